@@ -1,0 +1,36 @@
+"""How the kernels are compiled: read by setup.py and by whoever compiles the same sources elsewhere.
+
+A kernel gives the same bits on every CPU of an architecture: `-ffp-contract=off`, never `-march`.
+Directives stand here alone, not at the head of a .pyx file, so that the debug build reaches every kernel.
+"""
+
+from typing import Any
+
+__all__ = ["COMPILE_FLAGS", "directives"]
+
+#: Flags for gcc and clang that fix the bits (no fused multiply-add) and the meaning of a cast pointer.
+COMPILE_FLAGS = ["-ffp-contract=off", "-fno-strict-aliasing"]
+
+
+def directives(*, debug: bool = False) -> dict[str, Any]:
+    """Cython's compiler directives.
+
+    Parameters
+    ----------
+    debug : bool, default False
+        Check every index and every memoryview.
+
+    Returns
+    -------
+    dict
+        Directive to value, as `cythonize(compiler_directives=...)` takes it.
+    """
+    return {
+        "language_level": 3,
+        "boundscheck": debug,
+        "wraparound": False,
+        "initializedcheck": debug,
+        "cdivision": True,
+        "embedsignature": True,
+        "freethreading_compatible": True,
+    }

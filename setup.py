@@ -1,0 +1,81 @@
+"""Build of the compiled kernels; everything else about the package is in pyproject.toml.
+
+Environment:
+
+    LAVENDER_DEBUG=1        every index of every memoryview is checked, -O1 -g
+    LAVENDER_DEBUG=asan     the same, with the address and undefined-behaviour sanitizers, which also see raw
+                            pointers (gcc; run Python with LD_PRELOAD="$(gcc -print-file-name=libasan.so)")
+"""
+
+import json
+import multiprocessing
+import os
+import runpy
+import sys
+from pathlib import Path
+
+import Cython
+from Cython.Build import cythonize
+from setuptools import Extension, setup
+from setuptools.command.build_ext import build_ext
+
+MODE = os.environ.get("LAVENDER_DEBUG", "")
+DEBUG = MODE not in ("", "0")
+OPTIONS = runpy.run_path("lavender_ext/build_options.py")
+DIRECTIVES = OPTIONS["directives"](debug=DEBUG)
+
+LINK_ARGS = []
+if sys.platform == "win32":
+    COMPILE_ARGS = ["/Od", "/fp:precise"] if DEBUG else ["/O2", "/fp:precise"]
+else:
+    COMPILE_ARGS = ["-O1", "-g"] if DEBUG else ["-O3", "-g0"]
+    COMPILE_ARGS += [*OPTIONS["COMPILE_FLAGS"], "-Wno-unused-function"]
+    if MODE == "asan":
+        LINK_ARGS = ["-fsanitize=address,undefined", "-fno-sanitize-recover=undefined"]
+        COMPILE_ARGS += [*LINK_ARGS, "-fno-omit-frame-pointer"]
+
+
+class BuildKernels(build_ext):
+    """Translates .pyx to C under build/, in parallel, only when an extension is built (not for an sdist)."""
+
+    def run(self):
+        out = Path("build", "cython")
+        stamp = out / "how.json"
+        how = json.dumps([Cython.__version__, DIRECTIVES, COMPILE_ARGS, LINK_ARGS])
+        if not (stamp.exists() and stamp.read_text() == how):
+            self.force = True  # file times do not tell that flags or directives changed
+        workers = os.cpu_count() or 1
+        forks = multiprocessing.get_start_method() == "fork"  # elsewhere workers would run this file anew
+        translated = cythonize(
+            self.extensions,
+            build_dir=str(out),
+            compiler_directives=DIRECTIVES,
+            force=bool(self.force),
+            nthreads=workers if forks else 0,
+        )
+        for extension, c_extension in zip(self.extensions, translated, strict=True):
+            extension.sources = c_extension.sources
+            extension.depends = c_extension.depends
+        self.parallel = self.parallel or workers
+        super().run()
+        stamp.parent.mkdir(parents=True, exist_ok=True)
+        stamp.write_text(how)
+
+
+def extension(path):
+    """One module, named after its file; *_threads.pyx alone use OpenMP."""
+    openmp = []
+    if path.stem.endswith("_threads") and sys.platform != "darwin":  # Apple's clang ships without OpenMP
+        openmp = ["/openmp"] if sys.platform == "win32" else ["-fopenmp"]
+    return Extension(
+        f"lavender_ext.{path.stem}",
+        [path.as_posix()],
+        extra_compile_args=COMPILE_ARGS + openmp,
+        extra_link_args=LINK_ARGS + (openmp if sys.platform != "win32" else []),
+    )
+
+
+setup(
+    ext_modules=[extension(path) for path in sorted(Path("lavender_ext").glob("*.pyx"))],
+    cmdclass={"build_ext": BuildKernels},
+)
