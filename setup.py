@@ -39,11 +39,12 @@ class BuildKernels(build_ext):
     """Translates .pyx to C under build/, in parallel, only when an extension is built (not for an sdist)."""
 
     def run(self):
+        """Translate, then compile; everything anew when flags or directives are others than last time."""
         out = Path("build", "cython")
         stamp = out / "how.json"
         how = json.dumps([Cython.__version__, DIRECTIVES, COMPILE_ARGS, LINK_ARGS])
         if not (stamp.exists() and stamp.read_text() == how):
-            self.force = True  # file times do not tell that flags or directives changed
+            self.force = True  # file times do not tell
         workers = os.cpu_count() or 1
         forks = multiprocessing.get_start_method() == "fork"  # elsewhere workers would run this file anew
         translated = cythonize(

@@ -1,0 +1,243 @@
+"""Check that the compiled core of every kernel module needs neither Python nor static data.
+
+    python .ci/check_kernels.py [FILE.pyx ...]        without files: every module in lavender_ext
+
+What the core functions (`cdef public ... lav_*`) reach must stand alone: the same C then compiles to
+WebAssembly without an interpreter. An ordinary build never shows a breach, because the whole extension module
+has Python at hand. So each module is translated, compiled with one section per function, and linked with only
+its core functions as roots; the linker drops the Python part, and in what is left
+
+* a relocation to a symbol outside the object may only name `ALLOWED` (else: a call into Python, an exception,
+  a parallel loop, libm, malloc);
+* no writable section may be left (else: a module-level variable or an imported function pointer, which only
+  the initialisation of the Python module would fill), and no read-only data but the literals of instructions
+  (else: a table or a string).
+
+The sources are read too: signatures of core functions are fixed-width and `noexcept nogil`, directives stand
+in lavender_ext/build_options.py alone, and nothing imports lavender.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import runpy
+import shlex
+import shutil
+import subprocess
+import sys
+import sysconfig
+import tempfile
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+OPTIONS = runpy.run_path(str(ROOT / "lavender_ext" / "build_options.py"))
+
+#: sqrt and floor are exact, so every libm gives the same bits; compilers write the mem functions themselves.
+ALLOWED = frozenset({"sqrt", "floor", "memcpy", "memset", "memmove"})
+
+#: A threaded module is exempt by name: prange needs the OpenMP runtime and the thread state of Python. Its
+#: arithmetic is the inline functions of the .pxd files, which the serial modules compile and this check sees.
+EXEMPT_SUFFIX = "_threads"
+
+#: Types that have one size everywhere, as a host outside C must build them; structs end in _t too.
+FIXED = re.compile(r"(void|float|double|u?int(8|16|32|64)_t|\w+_t)$")
+NOT_FIXED = {"size_t", "ssize_t", "ptrdiff_t", "intptr_t", "uintptr_t", "Py_ssize_t", "wchar_t"}
+
+CORE = re.compile(
+    r"^cdef public (?!enum\b|struct\b|union\b|class\b)(?P<head>[^(\n]*?)(?P<name>\w+)"
+    r"\((?P<args>[^)]*)\)(?P<tail>[^:]*):",
+    re.MULTILINE,
+)
+HEADER = re.compile(r"#\s*cython\s*:(.*)", re.I)
+
+
+@dataclass
+class Verdict:
+    """What was found in one module: its core functions, their code in bytes, and every breach in words."""
+
+    module: str
+    functions: list[str] = field(default_factory=list)
+    code: int = 0
+    breaches: list[str] = field(default_factory=list)
+    exempt: bool = False
+
+    def __str__(self) -> str:
+        if self.exempt:
+            return f"{self.module}: exempt (threads)"
+        lines = [f"{self.module}: {len(self.functions)} core functions, {self.code} bytes of code"]
+        return "\n".join([*lines, *(f"  BREACH {text}" for text in self.breaches)])
+
+
+def type_of(declaration: str) -> str:
+    """The type in `const double* x`, without const and pointer stars: `double`."""
+    words = [word for word in declaration.replace("*", " ").split() if word != "const"]
+    return " ".join(words[:-1]) if len(words) > 1 else " ".join(words)
+
+
+def read_source(path: Path) -> tuple[list[str], list[str]]:
+    """Names of the core functions in a .pyx file, and what its text breaks."""
+    text = path.read_text(encoding="utf-8")
+    names, breaches = [], []
+    for line in text.splitlines():
+        if line.strip() and not line.startswith("#"):
+            break
+        header = HEADER.match(line)
+        if header:
+            breaches.append(
+                f"directives at the head ({header[1].strip()}): they belong in build_options.py, "
+                "or the debug build does not reach this module"
+            )
+    if re.search(r"^\s*(from|import|cimport)\s+lavender\b(?!_)", text, re.M):
+        breaches.append("imports lavender: the kernels stand below it")
+    for match in CORE.finditer(text):
+        name = match["name"]
+        if not name.startswith("lav_"):
+            breaches.append(f"{name}: a public function is a core function and is named lav_*")
+            continue
+        names.append(name)
+        if match["tail"].split() != ["noexcept", "nogil"]:
+            breaches.append(f"{name}: must be declared noexcept nogil")
+        declarations = [f"{match['head']} {name}", *filter(str.strip, match["args"].split(","))]
+        for declaration in declarations:
+            kind, shown = type_of(declaration), " ".join(declaration.split())
+            if "[" in declaration or kind in NOT_FIXED or not FIXED.match(kind):
+                breaches.append(f"{name}: '{shown}' is not of a fixed-width type or a pointer to one")
+            elif kind.endswith("int64_t") and "*" not in declaration:
+                breaches.append(f"{name}: '{shown}' passes a 64-bit integer by value (JavaScript: BigInt)")
+    if not names and not breaches:
+        breaches.append("has no core function `cdef public ... lav_*(...) noexcept nogil`")
+    return names, breaches
+
+
+def run(*command: str | Path, cwd: Path) -> str:
+    """Standard output of a command; RuntimeError with its messages if it fails."""
+    done = subprocess.run(
+        [str(part) for part in command], cwd=cwd, capture_output=True, text=True, check=False
+    )
+    if done.returncode:
+        shown = shlex.join(map(str, command))
+        raise RuntimeError(f"{shown} failed with status {done.returncode}:\n{done.stdout}{done.stderr}")
+    return done.stdout
+
+
+def link_core(path: Path, names: list[str], root: Path, work: Path) -> Path:
+    """The object file that holds what the functions `names` of the module `path` reach, and nothing else."""
+    compiler = shlex.split(os.environ.get("CC", "cc"))
+    c_file, whole, core = (work / (path.stem + suffix) for suffix in (".c", ".o", ".core.o"))
+    directives = [f"-X{name}={value}" for name, value in OPTIONS["directives"]().items()]
+    run(sys.executable, "-m", "cython", *directives, path, "-o", c_file, cwd=root)
+    sections = ["-ffunction-sections", "-fdata-sections", "-fno-jump-tables", "-fno-tree-switch-conversion"]
+    plain = [
+        "-fno-stack-protector",
+        "-fno-asynchronous-unwind-tables",
+        "-U_FORTIFY_SOURCE",
+        "-fPIC",
+        "-w",
+        "-O2",
+    ]
+    include = "-I" + sysconfig.get_paths()["include"]
+    run(*compiler, *OPTIONS["COMPILE_FLAGS"], *sections, *plain, include, "-c", c_file, "-o", whole, cwd=root)
+    roots = [f"-Wl,-u,{name}" for name in names]
+    run(*compiler, "-r", "-nostdlib", "-no-pie", "-Wl,--gc-sections", *roots, whole, "-o", core, cwd=root)
+    return core
+
+
+def read_object(core: Path) -> tuple[int, list[str]]:
+    """Bytes of code in a linked core, and what it breaks."""
+    code, breaches = 0, []
+    section = re.compile(
+        r"\] (?P<name>\.\S+)\s+(?:PROGBITS|NOBITS)\s+\S+ \S+ (?P<size>\S+) \S+\s+(?P<flags>\w*)"
+        r"\s+\d+\s+\d+\s+\d+$",
+        re.MULTILINE,
+    )
+    for match in section.finditer(run("readelf", "-SW", core, cwd=core.parent)):
+        name, size, flags = match["name"], int(match["size"], 16), match["flags"]
+        if "A" not in flags or not size or name.startswith(".note"):
+            continue
+        if "X" in flags:
+            code += size
+        elif "W" in flags:
+            breaches.append(
+                f"reads or writes static data: {name}, {size} bytes, which no one fills outside Python"
+            )
+        elif not name.startswith(".rodata.cst"):
+            breaches.append(f"reads a constant table or string: {name}, {size} bytes")
+    symbol_line = re.compile(r"^\s*\d+: \S+\s+\S+ \w+\s+\w+\s+\w+\s+(?!UND)\S+ (\S+)$", re.MULTILINE)
+    defined = set(symbol_line.findall(run("readelf", "-sW", core, cwd=core.parent)))
+    used_by: dict[str, set[str]] = {}
+    user = ""
+    for line in run("readelf", "-rW", core, cwd=core.parent).splitlines():
+        head = re.match(r"Relocation section '\.rela?(\S+)'", line)
+        if head:
+            user = re.sub(r"^\.text\.(unlikely\.|hot\.|startup\.)?", "", head[1])
+        entry = re.match(r"[0-9a-f]{8,16}\s+[0-9a-f]{8,16}\s+R_\S+\s+[0-9a-f]{8,16}\s+(\S+)", line)
+        if entry and not entry[1].startswith("."):
+            symbol = entry[1].split("@")[0]
+            if symbol not in defined and symbol not in ALLOWED:
+                used_by.setdefault(symbol, set()).add(user)
+    breaches += [
+        f"needs {symbol} (in {', '.join(sorted(users))})" for symbol, users in sorted(used_by.items())
+    ]
+    return code, breaches
+
+
+def check(path: Path, root: Path = ROOT) -> Verdict:
+    """Check one .pyx file.
+
+    Parameters
+    ----------
+    path : Path
+        The module; what it cimports is found from `root`.
+    root : Path, optional
+        The folder that holds the package lavender_ext.
+
+    Returns
+    -------
+    Verdict
+        Without breaches when the core stands alone.
+
+    Raises
+    ------
+    RuntimeError
+        If Cython, the compiler or the linker fails.
+    """
+    verdict = Verdict(path.stem, exempt=path.stem.endswith(EXEMPT_SUFFIX))
+    if verdict.exempt:
+        return verdict
+    verdict.functions, verdict.breaches = read_source(path)
+    if verdict.functions:
+        with tempfile.TemporaryDirectory() as work:
+            core = link_core(path.resolve(), verdict.functions, root, Path(work))
+            verdict.code, found = read_object(core)
+            verdict.breaches += found
+    return verdict
+
+
+def tools_missing() -> str:
+    """Why the check cannot run here; empty when it can."""
+    if not sys.platform.startswith("linux"):
+        return "the check reads ELF objects, so it runs on Linux"
+    needed = [shlex.split(os.environ.get("CC", "cc"))[0], "readelf"]
+    absent = [tool for tool in needed if shutil.which(tool) is None]
+    return f"not found: {', '.join(absent)} (a C compiler and binutils are needed)" if absent else ""
+
+
+def main(arguments: list[str]) -> int:
+    """Print a verdict for each module; 0 when all are pure."""
+    missing = tools_missing()
+    if missing:
+        print(missing, file=sys.stderr)
+        return 2
+    paths = [Path(name) for name in arguments] or sorted((ROOT / "lavender_ext").glob("*.pyx"))
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        verdicts = list(pool.map(check, paths))
+    for verdict in verdicts:
+        print(verdict)
+    return int(not verdicts or any(verdict.breaches for verdict in verdicts))
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,30 @@
+"""What all tests share: one thread for BLAS, no display, reproducible examples, the reference problems."""
+
+import os
+from pathlib import Path
+
+for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(variable, "1")  # before NumPy starts its threads: small matrices only lose by them
+os.environ.setdefault("MPLBACKEND", "Agg")
+
+import hypothesis
+import pytest
+
+# Timings say nothing on a shared machine, so no deadline; the same examples every run, so a failure repeats.
+# HYPOTHESIS_PROFILE=search draws new ones.
+hypothesis.settings.register_profile("repeat", deadline=None, derandomize=True, print_blob=True)
+hypothesis.settings.register_profile("search", deadline=None, max_examples=1000)
+hypothesis.settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "repeat"))
+
+PROBLEMS = os.environ.get("LAVENDER_PROBLEMS", "")
+
+
+@pytest.fixture(scope="session")
+def problem_dir() -> Path:
+    """Folder of the reference problems, named by LAVENDER_PROBLEMS."""
+    if not PROBLEMS:
+        pytest.skip("LAVENDER_PROBLEMS does not name a folder of reference problems")
+    folder = Path(PROBLEMS)
+    if not any(folder.glob("*.npz")) and not any(folder.glob("*.hdf5")):
+        pytest.fail(f"LAVENDER_PROBLEMS={PROBLEMS} holds no .npz or .hdf5 file")
+    return folder
