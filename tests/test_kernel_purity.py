@@ -125,10 +125,8 @@ def test_a_function_imported_from_another_module_is_a_breach(tmp_path):
     (tmp_path / "__init__.py").touch()
     (tmp_path / "other.pxd").write_text("cdef double twice(double x) noexcept nogil\n")
     (tmp_path / "other.pyx").write_text("cdef double twice(double x) noexcept nogil:\n    return 2.0 * x\n")
-    text = (
-        "from .other cimport twice\n\n"
-        + "cdef public double lav_x(double x) noexcept nogil:\n    return twice(x)\n"
-    )
+    core = "cdef public double lav_x(double x) noexcept nogil:\n    return twice(x)\n"
+    text = f"from .other cimport twice\n\n{core}"
     breaches = verdict(tmp_path, "user", text).breaches
     assert any("static data" in breach and "twice" in breach for breach in breaches)
 

@@ -1,0 +1,61 @@
+"""Check that a source distribution and a wheel hold what they must, and nothing a build left behind.
+
+python .ci/check_dist.py FOLDER        the folder with one .tar.gz and one .whl
+"""
+
+import sys
+import tarfile
+import zipfile
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+def names_in(folder: Path) -> tuple[set[str], set[str]]:
+    """Paths in the sdist (below its top folder) and in the wheel."""
+    (sdist,), (wheel,) = folder.glob("*.tar.gz"), folder.glob("*.whl")
+    with tarfile.open(sdist) as archive:
+        in_sdist = {name.partition("/")[2] for name in archive.getnames()}
+    with zipfile.ZipFile(wheel) as archive:
+        in_wheel = set(archive.namelist())
+    return in_sdist, in_wheel
+
+
+def problems(in_sdist: set[str], in_wheel: set[str]) -> list[str]:
+    """What is missing or out of place, one sentence each."""
+    packages = [path for name in ("lavender", "lavender_ext") for path in (ROOT / name).rglob("*")]
+    sources = {
+        path.relative_to(ROOT).as_posix()
+        for path in packages
+        if path.is_file() and path.suffix not in {".pyc", ".so", ".pyd", ".c", ".h"}
+    }
+    tests = {path.relative_to(ROOT).as_posix() for path in (ROOT / "tests").rglob("*.py")}
+    kernels = {Path(name).stem for name in sources if name.endswith(".pyx")}
+    modules = {name.split("/")[1].split(".")[0] for name in in_wheel if name.endswith((".so", ".pyd"))}
+    found = [f"sdist lacks {name}" for name in sorted((sources | tests) - in_sdist)]
+    for name in (
+        "LICENSE",
+        "README.md",
+        "CHANGELOG.md",
+        "setup.py",
+        "pyproject.toml",
+        ".ci/check_kernels.py",
+    ):
+        found += [] if name in in_sdist else [f"sdist lacks {name}"]
+    found += [f"wheel lacks {name}" for name in sorted(sources - in_wheel)]
+    found += [f"wheel lacks the compiled module lavender_ext.{name}" for name in sorted(kernels - modules)]
+    if not any(name.endswith("/licenses/LICENSE") for name in in_wheel):
+        found.append("wheel lacks LICENSE")
+    left = [f"sdist holds {name}" for name in in_sdist if name.endswith((".c", ".h", ".so", ".pyc", ".o"))]
+    left += [f"wheel holds {name}" for name in in_wheel if name.endswith((".c", ".h", ".pyc", ".o"))]
+    left += [f"wheel holds {name}" for name in in_wheel if name.split("/")[0] in {"tests", "build", "docs"}]
+    return found + sorted(left)
+
+
+if __name__ == "__main__":
+    in_sdist, in_wheel = names_in(Path(sys.argv[1]))
+    found = problems(in_sdist, in_wheel)
+    print(
+        "\n".join(found) or f"sdist: {len(in_sdist)} entries, wheel: {len(in_wheel)} entries, nothing amiss"
+    )
+    sys.exit(bool(found))

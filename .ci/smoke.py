@@ -1,0 +1,35 @@
+"""Import lavender from where it should come, solve a small problem, compare with the answer made by hand.
+
+python .ci/smoke.py FOLDER        lavender and its kernels must be imported from below FOLDER
+"""
+
+import sys
+from pathlib import Path
+
+import lavender_ext.sweeps
+import numpy as np
+
+import lavender as lv
+
+
+def main(folder: Path) -> None:
+    """Raise AssertionError where an answer or an origin is wrong."""
+    for module in (lv, lavender_ext.sweeps):
+        origin = Path(module.__file__).resolve()
+        assert origin.is_relative_to(folder.resolve()), (
+            f"{module.__name__} came from {origin}, not from {folder}"
+        )
+
+    # Row 1 separates: impulse (1/2, 0), slack (0, 1/2 + 1).
+    problem = lv.Problem.lcp(np.array([[2.0, 1.0], [1.0, 2.0]]), np.array([1.0, -1.0]))
+    for solver in ("pgs", "direct"):
+        solution = lv.solve(problem, solver, tol=1e-12)
+        assert solution.success, solution
+        # tol 1e-12 times the condition number 3 of A leaves the answer within 1e-11.
+        np.testing.assert_allclose(solution.impulse, [0.5, 0.0], rtol=0.0, atol=1e-11)
+        np.testing.assert_allclose(solution.slack, [0.0, 1.5], rtol=0.0, atol=1e-11)
+    print(f"lavender {lv.__version__} from {Path(lv.__file__).parent}: {solution}")
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))

@@ -1,0 +1,108 @@
+"""What is installed is whole, light to import, and as README and changelog say."""
+
+import ast
+import importlib.metadata
+import importlib.util
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import lavender
+import lavender_ext
+
+ROOT = Path(__file__).resolve().parent.parent
+KERNELS = Path(lavender_ext.__file__).parent
+MODULES = sorted(path.stem for path in KERNELS.glob("*.pyx"))
+
+
+def python(code):
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, cwd=ROOT)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_version_is_the_installed_one_and_in_the_changelog():
+    assert lavender.__version__ == importlib.metadata.version("lavender")
+    assert f"## [{lavender.__version__}]" in (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+
+
+def test_types_ship():
+    assert (Path(lavender.__file__).parent / "py.typed").exists()
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_kernel_is_compiled_from_source_that_ships(name):
+    spec = importlib.util.find_spec(f"lavender_ext.{name}")
+    assert spec is not None
+    assert spec.origin.endswith((".so", ".pyd"))
+    assert (KERNELS / f"{name}.pyx").exists()
+
+
+def test_import_is_light():
+    # Half a second is what the user would feel; the best of three, since other work only adds to it.
+    code = "import time; t = time.perf_counter(); import lavender; print(time.perf_counter() - t)"
+    assert min(float(python(code)) for _ in range(3)) < 0.5
+
+
+def test_import_loads_no_backend_and_no_plots():
+    loaded = set(json.loads(python("import sys, json, lavender; print(json.dumps(list(sys.modules)))")))
+    heavy = {"matplotlib", "h5py", "qpsolvers", "osqp", "clarabel", "piqp", "daqp", "quadprog", "scs"}
+    heavy |= {"proxsuite", "highspy", "qpalm", "rich", "click"}
+    assert loaded & heavy == set()
+
+
+def test_public_names_are_there():
+    assert len(lavender.__all__) == len(set(lavender.__all__))
+    for name in lavender.__all__:
+        assert hasattr(lavender, name), name
+
+
+def test_command_is_installed():
+    (entry,) = importlib.metadata.entry_points(group="console_scripts", name="lavender")
+    assert callable(entry.load())
+
+
+def declared(table):
+    """Names of the distributions in a list of requirements of pyproject.toml."""
+    text = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+    block = re.search(rf"^{table} = \[(.*?)\]$", text, re.MULTILINE | re.DOTALL)[1]
+    return {name.lower() for name in re.findall(r'"([A-Za-z0-9_-]+)[>"]', block)}
+
+
+def test_every_import_is_declared():
+    # Anything that lavender imports at all stands in pyproject.toml under its own name.
+    known = declared("dependencies") | declared("fclib") | declared("qp")
+    known |= set(sys.stdlib_module_names) | {"lavender", "lavender_ext"}
+    found = set()
+    for path in Path(lavender.__file__).parent.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Import):
+                found |= {alias.name.split(".")[0] for alias in node.names}
+            elif isinstance(node, ast.ImportFrom) and not node.level:
+                found.add(node.module.split(".")[0])
+    assert found - known == set()
+
+
+@pytest.mark.parametrize("name", ["report", "test"])
+def test_readme_command_is_one_line_from_a_fresh_clone(name):
+    done = subprocess.run(
+        [sys.executable, str(ROOT / ".ci" / "readme_command.py"), name],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert done.stdout.startswith("python3 -m venv .venv && .venv/bin/pip install ")
+    assert done.stdout.count("\n") == 1
+
+
+def test_debug_build_differs_in_checks_alone():
+    from lavender_ext.build_options import COMPILE_FLAGS, directives
+
+    differ = {name for name, value in directives(debug=True).items() if value != directives()[name]}
+    assert differ == {"boundscheck", "initializedcheck"}
+    assert "-ffp-contract=off" in COMPILE_FLAGS
+    assert not any("march" in flag or "fast-math" in flag for flag in COMPILE_FLAGS)
