@@ -1,0 +1,45 @@
+"""lavender: the constraint problem of one rigid-body step, solved by the solver you name, and judged."""
+
+from lavender.cones import CONTACT, CONTACT_SPIN, ROW, Cones
+from lavender.errors import (
+    CapabilityError,
+    InputError,
+    LavenderError,
+    SolveFailed,
+    SolverUnavailable,
+    UnknownName,
+)
+from lavender.problem import Problem, Rows
+from lavender.registry import SolverSpec, available, get, known, register
+from lavender.residuals import Residual, residual
+from lavender.solution import Claim, Solution, Status
+from lavender.solve import prepare, solve
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "CONTACT",
+    "CONTACT_SPIN",
+    "ROW",
+    "CapabilityError",
+    "Claim",
+    "Cones",
+    "InputError",
+    "LavenderError",
+    "Problem",
+    "Residual",
+    "Rows",
+    "Solution",
+    "SolveFailed",
+    "SolverSpec",
+    "SolverUnavailable",
+    "Status",
+    "UnknownName",
+    "available",
+    "get",
+    "known",
+    "prepare",
+    "register",
+    "residual",
+    "solve",
+]

@@ -1,0 +1,91 @@
+"""One gate for arrays: dtype, shape, finiteness, privacy. Kernels behind it check nothing."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from lavender.errors import InputError
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int32]
+
+
+def read_only(array: np.ndarray) -> np.ndarray:
+    array.flags.writeable = False
+    return array
+
+
+def as_array(
+    name: str,
+    value: Any,
+    shape: tuple[int | None, ...],
+    *,
+    dtype: type = np.float64,
+    finite: bool = True,
+    copy: bool = True,
+    unit: str = "",
+) -> np.ndarray:
+    """`value` as a private read-only C-contiguous array of the given shape (None: any length).
+
+    A scalar fills a one-dimensional shape of known length. With `copy=False` an array that already
+    fits is adopted and marked read-only.
+
+    Raises
+    ------
+    InputError
+        Not numeric, complex, of another shape, or not finite where it must be.
+    """
+    what = f"{name} [{unit}]" if unit else name
+    try:
+        given = np.asarray(value)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{what} is not an array of numbers ({error})") from None
+    if given.dtype.kind not in "buif":
+        raise InputError(f"{what} has dtype {given.dtype}; real numbers are needed")
+    if dtype is np.int32 and given.dtype.kind == "f" and given.size and not np.array_equal(given, np.rint(given)):
+        raise InputError(f"{what} must hold whole numbers")
+    if given.ndim == 0 and len(shape) == 1 and shape[0] is not None:
+        given = np.full(shape[0], given)
+        copy = False
+    if given.ndim != len(shape) or any(n is not None and n != s for n, s in zip(shape, given.shape, strict=True)):
+        wanted = "(" + ", ".join("any" if n is None else str(n) for n in shape) + ("," if len(shape) == 1 else "") + ")"
+        raise InputError(f"{what} has shape {given.shape}; {wanted} is needed")
+    if dtype is np.int32 and given.size and (given.min() < -(2**31) or given.max() >= 2**31):
+        raise InputError(f"{what} holds numbers beyond 32 bits")
+    array = np.array(given, dtype, order="C") if copy else np.ascontiguousarray(given, dtype)
+    if finite and array.dtype.kind == "f":
+        _check_finite(what, array)
+    return read_only(array)
+
+
+def _check_finite(what: str, array: np.ndarray) -> None:
+    # One sum sees every NaN and infinity; only a failing array pays for the search.
+    if not np.isfinite(array.sum()):
+        bad = np.argwhere(~np.isfinite(array))
+        if len(bad):
+            where = ", ".join(map(str, bad[0]))
+            raise InputError(f"{what} must be finite; entry [{where}] is {array[tuple(bad[0])]}, {len(bad)} in all")
+
+
+def check_not_nan(what: str, array: np.ndarray) -> None:
+    bad = np.flatnonzero(np.isnan(array))
+    if len(bad):
+        raise InputError(f"{what} must not be NaN; entry [{bad[0]}] is, {len(bad)} in all")
+
+
+def check_not_negative(what: str, array: np.ndarray) -> None:
+    if array.size and array.min() < 0:
+        i = int(np.argmin(array))
+        raise InputError(f"{what} must not be negative; entry [{i}] is {array[i]}")
+
+
+def equal(x: object, y: object) -> bool:
+    """Equality of fields: arrays bit for bit in value and shape, None with None."""
+    if x is None or y is None:
+        return x is y
+    if isinstance(x, np.ndarray) or isinstance(y, np.ndarray):
+        return np.array_equal(x, y)  # type: ignore[arg-type]
+    return bool(x == y)

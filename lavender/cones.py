@@ -1,0 +1,163 @@
+"""Blocks of a problem: which rows belong together and what bounds them.
+
+A block is one or more bounded rows (`ROW`), or a contact: normal row, then 0 to 2 tangent rows, then
+perhaps one spin row. With lambda [N s] the bounds are
+
+    ROW           lower <= lambda_i <= upper on each of its rows
+    CONTACT       0 <= lambda_n,  |lambda_t| <= mu lambda_n
+    CONTACT_SPIN  the same, and |lambda_s| <= mu r lambda_n, r = patch radius [m]
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from lavender._arrays import FloatArray, IntArray, as_array, check_not_nan, check_not_negative, equal
+from lavender.errors import InputError
+
+__all__ = ["CONTACT", "CONTACT_SPIN", "ROW", "Cones", "project"]
+
+ROW, CONTACT, CONTACT_SPIN = 0, 1, 2
+
+
+@dataclass(frozen=True, eq=False)
+class Cones:
+    """Bounds of every block; use the class methods unless blocks are mixed.
+
+    Raises
+    ------
+    InputError
+        Shapes that do not fit, lower > upper, NaN bounds, negative mu or patch radius, a contact with
+        more rows than normal, two tangents and spin.
+    """
+
+    ptr: IntArray  # (k + 1,) first row of each block, then m
+    kind: IntArray  # (k,) ROW | CONTACT | CONTACT_SPIN
+    lower: FloatArray  # (m,) N s, read on ROW blocks, -inf allowed
+    upper: FloatArray  # (m,) N s, read on ROW blocks, +inf allowed
+    mu: FloatArray  # (k,) -, read on contacts
+    patch_radius: FloatArray  # (k,) m, read on CONTACT_SPIN
+
+    def __post_init__(self) -> None:
+        ptr = as_array("cones.ptr", self.ptr, (None,), dtype=np.int32)
+        if len(ptr) == 0 or ptr[0] != 0 or np.any(np.diff(ptr) <= 0):
+            raise InputError("cones.ptr must start with 0 and increase: the first row of each block, then the number of rows")
+        k, m = len(ptr) - 1, int(ptr[-1])
+        kind = as_array("cones.kind", self.kind, (k,), dtype=np.int32)
+        if k and not np.isin(kind, (ROW, CONTACT, CONTACT_SPIN)).all():
+            raise InputError(f"cones.kind holds {sorted(set(kind.tolist()))}; ROW=0, CONTACT=1, CONTACT_SPIN=2 are known")
+        size = np.diff(ptr)
+        bad = np.flatnonzero((kind != ROW) & ((size < kind) | (size > kind + 2)))
+        if len(bad):
+            raise InputError(
+                f"block {bad[0]} is a contact of {size[bad[0]]} rows; a contact has a normal, up to two tangents, "
+                "and one spin row if it is CONTACT_SPIN"
+            )
+        lower = as_array("lower", self.lower, (m,), finite=False, unit="N s")
+        upper = as_array("upper", self.upper, (m,), finite=False, unit="N s")
+        check_not_nan("lower", lower)
+        check_not_nan("upper", upper)
+        contact_rows = np.repeat(kind != ROW, size)
+        bad = np.flatnonzero(~contact_rows & ~((lower <= upper) & (lower < np.inf) & (upper > -np.inf)))
+        if len(bad):
+            i = bad[0]
+            raise InputError(f"row {i}: lower = {lower[i]}, upper = {upper[i]}; lower <= upper is needed, and a number between them")
+        if contact_rows.any():
+            # One spelling for rows whose bounds are never read, so that equal problems compare equal.
+            lower, upper = lower.copy(), upper.copy()
+            lower[contact_rows], upper[contact_rows] = -np.inf, np.inf
+            normal = ptr[:-1][kind != ROW]
+            lower[normal] = 0.0
+            lower.flags.writeable = upper.flags.writeable = False
+        mu = as_array("mu", self.mu, (k,))
+        check_not_negative("mu", mu)
+        radius = as_array("patch_radius", self.patch_radius, (k,), unit="m")
+        check_not_negative("patch_radius", radius)
+        for name, value in zip(("ptr", "kind", "lower", "upper", "mu", "patch_radius"), (ptr, kind, lower, upper, mu, radius), strict=True):
+            object.__setattr__(self, name, value)
+
+    @classmethod
+    def _trusted(cls, *values: np.ndarray) -> Cones:
+        # For arrays this module has just made; nothing is checked again.
+        cones = object.__new__(cls)
+        for field, value in zip(fields(cls), values, strict=True):
+            value.flags.writeable = False
+            object.__setattr__(cones, field.name, value)
+        return cones
+
+    @classmethod
+    def bounded(cls, lower: FloatArray, upper: FloatArray) -> Cones:
+        """One ROW block for each pair of bounds; arrays (m,) [N s]."""
+        m = len(lower)
+        return cls(np.arange(m + 1, dtype=np.int32), np.zeros(m, np.int32), lower, upper, np.zeros(m), np.zeros(m))
+
+    @classmethod
+    def free(cls, m: int) -> Cones:
+        """m unbounded rows, each its own block: a linear system."""
+        return cls._trusted(
+            np.arange(m + 1, dtype=np.int32), np.zeros(m, np.int32), np.full(m, -np.inf), np.full(m, np.inf), np.zeros(m), np.zeros(m)
+        )
+
+    @classmethod
+    def contacts(cls, mu: FloatArray, tangents: int = 2, patch_radius: FloatArray | None = None) -> Cones:
+        """Contacts only: mu (k,), the same number of tangents each, with a spin row if a radius is given (k,) [m]."""
+        mu = np.atleast_1d(np.asarray(mu, float))
+        k, spin = len(mu), patch_radius is not None
+        size = 1 + tangents + spin
+        radius = np.zeros(k) if patch_radius is None else np.broadcast_to(np.asarray(patch_radius, float), (k,))
+        m = k * size
+        kind = np.full(k, CONTACT_SPIN if spin else CONTACT, np.int32)
+        return cls(np.arange(0, m + 1, size, dtype=np.int32), kind, np.zeros(m), np.zeros(m), mu, radius)
+
+    @property
+    def n_blocks(self) -> int:
+        return len(self.kind)
+
+    @property
+    def n_rows(self) -> int:
+        return int(self.ptr[-1])
+
+    @property
+    def is_free(self) -> bool:
+        """Every row is unbounded."""
+        return bool(np.all(self.kind == ROW) and np.all(np.isneginf(self.lower)) and np.all(np.isposinf(self.upper)))
+
+    @property
+    def is_bounded_rows(self) -> bool:
+        """Every row has constant bounds: ROW blocks and contacts of a normal alone."""
+        return bool(np.all((self.kind == ROW) | (np.diff(self.ptr) == 1)))
+
+    @property
+    def n_tangents(self) -> IntArray:
+        """(k,) tangent rows of each block, 0 on ROW."""
+        return np.where(self.kind == ROW, 0, np.diff(self.ptr) - self.kind).astype(np.int32)
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Cones):
+            return NotImplemented
+        return all(equal(getattr(self, f.name), getattr(other, f.name)) for f in fields(self))
+
+    __hash__ = None  # type: ignore[assignment]
+
+
+def project(cones: Cones, impulse: FloatArray) -> FloatArray:
+    """Nearest feasible normal and rows, then tangents and spin onto mu lambda_n; (m,) [N s].
+
+    This is the feasibility step of a sweep, not the projection onto the friction cone: the normal is
+    clipped first and keeps its value.
+    """
+    out = np.clip(impulse, cones.lower, cones.upper)
+    tangents = cones.n_tangents
+    for i in np.flatnonzero((cones.kind != ROW) & (np.diff(cones.ptr) > 1)):
+        j, end, nt = cones.ptr[i], cones.ptr[i + 1], tangents[i]
+        bound = cones.mu[i] * out[j]
+        t = out[j + 1 : j + 1 + nt]
+        size = np.hypot.reduce(t) if nt else 0.0
+        if size > bound:
+            t *= bound / size
+        if cones.kind[i] == CONTACT_SPIN:
+            spin = bound * cones.patch_radius[i]
+            out[end - 1] = np.clip(out[end - 1], -spin, spin)
+    return out

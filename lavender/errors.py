@@ -1,0 +1,50 @@
+"""What lavender raises. Every message says what came, what was needed, and what to do."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+__all__ = [
+    "CapabilityError",
+    "InputError",
+    "LavenderError",
+    "SolveFailed",
+    "SolverUnavailable",
+    "UnknownName",
+]
+
+
+class LavenderError(Exception):
+    """Base of everything lavender raises on purpose."""
+
+
+class InputError(LavenderError, ValueError):
+    """An argument, array or file that lavender cannot take."""
+
+
+class UnknownName(LavenderError, KeyError):
+    """A solver, option, order, scene or case that does not exist; the message names the nearest."""
+
+    def __init__(self, kind: str, name: object, known: Iterable[str]) -> None:
+        known = sorted(known)
+        near = difflib.get_close_matches(str(name), known, n=3, cutoff=0.5)
+        hint = f"did you mean {' or '.join(map(repr, near))}?" if near else f"known: {', '.join(known) or 'none'}"
+        self.message = f"unknown {kind} {name!r}; {hint}"
+        super().__init__(self.message)
+
+    def __str__(self) -> str:
+        # KeyError would show the repr of the message.
+        return self.message
+
+
+class SolverUnavailable(LavenderError):
+    """A known solver whose package is not installed here."""
+
+
+class CapabilityError(LavenderError):
+    """A solver or format that cannot take this problem or option; the message says which can."""
+
+
+class SolveFailed(LavenderError):
+    """Raised only by `Solution.raise_for_status`."""

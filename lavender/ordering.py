@@ -1,0 +1,165 @@
+"""Sweep orders of blocks, by name, and colours for threads.
+
+    given       as they stand                    bottom_up   by level from the ground, breadth first
+    reverse     backwards                        top_down    the levels backwards
+    symmetric   given, then reverse, in turn     colored     colour by colour, none sharing a moving body
+    random      shuffled before every sweep      an int array: that permutation of blocks
+
+On a problem with rows, joints stay before contacts under every name.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import scipy.sparse as sp
+
+from lavender._arrays import IntArray, as_array
+from lavender.errors import CapabilityError, InputError, UnknownName
+from lavender.problem import Problem
+from lavender_ext import orders as kernels
+
+__all__ = ["ORDERS", "Order", "block_order", "colors", "levels"]
+
+ORDERS = ("given", "reverse", "symmetric", "random", "colored", "bottom_up", "top_down")
+# Modes of lavender_ext/order.pxd.
+_GIVEN, _SYMMETRIC, _RANDOM = 0, 1, 2
+
+
+@dataclass
+class Order:
+    """A sweep order as the kernels take it; `blocks` and `rng` advance with the sweeps."""
+
+    blocks: IntArray  # (k,) the coming sweep's order, modified in place
+    split: int  # blocks[:split] and blocks[split:] are permuted apart: joints, contacts
+    mode: int  # given, symmetric or random
+    rng: np.ndarray  # (1,) uint64, state of the generator
+    color_ptr: IntArray | None = None  # first place of each colour in `blocks`, then k
+
+    def fresh(self) -> Order:
+        """A copy that can be swept without touching this one."""
+        return Order(self.blocks.copy(), self.split, self.mode, self.rng.copy(), self.color_ptr)
+
+    @property
+    def is_given(self) -> bool:
+        return self.mode == _GIVEN and bool(np.array_equal(self.blocks, np.arange(len(self.blocks))))
+
+
+def block_order(problem: Problem, order: str | Sequence[int] | Any = "given", *, seed: int = 0, ground: Any = None) -> Order:
+    """Order of a problem's blocks.
+
+    Parameters
+    ----------
+    order : str or int array (k,)
+    seed : int, only with "random"
+    ground : int array, only with "bottom_up" / "top_down" on a matrix
+        Blocks that touch the ground; with rows the static bodies are known.
+
+    Raises
+    ------
+    UnknownName
+        No such order.
+    InputError
+        Not a permutation; ground given where it is not used, or out of range.
+    CapabilityError
+        Levels of a matrix without `ground`.
+    """
+    k = problem.n_blocks
+    split = 0 if problem.rows is None else problem.rows.n_joints
+    if not isinstance(seed, (int, np.integer)) or seed < 0:
+        raise InputError(f"seed is {seed!r}; a whole number >= 0 is needed")
+    rng = np.array([int(seed) % 2**64], np.uint64)
+    if not isinstance(order, str):
+        blocks = as_array("order", order, (k,), dtype=np.int32).copy()
+        if not np.array_equal(np.sort(blocks), np.arange(k)):
+            raise InputError(f"order must hold every block from 0 to {k - 1} once")
+        return Order(blocks, k, _GIVEN, rng)
+    if order not in ORDERS:
+        raise UnknownName("order", order, ORDERS)
+    if ground is not None and order not in ("bottom_up", "top_down"):
+        raise InputError(f"ground= goes with bottom_up and top_down, not with {order!r}")
+    blocks = np.arange(k, dtype=np.int32)
+    if order == "reverse":
+        blocks = np.concatenate([blocks[:split][::-1], blocks[split:][::-1]])
+    elif order in ("bottom_up", "top_down"):
+        level = levels(problem, ground)
+        if order == "top_down":
+            level = level.max(initial=0) - level
+        blocks = _by_key(level, split)[0]
+    elif order == "colored":
+        blocks, ptr = _by_key(colors(problem), split)
+        return Order(blocks, split, _GIVEN, rng, ptr)
+    mode = _SYMMETRIC if order == "symmetric" else _RANDOM if order == "random" else _GIVEN
+    return Order(np.ascontiguousarray(blocks, np.int32), split, mode, rng)
+
+
+def _by_key(key: IntArray, split: int) -> tuple[IntArray, IntArray]:
+    # Stable order by key within joints and within contacts; first place of each key, then k.
+    parts, starts, base = [], [np.zeros(1, np.int32)], 0
+    for part in (key[:split], key[split:]):
+        blocks, start = kernels.stable_order(np.ascontiguousarray(part, np.int32))
+        parts.append(blocks + base)
+        ends = start[1:] + base
+        starts.append(ends[np.diff(start) > 0])
+        base += len(part)
+    return np.concatenate(parts).astype(np.int32), np.concatenate(starts).astype(np.int32)
+
+
+def _block_bodies(problem: Problem) -> IntArray:
+    rows = problem.rows
+    assert rows is not None
+    return np.ascontiguousarray(np.concatenate([rows.joint_body, rows.contact_body]), np.int32)
+
+
+def levels(problem: Problem, ground: Any = None) -> IntArray:
+    """Level (k,) of each block: distance from the static bodies, or from the blocks `ground` through A."""
+    k = problem.n_blocks
+    if problem.rows is not None:
+        if ground is not None:
+            raise InputError("ground= is for problems given as a matrix; with rows the static bodies are known")
+        return kernels.body_order_levels(_block_bodies(problem), problem.rows.n_bodies)
+    if ground is None:
+        raise CapabilityError("levels of a matrix need ground=: the blocks that touch the ground (with rows they are known)")
+    ground = as_array("ground", ground, (None,), dtype=np.int32)
+    if ground.size and (ground.min() < 0 or ground.max() >= k):
+        raise InputError(f"ground names block {ground.max()}; there are {k} blocks")
+    graph = _block_graph(problem)
+    level = np.full(k, -1, np.int32)
+    front = np.unique(ground)
+    depth = 0
+    while len(front):
+        level[front] = depth
+        depth += 1
+        reached = np.unique(graph[front].indices)
+        front = reached[level[reached] < 0]
+    level[level < 0] = depth
+    return level
+
+
+def colors(problem: Problem) -> IntArray:
+    """Colour (k,) of each block, greedy in the given order; one colour shares no moving body (rows) and no entry of A."""
+    if problem.rows is not None:
+        return kernels.body_colors(_block_bodies(problem), problem.rows.n_bodies)
+    graph = _block_graph(problem)
+    k = problem.n_blocks
+    return kernels.graph_colors(
+        np.arange(k + 1, dtype=np.int32), np.arange(k, dtype=np.int32), graph.indptr.astype(np.int32), graph.indices.astype(np.int32)
+    )
+
+
+def _block_graph(problem: Problem) -> sp.csr_array:
+    # Blocks that meet in A, as a symmetric pattern without the diagonal.
+    a = problem.csr
+    block_of = np.repeat(np.arange(problem.n_blocks), np.diff(problem.cones.ptr))
+    i = np.repeat(block_of, np.diff(a.indptr))
+    j = block_of[a.indices]
+    keep = i != j
+    i, j = i[keep], j[keep]
+    ones = np.ones(2 * len(i), np.int8)
+    k = problem.n_blocks
+    graph = sp.csr_array((ones, (np.concatenate([i, j]), np.concatenate([j, i]))), shape=(k, k))
+    graph.sum_duplicates()
+    return graph

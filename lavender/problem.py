@@ -1,0 +1,574 @@
+"""The constraint problem of one step: w = A lambda - b, and what bounds lambda.
+
+    A = J M^-1 J^T + diag(compliance)  [1/kg],   b = target - J v*  [m/s],   w = A lambda - b  [m/s]
+
+`Rows` holds J and M^-1 factored; `Problem` holds either rows or a matrix, never both, and derives the
+rest on first use.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import scipy.sparse as sp
+
+from lavender._arrays import FloatArray, IntArray, as_array, check_not_negative, equal, read_only
+from lavender.cones import CONTACT_SPIN, ROW, Cones
+from lavender.errors import CapabilityError, InputError
+from lavender_ext import judge, problem as kernels
+
+__all__ = ["LAWS", "Problem", "Rows", "VelocityForm"]
+
+FRICTION = ("coulomb", "cone")
+# A solver that takes a law takes every law before it that it contains: linear < lcp < coulomb | cone.
+LAWS = ("linear", "lcp", "coulomb", "cone")
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """J and M^-1 in the layout that sweeps want: joint rows dense, contacts compact.
+
+    Row of a contact from body a to body b (n normal, t1, t2 = n x t1 tangents, arms from the centres):
+    n.u, t.u with u = v_b + omega_b x arm_b - v_a - omega_a x arm_a, and n.(omega_b - omega_a) for spin.
+    Body -1 is static. Joints come first.
+
+    Raises
+    ------
+    InputError
+        Shapes that do not fit, a body that does not exist, a row between a body and itself, negative
+        inverse mass, a normal or tangent that is not a unit vector or not orthogonal.
+    """
+
+    inv_mass: FloatArray  # (n,) 1/kg
+    inv_inertia: FloatArray  # (n, 3, 3) 1/(kg m^2), world axes, symmetric
+    v_free: FloatArray  # (n, 6) m/s, rad/s: v*, the velocity without constraint impulses
+    jac: FloatArray = field(default_factory=lambda: np.zeros((0, 12)))  # (mj, 12) linear, angular of a, then of b
+    joint_ptr: IntArray = field(default_factory=lambda: np.zeros(1, np.int32))  # (kj + 1,) first row of each joint
+    joint_body: IntArray = field(default_factory=lambda: np.zeros((0, 2), np.int32))  # (kj, 2)
+    normal: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))  # (c, 3) unit, from a to b
+    tangent: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))  # (c, 3) unit, orthogonal to normal
+    arm_a: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))  # (c, 3) m
+    arm_b: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))  # (c, 3) m
+    contact_body: IntArray = field(default_factory=lambda: np.zeros((0, 2), np.int32))  # (c, 2)
+    copy: bool = field(default=True, repr=False)  # False: adopt arrays that fit, and mark them read-only
+
+    def __post_init__(self) -> None:
+        n = np.shape(self.inv_mass)[0] if np.ndim(self.inv_mass) == 1 else None
+        c = np.shape(self.normal)[0] if np.ndim(self.normal) == 2 else None
+        ptr = as_array("joint_ptr", self.joint_ptr, (None,), dtype=np.int32, copy=self.copy)
+        if len(ptr) == 0 or ptr[0] != 0 or np.any(np.diff(ptr) <= 0):
+            raise InputError("joint_ptr must start with 0 and increase: the first row of each joint, then the number of joint rows")
+        shapes: dict[str, tuple[int | None, ...]] = {
+            "inv_mass": (n,), "inv_inertia": (n, 3, 3), "v_free": (n, 6), "jac": (int(ptr[-1]), 12), "normal": (c, 3),
+            "tangent": (c, 3), "arm_a": (c, 3), "arm_b": (c, 3),
+        }  # fmt: skip
+        object.__setattr__(self, "joint_ptr", ptr)
+        for name, shape in shapes.items():
+            object.__setattr__(self, name, as_array(name, getattr(self, name), shape, copy=self.copy))
+        for name, shape in (("joint_body", (len(ptr) - 1, 2)), ("contact_body", (c, 2))):
+            body = as_array(name, getattr(self, name), shape, dtype=np.int32, copy=self.copy)
+            object.__setattr__(self, name, body)
+            if body.size and (body.min() < -1 or body.max() >= len(self.inv_mass)):
+                raise InputError(f"{name} names body {body.max() if body.max() >= len(self.inv_mass) else body.min()}; there are {len(self.inv_mass)} bodies, and -1 is static")
+            same = np.flatnonzero((body[:, 0] == body[:, 1]) & (body[:, 0] >= 0))
+            if len(same):
+                raise InputError(f"{name}[{same[0]}] joins body {body[same[0], 0]} to itself")
+        check_not_negative("inv_mass", self.inv_mass)
+        if self.n_contacts:
+            # 1e-9: far above rounding of a normalised vector, far below anything meant otherwise.
+            off = np.abs(np.stack([
+                np.einsum("ij,ij->i", self.normal, self.normal) - 1.0,
+                np.einsum("ij,ij->i", self.tangent, self.tangent) - 1.0,
+                np.einsum("ij,ij->i", self.normal, self.tangent),
+            ])).max(axis=0)  # fmt: skip
+            if off.max() > 1e-9:
+                i = int(np.argmax(off))
+                raise InputError(f"contact {i}: normal {self.normal[i]} and tangent {self.tangent[i]} must be orthogonal unit vectors")
+
+    @property
+    def n_bodies(self) -> int:
+        return len(self.inv_mass)
+
+    @property
+    def n_joints(self) -> int:
+        return len(self.joint_body)
+
+    @property
+    def n_contacts(self) -> int:
+        return len(self.contact_body)
+
+    def jacobian(self, cones: Cones) -> sp.csr_array:
+        """J as CSR (m, 6 n); the columns of body i are 6 i .. 6 i + 5, linear then angular."""
+        tangents, spin = cones.n_tangents[self.n_joints :], cones.kind[self.n_joints :] == CONTACT_SPIN
+        first = cones.ptr[self.n_joints : -1]
+        m = cones.n_rows
+        dense = np.zeros((m, 12))
+        body = np.empty((m, 2), np.int64)
+        mj = len(self.jac)
+        dense[:mj] = self.jac
+        body[:mj] = np.repeat(self.joint_body, np.diff(self.joint_ptr), axis=0)
+        body[mj:] = np.repeat(self.contact_body, np.diff(cones.ptr[self.n_joints :]), axis=0)
+        t2 = np.cross(self.normal, self.tangent)
+        for axis, row in ((self.normal, 0), (self.tangent, 1), (t2, 2)):
+            has = np.flatnonzero(tangents >= row)
+            dense[first[has] + row] = np.hstack([
+                -axis[has], -np.cross(self.arm_a[has], axis[has]), axis[has], np.cross(self.arm_b[has], axis[has])
+            ])  # fmt: skip
+        last = cones.ptr[self.n_joints + 1 :][spin] - 1
+        dense[last] = 0.0
+        dense[last, 3:6], dense[last, 9:12] = -self.normal[spin], self.normal[spin]
+        keep = np.repeat(body >= 0, 6, axis=1) & (dense != 0.0)
+        columns = (6 * body[:, [0, 1], None] + np.arange(6)).reshape(m, 12)
+        indptr = np.concatenate([[0], np.cumsum(keep.sum(axis=1))])
+        jac = sp.csr_array((dense[keep], columns[keep], indptr), shape=(m, 6 * self.n_bodies))
+        jac.sort_indices()
+        return jac
+
+    def inverse_mass_matrix(self) -> sp.csr_array:
+        """M^-1 as CSR (6 n, 6 n)."""
+        n = self.n_bodies
+        diagonal = np.repeat(np.arange(n) * 6, 3) + np.tile(np.arange(3), n)
+        block = np.repeat(np.arange(n) * 6 + 3, 9)
+        i = np.concatenate([diagonal, block + np.tile(np.repeat(np.arange(3), 3), n)])
+        j = np.concatenate([diagonal, block + np.tile(np.arange(3), 3 * n)])
+        x = np.concatenate([np.repeat(self.inv_mass, 3), self.inv_inertia.ravel()])
+        return sp.csr_array((x, (i, j)), shape=(6 * n, 6 * n))
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Rows):
+            return NotImplemented
+        return all(equal(getattr(self, f.name), getattr(other, f.name)) for f in fields(self) if f.name != "copy")
+
+    __hash__ = None  # type: ignore[assignment]
+
+
+@dataclass(frozen=True)
+class VelocityForm:
+    """min 1/2 |y|^2 + 1/2 z^T diag(theta) z over y [sqrt J], z = scaled impulse, in the metric of d.
+
+        K y + diag(theta) z - g  is complementary to  z,     y = K^T z,
+        K = D^-1/2 J M^-1/2,  theta = compliance / d,  g = D^-1/2 b,  lambda = D^-1/2 z
+
+    so that K K^T + diag(theta) = D^-1/2 A D^-1/2 and y is the mass-scaled change of velocity M^1/2 (v - v*).
+    """
+
+    jacobian: sp.csr_array  # K (m, 6 n), unit rows
+    rhs: FloatArray  # g (m,) sqrt J
+    theta: FloatArray  # (m,) -
+    scale: FloatArray  # D^-1/2 (m,) sqrt kg
+
+    def impulse(self, multiplier: FloatArray) -> FloatArray:
+        """lambda (m,) [N s] of a multiplier z (m,) [sqrt J]."""
+        return self.scale * multiplier
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """Find lambda (m,) [N s] with w = A lambda - b [m/s] complementary to it on every block.
+
+    Parameters
+    ----------
+    b : (m,) m/s
+        target - J v*: the relative velocity that the impulses must make up for.
+    cones : Cones
+        Blocks and bounds.
+    matrix : (m, m) array or sparse, 1/kg
+        A, kept exactly as given (asymmetric, indefinite and singular are legal); or
+    rows : Rows
+        J and M^-1; A is then J M^-1 J^T + diag(compliance) and is formed only on request.
+    friction : {"coulomb", "cone"}
+        Exact Coulomb friction (non-associated), or its convex relaxation.
+    compliance : (m,) 1/kg, only with `rows`
+        Softness of each row, >= 0.
+    guess : (m,) N s, optional
+        Warm start that travels with the problem.
+    key : (k,) uint64, optional
+        Identity of each block across steps.
+    names : sequence of str (k,), optional
+        Names of blocks, e.g. "hinge 7"; see `row_name`.
+    name : str
+    copy : bool
+        False adopts arrays that already fit, marking them read-only.
+
+    Raises
+    ------
+    InputError
+        Wrong shapes, NaN or infinity, both or neither of matrix and rows, nnz >= 2^31.
+    """
+
+    b: FloatArray
+    cones: Cones
+    matrix: Any = None
+    rows: Rows | None = None
+    friction: str = "coulomb"
+    compliance: FloatArray | None = None
+    guess: FloatArray | None = None
+    key: Any = None
+    names: Sequence[str] | None = None
+    name: str = ""
+    copy: bool = field(default=True, repr=False)
+
+    def __post_init__(self) -> None:
+        put = object.__setattr__
+        if not isinstance(self.cones, Cones):
+            raise InputError(f"cones is a {type(self.cones).__name__}; a Cones is needed (Cones.bounded, Cones.contacts)")
+        m, k = self.cones.n_rows, self.cones.n_blocks
+        put(self, "b", as_array("b", self.b, (m,), unit="m/s", copy=self.copy))
+        if (self.matrix is None) == (self.rows is None):
+            raise InputError("give either matrix= or rows=, one of them")
+        if self.friction not in FRICTION:
+            raise InputError(f"friction is {self.friction!r}; 'coulomb' or 'cone' is needed")
+        if self.rows is not None:
+            self._check_rows(self.rows, m, k)
+        else:
+            put(self, "matrix", _checked_matrix(self.matrix, m, self.copy))
+            if self.compliance is not None:
+                raise InputError("compliance goes with rows; in a matrix it is already on the diagonal of A")
+        if self.guess is not None:
+            put(self, "guess", as_array("guess", self.guess, (m,), unit="N s", copy=self.copy))
+        if self.key is not None:
+            key = np.asarray(self.key)
+            if key.shape != (k,) or key.dtype.kind not in "ui" or (key.dtype.kind == "i" and key.size and key.min() < 0):
+                raise InputError(f"key has shape {key.shape} and dtype {key.dtype}; ({k},) unsigned 64-bit is needed")
+            put(self, "key", read_only(key.astype(np.uint64)))
+        if self.names is not None:
+            names = tuple(map(str, self.names))
+            if len(names) != k:
+                raise InputError(f"{len(names)} names for {k} blocks; one for each block is needed")
+            put(self, "names", names)
+        put(self, "name", str(self.name))
+
+    def _check_rows(self, rows: Rows, m: int, k: int) -> None:
+        put = object.__setattr__
+        if not isinstance(rows, Rows):
+            raise InputError(f"rows is a {type(rows).__name__}; a Rows is needed")
+        kj = rows.n_joints
+        kind = self.cones.kind
+        if kj + rows.n_contacts != k or np.any(kind[:kj] != ROW) or np.any(kind[kj:] == ROW):
+            raise InputError(f"rows has {kj} joints and {rows.n_contacts} contacts; cones must have as many ROW blocks, then contacts (it has {k} blocks)")
+        if not np.array_equal(self.cones.ptr[: kj + 1], rows.joint_ptr):
+            raise InputError("cones.ptr and rows.joint_ptr disagree about the rows of the joints")
+        compliance = np.zeros(m) if self.compliance is None else self.compliance
+        put(self, "compliance", as_array("compliance", compliance, (m,), unit="1/kg", copy=self.copy))
+        check_not_negative("compliance", self.compliance)  # type: ignore[arg-type]
+
+    # -- constructors ---------------------------------------------------------------------------
+
+    @classmethod
+    def linear(cls, A: Any, b: Any, **more: Any) -> Problem:
+        """A lambda = b: every row unbounded. A (m, m) [1/kg], b (m,) [m/s]."""
+        b = as_array("b", b, (None,), unit="m/s")
+        return cls(b, Cones.free(len(b)), A, **more)
+
+    @classmethod
+    def lcp(cls, A: Any, b: Any, lower: Any = 0.0, upper: Any = np.inf, **more: Any) -> Problem:
+        """Boxed LCP: lower <= lambda <= upper complementary to w = A lambda - b; bounds scalar or (m,) [N s]."""
+        b = as_array("b", b, (None,), unit="m/s")
+        bounds = [as_array(n, x, (len(b),), finite=False, unit="N s") for n, x in (("lower", lower), ("upper", upper))]
+        return cls(b, Cones.bounded(*bounds), A, **more)
+
+    @classmethod
+    def contact(cls, A: Any, b: Any, mu: Any, patch_radius: Any = None, **more: Any) -> Problem:
+        """Contacts only, mu (k,); m / k rows each: normal, 0 to 2 tangents, and spin if `patch_radius` (k,) [m] is given."""
+        b = as_array("b", b, (None,), unit="m/s")
+        mu = as_array("mu", np.atleast_1d(np.asarray(mu)), (None,))
+        if (len(mu) == 0) != (len(b) == 0) or (len(mu) and len(b) % len(mu)):
+            raise InputError(f"b has {len(b)} rows for {len(mu)} values of mu; the same number of rows for each contact is needed")
+        tangents = len(b) // len(mu) - 1 - (patch_radius is not None) if len(mu) else 0
+        if not 0 <= tangents <= 2:
+            raise InputError(f"{len(b)} rows for {len(mu)} contacts; a contact has a normal, up to two tangents, and spin with patch_radius")
+        if patch_radius is not None:
+            patch_radius = as_array("patch_radius", patch_radius, (len(mu),), unit="m")
+        return cls(b, Cones.contacts(mu, tangents, patch_radius), A, **more)
+
+    @classmethod
+    def from_rows(
+        cls,
+        rows: Rows,
+        target: Any = 0.0,
+        *,
+        lower: Any = -np.inf,
+        upper: Any = np.inf,
+        mu: Any = 0.0,
+        tangents: Any = 0,
+        patch_radius: Any = None,
+        **more: Any,
+    ) -> Problem:
+        """Problem of a step from factored rows: b = target - J v*.
+
+        Parameters
+        ----------
+        rows : Rows
+        target : scalar or (m,) m/s
+            Wanted relative velocity after the step: 0 holds, -depth/dt pushes out, -e v_n bounces.
+        lower, upper : scalar or (mj,) N s
+            Bounds of the joint rows.
+        mu : scalar or (c,)
+        tangents : int or (c,)
+            Tangent rows of each contact, 0 to 2.
+        patch_radius : scalar or (c,) m, optional
+            Gives each contact a spin row.
+        """
+        if not isinstance(rows, Rows):
+            raise InputError(f"rows is a {type(rows).__name__}; a Rows is needed")
+        kj, c, mj = rows.n_joints, rows.n_contacts, len(rows.jac)
+        tangents = as_array("tangents", tangents, (c,), dtype=np.int32)
+        if c and (tangents.min() < 0 or tangents.max() > 2):
+            raise InputError("tangents must be 0, 1 or 2 for each contact")
+        spin = patch_radius is not None
+        ptr = np.concatenate([rows.joint_ptr, mj + np.cumsum(1 + tangents + spin)]).astype(np.int32)
+        kind = np.repeat(np.array([ROW, 1 + spin], np.int32), [kj, c])
+        m = int(ptr[-1])
+        low, high = np.full(m, -np.inf), np.full(m, np.inf)
+        low[:mj] = as_array("lower", lower, (mj,), finite=False, unit="N s")
+        high[:mj] = as_array("upper", upper, (mj,), finite=False, unit="N s")
+        both = np.zeros((2, kj + c))
+        both[0, kj:] = as_array("mu", mu, (c,))
+        both[1, kj:] = 0.0 if patch_radius is None else as_array("patch_radius", patch_radius, (c,), unit="m")
+        cones = Cones(ptr, kind, low, high, both[0], both[1])
+        target = as_array("target", target, (m,), unit="m/s")
+        jv = np.zeros(m + 1)
+        # b = target - J v*: the slack kernel with lambda = 0 and v = v* gives J v* - 0.
+        blank = cls(np.zeros(m), cones, rows=rows, **more)
+        kernels.rows_velocity(blank.data, np.ascontiguousarray(rows.v_free), jv)
+        return replace(blank, b=target - jv[:m], copy=False)
+
+    # -- size and kind --------------------------------------------------------------------------
+
+    @property
+    def m(self) -> int:
+        """Number of rows."""
+        return len(self.b)
+
+    @property
+    def n_blocks(self) -> int:
+        return self.cones.n_blocks
+
+    @cached_property
+    def law(self) -> str:
+        """Problem class, from what the blocks hold: "linear", "lcp", "coulomb" or "cone"."""
+        if self.cones.is_free:
+            return "linear"
+        return "lcp" if self.cones.is_bounded_rows else self.friction
+
+    @cached_property
+    def asymmetry(self) -> float:
+        """max |A - A^T| / max |A|; exactly 0 with rows."""
+        if self.rows is not None or self.m == 0:
+            return 0.0
+        a = self.csr
+        big = np.abs(a.data).max(initial=0.0)
+        gap = (a - a.T).tocsr()
+        return float(np.abs(gap.data).max(initial=0.0) / big) if big > 0 else 0.0
+
+    @property
+    def is_symmetric(self) -> bool:
+        """A = A^T up to rounding of its entries (1e-14 of the largest)."""
+        return self.asymmetry <= 1e-14
+
+    # -- derived, computed once ------------------------------------------------------------------
+
+    @cached_property
+    def data(self) -> kernels.Data:
+        """What the kernels read: pointers, d, nu, sweep steps. Of the rows where there are rows."""
+        if self.rows is None:
+            return self.csr_data
+        r = self.rows
+        return self._data(
+            rows=(r.jac, r.joint_body, r.normal, r.tangent, r.arm_a, r.arm_b, r.contact_body, r.inv_mass, r.inv_inertia, self.compliance)
+        )
+
+    @cached_property
+    def csr_data(self) -> kernels.Data:
+        """The same over A in compressed rows; forms A where only rows are given."""
+        a = self.csr
+        return self._data(csr=(a.indptr, a.indices, a.data))
+
+    def _data(self, **operator: Any) -> kernels.Data:
+        c = self.cones
+        return kernels.Data(c.ptr, c.kind, c.lower, c.upper, c.mu, c.patch_radius, self.b, FRICTION.index(self.friction), **operator)
+
+    @cached_property
+    def csr(self) -> sp.csr_array:
+        """A in compressed rows (m, m), int32 indices; do not modify."""
+        if self.rows is not None:
+            return _canonical(self._assemble(), self.m)
+        if isinstance(self.matrix, np.ndarray):
+            indptr, indices, data = kernels.dense_to_csr(self.matrix)
+            return sp.csr_array((data, indices, indptr), shape=(self.m, self.m))
+        return self.matrix
+
+    def _assemble(self) -> sp.csr_array:
+        jac = self.jacobian
+        a = jac @ self.rows.inverse_mass_matrix() @ jac.T  # type: ignore[union-attr]
+        # (J M^-1 J^T) is symmetric; the mean removes what the order of additions left.
+        return sp.csr_array(0.5 * (a + a.T) + sp.diags_array(self.compliance))
+
+    @cached_property
+    def jacobian(self) -> sp.csr_array:
+        """J (m, 6 n) as CSR; only with rows.
+
+        Raises
+        ------
+        CapabilityError
+            The problem was given as a matrix.
+        """
+        if self.rows is None:
+            raise CapabilityError("this problem was given as a matrix; its Jacobian is not known (make it with Problem.from_rows)")
+        return self.rows.jacobian(self.cones)
+
+    @property
+    def d(self) -> FloatArray:
+        """(m,) 1/kg: diagonal of A with fallbacks, the judge's metric."""
+        return self.data.d
+
+    def delassus(self) -> Any:
+        """A (m, m) [1/kg]: the matrix as given, or J M^-1 J^T + diag(compliance) as CSR."""
+        return self.csr if self.matrix is None else self.matrix
+
+    def dense(self) -> FloatArray:
+        """A (m, m) [1/kg] as a new dense array."""
+        return self.matrix.copy() if isinstance(self.matrix, np.ndarray) else self.csr.toarray()
+
+    def slack(self, impulse: Any) -> FloatArray:
+        """w = A lambda - b (m,) [m/s], recomputed from the problem's data."""
+        w = np.empty(self.m)
+        judge.slack(self.data, self.impulse_array(impulse), w)
+        return w
+
+    def velocity(self, impulse: Any) -> FloatArray:
+        """v+ = v* + M^-1 J^T lambda (n, 6) [m/s, rad/s]; only with rows."""
+        if self.rows is None:
+            raise CapabilityError("this problem was given as a matrix; body velocities need rows (make it with Problem.from_rows)")
+        v = np.zeros((self.rows.n_bodies, 6))
+        judge.velocity_change(self.data, self.impulse_array(impulse), v)
+        return self.rows.v_free + v
+
+    def start(self) -> FloatArray:
+        """Pi(0) (m,) [N s]: doing nothing, clipped to the bounds; a new array."""
+        return np.clip(np.zeros(self.m), self.cones.lower, self.cones.upper)
+
+    def impulse_array(self, impulse: Any, name: str = "impulse") -> FloatArray:
+        """A writable private copy of `impulse`, checked: (m,) [N s], finite."""
+        return as_array(name, impulse, (self.m,), unit="N s").copy()
+
+    # -- names -----------------------------------------------------------------------------------
+
+    def block_of(self, row: int) -> int:
+        """Block that holds a row."""
+        return int(np.searchsorted(self.cones.ptr, row, side="right")) - 1
+
+    def row_name(self, row: int) -> str:
+        """Name of a row, e.g. "hinge 7, axis 2" or "contact 3, tangent 1".
+
+        Raises
+        ------
+        InputError
+            No such row.
+        """
+        if not 0 <= row < self.m:
+            raise InputError(f"row {row} of a problem of {self.m} rows")
+        i = self.block_of(row)
+        offset, size, kind = row - int(self.cones.ptr[i]), int(np.diff(self.cones.ptr)[i]), self.cones.kind[i]
+        if kind == ROW:
+            name = self.names[i] if self.names else f"row {row}" if size == 1 else f"joint {i}"
+            return name if size == 1 else f"{name}, axis {offset}"
+        first_contact = 0 if self.rows is None else self.rows.n_joints
+        name = self.names[i] if self.names else f"contact {i - first_contact}"
+        if offset == 0:
+            return f"{name}, normal"
+        return f"{name}, spin" if kind == CONTACT_SPIN and offset == size - 1 else f"{name}, tangent {offset}"
+
+    # -- other forms -----------------------------------------------------------------------------
+
+    def relaxed(self, friction: str = "cone") -> Problem:
+        """The same problem under another friction law: "cone" is the convex relaxation."""
+        return replace(self, friction=friction, copy=False)
+
+    def boxed(self, normal_impulse: Any) -> Problem:
+        """Friction bounded by fixed normals: |lambda_t| <= mu N on each tangent alone (a square, not the disk).
+
+        Parameters
+        ----------
+        normal_impulse : scalar or (c,) N s
+            N of each contact, in block order.
+        """
+        c = self.cones
+        contact = np.flatnonzero(c.kind != ROW)
+        n = as_array("normal_impulse", normal_impulse, (len(contact),), unit="N s")
+        check_not_negative("normal_impulse", n)
+        lower, upper = c.lower.copy(), c.upper.copy()
+        for i, load in zip(contact, n, strict=True):
+            j, end = c.ptr[i], c.ptr[i + 1]
+            bound = np.full(end - j, c.mu[i] * load)
+            if c.kind[i] == CONTACT_SPIN:
+                bound[-1] *= c.patch_radius[i]
+            lower[j + 1 : end], upper[j + 1 : end] = -bound[1:], bound[1:]
+            upper[j] = np.inf
+        names = None if self.names is None else [self.row_name(i) for i in range(self.m)]
+        return Problem(self.b, Cones.bounded(lower, upper), self.csr, guess=self.guess, names=names, name=self.name, copy=False)
+
+    def velocity_form(self) -> VelocityForm:
+        """The mass-scaled velocity form (see `VelocityForm`); only with rows.
+
+        Raises
+        ------
+        CapabilityError
+            The problem was given as a matrix.
+        """
+        jac = self.jacobian
+        rows = self.rows
+        assert rows is not None
+        n = rows.n_bodies
+        # M^-1 = L L^T by blocks; a singular inverse inertia (a pinned axis) has a root but no Cholesky factor.
+        value, vector = np.linalg.eigh(rows.inv_inertia) if n else (np.zeros((0, 3)), np.zeros((0, 3, 3)))
+        root = vector * np.sqrt(np.maximum(value, 0.0))[:, None, :]
+        half = replace(rows, inv_mass=np.sqrt(rows.inv_mass), inv_inertia=root, copy=False).inverse_mass_matrix()
+        scale = 1.0 / np.sqrt(self.d)
+        k = sp.csr_array(sp.diags_array(scale) @ (jac @ half))
+        return VelocityForm(k, scale * self.b, self.compliance * scale**2, scale)  # type: ignore[operator]
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Problem):
+            return NotImplemented
+        if not all(
+            equal(getattr(self, n), getattr(other, n))
+            for n in ("b", "cones", "rows", "friction", "compliance", "guess", "key", "names", "name")
+        ):
+            return False
+        if sp.issparse(self.matrix) and sp.issparse(other.matrix):
+            return all(equal(getattr(self.matrix, n), getattr(other.matrix, n)) for n in ("indptr", "indices", "data"))
+        return type(self.matrix) is type(other.matrix) and equal(self.matrix, other.matrix)
+
+    __hash__ = None  # type: ignore[assignment]
+
+    def __repr__(self) -> str:
+        kind = "rows" if self.rows is not None else "CSR" if sp.issparse(self.matrix) else "dense"
+        name = f"{self.name!r}, " if self.name else ""
+        return f"<Problem {name}{self.law}, {self.m} rows in {self.n_blocks} blocks, {kind}>"
+
+
+def _checked_matrix(matrix: Any, m: int, copy: bool) -> Any:
+    if not sp.issparse(matrix):
+        return as_array("A", matrix, (m, m), unit="1/kg", copy=copy)
+    if matrix.shape != (m, m):
+        raise InputError(f"A has shape {matrix.shape}; ({m}, {m}) is needed, as b has {m} rows")
+    if matrix.nnz >= 2**31:
+        raise InputError(f"A has {matrix.nnz} nonzeros, more than 32-bit indices reach; give J and M^-1 instead (Problem.from_rows)")
+    if matrix.dtype.kind not in "buif":
+        raise InputError(f"A has dtype {matrix.dtype}; real numbers are needed")
+    given = sp.csr_array(matrix, copy=copy)
+    as_array("A", given.data, (None,), unit="1/kg", copy=False)
+    return _canonical(given, m)
+
+
+def _canonical(a: sp.csr_array, m: int) -> sp.csr_array:
+    if not a.has_canonical_format:
+        a = a.copy()
+        a.sum_duplicates()
+    parts = [read_only(np.ascontiguousarray(x, t)) for x, t in ((a.data, np.float64), (a.indices, np.int32), (a.indptr, np.int32))]
+    return sp.csr_array(tuple(parts), shape=(m, m))

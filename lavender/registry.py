@@ -1,0 +1,221 @@
+"""Solvers by name: what each can do is data, and each capability is tested on every solver.
+
+A solver is an object that holds only its options, made by `SolverSpec.factory(**options)`, with
+
+    prepare(problem) -> state         factor, colour, allocate
+    update(state, problem) -> state   the same structure with new numbers, and a fresh start
+    run(state, impulse, n, tol, time_limit) -> Claim
+        n more iterations on `impulse` (m,) in place, fewer only when its own test stops it. With
+        `resumable`, n1 then n2 iterations give the bits of n1 + n2 and time_limit is None.
+
+Third parties register through the entry point group "lavender.solvers" (an object that is a
+`SolverSpec`, or a function that returns one) or with `register`.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import warnings
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import cache
+from importlib.metadata import entry_points
+from typing import Any, Protocol
+
+from lavender._arrays import FloatArray
+from lavender.errors import InputError, SolverUnavailable, UnknownName
+from lavender.problem import LAWS, Problem
+from lavender.solution import Claim
+
+__all__ = ["Solver", "SolverSpec", "available", "get", "known", "register"]
+
+OPERATORS = ("rows", "matrix", "either")
+
+
+class Solver(Protocol):
+    """What a factory returns; see the module."""
+
+    def prepare(self, problem: Problem) -> Any: ...
+    def update(self, state: Any, problem: Problem) -> Any: ...
+    def run(self, state: Any, impulse: FloatArray, n: int, tol: float, time_limit: float | None) -> Claim: ...
+
+
+@dataclass(frozen=True)
+class SolverSpec:
+    """One solver: its name, where its code is, and what it can do.
+
+    Raises
+    ------
+    InputError
+        A law or operator that does not exist, an empty name.
+    """
+
+    name: str
+    factory: str | Callable[..., Solver]  # "module:attribute" is imported at first use
+    laws: frozenset[str]  # of LAWS: "linear", "lcp", "coulomb", "cone"
+    summary: str
+    reference: str = ""  # paper or manual
+    operator: str = "either"  # what it reads: "rows", "matrix" (formed from rows where needed) or "either"
+    exact: bool = False  # finite or to rounding, not to tol
+    resumable: bool = True
+    impulse: bool = True  # a warm start changes what it does
+    order: bool = False  # takes order= and ground=
+    seed: bool = False  # takes seed=
+    threads: bool = False  # takes threads=
+    callback: bool = True  # takes callback=; needs resumable
+    history: bool = True  # records history; needs resumable
+    delegates: bool = False  # may hand over to other solvers: only "auto"
+    max_iter: int = 1000  # default budget
+    options: Mapping[str, str] = field(default_factory=dict)  # own options: name -> one line
+    requires: tuple[str, ...] = ()  # modules that must be importable
+    install: str = ""  # what to install where they are not
+    refusal: Callable[[Problem], str | None] | None = None  # more reasons against a problem
+
+    def __post_init__(self) -> None:
+        if not self.name or not set(self.laws) <= set(LAWS) or not self.laws or self.operator not in OPERATORS:
+            raise InputError(f"solver {self.name!r}: laws {sorted(self.laws)} must be of {LAWS}, operator {self.operator!r} of {OPERATORS}")
+        object.__setattr__(self, "laws", frozenset(self.laws))
+        if not self.resumable:
+            object.__setattr__(self, "callback", False)
+            object.__setattr__(self, "history", False)
+
+    @property
+    def accepts(self) -> frozenset[str]:
+        """Options beyond those of the front door."""
+        shared = {"order": ("order", "ground"), "seed": ("seed",), "threads": ("threads",)}
+        return frozenset(self.options) | {o for flag, names in shared.items() if getattr(self, flag) for o in names}
+
+    def missing(self) -> str | None:
+        """None when the solver can run here, else what to install."""
+        absent = [m for m in self.requires if not _importable(m)]
+        if not absent:
+            return None
+        return f"needs {', '.join(absent)}: pip install {self.install or ' '.join(absent)}"
+
+    def refuses(self, problem: Problem) -> str | None:
+        """None when the solver takes this problem, else the reason."""
+        if problem.law not in self.laws:
+            takes = ", ".join(law for law in LAWS if law in self.laws)
+            return f"takes laws {takes}, not {problem.law!r}{_way_round(problem.law, self.laws)}"
+        if self.operator == "rows" and problem.rows is None:
+            return "needs a problem with rows (Problem.from_rows); this one was given as a matrix"
+        return self.refusal(problem) if self.refusal is not None else None
+
+    def load(self) -> Callable[..., Solver]:
+        if not isinstance(self.factory, str):
+            return self.factory
+        module, _, attribute = self.factory.partition(":")
+        return getattr(importlib.import_module(module), attribute)
+
+
+def _way_round(law: str, laws: frozenset[str]) -> str:
+    if law == "coulomb" and "cone" in laws:
+        return ": pass problem.relaxed('cone'), or use a solver for Coulomb friction"
+    if law in ("coulomb", "cone") and "lcp" in laws:
+        return ": pass problem.boxed(normal_impulse), or use a solver for friction"
+    if law == "cone" and "coulomb" in laws:
+        return ": pass problem.relaxed('coulomb')"
+    return ""
+
+
+@cache
+def _importable(module: str) -> bool:
+    try:
+        return importlib.util.find_spec(module) is not None
+    except (ImportError, ValueError):
+        return False
+
+
+_registered: dict[str, SolverSpec] = {}
+
+
+@cache
+def _load_builtin_and_plugins() -> None:
+    from lavender.solvers import SPECS  # the table imports this module
+
+    for spec in SPECS:
+        _registered.setdefault(spec.name, spec)
+    for entry in entry_points(group="lavender.solvers"):
+        try:
+            spec = entry.load()
+            spec = spec if isinstance(spec, SolverSpec) else spec()
+            register(spec)
+        except Exception as error:  # a plug-in may fail in any way; it must not take lavender with it
+            warnings.warn(f"solver plug-in {entry.name!r} ({entry.value}) was left out: {error}", stacklevel=3)
+
+
+def register(spec: SolverSpec, *, replace: bool = False) -> None:
+    """Add a solver; `replace=True` to put it in the place of one of the same name.
+
+    Raises
+    ------
+    InputError
+        Not a SolverSpec, or the name is taken.
+    """
+    if not isinstance(spec, SolverSpec):
+        raise InputError(f"register needs a SolverSpec, not a {type(spec).__name__}")
+    _load_builtin_and_plugins() if spec.name not in _registered else None
+    if spec.name in _registered and not replace:
+        raise InputError(f"a solver named {spec.name!r} is registered already; pass replace=True to take its place")
+    _registered[spec.name] = spec
+
+
+def specs() -> dict[str, SolverSpec]:
+    """Every registered solver by name, installed or not."""
+    _load_builtin_and_plugins()
+    return dict(_registered)
+
+
+def get(name: str) -> SolverSpec:
+    """The solver of that name, ready to run.
+
+    Raises
+    ------
+    UnknownName
+        No such solver; the nearest names are listed.
+    SolverUnavailable
+        Its package is not installed; the message says what to install.
+    """
+    table = specs()
+    if name not in table:
+        raise UnknownName("solver", name, table)
+    reason = table[name].missing()
+    if reason:
+        raise SolverUnavailable(f"solver {name!r} {reason}")
+    return table[name]
+
+
+def known(problem: Problem | None = None) -> dict[str, str | None]:
+    """Every solver: None where it can be used here (and takes `problem`), else the reason it cannot."""
+    return {
+        name: spec.missing() or (spec.refuses(problem) if problem is not None else None) for name, spec in sorted(specs().items())
+    }
+
+
+def available(problem: Problem | None = None, *, law: str | None = None, **capabilities: bool) -> list[str]:
+    """Names of solvers installed here that take `problem`, a law, and have the capabilities.
+
+    >>> from lavender.registry import available
+    >>> "pgs" in available(law="lcp", order=True)
+    True
+
+    Raises
+    ------
+    InputError
+        A capability that no spec has.
+    """
+    flags = {n for n, f in SolverSpec.__dataclass_fields__.items() if f.type == "bool"}
+    for name in capabilities:
+        if name not in flags:
+            raise InputError(f"unknown capability {name!r}; known: {', '.join(sorted(flags))}")
+    if law is not None and law not in LAWS:
+        raise UnknownName("law", law, LAWS)
+    table = specs()
+    return [
+        name
+        for name, reason in known(problem).items()
+        if reason is None
+        and (law is None or law in table[name].laws)
+        and all(bool(getattr(table[name], c)) == bool(v) for c, v in capabilities.items())
+    ]

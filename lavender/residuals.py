@@ -1,0 +1,298 @@
+"""The one judge: how wrong an impulse is, in units, row by row. No solver decides success.
+
+With w = A lambda - b recomputed from the problem's data, d = diag(A) (`Problem.d`), e the error of a
+block (an inactive row: w / d, the step that is missing; formulas in `lavender_ext/block.pxd`):
+
+    energy    E = sqrt(sum d e^2)                    [sqrt J]
+    velocity  V = max sqrt(nu d) |e|                 [m/s]
+    relative  max(E / E0, V / V0)                    [-]     E0, V0: E, V of doing nothing, lambda = Pi(0)
+    floor     2^-53 (|A| |lambda| + |b|) put through the same two norms: what rounding lambda to
+              float64 costs; no solver can promise less than about twice that
+    success   relative <= tol
+
+Where doing nothing already solves the problem to rounding (E0 <= 2^-48 of the energy norm of b), the
+norms of b stand in for E0 and V0. E sees heavy bodies, V sees light ones.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from lavender._arrays import FloatArray
+from lavender.cones import ROW
+from lavender.errors import InputError
+from lavender.problem import Problem
+from lavender_ext import judge as kernels
+
+__all__ = ["Residual", "check_certificate", "natural_map", "qp_residual", "residual", "siconos_error"]
+
+
+@dataclass(frozen=True)
+class Residual:
+    """Error of one impulse. `str()` is one line."""
+
+    relative: float  # -, max(energy / energy_start, velocity / velocity_start)
+    energy: float  # sqrt J
+    velocity: float  # m/s, of the worst row
+    floor: float  # -, relative residual that float64 alone costs
+    worst_row: int  # row of the largest velocity error, -1 for an empty problem
+    worst_name: str  # its name, e.g. "contact 3, tangent 1"
+    energy_start: float  # sqrt J, E of doing nothing (or the norm of b)
+    velocity_start: float  # m/s
+    error: FloatArray = field(repr=False)  # (m,) N s, e
+    slack: FloatArray = field(repr=False)  # (m,) m/s, w
+    _weight: FloatArray = field(repr=False)  # (m,) 1/kg, sqrt(nu d)
+
+    @property
+    def velocity_by_row(self) -> FloatArray:
+        """sqrt(nu d) |e| (m,) [m/s]; each tangent of a pair alone."""
+        return self._weight * np.abs(self.error)
+
+    def __str__(self) -> str:
+        worst = f", worst {self.worst_name} {self.velocity:.2g} m/s" if self.worst_row >= 0 else ""
+        return f"relative {self.relative:.2e}, energy {self.energy:.2e} sqrt(J){worst}, floor {self.floor:.1e}"
+
+
+def _ratio(x: float, reference: float) -> float:
+    if x == 0.0:
+        return 0.0
+    if not np.isfinite(x):
+        return np.inf
+    return x / reference if reference > 0.0 else np.inf
+
+
+def reference(problem: Problem) -> tuple[float, float]:
+    """E0 [sqrt J] and V0 [m/s]; computed once per problem."""
+    data = problem.data
+    if data.start_energy < 0.0:
+        m = problem.m
+        w, e = np.empty(m), np.empty(m)
+        energy, velocity, *_ = kernels.judge(data, problem.start(), w, e, False)
+        # The norms of b: sqrt(sum b^2 / d), max |b| sqrt(nu / d). Scaled, so that 1e-200 does not vanish.
+        x = np.abs(problem.b) / np.sqrt(data.d)
+        big = x.max(initial=0.0)
+        rhs_energy = big * float(np.sqrt(np.sum((x / big) ** 2))) if big > 0.0 else 0.0
+        if energy <= 2.0**-48 * rhs_energy:
+            energy, velocity = rhs_energy, float((x * np.sqrt(data.nu)).max(initial=0.0))
+        data.set_start(energy, velocity)
+    return data.start_energy, data.start_velocity
+
+
+def quick(problem: Problem, impulse: FloatArray, w: FloatArray, e: FloatArray, floor: bool = False) -> tuple[float, float]:
+    """(relative, floor) with w, e as scratch (m,): the solvers' own stopping test, the judge's arithmetic."""
+    start_energy, start_velocity = reference(problem)
+    energy, velocity, _, floor_energy, floor_velocity, finite = kernels.judge(problem.data, impulse, w, e, floor)
+    if not finite:
+        return np.inf, 0.0
+    return (
+        max(_ratio(energy, start_energy), _ratio(velocity, start_velocity)),
+        max(_ratio(floor_energy, start_energy), _ratio(floor_velocity, start_velocity)),
+    )
+
+
+def residual(problem: Problem, impulse: Any) -> Residual:
+    """Judge an impulse (m,) [N s].
+
+    Non-finite entries are allowed here and give an infinite relative residual.
+
+    Raises
+    ------
+    InputError
+        `impulse` has the wrong length.
+    """
+    impulse = np.ascontiguousarray(impulse, float)
+    if impulse.shape != (problem.m,):
+        raise InputError(f"impulse has shape {impulse.shape}; ({problem.m},) is needed")
+    w, e = np.empty(problem.m), np.empty(problem.m)
+    start_energy, start_velocity = reference(problem)
+    data = problem.data
+    energy, velocity, worst, floor_energy, floor_velocity, finite = kernels.judge(data, impulse, w, e, True)
+    if not finite:
+        energy = velocity = np.inf
+    return Residual(
+        relative=max(_ratio(energy, start_energy), _ratio(velocity, start_velocity)),
+        energy=energy,
+        velocity=velocity,
+        floor=max(_ratio(floor_energy, start_energy), _ratio(floor_velocity, start_velocity)),
+        worst_row=worst,
+        worst_name=problem.row_name(worst) if worst >= 0 else "",
+        energy_start=start_energy,
+        velocity_start=start_velocity,
+        error=e,
+        slack=w,
+        _weight=data.weight,
+    )
+
+
+# -- other measures, on request ------------------------------------------------------------------
+
+
+def natural_map(problem: Problem, impulse: Any) -> float:
+    """The chapter's plain r_p = |lambda - Pi(lambda - w)|_2, bounded rows only [mixes N s and m/s].
+
+    Raises
+    ------
+    InputError
+        The problem has friction, where Pi needs a metric: use `residual` or `siconos_error`.
+    """
+    if problem.law not in ("linear", "lcp"):
+        raise InputError(f"natural_map is for bounded rows; this problem is {problem.law!r}: use residual or siconos_error")
+    lam = problem.impulse_array(impulse)
+    w = problem.slack(lam)
+    c = problem.cones
+    # lambda - clip(lambda - w), written so that an inactive row keeps its digits.
+    y = lam - w
+    return float(np.linalg.norm(np.where(y < c.lower, lam - c.lower, np.where(y > c.upper, lam - c.upper, w))))
+
+
+def siconos_error(problem: Problem, impulse: Any) -> dict[str, float]:
+    """The full Coulomb errors of FCLIB and Siconos (Acary, Bremond, Huber 2018), friction blocks without spin.
+
+        |F|_2,  F_i = r_i - P_K(r_i - (u_i + mu |u_T| n))   on contacts, with unit step
+
+    Returns
+    -------
+    dict
+        "absolute" = |F|; "siconos" = |F| / max(|q|, |r|, |u|); "relative" = |F| / |q|;
+        "fclib" = |F| / (1 + sqrt(|q|)). Mixes N s and m/s, and depends on the unit of mass.
+    """
+    lam = problem.impulse_array(impulse)
+    u = problem.slack(lam)
+    c = problem.cones
+    out = np.empty(problem.m)
+    for i in range(c.n_blocks):
+        s = slice(c.ptr[i], c.ptr[i + 1])
+        if c.kind[i] == ROW:
+            out[s] = lam[s] - np.clip(lam[s] - u[s], c.lower[s], c.upper[s])
+            continue
+        if c.kind[i] != 1:
+            raise InputError("siconos_error has no spin rows")
+        z = lam[s] - u[s]
+        z[0] -= c.mu[i] * np.linalg.norm(u[s][1:])
+        out[s] = lam[s] - _project_unit_cone(z, float(c.mu[i]))
+    total, q, r, v = (float(np.linalg.norm(x)) for x in (out, problem.b, lam, u))
+    big = max(q, r, v)
+    return {
+        "absolute": total,
+        "siconos": total / big if big > 0 else total,
+        "relative": total / q if q > 0 else total,
+        "fclib": total / (1.0 + np.sqrt(q)),
+    }
+
+
+def _project_unit_cone(z: FloatArray, mu: float) -> FloatArray:
+    # Euclidean projection on {|z_t| <= mu z_n}.
+    t = float(np.linalg.norm(z[1:]))
+    if t <= mu * z[0]:
+        return z
+    if mu * t <= -z[0]:
+        return np.zeros_like(z)
+    n = (z[0] + mu * t) / (1.0 + mu * mu)
+    return np.concatenate([[n], (mu * n / t) * z[1:]])
+
+
+@dataclass(frozen=True)
+class QPResidual:
+    """Optimality of a bounded-row problem as the QP min 1/2 l.A l - b.l, lower <= l <= upper."""
+
+    primal: float  # N s, largest violation of a bound
+    dual: float  # m/s, largest |A l - b + z|, z the multiplier of the bounds
+    gap: float  # J, |l.A l - b.l + z_upper.upper - z_lower.lower|
+    sign: float  # m/s, largest multiplier of the wrong sign, or on a bound that does not exist
+
+    @property
+    def worst(self) -> float:
+        return max(self.primal, self.dual, self.gap, self.sign)
+
+
+def qp_residual(problem: Problem, impulse: Any, multiplier: Any = None) -> QPResidual:
+    """Primal, dual and gap residuals with multiplier signs checked.
+
+    Parameters
+    ----------
+    impulse : (m,) N s
+    multiplier : (m,) m/s, optional
+        z with A l - b + z = 0: positive part for the upper bound, negative for the lower (the sign of
+        qpsolvers' `z_box`). Default: the slack, z = -(A l - b), where the bound is within 1e-9 of its
+        range or of |l|.
+    """
+    if problem.law not in ("linear", "lcp"):
+        raise InputError(f"qp_residual is for bounded rows; this problem is {problem.law!r}")
+    lam = problem.impulse_array(impulse)
+    w = problem.slack(lam)
+    c = problem.cones
+    scale = np.maximum(np.abs(lam).max(initial=0.0), 1e-300)
+    if multiplier is None:
+        at_low = lam - c.lower <= 1e-9 * scale
+        at_high = c.upper - lam <= 1e-9 * scale
+        z = np.where(at_low, np.minimum(-w, 0.0), 0.0) + np.where(at_high, np.maximum(-w, 0.0), 0.0)
+    else:
+        z = problem.impulse_array(multiplier, "multiplier")
+    up, down = np.maximum(z, 0.0), np.maximum(-z, 0.0)
+    bound = up @ np.where(np.isfinite(c.upper), c.upper, 0.0) - down @ np.where(np.isfinite(c.lower), c.lower, 0.0)
+    wrong = np.where(np.isfinite(c.upper), 0.0, up) + np.where(np.isfinite(c.lower), 0.0, down)
+    primal = np.maximum(np.maximum(c.lower - lam, lam - c.upper), 0.0)
+    return QPResidual(
+        float(primal.max(initial=0.0)),
+        float(np.abs(w + z).max(initial=0.0)),
+        float(abs(lam @ w + bound)),
+        float(wrong.max(initial=0.0)),
+    )
+
+
+def check_certificate(problem: Problem, y: Any) -> str | None:
+    """Does y (m,) prove that the problem has no solution? None if it does, else the reason it does not.
+
+    Free rows, or symmetric positive semidefinite A: y in the recession cone of the bounds,
+    |A y| <= 1e-10 |A| |y| row by row, b.y > 1e-10 |b|.|y|. LCP with any A: y >= 0, A^T y <= 0,
+    b.y > 0 to the same accuracy. Not asked for Coulomb friction.
+    """
+    y = np.asarray(y, float)
+    if y.shape != (problem.m,) or not np.isfinite(y).all() or not np.any(y):
+        return f"certificate of shape {y.shape} must be {problem.m} finite numbers, not all zero"
+    if problem.law == "coulomb":
+        return "certificates are not defined for Coulomb friction"
+    gain = float(problem.b @ y)
+    if not gain > 1e-10 * float(np.abs(problem.b) @ np.abs(y)):
+        return f"b.y = {gain:.2e} is not positive"
+    c = problem.cones
+    outside = _recession_violation(problem, y)
+    if outside:
+        return outside
+    a = problem.csr
+    size = abs(a) @ np.abs(y)
+    ay = a @ y
+    if np.all(np.abs(ay) <= 1e-10 * size) and (problem.is_symmetric or problem.law == "linear"):
+        # Symmetric: y is in the null space. Free rows need A^T y = 0, checked here for asymmetric A.
+        if problem.is_symmetric or np.all(np.abs(a.T @ y) <= 1e-10 * (abs(a).T @ np.abs(y))):
+            return None
+    if problem.law in ("linear", "lcp"):
+        # lambda = lower + x, x >= 0 for rows bounded below alone: w >= 0 gives 0 <= y.w = (A^T y).lambda - b.y.
+        aty, size = a.T @ y, abs(a).T @ np.abs(y)
+        free = np.isneginf(c.lower) & np.isposinf(c.upper)
+        plain = (c.lower == 0.0) & np.isposinf(c.upper)
+        if np.all(free | plain) and np.all(np.abs(aty[free]) <= 1e-10 * size[free]) and np.all(aty[plain] <= 1e-10 * size[plain]):
+            return None
+        return f"A^T y reaches {aty.max(initial=0.0):.2e}, above rounding"
+    return f"|A y| reaches {np.abs(ay).max(initial=0.0):.2e}, above rounding"
+
+
+def _recession_violation(problem: Problem, y: FloatArray) -> str | None:
+    c = problem.cones
+    bad = ((y > 0.0) & np.isfinite(c.upper)) | ((y < 0.0) & np.isfinite(c.lower))
+    contact_rows = np.repeat(c.kind != ROW, np.diff(c.ptr))
+    bad[contact_rows] = False
+    if bad.any():
+        i = int(np.flatnonzero(bad)[0])
+        return f"y[{i}] = {y[i]:.2e} leaves the bounds of {problem.row_name(i)}"
+    for i in np.flatnonzero(c.kind != ROW):
+        part = y[c.ptr[i] : c.ptr[i + 1]]
+        nt = int(c.n_tangents[i])
+        limit = c.mu[i] * part[0] * (1 + 1e-12)
+        spin = abs(part[-1]) if c.kind[i] == 2 else 0.0
+        if part[0] < 0.0 or np.linalg.norm(part[1 : 1 + nt]) > limit or spin > limit * c.patch_radius[i]:
+            return f"y leaves the cone of {problem.row_name(int(c.ptr[i]))}"
+    return None

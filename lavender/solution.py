@@ -1,0 +1,124 @@
+"""What comes back from a solve: the iterate, the solver's claim, our residual, and what it cost."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import Enum
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from lavender._arrays import FloatArray
+from lavender.errors import SolveFailed
+from lavender.residuals import Residual
+
+__all__ = ["Claim", "History", "Solution", "SolverRun", "Status"]
+
+
+class Status(str, Enum):
+    """The solver's claim; the value is its meaning in words."""
+
+    CONVERGED = "its own test at tol was met"
+    FLOOR = "above tol, within twice what rounding to float64 allows"
+    MAX_ITERATIONS = "the iteration budget was used up"
+    TIME_LIMIT = "the time limit was reached"
+    STALLED = "no progress any more"
+    DIVERGED = "the iterate grew, or is not finite"
+    INFEASIBLE = "no solution exists; `certificate` proves it"
+    NUMERICAL_ERROR = "a factorisation or the backend failed"
+    INTERRUPTED = "stopped by Ctrl-C or by the callback"
+
+    def __str__(self) -> str:
+        return self.name
+
+
+@dataclass(frozen=True)
+class Claim:
+    """What one call of a solver's `run` says of itself."""
+
+    status: Status  # MAX_ITERATIONS: exactly the n iterations asked for
+    iterations: int  # done in this call
+    work: Mapping[str, int] = field(default_factory=dict)  # of this call: sweeps, factorisations, ...
+    message: str = ""
+    form: str = ""  # which formulation ran, where there is a choice
+    dual: Any = None  # the backend's own multipliers, as it returned them
+    certificate: FloatArray | None = None  # (m,), with INFEASIBLE
+
+
+@dataclass(frozen=True)
+class History:
+    """Recorded at fixed iteration counts, never at times; arrays of one length."""
+
+    iterations: np.ndarray  # int64
+    time: FloatArray  # s, solver time alone
+    relative: FloatArray  # -
+    energy: FloatArray  # sqrt J
+    velocity: FloatArray  # m/s
+
+    def __len__(self) -> int:
+        return len(self.iterations)
+
+
+@dataclass(frozen=True)
+class SolverRun:
+    """Which solver ran, how."""
+
+    name: str
+    options: Mapping[str, Any]
+    form: str = ""
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Result of `solve`; returned for every status, with the iterate. `str()` is one line."""
+
+    impulse: FloatArray  # (m,) N s
+    residual: Residual
+    status: Status  # the solver's claim
+    tol: float  # - relative residual asked for
+    iterations: int
+    work: Mapping[str, int]  # sweeps, matvecs, factorisations, pivots, ...: what ran
+    setup_time: float  # s, preparing (factor, colour, allocate)
+    solve_time: float  # s, iterating
+    solver: SolverRun
+    message: str = ""
+    history: History | None = None
+    dual: Any = None
+    certificate: FloatArray | None = None  # (m,), with INFEASIBLE
+    contradicted: str = ""  # why the judge disagrees with `status`; empty where it does not
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "work", MappingProxyType(dict(self.work)))
+
+    @property
+    def slack(self) -> FloatArray:
+        """w = A lambda - b (m,) [m/s], recomputed by the judge."""
+        return self.residual.slack
+
+    @property
+    def success(self) -> bool:
+        """The judge's relative residual is at most `tol`."""
+        return self.residual.relative <= self.tol
+
+    def raise_for_status(self) -> Solution:
+        """Return self when the judge accepts the result (within tol, or at the floor of float64).
+
+        Raises
+        ------
+        SolveFailed
+            Otherwise, with the one-line summary.
+        """
+        if self.success or self.residual.relative <= 2.0 * self.residual.floor:
+            return self
+        raise SolveFailed(str(self))
+
+    def __str__(self) -> str:
+        work = ", ".join(f"{n} {k}" for k, n in self.work.items())
+        note = f"; {self.message}" if self.message else ""
+        wrong = f"; CONTRADICTED: {self.contradicted}" if self.contradicted else ""
+        return (
+            f"{self.solver.name}: {self.status.name}, {self.residual}, "
+            f"{work or f'{self.iterations} iterations'}, {1e3 * (self.setup_time + self.solve_time):.3g} ms{note}{wrong}"
+        )

@@ -1,0 +1,368 @@
+"""The front door: check the request, run the solver in short chunks, judge what comes back.
+
+Only this module loops over time: it reads the clock, records history, calls back, and turns Ctrl-C into
+a result. Chunks last about 25 ms and change no result, because every solver's own checks fall at fixed
+iteration counts.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from lavender._arrays import FloatArray, equal
+from lavender.cones import ROW
+from lavender.errors import CapabilityError, InputError, UnknownName
+from lavender.problem import Problem
+from lavender.registry import SolverSpec, get
+from lavender.residuals import Residual, check_certificate, residual
+from lavender.solution import Claim, History, Solution, SolverRun, Status
+
+__all__ = ["Prepared", "prepare", "solve"]
+
+CHUNK_TIME = 0.025  # s, aim; twice that is still below what a person notices on Ctrl-C
+Callback = Callable[[int, FloatArray, Residual], Any]
+FRONT_DOOR = ("impulse", "tol", "max_iter", "time_limit", "history", "callback")
+
+
+def solve(
+    problem: Problem,
+    solver: str,
+    *,
+    impulse: Any = None,
+    tol: float = 1e-6,
+    max_iter: int | None = None,
+    time_limit: float | None = None,
+    history: bool = False,
+    callback: Callback | None = None,
+    **options: Any,
+) -> Solution:
+    """Solve a constraint problem with the solver of that name.
+
+    Parameters
+    ----------
+    problem : Problem
+    solver : str
+        A registered name; `available(problem)` lists those that take the problem here.
+    impulse : (m,) N s, optional
+        Warm start. Default: `problem.guess`, else Pi(0), zero clipped to the bounds.
+    tol : float, default 1e-6
+        Relative residual asked for (see `lavender.residuals`). 0 runs exactly `max_iter` iterations.
+    max_iter : int, optional
+        Budget in the solver's own iterations (sweeps, steps, pivots); default: the spec's.
+    time_limit : float, optional, s
+        Of solving; checked between chunks.
+    history : bool
+        Record iterations, time and residual at fixed counts.
+    callback : callable (iterations, impulse, residual), optional
+        Called where history would be recorded; a true return stops the solve.
+    **options
+        `order`, `ground`, `seed`, `threads` and the solver's own, as its spec lists.
+
+    Returns
+    -------
+    Solution
+        For every status, with the iterate. Non-convergence is a result, not an exception.
+
+    Raises
+    ------
+    UnknownName
+        No such solver or option.
+    SolverUnavailable
+        The solver's package is not installed.
+    CapabilityError
+        The solver cannot take this problem or option; the message says why.
+    InputError
+        Wrong `impulse`, negative or NaN `tol`, `max_iter`, `time_limit`.
+    """
+    return prepare(problem, solver, **options).solve(
+        impulse=impulse, tol=tol, max_iter=max_iter, time_limit=time_limit, history=history, callback=callback
+    )
+
+
+def prepare(problem: Problem, solver: str, **options: Any) -> Prepared:
+    """Do the part of a solve that does not depend on the iterate: factor, colour, allocate.
+
+    The result solves this problem, or another of the same structure, as often as wanted. Raises as
+    `solve`.
+    """
+    return Prepared(problem, get(solver), options)
+
+
+class Prepared:
+    """A solver ready for a problem; `solve(problem2)` reuses what the structure allows."""
+
+    def __init__(self, problem: Problem, spec: SolverSpec, options: dict[str, Any]) -> None:
+        _check_problem(problem, spec)
+        for name in options:
+            if name not in spec.accepts:
+                if name in ("order", "ground", "seed", "threads") or name in FRONT_DOOR:
+                    raise CapabilityError(f"solver {spec.name!r} does not take {name}=; it takes: {', '.join(sorted(spec.accepts)) or 'no options'}")
+                raise UnknownName(f"option of solver {spec.name!r}", name, spec.accepts)
+        self.spec = spec
+        self.options = dict(options)
+        self.problem = problem
+        start = perf_counter()
+        self._solver = spec.load()(**options)
+        self._state = self._solver.prepare(problem)
+        self.setup_time = perf_counter() - start
+        self._fresh = True
+
+    def solve(
+        self,
+        problem: Problem | None = None,
+        *,
+        impulse: Any = None,
+        tol: float = 1e-6,
+        max_iter: int | None = None,
+        time_limit: float | None = None,
+        history: bool = False,
+        callback: Callback | None = None,
+    ) -> Solution:
+        """As `lavender.solve`; `problem`, if given, replaces the prepared one."""
+        spec = self.spec
+        tol, max_iter, time_limit = _check_budget(spec, tol, max_iter, time_limit)
+        if (callback is not None and not spec.callback) or (history and not spec.history):
+            raise CapabilityError(f"solver {spec.name!r} runs in one call; it takes no callback and records no history")
+        self._refresh(problem)
+        problem = self.problem
+        if impulse is not None:
+            lam = problem.impulse_array(impulse)
+        else:
+            lam = problem.start() if problem.guess is None else problem.guess.copy()
+        setup_time, self.setup_time = self.setup_time, 0.0
+        proof = _decide_empty_rows(problem, lam)
+        if proof is not None:
+            claim = Claim(Status.INFEASIBLE, 0, {}, proof[0], certificate=proof[1])
+            return _finish(problem, spec, self.options, lam, claim, tol, setup_time, 0.0, None)
+        loop = _Loop(problem, self._solver, self._state, lam, tol, time_limit, history, callback)
+        claim = loop.run(max_iter) if spec.resumable else loop.run_once(max_iter)
+        return _finish(problem, spec, self.options, loop.impulse, claim, tol, setup_time, loop.time, loop.recorded())
+
+    def _refresh(self, problem: Problem | None) -> None:
+        if problem is None or problem is self.problem:
+            if not self._fresh:
+                self._state = self._solver.update(self._state, self.problem)
+        else:
+            _check_problem(problem, self.spec)
+            start = perf_counter()
+            if same_structure(self.problem, problem):
+                self._state = self._solver.update(self._state, problem)
+            else:
+                self._state = self._solver.prepare(problem)
+            self.setup_time = perf_counter() - start
+            self.problem = problem
+        self._fresh = False
+
+
+def same_structure(p: Problem, q: Problem) -> bool:
+    """Same blocks, same kind of operator, same bodies or same pattern of A."""
+    if not (equal(p.cones.ptr, q.cones.ptr) and equal(p.cones.kind, q.cones.kind)) or p.law != q.law:
+        return False
+    if p.rows is not None and q.rows is not None:
+        return (
+            p.rows.n_bodies == q.rows.n_bodies
+            and equal(p.rows.joint_body, q.rows.joint_body)
+            and equal(p.rows.contact_body, q.rows.contact_body)
+        )
+    if p.rows is not None or q.rows is not None:
+        return False
+    return equal(p.csr.indptr, q.csr.indptr) and equal(p.csr.indices, q.csr.indices)
+
+
+class _Loop:
+    """Chunks, clock, history and Ctrl-C around one solver's `run`."""
+
+    def __init__(
+        self,
+        problem: Problem,
+        solver: Any,
+        state: Any,
+        impulse: FloatArray,
+        tol: float,
+        time_limit: float | None,
+        history: bool,
+        callback: Callback | None,
+    ) -> None:
+        self.problem, self.solver, self.state, self.impulse = problem, solver, state, impulse
+        self.tol, self.time_limit, self.callback = tol, time_limit, callback
+        self.rows: list[tuple[int, float, float, float, float]] | None = [] if history else None
+        self.time = 0.0
+        self.done = 0
+        self.work: dict[str, int] = {}
+
+    def run_once(self, max_iter: int) -> Claim:
+        start_point = self.impulse.copy()
+        start = perf_counter()
+        try:
+            return self.solver.run(self.state, self.impulse, max_iter, self.tol, self.time_limit)
+        except KeyboardInterrupt:
+            if not np.isfinite(self.impulse).all():
+                self.impulse[:] = start_point
+            return Claim(Status.INTERRUPTED, 0, {}, "Ctrl-C")
+        finally:
+            self.time = perf_counter() - start
+
+    def run(self, max_iter: int) -> Claim:
+        # About a nanosecond per unit of work: the first guess, then measured.
+        chunk = max(1, int(CHUNK_TIME * 1e9) // max(1, self.problem.data.work))
+        records = self.rows is not None or self.callback is not None
+        claim = Claim(Status.MAX_ITERATIONS, 0)
+        try:
+            if records and self._record():
+                return self._total(Claim(Status.INTERRUPTED, 0, {}, "stopped by the callback"))
+            while self.done < max_iter:
+                n = min(chunk, max_iter - self.done)
+                if records:
+                    n = min(n, next_count(self.done) - self.done)
+                start = perf_counter()
+                claim = self.solver.run(self.state, self.impulse, n, self.tol, None)
+                elapsed = perf_counter() - start
+                self.time += elapsed
+                self.done += claim.iterations
+                for kind, count in claim.work.items():
+                    self.work[kind] = self.work.get(kind, 0) + count
+                stopped = records and self.done == self._next_record and self._record()
+                if claim.status is not Status.MAX_ITERATIONS:
+                    break
+                if stopped:
+                    claim = Claim(Status.INTERRUPTED, 0, {}, "stopped by the callback")
+                    break
+                if self.time_limit is not None and self.time >= self.time_limit:
+                    claim = Claim(Status.TIME_LIMIT, 0, {}, claim.message)
+                    break
+                chunk = self._next_chunk(n, elapsed)
+        except KeyboardInterrupt:
+            claim = Claim(Status.INTERRUPTED, 0, {}, "Ctrl-C")
+        self._keep_best()
+        return self._total(claim)
+
+    def _next_chunk(self, n: int, elapsed: float) -> int:
+        aim = CHUNK_TIME
+        if self.time_limit is not None:
+            aim = min(aim, max(self.time_limit - self.time, 0.0))
+        return max(1, min(8 * n, int(n * aim / max(elapsed, 1e-7))))
+
+    def _keep_best(self) -> None:
+        # A solver whose residual may rise keeps its best checked iterate; a budget (tol = 0) means the last one.
+        best = getattr(self.state, "best", None)
+        if self.tol > 0.0 and best is not None and best[1] is not None and best[1] is not self.impulse:
+            if not residual(self.problem, self.impulse).relative <= best[0]:
+                self.impulse[:] = best[1]
+
+    def _record(self) -> bool:
+        r = residual(self.problem, self.impulse)
+        if self.rows is not None:
+            self.rows.append((self.done, self.time, r.relative, r.energy, r.velocity))
+        self._next_record = next_count(self.done)
+        return bool(self.callback(self.done, self.impulse.copy(), r)) if self.callback is not None else False
+
+    _next_record = 0
+
+    def _total(self, claim: Claim) -> Claim:
+        return replace(claim, iterations=self.done, work=self.work)
+
+    def recorded(self) -> History | None:
+        if self.rows is None:
+            return None
+        if not self.rows or self.rows[-1][0] != self.done:
+            self._record()
+        columns = list(zip(*self.rows, strict=True))
+        return History(np.array(columns[0], np.int64), *(np.array(c, float) for c in columns[1:]))
+
+
+def next_count(n: int) -> int:
+    """The iteration count of the check or record after n: 1, 2, ... 16, then an eighth more each time."""
+    return n + max(1, n >> 3)
+
+
+def _finish(
+    problem: Problem,
+    spec: SolverSpec,
+    options: dict[str, Any],
+    impulse: FloatArray,
+    claim: Claim,
+    tol: float,
+    setup_time: float,
+    solve_time: float,
+    history: History | None,
+) -> Solution:
+    judged = residual(problem, impulse)
+    status, message = claim.status, claim.message
+    relative = judged.relative
+    if not np.isfinite(impulse).all() and status is not Status.NUMERICAL_ERROR:
+        status = Status.DIVERGED
+    elif status in (Status.MAX_ITERATIONS, Status.TIME_LIMIT, Status.STALLED) and 0.0 < tol and relative <= tol:
+        status = Status.CONVERGED
+    elif tol < relative <= 2.0 * judged.floor and status in (Status.CONVERGED, Status.STALLED):
+        status = Status.FLOOR
+    contradicted = ""
+    if status is Status.CONVERGED and not relative <= tol:
+        contradicted = f"says CONVERGED, relative residual {relative:.2e} is above tol {tol:.1e}"
+    elif status is Status.FLOOR and not relative <= 2.0 * judged.floor:
+        contradicted = f"says FLOOR, relative residual {relative:.2e} is above twice {judged.floor:.2e}"
+    elif status is Status.INFEASIBLE:
+        reason = "no certificate was given" if claim.certificate is None else check_certificate(problem, claim.certificate)
+        contradicted = f"says INFEASIBLE, {reason}" if reason else ""
+    impulse.flags.writeable = False
+    return Solution(
+        impulse=impulse,
+        residual=judged,
+        status=status,
+        tol=tol,
+        iterations=claim.iterations,
+        work=claim.work,
+        setup_time=setup_time,
+        solve_time=solve_time,
+        solver=SolverRun(spec.name, options, claim.form),
+        message=message,
+        history=history,
+        dual=claim.dual,
+        certificate=claim.certificate,
+        contradicted=contradicted,
+    )
+
+
+def _decide_empty_rows(problem: Problem, impulse: FloatArray) -> tuple[str, FloatArray] | None:
+    """Rows of A that are all zero: put on the bound that b asks for, or prove that there is none."""
+    cones = problem.cones
+    for i in problem.data.empty:
+        block = problem.block_of(int(i))
+        if cones.kind[block] != ROW and i != cones.ptr[block]:
+            continue                                    # tangents and spin: bounded by mu lambda_n
+        b = problem.b[i]
+        bound = cones.upper[i] if b > 0.0 else cones.lower[i]
+        if b == 0.0:
+            continue
+        if np.isfinite(bound):
+            impulse[i] = bound
+            continue
+        y = np.zeros(problem.m)
+        y[i] = math.copysign(1.0, b)
+        return f"{problem.row_name(int(i))}: its row of A is zero, so nothing can meet b = {b:.3g} m/s", y
+    return None
+
+
+def _check_problem(problem: Problem, spec: SolverSpec) -> None:
+    if not isinstance(problem, Problem):
+        raise InputError(f"problem is a {type(problem).__name__}; a lavender.Problem is needed")
+    reason = spec.refuses(problem)
+    if reason:
+        raise CapabilityError(f"solver {spec.name!r} {reason}")
+
+
+def _check_budget(spec: SolverSpec, tol: float, max_iter: int | None, time_limit: float | None) -> tuple[float, int, float | None]:
+    if not isinstance(tol, (int, float, np.number)) or not 0.0 <= tol < math.inf:
+        raise InputError(f"tol is {tol!r}; a number >= 0 is needed (0 runs the whole budget)")
+    if max_iter is None:
+        max_iter = spec.max_iter
+    if isinstance(max_iter, bool) or not isinstance(max_iter, (int, np.integer)) or not 0 <= max_iter < 2**31:
+        raise InputError(f"max_iter is {max_iter!r}; a whole number from 0 to 2^31 - 1 is needed")
+    if time_limit is not None and (not isinstance(time_limit, (int, float, np.number)) or not time_limit > 0.0):
+        raise InputError(f"time_limit is {time_limit!r}; seconds above 0, or None")
+    return float(tol), int(max_iter), time_limit

@@ -1,0 +1,28 @@
+"""Gauss-Seidel on free rows: lambda_i <- lambda_i - w_i / d_i, w of this moment (SOR with omega = 1)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from lavender.registry import SolverSpec
+from lavender.solvers.sor import SOR
+
+
+@dataclass(frozen=True)
+class GaussSeidel(SOR):
+    """Gauss-Seidel; `order`, `ground`, `seed` as in `lavender.ordering`."""
+
+    omega: float = field(default=1.0, init=False)
+
+
+SPEC = SolverSpec(
+    name="gauss_seidel",
+    factory=GaussSeidel,
+    laws=frozenset({"linear"}),
+    operator="matrix",
+    order=True,
+    seed=True,
+    max_iter=1000,
+    summary="Gauss-Seidel iteration of a linear system",
+    reference="Saad 2003, Iterative Methods for Sparse Linear Systems, section 4.1",
+)

@@ -1,0 +1,54 @@
+"""Successive over-relaxation on free rows: lambda_i <- lambda_i - omega w_i / d_i, w of this moment.
+
+Converges for symmetric positive definite A and 0 < omega < 2 (Ostrowski, Reich).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from lavender._arrays import FloatArray
+from lavender.errors import InputError
+from lavender.registry import SolverSpec
+from lavender.solution import Claim
+from lavender.solvers._sweeping import Sweeping, SweepState, run_sweeps
+from lavender_ext import sweeps as kernels
+
+
+@dataclass(frozen=True)
+class SOR(Sweeping):
+    """Successive over-relaxation.
+
+    Parameters
+    ----------
+    omega : float, default 1.5
+        Relaxation, 0 < omega < 2.
+    """
+
+    omega: float = 1.5
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.omega < 2.0:
+            raise InputError(f"omega is {self.omega}; 0 < omega < 2 is needed, outside it SOR diverges")
+
+    def run(self, state: SweepState, impulse: FloatArray, n: int, tol: float, time_limit: float | None = None) -> Claim:
+        o = state.order
+
+        def sweep(count: int) -> None:
+            kernels.sor_sweeps(state.data, self.omega, impulse, o.blocks, o.split, o.mode, o.rng, state.first, count)
+
+        return run_sweeps(state, impulse, n, tol, sweep)
+
+
+SPEC = SolverSpec(
+    name="sor",
+    factory=SOR,
+    laws=frozenset({"linear"}),
+    operator="matrix",
+    order=True,
+    seed=True,
+    max_iter=1000,
+    options={"omega": "relaxation, 0 < omega < 2, default 1.5"},
+    summary="successive over-relaxation of a linear system",
+    reference="Young 1971, Iterative Solution of Large Linear Systems",
+)

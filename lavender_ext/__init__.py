@@ -1,0 +1,1 @@
+"""Compiled kernels of lavender: raw arrays in, numbers out. Nothing here imports lavender."""

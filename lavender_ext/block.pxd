@@ -1,0 +1,208 @@
+"""The arithmetic of one block: the update of a sweep and the error of the judge.
+
+A block is one or more bounded rows (ROW), or a contact: a normal row, then 0, 1 or 2 tangent rows
+(CONTACT), then one spin row (CONTACT_SPIN). With w = A lam - b [m/s] and d = diag(A) [1/kg]:
+
+    update   row      lam  <- clip(lam - w / d, lower, upper)                                  (1)
+             normal   lam_n <- max(0, lam_n - w_n / d_n)                                       (2)
+             tangents lam_t <- radial projection on mu lam_n of lam_t - w_t / lambda_max(A_tt)  (3)
+             spin     lam_s <- clip(lam_s - w_s / d_s, -mu r lam_n, mu r lam_n)                (4)
+    error    row      e = lam - clip(lam - w / d, lower, upper), w / d where free              (5)
+             coulomb  (5) for the normal; e_t = lam_t - Pi_disk(mu lam_n+)(lam_t - w_t / d_t),
+                      e_s likewise on mu r lam_n+, lam_n+ = max(0, lam_n)                       (6)
+             cone     e = lam - Pi(lam - w / d) in the metric of d                             (7)
+
+Every function here is inline, allocates nothing, calls sqrt at most, and serves the sweeps, the
+judge, the engine and the WebAssembly build alike.
+"""
+from libc.math cimport fabs, sqrt
+from libc.stdint cimport int32_t
+
+
+cdef enum:
+    ROW = 0
+    CONTACT = 1
+    CONTACT_SPIN = 2
+
+cdef enum:
+    COULOMB = 0
+    CONE = 1
+
+
+cdef struct blocks_t:
+    int32_t n_blocks            # k
+    int32_t n_rows              # m
+    int32_t law                 # COULOMB | CONE
+    const int32_t* ptr          # (k + 1) first row of each block; ptr[0] = 0, increasing
+    const int32_t* kind         # (k) ROW | CONTACT | CONTACT_SPIN
+    const double* lower         # (m) N s, read on ROW blocks
+    const double* upper         # (m) N s, read on ROW blocks
+    const double* mu            # (k) -, >= 0
+    const double* patch_radius  # (k) m, >= 0
+    const double* b             # (m) m/s
+    const double* d             # (m) 1/kg, > 0, equal on the two tangents of a contact
+    const double* nu            # (m) 1/kg, > 0: velocity error = sqrt(nu d) |e|
+    const double* step          # (m) kg: 1/d, on tangents 1/lambda_max(A_tt)
+
+
+cdef inline double clip(double x, double low, double high) noexcept nogil:
+    # NaN passes through, so that a lost iterate is seen.
+    return low if x < low else (high if x > high else x)
+
+
+cdef inline double norm2(double x, double y) noexcept nogil:
+    # sqrt(x^2 + y^2) without overflow or underflow; the plain formula where it is safe.
+    cdef double s = x * x + y * y
+    cdef double big, small
+    if 1e-280 < s < 1e280:
+        return sqrt(s)
+    x = fabs(x)
+    y = fabs(y)
+    big = x if x > y else y
+    small = y if x > y else x
+    if not big > 0.0:
+        return x + y                                    # 0, or NaN
+    if big > 1.7976931348623157e308:
+        return big
+    small = small / big
+    return big * sqrt(1.0 + small * small)
+
+
+cdef inline int32_t n_tangents(int32_t kind, int32_t size) noexcept nogil:
+    return size - kind                                  # CONTACT = 1 normal, CONTACT_SPIN = 1 more
+
+
+cdef inline double relax_row(double lam, double w, double step, double low, double high) noexcept nogil:
+    return clip(lam - w * step, low, high)              # (1)
+
+
+cdef inline double relax_normal(double lam, double w, double step) noexcept nogil:
+    cdef double y = lam - w * step                      # (2)
+    return 0.0 if y < 0.0 else y
+
+
+cdef inline void relax_tangents(double* lam, const double* w, double step, double radius,
+                                int32_t n) noexcept nogil:
+    # (3): lam, w of the n tangent rows; one scalar step for both.
+    cdef double x, y, r
+    if n == 1:
+        lam[0] = clip(lam[0] - w[0] * step, -radius, radius)
+    else:
+        x = lam[0] - w[0] * step
+        y = lam[1] - w[1] * step
+        r = norm2(x, y)
+        if r > radius:
+            r = radius / r
+            x = x * r
+            y = y * r
+        lam[0] = x
+        lam[1] = y
+
+
+cdef inline double row_error(double lam, double w, double d, double low, double high) noexcept nogil:
+    # (5), written so that an inactive bound costs no digits: e = w / d there, not lam - (lam - w / d).
+    cdef double t = w / d
+    cdef double y = lam - t
+    if y < low:
+        return lam - low
+    if y > high:
+        return lam - high
+    return t
+
+
+cdef inline void tangent_error(const double* lam, const double* w, double d, double radius,
+                               int32_t n, double* e) noexcept nogil:
+    cdef double x, y, r
+    if n == 1:
+        e[0] = row_error(lam[0], w[0], d, -radius, radius)
+    elif n == 2:
+        e[0] = w[0] / d
+        e[1] = w[1] / d
+        x = lam[0] - e[0]
+        y = lam[1] - e[1]
+        r = norm2(x, y)
+        if r > radius:
+            r = radius / r
+            e[0] = lam[0] - r * x
+            e[1] = lam[1] - r * y
+
+
+cdef inline void coulomb_error(const double* lam, const double* w, const double* d, double mu,
+                               double patch_radius, int32_t nt, int32_t spin, double* e) noexcept nogil:
+    # (6): one contact of 1 + nt + spin rows.
+    cdef double bound = mu * (lam[0] if lam[0] > 0.0 else 0.0)
+    cdef double inf = 1.0 / 0.0
+    e[0] = row_error(lam[0], w[0], d[0], 0.0, inf)
+    if nt > 0:
+        tangent_error(lam + 1, w + 1, d[1], bound, nt, e + 1)
+    if spin:
+        bound = bound * patch_radius
+        e[1 + nt] = row_error(lam[1 + nt], w[1 + nt], d[1 + nt], -bound, bound)
+
+
+cdef inline void cone_error(const double* lam, const double* w, const double* d, double mu,
+                            double patch_radius, int32_t nt, int32_t spin, double* e) noexcept nogil:
+    # (7): the projection on {|y_t| <= a_t y_n, |y_s| <= a_s y_n} after y = sqrt(d) (lam - w / d). The
+    # largest of the four candidates for s is the projection's normal part: three pieces of one
+    # convex piecewise quadratic in s.
+    cdef double rn = sqrt(d[0]), rt = 1.0, rs = 1.0, at = 0.0, as_ = 0.0
+    cdef double yn, y0 = 0.0, y1 = 0.0, ys = 0.0, t = 0.0, s, c, f
+    cdef int32_t i, js = 1 + nt
+    yn = rn * (lam[0] - w[0] / d[0])
+    if nt > 0:
+        rt = sqrt(d[1])
+        at = mu * rt / rn
+        y0 = rt * (lam[1] - w[1] / d[1])
+        if nt == 2:
+            y1 = rt * (lam[2] - w[2] / d[2])
+        t = norm2(y0, y1)
+    if spin:
+        rs = sqrt(d[js])
+        as_ = mu * patch_radius * rs / rn
+        ys = rs * (lam[js] - w[js] / d[js])
+    s = yn if yn > 0.0 else 0.0
+    c = (yn + at * t) / (1.0 + at * at)
+    if c > s:
+        s = c
+    c = (yn + as_ * fabs(ys)) / (1.0 + as_ * as_)
+    if c > s:
+        s = c
+    c = (yn + at * t + as_ * fabs(ys)) / (1.0 + at * at + as_ * as_)
+    if c > s:
+        s = c
+    # e = lam - Pi: w / d where the projection moves nothing.
+    e[0] = w[0] / d[0] if s == yn else lam[0] - s / rn
+    if nt > 0:
+        if t > at * s:
+            f = at * s / (t * rt)
+            e[1] = lam[1] - f * y0
+            if nt == 2:
+                e[2] = lam[2] - f * y1
+        else:
+            for i in range(1, 1 + nt):
+                e[i] = w[i] / d[i]
+    if spin:
+        if ys > as_ * s:
+            e[js] = lam[js] - as_ * s / rs
+        elif ys < -as_ * s:
+            e[js] = lam[js] + as_ * s / rs
+        else:
+            e[js] = w[js] / d[js]
+    if not (yn == yn and t == t and ys == ys):
+        e[0] = yn + t + ys                              # NaN: comparisons above would hide it
+
+
+cdef inline void block_error(const blocks_t* p, int32_t i, const double* lam, const double* w,
+                             double* e) noexcept nogil:
+    """Error e of block i [N s]; lam, w, e are whole vectors (m)."""
+    cdef int32_t j = p.ptr[i], end = p.ptr[i + 1], kind = p.kind[i], nt
+    if kind == ROW:
+        while j < end:
+            e[j] = row_error(lam[j], w[j], p.d[j], p.lower[j], p.upper[j])
+            j += 1
+        return
+    nt = n_tangents(kind, end - j)
+    if p.law == CONE:
+        cone_error(lam + j, w + j, p.d + j, p.mu[i], p.patch_radius[i], nt, kind == CONTACT_SPIN, e + j)
+    else:
+        coulomb_error(lam + j, w + j, p.d + j, p.mu[i], p.patch_radius[i], nt, kind == CONTACT_SPIN, e + j)

@@ -1,0 +1,156 @@
+"""Sweep orders of blocks: the next sweep's order, levels from the ground, greedy colours.
+
+An order is a permutation of block numbers (int32). GIVEN keeps it; SYMMETRIC turns it round before
+every sweep but the first; RANDOM shuffles it before every sweep with an own generator (SplitMix64,
+Steele, Lea, Flood 2014), so that a seed means the same sweep everywhere.
+"""
+from libc.stdint cimport int32_t, uint64_t
+
+
+cdef enum:
+    GIVEN = 0
+    SYMMETRIC = 1
+    RANDOM = 2
+
+
+cdef inline uint64_t next_random(uint64_t* state) noexcept nogil:
+    cdef uint64_t z
+    state[0] = state[0] + <uint64_t>0x9E3779B97F4A7C15ULL
+    z = state[0]
+    z = (z ^ (z >> 30)) * <uint64_t>0xBF58476D1CE4E5B9ULL
+    z = (z ^ (z >> 27)) * <uint64_t>0x94D049BB133111EBULL
+    return z ^ (z >> 31)
+
+
+cdef inline void shuffle(int32_t* order, int32_t first, int32_t end, uint64_t* rng) noexcept nogil:
+    # Fisher-Yates on order[first:end]; the draw is (random 32 bits) * n / 2^32.
+    cdef int32_t i = end - 1, j, t
+    while i > first:
+        j = first + <int32_t>(((next_random(rng) >> 32) * <uint64_t>(i - first + 1)) >> 32)
+        t = order[i]
+        order[i] = order[j]
+        order[j] = t
+        i -= 1
+
+
+cdef inline void reverse(int32_t* order, int32_t first, int32_t end) noexcept nogil:
+    cdef int32_t i = first, j = end - 1, t
+    while i < j:
+        t = order[i]
+        order[i] = order[j]
+        order[j] = t
+        i += 1
+        j -= 1
+
+
+cdef inline void advance_order(int32_t mode, int32_t first_sweep, int32_t* order, int32_t first, int32_t end,
+                               uint64_t* rng) noexcept nogil:
+    """Order of the coming sweep, in place, of the blocks order[first:end]."""
+    if mode == RANDOM:
+        shuffle(order, first, end, rng)
+    elif mode == SYMMETRIC and not first_sweep:
+        reverse(order, first, end)
+
+
+cdef inline int32_t body_levels(int32_t n_blocks, const int32_t* body, int32_t n_bodies, int32_t* level) noexcept nogil:
+    """Breadth-first level of each body from the static ones (body -1); unreached bodies get the last level + 1.
+
+    `body` is (n_blocks, 2). Relaxed edge by edge until nothing changes, forwards then backwards: as many
+    passes as the longest run against both directions, linear for scenes built bottom-up.
+    """
+    cdef int32_t i, a, b, la, lb, changed = 1, top = 0, far = 2147483647
+    for i in range(n_bodies):
+        level[i] = far
+    while changed:
+        changed = 0
+        for i in range(2 * n_blocks):
+            a = body[2 * i] if i < n_blocks else body[2 * (2 * n_blocks - 1 - i)]
+            b = body[2 * i + 1] if i < n_blocks else body[2 * (2 * n_blocks - 1 - i) + 1]
+            la = -1 if a < 0 else level[a]
+            lb = -1 if b < 0 else level[b]
+            if a >= 0 and lb != far and lb + 1 < la:
+                level[a] = lb + 1
+                changed = 1
+            if b >= 0 and la != far and la + 1 < lb:
+                level[b] = la + 1
+                changed = 1
+    for i in range(n_bodies):
+        if level[i] != far and level[i] > top:
+            top = level[i]
+    for i in range(n_bodies):
+        if level[i] == far:
+            level[i] = top + 1
+    return top + 1
+
+
+cdef inline void block_levels(int32_t n_blocks, const int32_t* body, const int32_t* level, int32_t* out) noexcept nogil:
+    # A block sits as low as the lower of its two bodies: a block on the ground has level 0.
+    cdef int32_t i, la, lb
+    for i in range(n_blocks):
+        la = 0 if body[2 * i] < 0 else level[body[2 * i]] + 1
+        lb = 0 if body[2 * i + 1] < 0 else level[body[2 * i + 1]] + 1
+        out[i] = la if la < lb else lb
+
+
+cdef inline void sort_by_level(int32_t n_blocks, const int32_t* level, int32_t n_levels, int32_t* start,
+                               int32_t* order) noexcept nogil:
+    # Stable counting sort; start has n_levels + 1 entries and ends as the first place of each level.
+    cdef int32_t i, s, t
+    for i in range(n_levels + 1):
+        start[i] = 0
+    for i in range(n_blocks):
+        start[level[i]] += 1
+    s = 0
+    for i in range(n_levels + 1):
+        t = start[i]
+        start[i] = s
+        s += t
+    for i in range(n_blocks):
+        order[start[level[i]]] = i
+        start[level[i]] += 1
+    i = n_levels
+    while i > 0:
+        start[i] = start[i - 1]
+        i -= 1
+    start[0] = 0
+
+
+cdef inline int32_t color_by_bodies(int32_t n_blocks, const int32_t* body, int32_t n_bodies, uint64_t* used,
+                                    int32_t* color) noexcept nogil:
+    """Greedy colours: no two blocks of one colour share a moving body. Returns the number of colours.
+
+    `used` (n_bodies) holds one bit per colour of the current group of 63; blocks that find no free bit
+    wait for the next group.
+    """
+    cdef int32_t i, a, b, c, base = 0, left = n_blocks, top = 0
+    cdef uint64_t free
+    for i in range(n_blocks):
+        color[i] = -1
+    while left > 0:
+        for i in range(n_bodies):
+            used[i] = 0
+        for i in range(n_blocks):
+            if color[i] >= 0:
+                continue
+            a = body[2 * i]
+            b = body[2 * i + 1]
+            free = 0
+            if a >= 0:
+                free |= used[a]
+            if b >= 0:
+                free |= used[b]
+            c = 0
+            while c < 63 and (free >> c) & 1:
+                c += 1
+            if c == 63:
+                continue
+            if a >= 0:
+                used[a] |= (<uint64_t>1) << c
+            if b >= 0:
+                used[b] |= (<uint64_t>1) << c
+            color[i] = base + c
+            if base + c + 1 > top:
+                top = base + c + 1
+            left -= 1
+        base += 63
+    return top

@@ -1,0 +1,147 @@
+"""Sweeps of Gauss-Seidel and Jacobi type, on the rows of A or on the factored form.
+
+    pgs                   block i, then the next, each on w = A lam - b with the lam of now          (1)
+    sequential impulses   the same sweep on v = M^-1 J^T lam: w = J v + c lam - b, A never formed     (2)
+    jacobi                all blocks on the w of before the sweep, each step times omega              (3)
+    sor                   lam_i <- lam_i - omega w_i / d_i on free rows                              (4)
+
+The update of one block is block.pxd (1)-(4) everywhere. Invariant of (2), on entry and after every
+block: v = M^-1 J^T lam to rounding.
+"""
+from libc.stdint cimport int32_t, uint64_t
+
+import numpy as np
+
+from lavender_ext.block cimport (CONTACT_SPIN, ROW, blocks_t, n_tangents, relax_normal, relax_row,
+                                 relax_tangents)
+from lavender_ext.csr cimport csr_dot, csr_t
+from lavender_ext.order cimport GIVEN, advance_order
+from lavender_ext.problem cimport Data
+from lavender_ext.rows cimport relax_rows_block, rows_t
+
+
+cdef inline void relax_csr_block(const blocks_t* p, const csr_t* a, int32_t i, double* lam) noexcept nogil:
+    cdef int32_t j = p.ptr[i], end = p.ptr[i + 1], kind = p.kind[i], nt, q
+    cdef double w[2]
+    cdef double bound
+    if kind == ROW:
+        for q in range(j, end):
+            lam[q] = relax_row(lam[q], csr_dot(a, q, lam) - p.b[q], p.step[q], p.lower[q], p.upper[q])
+        return
+    nt = n_tangents(kind, end - j)
+    lam[j] = relax_normal(lam[j], csr_dot(a, j, lam) - p.b[j], p.step[j])
+    bound = p.mu[i] * lam[j]
+    if nt > 0:
+        for q in range(nt):
+            w[q] = csr_dot(a, j + 1 + q, lam) - p.b[j + 1 + q]
+        relax_tangents(lam + j + 1, w, p.step[j + 1], bound, nt)
+    if kind == CONTACT_SPIN:
+        q = end - 1
+        bound = p.patch_radius[i] * bound
+        lam[q] = relax_row(lam[q], csr_dot(a, q, lam) - p.b[q], p.step[q], -bound, bound)
+
+
+cdef public void lav_pgs_sweeps(const blocks_t* p, const csr_t* a, double* lam, int32_t* order, int32_t split, int32_t mode,
+                                uint64_t* rng, int32_t first_sweep, int32_t n) noexcept nogil:
+    """n sweeps of (1); order (k) is advanced before each, within order[:split] and order[split:] apart;
+    `first_sweep` says that none came before."""
+    cdef int32_t s, i
+    for s in range(n):
+        advance_order(mode, first_sweep and s == 0, order, 0, split, rng)
+        advance_order(mode, first_sweep and s == 0, order, split, p.n_blocks, rng)
+        for i in range(p.n_blocks):
+            relax_csr_block(p, a, order[i], lam)
+
+
+cdef public void lav_pgs_rows_in_order(const blocks_t* p, const csr_t* a, double* lam, int32_t n) noexcept nogil:
+    """(1) where every block is one row and the order is as given: the same bits, without the look-ups."""
+    cdef int32_t s, i
+    for s in range(n):
+        for i in range(p.n_rows):
+            lam[i] = relax_row(lam[i], csr_dot(a, i, lam) - p.b[i], p.step[i], p.lower[i], p.upper[i])
+
+
+cdef public void lav_sor_sweeps(const blocks_t* p, const csr_t* a, double omega, double* lam, int32_t* order,
+                                int32_t split, int32_t mode, uint64_t* rng, int32_t first_sweep, int32_t n) noexcept nogil:
+    """n sweeps of (4) over free rows."""
+    cdef int32_t s, i, q
+    for s in range(n):
+        advance_order(mode, first_sweep and s == 0, order, 0, split, rng)
+        advance_order(mode, first_sweep and s == 0, order, split, p.n_blocks, rng)
+        for i in range(p.n_blocks):
+            for q in range(p.ptr[order[i]], p.ptr[order[i] + 1]):
+                lam[q] = lam[q] - omega * p.step[q] * (csr_dot(a, q, lam) - p.b[q])
+
+
+cdef public void lav_jacobi_sweeps(const blocks_t* p, const csr_t* a, double omega, double* lam, double* w,
+                                   int32_t n) noexcept nogil:
+    """n sweeps of (3); w (m) is scratch."""
+    cdef int32_t s, i, j, q, nt, end
+    cdef double bound
+    for s in range(n):
+        for i in range(p.n_rows):
+            w[i] = csr_dot(a, i, lam) - p.b[i]
+        for i in range(p.n_blocks):
+            j = p.ptr[i]
+            end = p.ptr[i + 1]
+            if p.kind[i] == ROW:
+                for q in range(j, end):
+                    lam[q] = relax_row(lam[q], w[q], omega * p.step[q], p.lower[q], p.upper[q])
+                continue
+            nt = n_tangents(p.kind[i], end - j)
+            lam[j] = relax_normal(lam[j], w[j], omega * p.step[j])
+            bound = p.mu[i] * lam[j]
+            if nt > 0:
+                relax_tangents(lam + j + 1, w + j + 1, omega * p.step[j + 1], bound, nt)
+            if p.kind[i] == CONTACT_SPIN:
+                q = end - 1
+                bound = p.patch_radius[i] * bound
+                lam[q] = relax_row(lam[q], w[q], omega * p.step[q], -bound, bound)
+
+
+cdef public void lav_impulse_sweeps(const blocks_t* p, const rows_t* r, double* lam, double* v, int32_t* order,
+                                    int32_t split, int32_t mode, uint64_t* rng, int32_t first_sweep, int32_t n) noexcept nogil:
+    """n sweeps of (2); v (n_bodies, 6)."""
+    cdef int32_t s, i
+    for s in range(n):
+        advance_order(mode, first_sweep and s == 0, order, 0, split, rng)
+        advance_order(mode, first_sweep and s == 0, order, split, p.n_blocks, rng)
+        for i in range(p.n_blocks):
+            relax_rows_block(p, r, order[i], lam, v)
+
+
+def pgs_sweeps(Data p, double[::1] lam, int32_t[::1] order, int split, int mode, uint64_t[::1] rng, bint first_sweep, int n):
+    """`n` sweeps of projected Gauss-Seidel in place, GIL released; an empty order means row by row."""
+    if p.blocks.n_rows == 0 or n <= 0:
+        return
+    with nogil:
+        if mode == GIVEN and p.single_rows and order.shape[0] == 0:
+            lav_pgs_rows_in_order(&p.blocks, &p.csr, &lam[0], n)
+        else:
+            lav_pgs_sweeps(&p.blocks, &p.csr, &lam[0], &order[0], split, mode, &rng[0], first_sweep, n)
+
+
+def sor_sweeps(Data p, double omega, double[::1] lam, int32_t[::1] order, int split, int mode, uint64_t[::1] rng,
+               bint first_sweep, int n):
+    """`n` sweeps of successive over-relaxation on free rows in place, GIL released."""
+    if p.blocks.n_rows == 0 or n <= 0:
+        return
+    with nogil:
+        lav_sor_sweeps(&p.blocks, &p.csr, omega, &lam[0], &order[0], split, mode, &rng[0], first_sweep, n)
+
+
+def jacobi_sweeps(Data p, double omega, double[::1] lam, double[::1] w, int n):
+    """`n` sweeps of (projected) Jacobi in place, GIL released; w (m,) is scratch."""
+    if p.blocks.n_rows == 0 or n <= 0:
+        return
+    with nogil:
+        lav_jacobi_sweeps(&p.blocks, &p.csr, omega, &lam[0], &w[0], n)
+
+
+def impulse_sweeps(Data p, double[::1] lam, double[:, ::1] v, int32_t[::1] order, int split, int mode, uint64_t[::1] rng,
+                   bint first_sweep, int n):
+    """`n` sweeps of sequential impulses in place, GIL released; v (n_bodies + 1, 6) holds M^-1 J^T lam."""
+    if p.blocks.n_rows == 0 or n <= 0:
+        return
+    with nogil:
+        lav_impulse_sweeps(&p.blocks, &p.rows, &lam[0], &v[0, 0], &order[0], split, mode, &rng[0], first_sweep, n)
