@@ -21,8 +21,8 @@ from lavender_ext.block cimport CONTACT, CONTACT_SPIN
 from lavender_ext.engine_body cimport to_body
 from lavender_ext.engine_collide cimport collide, manifold_t
 from lavender_ext.engine_types cimport (BOX, CAP_CONTACT, H_CACHED, H_CONTACTS, H_CONTACT_ROWS, H_MATCHES,
-                                        H_NEED_CONTACTS, H_PAIRS, H_WARM_START, N_CACHE_IMPULSE, N_FRAME,
-                                        N_JOINT, N_JOINT_ROW, S_BOUNCE, S_H, S_MARGIN, S_MATCH, engine_t)
+                                        H_PAIRS, H_WARM_START, N_CACHE_IMPULSE, N_JOINT,
+                                        N_JOINT_ROW, S_BOUNCE, S_H, S_MARGIN, S_MATCH, engine_t)
 from lavender_ext.rows cimport (contact_diagonal, contact_slack, cross, dot3, largest_eigenvalue, reciprocal,
                                 relative_velocity, rows_t)
 
@@ -84,13 +84,20 @@ cdef inline void guess_contact(engine_t* e, int32_t c, int32_t entry, int32_t nt
         lam[1 + nt] = p[4]
 
 
+cdef inline double normal_velocity(const engine_t* e, int32_t a, int32_t b, int32_t c) noexcept nogil:
+    # closing speed of a contact with the velocities before the substep, static bodies at rest
+    cdef double u[3]
+    cdef double s[3]
+    relative_velocity(e.v, a if e.dyn[a] >= 0 else -1, b if e.dyn[b] >= 0 else -1, e.arm_a + 3 * c, e.arm_b + 3 * c, u, s)
+    return dot3(e.normal + 3 * c, u)
+
+
 cdef inline void make_contact(engine_t* e, const rows_t* r, int32_t c, int32_t row, int32_t a, int32_t b,
                               const manifold_t* m, int32_t at, int32_t nt, int32_t spin, double bounce) noexcept nogil:
     """Row data of contact c, rows row .. row + nt + spin, of point `at` of the manifold."""
     cdef double h = e.setting[S_H], vn, t12, gap = m.gap[at], target
-    cdef double u[3]
     cdef double w[4]
-    cdef int32_t k, da = e.dyn[a], db = e.dyn[b], mj = row
+    cdef int32_t k, da = e.dyn[a], db = e.dyn[b]
     cdef double* d = e.d + row
     e.contact_pair[2 * c] = a
     e.contact_pair[2 * c + 1] = b
@@ -139,14 +146,6 @@ cdef inline void make_contact(engine_t* e, const rows_t* r, int32_t c, int32_t r
     for k in range(1, 1 + nt + spin):
         e.target[row + k] = 0.0
         e.b[row + k] = 0.0 - w[k]
-
-
-cdef inline double normal_velocity(const engine_t* e, int32_t a, int32_t b, int32_t c) noexcept nogil:
-    # closing speed of a contact with the velocities before the substep, static bodies at rest
-    cdef double u[3]
-    cdef double s[3]
-    relative_velocity(e.v, a if e.dyn[a] >= 0 else -1, b if e.dyn[b] >= 0 else -1, e.arm_a + 3 * c, e.arm_b + 3 * c, u, s)
-    return dot3(e.normal + 3 * c, u)
 
 
 cdef inline int32_t make_contacts(engine_t* e, const rows_t* r) noexcept nogil:

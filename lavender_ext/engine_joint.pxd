@@ -110,7 +110,6 @@ cdef inline void joint_geometry(engine_t* e, int32_t i) noexcept nogil:
     direction(e, a, p + J_AXIS_A, axis)
     direction(e, b, p + J_AXIS_B, other)
     direction(e, a, p + J_SIDE_A, side)
-    # side.axis_b grows with (axis_b x side).(omega_b - omega_a); where aligned axis_b x side is the other side
     turn_row(e.jac + 12 * (row + 3), side)
     cross(axis, side, pa)
     turn_row(e.jac + 12 * (row + 4), pa)

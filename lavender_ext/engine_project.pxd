@@ -61,7 +61,7 @@ cdef inline int32_t project_positions(engine_t* e) noexcept nogil:
             e.push[j] = 0.0
             x = e.joint_error[j] + h * joint_velocity(e.jac + 12 * j, e.shift, a, b)
             goal[j] = -clip(beta * x, -most, most)
-            if rigid_row(e, i, j) and goal[j] != 0.0:
+            if fabs(x) > 1e-3 * slop and rigid_row(e, i, j):
                 due = 1
     for c in range(n):
         e.push[mj + c] = 0.0

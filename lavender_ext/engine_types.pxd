@@ -175,7 +175,8 @@ cdef struct engine_t:
     double* shift           # (nd, 6) m, rad: the position projection
     int32_t* body_of        # (nd) body of a dynamic number
     int32_t* order          # (kj + c) sweep order of the blocks
-    int32_t* order_scratch  # (2 (n + c))
+    int32_t* order_scratch  # (2 (n + kj + c) + 8)
+    uint64_t* color_scratch  # (nd)
 
 
 cdef inline double* reals(double* base, int64_t* at, int64_t count) noexcept nogil:
@@ -264,9 +265,10 @@ cdef inline void bind(const int32_t* size, double* real, int32_t* index, uint64_
     e.ptr = ints(index, &j, k + 1)
     e.kind = ints(index, &j, k)
     e.order = ints(index, &j, k)
-    e.order_scratch = ints(index, &j, 2 * (n + k))
+    e.order_scratch = ints(index, &j, 2 * (n + k) + 8)
     e.key = keys
     e.cache_key = keys + c
     used[0] = i
     used[1] = j
-    used[2] = 2 * c
+    e.color_scratch = keys + 2 * c
+    used[2] = 2 * c + nd
