@@ -1,6 +1,7 @@
 """The check of the kernels' purity sees every kind of breach, and passes a clean core."""
 
 import importlib.util
+import re
 import sys
 from pathlib import Path
 
@@ -102,15 +103,15 @@ def test_a_clean_core_passes_although_its_module_uses_python(tmp_path):
 def test_every_kind_of_breach_is_named(tmp_path):
     found = "\n".join(verdict(tmp_path, "impure", IMPURE).breaches)
     for sign in (
-        "static data: .bss.__pyx_v_6impure_SCALE",
-        "constant table or string: .rodata.TABLE",
-        "needs PyGILState_Ensure (in lav_calls_python)",
-        "needs PyEval_SaveThread (in lav_runs_threads)",
-        "needs malloc (in lav_allocates)",
-        "needs free (in lav_allocates)",
-        "needs sin (in lav_calls_libm)",
+        r"static data: \.bss\.__pyx_v_6impure_SCALE",
+        r"constant table or string: \.rodata\.TABLE",
+        r"needs PyGILState_Ensure \(in .*lav_calls_python",
+        r"needs PyEval_RestoreThread \(in .*lav_runs_threads",
+        r"needs malloc \(in lav_allocates\)",
+        r"needs free \(in lav_allocates\)",
+        r"needs sin \(in lav_calls_libm\)",
     ):
-        assert sign in found
+        assert re.search(sign, found), f"{sign} not in\n{found}"
 
 
 def test_a_division_that_raises_is_a_breach(tmp_path, monkeypatch):
