@@ -99,6 +99,14 @@ def test_readme_command_is_one_line_from_a_fresh_clone(name):
     assert done.stdout.count("\n") == 1
 
 
+def test_readme_python_runs(capsys):
+    blocks = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.DOTALL)
+    assert blocks
+    for block in blocks:
+        exec(compile(block, "README.md", "exec"), {})
+    assert capsys.readouterr().out
+
+
 def test_debug_build_differs_in_checks_alone():
     from lavender_ext.build_options import COMPILE_FLAGS, directives
 
