@@ -1,5 +1,6 @@
 """lavender: the constraint problem of one rigid-body step, solved by the solver you name, and judged."""
 
+from lavender._version import __version__
 from lavender.cones import CONTACT, CONTACT_SPIN, ROW, Cones
 from lavender.errors import (
     CapabilityError,
@@ -14,8 +15,6 @@ from lavender.registry import SolverSpec, available, get, known, register
 from lavender.residuals import Residual, residual
 from lavender.solution import Claim, Solution, Status
 from lavender.solve import prepare, solve
-
-__version__ = "0.1.0"
 
 __all__ = [
     "CONTACT",
@@ -35,6 +34,7 @@ __all__ = [
     "SolverUnavailable",
     "Status",
     "UnknownName",
+    "__version__",
     "available",
     "get",
     "known",

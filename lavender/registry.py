@@ -73,8 +73,15 @@ class SolverSpec:
     refusal: Callable[[Problem], str | None] | None = None  # more reasons against a problem
 
     def __post_init__(self) -> None:
-        if not self.name or not set(self.laws) <= set(LAWS) or not self.laws or self.operator not in OPERATORS:
-            raise InputError(f"solver {self.name!r}: laws {sorted(self.laws)} must be of {LAWS}, operator {self.operator!r} of {OPERATORS}")
+        if (
+            not self.name
+            or not set(self.laws) <= set(LAWS)
+            or not self.laws
+            or self.operator not in OPERATORS
+        ):
+            raise InputError(
+                f"solver {self.name!r}: laws {sorted(self.laws)} must be of {LAWS}, operator {self.operator!r} of {OPERATORS}"
+            )
         object.__setattr__(self, "laws", frozenset(self.laws))
         if not self.resumable:
             object.__setattr__(self, "callback", False)
@@ -84,7 +91,9 @@ class SolverSpec:
     def accepts(self) -> frozenset[str]:
         """Options beyond those of the front door."""
         shared = {"order": ("order", "ground"), "seed": ("seed",), "threads": ("threads",)}
-        return frozenset(self.options) | {o for flag, names in shared.items() if getattr(self, flag) for o in names}
+        return frozenset(self.options) | {
+            o for flag, names in shared.items() if getattr(self, flag) for o in names
+        }
 
     def missing(self) -> str | None:
         """None when the solver can run here, else what to install."""
@@ -101,6 +110,10 @@ class SolverSpec:
         if self.operator == "rows" and problem.rows is None:
             return "needs a problem with rows (Problem.from_rows); this one was given as a matrix"
         return self.refusal(problem) if self.refusal is not None else None
+
+    def factory_module(self) -> str:
+        """Module that holds the solver's code."""
+        return self.factory.partition(":")[0] if isinstance(self.factory, str) else self.factory.__module__
 
     def load(self) -> Callable[..., Solver]:
         if not isinstance(self.factory, str):
@@ -142,7 +155,9 @@ def _load_builtin_and_plugins() -> None:
             spec = spec if isinstance(spec, SolverSpec) else spec()
             register(spec)
         except Exception as error:  # a plug-in may fail in any way; it must not take lavender with it
-            warnings.warn(f"solver plug-in {entry.name!r} ({entry.value}) was left out: {error}", stacklevel=3)
+            warnings.warn(
+                f"solver plug-in {entry.name!r} ({entry.value}) was left out: {error}", stacklevel=3
+            )
 
 
 def register(spec: SolverSpec, *, replace: bool = False) -> None:
@@ -157,7 +172,9 @@ def register(spec: SolverSpec, *, replace: bool = False) -> None:
         raise InputError(f"register needs a SolverSpec, not a {type(spec).__name__}")
     _load_builtin_and_plugins() if spec.name not in _registered else None
     if spec.name in _registered and not replace:
-        raise InputError(f"a solver named {spec.name!r} is registered already; pass replace=True to take its place")
+        raise InputError(
+            f"a solver named {spec.name!r} is registered already; pass replace=True to take its place"
+        )
     _registered[spec.name] = spec
 
 
@@ -189,7 +206,8 @@ def get(name: str) -> SolverSpec:
 def known(problem: Problem | None = None) -> dict[str, str | None]:
     """Every solver: None where it can be used here (and takes `problem`), else the reason it cannot."""
     return {
-        name: spec.missing() or (spec.refuses(problem) if problem is not None else None) for name, spec in sorted(specs().items())
+        name: spec.missing() or (spec.refuses(problem) if problem is not None else None)
+        for name, spec in sorted(specs().items())
     }
 
 

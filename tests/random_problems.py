@@ -1,0 +1,100 @@
+"""Small random problems for property tests: rows with joints and contacts of every kind, and plain matrices."""
+
+import hypothesis.strategies as st
+import numpy as np
+
+import lavender as lv
+
+
+def rotation(rng):
+    q = rng.normal(size=4)
+    w, x, y, z = q / np.linalg.norm(q)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def unit(rng):
+    x = rng.normal(size=3)
+    return x / np.linalg.norm(x)
+
+
+def random_rows(rng, bodies=5, joints=3, contacts=8):
+    """Bodies of mixed mass, joints of 1 to 3 rows (some angular), contacts; some against the ground."""
+    mass = rng.uniform(0.5, 3.0, bodies)
+    inertia = [r @ np.diag(rng.uniform(5.0, 12.0, 3)) @ r.T / m for m, r in zip(mass, (rotation(rng) for _ in mass))]
+
+    def pair():
+        a, b = rng.choice(bodies, 2, replace=False)
+        return (-1, b) if rng.random() < 0.4 else (a, b)
+
+    sizes = rng.integers(1, 4, joints)
+    ptr = np.concatenate([[0], np.cumsum(sizes)])
+    joint_body = np.array([pair() for _ in range(joints)], np.int32).reshape(-1, 2)
+    jac = rng.normal(size=(ptr[-1], 12))
+    if joints:
+        jac[ptr[:-1][::2], :3] = jac[ptr[:-1][::2], 6:9] = 0.0  # angular rows
+    jac[np.repeat(joint_body[:, 0], sizes) < 0, :6] = 0.0
+    normal = np.array([unit(rng) for _ in range(contacts)]).reshape(-1, 3)
+    tangent = np.array([np.cross(n, unit(rng)) for n in normal]).reshape(-1, 3)
+    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
+    return lv.Rows(
+        inv_mass=1.0 / mass,
+        inv_inertia=np.array(inertia),
+        v_free=rng.normal(size=(bodies, 6)),
+        jac=jac,
+        joint_ptr=ptr,
+        joint_body=joint_body,
+        normal=normal,
+        tangent=tangent,
+        arm_a=rng.normal(size=(contacts, 3)) * 0.5,
+        arm_b=rng.normal(size=(contacts, 3)) * 0.5,
+        contact_body=np.array([pair() for _ in range(contacts)], np.int32).reshape(-1, 2),
+    )
+
+
+def random_contact_problem(seed, friction="coulomb", tangents=None, spin=True, **sizes):
+    """A factored problem with free and bounded joint rows and contacts; `tangents` None mixes 0, 1, 2."""
+    rng = np.random.default_rng(seed)
+    rows = random_rows(rng, **sizes)
+    c, mj = rows.n_contacts, len(rows.jac)
+    if tangents is None:
+        tangents = rng.integers(0, 3, c)
+    bounded = rng.random(mj) < 0.4
+    high = np.where(bounded, rng.uniform(0.0, 0.5, mj), np.inf)
+    m = mj + int(np.sum(np.broadcast_to(tangents, c))) + c * (1 + spin)
+    return lv.Problem.from_rows(
+        rows,
+        target=rng.normal(size=m) * 0.1,
+        lower=-high,
+        upper=high,
+        mu=rng.uniform(0.0, 1.2, c),
+        tangents=tangents,
+        patch_radius=rng.uniform(0.0, 0.4, c) if spin else None,
+        friction=friction,
+        compliance=rng.uniform(0.0, 0.2, m) * (rng.random(m) < 0.5),
+        name=f"random {seed}",
+    )
+
+
+def as_matrix(problem):
+    """The same problem given by its matrix."""
+    return lv.Problem(
+        problem.b, problem.cones, problem.delassus(), friction=problem.friction, guess=problem.guess, name=problem.name
+    )
+
+
+def random_lcp(seed, m=12, rank=None, boxed=True):
+    rng = np.random.default_rng(seed)
+    g = rng.normal(size=(m, rank or m + 2))
+    high = np.where(rng.random(m) < 0.5, rng.uniform(0.1, 1.0, m), np.inf) if boxed else np.inf
+    # b in the range of A, plus a push into separation: solvable also where A is singular.
+    a = g @ g.T
+    return lv.Problem.lcp(a, a @ rng.normal(size=m) - rng.uniform(0.0, 1.0, m), upper=high, name=f"lcp {seed}")
+
+
+seeds = st.integers(0, 2**32 - 1)

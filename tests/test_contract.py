@@ -1,0 +1,345 @@
+"""What every registered solver owes its user: each capability its spec declares is exercised here."""
+
+import functools
+import inspect
+import threading
+
+import numpy as np
+import pytest
+from random_problems import as_matrix, random_contact_problem, random_lcp
+
+import lavender as lv
+from lavender import registry
+from lavender.problem import LAWS
+from lavender.residuals import check_certificate
+
+NAMES = sorted(registry.specs())
+HERE = lv.available()
+RESUMABLE = lv.available(resumable=True)
+OURS = [n for n in HERE if not n.startswith("_") and not registry.specs()[n].factory_module().startswith("lavender.external")]
+
+
+@functools.cache
+def example(law, rows):
+    """A well-behaved problem of that law; the smallest eigenvalue of A is well away from zero."""
+    if law == "linear":
+        base = random_contact_problem(21, contacts=0, joints=12, bodies=6)
+        c = base.cones
+        free = lv.Cones(c.ptr, c.kind, np.full(c.n_rows, -np.inf), np.full(c.n_rows, np.inf), c.mu, c.patch_radius)
+        soft = base.compliance + 0.5
+        problem = lv.Problem(base.b, free, rows=base.rows, compliance=soft)
+    elif law == "lcp":
+        base = random_contact_problem(22, tangents=0, spin=False)
+        problem = lv.Problem(base.b, base.cones, rows=base.rows, compliance=base.compliance + 0.3)
+    else:
+        base = random_contact_problem(23, friction=law, tangents=2, spin=False)
+        problem = lv.Problem(base.b, base.cones, rows=base.rows, compliance=base.compliance + 0.3, friction=law)
+    assert problem.law == law
+    return problem if rows else as_matrix(problem)
+
+
+def examples(spec):
+    for law in LAWS:
+        if law in spec.laws:
+            for rows in (True, False):
+                problem = example(law, rows)
+                if spec.refuses(problem) is None:
+                    yield problem
+
+
+def budget(spec):
+    return max(spec.max_iter, 20_000) if spec.resumable else None
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_spec_says_what_it_is(name):
+    spec = registry.specs()[name]
+    assert spec.name == name
+    assert spec.summary
+    assert spec.max_iter > 0
+    reason = spec.missing()
+    if reason is not None:
+        assert "pip install" in reason
+        with pytest.raises(lv.SolverUnavailable, match="pip install"):
+            registry.get(name)
+
+
+def test_only_auto_may_delegate():
+    assert [n for n in NAMES if registry.specs()[n].delegates] in ([], ["auto"])
+
+
+@pytest.mark.parametrize("name", HERE)
+def test_solves_every_law_it_declares(name):
+    spec = registry.get(name)
+    problems = list(examples(spec))
+    assert problems, "a spec that refuses every example declares nothing"
+    for problem in problems:
+        solution = lv.solve(problem, name, tol=1e-6, max_iter=budget(spec))
+        assert solution.status in (lv.Status.CONVERGED, lv.Status.FLOOR), solution
+        assert solution.success, solution
+        assert not solution.contradicted, solution
+        assert solution.solver.name == name
+        assert solution.setup_time >= 0.0
+        assert solution.solve_time > 0.0
+        assert sum(solution.work.values()) > 0, "work must show what ran"
+        if spec.resumable:
+            assert solution.iterations > 0, "the start is not a solution"
+        np.testing.assert_array_equal(solution.slack, lv.residual(problem, solution.impulse).slack)
+
+
+@pytest.mark.parametrize("name", HERE)
+def test_refuses_what_it_does_not_declare(name):
+    spec = registry.get(name)
+    for law in LAWS:
+        problem = example(law, True)
+        if law not in spec.laws:
+            with pytest.raises(lv.CapabilityError, match=f"{name}.*not '{law}'"):
+                lv.solve(problem, name)
+    if spec.operator == "rows":
+        with pytest.raises(lv.CapabilityError, match="from_rows"):
+            lv.solve(example("lcp", False), name)
+
+
+@pytest.mark.parametrize("name", HERE)
+def test_an_option_that_is_not_honoured_is_refused(name):
+    spec = registry.get(name)
+    problem = next(examples(spec))
+    with pytest.raises(lv.UnknownName, match="no_such_option"):
+        lv.solve(problem, name, no_such_option=1)
+    for flag, option in (("order", {"order": "reverse"}), ("seed", {"seed": 3}), ("threads", {"threads": 1})):
+        if not getattr(spec, flag):
+            with pytest.raises(lv.CapabilityError, match=flag):
+                lv.solve(problem, name, **option)
+    if not spec.callback:
+        with pytest.raises(lv.CapabilityError, match="callback"):
+            lv.solve(problem, name, callback=print)
+    if not spec.history:
+        with pytest.raises(lv.CapabilityError, match="history"):
+            lv.solve(problem, name, history=True)
+
+
+@pytest.mark.parametrize("name", HERE)
+def test_declared_options_are_those_of_the_factory(name):
+    spec = registry.get(name)
+    parameters = set(inspect.signature(spec.load()).parameters)
+    assert spec.accepts <= parameters, f"{sorted(spec.accepts - parameters)} are declared and not taken"
+    assert parameters <= spec.accepts, f"{sorted(parameters - spec.accepts)} are taken and not declared"
+
+
+@pytest.mark.parametrize("name", RESUMABLE)
+def test_n1_then_n2_iterations_are_n1_plus_n2_to_the_bit(name):
+    spec = registry.get(name)
+    options = [{}] + ([{"order": o} for o in ("random", "symmetric", "colored")] if spec.order else [])
+    for problem in examples(spec):
+        for option in options:
+            for tol in (0.0, 1e-14):
+                solver = spec.load()(**option)
+                whole, parts = problem.start(), problem.start()
+                state = solver.prepare(problem)
+                done = solver.run(state, whole, 23, tol, None).iterations
+                state = solver.prepare(problem)
+                split = sum(solver.run(state, parts, n, tol, None).iterations for n in (1, 7, 15))
+                assert (done, whole.tobytes()) == (split, parts.tobytes()), (name, option, tol)
+
+
+@pytest.mark.parametrize("name", RESUMABLE)
+def test_tol_zero_is_an_exact_budget(name):
+    for problem in examples(registry.get(name)):
+        solution = lv.solve(problem, name, tol=0.0, max_iter=5)
+        assert (solution.status, solution.iterations) == (lv.Status.MAX_ITERATIONS, 5)
+        assert sum(solution.work.values()) >= 5
+
+
+@pytest.mark.parametrize("name", OURS)
+def test_update_equals_a_fresh_solve_to_the_bit(name):
+    spec = registry.get(name)
+    kwargs = {"tol": 1e-9, "max_iter": 50 if spec.resumable else None}
+    for problem in examples(spec):
+        other = lv.Problem(
+            problem.b * 1.25 + 0.01, problem.cones, problem.matrix if problem.rows is None else None,
+            rows=problem.rows, friction=problem.friction, compliance=problem.compliance,
+        )  # fmt: skip
+        prepared = lv.prepare(problem, name)
+        first = prepared.solve(**kwargs)
+        again = prepared.solve(**kwargs)
+        changed = prepared.solve(other, **kwargs)
+        fresh = lv.solve(other, name, **kwargs)
+        assert first.impulse.tobytes() == again.impulse.tobytes()
+        assert changed.impulse.tobytes() == fresh.impulse.tobytes()
+        assert (changed.status, changed.iterations) == (fresh.status, fresh.iterations)
+
+
+@pytest.mark.parametrize("name", HERE)
+def test_the_same_call_gives_the_same_bits(name):
+    spec = registry.get(name)
+    problem = next(examples(spec))
+    x, y = (lv.solve(problem, name, tol=1e-8).impulse for _ in range(2))
+    assert x.tobytes() == y.tobytes()
+
+
+@pytest.mark.parametrize("name", lv.available(impulse=True))
+def test_a_solution_given_back_is_kept(name):
+    spec = registry.get(name)
+    for problem in examples(spec):
+        first = lv.solve(problem, name, tol=1e-9, max_iter=budget(spec))
+        if not first.success:
+            continue
+        again = lv.solve(problem, name, tol=1e-8, impulse=first.impulse)
+        assert again.success, again
+        if spec.resumable:
+            assert again.iterations == 0
+
+
+@pytest.mark.parametrize("name", lv.available(impulse=True, resumable=True))
+def test_a_warm_start_is_used_and_not_modified(name):
+    for problem in examples(registry.get(name)):
+        near = lv.solve(problem, name, tol=1e-4, max_iter=20_000).impulse
+        kept = near.copy()
+        cold = lv.solve(problem, name, tol=1e-6, max_iter=20_000)
+        warm = lv.solve(problem, name, tol=1e-6, max_iter=20_000, impulse=near)
+        assert warm.iterations <= cold.iterations
+        np.testing.assert_array_equal(near, kept)
+
+
+@pytest.mark.parametrize("name", lv.available(order=True))
+def test_orders_change_the_sweep_and_not_the_answer(name):
+    spec = registry.get(name)
+    problem = next(p for p in examples(spec) if p.law != "coulomb")
+    results = {o: lv.solve(problem, name, order=o, tol=1e-10, max_iter=20_000) for o in ("given", "reverse", "random", "colored")}
+    assert all(s.success for s in results.values())
+    early = {lv.solve(problem, name, order=o, tol=0.0, max_iter=2).impulse.tobytes() for o in results}
+    assert len(early) == len(results), "each order sweeps differently"
+    with pytest.raises(lv.UnknownName, match="botom_up"):
+        lv.solve(problem, name, order="botom_up")
+    with pytest.raises(lv.InputError, match="once"):
+        lv.solve(problem, name, order=[0] * problem.n_blocks)
+
+
+@pytest.mark.parametrize("name", lv.available(seed=True))
+def test_seeds_change_random_sweeps(name):
+    problem = next(examples(registry.get(name)))
+    x, y, z = (lv.solve(problem, name, order="random", seed=s, tol=0.0, max_iter=2).impulse for s in (1, 1, 2))
+    assert x.tobytes() == y.tobytes() != z.tobytes()
+
+
+@pytest.mark.parametrize("name", lv.available(threads=True))
+def test_thread_count_changes_no_bit(name):
+    problem = next(examples(registry.get(name)))
+    one, two = (lv.solve(problem, name, order="colored", threads=t, tol=0.0, max_iter=10).impulse for t in (1, 2))
+    assert one.tobytes() == two.tobytes()
+
+
+@pytest.mark.parametrize("name", lv.available(history=True))
+def test_history_is_recorded_at_fixed_counts(name):
+    problem = next(examples(registry.get(name)))
+    solution = lv.solve(problem, name, history=True, tol=0.0, max_iter=40)
+    h = solution.history
+    assert h.iterations.tolist() == [*range(17), 18, 20, 22, 24, 27, 30, 33, 37, 40]
+    assert h.relative[0] == pytest.approx(1.0)
+    assert h.relative[-1] == solution.residual.relative
+    assert np.all(np.diff(h.time) >= 0.0)
+    plain = lv.solve(problem, name, tol=0.0, max_iter=40)
+    assert plain.impulse.tobytes() == solution.impulse.tobytes(), "watching changes nothing"
+
+
+@pytest.mark.parametrize("name", lv.available(callback=True))
+def test_a_callback_sees_the_iterate_and_may_stop(name):
+    problem = next(examples(registry.get(name)))
+    seen = []
+
+    def callback(n, impulse, residual):
+        seen.append((n, residual.relative))
+        impulse[:] = np.nan  # a copy: the solver does not see this
+        return n >= 3
+
+    solution = lv.solve(problem, name, callback=callback, tol=0.0, max_iter=50)
+    assert solution.status is lv.Status.INTERRUPTED
+    assert [n for n, _ in seen] == [0, 1, 2, 3]
+    assert np.isfinite(solution.impulse).all()
+
+
+@pytest.mark.parametrize("name", RESUMABLE)
+def test_time_limit_returns_the_iterate(name):
+    problem = next(examples(registry.get(name)))
+    solution = lv.solve(problem, name, tol=0.0, max_iter=2**31 - 1, time_limit=0.05)
+    assert solution.status is lv.Status.TIME_LIMIT
+    assert solution.iterations > 0
+    assert solution.solve_time < 0.05 * 1.1 + 0.05
+
+
+@pytest.mark.parametrize("name", HERE)
+def test_legal_oddities_are_solved_or_refused_by_reason(name):
+    """0 rows, 1 row, all-static rows, zero rows of A, singular and indefinite A: a result or a CapabilityError."""
+    cases = [
+        lv.Problem.linear(np.zeros((0, 0)), []),
+        lv.Problem.lcp(np.zeros((0, 0)), []),
+        lv.Problem.linear([[2.0]], [1.0]),
+        lv.Problem.lcp([[2.0]], [1.0]),
+        lv.Problem.lcp([[2.0]], [-1.0]),
+        lv.Problem.lcp(np.diag([1.0, 0.0]), [1.0, -1.0]),
+        lv.Problem.lcp(np.diag([1.0, 0.0]), [1.0, 1.0], upper=3.0),
+        lv.Problem.lcp(np.ones((3, 3)), [1.0, 1.0, 1.0]),
+        lv.Problem.linear(np.ones((3, 3)), [1.0, 1.0, 1.0]),
+        lv.Problem.lcp([[0.0, 1.0], [1.0, 0.0]], [1.0, 1.0]),
+        lv.Problem.lcp([[-1.0, 2.0], [2.0, -1.0]], [1.0, 1.0]),
+        lv.Problem.lcp([[2.0, 1.0], [-1.0, 2.0]], [1.0, 1.0]),
+        lv.Problem.contact(np.diag([1.0, 0.0, 0.0]), [1.0, 0.2, 0.1], [0.5]),
+    ]
+    for problem in cases:
+        try:
+            solution = lv.solve(problem, name)
+        except lv.CapabilityError:
+            continue
+        assert np.isfinite(solution.impulse).all(), (problem, solution)
+        if name in OURS:
+            assert not solution.contradicted, (problem, solution)
+        if problem.m == 0:
+            assert solution.success
+
+
+@pytest.mark.parametrize("name", HERE)
+def test_a_row_that_nothing_can_meet_is_infeasible(name):
+    problem = lv.Problem.lcp(np.diag([1.0, 0.0]), [1.0, 1.0])
+    if registry.get(name).refuses(problem):
+        with pytest.raises(lv.CapabilityError):
+            lv.solve(problem, name)
+        return
+    solution = lv.solve(problem, name)
+    assert solution.status is lv.Status.INFEASIBLE
+    assert "row 1" in solution.message
+    assert check_certificate(problem, solution.certificate) is None
+    assert not solution.contradicted
+
+
+@pytest.mark.parametrize("name", OURS)
+def test_units_scale_the_result(name):
+    """The same problem in g, mm, ms: the impulse scales, the iterations stay."""
+    spec = registry.get(name)
+    for problem in examples(spec):
+        if problem.rows is not None:
+            continue
+        kg, speed = 2.0**-10, 2.0**7  # powers of two: no rounding
+        c = problem.cones
+        scale = speed * kg
+        scaled = lv.Problem(
+            problem.b * speed, lv.Cones(c.ptr, c.kind, c.lower * scale, c.upper * scale, c.mu, c.patch_radius),
+            problem.matrix / kg, friction=problem.friction,
+        )  # fmt: skip
+        x, y = (lv.solve(p, name, tol=1e-9, max_iter=budget(spec)) for p in (problem, scaled))
+        assert (x.status, x.iterations) == (y.status, y.iterations)
+        np.testing.assert_allclose(y.impulse / scale, x.impulse, atol=1e-7 * np.abs(x.impulse).max())
+
+
+@pytest.mark.parametrize("name", RESUMABLE)
+def test_one_solver_serves_two_threads(name):
+    problem = next(examples(registry.get(name)))
+    expected = lv.solve(problem, name, tol=0.0, max_iter=2000).impulse.tobytes()
+    results = [None, None]
+
+    def work(i):
+        results[i] = lv.solve(problem, name, tol=0.0, max_iter=2000).impulse.tobytes()
+
+    threads = [threading.Thread(target=work, args=(i,)) for i in range(2)]
+    [t.start() for t in threads]
+    [t.join() for t in threads]
+    assert results == [expected, expected]

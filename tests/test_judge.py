@@ -1,0 +1,397 @@
+"""The judge against a NumPy twin that shares nothing with it, and the laws its numbers must obey."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from random_problems import as_matrix, random_contact_problem, random_lcp, seeds
+
+import lavender as lv
+from lavender.residuals import check_certificate, natural_map, qp_residual
+
+# -- the twin --------------------------------------------------------------------------------------
+
+
+def twin_diagonal(a, cones, factored):
+    """d of DESIGN: A_ii, or a fallback, mean on a tangent pair."""
+    big = np.abs(a).max(axis=1, initial=0.0)
+    diag = np.diag(a).copy()
+    d = np.where(diag > (0.0 if factored else 1e-10 * big), diag, 0.0 if factored else big)
+    positive = d[d > 0]
+    d[d <= 0] = positive.mean() if len(positive) else 1.0
+    for i in range(cones.n_blocks):
+        j, nt = cones.ptr[i], cones.n_tangents[i]
+        if nt == 2:
+            d[j + 1 : j + 3] = d[j + 1 : j + 3].mean()
+    return d
+
+
+def disk(y, radius):
+    size = np.linalg.norm(y)
+    return y if size <= radius else y * (radius / size)
+
+
+def cone_projection(y, a_t, a_s, spin):
+    """Projection on |y_t| <= a_t y_n, |y_s| <= a_s y_n by brute force over the normal part."""
+    t = y[1:-1] if spin else y[1:]
+    s_ = y[-1] if spin else 0.0
+
+    def distance(s):
+        over_t = max(0.0, np.linalg.norm(t) - a_t * s)
+        over_s = max(0.0, abs(s_) - a_s * s)
+        return (s - y[0]) ** 2 + over_t**2 + over_s**2
+
+    low, high = 0.0, abs(y).sum() * 4 + 1.0
+    for _ in range(200):  # golden-free ternary search: the function is convex
+        a, b = low + (high - low) / 3, high - (high - low) / 3
+        low, high = (a, high) if distance(a) > distance(b) else (low, b)
+    s = 0.5 * (low + high)
+    out = [np.array([s]), disk(t, a_t * s)]
+    if spin:
+        out.append(np.clip([s_], -a_s * s, a_s * s))
+    return np.concatenate(out)
+
+
+def twin(problem, lam, inertia_weight=None):
+    """(E, V) by the formulas of DESIGN, dense and slow."""
+    a = problem.dense()
+    c = problem.cones
+    d = twin_diagonal(a, c, problem.rows is not None)
+    nu = d.copy()
+    if inertia_weight is not None:
+        nu = np.where(np.isnan(inertia_weight), d, inertia_weight)
+    w = a @ lam - problem.b
+    e = np.zeros(problem.m)
+    speeds = []
+    for i in range(c.n_blocks):
+        s = slice(c.ptr[i], c.ptr[i + 1])
+        l, ww, dd = lam[s], w[s], d[s]
+        if c.kind[i] == lv.ROW:
+            e[s] = l - np.clip(l - ww / dd, c.lower[s], c.upper[s])
+            speeds += list(np.sqrt(nu[s] * dd) * np.abs(e[s]))
+            continue
+        nt, spin = c.n_tangents[i], c.kind[i] == lv.CONTACT_SPIN
+        if spin:
+            nu[s.stop - 1] = dd[0]
+        mu, r = c.mu[i], c.patch_radius[i]
+        if problem.friction == "cone":
+            y = np.sqrt(dd) * (l - ww / dd)
+            a_t = mu * np.sqrt(dd[1] / dd[0]) if nt else 0.0
+            a_s = mu * r * np.sqrt(dd[-1] / dd[0])
+            e[s] = l - cone_projection(y, a_t, a_s, spin) / np.sqrt(dd)
+        else:
+            bound = mu * max(0.0, l[0])
+            e[s.start] = l[0] - max(0.0, l[0] - ww[0] / dd[0])
+            t = slice(1, 1 + nt)
+            e[s][t] = l[t] - disk(l[t] - ww[t] / dd[t], bound)
+            if spin:
+                e[s.stop - 1] = l[-1] - np.clip(l[-1] - ww[-1] / dd[-1], -r * bound, r * bound)
+        weight = np.sqrt(nu[s] * dd)
+        speeds.append(weight[0] * abs(e[s][0]))
+        if nt:
+            speeds.append(weight[1] * np.linalg.norm(e[s][1 : 1 + nt]))
+        if spin:
+            speeds.append(weight[-1] * abs(e[s][-1]))
+    return np.sqrt(np.sum(d * e * e)), max(speeds, default=0.0)
+
+
+def angular_weight(problem):
+    """1/m_a + 1/m_b on joint rows without linear entries, NaN elsewhere."""
+    rows = problem.rows
+    out = np.full(problem.m, np.nan)
+    body = np.repeat(rows.joint_body, np.diff(rows.joint_ptr), axis=0)
+    inv = np.append(rows.inv_mass, 0.0)  # body -1 reads the last entry
+    angular = ~rows.jac[:, [0, 1, 2, 6, 7, 8]].any(axis=1)
+    out[: len(body)][angular] = (inv[body[:, 0]] + inv[body[:, 1]])[angular]
+    return out
+
+
+@settings(max_examples=60)
+@given(seed=seeds)
+@pytest.mark.parametrize("friction", ["coulomb", "cone"])
+@pytest.mark.parametrize("spin", [False, True])
+def test_energy_and_velocity_equal_the_twin(friction, spin, seed):
+    problem = random_contact_problem(seed, friction, spin=spin)
+    lam = np.random.default_rng(seed + 1).normal(size=problem.m)
+    # The cone twin finds its projection by search: to the square root of rounding of a quadratic's minimum.
+    rtol = 1e-6 if friction == "cone" else 1e-12
+    for p, weight in ((problem, angular_weight(problem)), (as_matrix(problem), None)):
+        judged = lv.residual(p, lam)
+        energy, velocity = twin(p, lam, weight)
+        np.testing.assert_allclose([judged.energy, judged.velocity], [energy, velocity], rtol=rtol)
+        energy0, velocity0 = twin(p, p.start(), weight)
+        np.testing.assert_allclose(judged.relative, max(energy / energy0, velocity / velocity0), rtol=rtol)
+
+
+@given(seed=seeds)
+def test_slack_is_a_lambda_minus_b_in_both_forms(seed):
+    problem = random_contact_problem(seed)
+    lam = np.random.default_rng(seed).normal(size=problem.m)
+    jac = problem.jacobian.toarray()
+    minv = problem.rows.inverse_mass_matrix().toarray()
+    a = jac @ minv @ jac.T + np.diag(problem.compliance)
+    w = a @ lam - problem.b
+    scale = np.abs(a).sum() * np.abs(lam).max()
+    # 1e-14 of the size of what is added: a few roundings on a few dozen terms.
+    np.testing.assert_allclose(problem.slack(lam), w, atol=1e-14 * scale)
+    np.testing.assert_allclose(as_matrix(problem).slack(lam), w, atol=1e-14 * scale)
+    np.testing.assert_allclose(problem.dense(), a, atol=1e-14 * np.abs(a).max())
+    np.testing.assert_allclose(problem.velocity(lam).ravel(), problem.rows.v_free.ravel() + minv @ jac.T @ lam, atol=1e-13)
+
+
+# -- zero at solutions made by hand ------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("friction", ["coulomb", "cone"])
+@pytest.mark.parametrize("spin", [False, True])
+def test_zero_at_a_solution_made_by_hand(friction, spin):
+    """Choose lambda and a matching slack for open, sticking and sliding contacts; b follows."""
+    rng = np.random.default_rng(5)
+    size = 3 + spin
+    mu, r = np.array([0.5, 0.5, 0.8]), np.array([0.3, 0.3, 0.2])
+    m = 3 * size
+    g = rng.normal(size=(m, m))
+    a = g @ g.T
+    lam, w = np.zeros((3, size)), np.zeros((3, size))
+    w[0, 0] = 0.7  # open: lambda = 0, separating
+    if friction == "cone":
+        w[0, 0] = 10.0  # deep inside the dual cone, so that tangential velocity asks nothing
+    w[0, 1:3] = 0.1, -0.2
+    lam[1, 0], lam[1, 1:3] = 2.0, (0.3, 0.1)  # sticking, inside the disk
+    lam[2, 0] = 1.5  # sliding: tangent impulse opposite to slip, on the disk
+    slip = np.array([0.6, -0.8])
+    lam[2, 1:3] = -mu[2] * 1.5 * slip
+    w[2, 1:3] = 0.9 * slip
+    if friction == "cone":
+        w[2, 0] = mu[2] * 0.9  # the relaxation lifts a slider by mu |slip|
+    if spin:
+        lam[1, 3] = 0.01
+        lam[2, 3], w[2, 3] = mu[2] * r[2] * 1.5, -0.4
+        if friction == "cone":
+            w[2, 0] += mu[2] * r[2] * 0.4
+    b = a @ lam.ravel() - w.ravel()
+    problem = lv.Problem.contact(a, b, mu, patch_radius=r if spin else None, friction=friction)
+    judged = lv.residual(problem, lam.ravel())
+    # b is rounded once when it is formed, w once more: the floor says what that costs.
+    assert judged.relative <= 4 * judged.floor
+
+
+def test_zero_at_bounds_of_boxed_rows():
+    a = np.diag([2.0, 2.0, 2.0, 2.0])
+    problem = lv.Problem.lcp(a, [-1.0, 1.0, 9.0, -9.0], lower=[0, 0, -1, -1], upper=[np.inf, np.inf, 1, 1])
+    assert lv.residual(problem, [0.0, 0.5, 1.0, -1.0]).relative == 0.0
+
+
+# -- invariance ----------------------------------------------------------------------------------------
+
+
+@given(seed=seeds)
+@pytest.mark.parametrize("kg, m, s", [(1e3, 1.0, 1.0), (1.0, 1e3, 1.0), (1.0, 1.0, 1e3), (1e-6, 1e4, 1e-3)])
+def test_units_change_no_relative_residual(kg, m, s, seed):
+    """All-linear rows: A scales with 1/kg, b with m/s, lambda with kg m/s."""
+    problem = random_contact_problem(seed, spin=False, joints=0)
+    matrix = as_matrix(problem)
+    lam = np.random.default_rng(seed).normal(size=problem.m)
+    scaled = lv.Problem(problem.b * (m / s), problem.cones, problem.delassus() / kg)
+    judged, again = lv.residual(matrix, lam), lv.residual(scaled, lam * (kg * m / s))
+    np.testing.assert_allclose(again.relative, judged.relative, rtol=1e-12)  # roundings of the products
+    np.testing.assert_allclose(again.velocity, judged.velocity * m / s, rtol=1e-12)
+    np.testing.assert_allclose(again.energy, judged.energy * np.sqrt(kg) * m / s, rtol=1e-12)
+
+
+@pytest.mark.parametrize("scale", [1e-150, 1e-30, 1e30, 1e150])
+def test_extreme_units_neither_overflow_nor_underflow(scale):
+    problem = random_lcp(3)
+    lam = np.random.default_rng(0).normal(size=problem.m)
+    scaled = lv.Problem(problem.b * scale, lv.Cones.bounded(problem.cones.lower * scale, problem.cones.upper * scale), problem.matrix)
+    np.testing.assert_allclose(
+        lv.residual(scaled, lam * scale).relative, lv.residual(problem, lam).relative, rtol=1e-12
+    )
+
+
+@given(seed=seeds)
+def test_scaling_single_rows_leaves_the_energy_ratio_alone(seed):
+    """Row i in its own unit: A -> S A S, b -> S b, lambda -> lambda / S."""
+    problem = random_lcp(seed, boxed=True)
+    rng = np.random.default_rng(seed)
+    lam, s = rng.normal(size=problem.m), 10.0 ** rng.uniform(-3, 3, problem.m)
+    c = problem.cones
+    scaled = lv.Problem.lcp(s[:, None] * problem.matrix * s, s * problem.b, c.lower / s, c.upper / s)
+    x, y = lv.residual(problem, lam), lv.residual(scaled, lam / s)
+    np.testing.assert_allclose(y.energy / y.energy_start, x.energy / x.energy_start, rtol=1e-11)
+
+
+@given(seed=seeds)
+@pytest.mark.parametrize("friction", ["coulomb", "cone"])
+def test_rotating_the_tangent_frame_changes_nothing(friction, seed):
+    problem = random_contact_problem(seed, friction, tangents=2, joints=0)
+    rng = np.random.default_rng(seed)
+    lam = rng.normal(size=problem.m)
+    turn = np.eye(problem.m)
+    for i in range(problem.n_blocks):
+        j, angle = problem.cones.ptr[i], rng.uniform(0, 2 * np.pi)
+        turn[j + 1 : j + 3, j + 1 : j + 3] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+    a = turn @ problem.dense() @ turn.T
+    turned = lv.Problem(turn @ problem.b, problem.cones, a, friction=friction)
+    x, y = lv.residual(as_matrix(problem), lam), lv.residual(turned, turn @ lam)
+    np.testing.assert_allclose([y.relative, y.energy, y.velocity], [x.relative, x.energy, x.velocity], rtol=1e-11)
+
+
+def test_a_thousand_separating_rows_dilute_nothing():
+    problem = random_lcp(7, boxed=False)
+    lam = np.random.default_rng(1).uniform(size=problem.m)
+    m, n = problem.m, 1000
+    a = np.eye(m + n)
+    a[:m, :m] = problem.matrix
+    padded = lv.Problem.lcp(a, np.concatenate([problem.b, np.full(n, -5.0)]))
+    x, y = lv.residual(problem, lam), lv.residual(padded, np.concatenate([lam, np.zeros(n)]))
+    assert (x.relative, x.energy, x.velocity) == (y.relative, y.energy, y.velocity)
+
+
+def test_mass_ratio_hides_neither_the_light_nor_the_heavy_body():
+    """Two resting bodies, 1 kg and 1e6 kg; one of them ignored: its error is as large as doing nothing."""
+    a, b = np.diag([1.0, 1e-6]), np.array([0.1, 0.1])
+    problem = lv.Problem.lcp(a, b)
+    exact = np.array([0.1, 1e5])
+    assert lv.residual(problem, exact).relative <= lv.residual(problem, exact).floor
+    light_wrong, heavy_wrong = exact * [0.0, 1.0], exact * [1.0, 0.0]
+    light, heavy = lv.residual(problem, light_wrong), lv.residual(problem, heavy_wrong)
+    assert light.relative == pytest.approx(1.0)  # V sees it, E alone would say 1e-3
+    assert light.energy / light.energy_start < 2e-3
+    assert heavy.relative == pytest.approx(1.0)
+    assert (light.worst_row, heavy.worst_row) == (0, 1)
+
+
+# -- diagonals, b = 0, floor ---------------------------------------------------------------------------
+
+
+def test_diagonal_falls_back_where_it_must():
+    a = np.array([[0.0, 3.0, 0.0], [3.0, -1.0, 0.0], [0.0, 0.0, 0.0]])
+    np.testing.assert_array_equal(lv.Problem.lcp(a, np.zeros(3)).d, [3.0, 3.0, 3.0])
+    tiny = np.array([[1e-12, 1.0], [1.0, 2.0]])
+    np.testing.assert_array_equal(lv.Problem.lcp(tiny, np.zeros(2)).d, [1.0, 2.0])
+    np.testing.assert_array_equal(lv.Problem.lcp(np.zeros((2, 2)), np.zeros(2)).d, [1.0, 1.0])
+    pair = lv.Problem.contact(np.diag([1.0, 1.0, 10.0]), np.zeros(3), [0.5])
+    np.testing.assert_array_equal(pair.d, [1.0, 5.5, 5.5])
+
+
+@given(seed=seeds)
+def test_diagonal_equals_the_twin(seed):
+    problem = random_contact_problem(seed)
+    np.testing.assert_allclose(problem.d, twin_diagonal(problem.dense(), problem.cones, True), rtol=1e-13)
+    matrix = as_matrix(problem)
+    np.testing.assert_allclose(matrix.d, twin_diagonal(problem.dense(), problem.cones, False), rtol=1e-15)
+
+
+def test_nothing_to_do_and_nothing_done_is_no_error():
+    problem = lv.Problem.lcp(np.eye(3), np.zeros(3))
+    assert lv.residual(problem, np.zeros(3)).relative == 0.0
+    assert lv.residual(problem, np.ones(3)).relative == np.inf
+    # Doing nothing solves this one: the norms of b stand in.
+    resting = lv.Problem.lcp(np.eye(3), [-1.0, -2.0, -3.0])
+    assert lv.residual(resting, np.zeros(3)).relative == 0.0
+    assert lv.residual(resting, [1e-3, 0.0, 0.0]).relative == pytest.approx(1e-3 / 3.0)
+    empty = lv.Problem.lcp(np.zeros((0, 0)), [])
+    assert lv.residual(empty, []).relative == 0.0
+
+
+def test_lost_iterates_are_seen():
+    for friction in ("coulomb", "cone"):
+        problem = random_contact_problem(1, friction)
+        for bad in (np.nan, np.inf, -np.inf):
+            for row in range(problem.m):
+                lam = np.zeros(problem.m)
+                lam[row] = bad
+                assert lv.residual(problem, lam).relative == np.inf, (friction, bad, row)
+
+
+@given(seed=seeds)
+def test_floor_bounds_the_rounded_exact_solution(seed):
+    """A solution in long double, rounded to float64, scores at most twice the floor, and not far below it."""
+    rng = np.random.default_rng(seed)
+    m = 12
+    scale = 10.0 ** rng.uniform(-3, 3, m)
+    g = rng.normal(size=(m, m)) * scale[:, None]
+    a = np.round(g @ g.T, 12)
+    a = (a + a.T) / 2 + np.diag(scale**2)
+    b = rng.normal(size=m) * scale
+    x = np.linalg.solve(a, b)
+    la, lb, exact = a.astype(np.longdouble), b.astype(np.longdouble), x.astype(np.longdouble)
+    for _ in range(20):  # refinement: each step gains the digits of the float64 factorisation
+        exact += np.linalg.solve(a, (lb - la @ exact).astype(float))
+    judged = lv.residual(lv.Problem.linear(a, b), exact.astype(float))
+    assert judged.relative <= 2.0 * judged.floor
+    assert judged.floor <= 1e-6
+
+
+@given(seed=seeds)
+def test_floor_of_rows_is_a_little_above_that_of_the_matrix(seed):
+    problem = random_contact_problem(seed)
+    lam = np.random.default_rng(seed).normal(size=problem.m)
+    rows, matrix = lv.residual(problem, lam), lv.residual(as_matrix(problem), lam)
+    # |J||M^-1||J|^T |lam| >= |A||lam| entry by entry; the two judges weigh angular rows differently, so compare E.
+    ratio = rows.floor * rows.energy_start / (matrix.floor * matrix.energy_start)
+    assert ratio > 0.1
+    assert ratio < 100.0
+
+
+# -- other measures --------------------------------------------------------------------------------------
+
+
+def test_qp_residual_checks_the_sign_of_multipliers():
+    """min x^2 with x <= 1 and the multiplier -2: every residual but the sign is zero at the wrong point x = 1."""
+    problem = lv.Problem.lcp([[2.0]], [0.0], lower=-np.inf, upper=1.0)
+    wrong = qp_residual(problem, [1.0], [-2.0])
+    assert (wrong.primal, wrong.dual) == (0.0, 0.0)
+    assert wrong.sign == 2.0
+    assert qp_residual(problem, [0.0], [0.0]).worst == 0.0
+
+
+@given(seed=seeds)
+def test_natural_map_is_the_plain_formula(seed):
+    problem = random_lcp(seed)
+    lam = np.random.default_rng(seed).normal(size=problem.m)
+    c, w = problem.cones, problem.matrix @ lam - problem.b
+    expected = np.linalg.norm(lam - np.clip(lam - w, c.lower, c.upper))
+    np.testing.assert_allclose(natural_map(problem, lam), expected, rtol=1e-13)
+
+
+def test_certificates_are_checked():
+    a = np.array([[1.0, -1.0], [-1.0, 1.0]])
+    infeasible = lv.Problem.lcp(a, [1.0, 1.0])
+    assert check_certificate(infeasible, [1.0, 1.0]) is None
+    assert "not positive" in check_certificate(infeasible, [-1.0, -1.0])
+    assert "above rounding" in check_certificate(infeasible, [1.0, 0.5])
+    assert check_certificate(lv.Problem.lcp(a, [1.0, -2.0]), [1.0, 1.0]) is not None
+    free = lv.Problem.linear(a, [1.0, 1.0])
+    assert check_certificate(free, [1.0, 1.0]) is None
+    boxed = lv.Problem.lcp(a, [1.0, 1.0], upper=5.0)
+    assert "leaves the bounds" in check_certificate(boxed, [1.0, 1.0])
+
+
+def test_the_inequality_between_two_points_holds():
+    """|D|_A^2 <= |D|_A |eps|_A + |eps|_D |D|_D for symmetric PSD boxed problems (D = difference, eps = e1 - e2)."""
+    for seed in range(200):
+        problem = random_lcp(seed, rank=8)
+        rng = np.random.default_rng(seed)
+        x, y = rng.uniform(size=(2, problem.m))
+        d = problem.d
+        delta = x - y
+        eps = lv.residual(problem, x).error - lv.residual(problem, y).error
+        a = problem.matrix
+        norm_a = lambda v: np.sqrt(max(v @ a @ v, 0.0))  # noqa: E731
+        norm_d = lambda v: np.sqrt(v @ (d * v))  # noqa: E731
+        left = delta @ a @ delta
+        assert left <= (norm_a(delta) * norm_a(eps) + norm_d(eps) * norm_d(delta)) * (1 + 1e-12)
+
+
+def test_residual_reads_as_one_line_and_names_the_worst_row():
+    problem = random_contact_problem(0)
+    judged = lv.residual(problem, problem.start())
+    assert judged.worst_name == problem.row_name(judged.worst_row)
+    assert judged.worst_name in str(judged)
+    assert "\n" not in str(judged)
+    assert dataclasses.is_dataclass(judged)
+    by_row = judged.velocity_by_row
+    assert by_row.max() <= judged.velocity * (1 + 1e-12)

@@ -1,0 +1,337 @@
+"""Problems: what they derive, what they keep, and every kind of bad input by its message."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+from hypothesis import given
+from random_problems import as_matrix, random_contact_problem, random_lcp, random_rows, seeds
+
+import lavender as lv
+
+I2 = np.eye(2)
+
+
+# -- classes and forms -----------------------------------------------------------------------------------
+
+
+def test_the_class_follows_from_the_blocks():
+    assert lv.Problem.linear(I2, [1, 1]).law == "linear"
+    assert lv.Problem.lcp(I2, [1, 1]).law == "lcp"
+    assert lv.Problem.lcp(I2, [1, 1], lower=-np.inf).law == "linear"
+    assert lv.Problem.contact(I2, [1, 1], [0.5, 0.5]).law == "lcp"  # normals only
+    assert lv.Problem.contact(I2, [1, 1], [0.5]).law == "coulomb"
+    assert lv.Problem.contact(I2, [1, 1], [0.5], friction="cone").law == "cone"
+    assert lv.Problem.contact(I2, [1, 1], [0.5], patch_radius=[0.1]).law == "coulomb"
+
+
+def test_the_matrix_is_kept_as_given():
+    a = np.array([[1.0, 2.0], [0.5, -1.0]])
+    problem = lv.Problem.lcp(a, [1.0, 1.0])
+    assert problem.delassus() is problem.matrix
+    a[0, 0] = 99.0  # the caller's array is not ours
+    assert problem.matrix[0, 0] == 1.0
+    with pytest.raises(ValueError, match="read-only"):
+        problem.matrix[0, 0] = 3.0
+    adopted = np.ascontiguousarray(a)
+    problem = lv.Problem.lcp(adopted, [1.0, 1.0], copy=False)
+    assert problem.matrix is adopted
+    assert not adopted.flags.writeable
+
+
+@pytest.mark.parametrize("form", [sp.csr_array, sp.csc_array, sp.coo_array, sp.csr_matrix])
+def test_sparse_formats_mean_the_same(form):
+    problem = random_lcp(3)
+    sparse = lv.Problem(problem.b, problem.cones, form(problem.matrix))
+    np.testing.assert_array_equal(sparse.dense(), problem.matrix)
+    x, y = (lv.solve(p, "pgs", tol=0.0, max_iter=9).impulse for p in (problem, sparse))
+    assert x.tobytes() == y.tobytes()
+
+
+def test_duplicate_entries_add_up():
+    a = sp.coo_array(([1.0, 1.0, 2.0], ([0, 0, 1], [0, 0, 1])), shape=(2, 2))
+    np.testing.assert_array_equal(lv.Problem.lcp(a, [1, 1]).dense(), 2 * I2)
+
+
+@given(seed=seeds)
+def test_velocity_form_is_the_same_problem(seed):
+    problem = random_contact_problem(seed)
+    form = problem.velocity_form()
+    k, s = form.jacobian.toarray(), form.scale
+    a = (k @ k.T + np.diag(form.theta)) / np.outer(s, s)
+    np.testing.assert_allclose(a, problem.dense(), atol=1e-12 * np.abs(a).max())
+    np.testing.assert_allclose(form.rhs / s, problem.b, rtol=1e-14)
+    z = np.ones(problem.m)
+    np.testing.assert_allclose(form.impulse(z), s)
+
+
+def test_from_rows_forms_b_from_target_and_free_velocity():
+    rng = np.random.default_rng(2)
+    rows = random_rows(rng)
+    problem = lv.Problem.from_rows(rows, target=0.25, mu=0.3, tangents=2)
+    np.testing.assert_allclose(problem.b, 0.25 - problem.jacobian @ rows.v_free.ravel(), atol=1e-13)
+    # w is then the relative velocity after the step minus its target.
+    lam = rng.normal(size=problem.m)
+    after = problem.jacobian @ problem.velocity(lam).ravel()
+    np.testing.assert_allclose(problem.slack(lam), after - 0.25, atol=1e-11)
+
+
+def test_relaxed_and_boxed_change_the_law_alone():
+    problem = random_contact_problem(4, tangents=2, spin=True)
+    cone = problem.relaxed("cone")
+    assert (cone.law, cone.relaxed("coulomb")) == ("cone", problem)
+    c = problem.rows.n_contacts
+    boxed = problem.boxed(np.full(c, 2.0))
+    assert boxed.law == "lcp"
+    i = problem.rows.n_joints
+    j, mu, r = problem.cones.ptr[i], problem.cones.mu[i], problem.cones.patch_radius[i]
+    np.testing.assert_allclose(boxed.cones.upper[j : j + 4], [np.inf, 2 * mu, 2 * mu, 2 * mu * r])
+    np.testing.assert_allclose(boxed.cones.lower[j : j + 4], [0.0, -2 * mu, -2 * mu, -2 * mu * r])
+    with pytest.raises(lv.InputError, match="negative"):
+        problem.boxed(np.full(c, -1.0))
+
+
+def test_equality_is_of_values():
+    assert random_contact_problem(1) == random_contact_problem(1)
+    assert random_contact_problem(1) != random_contact_problem(2)
+    assert as_matrix(random_contact_problem(1)) != random_contact_problem(1)
+    p = random_lcp(1)
+    assert p != lv.Problem(p.b, p.cones, p.matrix, guess=np.zeros(p.m))
+    assert p != lv.Problem(p.b, p.cones, sp.csr_array(p.matrix))
+
+
+def test_rows_have_names():
+    problem = random_contact_problem(6, tangents=2, spin=True)
+    kj = problem.rows.n_joints
+    first = int(problem.cones.ptr[kj])
+    assert [problem.row_name(first + i) for i in range(4)] == [
+        "contact 0, normal", "contact 0, tangent 1", "contact 0, tangent 2", "contact 0, spin",
+    ]  # fmt: skip
+    named = lv.Problem(
+        problem.b, problem.cones, rows=problem.rows, names=[f"hinge {i}" for i in range(kj)] + ["box 1 on box 2"] * 8
+    )
+    wide = int(np.argmax(np.diff(problem.cones.ptr[: kj + 1]) > 1))
+    assert named.row_name(int(problem.cones.ptr[wide]) + 1) == f"hinge {wide}, axis 1"
+    assert named.row_name(first) == "box 1 on box 2, normal"
+    assert random_lcp(1).row_name(3) == "row 3"
+    with pytest.raises(lv.InputError, match="row 99"):
+        random_lcp(1).row_name(99)
+
+
+def test_static_bodies_and_pinned_bodies_are_legal():
+    """All-static rows are empty rows of A; a body of infinite mass gives none of its own."""
+    rows = lv.Rows(
+        inv_mass=[0.0], inv_inertia=np.zeros((1, 3, 3)), v_free=np.ones((1, 6)), normal=[[0, 0, 1.0]] * 2,
+        tangent=[[1.0, 0, 0]] * 2, arm_a=np.zeros((2, 3)), arm_b=np.zeros((2, 3)), contact_body=[[-1, -1], [-1, 0]],
+    )  # fmt: skip
+    problem = lv.Problem.from_rows(rows, target=[0.0, -1.0])
+    assert not problem.csr.toarray().any()
+    np.testing.assert_array_equal(problem.d, [1.0, 1.0])
+    assert lv.solve(problem, "sequential_impulses").success
+
+
+# -- bad input ---------------------------------------------------------------------------------------------
+
+NAN, INF = np.nan, np.inf
+BAD_PROBLEMS = {
+    "NaN in A": (lambda: lv.Problem.lcp([[NAN, 0], [0, 1]], [1, 1]), r"A \[1/kg\] must be finite; entry \[0, 0\] is nan"),
+    "inf in sparse A": (lambda: lv.Problem.lcp(sp.csr_array([[INF, 0], [0, 1.0]]), [1, 1]), "must be finite"),
+    "NaN in b": (lambda: lv.Problem.lcp(I2, [1, NAN]), r"b \[m/s\] must be finite; entry \[1\]"),
+    "not square": (lambda: lv.Problem.lcp(np.ones((2, 3)), [1, 1]), r"shape \(2, 3\); \(2, 2\) is needed"),
+    "sparse, not square": (lambda: lv.Problem.lcp(sp.csr_array(np.ones((2, 3))), [1, 1]), r"\(2, 2\) is needed"),
+    "A and b disagree": (lambda: lv.Problem.lcp(I2, [1, 1, 1]), r"\(3, 3\) is needed"),
+    "complex A": (lambda: lv.Problem.lcp(I2 * 1j, [1, 1]), "complex"),
+    "text": (lambda: lv.Problem.lcp([["x"]], [1]), "real numbers"),
+    "ragged": (lambda: lv.Problem.lcp([[1], [1, 2]], [1, 1]), "not an array"),
+    "lower > upper": (lambda: lv.Problem.lcp(I2, [1, 1], 2.0, 1.0), "row 0: lower = 2.0, upper = 1.0"),
+    "lower = inf": (lambda: lv.Problem.lcp(I2, [1, 1], INF, INF), "a number between"),
+    "NaN bound": (lambda: lv.Problem.lcp(I2, [1, 1], [0, NAN]), r"lower must not be NaN; entry \[1\]"),
+    "bounds of wrong length": (lambda: lv.Problem.lcp(I2, [1, 1], [0, 0, 0]), r"\(2,\) is needed"),
+    "negative mu": (lambda: lv.Problem.contact(np.eye(3), np.ones(3), [-0.1]), r"mu must not be negative; entry \[0\]"),
+    "infinite mu": (lambda: lv.Problem.contact(np.eye(3), np.ones(3), [INF]), "mu must be finite"),
+    "negative radius": (lambda: lv.Problem.contact(np.eye(4), np.ones(4), [1], [-1]), "patch_radius must not be negative"),
+    "rows per contact": (lambda: lv.Problem.contact(np.eye(5), np.ones(5), [1, 1]), "5 rows for 2"),
+    "five rows": (lambda: lv.Problem.contact(np.eye(5), np.ones(5), [1]), "up to two tangents"),
+    "law": (lambda: lv.Problem.contact(np.eye(3), np.ones(3), [1], friction="couloumb"), "'coulomb' or 'cone'"),
+    "guess": (lambda: lv.Problem.lcp(I2, [1, 1], guess=[1.0]), r"guess \[N s\] has shape \(1,\)"),
+    "NaN guess": (lambda: lv.Problem.lcp(I2, [1, 1], guess=[1.0, NAN]), "guess .* finite"),
+    "names": (lambda: lv.Problem.lcp(I2, [1, 1], names=["a"]), "1 names for 2 blocks"),
+    "key": (lambda: lv.Problem.lcp(I2, [1, 1], key=[-1, 2]), "unsigned"),
+    "compliance": (lambda: lv.Problem.lcp(I2, [1, 1], compliance=[1, 1]), "already on the diagonal"),
+    "both forms": (lambda: lv.Problem(np.ones(2), lv.Cones.free(2), I2, rows=random_rows(np.random.default_rng(0))), "one of them"),
+    "neither form": (lambda: lv.Problem(np.ones(2), lv.Cones.free(2)), "one of them"),
+    "cones": (lambda: lv.Problem(np.ones(2), None, I2), "a Cones is needed"),
+    "kind": (lambda: lv.Cones([0, 1], [7], [0], [1], [0], [0]), r"\[7\]"),
+    "ptr": (lambda: lv.Cones([0, 2, 1], [0, 0], [0], [1], [0, 0], [0, 0]), "increase"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_PROBLEMS)
+def test_bad_problems_say_what_came_and_what_was_needed(case):
+    make, message = BAD_PROBLEMS[case]
+    with pytest.raises(lv.InputError, match=message) as raised:
+        make()
+    assert isinstance(raised.value, ValueError)
+    assert isinstance(raised.value, lv.LavenderError)
+
+
+def rows_with(**changes):
+    rows = random_rows(np.random.default_rng(0))
+    values = {f: getattr(rows, f) for f in rows.__dataclass_fields__ if f != "copy"}
+    return lv.Rows(**{**values, **changes})
+
+
+BAD_ROWS = {
+    "missing body": ({"contact_body": np.full((8, 2), [0, 9])}, "body 9; there are 5 bodies"),
+    "body -2": ({"contact_body": np.full((8, 2), [0, -2])}, "body -2"),
+    "itself": ({"contact_body": np.full((8, 2), [3, 3])}, "joins body 3 to itself"),
+    "negative mass": ({"inv_mass": -np.ones(5)}, "inv_mass must not be negative"),
+    "normal": ({"normal": np.tile([0, 0, 2.0], (8, 1))}, "orthogonal unit vectors"),
+    "tangent": ({"tangent": np.tile([0, 0, 1.0], (8, 1)), "normal": np.tile([0, 0, 1.0], (8, 1))}, "orthogonal"),
+    "arms": ({"arm_a": np.zeros((7, 3))}, r"\(8, 3\) is needed"),
+    "velocity": ({"v_free": np.full((5, 6), NAN)}, "v_free must be finite"),
+    "jac": ({"jac": np.zeros((1, 12))}, "jac has shape"),
+    "fractional body": ({"contact_body": np.full((8, 2), 0.5)}, "whole numbers"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_ROWS)
+def test_bad_rows_say_what_came_and_what_was_needed(case):
+    changes, message = BAD_ROWS[case]
+    with pytest.raises(lv.InputError, match=message):
+        rows_with(**changes)
+
+
+BAD_CALLS = {
+    "negative tol": ({"tol": -1e-3}, lv.InputError, "tol is -0.001"),
+    "NaN tol": ({"tol": NAN}, lv.InputError, "tol is nan"),
+    "tol as text": ({"tol": "tight"}, lv.InputError, "'tight'"),
+    "negative max_iter": ({"max_iter": -1}, lv.InputError, "max_iter is -1"),
+    "fractional max_iter": ({"max_iter": 2.5}, lv.InputError, "max_iter is 2.5"),
+    "zero time": ({"time_limit": 0.0}, lv.InputError, "time_limit is 0.0"),
+    "short warm start": ({"impulse": [1.0]}, lv.InputError, r"impulse \[N s\] has shape \(1,\); \(12,\) is needed"),
+    "NaN warm start": ({"impulse": [NAN] * 12}, lv.InputError, "must be finite"),
+    "seed": ({"order": "random", "seed": -1}, lv.InputError, "seed is -1"),
+    "ground": ({"order": "given", "ground": [0]}, lv.InputError, "bottom_up"),
+    "unknown option": ({"omga": 1.0}, lv.UnknownName, "omga"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_CALLS)
+def test_bad_calls_say_what_came_and_what_was_needed(case):
+    options, kind, message = BAD_CALLS[case]
+    with pytest.raises(kind, match=message):
+        lv.solve(random_lcp(0), "pgs", **options)
+
+
+def test_an_unknown_solver_gets_the_nearest_names():
+    with pytest.raises(lv.UnknownName, match="did you mean 'jacobi'") as raised:
+        lv.solve(random_lcp(0), "jakobi")
+    assert isinstance(raised.value, KeyError)
+    with pytest.raises(lv.InputError, match="Problem is needed"):
+        lv.solve(I2, "pgs")
+    with pytest.raises(lv.InputError, match="capability 'fast'"):
+        lv.available(fast=True)
+    with pytest.raises(lv.UnknownName, match="law"):
+        lv.available(law="ncp")
+
+
+def test_raise_for_status():
+    problem = random_lcp(0)
+    good = lv.solve(problem, "pgs", tol=1e-6, max_iter=20_000)
+    assert good.raise_for_status() is good
+    with pytest.raises(lv.SolveFailed, match="MAX_ITERATIONS"):
+        lv.solve(problem, "pgs", tol=1e-12, max_iter=1).raise_for_status()
+
+
+# -- the registry --------------------------------------------------------------------------------------------
+
+
+def test_a_plug_in_is_registered_and_solved_with(monkeypatch):
+    class Zero:
+        def prepare(self, problem):
+            return problem
+
+        update = run = None
+
+        def run(self, state, impulse, n, tol, time_limit):  # noqa: F811
+            impulse[:] = 0.0
+            return lv.Claim(lv.Status.CONVERGED, 1, {"nothing": 1})
+
+    spec = lv.SolverSpec("zero", Zero, {"linear", "lcp"}, "does nothing, and claims to be done", resumable=False)
+    from lavender import registry
+
+    monkeypatch.setattr(registry, "_registered", dict(registry.specs()))
+    lv.register(spec)
+    with pytest.raises(lv.InputError, match="registered already"):
+        lv.register(spec)
+    lv.register(spec, replace=True)
+    problem = lv.Problem.lcp(I2, [1.0, 1.0])
+    assert "zero" in lv.available(problem)
+    solution = lv.solve(problem, "zero")
+    assert not solution.success
+    assert "CONTRADICTED" in str(solution)
+    assert "says CONVERGED" in solution.contradicted
+    with pytest.raises(lv.InputError, match="SolverSpec"):
+        lv.register("pgs")
+    with pytest.raises(lv.InputError, match="laws"):
+        lv.SolverSpec("odd", Zero, {"quadratic"}, "")
+
+
+def test_a_broken_plug_in_warns_by_name_and_breaks_nothing(tmp_path):
+    info = tmp_path / "broken-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: broken\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text("[lavender.solvers]\nbroken = no_such_module:SPEC\n")
+    code = (
+        f"import sys; sys.path.insert(0, {str(tmp_path)!r})\n"
+        "import warnings, lavender as lv\n"
+        "with warnings.catch_warnings(record=True) as w:\n"
+        "    warnings.simplefilter('always')\n"
+        "    names = lv.available()\n"
+        "assert 'pgs' in names\n"
+        "assert any(\"'broken'\" in str(x.message) for x in w), [str(x.message) for x in w]\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_import_is_light():
+    code = (
+        "import sys, lavender; lavender.available()\n"
+        "heavy = {'matplotlib', 'qpsolvers', 'osqp', 'clarabel', 'h5py', 'qdldl', 'rich', 'click', 'pandas'} & set(sys.modules)\n"
+        "assert not heavy, heavy\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_ctrl_c_returns_the_iterate(monkeypatch):
+    front_door = sys.modules[lv.solve.__module__]  # the function shadows its module
+    problem = random_lcp(0)
+    calls = []
+    original = front_door._Loop._next_chunk
+
+    def interrupt(self, n, elapsed):
+        calls.append(n)
+        if len(calls) == 3:
+            raise KeyboardInterrupt
+        return original(self, n, elapsed)
+
+    monkeypatch.setattr(front_door._Loop, "_next_chunk", interrupt)
+    solution = lv.solve(problem, "pgs", tol=0.0, max_iter=2**31 - 1)
+    assert solution.status is lv.Status.INTERRUPTED
+    assert solution.iterations > 0
+    assert solution.residual.relative < 1.0
+
+
+def test_ctrl_c_from_a_real_signal(tmp_path):
+    code = (
+        "import _thread, threading, numpy as np, lavender as lv\n"
+        "problem = lv.Problem.lcp(np.eye(3) * 2 - np.eye(3, k=1) - np.eye(3, k=-1), [1.0, 1.0, 1.0])\n"
+        "threading.Timer(0.3, _thread.interrupt_main).start()\n"
+        "solution = lv.solve(problem, 'pgs', tol=0.0, max_iter=2**31 - 1)\n"
+        "assert solution.status is lv.Status.INTERRUPTED, solution\n"
+        "assert solution.iterations > 1000 and solution.residual.relative < 1e-9, solution\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)

@@ -1,0 +1,282 @@
+"""Sweep solvers against a dense slow twin, each other, and closed forms."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from random_problems import as_matrix, random_contact_problem, random_lcp, seeds
+
+import lavender as lv
+from lavender.ordering import ORDERS, block_order, colors, levels
+
+# -- the twin ------------------------------------------------------------------------------------------
+
+
+def twin_sweep(problem, a, lam, blocks):
+    """One sweep of DESIGN section 2, dense and slow, in place."""
+    c, d, b = problem.cones, problem.d, problem.b
+    for i in blocks:
+        j, end, nt = c.ptr[i], c.ptr[i + 1], c.n_tangents[i]
+        if c.kind[i] == lv.ROW:
+            for q in range(j, end):
+                lam[q] = np.clip(lam[q] - (a[q] @ lam - b[q]) / d[q], c.lower[q], c.upper[q])
+            continue
+        lam[j] = max(0.0, lam[j] - (a[j] @ lam - b[j]) / d[j])
+        t = slice(j + 1, j + 1 + nt)
+        if nt:
+            step = 1.0 / np.linalg.eigvalsh(0.5 * (a[t, t] + a[t, t].T)).max()
+            y = lam[t] - step * (a[t] @ lam - b[t])
+            size, bound = np.linalg.norm(y), c.mu[i] * lam[j]
+            lam[t] = y if size <= bound else y * bound / size
+        if c.kind[i] == lv.CONTACT_SPIN:
+            s, bound = end - 1, c.mu[i] * c.patch_radius[i] * lam[j]
+            lam[s] = np.clip(lam[s] - (a[s] @ lam - b[s]) / d[s], -bound, bound)
+
+
+def sweeps(problem, name, n, **options):
+    return lv.solve(problem, name, tol=0.0, max_iter=n, **options).impulse
+
+
+@settings(max_examples=60)
+@given(seed=seeds)
+def test_a_sweep_is_the_update_written_densely(seed):
+    problem = random_contact_problem(seed)
+    lam = problem.start()
+    a = problem.dense()
+    for _ in range(5):
+        twin_sweep(problem, a, lam, range(problem.n_blocks))
+    # 1e-12 of the largest impulse: a few hundred roundings, none amplified by a contraction.
+    atol = 1e-12 * np.abs(lam).max()
+    np.testing.assert_allclose(sweeps(problem, "sequential_impulses", 5), lam, atol=atol, rtol=0)
+    np.testing.assert_allclose(sweeps(problem, "pgs", 5), lam, atol=atol, rtol=0)
+    np.testing.assert_allclose(sweeps(as_matrix(problem), "pgs", 5), lam, atol=atol, rtol=0)
+
+
+@pytest.mark.parametrize("order", ORDERS)
+@given(seed=seeds)
+def test_sequential_impulses_equal_pgs_on_every_order(order, seed):
+    problem = random_contact_problem(seed)
+    x = sweeps(problem, "sequential_impulses", 200, order=order)
+    y = sweeps(problem, "pgs", 200, order=order)
+    np.testing.assert_allclose(x, y, atol=1e-12 * np.abs(y).max(), rtol=0)
+
+
+def test_sequential_impulses_equal_pgs_for_ten_thousand_sweeps():
+    problem = random_contact_problem(11, bodies=8, contacts=16)
+    for order in ("given", "random", "symmetric"):
+        x = sweeps(problem, "sequential_impulses", 10_000, order=order)
+        y = sweeps(problem, "pgs", 10_000, order=order)
+        np.testing.assert_allclose(x, y, atol=1e-12 * np.abs(y).max(), rtol=0)
+
+
+@given(seed=seeds)
+@pytest.mark.parametrize("name", ["pgs", "jacobi"])
+def test_row_order_given_by_name_or_by_numbers_is_the_same(name, seed):
+    problem = random_lcp(seed)
+    if name == "pgs":
+        np.testing.assert_array_equal(sweeps(problem, name, 7), sweeps(problem, name, 7, order=np.arange(problem.n_blocks)))
+    permutation = np.random.default_rng(seed).permutation(problem.m)
+    c = problem.cones
+    permuted = lv.Problem.lcp(
+        problem.matrix[np.ix_(permutation, permutation)], problem.b[permutation], c.lower[permutation], c.upper[permutation]
+    )
+    x = sweeps(problem, name, 7, **({"order": permutation} if name == "pgs" else {}))
+    # Sweeping P A P^T forwards is sweeping A in the order P, up to the order of additions.
+    np.testing.assert_allclose(sweeps(permuted, name, 7), x[permutation], atol=1e-12 * np.abs(x).max())
+
+
+@given(seed=seeds)
+def test_gauss_seidel_and_sor_are_their_formulas(seed):
+    problem = random_lcp(seed, boxed=False)
+    a, b = problem.matrix, problem.b
+    linear = lv.Problem.linear(a, b)
+    for name, omega, options in (("gauss_seidel", 1.0, {}), ("sor", 1.3, {"omega": 1.3})):
+        lam = np.zeros(len(b))
+        for _ in range(3):
+            for i in range(len(b)):
+                lam[i] -= omega * (a[i] @ lam - b[i]) / a[i, i]
+        np.testing.assert_allclose(sweeps(linear, name, 3, **options), lam, atol=1e-12 * np.abs(lam).max())
+
+
+@given(seed=seeds)
+def test_jacobi_is_its_formula(seed):
+    problem = random_lcp(seed)
+    a, b, c = problem.matrix, problem.b, problem.cones
+    lam = np.zeros(len(b))
+    for _ in range(4):
+        lam = np.clip(lam - 0.3 * (a @ lam - b) / np.diag(a), c.lower, c.upper)
+    np.testing.assert_allclose(sweeps(problem, "jacobi", 4, omega=0.3), lam, atol=1e-12 * (1 + np.abs(lam).max()))
+
+
+# -- tangent blocks -------------------------------------------------------------------------------------
+
+BLOCKS = {
+    "diag(1, 10)": np.diag([1.0, 10.0]),
+    "diag(1, 100)": np.diag([1.0, 100.0]),
+    "rank 1": np.outer([1.0, 2.0], [1.0, 2.0]),
+    "nearly rank 1": np.outer([1.0, 2.0], [1.0, 2.0]) + 1e-3 * np.eye(2),
+}
+
+
+@pytest.mark.parametrize("name", BLOCKS)
+@pytest.mark.parametrize("slip", [0.0, 0.2, 30.0], ids=["rest", "stick", "slide"])
+@pytest.mark.parametrize("solver", ["pgs", "jacobi"])
+def test_anisotropic_tangents_converge_to_the_right_point(solver, name, slip):
+    a = np.zeros((3, 3))
+    a[0, 0], a[1:, 1:] = 1.0, BLOCKS[name]
+    # Tangential velocity in the range of the block, so that sticking is possible where it is singular.
+    b = np.concatenate([[1.0], -BLOCKS[name] @ [0.6 * slip, 0.3 * slip]])
+    solution = lv.solve(lv.Problem.contact(a, b, [0.5]), solver, tol=1e-12, max_iter=200_000)
+    assert solution.success, solution
+    bound = 0.5 * solution.impulse[0]
+    size = np.linalg.norm(solution.impulse[1:])
+    w = solution.slack[1:]
+    if slip == 30.0:
+        assert size == pytest.approx(bound, rel=1e-12)
+        # Sliding: the tangent impulse opposes the slip.
+        cross = solution.impulse[1] * w[1] - solution.impulse[2] * w[0]
+        assert abs(cross) <= 1e-9 * size * np.linalg.norm(w)
+        assert solution.impulse[1:] @ w < 0.0
+    else:
+        assert size <= bound
+
+
+@given(seed=seeds)
+def test_friction_problems_converge_and_both_forms_agree(seed):
+    problem = random_contact_problem(seed)
+    solution = lv.solve(problem, "sequential_impulses", tol=1e-9, max_iter=50_000)
+    assert solution.success, solution
+    assert lv.residual(as_matrix(problem), solution.impulse).relative <= 1e-6
+
+
+# -- laws (closed forms) ----------------------------------------------------------------------------------
+
+
+def stacked_boxes(n):
+    """n equal masses, one point contact each, normals only: tridiagonal A = 1, 2, 2, ... / m."""
+    a = 2.0 * np.eye(n) - np.eye(n, k=1) - np.eye(n, k=-1)
+    a[0, 0] = 1.0
+    b = np.zeros(n)
+    b[0] = 0.1
+    return lv.Problem.lcp(a, b)
+
+
+def contraction(problem, name, first, last, **options):
+    exact = np.linalg.solve(problem.dense(), problem.b)
+    x, y = (sweeps(problem, name, n, **options) - exact for n in (first, last))
+    return (np.linalg.norm(y) / np.linalg.norm(x)) ** (1.0 / (last - first))
+
+
+@pytest.mark.parametrize("n", [2, 5, 10, 20])
+@pytest.mark.parametrize("order", ["given", "reverse"])
+def test_stack_contracts_by_cos_squared(n, order):
+    """n equal boxes, one point each: the asymptotic Gauss-Seidel factor is cos^2(pi / 2n)."""
+    problem = stacked_boxes(n)
+    rate = contraction(problem, "pgs", 2 * n * n, 3 * n * n, order=order)
+    jacobi = np.eye(n) - problem.matrix / np.diag(problem.matrix)[:, None]
+    # Consistently ordered: the Gauss-Seidel factor is the square of the Jacobi one (Young 1971).
+    assert rate == pytest.approx(np.abs(np.linalg.eigvals(jacobi)).max() ** 2, rel=1e-3)
+    assert rate == pytest.approx(np.cos(np.pi / (2 * n)) ** 2, rel=2e-3)
+
+
+@pytest.mark.parametrize("ratio", [1.0, 10.0, 100.0])
+def test_heavy_on_light_contracts_by_r_over_one_plus_r(ratio):
+    """Mass R on mass 1 on the ground: A = [[1, -1], [-1, 1 + 1/R]]."""
+    problem = lv.Problem.lcp([[1.0, -1.0], [-1.0, 1.0 + 1.0 / ratio]], [0.1, 0.0])
+    assert contraction(problem, "pgs", 2, 6) == pytest.approx(ratio / (1.0 + ratio), rel=1e-9)
+
+
+@pytest.mark.parametrize("k", [2, 3, 5])
+def test_coincident_contacts_defeat_undamped_jacobi(k):
+    """k contacts at one place: A is all ones. Unprojected factor k - 1; projected from 0, period 2."""
+    a, b = np.ones((k, k)), np.ones(k)
+    free = lv.Problem.linear(a, b)
+    size = [abs(lv.solve(free, "jacobi", omega=1.0, tol=0.0, max_iter=n).slack[0]) for n in (3, 4)]
+    assert size[1] / size[0] == pytest.approx(k - 1.0)
+    lcp = lv.Problem.lcp(a, b)
+    for n in range(4):
+        np.testing.assert_array_equal(sweeps(lcp, "jacobi", n, omega=1.0), np.full(k, float(n % 2)))
+    assert lv.solve(lcp, "jacobi", omega=1.0, tol=1e-6).status is lv.Status.STALLED
+    assert lv.solve(lcp, "jacobi", tol=1e-9).success
+
+
+# -- orders ------------------------------------------------------------------------------------------------
+
+
+@given(seed=seeds)
+@pytest.mark.parametrize("order", ORDERS)
+def test_named_orders_are_permutations_with_joints_first(order, seed):
+    problem = random_contact_problem(seed)
+    o = block_order(problem, order, seed=seed)
+    assert sorted(o.blocks.tolist()) == list(range(problem.n_blocks))
+    assert o.split == problem.rows.n_joints
+    assert sorted(o.blocks[: o.split].tolist()) == list(range(o.split))
+
+
+@given(seed=seeds)
+def test_colors_share_no_moving_body(seed):
+    problem = random_contact_problem(seed, bodies=6, contacts=20)
+    o = block_order(problem, "colored")
+    body = np.concatenate([problem.rows.joint_body, problem.rows.contact_body])
+    assert o.color_ptr[0] == 0
+    assert o.color_ptr[-1] == problem.n_blocks
+    for first, end in zip(o.color_ptr[:-1], o.color_ptr[1:], strict=True):
+        moving = body[o.blocks[first:end]].ravel()
+        moving = moving[moving >= 0]
+        assert len(moving) == len(set(moving.tolist()))
+
+
+@given(seed=seeds)
+def test_colors_of_a_matrix_share_no_entry(seed):
+    problem = as_matrix(random_contact_problem(seed, bodies=6, contacts=20))
+    color, a, ptr = colors(problem), problem.dense(), problem.cones.ptr
+    for i in range(problem.n_blocks):
+        for j in range(i):
+            if color[i] == color[j]:
+                assert not a[ptr[i] : ptr[i + 1], ptr[j] : ptr[j + 1]].any()
+
+
+def test_more_than_63_colors_are_found():
+    """100 contacts of one body with 100 others: every one needs its own colour."""
+    n = 100
+    rng = np.random.default_rng(0)
+    normal = np.tile([0.0, 0.0, 1.0], (n, 1))
+    rows = lv.Rows(
+        inv_mass=np.ones(n + 1), inv_inertia=np.tile(np.eye(3), (n + 1, 1, 1)), v_free=rng.normal(size=(n + 1, 6)),
+        normal=normal, tangent=np.tile([1.0, 0.0, 0.0], (n, 1)), arm_a=np.zeros((n, 3)), arm_b=np.zeros((n, 3)),
+        contact_body=np.stack([np.zeros(n), np.arange(1, n + 1)], axis=1),
+    )  # fmt: skip
+    assert sorted(colors(lv.Problem.from_rows(rows)).tolist()) == list(range(n))
+
+
+def test_levels_count_from_the_ground():
+    n = 6
+    body = np.stack([np.arange(-1, n - 1), np.arange(n)], axis=1)
+    shuffled = np.random.default_rng(3).permutation(n)
+    rows = lv.Rows(
+        inv_mass=np.ones(n), inv_inertia=np.tile(np.eye(3), (n, 1, 1)), v_free=np.zeros((n, 6)),
+        normal=np.tile([0.0, 0.0, 1.0], (n, 1)), tangent=np.tile([1.0, 0.0, 0.0], (n, 1)),
+        arm_a=np.zeros((n, 3)), arm_b=np.zeros((n, 3)), contact_body=body[shuffled],
+    )  # fmt: skip
+    problem = lv.Problem.from_rows(rows)
+    np.testing.assert_array_equal(levels(problem), shuffled)
+    np.testing.assert_array_equal(shuffled[block_order(problem, "bottom_up").blocks], np.arange(n))
+    np.testing.assert_array_equal(shuffled[block_order(problem, "top_down").blocks], np.arange(n)[::-1])
+    matrix = as_matrix(problem)
+    ground = np.flatnonzero(shuffled == 0)
+    np.testing.assert_array_equal(levels(matrix, ground), shuffled)
+    with pytest.raises(lv.CapabilityError, match="ground"):
+        block_order(matrix, "bottom_up")
+
+
+def test_random_order_depends_on_the_seed_alone():
+    problem = random_lcp(2)
+    x = sweeps(problem, "pgs", 9, order="random", seed=5)
+    np.testing.assert_array_equal(x, sweeps(problem, "pgs", 9, order="random", seed=5))
+    assert not np.array_equal(x, sweeps(problem, "pgs", 9, order="random", seed=6))
+
+
+def test_symmetric_is_forwards_then_backwards():
+    problem = random_lcp(4)
+    forwards = lv.solve(problem, "pgs", tol=0.0, max_iter=1)
+    both = sweeps(problem, "pgs", 1, order="reverse", impulse=forwards.impulse)
+    np.testing.assert_array_equal(sweeps(problem, "pgs", 2, order="symmetric"), both)
