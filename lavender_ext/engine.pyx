@@ -77,11 +77,11 @@ cdef inline int32_t prepare(engine_t* e) noexcept nogil:
     cdef blocks_t p
     cdef rows_t r
     cdef int32_t pairs, contacts
+    start_bodies(e)
     pairs = update_pairs(e)
     e.head[H_NEED_PAIRS] = pairs
     if pairs > e.size[CAP_PAIR]:
         return NEED_ROOM
-    start_bodies(e)
     view(e, &p, &r)
     if e.size[N_JOINT] > 0:
         make_joints(e)
@@ -123,30 +123,30 @@ cdef inline void warm(engine_t* e, const rows_t* r) noexcept nogil:
         contact_push(r, c, n_tangents(e.kind[i], e.ptr[i + 1] - j), e.kind[i] == CONTACT_SPIN, e.impulse + j, e.dv)
 
 
-cdef inline void order_group(engine_t* e, int32_t n, const int32_t* body, int32_t first) noexcept nogil:
-    # sweep order of n blocks, the first of them number `first`, into e.order[first:first + n]
-    cdef int32_t* order = e.order + first
+cdef inline void order_blocks(engine_t* e) noexcept nogil:
+    """Sweep order of all blocks into e.order, as lavender.ordering makes it: joints, then contacts."""
+    cdef int32_t kj = e.size[N_JOINT], n = kj + e.head[H_CONTACTS], nd = e.size[N_DYNAMIC], mode = e.head[H_ORDER]
     cdef int32_t* level = e.order_scratch
-    cdef int32_t* out
-    cdef int32_t i, levels, mode = e.head[H_ORDER]
-    if mode == COLORED:
-        levels = color_by_bodies(n, body, e.size[N_DYNAMIC], e.color_scratch, level)
-        sort_by_level(n, level, levels, level + n, order)
-    elif mode == BOTTOM_UP or mode == TOP_DOWN:
-        out = level + e.size[N_DYNAMIC]
-        levels = body_levels(n, body, e.size[N_DYNAMIC], level) + 2
-        block_levels(n, body, level, out)
+    cdef int32_t* of_block = level + nd
+    cdef int32_t i, levels
+    for i in range(n):
+        e.order[i] = i
+    if mode == REVERSED:
+        reverse(e.order, 0, kj)
+        reverse(e.order, kj, n)
+    elif mode == BOTTOM_UP or mode == TOP_DOWN or mode == COLORED:
+        if mode == COLORED:
+            levels = color_by_bodies(n, e.joint_body, nd, e.color_scratch, of_block)
+        else:
+            levels = body_levels(n, e.joint_body, nd, level) + 2
+            block_levels(n, e.joint_body, level, of_block)
         if mode == TOP_DOWN:
             for i in range(n):
-                out[i] = levels - 1 - out[i]
-        sort_by_level(n, out, levels, out + n, order)
-    else:
-        for i in range(n):
-            order[i] = i
-        if mode == REVERSED:
-            reverse(order, 0, n)
-    for i in range(n):
-        order[i] += first
+                of_block[i] = levels - 1 - of_block[i]
+        sort_by_level(kj, of_block, levels, of_block + n, e.order)
+        sort_by_level(n - kj, of_block + kj, levels, of_block + n, e.order + kj)
+        for i in range(kj, n):
+            e.order[i] += kj
 
 
 cdef inline void sweep_all(engine_t* e, const blocks_t* p, const rows_t* r) noexcept nogil:
@@ -160,8 +160,7 @@ cdef inline void sweep_all(engine_t* e, const blocks_t* p, const rows_t* r) noex
             for i in range(kj, k):
                 relax_contact_block(p, r, i, e.impulse, e.dv)
         return
-    order_group(e, kj, e.joint_body, 0)
-    order_group(e, r.n_contacts, e.contact_body, kj)
+    order_blocks(e)
     mode = SYMMETRIC if e.head[H_ORDER] == SYMMETRICALLY else (RANDOM if e.head[H_ORDER] == AT_RANDOM else 0)
     # every substep has its own stream, a function of seed and substep alone
     rng = ((<uint64_t>(<int64_t>e.head[H_SEED])) << 32) ^ (<uint64_t>(<int64_t>e.head[H_STEP]))
@@ -215,10 +214,11 @@ cdef public void lav_engine_lengths(const int32_t* size, int32_t* used) noexcept
 
 
 cdef public int32_t lav_engine_pairs(const int32_t* size, double* real, int32_t* index, uint64_t* keys) noexcept nogil:
-    """The broad phase alone; returns the number of pairs needed."""
+    """The first two stages alone; returns the number of pairs needed."""
     cdef engine_t e
     cdef int64_t n[3]
     bind(size, real, index, keys, &e, n)
+    start_bodies(&e)
     return update_pairs(&e)
 
 

@@ -126,7 +126,7 @@ cdef struct engine_t:
     int32_t* joint_kind     # (kj)
     int32_t* joint_motor    # (kj) 0 or 1
     int32_t* joint_bodies   # (kj, 2) bodies, -1 = the world
-    int32_t* joint_body     # (kj, 2) dynamic numbers, -1 = static
+    int32_t* joint_body     # (kj, 2) dynamic numbers, -1 = static; contact_body follows
     double* jac             # (mj, 12)
     double* minv_jac        # (mj, 12)
     int32_t* excluded       # (N_EXCLUDED, 2) pairs that never collide, sorted
@@ -139,7 +139,7 @@ cdef struct engine_t:
     int32_t* cell           # (n, 4) cell and level
     # contacts
     int32_t* contact_pair   # (c, 2) bodies
-    int32_t* contact_body   # (c, 2) dynamic numbers
+    int32_t* contact_body   # (c, 2) dynamic numbers, right after joint_body: together the bodies of all blocks
     double* point           # (c, 3) m
     double* gap             # (c) m, negative = penetration
     double* normal          # (c, 3)
@@ -175,7 +175,7 @@ cdef struct engine_t:
     double* shift           # (nd, 6) m, rad: the position projection
     int32_t* body_of        # (nd) body of a dynamic number
     int32_t* order          # (kj + c) sweep order of the blocks
-    int32_t* order_scratch  # (2 (n + kj + c) + 8)
+    int32_t* order_scratch  # (2 (n + kj + c) + 8): level of each body, of each block, places
     uint64_t* color_scratch  # (nd)
 
 
@@ -252,7 +252,6 @@ cdef inline void bind(const int32_t* size, double* real, int32_t* index, uint64_
     e.joint_kind = ints(index, &j, kj)
     e.joint_motor = ints(index, &j, kj)
     e.joint_bodies = ints(index, &j, 2 * kj)
-    e.joint_body = ints(index, &j, 2 * kj)
     e.excluded = ints(index, &j, 2 * size[N_EXCLUDED])
     e.pair = ints(index, &j, 2 * p)
     e.pair_scratch = ints(index, &j, 2 * p)
@@ -261,7 +260,8 @@ cdef inline void bind(const int32_t* size, double* real, int32_t* index, uint64_
     e.chain = ints(index, &j, grid)
     e.cell = ints(index, &j, 4 * grid)
     e.contact_pair = ints(index, &j, 2 * c)
-    e.contact_body = ints(index, &j, 2 * c)
+    e.joint_body = ints(index, &j, 2 * k)
+    e.contact_body = e.joint_body + 2 * kj
     e.ptr = ints(index, &j, k + 1)
     e.kind = ints(index, &j, k)
     e.order = ints(index, &j, k)

@@ -1,0 +1,6 @@
+"""LavenderSim: the step loop over the compiled substep, and the problems inside it."""
+
+from lavender.engine.simulation import SOLVER_FIELDS, Simulation
+from lavender.engine.snapshot import Snapshot
+
+__all__ = ["SOLVER_FIELDS", "Simulation", "Snapshot"]

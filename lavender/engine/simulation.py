@@ -1,0 +1,452 @@
+"""LavenderSim's step loop, and the constraint problem inside every step."""
+
+from __future__ import annotations
+
+from os import PathLike
+from typing import Any
+
+import numpy as np
+
+from lavender._arrays import FloatArray, read_only
+from lavender.cones import CONTACT_SPIN, Cones
+from lavender.engine.layout import HEAD, NEED_ROOM, NOT_FINITE, OK, SETTING, SIZE
+from lavender.engine.snapshot import Snapshot
+from lavender.engine.state import State
+from lavender.errors import InputError, LavenderError, SolveFailed
+from lavender.problem import Problem, Rows
+from lavender.residuals import Residual, residual
+from lavender.scene import Scene
+from lavender.scene.parts import whole
+from lavender.scene.scene import SWEEPS
+from lavender.solution import Solution
+from lavender.solve import solve
+
+__all__ = ["SOLVER_FIELDS", "Simulation"]
+
+#: The eight values of `observation["solver"]`, of the final substep: sweep budget, warm-start mode (0 or 1),
+#: contacts, contacts found in the cache, max |e_n| [N s] before the first sweep and after the last, and
+#: max(0, -w_n) [m/s] likewise.
+SOLVER_FIELDS = (
+    "iterations",
+    "warm_start",
+    "contacts",
+    "cache_matches",
+    "residual_initial",
+    "residual_final",
+    "violation_initial",
+    "violation_final",
+)
+PARTS = ("joint", "normal", "disk", "spin")
+
+
+class Simulation:
+    """Steps a scene. The scene is read once; changing it later changes nothing here.
+
+    Parameters
+    ----------
+    scene : Scene or str
+        A scene, or the name of one of the gallery.
+    report_residual : bool, default False
+        Put the judge's residual over all rows of the final substep into `info["residual"]`; costs about as
+        much as a step.
+
+    Raises
+    ------
+    InputError
+        Not a scene, or one without bodies.
+    """
+
+    def __init__(self, scene: Scene | str, *, report_residual: bool = False) -> None:
+        if isinstance(scene, str):
+            scene = Scene(scene)
+        if not isinstance(scene, Scene):
+            raise InputError(f"scene is a {type(scene).__name__}; a lavender.Scene is needed, or a name")
+        if not scene.bodies:
+            raise InputError("the scene has no bodies; add some (add_box, add_sphere, add_plane)")
+        self.scene = scene
+        self.report_residual = report_residual
+        self._load(scene)
+
+    def _load(self, scene: Scene) -> None:
+        p = self._parameters = scene.parameters
+        self._names = tuple(b.name for b in scene.bodies)
+        self._joint_names = tuple(j.name for j in scene.joints)
+        self._state = State.of_scene(scene)
+        self._fingerprint = scene.fingerprint()
+        self._own_sweeps = p.solver == "sequential_impulses"
+        self._steps = 0
+        self._failed = 0
+        self._lost = ""
+        self._last: Solution | None = None
+
+    # -- running --------------------------------------------------------------------------------
+
+    @property
+    def time(self) -> float:
+        """Simulated time [s]."""
+        return self._steps * self._parameters.dt
+
+    @property
+    def steps(self) -> int:
+        """Steps done since the start or the last reset."""
+        return self._steps
+
+    @property
+    def solver_iterations(self) -> int:
+        """Budget of the velocity solve."""
+        return int(self._state.head[HEAD["iterations"]])
+
+    @property
+    def warm_start(self) -> bool:
+        """Whether impulses are carried over from the cache."""
+        return bool(self._state.head[HEAD["warm_start"]])
+
+    @property
+    def last_solution(self) -> Solution | None:
+        """What the registered solver returned for the last substep; None with the built-in sweeps."""
+        return self._last
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the engine's arrays."""
+        return self._state.nbytes
+
+    def set_solver_iterations(self, n: int) -> None:
+        """Budget from the next step on.
+
+        Raises
+        ------
+        InputError
+            Not a whole number of 4 to 64 for sequential_impulses, of at least 1 for other solvers.
+        """
+        low, high = SWEEPS if self._own_sweeps else (1, 2**31 - 1)
+        self._state.head[HEAD["iterations"]] = whole("solver_iterations", n, low, high)
+
+    def set_warm_start(self, flag: bool) -> None:
+        """Warm starting from the next step on; the cache is kept up to date either way."""
+        if not isinstance(flag, (bool, np.bool_)):
+            raise InputError(f"warm_start is {flag!r}; True or False is needed")
+        self._state.head[HEAD["warm_start"]] = bool(flag)
+
+    def reset(self, seed: int | None = None) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Back to the start of the scene; with `seed`, of the scene built with that seed.
+
+        The sweep budget and the warm-start mode stay as they are.
+
+        Returns
+        -------
+        observation, info
+            As `step`.
+        """
+        sweeps, warm = self.solver_iterations, self.warm_start
+        if seed is not None:
+            self.scene = self.scene.with_parameters(seed=whole("seed", seed))
+        self._load(self.scene)
+        self._state.head[HEAD["iterations"]] = sweeps
+        self._state.head[HEAD["warm_start"]] = warm
+        return self._observe(), self._info()
+
+    def step(self, action: None = None) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
+        """Advance by dt.
+
+        Parameters
+        ----------
+        action : None
+            There are no actions; the argument is there for Gymnasium's shape.
+
+        Returns
+        -------
+        observation : dict of fresh arrays
+            positions (n, 3) [m], quaternions (n, 4) w x y z, velocities (n, 6) [m/s, rad/s],
+            joint_impulses (mj,) [N s, N m s], solver (8,) see `SOLVER_FIELDS`, and contacts: pair (c, 2),
+            point, normal, tangent (c, 3), depth (c,) [m, positive inside], impulses (c, r) [N s, N m s], the
+            rows that contacts of this scene can have: normal, two tangents, spin. Contacts and impulses are
+            those of the final substep.
+        reward : float
+            0.0
+        terminated : bool
+            A position or velocity is no longer finite; `info["lost_body"]` names the body.
+        truncated : bool
+            False
+        info : dict
+            time [s], step, failed_solves, and on request residual.
+
+        Raises
+        ------
+        SolveFailed
+            With `on_failure="raise"`, before the state has changed.
+        LavenderError
+            The simulation had terminated: reset it or restore a snapshot.
+        """
+        if action is not None:
+            raise InputError(f"action is {action!r}; this simulation takes none")
+        if self._lost:
+            raise LavenderError(f"the state of {self._lost!r} is not finite; reset() or restore a snapshot")
+        if self._own_sweeps:
+            status = self._sweep_substeps()
+        else:
+            status = self._solver_substeps()
+        self._steps += 1
+        if status == NOT_FINITE:
+            self._lost = self._names[int(self._state.head[HEAD["lost"]])]
+        return self._observe(), 0.0, bool(self._lost), False, self._info()
+
+    def _sweep_substeps(self) -> int:
+        left = self._parameters.substeps
+        while True:
+            status, done = self._state.kernel.substeps(left)
+            left -= done
+            if status != NEED_ROOM:
+                return int(status)
+            self._state = self._state.grown()
+
+    def _prepare(self) -> None:
+        while self._state.kernel.prepare() == NEED_ROOM:
+            self._state = self._state.grown()
+
+    def _solver_substeps(self) -> int:
+        status = OK
+        for _ in range(self._parameters.substeps):
+            self._prepare()
+            kernel, a = self._state.kernel, self._state.a
+            kernel.solve(False)
+            problem = self._problem(self._state)
+            if problem.m:
+                a["impulse"][: problem.m] = self._solve(problem)
+            kernel.apply()
+            status = kernel.finish()
+            if status != OK:
+                break
+        return int(status)
+
+    def _solve(self, problem: Problem) -> FloatArray:
+        p = self._parameters
+        guess = problem.start() if problem.guess is None else problem.guess
+        solution = solve(problem, p.solver, impulse=guess, max_iter=self.solver_iterations, **p.solver_options)
+        self._last = solution
+        judged = solution.residual
+        if solution.success or judged.relative <= 2.0 * judged.floor:
+            return solution.impulse
+        if p.on_failure == "raise":
+            raise SolveFailed(f"{self.scene!r}, step {self._steps}: {solution}")
+        self._failed += 1
+        if p.on_failure == "keep" or not np.isfinite(solution.impulse).all():
+            return guess
+        return 0.5 * (guess + solution.impulse) if p.on_failure == "damp" else solution.impulse
+
+    def _observe(self) -> dict[str, Any]:
+        s = self._state
+        a, mj = s.a, int(s.size[SIZE["joint_rows"]])
+        c, rows = int(s.head[HEAD["contacts"]]), int(s.head[HEAD["contact_rows"]])
+        per = int(s.size[SIZE["rows_per_contact"]])
+        if rows == c * per:
+            impulses = a["impulse"][mj : mj + rows].reshape(c, per).copy()
+        else:
+            impulses = self._spread(c, per)
+        return {
+            "positions": a["x"].copy(),
+            "quaternions": a["q"].copy(),
+            "velocities": a["v"].copy(),
+            "contacts": {
+                "pair": a["contact_pair"][:c].copy(),
+                "point": a["point"][:c].copy(),
+                "normal": a["normal"][:c].copy(),
+                "tangent": a["tangent"][:c].copy(),
+                "depth": -a["gap"][:c],
+                "impulses": impulses,
+            },
+            "joint_impulses": a["joint_impulse"].copy(),
+            "solver": s.setting[SETTING["out"] : SETTING["out"] + 8].copy(),
+        }
+
+    def _spread(self, c: int, per: int) -> FloatArray:
+        # contacts that lack some of the scene's rows have zeros there
+        a, kj = self._state.a, int(self._state.size[SIZE["joints"]])
+        out = np.zeros((c, per))
+        first, end = a["ptr"][kj : kj + c], a["ptr"][kj + 1 : kj + c + 1]
+        for row in range(per):
+            has = first + row < end
+            out[has, row] = a["impulse"][first[has] + row]
+        return out
+
+    def _info(self) -> dict[str, Any]:
+        info: dict[str, Any] = {"time": self.time, "step": self._steps, "failed_solves": self._failed}
+        if self._lost:
+            info["lost_body"] = self._lost
+        if self.report_residual and not self._lost:
+            info["residual"] = self.residual()
+        return info
+
+    # -- the problem ----------------------------------------------------------------------------
+
+    def constraint_problem(self) -> Problem:
+        """The next substep's velocity problem, with its warm start as `guess`; changes no state.
+
+        With `substeps=1`, `lavender.solve(problem, "sequential_impulses", tol=0, max_iter=n)` returns the
+        impulses that the next step reports, bit for bit (n = `solver_iterations`; the scene's `order`).
+        """
+        state = self._state.copy()
+        while state.kernel.prepare() == NEED_ROOM:
+            state = state.grown()
+        return self._problem(state)
+
+    def sweep_seed(self) -> int:
+        """`seed` for `lavender.solve(..., order="random")` that gives the next substep's order."""
+        head = self._state.head
+        return (int(head[HEAD["seed"]]) << 32) ^ int(head[HEAD["step"]])
+
+    def _problem(self, state: State) -> Problem:
+        a = state.a
+        kj, mj = int(state.size[SIZE["joints"]]), int(state.size[SIZE["joint_rows"]])
+        c = int(state.head[HEAD["contacts"]])
+        k, m = kj + c, mj + int(state.head[HEAD["contact_rows"]])
+        normal = a["normal"][:c].copy()
+        tangent = a["tangent"][:c].copy() if len(a["tangent"]) else np.zeros((c, 3))
+        # contacts without friction have no tangent; any unit vector normal to the normal stands in
+        bare = np.flatnonzero(a["mu"][kj:k] == 0.0)
+        tangent[bare] = _any_tangent(normal[bare])
+        rows = Rows(
+            inv_mass=a["inv_mass"].copy(),
+            inv_inertia=a["inv_inertia"].copy(),
+            v_free=a["v_free"].copy(),
+            jac=a["jac"].copy(),
+            joint_ptr=a["ptr"][: kj + 1].copy(),
+            joint_body=a["joint_body"].copy(),
+            normal=normal,
+            tangent=tangent,
+            arm_a=a["arm_a"][:c].copy(),
+            arm_b=a["arm_b"][:c].copy(),
+            contact_body=a["contact_body"][:c].copy(),
+            copy=False,
+        )
+        lower, upper = np.full(m, -np.inf), np.full(m, np.inf)
+        lower[:mj], upper[:mj] = a["lower"][:mj], a["upper"][:mj]
+        cones = Cones(a["ptr"][: k + 1].copy(), a["kind"][:k].copy(), lower, upper, a["mu"][:k].copy(), a["patch_radius"][:k].copy())
+        guess = a["impulse"][:m].copy() if state.head[HEAD["warm_start"]] else None
+        return Problem(
+            a["b"][:m].copy(),
+            cones,
+            rows=rows,
+            compliance=a["compliance"][:m].copy(),
+            guess=guess,
+            key=self._block_keys(state, kj, c),
+            names=self._block_names(a["contact_pair"][:c], a["key"][:c]),
+            name=f"{self.scene.name or 'scene'}, step {self._steps + 1}",
+            copy=False,
+        )
+
+    def _block_keys(self, state: State, kj: int, c: int) -> np.ndarray:
+        # joints above all contacts: 24 bits for each body leave the pair (2^24 - 1, ...) free
+        joints = np.uint64(0xFFFFFF << 40) + np.arange(kj, dtype=np.uint64)
+        return np.concatenate([joints, state.a["key"][:c]])
+
+    def _block_names(self, pair: np.ndarray, key: np.ndarray) -> list[str]:
+        names = self._names
+        points = (key & np.uint64(0xFFFF)).tolist()
+        return [*self._joint_names, *(f"{names[i]} on {names[j]}, point {f}" for (i, j), f in zip(pair.tolist(), points, strict=True))]
+
+    def residual(self) -> dict[str, Any]:
+        """The judge over all rows of the last substep, with the impulses that it used.
+
+        Returns
+        -------
+        dict
+            relative [-], energy [sqrt J], velocity [m/s], floor [-], worst (name of a row), and share: the
+            part of energy squared that joints, normals, disks and spins have (they add up to 1, or to 0
+            without error).
+
+        Raises
+        ------
+        InputError
+            No step has been done.
+        """
+        if self._state.head[HEAD["step"]] == 0:
+            raise InputError("no step has been done yet")
+        problem = self._problem(self._state)
+        judged = residual(problem, self._state.a["impulse"][: problem.m].copy())
+        return {
+            "relative": judged.relative,
+            "energy": judged.energy,
+            "velocity": judged.velocity,
+            "floor": judged.floor,
+            "worst": judged.worst_name,
+            "share": _shares(problem, judged),
+        }
+
+    # -- snapshots ------------------------------------------------------------------------------
+
+    def snapshot(self) -> Snapshot:
+        """The whole state: bodies, contact cache, joint impulses, sweep budget, warm-start mode, counters."""
+        s = self._state
+        return Snapshot(
+            fingerprint=self._fingerprint,
+            steps=self._steps,
+            failed=self._failed,
+            lost=self._lost,
+            size=read_only(s.size.copy()),
+            real=read_only(s.real.copy()),
+            index=read_only(s.index.copy()),
+            keys=read_only(s.keys.copy()),
+        )
+
+    def restore(self, snapshot: Snapshot) -> None:
+        """Continue from a snapshot of this scene, bit for bit.
+
+        Raises
+        ------
+        InputError
+            Not a snapshot, or of another scene.
+        """
+        if not isinstance(snapshot, Snapshot):
+            raise InputError(f"snapshot is a {type(snapshot).__name__}; a Snapshot is needed (sim.snapshot())")
+        if snapshot.fingerprint != self._fingerprint:
+            raise InputError("the snapshot is of another scene: bodies, joints or parameters differ")
+        state = State(snapshot.size)
+        if any(len(x) != len(y) for x, y in ((state.real, snapshot.real), (state.index, snapshot.index), (state.keys, snapshot.keys))):
+            raise InputError("the snapshot's arrays do not fit its sizes; it is damaged")
+        state.real[:], state.index[:], state.keys[:] = snapshot.real, snapshot.index, snapshot.keys
+        self._state = state
+        self._steps, self._failed, self._lost = snapshot.steps, snapshot.failed, snapshot.lost
+        self._last = None
+
+    def save(self, path: str | PathLike[str]) -> None:
+        """Write a snapshot to a file; see `Snapshot.save`."""
+        self.snapshot().save(path)
+
+    def load(self, path: str | PathLike[str]) -> None:
+        """Continue from a file written by `save`.
+
+        Raises
+        ------
+        InputError
+            Not such a file, damaged, or of another scene.
+        """
+        self.restore(Snapshot.load(path))
+
+    def __repr__(self) -> str:
+        return f"<Simulation of {self.scene!r}, step {self._steps}>"
+
+
+def _any_tangent(normal: FloatArray) -> FloatArray:
+    out = np.zeros_like(normal)
+    for i, n in enumerate(normal):
+        t = np.cross(n, np.eye(3)[np.argmin(np.abs(n))])
+        out[i] = t / np.linalg.norm(t)
+    return out
+
+
+def _shares(problem: Problem, judged: Residual) -> dict[str, float]:
+    c = problem.cones
+    part = np.zeros(problem.m, np.int32)
+    contact = np.flatnonzero(c.kind > 0)
+    part[c.ptr[0] :] = 2
+    joints = len(c.kind) - len(contact)
+    part[: c.ptr[joints]] = 0
+    part[c.ptr[:-1][contact]] = 1
+    part[c.ptr[1:][c.kind == CONTACT_SPIN] - 1] = 3
+    energy = problem.d * judged.error**2
+    total = float(energy.sum())
+    sums = np.bincount(part, weights=energy, minlength=4) if problem.m else np.zeros(4)
+    return {name: float(x / total) if total > 0.0 else 0.0 for name, x in zip(PARTS, sums, strict=True)}
+
+

@@ -1,0 +1,179 @@
+"""The engine's buffers: made from a scene, grown where they are too small, named by array."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from lavender.engine.layout import (
+    CAP_CONTACT,
+    CAP_PAIR,
+    HEAD,
+    JOINT,
+    JOINT_KINDS,
+    N_SIZES,
+    SETTING,
+    SIZE,
+)
+from lavender.errors import InputError
+from lavender.ordering import ORDERS
+from lavender.scene import Box, Plane, Scene, Sphere
+from lavender_ext import engine as kernels
+
+__all__ = ["ORDER_NUMBER", "State"]
+
+# H_ORDER of lavender_ext/engine.pyx
+ORDER_NUMBER = {"given": 0, "reverse": 1, "symmetric": 2, "random": 3, "bottom_up": 4, "top_down": 5, "colored": 6}
+assert set(ORDER_NUMBER) == set(ORDERS)
+
+BRUTE_FORCE = 32  # bodies up to which testing all pairs is quicker than the grid
+BETA = 0.2  # -, share of the position error removed per substep
+MAX_PUSH = 0.2  # m, largest position error corrected per substep
+# What the kernels carry from one substep to the next or a scene gives; the rest is scratch of one substep.
+KEPT = (
+    "setting", "x", "q", "v", "inv_mass_body", "inertia", "inv_inertia_body", "shape", "friction", "restitution",
+    "patch", "fat", "joint", "joint_impulse", "inv_mass", "inv_inertia", "cache_impulse", "cache_local", "head",
+    "kind_of_shape", "dyn", "uneven", "body_of", "joint_kind", "joint_motor", "joint_bodies", "joint_body",
+    "excluded", "ptr", "cache_key",
+)  # fmt: skip
+
+
+class State:
+    """Three buffers with the arrays of `lavender_ext/engine_types.pxd` by name, as attributes of `a`."""
+
+    def __init__(self, size: np.ndarray) -> None:
+        self.size = np.ascontiguousarray(size, np.int32)
+        used = kernels.lengths(self.size)
+        if min(used) < 0:
+            raise InputError("the scene needs more than 2^31 entries in one buffer; make it smaller")
+        self.real = np.zeros(used[0])
+        self.index = np.zeros(used[1], np.int32)
+        self.keys = np.zeros(max(used[2], 1), np.uint64)
+        self.kernel = kernels.Buffers(self.size, self.real, self.index, self.keys)
+        self.a: dict[str, np.ndarray] = self.kernel.arrays()
+        self.head, self.setting = self.a["head"], self.a["setting"]
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of all three buffers."""
+        return int(self.real.nbytes + self.index.nbytes + self.keys.nbytes)
+
+    def copy(self) -> State:
+        """The same, in buffers of its own."""
+        other = State(self.size)
+        other.take(self)
+        return other
+
+    def take(self, other: State) -> None:
+        """Copy the buffers of a state of the same sizes, bit for bit."""
+        self.real[:] = other.real
+        self.index[:] = other.index
+        self.keys[:] = other.keys
+
+    def grown(self) -> State:
+        """A copy with room for what the last substep found missing."""
+        size = self.size.copy()
+        for cap, need in ((CAP_PAIR, HEAD["need_pairs"]), (CAP_CONTACT, HEAD["need_contacts"])):
+            if self.head[need] > size[cap]:
+                size[cap] = int(self.head[need] * 1.25) + 16
+        other = State(size)
+        for name in KEPT:
+            source, goal = self.a[name], other.a[name]
+            if source.shape == goal.shape:
+                goal[...] = source
+            else:
+                goal[: len(source)] = source
+        other.head[HEAD["pairs_valid"]] = 0
+        return other
+
+    @classmethod
+    def of_scene(cls, scene: Scene) -> State:
+        """The start state of a scene."""
+        p, bodies, joints = scene.parameters, scene.bodies, scene.joints
+        n = len(bodies)
+        uneven = [not b.is_static and not _is_even(b.inertia) for b in bodies]
+        frames = any(uneven) or bool(joints) or any(isinstance(b.shape, Box) for b in bodies)
+        mu = np.array([p.friction if b.friction is None else b.friction for b in bodies])
+        patch = np.array([p.patch_radius if b.patch_radius is None else b.patch_radius for b in bodies])
+        shaped = np.array([b.shape is not None for b in bodies], bool)
+        per = 1 + 2 * bool((mu[shaped] > 0.0).any()) + bool((mu[shaped] > 0.0).any() and (patch[shaped] > 0.0).any())
+        excluded = sorted({tuple(sorted((j.a, j.b))) for j in joints if not j.collide and min(j.a, j.b) >= 0})
+        n_shapes = int(shaped.sum())
+        size = np.zeros(N_SIZES, np.int32)
+        size[SIZE["bodies"]] = n
+        size[SIZE["dynamic"]] = sum(not b.is_static for b in bodies)
+        size[SIZE["joints"]] = len(joints)
+        size[SIZE["joint_rows"]] = sum(j.n_rows for j in joints)
+        size[SIZE["excluded"]] = len(excluded)
+        size[SIZE["buckets"]] = 0 if n_shapes <= BRUTE_FORCE else 1 << int(np.ceil(np.log2(2 * n_shapes)))
+        size[SIZE["frames"]] = n if frames else 0
+        size[SIZE["rows_per_contact"]] = per
+        size[CAP_PAIR] = 4 * n_shapes if n_shapes > 1 else 0
+        size[CAP_CONTACT] = 4 * n_shapes if n_shapes > 1 else 0
+        state = cls(size)
+        a, head, setting = state.a, state.head, state.setting
+        setting[SETTING["h"]] = p.dt / p.substeps
+        setting[SETTING["gravity"] : SETTING["gravity"] + 3] = p.gravity
+        setting[SETTING["slop"]] = p.slop
+        setting[SETTING["margin"]] = p.margin
+        setting[SETTING["skin"]] = 5.0 * p.margin
+        setting[SETTING["beta"]] = BETA
+        setting[SETTING["max_push"]] = MAX_PUSH
+        setting[SETTING["bounce"]] = p.restitution_threshold
+        setting[SETTING["match"]] = 5.0 * p.margin
+        head[HEAD["iterations"]] = p.solver_iterations
+        head[HEAD["warm_start"]] = p.warm_start
+        head[HEAD["position_iterations"]] = p.position_iterations
+        head[HEAD["order"]] = ORDER_NUMBER[p.order]
+        head[HEAD["seed"]] = p.seed
+        head[HEAD["lost"]] = -1
+        dynamic = 0
+        for i, b in enumerate(bodies):
+            a["x"][i], a["q"][i] = b.position, b.quaternion
+            a["v"][i, :3], a["v"][i, 3:] = b.velocity, b.angular_velocity
+            a["dyn"][i] = -1
+            if not b.is_static:
+                inverse = np.linalg.inv(b.inertia)
+                a["dyn"][i] = dynamic
+                a["body_of"][dynamic] = i
+                a["inv_mass_body"][i] = a["inv_mass"][dynamic] = 1.0 / b.mass
+                a["inertia"][i] = b.inertia
+                a["inv_inertia_body"][i] = a["inv_inertia"][dynamic] = 0.5 * (inverse + inverse.T)
+                a["uneven"][i] = uneven[i]
+                dynamic += 1
+            a["restitution"][i] = p.restitution if b.restitution is None else b.restitution
+            a["kind_of_shape"][i], a["shape"][i] = _shape(b.shape)
+        a["friction"][:], a["patch"][:] = mu, patch
+        row = 0
+        for i, j in enumerate(joints):
+            values = a["joint"][i]
+            for name, x in (("anchor_a", j.anchor_a), ("anchor_b", j.anchor_b), ("axis_a", j.axis_a), ("axis_b", j.axis_b)):
+                values[JOINT[name] : JOINT[name] + 3] = x
+            side = np.cross(j.axis_a, np.eye(3)[np.argmin(np.abs(j.axis_a))])
+            values[JOINT["side_a"] : JOINT["side_a"] + 3] = side / np.linalg.norm(side)
+            values[JOINT["length"]], values[JOINT["hertz"]], values[JOINT["damping"]] = j.length, j.hertz, j.damping
+            values[JOINT["speed"]], values[JOINT["torque"]] = j.motor_speed or 0.0, j.motor_torque
+            a["joint_kind"][i], a["joint_motor"][i] = JOINT_KINDS[j.kind], j.motor_speed is not None
+            a["joint_bodies"][i] = j.a, j.b
+            a["joint_body"][i] = [a["dyn"][k] if k >= 0 else -1 for k in (j.a, j.b)]
+            row += j.n_rows
+            a["ptr"][i + 1] = row
+        if excluded:
+            a["excluded"][:] = excluded
+        return state
+
+
+def _is_even(inertia: np.ndarray) -> bool:
+    # the same about every axis, to the bit: then R I R^T is I whatever R
+    return bool(np.array_equal(inertia, np.eye(3) * inertia[0, 0]))
+
+
+def _shape(shape: Any) -> tuple[int, list[float]]:
+    if isinstance(shape, Plane):
+        return 1, [*shape.normal, shape.offset]
+    if isinstance(shape, Sphere):
+        return 2, [shape.radius, shape.radius, shape.radius, 0.0]
+    if isinstance(shape, Box):
+        return 3, [*(0.5 * np.array(shape.size)), 0.0]
+    return 0, [0.0, 0.0, 0.0, 0.0]

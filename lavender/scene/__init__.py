@@ -1,0 +1,7 @@
+"""Scenes: bodies, shapes and joints, by hand or from the gallery."""
+
+from lavender.scene.gallery import SCENES
+from lavender.scene.parts import Body, Box, Joint, Plane, Sphere
+from lavender.scene.scene import ON_FAILURE, Parameters, Scene
+
+__all__ = ["ON_FAILURE", "SCENES", "Body", "Box", "Joint", "Parameters", "Plane", "Scene", "Sphere"]

@@ -1,0 +1,166 @@
+"""Bodies, shapes and joints: what a scene is made of. Plain data; the engine reads it once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from lavender._arrays import FloatArray
+from lavender.errors import InputError
+
+__all__ = ["BALL", "DISTANCE", "HINGE", "Body", "Box", "Joint", "Plane", "Sphere"]
+
+Shape = "Plane | Sphere | Box"
+
+
+@dataclass(frozen=True)
+class Plane:
+    """All points x with normal.x <= offset are inside; always static."""
+
+    normal: tuple[float, float, float]  # unit, world
+    offset: float  # m
+
+
+@dataclass(frozen=True)
+class Sphere:
+    """A ball round the body's centre."""
+
+    radius: float  # m
+
+    def inertia(self, mass: float) -> FloatArray:
+        """Inertia (3, 3) [kg m^2] of a solid ball."""
+        return np.eye(3) * (0.4 * mass * self.radius**2)
+
+
+@dataclass(frozen=True)
+class Box:
+    """A box round the body's centre, along the body's axes."""
+
+    size: tuple[float, float, float]  # m, whole edges
+
+    def inertia(self, mass: float) -> FloatArray:
+        """Inertia (3, 3) [kg m^2] of a solid box."""
+        x, y, z = (s * s for s in self.size)
+        return np.diag([y + z, x + z, x + y]) * (mass / 12.0)
+
+
+@dataclass(frozen=True)
+class Body:
+    """One rigid body; `mass` 0 means static."""
+
+    name: str
+    shape: Plane | Sphere | Box | None
+    mass: float  # kg
+    inertia: FloatArray = field(repr=False)  # (3, 3) kg m^2, body axes
+    position: FloatArray  # (3,) m
+    quaternion: FloatArray  # (4,) unit, w x y z, body to world
+    velocity: FloatArray  # (3,) m/s
+    angular_velocity: FloatArray  # (3,) rad/s, world
+    friction: float | None = None  # -, None: the scene's
+    restitution: float | None = None  # -, None: the scene's
+    patch_radius: float | None = None  # m, None: the scene's
+
+    @property
+    def is_static(self) -> bool:
+        return self.mass == 0.0
+
+    def to_local(self, point: FloatArray) -> FloatArray:
+        """World point (3,) [m] in the body's frame."""
+        return rotation(self.quaternion).T @ (point - self.position)
+
+    def direction_to_local(self, direction: FloatArray) -> FloatArray:
+        """World direction (3,) in the body's frame."""
+        return rotation(self.quaternion).T @ direction
+
+
+DISTANCE, BALL, HINGE = "distance", "ball", "hinge"
+
+
+@dataclass(frozen=True)
+class Joint:
+    """One joint between bodies a and b (-1: the world); anchors and axes in the bodies' frames."""
+
+    kind: str
+    name: str
+    a: int
+    b: int
+    anchor_a: FloatArray  # (3,) m
+    anchor_b: FloatArray  # (3,) m
+    axis_a: FloatArray  # (3,) unit
+    axis_b: FloatArray  # (3,) unit
+    length: float = 0.0  # m, distance joints
+    hertz: float = 0.0  # 1/s, 0: rigid
+    damping: float = 1.0  # -, damping ratio of a soft joint
+    motor_speed: float | None = None  # rad/s of b against a, hinges; None: no motor
+    motor_torque: float = 0.0  # N m, largest
+    collide: bool = False  # whether the two bodies may touch
+
+    @property
+    def n_rows(self) -> int:
+        rows = {DISTANCE: 1, BALL: 3, HINGE: 5}[self.kind]
+        return rows + (self.motor_speed is not None)
+
+
+def rotation(q: FloatArray) -> FloatArray:
+    """Rotation matrix (3, 3), body to world, of a unit quaternion (4,) w x y z."""
+    w, x, y, z = q
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def quaternion(axis: tuple[float, float, float], angle: float) -> FloatArray:
+    """Unit quaternion (4,) of a turn by `angle` [rad] round `axis`."""
+    u = np.asarray(axis, float) / np.linalg.norm(axis)
+    return np.concatenate([[np.cos(angle / 2)], np.sin(angle / 2) * u])
+
+
+def numbers(what: str, value: object, n: int) -> FloatArray:
+    """`value` as a new finite array (n,)."""
+    try:
+        x = np.array(value, float)
+    except (TypeError, ValueError):
+        raise InputError(f"{what} is {value!r}; {n} numbers are needed") from None
+    if x.shape != (n,):
+        raise InputError(f"{what} has shape {x.shape}; ({n},) is needed")
+    if not np.isfinite(x).all():
+        raise InputError(f"{what} must be finite; it is {x.tolist()}")
+    return x
+
+
+def number(
+    what: str, value: object, *, low: float = -np.inf, high: float = np.inf, above: float | None = None
+) -> float:
+    """`value` as a finite float in [low, high], or above `above`."""
+    if isinstance(value, bool) or not isinstance(value, (int, float, np.integer, np.floating)):
+        raise InputError(f"{what} is {value!r}; a number is needed")
+    x = float(value)
+    if not np.isfinite(x):
+        raise InputError(f"{what} is {x}; a finite number is needed")
+    if above is not None and not x > above:
+        raise InputError(f"{what} is {x:g}; more than {above:g} is needed")
+    if x < low or x > high:
+        wanted = f"at least {low:g}" if high == np.inf else f"{low:g} to {high:g}"
+        raise InputError(f"{what} is {x:g}; {wanted} is needed")
+    return x
+
+
+def whole(what: str, value: object, low: int = 0, high: int = 2**31 - 1) -> int:
+    """`value` as an int in [low, high]."""
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or not low <= value <= high:
+        raise InputError(f"{what} is {value!r}; a whole number from {low} to {high} is needed")
+    return int(value)
+
+
+def unit(what: str, value: object) -> FloatArray:
+    """`value` as a unit vector (3,)."""
+    x = numbers(what, value, 3)
+    size = np.linalg.norm(x)
+    if not size > 0.0:
+        raise InputError(f"{what} is zero; a direction is needed")
+    return x / size

@@ -1,0 +1,418 @@
+"""A scene: bodies, shapes, joints, and how they are to be stepped."""
+
+from __future__ import annotations
+
+import hashlib
+import inspect
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+import numpy as np
+
+from lavender._arrays import FloatArray
+from lavender.errors import InputError, UnknownName
+from lavender.ordering import ORDERS
+from lavender.registry import get
+from lavender.scene.parts import (
+    BALL,
+    DISTANCE,
+    HINGE,
+    Body,
+    Box,
+    Joint,
+    Plane,
+    Sphere,
+    number,
+    numbers,
+    unit,
+    whole,
+)
+
+__all__ = ["ON_FAILURE", "Parameters", "Scene"]
+
+ON_FAILURE = ("use", "keep", "damp", "raise")
+SWEEPS = (4, 64)  # sweep budget of sequential impulses
+MAX_BODIES = 2**24 - 1  # a contact's key has 24 bits for each body
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """Parameters that every scene has."""
+
+    dt: float = 1.0 / 60.0  # s, of one step
+    substeps: int = 1
+    gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)  # m/s^2
+    solver: str = "sequential_impulses"
+    solver_options: Mapping[str, Any] = field(default_factory=dict)
+    solver_iterations: int | None = None  # None: 16 sweeps, or the solver's own default
+    warm_start: bool = True
+    order: str = "given"
+    friction: float = 0.5  # -, of bodies that say nothing else
+    restitution: float = 0.0  # -, of bodies that say nothing else
+    patch_radius: float = 0.0  # m, of bodies that say nothing else; 0: no spin friction
+    position_iterations: int = 2
+    seed: int = 0
+    on_failure: str = "use"
+    slop: float = 1e-3  # m, penetration left alone
+    margin: float = 1e-2  # m, gap below which contacts are made
+    restitution_threshold: float = 0.5  # m/s, slower closing speeds do not bounce
+
+    def __post_init__(self) -> None:
+        put = object.__setattr__
+        put(self, "dt", number("dt", self.dt, above=0.0))
+        put(self, "substeps", whole("substeps", self.substeps, 1))
+        if isinstance(self.gravity, (int, float)):
+            put(self, "gravity", (0.0, 0.0, -number("gravity", self.gravity)))
+        put(self, "gravity", tuple(numbers("gravity", self.gravity, 3).tolist()))
+        spec = get(self.solver)
+        if not isinstance(self.solver_options, Mapping):
+            raise InputError(f"solver_options is {self.solver_options!r}; a mapping is needed")
+        put(self, "solver_options", dict(self.solver_options))
+        sweeps = self.solver_iterations
+        if self.solver == "sequential_impulses":
+            if self.solver_options:
+                raise InputError(
+                    f"solver_options {sorted(self.solver_options)} are for other solvers; sequential_impulses takes order= "
+                    "and seed= of the scene"
+                )
+            sweeps = 16 if sweeps is None else whole("solver_iterations", sweeps, *SWEEPS)
+        elif sweeps is None:
+            sweeps = spec.max_iter
+        put(self, "solver_iterations", whole("solver_iterations", sweeps, 1))
+        if not isinstance(self.warm_start, (bool, np.bool_)):
+            raise InputError(f"warm_start is {self.warm_start!r}; True or False is needed")
+        put(self, "warm_start", bool(self.warm_start))
+        if self.order not in ORDERS:
+            raise UnknownName("order", self.order, ORDERS)
+        if self.order != "given" and self.solver != "sequential_impulses":
+            raise InputError(f"order={self.order!r} is for sequential_impulses; give {self.solver} its own in solver_options")
+        for name in ("friction", "restitution", "patch_radius", "slop", "restitution_threshold"):
+            put(self, name, number(name, getattr(self, name), low=0.0, high=1.0 if name == "restitution" else np.inf))
+        put(self, "margin", number("margin", self.margin, low=0.0))
+        put(self, "position_iterations", whole("position_iterations", self.position_iterations, 0, 1000))
+        put(self, "seed", whole("seed", self.seed))
+        if self.on_failure not in ON_FAILURE:
+            raise UnknownName("on_failure", self.on_failure, ON_FAILURE)
+
+
+COMMON = tuple(f.name for f in fields(Parameters))
+
+
+class Scene:
+    """Bodies and joints with their parameters: a named scene of the gallery, or an empty one to build.
+
+    Parameters
+    ----------
+    name : str, optional
+        A scene of the gallery (`lavender.scene.gallery.SCENES`); None: empty.
+    **parameters
+        Those of `Parameters`, and the named scene's own (sizes, numbers, angles; see its docstring).
+
+    Raises
+    ------
+    UnknownName
+        No such scene or parameter; the message names the nearest.
+    InputError
+        A value that makes no sense.
+
+    Examples
+    --------
+    >>> import lavender as lv
+    >>> scene = lv.Scene(dt=0.01)
+    >>> ground = scene.add_plane()
+    >>> box = scene.add_box((1, 1, 1), mass=2.0, position=(0, 0, 0.5))
+    >>> scene.n_bodies
+    2
+    """
+
+    def __init__(self, name: str | None = None, **parameters: Any) -> None:
+        from lavender.scene.gallery import SCENES
+
+        if name is not None and name not in SCENES:
+            raise UnknownName("scene", name, SCENES)
+        own = dict(inspect.signature(SCENES[name]).parameters) if name is not None else {}
+        own.pop("scene", None)
+        for key in parameters:
+            if key not in COMMON and key not in own:
+                what = f"parameter of scene {name!r}" if name else "scene parameter"
+                raise UnknownName(what, key, [*COMMON, *own])
+        self.name = name or ""
+        common = {k: v for k, v in parameters.items() if k in COMMON}
+        if name is not None:
+            common = {**getattr(SCENES[name], "defaults", {}), **common}
+        self.parameters = Parameters(**common)
+        self.own = {k: v for k, v in parameters.items() if k in own}
+        self.bodies: list[Body] = []
+        self.joints: list[Joint] = []
+        if name is not None:
+            SCENES[name](self, **self.own)
+
+    @property
+    def n_bodies(self) -> int:
+        return len(self.bodies)
+
+    @property
+    def n_joints(self) -> int:
+        return len(self.joints)
+
+    def with_parameters(self, **changes: Any) -> Scene:
+        """The same scene with other parameters; one of the gallery is built anew.
+
+        Raises
+        ------
+        UnknownName
+            No such parameter; of a scene built by hand only those of `Parameters` can change.
+        """
+        common = {f.name: getattr(self.parameters, f.name) for f in fields(Parameters)}
+        if self.name:
+            return Scene(self.name, **{**common, **self.own, **changes})
+        for key in changes:
+            if key not in COMMON:
+                raise UnknownName("scene parameter", key, COMMON)
+        scene = Scene(**{**common, **changes})
+        scene.bodies, scene.joints = list(self.bodies), list(self.joints)
+        return scene
+
+    # -- bodies ---------------------------------------------------------------------------------
+
+    def add_body(
+        self,
+        mass: float = 1.0,
+        inertia: Any = None,
+        *,
+        position: Any = (0.0, 0.0, 0.0),
+        quaternion: Any = (1.0, 0.0, 0.0, 0.0),
+        velocity: Any = (0.0, 0.0, 0.0),
+        angular_velocity: Any = (0.0, 0.0, 0.0),
+        static: bool = False,
+        name: str | None = None,
+        friction: float | None = None,
+        restitution: float | None = None,
+        patch_radius: float | None = None,
+        shape: Plane | Sphere | Box | None = None,
+    ) -> int:
+        """Add a body; returns its number.
+
+        Parameters
+        ----------
+        mass : float, kg
+            Positive, or 0 for a static body.
+        inertia : (3,) or (3, 3) kg m^2, optional
+            Principal moments or the tensor in the body's axes, positive definite. Default: that of the
+            solid shape; of a ball of radius 0.1 m where there is none.
+        position : (3,) m
+        quaternion : (4,) w x y z
+            Body to world; normalised here.
+        velocity, angular_velocity : (3,) m/s, rad/s
+        static : bool
+            The same as mass 0.
+        friction, restitution, patch_radius : float, optional
+            Default: the scene's.
+        shape : Plane, Sphere or Box, optional
+            None: a body that touches nothing.
+
+        Raises
+        ------
+        InputError
+            Nothing is added.
+        """
+        number_ = len(self.bodies)
+        label = name or f"{type(shape).__name__.lower() if shape is not None else 'body'} {number_}"
+        if number_ >= MAX_BODIES:
+            raise InputError(f"a scene has at most {MAX_BODIES} bodies")
+        if not isinstance(label, str):
+            raise InputError(f"name is {name!r}; a string is needed")
+        static = bool(static) or isinstance(shape, Plane)
+        mass = 0.0 if static else number(f"mass of {label} [kg]", mass)
+        if mass < 0.0 or (mass == 0.0 and not static):
+            raise InputError(f"mass of {label} is {mass:g} kg; a positive mass is needed, or static=True")
+        q = numbers(f"quaternion of {label}", quaternion, 4)
+        size = float(np.linalg.norm(q))
+        if not size > 1e-12:
+            raise InputError(f"quaternion of {label} is {q.tolist()}; one that is not zero is needed")
+        v = numbers(f"velocity of {label} [m/s]", velocity, 3)
+        omega = numbers(f"angular_velocity of {label} [rad/s]", angular_velocity, 3)
+        if static and (v.any() or omega.any()):
+            raise InputError(f"{label} is static; it has no velocity")
+        body = Body(
+            name=label,
+            shape=shape,
+            mass=mass,
+            inertia=np.zeros((3, 3)) if static else _inertia(label, inertia, shape, mass),
+            position=numbers(f"position of {label} [m]", position, 3),
+            quaternion=q / size,
+            velocity=v,
+            angular_velocity=omega,
+            friction=None if friction is None else number(f"friction of {label}", friction, low=0.0),
+            restitution=None if restitution is None else number(f"restitution of {label}", restitution, low=0.0, high=1.0),
+            patch_radius=None if patch_radius is None else number(f"patch_radius of {label} [m]", patch_radius, low=0.0),
+        )
+        self.bodies.append(body)
+        return number_
+
+    def add_box(self, size: Any = (1.0, 1.0, 1.0), mass: float = 1.0, **more: Any) -> int:
+        """Add a box of whole edges `size` (3,) [m]; `more` as in `add_body`. Returns its number."""
+        edges = numbers("size of a box [m]", size, 3)
+        if not (edges > 0.0).all():
+            raise InputError(f"size of a box is {edges.tolist()} m; three positive edges are needed")
+        return self.add_body(mass, shape=Box(tuple(edges.tolist())), **more)
+
+    def add_sphere(self, radius: float = 0.5, mass: float = 1.0, **more: Any) -> int:
+        """Add a sphere of `radius` [m]; `more` as in `add_body`. Returns its number."""
+        return self.add_body(mass, shape=Sphere(number("radius of a sphere [m]", radius, above=0.0)), **more)
+
+    def add_plane(self, normal: Any = (0.0, 0.0, 1.0), offset: float = 0.0, **more: Any) -> int:
+        """Add a static half-space normal.x <= offset [m]; `more`: name, friction, restitution, patch_radius."""
+        n = unit("normal of a plane", normal)
+        d = number("offset of a plane [m]", offset)
+        for key in ("position", "quaternion", "velocity", "angular_velocity", "inertia", "mass"):
+            if key in more:
+                raise InputError(f"a plane is static and has no {key}; give normal and offset")
+        return self.add_body(0.0, static=True, shape=Plane(tuple(n.tolist()), d), position=d * n, **more)
+
+    # -- joints ---------------------------------------------------------------------------------
+
+    def add_joint(
+        self,
+        kind: str,
+        a: int,
+        b: int,
+        *,
+        anchor: Any = None,
+        anchor_a: Any = None,
+        anchor_b: Any = None,
+        axis: Any = None,
+        length: float | None = None,
+        hertz: float = 0.0,
+        damping: float = 1.0,
+        motor_speed: float | None = None,
+        motor_torque: float | None = None,
+        collide: bool = False,
+        name: str | None = None,
+    ) -> int:
+        """Add a joint between bodies a and b as they stand; returns its number.
+
+        Parameters
+        ----------
+        kind : {"distance", "ball", "hinge"}
+        a, b : int
+            Body numbers; -1 is the world.
+        anchor : (3,) m, world
+            Common point of a ball or hinge.
+        anchor_a, anchor_b : (3,) m, world
+            Ends of a distance joint; default: the bodies' centres.
+        axis : (3,), world
+            Of a hinge.
+        length : float, m
+            Of a distance joint; default: as the anchors stand.
+        hertz, damping : float, 1/s and -
+            A soft joint of that frequency and damping ratio; 0 Hz is rigid.
+        motor_speed, motor_torque : float, rad/s and N m
+            A hinge's motor: speed of b against a round the axis, and the largest torque.
+        collide : bool
+            Whether the two bodies may touch; by default they do not.
+
+        Raises
+        ------
+        InputError
+            A missing body, no dynamic body, an anchor or axis too few or too many. Nothing is added.
+        """
+        if kind not in (DISTANCE, BALL, HINGE):
+            raise UnknownName("joint", kind, (DISTANCE, BALL, HINGE))
+        label = name or f"{kind} {len(self.joints)}"
+        for body in (a, b):
+            if isinstance(body, bool) or not isinstance(body, (int, np.integer)) or not -1 <= body < self.n_bodies:
+                raise InputError(f"{label} names body {body!r}; there are bodies 0 to {self.n_bodies - 1}, and -1 is the world")
+        a, b = int(a), int(b)
+        if a == b or all(i < 0 or self.bodies[i].is_static for i in (a, b)):
+            raise InputError(f"{label} joins {a} and {b}; two bodies are needed, at least one of them dynamic")
+        hertz = number(f"hertz of {label}", hertz, low=0.0)
+        damping = number(f"damping of {label}", damping, low=0.0)
+        if kind == DISTANCE:
+            if anchor is not None or axis is not None:
+                raise InputError(f"{label} takes anchor_a and anchor_b, no anchor or axis")
+            pa, pb = (self._anchor(label, i, p) for i, p in ((a, anchor_a), (b, anchor_b)))
+            length = float(np.linalg.norm(pb - pa)) if length is None else number(f"length of {label} [m]", length, low=0.0)
+            if length == 0.0:
+                raise InputError(f"{label} has length 0; use a ball joint")
+        else:
+            if anchor is None or anchor_a is not None or anchor_b is not None or length is not None:
+                raise InputError(f"{label} takes anchor=, one world point, and no length")
+            pa = pb = numbers(f"anchor of {label} [m]", anchor, 3)
+        if (axis is None) == (kind == HINGE):
+            raise InputError(f"{label}: axis= goes with a hinge, and a hinge needs one")
+        world_axis = unit(f"axis of {label}", axis) if kind == HINGE else np.array([0.0, 0.0, 1.0])
+        if (motor_speed is not None or motor_torque is not None) and kind != HINGE:
+            raise InputError(f"{label}: only a hinge has a motor")
+        if (motor_speed is None) != (motor_torque is None):
+            raise InputError(f"{label}: a motor needs both motor_speed and motor_torque")
+        joint = Joint(
+            kind=kind,
+            name=label,
+            a=a,
+            b=b,
+            anchor_a=self._local(a, pa),
+            anchor_b=self._local(b, pb),
+            axis_a=world_axis if a < 0 else self.bodies[a].direction_to_local(world_axis),
+            axis_b=world_axis if b < 0 else self.bodies[b].direction_to_local(world_axis),
+            length=length or 0.0,
+            hertz=hertz,
+            damping=damping,
+            motor_speed=None if motor_speed is None else number(f"motor_speed of {label} [rad/s]", motor_speed),
+            motor_torque=0.0 if motor_torque is None else number(f"motor_torque of {label} [N m]", motor_torque, low=0.0),
+            collide=bool(collide),
+        )
+        self.joints.append(joint)
+        return len(self.joints) - 1
+
+    def _anchor(self, label: str, body: int, point: Any) -> FloatArray:
+        if point is not None:
+            return numbers(f"anchor of {label} [m]", point, 3)
+        if body < 0:
+            raise InputError(f"{label}: the world has no centre; give the anchor at its side")
+        return self.bodies[body].position
+
+    def _local(self, body: int, point: FloatArray) -> FloatArray:
+        return point if body < 0 else self.bodies[body].to_local(point)
+
+    # -- identity -------------------------------------------------------------------------------
+
+    def fingerprint(self) -> str:
+        """Hash of what cannot change while the scene runs: bodies, joints and parameters, without the start state
+        and without the sweep budget and warm-start mode.
+        """
+        free = ("solver_iterations", "warm_start")
+        head = {f.name: getattr(self.parameters, f.name) for f in fields(Parameters) if f.name not in free}
+        parts: list[Any] = [head]
+        for b in self.bodies:
+            shape = None if b.shape is None else [type(b.shape).__name__, repr(b.shape)]
+            parts.append([b.name, shape, b.mass, b.inertia.tolist(), b.friction, b.restitution, b.patch_radius])
+        for j in self.joints:
+            parts.append([getattr(j, f.name) for f in fields(Joint)])
+        text = json.dumps(parts, default=lambda x: x.tolist() if isinstance(x, np.ndarray) else repr(x))
+        return hashlib.sha256(text.encode()).hexdigest()
+
+    def __repr__(self) -> str:
+        return f"<Scene {self.name or 'by hand'!r}: {self.n_bodies} bodies, {self.n_joints} joints>"
+
+
+def _inertia(label: str, given: Any, shape: Any, mass: float) -> FloatArray:
+    if given is None:
+        return (shape if shape is not None else Sphere(0.1)).inertia(mass)
+    try:
+        x = np.array(given, float)
+    except (TypeError, ValueError):
+        raise InputError(f"inertia of {label} is {given!r}; 3 moments or a (3, 3) tensor is needed") from None
+    if x.shape == (3,):
+        x = np.diag(x)
+    if x.shape != (3, 3) or not np.isfinite(x).all():
+        raise InputError(f"inertia of {label} is {x.tolist()}; 3 finite moments or a (3, 3) tensor is needed")
+    if np.abs(x - x.T).max() > 1e-12 * np.abs(x).max():
+        raise InputError(f"inertia of {label} is not symmetric")
+    x = 0.5 * (x + x.T)
+    value = np.linalg.eigvalsh(x)
+    if not value[0] > 1e-14 * value[-1] or not value[0] > 0.0:
+        raise InputError(f"inertia of {label} has moments {value.tolist()} kg m^2; all must be positive")
+    return x
