@@ -45,13 +45,25 @@ def as_array(
         raise InputError(f"{what} is not an array of numbers ({error})") from None
     if given.dtype.kind not in "buif":
         raise InputError(f"{what} has dtype {given.dtype}; real numbers are needed")
-    if dtype is np.int32 and given.dtype.kind == "f" and given.size and not np.array_equal(given, np.rint(given)):
+    if (
+        dtype is np.int32
+        and given.dtype.kind == "f"
+        and given.size
+        and not np.array_equal(given, np.rint(given))
+    ):
         raise InputError(f"{what} must hold whole numbers")
     if given.ndim == 0 and len(shape) == 1 and shape[0] is not None:
         given = np.full(shape[0], given)
         copy = False
-    if given.ndim != len(shape) or any(n is not None and n != s for n, s in zip(shape, given.shape, strict=True)):
-        wanted = "(" + ", ".join("any" if n is None else str(n) for n in shape) + ("," if len(shape) == 1 else "") + ")"
+    if given.ndim != len(shape) or any(
+        n is not None and n != s for n, s in zip(shape, given.shape, strict=True)
+    ):
+        wanted = (
+            "("
+            + ", ".join("any" if n is None else str(n) for n in shape)
+            + ("," if len(shape) == 1 else "")
+            + ")"
+        )
         raise InputError(f"{what} has shape {given.shape}; {wanted} is needed")
     if dtype is np.int32 and given.size and (given.min() < -(2**31) or given.max() >= 2**31):
         raise InputError(f"{what} holds numbers beyond 32 bits")
@@ -67,7 +79,9 @@ def _check_finite(what: str, array: np.ndarray) -> None:
         bad = np.argwhere(~np.isfinite(array))
         if len(bad):
             where = ", ".join(map(str, bad[0]))
-            raise InputError(f"{what} must be finite; entry [{where}] is {array[tuple(bad[0])]}, {len(bad)} in all")
+            raise InputError(
+                f"{what} must be finite; entry [{where}] is {array[tuple(bad[0])]}, {len(bad)} in all"
+            )
 
 
 def check_not_nan(what: str, array: np.ndarray) -> None:

@@ -43,16 +43,22 @@ class Cones:
     def __post_init__(self) -> None:
         ptr = as_array("cones.ptr", self.ptr, (None,), dtype=np.int32)
         if len(ptr) == 0 or ptr[0] != 0 or np.any(np.diff(ptr) <= 0):
-            raise InputError("cones.ptr must start with 0 and increase: the first row of each block, then the number of rows")
+            raise InputError(
+                "cones.ptr must start with 0 and increase: the first row of each block, then the number of "
+                "rows"
+            )
         k, m = len(ptr) - 1, int(ptr[-1])
         kind = as_array("cones.kind", self.kind, (k,), dtype=np.int32)
         if k and not np.isin(kind, (ROW, CONTACT, CONTACT_SPIN)).all():
-            raise InputError(f"cones.kind holds {sorted(set(kind.tolist()))}; ROW=0, CONTACT=1, CONTACT_SPIN=2 are known")
+            raise InputError(
+                f"cones.kind holds {sorted(set(kind.tolist()))}; ROW=0, CONTACT=1, CONTACT_SPIN=2 are known"
+            )
         size = np.diff(ptr)
         bad = np.flatnonzero((kind != ROW) & ((size < kind) | (size > kind + 2)))
         if len(bad):
             raise InputError(
-                f"block {bad[0]} is a contact of {size[bad[0]]} rows; a contact has a normal, up to two tangents, "
+                f"block {bad[0]} is a contact of {size[bad[0]]} rows; a contact has a normal, up to "
+                "two tangents, "
                 "and one spin row if it is CONTACT_SPIN"
             )
         lower = as_array("lower", self.lower, (m,), finite=False, unit="N s")
@@ -63,7 +69,10 @@ class Cones:
         bad = np.flatnonzero(~contact_rows & ~((lower <= upper) & (lower < np.inf) & (upper > -np.inf)))
         if len(bad):
             i = bad[0]
-            raise InputError(f"row {i}: lower = {lower[i]}, upper = {upper[i]}; lower <= upper is needed, and a number between them")
+            raise InputError(
+                f"row {i}: lower = {lower[i]}, upper = {upper[i]}; lower <= upper is needed, "
+                "and a number between them"
+            )
         if contact_rows.any():
             # One spelling for rows whose bounds are never read, so that equal problems compare equal.
             lower, upper = lower.copy(), upper.copy()
@@ -75,7 +84,11 @@ class Cones:
         check_not_negative("mu", mu)
         radius = as_array("patch_radius", self.patch_radius, (k,), unit="m")
         check_not_negative("patch_radius", radius)
-        for name, value in zip(("ptr", "kind", "lower", "upper", "mu", "patch_radius"), (ptr, kind, lower, upper, mu, radius), strict=True):
+        for name, value in zip(
+            ("ptr", "kind", "lower", "upper", "mu", "patch_radius"),
+            (ptr, kind, lower, upper, mu, radius),
+            strict=True,
+        ):
             object.__setattr__(self, name, value)
 
     @classmethod
@@ -91,38 +104,51 @@ class Cones:
     def bounded(cls, lower: FloatArray, upper: FloatArray) -> Cones:
         """One ROW block for each pair of bounds; arrays (m,) [N s]."""
         m = len(lower)
-        return cls(np.arange(m + 1, dtype=np.int32), np.zeros(m, np.int32), lower, upper, np.zeros(m), np.zeros(m))
+        return cls(
+            np.arange(m + 1, dtype=np.int32), np.zeros(m, np.int32), lower, upper, np.zeros(m), np.zeros(m)
+        )
 
     @classmethod
     def free(cls, m: int) -> Cones:
         """m unbounded rows, each its own block: a linear system."""
         return cls._trusted(
-            np.arange(m + 1, dtype=np.int32), np.zeros(m, np.int32), np.full(m, -np.inf), np.full(m, np.inf), np.zeros(m), np.zeros(m)
+            np.arange(m + 1, dtype=np.int32),
+            np.zeros(m, np.int32),
+            np.full(m, -np.inf),
+            np.full(m, np.inf),
+            np.zeros(m),
+            np.zeros(m),
         )
 
     @classmethod
     def contacts(cls, mu: FloatArray, tangents: int = 2, patch_radius: FloatArray | None = None) -> Cones:
-        """Contacts only: mu (k,), the same number of tangents each, with a spin row if a radius is given (k,) [m]."""
+        """Contacts only, the same rows for each: mu (k,), and with a radius (k,) [m] a spin row."""
         mu = np.atleast_1d(np.asarray(mu, float))
         k, spin = len(mu), patch_radius is not None
         size = 1 + tangents + spin
-        radius = np.zeros(k) if patch_radius is None else np.broadcast_to(np.asarray(patch_radius, float), (k,))
+        radius = (
+            np.zeros(k) if patch_radius is None else np.broadcast_to(np.asarray(patch_radius, float), (k,))
+        )
         m = k * size
         kind = np.full(k, CONTACT_SPIN if spin else CONTACT, np.int32)
         return cls(np.arange(0, m + 1, size, dtype=np.int32), kind, np.zeros(m), np.zeros(m), mu, radius)
 
     @property
     def n_blocks(self) -> int:
+        """Number of blocks, k."""
         return len(self.kind)
 
     @property
     def n_rows(self) -> int:
+        """Number of rows, m."""
         return int(self.ptr[-1])
 
     @property
     def is_free(self) -> bool:
         """Every row is unbounded."""
-        return bool(np.all(self.kind == ROW) and np.all(np.isneginf(self.lower)) and np.all(np.isposinf(self.upper)))
+        return bool(
+            np.all(self.kind == ROW) and np.all(np.isneginf(self.lower)) and np.all(np.isposinf(self.upper))
+        )
 
     @property
     def is_bounded_rows(self) -> bool:

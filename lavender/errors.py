@@ -29,7 +29,11 @@ class UnknownName(LavenderError, KeyError):
     def __init__(self, kind: str, name: object, known: Iterable[str]) -> None:
         known = sorted(known)
         near = difflib.get_close_matches(str(name), known, n=3, cutoff=0.5)
-        hint = f"did you mean {' or '.join(map(repr, near))}?" if near else f"known: {', '.join(known) or 'none'}"
+        hint = (
+            f"did you mean {' or '.join(map(repr, near))}?"
+            if near
+            else f"known: {', '.join(known) or 'none'}"
+        )
         self.message = f"unknown {kind} {name!r}; {hint}"
         super().__init__(self.message)
 

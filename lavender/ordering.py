@@ -45,10 +45,13 @@ class Order:
 
     @property
     def is_given(self) -> bool:
+        """Every sweep runs over the blocks as they stand."""
         return self.mode == _GIVEN and bool(np.array_equal(self.blocks, np.arange(len(self.blocks))))
 
 
-def block_order(problem: Problem, order: str | Sequence[int] | Any = "given", *, seed: int = 0, ground: Any = None) -> Order:
+def block_order(
+    problem: Problem, order: str | Sequence[int] | Any = "given", *, seed: int = 0, ground: Any = None
+) -> Order:
     """Order of a problem's blocks.
 
     Parameters
@@ -119,10 +122,14 @@ def levels(problem: Problem, ground: Any = None) -> IntArray:
     k = problem.n_blocks
     if problem.rows is not None:
         if ground is not None:
-            raise InputError("ground= is for problems given as a matrix; with rows the static bodies are known")
+            raise InputError(
+                "ground= is for problems given as a matrix; with rows the static bodies are known"
+            )
         return kernels.body_order_levels(_block_bodies(problem), problem.rows.n_bodies)
     if ground is None:
-        raise CapabilityError("levels of a matrix need ground=: the blocks that touch the ground (with rows they are known)")
+        raise CapabilityError(
+            "levels of a matrix need ground=: the blocks that touch the ground (with rows they are known)"
+        )
     ground = as_array("ground", ground, (None,), dtype=np.int32)
     if ground.size and (ground.min() < 0 or ground.max() >= k):
         raise InputError(f"ground names block {ground.max()}; there are {k} blocks")
@@ -140,13 +147,19 @@ def levels(problem: Problem, ground: Any = None) -> IntArray:
 
 
 def colors(problem: Problem) -> IntArray:
-    """Colour (k,) of each block, greedy in the given order; one colour shares no moving body (rows) and no entry of A."""
+    """Colour (k,) of each block, greedy in the given order.
+
+    Blocks of one colour share no moving body (rows), or no entry of A (matrix).
+    """
     if problem.rows is not None:
         return kernels.body_colors(_block_bodies(problem), problem.rows.n_bodies)
     graph = _block_graph(problem)
     k = problem.n_blocks
     return kernels.graph_colors(
-        np.arange(k + 1, dtype=np.int32), np.arange(k, dtype=np.int32), graph.indptr.astype(np.int32), graph.indices.astype(np.int32)
+        np.arange(k + 1, dtype=np.int32),
+        np.arange(k, dtype=np.int32),
+        graph.indptr.astype(np.int32),
+        graph.indices.astype(np.int32),
     )
 
 

@@ -19,7 +19,8 @@ import scipy.sparse as sp
 from lavender._arrays import FloatArray, IntArray, as_array, check_not_negative, equal, read_only
 from lavender.cones import CONTACT_SPIN, ROW, Cones
 from lavender.errors import CapabilityError, InputError
-from lavender_ext import judge, problem as kernels
+from lavender_ext import judge, pivoting
+from lavender_ext import problem as kernels
 
 __all__ = ["LAWS", "Problem", "Rows", "VelocityForm"]
 
@@ -46,8 +47,12 @@ class Rows:
     inv_mass: FloatArray  # (n,) 1/kg
     inv_inertia: FloatArray  # (n, 3, 3) 1/(kg m^2), world axes, symmetric
     v_free: FloatArray  # (n, 6) m/s, rad/s: v*, the velocity without constraint impulses
-    jac: FloatArray = field(default_factory=lambda: np.zeros((0, 12)))  # (mj, 12) linear, angular of a, then of b
-    joint_ptr: IntArray = field(default_factory=lambda: np.zeros(1, np.int32))  # (kj + 1,) first row of each joint
+    jac: FloatArray = field(
+        default_factory=lambda: np.zeros((0, 12))
+    )  # (mj, 12) linear, angular of a, then of b
+    joint_ptr: IntArray = field(
+        default_factory=lambda: np.zeros(1, np.int32)
+    )  # (kj + 1,) first row of each joint
     joint_body: IntArray = field(default_factory=lambda: np.zeros((0, 2), np.int32))  # (kj, 2)
     normal: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))  # (c, 3) unit, from a to b
     tangent: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))  # (c, 3) unit, orthogonal to normal
@@ -61,10 +66,13 @@ class Rows:
         c = np.shape(self.normal)[0] if np.ndim(self.normal) == 2 else None
         ptr = as_array("joint_ptr", self.joint_ptr, (None,), dtype=np.int32, copy=self.copy)
         if len(ptr) == 0 or ptr[0] != 0 or np.any(np.diff(ptr) <= 0):
-            raise InputError("joint_ptr must start with 0 and increase: the first row of each joint, then the number of joint rows")
+            raise InputError(
+                "joint_ptr must start with 0 and increase: the first row of each joint, then the "
+                "number of joint rows"
+            )
         shapes: dict[str, tuple[int | None, ...]] = {
-            "inv_mass": (n,), "inv_inertia": (n, 3, 3), "v_free": (n, 6), "jac": (int(ptr[-1]), 12), "normal": (c, 3),
-            "tangent": (c, 3), "arm_a": (c, 3), "arm_b": (c, 3),
+            "inv_mass": (n,), "inv_inertia": (n, 3, 3), "v_free": (n, 6), "jac": (int(ptr[-1]), 12),
+            "normal": (c, 3), "tangent": (c, 3), "arm_a": (c, 3), "arm_b": (c, 3),
         }  # fmt: skip
         object.__setattr__(self, "joint_ptr", ptr)
         for name, shape in shapes.items():
@@ -73,7 +81,10 @@ class Rows:
             body = as_array(name, getattr(self, name), shape, dtype=np.int32, copy=self.copy)
             object.__setattr__(self, name, body)
             if body.size and (body.min() < -1 or body.max() >= len(self.inv_mass)):
-                raise InputError(f"{name} names body {body.max() if body.max() >= len(self.inv_mass) else body.min()}; there are {len(self.inv_mass)} bodies, and -1 is static")
+                stray = body.max() if body.max() >= len(self.inv_mass) else body.min()
+                raise InputError(
+                    f"{name} names body {stray}; there are {len(self.inv_mass)} bodies, and -1 is static"
+                )
             same = np.flatnonzero((body[:, 0] == body[:, 1]) & (body[:, 0] >= 0))
             if len(same):
                 raise InputError(f"{name}[{same[0]}] joins body {body[same[0], 0]} to itself")
@@ -87,18 +98,24 @@ class Rows:
             ])).max(axis=0)  # fmt: skip
             if off.max() > 1e-9:
                 i = int(np.argmax(off))
-                raise InputError(f"contact {i}: normal {self.normal[i]} and tangent {self.tangent[i]} must be orthogonal unit vectors")
+                raise InputError(
+                    f"contact {i}: normal {self.normal[i]} and tangent {self.tangent[i]} must be "
+                    "orthogonal unit vectors"
+                )
 
     @property
     def n_bodies(self) -> int:
+        """Number of moving bodies, n."""
         return len(self.inv_mass)
 
     @property
     def n_joints(self) -> int:
+        """Number of joints, kj: the first blocks."""
         return len(self.joint_body)
 
     @property
     def n_contacts(self) -> int:
+        """Number of contacts, c: the blocks after the joints."""
         return len(self.contact_body)
 
     def jacobian(self, cones: Cones) -> sp.csr_array:
@@ -116,7 +133,8 @@ class Rows:
         for axis, row in ((self.normal, 0), (self.tangent, 1), (t2, 2)):
             has = np.flatnonzero(tangents >= row)
             dense[first[has] + row] = np.hstack([
-                -axis[has], -np.cross(self.arm_a[has], axis[has]), axis[has], np.cross(self.arm_b[has], axis[has])
+                -axis[has], -np.cross(self.arm_a[has], axis[has]),
+                axis[has], np.cross(self.arm_b[has], axis[has]),
             ])  # fmt: skip
         last = cones.ptr[self.n_joints + 1 :][spin] - 1
         dense[last] = 0.0
@@ -141,7 +159,9 @@ class Rows:
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Rows):
             return NotImplemented
-        return all(equal(getattr(self, f.name), getattr(other, f.name)) for f in fields(self) if f.name != "copy")
+        return all(
+            equal(getattr(self, f.name), getattr(other, f.name)) for f in fields(self) if f.name != "copy"
+        )
 
     __hash__ = None  # type: ignore[assignment]
 
@@ -215,7 +235,9 @@ class Problem:
     def __post_init__(self) -> None:
         put = object.__setattr__
         if not isinstance(self.cones, Cones):
-            raise InputError(f"cones is a {type(self.cones).__name__}; a Cones is needed (Cones.bounded, Cones.contacts)")
+            raise InputError(
+                f"cones is a {type(self.cones).__name__}; a Cones is needed (Cones.bounded, Cones.contacts)"
+            )
         m, k = self.cones.n_rows, self.cones.n_blocks
         put(self, "b", as_array("b", self.b, (m,), unit="m/s", copy=self.copy))
         if (self.matrix is None) == (self.rows is None):
@@ -232,8 +254,14 @@ class Problem:
             put(self, "guess", as_array("guess", self.guess, (m,), unit="N s", copy=self.copy))
         if self.key is not None:
             key = np.asarray(self.key)
-            if key.shape != (k,) or key.dtype.kind not in "ui" or (key.dtype.kind == "i" and key.size and key.min() < 0):
-                raise InputError(f"key has shape {key.shape} and dtype {key.dtype}; ({k},) unsigned 64-bit is needed")
+            if (
+                key.shape != (k,)
+                or key.dtype.kind not in "ui"
+                or (key.dtype.kind == "i" and key.size and key.min() < 0)
+            ):
+                raise InputError(
+                    f"key has shape {key.shape} and dtype {key.dtype}; ({k},) unsigned 64-bit is needed"
+                )
             put(self, "key", read_only(key.astype(np.uint64)))
         if self.names is not None:
             names = tuple(map(str, self.names))
@@ -249,7 +277,10 @@ class Problem:
         kj = rows.n_joints
         kind = self.cones.kind
         if kj + rows.n_contacts != k or np.any(kind[:kj] != ROW) or np.any(kind[kj:] == ROW):
-            raise InputError(f"rows has {kj} joints and {rows.n_contacts} contacts; cones must have as many ROW blocks, then contacts (it has {k} blocks)")
+            raise InputError(
+                f"rows has {kj} joints and {rows.n_contacts} contacts; cones must have as many ROW "
+                f"blocks, then contacts (it has {k} blocks)"
+            )
         if not np.array_equal(self.cones.ptr[: kj + 1], rows.joint_ptr):
             raise InputError("cones.ptr and rows.joint_ptr disagree about the rows of the joints")
         compliance = np.zeros(m) if self.compliance is None else self.compliance
@@ -266,21 +297,30 @@ class Problem:
 
     @classmethod
     def lcp(cls, A: Any, b: Any, lower: Any = 0.0, upper: Any = np.inf, **more: Any) -> Problem:
-        """Boxed LCP: lower <= lambda <= upper complementary to w = A lambda - b; bounds scalar or (m,) [N s]."""
+        """Boxed LCP: lower <= lambda <= upper complementary to A lambda - b; bounds scalar or (m,) [N s]."""
         b = as_array("b", b, (None,), unit="m/s")
-        bounds = [as_array(n, x, (len(b),), finite=False, unit="N s") for n, x in (("lower", lower), ("upper", upper))]
+        bounds = [
+            as_array(n, x, (len(b),), finite=False, unit="N s")
+            for n, x in (("lower", lower), ("upper", upper))
+        ]
         return cls(b, Cones.bounded(*bounds), A, **more)
 
     @classmethod
     def contact(cls, A: Any, b: Any, mu: Any, patch_radius: Any = None, **more: Any) -> Problem:
-        """Contacts only, mu (k,); m / k rows each: normal, 0 to 2 tangents, and spin if `patch_radius` (k,) [m] is given."""
+        """Contacts only, mu (k,), m / k rows each: normal, 0 to 2 tangents, spin with `patch_radius` (k,) [m]."""
         b = as_array("b", b, (None,), unit="m/s")
         mu = as_array("mu", np.atleast_1d(np.asarray(mu)), (None,))
         if (len(mu) == 0) != (len(b) == 0) or (len(mu) and len(b) % len(mu)):
-            raise InputError(f"b has {len(b)} rows for {len(mu)} values of mu; the same number of rows for each contact is needed")
+            raise InputError(
+                f"b has {len(b)} rows for {len(mu)} values of mu; the same number of rows for each "
+                "contact is needed"
+            )
         tangents = len(b) // len(mu) - 1 - (patch_radius is not None) if len(mu) else 0
         if not 0 <= tangents <= 2:
-            raise InputError(f"{len(b)} rows for {len(mu)} contacts; a contact has a normal, up to two tangents, and spin with patch_radius")
+            raise InputError(
+                f"{len(b)} rows for {len(mu)} contacts; a contact has a normal, up to two tangents, "
+                "and spin with patch_radius"
+            )
         if patch_radius is not None:
             patch_radius = as_array("patch_radius", patch_radius, (len(mu),), unit="m")
         return cls(b, Cones.contacts(mu, tangents, patch_radius), A, **more)
@@ -346,6 +386,7 @@ class Problem:
 
     @property
     def n_blocks(self) -> int:
+        """Number of blocks, k."""
         return self.cones.n_blocks
 
     @cached_property
@@ -358,12 +399,20 @@ class Problem:
     @cached_property
     def asymmetry(self) -> float:
         """max |A - A^T| / max |A|; exactly 0 with rows."""
-        if self.rows is not None or self.m == 0:
+        if self.rows is not None:
             return 0.0
+        gap, big = self._scan[2:]
+        return gap / big if big > 0.0 else 0.0
+
+    @property
+    def bandwidth(self) -> tuple[int, int]:
+        """Lower and upper half bandwidth of A: the largest i - j and j - i of a stored entry."""
+        return self._scan[:2]
+
+    @cached_property
+    def _scan(self) -> tuple[int, int, float, float]:
         a = self.csr
-        big = np.abs(a.data).max(initial=0.0)
-        gap = (a - a.T).tocsr()
-        return float(np.abs(gap.data).max(initial=0.0) / big) if big > 0 else 0.0
+        return pivoting.scan(a.indptr, a.indices, a.data)
 
     @property
     def is_symmetric(self) -> bool:
@@ -379,7 +428,18 @@ class Problem:
             return self.csr_data
         r = self.rows
         return self._data(
-            rows=(r.jac, r.joint_body, r.normal, r.tangent, r.arm_a, r.arm_b, r.contact_body, r.inv_mass, r.inv_inertia, self.compliance)
+            rows=(
+                r.jac,
+                r.joint_body,
+                r.normal,
+                r.tangent,
+                r.arm_a,
+                r.arm_b,
+                r.contact_body,
+                r.inv_mass,
+                r.inv_inertia,
+                self.compliance,
+            )
         )
 
     @cached_property
@@ -390,7 +450,17 @@ class Problem:
 
     def _data(self, **operator: Any) -> kernels.Data:
         c = self.cones
-        return kernels.Data(c.ptr, c.kind, c.lower, c.upper, c.mu, c.patch_radius, self.b, FRICTION.index(self.friction), **operator)
+        return kernels.Data(
+            c.ptr,
+            c.kind,
+            c.lower,
+            c.upper,
+            c.mu,
+            c.patch_radius,
+            self.b,
+            FRICTION.index(self.friction),
+            **operator,
+        )
 
     @cached_property
     def csr(self) -> sp.csr_array:
@@ -418,7 +488,10 @@ class Problem:
             The problem was given as a matrix.
         """
         if self.rows is None:
-            raise CapabilityError("this problem was given as a matrix; its Jacobian is not known (make it with Problem.from_rows)")
+            raise CapabilityError(
+                "this problem was given as a matrix; its Jacobian is not known (make it with "
+                "Problem.from_rows)"
+            )
         return self.rows.jacobian(self.cones)
 
     @property
@@ -443,7 +516,10 @@ class Problem:
     def velocity(self, impulse: Any) -> FloatArray:
         """v+ = v* + M^-1 J^T lambda (n, 6) [m/s, rad/s]; only with rows."""
         if self.rows is None:
-            raise CapabilityError("this problem was given as a matrix; body velocities need rows (make it with Problem.from_rows)")
+            raise CapabilityError(
+                "this problem was given as a matrix; body velocities need rows (make it with "
+                "Problem.from_rows)"
+            )
         v = np.zeros((self.rows.n_bodies, 6))
         judge.velocity_change(self.data, self.impulse_array(impulse), v)
         return self.rows.v_free + v
@@ -490,7 +566,7 @@ class Problem:
         return replace(self, friction=friction, copy=False)
 
     def boxed(self, normal_impulse: Any) -> Problem:
-        """Friction bounded by fixed normals: |lambda_t| <= mu N on each tangent alone (a square, not the disk).
+        """Friction bounded by fixed normals: |lambda_t| <= mu N on each tangent alone: a square, not the disk.
 
         Parameters
         ----------
@@ -510,7 +586,15 @@ class Problem:
             lower[j + 1 : end], upper[j + 1 : end] = -bound[1:], bound[1:]
             upper[j] = np.inf
         names = None if self.names is None else [self.row_name(i) for i in range(self.m)]
-        return Problem(self.b, Cones.bounded(lower, upper), self.csr, guess=self.guess, names=names, name=self.name, copy=False)
+        return Problem(
+            self.b,
+            Cones.bounded(lower, upper),
+            self.csr,
+            guess=self.guess,
+            names=names,
+            name=self.name,
+            copy=False,
+        )
 
     def velocity_form(self) -> VelocityForm:
         """The mass-scaled velocity form (see `VelocityForm`); only with rows.
@@ -527,7 +611,9 @@ class Problem:
         # M^-1 = L L^T by blocks; a singular inverse inertia (a pinned axis) has a root but no Cholesky factor.
         value, vector = np.linalg.eigh(rows.inv_inertia) if n else (np.zeros((0, 3)), np.zeros((0, 3, 3)))
         root = vector * np.sqrt(np.maximum(value, 0.0))[:, None, :]
-        half = replace(rows, inv_mass=np.sqrt(rows.inv_mass), inv_inertia=root, copy=False).inverse_mass_matrix()
+        half = replace(
+            rows, inv_mass=np.sqrt(rows.inv_mass), inv_inertia=root, copy=False
+        ).inverse_mass_matrix()
         scale = 1.0 / np.sqrt(self.d)
         k = sp.csr_array(sp.diags_array(scale) @ (jac @ half))
         return VelocityForm(k, scale * self.b, self.compliance * scale**2, scale)  # type: ignore[operator]
@@ -541,7 +627,10 @@ class Problem:
         ):
             return False
         if sp.issparse(self.matrix) and sp.issparse(other.matrix):
-            return all(equal(getattr(self.matrix, n), getattr(other.matrix, n)) for n in ("indptr", "indices", "data"))
+            return all(
+                equal(getattr(self.matrix, n), getattr(other.matrix, n))
+                for n in ("indptr", "indices", "data")
+            )
         return type(self.matrix) is type(other.matrix) and equal(self.matrix, other.matrix)
 
     __hash__ = None  # type: ignore[assignment]
@@ -558,7 +647,10 @@ def _checked_matrix(matrix: Any, m: int, copy: bool) -> Any:
     if matrix.shape != (m, m):
         raise InputError(f"A has shape {matrix.shape}; ({m}, {m}) is needed, as b has {m} rows")
     if matrix.nnz >= 2**31:
-        raise InputError(f"A has {matrix.nnz} nonzeros, more than 32-bit indices reach; give J and M^-1 instead (Problem.from_rows)")
+        raise InputError(
+            f"A has {matrix.nnz} nonzeros, more than 32-bit indices reach; give J and M^-1 instead "
+            "(Problem.from_rows)"
+        )
     if matrix.dtype.kind not in "buif":
         raise InputError(f"A has dtype {matrix.dtype}; real numbers are needed")
     given = sp.csr_array(matrix, copy=copy)
@@ -570,5 +662,8 @@ def _canonical(a: sp.csr_array, m: int) -> sp.csr_array:
     if not a.has_canonical_format:
         a = a.copy()
         a.sum_duplicates()
-    parts = [read_only(np.ascontiguousarray(x, t)) for x, t in ((a.data, np.float64), (a.indices, np.int32), (a.indptr, np.int32))]
+    parts = [
+        read_only(np.ascontiguousarray(x, t))
+        for x, t in ((a.data, np.float64), (a.indices, np.int32), (a.indptr, np.int32))
+    ]
     return sp.csr_array(tuple(parts), shape=(m, m))

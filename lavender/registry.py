@@ -36,9 +36,14 @@ OPERATORS = ("rows", "matrix", "either")
 class Solver(Protocol):
     """What a factory returns; see the module."""
 
-    def prepare(self, problem: Problem) -> Any: ...
-    def update(self, state: Any, problem: Problem) -> Any: ...
-    def run(self, state: Any, impulse: FloatArray, n: int, tol: float, time_limit: float | None) -> Claim: ...
+    def prepare(self, problem: Problem) -> Any:
+        """Factor, colour, allocate."""
+
+    def update(self, state: Any, problem: Problem) -> Any:
+        """The same structure with new numbers, and a fresh start."""
+
+    def run(self, state: Any, impulse: FloatArray, n: int, tol: float, time_limit: float | None) -> Claim:
+        """n more iterations on `impulse` (m,) in place."""
 
 
 @dataclass(frozen=True)
@@ -80,7 +85,8 @@ class SolverSpec:
             or self.operator not in OPERATORS
         ):
             raise InputError(
-                f"solver {self.name!r}: laws {sorted(self.laws)} must be of {LAWS}, operator {self.operator!r} of {OPERATORS}"
+                f"solver {self.name!r}: laws {sorted(self.laws)} must be of {LAWS}, operator "
+                f"{self.operator!r} of {OPERATORS}"
             )
         object.__setattr__(self, "laws", frozenset(self.laws))
         if not self.resumable:
@@ -116,6 +122,7 @@ class SolverSpec:
         return self.factory.partition(":")[0] if isinstance(self.factory, str) else self.factory.__module__
 
     def load(self) -> Callable[..., Solver]:
+        """The factory, imported now if it was not."""
         if not isinstance(self.factory, str):
             return self.factory
         module, _, attribute = self.factory.partition(":")

@@ -120,5 +120,6 @@ class Solution:
         wrong = f"; CONTRADICTED: {self.contradicted}" if self.contradicted else ""
         return (
             f"{self.solver.name}: {self.status.name}, {self.residual}, "
-            f"{work or f'{self.iterations} iterations'}, {1e3 * (self.setup_time + self.solve_time):.3g} ms{note}{wrong}"
+            f"{work or f'{self.iterations} iterations'}, "
+            f"{1e3 * (self.setup_time + self.solve_time):.3g} ms{note}{wrong}"
         )

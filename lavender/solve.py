@@ -102,7 +102,10 @@ class Prepared:
         for name in options:
             if name not in spec.accepts:
                 if name in ("order", "ground", "seed", "threads") or name in FRONT_DOOR:
-                    raise CapabilityError(f"solver {spec.name!r} does not take {name}=; it takes: {', '.join(sorted(spec.accepts)) or 'no options'}")
+                    raise CapabilityError(
+                        f"solver {spec.name!r} does not take {name}=; it takes: "
+                        f"{', '.join(sorted(spec.accepts)) or 'no options'}"
+                    )
                 raise UnknownName(f"option of solver {spec.name!r}", name, spec.accepts)
         self.spec = spec
         self.options = dict(options)
@@ -128,7 +131,9 @@ class Prepared:
         spec = self.spec
         tol, max_iter, time_limit = _check_budget(spec, tol, max_iter, time_limit)
         if (callback is not None and not spec.callback) or (history and not spec.history):
-            raise CapabilityError(f"solver {spec.name!r} runs in one call; it takes no callback and records no history")
+            raise CapabilityError(
+                f"solver {spec.name!r} runs in one call; it takes no callback and records no history"
+            )
         self._refresh(problem)
         problem = self.problem
         if impulse is not None:
@@ -142,7 +147,9 @@ class Prepared:
             return _finish(problem, spec, self.options, lam, claim, tol, setup_time, 0.0, None)
         loop = _Loop(problem, self._solver, self._state, lam, tol, time_limit, history, callback)
         claim = loop.run(max_iter) if spec.resumable else loop.run_once(max_iter)
-        return _finish(problem, spec, self.options, loop.impulse, claim, tol, setup_time, loop.time, loop.recorded())
+        return _finish(
+            problem, spec, self.options, loop.impulse, claim, tol, setup_time, loop.time, loop.recorded()
+        )
 
     def _refresh(self, problem: Problem | None) -> None:
         if problem is None or problem is self.problem:
@@ -251,9 +258,10 @@ class _Loop:
     def _keep_best(self) -> None:
         # A solver whose residual may rise keeps its best checked iterate; a budget (tol = 0) means the last one.
         best = getattr(self.state, "best", None)
-        if self.tol > 0.0 and best is not None and best[1] is not None and best[1] is not self.impulse:
-            if not residual(self.problem, self.impulse).relative <= best[0]:
-                self.impulse[:] = best[1]
+        if self.tol == 0.0 or best is None or best[1] is None:
+            return
+        if not residual(self.problem, self.impulse).relative <= best[0]:
+            self.impulse[:] = best[1]
 
     def _record(self) -> bool:
         r = residual(self.problem, self.impulse)
@@ -297,7 +305,9 @@ def _finish(
     relative = judged.relative
     if not np.isfinite(impulse).all() and status is not Status.NUMERICAL_ERROR:
         status = Status.DIVERGED
-    elif status in (Status.MAX_ITERATIONS, Status.TIME_LIMIT, Status.STALLED) and 0.0 < tol and relative <= tol:
+    elif (
+        status in (Status.MAX_ITERATIONS, Status.TIME_LIMIT, Status.STALLED) and tol > 0.0 and relative <= tol
+    ):
         status = Status.CONVERGED
     elif tol < relative <= 2.0 * judged.floor and status in (Status.CONVERGED, Status.STALLED):
         status = Status.FLOOR
@@ -307,7 +317,11 @@ def _finish(
     elif status is Status.FLOOR and not relative <= 2.0 * judged.floor:
         contradicted = f"says FLOOR, relative residual {relative:.2e} is above twice {judged.floor:.2e}"
     elif status is Status.INFEASIBLE:
-        reason = "no certificate was given" if claim.certificate is None else check_certificate(problem, claim.certificate)
+        reason = (
+            "no certificate was given"
+            if claim.certificate is None
+            else check_certificate(problem, claim.certificate)
+        )
         contradicted = f"says INFEASIBLE, {reason}" if reason else ""
     impulse.flags.writeable = False
     return Solution(
@@ -334,7 +348,7 @@ def _decide_empty_rows(problem: Problem, impulse: FloatArray) -> tuple[str, Floa
     for i in problem.data.empty:
         block = problem.block_of(int(i))
         if cones.kind[block] != ROW and i != cones.ptr[block]:
-            continue                                    # tangents and spin: bounded by mu lambda_n
+            continue  # tangents and spin: bounded by mu lambda_n
         b = problem.b[i]
         bound = cones.upper[i] if b > 0.0 else cones.lower[i]
         if b == 0.0:
@@ -356,13 +370,17 @@ def _check_problem(problem: Problem, spec: SolverSpec) -> None:
         raise CapabilityError(f"solver {spec.name!r} {reason}")
 
 
-def _check_budget(spec: SolverSpec, tol: float, max_iter: int | None, time_limit: float | None) -> tuple[float, int, float | None]:
+def _check_budget(
+    spec: SolverSpec, tol: float, max_iter: int | None, time_limit: float | None
+) -> tuple[float, int, float | None]:
     if not isinstance(tol, (int, float, np.number)) or not 0.0 <= tol < math.inf:
         raise InputError(f"tol is {tol!r}; a number >= 0 is needed (0 runs the whole budget)")
     if max_iter is None:
         max_iter = spec.max_iter
     if isinstance(max_iter, bool) or not isinstance(max_iter, (int, np.integer)) or not 0 <= max_iter < 2**31:
         raise InputError(f"max_iter is {max_iter!r}; a whole number from 0 to 2^31 - 1 is needed")
-    if time_limit is not None and (not isinstance(time_limit, (int, float, np.number)) or not time_limit > 0.0):
+    if time_limit is not None and (
+        not isinstance(time_limit, (int, float, np.number)) or not time_limit > 0.0
+    ):
         raise InputError(f"time_limit is {time_limit!r}; seconds above 0, or None")
     return float(tol), int(max_iter), time_limit

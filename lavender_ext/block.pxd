@@ -83,20 +83,28 @@ cdef inline double relax_normal(double lam, double w, double step) noexcept nogi
 
 cdef inline void relax_tangents(double* lam, const double* w, double step, double radius,
                                 int32_t n) noexcept nogil:
-    # (3): lam, w of the n tangent rows; one scalar step for both.
-    cdef double x, y, r
+    # (3): lam, w of the n tangent rows; one scalar step for both. Squares decide where they are safe, so
+    # that a sticking contact costs no root.
+    cdef double x, y, s, r
     if n == 1:
         lam[0] = clip(lam[0] - w[0] * step, -radius, radius)
+        return
+    x = lam[0] - w[0] * step
+    y = lam[1] - w[1] * step
+    s = x * x + y * y
+    if 1e-280 < s < 1e280:
+        if s > radius * radius:
+            r = radius / sqrt(s)
+            x = x * r
+            y = y * r
     else:
-        x = lam[0] - w[0] * step
-        y = lam[1] - w[1] * step
         r = norm2(x, y)
         if r > radius:
             r = radius / r
             x = x * r
             y = y * r
-        lam[0] = x
-        lam[1] = y
+    lam[0] = x
+    lam[1] = y
 
 
 cdef inline double row_error(double lam, double w, double d, double low, double high) noexcept nogil:

@@ -26,7 +26,9 @@ def unit(rng):
 def random_rows(rng, bodies=5, joints=3, contacts=8):
     """Bodies of mixed mass, joints of 1 to 3 rows (some angular), contacts; some against the ground."""
     mass = rng.uniform(0.5, 3.0, bodies)
-    inertia = [r @ np.diag(rng.uniform(5.0, 12.0, 3)) @ r.T / m for m, r in zip(mass, (rotation(rng) for _ in mass))]
+    inertia = [
+        r @ np.diag(rng.uniform(5.0, 12.0, 3)) @ r.T / m for m, r in zip(mass, (rotation(rng) for _ in mass))
+    ]
 
     def pair():
         a, b = rng.choice(bodies, 2, replace=False)
@@ -84,7 +86,12 @@ def random_contact_problem(seed, friction="coulomb", tangents=None, spin=True, *
 def as_matrix(problem):
     """The same problem given by its matrix."""
     return lv.Problem(
-        problem.b, problem.cones, problem.delassus(), friction=problem.friction, guess=problem.guess, name=problem.name
+        problem.b,
+        problem.cones,
+        problem.delassus(),
+        friction=problem.friction,
+        guess=problem.guess,
+        name=problem.name,
     )
 
 
@@ -94,7 +101,9 @@ def random_lcp(seed, m=12, rank=None, boxed=True):
     high = np.where(rng.random(m) < 0.5, rng.uniform(0.1, 1.0, m), np.inf) if boxed else np.inf
     # b in the range of A, plus a push into separation: solvable also where A is singular.
     a = g @ g.T
-    return lv.Problem.lcp(a, a @ rng.normal(size=m) - rng.uniform(0.0, 1.0, m), upper=high, name=f"lcp {seed}")
+    return lv.Problem.lcp(
+        a, a @ rng.normal(size=m) - rng.uniform(0.0, 1.0, m), upper=high, name=f"lcp {seed}"
+    )
 
 
 seeds = st.integers(0, 2**32 - 1)

@@ -6,7 +6,7 @@ import threading
 
 import numpy as np
 import pytest
-from random_problems import as_matrix, random_contact_problem, random_lcp
+from random_problems import as_matrix, random_contact_problem
 
 import lavender as lv
 from lavender import registry
@@ -16,7 +16,11 @@ from lavender.residuals import check_certificate
 NAMES = sorted(registry.specs())
 HERE = lv.available()
 RESUMABLE = lv.available(resumable=True)
-OURS = [n for n in HERE if not n.startswith("_") and not registry.specs()[n].factory_module().startswith("lavender.external")]
+OURS = [
+    n
+    for n in HERE
+    if not n.startswith("_") and not registry.specs()[n].factory_module().startswith("lavender.external")
+]
 
 
 @functools.cache
@@ -25,7 +29,9 @@ def example(law, rows):
     if law == "linear":
         base = random_contact_problem(21, contacts=0, joints=12, bodies=6)
         c = base.cones
-        free = lv.Cones(c.ptr, c.kind, np.full(c.n_rows, -np.inf), np.full(c.n_rows, np.inf), c.mu, c.patch_radius)
+        free = lv.Cones(
+            c.ptr, c.kind, np.full(c.n_rows, -np.inf), np.full(c.n_rows, np.inf), c.mu, c.patch_radius
+        )
         soft = base.compliance + 0.5
         problem = lv.Problem(base.b, free, rows=base.rows, compliance=soft)
     elif law == "lcp":
@@ -33,7 +39,9 @@ def example(law, rows):
         problem = lv.Problem(base.b, base.cones, rows=base.rows, compliance=base.compliance + 0.3)
     else:
         base = random_contact_problem(23, friction=law, tangents=2, spin=False)
-        problem = lv.Problem(base.b, base.cones, rows=base.rows, compliance=base.compliance + 0.3, friction=law)
+        problem = lv.Problem(
+            base.b, base.cones, rows=base.rows, compliance=base.compliance + 0.3, friction=law
+        )
     assert problem.law == law
     return problem if rows else as_matrix(problem)
 
@@ -205,7 +213,10 @@ def test_a_warm_start_is_used_and_not_modified(name):
 def test_orders_change_the_sweep_and_not_the_answer(name):
     spec = registry.get(name)
     problem = next(p for p in examples(spec) if p.law != "coulomb")
-    results = {o: lv.solve(problem, name, order=o, tol=1e-10, max_iter=20_000) for o in ("given", "reverse", "random", "colored")}
+    results = {
+        o: lv.solve(problem, name, order=o, tol=1e-10, max_iter=20_000)
+        for o in ("given", "reverse", "random", "colored")
+    }
     assert all(s.success for s in results.values())
     early = {lv.solve(problem, name, order=o, tol=0.0, max_iter=2).impulse.tobytes() for o in results}
     assert len(early) == len(results), "each order sweeps differently"
@@ -218,14 +229,18 @@ def test_orders_change_the_sweep_and_not_the_answer(name):
 @pytest.mark.parametrize("name", lv.available(seed=True))
 def test_seeds_change_random_sweeps(name):
     problem = next(examples(registry.get(name)))
-    x, y, z = (lv.solve(problem, name, order="random", seed=s, tol=0.0, max_iter=2).impulse for s in (1, 1, 2))
+    x, y, z = (
+        lv.solve(problem, name, order="random", seed=s, tol=0.0, max_iter=2).impulse for s in (1, 1, 2)
+    )
     assert x.tobytes() == y.tobytes() != z.tobytes()
 
 
 @pytest.mark.parametrize("name", lv.available(threads=True))
 def test_thread_count_changes_no_bit(name):
     problem = next(examples(registry.get(name)))
-    one, two = (lv.solve(problem, name, order="colored", threads=t, tol=0.0, max_iter=10).impulse for t in (1, 2))
+    one, two = (
+        lv.solve(problem, name, order="colored", threads=t, tol=0.0, max_iter=10).impulse for t in (1, 2)
+    )
     assert one.tobytes() == two.tobytes()
 
 

@@ -137,7 +137,9 @@ def test_slack_is_a_lambda_minus_b_in_both_forms(seed):
     np.testing.assert_allclose(problem.slack(lam), w, atol=1e-14 * scale)
     np.testing.assert_allclose(as_matrix(problem).slack(lam), w, atol=1e-14 * scale)
     np.testing.assert_allclose(problem.dense(), a, atol=1e-14 * np.abs(a).max())
-    np.testing.assert_allclose(problem.velocity(lam).ravel(), problem.rows.v_free.ravel() + minv @ jac.T @ lam, atol=1e-13)
+    np.testing.assert_allclose(
+        problem.velocity(lam).ravel(), problem.rows.v_free.ravel() + minv @ jac.T @ lam, atol=1e-13
+    )
 
 
 # -- zero at solutions made by hand ------------------------------------------------------------------
@@ -204,7 +206,11 @@ def test_units_change_no_relative_residual(kg, m, s, seed):
 def test_extreme_units_neither_overflow_nor_underflow(scale):
     problem = random_lcp(3)
     lam = np.random.default_rng(0).normal(size=problem.m)
-    scaled = lv.Problem(problem.b * scale, lv.Cones.bounded(problem.cones.lower * scale, problem.cones.upper * scale), problem.matrix)
+    scaled = lv.Problem(
+        problem.b * scale,
+        lv.Cones.bounded(problem.cones.lower * scale, problem.cones.upper * scale),
+        problem.matrix,
+    )
     np.testing.assert_allclose(
         lv.residual(scaled, lam * scale).relative, lv.residual(problem, lam).relative, rtol=1e-12
     )
@@ -235,7 +241,9 @@ def test_rotating_the_tangent_frame_changes_nothing(friction, seed):
     a = turn @ problem.dense() @ turn.T
     turned = lv.Problem(turn @ problem.b, problem.cones, a, friction=friction)
     x, y = lv.residual(as_matrix(problem), lam), lv.residual(turned, turn @ lam)
-    np.testing.assert_allclose([y.relative, y.energy, y.velocity], [x.relative, x.energy, x.velocity], rtol=1e-11)
+    np.testing.assert_allclose(
+        [y.relative, y.energy, y.velocity], [x.relative, x.energy, x.velocity], rtol=1e-11
+    )
 
 
 def test_a_thousand_separating_rows_dilute_nothing():
@@ -379,11 +387,9 @@ def test_the_inequality_between_two_points_holds():
         d = problem.d
         delta = x - y
         eps = lv.residual(problem, x).error - lv.residual(problem, y).error
-        a = problem.matrix
-        norm_a = lambda v: np.sqrt(max(v @ a @ v, 0.0))  # noqa: E731
-        norm_d = lambda v: np.sqrt(v @ (d * v))  # noqa: E731
-        left = delta @ a @ delta
-        assert left <= (norm_a(delta) * norm_a(eps) + norm_d(eps) * norm_d(delta)) * (1 + 1e-12)
+        delta_a, eps_a = (np.sqrt(max(v @ problem.matrix @ v, 0.0)) for v in (delta, eps))
+        delta_d, eps_d = (np.sqrt(v @ (d * v)) for v in (delta, eps))
+        assert delta_a**2 <= (delta_a * eps_a + eps_d * delta_d) * (1 + 1e-12)
 
 
 def test_residual_reads_as_one_line_and_names_the_worst_row():

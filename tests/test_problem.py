@@ -110,7 +110,10 @@ def test_rows_have_names():
         "contact 0, normal", "contact 0, tangent 1", "contact 0, tangent 2", "contact 0, spin",
     ]  # fmt: skip
     named = lv.Problem(
-        problem.b, problem.cones, rows=problem.rows, names=[f"hinge {i}" for i in range(kj)] + ["box 1 on box 2"] * 8
+        problem.b,
+        problem.cones,
+        rows=problem.rows,
+        names=[f"hinge {i}" for i in range(kj)] + ["box 1 on box 2"] * 8,
     )
     wide = int(np.argmax(np.diff(problem.cones.ptr[: kj + 1]) > 1))
     assert named.row_name(int(problem.cones.ptr[wide]) + 1) == f"hinge {wide}, axis 1"
@@ -136,11 +139,17 @@ def test_static_bodies_and_pinned_bodies_are_legal():
 
 NAN, INF = np.nan, np.inf
 BAD_PROBLEMS = {
-    "NaN in A": (lambda: lv.Problem.lcp([[NAN, 0], [0, 1]], [1, 1]), r"A \[1/kg\] must be finite; entry \[0, 0\] is nan"),
+    "NaN in A": (
+        lambda: lv.Problem.lcp([[NAN, 0], [0, 1]], [1, 1]),
+        r"A \[1/kg\] must be finite; entry \[0, 0\] is nan",
+    ),
     "inf in sparse A": (lambda: lv.Problem.lcp(sp.csr_array([[INF, 0], [0, 1.0]]), [1, 1]), "must be finite"),
     "NaN in b": (lambda: lv.Problem.lcp(I2, [1, NAN]), r"b \[m/s\] must be finite; entry \[1\]"),
     "not square": (lambda: lv.Problem.lcp(np.ones((2, 3)), [1, 1]), r"shape \(2, 3\); \(2, 2\) is needed"),
-    "sparse, not square": (lambda: lv.Problem.lcp(sp.csr_array(np.ones((2, 3))), [1, 1]), r"\(2, 2\) is needed"),
+    "sparse, not square": (
+        lambda: lv.Problem.lcp(sp.csr_array(np.ones((2, 3))), [1, 1]),
+        r"\(2, 2\) is needed",
+    ),
     "A and b disagree": (lambda: lv.Problem.lcp(I2, [1, 1, 1]), r"\(3, 3\) is needed"),
     "complex A": (lambda: lv.Problem.lcp(I2 * 1j, [1, 1]), "complex"),
     "text": (lambda: lv.Problem.lcp([["x"]], [1]), "real numbers"),
@@ -149,18 +158,30 @@ BAD_PROBLEMS = {
     "lower = inf": (lambda: lv.Problem.lcp(I2, [1, 1], INF, INF), "a number between"),
     "NaN bound": (lambda: lv.Problem.lcp(I2, [1, 1], [0, NAN]), r"lower must not be NaN; entry \[1\]"),
     "bounds of wrong length": (lambda: lv.Problem.lcp(I2, [1, 1], [0, 0, 0]), r"\(2,\) is needed"),
-    "negative mu": (lambda: lv.Problem.contact(np.eye(3), np.ones(3), [-0.1]), r"mu must not be negative; entry \[0\]"),
+    "negative mu": (
+        lambda: lv.Problem.contact(np.eye(3), np.ones(3), [-0.1]),
+        r"mu must not be negative; entry \[0\]",
+    ),
     "infinite mu": (lambda: lv.Problem.contact(np.eye(3), np.ones(3), [INF]), "mu must be finite"),
-    "negative radius": (lambda: lv.Problem.contact(np.eye(4), np.ones(4), [1], [-1]), "patch_radius must not be negative"),
+    "negative radius": (
+        lambda: lv.Problem.contact(np.eye(4), np.ones(4), [1], [-1]),
+        "patch_radius must not be negative",
+    ),
     "rows per contact": (lambda: lv.Problem.contact(np.eye(5), np.ones(5), [1, 1]), "5 rows for 2"),
     "five rows": (lambda: lv.Problem.contact(np.eye(5), np.ones(5), [1]), "up to two tangents"),
-    "law": (lambda: lv.Problem.contact(np.eye(3), np.ones(3), [1], friction="couloumb"), "'coulomb' or 'cone'"),
+    "law": (
+        lambda: lv.Problem.contact(np.eye(3), np.ones(3), [1], friction="couloumb"),
+        "'coulomb' or 'cone'",
+    ),
     "guess": (lambda: lv.Problem.lcp(I2, [1, 1], guess=[1.0]), r"guess \[N s\] has shape \(1,\)"),
     "NaN guess": (lambda: lv.Problem.lcp(I2, [1, 1], guess=[1.0, NAN]), "guess .* finite"),
     "names": (lambda: lv.Problem.lcp(I2, [1, 1], names=["a"]), "1 names for 2 blocks"),
     "key": (lambda: lv.Problem.lcp(I2, [1, 1], key=[-1, 2]), "unsigned"),
     "compliance": (lambda: lv.Problem.lcp(I2, [1, 1], compliance=[1, 1]), "already on the diagonal"),
-    "both forms": (lambda: lv.Problem(np.ones(2), lv.Cones.free(2), I2, rows=random_rows(np.random.default_rng(0))), "one of them"),
+    "both forms": (
+        lambda: lv.Problem(np.ones(2), lv.Cones.free(2), I2, rows=random_rows(np.random.default_rng(0))),
+        "one of them",
+    ),
     "neither form": (lambda: lv.Problem(np.ones(2), lv.Cones.free(2)), "one of them"),
     "cones": (lambda: lv.Problem(np.ones(2), None, I2), "a Cones is needed"),
     "kind": (lambda: lv.Cones([0, 1], [7], [0], [1], [0], [0]), r"\[7\]"),
@@ -189,7 +210,10 @@ BAD_ROWS = {
     "itself": ({"contact_body": np.full((8, 2), [3, 3])}, "joins body 3 to itself"),
     "negative mass": ({"inv_mass": -np.ones(5)}, "inv_mass must not be negative"),
     "normal": ({"normal": np.tile([0, 0, 2.0], (8, 1))}, "orthogonal unit vectors"),
-    "tangent": ({"tangent": np.tile([0, 0, 1.0], (8, 1)), "normal": np.tile([0, 0, 1.0], (8, 1))}, "orthogonal"),
+    "tangent": (
+        {"tangent": np.tile([0, 0, 1.0], (8, 1)), "normal": np.tile([0, 0, 1.0], (8, 1))},
+        "orthogonal",
+    ),
     "arms": ({"arm_a": np.zeros((7, 3))}, r"\(8, 3\) is needed"),
     "velocity": ({"v_free": np.full((5, 6), NAN)}, "v_free must be finite"),
     "jac": ({"jac": np.zeros((1, 12))}, "jac has shape"),
@@ -211,7 +235,11 @@ BAD_CALLS = {
     "negative max_iter": ({"max_iter": -1}, lv.InputError, "max_iter is -1"),
     "fractional max_iter": ({"max_iter": 2.5}, lv.InputError, "max_iter is 2.5"),
     "zero time": ({"time_limit": 0.0}, lv.InputError, "time_limit is 0.0"),
-    "short warm start": ({"impulse": [1.0]}, lv.InputError, r"impulse \[N s\] has shape \(1,\); \(12,\) is needed"),
+    "short warm start": (
+        {"impulse": [1.0]},
+        lv.InputError,
+        r"impulse \[N s\] has shape \(1,\); \(12,\) is needed",
+    ),
     "NaN warm start": ({"impulse": [NAN] * 12}, lv.InputError, "must be finite"),
     "seed": ({"order": "random", "seed": -1}, lv.InputError, "seed is -1"),
     "ground": ({"order": "given", "ground": [0]}, lv.InputError, "bottom_up"),
@@ -260,7 +288,9 @@ def test_a_plug_in_is_registered_and_solved_with(monkeypatch):
             impulse[:] = 0.0
             return lv.Claim(lv.Status.CONVERGED, 1, {"nothing": 1})
 
-    spec = lv.SolverSpec("zero", Zero, {"linear", "lcp"}, "does nothing, and claims to be done", resumable=False)
+    spec = lv.SolverSpec(
+        "zero", Zero, {"linear", "lcp"}, "does nothing, and claims to be done", resumable=False
+    )
     from lavender import registry
 
     monkeypatch.setattr(registry, "_registered", dict(registry.specs()))

@@ -73,11 +73,16 @@ def test_sequential_impulses_equal_pgs_for_ten_thousand_sweeps():
 def test_row_order_given_by_name_or_by_numbers_is_the_same(name, seed):
     problem = random_lcp(seed)
     if name == "pgs":
-        np.testing.assert_array_equal(sweeps(problem, name, 7), sweeps(problem, name, 7, order=np.arange(problem.n_blocks)))
+        np.testing.assert_array_equal(
+            sweeps(problem, name, 7), sweeps(problem, name, 7, order=np.arange(problem.n_blocks))
+        )
     permutation = np.random.default_rng(seed).permutation(problem.m)
     c = problem.cones
     permuted = lv.Problem.lcp(
-        problem.matrix[np.ix_(permutation, permutation)], problem.b[permutation], c.lower[permutation], c.upper[permutation]
+        problem.matrix[np.ix_(permutation, permutation)],
+        problem.b[permutation],
+        c.lower[permutation],
+        c.upper[permutation],
     )
     x = sweeps(problem, name, 7, **({"order": permutation} if name == "pgs" else {}))
     # Sweeping P A P^T forwards is sweeping A in the order P, up to the order of additions.
@@ -104,7 +109,9 @@ def test_jacobi_is_its_formula(seed):
     lam = np.zeros(len(b))
     for _ in range(4):
         lam = np.clip(lam - 0.3 * (a @ lam - b) / np.diag(a), c.lower, c.upper)
-    np.testing.assert_allclose(sweeps(problem, "jacobi", 4, omega=0.3), lam, atol=1e-12 * (1 + np.abs(lam).max()))
+    np.testing.assert_allclose(
+        sweeps(problem, "jacobi", 4, omega=0.3), lam, atol=1e-12 * (1 + np.abs(lam).max())
+    )
 
 
 # -- tangent blocks -------------------------------------------------------------------------------------

@@ -76,7 +76,9 @@ class SweepState:
         return status
 
 
-def run_sweeps(state: SweepState, impulse: FloatArray, n: int, tol: float, sweep: Callable[[int], None]) -> Claim:
+def run_sweeps(
+    state: SweepState, impulse: FloatArray, n: int, tol: float, sweep: Callable[[int], None]
+) -> Claim:
     """n sweeps, or fewer where a check ends them; tol = 0 checks nothing."""
     done = 0
     status = Status.MAX_ITERATIONS

@@ -24,6 +24,8 @@ from lavender_ext import sweeps as kernels
 
 @dataclass
 class JacobiState(SweepState):
+    """A sweep state with its damping and a scratch vector (m,)."""
+
     omega: float = 1.0
     scratch: FloatArray | None = None
 
@@ -42,7 +44,9 @@ class Jacobi:
 
     def __post_init__(self) -> None:
         if self.omega is not None and not 0.0 < self.omega < np.inf:
-            raise InputError(f"omega is {self.omega}; a number above 0 is needed, or None for the safe damping")
+            raise InputError(
+                f"omega is {self.omega}; a number above 0 is needed, or None for the safe damping"
+            )
 
     def prepare(self, problem: Problem) -> JacobiState:
         base = Sweeping().prepare(problem)
@@ -52,9 +56,17 @@ class Jacobi:
     def update(self, state: JacobiState, problem: Problem) -> JacobiState:
         return self.prepare(problem)
 
-    def run(self, state: JacobiState, impulse: FloatArray, n: int, tol: float, time_limit: float | None = None) -> Claim:
+    def run(
+        self, state: JacobiState, impulse: FloatArray, n: int, tol: float, time_limit: float | None = None
+    ) -> Claim:
         scratch = state.scratch
-        return run_sweeps(state, impulse, n, tol, lambda count: kernels.jacobi_sweeps(state.data, state.omega, impulse, scratch, count))
+        return run_sweeps(
+            state,
+            impulse,
+            n,
+            tol,
+            lambda count: kernels.jacobi_sweeps(state.data, state.omega, impulse, scratch, count),
+        )
 
 
 def safe_damping(problem: Problem) -> float:

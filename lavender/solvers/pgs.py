@@ -26,7 +26,9 @@ _ROW_BY_ROW = np.empty(0, np.int32)
 class PGS(Sweeping):
     """Projected Gauss-Seidel; `order`, `ground`, `seed` as in `lavender.ordering`."""
 
-    def run(self, state: SweepState, impulse: FloatArray, n: int, tol: float, time_limit: float | None = None) -> Claim:
+    def run(
+        self, state: SweepState, impulse: FloatArray, n: int, tol: float, time_limit: float | None = None
+    ) -> Claim:
         o = state.order
         # The same bits with or without an order array; without one the kernel skips two look-ups a row.
         blocks = _ROW_BY_ROW if state.data.single_rows and o.is_given else o.blocks

@@ -1,6 +1,7 @@
 """Sequential impulses: projected Gauss-Seidel on body velocities, A never formed.
 
-    w_i = J_i v - b_i + c_i lambda_i,   lambda_i <- update of `lavender_ext/block.pxd`,   v += M^-1 J_i^T (change)
+    w_i = J_i v - b_i + c_i lambda_i,   lambda_i <- update of `lavender_ext/block.pxd`,
+    v <- v + M^-1 J_i^T (change of lambda_i)
 
 with v = M^-1 J^T lambda, the change of velocity. Equal to `pgs` on the same order, sweep by sweep, to
 rounding; a contact costs the same whatever the number of its neighbours.
@@ -18,7 +19,8 @@ from lavender.problem import Problem
 from lavender.registry import SolverSpec
 from lavender.solution import Claim
 from lavender.solvers._sweeping import Sweeping, SweepState, run_sweeps
-from lavender_ext import judge, sweeps as kernels
+from lavender_ext import judge
+from lavender_ext import sweeps as kernels
 
 
 @dataclass(frozen=True)
@@ -29,7 +31,9 @@ class SequentialImpulses(Sweeping):
         order = block_order(problem, self.order, seed=self.seed, ground=self.ground)
         return SweepState(problem, problem.data, order)
 
-    def run(self, state: SweepState, impulse: FloatArray, n: int, tol: float, time_limit: float | None = None) -> Claim:
+    def run(
+        self, state: SweepState, impulse: FloatArray, n: int, tol: float, time_limit: float | None = None
+    ) -> Claim:
         o = state.order
         if state.velocity is None:
             # The invariant v = M^-1 J^T lambda, once; the sweeps keep it.
@@ -38,7 +42,9 @@ class SequentialImpulses(Sweeping):
         velocity = state.velocity
 
         def sweep(count: int) -> None:
-            kernels.impulse_sweeps(state.data, impulse, velocity, o.blocks, o.split, o.mode, o.rng, state.first, count)
+            kernels.impulse_sweeps(
+                state.data, impulse, velocity, o.blocks, o.split, o.mode, o.rng, state.first, count
+            )
 
         return run_sweeps(state, impulse, n, tol, sweep)
 

@@ -31,11 +31,15 @@ class SOR(Sweeping):
         if not 0.0 < self.omega < 2.0:
             raise InputError(f"omega is {self.omega}; 0 < omega < 2 is needed, outside it SOR diverges")
 
-    def run(self, state: SweepState, impulse: FloatArray, n: int, tol: float, time_limit: float | None = None) -> Claim:
+    def run(
+        self, state: SweepState, impulse: FloatArray, n: int, tol: float, time_limit: float | None = None
+    ) -> Claim:
         o = state.order
 
         def sweep(count: int) -> None:
-            kernels.sor_sweeps(state.data, self.omega, impulse, o.blocks, o.split, o.mode, o.rng, state.first, count)
+            kernels.sor_sweeps(
+                state.data, self.omega, impulse, o.blocks, o.split, o.mode, o.rng, state.first, count
+            )
 
         return run_sweeps(state, impulse, n, tol, sweep)
 
