@@ -16,15 +16,6 @@ from lavender_ext.problem cimport Data
 from lavender_ext.rows cimport abs_push, contact_jacobian, contact_push, joint_push, rows_t, rows_times
 
 
-cdef struct score_t:
-    double energy               # sqrt J
-    double velocity             # m/s
-    double floor_energy         # sqrt J
-    double floor_velocity       # m/s
-    int32_t worst               # row of the largest velocity error, -1 where there is none
-    int32_t finite              # 0 where e holds a NaN or an infinity
-
-
 cdef struct sum_t:              # sum of squares as scale^2 * ssq: neither over- nor underflows
     double scale
     double ssq
@@ -184,26 +175,34 @@ def slack(Data p, const double[::1] lam, double[::1] w):
             lav_csr_slack(&p.blocks, &p.csr, &lam[0], &w[0])
 
 
+cdef void judge_into(const blocks_t* p, const csr_t* a, const rows_t* r, bint factored, const double* lam, double* w,
+                     double* e, double* v, bint floor, score_t* out) noexcept nogil:
+    """Slack into w (m), error into e (m), the sums into out; v (n_bodies, 6) is scratch, read where factored."""
+    if factored:
+        lav_rows_velocity(p, r, lam, v)
+        lav_rows_slack(p, r, lam, v, w)
+        lav_score(p, lam, w, e, out)
+        if floor:
+            lav_rows_floor(p, r, lam, v, out)
+    else:
+        lav_csr_slack(p, a, lam, w)
+        lav_score(p, lam, w, e, out)
+        if floor:
+            lav_csr_floor(p, a, lam, out)
+
+
 def judge(Data p, const double[::1] lam, double[::1] w, double[::1] e, bint floor=True):
     """Slack into w, error into e, and (energy, velocity, worst row, floor energy, floor velocity, finite)."""
     cdef score_t s = score_t(0.0, 0.0, 0.0, 0.0, -1, 1)
-    cdef double[::1] v
+    cdef double[::1] bodies
+    cdef double* v = NULL
     if p.blocks.n_rows == 0:
         return 0.0, 0.0, -1, 0.0, 0.0, True
     if p.factored:
-        v = np.empty(6 * p.rows.n_bodies + 1)
-        with nogil:
-            lav_rows_velocity(&p.blocks, &p.rows, &lam[0], &v[0])
-            lav_rows_slack(&p.blocks, &p.rows, &lam[0], &v[0], &w[0])
-            lav_score(&p.blocks, &lam[0], &w[0], &e[0], &s)
-            if floor:
-                lav_rows_floor(&p.blocks, &p.rows, &lam[0], &v[0], &s)
-    else:
-        with nogil:
-            lav_csr_slack(&p.blocks, &p.csr, &lam[0], &w[0])
-            lav_score(&p.blocks, &lam[0], &w[0], &e[0], &s)
-            if floor:
-                lav_csr_floor(&p.blocks, &p.csr, &lam[0], &s)
+        bodies = np.empty(6 * p.rows.n_bodies + 1)
+        v = &bodies[0]
+    with nogil:
+        judge_into(&p.blocks, &p.csr, &p.rows, p.factored, &lam[0], &w[0], &e[0], v, floor, &s)
     return s.energy, s.velocity, s.worst, s.floor_energy, s.floor_velocity, bool(s.finite)
 
 

@@ -10,14 +10,13 @@ block: v = M^-1 J^T lam to rounding.
 """
 from libc.stdint cimport int32_t, uint64_t
 
-import numpy as np
-
 from lavender_ext.block cimport (CONTACT_SPIN, ROW, blocks_t, n_tangents, relax_normal, relax_row,
                                  relax_tangents)
 from lavender_ext.csr cimport csr_dot, csr_t
-from lavender_ext.order cimport GIVEN, advance_order
+from lavender_ext.order cimport advance_order
 from lavender_ext.problem cimport Data
 from lavender_ext.rows cimport relax_rows_block, rows_t
+from lavender_ext.watch cimport CONVERGED, RUNNING, Watch, sweep_t
 
 
 cdef inline void relax_csr_block(const blocks_t* p, const csr_t* a, int32_t i, double* lam) noexcept nogil:
@@ -110,38 +109,72 @@ cdef public void lav_impulse_sweeps(const blocks_t* p, const rows_t* r, double* 
             relax_rows_block(p, r, order[i], lam, v)
 
 
-def pgs_sweeps(Data p, double[::1] lam, int32_t[::1] order, int split, int mode, uint64_t[::1] rng, bint first_sweep, int n):
-    """`n` sweeps of projected Gauss-Seidel in place, GIL released; an empty order means row by row."""
-    if p.blocks.n_rows == 0 or n <= 0:
-        return
+cdef struct context_t:          # what a sweep needs besides lam
+    const blocks_t* blocks
+    const csr_t* csr
+    const rows_t* rows
+    double omega
+    double* scratch             # (m) Jacobi; (n_bodies, 6) velocity of sequential impulses
+    int32_t* order
+    int32_t split
+    int32_t mode
+    uint64_t* rng
+
+
+cdef void pgs_step(void* context, double* lam, int32_t first_sweep, int32_t n) noexcept nogil:
+    cdef context_t* c = <context_t*>context
+    if c.order == NULL:
+        lav_pgs_rows_in_order(c.blocks, c.csr, lam, n)
+    else:
+        lav_pgs_sweeps(c.blocks, c.csr, lam, c.order, c.split, c.mode, c.rng, first_sweep, n)
+
+
+cdef void sor_step(void* context, double* lam, int32_t first_sweep, int32_t n) noexcept nogil:
+    cdef context_t* c = <context_t*>context
+    lav_sor_sweeps(c.blocks, c.csr, c.omega, lam, c.order, c.split, c.mode, c.rng, first_sweep, n)
+
+
+cdef void jacobi_step(void* context, double* lam, int32_t first_sweep, int32_t n) noexcept nogil:
+    cdef context_t* c = <context_t*>context
+    lav_jacobi_sweeps(c.blocks, c.csr, c.omega, lam, c.scratch, n)
+
+
+cdef void impulse_step(void* context, double* lam, int32_t first_sweep, int32_t n) noexcept nogil:
+    cdef context_t* c = <context_t*>context
+    lav_impulse_sweeps(c.blocks, c.rows, lam, c.scratch, c.order, c.split, c.mode, c.rng, first_sweep, n)
+
+
+PGS, SOR, JACOBI, IMPULSES = range(4)
+
+
+def run(int kind, Data p, Watch watch, double[::1] lam, int n, double tol, int32_t[::1] order, int split, int mode,
+        uint64_t[::1] rng, double omega=1.0, double[::1] scratch=None):
+    """`n` sweeps in place under `watch`, GIL released: (status, sweeps done).
+
+    kind is PGS, SOR, JACOBI or IMPULSES; an empty order means row by row, for PGS over single rows.
+    """
+    cdef context_t c
+    cdef int32_t status, done = 0
+    cdef sweep_t step = pgs_step
+    if lam.shape[0] == 0:
+        if tol > 0.0:
+            return CONVERGED, 0
+        return RUNNING, n
+    if kind == 1:
+        step = sor_step
+    elif kind == 2:
+        step = jacobi_step
+    elif kind == 3:
+        step = impulse_step
+    c.blocks = &p.blocks
+    c.csr = &p.csr
+    c.rows = &p.rows
+    c.omega = omega
+    c.scratch = &scratch[0] if scratch is not None else NULL
+    c.order = &order[0] if order.shape[0] else NULL
+    c.split = split
+    c.mode = mode
+    c.rng = &rng[0]
     with nogil:
-        if mode == GIVEN and p.single_rows and order.shape[0] == 0:
-            lav_pgs_rows_in_order(&p.blocks, &p.csr, &lam[0], n)
-        else:
-            lav_pgs_sweeps(&p.blocks, &p.csr, &lam[0], &order[0], split, mode, &rng[0], first_sweep, n)
-
-
-def sor_sweeps(Data p, double omega, double[::1] lam, int32_t[::1] order, int split, int mode, uint64_t[::1] rng,
-               bint first_sweep, int n):
-    """`n` sweeps of successive over-relaxation on free rows in place, GIL released."""
-    if p.blocks.n_rows == 0 or n <= 0:
-        return
-    with nogil:
-        lav_sor_sweeps(&p.blocks, &p.csr, omega, &lam[0], &order[0], split, mode, &rng[0], first_sweep, n)
-
-
-def jacobi_sweeps(Data p, double omega, double[::1] lam, double[::1] w, int n):
-    """`n` sweeps of (projected) Jacobi in place, GIL released; w (m,) is scratch."""
-    if p.blocks.n_rows == 0 or n <= 0:
-        return
-    with nogil:
-        lav_jacobi_sweeps(&p.blocks, &p.csr, omega, &lam[0], &w[0], n)
-
-
-def impulse_sweeps(Data p, double[::1] lam, double[:, ::1] v, int32_t[::1] order, int split, int mode, uint64_t[::1] rng,
-                   bint first_sweep, int n):
-    """`n` sweeps of sequential impulses in place, GIL released; v (n_bodies + 1, 6) holds M^-1 J^T lam."""
-    if p.blocks.n_rows == 0 or n <= 0:
-        return
-    with nogil:
-        lav_impulse_sweeps(&p.blocks, &p.rows, &lam[0], &v[0, 0], &order[0], split, mode, &rng[0], first_sweep, n)
+        status = watch.run(step, &c, &lam[0], n, tol, &done)
+    return status, done

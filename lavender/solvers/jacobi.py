@@ -15,19 +15,21 @@ import numpy as np
 
 from lavender._arrays import FloatArray
 from lavender.errors import InputError
+from lavender.ordering import block_order
 from lavender.problem import Problem
 from lavender.registry import SolverSpec
 from lavender.solution import Claim
-from lavender.solvers._sweeping import Sweeping, SweepState, run_sweeps
+from lavender.solvers._sweeping import SweepState, run_kernel
 from lavender_ext import sweeps as kernels
 
 
-@dataclass
 class JacobiState(SweepState):
     """A sweep state with its damping and a scratch vector (m,)."""
 
-    omega: float = 1.0
-    scratch: FloatArray | None = None
+    def __init__(self, problem: Problem, omega: float) -> None:
+        super().__init__(problem, problem.csr_data, block_order(problem))
+        self.omega = omega
+        self.scratch = np.empty(problem.m + 1)
 
 
 @dataclass(frozen=True)
@@ -49,9 +51,7 @@ class Jacobi:
             )
 
     def prepare(self, problem: Problem) -> JacobiState:
-        base = Sweeping().prepare(problem)
-        omega = safe_damping(problem) if self.omega is None else self.omega
-        return JacobiState(base.problem, base.data, base.order, omega=omega, scratch=np.empty(problem.m))
+        return JacobiState(problem, safe_damping(problem) if self.omega is None else self.omega)
 
     def update(self, state: JacobiState, problem: Problem) -> JacobiState:
         return self.prepare(problem)
@@ -59,14 +59,7 @@ class Jacobi:
     def run(
         self, state: JacobiState, impulse: FloatArray, n: int, tol: float, time_limit: float | None = None
     ) -> Claim:
-        scratch = state.scratch
-        return run_sweeps(
-            state,
-            impulse,
-            n,
-            tol,
-            lambda count: kernels.jacobi_sweeps(state.data, state.omega, impulse, scratch, count),
-        )
+        return run_kernel(state, impulse, n, tol, kernels.JACOBI, state.omega, state.scratch)
 
 
 def safe_damping(problem: Problem) -> float:

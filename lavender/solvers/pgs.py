@@ -11,15 +11,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-
 from lavender._arrays import FloatArray
 from lavender.registry import SolverSpec
 from lavender.solution import Claim
-from lavender.solvers._sweeping import Sweeping, SweepState, run_sweeps
+from lavender.solvers._sweeping import Sweeping, SweepState, run_kernel
 from lavender_ext import sweeps as kernels
-
-_ROW_BY_ROW = np.empty(0, np.int32)
 
 
 @dataclass(frozen=True)
@@ -29,14 +25,7 @@ class PGS(Sweeping):
     def run(
         self, state: SweepState, impulse: FloatArray, n: int, tol: float, time_limit: float | None = None
     ) -> Claim:
-        o = state.order
-        # The same bits with or without an order array; without one the kernel skips two look-ups a row.
-        blocks = _ROW_BY_ROW if state.data.single_rows and o.is_given else o.blocks
-
-        def sweep(count: int) -> None:
-            kernels.pgs_sweeps(state.data, impulse, blocks, o.split, o.mode, o.rng, state.first, count)
-
-        return run_sweeps(state, impulse, n, tol, sweep)
+        return run_kernel(state, impulse, n, tol, kernels.PGS)
 
 
 SPEC = SolverSpec(

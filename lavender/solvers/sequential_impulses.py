@@ -18,35 +18,32 @@ from lavender.ordering import block_order
 from lavender.problem import Problem
 from lavender.registry import SolverSpec
 from lavender.solution import Claim
-from lavender.solvers._sweeping import Sweeping, SweepState, run_sweeps
+from lavender.solvers._sweeping import Sweeping, SweepState, run_kernel
 from lavender_ext import judge
 from lavender_ext import sweeps as kernels
+
+
+class ImpulseState(SweepState):
+    """A sweep state with v = M^-1 J^T lambda (n + 1, 6), formed once and kept by the sweeps."""
+
+    velocity: FloatArray | None = None
 
 
 @dataclass(frozen=True)
 class SequentialImpulses(Sweeping):
     """Matrix-free projected Gauss-Seidel; `order`, `ground`, `seed` as in `lavender.ordering`."""
 
-    def prepare(self, problem: Problem) -> SweepState:
+    def prepare(self, problem: Problem) -> ImpulseState:
         order = block_order(problem, self.order, seed=self.seed, ground=self.ground)
-        return SweepState(problem, problem.data, order)
+        return ImpulseState(problem, problem.data, order)
 
     def run(
-        self, state: SweepState, impulse: FloatArray, n: int, tol: float, time_limit: float | None = None
+        self, state: ImpulseState, impulse: FloatArray, n: int, tol: float, time_limit: float | None = None
     ) -> Claim:
-        o = state.order
         if state.velocity is None:
-            # The invariant v = M^-1 J^T lambda, once; the sweeps keep it.
             state.velocity = np.zeros((state.data.n_bodies + 1, 6))
             judge.velocity_change(state.data, impulse, state.velocity)
-        velocity = state.velocity
-
-        def sweep(count: int) -> None:
-            kernels.impulse_sweeps(
-                state.data, impulse, velocity, o.blocks, o.split, o.mode, o.rng, state.first, count
-            )
-
-        return run_sweeps(state, impulse, n, tol, sweep)
+        return run_kernel(state, impulse, n, tol, kernels.IMPULSES, scratch=state.velocity.ravel())
 
 
 SPEC = SolverSpec(

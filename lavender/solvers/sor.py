@@ -11,7 +11,7 @@ from lavender._arrays import FloatArray
 from lavender.errors import InputError
 from lavender.registry import SolverSpec
 from lavender.solution import Claim
-from lavender.solvers._sweeping import Sweeping, SweepState, run_sweeps
+from lavender.solvers._sweeping import Sweeping, SweepState, run_kernel
 from lavender_ext import sweeps as kernels
 
 
@@ -34,14 +34,7 @@ class SOR(Sweeping):
     def run(
         self, state: SweepState, impulse: FloatArray, n: int, tol: float, time_limit: float | None = None
     ) -> Claim:
-        o = state.order
-
-        def sweep(count: int) -> None:
-            kernels.sor_sweeps(
-                state.data, self.omega, impulse, o.blocks, o.split, o.mode, o.rng, state.first, count
-            )
-
-        return run_sweeps(state, impulse, n, tol, sweep)
+        return run_kernel(state, impulse, n, tol, kernels.SOR, self.omega)
 
 
 SPEC = SolverSpec(
