@@ -11,7 +11,7 @@ On a problem with rows, joints stay before contacts under every name.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -38,15 +38,11 @@ class Order:
     mode: int  # given, symmetric or random
     rng: np.ndarray  # (1,) uint64, state of the generator
     color_ptr: IntArray | None = None  # first place of each colour in `blocks`, then k
+    is_given: bool = False  # every sweep runs over the blocks as they stand
 
     def fresh(self) -> Order:
         """A copy that can be swept without touching this one."""
-        return Order(self.blocks.copy(), self.split, self.mode, self.rng.copy(), self.color_ptr)
-
-    @property
-    def is_given(self) -> bool:
-        """Every sweep runs over the blocks as they stand."""
-        return self.mode == _GIVEN and bool(np.array_equal(self.blocks, np.arange(len(self.blocks))))
+        return replace(self, blocks=self.blocks.copy(), rng=self.rng.copy())
 
 
 def block_order(
@@ -85,6 +81,8 @@ def block_order(
     if ground is not None and order not in ("bottom_up", "top_down"):
         raise InputError(f"ground= goes with bottom_up and top_down, not with {order!r}")
     blocks = np.arange(k, dtype=np.int32)
+    if order == "given":
+        return Order(blocks, split, _GIVEN, rng, is_given=True)
     if order == "reverse":
         blocks = np.concatenate([blocks[:split][::-1], blocks[split:][::-1]])
     elif order in ("bottom_up", "top_down"):

@@ -39,17 +39,21 @@ class Residual:
     velocity: float  # m/s, of the worst row
     floor: float  # -, relative residual that float64 alone costs
     worst_row: int  # row of the largest velocity error, -1 for an empty problem
-    worst_name: str  # its name, e.g. "contact 3, tangent 1"
     energy_start: float  # sqrt J, E of doing nothing (or the norm of b)
     velocity_start: float  # m/s
     error: FloatArray = field(repr=False)  # (m,) N s, e
     slack: FloatArray = field(repr=False)  # (m,) m/s, w
-    _weight: FloatArray = field(repr=False)  # (m,) 1/kg, sqrt(nu d)
+    _problem: Problem = field(repr=False)
+
+    @property
+    def worst_name(self) -> str:
+        """Name of the worst row, e.g. "contact 3, tangent 1"; empty for an empty problem."""
+        return self._problem.row_name(self.worst_row) if self.worst_row >= 0 else ""
 
     @property
     def velocity_by_row(self) -> FloatArray:
         """sqrt(nu d) |e| (m,) [m/s]; each tangent of a pair alone."""
-        return self._weight * np.abs(self.error)
+        return self._problem.data.weight * np.abs(self.error)
 
     def __str__(self) -> str:
         worst = f", worst {self.worst_name} {self.velocity:.2g} m/s" if self.worst_row >= 0 else ""
@@ -124,12 +128,11 @@ def residual(problem: Problem, impulse: Any) -> Residual:
         velocity=velocity,
         floor=max(_ratio(floor_energy, start_energy), _ratio(floor_velocity, start_velocity)),
         worst_row=worst,
-        worst_name=problem.row_name(worst) if worst >= 0 else "",
         energy_start=start_energy,
         velocity_start=start_velocity,
         error=e,
         slack=w,
-        _weight=data.weight,
+        _problem=problem,
     )
 
 

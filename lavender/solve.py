@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
 from time import perf_counter
 from typing import Any
 
@@ -273,7 +272,9 @@ class _Loop:
     _next_record = 0
 
     def _total(self, claim: Claim) -> Claim:
-        return replace(claim, iterations=self.done, work=self.work)
+        return Claim(
+            claim.status, self.done, self.work, claim.message, claim.form, claim.dual, claim.certificate
+        )
 
     def recorded(self) -> History | None:
         if self.rows is None:

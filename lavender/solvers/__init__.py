@@ -2,13 +2,23 @@
 
 from __future__ import annotations
 
+from importlib import import_module
+
+from lavender import external
 from lavender.registry import SolverSpec
-from lavender.solvers import gauss_seidel, jacobi, pgs, sequential_impulses, sor
+
+# File in this folder, with its SPEC; from the exact to the plain.
+_TABLE = (
+    "direct",
+    "block_gauss_seidel",
+    "pgs",
+    "sequential_impulses",
+    "jacobi",
+    "sor",
+    "gauss_seidel",
+)
 
 SPECS: tuple[SolverSpec, ...] = (
-    gauss_seidel.SPEC,
-    sor.SPEC,
-    jacobi.SPEC,
-    pgs.SPEC,
-    sequential_impulses.SPEC,
+    *(import_module(f"{__name__}.{name}").SPEC for name in _TABLE),
+    *external.SPECS,
 )
