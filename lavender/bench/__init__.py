@@ -1,0 +1,39 @@
+"""Case x solver x budget -> records, timed in one place.
+
+    records = lavender.bench.run(["pile.npz"], ["pgs", "osqp"])
+    records.rows()       # plain dictionaries, or records.frame() for pandas
+
+Nothing here draws or prints; `lavender.report` reads the records.
+"""
+
+from lavender.bench.cases import Item, resolve, structure_of
+from lavender.bench.machine import cpu_name
+from lavender.bench.measure import Task, measure, one_thread
+from lavender.bench.plan import Plan
+from lavender.bench.record import CaseInfo, Record, Run, Skip, level_name
+from lavender.bench.run import Event, run, solver_names
+from lavender.bench.store import Records, Store, read, write_csv, write_json
+
+__all__ = [
+    "CaseInfo",
+    "Event",
+    "Item",
+    "Plan",
+    "Record",
+    "Records",
+    "Run",
+    "Skip",
+    "Store",
+    "Task",
+    "cpu_name",
+    "level_name",
+    "measure",
+    "one_thread",
+    "read",
+    "resolve",
+    "run",
+    "solver_names",
+    "structure_of",
+    "write_csv",
+    "write_json",
+]

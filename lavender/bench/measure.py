@@ -1,0 +1,172 @@
+"""The one place that times a solve.
+
+A measurement takes a fresh problem (nothing computed yet) for every repeat, prepares the solver
+(set-up: form A, factor, colour, allocate) and solves (solve). Judging is outside both clocks. BLAS and
+OpenMP have one thread and the garbage collector waits.
+"""
+
+from __future__ import annotations
+
+import gc
+import statistics
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from time import perf_counter
+from typing import Any
+
+from lavender import registry
+from lavender.bench.record import ERROR, Record, task_key
+from lavender.problem import Problem
+from lavender.residuals import reference
+from lavender.solution import Solution, Status
+from lavender.solve import prepare
+
+__all__ = ["Task", "measure", "one_thread"]
+
+CLAIMS = (Status.CONVERGED, Status.FLOOR, Status.INFEASIBLE)
+
+
+@dataclass(frozen=True)
+class Task:
+    """One measurement to make."""
+
+    run: str
+    case: str
+    sha: str
+    solver: str
+    mode: str  # "tol" | "budget"
+    tol: float
+    max_iter: int  # 0: the solver's own default
+    time_limit: float  # s, of one solve
+    start: str = "cold"
+    options: Mapping[str, Any] = field(default_factory=dict)
+    repeats: int = 1
+    step: int = -1
+
+    @property
+    def key(self) -> tuple[Any, ...]:
+        """As `Record.key` of what comes out."""
+        return task_key(
+            self.case, self.sha, self.solver, self.options, self.start, self.mode, self.tol, self.max_iter, self.time_limit
+        )
+
+    def record(self, **what: Any) -> Record:
+        """A record of this task."""
+        return Record(
+            run=self.run,
+            case=self.case,
+            sha=self.sha,
+            solver=self.solver,
+            options=dict(self.options),
+            start=self.start,
+            mode=self.mode,
+            tol=self.tol,
+            max_iter=self.max_iter,
+            time_limit=self.time_limit,
+            order=str(self.options.get("order", "given")),
+            seed=int(self.options.get("seed", 0)),
+            step=self.step,
+            **what,
+        )
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """BLAS and OpenMP limited to one thread, the garbage collector off."""
+    from threadpoolctl import threadpool_limits
+
+    collects = gc.isenabled()
+    gc.collect()
+    gc.disable()
+    try:
+        with threadpool_limits(limits=1):
+            yield
+    finally:
+        if collects:
+            gc.enable()
+
+
+def measure(problem: Problem, task: Task, impulse: Any = None) -> Record:
+    """Make one measurement; what the solver raises becomes a record of status ERROR.
+
+    Parameters
+    ----------
+    impulse : (m,) N s, optional
+        Start, for `start="carried"`. "cold" starts from Pi(0), "warm" from the problem's guess.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        Ctrl-C; nothing is recorded.
+    """
+    return measure_solution(problem, task, impulse)[0]
+
+
+def measure_solution(problem: Problem, task: Task, impulse: Any = None) -> tuple[Record, Solution | None]:
+    """As `measure`, with the solution of the last repeat."""
+    setups: list[float] = []
+    solves: list[float] = []
+    solution = None
+    try:
+        registry.get(task.solver).load()  # the import is no part of the time
+        with one_thread():
+            begun = perf_counter()
+            for _ in range(max(1, task.repeats)):
+                solution = _once(problem, task, impulse)
+                setups.append(solution.setup_time)
+                solves.append(solution.solve_time)
+                if solution.status is Status.INTERRUPTED:
+                    raise KeyboardInterrupt
+                if solution.status is Status.TIME_LIMIT or perf_counter() - begun > task.time_limit:
+                    break
+    except Exception as error:
+        # A backend may raise anything; it costs its own record, never the run.
+        text = f"{type(error).__name__}: {error}".strip()
+        return task.record(status=ERROR, message=text[:500], repeats=len(solves)), None
+    return record_of(task, solution, setups, solves), solution
+
+
+def _once(problem: Problem, task: Task, impulse: Any) -> Solution:
+    fresh = replace(problem, copy=False)  # nothing derived yet: forming A is set-up
+    prepared = prepare(fresh, task.solver, **task.options)
+    reference(fresh)  # E0, V0: the judge's, outside the clocks
+    if task.start == "cold":
+        impulse = fresh.start()
+    elif task.start == "warm":
+        impulse = fresh.guess
+    return prepared.solve(
+        impulse=impulse,
+        tol=task.tol,
+        max_iter=task.max_iter or None,
+        time_limit=task.time_limit,
+    )
+
+
+def record_of(task: Task, s: Solution, setups: list[float], solves: list[float]) -> Record:
+    """The record of repeats that ended in the solution `s`."""
+    both = [a + b for a, b in zip(setups, solves, strict=True)]
+    r = s.residual
+    return task.record(
+        status=s.status.name,
+        relative=float(r.relative),
+        energy=float(r.energy),
+        velocity=float(r.velocity),
+        floor=float(r.floor),
+        worst_row=int(r.worst_row),
+        worst_name=r.worst_name,
+        success=bool(s.success) and task.mode == "tol",
+        contradicted=s.contradicted,
+        claims=s.status in CLAIMS,
+        iterations=int(s.iterations),
+        work={k: int(v) for k, v in s.work.items()},
+        form=s.solver.form,
+        message=s.message[:500],
+        repeats=len(both),
+        setup_min=min(setups),
+        setup_median=statistics.median(setups),
+        solve_min=min(solves),
+        solve_median=statistics.median(solves),
+        time_min=min(both),
+        time_median=statistics.median(both),
+    )

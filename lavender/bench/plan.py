@@ -1,0 +1,106 @@
+"""What to measure: levels, budgets, starts, orders, and the rule that makes tasks of them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from lavender.bench.measure import Task
+from lavender.bench.record import CaseInfo, Record
+from lavender.errors import InputError
+from lavender.problem import Problem
+from lavender.registry import SolverSpec
+
+__all__ = ["Plan"]
+
+UNLIMITED = 10_000_000  # iterations of a run to a tolerance: the time limit ends it first
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How each solver is run on each case.
+
+    Parameters
+    ----------
+    levels : relative residuals to reach, each a solve with that `tol`
+    budgets : exact iteration counts (`tol=0`), for solvers that can stop anywhere
+    repeats : solves of each kind; minimum and median are recorded. Repeats end early once they have
+        taken `time_limit` together.
+    time_limit : s, of one solve
+    warm : also start from the problem's guess, where it has one
+    orders : sweep orders beside "given", each at the middle budget, for solvers that take an order;
+        "random:3" is random with seed 3
+
+    Raises
+    ------
+    InputError
+        A level, budget, count or limit that is not positive.
+    """
+
+    levels: Sequence[float] = (1e-3, 1e-6, 1e-9)
+    budgets: Sequence[int] = (4, 8, 16, 32, 64)
+    repeats: int = 3
+    time_limit: float = 1.0
+    warm: bool = True
+    orders: Sequence[str] = ("reverse", "symmetric", "random:0", "random:1", "random:2")
+    campaign: bool = False
+
+    def __post_init__(self) -> None:
+        for name, values in (("level", self.levels), ("budget", self.budgets)):
+            for value in values:
+                if not (math.isfinite(value) and value > 0):
+                    raise InputError(f"{name} {value} must be a positive number")
+        if not self.levels and not self.budgets:
+            raise InputError("nothing to run: give levels, budgets or both")
+        if self.repeats < 1:
+            raise InputError(f"repeats is {self.repeats}; at least 1 is needed")
+        if not (math.isfinite(self.time_limit) and self.time_limit > 0.0):
+            raise InputError(f"time limit is {self.time_limit}; a positive number of seconds is needed")
+        object.__setattr__(self, "levels", tuple(sorted(map(float, self.levels), reverse=True)))
+        object.__setattr__(self, "budgets", tuple(sorted(map(int, self.budgets))))
+        object.__setattr__(self, "orders", tuple(self.orders))
+
+    def as_dict(self) -> dict[str, Any]:
+        """For the description of a run."""
+        return asdict(self)
+
+    def tasks(self, info: CaseInfo, problem: Problem, spec: SolverSpec) -> Iterator[Task | None]:
+        """The measurements of one solver on one case; send each record back in, it decides what follows.
+
+        To a tolerance: an exact solver once, at the tightest level. Others level by level; one that can
+        be resumed, or that ran out of time, is not asked for a tighter level than the one it missed: the
+        iterates would be the same. Then budgets, then sweep orders at the middle budget.
+        """
+        starts = ["cold"]
+        if self.warm and problem.guess is not None and spec.impulse and not spec.exact:
+            starts.append("warm")
+
+        def task(mode: str, tol: float, max_iter: int, start: str, **options: Any) -> Task:
+            return Task(
+                info.run, info.case, info.sha, spec.name, mode, tol, max_iter, self.time_limit, start, options,
+                self.repeats, info.step,
+            )  # fmt: skip
+
+        for start in starts:
+            levels = self.levels[-1:] if spec.exact else self.levels
+            for level in levels:
+                record: Record | None = yield task("tol", level, UNLIMITED if spec.resumable else 0, start)
+                if record is not None and not record.relative <= level and (spec.resumable or _hopeless(record)):
+                    break
+            if spec.resumable and not spec.exact:
+                for n in self.budgets:
+                    yield task("budget", 0.0, n, start)
+        if spec.order and self.budgets and not spec.exact:
+            middle = self.budgets[len(self.budgets) // 2]
+            for word in self.orders:
+                name, _, seed = word.partition(":")
+                if name in ("bottom_up", "top_down") and problem.rows is None:
+                    continue  # without bodies nobody knows the ground
+                more = {"seed": int(seed)} if seed else {}
+                yield task("budget", 0.0, middle, "cold", order=name, **more)
+
+
+def _hopeless(record: Record) -> bool:
+    return record.status in ("TIME_LIMIT", "KILLED", "ERROR", "INFEASIBLE") or record.status.startswith("CRASHED")

@@ -1,0 +1,207 @@
+"""Records on disk: one JSON object a line, appended and flushed as each is made; CSV and JSON on request.
+
+A line is whole or it is not there: a run that was killed leaves at most a torn last line, which is cut
+off before the next one is written.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+from collections.abc import Iterable, Iterator
+from dataclasses import asdict, dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+from lavender.bench.record import CaseInfo, Record, Run, Skip, from_json, to_json
+from lavender.errors import InputError
+
+__all__ = ["Records", "Store", "read", "write_csv", "write_json"]
+
+
+@dataclass
+class Records:
+    """Everything that one or more runs wrote."""
+
+    runs: dict[str, Run] = field(default_factory=dict)
+    cases: dict[str, CaseInfo] = field(default_factory=dict)  # the latest description of each
+    skips: list[Skip] = field(default_factory=list)
+    records: list[Record] = field(default_factory=list)
+    source: str = ""
+
+    def add(self, entry: Run | CaseInfo | Skip | Record) -> None:
+        """Take one entry; a record or skip made again replaces the earlier one."""
+        if isinstance(entry, Run):
+            self.runs.pop(entry.run, None)  # the newest stands last
+            self.runs[entry.run] = entry
+        elif isinstance(entry, CaseInfo):
+            self.cases[entry.case] = entry
+        elif isinstance(entry, Skip):
+            self.skips = [s for s in self.skips if (s.run, s.case, s.solver) != (entry.run, entry.case, entry.solver)]
+            self.skips.append(entry)
+        else:
+            self.records.append(entry)
+
+    def __iter__(self) -> Iterator[Record]:
+        return iter(self.records)
+
+    def __len__(self) -> int:
+        return len(self.records)
+
+    def latest(self) -> Records:
+        """Only the run that wrote last: ratios of times make sense within one run alone."""
+        if len(self.runs) < 2:
+            return self
+        run = list(self.runs)[-1]
+        return Records(
+            {run: self.runs[run]},
+            {name: info for name, info in self.cases.items() if info.run == run},
+            [s for s in self.skips if s.run == run],
+            [r for r in self.records if r.run == run],
+            self.source,
+        )
+
+    def rows(self) -> list[dict[str, Any]]:
+        """Plain rows, one for each record, with its case and machine: the columns of `records.csv`."""
+        out = []
+        for r in self.records:
+            run, info = self.runs.get(r.run), self.cases.get(r.case)
+            row = {k: v for k, v in asdict(r).items() if k != "sha"}
+            row |= {
+                "law": info.law if info else "",
+                "rows": info.rows if info else 0,
+                "structure": ", ".join(info.structure) if info else "",
+                "lavender": run.lavender if run else "",
+                "python": run.python if run else "",
+                "platform": run.platform if run else "",
+                "cpu": run.cpu if run else "",
+                "cores": run.cores if run else 0,
+                "versions": dict(run.versions) if run else {},
+                "started": run.started if run else "",
+            }
+            out.append(row)
+        return out
+
+    def frame(self) -> Any:
+        """`rows()` as a pandas frame.
+
+        Raises
+        ------
+        ImportError
+            pandas is not installed.
+        """
+        import pandas
+
+        return pandas.DataFrame(self.rows())
+
+
+class Store:
+    """Appends entries to a `.jsonl` file.
+
+    Raises
+    ------
+    InputError
+        The file cannot be written; known before anything is solved.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            self.records = read(self.path) if self.path.exists() else Records()
+            _cut_torn_line(self.path)
+            self._file = self.path.open("a", encoding="utf-8")
+        except OSError as error:
+            raise InputError(
+                f"cannot write {self.path} ({error.strerror or error}): give a folder that you may write to"
+            ) from None
+
+    def add(self, entry: Run | CaseInfo | Skip | Record) -> None:
+        """Write one entry and hand it to the operating system before anything else happens."""
+        line = json.dumps(to_json(entry), allow_nan=False)
+        try:
+            self._file.write(line + "\n")
+            self._file.flush()
+            if isinstance(entry, Record):
+                os.fdatasync(self._file.fileno()) if hasattr(os, "fdatasync") else os.fsync(self._file.fileno())
+        except OSError as error:
+            raise InputError(
+                f"cannot write {self.path} ({error.strerror or error}): make room and run the same command again; "
+                "it goes on from the last record"
+            ) from None
+        self.records.add(entry)
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+    def __enter__(self) -> Store:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def _cut_torn_line(path: Path) -> None:
+    if not path.exists():
+        return
+    with path.open("rb+") as f:
+        data = f.read()
+        end = data.rfind(b"\n") + 1
+        if end != len(data):
+            f.truncate(end)
+
+
+def read(path: str | Path) -> Records:
+    """Read a `records.jsonl` (or the folder that holds one). A torn last line is left out.
+
+    Raises
+    ------
+    InputError
+        No such file, or a line that is not a record.
+    """
+    path = Path(path)
+    if path.is_dir():
+        path = path / "records.jsonl"
+    try:
+        lines = path.read_text(encoding="utf-8", errors="replace").split("\n")
+    except OSError as error:
+        raise InputError(f"cannot read {path} ({error.strerror or error}); a records.jsonl is needed") from None
+    found = Records(source=str(path))
+    last = lines.pop()  # without a newline: empty, or torn
+    for number, line in enumerate(lines, 1):
+        if not line.strip():
+            continue
+        try:
+            found.add(from_json(json.loads(line)))
+        except ValueError as error:
+            raise InputError(f"{path}, line {number}: {error}; a records.jsonl is needed") from None
+    del last
+    return found
+
+
+def write_csv(records: Records, path: str | Path) -> None:
+    """One row for each record; `work`, `options` and `versions` are JSON in their cells."""
+    rows = records.rows()
+    columns = list(rows[0]) if rows else [f.name for f in fields(Record)]
+    with Path(path).open("w", newline="", encoding="utf-8") as f:
+        writer = csv.DictWriter(f, columns)
+        writer.writeheader()
+        for row in rows:
+            writer.writerow({k: json.dumps(v, default=str) if isinstance(v, dict) else v for k, v in row.items()})
+
+
+def write_json(records: Records, path: str | Path) -> None:
+    """{"runs": [...], "cases": [...], "skips": [...], "records": [...]}; inf and nan are words."""
+
+    def plain(entries: Iterable[Any]) -> list[dict[str, Any]]:
+        return [{k: v for k, v in to_json(e).items() if k != "kind"} for e in entries]
+
+    content = {
+        "runs": plain(records.runs.values()),
+        "cases": plain(records.cases.values()),
+        "skips": plain(records.skips),
+        "records": plain(records.records),
+    }
+    Path(path).write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")

@@ -1,0 +1,185 @@
+"""A process of its own for code that is not ours: it may hang, eat memory or die, and costs one record.
+
+The parent starts `python -m lavender.bench.worker`, sends a problem once and tasks after it, and gets
+records back: pickles with a length in front, over the standard streams. What a backend prints goes to
+nowhere. A worker that does not answer in time is killed; the next task starts another.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import pickle
+import queue
+import signal
+import struct
+import subprocess
+import sys
+import threading
+from typing import IO, Any
+
+from lavender.bench.measure import Task
+from lavender.bench.record import CRASHED, KILLED, Record
+from lavender.problem import Problem
+
+__all__ = ["Worker"]
+
+START_TIME = 60.0  # s, to import everything on a loaded machine
+GRACE = 5.0  # s, beyond the repeats' own limits, for set-up and judging
+
+
+def _send(stream: IO[bytes], message: Any) -> None:
+    data = pickle.dumps(message, pickle.HIGHEST_PROTOCOL)
+    stream.write(struct.pack("<Q", len(data)) + data)
+    stream.flush()
+
+
+def _receive(stream: IO[bytes]) -> Any:
+    head = stream.read(8)
+    if len(head) < 8:
+        raise EOFError
+    (size,) = struct.unpack("<Q", head)
+    data = stream.read(size)
+    if len(data) < size:
+        raise EOFError
+    return pickle.loads(data)
+
+
+class Worker:
+    """One worker process at a time, started when needed; `close` ends it.
+
+    Parameters
+    ----------
+    memory : int, optional, bytes
+        Limit of the worker's address space, where the system has one.
+    """
+
+    def __init__(self, memory: int | None = None) -> None:
+        self.memory = memory
+        self._process: subprocess.Popen[bytes] | None = None
+        self._answers: queue.Queue[Any] = queue.Queue()
+        self._holds = ""
+
+    def measure(self, problem: Problem, task: Task, impulse: Any = None) -> Record:
+        """As `lavender.bench.measure.measure`, in the worker."""
+        if self._process is None:
+            self._start()
+        # Every repeat may take its limit once, though repeats end after the first limit; set-up is not limited.
+        limit = 2.0 * task.time_limit + GRACE + 2.0 * task.time_limit
+        try:
+            assert self._process is not None and self._process.stdin is not None
+            if self._holds != task.sha:
+                _send(self._process.stdin, ("problem", problem))
+                self._holds = task.sha
+            _send(self._process.stdin, ("task", task, impulse))
+            answer = self._answers.get(timeout=limit)
+        except queue.Empty:
+            self._end()
+            return task.record(status=KILLED, message=f"did not stop: killed {limit:.3g} s after it was started")
+        except (BrokenPipeError, OSError):
+            answer = None
+        except KeyboardInterrupt:
+            self._end()
+            raise
+        if answer is None:
+            return task.record(status=f"{CRASHED} ({self._cause()})", message="the process of the backend died")
+        return answer
+
+    def _start(self) -> None:
+        environment = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
+        environment["PYTHONPATH"] = os.pathsep.join(p for p in sys.path if p)
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "lavender.bench.worker", str(self.memory or 0)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            env=environment,
+        )
+        self._holds = ""
+        answers: queue.Queue[Any] = queue.Queue()
+        self._answers = answers
+        stream = self._process.stdout
+
+        def listen() -> None:
+            assert stream is not None
+            with contextlib.suppress(Exception):
+                while True:
+                    answers.put(_receive(stream))
+            answers.put(None)  # the end, however it came
+
+        threading.Thread(target=listen, daemon=True).start()
+        try:
+            ready = answers.get(timeout=START_TIME)
+        except queue.Empty:
+            ready = None
+        if ready != "ready":
+            cause = self._cause()
+            raise RuntimeError(f"the worker process did not start ({cause})")
+
+    def _cause(self) -> str:
+        process = self._process
+        assert process is not None
+        try:
+            code = process.wait(timeout=1.0)
+        except subprocess.TimeoutExpired:
+            code = None
+        self._end()
+        if code is None:
+            return "no answer"
+        if code < 0:
+            with contextlib.suppress(ValueError):
+                return signal.Signals(-code).name
+        return f"exit status {code}"
+
+    def _end(self) -> None:
+        process, self._process = self._process, None
+        self._holds = ""
+        if process is None:
+            return
+        process.kill()
+        process.wait()
+        for stream in (process.stdin, process.stdout):
+            if stream is not None:
+                with contextlib.suppress(OSError):
+                    stream.close()
+
+    def close(self) -> None:
+        """End the process."""
+        self._end()
+
+    def __enter__(self) -> Worker:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def _serve(memory: int) -> None:
+    # Ctrl-C goes to the whole group: the parent decides.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    if memory:
+        with contextlib.suppress(ImportError, ValueError, OSError):
+            import resource
+
+            resource.setrlimit(resource.RLIMIT_AS, (memory, memory))
+    requests, answers = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
+    nowhere = os.open(os.devnull, os.O_RDWR)
+    os.dup2(nowhere, 0)
+    os.dup2(nowhere, 1)
+    from lavender.bench.measure import measure
+
+    _send(answers, "ready")
+    problem = None
+    while True:
+        try:
+            message = _receive(requests)
+        except EOFError:
+            return
+        if message[0] == "problem":
+            problem = message[1]
+        else:
+            _send(answers, measure(problem, message[1], message[2]))
+
+
+if __name__ == "__main__":
+    _serve(int(sys.argv[1]))

@@ -1,0 +1,459 @@
+"""The command `lavender`. What a subcommand needs is imported when it runs, so that --help is quick."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from lavender._version import __version__
+from lavender.errors import InputError, LavenderError
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from lavender.bench import Event, Plan, Records
+
+__all__ = ["main"]
+
+EXIT_BAD_INPUT = 2
+EXIT_CONTRADICTED = 1
+EXIT_INTERRUPTED = 130
+THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
+
+
+def _is_order(word: str) -> bool:
+    from lavender.ordering import ORDERS
+
+    return word.partition(":")[0] in ORDERS
+
+
+def _is_solver(word: str) -> bool:
+    from lavender import registry
+
+    return word in registry.specs() and not Path(word).exists()
+
+
+class ManyValues(click.Command):
+    """`--levels 1e-3 1e-6` as well as `--levels 1e-3,1e-6`: what follows is taken while it fits the option."""
+
+    FITS: dict[str, Callable[[str], bool]] = {  # noqa: RUF012 - a constant of the class
+        "--levels": _is_number,
+        "--budgets": _is_number,
+        "--solvers": _is_solver,
+        "--orders": _is_order,
+    }
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Fold the values of such an option into one word, then parse as click does."""
+        folded: list[str] = []
+        i = 0
+        while i < len(args):
+            word = args[i]
+            folded.append(word)
+            i += 1
+            if word in self.FITS and i < len(args):
+                values = [args[i]]
+                i += 1
+                while i < len(args) and not args[i].startswith("-") and self.FITS[word](args[i]):
+                    values.append(args[i])
+                    i += 1
+                folded.append(",".join(values))
+        return super().parse_args(ctx, folded)
+
+
+class Numbers(click.ParamType):
+    """Numbers with commas or blanks between them."""
+
+    name = "x,x,..."
+
+    def __init__(self, kind: type = float) -> None:
+        self.kind = kind
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[Any, ...]:
+        """A tuple of numbers."""
+        if not isinstance(value, str):
+            return tuple(value)
+        try:
+            return tuple(self.kind(word) for word in value.replace(",", " ").split())
+        except ValueError:
+            return self.fail(f"{value!r} is not a list of {'whole ' if self.kind is int else ''}numbers", param, ctx)
+
+
+class Names(click.ParamType):
+    """Words with commas or blanks between them."""
+
+    name = "a,b,..."
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[str, ...]:
+        """A tuple of words."""
+        return tuple(value.replace(",", " ").split()) if isinstance(value, str) else tuple(value)
+
+
+@click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
+@click.version_option(__version__, prog_name="lavender")
+def cli() -> None:
+    """Constraint solvers of rigid-body simulation: any solver by name, its error in units, its cost."""
+
+
+def _one_thread() -> None:
+    # For libraries that are loaded later; those that are loaded are limited while timing.
+    for name in THREADS:
+        os.environ.setdefault(name, "1")
+
+
+def _console(stderr: bool = False) -> Console:
+    from rich.console import Console
+
+    console = Console(stderr=stderr)
+    if not console.is_terminal and "COLUMNS" not in os.environ:
+        console = Console(stderr=stderr, width=140)  # into a file or a pipe: tables keep their columns
+    return console
+
+
+def _plan_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    options = (
+        click.option("--solvers", type=Names(), help="Solvers by name; all that are installed if not given."),
+        click.option("--levels", type=Numbers(), default="1e-3,1e-6,1e-9", show_default=True, help="Relative residuals to reach."),
+        click.option("--budgets", type=Numbers(int), default="4,8,16,32,64", show_default=True, help="Exact iteration counts."),
+        click.option("--orders", type=Names(), default=None, help="Sweep orders beside 'given', at the middle budget; random:3 is seed 3."),
+        click.option("--repeats", type=int, default=3, show_default=True, help="Solves of each kind; minimum and median count."),
+        click.option("--time-limit", type=float, default=1.0, show_default=True, metavar="S", help="Of one solve."),
+        click.option("--memory", type=float, default=None, metavar="GB", help="Limit for backends of other packages."),
+        click.option("--in-process", is_flag=True, help="Run backends of other packages here, not in a process of their own."),
+    )
+    for option in reversed(options):
+        command = option(command)
+    return command
+
+
+def _plan(levels: Sequence[float], budgets: Sequence[int], orders: Sequence[str] | None, repeats: int, time_limit: float) -> Plan:
+    from lavender.bench import Plan
+
+    more = {} if orders is None else {"orders": orders}
+    return Plan(levels=levels, budgets=budgets, repeats=repeats, time_limit=time_limit, **more)
+
+
+@cli.command(cls=ManyValues)
+@click.argument("files", nargs=-1, metavar="[FILES | FOLDERS | NAMES]...")
+@_plan_options
+@click.option("--out", type=click.Path(path_type=Path), default=Path("lavender-report"), show_default=True, help="Folder of the report.")
+@click.option("--no-figures", is_flag=True, help="Leave out the SVG and PNG files.")
+def report(
+    files: tuple[str, ...],
+    solvers: tuple[str, ...] | None,
+    levels: tuple[float, ...],
+    budgets: tuple[int, ...],
+    orders: tuple[str, ...] | None,
+    repeats: int,
+    time_limit: float,
+    memory: float | None,
+    in_process: bool,
+    out: Path,
+    no_figures: bool,
+) -> None:
+    """Speed against error: every solver on every case, to each level and at each budget.
+
+    FILES are problems (.npz, .hdf5), folders of them, or cases of the built-in suite such as
+    "stack(n=64)"; without any, the built-in suite runs. A records.jsonl is shown again without
+    solving. The same command goes on where it was stopped.
+    """
+    from lavender import bench
+    from lavender.report.terminal import print_report
+    from lavender.report.write import write
+
+    console = _console()
+    shown = [Path(f) for f in files if f.endswith(".jsonl")]
+    if shown:
+        if len(files) > 1:
+            raise InputError("a records.jsonl is shown alone: give one, and no problems")
+        records, stopped = bench.read(shown[0]), False
+    else:
+        plan = _plan(levels, budgets, orders, repeats, time_limit)
+        records, stopped = _measure(files, solvers, plan, out / "records.jsonl", memory, in_process)
+    print_report(records, console)
+    index = write(records, out, figures=not no_figures)
+    console.print(f"\n{len(records)} runs in {out / 'records.csv'}, page: [bold]{index}[/]", highlight=False)
+    if stopped:
+        console.print("[yellow]Stopped; the same command goes on from here.[/]")
+        raise click.exceptions.Exit(EXIT_INTERRUPTED)
+
+
+@cli.command(cls=ManyValues)
+@click.argument("files", nargs=-1, metavar="[FILES | FOLDERS | NAMES]...")
+@_plan_options
+@click.option("--out", type=click.Path(path_type=Path), default=Path("records.jsonl"), show_default=True, help="File of the records.")
+def bench(
+    files: tuple[str, ...],
+    solvers: tuple[str, ...] | None,
+    levels: tuple[float, ...],
+    budgets: tuple[int, ...],
+    orders: tuple[str, ...] | None,
+    repeats: int,
+    time_limit: float,
+    memory: float | None,
+    in_process: bool,
+    out: Path,
+) -> None:
+    """As `report`, but only the records: a .jsonl file that `lavender report` shows later."""
+    plan = _plan(levels, budgets, orders, repeats, time_limit)
+    records, stopped = _measure(files, solvers, plan, out, memory, in_process)
+    _console().print(f"{len(records)} runs in {out}", highlight=False)
+    if stopped:
+        raise click.exceptions.Exit(EXIT_INTERRUPTED)
+
+
+def _measure(
+    files: Sequence[str],
+    solvers: Sequence[str] | None,
+    plan: Plan,
+    path: Path,
+    memory: float | None,
+    in_process: bool,
+) -> tuple[Records, bool]:
+    """Run with a progress bar; (records, was it stopped by Ctrl-C)."""
+    from lavender import bench
+
+    _one_thread()
+    bench.solver_names(solvers)  # before anything is loaded: names first
+    with bench.Store(path) as store:
+        items = bench.resolve(files)
+        found: list[Records] = []
+        with _progress() as watch:
+            try:
+                bench.run(
+                    items,
+                    solvers,
+                    plan,
+                    store,
+                    watch=watch,
+                    isolate=not in_process,
+                    memory=int(memory * 2**30) if memory else None,
+                    into=found,
+                )
+            except KeyboardInterrupt:
+                return found[0], True
+        return found[0], False
+
+
+class _progress:
+    """A progress bar over pairs of case and solver, on a terminal; silent elsewhere."""
+
+    def __enter__(self) -> Callable[[Event], None]:
+        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+        self.bar = Progress(
+            BarColumn(),
+            MofNCompleteColumn(),
+            TimeElapsedColumn(),
+            TextColumn("{task.fields[what]}", markup=False),
+            console=_console(stderr=True),
+            transient=True,
+            refresh_per_second=4,  # drawing takes time from what is being timed
+        )
+        self.bar.start()
+        task = self.bar.add_task("", total=None, what="")
+
+        def watch(event: Event) -> None:
+            self.bar.update(task, completed=event.done, total=event.total, what=f"{event.case} {event.solver}".strip())
+
+        return watch
+
+    def __exit__(self, *_: object) -> None:
+        self.bar.stop()
+
+
+@cli.command()
+@click.argument("file")
+@click.option("--solver", required=True, help="Name of the solver; see `lavender solvers`.")
+@click.option("--tol", type=float, default=1e-6, show_default=True, help="Relative residual asked for; 0 runs the whole budget.")
+@click.option("--max-iter", type=int, default=None, help="Iteration budget; default: the solver's.")
+@click.option("--time-limit", type=float, default=None, metavar="S")
+@click.option("--order", default=None, help="Sweep order, for solvers that take one.")
+@click.option("--seed", type=int, default=None, help="Of a random order.")
+@click.option("--history", is_flag=True, help="Print the residual along the way.")
+@click.option("--output", type=click.Path(path_type=Path), default=None, help="Write impulse, slack and what was said of them, .npz.")
+def solve(
+    file: str,
+    solver: str,
+    tol: float,
+    max_iter: int | None,
+    time_limit: float | None,
+    order: str | None,
+    seed: int | None,
+    history: bool,
+    output: Path | None,
+) -> None:
+    """Solve one problem (a file, or a case of the suite) and say how wrong the answer is."""
+    from lavender import bench
+    from lavender.report.text import residual, seconds
+    from lavender.solve import solve as solve_problem
+
+    _one_thread()
+    if output is not None:
+        _check_writable(output)
+    (item, *more) = bench.resolve([file])
+    if more:
+        raise InputError(f"{file} holds {len(more) + 1} problems; give one file")
+    options = {k: v for k, v in (("order", order), ("seed", seed)) if v is not None}
+    solution = solve_problem(
+        item.problem, solver, tol=tol, max_iter=max_iter, time_limit=time_limit, history=history, **options
+    )
+    click.echo(f"{item.name}: {item.problem.law}, {item.problem.m} rows")
+    if solution.history is not None:
+        click.echo(f"{'iterations':>10}  {'time':>9}  {'relative':>9}  {'energy':>9}  {'velocity':>9}")
+        h = solution.history
+        for n, t, r, e, v in zip(h.iterations, h.time, h.relative, h.energy, h.velocity, strict=True):
+            click.echo(f"{n:>10}  {seconds(t):>9}  {residual(r):>9}  {residual(e):>9}  {residual(v):>9}")
+    click.echo(str(solution))
+    if output is not None:
+        import numpy as np
+
+        try:
+            with output.open("wb") as f:
+                np.savez(
+                    f,
+                    impulse=solution.impulse,
+                    slack=solution.slack,
+                    error=solution.residual.error,
+                    relative=solution.residual.relative,
+                    energy=solution.residual.energy,
+                    velocity=solution.residual.velocity,
+                    floor=solution.residual.floor,
+                    status=solution.status.name,
+                    solver=solution.solver.name,
+                    iterations=solution.iterations,
+                    setup_time=solution.setup_time,
+                    solve_time=solution.solve_time,
+                )
+        except OSError as error:
+            raise _unwritable(output, error) from None
+        click.echo(f"written: {output}")
+    if solution.status.name == "INTERRUPTED":
+        raise click.exceptions.Exit(EXIT_INTERRUPTED)
+
+
+def _unwritable(path: Path, error: OSError) -> InputError:
+    return InputError(f"cannot write {path} ({error.strerror or error}): give a path that you may write to")
+
+
+def _check_writable(path: Path) -> None:
+    # Opened for appending: what is there stays, and nothing is left where nothing was.
+    existed = path.exists()
+    try:
+        with path.open("ab"):
+            pass
+    except OSError as error:
+        raise _unwritable(path, error) from None
+    if not existed:
+        path.unlink()
+
+
+@cli.command()
+@click.option("--problem", default=None, help="Say for this problem (file or suite case) who takes it.")
+def solvers(problem: str | None) -> None:
+    """What is installed, or why not, and what each solver can do."""
+    from rich.table import Table
+
+    from lavender import bench, registry
+
+    given = bench.resolve([problem])[0].problem if problem else None
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    for name in ("solver", "laws", "reads", "can", "what it is"):
+        table.add_column(name, no_wrap=name == "solver", overflow="fold")
+    reasons = registry.known(given)
+    for name, spec in sorted(registry.specs().items()):
+        abilities = [
+            word
+            for word, has in (
+                ("exact", spec.exact),
+                ("warm start", spec.impulse),
+                ("budget", spec.resumable),
+                ("order", spec.order),
+                ("seed", spec.seed),
+                ("threads", spec.threads),
+                ("history", spec.history),
+            )
+            if has
+        ]
+        reason = reasons[name]
+        what = spec.summary if reason is None else f"[yellow]{_plain(reason)}[/]"
+        laws = [law for law in ("linear", "lcp", "coulomb", "cone") if law in spec.laws]
+        table.add_row(name, " ".join(laws), spec.operator, ", ".join(abilities), what, style="" if reason is None else "dim")
+    _console().print(table)
+
+
+def _plain(text: str) -> str:
+    from rich.markup import escape
+
+    return escape(text)
+
+
+@cli.command(cls=ManyValues)
+@click.argument("files", nargs=-1, metavar="[FILES | FOLDERS | NAMES]...")
+@click.option("--solvers", type=Names(), help="Solvers by name; all that take the problem if not given.")
+@click.option("--reference", default="osqp", show_default=True, help="Whose answer to compare with.")
+@click.option("--tol", type=float, default=1e-6, show_default=True)
+def check(files: tuple[str, ...], solvers: tuple[str, ...] | None, reference: str, tol: float) -> None:
+    """Compare solvers with a reference and with the judge; exit 1 when a claim is contradicted."""
+    from lavender import bench
+    from lavender.check import cross_check
+
+    _one_thread()
+    console = _console()
+    contradicted = 0
+    bench.solver_names(solvers)
+    for item in bench.resolve(files):
+        try:
+            found = cross_check(item.problem, solvers=solvers, reference=reference, tol=tol)
+        except LavenderError as error:
+            console.print(f"{item.name}: {_plain(str(error))}", style="yellow", highlight=False)
+            continue
+        finally:
+            item.forget()
+        console.print(f"[bold]{_plain(item.name)}[/]", highlight=False)
+        console.print(str(found), highlight=False, markup=False)
+        contradicted += _count_contradicted(found)
+    if contradicted:
+        console.print(f"[bold red]{contradicted} claims are contradicted[/]")
+        raise click.exceptions.Exit(EXIT_CONTRADICTED)
+
+
+def _count_contradicted(found: Any) -> int:
+    return sum(bool(row.contradicted) for row in found.rows)
+
+
+def main(args: Sequence[str] | None = None) -> None:
+    """Entry point: what lavender raises on purpose becomes one line and status 2."""
+    try:
+        code = cli.main(args=None if args is None else list(args), prog_name="lavender", standalone_mode=False)
+    except LavenderError as error:
+        click.echo(f"lavender: {error}", err=True)
+        code = EXIT_BAD_INPUT
+    except click.exceptions.ClickException as error:
+        error.show()
+        code = error.exit_code
+    except (click.exceptions.Abort, KeyboardInterrupt):
+        click.echo("lavender: stopped", err=True)
+        code = EXIT_INTERRUPTED
+    except BrokenPipeError:
+        # `lavender solvers | head`: nobody reads any more.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        code = 0
+    raise SystemExit(code if isinstance(code, int) else 0)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,169 @@
+"""Points of every figure, once, for the interactive page and for SVG and PNG alike."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from statistics import median
+
+from lavender.bench.record import Record, level_name
+from lavender.bench.store import Records
+from lavender.report import tables
+from lavender.report.text import residual, seconds
+
+__all__ = ["Curve", "Figure", "budget_figure", "profile_figure", "work_precision"]
+
+TINY = 1e-17  # where a residual of exactly zero is drawn
+
+
+@dataclass(frozen=True)
+class Curve:
+    """One line: points, and what hovering over each says."""
+
+    solver: str
+    label: str
+    x: tuple[float, ...]
+    y: tuple[float, ...]
+    hover: tuple[str, ...] = ()
+    thin: bool = False  # warm starts
+    steps: bool = False
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A diagram without a drawing library."""
+
+    name: str  # file name, without suffix
+    title: str
+    x_title: str
+    y_title: str
+    curves: tuple[Curve, ...]
+    x_log: bool = True
+    y_log: bool = True
+    levels: tuple[float, ...] = ()
+    floor: float = math.nan
+    start: float = math.nan
+    notes: Mapping[str, str] = field(default_factory=dict)
+
+
+def _hover(r: Record) -> str:
+    asked = f"to {level_name(r.tol)}" if r.mode == "tol" else f"{r.max_iter} iterations"
+    work = ", ".join(f"{n} {k}" for k, n in r.work.items())
+    lines = [
+        f"{r.solver} ({r.start}), {asked}",
+        f"relative {residual(r.relative)}, floor {residual(r.floor)}",
+        f"{seconds(r.time_min)} (set-up {seconds(r.setup_min)}), median {seconds(r.time_median)}",
+        f"{r.status}; {work or f'{r.iterations} iterations'}{'; form ' + r.form if r.form else ''}",
+    ]
+    if r.worst_name:
+        lines.append(f"worst: {r.worst_name}, {residual(r.velocity)} m/s")
+    if r.contradicted:
+        lines.append("CONTRADICTED: " + r.contradicted)
+    return "\n".join(lines)
+
+
+def work_precision(records: Records, case: str) -> Figure:
+    """Error against time: every run of a case, one curve for each solver and start, by time."""
+    curves = []
+    floors: list[tuple[float, float]] = []
+    for (name, solver, start), group in sorted(tables.pairs(records).items()):
+        if name != case:
+            continue
+        runs = sorted((r for r in group if r.usable), key=lambda r: (r.time_min, -r.relative))
+        floors += [(r.relative, r.floor) for r in runs if r.floor > 0.0]
+        if runs:
+            curves.append(
+                Curve(
+                    solver,
+                    solver if start == "cold" else f"{solver} ({start})",
+                    tuple(r.time_min for r in runs),
+                    tuple(max(r.relative, TINY) for r in runs),
+                    tuple(map(_hover, runs)),
+                    thin=start != "cold",
+                )
+            )
+    floors.sort()
+    # The floor depends on the impulses: that of the best run is the one of the solution.
+    floor = floors[0][1] if floors else math.nan
+    return Figure(
+        "work-precision " + case, case, "time: set-up and solve [s]", "relative residual [-]", tuple(curves),
+        levels=tables.levels_of(records), floor=floor,
+    )  # fmt: skip
+
+
+def family_figure(records: Records, family: str, cases: list[str]) -> Figure:
+    """Work-precision over a family: geometric mean time to each residual decade that most cases reach."""
+    groups = {k: [r for r in g if r.usable] for k, g in tables.pairs(records).items() if k[0] in cases and k[2] == "cold"}
+    solvers = sorted({k[1] for k in groups})
+    decades = [10.0**-k for k in range(0, 15)]
+    curves = []
+    for solver in solvers:
+        x, y, hover = [], [], []
+        for level in decades:
+            t = [
+                min((r.time_min for r in groups.get((c, solver, "cold"), ()) if r.relative <= level), default=math.inf)
+                for c in cases
+            ]
+            reached = [v for v in t if math.isfinite(v)]
+            if 2 * len(reached) > len(cases):
+                # Median with misses at infinity: it does not flatter a solver that solves the easy half alone.
+                x.append(median(t) if math.isfinite(median(t)) else max(reached))
+                y.append(level)
+                hover.append(f"{solver}: {len(reached)} of {len(cases)} cases to {level_name(level)}, median {seconds(x[-1])}")
+        if x:
+            curves.append(Curve(solver, solver, tuple(x), tuple(y), tuple(hover)))
+    return Figure(
+        "family " + family, f"{family} ({len(cases)} cases)", "median time [s], misses at infinity",
+        "relative residual [-]", tuple(curves), levels=tables.levels_of(records), floor=_family_floor(records, cases),
+    )  # fmt: skip
+
+
+def _family_floor(records: Records, cases: list[str]) -> float:
+    floors = [work_precision(records, c).floor for c in cases]
+    floors = [f for f in floors if math.isfinite(f)]
+    return max(floors, default=math.nan)
+
+
+def budget_figure(records: Records, case: str) -> Figure:
+    """Residual against exact iteration budgets, cold and warm."""
+    curves = []
+    for (name, solver, start), points in sorted(tables.budgets(records).items()):
+        if name == case:
+            curves.append(
+                Curve(
+                    solver,
+                    solver if start == "cold" else f"{solver} ({start})",
+                    tuple(float(n) for n, _ in points),
+                    tuple(max(r, TINY) for _, r in points),
+                    tuple(f"{solver} ({start}): {n} iterations, relative {residual(r)}" for n, r in points),
+                    thin=start != "cold",
+                )
+            )
+    return Figure(
+        "budget " + case, case, "iterations (sweeps)", "relative residual [-]", tuple(curves),
+        levels=tables.levels_of(records), floor=work_precision(records, case).floor,
+    )  # fmt: skip
+
+
+def profile_figure(profile: tables.Profile) -> Figure:
+    """Dolan-More profile as steps."""
+    curves = []
+    for solver, steps in profile.curves.items():
+        if not steps or steps[-1][1] <= 0.0:
+            continue
+        curves.append(
+            Curve(
+                solver,
+                solver,
+                tuple(r for r, _ in steps),
+                tuple(100.0 * s for _, s in steps),
+                tuple(f"{solver}: {100 * s:.0f}% within {r:.3g} times the fastest" for r, s in steps),
+                steps=True,
+            )
+        )
+    return Figure(
+        f"profile {profile.law} {level_name(profile.level)}",
+        f"{profile.law}, to {level_name(profile.level)} ({profile.cases} cases)",
+        "time / fastest time", "cases solved [%]", tuple(curves), y_log=False,
+    )  # fmt: skip

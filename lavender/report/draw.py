@@ -1,0 +1,106 @@
+"""Figures as SVG and PNG (matplotlib), and as data for the interactive page (plotly.js)."""
+
+from __future__ import annotations
+
+import io
+import math
+import re
+from pathlib import Path
+from typing import Any
+
+from lavender.report.curves import Figure
+from lavender.report.style import Look
+
+__all__ = ["file_name", "matplotlib_figure", "plotly_data", "save", "svg"]
+
+
+def file_name(name: str) -> str:
+    """A name that every file system takes."""
+    return re.sub(r"[^A-Za-z0-9._-]+", "_", name).strip("_.")[:120] or "figure"
+
+
+def matplotlib_figure(figure: Figure, look: dict[str, Look]) -> Any:
+    """The figure drawn, without pyplot and its global state."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure as Canvas
+
+    canvas = Canvas(figsize=(7.2, 4.6), layout="constrained")
+    FigureCanvasAgg(canvas)
+    axes = canvas.add_subplot()
+    for c in figure.curves:
+        k = look[c.solver]
+        style: dict[str, Any] = {"color": k.color, "linestyle": k.line, "label": c.label, "linewidth": 0.8 if c.thin else 1.5}
+        if c.steps:
+            last = max(x for d in figure.curves for x in d.x) * 1.3
+            axes.step([*c.x, last], [*c.y, c.y[-1]], where="post", **style)
+        else:
+            axes.plot(c.x, c.y, marker=k.marker, markersize=4, markerfacecolor="none" if c.thin else k.color, **style)
+    if figure.x_log:
+        axes.set_xscale("log")
+    if figure.y_log:
+        axes.set_yscale("log")
+    for level in figure.levels:
+        axes.axhline(level, color="0.8", linewidth=0.6, zorder=0)
+    if math.isfinite(figure.floor) and figure.floor > 0.0:
+        axes.axhline(figure.floor, color="0.35", linewidth=1.0, linestyle=(0, (1, 1)), label="floor of float64", zorder=0)
+    axes.set_xlabel(figure.x_title)
+    axes.set_ylabel(figure.y_title)
+    axes.set_title(figure.title, fontsize=10)
+    if axes.get_legend_handles_labels()[0]:
+        axes.legend(fontsize=7, loc="center left", bbox_to_anchor=(1.01, 0.5), frameon=False)
+    return canvas
+
+
+def save(figure: Figure, look: dict[str, Look], folder: Path) -> None:
+    """NAME.svg and NAME.png in `folder`."""
+    canvas = matplotlib_figure(figure, look)
+    path = folder / file_name(figure.name)
+    canvas.savefig(path.with_name(path.name + ".svg"), metadata={"Date": None})
+    canvas.savefig(path.with_name(path.name + ".png"), dpi=110, metadata={"Software": None})
+
+
+def svg(figure: Figure, look: dict[str, Look]) -> str:
+    """The figure as an <svg> element for a page."""
+    out = io.StringIO()
+    matplotlib_figure(figure, look).savefig(out, format="svg", metadata={"Date": None})
+    text = out.getvalue()
+    return text[text.index("<svg") :]
+
+
+def plotly_data(figure: Figure, look: dict[str, Look]) -> dict[str, Any]:
+    """Traces and layout for plotly.js; colours of paper, grid and text are the page's, set there."""
+    traces: list[dict[str, Any]] = []
+    for c in figure.curves:
+        k = look[c.solver]
+        x, y = list(c.x), list(c.y)
+        if c.steps:
+            x.append(max(v for d in figure.curves for v in d.x) * 1.3)
+            y.append(y[-1])
+        traces.append({
+            "x": x,
+            "y": y,
+            "name": c.label,
+            "text": [_html(t) for t in c.hover],
+            "hoverinfo": "text" if c.hover else "name",
+            "mode": "lines" if c.steps else "lines+markers",
+            "line": {
+                "color": k.color,
+                "dash": k.dash,
+                "width": 1.0 if c.thin else 2.0,
+                **({"shape": "hv"} if c.steps else {}),
+            },
+            "marker": {"symbol": k.mark + ("-open" if c.thin else ""), "size": 7, "color": k.color},
+        })  # fmt: skip
+    return {
+        "traces": traces,
+        "title": figure.title,
+        "x": {"title": figure.x_title, "log": figure.x_log},
+        "y": {"title": figure.y_title, "log": figure.y_log},
+        "levels": list(figure.levels),
+        "floor": figure.floor if math.isfinite(figure.floor) and figure.floor > 0.0 else None,
+    }
+
+
+def _html(text: str) -> str:
+    # plotly reads a little HTML in hover texts; names of files and rows are not meant as such.
+    return text.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;").replace("\n", "<br>")

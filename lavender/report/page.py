@@ -1,0 +1,125 @@
+"""The report as one self-contained HTML file: no network, dark and light, phone and print."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import math
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from lavender.bench.record import level_name
+from lavender.bench.store import Records
+from lavender.report import curves, tables
+from lavender.report.draw import file_name, plotly_data
+from lavender.report.style import looks
+from lavender.report.text import residual, seconds
+
+__all__ = ["page"]
+
+LIMITATIONS = (
+    "Times are wall-clock on a machine that may be doing other work: the minimum of the repeats is shown, the "
+    "median is in records.csv. Differences below a few tens of per cent mean nothing without more repeats.",
+    "Set-up and solve are added; a simulation that reuses a factorisation between steps pays the set-up less often.",
+    "BLAS and OpenMP have one thread. A backend that starts threads of its own in another way is not held back.",
+    "Times of Python-level solvers contain the interpreter: below about 50 microseconds they say little about an algorithm.",
+    "Ratios of times are taken within one run only. A time to a level is that of the cheapest run whose judged "
+    "residual is at or below the level.",
+    "A missed level is charged the time limit in the geometric means, and stands at infinity in the profiles. Many "
+    "curves in one profile mislead about who comes second: look at the two you consider.",
+    "Recommendations hold for the cases of this report; they rank by cases solved first, then by time.",
+    "The residual is zero exactly at a solution; how far an impulse is from the solution depends on the problem's conditioning too.",
+)
+
+
+@cache
+def plotly_source() -> str:
+    """plotly.js as it ships in the Python package plotly, to embed."""
+    spec = importlib.util.find_spec("plotly")
+    assert spec is not None and spec.submodule_search_locations  # a dependency of lavender
+    source = Path(spec.submodule_search_locations[0], "package_data", "plotly.min.js").read_text(encoding="utf-8")
+    # Nothing inside may end the script element that holds it.
+    return source.replace("</script", "<\\/script")
+
+
+def page(records: Records, title: str = "lavender report") -> str:
+    """The whole page. Every text that came from a file, a problem or a backend is escaped."""
+    import jinja2
+
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("lavender.report"),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters.update(seconds=seconds, residual=residual, level=level_name, anchor=file_name)
+    content = _content(records)
+    figures = json.dumps(content.pop("figures"), allow_nan=False).replace("<", "\\u003c")
+    return environment.get_template("index.html.j2").render(
+        title=title,
+        figures_json=figures,
+        plotly=plotly_source(),
+        limitations=LIMITATIONS,
+        inf=math.inf,
+        isfinite=math.isfinite,
+        **content,
+    )
+
+
+def _content(records: Records) -> dict[str, Any]:
+    look = looks(r.solver for r in records)
+    levels = tables.levels_of(records)
+    figures: dict[str, Any] = {}
+
+    def add(figure: curves.Figure) -> str:
+        if not figure.curves:
+            return ""
+        key = file_name(figure.name)
+        figures[key] = plotly_data(figure, look)
+        return key
+
+    by_case: dict[str, list[tables.Reach]] = {}
+    for reach in tables.reaches(records, levels):
+        by_case.setdefault(reach.case, []).append(reach)
+    cases = [
+        {
+            "info": records.cases[name],
+            "reaches": rows,
+            "work_precision": add(curves.work_precision(records, name)),
+            "budget": add(curves.budget_figure(records, name)),
+        }
+        for name, rows in by_case.items()
+    ]
+    families = tables.families(records)
+    family_figures = {f: add(curves.family_figure(records, f, cs)) for f, cs in families.items() if len(cs) > 1}
+    profiles: dict[str, list[str]] = {}
+    for profile in tables.profiles(records):
+        if profile.cases > 1:
+            key = add(curves.profile_figure(profile))
+            if key:
+                profiles.setdefault(profile.law, []).append(key)
+    advice_level, advice_time = tables.advice_by_level(records), tables.advice_by_time(records)
+    return {
+        "figures": figures,
+        "runs": list(records.runs.values()),
+        "levels": levels,
+        "times": tables.time_budgets(records),
+        "families": families,
+        "family_figures": family_figures,
+        "by_level": {(a.family, a.target): a for a in advice_level},
+        "by_time": {(a.family, a.target): a for a in advice_time},
+        "claims": tables.claims(records),
+        "failures": tables.failures(records),
+        "cases": cases,
+        "profiles": profiles,
+        "means": tables.geometric_means(records),
+        "shift": tables.shift_of(records),
+        "limit": tables.limit_of(records),
+        "spreads": sorted(tables.spreads(records), key=lambda s: -s.factor),
+        "lost": [s for s in records.skips if not s.solver],
+        "refused": [s for s in records.skips if s.solver],
+        "n_records": len(records),
+        "look": look,
+    }

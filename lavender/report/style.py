@@ -1,0 +1,45 @@
+"""One look for every figure: a solver keeps its colour, dash and mark wherever it appears.
+
+Colours are Okabe and Ito's (distinct under the common colour-vision deficiencies), the darker ones
+readable on white and on near-black; dashes and marks tell apart what shares a colour, also in grey print.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+__all__ = ["Look", "looks"]
+
+COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#8C6D31", "#7F7F7F")
+# (plotly, matplotlib) names of the same dashes and marks.
+DASHES = (("solid", "-"), ("dash", "--"), ("dot", ":"), ("dashdot", "-."))
+MARKS = (
+    ("circle", "o"),
+    ("square", "s"),
+    ("triangle-up", "^"),
+    ("diamond", "D"),
+    ("x", "X"),
+    ("star", "*"),
+    ("triangle-down", "v"),
+)
+
+
+@dataclass(frozen=True)
+class Look:
+    """Colour, dash and mark, for plotly and for matplotlib."""
+
+    color: str
+    dash: str
+    mark: str
+    line: str  # matplotlib
+    marker: str  # matplotlib
+
+
+def looks(solvers: Iterable[str]) -> dict[str, Look]:
+    """A look for each solver, by its place among the sorted names."""
+    out = {}
+    for i, name in enumerate(sorted(set(solvers))):
+        dash, mark = DASHES[i // len(COLORS) % len(DASHES)], MARKS[i % len(MARKS)]
+        out[name] = Look(COLORS[i % len(COLORS)], dash[0], mark[0], dash[1], mark[1])
+    return out

@@ -1,0 +1,412 @@
+"""Records -> plain tables (lists of small frozen rows). Nothing is solved, timed or drawn here.
+
+Time to a level: the smallest time of any run whose judged residual is at or below it, whatever was asked
+for: runs are matched by the accuracy they reached, never by the one they were asked for.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from statistics import median
+
+from lavender.bench.record import Record, level_name
+from lavender.bench.store import Records
+
+__all__ = [
+    "Advice",
+    "Claims",
+    "Failure",
+    "Profile",
+    "Reach",
+    "Spread",
+    "advice_by_level",
+    "advice_by_time",
+    "budgets",
+    "claims",
+    "failures",
+    "families",
+    "geometric_means",
+    "levels_of",
+    "pairs",
+    "profiles",
+    "reaches",
+    "spreads",
+    "time_budgets",
+]
+
+FAILED = ("ERROR", "KILLED", "NUMERICAL_ERROR", "DIVERGED", "STALLED", "INFEASIBLE", "TIME_LIMIT", "MAX_ITERATIONS")
+
+
+@dataclass(frozen=True)
+class Reach:
+    """How far and how fast one solver came on one case."""
+
+    case: str
+    solver: str
+    start: str
+    times: Mapping[float, float]  # s to each level, inf where it was not reached
+    best: float  # smallest relative residual of any run
+    best_time: float  # s, of that run
+    floor: float  # of that run
+    status: str  # of the run to the tightest level asked for
+    contradicted: str
+    message: str
+    worst_name: str
+    form: str
+
+    @property
+    def at_floor(self) -> bool:
+        """No better residual can be asked of float64."""
+        return self.best <= 2.0 * self.floor
+
+
+@dataclass(frozen=True)
+class Failure:
+    """A run that missed what it was asked for, or whose claim does not hold."""
+
+    case: str
+    solver: str
+    asked: str
+    start: str
+    status: str
+    relative: float
+    floor: float
+    worst_name: str
+    contradicted: str
+    message: str
+
+
+@dataclass(frozen=True)
+class Claims:
+    """What a solver said of itself, against the judge."""
+
+    solver: str
+    runs: int
+    claims: int  # says CONVERGED, FLOOR or INFEASIBLE
+    wrong: int
+    reached: int  # runs to a level that the judge confirms
+    asked: int
+    crashed: int  # ERROR, KILLED, CRASHED
+
+    @property
+    def rate(self) -> float:
+        """Share of claims that the judge confirms; nan without claims."""
+        return 1.0 - self.wrong / self.claims if self.claims else math.nan
+
+
+@dataclass(frozen=True)
+class Choice:
+    """One solver's standing in a family."""
+
+    solver: str
+    solved: int
+    cases: int
+    score: float  # shifted geometric mean of times [s], or geometric mean of residuals
+
+
+@dataclass(frozen=True)
+class Advice:
+    """Solvers of a family in order of merit for one accuracy level or time budget."""
+
+    family: str
+    target: float  # level [-] or time [s]
+    ranking: tuple[Choice, ...]
+
+    @property
+    def best(self) -> Choice | None:
+        """The recommended one; None when nobody got there."""
+        return self.ranking[0] if self.ranking and self.ranking[0].solved else None
+
+
+@dataclass(frozen=True)
+class Profile:
+    """Dolan-More performance profile of one level over the cases of one law."""
+
+    law: str
+    level: float
+    cases: int
+    curves: Mapping[str, tuple[tuple[float, float], ...]]  # solver -> (ratio, share) steps
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Residual at one budget over sweep orders."""
+
+    case: str
+    solver: str
+    budget: int
+    by_order: Mapping[str, float]
+
+    @property
+    def factor(self) -> float:
+        """Worst over best order."""
+        values = [v for v in self.by_order.values() if v > 0.0]
+        return max(values) / min(values) if values else 1.0
+
+
+# -- groups ---------------------------------------------------------------------------------------
+
+
+def levels_of(records: Records) -> tuple[float, ...]:
+    """Levels of the newest run's plan, loosest first; else the tolerances that were asked for."""
+    for run in reversed(list(records.runs.values())):
+        if run.plan.get("levels"):
+            return tuple(sorted(map(float, run.plan["levels"]), reverse=True))
+    return tuple(sorted({r.tol for r in records if r.mode == "tol"}, reverse=True)) or (1e-3, 1e-6, 1e-9)
+
+
+def pairs(records: Iterable[Record]) -> dict[tuple[str, str, str], list[Record]]:
+    """Runs in the given order of blocks, by (case, solver, start)."""
+    groups: dict[tuple[str, str, str], list[Record]] = defaultdict(list)
+    for r in records:
+        if r.order == "given":
+            groups[r.case, r.solver, r.start].append(r)
+    return dict(groups)
+
+
+def families(records: Records) -> dict[str, list[str]]:
+    """Structure -> cases, biggest first. A case is in every family whose word describes it."""
+    found: dict[str, list[str]] = defaultdict(list)
+    ran = {r.case for r in records}
+    for name, info in records.cases.items():
+        if name in ran:
+            for word in info.structure:
+                found[word].append(name)
+    order = ("chain", "mesh", "stack", "pile", "redundant", "friction", "large mass ratio", "asymmetric")
+    return {w: found[w] for w in sorted(found, key=lambda w: (order.index(w) if w in order else len(order), w))}
+
+
+# -- per case -------------------------------------------------------------------------------------
+
+
+def reaches(records: Records, levels: Sequence[float] | None = None) -> list[Reach]:
+    """One row for each case, solver and start, in the order of the records."""
+    levels = levels_of(records) if levels is None else tuple(levels)
+    out = []
+    for (case, solver, start), group in pairs(records).items():
+        good = [r for r in group if r.usable]
+        best = min(good, key=lambda r: (r.relative, r.time_min), default=None)
+        asked = [r for r in group if r.mode == "tol"] or group
+        last = asked[-1]
+        out.append(
+            Reach(
+                case,
+                solver,
+                start,
+                {level: min((r.time_min for r in good if r.relative <= level), default=math.inf) for level in levels},
+                best.relative if best else math.inf,
+                best.time_min if best else math.nan,
+                best.floor if best else math.nan,
+                last.status,
+                next((r.contradicted for r in group if r.contradicted), ""),
+                last.message,
+                last.worst_name,
+                last.form,
+            )
+        )
+    return out
+
+
+def failures(records: Records) -> list[Failure]:
+    """Runs to a level that the judge does not confirm (nor the floor excuses), crashes, and false claims."""
+    out = []
+    for r in records:
+        missed = r.mode == "tol" and not r.success and not r.relative <= 2.0 * r.floor
+        proven = r.status == "INFEASIBLE" and not r.contradicted
+        lost = not math.isfinite(r.relative) or r.status.startswith(("ERROR", "KILLED", "CRASHED"))
+        if (missed and not proven) or lost or r.contradicted:
+            asked = f"relative residual {level_name(r.tol)}" if r.mode == "tol" else f"{r.max_iter} iterations"
+            if r.order != "given":
+                asked += f", order {r.order}"
+            out.append(
+                Failure(
+                    r.case, r.solver, asked, r.start, r.status, r.relative, r.floor, r.worst_name, r.contradicted, r.message
+                )
+            )
+    return out
+
+
+def claims(records: Records) -> list[Claims]:
+    """By solver: how often its claim holds."""
+    out = []
+    for solver in sorted({r.solver for r in records}):
+        mine = [r for r in records if r.solver == solver]
+        asked = [r for r in mine if r.mode == "tol"]
+        out.append(
+            Claims(
+                solver,
+                len(mine),
+                sum(r.claims for r in mine),
+                sum(r.claims and bool(r.contradicted) for r in mine),
+                sum(r.success for r in asked),
+                len(asked),
+                sum(r.status.startswith(("ERROR", "KILLED", "CRASHED")) for r in mine),
+            )
+        )
+    return out
+
+
+def spreads(records: Records) -> list[Spread]:
+    """Where one budget was run in several sweep orders, the residual of each."""
+    groups: dict[tuple[str, str, int], dict[str, float]] = defaultdict(dict)
+    for r in records:
+        if r.mode == "budget" and r.start == "cold":
+            name = f"{r.order} {r.seed}" if r.order == "random" else r.order
+            groups[r.case, r.solver, r.max_iter][name] = r.relative
+    return [Spread(*key, by_order) for key, by_order in groups.items() if len(by_order) > 1]
+
+
+def budgets(records: Records) -> dict[tuple[str, str, str], list[tuple[int, float]]]:
+    """(case, solver, start) -> (iterations, residual) of the exact budgets, given order."""
+    groups: dict[tuple[str, str, str], list[tuple[int, float]]] = defaultdict(list)
+    for r in records:
+        if r.mode == "budget" and r.order == "given" and r.status == "MAX_ITERATIONS":
+            groups[r.case, r.solver, r.start].append((r.iterations, r.relative))
+    return {key: sorted(points) for key, points in groups.items()}
+
+
+# -- over cases -----------------------------------------------------------------------------------
+
+
+def geometric_mean(values: Sequence[float], shift: float = 0.0) -> float:
+    """exp(mean(log(x + shift))) - shift; nan for nothing."""
+    if not values:
+        return math.nan
+    return math.exp(sum(math.log(v + shift) for v in values) / len(values)) - shift
+
+
+def _times(records: Records, level: float) -> dict[str, dict[str, float]]:
+    # case -> solver -> time to the level from a cold start, inf where missed; refused solvers are absent.
+    out: dict[str, dict[str, float]] = defaultdict(dict)
+    for reach in reaches(records, [level]):
+        if reach.start == "cold":
+            out[reach.case][reach.solver] = reach.times[level]
+    return out
+
+
+def shift_of(records: Records) -> float:
+    """Shift of the geometric means [s]: the median over cases of the fastest time to the loosest level."""
+    level = levels_of(records)[0]
+    fastest = [min(by.values()) for by in _times(records, level).values() if by]
+    fastest = [t for t in fastest if math.isfinite(t)]
+    return float(f"{median(fastest):.1g}") if fastest else 1e-3
+
+
+def limit_of(records: Records) -> float:
+    """What a missed level is charged [s]: the time limit."""
+    return max((r.time_limit for r in records), default=1.0)
+
+
+def geometric_means(records: Records) -> dict[str, dict[float, dict[str, tuple[float, int, int]]]]:
+    """law -> level -> solver -> (shifted geometric mean [s], solved, cases); a miss costs the time limit.
+
+    A solver stands in a law's table when it takes every case of it.
+    """
+    shift, limit = shift_of(records), limit_of(records)
+    out: dict[str, dict[float, dict[str, tuple[float, int, int]]]] = {}
+    for law, cases in _laws(records).items():
+        out[law] = {}
+        for level in levels_of(records):
+            times = _times(records, level)
+            by: dict[str, tuple[float, int, int]] = {}
+            for solver in _whole(times, cases):
+                t = [times[c][solver] for c in cases]
+                solved = sum(map(math.isfinite, t))
+                by[solver] = (geometric_mean([x if math.isfinite(x) else limit for x in t], shift), solved, len(cases))
+            out[law][level] = dict(sorted(by.items(), key=lambda kv: kv[1][0]))
+    return out
+
+
+def _laws(records: Records) -> dict[str, list[str]]:
+    ran = {r.case for r in records}
+    out: dict[str, list[str]] = defaultdict(list)
+    for name, info in records.cases.items():
+        if name in ran:
+            out[info.law].append(name)
+    return dict(out)
+
+
+def _whole(times: Mapping[str, Mapping[str, float]], cases: Sequence[str]) -> list[str]:
+    everyone = sorted({s for c in cases for s in times.get(c, {})})
+    return [s for s in everyone if all(s in times.get(c, {}) for c in cases)]
+
+
+def profiles(records: Records) -> list[Profile]:
+    """Share of cases that a solver brings to a level within `ratio` times the fastest; misses at infinity.
+
+    Over the cases of one law, and within one run (`Records.latest`); a case that nobody brought to the
+    level counts against everyone.
+    """
+    out = []
+    for law, cases in _laws(records).items():
+        for level in levels_of(records):
+            times = _times(records, level)
+            curves: dict[str, tuple[tuple[float, float], ...]] = {}
+            for solver in sorted({s for c in cases for s in times.get(c, {})}):
+                ratios = []
+                for c in cases:
+                    t = times.get(c, {}).get(solver, math.inf)
+                    if math.isfinite(t):
+                        ratios.append(t / min(times[c].values()))
+                steps = [(1.0, sum(r <= 1.0 for r in ratios) / len(cases))]
+                steps += [(r, sum(q <= r for q in ratios) / len(cases)) for r in sorted(set(ratios)) if r > 1.0]
+                curves[solver] = tuple(steps)
+            out.append(Profile(law, level, len(cases), curves))
+    return out
+
+
+def advice_by_level(records: Records) -> list[Advice]:
+    """For each structure and level: first who solves most cases, then who is fastest (shifted geometric mean).
+
+    A solver whose claim was wrong on a case of the family at any level comes after all that were not.
+    """
+    shift, limit = shift_of(records), limit_of(records)
+    liars = {(r.case, r.solver) for r in records if r.contradicted}
+    out = []
+    for family, cases in families(records).items():
+        for level in levels_of(records):
+            times = _times(records, level)
+            choices = []
+            for solver in sorted({s for c in cases for s in times.get(c, {})}):
+                t = [times.get(c, {}).get(solver, math.inf) for c in cases]
+                score = geometric_mean([x if math.isfinite(x) else limit for x in t], shift)
+                choices.append(Choice(solver, sum(map(math.isfinite, t)), len(cases), score))
+            choices.sort(key=lambda k: (any((c, k.solver) in liars for c in cases), -k.solved, k.score))
+            out.append(Advice(family, level, tuple(choices)))
+    return out
+
+
+def time_budgets(records: Records) -> tuple[float, ...]:
+    """Three decades of time [s] around the median of the fastest times to the middle level."""
+    levels = levels_of(records)
+    fastest = [min(by.values()) for by in _times(records, levels[len(levels) // 2]).values() if by]
+    fastest = [t for t in fastest if math.isfinite(t)]
+    middle = round(math.log10(median(fastest))) if fastest else -3
+    return tuple(10.0**k for k in (middle - 1, middle, middle + 1))
+
+
+def advice_by_time(records: Records) -> list[Advice]:
+    """For each structure and time budget: the smallest geometric mean of residuals reached in that time.
+
+    A solver with nothing to show in the time scores 1 on that case: doing nothing. "Solved" counts the
+    cases on which it brought anything back.
+    """
+    out = []
+    groups = {k: [r for r in g if r.usable] for k, g in pairs(records).items() if k[2] == "cold"}
+    for family, cases in families(records).items():
+        solvers = sorted({s for (c, s, _) in groups if c in cases})
+        for limit in time_budgets(records):
+            choices = []
+            for solver in solvers:
+                got = [
+                    min((max(r.relative, 1e-17) for r in groups.get((c, solver, "cold"), ()) if r.time_min <= limit), default=None)
+                    for c in cases
+                ]
+                score = geometric_mean([1.0 if g is None else min(g, 1.0) for g in got])
+                choices.append(Choice(solver, sum(g is not None for g in got), len(cases), score))
+            choices.sort(key=lambda k: (k.score, -k.solved))
+            out.append(Advice(family, limit, tuple(choices)))
+    return out

@@ -1,0 +1,99 @@
+"use strict";
+(function () {
+  const figures = JSON.parse(document.getElementById("figures").textContent);
+  const root = document.documentElement;
+  const drawn = new Set();
+
+  function theme() {
+    const css = getComputedStyle(root);
+    const get = (name) => css.getPropertyValue(name).trim();
+    return { paper: get("--paper"), ink: get("--ink"), quiet: get("--quiet"), line: get("--line") };
+  }
+
+  function layout(figure, width) {
+    const t = theme();
+    const phone = width < 520;
+    const axis = (a) => ({
+      title: { text: a.title, font: { size: 12 } },
+      type: a.log ? "log" : "linear",
+      gridcolor: t.line,
+      zeroline: false,
+      exponentformat: "power",
+      dtick: a.log ? undefined : null,
+      automargin: true,
+    });
+    const line = (y, color, dash) => ({
+      type: "line", xref: "paper", x0: 0, x1: 1, yref: "y", y0: y, y1: y, layer: "below",
+      line: { color: color, width: 1, dash: dash },
+    });
+    const shapes = figure.levels.map((y) => line(y, t.line, "solid"));
+    const annotations = [];
+    if (figure.floor !== null) {
+      shapes.push(line(figure.floor, t.quiet, "dot"));
+      annotations.push({
+        xref: "paper", x: 1, xanchor: "right", yref: "y", yanchor: "bottom", showarrow: false, text: "floor",
+        y: figure.y.log ? Math.log10(figure.floor) : figure.floor, font: { size: 10, color: t.quiet },
+      });
+    }
+    return {
+      title: { text: figure.title.replace(/&/g, "&amp;").replace(/</g, "&lt;"), font: { size: 13 } },
+      font: { color: t.ink, family: "system-ui, sans-serif", size: 11 },
+      paper_bgcolor: t.paper, plot_bgcolor: t.paper,
+      margin: { l: 60, r: 12, t: 36, b: 44 },
+      xaxis: axis(figure.x), yaxis: axis(figure.y),
+      legend: phone || width < 620 ? { orientation: "h", y: -0.22, font: { size: 10 } } : { font: { size: 10 } },
+      hoverlabel: { align: "left" }, hovermode: "closest",
+      shapes: shapes, annotations: annotations,
+    };
+  }
+
+  function draw(box) {
+    const figure = figures[box.dataset.figure];
+    if (!figure || drawn.has(box)) return;
+    drawn.add(box);
+    Plotly.newPlot(box, figure.traces, layout(figure, box.clientWidth), {
+      responsive: true, displaylogo: false,
+      toImageButtonOptions: { format: "svg", filename: box.dataset.figure },
+      modeBarButtonsToRemove: ["select2d", "lasso2d", "autoScale2d"],
+    });
+  }
+
+  function redraw() {
+    drawn.forEach((box) => {
+      const figure = figures[box.dataset.figure];
+      Plotly.react(box, figure.traces, layout(figure, box.clientWidth), { responsive: true, displaylogo: false });
+    });
+  }
+
+  const boxes = Array.from(document.querySelectorAll(".chart"));
+  const watcher = new IntersectionObserver(
+    (entries) => entries.forEach((e) => { if (e.isIntersecting) { draw(e.target); watcher.unobserve(e.target); } }),
+    { rootMargin: "600px" });
+  boxes.forEach((box) => watcher.observe(box));
+
+  const dark = matchMedia("(prefers-color-scheme: dark)");
+  const isDark = () => (root.dataset.theme ? root.dataset.theme === "dark" : dark.matches);
+  document.getElementById("theme").addEventListener("click", () => {
+    root.dataset.theme = isDark() ? "light" : "dark";
+    redraw();
+  });
+  dark.addEventListener("change", redraw);
+  let before = "";
+  addEventListener("beforeprint", () => {
+    before = root.dataset.theme || "";
+    root.dataset.theme = "light";
+    boxes.forEach(draw);
+    redraw();
+    document.querySelectorAll("details").forEach((d) => { d.open = true; });
+  });
+  addEventListener("afterprint", () => {
+    if (before) root.dataset.theme = before; else delete root.dataset.theme;
+    redraw();
+  });
+  function follow() {
+    const target = location.hash ? document.getElementById(decodeURIComponent(location.hash.slice(1))) : null;
+    if (target && target.closest("details")) target.closest("details").open = true;
+  }
+  addEventListener("hashchange", follow);
+  follow();
+})();

@@ -1,0 +1,93 @@
+"""Tables for the terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+from lavender.bench.record import level_name
+from lavender.bench.store import Records
+from lavender.report import tables
+from lavender.report.text import residual, seconds
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+__all__ = ["print_report"]
+
+GOOD = ("CONVERGED", "FLOOR")
+
+
+def reach_table(records: Records, levels: Sequence[float]) -> Any:
+    """Per case and solver: time to each level, best residual, status, and whether the claim holds."""
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(box=None, pad_edge=False, header_style="bold", show_lines=False)
+    table.add_column("case", overflow="fold", max_width=34)
+    table.add_column("solver", no_wrap=True)
+    for level in levels:
+        table.add_column(f"to {level_name(level)}", justify="right", no_wrap=True)
+    table.add_column("best", justify="right", no_wrap=True)
+    table.add_column("status", no_wrap=True)
+    table.add_column("claim", no_wrap=True)
+    shown = ""
+    for row in tables.reaches(records, levels):
+        name = row.solver + ("" if row.start == "cold" else f" ({row.start})")
+        cells = [Text(seconds(row.times[level]), style="" if row.times[level] < float("inf") else "dim") for level in levels]
+        best = residual(row.best) + (" (floor)" if row.at_floor else "")
+        status = Text(row.status, style="green" if row.status in GOOD else "yellow")
+        claim = Text("✗ contradicted", style="bold red") if row.contradicted else Text("")
+        if shown and row.case != shown:
+            table.add_section()
+        table.add_row("" if row.case == shown else row.case, name, *cells, best, status, claim)
+        shown = row.case
+    return table
+
+
+def advice_table(records: Records) -> Any:
+    """Per structure and level: the recommended solver, its mean time, and on how many cases it got there."""
+    from rich.table import Table
+
+    rows = tables.advice_by_level(records)
+    levels = sorted({a.target for a in rows}, reverse=True)
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    table.add_column("structure", no_wrap=True)
+    for level in levels:
+        table.add_column(f"to {level_name(level)}")
+    for family in dict.fromkeys(a.family for a in rows):
+        cells = []
+        for level in levels:
+            best = next(a for a in rows if a.family == family and a.target == level).best
+            cells.append(f"{best.solver}, {seconds(best.score)}, {best.solved}/{best.cases}" if best else "nobody")
+        table.add_row(family, *cells)
+    return table
+
+
+def print_report(records: Records, console: Console, levels: Sequence[float] | None = None) -> None:
+    """Everything the terminal shows after a run."""
+    levels = tables.levels_of(records) if levels is None else levels
+    if len(records):
+        console.print(reach_table(records, levels))
+        console.print()
+    lost = [s for s in records.skips if not s.solver]
+    for skip in lost:
+        console.print(f"[yellow]not run:[/] {skip.case}: {skip.reason}", highlight=False)
+    refused = [s for s in records.skips if s.solver]
+    if refused:
+        names = sorted({s.solver for s in refused})
+        console.print(
+            f"{len(refused)} pairs were not run because the solver does not take the problem ({', '.join(names)}); the page says why.",
+            highlight=False,
+            style="dim",
+        )
+    if len(records):
+        console.print("\n[bold]Recommended[/] (solver, shifted geometric mean of time, cases brought to the level)")
+        console.print(advice_table(records), highlight=False)
+    wrong = [r for r in records if r.contradicted]
+    if wrong:
+        console.print(f"\n[bold red]{len(wrong)} claims are contradicted by the judge:[/]")
+        for r in wrong[:20]:
+            console.print(f"  {r.case}, {r.solver}: {r.contradicted}", highlight=False)
+        if len(wrong) > 20:
+            console.print(f"  and {len(wrong) - 20} more", highlight=False)

@@ -1,0 +1,58 @@
+"""Everything that a report leaves in its folder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from lavender.bench.store import Records, write_csv, write_json
+from lavender.errors import InputError
+
+__all__ = ["write"]
+
+
+def write(records: Records, folder: str | Path, *, figures: bool = True) -> Path:
+    """Write `records.csv`, `records.json`, `figures/*.svg`, `figures/*.png`, `summary.md` and `index.html`.
+
+    Parameters
+    ----------
+    records : Records
+        Times are compared within the newest run alone; csv and json hold all of them.
+    folder : path
+    figures : bool
+        False leaves out the SVG and PNG files, which take most of the time.
+
+    Returns
+    -------
+    Path
+        Of index.html.
+
+    Raises
+    ------
+    InputError
+        The folder cannot be written.
+    """
+    from lavender.report.curves import budget_figure, work_precision
+    from lavender.report.draw import save
+    from lavender.report.markdown import summary
+    from lavender.report.page import page
+    from lavender.report.style import looks
+
+    folder = Path(folder)
+    shown = records.latest()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        write_csv(records, folder / "records.csv")
+        write_json(records, folder / "records.json")
+        index = folder / "index.html"
+        index.write_text(page(shown), encoding="utf-8")
+        (folder / "summary.md").write_text(summary(shown), encoding="utf-8")
+        if figures:
+            (folder / "figures").mkdir(exist_ok=True)
+            look = looks(r.solver for r in shown)
+            for case in dict.fromkeys(r.case for r in shown):
+                for figure in (work_precision(shown, case), budget_figure(shown, case)):
+                    if figure.curves:
+                        save(figure, look, folder / "figures")
+    except OSError as error:
+        raise InputError(f"cannot write {error.filename or folder} ({error.strerror or error}): give a folder that you may write to") from None
+    return index
