@@ -1,0 +1,518 @@
+"""FCLIB files (HDF5): friction contact problems in 2D and 3D, local and global.
+
+    local     u = W r + q                                         A = W, b = -q, lambda = r, w = u
+    global    M v = H r + f,  u = H^T v + w                       A = H^T M^-1 H,  b = -(w + H^T M^-1 f)
+    with equations (V, R, s or G, b): free rows after the contacts, w = 0 there
+
+FCLIB's vector `w` is an offset of the velocity, not our slack. Format: Acary, Bremond, Huber et al.,
+"FCLIB: a collection of discrete 3D frictional contact problems", Inria RT-444, 2014.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import scipy.sparse as sp
+import scipy.sparse.linalg as spla
+
+from lavender._arrays import FloatArray, as_array
+from lavender.cones import CONTACT, ROW, Cones
+from lavender.errors import CapabilityError, InputError
+from lavender.io.npz import compressed
+from lavender.io.stored import MAX_BYTES, Stored, write_atomically
+from lavender.problem import Problem
+
+__all__ = ["Contents", "contents", "read", "read_contents", "write", "write_contents"]
+
+LOCAL, GLOBAL = "fclib_local", "fclib_global"
+ROLLING = ("fclib_local_rolling", "fclib_global_rolling")
+CONDENSE_CHUNK = 2**23  # numbers of M^-1 H held dense at a time: 64 MiB
+
+
+@dataclass(frozen=True, eq=False)
+class Contents:
+    """An FCLIB file as it is: nothing condensed, rescaled or symmetrised.
+
+    Local: W, q (and V, R, s). Global: M, H, f, w (and G, b). Matrices as (rows, columns) of SciPy, CSR.
+    """
+
+    spacedim: int  # 2 or 3 rows of each contact, normal first
+    mu: FloatArray  # (c,)
+    W: sp.csr_array | None = None  # (m, m)
+    q: FloatArray | None = None  # (m,)
+    V: sp.csr_array | None = None  # (m, p)
+    R: sp.csr_array | None = None  # (p, p)
+    s: FloatArray | None = None  # (p,)
+    M: sp.csr_array | None = None  # (n, n)
+    H: sp.csr_array | None = None  # (n, m)
+    f: FloatArray | None = None  # (n,)
+    w: FloatArray | None = None  # (m,)
+    G: sp.csr_array | None = None  # (n, p)
+    b: FloatArray | None = None  # (p,)
+    solution: Mapping[str, FloatArray] = field(default_factory=dict)  # "r", "u" (m,), "v" (n,), "l" (p,)
+    guesses: tuple[Mapping[str, FloatArray], ...] = ()  # as solution
+    info: Mapping[str, str] = field(default_factory=dict)  # "title", "description", "math_info"
+    compare: str = ""  # not FCLIB: "r,u", "u" or "error" where the file has a group `reference`
+
+    @property
+    def form(self) -> str:
+        """Which form: "local" or "global"."""
+        return "local" if self.W is not None else "global"
+
+    def problem(self, name: str = "") -> Problem:
+        """The problem, condensed to a matrix where it is global.
+
+        Raises
+        ------
+        InputError
+            M is singular, or parts do not fit each other.
+        """
+        a, b = self._local() if self.form == "local" else self._condensed()
+        c, d = len(self.mu), self.spacedim
+        p = len(b) - c * d
+        ptr = np.concatenate([np.arange(0, c * d + 1, d), c * d + 1 + np.arange(p)])
+        kind = np.repeat(np.array([CONTACT, ROW], np.int32), [c, p])
+        mu = np.concatenate([self.mu, np.zeros(p)])
+        free = np.full(len(b), np.inf)
+        cones = Cones(ptr, kind, -free, free, mu, np.zeros(c + p))
+        guess = self._impulse(self.guesses[0]) if self.guesses else None
+        return Problem(b, cones, a, guess=guess, name=self.info.get("title", "") or name)
+
+    def _local(self) -> tuple[sp.csr_array, FloatArray]:
+        assert self.q is not None
+        if self.V is None or self.s is None:
+            return self.W, -self.q
+        a = sp.block_array([[self.W, self.V], [self.V.T, self.R]])
+        return sp.csr_array(a), -np.concatenate([self.q, self.s])
+
+    def _condensed(self) -> tuple[sp.csr_array, FloatArray]:
+        # J = [H G]^T: contact rows and equations alike.
+        assert self.M is not None
+        assert self.H is not None
+        assert self.w is not None
+        jt, offset = self.H, self.w
+        if self.G is not None and self.b is not None:
+            jt, offset = sp.csr_array(sp.hstack([self.H, self.G])), np.concatenate([self.w, self.b])
+        if self.M.shape[0] == 0:
+            return sp.csr_array((len(offset), len(offset))), -offset
+        try:
+            factor = spla.splu(sp.csc_matrix(self.M))
+        except RuntimeError as error:
+            raise InputError(f"M cannot be factorised ({error}); an invertible M is needed") from None
+        m = jt.shape[1]
+        step = max(1, CONDENSE_CHUNK // max(1, jt.shape[0]))
+        columns = sp.csc_array(jt)
+        j = sp.csr_array(jt.T)
+        parts = [
+            sp.csr_array(j @ factor.solve(columns[:, k : min(k + step, m)].toarray()))
+            for k in range(0, m, step)
+        ]
+        a = sp.csr_array(sp.hstack(parts)) if parts else sp.csr_array((0, 0))
+        gap = self.M - self.M.T
+        if gap.nnz == 0 or not np.any(gap.data):
+            a = sp.csr_array(0.5 * (a + a.T))  # what the order of additions left, where M is symmetric
+        return a, -(offset + j @ factor.solve(self.f))
+
+    def _impulse(self, point: Mapping[str, FloatArray]) -> FloatArray:
+        return np.concatenate([point["r"], point["l"]]) if "l" in point else point["r"]
+
+    def impulse(self) -> FloatArray | None:
+        """The stored solution (m + p,) [N s], or None."""
+        return self._impulse(self.solution) if "r" in self.solution else None
+
+    def slack(self) -> FloatArray | None:
+        """The stored u, zero on equations (m + p,) [m/s], or None."""
+        if "u" not in self.solution:
+            return None
+        return np.concatenate([self.solution["u"], np.zeros(len(self.solution.get("l", ())))])
+
+
+# -- reading --------------------------------------------------------------------------------------
+
+
+def read(path: str | os.PathLike[str], *, max_bytes: int = MAX_BYTES) -> Stored:
+    """Problem, solution and guesses of an FCLIB file.
+
+    A file that holds both forms is read in its local form; the first guess becomes `problem.guess`.
+
+    Raises
+    ------
+    InputError
+        Not an FCLIB file, truncated, inconsistent; or h5py is not installed.
+    CapabilityError
+        Rolling friction.
+    """
+    file = read_contents(path, max_bytes=max_bytes)
+    try:
+        problem = file.problem(Path(path).stem)
+        guesses = tuple(problem.impulse_array(file._impulse(g), "guess") for g in file.guesses)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    return Stored(
+        problem,
+        LOCAL if file.form == "local" else GLOBAL,
+        impulse=file.impulse(),
+        slack=file.slack(),
+        compare=file.compare,
+        guesses=guesses,
+        info=file.info,
+    )
+
+
+def read_contents(path: str | os.PathLike[str], *, max_bytes: int = MAX_BYTES) -> Contents:
+    """The matrices and vectors of an FCLIB file, as they stand there; raises as `read`."""
+    h5py = _h5py()
+    try:
+        with h5py.File(path, "r") as file:
+            return _read_file(_Reader(h5py, file, max_bytes))
+    except (InputError, CapabilityError) as error:
+        raise type(error)(f"{path}: {error}") from None
+    except (OSError, KeyError, RuntimeError, ValueError, TypeError, OverflowError, MemoryError) as error:
+        raise InputError(
+            f"{path} cannot be read as HDF5 ({error}); it is damaged or of another kind"
+        ) from None
+
+
+class _Reader:
+    """Datasets of one HDF5 file; follows no link out of it and allocates no more than allowed."""
+
+    def __init__(self, h5py: Any, file: Any, max_bytes: int) -> None:
+        self.h5py, self.file, self.left = h5py, file, max_bytes
+
+    def node(self, path: str) -> Any:
+        """Group or dataset at a path, or None."""
+        node = self.file
+        for part in path.split("/"):
+            if not isinstance(node, self.h5py.Group):
+                return None
+            link = node.get(part, getlink=True)
+            if link is None:
+                return None
+            if not isinstance(link, self.h5py.HardLink):
+                raise InputError(f"{path} is a {type(link).__name__}; links out of a group are not followed")
+            node = node[part]
+        return node
+
+    def has(self, path: str) -> bool:
+        return self.node(path) is not None
+
+    def array(self, path: str, kinds: str, count: int | None = None) -> np.ndarray:
+        """A dataset as a flat array of `count` numbers (None: any)."""
+        data = self.node(path)
+        if not isinstance(data, self.h5py.Dataset):
+            raise InputError(f"{path} is missing or not a dataset")
+        if data.is_virtual or data.external:
+            raise InputError(f"{path} keeps its numbers in other files; they are not followed")
+        if data.dtype.kind not in kinds or data.shape is None:
+            wanted = "whole numbers" if kinds == "iu" else "numbers"
+            raise InputError(f"{path} has type {data.dtype}; {wanted} are needed")
+        if count is not None and data.size != count:
+            raise InputError(f"{path} has {data.size} entries; {count} are needed")
+        self.left -= data.nbytes
+        if self.left < 0:
+            raise InputError(f"{path} brings the declared size above max_bytes=; pass more if that is meant")
+        return np.asarray(data[()]).reshape(-1)
+
+    def whole(self, path: str) -> int:
+        value = int(self.array(path, "iu", 1)[0])
+        if not -(2**31) <= value < 2**31:
+            raise InputError(f"{path} is {value}, beyond 32 bits")
+        return value
+
+    def vector(self, path: str, count: int) -> FloatArray:
+        return as_array(path, self.array(path, "iuf", count), (count,))
+
+    def text(self, path: str) -> str:
+        data = self.node(path)
+        if not isinstance(data, self.h5py.Dataset) or data.size != 1 or data.nbytes > 2**20:
+            return ""
+        value = data[()]
+        value = value.flat[0] if isinstance(value, np.ndarray) else value
+        return value.decode("utf-8", "replace").rstrip("\0") if isinstance(value, bytes) else str(value)
+
+    def matrix(self, path: str, shape: tuple[int | None, int | None]) -> sp.csr_array:
+        """nz = -2 compressed rows, -1 compressed columns, >= 0 triplets (p columns, i rows)."""
+        m, n, nz, nzmax = (self.whole(f"{path}/{name}") for name in ("m", "n", "nz", "nzmax"))
+        if min(m, n, nzmax) < 0 or nz < -2 or nz > nzmax:
+            raise InputError(f"{path}: m {m}, n {n}, nz {nz}, nzmax {nzmax}; nz is -2, -1 or 0 to nzmax")
+        if any(want is not None and have != want for have, want in zip((m, n), shape, strict=True)):
+            wanted = " x ".join("any" if s is None else str(s) for s in shape)
+            raise InputError(f"{path} is {m} x {n}; {wanted} is needed")
+        x = as_array(f"{path}/x", self.array(f"{path}/x", "iuf"), (None,), finite=False)
+        i, p = self.array(f"{path}/i", "iu"), self.array(f"{path}/p", "iu")
+        try:
+            if nz == -2:
+                a = compressed(p, i, x, m, n)
+            elif nz == -1:
+                a = sp.csr_array(compressed(p, i, x, n, m).T)
+            else:
+                a = _triplets(p, i, x, nz, m, n)
+        except InputError as error:
+            raise InputError(f"{path}: {error}") from None
+        as_array(f"{path}/x", a.data, (None,), copy=False)
+        return a
+
+
+def _triplets(p: np.ndarray, i: np.ndarray, x: np.ndarray, nz: int, m: int, n: int) -> sp.csr_array:
+    if min(len(p), len(i), len(x)) < nz:
+        raise InputError(f"{nz} triplets are announced; p has {len(p)}, i {len(i)}, x {len(x)}")
+    p, i, x = p[:nz], i[:nz], x[:nz]
+    if nz and (p.min() < 0 or i.min() < 0 or p.max() >= n or i.max() >= m):
+        raise InputError(f"triplets leave the {m} rows (i) and {n} columns (p)")
+    return sp.csr_array(sp.coo_array((x, (i.astype(np.int64), p.astype(np.int64))), shape=(m, n)))
+
+
+def _read_file(r: _Reader) -> Contents:
+    if any(r.has(name) for name in ROLLING):
+        raise CapabilityError(
+            "rolling friction has no block here: a contact is a normal, up to two tangents and a spin row; "
+            "Siconos solves this problem"
+        )
+    group = LOCAL if r.has(LOCAL) else GLOBAL
+    if not r.has(group):
+        found = ", ".join(list(r.file)[:8]) or "nothing"
+        raise InputError(f"holds {found}; an FCLIB file has a group {LOCAL} or {GLOBAL}")
+    spacedim = r.whole(f"{group}/spacedim")
+    if spacedim not in (2, 3):
+        raise InputError(f"{group}/spacedim is {spacedim}; 2 or 3 is needed")
+    parts: dict[str, Any] = {}
+    vectors = f"{group}/vectors"
+    if group == LOCAL:
+        parts["W"] = w = r.matrix(f"{group}/W", (None, None))
+        n, m, p = 0, w.shape[0], 0
+        if w.shape != (m, m):
+            raise InputError(f"{group}/W is {w.shape[0]} x {w.shape[1]}; a square matrix is needed")
+        parts["q"] = r.vector(f"{vectors}/q", m)
+        if r.has(f"{group}/V") or r.has(f"{group}/R"):
+            parts["V"] = v = r.matrix(f"{group}/V", (m, None))
+            p = v.shape[1]
+            parts["R"], parts["s"] = r.matrix(f"{group}/R", (p, p)), r.vector(f"{vectors}/s", p)
+    else:
+        parts["H"] = h = r.matrix(f"{group}/H", (None, None))
+        (n, m), p = h.shape, 0
+        parts["M"] = r.matrix(f"{group}/M", (n, n))
+        parts["f"], parts["w"] = r.vector(f"{vectors}/f", n), r.vector(f"{vectors}/w", m)
+        if r.has(f"{group}/G"):
+            parts["G"] = g = r.matrix(f"{group}/G", (n, None))
+            p = g.shape[1]
+            parts["b"] = r.vector(f"{vectors}/b", p)
+    if m % spacedim:
+        raise InputError(f"{m} rows are not a multiple of spacedim = {spacedim}")
+    return Contents(
+        spacedim,
+        r.vector(f"{vectors}/mu", m // spacedim),
+        solution=_point(r, "solution", n, m, p) if r.has("solution") else {},
+        guesses=_guesses(r, n, m, p),
+        info={name: r.text(f"{group}/info/{name}") for name in ("title", "description", "math_info")},
+        compare=r.text("reference/compare"),
+        **parts,
+    )
+
+
+def _point(r: _Reader, group: str, n: int, m: int, p: int) -> dict[str, FloatArray]:
+    point = {"r": r.vector(f"{group}/r", m)}
+    for name, size in (("u", m), ("v", n), ("l", p)):
+        if size and r.has(f"{group}/{name}"):
+            point[name] = r.vector(f"{group}/{name}", size)
+    if p and "l" not in point:
+        raise InputError(f"{group} has no l, the multipliers of the {p} equations")
+    return point
+
+
+def _guesses(r: _Reader, n: int, m: int, p: int) -> tuple[dict[str, FloatArray], ...]:
+    if not r.has("guesses"):
+        return ()
+    count = r.whole("guesses/number_of_guesses")
+    if count < 0 or count > len(r.node("guesses")):
+        raise InputError(f"guesses/number_of_guesses is {count}; there are {len(r.node('guesses')) - 1}")
+    return tuple(_point(r, f"guesses/{i + 1}", n, m, p) for i in range(count))
+
+
+# -- writing --------------------------------------------------------------------------------------
+
+
+def write(
+    problem: Problem,
+    path: str | os.PathLike[str],
+    *,
+    impulse: Any = None,
+    form: str | None = None,
+    drop: Collection[str] = (),
+) -> None:
+    """Save a friction contact problem; see `lavender.io.save`.
+
+    Raises
+    ------
+    CapabilityError
+        FCLIB cannot hold something of this problem; every such thing is named.
+    """
+    write_contents(contents(problem, impulse=impulse, form=form, drop=drop), path)
+
+
+def contents(
+    problem: Problem, *, impulse: Any = None, form: str | None = None, drop: Collection[str] = ()
+) -> Contents:
+    """What an FCLIB file of this problem holds; raises as `write`."""
+    if not isinstance(problem, Problem):
+        raise InputError(f"problem is a {type(problem).__name__}; a lavender.Problem is needed")
+    if form is None:
+        form = "local" if problem.rows is None else "global"
+    if form not in ("local", "global"):
+        raise InputError(f"form is {form!r}; 'local' or 'global' is needed")
+    unknown = sorted(set(drop) - {"names", "key"})
+    if unknown:
+        raise InputError(f"drop names {', '.join(unknown)}; only 'names' and 'key' may be left out")
+    reasons = _cannot_hold(problem, form, drop)
+    if reasons:
+        text = "; ".join(reasons)
+        raise CapabilityError(f"FCLIB's {form} form cannot hold {text}. An .npz holds everything")
+    mu = problem.cones.mu
+    spacedim = int(problem.cones.ptr[1])
+    info = {"title": problem.name}
+    points = []
+    for point in (impulse, problem.guess):
+        if point is None:
+            continue
+        lam = problem.impulse_array(point)
+        entry = {"r": lam, "u": problem.slack(lam)}
+        if form == "global":
+            entry["v"] = problem.velocity(lam).ravel()
+        points.append(entry)
+    solution = points[0] if impulse is not None else {}
+    guesses = tuple(points[-1:]) if problem.guess is not None else ()
+    if form == "local":
+        return Contents(
+            spacedim, mu, W=problem.csr, q=-problem.b, solution=solution, guesses=guesses, info=info
+        )
+    rows = problem.rows
+    assert rows is not None
+    inertia = np.linalg.inv(rows.inv_inertia)
+    blocks = np.zeros((rows.n_bodies, 6, 6))
+    blocks[:, :3, :3] = np.eye(3) / rows.inv_mass[:, None, None]
+    blocks[:, 3:, 3:] = 0.5 * (inertia + inertia.transpose(0, 2, 1))
+    mass = sp.csr_array(sp.block_diag(list(blocks), format="csr"))
+    mass.eliminate_zeros()
+    jac = problem.jacobian
+    v = rows.v_free.ravel()
+    return Contents(
+        spacedim,
+        mu,
+        M=mass,
+        H=sp.csr_array(jac.T),
+        f=mass @ v,
+        w=-(problem.b + jac @ v),
+        solution=solution,
+        guesses=guesses,
+        info=info,
+    )
+
+
+def _cannot_hold(problem: Problem, form: str, drop: Collection[str]) -> list[str]:
+    c = problem.cones
+    reasons = []
+    if np.any(c.kind == ROW):
+        free = np.isneginf(c.lower) & np.isposinf(c.upper)
+        rows = np.repeat(c.kind == ROW, np.diff(c.ptr))
+        what = "free rows" if np.all(free[rows]) else "bounded rows"
+        reasons.append(f"ROW blocks ({int(rows.sum())} {what}; contacts only)")
+    if np.any(c.kind > CONTACT):
+        reasons.append("spin rows")
+    contacts = c.n_tangents[c.kind != ROW]
+    if problem.n_blocks == 0:
+        reasons.append("a problem without contacts")
+    elif len(contacts) and (contacts.min() != contacts.max() or contacts[0] == 0):
+        sizes = sorted({int(t) + 1 for t in contacts})
+        reasons.append(f"contacts of {', '.join(map(str, sizes))} rows (all 2, or all 3)")
+    if problem.friction != "coulomb":
+        reasons.append("the 'cone' law (it means Coulomb friction: pass problem.relaxed('coulomb'))")
+    if problem.names is not None and "names" not in drop:
+        reasons.append("names of blocks (drop=('names',) leaves them out)")
+    if problem.key is not None and "key" not in drop:
+        reasons.append("keys of blocks (drop=('key',) leaves them out)")
+    if form == "global":
+        reasons += _no_global_form(problem)
+    return reasons
+
+
+def _no_global_form(problem: Problem) -> list[str]:
+    rows = problem.rows
+    if rows is None:
+        return ["a problem given as a matrix (form='local' holds it)"]
+    reasons = []
+    if problem.compliance is not None and np.any(problem.compliance):
+        reasons.append("compliance (form='local' holds it, added to the diagonal of W)")
+    heavy = np.flatnonzero(rows.inv_mass == 0.0)
+    if len(heavy):
+        reasons.append(f"an infinite mass (body {heavy[0]}; form='local' holds it)")
+    value = np.linalg.eigvalsh(rows.inv_inertia) if rows.n_bodies else np.ones((0, 3))
+    stiff = np.flatnonzero(value[:, 0] <= 1e-14 * value[:, 2])
+    if len(stiff):
+        reasons.append(f"an infinite inertia (body {stiff[0]}; form='local' holds it)")
+    return reasons
+
+
+def write_contents(file: Contents, path: str | os.PathLike[str]) -> None:
+    """Write matrices and vectors as FCLIB lays them out, compressed rows, to the bit.
+
+    Raises
+    ------
+    InputError
+        The path cannot be written, or h5py is not installed.
+    """
+    h5py = _h5py()
+
+    def write_to(temporary: Path) -> None:
+        with h5py.File(temporary, "w-") as out:
+            _write_file(out, file)
+
+    write_atomically(path, write_to)
+
+
+def _write_file(out: Any, file: Contents) -> None:
+    group = out.create_group(LOCAL if file.form == "local" else GLOBAL)
+    group["spacedim"] = np.array([file.spacedim], np.int32)
+    for name in ("W", "V", "R", "M", "H", "G"):
+        if getattr(file, name) is not None:
+            _write_matrix(group.create_group(name), getattr(file, name))
+    vectors = group.create_group("vectors")
+    for name in ("q", "s", "f", "w", "b", "mu"):
+        if getattr(file, name) is not None:
+            vectors[name] = getattr(file, name)
+    if any(file.info.values()):
+        info = group.create_group("info")
+        for name in ("title", "description", "math_info"):
+            text = file.info.get(name, "").encode()
+            info[name] = np.array(text, f"S{len(text) + 1}")  # FCLIB reads strings up to their NUL
+    if file.solution:
+        _write_point(out.create_group("solution"), file.solution)
+    if file.guesses:
+        guesses = out.create_group("guesses")
+        guesses["number_of_guesses"] = np.array([len(file.guesses)], np.int32)
+        for i, guess in enumerate(file.guesses):
+            _write_point(guesses.create_group(str(i + 1)), guess)
+
+
+def _write_matrix(group: Any, a: sp.csr_array) -> None:
+    for name, value in (("nzmax", a.nnz), ("m", a.shape[0]), ("n", a.shape[1]), ("nz", -2)):
+        group[name] = np.array([value], np.int32)
+    group["p"], group["i"], group["x"] = a.indptr.astype(np.int32), a.indices.astype(np.int32), a.data
+
+
+def _write_point(group: Any, point: Mapping[str, FloatArray]) -> None:
+    for name, value in point.items():
+        group[name] = value
+
+
+def _h5py() -> Any:
+    try:
+        import h5py
+    except ImportError:
+        raise InputError(
+            "FCLIB files are HDF5, which needs h5py: pip install 'lavender[fclib]' (an .npz needs nothing)"
+        ) from None
+    return h5py

@@ -1,0 +1,378 @@
+"""Problems in NumPy archives (.npz): our own format, the plain box format, the benchmark generator's.
+
+Nothing in an archive is executed or unpickled. Sizes are checked against what the archive declares before
+anything is allocated, and the parts against each other before a kernel sees them. `docs/formats.md`
+describes each entry.
+"""
+
+from __future__ import annotations
+
+import ast
+import json
+import math
+import os
+import struct
+import zipfile
+import zlib
+from collections.abc import Collection, Mapping
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import scipy.sparse as sp
+
+from lavender._arrays import FloatArray
+from lavender.cones import CONTACT, ROW, Cones
+from lavender.errors import InputError
+from lavender.io.stored import MAX_BYTES, Stored, write_atomically
+from lavender.problem import Problem, Rows
+
+__all__ = ["VERSION", "read", "write"]
+
+VERSION = 1
+MAX_HEADER = 10_000  # bytes of a .npy header: 100 are usual
+CONES = tuple(f"cones_{f.name}" for f in fields(Cones))
+ROWS = tuple(f"rows_{f.name}" for f in fields(Rows) if f.name != "copy")
+CSR = ("A_data", "A_indices", "A_indptr", "A_shape")
+OPTIONAL = ("guess", "key", "impulse")
+BROKEN = (
+    zipfile.BadZipFile,
+    zlib.error,
+    struct.error,
+    EOFError,
+    OSError,
+    RuntimeError,
+    NotImplementedError,
+    ValueError,
+    SyntaxError,
+    TypeError,
+    OverflowError,
+    MemoryError,
+    RecursionError,
+)
+
+
+class _Archive(Mapping[str, np.ndarray]):
+    """Arrays of an .npz by name, each read once when asked for."""
+
+    def __init__(self, path: str | os.PathLike[str], max_bytes: int) -> None:
+        self.path = path
+        self._arrays: dict[str, np.ndarray] = {}
+        try:
+            self._zip = zipfile.ZipFile(path)
+        except BROKEN as error:
+            raise InputError(f"{path} is not a complete .npz archive ({error}); save it again") from None
+        self._entries: dict[str, zipfile.ZipInfo] = {}
+        for entry in self._zip.infolist():
+            name = entry.filename.removesuffix(".npy")
+            if name == entry.filename or name in self._entries:
+                raise InputError(f"{path} holds {entry.filename!r}; an .npz holds one .npy under each name")
+            self._entries[name] = entry
+        declared = sum(entry.file_size for entry in self._entries.values())
+        if declared > max_bytes:
+            raise InputError(
+                f"{path} declares {declared} bytes of arrays, more than {max_bytes}; "
+                "pass max_bytes= if the file is meant to be that large"
+            )
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        if name not in self._arrays:
+            try:
+                entry = self._entries[name]
+            except KeyError:
+                has = ", ".join(self._entries) or "nothing"
+                raise InputError(f"{self.path} has no entry {name!r}; it has {has}") from None
+            try:
+                with self._zip.open(entry) as stream:
+                    self._arrays[name] = _read_npy(stream, entry.file_size)
+            except BROKEN as error:
+                raise InputError(f"{self.path}: entry {name!r} cannot be read: {error}") from None
+        return self._arrays[name]
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._entries
+
+    def __iter__(self) -> Any:
+        return iter(self._entries)
+
+    def __len__(self) -> int:
+        return len(self._entries)
+
+    def close(self) -> None:
+        self._zip.close()
+
+    def scalar(self, name: str) -> Any:
+        value = self[name]
+        if value.size != 1:
+            raise InputError(f"{self.path}: entry {name!r} has shape {value.shape}; one value is needed")
+        return value.reshape(()).item()
+
+
+def _read_npy(stream: Any, size: int) -> np.ndarray:
+    """One array of numbers or text; `size` is what the archive declares for header and data together."""
+    start = stream.read(8)
+    if start[:6] != b"\x93NUMPY" or len(start) < 8 or start[6] not in (1, 2, 3):
+        raise ValueError("it is not an array (.npy)")
+    wide = start[6] > 1
+    length = struct.unpack("<I" if wide else "<H", stream.read(4 if wide else 2))[0]
+    if length > MAX_HEADER:
+        raise ValueError(f"its header has {length} bytes, more than {MAX_HEADER}")
+    header = ast.literal_eval(stream.read(length).decode("latin1" if start[6] < 3 else "utf-8"))
+    if not isinstance(header, dict) or set(header) != {"descr", "fortran_order", "shape"}:
+        raise ValueError("its header is not that of an array")
+    descr, shape = header["descr"], header["shape"]
+    if not isinstance(descr, str):
+        raise ValueError("it is a record array; plain numbers are needed")
+    dtype = np.dtype(descr)
+    if dtype.kind not in "buifUS":
+        raise ValueError(f"it has dtype {descr!r}; objects are never read from a file, numbers are needed")
+    if not isinstance(shape, tuple) or not all(type(n) is int and n >= 0 for n in shape):
+        raise ValueError(f"its shape {shape!r} is not one")
+    data = math.prod(shape) * dtype.itemsize
+    if data + 8 + (4 if wide else 2) + length != size:
+        raise ValueError(f"its shape {shape} needs {data} bytes, but the archive declares {size}")
+    raw = stream.read(data)
+    if len(raw) != data or stream.read(1):
+        raise EOFError(f"{len(raw)} of {data} bytes are there")
+    return np.frombuffer(raw, dtype).reshape(shape, order="F" if header["fortran_order"] is True else "C")
+
+
+def read(path: str | os.PathLike[str], *, max_bytes: int = MAX_BYTES) -> Stored:
+    """A problem from an .npz archive of any layout that `docs/formats.md` lists.
+
+    Raises
+    ------
+    InputError
+        Truncated, foreign or inconsistent; the message names the entry.
+    """
+    archive = _Archive(path, max_bytes)
+    try:
+        if "lavender_format" in archive:
+            return _read_own(archive)
+        if {"kind", "J_data", "minv"} <= set(archive):
+            return _read_generated(archive)
+        if {"b", "lo", "hi"} <= set(archive):
+            return _read_box(archive)
+    except InputError as error:
+        text = str(error)
+        raise InputError(text if text.startswith(str(path)) else f"{path}: {text}") from None
+    finally:
+        archive.close()
+    has = ", ".join(archive) or "nothing"
+    raise InputError(
+        f"{path} holds {has}; a problem has 'lavender_format' (lavender.io.save), or b, lo, hi, A"
+    )
+
+
+# -- our own format -------------------------------------------------------------------------------
+
+
+def write(problem: Problem, path: str | os.PathLike[str], *, impulse: Any = None) -> None:
+    """Save a problem in our own format, and beside it an impulse (m,) [N s], e.g. its solution.
+
+    `read(path).problem == problem`, bit for bit.
+    """
+    if not isinstance(problem, Problem):
+        raise InputError(f"problem is a {type(problem).__name__}; a lavender.Problem is needed")
+    arrays: dict[str, Any] = {"lavender_format": np.int64(VERSION), "b": problem.b}
+    for name in CONES:
+        arrays[name] = getattr(problem.cones, name.removeprefix("cones_"))
+    if problem.rows is not None:
+        for name in ROWS:
+            arrays[name] = getattr(problem.rows, name.removeprefix("rows_"))
+        arrays["compliance"] = problem.compliance
+        operator = "rows"
+    elif sp.issparse(problem.matrix):
+        a = problem.matrix
+        arrays |= dict(zip(CSR, (a.data, a.indices, a.indptr, np.array(a.shape, np.int64)), strict=True))
+        operator = "csr"
+    else:
+        arrays["A"] = problem.matrix
+        operator = "dense"
+    if problem.guess is not None:
+        arrays["guess"] = problem.guess
+    if problem.key is not None:
+        arrays["key"] = problem.key
+    if impulse is not None:
+        arrays["impulse"] = problem.impulse_array(impulse)
+    meta = {"operator": operator, "friction": problem.friction, "name": problem.name, "names": problem.names}
+    arrays["meta"] = np.frombuffer(json.dumps(meta).encode("ascii"), np.uint8)
+
+    def write_to(temporary: Path) -> None:
+        with open(temporary, "xb") as stream:
+            np.savez_compressed(stream, allow_pickle=False, **arrays)
+
+    write_atomically(path, write_to)
+
+
+def _read_own(archive: _Archive) -> Stored:
+    version = archive.scalar("lavender_format")
+    if version != VERSION or isinstance(version, bool):
+        raise InputError(
+            f"lavender_format is {version!r}; this lavender reads {VERSION}: update it, or save again"
+        )
+    meta = _meta(archive)
+    operator = {"dense": ("A",), "csr": CSR, "rows": (*ROWS, "compliance")}[meta["operator"]]
+    needed = ("lavender_format", "meta", "b", *CONES, *operator)
+    _check_entries(archive, needed, OPTIONAL)
+    for name in archive:
+        if archive[name].dtype.kind not in "iuf":
+            raise InputError(f"entry {name!r} has dtype {archive[name].dtype}; numbers are needed")
+    more: dict[str, Any] = {name: archive[name] for name in ("guess", "key") if name in archive}
+    if meta["operator"] == "rows":
+        parts: dict[str, Any] = {name.removeprefix("rows_"): archive[name] for name in ROWS}
+        more["rows"] = Rows(**parts)
+        more["compliance"] = archive["compliance"]
+    else:
+        more["matrix"] = _matrix(archive)
+    cones = Cones(**{name.removeprefix("cones_"): archive[name] for name in CONES})
+    problem = Problem(
+        archive["b"], cones, friction=meta["friction"], names=meta["names"], name=meta["name"], **more
+    )
+    return Stored(problem, "lavender", impulse=_vector(archive, "impulse", problem))
+
+
+def _meta(archive: _Archive) -> dict[str, Any]:
+    try:
+        meta = json.loads(archive["meta"].astype(np.uint8, casting="safe").tobytes())
+    except (ValueError, TypeError, RecursionError) as error:
+        raise InputError(f"entry 'meta' is not JSON text in bytes ({error})") from None
+    if (
+        not isinstance(meta, dict)
+        or set(meta) != {"operator", "friction", "name", "names"}
+        or meta["operator"] not in ("dense", "csr", "rows")
+        or not isinstance(meta["name"], str)
+        or not isinstance(meta["friction"], str)
+        or not _is_names(meta["names"])
+    ):
+        raise InputError("entry 'meta' must hold operator (dense, csr or rows), friction, name and names")
+    return meta
+
+
+def _is_names(value: Any) -> bool:
+    return value is None or (isinstance(value, list) and all(isinstance(name, str) for name in value))
+
+
+def _check_entries(archive: _Archive, needed: Collection[str], optional: Collection[str]) -> None:
+    missing = [name for name in needed if name not in archive]
+    if missing:
+        raise InputError(f"entries {', '.join(missing)} are missing; the file is not complete")
+    unknown = [name for name in archive if name not in needed and name not in optional]
+    if unknown:
+        raise InputError(f"entries {', '.join(unknown)} do not belong to format {VERSION}")
+
+
+# -- plain box format and the benchmark generator's -----------------------------------------------
+
+
+def _read_box(archive: _Archive) -> Stored:
+    """w = A l - b, lo <= l <= hi complementary to w; rows of a friction cone are one contact."""
+    b = archive["b"]
+    if b.ndim != 1:
+        raise InputError(f"b has shape {b.shape}; one dimension is needed")
+    cones = _box_cones(archive, len(b))
+    problem = Problem(b, cones, _matrix(archive), name=Path(archive.path).stem)
+    compare = archive.scalar("compare") if "compare" in archive else ""
+    return Stored(
+        problem,
+        "box",
+        impulse=_vector(archive, "l_ref", problem),
+        slack=_vector(archive, "w_ref", problem),
+        compare=str(compare),
+    )
+
+
+def _box_cones(archive: _Archive, m: int) -> Cones:
+    lower, upper = (_numbers(archive, name, (m,)) for name in ("lo", "hi"))
+    if "cone_start" not in archive or archive["cone_start"].size == 0:
+        return Cones.bounded(lower, upper)
+    shape = (archive["cone_start"].size,)
+    start = _numbers(archive, "cone_start", shape).astype(np.int64)
+    size = _numbers(archive, "cone_dim", shape).astype(np.int64)
+    mu = _numbers(archive, "cone_mu", shape)
+    order = np.argsort(start)
+    start, size, mu = start[order], size[order], mu[order]
+    end = start + size
+    if size.min() < 1 or size.max() > 3 or start.min() < 0 or end.max() > m or np.any(end[:-1] > start[1:]):
+        raise InputError(
+            f"cone_start and cone_dim must name cones of 1 to 3 rows that do not overlap, within the {m} rows"
+        )
+    inside = np.zeros(m, bool)  # rows that do not begin a block
+    for s, e in zip(start, end, strict=True):
+        inside[s + 1 : e] = True
+    first = np.flatnonzero(~inside)
+    kind = np.full(len(first), ROW, np.int32)
+    friction = np.zeros(len(first))
+    at = np.searchsorted(first, start)
+    kind[at], friction[at] = CONTACT, mu
+    return Cones(np.append(first, m), kind, lower, upper, friction, np.zeros(len(first)))
+
+
+def _read_generated(archive: _Archive) -> Stored:
+    """Layout of a benchmark generator: A, b, and `kind` lcp (l >= 0), free, or cone (3 rows per contact)."""
+    kind = archive.scalar("kind")
+    b = archive["b"]
+    name = Path(archive.path).stem
+    if b.ndim != 1:
+        raise InputError(f"b has shape {b.shape}; one dimension is needed")
+    if kind == "lcp":
+        problem = Problem.lcp(_matrix(archive), b, name=name)
+    elif kind == "free":
+        problem = Problem.linear(_matrix(archive), b, name=name)
+    elif kind == "cone":
+        problem = Problem.contact(_matrix(archive), b, archive["mu"], friction="cone", name=name)
+    else:
+        raise InputError(f"entry 'kind' is {kind!r}; 'lcp', 'free' or 'cone' is needed")
+    return Stored(problem, "generated")
+
+
+def _numbers(archive: _Archive, name: str, shape: tuple[int, ...]) -> np.ndarray:
+    value = archive[name]
+    if value.dtype.kind not in "buif" or value.shape != shape:
+        raise InputError(
+            f"entry {name!r} has dtype {value.dtype}, shape {value.shape}; numbers, shape {shape}, are needed"
+        )
+    return value
+
+
+def _vector(archive: _Archive, name: str, problem: Problem) -> FloatArray | None:
+    return problem.impulse_array(archive[name], f"entry {name!r}") if name in archive else None
+
+
+def _matrix(archive: _Archive) -> Any:
+    """Dense `A`, or compressed rows whose every index has been checked."""
+    if "A" in archive:
+        return archive["A"]
+    m = archive["b"].size
+    shape = tuple(archive["A_shape"].ravel().tolist())
+    if shape != (m, m):
+        raise InputError(f"A_shape is {shape}; ({m}, {m}) is needed, as b has {m} rows")
+    return compressed(archive["A_indptr"], archive["A_indices"], archive["A_data"], m, m)
+
+
+def compressed(indptr: np.ndarray, indices: np.ndarray, data: np.ndarray, m: int, n: int) -> sp.csr_array:
+    """CSR matrix (m, n) of arrays from a file; `data` may be longer than the pointers say.
+
+    Raises
+    ------
+    InputError
+        Pointers that do not start with 0 or decrease, indices outside the matrix, wrong lengths.
+    """
+    for what, x, kinds in (("pointers", indptr, "iu"), ("indices", indices, "iu"), ("values", data, "buif")):
+        if x.ndim != 1 or x.dtype.kind not in kinds:
+            raise InputError(
+                f"the {what} of a compressed matrix have dtype {x.dtype} and shape {x.shape}; "
+                f"one dimension of {'whole ' if kinds == 'iu' else ''}numbers is needed"
+            )
+    if len(indptr) != m + 1 or indptr[0] != 0 or np.any(indptr[1:] < indptr[:-1]):
+        raise InputError(f"the pointers of a compressed matrix must be {m + 1} numbers from 0 upwards")
+    used = int(indptr[-1])
+    if used > len(indices) or used > len(data):
+        raise InputError(
+            f"a compressed matrix points to {used} entries; it has {len(indices)} indices, {len(data)} values"
+        )
+    if used and (indices[:used].min() < 0 or indices[:used].max() >= n):
+        raise InputError(f"a compressed matrix has indices outside its {n} columns")
+    parts = (data[:used].astype(np.float64), indices[:used].astype(np.int64), indptr.astype(np.int64))
+    return sp.csr_array(parts, shape=(m, n))

@@ -1,0 +1,446 @@
+"""FCLIB files: what they hold is kept to the bit, what they cannot hold is named."""
+
+import os
+import sys
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from random_problems import random_contact_problem, seeds
+
+import lavender as lv
+import lavender.io
+from lavender.io import fclib
+
+h5py = pytest.importorskip("h5py", reason="FCLIB files need the extra fclib")
+
+
+def local_problem(spacedim=3, contacts=4, guess=True):
+    """An asymmetric W with a stored zero, as recorded problems have them."""
+    rng = np.random.default_rng(contacts)
+    m = spacedim * contacts
+    w = sp.csr_array(rng.normal(size=(m, m)) * (rng.random((m, m)) < 0.6))
+    w.data[0] = 0.0
+    return lv.Problem.contact(
+        w,
+        rng.normal(size=m),
+        rng.uniform(0.0, 1.0, contacts),
+        guess=rng.random(m) if guess else None,
+        name="local",
+    )
+
+
+def global_problem(seed=0, tangents=2):
+    return random_contact_problem(seed, tangents=tangents, spin=False, joints=0)
+
+
+def soft(problem, compliance=0.0):
+    """The same with one compliance for every row."""
+    return lv.Problem(problem.b, problem.cones, rows=problem.rows, compliance=np.full(problem.m, compliance))
+
+
+# -- there and back -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("spacedim", [2, 3])
+@pytest.mark.parametrize("suffix", [".hdf5", ".h5"])
+def test_a_local_file_keeps_everything_to_the_bit(tmp_path, spacedim, suffix):
+    problem = local_problem(spacedim)
+    impulse = np.linspace(0.0, 1.0, problem.m)
+    path = tmp_path / f"p{suffix}"
+    lavender.io.save(problem, path, impulse=impulse)
+    stored = lavender.io.read(path)
+    assert stored.problem == problem
+    assert stored.problem.guess.tobytes() == problem.guess.tobytes()
+    assert stored.impulse.tobytes() == impulse.tobytes()
+    assert stored.slack.tobytes() == problem.slack(impulse).tobytes()
+    assert [g.tobytes() for g in stored.guesses] == [problem.guess.tobytes()]
+    assert stored.info["title"] == "local"
+    with h5py.File(path) as file:  # FCLIB's own names, in FCLIB's sign
+        group = file["fclib_local"]
+        w = sp.csr_array((group["W/x"][()], group["W/i"][()], group["W/p"][()]), shape=(problem.m, problem.m))
+        assert np.array_equal(w.toarray(), problem.dense())
+        assert np.array_equal(group["vectors/q"][()], -problem.b)
+        assert np.array_equal(group["vectors/mu"][()], problem.cones.mu)
+        assert [group[f"W/{n}"][()].tolist() for n in ("m", "n", "nz", "nzmax")] == [
+            [problem.m],
+            [problem.m],
+            [-2],
+            [w.nnz],
+        ]
+        assert group["spacedim"][()].tolist() == [spacedim]
+        assert group["W/p"].dtype == np.int32
+        assert file["guesses/number_of_guesses"][()].tolist() == [1]
+        assert np.array_equal(file["guesses/1/r"][()], problem.guess)
+        assert np.array_equal(file["solution/r"][()], impulse)
+
+
+def test_a_dense_problem_comes_back_with_the_same_numbers(tmp_path):
+    problem = lv.Problem.contact(np.arange(9.0).reshape(3, 3), [1.0, -0.0, 2.0], [0.5])
+    lavender.io.save(problem, tmp_path / "p.hdf5")
+    loaded = lavender.io.load(tmp_path / "p.hdf5")
+    assert np.array_equal(loaded.dense(), problem.dense())
+    assert np.array_equal(loaded.b, problem.b)
+    assert loaded.name == "p"
+
+
+@given(seeds, st.sampled_from([1, 2]))
+@settings(max_examples=10)
+def test_a_global_file_keeps_the_matrices_to_the_bit_and_condenses_to_A(tmp_path_factory, seed, tangents):
+    problem = soft(global_problem(seed, tangents))
+    impulse = np.linspace(0.0, 1.0, problem.m)
+    path = tmp_path_factory.mktemp("global") / "p.hdf5"
+    lavender.io.save(problem, path, impulse=impulse)
+    file = fclib.read_contents(path)
+    assert (file.form, file.spacedim) == ("global", 1 + tangents)
+    assert np.array_equal(file.H.toarray(), problem.jacobian.toarray().T)
+    n = problem.rows.n_bodies
+    assert np.array_equal(
+        file.M.diagonal().reshape(n, 6)[:, :3], np.repeat(1 / problem.rows.inv_mass, 3).reshape(n, 3)
+    )
+    assert np.array_equal(file.mu, problem.cones.mu)
+    # M came from inverting inertia tensors of condition below 10: a few units of rounding, amplified by 10.
+    unit = file.M @ problem.rows.inverse_mass_matrix()
+    assert np.allclose(unit.toarray(), np.eye(6 * n), rtol=0, atol=1e-13)
+    assert np.array_equal(file.solution["v"], problem.velocity(impulse).ravel())
+    stored = lavender.io.read(path)
+    assert stored.format == "fclib_global"
+    a = problem.dense()
+    assert np.allclose(stored.problem.dense(), a, rtol=0, atol=1e-13 * np.abs(a).max())
+    assert np.allclose(stored.problem.b, problem.b, rtol=0, atol=1e-12)
+    assert stored.problem.asymmetry == 0.0
+    again = path.with_name("again.hdf5")
+    fclib.write_contents(file, again)
+    assert_same(fclib.read_contents(again), file)
+
+
+def assert_same(x, y):
+    for name in ("W", "V", "R", "M", "H", "G"):
+        a, b = getattr(x, name), getattr(y, name)
+        assert (a is None) == (b is None), name
+        if a is not None:
+            assert [getattr(a, n).tobytes() for n in ("indptr", "indices", "data")] == [
+                getattr(b, n).tobytes() for n in ("indptr", "indices", "data")
+            ], name
+    for name in ("q", "s", "f", "w", "b", "mu"):
+        a, b = getattr(x, name), getattr(y, name)
+        assert (a is None) == (b is None), name
+        assert a is None or a.tobytes() == b.tobytes(), name
+    for a, b in zip((x.solution, *x.guesses), (y.solution, *y.guesses), strict=True):
+        assert {n: v.tobytes() for n, v in a.items()} == {n: v.tobytes() for n, v in b.items()}
+    assert x.info == y.info
+
+
+def test_rows_may_be_saved_condensed(tmp_path):
+    problem = soft(global_problem(3), 0.125)
+    lavender.io.save(problem, tmp_path / "p.hdf5", form="local")
+    loaded = lavender.io.load(tmp_path / "p.hdf5")
+    assert np.array_equal(loaded.dense(), problem.dense())  # compliance is on the diagonal of W
+    assert np.array_equal(loaded.b, problem.b)
+
+
+# -- files of others ------------------------------------------------------------------------------
+
+
+def make(path, spacedim=3, **parts):
+    """An FCLIB file by hand: matrices as dicts of datasets, vectors as arrays."""
+    kind = "fclib_global" if "M" in parts else "fclib_local"
+    with h5py.File(path, "w") as file:
+        group = file.create_group(kind)
+        group["spacedim"] = np.array([spacedim], np.int32)
+        for name, value in parts.items():
+            if isinstance(value, dict):
+                for part, x in value.items():
+                    group[f"{name}/{part}"] = x
+            else:
+                group[f"vectors/{name}"] = value
+    return path
+
+
+def encoded(a, nz, spare=0):
+    """A dense matrix in FCLIB's compressed rows (-2), columns (-1), or triplets, with `spare` unused entries."""
+    a = np.asarray(a, float)
+    rest = np.full(spare, 7)
+    if nz == -2:
+        c = sp.csr_array(a)
+        p, i, x = c.indptr, c.indices, c.data
+    elif nz == -1:
+        c = sp.csc_array(a)
+        p, i, x = c.indptr, c.indices, c.data
+    else:
+        c = sp.coo_array(a)
+        p, i, x, nz = np.append(c.coords[1], rest), c.coords[0], c.data, c.nnz
+    x, i = np.append(x, np.full(spare, np.nan)), np.append(i, rest)
+    numbers = {"m": a.shape[0], "n": a.shape[1], "nz": nz, "nzmax": len(x)}
+    out = {name: np.array([value], np.int32) for name, value in numbers.items()}
+    return out | {"p": p.astype(np.int32), "i": i.astype(np.int32), "x": x}
+
+
+W = np.array([[2.0, 0.5, 0.0], [0.0, 1.0, 0.25], [0.125, 0.0, 3.0]])
+
+
+@pytest.mark.parametrize("spare", [0, 5])
+@pytest.mark.parametrize("nz", [-2, -1, 0])
+def test_every_storage_is_read(tmp_path, nz, spare):
+    problem = lavender.io.load(make(tmp_path / "p.h5", W=encoded(W, nz, spare), q=np.arange(3.0), mu=[0.5]))
+    assert np.array_equal(problem.dense(), W)
+    assert np.array_equal(problem.b, -np.arange(3.0))
+    m, h = np.diag([2.0, 4.0, 0.5, 1.0]), np.vstack([W, np.ones(3)])
+    parts = {"M": encoded(m, nz, spare), "H": encoded(h, nz, spare)}
+    problem = lavender.io.load(make(tmp_path / "g.h5", f=np.arange(4.0), w=np.ones(3), mu=[0.5], **parts))
+    assert np.array_equal(problem.dense(), h.T @ np.linalg.inv(m) @ h)  # powers of two: exact
+    assert np.array_equal(problem.b, -(np.ones(3) + h.T @ np.linalg.inv(m) @ np.arange(4.0)))
+
+
+def test_repeated_triplets_are_summed(tmp_path):
+    parts = {n: np.array([v], np.int32) for n, v in {"m": 3, "n": 3, "nz": 4, "nzmax": 4}.items()}
+    parts |= {"p": np.array([0, 1, 2, 1]), "i": np.array([0, 1, 2, 1]), "x": np.array([1.0, 2.0, 3.0, 4.0])}
+    problem = lavender.io.load(make(tmp_path / "p.h5", W=parts, q=np.zeros(3), mu=[0.0]))
+    assert np.array_equal(problem.dense(), np.diag([1.0, 6.0, 3.0]))
+
+
+def test_equations_become_free_rows(tmp_path):
+    """Local V, R, s and global G, b: the same mechanism, joined rigidly at one row."""
+    m, h, g = (
+        np.diag([2.0, 4.0, 0.5, 1.0]),
+        np.vstack([W, np.ones(3)]),
+        np.array([[1.0], [0.0], [0.0], [-1.0]]),
+    )
+    f, w, b = np.arange(4.0), np.ones(3), np.array([0.25])
+    glob = lavender.io.load(
+        make(tmp_path / "g.h5", M=encoded(m, -2), H=encoded(h, -2), G=encoded(g, -2), f=f, w=w, b=b, mu=[0.5])
+    )
+    inv = np.linalg.inv(m)
+    local = {"W": h.T @ inv @ h, "V": h.T @ inv @ g, "R": g.T @ inv @ g}
+    parts = {name: encoded(x, -2) for name, x in local.items()}
+    loc = lavender.io.load(
+        make(tmp_path / "l.h5", q=w + h.T @ inv @ f, s=b + g.T @ inv @ f, mu=[0.5], **parts)
+    )
+    assert glob.cones.kind.tolist() == [lv.CONTACT, lv.ROW]
+    assert np.array_equal(glob.dense(), loc.dense())
+    assert np.array_equal(glob.b, loc.b)
+    assert glob.cones == loc.cones
+    assert np.all(np.isinf([glob.cones.lower[3], glob.cones.upper[3]]))
+
+
+def test_both_forms_are_read_as_local(tmp_path):
+    path = make(tmp_path / "p.h5", W=encoded(W, -2), q=np.zeros(3), mu=[0.5])
+    with h5py.File(path, "a") as file:
+        file.create_group("fclib_global")
+    assert lavender.io.read(path).format == "fclib_local"
+
+
+# -- refused --------------------------------------------------------------------------------------
+
+
+def one_body(inv_mass=1.0, inv_inertia=None):
+    """One contact of one body with the ground."""
+    arm = np.zeros((1, 3))
+    rows = lv.Rows(
+        inv_mass=[inv_mass],
+        inv_inertia=np.array([np.eye(3) if inv_inertia is None else inv_inertia]),
+        v_free=np.zeros((1, 6)),
+        normal=[[0.0, 0.0, 1.0]],
+        tangent=[[1.0, 0.0, 0.0]],
+        arm_a=arm,
+        arm_b=arm,
+        contact_body=[[-1, 0]],
+    )
+    return lv.Problem.from_rows(rows, tangents=2)
+
+
+def test_what_fclib_cannot_hold_is_named(tmp_path):
+    rows = soft(global_problem())
+    named = lv.Problem(rows.b, rows.cones, rows=rows.rows, names=["x"] * 8, key=range(8))
+    heavy, pinned = one_body(inv_mass=0.0), one_body(inv_inertia=np.diag([1.0, 0.0, 1.0]))
+    cases = [
+        (lv.Problem.lcp(np.eye(2), [1.0, 1.0]), {}, ["ROW blocks .*2 bounded rows"]),
+        (lv.Problem.linear(np.eye(2), [1.0, 1.0]), {}, ["ROW blocks .*2 free rows"]),
+        (random_contact_problem(0), {}, ["ROW blocks", "spin rows", "contacts of"]),
+        (lv.Problem.contact(np.eye(4), np.ones(4), [0.5], patch_radius=[0.1]), {}, ["spin rows"]),
+        (lv.Problem.contact(np.eye(2), np.ones(2), [0.5, 0.5]), {}, ["contacts of 1 rows"]),
+        (lv.Problem.contact(np.eye(3), np.ones(3), [0.5], friction="cone"), {}, ["'cone' law"]),
+        (lv.Problem.contact(np.zeros((0, 0)), [], []), {}, ["without contacts"]),
+        (named, {}, ["names of blocks", "keys of blocks"]),
+        (named, {"drop": ["names"]}, ["keys of blocks"]),
+        (soft(rows, 0.5), {}, ["compliance"]),
+        (heavy, {}, ["infinite mass"]),
+        (pinned, {}, ["infinite inertia"]),
+        (local_problem(), {"form": "global"}, ["given as a matrix"]),
+    ]
+    for problem, options, signs in cases:
+        for sign in signs:
+            with pytest.raises(lv.CapabilityError, match=sign):
+                lavender.io.save(problem, tmp_path / "p.hdf5", **options)
+    assert os.listdir(tmp_path) == []
+    lavender.io.save(named, tmp_path / "p.hdf5", drop=["names", "key"])
+    lavender.io.save(heavy, tmp_path / "p.hdf5", form="local")
+    with pytest.raises(lv.InputError, match="'local' or 'global'"):
+        lavender.io.save(rows, tmp_path / "p.hdf5", form="middle")
+    with pytest.raises(lv.InputError, match="only 'names' and 'key'"):
+        lavender.io.save(rows, tmp_path / "p.hdf5", drop=["compliance"])
+    with pytest.raises(lv.InputError, match="cannot write"):
+        lavender.io.save(rows, tmp_path / "nowhere" / "p.hdf5")
+    with pytest.raises(lv.InputError, match=r"a lavender\.Problem is needed"):
+        lavender.io.save(None, tmp_path / "p.hdf5")
+
+
+def test_rolling_friction_is_a_capability_error(tmp_path):
+    for name in ("fclib_local_rolling", "fclib_global_rolling"):
+        with h5py.File(tmp_path / "r.h5", "w") as file:
+            file.create_group(name)
+        with pytest.raises(lv.CapabilityError, match="rolling friction has no block here"):
+            lavender.io.load(tmp_path / "r.h5")
+
+
+GOOD = encoded(W, -2)
+
+
+@pytest.mark.parametrize(
+    ("changes", "sign"),
+    [
+        ({"W": GOOD | {"p": np.array([0, 2, 1, 6], np.int32)}}, "pointers"),
+        ({"W": GOOD | {"p": np.array([0, 2, 4, 60], np.int32)}}, "points to 60"),
+        ({"W": GOOD | {"p": np.array([0, 2], np.int32)}}, "pointers"),
+        ({"W": GOOD | {"i": np.array([0, 1, 1, 2, 0, 3], np.int32)}}, "outside its 3 columns"),
+        ({"W": GOOD | {"i": np.array([0, 1, 1, 2, 0, -1], np.int32)}}, "outside its 3 columns"),
+        ({"W": GOOD | {"i": np.zeros(6)}}, "whole numbers"),
+        ({"W": GOOD | {"x": np.full(6, np.nan)}}, "finite"),
+        ({"W": GOOD | {"x": np.zeros(3)}}, "points to 6"),
+        ({"W": GOOD | {"x": np.array([b"1"] * 6)}}, "numbers are needed"),
+        ({"W": GOOD | {"m": np.array([4], np.int32), "p": np.array([0, 2, 4, 6, 6])}}, "4 x 3"),
+        ({"W": GOOD | {"m": np.array([-3], np.int32)}}, "m -3"),
+        ({"W": GOOD | {"m": np.array([2**40])}}, "32 bits"),
+        ({"W": GOOD | {"m": np.array([3, 3], np.int32)}}, "1 are needed"),
+        ({"W": GOOD | {"nz": np.array([-3], np.int32)}}, "nz is -2, -1"),
+        (
+            {"W": GOOD | {"nz": np.array([5], np.int32), "p": np.zeros(4, np.int32)}},
+            "5 triplets are announced",
+        ),
+        (
+            {"W": GOOD | {"nz": np.array([3], np.int32), "p": np.array([0, 1, 3], np.int32)}},
+            "leave the 3 rows",
+        ),
+        ({"W": {k: v for k, v in GOOD.items() if k != "nz"}}, "W/nz is missing"),
+        ({"q": np.zeros(4)}, "q has 4 entries; 3"),
+        ({"q": np.full(3, np.inf)}, "finite"),
+        ({"mu": [0.5, 0.5]}, "mu has 2 entries; 1"),
+        ({"mu": [-0.5]}, "mu"),
+        ({"mu": None}, "mu is missing"),
+        ({"spacedim": 2}, "3 rows are not a multiple of spacedim = 2"),
+        ({"spacedim": 5}, "2 or 3 is needed"),
+    ],
+)
+def test_inconsistent_files_are_refused_by_name(tmp_path, changes, sign):
+    parts = {"W": GOOD, "q": np.zeros(3), "mu": [0.5]} | changes
+    path = make(tmp_path / "bad.h5", **{n: v for n, v in parts.items() if v is not None})
+    with pytest.raises(lv.InputError, match=sign) as error:
+        lavender.io.load(path)
+    assert "bad.h5" in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("group", "datasets", "sign"),
+    [
+        ("solution", {"u": np.zeros(3)}, "solution/r is missing"),
+        ("solution", {"r": np.zeros(2)}, "solution/r has 2"),
+        ("guesses", {"number_of_guesses": np.array([2**31 - 1])}, "number_of_guesses"),
+        ("guesses", {"number_of_guesses": np.array([1]), "1": np.zeros(3)}, "1/r is missing"),
+        ("guesses", {"number_of_guesses": np.array([1]), "1/r": np.full(3, np.nan)}, "finite"),
+    ],
+)
+def test_wrong_solutions_and_guesses_are_refused(tmp_path, group, datasets, sign):
+    path = make(tmp_path / "p.h5", W=GOOD, q=np.zeros(3), mu=[0.5])
+    with h5py.File(path, "a") as file:
+        for name, value in datasets.items():
+            file[f"{group}/{name}"] = value
+    with pytest.raises(lv.InputError, match=sign):
+        lavender.io.load(path)
+
+
+def test_a_singular_mass_matrix_is_refused(tmp_path):
+    parts = {"M": encoded(np.diag([1.0, 0.0]), -2), "H": encoded(np.ones((2, 3)), -2)}
+    with pytest.raises(lv.InputError, match="invertible M"):
+        lavender.io.load(make(tmp_path / "p.h5", f=np.zeros(2), w=np.zeros(3), mu=[0.5], **parts))
+
+
+def test_files_that_are_no_fclib_are_refused(tmp_path):
+    with h5py.File(tmp_path / "foreign.h5", "w") as file:
+        file["weights"] = np.zeros(3)
+    with pytest.raises(lv.InputError, match="holds weights; an FCLIB file"):
+        lavender.io.load(tmp_path / "foreign.h5")
+    with h5py.File(tmp_path / "group.h5", "w") as file:
+        file["fclib_local"] = np.zeros(3)
+    with pytest.raises(lv.InputError, match="spacedim is missing"):
+        lavender.io.load(tmp_path / "group.h5")
+
+
+def test_nothing_outside_the_file_is_read(tmp_path):
+    secret = tmp_path / "secret.bin"
+    np.arange(3.0).tofile(secret)
+    with h5py.File(tmp_path / "other.h5", "w") as file:
+        file["q"] = np.arange(3.0)
+    for kind in ("external link", "soft link", "external storage", "virtual"):
+        path = make(tmp_path / "p.h5", W=GOOD, mu=[0.5])
+        with h5py.File(path, "a") as file:
+            vectors = file["fclib_local/vectors"]
+            if kind == "external link":
+                vectors["q"] = h5py.ExternalLink("other.h5", "/q")
+            elif kind == "soft link":
+                vectors["q"] = h5py.SoftLink("/fclib_local/vectors/mu")
+            elif kind == "external storage":
+                vectors.create_dataset("q", (3,), "f8", external=[(str(secret), 0, 24)])
+            else:
+                layout = h5py.VirtualLayout((3,), "f8")
+                layout[:] = h5py.VirtualSource(str(tmp_path / "other.h5"), "q", (3,))
+                vectors.create_virtual_dataset("q", layout)
+        with pytest.raises(lv.InputError, match=r"not followed"):
+            lavender.io.load(path)
+
+
+def test_a_dataset_that_declares_too_much_is_not_allocated(tmp_path):
+    path = make(tmp_path / "p.h5", W=GOOD, mu=[0.5])
+    with h5py.File(path, "a") as file:
+        file["fclib_local"].create_dataset("vectors/q", (2**45,), "f8", chunks=(2**10,))
+        del file["fclib_local/W/x"]
+        file["fclib_local"].create_dataset("W/x", (2**45,), "f8", chunks=(2**10,))
+    assert path.stat().st_size < 100_000
+    with pytest.raises(lv.InputError, match="max_bytes"):
+        lavender.io.load(path)
+
+
+@given(st.data())
+@settings(max_examples=60)
+def test_a_truncated_or_damaged_file_never_gives_a_wrong_shape(tmp_path_factory, data):
+    """HDF5 has no checksums, so damage may change a number, but never what a kernel relies on."""
+    problem = local_problem(contacts=2)
+    path = tmp_path_factory.mktemp("damage") / "p.hdf5"
+    lavender.io.save(problem, path)
+    raw = bytearray(path.read_bytes())
+    if data.draw(st.booleans()):
+        raw = raw[: data.draw(st.integers(0, len(raw) - 1))]
+    else:
+        raw[data.draw(st.integers(0, len(raw) - 1))] = data.draw(st.integers(0, 255))
+    path.write_bytes(raw)
+    try:
+        loaded = lavender.io.load(path)
+    except lv.LavenderError as error:
+        message = str(error)
+    else:
+        message = str(path)
+        assert loaded.m % 2 == 0
+        assert np.isfinite(lv.residual(loaded, loaded.start()).floor)
+    assert str(path) in message
+
+
+def test_without_h5py_the_extra_is_named(tmp_path, monkeypatch):
+    lavender.io.save(local_problem(), tmp_path / "p.hdf5")
+    monkeypatch.setitem(sys.modules, "h5py", None)
+    for act in (
+        lambda: lavender.io.load(tmp_path / "p.hdf5"),
+        lambda: lavender.io.save(local_problem(), tmp_path / "q.h5"),
+    ):
+        with pytest.raises(lv.InputError, match=r"lavender\[fclib\]"):
+            act()

@@ -1,0 +1,448 @@
+"""Problems in .npz: nothing is lost, nothing foreign gets in."""
+
+import dataclasses
+import io as bytestreams
+import json
+import os
+import pickle
+import struct
+import zipfile
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from random_problems import random_contact_problem, random_lcp, seeds
+
+import lavender as lv
+import lavender.io
+
+
+def variants():
+    """One problem of every operator, law and optional field."""
+    rows = random_contact_problem(1)
+    k = rows.n_blocks
+    a = sp.random_array((9, 9), density=0.3, rng=np.random.default_rng(0), format="csr")
+    a.data[0] = 0.0  # a stored zero is kept
+    kept = {
+        "guess": np.arange(rows.m, dtype=float) - 0.0,
+        "key": np.array([2**64 - 1, *range(k - 1)], np.uint64),
+        "names": ['hinge "7"', "Gelenk ä, \ud800", "nul\0", *(f"block {i}" for i in range(3, k))],
+        "name": "a\\name\n",
+    }
+    yield "rows", rows
+    yield "rows, everything", dataclasses.replace(rows, **kept)
+    yield "rows, cone law", rows.relaxed("cone")
+    yield "dense", random_lcp(3)
+    yield "csr", lv.Problem.linear(a, np.linspace(-1.0, 1.0, 9))
+    yield "csr, contacts", lv.Problem.contact(a, np.ones(9), [0.0, 0.5, 1e300], name="contacts")
+    yield "spin", lv.Problem.contact(np.eye(8), np.ones(8), [0.5, 0.2], patch_radius=[0.1, 0.0])
+    yield "empty", lv.Problem.linear(np.zeros((0, 0)), [])
+    yield "empty csr", lv.Problem.linear(sp.csr_array((0, 0)), [])
+    yield (
+        "denormals",
+        lv.Problem.lcp([[5e-324, -0.0], [0.0, 1e308]], [-5e-324, -0.0], lower=-np.inf, upper=5e-324),
+    )
+
+
+@pytest.mark.parametrize("problem", [pytest.param(problem, id=name) for name, problem in variants()])
+def test_a_saved_problem_is_the_same_problem(tmp_path, problem):
+    path = tmp_path / "problem.npz"
+    impulse = np.linspace(0.0, 1.0, problem.m)
+    lavender.io.save(problem, path, impulse=impulse)
+    stored = lavender.io.read(path)
+    assert stored.problem == problem
+    assert lavender.io.load(path) == problem
+    assert stored.problem.b.tobytes() == problem.b.tobytes()  # also the sign of zero
+    assert np.array_equal(lavender.io.load_solution(path), impulse)
+    lavender.io.save(problem, path)
+    assert lavender.io.load_solution(path) is None
+
+
+@given(seeds)
+@settings(max_examples=25)
+def test_random_problems_come_back(tmp_path_factory, seed):
+    path = tmp_path_factory.mktemp("npz") / "p.npz"
+    for problem in (random_contact_problem(seed), random_lcp(seed)):
+        lavender.io.save(problem, path)
+        assert lavender.io.load(path) == problem
+
+
+def test_two_saves_give_the_same_bytes(tmp_path):
+    problem = random_contact_problem(5)
+    for name in ("a.npz", "b.npz"):
+        lavender.io.save(problem, tmp_path / name)
+    assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
+
+
+def test_a_loaded_problem_gives_the_same_solution(tmp_path):
+    problem = random_contact_problem(8)
+    lavender.io.save(problem, tmp_path / "p.npz")
+    one, two = (
+        lv.solve(p, "pgs", max_iter=50, tol=0.0) for p in (problem, lavender.io.load(tmp_path / "p.npz"))
+    )
+    assert one.impulse.tobytes() == two.impulse.tobytes()
+
+
+# -- writing --------------------------------------------------------------------------------------
+
+
+def test_what_cannot_be_written_is_named_and_leaves_nothing(tmp_path):
+    problem = random_lcp(1)
+    (tmp_path / "folder.npz").mkdir()
+    (tmp_path / "file").write_text("")
+    for path in ("missing/p.npz", "folder.npz", "file/p.npz"):
+        with pytest.raises(lv.InputError, match="cannot write"):
+            lavender.io.save(problem, tmp_path / path)
+    assert sorted(os.listdir(tmp_path)) == ["file", "folder.npz"]
+    for name in ("p.mat", "p"):
+        with pytest.raises(lv.InputError, match=r"\.npz or \.hdf5"):
+            lavender.io.save(problem, tmp_path / name)
+    with pytest.raises(lv.InputError, match=r"a lavender\.Problem is needed"):
+        lavender.io.save("problem", tmp_path / "p.npz")
+    with pytest.raises(lv.InputError, match="impulse"):
+        lavender.io.save(problem, tmp_path / "p.npz", impulse=[1.0])
+    with pytest.raises(lv.InputError, match="for FCLIB"):
+        lavender.io.save(problem, tmp_path / "p.npz", form="local")
+
+
+def test_a_failed_save_keeps_the_old_file(tmp_path, monkeypatch):
+    path = tmp_path / "p.npz"
+    old, new = random_lcp(1), random_lcp(2)
+    lavender.io.save(old, path)
+
+    def full(stream, *args, **kwargs):
+        stream.write(b"PK\x03\x04 half an archive")
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(np, "savez_compressed", full)
+    with pytest.raises(lv.InputError, match="No space left"):
+        lavender.io.save(new, path)
+    monkeypatch.undo()
+    assert lavender.io.load(path) == old
+    assert os.listdir(tmp_path) == ["p.npz"]
+    lavender.io.save(new, path)
+    assert lavender.io.load(path) == new
+
+
+# -- foreign, truncated, malicious ----------------------------------------------------------------
+
+
+def archive(path, entries):
+    """An .npz of arrays, or of raw bytes for one entry."""
+    with zipfile.ZipFile(path, "w") as out:
+        for name, value in entries.items():
+            if not isinstance(value, bytes):
+                stream = bytestreams.BytesIO()
+                np.lib.format.write_array(stream, np.asanyarray(value), allow_pickle=True)
+                value = stream.getvalue()
+            out.writestr(f"{name}.npy", value)
+    return path
+
+
+def own(tmp_path, problem=None, **changes):
+    """The entries of a saved problem, some replaced (None: left out), as a file."""
+    path = tmp_path / "own.npz"
+    lavender.io.save(problem or random_lcp(1, boxed=False), path)
+    with np.load(path) as saved:
+        entries = dict(saved)
+    entries.update(changes)
+    return archive(path, {name: value for name, value in entries.items() if value is not None})
+
+
+def npy(descr, shape, data=b"", fortran=False, version=1):
+    header = repr({"descr": descr, "fortran_order": fortran, "shape": shape}).encode() + b"\n"
+    return (
+        b"\x93NUMPY"
+        + bytes([version, 0])
+        + struct.pack("<H" if version == 1 else "<I", len(header))
+        + header
+        + data
+    )
+
+
+class Bomb:
+    def __reduce__(self):
+        return (os.mkdir, (os.environ["LAVENDER_TEST_BOMB"],))
+
+
+def test_nothing_is_unpickled(tmp_path, monkeypatch):
+    trace = tmp_path / "executed"
+    monkeypatch.setenv("LAVENDER_TEST_BOMB", str(trace))
+    for entry in (np.array(Bomb(), object), npy("|O", (1,), pickle.dumps(Bomb())), pickle.dumps(Bomb())):
+        for path in (
+            own(tmp_path, b=entry),
+            archive(tmp_path / "box.npz", {"b": entry, "lo": 0, "hi": 0, "A": 0}),
+        ):
+            with pytest.raises(lv.InputError, match="'b'"):
+                lavender.io.load(path)
+    assert not trace.exists()
+
+
+@pytest.mark.parametrize(
+    ("entry", "sign"),
+    [
+        (npy("<f8", (2**60,)), "declares"),
+        (npy("<f8", (2**40, 2**40)), "declares"),
+        (npy("<f8", (12,), bytes(95)), "declares"),
+        (npy("<f8", (12,), bytes(97)), "declares"),
+        (npy("<f8", (-12,), b""), "shape"),
+        (npy("<f8", (True, 12), bytes(96)), "shape"),
+        (npy("<f8", 12, bytes(96)), "shape"),
+        (npy([("x", "<f8")], (12,), bytes(96)), "record array"),
+        (npy("<c16", (6,), bytes(96)), "numbers are needed"),
+        (npy("<M8[s]", (12,), bytes(96)), "numbers are needed"),
+        (npy("nonsense", (12,), bytes(96)), "cannot be read"),
+        (npy("<f8", (12,), bytes(96), version=4), "not an array"),
+        (b"\x93NUMPY\x01\x00\xff\xff" + b" " * 65535, "header"),
+        (b"\x93NUMPY\x01\x00\x10\x00" + b"(" * 16, "cannot be read"),
+        (b"\x93NUMPY\x02\x00\xff\xff\xff\xff", "header"),
+        (b"", "not an array"),
+        (b"\x93NUM", "not an array"),
+    ],
+)
+def test_entries_that_lie_are_refused(tmp_path, entry, sign):
+    with pytest.raises(lv.InputError, match=sign):
+        lavender.io.load(own(tmp_path, b=entry))
+
+
+def test_a_bomb_is_refused_by_its_declared_size(tmp_path):
+    path = tmp_path / "bomb.npz"
+    lavender.io.save(lv.Problem.linear(np.zeros((1500, 1500)), np.zeros(1500)), path)
+    assert path.stat().st_size < 30_000  # 18 MB of zeros
+    with pytest.raises(lv.InputError, match="max_bytes"):
+        lavender.io.load(path, max_bytes=10**7)
+    assert lavender.io.load(path).m == 1500
+
+
+def test_an_archive_that_hides_its_size_is_refused(tmp_path):
+    path = own(tmp_path)
+    raw = bytearray(path.read_bytes())
+    at = raw.index(b"PK\x01\x02")  # the first entry of the directory; its declared size is at 24
+    struct.pack_into("<I", raw, at + 24, 7)
+    path.write_bytes(raw)
+    with pytest.raises(lv.InputError):
+        lavender.io.load(path)
+
+
+def test_files_that_are_no_problem_are_refused(tmp_path):
+    cases = {
+        "empty.npz": (b"", "is empty"),
+        "text.npz": (b"Hello, world", "starts with"),
+        "short.npz": (b"PK", "not a complete"),
+    }
+    for name, (content, sign) in cases.items():
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(lv.InputError, match=sign):
+            lavender.io.load(tmp_path / name)
+    with pytest.raises(lv.InputError, match="No such file"):
+        lavender.io.load(tmp_path / "nowhere.npz")
+    with pytest.raises(lv.InputError, match="cannot read"):
+        lavender.io.load(tmp_path)
+    with pytest.raises(lv.InputError, match="holds x, y; a problem has"):
+        lavender.io.load(archive(tmp_path / "foreign.npz", {"x": 1, "y": 2}))
+    with pytest.raises(lv.InputError, match="holds nothing"):
+        lavender.io.load(archive(tmp_path / "none.npz", {}))
+    with zipfile.ZipFile(tmp_path / "office.npz", "w") as out:
+        out.writestr("word/document.xml", "<xml/>")
+    with pytest.raises(lv.InputError, match=r"word/document\.xml"):
+        lavender.io.load(tmp_path / "office.npz")
+    with zipfile.ZipFile(tmp_path / "twice.npz", "w") as out:
+        out.writestr("b.npy", npy("<f8", (0,)))
+        with pytest.warns(UserWarning, match="Duplicate"):
+            out.writestr("b.npy", npy("<f8", (0,)))
+    with pytest.raises(lv.InputError, match="under each name"):
+        lavender.io.load(tmp_path / "twice.npz")
+
+
+META = {"operator": "dense", "friction": "coulomb", "name": "", "names": None}
+
+
+@pytest.mark.parametrize(
+    ("changes", "sign"),
+    [
+        ({"lavender_format": np.int64(2)}, "this lavender reads 1"),
+        ({"lavender_format": np.bool_(True)}, "this lavender reads 1"),
+        ({"lavender_format": np.array("1.0")}, "this lavender reads 1"),
+        ({"lavender_format": np.array([1, 1])}, "one value"),
+        ({"b": None}, "entries b are missing"),
+        ({"A": None, "cones_mu": None}, "entries cones_mu, A are missing"),
+        ({"extra": np.zeros(1)}, "extra do not belong"),
+        ({"meta": np.frombuffer(b"{", np.uint8)}, "JSON"),
+        ({"meta": np.frombuffer(b"\xff\xfe", np.uint8)}, "JSON"),
+        ({"meta": np.zeros(3)}, "JSON"),
+        ({"meta": np.frombuffer(b"[" * 100_000, np.uint8)}, "JSON"),
+        ({"meta": META | {"operator": "magic"}}, "'meta' must hold"),
+        ({"meta": META | {"names": "abc"}}, "'meta' must hold"),
+        ({"meta": META | {"names": [1]}}, "'meta' must hold"),
+        ({"meta": META | {"more": 1}}, "'meta' must hold"),
+        ({"meta": META | {"friction": "glue"}}, "'coulomb' or 'cone'"),
+        ({"meta": META | {"names": ["one"]}}, "names for 12 blocks"),
+        ({"b": np.full(12, np.nan)}, "finite"),
+        ({"b": np.array(["1"] * 12)}, "numbers are needed"),
+        ({"b": np.zeros(11)}, "b .*shape"),
+        ({"A": np.zeros((12, 11))}, "A .*shape"),
+        ({"key": np.zeros(12)}, "key"),
+        ({"guess": np.zeros(3)}, "guess"),
+        ({"impulse": np.zeros(3)}, "impulse"),
+        ({"cones_ptr": np.arange(13)[::-1]}, "cones.ptr"),
+        ({"cones_lower": np.full(12, np.nan)}, "NaN"),
+    ],
+)
+def test_an_inconsistent_file_of_our_own_is_refused_by_name(tmp_path, changes, sign):
+    changes = {
+        n: np.frombuffer(json.dumps(v).encode(), np.uint8) if isinstance(v, dict) else v
+        for n, v in changes.items()
+    }
+    with pytest.raises(lv.InputError, match=sign) as error:
+        lavender.io.load(own(tmp_path, **changes))
+    assert "own.npz" in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("changes", "sign"),
+    [
+        ({"A_indices": np.array([0, 1, 9, 3], np.int32)}, "outside"),
+        ({"A_indices": np.array([0, 1, -1, 3], np.int32)}, "outside"),
+        ({"A_indptr": np.array([0, 3, 2, 3, 4], np.int32)}, "pointers"),
+        ({"A_indptr": np.array([0, 1, 2, 3, 2**30], np.int32)}, "points to"),
+        ({"A_indptr": np.array([1, 1, 2, 3, 4], np.int32)}, "pointers"),
+        ({"A_indptr": np.array([0, 4], np.int32)}, "pointers"),
+        ({"A_indptr": np.array([0.0, 1, 2, 3, 4])}, "pointers"),
+        ({"A_data": np.zeros((2, 2))}, "values"),
+        ({"A_shape": np.array([2**31, 2**31])}, "A_shape"),
+        ({"A_shape": np.array([4])}, "A_shape"),
+    ],
+)
+def test_indices_are_checked_before_a_kernel_reads_them(tmp_path, changes, sign):
+    problem = lv.Problem.linear(sp.eye_array(4, format="csr"), np.ones(4))
+    assert lavender.io.load(own(tmp_path, problem)) == problem
+    with pytest.raises(lv.InputError, match=sign):
+        lavender.io.load(own(tmp_path, problem, **changes))
+
+
+@pytest.mark.parametrize(
+    ("changes", "sign"),
+    [
+        ({"rows_contact_body": np.full((8, 2), 99, np.int32)}, "body 99"),
+        ({"rows_joint_body": np.full((3, 2), -2, np.int32)}, "body -2"),
+        ({"rows_joint_ptr": np.array([0, 2**31 - 1], np.int32)}, "jac"),
+        ({"rows_normal": np.zeros((8, 3))}, "unit vectors"),
+        ({"rows_arm_a": np.zeros((7, 3))}, "arm_a"),
+        ({"compliance": np.full(1, -1.0)}, "compliance"),
+    ],
+)
+def test_rows_are_checked_before_a_kernel_reads_them(tmp_path, changes, sign):
+    with pytest.raises(lv.InputError, match=sign):
+        lavender.io.load(own(tmp_path, random_contact_problem(1), **changes))
+
+
+@given(st.data())
+@settings(max_examples=150)
+def test_a_damaged_file_is_an_input_error_or_the_same_problem(tmp_path_factory, data):
+    folder = tmp_path_factory.mktemp("damage")
+    problem = data.draw(
+        st.sampled_from([random_contact_problem(2, bodies=3, contacts=3), random_lcp(2, m=4)])
+    )
+    path = folder / "p.npz"
+    lavender.io.save(problem, path)
+    raw = bytearray(path.read_bytes())
+    if data.draw(st.booleans()):
+        raw = raw[: data.draw(st.integers(0, len(raw) - 1))]
+    else:
+        for _ in range(data.draw(st.integers(1, 4))):
+            raw[data.draw(st.integers(0, len(raw) - 1))] = data.draw(st.integers(0, 255))
+    path.write_bytes(raw)
+    try:
+        loaded = lavender.io.load(path)
+    except lv.InputError as error:
+        message = str(error)
+    else:
+        message = str(path)
+        assert loaded == problem  # the damage hit a time stamp or an attribute of the archive
+    assert str(path) in message
+
+
+# -- plain box format -----------------------------------------------------------------------------
+
+
+def box(tmp_path, **changes):
+    rng = np.random.default_rng(0)
+    g = rng.normal(size=(7, 7))
+    entries = {"A": g @ g.T, "b": rng.normal(size=7), "lo": np.zeros(7), "hi": np.full(7, np.inf)} | changes
+    return archive(tmp_path / "box.npz", {n: v for n, v in entries.items() if v is not None})
+
+
+def test_box_rows_and_cones_become_blocks_in_their_order(tmp_path):
+    lo = np.array([0.0, -np.inf, 5.0, 5.0, 5.0, -1.0, 7.0])
+    hi = np.array([1.0, 0.5, 4.0, 4.0, 4.0, 0.0, 6.0])  # rows of cones do not read theirs
+    cones = {"cone_start": [6, 2], "cone_dim": [1, 3], "cone_mu": [0.25, 0.5]}
+    found = {"l_ref": np.ones(7), "w_ref": np.zeros(7), "compare": "w"}
+    stored = lavender.io.read(box(tmp_path, lo=lo, hi=hi, **cones, **found))
+    cones = stored.problem.cones
+    assert cones.ptr.tolist() == [0, 1, 2, 5, 6, 7]
+    assert cones.kind.tolist() == [lv.ROW, lv.ROW, lv.CONTACT, lv.ROW, lv.CONTACT]
+    assert cones.mu.tolist() == [0.0, 0.0, 0.5, 0.0, 0.25]
+    assert cones.lower[[0, 1, 5]].tolist() == [0.0, -np.inf, -1.0]
+    assert cones.upper[[0, 1, 5]].tolist() == [1.0, 0.5, 0.0]
+    assert stored.problem.name == "box"
+    assert stored.format == "box"
+    assert stored.compare == "w"
+    assert np.array_equal(stored.impulse, np.ones(7))
+    assert np.array_equal(stored.slack, np.zeros(7))
+
+
+def test_box_matrices_may_be_sparse_and_of_any_number(tmp_path):
+    a = sp.random_array((7, 7), density=0.4, rng=np.random.default_rng(1), format="csr")
+    parts = {
+        "A": None,
+        "A_data": a.data,
+        "A_indices": a.indices,
+        "A_indptr": a.indptr,
+        "A_shape": np.array(a.shape),
+    }
+    problem = lavender.io.load(box(tmp_path, **parts))
+    assert np.array_equal(problem.dense(), a.toarray())
+    whole = lavender.io.load(
+        box(tmp_path, A=np.asfortranarray(np.triu(np.ones((7, 7), np.int16))), b=np.ones(7, ">f4"))
+    )
+    assert np.array_equal(whole.dense(), np.triu(np.ones((7, 7))))
+    assert whole.b.dtype == np.float64
+
+
+@pytest.mark.parametrize(
+    ("changes", "sign"),
+    [
+        ({"A": None}, "no entry 'A_shape'"),
+        ({"lo": np.zeros(6)}, "'lo'"),
+        ({"lo": np.full(7, 1.0), "hi": np.zeros(7)}, "lower <= upper"),
+        ({"b": np.zeros((7, 1))}, "one dimension"),
+        ({"cone_start": [5], "cone_dim": [3], "cone_mu": [0.5]}, "within the 7 rows"),
+        ({"cone_start": [-1], "cone_dim": [3], "cone_mu": [0.5]}, "within the 7 rows"),
+        ({"cone_start": [0, 2], "cone_dim": [3, 3], "cone_mu": [0.5, 0.5]}, "overlap"),
+        ({"cone_start": [0], "cone_dim": [5], "cone_mu": [0.5]}, "1 to 3 rows"),
+        ({"cone_start": [0], "cone_dim": [3], "cone_mu": [-0.5]}, "mu"),
+        ({"cone_start": [0], "cone_dim": [3, 3], "cone_mu": [0.5]}, "'cone_dim'"),
+        ({"cone_start": [0], "cone_mu": [0.5]}, "'cone_dim'"),
+        ({"l_ref": np.zeros(3)}, "l_ref"),
+        ({"A": np.full((7, 7), np.inf)}, "finite"),
+    ],
+)
+def test_a_wrong_box_file_is_refused_by_name(tmp_path, changes, sign):
+    with pytest.raises(lv.InputError, match=sign):
+        lavender.io.load(box(tmp_path, **changes))
+
+
+def test_the_generators_layout_is_read(tmp_path):
+    a = sp.csr_array(np.diag([1.0, 2.0, 3.0]))
+    parts = {"A_data": a.data, "A_indices": a.indices, "A_indptr": a.indptr, "A_shape": np.array(a.shape)}
+    rest = {"J_data": np.zeros(1), "minv": np.ones(6), "b": np.ones(3), "mu": np.array([0.5])}
+    laws = {"lcp": "lcp", "free": "linear", "cone": "cone"}
+    for kind, law in laws.items():
+        stored = lavender.io.read(archive(tmp_path / "generated.npz", {"kind": kind} | rest | parts))
+        assert stored.problem.law == law
+        assert stored.format == "generated"
+        assert np.array_equal(stored.problem.dense(), a.toarray())
+    with pytest.raises(lv.InputError, match="'lcp', 'free' or 'cone'"):
+        lavender.io.load(archive(tmp_path / "generated.npz", {"kind": "magic"} | rest | parts))
