@@ -45,7 +45,7 @@ class SweepState:
         return self.watch.best
 
 
-def _claim(status: int, done: int) -> Claim:
+def claim(status: int, done: int) -> Claim:
     return Claim(_STATUS[status], done, {"sweeps": done})
 
 
@@ -53,7 +53,7 @@ def run_sweeps(
     state: SweepState, impulse: FloatArray, n: int, tol: float, sweep: Callable[[int], None]
 ) -> Claim:
     """n sweeps by a Python callable, or fewer where a check ends them; tol = 0 checks nothing."""
-    return _claim(*state.watch.run_python(lambda count, first: sweep(count), impulse, n, tol))
+    return claim(*state.watch.run_python(lambda count, first: sweep(count), impulse, n, tol))
 
 
 def run_kernel(
@@ -69,7 +69,7 @@ def run_kernel(
     o = state.order
     # The same bits with or without an order array; without one the kernel skips two look-ups a row.
     blocks = _ROW_BY_ROW if kind == kernels.PGS and state.data.single_rows and o.is_given else o.blocks
-    return _claim(
+    return claim(
         *kernels.run(
             kind, state.data, state.watch, impulse, n, tol, blocks, o.split, o.mode, o.rng, omega, scratch
         )

@@ -1,0 +1,71 @@
+"""Block Gauss-Seidel: one contact or joint after the other, each solved exactly with the others held still.
+
+    find lam_i:   w_i = A_ii lam_i + q_i complementary to lam_i,   q_i = sum_{j != i} A_ij lam_j - b_i
+
+A contact is open, sticks, or slips in the direction that a scalar Newton iteration finds
+(`lavender_ext/local.pxd`); the rows of a joint are a small boxed problem, solved by pivoting. Normal and
+friction of one contact no longer wait for each other as in `pgs`; contacts still do. Works on the rows of
+A, or on body velocities where the problem has rows. `work["fallbacks"]` counts blocks without an exact
+answer that were relaxed instead.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from lavender._arrays import FloatArray
+from lavender.ordering import Order, block_order
+from lavender.problem import Problem
+from lavender.registry import SolverSpec
+from lavender.solution import Claim
+from lavender.solvers._sweeping import Sweeping, SweepState, claim
+from lavender_ext import block_gs as kernels
+from lavender_ext import judge
+
+
+class BlockState(SweepState):
+    """A sweep state with the prepared numbers of every block, and v = M^-1 J^T lambda where there are rows."""
+
+    velocity: FloatArray | None = None  # (n + 1, 6)
+
+    def __init__(self, problem: Problem, data: Any, order: Order) -> None:
+        super().__init__(problem, data, order)
+        self.prepared = kernels.prepare(data)
+
+
+@dataclass(frozen=True)
+class BlockGaussSeidel(Sweeping):
+    """Block Gauss-Seidel; `order`, `ground`, `seed` as in `lavender.ordering`."""
+
+    def prepare(self, problem: Problem) -> BlockState:
+        order = block_order(problem, self.order, seed=self.seed, ground=self.ground)
+        return BlockState(problem, problem.data, order)
+
+    def run(
+        self, state: BlockState, impulse: FloatArray, n: int, tol: float, time_limit: float | None = None
+    ) -> Claim:
+        o, data = state.order, state.data
+        if state.velocity is None:
+            state.velocity = np.zeros((data.n_bodies + 1, 6))
+            if data.factored:
+                judge.velocity_change(data, impulse, state.velocity)
+        status, done, fallbacks = kernels.run(
+            data, state.watch, impulse, n, tol, *state.prepared, state.velocity, o.blocks, o.split, o.mode, o.rng
+        )
+        form = "body velocities" if data.factored else "rows of A"
+        return replace(claim(status, done), work={"sweeps": done, "fallbacks": fallbacks}, form=form)
+
+
+SPEC = SolverSpec(
+    name="block_gauss_seidel",
+    factory=BlockGaussSeidel,
+    laws=frozenset({"linear", "lcp", "coulomb", "cone"}),
+    order=True,
+    seed=True,
+    max_iter=1000,
+    summary="Gauss-Seidel over contacts and joints, each solved exactly",
+    reference="Jourdan, Alart, Jean 1998; Acary, Bremond, Huber 2018 (NSGS with an exact local solver)",
+)
