@@ -68,6 +68,7 @@ cdef inline void view(const engine_t* e, blocks_t* p, rows_t* r) noexcept nogil:
     r.arm_b = e.arm_b
     r.contact_body = e.contact_body
     r.coupling = e.coupling
+    r.swing = e.swing
     r.inv_mass = e.inv_mass
     r.inv_inertia = e.inv_inertia
     r.compliance = e.compliance
@@ -365,7 +366,7 @@ cdef class Buffers:
             "dv": (real, e.dv - r, (nd, 6)), "shift": (real, e.shift - r, (nd, 6)), "point": (real, e.point - r, (c, 3)),
             "gap": (real, e.gap - r, (c,)), "normal": (real, e.normal - r, (c, 3)), "tangent": (real, e.tangent - r, (nt, 3)),
             "arm_a": (real, e.arm_a - r, (c, 3)), "arm_b": (real, e.arm_b - r, (c, 3)),
-            "coupling": (real, e.coupling - r, (nt, 5)), "local": (real, e.local - r, (c, 6)),
+            "coupling": (real, e.coupling - r, (nt, 5)), "swing": (real, e.swing - r, (m - mj, 6)), "local": (real, e.local - r, (c, 6)),
             "cache_impulse": (real, e.cache_impulse - r, (c, 5)), "cache_local": (real, e.cache_local - r, (c, 6)),
             "push": (real, e.push - r, (mj + c,)), "target": (real, e.target - r, (m,)), "lower": (real, e.lower - r, (m,)),
             "upper": (real, e.upper - r, (m,)), "b": (real, e.b - r, (m,)), "d": (real, e.d - r, (m,)),

@@ -124,7 +124,7 @@ cdef inline void make_contact(engine_t* e, const rows_t* r, int32_t c, int32_t r
     if nt > 0:
         tangent_of(e.normal + 3 * c, e.tangent + 3 * c)
     contact_diagonal(e.normal + 3 * c, e.tangent + 3 * c, e.arm_a + 3 * c, e.arm_b + 3 * c, nt, spin, da, db,
-                     e.inv_mass, e.inv_inertia, d, &t12, e.coupling + 5 * c)
+                     e.inv_mass, e.inv_inertia, d, &t12, e.coupling + 5 * c, e.swing + 6 * (row - e.size[N_JOINT_ROW]))
     for k in range(1 + nt + spin):
         d[k] += e.compliance[row + k]
     e.step[row] = reciprocal(d[0])

@@ -37,7 +37,6 @@ cdef inline int32_t project_positions(engine_t* e) noexcept nogil:
     cdef double h = e.setting[S_H], slop = e.setting[S_SLOP], beta = e.setting[S_BETA], most = e.setting[S_MAX_PUSH]
     cdef double depth = 0.0, off = 0.0, x, y, p
     cdef double impulse[3]
-    cdef double none[3]
     cdef const double* normal
     cdef double* goal = e.target                        # free after the solve: J s wanted, by contact and joint row
     e.head[H_PROJECTED] = 0
@@ -73,9 +72,6 @@ cdef inline int32_t project_positions(engine_t* e) noexcept nogil:
         return 0
     for i in range(6 * e.size[N_DYNAMIC]):
         e.shift[i] = 0.0
-    none[0] = 0.0
-    none[1] = 0.0
-    none[2] = 0.0
     for sweep in range(e.head[H_POSITION_ITERATIONS]):
         for i in range(e.size[N_JOINT]):
             a = e.joint_body[2 * i]
@@ -95,6 +91,6 @@ cdef inline int32_t project_positions(engine_t* e) noexcept nogil:
             for i in range(3):
                 impulse[i] = p * normal[i]
             push_bodies(e.shift, e.contact_body[2 * c], e.contact_body[2 * c + 1], e.inv_mass, e.inv_inertia,
-                        e.arm_a + 3 * c, e.arm_b + 3 * c, impulse, none)
+                        e.arm_a + 3 * c, e.arm_b + 3 * c, impulse, NULL)
     e.head[H_PROJECTED] = e.head[H_POSITION_ITERATIONS]
     return 1

@@ -85,8 +85,9 @@ cdef public void lav_matrix_nu(const blocks_t* p, double* nu) noexcept nogil:
 
 
 cdef public int32_t lav_rows_diagonal(const blocks_t* p, const rows_t* r, double* d, double* nu, double* step,
-                                      int32_t* empty, double* minv_jac, double* coupling) noexcept nogil:
-    """d, nu, step, M^-1 J^T of joints and the coupling of contacts, from the factored form."""
+                                      int32_t* empty, double* minv_jac, double* coupling,
+                                      double* swing) noexcept nogil:
+    """d, nu, step, M^-1 J^T of joints, coupling and swing of contacts, from the factored form."""
     cdef int32_t i, j, q, c, t, nt, spin, end, n_empty = 0, n_positive = 0, a, b
     cdef double total = 0.0, mean, e, off, linear, inv
     for i in range(r.n_joints):
@@ -104,7 +105,7 @@ cdef public int32_t lav_rows_diagonal(const blocks_t* p, const rows_t* r, double
         nt = n_tangents(p.kind[i], end - j)
         contact_diagonal(r.normal + 3 * c, r.tangent + 3 * c, r.arm_a + 3 * c, r.arm_b + 3 * c, nt, spin,
                          r.contact_body[2 * c], r.contact_body[2 * c + 1], r.inv_mass, r.inv_inertia, d + j, &off,
-                         coupling + 5 * c)
+                         coupling + 5 * c, swing + 6 * (j - p.ptr[r.n_joints]))
         for q in range(end - j):
             d[j + q] += r.compliance[j + q]
             step[j + q] = 0.0
@@ -193,7 +194,8 @@ cdef class Data:
         if self.factored:
             self._set_rows(rows)
             n_empty = lav_rows_diagonal(&self.blocks, &self.rows, &d[0], &nu[0], &step[0], &empty[0],
-                                        <double*>self.rows.minv_jac, <double*>self.rows.coupling)
+                                        <double*>self.rows.minv_jac, <double*>self.rows.coupling,
+                                        <double*>self.rows.swing)
         else:
             indptr, indices, data = csr
             self.csr.indptr = &indptr[0]
@@ -212,16 +214,18 @@ cdef class Data:
         cdef const int32_t[:, ::1] joint_body, contact_body
         cdef const double[::1] inv_mass, compliance
         cdef const double[:, :, ::1] inv_inertia
-        cdef double[:, ::1] minv_jac, coupling
+        cdef double[:, ::1] minv_jac, coupling, swing
         jac, joint_body, normal, tangent, arm_a, arm_b, contact_body, inv_mass, inv_inertia, compliance = rows
         minv_jac = np.zeros((jac.shape[0] + 1, 12))
         coupling = np.zeros((normal.shape[0] + 1, 5))
-        self.keep += [minv_jac, coupling]
+        swing = np.zeros((self.blocks.n_rows - jac.shape[0] + 1, 6))
+        self.keep += [minv_jac, coupling, swing]
         self.rows.n_bodies = <int32_t>inv_mass.shape[0]
         self.rows.n_joints = <int32_t>joint_body.shape[0]
         self.rows.n_contacts = <int32_t>contact_body.shape[0]
         self.rows.minv_jac = &minv_jac[0, 0]
         self.rows.coupling = &coupling[0, 0]
+        self.rows.swing = &swing[0, 0]
         if jac.shape[0]:
             self.rows.jac = &jac[0, 0]
         if self.rows.n_joints:

@@ -11,7 +11,8 @@ and an impulse P [N s] with spin s [N m s] along n changes
     v_b += P / m_b,  omega_b += I_b^-1 (arm_b x P + s n),  and the opposite on a.              (3)
 
 Because the rows of one contact couple by A_tn, A_sn, A_st alone, a sweep reads u once, follows it
-through these couplings, and writes both bodies once:
+through these couplings, and writes both bodies once, omega by the stored I^-1 (arm x axis) of each row
+(`swing`: a product instead of two on the way from one contact to the next, 1.3 times as fast):
 
     w_t after the normal's step = t.u + A_tn (change of lam_n), and so on.                     (4)
 """
@@ -36,6 +37,7 @@ cdef struct rows_t:
     const double* arm_b         # (c, 3) m
     const int32_t* contact_body  # (c, 2)
     const double* coupling      # (c, 5) 1/kg: A_t1n, A_t2n, A_sn, A_st1, A_st2 without compliance
+    const double* swing         # (contact rows, 6) 1/(kg m): change of -omega_a and omega_b by a unit impulse
     const double* inv_mass      # (n) 1/kg
     const double* inv_inertia   # (n, 9) 1/(kg m^2), world
     const double* compliance    # (m) 1/kg
@@ -77,12 +79,15 @@ cdef inline void relative_velocity(const double* v, int32_t a, int32_t b, const 
 
 cdef inline void push(double* v, double inv_mass, const double* inv_inertia, const double* arm,
                       const double* impulse, const double* twist, double sign) noexcept nogil:
-    # (3) for one body; twist = s n.
+    # (3) for one body; twist = s n, or NULL.
     cdef double l[3]
     cdef int32_t k
     cross(arm, impulse, l)
+    if twist != NULL:
+        for k in range(3):
+            l[k] += twist[k]
     for k in range(3):
-        l[k] = sign * (l[k] + twist[k])
+        l[k] = sign * l[k]
         v[k] += sign * inv_mass * impulse[k]
     for k in range(3):
         v[3 + k] += dot3(inv_inertia + 3 * k, l)
@@ -130,35 +135,50 @@ cdef inline void relax_joint(const blocks_t* p, const rows_t* r, int32_t i, doub
         lam[j] = y
 
 
+cdef inline void swing_body(double* v, double inv_mass, const double* swing, const double* impulse, double dn,
+                            double d0, double d1, double ds, int32_t nt, int32_t spin, double sign) noexcept nogil:
+    # (3) for one body: swing is at the first row of this contact and this side.
+    cdef int32_t k
+    cdef double w
+    for k in range(3):
+        v[k] += sign * (inv_mass * impulse[k])
+        w = dn * swing[k]
+        if nt > 0:
+            w += d0 * swing[6 + k]
+        if nt > 1:
+            w += d1 * swing[12 + k]
+        if spin:
+            w += ds * swing[6 * (1 + nt) + k]
+        v[3 + k] += sign * w
+
+
 cdef inline void relax_contact(const double* normal, const double* tangent, const double* arm_a,
-                               const double* arm_b, const double* coupling, const double* compliance,
-                               const double* rhs, const double* step, double mu, double patch_radius,
-                               int32_t nt, int32_t spin, int32_t a, int32_t b, const double* inv_mass,
-                               const double* inv_inertia, double* lam, double* v) noexcept nogil:
+                               const double* arm_b, const double* coupling, const double* swing,
+                               const double* compliance, const double* rhs, const double* step, double mu,
+                               double patch_radius, int32_t nt, int32_t spin, int32_t a, int32_t b,
+                               const double* inv_mass, double* lam, double* v) noexcept nogil:
     """One contact: normal, tangents together, spin; all pointers are at this contact's first entry."""
     cdef double u[3]
     cdef double omega[3]
     cdef double t2[3]
     cdef double impulse[3]
-    cdef double twist[3]
     cdef double w[2]
     cdef double old[2]
-    cdef double y, dn, ds, d0 = 0.0, d1 = 0.0
+    cdef double y, dn, ds = 0.0, d0 = 0.0, d1 = 0.0
     cdef int32_t k, js = 1 + nt
     relative_velocity(v, a, b, arm_a, arm_b, u, omega)
-    y = relax_normal(lam[0], dot3(normal, u) + compliance[0] * lam[0] - rhs[0], step[0])
+    y = relax_normal(lam[0], dot3(normal, u) + (compliance[0] * lam[0] - rhs[0]), step[0])
     dn = y - lam[0]
     lam[0] = y
     for k in range(3):
         impulse[k] = dn * normal[k]
-        twist[k] = 0.0
     if nt > 0:
         old[0] = lam[1]
-        w[0] = dot3(tangent, u) + coupling[0] * dn + compliance[1] * lam[1] - rhs[1]
+        w[0] = (dot3(tangent, u) + (compliance[1] * lam[1] - rhs[1])) + coupling[0] * dn
         if nt == 2:
             cross(normal, tangent, t2)
             old[1] = lam[2]
-            w[1] = dot3(t2, u) + coupling[1] * dn + compliance[2] * lam[2] - rhs[2]
+            w[1] = (dot3(t2, u) + (compliance[2] * lam[2] - rhs[2])) + coupling[1] * dn
         relax_tangents(lam + 1, w, step[1], mu * y, nt)
         d0 = lam[1] - old[0]
         for k in range(3):
@@ -168,23 +188,35 @@ cdef inline void relax_contact(const double* normal, const double* tangent, cons
             for k in range(3):
                 impulse[k] += d1 * t2[k]
     if spin:
-        w[0] = (dot3(normal, omega) + coupling[2] * dn + coupling[3] * d0 + coupling[4] * d1
-                + compliance[js] * lam[js] - rhs[js])
+        w[0] = (dot3(normal, omega) + (compliance[js] * lam[js] - rhs[js])
+                + coupling[2] * dn + coupling[3] * d0 + coupling[4] * d1)
         y = relax_row(lam[js], w[0], step[js], -(mu * patch_radius * y), mu * patch_radius * y)
         ds = y - lam[js]
         lam[js] = y
-        for k in range(3):
-            twist[k] = ds * normal[k]
-    push_bodies(v, a, b, inv_mass, inv_inertia, arm_a, arm_b, impulse, twist)
+    if a >= 0:
+        swing_body(v + 6 * a, inv_mass[a], swing, impulse, dn, d0, d1, ds, nt, spin, -1.0)
+    if b >= 0:
+        swing_body(v + 6 * b, inv_mass[b], swing + 3, impulse, dn, d0, d1, ds, nt, spin, 1.0)
 
 
 cdef inline void relax_contact_block(const blocks_t* p, const rows_t* r, int32_t i, double* lam,
                                      double* v) noexcept nogil:
-    cdef int32_t c = i - r.n_joints, j = p.ptr[i], kind = p.kind[i]
-    relax_contact(r.normal + 3 * c, r.tangent + 3 * c, r.arm_a + 3 * c, r.arm_b + 3 * c,
-                  r.coupling + 5 * c, r.compliance + j, p.b + j, p.step + j, p.mu[i], p.patch_radius[i],
-                  n_tangents(kind, p.ptr[i + 1] - j), kind == CONTACT_SPIN, r.contact_body[2 * c],
-                  r.contact_body[2 * c + 1], r.inv_mass, r.inv_inertia, lam + j, v)
+    # The two common kinds with their sizes as constants: a compiler then leaves out the rows that are not there.
+    cdef int32_t c = i - r.n_joints, j = p.ptr[i], kind = p.kind[i], nt = n_tangents(kind, p.ptr[i + 1] - j)
+    cdef const double* swing = r.swing + 6 * (j - p.ptr[r.n_joints])
+    if kind == CONTACT_SPIN or nt == 1:
+        relax_contact(r.normal + 3 * c, r.tangent + 3 * c, r.arm_a + 3 * c, r.arm_b + 3 * c,
+                      r.coupling + 5 * c, swing, r.compliance + j, p.b + j, p.step + j, p.mu[i], p.patch_radius[i],
+                      nt, kind == CONTACT_SPIN, r.contact_body[2 * c], r.contact_body[2 * c + 1], r.inv_mass,
+                      lam + j, v)
+    elif nt == 2:
+        relax_contact(r.normal + 3 * c, r.tangent + 3 * c, r.arm_a + 3 * c, r.arm_b + 3 * c,
+                      r.coupling + 5 * c, swing, r.compliance + j, p.b + j, p.step + j, p.mu[i], 0.0, 2, 0,
+                      r.contact_body[2 * c], r.contact_body[2 * c + 1], r.inv_mass, lam + j, v)
+    else:
+        relax_contact(r.normal + 3 * c, NULL, r.arm_a + 3 * c, r.arm_b + 3 * c, NULL, swing, r.compliance + j,
+                      p.b + j, p.step + j, 0.0, 0.0, 0, 0, r.contact_body[2 * c], r.contact_body[2 * c + 1],
+                      r.inv_mass, lam + j, v)
 
 
 cdef inline void relax_rows_block(const blocks_t* p, const rows_t* r, int32_t i, double* lam,
@@ -308,8 +340,11 @@ cdef inline void minv_times(const double* jac, const double* inv_mass, const dou
 
 cdef inline void contact_diagonal(const double* normal, const double* tangent, const double* arm_a, const double* arm_b,
                                   int32_t nt, int32_t spin, int32_t a, int32_t b, const double* inv_mass,
-                                  const double* inv_inertia, double* d, double* t12, double* coupling) noexcept nogil:
+                                  const double* inv_inertia, double* d, double* t12, double* coupling,
+                                  double* swing) noexcept nogil:
     """A among the rows of one contact, without compliance: diagonal d (1 + nt + spin), t12 = A_t1t2, coupling (5).
+
+    And swing (1 + nt + spin, 6): I_a^-1 (arm_a x axis), I_b^-1 (arm_b x axis) of each row, 0 where static.
 
     With l = arm x axis and the sums over both bodies, A_pq = (sum 1/m) p.q + sum l_p . I^-1 l_q; for spin l = n.
     """
@@ -330,6 +365,8 @@ cdef inline void contact_diagonal(const double* normal, const double* tangent, c
         cross(normal, tangent, axis + 6)
     for i in range(1 + nt + spin):
         d[i] = 0.0
+    for i in range(6 * (1 + nt + spin)):
+        swing[i] = 0.0
     t12[0] = 0.0
     if nt + spin > 0:
         for i in range(5):
@@ -345,6 +382,7 @@ cdef inline void contact_diagonal(const double* normal, const double* tangent, c
             cross(arm, axis + 3 * i, l + 3 * i)
             for q in range(3):
                 k[3 * i + q] = dot3(inv + 3 * q, l + 3 * i)
+                swing[6 * i + 3 * side + q] = k[3 * i + q]
             d[i] += dot3(l + 3 * i, k + 3 * i)
         if nt > 0:
             coupling[0] += dot3(l + 3, k)
@@ -354,6 +392,7 @@ cdef inline void contact_diagonal(const double* normal, const double* tangent, c
         if spin:
             for q in range(3):
                 ks[q] = dot3(inv + 3 * q, normal)
+                swing[6 * (1 + nt) + 3 * side + q] = ks[q]
             d[1 + nt] += dot3(normal, ks)
             coupling[2] += dot3(normal, k)
             for i in range(nt):
