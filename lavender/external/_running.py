@@ -1,0 +1,213 @@
+"""What every adapter shares: one call of a backend, and how its answer becomes a claim."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import sys
+import warnings
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from lavender._arrays import FloatArray
+from lavender.errors import InputError
+from lavender.external.as_qp import QP, target
+from lavender.problem import Problem
+from lavender.residuals import quick
+from lavender.solution import Claim, Status
+
+__all__ = ["GAP_RELATIVE", "Answer", "Limits", "ask", "definite_refusal", "quiet", "symmetric_refusal"]
+
+ATTEMPTS = 3
+EPS_MIN = 1e-14  # asked of a backend at the least: its own arithmetic stops there
+GAP_MIN = 1e-18
+GAP_RELATIVE = 1e-13  # of the objective: what the sums of a gap lose to rounding
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What one call may use; tolerances in the units of `QP`, absolute."""
+
+    eps: float  # residual of stationarity and of the constraints
+    gap: float  # difference of objectives
+    max_iter: int
+    time_limit: float | None  # s
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What a backend returned; arrays None where it gave none."""
+
+    status: Status
+    words: str  # the backend's own
+    x: FloatArray | None = None  # (n,)
+    zeta: FloatArray | None = None  # (r,) multipliers of the rows
+    xi: FloatArray | None = None  # (n,) of the bounds
+    work: Mapping[str, int] = field(default_factory=dict)
+    direction: FloatArray | None = None  # of an unbounded x
+    contradiction: FloatArray | None = None  # multipliers that prove the rows contradict each other
+
+
+Call = Callable[[QP, FloatArray, Limits, dict[str, Any]], Answer]
+
+
+def ask(
+    problem: Problem,
+    qp: QP,
+    impulse: FloatArray,
+    call: Call,
+    n: int,
+    tol: float,
+    time_limit: float | None,
+    settings: Mapping[str, Any],
+    *,
+    stoppable: bool,
+    noisy: bool = False,
+) -> Claim:
+    """Run the backend and write its iterate to `impulse`, or leave the start point and say why.
+
+    A backend that says it is done where the judge does not find `tol` is asked again, 100 times more
+    closely, at most `ATTEMPTS` times in all: its tests are not the judge's. An interior-point method
+    leaves sqrt(x w) on a row where impulse and slack both vanish; its gap starts at eps and falls to eps^2.
+    """
+    work: dict[str, int] = {"backend_calls": 0}
+    if not len(qp.kept):
+        impulse[:] = qp.fixed
+        return Claim(Status.CONVERGED, 0, work, "every row was decided by its bounds", qp.form)
+    if n == 0:
+        return Claim(Status.MAX_ITERATIONS, 0, work, "", qp.form)
+    start = impulse.copy()
+    eps = max(0.5 * target(problem, tol), EPS_MIN)
+    levels = [
+        (max(eps / 100.0**i, EPS_MIN), max(eps if i == 0 else eps * eps / 10.0 ** (i - 1), GAP_MIN))
+        for i in range(ATTEMPTS)
+    ]
+    if tol == 0.0:
+        levels = levels[-1:]
+    best: tuple[float, Claim, FloatArray] | None = None
+    clock = perf_counter()
+    left, time_left = n, time_limit
+    w, e = np.empty(problem.m), np.empty(problem.m)
+    for level, gap in levels:
+        claim = _once(qp, impulse, call, Limits(level, gap, left, time_left), settings, noisy)
+        for kind, count in claim.work.items():
+            work[kind] = work.get(kind, 0) + count
+        relative, floor = quick(problem, impulse, w, e, floor=True)
+        if best is not None and best[0] <= relative:
+            # Asked more closely it got no closer.
+            break
+        best = (relative, claim, impulse.copy())
+        left -= claim.iterations
+        if time_limit is not None:
+            time_left = time_limit - (perf_counter() - clock)
+        if (
+            claim.status is not Status.CONVERGED
+            or relative <= max(tol, 2.0 * floor)
+            or left <= 0
+            or (time_left is not None and time_left <= 0.0)
+        ):
+            break
+        impulse[:] = start
+    assert best is not None
+    impulse[:] = best[2]
+    claim = best[1]
+    status, words = claim.status, claim.message
+    if tol == 0.0 and status is Status.CONVERGED:
+        status, words = Status.STALLED, f"{words}; tol=0: ran at its tightest tolerance"
+    if time_limit is not None and not stoppable:
+        words = f"{words}; takes no time limit and ran to its end"
+    return replace(claim, status=status, message=words, work=work, iterations=work.get("iterations", 0))
+
+
+def _once(
+    qp: QP, impulse: FloatArray, call: Call, limit: Limits, settings: Mapping[str, Any], noisy: bool
+) -> Claim:
+    try:
+        with quiet(noisy) as said:
+            answer = call(qp, impulse, limit, dict(settings))
+    except (KeyboardInterrupt, SystemExit, GeneratorExit, InputError):
+        raise
+    except BaseException as error:  # a backend may fail in any way; a panic of Rust is no Exception
+        words = f"{type(error).__name__}: {error}; start point returned"
+        return Claim(Status.NUMERICAL_ERROR, 0, {"backend_calls": 1}, words, qp.form)
+    status, words = answer.status, answer.words or "; ".join(said)
+    work = {"backend_calls": 1, **{k: int(v) for k, v in answer.work.items()}}
+    certificate = None
+    if status is Status.INFEASIBLE:
+        certificate = qp.direction(answer.direction, answer.contradiction)
+    x, zeta = answer.x, answer.zeta
+    found = x is not None and len(x) == qp.n and bool(np.isfinite(x).all())
+    if qp.form == "velocity":
+        found = found and zeta is not None and len(zeta) == len(qp.b) and bool(np.isfinite(zeta).all())
+    dual = None
+    if found and status is not Status.INFEASIBLE:
+        assert x is not None
+        impulse[:] = qp.impulse(x, np.zeros(0) if zeta is None else zeta)
+        xi = answer.xi if answer.xi is not None and len(answer.xi) == qp.n else np.full(qp.n, np.nan)
+        dual = qp.multiplier(x, xi)
+    elif status is not Status.INFEASIBLE:
+        if status not in (Status.TIME_LIMIT, Status.INTERRUPTED):
+            status = Status.NUMERICAL_ERROR
+        words = f"{words}; no iterate, start point returned".removeprefix("; ")
+    return Claim(status, work.get("iterations", 0), work, words, qp.form, dual, certificate)
+
+
+def symmetric_refusal(problem: Problem) -> str | None:
+    """A quadratic program has a symmetric P: anything else would be another problem."""
+    if problem.is_symmetric:
+        return None
+    return (
+        f"needs a symmetric A; here max|A - A^T| / max|A| = {problem.asymmetry:.1e} "
+        "(pgs takes it as it is; a Problem of (A + A^T)/2 is another problem, if that error is small enough)"
+    )
+
+
+def definite_refusal(problem: Problem) -> str | None:
+    """A negative diagonal entry shows that no QP solver can take this A; a factorisation sees the rest."""
+    if problem.rows is None and problem.m:
+        diagonal = problem.csr.diagonal()
+        i = int(np.argmin(diagonal))
+        if diagonal[i] < 0.0:
+            return f"needs a positive semidefinite A; A[{i}, {i}] = {diagonal[i]:.3g}"
+    return None
+
+
+@contextlib.contextmanager
+def quiet(noisy: bool) -> Iterator[list[str]]:
+    """Collect the warnings of a backend and swallow what it writes to sys.stdout and sys.stderr.
+
+    With `noisy` also what compiled code prints: that needs the file descriptors of the whole process,
+    so only backends known to print pay for it.
+    """
+    said: list[str] = []
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        try:
+            with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
+                with _descriptors_to_null() if noisy else contextlib.nullcontext():
+                    yield said
+        finally:
+            said += [str(w.message).strip() for w in caught if not issubclass(w.category, DeprecationWarning)]
+
+
+@contextlib.contextmanager
+def _descriptors_to_null() -> Iterator[None]:
+    for stream in (sys.__stdout__, sys.__stderr__):
+        if stream is not None:
+            stream.flush()
+    saved = [(fd, os.dup(fd)) for fd in (1, 2)]
+    null = os.open(os.devnull, os.O_WRONLY)
+    try:
+        for fd, _ in saved:
+            os.dup2(null, fd)
+        yield
+    finally:
+        for fd, copy in saved:
+            os.dup2(copy, fd)
+            os.close(copy)
+        os.close(null)

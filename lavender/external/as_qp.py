@@ -1,0 +1,423 @@
+"""A problem as a convex program, in two forms. Pure conversion: nothing here solves.
+
+Both are written as
+
+    min 1/2 x.P x + q.x    subject to   A x + s = b,  s in {0}^z x R+^k x second-order cones,   lb <= x <= ub
+
+with multipliers zeta of the rows and xi of the bounds:  P x + q + A^T zeta + xi = 0.
+
+Impulse form, x = S^-1 lambda / sigma, S = D^-1/2 (unit diagonal where `unit_diagonal`):
+
+    P = S A S,  q = -S b / sigma,  bounds of lambda;  friction  |x_t| <= a x_n,  a = mu S_n / S_t
+
+Velocity form, from `Problem.velocity_form` (K, theta, g; y = M^1/2 times the change of velocity):
+
+    min 1/2 |y|^2 + 1/2 |p|^2 - (K~^T r).(y, p) + (u - l).t,   K~ = [K, theta^1/2],  w = K~ (y, p) - g
+
+    free row                w = 0                          r = 0
+    lower bound alone       w >= 0                         r = l
+    both bounds             w + t >= 0, t >= 0             r = l, the multiplier ends at u - l
+    upper bound alone       -w >= 0                        r = u
+    disk and spin           w_n - a_s t >= a |w_t|,  t >= |w_s|
+
+and z = r + T zeta, lambda = sigma S z, where the rows are A = -T^T K~ (t aside). Its size is that of
+the velocities, and J is never squared.
+
+sigma = max(E0 / sqrt(m), V0 sqrt(heaviest mass)) makes both free of units, with unknowns near 1 also at
+large mass ratios; a residual of x times sigma is a residual of the judge. Rows whose impulse is known (lower = upper, friction with mu = 0, rows of A that
+are all zero) are taken out first.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import scipy.sparse as sp
+
+from lavender._arrays import FloatArray
+from lavender.cones import CONTACT_SPIN, ROW
+from lavender.errors import CapabilityError, InputError
+from lavender.problem import Problem
+from lavender.residuals import reference
+
+__all__ = ["FORMS", "QP", "impulse_form", "pick_form", "target", "velocity_form"]
+
+FORMS = ("impulse", "velocity", "auto")
+IntpArray = npt.NDArray[np.intp]
+MASS_RATIO = 1e3  # from here on the velocity form is more accurate, whatever the sizes
+
+
+@dataclass(frozen=True)
+class QP:
+    """A convex program and the way back; see the module. All arrays are free of units."""
+
+    form: str  # "impulse" or "velocity"
+    P: sp.csc_matrix  # (n, n) symmetric, both triangles
+    q: FloatArray  # (n,)
+    A: sp.csc_matrix  # (r, n)
+    b: FloatArray  # (r,)
+    n_zero: int  # rows with s = 0, first
+    n_nonneg: int  # rows with s >= 0, next
+    soc: tuple[int, ...]  # sizes of the second-order cones, last
+    lb: FloatArray | None  # (n,), or no bounds at all
+    ub: FloatArray | None  # (n,)
+    problem: Problem
+    kept: IntpArray  # (k,) rows of the problem that are unknown here
+    fixed: FloatArray  # (m,) N s, impulse of the rows that are not; 0 elsewhere
+    root: FloatArray  # (k,) S, kg^1/2
+    sigma: float  # J^1/2
+    back: sp.csr_matrix  # T (k, r), velocity form
+    shift: FloatArray  # r (k,), velocity form
+    lift: sp.csr_matrix  # K~ (k, n - number of t), velocity form
+
+    @property
+    def n(self) -> int:
+        """Number of unknowns."""
+        return len(self.q)
+
+    @property
+    def is_bounds_only(self) -> bool:
+        """No rows, and no bound that is finite: a backend may call it unconstrained."""
+        no_bound = self.lb is None or not (np.isfinite(self.lb).any() or np.isfinite(self.ub).any())
+        return len(self.b) == 0 and no_bound
+
+    def impulse(self, x: FloatArray, zeta: FloatArray) -> FloatArray:
+        """lambda (m,) [N s] of an answer, rounding outside constant bounds clipped."""
+        lam = self.fixed.copy()
+        z = x if self.form == "impulse" else self.shift + self.back @ zeta
+        lam[self.kept] = self.sigma * self.root * z
+        c = self.problem.cones
+        return np.clip(lam, c.lower, c.upper, out=lam)
+
+    def direction(self, x: FloatArray | None, zeta: FloatArray | None) -> FloatArray | None:
+        """Certificate (m,) that no solution exists, of an unbounded x or of contradicting rows; None without one."""
+        given = x if self.form == "impulse" else zeta
+        if given is None or len(given) != (self.n if self.form == "impulse" else len(self.b)):
+            return None
+        y = np.zeros(self.problem.m)
+        y[self.kept] = self.root * (given if self.form == "impulse" else self.back @ given)
+        c = self.problem.cones
+        # Out of the recession cone of the bounds by rounding only.
+        y = np.clip(
+            y, np.where(np.isfinite(c.lower), 0.0, -np.inf), np.where(np.isfinite(c.upper), 0.0, np.inf)
+        )
+        big = np.abs(y).max(initial=0.0)
+        return y / big if 0.0 < big < np.inf else None
+
+    def multiplier(self, x: FloatArray, xi: FloatArray) -> FloatArray:
+        """The backend's own multiplier of the bounds of lambda, z (m,) [m/s] with A lambda - b + z = 0.
+
+        Impulse form: xi. Velocity form: -w of its own velocities. Rows that were taken out: their slack.
+        """
+        if self.form == "impulse":
+            lam = self.fixed.copy()
+            lam[self.kept] = self.sigma * self.root * x
+            z = -self.problem.slack(lam)
+            z[self.kept] = xi * (self.sigma / self.root)
+            return z
+        z = np.zeros(self.problem.m)
+        g = self.problem.b[self.kept] * (self.root / self.sigma)
+        z[self.kept] = -(self.lift @ x[: self.lift.shape[1]] - g) * (self.sigma / self.root)
+        return z
+
+    def start(self, impulse: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """(x, zeta, xi) of a warm start (m,) [N s]; for programs without second-order cones."""
+        z = impulse[self.kept] / (self.sigma * self.root)
+        xi = np.zeros(self.n)
+        if self.form == "impulse":
+            if self.lb is not None:
+                gradient = self.P @ z + self.q
+                at_low, at_high = z <= self.lb, z >= self.ub
+                xi = np.where(at_low, np.minimum(-gradient, 0.0), 0.0) + np.where(
+                    at_high, np.maximum(-gradient, 0.0), 0.0
+                )
+            # The equality form of a linear system: P x - b = 0 with P (x + zeta) = 0.
+            return z, -z if len(self.b) else np.zeros(0), xi
+        ny = self.lift.shape[1]
+        zeta = self.back.T @ (z - self.shift)
+        zeta[self.n_zero :] = np.maximum(zeta[self.n_zero :], 0.0)
+        x = np.zeros(self.n)
+        x[:ny] = self.lift.T @ (self.shift + self.back @ zeta)
+        x[ny:] = np.maximum(self.A[:, ny:].T @ (self.A[:, :ny] @ x[:ny] - self.b) * -1.0, 0.0)
+        return x, zeta, xi
+
+
+def pick_form(problem: Problem, form: str, definite: bool = False) -> str:
+    """ "impulse" or "velocity". "auto": velocity where rows are known and m > 6 n, the mass ratio is 1e3
+    or more, or the backend needs a definite P (`definite`).
+
+    Raises
+    ------
+    InputError
+        No such form.
+    CapabilityError
+        "velocity" for a problem given as a matrix.
+    """
+    if form not in FORMS:
+        raise InputError(f"form is {form!r}; one of {', '.join(map(repr, FORMS))} is needed")
+    rows = problem.rows
+    if form == "velocity" and rows is None:
+        raise CapabilityError(
+            "form='velocity' needs a problem with rows (Problem.from_rows); this one was given as a matrix"
+        )
+    if form != "auto":
+        return form
+    if rows is None:
+        return "impulse"
+    moving = rows.inv_mass[rows.inv_mass > 0.0]
+    ratio = moving.max() / moving.min() if len(moving) else 1.0
+    return "velocity" if definite or problem.m > 6 * rows.n_bodies or ratio >= MASS_RATIO else "impulse"
+
+
+def target(problem: Problem, tol: float) -> float:
+    """Largest residual of one unknown [-] with which the judge's relative residual is at most `tol`.
+
+    E <= sqrt(m) sigma eps,  V <= max sqrt(nu) sigma eps
+    """
+    energy, velocity = reference(problem)
+    sigma = _sigma(problem)
+    each = [
+        start / (size * sigma)
+        for start, size in (
+            (energy, np.sqrt(problem.m)),
+            (velocity, np.sqrt(problem.data.nu.max(initial=0.0))),
+        )
+        if start > 0.0 and size > 0.0
+    ]
+    return tol * min([1.0, *each])
+
+
+def impulse_form(problem: Problem, *, unit_diagonal: bool = True, equality: bool = False) -> QP:
+    """min 1/2 l.A l - b.l over the bounds or friction cones of a symmetric problem.
+
+    Parameters
+    ----------
+    unit_diagonal : bool
+        Scale by D^-1/2; otherwise by one number, so that P is A in other units.
+    equality : bool
+        Write a linear system as min 1/2 x.P x subject to P x = -q, for backends that need a row.
+    """
+    parts = _Parts.of(problem, unit_diagonal)
+    c, kept, root, sigma = problem.cones, parts.kept, parts.root, parts.sigma
+    a = problem.csr
+    scale = sp.diags_array(root)
+    p = sp.csc_matrix(scale @ a[kept][:, kept] @ scale)
+    b = problem.b - (a @ parts.fixed if parts.fixed.any() else 0.0)
+    q = -root * b[kept] / sigma
+    rows, k = parts.friction_rows(), len(kept)
+    lb = ub = None
+    if not problem.cones.is_free:
+        lb, ub = c.lower[kept] / (root * sigma), c.upper[kept] / (root * sigma)
+    matrix, rhs, n_zero = sp.csc_matrix((0, k)), np.zeros(0), 0
+    if equality:
+        matrix, rhs, n_zero, q = p, -q, k, np.zeros(k)
+    elif len(parts.contacts):
+        # s = a x_n - x_t >= 0, s = a x_n + x_t >= 0;  s = (a x_n, x_t) in the cone of the disk.
+        put = _Entries()
+        for n, t, ratio in rows.pairs:
+            put.row([(n, -ratio), (t, 1.0)])
+            put.row([(n, -ratio), (t, -1.0)])
+        for n, t1, t2, ratio in rows.disks:
+            put.row([(n, -ratio)])
+            put.row([(t1, -1.0)])
+            put.row([(t2, -1.0)])
+        matrix = put.matrix(k)
+        rhs = np.zeros(matrix.shape[0])
+    return QP(
+        "impulse", p, q, matrix, rhs, n_zero, 2 * len(rows.pairs), (3,) * len(rows.disks), lb, ub,
+        problem, kept, parts.fixed, root, sigma, sp.csr_matrix((k, len(rhs))), np.zeros(k), sp.csr_matrix((k, 0)),
+    )  # fmt: skip
+
+
+def velocity_form(problem: Problem) -> QP:
+    """The mass-scaled velocity form of a problem with rows.
+
+    Raises
+    ------
+    CapabilityError
+        The problem was given as a matrix.
+    """
+    form = problem.velocity_form()
+    parts = _Parts.of(problem, True)
+    c, kept, root, sigma = problem.cones, parts.kept, parts.root, parts.sigma
+    k = len(kept)
+    jac = sp.csr_matrix(form.jacobian)
+    theta = form.theta[kept]
+    soft = np.flatnonzero(theta > 0.0)
+    soften = sp.csr_matrix((np.sqrt(theta[soft]), (soft, np.arange(len(soft)))), shape=(k, len(soft)))
+    lift = sp.csr_matrix(sp.hstack([jac[kept], soften]))
+    ny = lift.shape[1]
+    g = form.rhs[kept] / sigma
+    low, high = c.lower[kept] / (root * sigma), c.upper[kept] / (root * sigma)
+    rows = parts.friction_rows()
+    plain = np.ones(k, bool)
+    plain[rows.members] = False
+    has_low, has_high = np.isfinite(low), np.isfinite(high)
+    free = np.flatnonzero(plain & ~has_low & ~has_high)
+    lower = np.flatnonzero(plain & has_low)
+    both = np.flatnonzero(plain & has_low & has_high)
+    upper = np.flatnonzero(plain & ~has_low & has_high)
+    shift = np.zeros(k)
+    shift[lower], shift[upper] = low[lower], high[upper]
+    # Columns of T, and the entries of the t unknowns in their rows.
+    put, slack = _Entries(), _Entries()
+    t_of = {int(i): ny + j for j, i in enumerate(both)}
+    n = ny + len(both)
+    for i in free:
+        put.row([(int(i), 1.0)])
+        slack.row([])
+    for i in lower:
+        put.row([(int(i), 1.0)])
+        slack.row([(t_of[int(i)], -1.0)] if int(i) in t_of else [])
+    for i in upper:
+        put.row([(int(i), -1.0)])
+        slack.row([])
+    heads: dict[int, list[tuple[int, float]]] = {}
+    for normal, tangent, ratio in rows.pairs:
+        heads.setdefault(normal, []).append((n, ratio))
+        for sign in (-1.0, 1.0):
+            put.row([(tangent, sign)])
+            slack.row([(n, -1.0)])
+        n += 1
+    alone = [normal for normal in heads if normal not in {d[0] for d in rows.disks}]
+    for normal in alone:
+        put.row([(normal, 1.0)])
+        slack.row(heads[normal])
+    for normal, t1, t2, ratio in rows.disks:
+        put.row([(normal, 1.0)])
+        slack.row(heads.get(normal, []))
+        for tangent in (t1, t2):
+            put.row([(tangent, ratio)])
+            slack.row([])
+    back = sp.csr_matrix(put.matrix(k).T)
+    matrix = sp.csc_matrix(sp.hstack([-(back.T @ lift), sp.csc_matrix((back.shape[1], 0))]))
+    matrix = sp.csc_matrix(
+        (matrix.data, matrix.indices, np.pad(matrix.indptr, (0, n - ny), mode="edge")),
+        shape=(back.shape[1], n),
+    )
+    matrix = sp.csc_matrix(matrix + slack.matrix(n))
+    q = np.zeros(n)
+    known = np.zeros(ny)
+    known[: jac.shape[1]] = jac.T @ (parts.fixed / (form.scale * sigma))
+    q[:ny] = -(lift.T @ shift) - known
+    q[ny : ny + len(both)] = high[both] - low[both]
+    lb = ub = None
+    if n > ny:
+        lb, ub = np.full(n, -np.inf), np.full(n, np.inf)
+        lb[ny:] = 0.0
+    diagonal = np.zeros(n)
+    diagonal[:ny] = 1.0
+    n_nonneg = len(lower) + len(upper) + 2 * len(rows.pairs) + len(alone)
+    return QP(
+        "velocity", sp.csc_matrix(sp.diags_array(diagonal)), q, matrix, -(back.T @ g), len(free), n_nonneg,
+        (3,) * len(rows.disks), lb, ub, problem, kept, parts.fixed, root, sigma, back, shift, lift,
+    )  # fmt: skip
+
+
+def _sigma(problem: Problem) -> float:
+    energy, velocity = reference(problem)
+    if problem.rows is None:
+        d = problem.d
+        heaviest = 1.0 / d.min() if len(d) else 0.0
+    else:
+        moving = problem.rows.inv_mass[problem.rows.inv_mass > 0.0]
+        heaviest = 1.0 / moving.min() if len(moving) else 0.0
+    sigma = max(energy / np.sqrt(max(problem.m, 1)), velocity * np.sqrt(heaviest))
+    return float(sigma) if 0.0 < sigma < np.inf else 1.0
+
+
+class _Entries:
+    """Rows of a sparse matrix, one after the other."""
+
+    def __init__(self) -> None:
+        self.ptr, self.column, self.value = [0], list[int](), list[float]()
+
+    def row(self, entries: list[tuple[int, float]]) -> None:
+        for column, value in entries:
+            self.column.append(column)
+            self.value.append(value)
+        self.ptr.append(len(self.column))
+
+    def matrix(self, columns: int) -> sp.csc_matrix:
+        shape = (len(self.ptr) - 1, columns)
+        return sp.csc_matrix(
+            sp.csr_matrix((np.array(self.value, float), np.array(self.column, int), self.ptr), shape)
+        )
+
+
+@dataclass(frozen=True)
+class _FrictionRows:
+    """Rows of friction among the kept ones, with a = mu S_n / S_t (times r on spin) in scaled unknowns."""
+
+    pairs: list[tuple[int, int, float]]  # normal, the row bounded by |x| <= a x_n, a
+    disks: list[tuple[int, int, int, float]]  # normal, two tangents, a
+
+    @property
+    def members(self) -> list[int]:
+        return [i for p in self.pairs for i in p[:2]] + [i for d in self.disks for i in d[:3]]
+
+
+@dataclass(frozen=True)
+class _Parts:
+    """What both forms share: rows that stay, impulses of those that do not, scaling."""
+
+    problem: Problem
+    kept: IntpArray
+    fixed: FloatArray
+    root: FloatArray
+    sigma: float
+    contacts: IntpArray  # blocks with friction rows that stay
+
+    @classmethod
+    def of(cls, problem: Problem, unit_diagonal: bool) -> _Parts:
+        c = problem.cones
+        known = (c.lower == c.upper) & np.isfinite(c.lower)
+        fixed = np.where(known, c.lower, 0.0)
+        size = np.diff(c.ptr)
+        alone = np.repeat((c.kind == ROW) | (size == 1), size)
+        for i in np.asarray(problem.data.empty, int):
+            # A row of zeros: b alone decides, and where no finite bound meets it the front door has said so.
+            if alone[i]:
+                bound = c.upper[i] if problem.b[i] > 0.0 else c.lower[i] if problem.b[i] < 0.0 else 0.0
+                known[i] = True
+                fixed[i] = np.clip(bound if np.isfinite(bound) else 0.0, c.lower[i], c.upper[i])
+        friction = np.flatnonzero((c.kind != ROW) & (size > 1))
+        stays = []
+        for i in friction:
+            start, end = c.ptr[i] + 1, c.ptr[i + 1]
+            spin = c.kind[i] == CONTACT_SPIN
+            if c.mu[i] == 0.0:
+                known[start:end] = True
+                continue
+            if spin and c.patch_radius[i] == 0.0:
+                known[end - 1] = True
+            if not known[start:end].all():
+                stays.append(i)
+        kept = np.flatnonzero(~known)
+        d = problem.d[kept]
+        if not unit_diagonal and len(d):
+            d = np.full(len(d), np.exp(np.mean(np.log(d))))
+        return cls(problem, kept, fixed, 1.0 / np.sqrt(d), _sigma(problem), np.array(stays, int))
+
+    def friction_rows(self) -> _FrictionRows:
+        c = self.problem.cones
+        place = np.full(self.problem.m, -1)
+        place[self.kept] = np.arange(len(self.kept))
+        pairs: list[tuple[int, int, float]] = []
+        disks: list[tuple[int, int, int, float]] = []
+        for i in self.contacts:
+            n, end = int(c.ptr[i]), int(c.ptr[i + 1])
+            spin = c.kind[i] == CONTACT_SPIN
+            tangents = list(range(n + 1, end - 1 if spin else end))
+            j = int(place[n])
+            ratio = [float(c.mu[i] * self.root[j] / self.root[place[t]]) for t in tangents]
+            if len(tangents) == 1:
+                pairs.append((j, int(place[tangents[0]]), ratio[0]))
+            elif tangents:
+                disks.append((j, int(place[tangents[0]]), int(place[tangents[1]]), ratio[0]))
+            if spin and place[end - 1] >= 0:
+                s = int(place[end - 1])
+                pairs.append((j, s, float(c.mu[i] * c.patch_radius[i] * self.root[j] / self.root[s])))
+        return _FrictionRows(pairs, disks)

@@ -1,0 +1,78 @@
+"""Clarabel on the convex relaxation of friction: disk and spin as second-order cones.
+
+    min 1/2 l.A l - b.l,   l_n >= 0,  |l_t| <= mu l_n,  |l_s| <= mu r l_n          (impulse form)
+
+or the velocity form of `as_qp` with the dual cone w_n >= a |w_t| + a_s |w_s|. Bounded rows come along, so
+it takes linear and boxed problems too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from lavender._arrays import FloatArray
+from lavender.errors import InputError
+from lavender.external._running import ask, definite_refusal, symmetric_refusal
+from lavender.external.as_qp import QP, impulse_form, pick_form, velocity_form
+from lavender.external.qpsolvers_ import OPTIONS, _clarabel
+from lavender.problem import Problem
+from lavender.registry import SolverSpec
+from lavender.solution import Claim
+
+
+@dataclass(frozen=True)
+class ClarabelCone:
+    """Options as those of the QP backends."""
+
+    form: str = "auto"
+    unit_diagonal: bool = True
+    settings: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.settings, Mapping):
+            raise InputError(
+                f"settings is a {type(self.settings).__name__}; a mapping of names to values is needed"
+            )
+
+    def prepare(self, problem: Problem) -> tuple[Problem, QP]:
+        if pick_form(problem, self.form) == "velocity":
+            return problem, velocity_form(problem)
+        return problem, impulse_form(problem, unit_diagonal=self.unit_diagonal)
+
+    def update(self, state: tuple[Problem, QP], problem: Problem) -> tuple[Problem, QP]:
+        return self.prepare(problem)
+
+    def run(
+        self,
+        state: tuple[Problem, QP],
+        impulse: FloatArray,
+        n: int,
+        tol: float,
+        time_limit: float | None = None,
+    ) -> Claim:
+        problem, qp = state
+        return ask(problem, qp, impulse, _clarabel, n, tol, time_limit, self.settings, stoppable=True)
+
+
+def refusal(problem: Problem) -> str | None:
+    """Why it cannot take this problem."""
+    return symmetric_refusal(problem) or definite_refusal(problem)
+
+
+SPEC = SolverSpec(
+    name="clarabel_cone",
+    factory=ClarabelCone,
+    laws=frozenset({"linear", "lcp", "cone"}),
+    resumable=False,
+    external=True,
+    impulse=False,
+    max_iter=200,
+    options=OPTIONS,
+    requires=("clarabel",),
+    install="clarabel",
+    summary="interior point on the convex relaxation of friction, second-order cones",
+    reference="Goulart, Chen 2024, Clarabel; Tasora, Anitescu 2011 for the relaxation",
+    refusal=refusal,
+)
