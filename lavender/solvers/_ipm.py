@@ -1,0 +1,457 @@
+"""The problem in the scaled unknown z = D^1/2 lambda, its Newton systems, and a cold interior point.
+
+    H z - g = s,   H = D^-1/2 A D^-1/2,   g = D^-1/2 b,   z, s complementary on every block
+
+Two forms of H: `VelocitySystem` never forms it (K K^T + theta with one small dense block for each body,
+factored in compiled code), `MatrixSystem` holds it (dense LAPACK or sparse LU). The equations are in
+`lavender_ext/newton.pyx`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import qdldl
+import scipy.linalg as sl
+import scipy.sparse as sp
+import scipy.sparse.linalg as ssl
+
+from lavender._arrays import FloatArray, IntArray
+from lavender.cones import CONTACT, CONTACT_SPIN, ROW
+from lavender.problem import Problem
+from lavender_ext import newton as kernels
+
+DENSE_ROWS = 400  # below: dense LAPACK beats sparse bookkeeping
+DENSE_FILL = 0.1  # nonzero share of A above which a sparse factor is full anyway
+DENSE_LIMIT = 6000  # rows; 288 MB of A
+
+# Weight of the proximal term in an interior point system, relative to d: far below any step that
+# matters, far above the rounding of a pivot.
+DELTA = 1e-10
+
+
+@dataclass
+class Scaled:
+    """Rows that move, as elements. Fixed rows (equal bounds, mu = 0 tangents, empty rows) are taken out."""
+
+    problem: Problem
+    keep: IntArray  # (mk,) rows that move
+    fixed: FloatArray  # (m,) impulse of the fixed rows, 0 elsewhere
+    scale: FloatArray  # (mk,) D^-1/2
+    g: FloatArray  # (mk,)
+    theta: FloatArray  # (mk,)
+    ptr: IntArray
+    kind: IntArray
+    wptr: IntArray
+    lower: FloatArray
+    upper: FloatArray
+    a_t: FloatArray
+    a_s: FloatArray
+    bodies: IntArray | None = None  # (n, 2) bodies of each element
+    whole: bool = True  # every row moves
+
+    @property
+    def m(self) -> int:
+        return len(self.keep)
+
+    def impulse(self, z: FloatArray) -> FloatArray:
+        """lambda (m,) of z."""
+        if self.whole:
+            return z * self.scale
+        lam = self.fixed.copy()
+        lam[self.keep] = z * self.scale
+        return lam
+
+    def unknown(self, impulse: FloatArray) -> FloatArray:
+        """z of lambda (m,)."""
+        return (impulse if self.whole else impulse[self.keep]) / self.scale
+
+
+def scaled(problem: Problem) -> Scaled:
+    """Scale, and take out what cannot move."""
+    cones, d, m = problem.cones, problem.d, problem.m
+    size = np.diff(cones.ptr)
+    single = cones.is_bounded_rows
+    fixed = np.zeros(m)
+    still = cones.lower == cones.upper
+    if single:
+        row = np.repeat(cones.kind == ROW, size)
+    else:
+        row = np.repeat((cones.kind == ROW) | (size == 1), size)
+        mu, radius = np.repeat(cones.mu, size), np.repeat(cones.patch_radius, size)
+        position = np.arange(m) - np.repeat(cones.ptr[:-1], size)
+        contact = np.repeat(cones.kind != ROW, size)
+        spin = contact & np.repeat(cones.kind == CONTACT_SPIN, size) & (position == np.repeat(size, size) - 1)
+        still = still | (contact & (position > 0) & ((mu == 0.0) | (spin & (radius == 0.0))))
+    fixed[still] = np.where(np.isfinite(cones.lower[still]), cones.lower[still], 0.0)
+    for i in problem.data.empty:
+        block = problem.block_of(int(i))
+        if cones.kind[block] == ROW or size[block] == 1:
+            still = still.copy() if still.base is not None else still
+            still[i] = True
+            bound = cones.upper[i] if problem.b[i] > 0.0 else cones.lower[i] if problem.b[i] < 0.0 else 0.0
+            fixed[i] = np.clip(bound if np.isfinite(bound) else 0.0, cones.lower[i], cones.upper[i])
+    whole = not still.any()
+    keep = np.arange(m, dtype=np.int32) if whole else np.flatnonzero(~still).astype(np.int32)
+    b = problem.b if whole or not fixed.any() else problem.b + _minus_fixed(problem, fixed)
+    scale = 1.0 / np.sqrt(d if whole else d[keep])
+    mk = len(keep)
+    compliance = problem.compliance
+    theta = np.zeros(mk) if compliance is None else (compliance[keep] * scale * scale)
+    lower, upper = cones.lower[keep] / scale, cones.upper[keep] / scale
+    if single:
+        n = mk
+        ptr, kind = np.arange(n + 1, dtype=np.int32), np.zeros(n, np.int32)
+        a_t = a_s = np.zeros(n)
+        wptr = ptr
+    else:
+        block = np.repeat(np.arange(len(size)), size)[keep]
+        is_row = row[keep]
+        first = np.ones(mk, bool)
+        first[1:] = is_row[1:] | (block[1:] != block[:-1])
+        start = np.flatnonzero(first)
+        ptr = np.append(start, mk).astype(np.int32)
+        n_rows = np.diff(ptr)
+        kind = np.where(is_row[start] | (n_rows == 1), ROW, CONTACT).astype(np.int32)
+        of = block[start]
+        with_spin = np.zeros(len(start), bool)
+        last = ptr[1:] - 1
+        with_spin = spin[keep][last] & (kind != ROW)
+        kind[with_spin] = CONTACT_SPIN
+        wptr = np.concatenate([[0], np.cumsum(n_rows**2)]).astype(np.int32)
+        root = 1.0 / scale
+        second = np.minimum(start + 1, max(mk - 1, 0))
+        contact_of = kind != ROW
+        a_t = np.where(contact_of, cones.mu[of] * root[second] / root[start], 0.0)
+        a_s = np.where(with_spin, (cones.mu * cones.patch_radius)[of] * root[last] / root[start], 0.0)
+    bodies = None
+    if problem.rows is not None:
+        rows = problem.rows
+        per_block = np.concatenate([rows.joint_body, rows.contact_body])
+        element_block = np.repeat(np.arange(len(size)), size)[keep][ptr[:-1]]
+        bodies = np.ascontiguousarray(per_block[element_block], np.int32)
+    return Scaled(problem, keep, fixed, scale, b[keep] * scale, theta, ptr, kind, wptr, lower, upper, a_t, a_s, bodies, whole)
+
+
+def _minus_fixed(problem: Problem, fixed: FloatArray) -> FloatArray:
+    # -A fixed: slack(fixed) = A fixed - b
+    return -(problem.slack(fixed) + problem.b)
+
+
+class System:
+    """H and its Newton systems; the two forms share the elements."""
+
+    form = ""
+    factorisations = 0
+
+    def __init__(self, sc: Scaled, unsymmetric: bool) -> None:
+        self.sc = sc
+        self.unsymmetric = unsymmetric  # the natural map's Newton matrix is
+        m = sc.m
+        self.v = np.zeros(int(sc.wptr[-1]))
+        self.einv = np.zeros_like(self.v)
+        self.p = np.zeros_like(self.v)
+        self.t, self.q = np.zeros(m), np.zeros(m)
+
+    elements: Any
+
+    def _elements(self, node: IntArray, slot: IntArray, panel: FloatArray, s: int) -> Any:
+        sc = self.sc
+        return kernels.Elements(
+            sc.ptr, sc.kind, sc.wptr, node, slot, panel, sc.theta, sc.g, sc.lower, sc.upper,
+            np.ascontiguousarray(sc.a_t, float), np.ascontiguousarray(sc.a_s, float), s,
+            sc.problem.law == "coulomb",
+        )  # fmt: skip
+
+    def times(self, z: FloatArray) -> FloatArray:
+        raise NotImplementedError
+
+    def factor_barrier(self) -> bool:
+        """Factor H + W, with V = (W + theta + delta)^-1 in `v`."""
+        raise NotImplementedError
+
+    def solve_barrier(self, r: FloatArray) -> FloatArray:
+        raise NotImplementedError
+
+    def natural(self, z: FloatArray, s: FloatArray, f: FloatArray, augmented: bool, eps: float) -> int:
+        """F into f, and the small matrices of its derivative; the fingerprint of the active pieces."""
+        return self.elements.natural(z, s, augmented, eps, f, self.p, self.einv, self.v)
+
+    def factor_natural(self, eps: float) -> bool:
+        raise NotImplementedError
+
+    def solve_natural(self, r: FloatArray) -> FloatArray:
+        raise NotImplementedError
+
+    def natural_times(self, dz: FloatArray) -> FloatArray:
+        """(I - P) dz + P H dz."""
+        out = np.empty_like(dz)
+        self.elements.times(self.p, self.times(dz) - dz, out)
+        return out + dz
+
+
+class VelocitySystem(System):
+    """K K^T + theta, one block column of s unknowns for each body."""
+
+    form = "velocity"
+
+    def __init__(self, sc: Scaled, unsymmetric: bool) -> None:
+        super().__init__(sc, unsymmetric)
+        rows = sc.problem.rows
+        assert rows is not None and sc.bodies is not None
+        full = np.zeros((sc.problem.m, 12))
+        kernels.panel(sc.problem.data, rows.inv_inertia, np.sqrt(rows.inv_mass), full)
+        if not sc.whole:
+            full = full[sc.keep]
+        used = full.any(axis=0)
+        used = used[:6] | used[6:]
+        s = max(1, int(used.sum()))
+        s = next(k for k in (1, 2, 3, 6) if k >= s)
+        columns = np.flatnonzero(used)
+        if len(columns) < s:
+            columns = np.concatenate([columns, np.flatnonzero(~used)])[:s]
+        columns.sort()
+        halves = full.reshape(-1, 2, 6)[:, :, columns] if s < 6 else full.reshape(-1, 2, 6)
+        body = sc.bodies
+        nptr, nind, rank, slot = block_pattern(rows.n_bodies, body)
+        node = np.where(body >= 0, rank[np.maximum(body, 0)], -1).astype(np.int32)
+        swap = node[:, 0] < node[:, 1]
+        node[swap] = node[swap][:, ::-1]
+        turned = np.repeat(swap, np.diff(sc.ptr))
+        halves = np.ascontiguousarray(halves)
+        halves[turned] = halves[turned][:, ::-1]
+        self.s, self.n = s, rows.n_bodies
+        self.elements = self._elements(node, slot, halves, s)
+        self.structure = (nptr, nind, *kernels.symbolic(nptr, nind))
+        self.y = np.zeros(self.n * s + 1)
+        self.factor: Any = None
+
+    def _factor(self, lu: bool) -> bool:
+        if self.factor is None or (lu and not self.factor_unsymmetric):
+            self.factor = kernels.Factor(*self.structure, self.s, lu)
+            self.factor_unsymmetric = lu
+        self.factorisations += 1
+        return self.factor.factor(self.elements, self.v, lu) == 0
+
+    def times(self, z: FloatArray) -> FloatArray:
+        if self.factor is None:
+            self.factor = kernels.Factor(*self.structure, self.s, False)
+            self.factor_unsymmetric = False
+        out = np.empty_like(z)
+        self.factor.gram(self.elements, z, self.y, out)
+        return out + self.sc.theta * z
+
+    def factor_barrier(self) -> bool:
+        return self._factor(False)
+
+    def solve_barrier(self, r: FloatArray) -> FloatArray:
+        t, q = self.t, self.q
+        self.elements.times(self.v, r, t)
+        self.factor.solve(self.elements, t, self.y, q)
+        out = np.empty_like(r)
+        self.elements.times(self.v, r - q, out)
+        return out
+
+    def factor_natural(self, eps: float) -> bool:
+        return self._factor(self.unsymmetric)
+
+    def solve_natural(self, r: FloatArray) -> FloatArray:
+        t, q = self.t, self.q
+        self.elements.times(self.einv, r, t)
+        self.factor.solve(self.elements, t, self.y, q)
+        self.elements.times(self.p, q, t)
+        out = np.empty_like(r)
+        self.elements.times(self.einv, r - t, out)
+        return out
+
+
+class MatrixSystem(System):
+    """H as a matrix: dense LAPACK, or sparse LU."""
+
+    form = "impulse"
+
+    def __init__(self, sc: Scaled, unsymmetric: bool) -> None:
+        super().__init__(sc, unsymmetric)
+        m = sc.m
+        a = sc.problem.csr
+        if not sc.whole:
+            a = a[sc.keep][:, sc.keep]
+        self.dense = m <= DENSE_ROWS or (a.nnz > DENSE_FILL * m * m and m <= DENSE_LIMIT)
+        h = sp.diags_array(sc.scale) @ a @ sp.diags_array(sc.scale)
+        self.h: Any = np.asfortranarray(h.toarray()) if self.dense else sp.csr_array(h)
+        # theta is on the diagonal of A already.
+        sc.theta = np.zeros(m)
+        self.symmetric = sc.problem.is_symmetric
+        n = len(sc.kind)
+        self.elements = self._elements(np.full((n, 2), -1, np.int32), np.zeros((n, 3), np.int32), np.zeros((m, 2)), 1)
+        # Rows and columns of the elements' small matrices, row by row of each.
+        size = np.diff(sc.ptr)
+        nr = np.repeat(size, size**2)
+        inner = np.arange(int(sc.wptr[-1])) - np.repeat(sc.wptr[:-1], size**2)
+        base = np.repeat(sc.ptr[:-1], size**2)
+        self.small_row, self.small_column = base + inner // nr, base + inner % nr
+        self.solver: Any = None
+
+    def small(self, values: FloatArray) -> sp.csr_array:
+        m = self.sc.m
+        return sp.csr_array((values, (self.small_row, self.small_column)), shape=(m, m))
+
+    def times(self, z: FloatArray) -> FloatArray:
+        return self.h @ z
+
+    def _lu(self, matrix: Any) -> bool:
+        self.factorisations += 1
+        if self.dense:
+            lu, pivot, info = sl.lapack.dgetrf(matrix, overwrite_a=True)
+            self.solver = lambda r: sl.lapack.dgetrs(lu, pivot, r)[0]
+            return info == 0
+        try:
+            factor = ssl.splu(sp.csc_array(matrix), permc_spec="COLAMD")
+        except RuntimeError:
+            self.solver = None
+            return False
+        self.solver = factor.solve
+        return True
+
+    def factor_barrier(self) -> bool:
+        # H + V^-1, or I + V H where V is not diagonal: its inverse would lose the small eigenvalues.
+        m = self.sc.m
+        diagonal = len(self.sc.kind) == m
+        self.premultiply = not diagonal
+        if not self.dense:
+            if diagonal:
+                return self._lu(self.h + sp.diags_array(1.0 / self.v))
+            return self._lu(self.small(self.v) @ self.h + sp.eye_array(m))
+        every = np.arange(m)
+        if not diagonal:
+            matrix = np.asfortranarray(self.small(self.v) @ self.h)
+            matrix[every, every] += 1.0
+            return self._lu(matrix)
+        matrix = self.h.copy(order="F")
+        matrix[every, every] += 1.0 / self.v
+        if self.symmetric:
+            c, info = sl.lapack.dpotrf(matrix, lower=1, clean=0)
+            if info == 0:
+                self.factorisations += 1
+                self.solver = lambda r: sl.lapack.dpotrs(c, r, lower=1)[0]
+                return True
+        return self._lu(matrix)
+
+    def solve_barrier(self, r: FloatArray) -> FloatArray:
+        if self.premultiply:
+            t = np.empty_like(r)
+            self.elements.times(self.v, r, t)
+            r = t
+        return self.solver(r)
+
+    def factor_natural(self, eps: float) -> bool:
+        m = self.sc.m
+        if self.dense:
+            h = self.h.copy(order="F")
+            h[np.arange(m), np.arange(m)] += eps - 1.0
+            size = np.diff(self.sc.ptr)
+            if len(size) == m:
+                matrix = self.p[:, None] * h
+            else:
+                matrix = self.small(self.p) @ h
+            matrix = np.asfortranarray(matrix)
+            matrix[np.arange(m), np.arange(m)] += 1.0
+            return self._lu(matrix)
+        p = self.small(self.p)
+        return self._lu(p @ self.h + (eps - 1.0) * p + sp.eye_array(m))
+
+    def solve_natural(self, r: FloatArray) -> FloatArray:
+        return self.solver(r)
+
+
+def block_pattern(n: int, body: IntArray) -> tuple[IntArray, IntArray, IntArray, IntArray]:
+    """Lower block rows (nptr, nind), the rank of each body in the elimination order, and slots (elements, 3)."""
+    a, b = body[:, 0].astype(np.int64), body[:, 1].astype(np.int64)
+    both = (a >= 0) & (b >= 0)
+    code = np.unique(np.minimum(a, b)[both] * n + np.maximum(a, b)[both])
+    low, high = code // n, code % n
+    rank = _fill_reducing(n, low, high)
+    r_low, r_high = rank[low], rank[high]
+    row, column = np.maximum(r_low, r_high), np.minimum(r_low, r_high)
+    row, column = np.concatenate([row, np.arange(n)]), np.concatenate([column, np.arange(n)])
+    key = np.sort(row * n + column)
+    nptr = np.concatenate([[0], np.cumsum(np.bincount(key // n, minlength=n))]).astype(np.int32)
+    nind = (key % n).astype(np.int32)
+    ra, rb = np.where(a >= 0, rank[np.maximum(a, 0)], -1), np.where(b >= 0, rank[np.maximum(b, 0)], -1)
+    first, second = np.maximum(ra, rb), np.minimum(ra, rb)
+    slot = np.zeros((len(body), 3), np.int32)
+    slot[:, 0] = nptr[np.maximum(first, 0) + 1] - 1
+    slot[:, 1] = nptr[np.maximum(second, 0) + 1] - 1
+    slot[both, 2] = np.searchsorted(key, first[both] * n + second[both])
+    return nptr, nind, rank, slot
+
+
+def _fill_reducing(n: int, low: Any, high: Any) -> Any:
+    # Minimum degree (through qdldl) on the graph of bodies; a band of width 1 is left as it is.
+    if len(low) == 0 or int((high - low).max()) <= 1:
+        return np.arange(n)
+    degree = np.bincount(low, minlength=n) + np.bincount(high, minlength=n) + 1.0
+    index = np.concatenate([low, np.arange(n)])
+    other = np.concatenate([high, np.arange(n)])
+    value = np.concatenate([np.full(len(low), -1.0), degree])
+    graph = sp.csc_matrix((value, (index, other)), shape=(n, n))
+    order = np.asarray(qdldl.Solver(graph, upper=True).factors()[2], np.int64)
+    rank = np.empty(n, np.int64)
+    rank[order] = np.arange(n)
+    return rank
+
+
+def make_system(problem: Problem, form: str) -> System:
+    """The system of a problem; form "velocity" or "impulse"."""
+    sc = scaled(problem)
+    unsymmetric = problem.law == "coulomb"
+    return VelocitySystem(sc, unsymmetric) if form == "velocity" else MatrixSystem(sc, unsymmetric)
+
+
+@dataclass
+class InteriorPoint:
+    """Iterates of a Mehrotra predictor-corrector; `step()` takes one, `z` is the current point."""
+
+    system: System
+    z: FloatArray = field(init=False)
+    gap: float = field(init=False, default=np.inf)  # G z . u / degree
+    length: float = field(init=False, default=0.0)
+
+    def __post_init__(self) -> None:
+        sy, sc = self.system, self.system.sc
+        m = sc.m
+        size = np.diff(sc.ptr)
+        free = (sc.kind == ROW) & np.isinf(sc.lower[sc.ptr[:-1]]) & np.isinf(sc.upper[sc.ptr[:-1]]) if m else np.zeros(0, bool)
+        diagonal = np.repeat(sc.wptr[:-1], size) + (np.arange(m) - np.repeat(sc.ptr[:-1], size)) * (np.repeat(size, size) + 1)
+        sy.v[:] = 0.0
+        sy.v[diagonal] = 1.0 / (sc.theta + np.where(np.repeat(free, size), DELTA, 1.0))
+        self.u1, self.u2 = np.zeros(m), np.zeros(m)
+        self.t1, self.t2, self.r = np.zeros(m), np.zeros(m), np.zeros(m)
+        sy.factor_barrier()
+        self.z = sy.solve_barrier(sc.g)
+        self.degree = sy.elements.start(sy.times(self.z), self.z, self.u1, self.u2)
+
+    def step(self) -> bool:
+        """One predictor-corrector step; False where the factorisation or the step fails."""
+        sy, sc, e = self.system, self.system.sc, self.system.elements
+        z, u1, u2 = self.z, self.u1, self.u2
+        hz = sy.times(z)
+        gap = e.scale(z, u1, u2, DELTA, sy.v)
+        if not sy.factor_barrier() and not np.isfinite(gap):
+            return False
+        da = sy.solve_barrier(sc.g - hz)
+        mu = gap / max(self.degree, 1.0)
+        if self.degree > 0:
+            _, after = e.affine(z, u1, u2, da)
+            sigma = min(1.0, max(after / gap, 0.0)) ** 3 if gap > 0 else 0.0
+        else:
+            sigma = 0.0
+        e.rhs(z, u1, u2, hz, da, sigma * mu, self.r)
+        dz = sy.solve_barrier(self.r)
+        if not np.isfinite(dz).all():
+            return False
+        self.length = e.step(z, u1, u2, dz, da, sigma * mu, 0.995, self.t1, self.t2)
+        self.gap = mu
+        return self.length > 0.0

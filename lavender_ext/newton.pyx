@@ -1,0 +1,1552 @@
+"""Newton systems of the whole problem: block Cholesky, interior point steps, natural map of every block.
+
+Scaled by d = diag(A): z = D^1/2 lambda [sqrt J], g = D^-1/2 b, s = H z - g,
+
+    H = D^-1/2 A D^-1/2 = K K^T + diag(theta),   K = D^-1/2 J M^-1/2                              (1)
+
+Elements: a bounded row, or a contact (normal, tangents, spin) whose cones in z are |z_t| <= a_t z_n and
+|z_s| <= a_s z_n. Both methods below ask for (H + W) dz = r with one small W for each element; in the
+velocity form, with V = (theta + W)^-1 per element,
+
+    N = I + K^T V K,   N dy = K^T V r,   dz = V (r - K dy)                                        (2)
+
+and N, one block of `s` columns for each body, is factored by block Cholesky in a fixed order. Nothing
+here squares J twice, and rows that depend on each other cost nothing.
+
+Interior point (Mehrotra 1992; Nesterov and Todd 1997 for the cones; Vandenberghe 2010, section 5 and 7):
+u dual to G z, G z and u inside every cone, W = G^T T^-2 G with T u = T^-1 G z = v the scaling,
+
+    affine     (H + W) dz = -(H z - g),                    du = -u - T^-2 G dz                    (3)
+    combined   c = v o v + (T^-1 G dz_a) o (T du_a) - sigma mu e,   sigma = (mu_a / mu)^3
+               (H + W) dz = -(H z - g - G^T u) - G^T T^-1 (v \\ c),  du = -T^-1 (v \\ c) - T^-2 G dz  (4)
+
+Natural map F = z - Pi(z - s), Newton step with a proximal weight eps on what is fixed by H alone:
+
+    (I - P + P (theta + eps)) dz + P K dy = r,   dy = K^T dz,   P in the derivative of Pi         (5)
+
+with E = I - P + P (theta + eps) the same as (2) for V = E^-1 P, r -> P^-1 r. For Coulomb friction the
+radius of the disk is a_t max(0, z_n - s_n) (Alart and Curnier 1991), P is not symmetric, and N is
+factored by block LU.
+"""
+from libc.math cimport fabs, sqrt
+from libc.stdint cimport int32_t, int64_t
+
+import numpy as np
+
+from lavender_ext.block cimport CONTACT, CONTACT_SPIN as SPIN, ROW, blocks_t, n_tangents
+from lavender_ext.problem cimport Data
+from lavender_ext.rows cimport contact_jacobian, rows_t
+
+cdef struct factor_t:
+    int32_t n                   # block columns
+    int32_t s                   # rows of a block, 1 to 6
+    const int32_t* nptr         # (n + 1) blocks of row k of N, columns <= k ascending, the diagonal last
+    const int32_t* nind
+    const int32_t* rptr         # (n + 1) pattern of row k of L, columns < k ascending
+    const int32_t* rind
+    const int32_t* lptr         # (n + 1) column of L, rows > j ascending
+    const int32_t* lind
+    double* nval                # lower blocks of N, row-major
+    double* mval                # their mirror (upper blocks, transposed), unsymmetric only
+    double* lval                # blocks of L, each transposed
+    double* uval                # blocks of U, unsymmetric only
+    double* dval                # (n) factored diagonal blocks
+    double* work                # (n) blocks, zero between calls
+    double* work2
+    int32_t* pivot              # (n s), unsymmetric only
+    int32_t* next               # (n)
+
+cdef struct elements_t:
+    int32_t n                   # elements
+    int32_t m                   # rows
+    int32_t s                   # columns of a body in the panel
+    int32_t coulomb
+    const int32_t* ptr          # (n + 1) first row
+    const int32_t* kind         # (n) ROW (one row each) | CONTACT | SPIN
+    const int32_t* wptr         # (n + 1) first entry of the element's small square matrices
+    const int32_t* node         # (n, 2) block columns, the first the larger, -1 where static
+    const int32_t* slot         # (n, 3) blocks of N: first-first, second-second, first-second
+    const double* panel         # (m, 2 s) K
+    const double* theta         # (m)
+    const double* g             # (m)
+    const double* lower         # (m) scaled, read on ROW
+    const double* upper         # (m)
+    const double* at            # (n) a_t
+    const double* as_           # (n) a_s
+
+
+# -- small dense blocks ---------------------------------------------------------------------------
+
+
+cdef inline void sub_product(double* w, const double* y, const double* lt, const int32_t s) noexcept nogil:
+    # w -= y l^T, l given transposed
+    cdef int32_t r, c, t
+    cdef double x
+    for r in range(s):
+        for t in range(s):
+            x = y[r * s + t]
+            for c in range(s):
+                w[r * s + c] -= x * lt[t * s + c]
+
+
+cdef inline void sub_square(double* w, const double* y, const int32_t s) noexcept nogil:
+    # w -= y y^T, lower triangle
+    cdef int32_t r, c, t
+    cdef double x
+    for r in range(s):
+        for c in range(r + 1):
+            x = 0.0
+            for t in range(s):
+                x += y[r * s + t] * y[c * s + t]
+            w[r * s + c] -= x
+
+
+cdef inline int32_t small_cholesky(double* a, const int32_t s) noexcept nogil:
+    # a = l l^T in the lower triangle; the diagonal holds 1 / l_ii. A pivot lost to rounding drops its column.
+    cdef int32_t i, j, t, lost = 0
+    cdef double x, top
+    for j in range(s):
+        top = a[j * s + j]
+        x = top
+        for t in range(j):
+            x -= a[j * s + t] * a[j * s + t]
+        if not x > 1e-15 * top:
+            lost += 1
+            x = 0.0
+        else:
+            x = 1.0 / sqrt(x)
+        a[j * s + j] = x
+        for i in range(j + 1, s):
+            top = a[i * s + j]
+            for t in range(j):
+                top -= a[i * s + t] * a[j * s + t]
+            a[i * s + j] = top * x
+    return lost
+
+
+cdef inline void solve_right(double* y, const double* l, const int32_t s) noexcept nogil:
+    # y <- y l^-T, row by row: the forward solve of each row
+    cdef int32_t r, c, t
+    cdef double x
+    for r in range(s):
+        for c in range(s):
+            x = y[r * s + c]
+            for t in range(c):
+                x -= y[r * s + t] * l[c * s + t]
+            y[r * s + c] = x * l[c * s + c]
+
+
+cdef inline int32_t factor_blocks(const factor_t* f, const int32_t s) noexcept nogil:
+    cdef int32_t k, q, p, j, i, c, r, lost = 0
+    cdef int64_t b = s * s
+    cdef double *y
+    cdef double *l
+    for k in range(f.n):
+        f.next[k] = f.lptr[k]
+    for k in range(f.n):
+        for q in range(f.nptr[k], f.nptr[k + 1]):
+            y = f.work + f.nind[q] * b
+            for c in range(s * s):
+                y[c] = f.nval[q * b + c]
+        for q in range(f.rptr[k], f.rptr[k + 1]):
+            j = f.rind[q]
+            y = f.work + j * b
+            solve_right(y, f.dval + j * b, s)
+            for p in range(f.lptr[j], f.next[j]):
+                sub_product(f.work + f.lind[p] * b, y, f.lval + p * b, s)
+            sub_square(f.work + k * b, y, s)
+            l = f.lval + f.next[j] * b
+            f.next[j] += 1
+            for r in range(s):
+                for c in range(s):
+                    l[c * s + r] = y[r * s + c]
+                    y[r * s + c] = 0.0
+        y = f.work + k * b
+        lost += small_cholesky(y, s)
+        for c in range(s * s):
+            f.dval[k * b + c] = y[c]
+            y[c] = 0.0
+    return lost
+
+
+cdef public int32_t lav_block_cholesky(const factor_t* f) noexcept nogil:
+    """N = L L^T, up-looking by block rows; returns the number of pivots lost to rounding."""
+    if f.s == 1:
+        return factor_blocks(f, 1)
+    if f.s == 2:
+        return factor_blocks(f, 2)
+    if f.s == 3:
+        return factor_blocks(f, 3)
+    if f.s == 6:
+        return factor_blocks(f, 6)
+    return factor_blocks(f, f.s)
+
+
+cdef inline void solve_blocks(const factor_t* f, double* x, const int32_t s) noexcept nogil:
+    cdef int32_t j, p, r, c
+    cdef int64_t b = s * s
+    cdef double t
+    cdef const double *l
+    cdef const double *d
+    cdef double *y
+    for j in range(f.n):
+        d = f.dval + j * b
+        for r in range(s):
+            t = x[j * s + r]
+            for c in range(r):
+                t -= d[r * s + c] * x[j * s + c]
+            x[j * s + r] = t * d[r * s + r]
+        for p in range(f.lptr[j], f.lptr[j + 1]):
+            l = f.lval + p * b
+            y = x + f.lind[p] * s
+            for c in range(s):
+                t = x[j * s + c]
+                for r in range(s):
+                    y[r] -= l[c * s + r] * t
+    for j in range(f.n - 1, -1, -1):
+        for p in range(f.lptr[j], f.lptr[j + 1]):
+            l = f.lval + p * b
+            y = x + f.lind[p] * s
+            for c in range(s):
+                t = 0.0
+                for r in range(s):
+                    t += l[c * s + r] * y[r]
+                x[j * s + c] -= t
+        d = f.dval + j * b
+        for r in range(s - 1, -1, -1):
+            t = x[j * s + r]
+            for c in range(r + 1, s):
+                t -= d[c * s + r] * x[j * s + c]
+            x[j * s + r] = t * d[r * s + r]
+
+
+cdef public void lav_block_solve(const factor_t* f, double* x) noexcept nogil:
+    """x <- N^-1 x after `lav_block_cholesky`, x (n, s)."""
+    if f.s == 1:
+        solve_blocks(f, x, 1)
+    elif f.s == 3:
+        solve_blocks(f, x, 3)
+    elif f.s == 6:
+        solve_blocks(f, x, 6)
+    else:
+        solve_blocks(f, x, f.s)
+
+
+# -- unsymmetric: block LU with pivots inside the diagonal blocks ------------------------------------
+
+
+cdef inline int32_t small_lu(double* a, int32_t* pivot, const int32_t s) noexcept nogil:
+    cdef int32_t i, j, k, best, lost = 0
+    cdef double x, top
+    for j in range(s):
+        best = j
+        top = fabs(a[j * s + j])
+        for i in range(j + 1, s):
+            if fabs(a[i * s + j]) > top:
+                top = fabs(a[i * s + j])
+                best = i
+        pivot[j] = best
+        if best != j:
+            for k in range(s):
+                x = a[j * s + k]
+                a[j * s + k] = a[best * s + k]
+                a[best * s + k] = x
+        if not top > 1e-300:
+            lost += 1
+            a[j * s + j] = 0.0
+            x = 0.0
+        else:
+            x = 1.0 / a[j * s + j]
+            a[j * s + j] = x                            # kept as reciprocal
+        for i in range(j + 1, s):
+            a[i * s + j] = a[i * s + j] * x
+            for k in range(j + 1, s):
+                a[i * s + k] -= a[i * s + j] * a[j * s + k]
+    return lost
+
+
+cdef inline void small_solve(const double* a, const int32_t* pivot, double* x, const int32_t s,
+                             const int32_t step) noexcept nogil:
+    # x <- a^-1 x, entries `step` apart
+    cdef int32_t i, j
+    cdef double t
+    for j in range(s):
+        if pivot[j] != j:
+            t = x[j * step]
+            x[j * step] = x[pivot[j] * step]
+            x[pivot[j] * step] = t
+    for i in range(1, s):
+        for j in range(i):
+            x[i * step] -= a[i * s + j] * x[j * step]
+    for i in range(s - 1, -1, -1):
+        for j in range(i + 1, s):
+            x[i * step] -= a[i * s + j] * x[j * step]
+        x[i * step] *= a[i * s + i]
+
+
+cdef inline int32_t lu_blocks(const factor_t* f, const int32_t s) noexcept nogil:
+    # L unit, D blocks, U = D times what is kept: N_kj = sum L_kq N_qj. With Y = row k of N after
+    # elimination, L_kj = Y_kj D_j^-1; uval holds D_j^-1 U_jk, lval holds Y_kj (transposed).
+    cdef int32_t k, q, p, j, i, c, r, lost = 0
+    cdef int64_t b = s * s
+    cdef double *y
+    cdef double *z
+    cdef double *l
+    cdef double *u
+    for k in range(f.n):
+        f.next[k] = f.lptr[k]
+    for k in range(f.n):
+        for q in range(f.nptr[k], f.nptr[k + 1]):
+            y = f.work + f.nind[q] * b
+            z = f.work2 + f.nind[q] * b                 # transposed: column k of N, as rows
+            for c in range(s * s):
+                y[c] = f.nval[q * b + c]
+                z[c] = f.mval[q * b + c]
+        for q in range(f.rptr[k], f.rptr[k + 1]):
+            j = f.rind[q]
+            y = f.work + j * b                          # Y_kj
+            z = f.work2 + j * b                         # (U_jk)^T
+            # z <- (D_j^-1 U_jk)^T: each row of z is a column of U_jk
+            for r in range(s):
+                small_solve(f.dval + j * b, f.pivot + j * s, z + r * s, s, 1)
+            for p in range(f.lptr[j], f.next[j]):
+                i = f.lind[p]
+                # N_ki -= Y_kj (D_j^-1 U_ji);  N_ik -= Y_ij (D_j^-1 U_jk), held transposed
+                sub_product(f.work + i * b, y, f.uval + p * b, s)
+                sub_product(f.work2 + i * b, z, f.lval + p * b, s)
+            l = f.lval + f.next[j] * b
+            u = f.uval + f.next[j] * b
+            f.next[j] += 1
+            for r in range(s):
+                for c in range(s):
+                    l[c * s + r] = y[r * s + c]
+                    u[c * s + r] = z[r * s + c]
+            sub_product(f.work + k * b, y, u, s)        # D_k -= Y_kj (D_j^-1 U_jk)
+            for c in range(s * s):
+                y[c] = 0.0
+                z[c] = 0.0
+        y = f.work + k * b
+        lost += small_lu(y, f.pivot + k * s, s)
+        for c in range(s * s):
+            f.dval[k * b + c] = y[c]
+            y[c] = 0.0
+            f.work2[k * b + c] = 0.0
+    return lost
+
+
+cdef public int32_t lav_block_lu(const factor_t* f) noexcept nogil:
+    """N = L U with the pattern of the symmetric factor; returns the number of zero pivots."""
+    if f.s == 3:
+        return lu_blocks(f, 3)
+    if f.s == 6:
+        return lu_blocks(f, 6)
+    return lu_blocks(f, f.s)
+
+
+cdef public void lav_block_lu_solve(const factor_t* f, double* x) noexcept nogil:
+    """x <- N^-1 x after `lav_block_lu`."""
+    cdef int32_t j, p, r, c, s = f.s
+    cdef int64_t b = s * s
+    cdef double t
+    cdef double *y
+    cdef const double *l
+    for j in range(f.n):                                # x_j <- D_j^-1 x_j, x_i -= Y_ij x_j
+        small_solve(f.dval + j * b, f.pivot + j * s, x + j * s, s, 1)
+        for p in range(f.lptr[j], f.lptr[j + 1]):
+            l = f.lval + p * b
+            y = x + f.lind[p] * s
+            for c in range(s):
+                t = x[j * s + c]
+                for r in range(s):
+                    y[r] -= l[c * s + r] * t
+    for j in range(f.n - 1, -1, -1):                    # x_j -= (D_j^-1 U_ji) x_i
+        for p in range(f.lptr[j], f.lptr[j + 1]):
+            l = f.uval + p * b
+            y = x + f.lind[p] * s
+            for r in range(s):
+                t = 0.0
+                for c in range(s):
+                    t += l[c * s + r] * y[c]
+                x[j * s + r] -= t
+
+
+# -- K ----------------------------------------------------------------------------------------------
+
+
+cdef public int32_t lav_inertia_root(int32_t n, const double* inv_inertia, double* root) noexcept nogil:
+    """Lower L with L L^T = I^-1 for each body, (n, 9); a pivot at rounding is a pinned axis, zero."""
+    cdef int32_t i, c, r, t
+    cdef double x, top
+    cdef const double *a
+    cdef double *l
+    for i in range(n):
+        a = inv_inertia + 9 * i
+        l = root + 9 * i
+        for c in range(9):
+            l[c] = 0.0
+        for c in range(3):
+            x = a[4 * c]
+            for t in range(c):
+                x -= l[3 * c + t] * l[3 * c + t]
+            if not x > 1e-14 * a[4 * c]:
+                continue
+            x = sqrt(x)
+            l[4 * c] = x
+            for r in range(c + 1, 3):
+                top = 0.5 * (a[3 * r + c] + a[3 * c + r])
+                for t in range(c):
+                    top -= l[3 * r + t] * l[3 * c + t]
+                l[3 * r + c] = top / x
+    return 0
+
+
+cdef public void lav_panel(const blocks_t* p, const rows_t* r, const double* root, const double* root_mass, double* panel) noexcept nogil:
+    """K (m, 12): D^-1/2 J M^-1/2, columns of body a then b."""
+    cdef int32_t i, j, q, c, k, h, a, b, body
+    cdef double jac[48]
+    cdef double x
+    cdef const double *row
+    cdef const double *l
+    cdef double *out
+    for i in range(p.n_blocks):
+        j = p.ptr[i]
+        c = i - r.n_joints
+        if c < 0:
+            a = r.joint_body[2 * i]
+            b = r.joint_body[2 * i + 1]
+            row = r.jac + 12 * j
+        else:
+            a = r.contact_body[2 * c]
+            b = r.contact_body[2 * c + 1]
+            contact_jacobian(r, c, n_tangents(p.kind[i], p.ptr[i + 1] - j), p.kind[i] == SPIN, jac)
+            row = jac
+        for q in range(j, p.ptr[i + 1]):
+            out = panel + 12 * <int64_t>q
+            x = 1.0 / sqrt(p.d[q])
+            for h in range(2):
+                body = a if h == 0 else b
+                for k in range(6):
+                    out[6 * h + k] = 0.0
+                if body >= 0:
+                    l = root + 9 * body
+                    for k in range(3):
+                        out[6 * h + k] = x * row[6 * h + k] * root_mass[body]
+                        out[6 * h + 3 + k] = x * (row[6 * h + 3] * l[k] + row[6 * h + 4] * l[3 + k] + row[6 * h + 5] * l[6 + k])
+            row += 12
+
+
+# -- symbolic ---------------------------------------------------------------------------------------
+
+
+cdef public void lav_block_tree(int32_t n, const int32_t* nptr, const int32_t* nind, int32_t* parent,
+                                int32_t* mark, int32_t* row_count, int32_t* column_count) noexcept nogil:
+    """Elimination tree of the lower pattern, and how many blocks each row and column of L holds."""
+    cdef int32_t k, q, j
+    for k in range(n):
+        parent[k] = -1
+        mark[k] = k
+        row_count[k] = 0
+        column_count[k] = 0
+        for q in range(nptr[k], nptr[k + 1]):
+            j = nind[q]
+            while j < k and mark[j] != k:
+                if parent[j] < 0:
+                    parent[j] = k
+                mark[j] = k
+                row_count[k] += 1
+                column_count[j] += 1
+                j = parent[j]
+
+
+cdef public void lav_block_pattern(int32_t n, const int32_t* nptr, const int32_t* nind, const int32_t* parent,
+                                   int32_t* mark, const int32_t* lptr, const int32_t* rptr, int32_t* next,
+                                   int32_t* lind, int32_t* rind) noexcept nogil:
+    """Rows of every column of L, and columns of every row, both ascending."""
+    cdef int32_t k, q, j, p
+    for k in range(n):
+        mark[k] = k
+        next[k] = lptr[k]
+        for q in range(nptr[k], nptr[k + 1]):
+            j = nind[q]
+            while j < k and mark[j] != k:
+                mark[j] = k
+                lind[next[j]] = k
+                next[j] += 1
+                j = parent[j]
+    for k in range(n):
+        next[k] = rptr[k]
+    for j in range(n):
+        for p in range(lptr[j], lptr[j + 1]):
+            k = lind[p]
+            rind[next[k]] = j
+            next[k] += 1
+
+
+# -- the normal matrix ------------------------------------------------------------------------------
+
+
+cdef inline void add_outer(double* out, const double* left, const double* right, double x, int32_t s) noexcept nogil:
+    cdef int32_t i, j
+    cdef double t
+    for i in range(s):
+        t = x * left[i]
+        for j in range(s):
+            out[i * s + j] += t * right[j]
+
+
+cdef inline void add_elements(const elements_t* e, const double* v, const factor_t* f, int32_t lu, const int32_t s) noexcept nogil:
+    cdef int32_t i, j, r, c, nr, first, second, n_blocks = f.nptr[f.n]
+    cdef int64_t b = s * s, q
+    cdef const double *pr
+    cdef const double *pc
+    cdef const int32_t *slot
+    cdef double x
+    for q in range(n_blocks * b):
+        f.nval[q] = 0.0
+    if lu:
+        for q in range(n_blocks * b):
+            f.mval[q] = 0.0
+    for i in range(f.n):
+        q = (f.nptr[i + 1] - 1) * b
+        for c in range(s):
+            f.nval[q + c * s + c] = 1.0
+            if lu:
+                f.mval[q + c * s + c] = 1.0
+    for i in range(e.n):
+        j = e.ptr[i]
+        nr = e.ptr[i + 1] - j
+        first = e.node[2 * i]
+        second = e.node[2 * i + 1]
+        slot = e.slot + 3 * i
+        if first < 0:
+            continue
+        for r in range(nr):
+            pr = e.panel + <int64_t>(j + r) * 2 * s
+            for c in range(nr):
+                x = v[e.wptr[i] + r * nr + c]
+                if x == 0.0:
+                    continue
+                pc = e.panel + <int64_t>(j + c) * 2 * s
+                add_outer(f.nval + slot[0] * b, pr, pc, x, s)
+                if second >= 0:
+                    add_outer(f.nval + slot[1] * b, pr + s, pc + s, x, s)
+                    add_outer(f.nval + slot[2] * b, pr, pc + s, x, s)
+                    if lu:
+                        # block (second, first) transposed: entries [first column, second row]
+                        add_outer(f.mval + slot[2] * b, pc, pr + s, x, s)
+    if lu:
+        # The mirror of a diagonal block is its transpose; only off-diagonal blocks are read there.
+        for i in range(f.n):
+            q = (f.nptr[i + 1] - 1) * b
+            for r in range(s):
+                for c in range(s):
+                    f.mval[q + c * s + r] = f.nval[q + r * s + c]
+
+
+cdef public void lav_normal_matrix(const elements_t* e, const double* v, const factor_t* f, int32_t lu) noexcept nogil:
+    """N = I + K^T V K of (2) into the blocks of `f`; with `lu` the upper blocks too."""
+    if f.s == 1:
+        add_elements(e, v, f, lu, 1)
+    elif f.s == 3:
+        add_elements(e, v, f, lu, 3)
+    elif f.s == 6:
+        add_elements(e, v, f, lu, 6)
+    else:
+        add_elements(e, v, f, lu, f.s)
+
+
+cdef public void lav_to_bodies(const elements_t* e, int32_t n, const double* x, double* y) noexcept nogil:
+    """y = K^T x, (n, s)."""
+    cdef int32_t i, j, c, s = e.s
+    cdef const double *p
+    cdef double *a
+    cdef double *b
+    for i in range(n * s):
+        y[i] = 0.0
+    for i in range(e.n):
+        if e.node[2 * i] < 0:
+            continue
+        a = y + e.node[2 * i] * s
+        b = y + e.node[2 * i + 1] * s if e.node[2 * i + 1] >= 0 else NULL
+        for j in range(e.ptr[i], e.ptr[i + 1]):
+            p = e.panel + <int64_t>j * 2 * s
+            for c in range(s):
+                a[c] += p[c] * x[j]
+            if b != NULL:
+                for c in range(s):
+                    b[c] += p[s + c] * x[j]
+
+
+cdef public void lav_to_rows(const elements_t* e, const double* y, double* x) noexcept nogil:
+    """x = K y, (m)."""
+    cdef int32_t i, j, c, s = e.s
+    cdef const double *p
+    cdef const double *a
+    cdef const double *b
+    cdef double t
+    for i in range(e.n):
+        a = y + e.node[2 * i] * s if e.node[2 * i] >= 0 else NULL
+        b = y + e.node[2 * i + 1] * s if e.node[2 * i + 1] >= 0 else NULL
+        for j in range(e.ptr[i], e.ptr[i + 1]):
+            p = e.panel + <int64_t>j * 2 * s
+            t = 0.0
+            if a != NULL:
+                for c in range(s):
+                    t += p[c] * a[c]
+            if b != NULL:
+                for c in range(s):
+                    t += p[s + c] * b[c]
+            x[j] = t
+
+
+# -- small square matrices of an element, at most 4 x 4 ------------------------------------------------
+
+
+cdef inline void invert_small(double* a, double* inv, int32_t n) noexcept nogil:
+    # Gauss-Jordan with row pivots; a is lost. A zero pivot leaves zeros in its column.
+    cdef int32_t i, j, k, best
+    cdef double x
+    for i in range(n * n):
+        inv[i] = 0.0
+    for i in range(n):
+        inv[i * n + i] = 1.0
+    for k in range(n):
+        best = k
+        for i in range(k + 1, n):
+            if fabs(a[i * n + k]) > fabs(a[best * n + k]):
+                best = i
+        if best != k:
+            for j in range(n):
+                x = a[k * n + j]
+                a[k * n + j] = a[best * n + j]
+                a[best * n + j] = x
+                x = inv[k * n + j]
+                inv[k * n + j] = inv[best * n + j]
+                inv[best * n + j] = x
+        x = a[k * n + k]
+        x = 1.0 / x if fabs(x) > 1e-300 else 0.0
+        for j in range(n):
+            a[k * n + j] *= x
+            inv[k * n + j] *= x
+        for i in range(n):
+            if i != k:
+                x = a[i * n + k]
+                if x != 0.0:
+                    for j in range(n):
+                        a[i * n + j] -= x * a[k * n + j]
+                        inv[i * n + j] -= x * inv[k * n + j]
+
+
+cdef inline void element_times(const elements_t* e, const double* w, const double* x, double* out) noexcept nogil:
+    cdef int32_t i, j, r, c, nr
+    cdef double t
+    for i in range(e.n):
+        j = e.ptr[i]
+        nr = e.ptr[i + 1] - j
+        for r in range(nr):
+            t = 0.0
+            for c in range(nr):
+                t += w[e.wptr[i] + r * nr + c] * x[j + c]
+            out[j + r] = t
+
+
+# -- interior point ---------------------------------------------------------------------------------
+
+
+cdef inline double cone_gap(const double* x, int32_t n) noexcept nogil:
+    # x_0 - |x_1..|
+    cdef double t = 0.0
+    cdef int32_t i
+    for i in range(1, n):
+        t += x[i] * x[i]
+    return x[0] - sqrt(t)
+
+
+cdef inline double cone_det(const double* x, int32_t n) noexcept nogil:
+    cdef double t = 0.0
+    cdef int32_t i
+    for i in range(1, n):
+        t += x[i] * x[i]
+    t = sqrt(t)
+    return (x[0] - t) * (x[0] + t)
+
+
+cdef inline double cone_step(const double* x, const double* dx, int32_t n) noexcept nogil:
+    # largest step to the boundary of the second-order cone; 1e30 where there is none
+    cdef double a = dx[0] * dx[0], b = x[0] * dx[0], c = cone_det(x, n), disc, q
+    cdef int32_t i
+    for i in range(1, n):
+        a -= dx[i] * dx[i]
+        b -= x[i] * dx[i]
+    if c <= 0.0:
+        return 0.0
+    disc = b * b - a * c
+    if disc < 0.0:
+        return 1e30
+    q = -b + sqrt(disc)
+    if q <= 0.0:
+        return 1e30
+    return c / q
+
+
+# One cone of a contact in its own coordinates: x_0 = a z_n, then the tangents (which = 0) or the spin (1).
+cdef inline int32_t cone_size(const elements_t* e, int32_t i, int32_t which) noexcept nogil:
+    cdef int32_t nr = e.ptr[i + 1] - e.ptr[i]
+    if which == 0:
+        return nr - 1 if e.kind[i] == SPIN else nr
+    return 2 if e.kind[i] == SPIN else 0
+
+
+cdef inline double on_normal(double a) noexcept nogil:
+    return a if a > 1.0 else 1.0
+
+
+cdef inline double on_tangent(double a) noexcept nogil:
+    return 1.0 / a if a < 1.0 else 1.0
+
+
+cdef inline void gather(const elements_t* e, int32_t i, int32_t which, const double* z, double* x) noexcept nogil:
+    # x = G z, G = diag(1, 1/a) or diag(a, 1): no entry below 1, so that G never blows a proximal term up
+    cdef int32_t j = e.ptr[i], n, k
+    cdef double a = e.at[i] if which == 0 else e.as_[i]
+    x[0] = on_normal(a) * z[j]
+    if which == 0:
+        n = cone_size(e, i, 0)
+        for k in range(1, n):
+            x[k] = on_tangent(a) * z[j + k]
+    else:
+        x[1] = on_tangent(a) * z[e.ptr[i + 1] - 1]
+
+
+cdef inline void scatter(const elements_t* e, int32_t i, int32_t which, const double* x, double* z) noexcept nogil:
+    # z += G^T x
+    cdef int32_t j = e.ptr[i], n, k
+    cdef double a = e.at[i] if which == 0 else e.as_[i]
+    z[j] += on_normal(a) * x[0]
+    if which == 0:
+        n = cone_size(e, i, 0)
+        for k in range(1, n):
+            z[j + k] += on_tangent(a) * x[k]
+    else:
+        z[e.ptr[i + 1] - 1] += on_tangent(a) * x[1]
+
+
+# u1 (m): dual of the lower bound, or of the tangent cone. u2 (m): of the upper bound, or of the spin cone
+# (its two entries on the normal and the spin row).
+cdef inline void load_dual(const elements_t* e, int32_t i, int32_t which, const double* u1, const double* u2,
+                           double* x) noexcept nogil:
+    cdef int32_t j = e.ptr[i], k
+    if which == 0:
+        for k in range(cone_size(e, i, 0)):
+            x[k] = u1[j + k]
+    else:
+        x[0] = u2[j]
+        x[1] = u2[e.ptr[i + 1] - 1]
+
+
+cdef inline void store_dual(const elements_t* e, int32_t i, int32_t which, const double* x, double* u1,
+                            double* u2) noexcept nogil:
+    cdef int32_t j = e.ptr[i], k
+    if which == 0:
+        for k in range(cone_size(e, i, 0)):
+            u1[j + k] = x[k]
+    else:
+        u2[j] = x[0]
+        u2[e.ptr[i + 1] - 1] = x[1]
+
+
+cdef inline bint has_cone(const elements_t* e, int32_t i, int32_t which) noexcept nogil:
+    # a contact without tangents is a plain normal: its cone is the half-line, a = 1
+    return which == 0 and (cone_size(e, i, 0) > 1 or e.kind[i] != SPIN) or which == 1 and e.kind[i] == SPIN
+
+
+cdef inline void nt_scaling(const double* s, const double* u, int32_t n, double* w, double* eta) noexcept nogil:
+    # T = eta [w0 w1'; w1 I + w1 w1'/(1 + w0)], T u = T^-1 s
+    cdef double ds = sqrt(cone_det(s, n)), du = sqrt(cone_det(u, n)), dot = 0.0, gamma
+    cdef int32_t k
+    for k in range(n):
+        dot += s[k] * u[k]
+    gamma = sqrt(0.5 * (1.0 + dot / (ds * du)))
+    w[0] = (s[0] / ds + u[0] / du) / (2.0 * gamma)
+    for k in range(1, n):
+        w[k] = (s[k] / ds - u[k] / du) / (2.0 * gamma)
+    dot = 1.0
+    for k in range(1, n):
+        dot += w[k] * w[k]
+    w[0] = sqrt(dot)                                    # w0^2 - |w1|^2 = 1 again after rounding
+    eta[0] = sqrt(ds / du)
+
+
+cdef inline void scale_times(const double* w, double eta, int32_t n, const double* x, bint inverse, double* out) noexcept nogil:
+    cdef double t = 0.0, sign = -1.0 if inverse else 1.0, f = 1.0 / eta if inverse else eta
+    cdef int32_t k
+    for k in range(1, n):
+        t += w[k] * x[k]
+    out[0] = f * (w[0] * x[0] + sign * t)
+    for k in range(1, n):
+        out[k] = f * (x[k] + w[k] * (sign * x[0] + t / (1.0 + w[0])))
+
+
+cdef inline void cone_divide(const double* v, const double* c, int32_t n, double* out) noexcept nogil:
+    # v o out = c
+    cdef double det = cone_det(v, n), dot = 0.0
+    cdef int32_t k
+    for k in range(1, n):
+        dot += v[k] * c[k]
+    out[0] = (v[0] * c[0] - dot) / det
+    for k in range(1, n):
+        out[k] = (c[k] - out[0] * v[k]) / v[0]
+
+
+cdef inline bint is_low(const elements_t* e, int32_t j) noexcept nogil:
+    return e.lower[j] > -1.7976931348623157e308
+
+
+cdef inline bint is_high(const elements_t* e, int32_t j) noexcept nogil:
+    return e.upper[j] < 1.7976931348623157e308
+
+
+cdef public double lav_ipm_start(const elements_t* e, const double* hz, double* z, double* u1, double* u2) noexcept nogil:
+    """Puts z and u inside their cones, starting from z with (H + I) z = g; returns the degree (number of cones).
+
+    Vandenberghe 2010, section 7.3: both are shifted along the cones' axes, by one amount each.
+    """
+    cdef int32_t i, j, k, which, n
+    cdef double worst_z = -1e300, worst_u = -1e300, size = 0.0, x, degree = 0.0, width
+    cdef double c[4]
+    for j in range(e.m):
+        size += z[j] * z[j] + (hz[j] - e.g[j]) * (hz[j] - e.g[j])
+    size = sqrt(size / (e.m if e.m > 0 else 1))
+    if not size > 0.0:
+        size = 1.0
+    for i in range(e.n):
+        j = e.ptr[i]
+        if e.kind[i] == ROW:
+            u1[j] = 0.0
+            u2[j] = 0.0
+            if is_low(e, j) and is_high(e, j):
+                width = e.upper[j] - e.lower[j]
+                x = 0.1 * width
+                if z[j] < e.lower[j] + x:
+                    z[j] = e.lower[j] + x
+                if z[j] > e.upper[j] - x:
+                    z[j] = e.upper[j] - x
+                x = hz[j] - e.g[j]
+                u1[j] = size + (x if x > 0.0 else 0.0)
+                u2[j] = size + (-x if x < 0.0 else 0.0)
+                degree += 2.0
+            elif is_low(e, j):
+                x = e.lower[j] - z[j]
+                worst_z = x if x > worst_z else worst_z
+                worst_u = -x if -x > worst_u else worst_u
+                u1[j] = x
+                degree += 1.0
+            elif is_high(e, j):
+                x = z[j] - e.upper[j]
+                worst_z = x if x > worst_z else worst_z
+                worst_u = -x if -x > worst_u else worst_u
+                u2[j] = x
+                degree += 1.0
+            continue
+        for which in range(2):
+            if not has_cone(e, i, which):
+                continue
+            n = cone_size(e, i, which)
+            gather(e, i, which, z, c)
+            x = -cone_gap(c, n) / on_normal(e.at[i] if which == 0 else e.as_[i])
+            worst_z = x if x > worst_z else worst_z
+            for k in range(n):
+                c[k] = -c[k]
+            x = -cone_gap(c, n)
+            worst_u = x if x > worst_u else worst_u
+            store_dual(e, i, which, c, u1, u2)
+            degree += 1.0
+    worst_z = worst_z + size if worst_z > -1e-8 * size else 0.0
+    worst_u = worst_u + size if worst_u > -1e-8 * size else 0.0
+    for i in range(e.n):
+        j = e.ptr[i]
+        if e.kind[i] == ROW:
+            if is_low(e, j) and not is_high(e, j):
+                z[j] += worst_z
+                u1[j] += worst_u
+            elif is_high(e, j) and not is_low(e, j):
+                z[j] -= worst_z
+                u2[j] += worst_u
+            continue
+        z[j] += worst_z
+        for which in range(2):
+            if has_cone(e, i, which):
+                if which == 0:
+                    u1[j] += worst_u
+                else:
+                    u2[j] += worst_u
+    return degree
+
+
+cdef inline void cone_inverse(const double* s, const double* u, int32_t n, double a, double delta, double* v) noexcept nogil:
+    # v (n, n) = G^-1 (T^-2 + delta)^-1 G^-T through the eigenvalues of T^2: eta^2 (w0 +- |w1|)^2 along
+    # (1, +-w1/|w1|), eta^2 across. Inverting T^-2 as a matrix would lose the small ones.
+    cdef double w[4]
+    cdef double h[4]
+    cdef double eta, size = 0.0, grow, shrink, across, x, gn = on_normal(a), gt = on_tangent(a)
+    cdef int32_t k, l
+    nt_scaling(s, u, n, w, &eta)
+    for k in range(1, n):
+        size += w[k] * w[k]
+    size = sqrt(size)
+    grow = eta * (w[0] + size)
+    shrink = eta / (w[0] + size)
+    grow = grow * grow
+    shrink = shrink * shrink
+    across = eta * eta
+    grow = grow / (1.0 + delta * grow)
+    shrink = shrink / (1.0 + delta * shrink)
+    across = across / (1.0 + delta * across)
+    h[0] = 1.0
+    for k in range(1, n):
+        h[k] = w[k] / size if size > 0.0 else (1.0 if k == 1 else 0.0)
+    for k in range(n):
+        for l in range(n):
+            if k == 0 and l == 0:
+                x = 0.5 * (grow + shrink)
+            elif k == 0 or l == 0:
+                x = 0.5 * (grow - shrink) * h[k] * h[l]
+            else:
+                x = (0.5 * (grow + shrink) - across) * h[k] * h[l]
+                if k == l:
+                    x += across
+            x = x / (gn if k == 0 else gt)
+            v[k * n + l] = x / (gn if l == 0 else gt)
+
+
+cdef public void lav_ipm_scale(const elements_t* e, const double* z, const double* u1, const double* u2, double delta,
+                               double* v, double* gap) noexcept nogil:
+    """V = (W + theta + delta)^-1 of (3) for each element, and the gap G z . u."""
+    cdef int32_t i, j, k, l, n, nr, q, t
+    cdef double x, y, total = 0.0
+    cdef double s[4]
+    cdef double u[4]
+    cdef double a[16]
+    cdef double b[16]
+    for i in range(e.n):
+        j = e.ptr[i]
+        nr = e.ptr[i + 1] - j
+        q = e.wptr[i]
+        if e.kind[i] == ROW:
+            x = e.theta[j] + delta
+            if is_low(e, j):
+                x += u1[j] / (z[j] - e.lower[j])
+                total += u1[j] * (z[j] - e.lower[j])
+            if is_high(e, j):
+                x += u2[j] / (e.upper[j] - z[j])
+                total += u2[j] * (e.upper[j] - z[j])
+            v[q] = 1.0 / x
+            continue
+        if e.kind[i] == CONTACT:
+            gather(e, i, 0, z, s)
+            load_dual(e, i, 0, u1, u2, u)
+            for k in range(nr):
+                total += s[k] * u[k]
+            cone_inverse(s, u, nr, e.at[i], delta, v + q)
+        else:
+            # Two cones share the normal: V_nn is the parallel sum, each tangent part follows its normal.
+            gather(e, i, 1, z, s)
+            load_dual(e, i, 1, u1, u2, u)
+            total += s[0] * u[0] + s[1] * u[1]
+            cone_inverse(s, u, 2, e.as_[i], delta, b)
+            n = nr - 1
+            if n > 1:
+                gather(e, i, 0, z, s)
+                load_dual(e, i, 0, u1, u2, u)
+                for k in range(n):
+                    total += s[k] * u[k]
+                cone_inverse(s, u, n, e.at[i], delta, a)
+                x = a[0] * (b[0] / (a[0] + b[0]))
+            else:
+                x = b[0]
+                a[0] = x
+            v[q] = x
+            for k in range(1, n):
+                v[q + k] = a[k] / a[0] * x
+                v[q + k * nr] = v[q + k]
+                for l in range(1, n):
+                    v[q + k * nr + l] = a[k * n + l] - a[k] * (a[l] / a[0]) * (1.0 - x / a[0])
+            v[q + n] = b[1] / b[0] * x
+            v[q + n * nr] = v[q + n]
+            v[q + n * nr + n] = b[3] - b[1] * (b[1] / b[0]) * (1.0 - x / b[0])
+            for k in range(1, n):
+                v[q + k * nr + n] = a[k] / a[0] * x * (b[1] / b[0])
+                v[q + n * nr + k] = v[q + k * nr + n]
+        y = 0.0
+        for k in range(nr):
+            y += e.theta[j + k]
+        if y > 0.0:                                     # V <- (I + V theta)^-1 V
+            for k in range(nr):
+                for l in range(nr):
+                    a[k * nr + l] = v[q + k * nr + l] * e.theta[j + l] + (1.0 if k == l else 0.0)
+            invert_small(a, b, nr)
+            for k in range(nr):
+                for l in range(nr):
+                    a[k * nr + l] = 0.0
+                    for t in range(nr):
+                        a[k * nr + l] += b[k * nr + t] * v[q + t * nr + l]
+            for k in range(nr * nr):
+                v[q + k] = a[k]
+    gap[0] = total
+
+
+cdef inline double row_limit(double x, double dx, double best) noexcept nogil:
+    if dx < 0.0 and -x / dx < best:
+        return -x / dx
+    return best
+
+
+cdef inline void dual_step(const elements_t* e, int32_t i, int32_t which, const double* z, const double* u1,
+                           const double* u2, const double* dz, const double* da, double sigma_mu, double* s,
+                           double* u, double* ds, double* du, double* rhs) noexcept nogil:
+    # (3) where da is NULL, else (4); rhs = T^-1 (v \ c) in the cone's coordinates. dz NULL: rhs alone.
+    cdef double w[4]
+    cdef double v[4]
+    cdef double x[4]
+    cdef double y[4]
+    cdef double c[4]
+    cdef double eta
+    cdef int32_t n = cone_size(e, i, which), k
+    gather(e, i, which, z, s)
+    load_dual(e, i, which, u1, u2, u)
+    nt_scaling(s, u, n, w, &eta)
+    if da == NULL:
+        for k in range(n):
+            rhs[k] = u[k]
+    else:
+        scale_times(w, eta, n, u, False, v)
+        gather(e, i, which, da, x)
+        scale_times(w, eta, n, x, True, y)              # T^-1 G dz_a
+        scale_times(w, eta, n, y, True, x)              # T^-2 G dz_a
+        for k in range(n):
+            x[k] = -u[k] - x[k]                         # du_a
+        scale_times(w, eta, n, x, False, c)             # T du_a
+        # v o v + y o c - sigma mu e
+        x[0] = -sigma_mu
+        for k in range(n):
+            x[0] += v[k] * v[k] + y[k] * c[k]
+        for k in range(1, n):
+            x[k] = 2.0 * v[0] * v[k] + y[0] * c[k] + c[0] * y[k]
+        cone_divide(v, x, n, c)
+        scale_times(w, eta, n, c, True, rhs)
+    if dz != NULL:
+        gather(e, i, which, dz, ds)
+        scale_times(w, eta, n, ds, True, x)
+        scale_times(w, eta, n, x, True, y)
+        for k in range(n):
+            du[k] = -rhs[k] - y[k]
+
+
+cdef public double lav_ipm_affine(const elements_t* e, const double* z, const double* u1, const double* u2,
+                                  const double* dz, double* gap) noexcept nogil:
+    """Largest step (at most 1) of the affine direction, and the gap G z . u after it."""
+    cdef int32_t i, j, k, which, n
+    cdef double best = 1.0, a, b, x, t00 = 0.0, t01 = 0.0, t11 = 0.0
+    cdef double s[4]
+    cdef double u[4]
+    cdef double ds[4]
+    cdef double du[4]
+    cdef double rhs[4]
+    for i in range(e.n):
+        j = e.ptr[i]
+        if e.kind[i] == ROW:
+            if is_low(e, j):
+                a = z[j] - e.lower[j]
+                x = -u1[j] - u1[j] / a * dz[j]
+                best = row_limit(a, dz[j], best)
+                best = row_limit(u1[j], x, best)
+                t00 += a * u1[j]
+                t01 += a * x + u1[j] * dz[j]
+                t11 += x * dz[j]
+            if is_high(e, j):
+                a = e.upper[j] - z[j]
+                x = -u2[j] + u2[j] / a * dz[j]
+                best = row_limit(a, -dz[j], best)
+                best = row_limit(u2[j], x, best)
+                t00 += a * u2[j]
+                t01 += a * x - u2[j] * dz[j]
+                t11 -= x * dz[j]
+            continue
+        for which in range(2):
+            if not has_cone(e, i, which):
+                continue
+            n = cone_size(e, i, which)
+            dual_step(e, i, which, z, u1, u2, dz, NULL, 0.0, s, u, ds, du, rhs)
+            a = cone_step(s, ds, n)
+            b = cone_step(u, du, n)
+            best = a if a < best else best
+            best = b if b < best else best
+            for k in range(n):
+                t00 += s[k] * u[k]
+                t01 += s[k] * du[k] + u[k] * ds[k]
+                t11 += ds[k] * du[k]
+    gap[0] = t00 + best * (t01 + best * t11)
+    return best
+
+
+cdef public void lav_ipm_rhs(const elements_t* e, const double* z, const double* u1, const double* u2, const double* hz,
+                             const double* da, double sigma_mu, double* rhs) noexcept nogil:
+    """Right-hand side of (4)."""
+    cdef int32_t i, j, k, which, n
+    cdef double a, x
+    cdef double s[4]
+    cdef double u[4]
+    cdef double t[4]
+    for i in range(e.n):
+        for j in range(e.ptr[i], e.ptr[i + 1]):
+            rhs[j] = -(hz[j] - e.g[j])
+        j = e.ptr[i]
+        if e.kind[i] == ROW:
+            # -(H z - g - u1 + u2) - c1/s1 + c2/s2, c = s u + ds du - sigma mu: the u cancel
+            if is_low(e, j):
+                a = z[j] - e.lower[j]
+                x = -u1[j] - u1[j] / a * da[j]
+                rhs[j] -= (da[j] * x - sigma_mu) / a
+            if is_high(e, j):
+                a = e.upper[j] - z[j]
+                x = -u2[j] + u2[j] / a * da[j]
+                rhs[j] += (-da[j] * x - sigma_mu) / a
+            continue
+        for which in range(2):
+            if not has_cone(e, i, which):
+                continue
+            n = cone_size(e, i, which)
+            dual_step(e, i, which, z, u1, u2, NULL, da, sigma_mu, s, u, NULL, NULL, t)
+            for k in range(n):
+                t[k] = u[k] - t[k]
+            scatter(e, i, which, t, rhs)
+
+
+cdef public double lav_ipm_update(const elements_t* e, double* z, double* u1, double* u2, const double* dz,
+                                  const double* da, double sigma_mu, double damping, double* du1, double* du2) noexcept nogil:
+    """Takes the combined step in place; returns its length. du1, du2 (m) are scratch."""
+    cdef int32_t i, j, k, which, n
+    cdef double best = 1.0 / damping, a, b, x
+    cdef double s[4]
+    cdef double u[4]
+    cdef double ds[4]
+    cdef double du[4]
+    cdef double rhs[4]
+    for i in range(e.n):
+        j = e.ptr[i]
+        if e.kind[i] == ROW:
+            if is_low(e, j):
+                a = z[j] - e.lower[j]
+                x = -u1[j] - u1[j] / a * da[j]
+                x = -u1[j] - (da[j] * x - sigma_mu) / a - u1[j] / a * dz[j]
+                best = row_limit(a, dz[j], best)
+                best = row_limit(u1[j], x, best)
+                du1[j] = x
+            if is_high(e, j):
+                a = e.upper[j] - z[j]
+                x = -u2[j] + u2[j] / a * da[j]
+                x = -u2[j] - (-da[j] * x - sigma_mu) / a + u2[j] / a * dz[j]
+                best = row_limit(a, -dz[j], best)
+                best = row_limit(u2[j], x, best)
+                du2[j] = x
+            continue
+        for which in range(2):
+            if not has_cone(e, i, which):
+                continue
+            n = cone_size(e, i, which)
+            dual_step(e, i, which, z, u1, u2, dz, da, sigma_mu, s, u, ds, du, rhs)
+            a = cone_step(s, ds, n)
+            b = cone_step(u, du, n)
+            best = a if a < best else best
+            best = b if b < best else best
+            store_dual(e, i, which, du, du1, du2)
+    best = best * damping
+    for j in range(e.m):
+        z[j] += best * dz[j]
+    for i in range(e.n):
+        j = e.ptr[i]
+        if e.kind[i] == ROW:
+            if is_low(e, j):
+                u1[j] += best * du1[j]
+            if is_high(e, j):
+                u2[j] += best * du2[j]
+            continue
+        for k in range(j, e.ptr[i + 1]):
+            if has_cone(e, i, 0) and k - j < cone_size(e, i, 0):
+                u1[k] += best * du1[k]
+        if has_cone(e, i, 1):
+            u2[j] += best * du2[j]
+            u2[e.ptr[i + 1] - 1] += best * du2[e.ptr[i + 1] - 1]
+    return best
+
+
+# -- natural map ------------------------------------------------------------------------------------
+
+
+cdef inline void natural_contact(const elements_t* e, int32_t i, const double* z, const double* s, double* f,
+                                 double* p) noexcept nogil:
+    # F (nr) and P (nr, nr) of one contact, convex cone: projection in the metric of d.
+    cdef int32_t nr = e.ptr[i + 1] - e.ptr[i], nt, js, k, l
+    cdef bint spin = e.kind[i] == SPIN, slide, turn
+    cdef double at = e.at[i], as_ = e.as_[i], yn, ys = 0.0, t = 0.0, h, c, norm, kappa
+    cdef double y[2]
+    cdef double n[4]
+    nt = nr - 1 - spin
+    js = nr - 1
+    for k in range(nr * nr):
+        p[k] = 0.0
+    yn = z[0] - s[0]
+    y[0] = y[1] = 0.0
+    for k in range(nt):
+        y[k] = z[1 + k] - s[1 + k]
+        t += y[k] * y[k]
+    t = sqrt(t)
+    if spin:
+        ys = z[js] - s[js]
+    if nt == 0:
+        at = 0.0
+    if not spin:
+        as_ = 0.0
+    h = yn if yn > 0.0 else 0.0
+    c = (yn + at * t) / (1.0 + at * at)
+    h = c if c > h else h
+    c = (yn + as_ * fabs(ys)) / (1.0 + as_ * as_)
+    h = c if c > h else h
+    c = (yn + at * t + as_ * fabs(ys)) / (1.0 + at * at + as_ * as_)
+    h = c if c > h else h
+    if h <= 0.0:
+        for k in range(nr):
+            f[k] = z[k]
+        return
+    slide = nt > 0 and t > at * h
+    turn = spin and fabs(ys) > as_ * h
+    if not slide and not turn:
+        for k in range(nr):
+            f[k] = s[k]
+            p[k * nr + k] = 1.0
+        return
+    # The face: one ray n in the normal, sliding and turning directions, and what stays free beside it.
+    for k in range(nr):
+        n[k] = 0.0
+    n[0] = 1.0
+    f[0] = z[0] - h
+    for k in range(nt):
+        if slide:
+            n[1 + k] = at * y[k] / t
+            f[1 + k] = z[1 + k] - h * n[1 + k]
+        else:
+            f[1 + k] = s[1 + k]
+            p[(1 + k) * nr + 1 + k] = 1.0
+    if spin:
+        if turn:
+            n[js] = as_ if ys > 0.0 else -as_
+            f[js] = z[js] - h * n[js]
+        else:
+            f[js] = s[js]
+            p[js * nr + js] = 1.0
+    norm = 0.0
+    for k in range(nr):
+        norm += n[k] * n[k]
+    for k in range(nr):
+        for l in range(nr):
+            p[k * nr + l] += n[k] * n[l] / norm
+    if slide and nt == 2:
+        kappa = at * h / t
+        n[0] = -y[1] / t
+        n[1] = y[0] / t
+        for k in range(2):
+            for l in range(2):
+                p[(1 + k) * nr + 1 + l] += kappa * n[k] * n[l]
+
+
+cdef inline void natural_coulomb(const elements_t* e, int32_t i, const double* z, const double* s, int32_t augmented,
+                                 double* f, double* p) noexcept nogil:
+    # The same for Coulomb friction; radius a_t y_n with `augmented` (Alart-Curnier), else a_t z_n.
+    # Without it the part of the derivative beside P H is put into p[16..]: dPi/dz_n, by row.
+    cdef int32_t nr = e.ptr[i + 1] - e.ptr[i], nt, js, k, l
+    cdef bint spin = e.kind[i] == SPIN
+    cdef double yn, rn, radius, t = 0.0, kappa, x
+    cdef double y[2]
+    cdef double n[2]
+    nt = nr - 1 - spin
+    js = nr - 1
+    for k in range(nr * nr):
+        p[k] = 0.0
+    yn = z[0] - s[0]
+    if yn > 0.0:
+        f[0] = s[0]
+        p[0] = 1.0
+    else:
+        f[0] = z[0]
+    rn = yn if augmented else z[0]
+    rn = rn if rn > 0.0 else 0.0
+    radius = e.at[i] * rn
+    y[0] = y[1] = 0.0
+    for k in range(nt):
+        y[k] = z[1 + k] - s[1 + k]
+        t += y[k] * y[k]
+    t = sqrt(t)
+    if t > radius:
+        for k in range(nt):
+            n[k] = y[k] / t
+            f[1 + k] = z[1 + k] - radius * n[k]
+            if rn > 0.0:
+                p[(1 + k) * nr] = e.at[i] * n[k]
+        if nt == 2:
+            kappa = radius / t
+            x = n[0]
+            n[0] = -n[1]
+            n[1] = x
+            for k in range(2):
+                for l in range(2):
+                    p[(1 + k) * nr + 1 + l] += kappa * n[k] * n[l]
+    else:
+        for k in range(nt):
+            f[1 + k] = s[1 + k]
+            if radius > 0.0 or t < radius:
+                p[(1 + k) * nr + 1 + k] = 1.0
+            else:
+                f[1 + k] = z[1 + k]
+    if spin:
+        radius = e.as_[i] * rn
+        x = z[js] - s[js]
+        if fabs(x) > radius or radius <= 0.0:
+            f[js] = z[js] - (radius if x > 0.0 else -radius)
+            if rn > 0.0:
+                p[js * nr] = e.as_[i] if x > 0.0 else -e.as_[i]
+        else:
+            f[js] = s[js]
+            p[js * nr + js] = 1.0
+
+
+cdef public int32_t lav_natural(const elements_t* e, const double* z, const double* s, int32_t augmented, double eps,
+                                double* f, double* p, double* einv, double* v) noexcept nogil:
+    """F, P, E^-1 and V = E^-1 P of (5) for every element; returns a fingerprint of which pieces are active.
+
+    einv, v may be NULL: F and P alone.
+    """
+    cdef int32_t i, j, k, l, q, nr, piece, mark = 0
+    cdef double y, x
+    cdef double a[16]
+    for i in range(e.n):
+        j = e.ptr[i]
+        nr = e.ptr[i + 1] - j
+        q = e.wptr[i]
+        if e.kind[i] == ROW:
+            y = z[j] - s[j]
+            piece = 1
+            if y < e.lower[j]:
+                f[j] = z[j] - e.lower[j]
+                p[q] = 0.0
+                piece = 0
+            elif y > e.upper[j]:
+                f[j] = z[j] - e.upper[j]
+                p[q] = 0.0
+                piece = 2
+            else:
+                f[j] = s[j]
+                p[q] = 1.0
+            mark = (mark * 31 + piece) & 0xffffff
+            if v != NULL:
+                if piece == 1:
+                    einv[q] = 1.0 / (e.theta[j] + eps)
+                    v[q] = einv[q]
+                else:
+                    einv[q] = 1.0
+                    v[q] = 0.0
+            continue
+        if e.coulomb:
+            natural_coulomb(e, i, z + j, s + j, augmented, f + j, p + q)
+        else:
+            natural_contact(e, i, z + j, s + j, f + j, p + q)
+        piece = 0
+        for k in range(nr):
+            if f[j + k] == s[j + k]:
+                piece += 1 << k
+            if f[j + k] == z[j + k]:
+                piece += 16 << k
+        mark = (mark * 31 + piece) & 0xffffff
+        if v != NULL:
+            for k in range(nr):
+                for l in range(nr):
+                    x = p[q + k * nr + l]
+                    a[k * nr + l] = x * (e.theta[j + l] + eps) - x
+                a[k * nr + k] += 1.0
+            invert_small(a, einv + q, nr)
+            for k in range(nr):
+                for l in range(nr):
+                    x = 0.0
+                    for piece in range(nr):
+                        x += einv[q + k * nr + piece] * p[q + piece * nr + l]
+                    v[q + k * nr + l] = x
+    return mark
+
+
+# -- Python entry -----------------------------------------------------------------------------------
+
+
+cdef void* address(object array):
+    cdef const double[::1] x
+    cdef const int32_t[::1] y
+    flat = array.ravel()
+    if flat.size == 0:
+        return NULL
+    if flat.dtype == np.int32:
+        y = flat
+        return <void*>&y[0]
+    x = flat
+    return <void*>&x[0]
+
+
+cdef class Elements:
+    """Bounds and cones of the scaled problem, with the small matrices of every element.
+
+    Every array is C-contiguous, float64 or int32, of the length that the structs above give, checked by
+    the caller.
+    """
+    cdef elements_t e
+    cdef list keep
+    cdef readonly int m, n, n_small
+
+    def __init__(self, ptr, kind, wptr, node, slot, panel, theta, g, lower, upper, at, as_, int s, bint coulomb):
+        self.keep = [ptr, kind, wptr, node, slot, panel, theta, g, lower, upper, at, as_]
+        self.n = len(kind)
+        self.m = len(g)
+        self.n_small = int(wptr[len(kind)])
+        self.e = elements_t(
+            self.n, self.m, s, coulomb, <int32_t*>address(ptr), <int32_t*>address(kind), <int32_t*>address(wptr),
+            <int32_t*>address(node), <int32_t*>address(slot), <double*>address(panel), <double*>address(theta),
+            <double*>address(g), <double*>address(lower), <double*>address(upper), <double*>address(at),
+            <double*>address(as_))
+
+    def start(self, const double[::1] hz, double[::1] z, double[::1] u1, double[::1] u2):
+        """z, u inside their cones; returns the degree."""
+        return lav_ipm_start(&self.e, &hz[0], &z[0], &u1[0], &u2[0])
+
+    def scale(self, const double[::1] z, const double[::1] u1, const double[::1] u2, double delta, double[::1] v):
+        """V = (W + theta + delta)^-1 into v; returns the gap."""
+        cdef double gap
+        with nogil:
+            lav_ipm_scale(&self.e, &z[0], &u1[0], &u2[0], delta, &v[0], &gap)
+        return gap
+
+    def affine(self, const double[::1] z, const double[::1] u1, const double[::1] u2, const double[::1] dz):
+        """(step, gap after it)."""
+        cdef double gap, step
+        with nogil:
+            step = lav_ipm_affine(&self.e, &z[0], &u1[0], &u2[0], &dz[0], &gap)
+        return step, gap
+
+    def rhs(self, const double[::1] z, const double[::1] u1, const double[::1] u2, const double[::1] hz,
+            const double[::1] da, double sigma_mu, double[::1] out):
+        with nogil:
+            lav_ipm_rhs(&self.e, &z[0], &u1[0], &u2[0], &hz[0], &da[0], sigma_mu, &out[0])
+
+    def step(self, double[::1] z, double[::1] u1, double[::1] u2, const double[::1] dz, const double[::1] da,
+             double sigma_mu, double damping, double[::1] t1, double[::1] t2):
+        """The combined step in place; returns its length."""
+        cdef double length
+        with nogil:
+            length = lav_ipm_update(&self.e, &z[0], &u1[0], &u2[0], &dz[0], &da[0], sigma_mu, damping, &t1[0], &t2[0])
+        return length
+
+    def natural(self, const double[::1] z, const double[::1] s, bint augmented, double eps, double[::1] f, double[::1] p,
+                double[::1] einv=None, double[::1] v=None):
+        """F, P and, where given, E^-1 and V; returns a fingerprint of the active pieces."""
+        cdef int32_t mark
+        cdef double* x = NULL
+        cdef double* y = NULL
+        if einv is not None:
+            x = &einv[0]
+            y = &v[0]
+        with nogil:
+            mark = lav_natural(&self.e, &z[0], &s[0], augmented, eps, &f[0], &p[0], x, y)
+        return mark
+
+    def times(self, const double[::1] w, const double[::1] x, double[::1] out):
+        """out = W x, one small matrix for each element."""
+        with nogil:
+            element_times(&self.e, &w[0], &x[0], &out[0])
+
+
+def panel(Data p, const double[:, :, ::1] inv_inertia, const double[::1] root_mass, double[:, ::1] out):
+    """K = D^-1/2 J M^-1/2 (m, 12) of a factored problem; root_mass (n,) = sqrt(inv_mass)."""
+    cdef int32_t n = <int32_t>root_mass.shape[0]
+    cdef double[::1] root = np.empty(9 * n + 1)
+    if out.shape[0] == 0 or n == 0:
+        return
+    with nogil:
+        lav_inertia_root(n, &inv_inertia[0, 0, 0], &root[0])
+        lav_panel(&p.blocks, &p.rows, &root[0], &root_mass[0], &out[0, 0])
+
+
+def symbolic(const int32_t[::1] nptr, const int32_t[::1] nind):
+    """(lptr, lind, rptr, rind) of the factor of a lower block pattern; nptr (n + 1), diagonal last in each row."""
+    cdef int32_t n = <int32_t>nptr.shape[0] - 1
+    cdef int32_t[::1] parent = np.empty(n + 1, np.int32), mark = np.empty(n + 1, np.int32)
+    rows, columns = np.zeros(n + 1, np.int32), np.zeros(n + 1, np.int32)
+    cdef int32_t[::1] row_count = rows, column_count = columns
+    lav_block_tree(n, &nptr[0], &nind[0], &parent[0], &mark[0], &row_count[0], &column_count[0])
+    pointers = []
+    for counts in (columns, rows):
+        total = np.zeros(n + 1, np.int64)
+        np.cumsum(counts[:n], out=total[1:])
+        if total[n] >= 2**31:
+            raise OverflowError("the factor has 2^31 blocks or more")
+        pointers.append(total.astype(np.int32))
+    cdef int32_t[::1] lptr = pointers[0], rptr = pointers[1]
+    lind_array, rind_array = np.empty(lptr[n] + 1, np.int32), np.empty(lptr[n] + 1, np.int32)
+    cdef int32_t[::1] lind = lind_array, rind = rind_array
+    lav_block_pattern(n, &nptr[0], &nind[0], &parent[0], &mark[0], &lptr[0], &rptr[0], &row_count[0], &lind[0], &rind[0])
+    return pointers[0], lind_array, pointers[1], rind_array
+
+
+cdef class Factor:
+    """N = I + K^T V K and its block factor; arrays as in `factor_t`, the pattern from `symbolic`."""
+    cdef factor_t f
+    cdef list keep
+    cdef readonly int n, s
+    cdef bint lu, unsymmetric
+
+    def __init__(self, nptr, nind, lptr, lind, rptr, rind, int s, bint unsymmetric):
+        n = len(nptr) - 1
+        blocks = s * s
+        def zeros(count):
+            return np.zeros(max(1, count))
+        nval, lval = zeros(len(nind) * blocks), zeros(int(lptr[n]) * blocks)
+        mval = zeros(len(nind) * blocks) if unsymmetric else zeros(0)
+        uval = zeros(int(lptr[n]) * blocks) if unsymmetric else zeros(0)
+        dval, work, work2 = zeros(n * blocks), zeros(n * blocks), zeros(n * blocks if unsymmetric else 0)
+        pivot, nxt = np.zeros(n * s + 1, np.int32), np.zeros(n + 1, np.int32)
+        self.keep = [nptr, nind, lptr, lind, rptr, rind, nval, lval, mval, uval, dval, work, work2, pivot, nxt]
+        self.n, self.s, self.unsymmetric, self.lu = n, s, unsymmetric, False
+        self.f = factor_t(
+            n, s, <int32_t*>address(nptr), <int32_t*>address(nind), <int32_t*>address(rptr), <int32_t*>address(rind),
+            <int32_t*>address(lptr), <int32_t*>address(lind), <double*>address(nval), <double*>address(mval),
+            <double*>address(lval), <double*>address(uval), <double*>address(dval), <double*>address(work),
+            <double*>address(work2), <int32_t*>address(pivot), <int32_t*>address(nxt))
+
+    def factor(self, Elements e, const double[::1] v, bint lu=False):
+        """Forms N of V and factors it; returns the number of pivots lost to rounding."""
+        cdef int32_t lost
+        self.lu = lu
+        with nogil:
+            lav_normal_matrix(&e.e, &v[0], &self.f, lu)
+            lost = lav_block_lu(&self.f) if lu else lav_block_cholesky(&self.f)
+        return lost
+
+    def solve(self, Elements e, const double[::1] x, double[::1] y, double[::1] out):
+        """y <- N^-1 K^T x, out <- K y."""
+        with nogil:
+            lav_to_bodies(&e.e, self.n, &x[0], &y[0])
+            if self.lu:
+                lav_block_lu_solve(&self.f, &y[0])
+            else:
+                lav_block_solve(&self.f, &y[0])
+            lav_to_rows(&e.e, &y[0], &out[0])
+
+    def gram(self, Elements e, const double[::1] x, double[::1] y, double[::1] out):
+        """out <- K K^T x, y <- K^T x."""
+        with nogil:
+            lav_to_bodies(&e.e, self.n, &x[0], &y[0])
+            lav_to_rows(&e.e, &y[0], &out[0])
