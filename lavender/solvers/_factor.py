@@ -1,0 +1,193 @@
+"""Factorisations under `direct`: which one a matrix gets, and one interface over them.
+
+    band     LDL^T by diagonals in compiled code (small matrices, and any of small bandwidth)
+    dense    Cholesky (LAPACK potrf)
+    sparse   LDL^T of a permuted matrix (QDLDL with its minimum degree ordering)
+    general  LU with pivoting (LAPACK getrf, or SuperLU), linear systems that are not symmetric definite
+
+A pivot of at most 1e-13 d_i counts as zero: some hundred roundings of A_ii, and below what a mass ratio of
+1e8 leaves.
+"""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any, Protocol
+
+import numpy as np
+import scipy.sparse as sp
+from scipy.linalg import lapack
+
+from lavender._arrays import FloatArray, IntArray
+from lavender.problem import Problem
+from lavender_ext import pivoting as kernels
+
+TINY = 1e-13  # -, of d
+SMALL_SIZE = 64  # rows up to which the compiled factorisation beats LAPACK behind SciPy
+SMALL_BAND = 40  # half bandwidth up to which it beats the others
+DENSE_SHARE = 0.1  # of nonzeros, from which dense Cholesky beats sparse
+DENSE_LIMIT = 6000  # rows, 288 MB
+GENERAL_LIMIT = 2000  # rows up to which a singular matrix that is not symmetric is decomposed as a dense one
+
+
+def choose(problem: Problem) -> tuple[str, int, IntArray]:
+    """Factorisation, half bandwidth and order of elimination for a symmetric A; by structure alone."""
+    m, nnz = problem.m, problem.csr.nnz
+    order = np.arange(m, dtype=np.int32)
+    band = max(problem.bandwidth)
+    if m <= SMALL_SIZE or band <= SMALL_BAND:
+        return "band", band, order
+    if nnz >= DENSE_SHARE * m * m and m <= DENSE_LIMIT:
+        return "dense", m - 1, order
+    # A band needs 2 band + 1 places a row: a mean row of more nonzeros than that has none so narrow.
+    if nnz <= (2 * SMALL_BAND + 1) * m:
+        order = sp.csgraph.reverse_cuthill_mckee(problem.csr, symmetric_mode=True).astype(np.int32)
+        band = permuted_band(problem, order)
+        if band <= SMALL_BAND:
+            return "band", band, order
+    return "sparse", m - 1, np.arange(m, dtype=np.int32)
+
+
+def permuted_band(problem: Problem, order: IntArray) -> int:
+    """Half bandwidth of A with its rows in that order."""
+    place = np.empty(problem.m, np.int64)
+    place[order] = np.arange(problem.m)
+    a = problem.csr
+    row = np.repeat(place, np.diff(a.indptr))
+    return int(np.abs(row - place[a.indices]).max(initial=0))
+
+
+class Factor(Protocol):
+    """Factorisation of A_FF + shift D_FF for changing free sets."""
+
+    def factor(self, place: IntArray, n_free: int, shift: float, tiny: float = TINY) -> int:
+        """Factor the rows with place >= 0, numbered in order of rows; the number of pivots not above tiny d."""
+        ...
+
+    def solve(self, rhs: FloatArray) -> FloatArray:
+        """Solve for the free rows, (n_free,)."""
+        ...
+
+
+class DenseFactor:
+    """Cholesky, A = L L^T."""
+
+    def __init__(self, problem: Problem) -> None:
+        self.a = problem.dense()
+        self.d = problem.csr_data.d
+
+    def factor(self, place: IntArray, n_free: int, shift: float, tiny: float = TINY) -> int:
+        free = np.flatnonzero(place >= 0)
+        a = self.a.copy() if n_free == len(place) else self.a[np.ix_(free, free)]
+        d = self.d[free]
+        if shift > 0.0:
+            a.flat[:: n_free + 1] += shift * d
+        if n_free == 0:
+            self.c = a
+            return 0
+        # Row-major input read as column-major is the transpose: the same matrix, and no copy.
+        self.c, info = lapack.dpotrf(a.T, lower=1, overwrite_a=1, clean=0)
+        if info != 0:
+            return n_free - info + 1
+        pivot = np.diagonal(self.c)
+        return int(np.count_nonzero(pivot * pivot <= tiny * d))
+
+    def solve(self, rhs: FloatArray) -> FloatArray:
+        if len(rhs) == 0:
+            return rhs
+        return lapack.dpotrs(self.c, rhs, lower=1)[0]
+
+
+class SparseFactor:
+    """LDL^T with minimum degree ordering."""
+
+    def __init__(self, problem: Problem) -> None:
+        self.csr = problem.csr
+        self.d = problem.csr_data.d
+
+    def factor(self, place: IntArray, n_free: int, shift: float, tiny: float = TINY) -> int:
+        import qdldl
+
+        a = self.csr
+        upper = kernels.free_block(a.indptr, a.indices, a.data, place, self.d, shift, n_free)
+        self.n = n_free
+        if n_free == 0:
+            return 0
+        try:
+            self.ldl = qdldl.Solver(sp.csc_matrix(upper, shape=(n_free, n_free)), upper=True)
+        except RuntimeError:  # an exact zero on the diagonal of D
+            return n_free
+        _, pivot, order = self.ldl.factors()
+        return int(np.count_nonzero(pivot <= tiny * self.d[np.flatnonzero(place >= 0)][order]))
+
+    def solve(self, rhs: FloatArray) -> FloatArray:
+        return self.ldl.solve(rhs) if self.n else rhs
+
+
+class GeneralFactor:
+    """LU of A scaled to D^-1/2 A D^-1/2, with a rank-revealing path where that is singular.
+
+    Attributes
+    ----------
+    rank : int
+        m, or the rank found by QR with column pivoting; -1 where A is singular and too large for that.
+    """
+
+    def __init__(self, problem: Problem) -> None:
+        m, a = problem.m, problem.csr
+        self.scale = 1.0 / np.sqrt(problem.csr_data.d)
+        self.rank = m
+        self.lu: Any = None
+        self.dense: FloatArray | None = None
+        scaled = sp.csr_array(sp.diags_array(self.scale) @ a @ sp.diags_array(self.scale))
+        if a.nnz >= DENSE_SHARE * m * m or m <= SMALL_SIZE:
+            self._factor_dense(scaled.toarray())
+        else:
+            self._factor_sparse(sp.csc_array(scaled))
+
+    def _factor_dense(self, a: FloatArray) -> None:
+        lu, pivot, info = lapack.dgetrf(a)
+        norm = np.abs(a).sum(axis=0).max(initial=0.0)
+        rcond = lapack.dgecon(lu, norm)[0] if info == 0 and len(a) else float(len(a) == 0)
+        if rcond <= TINY * max(1, len(a)) / 10.0:
+            self._reveal(a)
+        else:
+            self.lu = (lu, pivot)
+
+    def _factor_sparse(self, a: sp.csc_array) -> None:
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                self.lu = sp.linalg.splu(a)
+            pivot = np.abs(self.lu.U.diagonal())
+        except RuntimeError:  # exactly singular
+            pivot = np.zeros(1)
+        if pivot.min(initial=np.inf) > TINY * max(1.0, pivot.max(initial=0.0)):
+            return
+        self.lu = None
+        if a.shape[0] <= GENERAL_LIMIT:
+            self._reveal(a.toarray())
+        else:
+            self.rank = -1
+
+    def _reveal(self, a: FloatArray) -> None:
+        # A P = Q R; the rank is where |R_ii| falls to rounding. Least squares of least norm in the metric of D.
+        self.dense = a
+        u, s, vt = np.linalg.svd(a)
+        self.rank = int(np.count_nonzero(s > len(a) * TINY / 10.0 * s[0])) if len(s) and s[0] > 0.0 else 0
+        self.svd = (u[:, : self.rank], s[: self.rank], vt[: self.rank])
+
+    @property
+    def usable(self) -> bool:
+        return self.lu is not None or self.dense is not None
+
+    def solve(self, rhs: FloatArray) -> FloatArray:
+        y = self.scale * rhs
+        if self.dense is not None:
+            u, s, vt = self.svd
+            y = vt.T @ ((u.T @ y) / s)
+        elif isinstance(self.lu, tuple):
+            y = lapack.dgetrs(*self.lu, y)[0]
+        else:
+            y = self.lu.solve(y)
+        return self.scale * y

@@ -1,0 +1,328 @@
+"""Factor and solve; with bounds, block principal pivoting on the same factorisation.
+
+    linear   A lambda = b by band, dense or sparse factorisation, then lambda <- lambda - A^-1 w (refinement)
+    boxed    w = A lambda - b complementary to lower <= lambda <= upper: guess which rows are free, solve
+             them, exchange the rows of the wrong sign, repeat (`lavender_ext/pivoting.pyx`)
+    singular the same on A + s D, s = 1e-10, around the last answer c: (A + s D) lambda = b + s D c. A fixed
+             point solves A itself (proximal point method); on the rows it settles on, each pass is one
+             refinement that shrinks what A sees by s / (s + sigma). On a problem without a solution the
+             passes keep walking along some y >= 0 with A y = 0, b.y > 0: the certificate.
+
+Positive definite A: finite and exact to rounding, whatever `tol`. Singular positive semidefinite A: the
+message says so, and what cannot be refined to rounding is STALLED with the best iterate. Linear systems
+that are asymmetric or indefinite get LU with pivoting, and where that is singular its rank from an SVD.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from lavender._arrays import FloatArray
+from lavender.problem import Problem
+from lavender.registry import SolverSpec
+from lavender.residuals import check_certificate, quick, reference
+from lavender.solution import Claim, Status
+from lavender.solvers._factor import GeneralFactor
+from lavender.solvers._pivoting import INDEFINITE, ROUNDS, SMALL, SOLVED, PivotState
+from lavender_ext import judge
+
+SHIFT = 1e-10  # -, s: far above the rounding of a factorisation, below what a mass ratio of 1e8 leaves
+SHIFT_STEP = 100.0
+SHIFT_LIMIT = 1e-2
+GOOD = 1e-13  # relative residual at which refinement ends, where the floor allows it
+PASSES = 100  # proximal passes at most
+PATIENCE = 6  # passes without halving the best residual
+SWEEPS = 2  # symmetric sweeps of Gauss-Seidel that guess the free rows
+BATCH = 32  # rounds between two looks at the clock and the judge
+
+
+@dataclass
+class DirectState:
+    """Factor of a linear system, or the rows of a boxed one; fresh before each run."""
+
+    problem: Problem
+    pivot: PivotState | None = None
+    general: GeneralFactor | None = None
+    outcome: int = SOLVED  # of the factorisation of a linear system
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class Direct:
+    """Direct solution of linear systems and of symmetric positive semidefinite boxed LCPs."""
+
+    def prepare(self, problem: Problem) -> DirectState:
+        if not problem.is_symmetric:
+            return _general(problem, "A is not symmetric")
+        state = DirectState(problem, PivotState(problem))
+        if problem.law == "linear" and state.pivot is not None:
+            state.outcome = state.pivot.factorise()
+            if state.outcome == INDEFINITE:
+                return _general(problem, "A is indefinite")
+        return state
+
+    def update(self, state: DirectState, problem: Problem) -> DirectState:
+        return self.prepare(problem)
+
+    def run(
+        self, state: DirectState, impulse: FloatArray, n: int, tol: float, time_limit: float | None = None
+    ) -> Claim:
+        run = _Run(state, impulse, n, tol, time_limit)
+        if state.problem.m == 0:
+            return run.claim(Status.CONVERGED)
+        if n == 0:
+            return run.claim(Status.MAX_ITERATIONS)
+        if state.general is not None:
+            return run.linear_general(state.general)
+        return run.pivoting()
+
+
+def _general(problem: Problem, why: str) -> DirectState:
+    factor = GeneralFactor(problem)
+    if not factor.usable:
+        why += "; LU is singular and A too large for a decomposition that reveals its rank"
+    elif factor.rank < problem.m:
+        why += f"; A is singular, rank {factor.rank} of {problem.m}"
+    return DirectState(problem, general=factor, note=why)
+
+
+class _Run:
+    """One solve: the best judged iterate so far, and what was spent."""
+
+    def __init__(self, state: DirectState, impulse: FloatArray, n: int, tol: float, time_limit: float | None) -> None:
+        self.state, self.problem, self.impulse, self.budget, self.tol = state, state.problem, impulse, n, tol
+        self.stop_at = None if time_limit is None else perf_counter() + time_limit
+        m = state.problem.m
+        self.w, self.e, self.candidate = np.empty(m), np.empty(m), np.empty(m)
+        self.best, self.floor, self.sure = np.inf, 0.0, True
+        self.iterations = 0
+        self.work: dict[str, int] = {}
+        self.notes = [state.note] if state.note else []
+
+    # -- judging ---------------------------------------------------------------------------------
+
+    def judge(self, x: FloatArray) -> float:
+        """Relative residual of x; the best x becomes the result."""
+        return self.keep(*quick(self.problem, x, self.w, self.e, floor=True), x)
+
+    def judge_pivot(self, pivot: PivotState, solved: bool) -> float:
+        """The same for the pivoting's x, clipped; from its own w and rounding where these are the judge's."""
+        if solved and pivot.rows.shift == 0.0 and self.problem.rows is None:
+            energy, velocity = reference(self.problem)
+            e, v, floor_e, floor_v = pivot.rows.score()
+            if energy > 0.0 and velocity > 0.0 and np.isfinite(e):
+                relative, floor = max(e / energy, v / velocity), max(floor_e / energy, floor_v / velocity)
+                return self.keep(relative, floor, pivot.impulse(self.candidate), sure=False)
+        return self.judge(pivot.impulse(self.candidate))
+
+    def keep(self, relative: float, floor: float, x: FloatArray, sure: bool = True) -> float:
+        if relative < self.best:
+            self.best, self.floor, self.sure = relative, floor, sure
+            self.impulse[:] = x
+        return relative
+
+    @property
+    def is_good(self) -> bool:
+        return self.best <= max(GOOD, self.floor)
+
+    @property
+    def out_of_time(self) -> bool:
+        return self.stop_at is not None and perf_counter() >= self.stop_at
+
+    def claim(self, status: Status, **more: Any) -> Claim:
+        state = self.state
+        form = "LU" if state.general is not None else state.pivot.form if state.pivot is not None else ""
+        work = dict(self.work)
+        if state.pivot is not None:
+            work.update({k: v for k, v in state.pivot.work.items() if v})
+        return Claim(status, self.iterations, work, "; ".join(self.notes), form=form, **more)
+
+    def verdict(self) -> Claim:
+        """What the best iterate deserves, when nothing is left to do."""
+        if not self.sure and self.best > 0.1 * self.tol:
+            # Clipping x moved w by some roundings: near tol the judge's own pass decides.
+            self.best, self.floor = quick(self.problem, self.impulse, self.w, self.e, floor=True)
+        if self.best <= self.tol:
+            return self.claim(Status.CONVERGED)
+        if self.best <= 2.0 * self.floor:
+            return self.claim(Status.FLOOR)
+        return self.claim(Status.STALLED)
+
+    # -- linear systems that are not symmetric definite -------------------------------------------
+
+    def linear_general(self, factor: GeneralFactor) -> Claim:
+        problem = self.problem
+        self.iterations = 1
+        self.work = {"factorisations": 1}
+        if not factor.usable:
+            return self.claim(Status.NUMERICAL_ERROR)
+        singular = factor.rank < problem.m
+        x = self.impulse.copy() if singular else np.zeros(problem.m)
+        w = np.empty(problem.m)
+        previous = np.inf
+        for k in range(8):
+            judge.slack(problem.csr_data, x, w)
+            x -= factor.solve(w)
+            relative = self.judge(x)
+            self.work["refinements"] = k
+            if self.is_good or not relative < 0.5 * previous:
+                break
+            previous = relative
+        if not self.is_good and singular:
+            # What least squares leaves of b is orthogonal to the range of A: a certificate if it is not rounding.
+            judge.slack(problem.csr_data, x, w)
+            proof = self.certificate(-w)
+            if proof is not None:
+                return proof
+        return self.verdict()
+
+    # -- symmetric A -------------------------------------------------------------------------------
+
+    def pivoting(self) -> Claim:
+        pivot = self.state.pivot
+        assert pivot is not None
+        rows = pivot.rows
+        code = self.state.outcome
+        if self.problem.law == "linear":
+            rows.x[:] = self.impulse
+            if code == SOLVED:
+                pivot.solve_free()
+                self.iterations = 1
+                self.refine(pivot, self.judge_pivot(pivot, True))
+        else:
+            # Which rows will be free? Where a few sweeps put them.
+            rows.x[:] = self.impulse
+            rows.sweep(SWEEPS)
+            self.work["sweeps"] = 2 * SWEEPS
+            rows.predict()
+            code = self.rounds(pivot)
+        if self.is_good:
+            return self.verdict()
+        if code == ROUNDS and (self.iterations >= self.budget or self.out_of_time):
+            return self.out_of_budget()
+        if code == INDEFINITE:
+            return self.indefinite()
+        if code == SMALL:
+            self.note_singular(pivot)
+        return self.proximal(pivot)
+
+    def rounds(self, pivot: PivotState) -> int:
+        """Rounds to the end of this pass, refined and judged, within the budget and the time."""
+        while True:
+            code, done = pivot.rounds(min(BATCH, self.budget - self.iterations), self.stop_at)
+            self.iterations += done
+            if code not in (SOLVED, ROUNDS):
+                return code
+            relative = self.judge_pivot(pivot, code == SOLVED)
+            if code == SOLVED and pivot.rows.shift == 0.0:
+                code = self.refine(pivot, relative)
+            # Signs that differ by rounding alone exchange for ever; the judge sees that nothing is wrong.
+            if code == SOLVED or self.is_good or self.iterations >= self.budget or self.out_of_time:
+                return code
+
+    def refine(self, pivot: PivotState, relative: float) -> int:
+        """x <- x - A_FF^-1 w while that halves the residual; ROUNDS where it changes a sign."""
+        previous = np.inf
+        while not self.is_good and relative < 0.5 * previous:
+            previous = relative
+            pivot.correct()
+            self.work["refinements"] = self.work.get("refinements", 0) + 1
+            if pivot.exchange():
+                return ROUNDS
+            relative = self.judge_pivot(pivot, True)
+        return SOLVED
+
+    def out_of_budget(self) -> Claim:
+        return self.claim(Status.TIME_LIMIT if self.iterations < self.budget else Status.MAX_ITERATIONS)
+
+    def indefinite(self) -> Claim:
+        self.notes.append("A is indefinite on the free rows: no solution by this method, see lemke")
+        return self.claim(Status.NUMERICAL_ERROR)
+
+    def note_singular(self, pivot: PivotState) -> None:
+        if self.problem.law == "linear":
+            rank = pivot.rank()
+            self.notes.append(f"A is singular, rank {rank} of {self.problem.m}")
+            self.work["rank"] = rank
+        else:
+            self.notes.append("A is singular on the free rows: shifted and refined")
+        self.work["shifts"] = 0
+
+    def proximal(self, pivot: PivotState) -> Claim:
+        """Passes on A + s D around the last answer, s raised until its factor exists."""
+        problem, rows = self.problem, pivot.rows
+        shift, reference, waited = SHIFT, self.best, 0
+        rows.x[:] = self.impulse
+        pivot.start(shift)
+        self.work["shifts"] = 1
+        for _ in range(PASSES):
+            rows.recenter()
+            rows.restart()
+            code = self.rounds(pivot)
+            if self.is_good:
+                break
+            if code == ROUNDS:
+                return self.out_of_budget()
+            if code in (SMALL, INDEFINITE):
+                shift *= SHIFT_STEP
+                if shift > SHIFT_LIMIT:
+                    return self.indefinite_linear() if problem.law == "linear" else self.indefinite()
+                rows.x[:] = self.impulse
+                pivot.start(shift)
+                self.work["shifts"] += 1
+                continue
+            if self.best <= 0.5 * reference:
+                reference, waited = self.best, 0
+                continue
+            waited += 1
+            proof = self.certificate(rows.x - rows.center)
+            if proof is not None:
+                return proof
+            if waited >= PATIENCE or self.out_of_time:
+                break
+        return self.verdict()
+
+    def indefinite_linear(self) -> Claim:
+        state = _general(self.problem, "A is indefinite")
+        self.notes = [state.note]
+        assert state.general is not None
+        return self.linear_general(state.general)
+
+    def certificate(self, step: FloatArray) -> Claim | None:
+        """INFEASIBLE where `step`, cut to the directions the bounds allow, proves it."""
+        c = self.problem.cones
+        y = np.where(np.isfinite(c.upper), np.minimum(step, 0.0), step)
+        y = np.where(np.isfinite(c.lower), np.maximum(y, 0.0), y)
+        size = np.abs(y).max(initial=0.0)
+        if not 0.0 < size < np.inf:
+            return None
+        y = y / size
+        y[np.abs(y) < 1e-13] = 0.0
+        if check_certificate(self.problem, y) is not None:
+            return None
+        self.notes.append("no impulse meets every row: certificate found")
+        return self.claim(Status.INFEASIBLE, certificate=y)
+
+
+def _refusal(problem: Problem) -> str | None:
+    if problem.law == "lcp" and not problem.is_symmetric:
+        return f"needs symmetric A where rows are bounded; asymmetry is {problem.asymmetry:.1e}: use lemke or pgs"
+    return None
+
+
+SPEC = SolverSpec(
+    name="direct",
+    factory=Direct,
+    laws=frozenset({"linear", "lcp"}),
+    operator="matrix",
+    exact=True,
+    resumable=False,
+    max_iter=1000,
+    refusal=_refusal,
+    summary="factorisation; symmetric boxed LCP by block principal pivoting",
+    reference="Golub, Van Loan 2013, chapter 4; Judice, Pires 1994, Computers and Operations Research 21",
+)

@@ -1,0 +1,141 @@
+"""LDL^T of a symmetric matrix stored by diagonals, dense matrices included (width n).
+
+    c[i width + t] = A[i + t, i],  0 <= t < width                      lower half, column by column
+    column i:  p_i = c[i, 0],  c[i + s, t - s] -= c[i, s] c[i, t] / p_i   for 1 <= s <= t              (1)
+
+After it c[i, 0] holds 1 / p_i and c[i, t] the column before its division, so that L[i + t, i] =
+c[i, t] c[i, 0]. Right-looking: between two pivots lie one division, one product and one difference.
+"""
+from libc.stdint cimport int32_t, int64_t
+
+
+cdef struct pivots_t:
+    int32_t small               # pivots with |p_i| <= tiny * size_i: skipped, their row and column drop out
+    int32_t negative            # pivots below that
+    double least                # smallest p_i / size_i
+    int32_t first_small         # place of the first small pivot, -1
+
+
+cdef inline double pivot_2(double p, double size, int32_t i, double tiny, pivots_t* out) noexcept nogil:
+    # 1 / p, or 0 for a small pivot.
+    if p < out.least * size:
+        out.least = p / size
+    if not p > tiny * size:
+        if p < -tiny * size:
+            out.negative += 1
+        else:
+            out.small += 1
+            if out.first_small < 0:
+                out.first_small = i
+            return 0.0
+    return 1.0 / p
+
+
+cdef inline void ldl_factor_2(int32_t n, double* c, const double* size, double tiny, pivots_t* out) noexcept nogil:
+    # (1) for a tridiagonal matrix, from both ends to the middle row h (twisted factorisation): two chains of
+    # divisions that do not wait for each other. c[2 i] = 1 / p_i; the off-diagonals stay.
+    cdef int32_t i = 0, j = n - 1, h = n // 2
+    cdef double p = c[0], r = c[2 * (n - 1)], off
+    while i < h or j > h:
+        if i < h:
+            p = pivot_2(p, size[i], i, tiny, out)
+            c[2 * i] = p
+            off = c[2 * i + 1]
+            p = (c[2 * i + 2] if i + 1 < h else 0.0) - off * off * p
+            i += 1
+        if j > h:
+            r = pivot_2(r, size[j], j, tiny, out)
+            c[2 * j] = r
+            off = c[2 * j - 1]
+            r = (c[2 * j - 2] if j - 1 > h else 0.0) - off * off * r
+            j -= 1
+    # Both chains end with what they take from the diagonal of row h, itself still untouched.
+    off = c[2 * h]
+    if h > 0:
+        off += p
+    if h < n - 1:
+        off += r
+    c[2 * h] = pivot_2(off, size[h], h, tiny, out)
+
+
+cdef inline void ldl_solve_2(int32_t n, const double* c, double* x) noexcept nogil:
+    cdef int32_t i = 0, j = n - 1, h = n // 2
+    while i < h or j > h:
+        if i < h:
+            x[i + 1] -= c[2 * i + 1] * c[2 * i] * x[i]
+            i += 1
+        if j > h:
+            x[j - 1] -= c[2 * j - 1] * c[2 * j] * x[j]
+            j -= 1
+    x[h] *= c[2 * h]
+    i = h - 1
+    j = h + 1
+    while i >= 0 or j < n:
+        if i >= 0:
+            x[i] = x[i] * c[2 * i] - c[2 * i + 1] * c[2 * i] * x[i + 1]
+            i -= 1
+        if j < n:
+            x[j] = x[j] * c[2 * j] - c[2 * j - 1] * c[2 * j] * x[j - 1]
+            j += 1
+
+
+cdef inline void ldl_factor(int32_t n, int32_t width, double* c, const double* size, double tiny,
+                            pivots_t* out) noexcept nogil:
+    # (1); size (n) > 0 is what a pivot is compared with.
+    cdef int32_t i, s, t, last
+    cdef double p, inv, l
+    cdef double* col
+    cdef double* to
+    out.small = 0
+    out.negative = 0
+    out.least = 1.7976931348623157e308
+    out.first_small = -1
+    if width == 2:
+        ldl_factor_2(n, c, size, tiny, out)
+        return
+    for i in range(n):
+        col = c + <int64_t>i * width
+        p = col[0]
+        if p < out.least * size[i]:
+            out.least = p / size[i]
+        if not p > tiny * size[i]:
+            if p < -tiny * size[i]:
+                out.negative += 1
+            else:
+                out.small += 1
+                if out.first_small < 0:
+                    out.first_small = i
+                for t in range(width):
+                    col[t] = 0.0
+                continue
+        inv = 1.0 / p
+        col[0] = inv
+        last = width if width <= n - i else n - i
+        for s in range(1, last):
+            l = col[s] * inv
+            to = col + <int64_t>s * width
+            for t in range(s, last):
+                to[t - s] -= l * col[t]
+
+
+cdef inline void ldl_solve(int32_t n, int32_t width, const double* c, double* x) noexcept nogil:
+    # x <- (L D L^T)^-1 x; 0 on skipped places.
+    cdef int32_t i, t, last
+    cdef double y
+    cdef const double* col
+    if width == 2:
+        ldl_solve_2(n, c, x)
+        return
+    for i in range(n):
+        col = c + <int64_t>i * width
+        y = x[i] * col[0]
+        last = width if width <= n - i else n - i
+        for t in range(1, last):
+            x[i + t] -= col[t] * y
+    for i in range(n - 1, -1, -1):
+        col = c + <int64_t>i * width
+        y = x[i]
+        last = width if width <= n - i else n - i
+        for t in range(1, last):
+            y -= col[t] * x[i + t]
+        x[i] = y * col[0]
