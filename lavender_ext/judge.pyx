@@ -1,163 +1,25 @@
-"""The judge's pass: w = A lam - b formed anew, error e of every block, three sums over rows.
-
-    E   = sqrt(sum d e^2)                       [sqrt J]
-    V   = max sqrt(nu d) |e|                    [m/s], |e| the pair's norm on tangents
-    F_i = 2^-53 (|A| |lam| + |b|)_i             [m/s]; factored: |J| |M^-1| |J|^T |lam| + c |lam| for |A| |lam|
-    floor energy sqrt(sum F^2 / d), floor velocity max F sqrt(nu / d)
-"""
-from libc.math cimport fabs, sqrt
+"""The judge for Python: thin entries of judge.pxd, and the same pass exported by name."""
 from libc.stdint cimport int32_t
 
 import numpy as np
 
-from lavender_ext.block cimport CONTACT_SPIN, ROW, block_error, blocks_t, n_tangents, norm2
-from lavender_ext.csr cimport csr_abs_dot, csr_dot, csr_t
+from lavender_ext.block cimport blocks_t
+from lavender_ext.csr cimport csr_t
+from lavender_ext.judge cimport csr_slack, judge_into, rows_slack, rows_velocity, score_rows, score_t
 from lavender_ext.problem cimport Data
-from lavender_ext.rows cimport abs_push, contact_jacobian, contact_push, joint_push, rows_t, rows_times
+from lavender_ext.rows cimport rows_t
 
 
-cdef struct sum_t:              # sum of squares as scale^2 * ssq: neither over- nor underflows
-    double scale
-    double ssq
+cdef public void lav_judge_csr(const blocks_t* p, const csr_t* a, const double* lam, double* w, double* e,
+                               int32_t floor, score_t* out) noexcept nogil:
+    """Slack w (m), error e (m) and the sums of lam (m) for a problem given by A."""
+    judge_into(p, a, NULL, 0, lam, w, e, NULL, floor, out)
 
 
-cdef inline void add_square(sum_t* s, double x) noexcept nogil:
-    cdef double r
-    x = fabs(x)
-    if x > s.scale:
-        r = s.scale / x
-        s.ssq = 1.0 + s.ssq * r * r
-        s.scale = x
-    elif x > 0.0:
-        r = x / s.scale
-        s.ssq += r * r
-
-
-cdef inline double root(const sum_t* s) noexcept nogil:
-    return s.scale * sqrt(s.ssq)
-
-
-cdef public void lav_csr_slack(const blocks_t* p, const csr_t* a, const double* lam, double* w) noexcept nogil:
-    cdef int32_t i
-    for i in range(p.n_rows):
-        w[i] = csr_dot(a, i, lam) - p.b[i]
-
-
-cdef public void lav_rows_velocity(const blocks_t* p, const rows_t* r, const double* lam, double* v) noexcept nogil:
-    """v = M^-1 J^T lam, (n, 6)."""
-    cdef int32_t i, j, c
-    for i in range(6 * r.n_bodies):
-        v[i] = 0.0
-    for i in range(r.n_joints):
-        for j in range(p.ptr[i], p.ptr[i + 1]):
-            joint_push(r.minv_jac + 12 * j, lam[j], v, r.joint_body[2 * i], r.joint_body[2 * i + 1])
-    for c in range(r.n_contacts):
-        i = r.n_joints + c
-        j = p.ptr[i]
-        contact_push(r, c, n_tangents(p.kind[i], p.ptr[i + 1] - j), p.kind[i] == CONTACT_SPIN, lam + j, v)
-
-
-cdef public void lav_rows_slack(const blocks_t* p, const rows_t* r, const double* lam, const double* v,
-                                double* w) noexcept nogil:
-    """w = J v + c lam - b, v = M^-1 J^T lam."""
-    cdef int32_t j
-    rows_times(p, r, v, w)
-    for j in range(p.n_rows):
-        w[j] += r.compliance[j] * lam[j] - p.b[j]
-
-
-cdef public void lav_score(const blocks_t* p, const double* lam, const double* w, double* e, score_t* out) noexcept nogil:
-    """Errors e (m) of all blocks and their two sums; the floor entries are left alone."""
-    cdef int32_t i, j, k, nt
-    cdef double v, big = -1.0
-    cdef sum_t total = sum_t(0.0, 0.0)
-    out.worst = -1
-    out.finite = 1
-    for i in range(p.n_blocks):
-        block_error(p, i, lam, w, e)
-        j = p.ptr[i]
-        nt = 0 if p.kind[i] == ROW else n_tangents(p.kind[i], p.ptr[i + 1] - j)
-        for k in range(j, p.ptr[i + 1]):
-            add_square(&total, sqrt(p.d[k]) * e[k])
-            if nt == 2 and k == j + 2:
-                continue                                # the pair counts once, below
-            v = norm2(e[k], e[k + 1]) if nt == 2 and k == j + 1 else fabs(e[k])
-            v = sqrt(p.nu[k]) * sqrt(p.d[k]) * v
-            if v > big:
-                big = v
-                out.worst = k
-            elif v != v and out.finite:
-                out.finite = 0
-                out.worst = k
-                big = 1.0 / 0.0
-    if big > 1.7976931348623157e308:
-        out.finite = 0
-    out.energy = root(&total)
-    out.velocity = big if big > 0.0 else 0.0
-
-
-cdef inline void add_floor(const blocks_t* p, int32_t i, double size, sum_t* total, double* big) noexcept nogil:
-    cdef double f = 1.1102230246251565e-16 * (size + fabs(p.b[i])), v
-    add_square(total, f / sqrt(p.d[i]))
-    v = f * sqrt(p.nu[i]) / sqrt(p.d[i])
-    if v > big[0]:
-        big[0] = v
-
-
-cdef public void lav_csr_floor(const blocks_t* p, const csr_t* a, const double* lam, score_t* out) noexcept nogil:
-    cdef int32_t i
-    cdef sum_t total = sum_t(0.0, 0.0)
-    cdef double big = 0.0
-    for i in range(p.n_rows):
-        add_floor(p, i, csr_abs_dot(a, i, lam), &total, &big)
-    out.floor_energy = root(&total)
-    out.floor_velocity = big
-
-
-cdef public void lav_rows_floor(const blocks_t* p, const rows_t* r, const double* lam, double* v, score_t* out) noexcept nogil:
-    """v (n, 6) is scratch."""
-    cdef int32_t i, j, c, q, t, a, b
-    cdef double size
-    cdef double jac[48]
-    cdef const double* row
-    cdef sum_t total = sum_t(0.0, 0.0)
-    cdef double big = 0.0
-    for i in range(6 * r.n_bodies):
-        v[i] = 0.0
-    for t in range(2):                                  # first the bodies, then the rows
-        for i in range(p.n_blocks):
-            j = p.ptr[i]
-            c = i - r.n_joints
-            if c < 0:
-                a = r.joint_body[2 * i]
-                b = r.joint_body[2 * i + 1]
-                row = r.jac + 12 * j
-            else:
-                a = r.contact_body[2 * c]
-                b = r.contact_body[2 * c + 1]
-                contact_jacobian(r, c, n_tangents(p.kind[i], p.ptr[i + 1] - j), p.kind[i] == CONTACT_SPIN, jac)
-                row = jac
-            for q in range(j, p.ptr[i + 1]):
-                if t == 0:
-                    abs_push(row, fabs(lam[q]), r.inv_mass, r.inv_inertia, a, b, v)
-                else:
-                    size = r.compliance[q] * fabs(lam[q])
-                    size += abs_joint_velocity(row, v, a, b)
-                    add_floor(p, q, size, &total, &big)
-                row += 12
-    out.floor_energy = root(&total)
-    out.floor_velocity = big
-
-
-cdef inline double abs_joint_velocity(const double* jac, const double* v, int32_t a, int32_t b) noexcept nogil:
-    cdef double s = 0.0
-    cdef int32_t k
-    for k in range(6):
-        if a >= 0:
-            s += fabs(jac[k]) * v[6 * a + k]
-        if b >= 0:
-            s += fabs(jac[6 + k]) * v[6 * b + k]
-    return s
+cdef public void lav_judge_rows(const blocks_t* p, const rows_t* r, const double* lam, double* w, double* e, double* v,
+                                int32_t floor, score_t* out) noexcept nogil:
+    """The same for a factored problem; v (n_bodies, 6) is scratch."""
+    judge_into(p, NULL, r, 1, lam, w, e, v, floor, out)
 
 
 def slack(Data p, const double[::1] lam, double[::1] w):
@@ -168,27 +30,11 @@ def slack(Data p, const double[::1] lam, double[::1] w):
     if p.factored:
         v = np.empty(6 * p.rows.n_bodies + 1)
         with nogil:
-            lav_rows_velocity(&p.blocks, &p.rows, &lam[0], &v[0])
-            lav_rows_slack(&p.blocks, &p.rows, &lam[0], &v[0], &w[0])
+            rows_velocity(&p.blocks, &p.rows, &lam[0], &v[0])
+            rows_slack(&p.blocks, &p.rows, &lam[0], &v[0], &w[0])
     else:
         with nogil:
-            lav_csr_slack(&p.blocks, &p.csr, &lam[0], &w[0])
-
-
-cdef void judge_into(const blocks_t* p, const csr_t* a, const rows_t* r, bint factored, const double* lam, double* w,
-                     double* e, double* v, bint floor, score_t* out) noexcept nogil:
-    """Slack into w (m), error into e (m), the sums into out; v (n_bodies, 6) is scratch, read where factored."""
-    if factored:
-        lav_rows_velocity(p, r, lam, v)
-        lav_rows_slack(p, r, lam, v, w)
-        lav_score(p, lam, w, e, out)
-        if floor:
-            lav_rows_floor(p, r, lam, v, out)
-    else:
-        lav_csr_slack(p, a, lam, w)
-        lav_score(p, lam, w, e, out)
-        if floor:
-            lav_csr_floor(p, a, lam, out)
+            csr_slack(&p.blocks, &p.csr, &lam[0], &w[0])
 
 
 def judge(Data p, const double[::1] lam, double[::1] w, double[::1] e, bint floor=True):
@@ -212,7 +58,7 @@ def score(Data p, const double[::1] lam, const double[::1] w, double[::1] e):
     if p.blocks.n_rows == 0:
         return 0.0, 0.0, -1, True
     with nogil:
-        lav_score(&p.blocks, &lam[0], &w[0], &e[0], &s)
+        score_rows(&p.blocks, &lam[0], &w[0], &e[0], &s)
     return s.energy, s.velocity, s.worst, bool(s.finite)
 
 
@@ -224,4 +70,4 @@ def velocity_change(Data p, const double[::1] lam, double[:, ::1] v):
         v[:, :] = 0.0
         return
     with nogil:
-        lav_rows_velocity(&p.blocks, &p.rows, &lam[0], &v[0, 0])
+        rows_velocity(&p.blocks, &p.rows, &lam[0], &v[0, 0])

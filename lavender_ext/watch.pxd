@@ -1,7 +1,22 @@
-"""The stopping test of a sweep solver: the judge's own arithmetic at fixed sweep counts."""
+"""The stopping test of a sweep solver: the judge's own arithmetic at fixed sweep counts.
+
+Checks fall at 1, 2, ... 16 sweeps, then an eighth more each time. The relative residual r decides:
+
+    r <= tol                                        CONVERGED
+    r not finite, or > 1e6 max(1, r at the start)   DIVERGED
+    no better than the best so far, and
+        best <= 1e-6 and best <= 2 floor            AT_FLOOR
+        sweeps > 8 * sweeps of the best + 64        STALLED
+
+On the last three the best iterate is put back. A check costs about one sweep.
+"""
 from libc.stdint cimport int32_t
 
+from lavender_ext.block cimport blocks_t
+from lavender_ext.csr cimport csr_t
+from lavender_ext.judge cimport judge_into, score_t
 from lavender_ext.problem cimport Data
+from lavender_ext.rows cimport rows_t
 
 
 cdef enum:
@@ -12,18 +27,75 @@ cdef enum:
     AT_FLOOR = 4
 
 
+cdef struct watch_t:
+    int32_t total               # sweeps done
+    int32_t check_at            # sweeps at the next check
+    int32_t best_at             # sweeps at the best check, -1 before any
+    double start                # relative residual at the first check
+    double best_relative        # of the best check
+    double start_energy         # sqrt J, of doing nothing
+    double start_velocity       # m/s
+    double* best                # (m) N s
+    double* w                   # (m) scratch
+    double* e                   # (m) scratch
+    double* v                   # (n_bodies, 6) scratch
+
+
 ctypedef void (*sweep_t)(void* context, double* lam, int32_t first_sweep, int32_t n) noexcept nogil
+
+
+cdef inline double ratio(double x, double reference) noexcept nogil:
+    if x == 0.0:
+        return 0.0
+    return x / reference if reference > 0.0 else 1.0 / 0.0
+
+
+cdef inline double relative(const watch_t* s, double energy, double velocity) noexcept nogil:
+    cdef double x = ratio(energy, s.start_energy), y = ratio(velocity, s.start_velocity)
+    return x if x > y else y
+
+
+cdef inline void copy(const double* x, double* out, int32_t n) noexcept nogil:
+    cdef int32_t i
+    for i in range(n):
+        out[i] = x[i]
+
+
+cdef inline int32_t check(watch_t* s, const blocks_t* p, const csr_t* a, const rows_t* r, int32_t factored,
+                          double* lam, double tol) noexcept nogil:
+    """One check; sets the sweeps of the next."""
+    cdef score_t x
+    cdef double now, inf = 1.0 / 0.0
+    judge_into(p, a, r, factored, lam, s.w, s.e, s.v, 0, &x)
+    now = relative(s, x.energy, x.velocity) if x.finite else inf
+    if s.total == 0:
+        s.start = now
+    s.check_at = s.total + (s.total >> 3 if s.total >= 16 else 1)
+    if now <= tol:
+        return CONVERGED
+    if now < s.best_relative:
+        s.best_relative = now
+        s.best_at = s.total
+        copy(lam, s.best, p.n_rows)
+        return RUNNING
+    if not now < inf or now > 1e6 * (s.start if s.start > 1.0 else 1.0):
+        if s.best_at >= 0:
+            copy(s.best, lam, p.n_rows)
+        return DIVERGED
+    if s.best_at >= 0 and s.best_relative <= 1e-6:
+        judge_into(p, a, r, factored, s.best, s.w, s.e, s.v, 1, &x)
+        if s.best_relative <= 2.0 * relative(s, x.floor_energy, x.floor_velocity):
+            copy(s.best, lam, p.n_rows)
+            return AT_FLOOR
+    if s.total > 8 * <double>s.best_at + 64:
+        copy(s.best, lam, p.n_rows)
+        return STALLED
+    return RUNNING
 
 
 cdef class Watch:
     cdef Data data
-    cdef readonly int32_t total             # sweeps done
-    cdef readonly int32_t check_at          # sweeps at the next check
-    cdef readonly int32_t best_at           # sweeps at the best check
-    cdef readonly double start              # relative residual at the first check
-    cdef readonly double best_relative      # of the best check
-    cdef double[::1] best_lam, w, e, v
+    cdef watch_t state
+    cdef object keep
     cdef int32_t check(self, double* lam, double tol) noexcept nogil
-    cdef double relative(self, double energy, double velocity) noexcept nogil
-    cdef void restore(self, double* lam) noexcept nogil
     cdef int32_t run(self, sweep_t sweep, void* context, double* lam, int32_t n, double tol, int32_t* done) noexcept nogil
