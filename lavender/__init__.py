@@ -1,6 +1,7 @@
 """lavender: the constraint problem of one rigid-body step, solved by the solver you name, and judged."""
 
 from lavender._version import __version__
+from lavender.check import CrossCheck, cross_check
 from lavender.cones import CONTACT, CONTACT_SPIN, ROW, Cones
 from lavender.errors import (
     CapabilityError,
@@ -23,6 +24,7 @@ __all__ = [
     "CapabilityError",
     "Claim",
     "Cones",
+    "CrossCheck",
     "InputError",
     "LavenderError",
     "Problem",
@@ -36,6 +38,7 @@ __all__ = [
     "UnknownName",
     "__version__",
     "available",
+    "cross_check",
     "get",
     "known",
     "prepare",

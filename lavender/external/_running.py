@@ -83,10 +83,9 @@ def ask(
         return Claim(Status.MAX_ITERATIONS, 0, work, "", qp.form)
     start = impulse.copy()
     eps = max(0.5 * target(problem, tol), EPS_MIN)
-    levels = [
-        (max(eps / 100.0**i, EPS_MIN), max(eps if i == 0 else eps * eps / 10.0 ** (i - 1), GAP_MIN))
-        for i in range(ATTEMPTS)
-    ]
+    levels = [(eps, eps)]
+    for i in range(1, ATTEMPTS):
+        levels.append((max(eps / 100.0**i, EPS_MIN), max(10.0 * eps * eps / 10.0**i, GAP_MIN)))
     if tol == 0.0:
         levels = levels[-1:]
     best: tuple[float, Claim, FloatArray] | None = None
@@ -188,9 +187,12 @@ def quiet(noisy: bool) -> Iterator[list[str]]:
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         try:
-            with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
-                with _descriptors_to_null() if noisy else contextlib.nullcontext():
-                    yield said
+            with (
+                contextlib.redirect_stdout(io.StringIO()),
+                contextlib.redirect_stderr(io.StringIO()),
+                _descriptors_to_null() if noisy else contextlib.nullcontext(),
+            ):
+                yield said
         finally:
             said += [str(w.message).strip() for w in caught if not issubclass(w.category, DeprecationWarning)]
 

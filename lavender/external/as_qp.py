@@ -24,8 +24,8 @@ and z = r + T zeta, lambda = sigma S z, where the rows are A = -T^T K~ (t aside)
 the velocities, and J is never squared.
 
 sigma = max(E0 / sqrt(m), V0 sqrt(heaviest mass)) makes both free of units, with unknowns near 1 also at
-large mass ratios; a residual of x times sigma is a residual of the judge. Rows whose impulse is known (lower = upper, friction with mu = 0, rows of A that
-are all zero) are taken out first.
+large mass ratios; a residual of x times sigma is a residual of the judge. Rows whose impulse is known
+(lower = upper, friction with mu = 0, rows of A that are all zero) are taken out first.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ class QP:
     @property
     def is_bounds_only(self) -> bool:
         """No rows, and no bound that is finite: a backend may call it unconstrained."""
-        no_bound = self.lb is None or not (np.isfinite(self.lb).any() or np.isfinite(self.ub).any())
+        no_bound = self.lb is None or self.ub is None or not np.isfinite([self.lb, self.ub]).any()
         return len(self.b) == 0 and no_bound
 
     def impulse(self, x: FloatArray, zeta: FloatArray) -> FloatArray:
@@ -127,7 +127,7 @@ class QP:
         z = impulse[self.kept] / (self.sigma * self.root)
         xi = np.zeros(self.n)
         if self.form == "impulse":
-            if self.lb is not None:
+            if self.lb is not None and self.ub is not None:
                 gradient = self.P @ z + self.q
                 at_low, at_high = z <= self.lb, z >= self.ub
                 xi = np.where(at_low, np.minimum(-gradient, 0.0), 0.0) + np.where(
@@ -145,8 +145,10 @@ class QP:
 
 
 def pick_form(problem: Problem, form: str, definite: bool = False) -> str:
-    """ "impulse" or "velocity". "auto": velocity where rows are known and m > 6 n, the mass ratio is 1e3
-    or more, or the backend needs a definite P (`definite`).
+    """The form that `form` asks for, "impulse" or "velocity".
+
+    "auto" takes the velocity form where rows are known and m > 6 n, the mass ratio is 1e3 or more, or
+    the backend needs a definite P (`definite`).
 
     Raises
     ------
@@ -292,12 +294,8 @@ def velocity_form(problem: Problem) -> QP:
             put.row([(tangent, ratio)])
             slack.row([])
     back = sp.csr_matrix(put.matrix(k).T)
-    matrix = sp.csc_matrix(sp.hstack([-(back.T @ lift), sp.csc_matrix((back.shape[1], 0))]))
-    matrix = sp.csc_matrix(
-        (matrix.data, matrix.indices, np.pad(matrix.indptr, (0, n - ny), mode="edge")),
-        shape=(back.shape[1], n),
-    )
-    matrix = sp.csc_matrix(matrix + slack.matrix(n))
+    velocities = sp.hstack([-(back.T @ lift), sp.csc_matrix((back.shape[1], n - ny))])
+    matrix = sp.csc_matrix(velocities + slack.matrix(n))
     q = np.zeros(n)
     known = np.zeros(ny)
     known[: jac.shape[1]] = jac.T @ (parts.fixed / (form.scale * sigma))

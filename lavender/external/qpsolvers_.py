@@ -57,6 +57,7 @@ class Backend:
     warm: bool = False  # uses a start point
     stoppable: bool = False  # takes a time limit
     linear: str = "bounds"  # what keeps it at work without constraints: "bounds", "equality", or "" (refused)
+    finite: bool = False  # takes no infinite bounds: the finite ones become rows
     noisy: bool = False  # prints even when told not to
 
 
@@ -152,10 +153,17 @@ def _through_qpsolvers(
     dense = backend.dense
     p = qp.P.toarray() if dense else qp.P
     rows = qp.A.toarray() if dense else qp.A
-    g, h = (rows[z:], qp.b[z:]) if len(qp.b) > z else (None, None)
-    a, b = (rows[:z], qp.b[:z]) if z else (None, None)
     lb, ub = qp.lb, qp.ub
-    if lb is None and len(qp.b) == 0:
+    inequality, side = rows[z:], qp.b[z:]
+    bounds = _bound_rows(qp) if backend.finite else []
+    if bounds:
+        lb = ub = None
+        inequality = sp.csc_matrix(sp.vstack([inequality, *(s * m for s, m, _, _ in bounds)]))
+        inequality = inequality.toarray() if dense else inequality
+        side = np.concatenate([side, *(h for _, _, h, _ in bounds)])
+    g, h = (inequality, side) if len(side) else (None, None)
+    a, b = (rows[:z], qp.b[:z]) if z else (None, None)
+    if lb is None and g is None and a is None:
         lb, ub = np.full(qp.n, -np.inf), np.full(qp.n, np.inf)  # infinite bounds: no hand-over to LSQR
     problem = qpsolvers.Problem(p, qp.q, g, h, a, b, lb, ub)
     x0 = settings.pop("initvals", None)
@@ -174,21 +182,41 @@ def _through_qpsolvers(
         zeta[:z] = solution.y
     elif z:
         x = x if qp.form == "impulse" else None
-    if len(qp.b) > z and _given(solution.z, len(qp.b) - z):
-        zeta[z:] = solution.z
+    if len(qp.b) > z and _given(solution.z, len(side)):
+        zeta[z:] = np.asarray(solution.z)[: len(qp.b) - z]
     elif len(qp.b) > z:
         x = None  # multipliers are the answer of the velocity form
     xi = np.asarray(solution.z_box, float) if _given(solution.z_box, qp.n) else None
+    if bounds and _given(solution.z, len(side)):
+        xi, at0 = np.zeros(qp.n), len(qp.b) - z
+        for sign, _, _, at in bounds:
+            xi[at] += sign * np.asarray(solution.z)[at0 : at0 + len(at)]
+            at0 += len(at)
     iterations = _iterations(extras)
     work = {} if iterations is None else {"iterations": iterations}
-    return Answer(status, own or words or _words(solution.found, x), x, zeta, xi, work)
+    words = own or words or _words(solution.found, x)
+    if backend.settings is None:
+        words += ", at its own tolerance"
+    return Answer(status, words, x, zeta, xi, work)
+
+
+def _bound_rows(qp: QP) -> list[tuple[float, sp.csr_matrix, FloatArray, Any]]:
+    """Finite bounds as rows sign x[at] <= h: (sign, rows of the identity, h, at) for upper, then lower."""
+    if qp.lb is None or qp.ub is None:
+        return []
+    eye = sp.csr_matrix(sp.eye_array(qp.n))
+    found = []
+    for sign, bound in ((1.0, qp.ub), (-1.0, qp.lb)):
+        at = np.flatnonzero(np.isfinite(bound))
+        found.append((sign, eye[at], sign * bound[at], at))
+    return found
 
 
 def _given(y: Any, size: int) -> bool:
     return y is not None and np.size(y) == size
 
 
-def _words(found: bool, x: Any) -> str:
+def _words(found: bool | None, x: Any) -> str:
     return "solved" if found else "not solved" if x is not None else "not solved, nothing returned"
 
 
@@ -215,10 +243,14 @@ def _status_of(solution: Any, extras: Mapping[str, Any]) -> tuple[Status, str]:
             value = extras.get(name)
         if value is not None:
             words = str(getattr(value, "name", value))
+            words = f"status {words}" if words.lstrip("-").isdigit() else words
             break
     low = words.lower()
     if solution.found:
         return Status.CONVERGED, words
+    if "exitFlag" in (info if isinstance(info, Mapping) else ()):
+        ecos = {1: Status.INFEASIBLE, 2: Status.INFEASIBLE, 10: Status.STALLED, -1: Status.MAX_ITERATIONS}
+        return ecos.get(int(info["exitFlag"]), Status.NUMERICAL_ERROR), words
     if "infeas" in low or "unbounded" in low:
         return Status.INFEASIBLE, words
     if "time" in low:
@@ -337,17 +369,11 @@ def _certificate(y: Any, size: int) -> FloatArray | None:
 def _clarabel(qp: QP, impulse: FloatArray, limit: Limits, extra: dict[str, Any]) -> Answer:
     import clarabel
 
-    blocks, rhs, signs = [qp.A[: qp.n_zero + qp.n_nonneg]], [qp.b[: qp.n_zero + qp.n_nonneg]], []
-    eye = sp.eye_array(qp.n, format="csr")
-    if qp.lb is not None and qp.ub is not None:
-        for sign, bound in ((1.0, qp.ub), (-1.0, qp.lb)):
-            at = np.flatnonzero(np.isfinite(bound))
-            signs.append((sign, at))
-            blocks.append(sign * eye[at])
-            rhs.append(sign * bound[at])
-    blocks.append(qp.A[qp.n_zero + qp.n_nonneg :])
-    rhs.append(qp.b[qp.n_zero + qp.n_nonneg :])
-    n_bounds = sum(len(at) for _, at in signs)
+    first = qp.n_zero + qp.n_nonneg
+    bounds = _bound_rows(qp)
+    n_bounds = sum(len(at) for *_, at in bounds)
+    stacked = sp.csc_matrix(sp.vstack([qp.A[:first], *(sign * m for sign, m, _, _ in bounds), qp.A[first:]]))
+    rhs = np.concatenate([qp.b[:first], *(h for _, _, h, _ in bounds), qp.b[first:]])
     cones = []
     if qp.n_zero:
         cones.append(clarabel.ZeroConeT(qp.n_zero))
@@ -368,10 +394,7 @@ def _clarabel(qp: QP, impulse: FloatArray, limit: Limits, extra: dict[str, Any])
     if limit.time_limit is not None:
         settings.time_limit = limit.time_limit
     _set_all(settings, extra, "clarabel")
-    stacked = sp.csc_matrix(sp.vstack(blocks))
-    solver = clarabel.DefaultSolver(
-        sp.csc_matrix(sp.triu(qp.P)), qp.q, stacked, np.concatenate(rhs), cones, settings
-    )
+    solver = clarabel.DefaultSolver(sp.csc_matrix(sp.triu(qp.P)), qp.q, stacked, rhs, cones, settings)
     result = solver.solve()
     name = str(result.status)
     status = {
@@ -386,11 +409,10 @@ def _clarabel(qp: QP, impulse: FloatArray, limit: Limits, extra: dict[str, Any])
         "MaxTime": Status.TIME_LIMIT,
     }.get(name, Status.NUMERICAL_ERROR)
     x, z = np.array(result.x), np.array(result.z)
-    first = qp.n_zero + qp.n_nonneg
     zeta = np.concatenate([z[:first], z[first + n_bounds :]])
     xi = np.zeros(qp.n)
     at0 = first
-    for sign, at in signs:
+    for sign, _, _, at in bounds:
         xi[at] += sign * z[at0 : at0 + len(at)]
         at0 += len(at)
     # One factorisation before the first step and one for each.
@@ -401,17 +423,17 @@ def _clarabel(qp: QP, impulse: FloatArray, limit: Limits, extra: dict[str, Any])
 def _daqp(qp: QP, impulse: FloatArray, limit: Limits, extra: dict[str, Any]) -> Answer:
     import daqp
 
-    rows, low, high = _two_sided(qp, False)
-    bounded = qp.lb is not None and qp.ub is not None
-    lb, ub = (qp.lb, qp.ub) if bounded else (np.zeros(0), np.zeros(0))
-    assert lb is not None and ub is not None
+    _, low, high = _two_sided(qp, False)
+    bounded = qp.lb is not None
+    lb = np.zeros(0) if qp.lb is None else qp.lb
+    ub = np.zeros(0) if qp.ub is None else qp.ub
     low, high = (np.clip(np.concatenate(p), -1e30, 1e30) for p in ((lb, low), (ub, high)))
     sense = np.zeros(len(low), np.int32)
     sense[len(lb) : len(lb) + qp.n_zero] = 5
     x0, _, _ = qp.start(impulse)
     settings: dict[str, Any] = {
         "iter_limit": limit.max_iter,
-        "primal_tol": _at(limit.eps, 1e-12),
+        "primal_tol": _at(limit.eps, 1e-11),
         "dual_tol": _at(limit.eps, 1e-13),
     }
     if limit.time_limit is not None:
@@ -472,7 +494,7 @@ def _highs(qp: QP, impulse: FloatArray, limit: Limits, extra: dict[str, Any]) ->
         lp.a_matrix_.start_, lp.a_matrix_.index_, lp.a_matrix_.value_ = rows.indptr, rows.indices, rows.data
         lp.a_matrix_.num_row_, lp.a_matrix_.num_col_ = rows.shape
         lp.row_lower_, lp.row_upper_ = low, high
-    solver = highspy.Highs()
+    solver: Any = highspy.Highs()  # type: ignore[no-untyped-call]
     settings: dict[str, Any] = {
         "output_flag": False,
         "threads": 1,
@@ -596,7 +618,10 @@ def _copt(limit: Limits) -> dict[str, Any]:
 
 
 def _qtqp(limit: Limits) -> dict[str, Any]:
-    return {"atol": limit.eps, "rtol": 0.0, "max_iter": limit.max_iter}
+    return {
+        "tol_feas": limit.eps, "tol_gap_abs": limit.gap, "tol_gap_rel": GAP_RELATIVE,
+        "max_iter": limit.max_iter, "collect_stats": True,
+    }  # fmt: skip
 
 
 def _pyqpmad(limit: Limits) -> dict[str, Any]:
@@ -633,7 +658,7 @@ BACKENDS: tuple[Backend, ...] = (
             "Vandenberghe 2010, CVXOPT", settings=_cvxopt, max_iter=100),
     Backend("ecos", ("qpsolvers", "ecos"), "ecos", "interior point for second-order cones",
             "Domahidi, Chu, Boyd 2013, ECOS", settings=_ecos, max_iter=100, dense=True, definite=True,
-            linear="equality"),
+            linear="equality", finite=True),
     Backend("gurobi", ("qpsolvers", "gurobipy"), "gurobipy", "interior point and simplex", "Gurobi manual",
             settings=_gurobi, stoppable=True, noisy=True),
     Backend("copt", ("qpsolvers", "coptpy"), "coptpy", "interior point", "COPT manual",
@@ -655,7 +680,7 @@ BACKENDS: tuple[Backend, ...] = (
     Backend("qpoases", ("qpsolvers", "qpoases"), "qpoases", "online active set",
             "Ferreau et al. 2014, qpOASES", dense=True),
     Backend("qpswift", ("qpsolvers", "qpSWIFT"), "qpSWIFT", "interior point",
-            "Pandala, Ding, Park 2019, qpSWIFT", dense=True, linear=""),
+            "Pandala, Ding, Park 2019, qpSWIFT", dense=True, linear="", finite=True),
     Backend("sip", ("qpsolvers", "sip_qp_python"), "sip-qp-python", "interior point", "SIP manual"),
 )  # fmt: skip
 

@@ -1,0 +1,339 @@
+"""Do solvers agree? Each against the judge, and against the optimum that a QP backend found.
+
+For symmetric positive semidefinite A and a convex set of impulses (bounds, the cones of relaxed
+friction) any two impulses, with Delta = l1 - l2, eps = e1 - e2 (the judge's errors) and D = diag(d), obey
+
+    |Delta|_A^2 <= |Delta|_A |eps|_A + |eps|_D |Delta|_D                                          (1)
+
+Both p = l - e are projections of l - w/d in the metric of D, so (w1 - w2 - D eps).(Delta - eps) <= 0; expand and use
+Cauchy-Schwarz. A breach means that a residual is computed wrongly. |Delta|_A [sqrt J] is the energy of
+the difference of velocities, which is unique where impulses are not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from lavender._arrays import FloatArray
+from lavender.errors import InputError, LavenderError
+from lavender.problem import Problem
+from lavender.registry import available, get, known
+from lavender.residuals import qp_residual
+from lavender.solution import Solution
+from lavender.solve import solve
+
+__all__ = ["REFERENCES", "CrossCheck", "CrossCheckRow", "cross_check"]
+
+REFERENCES = ("osqp", "clarabel", "piqp", "direct")
+REFERENCE_TOL = 1e-9  # relative residual that a reference must reach, or 10 times the floor
+SIGN_TOL = 1e-6  # multipliers of a reference: the judge has measured its accuracy, this finds wrong signs
+
+AGREES = "agrees"
+AGREES_UNCOMPARED = "solved, nothing to compare with"
+NOT_SOLVED = "not solved"
+CONTRADICTED = "claim contradicted"
+BREACH = "breach: a residual is computed wrongly"
+REFUSED = "refused"
+
+
+@dataclass(frozen=True)
+class CrossCheckRow:
+    """One solver beside the reference; numbers are None where they mean nothing."""
+
+    solver: str
+    verdict: str
+    status: str = ""
+    relative: float | None = None  # -, the judge's
+    floor: float | None = None  # -
+    distance: float | None = None  # sqrt J, |Delta|_A to the reference
+    allowed: float | None = None  # sqrt J, largest distance that (1) allows
+    slack: float | None = None  # m/s, largest difference of slack
+    objective: float | None = None  # J, 1/2 l.A l - b.l minus that of the reference
+    time: float | None = None  # s, set-up and solve
+    note: str = ""  # form, message, reason
+    solution: Solution | None = None
+
+    @property
+    def contradicted(self) -> bool:
+        """The solver claims what the judge does not find, or inequality (1) is broken."""
+        return self.verdict in (CONTRADICTED, BREACH)
+
+
+@dataclass(frozen=True)
+class CrossCheck:
+    """Table of `cross_check`; iterates over its rows, and `str()` is plain text."""
+
+    problem: Problem
+    tol: float
+    reference: str | None  # name of the solver that gave the reference, None without one
+    reference_note: str  # how good it is, or why there is none
+    rows: tuple[CrossCheckRow, ...]
+
+    def __iter__(self) -> Iterator[CrossCheckRow]:
+        return iter(self.rows)
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def __getitem__(self, solver: str) -> CrossCheckRow:
+        for row in self.rows:
+            if row.solver == solver:
+                return row
+        raise InputError(
+            f"no solver {solver!r} in this check; it has {', '.join(r.solver for r in self.rows)}"
+        )
+
+    @property
+    def contradicted(self) -> tuple[CrossCheckRow, ...]:
+        """Rows whose claim does not hold."""
+        return tuple(row for row in self.rows if row.contradicted)
+
+    @property
+    def agreed(self) -> tuple[CrossCheckRow, ...]:
+        """Rows that agree with the reference."""
+        return tuple(row for row in self.rows if row.verdict == AGREES)
+
+    @property
+    def ok(self) -> bool:
+        """No claim is contradicted."""
+        return not self.contradicted
+
+    def __str__(self) -> str:
+        head = (
+            "solver",
+            "verdict",
+            "status",
+            "relative",
+            "floor",
+            "distance",
+            "allowed",
+            "objective",
+            "ms",
+            "",
+        )
+        body = [
+            (
+                r.solver, r.verdict, r.status, _short(r.relative), _short(r.floor), _short(r.distance),
+                _short(r.allowed), _short(r.objective), "" if r.time is None else f"{1e3 * r.time:.3g}", r.note,
+            )
+            for r in self.rows
+        ]  # fmt: skip
+        widths = [max(len(line[i]) for line in (head, *body)) for i in range(len(head))]
+        lines = [
+            "  ".join(x.ljust(n) for x, n in zip(line, widths, strict=True)).rstrip()
+            for line in (head, *body)
+        ]
+        name = self.problem.name or f"{self.problem.m} rows"
+        reference = f"reference {self.reference}" if self.reference else "no reference"
+        return "\n".join(
+            [f"{name} ({self.problem.law}), tol {self.tol:g}: {reference}, {self.reference_note}", *lines]
+        )
+
+
+def _short(x: float | None) -> str:
+    return "" if x is None else f"{x:.1e}"
+
+
+def cross_check(
+    problem: Problem,
+    solvers: Iterable[str] | None = None,
+    reference: str = "osqp",
+    *,
+    tol: float = 1e-6,
+    max_iter: int | None = None,
+    time_limit: float | None = None,
+) -> CrossCheck:
+    """Solve with every solver and compare each with a judged reference.
+
+    The reference must reach max(1e-9, 10 floor) by the judge and have multipliers of the right sign;
+    otherwise the next of osqp, clarabel, piqp, direct is taken, and named.
+
+    Parameters
+    ----------
+    problem : Problem
+    solvers : names, optional
+        Default: all that take the problem here.
+    reference : str
+        Tried first.
+    tol : float
+        Relative residual asked of the solvers.
+    max_iter : int, optional
+        Budget of the solvers, in their own iterations; default: each spec's.
+    time_limit : float, optional, s
+        For each solver, where it can be stopped.
+
+    Returns
+    -------
+    CrossCheck
+        Distances, slack and objective only for symmetric A without Coulomb friction.
+
+    Raises
+    ------
+    UnknownName
+        A solver or reference that does not exist.
+    InputError
+        Wrong `tol` or limits.
+    """
+    names = (
+        available(problem) if solvers is None else [solvers] if isinstance(solvers, str) else list(solvers)
+    )
+    reasons = known(problem)
+    for name in (reference, *names):
+        if name not in reasons:
+            get(name)  # raises UnknownName with the nearest names
+    optimum, chosen, note = _reference(problem, reference, reasons, time_limit)
+    rows = []
+    for name in names:
+        reason = reasons[name]
+        if reason is not None:
+            rows.append(CrossCheckRow(name, REFUSED, note=reason))
+            continue
+        try:
+            solution = solve(problem, name, tol=tol, max_iter=max_iter, time_limit=time_limit)
+        except InputError:
+            raise
+        except LavenderError as error:  # refused only after a look at the numbers
+            rows.append(CrossCheckRow(name, REFUSED, note=str(error)))
+            continue
+        rows.append(_compare(problem, name, solution, optimum))
+    return CrossCheck(problem, tol, chosen, note, tuple(rows))
+
+
+def _reference(
+    problem: Problem, first: str, reasons: dict[str, str | None], time_limit: float | None
+) -> tuple[Solution | None, str | None, str]:
+    """(solution, solver, how good) of the first that passes, or (None, None, why none does)."""
+    if problem.law == "coulomb":
+        return None, None, "Coulomb friction is not the optimality condition of a QP"
+    if not problem.is_symmetric:
+        return None, None, f"A is not symmetric (by {problem.asymmetry:.1e}), so the problem is no QP"
+    chain = (first, *(r for r in (*REFERENCES, "clarabel_cone") if r != first))
+    failed = []
+    for name in chain:
+        reason = reasons.get(name, "not registered")
+        if reason is not None:
+            failed.append(f"{name} {reason}")
+            continue
+        try:
+            solution = solve(problem, name, tol=0.1 * REFERENCE_TOL, time_limit=time_limit)
+        except LavenderError as error:
+            failed.append(f"{name}: {error}")
+            continue
+        reason = unfit(problem, solution)
+        if reason is None:
+            note = f"relative {solution.residual.relative:.1e}"
+            return solution, name, note + (f" ({'; '.join(failed)})" if failed else "")
+        failed.append(f"{name}: {reason}")
+    return None, None, "; ".join(failed)
+
+
+def unfit(problem: Problem, solution: Solution) -> str | None:
+    """Why a solution cannot serve as reference; None if it can."""
+    r = solution.residual
+    needed = max(REFERENCE_TOL, 10.0 * r.floor)
+    if not r.relative <= needed:
+        return f"relative {r.relative:.1e} above {needed:.1e}"
+    if problem.law not in ("linear", "lcp"):
+        return None
+    lam = solution.impulse
+    q = qp_residual(problem, lam, _multiplier(problem, solution))
+    speed = float(np.abs(problem.b).max(initial=0.0)) + float(np.abs(r.slack).max(initial=0.0))
+    work = float(np.abs(lam) @ (np.abs(problem.b) + np.abs(r.slack)))
+    size = float(np.abs(lam).max(initial=0.0))
+    limit = max(SIGN_TOL, 10.0 * r.floor)
+    for what, value, scale in (
+        ("bounds violated", q.primal, size),
+        ("multipliers do not fit the slack", q.dual, speed),
+        ("a multiplier has the wrong sign", q.sign, speed),
+        ("duality gap", q.gap, work),
+    ):
+        if not value <= limit * scale:
+            return f"{what} by {value:.1e} of {scale:.1e}"
+    return None
+
+
+def _multiplier(problem: Problem, solution: Solution) -> FloatArray:
+    """The solver's own multipliers where it gave them for every row, else the slack's."""
+    own = solution.dual
+    if isinstance(own, np.ndarray) and own.shape == (problem.m,) and np.isfinite(own).all():
+        return own
+    return -solution.residual.slack
+
+
+def _compare(problem: Problem, name: str, solution: Solution, optimum: Solution | None) -> CrossCheckRow:
+    r = solution.residual
+    note = "; ".join(
+        x for x in (solution.solver.form and f"{solution.solver.form} form", solution.message) if x
+    )
+    shared: dict[str, Any] = {
+        "status": solution.status.name,
+        "relative": r.relative,
+        "floor": r.floor,
+        "time": solution.setup_time + solution.solve_time,
+        "solution": solution,
+    }
+    if optimum is not None and np.isfinite(solution.impulse).all():
+        distance, allowed = _distance(problem, solution, optimum)
+        shared |= {
+            "distance": distance,
+            "slack": float(np.abs(r.slack - optimum.slack).max(initial=0.0)),
+            "objective": _objective(problem, solution) - _objective(problem, optimum),
+        }
+        shared["allowed"] = allowed
+        if distance > allowed:
+            return CrossCheckRow(name, BREACH, note=note, **shared)
+    if solution.contradicted:
+        return CrossCheckRow(
+            name, CONTRADICTED, note=f"{solution.contradicted}; {note}".rstrip("; "), **shared
+        )
+    if not (solution.success or r.relative <= 2.0 * r.floor):
+        return CrossCheckRow(name, NOT_SOLVED, note=note, **shared)
+    return CrossCheckRow(name, AGREES if "allowed" in shared else AGREES_UNCOMPARED, note=note, **shared)
+
+
+def _distance(problem: Problem, one: Solution, two: Solution) -> tuple[float, float]:
+    """|Delta|_A and the largest value of it that (1) allows, rounding included [sqrt J]."""
+    d: Any = problem.d
+    delta = one.impulse - two.impulse
+    eps = one.residual.error - two.residual.error
+    a_delta, a_eps = _apply(problem, delta), _apply(problem, eps)
+    distance = float(np.sqrt(max(delta @ a_delta, 0.0)))
+    # The errors e themselves are known to the floor of both residuals, in the norm of D.
+    fuzz = float(sum(s.residual.floor * s.residual.energy_start for s in (one, two)))
+    root = 1.0 / np.sqrt(d)
+    stiff = float(np.sqrt(np.max(root * _apply_abs(problem, root), initial=0.0)))
+    eps_d = float(np.sqrt(np.sum(d * eps * eps))) + fuzz
+    eps_a = float(np.sqrt(max(eps @ a_eps, 0.0))) + stiff * fuzz
+    delta_d = float(np.sqrt(np.sum(d * delta * delta)))
+    # x^2 <= x eps_a + eps_d delta_d bounds x by the larger root. Rounding of Delta.A Delta itself:
+    rounding = 2.0**-50 * stiff * delta_d
+    allowed = 0.5 * (eps_a + np.sqrt(eps_a * eps_a + 4.0 * eps_d * delta_d))
+    return distance, float(allowed * (1.0 + 1e-9) + np.sqrt(rounding * stiff * delta_d))
+
+
+def _apply(problem: Problem, x: Any) -> Any:
+    """A x (m,), without forming A where rows are known."""
+    if problem.rows is None:
+        return problem.csr @ x
+    assert problem.compliance is not None
+    jac = problem.jacobian
+    return jac @ (problem.rows.inverse_mass_matrix() @ (jac.T @ x)) + problem.compliance * x
+
+
+def _apply_abs(problem: Problem, x: Any) -> Any:
+    """A bound of abs(A) x for x >= 0."""
+    if problem.rows is None:
+        return abs(problem.csr) @ x
+    assert problem.compliance is not None
+    jac = abs(problem.jacobian)
+    return jac @ (abs(problem.rows.inverse_mass_matrix()) @ (jac.T @ x)) + problem.compliance * x
+
+
+def _objective(problem: Problem, solution: Solution) -> float:
+    """1/2 l.A l - b.l [J]."""
+    lam = solution.impulse
+    return float(0.5 * (lam @ (solution.slack - problem.b)))
