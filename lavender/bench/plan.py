@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from lavender.bench.measure import Task
+from lavender.bench.timing import Task
 from lavender.bench.record import CaseInfo, Record
 from lavender.errors import InputError
 from lavender.problem import Problem

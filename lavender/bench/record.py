@@ -141,7 +141,7 @@ def task_key(
     time_limit: float,
 ) -> tuple[Any, ...]:
     """The identity of a measurement, before it is made."""
-    return (case, sha, solver, repr(sorted(options.items())), start, mode, tol, max_iter, time_limit)
+    return (case, sha, solver, repr(sorted(_plain(options).items())), start, mode, tol, max_iter, time_limit)
 
 
 _KINDS: dict[str, type] = {"run": Run, "case": CaseInfo, "skip": Skip, "record": Record}

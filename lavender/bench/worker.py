@@ -18,7 +18,7 @@ import sys
 import threading
 from typing import IO, Any
 
-from lavender.bench.measure import Task
+from lavender.bench.timing import Task
 from lavender.bench.record import CRASHED, KILLED, Record
 from lavender.problem import Problem
 
@@ -52,20 +52,24 @@ class Worker:
     ----------
     memory : int, optional, bytes
         Limit of the worker's address space, where the system has one.
+    grace : s, optional
+        Beyond the time limits of a task, before the worker is killed.
     """
 
-    def __init__(self, memory: int | None = None) -> None:
+    def __init__(self, memory: int | None = None, grace: float | None = None) -> None:
         self.memory = memory
+        self.grace = GRACE if grace is None else grace
         self._process: subprocess.Popen[bytes] | None = None
         self._answers: queue.Queue[Any] = queue.Queue()
         self._holds = ""
 
     def measure(self, problem: Problem, task: Task, impulse: Any = None) -> Record:
-        """As `lavender.bench.measure.measure`, in the worker."""
+        """As `lavender.bench.timing.measure`, in the worker."""
         if self._process is None:
             self._start()
-        # Every repeat may take its limit once, though repeats end after the first limit; set-up is not limited.
-        limit = 2.0 * task.time_limit + GRACE + 2.0 * task.time_limit
+        # Repeats end once they took the limit together, so there are at most two that take it; twice that
+        # for a backend that looks at the clock now and then.
+        limit = 4.0 * task.time_limit + self.grace
         try:
             assert self._process is not None and self._process.stdin is not None
             if self._holds != task.sha:
@@ -75,7 +79,7 @@ class Worker:
             answer = self._answers.get(timeout=limit)
         except queue.Empty:
             self._end()
-            return task.record(status=KILLED, message=f"did not stop: killed {limit:.3g} s after it was started")
+            return task.record(status=KILLED, message=f"did not stop; its process was killed after {limit:.3g} s")
         except (BrokenPipeError, OSError):
             answer = None
         except KeyboardInterrupt:
@@ -166,7 +170,7 @@ def _serve(memory: int) -> None:
     nowhere = os.open(os.devnull, os.O_RDWR)
     os.dup2(nowhere, 0)
     os.dup2(nowhere, 1)
-    from lavender.bench.measure import measure
+    from lavender.bench.timing import measure
 
     _send(answers, "ready")
     problem = None

@@ -63,14 +63,21 @@ def _hover(r: Record) -> str:
     return "\n".join(lines)
 
 
+def _in_order_of_work(runs: list[Record]) -> list[Record]:
+    # Times of microseconds jitter; iterations and tolerances do not.
+    if any(r.mode == "budget" for r in runs):
+        return sorted(runs, key=lambda r: (r.iterations, r.time_min))
+    return sorted(runs, key=lambda r: (-r.tol, r.time_min))
+
+
 def work_precision(records: Records, case: str) -> Figure:
-    """Error against time: every run of a case, one curve for each solver and start, by time."""
+    """Error against time: every run of a case, one curve for each solver and start, along its work."""
     curves = []
     floors: list[tuple[float, float]] = []
     for (name, solver, start), group in sorted(tables.pairs(records).items()):
         if name != case:
             continue
-        runs = sorted((r for r in group if r.usable), key=lambda r: (r.time_min, -r.relative))
+        runs = _in_order_of_work([r for r in group if r.usable])
         floors += [(r.relative, r.floor) for r in runs if r.floor > 0.0]
         if runs:
             curves.append(

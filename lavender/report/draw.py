@@ -94,7 +94,7 @@ def plotly_data(figure: Figure, look: dict[str, Look]) -> dict[str, Any]:
     return {
         "traces": traces,
         "title": figure.title,
-        "x": {"title": figure.x_title, "log": figure.x_log},
+        "x": {"title": figure.x_title, "log": figure.x_log, "seconds": "[s]" in figure.x_title},
         "y": {"title": figure.y_title, "log": figure.y_log},
         "levels": list(figure.levels),
         "floor": figure.floor if math.isfinite(figure.floor) and figure.floor > 0.0 else None,

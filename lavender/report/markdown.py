@@ -24,7 +24,7 @@ def summary(records: Records) -> str:
             cells = []
             for level in levels:
                 best = next(a for a in rows if a.family == family and a.target == level).best
-                cells.append(f"{best.solver} {seconds(best.score)} ({best.solved}/{best.cases})" if best else "nobody")
+                cells.append(f"{best.solver} {seconds(best.typical)} ({best.solved}/{best.cases})" if best else "nobody")
             lines.append(f"| {family} | " + " | ".join(cells) + " |")
         lines.append("")
     lines += ["| case | solver | " + " | ".join(f"to {level_name(x)}" for x in levels) + " | best | status |"]

@@ -1,4 +1,4 @@
-"""One look for every figure: a solver keeps its colour, dash and mark wherever it appears.
+"""One look for every figure: a solver keeps its colour, dash and mark wherever it appears in one report.
 
 Colours are Okabe and Ito's (distinct under the common colour-vision deficiencies), the darker ones
 readable on white and on near-black; dashes and marks tell apart what shares a colour, also in grey print.
@@ -36,10 +36,18 @@ class Look:
     marker: str  # matplotlib
 
 
+# These come first, so that what is compared most often never shares a colour.
+FIRST = ("pgs", "direct", "block_gauss_seidel", "osqp", "newton", "clarabel", "jacobi", "sequential_impulses")
+
+
 def looks(solvers: Iterable[str]) -> dict[str, Look]:
-    """A look for each solver, by its place among the sorted names."""
+    """A look for each solver: by its place in `FIRST`, then among the sorted names."""
     out = {}
-    for i, name in enumerate(sorted(set(solvers))):
+    names = set(solvers)
+    rest = sorted(names - set(FIRST))
+    place = {name: i for i, name in enumerate((*FIRST, *rest))}
+    for name in sorted(names):
+        i = place[name]
         dash, mark = DASHES[i // len(COLORS) % len(DASHES)], MARKS[i % len(MARKS)]
         out[name] = Look(COLORS[i % len(COLORS)], dash[0], mark[0], dash[1], mark[1])
     return out

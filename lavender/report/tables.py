@@ -104,7 +104,8 @@ class Choice:
     solver: str
     solved: int
     cases: int
-    score: float  # shifted geometric mean of times [s], or geometric mean of residuals
+    score: float  # what ranks: shifted geometric mean of times [s], or geometric mean of residuals
+    typical: float  # s, median time on the cases it solved; nan for a time budget
 
 
 @dataclass(frozen=True)
@@ -373,7 +374,8 @@ def advice_by_level(records: Records) -> list[Advice]:
             for solver in sorted({s for c in cases for s in times.get(c, {})}):
                 t = [times.get(c, {}).get(solver, math.inf) for c in cases]
                 score = geometric_mean([x if math.isfinite(x) else limit for x in t], shift)
-                choices.append(Choice(solver, sum(map(math.isfinite, t)), len(cases), score))
+                solved = [x for x in t if math.isfinite(x)]
+                choices.append(Choice(solver, len(solved), len(cases), score, median(solved) if solved else math.nan))
             choices.sort(key=lambda k: (any((c, k.solver) in liars for c in cases), -k.solved, k.score))
             out.append(Advice(family, level, tuple(choices)))
     return out
@@ -406,7 +408,7 @@ def advice_by_time(records: Records) -> list[Advice]:
                     for c in cases
                 ]
                 score = geometric_mean([1.0 if g is None else min(g, 1.0) for g in got])
-                choices.append(Choice(solver, sum(g is not None for g in got), len(cases), score))
+                choices.append(Choice(solver, sum(g is not None for g in got), len(cases), score, math.nan))
             choices.sort(key=lambda k: (k.score, -k.solved))
             out.append(Advice(family, limit, tuple(choices)))
     return out

@@ -59,7 +59,7 @@ def advice_table(records: Records) -> Any:
         cells = []
         for level in levels:
             best = next(a for a in rows if a.family == family and a.target == level).best
-            cells.append(f"{best.solver}, {seconds(best.score)}, {best.solved}/{best.cases}" if best else "nobody")
+            cells.append(f"{best.solver}, {seconds(best.typical)}, {best.solved}/{best.cases}" if best else "nobody")
         table.add_row(family, *cells)
     return table
 
@@ -82,7 +82,7 @@ def print_report(records: Records, console: Console, levels: Sequence[float] | N
             style="dim",
         )
     if len(records):
-        console.print("\n[bold]Recommended[/] (solver, shifted geometric mean of time, cases brought to the level)")
+        console.print("\n[bold]Recommended[/] (solver, median time where it gets there, cases it brings to the level)")
         console.print(advice_table(records), highlight=False)
     wrong = [r for r in records if r.contradicted]
     if wrong:

@@ -18,8 +18,8 @@
       type: a.log ? "log" : "linear",
       gridcolor: t.line,
       zeroline: false,
-      exponentformat: "power",
-      dtick: a.log ? undefined : null,
+      exponentformat: a.seconds ? "SI" : "power",
+      ticksuffix: a.seconds ? "s" : "",
       automargin: true,
     });
     const line = (y, color, dash) => ({

@@ -10,13 +10,14 @@ from typing import Any
 from lavender import registry
 from lavender.bench import machine
 from lavender.bench.cases import Item, describe, resolve
-from lavender.bench.measure import Task, measure
+from lavender.bench.timing import Task, measure
 from lavender.bench.plan import Plan
 from lavender.bench.record import CaseInfo, Record, Run, Skip
 from lavender.bench.store import Records, Store
 from lavender.bench.worker import Worker
 from lavender.errors import LavenderError
 from lavender.problem import Problem
+from lavender.registry import SolverSpec
 
 __all__ = ["Event", "run", "solver_names"]
 
@@ -33,6 +34,11 @@ class Event:
     solver: str
     record: Record | None = None
     reused: bool = False
+
+
+def is_foreign(spec: SolverSpec) -> bool:
+    """Code that other packages brought, which a process of its own can import."""
+    return spec.external or bool(spec.requires) or (isinstance(spec.factory, str) and not spec.factory.startswith("lavender."))
 
 
 def solver_names(names: Sequence[str] | None) -> list[str]:
@@ -71,7 +77,7 @@ def run(
         Keeps each record when it is made; a measurement that it holds already, from the same machine,
         versions and plan, is not made again.
     watch : callable (Event), optional
-    isolate : run solvers that other packages provide in a process of their own
+    isolate : run solvers that other packages bring in a process of their own
     memory : bytes, optional
         Limit of that process.
     into : list, optional
@@ -129,7 +135,7 @@ class _Runner:
             try:
                 info = describe(item, self.this.run)
             except (LavenderError, OSError) as error:
-                self.keep(Skip(self.this.run, item.name, "", f"{item.source} did not load: {error}"))
+                self.keep(Skip(self.this.run, item.name, "", _not_loaded(item, error)))
                 self.done += len(self.names)
                 self.tell(item.name, "")
                 continue
@@ -148,7 +154,7 @@ class _Runner:
         if reason:
             self.keep(Skip(self.this.run, info.case, name, reason))
             return
-        isolated = self.worker is not None and bool(spec.requires)
+        isolated = self.worker is not None and is_foreign(spec)
         tasks = self.plan.tasks(info, problem, spec)
         record: Record | None = None
         while True:
@@ -169,3 +175,8 @@ class _Runner:
         if isolated and self.worker is not None:
             return self.worker.measure(replace(problem, copy=False), task)
         return measure(problem, task)
+
+
+def _not_loaded(item: Item, error: Exception) -> str:
+    text = str(error)
+    return f"did not load: {text}" if text.startswith(item.source) else f"did not load: {item.source}: {text}"

@@ -1,0 +1,103 @@
+"""Friction bounds added to the toy QP: fixed boxes on the tangents, filled in by the normals.
+
+Six unit boxes stand on each other, a contact each with a normal and one tangent (no rotation, so the
+two directions do not couple). The top box is hit sideways. As a QP the tangents are bounded by
+|l_t| <= mu N with a number N given beforehand:
+
+    min 1/2 l.A l - b.l,    0 <= l_n,   -mu N <= l_t <= mu N
+
+N = 0 is no friction; N unbounded glues the stack; N from the normals of the solve before is right here,
+where the tangents do not change the normals, and the iteration N <- l_n ends after one round.
+Coulomb's law solves for both at once.
+
+    python examples/friction_bounds.py [FIGURE.png]
+"""
+
+import sys
+
+import numpy as np
+
+import lavender as lv
+
+N = 6
+MU = 0.5
+GRAVITY_STEP = 9.81 / 60.0  # m/s
+PUSH = 0.4  # m/s, top box sideways
+TOL = 1e-10
+
+
+def problem():
+    """Normal and tangent of each contact in turn: A (12, 12), b (12,)."""
+    jacobian = np.eye(N) - np.eye(N, k=-1)
+    down, sideways = np.full(N, -GRAVITY_STEP), np.zeros(N)
+    sideways[-1] = PUSH
+    a = np.kron(jacobian @ jacobian.T, np.eye(2))  # rows of a contact: normal, tangent
+    b = -np.stack([jacobian @ down, jacobian @ sideways], axis=1).ravel()
+    return lv.Problem.contact(a, b, np.full(N, MU), name="toy stack with friction")
+
+
+def sideways_velocity(impulse):
+    """Velocity of each box after the step (N,) [m/s]."""
+    jacobian = np.eye(N) - np.eye(N, k=-1)
+    start = np.zeros(N)
+    start[-1] = PUSH
+    return start + jacobian.T @ impulse[1::2]
+
+
+def numbers():
+    """Impulses without friction, with glue, with bounds filled in round by round, and with Coulomb's law."""
+    toy = problem()
+    none = toy.boxed(0.0)
+    rounds = [lv.solve(none, "direct", tol=TOL).impulse]
+    for _ in range(3):
+        rounds.append(lv.solve(toy.boxed(rounds[-1][0::2]), "direct", tol=TOL).impulse)
+    bounded = toy.boxed(rounds[-1][0::2])
+    return {
+        "problem": toy,
+        "rounds": rounds,
+        "glued": lv.solve(toy.boxed(1e6), "direct", tol=TOL).impulse,
+        "osqp": lv.solve(bounded, "osqp", tol=1e-9).impulse,
+        "pgs": lv.solve(bounded, "pgs", tol=TOL, max_iter=100_000).impulse,
+        "coulomb": lv.solve(toy, "pgs", tol=TOL, max_iter=100_000),
+    }
+
+
+def figure(found, path):
+    """Tangential impulses against their bounds, and what the boxes do."""
+    from matplotlib.figure import Figure
+
+    canvas = Figure(figsize=(9, 4), layout="constrained")
+    left, right = canvas.subplots(1, 2)
+    contacts = np.arange(1, N + 1)
+    bound = MU * found["rounds"][-1][0::2]
+    left.fill_between(contacts, -bound, bound, alpha=0.2, label="|l_t| <= mu l_n")
+    for name, impulse, style in (
+        ("no friction", found["rounds"][0], "o:"),
+        ("glued", found["glued"], "s--"),
+        ("bounded", found["rounds"][-1], "D-"),
+        ("Coulomb", found["coulomb"].impulse, "x"),
+    ):
+        left.plot(contacts, impulse[1::2], style, label=name)
+        right.plot(contacts, sideways_velocity(impulse), style, label=name)
+    left.set(xlabel="contact, from the ground", ylabel="tangential impulse [N s]")
+    right.set(xlabel="box, from the ground", ylabel="velocity sideways [m/s]")
+    left.legend(fontsize=8)
+    canvas.savefig(path)
+
+
+def main(path="friction_bounds.png"):
+    """Print the table, save the figure."""
+    found = numbers()
+    print(f"{'contact':<22}" + "".join(f"{i + 1:>9}" for i in range(N)))
+    print(f"{'normal':<22}" + "".join(f"{x + 0.0:>9.5f}" for x in found["rounds"][-1][0::2]))
+    rows = [(f"tangent, round {i}", x) for i, x in enumerate(found["rounds"])]
+    for name, impulse in [*rows, ("tangent, glued", found["glued"]), ("tangent, Coulomb", found["coulomb"].impulse)]:
+        print(f"{name:<22}" + "".join(f"{x + 0.0:>9.5f}" for x in impulse[1::2]))
+    gap = max(np.abs(found["rounds"][-1] - found[name]).max() for name in ("osqp", "pgs"))
+    print(f"direct, OSQP and projected Gauss-Seidel agree on the bounded QP within {gap:.1e} N s")
+    figure(found, path)
+    print(f"figure: {path}")
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

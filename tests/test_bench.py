@@ -1,0 +1,474 @@
+"""Records: judged, timed apart, written when they are made, and never lost to a backend."""
+
+import dataclasses
+import itertools
+import json
+import math
+import os
+import time
+
+import numpy as np
+import pytest
+
+import lavender as lv
+from lavender import bench, registry
+from lavender.bench import cases as bench_cases
+from lavender.bench import machine, store, timing
+from lavender.bench import runner
+from lavender.bench.record import Record, from_json, to_json
+from lavender.bench.worker import Worker
+
+
+def chain(n, name="chain", **more):
+    a = np.diag(np.full(n, 2.0)) - np.diag(np.ones(n - 1), 1) - np.diag(np.ones(n - 1), -1)
+    return lv.Problem.linear(a, np.ones(n), name=name, **more)
+
+
+def stack(n, name="stack", **more):
+    p = chain(n)
+    return lv.Problem.lcp(p.matrix, np.linspace(1.0, -0.2, n), name=name, **more)
+
+
+QUICK = bench.Plan(levels=(1e-3, 1e-8), budgets=(2, 5), repeats=2, time_limit=0.5, orders=("reverse",))
+
+
+@dataclasses.dataclass(frozen=True)
+class Fake:
+    """A solver that does what a test asks of it."""
+
+    what: str
+
+    def prepare(self, problem):
+        return problem
+
+    def update(self, state, problem):
+        return problem
+
+    def run(self, state, impulse, n, tol, time_limit=None):
+        if self.what == "raise":
+            raise ZeroDivisionError("of the backend")
+        if self.what == "interrupt":
+            raise KeyboardInterrupt
+        if self.what == "lie":
+            return lv.Claim(lv.Status.CONVERGED, 1)
+        if self.what == "nan":
+            impulse[:] = np.nan
+            return lv.Claim(lv.Status.NUMERICAL_ERROR, 1)
+        raise AssertionError(self.what)
+
+
+@pytest.fixture
+def fakes(monkeypatch):
+    """Registers solvers `fake_lie` and so on for one test."""
+    monkeypatch.setattr(registry, "_registered", registry.specs())
+
+    def add(*whats):
+        for what in whats:
+            registry.register(
+                lv.SolverSpec(
+                    f"fake_{what}",
+                    lambda what=what: Fake(what),
+                    laws={"linear", "lcp"},
+                    summary="of a test",
+                    resumable=False,
+                )
+            )
+
+    return add
+
+
+def test_a_record_holds_what_the_judge_says_and_what_it_cost():
+    p = stack(12)
+    records = bench.run([p], ["pgs"], QUICK)
+    assert [(r.mode, r.tol, r.max_iter, r.order) for r in records] == [
+        ("tol", 1e-3, 10_000_000, "given"),
+        ("tol", 1e-8, 10_000_000, "given"),
+        ("budget", 0.0, 2, "given"),
+        ("budget", 0.0, 5, "given"),
+        ("budget", 0.0, 5, "reverse"),
+    ]
+    for r in records:
+        again = lv.solve(p, "pgs", tol=r.tol, max_iter=r.max_iter, order=r.order)
+        assert (r.relative, r.energy, r.velocity, r.floor, r.worst_row) == (
+            again.residual.relative,
+            again.residual.energy,
+            again.residual.velocity,
+            again.residual.floor,
+            again.residual.worst_row,
+        )
+        assert r.status == again.status.name
+        assert dict(r.work) == dict(again.work)
+        assert r.success == (r.mode == "tol")
+        assert 1 <= r.repeats <= 2
+        assert 0.0 < r.setup_min <= r.setup_median
+        assert 0.0 < r.solve_min <= r.solve_median
+        # The smallest sum is at least the sum of the smallest.
+        assert r.setup_min + r.solve_min <= r.time_min <= r.time_median
+    assert records.cases["stack"].structure == ("stack",)
+
+
+def test_a_budget_is_exact_and_warm_starts_from_the_guess():
+    p = stack(12)
+    exact = lv.solve(p, "direct", tol=1e-12).impulse
+    records = bench.run([dataclasses.replace(p, guess=exact)], ["pgs"], QUICK)
+    for r in records:
+        if r.mode == "budget":
+            assert r.iterations == r.work["sweeps"] == r.max_iter
+    cold, warm = ([r for r in records if r.start == s and r.mode == "tol"][-1] for s in ("cold", "warm"))
+    assert cold.iterations > 5
+    assert warm.iterations == 0
+
+
+def test_exact_solvers_run_once_and_hopeless_levels_are_left_out():
+    records = bench.run([stack(8)], ["direct"], QUICK)
+    assert [(r.tol, r.success) for r in records] == [(1e-8, True)]
+    # A row that nothing can meet: projected Gauss-Seidel misses the loosest level, so tighter ones are not tried.
+    impossible = lv.Problem.lcp(np.array([[1.0, -1.0], [-1.0, 1.0]]), np.array([1.0, 1.0]), name="impossible")
+    records = bench.run([impossible], ["pgs"], QUICK)
+    assert [r.tol for r in records if r.mode == "tol"] == [1e-3]
+
+
+def test_a_solver_that_raises_costs_its_own_record(fakes):
+    fakes("raise", "nan", "lie")
+    records = bench.run([stack(4, "one"), stack(5, "two")], ["fake_raise", "fake_nan", "fake_lie", "pgs"], QUICK)
+    by = {(r.case, r.solver): r for r in records}
+    for case in ("one", "two"):
+        assert by[case, "fake_raise"].status == "ERROR"
+        assert by[case, "fake_raise"].message == "ZeroDivisionError: of the backend"
+        assert by[case, "fake_nan"].status == "NUMERICAL_ERROR"
+        assert by[case, "fake_nan"].relative == math.inf
+        assert by[case, "fake_lie"].contradicted
+        assert by[case, "pgs"].status == "MAX_ITERATIONS"  # the last: a budget
+    assert sum(r.solver == "fake_raise" for r in records) == 2  # one each: no level after it can be better
+
+
+def test_a_refused_case_and_a_file_that_does_not_load_are_named(tmp_path):
+    (tmp_path / "bad.npz").write_bytes(b"not an archive")
+    records = bench.run([tmp_path, stack(4)], ["gauss_seidel"], QUICK)
+    assert len(records) == 0
+    lost, refused = records.skips
+    assert (lost.case, lost.solver) == ("bad", "")
+    assert "bad.npz" in lost.reason
+    assert (refused.case, refused.solver) == ("stack", "gauss_seidel")
+    assert "lcp" in refused.reason
+
+
+def test_each_record_is_on_disk_when_it_is_made(tmp_path):
+    path = tmp_path / "records.jsonl"
+    seen = []
+
+    def watch(event):
+        if event.record is not None:
+            last = json.loads(path.read_text().splitlines()[-1])
+            seen.append(from_json(last) == event.record)
+
+    records = bench.run([stack(6)], ["pgs", "direct"], QUICK, path, watch=watch)
+    assert seen == [True] * len(records)
+    assert bench.read(path).records == records.records
+
+
+def test_the_same_command_goes_on_where_it_was_killed(tmp_path, monkeypatch):
+    path = tmp_path / "records.jsonl"
+    problems = [stack(6), chain(7)]
+    whole = bench.run(problems, ["pgs", "direct"], QUICK, path)
+    lines = path.read_bytes().splitlines(keepends=True)
+    # Killed while line 8 was being written.
+    path.write_bytes(b"".join(lines[:7]) + lines[7][: len(lines[7]) // 2])
+    kept = len(bench.read(path))
+    made = []
+    monkeypatch.setattr(runner, "measure", lambda p, task: made.append(task) or timing.measure(p, task))
+    again = bench.run(problems, ["pgs", "direct"], QUICK, path)
+    assert [r.key for r in again] == [r.key for r in whole]
+    assert len(made) == len(whole) - kept
+    assert 0 < kept < len(whole)
+    # And nothing is left to do the third time.
+    made.clear()
+    assert len(bench.run(problems, ["pgs", "direct"], QUICK, path)) == len(whole)
+    assert made == []
+    for line in path.read_text().splitlines():
+        json.loads(line)
+
+
+def test_another_version_or_cpu_is_another_run(tmp_path, monkeypatch):
+    path = tmp_path / "records.jsonl"
+    first = bench.run([stack(5)], ["direct"], QUICK, path)
+    ids = {r.run for r in first}
+    for name, value in (("__version__", "99"), ("cpu_name", lambda: "another")):
+        monkeypatch.setattr(machine, name, value)
+        ids |= {r.run for r in bench.run([stack(5)], ["direct"], QUICK, path)}
+    assert len(ids) == 3
+    assert len(bench.read(path)) == 3 * len(first)
+    assert len(bench.read(path).latest()) == len(first)
+
+
+def test_a_changed_problem_of_the_same_name_is_measured_again(tmp_path):
+    path = tmp_path / "records.jsonl"
+    bench.run([stack(5)], ["direct"], QUICK, path)
+    bench.run([stack(6)], ["direct"], QUICK, path)
+    assert len(bench.read(path)) == 2
+
+
+def test_ctrl_c_keeps_what_there_is(tmp_path, fakes):
+    fakes("interrupt")
+    path, into = tmp_path / "records.jsonl", []
+    with pytest.raises(KeyboardInterrupt):
+        bench.run([stack(5)], ["pgs", "fake_interrupt", "direct"], QUICK, path, into=into)
+    kept = bench.read(path).records
+    assert {r.solver for r in kept} == {"pgs"}
+    assert into[0].records == kept
+
+
+def test_a_full_disk_is_said_and_the_next_run_goes_on(tmp_path, monkeypatch):
+    path = tmp_path / "records.jsonl"
+    full = OSError(28, "No space left on device")
+    counter = itertools.count()
+    opened = bench.Store(path)
+    write = opened._file.write
+
+    class Disk:
+        def __getattr__(self, name):
+            return getattr(opened_file, name)
+
+        def write(self, text):
+            if next(counter) == 4:
+                write(text[:20])
+                raise full
+            return write(text)
+
+    opened_file = opened._file
+    opened._file = Disk()
+    with pytest.raises(lv.InputError, match="No space left"):
+        bench.run([stack(6)], ["pgs", "direct"], QUICK, opened)
+    opened_file.close()
+    assert len(bench.run([stack(6)], ["pgs", "direct"], QUICK, path)) == len({r.key for r in bench.read(path)})
+
+
+def test_an_unwritable_place_is_known_before_anything_runs(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(lv.InputError, match="cannot write"):
+        bench.Store(tmp_path / "file" / "records.jsonl")
+
+
+@pytest.mark.parametrize("text", ['{"kind": "record"}', '{"kind": "other"}', "[1]", "words"])
+def test_a_file_of_something_else_is_refused(tmp_path, text):
+    (tmp_path / "records.jsonl").write_text(text + "\n")
+    with pytest.raises(lv.InputError, match="line 1"):
+        bench.read(tmp_path)
+
+
+def test_json_and_csv_hold_every_number(tmp_path):
+    records = bench.run([stack(6), chain(4, guess=np.ones(4))], ["pgs", "direct"], QUICK)
+    store.write_json(records, tmp_path / "r.json")
+    store.write_csv(records, tmp_path / "r.csv")
+    content = json.loads((tmp_path / "r.json").read_text())
+    again = [from_json({"kind": "record", **r}) for r in content["records"]]
+    assert again == records.records
+    import csv
+
+    with (tmp_path / "r.csv").open(newline="") as f:
+        rows = list(csv.DictReader(f))
+    assert len(rows) == len(records)
+    for row, r in zip(rows, records, strict=True):
+        assert float(row["relative"]) == r.relative
+        assert float(row["time_min"]) == r.time_min
+        assert json.loads(row["work"]) == dict(r.work)
+        assert row["cpu"] == bench.cpu_name()
+        assert json.loads(row["versions"])["numpy"] == np.__version__
+
+
+def test_infinite_and_undefined_numbers_survive_json():
+    r = Record(
+        run="r", case="c", sha="s", solver="x", options={"seed": np.int64(3)}, start="cold", mode="tol", tol=1e-3,
+        max_iter=1, time_limit=1.0, order="given", seed=3, status="ERROR", message="é\n",
+    )  # fmt: skip
+    back = from_json(json.loads(json.dumps(to_json(r), allow_nan=False)))
+    assert back.relative == math.inf
+    assert math.isnan(back.time_min)
+    assert back.options == {"seed": 3}
+    assert back.message == "é\n"
+    assert back.key == r.key
+
+
+@pytest.mark.parametrize(
+    ("change", "sign"),
+    [
+        ({"levels": (0.0,)}, "level 0.0"),
+        ({"levels": (float("nan"),)}, "level nan"),
+        ({"budgets": (-4,)}, "budget -4"),
+        ({"levels": (), "budgets": ()}, "nothing to run"),
+        ({"repeats": 0}, "repeats is 0"),
+        ({"time_limit": 0.0}, "time limit is 0.0"),
+    ],
+)
+def test_a_senseless_plan_is_refused(change, sign):
+    with pytest.raises(lv.InputError, match=sign):
+        bench.Plan(**change)
+
+
+def test_unknown_and_missing_names_are_refused_before_loading(tmp_path):
+    with pytest.raises(lv.UnknownName, match="pgs"):
+        bench.run([stack(3)], ["pgz"])
+    with pytest.raises(lv.InputError, match="no such file"):
+        bench.resolve([tmp_path / "nothing.npz"])
+    with pytest.raises(lv.InputError, match="holds no problem file"):
+        bench.resolve([tmp_path])
+
+
+@pytest.mark.parametrize(
+    ("level", "name"), [(1e-3, "1e-3"), (1e-10, "1e-10"), (2.5e-6, "2.5e-6"), (0.5, "5e-1"), (1.0, "1e0")]
+)
+def test_levels_are_written_as_people_do(level, name):
+    assert bench.level_name(level) == name
+
+
+def two_bodies(copies, ratio=1.0):
+    """A light ball on the ground, a heavy one on it, each pair touching at `copies` equal contacts."""
+    n = 2 * copies
+    up, side = np.tile([0.0, 0.0, 1.0], (n, 1)), np.tile([1.0, 0.0, 0.0], (n, 1))
+    rows = lv.Rows(
+        inv_mass=np.array([1.0, 1.0 / ratio]),
+        inv_inertia=np.stack([np.eye(3), np.eye(3) / ratio]),
+        v_free=np.zeros((2, 6)),
+        normal=up,
+        tangent=side,
+        arm_a=np.zeros((n, 3)),
+        arm_b=np.zeros((n, 3)),
+        contact_body=np.repeat(np.array([[-1, 0], [0, 1]], np.int32), copies, axis=0),
+    )
+    return rows
+
+
+def pile():
+    rng = np.random.default_rng(0)
+    x = rng.standard_normal((12, 20))
+    return lv.Problem.lcp(x @ x.T, rng.standard_normal(12))
+
+
+@pytest.mark.parametrize(
+    ("problem", "words"),
+    [
+        (chain(6), ("chain",)),
+        (stack(6), ("stack",)),
+        (lv.Problem.from_rows(two_bodies(1)), ("stack",)),
+        (lv.Problem.from_rows(two_bodies(1, 1e4)), ("stack", "large mass ratio")),
+        (lv.Problem.from_rows(two_bodies(3)), ("stack", "redundant")),
+        (lv.Problem.from_rows(two_bodies(1), mu=0.5, tangents=2), ("stack", "friction")),
+        (lv.Problem.lcp(lv.Problem.from_rows(two_bodies(3)).dense(), np.zeros(6)), ("stack", "redundant")),
+        (lv.Problem.linear(np.array([[2.0, 0.5], [0.0, 2.0]]), np.ones(2)), ("chain", "asymmetric")),
+        (lv.Problem.linear(np.zeros((0, 0)), np.zeros(0)), ("empty",)),
+    ],
+)
+def test_structure_is_recognised(problem, words):
+    assert bench.structure_of(problem) == words
+
+
+def test_what_couples_everywhere_is_a_pile():
+    rng = np.random.default_rng(3)
+    graph = np.zeros((30, 30))
+    for i in range(30):
+        for j in rng.choice(30, 4):
+            graph[i, j] = graph[j, i] = -0.1
+    np.fill_diagonal(graph, 2.0)
+    assert bench.structure_of(lv.Problem.lcp(graph, np.ones(30))) == ("pile",)
+
+
+def test_a_fingerprint_sees_every_number():
+    p = stack(5)
+    variants = [
+        p,
+        dataclasses.replace(p, b=p.b + 1e-15),
+        dataclasses.replace(p, guess=np.zeros(5)),
+        lv.Problem.lcp(p.matrix, p.b, upper=1.0),
+        lv.Problem.lcp(2 * p.matrix, p.b),
+        lv.Problem.contact(p.matrix, p.b, np.zeros(5)),
+    ]
+    prints = [bench_cases.fingerprint(v) for v in variants]
+    assert len(set(prints)) == len(variants)
+    assert bench_cases.fingerprint(stack(5, "renamed")) == prints[0]
+
+
+# -- a process of its own ------------------------------------------------------------------------
+
+BACKENDS = """
+import os, signal, sys, time
+import numpy as np
+import lavender as lv
+
+class Backend:
+    def __init__(self, what): self.what = what
+    def prepare(self, problem): return problem
+    def update(self, state, problem): return problem
+    def run(self, state, impulse, n, tol, time_limit=None):
+        if self.what == "hang":
+            while True: time.sleep(1)
+        if self.what == "segfault": os.kill(os.getpid(), signal.SIGSEGV)
+        if self.what == "exit": os._exit(3)
+        if self.what == "eat": self.all = [np.empty(4 * 10**7) for _ in range(1000)]
+        if self.what == "talk":
+            print("noise" * 10000, flush=True); os.write(1, b"more noise"); print("noise", file=sys.stderr)
+            impulse[:] = state.b / state.matrix.diagonal()
+        return lv.Claim(lv.Status.CONVERGED, 1, {"calls": 1}, str(os.getpid()))
+
+def make(what):
+    def factory(): return Backend(what)
+    return factory
+
+hang, segfault, exit_, eat, talk = map(make, ("hang", "segfault", "exit", "eat", "talk"))
+
+def spec(name, factory):
+    return lv.SolverSpec(name, "fake_backends:" + factory, laws={"linear", "lcp"}, summary="test", resumable=False,
+                         requires=("fake_backends",))
+specs = [spec("hang", "hang"), spec("segfault", "segfault"), spec("exit", "exit_"), spec("eat", "eat"), spec("talk", "talk")]
+HANG, SEGFAULT, EXIT, EAT, TALK = specs
+"""
+
+
+@pytest.fixture
+def plugin(tmp_path, monkeypatch):
+    """An installed plug-in, as the worker process finds it: through its entry points."""
+    folder = tmp_path / "site"
+    info = folder / "fake_backends-1.0.dist-info"
+    info.mkdir(parents=True)
+    (folder / "fake_backends.py").write_text(BACKENDS)
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: fake-backends\nVersion: 1.0\n")
+    names = ("hang", "segfault", "exit", "eat", "talk")
+    lines = [f"{n} = fake_backends:{n.upper()}" for n in names]
+    (info / "entry_points.txt").write_text("[lavender.solvers]\n" + "\n".join(lines) + "\n")
+    monkeypatch.setattr(registry, "_registered", dict(registry.specs()))
+    monkeypatch.syspath_prepend(str(folder))
+    registry._load_builtin_and_plugins.cache_clear()
+    yield names
+    registry._load_builtin_and_plugins.cache_clear()
+
+
+def task(problem, solver, **more):
+    return bench.Task("run", "case", bench_cases.fingerprint(problem), solver, "tol", 1e-6, 0, 0.05, **more)
+
+
+def test_a_backend_that_hangs_or_dies_costs_its_own_record(plugin):
+    p = lv.Problem.linear(np.diag([1.0, 2.0]), np.ones(2))
+    with Worker(memory=2**31, grace=1.0) as worker:
+        found = {name: worker.measure(p, task(p, name)) for name in ("talk", "hang", "segfault", "exit", "eat")}
+        after = worker.measure(p, task(p, "talk"))
+    assert found["hang"].status == "KILLED"
+    assert found["segfault"].status == "CRASHED (SIGSEGV)"
+    assert found["exit"].status == "CRASHED (exit status 3)"
+    assert found["eat"].status == "ERROR"
+    assert "MemoryError" in found["eat"].message
+    for record in (found["talk"], after):
+        assert record.status == "CONVERGED"
+        assert record.relative == 0.0
+        assert int(record.message) != os.getpid()
+
+
+def test_a_whole_run_survives_its_backends(plugin, monkeypatch):
+    from lavender.bench import worker
+
+    monkeypatch.setattr(worker, "GRACE", 0.5)
+    plan = bench.Plan(levels=(1e-3,), budgets=(), repeats=1, time_limit=0.05)
+    started = time.monotonic()
+    records = bench.run([stack(4)], ["hang", "segfault", "pgs", "talk"], plan)
+    assert [r.solver for r in records] == ["hang", "segfault", "pgs", "talk"]
+    assert [r.status.split()[0] for r in records] == ["KILLED", "CRASHED", "CONVERGED", "CONVERGED"]
+    assert records.records[3].contradicted  # its diagonal step does not solve a stack, and it says so
+    assert time.monotonic() - started < 60.0  # hangs are cut off
