@@ -37,6 +37,11 @@ from lavender_ext.block cimport CONTACT, CONTACT_SPIN as SPIN, ROW, blocks_t, n_
 from lavender_ext.problem cimport Data
 from lavender_ext.rows cimport contact_jacobian, rows_t
 
+cdef enum:                      # which natural map
+    CONVEX = 0
+    COULOMB = 1                 # radius a_t z_n; P is then the derivative for fixed radius alone
+    AUGMENTED = 2               # radius a_t (z_n - s_n), Alart-Curnier
+
 cdef struct factor_t:
     int32_t n                   # block columns
     int32_t s                   # rows of a block, 1 to 6
@@ -60,7 +65,6 @@ cdef struct elements_t:
     int32_t n                   # elements
     int32_t m                   # rows
     int32_t s                   # columns of a body in the panel
-    int32_t coulomb
     const int32_t* ptr          # (n + 1) first row
     const int32_t* kind         # (n) ROW (one row each) | CONTACT | SPIN
     const int32_t* wptr         # (n + 1) first entry of the element's small square matrices
@@ -366,7 +370,7 @@ cdef public void lav_block_lu_solve(const factor_t* f, double* x) noexcept nogil
             for r in range(s):
                 t = 0.0
                 for c in range(s):
-                    t += l[c * s + r] * y[c]
+                    t += l[r * s + c] * y[c]
                 x[j * s + r] -= t
 
 
@@ -1262,7 +1266,6 @@ cdef inline void natural_contact(const elements_t* e, int32_t i, const double* z
 cdef inline void natural_coulomb(const elements_t* e, int32_t i, const double* z, const double* s, int32_t augmented,
                                  double* f, double* p) noexcept nogil:
     # The same for Coulomb friction; radius a_t y_n with `augmented` (Alart-Curnier), else a_t z_n.
-    # Without it the part of the derivative beside P H is put into p[16..]: dPi/dz_n, by row.
     cdef int32_t nr = e.ptr[i + 1] - e.ptr[i], nt, js, k, l
     cdef bint spin = e.kind[i] == SPIN
     cdef double yn, rn, radius, t = 0.0, kappa, x
@@ -1319,13 +1322,14 @@ cdef inline void natural_coulomb(const elements_t* e, int32_t i, const double* z
             p[js * nr + js] = 1.0
 
 
-cdef public int32_t lav_natural(const elements_t* e, const double* z, const double* s, int32_t augmented, double eps,
-                                double* f, double* p, double* einv, double* v) noexcept nogil:
-    """F, P, E^-1 and V = E^-1 P of (5) for every element; returns a fingerprint of which pieces are active.
+cdef public double lav_natural(const elements_t* e, const double* z, const double* s, int32_t law, double eps,
+                               double* f, double* p, double* einv, double* v) noexcept nogil:
+    """F, P, E^-1 and V = E^-1 P of (5) for every element; returns |F|, the judge's energy error.
 
-    einv, v may be NULL: F and P alone.
+    law: CONVEX, COULOMB or AUGMENTED. einv, v may be NULL: F and P alone.
     """
-    cdef int32_t i, j, k, l, q, nr, piece, mark = 0
+    cdef int32_t i, j, k, l, q, nr, piece
+    cdef double total = 0.0
     cdef double y, x
     cdef double a[16]
     for i in range(e.n):
@@ -1346,7 +1350,7 @@ cdef public int32_t lav_natural(const elements_t* e, const double* z, const doub
             else:
                 f[j] = s[j]
                 p[q] = 1.0
-            mark = (mark * 31 + piece) & 0xffffff
+            total += f[j] * f[j]
             if v != NULL:
                 if piece == 1:
                     einv[q] = 1.0 / (e.theta[j] + eps)
@@ -1355,17 +1359,12 @@ cdef public int32_t lav_natural(const elements_t* e, const double* z, const doub
                     einv[q] = 1.0
                     v[q] = 0.0
             continue
-        if e.coulomb:
-            natural_coulomb(e, i, z + j, s + j, augmented, f + j, p + q)
-        else:
+        if law == CONVEX:
             natural_contact(e, i, z + j, s + j, f + j, p + q)
-        piece = 0
+        else:
+            natural_coulomb(e, i, z + j, s + j, law == AUGMENTED, f + j, p + q)
         for k in range(nr):
-            if f[j + k] == s[j + k]:
-                piece += 1 << k
-            if f[j + k] == z[j + k]:
-                piece += 16 << k
-        mark = (mark * 31 + piece) & 0xffffff
+            total += f[j + k] * f[j + k]
         if v != NULL:
             for k in range(nr):
                 for l in range(nr):
@@ -1379,7 +1378,7 @@ cdef public int32_t lav_natural(const elements_t* e, const double* z, const doub
                     for piece in range(nr):
                         x += einv[q + k * nr + piece] * p[q + piece * nr + l]
                     v[q + k * nr + l] = x
-    return mark
+    return sqrt(total)
 
 
 # -- Python entry -----------------------------------------------------------------------------------
@@ -1408,13 +1407,13 @@ cdef class Elements:
     cdef list keep
     cdef readonly int m, n, n_small
 
-    def __init__(self, ptr, kind, wptr, node, slot, panel, theta, g, lower, upper, at, as_, int s, bint coulomb):
+    def __init__(self, ptr, kind, wptr, node, slot, panel, theta, g, lower, upper, at, as_, int s):
         self.keep = [ptr, kind, wptr, node, slot, panel, theta, g, lower, upper, at, as_]
         self.n = len(kind)
         self.m = len(g)
         self.n_small = int(wptr[len(kind)])
         self.e = elements_t(
-            self.n, self.m, s, coulomb, <int32_t*>address(ptr), <int32_t*>address(kind), <int32_t*>address(wptr),
+            self.n, self.m, s, <int32_t*>address(ptr), <int32_t*>address(kind), <int32_t*>address(wptr),
             <int32_t*>address(node), <int32_t*>address(slot), <double*>address(panel), <double*>address(theta),
             <double*>address(g), <double*>address(lower), <double*>address(upper), <double*>address(at),
             <double*>address(as_))
@@ -1450,18 +1449,18 @@ cdef class Elements:
             length = lav_ipm_update(&self.e, &z[0], &u1[0], &u2[0], &dz[0], &da[0], sigma_mu, damping, &t1[0], &t2[0])
         return length
 
-    def natural(self, const double[::1] z, const double[::1] s, bint augmented, double eps, double[::1] f, double[::1] p,
+    def natural(self, const double[::1] z, const double[::1] s, int law, double eps, double[::1] f, double[::1] p,
                 double[::1] einv=None, double[::1] v=None):
-        """F, P and, where given, E^-1 and V; returns a fingerprint of the active pieces."""
-        cdef int32_t mark
+        """F, P and, where given, E^-1 and V; returns |F|."""
+        cdef double size
         cdef double* x = NULL
         cdef double* y = NULL
         if einv is not None:
             x = &einv[0]
             y = &v[0]
         with nogil:
-            mark = lav_natural(&self.e, &z[0], &s[0], augmented, eps, &f[0], &p[0], x, y)
-        return mark
+            size = lav_natural(&self.e, &z[0], &s[0], law, eps, &f[0], &p[0], x, y)
+        return size
 
     def times(self, const double[::1] w, const double[::1] x, double[::1] out):
         """out = W x, one small matrix for each element."""

@@ -23,12 +23,14 @@ from lavender.cones import CONTACT, CONTACT_SPIN, ROW
 from lavender.problem import Problem
 from lavender_ext import newton as kernels
 
+CONVEX, COULOMB, AUGMENTED = 0, 1, 2  # natural maps, as in the kernel
 DENSE_ROWS = 400  # below: dense LAPACK beats sparse bookkeeping
 DENSE_FILL = 0.1  # nonzero share of A above which a sparse factor is full anyway
 DENSE_LIMIT = 6000  # rows; 288 MB of A
 
 # Weight of the proximal term in an interior point system, relative to d: far below any step that
 # matters, far above the rounding of a pivot.
+START = 1e-6
 DELTA = 1e-10
 
 
@@ -146,9 +148,8 @@ class System:
     form = ""
     factorisations = 0
 
-    def __init__(self, sc: Scaled, unsymmetric: bool) -> None:
+    def __init__(self, sc: Scaled) -> None:
         self.sc = sc
-        self.unsymmetric = unsymmetric  # the natural map's Newton matrix is
         m = sc.m
         self.v = np.zeros(int(sc.wptr[-1]))
         self.einv = np.zeros_like(self.v)
@@ -162,7 +163,6 @@ class System:
         return kernels.Elements(
             sc.ptr, sc.kind, sc.wptr, node, slot, panel, sc.theta, sc.g, sc.lower, sc.upper,
             np.ascontiguousarray(sc.a_t, float), np.ascontiguousarray(sc.a_s, float), s,
-            sc.problem.law == "coulomb",
         )  # fmt: skip
 
     def times(self, z: FloatArray) -> FloatArray:
@@ -175,11 +175,17 @@ class System:
     def solve_barrier(self, r: FloatArray) -> FloatArray:
         raise NotImplementedError
 
-    def natural(self, z: FloatArray, s: FloatArray, f: FloatArray, augmented: bool, eps: float) -> int:
-        """F into f, and the small matrices of its derivative; the fingerprint of the active pieces."""
-        return self.elements.natural(z, s, augmented, eps, f, self.p, self.einv, self.v)
+    def natural(self, z: FloatArray, s: FloatArray, law: int, eps: float, f: FloatArray) -> float:
+        """F of the map `law` into f, and the small matrices of its derivative; |F|."""
+        self.law = law
+        return self.elements.natural(z, s, law, eps, f, self.p, self.einv, self.v)
+
+    def natural_size(self, z: FloatArray, s: FloatArray, law: int, f: FloatArray) -> float:
+        """F into f; |F|, the judge's energy error [sqrt J]."""
+        return self.elements.natural(z, s, law, 0.0, f, self.p)
 
     def factor_natural(self, eps: float) -> bool:
+        """Factor (I - P) + P (H + eps) of the last `natural`."""
         raise NotImplementedError
 
     def solve_natural(self, r: FloatArray) -> FloatArray:
@@ -197,8 +203,8 @@ class VelocitySystem(System):
 
     form = "velocity"
 
-    def __init__(self, sc: Scaled, unsymmetric: bool) -> None:
-        super().__init__(sc, unsymmetric)
+    def __init__(self, sc: Scaled) -> None:
+        super().__init__(sc)
         rows = sc.problem.rows
         assert rows is not None and sc.bodies is not None
         full = np.zeros((sc.problem.m, 12))
@@ -255,7 +261,7 @@ class VelocitySystem(System):
         return out
 
     def factor_natural(self, eps: float) -> bool:
-        return self._factor(self.unsymmetric)
+        return self._factor(self.law != CONVEX)
 
     def solve_natural(self, r: FloatArray) -> FloatArray:
         t, q = self.t, self.q
@@ -272,8 +278,8 @@ class MatrixSystem(System):
 
     form = "impulse"
 
-    def __init__(self, sc: Scaled, unsymmetric: bool) -> None:
-        super().__init__(sc, unsymmetric)
+    def __init__(self, sc: Scaled) -> None:
+        super().__init__(sc)
         m = sc.m
         a = sc.problem.csr
         if not sc.whole:
@@ -406,8 +412,7 @@ def _fill_reducing(n: int, low: Any, high: Any) -> Any:
 def make_system(problem: Problem, form: str) -> System:
     """The system of a problem; form "velocity" or "impulse"."""
     sc = scaled(problem)
-    unsymmetric = problem.law == "coulomb"
-    return VelocitySystem(sc, unsymmetric) if form == "velocity" else MatrixSystem(sc, unsymmetric)
+    return VelocitySystem(sc) if form == "velocity" else MatrixSystem(sc)
 
 
 @dataclass
@@ -416,8 +421,10 @@ class InteriorPoint:
 
     system: System
     z: FloatArray = field(init=False)
+    everything: FloatArray = field(init=False)
     gap: float = field(init=False, default=np.inf)  # G z . u / degree
-    length: float = field(init=False, default=0.0)
+    first_gap: float = field(init=False, default=0.0)
+    length: float = field(init=False, default=1.0)
 
     def __post_init__(self) -> None:
         sy, sc = self.system, self.system.sc
@@ -426,11 +433,12 @@ class InteriorPoint:
         free = (sc.kind == ROW) & np.isinf(sc.lower[sc.ptr[:-1]]) & np.isinf(sc.upper[sc.ptr[:-1]]) if m else np.zeros(0, bool)
         diagonal = np.repeat(sc.wptr[:-1], size) + (np.arange(m) - np.repeat(sc.ptr[:-1], size)) * (np.repeat(size, size) + 1)
         sy.v[:] = 0.0
-        sy.v[diagonal] = 1.0 / (sc.theta + np.where(np.repeat(free, size), DELTA, 1.0))
+        sy.v[diagonal] = 1.0 / (sc.theta + np.where(np.repeat(free, size), DELTA, START))
         self.u1, self.u2 = np.zeros(m), np.zeros(m)
         self.t1, self.t2, self.r = np.zeros(m), np.zeros(m), np.zeros(m)
         sy.factor_barrier()
         self.z = sy.solve_barrier(sc.g)
+        self.everything = self.z.copy()  # nearly H z = g on every row: where all of them hold, the answer
         self.degree = sy.elements.start(sy.times(self.z), self.z, self.u1, self.u2)
 
     def step(self) -> bool:
@@ -454,4 +462,5 @@ class InteriorPoint:
             return False
         self.length = e.step(z, u1, u2, dz, da, sigma * mu, 0.995, self.t1, self.t2)
         self.gap = mu
+        self.first_gap = max(self.first_gap, mu)
         return self.length > 0.0

@@ -1,46 +1,92 @@
-"""Active-set polish: Newton's method on the natural map, on convex problems.
+"""Newton's method on the natural map: the active-set polish, and the proximal point method around it.
 
     F(z) = z - Pi(z - (H z - g)) = 0,    (I - P + P H) dz = -F,    P in the derivative of Pi
 
 For bounded rows P is 0 or 1: the identified rows are solved exactly, rows with the wrong sign change
 sides, and so on: the primal-dual active set method (Qi, Sun 1993; Hintermueller, Ito, Kunisch 2002).
-Each system carries a proximal weight eps that its iterative refinement takes away again, so rows that
-depend on each other keep the impulses nearest to those they came with.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from dataclasses import dataclass, field
 from time import perf_counter
 
 import numpy as np
 
 from lavender._arrays import FloatArray
 from lavender.residuals import quick
-from lavender.solvers._ipm import System
+from lavender.solvers._ipm import AUGMENTED, CONVEX, InteriorPoint, System
 
-EPS = 1e-9  # proximal weight, relative to d
+EPS = 1e-9  # proximal weight of the polish, relative to d; refinement takes it away again
+ALPHA_LOW = 1e-12  # proximal weight below which a factorisation sees none
 
 
-class Judge:
-    """The judge's relative residual of z, and the best z so far."""
+@dataclass
+class Run:
+    """Budget, clock and best iterate of one solve; `score` is the judge's relative residual."""
 
-    def __init__(self, system: System) -> None:
-        self.sc = system.sc
-        self.problem = system.sc.problem
-        self.w, self.e = np.empty(self.problem.m), np.empty(self.problem.m)
-        self.best, self.best_z, self.floor = np.inf, np.zeros(system.sc.m), 0.0
+    system: System
+    tol: float
+    budget: int  # factorisations
+    deadline: float  # of perf_counter
+    best: float = np.inf
+    best_z: FloatArray = field(init=False)
+    floor: float = 0.0
+    log: list[str] = field(default_factory=list)
 
-    def __call__(self, z: FloatArray) -> float:
-        relative, _ = quick(self.problem, self.sc.impulse(z), self.w, self.e)
+    def __post_init__(self) -> None:
+        m = self.system.sc.problem.m
+        self.w, self.e = np.empty(m), np.empty(m)
+        self.best_z = np.zeros(self.system.sc.m)
+
+    def score(self, z: FloatArray) -> float:
+        """Relative residual of z; keeps the best."""
+        sc = self.system.sc
+        relative, _ = quick(sc.problem, sc.impulse(z), self.w, self.e)
+        if relative < self.best:
+            self.best, self.best_z = relative, z.copy()
+        return relative
+
+    @property
+    def reached(self) -> bool:
+        return self.best <= self.tol
+
+    @property
+    def spent(self) -> bool:
+        return self.system.factorisations >= self.budget or perf_counter() >= self.deadline
+
+    def at_floor(self) -> bool:
+        """The best point is within twice the floor."""
+        if self.best > 1e-5:
+            return False
+        sc = self.system.sc
+        relative, self.floor = quick(sc.problem, sc.impulse(self.best_z), self.w, self.e, True)
+        return relative <= 2.0 * self.floor
+
+    @property
+    def done(self) -> bool:
+        return self.reached or self.spent
+
+
+@dataclass
+class EnergyRun(Run):
+    """The same where the problem solved is the convex relaxation: |F| / |F(0)|, the energy part alone."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.f = np.empty(self.system.sc.m)
+        zero = np.zeros(self.system.sc.m)
+        self.start = self.system.natural_size(zero, -self.system.sc.g, CONVEX, self.f) or 1.0
+
+    def score(self, z: FloatArray) -> float:
+        sy = self.system
+        relative = sy.natural_size(z, sy.times(z) - sy.sc.g, CONVEX, self.f) / self.start
         if relative < self.best:
             self.best, self.best_z = relative, z.copy()
         return relative
 
     def at_floor(self) -> bool:
-        """The best point is within twice the floor."""
-        relative, self.floor = quick(self.problem, self.sc.impulse(self.best_z), self.w, self.e, True)
-        return relative <= 2.0 * self.floor
+        return self.best <= 1e-14
 
 
 def refined(system: System, rhs: FloatArray, rounds: int = 8) -> FloatArray:
@@ -58,35 +104,123 @@ def refined(system: System, rhs: FloatArray, rounds: int = 8) -> FloatArray:
     return x
 
 
-def polish(
-    system: System,
-    judge: Judge,
-    z: FloatArray,
-    tol: float,
-    budget: int,
-    *,
-    eps: float = EPS,
-    patience: int = 3,
-    deadline: float = np.inf,
-    clock: Callable[[], float] = perf_counter,
-) -> tuple[bool, int]:
-    """Newton steps from z until the judge says tol; (reached, steps). The judge keeps the best point."""
+def polish(run: Run, z: FloatArray, law: int = CONVEX, *, patience: int = 2, limit: int = 12) -> None:
+    """Newton steps from z until the judge is content or `patience` of them gain nothing."""
+    system = run.system
     f = np.empty_like(z)
     worse = 0
-    steps = 0
-    relative = judge(z)
-    while relative > tol and steps < budget and clock() < deadline:
-        s = system.times(z) - system.sc.g
-        system.natural(z, s, f, False, eps)
-        if not system.factor_natural(eps):
-            pass  # a lost pivot drops its direction; refinement tells whether it mattered
-        steps += 1
-        best = judge.best
+    best = run.score(z)
+    for _ in range(limit):
+        if run.done:
+            return
+        system.natural(z, system.times(z) - system.sc.g, law, EPS, f)
+        system.factor_natural(EPS)
         z = z + refined(system, -f)
         if not np.isfinite(z).all():
-            break
-        relative = judge(z)
+            return
+        relative = run.score(z)
         worse = 0 if relative < 0.5 * best else worse + 1
-        if worse >= patience:
+        best = min(best, relative)
+        if worse >= patience or (worse and run.at_floor()):
+            return
+
+
+def proximal_newton(run: Run, z: FloatArray, law: int = CONVEX, *, alpha: float = 1e-4, limit: int = 1000) -> None:
+    """Proximal point with inner Newton: each round solves the problem of H + alpha, g + alpha c.
+
+        F_c(z) = z - Pi(z - (H z - g) - alpha (z - c)),   c = z of the last round      (Rockafellar 1976)
+
+    The inner problem is strongly monotone where H is monotone, its Newton system is factored with the
+    proximal weight as it is, and steps pass a non-monotone line search on |F_c| (Grippo, Lampariello,
+    Lucidi 1986). alpha falls while rounds are short and rises where one fails.
+    """
+    system = run.system
+    g = system.sc.g
+    f = np.empty_like(z)
+    last = system.factorisations + limit
+    run.score(z)
+    failures = idle = 0
+    while not run.done and system.factorisations < last:
+        c, hz, before, start = z, system.times(z), run.best, system.factorisations
+        history: list[float] = []
+        solved = False
+        for _ in range(12):
+            size = system.natural(z, hz - g + alpha * (z - c), law, alpha, f)
+            history.append(size)
+            if size <= 1e-3 * history[0] or size <= 1e-15 * float(np.sqrt(z @ z)):
+                solved = True
+                if len(history) > 2 or size == 0.0:
+                    break
+            if run.spent:
+                break
+            system.factor_natural(alpha)
+            dz = system.solve_natural(-f)
+            if not np.isfinite(dz).all():
+                break
+            hdz = system.times(dz)
+            bound = max(history[-4:])
+            best, t = (np.inf, 1.0), 1.0
+            for _ in range(6):
+                trial = z + t * dz
+                value = system.natural_size(trial, hz + t * hdz - g + alpha * (trial - c), law, f)
+                if value < best[0]:
+                    best = (value, t)
+                if value <= (1.0 - 1e-4 * t) * bound:
+                    break
+                t *= 0.5
+            if not best[0] < 1e6 * history[0]:
+                break
+            z = z + best[1] * dz
+            hz = hz + best[1] * hdz
+            if run.score(z) <= run.tol:
+                break
+        used = system.factorisations - start
+        run.log.append(f"{alpha:.0e}:{used}{'' if solved else '!'}:{run.best:.0e}")
+        if run.done or (run.best > 0.5 * before and run.at_floor()):
             break
-    return judge.best <= tol, steps
+        if solved or run.best < 0.3 * before:
+            failures = 0
+            idle = idle + 1 if run.best > 0.5 * before else 0
+            if idle > 2 and alpha == ALPHA_LOW:
+                break
+            alpha = max(ALPHA_LOW, alpha * (0.03 if used <= 4 else 0.2 if used <= 8 else 0.7))
+        else:
+            failures += 1
+            alpha *= 30.0
+            z = run.best_z.copy()
+            if failures >= 4 or alpha > 10.0:
+                break
+
+
+def solve_convex(run: Run, z: FloatArray, cold: bool) -> None:
+    """Warm start, then H z = g on every row, then an interior point with a polish at each new decade."""
+    system = run.system
+    rows = len(system.sc.kind) == system.sc.m
+    if not cold:
+        polish(run, z, patience=1)
+        if run.done:
+            return
+    ip = InteriorPoint(system)
+    if rows:
+        polish(run, ip.everything, patience=1, limit=3)
+    trigger = 1e-2
+    while not run.done:
+        if not ip.step():
+            break
+        relative = run.score(ip.z)
+        if relative < trigger:
+            trigger = 0.1 * relative
+            if rows:
+                polish(run, ip.z.copy())
+            else:
+                proximal_newton(run, ip.z.copy(), alpha=min(1e-4, relative), limit=12)
+            trigger = min(trigger, 0.1 * run.best) if run.best < 1e-6 else trigger
+            if run.at_floor():
+                return
+        if ip.length < 1e-6 or ip.gap < 1e-24 * ip.first_gap:
+            break
+    if not run.done:
+        proximal_newton(run, run.best_z.copy(), alpha=1e-5)
+
+
+__all__ = ["AUGMENTED", "CONVEX", "EnergyRun", "Run", "polish", "proximal_newton", "refined", "solve_convex"]

@@ -1,0 +1,117 @@
+"""Second-order solver for every law: interior point, active-set polish, proximal Newton.
+
+    z = D^1/2 lambda,   H = D^-1/2 A D^-1/2,   s = H z - g complementary to z on every block
+
+1. Newton's method on the natural map from the warm start, then from the solution of H z = g.
+2. A cold Mehrotra interior point (`_ipm.py`), polished on the identified rows (`_polish.py`) as soon as
+   it has found them, to the floor of float64.
+3. Coulomb friction starts from the convex answer and ends with a proximal Newton method on the
+   Alart-Curnier map; where that fails, De Saxce's fixed point on the normals moves the convex problem
+   towards it.
+
+Form "velocity" factors I + K^T V K over the bodies and never squares J; "impulse" factors over the rows.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from time import perf_counter
+
+import numpy as np
+
+from lavender._arrays import FloatArray
+from lavender.errors import InputError
+from lavender.problem import Problem
+from lavender.registry import SolverSpec
+from lavender.solution import Claim, Status
+from lavender.solvers._coulomb_newton import solve_coulomb
+from lavender.solvers._ipm import System, make_system
+from lavender.solvers._polish import Run, solve_convex
+
+FORMS = ("auto", "velocity", "impulse")
+
+
+@dataclass
+class NewtonState:
+    """The system; `done` is set once its numbers belong to an earlier run."""
+
+    problem: Problem
+    system: System | None  # None where nothing moves
+
+
+@dataclass(frozen=True)
+class Newton:
+    """Interior point and semismooth Newton.
+
+    Parameters
+    ----------
+    form : {"auto", "velocity", "impulse"}
+        Unknowns of the factorisation: the bodies (needs rows) or the rows of A. "auto": the bodies where
+        they are known.
+    """
+
+    form: str = "auto"
+
+    def prepare(self, problem: Problem) -> NewtonState:
+        if self.form not in FORMS:
+            raise InputError(f"form is {self.form!r}; one of {', '.join(FORMS)} is needed")
+        if self.form == "velocity" and problem.rows is None:
+            raise InputError("form='velocity' needs a problem with rows (Problem.from_rows); this one was given as a matrix")
+        if problem.m == 0:
+            return NewtonState(problem, None)
+        form = self.form
+        if form == "auto":
+            form = "impulse" if problem.rows is None or problem.rows.n_bodies == 0 else "velocity"
+        system = make_system(problem, form)
+        return NewtonState(problem, system if system.sc.m else None)
+
+    def update(self, state: NewtonState, problem: Problem) -> NewtonState:
+        return self.prepare(problem)
+
+    def run(
+        self, state: NewtonState, impulse: FloatArray, n: int, tol: float, time_limit: float | None = None
+    ) -> Claim:
+        problem, system = state.problem, state.system
+        if problem.m == 0:
+            return Claim(Status.CONVERGED, 0)
+        if system is None:
+            system = make_system(problem, "impulse")
+            impulse[:] = system.sc.fixed
+            return Claim(Status.STALLED, 0, {"factorisations": 0}, "no row can move")
+        system.factorisations = 0
+        deadline = np.inf if time_limit is None else perf_counter() + time_limit
+        run = Run(system, tol, n, deadline)
+        cold = bool(np.array_equal(impulse, problem.start()))
+        z = system.sc.unknown(impulse)
+        run.score(z)
+        if not run.done:
+            if problem.law == "coulomb":
+                solve_coulomb(run, z, cold)
+            else:
+                solve_convex(run, z, cold)
+        impulse[:] = system.sc.impulse(run.best_z)
+        if run.reached:
+            status = Status.CONVERGED
+        elif run.at_floor():
+            status = Status.FLOOR
+        elif perf_counter() >= deadline:
+            status = Status.TIME_LIMIT
+        elif system.factorisations >= n:
+            status = Status.MAX_ITERATIONS
+        else:
+            status = Status.STALLED
+        work = {"factorisations": system.factorisations}
+        return Claim(status, system.factorisations, work, " ".join(run.log), form=system.form)
+
+
+SPEC = SolverSpec(
+    name="newton",
+    factory=Newton,
+    laws=frozenset({"linear", "lcp", "coulomb", "cone"}),
+    operator="either",
+    resumable=False,
+    max_iter=500,
+    options={"form": "auto, velocity (bodies) or impulse (rows): unknowns of the factorisation"},
+    summary="interior point, active-set polish and proximal semismooth Newton",
+    reference="Mehrotra 1992; Nesterov, Todd 1997; Hintermueller, Ito, Kunisch 2002; Alart, Curnier 1991",
+)
