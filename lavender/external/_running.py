@@ -21,12 +21,13 @@ from lavender.problem import Problem
 from lavender.residuals import quick
 from lavender.solution import Claim, Status
 
-__all__ = ["GAP_RELATIVE", "Answer", "Limits", "ask", "definite_refusal", "quiet", "symmetric_refusal"]
+__all__ = ["Answer", "Limits", "ask", "definite_refusal", "quiet", "symmetric_refusal"]
 
 ATTEMPTS = 3
 EPS_MIN = 1e-14  # asked of a backend at the least: its own arithmetic stops there
 GAP_MIN = 1e-18
-GAP_RELATIVE = 1e-13  # of the objective: what the sums of a gap lose to rounding
+# Of the objective: what the sums of a gap lose to rounding at a large mass ratio; and when asked again.
+GAP_RELATIVE, GAP_RELATIVE_MIN = 1e-13, 1e-16
 
 
 @dataclass(frozen=True)
@@ -35,6 +36,7 @@ class Limits:
 
     eps: float  # residual of stationarity and of the constraints
     gap: float  # difference of objectives
+    gap_relative: float  # the same, of the objective; either will do
     max_iter: int
     time_limit: float | None  # s
 
@@ -83,17 +85,18 @@ def ask(
         return Claim(Status.MAX_ITERATIONS, 0, work, "", qp.form)
     start = impulse.copy()
     eps = max(0.5 * target(problem, tol), EPS_MIN)
-    levels = [(eps, eps)]
+    levels = [(eps, eps, GAP_RELATIVE)]
     for i in range(1, ATTEMPTS):
-        levels.append((max(eps / 100.0**i, EPS_MIN), max(10.0 * eps * eps / 10.0**i, GAP_MIN)))
+        closer = max(10.0 * eps * eps / 10.0**i, GAP_MIN)
+        levels.append((max(eps / 100.0**i, EPS_MIN), closer, GAP_RELATIVE_MIN))
     if tol == 0.0:
         levels = levels[-1:]
     best: tuple[float, Claim, FloatArray] | None = None
     clock = perf_counter()
     left, time_left = n, time_limit
     w, e = np.empty(problem.m), np.empty(problem.m)
-    for level, gap in levels:
-        claim = _once(qp, impulse, call, Limits(level, gap, left, time_left), settings, noisy)
+    for level, gap, gap_relative in levels:
+        claim = _once(qp, impulse, call, Limits(level, gap, gap_relative, left, time_left), settings, noisy)
         for kind, count in claim.work.items():
             work[kind] = work.get(kind, 0) + count
         relative, floor = quick(problem, impulse, w, e, floor=True)
@@ -116,6 +119,9 @@ def ask(
     impulse[:] = best[2]
     claim = best[1]
     status, words = claim.status, claim.message
+    if status is Status.NUMERICAL_ERROR and claim.dual is not None and best[0] <= tol:
+        # It broke down, in its own words, after it had got there.
+        status = Status.STALLED
     if tol == 0.0 and status is Status.CONVERGED:
         status, words = Status.STALLED, f"{words}; tol=0: ran at its tightest tolerance"
     if time_limit is not None and not stoppable:

@@ -139,7 +139,7 @@ class QP:
         zeta = self.back.T @ (z - self.shift)
         zeta[self.n_zero :] = np.maximum(zeta[self.n_zero :], 0.0)
         x = np.zeros(self.n)
-        x[:ny] = self.lift.T @ (self.shift + self.back @ zeta)
+        x[:ny] = self.lift.T @ (self.back @ zeta) - self.q[:ny]
         x[ny:] = np.maximum(self.A[:, ny:].T @ (self.A[:, :ny] @ x[:ny] - self.b) * -1.0, 0.0)
         return x, zeta, xi
 

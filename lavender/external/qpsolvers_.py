@@ -21,7 +21,6 @@ import scipy.sparse as sp
 from lavender._arrays import FloatArray
 from lavender.errors import CapabilityError, InputError
 from lavender.external._running import (
-    GAP_RELATIVE,
     Answer,
     Call,
     Limits,
@@ -33,6 +32,7 @@ from lavender.external._running import (
 from lavender.external.as_qp import QP, impulse_form, pick_form, velocity_form
 from lavender.problem import Problem
 from lavender.registry import SolverSpec
+from lavender.residuals import check_certificate
 from lavender.solution import Claim, Status
 
 __all__ = ["BACKENDS", "SPECS", "Backend", "QPSolver"]
@@ -197,7 +197,16 @@ def _through_qpsolvers(
     words = own or words or _words(solution.found, x)
     if backend.settings is None:
         words += ", at its own tolerance"
-    return Answer(status, words, x, zeta, xi, work)
+    proof = _proof(qp, x, zeta) if status is Status.INFEASIBLE else (None, None)
+    return Answer(status, words, x, zeta, xi, work, *proof)
+
+
+def _proof(
+    qp: QP, x: FloatArray | None, zeta: FloatArray | None
+) -> tuple[FloatArray | None, FloatArray | None]:
+    """The iterate as a certificate, where it is one: backends without a field for it return it as iterate."""
+    y = qp.direction(x, zeta)
+    return (x, zeta) if y is not None and check_certificate(qp.problem, y) is None else (None, None)
 
 
 def _bound_rows(qp: QP) -> list[tuple[float, sp.csr_matrix, FloatArray, Any]]:
@@ -328,7 +337,12 @@ def _osqp(qp: QP, impulse: FloatArray, limit: Limits, extra: dict[str, Any]) -> 
         if key not in known:
             raise InputError(f"osqp has no setting {key!r}; known: {', '.join(sorted(known))}")
     p = sp.csc_matrix(sp.triu(qp.P))
-    solver.setup(p, qp.q, rows, low, high, **{**settings, **extra})
+    try:
+        solver.setup(p, qp.q, rows, low, high, **{**settings, **extra})
+    except osqp.OSQPException as error:
+        # Its text is a number: 4 = the factorisation met a P that is not positive semidefinite.
+        words = "P is not positive semidefinite" if str(error) == "4" else "see its list of error codes"
+        return Answer(Status.NUMERICAL_ERROR, f"OSQPException {error}: {words}")
     x, zeta, xi = qp.start(impulse)
     bounded = qp.lb is not None
     solver.warm_start(x=x, y=np.concatenate([zeta, xi]) if bounded else zeta)
@@ -386,11 +400,11 @@ def _clarabel(qp: QP, impulse: FloatArray, limit: Limits, extra: dict[str, Any])
     settings.max_iter = limit.max_iter
     settings.tol_feas = limit.eps
     settings.tol_gap_abs = limit.gap
-    settings.tol_gap_rel = GAP_RELATIVE
+    settings.tol_gap_rel = limit.gap_relative
     settings.tol_ktratio = 1e-10
     # Where it cannot get further it says so; "almost solved" is no claim at these tolerances.
     settings.reduced_tol_feas, settings.reduced_tol_gap_abs = limit.eps, limit.gap
-    settings.reduced_tol_gap_rel = GAP_RELATIVE
+    settings.reduced_tol_gap_rel = limit.gap_relative
     if limit.time_limit is not None:
         settings.time_limit = limit.time_limit
     _set_all(settings, extra, "clarabel")
@@ -469,6 +483,7 @@ def _daqp(qp: QP, impulse: FloatArray, limit: Limits, extra: dict[str, Any]) -> 
         multipliers[k:],
         multipliers[:k] if bounded else np.zeros(qp.n),
         {"iterations": info["iterations"]},
+        *_proof(qp, np.asarray(x), multipliers[k:]),
     )
 
 
@@ -581,7 +596,7 @@ def _qpalm(qp: QP, impulse: FloatArray, limit: Limits, extra: dict[str, Any]) ->
 def _piqp(limit: Limits) -> dict[str, Any]:
     return {
         "eps_abs": limit.eps, "eps_rel": 0.0, "max_iter": limit.max_iter,
-        "check_duality_gap": True, "eps_duality_gap_abs": limit.gap, "eps_duality_gap_rel": GAP_RELATIVE,
+        "check_duality_gap": True, "eps_duality_gap_abs": limit.gap, "eps_duality_gap_rel": limit.gap_relative,
     }  # fmt: skip
 
 
@@ -595,11 +610,21 @@ def _scs(limit: Limits) -> dict[str, Any]:
 
 
 def _cvxopt(limit: Limits) -> dict[str, Any]:
-    return {"feastol": limit.eps, "abstol": limit.gap, "reltol": GAP_RELATIVE, "maxiters": limit.max_iter}
+    return {
+        "feastol": limit.eps,
+        "abstol": limit.gap,
+        "reltol": limit.gap_relative,
+        "maxiters": limit.max_iter,
+    }
 
 
 def _ecos(limit: Limits) -> dict[str, Any]:
-    return {"feastol": limit.eps, "abstol": limit.gap, "reltol": GAP_RELATIVE, "max_iters": limit.max_iter}
+    return {
+        "feastol": limit.eps,
+        "abstol": limit.gap,
+        "reltol": limit.gap_relative,
+        "max_iters": limit.max_iter,
+    }
 
 
 def _gurobi(limit: Limits) -> dict[str, Any]:
@@ -619,7 +644,7 @@ def _copt(limit: Limits) -> dict[str, Any]:
 
 def _qtqp(limit: Limits) -> dict[str, Any]:
     return {
-        "tol_feas": limit.eps, "tol_gap_abs": limit.gap, "tol_gap_rel": GAP_RELATIVE,
+        "tol_feas": limit.eps, "tol_gap_abs": limit.gap, "tol_gap_rel": limit.gap_relative,
         "max_iter": limit.max_iter, "collect_stats": True,
     }  # fmt: skip
 
