@@ -11,8 +11,11 @@ Prepared numbers of block i stand from g[start[i]] on:
 from libc.stdint cimport int32_t
 
 from lavender_ext.block cimport (CONE, CONTACT_SPIN, ROW, blocks_t, n_tangents, relax_normal, relax_row)
+from lavender_ext.csr cimport csr_dot, csr_t
 from lavender_ext.local cimport (FAILED, MAX_ROWS, PREPARED, boxed_rows, cone3, contact_with_spin,
                                  contact_without_spin, coulomb3, eliminate, prepare3, project_locally)
+from lavender_ext.rows cimport (cross, dot3, joint_push, joint_velocity, push_bodies, relative_velocity,
+                                relax_joint, rows_t)
 
 
 cdef inline int32_t prepared_size(const blocks_t* p, int32_t i) noexcept nogil:
@@ -113,3 +116,113 @@ cdef inline int32_t solve_block(const blocks_t* p, int32_t i, const double* g, c
         project_locally(p.law, nt, kind == CONTACT_SPIN, g, q, p.d + j, p.step + j, p.mu[i], p.patch_radius[i], lam)
         return 1
     return 0
+
+
+cdef inline void csr_dot3(const csr_t* a, int32_t i, const double* x, double* out) noexcept nogil:
+    # Rows i, i + 1, i + 2 of one pattern.
+    cdef int32_t p, n = a.indptr[i + 1] - a.indptr[i]
+    cdef const int32_t* idx = a.indices + a.indptr[i]
+    cdef const double* u = a.data + a.indptr[i]
+    cdef const double* v = a.data + a.indptr[i + 1]
+    cdef const double* w = a.data + a.indptr[i + 2]
+    cdef double s0 = 0.0, s1 = 0.0, s2 = 0.0, t0 = 0.0, t1 = 0.0, t2 = 0.0, y
+    p = 0
+    while p + 2 <= n:
+        y = x[idx[p]]
+        s0 += u[p] * y
+        s1 += v[p] * y
+        s2 += w[p] * y
+        y = x[idx[p + 1]]
+        t0 += u[p + 1] * y
+        t1 += v[p + 1] * y
+        t2 += w[p + 1] * y
+        p += 2
+    if p < n:
+        y = x[idx[p]]
+        s0 += u[p] * y
+        s1 += v[p] * y
+        s2 += w[p] * y
+    out[0] = s0 + t0
+    out[1] = s1 + t1
+    out[2] = s2 + t2
+
+
+cdef inline int32_t solve_csr_block(const blocks_t* p, const csr_t* a, int32_t i, const double* g, double* lam) noexcept nogil:
+    cdef int32_t j = p.ptr[i], n = p.ptr[i + 1] - j, k
+    cdef double w[MAX_ROWS]
+    if n > MAX_ROWS:                                    # ROW: row by row
+        for k in range(j, j + n):
+            lam[k] = relax_row(lam[k], csr_dot(a, k, lam) - p.b[k], p.step[k], p.lower[k], p.upper[k])
+        return 1
+    if n == 3 and p.kind[i] != ROW and p.kind[i] != CONTACT_SPIN and g[15] != 0.0:
+        csr_dot3(a, j, lam, w)
+        w[0] -= p.b[j]
+        w[1] -= p.b[j + 1]
+        w[2] -= p.b[j + 2]
+    else:
+        for k in range(n):
+            w[k] = csr_dot(a, j + k, lam) - p.b[j + k]
+    return solve_block(p, i, g, w, lam + j)
+
+
+cdef inline int32_t solve_rows_block(const blocks_t* p, const rows_t* r, int32_t i, const double* g, double* lam,
+                                     double* v) noexcept nogil:
+    cdef int32_t j = p.ptr[i], n = p.ptr[i + 1] - j, c = i - r.n_joints, k, a, b, nt, spin, found
+    cdef double w[MAX_ROWS]
+    cdef double old[MAX_ROWS]
+    cdef double u[3]
+    cdef double omega[3]
+    cdef double t2[3]
+    cdef double impulse[3]
+    cdef double twist[3]
+    cdef const double* normal
+    cdef const double* t1
+    w[0] = 0.0
+    if c < 0:
+        if n > MAX_ROWS:
+            relax_joint(p, r, i, lam, v)
+            return 1
+        a = r.joint_body[2 * i]
+        b = r.joint_body[2 * i + 1]
+        for k in range(n):
+            w[k] = joint_velocity(r.jac + 12 * (j + k), v, a, b) + r.compliance[j + k] * lam[j + k] - p.b[j + k]
+            old[k] = lam[j + k]
+        found = solve_block(p, i, g, w, lam + j)
+        for k in range(n):
+            joint_push(r.minv_jac + 12 * (j + k), lam[j + k] - old[k], v, a, b)
+        return found
+    a = r.contact_body[2 * c]
+    b = r.contact_body[2 * c + 1]
+    spin = p.kind[i] == CONTACT_SPIN
+    nt = n - 1 - spin
+    normal = r.normal + 3 * c
+    t1 = r.tangent + 3 * c
+    relative_velocity(v, a, b, r.arm_a + 3 * c, r.arm_b + 3 * c, u, omega)
+    w[0] = dot3(normal, u)
+    if nt > 0:
+        w[1] = dot3(t1, u)
+    if nt > 1:
+        cross(normal, t1, t2)
+        w[2] = dot3(t2, u)
+    if spin:
+        w[1 + nt] = dot3(normal, omega)
+    for k in range(n):
+        w[k] += r.compliance[j + k] * lam[j + k] - p.b[j + k]
+        old[k] = lam[j + k]
+    found = solve_block(p, i, g, w, lam + j)
+    for k in range(n):
+        w[k] = lam[j + k] - old[k]
+    for k in range(3):
+        impulse[k] = w[0] * normal[k]
+        twist[k] = 0.0
+    if nt > 0:
+        for k in range(3):
+            impulse[k] += w[1] * t1[k]
+    if nt > 1:
+        for k in range(3):
+            impulse[k] += w[2] * t2[k]
+    if spin:
+        for k in range(3):
+            twist[k] = w[1 + nt] * normal[k]
+    push_bodies(v, a, b, r.inv_mass, r.inv_inertia, r.arm_a + 3 * c, r.arm_b + 3 * c, impulse, twist)
+    return found

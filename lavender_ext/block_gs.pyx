@@ -7,14 +7,13 @@ from libc.stdint cimport int32_t, uint64_t
 
 import numpy as np
 
-from lavender_ext.block cimport CONTACT_SPIN, ROW, blocks_t, n_tangents, relax_row
-from lavender_ext.block_gs cimport prepare_block, prepared_size, solve_block
-from lavender_ext.csr cimport csr_dot, csr_t
+from lavender_ext.block cimport CONTACT_SPIN, blocks_t, n_tangents
+from lavender_ext.block_gs cimport prepare_block, prepared_size, solve_csr_block, solve_rows_block
+from lavender_ext.csr cimport csr_t
 from lavender_ext.local cimport MAX_ROWS, boxed_rows, contact_with_spin, contact_without_spin
 from lavender_ext.order cimport advance_order
 from lavender_ext.problem cimport Data
-from lavender_ext.rows cimport (contact_jacobian, cross, dot12, dot3, joint_push, joint_velocity, minv_times,
-                                push_bodies, relative_velocity, relax_joint, rows_t)
+from lavender_ext.rows cimport contact_jacobian, dot12, minv_times, rows_t
 from lavender_ext.watch cimport CONVERGED, RUNNING, Watch
 
 
@@ -83,116 +82,6 @@ cdef public void lav_prepare_rows(const blocks_t* p, const rows_t* r, const int3
         if c >= 0 and W[0] > 0.0:
             W[0] = p.d[j]                               # the same number summed in another order
         prepare_block(p, i, W, 0, g + start[i])
-
-
-cdef inline void csr_dot3(const csr_t* a, int32_t i, const double* x, double* out) noexcept nogil:
-    # Rows i, i + 1, i + 2 of one pattern.
-    cdef int32_t p, n = a.indptr[i + 1] - a.indptr[i]
-    cdef const int32_t* idx = a.indices + a.indptr[i]
-    cdef const double* u = a.data + a.indptr[i]
-    cdef const double* v = a.data + a.indptr[i + 1]
-    cdef const double* w = a.data + a.indptr[i + 2]
-    cdef double s0 = 0.0, s1 = 0.0, s2 = 0.0, t0 = 0.0, t1 = 0.0, t2 = 0.0, y
-    p = 0
-    while p + 2 <= n:
-        y = x[idx[p]]
-        s0 += u[p] * y
-        s1 += v[p] * y
-        s2 += w[p] * y
-        y = x[idx[p + 1]]
-        t0 += u[p + 1] * y
-        t1 += v[p + 1] * y
-        t2 += w[p + 1] * y
-        p += 2
-    if p < n:
-        y = x[idx[p]]
-        s0 += u[p] * y
-        s1 += v[p] * y
-        s2 += w[p] * y
-    out[0] = s0 + t0
-    out[1] = s1 + t1
-    out[2] = s2 + t2
-
-
-cdef inline int32_t solve_csr_block(const blocks_t* p, const csr_t* a, int32_t i, const double* g, double* lam) noexcept nogil:
-    cdef int32_t j = p.ptr[i], n = p.ptr[i + 1] - j, k
-    cdef double w[MAX_ROWS]
-    if n > MAX_ROWS:                                    # ROW: row by row
-        for k in range(j, j + n):
-            lam[k] = relax_row(lam[k], csr_dot(a, k, lam) - p.b[k], p.step[k], p.lower[k], p.upper[k])
-        return 1
-    if n == 3 and p.kind[i] != ROW and p.kind[i] != CONTACT_SPIN and g[15] != 0.0:
-        csr_dot3(a, j, lam, w)
-        w[0] -= p.b[j]
-        w[1] -= p.b[j + 1]
-        w[2] -= p.b[j + 2]
-    else:
-        for k in range(n):
-            w[k] = csr_dot(a, j + k, lam) - p.b[j + k]
-    return solve_block(p, i, g, w, lam + j)
-
-
-cdef inline int32_t solve_rows_block(const blocks_t* p, const rows_t* r, int32_t i, const double* g, double* lam,
-                                     double* v) noexcept nogil:
-    cdef int32_t j = p.ptr[i], n = p.ptr[i + 1] - j, c = i - r.n_joints, k, a, b, nt, spin, found
-    cdef double w[MAX_ROWS]
-    cdef double old[MAX_ROWS]
-    cdef double u[3]
-    cdef double omega[3]
-    cdef double t2[3]
-    cdef double impulse[3]
-    cdef double twist[3]
-    cdef const double* normal
-    cdef const double* t1
-    w[0] = 0.0
-    if c < 0:
-        if n > MAX_ROWS:
-            relax_joint(p, r, i, lam, v)
-            return 1
-        a = r.joint_body[2 * i]
-        b = r.joint_body[2 * i + 1]
-        for k in range(n):
-            w[k] = joint_velocity(r.jac + 12 * (j + k), v, a, b) + r.compliance[j + k] * lam[j + k] - p.b[j + k]
-            old[k] = lam[j + k]
-        found = solve_block(p, i, g, w, lam + j)
-        for k in range(n):
-            joint_push(r.minv_jac + 12 * (j + k), lam[j + k] - old[k], v, a, b)
-        return found
-    a = r.contact_body[2 * c]
-    b = r.contact_body[2 * c + 1]
-    spin = p.kind[i] == CONTACT_SPIN
-    nt = n - 1 - spin
-    normal = r.normal + 3 * c
-    t1 = r.tangent + 3 * c
-    relative_velocity(v, a, b, r.arm_a + 3 * c, r.arm_b + 3 * c, u, omega)
-    w[0] = dot3(normal, u)
-    if nt > 0:
-        w[1] = dot3(t1, u)
-    if nt > 1:
-        cross(normal, t1, t2)
-        w[2] = dot3(t2, u)
-    if spin:
-        w[1 + nt] = dot3(normal, omega)
-    for k in range(n):
-        w[k] += r.compliance[j + k] * lam[j + k] - p.b[j + k]
-        old[k] = lam[j + k]
-    found = solve_block(p, i, g, w, lam + j)
-    for k in range(n):
-        w[k] = lam[j + k] - old[k]
-    for k in range(3):
-        impulse[k] = w[0] * normal[k]
-        twist[k] = 0.0
-    if nt > 0:
-        for k in range(3):
-            impulse[k] += w[1] * t1[k]
-    if nt > 1:
-        for k in range(3):
-            impulse[k] += w[2] * t2[k]
-    if spin:
-        for k in range(3):
-            twist[k] = w[1 + nt] * normal[k]
-    push_bodies(v, a, b, r.inv_mass, r.inv_inertia, r.arm_a + 3 * c, r.arm_b + 3 * c, impulse, twist)
-    return found
 
 
 cdef public double lav_block_sweeps_csr(const blocks_t* p, const csr_t* a, const int32_t* start, const double* g, double* lam,

@@ -10,7 +10,10 @@ from lavender.registry import SolverSpec
 # File in this folder, with its SPEC; from the exact to the plain.
 _TABLE = (
     "direct",
+    "newton",
     "block_gauss_seidel",
+    "nncg",
+    "anderson",
     "pgs",
     "sequential_impulses",
     "jacobi",

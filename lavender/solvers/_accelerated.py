@@ -1,0 +1,67 @@
+"""What `nncg` and `anderson` share: sweeps over rows of A or body velocities, by `pgs` or by exact blocks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+from lavender._arrays import FloatArray
+from lavender.errors import InputError, UnknownName
+from lavender.ordering import Order, block_order
+from lavender.problem import Problem
+from lavender.solution import Claim
+from lavender.solvers._sweeping import Sweeping, SweepState, claim
+from lavender_ext import accelerate as kernels
+from lavender_ext import block_gs, judge
+
+SWEEPS = ("pgs", "blocks")
+LARGEST_MEMORY = 16
+SWEEP_OPTION = "'pgs' or 'blocks' (each contact and joint solved exactly); default: pgs, blocks for the cone law"
+
+
+class AcceleratedState(SweepState):
+    """A sweep state with the memory of the acceleration and, where there are rows, v = M^-1 J^T lambda."""
+
+    def __init__(self, problem: Problem, data: Any, order: Order, blocks: bool, memory: int) -> None:
+        super().__init__(problem, data, order)
+        self.prepared = block_gs.prepare(data) if blocks else None
+        self.memory = memory
+        self.space = kernels.allocate(data, memory)
+        self.restarts = 0
+
+
+@dataclass(frozen=True)
+class Accelerated(Sweeping):
+    """Life cycle of an accelerated sweep; `memory` 0 is nncg."""
+
+    sweep: str | None = None
+
+    @property
+    def _memory(self) -> int:
+        return 0
+
+    def prepare(self, problem: Problem) -> AcceleratedState:
+        """Order, memory, and each block's own part of A where blocks are solved exactly."""
+        if self.sweep is not None and self.sweep not in SWEEPS:
+            raise UnknownName("sweep", self.sweep, SWEEPS)
+        if self.sweep == "pgs" and problem.law == "cone":
+            raise InputError("sweep='pgs' has no update for the cone law; sweep='blocks' has")
+        blocks = self.sweep == "blocks" or (self.sweep is None and problem.law == "cone")
+        order = block_order(problem, self.order, seed=self.seed, ground=self.ground)
+        return AcceleratedState(problem, problem.data, order, blocks, self._memory)
+
+    def run(
+        self, state: AcceleratedState, impulse: FloatArray, n: int, tol: float, time_limit: float | None = None
+    ) -> Claim:
+        """n iterations, or fewer where a check ends them."""
+        o, data = state.order, state.data
+        if state.first and data.factored:
+            judge.velocity_change(data, impulse, state.space[-1])
+        status, done, sweeps, restarts = kernels.run(
+            data, state.watch, impulse, n, tol, state.memory, state.prepared, state.space, o.blocks, o.split, o.mode, o.rng
+        )  # fmt: skip
+        work = {"sweeps": sweeps, "restarts": restarts - state.restarts}
+        state.restarts = restarts
+        sweep = "pgs" if state.prepared is None else "blocks"
+        form = f"{sweep} on {'body velocities' if data.factored else 'rows of A'}"
+        return replace(claim(status, done), work=work, form=form)

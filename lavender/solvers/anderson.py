@@ -1,0 +1,45 @@
+"""Anderson acceleration of projected Gauss-Seidel: the last few sweeps, combined to cancel their steps.
+
+    y = S(x),   f = D^1/2 (y - x),   x <- Pi(y - sum_i gamma_i (y_{i+1} - y_i)),
+    gamma = argmin | f - sum_i gamma_i (f_{i+1} - f_i) |       over the last `memory` sweeps
+
+On a linear problem this is a truncated GMRES of which the sweep is the preconditioner; it asks neither for
+a symmetric A nor for an energy, so friction is accelerated alike. A step that doubles |f| is undone and
+the memory cleared.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from lavender.errors import InputError
+from lavender.registry import SolverSpec
+from lavender.solvers._accelerated import LARGEST_MEMORY, SWEEP_OPTION, Accelerated
+
+
+@dataclass(frozen=True)
+class Anderson(Accelerated):
+    """Anderson-accelerated sweeps; `order`, `ground`, `seed` as in `lavender.ordering`."""
+
+    memory: int = 5
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.memory, int) or not 1 <= self.memory <= LARGEST_MEMORY:
+            raise InputError(f"memory is {self.memory!r}; a whole number from 1 to {LARGEST_MEMORY} is needed")
+
+    @property
+    def _memory(self) -> int:
+        return self.memory
+
+
+SPEC = SolverSpec(
+    name="anderson",
+    factory=Anderson,
+    laws=frozenset({"linear", "lcp", "coulomb", "cone"}),
+    order=True,
+    seed=True,
+    max_iter=1000,
+    options={"sweep": SWEEP_OPTION, "memory": "sweeps that are combined, 1 to 16; default 5"},
+    summary="Anderson acceleration of Gauss-Seidel sweeps",
+    reference="Anderson 1965; Walker, Ni 2011; Zhang, O'Donoghue, Boyd 2020 (safeguards)",
+)

@@ -1,0 +1,425 @@
+"""Sweeps of Gauss-Seidel type, accelerated: one sweep y = S(x) is the map, g = x - y its step.
+
+    nncg      x_k = y_{k-1} + beta_{k-1} p_{k-2},  y_k = S(x_k),  g_k = x_k - y_k,                    (1)
+              beta_k = g_k.D g_k / g_{k-1}.D g_{k-1},  p_k = beta_k p_{k-1} - g_k  (p_k = -g_k where beta_k > 1)
+    anderson  x_k = Pi(y - sum_i gamma_i (y_i+1 - y_i)),  gamma least squares of f = sum_i gamma_i (f_i+1 - f_i),
+              f = D^1/2 (y - x), over the last `memory` sweeps                                        (2)
+
+D = diag d, so that both work in energy. S is a sweep of pgs or of exact blocks (block_gs.pxd), over A in
+compressed rows or over the factored form; there v = M^-1 J^T lam is linear in lam and follows every
+combination. With the symmetric order S is a sweep and the same sweep backwards. An iterate that is shown
+is always a swept one, y. All sums run in a fixed order.
+
+Safeguard of (2): where a step multiplied |f| by more than GUARD, it is undone and the memory cleared.
+Where WINDOW steps have not reduced the least |f| to PROGRESS of it, as many plain sweeps follow.
+"""
+from libc.math cimport fabs, sqrt
+from libc.stdint cimport int32_t, uint64_t
+
+import numpy as np
+
+from lavender_ext.block cimport (CONTACT_SPIN, ROW, blocks_t, clip, n_tangents, norm2)
+from lavender_ext.block_gs cimport solve_csr_block, solve_rows_block
+from lavender_ext.csr cimport csr_t
+from lavender_ext.order cimport SYMMETRIC, advance_order
+from lavender_ext.pgs cimport relax_csr_block
+from lavender_ext.problem cimport Data
+from lavender_ext.rows cimport contact_push, joint_push, relax_rows_block, rows_t
+from lavender_ext.watch cimport CONVERGED, RUNNING, Watch
+
+cdef enum:
+    MAX_MEMORY = 16
+    WINDOW = 200
+    REFRESH = 64                # v is formed anew from lam as often: rounding adds up in it
+
+cdef enum:                      # numbers of a run, in control[]
+    TURN = 0                    # iterations done
+    LAST = 1                    # nncg: g.Dg of the last sweep; anderson: |f|
+    KEPT = 2                    # differences in memory
+    HEAD = 3                    # slot of the next one
+    FRESH = 4                   # f and y of the sweep before are there
+    REST = 5                    # plain sweeps to come
+    LEAST = 6                   # least |f| so far
+    AGO = 7                     # LEAST at the start of the window
+    STEPS = 8                   # steps since then
+    RESTARTS = 9                # beta > 1; undone steps
+    CONTROL = 10
+
+
+cdef struct sweep_data_t:
+    const blocks_t* blocks
+    const csr_t* csr            # NULL where factored
+    const rows_t* rows
+    const int32_t* start        # prepared blocks, NULL for pgs
+    const double* g
+    int32_t* order
+    int32_t split
+    int32_t mode
+    int32_t memory
+    uint64_t* rng
+    double* v                   # (n_bodies, 6), with nv = 6 n_bodies; nv = 0 where not factored
+    int32_t nv
+    double* control             # (CONTROL)
+    double* gram                # (MAX_MEMORY, MAX_MEMORY)
+    double* work                # nncg 3 (m + nv); anderson (3 + 2 memory) (m + nv)
+
+
+cdef inline void sweep(const sweep_data_t* c, double* lam, int32_t first) noexcept nogil:
+    cdef const blocks_t* p = c.blocks
+    cdef int32_t i, q, k
+    for k in range(2 if c.mode == SYMMETRIC else 1):
+        advance_order(c.mode, first and k == 0, c.order, 0, c.split, c.rng)
+        advance_order(c.mode, first and k == 0, c.order, c.split, p.n_blocks, c.rng)
+        if c.nv == 0:
+            if c.start == NULL:
+                for q in range(p.n_blocks):
+                    relax_csr_block(p, c.csr, c.order[q], lam)
+            else:
+                for q in range(p.n_blocks):
+                    i = c.order[q]
+                    solve_csr_block(p, c.csr, i, c.g + c.start[i], lam)
+        elif c.start == NULL:
+            for q in range(p.n_blocks):
+                relax_rows_block(p, c.rows, c.order[q], lam, c.v)
+        else:
+            for q in range(p.n_blocks):
+                i = c.order[q]
+                solve_rows_block(p, c.rows, i, c.g + c.start[i], lam, c.v)
+
+
+cdef inline void push_block(const sweep_data_t* c, int32_t i, const double* change, double* v) noexcept nogil:
+    # v += M^-1 J^T change of one block; change at its first row.
+    cdef const blocks_t* p = c.blocks
+    cdef const rows_t* r = c.rows
+    cdef int32_t j = p.ptr[i], n = p.ptr[i + 1] - j, k
+    if i < r.n_joints:
+        for k in range(n):
+            joint_push(r.minv_jac + 12 * (j + k), change[k], v, r.joint_body[2 * i], r.joint_body[2 * i + 1])
+    else:
+        contact_push(r, i - r.n_joints, n_tangents(p.kind[i], n), p.kind[i] == CONTACT_SPIN, change, v)
+
+
+cdef inline void refresh(const sweep_data_t* c, const double* lam) noexcept nogil:
+    cdef int32_t i
+    for i in range(c.nv):
+        c.v[i] = 0.0
+    if c.nv > 0:
+        for i in range(c.blocks.n_blocks):
+            push_block(c, i, lam + c.blocks.ptr[i], c.v)
+
+
+cdef inline void project_block(const sweep_data_t* c, int32_t i, double* lam) noexcept nogil:
+    """lam of block i into its bounds, normal first; v follows."""
+    cdef const blocks_t* p = c.blocks
+    cdef int32_t j = p.ptr[i], n = p.ptr[i + 1] - j, k, nt, moved = 0
+    cdef double bound, size
+    cdef double change[4]
+    if p.kind[i] == ROW:
+        for k in range(j, j + n):
+            size = clip(lam[k], p.lower[k], p.upper[k])
+            if size != lam[k]:
+                if c.nv > 0:
+                    joint_push(c.rows.minv_jac + 12 * k, size - lam[k], c.v, c.rows.joint_body[2 * i],
+                               c.rows.joint_body[2 * i + 1])
+                lam[k] = size
+        return
+    for k in range(n):
+        change[k] = lam[j + k]
+    if lam[j] < 0.0:
+        lam[j] = 0.0
+        moved = 1
+    bound = p.mu[i] * lam[j]
+    nt = n_tangents(p.kind[i], n)
+    if nt > 0:
+        size = norm2(lam[j + 1], lam[j + 2]) if nt == 2 else fabs(lam[j + 1])
+        if size > bound:
+            size = bound / size
+            for k in range(1, 1 + nt):
+                lam[j + k] *= size
+            moved = 1
+    if p.kind[i] == CONTACT_SPIN:
+        bound = bound * p.patch_radius[i]
+        if fabs(lam[j + n - 1]) > bound:
+            lam[j + n - 1] = bound if lam[j + n - 1] > 0.0 else -bound
+            moved = 1
+    if moved and c.nv > 0:
+        for k in range(n):
+            change[k] = lam[j + k] - change[k]
+        push_block(c, i, change, c.v)
+
+
+cdef public void lav_nncg(sweep_data_t* c, double* lam, int32_t first_sweep, int32_t n) noexcept nogil:
+    """n iterations of (1)."""
+    cdef int32_t m = c.blocks.n_rows, i, s
+    cdef double* x = c.work                             # x, then g; behind lam's part that of v
+    cdef double* q = c.work + m + c.nv                  # beta p, to be added
+    cdef double* p = q + m + c.nv
+    cdef double* control = c.control
+    cdef const double* d = c.blocks.d
+    cdef double s0, s1, s2, s3, beta
+    for s in range(n):
+        if c.nv > 0 and control[TURN] > 0.0 and <int32_t>control[TURN] % REFRESH == 0:
+            refresh(c, lam)
+        for i in range(m):
+            lam[i] += q[i]
+            x[i] = lam[i]
+        for i in range(c.nv):
+            c.v[i] += q[m + i]
+            x[m + i] = c.v[i]
+        sweep(c, lam, first_sweep and s == 0)
+        s0 = s1 = s2 = s3 = 0.0
+        i = 0
+        while i < m:
+            x[i] -= lam[i]
+            i += 1
+        i = 0
+        while i + 4 <= m:
+            s0 += d[i] * x[i] * x[i]
+            s1 += d[i + 1] * x[i + 1] * x[i + 1]
+            s2 += d[i + 2] * x[i + 2] * x[i + 2]
+            s3 += d[i + 3] * x[i + 3] * x[i + 3]
+            i += 4
+        while i < m:
+            s0 += d[i] * x[i] * x[i]
+            i += 1
+        s0 = (s0 + s1) + (s2 + s3)
+        for i in range(c.nv):
+            x[m + i] -= c.v[i]
+        beta = s0 / control[LAST] if control[TURN] > 0.0 and control[LAST] > 0.0 else 0.0
+        if not beta <= 1.0:
+            beta = 0.0
+            control[RESTARTS] += 1.0
+        control[LAST] = s0
+        control[TURN] += 1.0
+        for i in range(m + c.nv):
+            q[i] = beta * p[i]
+            p[i] = q[i] - x[i]
+
+
+cdef inline int32_t least_squares(int32_t n, int32_t head, int32_t memory, const double* gram, const double* rhs,
+                                  double* gamma) noexcept nogil:
+    """gamma (memory), by slot, of the normal equations over the n newest differences; newest first, dependent ones out.
+
+    Cholesky: a column whose pivot is below 1e-12 of its square says nothing new.
+    """
+    cdef double l[MAX_MEMORY * MAX_MEMORY]
+    cdef double y[MAX_MEMORY]
+    cdef int32_t slot[MAX_MEMORY]
+    cdef int32_t i, j, k, t, used = 0
+    cdef double x, a
+    for i in range(memory):
+        gamma[i] = 0.0
+    for i in range(n):
+        k = (head - 1 - i + 2 * memory) % memory
+        a = gram[MAX_MEMORY * k + k]
+        x = a
+        for j in range(used):
+            l[MAX_MEMORY * used + j] = gram[MAX_MEMORY * k + slot[j]]
+        for j in range(used):
+            for t in range(j):
+                l[MAX_MEMORY * used + j] -= l[MAX_MEMORY * used + t] * l[MAX_MEMORY * j + t]
+            l[MAX_MEMORY * used + j] /= l[MAX_MEMORY * j + j]
+            x -= l[MAX_MEMORY * used + j] * l[MAX_MEMORY * used + j]
+        if not x > 1e-12 * a:
+            continue
+        l[MAX_MEMORY * used + used] = sqrt(x)
+        slot[used] = k
+        used += 1
+    for i in range(used):
+        x = rhs[slot[i]]
+        for j in range(i):
+            x -= l[MAX_MEMORY * i + j] * y[j]
+        y[i] = x / l[MAX_MEMORY * i + i]
+    i = used - 1
+    while i >= 0:
+        x = y[i]
+        for j in range(i + 1, used):
+            x -= l[MAX_MEMORY * j + i] * y[j]
+        y[i] = x / l[MAX_MEMORY * i + i]
+        gamma[slot[i]] = y[i]
+        i -= 1
+    return used
+
+
+cdef public void lav_anderson(sweep_data_t* c, double* lam, int32_t first_sweep, int32_t n) noexcept nogil:
+    """n iterations of (2)."""
+    cdef int32_t m = c.blocks.n_rows, w = m + c.nv, i, j, k, s, kept, head, stepped
+    cdef double* x = c.work                             # x, later the new f; behind lam's part that of v
+    cdef double* y = x + w                              # the swept iterate before
+    cdef double* f = y + w
+    cdef double* dy = f + w                             # (memory, w)
+    cdef double* df = dy + c.memory * w                 # (memory, w), the first m of each
+    cdef double* control = c.control
+    cdef const double* d = c.blocks.d
+    cdef const double* u
+    cdef double* dnew
+    cdef double rhs[MAX_MEMORY]
+    cdef double gamma[MAX_MEMORY]
+    cdef double a0, a1, size
+    for s in range(n):
+        if c.nv > 0 and control[TURN] > 0.0 and <int32_t>control[TURN] % REFRESH == 0:
+            refresh(c, lam)
+        kept = <int32_t>control[KEPT]
+        head = <int32_t>control[HEAD]
+        stepped = 0
+        # lam is y of the last sweep, f its step; rhs = df.f
+        if kept > 0 and control[REST] <= 0.0:
+            for k in range(kept):
+                j = (head - 1 - k + 2 * c.memory) % c.memory
+                u = df + j * w
+                a0 = a1 = 0.0
+                i = 0
+                while i + 2 <= m:
+                    a0 += u[i] * f[i]
+                    a1 += u[i + 1] * f[i + 1]
+                    i += 2
+                if i < m:
+                    a0 += u[i] * f[i]
+                rhs[j] = a0 + a1
+            if least_squares(kept, head, c.memory, c.gram, rhs, gamma) > 0:
+                stepped = 1
+                for i in range(m):
+                    x[i] = lam[i]
+                for i in range(c.nv):
+                    x[m + i] = c.v[i]
+                for j in range(c.memory):
+                    a0 = gamma[j]
+                    u = dy + j * w
+                    if a0 != 0.0:
+                        for i in range(w):
+                            x[i] -= a0 * u[i]
+                for i in range(m):
+                    lam[i] = x[i]
+                for i in range(c.nv):
+                    c.v[i] = x[m + i]
+                for i in range(c.blocks.n_blocks):
+                    project_block(c, i, lam)
+        for i in range(m):
+            x[i] = lam[i]
+        sweep(c, lam, first_sweep and s == 0)
+        control[TURN] += 1.0
+        a0 = a1 = 0.0
+        for i in range(m):
+            x[i] = sqrt(d[i]) * (lam[i] - x[i])
+        i = 0
+        while i + 2 <= m:
+            a0 += x[i] * x[i]
+            a1 += x[i + 1] * x[i + 1]
+            i += 2
+        if i < m:
+            a0 += x[i] * x[i]
+        size = sqrt(a0 + a1)
+        if stepped and not size <= 2.0 * control[LAST]:
+            # Undo: back to the sweep before, nothing remembered.
+            for i in range(m):
+                lam[i] = y[i]
+            for i in range(c.nv):
+                c.v[i] = y[m + i]
+            control[KEPT] = 0.0
+            control[FRESH] = 0.0
+            control[RESTARTS] += 1.0
+            continue
+        control[LAST] = size
+        control[REST] -= 1.0
+        if not size >= control[LEAST] or control[TURN] <= 1.0:
+            control[LEAST] = size
+        if control[REST] <= 0.0:
+            control[STEPS] += 1.0
+            if control[STEPS] >= WINDOW:
+                if control[AGO] > 0.0 and control[LEAST] > 0.9 * control[AGO]:
+                    control[REST] = WINDOW
+                    control[KEPT] = 0.0
+                    control[FRESH] = 0.0
+                    kept = 0
+                control[AGO] = control[LEAST]
+                control[STEPS] = 0.0
+        if control[FRESH] > 0.0 and control[REST] <= 1.0:
+            # Into memory: the newest differences and their products with the others.
+            dnew = dy + head * w
+            for i in range(m):
+                dnew[i] = lam[i] - y[i]
+            for i in range(c.nv):
+                dnew[m + i] = c.v[i] - y[m + i]
+            dnew = df + head * w
+            for i in range(m):
+                dnew[i] = x[i] - f[i]
+            if kept < c.memory:
+                kept += 1
+            for k in range(kept):
+                j = (head - k + 2 * c.memory) % c.memory
+                u = df + j * w
+                a0 = a1 = 0.0
+                i = 0
+                while i + 2 <= m:
+                    a0 += u[i] * dnew[i]
+                    a1 += u[i + 1] * dnew[i + 1]
+                    i += 2
+                if i < m:
+                    a0 += u[i] * dnew[i]
+                c.gram[MAX_MEMORY * head + j] = a0 + a1
+                c.gram[MAX_MEMORY * j + head] = a0 + a1
+            control[KEPT] = kept
+            control[HEAD] = (head + 1) % c.memory
+        for i in range(m):
+            y[i] = lam[i]
+            f[i] = x[i]
+        for i in range(c.nv):
+            y[m + i] = c.v[i]
+        control[FRESH] = 1.0
+
+
+cdef void nncg_step(void* context, double* lam, int32_t first_sweep, int32_t n) noexcept nogil:
+    lav_nncg(<sweep_data_t*>context, lam, first_sweep, n)
+
+
+cdef void anderson_step(void* context, double* lam, int32_t first_sweep, int32_t n) noexcept nogil:
+    lav_anderson(<sweep_data_t*>context, lam, first_sweep, n)
+
+
+def allocate(Data p, int memory):
+    """Zeroed (control, gram, work, v) for a run; memory 0 is nncg."""
+    cdef Py_ssize_t m = p.blocks.n_rows, nv = 6 * p.rows.n_bodies if p.factored else 0
+    if not 0 <= memory <= MAX_MEMORY:
+        raise ValueError(f"memory is {memory}; 0 to {MAX_MEMORY} is needed")
+    return (np.zeros(CONTROL), np.zeros(MAX_MEMORY * MAX_MEMORY), np.zeros((3 + 2 * memory) * (m + nv) + 1),
+            np.zeros((nv // 6 + 1, 6)))
+
+
+def run(Data p, Watch watch, double[::1] lam, int n, double tol, int memory, prepared, space, int32_t[::1] order, int split,
+        int mode, uint64_t[::1] rng):
+    """`n` iterations in place under `watch`, GIL released: (status, iterations, sweeps, restarts so far).
+
+    prepared is None for sweeps of pgs, else (start, numbers) of block_gs.prepare; space comes from
+    `allocate`, v in it holding M^-1 J^T lam.
+    """
+    cdef sweep_data_t c
+    cdef int32_t status, done = 0
+    cdef double[::1] control = space[0], gram = space[1], work = space[2], g
+    cdef double[:, ::1] v = space[3]
+    cdef int32_t[::1] start
+    if lam.shape[0] == 0:
+        if tol > 0.0:
+            return CONVERGED, 0, 0, 0
+        return RUNNING, n, n, 0
+    c.blocks = &p.blocks
+    c.csr = &p.csr
+    c.rows = &p.rows
+    c.start = NULL
+    c.g = NULL
+    if prepared is not None:
+        start, g = prepared
+        c.start = &start[0]
+        c.g = &g[0]
+    c.order = &order[0]
+    c.split = split
+    c.mode = mode
+    c.memory = memory
+    c.rng = &rng[0]
+    c.v = &v[0, 0]
+    c.nv = 6 * p.rows.n_bodies if p.factored else 0
+    c.control = &control[0]
+    c.gram = &gram[0]
+    c.work = &work[0]
+    with nogil:
+        status = watch.run(nncg_step if memory == 0 else anderson_step, &c, &lam[0], n, tol, &done)
+    return status, done, done * (2 if mode == SYMMETRIC else 1), int(control[RESTARTS])
