@@ -7,6 +7,7 @@ from random_problems import as_matrix, random_contact_problem, random_lcp, seeds
 
 import lavender as lv
 from lavender.ordering import ORDERS, block_order, colors, levels
+from lavender.solvers import _sweeping
 
 # -- the twin ------------------------------------------------------------------------------------------
 
@@ -287,3 +288,25 @@ def test_symmetric_is_forwards_then_backwards():
     forwards = lv.solve(problem, "pgs", tol=0.0, max_iter=1)
     both = sweeps(problem, "pgs", 1, order="reverse", impulse=forwards.impulse)
     np.testing.assert_array_equal(sweeps(problem, "pgs", 2, order="symmetric"), both)
+
+
+# -- threads -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["pgs", "sequential_impulses"])
+def test_threads_change_no_bit(name, monkeypatch):
+    """Small problems fall back to one thread; here they may not."""
+    monkeypatch.setattr(_sweeping, "GRAIN", 0)
+    problem = random_contact_problem(3, bodies=40, joints=20, contacts=200)
+    results = {
+        t: lv.solve(problem, name, order="colored", threads=t, tol=1e-8, max_iter=300) for t in (1, 2, 3, 4)
+    }
+    assert len({s.impulse.tobytes() for s in results.values()}) == 1
+    assert len({s.iterations for s in results.values()}) == 1
+
+
+def test_threads_need_colors():
+    with pytest.raises(lv.InputError, match="colored"):
+        lv.solve(random_lcp(0), "pgs", threads=2)
+    with pytest.raises(lv.InputError, match="whole number from 1"):
+        lv.solve(random_lcp(0), "pgs", order="colored", threads=0)

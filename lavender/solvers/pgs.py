@@ -14,17 +14,19 @@ from dataclasses import dataclass
 from lavender._arrays import FloatArray
 from lavender.registry import SolverSpec
 from lavender.solution import Claim
-from lavender.solvers._sweeping import Sweeping, SweepState, run_kernel
+from lavender.solvers._sweeping import SweepState, Threaded, run_kernel, run_threads
 from lavender_ext import sweeps as kernels
 
 
 @dataclass(frozen=True)
-class PGS(Sweeping):
-    """Projected Gauss-Seidel; `order`, `ground`, `seed` as in `lavender.ordering`."""
+class PGS(Threaded):
+    """Projected Gauss-Seidel; `order`, `ground`, `seed` as in `lavender.ordering`; `threads` with "colored"."""
 
     def run(
         self, state: SweepState, impulse: FloatArray, n: int, tol: float, time_limit: float | None = None
     ) -> Claim:
+        if self.uses_threads(state):
+            return run_threads(state, impulse, n, tol, self.threads)
         return run_kernel(state, impulse, n, tol, kernels.PGS)
 
 
@@ -35,6 +37,7 @@ SPEC = SolverSpec(
     operator="matrix",
     order=True,
     seed=True,
+    threads=True,
     max_iter=1000,
     summary="projected Gauss-Seidel on the rows of A",
     reference="Cottle, Pang, Stone 1992, section 5.2; Jourdan, Alart, Jean 1998 for friction",

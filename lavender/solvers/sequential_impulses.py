@@ -18,7 +18,7 @@ from lavender.ordering import block_order
 from lavender.problem import Problem
 from lavender.registry import SolverSpec
 from lavender.solution import Claim
-from lavender.solvers._sweeping import Sweeping, SweepState, run_kernel
+from lavender.solvers._sweeping import SweepState, Threaded, run_kernel, run_threads
 from lavender_ext import judge
 from lavender_ext import sweeps as kernels
 
@@ -30,8 +30,10 @@ class ImpulseState(SweepState):
 
 
 @dataclass(frozen=True)
-class SequentialImpulses(Sweeping):
-    """Matrix-free projected Gauss-Seidel; `order`, `ground`, `seed` as in `lavender.ordering`."""
+class SequentialImpulses(Threaded):
+    """Matrix-free projected Gauss-Seidel; `order`, `ground`, `seed` as in `lavender.ordering`;
+    `threads` with "colored".
+    """
 
     def prepare(self, problem: Problem) -> ImpulseState:
         order = block_order(problem, self.order, seed=self.seed, ground=self.ground)
@@ -43,7 +45,10 @@ class SequentialImpulses(Sweeping):
         if state.velocity is None:
             state.velocity = np.zeros((state.data.n_bodies + 1, 6))
             judge.velocity_change(state.data, impulse, state.velocity)
-        return run_kernel(state, impulse, n, tol, kernels.IMPULSES, scratch=state.velocity.ravel())
+        velocity = state.velocity.ravel()
+        if self.uses_threads(state):
+            return run_threads(state, impulse, n, tol, self.threads, velocity)
+        return run_kernel(state, impulse, n, tol, kernels.IMPULSES, scratch=velocity)
 
 
 SPEC = SolverSpec(
@@ -53,6 +58,7 @@ SPEC = SolverSpec(
     operator="rows",
     order=True,
     seed=True,
+    threads=True,
     max_iter=1000,
     summary="projected Gauss-Seidel on body velocities, matrix-free",
     reference="Catto 2005, Iterative Dynamics with Temporal Coherence; Guendelman, Bridson, Fedkiw 2003",
