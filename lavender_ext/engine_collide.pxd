@@ -228,10 +228,10 @@ cdef inline void face_points(const double* xr, const double* rr, const double* h
         for k in range(3):
             more[3 * i + k] = u[k]
     for k in range(3):
-        poly[k] = w[k] + more[k] + more[3 + k]
-        poly[3 + k] = w[k] - more[k] + more[3 + k]
-        poly[6 + k] = w[k] - more[k] - more[3 + k]
-        poly[9 + k] = w[k] + more[k] - more[3 + k]
+        poly[k] = w[k] - more[k] - more[3 + k]
+        poly[3 + k] = w[k] + more[k] - more[3 + k]
+        poly[6 + k] = w[k] + more[k] + more[3 + k]
+        poly[9 + k] = w[k] - more[k] + more[3 + k]
     for i in range(4):
         code[i] = i
     count = 4
@@ -270,7 +270,7 @@ cdef inline void face_points(const double* xr, const double* rr, const double* h
             pick[i] = 0
             for j in range(kept):
                 s = (more[3 * j] + 0.3 * more[3 * j + 1]) if i & 1 == 0 else (more[3 * j + 1] - 0.3 * more[3 * j])
-                if i & 2:
+                if i < 2:
                     s = -s
                 if s > best:
                     best = s
@@ -300,6 +300,10 @@ cdef inline void face_points(const double* xr, const double* rr, const double* h
             pick[i] = pick[0] if kept > 0 else 0
     feature = (((on_b * 8 + axis * 2 + (sign > 0.0)) * 8) + face) * 64
     m.n = 0
+    if kept >= 4:                                       # from round the face to row by row, as the corners of a box count
+        i = pick[2]
+        pick[2] = pick[3]
+        pick[3] = i
     for i in range(4 if kept > 4 else kept):
         at = pick[i]
         for j in range(i):

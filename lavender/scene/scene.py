@@ -41,7 +41,7 @@ MAX_BODIES = 2**24 - 1  # a contact's key has 24 bits for each body
 class Parameters:
     """Parameters that every scene has."""
 
-    dt: float = 1.0 / 60.0  # s, of one step
+    dt: float = 1.0 / 120.0  # s, of one step
     substeps: int = 1
     gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)  # m/s^2
     solver: str = "sequential_impulses"
