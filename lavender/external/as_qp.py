@@ -83,6 +83,11 @@ class QP:
         no_bound = self.lb is None or self.ub is None or not np.isfinite([self.lb, self.ub]).any()
         return len(self.b) == 0 and no_bound
 
+    @property
+    def is_definite(self) -> bool:
+        """Velocity form: P has no zero on its diagonal, as no row needs a t."""
+        return self.form == "velocity" and self.n == self.lift.shape[1]
+
     def impulse(self, x: FloatArray, zeta: FloatArray) -> FloatArray:
         """lambda (m,) [N s] of an answer, rounding outside constant bounds clipped."""
         lam = self.fixed.copy()

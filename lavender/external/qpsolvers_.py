@@ -96,9 +96,10 @@ class QPSolver:
 
     def prepare(self, problem: Problem) -> State:
         b = self.backend
-        if pick_form(problem, self.form, b.definite) == "velocity":
-            qp = velocity_form(problem)
-        else:
+        qp = velocity_form(problem) if pick_form(problem, self.form, b.definite) == "velocity" else None
+        if qp is not None and b.definite and self.form == "auto" and not qp.is_definite:
+            qp = None
+        if qp is None:
             qp = impulse_form(
                 problem,
                 unit_diagonal=self.unit_diagonal,
@@ -601,7 +602,11 @@ def _piqp(limit: Limits) -> dict[str, Any]:
 
 
 def _proxqp(limit: Limits) -> dict[str, Any]:
-    return {"eps_abs": limit.eps, "eps_rel": 0.0, "max_iter": limit.max_iter}
+    # Without the gap it accepts multipliers on bounds that are not active (met on a redundant stack).
+    return {
+        "eps_abs": limit.eps, "eps_rel": 0.0, "max_iter": limit.max_iter,
+        "check_duality_gap": True, "eps_duality_gap_abs": limit.gap, "eps_duality_gap_rel": limit.gap_relative,
+    }  # fmt: skip
 
 
 def _scs(limit: Limits) -> dict[str, Any]:

@@ -1,0 +1,459 @@
+"""What every QP backend owes its user: its own name, its own words, silence, and never an exception."""
+
+import itertools
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from random_problems import as_matrix, random_contact_problem, random_rows
+
+import lavender as lv
+from lavender import registry
+from lavender.external import qpsolvers_
+from lavender.external._running import Answer
+from lavender.residuals import check_certificate, qp_residual
+
+BACKENDS = sorted(n for n in lv.available(law="lcp") if registry.specs()[n].external)
+DEFINITE = {"quadprog", "ecos", "pyqpmad"}
+PROVE_INFEASIBLE = {"osqp", "clarabel", "clarabel_cone", "piqp", "qpalm", "daqp", "scs"}
+RNG = np.random.default_rng(12)
+
+
+def spd(n, seed=0):
+    a = np.random.default_rng(seed).normal(size=(n, n))
+    return a @ a.T / n + np.eye(n), np.random.default_rng(seed + 1).normal(size=n)
+
+
+def box_stack(n, mass_ratio=1.0):
+    """n unit cubes on the ground, four contacts each, the top one heavier: singular A, 4 n rows."""
+    inv_mass = np.ones(n)
+    inv_mass[-1] /= mass_ratio
+    corners = np.array([[x, y] for x in (-0.5, 0.5) for y in (-0.5, 0.5)])
+    above = np.repeat(np.arange(n), 4)
+    arm = np.column_stack([np.tile(corners, (n, 1)), np.full(4 * n, 0.5)])
+    v = np.zeros((n, 6))
+    v[:, 2] = -9.81 / 60.0
+    rows = lv.Rows(
+        inv_mass, 6.0 * inv_mass[:, None, None] * np.eye(3), v,
+        normal=np.tile([0.0, 0.0, 1.0], (4 * n, 1)), tangent=np.tile([1.0, 0.0, 0.0], (4 * n, 1)),
+        arm_a=arm, arm_b=arm * [1.0, 1.0, -1.0], contact_body=np.column_stack([above - 1, above]).astype(np.int32),
+    )  # fmt: skip
+    return lv.Problem.from_rows(rows, name=f"box stack {n}, mass ratio {mass_ratio:g}")
+
+
+def replaced(monkeypatch, name, call):
+    """The backend `name` with its call replaced, its spec otherwise as it is."""
+    from dataclasses import replace
+    from functools import partial
+
+    backend = next(b for b in qpsolvers_.BACKENDS if b.name == name)
+    fake = replace(registry.get(name), factory=partial(qpsolvers_.QPSolver, replace(backend, call=call)))
+    monkeypatch.setitem(registry._registered, name, fake)
+
+
+# -- listing ----------------------------------------------------------------------------------------
+
+
+def test_listing_imports_no_backend():
+    code = (
+        "import sys, lavender as lv; lv.known(); lv.available(law='lcp');"
+        "names = 'qpsolvers osqp clarabel piqp daqp scs highspy qpalm proxsuite quadprog'.split();"
+        "print([m for m in names if m in sys.modules])"
+    )
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert out.stdout.strip() == "[]"
+
+
+def test_every_backend_of_qpsolvers_is_known():
+    qpsolvers = pytest.importorskip("qpsolvers")
+    assert set(qpsolvers.available_solvers) <= set(BACKENDS)
+
+
+def test_an_absent_backend_says_what_to_install():
+    reasons = lv.known()
+    absent = [b for b in qpsolvers_.BACKENDS if reasons[b.name] is not None]
+    assert absent, "no machine has all of them"
+    for backend in absent:
+        assert f"pip install {backend.install}" in reasons[backend.name]
+
+
+# -- what a problem may be ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", BACKENDS)
+def test_asymmetric_is_refused_with_the_reason(name):
+    a, b = spd(4)
+    a[0, 1] += 1e-3
+    with pytest.raises(lv.CapabilityError, match="needs a symmetric A"):
+        lv.solve(lv.Problem.lcp(a, b), name)
+
+
+@pytest.mark.parametrize("name", BACKENDS)
+def test_negative_diagonal_is_refused_with_the_reason(name):
+    with pytest.raises(lv.CapabilityError, match=r"positive semidefinite A; A\[1, 1\] = -1"):
+        lv.solve(lv.Problem.lcp(np.diag([1.0, -1.0]), [1.0, 1.0]), name)
+
+
+@pytest.mark.parametrize("name", BACKENDS)
+def test_indefinite_is_a_result_and_never_an_unmarked_wrong_claim(name):
+    # Eigenvalues 3 and -1; a backend may hit one of the LCP's solutions or fail, but not be believed wrongly.
+    solution = lv.solve(lv.Problem.lcp([[1.0, 2.0], [2.0, 1.0]], [-1.0, 2.0]), name)
+    if solution.status is lv.Status.CONVERGED:
+        assert solution.success or solution.contradicted
+    else:
+        assert solution.message
+    assert np.isfinite(solution.impulse).all()
+
+
+@pytest.mark.parametrize("name", BACKENDS)
+@pytest.mark.parametrize("linear", [True, False])
+def test_infeasible_is_claimed_with_a_proof_or_marked(name, linear):
+    a, b = np.array([[1.0, -1.0], [-1.0, 1.0]]), np.array([1.0, 1.0])
+    problem = lv.Problem.linear(a, b) if linear else lv.Problem.lcp(a, b)
+    solution = lv.solve(problem, name, max_iter=500)
+    assert not solution.success
+    if name in PROVE_INFEASIBLE:
+        assert solution.status is lv.Status.INFEASIBLE, str(solution)
+        assert check_certificate(problem, solution.certificate) is None
+        assert solution.contradicted == ""
+    if solution.status in (lv.Status.CONVERGED, lv.Status.INFEASIBLE) and solution.certificate is None:
+        assert solution.contradicted
+
+
+@pytest.mark.parametrize("name", ["osqp", "clarabel", "qpalm"])
+def test_contradicting_rows_are_proved_in_the_velocity_form(name):
+    if name not in BACKENDS:
+        pytest.skip(f"{name} is not installed")
+    rows = lv.Rows(
+        np.ones(1), np.eye(3)[None], np.zeros((1, 6)), normal=np.array([[0.0, 0, 1], [0, 0, -1.0]]),
+        tangent=np.array([[1.0, 0, 0], [1.0, 0, 0]]), arm_a=np.zeros((2, 3)), arm_b=np.zeros((2, 3)),
+        contact_body=np.array([[-1, 0], [-1, 0]], np.int32),
+    )  # fmt: skip
+    problem = lv.Problem.from_rows(rows, [1.0, 1.0])  # up and down at 1 m/s
+    solution = lv.solve(problem, name, form="velocity")
+    assert solution.status is lv.Status.INFEASIBLE, str(solution)
+    assert check_certificate(problem, solution.certificate) is None
+
+
+@pytest.mark.parametrize("name", BACKENDS)
+def test_nothing_to_solve(name):
+    empty = lv.solve(lv.Problem.lcp(np.zeros((0, 0)), []), name)
+    assert empty.success
+    fixed = lv.solve(lv.Problem.lcp(np.eye(2), [1.0, 1.0], lower=[0.5, 2.0], upper=[0.5, 2.0]), name)
+    assert fixed.success
+    assert fixed.impulse.tolist() == [0.5, 2.0]
+    assert fixed.work == {"backend_calls": 0}
+    assert "decided by its bounds" in fixed.message
+
+
+@pytest.mark.parametrize("name", BACKENDS)
+def test_boxed_friction(name):
+    problem = random_contact_problem(31, tangents=2, spin=False)
+    normal = np.full(problem.rows.n_contacts, 0.3)
+    boxed = problem.boxed(normal)
+    soft = lv.Problem(boxed.b, boxed.cones, boxed.csr + 0.2 * np.eye(boxed.m))
+    solution = lv.solve(soft, name)
+    assert solution.success, str(solution)
+
+
+@pytest.mark.parametrize("name", BACKENDS)
+@pytest.mark.parametrize("mass_ratio", [1.0, 1e4])
+def test_redundant_contacts_in_the_form_that_suits_them(name, mass_ratio):
+    # Singular A, and at 1e4 ill-conditioned: the velocity form is definite, so quadprog takes it too.
+    problem = box_stack(10, mass_ratio)
+    solution = lv.solve(problem, name)
+    assert solution.solver.form == (
+        "velocity" if mass_ratio > 1.0 or name in ("quadprog", "ecos") else "impulse"
+    )
+    assert solution.success, str(solution)
+    # The boxes come to rest: A is singular, so the velocities are what is unique.
+    speed = np.abs(problem.velocity(solution.impulse)).max()
+    assert speed <= 1e-5 * 9.81 / 60.0
+
+
+@pytest.mark.parametrize("name", ["quadprog", "ecos"])
+def test_singular_a_in_the_impulse_form_is_an_honest_failure(name):
+    if name not in BACKENDS:
+        pytest.skip(f"{name} is not installed")
+    problem = box_stack(3)
+    start = np.full(problem.m, 0.01)
+    solution = lv.solve(problem, name, form="impulse", impulse=start)
+    assert solution.status is lv.Status.NUMERICAL_ERROR
+    assert "not positive definite" in solution.message
+    assert np.array_equal(solution.impulse, start)
+
+
+# -- what ran -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", BACKENDS)
+def test_linear_problems_never_go_to_lsqr(name, monkeypatch):
+    import importlib
+
+    import scipy.sparse.linalg
+
+    def trap(*_, **__):
+        raise AssertionError("LSQR was called in place of the backend")
+
+    monkeypatch.setattr(scipy.sparse.linalg, "lsqr", trap)
+    for module in (
+        "qpsolvers.solve_unconstrained",
+        *(f"qpsolvers.solvers.{n}_" for n in ("clarabel", "scs")),
+    ):
+        try:
+            loaded = importlib.import_module(module)
+        except ImportError:
+            continue
+        for attribute in ("lsqr", "solve_unconstrained"):
+            if hasattr(loaded, attribute):
+                monkeypatch.setattr(loaded, attribute, trap)
+    problem = lv.Problem.linear(*spd(12))
+    if registry.get(name).refuses(problem):
+        pytest.skip(f"{name} takes no problem without inequalities, and says so")
+    solution = lv.solve(problem, name, tol=1e-8)
+    assert solution.success, str(solution)
+    assert solution.work["backend_calls"] >= 1
+    assert "LSQR" not in solution.message
+
+
+@pytest.mark.parametrize("name", BACKENDS)
+def test_backends_are_silent(name, capfd):
+    for problem in (lv.Problem.linear(*spd(6)), lv.Problem.lcp(*spd(6)), box_stack(2)):
+        if registry.get(name).refuses(problem) is None:
+            lv.solve(problem, name)
+    out, err = capfd.readouterr()
+    assert out == ""
+    assert err == ""
+
+
+@pytest.mark.parametrize("name", BACKENDS)
+@pytest.mark.parametrize("form", ["impulse", "velocity"])
+def test_twice_gives_the_same_bits(name, form):
+    problem = random_contact_problem(33, tangents=0, spin=False)
+    one, two = (lv.solve(problem, name, form=form) for _ in range(2))
+    assert one.impulse.tobytes() == two.impulse.tobytes()
+    assert one.work == two.work
+
+
+@pytest.mark.parametrize("name", BACKENDS)
+@pytest.mark.parametrize("form", ["impulse", "velocity"])
+def test_dual_holds_the_backends_own_multipliers(name, form):
+    problem = random_contact_problem(34, tangents=0, spin=False)
+    problem = lv.Problem(problem.b, problem.cones, rows=problem.rows, compliance=problem.compliance + 0.3)
+    if form == "velocity" and name in DEFINITE:
+        # Rows with two finite bounds add unknowns without a cost of their own: P is then only semidefinite.
+        assert "not positive definite" in lv.solve(problem, name, form=form).message
+        form = "auto"
+    solution = lv.solve(problem, name, form=form, tol=1e-8)
+    assert solution.success, str(solution)
+    assert solution.dual.shape == (problem.m,)
+    q = qp_residual(problem, solution.impulse, solution.dual)
+    speed = np.abs(problem.b).max()
+    # 1e-8 relative, times the condition number of this problem (below 100).
+    assert q.dual <= 1e-6 * speed
+    assert q.sign <= 1e-6 * speed
+    assert q.gap <= 1e-6 * speed * np.abs(solution.impulse).sum()
+
+
+@pytest.mark.parametrize("name", BACKENDS)
+def test_warm_start_is_used_where_the_spec_says_so(name):
+    problem = lv.Problem.lcp(*spd(40, seed=5))
+    cold = lv.solve(problem, name, tol=1e-6)
+    warm = lv.solve(problem, name, tol=1e-6, impulse=lv.solve(problem, "direct").impulse)
+    if registry.get(name).impulse:
+        assert warm.work["iterations"] <= cold.work["iterations"]
+        assert warm.impulse.tobytes() != cold.impulse.tobytes() or warm.work != cold.work
+    else:
+        assert warm.impulse.tobytes() == cold.impulse.tobytes()
+        assert warm.work == cold.work
+
+
+@pytest.mark.parametrize("name", BACKENDS)
+def test_no_time_limit_is_said(name):
+    backend = next((b for b in qpsolvers_.BACKENDS if b.name == name), None)
+    solution = lv.solve(lv.Problem.lcp(*spd(5)), name, time_limit=10.0)
+    stoppable = backend is None or backend.stoppable
+    assert ("takes no time limit" in solution.message) == (not stoppable)
+
+
+@pytest.mark.parametrize("name", ["osqp", "scs", "qpalm"])
+def test_time_limit_stops_a_backend(name):
+    if name not in BACKENDS:
+        pytest.skip(f"{name} is not installed")
+    # Far below what the first-order methods can reach: only the clock ends this.
+    problem = box_stack(30, 1e6)
+    solution = lv.solve(problem, name, tol=1e-13, form="impulse", max_iter=10**8, time_limit=0.2)
+    assert solution.solve_time < 5.0
+    assert solution.status in (lv.Status.TIME_LIMIT, lv.Status.FLOOR, lv.Status.STALLED), str(solution)
+
+
+@pytest.mark.parametrize("name", ["osqp", "clarabel", "piqp", "qpalm", "scs", "proxqp", "clarabel_cone"])
+def test_the_iteration_budget_reaches_the_backend(name):
+    if name not in BACKENDS:
+        pytest.skip(f"{name} is not installed")
+    problem = box_stack(10, 1e4)
+    solution = lv.solve(problem, name, max_iter=2, form="impulse")
+    assert solution.work["iterations"] <= 3  # qpalm counts the step it stops in
+    assert solution.status is not lv.Status.CONVERGED or solution.success
+    none = lv.solve(problem, name, max_iter=0)
+    assert none.status is lv.Status.MAX_ITERATIONS
+    assert none.work == {"backend_calls": 0}
+
+
+# -- options ------------------------------------------------------------------------------------------
+
+
+def test_settings_reach_the_backend():
+    problem = lv.Problem.lcp(*spd(20))
+    one = lv.solve(problem, "osqp", settings={"max_iter": 25, "polishing": False, "rho": 1e-6})
+    assert one.work["iterations"] == 25
+    assert one.status is lv.Status.MAX_ITERATIONS
+    assert "polish" not in one.message
+
+
+@pytest.mark.parametrize("name", ["osqp", "clarabel", "qpalm", "highs"])
+def test_an_unknown_setting_is_an_input_error(name):
+    if name not in BACKENDS:
+        pytest.skip(f"{name} is not installed")
+    with pytest.raises(lv.InputError, match="bogus"):
+        lv.solve(lv.Problem.lcp(*spd(3)), name, settings={"bogus": 1})
+
+
+@pytest.mark.parametrize("name", ["osqp", "clarabel_cone"])
+def test_settings_must_be_a_mapping(name):
+    with pytest.raises(lv.InputError, match="mapping"):
+        lv.solve(lv.Problem.lcp(*spd(3)), name, settings=[1])
+
+
+def test_unit_diagonal_is_a_choice():
+    problem = box_stack(4)
+    for unit in (True, False):
+        assert lv.solve(problem, "osqp", form="impulse", unit_diagonal=unit).success
+
+
+# -- failures of a backend ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "error",
+    [ValueError("it broke"), MemoryError("it broke"), type("Panic", (BaseException,), {})("it broke")],
+)
+def test_an_exception_becomes_a_result(monkeypatch, error):
+    def call(*_):
+        raise error
+
+    replaced(monkeypatch, "osqp", call)
+    start = np.array([0.1, 0.2, 0.3])
+    solution = lv.solve(lv.Problem.lcp(*spd(3)), "osqp", impulse=start)
+    assert solution.status is lv.Status.NUMERICAL_ERROR
+    assert f"{type(error).__name__}: it broke" in solution.message
+    assert np.array_equal(solution.impulse, start)
+    assert solution.dual is None
+
+
+def test_ctrl_c_is_interrupted(monkeypatch):
+    def call(*_):
+        raise KeyboardInterrupt
+
+    replaced(monkeypatch, "osqp", call)
+    start = np.array([0.1, 0.2, 0.3])
+    solution = lv.solve(lv.Problem.lcp(*spd(3)), "osqp", impulse=start)
+    assert solution.status is lv.Status.INTERRUPTED
+    assert np.array_equal(solution.impulse, start)
+
+
+@pytest.mark.parametrize("x", [None, np.array([np.nan, 1.0, 1.0]), np.zeros(2)])
+def test_no_iterate_returns_the_start_point(monkeypatch, x):
+    replaced(monkeypatch, "osqp", lambda *_: Answer(lv.Status.CONVERGED, "gave up", x))
+    start = np.array([0.1, 0.2, 0.3])
+    solution = lv.solve(lv.Problem.lcp(*spd(3)), "osqp", impulse=start)
+    assert solution.status is lv.Status.NUMERICAL_ERROR
+    assert solution.message.startswith("gave up; no iterate")
+    assert np.array_equal(solution.impulse, start)
+
+
+def test_a_claim_that_the_judge_does_not_find_is_asked_again_then_marked(monkeypatch):
+    asked = []
+
+    def call(qp, impulse, limit, extra):
+        asked.append((limit.eps, limit.gap))
+        return Answer(
+            lv.Status.CONVERGED, "solved", np.full(qp.n, 0.5 + limit.eps), np.zeros(0), np.zeros(qp.n)
+        )
+
+    replaced(monkeypatch, "osqp", call)
+    solution = lv.solve(lv.Problem.lcp(*spd(3)), "osqp")
+    assert len(asked) == solution.work["backend_calls"] > 1
+    assert all(after < before for before, after in itertools.pairwise(asked))
+    assert solution.status is lv.Status.CONVERGED
+    assert "above tol" in solution.contradicted
+
+
+def test_the_best_of_several_answers_is_returned(monkeypatch):
+    problem = lv.Problem.lcp(np.eye(3), np.ones(3))
+    answers = iter([1.001, 1.5])
+
+    def call(qp, impulse, limit, extra):
+        x = next(answers) / (qp.sigma * qp.root)
+        return Answer(lv.Status.CONVERGED, "solved", x, np.zeros(0), np.zeros(qp.n), {"iterations": 7})
+
+    replaced(monkeypatch, "osqp", call)
+    solution = lv.solve(problem, "osqp")
+    assert np.allclose(solution.impulse, 1.001)
+    assert solution.work == {"backend_calls": 2, "iterations": 14}
+
+
+def test_tol_zero_runs_at_the_tightest_tolerance():
+    solution = lv.solve(lv.Problem.lcp(*spd(10)), "clarabel", tol=0.0)
+    assert solution.status in (lv.Status.STALLED, lv.Status.FLOOR)
+    assert solution.residual.relative <= 1e-10
+
+
+def test_dense_backends_refuse_what_would_not_fit(monkeypatch):
+    monkeypatch.setattr(qpsolvers_, "DENSE_LIMIT", 8 * 10 * 10)
+    problem = lv.Problem.lcp(*spd(11))
+    with pytest.raises(lv.CapabilityError, match="dense matrices only"):
+        lv.solve(problem, "daqp")
+    assert lv.solve(problem, "osqp").success
+
+
+# -- friction cones -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("tangents", [1, 2, None])
+@pytest.mark.parametrize("spin", [False, True])
+@pytest.mark.parametrize("seed", range(3))
+def test_cone_program_in_both_forms(tangents, spin, seed):
+    problem = random_contact_problem(seed, friction="cone", tangents=tangents, spin=spin)
+    by_form = [lv.solve(problem, "clarabel_cone", form=form) for form in ("impulse", "velocity")]
+    for solution in by_form:
+        assert solution.success, str(solution)
+        assert solution.contradicted == ""
+    by_matrix = lv.solve(as_matrix(problem), "clarabel_cone")
+    assert by_matrix.solver.form == "impulse"
+    # Velocities of the rows are unique; 1e-6 relative, square root for the flat directions of the cones.
+    scale = 1e-3 * np.abs(problem.b).max()
+    assert np.abs(by_form[0].slack - by_form[1].slack).max() <= scale
+    assert np.abs(by_form[0].slack - by_matrix.slack).max() <= scale
+
+
+def test_cone_program_of_a_sliding_block():
+    # A block pushed sideways at 1 m/s on the ground, mu = 0.5: it keeps sliding, the relaxation lifts it by mu |u_t|.
+    rows = lv.Rows(
+        np.ones(1), np.zeros((1, 3, 3)), np.array([[1.0, 0, -0.2, 0, 0, 0]]), normal=np.array([[0.0, 0, 1]]),
+        tangent=np.array([[1.0, 0, 0]]), arm_a=np.zeros((1, 3)), arm_b=np.zeros((1, 3)),
+        contact_body=np.array([[-1, 0]], np.int32),
+    )  # fmt: skip
+    problem = lv.Problem.from_rows(rows, mu=0.5, tangents=2, friction="cone")
+    solution = lv.solve(problem, "clarabel_cone", tol=1e-8)
+    # Projection of (0.2, -1) on {|t| <= n / 2}: n = (0.2 + 0.5) / 1.25.
+    assert np.allclose(solution.impulse, [0.56, -0.28, 0.0], atol=1e-7)
+
+
+def test_random_rows_with_joints_and_contacts_meet_in_the_cone_program():
+    rng = np.random.default_rng(2)
+    rows = random_rows(rng, bodies=4, joints=2, contacts=5)
+    problem = lv.Problem.from_rows(rows, mu=0.4, tangents=2, friction="cone", compliance=0.1)
+    solution = lv.solve(problem, "clarabel_cone")
+    assert solution.success, str(solution)
