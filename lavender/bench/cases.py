@@ -80,7 +80,7 @@ def resolve(words: Iterable[str | Path | Problem]) -> list[Item]:
         else:
             from lavender import suite
 
-            items.append(_from_case(suite.case(str(word)), str(word)))
+            items += [_from_case(case, case.name) for case in suite.cases(str(word))]
     return _unique_names(items)
 
 
