@@ -11,8 +11,9 @@ velocities before the substep and v* those after gravity, g the gap and e the re
 Combined: mu = sqrt(mu_a mu_b), e = max, patch radius = min.
 
 The cache holds key, impulse and arms of the last substep's contacts, sorted by pair as the pair list is.
-A contact takes the impulse of the entry with its key whose point is within the match distance in the
-frame of either body: a stale or false entry is left alone, or corrected by the sweeps.
+A contact takes the impulse of the entry with its key, if its point is within the match distance in the
+frame of either body; where the key is new (a corner crossed an edge) the nearest entry of the pair that
+no key has claimed. A stale or false entry is left alone, or corrected by the sweeps.
 """
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t, uint64_t
@@ -57,18 +58,45 @@ cdef inline double distance2(const double* a, const double* b) noexcept nogil:
     return x * x + y * y + z * z
 
 
-cdef inline int32_t cached(const engine_t* e, int32_t c, uint64_t key, int32_t first) noexcept nogil:
-    # entry of the contact's pair from `first` on that has its key and its place, or -1
-    cdef double reach = e.setting[S_MATCH] * e.setting[S_MATCH]
-    cdef int32_t i = first
-    while i < e.head[H_CACHED] and (e.cache_key[i] >> 16) == (key >> 16):
-        if e.cache_key[i] == key:
-            if (distance2(e.cache_local + 6 * i, e.local + 6 * c) <= reach
-                    or distance2(e.cache_local + 6 * i + 3, e.local + 6 * c + 3) <= reach):
-                return i
-            return -1
-        i += 1
-    return -1
+cdef inline double apart2(const engine_t* e, int32_t c, int32_t entry) noexcept nogil:
+    # squared distance of a contact from a cached one, in the frame of the body where it moved less
+    cdef double x = distance2(e.cache_local + 6 * entry, e.local + 6 * c)
+    cdef double y = distance2(e.cache_local + 6 * entry + 3, e.local + 6 * c + 3)
+    return x if x < y else y
+
+
+cdef inline void match_pair(const engine_t* e, int32_t c, int32_t n, int32_t first, int32_t* entry) noexcept nogil:
+    """Cached entries of contacts c .. c + n - 1 of one pair, whose entries begin at `first`; -1 where there is none.
+
+    By key, then by place: a contact whose key is new takes the nearest entry that no key has claimed.
+    """
+    cdef double reach = e.setting[S_MATCH] * e.setting[S_MATCH], x, least
+    cdef uint64_t pair = e.key[c] >> 16
+    cdef int32_t i, j, end = first, used = 0, missing = 0
+    while end < e.head[H_CACHED] and end < first + 4 and (e.cache_key[end] >> 16) == pair:
+        end += 1
+    for j in range(n):
+        entry[j] = -1
+        for i in range(first, end):
+            if e.cache_key[i] == e.key[c + j] and not (used >> (i - first)) & 1 and apart2(e, c + j, i) <= reach:
+                entry[j] = i
+                used |= 1 << (i - first)
+                break
+        missing += entry[j] < 0
+    if missing == 0 or used == (1 << (end - first)) - 1:
+        return
+    for j in range(n):
+        if entry[j] >= 0:
+            continue
+        least = reach
+        for i in range(first, end):
+            if not (used >> (i - first)) & 1:
+                x = apart2(e, c + j, i)
+                if x <= least:
+                    least = x
+                    entry[j] = i
+        if entry[j] >= 0:
+            used |= 1 << (entry[j] - first)
 
 
 cdef inline void guess_contact(engine_t* e, int32_t c, int32_t entry, int32_t nt, int32_t spin, double* lam) noexcept nogil:
@@ -151,7 +179,8 @@ cdef inline void make_contact(engine_t* e, const rows_t* r, int32_t c, int32_t r
 cdef inline int32_t make_contacts(engine_t* e, const rows_t* r) noexcept nogil:
     """All contacts of the pair list, with guesses from the cache; returns how many there are (see CAP_CONTACT)."""
     cdef manifold_t m
-    cdef int32_t i, j, k, a, b, nt, spin, entry, c = 0, row = e.size[N_JOINT_ROW], block, first = 0, matches = 0
+    cdef int32_t entry[4]
+    cdef int32_t i, j, k, a, b, nt, spin, start, c = 0, row = e.size[N_JOINT_ROW], block, first = 0, matches = 0
     cdef double mu, patch, bounce, margin = e.setting[S_MARGIN]
     cdef uint64_t pair
     e.ptr[e.size[N_JOINT]] = row
@@ -172,6 +201,7 @@ cdef inline int32_t make_contacts(engine_t* e, const rows_t* r) noexcept nogil:
         pair = contact_key(a, b, 0)
         while first < e.head[H_CACHED] and e.cache_key[first] < pair:
             first += 1
+        start = c
         for j in range(m.n):
             make_contact(e, r, c, row, a, b, &m, j, nt, spin, bounce)
             block = e.size[N_JOINT] + c
@@ -180,14 +210,15 @@ cdef inline int32_t make_contacts(engine_t* e, const rows_t* r) noexcept nogil:
             e.patch_radius[block] = patch if spin else 0.0
             for k in range(1 + nt + spin):
                 e.impulse[row + k] = 0.0
-            if e.head[H_WARM_START]:
-                entry = cached(e, c, e.key[c], first)
-                if entry >= 0:
-                    guess_contact(e, c, entry, nt, spin, e.impulse + row)
-                    matches += 1
             row += 1 + nt + spin
             c += 1
             e.ptr[block + 1] = row
+        if e.head[H_WARM_START] and first < e.head[H_CACHED]:
+            match_pair(e, start, m.n, first, entry)
+            for j in range(m.n):
+                if entry[j] >= 0:
+                    guess_contact(e, start + j, entry[j], nt, spin, e.impulse + e.ptr[e.size[N_JOINT] + start + j])
+                    matches += 1
     if c <= e.size[CAP_CONTACT]:
         e.head[H_CONTACTS] = c
         e.head[H_CONTACT_ROWS] = row - e.size[N_JOINT_ROW]
