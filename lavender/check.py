@@ -211,7 +211,8 @@ def _reference(
         return None, None, "Coulomb friction is not the optimality condition of a QP"
     if not problem.is_symmetric:
         return None, None, f"A is not symmetric (by {problem.asymmetry:.1e}), so the problem is no QP"
-    chain = (first, *(r for r in (*REFERENCES, "clarabel_cone") if r != first))
+    usual = ("clarabel_cone",) if problem.law == "cone" else REFERENCES
+    chain = (first, *(r for r in usual if r != first))
     failed = []
     for name in chain:
         reason = reasons.get(name, "not registered")
@@ -247,8 +248,8 @@ def unfit(problem: Problem, solution: Solution) -> str | None:
     limit = max(SIGN_TOL, 10.0 * r.floor)
     for what, value, scale in (
         ("bounds violated", q.primal, size),
-        ("multipliers do not fit the slack", q.dual, speed),
         ("a multiplier has the wrong sign", q.sign, speed),
+        ("multipliers do not fit the slack", q.dual, speed),
         ("duality gap", q.gap, work),
     ):
         if not value <= limit * scale:

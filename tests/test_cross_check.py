@@ -1,0 +1,246 @@
+"""cross_check: a judged reference, an inequality that cannot be broken, and liars that are found."""
+
+from dataclasses import replace
+
+import hypothesis.strategies as st
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from random_problems import as_matrix, random_contact_problem, random_rows
+from test_external_backends import box_stack, spd
+
+import lavender as lv
+from lavender import check, registry
+from lavender.check import cross_check
+
+ITERATIVE = ["pgs", "jacobi", "sequential_impulses"]
+
+
+def bounded_problem(seed, stiff=0.3, contacts=8):
+    """Joints with and without bounds, contacts without friction; every row a little compliant."""
+    problem = random_contact_problem(seed, tangents=0, spin=False, contacts=contacts)
+    return lv.Problem(problem.b, problem.cones, rows=problem.rows, compliance=problem.compliance + stiff)
+
+
+@pytest.fixture
+def register(monkeypatch):
+    """Adds a solver for one test; its `run` gets (problem, impulse) and returns a Claim."""
+
+    def add(name, run):
+        class Solver:
+            def prepare(self, problem):
+                return problem
+
+            update = prepare
+
+            def run(self, state, impulse, n, tol, time_limit=None):
+                return run(state, impulse)
+
+        spec = lv.SolverSpec(
+            name=name,
+            factory=Solver,
+            laws=frozenset({"linear", "lcp"}),
+            summary="for a test",
+            resumable=False,
+        )
+        registry.specs()
+        monkeypatch.setitem(registry._registered, name, spec)
+
+    return add
+
+
+# -- solvers against OSQP optima ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_iterative_solvers_agree_with_osqp_on_random_problems(seed):
+    table = cross_check(bounded_problem(seed), ITERATIVE, max_iter=50_000)
+    assert table.reference == "osqp", table.reference_note
+    assert [r.solver for r in table.agreed] == ITERATIVE, str(table)
+    assert table.ok
+
+
+def structured():
+    a = 2.0 * np.eye(40) - np.eye(40, k=1) - np.eye(40, k=-1)  # a column of equal discs, mass 1
+    b = np.zeros(40)
+    b[0] = 9.81 / 60.0
+    yield lv.Problem.lcp(a, b, name="stack 40")
+    yield lv.Problem.linear(a + 0.1 * np.eye(40), b, name="soft chain 40")
+    yield box_stack(3)
+    yield lv.Problem.lcp(*spd(30), lower=-0.1, upper=0.2, name="boxed 30")
+    friction = random_contact_problem(7, tangents=2, spin=False)
+    boxed = friction.boxed(np.full(friction.rows.n_contacts, 0.2))
+    yield lv.Problem(boxed.b, boxed.cones, boxed.csr + 0.3 * np.eye(boxed.m), name="boxed friction")
+
+
+@pytest.mark.parametrize("problem", list(structured()), ids=lambda p: p.name)
+def test_iterative_solvers_agree_with_osqp_on_structured_problems(problem):
+    names = [n for n in ITERATIVE if registry.get(n).refuses(problem) is None]
+    table = cross_check(problem, names, max_iter=100_000)
+    assert table.reference == "osqp", table.reference_note
+    assert [r.solver for r in table.agreed] == names, str(table)
+    for row in table:
+        # Both slacks are unique; 1e-6 relative, times a condition number below 1e3 (stack 40: 40^2 / 4).
+        assert row.slack <= 1e-3 * np.abs(problem.b).max()
+
+
+@pytest.mark.parametrize("mass_ratio", [1.0, 1e4, 1e6])
+def test_every_solver_on_redundant_contacts(mass_ratio):
+    problem = box_stack(10, mass_ratio)
+    names = [n for n in lv.available(problem) if registry.get(n).external]
+    table = cross_check(problem, names)
+    assert table.reference is not None, table.reference_note
+    assert table.ok, str(table)
+    assert len(table.agreed) == len(names), str(table)
+
+
+def test_the_cone_program_is_the_reference_of_relaxed_friction():
+    problem = random_contact_problem(5, friction="cone", tangents=2, spin=False)
+    table = cross_check(problem)
+    assert table.reference == "clarabel_cone"
+    assert "osqp" in table.reference_note
+    assert table["clarabel_cone"].verdict == "agrees", str(table)
+    assert table.ok
+
+
+# -- the inequality -------------------------------------------------------------------------------------
+
+
+@given(st.integers(0, 10**6), st.floats(-6.0, 1.0))
+@settings(max_examples=80)
+def test_any_two_points_obey_the_inequality(seed, size):
+    rng = np.random.default_rng(seed)
+    law = ("lcp", "matrix", "cone")[seed % 3]
+    if law == "cone":
+        problem = random_contact_problem(seed, friction="cone")
+    else:
+        problem = bounded_problem(seed, stiff=0.0)
+        problem = as_matrix(problem) if law == "matrix" else problem
+    some = lv.solve(problem, "clarabel_cone", max_iter=3, tol=0.0)
+    points = [replace(some, residual=lv.residual(problem, x), impulse=x) for x in (
+        some.impulse, some.impulse + 10.0**size * rng.normal(size=problem.m)
+    )]  # fmt: skip
+    distance, allowed = check._distance(problem, *points)
+    assert distance <= allowed
+    delta = points[0].impulse - points[1].impulse
+    assert distance == pytest.approx(np.sqrt(delta @ problem.dense() @ delta), rel=1e-6)
+
+
+def test_a_residual_that_is_too_small_breaks_the_inequality():
+    problem = bounded_problem(3)
+    optimum = lv.solve(problem, "osqp", tol=1e-10)
+    wrong = optimum.impulse + 0.1
+    honest = lv.residual(problem, wrong)
+    # As if the judge had lost a factor of a thousand.
+    faulty = replace(honest, error=1e-3 * honest.error, relative=1e-3 * honest.relative)
+    row = check._compare(problem, "faulty", replace(optimum, impulse=wrong, residual=faulty), optimum)
+    assert row.verdict == check.BREACH
+    assert row.contradicted
+    fair = check._compare(
+        problem, "fair", replace(optimum, impulse=wrong, residual=honest, contradicted=""), optimum
+    )
+    assert fair.verdict == check.NOT_SOLVED
+    assert not fair.contradicted
+
+
+# -- the reference --------------------------------------------------------------------------------------
+
+
+def test_the_next_reference_is_taken_and_named(register):
+    register("hopeless", lambda problem, impulse: lv.Claim(lv.Status.MAX_ITERATIONS, 0))
+    table = cross_check(bounded_problem(1), ["pgs"], reference="hopeless")
+    assert table.reference == "osqp"
+    assert "hopeless: relative 1.0e+00 above" in table.reference_note
+    assert table["pgs"].verdict == "agrees"
+
+
+def test_no_reference_leaves_distances_out(monkeypatch):
+    monkeypatch.setattr(check, "REFERENCES", ())
+    problem = bounded_problem(1)
+    table = cross_check(problem, ["pgs"], reference="gauss_seidel")
+    assert table.reference is None
+    assert "gauss_seidel takes laws linear" in table.reference_note
+    assert table["pgs"].distance is None
+    assert table["pgs"].verdict == check.AGREES_UNCOMPARED
+    assert "no reference" in str(table)
+
+
+def test_coulomb_and_asymmetric_have_no_reference():
+    coulomb = random_contact_problem(2, tangents=2, spin=False)
+    table = cross_check(coulomb, ["pgs"], max_iter=20_000)
+    assert table.reference is None
+    assert "Coulomb" in table.reference_note
+    assert table["pgs"].slack is None
+    assert table["pgs"].objective is None
+    a, b = spd(6)
+    a[0, 1] += 1e-2
+    table = cross_check(lv.Problem.lcp(a, b), ["pgs", "osqp"])
+    assert table.reference is None
+    assert "not symmetric" in table.reference_note
+    assert table["osqp"].verdict == check.REFUSED
+    assert "symmetric" in table["osqp"].note
+
+
+def test_a_reference_with_a_wrong_multiplier_is_not_taken():
+    problem = bounded_problem(4)
+    good = lv.solve(problem, "osqp", tol=1e-10)
+    assert check.unfit(problem, good) is None
+    open_row = int(np.argmax(np.where(np.isinf(problem.cones.upper), good.slack, 0.0)))
+    assert good.slack[open_row] > 0.01
+    flipped = good.dual.copy()
+    flipped[open_row] *= -1.0
+    assert "wrong sign" in check.unfit(problem, replace(good, dual=flipped))
+    assert "do not fit the slack" in check.unfit(problem, replace(good, dual=0.5 * good.dual))
+    rough = lv.solve(problem, "pgs", tol=1e-4)
+    assert "above 1.0e-09" in check.unfit(problem, rough)
+
+
+# -- claims ---------------------------------------------------------------------------------------------
+
+
+def test_a_liar_is_contradicted(register):
+    register("liar", lambda problem, impulse: lv.Claim(lv.Status.CONVERGED, 1, {"sweeps": 1}))
+    table = cross_check(bounded_problem(2), ["liar", "direct"])
+    assert not table.ok
+    assert [r.solver for r in table.contradicted] == ["liar"]
+    assert "says CONVERGED" in table["liar"].note
+    assert table["direct"].verdict == "agrees"
+
+
+def test_a_budget_that_is_too_small_is_no_lie():
+    table = cross_check(bounded_problem(2), ["pgs"], max_iter=1)
+    assert table["pgs"].verdict == check.NOT_SOLVED
+    assert table.ok
+
+
+def test_default_is_every_solver_that_takes_the_problem():
+    problem = bounded_problem(6)
+    table = lv.cross_check(problem)
+    assert [r.solver for r in table] == lv.available(problem)
+    text = str(table)
+    for name in lv.available(problem):
+        assert name in text
+    assert "reference osqp" in text
+    assert len(text.splitlines()) == len(table) + 2
+
+
+def test_unknown_names():
+    problem = lv.Problem.lcp(*spd(3))
+    with pytest.raises(lv.UnknownName, match="osqp"):
+        cross_check(problem, ["osq"])
+    with pytest.raises(lv.UnknownName, match="osqp"):
+        cross_check(problem, ["pgs"], reference="osq")
+    with pytest.raises(lv.InputError, match="no solver 'direct' in this check"):
+        cross_check(problem, ["pgs"])["direct"]
+    with pytest.raises(lv.InputError, match="tol"):
+        cross_check(problem, ["pgs"], tol=-1.0)
+
+
+def test_rows_are_compared_without_forming_a():
+    rows = random_rows(np.random.default_rng(1), bodies=4, joints=2, contacts=6)
+    problem = lv.Problem.from_rows(rows, compliance=0.2)
+    cross_check(problem, ["sequential_impulses"], max_iter=20_000)
+    x = np.random.default_rng(2).normal(size=problem.m)
+    assert np.allclose(check._apply(problem, x), problem.dense() @ x, rtol=1e-12, atol=1e-12)
+    bound = check._apply_abs(problem, np.abs(x))
+    assert np.all(bound >= (np.abs(problem.dense()) @ np.abs(x)) * (1.0 - 1e-12))
