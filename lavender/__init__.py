@@ -3,6 +3,7 @@
 from lavender._version import __version__
 from lavender.check import CrossCheck, cross_check
 from lavender.cones import CONTACT, CONTACT_SPIN, ROW, Cones
+from lavender.engine import SOLVER_FIELDS, Simulation, Snapshot
 from lavender.errors import (
     CapabilityError,
     InputError,
@@ -14,6 +15,7 @@ from lavender.errors import (
 from lavender.problem import Problem, Rows
 from lavender.registry import SolverSpec, available, get, known, register
 from lavender.residuals import Residual, residual
+from lavender.scene import Scene
 from lavender.solution import Claim, Solution, Status
 from lavender.solve import prepare, solve
 
@@ -21,6 +23,7 @@ __all__ = [
     "CONTACT",
     "CONTACT_SPIN",
     "ROW",
+    "SOLVER_FIELDS",
     "CapabilityError",
     "Claim",
     "Cones",
@@ -30,6 +33,9 @@ __all__ = [
     "Problem",
     "Residual",
     "Rows",
+    "Scene",
+    "Simulation",
+    "Snapshot",
     "Solution",
     "SolveFailed",
     "SolverSpec",

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from os import PathLike
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from lavender import io
 from lavender._arrays import FloatArray, read_only
 from lavender.cones import CONTACT_SPIN, Cones
 from lavender.engine.layout import HEAD, NEED_ROOM, NOT_FINITE, OK, SETTING, SIZE
 from lavender.engine.snapshot import Snapshot
 from lavender.engine.state import State
-from lavender.errors import InputError, LavenderError, SolveFailed
+from lavender.errors import InputError, LavenderError, SolveFailed, UnknownName
 from lavender.problem import Problem, Rows
 from lavender.residuals import Residual, residual
 from lavender.scene import Scene
@@ -372,6 +374,51 @@ class Simulation:
             "worst": judged.worst_name,
             "share": _shares(problem, judged),
         }
+
+    def record(self, folder: str | PathLike[str], steps: int, *, form: str = "npz") -> list[Path]:
+        """Step `steps` times and write the problem of each (of its first substep), with its warm start.
+
+        Parameters
+        ----------
+        folder : path
+            Made if it does not exist; `lavender report` takes it as it is.
+        steps : int
+        form : {"npz", "fclib"}
+            `.npz` holds everything; `.hdf5` (FCLIB, extra `fclib`) contacts without joints, spin or soft rows.
+
+        Returns
+        -------
+        list of Path
+            One file for each step that had rows.
+
+        Raises
+        ------
+        InputError
+            A folder that cannot be written, another form.
+        CapabilityError
+            FCLIB cannot hold these rows; nothing is stepped.
+        """
+        if form not in ("npz", "fclib"):
+            raise UnknownName("form", form, ("npz", "fclib"))
+        steps = whole("steps", steps, 1)
+        folder = Path(folder)
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError(f"cannot make the folder {str(folder)!r}: {error.strerror}") from None
+        more: dict[str, Any] = {} if form == "npz" else {"drop": ("names", "key")}
+        suffix = ".npz" if form == "npz" else ".hdf5"
+        name, digits = self.scene.name or "scene", len(str(self._steps + steps))
+        written = []
+        for _ in range(steps):
+            problem = self.constraint_problem()
+            if problem.m:
+                path = folder / f"{name}-{self._steps + 1:0{digits}d}{suffix}"
+                io.save(problem, path, **more)
+                written.append(path)
+            if self.step()[2]:
+                break
+        return written
 
     # -- snapshots ------------------------------------------------------------------------------
 

@@ -1,0 +1,204 @@
+"""Run a scene and keep what it says of its solver: the body of `lavender run`."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from lavender import io
+from lavender._arrays import FloatArray
+from lavender.engine.simulation import SOLVER_FIELDS, Simulation
+from lavender.errors import InputError
+from lavender.scene import Scene
+from lavender.scene.parts import whole
+
+__all__ = ["Trace", "run", "run_scene"]
+
+
+@dataclass(frozen=True)
+class Trace:
+    """What a run measured, one row for each step."""
+
+    scene: str
+    time: FloatArray  # (steps,) s, simulated
+    solver: FloatArray  # (steps, 8) see SOLVER_FIELDS
+    depth: FloatArray  # (steps,) m, deepest penetration
+    cost: FloatArray  # (steps,) s, wall time of the step
+    lost_body: str = ""  # name of the body that ended the run, or empty
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    def column(self, name: str) -> FloatArray:
+        """One of `SOLVER_FIELDS` over the steps (steps,)."""
+        return self.solver[:, SOLVER_FIELDS.index(name)]
+
+    def save(self, path: str | PathLike[str]) -> None:
+        """Write as CSV, one line for each step.
+
+        Raises
+        ------
+        InputError
+            A path that cannot be written.
+        """
+        try:
+            with open(path, "w", newline="") as stream:
+                write = csv.writer(stream)
+                write.writerow(["step", "time", *SOLVER_FIELDS, "depth", "cost"])
+                for i in range(len(self)):
+                    row = [self.time[i], *self.solver[i], self.depth[i], self.cost[i]]
+                    write.writerow([i + 1, *(repr(float(x)) for x in row)])
+        except OSError as error:
+            raise InputError(f"cannot write {str(path)!r}: {error.strerror}") from None
+
+    def plot(self, path: str | PathLike[str]) -> None:
+        """Residuals, contacts with matches, and depth over time, as a figure.
+
+        Raises
+        ------
+        InputError
+            A path that cannot be written, or a suffix that matplotlib does not know.
+        """
+        from matplotlib.figure import Figure
+
+        canvas = Figure(figsize=(12, 3.6), layout="constrained")
+        left, middle, right = canvas.subplots(1, 3)
+        for name in ("residual_initial", "residual_final"):
+            left.semilogy(self.time, np.maximum(self.column(name), 1e-18), label=name.replace("_", " "))
+        left.set(xlabel="time [s]", ylabel="max $|e_n|$ [N s]", title=self.scene)
+        left.legend(fontsize=8)
+        for name in ("contacts", "cache_matches"):
+            middle.plot(self.time, self.column(name), label=name.replace("_", " "))
+        middle.set(xlabel="time [s]")
+        middle.legend(fontsize=8)
+        right.plot(self.time, 1e3 * self.depth)
+        right.set(xlabel="time [s]", ylabel="deepest penetration [mm]")
+        try:
+            canvas.savefig(path)
+        except (OSError, ValueError) as error:
+            raise InputError(f"cannot write the figure {str(path)!r}: {error}") from None
+
+
+def run(
+    simulation: Simulation,
+    steps: int,
+    *,
+    record: str | PathLike[str] | None = None,
+    watch: Callable[[int, dict[str, Any], dict[str, Any]], Any] | None = None,
+) -> Trace:
+    """Step a simulation and keep its trace; stops where the state is no longer finite.
+
+    Parameters
+    ----------
+    simulation : Simulation
+    steps : int
+    record : path, optional
+        Folder for the problem of every step, as `Simulation.record` writes them.
+    watch : callable (step, observation, info), optional
+        Called after every step.
+    """
+    steps = whole("steps", steps, 1)
+    solver, depth, cost, time = np.zeros((steps, 8)), np.zeros(steps), np.zeros(steps), np.zeros(steps)
+    lost, done = "", 0
+    while done < steps and not lost:
+        if record is not None:
+            _write_problem(simulation, Path(record))
+        start = perf_counter()
+        observation, _, _, _, info = simulation.step()
+        cost[done] = perf_counter() - start
+        solver[done] = observation["solver"]
+        depth[done] = observation["contacts"]["depth"].max(initial=0.0)
+        time[done] = info["time"]
+        lost = info.get("lost_body", "")
+        done += 1
+        if watch is not None:
+            watch(done, observation, info)
+    return Trace(repr(simulation.scene), time[:done], solver[:done], depth[:done], cost[:done], lost)
+
+
+def _write_problem(simulation: Simulation, folder: Path) -> None:
+    problem = simulation.constraint_problem()
+    if problem.m:
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError(f"cannot make the folder {str(folder)!r}: {error.strerror}") from None
+        io.save(problem, folder / f"{simulation.scene.name or 'scene'}-{simulation.steps + 1:06d}.npz")
+
+
+def line(step: int, observation: Mapping[str, Any], info: Mapping[str, Any]) -> str:
+    """One line about a step: time, contacts, matches, residual before and after the solve, depth."""
+    s = observation["solver"]
+    depth = observation["contacts"]["depth"].max(initial=0.0)
+    text = (
+        f"step {step:>6}  t {info['time']:8.3f} s  contacts {int(s[2]):>5}  matches {int(s[3]):>5}  "
+        f"residual {s[4]:.2e} -> {s[5]:.2e} N s  violation {s[7]:.2e} m/s  depth {1e3 * depth:7.3f} mm"
+    )
+    failed = f"  failed solves {info['failed_solves']}" if info["failed_solves"] else ""
+    rest = f"  relative {info['residual']['relative']:.2e}, worst {info['residual']['worst']}" if "residual" in info else ""
+    return text + failed + rest
+
+
+def run_scene(
+    name: str,
+    *,
+    steps: int = 240,
+    iterations: int | None = None,
+    warm_start: bool = True,
+    parameters: Mapping[str, Any] | None = None,
+    residual: bool = False,
+    trace: str | PathLike[str] | None = None,
+    plot: str | PathLike[str] | None = None,
+    record: str | PathLike[str] | None = None,
+    every: int = 1,
+    show: Callable[[str], Any] = print,
+) -> Trace:
+    """`lavender run NAME`: a gallery scene, a live line, and files on request.
+
+    Parameters
+    ----------
+    name : str
+        Of the gallery.
+    steps, iterations, warm_start
+        Number of steps, sweep budget (None: the scene's), and mode.
+    parameters : mapping, optional
+        Further parameters of the scene.
+    residual : bool
+        Judge all rows of every step.
+    trace, plot, record : path, optional
+        CSV of the trace, figure, folder of the problems.
+    every : int
+        Show one line in so many, and always the last.
+    show : callable
+        Takes each line; a terminal may overwrite the one before.
+
+    Raises
+    ------
+    UnknownName, InputError, LavenderError
+        As `Scene` and `Simulation`.
+    """
+    every = whole("every", every, 1)
+    given = dict(parameters or {})
+    if iterations is not None:
+        given["solver_iterations"] = iterations
+    simulation = Simulation(Scene(name, **{**given, "warm_start": warm_start}), report_residual=residual)
+
+    def watch(step: int, observation: dict[str, Any], info: dict[str, Any]) -> None:
+        if step % every == 0 or step == steps or "lost_body" in info:
+            show(line(step, observation, info))
+
+    found = run(simulation, steps, record=record, watch=watch)
+    if found.lost_body:
+        show(f"stopped: the state of {found.lost_body!r} is not finite")
+    if trace is not None:
+        found.save(trace)
+    if plot is not None:
+        found.plot(plot)
+    return found
