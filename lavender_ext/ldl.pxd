@@ -9,9 +9,13 @@ c[i, t] c[i, 0]. Right-looking: between two pivots lie one division, one product
 from libc.stdint cimport int32_t, int64_t
 
 
+cdef enum:
+    NEGATIVE_DIGITS = 100000000     # what rounding leaves of a zero pivot, after others were skipped, is above -1e-8
+
+
 cdef struct pivots_t:
-    int32_t small               # pivots with |p_i| <= tiny * size_i: skipped, their row and column drop out
-    int32_t negative            # pivots below that
+    int32_t small               # pivots below tiny * size_i: skipped, their row and column drop out
+    int32_t negative            # pivots below -size_i / NEGATIVE_DIGITS: kept
     double least                # smallest p_i / size_i
     int32_t first_small         # place of the first small pivot, -1
 
@@ -21,7 +25,7 @@ cdef inline double pivot_2(double p, double size, int32_t i, double tiny, pivots
     if p < out.least * size:
         out.least = p / size
     if not p > tiny * size:
-        if p < -tiny * size:
+        if p * NEGATIVE_DIGITS < -size:
             out.negative += 1
         else:
             out.small += 1
@@ -99,7 +103,7 @@ cdef inline void ldl_factor(int32_t n, int32_t width, double* c, const double* s
         if p < out.least * size[i]:
             out.least = p / size[i]
         if not p > tiny * size[i]:
-            if p < -tiny * size[i]:
+            if p * NEGATIVE_DIGITS < -size[i]:
                 out.negative += 1
             else:
                 out.small += 1

@@ -61,7 +61,7 @@ class Factor(Protocol):
     """Factorisation of A_FF + shift D_FF for changing free sets."""
 
     def factor(self, place: IntArray, n_free: int, shift: float, tiny: float = TINY) -> int:
-        """Factor the rows with place >= 0, numbered in order of rows; the number of pivots not above tiny d."""
+        """Factor the rows with place >= 0, numbered in order of rows; how many pivots are not above tiny d."""
         ...
 
     def solve(self, rhs: FloatArray) -> FloatArray:

@@ -13,10 +13,11 @@ from scipy.linalg import lapack
 
 from lavender._arrays import FloatArray
 from lavender.problem import Problem
-from lavender.solvers._factor import TINY, DenseFactor, SparseFactor, choose
+from lavender.solvers._factor import TINY, DenseFactor, Factor, SparseFactor, choose
 from lavender_ext.pivoting import Pivoting
 
-SOLVED, ROUNDS, SMALL, INDEFINITE = range(4)  # outcomes, as in lavender_ext/pivoting.pyx
+SOLVED, ROUNDS, SMALL, INDEFINITE, STUCK = range(5)  # outcomes, as in lavender_ext/pivoting.pyx
+SLOP = 8.0  # roundings of w within which a sign means nothing, as there
 
 
 class PivotState:
@@ -26,9 +27,11 @@ class PivotState:
         self.problem = problem
         self.form, band, order = choose(problem)
         self.rows = Pivoting(problem.csr_data, band if self.form == "band" else -1, order, TINY)
-        self.factor = {"dense": DenseFactor, "sparse": SparseFactor}[self.form](problem) if self.form != "band" else None
+        self.factor: Factor | None = None
+        if self.form != "band":
+            self.factor = DenseFactor(problem) if self.form == "dense" else SparseFactor(problem)
         self.is_factored = False
-        self.factorisations = 0  # by Python
+        self.factorisations = self.exchanged = self.searches = 0  # by Python
 
     def start(self, shift: float) -> None:
         """Proximal shift s; nothing is factored."""
@@ -41,13 +44,15 @@ class PivotState:
         r = self.rows
         return {
             "factorisations": r.factorisations + self.factorisations,
-            "pivots": r.exchanged,
+            "pivots": r.exchanged + self.exchanged,
+            "line_searches": self.searches,
         }
 
     def factorise(self) -> int:
         """Factor the free rows: SOLVED, SMALL or INDEFINITE."""
         if self.factor is None:
             small, negative = self.rows.factor()
+            self.is_factored = True
             return INDEFINITE if negative else SMALL if small else SOLVED
         n_free = self.rows.number()
         self.factorisations += 1
@@ -62,13 +67,17 @@ class PivotState:
             self.rows.x[:] = self.factor.solve(self.problem.b)
             self.rows.slack()
 
-    def correct(self) -> None:
-        """x_F <- x_F - (A_FF + s D_FF)^-1 w_F, then w anew."""
+    def newton(self) -> None:
+        """x_F <- x_F - (A_FF + s D_FF)^-1 w_F."""
         if self.factor is None:
             self.rows.correct()
         else:
             free = np.flatnonzero(self.rows.place >= 0)
             self.rows.x[free] -= self.factor.solve(self.rows.w[free])
+
+    def correct(self) -> None:
+        """The same, then w anew."""
+        self.newton()
         self.rows.slack()
 
     def rounds(self, n: int, stop_at: float | None = None) -> tuple[int, int]:
@@ -85,8 +94,9 @@ class PivotState:
                 if code != SOLVED:
                     return code, done
             self.correct()
-            if self.exchange() == 0:
-                return SOLVED, done
+            bad = self.exchange()
+            if bad <= 0:
+                return (STUCK if bad else SOLVED), done
             if stop_at is not None and perf_counter() >= stop_at:
                 return ROUNDS, done
         return ROUNDS, n
@@ -94,9 +104,53 @@ class PivotState:
     def exchange(self) -> int:
         """Rows of the wrong sign, which have now changed sides."""
         bad = self.rows.exchange()
-        if bad:
+        if bad > 0:
             self.is_factored = False
         return bad
+
+    def descend(self, n: int, stop_at: float | None = None) -> tuple[int, int]:
+        """At most n steps of projected Newton on the energy: (outcome, steps done). x must be within its bounds.
+
+            phi(x) = 1/2 x.A x - b.x + s/2 |x - center|_D^2,  grad phi = w                         (1)
+            x <- P(x - t A_FF^-1 w_F),  F: rows off their bounds, or whose w pushes them off         (2)
+            t = 1, 1/2, ... until phi falls by 1e-4 of what w promises                              (3)
+
+        Bertsekas 1982. Monotone, so no set comes back: what pivoting lacks on a nearly singular A.
+        """
+        rows, cones = self.rows, self.problem.cones
+        low, high, fixed = cones.lower, cones.upper, cones.lower == cones.upper
+        rows.slack()
+        x, w = rows.x.copy(), rows.w.copy()
+        for done in range(1, n + 1):
+            slop = SLOP * rows.f
+            at = np.where(fixed | ((x <= low) & (w >= -slop)), -1, np.where((x >= high) & (w <= slop), 1, 0))
+            if not (self.is_factored and np.array_equal(at, rows.at)):
+                self.exchanged += int(np.count_nonzero(at != rows.at))
+                rows.at[:] = at
+                code = self.factorise()
+                if code != SOLVED:
+                    return code, done
+            self.newton()
+            step = rows.x - x
+            t = 1.0
+            while True:
+                np.clip(x + t * step, low, high, out=rows.x)
+                rows.slack()
+                self.searches += 1
+                move = rows.x - x
+                # phi(y) - phi(x) = 1/2 (w(x) + w(y)).(y - x): no cancellation
+                if 0.5 * ((w + rows.w) @ move) <= 1e-4 * (w @ move) or t < 1e-12:
+                    break
+                t *= 0.5
+            slop = SLOP * rows.f
+            reach = slop / self.problem.csr_data.d
+            whole = t == 1.0 and bool(np.all((x + step >= low - reach) & (x + step <= high + reach)))
+            x, w = rows.x.copy(), rows.w.copy()
+            if whole and not np.any(((at < 0) & ~fixed & (w < -slop)) | ((at > 0) & (w > slop))):
+                return SOLVED, done
+            if stop_at is not None and perf_counter() >= stop_at:
+                return ROUNDS, done
+        return ROUNDS, n
 
     def impulse(self, out: FloatArray) -> FloatArray:
         """x clipped to the bounds, into out (m,)."""

@@ -15,7 +15,7 @@ that are asymmetric or indefinite get LU with pivoting, and where that is singul
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from time import perf_counter
 from typing import Any
 
@@ -27,13 +27,14 @@ from lavender.registry import SolverSpec
 from lavender.residuals import check_certificate, quick, reference
 from lavender.solution import Claim, Status
 from lavender.solvers._factor import GeneralFactor
-from lavender.solvers._pivoting import INDEFINITE, ROUNDS, SMALL, SOLVED, PivotState
+from lavender.solvers._pivoting import INDEFINITE, ROUNDS, SMALL, SOLVED, STUCK, PivotState
 from lavender_ext import judge
 
-SHIFT = 1e-10  # -, s: far above the rounding of a factorisation, below what a mass ratio of 1e8 leaves
+# -, s: the last is far above the rounding of a factorisation and below what a mass ratio of 1e8 leaves.
+PATH = (1e-2, 1e-4, 1e-6, 1e-8, 1e-10)
 SHIFT_STEP = 100.0
-SHIFT_LIMIT = 1e-2
 GOOD = 1e-13  # relative residual at which refinement ends, where the floor allows it
+RUNAWAY = 1e-6
 PASSES = 100  # proximal passes at most
 PATIENCE = 6  # passes without halving the best residual
 SWEEPS = 2  # symmetric sweeps of Gauss-Seidel that guess the free rows
@@ -93,10 +94,13 @@ def _general(problem: Problem, why: str) -> DirectState:
 class _Run:
     """One solve: the best judged iterate so far, and what was spent."""
 
-    def __init__(self, state: DirectState, impulse: FloatArray, n: int, tol: float, time_limit: float | None) -> None:
+    def __init__(
+        self, state: DirectState, impulse: FloatArray, n: int, tol: float, time_limit: float | None
+    ) -> None:
         self.state, self.problem, self.impulse, self.budget, self.tol = state, state.problem, impulse, n, tol
         self.stop_at = None if time_limit is None else perf_counter() + time_limit
         m = state.problem.m
+        self.start = impulse.copy()
         self.w, self.e, self.candidate = np.empty(m), np.empty(m), np.empty(m)
         self.best, self.floor, self.sure = np.inf, 0.0, True
         self.iterations = 0
@@ -125,9 +129,9 @@ class _Run:
             self.impulse[:] = x
         return relative
 
-    @property
-    def is_good(self) -> bool:
-        return self.best <= max(GOOD, self.floor)
+    def good(self) -> bool:
+        # A floor above 1e-6 belongs to an impulse that ran away, not to the problem.
+        return self.best <= max(GOOD, min(self.floor, RUNAWAY))
 
     @property
     def out_of_time(self) -> bool:
@@ -169,13 +173,13 @@ class _Run:
             x -= factor.solve(w)
             relative = self.judge(x)
             self.work["refinements"] = k
-            if self.is_good or not relative < 0.5 * previous:
+            if self.good() or not relative < 0.5 * previous:
                 break
             previous = relative
-        if not self.is_good and singular:
-            # What least squares leaves of b is orthogonal to the range of A: a certificate if it is not rounding.
+        if not self.good() and singular:
+            # What least squares in the metric of D leaves of b is orthogonal to the range of A.
             judge.slack(problem.csr_data, x, w)
-            proof = self.certificate(-w)
+            proof = self.certificate(-w / problem.csr_data.d)
             if proof is not None:
                 return proof
         return self.verdict()
@@ -200,7 +204,7 @@ class _Run:
             self.work["sweeps"] = 2 * SWEEPS
             rows.predict()
             code = self.rounds(pivot)
-        if self.is_good:
+        if self.good():
             return self.verdict()
         if code == ROUNDS and (self.iterations >= self.budget or self.out_of_time):
             return self.out_of_budget()
@@ -208,26 +212,26 @@ class _Run:
             return self.indefinite()
         if code == SMALL:
             self.note_singular(pivot)
-        return self.proximal(pivot)
+        return self.proximal(pivot, code == STUCK)
 
     def rounds(self, pivot: PivotState) -> int:
         """Rounds to the end of this pass, refined and judged, within the budget and the time."""
         while True:
             code, done = pivot.rounds(min(BATCH, self.budget - self.iterations), self.stop_at)
             self.iterations += done
-            if code not in (SOLVED, ROUNDS):
+            if code in (SMALL, INDEFINITE):
                 return code
             relative = self.judge_pivot(pivot, code == SOLVED)
             if code == SOLVED and pivot.rows.shift == 0.0:
                 code = self.refine(pivot, relative)
             # Signs that differ by rounding alone exchange for ever; the judge sees that nothing is wrong.
-            if code == SOLVED or self.is_good or self.iterations >= self.budget or self.out_of_time:
+            if code != ROUNDS or self.good() or self.iterations >= self.budget or self.out_of_time:
                 return code
 
     def refine(self, pivot: PivotState, relative: float) -> int:
         """x <- x - A_FF^-1 w while that halves the residual; ROUNDS where it changes a sign."""
         previous = np.inf
-        while not self.is_good and relative < 0.5 * previous:
+        while not self.good() and relative < 0.5 * previous:
             previous = relative
             pivot.correct()
             self.work["refinements"] = self.work.get("refinements", 0) + 1
@@ -237,6 +241,8 @@ class _Run:
         return SOLVED
 
     def out_of_budget(self) -> Claim:
+        if not self.best <= 1.0:
+            self.judge(self.problem.start())
         return self.claim(Status.TIME_LIMIT if self.iterations < self.budget else Status.MAX_ITERATIONS)
 
     def indefinite(self) -> Claim:
@@ -250,47 +256,84 @@ class _Run:
             self.work["rank"] = rank
         else:
             self.notes.append("A is singular on the free rows: shifted and refined")
-        self.work["shifts"] = 0
 
-    def proximal(self, pivot: PivotState) -> Claim:
-        """Passes on A + s D around the last answer, s raised until its factor exists."""
+    def proximal(self, pivot: PivotState, stuck: bool) -> Claim:
+        """Passes on A + s D around the last answer; where pivoting is stuck, descent along falling s."""
         problem, rows = self.problem, pivot.rows
-        shift, reference, waited = SHIFT, self.best, 0
-        rows.x[:] = self.impulse
-        pivot.start(shift)
-        self.work["shifts"] = 1
+        path = list(PATH if stuck else PATH[-1:])
+        reference, waited = np.inf, 0
+        rows.x[:] = self.impulse if self.floor <= RUNAWAY else self.start
+        self.work["shifts"] = 0
+        shift = 0.0
         for _ in range(PASSES):
             rows.recenter()
+            if path:
+                shift = path.pop(0)
+                pivot.start(shift)
+                self.work["shifts"] += 1
             rows.restart()
-            code = self.rounds(pivot)
-            if self.is_good:
+            code = self.descend(pivot) if stuck else self.rounds(pivot)
+            if self.good():
                 break
             if code == ROUNDS:
                 return self.out_of_budget()
-            if code in (SMALL, INDEFINITE):
-                shift *= SHIFT_STEP
-                if shift > SHIFT_LIMIT:
-                    return self.indefinite_linear() if problem.law == "linear" else self.indefinite()
-                rows.x[:] = self.impulse
-                pivot.start(shift)
-                self.work["shifts"] += 1
+            if code == STUCK:
+                stuck, path = True, list(PATH)
+                np.clip(rows.center, problem.cones.lower, problem.cones.upper, out=rows.x)
                 continue
-            if self.best <= 0.5 * reference:
+            if code in (SMALL, INDEFINITE):
+                if shift >= PATH[0]:
+                    return self.indefinite_linear() if problem.law == "linear" else self.indefinite()
+                path = [shift * SHIFT_STEP]
+                rows.x[:] = rows.center
+                continue
+            step = rows.x - rows.center
+            self.settle(pivot)
+            if self.good():
+                break
+            if path or self.best <= 0.5 * reference:
                 reference, waited = self.best, 0
                 continue
             waited += 1
-            proof = self.certificate(rows.x - rows.center)
+            proof = self.certificate(step)
             if proof is not None:
                 return proof
             if waited >= PATIENCE or self.out_of_time:
                 break
+        if problem.law == "linear" and self.best > max(self.tol, 2.0 * self.floor) and not self.out_of_time:
+            return self.indefinite_linear()
         return self.verdict()
 
+    def descend(self, pivot: PivotState) -> int:
+        rows, c = pivot.rows, self.problem.cones
+        np.clip(rows.x, c.lower, c.upper, out=rows.x)
+        code, done = pivot.descend(self.budget - self.iterations, self.stop_at)
+        self.iterations += done
+        if code in (SOLVED, ROUNDS):
+            self.judge(pivot.impulse(self.candidate))
+        return code
+
+    def settle(self, pivot: PivotState) -> None:
+        """Refine on the rows found, whatever signs rounding gives: more passes with the same factor."""
+        rows, previous = pivot.rows, np.inf
+        relative = self.judge(pivot.impulse(self.candidate))
+        while not self.good() and relative < 0.5 * previous:
+            kept, previous = rows.x.copy(), relative
+            rows.recenter()
+            rows.slack()
+            pivot.correct()
+            self.work["refinements"] = self.work.get("refinements", 0) + 1
+            relative = self.judge(pivot.impulse(self.candidate))
+            if not relative < previous:
+                rows.x[:] = kept
+
     def indefinite_linear(self) -> Claim:
-        state = _general(self.problem, "A is indefinite")
-        self.notes = [state.note]
-        assert state.general is not None
-        return self.linear_general(state.general)
+        before = self.state.pivot.work if self.state.pivot is not None else {}
+        self.state = _general(self.problem, "A is indefinite")
+        self.notes = [self.state.note]
+        assert self.state.general is not None
+        claim = self.linear_general(self.state.general)
+        return replace(claim, work={**claim.work, "factorisations": 1 + before.get("factorisations", 0)})
 
     def certificate(self, step: FloatArray) -> Claim | None:
         """INFEASIBLE where `step`, cut to the directions the bounds allow, proves it."""

@@ -1,0 +1,283 @@
+"""`direct`: every factorisation, pivoting against enumeration, singular and infeasible problems."""
+
+import hypothesis.strategies as st
+import numpy as np
+import pytest
+import scipy.sparse as sp
+from enumeration import enumerate_lcp
+from hypothesis import given
+from random_problems import as_matrix, random_contact_problem, random_lcp, seeds
+
+import lavender as lv
+from lavender.residuals import check_certificate
+from lavender_ext import pivoting as kernels
+
+
+def accurate(solution):
+    """Within 1e-12, or twice what rounding lambda to float64 costs."""
+    r = solution.residual
+    return r.relative <= max(1e-12, 2.0 * r.floor)
+
+
+def spd(rng, m, spread=2.0):
+    q, _ = np.linalg.qr(rng.normal(size=(m, m)))
+    return q @ np.diag(10.0 ** rng.uniform(-spread, 0.0, m)) @ q.T
+
+
+def symmetric(a):
+    return 0.5 * (a + a.T)
+
+
+def laplacian(n):
+    """n x n grid: half bandwidth n, sparse."""
+    t = sp.diags_array([-np.ones(n - 1), 2.5 * np.ones(n), -np.ones(n - 1)], offsets=[-1, 0, 1])
+    return sp.csr_array(sp.kron(sp.eye_array(n), t) + sp.kron(t, sp.eye_array(n)))
+
+
+def tridiagonal(m, diagonal=2.01):
+    return sp.csr_array(
+        sp.diags_array([-np.ones(m - 1), diagonal * np.ones(m), -np.ones(m - 1)], offsets=[-1, 0, 1])
+    )
+
+
+def shuffled(rng, a):
+    order = rng.permutation(a.shape[0])
+    return sp.csr_array(a[order][:, order])
+
+
+RNG = np.random.default_rng(5)
+LINEAR = {
+    "tridiagonal": (tridiagonal(500), "band"),
+    "pentadiagonal": (sp.csr_array(tridiagonal(300) @ tridiagonal(300)), "band"),
+    "shuffled tridiagonal": (shuffled(RNG, tridiagonal(500)), "band"),
+    "diagonal": (sp.csr_array(sp.diags_array(np.arange(1.0, 100.0))), "band"),
+    "small": (symmetric(spd(RNG, 20)), "band"),
+    "dense": (symmetric(spd(RNG, 150)), "dense"),
+    "sparse": (laplacian(60), "sparse"),
+    "asymmetric": (spd(RNG, 30) + np.triu(RNG.normal(size=(30, 30))), "LU"),
+    "asymmetric sparse": (sp.csr_array(laplacian(20) + sp.diags_array(np.ones(399), offsets=1)), "LU"),
+    "indefinite": (symmetric(RNG.normal(size=(40, 40))), "LU"),
+    "indefinite dense": (symmetric(RNG.normal(size=(120, 120))), "LU"),
+    "indefinite sparse": (sp.csr_array(laplacian(60) - 3.3 * sp.eye_array(3600)), "LU"),
+    "zero diagonal": (np.array([[0.0, 1.0], [1.0, 0.0]]), "LU"),
+}
+
+
+@pytest.mark.parametrize("case", LINEAR)
+def test_every_factorisation_reaches_rounding(case):
+    a, form = LINEAR[case]
+    problem = lv.Problem.linear(a, np.random.default_rng(1).normal(size=a.shape[0]))
+    solution = lv.solve(problem, "direct", tol=1e-9)
+    assert solution.solver.form == form
+    assert solution.status in (lv.Status.CONVERGED, lv.Status.FLOOR)
+    assert not solution.contradicted
+    assert accurate(solution), solution
+    assert solution.work["factorisations"] >= 1
+
+
+@given(seed=seeds, m=st.integers(1, 9), band=st.integers(0, 3), bound=st.integers(0, 511))
+def test_the_compiled_factorisation_solves_any_free_set(seed, m, band, bound):
+    rng = np.random.default_rng(seed)
+    lower = sum((np.diag(rng.normal(size=m - k), -k) for k in range(min(band, m - 1) + 1)), np.zeros((m, m)))
+    a = lower @ lower.T + np.eye(m)
+    problem = lv.Problem.lcp(a, rng.normal(size=m))
+    order = rng.permutation(m).astype(np.int32)
+    for p, wide in ((np.arange(m, dtype=np.int32), max(problem.bandwidth)), (order, m - 1)):
+        rows = kernels.Pivoting(problem.csr_data, wide, p, 1e-13)
+        rows.at[:] = [-((bound >> i) & 1) for i in range(m)]
+        free = rows.at == 0
+        rows.x[:] = 0.0
+        rows.slack()
+        assert rows.factor() == (0, 0)
+        rows.correct()
+        expected = np.zeros(m)
+        expected[free] = np.linalg.solve(a[np.ix_(free, free)], problem.b[free])
+        # Condition of 1 + L L^T with |L| of a few: far below 1e4.
+        np.testing.assert_allclose(rows.x, expected, rtol=1e-11, atol=1e-11)
+
+
+@given(seed=seeds, m=st.integers(1, 7), boxed=st.booleans(), whole=st.booleans())
+def test_positive_definite_pivoting_equals_enumeration(seed, m, boxed, whole):
+    rng = np.random.default_rng(seed)
+    g = rng.normal(size=(m, m + 2))
+    if whole:  # small whole numbers: degenerate, w = 0 and lambda = 0 at once
+        g = np.rint(g)
+    a = g @ g.T + 0.25 * np.eye(m)
+    b = np.rint(2.0 * rng.normal(size=m)) if whole else rng.normal(size=m)
+    low = np.where(rng.random(m) < 0.2, -np.inf, -np.rint(2.0 * rng.random(m)) if boxed else 0.0)
+    high = np.where(rng.random(m) < 0.5, np.inf, np.maximum(low, 0.0) + 1.0) if boxed else np.full(m, np.inf)
+    solution = lv.solve(lv.Problem.lcp(a, b, low, high), "direct", tol=1e-9)
+    assert accurate(solution), solution
+    truth = enumerate_lcp(a, b, low, high)
+    assert truth
+    for x, _ in truth:  # all spellings of the one solution
+        np.testing.assert_allclose(solution.impulse, x, atol=1e-7)
+
+
+@given(seed=seeds, m=st.integers(2, 8), whole=st.booleans())
+def test_semidefinite_pivoting_finds_the_slack_of_enumeration(seed, m, whole):
+    rng = np.random.default_rng(seed)
+    g = rng.normal(size=(m, max(1, m // 2)))
+    if whole:
+        g = np.rint(g)
+    a = g @ g.T
+    b = a @ np.maximum(rng.normal(size=m), 0.0) - np.maximum(rng.normal(size=m), 0.0)
+    solution = lv.solve(lv.Problem.lcp(a, b), "direct", tol=1e-9)
+    assert solution.success, solution
+    assert not solution.contradicted
+    truth = enumerate_lcp(a, b, np.zeros(m), np.full(m, np.inf))
+    for _, w in truth:  # the slack of a symmetric semidefinite LCP is unique
+        np.testing.assert_allclose(solution.slack, w, atol=1e-6)
+
+
+@given(seed=seeds, rank=st.integers(2, 12))
+def test_boxed_problems_of_any_rank(seed, rank):
+    solution = lv.solve(random_lcp(seed, m=12, rank=rank), "direct", tol=1e-9)
+    assert solution.status in (lv.Status.CONVERGED, lv.Status.FLOOR), solution
+    assert not solution.contradicted
+
+
+@pytest.mark.parametrize("m", [90, 300])
+@pytest.mark.parametrize("shape", ["dense", "sparse"])
+def test_larger_semidefinite_problems_need_descent(m, shape):
+    rng = np.random.default_rng(m)
+    if shape == "dense":
+        g = rng.normal(size=(m, m // 2))
+    else:
+        g = sp.random_array((m, m // 2), density=3.0 / m, rng=rng).toarray()
+    a = sp.csr_array(g @ g.T)
+    b = a @ np.maximum(rng.uniform(-0.3, 1.0, m), 0.0) - np.where(rng.random(m) < 0.5, rng.random(m), 0.0)
+    problem = lv.Problem.lcp(a, b)
+    solution = lv.solve(problem, "direct", tol=1e-9)
+    assert solution.success, solution
+    assert "singular" in solution.message
+    assert solution.work["shifts"] >= 1
+
+
+def test_a_stack_takes_one_factorisation():
+    """Impulses pass through the whole stack in the sweeps that guess the free rows."""
+    m = 2000
+    a = sp.lil_array(tridiagonal(m, 2.0))
+    a[0, 0] = 1.0
+    b = np.zeros(m)
+    b[0] = 0.1
+    solution = lv.solve(lv.Problem.lcp(sp.csr_array(a), b), "direct", tol=1e-9)
+    assert solution.residual.relative <= 2.0 * solution.residual.floor
+    assert solution.work["factorisations"] == 1
+    np.testing.assert_allclose(solution.impulse, 0.1 * np.arange(m, 0, -1), rtol=1e-6)
+
+
+@pytest.mark.parametrize("m", [5, 30, 120, 900])
+def test_singular_linear_systems_say_their_rank(m):
+    rng = np.random.default_rng(m)
+    if m == 900:
+        grid = laplacian(30)
+        a = sp.csr_array(sp.diags_array(np.full(900, 1.0)) @ grid)
+        a = a - sp.diags_array(a @ np.ones(900))  # a graph's Laplacian: rank m - 1
+        rank = m - 1
+    else:
+        rank = m // 2
+        g = rng.normal(size=(m, rank))
+        a = symmetric(g @ g.T)
+    problem = lv.Problem.linear(a, a @ rng.normal(size=m))
+    solution = lv.solve(problem, "direct", tol=1e-9)
+    assert solution.success, solution
+    assert f"rank {rank} of {m}" in solution.message
+    assert solution.work["rank"] == rank
+
+
+@pytest.mark.parametrize("kind", ["symmetric", "asymmetric"])
+@given(seed=seeds, m=st.integers(2, 12))
+def test_inconsistent_linear_systems_are_infeasible_with_a_certificate(kind, seed, m):
+    rng = np.random.default_rng(seed)
+    g = rng.normal(size=(m, m - 1))
+    a = symmetric(g @ g.T) if kind == "symmetric" else g @ rng.normal(size=(m - 1, m))
+    left = np.linalg.svd(a)[0][:, -1]
+    problem = lv.Problem.linear(a, a @ rng.normal(size=m) + left)
+    solution = lv.solve(problem, "direct")
+    assert solution.status is lv.Status.INFEASIBLE, solution
+    assert check_certificate(problem, solution.certificate) is None
+
+
+@given(seed=seeds, m=st.integers(2, 14))
+def test_an_lcp_without_a_solution_gets_a_certificate(seed, m):
+    """y >= 0 with A y = 0 and b.y > 0 put in by hand."""
+    rng = np.random.default_rng(seed)
+    y = np.maximum(rng.uniform(-0.5, 1.0, m), 0.0)
+    y[0] = 1.0
+    g = rng.normal(size=(m, m))
+    g -= np.outer(y, y @ g) / (y @ y)
+    a = symmetric(g @ g.T)
+    b = rng.normal(size=m)
+    b += y * (0.5 - b @ y) / (y @ y)
+    problem = lv.Problem.lcp(a, b)
+    solution = lv.solve(problem, "direct")
+    assert solution.status is lv.Status.INFEASIBLE, solution
+    assert check_certificate(problem, solution.certificate) is None
+
+
+def test_rows_are_solved_through_their_assembled_matrix():
+    problem = random_contact_problem(3, tangents=0, spin=False)
+    rows, matrix = (lv.solve(p, "direct", tol=1e-9) for p in (problem, as_matrix(problem)))
+    assert rows.success
+    assert matrix.success
+    np.testing.assert_allclose(rows.slack, matrix.slack, atol=1e-8)
+
+
+def test_warm_starts_choose_among_solutions():
+    """Two equal contacts share a load: the answer stays at the split it is given."""
+    problem = lv.Problem.lcp(np.ones((2, 2)), [1.0, 1.0])
+    for share in (0.25, 0.5, 0.9):
+        solution = lv.solve(problem, "direct", impulse=[share, 1.0 - share])
+        np.testing.assert_allclose(solution.impulse, [share, 1.0 - share], atol=1e-9)
+
+
+def test_refusals_and_indefinite_matrices():
+    with pytest.raises(lv.CapabilityError, match=r"symmetric A.*lemke"):
+        lv.solve(lv.Problem.lcp([[2.0, 1.0], [-1.0, 2.0]], [1.0, 1.0]), "direct")
+    solution = lv.solve(lv.Problem.lcp([[1.0, 3.0], [3.0, 1.0]], [1.0, 1.0]), "direct")
+    assert not solution.contradicted
+    solution = lv.solve(lv.Problem.lcp(-np.eye(3), [1.0, 1.0, 1.0]), "direct")
+    assert solution.status is lv.Status.NUMERICAL_ERROR
+    assert "indefinite" in solution.message
+    assert np.isfinite(solution.impulse).all()
+
+
+def test_budgets():
+    rng = np.random.default_rng(0)
+    g = rng.normal(size=(200, 100))
+    problem = lv.Problem.lcp(g @ g.T, rng.normal(size=200))
+    none = lv.solve(problem, "direct", max_iter=0)
+    assert (none.status, none.iterations) == (lv.Status.MAX_ITERATIONS, 0)
+    few = lv.solve(problem, "direct", max_iter=3)
+    assert few.iterations <= 3
+    assert few.residual.relative <= 1.0, "no worse than doing nothing"
+    short = lv.solve(problem, "direct", time_limit=1e-3)
+    assert short.solve_time < 0.051
+    assert not short.contradicted
+
+
+def test_reference_problems(problem_dir):
+    seen = 0
+    for path in sorted(problem_dir.glob("*.npz")):
+        with np.load(path) as data:
+            if "cone_start" in data:
+                continue
+            if "A" in data:
+                a = data["A"]
+            else:
+                a = sp.csr_array(
+                    (data["A_data"], data["A_indices"], data["A_indptr"]), tuple(data["A_shape"])
+                )
+            problem = lv.Problem.lcp(a, data["b"], data["lo"], data["hi"], name=path.stem)
+        if lv.get("direct").refuses(problem):
+            assert not problem.is_symmetric
+            continue
+        seen += 1
+        solution = lv.solve(problem, "direct", tol=1e-9)
+        assert not solution.contradicted, (path.stem, solution)
+        if path.stem == "lcpgen_psd-300":
+            assert solution.status is lv.Status.INFEASIBLE, solution
+        else:
+            assert accurate(solution), (path.stem, solution)
+    assert seen > 5
