@@ -19,7 +19,7 @@ import scipy.sparse as sp
 from lavender._arrays import FloatArray, IntArray, as_array, check_not_negative, equal, read_only
 from lavender.cones import CONTACT_SPIN, ROW, Cones
 from lavender.errors import CapabilityError, InputError
-from lavender_ext import judge, pivoting
+from lavender_ext import assemble, judge, pivoting
 from lavender_ext import problem as kernels
 
 __all__ = ["LAWS", "Problem", "Rows", "VelocityForm"]
@@ -466,17 +466,18 @@ class Problem:
     def csr(self) -> sp.csr_array:
         """A in compressed rows (m, m), int32 indices; do not modify."""
         if self.rows is not None:
-            return _canonical(self._assemble(), self.m)
-        if isinstance(self.matrix, np.ndarray):
+            most, start, blocks = assemble.bound(self.data)
+            if most >= 2**31:
+                raise InputError(
+                    f"A would have up to {most} entries, more than 32-bit indices reach: "
+                    "use a solver that takes rows (operator 'rows' or 'either')"
+                )
+            indptr, indices, data = assemble.delassus(self.data, most, start, blocks)
+        elif isinstance(self.matrix, np.ndarray):
             indptr, indices, data = kernels.dense_to_csr(self.matrix)
-            return sp.csr_array((data, indices, indptr), shape=(self.m, self.m))
-        return self.matrix
-
-    def _assemble(self) -> sp.csr_array:
-        jac = self.jacobian
-        a = jac @ self.rows.inverse_mass_matrix() @ jac.T  # type: ignore[union-attr]
-        # (J M^-1 J^T) is symmetric; the mean removes what the order of additions left.
-        return sp.csr_array(0.5 * (a + a.T) + sp.diags_array(self.compliance))
+        else:
+            return self.matrix
+        return sp.csr_array((data, indices, indptr), shape=(self.m, self.m))
 
     @cached_property
     def jacobian(self) -> sp.csr_array:
