@@ -6,8 +6,7 @@
               f = D^1/2 (y - x), over the last `memory` sweeps                                        (2)
 
 D = diag d, so that both work in energy. S is a sweep of pgs or of exact blocks (block_gs.pxd), over A in
-compressed rows or over the factored form; there v = M^-1 J^T lam is linear in lam and follows every
-combination. With the symmetric order S is a sweep and the same sweep backwards. An iterate that is shown
+compressed rows or over the factored form with v = M^-1 J^T lam. With the symmetric order S is a sweep and the same sweep backwards. An iterate that is shown
 is always a swept one, y. All sums run in a fixed order.
 
 Safeguard of (2): where a step multiplied |f| by more than GUARD, it is undone and the memory cleared.
@@ -30,7 +29,7 @@ from lavender_ext.watch cimport CONVERGED, RUNNING, Watch
 cdef enum:
     MAX_MEMORY = 16
     WINDOW = 200
-    REFRESH = 64                # v is formed anew from lam as often: rounding adds up in it
+    REFRESH = 64                # iterations of nncg after which v is formed anew: rounding adds up in it
 
 cdef enum:                      # numbers of a run, in control[]
     TURN = 0                    # iterations done
@@ -61,7 +60,7 @@ cdef struct sweep_data_t:
     int32_t nv
     double* control             # (CONTROL)
     double* gram                # (MAX_MEMORY, MAX_MEMORY)
-    double* work                # nncg 3 (m + nv); anderson (3 + 2 memory) (m + nv)
+    double* work                # nncg 3 (m + nv); anderson (3 + 2 memory) m
 
 
 cdef inline void sweep(const sweep_data_t* c, double* lam, int32_t first) noexcept nogil:
@@ -87,47 +86,34 @@ cdef inline void sweep(const sweep_data_t* c, double* lam, int32_t first) noexce
                 solve_rows_block(p, c.rows, i, c.g + c.start[i], lam, c.v)
 
 
-cdef inline void push_block(const sweep_data_t* c, int32_t i, const double* change, double* v) noexcept nogil:
-    # v += M^-1 J^T change of one block; change at its first row.
+cdef inline void form_velocity(const sweep_data_t* c, const double* lam) noexcept nogil:
+    # v = M^-1 J^T lam; nothing to do where not factored.
     cdef const blocks_t* p = c.blocks
     cdef const rows_t* r = c.rows
-    cdef int32_t j = p.ptr[i], n = p.ptr[i + 1] - j, k
-    if i < r.n_joints:
-        for k in range(n):
-            joint_push(r.minv_jac + 12 * (j + k), change[k], v, r.joint_body[2 * i], r.joint_body[2 * i + 1])
-    else:
-        contact_push(r, i - r.n_joints, n_tangents(p.kind[i], n), p.kind[i] == CONTACT_SPIN, change, v)
-
-
-cdef inline void refresh(const sweep_data_t* c, const double* lam) noexcept nogil:
-    cdef int32_t i
+    cdef int32_t i, j, k
     for i in range(c.nv):
         c.v[i] = 0.0
-    if c.nv > 0:
-        for i in range(c.blocks.n_blocks):
-            push_block(c, i, lam + c.blocks.ptr[i], c.v)
+    if c.nv == 0:
+        return
+    for i in range(r.n_joints):
+        for j in range(p.ptr[i], p.ptr[i + 1]):
+            joint_push(r.minv_jac + 12 * j, lam[j], c.v, r.joint_body[2 * i], r.joint_body[2 * i + 1])
+    for k in range(r.n_contacts):
+        i = r.n_joints + k
+        j = p.ptr[i]
+        contact_push(r, k, n_tangents(p.kind[i], p.ptr[i + 1] - j), p.kind[i] == CONTACT_SPIN, lam + j, c.v)
 
 
-cdef inline void project_block(const sweep_data_t* c, int32_t i, double* lam) noexcept nogil:
-    """lam of block i into its bounds, normal first; v follows."""
-    cdef const blocks_t* p = c.blocks
-    cdef int32_t j = p.ptr[i], n = p.ptr[i + 1] - j, k, nt, moved = 0
+cdef inline void project_block(const blocks_t* p, int32_t i, double* lam) noexcept nogil:
+    """lam of block i into its bounds, normal first."""
+    cdef int32_t j = p.ptr[i], n = p.ptr[i + 1] - j, k, nt
     cdef double bound, size
-    cdef double change[4]
     if p.kind[i] == ROW:
         for k in range(j, j + n):
-            size = clip(lam[k], p.lower[k], p.upper[k])
-            if size != lam[k]:
-                if c.nv > 0:
-                    joint_push(c.rows.minv_jac + 12 * k, size - lam[k], c.v, c.rows.joint_body[2 * i],
-                               c.rows.joint_body[2 * i + 1])
-                lam[k] = size
+            lam[k] = clip(lam[k], p.lower[k], p.upper[k])
         return
-    for k in range(n):
-        change[k] = lam[j + k]
     if lam[j] < 0.0:
         lam[j] = 0.0
-        moved = 1
     bound = p.mu[i] * lam[j]
     nt = n_tangents(p.kind[i], n)
     if nt > 0:
@@ -136,16 +122,9 @@ cdef inline void project_block(const sweep_data_t* c, int32_t i, double* lam) no
             size = bound / size
             for k in range(1, 1 + nt):
                 lam[j + k] *= size
-            moved = 1
     if p.kind[i] == CONTACT_SPIN:
         bound = bound * p.patch_radius[i]
-        if fabs(lam[j + n - 1]) > bound:
-            lam[j + n - 1] = bound if lam[j + n - 1] > 0.0 else -bound
-            moved = 1
-    if moved and c.nv > 0:
-        for k in range(n):
-            change[k] = lam[j + k] - change[k]
-        push_block(c, i, change, c.v)
+        lam[j + n - 1] = clip(lam[j + n - 1], -bound, bound)
 
 
 cdef public void lav_nncg(sweep_data_t* c, double* lam, int32_t first_sweep, int32_t n) noexcept nogil:
@@ -158,8 +137,8 @@ cdef public void lav_nncg(sweep_data_t* c, double* lam, int32_t first_sweep, int
     cdef const double* d = c.blocks.d
     cdef double s0, s1, s2, s3, beta
     for s in range(n):
-        if c.nv > 0 and control[TURN] > 0.0 and <int32_t>control[TURN] % REFRESH == 0:
-            refresh(c, lam)
+        if control[TURN] > 0.0 and <int32_t>control[TURN] % REFRESH == 0:
+            form_velocity(c, lam)
         for i in range(m):
             lam[i] += q[i]
             x[i] = lam[i]
@@ -243,12 +222,12 @@ cdef inline int32_t least_squares(int32_t n, int32_t head, int32_t memory, const
 
 cdef public void lav_anderson(sweep_data_t* c, double* lam, int32_t first_sweep, int32_t n) noexcept nogil:
     """n iterations of (2)."""
-    cdef int32_t m = c.blocks.n_rows, w = m + c.nv, i, j, k, s, kept, head, stepped
-    cdef double* x = c.work                             # x, later the new f; behind lam's part that of v
-    cdef double* y = x + w                              # the swept iterate before
-    cdef double* f = y + w
-    cdef double* dy = f + w                             # (memory, w)
-    cdef double* df = dy + c.memory * w                 # (memory, w), the first m of each
+    cdef int32_t m = c.blocks.n_rows, i, j, k, s, kept, head, stepped
+    cdef double* x = c.work                             # x, later the new f
+    cdef double* y = x + m                              # the swept iterate before
+    cdef double* f = y + m
+    cdef double* dy = f + m                             # (memory, m)
+    cdef double* df = dy + c.memory * m                 # (memory, m)
     cdef double* control = c.control
     cdef const double* d = c.blocks.d
     cdef const double* u
@@ -257,8 +236,6 @@ cdef public void lav_anderson(sweep_data_t* c, double* lam, int32_t first_sweep,
     cdef double gamma[MAX_MEMORY]
     cdef double a0, a1, size
     for s in range(n):
-        if c.nv > 0 and control[TURN] > 0.0 and <int32_t>control[TURN] % REFRESH == 0:
-            refresh(c, lam)
         kept = <int32_t>control[KEPT]
         head = <int32_t>control[HEAD]
         stepped = 0
@@ -266,7 +243,7 @@ cdef public void lav_anderson(sweep_data_t* c, double* lam, int32_t first_sweep,
         if kept > 0 and control[REST] <= 0.0:
             for k in range(kept):
                 j = (head - 1 - k + 2 * c.memory) % c.memory
-                u = df + j * w
+                u = df + j * m
                 a0 = a1 = 0.0
                 i = 0
                 while i + 2 <= m:
@@ -278,22 +255,15 @@ cdef public void lav_anderson(sweep_data_t* c, double* lam, int32_t first_sweep,
                 rhs[j] = a0 + a1
             if least_squares(kept, head, c.memory, c.gram, rhs, gamma) > 0:
                 stepped = 1
-                for i in range(m):
-                    x[i] = lam[i]
-                for i in range(c.nv):
-                    x[m + i] = c.v[i]
                 for j in range(c.memory):
                     a0 = gamma[j]
-                    u = dy + j * w
+                    u = dy + j * m
                     if a0 != 0.0:
-                        for i in range(w):
-                            x[i] -= a0 * u[i]
-                for i in range(m):
-                    lam[i] = x[i]
-                for i in range(c.nv):
-                    c.v[i] = x[m + i]
+                        for i in range(m):
+                            lam[i] -= a0 * u[i]
                 for i in range(c.blocks.n_blocks):
-                    project_block(c, i, lam)
+                    project_block(c.blocks, i, lam)
+                form_velocity(c, lam)
         for i in range(m):
             x[i] = lam[i]
         sweep(c, lam, first_sweep and s == 0)
@@ -313,8 +283,7 @@ cdef public void lav_anderson(sweep_data_t* c, double* lam, int32_t first_sweep,
             # Undo: back to the sweep before, nothing remembered.
             for i in range(m):
                 lam[i] = y[i]
-            for i in range(c.nv):
-                c.v[i] = y[m + i]
+            form_velocity(c, lam)
             control[KEPT] = 0.0
             control[FRESH] = 0.0
             control[RESTARTS] += 1.0
@@ -335,19 +304,17 @@ cdef public void lav_anderson(sweep_data_t* c, double* lam, int32_t first_sweep,
                 control[STEPS] = 0.0
         if control[FRESH] > 0.0 and control[REST] <= 1.0:
             # Into memory: the newest differences and their products with the others.
-            dnew = dy + head * w
+            dnew = dy + head * m
             for i in range(m):
                 dnew[i] = lam[i] - y[i]
-            for i in range(c.nv):
-                dnew[m + i] = c.v[i] - y[m + i]
-            dnew = df + head * w
+            dnew = df + head * m
             for i in range(m):
                 dnew[i] = x[i] - f[i]
             if kept < c.memory:
                 kept += 1
             for k in range(kept):
                 j = (head - k + 2 * c.memory) % c.memory
-                u = df + j * w
+                u = df + j * m
                 a0 = a1 = 0.0
                 i = 0
                 while i + 2 <= m:
@@ -363,8 +330,6 @@ cdef public void lav_anderson(sweep_data_t* c, double* lam, int32_t first_sweep,
         for i in range(m):
             y[i] = lam[i]
             f[i] = x[i]
-        for i in range(c.nv):
-            y[m + i] = c.v[i]
         control[FRESH] = 1.0
 
 
@@ -381,7 +346,7 @@ def allocate(Data p, int memory):
     cdef Py_ssize_t m = p.blocks.n_rows, nv = 6 * p.rows.n_bodies if p.factored else 0
     if not 0 <= memory <= MAX_MEMORY:
         raise ValueError(f"memory is {memory}; 0 to {MAX_MEMORY} is needed")
-    return (np.zeros(CONTROL), np.zeros(MAX_MEMORY * MAX_MEMORY), np.zeros((3 + 2 * memory) * (m + nv) + 1),
+    return (np.zeros(CONTROL), np.zeros(MAX_MEMORY * MAX_MEMORY), np.zeros(3 * (m + nv) + 2 * memory * m + 1),
             np.zeros((nv // 6 + 1, 6)))
 
 

@@ -19,7 +19,7 @@ cdef public int32_t lav_watch_check(watch_t* s, const blocks_t* p, const csr_t* 
 cdef class Watch:
     """Where a run of sweeps stands; `data` is what the judge reads, its start error known."""
 
-    def __init__(self, Data data):
+    def __init__(self, Data data, int patience=64):
         cdef Py_ssize_t m = data.blocks.n_rows
         cdef double[::1] scratch = np.empty(3 * m + 6 * data.rows.n_bodies + 4)
         self.data = data
@@ -30,6 +30,7 @@ cdef class Watch:
         self.state.v = &scratch[3 * m]
         self.state.total = self.state.check_at = 0
         self.state.best_at = -1
+        self.state.patience = patience
         self.state.best_relative = 1.0 / 0.0
         self.state.start_energy = data.start_energy
         self.state.start_velocity = data.start_velocity

@@ -13,9 +13,11 @@ from lavender.solution import Claim
 from lavender.solvers._sweeping import Sweeping, SweepState, claim
 from lavender_ext import accelerate as kernels
 from lavender_ext import block_gs, judge
+from lavender_ext.watch import Watch
 
 SWEEPS = ("pgs", "blocks")
 LARGEST_MEMORY = 16
+PATIENCE = 500  # iterations: on mass ratios the residual of a conjugate gradient rises for hundreds first
 SWEEP_OPTION = "'pgs' or 'blocks' (each contact and joint solved exactly); default: pgs, blocks for the cone law"
 
 
@@ -24,6 +26,7 @@ class AcceleratedState(SweepState):
 
     def __init__(self, problem: Problem, data: Any, order: Order, blocks: bool, memory: int) -> None:
         super().__init__(problem, data, order)
+        self.watch = Watch(problem.data, PATIENCE)
         self.prepared = block_gs.prepare(data) if blocks else None
         self.memory = memory
         self.space = kernels.allocate(data, memory)
