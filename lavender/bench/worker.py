@@ -24,8 +24,14 @@ from lavender.problem import Problem
 
 __all__ = ["Worker"]
 
+# Not `-m`: that puts the current folder first, and in a checkout its sources would hide the installed package.
+_START = (
+    "import sys; sys.path[:] = filter(None, sys.path); "
+    "from lavender.bench import worker; worker._serve(int(sys.argv[1]))"
+)
+
 START_TIME = 60.0  # s, to import everything on a loaded machine
-GRACE = 5.0  # s, beyond the repeats' own limits, for set-up and judging
+GRACE = 2.0  # s, beyond the repeats' own limits, for set-up and judging
 
 
 def _send(stream: IO[bytes], message: Any) -> None:
@@ -67,9 +73,9 @@ class Worker:
         """As `lavender.bench.timing.measure`, in the worker."""
         if self._process is None:
             self._start()
-        # Repeats end once they took the limit together, so there are at most two that take it; twice that
-        # for a backend that looks at the clock now and then.
-        limit = 4.0 * task.time_limit + self.grace
+        # Repeats end once they took the limit together, so at most two can take it; backends look at the clock
+        # now and then.
+        limit = 3.0 * task.time_limit + self.grace
         try:
             assert self._process is not None and self._process.stdin is not None
             if self._holds != task.sha:
@@ -91,9 +97,9 @@ class Worker:
 
     def _start(self) -> None:
         environment = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
-        environment["PYTHONPATH"] = os.pathsep.join(p for p in sys.path if p)
+        environment["PYTHONPATH"] = os.pathsep.join(p or os.getcwd() for p in sys.path)
         self._process = subprocess.Popen(
-            [sys.executable, "-m", "lavender.bench.worker", str(self.memory or 0)],
+            [sys.executable, "-c", _START, str(self.memory or 0)],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
@@ -183,7 +189,3 @@ def _serve(memory: int) -> None:
             problem = message[1]
         else:
             _send(answers, measure(problem, message[1], message[2]))
-
-
-if __name__ == "__main__":
-    _serve(int(sys.argv[1]))
