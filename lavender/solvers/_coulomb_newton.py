@@ -12,39 +12,69 @@ import numpy as np
 
 from lavender._arrays import FloatArray
 from lavender.cones import ROW
-from lavender.solvers._ipm import AUGMENTED
-from lavender.solvers._polish import EnergyRun, Run, proximal_newton, solve_convex
+from lavender.solvers._ipm import AUGMENTED, InteriorPoint
+from lavender.solvers._polish import EnergyRun, Proximal, Run, solve_convex
 
 CONVEX_TOL = 1e-4  # of the convex start, in energy
+STRETCH = 60  # factorisations between two looks at whether a method gets anywhere
+HEAVY = 1e3  # mass ratio from which the convex answer is asked first
 OUTER = 30  # fixed points at most
 
 
 def solve_coulomb(run: Run, z: FloatArray, cold: bool) -> None:
-    """From the warm start, then from the convex answer, then from De Saxce's fixed points."""
-    if not cold:
-        proximal_newton(run, z, AUGMENTED, alpha=1e-4, limit=30)
-        if run.done or run.at_floor():
-            return
+    """From the start, then from the convex answer, then from De Saxce's fixed points."""
     system = run.system
+    plain = Proximal(z, AUGMENTED)
+    if not cold or not _is_heavy(run):
+        _pursue(run, plain)
+    if run.done or run.at_floor():
+        return
     g = system.sc.g
-    plain = g.copy()
-    point = z
+    given = g.copy()
+    point = run.best_z.copy()
+    other: InteriorPoint | None = None
     try:
         for outer in range(OUTER):
-            convex = EnergyRun(system, CONVEX_TOL * 0.1**min(outer, 4), run.budget, run.deadline)
+            convex = EnergyRun(system, CONVEX_TOL * 0.1 ** min(outer, 4), run.budget, run.deadline)
             solve_convex(convex, point, cold=outer == 0)
             point = convex.best_z
-            g[:] = plain
+            g[:] = given
             run.log.append(f"convex {convex.best:.0e}")
             run.score(point)
             if run.done:
                 return
-            proximal_newton(run, point.copy(), AUGMENTED, alpha=1e-4, limit=60)
+            _pursue(run, Proximal(point.copy(), AUGMENTED, 1e-3))
             if run.done or run.at_floor():
                 return
-            _lower_normals(run, plain, point)
+            if other is None:
+                other = InteriorPoint(system)
+                Proximal(other.everything, AUGMENTED, 1e-6).advance(run, STRETCH // 2)
+                if run.done or run.at_floor():
+                    return
+            if not plain.stuck:
+                plain.advance(run, STRETCH)
+                if run.done or run.at_floor():
+                    return
+            _lower_normals(run, given, point)
     finally:
-        g[:] = plain
+        g[:] = given
+
+
+def _pursue(run: Run, method: Proximal) -> None:
+    # As long as each stretch brings the residual down to a third.
+    while not run.done and not method.stuck:
+        before = run.best
+        method.advance(run, STRETCH)
+        if run.best > 0.3 * before or run.at_floor():
+            return
+
+
+def _is_heavy(run: Run) -> bool:
+    rows = run.system.sc.problem.rows
+    if rows is None:
+        return False
+    moving = rows.inv_mass[rows.inv_mass > 0.0]
+    return len(moving) > 0 and bool(moving.max() >= HEAVY * moving.min())
 
 
 def _lower_normals(run: Run, plain: FloatArray, z: FloatArray) -> None:

@@ -13,7 +13,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-import qdldl
 import scipy.linalg as sl
 import scipy.sparse as sp
 import scipy.sparse.linalg as ssl
@@ -403,6 +402,8 @@ def _fill_reducing(n: int, low: Any, high: Any) -> Any:
     other = np.concatenate([high, np.arange(n)])
     value = np.concatenate([np.full(len(low), -1.0), degree])
     graph = sp.csc_matrix((value, (index, other)), shape=(n, n))
+    import qdldl
+
     order = np.asarray(qdldl.Solver(graph, upper=True).factors()[2], np.int64)
     rank = np.empty(n, np.int64)
     rank[order] = np.arange(n)

@@ -18,6 +18,10 @@ from lavender.residuals import quick
 from lavender.solvers._ipm import AUGMENTED, CONVEX, InteriorPoint, System
 
 EPS = 1e-9  # proximal weight of the polish, relative to d; refinement takes it away again
+INNER_STEPS = 20  # Newton steps of one proximal round at most
+INNER_TOL = 0.1  # |F_c| at which a round ends, relative to its start
+MEMORY = 6  # steps that the non-monotone line search looks back
+PROBE = 1e-7  # proximal weight below which a round is as good as a plain Newton step
 ALPHA_LOW = 1e-12  # proximal weight below which a factorisation sees none
 
 
@@ -119,38 +123,69 @@ def polish(run: Run, z: FloatArray, law: int = CONVEX, *, patience: int = 2, lim
         if not np.isfinite(z).all():
             return
         relative = run.score(z)
+        if relative > 1e3 * best:
+            return
         worse = 0 if relative < 0.5 * best else worse + 1
         best = min(best, relative)
         if worse >= patience or (worse and run.at_floor()):
             return
 
 
-def proximal_newton(run: Run, z: FloatArray, law: int = CONVEX, *, alpha: float = 1e-4, limit: int = 1000) -> None:
+@dataclass
+class Proximal:
     """Proximal point with inner Newton: each round solves the problem of H + alpha, g + alpha c.
 
         F_c(z) = z - Pi(z - (H z - g) - alpha (z - c)),   c = z of the last round      (Rockafellar 1976)
 
     The inner problem is strongly monotone where H is monotone, its Newton system is factored with the
     proximal weight as it is, and steps pass a non-monotone line search on |F_c| (Grippo, Lampariello,
-    Lucidi 1986). alpha falls while rounds are short and rises where one fails.
+    Lucidi 1986). alpha falls the faster the shorter the rounds are, and rises where one fails.
+    `advance` goes on from where it stands.
     """
-    system = run.system
-    g = system.sc.g
-    f = np.empty_like(z)
-    last = system.factorisations + limit
-    run.score(z)
-    failures = idle = 0
-    while not run.done and system.factorisations < last:
-        c, hz, before, start = z, system.times(z), run.best, system.factorisations
+
+    z: FloatArray
+    law: int = CONVEX
+    alpha: float = 1e-2
+    slowest: float = 0.1  # alpha falls at most by this factor; closer to 1 after a failure
+    failures: int = 0
+    idle: int = 0
+    probed: float = 1e-2
+    stuck: bool = False
+
+    def advance(self, run: Run, limit: int = 10_000) -> None:
+        """Rounds until the judge is content, `limit` factorisations are spent, or nothing moves."""
+        system = run.system
+        last = system.factorisations + limit
+        run.score(self.z)
+        while not run.done and not self.stuck and system.factorisations < last:
+            if run.best < self.probed and self.alpha > PROBE:
+                # Near enough, plain Newton steps may end it: asked once for each decade.
+                polish(run, run.best_z.copy(), self.law, limit=4)
+                self.probed = 0.1 * run.best
+                if run.done:
+                    break
+            before, start = run.best, system.factorisations
+            solved = self._round(run)
+            used = system.factorisations - start
+            run.log.append(f"{self.alpha:.0e}:{used}{'' if solved else '!'}:{run.best:.0e}")
+            if run.best > 0.5 * before and run.at_floor():
+                break
+            self._adapt(solved, used, run.best > 0.5 * before)
+
+    def _round(self, run: Run) -> bool:
+        system, alpha, law = run.system, self.alpha, self.law
+        g = system.sc.g
+        z = c = self.z
+        f = np.empty_like(z)
+        hz = system.times(z)
         history: list[float] = []
         solved = False
-        for _ in range(12):
+        for _ in range(INNER_STEPS):
             size = system.natural(z, hz - g + alpha * (z - c), law, alpha, f)
             history.append(size)
-            if size <= 1e-3 * history[0] or size <= 1e-15 * float(np.sqrt(z @ z)):
+            if (size <= INNER_TOL * history[0] and len(history) > 1) or size == 0.0:
                 solved = True
-                if len(history) > 2 or size == 0.0:
-                    break
+                break
             if run.spent:
                 break
             system.factor_natural(alpha)
@@ -158,9 +193,9 @@ def proximal_newton(run: Run, z: FloatArray, law: int = CONVEX, *, alpha: float 
             if not np.isfinite(dz).all():
                 break
             hdz = system.times(dz)
-            bound = max(history[-4:])
+            bound = max(history[-MEMORY:])
             best, t = (np.inf, 1.0), 1.0
-            for _ in range(6):
+            for _ in range(7):
                 trial = z + t * dz
                 value = system.natural_size(trial, hz + t * hdz - g + alpha * (trial - c), law, f)
                 if value < best[0]:
@@ -168,28 +203,26 @@ def proximal_newton(run: Run, z: FloatArray, law: int = CONVEX, *, alpha: float 
                 if value <= (1.0 - 1e-4 * t) * bound:
                     break
                 t *= 0.5
-            if not best[0] < 1e6 * history[0]:
-                break
             z = z + best[1] * dz
             hz = hz + best[1] * hdz
             if run.score(z) <= run.tol:
                 break
-        used = system.factorisations - start
-        run.log.append(f"{alpha:.0e}:{used}{'' if solved else '!'}:{run.best:.0e}")
-        if run.done or (run.best > 0.5 * before and run.at_floor()):
-            break
-        if solved or run.best < 0.3 * before:
-            failures = 0
-            idle = idle + 1 if run.best > 0.5 * before else 0
-            if idle > 2 and alpha == ALPHA_LOW:
-                break
-            alpha = max(ALPHA_LOW, alpha * (0.03 if used <= 4 else 0.2 if used <= 8 else 0.7))
+        if solved or history[-1] <= history[0]:
+            self.z = z
+        return solved
+
+    def _adapt(self, solved: bool, used: int, idle: bool) -> None:
+        if solved:
+            self.failures = 0
+            fall = 0.05 if used <= 2 else 0.15 if used <= 4 else 0.4 if used <= 8 else 1.0
+            self.alpha = max(ALPHA_LOW, self.alpha * max(fall, self.slowest))
+            self.slowest = max(0.05, 0.5 * self.slowest)
+            self.idle = self.idle + 1 if self.alpha == ALPHA_LOW and idle else 0
         else:
-            failures += 1
-            alpha *= 30.0
-            z = run.best_z.copy()
-            if failures >= 4 or alpha > 10.0:
-                break
+            self.failures += 1
+            self.slowest = 0.2 if self.slowest < 0.2 else min(0.7, 2.0 * self.slowest)
+            self.alpha *= 5.0
+        self.stuck = self.idle > 3 or self.failures > 6 or self.alpha > 10.0
 
 
 def solve_convex(run: Run, z: FloatArray, cold: bool) -> None:
@@ -213,14 +246,14 @@ def solve_convex(run: Run, z: FloatArray, cold: bool) -> None:
             if rows:
                 polish(run, ip.z.copy())
             else:
-                proximal_newton(run, ip.z.copy(), alpha=min(1e-4, relative), limit=12)
+                Proximal(ip.z.copy(), alpha=min(1e-4, relative), probed=0.0).advance(run, 12)
             trigger = min(trigger, 0.1 * run.best) if run.best < 1e-6 else trigger
             if run.at_floor():
                 return
         if ip.length < 1e-6 or ip.gap < 1e-24 * ip.first_gap:
             break
     if not run.done:
-        proximal_newton(run, run.best_z.copy(), alpha=1e-5)
+        Proximal(run.best_z.copy(), alpha=1e-3).advance(run)
 
 
-__all__ = ["AUGMENTED", "CONVEX", "EnergyRun", "Run", "polish", "proximal_newton", "refined", "solve_convex"]
+__all__ = ["AUGMENTED", "CONVEX", "EnergyRun", "Proximal", "Run", "polish", "refined", "solve_convex"]
