@@ -1,9 +1,14 @@
-"""lavender: the constraint problem of one rigid-body step, solved by the solver you name, and judged."""
+"""lavender: the constraint problem of one rigid-body step, solved by the solver you name, and judged.
+
+Scenes, the engine, files, cases and reports are imported at their first use: `lavender.Scene`,
+`lavender.io`, `lavender.suite`, `lavender.bench`, `lavender.report`.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
 from lavender._version import __version__
-from lavender.check import CrossCheck, cross_check
 from lavender.cones import CONTACT, CONTACT_SPIN, ROW, Cones
-from lavender.engine import SOLVER_FIELDS, Simulation, Snapshot
 from lavender.errors import (
     CapabilityError,
     InputError,
@@ -15,9 +20,30 @@ from lavender.errors import (
 from lavender.problem import Problem, Rows
 from lavender.registry import SolverSpec, available, get, known, register
 from lavender.residuals import Residual, residual
-from lavender.scene import Scene
 from lavender.solution import Claim, Solution, Status
 from lavender.solve import prepare, solve
+
+if TYPE_CHECKING:
+    from lavender import bench, engine, io, report, scene, suite
+    from lavender.check import CrossCheck, cross_check
+    from lavender.engine import SOLVER_FIELDS, Simulation, Snapshot
+    from lavender.scene import Scene
+
+# Public name -> module that holds it; the module itself where both are the same.
+_LATER = {
+    "CrossCheck": "lavender.check",
+    "SOLVER_FIELDS": "lavender.engine",
+    "Scene": "lavender.scene",
+    "Simulation": "lavender.engine",
+    "Snapshot": "lavender.engine",
+    "bench": "lavender.bench",
+    "cross_check": "lavender.check",
+    "engine": "lavender.engine",
+    "io": "lavender.io",
+    "report": "lavender.report",
+    "scene": "lavender.scene",
+    "suite": "lavender.suite",
+}
 
 __all__ = [
     "CONTACT",
@@ -44,11 +70,30 @@ __all__ = [
     "UnknownName",
     "__version__",
     "available",
+    "bench",
     "cross_check",
+    "engine",
     "get",
+    "io",
     "known",
     "prepare",
     "register",
+    "report",
     "residual",
+    "scene",
     "solve",
+    "suite",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _LATER:
+        raise AttributeError(f"module 'lavender' has no attribute {name!r}")
+    module = import_module(_LATER[name])
+    value = module if _LATER[name] == f"lavender.{name}" else getattr(module, name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_LATER})
