@@ -29,6 +29,7 @@ from lavender.solve import solve
 __all__ = ["REFERENCES", "CrossCheck", "CrossCheckRow", "cross_check"]
 
 REFERENCES = ("osqp", "clarabel", "piqp", "direct")
+CONE_REFERENCES = ("clarabel_cone", "block_gauss_seidel")  # of relaxed friction, which is no QP
 REFERENCE_TOL = 1e-9  # relative residual that a reference must reach, or 10 times the floor
 SIGN_TOL = 1e-6  # multipliers of a reference: the judge has measured its accuracy, this finds wrong signs
 
@@ -150,7 +151,8 @@ def cross_check(
     """Solve with every solver and compare each with a judged reference.
 
     The reference must reach max(1e-9, 10 floor) by the judge and have multipliers of the right sign;
-    otherwise the next of osqp, clarabel, piqp, direct is taken, and named.
+    otherwise the next of osqp, clarabel, piqp, direct (relaxed friction: clarabel_cone,
+    block_gauss_seidel) is taken, and named.
 
     Parameters
     ----------
@@ -211,7 +213,7 @@ def _reference(
         return None, None, "Coulomb friction is not the optimality condition of a QP"
     if not problem.is_symmetric:
         return None, None, f"A is not symmetric (by {problem.asymmetry:.1e}), so the problem is no QP"
-    usual = ("clarabel_cone",) if problem.law == "cone" else REFERENCES
+    usual = CONE_REFERENCES if problem.law == "cone" else REFERENCES
     chain = (first, *(r for r in usual if r != first))
     failed = []
     for name in chain:
@@ -220,7 +222,9 @@ def _reference(
             failed.append(f"{name} {reason}")
             continue
         try:
-            solution = solve(problem, name, tol=0.1 * REFERENCE_TOL, time_limit=time_limit)
+            spec = get(name)
+            budget = 100 * spec.max_iter if spec.resumable else None  # a reference may take its time
+            solution = solve(problem, name, tol=0.1 * REFERENCE_TOL, max_iter=budget, time_limit=time_limit)
         except LavenderError as error:
             failed.append(f"{name}: {error}")
             continue

@@ -23,7 +23,6 @@ from lavender.solution import Claim, Status
 
 __all__ = ["Answer", "Limits", "ask", "definite_refusal", "quiet", "symmetric_refusal"]
 
-ATTEMPTS = 3
 EPS_MIN = 1e-14  # asked of a backend at the least: its own arithmetic stops there
 GAP_MIN = 1e-18
 # Of the objective: what the sums of a gap lose to rounding at a large mass ratio; and when asked again.
@@ -74,8 +73,8 @@ def ask(
     """Run the backend and write its iterate to `impulse`, or leave the start point and say why.
 
     A backend that says it is done where the judge does not find `tol` is asked again, 100 times more
-    closely, at most `ATTEMPTS` times in all: its tests are not the judge's. An interior-point method
-    leaves sqrt(x w) on a row where impulse and slack both vanish; its gap starts at eps and falls to eps^2.
+    closely, at most three times in all: its tests are not the judge's. An interior-point method leaves
+    sqrt(x w) on a row where impulse and slack both vanish, so its gap falls towards eps^2.
     """
     work: dict[str, int] = {"backend_calls": 0}
     if not len(qp.kept):
@@ -85,10 +84,12 @@ def ask(
         return Claim(Status.MAX_ITERATIONS, 0, work, "", qp.form)
     start = impulse.copy()
     eps = max(0.5 * target(problem, tol), EPS_MIN)
-    levels = [(eps, eps, GAP_RELATIVE)]
-    for i in range(1, ATTEMPTS):
-        closer = max(10.0 * eps * eps / 10.0**i, GAP_MIN)
-        levels.append((max(eps / 100.0**i, EPS_MIN), closer, GAP_RELATIVE_MIN))
+    # Unknowns are near 1, so objectives lie between 1 and m: a gap below 1e-13 is often lost in its own sums.
+    levels = [
+        (eps, 1e-2 * eps, GAP_RELATIVE),
+        (max(1e-2 * eps, EPS_MIN), max(1e-5 * eps, 1e-13), 1e-2 * GAP_RELATIVE),
+        (max(1e-4 * eps, EPS_MIN), max(1e-2 * eps * eps, GAP_MIN), GAP_RELATIVE_MIN),
+    ]
     if tol == 0.0:
         levels = levels[-1:]
     best: tuple[float, Claim, FloatArray] | None = None
@@ -100,10 +101,8 @@ def ask(
         for kind, count in claim.work.items():
             work[kind] = work.get(kind, 0) + count
         relative, floor = quick(problem, impulse, w, e, floor=True)
-        if best is not None and best[0] <= relative:
-            # Asked more closely it got no closer.
-            break
-        best = (relative, claim, impulse.copy())
+        if best is None or relative < best[0]:
+            best = (relative, claim, impulse.copy())
         left -= claim.iterations
         if time_limit is not None:
             time_left = time_limit - (perf_counter() - clock)
@@ -116,10 +115,14 @@ def ask(
             break
         impulse[:] = start
     assert best is not None
-    impulse[:] = best[2]
-    claim = best[1]
+    last = claim
+    relative, claim, impulse[:] = best
     status, words = claim.status, claim.message
-    if status is Status.NUMERICAL_ERROR and claim.dual is not None and best[0] <= tol:
+    if last is not claim and last.status is not Status.CONVERGED and relative > tol:
+        # Its looser answer was the better one; what it says of the closer ones is the claim.
+        status = Status.STALLED if last.status is Status.NUMERICAL_ERROR else last.status
+        words = f"{words}; asked more closely: {last.message}"
+    if status is Status.NUMERICAL_ERROR and claim.dual is not None and relative <= tol:
         # It broke down, in its own words, after it had got there.
         status = Status.STALLED
     if tol == 0.0 and status is Status.CONVERGED:
