@@ -36,7 +36,9 @@ def exact(problem):
         for i in range(problem.m):
             x[i] = np.clip(x[i] - (a[i] @ x - b[i]) / a[i, i], c.lower[i], c.upper[i])
     inside = (x > c.lower) & (x < c.upper)
-    x[inside] = np.linalg.solve(a[np.ix_(inside, inside)], b[inside] - a[np.ix_(inside, ~inside)] @ x[~inside])
+    x[inside] = np.linalg.solve(
+        a[np.ix_(inside, inside)], b[inside] - a[np.ix_(inside, ~inside)] @ x[~inside]
+    )
     return x
 
 
