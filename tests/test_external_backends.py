@@ -111,6 +111,8 @@ def test_indefinite_is_a_result_and_never_an_unmarked_wrong_claim(name):
 def test_infeasible_is_claimed_with_a_proof_or_marked(name, linear):
     a, b = np.array([[1.0, -1.0], [-1.0, 1.0]]), np.array([1.0, 1.0])
     problem = lv.Problem.linear(a, b) if linear else lv.Problem.lcp(a, b)
+    if registry.get(name).refuses(problem):
+        pytest.skip(f"{name} takes no linear problems")
     solution = lv.solve(problem, name, max_iter=500)
     assert not solution.success
     if name in PROVE_INFEASIBLE:
@@ -163,9 +165,7 @@ def test_redundant_contacts_in_the_form_that_suits_them(name, mass_ratio):
     # Singular A, and at 1e4 ill-conditioned: the velocity form is definite, so quadprog takes it too.
     problem = box_stack(10, mass_ratio)
     solution = lv.solve(problem, name)
-    assert solution.solver.form == (
-        "velocity" if mass_ratio > 1.0 or name in ("quadprog", "ecos") else "impulse"
-    )
+    assert solution.solver.form == ("velocity" if mass_ratio > 1.0 or name in DEFINITE else "impulse")
     assert solution.success, str(solution)
     # The boxes come to rest: A is singular, so the velocities are what is unique.
     speed = np.abs(problem.velocity(solution.impulse)).max()
@@ -243,7 +243,7 @@ def test_dual_holds_the_backends_own_multipliers(name, form):
     problem = lv.Problem(problem.b, problem.cones, rows=problem.rows, compliance=problem.compliance + 0.3)
     if form == "velocity" and name in DEFINITE:
         # Rows with two finite bounds add unknowns without a cost of their own: P is then only semidefinite.
-        assert "not positive definite" in lv.solve(problem, name, form=form).message
+        assert lv.solve(problem, name, form=form).status is lv.Status.NUMERICAL_ERROR
         form = "auto"
     solution = lv.solve(problem, name, form=form, tol=1e-8)
     assert solution.success, str(solution)

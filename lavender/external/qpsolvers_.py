@@ -105,7 +105,7 @@ class QPSolver:
                 unit_diagonal=self.unit_diagonal,
                 equality=b.linear == "equality" and problem.cones.is_free,
             )
-        if qp.is_bounds_only and not b.linear:
+        if len(qp.kept) and qp.is_bounds_only and not b.linear:
             raise CapabilityError(
                 f"solver {b.name!r} takes no problem without inequalities, and qpsolvers would hand it to LSQR; "
                 "use direct or another backend"
@@ -131,10 +131,8 @@ class QPSolver:
         )  # fmt: skip
 
 
-def refusal(backend: Backend, problem: Problem) -> str | None:
-    """Why this backend cannot take this problem, before any conversion."""
-    if not backend.linear and problem.cones.is_free and problem.rows is None:
-        return "takes no problem without inequalities (qpsolvers would hand it to LSQR)"
+def refusal(problem: Problem) -> str | None:
+    """Why no QP backend can take this problem, before any conversion."""
     return symmetric_refusal(problem) or definite_refusal(problem)
 
 
@@ -725,7 +723,7 @@ def _spec(backend: Backend) -> SolverSpec:
     return SolverSpec(
         name=backend.name,
         factory=partial(QPSolver, backend),
-        laws=frozenset({"linear", "lcp"}),
+        laws=frozenset({"linear", "lcp"} if backend.linear else {"lcp"}),
         resumable=False,
         external=True,
         impulse=backend.warm,
@@ -735,7 +733,7 @@ def _spec(backend: Backend) -> SolverSpec:
         install=backend.install,
         summary=f"{backend.summary} (QP backend)",
         reference=backend.reference,
-        refusal=partial(refusal, backend),
+        refusal=refusal,
     )
 
 
