@@ -140,8 +140,9 @@ def test_contradicting_rows_are_proved_in_the_velocity_form(name):
 
 @pytest.mark.parametrize("name", BACKENDS)
 def test_nothing_to_solve(name):
-    empty = lv.solve(lv.Problem.lcp(np.zeros((0, 0)), []), name)
-    assert empty.success
+    empty = lv.Problem.lcp(np.zeros((0, 0)), [])  # no row is bounded: its law is linear
+    if registry.get(name).refuses(empty) is None:
+        assert lv.solve(empty, name).success
     fixed = lv.solve(lv.Problem.lcp(np.eye(2), [1.0, 1.0], lower=[0.5, 2.0], upper=[0.5, 2.0]), name)
     assert fixed.success
     assert fixed.impulse.tolist() == [0.5, 2.0]
