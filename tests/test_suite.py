@@ -35,6 +35,9 @@ def test_a_function_and_its_name_agree():
     assert suite.case("pyramid(friction='cone', k=2)").name == "pyramid(k=2, friction=cone)"
     assert suite.case("stack(n=1e1)").name == "stack(n=10)"
     assert suite.case("two_particles").name == "two_particles"
+    assert suite.stack().name == "stack"
+    assert suite.case("near_parallel(angle=1e-09)").name == "near_parallel(angle=1e-9)"
+    assert suite.case("stack(mass_ratio=1000)").name == "stack(mass_ratio=1e3)"
     assert suite.case("two_particles(m2=0.1)").name == "two_particles(m2=0.1)"
     assert suite.case("two_particles(drift=-1e-3)").parameters["drift"] == -1e-3
 

@@ -16,7 +16,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from lavender.errors import UnknownName
-from lavender.suite.case import FAMILIES, Case, Reference, parse
+from lavender.suite import hard
+from lavender.suite.case import FAMILIES, Case, Reference, parse, spell
 from lavender.suite.families import (
     box_stack,
     boxed_friction,
@@ -31,6 +32,7 @@ from lavender.suite.families import (
 )
 
 __all__ = [
+    "FAMILIES",
     "SETS",
     "Case",
     "Reference",
@@ -43,6 +45,8 @@ __all__ = [
     "families",
     "granular",
     "hang",
+    "hard",
+    "parse",
     "pyramid",
     "random_spd",
     "stack",
@@ -72,6 +76,7 @@ SETS: dict[str, tuple[str, ...]] = {
         "granularF(n=4, sliding=0.5)",
         "granular(n=4, friction=cone)",
     ),
+    "hard": hard.SET,
 }
 
 
@@ -79,10 +84,8 @@ def families() -> dict[str, str]:
     """Every family: its name with parameters and their defaults, and one line."""
     out = {}
     for f in FAMILIES.values():
-        shown = [
-            str(p.replace(annotation=p.empty)) for n, p in f.signature.parameters.items() if n not in f.preset
-        ]
-        out[f"{f.name}({', '.join(shown)})".replace("'", "")] = f.summary
+        shown = [f"{n}={spell(p.default)}" for n, p in f.signature.parameters.items() if n not in f.preset]
+        out[f"{f.name}({', '.join(shown)})"] = f.summary
     return out
 
 

@@ -93,10 +93,11 @@ def family(**twins: Mapping[str, Any]) -> Callable[[Callable[P, Draft]], Callabl
         @functools.wraps(function)
         def make(*args: P.args, **kwargs: P.kwargs) -> Case:
             bound = signature.bind(*args, **kwargs)
+            given = frozenset(bound.arguments)
             bound.apply_defaults()
             values = {n: _check(name, signature.parameters[n], v) for n, v in bound.arguments.items()}
             draft = function(**values)  # type: ignore[call-arg]
-            text = _text(name, values)
+            text = _text(name, values, given)
             return Case(
                 text,
                 replace(draft.problem, name=text, copy=False),
@@ -134,8 +135,8 @@ def _check(name: str, parameter: inspect.Parameter, value: Any) -> Any:
     return number
 
 
-def _text(name: str, values: Mapping[str, Any]) -> str:
-    """The shortest name that gives these parameters."""
+def _text(name: str, values: Mapping[str, Any], given: frozenset[str]) -> str:
+    """A name that gives these parameters: what was asked for, spelled in one way."""
     best = name
     preset: Mapping[str, Any] = {}
     for alias in FAMILIES.values():
@@ -144,20 +145,23 @@ def _text(name: str, values: Mapping[str, Any]) -> str:
             best, preset = alias.name, fixed
     parameters = FAMILIES[name].signature.parameters
     shown = [
-        f"{n}={_spell(v)}"
-        for i, (n, v) in enumerate(values.items())
-        if n not in preset and ((i == 0 and isinstance(v, int)) or v != parameters[n].default)
+        f"{n}={spell(v)}"
+        for n, v in values.items()
+        if n not in preset and (n in given or v != parameters[n].default)
     ]
     return f"{best}({', '.join(shown)})" if shown else best
 
 
-def _spell(value: Any) -> str:
+def spell(value: Any) -> str:
+    """A value as it stands in names: the shortest text that gives the same number."""
     if not isinstance(value, float):
         return str(value)
-    plain = f"{value:.17g}" if value == int(value) else repr(value)
     mantissa, _, exponent = f"{value:.16e}".partition("e")
-    short = f"{mantissa.rstrip('0').rstrip('.')}e{int(exponent)}"
-    return min((s for s in (repr(value), plain, short) if float(s) == value), key=len)
+    spellings = [repr(value), f"{value:.17g}", f"{mantissa.rstrip('0').rstrip('.')}e{int(exponent)}"]
+    mantissa, _, exponent = repr(value).partition("e")
+    if exponent:
+        spellings.append(f"{mantissa}e{int(exponent)}")
+    return min((s for s in spellings if float(s) == value), key=len)
 
 
 def parse(text: str, known: Iterable[str] = ()) -> tuple[str, dict[str, Any]]:

@@ -11,21 +11,22 @@ checked. What passes is a solution whoever proposed it.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from math import fsum
 
 import numpy as np
 import scipy.sparse as sp
 import scipy.sparse.linalg as spla
 
-from lavender._arrays import FloatArray
+from lavender._arrays import FloatArray, IntArray
+from lavender.cones import ROW
 from lavender.errors import InputError
 from lavender.problem import Problem
 
-__all__ = ["Wide", "solve_boxed", "solve_linear"]
+__all__ = ["Wide", "at_rest", "solve_boxed", "solve_linear"]
 
 SPLIT = 2.0**27 + 1.0
-DENSE_ROWS = 1500  # up to here singular rows are found by a singular value decomposition
+DENSE_ROWS = 2000  # up to here singular rows are found by a singular value decomposition
 MAX_STEPS = 40
 
 Pair = tuple[FloatArray, FloatArray]
@@ -135,40 +136,125 @@ def solve_boxed(problem: Problem, candidate: FloatArray, margin: float = 1e-6) -
     return np.clip(hi, c.lower, c.upper)
 
 
+def at_rest(problem: Problem) -> FloatArray:
+    """Impulses within the cones that leave every body at rest (m,) [N s], proved; w = 0 is then the solution.
+
+    A linear program proposes them (J^T lambda = -M v*, as far inside |t1| + |t2| <= mu n as it can); they are
+    refined and checked like any candidate. Whatever the friction law, w = 0 with lambda in its cone is a solution.
+
+    Raises
+    ------
+    InputError
+        No such impulses were found: the bodies cannot stay at rest, or a row has no room for rounding.
+    """
+    c, rows = problem.cones, problem.rows
+    if rows is None or np.any(c.kind == ROW):
+        raise InputError("at_rest needs contacts given by rows")
+    normal = c.ptr[:-1]
+    weight = np.repeat(np.stack([1.0 / rows.inv_mass, 1.0 / rows.inv_inertia[:, 0, 0]], 1), 3, axis=1)
+    momentum = -weight * rows.v_free
+    largest = np.abs(momentum).max(axis=1, initial=1e-300)
+    wide = Wide(problem)
+    # Two scales of the balance: the largest weight of all (heavy on light), each body's own (light on heavy).
+    for scale in (np.full_like(largest, largest.max()), largest):
+        candidate = _inside(problem, momentum.ravel(), np.repeat(scale, 6))
+        if candidate is None:
+            continue
+        inside = np.repeat(candidate[normal] > 1e-12 * np.abs(candidate).max(), np.diff(c.ptr))
+        hi, lo = _solve_rows(problem, wide, inside, np.where(inside, candidate, 0.0))
+        if np.all(np.abs(wide.slack(hi, lo)) <= 2.0**-49 * wide.size(hi)) and _in_cones(problem, hi):
+            return hi
+    raise InputError("no impulses with room for rounding hold the bodies at rest")
+
+
+def _inside(problem: Problem, momentum: FloatArray, scale: FloatArray) -> FloatArray | None:
+    """J^T lambda = momentum (6 n,) [N s], rows divided by `scale`, as far inside the cones as a linear program can."""
+    from scipy.optimize import linprog
+
+    c = problem.cones
+    normal, k, m = c.ptr[:-1], problem.n_blocks, problem.m
+    balance = sp.csr_array(sp.diags_array(scale.max() / scale) @ problem.jacobian.T)
+    # Unknowns: lambda / scale.max() and the room s. Facets: s - n <= 0, and +-t1 +- t2 - mu n + s <= 0.
+    one = np.ones(k)
+    pairs = np.stack([normal, np.full(k, m)], 1).ravel()
+    facets = [sp.csr_array((np.tile([-1.0, 1.0], k), pairs, _ends(k, 2)), shape=(k, m + 1))]
+    for x, y in [(x, y) for x in (-1.0, 1.0) for y in (-1.0, 1.0)] if c.n_tangents.any() else []:
+        values = np.stack([-c.mu, x * one, y * one, one], 1).ravel()
+        columns = np.stack([normal, normal + 1, normal + 2, np.full(k, m)], 1).ravel()
+        facets.append(sp.csr_array((values, columns, _ends(k, 4)), shape=(k, m + 1)))
+    found = linprog(
+        np.append(np.zeros(m), -1.0),
+        A_ub=sp.vstack(facets),
+        b_ub=np.zeros(k * len(facets)),
+        A_eq=sp.hstack([balance, sp.csr_array((len(momentum), 1))]),
+        b_eq=momentum / scale,
+        bounds=[(None, None)] * m + [(0.0, scale.min() / scale.max())],
+        method="highs",
+    )
+    return scale.max() * found.x[:m] if found.status == 0 else None
+
+
+def _ends(k: int, each: int) -> IntArray:
+    return np.arange(0, each * k + 1, each, dtype=np.int32)
+
+
+def _in_cones(problem: Problem, impulse: FloatArray) -> bool:
+    c = problem.cones
+    normal = impulse[c.ptr[:-1]]
+    if not c.n_tangents.any():
+        return bool(normal.min(initial=0.0) >= 0.0)
+    t = np.stack([impulse[c.ptr[:-1] + 1], impulse[c.ptr[:-1] + 2]])
+    return bool(np.all(normal >= 0.0) and np.all(np.hypot(*t) <= c.mu * normal))
+
+
 def _solve_rows(problem: Problem, wide: Wide, rows: np.ndarray, start: FloatArray) -> Pair:
     """Solve w = 0 on `rows`, the other entries as in `start`; the smallest change where those rows depend."""
-    hi, lo = start.copy(), np.zeros_like(start)
     index = np.flatnonzero(rows)
     if len(index) == 0:
-        return hi, lo
-    solve = _solver(sp.csc_matrix(problem.csr[index][:, index]))
+        return start.copy(), np.zeros_like(start)
+    for solve in _solvers(sp.csc_matrix(problem.csr[index][:, index])):
+        found = _refined(wide, index, start, solve)
+        if found is not None:
+            return found
+    raise InputError("the refinement does not settle: the rows are singular to float64")
+
+
+def _refined(
+    wide: Wide, index: np.ndarray, start: FloatArray, solve: Callable[[FloatArray], FloatArray]
+) -> Pair | None:
+    hi, lo = start.copy(), np.zeros_like(start)
     last = np.inf
     for _ in range(MAX_STEPS):
         step = solve(-wide.slack(hi, lo)[index])
         change = float(np.abs(step).max())
+        if not np.isfinite(change):
+            return None
         # hi + lo + step, renormalised.
         x, y = hi[index], lo[index] + step
         hi[index] = total = x + y
         back = total - x
         lo[index] = (x - (total - back)) + (y - back)
-        if change <= 2.0**-60 * float(np.abs(hi).max()):
+        size = float(np.abs(hi).max())
+        if change <= 2.0**-60 * size:
             return hi, lo
-        if change > 0.5 * last and change <= 2.0**-53 * float(np.abs(hi).max()):
+        if change > 0.5 * last and change <= 2.0**-53 * size:
             return hi, lo  # dependent rows: what is left lies in the noise of the data
         last = change
-    raise InputError("the refinement does not settle: the rows are singular to float64")
+    return None
 
 
-def _solver(a: sp.csc_matrix) -> Callable[[FloatArray], FloatArray]:
+def _solvers(a: sp.csc_matrix) -> Iterator[Callable[[FloatArray], FloatArray]]:
+    """A factorisation, then inverses on ever smaller ranges of A, for rows that depend on each other."""
     if a.shape[0] <= DENSE_ROWS:
         dense = a.toarray()
         d = 1.0 / np.sqrt(np.maximum(np.abs(dense.diagonal()), 1e-300))
         u, s, vt = np.linalg.svd(dense * d[:, None] * d[None, :])
-        keep = s > 1e-13 * s[0]
-        if not keep.all():
-            pinv = (vt[keep].T / s[keep]) @ u[:, keep].T
-            return lambda r: d * (pinv @ (d * r))
+        for cut in (4e-15, 1e-12):
+            keep = s > cut * s[0]
+            inverse = (vt[keep].T / s[keep]) @ u[:, keep].T
+            yield lambda r, inverse=inverse: d * (inverse @ (d * r))  # type: ignore[misc]
+        return
     try:
-        return spla.splu(a).solve
+        yield spla.splu(a).solve
     except RuntimeError as error:
         raise InputError(f"the rows cannot be factorised ({error})") from None

@@ -8,6 +8,8 @@ relaxation have the same answer.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from lavender._arrays import FloatArray
@@ -24,23 +26,32 @@ from lavender.suite.build import (
     static_loads,
 )
 from lavender.suite.case import Draft, Reference, family
-from lavender.suite.exact import solve_linear
+from lavender.suite.exact import at_rest, solve_linear
 
 WITH_FRICTION = {"friction": "coulomb"}
 MU = 0.5
 SPHERE, BOX, PEBBLE, ROD = 0.1, 1.0 / 6.0, 0.1, 0.1  # inertia / mass [m^2]
 
 
-def _at_least(least: int, **sizes: int) -> None:
+def at_least(least: int, **sizes: int) -> None:
+    """Refuse sizes below `least`."""
     for name, value in sizes.items():
         if value < least:
             raise InputError(f"{name} is {value}; at least {least} is needed")
 
 
-def _positive(**values: float) -> None:
+def positive(**values: float) -> None:
+    """Refuse values that are not above 0."""
     for name, value in values.items():
         if not value > 0.0:
             raise InputError(f"{name} is {value}; a number above 0 is needed")
+
+
+def rest_reference(problem: Problem) -> Callable[[], Reference]:
+    """The reference of bodies that stay where they are: w = 0."""
+    return lambda: Reference(
+        at_rest(problem), "at rest: impulses from a linear program, proved in 100 bits", "slack"
+    )
 
 
 # -- stacks ---------------------------------------------------------------------------------------
@@ -53,8 +64,8 @@ def stack(n: int = 64, mass_ratio: float = 1.0, friction: str = "none", sliding:
     A is tridiagonal with condition number near n^2 (and mass_ratio on top). Frictionless and in one step
     of gravity, contact i carries what is above it: lambda_i = g h sum of masses above.
     """
-    _at_least(1, n=n)
-    _positive(mass_ratio=mass_ratio)
+    at_least(1, n=n)
+    positive(mass_ratio=mass_ratio)
     mass = np.ones(n)
     mass[-1] = mass_ratio
     k = np.arange(n)
@@ -100,8 +111,8 @@ def box_stack(n: int = 10, mass_ratio: float = 1.0, friction: str = "none", slid
 
 
 def _column(n: int, mass_ratio: float) -> tuple[Bodies, Contacts]:
-    _at_least(1, n=n)
-    _positive(mass_ratio=mass_ratio)
+    at_least(1, n=n)
+    positive(mass_ratio=mass_ratio)
     k = np.arange(n)
     mass = np.ones(n)
     mass[-1] = mass_ratio
@@ -123,12 +134,13 @@ def pyramid(
     """
     bodies, contacts = _triangle(k, mass_ratio, bottom_ratio)
     problem = _boxes(bodies, contacts, friction, sliding)
-    return Draft(problem, "more contacts than degrees of freedom, loads that spread sideways, heavy on light")
+    reason = "more contacts than degrees of freedom, loads that spread sideways, heavy on light"
+    return Draft(problem, reason, rest_reference(problem) if friction == "none" else None)
 
 
 def _triangle(k: int, mass_ratio: float, bottom_ratio: float = 1.0) -> tuple[Bodies, Contacts]:
-    _at_least(1, k=k)
-    _positive(mass_ratio=mass_ratio, bottom_ratio=bottom_ratio)
+    at_least(1, k=k)
+    positive(mass_ratio=mass_ratio, bottom_ratio=bottom_ratio)
     row = np.repeat(np.arange(k), k - np.arange(k))
     first = np.concatenate([[0], np.cumsum(k - np.arange(k))])  # first box of each row
     column = np.arange(len(row)) - first[row]
@@ -173,7 +185,7 @@ def granular(n: int = 4, friction: str = "none", sliding: float = 0.0, seed: int
     n = 4, 9, 18 give 299, 3,402 and 27,570 contacts (seed 7). Well conditioned and three-dimensional: sparse
     factorisations fill in, sweeps converge fast.
     """
-    _at_least(1, n=n)
+    at_least(1, n=n)
     bodies, contacts = _pile(n, seed)
     sideways(bodies, sliding)
     problem = contact_problem(bodies, contacts, friction, MU)
@@ -258,8 +270,8 @@ def chain(n: int = 33, tip_mass: float = 1.0) -> Draft:
 
     Half-bandwidth 5. Little tension travels: the easy chain.
     """
-    _at_least(1, n=n)
-    _positive(tip_mass=tip_mass)
+    at_least(1, n=n)
+    positive(tip_mass=tip_mass)
     k = np.arange(n)
     link = np.stack([0.8 + 0.0 * k, 0.3 * np.cos(k), -0.5 + 0.3 * np.sin(1.7 * k)], 1)
     problem = _chain(link, tip_mass, 0.02)
@@ -276,8 +288,8 @@ def hang(n: int = 33, tip_mass: float = 1.0) -> Draft:
 
     Half-bandwidth 5; the condition number grows as n^2 and with tip_mass: the hard chain.
     """
-    _at_least(1, n=n)
-    _positive(tip_mass=tip_mass)
+    at_least(1, n=n)
+    positive(tip_mass=tip_mass)
     k = np.arange(n)
     link = np.stack([1e-4 * np.cos(k), 1e-4 * np.sin(1.7 * k), -1.0 + 0.0 * k], 1)
     problem = _chain(link, tip_mass, 1e-4)
@@ -316,7 +328,7 @@ def ball_joints(position: FloatArray, body: np.ndarray, anchor: FloatArray) -> F
     return jac.reshape(-1, 12)
 
 
-def _linear(problem: Problem):  # type: ignore[no-untyped-def]
+def _linear(problem: Problem) -> Callable[[], Reference]:
     return lambda: Reference(solve_linear(problem), "factorised in float64, refined in 100 bits")
 
 
@@ -333,7 +345,7 @@ def two_particles(m1: float = 1.0, m2: float = 2.0, drift: float = 0.01) -> Draf
 
     The reduced mass 1/A answers: the impulse of a rod is its closing speed times m1 m2 / (m1 + m2).
     """
-    _positive(m1=m1, m2=m2)
+    positive(m1=m1, m2=m2)
     x = np.array([[0.0, 0.0, 0.0], [0.6, 0.0, 0.8]])
     bodies = Bodies(x, [m1, m2], 0.0)
     bodies.v_free[0, :3], bodies.v_free[1, :3] = [0.3, 0.0, -FALL], [0.0, 0.1, -FALL]
@@ -400,7 +412,7 @@ def random_spd(n: int = 100, condition: float = 1e6, seed: int = 0) -> Draft:
 
     b = A x with x of standard normal entries, so that every eigenvector matters.
     """
-    _at_least(1, n=n)
+    at_least(1, n=n)
     if not condition >= 1.0:
         raise InputError(f"condition is {condition}; 1 or more is needed")
     rng = np.random.default_rng(seed)
@@ -431,7 +443,7 @@ def boxed_friction(
         bodies, contacts = _triangle(n, mass_ratio)
         _shake(bodies)
     elif scene == "granular":
-        _at_least(1, n=n)
+        at_least(1, n=n)
         bodies, contacts = _pile(n, 7)
     else:
         raise InputError(f"scene is {scene!r}; box_stack, pyramid, granular are known")
