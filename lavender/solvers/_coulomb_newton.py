@@ -26,13 +26,19 @@ def solve_coulomb(run: Run, z: FloatArray, cold: bool) -> None:
     system = run.system
     plain = Proximal(z, AUGMENTED)
     if not cold or not _is_heavy(run):
+        plain.advance(run, STRETCH // 2)
+        if run.done or run.at_floor():
+            return
+        near = Proximal(InteriorPoint(system).everything, AUGMENTED, 1e-6)
+        near.advance(run, STRETCH // 3)
+        if run.done or run.at_floor():
+            return
         _pursue(run, plain)
     if run.done or run.at_floor():
         return
     g = system.sc.g
     given = g.copy()
     point = run.best_z.copy()
-    other: InteriorPoint | None = None
     try:
         for outer in range(OUTER):
             convex = EnergyRun(system, CONVEX_TOL * 0.1 ** min(outer, 4), run.budget, run.deadline)
@@ -46,11 +52,6 @@ def solve_coulomb(run: Run, z: FloatArray, cold: bool) -> None:
             _pursue(run, Proximal(point.copy(), AUGMENTED, 1e-3))
             if run.done or run.at_floor():
                 return
-            if other is None:
-                other = InteriorPoint(system)
-                Proximal(other.everything, AUGMENTED, 1e-6).advance(run, STRETCH // 2)
-                if run.done or run.at_floor():
-                    return
             if not plain.stuck:
                 plain.advance(run, STRETCH)
                 if run.done or run.at_floor():

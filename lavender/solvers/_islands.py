@@ -1,0 +1,87 @@
+"""Islands: blocks that share no moving body (rows) or no entry of A (matrix) are problems of their own."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import scipy.sparse as sp
+from scipy.sparse.csgraph import connected_components
+
+from lavender._arrays import FloatArray, IntArray
+from lavender.cones import Cones
+from lavender.problem import Problem
+
+
+def islands(problem: Problem) -> tuple[int, IntArray]:
+    """How many islands there are, and the island of each block (k,), numbered in block order.
+
+    A block between static bodies alone, or with an empty row of A, is an island of its own.
+    """
+    k = problem.n_blocks
+    if k == 0:
+        return 0, np.zeros(0, np.int32)
+    if problem.rows is not None:
+        body = np.concatenate([problem.rows.joint_body, problem.rows.contact_body])
+        block, side = np.nonzero(body >= 0)
+        index = k + body[block, side]
+        graph = sp.coo_array(
+            (np.ones(len(block)), (block, index)), shape=(k + problem.rows.n_bodies,) * 2
+        )
+    else:
+        a = problem.csr
+        of_row = np.repeat(np.arange(k), np.diff(problem.cones.ptr))
+        entry_row = np.repeat(np.arange(problem.m), np.diff(a.indptr))
+        graph = sp.coo_array((np.ones(a.nnz), (of_row[entry_row], of_row[a.indices])), shape=(k, k))
+    _, label = connected_components(graph, directed=False)
+    _, first, inverse = np.unique(label[:k], return_index=True, return_inverse=True)
+    rank = np.empty(len(first), np.int32)
+    rank[np.argsort(first)] = np.arange(len(first))
+    return len(first), rank[inverse.ravel()]
+
+
+def rows_of(problem: Problem, blocks: IntArray) -> IntArray:
+    """Row numbers of these blocks, in order."""
+    ptr = problem.cones.ptr
+    size = np.diff(ptr)[blocks]
+    start = np.repeat(ptr[:-1][blocks], size)
+    inner = np.arange(int(size.sum())) - np.repeat(np.cumsum(size) - size, size)
+    return start + inner
+
+
+def restrict(problem: Problem, blocks: IntArray, rows: IntArray) -> Problem:
+    """The problem of these blocks alone; exact where they are whole islands."""
+    c = problem.cones
+    size = np.diff(c.ptr)[blocks]
+    ptr = np.concatenate([[0], np.cumsum(size)]).astype(np.int32)
+    cones = Cones(ptr, c.kind[blocks], c.lower[rows], c.upper[rows], c.mu[blocks], c.patch_radius[blocks])
+    names = None if problem.names is None else [problem.names[i] for i in blocks]
+    more: dict[str, Any] = {"friction": problem.friction, "names": names, "name": problem.name}
+    b: FloatArray = problem.b[rows]
+    if problem.rows is None:
+        return Problem(b, cones, problem.csr[rows][:, rows], **more)
+    given = problem.rows
+    joints = blocks[blocks < given.n_joints]
+    contacts = blocks[blocks >= given.n_joints] - given.n_joints
+    used = np.unique(np.concatenate([given.joint_body[joints].ravel(), given.contact_body[contacts].ravel()]))
+    used = used[used >= 0]
+    number = np.full(given.n_bodies + 1, -1, np.int32)  # the last entry is body -1
+    number[used] = np.arange(len(used))
+    joint_rows = int(np.diff(given.joint_ptr)[joints].sum())
+    part = replace(
+        given,
+        inv_mass=given.inv_mass[used],
+        inv_inertia=given.inv_inertia[used],
+        v_free=given.v_free[used],
+        jac=given.jac[rows[:joint_rows]],
+        joint_ptr=np.concatenate([[0], np.cumsum(np.diff(given.joint_ptr)[joints])]).astype(np.int32),
+        joint_body=number[given.joint_body[joints]],
+        normal=given.normal[contacts],
+        tangent=given.tangent[contacts],
+        arm_a=given.arm_a[contacts],
+        arm_b=given.arm_b[contacts],
+        contact_body=number[given.contact_body[contacts]],
+    )
+    assert problem.compliance is not None
+    return Problem(b, cones, rows=part, compliance=problem.compliance[rows], **more)
