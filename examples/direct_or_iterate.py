@@ -54,7 +54,9 @@ def figure(found, path):
         for solver, style in zip(SOLVERS, ("-", "--"), strict=True):
             h = row[solver].history
             axes.loglog(h.iterations[1:], h.relative[1:], style, label=solver)
-        axes.axhline(row["direct"].residual.relative, color="k", linestyle=":", label="direct, one factorisation")
+        axes.axhline(
+            row["direct"].residual.relative, color="k", linestyle=":", label="direct, one factorisation"
+        )
         axes.set_title(f"condition {row['condition']:.1e}")
         axes.set_xlabel("sweeps")
     canvas.axes[0].set_ylabel("relative residual")
@@ -70,7 +72,9 @@ def main(path="direct_or_iterate.png"):
     print(f"{'':>10} {'residual':>9} {'sweeps':>14} {'sweeps':>10}   (to a relative residual of {TOL:g})")
     for row in found.values():
         sweeps = [row[s].work["sweeps"] for s in SOLVERS]
-        print(f"{row['condition']:>10.1e} {row['direct'].residual.relative:>9.1e} {sweeps[0]:>14} {sweeps[1]:>10}")
+        print(
+            f"{row['condition']:>10.1e} {row['direct'].residual.relative:>9.1e} {sweeps[0]:>14} {sweeps[1]:>10}"
+        )
     figure(found, path)
     print(f"figure: {path}")
 

@@ -91,7 +91,11 @@ def main(path="friction_bounds.png"):
     print(f"{'contact':<22}" + "".join(f"{i + 1:>9}" for i in range(N)))
     print(f"{'normal':<22}" + "".join(f"{x + 0.0:>9.5f}" for x in found["rounds"][-1][0::2]))
     rows = [(f"tangent, round {i}", x) for i, x in enumerate(found["rounds"])]
-    for name, impulse in [*rows, ("tangent, glued", found["glued"]), ("tangent, Coulomb", found["coulomb"].impulse)]:
+    for name, impulse in [
+        *rows,
+        ("tangent, glued", found["glued"]),
+        ("tangent, Coulomb", found["coulomb"].impulse),
+    ]:
         print(f"{name:<22}" + "".join(f"{x + 0.0:>9.5f}" for x in impulse[1::2]))
     gap = max(np.abs(found["rounds"][-1] - found[name]).max() for name in ("osqp", "pgs"))
     print(f"direct, OSQP and projected Gauss-Seidel agree on the bounded QP within {gap:.1e} N s")

@@ -63,7 +63,9 @@ def figure(found, path):
         left.plot(sweeps, found["impulse"][:, i], color=f"C{i}", label=f"contact {i + 1}")
         left.plot(SWEEPS, found["clamped"][i], "x", color=f"C{i}")
         middle.plot(sweeps, found["slack"][:, i], color=f"C{i}")
-    left.set(title="impulse (x: solved, then clamped)", ylabel="impulse [N s]", xlabel="sweeps", xscale="symlog")
+    left.set(
+        title="impulse (x: solved, then clamped)", ylabel="impulse [N s]", xlabel="sweeps", xscale="symlog"
+    )
     left.legend(fontsize=7)
     middle.set(title="slack", ylabel="slack [m/s]", xlabel="sweeps", xscale="symlog")
     right.semilogy(sweeps, np.maximum(found["r_p"], 1e-17), label="projected Gauss-Seidel")
@@ -81,7 +83,10 @@ def main(path="toy_stack.png"):
         print(f"{name:<14}" + "".join(f"{x + 0.0:>9.4f}" for x in found[name]))
     for sweep in (0, 1, 4, 16, 64, SWEEPS):
         print(f"after {sweep:>3} sweeps  r_p {found['r_p'][sweep]:.2e}")
-    print(f"solved, then clamped once  r_p {found['clamped_r_p']:.2e}: boxes still approach at {-found['clamped_slack'].min():.3f} m/s")
+    print(
+        f"solved, then clamped once  r_p {found['clamped_r_p']:.2e}: "
+        f"boxes still approach at {-found['clamped_slack'].min():.3f} m/s"
+    )
     figure(found, path)
     print(f"figure: {path}")
 

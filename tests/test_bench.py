@@ -13,8 +13,7 @@ import pytest
 import lavender as lv
 from lavender import bench, registry
 from lavender.bench import cases as bench_cases
-from lavender.bench import machine, store, timing
-from lavender.bench import runner
+from lavender.bench import machine, runner, store, timing
 from lavender.bench.record import Record, from_json, to_json
 from lavender.bench.worker import Worker
 
@@ -130,7 +129,9 @@ def test_exact_solvers_run_once_and_hopeless_levels_are_left_out():
 
 def test_a_solver_that_raises_costs_its_own_record(fakes):
     fakes("raise", "nan", "lie")
-    records = bench.run([stack(4, "one"), stack(5, "two")], ["fake_raise", "fake_nan", "fake_lie", "pgs"], QUICK)
+    records = bench.run(
+        [stack(4, "one"), stack(5, "two")], ["fake_raise", "fake_nan", "fake_lie", "pgs"], QUICK
+    )
     by = {(r.case, r.solver): r for r in records}
     for case in ("one", "two"):
         assert by[case, "fake_raise"].status == "ERROR"
@@ -240,7 +241,9 @@ def test_a_full_disk_is_said_and_the_next_run_goes_on(tmp_path, monkeypatch):
     with pytest.raises(lv.InputError, match="No space left"):
         bench.run([stack(6)], ["pgs", "direct"], QUICK, opened)
     opened_file.close()
-    assert len(bench.run([stack(6)], ["pgs", "direct"], QUICK, path)) == len({r.key for r in bench.read(path)})
+    assert len(bench.run([stack(6)], ["pgs", "direct"], QUICK, path)) == len(
+        {r.key for r in bench.read(path)}
+    )
 
 
 def test_an_unwritable_place_is_known_before_anything_runs(tmp_path):
@@ -418,8 +421,8 @@ hang, segfault, exit_, eat, talk = map(make, ("hang", "segfault", "exit", "eat",
 def spec(name, factory):
     return lv.SolverSpec(name, "fake_backends:" + factory, laws={"linear", "lcp"}, summary="test", resumable=False,
                          requires=("fake_backends",))
-specs = [spec("hang", "hang"), spec("segfault", "segfault"), spec("exit", "exit_"), spec("eat", "eat"), spec("talk", "talk")]
-HANG, SEGFAULT, EXIT, EAT, TALK = specs
+names = {"hang": "hang", "segfault": "segfault", "exit": "exit_", "eat": "eat", "talk": "talk"}
+HANG, SEGFAULT, EXIT, EAT, TALK = (spec(name, factory) for name, factory in names.items())
 """
 
 
@@ -448,7 +451,9 @@ def task(problem, solver, **more):
 def test_a_backend_that_hangs_or_dies_costs_its_own_record(plugin):
     p = lv.Problem.linear(np.diag([1.0, 2.0]), np.ones(2))
     with Worker(memory=2**31, grace=1.0) as worker:
-        found = {name: worker.measure(p, task(p, name)) for name in ("talk", "hang", "segfault", "exit", "eat")}
+        found = {
+            name: worker.measure(p, task(p, name)) for name in ("talk", "hang", "segfault", "exit", "eat")
+        }
         after = worker.measure(p, task(p, "talk"))
     assert found["hang"].status == "KILLED"
     assert found["segfault"].status == "CRASHED (SIGSEGV)"

@@ -1,6 +1,7 @@
 """The examples run, and the relations that they show hold."""
 
 import importlib.util
+import itertools
 from pathlib import Path
 
 import numpy as np
@@ -34,7 +35,7 @@ def test_direct_does_not_mind_the_condition_number_and_sweeps_do():
         for solver in module.SOLVERS:
             assert row[solver].success
             assert row[solver].history.relative[-1] <= module.TOL
-    for easy, hard in zip(rows, rows[1:], strict=False):
+    for easy, hard in itertools.pairwise(rows):
         ratio = hard["condition"] / easy["condition"]
         for solver in module.SOLVERS:
             # Theory: the rate is 1 - c / condition, so sweeps grow like the condition number; within a factor 3 here.
@@ -49,7 +50,9 @@ def test_sweeps_solve_the_toy_stack_and_clamping_once_does_not():
     # Contact 5 opens; the boxes below carry their own weight alone.
     assert exact[4] == 0.0
     assert np.all(np.delete(exact, 4) > 0.0)
-    np.testing.assert_allclose(exact[:4], example("toy_stack").GRAVITY_STEP * np.array([4, 3, 2, 1]), rtol=1e-12)
+    np.testing.assert_allclose(
+        exact[:4], example("toy_stack").GRAVITY_STEP * np.array([4, 3, 2, 1]), rtol=1e-12
+    )
     assert found["r_p"][0] > found["r_p"][16] > 100 * found["r_p"][-1]
     # 400 sweeps at a rate of cos(pi / 10)^2 or better leave nothing but rounding.
     np.testing.assert_allclose(found["impulse"][-1], exact, rtol=0.0, atol=1e-12)

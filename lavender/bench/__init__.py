@@ -8,11 +8,11 @@ Nothing here draws or prints; `lavender.report` reads the records.
 
 from lavender.bench.cases import Item, resolve, structure_of
 from lavender.bench.machine import cpu_name
-from lavender.bench.timing import Task, measure, one_thread
 from lavender.bench.plan import Plan
 from lavender.bench.record import CaseInfo, Record, Run, Skip, level_name
 from lavender.bench.runner import Event, run, solver_names
 from lavender.bench.store import Records, Store, read, write_csv, write_json
+from lavender.bench.timing import Task, measure, one_thread
 
 __all__ = [
     "CaseInfo",

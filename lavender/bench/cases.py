@@ -15,6 +15,7 @@ from lavender.bench.record import CaseInfo
 from lavender.cones import ROW
 from lavender.errors import InputError
 from lavender.problem import Problem
+from lavender.suite import Case
 
 __all__ = ["SUFFIXES", "Item", "describe", "resolve", "structure_of"]
 
@@ -44,8 +45,11 @@ class Item:
         self.__dict__.pop("problem", None)
 
 
-def resolve(words: Iterable[str | Path | Problem]) -> list[Item]:
-    """Cases behind files, folders (all problem files in them), suite names or problems; all of the suite if none.
+Source = str | Path | Problem | Case | Item
+
+
+def resolve(words: Iterable[Source]) -> list[Item]:
+    """Cases behind files, folders (their problem files), names or cases of the suite, problems; all of it if none.
 
     Nothing is loaded yet, but every word is checked to exist.
 
@@ -66,7 +70,9 @@ def resolve(words: Iterable[str | Path | Problem]) -> list[Item]:
         if isinstance(word, Problem):
             name = word.name or f"problem {len(items)}"
             items.append(Item(name, name, _constant(word)))
-        elif hasattr(word, "problem") and hasattr(word, "reason"):
+        elif isinstance(word, Item):
+            items.append(word)
+        elif isinstance(word, Case):
             items.append(_from_case(word, word.name))
         elif Path(word).is_dir():
             paths = sorted(p for p in Path(word).iterdir() if p.suffix.lower() in SUFFIXES)
@@ -76,7 +82,9 @@ def resolve(words: Iterable[str | Path | Problem]) -> list[Item]:
         elif Path(word).exists():
             items.append(_from_file(Path(word)))
         elif Path(word).suffix.lower() in SUFFIXES or "/" in str(word):
-            raise InputError(f"{word}: no such file; give problem files ({', '.join(SUFFIXES)}), folders or suite names")
+            raise InputError(
+                f"{word}: no such file; give problem files ({', '.join(SUFFIXES)}), folders or suite names"
+            )
         else:
             from lavender import suite
 
@@ -88,7 +96,7 @@ def _constant(problem: Problem) -> Callable[[], Problem]:
     return lambda: problem
 
 
-def _from_case(case: Any, source: str) -> Item:
+def _from_case(case: Case, source: str) -> Item:
     return Item(case.name, source, _constant(case.problem), case.reason)
 
 
@@ -155,7 +163,8 @@ def mass_ratio(problem: Problem) -> float:
         x = problem.rows.inv_mass
     else:
         c = problem.cones
-        x = problem.d[np.concatenate([np.flatnonzero(np.repeat(c.kind == ROW, np.diff(c.ptr))), c.ptr[:-1][c.kind != ROW]])]
+        rows = np.flatnonzero(np.repeat(c.kind == ROW, np.diff(c.ptr)))
+        x = problem.d[np.concatenate([rows, c.ptr[:-1][c.kind != ROW]])]
     x = x[x > 0.0]
     return float(x.max() / x.min()) if len(x) else 1.0
 
@@ -224,4 +233,6 @@ def _redundant(problem: Problem) -> bool:
     scale = 1.0 / np.sqrt(problem.d)
     a = problem.dense() * scale[:, None] * scale[None, :]
     values = np.linalg.svd(a, compute_uv=False)
-    return bool(values[-1] <= 1e-12 * max(values[0], 1e-300))  # far below any condition number met in practice
+    return bool(
+        values[-1] <= 1e-12 * max(values[0], 1e-300)
+    )  # far below any condition number met in practice

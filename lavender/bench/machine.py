@@ -25,7 +25,9 @@ def cpu_name() -> str:
     """Model of the processor, as the system names it."""
     info = Path("/proc/cpuinfo")
     if info.exists():
-        found = re.search(r"^(?:model name|Model)\s*:\s*(.+)$", info.read_text(errors="replace"), re.MULTILINE)
+        found = re.search(
+            r"^(?:model name|Model)\s*:\s*(.+)$", info.read_text(errors="replace"), re.MULTILINE
+        )
         if found:
             return found[1].strip()
     return platform.processor() or platform.machine() or "unknown"

@@ -7,9 +7,10 @@ from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from lavender.bench.timing import Task
 from lavender.bench.record import CaseInfo, Record
-from lavender.errors import InputError
+from lavender.bench.timing import Task
+from lavender.errors import InputError, UnknownName
+from lavender.ordering import ORDERS
 from lavender.problem import Problem
 from lavender.registry import SolverSpec
 
@@ -36,7 +37,9 @@ class Plan:
     Raises
     ------
     InputError
-        A level, budget, count or limit that is not positive.
+        A level, budget, count or limit that is not positive, a senseless seed.
+    UnknownName
+        An order that does not exist.
     """
 
     levels: Sequence[float] = (1e-3, 1e-6, 1e-9)
@@ -58,6 +61,12 @@ class Plan:
             raise InputError(f"repeats is {self.repeats}; at least 1 is needed")
         if not (math.isfinite(self.time_limit) and self.time_limit > 0.0):
             raise InputError(f"time limit is {self.time_limit}; a positive number of seconds is needed")
+        for word in self.orders:
+            name, _, seed = word.partition(":")
+            if name not in ORDERS:
+                raise UnknownName("order", name, ORDERS)
+            if seed and not (name == "random" and seed.isdecimal()):
+                raise InputError(f"order {word!r}: only random takes a seed, a whole number: random:3")
         object.__setattr__(self, "levels", tuple(sorted(map(float, self.levels), reverse=True)))
         object.__setattr__(self, "budgets", tuple(sorted(map(int, self.budgets))))
         object.__setattr__(self, "orders", tuple(self.orders))
@@ -87,7 +96,11 @@ class Plan:
             levels = self.levels[-1:] if spec.exact else self.levels
             for level in levels:
                 record: Record | None = yield task("tol", level, UNLIMITED if spec.resumable else 0, start)
-                if record is not None and not record.relative <= level and (spec.resumable or _hopeless(record)):
+                if (
+                    record is not None
+                    and not record.relative <= level
+                    and (spec.resumable or _hopeless(record))
+                ):
                     break
             if spec.resumable and not spec.exact:
                 for n in self.budgets:
@@ -103,4 +116,6 @@ class Plan:
 
 
 def _hopeless(record: Record) -> bool:
-    return record.status in ("TIME_LIMIT", "KILLED", "ERROR", "INFEASIBLE") or record.status.startswith("CRASHED")
+    return record.status in ("TIME_LIMIT", "KILLED", "ERROR", "INFEASIBLE") or record.status.startswith(
+        "CRASHED"
+    )

@@ -77,7 +77,9 @@ class Record:
     sha: str  # of the case's numbers
     solver: str
     options: Mapping[str, Any]
-    start: str  # "cold" from doing nothing, "warm" from the guess of the problem, "carried" from the step before
+    start: (
+        str  # "cold" from doing nothing, "warm" from the guess of the problem, "carried" from the step before
+    )
     mode: str  # "tol": to that residual; "budget": exactly max_iter iterations
     tol: float
     max_iter: int

@@ -9,11 +9,11 @@ from typing import Any
 
 from lavender import registry
 from lavender.bench import machine
-from lavender.bench.cases import Item, describe, resolve
-from lavender.bench.timing import Task, measure
+from lavender.bench.cases import Item, Source, describe, resolve
 from lavender.bench.plan import Plan
 from lavender.bench.record import CaseInfo, Record, Run, Skip
 from lavender.bench.store import Records, Store
+from lavender.bench.timing import Task, measure
 from lavender.bench.worker import Worker
 from lavender.errors import LavenderError
 from lavender.problem import Problem
@@ -38,7 +38,11 @@ class Event:
 
 def is_foreign(spec: SolverSpec) -> bool:
     """Code that other packages brought, which a process of its own can import."""
-    return spec.external or bool(spec.requires) or (isinstance(spec.factory, str) and not spec.factory.startswith("lavender."))
+    return (
+        spec.external
+        or bool(spec.requires)
+        or (isinstance(spec.factory, str) and not spec.factory.startswith("lavender."))
+    )
 
 
 def solver_names(names: Sequence[str] | None) -> list[str]:
@@ -56,7 +60,7 @@ def solver_names(names: Sequence[str] | None) -> list[str]:
 
 
 def run(
-    cases: Iterable[str | Path | Problem] = (),
+    cases: Iterable[Source] = (),
     solvers: Sequence[str] | None = None,
     plan: Plan | None = None,
     store: Store | str | Path | None = None,
@@ -89,7 +93,7 @@ def run(
         Of this run: those made and those found.
     """
     plan = plan or Plan()
-    items = cases if isinstance(cases, list) and all(isinstance(c, Item) for c in cases) else resolve(cases)
+    items = resolve(cases)
     names = solver_names(solvers)
     specs = registry.specs()
     packages = {module for name in names for module in specs[name].requires}
@@ -106,9 +110,22 @@ def run(
 
 class _Runner:
     def __init__(
-        self, this: Run, plan: Plan, names: list[str], store: Store | None, watch: Watch | None, worker: Worker | None
+        self,
+        this: Run,
+        plan: Plan,
+        names: list[str],
+        store: Store | None,
+        watch: Watch | None,
+        worker: Worker | None,
     ) -> None:
-        self.this, self.plan, self.names, self.store, self.watch, self.worker = this, plan, names, store, watch, worker
+        self.this, self.plan, self.names, self.store, self.watch, self.worker = (
+            this,
+            plan,
+            names,
+            store,
+            watch,
+            worker,
+        )
         self.specs = registry.specs()
         self.out = Records(source=str(store.path) if store else "")
         self.done = 0

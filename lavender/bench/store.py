@@ -38,7 +38,9 @@ class Records:
         elif isinstance(entry, CaseInfo):
             self.cases[entry.case] = entry
         elif isinstance(entry, Skip):
-            self.skips = [s for s in self.skips if (s.run, s.case, s.solver) != (entry.run, entry.case, entry.solver)]
+            self.skips = [
+                s for s in self.skips if (s.run, s.case, s.solver) != (entry.run, entry.case, entry.solver)
+            ]
             self.skips.append(entry)
         else:
             self.records.append(entry)
@@ -124,7 +126,9 @@ class Store:
             self._file.write(line + "\n")
             self._file.flush()
             if isinstance(entry, Record):
-                os.fdatasync(self._file.fileno()) if hasattr(os, "fdatasync") else os.fsync(self._file.fileno())
+                os.fdatasync(self._file.fileno()) if hasattr(os, "fdatasync") else os.fsync(
+                    self._file.fileno()
+                )
         except OSError as error:
             raise InputError(
                 f"cannot write {self.path} ({error.strerror or error}): make room and run the same command again; "
@@ -167,7 +171,9 @@ def read(path: str | Path) -> Records:
     try:
         lines = path.read_text(encoding="utf-8", errors="replace").split("\n")
     except OSError as error:
-        raise InputError(f"cannot read {path} ({error.strerror or error}); a records.jsonl is needed") from None
+        raise InputError(
+            f"cannot read {path} ({error.strerror or error}); a records.jsonl is needed"
+        ) from None
     found = Records(source=str(path))
     last = lines.pop()  # without a newline: empty, or torn
     for number, line in enumerate(lines, 1):
@@ -189,7 +195,9 @@ def write_csv(records: Records, path: str | Path) -> None:
         writer = csv.DictWriter(f, columns)
         writer.writeheader()
         for row in rows:
-            writer.writerow({k: json.dumps(v, default=str) if isinstance(v, dict) else v for k, v in row.items()})
+            writer.writerow(
+                {k: json.dumps(v, default=str) if isinstance(v, dict) else v for k, v in row.items()}
+            )
 
 
 def write_json(records: Records, path: str | Path) -> None:

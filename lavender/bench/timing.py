@@ -48,7 +48,15 @@ class Task:
     def key(self) -> tuple[Any, ...]:
         """As `Record.key` of what comes out."""
         return task_key(
-            self.case, self.sha, self.solver, self.options, self.start, self.mode, self.tol, self.max_iter, self.time_limit
+            self.case,
+            self.sha,
+            self.solver,
+            self.options,
+            self.start,
+            self.mode,
+            self.tol,
+            self.max_iter,
+            self.time_limit,
         )
 
     def record(self, **what: Any) -> Record:
@@ -124,6 +132,7 @@ def measure_solution(problem: Problem, task: Task, impulse: Any = None) -> tuple
         # A backend may raise anything; it costs its own record, never the run.
         text = f"{type(error).__name__}: {error}".strip()
         return task.record(status=ERROR, message=text[:500], repeats=len(solves)), None
+    assert solution is not None  # there is at least one repeat
     return record_of(task, solution, setups, solves), solution
 
 

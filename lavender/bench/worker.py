@@ -1,6 +1,6 @@
 """A process of its own for code that is not ours: it may hang, eat memory or die, and costs one record.
 
-The parent starts `python -m lavender.bench.worker`, sends a problem once and tasks after it, and gets
+The parent starts another Python, sends a problem once and tasks after it, and gets
 records back: pickles with a length in front, over the standard streams. What a backend prints goes to
 nowhere. A worker that does not answer in time is killed; the next task starts another.
 """
@@ -18,8 +18,8 @@ import sys
 import threading
 from typing import IO, Any
 
-from lavender.bench.timing import Task
 from lavender.bench.record import CRASHED, KILLED, Record
+from lavender.bench.timing import Task
 from lavender.problem import Problem
 
 __all__ = ["Worker"]
@@ -72,7 +72,11 @@ class Worker:
     def measure(self, problem: Problem, task: Task, impulse: Any = None) -> Record:
         """As `lavender.bench.timing.measure`, in the worker."""
         if self._process is None:
-            self._start()
+            cause = self._start()
+            if cause:
+                return task.record(
+                    status=f"{CRASHED} (did not start)", message=f"the worker process ended: {cause}"
+                )
         # Repeats end once they took the limit together, so at most two can take it; backends look at the clock
         # now and then.
         limit = 3.0 * task.time_limit + self.grace
@@ -85,18 +89,28 @@ class Worker:
             answer = self._answers.get(timeout=limit)
         except queue.Empty:
             self._end()
-            return task.record(status=KILLED, message=f"did not stop; its process was killed after {limit:.3g} s")
+            return task.record(
+                status=KILLED, message=f"did not stop; its process was killed after {limit:.3g} s"
+            )
         except (BrokenPipeError, OSError):
             answer = None
         except KeyboardInterrupt:
             self._end()
             raise
         if answer is None:
-            return task.record(status=f"{CRASHED} ({self._cause()})", message="the process of the backend died")
+            return task.record(
+                status=f"{CRASHED} ({self._cause()})", message="the process of the backend died"
+            )
         return answer
 
-    def _start(self) -> None:
-        environment = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
+    def _start(self) -> str:
+        """Start a process and wait until it is ready; why it is not, or nothing."""
+        environment = {
+            **os.environ,
+            "OMP_NUM_THREADS": "1",
+            "OPENBLAS_NUM_THREADS": "1",
+            "MKL_NUM_THREADS": "1",
+        }
         environment["PYTHONPATH"] = os.pathsep.join(p or os.getcwd() for p in sys.path)
         self._process = subprocess.Popen(
             [sys.executable, "-c", _START, str(self.memory or 0)],
@@ -122,9 +136,7 @@ class Worker:
             ready = answers.get(timeout=START_TIME)
         except queue.Empty:
             ready = None
-        if ready != "ready":
-            cause = self._cause()
-            raise RuntimeError(f"the worker process did not start ({cause})")
+        return "" if ready == "ready" else self._cause()
 
     def _cause(self) -> str:
         process = self._process
@@ -179,7 +191,7 @@ def _serve(memory: int) -> None:
     from lavender.bench.timing import measure
 
     _send(answers, "ready")
-    problem = None
+    problem: Any = None
     while True:
         try:
             message = _receive(requests)

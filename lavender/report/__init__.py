@@ -1,8 +1,8 @@
 """Records -> terminal tables, plots, a page. Never solves.
 
-    records = lavender.bench.read("report/records.jsonl")
-    lavender.report.reaches(records)          # plain rows
-    lavender.report.write(records, "report")  # records.csv, records.json, figures, index.html
+records = lavender.bench.read("report/records.jsonl")
+lavender.report.reaches(records)          # plain rows
+lavender.report.write(records, "report")  # records.csv, records.json, figures, index.html
 """
 
 from lavender.report.tables import (

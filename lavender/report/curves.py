@@ -101,15 +101,22 @@ def work_precision(records: Records, case: str) -> Figure:
 
 def family_figure(records: Records, family: str, cases: list[str]) -> Figure:
     """Work-precision over a family: geometric mean time to each residual decade that most cases reach."""
-    groups = {k: [r for r in g if r.usable] for k, g in tables.pairs(records).items() if k[0] in cases and k[2] == "cold"}
+    groups = {
+        k: [r for r in g if r.usable]
+        for k, g in tables.pairs(records).items()
+        if k[0] in cases and k[2] == "cold"
+    }
     solvers = sorted({k[1] for k in groups})
-    decades = [10.0**-k for k in range(0, 15)]
+    decades = [10.0**-k for k in range(15)]
     curves = []
     for solver in solvers:
         x, y, hover = [], [], []
         for level in decades:
             t = [
-                min((r.time_min for r in groups.get((c, solver, "cold"), ()) if r.relative <= level), default=math.inf)
+                min(
+                    (r.time_min for r in groups.get((c, solver, "cold"), ()) if r.relative <= level),
+                    default=math.inf,
+                )
                 for c in cases
             ]
             reached = [v for v in t if math.isfinite(v)]
@@ -117,7 +124,9 @@ def family_figure(records: Records, family: str, cases: list[str]) -> Figure:
                 # Median with misses at infinity: it does not flatter a solver that solves the easy half alone.
                 x.append(median(t) if math.isfinite(median(t)) else max(reached))
                 y.append(level)
-                hover.append(f"{solver}: {len(reached)} of {len(cases)} cases to {level_name(level)}, median {seconds(x[-1])}")
+                hover.append(
+                    f"{solver}: {len(reached)} of {len(cases)} cases to {level_name(level)}, median {seconds(x[-1])}"
+                )
         if x:
             curves.append(Curve(solver, solver, tuple(x), tuple(y), tuple(hover)))
     return Figure(

@@ -15,7 +15,8 @@ def summary(records: Records) -> str:
     levels = tables.levels_of(records)
     lines = ["## lavender report", ""]
     for run in records.runs.values():
-        lines += [f"{run.cpu}, {run.threads} thread; lavender {run.lavender}, Python {run.python}; run {run.run}, {run.started}", ""]
+        machine = f"{run.cpu}, {run.threads} thread; lavender {run.lavender}, Python {run.python}"
+        lines += [f"{machine}; run {run.run}, {run.started}", ""]
     rows = tables.advice_by_level(records)
     if rows:
         lines += ["| structure | " + " | ".join(f"to {level_name(x)}" for x in levels) + " |"]
@@ -24,7 +25,11 @@ def summary(records: Records) -> str:
             cells = []
             for level in levels:
                 best = next(a for a in rows if a.family == family and a.target == level).best
-                cells.append(f"{best.solver} {seconds(best.typical)} ({best.solved}/{best.cases})" if best else "nobody")
+                cells.append(
+                    f"{best.solver} {seconds(best.typical)} ({best.solved}/{best.cases})"
+                    if best
+                    else "nobody"
+                )
             lines.append(f"| {family} | " + " | ".join(cells) + " |")
         lines.append("")
     lines += ["| case | solver | " + " | ".join(f"to {level_name(x)}" for x in levels) + " | best | status |"]

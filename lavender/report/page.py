@@ -18,27 +18,15 @@ from lavender.report.text import residual, seconds
 
 __all__ = ["page"]
 
-LIMITATIONS = (
-    "Times are wall-clock on a machine that may be doing other work: the minimum of the repeats is shown, the "
-    "median is in records.csv. Differences below a few tens of per cent mean nothing without more repeats.",
-    "Set-up and solve are added; a simulation that reuses a factorisation between steps pays the set-up less often.",
-    "BLAS and OpenMP have one thread. A backend that starts threads of its own in another way is not held back.",
-    "Times of Python-level solvers contain the interpreter: below about 50 microseconds they say little about an algorithm.",
-    "Ratios of times are taken within one run only. A time to a level is that of the cheapest run whose judged "
-    "residual is at or below the level.",
-    "A missed level is charged the time limit in the geometric means, and stands at infinity in the profiles. Many "
-    "curves in one profile mislead about who comes second: look at the two you consider.",
-    "Recommendations hold for the cases of this report; they rank by cases solved first, then by time.",
-    "The residual is zero exactly at a solution; how far an impulse is from the solution depends on the problem's conditioning too.",
-)
-
 
 @cache
 def plotly_source() -> str:
     """plotly.js as it ships in the Python package plotly, to embed."""
     spec = importlib.util.find_spec("plotly")
     assert spec is not None and spec.submodule_search_locations  # a dependency of lavender
-    source = Path(spec.submodule_search_locations[0], "package_data", "plotly.min.js").read_text(encoding="utf-8")
+    source = Path(spec.submodule_search_locations[0], "package_data", "plotly.min.js").read_text(
+        encoding="utf-8"
+    )
     # Nothing inside may end the script element that holds it.
     return source.replace("</script", "<\\/script")
 
@@ -61,7 +49,6 @@ def page(records: Records, title: str = "lavender report") -> str:
         title=title,
         figures_json=figures,
         plotly=plotly_source(),
-        limitations=LIMITATIONS,
         inf=math.inf,
         isfinite=math.isfinite,
         **content,
@@ -93,7 +80,9 @@ def _content(records: Records) -> dict[str, Any]:
         for name, rows in by_case.items()
     ]
     families = tables.families(records)
-    family_figures = {f: add(curves.family_figure(records, f, cs)) for f, cs in families.items() if len(cs) > 1}
+    family_figures = {
+        f: add(curves.family_figure(records, f, cs)) for f, cs in families.items() if len(cs) > 1
+    }
     profiles: dict[str, list[str]] = {}
     for profile in tables.profiles(records):
         if profile.cases > 1:

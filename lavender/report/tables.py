@@ -37,7 +37,16 @@ __all__ = [
     "time_budgets",
 ]
 
-FAILED = ("ERROR", "KILLED", "NUMERICAL_ERROR", "DIVERGED", "STALLED", "INFEASIBLE", "TIME_LIMIT", "MAX_ITERATIONS")
+FAILED = (
+    "ERROR",
+    "KILLED",
+    "NUMERICAL_ERROR",
+    "DIVERGED",
+    "STALLED",
+    "INFEASIBLE",
+    "TIME_LIMIT",
+    "MAX_ITERATIONS",
+)
 
 
 @dataclass(frozen=True)
@@ -177,7 +186,9 @@ def families(records: Records) -> dict[str, list[str]]:
             for word in info.structure:
                 found[word].append(name)
     order = ("chain", "mesh", "stack", "pile", "redundant", "friction", "large mass ratio", "asymmetric")
-    return {w: found[w] for w in sorted(found, key=lambda w: (order.index(w) if w in order else len(order), w))}
+    return {
+        w: found[w] for w in sorted(found, key=lambda w: (order.index(w) if w in order else len(order), w))
+    }
 
 
 # -- per case -------------------------------------------------------------------------------------
@@ -197,7 +208,10 @@ def reaches(records: Records, levels: Sequence[float] | None = None) -> list[Rea
                 case,
                 solver,
                 start,
-                {level: min((r.time_min for r in good if r.relative <= level), default=math.inf) for level in levels},
+                {
+                    level: min((r.time_min for r in good if r.relative <= level), default=math.inf)
+                    for level in levels
+                },
                 best.relative if best else math.inf,
                 best.time_min if best else math.nan,
                 best.floor if best else math.nan,
@@ -219,12 +233,23 @@ def failures(records: Records) -> list[Failure]:
         proven = r.status == "INFEASIBLE" and not r.contradicted
         lost = not math.isfinite(r.relative) or r.status.startswith(("ERROR", "KILLED", "CRASHED"))
         if (missed and not proven) or lost or r.contradicted:
-            asked = f"relative residual {level_name(r.tol)}" if r.mode == "tol" else f"{r.max_iter} iterations"
+            asked = (
+                f"relative residual {level_name(r.tol)}" if r.mode == "tol" else f"{r.max_iter} iterations"
+            )
             if r.order != "given":
                 asked += f", order {r.order}"
             out.append(
                 Failure(
-                    r.case, r.solver, asked, r.start, r.status, r.relative, r.floor, r.worst_name, r.contradicted, r.message
+                    r.case,
+                    r.solver,
+                    asked,
+                    r.start,
+                    r.status,
+                    r.relative,
+                    r.floor,
+                    r.worst_name,
+                    r.contradicted,
+                    r.message,
                 )
             )
     return out
@@ -316,7 +341,11 @@ def geometric_means(records: Records) -> dict[str, dict[float, dict[str, tuple[f
             for solver in _whole(times, cases):
                 t = [times[c][solver] for c in cases]
                 solved = sum(map(math.isfinite, t))
-                by[solver] = (geometric_mean([x if math.isfinite(x) else limit for x in t], shift), solved, len(cases))
+                by[solver] = (
+                    geometric_mean([x if math.isfinite(x) else limit for x in t], shift),
+                    solved,
+                    len(cases),
+                )
             out[law][level] = dict(sorted(by.items(), key=lambda kv: kv[1][0]))
     return out
 
@@ -353,7 +382,9 @@ def profiles(records: Records) -> list[Profile]:
                     if math.isfinite(t):
                         ratios.append(t / min(times[c].values()))
                 steps = [(1.0, sum(r <= 1.0 for r in ratios) / len(cases))]
-                steps += [(r, sum(q <= r for q in ratios) / len(cases)) for r in sorted(set(ratios)) if r > 1.0]
+                steps += [
+                    (r, sum(q <= r for q in ratios) / len(cases)) for r in sorted(set(ratios)) if r > 1.0
+                ]
                 curves[solver] = tuple(steps)
             out.append(Profile(law, level, len(cases), curves))
     return out
@@ -375,7 +406,9 @@ def advice_by_level(records: Records) -> list[Advice]:
                 t = [times.get(c, {}).get(solver, math.inf) for c in cases]
                 score = geometric_mean([x if math.isfinite(x) else limit for x in t], shift)
                 solved = [x for x in t if math.isfinite(x)]
-                choices.append(Choice(solver, len(solved), len(cases), score, median(solved) if solved else math.nan))
+                choices.append(
+                    Choice(solver, len(solved), len(cases), score, median(solved) if solved else math.nan)
+                )
             choices.sort(key=lambda k: (any((c, k.solver) in liars for c in cases), -k.solved, k.score))
             out.append(Advice(family, level, tuple(choices)))
     return out
@@ -404,7 +437,14 @@ def advice_by_time(records: Records) -> list[Advice]:
             choices = []
             for solver in solvers:
                 got = [
-                    min((max(r.relative, 1e-17) for r in groups.get((c, solver, "cold"), ()) if r.time_min <= limit), default=None)
+                    min(
+                        (
+                            max(r.relative, 1e-17)
+                            for r in groups.get((c, solver, "cold"), ())
+                            if r.time_min <= limit
+                        ),
+                        default=None,
+                    )
                     for c in cases
                 ]
                 score = geometric_mean([1.0 if g is None else min(g, 1.0) for g in got])

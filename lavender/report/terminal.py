@@ -34,7 +34,10 @@ def reach_table(records: Records, levels: Sequence[float]) -> Any:
     shown = ""
     for row in tables.reaches(records, levels):
         name = row.solver + ("" if row.start == "cold" else f" ({row.start})")
-        cells = [Text(seconds(row.times[level]), style="" if row.times[level] < float("inf") else "dim") for level in levels]
+        cells = [
+            Text(seconds(row.times[level]), style="" if row.times[level] < float("inf") else "dim")
+            for level in levels
+        ]
         best = residual(row.best) + (" (floor)" if row.at_floor else "")
         status = Text(row.status, style="green" if row.status in GOOD else "yellow")
         claim = Text("✗ contradicted", style="bold red") if row.contradicted else Text("")
@@ -59,7 +62,9 @@ def advice_table(records: Records) -> Any:
         cells = []
         for level in levels:
             best = next(a for a in rows if a.family == family and a.target == level).best
-            cells.append(f"{best.solver}, {seconds(best.typical)}, {best.solved}/{best.cases}" if best else "nobody")
+            cells.append(
+                f"{best.solver}, {seconds(best.typical)}, {best.solved}/{best.cases}" if best else "nobody"
+            )
         table.add_row(family, *cells)
     return table
 
@@ -77,12 +82,15 @@ def print_report(records: Records, console: Console, levels: Sequence[float] | N
     if refused:
         names = sorted({s.solver for s in refused})
         console.print(
-            f"{len(refused)} pairs were not run because the solver does not take the problem ({', '.join(names)}); the page says why.",
+            f"{len(refused)} pairs were not run because the solver does not take the problem "
+            f"({', '.join(names)}); the page says why.",
             highlight=False,
             style="dim",
         )
     if len(records):
-        console.print("\n[bold]Recommended[/] (solver, median time where it gets there, cases it brings to the level)")
+        console.print(
+            "\n[bold]Recommended[/] (solver, median time where it gets there, cases it brings to the level)"
+        )
         console.print(advice_table(records), highlight=False)
     wrong = [r for r in records if r.contradicted]
     if wrong:

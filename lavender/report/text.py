@@ -14,7 +14,7 @@ def seconds(t: float, missing: str = "–") -> str:
     for scale, unit in ((1.0, "s"), (1e-3, "ms"), (1e-6, "µs")):
         if t >= 0.9995 * scale or unit == "µs":
             x = t / scale
-            digits = max(0, 2 - int(math.floor(math.log10(x)))) if x >= 1.0 else 2
+            digits = max(0, 2 - math.floor(math.log10(x))) if x >= 1.0 else 2
             return f"{x:.{digits}f} {unit}"
     return missing
 

@@ -54,5 +54,7 @@ def write(records: Records, folder: str | Path, *, figures: bool = True) -> Path
                     if figure.curves:
                         save(figure, look, folder / "figures")
     except OSError as error:
-        raise InputError(f"cannot write {error.filename or folder} ({error.strerror or error}): give a folder that you may write to") from None
+        raise InputError(
+            f"cannot write {error.filename or folder} ({error.strerror or error}): give a folder that you may write to"
+        ) from None
     return index

@@ -1,0 +1,230 @@
+"""The command line: what it leaves, and what it says when it cannot."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+import lavender as lv
+from lavender import bench, cli, io, registry
+from lavender import check as checking
+
+
+def problem(n=8):
+    a = np.diag(np.full(n, 2.0)) - np.diag(np.ones(n - 1), 1) - np.diag(np.ones(n - 1), -1)
+    return lv.Problem.lcp(a, np.linspace(1.0, -0.2, n))
+
+
+@pytest.fixture
+def path(tmp_path):
+    io.save(problem(), tmp_path / "stack8.npz")
+    return tmp_path / "stack8.npz"
+
+
+@pytest.fixture
+def lavender(capsys, tmp_path, monkeypatch):
+    """Runs the command in a folder of its own: (status, stdout, stderr)."""
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    monkeypatch.setenv("COLUMNS", "160")
+
+    def run(*words):
+        with pytest.raises(SystemExit) as end:
+            cli.main([str(w) for w in words])
+        out, err = capsys.readouterr()
+        return end.value.code, out, err
+
+    return run
+
+
+QUICK = ("--levels", "1e-3", "1e-6", "--budgets", "2", "4", "--repeats", "1", "--no-figures")
+
+
+def test_report_leaves_records_and_page_and_prints_times(lavender, path, tmp_path):
+    code, out, _ = lavender("report", path, "--solvers", "pgs", "direct", *QUICK, "--out", tmp_path / "out")
+    assert code == 0
+    names = {p.name for p in (tmp_path / "out").iterdir()}
+    assert names == {"records.jsonl", "records.csv", "records.json", "index.html", "summary.md"}
+    records = bench.read(tmp_path / "out")
+    assert {r.solver for r in records} == {"pgs", "direct"}
+    assert {r.max_iter for r in records if r.mode == "budget"} == {2, 4}
+    assert {r.tol for r in records if r.solver == "pgs" and r.mode == "tol"} == {1e-3, 1e-6}
+    for word in ("stack8", "to 1e-3", "to 1e-6", "CONVERGED", "Recommended", "index.html"):
+        assert word in out
+
+
+def test_lists_take_commas_or_blanks_and_files_may_follow(lavender, path, tmp_path):
+    code, *_ = lavender(
+        "report", "--levels=1e-2", "--solvers", "pgs,jacobi", "--budgets", "3", "5", path, "--orders", "reverse",
+        "--repeats", 1, "--no-figures", "--out", tmp_path / "out",
+    )  # fmt: skip
+    assert code == 0
+    records = bench.read(tmp_path / "out")
+    assert {r.solver for r in records} == {"pgs", "jacobi"}
+    assert {r.max_iter for r in records if r.mode == "budget"} == {3, 5}
+    assert {r.order for r in records} == {"given", "reverse"}
+
+
+def test_a_contradicted_claim_is_marked(lavender, path, monkeypatch):
+    monkeypatch.setattr(registry, "_registered", registry.specs())
+
+    class Liar:
+        def prepare(self, problem):
+            return problem
+
+        update = prepare
+
+        def run(self, *_):
+            return lv.Claim(lv.Status.CONVERGED, 1)
+
+    registry.register(lv.SolverSpec("liar", Liar, laws={"lcp"}, summary="says it did", resumable=False))
+    code, out, _ = lavender("report", path, "--solvers", "liar", *QUICK)
+    assert code == 0
+    assert "✗ contradicted" in out
+    assert "2 claims are contradicted" in out
+    code, out, _ = lavender("check", path, "--solvers", "liar")
+    assert code == 1
+    assert "claim contradicted" in out
+
+
+def test_check_passes_honest_solvers(lavender, path):
+    code, out, _ = lavender("check", path, "--solvers", "pgs", "direct")
+    assert code == 0
+    assert out.count(checking.AGREES) >= 2
+
+
+def test_records_are_shown_again_without_solving(lavender, path, tmp_path, monkeypatch):
+    lavender("bench", path, "--solvers", "pgs", *QUICK[:-1], "--out", tmp_path / "r.jsonl")
+    before = (tmp_path / "r.jsonl").read_bytes()
+    monkeypatch.setattr(bench, "run", None)
+    code, out, _ = lavender("report", tmp_path / "r.jsonl", "--out", tmp_path / "again", "--no-figures")
+    assert code == 0
+    assert "stack8" in out
+    assert (tmp_path / "again" / "index.html").exists()
+    assert (tmp_path / "r.jsonl").read_bytes() == before
+
+
+def test_solve_prints_one_line_and_writes_the_answer(lavender, path, tmp_path):
+    target = tmp_path / "answer.npz"
+    code, out, _ = lavender("solve", path, "--solver", "pgs", "--tol", 1e-10, "--history", "--output", target)
+    assert code == 0
+    assert "pgs: CONVERGED" in out
+    assert "iterations" in out
+    with np.load(target, allow_pickle=False) as answer:
+        exact = lv.solve(problem(), "pgs", tol=1e-10)
+        np.testing.assert_array_equal(answer["impulse"], exact.impulse)
+        assert answer["relative"] == exact.residual.relative
+        assert str(answer["status"]) == "CONVERGED"
+
+
+def test_solve_takes_cases_of_the_suite(lavender):
+    code, out, _ = lavender("solve", "stack(n=8)", "--solver", "direct")
+    assert code == 0
+    assert "8 rows" in out
+
+
+def test_solvers_lists_all_with_reasons(lavender):
+    code, out, _ = lavender("solvers")
+    assert code == 0
+    for name, spec in registry.specs().items():
+        assert name in out
+        assert spec.missing() is None or "pip install" in out
+    code, out, _ = lavender("solvers", "--problem", "stack(n=8)")
+    assert code == 0
+    assert "takes laws linear" in out  # gauss_seidel, sor
+
+
+@pytest.mark.parametrize(
+    ("words", "sign"),
+    [
+        (("report", "--solvers", "pgz"), "did you mean 'pgs'"),
+        (("report", "no/such.npz"), "no such file"),
+        (("report", "stak(n=8)"), "did you mean"),
+        (("report", "--levels", "0"), "level 0.0 must be"),
+        (("report", "--budgets", "-4"), "budget -4"),
+        (("report", "--repeats", "0"), "repeats is 0"),
+        (("report", "--time-limit", "-1"), "time limit is -1.0"),
+        (("report", "--orders", "sideways"), "sideways"),
+        (("report", "a.jsonl", "b.npz"), "shown alone"),
+        (("report", "missing.jsonl"), "cannot read"),
+        (("solve", "stack(n=4)", "--solver", "nobody"), "unknown solver 'nobody'"),
+        (("solve", "stack(n=4)", "--solver", "pgs", "--tol", "-1"), "tol"),
+        (("solve", "stack(n=4)", "--solver", "pgs", "--max-iter", "-1"), "max_iter"),
+        (("solve", "stack(n=4)", "--solver", "direct", "--order", "reverse"), "order"),
+        (("solve", "stack(n=4)", "--solver", "pgs", "--output", "no/such/folder.npz"), "cannot write"),
+        (("check", "nothing.npz"), "no such file"),
+        (("report", "--levels", "many"), "not a list of numbers"),
+        (("nonsense",), "No such command"),
+    ],
+)
+def test_bad_input_is_one_line_and_status_2(lavender, words, sign):
+    code, out, err = lavender(*words)
+    assert code == 2
+    assert sign in err
+    assert "Traceback" not in err + out
+
+
+@pytest.mark.parametrize("content", [b"", b"PK\x03\x04 broken", b"\x89HDF broken"])
+def test_a_broken_file_is_named(lavender, tmp_path, content):
+    for suffix in (".npz", ".hdf5"):
+        bad = tmp_path / f"bad{suffix}"
+        bad.write_bytes(content)
+        code, _, err = lavender("solve", bad, "--solver", "pgs")
+        assert code == 2
+        assert "bad" in err
+        assert err.count("\n") == 1
+
+
+def test_an_unwritable_report_is_refused_before_anything_is_solved(lavender, path, tmp_path, monkeypatch):
+    monkeypatch.setattr(bench, "run", None)  # calling it would be a TypeError
+    (tmp_path / "file").write_text("")
+    code, _, err = lavender("report", path, "--out", tmp_path / "file" / "out")
+    assert code == 2
+    assert "cannot write" in err
+
+
+def test_help_is_quick_and_names_every_command():
+    start = time.perf_counter()
+    done = subprocess.run(
+        [sys.executable, "-m", "lavender.cli", "--help"], capture_output=True, text=True, check=True
+    )
+    took = time.perf_counter() - start
+    for name in ("report", "bench", "check", "solve", "solvers"):
+        assert name in done.stdout
+    # 0.25 s on the machine that this was written on; ten times that on a loaded one.
+    assert took < 2.5
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
+def test_ctrl_c_keeps_the_records_and_writes_the_page(tmp_path):
+    # A problem that nothing solves in the time: every run to a level takes its limit.
+    out = tmp_path / "out"
+    a = np.array([[1.0, -1.0], [-1.0, 1.0]])
+    n = 300
+    big = np.kron(np.eye(n), a) + 1e-9 * np.eye(2 * n)
+    io.save(lv.Problem.lcp(big, np.random.default_rng(0).standard_normal(2 * n)), tmp_path / "hard.npz")
+    io.save(problem(), tmp_path / "easy.npz")
+    command = [sys.executable, "-m", "lavender.cli", "report", tmp_path / "easy.npz", tmp_path / "hard.npz"]
+    command += ["--solvers", "pgs,jacobi", "--time-limit", "60", "--no-figures", "--out", out]
+    process = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True
+    )
+    records = out / "records.jsonl"
+    deadline = time.monotonic() + 60.0
+    while time.monotonic() < deadline:
+        if records.exists() and '"case": "hard"' in records.read_text():
+            break
+        time.sleep(0.05)
+    os.killpg(process.pid, signal.SIGINT)
+    printed, said = process.communicate(timeout=60)
+    assert process.returncode == 130, said
+    assert b"Traceback" not in said
+    assert b"goes on from here" in printed
+    assert (out / "index.html").exists()
+    kept = [json.loads(line) for line in records.read_text().splitlines()]
+    assert any(r["kind"] == "record" and r["case"] == "easy" for r in kept)

@@ -1,0 +1,298 @@
+"""Tables say what the records say; the page stands alone and hides nothing."""
+
+import html.parser
+import json
+import math
+import re
+
+import numpy as np
+import pytest
+
+import lavender as lv
+from lavender import bench, report
+from lavender.bench.record import CaseInfo, Record, Run
+from lavender.report import curves, draw, tables
+from lavender.report.style import looks
+from lavender.report.text import residual, seconds
+
+LEVELS = (1e-3, 1e-6)
+
+
+def info(case, law="lcp", structure=("stack",)):
+    return CaseInfo("run", case, case, "sha" + case, law, 8, 8, 0, 0, 22, 1.0, structure, True, "a reason")
+
+
+def record(case, solver, time, relative, **more):
+    values = {
+        "run": "run", "case": case, "sha": "sha" + case, "solver": solver, "options": {}, "start": "cold",
+        "mode": "tol",
+        "tol": 1e-6, "max_iter": 0, "time_limit": 2.0, "order": "given", "seed": 0, "relative": relative,
+        "energy": relative, "velocity": relative, "floor": 1e-15, "status": "CONVERGED", "claims": True,
+        "time_min": time, "time_median": time, "setup_min": time / 2, "solve_min": time / 2, "setup_median": time / 2,
+        "solve_median": time / 2, "repeats": 1, "success": relative <= more.get("tol", 1e-6),
+    }  # fmt: skip
+    return Record(**(values | more))
+
+
+def records_of(*made, structure=None, law=None):
+    found = bench.Records()
+    found.add(
+        Run(
+            "run",
+            "2026-01-01",
+            "0.1",
+            "3.11",
+            "linux",
+            "a cpu",
+            2,
+            1,
+            {"numpy": "2"},
+            {"levels": list(LEVELS)},
+        )
+    )
+    for case in dict.fromkeys(r.case for r in made):
+        found.add(info(case, (law or {}).get(case, "lcp"), (structure or {}).get(case, ("stack",))))
+    for r in made:
+        found.add(r)
+    return found
+
+
+def test_time_to_a_level_is_that_of_the_cheapest_run_that_reached_it():
+    found = records_of(
+        record("a", "x", 5.0, 1e-4, tol=1e-3),
+        record("a", "x", 9.0, 1e-8),
+        record(
+            "a", "x", 1.0, 9e-4, mode="budget", tol=0.0, max_iter=4, status="MAX_ITERATIONS", claims=False
+        ),
+        record("a", "x", 0.1, 1e-9, order="reverse", mode="budget"),  # another order does not count
+        record("a", "y", 2.0, 2e-3, tol=1e-3, status="STALLED", claims=False),
+        record("a", "y", 3.0, 0.5, tol=1e-3, contradicted="says CONVERGED"),
+    )
+    x, y = report.reaches(found)
+    assert dict(x.times) == {1e-3: 1.0, 1e-6: 9.0}
+    assert (x.best, x.best_time, x.status) == (1e-8, 9.0, "CONVERGED")
+    assert dict(y.times) == {1e-3: math.inf, 1e-6: math.inf}
+    assert (y.best, y.best_time, y.contradicted) == (2e-3, 2.0, "says CONVERGED")
+
+
+def test_profiles_count_misses_and_refusals_at_infinity():
+    found = records_of(
+        record("a", "fast", 1.0, 1e-7), record("a", "slow", 3.0, 1e-7),
+        record("b", "fast", 2.0, 1e-1, success=False), record("b", "slow", 4.0, 1e-7),
+        record("c", "slow", 1.0, 1e-7), record("d", "slow", 1.0, 1.0), record("d", "fast", 1.0, 1.0),
+    )  # fmt: skip
+    profile = next(p for p in report.profiles(found) if p.level == 1e-6)
+    assert profile.cases == 4
+    assert dict(profile.curves) == {"fast": ((1.0, 0.25),), "slow": ((1.0, 0.5), (3.0, 0.75))}
+
+
+def test_shifted_geometric_means_charge_misses_the_limit():
+    found = records_of(
+        record("a", "x", 1.0, 1e-7), record("b", "x", 4.0, 1e-7),
+        record("a", "y", 1.0, 1e-7), record("b", "y", 0.5, 1.0, success=False),
+        record("a", "z", 1.0, 1e-7),  # does not take b: not compared
+    )  # fmt: skip
+    means = report.geometric_means(found)["lcp"][1e-6]
+    shift = tables.shift_of(found)
+    assert shift == float(f"{np.median([1.0, 4.0]):.1g}")
+    assert set(means) == {"x", "y"}
+    assert means["x"] == (pytest.approx(math.sqrt((1 + shift) * (4 + shift)) - shift), 2, 2)
+    assert means["y"] == (pytest.approx(math.sqrt((1 + shift) * (2 + shift)) - shift), 1, 2)  # limit 2 s
+
+
+def test_advice_puts_who_solves_most_first_and_false_claims_last():
+    found = records_of(
+        record("a", "quick", 0.1, 1e-7), record("b", "quick", 0.1, 1e-1),
+        record("a", "sure", 1.0, 1e-7), record("b", "sure", 1.0, 1e-7),
+        record("a", "liar", 0.1, 1e-7), record("b", "liar", 0.1, 1e-7, contradicted="says CONVERGED"),
+        structure={"a": ("stack",), "b": ("stack", "redundant")},
+    )  # fmt: skip
+    by = {(a.family, a.target): a for a in report.advice_by_level(found)}
+    assert [c.solver for c in by["stack", 1e-6].ranking] == ["sure", "quick", "liar"]
+    assert by["stack", 1e-6].best.solved == 2
+    assert by["redundant", 1e-6].best.solver == "sure"
+    assert list(report.families(found)) == ["stack", "redundant"]
+
+
+def test_advice_names_nobody_where_nobody_got_there():
+    found = records_of(record("a", "x", 1.0, 0.5))
+    assert all(a.best is None for a in report.advice_by_level(found))
+
+
+def test_advice_by_time_takes_the_best_residual_within_the_budget():
+    found = records_of(
+        record("a", "rough", 0.01, 1e-2), record("a", "rough", 5.0, 1e-7),
+        record("a", "fine", 1.0, 1e-9),
+    )  # fmt: skip
+    by = {round(math.log10(a.target)): a for a in report.advice_by_time(found)}
+    assert sorted(by) == [-1, 0, 1]  # decades about 1 s
+    assert by[-1].best.solver == "rough"
+    assert by[-1].best.score == pytest.approx(1e-2)
+    assert by[-1].ranking[1].score == 1.0  # nothing yet: doing nothing
+    assert by[0].best.solver == "fine"
+
+
+def test_claims_failures_and_spreads():
+    found = records_of(
+        record("a", "x", 1.0, 1e-7), record("a", "x", 1.0, 1e-2, contradicted="says CONVERGED"),
+        record("a", "y", math.nan, math.inf, status="CRASHED (SIGSEGV)", claims=False, success=False, message="died"),
+        record("a", "z", 1.0, 1e-5, status="FLOOR", floor=1e-5),  # excused
+        record("a", "w", 1.0, math.inf, status="INFEASIBLE", floor=math.nan, success=False, worst_name="row 3"),
+        *(record("a", "x", 1.0, r, mode="budget", tol=0.0, max_iter=8, order=o, claims=False, status="MAX_ITERATIONS")
+          for o, r in (("given", 1e-2), ("reverse", 4e-2))),
+    )  # fmt: skip
+    by = {c.solver: c for c in report.claims(found)}
+    assert (by["x"].claims, by["x"].wrong, by["x"].rate) == (2, 1, 0.5)
+    assert (by["y"].crashed, by["y"].asked, by["y"].reached) == (1, 1, 0)
+    assert math.isnan(by["y"].rate)
+    assert [(f.solver, f.status) for f in report.failures(found)] == [
+        ("x", "CONVERGED"),
+        ("y", "CRASHED (SIGSEGV)"),
+        ("w", "INFEASIBLE"),
+    ]
+    (spread,) = report.spreads(found)
+    assert (spread.budget, spread.factor) == (8, 4.0)
+
+
+@pytest.mark.parametrize(
+    ("t", "text"),
+    [
+        (1.0, "1.00 s"),
+        (0.0123, "12.3 ms"),
+        (1e-3, "1.00 ms"),
+        (4.5e-5, "45.0 µs"),
+        (9e-8, "0.09 µs"),
+        (123.4, "123 s"),
+    ],
+)
+def test_times_have_three_digits_and_a_unit(t, text):
+    assert seconds(t) == text
+    assert seconds(math.inf) == "–"
+
+
+def test_residuals_have_two_digits():
+    assert [residual(x) for x in (3.44e-7, 0.0, math.inf, 1.0)] == ["3.4e-7", "0", "inf", "1.0e0"]
+
+
+def test_looks_tell_solvers_apart():
+    names = [f"s{i}" for i in range(24)] + ["pgs", "direct"]
+    found = looks(names)
+    assert len({(k.color, k.dash, k.mark) for k in found.values()}) == len(names)
+    assert found["pgs"].color != found["direct"].color
+    assert found == looks(reversed(names))
+
+
+class Page(html.parser.HTMLParser):
+    """What a page loads, and whether its elements close."""
+
+    VOID = frozenset({"meta", "br", "hr", "img", "input", "link"})
+
+    def __init__(self, text):
+        super().__init__()
+        self.open, self.loads, self.ids, self.links, self.wrong = [], [], set(), set(), []
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        values = dict(attrs)
+        self.ids.add(values.get("id"))
+        if values.get("href", "").startswith("#"):
+            self.links.add(values["href"][1:])
+        self.loads += [v for k, v in attrs if k in ("src", "srcset", "data")]
+        self.loads += [values["href"]] if tag == "link" else []
+        if tag not in self.VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        if self.open.pop() != tag:
+            self.wrong.append(tag)
+
+
+@pytest.fixture(scope="module")
+def real():
+    """Records of two real problems, one named as an attacker would."""
+    a = np.diag(np.full(8, 2.0)) - np.diag(np.ones(7), 1) - np.diag(np.ones(7), -1)
+    evil = '</script><script>alert("x")</script>&|'
+    problems = [
+        lv.Problem.lcp(a, np.ones(8), name=evil, names=[f"<b>row {i}" for i in range(8)], guess=np.ones(8)),
+        lv.Problem.linear(a, np.ones(8), name="chain"),
+    ]
+    plan = bench.Plan(levels=LEVELS, budgets=(2, 4, 8), repeats=1)
+    return bench.run(problems, ["pgs", "direct", "jacobi", "gauss_seidel"], plan), evil
+
+
+def test_the_page_stands_alone_and_is_well_formed(real, tmp_path):
+    records, evil = real
+    index = report.write(records, tmp_path)
+    text = index.read_text()
+    page = Page(text)
+    assert page.open == []
+    assert page.wrong == []
+    assert page.loads == []  # nothing from anywhere
+    assert "<script>alert" not in text
+    assert "<b>row" not in text
+    assert evil not in text
+    assert page.links <= page.ids
+    figures = json.loads(re.search(r'id="figures">(.*?)</script>', text, re.DOTALL)[1])
+    places = set(re.findall(r'data-figure="([^"]+)"', text))
+    assert places == set(figures)
+    for name in ("pgs", "jacobi", "Limitations", bench.cpu_name(), "numpy " + np.__version__):
+        assert name in text
+
+
+def test_everything_asked_for_is_in_the_folder(real, tmp_path):
+    records, _ = real
+    report.write(records, tmp_path)
+    names = {p.name for p in tmp_path.iterdir()}
+    assert names == {"records.csv", "records.json", "index.html", "summary.md", "figures"}
+    figures = sorted(p.name for p in (tmp_path / "figures").iterdir())
+    assert len(figures) == 8  # two cases, two diagrams, two formats
+    assert all(p.stat().st_size > 1000 for p in (tmp_path / "figures").iterdir())
+    text = (tmp_path / "summary.md").read_text()
+    for solver in ("pgs", "direct", "jacobi", "gauss_seidel"):
+        assert text.count(f"\n| chain | {solver} |") == 1
+
+
+def test_a_curve_is_the_runs_of_its_solver(real):
+    records, _ = real
+    figure = curves.work_precision(records, "chain")
+    by = {c.label: c for c in figure.curves}
+    assert set(by) == {"pgs", "direct", "jacobi", "gauss_seidel"}
+    mine = [r for r in records if r.case == "chain" and r.solver == "pgs" and r.order == "given"]
+    assert sorted(zip(by["pgs"].x, by["pgs"].y, strict=True)) == sorted(
+        (r.time_min, r.relative) for r in mine
+    )
+    best = min(
+        (r for r in records if r.case == "chain" and r.order == "given" and r.floor > 0),
+        key=lambda r: (r.relative, r.floor),
+    )
+    assert figure.floor == best.floor
+    data = draw.plotly_data(figure, looks(by))
+    assert [t["name"] for t in data["traces"]] == [c.label for c in figure.curves]
+    assert data["floor"] == figure.floor
+
+
+def test_warm_runs_have_their_own_curves(real):
+    records, evil = real
+    labels = {c.label for c in curves.work_precision(records, evil).curves}
+    assert {"pgs", "pgs (warm)"} <= labels
+
+
+def test_a_report_of_nothing_says_so(tmp_path):
+    records = bench.run([lv.Problem.lcp(np.eye(2), np.ones(2))], ["gauss_seidel"], bench.Plan())
+    text = report.write(records, tmp_path).read_text()
+    assert "No case ran" in text
+    assert "takes laws linear" in text
+
+
+def test_an_unwritable_folder_is_an_input_error(real, tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(lv.InputError, match="cannot write"):
+        report.write(real[0], tmp_path / "file")
+
+
+def test_a_frame_has_the_rows(real):
+    pandas = pytest.importorskip("pandas", reason="a frame needs pandas (extra: frame)")
+    frame = real[0].frame()
+    assert isinstance(frame, pandas.DataFrame)
+    assert len(frame) == len(real[0])
+    assert frame["relative"].tolist() == [r.relative for r in real[0]]
