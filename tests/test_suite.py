@@ -205,12 +205,15 @@ def test_chains_are_banded_and_hold_their_weight():
 @pytest.mark.parametrize(
     "name",
     [
-        *(n for n in DEFAULT if n not in ("granular(n=9)", "pyramid(k=10, mass_ratio=1e3)")),
+        *(n for n in DEFAULT if n != "granular(n=9)"),  # half a second
         "stack(n=300, mass_ratio=1e6)",
         "stackF(n=20, mass_ratio=7)",
         "box_stack(n=5, mass_ratio=1e8)",
         "toy_stack(kick=0.1)",
         "toy_stack(kick=0)",
+        "toy_stack(friction=box)",
+        "boxed_friction(n=5)",
+        "boxed_friction(n=4, scene=pyramid)",
         "hang(n=20, tip_mass=1e6)",
         "random_spd(n=60, condition=1e10)",
     ],
@@ -218,7 +221,7 @@ def test_chains_are_banded_and_hold_their_weight():
 def test_a_reference_is_a_solution(name):
     case = suite.case(name)
     if case.reference is None:
-        assert case.problem.law != "linear"
+        assert case.problem.law in ("coulomb", "cone")
         return
     judged = lv.residual(case.problem, case.reference.impulse)
     # Rounded to float64, and no worse than what rounding costs.

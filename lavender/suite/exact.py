@@ -130,7 +130,8 @@ def solve_boxed(problem: Problem, candidate: FloatArray, margin: float = 1e-6) -
     )
     out = np.maximum(np.maximum(c.lower - hi, hi - c.upper), 0.0).max(initial=0.0)
     # Rows that are zero in exact arithmetic are known to some units of 2^-53 in the rounded data.
-    if np.any(wrong > 2.0**-49 * wide.size(hi)) or out > 2.0**-49 * size:
+    room = wide.size(hi)
+    if np.any(wrong > 2.0**-49 * room + 2.0**-90 * room.max(initial=0.0)) or out > 2.0**-49 * size:
         worst = max(float(wrong.max()), float(out))
         raise InputError(f"the candidate's active set gives no solution: a condition fails by {worst:.1e}")
     return np.clip(hi, c.lower, c.upper)

@@ -15,6 +15,7 @@ import numpy as np
 from lavender._arrays import FloatArray
 from lavender.errors import InputError
 from lavender.problem import Problem
+from lavender.solve import solve
 from lavender.suite.build import (
     FALL,
     Bodies,
@@ -26,7 +27,7 @@ from lavender.suite.build import (
     static_loads,
 )
 from lavender.suite.case import Draft, Reference, family
-from lavender.suite.exact import at_rest, solve_linear
+from lavender.suite.exact import at_rest, solve_boxed, solve_linear
 
 WITH_FRICTION = {"friction": "coulomb"}
 MU = 0.5
@@ -52,6 +53,18 @@ def rest_reference(problem: Problem) -> Callable[[], Reference]:
     return lambda: Reference(
         at_rest(problem), "at rest: impulses from a linear program, proved in 100 bits", "slack"
     )
+
+
+def boxed_reference(problem: Problem) -> Callable[[], Reference]:
+    """The reference of a boxed LCP: sweeps propose the active set, and what they propose is proved."""
+
+    def proved() -> Reference:
+        candidate = solve(problem, "pgs", tol=1e-10, max_iter=50_000).impulse
+        return Reference(
+            solve_boxed(problem, candidate), "active set from sweeps, solved and proved in 100 bits", "slack"
+        )
+
+    return proved
 
 
 # -- stacks ---------------------------------------------------------------------------------------
@@ -189,9 +202,8 @@ def granular(n: int = 4, friction: str = "none", sliding: float = 0.0, seed: int
     bodies, contacts = _pile(n, seed)
     sideways(bodies, sliding)
     problem = contact_problem(bodies, contacts, friction, MU)
-    return Draft(
-        problem, "a large well-conditioned pile: the home ground of sweeps, where factorisations fill in"
-    )
+    reason = "a large well-conditioned pile: the home ground of sweeps, where factorisations fill in"
+    return Draft(problem, reason, boxed_reference(problem) if friction == "none" else None)
 
 
 def _pile(n: int, seed: int) -> tuple[Bodies, Contacts]:
@@ -388,7 +400,7 @@ def toy_stack(kick: float = 1.0, friction: str = "none") -> Draft:
         )
     bodies.v_free[:, 0] = 0.05 * (k + 1)
     problem = _boxed(bodies, contacts)
-    return Draft(problem, reason + ", with friction bounded by fixed loads")
+    return Draft(problem, reason + ", with friction bounded by fixed loads", boxed_reference(problem))
 
 
 def _toy_solution(b: FloatArray) -> FloatArray:
@@ -448,8 +460,11 @@ def boxed_friction(
     else:
         raise InputError(f"scene is {scene!r}; box_stack, pyramid, granular are known")
     sideways(bodies, sliding)
+    problem = _boxed(bodies, contacts)
     return Draft(
-        _boxed(bodies, contacts), "friction that every QP solver takes: a boxed LCP with finite bounds"
+        problem,
+        "friction that every QP solver takes: a boxed LCP with finite bounds",
+        boxed_reference(problem),
     )
 
 
