@@ -20,13 +20,14 @@ from lavender_ext.engine_broad cimport update_pairs
 from lavender_ext.engine_contact cimport make_contacts, store_contacts
 from lavender_ext.engine_joint cimport make_joints
 from lavender_ext.engine_project cimport normal_speed, project_positions
-from lavender_ext.engine_types cimport (CAP_CONTACT, CAP_PAIR, H_CONTACTS, H_CONTACT_ROWS, H_ITERATIONS, H_LOST,
-                                        H_MATCHES, H_NEED_CONTACTS, H_NEED_PAIRS, H_ORDER, H_SEED, H_STEP,
-                                        H_WARM_START, NEED_ROOM, NOT_FINITE, N_BODY, N_BUCKET, N_DYNAMIC,
-                                        N_EXCLUDED, N_FRAME, N_HEAD, N_JOINT, N_JOINT_REAL, N_JOINT_ROW,
-                                        N_SETTINGS, N_SIZES, OK, ROWS_PER_CONTACT, S_OUT, bind, engine_t)
-from lavender_ext.order cimport (RANDOM, SYMMETRIC, advance_order, block_levels, body_levels, color_by_bodies,
-                                 reverse, sort_by_level)
+from lavender_ext.engine_types cimport (CAP_CONTACT, CAP_PAIR, H_CONTACTS, H_CONTACT_ROWS, H_ITERATIONS,
+                                        H_LOST, H_MATCHES, H_NEED_CONTACTS, H_NEED_PAIRS, H_ORDER, H_SEED,
+                                        H_STEP, H_WARM_START, NEED_ROOM, NOT_FINITE, N_BODY,
+                                        N_DYNAMIC, N_EXCLUDED, N_FRAME, N_HEAD, N_JOINT, N_JOINT_REAL,
+                                        N_JOINT_ROW, N_SETTINGS, OK, ROWS_PER_CONTACT, S_OUT,
+                                        bind, engine_t)
+from lavender_ext.order cimport (RANDOM, SYMMETRIC, advance_order, block_levels, body_levels,
+                                 color_by_bodies, reverse, sort_by_level)
 from lavender_ext.rows cimport contact_push, joint_push, relax_contact_block, relax_joint, rows_t
 
 
@@ -121,12 +122,14 @@ cdef inline void warm(engine_t* e, const rows_t* r) noexcept nogil:
     for c in range(r.n_contacts):
         i = r.n_joints + c
         j = e.ptr[i]
-        contact_push(r, c, n_tangents(e.kind[i], e.ptr[i + 1] - j), e.kind[i] == CONTACT_SPIN, e.impulse + j, e.dv)
+        contact_push(r, c, n_tangents(e.kind[i], e.ptr[i + 1] - j), e.kind[i] == CONTACT_SPIN, e.impulse + j,
+                     e.dv)
 
 
 cdef inline void order_blocks(engine_t* e) noexcept nogil:
     """Sweep order of all blocks into e.order, as lavender.ordering makes it: joints, then contacts."""
-    cdef int32_t kj = e.size[N_JOINT], n = kj + e.head[H_CONTACTS], nd = e.size[N_DYNAMIC], mode = e.head[H_ORDER]
+    cdef int32_t kj = e.size[N_JOINT], n = kj + e.head[H_CONTACTS], nd = e.size[N_DYNAMIC]
+    cdef int32_t mode = e.head[H_ORDER]
     cdef int32_t* level = e.order_scratch
     cdef int32_t* of_block = level + nd
     cdef int32_t i, levels
@@ -152,10 +155,10 @@ cdef inline void order_blocks(engine_t* e) noexcept nogil:
 
 cdef inline void sweep_all(engine_t* e, const blocks_t* p, const rows_t* r) noexcept nogil:
     """The budgeted sweeps: joints, then contacts."""
-    cdef int32_t s, i, kj = r.n_joints, k = p.n_blocks, mode
+    cdef int32_t s, _s, i, kj = r.n_joints, k = p.n_blocks, mode
     cdef uint64_t rng
     if e.head[H_ORDER] == AS_GIVEN:
-        for s in range(e.head[H_ITERATIONS]):
+        for _s in range(e.head[H_ITERATIONS]):
             for i in range(kj):
                 relax_joint(p, r, i, e.impulse, e.dv)
             for i in range(kj, k):
@@ -214,7 +217,8 @@ cdef public void lav_engine_lengths(const int32_t* size, int32_t* used) noexcept
         used[k] = <int32_t>n[k] if n[k] < 2147483647 else -1
 
 
-cdef public int32_t lav_engine_pairs(const int32_t* size, double* real, int32_t* index, uint64_t* keys) noexcept nogil:
+cdef public int32_t lav_engine_pairs(const int32_t* size, double* real, int32_t* index,
+                                     uint64_t* keys) noexcept nogil:
     """The first two stages alone; returns the number of pairs needed."""
     cdef engine_t e
     cdef int64_t n[3]
@@ -223,7 +227,8 @@ cdef public int32_t lav_engine_pairs(const int32_t* size, double* real, int32_t*
     return update_pairs(&e)
 
 
-cdef public int32_t lav_engine_prepare(const int32_t* size, double* real, int32_t* index, uint64_t* keys) noexcept nogil:
+cdef public int32_t lav_engine_prepare(const int32_t* size, double* real, int32_t* index,
+                                       uint64_t* keys) noexcept nogil:
     """The coming substep's velocity problem; changes no state. Returns OK or NEED_ROOM."""
     cdef engine_t e
     cdef int64_t n[3]
@@ -231,7 +236,8 @@ cdef public int32_t lav_engine_prepare(const int32_t* size, double* real, int32_
     return prepare(&e)
 
 
-cdef public void lav_engine_solve(const int32_t* size, double* real, int32_t* index, uint64_t* keys, int32_t sweeps) noexcept nogil:
+cdef public void lav_engine_solve(const int32_t* size, double* real, int32_t* index, uint64_t* keys,
+                                  int32_t sweeps) noexcept nogil:
     """Sequential impulses on the prepared problem; sweeps = 0 applies the guesses and measures them only."""
     cdef engine_t e
     cdef int64_t n[3]
@@ -239,7 +245,8 @@ cdef public void lav_engine_solve(const int32_t* size, double* real, int32_t* in
     solve(&e, sweeps)
 
 
-cdef public void lav_engine_apply(const int32_t* size, double* real, int32_t* index, uint64_t* keys) noexcept nogil:
+cdef public void lav_engine_apply(const int32_t* size, double* real, int32_t* index,
+                                  uint64_t* keys) noexcept nogil:
     """dv and the final measures of impulses that another solver has written."""
     cdef engine_t e
     cdef int64_t n[3]
@@ -255,7 +262,8 @@ cdef public void lav_engine_apply(const int32_t* size, double* real, int32_t* in
     measure(&e, e.setting + S_OUT + 5, e.setting + S_OUT + 7)
 
 
-cdef public int32_t lav_engine_finish(const int32_t* size, double* real, int32_t* index, uint64_t* keys) noexcept nogil:
+cdef public int32_t lav_engine_finish(const int32_t* size, double* real, int32_t* index,
+                                      uint64_t* keys) noexcept nogil:
     """Positions, velocities and cache after the solve. Returns OK or NOT_FINITE."""
     cdef engine_t e
     cdef int64_t n[3]
@@ -337,7 +345,8 @@ cdef class Buffers:
         """Run n substeps; returns (status, how many were completed)."""
         cdef int32_t status, done = 0
         with nogil:
-            status = lav_engine_substeps(&self.size[0], &self.real[0], &self.index[0], &self.keys[0], n, &done)
+            status = lav_engine_substeps(&self.size[0], &self.real[0], &self.index[0], &self.keys[0], n,
+                                         &done)
         return status, done
 
     def arrays(self):
@@ -353,9 +362,11 @@ cdef class Buffers:
         nt, m = c if per > 1 else 0, mj + c * per
         real, index, keys = np.asarray(self.real), np.asarray(self.index), np.asarray(self.keys)
         table = {
-            "setting": (real, e.setting - r, (N_SETTINGS,)), "x": (real, e.x - r, (n, 3)), "q": (real, e.q - r, (n, 4)),
+            "setting": (real, e.setting - r, (N_SETTINGS,)), "x": (real, e.x - r, (n, 3)),
+            "q": (real, e.q - r, (n, 4)),
             "v": (real, e.v - r, (n, 6)), "inv_mass_body": (real, e.inv_mass_body - r, (n,)),
-            "inertia": (real, e.inertia - r, (n, 3, 3)), "inv_inertia_body": (real, e.inv_inertia_body - r, (n, 3, 3)),
+            "inertia": (real, e.inertia - r, (n, 3, 3)),
+            "inv_inertia_body": (real, e.inv_inertia_body - r, (n, 3, 3)),
             "shape": (real, e.shape - r, (n, 4)), "friction": (real, e.friction - r, (n,)),
             "restitution": (real, e.restitution - r, (n,)), "patch": (real, e.patch - r, (n,)),
             "rot": (real, e.rot - r, (self.size[N_FRAME], 3, 3)), "fat": (real, e.fat - r, (n, 6)),
@@ -363,22 +374,31 @@ cdef class Buffers:
             "jac": (real, e.jac - r, (mj, 12)), "minv_jac": (real, e.minv_jac - r, (mj, 12)),
             "joint_impulse": (real, e.joint_impulse - r, (mj,)), "inv_mass": (real, e.inv_mass - r, (nd,)),
             "inv_inertia": (real, e.inv_inertia - r, (nd, 3, 3)), "v_free": (real, e.v_free - r, (nd, 6)),
-            "dv": (real, e.dv - r, (nd, 6)), "shift": (real, e.shift - r, (nd, 6)), "point": (real, e.point - r, (c, 3)),
-            "gap": (real, e.gap - r, (c,)), "normal": (real, e.normal - r, (c, 3)), "tangent": (real, e.tangent - r, (nt, 3)),
+            "dv": (real, e.dv - r, (nd, 6)), "shift": (real, e.shift - r, (nd, 6)),
+            "point": (real, e.point - r, (c, 3)),
+            "gap": (real, e.gap - r, (c,)), "normal": (real, e.normal - r, (c, 3)),
+            "tangent": (real, e.tangent - r, (nt, 3)),
             "arm_a": (real, e.arm_a - r, (c, 3)), "arm_b": (real, e.arm_b - r, (c, 3)),
-            "coupling": (real, e.coupling - r, (nt, 5)), "swing": (real, e.swing - r, (m - mj, 6)), "local": (real, e.local - r, (c, 6)),
-            "cache_impulse": (real, e.cache_impulse - r, (c, 5)), "cache_local": (real, e.cache_local - r, (c, 6)),
-            "push": (real, e.push - r, (mj + c,)), "target": (real, e.target - r, (m,)), "lower": (real, e.lower - r, (m,)),
+            "coupling": (real, e.coupling - r, (nt, 5)), "swing": (real, e.swing - r, (m - mj, 6)),
+            "local": (real, e.local - r, (c, 6)),
+            "cache_impulse": (real, e.cache_impulse - r, (c, 5)),
+            "cache_local": (real, e.cache_local - r, (c, 6)),
+            "push": (real, e.push - r, (mj + c,)), "target": (real, e.target - r, (m,)),
+            "lower": (real, e.lower - r, (m,)),
             "upper": (real, e.upper - r, (m,)), "b": (real, e.b - r, (m,)), "d": (real, e.d - r, (m,)),
             "step": (real, e.step - r, (m,)), "compliance": (real, e.compliance - r, (m,)),
             "impulse": (real, e.impulse - r, (m,)), "mu": (real, e.mu - r, (kj + c,)),
             "patch_radius": (real, e.patch_radius - r, (kj + c,)),
             "head": (index, e.head - i, (N_HEAD,)), "kind_of_shape": (index, e.kind_of_shape - i, (n,)),
-            "dyn": (index, e.dyn - i, (n,)), "uneven": (index, e.uneven - i, (n,)), "body_of": (index, e.body_of - i, (nd,)),
+            "dyn": (index, e.dyn - i, (n,)), "uneven": (index, e.uneven - i, (n,)),
+            "body_of": (index, e.body_of - i, (nd,)),
             "joint_kind": (index, e.joint_kind - i, (kj,)), "joint_motor": (index, e.joint_motor - i, (kj,)),
-            "joint_bodies": (index, e.joint_bodies - i, (kj, 2)), "joint_body": (index, e.joint_body - i, (kj, 2)),
-            "excluded": (index, e.excluded - i, (self.size[N_EXCLUDED], 2)), "pair": (index, e.pair - i, (p, 2)),
-            "contact_pair": (index, e.contact_pair - i, (c, 2)), "contact_body": (index, e.contact_body - i, (c, 2)),
+            "joint_bodies": (index, e.joint_bodies - i, (kj, 2)),
+            "joint_body": (index, e.joint_body - i, (kj, 2)),
+            "excluded": (index, e.excluded - i, (self.size[N_EXCLUDED], 2)),
+            "pair": (index, e.pair - i, (p, 2)),
+            "contact_pair": (index, e.contact_pair - i, (c, 2)),
+            "contact_body": (index, e.contact_body - i, (c, 2)),
             "ptr": (index, e.ptr - i, (kj + c + 1,)), "kind": (index, e.kind - i, (kj + c,)),
             "key": (keys, e.key - k, (c,)), "cache_key": (keys, e.cache_key - k, (c,)),
         }

@@ -5,7 +5,8 @@
 
 A body whose inertia has a direction drifts by the midpoint rule at constant L [N m s]:
 
-    q' = (1) over h/2 with omega,  omega' = I(q')^-1 L,  q <- (1) over h with omega',  omega <- I(q)^-1 L   (3)
+    q' = (1) over h/2 with omega,  omega' = I(q')^-1 L,                                        (3)
+    q <- (1) over h with omega',   omega <- I(q)^-1 L
 
 so the gyroscopic term costs nothing in angular momentum (kept to rounding) and O(h^2) in energy. Even
 inertia (spheres, cubes) needs (1) alone.
@@ -73,7 +74,8 @@ cdef inline void world_tensor(const double* r, const double* body, double* out) 
             out[3 * j + i] = out[3 * i + j]
 
 
-cdef inline void world_times(const double* r, const double* body, const double* a, double* out) noexcept nogil:
+cdef inline void world_times(const double* r, const double* body, const double* a,
+                             double* out) noexcept nogil:
     # R T R^T a
     cdef double s[3]
     cdef double t[3]

@@ -13,8 +13,9 @@ of sizes; counting sorts put the pairs in order.
 from libc.math cimport fabs, floor
 from libc.stdint cimport int32_t, uint32_t
 
-from lavender_ext.engine_types cimport (BOX, CAP_PAIR, H_PAIRS, H_PAIRS_VALID, H_REBUILDS, N_BODY, N_BUCKET,
-                                        N_EXCLUDED, NO_SHAPE, PLANE, SPHERE, S_MARGIN, S_SKIN, engine_t)
+from lavender_ext.engine_types cimport (BOX, CAP_PAIR, H_PAIRS, H_PAIRS_VALID, H_REBUILDS, N_BODY,
+                                        N_BUCKET, N_EXCLUDED, NO_SHAPE, PLANE, SPHERE, S_MARGIN, S_SKIN,
+                                        engine_t)
 
 
 cdef inline void half_box(const engine_t* e, int32_t i, double* half) noexcept nogil:
@@ -52,7 +53,9 @@ cdef inline int32_t pairs_hold(engine_t* e) noexcept nogil:
 
 
 cdef inline int32_t may_meet(const engine_t* e, int32_t i, int32_t j) noexcept nogil:
-    return (e.dyn[i] >= 0 or e.dyn[j] >= 0) and e.kind_of_shape[i] != NO_SHAPE and e.kind_of_shape[j] != NO_SHAPE
+    if e.kind_of_shape[i] == NO_SHAPE or e.kind_of_shape[j] == NO_SHAPE:
+        return 0
+    return e.dyn[i] >= 0 or e.dyn[j] >= 0
 
 
 cdef inline int32_t boxes_meet(const engine_t* e, int32_t i, int32_t j) noexcept nogil:
@@ -162,7 +165,8 @@ cdef inline void grid_pairs(engine_t* e, int32_t* n_pairs) noexcept nogil:
                             j = e.bucket[cell_hash(c, mask)]
                             while j >= 0:
                                 if (e.cell[4 * j] == x and e.cell[4 * j + 1] == y and e.cell[4 * j + 2] == z
-                                        and e.cell[4 * j + 3] == level and (level > e.cell[4 * i + 3] or j < i)
+                                        and e.cell[4 * j + 3] == level
+                                        and (level > e.cell[4 * i + 3] or j < i)
                                         and may_meet(e, i, j) and boxes_meet(e, i, j)):
                                     add_pair(e, i, j, n_pairs)
                                 j = e.chain[j]

@@ -58,7 +58,8 @@ cdef inline void sphere_sphere(const double* xa, double ra, const double* xb, do
     m.n = 1
 
 
-cdef inline void plane_sphere(const double* plane, const double* x, double r, double margin, manifold_t* m) noexcept nogil:
+cdef inline void plane_sphere(const double* plane, const double* x, double r, double margin,
+                              manifold_t* m) noexcept nogil:
     cdef double gap = dot3(plane, x) - plane[3] - r
     cdef int32_t k
     if gap > margin:
@@ -77,7 +78,7 @@ cdef inline void plane_box(const double* plane, const double* x, const double* r
     cdef double p[3]
     cdef double gap[8]
     cdef double low, g = dot3(plane, x) - plane[3]
-    cdef int32_t i, j, k, best, taken = 0
+    cdef int32_t i, _j, k, best, taken = 0
     to_body(rot, plane, p)
     low = g
     for k in range(3):
@@ -89,7 +90,7 @@ cdef inline void plane_box(const double* plane, const double* x, const double* r
         gap[i] = g + (p[0] if i & 1 else -p[0]) + (p[1] if i & 2 else -p[1]) + (p[2] if i & 4 else -p[2])
     for k in range(3):
         m.normal[k] = plane[k]
-    for j in range(4):
+    for _j in range(4):
         best = -1
         for i in range(8):
             if not (taken >> i) & 1 and gap[i] <= margin and (best < 0 or gap[i] < gap[best]):
@@ -110,8 +111,8 @@ cdef inline void plane_box(const double* plane, const double* x, const double* r
             m.n += 1
 
 
-cdef inline void box_sphere(const double* xa, const double* rot, const double* half, const double* xb, double r,
-                            double margin, manifold_t* m) noexcept nogil:
+cdef inline void box_sphere(const double* xa, const double* rot, const double* half, const double* xb,
+                            double r, double margin, manifold_t* m) noexcept nogil:
     cdef double d[3]
     cdef double c[3]
     cdef double near[3]
@@ -153,8 +154,9 @@ cdef inline void box_sphere(const double* xa, const double* rot, const double* h
     m.n = 1
 
 
-cdef inline int32_t clip_side(int32_t n, const double* p, const int32_t* code, int32_t axis, double sign, double bound,
-                              double tol, int32_t line, double* out, int32_t* out_code) noexcept nogil:
+cdef inline int32_t clip_side(int32_t n, const double* p, const int32_t* code, int32_t axis, double sign,
+                              double bound, double tol, int32_t line, double* out,
+                              int32_t* out_code) noexcept nogil:
     # Polygon p (n, 3), edge code[i] from point i to i + 1, against sign * p[axis] <= bound. A corner within
     # tol of the side counts as inside: a pair that lies edge on edge keeps its corners.
     cdef int32_t i, j, k, kept = 0
@@ -180,9 +182,9 @@ cdef inline int32_t clip_side(int32_t n, const double* p, const int32_t* code, i
 
 
 cdef inline void face_points(const double* xr, const double* rr, const double* hr, int32_t axis, double sign,
-                             const double* xo, const double* ro, const double* ho, int32_t on_b, double margin,
-                             manifold_t* m) noexcept nogil:
-    # Reference face `axis`, `sign` of one box, the other box clipped; (x, y, z) below is the frame of the face.
+                             const double* xo, const double* ro, const double* ho, int32_t on_b,
+                             double margin, manifold_t* m) noexcept nogil:
+    # Reference face `axis`, `sign` of one box, the other box clipped; (x, y, z) is the frame of the face.
     cdef double poly[36]
     cdef double more[36]
     cdef int32_t code[12]
@@ -269,7 +271,10 @@ cdef inline void face_points(const double* xr, const double* rr, const double* h
             best = -1.0 / 0.0
             pick[i] = 0
             for j in range(kept):
-                s = (more[3 * j] + 0.3 * more[3 * j + 1]) if i & 1 == 0 else (more[3 * j + 1] - 0.3 * more[3 * j])
+                if i & 1:
+                    s = more[3 * j + 1] - 0.3 * more[3 * j]
+                else:
+                    s = more[3 * j] + 0.3 * more[3 * j + 1]
                 if i < 2:
                     s = -s
                 if s > best:
@@ -287,8 +292,8 @@ cdef inline void face_points(const double* xr, const double* rr, const double* h
             best = 1.0 / 0.0
             other = 0
             for i in range(4):
-                s = ((more[3 * pick[i]] - more[3 * at]) * (more[3 * pick[i]] - more[3 * at])
-                     + (more[3 * pick[i] + 1] - more[3 * at + 1]) * (more[3 * pick[i] + 1] - more[3 * at + 1]))
+                s = (more[3 * pick[i]] - more[3 * at]) * (more[3 * pick[i]] - more[3 * at])
+                s += (more[3 * pick[i] + 1] - more[3 * at + 1]) * (more[3 * pick[i] + 1] - more[3 * at + 1])
                 if s < best:
                     best = s
                     other = i
@@ -300,7 +305,8 @@ cdef inline void face_points(const double* xr, const double* rr, const double* h
             pick[i] = pick[0] if kept > 0 else 0
     feature = (((on_b * 8 + axis * 2 + (sign > 0.0)) * 8) + face) * 64
     m.n = 0
-    if kept >= 4:                                       # from round the face to row by row, as the corners of a box count
+    # from round the face to row by row, as the corners of a box count
+    if kept >= 4:
         i = pick[2]
         pick[2] = pick[3]
         pick[3] = i
@@ -314,7 +320,8 @@ cdef inline void face_points(const double* xr, const double* rr, const double* h
             continue
         s = hr[axis] + 0.5 * more[3 * at + 2]
         for k in range(3):
-            m.point[3 * m.n + k] = xr[k] + more[3 * at] * rr[3 * k + ax] + more[3 * at + 1] * rr[3 * k + ay] + s * n[k]
+            m.point[3 * m.n + k] = (xr[k] + more[3 * at] * rr[3 * k + ax] + more[3 * at + 1] * rr[3 * k + ay]
+                                    + s * n[k])
         m.gap[m.n] = more[3 * at + 2]
         m.feature[m.n] = feature + more_code[at]
         m.n += 1
@@ -323,7 +330,8 @@ cdef inline void face_points(const double* xr, const double* rr, const double* h
 
 
 cdef inline void edge_point(const double* xa, const double* ra, const double* ha, int32_t i, const double* xb,
-                            const double* rb, const double* hb, int32_t j, double* n, double gap, manifold_t* m) noexcept nogil:
+                            const double* rb, const double* hb, int32_t j, double* n, double gap,
+                            manifold_t* m) noexcept nogil:
     # nearest points of the two edges along axes i of a and j of b that face each other along n
     cdef double p[3]
     cdef double q[3]
@@ -367,8 +375,8 @@ cdef inline void edge_point(const double* xa, const double* ra, const double* ha
     m.n = 1
 
 
-cdef inline void box_box(const double* xa, const double* ra, const double* ha, const double* xb, const double* rb,
-                         const double* hb, double margin, manifold_t* m) noexcept nogil:
+cdef inline void box_box(const double* xa, const double* ra, const double* ha, const double* xb,
+                         const double* rb, const double* hb, double margin, manifold_t* m) noexcept nogil:
     cdef double c[9]            # R_a^T R_b
     cdef double f[9]            # |c|
     cdef double d[3]
@@ -446,9 +454,10 @@ cdef inline void box_box(const double* xa, const double* ra, const double* ha, c
         face_points(xa, ra, ha, axis_a, -1.0 if ta[axis_a] < 0.0 else 1.0, xb, rb, hb, 0, margin, m)
 
 
-cdef inline void collide(const engine_t* e, int32_t a, int32_t b, double margin, manifold_t* m) noexcept nogil:
+cdef inline void collide(const engine_t* e, int32_t a, int32_t b, double margin,
+                         manifold_t* m) noexcept nogil:
     """Manifold of bodies a < b; n = 0 where they are further apart than the margin."""
-    cdef int32_t ka = e.kind_of_shape[a], kb = e.kind_of_shape[b], i, k, flip = 0
+    cdef int32_t ka = e.kind_of_shape[a], kb = e.kind_of_shape[b], k, flip = 0
     cdef const double* xa = e.x + 3 * a
     cdef const double* xb = e.x + 3 * b
     cdef const double* sa = e.shape + 4 * a

@@ -22,10 +22,10 @@ from lavender_ext.block cimport CONTACT, CONTACT_SPIN
 from lavender_ext.engine_body cimport to_body
 from lavender_ext.engine_collide cimport collide, manifold_t
 from lavender_ext.engine_types cimport (BOX, CAP_CONTACT, H_CACHED, H_CONTACTS, H_CONTACT_ROWS, H_MATCHES,
-                                        H_PAIRS, H_WARM_START, N_CACHE_IMPULSE, N_JOINT,
-                                        N_JOINT_ROW, S_BOUNCE, S_H, S_MARGIN, S_MATCH, engine_t)
-from lavender_ext.rows cimport (contact_diagonal, contact_slack, cross, dot3, largest_eigenvalue, reciprocal,
-                                relative_velocity, rows_t)
+                                        H_PAIRS, H_WARM_START, N_CACHE_IMPULSE, N_JOINT, N_JOINT_ROW,
+                                        S_BOUNCE, S_H, S_MARGIN, S_MATCH, engine_t)
+from lavender_ext.rows cimport (contact_diagonal, contact_slack, cross, dot3, largest_eigenvalue,
+                                reciprocal, relative_velocity, rows_t)
 
 
 cdef inline uint64_t contact_key(int32_t a, int32_t b, int32_t feature) noexcept nogil:
@@ -65,8 +65,9 @@ cdef inline double apart2(const engine_t* e, int32_t c, int32_t entry) noexcept 
     return x if x < y else y
 
 
-cdef inline void match_pair(const engine_t* e, int32_t c, int32_t n, int32_t first, int32_t* entry) noexcept nogil:
-    """Cached entries of contacts c .. c + n - 1 of one pair, whose entries begin at `first`; -1 where there is none.
+cdef inline void match_pair(const engine_t* e, int32_t c, int32_t n, int32_t first,
+                            int32_t* entry) noexcept nogil:
+    """Cached entries of contacts c .. c + n - 1 of one pair, whose entries begin at `first`; -1 for none.
 
     By key, then by place: a contact whose key is new takes the nearest entry that no key has claimed.
     """
@@ -78,7 +79,8 @@ cdef inline void match_pair(const engine_t* e, int32_t c, int32_t n, int32_t fir
     for j in range(n):
         entry[j] = -1
         for i in range(first, end):
-            if e.cache_key[i] == e.key[c + j] and not (used >> (i - first)) & 1 and apart2(e, c + j, i) <= reach:
+            if (e.cache_key[i] == e.key[c + j] and not (used >> (i - first)) & 1
+                    and apart2(e, c + j, i) <= reach):
                 entry[j] = i
                 used |= 1 << (i - first)
                 break
@@ -99,7 +101,8 @@ cdef inline void match_pair(const engine_t* e, int32_t c, int32_t n, int32_t fir
             used |= 1 << (entry[j] - first)
 
 
-cdef inline void guess_contact(engine_t* e, int32_t c, int32_t entry, int32_t nt, int32_t spin, double* lam) noexcept nogil:
+cdef inline void guess_contact(engine_t* e, int32_t c, int32_t entry, int32_t nt, int32_t spin,
+                               double* lam) noexcept nogil:
     # The cached impulse in this contact's frame: friction is kept as a world vector.
     cdef double t2[3]
     cdef const double* p = e.cache_impulse + N_CACHE_IMPULSE * entry
@@ -116,12 +119,14 @@ cdef inline double normal_velocity(const engine_t* e, int32_t a, int32_t b, int3
     # closing speed of a contact with the velocities before the substep, static bodies at rest
     cdef double u[3]
     cdef double s[3]
-    relative_velocity(e.v, a if e.dyn[a] >= 0 else -1, b if e.dyn[b] >= 0 else -1, e.arm_a + 3 * c, e.arm_b + 3 * c, u, s)
+    relative_velocity(e.v, a if e.dyn[a] >= 0 else -1, b if e.dyn[b] >= 0 else -1, e.arm_a + 3 * c,
+                      e.arm_b + 3 * c, u, s)
     return dot3(e.normal + 3 * c, u)
 
 
 cdef inline void make_contact(engine_t* e, const rows_t* r, int32_t c, int32_t row, int32_t a, int32_t b,
-                              const manifold_t* m, int32_t at, int32_t nt, int32_t spin, double bounce) noexcept nogil:
+                              const manifold_t* m, int32_t at, int32_t nt, int32_t spin,
+                              double bounce) noexcept nogil:
     """Row data of contact c, rows row .. row + nt + spin, of point `at` of the manifold."""
     cdef double h = e.setting[S_H], vn, t12, gap = m.gap[at], target
     cdef double w[4]
@@ -152,7 +157,8 @@ cdef inline void make_contact(engine_t* e, const rows_t* r, int32_t c, int32_t r
     if nt > 0:
         tangent_of(e.normal + 3 * c, e.tangent + 3 * c)
     contact_diagonal(e.normal + 3 * c, e.tangent + 3 * c, e.arm_a + 3 * c, e.arm_b + 3 * c, nt, spin, da, db,
-                     e.inv_mass, e.inv_inertia, d, &t12, e.coupling + 5 * c, e.swing + 6 * (row - e.size[N_JOINT_ROW]))
+                     e.inv_mass, e.inv_inertia, d, &t12, e.coupling + 5 * c,
+                     e.swing + 6 * (row - e.size[N_JOINT_ROW]))
     for k in range(1 + nt + spin):
         d[k] += e.compliance[row + k]
     e.step[row] = reciprocal(d[0])
@@ -177,10 +183,11 @@ cdef inline void make_contact(engine_t* e, const rows_t* r, int32_t c, int32_t r
 
 
 cdef inline int32_t make_contacts(engine_t* e, const rows_t* r) noexcept nogil:
-    """All contacts of the pair list, with guesses from the cache; returns how many there are (see CAP_CONTACT)."""
+    """All contacts of the pair list, with guesses from the cache; returns how many there are."""
     cdef manifold_t m
     cdef int32_t entry[4]
-    cdef int32_t i, j, k, a, b, nt, spin, start, c = 0, row = e.size[N_JOINT_ROW], block, first = 0, matches = 0
+    cdef int32_t i, j, k, a, b, nt, spin, start, c = 0, row = e.size[N_JOINT_ROW], block, first = 0
+    cdef int32_t matches = 0
     cdef double mu, patch, bounce, margin = e.setting[S_MARGIN]
     cdef uint64_t pair
     e.ptr[e.size[N_JOINT]] = row
@@ -217,7 +224,8 @@ cdef inline int32_t make_contacts(engine_t* e, const rows_t* r) noexcept nogil:
             match_pair(e, start, m.n, first, entry)
             for j in range(m.n):
                 if entry[j] >= 0:
-                    guess_contact(e, start + j, entry[j], nt, spin, e.impulse + e.ptr[e.size[N_JOINT] + start + j])
+                    k = e.ptr[e.size[N_JOINT] + start + j]
+                    guess_contact(e, start + j, entry[j], nt, spin, e.impulse + k)
                     matches += 1
     if c <= e.size[CAP_CONTACT]:
         e.head[H_CONTACTS] = c

@@ -18,13 +18,14 @@ from libc.stdint cimport int32_t
 
 from lavender_ext.block cimport ROW
 from lavender_ext.engine_body cimport to_world
-from lavender_ext.engine_types cimport (BALL, DISTANCE, HINGE, H_WARM_START, J_ANCHOR_A, J_ANCHOR_B, J_AXIS_A, J_AXIS_B,
-                                        J_DAMPING, J_HERTZ, J_LENGTH, J_SIDE_A, J_SPEED, J_TORQUE, N_JOINT,
-                                        N_JOINT_REAL, S_H, engine_t)
+from lavender_ext.engine_types cimport (BALL, DISTANCE, HINGE, H_WARM_START, J_ANCHOR_A, J_ANCHOR_B,
+                                        J_AXIS_A, J_AXIS_B, J_DAMPING, J_HERTZ, J_LENGTH, J_SIDE_A,
+                                        J_SPEED, J_TORQUE, N_JOINT, N_JOINT_REAL, S_H, engine_t)
 from lavender_ext.rows cimport cross, dot3, dot12, joint_velocity, minv_times, reciprocal
 
 
-cdef inline void anchor(const engine_t* e, int32_t body, const double* local, double* arm, double* point) noexcept nogil:
+cdef inline void anchor(const engine_t* e, int32_t body, const double* local, double* arm,
+                        double* point) noexcept nogil:
     # arm from the centre and point, world; body -1 is the world
     cdef int32_t k
     if body < 0:
@@ -46,7 +47,8 @@ cdef inline void direction(const engine_t* e, int32_t body, const double* local,
         to_world(e.rot + 9 * body, local, out)
 
 
-cdef inline void point_row(double* jac, const double* axis, const double* arm_a, const double* arm_b) noexcept nogil:
+cdef inline void point_row(double* jac, const double* axis, const double* arm_a,
+                           const double* arm_b) noexcept nogil:
     # axis.(v_b + omega_b x arm_b - v_a - omega_a x arm_a)
     cdef double l[3]
     cdef int32_t k

@@ -13,9 +13,9 @@ from libc.math cimport fabs
 from libc.stdint cimport int32_t
 
 from lavender_ext.block cimport clip, relax_normal
-from lavender_ext.engine_types cimport (H_CONTACTS, H_POSITION_ITERATIONS, H_PROJECTED, J_HERTZ, N_DYNAMIC, N_JOINT,
-                                        N_JOINT_REAL, N_JOINT_ROW, S_BETA, S_DEPTH, S_H, S_JOINT_ERROR, S_MAX_PUSH,
-                                        S_SLOP, engine_t)
+from lavender_ext.engine_types cimport (H_CONTACTS, H_POSITION_ITERATIONS, H_PROJECTED, J_HERTZ, N_DYNAMIC,
+                                        N_JOINT, N_JOINT_REAL, N_JOINT_ROW, S_BETA, S_DEPTH, S_H,
+                                        S_JOINT_ERROR, S_MAX_PUSH, S_SLOP, engine_t)
 from lavender_ext.rows cimport dot3, joint_push, joint_velocity, push_bodies, relative_velocity
 
 
@@ -27,18 +27,21 @@ cdef inline int32_t rigid_row(const engine_t* e, int32_t i, int32_t row) noexcep
 cdef inline double normal_speed(const engine_t* e, const double* v, int32_t c) noexcept nogil:
     cdef double u[3]
     cdef double s[3]
-    relative_velocity(v, e.contact_body[2 * c], e.contact_body[2 * c + 1], e.arm_a + 3 * c, e.arm_b + 3 * c, u, s)
+    relative_velocity(v, e.contact_body[2 * c], e.contact_body[2 * c + 1], e.arm_a + 3 * c, e.arm_b + 3 * c,
+                      u, s)
     return dot3(e.normal + 3 * c, u)
 
 
 cdef inline int32_t project_positions(engine_t* e) noexcept nogil:
-    """Fill e.shift; returns 1 where there is any. Writes S_DEPTH, S_JOINT_ERROR of the start of the substep."""
-    cdef int32_t n = e.head[H_CONTACTS], mj = e.size[N_JOINT_ROW], sweep, i, j, c, a, b, due = 0
-    cdef double h = e.setting[S_H], slop = e.setting[S_SLOP], beta = e.setting[S_BETA], most = e.setting[S_MAX_PUSH]
+    """Fill e.shift; returns 1 where there is any. Writes S_DEPTH, S_JOINT_ERROR as the substep began."""
+    cdef int32_t n = e.head[H_CONTACTS], mj = e.size[N_JOINT_ROW], _sweep, i, j, c, a, b, due = 0
+    cdef double h = e.setting[S_H], slop = e.setting[S_SLOP], beta = e.setting[S_BETA]
+    cdef double most = e.setting[S_MAX_PUSH]
     cdef double depth = 0.0, off = 0.0, x, y, p
     cdef double impulse[3]
     cdef const double* normal
-    cdef double* goal = e.target                        # free after the solve: J s wanted, by contact and joint row
+    # free after the solve: J s wanted, by contact and joint row
+    cdef double* goal = e.target
     e.head[H_PROJECTED] = 0
     for c in range(n):
         if -e.gap[c] > depth:
@@ -72,7 +75,7 @@ cdef inline int32_t project_positions(engine_t* e) noexcept nogil:
         return 0
     for i in range(6 * e.size[N_DYNAMIC]):
         e.shift[i] = 0.0
-    for sweep in range(e.head[H_POSITION_ITERATIONS]):
+    for _sweep in range(e.head[H_POSITION_ITERATIONS]):
         for i in range(e.size[N_JOINT]):
             a = e.joint_body[2 * i]
             b = e.joint_body[2 * i + 1]

@@ -19,7 +19,7 @@ cdef enum:
     N_JOINT_ROW = 3
     N_EXCLUDED = 4
     N_BUCKET = 5            # buckets of the hash grid, a power of two; 0: all pairs are tested
-    N_FRAME = 6             # rotation matrices: n_bodies where boxes, joints or uneven inertia need them, else 0
+    N_FRAME = 6             # rotation matrices: n_bodies where boxes, joints or uneven inertia are, else 0
     ROWS_PER_CONTACT = 7    # 1 without friction, 3 with, 4 with patch friction
     CAP_PAIR = 8
     CAP_CONTACT = 9
@@ -139,7 +139,7 @@ cdef struct engine_t:
     int32_t* cell           # (n, 4) cell and level
     # contacts
     int32_t* contact_pair   # (c, 2) bodies
-    int32_t* contact_body   # (c, 2) dynamic numbers, right after joint_body: together the bodies of all blocks
+    int32_t* contact_body   # (c, 2) dynamic numbers; right after joint_body, so that all blocks follow
     double* point           # (c, 3) m
     double* gap             # (c) m, negative = penetration
     double* normal          # (c, 3)

@@ -114,7 +114,8 @@ cdef inline double joint_velocity(const double* jac, const double* v, int32_t a,
     return s + t
 
 
-cdef inline void joint_push(const double* minv_jac, double change, double* v, int32_t a, int32_t b) noexcept nogil:
+cdef inline void joint_push(const double* minv_jac, double change, double* v, int32_t a,
+                            int32_t b) noexcept nogil:
     cdef int32_t k
     if a >= 0:
         for k in range(6):
@@ -124,7 +125,8 @@ cdef inline void joint_push(const double* minv_jac, double change, double* v, in
             v[6 * b + k] += change * minv_jac[6 + k]
 
 
-cdef inline void relax_joint(const blocks_t* p, const rows_t* r, int32_t i, double* lam, double* v) noexcept nogil:
+cdef inline void relax_joint(const blocks_t* p, const rows_t* r, int32_t i, double* lam,
+                             double* v) noexcept nogil:
     """One joint, its rows in turn: w = J v + c lam - b, equation (1) of block.pxd."""
     cdef int32_t j, a = r.joint_body[2 * i], b = r.joint_body[2 * i + 1]
     cdef double w, y
@@ -136,7 +138,8 @@ cdef inline void relax_joint(const blocks_t* p, const rows_t* r, int32_t i, doub
 
 
 cdef inline void swing_body(double* v, double inv_mass, const double* swing, const double* impulse, double dn,
-                            double d0, double d1, double ds, int32_t nt, int32_t spin, double sign) noexcept nogil:
+                            double d0, double d1, double ds, int32_t nt, int32_t spin,
+                            double sign) noexcept nogil:
     # (3) for one body: swing is at the first row of this contact and this side.
     cdef int32_t k
     cdef double w
@@ -201,12 +204,14 @@ cdef inline void relax_contact(const double* normal, const double* tangent, cons
 
 cdef inline void relax_contact_block(const blocks_t* p, const rows_t* r, int32_t i, double* lam,
                                      double* v) noexcept nogil:
-    # The two common kinds with their sizes as constants: a compiler then leaves out the rows that are not there.
+    # The two common kinds with their sizes as constants: a compiler then leaves out the rows that are not
+    # there.
     cdef int32_t c = i - r.n_joints, j = p.ptr[i], kind = p.kind[i], nt = n_tangents(kind, p.ptr[i + 1] - j)
     cdef const double* swing = r.swing + 6 * (j - p.ptr[r.n_joints])
     if kind == CONTACT_SPIN or nt == 1:
         relax_contact(r.normal + 3 * c, r.tangent + 3 * c, r.arm_a + 3 * c, r.arm_b + 3 * c,
-                      r.coupling + 5 * c, swing, r.compliance + j, p.b + j, p.step + j, p.mu[i], p.patch_radius[i],
+                      r.coupling + 5 * c, swing, r.compliance + j, p.b + j, p.step + j, p.mu[i],
+                      p.patch_radius[i],
                       nt, kind == CONTACT_SPIN, r.contact_body[2 * c], r.contact_body[2 * c + 1], r.inv_mass,
                       lam + j, v)
     elif nt == 2:
@@ -283,7 +288,8 @@ cdef inline void contact_push(const rows_t* r, int32_t c, int32_t nt, int32_t sp
                 r.arm_a + 3 * c, r.arm_b + 3 * c, impulse, twist)
 
 
-cdef inline void contact_jacobian(const rows_t* r, int32_t c, int32_t nt, int32_t spin, double* jac) noexcept nogil:
+cdef inline void contact_jacobian(const rows_t* r, int32_t c, int32_t nt, int32_t spin,
+                                  double* jac) noexcept nogil:
     # Rows of one contact as (1 + nt + spin, 12), in the layout of joint rows.
     cdef double axis[3]
     cdef double arm[3]
@@ -338,11 +344,13 @@ cdef inline void minv_times(const double* jac, const double* inv_mass, const dou
             out[9 + k] = dot3(inv_inertia + 9 * b + 3 * k, jac + 9)
 
 
-cdef inline void contact_diagonal(const double* normal, const double* tangent, const double* arm_a, const double* arm_b,
+cdef inline void contact_diagonal(const double* normal, const double* tangent, const double* arm_a,
+                                  const double* arm_b,
                                   int32_t nt, int32_t spin, int32_t a, int32_t b, const double* inv_mass,
                                   const double* inv_inertia, double* d, double* t12, double* coupling,
                                   double* swing) noexcept nogil:
-    """A among the rows of one contact, without compliance: diagonal d (1 + nt + spin), t12 = A_t1t2, coupling (5).
+    """A among the rows of one contact, without compliance: diagonal d (1 + nt + spin), t12 = A_t1t2,
+    coupling (5).
 
     And swing (1 + nt + spin, 6): I_a^-1 (arm_a x axis), I_b^-1 (arm_b x axis) of each row, 0 where static.
 

@@ -1,7 +1,8 @@
 """Places of numbers in the engine's small arrays, as `lavender_ext/engine_types.pxd` numbers them."""
 
 SIZE = {
-    "bodies": 0, "dynamic": 1, "joints": 2, "joint_rows": 3, "excluded": 4, "buckets": 5, "frames": 6, "rows_per_contact": 7,
+    "bodies": 0, "dynamic": 1, "joints": 2, "joint_rows": 3, "excluded": 4, "buckets": 5, "frames": 6,
+    "rows_per_contact": 7,
 }  # fmt: skip
 CAP_PAIR, CAP_CONTACT, N_SIZES = 8, 9, 10
 HEAD = {

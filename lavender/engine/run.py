@@ -142,7 +142,11 @@ def line(step: int, observation: Mapping[str, Any], info: Mapping[str, Any]) -> 
         f"residual {s[4]:.2e} -> {s[5]:.2e} N s  violation {s[7]:.2e} m/s  depth {1e3 * depth:7.3f} mm"
     )
     failed = f"  failed solves {info['failed_solves']}" if info["failed_solves"] else ""
-    rest = f"  relative {info['residual']['relative']:.2e}, worst {info['residual']['worst']}" if "residual" in info else ""
+    rest = (
+        f"  relative {info['residual']['relative']:.2e}, worst {info['residual']['worst']}"
+        if "residual" in info
+        else ""
+    )
     return text + failed + rest
 
 

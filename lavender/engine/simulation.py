@@ -224,7 +224,9 @@ class Simulation:
     def _solve(self, problem: Problem) -> FloatArray:
         p = self._parameters
         guess = problem.start() if problem.guess is None else problem.guess
-        solution = solve(problem, p.solver, impulse=guess, max_iter=self.solver_iterations, **p.solver_options)
+        solution = solve(
+            problem, p.solver, impulse=guess, max_iter=self.solver_iterations, **p.solver_options
+        )
         self._last = solution
         judged = solution.residual
         if solution.success or judged.relative <= 2.0 * judged.floor:
@@ -323,7 +325,14 @@ class Simulation:
         )
         lower, upper = np.full(m, -np.inf), np.full(m, np.inf)
         lower[:mj], upper[:mj] = a["lower"][:mj], a["upper"][:mj]
-        cones = Cones(a["ptr"][: k + 1].copy(), a["kind"][:k].copy(), lower, upper, a["mu"][:k].copy(), a["patch_radius"][:k].copy())
+        cones = Cones(
+            a["ptr"][: k + 1].copy(),
+            a["kind"][:k].copy(),
+            lower,
+            upper,
+            a["mu"][:k].copy(),
+            a["patch_radius"][:k].copy(),
+        )
         guess = a["impulse"][:m].copy() if state.head[HEAD["warm_start"]] else None
         return Problem(
             a["b"][:m].copy(),
@@ -345,7 +354,13 @@ class Simulation:
     def _block_names(self, pair: np.ndarray, key: np.ndarray) -> list[str]:
         names = self._names
         points = (key & np.uint64(0xFFFF)).tolist()
-        return [*self._joint_names, *(f"{names[i]} on {names[j]}, point {f}" for (i, j), f in zip(pair.tolist(), points, strict=True))]
+        return [
+            *self._joint_names,
+            *(
+                f"{names[i]} on {names[j]}, point {f}"
+                for (i, j), f in zip(pair.tolist(), points, strict=True)
+            ),
+        ]
 
     def residual(self) -> dict[str, Any]:
         """The judge over all rows of the last substep, with the impulses that it used.
@@ -445,11 +460,20 @@ class Simulation:
             Not a snapshot, or of another scene.
         """
         if not isinstance(snapshot, Snapshot):
-            raise InputError(f"snapshot is a {type(snapshot).__name__}; a Snapshot is needed (sim.snapshot())")
+            raise InputError(
+                f"snapshot is a {type(snapshot).__name__}; a Snapshot is needed (sim.snapshot())"
+            )
         if snapshot.fingerprint != self._fingerprint:
             raise InputError("the snapshot is of another scene: bodies, joints or parameters differ")
         state = State(snapshot.size)
-        if any(len(x) != len(y) for x, y in ((state.real, snapshot.real), (state.index, snapshot.index), (state.keys, snapshot.keys))):
+        if any(
+            len(x) != len(y)
+            for x, y in (
+                (state.real, snapshot.real),
+                (state.index, snapshot.index),
+                (state.keys, snapshot.keys),
+            )
+        ):
             raise InputError("the snapshot's arrays do not fit its sizes; it is damaged")
         state.real[:], state.index[:], state.keys[:] = snapshot.real, snapshot.index, snapshot.keys
         self._state = state
@@ -495,5 +519,3 @@ def _shares(problem: Problem, judged: Residual) -> dict[str, float]:
     total = float(energy.sum())
     sums = np.bincount(part, weights=energy, minlength=4) if problem.m else np.zeros(4)
     return {name: float(x / total) if total > 0.0 else 0.0 for name, x in zip(PARTS, sums, strict=True)}
-
-

@@ -78,7 +78,9 @@ class Snapshot:
             end = start + int.from_bytes(body[len(MAGIC) : start], "little")
             header = json.loads(body[start:end])
             if header["version"] != VERSION:
-                raise InputError(f"the snapshot {str(path)!r} has version {header['version']}; {VERSION} is read here")
+                raise InputError(
+                    f"the snapshot {str(path)!r} has version {header['version']}; {VERSION} is read here"
+                )
             arrays = {}
             for (name, code), n in zip(ARRAYS, header["lengths"], strict=True):
                 x = np.frombuffer(body, code, n, end)
@@ -90,7 +92,11 @@ class Snapshot:
             if [max(n, 1) for n in used] != [max(n, 1) for n in header["lengths"][1:]]:
                 raise ValueError("lengths")
             return cls(
-                str(header["fingerprint"]), int(header["steps"]), int(header["failed"]), str(header["lost"]), **arrays
+                str(header["fingerprint"]),
+                int(header["steps"]),
+                int(header["failed"]),
+                str(header["lost"]),
+                **arrays,
             )
         except (ValueError, KeyError, TypeError, UnicodeDecodeError) as error:
             if isinstance(error, InputError):

@@ -24,7 +24,15 @@ from lavender_ext import engine as kernels
 __all__ = ["ORDER_NUMBER", "State"]
 
 # H_ORDER of lavender_ext/engine.pyx
-ORDER_NUMBER = {"given": 0, "reverse": 1, "symmetric": 2, "random": 3, "bottom_up": 4, "top_down": 5, "colored": 6}
+ORDER_NUMBER = {
+    "given": 0,
+    "reverse": 1,
+    "symmetric": 2,
+    "random": 3,
+    "bottom_up": 4,
+    "top_down": 5,
+    "colored": 6,
+}
 assert set(ORDER_NUMBER) == set(ORDERS)
 
 BRUTE_FORCE = 32  # bodies up to which testing all pairs is quicker than the grid
@@ -97,7 +105,11 @@ class State:
         mu = np.array([p.friction if b.friction is None else b.friction for b in bodies])
         patch = np.array([p.patch_radius if b.patch_radius is None else b.patch_radius for b in bodies])
         shaped = np.array([b.shape is not None for b in bodies], bool)
-        per = 1 + 2 * bool((mu[shaped] > 0.0).any()) + bool((mu[shaped] > 0.0).any() and (patch[shaped] > 0.0).any())
+        per = (
+            1
+            + 2 * bool((mu[shaped] > 0.0).any())
+            + bool((mu[shaped] > 0.0).any() and (patch[shaped] > 0.0).any())
+        )
         excluded = sorted({tuple(sorted((j.a, j.b))) for j in joints if not j.collide and min(j.a, j.b) >= 0})
         n_shapes = int(shaped.sum())
         size = np.zeros(N_SIZES, np.int32)
@@ -148,11 +160,20 @@ class State:
         row = 0
         for i, j in enumerate(joints):
             values = a["joint"][i]
-            for name, x in (("anchor_a", j.anchor_a), ("anchor_b", j.anchor_b), ("axis_a", j.axis_a), ("axis_b", j.axis_b)):
+            for name, x in (
+                ("anchor_a", j.anchor_a),
+                ("anchor_b", j.anchor_b),
+                ("axis_a", j.axis_a),
+                ("axis_b", j.axis_b),
+            ):
                 values[JOINT[name] : JOINT[name] + 3] = x
             side = np.cross(j.axis_a, np.eye(3)[np.argmin(np.abs(j.axis_a))])
             values[JOINT["side_a"] : JOINT["side_a"] + 3] = side / np.linalg.norm(side)
-            values[JOINT["length"]], values[JOINT["hertz"]], values[JOINT["damping"]] = j.length, j.hertz, j.damping
+            values[JOINT["length"]], values[JOINT["hertz"]], values[JOINT["damping"]] = (
+                j.length,
+                j.hertz,
+                j.damping,
+            )
             values[JOINT["speed"]], values[JOINT["torque"]] = j.motor_speed or 0.0, j.motor_torque
             a["joint_kind"][i], a["joint_motor"][i] = JOINT_KINDS[j.kind], j.motor_speed is not None
             a["joint_bodies"][i] = j.a, j.b

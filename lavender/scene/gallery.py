@@ -7,6 +7,7 @@ contacts is bottom-up.
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -89,9 +90,11 @@ def card_house(scene: Scene, levels: int = 2, lean: float = 0.3) -> None:
                     position=(x - side * 0.5 * reach, 0.0, z + 0.5 * height),
                     quaternion=quaternion((0.0, 1.0, 0.0), side * lean),
                 )
-        for left, right in zip(apex[:-1], apex[1:], strict=True):
+        for left, right in pairwise(apex):
             scene.add_box(
-                (pitch - 1e-3, width, thick), mass, position=(0.5 * (left + right), 0.0, z + height + 0.5 * thick)
+                (pitch - 1e-3, width, thick),
+                mass,
+                position=(0.5 * (left + right), 0.0, z + height + 0.5 * thick),
             )
         z += height + thick
 
@@ -160,7 +163,9 @@ def bridge(scene: Scene, n: int = 16, load: float = 10.0) -> None:
     planks = []
     for i in range(n):
         planks.append(
-            scene.add_box((0.46, 1.0, 0.1), 1.0, position=((i + 0.5 - 0.5 * n) * 0.5, 0.0, 3.0), name=f"plank {i}")
+            scene.add_box(
+                (0.46, 1.0, 0.1), 1.0, position=((i + 0.5 - 0.5 * n) * 0.5, 0.0, 3.0), name=f"plank {i}"
+            )
         )
     for i, (a, b) in enumerate(zip([-1, *planks], [*planks, -1], strict=True)):
         scene.add_joint("hinge", a, b, anchor=((i - 0.5 * n) * 0.5, 0.0, 3.0), axis=(0.0, 1.0, 0.0))
@@ -238,7 +243,7 @@ def newtons_cradle(scene: Scene, n: int = 5, lifted: int = 1, angle: float = 0.6
             radius, position=pivot + drop * np.array([np.sin(t), 0.0, -np.cos(t)]), name=f"ball {i}"
         )
         for side in (-1.0, 1.0):
-            scene.add_joint("distance", -1, ball, anchor_a=pivot + (0.0, side * apart, 0.0))
+            scene.add_joint("distance", -1, ball, anchor_a=pivot + np.array([0.0, side * apart, 0.0]))
 
 
 @_named()
@@ -260,10 +265,12 @@ def four_bar(scene: Scene, motor: float | None = None, torque: float = 200.0, ti
         # bars lie side by side along the axis: their centres are off the plane of the hinges
         place = 0.5 * (corner[i] + corner[i + 1]) + 0.15 * (i - 1) * axis
         bars.append(
-            scene.add_box((long, 0.1, 0.1), long, position=place, quaternion=q, name=("crank", "coupler", "rocker")[i])
+            scene.add_box(
+                (long, 0.1, 0.1), long, position=place, quaternion=q, name=("crank", "coupler", "rocker")[i]
+            )
         )
     for i, (a, b) in enumerate(zip([-1, *bars], [*bars, -1], strict=True)):
-        drive = {} if motor is None or i else {"motor_speed": motor, "motor_torque": torque}
+        drive: dict[str, Any] = {} if motor is None or i else {"motor_speed": motor, "motor_torque": torque}
         scene.add_joint("hinge", a, b, anchor=corner[i], axis=axis, **drive)
 
 

@@ -63,6 +63,7 @@ class Body:
 
     @property
     def is_static(self) -> bool:
+        """Whether nothing moves it."""
         return self.mass == 0.0
 
     def to_local(self, point: FloatArray) -> FloatArray:
@@ -98,6 +99,7 @@ class Joint:
 
     @property
     def n_rows(self) -> int:
+        """Rows that it brings to the problem."""
         rows = {DISTANCE: 1, BALL: 3, HINGE: 5}[self.kind]
         return rows + (self.motor_speed is not None)
 

@@ -63,9 +63,10 @@ class Parameters:
         put = object.__setattr__
         put(self, "dt", number("dt", self.dt, above=0.0))
         put(self, "substeps", whole("substeps", self.substeps, 1))
-        if isinstance(self.gravity, (int, float)):
-            put(self, "gravity", (0.0, 0.0, -number("gravity", self.gravity)))
-        put(self, "gravity", tuple(numbers("gravity", self.gravity, 3).tolist()))
+        gravity: Any = self.gravity
+        if isinstance(gravity, (int, float)):
+            gravity = (0.0, 0.0, -number("gravity", gravity))
+        put(self, "gravity", tuple(numbers("gravity", gravity, 3).tolist()))
         spec = get(self.solver)
         if not isinstance(self.solver_options, Mapping):
             raise InputError(f"solver_options is {self.solver_options!r}; a mapping is needed")
@@ -74,8 +75,8 @@ class Parameters:
         if self.solver == "sequential_impulses":
             if self.solver_options:
                 raise InputError(
-                    f"solver_options {sorted(self.solver_options)} are for other solvers; sequential_impulses takes order= "
-                    "and seed= of the scene"
+                    f"solver_options {sorted(self.solver_options)} are for other solvers; sequential_impulses "
+                    "takes order= and seed= of the scene"
                 )
             sweeps = 16 if sweeps is None else whole("solver_iterations", sweeps, *SWEEPS)
         elif sweeps is None:
@@ -87,9 +88,15 @@ class Parameters:
         if self.order not in ORDERS:
             raise UnknownName("order", self.order, ORDERS)
         if self.order != "given" and self.solver != "sequential_impulses":
-            raise InputError(f"order={self.order!r} is for sequential_impulses; give {self.solver} its own in solver_options")
+            raise InputError(
+                f"order={self.order!r} is for sequential_impulses; give {self.solver} its own in solver_options"
+            )
         for name in ("friction", "restitution", "patch_radius", "slop", "restitution_threshold"):
-            put(self, name, number(name, getattr(self, name), low=0.0, high=1.0 if name == "restitution" else np.inf))
+            put(
+                self,
+                name,
+                number(name, getattr(self, name), low=0.0, high=1.0 if name == "restitution" else np.inf),
+            )
         put(self, "margin", number("margin", self.margin, low=0.0))
         put(self, "position_iterations", whole("position_iterations", self.position_iterations, 0, 1000))
         put(self, "seed", whole("seed", self.seed))
@@ -151,10 +158,12 @@ class Scene:
 
     @property
     def n_bodies(self) -> int:
+        """Bodies, static ones included."""
         return len(self.bodies)
 
     @property
     def n_joints(self) -> int:
+        """Joints."""
         return len(self.joints)
 
     def with_parameters(self, **changes: Any) -> Scene:
@@ -246,8 +255,12 @@ class Scene:
             velocity=v,
             angular_velocity=omega,
             friction=None if friction is None else number(f"friction of {label}", friction, low=0.0),
-            restitution=None if restitution is None else number(f"restitution of {label}", restitution, low=0.0, high=1.0),
-            patch_radius=None if patch_radius is None else number(f"patch_radius of {label} [m]", patch_radius, low=0.0),
+            restitution=None
+            if restitution is None
+            else number(f"restitution of {label}", restitution, low=0.0, high=1.0),
+            patch_radius=None
+            if patch_radius is None
+            else number(f"patch_radius of {label} [m]", patch_radius, low=0.0),
         )
         self.bodies.append(body)
         return number_
@@ -323,18 +336,30 @@ class Scene:
             raise UnknownName("joint", kind, (DISTANCE, BALL, HINGE))
         label = name or f"{kind} {len(self.joints)}"
         for body in (a, b):
-            if isinstance(body, bool) or not isinstance(body, (int, np.integer)) or not -1 <= body < self.n_bodies:
-                raise InputError(f"{label} names body {body!r}; there are bodies 0 to {self.n_bodies - 1}, and -1 is the world")
+            if (
+                isinstance(body, bool)
+                or not isinstance(body, (int, np.integer))
+                or not -1 <= body < self.n_bodies
+            ):
+                raise InputError(
+                    f"{label} names body {body!r}; there are bodies 0 to {self.n_bodies - 1}, and -1 is the world"
+                )
         a, b = int(a), int(b)
         if a == b or all(i < 0 or self.bodies[i].is_static for i in (a, b)):
-            raise InputError(f"{label} joins {a} and {b}; two bodies are needed, at least one of them dynamic")
+            raise InputError(
+                f"{label} joins {a} and {b}; two bodies are needed, at least one of them dynamic"
+            )
         hertz = number(f"hertz of {label}", hertz, low=0.0)
         damping = number(f"damping of {label}", damping, low=0.0)
         if kind == DISTANCE:
             if anchor is not None or axis is not None:
                 raise InputError(f"{label} takes anchor_a and anchor_b, no anchor or axis")
             pa, pb = (self._anchor(label, i, p) for i, p in ((a, anchor_a), (b, anchor_b)))
-            length = float(np.linalg.norm(pb - pa)) if length is None else number(f"length of {label} [m]", length, low=0.0)
+            length = (
+                float(np.linalg.norm(pb - pa))
+                if length is None
+                else number(f"length of {label} [m]", length, low=0.0)
+            )
             if length == 0.0:
                 raise InputError(f"{label} has length 0; use a ball joint")
         else:
@@ -360,8 +385,12 @@ class Scene:
             length=length or 0.0,
             hertz=hertz,
             damping=damping,
-            motor_speed=None if motor_speed is None else number(f"motor_speed of {label} [rad/s]", motor_speed),
-            motor_torque=0.0 if motor_torque is None else number(f"motor_torque of {label} [N m]", motor_torque, low=0.0),
+            motor_speed=None
+            if motor_speed is None
+            else number(f"motor_speed of {label} [rad/s]", motor_speed),
+            motor_torque=0.0
+            if motor_torque is None
+            else number(f"motor_torque of {label} [N m]", motor_torque, low=0.0),
             collide=bool(collide),
         )
         self.joints.append(joint)
@@ -388,7 +417,9 @@ class Scene:
         parts: list[Any] = [head]
         for b in self.bodies:
             shape = None if b.shape is None else [type(b.shape).__name__, repr(b.shape)]
-            parts.append([b.name, shape, b.mass, b.inertia.tolist(), b.friction, b.restitution, b.patch_radius])
+            parts.append(
+                [b.name, shape, b.mass, b.inertia.tolist(), b.friction, b.restitution, b.patch_radius]
+            )
         for j in self.joints:
             parts.append([getattr(j, f.name) for f in fields(Joint)])
         text = json.dumps(parts, default=lambda x: x.tolist() if isinstance(x, np.ndarray) else repr(x))
