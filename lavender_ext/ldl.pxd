@@ -10,7 +10,7 @@ from libc.stdint cimport int32_t, int64_t
 
 
 cdef enum:
-    NEGATIVE_DIGITS = 100000000     # what rounding leaves of a zero pivot, after others were skipped, is above -1e-8
+    NEGATIVE_DIGITS = 100000000     # rounding leaves no zero pivot below -1e-8, others having been skipped
 
 
 cdef struct pivots_t:
@@ -35,7 +35,8 @@ cdef inline double pivot_2(double p, double size, int32_t i, double tiny, pivots
     return 1.0 / p
 
 
-cdef inline void ldl_factor_2(int32_t n, double* c, const double* size, double tiny, pivots_t* out) noexcept nogil:
+cdef inline void ldl_factor_2(int32_t n, double* c, const double* size, double tiny,
+                              pivots_t* out) noexcept nogil:
     # (1) for a tridiagonal matrix, from both ends to the middle row h (twisted factorisation): two chains of
     # divisions that do not wait for each other. c[2 i] = 1 / p_i; the off-diagonals stay.
     cdef int32_t i = 0, j = n - 1, h = n // 2

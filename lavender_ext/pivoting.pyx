@@ -1,14 +1,14 @@
 """Principal pivoting on a symmetric boxed LCP, and the symmetric factorisations under it.
 
-    free rows F:  (A_FF + s D_FF) x_F = b_F - A_FB x_B + s D_FF center_F,   bound rows B: x = lower or upper   (1)
+    free rows F: (A_FF + s D_FF) x_F = b_F - A_FB x_B + s D_FF center_F,  bound rows B: x = its bound    (1)
     w = A x - b + s D (x - center),   D = diag(d)                                                       (2)
     infeasible: x_i outside its bounds on F, w_i < 0 at a lower, w_i > 0 at an upper bound              (3)
     exchange all infeasible rows, while their number falls within `patience` tries                      (4)
 
 Judice, Pires 1994 (block principal pivoting; when (4) is stuck the caller descends on the energy instead).
-s > 0 is the proximal shift of a singular matrix. Free rows are numbered compactly in a fixed order of elimination,
-so the bandwidth of A never grows; a dense matrix is a band of full width. A linear system is the case of
-all rows free.
+s > 0 is the proximal shift of a singular matrix. Free rows are numbered compactly in a fixed order of
+elimination, so the bandwidth of A never grows; a dense matrix is a band of full width. A linear system is
+the case of all rows free.
 """
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t, int64_t
@@ -66,8 +66,9 @@ cdef struct pivoting_t:
     int32_t n_rounds
 
 
-cdef public void lav_csr_scan(const csr_t* a, int32_t n, int32_t* cursor, int32_t* band, double* size) noexcept nogil:
-    """Lower and upper bandwidth into band[2]; max |A - A^T|, max |A| into size[2]; columns sorted in each row.
+cdef public void lav_csr_scan(const csr_t* a, int32_t n, int32_t* cursor, int32_t* band,
+                              double* size) noexcept nogil:
+    """Lower and upper bandwidth into band[2]; max |A - A^T|, max |A| into size[2]; columns are sorted.
 
     cursor (n) is scratch: the first entry of row j that no earlier row has looked up as its mirror image.
     """
@@ -248,7 +249,7 @@ cdef public void lav_pivot_place(pivoting_t* s) noexcept nogil:
 
 
 cdef public void lav_pivot_score(const pivoting_t* s, double* out) noexcept nogil:
-    """The judge's four sums for x as it stands, s = 0: energy, velocity of e, then of the floor f, into out[4].
+    """The judge's four sums for x as it stands, s = 0: energy, velocity of e, then of f, into out[4].
 
     e = w / d on free rows and where w has the wrong sign at a bound, 0 elsewhere.
     """
@@ -256,7 +257,8 @@ cdef public void lav_pivot_score(const pivoting_t* s, double* out) noexcept nogi
     cdef double t, v, energy = 0.0, floor = 0.0, fast = 0.0, fast_floor = 0.0
     for i in range(s.n):
         t = s.w[i]
-        if (s.at[i] == AT_LOWER and t > 0.0) or (s.at[i] == AT_UPPER and t < 0.0) or s.p.lower[i] == s.p.upper[i]:
+        if s.p.lower[i] == s.p.upper[i] or (s.at[i] == AT_LOWER and t > 0.0) or (
+                s.at[i] == AT_UPPER and t < 0.0):
             t = 0.0
         v = s.p.nu[i] * s.p.step[i]
         t = t * t
@@ -281,19 +283,21 @@ cdef public void lav_pivot_sweep(pivoting_t* s, int32_t n) noexcept nogil:
     """
     cdef int32_t i, k
     cdef double* x = s.x
-    cdef double omega
+    cdef double omega, w
     for k in range(n):
         omega = 1.7 if k == 0 else 1.0
         for i in range(s.n):
-            x[i] = relax_row(x[i], csr_dot(s.a, i, x) - s.p.b[i], omega * s.p.step[i], s.p.lower[i], s.p.upper[i])
+            w = csr_dot(s.a, i, x) - s.p.b[i]
+            x[i] = relax_row(x[i], w, omega * s.p.step[i], s.p.lower[i], s.p.upper[i])
         for i in range(s.n - 1, -1, -1):
-            x[i] = relax_row(x[i], csr_dot(s.a, i, x) - s.p.b[i], omega * s.p.step[i], s.p.lower[i], s.p.upper[i])
+            w = csr_dot(s.a, i, x) - s.p.b[i]
+            x[i] = relax_row(x[i], w, omega * s.p.step[i], s.p.lower[i], s.p.upper[i])
 
 
 cdef public int32_t lav_pivot_rounds(pivoting_t* s, int32_t rounds) noexcept nogil:
     """At most `rounds` rounds of: factor, solve, exchange; until no row is infeasible."""
-    cdef int32_t r, bad
-    for r in range(rounds):
+    cdef int32_t _r, bad
+    for _r in range(rounds):
         s.n_rounds += 1
         lav_pivot_place(s)
         lav_pivot_slack(s)
@@ -333,7 +337,7 @@ def scan(const int32_t[::1] indptr, const int32_t[::1] indices, const double[::1
 
 def free_block(const int32_t[::1] indptr, const int32_t[::1] indices, const double[::1] data,
                const int32_t[::1] place, const double[::1] d, double shift, int n_free):
-    """Upper triangle of A_FF + shift D_FF by columns: (data, indices, indptr); place (m,) as in `Pivoting`."""
+    """Upper triangle of A_FF + shift D_FF by columns: (data, indices, indptr); place (m,) of `Pivoting`."""
     cdef int32_t i, j, q, k = 0, at, n = <int32_t>indptr.shape[0] - 1, missing
     cdef int32_t[::1] ptr = np.empty(n_free + 1, np.int32)
     cdef int32_t[::1] idx
@@ -404,7 +408,8 @@ cdef class Pivoting:
         self.p = p
         whole, whole_ints = np.asarray(reals), np.asarray(ints)
         self.keep = (whole, whole_ints, order)
-        self.x, self.w, self.f, self.center = whole[:m], whole[m:2 * m], whole[2 * m:3 * m], whole[3 * m:4 * m]
+        self.x, self.w = whole[:m], whole[m:2 * m]
+        self.f, self.center = whole[2 * m:3 * m], whole[3 * m:4 * m]
         self.at, self.place = whole_ints[:m], whole_ints[m:2 * m]
         self.s.a = &p.csr
         self.s.p = &p.blocks
@@ -484,7 +489,7 @@ cdef class Pivoting:
             lav_pivot_slack(&self.s)
 
     def exchange(self):
-        """Number of infeasible rows, which have changed sides; negative, and nothing changed, without patience."""
+        """Number of infeasible rows, which have changed sides; negative: out of patience, none has."""
         return lav_pivot_exchange(&self.s)
 
     def put_bounds(self):
@@ -503,7 +508,7 @@ cdef class Pivoting:
         return k
 
     def score(self):
-        """(energy, velocity, floor energy, floor velocity) as the judge's, for x as it stands; without shift."""
+        """(energy, velocity, floor energy, floor velocity) as the judge's, for x as it is; without shift."""
         cdef double out[4]
         with nogil:
             lav_pivot_score(&self.s, out)

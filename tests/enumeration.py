@@ -8,10 +8,11 @@ import numpy as np
 def enumerate_lcp(a, b, lower, upper, tol=1e-9):
     """All (lambda, w) that solve the boxed LCP with a nonsingular free block, up to `tol`; n up to 8 or so."""
     sides = [
-        [0] + [-1] * bool(np.isfinite(lo)) + [1] * bool(np.isfinite(hi) and hi > lo)
+        [-1] if lo == hi else [0] + [-1] * bool(np.isfinite(lo)) + [1] * bool(np.isfinite(hi))
         for lo, hi in zip(lower, upper, strict=True)
     ]
     found = []
+    fixed = lower == upper  # any w
     for side in map(np.array, itertools.product(*sides)):
         free = side == 0
         x = np.where(side < 0, lower, np.where(side > 0, upper, 0.0))
@@ -23,6 +24,6 @@ def enumerate_lcp(a, b, lower, upper, tol=1e-9):
         w = a @ x - b
         slop = tol * (1.0 + np.abs(x).max(initial=0.0) + np.abs(b).max(initial=0.0))
         inside = np.all(x >= lower - slop) and np.all(x <= upper + slop)
-        if inside and np.all(w[side < 0] >= -slop) and np.all(w[side > 0] <= slop):
+        if inside and np.all(w[(side < 0) & ~fixed] >= -slop) and np.all(w[side > 0] <= slop):
             found.append((x, w))
     return found

@@ -9,8 +9,10 @@ from lavender.registry import SolverSpec
 
 # File in this folder, with its SPEC; from the exact to the plain.
 _TABLE = (
+    "auto",
     "direct",
     "newton",
+    "lemke",
     "block_gauss_seidel",
     "nncg",
     "anderson",

@@ -9,12 +9,12 @@ from __future__ import annotations
 from time import perf_counter
 
 import numpy as np
+from lavender_ext.pivoting import Pivoting
 from scipy.linalg import lapack
 
 from lavender._arrays import FloatArray
 from lavender.problem import Problem
 from lavender.solvers._factor import TINY, DenseFactor, Factor, SparseFactor, choose
-from lavender_ext.pivoting import Pivoting
 
 SOLVED, ROUNDS, SMALL, INDEFINITE, STUCK = range(5)  # outcomes, as in lavender_ext/pivoting.pyx
 SLOP = 8.0  # roundings of w within which a sign means nothing, as there

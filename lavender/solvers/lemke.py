@@ -1,0 +1,387 @@
+"""Lemke's method: complementary pivoting along one path, for any small dense A.
+
+    w = q + M s + c z,   w, s >= 0,  w_i s_i = 0,   z from its first value down to 0
+
+The path ends at z = 0, a solution, or on a secondary ray. For copositive-plus M (positive semidefinite ones
+are) a ray proves that there is none: its direction is the certificate, checked before INFEASIBLE is said.
+Everything is scaled to unit diagonal first. Rows become nonnegative ones exactly:
+
+    lower bound alone   lambda = lower + s              upper bound alone   lambda = upper - s, w -> -w
+    both bounds         lambda = lower + s, a row more: upper - lower - s >= 0 complementary to v >= 0,
+                        w + v >= 0 complementary to s
+    free                eliminated by principal pivots; what none reaches is split, lambda = s+ - s-
+    fixed               a constant
+
+In the end the rows found free are solved anew by LU of A itself and refined, so that what the pivots lost
+does not reach the result. Ties are broken lexicographically: no cycles, in exact arithmetic.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from time import perf_counter
+
+import numpy as np
+import numpy.typing as npt
+from lavender_ext.tableau import Dictionary
+from scipy.linalg import lapack
+
+from lavender._arrays import FloatArray, IntArray
+from lavender.problem import Problem
+from lavender.registry import SolverSpec
+from lavender.residuals import check_certificate, quick
+from lavender.solution import Claim, Status
+from lavender_ext import judge
+
+LIMIT = 2000  # rows: a dictionary of 32 MB
+# -, entries of a column this much below its largest are not pivoted on; the finer one for a second path, on
+# matrices whose own entries span as much.
+TINY, FINER = 1e-11, 1e-13
+REGULAR = 1e-13  # -, reciprocal condition above which a block can be eliminated: the result is refined anyway
+STABLE = 1e-2  # -, a diagonal entry of this share of its row and column makes a fair pivot of its own
+BATCH = 200  # pivots between two looks at the clock; then the dictionary is formed anew, which drops what rounding left
+PATHS = 8  # covering vectors tried
+PIVOTS_A_ROW = 20  # on one path, before it counts as lost
+GOOD = 1e-12  # relative residual at which no other path is tried
+DONE, PIVOTS, RAY = range(3)  # as in lavender_ext/tableau.pyx
+
+
+Places = npt.NDArray[np.intp]
+Mask = npt.NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Standard:
+    """M s + q >= 0, s >= 0 for the rows of a problem, and the way back.
+
+    Of an `exchanged` row s stands for w and w for lambda's distance from its bound.
+    """
+
+    problem: Problem
+    m: FloatArray  # (n, n) -
+    q: FloatArray  # (n,) sqrt J
+    base: FloatArray  # (m,) N s, lambda where its variable is 0
+    turn: FloatArray  # (m,) sqrt kg, lambda_i = base_i + turn_i x_i; negative for an upper bound alone
+    kept: Places  # rows with a variable of their own: the first places; then caps, then second halves
+    capped: Places  # places of kept rows with both bounds
+    split: Places  # places of kept rows that are free
+    exchanged: Mask  # (kept + caps,)
+    out: Places  # free rows eliminated
+    back: FloatArray  # (out, kept + caps + 1): x_out = back @ (s, 1)
+
+    def impulse(self, s: FloatArray, w: FloatArray, direction: bool = False) -> FloatArray:
+        """lambda (m,) [N s] of s, w (n,), or the direction of lambda for directions of both."""
+        k, whole = len(self.kept), len(self.exchanged)
+        s = s.copy()
+        s[self.split] -= s[whole:]
+        x = np.where(self.exchanged, w[:whole], s[:whole])[:k]
+        lam = np.zeros(len(self.base)) if direction else self.base.copy()
+        lam[self.kept] += self.turn[self.kept] * x
+        x_out = self.back[:, :whole] @ s[:whole] + (0.0 if direction else self.back[:, whole])
+        lam[self.out] += self.turn[self.out] * x_out
+        return lam
+
+
+def standard_form(problem: Problem) -> Standard:
+    """Scale, shift, eliminate and split; see the module."""
+    c = problem.cones
+    a = problem.dense()
+    low, high = np.isfinite(c.lower), np.isfinite(c.upper)
+    rows = np.flatnonzero(~(low & high & (c.lower == c.upper)))
+    base = np.where(low, c.lower, np.where(high, c.upper, 0.0))
+    turn = np.where(~low & high, -1.0, 1.0) / np.sqrt(problem.csr_data.d)
+    scaled = (turn[:, None] * a * turn)[np.ix_(rows, rows)]
+    q = (turn * (a @ base - problem.b))[rows]
+    free = (~low & ~high)[rows]
+    capped = np.flatnonzero((low & high)[rows])
+    k, n = len(rows), len(rows) + len(capped)
+    m = np.zeros((n, n))
+    m[:k, :k] = scaled
+    m[capped, np.arange(k, n)] = 1.0
+    m[np.arange(k, n), capped] = -1.0
+    room = (c.upper - c.lower)[rows][capped] / np.abs(turn[rows][capped])
+    m, q, gone, exchanged = _eliminate(m, np.concatenate([q, room]), np.flatnonzero(free))
+    stay = np.flatnonzero(~gone)
+    place = np.cumsum(~gone) - 1  # of a row that stays
+    split = place[np.flatnonzero(free & ~gone[:k])]
+    back = np.column_stack([m[np.ix_(np.flatnonzero(gone), stay)], q[gone]])
+    m, q = m[np.ix_(stay, stay)], q[stay]
+    m = np.block([[m, -m[:, split]], [-m[split], m[np.ix_(split, split)]]])
+    q = np.concatenate([q, -q[split]])
+    kept, out = rows[~gone[:k]], rows[gone[:k]]
+    return Standard(problem, m, q, base, turn, kept, place[capped], split, exchanged[stay], out, back)
+
+
+def _eliminate(m: FloatArray, q: FloatArray, free: Places) -> tuple[FloatArray, FloatArray, Mask, Mask]:
+    """Principal pivots that make the variables of free rows basic: (M, q, rows that are, rows exchanged).
+
+    All at once where their block is regular; else one by one, or two by two with whichever row helps, which
+    then has exchanged its two variables. Free rows that no pivot reaches stay as they are.
+    """
+    gone, exchanged = np.zeros(len(q), bool), np.zeros(len(q), bool)
+    if len(free) == 0:
+        return m, q, gone, exchanged
+    block = m[np.ix_(free, free)]
+    lu, _, info = lapack.dgetrf(block)
+    if info == 0 and lapack.dgecon(lu, np.abs(block).sum(axis=0).max())[0] > REGULAR:
+        gone[free] = True
+        return (*_principal_pivot(m, q, free), gone, exchanged)
+    left = list(free)
+    while left:
+        size = np.maximum(np.abs(m).max(axis=0), np.abs(m).max(axis=1))
+        size = np.where(size > 0.0, size, 1.0)
+        diagonal = np.diagonal(m)
+        single = np.abs(diagonal[left]) / size[left]
+        best = int(np.argmax(single))
+        pair = [left[best]]
+        if single[best] < STABLE:
+            # det of rows (f, j) against the size of both; eliminated rows are out of the question
+            det = np.abs(diagonal[left, None] * diagonal - m[left] * m[:, left].T) / (size[left, None] * size)
+            det[:, gone] = 0.0
+            f, j = np.unravel_index(int(np.argmax(det)), det.shape)
+            if det[f, j] > max(single[best] ** 2, REGULAR):
+                pair = [left[f], int(j)]
+            elif single[best] <= REGULAR:
+                break
+        m, q = _principal_pivot(m, q, np.array(pair))
+        for i in pair:
+            if i in left:
+                left.remove(i)
+                gone[i] = True
+            else:
+                exchanged[i] = not exchanged[i]
+    return m, q, gone, exchanged
+
+
+def _principal_pivot(m: FloatArray, q: FloatArray, rows: Places) -> tuple[FloatArray, FloatArray]:
+    """w and s of these rows change places in w = M s + q."""
+    inverse = np.linalg.inv(m[np.ix_(rows, rows)])
+    new = m - m[:, rows] @ inverse @ m[rows]
+    new[:, rows] = m[:, rows] @ inverse
+    new[rows] = -inverse @ m[rows]
+    new[np.ix_(rows, rows)] = inverse
+    head = inverse @ q[rows]
+    q = q - m[:, rows] @ head
+    q[rows] = -head
+    return new, q
+
+
+@dataclass(frozen=True)
+class Lemke:
+    """Lemke's complementary pivoting; one path, no options."""
+
+    def prepare(self, problem: Problem) -> Standard:
+        return standard_form(problem)
+
+    def update(self, state: Standard, problem: Problem) -> Standard:
+        return standard_form(problem)
+
+    def run(
+        self, state: Standard, impulse: FloatArray, n: int, tol: float, time_limit: float | None = None
+    ) -> Claim:
+        run = _Run(state, impulse, n, tol, time_limit)
+        return run.solve() if n > 0 else run.claim(Status.MAX_ITERATIONS)
+
+
+class _Run:
+    def __init__(
+        self, form: Standard, impulse: FloatArray, n: int, tol: float, time_limit: float | None
+    ) -> None:
+        self.form, self.problem, self.impulse, self.budget, self.tol = form, form.problem, impulse, n, tol
+        self.stop_at = None if time_limit is None else perf_counter() + time_limit
+        m = form.problem.m
+        self.w, self.e = np.empty(m), np.empty(m)
+        self.best, self.floor = np.inf, 0.0
+        self.pivots, self.work = 0, {"pivots": 0}
+        self.message = ""
+
+    def judge(self, x: FloatArray) -> float:
+        """Relative residual of x within its bounds; the best becomes the result."""
+        c = self.problem.cones
+        x = np.clip(x, c.lower, c.upper)
+        if not np.isfinite(x).all():
+            return np.inf
+        relative, floor = quick(self.problem, x, self.w, self.e, floor=True)
+        if relative < self.best:
+            self.best, self.floor = relative, floor
+            self.impulse[:] = x
+        return relative
+
+    def claim(self, status: Status, certificate: FloatArray | None = None) -> Claim:
+        self.work["pivots"] = self.pivots
+        return Claim(status, self.pivots, self.work, self.message, form="dense", certificate=certificate)
+
+    def verdict(self) -> Claim:
+        if self.best <= self.tol:
+            self.message = ""
+            return self.claim(Status.CONVERGED)
+        return self.claim(Status.FLOOR if self.best <= 2.0 * self.floor else Status.STALLED)
+
+    def count(self, what: str) -> None:
+        self.work[what] = self.work.get(what, 0) + 1
+
+    # -- the path ----------------------------------------------------------------------------------
+
+    def solve(self) -> Claim:
+        q = self.form.q
+        n = len(q)
+        self.judge(self.impulse.copy())
+        if n == 0 or q.min() >= 0.0:
+            self.finish(np.arange(n, dtype=np.int32))
+            return self.verdict()
+        covers = np.random.default_rng(0)
+        for path in range(PATHS):
+            # Another covering vector is another path: past rays that prove nothing, and past lost ones.
+            cover = np.ones(n) if path < 2 else covers.uniform(0.2, 1.8, n)
+            claim = self.follow(cover, FINER if path == 1 else TINY)
+            if claim is not None:
+                return claim
+            if self.best <= max(GOOD, 2.0 * self.floor):
+                break
+        return self.verdict()
+
+    def follow(self, cover: FloatArray, tiny: float) -> Claim | None:
+        """One path from q + M s + cover z; None where its end proves nothing or is judged elsewhere."""
+        q = self.form.q
+        n = len(q)
+        basic = np.arange(n, dtype=np.int32)
+        nonbasic = np.append(np.arange(n, 2 * n), 2 * n).astype(np.int32)
+        t = np.ascontiguousarray(np.column_stack([self.form.m, cover, q]))
+        book = Dictionary(t, basic, nonbasic, np.empty(2 * n + 1, np.int32), tiny)
+        # z enters where q / cover is least; the last of equals is lexicographically least.
+        r = n - 1 - int(np.argmin((q / cover)[::-1]))
+        book.pivot(r, n)
+        book.enter(n + r)
+        self.pivots += 1
+        last = self.pivots + PIVOTS_A_ROW * n + BATCH
+        self.count("paths")
+        while True:
+            code, done = book.pivots(max(0, min(BATCH, self.budget - self.pivots)))
+            self.pivots += done
+            self.work["pivots"] = self.pivots
+            if code != PIVOTS:
+                break
+            if self.pivots >= self.budget or (self.stop_at is not None and perf_counter() >= self.stop_at):
+                self.judge(self.form.impulse(*self.values(t, basic)))
+                return self.claim(Status.MAX_ITERATIONS if self.pivots >= self.budget else Status.TIME_LIMIT)
+            entering = int(nonbasic[book.entering])
+            if self.pivots >= last or not self.form_anew(t, basic, nonbasic, cover):
+                self.message = "lost its path to rounding"
+                return None
+            book = Dictionary(t, basic, nonbasic, np.empty(2 * n + 1, np.int32), tiny)
+            book.enter(entering)
+        self.judge(self.form.impulse(*self.values(t, basic)))
+        if code == RAY:
+            return self.ray(t, basic, nonbasic, book.entering)
+        self.message = ""
+        self.finish(basic)
+        return None
+
+    def values(self, t: FloatArray, basic: IntArray) -> tuple[FloatArray, FloatArray]:
+        """s, w (n,) of a dictionary."""
+        return self.column(np.maximum(t[:, -1], 0.0), basic)
+
+    def column(self, x: FloatArray, basic: IntArray) -> tuple[FloatArray, FloatArray]:
+        n = len(basic)
+        both = np.zeros(2 * n + 1)
+        both[basic] = x
+        return both[n : 2 * n], both[:n]
+
+    def form_anew(self, t: FloatArray, basic: IntArray, nonbasic: IntArray, cover: FloatArray) -> bool:
+        """The same dictionary from M and q; False where its basis is singular to rounding."""
+        n = len(basic)
+        # w - M s - c z = q; columns of w, s, z
+        columns = np.column_stack([np.eye(n), -self.form.m, -cover])
+        lu, pivot, info = lapack.dgetrf(columns[:, basic])
+        if info != 0:
+            return False
+        new = lapack.dgetrs(lu, pivot, np.column_stack([-columns[:, nonbasic], self.form.q]))[0]
+        if not np.isfinite(new).all():
+            return False
+        t[:] = new
+        self.count("factorisations")
+        return True
+
+    def ray(self, t: FloatArray, basic: IntArray, nonbasic: IntArray, entering: int) -> Claim | None:
+        """On a secondary ray: its direction may prove that there is no solution."""
+        n = len(basic)
+        s, w = self.column(t[:, entering], basic)
+        into = int(nonbasic[entering])
+        if into < n:
+            w[into] = 1.0
+        elif into < 2 * n:
+            s[into - n] = 1.0
+        big = max(s.max(), w.max())
+        s, w = (np.where(x > TINY * big, x, 0.0) for x in (s, w))
+        y = self.form.impulse(s, w, direction=True)
+        c = self.problem.cones
+        y[np.isfinite(c.lower) & np.isfinite(c.upper)] = 0.0
+        self.message = "ended on a secondary ray"
+        size = np.abs(y).max(initial=0.0)
+        if size > 0.0 and check_certificate(self.problem, y / size) is None:
+            self.message += ": no impulse meets every row"
+            return self.claim(Status.INFEASIBLE, y / size)
+        return None
+
+    # -- the result --------------------------------------------------------------------------------
+
+    def finish(self, basic: IntArray) -> None:
+        """Solve the rows found free anew, on A itself, and refine while that halves the residual."""
+        form, problem = self.form, self.problem
+        n, k, whole = len(form.q), len(form.kept), len(form.exchanged)
+        is_basic = np.zeros(2 * n + 1, bool)
+        is_basic[basic] = True
+        x_basic = np.where(form.exchanged, is_basic[:whole], is_basic[n : n + whole])
+        on = x_basic[:k].copy()
+        on[form.split] = True
+        x = form.base.copy()
+        pulls = form.capped[x_basic[k:]]  # the cap pulls: at the upper bound
+        x[form.kept[pulls]] = problem.cones.upper[form.kept[pulls]]
+        on[pulls] = False
+        free = np.sort(np.concatenate([form.kept[on], form.out]))
+        if len(free) == 0:
+            self.judge(x)
+            return
+        scale = np.abs(form.turn[free])
+        a = scale[:, None] * problem.csr[free][:, free].toarray() * scale
+        self.count("factorisations")
+        lu, pivot, info = lapack.dgetrf(a)
+        singular = info != 0 or lapack.dgecon(lu, np.abs(a).sum(axis=0).max())[0] < 1e-14
+        if singular:
+            # Start from what the pivots found: of all solutions on these rows the nearest to it.
+            x[free] = self.impulse[free]
+        w, previous = np.empty(problem.m), np.inf
+        for _ in range(6):
+            judge.slack(problem.csr_data, x, w)
+            rhs = scale * w[free]
+            step = np.linalg.lstsq(a, rhs, rcond=1e-13)[0] if singular else lapack.dgetrs(lu, pivot, rhs)[0]
+            x[free] -= scale * step
+            relative = self.judge(x)
+            if relative <= self.floor or not relative < 0.5 * previous:
+                break
+            previous = relative
+            self.count("refinements")
+
+
+def _refusal(problem: Problem) -> str | None:
+    if problem.m > LIMIT:
+        return (
+            f"holds a dense dictionary, for at most {LIMIT} rows; this problem has {problem.m}: "
+            "use direct, newton or pgs"
+        )
+    return None
+
+
+SPEC = SolverSpec(
+    name="lemke",
+    factory=Lemke,
+    laws=frozenset({"linear", "lcp"}),
+    operator="matrix",
+    exact=True,
+    resumable=False,
+    impulse=False,
+    max_iter=20_000,
+    refusal=_refusal,
+    summary="Lemke's complementary pivoting, dense, any A",
+    reference="Lemke 1965; Cottle, Pang, Stone 1992, section 4.4, and 4.9 for degeneracy",
+)

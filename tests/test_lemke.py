@@ -1,0 +1,176 @@
+"""`lemke`: against enumeration, on every kind of row, degenerate and asymmetric; rays and certificates."""
+
+import hypothesis.strategies as st
+import numpy as np
+import pytest
+import scipy.sparse as sp
+from enumeration import enumerate_lcp
+from hypothesis import given
+from random_problems import random_lcp, seeds
+
+import lavender as lv
+from lavender.residuals import check_certificate
+
+
+def accurate(solution):
+    """Within 1e-12, or twice what rounding lambda to float64 costs."""
+    r = solution.residual
+    return r.relative <= max(1e-12, 2.0 * r.floor)
+
+
+def random_bounds(rng, m):
+    """A mix of plain, boxed, upper-only, free and fixed rows."""
+    kind = rng.integers(0, 5, m)
+    low = np.choose(kind, [0.0, -1.0, -np.inf, -np.inf, 0.5])
+    high = np.choose(kind, [np.inf, 1.0, 0.5, np.inf, 0.5])
+    return low, high
+
+
+@given(seed=seeds, m=st.integers(1, 8), whole=st.booleans())
+def test_p_matrices_have_the_one_solution_of_enumeration(seed, m, whole):
+    rng = np.random.default_rng(seed)
+    g = rng.normal(size=(m, m))
+    skew = rng.normal(size=(m, m))
+    if whole:
+        g, skew = np.rint(g), np.rint(skew)
+    a = g @ g.T + 0.5 * np.eye(m) + skew - skew.T  # positive definite, not symmetric
+    b = np.rint(2.0 * rng.normal(size=m)) if whole else rng.normal(size=m)
+    solution = lv.solve(lv.Problem.lcp(a, b), "lemke", tol=1e-9)
+    assert accurate(solution), solution
+    truth = enumerate_lcp(a, b, np.zeros(m), np.full(m, np.inf))
+    assert truth
+    for x, _ in truth:
+        np.testing.assert_allclose(solution.impulse, x, atol=1e-7)
+
+
+@given(seed=seeds, m=st.integers(1, 6))
+def test_every_kind_of_row_against_enumeration(seed, m):
+    rng = np.random.default_rng(seed)
+    g, skew = rng.normal(size=(2, m, m))
+    a = g @ g.T + 0.5 * np.eye(m) + skew - skew.T
+    low, high = random_bounds(rng, m)
+    b = 2.0 * rng.normal(size=m)
+    solution = lv.solve(lv.Problem.lcp(a, b, low, high), "lemke", tol=1e-9)
+    assert accurate(solution), solution
+    truth = enumerate_lcp(a, b, low, high)
+    assert truth
+    for x, _ in truth:
+        np.testing.assert_allclose(solution.impulse, x, atol=1e-7)
+
+
+@given(seed=seeds, m=st.integers(1, 6))
+def test_any_matrix_a_claim_is_a_solution(seed, m):
+    """No claim that the judge contradicts, and where enumeration finds nothing, no success either."""
+    rng = np.random.default_rng(seed)
+    a = np.rint(2.0 * rng.normal(size=(m, m)))
+    low, high = random_bounds(rng, m)
+    problem = lv.Problem.lcp(a, np.rint(3.0 * rng.normal(size=m)), low, high)
+    solution = lv.solve(problem, "lemke", tol=1e-9)
+    assert not solution.contradicted, solution
+    assert np.isfinite(solution.impulse).all()
+    if solution.status is lv.Status.INFEASIBLE:
+        assert not enumerate_lcp(a, problem.b, low, high)
+
+
+@given(seed=seeds, m=st.integers(2, 8), rank=st.integers(1, 4))
+def test_degenerate_semidefinite_problems_end(seed, m, rank):
+    """Whole numbers, repeated rows, b = 0 in places: ties at every pivot."""
+    rng = np.random.default_rng(seed)
+    g = np.rint(rng.normal(size=(m, rank)))
+    g[m // 2 :] = g[: m - m // 2]
+    a = g @ g.T
+    b = a @ np.maximum(np.rint(rng.normal(size=m)), 0.0) - np.maximum(np.rint(rng.normal(size=m)), 0.0)
+    solution = lv.solve(lv.Problem.lcp(a, b), "lemke", tol=1e-9)
+    assert solution.success, solution
+    for _, w in enumerate_lcp(a, b, np.zeros(m), np.full(m, np.inf)):
+        np.testing.assert_allclose(solution.slack, w, atol=1e-7)
+
+
+@given(seed=seeds, rank=st.integers(2, 12))
+def test_agrees_with_direct(seed, rank):
+    problem = random_lcp(seed, m=12, rank=rank)
+    x, y = (lv.solve(problem, name, tol=1e-9) for name in ("lemke", "direct"))
+    assert x.success, x
+    np.testing.assert_allclose(x.slack, y.slack, atol=1e-6 * max(1.0, np.abs(y.slack).max()))
+
+
+def test_a_saddle_point_needs_no_split():
+    """Free rows with a zero block are eliminated together with the rows they act on."""
+    rng = np.random.default_rng(1)
+    j = rng.normal(size=(3, 6))
+    a = np.block([[np.eye(6), j.T], [-j, np.zeros((3, 3))]])
+    low = np.append(np.zeros(6), np.full(3, -np.inf))
+    b = np.append(rng.normal(size=6) + 1.0, -j @ np.ones(6))
+    solution = lv.solve(lv.Problem.lcp(a, b, low), "lemke", tol=1e-9)
+    assert accurate(solution), solution
+    np.testing.assert_allclose(j @ solution.impulse[:6], j @ np.ones(6), atol=1e-10)
+
+
+def test_free_rows_that_no_pivot_reaches_are_split():
+    g = np.array([[1.0], [1.0], [2.0]])
+    problem = lv.Problem.lcp(g @ g.T, [1.0, 1.0, 2.0], [-np.inf, -np.inf, 0.0])
+    solution = lv.solve(problem, "lemke", tol=1e-9)
+    assert accurate(solution), solution
+
+
+@given(seed=seeds, m=st.integers(2, 10))
+def test_a_ray_of_a_semidefinite_problem_is_a_certificate(seed, m):
+    """y >= 0 with A y = 0 and b.y > 0 put in by hand."""
+    rng = np.random.default_rng(seed)
+    y = np.maximum(rng.uniform(-0.5, 1.0, m), 0.0)
+    y[0] = 1.0
+    g = rng.normal(size=(m, m))
+    g -= np.outer(y, y @ g) / (y @ y)
+    a = 0.5 * (g @ g.T + (g @ g.T).T)
+    b = rng.normal(size=m)
+    b += y * (0.5 - b @ y) / (y @ y)
+    problem = lv.Problem.lcp(a, b)
+    solution = lv.solve(problem, "lemke")
+    assert solution.status is lv.Status.INFEASIBLE, solution
+    assert "ray" in solution.message or "row of A is zero" in solution.message
+    assert check_certificate(problem, solution.certificate) is None
+
+
+@pytest.mark.parametrize(("a", "b"), [([[-1.0]], [1.0]), ([[0.0, -1.0], [1.0, 0.0]], [1.0, -1.0])])
+def test_infeasible_without_symmetry(a, b):
+    """w_1 < 0 whatever lambda is: y = e_1 has A^T y <= 0 and b.y > 0."""
+    problem = lv.Problem.lcp(a, b)
+    solution = lv.solve(problem, "lemke")
+    assert solution.status is lv.Status.INFEASIBLE
+    assert check_certificate(problem, solution.certificate) is None
+
+
+def test_murtys_exponential_example_takes_all_its_pivots():
+    """2^n of them: shows that Lemke's path was followed, and that long paths end."""
+    n = 8
+    a = np.triu(np.full((n, n), 2.0), 1) + np.eye(n)
+    b = np.cumsum(2.0 ** np.arange(n)[::-1])[::-1]
+    solution = lv.solve(lv.Problem.lcp(a, b), "lemke", tol=1e-9)
+    assert solution.work["pivots"] == 2**n
+    np.testing.assert_array_equal(solution.impulse, np.append(np.zeros(n - 1), b[-1]))
+
+
+def test_budgets():
+    problem = random_lcp(3, m=60, rank=40)
+    few = lv.solve(problem, "lemke", max_iter=5)
+    assert (few.status, few.iterations) == (lv.Status.MAX_ITERATIONS, 5)
+    assert few.residual.relative <= 1.0, "no worse than doing nothing"
+    with pytest.raises(lv.CapabilityError, match="dense dictionary"):
+        lv.solve(lv.Problem.lcp(sp.eye_array(5000, format="csr"), np.ones(5000)), "lemke")
+
+
+def test_reference_problems(problem_dir):
+    seen = 0
+    for path in sorted(problem_dir.glob("*.npz")):
+        with np.load(path) as data:
+            if "cone_start" in data or "A" not in data:
+                continue
+            problem = lv.Problem.lcp(data["A"], data["b"], data["lo"], data["hi"], name=path.stem)
+        seen += 1
+        solution = lv.solve(problem, "lemke", tol=1e-9)
+        assert not solution.contradicted, (path.stem, solution)
+        if path.stem == "lcpgen_psd-300":
+            assert solution.status is lv.Status.INFEASIBLE, solution
+        else:
+            assert accurate(solution), (path.stem, solution)
+    assert seen > 20
