@@ -7,6 +7,7 @@ import os
 import pickle
 import struct
 import zipfile
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -446,3 +447,12 @@ def test_the_generators_layout_is_read(tmp_path):
         assert np.array_equal(stored.problem.dense(), a.toarray())
     with pytest.raises(lv.InputError, match="'lcp', 'free' or 'cone'"):
         lavender.io.load(archive(tmp_path / "generated.npz", {"kind": "magic"} | rest | parts))
+
+
+def test_the_documentation_lists_every_entry_of_our_format(tmp_path):
+    text = (Path(__file__).resolve().parent.parent / "docs" / "formats.md").read_text(encoding="utf-8")
+    for _, problem in variants():
+        lavender.io.save(problem, tmp_path / "p.npz", impulse=np.zeros(problem.m))
+        with np.load(tmp_path / "p.npz") as saved:
+            missing = [name for name in saved if f"`{name}`" not in text]
+        assert missing == []
