@@ -42,9 +42,6 @@ ALLOWED = frozenset({"sqrt", "floor", "memcpy", "memset", "memmove"})
 #: arithmetic is the inline functions of the .pxd files, which the serial modules compile and this check sees.
 EXEMPT_SUFFIX = "_threads"
 
-#: Modules without a core, and why they may be.
-PYTHON_SIDE = {"watch": "when a sweep solver looks at its error: a host without Python keeps its own loop"}
-
 #: Types that have one size everywhere, as a host outside C must build them; structs end in _t too.
 FIXED = re.compile(r"(void|float|double|u?int(8|16|32|64)_t|\w+_t)$")
 NOT_FIXED = {"size_t", "ssize_t", "ptrdiff_t", "intptr_t", "uintptr_t", "Py_ssize_t", "wchar_t"}
@@ -211,8 +208,6 @@ def check(path: Path, root: Path = ROOT) -> Verdict:
         return Verdict(path.stem, exempt="threads")
     verdict = Verdict(path.stem)
     verdict.functions, verdict.breaches = read_source(path)
-    if path.stem in PYTHON_SIDE and not verdict.functions:
-        return Verdict(path.stem, exempt=PYTHON_SIDE[path.stem])
     if verdict.functions:
         with tempfile.TemporaryDirectory() as work:
             core = link_core(path.resolve(), verdict.functions, root, Path(work))
