@@ -654,6 +654,31 @@ cdef inline void element_times(const elements_t* e, const double* w, const doubl
             out[j + r] = t
 
 
+cdef public void lav_element_product(const elements_t* e, const double* w, const double* h, double eps, double own,
+                                     double* out) noexcept nogil:
+    """out = W (H + eps) + I - own W, all (m, m) row-major, W one small matrix for each element."""
+    cdef int32_t i, j, k, r, c, nr, m = e.m
+    cdef double x
+    cdef double *y
+    cdef const double *a
+    for i in range(e.n):
+        j = e.ptr[i]
+        nr = e.ptr[i + 1] - j
+        for r in range(nr):
+            y = out + <int64_t>(j + r) * m
+            for k in range(m):
+                y[k] = 0.0
+            for c in range(nr):
+                x = w[e.wptr[i] + r * nr + c]
+                if x == 0.0:
+                    continue
+                a = h + <int64_t>(j + c) * m
+                for k in range(m):
+                    y[k] += x * a[k]
+                y[j + c] += x * (eps - own)
+            y[j + r] += 1.0
+
+
 # -- interior point ---------------------------------------------------------------------------------
 
 
@@ -1466,6 +1491,13 @@ cdef class Elements:
         """out = W x, one small matrix for each element."""
         with nogil:
             element_times(&self.e, &w[0], &x[0], &out[0])
+
+
+def element_product(Elements e, const double[::1] w, const double[:, ::1] h, double eps, double own, double[:, ::1] out):
+    """out = W (H + eps) + I - own W."""
+    if e.m:
+        with nogil:
+            lav_element_product(&e.e, &w[0], &h[0, 0], eps, own, &out[0, 0])
 
 
 def panel(Data p, const double[:, :, ::1] inv_inertia, const double[::1] root_mass, double[:, ::1] out):

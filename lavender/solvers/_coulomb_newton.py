@@ -17,6 +17,7 @@ from lavender.solvers._polish import EnergyRun, Proximal, Run, solve_convex
 
 CONVEX_TOL = 1e-4  # of the convex start, in energy
 STRETCH = 60  # factorisations between two looks at whether a method gets anywhere
+LARGE = 1000  # rows from which the first proximal weight is larger
 HEAVY = 1e3  # mass ratio from which the convex answer is asked first
 OUTER = 30  # fixed points at most
 
@@ -24,13 +25,13 @@ OUTER = 30  # fixed points at most
 def solve_coulomb(run: Run, z: FloatArray, cold: bool) -> None:
     """From the start, then from the convex answer, then from De Saxce's fixed points."""
     system = run.system
-    plain = Proximal(z, AUGMENTED)
+    plain = Proximal(z, AUGMENTED, 1e-3 if system.sc.m < LARGE else 1e-2)
     if not cold or not _is_heavy(run):
-        plain.advance(run, STRETCH // 2)
+        plain.advance(run, STRETCH // 3)
         if run.done or run.at_floor():
             return
-        near = Proximal(InteriorPoint(system).everything, AUGMENTED, 1e-6)
-        near.advance(run, STRETCH // 3)
+        near = Proximal(InteriorPoint(system).everything, AUGMENTED, 1e-4)
+        near.advance(run, STRETCH // 2)
         if run.done or run.at_floor():
             return
         _pursue(run, plain)

@@ -13,9 +13,12 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-import scipy.linalg as sl
 import scipy.sparse as sp
 import scipy.sparse.linalg as ssl
+from scipy.linalg.lapack import dgetrf as getrf
+from scipy.linalg.lapack import dgetrs as getrs
+from scipy.linalg.lapack import dpotrf as potrf
+from scipy.linalg.lapack import dpotrs as potrs
 
 from lavender._arrays import FloatArray, IntArray
 from lavender.cones import CONTACT, CONTACT_SPIN, ROW
@@ -285,7 +288,7 @@ class MatrixSystem(System):
             a = a[sc.keep][:, sc.keep]
         self.dense = m <= DENSE_ROWS or (a.nnz > DENSE_FILL * m * m and m <= DENSE_LIMIT)
         h = sp.diags_array(sc.scale) @ a @ sp.diags_array(sc.scale)
-        self.h: Any = np.asfortranarray(h.toarray()) if self.dense else sp.csr_array(h)
+        self.h: Any = np.ascontiguousarray(h.toarray()) if self.dense else sp.csr_array(h)
         # theta is on the diagonal of A already.
         sc.theta = np.zeros(m)
         self.symmetric = sc.problem.is_symmetric
@@ -306,43 +309,43 @@ class MatrixSystem(System):
     def times(self, z: FloatArray) -> FloatArray:
         return self.h @ z
 
-    def _lu(self, matrix: Any) -> bool:
+    def _dense_lu(self, w: FloatArray, eps: float, own: float) -> bool:
+        # Row-major for the kernel is the transpose for LAPACK.
+        matrix = np.empty_like(self.h)
+        kernels.element_product(self.elements, w, self.h, eps, own, matrix)
         self.factorisations += 1
-        if self.dense:
-            lu, pivot, info = sl.lapack.dgetrf(matrix, overwrite_a=True)
-            self.solver = lambda r: sl.lapack.dgetrs(lu, pivot, r)[0]
-            return info == 0
+        lu, pivot, info = getrf(matrix.T, overwrite_a=True)
+        self.solver = lambda r: getrs(lu, pivot, r, trans=1)[0]
+        return info == 0
+
+    def _sparse_lu(self, matrix: Any) -> bool:
+        self.factorisations += 1
         try:
             factor = ssl.splu(sp.csc_array(matrix), permc_spec="COLAMD")
         except RuntimeError:
-            self.solver = None
+            self.solver = lambda r: np.full_like(r, np.nan)
             return False
         self.solver = factor.solve
         return True
 
     def factor_barrier(self) -> bool:
         # H + V^-1, or I + V H where V is not diagonal: its inverse would lose the small eigenvalues.
-        m = self.sc.m
-        diagonal = len(self.sc.kind) == m
-        self.premultiply = not diagonal
+        diagonal = len(self.sc.kind) == self.sc.m
+        self.premultiply = self.dense or not diagonal
         if not self.dense:
             if diagonal:
-                return self._lu(self.h + sp.diags_array(1.0 / self.v))
-            return self._lu(self.small(self.v) @ self.h + sp.eye_array(m))
-        every = np.arange(m)
-        if not diagonal:
-            matrix = np.asfortranarray(self.small(self.v) @ self.h)
-            matrix[every, every] += 1.0
-            return self._lu(matrix)
-        matrix = self.h.copy(order="F")
-        matrix[every, every] += 1.0 / self.v
-        if self.symmetric:
-            c, info = sl.lapack.dpotrf(matrix, lower=1, clean=0)
+                return self._sparse_lu(self.h + sp.diags_array(1.0 / self.v))
+            return self._sparse_lu(self.small(self.v) @ self.h + sp.eye_array(self.sc.m))
+        if diagonal and self.symmetric:
+            matrix = self.h.copy()
+            matrix.flat[:: len(matrix) + 1] += 1.0 / self.v
+            c, info = potrf(matrix.T, lower=1, clean=0, overwrite_a=True)
             if info == 0:
                 self.factorisations += 1
-                self.solver = lambda r: sl.lapack.dpotrs(c, r, lower=1)[0]
+                self.premultiply = False
+                self.solver = lambda r: potrs(c, r, lower=1)[0]
                 return True
-        return self._lu(matrix)
+        return self._dense_lu(self.v, 0.0, 0.0)
 
     def solve_barrier(self, r: FloatArray) -> FloatArray:
         if self.premultiply:
@@ -352,20 +355,10 @@ class MatrixSystem(System):
         return self.solver(r)
 
     def factor_natural(self, eps: float) -> bool:
-        m = self.sc.m
         if self.dense:
-            h = self.h.copy(order="F")
-            h[np.arange(m), np.arange(m)] += eps - 1.0
-            size = np.diff(self.sc.ptr)
-            if len(size) == m:
-                matrix = self.p[:, None] * h
-            else:
-                matrix = self.small(self.p) @ h
-            matrix = np.asfortranarray(matrix)
-            matrix[np.arange(m), np.arange(m)] += 1.0
-            return self._lu(matrix)
+            return self._dense_lu(self.p, eps, 1.0)
         p = self.small(self.p)
-        return self._lu(p @ self.h + (eps - 1.0) * p + sp.eye_array(m))
+        return self._sparse_lu(p @ self.h + (eps - 1.0) * p + sp.eye_array(self.sc.m))
 
     def solve_natural(self, r: FloatArray) -> FloatArray:
         return self.solver(r)
