@@ -655,6 +655,10 @@ def _checked_matrix(matrix: Any, m: int, copy: bool) -> Any:
     if matrix.dtype.kind not in "buif":
         raise InputError(f"A has dtype {matrix.dtype}; real numbers are needed")
     given = sp.csr_array(matrix, copy=copy)
+    try:
+        given.check_format(full_check=True)  # kernels trust every index
+    except ValueError as error:
+        raise InputError(f"A is not a valid compressed matrix ({error}); check its indices and pointers") from None
     as_array("A", given.data, (None,), unit="1/kg", copy=False)
     return _canonical(given, m)
 

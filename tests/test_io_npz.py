@@ -456,3 +456,12 @@ def test_the_documentation_lists_every_entry_of_our_format(tmp_path):
         with np.load(tmp_path / "p.npz") as saved:
             missing = [name for name in saved if f"`{name}`" not in text]
         assert missing == []
+
+
+@pytest.mark.parametrize(
+    ("indices", "indptr"), [([0, 9], [0, 1, 2]), ([0, -1], [0, 1, 2]), ([0, 1], [0, 2, 1])]
+)
+def test_a_broken_compressed_matrix_is_refused_in_memory_too(indices, indptr):
+    broken = sp.csr_array((np.ones(2), np.array(indices), np.array(indptr)), shape=(2, 2))
+    with pytest.raises(lv.InputError, match="not a valid compressed matrix"):
+        lv.Problem.linear(broken, [1.0, 1.0])
