@@ -9,8 +9,7 @@ D = diag d, so that both work in energy. S is a sweep of pgs or of exact blocks 
 compressed rows or over the factored form with v = M^-1 J^T lam. With the symmetric order S is a sweep and the same sweep backwards. An iterate that is shown
 is always a swept one, y. All sums run in a fixed order.
 
-Safeguard of (2): where a step multiplied |f| by more than GUARD, it is undone and the memory cleared.
-Where WINDOW steps have not reduced the least |f| to PROGRESS of it, as many plain sweeps follow.
+(2) and its safeguards are those of mixing.pxd.
 """
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t, uint64_t
@@ -20,6 +19,7 @@ import numpy as np
 from lavender_ext.block cimport (CONTACT_SPIN, ROW, blocks_t, clip, n_tangents, norm2)
 from lavender_ext.block_gs cimport solve_csr_block, solve_rows_block
 from lavender_ext.csr cimport csr_t
+from lavender_ext.mixing cimport CONTROL, MAX_MEMORY, UNDONE, mix, mixing_t, take
 from lavender_ext.order cimport SYMMETRIC, advance_order
 from lavender_ext.pgs cimport relax_csr_block
 from lavender_ext.problem cimport Data
@@ -27,22 +27,12 @@ from lavender_ext.rows cimport contact_push, joint_push, relax_rows_block, rows_
 from lavender_ext.watch cimport CONVERGED, RUNNING, Watch
 
 cdef enum:
-    MAX_MEMORY = 16
-    WINDOW = 200
     REFRESH = 64                # iterations of nncg after which v is formed anew: rounding adds up in it
 
-cdef enum:                      # numbers of a run, in control[]
+cdef enum:                      # places in control of nncg
     TURN = 0                    # iterations done
-    LAST = 1                    # nncg: g.Dg of the last sweep; anderson: |f|
-    KEPT = 2                    # differences in memory
-    HEAD = 3                    # slot of the next one
-    FRESH = 4                   # f and y of the sweep before are there
-    REST = 5                    # plain sweeps to come
-    LEAST = 6                   # least |f| so far
-    AGO = 7                     # LEAST at the start of the window
-    STEPS = 8                   # steps since then
-    RESTARTS = 9                # beta > 1; undone steps
-    CONTROL = 10
+    NORM = 1                    # g.Dg of the last sweep
+    RESTARTS = 2                # beta > 1
 
 
 cdef struct sweep_data_t:
@@ -58,7 +48,7 @@ cdef struct sweep_data_t:
     uint64_t* rng
     double* v                   # (n_bodies, 6), with nv = 6 n_bodies; nv = 0 where not factored
     int32_t nv
-    double* control             # (CONTROL)
+    double* control             # (CONTROL) of mixing.pxd
     double* gram                # (MAX_MEMORY, MAX_MEMORY)
     double* work                # nncg 3 (m + nv); anderson (3 + 2 memory) m
 
@@ -164,173 +154,44 @@ cdef public void lav_nncg(sweep_data_t* c, double* lam, int32_t first_sweep, int
         s0 = (s0 + s1) + (s2 + s3)
         for i in range(c.nv):
             x[m + i] -= c.v[i]
-        beta = s0 / control[LAST] if control[TURN] > 0.0 and control[LAST] > 0.0 else 0.0
+        beta = s0 / control[NORM] if control[TURN] > 0.0 and control[NORM] > 0.0 else 0.0
         if not beta <= 1.0:
             beta = 0.0
             control[RESTARTS] += 1.0
-        control[LAST] = s0
+        control[NORM] = s0
         control[TURN] += 1.0
         for i in range(m + c.nv):
             q[i] = beta * p[i]
             p[i] = q[i] - x[i]
 
 
-cdef inline int32_t least_squares(int32_t n, int32_t head, int32_t memory, const double* gram, const double* rhs,
-                                  double* gamma) noexcept nogil:
-    """gamma (memory), by slot, of the normal equations over the n newest differences; newest first, dependent ones out.
-
-    Cholesky: a column whose pivot is below 1e-12 of its square says nothing new.
-    """
-    cdef double l[MAX_MEMORY * MAX_MEMORY]
-    cdef double y[MAX_MEMORY]
-    cdef int32_t slot[MAX_MEMORY]
-    cdef int32_t i, j, k, t, used = 0
-    cdef double x, a
-    for i in range(memory):
-        gamma[i] = 0.0
-    for i in range(n):
-        k = (head - 1 - i + 2 * memory) % memory
-        a = gram[MAX_MEMORY * k + k]
-        x = a
-        for j in range(used):
-            l[MAX_MEMORY * used + j] = gram[MAX_MEMORY * k + slot[j]]
-        for j in range(used):
-            for t in range(j):
-                l[MAX_MEMORY * used + j] -= l[MAX_MEMORY * used + t] * l[MAX_MEMORY * j + t]
-            l[MAX_MEMORY * used + j] /= l[MAX_MEMORY * j + j]
-            x -= l[MAX_MEMORY * used + j] * l[MAX_MEMORY * used + j]
-        if not x > 1e-12 * a:
-            continue
-        l[MAX_MEMORY * used + used] = sqrt(x)
-        slot[used] = k
-        used += 1
-    for i in range(used):
-        x = rhs[slot[i]]
-        for j in range(i):
-            x -= l[MAX_MEMORY * i + j] * y[j]
-        y[i] = x / l[MAX_MEMORY * i + i]
-    i = used - 1
-    while i >= 0:
-        x = y[i]
-        for j in range(i + 1, used):
-            x -= l[MAX_MEMORY * j + i] * y[j]
-        y[i] = x / l[MAX_MEMORY * i + i]
-        gamma[slot[i]] = y[i]
-        i -= 1
-    return used
-
-
 cdef public void lav_anderson(sweep_data_t* c, double* lam, int32_t first_sweep, int32_t n) noexcept nogil:
     """n iterations of (2)."""
-    cdef int32_t m = c.blocks.n_rows, i, j, k, s, kept, head, stepped
-    cdef double* x = c.work                             # x, later the new f
-    cdef double* y = x + m                              # the swept iterate before
-    cdef double* f = y + m
-    cdef double* dy = f + m                             # (memory, m)
-    cdef double* df = dy + c.memory * m                 # (memory, m)
-    cdef double* control = c.control
+    cdef int32_t m = c.blocks.n_rows, i, s, mixed
+    cdef double* x = c.work                             # x, later f
     cdef const double* d = c.blocks.d
-    cdef const double* u
-    cdef double* dnew
-    cdef double rhs[MAX_MEMORY]
-    cdef double gamma[MAX_MEMORY]
-    cdef double a0, a1, size
+    cdef mixing_t mixing
+    mixing.m = m
+    mixing.memory = c.memory
+    mixing.control = c.control
+    mixing.gram = c.gram
+    mixing.v = x + m
+    mixing.g = mixing.v + m
+    mixing.dv = mixing.g + m
+    mixing.dg = mixing.dv + c.memory * m
     for s in range(n):
-        kept = <int32_t>control[KEPT]
-        head = <int32_t>control[HEAD]
-        stepped = 0
-        # lam is y of the last sweep, f its step; rhs = df.f
-        if kept > 0 and control[REST] <= 0.0:
-            for k in range(kept):
-                j = (head - 1 - k + 2 * c.memory) % c.memory
-                u = df + j * m
-                a0 = a1 = 0.0
-                i = 0
-                while i + 2 <= m:
-                    a0 += u[i] * f[i]
-                    a1 += u[i + 1] * f[i + 1]
-                    i += 2
-                if i < m:
-                    a0 += u[i] * f[i]
-                rhs[j] = a0 + a1
-            if least_squares(kept, head, c.memory, c.gram, rhs, gamma) > 0:
-                stepped = 1
-                for j in range(c.memory):
-                    a0 = gamma[j]
-                    u = dy + j * m
-                    if a0 != 0.0:
-                        for i in range(m):
-                            lam[i] -= a0 * u[i]
-                for i in range(c.blocks.n_blocks):
-                    project_block(c.blocks, i, lam)
-                form_velocity(c, lam)
+        mixed = mix(&mixing, lam)
+        if mixed:
+            for i in range(c.blocks.n_blocks):
+                project_block(c.blocks, i, lam)
+            form_velocity(c, lam)
         for i in range(m):
             x[i] = lam[i]
         sweep(c, lam, first_sweep and s == 0)
-        control[TURN] += 1.0
-        a0 = a1 = 0.0
         for i in range(m):
             x[i] = sqrt(d[i]) * (lam[i] - x[i])
-        i = 0
-        while i + 2 <= m:
-            a0 += x[i] * x[i]
-            a1 += x[i + 1] * x[i + 1]
-            i += 2
-        if i < m:
-            a0 += x[i] * x[i]
-        size = sqrt(a0 + a1)
-        if stepped and not size <= 2.0 * control[LAST]:
-            # Undo: back to the sweep before, nothing remembered.
-            for i in range(m):
-                lam[i] = y[i]
+        if not take(&mixing, mixed, lam, x):
             form_velocity(c, lam)
-            control[KEPT] = 0.0
-            control[FRESH] = 0.0
-            control[RESTARTS] += 1.0
-            continue
-        control[LAST] = size
-        control[REST] -= 1.0
-        if not size >= control[LEAST] or control[TURN] <= 1.0:
-            control[LEAST] = size
-        if control[REST] <= 0.0:
-            control[STEPS] += 1.0
-            if control[STEPS] >= WINDOW:
-                if control[AGO] > 0.0 and control[LEAST] > 0.9 * control[AGO]:
-                    control[REST] = WINDOW
-                    control[KEPT] = 0.0
-                    control[FRESH] = 0.0
-                    kept = 0
-                control[AGO] = control[LEAST]
-                control[STEPS] = 0.0
-        if control[FRESH] > 0.0 and control[REST] <= 1.0:
-            # Into memory: the newest differences and their products with the others.
-            dnew = dy + head * m
-            for i in range(m):
-                dnew[i] = lam[i] - y[i]
-            dnew = df + head * m
-            for i in range(m):
-                dnew[i] = x[i] - f[i]
-            if kept < c.memory:
-                kept += 1
-            for k in range(kept):
-                j = (head - k + 2 * c.memory) % c.memory
-                u = df + j * m
-                a0 = a1 = 0.0
-                i = 0
-                while i + 2 <= m:
-                    a0 += u[i] * dnew[i]
-                    a1 += u[i + 1] * dnew[i + 1]
-                    i += 2
-                if i < m:
-                    a0 += u[i] * dnew[i]
-                c.gram[MAX_MEMORY * head + j] = a0 + a1
-                c.gram[MAX_MEMORY * j + head] = a0 + a1
-            control[KEPT] = kept
-            control[HEAD] = (head + 1) % c.memory
-        for i in range(m):
-            y[i] = lam[i]
-            f[i] = x[i]
-        control[FRESH] = 1.0
 
 
 cdef void nncg_step(void* context, double* lam, int32_t first_sweep, int32_t n) noexcept nogil:
@@ -387,4 +248,4 @@ def run(Data p, Watch watch, double[::1] lam, int n, double tol, int memory, pre
     c.work = &work[0]
     with nogil:
         status = watch.run(nncg_step if memory == 0 else anderson_step, &c, &lam[0], n, tol, &done)
-    return status, done, done * (2 if mode == SYMMETRIC else 1), int(control[RESTARTS])
+    return status, done, done * (2 if mode == SYMMETRIC else 1), int(control[RESTARTS if memory == 0 else UNDONE])
