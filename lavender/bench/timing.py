@@ -10,10 +10,13 @@ from __future__ import annotations
 import gc
 import statistics
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
+from functools import cache
 from time import perf_counter
 from typing import Any
+
+import numpy as np
 
 from lavender import registry
 from lavender.bench.record import ERROR, Record, task_key
@@ -79,16 +82,37 @@ class Task:
         )
 
 
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """BLAS and OpenMP limited to one thread, the garbage collector off."""
-    from threadpoolctl import threadpool_limits
+@cache
+def _warm_up(solver: str) -> None:
+    """Import what a solver needs, so that the first measurement does not time it."""
+    spec = registry.get(solver)
+    spec.load()
+    if spec.requires:
+        # Backends import their own code when they first solve: one row, outside every clock.
+        with suppress(Exception):
+            tiny = (
+                Problem.lcp(np.eye(1), np.ones(1))
+                if "lcp" in spec.laws
+                else Problem.linear(np.eye(1), np.ones(1))
+            )
+            prepare(tiny, solver).solve()
 
+
+@cache
+def _thread_pools(solver: str) -> Any:
+    # Looking for the libraries reads /proc, a few milliseconds: once a solver, when its own are loaded.
+    from threadpoolctl import ThreadpoolController
+
+    return ThreadpoolController()
+
+
+@contextmanager
+def one_thread(solver: str = "") -> Iterator[None]:
+    """BLAS and OpenMP limited to one thread, the garbage collector off; after `solver` was imported."""
     collects = gc.isenabled()
-    gc.collect()
     gc.disable()
     try:
-        with threadpool_limits(limits=1):
+        with _thread_pools(solver).limit(limits=1):
             yield
     finally:
         if collects:
@@ -117,8 +141,8 @@ def measure_solution(problem: Problem, task: Task, impulse: Any = None) -> tuple
     solves: list[float] = []
     solution = None
     try:
-        registry.get(task.solver).load()  # the import is no part of the time
-        with one_thread():
+        _warm_up(task.solver)
+        with one_thread(task.solver):
             begun = perf_counter()
             for _ in range(max(1, task.repeats)):
                 solution = _once(problem, task, impulse)
