@@ -26,6 +26,7 @@ from lavender_ext.engine_types cimport (CAP_CONTACT, CAP_PAIR, H_CONTACTS, H_CON
                                         N_DYNAMIC, N_EXCLUDED, N_FRAME, N_HEAD, N_JOINT, N_JOINT_REAL,
                                         N_JOINT_ROW, N_SETTINGS, OK, ROWS_PER_CONTACT, S_OUT,
                                         bind, engine_t)
+from lavender_ext.judge cimport rows_slack, score_rows, score_t
 from lavender_ext.order cimport (RANDOM, SYMMETRIC, advance_order, block_levels, body_levels,
                                  color_by_bodies, reverse, sort_by_level)
 from lavender_ext.rows cimport contact_push, joint_push, relax_contact_block, relax_joint, rows_t
@@ -153,16 +154,30 @@ cdef inline void order_blocks(engine_t* e) noexcept nogil:
             e.order[i] += kj
 
 
-cdef inline void sweep_all(engine_t* e, const blocks_t* p, const rows_t* r) noexcept nogil:
-    """The budgeted sweeps: joints, then contacts."""
-    cdef int32_t s, _s, i, kj = r.n_joints, k = p.n_blocks, mode
+cdef inline void note_sweep(const engine_t* e, const blocks_t* p, const rows_t* r, double* out,
+                            double* scratch) noexcept nogil:
+    # max |e_n| [N s] over the contacts, E = sqrt(sum d e^2) [sqrt J] over all rows; scratch (2 m)
+    cdef double violation
+    cdef score_t s
+    measure(e, out, &violation)
+    rows_slack(p, r, e.impulse, e.dv, scratch)
+    score_rows(p, e.impulse, scratch, scratch + p.n_rows, &s)
+    out[1] = s.energy
+
+
+cdef inline void sweep_all(engine_t* e, const blocks_t* p, const rows_t* r, double* curve,
+                           double* scratch) noexcept nogil:
+    """The budgeted sweeps: joints, then contacts; curve (sweeps + 1, 2) or NULL."""
+    cdef int32_t s, i, kj = r.n_joints, k = p.n_blocks, mode
     cdef uint64_t rng
     if e.head[H_ORDER] == AS_GIVEN:
-        for _s in range(e.head[H_ITERATIONS]):
+        for s in range(e.head[H_ITERATIONS]):
             for i in range(kj):
                 relax_joint(p, r, i, e.impulse, e.dv)
             for i in range(kj, k):
                 relax_contact_block(p, r, i, e.impulse, e.dv)
+            if curve != NULL:
+                note_sweep(e, p, r, curve + 2 * (s + 1), scratch)
         return
     order_blocks(e)
     mode = SYMMETRIC if e.head[H_ORDER] == SYMMETRICALLY else (RANDOM if e.head[H_ORDER] == AT_RANDOM else 0)
@@ -175,17 +190,21 @@ cdef inline void sweep_all(engine_t* e, const blocks_t* p, const rows_t* r) noex
             relax_joint(p, r, e.order[i], e.impulse, e.dv)
         for i in range(kj, k):
             relax_contact_block(p, r, e.order[i], e.impulse, e.dv)
+        if curve != NULL:
+            note_sweep(e, p, r, curve + 2 * (s + 1), scratch)
 
 
-cdef inline void solve(engine_t* e, int32_t sweeps) noexcept nogil:
+cdef inline void solve(engine_t* e, int32_t sweeps, double* curve, double* scratch) noexcept nogil:
     cdef blocks_t p
     cdef rows_t r
     cdef double* out = e.setting + S_OUT
     view(e, &p, &r)
     warm(e, &r)
     measure(e, out + 4, out + 6)
+    if curve != NULL:
+        note_sweep(e, &p, &r, curve, scratch)
     if sweeps:
-        sweep_all(e, &p, &r)
+        sweep_all(e, &p, &r, curve, scratch)
         measure(e, out + 5, out + 7)
 
 
@@ -242,7 +261,17 @@ cdef public void lav_engine_solve(const int32_t* size, double* real, int32_t* in
     cdef engine_t e
     cdef int64_t n[3]
     bind(size, real, index, keys, &e, n)
-    solve(&e, sweeps)
+    solve(&e, sweeps, NULL, NULL)
+
+
+cdef public void lav_engine_solve_watched(const int32_t* size, double* real, int32_t* index, uint64_t* keys,
+                                          double* curve, double* scratch) noexcept nogil:
+    """All sweeps, bit for bit, with the error before the first and after every one: curve (iterations + 1, 2)
+    holds max |e_n| [N s] over the contacts and E [sqrt J] over all rows; scratch (2 m)."""
+    cdef engine_t e
+    cdef int64_t n[3]
+    bind(size, real, index, keys, &e, n)
+    solve(&e, 1, curve, scratch)
 
 
 cdef public void lav_engine_apply(const int32_t* size, double* real, int32_t* index,
@@ -283,7 +312,7 @@ cdef public int32_t lav_engine_substeps(const int32_t* size, double* real, int32
         status = prepare(&e)
         if status != OK:
             return status
-        solve(&e, 1)
+        solve(&e, 1, NULL, NULL)
         status = finish(&e)
         done[0] += 1
         if status != OK:
@@ -330,6 +359,14 @@ cdef class Buffers:
     def solve(self, bint sweeps=True):
         with nogil:
             lav_engine_solve(&self.size[0], &self.real[0], &self.index[0], &self.keys[0], sweeps)
+
+    def solve_watched(self, double[:, ::1] curve):
+        """All sweeps; curve (iterations + 1, 2) takes max |e_n| [N s] and E [sqrt J] along the way."""
+        rows = self.size[N_JOINT_ROW] + self.size[CAP_CONTACT] * self.size[ROWS_PER_CONTACT]
+        cdef double[::1] scratch = np.empty(2 * rows + 1)
+        with nogil:
+            lav_engine_solve_watched(&self.size[0], &self.real[0], &self.index[0], &self.keys[0], &curve[0, 0],
+                                     &scratch[0])
 
     def apply(self):
         with nogil:

@@ -1,0 +1,297 @@
+"""The kernels as one WebAssembly module without Python: Cython's C, a C compiler for wasm32, a linker.
+
+    python lavender/web/compile.py OUT.wasm        from the root of the project, or wherever lavender_ext lies
+
+Only the standard library and Cython are imported, so that setup.py can run this before anything is built.
+
+Cython translates a module to C that holds its Python part and its core. The linker keeps what the exported
+core functions reach, and nothing else; three checks make that safe:
+
+* no symbol may stay undefined, so a core that calls Python, libm or malloc does not link;
+* no data may be left (`__data_end == __global_base`), since a module-level variable or an imported function
+  pointer is filled by the initialisation of a Python module, which never runs here;
+* the finished module is read back: no imports, exactly the expected functions, a size below `LARGEST`.
+
+The compiler is ziglang's (PyPI, the extra `wasm`), or what LAVENDER_WASM_CC and LAVENDER_WASM_LD name, such
+as `clang --target=wasm32-wasi` and `wasm-ld`.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import re
+import runpy
+import shlex
+import shutil
+import subprocess
+import sys
+import sysconfig
+import tempfile
+from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+__all__ = ["LARGEST", "MODULES", "BuildFailed", "Built", "build", "core_functions", "read_module", "why_not"]
+
+#: Modules of lavender_ext that the page and the checks use.
+MODULES = ("engine", "host", "judge", "orders", "problem", "sweeps")
+#: Largest size of the finished module [bytes].
+LARGEST = 200_000
+#: What the host needs beside the functions: where free memory begins, and the proof that no data is left.
+EDGES = ("__heap_base", "__data_end", "__global_base")
+
+#: CPython's headers describe the machine they were installed on; wasm32 has 4-byte pointers. This file stands
+#: in for their pyconfig.h.
+PYCONFIG = "\n".join(
+    [
+        "#ifndef Py_PYCONFIG_H",
+        "#define Py_PYCONFIG_H",
+        *(
+            f"#define {name} {value}"
+            for name, value in {
+                "SIZEOF_SHORT": 2, "SIZEOF_INT": 4, "SIZEOF_LONG": 4, "SIZEOF_LONG_LONG": 8, "SIZEOF_VOID_P": 4,
+                "SIZEOF_SIZE_T": 4, "SIZEOF_UINTPTR_T": 4, "SIZEOF_WCHAR_T": 4, "SIZEOF_TIME_T": 8, "SIZEOF_OFF_T": 8,
+                "SIZEOF_FLOAT": 4, "SIZEOF_DOUBLE": 8, "SIZEOF_FPOS_T": 16, "SIZEOF_PID_T": 4, "ALIGNOF_LONG": 4,
+                "ALIGNOF_SIZE_T": 4,
+            }.items()
+        ),
+        *(
+            f"#define {name} 1"
+            for name in (
+                "STDC_HEADERS", "HAVE_STDINT_H", "HAVE_STDDEF_H", "HAVE_STDLIB_H", "HAVE_STRING_H", "HAVE_SYS_TYPES_H",
+                "HAVE_PROTOTYPES", "HAVE_DECL_ISINF", "HAVE_DECL_ISNAN", "HAVE_DECL_ISFINITE", "HAVE_SSIZE_T",
+                "HAVE_PTHREAD_STUBS",
+            )
+        ),
+        "#endif",
+        "",
+    ]
+)  # fmt: skip
+
+
+class BuildFailed(Exception):
+    """The module could not be built, or is not what it must be; the message says why."""
+
+
+@dataclass(frozen=True)
+class Built:
+    """What was built: size [bytes], exported functions, imports."""
+
+    size: int
+    functions: tuple[str, ...]
+    imports: tuple[str, ...]
+    compiler: str
+
+
+def why_not() -> str:
+    """Why no module can be built here; empty when it can."""
+    if importlib.util.find_spec("Cython") is None:
+        return "Cython is not installed (pip install 'lavender[wasm]')"
+    if not os.environ.get("LAVENDER_WASM_CC") and importlib.util.find_spec("ziglang") is None:
+        return (
+            "no compiler for WebAssembly: pip install 'lavender[wasm]' brings ziglang, or set LAVENDER_WASM_CC and "
+            "LAVENDER_WASM_LD"
+        )
+    if not os.environ.get("LAVENDER_WASM_CC") and sys.version_info < (3, 11):
+        return (
+            f"the headers of CPython {sys.version_info[0]}.{sys.version_info[1]} do not compile for wasm32; "
+            "build with CPython 3.11 or newer"
+        )
+    if not Path(sysconfig.get_paths()["include"], "Python.h").exists():
+        return f"CPython's headers are not in {sysconfig.get_paths()['include']}: install them (python3-dev)"
+    return ""
+
+
+def core_functions(text: str) -> list[str]:
+    """Names of the core functions `cdef public ... lav_*` in the source of a module."""
+    return re.findall(r"^cdef public [^(\n]*?\b(lav_\w+)\(", text, re.MULTILINE)
+
+
+def build(out: Path, root: Path, modules: Iterable[str | Path] = MODULES, *, include: Path | None = None) -> Built:
+    """Build one module of the core functions of several kernel modules.
+
+    Parameters
+    ----------
+    out : Path
+        File to write; its folder exists.
+    root : Path
+        Folder that holds the package lavender_ext with its sources.
+    modules : iterable of str or Path
+        Names in lavender_ext, or paths of .pyx files.
+    include : Path, optional
+        CPython's headers; None: those of this interpreter.
+
+    Returns
+    -------
+    Built
+
+    Raises
+    ------
+    BuildFailed
+        No compiler; the kernels need Python, an import or static data; a module too large.
+    """
+    reason = why_not()
+    if reason:
+        raise BuildFailed(reason)
+    paths = [m if isinstance(m, Path) else root / "lavender_ext" / f"{m}.pyx" for m in modules]
+    names = [name for path in paths for name in core_functions(path.read_text(encoding="utf-8"))]
+    compiler = shlex.split(os.environ.get("LAVENDER_WASM_CC", "")) or [sys.executable, "-m", "ziglang", "cc", "-target", "wasm32-wasi"]
+    linker = shlex.split(os.environ.get("LAVENDER_WASM_LD", "")) or [sys.executable, "-m", "ziglang", "wasm-ld"]
+    options = runpy.run_path(str(root / "lavender_ext" / "build_options.py"))
+    with tempfile.TemporaryDirectory(prefix="lavender-wasm-") as folder:
+        work = Path(folder)
+        headers = work / "include"
+        shutil.copytree(include or sysconfig.get_paths()["include"], headers)
+        (headers / "pyconfig.h").write_text(PYCONFIG)
+        directives = [f"-X{name}={value}" for name, value in options["directives"]().items()]
+        flags = [*options["COMPILE_FLAGS"], "-O3", "-g0", "-w", "-ffunction-sections", "-fdata-sections", f"-I{headers}"]
+
+        def compile_one(path: Path) -> Path:
+            source, target = work / f"{path.stem}.c", work / f"{path.stem}.o"
+            _run([sys.executable, "-m", "cython", *directives, str(path), "-o", str(source)], root)
+            _run([*compiler, *flags, "-c", str(source), "-o", str(target)], root)
+            return target
+
+        with ThreadPoolExecutor(os.cpu_count()) as pool:
+            objects = list(pool.map(compile_one, paths))
+        module = work / "module.wasm"
+        exports = [f"--export={name}" for name in (*names, *EDGES)]
+        try:
+            _run([*linker, "--no-entry", "--gc-sections", "-s", *exports, *map(str, objects), "-o", str(module)], root)
+        except BuildFailed as error:
+            if "undefined symbol" in str(error):
+                raise BuildFailed(f"a kernel needs what WebAssembly does not have (Python, libm, malloc):\n{error}") from None
+            raise
+        data = module.read_bytes()
+        found = read_module(data)
+        _check(found, names, len(data))
+        # Moved into place in one step: whoever reads `out` at the same time sees the old file or the new one.
+        part = out.with_name(out.name + f".{os.getpid()}")
+        try:
+            part.write_bytes(data)
+            part.replace(out)
+        except OSError as error:
+            part.unlink(missing_ok=True)
+            raise BuildFailed(f"cannot write {out}: {error.strerror or error}") from None
+    return Built(len(data), tuple(sorted(names)), found.imports, shlex.join(compiler))
+
+
+def _run(command: list[str], folder: Path) -> None:
+    try:
+        done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+    except OSError as error:
+        raise BuildFailed(f"{command[0]} cannot be run: {error.strerror or error}") from None
+    if done.returncode:
+        raise BuildFailed(f"{shlex.join(command)} failed:\n{(done.stdout + done.stderr)[-4000:]}")
+
+
+def _check(found: Module, names: list[str], size: int) -> None:
+    if found.imports:
+        raise BuildFailed(f"the module imports {', '.join(found.imports)}; it must stand alone")
+    edges = {name: found.globals.get(name) for name in EDGES}
+    if None in edges.values() or edges["__data_end"] != edges["__global_base"] or found.data_segments:
+        raise BuildFailed(
+            "a kernel reads or writes static data, which nothing fills outside Python: "
+            f"{edges}, {found.data_segments} data segments"
+        )
+    missing = sorted(set(names) ^ set(found.functions))
+    if missing:
+        raise BuildFailed(f"exported functions are not those of the sources: {', '.join(missing)}")
+    if size >= LARGEST:
+        raise BuildFailed(f"the module has {size} bytes; below {LARGEST} are allowed")
+
+
+@dataclass(frozen=True)
+class Module:
+    """What a WebAssembly file says of itself: imports, exported functions and constants, data segments."""
+
+    imports: tuple[str, ...]
+    functions: tuple[str, ...]
+    globals: dict[str, int]  # exported constants
+    data_segments: int
+
+
+def read_module(data: bytes) -> Module:
+    """Read the sections of a WebAssembly module (version 1).
+
+    Parameters
+    ----------
+    data : bytes
+        The file.
+
+    Returns
+    -------
+    Module
+
+    Raises
+    ------
+    BuildFailed
+        Not such a file.
+    """
+    if data[:8] != b"\0asm\1\0\0\0":
+        raise BuildFailed("not a WebAssembly module of version 1")
+    sections = {}
+    at = 8
+    while at < len(data):
+        kind = data[at]
+        size, at = _number(data, at + 1)
+        sections[kind] = (at, at + size)
+        at += size
+    imports, functions, constants = [], [], {}
+    if 2 in sections:
+        count, at = _number(data, sections[2][0])
+        if count:
+            name, at = _name(data, at)
+            field, at = _name(data, at)
+            imports.append(f"{name}.{field}" + (f" and {count - 1} more" if count > 1 else ""))
+    values = []
+    if 6 in sections:
+        count, at = _number(data, sections[6][0])
+        for _ in range(count):
+            # type, mutability, then i32.const VALUE end
+            if data[at] != 0x7F or data[at + 2] != 0x41:
+                raise BuildFailed("a global of the module is not a 32-bit constant")
+            value, at = _number(data, at + 3, signed=True)
+            values.append(value)
+            at += 1
+    if 7 in sections:
+        count, at = _number(data, sections[7][0])
+        for _ in range(count):
+            name, at = _name(data, at)
+            kind = data[at]
+            index, at = _number(data, at + 1)
+            if kind == 0:
+                functions.append(name)
+            elif kind == 3:
+                constants[name] = values[index]
+    segments = _number(data, sections[11][0])[0] if 11 in sections else 0
+    return Module(tuple(imports), tuple(functions), constants, segments)
+
+
+def _number(data: bytes, at: int, signed: bool = False) -> tuple[int, int]:
+    # LEB128
+    value = shift = 0
+    while True:
+        byte = data[at]
+        at += 1
+        value |= (byte & 0x7F) << shift
+        shift += 7
+        if byte < 0x80:
+            break
+    if signed and byte & 0x40:
+        value -= 1 << shift
+    return value, at
+
+
+def _name(data: bytes, at: int) -> tuple[str, int]:
+    size, at = _number(data, at)
+    return data[at : at + size].decode(), at + size
+
+
+if __name__ == "__main__":
+    try:
+        print(build(Path(sys.argv[1]), Path(__file__).resolve().parent.parent.parent))
+    except BuildFailed as failure:
+        sys.exit(str(failure))
