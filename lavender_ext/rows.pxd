@@ -354,7 +354,7 @@ cdef inline void contact_diagonal(const double* normal, const double* tangent, c
 
     And swing (1 + nt + spin, 6): I_a^-1 (arm_a x axis), I_b^-1 (arm_b x axis) of each row, 0 where static.
 
-    With l = arm x axis and the sums over both bodies, A_pq = (sum 1/m) p.q + sum l_p . I^-1 l_q; for spin l = n.
+    With l = arm x axis (for spin l = n), A_pq = (sum 1/m) p.q + sum l_p . I^-1 l_q over both bodies.
     """
     cdef double axis[12]        # n, t1, t2
     cdef double l[9]

@@ -1,0 +1,73 @@
+"""The engine's examples run, and the relations that they show hold."""
+
+import importlib.util
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+FOLDER = Path(__file__).resolve().parent.parent / "examples"
+
+
+def example(name):
+    spec = importlib.util.spec_from_file_location(name, FOLDER / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.parametrize("name", ["engine_sweeps", "engine_warm_start", "two_particles"])
+def test_prints_its_numbers_and_saves_its_figure(name, tmp_path, capsys):
+    path = tmp_path / "figure.png"
+    example(name).main(str(path))
+    assert path.read_bytes().startswith(b"\x89PNG")
+    assert str(path) in capsys.readouterr().out
+
+
+def test_more_sweeps_help_in_the_first_solve_and_in_the_run():
+    found = example("engine_sweeps").numbers()
+    for name in ("bottom_up", "top_down", "friction"):
+        assert all(b < a for a, b in pairwise(found[name]))
+    # The law of six unit boxes on 24 points, to its three digits.
+    assert found["bottom_up"][0] / found["bottom_up"][-1] == pytest.approx(32.1, abs=0.06)
+    assert found["top_down"][0] / found["top_down"][-1] == pytest.approx(46.1, abs=0.06)
+    assert 20 < found["friction"][0] / found["friction"][-1] < 50
+    for column in found["run"].T:
+        assert all(b < a for a, b in pairwise(column))
+    # A cold solve of few sweeps must carry the weight, so the run is further off than the first solve.
+    assert found["run"][0, 0] > 2 * found["bottom_up"][0]
+    assert found["run"][-1, 0] == pytest.approx(found["bottom_up"][-1], rel=0.25)
+
+
+def test_warm_starts_begin_closer_and_are_missed_when_switched_off():
+    module = example("engine_warm_start")
+    found = module.numbers()
+    initial = {k: module.column(v[0], "residual_initial") for k, v in found.items()}
+    matches = {k: module.column(v[0], "cache_matches") for k, v in found.items()}
+    assert np.all(matches["warm"][1:] == 24) and np.all(matches["cold"] == 0)
+    assert np.median(initial["cold"][20:90]) > 30 * np.median(initial["warm"][20:90])
+    at = module.SWITCH
+    np.testing.assert_array_equal(found["switched off"][0][:at], found["warm"][0][:at])
+    assert np.all(matches["switched off"][at:] == 0)
+    assert initial["switched off"][at] > 30 * initial["switched off"][at - 1]
+    # The judge over all rows sees the same: without friction they are the normal rows.
+    for _, relative, share in found.values():
+        assert np.all(share[relative > 0] == pytest.approx(1.0))
+    medians = {k: np.median(v[1][20:90]) for k, v in found.items()}
+    assert medians["cold"] > 30 * medians["warm"]
+
+
+def test_two_particles_agree_with_the_closed_form():
+    module = example("two_particles")
+    found = module.numbers()
+    assert found["impulse"] == pytest.approx(-1.5, rel=1e-15)  # -2 m/s over 4/3 kg^-1
+    assert found["engine"] == pytest.approx(found["impulse"], rel=1e-15)
+    assert found["problem"].m == 1 and found["problem"].law == "linear"
+    assert found["problem"].row_name(0) == "distance 0"
+    assert found["after"][0, 0] == found["after"][1, 0] == pytest.approx(1.5, rel=1e-15)
+    # A substep turns the pair by 1/240 rad: (1/240)^2 / 2 of 1 m, a fifth of the error removed each time.
+    assert np.abs(found["apart"] - 1.0).max() < 5 * 0.5 / 240**2
+    np.testing.assert_allclose(
+        found["momentum"], np.tile(module.MASS @ module.SPEED, (module.STEPS, 1)), atol=1e-12
+    )
