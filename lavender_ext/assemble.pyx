@@ -42,13 +42,14 @@ cdef public void lav_expand_rows(const blocks_t* p, const rows_t* r, double* jac
             minv_times(jac + 12 * k, r.inv_mass, r.inv_inertia, a, b, minv_jac + 12 * k)
 
 
-cdef public int64_t lav_body_blocks(const blocks_t* p, const rows_t* r, int32_t* start, int32_t* blocks) noexcept nogil:
+cdef public void lav_body_blocks(const blocks_t* p, const rows_t* r, int32_t* start, int32_t* blocks,
+                                 int64_t* bound) noexcept nogil:
     """Blocks of each body: blocks[start[i]:start[i + 1]], increasing; start (n + 1), blocks (2 k).
 
-    Returns a bound on the entries of A.
+    bound[0] becomes a bound on the entries of A.
     """
     cdef int32_t i, s, x, t, sum_ = 0
-    cdef int64_t bound = 0, here
+    cdef int64_t here
     for i in range(r.n_bodies + 1):
         start[i] = 0
     for i in range(p.n_blocks):
@@ -71,12 +72,12 @@ cdef public int64_t lav_body_blocks(const blocks_t* p, const rows_t* r, int32_t*
         start[i] = start[i - 1]
         i -= 1
     start[0] = 0
+    bound[0] = p.n_rows
     for i in range(r.n_bodies):
         here = 0
         for x in range(start[i], start[i + 1]):
             here += p.ptr[blocks[x] + 1] - p.ptr[blocks[x]]
-        bound += here * here
-    return bound + p.n_rows
+        bound[0] += here * here
 
 
 cdef inline int32_t meet(const rows_t* r, int32_t i, const int32_t* start, const int32_t* blocks, int32_t* out) noexcept nogil:
@@ -126,12 +127,11 @@ cdef inline double meeting(const double* jac, const double* minv_jac, int32_t bi
     return value
 
 
-cdef public int64_t lav_assemble(const blocks_t* p, const rows_t* r, const double* jac, const double* minv_jac,
-                                 const int32_t* start, const int32_t* blocks, int32_t* near, int32_t* sides,
-                                 int32_t* indptr, int32_t* indices, double* data) noexcept nogil:
-    """Rows of A into indptr (m + 1), indices, data; near, sides (2 k + 1) are scratch. Returns the entries."""
-    cdef int32_t i, n, q, j, row, col
-    cdef int64_t nnz = 0
+cdef public void lav_assemble(const blocks_t* p, const rows_t* r, const double* jac, const double* minv_jac,
+                              const int32_t* start, const int32_t* blocks, int32_t* near, int32_t* sides,
+                              int32_t* indptr, int32_t* indices, double* data) noexcept nogil:
+    """Rows of A into indptr (m + 1), indices, data; near, sides (2 k + 1) are scratch."""
+    cdef int32_t i, n, q, j, row, col, nnz = 0
     cdef double value
     indptr[0] = 0
     for i in range(p.n_blocks):
@@ -154,26 +154,28 @@ cdef public int64_t lav_assemble(const blocks_t* p, const rows_t* r, const doubl
                         indices[nnz] = col
                         data[nnz] = value
                         nnz += 1
-            indptr[row + 1] = <int32_t>nnz
-    return nnz
+            indptr[row + 1] = nnz
 
 
 def bound(Data p):
     """(most entries A can have, start, blocks): how large A gets before it is formed."""
     cdef int32_t[::1] start = np.empty(p.rows.n_bodies + 1, np.int32)
     cdef int32_t[::1] blocks = np.empty(2 * p.blocks.n_blocks + 1, np.int32)
-    return lav_body_blocks(&p.blocks, &p.rows, &start[0], &blocks[0]), np.asarray(start), np.asarray(blocks)
+    cdef int64_t most
+    lav_body_blocks(&p.blocks, &p.rows, &start[0], &blocks[0], &most)
+    return most, np.asarray(start), np.asarray(blocks)
 
 
 def delassus(Data p, Py_ssize_t most, int32_t[::1] start, int32_t[::1] blocks):
     """A as (indptr, indices, data) of compressed rows with sorted columns; arguments are `bound(p)`, most < 2^31."""
     cdef Py_ssize_t m = p.blocks.n_rows
-    cdef int64_t nnz
+    cdef int32_t nnz
     cdef double[::1] jac = np.empty(12 * m + 1), minv_jac = np.empty(12 * m + 1), data = np.empty(most + 1)
     cdef int32_t[::1] indices = np.empty(most + 1, np.int32), indptr = np.zeros(m + 1, np.int32)
     cdef int32_t[::1] near = np.empty(4 * p.blocks.n_blocks + 2, np.int32)
     with nogil:
         lav_expand_rows(&p.blocks, &p.rows, &jac[0], &minv_jac[0])
-        nnz = lav_assemble(&p.blocks, &p.rows, &jac[0], &minv_jac[0], &start[0], &blocks[0], &near[0],
-                           &near[2 * p.blocks.n_blocks + 1], &indptr[0], &indices[0], &data[0])
+        lav_assemble(&p.blocks, &p.rows, &jac[0], &minv_jac[0], &start[0], &blocks[0], &near[0],
+                     &near[2 * p.blocks.n_blocks + 1], &indptr[0], &indices[0], &data[0])
+    nnz = indptr[m]
     return np.asarray(indptr), np.asarray(indices)[:nnz].copy(), np.asarray(data)[:nnz].copy()
