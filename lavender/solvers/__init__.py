@@ -13,6 +13,7 @@ _TABLE = (
     "direct",
     "newton",
     "lemke",
+    "admm",
     "block_gauss_seidel",
     "nncg",
     "anderson",

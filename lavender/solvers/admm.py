@@ -1,0 +1,204 @@
+"""Proximal splitting (ADMM) with factorisation reused and Anderson mixing: for redundant, ill-conditioned problems.
+
+    z = Pi_K(u),  y = rho (u - z),  (B + rho) x = c - s + rho z - y,  u <- u + alpha (x - z), then mixed
+
+in the metric of d: B = D^-1/2 A D^-1/2, c = D^-1/2 b, K the bounds and cones of all blocks at once, s De
+Saxce's shift of Coulomb's law (`lavender_ext/admm.pyx`). One triangular solve an iteration instead of a
+sweep, so mass ratios and long chains cost factorisations (rho is weighed every 20 iterations), not sweeps.
+Cholesky of a dense A, L D L^T of a sparse one or, where rows have fewer body unknowns than rows, of the
+body form; L U where A is not symmetric.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import qdldl
+import scipy.sparse as sp
+from scipy.sparse.linalg import splu
+
+from lavender._arrays import FloatArray
+from lavender.errors import InputError
+from lavender.problem import Problem
+from lavender.registry import SolverSpec
+from lavender.residuals import reference
+from lavender.solution import Claim, Status
+from lavender.solvers._accelerated import LARGEST_MEMORY
+from lavender.solvers._sweeping import claim
+from lavender_ext import admm as kernels
+from lavender_ext.watch import Watch
+
+_DENSE, _SYMMETRIC, _GENERAL, _BODIES = 0, 1, 2, 3
+_DENSE_ABOVE = 0.15  # share of nonzeros from which LAPACK on the full matrix is the faster factorisation
+_START_RHO = 0.3  # B has unit diagonal, so 1 is its scale
+_PATIENCE = 500  # iterations: on mass ratios the residual rises while rho finds its place
+
+
+class _Failed(Exception):
+    """A factorisation broke down; the text says how."""
+
+
+class AdmmState:
+    """Scaled problem, factorisation for the present rho, and the vectors of the run."""
+
+    def __init__(self, problem: Problem, memory: int) -> None:
+        reference(problem)
+        self.problem = problem
+        self.data = problem.data
+        self.watch = Watch(problem.data, _PATIENCE)
+        self.root = np.sqrt(problem.d)
+        self.c = problem.b / self.root
+        self.space = kernels.allocate(self.data, memory)
+        self.rho = _START_RHO
+        self.undone = 0
+        self.factorisations = 0
+        rows = problem.rows
+        self.matrix: Any = None
+        if rows is not None and 6 * rows.n_bodies < problem.m:
+            form = problem.velocity_form()
+            k = form.jacobian
+            # In the metric of D = diag d of the judge, which is the scale of the form.
+            self.kind = _BODIES
+            self.theta = form.theta
+            self.jacobian = k
+        else:
+            a = problem.csr
+            scale = sp.diags_array(1.0 / self.root)
+            self.matrix = sp.csr_array(scale @ a @ scale)
+            if not problem.is_symmetric:
+                self.kind = _GENERAL
+            elif self.matrix.nnz > _DENSE_ABOVE * problem.m**2 and problem.m > 1:
+                self.kind, self.matrix = _DENSE, self.matrix.toarray()
+            else:
+                self.kind = _SYMMETRIC
+        self.factor = self._factor()
+
+    @property
+    def best(self) -> tuple[float, FloatArray | None]:
+        """(relative residual, impulse) of the best check."""
+        return self.watch.best
+
+    def _factor(self) -> tuple[int, int, tuple[Any, ...]]:
+        self.factorisations += 1
+        m = self.problem.m
+        if m == 0:
+            return self.kind, 0, ()
+        if self.kind == _DENSE:
+            shifted = self.matrix.copy()
+            shifted[np.diag_indices(m)] += self.rho
+            try:
+                return _DENSE, m, (np.ascontiguousarray(np.linalg.cholesky(shifted)),)
+            except np.linalg.LinAlgError as error:
+                raise _Failed(f"A + rho D is not positive definite at rho = {self.rho:.1e}: {error}") from None
+        if self.kind == _GENERAL:
+            try:
+                lu = splu(sp.csc_array(self.matrix + self.rho * sp.eye_array(m)))
+            except RuntimeError as error:
+                raise _Failed(f"A + rho D has no LU factors at rho = {self.rho:.1e}: {error}") from None
+            lower, upper = _columns(lu.L), _columns(lu.U)
+            place = np.empty(m, np.int32)
+            place[lu.perm_r] = np.arange(m, dtype=np.int32)
+            # Row perm_r^-1[i] stands at place i; the solution's entry c stands at place perm_c[c].
+            column = np.empty(m, np.int32)
+            column[lu.perm_c] = np.arange(m, dtype=np.int32)
+            return _GENERAL, m, (*lower, place, column, *upper)
+        if self.kind == _BODIES:
+            k = self.jacobian
+            e = 1.0 / (self.theta + self.rho)
+            n = k.shape[1]
+            normal = sp.csc_array(k.T @ sp.diags_array(e) @ k + sp.eye_array(n))
+            extra: tuple[Any, ...] = (*_columns(k, convert=False), e)
+        else:
+            n, extra = m, ()
+            normal = sp.csc_array(self.matrix + self.rho * sp.eye_array(m))
+        lower, diag, order = qdldl.Solver(sp.csc_matrix(normal)).factors()
+        if not (np.isfinite(diag).all() and np.all(diag != 0.0)):
+            raise _Failed(f"L D L^T broke down at rho = {self.rho:.1e}")
+        order = np.ascontiguousarray(order, np.int32)
+        return self.kind, n, (*_columns(lower), order, order, np.ascontiguousarray(diag), *extra)
+
+
+def _columns(matrix: Any, convert: bool = True) -> tuple[Any, Any, Any]:
+    # (ptr, index, value) with sorted indices, as the kernel reads them.
+    if convert:
+        matrix = sp.csc_array(matrix)
+    matrix.sort_indices()
+    value = np.ascontiguousarray(matrix.data if matrix.nnz else np.zeros(1), np.float64)
+    index = np.ascontiguousarray(matrix.indices if matrix.nnz else np.zeros(1), np.int32)
+    return np.ascontiguousarray(matrix.indptr, np.int32), index, value
+
+
+@dataclass(frozen=True)
+class ADMM:
+    """Proximal splitting with spectral penalty and Anderson mixing."""
+
+    memory: int = 10
+    relaxation: float = 1.6
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.memory, int) or not 0 <= self.memory <= LARGEST_MEMORY:
+            raise InputError(f"memory is {self.memory!r}; a whole number from 0 to {LARGEST_MEMORY} is needed")
+        if not 0.0 < self.relaxation < 2.0:
+            raise InputError(f"relaxation is {self.relaxation!r}; a number between 0 and 2 is needed")
+
+    def prepare(self, problem: Problem) -> AdmmState | str:
+        """Scale and factor; a text where the factorisation broke down."""
+        try:
+            return AdmmState(problem, self.memory)
+        except _Failed as failure:
+            return str(failure)
+
+    def update(self, state: Any, problem: Problem) -> AdmmState | str:
+        """A fresh state: the penalty starts anew, so that a solve depends on its problem alone."""
+        return self.prepare(problem)
+
+    def run(
+        self, state: AdmmState | str, impulse: FloatArray, n: int, tol: float, time_limit: float | None = None
+    ) -> Claim:
+        """n iterations, or fewer where a check ends them."""
+        if isinstance(state, str):
+            return Claim(Status.NUMERICAL_ERROR, 0, {}, state)
+        data = state.data
+        if state.watch.total == 0 and len(impulse):
+            # y of the start: minus its slack, shifted; at a solution the first iteration stays there.
+            kernels.start(data, impulse, state.problem.slack(impulse), state.root, state.rho, state.space)
+        factorisations, undone, message = state.factorisations, state.undone, ""
+
+        def iterate(count: int, first: bool) -> None:
+            while count:
+                done, rho, state.undone = kernels.run(
+                    data, impulse, count, state.rho, self.relaxation, self.memory, state.space, state.root,
+                    state.c, state.factor,
+                )  # fmt: skip
+                count -= done
+                if rho > 0.0:
+                    state.rho = rho
+                    state.factor = state._factor()
+
+        try:
+            result = claim(*state.watch.run_python(iterate, impulse, n, tol))
+        except _Failed as failure:
+            result, message = Claim(Status.NUMERICAL_ERROR, state.watch.total), str(failure)
+        work = {
+            "solves": result.iterations,
+            "factorisations": state.factorisations - (0 if factorisations == 1 else factorisations),
+            "undone": state.undone - undone,
+        }
+        form = ("dense Cholesky", "sparse LDLT", "sparse LU", "LDLT over bodies")[state.kind]
+        return replace(result, work=work, form=form, message=message)
+
+
+SPEC = SolverSpec(
+    name="admm",
+    factory=ADMM,
+    laws=frozenset({"linear", "lcp", "coulomb", "cone"}),
+    max_iter=2000,
+    options={
+        "memory": "iterations that Anderson mixing combines, 0 (none) to 16; default 10",
+        "relaxation": "alpha between 0 and 2; default 1.6",
+    },
+    summary="proximal splitting, factorisation reused, Anderson-mixed",
+    reference="Boyd et al. 2011; Carpentier, Le Lidec, Montaut 2024 (contact); Acary et al. 2011 (De Saxce shift)",
+)
