@@ -415,11 +415,11 @@ def advice_by_level(records: Records) -> list[Advice]:
 
 
 def time_budgets(records: Records) -> tuple[float, ...]:
-    """Three decades of time [s] around the median of the fastest times to the middle level."""
+    """Three decades of time [s] about the median of the fastest times to the middle level."""
     levels = levels_of(records)
     fastest = [min(by.values()) for by in _times(records, levels[len(levels) // 2]).values() if by]
     fastest = [t for t in fastest if math.isfinite(t)]
-    middle = round(math.log10(median(fastest))) if fastest else -3
+    middle = math.ceil(math.log10(median(fastest))) if fastest else -3
     return tuple(10.0**k for k in (middle - 1, middle, middle + 1))
 
 

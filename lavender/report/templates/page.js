@@ -18,7 +18,8 @@
       type: a.log ? "log" : "linear",
       gridcolor: t.line,
       zeroline: false,
-      exponentformat: a.seconds ? "SI" : "power",
+      exponentformat: a.seconds ? "SI" : a.log ? "power" : "none",
+      minexponent: 1,
       ticksuffix: a.seconds ? "s" : "",
       automargin: true,
     });
@@ -35,13 +36,21 @@
         y: figure.y.log ? Math.log10(figure.floor) : figure.floor, font: { size: 10, color: t.quiet },
       });
     }
+    const below = phone || width < 620;
+    const entry = phone ? 92 : 110;
+    const columns = Math.max(1, Math.floor((width - 76) / (entry + 42)));
+    const rows = below ? Math.ceil(figure.traces.length / columns) : 0;
+    const legend = 20 * rows + (below ? 14 : 0);
     return {
+      height: below ? 330 + legend : Math.max(420, 110 + 19 * figure.traces.length),
       title: { text: figure.title.replace(/&/g, "&amp;").replace(/</g, "&lt;"), font: { size: 13 } },
       font: { color: t.ink, family: "system-ui, sans-serif", size: 11 },
       paper_bgcolor: t.paper, plot_bgcolor: t.paper,
-      margin: { l: 60, r: 12, t: 36, b: 44 },
+      margin: { l: 60, r: 12, t: 36, b: 48 + legend },
       xaxis: axis(figure.x), yaxis: axis(figure.y),
-      legend: phone || width < 620 ? { orientation: "h", y: -0.22, font: { size: 10 } } : { font: { size: 10 } },
+      legend: below
+        ? { orientation: "h", yref: "container", y: 0, yanchor: "bottom", font: { size: 10 }, entrywidth: entry }
+        : { font: { size: 10 } },
       hoverlabel: { align: "left" }, hovermode: "closest",
       shapes: shapes, annotations: annotations,
     };
