@@ -556,6 +556,16 @@ cdef class Pivoting:
     def n_rounds(self):
         return self.s.n_rounds
 
+    def skipped(self):
+        """Rows whose pivots were small in the last factorisation, in order of elimination."""
+        cdef int32_t i, at
+        found = []
+        for i in range(self.s.n):
+            at = self.s.place[self.s.order[i]]
+            if at >= 0 and self.s.c[<int64_t>at * self.s.width] == 0.0:
+                found.append(self.s.order[i])
+        return found
+
     @property
     def pivots(self):
         """(small, negative, least, first small place) of the last factorisation."""

@@ -1,0 +1,315 @@
+"""Which rows repeat others, what is unique all the same, and one impulse to stand for many.
+
+Where A is singular, impulses are not unique: a table on four legs. The slack w, and with it every body's
+velocity, is unique for symmetric positive semidefinite A without Coulomb friction. A row is redundant when
+what is left of it after all rows before it are taken out,
+
+    p_i = A_ii - A_iB A_BB^-1 A_Bi   (B: rows before i that are not redundant)   [1/kg]
+
+is at most `tol` A_ii: the squared share of its direction that is new, in the metric of the masses.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import scipy.sparse as sp
+from lavender_ext.pivoting import Pivoting, free_block
+from scipy.linalg import lapack, qr
+
+from lavender._arrays import FloatArray
+from lavender.cones import Cones
+from lavender.errors import CapabilityError, InputError, SolveFailed
+from lavender.problem import Problem
+from lavender.residuals import residual
+from lavender.solve import solve
+
+__all__ = ["Redundancy", "redundancy"]
+
+DENSE = 1200  # rows of an island up to which it is decomposed as a dense matrix
+# Larger islands: LDL^T of A + SHIFT D. A zero pivot becomes at most rows SHIFT d: ten times that counts as zero.
+SHIFT = 1e-13
+TIKHONOV = 1e-7  # -, weight of the distance to the wanted impulse while its rows are found
+UNMOVED = 1e-9  # -, entries of all unit null vectors up to which a row counts as not moved
+ACCEPTED = 1e-9  # relative residual of a representative, or twice its floor
+
+
+Places = npt.NDArray[np.intp]
+
+
+@dataclass(frozen=True)
+class Redundancy:
+    """What `redundancy` found; `str()` says it in a few lines."""
+
+    problem: Problem
+    rank: int  # of A
+    tol: float  # -, share of A_ii up to which a row counts as redundant; the largest that was used
+    method: str  # how the rank was found, in words
+    rows: tuple[int, ...]  # redundant rows: each adds nothing to the others that are kept
+    impulse_is_unique: npt.NDArray[np.bool_]  # (m,) rows whose impulse no redundancy can change
+    _scale: FloatArray = field(repr=False)  # (m,) sqrt kg, D^-1/2
+    # Rows and orthonormal null basis of D^-1/2 A D^-1/2 on them, of each dense island that has one.
+    _null: tuple[tuple[Places, FloatArray], ...] = field(repr=False)
+
+    @property
+    def row_names(self) -> tuple[str, ...]:
+        """Names of the redundant rows."""
+        return tuple(self.problem.row_name(i) for i in self.rows)
+
+    @cached_property
+    def blocks(self) -> tuple[int, ...]:
+        """Blocks (joints, contacts) whose rows are all redundant: without them nothing would change."""
+        ptr = self.problem.cones.ptr
+        count = np.bincount([self.problem.block_of(i) for i in self.rows], minlength=self.problem.n_blocks)
+        return tuple(int(i) for i in np.flatnonzero((count > 0) & (count == np.diff(ptr))))
+
+    @property
+    def block_names(self) -> tuple[str, ...]:
+        """Names of those blocks."""
+        first = (self.problem.row_name(int(self.problem.cones.ptr[i])) for i in self.blocks)
+        return tuple(name.rsplit(", ", 1)[0] for name in first)
+
+    @property
+    def slack_is_unique(self) -> bool:
+        """Slack and body velocities are the same in every solution."""
+        return self.problem.is_symmetric and self.problem.law != "coulomb"
+
+    @property
+    def unique(self) -> tuple[str, ...]:
+        """What every solution shares, for a positive semidefinite A; compare nothing else."""
+        if not self.slack_is_unique:
+            return ()
+        impulse = ("impulse",) if self.rank == self.problem.m else ()
+        return ("slack", "body velocities", "objective", *impulse)
+
+    def least_norm(self) -> FloatArray:
+        """The solution of least sum d lambda^2; (m,) [N s]. As `nearest_to` zero."""
+        return self.nearest_to(np.zeros(self.problem.m))
+
+    def nearest_to(self, previous: Any) -> FloatArray:
+        """The solution with the least sum d (lambda - previous)^2 [J]; (m,) [N s].
+
+        Linear systems and boxed LCPs: to rounding. On friction cones: to about 1e-7 of its size.
+
+        Parameters
+        ----------
+        previous : (m,) N s
+
+        Raises
+        ------
+        CapabilityError
+            Coulomb friction, or bounded rows with asymmetric A: solutions do not form one convex set.
+        SolveFailed
+            The judge did not accept the result.
+        """
+        p = self.problem
+        previous = p.impulse_array(previous, "previous")
+        if p.law == "coulomb" or (p.law != "linear" and not p.is_symmetric):
+            raise CapabilityError(
+                "a representative impulse needs symmetric A without Coulomb friction, where solutions form "
+                "one convex set; pass problem.relaxed('cone') for the convex relaxation"
+            )
+        if p.law == "linear":
+            x = solve(p, "direct", impulse=previous, tol=ACCEPTED).impulse
+            return _accepted(p, self._nearest(x, previous))
+        near = _drawn_to(p, previous)
+        if p.law == "cone":
+            return _accepted(p, solve(near, _cone_solver(near), tol=1e-10).impulse, 1e-6)
+        rough = solve(
+            near, "direct", impulse=np.clip(previous, p.cones.lower, p.cones.upper), tol=1e-9
+        ).impulse
+        return _accepted(p, _polished(p, rough, previous))
+
+    def _nearest(self, x: FloatArray, previous: FloatArray) -> FloatArray:
+        # x less what of x - previous lies in the null space of A, in the metric of D.
+        z = (x - previous) / self._scale
+        for rows, basis in self._null:
+            for _ in range(2):
+                z[rows] -= basis @ (basis.T @ z[rows])
+        return previous + self._scale * z
+
+    def __str__(self) -> str:
+        m = self.problem.m
+        if self.rank == m:
+            return f"rank {m} of {m} ({self.method}): no row is redundant"
+        names = ", ".join(self.row_names[:8]) + (", ..." if len(self.rows) > 8 else "")
+        lines = [f"rank {self.rank} of {m} ({self.method}); redundant: {names}"]
+        if self.blocks:
+            more = ", ..." if len(self.blocks) > 8 else ""
+            lines.append(f"all rows of: {', '.join(self.block_names[:8])}{more}")
+        lines.append(f"unique: {', '.join(self.unique) or 'nothing is certain to be'}")
+        return "\n".join(lines)
+
+
+def redundancy(problem: Problem, *, tol: float = 1e-12) -> Redundancy:
+    """Rank of A, the rows that repeat others, and what is unique.
+
+    Islands (rows that share no body, directly or through others) are decomposed apart: up to 1,200 rows by
+    QR of J M^-1/2 with column pivoting where rows are given (nothing is squared), else by Cholesky with
+    pivoting, or QR for asymmetric A; larger ones by LDL^T of A + 1e-13 D, where pivots up to 1e-12 d times
+    the number of rows count as zero.
+
+    Parameters
+    ----------
+    tol : float, default 1e-12
+        Share of A_ii up to which what is new in a row counts as nothing.
+
+    Raises
+    ------
+    InputError
+        `tol` is not between 0 and 1.
+    CapabilityError
+        Asymmetric A with an island of more than 1,200 rows.
+    """
+    if not isinstance(problem, Problem):
+        raise InputError(f"problem is a {type(problem).__name__}; a lavender.Problem is needed")
+    if not 0.0 <= tol < 1.0:
+        raise InputError(f"tol is {tol}; a share from 0 to 1 is needed")
+    m = problem.m
+    unique = np.ones(m, bool)
+    dependent: list[int] = []
+    used, methods = tol, set()
+    scale = 1.0 / np.sqrt(problem.csr_data.d)
+    null: list[tuple[Places, FloatArray]] = []
+    if m:
+        scaled = sp.csr_array(sp.diags_array(scale) @ problem.csr @ sp.diags_array(scale))
+        root = None
+        if problem.rows is not None and not np.any(problem.compliance):
+            root = problem.velocity_form().jacobian
+        count, label = sp.csgraph.connected_components(scaled, directed=False)
+        by_island = np.split(
+            np.argsort(label, kind="stable"), np.cumsum(np.bincount(label, minlength=count))[:-1]
+        )
+        for island in by_island:
+            part = scaled[island][:, island]
+            if len(island) > DENSE:
+                if not problem.is_symmetric:
+                    raise CapabilityError(
+                        f"A is asymmetric and {len(island)} of its rows hang together; the rank of at most "
+                        f"{DENSE} can be told: ask for parts, or for the symmetric part of A"
+                    )
+                limit = max(tol, 10.0 * SHIFT * len(island))
+                found, used = _sparse(part, limit), max(used, limit)
+                methods.add(f"LDL^T of A + {SHIFT:.0e} D, {limit:.0e}")
+                unique[island] = len(found) == 0
+            elif not problem.is_symmetric:
+                found = _by_qr(part.toarray().T, tol)
+                methods.add(f"QR with pivoting, {tol:.0e}")
+                unique[island] = len(found) == 0
+            else:
+                dense = part.toarray()
+                if root is not None:
+                    tail = _by_qr(root[island].toarray().T, tol)
+                    methods.add(f"QR of J M^-1/2 with pivoting, {tol:.0e}")
+                else:
+                    tail = _by_cholesky(dense, tol)
+                    methods.add(f"Cholesky with pivoting, {tol:.0e}")
+                found = _in_order(dense, tail, tol)
+                if len(found):
+                    basis = _null_basis(dense, found)
+                    null.append((island, basis))
+                    unique[island] = np.abs(basis).max(axis=1) <= UNMOVED
+            dependent += island[found].tolist()
+    method = "; ".join(sorted(methods)) or "no rows"
+    return Redundancy(
+        problem, m - len(dependent), used, method, tuple(sorted(dependent)), unique, scale, tuple(null)
+    )
+
+
+def _by_qr(a: FloatArray, tol: float) -> Places:
+    """Columns of `a` (unit length) that depend on the others, by QR with column pivoting."""
+    r, order = qr(a, mode="r", pivoting=True)
+    size = np.abs(np.diagonal(r)) ** 2
+    rank = int(np.count_nonzero(size > tol * size[0])) if len(size) and size[0] > 0.0 else 0
+    return np.sort(order[rank:])
+
+
+def _by_cholesky(a: FloatArray, tol: float) -> Places:
+    """Rows of a semidefinite `a` (unit diagonal) that depend on the others, by Cholesky with pivoting."""
+    # Rounding alone leaves a pivot of about len(a) 2^-53.
+    _, order, rank, _ = lapack.dpstrf(a, tol=max(tol, len(a) * 2.0**-52))
+    return np.sort(order[rank:] - 1)
+
+
+def _in_order(a: FloatArray, tail: Places, tol: float) -> Places:
+    """As many rows as `tail`, each dependent on rows before it; `tail` itself where that cannot be told."""
+    if len(tail) == 0:
+        return tail
+    m = len(a)
+    problem = Problem.linear(a, np.zeros(m))
+    pivoting = Pivoting(problem.csr_data, m - 1, np.arange(m, dtype=np.int32), max(tol, m * 2.0**-52))
+    pivoting.factor()
+    found = np.array(pivoting.skipped(), np.intp)
+    return found if len(found) == len(tail) else tail
+
+
+def _null_basis(a: FloatArray, found: Places) -> FloatArray:
+    """Orthonormal null vectors, from (-A_BB^-1 A_Bi, e_i) for each redundant row i."""
+    kept = np.setdiff1d(np.arange(len(a)), found)
+    vectors = np.zeros((len(a), len(found)))
+    vectors[found] = np.eye(len(found))
+    if len(kept):
+        _, share, info = lapack.dposv(a[np.ix_(kept, kept)], a[np.ix_(kept, found)])
+        if info != 0:
+            share = np.linalg.lstsq(a[np.ix_(kept, kept)], a[np.ix_(kept, found)], rcond=None)[0]
+        vectors[kept] = -share
+    return np.linalg.qr(vectors)[0]
+
+
+def _sparse(a: sp.csr_array, limit: float) -> Places:
+    """Dependent rows of a large semidefinite `a` (unit diagonal)."""
+    import qdldl
+
+    m = a.shape[0]
+    place = np.arange(m, dtype=np.int32)
+    a.sort_indices()
+    parts = (a.indptr.astype(np.int32), a.indices.astype(np.int32), a.data)
+    upper = free_block(*parts, place, np.ones(m), SHIFT, m)
+    _, pivot, order = qdldl.Solver(sp.csc_matrix(upper, shape=(m, m)), upper=True).factors()
+    return np.sort(np.asarray(order, np.intp)[pivot <= limit])
+
+
+def _drawn_to(p: Problem, previous: FloatArray) -> Problem:
+    """The problem with TIKHONOV / 2 sum d (lambda - previous)^2 added to its energy."""
+    weight = TIKHONOV * p.csr_data.d
+    a = sp.csr_array(p.csr + sp.diags_array(weight))
+    return Problem(p.b + weight * previous, p.cones, a, friction=p.friction)
+
+
+def _cone_solver(p: Problem) -> str:
+    from lavender.registry import available
+
+    here = [name for name in ("newton", "clarabel_cone") if name in available(p)]
+    if not here:
+        raise CapabilityError("friction cones need newton or clarabel_cone here; see lavender.known(problem)")
+    return here[0]
+
+
+def _polished(p: Problem, rough: FloatArray, previous: FloatArray) -> FloatArray:
+    """Free rows of `rough` solved on A itself, nearest to `previous`, the others at their bounds."""
+    c = p.cones
+    # A free row stands off its bounds by more than the weight could have moved it.
+    slop = (
+        10.0 * TIKHONOV * max(float(np.abs(rough).max(initial=0.0)), float(np.abs(previous).max(initial=0.0)))
+    )
+    free = (rough > c.lower + slop) & (rough < c.upper - slop)
+    x = np.where(free, rough, np.where(rough <= c.lower + slop, c.lower, c.upper))
+    rows = np.flatnonzero(free)
+    if len(rows):
+        rest = p.csr[rows] @ np.where(free, 0.0, x)
+        part = Problem(p.b[rows] - rest, Cones.free(len(rows)), p.csr[rows][:, rows])
+        y = redundancy(part).nearest_to(previous[rows])
+        x[rows] = np.clip(y, c.lower[rows], c.upper[rows])
+    good, bad = residual(p, x), residual(p, rough)
+    return x if good.relative <= max(bad.relative, 2.0 * good.floor) else rough
+
+
+def _accepted(p: Problem, impulse: FloatArray, tol: float = ACCEPTED) -> FloatArray:
+    r = residual(p, impulse)
+    if r.relative > max(tol, 2.0 * r.floor):
+        raise SolveFailed(f"the representative impulse is not a solution to {tol:.0e}: {r}")
+    return impulse
