@@ -654,9 +654,22 @@ cdef inline void element_times(const elements_t* e, const double* w, const doubl
             out[j + r] = t
 
 
+cdef inline void element_times_transposed(const elements_t* e, const double* w, const double* x, double* out) noexcept nogil:
+    cdef int32_t i, j, r, c, nr
+    cdef double t
+    for i in range(e.n):
+        j = e.ptr[i]
+        nr = e.ptr[i + 1] - j
+        for r in range(nr):
+            t = 0.0
+            for c in range(nr):
+                t += w[e.wptr[i] + c * nr + r] * x[j + c]
+            out[j + r] = t
+
+
 cdef public void lav_element_product(const elements_t* e, const double* w, const double* h, double eps, double own,
-                                     double* out) noexcept nogil:
-    """out = W (H + eps) + I - own W, all (m, m) row-major, W one small matrix for each element."""
+                                     double one, double* out) noexcept nogil:
+    """out = W (H + eps) + one I - own W, all (m, m) row-major, W one small matrix for each element."""
     cdef int32_t i, j, k, r, c, nr, m = e.m
     cdef double x
     cdef double *y
@@ -676,7 +689,7 @@ cdef public void lav_element_product(const elements_t* e, const double* w, const
                 for k in range(m):
                     y[k] += x * a[k]
                 y[j + c] += x * (eps - own)
-            y[j + r] += 1.0
+            y[j + r] += one
 
 
 # -- interior point ---------------------------------------------------------------------------------
@@ -912,13 +925,15 @@ cdef public double lav_ipm_start(const elements_t* e, const double* hz, double* 
     return degree
 
 
-cdef inline void cone_inverse(const double* s, const double* u, int32_t n, double a, double delta, double* v) noexcept nogil:
-    # v (n, n) = G^-1 (T^-2 + delta)^-1 G^-T through the eigenvalues of T^2: eta^2 (w0 +- |w1|)^2 along
-    # (1, +-w1/|w1|), eta^2 across. Inverting T^-2 as a matrix would lose the small ones.
+cdef inline double cone_parts(const double* s, const double* u, int32_t n, double a, double delta, double* h,
+                              double* c, double* root) noexcept nogil:
+    # (T^-2 + delta)^-1 between G^-1 and G^-T as x [1 h][1 h]^T + [0 0; 0 c]: returns x, the normal's own entry.
+    # Through the eigenvalues of T^2, eta^2 (w0 +- |w1|)^2 along (1, +-w1/|w1|) and eta^2 across: as a matrix
+    # T^-2 would lose the small ones. c and its square root are (n - 1, n - 1).
     cdef double w[4]
-    cdef double h[4]
-    cdef double eta, size = 0.0, grow, shrink, across, x, gn = on_normal(a), gt = on_tangent(a)
-    cdef int32_t k, l
+    cdef double d[4]
+    cdef double eta, size = 0.0, grow, shrink, across, along, x, gn = on_normal(a), gt = on_tangent(a)
+    cdef int32_t k, l, nt = n - 1
     nt_scaling(s, u, n, w, &eta)
     for k in range(1, n):
         size += w[k] * w[k]
@@ -931,32 +946,38 @@ cdef inline void cone_inverse(const double* s, const double* u, int32_t n, doubl
     grow = grow / (1.0 + delta * grow)
     shrink = shrink / (1.0 + delta * shrink)
     across = across / (1.0 + delta * across)
-    h[0] = 1.0
-    for k in range(1, n):
-        h[k] = w[k] / size if size > 0.0 else (1.0 if k == 1 else 0.0)
-    for k in range(n):
-        for l in range(n):
-            if k == 0 and l == 0:
-                x = 0.5 * (grow + shrink)
-            elif k == 0 or l == 0:
-                x = 0.5 * (grow - shrink) * h[k] * h[l]
-            else:
-                x = (0.5 * (grow + shrink) - across) * h[k] * h[l]
-                if k == l:
-                    x += across
-            x = x / (gn if k == 0 else gt)
-            v[k * n + l] = x / (gn if l == 0 else gt)
+    along = 2.0 * shrink * (grow / (grow + shrink)) / (gt * gt)
+    across = across / (gt * gt)
+    for k in range(nt):
+        d[k] = w[1 + k] / size if size > 0.0 else (1.0 if k == 0 else 0.0)
+        h[k] = (grow - shrink) / (grow + shrink) * (gn / gt) * d[k]
+    for k in range(nt):
+        for l in range(nt):
+            x = 1.0 if k == l else 0.0
+            c[k * nt + l] = across * x + (along - across) * d[k] * d[l]
+            root[k * nt + l] = sqrt(across) * x + (sqrt(along) - sqrt(across)) * d[k] * d[l]
+    return 0.5 * (grow + shrink) / (gn * gn)
 
 
 cdef public void lav_ipm_scale(const elements_t* e, const double* z, const double* u1, const double* u2, double delta,
-                               double* v, double* gap) noexcept nogil:
-    """V = (W + theta + delta)^-1 of (3) for each element, and the gap G z . u."""
+                               double* v, double* bt, double* gap) noexcept nogil:
+    """V = (W + theta + delta)^-1 of (3) for each element, B^T with V = B B^T where theta = 0, and the gap G z . u.
+
+    bt may be NULL.
+    """
     cdef int32_t i, j, k, l, n, nr, q, t
-    cdef double x, y, total = 0.0
+    cdef double x, y, r, total = 0.0
     cdef double s[4]
     cdef double u[4]
+    cdef double h[4]
+    cdef double c[4]
+    cdef double root[4]
+    cdef double hs[1]
+    cdef double cs[1]
+    cdef double rs[1]
     cdef double a[16]
     cdef double b[16]
+    hs[0] = cs[0] = rs[0] = 0.0
     for i in range(e.n):
         j = e.ptr[i]
         nr = e.ptr[i + 1] - j
@@ -970,42 +991,48 @@ cdef public void lav_ipm_scale(const elements_t* e, const double* z, const doubl
                 x += u2[j] / (e.upper[j] - z[j])
                 total += u2[j] * (e.upper[j] - z[j])
             v[q] = 1.0 / x
+            if bt != NULL:
+                bt[q] = sqrt(v[q])
             continue
-        if e.kind[i] == CONTACT:
+        n = nr if e.kind[i] == CONTACT else nr - 1
+        x = 0.0
+        if n > 1:
             gather(e, i, 0, z, s)
             load_dual(e, i, 0, u1, u2, u)
-            for k in range(nr):
+            for k in range(n):
                 total += s[k] * u[k]
-            cone_inverse(s, u, nr, e.at[i], delta, v + q)
-        else:
-            # Two cones share the normal: V_nn is the parallel sum, each tangent part follows its normal.
+            x = cone_parts(s, u, n, e.at[i], delta, h, c, root)
+        if e.kind[i] == SPIN:
+            # Two cones share the normal: their parallel sum there, each of the others follows it.
             gather(e, i, 1, z, s)
             load_dual(e, i, 1, u1, u2, u)
             total += s[0] * u[0] + s[1] * u[1]
-            cone_inverse(s, u, 2, e.as_[i], delta, b)
-            n = nr - 1
-            if n > 1:
-                gather(e, i, 0, z, s)
-                load_dual(e, i, 0, u1, u2, u)
-                for k in range(n):
-                    total += s[k] * u[k]
-                cone_inverse(s, u, n, e.at[i], delta, a)
-                x = a[0] * (b[0] / (a[0] + b[0]))
-            else:
-                x = b[0]
-                a[0] = x
-            v[q] = x
+            y = cone_parts(s, u, 2, e.as_[i], delta, hs, cs, rs)
+            x = x * (y / (x + y)) if n > 1 else y
+        for k in range(nr * nr):
+            v[q + k] = 0.0
+        a[0] = 1.0
+        for k in range(1, n):
+            a[k] = h[k - 1]
+            for l in range(1, n):
+                v[q + k * nr + l] = c[(k - 1) * (n - 1) + l - 1]
+        if e.kind[i] == SPIN:
+            a[nr - 1] = hs[0]
+            v[q + nr * nr - 1] = cs[0]
+        for k in range(nr):
+            for l in range(nr):
+                v[q + k * nr + l] += x * a[k] * a[l]
+        if bt != NULL:
+            r = sqrt(x)
+            for k in range(nr * nr):
+                bt[q + k] = 0.0
+            for k in range(nr):
+                bt[q + k] = r * a[k]
             for k in range(1, n):
-                v[q + k] = a[k] / a[0] * x
-                v[q + k * nr] = v[q + k]
                 for l in range(1, n):
-                    v[q + k * nr + l] = a[k * n + l] - a[k] * (a[l] / a[0]) * (1.0 - x / a[0])
-            v[q + n] = b[1] / b[0] * x
-            v[q + n * nr] = v[q + n]
-            v[q + n * nr + n] = b[3] - b[1] * (b[1] / b[0]) * (1.0 - x / b[0])
-            for k in range(1, n):
-                v[q + k * nr + n] = a[k] / a[0] * x * (b[1] / b[0])
-                v[q + n * nr + k] = v[q + k * nr + n]
+                    bt[q + k * nr + l] = root[(k - 1) * (n - 1) + l - 1]
+            if e.kind[i] == SPIN:
+                bt[q + nr * nr - 1] = rs[0]
         y = 0.0
         for k in range(nr):
             y += e.theta[j + k]
@@ -1447,11 +1474,15 @@ cdef class Elements:
         """z, u inside their cones; returns the degree."""
         return lav_ipm_start(&self.e, &hz[0], &z[0], &u1[0], &u2[0])
 
-    def scale(self, const double[::1] z, const double[::1] u1, const double[::1] u2, double delta, double[::1] v):
-        """V = (W + theta + delta)^-1 into v; returns the gap."""
+    def scale(self, const double[::1] z, const double[::1] u1, const double[::1] u2, double delta, double[::1] v,
+              double[::1] bt=None):
+        """V = (W + theta + delta)^-1 into v, B^T with V = B B^T (theta = 0) into bt; returns the gap."""
         cdef double gap
+        cdef double* x = NULL
+        if bt is not None:
+            x = &bt[0]
         with nogil:
-            lav_ipm_scale(&self.e, &z[0], &u1[0], &u2[0], delta, &v[0], &gap)
+            lav_ipm_scale(&self.e, &z[0], &u1[0], &u2[0], delta, &v[0], x, &gap)
         return gap
 
     def affine(self, const double[::1] z, const double[::1] u1, const double[::1] u2, const double[::1] dz):
@@ -1487,17 +1518,23 @@ cdef class Elements:
             size = lav_natural(&self.e, &z[0], &s[0], law, eps, &f[0], &p[0], x, y)
         return size
 
+    def times_transposed(self, const double[::1] w, const double[::1] x, double[::1] out):
+        """out = W^T x."""
+        with nogil:
+            element_times_transposed(&self.e, &w[0], &x[0], &out[0])
+
     def times(self, const double[::1] w, const double[::1] x, double[::1] out):
         """out = W x, one small matrix for each element."""
         with nogil:
             element_times(&self.e, &w[0], &x[0], &out[0])
 
 
-def element_product(Elements e, const double[::1] w, const double[:, ::1] h, double eps, double own, double[:, ::1] out):
-    """out = W (H + eps) + I - own W."""
+def element_product(Elements e, const double[::1] w, const double[:, ::1] h, double eps, double own, double one,
+                    double[:, ::1] out):
+    """out = W (H + eps) + one I - own W."""
     if e.m:
         with nogil:
-            lav_element_product(&e.e, &w[0], &h[0, 0], eps, own, &out[0, 0])
+            lav_element_product(&e.e, &w[0], &h[0, 0], eps, own, one, &out[0, 0])
 
 
 def panel(Data p, const double[:, :, ::1] inv_inertia, const double[::1] root_mass, double[:, ::1] out):

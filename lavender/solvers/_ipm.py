@@ -155,6 +155,7 @@ class System:
         m = sc.m
         self.v = np.zeros(int(sc.wptr[-1]))
         self.einv = np.zeros_like(self.v)
+        self.bt: FloatArray | None = None  # B^T with V = B B^T, where the form needs it
         self.p = np.zeros_like(self.v)
         self.t, self.q = np.zeros(m), np.zeros(m)
 
@@ -289,6 +290,8 @@ class MatrixSystem(System):
         self.dense = m <= DENSE_ROWS or (a.nnz > DENSE_FILL * m * m and m <= DENSE_LIMIT)
         h = sp.diags_array(sc.scale) @ a @ sp.diags_array(sc.scale)
         self.h: Any = np.ascontiguousarray(h.toarray()) if self.dense else sp.csr_array(h)
+        if len(sc.kind) < m:
+            self.bt = np.zeros_like(self.v)
         # theta is on the diagonal of A already.
         sc.theta = np.zeros(m)
         self.symmetric = sc.problem.is_symmetric
@@ -309,14 +312,17 @@ class MatrixSystem(System):
     def times(self, z: FloatArray) -> FloatArray:
         return self.h @ z
 
-    def _dense_lu(self, w: FloatArray, eps: float, own: float) -> bool:
+    def _dense_lu(self, transposed: FloatArray) -> bool:
         # Row-major for the kernel is the transpose for LAPACK.
-        matrix = np.empty_like(self.h)
-        kernels.element_product(self.elements, w, self.h, eps, own, matrix)
         self.factorisations += 1
-        lu, pivot, info = getrf(matrix.T, overwrite_a=True)
+        lu, pivot, info = getrf(transposed.T, overwrite_a=True)
         self.solver = lambda r: getrs(lu, pivot, r, trans=1)[0]
         return info == 0
+
+    def _product(self, w: FloatArray, h: FloatArray, eps: float, own: float, one: float) -> FloatArray:
+        out = np.empty_like(self.h)
+        kernels.element_product(self.elements, w, h, eps, own, one, out)
+        return out
 
     def _sparse_lu(self, matrix: Any) -> bool:
         self.factorisations += 1
@@ -329,34 +335,47 @@ class MatrixSystem(System):
         return True
 
     def factor_barrier(self) -> bool:
-        # H + V^-1, or I + V H where V is not diagonal: its inverse would lose the small eigenvalues.
-        diagonal = len(self.sc.kind) == self.sc.m
-        self.premultiply = self.dense or not diagonal
-        if not self.dense:
-            if diagonal:
-                return self._sparse_lu(self.h + sp.diags_array(1.0 / self.v))
-            return self._sparse_lu(self.small(self.v) @ self.h + sp.eye_array(self.sc.m))
-        if diagonal and self.symmetric:
+        # H + V^-1, or with cones I + B^T H B and dz = B (...): V^-1 would lose the small eigenvalues of V.
+        if self.bt is None:
+            w = 1.0 / self.v
+            if not self.dense:
+                return self._sparse_lu(self.h + sp.diags_array(w))
             matrix = self.h.copy()
-            matrix.flat[:: len(matrix) + 1] += 1.0 / self.v
-            c, info = potrf(matrix.T, lower=1, clean=0, overwrite_a=True)
-            if info == 0:
-                self.factorisations += 1
-                self.premultiply = False
-                self.solver = lambda r: potrs(c, r, lower=1)[0]
+            matrix.flat[:: len(matrix) + 1] += w
+            if self.symmetric and self._cholesky(matrix):
                 return True
-        return self._dense_lu(self.v, 0.0, 0.0)
+            if self.symmetric:
+                matrix = self.h.copy()
+                matrix.flat[:: len(matrix) + 1] += w
+            return self._dense_lu(matrix)
+        if not self.dense:
+            bt = self.small(self.bt)
+            return self._sparse_lu(bt @ self.h @ bt.T + sp.eye_array(self.sc.m))
+        left = np.ascontiguousarray(self._product(self.bt, self.h, 0.0, 0.0, 0.0).T)
+        matrix = self._product(self.bt, left, 0.0, 0.0, 1.0)
+        if self.symmetric and self._cholesky(matrix.copy()):
+            return True
+        return self._dense_lu(np.ascontiguousarray(matrix.T))
+
+    def _cholesky(self, matrix: FloatArray) -> bool:
+        c, info = potrf(matrix.T, lower=1, clean=0, overwrite_a=True)
+        if info != 0:
+            return False
+        self.factorisations += 1
+        self.solver = lambda r: potrs(c, r, lower=1)[0]
+        return True
 
     def solve_barrier(self, r: FloatArray) -> FloatArray:
-        if self.premultiply:
-            t = np.empty_like(r)
-            self.elements.times(self.v, r, t)
-            r = t
-        return self.solver(r)
+        if self.bt is None:
+            return self.solver(r)
+        t, out = np.empty_like(r), np.empty_like(r)
+        self.elements.times(self.bt, r, t)
+        self.elements.times_transposed(self.bt, self.solver(t), out)
+        return out
 
     def factor_natural(self, eps: float) -> bool:
         if self.dense:
-            return self._dense_lu(self.p, eps, 1.0)
+            return self._dense_lu(self._product(self.p, self.h, eps, 1.0, 1.0))
         p = self.small(self.p)
         return self._sparse_lu(p @ self.h + (eps - 1.0) * p + sp.eye_array(self.sc.m))
 
@@ -417,6 +436,7 @@ class InteriorPoint:
     z: FloatArray = field(init=False)
     everything: FloatArray = field(init=False)
     gap: float = field(init=False, default=np.inf)  # G z . u / degree
+    lowest_gap: float = field(init=False, default=np.inf)  # before this step
     first_gap: float = field(init=False, default=0.0)
     length: float = field(init=False, default=1.0)
 
@@ -428,6 +448,8 @@ class InteriorPoint:
         diagonal = np.repeat(sc.wptr[:-1], size) + (np.arange(m) - np.repeat(sc.ptr[:-1], size)) * (np.repeat(size, size) + 1)
         sy.v[:] = 0.0
         sy.v[diagonal] = 1.0 / (sc.theta + np.where(np.repeat(free, size), DELTA, START))
+        if sy.bt is not None:
+            sy.bt[:] = np.sqrt(sy.v)
         self.u1, self.u2 = np.zeros(m), np.zeros(m)
         self.t1, self.t2, self.r = np.zeros(m), np.zeros(m), np.zeros(m)
         sy.factor_barrier()
@@ -440,7 +462,7 @@ class InteriorPoint:
         sy, sc, e = self.system, self.system.sc, self.system.elements
         z, u1, u2 = self.z, self.u1, self.u2
         hz = sy.times(z)
-        gap = e.scale(z, u1, u2, DELTA, sy.v)
+        gap = e.scale(z, u1, u2, DELTA, sy.v, sy.bt)
         if not sy.factor_barrier() and not np.isfinite(gap):
             return False
         da = sy.solve_barrier(sc.g - hz)
@@ -455,6 +477,7 @@ class InteriorPoint:
         if not np.isfinite(dz).all():
             return False
         self.length = e.step(z, u1, u2, dz, da, sigma * mu, 0.995, self.t1, self.t2)
+        self.lowest_gap = min(self.lowest_gap, self.gap)
         self.gap = mu
         self.first_gap = max(self.first_gap, mu)
         return self.length > 0.0

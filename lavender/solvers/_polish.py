@@ -20,6 +20,7 @@ from lavender.solvers._ipm import AUGMENTED, CONVEX, InteriorPoint, System
 EPS = 1e-9  # proximal weight of the polish, relative to d; refinement takes it away again
 INNER_STEPS = 20  # Newton steps of one proximal round at most
 INNER_TOL = 0.1  # |F_c| at which a round ends, relative to its start
+IPM_PATIENCE = 15  # interior point steps that halve neither residual nor gap
 MEMORY = 6  # steps that the non-monotone line search looks back
 PROBE = 1e-7  # proximal weight below which a round is as good as a plain Newton step
 ALPHA_LOW = 1e-12  # proximal weight below which a factorisation sees none
@@ -237,10 +238,15 @@ def solve_convex(run: Run, z: FloatArray, cold: bool) -> None:
     if rows:
         polish(run, ip.everything, patience=1, limit=3)
     trigger = 1e-2
+    lowest, idle = np.inf, 0
     while not run.done:
         if not ip.step():
             break
         relative = run.score(ip.z)
+        idle = 0 if relative < 0.5 * lowest or ip.gap < 0.5 * ip.lowest_gap else idle + 1
+        lowest = min(lowest, relative)
+        if idle > IPM_PATIENCE:
+            break
         if relative < trigger:
             trigger = 0.1 * relative
             if rows:
