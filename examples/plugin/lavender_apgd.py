@@ -1,0 +1,81 @@
+"""Accelerated projected gradient descent with restart, in the metric of d = diag(A).
+
+    y <- l + beta (l - l_before),    l <- clip(y - s (A y - b) / d, lower, upper)
+
+s = 1 / max_i sum_j |A_ij| / d_i bounds 1 over the largest eigenvalue of D^-1 A. A step uphill restarts beta.
+"""
+
+from dataclasses import dataclass
+from math import sqrt
+
+import numpy as np
+
+import lavender as lv
+
+CHECK_EVERY = 10  # iterations between two looks at the residual, counted from the start of the state
+
+
+@dataclass
+class State:
+    """What one run carries from call to call, so that n1 and then n2 iterations are n1 + n2."""
+
+    problem: lv.Problem
+    A: object  # (m, m) CSR, 1/kg
+    step: np.ndarray  # (m,) kg, s / d
+    before: np.ndarray | None = None  # (m,) N s, the iterate before the last
+    theta: float = 1.0
+    done: int = 0
+
+
+@dataclass(frozen=True)
+class APGD:
+    """Options live here; everything that changes lives in the state."""
+
+    restart: bool = True
+
+    def prepare(self, problem):
+        """Everything that does not depend on the iterate."""
+        A, d = problem.csr, problem.d
+        largest = float((abs(A).sum(axis=1) / d).max(initial=0.0))
+        return State(problem, A, 1.0 / (max(largest, 1.0) * d))
+
+    def update(self, state, problem):
+        """The same structure with new numbers: nothing worth keeping here."""
+        return self.prepare(problem)
+
+    def run(self, state, impulse, n, tol, time_limit=None):
+        """n more iterations on `impulse` in place, fewer only where its own test stops it."""
+        problem, cones = state.problem, state.problem.cones
+        before = impulse.copy() if state.before is None else state.before
+        for i in range(n):
+            if tol > 0.0 and state.done % CHECK_EVERY == 0 and lv.residual(problem, impulse).relative <= tol:
+                state.before = before
+                return lv.Claim(lv.Status.CONVERGED, i, {"matvecs": i})
+            theta, now = state.theta, impulse.copy()
+            after = 0.5 * theta * (sqrt(theta * theta + 4.0) - theta)
+            y = now + theta * (1.0 - theta) / (theta * theta + after) * (now - before)
+            impulse[:] = np.clip(y - state.step * (state.A @ y - problem.b), cones.lower, cones.upper)
+            uphill = (y - impulse) @ ((impulse - now) / state.step) > 0.0
+            state.theta = 1.0 if self.restart and uphill else after
+            before = now
+            state.done += 1
+        state.before = before
+        return lv.Claim(lv.Status.MAX_ITERATIONS, n, {"matvecs": n})
+
+
+def refusal(problem):
+    """The step is safe for symmetric A only."""
+    return None if problem.is_symmetric else "needs a symmetric A; use pgs"
+
+
+SPEC = lv.SolverSpec(
+    name="apgd",
+    factory=APGD,
+    laws=frozenset({"linear", "lcp"}),
+    operator="matrix",
+    max_iter=2000,
+    options={"restart": "start beta anew after a step uphill; default True"},
+    refusal=refusal,
+    summary="accelerated projected gradient descent with restart",
+    reference="Nesterov 1983; O'Donoghue, Candes 2015; Mazhar, Heyn, Negrut, Tasora 2015 for contacts",
+)

@@ -1,0 +1,103 @@
+"""The plug-in of examples/plugin, installed as a user would: found by name, kept to the contract of all solvers."""
+
+import importlib.util
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+FOLDER = ROOT / "examples" / "plugin"
+
+if importlib.util.find_spec("pip") is None:
+    pytest.skip("pip is not installed: plug-ins are installed with it", allow_module_level=True)
+
+SOLVES = """
+import numpy as np
+import lavender as lv
+from lavender import suite
+
+assert "apgd" in lv.available(law="lcp"), lv.known()
+for name in ("stack(n=6)", "granular(n=3)", "random_spd(n=30, condition=100)"):
+    problem = suite.case(name).problem
+    found = lv.solve(problem, "apgd", tol=1e-9, max_iter=20_000)
+    assert found.success and found.work["matvecs"] > 0, found
+    exact = lv.solve(problem, "direct", tol=1e-9)
+    # Slack is unique; both are within 1e-9 of the largest right-hand side, times the conditioning (below 1e3).
+    np.testing.assert_allclose(found.slack, exact.slack, rtol=0.0, atol=1e-6 * abs(problem.b).max())
+assert "symmetric" in lv.known(lv.Problem.lcp([[2.0, 1.0], [0.0, 2.0]], [1.0, 1.0]))["apgd"]
+"""
+
+
+@pytest.fixture(scope="module")
+def environment(tmp_path_factory):
+    """Variables of a process that finds the plug-in beside lavender."""
+    folder = tmp_path_factory.mktemp("plugin")
+    shutil.copytree(FOLDER, folder / "source", ignore=shutil.ignore_patterns("build", "*.egg-info"))
+    installed = folder / "installed"
+    command = [
+        sys.executable,
+        "-m",
+        "pip",
+        "install",
+        "--quiet",
+        "--no-index",
+        "--no-build-isolation",
+        "--no-deps",
+    ]
+    run([*command, "--target", str(installed), str(folder / "source")], os.environ)
+    paths = [str(installed), str(ROOT), os.environ.get("PYTHONPATH", "")]
+    return {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, paths))}
+
+
+def run(command, environment):
+    done = subprocess.run(
+        command, env=dict(environment), capture_output=True, text=True, check=False, cwd=ROOT
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+def test_is_found_by_name_and_solves(environment):
+    run([sys.executable, "-c", SOLVES], environment)
+
+
+def test_the_command_line_lists_it(environment):
+    assert "apgd" in run([sys.executable, "-m", "lavender.cli", "solvers"], environment)
+
+
+def test_keeps_the_contract_of_every_solver(environment):
+    command = [
+        sys.executable,
+        "-m",
+        "pytest",
+        "-q",
+        "-p",
+        "no:cacheprovider",
+        "tests/test_contract.py",
+        "-k",
+        "apgd",
+    ]
+    report = run(command, environment)
+    # Each general property of a resumable solver that takes a start; the spec declares no order, seed or threads.
+    assert "passed" in report
+    assert int(report.split(" passed")[0].split()[-1]) >= 15
+
+
+def test_a_broken_plug_in_warns_by_name_and_harms_nobody(environment, tmp_path):
+    info = tmp_path / "broken-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: broken\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text("[lavender.solvers]\nnonsense = no_such_module:SPEC\n")
+    path = os.pathsep.join([str(tmp_path), environment["PYTHONPATH"]])
+    code = (
+        "import warnings, lavender as lv\n"
+        "with warnings.catch_warnings(record=True) as caught:\n"
+        "    warnings.simplefilter('always')\n"
+        "    assert 'pgs' in lv.available()\n"
+        "assert ['nonsense' in str(w.message) for w in caught] == [True], caught\n"
+    )
+    run([sys.executable, "-c", code], {**environment, "PYTHONPATH": path})
