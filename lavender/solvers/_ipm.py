@@ -234,7 +234,8 @@ class VelocitySystem(System):
         self.s, self.n = s, rows.n_bodies
         self.elements = self._elements(node, slot, halves, s)
         self.structure = (nptr, nind, *kernels.symbolic(nptr, nind))
-        self.y = np.zeros(self.n * s + 1)
+        self.y, self.y2 = np.zeros((2, self.n * s + 1))
+        self.cones = len(sc.kind) < sc.m
         self.factor: Any = None
 
     def _factor(self, lu: bool) -> bool:
@@ -261,6 +262,11 @@ class VelocitySystem(System):
         self.factor.solve(self.elements, t, self.y, q)
         out = np.empty_like(r)
         self.elements.times(self.v, r - q, out)
+        if self.cones:
+            # dy = K^T dz again after rounding: near the boundary of a cone V spans ten decades and more.
+            self.factor.refine(self.elements, out, self.y, self.y2, q)
+            self.elements.times(self.v, q, t)
+            out -= t
         return out
 
     def factor_natural(self, eps: float) -> bool:

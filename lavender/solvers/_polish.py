@@ -14,7 +14,7 @@ from time import perf_counter
 import numpy as np
 
 from lavender._arrays import FloatArray
-from lavender.residuals import quick
+from lavender.residuals import check_certificate, quick
 from lavender.solvers._ipm import AUGMENTED, CONVEX, InteriorPoint, System
 
 EPS = 1e-9  # proximal weight of the polish, relative to d; refinement takes it away again
@@ -22,6 +22,7 @@ INNER_STEPS = 20  # Newton steps of one proximal round at most
 INNER_TOL = 0.1  # |F_c| at which a round ends, relative to its start
 IPM_PATIENCE = 15  # interior point steps that halve neither residual nor gap
 MEMORY = 6  # steps that the non-monotone line search looks back
+CERTIFY = 1e-8  # relative residual below which there is a solution
 PROBE = 1e-7  # proximal weight below which a round is as good as a plain Newton step
 ALPHA_LOW = 1e-12  # proximal weight below which a factorisation sees none
 
@@ -38,6 +39,7 @@ class Run:
     best_z: FloatArray = field(init=False)
     floor: float = 0.0
     log: list[str] = field(default_factory=list)
+    certificate: FloatArray | None = None  # (m,) N s: no solution exists
 
     def __post_init__(self) -> None:
         m = self.system.sc.problem.m
@@ -70,7 +72,20 @@ class Run:
 
     @property
     def done(self) -> bool:
-        return self.reached or self.spent
+        return self.reached or self.certificate is not None or self.spent
+
+    def certify(self, y: FloatArray) -> None:
+        """Keep the direction y (scaled) if it proves that there is no solution."""
+        sc = self.system.sc
+        largest = float(np.abs(y).max(initial=0.0))
+        if not 0.0 < largest < np.inf:
+            return
+        # Rounding leaves rows that do not take part slightly on the wrong side of their bounds.
+        y = np.where(np.abs(y) > 1e-11 * largest, y / largest, 0.0)
+        whole = np.zeros(sc.problem.m)
+        whole[sc.keep] = y * sc.scale
+        if check_certificate(sc.problem, whole) is None:
+            self.certificate = whole
 
 
 @dataclass
@@ -92,6 +107,9 @@ class EnergyRun(Run):
 
     def at_floor(self) -> bool:
         return self.best <= 1e-14
+
+    def certify(self, y: FloatArray) -> None:
+        """Of the relaxation there may be a proof, of Coulomb's problem it says nothing."""
 
 
 def refined(system: System, rhs: FloatArray, rounds: int = 8) -> FloatArray:
@@ -165,8 +183,13 @@ class Proximal:
                 self.probed = 0.1 * run.best
                 if run.done:
                     break
-            before, start = run.best, system.factorisations
+            before, start, centre = run.best, system.factorisations, self.z
             solved = self._round(run)
+            if self.law == CONVEX and solved and run.best > 0.5 * before and run.best > CERTIFY:
+                # Without a solution the rounds walk off along a direction that H does not see.
+                run.certify(self.z - centre)
+                if run.certificate is not None:
+                    break
             used = system.factorisations - start
             run.log.append(f"{self.alpha:.0e}:{used}{'' if solved else '!'}:{run.best:.0e}")
             if run.best > 0.5 * before and run.at_floor():

@@ -90,7 +90,9 @@ class Newton:
             else:
                 solve_convex(run, z, cold)
         impulse[:] = system.sc.impulse(run.best_z)
-        if run.reached:
+        if run.certificate is not None:
+            status = Status.INFEASIBLE
+        elif run.reached:
             status = Status.CONVERGED
         elif run.at_floor():
             status = Status.FLOOR
@@ -101,7 +103,7 @@ class Newton:
         else:
             status = Status.STALLED
         work = {"factorisations": system.factorisations}
-        return Claim(status, system.factorisations, work, " ".join(run.log), form=system.form)
+        return Claim(status, system.factorisations, work, " ".join(run.log), form=system.form, certificate=run.certificate)
 
 
 SPEC = SolverSpec(
