@@ -76,7 +76,7 @@ cdef inline void view(const engine_t* e, blocks_t* p, rows_t* r) noexcept nogil:
     r.compliance = e.compliance
 
 
-cdef inline int32_t prepare(engine_t* e) noexcept nogil:
+cdef int32_t prepare(engine_t* e) noexcept nogil:
     cdef blocks_t p
     cdef rows_t r
     cdef int32_t pairs, contacts
@@ -165,20 +165,11 @@ cdef inline void note_sweep(const engine_t* e, const blocks_t* p, const rows_t* 
     out[1] = s.energy
 
 
-cdef inline void sweep_all(engine_t* e, const blocks_t* p, const rows_t* r, double* curve,
-                           double* scratch) noexcept nogil:
+cdef void sweep_all(engine_t* e, const blocks_t* p, const rows_t* r, double* curve,
+                    double* scratch) noexcept nogil:
     """The budgeted sweeps: joints, then contacts; curve (sweeps + 1, 2) or NULL."""
     cdef int32_t s, i, kj = r.n_joints, k = p.n_blocks, mode
     cdef uint64_t rng
-    if e.head[H_ORDER] == AS_GIVEN:
-        for s in range(e.head[H_ITERATIONS]):
-            for i in range(kj):
-                relax_joint(p, r, i, e.impulse, e.dv)
-            for i in range(kj, k):
-                relax_contact_block(p, r, i, e.impulse, e.dv)
-            if curve != NULL:
-                note_sweep(e, p, r, curve + 2 * (s + 1), scratch)
-        return
     order_blocks(e)
     mode = SYMMETRIC if e.head[H_ORDER] == SYMMETRICALLY else (RANDOM if e.head[H_ORDER] == AT_RANDOM else 0)
     # every substep has its own stream, a function of seed and substep alone
@@ -208,7 +199,7 @@ cdef inline void solve(engine_t* e, int32_t sweeps, double* curve, double* scrat
         measure(e, out + 5, out + 7)
 
 
-cdef inline int32_t finish(engine_t* e) noexcept nogil:
+cdef int32_t finish(engine_t* e) noexcept nogil:
     cdef int32_t i, shifted
     cdef double* out = e.setting + S_OUT
     out[0] = e.head[H_ITERATIONS]

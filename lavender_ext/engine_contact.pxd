@@ -125,8 +125,8 @@ cdef inline double normal_velocity(const engine_t* e, int32_t a, int32_t b, int3
 
 
 cdef inline void make_contact(engine_t* e, const rows_t* r, int32_t c, int32_t row, int32_t a, int32_t b,
-                              const manifold_t* m, int32_t at, int32_t nt, int32_t spin,
-                              double bounce) noexcept nogil:
+                              const manifold_t* m, int32_t at, const double* tangent, int32_t nt,
+                              int32_t spin, double bounce) noexcept nogil:
     """Row data of contact c, rows row .. row + nt + spin, of point `at` of the manifold."""
     cdef double h = e.setting[S_H], vn, t12, gap = m.gap[at], target
     cdef double w[4]
@@ -155,10 +155,19 @@ cdef inline void make_contact(engine_t* e, const rows_t* r, int32_t c, int32_t r
         for k in range(3):
             e.local[6 * c + 3 + k] = e.arm_b[3 * c + k]
     if nt > 0:
-        tangent_of(e.normal + 3 * c, e.tangent + 3 * c)
-    contact_diagonal(e.normal + 3 * c, e.tangent + 3 * c, e.arm_a + 3 * c, e.arm_b + 3 * c, nt, spin, da, db,
-                     e.inv_mass, e.inv_inertia, d, &t12, e.coupling + 5 * c,
-                     e.swing + 6 * (row - e.size[N_JOINT_ROW]))
+        for k in range(3):
+            e.tangent[3 * c + k] = tangent[k]
+    # the common kind with its size as constants, so that a compiler unrolls it
+    if nt == 2 and not spin:
+        contact_diagonal(e.normal + 3 * c, e.tangent + 3 * c, e.arm_a + 3 * c, e.arm_b + 3 * c, 2, 0, da, db,
+                         e.inv_mass, e.inv_inertia, d, &t12, e.coupling + 5 * c,
+                         e.swing + 6 * (row - e.size[N_JOINT_ROW]))
+        contact_slack(r, c, 2, 0, e.v_free, w)
+    else:
+        contact_diagonal(e.normal + 3 * c, e.tangent + 3 * c, e.arm_a + 3 * c, e.arm_b + 3 * c, nt, spin, da, db,
+                         e.inv_mass, e.inv_inertia, d, &t12, e.coupling + 5 * c,
+                         e.swing + 6 * (row - e.size[N_JOINT_ROW]))
+        contact_slack(r, c, nt, spin, e.v_free, w)
     for k in range(1 + nt + spin):
         d[k] += e.compliance[row + k]
     e.step[row] = reciprocal(d[0])
@@ -169,7 +178,6 @@ cdef inline void make_contact(engine_t* e, const rows_t* r, int32_t c, int32_t r
         d[2] = d[1]
     if spin:
         e.step[row + 1 + nt] = reciprocal(d[1 + nt])
-    contact_slack(r, c, nt, spin, e.v_free, w)
     target = -gap / h if gap > 0.0 else 0.0             # (1)
     if bounce > 0.0 and gap + h * w[0] <= 0.0:          # (2)
         vn = normal_velocity(e, a, b, c)
@@ -185,6 +193,7 @@ cdef inline void make_contact(engine_t* e, const rows_t* r, int32_t c, int32_t r
 cdef inline int32_t make_contacts(engine_t* e, const rows_t* r) noexcept nogil:
     """All contacts of the pair list, with guesses from the cache; returns how many there are."""
     cdef manifold_t m
+    cdef double tangent[3]
     cdef int32_t entry[4]
     cdef int32_t i, j, k, a, b, nt, spin, start, c = 0, row = e.size[N_JOINT_ROW], block, first = 0
     cdef int32_t matches = 0
@@ -205,12 +214,14 @@ cdef inline int32_t make_contacts(engine_t* e, const rows_t* r) noexcept nogil:
         patch = e.patch[a] if e.patch[a] < e.patch[b] else e.patch[b]
         nt = 2 if mu > 0.0 else 0
         spin = 1 if mu > 0.0 and patch > 0.0 else 0
+        if nt > 0:
+            tangent_of(m.normal, tangent)
         pair = contact_key(a, b, 0)
         while first < e.head[H_CACHED] and e.cache_key[first] < pair:
             first += 1
         start = c
         for j in range(m.n):
-            make_contact(e, r, c, row, a, b, &m, j, nt, spin, bounce)
+            make_contact(e, r, c, row, a, b, &m, j, tangent, nt, spin, bounce)
             block = e.size[N_JOINT] + c
             e.kind[block] = CONTACT_SPIN if spin else CONTACT
             e.mu[block] = mu
