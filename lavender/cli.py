@@ -12,6 +12,7 @@ import click
 
 from lavender._version import __version__
 from lavender.errors import InputError, LavenderError
+from lavender.web.command import web
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -210,6 +211,16 @@ def _plan(
     show_default=True,
     help="Folder of the report.",
 )
+@click.option(
+    "--sequence",
+    is_flag=True,
+    help="Each FOLDER holds the steps of a simulation: carry impulses from step to step.",
+)
+@click.option(
+    "--compare",
+    type=click.Path(path_type=Path),
+    help="Earlier records (.jsonl, or their folder) to compare with.",
+)
 @click.option("--no-figures", is_flag=True, help="Leave out the SVG and PNG files.")
 def report(
     files: tuple[str, ...],
@@ -222,6 +233,8 @@ def report(
     memory: float | None,
     in_process: bool,
     out: Path,
+    sequence: bool,
+    compare: Path | None,
     no_figures: bool,
 ) -> None:
     """Speed against error: every solver on every case, to each level and at each budget.
@@ -235,6 +248,7 @@ def report(
     from lavender.report.write import write
 
     console = _console()
+    old = None if compare is None else bench.read(compare)
     shown = [Path(f) for f in files if f.endswith(".jsonl")]
     if shown:
         if len(files) > 1:
@@ -242,9 +256,9 @@ def report(
         records, stopped = bench.read(shown[0]), False
     else:
         plan = _plan(files, levels, budgets, orders, repeats, time_limit)
-        records, stopped = _measure(files, solvers, plan, out / "records.jsonl", memory, in_process)
-    print_report(records, console)
-    index = write(records, out, figures=not no_figures)
+        records, stopped = _measure(files, solvers, plan, out / "records.jsonl", memory, in_process, sequence)
+    print_report(records, console, old=old)
+    index = write(records, out, figures=not no_figures, old=old)
     console.print(f"\n{len(records)} runs in {out / 'records.csv'}, page: [bold]{index}[/]", highlight=False)
     if stopped:
         console.print("[yellow]Stopped; the same command goes on from here.[/]")
@@ -288,6 +302,7 @@ def _measure(
     path: Path,
     memory: float | None,
     in_process: bool,
+    sequence: bool = False,
 ) -> tuple[Records, bool]:
     """Run with a progress bar; (records, was it stopped by Ctrl-C)."""
     from lavender import bench
@@ -295,7 +310,13 @@ def _measure(
     _one_thread()
     bench.solver_names(solvers)  # before anything is loaded: names first
     with bench.Store(path) as store:
-        items = bench.resolve(files)
+        items = (
+            [step for folder in files for step in bench.steps_in(folder)]
+            if sequence
+            else bench.resolve(files)
+        )
+        if sequence and not items:
+            raise InputError("--sequence needs a folder of problem files, one for each step")
         found: list[Records] = []
         with _progress() as watch:
             try:
@@ -441,6 +462,49 @@ def _check_writable(path: Path) -> None:
 
 
 @cli.command()
+@click.argument("scene")
+@click.option("--steps", type=int, default=120, show_default=True, help="Steps to run.")
+@click.option("--iterations", type=int, default=None, help="Sweeps of the velocity solve, 4 to 64.")
+@click.option("--cold", is_flag=True, help="Do not carry impulses from step to step.")
+@click.option(
+    "--record",
+    type=click.Path(path_type=Path),
+    default=None,
+    help="Folder for the problem of every step, .npz.",
+)
+@click.option(
+    "--skip", type=int, default=0, show_default=True, help="Steps before the first that is recorded."
+)
+def run(scene: str, steps: int, iterations: int | None, cold: bool, record: Path | None, skip: int) -> None:
+    """Run a LavenderSim scene of the gallery; record its steps as a sequence for `report --sequence`."""
+    from lavender import io
+    from lavender.engine import SOLVER_FIELDS, Simulation
+
+    simulation = Simulation(scene)
+    if iterations is not None:
+        simulation.set_solver_iterations(iterations)
+    simulation.set_warm_start(not cold)
+    if record is not None:
+        try:
+            record.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise _unwritable(record, error) from None
+    observation: dict[str, Any] = {}
+    saved = 0
+    for step in range(steps):
+        if record is not None and step >= skip:
+            io.save(simulation.constraint_problem(), record / f"step_{step:05d}.npz")
+            saved += 1
+        observation = simulation.step()[0]
+    click.echo(f"{scene}: {steps} steps, {simulation.time:.3f} s simulated")
+    if observation:
+        for name, value in zip(SOLVER_FIELDS, observation["solver"], strict=True):
+            click.echo(f"  {name:<18} {value:.6g}")
+    if record is not None:
+        click.echo(f"{saved} problems in {record}: lavender report --sequence {record}")
+
+
+@cli.command()
 @click.option("--problem", default=None, help="Say for this problem (file or suite case) who takes it.")
 def solvers(problem: str | None) -> None:
     """What is installed, or why not, and what each solver can do."""
@@ -515,6 +579,9 @@ def check(files: tuple[str, ...], solvers: tuple[str, ...] | None, reference: st
     if contradicted:
         console.print(f"[bold red]{contradicted} claims are contradicted[/]")
         raise click.exceptions.Exit(EXIT_CONTRADICTED)
+
+
+cli.add_command(web)
 
 
 def main(args: Sequence[str] | None = None) -> None:

@@ -477,3 +477,70 @@ def test_a_whole_run_survives_its_backends(plugin, monkeypatch):
     assert [r.status.split()[0] for r in records] == ["KILLED", "CRASHED", "CONVERGED", "CONVERGED"]
     assert records.records[3].contradicted  # its diagonal step does not solve a stack, and it says so
     assert time.monotonic() - started < 60.0  # hangs are cut off
+
+
+# -- sequences ------------------------------------------------------------------------------------
+
+
+def moving_stack(steps, n=10):
+    """A stack whose load changes slowly, as in consecutive steps."""
+    p = stack(n)
+    return [lv.Problem.lcp(p.matrix, p.b * (1.0 + 1e-3 * i), name=f"step {i}") for i in range(steps)]
+
+
+def test_impulses_travel_by_key():
+    a = np.diag([1.0, 2.0, 3.0, 4.0])
+    before = lv.Problem.contact(a, np.ones(4), np.full(2, 0.5), key=np.array([7, 9], np.uint64))
+    after = lv.Problem.contact(np.eye(6), np.ones(6), np.full(3, 0.5), key=np.array([9, 8, 7], np.uint64))
+    out = bench.carry(before, np.array([1.0, 2.0, 3.0, 4.0]), after)
+    np.testing.assert_array_equal(out, [3.0, 4.0, 0.0, 0.0, 1.0, 2.0])
+    # A contact that gained a row starts anew; without keys, the same blocks keep their places.
+    grown = lv.Problem.contact(np.eye(3), np.ones(3), np.full(1, 0.5), key=np.array([7], np.uint64))
+    np.testing.assert_array_equal(bench.carry(before, np.ones(4), grown), np.zeros(3))
+    np.testing.assert_array_equal(bench.carry(stack(3), np.ones(3), stack(3)), np.ones(3))
+    np.testing.assert_array_equal(bench.carry(stack(3), np.ones(3), stack(4)), np.zeros(4))
+
+
+def test_a_sequence_carries_each_solvers_own_impulses():
+    problems = moving_stack(5)
+    plan = bench.Plan(levels=(1e-6,), budgets=(6,), repeats=1)
+    records = bench.run(bench.sequence(problems, "load"), ["pgs"], plan)
+    impulse = problems[0].start()
+    by = {(r.start, r.mode, r.step): r for r in records}
+    for i, p in enumerate(problems):
+        carried = lv.solve(p, "pgs", impulse=impulse, tol=0.0, max_iter=6)
+        impulse = carried.impulse
+        assert by["carried", "budget", i].relative == carried.residual.relative
+        cold = lv.solve(p, "pgs", impulse=p.start(), tol=0.0, max_iter=6)
+        assert by["cold", "budget", i].relative == cold.residual.relative
+    assert len(records) == 5 * 4
+    # The load changes by a thousandth: from the second step on carrying is far ahead.
+    assert by["carried", "budget", 4].relative < 0.2 * by["cold", "budget", 4].relative
+
+
+def test_a_sequence_that_was_stopped_carries_on_with_the_same_bits(tmp_path):
+    items = bench.sequence(moving_stack(5), "load")
+    plan = bench.Plan(levels=(), budgets=(6,), repeats=1)
+    whole = bench.run(items, ["pgs"], plan, tmp_path / "a.jsonl")
+    lines = (tmp_path / "a.jsonl").read_bytes().splitlines(keepends=True)
+    assert b'"start": "carried"' in lines[-3]
+    (tmp_path / "b.jsonl").write_bytes(b"".join(lines[:-2]))
+    again = bench.run(items, ["pgs"], plan, tmp_path / "b.jsonl")
+    assert [(r.key, r.relative) for r in again] == [(r.key, r.relative) for r in whole]
+    assert len(bench.read(tmp_path / "b.jsonl")) == len(whole)  # only the missing two were made
+
+
+def test_a_folder_is_a_sequence_in_numeric_order(tmp_path):
+    from lavender import io
+
+    for i in (10, 9, 1):
+        io.save(stack(4), tmp_path / f"step_{i}.npz")
+    assert [item.source[-len("step_10.npz") :].lstrip("/") for item in bench.steps_in(tmp_path)] == [
+        "step_1.npz",
+        "step_9.npz",
+        "step_10.npz",
+    ]
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    with pytest.raises(lv.InputError, match="needs two"):
+        bench.steps_in(empty)

@@ -228,3 +228,31 @@ def test_ctrl_c_keeps_the_records_and_writes_the_page(tmp_path):
     assert (out / "index.html").exists()
     kept = [json.loads(line) for line in records.read_text().splitlines()]
     assert any(r["kind"] == "record" and r["case"] == "easy" for r in kept)
+
+
+def test_a_recorded_scene_is_reported_as_a_sequence(lavender, tmp_path):
+    folder = tmp_path / "steps"
+    code, out, _ = lavender("run", "stack", "--steps", 5, "--skip", 1, "--record", folder)
+    assert code == 0
+    assert "4 problems" in out
+    assert len(list(folder.glob("*.npz"))) == 4
+    words = (
+        "report",
+        "--sequence",
+        folder,
+        "--solvers",
+        "sequential_impulses",
+        "--budgets",
+        "4",
+        "--levels",
+        "1e-1",
+    )
+    code, out, _ = lavender(*words, "--no-figures", "--repeats", 1)
+    assert code == 0
+    assert "Sequences" in out
+    code, out, _ = lavender(*words, "--no-figures", "--repeats", 1, "--compare", "lavender-report")
+    assert code == 0
+    assert "nothing beyond noise" in out
+    assert lavender("run", "no such scene")[0] == 2
+    assert lavender("report", "--sequence")[0] == 2
+    assert lavender("report", "--sequence", folder, "--compare", "nowhere")[0] == 2

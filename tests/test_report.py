@@ -296,3 +296,45 @@ def test_a_frame_has_the_rows(real):
     assert isinstance(frame, pandas.DataFrame)
     assert len(frame) == len(real[0])
     assert frame["relative"].tolist() == [r.relative for r in real[0]]
+
+
+def test_sequences_are_compared_carried_against_cold(tmp_path):
+    a = np.diag(np.full(6, 2.0)) - np.diag(np.ones(5), 1) - np.diag(np.ones(5), -1)
+    problems = [lv.Problem.lcp(a, np.ones(6) * (1 + 0.001 * i)) for i in range(4)]
+    plan = bench.Plan(levels=(1e-6,), budgets=(5,), repeats=1)
+    records = bench.run(bench.sequence(problems, "load"), ["pgs", "direct"], plan)
+    budget, level, exact = tables.walks(records)
+    assert (budget.solver, budget.max_iter, budget.steps) == ("pgs", 5, 4)
+    cold = [r for r in records if r.solver == "pgs" and r.mode == "budget" and r.start == "cold"]
+    assert budget.time["cold"] == sum(r.time_min for r in cold)
+    assert budget.residuals["cold"] == tuple(r.relative for r in cold)
+    assert budget.gain > 1.0
+    assert level.iterations["carried"] < level.iterations["cold"]
+    assert set(exact.residuals) == {"cold"}
+    text = report.write(records, tmp_path, figures=False).read_text()
+    assert "Only sequences ran" in text
+    assert 'id="sequences"' in text
+    assert report.reaches(records) == []  # steps are no cases of their own
+
+
+def test_changes_beyond_noise_are_named(tmp_path):
+    old = records_of(
+        record("a", "x", 1.0, 1e-7), record("a", "y", 1.0, 1e-7), record("a", "z", 1.0, 1e-2, success=False),
+        record("a", "w", 1.0, 1e-7), record("a", "v", 1.0, 1e-7, time_median=1.5), record("b", "x", 1.0, 1e-7),
+    )  # fmt: skip
+    new = records_of(
+        record("a", "x", 3.0, 1e-7), record("a", "y", 1.1, 1e-7), record("a", "z", 1.0, 1e-7),
+        record("a", "w", 1.0, 1e-4, success=False), record("a", "v", 1.9, 1e-7),
+    )  # fmt: skip
+    found = {c.solver: c for c in tables.changes(old, new) if c.level == 1e-6}
+    assert {s: c.kind for s, c in found.items()} == {
+        "x": "slower", "y": "same", "z": "reached", "w": "lost", "v": "same",
+    }  # fmt: skip
+    assert found["v"].noise == 2.0  # its repeats spread by half
+    text = report.write(new, tmp_path, figures=False, old=old).read_text()
+    assert "Against the earlier run" in text
+    assert text.count("slower 3 times") == 2  # to both levels
+    # A case whose numbers have changed is not compared.
+    moved = records_of(record("a", "x", 3.0, 1e-7))
+    moved.cases["a"] = CaseInfo(**{**vars(info("a")), "sha": "another"})
+    assert tables.changes(old, moved) == []

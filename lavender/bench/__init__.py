@@ -11,6 +11,7 @@ from lavender.bench.machine import cpu_name
 from lavender.bench.plan import Plan
 from lavender.bench.record import CaseInfo, Record, Run, Skip, level_name
 from lavender.bench.runner import Event, run, solver_names
+from lavender.bench.sequences import carry, sequence, steps_in
 from lavender.bench.store import Records, Store, read, write_csv, write_json
 from lavender.bench.timing import Task, measure, one_thread
 
@@ -25,6 +26,7 @@ __all__ = [
     "Skip",
     "Store",
     "Task",
+    "carry",
     "cpu_name",
     "level_name",
     "measure",
@@ -32,7 +34,9 @@ __all__ = [
     "read",
     "resolve",
     "run",
+    "sequence",
     "solver_names",
+    "steps_in",
     "structure_of",
     "write_csv",
     "write_json",

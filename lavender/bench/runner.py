@@ -12,8 +12,9 @@ from lavender.bench import machine
 from lavender.bench.cases import Item, Source, describe, resolve
 from lavender.bench.plan import Plan
 from lavender.bench.record import CaseInfo, Record, Run, Skip
+from lavender.bench.sequences import carry, passes
 from lavender.bench.store import Records, Store
-from lavender.bench.timing import Task, measure
+from lavender.bench.timing import Task, measure, measure_impulse
 from lavender.bench.worker import Worker
 from lavender.errors import LavenderError
 from lavender.problem import Problem
@@ -148,22 +149,87 @@ class _Runner:
     def run(self, items: list[Item]) -> Records:
         self.total = len(items) * len(self.names)
         self.keep(self.this)
-        for item in items:
-            try:
-                info = describe(item, self.this.run)
-            except (LavenderError, OSError) as error:
-                self.keep(Skip(self.this.run, item.name, "", _not_loaded(item, error)))
-                self.done += len(self.names)
-                self.tell(item.name, "")
-                continue
-            self.keep(info)
-            for name in self.names:
-                self.tell(item.name, name)
-                self.pair(info, item.problem, name)
-                self.done += 1
-            item.forget()
+        for name, group in _sequences(items):
+            if name:
+                self.sequence(group)
+            else:
+                self.single(group[0])
         self.tell("", "")
         return self.out
+
+    def look(self, item: Item) -> CaseInfo | None:
+        """Load and describe a case; None, with a note, where it does not load."""
+        try:
+            info = describe(item, self.this.run)
+        except (LavenderError, OSError) as error:
+            self.keep(Skip(self.this.run, item.name, "", _not_loaded(item, error)))
+            self.done += len(self.names)
+            self.tell(item.name, "")
+            return None
+        self.keep(info)
+        return info
+
+    def single(self, item: Item) -> None:
+        info = self.look(item)
+        if info is None:
+            return
+        for name in self.names:
+            self.tell(item.name, name)
+            self.pair(info, item.problem, name)
+            self.done += 1
+        item.forget()
+
+    def sequence(self, items: list[Item]) -> None:
+        """Every solver, every pass (a budget or a level, cold or carried), step after step."""
+        infos = [self.look(item) for item in items]
+        steps = [(item, info) for item, info in zip(items, infos, strict=True) if info is not None]
+        for name in self.names:
+            spec = self.specs[name]
+            reason = next((r for item, _ in steps if (r := spec.refuses(item.problem))), None)
+            if reason:
+                self.keep(Skip(self.this.run, items[0].sequence, name, reason))
+            else:
+                for what in passes(self.plan, spec):
+                    self.tell(items[0].sequence, name)
+                    self.walk(steps, spec, *what)
+            self.done += len(steps)
+        for item in items:
+            item.forget()
+
+    def walk(
+        self,
+        steps: list[tuple[Item, CaseInfo]],
+        spec: SolverSpec,
+        start: str,
+        mode: str,
+        tol: float,
+        max_iter: int,
+    ) -> None:
+        """One pass; a carried pass that was stopped solves its earlier steps again, without recording them."""
+        tasks = [
+            Task(
+                self.this.run, info.case, info.sha, spec.name, mode, tol, max_iter, self.plan.time_limit,
+                start, {}, self.plan.repeats, info.step,
+            )
+            for _, info in steps
+        ]  # fmt: skip
+        missing = [task.key not in self.known for task in tasks]
+        before: tuple[Problem, Any] | None = None
+        for (item, info), task, new in zip(steps, tasks, missing, strict=True):
+            problem, impulse = item.problem, None
+            if start == "carried":
+                impulse = problem.start() if before is None else carry(*before, problem)
+            if new:
+                record, out = self.make_impulse(problem, task, spec, impulse)
+                self.keep(record)
+            else:
+                record, out = self.known[task.key], None
+                self.out.add(record)
+                if start == "carried" and any(missing):
+                    out = self.make_impulse(problem, replace(task, repeats=1), spec, impulse)[1]
+            if start == "carried":
+                before = None if out is None else (problem, out)
+            self.tell(info.case, spec.name, record, not new)
 
     def pair(self, info: CaseInfo, problem: Problem, name: str) -> None:
         spec = self.specs[name]
@@ -171,7 +237,6 @@ class _Runner:
         if reason:
             self.keep(Skip(self.this.run, info.case, name, reason))
             return
-        isolated = self.worker is not None and is_foreign(spec)
         tasks = self.plan.tasks(info, problem, spec)
         record: Record | None = None
         while True:
@@ -184,14 +249,32 @@ class _Runner:
                 record = found
                 self.out.add(record)
             else:
-                record = self.make(problem, task, isolated)
+                record = self.make(problem, task, spec)
                 self.keep(record)
             self.tell(info.case, name, record, found is not None)
 
-    def make(self, problem: Problem, task: Task, isolated: bool) -> Record:
-        if isolated and self.worker is not None:
+    def make(self, problem: Problem, task: Task, spec: SolverSpec) -> Record:
+        if self.worker is not None and is_foreign(spec):
             return self.worker.measure(replace(problem, copy=False), task)
         return measure(problem, task)
+
+    def make_impulse(
+        self, problem: Problem, task: Task, spec: SolverSpec, impulse: Any
+    ) -> tuple[Record, Any]:
+        if self.worker is not None and is_foreign(spec):
+            return self.worker.measure_impulse(replace(problem, copy=False), task, impulse)
+        return measure_impulse(problem, task, impulse)
+
+
+def _sequences(items: list[Item]) -> list[tuple[str, list[Item]]]:
+    """Items in runs of one sequence; those of none alone, under no name."""
+    out: list[tuple[str, list[Item]]] = []
+    for item in items:
+        if item.sequence and out and out[-1][0] == item.sequence:
+            out[-1][1].append(item)
+        else:
+            out.append((item.sequence, [item]))
+    return out
 
 
 def _not_loaded(item: Item, error: Exception) -> str:

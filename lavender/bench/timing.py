@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from lavender import registry
+from lavender._arrays import FloatArray
 from lavender.bench.record import ERROR, Record, task_key
 from lavender.problem import Problem
 from lavender.residuals import reference
@@ -119,24 +120,25 @@ def one_thread(solver: str = "") -> Iterator[None]:
             gc.enable()
 
 
-def measure(problem: Problem, task: Task, impulse: Any = None) -> Record:
+def measure(problem: Problem, task: Task) -> Record:
     """Make one measurement; what the solver raises becomes a record of status ERROR.
-
-    Parameters
-    ----------
-    impulse : (m,) N s, optional
-        Start, for `start="carried"`. "cold" starts from Pi(0), "warm" from the problem's guess.
 
     Raises
     ------
     KeyboardInterrupt
         Ctrl-C; nothing is recorded.
     """
-    return measure_solution(problem, task, impulse)[0]
+    return measure_impulse(problem, task)[0]
 
 
-def measure_solution(problem: Problem, task: Task, impulse: Any = None) -> tuple[Record, Solution | None]:
-    """As `measure`, with the solution of the last repeat."""
+def measure_impulse(problem: Problem, task: Task, impulse: Any = None) -> tuple[Record, FloatArray | None]:
+    """As `measure`, with the impulses (m,) [N s] that came out, or None.
+
+    Parameters
+    ----------
+    impulse : (m,) N s, optional
+        Start, for `start="carried"`. "cold" starts from Pi(0), "warm" from the problem's guess.
+    """
     setups: list[float] = []
     solves: list[float] = []
     solution = None
@@ -157,7 +159,8 @@ def measure_solution(problem: Problem, task: Task, impulse: Any = None) -> tuple
         text = f"{type(error).__name__}: {error}".strip()
         return task.record(status=ERROR, message=text[:500], repeats=len(solves)), None
     assert solution is not None  # there is at least one repeat
-    return record_of(task, solution, setups, solves), solution
+    impulse = solution.impulse if np.isfinite(solution.impulse).all() else None
+    return record_of(task, solution, setups, solves), impulse
 
 
 def _once(problem: Problem, task: Task, impulse: Any) -> Solution:

@@ -18,6 +18,7 @@ import sys
 import threading
 from typing import IO, Any
 
+from lavender._arrays import FloatArray
 from lavender.bench.record import CRASHED, KILLED, Record
 from lavender.bench.timing import Task
 from lavender.problem import Problem
@@ -69,14 +70,19 @@ class Worker:
         self._answers: queue.Queue[Any] = queue.Queue()
         self._holds = ""
 
-    def measure(self, problem: Problem, task: Task, impulse: Any = None) -> Record:
+    def measure(self, problem: Problem, task: Task) -> Record:
         """As `lavender.bench.timing.measure`, in the worker."""
+        return self.measure_impulse(problem, task)[0]
+
+    def measure_impulse(
+        self, problem: Problem, task: Task, impulse: Any = None
+    ) -> tuple[Record, FloatArray | None]:
+        """As `lavender.bench.timing.measure_impulse`, in the worker."""
         if self._process is None:
             cause = self._start()
             if cause:
-                return task.record(
-                    status=f"{CRASHED} (did not start)", message=f"the worker process ended: {cause}"
-                )
+                message = f"the worker process ended: {cause}"
+                return task.record(status=f"{CRASHED} (did not start)", message=message), None
         # Repeats end once they took the limit together, so at most two can take it; backends look at the clock
         # now and then.
         limit = 3.0 * task.time_limit + self.grace
@@ -89,18 +95,16 @@ class Worker:
             answer = self._answers.get(timeout=limit)
         except queue.Empty:
             self._end()
-            return task.record(
-                status=KILLED, message=f"did not stop; its process was killed after {limit:.3g} s"
-            )
+            message = f"did not stop; its process was killed after {limit:.3g} s"
+            return task.record(status=KILLED, message=message), None
         except (BrokenPipeError, OSError):
             answer = None
         except KeyboardInterrupt:
             self._end()
             raise
         if answer is None:
-            return task.record(
-                status=f"{CRASHED} ({self._cause()})", message="the process of the backend died"
-            )
+            message = "the process of the backend died"
+            return task.record(status=f"{CRASHED} ({self._cause()})", message=message), None
         return answer
 
     def _start(self) -> str:
@@ -188,7 +192,7 @@ def _serve(memory: int) -> None:
     nowhere = os.open(os.devnull, os.O_RDWR)
     os.dup2(nowhere, 0)
     os.dup2(nowhere, 1)
-    from lavender.bench.timing import measure
+    from lavender.bench.timing import measure_impulse
 
     _send(answers, "ready")
     problem: Any = None
@@ -200,4 +204,4 @@ def _serve(memory: int) -> None:
         if message[0] == "problem":
             problem = message[1]
         else:
-            _send(answers, measure(problem, message[1], message[2]))
+            _send(answers, measure_impulse(problem, message[1], message[2]))

@@ -12,7 +12,7 @@ from lavender.bench.store import Records
 from lavender.report import tables
 from lavender.report.text import residual, seconds
 
-__all__ = ["Curve", "Figure", "budget_figure", "profile_figure", "work_precision"]
+__all__ = ["Curve", "Figure", "budget_figure", "profile_figure", "walk_figure", "work_precision"]
 
 TINY = 1e-17  # where a residual of exactly zero is drawn
 
@@ -159,6 +159,26 @@ def budget_figure(records: Records, case: str) -> Figure:
     return Figure(
         "budget " + case, case, "iterations (sweeps)", "relative residual [-]", tuple(curves),
         levels=tables.levels_of(records), floor=work_precision(records, case).floor,
+    )  # fmt: skip
+
+
+def walk_figure(walk: tables.Walk) -> Figure:
+    """Residual of each step of a sequence, cold and carried."""
+    asked = f"{walk.max_iter} iterations" if walk.mode == "budget" else f"to {level_name(walk.tol)}"
+    curves = [
+        Curve(
+            walk.solver,
+            start,
+            tuple(float(i) for i in range(len(values))),
+            tuple(max(x, TINY) if math.isfinite(x) else math.nan for x in values),
+            tuple(f"{walk.solver} ({start}), step {i}: relative {residual(x)}" for i, x in enumerate(values)),
+            thin=start == "cold",
+        )
+        for start, values in sorted(walk.residuals.items())
+    ]
+    return Figure(
+        f"sequence {walk.sequence} {walk.solver} {asked}", f"{walk.sequence}: {walk.solver}, {asked}",
+        "step", "relative residual [-]", tuple(curves), x_log=False,
     )  # fmt: skip
 
 

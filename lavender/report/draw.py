@@ -121,7 +121,7 @@ def plotly_data(figure: Figure, look: dict[str, Look]) -> dict[str, Any]:
             y.append(y[-1])
         traces.append({
             "x": x,
-            "y": y,
+            "y": [v if math.isfinite(v) else None for v in y],
             "name": c.label,
             "text": [_html(t) for t in c.hover],
             "hoverinfo": "text" if c.hover else "name",

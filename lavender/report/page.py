@@ -31,7 +31,7 @@ def plotly_source() -> str:
     return source.replace("</script", "<\\/script")
 
 
-def page(records: Records, title: str = "lavender report") -> str:
+def page(records: Records, title: str = "lavender report", old: Records | None = None) -> str:
     """The whole page. Every text that came from a file, a problem or a backend is escaped."""
     import jinja2
 
@@ -43,7 +43,7 @@ def page(records: Records, title: str = "lavender report") -> str:
         lstrip_blocks=True,
     )
     environment.filters.update(seconds=seconds, residual=residual, level=level_name, anchor=file_name)
-    content = _content(records)
+    content = _content(records, old)
     figures = json.dumps(content.pop("figures"), allow_nan=False).replace("<", "\\u003c")
     return environment.get_template("index.html.j2").render(
         title=title,
@@ -55,7 +55,7 @@ def page(records: Records, title: str = "lavender report") -> str:
     )
 
 
-def _content(records: Records) -> dict[str, Any]:
+def _content(records: Records, old: Records | None) -> dict[str, Any]:
     look = looks(r.solver for r in records)
     levels = tables.levels_of(records)
     figures: dict[str, Any] = {}
@@ -89,6 +89,12 @@ def _content(records: Records) -> dict[str, Any]:
             key = add(curves.profile_figure(profile))
             if key:
                 profiles.setdefault(profile.law, []).append(key)
+    walks = tables.walks(records)
+    middle = sorted({w.max_iter for w in walks if w.mode == "budget"})
+    shown = (
+        [w for w in walks if w.mode == "budget" and w.max_iter == middle[len(middle) // 2]] if middle else []
+    )
+    changes = tables.changes(old, records) if old is not None else []
     advice_level, advice_time = tables.advice_by_level(records), tables.advice_by_time(records)
     return {
         "figures": figures,
@@ -109,6 +115,11 @@ def _content(records: Records) -> dict[str, Any]:
         "spreads": sorted(tables.spreads(records), key=lambda s: -s.factor),
         "lost": [s for s in records.skips if not s.solver],
         "refused": [s for s in records.skips if s.solver],
+        "walks": walks,
+        "walk_figures": [key for key in (add(curves.walk_figure(w)) for w in shown) if key],
+        "compared": old is not None,
+        "changes": [c for c in changes if c.kind != "same"],
+        "n_changes": len(changes),
         "n_records": len(records),
         "look": look,
     }

@@ -17,14 +17,17 @@ from lavender.bench.store import Records
 
 __all__ = [
     "Advice",
+    "Change",
     "Claims",
     "Failure",
     "Profile",
     "Reach",
     "Spread",
+    "Walk",
     "advice_by_level",
     "advice_by_time",
     "budgets",
+    "changes",
     "claims",
     "failures",
     "families",
@@ -35,6 +38,7 @@ __all__ = [
     "reaches",
     "spreads",
     "time_budgets",
+    "walks",
 ]
 
 FAILED = (
@@ -142,6 +146,56 @@ class Profile:
 
 
 @dataclass(frozen=True)
+class Walk:
+    """One solver over one sequence at one budget or level: cold, and with its impulses carried along."""
+
+    sequence: str
+    solver: str
+    mode: str
+    tol: float
+    max_iter: int
+    steps: int
+    time: Mapping[str, float]  # start -> s, all steps
+    iterations: Mapping[str, int]
+    residuals: Mapping[str, tuple[float, ...]]  # start -> of each step
+
+    def middle(self, start: str) -> float:
+        """Median residual over the steps."""
+        return median(self.residuals[start]) if self.residuals.get(start) else math.nan
+
+    @property
+    def gain(self) -> float:
+        """Median over the steps of cold over carried residual; nan without both."""
+        cold, carried = self.residuals.get("cold"), self.residuals.get("carried")
+        if not cold or not carried or len(cold) != len(carried):
+            return math.nan
+        pairs = [(c, w) for c, w in zip(cold, carried, strict=True) if w > 0.0 and math.isfinite(c)]
+        return median(c / w for c, w in pairs) if pairs else math.nan
+
+
+@dataclass(frozen=True)
+class Change:
+    """One case and solver in an old and a new run."""
+
+    case: str
+    solver: str
+    start: str
+    level: float
+    old: float  # s, inf where the level was missed
+    new: float
+    noise: float  # what counts as noise: a factor above 1
+
+    @property
+    def kind(self) -> str:
+        """reached | lost | faster | slower | same."""
+        if math.isfinite(self.new) != math.isfinite(self.old):
+            return "reached" if math.isfinite(self.new) else "lost"
+        if not math.isfinite(self.new) or self.old / self.noise <= self.new <= self.old * self.noise:
+            return "same"
+        return "faster" if self.new < self.old else "slower"
+
+
+@dataclass(frozen=True)
 class Spread:
     """Residual at one budget over sweep orders."""
 
@@ -172,7 +226,7 @@ def pairs(records: Iterable[Record]) -> dict[tuple[str, str, str], list[Record]]
     """Runs in the given order of blocks, by (case, solver, start)."""
     groups: dict[tuple[str, str, str], list[Record]] = defaultdict(list)
     for r in records:
-        if r.order == "given":
+        if r.order == "given" and r.step < 0:
             groups[r.case, r.solver, r.start].append(r)
     return dict(groups)
 
@@ -180,7 +234,7 @@ def pairs(records: Iterable[Record]) -> dict[tuple[str, str, str], list[Record]]
 def families(records: Records) -> dict[str, list[str]]:
     """Structure -> cases, biggest first. A case is in every family whose word describes it."""
     found: dict[str, list[str]] = defaultdict(list)
-    ran = {r.case for r in records}
+    ran = {r.case for r in records if r.step < 0}
     for name, info in records.cases.items():
         if name in ran:
             for word in info.structure:
@@ -279,7 +333,7 @@ def spreads(records: Records) -> list[Spread]:
     """Where one budget was run in several sweep orders, the residual of each."""
     groups: dict[tuple[str, str, int], dict[str, float]] = defaultdict(dict)
     for r in records:
-        if r.mode == "budget" and r.start == "cold":
+        if r.mode == "budget" and r.start == "cold" and r.step < 0:
             name = f"{r.order} {r.seed}" if r.order == "random" else r.order
             groups[r.case, r.solver, r.max_iter][name] = r.relative
     return [Spread(*key, by_order) for key, by_order in groups.items() if len(by_order) > 1]
@@ -289,7 +343,7 @@ def budgets(records: Records) -> dict[tuple[str, str, str], list[tuple[int, floa
     """(case, solver, start) -> (iterations, residual) of the exact budgets, given order."""
     groups: dict[tuple[str, str, str], list[tuple[int, float]]] = defaultdict(list)
     for r in records:
-        if r.mode == "budget" and r.order == "given" and r.status == "MAX_ITERATIONS":
+        if r.mode == "budget" and r.order == "given" and r.step < 0 and r.status == "MAX_ITERATIONS":
             groups[r.case, r.solver, r.start].append((r.iterations, r.relative))
     return {key: sorted(points) for key, points in groups.items()}
 
@@ -351,7 +405,7 @@ def geometric_means(records: Records) -> dict[str, dict[float, dict[str, tuple[f
 
 
 def _laws(records: Records) -> dict[str, list[str]]:
-    ran = {r.case for r in records}
+    ran = {r.case for r in records if r.step < 0}
     out: dict[str, list[str]] = defaultdict(list)
     for name, info in records.cases.items():
         if name in ran:
@@ -451,4 +505,56 @@ def advice_by_time(records: Records) -> list[Advice]:
                 choices.append(Choice(solver, sum(g is not None for g in got), len(cases), score, math.nan))
             choices.sort(key=lambda k: (k.score, -k.solved))
             out.append(Advice(family, limit, tuple(choices)))
+    return out
+
+
+def walks(records: Records) -> list[Walk]:
+    """Sequences: total time and iterations, residual of each step, carried against cold."""
+    groups: dict[tuple[str, str, str, float, int], dict[str, list[Record]]] = defaultdict(
+        lambda: defaultdict(list)
+    )
+    for r in records:
+        if r.step >= 0 and r.case in records.cases:
+            name = records.cases[r.case].sequence
+            groups[name, r.solver, r.mode, r.tol, r.max_iter][r.start].append(r)
+    out = []
+    for key, by_start in groups.items():
+        for group in by_start.values():
+            group.sort(key=lambda r: r.step)
+        out.append(
+            Walk(
+                *key,
+                max(len(g) for g in by_start.values()),
+                {s: sum(r.time_min for r in g) for s, g in by_start.items()},
+                {s: sum(r.iterations for r in g) for s, g in by_start.items()},
+                {s: tuple(r.relative for r in g) for s, g in by_start.items()},
+            )
+        )
+    return out
+
+
+NOISE = 1.25  # a factor of time below which nothing is said: what a busy machine does to a minimum of repeats
+
+
+def changes(old: Records, new: Records) -> list[Change]:
+    """Time to each level in two runs, on the cases whose numbers are the same in both.
+
+    Noise is at least `NOISE`, and at least twice the spread between minimum and median of either run.
+    """
+    levels = levels_of(new)
+    same = {name for name, info in new.cases.items() if name in old.cases and old.cases[name].sha == info.sha}
+    before = {(r.case, r.solver, r.start): r for r in reaches(old, levels)}
+    spread: dict[tuple[str, str, str], float] = defaultdict(lambda: 1.0)
+    for records in (old, new):
+        for key, group in pairs(records).items():
+            for r in group:
+                if r.usable and r.time_min > 0.0:
+                    spread[key] = max(spread[key], r.time_median / r.time_min)
+    out = []
+    for row in reaches(new, levels):
+        key = (row.case, row.solver, row.start)
+        if row.case not in same or key not in before:
+            continue
+        noise = max(NOISE, 1.0 + 2.0 * (spread[key] - 1.0))
+        out += [Change(*key, x, before[key].times[x], row.times[x], noise) for x in levels]
     return out

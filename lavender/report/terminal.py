@@ -69,10 +69,48 @@ def advice_table(records: Records) -> Any:
     return table
 
 
-def print_report(records: Records, console: Console, levels: Sequence[float] | None = None) -> None:
+def walk_table(records: Records) -> Any:
+    """Sequences: residual and time, carried against cold."""
+    from rich.table import Table
+
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    for name in ("sequence", "solver", "asked", "steps", "residual carried", "cold", "time carried", "cold"):
+        table.add_column(
+            name, no_wrap=True, justify="left" if name in ("sequence", "solver", "asked") else "right"
+        )
+    for w in tables.walks(records):
+        asked = f"{w.max_iter} iterations" if w.mode == "budget" else f"to {level_name(w.tol)}"
+        cells = [residual(w.middle(s)) if s in w.residuals else "–" for s in ("carried", "cold")]
+        cells += [seconds(w.time[s]) if s in w.time else "–" for s in ("carried", "cold")]
+        table.add_row(w.sequence, w.solver, asked, str(w.steps), *cells)
+    return table
+
+
+def change_table(old: Records, new: Records) -> Any:
+    """What differs from an earlier run beyond noise; None if nothing does."""
+    from rich.table import Table
+
+    found = [c for c in tables.changes(old, new) if c.kind != "same"]
+    if not found:
+        return None
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    for name in ("case", "solver", "level", "before", "now", "change"):
+        table.add_column(name, no_wrap=True)
+    for c in found:
+        bad = c.kind in ("lost", "slower")
+        factor = f" {c.new / c.old:.3g} times" if c.kind in ("faster", "slower") else ""
+        name = c.solver if c.start == "cold" else f"{c.solver} ({c.start})"
+        cells = (c.case, name, level_name(c.level), seconds(c.old), seconds(c.new), c.kind + factor)
+        table.add_row(*cells, style="red" if bad else "green")
+    return table
+
+
+def print_report(
+    records: Records, console: Console, levels: Sequence[float] | None = None, old: Records | None = None
+) -> None:
     """Everything the terminal shows after a run."""
     levels = tables.levels_of(records) if levels is None else levels
-    if len(records):
+    if any(r.step < 0 for r in records):
         console.print(reach_table(records, levels))
         console.print()
     lost = [s for s in records.skips if not s.solver]
@@ -87,11 +125,23 @@ def print_report(records: Records, console: Console, levels: Sequence[float] | N
             highlight=False,
             style="dim",
         )
-    if len(records):
+    if any(r.step < 0 for r in records):
         console.print(
             "\n[bold]Recommended[/] (solver, median time where it gets there, cases it brings to the level)"
         )
         console.print(advice_table(records), highlight=False)
+    if any(r.step >= 0 for r in records):
+        console.print(
+            "\n[bold]Sequences[/] (median residual, time of all steps; carried from step to step, or cold)"
+        )
+        console.print(walk_table(records), highlight=False)
+    if old is not None:
+        table = change_table(old, records)
+        console.print(
+            f"\n[bold]Against {old.source}[/]{'' if table else ': nothing beyond noise'}", highlight=False
+        )
+        if table:
+            console.print(table, highlight=False)
     wrong = [r for r in records if r.contradicted]
     if wrong:
         console.print(f"\n[bold red]{len(wrong)} claims are contradicted by the judge:[/]")

@@ -10,7 +10,7 @@ from lavender.errors import InputError
 __all__ = ["write"]
 
 
-def write(records: Records, folder: str | Path, *, figures: bool = True) -> Path:
+def write(records: Records, folder: str | Path, *, figures: bool = True, old: Records | None = None) -> Path:
     """Write `records.csv`, `records.json`, `figures/*.svg`, `figures/*.png`, `summary.md` and `index.html`.
 
     Parameters
@@ -20,6 +20,9 @@ def write(records: Records, folder: str | Path, *, figures: bool = True) -> Path
     folder : path
     figures : bool
         False leaves out the SVG and PNG files, which take most of the time.
+
+    old : Records, optional
+        An earlier run to compare with.
 
     Returns
     -------
@@ -44,12 +47,12 @@ def write(records: Records, folder: str | Path, *, figures: bool = True) -> Path
         write_csv(records, folder / "records.csv")
         write_json(records, folder / "records.json")
         index = folder / "index.html"
-        index.write_text(page(shown), encoding="utf-8")
+        index.write_text(page(shown, old=None if old is None else old.latest()), encoding="utf-8")
         (folder / "summary.md").write_text(summary(shown), encoding="utf-8")
         if figures:
             (folder / "figures").mkdir(exist_ok=True)
             look = looks(r.solver for r in shown)
-            for case in dict.fromkeys(r.case for r in shown):
+            for case in dict.fromkeys(r.case for r in shown if r.step < 0):
                 for figure in (work_precision(shown, case), budget_figure(shown, case)):
                     if figure.curves:
                         save(figure, look, folder / "figures")
