@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from lavender._arrays import FloatArray
-from lavender.cones import ROW
+from lavender.cones import CONTACT_SPIN, ROW
 from lavender.errors import InputError
 from lavender.problem import Problem
 from lavender_ext import judge as kernels
@@ -261,41 +261,47 @@ def qp_residual(problem: Problem, impulse: Any, multiplier: Any = None) -> QPRes
 def check_certificate(problem: Problem, y: Any) -> str | None:
     """Does y (m,) prove that the problem has no solution? None if it does, else the reason it does not.
 
-    Symmetric positive semidefinite A: y in the recession cone of the bounds, |A y| <= 1e-10 |A| |y| row
-    by row, b.y > 1e-10 |b|.|y|. Any A with rows that are free or bounded by 0 below: A^T y = 0 on the
-    free rows, y >= 0 and A^T y <= 0 on the others, b.y > 0, to the same accuracy. Not asked for Coulomb
-    friction.
+    y is a direction in which the bounds never end: along free rows, up where there is no upper bound, in the
+    cone of a contact (Coulomb: along its normal alone). There w.y >= 0 at every solution, so with z = A^T y
+
+        0 <= w.y = z.lambda - b.y,    and none exists where   b.y > max z.lambda                      (1)
+
+    over all lambda within the bounds, for any A and every law. z_i counts as zero up to
+    1e-10 (b.y / |b|.|y|) (|A|^T |y|)_i: with more a solution could exist, but only one with
+    |A| |lambda| > 1e10 |b| in the weights |y|, whose floor is above 1e-6.
     """
     y = np.asarray(y, float)
     if y.shape != (problem.m,) or not np.isfinite(y).all() or not np.any(y):
         return f"certificate of shape {y.shape} must be {problem.m} finite numbers, not all zero"
-    if problem.law == "coulomb":
-        return "certificates are not defined for Coulomb friction"
-    gain = float(problem.b @ y)
-    if not gain > 1e-10 * float(np.abs(problem.b) @ np.abs(y)):
+    gain, most = float(problem.b @ y), float(np.abs(problem.b) @ np.abs(y))
+    if not gain > 1e-10 * most:
         return f"b.y = {gain:.2e} is not positive"
-    c = problem.cones
     outside = _recession_violation(problem, y)
     if outside:
         return outside
     a = problem.csr
-    size = abs(a) @ np.abs(y)
-    ay = a @ y
-    if problem.is_symmetric and np.all(np.abs(ay) <= 1e-10 * size):
+    z, zero = a.T @ y, 1e-10 * (gain / most) * (abs(a).T @ np.abs(y))
+    z[np.abs(z) <= zero] = 0.0
+    pull = _pull(problem, z, zero)
+    if gain - pull.sum() > 1e-10 * (most + np.abs(pull).sum()):
         return None
-    if problem.law in ("linear", "lcp"):
-        # lambda = lower + x, x >= 0 for rows bounded below alone: w >= 0 gives 0 <= y.w = (A^T y).lambda - b.y.
-        aty, size = a.T @ y, abs(a).T @ np.abs(y)
-        free = np.isneginf(c.lower) & np.isposinf(c.upper)
-        plain = (c.lower == 0.0) & np.isposinf(c.upper)
-        if (
-            np.all(free | plain)
-            and np.all(np.abs(aty[free]) <= 1e-10 * size[free])
-            and np.all(aty[plain] <= 1e-10 * size[plain])
-        ):
-            return None
-        return f"A^T y reaches {aty.max(initial=0.0):.2e}, above rounding"
-    return f"|A y| reaches {np.abs(ay).max(initial=0.0):.2e}, above rounding"
+    return f"A^T y reaches {np.abs(z).max(initial=0.0):.2e}, above rounding; impulses within the bounds can meet b.y"
+
+
+def _pull(problem: Problem, z: FloatArray, zero: FloatArray) -> FloatArray:
+    """Largest z_i lambda_i (m,) of each row within its bounds; of a contact's together, on its normal."""
+    c = problem.cones
+    bound = np.where(z > 0.0, c.upper, c.lower)
+    pull = np.zeros(problem.m)
+    np.multiply(z, bound, out=pull, where=z != 0.0)
+    for i in np.flatnonzero(c.kind != ROW):
+        j, end, nt = c.ptr[i], c.ptr[i + 1], int(c.n_tangents[i])
+        rim = float(np.linalg.norm(z[j + 1 : j + 1 + nt]))
+        if c.kind[i] == CONTACT_SPIN:
+            rim += c.patch_radius[i] * abs(z[end - 1])
+        pull[j:end] = 0.0
+        pull[j] = np.inf if z[j] + c.mu[i] * rim > zero[j] else 0.0
+    return pull
 
 
 def _recession_violation(problem: Problem, y: FloatArray) -> str | None:
@@ -306,11 +312,15 @@ def _recession_violation(problem: Problem, y: FloatArray) -> str | None:
     if bad.any():
         i = int(np.flatnonzero(bad)[0])
         return f"y[{i}] = {y[i]:.2e} leaves the bounds of {problem.row_name(i)}"
-    for i in np.flatnonzero(c.kind != ROW):
-        part = y[c.ptr[i] : c.ptr[i + 1]]
-        nt = int(c.n_tangents[i])
-        limit = c.mu[i] * part[0] * (1 + 1e-12)
-        spin = abs(part[-1]) if c.kind[i] == 2 else 0.0
-        if part[0] < 0.0 or np.linalg.norm(part[1 : 1 + nt]) > limit or spin > limit * c.patch_radius[i]:
-            return f"y leaves the cone of {problem.row_name(int(c.ptr[i]))}"
+    for k in np.flatnonzero(c.kind != ROW):
+        part = y[c.ptr[k] : c.ptr[k + 1]]
+        nt = int(c.n_tangents[k])
+        limit = c.mu[k] * part[0] * (1 + 1e-12)
+        spin = abs(part[-1]) if c.kind[k] == CONTACT_SPIN else 0.0
+        if problem.law == "coulomb" and part[1:].any():
+            return (
+                f"y is not along the normal of {problem.row_name(int(c.ptr[k]))}, as Coulomb friction needs"
+            )
+        if part[0] < 0.0 or np.linalg.norm(part[1 : 1 + nt]) > limit or spin > limit * c.patch_radius[k]:
+            return f"y leaves the cone of {problem.row_name(int(c.ptr[k]))}"
     return None

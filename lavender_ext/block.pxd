@@ -108,14 +108,9 @@ cdef inline void relax_tangents(double* lam, const double* w, double step, doubl
 
 
 cdef inline double row_error(double lam, double w, double d, double low, double high) noexcept nogil:
-    # (5), written so that an inactive bound costs no digits: e = w / d there, not lam - (lam - w / d).
-    cdef double t = w / d
-    cdef double y = lam - t
-    if y < low:
-        return lam - low
-    if y > high:
-        return lam - high
-    return t
+    # (5) as clip(w / d, lam - high, lam - low): lam - clip(lam - w / d) would cost digits where no bound acts,
+    # and would not see a bound that is huge beside w / d.
+    return clip(w / d, lam - high, lam - low)
 
 
 cdef inline void tangent_error(const double* lam, const double* w, double d, double radius,

@@ -378,6 +378,56 @@ def test_certificates_are_checked():
     assert "leaves the bounds" in check_certificate(boxed, [1.0, 1.0])
 
 
+def test_certificates_hold_for_any_matrix_and_every_law():
+    # A^T y = 0 and y.w >= 0 on every row: nothing about symmetry, definiteness or friction is needed.
+    a = np.array([[0.0, 0.0, 0.0], [3.0, 1.0, -2.0], [1.0, 4.0, 1.0]])
+    b, y = [1.0, 2.0, -1.0], [1.0, 0.0, 0.0]
+    assert check_certificate(lv.Problem.lcp(a, b, [0.0, -1.0, -2.0], [np.inf, 1.0, 5.0]), y) is None
+    assert check_certificate(lv.Problem.contact(a, b, [0.5]), y) is None
+    assert check_certificate(lv.Problem.contact(a, b, [0.5], friction="cone"), y) is None
+    # z = A^T y may pull towards finite bounds, or into the polar cone: then what they give counts.
+    box = [np.array([[-1.0, 1.0], [0.0, 1.0]]), [2.0, 1.0], 0.0]
+    assert check_certificate(lv.Problem.lcp(*box, [np.inf, 1.5]), [1.0, 0.0]) is None
+    assert "can meet" in check_certificate(lv.Problem.lcp(*box, [np.inf, 2.5]), [1.0, 0.0])
+    slope = np.array([[-1.0, 0.6], [0.0, 1.0]])
+    assert check_certificate(lv.Problem.contact(slope, [1.0, 0.0], [1.5]), [1.0, 0.0]) is None
+    assert "can meet" in check_certificate(lv.Problem.contact(slope, [1.0, 0.0], [2.0]), [1.0, 0.0])
+
+
+def test_a_certificate_along_a_tangent_proves_nothing_under_coulomb():
+    a = np.zeros((2, 2))
+    contact = lv.Problem.contact(a, [0.0, 1.0], [1.0])
+    assert "along the normal" in check_certificate(contact, [1.0, 1.0])
+    # lambda_n is free to grow, so the tangent is solved by lambda_t = mu lambda_n; relaxed it never is.
+    assert check_certificate(contact.relaxed("cone"), [1.0, 1.0]) is None
+
+
+def test_a_nearly_singular_matrix_gives_no_certificate():
+    # lambda = (-99, 100) solves it; A y is small beside |A| |y|, but no smaller than what b asks of it.
+    h = 1e-11
+    problem = lv.Problem.linear([[1.0, 1.0], [1.0, 1.0 + h]], [1.0, 1.0 + 100.0 * h])
+    assert lv.residual(problem, [-99.0, 100.0]).relative < 1e-6
+    assert check_certificate(problem, [-1.0, 1.0]) is not None
+
+
+def test_bounds_that_are_huge_beside_the_step_are_seen():
+    # w pushes into a bound on which lambda already sits: no error, however large the bound.
+    for bound in (1e6, 1e100, 1e300):
+        problem = lv.Problem.lcp([[0.0, 0.0], [0.0, 1.0]], [1.0, 1.0], -bound, bound)
+        assert lv.residual(problem, [bound, 1.0]).relative == 0.0
+        assert lv.residual(problem, [-bound, 1.0]).relative > 0.1
+        assert lv.solve(problem, "pgs").impulse.tolist() == [bound, 1.0]
+
+
+def test_the_floor_of_a_tiny_matrix_does_not_underflow():
+    a, b = np.array([[3.7, 0.5], [0.5, 2.0]]), np.array([2.1, 0.96])
+    usual = lv.residual(lv.Problem.lcp(a, b, -1.0, 1.0), [0.5, 0.4])
+    tiny = lv.residual(
+        lv.Problem.lcp(a * 2.0**-730, b * 2.0**-700, -(2.0**30), 2.0**30), [2.0**29, 0.4 * 2.0**30]
+    )
+    assert (tiny.relative, tiny.floor) == pytest.approx((usual.relative, usual.floor), rel=1e-12)
+
+
 def test_the_inequality_between_two_points_holds():
     """|D|_A^2 <= |D|_A |eps|_A + |eps|_D |D|_D for symmetric PSD boxed problems (D = difference, eps = e1 - e2)."""
     for seed in range(200):
