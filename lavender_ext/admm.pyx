@@ -7,13 +7,14 @@ With x = D^1/2 lam, B = D^-1/2 A D^-1/2, c = D^-1/2 b, cones K in the same scale
     (B + rho) x = c - s + rho z - y                                                               (1)
     u <- u + alpha (x - z)                          then mixing.pxd
 
-At rest x = z: B z - c + s + y = 0. (1) is solved with a factorisation made by the caller: Cholesky of a
+At rest x = z: B z - c + s + y = 0. The shift comes in once both imbalances below are at most 1e-3, that
+is from the convex answer: where contacts stick that is the answer, elsewhere a start. (1) is solved with a factorisation made by the caller: Cholesky of a
 dense matrix, L D L^T or L U of a sparse one, or L D L^T of I + K^T diag(1 / (theta + rho)) K over bodies
 where B = K K^T + diag(theta):
 
     x = E (r - K t),  (I + K^T E K) t = K^T E r,  E = diag(1 / (theta + rho))                     (2)
 
-Every RHO_EVERY iterations rho is weighed: the square root of |x - z| / max(|x|, |z|) over
+After 20 iterations, then at every quarter more of them (20 at least), rho is weighed: the square root of |x - z| / max(|x|, |z|) over
 rho |z - z before| / max(|y|, |c|). Where that is outside 1/3 .. 3 the kernel stops and asks for a factorisation
 with the new rho; u then becomes z + y / rho.
 """
@@ -34,7 +35,8 @@ cdef enum:
     BODIES = 3
 
 cdef enum:
-    RHO_EVERY = 20
+    RHO_EVERY = 20              # iterations between weighings of rho at first, later a quarter of those done
+    CONVEX_AT_MOST = 200        # iterations without the shift
 
 
 cdef struct factor_t:           # of B + rho, or of the body form
@@ -69,7 +71,8 @@ cdef struct admm_t:
     double* g                   # (m)
     double* before              # (m) z of the iteration before
     double* work                # (m + n)
-    double* turn                # iterations done; whether u was mixed
+    double* turn                # iterations done; whether u was mixed; iterations at the next
+                                # weighing of rho; whether the shift is on
 
 
 cdef inline void solve_factor(const factor_t* f, double* x, double* work) noexcept nogil:
@@ -190,26 +193,34 @@ cdef inline double shift(const blocks_t* p, const double* root, int32_t i, const
     return s
 
 
-cdef inline double weighed(const admm_t* c) noexcept nogil:
-    # The rho that the last iteration asks for, or the present one.
+cdef inline double imbalance(const admm_t* c, double* primal, double* dual) noexcept nogil:
+    # |x - z| and rho |z - z before|, each over the size of its vectors; the larger of both.
     cdef int32_t i, m = c.blocks.n_rows
-    cdef double primal = 0.0, dual = 0.0, x = 0.0, y = 0.0, s, t
+    cdef double x = 0.0, y = 0.0, s, t
+    primal[0] = dual[0] = 0.0
     for i in range(m):
         s = c.x[i] - c.z[i]
         t = c.z[i] - c.before[i]
-        primal += s * s
-        dual += t * t
+        primal[0] += s * s
+        dual[0] += t * t
         s = c.x[i] * c.x[i]
         t = c.z[i] * c.z[i]
         x += s if s > t else t
         s = c.y[i] * c.y[i]
         t = c.c[i] * c.c[i]
         y += s if s > t else t
-    if not (primal > 0.0 and x > 0.0):
+    primal[0] = sqrt(primal[0] / x) if x > 0.0 else 0.0
+    dual[0] = c.rho * sqrt(dual[0] / y) if y > 0.0 else 0.0
+    return primal[0] if primal[0] > dual[0] else dual[0]
+
+
+cdef inline double weighed(const admm_t* c) noexcept nogil:
+    # The rho that the last iteration asks for, or the present one.
+    cdef double primal, dual, s
+    imbalance(c, &primal, &dual)
+    if not primal > 0.0:
         return c.rho
-    s = sqrt(primal / x)
-    t = c.rho * sqrt(dual / y) if y > 0.0 else 0.0
-    s = clip(sqrt(s / t) if t > 0.0 else 10.0, 0.1, 10.0)
+    s = clip(sqrt(primal / dual) if dual > 0.0 else 10.0, 0.1, 10.0)
     s = clip(s * c.rho, 1e-9, 1e4)
     return s if s > 3.0 * c.rho or 3.0 * s < c.rho else c.rho
 
@@ -218,7 +229,7 @@ cdef public double lav_admm(admm_t* c, const factor_t* f, const mixing_t* mixing
     """At most n iterations; n is what is left on return. Returns 0, or the rho that should be factored next."""
     cdef const blocks_t* p = c.blocks
     cdef int32_t m = p.n_rows, i, mixed
-    cdef double rho = c.rho
+    cdef double rho = c.rho, primal, dual
     while n[0] > 0:
         n[0] -= 1
         mixed = c.turn[1] > 0.0
@@ -227,7 +238,7 @@ cdef public double lav_admm(admm_t* c, const factor_t* f, const mixing_t* mixing
         for i in range(m):
             c.y[i] = rho * (c.u[i] - c.z[i])
             c.x[i] = c.c[i] + rho * c.z[i] - c.y[i]
-        if p.law != CONE:
+        if p.law != CONE and c.turn[3] > 0.0:
             for i in range(p.n_blocks):
                 if p.kind[i] != ROW:
                     c.x[p.ptr[i]] -= shift(p, c.root, i, c.y)
@@ -239,8 +250,13 @@ cdef public double lav_admm(admm_t* c, const factor_t* f, const mixing_t* mixing
         if not take(mixing, mixed, c.u, c.g):
             c.turn[1] = 0.0
             continue
-        if <int32_t>c.turn[0] % RHO_EVERY == 0:
-            rho = weighed(c)
+        if c.turn[3] == 0.0 and (c.turn[0] >= CONVEX_AT_MOST or imbalance(c, &primal, &dual) <= 1e-3):
+            c.turn[3] = 1.0
+            forget(mixing)
+        if c.turn[0] >= c.turn[2]:
+            if c.turn[2] > 0.0:
+                rho = weighed(c)
+            c.turn[2] = c.turn[0] + (0.25 * c.turn[0] if c.turn[0] > 4.0 * RHO_EVERY else RHO_EVERY)
         for i in range(m):
             c.before[i] = c.z[i]
             lam[i] = c.z[i] / c.root[i]
@@ -274,7 +290,7 @@ def allocate(Data p, int memory):
     """Zeroed vectors of a run: (control, gram, turn, work)."""
     if not 0 <= memory <= MAX_MEMORY:
         raise ValueError(f"memory is {memory}; 0 to {MAX_MEMORY} is needed")
-    return (np.zeros(CONTROL), np.zeros(MAX_MEMORY * MAX_MEMORY), np.zeros(2),
+    return (np.zeros(CONTROL), np.zeros(MAX_MEMORY * MAX_MEMORY), np.zeros(4),
             np.zeros((8 + 2 * memory) * p.blocks.n_rows + 1))
 
 

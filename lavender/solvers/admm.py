@@ -4,7 +4,7 @@
 
 in the metric of d: B = D^-1/2 A D^-1/2, c = D^-1/2 b, K the bounds and cones of all blocks at once, s De
 Saxce's shift of Coulomb's law (`lavender_ext/admm.pyx`). One triangular solve an iteration instead of a
-sweep, so mass ratios and long chains cost factorisations (rho is weighed every 20 iterations), not sweeps.
+sweep, so mass ratios and long chains cost factorisations (rho is weighed at 20 iterations, later ever more rarely), not sweeps.
 Cholesky of a dense A, L D L^T of a sparse one or, where rows have fewer body unknowns than rows, of the
 body form; L U where A is not symmetric.
 """
@@ -32,8 +32,8 @@ from lavender_ext.watch import Watch
 
 _DENSE, _SYMMETRIC, _GENERAL, _BODIES = 0, 1, 2, 3
 _DENSE_ABOVE = 0.15  # share of nonzeros from which LAPACK on the full matrix is the faster factorisation
-_START_RHO = 0.3  # B has unit diagonal, so 1 is its scale
-_PATIENCE = 500  # iterations: on mass ratios the residual rises while rho finds its place
+_START_RHO = 0.1  # B has unit diagonal, so 1 is its scale; measured
+_PATIENCE = 5000  # iterations: on mass ratios the residual rises while rho finds its place
 
 
 class _Failed(Exception):
@@ -164,7 +164,8 @@ class ADMM:
         if state.watch.total == 0 and len(impulse):
             # y of the start: minus its slack, shifted; at a solution the first iteration stays there.
             kernels.start(data, impulse, state.problem.slack(impulse), state.root, state.rho, state.space)
-        factorisations, undone, message = state.factorisations, state.undone, ""
+        before = state.factorisations if state.watch.total else 0
+        undone, message = state.undone, ""
 
         def iterate(count: int, first: bool) -> None:
             while count:
@@ -183,7 +184,7 @@ class ADMM:
             result, message = Claim(Status.NUMERICAL_ERROR, state.watch.total), str(failure)
         work = {
             "solves": result.iterations,
-            "factorisations": state.factorisations - (0 if factorisations == 1 else factorisations),
+            "factorisations": state.factorisations - before,
             "undone": state.undone - undone,
         }
         form = ("dense Cholesky", "sparse LDLT", "sparse LU", "LDLT over bodies")[state.kind]
