@@ -74,13 +74,33 @@ cdef inline void rows_slack(const blocks_t* p, const rows_t* r, const double* la
 
 cdef inline void score_rows(const blocks_t* p, const double* lam, const double* w, double* e, score_t* out) noexcept nogil:
     """Errors e (m) of all blocks and their two sums; the floor entries are left alone."""
-    cdef int32_t i, j, k, nt
-    cdef double v, big = -1.0
+    cdef int32_t i, j, k, nt, worst = -1
+    cdef double v, t, energy = 0.0, big = -1.0
     cdef sum_t total = sum_t(0.0, 0.0)
+    # Plain sums of squares, one division a row; kept where they can neither have over- nor underflown.
+    for i in range(p.n_blocks):
+        block_error(p, i, lam, w, e)
+        j = p.ptr[i]
+        nt = 0 if p.kind[i] == ROW else n_tangents(p.kind[i], p.ptr[i + 1] - j)
+        for k in range(j, p.ptr[i + 1]):
+            v = e[k] * e[k]
+            t = p.d[k] * v
+            energy += t
+            if nt == 2 and k == j + 1:
+                t = p.d[k] * (v + e[k + 1] * e[k + 1])
+            if p.nu[k] * t > big and not (nt == 2 and k == j + 2):
+                big = p.nu[k] * t
+                worst = k
+    if 1e-250 < energy < 1e250 and 1e-250 < big < 1e250:
+        out.worst = worst
+        out.finite = 1
+        out.energy = sqrt(energy)
+        out.velocity = sqrt(big)
+        return
+    big = -1.0
     out.worst = -1
     out.finite = 1
     for i in range(p.n_blocks):
-        block_error(p, i, lam, w, e)
         j = p.ptr[i]
         nt = 0 if p.kind[i] == ROW else n_tangents(p.kind[i], p.ptr[i + 1] - j)
         for k in range(j, p.ptr[i + 1]):
@@ -105,7 +125,7 @@ cdef inline void score_rows(const blocks_t* p, const double* lam, const double* 
 cdef inline void add_floor(const blocks_t* p, int32_t i, double size, sum_t* total, double* big) noexcept nogil:
     cdef double f = 1.1102230246251565e-16 * (size + fabs(p.b[i])), v
     add_square(total, f / sqrt(p.d[i]))
-    v = f * sqrt(p.nu[i]) / sqrt(p.d[i])
+    v = f * (sqrt(p.nu[i]) / sqrt(p.d[i]))
     if v > big[0]:
         big[0] = v
 
@@ -113,7 +133,19 @@ cdef inline void add_floor(const blocks_t* p, int32_t i, double size, sum_t* tot
 cdef inline void csr_floor(const blocks_t* p, const csr_t* a, const double* lam, score_t* out) noexcept nogil:
     cdef int32_t i
     cdef sum_t total = sum_t(0.0, 0.0)
-    cdef double big = 0.0
+    cdef double t, energy = 0.0, big = 0.0
+    for i in range(p.n_rows):
+        t = 1.1102230246251565e-16 * (csr_abs_dot(a, i, lam) + fabs(p.b[i]))
+        t = t * t / p.d[i]
+        energy += t
+        t = p.nu[i] * t
+        if t > big:
+            big = t
+    if 1e-250 < energy < 1e250 and 1e-250 < big < 1e250:
+        out.floor_energy = sqrt(energy)
+        out.floor_velocity = sqrt(big)
+        return
+    big = 0.0
     for i in range(p.n_rows):
         add_floor(p, i, csr_abs_dot(a, i, lam), &total, &big)
     out.floor_energy = root(&total)
