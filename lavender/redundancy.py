@@ -19,7 +19,6 @@ import numpy as np
 import numpy.typing as npt
 import scipy.sparse as sp
 from lavender_ext.pivoting import Pivoting, free_block
-from scipy.linalg import lapack, qr
 
 from lavender._arrays import FloatArray
 from lavender.cones import Cones
@@ -177,10 +176,12 @@ def redundancy(problem: Problem, *, tol: float = 1e-12) -> Redundancy:
     null: list[tuple[Places, FloatArray]] = []
     if m:
         scaled = sp.csr_array(sp.diags_array(scale) @ problem.csr @ sp.diags_array(scale))
+        from scipy.sparse import csgraph
+
         root = None
         if problem.rows is not None and not np.any(problem.compliance):
             root = problem.velocity_form().jacobian
-        count, label = sp.csgraph.connected_components(scaled, directed=False)
+        count, label = csgraph.connected_components(scaled, directed=False)
         by_island = np.split(
             np.argsort(label, kind="stable"), np.cumsum(np.bincount(label, minlength=count))[:-1]
         )
@@ -222,6 +223,8 @@ def redundancy(problem: Problem, *, tol: float = 1e-12) -> Redundancy:
 
 def _by_qr(a: FloatArray, tol: float) -> Places:
     """Columns of `a` (unit length) that depend on the others, by QR with column pivoting."""
+    from scipy.linalg import qr
+
     r, order = qr(a, mode="r", pivoting=True)
     size = np.abs(np.diagonal(r)) ** 2
     rank = int(np.count_nonzero(size > tol * size[0])) if len(size) and size[0] > 0.0 else 0
@@ -230,6 +233,8 @@ def _by_qr(a: FloatArray, tol: float) -> Places:
 
 def _by_cholesky(a: FloatArray, tol: float) -> Places:
     """Rows of a semidefinite `a` (unit diagonal) that depend on the others, by Cholesky with pivoting."""
+    from scipy.linalg import lapack
+
     # Rounding alone leaves a pivot of about len(a) 2^-53.
     _, order, rank, _ = lapack.dpstrf(a, tol=max(tol, len(a) * 2.0**-52))
     return np.sort(order[rank:] - 1)
@@ -249,6 +254,8 @@ def _in_order(a: FloatArray, tail: Places, tol: float) -> Places:
 
 def _null_basis(a: FloatArray, found: Places) -> FloatArray:
     """Orthonormal null vectors, from (-A_BB^-1 A_Bi, e_i) for each redundant row i."""
+    from scipy.linalg import lapack
+
     kept = np.setdiff1d(np.arange(len(a)), found)
     vectors = np.zeros((len(a), len(found)))
     vectors[found] = np.eye(len(found))

@@ -41,7 +41,9 @@ def choose(problem: Problem) -> tuple[str, int, IntArray]:
         return "dense", m - 1, order
     # A band needs 2 band + 1 places a row: a mean row of more nonzeros than that has none so narrow.
     if nnz <= (2 * SMALL_BAND + 1) * m:
-        order = sp.csgraph.reverse_cuthill_mckee(problem.csr, symmetric_mode=True).astype(np.int32)
+        from scipy.sparse.csgraph import reverse_cuthill_mckee
+
+        order = reverse_cuthill_mckee(problem.csr, symmetric_mode=True).astype(np.int32)
         band = permuted_band(problem, order)
         if band <= SMALL_BAND:
             return "band", band, order
@@ -155,10 +157,12 @@ class GeneralFactor:
             self.lu = (lu, pivot)
 
     def _factor_sparse(self, a: sp.csc_array) -> None:
+        from scipy.sparse.linalg import splu
+
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
-                self.lu = sp.linalg.splu(a)
+                self.lu = splu(a)
             pivot = np.abs(self.lu.U.diagonal())
         except RuntimeError:  # exactly singular
             pivot = np.zeros(1)
