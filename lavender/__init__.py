@@ -18,6 +18,7 @@ from lavender.errors import (
     UnknownName,
 )
 from lavender.problem import Problem, Rows
+from lavender.redundancy import Redundancy, redundancy
 from lavender.registry import SolverSpec, available, get, known, register
 from lavender.residuals import Residual, residual
 from lavender.solution import Claim, Solution, Status
@@ -57,6 +58,7 @@ __all__ = [
     "InputError",
     "LavenderError",
     "Problem",
+    "Redundancy",
     "Residual",
     "Rows",
     "Scene",
@@ -77,6 +79,7 @@ __all__ = [
     "io",
     "known",
     "prepare",
+    "redundancy",
     "register",
     "report",
     "residual",
