@@ -1,10 +1,11 @@
 """Cost of an engine's step at steady contact, with what the step leaves behind: LavenderSim, MuJoCo, PyBullet.
 
-    python benchmarks/bench_engine.py [--sweeps 16] [--scenes stack pyramid10 ...] [--json FILE]
+    python benchmarks/bench_engine.py [--sweeps 16] [--scenes stack6 pyramid55 ...] [--json FILE]
+    python benchmarks/bench_engine.py --detail        what each level of detail of one scene costs
 
 Every engine steps the same bodies (unit boxes, 1 kg; spheres of 0.5 m) with dt = 1/240 s, the same number of
 solver iterations at tolerance 0, warm-started, friction 0.5. After a settling time, the time is the least
-mean of seven batches of steps in a row (noise only adds), state changing all the while. Beside it stand
+mean of many short batches of steps in a row (noise only adds), state changing all the while. Beside it stand
 contacts, deepest penetration and the largest speed left; speed and penetration are compared because a
 residual of other engines' problems is not published. For LavenderSim also the judge's relative residual
 over all rows, and the share of each phase. MuJoCo: PGS, elliptic cones. PyBullet: maximal coordinates for
@@ -26,10 +27,10 @@ from typing import Any
 for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(variable, "1")
 
-import numpy as np
+import numpy as np  # noqa: E402
 
-import lavender as lv
-from lavender.scene import Box, Plane, Sphere
+import lavender as lv  # noqa: E402
+from lavender.scene import Box, Plane, Sphere  # noqa: E402
 
 DT = 1.0 / 240.0
 SCENES: dict[str, tuple[str, dict[str, Any], int]] = {  # name, parameters, steps to settle
@@ -64,11 +65,11 @@ def scene_of(name: str, sweeps: int) -> lv.Scene:
     return lv.Scene(gallery, dt=DT, solver_iterations=sweeps, **parameters)
 
 
-def least(step: Callable[[], Any], batches: int = 7, budget: float = 0.15) -> float:
-    """Least mean time of a batch [s]."""
+def least(step: Callable[[], Any], batches: int = 400, budget: float = 0.001) -> float:
+    """Least mean time [s] of batches of about `budget` seconds."""
     start = perf_counter()
     step()
-    n = max(1, min(400, int(budget / max(perf_counter() - start, 1e-6))))
+    n = max(1, min(200, int(budget / max(perf_counter() - start, 1e-6))))
     best = np.inf
     for _ in range(batches):
         start = perf_counter()
@@ -258,6 +259,43 @@ def pybullet_row(name: str, sweeps: int) -> Row:
         p.disconnect(client)
 
 
+# -- levels of detail -------------------------------------------------------------------------------
+
+
+def detail() -> None:
+    """One pile, with more and more declared: rows, bytes and time that each level brings."""
+    from lavender.engine.state import State
+
+    levels = (
+        ("frictionless spheres", {"friction": 0.0}),
+        ("friction disk", {}),
+        ("and patch friction", {"patch_radius": 0.05}),
+        ("frictionless boxes", {"friction": 0.0, "kind": "boxes"}),
+        ("boxes with friction disk", {"kind": "boxes"}),
+        ("and patch friction", {"kind": "boxes", "patch_radius": 0.05}),
+    )
+    print(
+        f"{'pile of 200':<26}{'rows/contact':>13}{'bytes/body':>12}{'bytes/contact':>14}{'contacts':>9}"
+        f"{'us/step':>9}{'ns/contact':>11}"
+    )
+    for label, more in levels:
+        sim = lv.Simulation(lv.Scene("pile", n=200, dt=DT, **more))
+        for _ in range(960):
+            sim.step()
+        seconds = least(lambda sim=sim: sim._state.kernel.substeps(1))
+        sizes = []
+        for bodies, contacts in ((0, 0), (0, 1000), (1000, 0)):
+            size = sim._state.size.copy()
+            size[[0, 1, 9]] += (bodies, bodies, contacts)
+            size[6] += bodies if size[6] else 0
+            sizes.append(State(size).nbytes)
+        c = int(sim._state.head[0])
+        print(
+            f"{label:<26}{int(sim._state.size[7]):>13}{(sizes[2] - sizes[0]) // 1000:>12}"
+            f"{(sizes[1] - sizes[0]) // 1000:>14}{c:>9}{1e6 * seconds:>9.0f}{1e9 * seconds / c:>11.0f}"
+        )
+
+
 ENGINES: dict[str, tuple[str, Callable[[str, int], Row]]] = {
     "lavender": ("lavender", lavender_row),
     "mujoco": ("mujoco", mujoco_row),
@@ -280,7 +318,12 @@ def main() -> None:
     parse.add_argument("--scenes", nargs="+", default=list(SCENES), choices=list(SCENES))
     parse.add_argument("--engines", nargs="+", default=list(ENGINES), choices=list(ENGINES))
     parse.add_argument("--json", default=None, help="write the rows here too")
+    parse.add_argument(
+        "--detail", action="store_true", help="levels of detail of one scene, LavenderSim alone"
+    )
     given = parse.parse_args()
+    if given.detail:
+        return detail()
     versions = {}
     for name in given.engines:
         versions[name] = lv.__version__ if name == "lavender" else available(ENGINES[name][0])
@@ -291,7 +334,8 @@ def main() -> None:
         + ", ".join(f"{k} {v}" for k, v in versions.items() if v)
     )
     print(
-        f"{'scene':<12}{'engine':<12}{'sweeps':>7}{'ms/step':>10}{'contacts':>9}{'depth mm':>10}{'speed m/s':>11}{'residual':>10}  phases [us]"
+        f"{'scene':<12}{'engine':<12}{'sweeps':>7}{'ms/step':>10}{'contacts':>9}{'depth mm':>10}"
+        f"{'speed m/s':>11}{'residual':>10}  phases [us]"
     )
     rows = []
     for scene in given.scenes:

@@ -160,8 +160,8 @@ cdef struct engine_t:
     # the velocity problem, as blocks_t and rows_t see it
     int32_t* ptr            # (kj + c + 1)
     int32_t* kind           # (kj + c)
-    double* lower           # (m) N s
-    double* upper           # (m) N s
+    double* lower           # (mj) N s, of the joint rows
+    double* upper           # (mj) N s
     double* mu              # (kj + c)
     double* patch_radius    # (kj + c) m
     double* b               # (m) m/s
@@ -237,8 +237,8 @@ cdef inline void bind(const int32_t* size, double* real, int32_t* index, uint64_
     e.cache_local = reals(real, &i, 6 * c)
     e.push = reals(real, &i, mj + c)
     e.target = reals(real, &i, m)
-    e.lower = reals(real, &i, m)
-    e.upper = reals(real, &i, m)
+    e.lower = reals(real, &i, mj)
+    e.upper = reals(real, &i, mj)
     e.b = reals(real, &i, m)
     e.d = reals(real, &i, m)
     e.step = reals(real, &i, m)
