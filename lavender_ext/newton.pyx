@@ -77,20 +77,26 @@ cdef struct elements_t:
     const double* upper         # (m)
     const double* at            # (n) a_t
     const double* as_           # (n) a_s
+    double* scaling             # (n, 10) w and eta of the element's cones, once lav_ipm_scale has run
 
 
 # -- small dense blocks ---------------------------------------------------------------------------
 
 
 cdef inline void sub_product(double* w, const double* y, const double* lt, const int32_t s) noexcept nogil:
-    # w -= y l^T, l given transposed
+    # w -= y l^T, l given transposed; one row of w at a time in registers
     cdef int32_t r, c, t
     cdef double x
+    cdef double row[6]
     for r in range(s):
+        for c in range(s):
+            row[c] = w[r * s + c]
         for t in range(s):
             x = y[r * s + t]
             for c in range(s):
-                w[r * s + c] -= x * lt[t * s + c]
+                row[c] -= x * lt[t * s + c]
+        for c in range(s):
+            w[r * s + c] = row[c]
 
 
 cdef inline void sub_square(double* w, const double* y, const int32_t s) noexcept nogil:
@@ -489,7 +495,7 @@ cdef public void lav_block_pattern(int32_t n, const int32_t* nptr, const int32_t
 # -- the normal matrix ------------------------------------------------------------------------------
 
 
-cdef inline void add_outer(double* out, const double* left, const double* right, double x, int32_t s) noexcept nogil:
+cdef inline void add_outer(double* out, const double* left, const double* right, double x, const int32_t s) noexcept nogil:
     cdef int32_t i, j
     cdef double t
     for i in range(s):
@@ -498,9 +504,27 @@ cdef inline void add_outer(double* out, const double* left, const double* right,
             out[i * s + j] += t * right[j]
 
 
+cdef inline void add_product(double* out, const double* left, const double* right, int32_t nr, bint lower,
+                             const int32_t s) noexcept nogil:
+    # out += left^T right, (nr, 2 s) rows of which s columns are read; the lower triangle alone on request
+    cdef int32_t i, j, r
+    cdef double x
+    cdef double row[6]
+    for i in range(s):
+        for j in range(s):
+            row[j] = 0.0
+        for r in range(nr):
+            x = left[r * 2 * s + i]
+            for j in range(s):
+                row[j] += x * right[r * 2 * s + j]
+        for j in range(i + 1 if lower else s):
+            out[i * s + j] += row[j]
+
+
 cdef inline void add_elements(const elements_t* e, const double* v, const factor_t* f, int32_t lu, const int32_t s) noexcept nogil:
-    cdef int32_t i, j, r, c, nr, first, second, n_blocks = f.nptr[f.n]
+    cdef int32_t i, j, k, r, c, nr, first, second, n_blocks = f.nptr[f.n]
     cdef int64_t b = s * s, q
+    cdef double t[48]
     cdef const double *pr
     cdef const double *pc
     cdef const int32_t *slot
@@ -524,20 +548,32 @@ cdef inline void add_elements(const elements_t* e, const double* v, const factor
         slot = e.slot + 3 * i
         if first < 0:
             continue
-        for r in range(nr):
-            pr = e.panel + <int64_t>(j + r) * 2 * s
-            for c in range(nr):
-                x = v[e.wptr[i] + r * nr + c]
-                if x == 0.0:
-                    continue
-                pc = e.panel + <int64_t>(j + c) * 2 * s
-                add_outer(f.nval + slot[0] * b, pr, pc, x, s)
+        pr = e.panel + <int64_t>j * 2 * s
+        if nr == 1:
+            x = v[e.wptr[i]]
+            if x != 0.0:
+                add_outer(f.nval + slot[0] * b, pr, pr, x, s)
                 if second >= 0:
-                    add_outer(f.nval + slot[1] * b, pr + s, pc + s, x, s)
-                    add_outer(f.nval + slot[2] * b, pr, pc + s, x, s)
+                    add_outer(f.nval + slot[1] * b, pr + s, pr + s, x, s)
+                    add_outer(f.nval + slot[2] * b, pr, pr + s, x, s)
                     if lu:
-                        # block (second, first) transposed: entries [first column, second row]
-                        add_outer(f.mval + slot[2] * b, pc, pr + s, x, s)
+                        add_outer(f.mval + slot[2] * b, pr, pr + s, x, s)
+            continue
+        for r in range(nr):                             # t = V K of this element, (nr, 2 s)
+            for c in range(2 * s):
+                t[r * 2 * s + c] = 0.0
+            for k in range(nr):
+                x = v[e.wptr[i] + r * nr + k]
+                pc = pr + k * 2 * s
+                for c in range(2 * s):
+                    t[r * 2 * s + c] += x * pc[c]
+        add_product(f.nval + slot[0] * b, pr, t, nr, not lu, s)
+        if second >= 0:
+            add_product(f.nval + slot[1] * b, pr + s, t + s, nr, not lu, s)
+            add_product(f.nval + slot[2] * b, pr, t + s, nr, False, s)
+            if lu:
+                # block (second, first) of K^T V K, transposed: (V K_first)^T K_second
+                add_product(f.mval + slot[2] * b, t, pr + s, nr, False, s)
     if lu:
         # The mirror of a diagonal block is its transpose; only off-diagonal blocks are read there.
         for i in range(f.n):
@@ -925,16 +961,17 @@ cdef public double lav_ipm_start(const elements_t* e, const double* hz, double* 
     return degree
 
 
-cdef inline double cone_parts(const double* s, const double* u, int32_t n, double a, double delta, double* h,
-                              double* c, double* root) noexcept nogil:
+cdef inline double cone_parts(const double* s, const double* u, int32_t n, double a, double delta, double* w,
+                              double* h, double* c, double* root) noexcept nogil:
     # (T^-2 + delta)^-1 between G^-1 and G^-T as x [1 h][1 h]^T + [0 0; 0 c]: returns x, the normal's own entry.
     # Through the eigenvalues of T^2, eta^2 (w0 +- |w1|)^2 along (1, +-w1/|w1|) and eta^2 across: as a matrix
     # T^-2 would lose the small ones. c and its square root are (n - 1, n - 1).
-    cdef double w[4]
+    # w (5) keeps the scaling and eta.
     cdef double d[4]
     cdef double eta, size = 0.0, grow, shrink, across, along, x, gn = on_normal(a), gt = on_tangent(a)
     cdef int32_t k, l, nt = n - 1
     nt_scaling(s, u, n, w, &eta)
+    w[4] = eta
     for k in range(1, n):
         size += w[k] * w[k]
     size = sqrt(size)
@@ -1001,13 +1038,13 @@ cdef public void lav_ipm_scale(const elements_t* e, const double* z, const doubl
             load_dual(e, i, 0, u1, u2, u)
             for k in range(n):
                 total += s[k] * u[k]
-            x = cone_parts(s, u, n, e.at[i], delta, h, c, root)
+            x = cone_parts(s, u, n, e.at[i], delta, e.scaling + 10 * i, h, c, root)
         if e.kind[i] == SPIN:
             # Two cones share the normal: their parallel sum there, each of the others follows it.
             gather(e, i, 1, z, s)
             load_dual(e, i, 1, u1, u2, u)
             total += s[0] * u[0] + s[1] * u[1]
-            y = cone_parts(s, u, 2, e.as_[i], delta, hs, cs, rs)
+            y = cone_parts(s, u, 2, e.as_[i], delta, e.scaling + 10 * i + 5, hs, cs, rs)
             x = x * (y / (x + y)) if n > 1 else y
         for k in range(nr * nr):
             v[q + k] = 0.0
@@ -1061,16 +1098,15 @@ cdef inline void dual_step(const elements_t* e, int32_t i, int32_t which, const 
                            const double* u2, const double* dz, const double* da, double sigma_mu, double* s,
                            double* u, double* ds, double* du, double* rhs) noexcept nogil:
     # (3) where da is NULL, else (4); rhs = T^-1 (v \ c) in the cone's coordinates. dz NULL: rhs alone.
-    cdef double w[4]
     cdef double v[4]
     cdef double x[4]
     cdef double y[4]
     cdef double c[4]
-    cdef double eta
+    cdef const double *w = e.scaling + 10 * i + 5 * which
+    cdef double eta = w[4]
     cdef int32_t n = cone_size(e, i, which), k
     gather(e, i, which, z, s)
     load_dual(e, i, which, u1, u2, u)
-    nt_scaling(s, u, n, w, &eta)
     if da == NULL:
         for k in range(n):
             rhs[k] = u[k]
@@ -1460,7 +1496,8 @@ cdef class Elements:
     cdef readonly int m, n, n_small
 
     def __init__(self, ptr, kind, wptr, node, slot, panel, theta, g, lower, upper, at, as_, int s):
-        self.keep = [ptr, kind, wptr, node, slot, panel, theta, g, lower, upper, at, as_]
+        scaling = np.zeros(10 * len(kind) if len(kind) < len(g) else 0)
+        self.keep = [ptr, kind, wptr, node, slot, panel, theta, g, lower, upper, at, as_, scaling]
         self.n = len(kind)
         self.m = len(g)
         self.n_small = int(wptr[len(kind)])
@@ -1468,7 +1505,7 @@ cdef class Elements:
             self.n, self.m, s, <int32_t*>address(ptr), <int32_t*>address(kind), <int32_t*>address(wptr),
             <int32_t*>address(node), <int32_t*>address(slot), <double*>address(panel), <double*>address(theta),
             <double*>address(g), <double*>address(lower), <double*>address(upper), <double*>address(at),
-            <double*>address(as_))
+            <double*>address(as_), <double*>address(scaling))
 
     def start(self, const double[::1] hz, double[::1] z, double[::1] u1, double[::1] u2):
         """z, u inside their cones; returns the degree."""

@@ -28,14 +28,14 @@ def solve_coulomb(run: Run, z: FloatArray, cold: bool) -> None:
     plain = Proximal(z, AUGMENTED, 1e-3 if system.sc.m < LARGE else 1e-2)
     if not cold or not _is_heavy(run):
         plain.advance(run, STRETCH // 3)
-        if run.done or run.at_floor():
+        if run.done() or run.at_floor():
             return
         near = Proximal(InteriorPoint(system).everything, AUGMENTED, 1e-4)
         near.advance(run, STRETCH // 2)
-        if run.done or run.at_floor():
+        if run.done() or run.at_floor():
             return
         _pursue(run, plain)
-    if run.done or run.at_floor():
+    if run.done() or run.at_floor():
         return
     g = system.sc.g
     given = g.copy()
@@ -46,16 +46,18 @@ def solve_coulomb(run: Run, z: FloatArray, cold: bool) -> None:
             solve_convex(convex, point, cold=outer == 0)
             point = convex.best_z
             g[:] = given
-            run.log.append(f"convex {convex.best:.0e}")
+            run.count("convex starts")
+            for stage, number in convex.stages.items():
+                run.stages[stage] = run.stages.get(stage, 0) + number
             run.score(point)
-            if run.done:
+            if run.done():
                 return
             _pursue(run, Proximal(point.copy(), AUGMENTED, 1e-3))
-            if run.done or run.at_floor():
+            if run.done() or run.at_floor():
                 return
             if not plain.stuck:
                 plain.advance(run, STRETCH)
-                if run.done or run.at_floor():
+                if run.done() or run.at_floor():
                     return
             _lower_normals(run, given, point)
     finally:
@@ -64,7 +66,7 @@ def solve_coulomb(run: Run, z: FloatArray, cold: bool) -> None:
 
 def _pursue(run: Run, method: Proximal) -> None:
     # As long as each stretch brings the residual down to a third.
-    while not run.done and not method.stuck:
+    while not run.done() and not method.stuck:
         before = run.best
         method.advance(run, STRETCH)
         if run.best > 0.3 * before or run.at_floor():

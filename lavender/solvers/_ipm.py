@@ -76,10 +76,10 @@ class Scaled:
 def scaled(problem: Problem) -> Scaled:
     """Scale, and take out what cannot move."""
     cones, d, m = problem.cones, problem.d, problem.m
-    size = np.diff(cones.ptr)
+    size: IntArray = np.diff(cones.ptr).astype(np.int32)
     single = cones.is_bounded_rows
     fixed = np.zeros(m)
-    still = cones.lower == cones.upper
+    still = np.asarray(cones.lower == cones.upper)
     if single:
         row = np.repeat(cones.kind == ROW, size)
     else:
@@ -91,14 +91,13 @@ def scaled(problem: Problem) -> Scaled:
         still = still | (contact & (position > 0) & ((mu == 0.0) | (spin & (radius == 0.0))))
     fixed[still] = np.where(np.isfinite(cones.lower[still]), cones.lower[still], 0.0)
     for i in problem.data.empty:
-        block = problem.block_of(int(i))
-        if cones.kind[block] == ROW or size[block] == 1:
-            still = still.copy() if still.base is not None else still
+        j = problem.block_of(int(i))
+        if cones.kind[j] == ROW or size[j] == 1:
             still[i] = True
             bound = cones.upper[i] if problem.b[i] > 0.0 else cones.lower[i] if problem.b[i] < 0.0 else 0.0
             fixed[i] = np.clip(bound if np.isfinite(bound) else 0.0, cones.lower[i], cones.upper[i])
     whole = not still.any()
-    keep = np.arange(m, dtype=np.int32) if whole else np.flatnonzero(~still).astype(np.int32)
+    keep: IntArray = (np.arange(m) if whole else np.flatnonzero(~still)).astype(np.int32)
     b = problem.b if whole or not fixed.any() else problem.b + _minus_fixed(problem, fixed)
     scale = 1.0 / np.sqrt(d if whole else d[keep])
     mk = len(keep)
@@ -106,9 +105,8 @@ def scaled(problem: Problem) -> Scaled:
     theta = np.zeros(mk) if compliance is None else (compliance[keep] * scale * scale)
     lower, upper = cones.lower[keep] / scale, cones.upper[keep] / scale
     if single:
-        n = mk
-        ptr, kind = np.arange(n + 1, dtype=np.int32), np.zeros(n, np.int32)
-        a_t = a_s = np.zeros(n)
+        ptr, kind = np.arange(mk + 1, dtype=np.int32), np.zeros(mk, np.int32)
+        a_t = a_s = np.zeros(mk)
         wptr = ptr
     else:
         block = np.repeat(np.arange(len(size)), size)[keep]
@@ -136,7 +134,23 @@ def scaled(problem: Problem) -> Scaled:
         per_block = np.concatenate([rows.joint_body, rows.contact_body])
         element_block = np.repeat(np.arange(len(size)), size)[keep][ptr[:-1]]
         bodies = np.ascontiguousarray(per_block[element_block], np.int32)
-    return Scaled(problem, keep, fixed, scale, b[keep] * scale, theta, ptr, kind, wptr, lower, upper, a_t, a_s, bodies, whole)
+    return Scaled(
+        problem,
+        keep,
+        fixed,
+        scale,
+        b[keep] * scale,
+        theta,
+        ptr,
+        kind,
+        wptr,
+        lower,
+        upper,
+        a_t,
+        a_s,
+        bodies,
+        whole,
+    )
 
 
 def _minus_fixed(problem: Problem, fixed: FloatArray) -> FloatArray:
@@ -149,6 +163,7 @@ class System:
 
     form = ""
     factorisations = 0
+    law = CONVEX  # of the last natural map
 
     def __init__(self, sc: Scaled) -> None:
         self.sc = sc
@@ -214,8 +229,7 @@ class VelocitySystem(System):
         kernels.panel(sc.problem.data, rows.inv_inertia, np.sqrt(rows.inv_mass), full)
         if not sc.whole:
             full = full[sc.keep]
-        used = full.any(axis=0)
-        used = used[:6] | used[6:]
+        used = np.any(full.reshape(-1, 2, 6), axis=(0, 1)).reshape(6)
         s = max(1, int(used.sum()))
         s = next(k for k in (1, 2, 3, 6) if k >= s)
         columns = np.flatnonzero(used)
@@ -237,6 +251,7 @@ class VelocitySystem(System):
         self.y, self.y2 = np.zeros((2, self.n * s + 1))
         self.cones = len(sc.kind) < sc.m
         self.factor: Any = None
+        self.factor_unsymmetric = False
 
     def _factor(self, lu: bool) -> bool:
         if self.factor is None or (lu and not self.factor_unsymmetric):
@@ -302,7 +317,9 @@ class MatrixSystem(System):
         sc.theta = np.zeros(m)
         self.symmetric = sc.problem.is_symmetric
         n = len(sc.kind)
-        self.elements = self._elements(np.full((n, 2), -1, np.int32), np.zeros((n, 3), np.int32), np.zeros((m, 2)), 1)
+        self.elements = self._elements(
+            np.full((n, 2), -1, np.int32), np.zeros((n, 3), np.int32), np.zeros((m, 2)), 1
+        )
         # Rows and columns of the elements' small matrices, row by row of each.
         size = np.diff(sc.ptr)
         nr = np.repeat(size, size**2)
@@ -450,8 +467,14 @@ class InteriorPoint:
         sy, sc = self.system, self.system.sc
         m = sc.m
         size = np.diff(sc.ptr)
-        free = (sc.kind == ROW) & np.isinf(sc.lower[sc.ptr[:-1]]) & np.isinf(sc.upper[sc.ptr[:-1]]) if m else np.zeros(0, bool)
-        diagonal = np.repeat(sc.wptr[:-1], size) + (np.arange(m) - np.repeat(sc.ptr[:-1], size)) * (np.repeat(size, size) + 1)
+        free = (
+            (sc.kind == ROW) & np.isinf(sc.lower[sc.ptr[:-1]]) & np.isinf(sc.upper[sc.ptr[:-1]])
+            if m
+            else np.zeros(0, bool)
+        )
+        diagonal = np.repeat(sc.wptr[:-1], size) + (np.arange(m) - np.repeat(sc.ptr[:-1], size)) * (
+            np.repeat(size, size) + 1
+        )
         sy.v[:] = 0.0
         sy.v[diagonal] = 1.0 / (sc.theta + np.where(np.repeat(free, size), DELTA, START))
         if sy.bt is not None:

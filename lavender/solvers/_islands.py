@@ -26,9 +26,7 @@ def islands(problem: Problem) -> tuple[int, IntArray]:
         body = np.concatenate([problem.rows.joint_body, problem.rows.contact_body])
         block, side = np.nonzero(body >= 0)
         index = k + body[block, side]
-        graph = sp.coo_array(
-            (np.ones(len(block)), (block, index)), shape=(k + problem.rows.n_bodies,) * 2
-        )
+        graph = sp.coo_array((np.ones(len(block)), (block, index)), shape=(k + problem.rows.n_bodies,) * 2)
     else:
         a = problem.csr
         of_row = np.repeat(np.arange(k), np.diff(problem.cones.ptr))

@@ -38,13 +38,20 @@ class Run:
     best: float = np.inf
     best_z: FloatArray = field(init=False)
     floor: float = 0.0
-    log: list[str] = field(default_factory=list)
+    stages: dict[str, int] = field(default_factory=dict)  # what ran, for the message
     certificate: FloatArray | None = None  # (m,) N s: no solution exists
 
     def __post_init__(self) -> None:
         m = self.system.sc.problem.m
         self.w, self.e = np.empty(m), np.empty(m)
         self.best_z = np.zeros(self.system.sc.m)
+
+    def count(self, stage: str) -> None:
+        self.stages[stage] = self.stages.get(stage, 0) + 1
+
+    @property
+    def message(self) -> str:
+        return ", ".join(f"{n} {stage}" for stage, n in self.stages.items())
 
     def score(self, z: FloatArray) -> float:
         """Relative residual of z; keeps the best."""
@@ -54,11 +61,9 @@ class Run:
             self.best, self.best_z = relative, z.copy()
         return relative
 
-    @property
     def reached(self) -> bool:
         return self.best <= self.tol
 
-    @property
     def spent(self) -> bool:
         return self.system.factorisations >= self.budget or perf_counter() >= self.deadline
 
@@ -70,9 +75,8 @@ class Run:
         relative, self.floor = quick(sc.problem, sc.impulse(self.best_z), self.w, self.e, True)
         return relative <= 2.0 * self.floor
 
-    @property
     def done(self) -> bool:
-        return self.reached or self.certificate is not None or self.spent
+        return self.reached() or self.certificate is not None or self.spent()
 
     def certify(self, y: FloatArray) -> None:
         """Keep the direction y (scaled) if it proves that there is no solution."""
@@ -134,10 +138,11 @@ def polish(run: Run, z: FloatArray, law: int = CONVEX, *, patience: int = 2, lim
     worse = 0
     best = run.score(z)
     for _ in range(limit):
-        if run.done:
+        if run.done():
             return
         system.natural(z, system.times(z) - system.sc.g, law, EPS, f)
         system.factor_natural(EPS)
+        run.count("polish steps")
         z = z + refined(system, -f)
         if not np.isfinite(z).all():
             return
@@ -176,12 +181,12 @@ class Proximal:
         system = run.system
         last = system.factorisations + limit
         run.score(self.z)
-        while not run.done and not self.stuck and system.factorisations < last:
+        while not run.done() and not self.stuck and system.factorisations < last:
             if run.best < self.probed and self.alpha > PROBE:
                 # Near enough, plain Newton steps may end it: asked once for each decade.
                 polish(run, run.best_z.copy(), self.law, limit=4)
                 self.probed = 0.1 * run.best
-                if run.done:
+                if run.done():
                     break
             before, start, centre = run.best, system.factorisations, self.z
             solved = self._round(run)
@@ -191,7 +196,7 @@ class Proximal:
                 if run.certificate is not None:
                     break
             used = system.factorisations - start
-            run.log.append(f"{self.alpha:.0e}:{used}{'' if solved else '!'}:{run.best:.0e}")
+            run.count("proximal rounds")
             if run.best > 0.5 * before and run.at_floor():
                 break
             self._adapt(solved, used, run.best > 0.5 * before)
@@ -210,7 +215,7 @@ class Proximal:
             if (size <= INNER_TOL * history[0] and len(history) > 1) or size == 0.0:
                 solved = True
                 break
-            if run.spent:
+            if run.spent():
                 break
             system.factor_natural(alpha)
             dz = system.solve_natural(-f)
@@ -255,16 +260,17 @@ def solve_convex(run: Run, z: FloatArray, cold: bool) -> None:
     rows = len(system.sc.kind) == system.sc.m
     if not cold:
         polish(run, z, patience=1)
-        if run.done:
+        if run.done():
             return
     ip = InteriorPoint(system)
     if rows:
         polish(run, ip.everything, patience=1, limit=3)
     trigger = 1e-2
     lowest, idle = np.inf, 0
-    while not run.done:
+    while not run.done():
         if not ip.step():
             break
+        run.count("interior point steps")
         relative = run.score(ip.z)
         idle = 0 if relative < 0.5 * lowest or ip.gap < 0.5 * ip.lowest_gap else idle + 1
         lowest = min(lowest, relative)
@@ -281,7 +287,7 @@ def solve_convex(run: Run, z: FloatArray, cold: bool) -> None:
                 return
         if ip.length < 1e-6 or ip.gap < 1e-24 * ip.first_gap:
             break
-    if not run.done:
+    if not run.done():
         Proximal(run.best_z.copy(), alpha=1e-3).advance(run)
 
 

@@ -205,7 +205,9 @@ def _solve(trail: Trail, budget: int) -> None:
 def _sweeps_first(problem: Problem) -> bool:
     """Whether sweeps are worth a try, by what is known without looking closer."""
     if problem.law == "lcp":
-        return problem.is_symmetric and not (_is_small_or_narrow(problem) or _is_heavy(problem) or _is_redundant(problem))
+        return problem.is_symmetric and not (
+            _is_small_or_narrow(problem) or _is_heavy(problem) or _is_redundant(problem)
+        )
     return not _is_heavy(problem)
 
 
@@ -213,7 +215,12 @@ def _sweep(trail: Trail, budget: int) -> bool:
     problem = trail.problem
     if problem.law == "lcp":
         return _sweeps(trail, "nncg", budget, _cap(problem))
-    if problem.law == "coulomb" and problem.m >= LARGE and problem.rows is not None and _relaxation(trail, budget):
+    if (
+        problem.law == "coulomb"
+        and problem.m >= LARGE
+        and problem.rows is not None
+        and _relaxation(trail, budget)
+    ):
         return True
     return _sweeps(trail, "anderson", budget, _cap(problem))
 
@@ -236,7 +243,7 @@ def _apart(trail: Trail, count: int, label: IntArray, budget: int) -> None:
     kinds: dict[str, int] = {}
     impulse = trail.impulse.copy()
     for i in np.flatnonzero(wrong):
-        blocks = order[ends[i] : ends[i + 1]]
+        blocks: IntArray = order[ends[i] : ends[i + 1]].astype(np.int32)
         rows = rows_of(problem, blocks)
         part = restrict(problem, blocks, rows)
         e0, v0 = reference(part)
@@ -268,6 +275,7 @@ def _connected(trail: Trail, budget: int, swept: bool) -> None:
     problem = trail.problem
     if trail.best <= trail.tol or budget <= trail.iterations:
         return
+    names: tuple[str, ...]
     if problem.law == "linear":
         names = ("direct", "newton")
     elif problem.law != "lcp":
@@ -308,7 +316,12 @@ def _certify(trail: Trail) -> None:
     """Look for a proof that an LCP without upper bounds has no solution, whatever its A."""
     problem = trail.problem
     cones = problem.cones
-    if problem.law not in ("linear", "lcp") or problem.m > CERTIFICATE_ROWS or trail.best < 1e-6 or trail.late:
+    if (
+        problem.law not in ("linear", "lcp")
+        or problem.m > CERTIFICATE_ROWS
+        or trail.best < 1e-6
+        or trail.late
+    ):
         return
     free = np.isneginf(cones.lower) & np.isposinf(cones.upper)
     if not np.all(free | ((cones.lower == 0.0) & np.isposinf(cones.upper))):

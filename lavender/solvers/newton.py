@@ -33,7 +33,7 @@ FORMS = ("auto", "velocity", "impulse")
 
 @dataclass
 class NewtonState:
-    """The system; `done` is set once its numbers belong to an earlier run."""
+    """The system of a problem, made once."""
 
     problem: Problem
     system: System | None  # None where nothing moves
@@ -56,7 +56,9 @@ class Newton:
         if self.form not in FORMS:
             raise InputError(f"form is {self.form!r}; one of {', '.join(FORMS)} is needed")
         if self.form == "velocity" and problem.rows is None:
-            raise InputError("form='velocity' needs a problem with rows (Problem.from_rows); this one was given as a matrix")
+            raise InputError(
+                "form='velocity' needs a problem with rows (Problem.from_rows); this one was given as a matrix"
+            )
         if problem.m == 0:
             return NewtonState(problem, None)
         form = self.form
@@ -84,7 +86,7 @@ class Newton:
         cold = bool(np.array_equal(impulse, problem.start()))
         z = system.sc.unknown(impulse)
         run.score(z)
-        if not run.done:
+        if not run.done():
             if problem.law == "coulomb":
                 solve_coulomb(run, z, cold)
             else:
@@ -92,7 +94,7 @@ class Newton:
         impulse[:] = system.sc.impulse(run.best_z)
         if run.certificate is not None:
             status = Status.INFEASIBLE
-        elif run.reached:
+        elif run.reached():
             status = Status.CONVERGED
         elif run.at_floor():
             status = Status.FLOOR
@@ -103,7 +105,14 @@ class Newton:
         else:
             status = Status.STALLED
         work = {"factorisations": system.factorisations}
-        return Claim(status, system.factorisations, work, " ".join(run.log), form=system.form, certificate=run.certificate)
+        return Claim(
+            status,
+            system.factorisations,
+            work,
+            run.message,
+            form=system.form,
+            certificate=run.certificate,
+        )
 
 
 SPEC = SolverSpec(

@@ -1,0 +1,150 @@
+"""auto: what it chooses, that it says so, islands, certificates, and that it gets there."""
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+from hypothesis import given, settings
+from random_problems import as_matrix, random_contact_problem, random_lcp, seeds
+
+import lavender as lv
+from lavender import registry, suite
+from lavender.solvers._islands import islands, restrict, rows_of
+
+
+def good(solution, tol):
+    return solution.residual.relative <= max(tol, 2.0 * solution.residual.floor) and not solution.contradicted
+
+
+def several(count, seed=0, friction="coulomb"):
+    """`count` problems side by side as one matrix, blocks shuffled."""
+    parts = [
+        as_matrix(random_contact_problem(seed + i, friction=friction, bodies=4, contacts=4, joints=1))
+        for i in range(count)
+    ]
+    a = sp.block_diag([p.csr + 0.2 * sp.eye_array(p.m) for p in parts], format="csr")
+    offset = np.cumsum([0] + [p.m for p in parts])
+    ptr = np.concatenate(
+        [p.cones.ptr[:-1] + o for p, o in zip(parts, offset[:-1], strict=True)] + [[offset[-1]]]
+    )
+    join = lambda name: np.concatenate([getattr(p.cones, name) for p in parts])  # noqa: E731
+    cones = lv.Cones(ptr, join("kind"), join("lower"), join("upper"), join("mu"), join("patch_radius"))
+    return lv.Problem(np.concatenate([p.b for p in parts]), cones, a, friction=friction), offset
+
+
+@given(seed=seeds)
+@settings(max_examples=30)
+def test_islands_of_rows_and_of_their_matrix_are_the_same(seed):
+    problem = random_contact_problem(seed, bodies=9, joints=2, contacts=5)
+    count, label = islands(problem)
+    count_of_matrix, label_of_matrix = islands(as_matrix(problem))
+    # Blocks that share a body may still not touch in A, where rows happen to be orthogonal; not at random.
+    assert count == count_of_matrix
+    assert np.array_equal(label, label_of_matrix)
+    assert np.array_equal(np.unique(label), np.arange(count))
+
+
+@pytest.mark.parametrize("form", ["rows", "matrix"])
+@given(seed=seeds)
+@settings(max_examples=25)
+def test_an_island_alone_is_the_part_of_the_whole(form, seed):
+    problem = random_contact_problem(seed, bodies=9, joints=2, contacts=6)
+    problem = problem if form == "rows" else as_matrix(problem)
+    count, label = islands(problem)
+    a = problem.dense()
+    for i in range(count):
+        blocks = np.flatnonzero(label == i)
+        rows = rows_of(problem, blocks)
+        part = restrict(problem, blocks, rows)
+        # Sums over one body in another order: a few roundings.
+        np.testing.assert_allclose(part.dense(), a[np.ix_(rows, rows)], rtol=0, atol=1e-13 * np.abs(a).max())
+        np.testing.assert_array_equal(part.b, problem.b[rows])
+        others = np.setdiff1d(np.arange(problem.m), rows)
+        assert not a[np.ix_(rows, others)].any()
+
+
+@pytest.mark.parametrize("friction", ["coulomb", "cone"])
+def test_islands_are_solved_to_their_share(friction):
+    problem, offset = several(6, friction=friction)
+    solution = lv.solve(problem, "auto", tol=1e-9)
+    assert good(solution, 1e-9), solution
+    assert len(offset) == 7
+
+
+def test_only_the_island_that_needs_it_goes_to_newton():
+    # One stiff column beside easy contacts: sweeps finish those, newton or direct the column.
+    stiff = suite.stack(n=60).problem
+    easy = np.eye(40) * 2.0
+    a = sp.block_diag([stiff.csr, easy], format="csr")
+    problem = lv.Problem.lcp(a, np.concatenate([stiff.b, np.ones(40)]))
+    solution = lv.solve(problem, "auto", tol=1e-11)
+    assert good(solution, 1e-11), solution
+    np.testing.assert_allclose(solution.impulse[60:], 0.5, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("problem", "word"),
+    [
+        (lambda: suite.stack(n=200).problem, "direct"),
+        (lambda: suite.hang(n=24).problem, "direct"),
+        (lambda: suite.granular(n=4).problem, "nncg"),
+        (lambda: suite.granular(n=3, friction="coulomb").problem, "anderson"),
+        (lambda: suite.granular(n=3, friction="coulomb").problem.relaxed("cone"), "anderson"),
+        (lambda: suite.pyramid(k=6, mass_ratio=1e6).problem, "newton"),
+        (lambda: suite.pyramid(k=5, mass_ratio=1e6, friction="coulomb").problem, "newton"),
+    ],
+)
+def test_the_message_names_what_ran_and_work_counts_it(problem, word):
+    solution = lv.solve(problem(), "auto", tol=1e-6)
+    assert solution.success, solution
+    assert word in solution.message
+    assert sum(solution.work.values()) > 0
+    named = {name for name in registry.specs() if name in solution.message}
+    assert named <= set(lv.available())
+
+
+@given(seed=seeds)
+@settings(max_examples=40)
+def test_every_random_lcp_is_solved(seed):
+    for rank in (None, 5):
+        solution = lv.solve(random_lcp(seed, m=12, rank=rank), "auto", tol=1e-10)
+        assert good(solution, 1e-10), solution
+
+
+@given(seed=seeds)
+@settings(max_examples=25)
+def test_every_random_compliant_problem_is_solved(seed):
+    for friction in ("coulomb", "cone"):
+        base = random_contact_problem(seed, friction=friction, bodies=5, contacts=8)
+        problem = lv.Problem(
+            base.b, base.cones, rows=base.rows, compliance=base.compliance + 0.1, friction=friction
+        )
+        for given_as in (problem, as_matrix(problem)):
+            solution = lv.solve(given_as, "auto", tol=1e-9)
+            assert good(solution, 1e-9), solution
+
+
+def test_what_has_no_solution_gets_a_certificate():
+    squeeze = np.array([[1.0, -1.0], [-1.0, 1.0]])
+    easy = np.eye(3)
+    one = lv.Problem.lcp(squeeze, [1.0, 0.5])
+    island = lv.Problem.lcp(sp.block_diag([easy, squeeze], format="csr"), [1.0, -1.0, 2.0, 1.0, 0.5])
+    asymmetric = lv.Problem.lcp([[0.0, -1.0], [-2.0, 0.0]], [1.0, 1.0])  # w = -lambda_other - 1 < 0 always
+    for problem in (one, island, asymmetric):
+        solution = lv.solve(problem, "auto", tol=1e-9)
+        assert solution.status is lv.Status.INFEASIBLE, solution
+        assert not solution.contradicted
+
+
+def test_budget_clock_and_warm_start():
+    problem = suite.pyramid(k=6, friction="coulomb", sliding=0.5).problem
+    none = lv.solve(problem, "auto", tol=1e-9, max_iter=0)
+    assert none.status is lv.Status.MAX_ITERATIONS
+    assert np.array_equal(none.impulse, problem.start())
+    short = lv.solve(problem, "auto", tol=0.0, time_limit=0.1)
+    assert short.status in (lv.Status.TIME_LIMIT, lv.Status.FLOOR, lv.Status.STALLED)
+    assert short.solve_time < 0.1 * 1.1 + 0.15  # 10 % and 50 ms, and a busy machine
+    full = lv.solve(problem, "auto", tol=1e-8)
+    assert full.success, full
+    again = lv.solve(problem, "auto", tol=1e-7, impulse=full.impulse)
+    assert again.message == "the start is a solution"
+    assert again.iterations == 0

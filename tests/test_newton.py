@@ -1,0 +1,350 @@
+"""newton: its linear algebra against dense NumPy, its answers against enumeration and closed forms."""
+
+import time
+
+import numpy as np
+import pytest
+from enumeration import enumerate_lcp
+from hypothesis import given, settings
+from random_problems import as_matrix, random_contact_problem, random_lcp, seeds
+
+import lavender as lv
+from lavender import suite
+from lavender.solvers import _ipm
+from lavender.solvers._ipm import AUGMENTED, CONVEX, InteriorPoint, make_system
+from lavender_ext import newton as kernels
+
+
+def good(solution, tol):
+    return solution.residual.relative <= max(tol, 2.0 * solution.residual.floor) and not solution.contradicted
+
+
+def dense_h(problem):
+    s = 1.0 / np.sqrt(problem.d)
+    return problem.dense() * s[:, None] * s[None, :]
+
+
+def dense_small(system, values):
+    """The elements' small matrices as one block diagonal matrix."""
+    sc = system.sc
+    out = np.zeros((sc.m, sc.m))
+    for i, q in enumerate(sc.wptr[:-1]):
+        j, end = sc.ptr[i], sc.ptr[i + 1]
+        out[j:end, j:end] = values[q : sc.wptr[i + 1]].reshape(end - j, end - j)
+    return out
+
+
+# -- linear algebra ---------------------------------------------------------------------------------
+
+
+@given(seed=seeds)
+@settings(max_examples=30)
+def test_velocity_form_is_h_without_forming_it(seed):
+    problem = random_contact_problem(seed, friction="cone", bodies=6, contacts=10)
+    system = make_system(problem, "velocity")
+    keep = system.sc.keep
+    h = dense_h(problem)[np.ix_(keep, keep)]
+    z = np.random.default_rng(seed).normal(size=system.sc.m)
+    np.testing.assert_allclose(system.times(z), h @ z, rtol=0, atol=1e-13 * np.abs(h).sum(axis=1).max())
+
+
+@pytest.mark.parametrize("law", [CONVEX, AUGMENTED])
+@pytest.mark.parametrize("form", ["velocity", "impulse"])
+@given(seed=seeds)
+@settings(max_examples=20)
+def test_newton_system_is_the_derivative_and_is_solved(form, law, seed):
+    problem = random_contact_problem(
+        seed, friction="cone" if law == CONVEX else "coulomb", bodies=6, contacts=10
+    )
+    system = make_system(problem, form)
+    m, g, eps = system.sc.m, system.sc.g, 1e-3
+    rng = np.random.default_rng(seed)
+    z, dz, f = rng.normal(size=m), rng.normal(size=m), np.empty(m)
+    system.natural(z, system.times(z) - g, law, eps, f)
+    slope = system.natural_times(dz)
+    # F is piecewise smooth: two nearby points on one piece give the derivative; other pieces tell nothing.
+    p = system.p.copy()
+    step = 1e-7
+    sides = []
+    for sign in (1.0, -1.0):
+        side = np.empty(m)
+        system.natural(z + sign * step * dz, system.times(z + sign * step * dz) - g, law, eps, side)
+        sides.append((side, np.abs(system.p - p).max()))
+    if max(change for _, change in sides) < 1e-4:
+        difference = (sides[0][0] - sides[1][0]) / (2.0 * step)
+        # Central differences: third derivatives near the tip of a cone times step^2, rounding over step.
+        np.testing.assert_allclose(difference, slope, rtol=0, atol=1e-5 * (1.0 + np.abs(slope).max()))
+    system.natural(z, system.times(z) - g, law, eps, f)
+    assert system.factor_natural(eps)
+    r = rng.normal(size=m)
+    x = system.solve_natural(r)
+    matrix = np.eye(m) + dense_small(system, system.p) @ (
+        dense_h(problem)[np.ix_(system.sc.keep, system.sc.keep)] + (eps - 1.0) * np.eye(m)
+    )
+    # eps = 1e-3 bounds the condition number by about 1e4 for these sizes.
+    np.testing.assert_allclose(matrix @ x, r, rtol=0, atol=1e-9 * (1.0 + np.abs(x).max()))
+
+
+@pytest.mark.parametrize("form", ["velocity", "impulse"])
+@given(seed=seeds)
+@settings(max_examples=20)
+def test_interior_point_system_is_solved_and_its_steps_stay_inside(form, seed):
+    problem = random_contact_problem(seed, friction="cone", bodies=6, contacts=10)
+    system = make_system(problem, form)
+    ip = InteriorPoint(system)
+    sc = system.sc
+    # V holds theta, the compliance, where H is K K^T + theta.
+    h = dense_h(problem)[np.ix_(sc.keep, sc.keep)] - np.diag(sc.theta)
+    for _ in range(4):
+        system.elements.scale(ip.z, ip.u1, ip.u2, 1e-6, system.v, system.bt)
+        system.factor_barrier()
+        r = np.random.default_rng(seed).normal(size=sc.m)
+        x = system.solve_barrier(r)
+        v = dense_small(system, system.v)
+        expected = np.linalg.solve(np.eye(sc.m) + v @ h, v @ r)
+        # With delta = 1e-6 V is at most 1e6: ten digits are lost at most.
+        np.testing.assert_allclose(x, expected, rtol=0, atol=1e-6 * np.abs(expected).max())
+        assert ip.step()
+        row = sc.kind == 0
+        z = ip.z[sc.ptr[:-1]]
+        assert np.all(z[row] > sc.lower[sc.ptr[:-1]][row])
+        assert np.all(z[row] < sc.upper[sc.ptr[:-1]][row])
+        for i in np.flatnonzero(~row):
+            t = ip.z[sc.ptr[i] + 1 : sc.ptr[i + 1] - (sc.kind[i] == 2)]
+            assert np.linalg.norm(t) <= sc.a_t[i] * z[i] * (1 + 1e-12)
+
+
+def test_block_factor_on_a_grid_of_bodies_matches_dense():
+    rng = np.random.default_rng(3)
+    n, s = 12, 3
+    body = np.array(
+        [(i, j) for i in range(n) for j in range(i) if rng.random() < 0.3] + [(0, -1), (5, -1)], np.int32
+    )
+    nptr, nind, rank, slot = _ipm.block_pattern(n, body)
+    node = np.where(body >= 0, rank[np.maximum(body, 0)], -1).astype(np.int32)
+    node = -np.sort(-node, axis=1)
+    m = len(body)
+    panel = rng.normal(size=(m, 2, s))
+    panel[node[:, 1] < 0, 1] = 0.0
+    k = np.zeros((m, n * s))
+    for i, (a, b) in enumerate(node):
+        k[i, a * s : a * s + s] = panel[i, 0]
+        if b >= 0:
+            k[i, b * s : b * s + s] = panel[i, 1]
+    index = np.arange(m + 1, dtype=np.int32)
+    zero = np.zeros(m)
+    elements = kernels.Elements(
+        index, np.zeros(m, np.int32), index, np.ascontiguousarray(node), slot, panel.copy(), zero, zero.copy(),
+        zero.copy(), zero + np.inf, zero.copy(), zero.copy(), s,
+    )  # fmt: skip
+    structure = kernels.symbolic(nptr, nind)
+    v, x, y, out = rng.uniform(0.1, 10.0, m), rng.normal(size=m), np.zeros(n * s), np.zeros(m)
+    expected = k @ np.linalg.solve(np.eye(n * s) + k.T @ (v[:, None] * k), k.T @ x)
+    for unsymmetric in (False, True):
+        factor = kernels.Factor(nptr, nind, *structure, s, unsymmetric)
+        assert factor.factor(elements, v, unsymmetric) == 0
+        factor.solve(elements, x, y, out)
+        np.testing.assert_allclose(out, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
+
+
+# -- answers ------------------------------------------------------------------------------------------
+
+
+@given(seed=seeds)
+@settings(max_examples=60)
+def test_small_boxed_lcp_agrees_with_enumeration(seed):
+    problem = random_lcp(seed, m=5)
+    solution = lv.solve(problem, "newton", tol=1e-11)
+    assert good(solution, 1e-11), solution
+    c = problem.cones
+    truth = enumerate_lcp(problem.dense(), problem.b, c.lower, c.upper)
+    assert truth
+    nearest = min(np.abs(solution.impulse - x).max() / (1.0 + np.abs(x).max()) for x, _ in truth)
+    # A of these problems has condition numbers up to 1e4 and more.
+    assert nearest < 1e-6
+
+
+@pytest.mark.parametrize("ratio", [1.0, 1e3, 1e6])
+@pytest.mark.parametrize("form", ["velocity", "impulse"])
+@pytest.mark.parametrize("family", [suite.pyramid, suite.box_stack])
+def test_redundant_boxes_cold_at_every_mass_ratio(family, form, ratio):
+    size = {"k": 5} if family is suite.pyramid else {"n": 8}
+    problem = family(mass_ratio=ratio, **size).problem
+    solution = lv.solve(problem, "newton", tol=1e-10, form=form)
+    assert good(solution, 1e-10), solution
+    assert solution.work["factorisations"] <= 30
+    assert solution.solver.form == form
+
+
+@pytest.mark.parametrize("ratio", [1.0, 1e6])
+@pytest.mark.parametrize("law", ["cone", "coulomb"])
+def test_friction_on_redundant_boxes(law, ratio):
+    problem = suite.pyramid(k=4, mass_ratio=ratio, friction="coulomb").problem.relaxed(law)
+    solution = lv.solve(problem, "newton", tol=1e-9)
+    assert good(solution, 1e-9), solution
+
+
+def test_sliding_boxes_obey_coulomb_and_not_the_relaxation():
+    problem = suite.box_stack(n=4, friction="coulomb", sliding=0.5).problem
+    solution = lv.solve(problem, "newton", tol=1e-10)
+    assert good(solution, 1e-10), solution
+    other = lv.solve(problem.relaxed("cone"), "newton", tol=1e-10)
+    assert good(other, 1e-10), other
+    # The relaxation lifts what slides; the two velocities differ by far more than the tolerance.
+    gap = np.abs(problem.velocity(solution.impulse) - problem.velocity(other.impulse)).max()
+    assert gap > 1e-3
+
+
+@pytest.mark.parametrize("k", [2, 8, 64])
+def test_duplicated_rows(k):
+    a = np.array([[2.0, -1.0], [-1.0, 2.0]])
+    each = np.repeat([0, 1], k)
+    problem = lv.Problem.lcp(a[np.ix_(each, each)], np.array([1.0, 0.5])[each])
+    solution = lv.solve(problem, "newton", tol=1e-12)
+    assert good(solution, 1e-12), solution
+    total = np.bincount(each, solution.impulse)
+    np.testing.assert_allclose(total, np.linalg.solve(a, [1.0, 0.5]), rtol=1e-11)
+
+
+@given(seed=seeds)
+@settings(max_examples=40)
+def test_one_random_contact_is_open_sticks_or_slides(seed):
+    rng = np.random.default_rng(seed)
+    g = rng.normal(size=(3, 3))
+    a, mu = g @ g.T + 0.05 * np.eye(3), rng.uniform(0.0, 1.0)
+    b = rng.normal(size=3)
+    solution = lv.solve(lv.Problem.contact(a, b, [mu]), "newton", tol=1e-11)
+    if not good(solution, 1e-11):
+        # More than one or no solution is possible for strong coupling; never a false claim.
+        assert solution.status is not lv.Status.CONVERGED
+        return
+    x, w = solution.impulse, solution.slack
+    scale = np.abs(b).max()
+    if x[0] <= 1e-9 * scale:
+        assert w[0] >= -1e-9 * scale
+    else:
+        assert abs(w[0]) <= 1e-8 * scale
+        slip = np.linalg.norm(w[1:])
+        if slip > 1e-6 * scale:  # impulse on the disk, against the slip
+            assert np.linalg.norm(x[1:]) == pytest.approx(mu * x[0], rel=1e-6, abs=1e-12)
+            assert x[1:] @ w[1:] == pytest.approx(-mu * x[0] * slip, rel=1e-4, abs=1e-9 * scale)
+        else:
+            assert np.linalg.norm(x[1:]) <= mu * x[0] * (1 + 1e-7) + 1e-12
+
+
+@pytest.mark.parametrize("friction", ["coulomb", "cone"])
+@given(seed=seeds)
+@settings(max_examples=25)
+def test_both_forms_and_block_gauss_seidel_find_the_same_velocities(friction, seed):
+    base = random_contact_problem(seed, friction=friction, bodies=5, contacts=6, joints=2)
+    problem = lv.Problem(
+        base.b, base.cones, rows=base.rows, compliance=base.compliance + 0.2, friction=friction
+    )
+    answers = [lv.solve(problem, "newton", tol=1e-11, form=form) for form in ("velocity", "impulse")]
+    for solution in answers:
+        assert good(solution, 1e-9), solution
+    if friction == "cone":  # unique slack; Coulomb friction may have several solutions
+        other = lv.solve(problem, "block_gauss_seidel", tol=1e-11, max_iter=20_000)
+        for solution in (answers[1], other):
+            np.testing.assert_allclose(
+                solution.slack, answers[0].slack, rtol=0, atol=1e-6 * (1.0 + np.abs(problem.b).max())
+            )
+
+
+def test_asymmetric_and_free_rows():
+    rng = np.random.default_rng(5)
+    a = rng.normal(size=(12, 12))
+    a = a @ a.T + 2.0 * (a - a.T) + np.eye(12)  # positive definite symmetric part
+    lower = np.where(np.arange(12) < 4, -np.inf, 0.0)
+    problem = lv.Problem.lcp(a, rng.normal(size=12), lower=lower)
+    solution = lv.solve(problem, "newton", tol=1e-12)
+    assert good(solution, 1e-12), solution
+    assert np.abs(solution.slack[:4]).max() < 1e-10
+
+
+def test_rows_that_cannot_move_are_left_where_they_are():
+    a = np.diag([1.0, 2.0, 3.0])
+    problem = lv.Problem.lcp(a, [1.0, 1.0, 1.0], lower=[0.5, 0.0, 0.0], upper=[0.5, 0.0, np.inf])
+    solution = lv.solve(problem, "newton", tol=1e-12)
+    np.testing.assert_allclose(solution.impulse, [0.5, 0.0, 1.0 / 3.0], rtol=0, atol=1e-14)
+    frictionless = lv.Problem.contact(np.eye(6), np.ones(6), [0.0, 0.5], friction="cone")
+    solution = lv.solve(frictionless, "newton", tol=1e-12)
+    assert good(solution, 1e-12)
+    assert np.array_equal(solution.impulse[1:3], [0.0, 0.0])
+
+
+# -- claims -------------------------------------------------------------------------------------------
+
+
+def test_no_solution_is_proved():
+    g = np.random.default_rng(1).normal(size=(20, 8))
+    a = g @ g.T
+    y = np.linalg.svd(g.T)[2][-1]
+    y = y if y.sum() > 0 else -y
+    free = lv.Problem.linear(a, y)
+    squeeze = lv.Problem.lcp(np.array([[1.0, -1.0], [-1.0, 1.0]]), [1.0, 0.5])
+    for problem in (free, squeeze):
+        solution = lv.solve(problem, "newton", tol=1e-9)
+        assert solution.status is lv.Status.INFEASIBLE, solution
+        assert not solution.contradicted
+        assert solution.certificate.shape == (problem.m,)
+
+
+def test_a_solution_given_back_costs_nothing():
+    problem = suite.pyramid(k=4, friction="coulomb").problem
+    first = lv.solve(problem, "newton", tol=1e-9)
+    assert first.work["factorisations"] > 0
+    again = lv.solve(problem, "newton", tol=1e-8, impulse=first.impulse)
+    assert again.work["factorisations"] == 0
+    assert np.array_equal(again.impulse, first.impulse)
+
+
+def test_budget_and_floor_are_what_they_say():
+    problem = suite.pyramid(k=5, mass_ratio=1e6).problem
+    few = lv.solve(problem, "newton", tol=1e-12, max_iter=3)
+    assert few.status is lv.Status.MAX_ITERATIONS
+    assert few.work["factorisations"] <= 3 + 1  # an interior point start counts one
+    assert few.residual.relative <= lv.residual(problem, problem.start()).relative
+    floor = lv.solve(problem, "newton", tol=1e-16)
+    assert floor.status is lv.Status.FLOOR
+    assert not floor.contradicted
+
+
+def test_time_limit_is_kept():
+    problem = suite.pyramid(k=8, mass_ratio=1e6, friction="coulomb", sliding=0.5).problem
+    start = time.perf_counter()
+    solution = lv.solve(problem, "newton", tol=0.0, max_iter=10**6, time_limit=0.1)
+    # 10 % and 50 ms, and one factorisation of slack for a busy machine.
+    assert time.perf_counter() - start < 0.1 * 1.1 + 0.15
+    assert solution.status is lv.Status.TIME_LIMIT
+    assert np.isfinite(solution.impulse).all()
+
+
+def test_the_same_bits_every_time():
+    problem = suite.box_stack(n=5, friction="coulomb", sliding=0.5).problem
+    first, second = (lv.solve(problem, "newton", tol=1e-9) for _ in range(2))
+    assert first.impulse.tobytes() == second.impulse.tobytes()
+    assert first.work == second.work
+
+
+@given(seed=seeds)
+@settings(max_examples=25)
+def test_units_change_nothing(seed):
+    base = as_matrix(random_contact_problem(seed, friction="cone", bodies=4, contacts=5, joints=1))
+    a, b = base.dense(), base.b
+    solution = lv.solve(base, "newton", tol=1e-9)
+    # kg -> 2^-20 kg: A grows by 2^20 and impulses shrink; powers of two keep every bit.
+    c = base.cones
+    factor = 2.0**20
+    cones = lv.Cones(c.ptr, c.kind, c.lower / factor, c.upper / factor, c.mu, c.patch_radius)
+    scaled = lv.solve(lv.Problem(b, cones, a * factor, friction="cone"), "newton", tol=1e-9)
+    np.testing.assert_allclose(
+        scaled.impulse * factor, solution.impulse, rtol=0, atol=1e-6 * (1e-9 + np.abs(solution.impulse).max())
+    )
+
+
+def test_a_form_that_does_not_exist_is_refused():
+    with pytest.raises(lv.InputError, match="velocity"):
+        lv.solve(lv.Problem.lcp([[1.0]], [1.0]), "newton", form="velocities")
+    with pytest.raises(lv.InputError, match="from_rows"):
+        lv.solve(lv.Problem.lcp([[1.0]], [1.0]), "newton", form="velocity")
