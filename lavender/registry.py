@@ -71,6 +71,7 @@ class SolverSpec:
     callback: bool = True  # takes callback=; needs resumable
     history: bool = True  # records history; needs resumable
     delegates: bool = False  # may hand over to other solvers: only "auto"
+    external: bool = False  # another project's code solves; its claims are its own
     max_iter: int = 1000  # default budget
     options: Mapping[str, str] = field(default_factory=dict)  # own options: name -> one line
     requires: tuple[str, ...] = ()  # modules that must be importable
@@ -117,10 +118,6 @@ class SolverSpec:
             return "needs a problem with rows (Problem.from_rows); this one was given as a matrix"
         return self.refusal(problem) if self.refusal is not None else None
 
-    def factory_module(self) -> str:
-        """Module that holds the solver's code."""
-        return self.factory.partition(":")[0] if isinstance(self.factory, str) else self.factory.__module__
-
     def load(self) -> Callable[..., Solver]:
         """The factory, imported now if it was not."""
         if not isinstance(self.factory, str):
@@ -160,7 +157,7 @@ def _load_builtin_and_plugins() -> None:
         try:
             spec = entry.load()
             spec = spec if isinstance(spec, SolverSpec) else spec()
-            register(spec)
+            _add(spec, replace=False)
         except Exception as error:  # a plug-in may fail in any way; it must not take lavender with it
             warnings.warn(
                 f"solver plug-in {entry.name!r} ({entry.value}) was left out: {error}", stacklevel=3
@@ -175,9 +172,13 @@ def register(spec: SolverSpec, *, replace: bool = False) -> None:
     InputError
         Not a SolverSpec, or the name is taken.
     """
+    _load_builtin_and_plugins()
+    _add(spec, replace)
+
+
+def _add(spec: SolverSpec, replace: bool) -> None:
     if not isinstance(spec, SolverSpec):
         raise InputError(f"register needs a SolverSpec, not a {type(spec).__name__}")
-    _load_builtin_and_plugins() if spec.name not in _registered else None
     if spec.name in _registered and not replace:
         raise InputError(
             f"a solver named {spec.name!r} is registered already; pass replace=True to take its place"
