@@ -216,6 +216,18 @@ def _plan(
     is_flag=True,
     help="Each FOLDER holds the steps of a simulation: carry impulses from step to step.",
 )
+@click.option("--campaign", is_flag=True, help="Error and robustness by many workers; no times.")
+@click.option(
+    "--seeds",
+    type=int,
+    default=1,
+    metavar="N",
+    help="With --campaign: seeds 0 to N - 1 of cases that take one.",
+)
+@click.option("--workers", type=int, default=-1, help="With --campaign: processes; -1 is one for each core.")
+@click.option(
+    "--backend", default="loky", show_default=True, help="With --campaign: a backend of joblib, such as dask."
+)
 @click.option(
     "--compare",
     type=click.Path(path_type=Path),
@@ -234,6 +246,10 @@ def report(
     in_process: bool,
     out: Path,
     sequence: bool,
+    campaign: bool,
+    seeds: int,
+    workers: int,
+    backend: str,
     compare: Path | None,
     no_figures: bool,
 ) -> None:
@@ -254,6 +270,10 @@ def report(
         if len(files) > 1:
             raise InputError("a records.jsonl is shown alone: give one, and no problems")
         records, stopped = bench.read(shown[0]), False
+    elif campaign:
+        many = bench.CampaignPlan(levels=levels, budgets=budgets, orders=orders or ())
+        words = bench.seeds(files, seeds)
+        records, stopped = _campaign(words, solvers, many, out / "records.jsonl", workers, backend)
     else:
         plan = _plan(files, levels, budgets, orders, repeats, time_limit)
         records, stopped = _measure(files, solvers, plan, out / "records.jsonl", memory, in_process, sequence)
@@ -333,6 +353,21 @@ def _measure(
             except KeyboardInterrupt:
                 return found[0], True
         return found[0], False
+
+
+def _campaign(
+    words: Sequence[str], solvers: Sequence[str] | None, plan: Any, path: Path, workers: int, backend: str
+) -> tuple[Records, bool]:
+    """Run a campaign with a progress bar; (records, was it stopped by Ctrl-C)."""
+    from lavender import bench
+
+    _one_thread()
+    with bench.Store(path) as store, _progress() as watch:
+        try:
+            made = bench.campaign(words, solvers, plan, store, workers=workers, backend=backend, watch=watch)
+        except KeyboardInterrupt:
+            return bench.read(path).latest(), True
+        return made, False
 
 
 class _progress:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable
+from typing import Any
 
 __all__ = [
     "CapabilityError",
@@ -40,6 +41,16 @@ class UnknownName(LavenderError, KeyError):
     def __str__(self) -> str:
         # KeyError would show the repr of the message.
         return self.message
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # Between processes exceptions travel by their arguments; those of __init__ are others.
+        return _restored, (self.message,)
+
+
+def _restored(message: str) -> UnknownName:
+    error = UnknownName.__new__(UnknownName, message)
+    error.message = message
+    return error
 
 
 class SolverUnavailable(LavenderError):

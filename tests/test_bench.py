@@ -365,6 +365,11 @@ def test_structure_is_recognised(problem, words):
     assert bench.structure_of(problem) == words
 
 
+def test_a_dense_matrix_is_no_chain():
+    a = np.random.default_rng(0).standard_normal((20, 20))
+    assert bench.structure_of(lv.Problem.linear(a @ a.T + np.eye(20), np.ones(20))) == ("mesh",)
+
+
 def test_what_couples_everywhere_is_a_pile():
     rng = np.random.default_rng(3)
     graph = np.zeros((30, 30))

@@ -6,6 +6,7 @@
 Nothing here draws or prints; `lavender.report` reads the records.
 """
 
+from lavender.bench.campaign import CampaignPlan, campaign, seeds
 from lavender.bench.cases import Item, resolve, structure_of
 from lavender.bench.machine import cpu_name
 from lavender.bench.plan import Plan
@@ -16,6 +17,7 @@ from lavender.bench.store import Records, Store, read, write_csv, write_json
 from lavender.bench.timing import Task, measure, one_thread
 
 __all__ = [
+    "CampaignPlan",
     "CaseInfo",
     "Event",
     "Item",
@@ -26,6 +28,7 @@ __all__ = [
     "Skip",
     "Store",
     "Task",
+    "campaign",
     "carry",
     "cpu_name",
     "level_name",
@@ -34,6 +37,7 @@ __all__ = [
     "read",
     "resolve",
     "run",
+    "seeds",
     "sequence",
     "solver_names",
     "steps_in",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property
@@ -21,6 +22,7 @@ __all__ = ["SUFFIXES", "Item", "describe", "resolve", "structure_of"]
 
 SUFFIXES = (".npz", ".hdf5", ".h5")
 RANK_ROWS = 300  # rows up to which the rank of A is computed, a fraction of a second
+MANIFOLD = 8  # blocks between one pair of bodies, at most
 LARGE_RATIO = 1e3  # mass ratio from which the velocity form changes everything
 
 
@@ -34,6 +36,7 @@ class Item:
     reason: str = ""
     sequence: str = ""
     step: int = -1
+    given: Problem | None = None  # in memory, not behind a name
 
     @cached_property
     def problem(self) -> Problem:
@@ -69,7 +72,7 @@ def resolve(words: Iterable[Source]) -> list[Item]:
     for word in words:
         if isinstance(word, Problem):
             name = word.name or f"problem {len(items)}"
-            items.append(Item(name, name, _constant(word)))
+            items.append(Item(name, name, _constant(word), given=word))
         elif isinstance(word, Item):
             items.append(word)
         elif isinstance(word, Case):
@@ -215,11 +218,12 @@ def _neighbours(problem: Problem) -> float:
     graph = sp.csr_array((np.ones(len(i)), (i, j)), shape=(c.n_blocks, c.n_blocks))
     graph = sp.csr_array(graph + graph.T + sp.eye_array(c.n_blocks))
     graph.sort_indices()
-    groups: dict[bytes, int] = {}
-    label = np.array([
-        groups.setdefault(graph.indices[graph.indptr[k] : graph.indptr[k + 1]].tobytes(), len(groups))
-        for k in range(c.n_blocks)
-    ])  # fmt: skip
+    patterns = [graph.indices[graph.indptr[k] : graph.indptr[k + 1]].tobytes() for k in range(c.n_blocks)]
+    count = Counter(patterns)
+    groups: dict[bytes | int, int] = {}
+    # More twins than points between two bodies: a dense matrix, not a manifold.
+    keys = [p if count[p] <= MANIFOLD else k for k, p in enumerate(patterns)]
+    label = np.array([groups.setdefault(key, len(groups)) for key in keys])
     g = graph.tocoo()
     edges = np.unique(np.stack([label[g.coords[0]], label[g.coords[1]]]), axis=1)
     return float(np.count_nonzero(edges[0] != edges[1])) / max(1, len(groups))

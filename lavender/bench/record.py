@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
 from typing import Any
 
-__all__ = ["CaseInfo", "Record", "Run", "Skip", "from_json", "level_name", "to_json"]
+__all__ = ["CaseInfo", "Done", "Entry", "Record", "Run", "Skip", "from_json", "level_name", "to_json"]
 
 # Beside the statuses of a solve: what can happen to a run that brings no solution back.
 ERROR, KILLED, CRASHED = "ERROR", "KILLED", "CRASHED"
@@ -66,6 +66,15 @@ class Skip:
     case: str
     solver: str
     reason: str
+
+
+@dataclass(frozen=True)
+class Done:
+    """Closes one pair of a campaign: every entry of it stands before this one."""
+
+    run: str
+    case: str
+    solver: str
 
 
 @dataclass(frozen=True)
@@ -146,16 +155,17 @@ def task_key(
     return (case, sha, solver, repr(sorted(_plain(options).items())), start, mode, tol, max_iter, time_limit)
 
 
-_KINDS: dict[str, type] = {"run": Run, "case": CaseInfo, "skip": Skip, "record": Record}
+Entry = Run | CaseInfo | Skip | Done | Record
+_KINDS: dict[str, type] = {"run": Run, "case": CaseInfo, "skip": Skip, "done": Done, "record": Record}
 
 
-def to_json(entry: Run | CaseInfo | Skip | Record) -> dict[str, Any]:
+def to_json(entry: Entry) -> dict[str, Any]:
     """A dictionary that JSON can hold: inf and nan become words."""
     kind = next(name for name, cls in _KINDS.items() if isinstance(entry, cls))
     return {"kind": kind, **{name: _plain(value) for name, value in asdict(entry).items()}}
 
 
-def from_json(line: Mapping[str, Any]) -> Run | CaseInfo | Skip | Record:
+def from_json(line: Mapping[str, Any]) -> Entry:
     """Back again; fields that this version does not know are left out.
 
     Raises

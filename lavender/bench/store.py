@@ -14,7 +14,7 @@ from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
-from lavender.bench.record import CaseInfo, Record, Run, Skip, from_json, to_json
+from lavender.bench.record import CaseInfo, Done, Entry, Record, Run, Skip, from_json, to_json
 from lavender.errors import InputError
 
 __all__ = ["Records", "Store", "read", "write_csv", "write_json"]
@@ -26,22 +26,27 @@ class Records:
 
     runs: dict[str, Run] = field(default_factory=dict)
     cases: dict[str, CaseInfo] = field(default_factory=dict)  # the latest description of each
-    skips: list[Skip] = field(default_factory=list)
     records: list[Record] = field(default_factory=list)
     source: str = ""
+    done: dict[tuple[str, str, str], Done] = field(default_factory=dict)  # pairs of a campaign, complete
+    _skips: dict[tuple[str, str, str], Skip] = field(default_factory=dict, repr=False)
 
-    def add(self, entry: Run | CaseInfo | Skip | Record) -> None:
-        """Take one entry; a record or skip made again replaces the earlier one."""
+    @property
+    def skips(self) -> list[Skip]:
+        """Pairs that did not run, and cases that did not load."""
+        return list(self._skips.values())
+
+    def add(self, entry: Entry) -> None:
+        """Take one entry; a description, note or run given again replaces the earlier one."""
         if isinstance(entry, Run):
             self.runs.pop(entry.run, None)  # the newest stands last
             self.runs[entry.run] = entry
         elif isinstance(entry, CaseInfo):
             self.cases[entry.case] = entry
         elif isinstance(entry, Skip):
-            self.skips = [
-                s for s in self.skips if (s.run, s.case, s.solver) != (entry.run, entry.case, entry.solver)
-            ]
-            self.skips.append(entry)
+            self._skips[entry.run, entry.case, entry.solver] = entry
+        elif isinstance(entry, Done):
+            self.done[entry.run, entry.case, entry.solver] = entry
         else:
             self.records.append(entry)
 
@@ -56,13 +61,13 @@ class Records:
         if len(self.runs) < 2:
             return self
         run = list(self.runs)[-1]
-        return Records(
-            {run: self.runs[run]},
-            {name: info for name, info in self.cases.items() if info.run == run},
-            [s for s in self.skips if s.run == run],
-            [r for r in self.records if r.run == run],
-            self.source,
-        )
+        found = Records(source=self.source)
+        found.add(self.runs[run])
+        entries: list[Entry] = [*self.cases.values(), *self.skips, *self.done.values(), *self.records]
+        for entry in entries:
+            if entry.run == run:
+                found.add(entry)
+        return found
 
     def rows(self) -> list[dict[str, Any]]:
         """Plain rows, one for each record, with its case and machine: the columns of `records.csv`."""
@@ -119,7 +124,7 @@ class Store:
                 f"cannot write {self.path} ({error.strerror or error}): give a folder that you may write to"
             ) from None
 
-    def add(self, entry: Run | CaseInfo | Skip | Record) -> None:
+    def add(self, entry: Entry) -> None:
         """Write one entry and hand it to the operating system before anything else happens."""
         line = json.dumps(to_json(entry), allow_nan=False)
         try:

@@ -70,6 +70,8 @@ def _content(records: Records, old: Records | None) -> dict[str, Any]:
     by_case: dict[str, list[tables.Reach]] = {}
     for reach in tables.reaches(records, levels):
         by_case.setdefault(reach.case, []).append(reach)
+    if tables.is_campaign(records):
+        by_case = {}  # thousands of them: the tables over all say it
     cases = [
         {
             "info": records.cases[name],
@@ -115,11 +117,15 @@ def _content(records: Records, old: Records | None) -> dict[str, Any]:
         "spreads": sorted(tables.spreads(records), key=lambda s: -s.factor),
         "lost": [s for s in records.skips if not s.solver],
         "refused": [s for s in records.skips if s.solver],
+        "campaign": tables.is_campaign(records),
+        "robustness": tables.robustness(records) if tables.is_campaign(records) else [],
+        "budgets": sorted({r.max_iter for r in records if r.mode == "budget"}),
         "walks": walks,
         "walk_figures": [key for key in (add(curves.walk_figure(w)) for w in shown) if key],
         "compared": old is not None,
         "changes": [c for c in changes if c.kind != "same"],
         "n_changes": len(changes),
         "n_records": len(records),
+        "n_cases": len({r.case for r in records}),
         "look": look,
     }

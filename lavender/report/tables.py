@@ -22,6 +22,7 @@ __all__ = [
     "Failure",
     "Profile",
     "Reach",
+    "Robustness",
     "Spread",
     "Walk",
     "advice_by_level",
@@ -36,21 +37,13 @@ __all__ = [
     "pairs",
     "profiles",
     "reaches",
+    "robustness",
     "spreads",
     "time_budgets",
     "walks",
 ]
 
-FAILED = (
-    "ERROR",
-    "KILLED",
-    "NUMERICAL_ERROR",
-    "DIVERGED",
-    "STALLED",
-    "INFEASIBLE",
-    "TIME_LIMIT",
-    "MAX_ITERATIONS",
-)
+DIED = ("ERROR", "KILLED", "CRASHED")
 
 
 @dataclass(frozen=True)
@@ -174,6 +167,20 @@ class Walk:
 
 
 @dataclass(frozen=True)
+class Robustness:
+    """One solver over the many cases of a campaign, by family of structure."""
+
+    family: str
+    solver: str
+    cases: int
+    reached: Mapping[float, int]  # level -> cases that the judge confirms
+    wrong: int  # claims that do not hold
+    died: int
+    budgets: Mapping[int, tuple[float, float]]  # iterations -> median and 95th percentile of the residual
+    hardest: str  # case with the largest residual of its best run
+
+
+@dataclass(frozen=True)
 class Change:
     """One case and solver in an old and a new run."""
 
@@ -285,7 +292,7 @@ def failures(records: Records) -> list[Failure]:
     for r in records:
         missed = r.mode == "tol" and not r.success and not r.relative <= 2.0 * r.floor
         proven = r.status == "INFEASIBLE" and not r.contradicted
-        lost = not math.isfinite(r.relative) or r.status.startswith(("ERROR", "KILLED", "CRASHED"))
+        lost = not math.isfinite(r.relative) or r.status.startswith(DIED)
         if (missed and not proven) or lost or r.contradicted:
             asked = (
                 f"relative residual {level_name(r.tol)}" if r.mode == "tol" else f"{r.max_iter} iterations"
@@ -323,7 +330,7 @@ def claims(records: Records) -> list[Claims]:
                 sum(r.claims and bool(r.contradicted) for r in mine),
                 sum(r.success for r in asked),
                 len(asked),
-                sum(r.status.startswith(("ERROR", "KILLED", "CRASHED")) for r in mine),
+                sum(r.status.startswith(DIED) for r in mine),
             )
         )
     return out
@@ -558,3 +565,46 @@ def changes(old: Records, new: Records) -> list[Change]:
         noise = max(NOISE, 1.0 + 2.0 * (spread[key] - 1.0))
         out += [Change(*key, x, before[key].times[x], row.times[x], noise) for x in levels]
     return out
+
+
+def is_campaign(records: Records) -> bool:
+    """Times were left out on purpose."""
+    return any(run.plan.get("campaign") for run in records.runs.values())
+
+
+def robustness(records: Records) -> list[Robustness]:
+    """By structure and solver: on how many cases each level is reached, false claims, residual by budget."""
+    levels = levels_of(records)
+    groups = {k[:2]: g for k, g in pairs(records).items() if k[2] == "cold"}
+    solvers = sorted({solver for _, solver in groups})
+    out = []
+    for family, cases in families(records).items():
+        for solver in solvers:
+            mine = {c: groups[c, solver] for c in cases if (c, solver) in groups}
+            if not mine:
+                continue
+            best = {c: min(r.relative for r in g) for c, g in mine.items()}
+            by_budget: dict[int, list[float]] = defaultdict(list)
+            for group in mine.values():
+                for r in group:
+                    if r.mode == "budget":
+                        by_budget[r.max_iter].append(r.relative)
+            runs = [r for g in mine.values() for r in g]
+            out.append(
+                Robustness(
+                    family,
+                    solver,
+                    len(mine),
+                    {x: sum(v <= x for v in best.values()) for x in levels},
+                    sum(bool(r.contradicted) for r in runs),
+                    sum(r.status.startswith(DIED) for r in runs),
+                    {n: (median(v), _quantile(v, 0.95)) for n, v in sorted(by_budget.items())},
+                    max(best, key=lambda c: best[c]),
+                )
+            )
+    return out
+
+
+def _quantile(values: Sequence[float], q: float) -> float:
+    ordered = sorted(values)
+    return ordered[min(len(ordered) - 1, math.ceil(q * len(ordered)) - 1)]

@@ -86,6 +86,29 @@ def walk_table(records: Records) -> Any:
     return table
 
 
+def robustness_table(records: Records, levels: Sequence[float]) -> Any:
+    """Campaigns: shares of cases solved, false claims, residual by budget."""
+    from rich.table import Table
+
+    rows = tables.robustness(records)
+    budgets = sorted({n for row in rows for n in row.budgets})
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    table.add_column("structure", no_wrap=True)
+    table.add_column("solver", no_wrap=True)
+    for name in ("cases", *(f"to {level_name(x)}" for x in levels), "false claims", "died"):
+        table.add_column(name, justify="right", no_wrap=True)
+    for n in budgets:
+        table.add_column(f"{n}: median, 95 %", justify="right", no_wrap=True)
+    shown = ""
+    for row in rows:
+        reached = [f"{100 * row.reached[x] / row.cases:.1f} %" for x in levels]
+        ends = [", ".join(map(residual, row.budgets[n])) if n in row.budgets else "–" for n in budgets]
+        name = "" if row.family == shown else row.family
+        table.add_row(name, row.solver, str(row.cases), *reached, str(row.wrong), str(row.died), *ends)
+        shown = row.family
+    return table
+
+
 def change_table(old: Records, new: Records) -> Any:
     """What differs from an earlier run beyond noise; None if nothing does."""
     from rich.table import Table
@@ -110,7 +133,13 @@ def print_report(
 ) -> None:
     """Everything the terminal shows after a run."""
     levels = tables.levels_of(records) if levels is None else levels
-    if any(r.step < 0 for r in records):
+    campaign = tables.is_campaign(records)
+    if campaign:
+        console.print(
+            "[bold]Campaign[/] (no times; share of cases brought to a level, residual at each budget)"
+        )
+        console.print(robustness_table(records, levels), highlight=False)
+    elif any(r.step < 0 for r in records):
         console.print(reach_table(records, levels))
         console.print()
     lost = [s for s in records.skips if not s.solver]
@@ -125,7 +154,7 @@ def print_report(
             highlight=False,
             style="dim",
         )
-    if any(r.step < 0 for r in records):
+    if any(r.step < 0 for r in records) and not campaign:
         console.print(
             "\n[bold]Recommended[/] (solver, median time where it gets there, cases it brings to the level)"
         )

@@ -39,6 +39,7 @@ def write(records: Records, folder: str | Path, *, figures: bool = True, old: Re
     from lavender.report.markdown import summary
     from lavender.report.page import page
     from lavender.report.style import looks
+    from lavender.report.tables import is_campaign
 
     folder = Path(folder)
     shown = records.latest()
@@ -49,7 +50,7 @@ def write(records: Records, folder: str | Path, *, figures: bool = True, old: Re
         index = folder / "index.html"
         index.write_text(page(shown, old=None if old is None else old.latest()), encoding="utf-8")
         (folder / "summary.md").write_text(summary(shown), encoding="utf-8")
-        if figures:
+        if figures and not is_campaign(shown):
             (folder / "figures").mkdir(exist_ok=True)
             look = looks(r.solver for r in shown)
             for case in dict.fromkeys(r.case for r in shown if r.step < 0):

@@ -1,0 +1,259 @@
+"""Error and robustness over thousands of cases: no timing, many workers, the same bits whatever their number.
+
+joblib distributes the pairs of case and solver: over processes of this machine, or over a cluster that
+runs already, by joblib's own backends ("dask", "ray"). Nothing in a record depends on who made it: runs
+end by iterations, never by the clock, and times are left out.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from lavender import registry
+from lavender.bench import machine
+from lavender.bench.cases import Item, Source, describe, resolve
+from lavender.bench.plan import Plan
+from lavender.bench.record import Done, Record, Skip
+from lavender.bench.runner import Event, Watch, _not_loaded, is_foreign, solver_names
+from lavender.bench.store import Records, Store
+from lavender.bench.timing import Task, measure
+from lavender.bench.worker import Worker
+from lavender.errors import InputError, LavenderError
+from lavender.problem import Problem
+
+__all__ = ["CampaignPlan", "campaign", "seeds"]
+
+ATTEMPTS = 5  # times that the remaining pairs are handed out again after workers were lost
+HANG = 60.0  # s, after which a backend of another package is killed; the only clock, and it costs its record
+
+
+@dataclass(frozen=True)
+class CampaignPlan(Plan):
+    """A plan that ends by iterations: `cap` for runs to a level, in place of a time limit."""
+
+    repeats: int = 1
+    time_limit: float = HANG
+    cap: int = 20_000
+    campaign: bool = True
+
+
+@dataclass(frozen=True)
+class Pair:
+    """One case and one solver; what travels to a worker."""
+
+    index: int
+    case: str
+    source: str | Problem  # a name or path that the worker resolves itself, or the problem
+    reason: str
+    solver: str
+
+
+def seeds(words: Iterable[str], n: int) -> list[str]:
+    """Cases of the suite with seed=0 .. n - 1, where their family takes a seed; others once.
+
+    Raises
+    ------
+    UnknownName, InputError
+        A name that the suite does not have.
+    """
+    from lavender.suite.case import FAMILIES, parse
+
+    out = []
+    for word in words:
+        name, given = parse(word)
+        if name in FAMILIES and "seed" in FAMILIES[name].signature.parameters and "seed" not in given:
+            for seed in range(n):
+                inside = ", ".join(f"{k}={v}" for k, v in {**given, "seed": seed}.items())
+                out.append(f"{name}({inside})")
+        else:
+            out.append(word)
+    return out
+
+
+def campaign(
+    cases: Iterable[Source],
+    solvers: Sequence[str] | None = None,
+    plan: CampaignPlan | None = None,
+    store: Store | str | Path | None = None,
+    *,
+    workers: int = -1,
+    backend: str = "loky",
+    watch: Watch | None = None,
+) -> Records:
+    """Run every solver on every case, without timing, by many workers.
+
+    Parameters
+    ----------
+    cases, solvers, store, watch : as `lavender.bench.run`
+    plan : CampaignPlan
+    workers : number of processes; -1: one for each core. A cluster has as many as it has.
+    backend : a backend of joblib: "loky" (processes here), "dask" (of the current
+        dask.distributed client), "ray"
+
+    Returns
+    -------
+    Records
+        In the order of cases and solvers, whatever the order they were made in; times are nan.
+
+    Raises
+    ------
+    InputError
+        A backend that joblib does not have here, or workers that were lost again and again.
+    """
+    plan = plan or CampaignPlan()
+    items = resolve(cases)
+    names = solver_names(solvers)
+    specs = registry.specs()
+    this = machine.describe(
+        {**plan.as_dict(), "campaign": True}, {m for n in names for m in specs[n].requires}
+    )
+    if store is not None and not isinstance(store, Store):
+        with Store(store) as opened:
+            return campaign(items, names, plan, opened, workers=workers, backend=backend, watch=watch)
+    pairs = [
+        Pair(len(names) * i + j, item.name, _travels(item), item.reason, name)
+        for i, item in enumerate(items)
+        for j, name in enumerate(names)
+    ]
+    known: dict[tuple[str, str], list[Any]] = {}
+    if store is not None:
+        known = _finished(store.records, this.run)
+    out = Records(source=str(store.path) if store is not None else "")
+    done: dict[int, list[Any]] = {
+        p.index: known[p.case, p.solver] for p in pairs if (p.case, p.solver) in known
+    }
+    out.add(this)
+    if store is not None:
+        store.add(this)
+    for attempt in range(ATTEMPTS + 1):
+        left = [p for p in pairs if p.index not in done]
+        if not left:
+            break
+        if attempt == ATTEMPTS:
+            raise InputError(
+                f"{len(left)} of {len(pairs)} pairs are not done: workers were lost {ATTEMPTS} times; "
+                "run the same command again, with fewer workers if memory is short"
+            )
+        for index, entries in _hand_out(left, plan, this.run, workers, backend):
+            done[index] = entries
+            if store is not None:
+                for entry in entries:
+                    store.add(entry)
+                store.add(Done(this.run, pairs[index].case, pairs[index].solver))
+            if watch is not None:
+                pair = pairs[index]
+                watch(Event(len(done), len(pairs), pair.case, pair.solver))
+    for index in sorted(done):
+        for entry in done[index]:
+            out.add(entry)
+    return out
+
+
+def _finished(records: Records, run: str) -> dict[tuple[str, str], list[Any]]:
+    """Entries of the pairs that the file holds whole, by (case, solver)."""
+    closed = {(case, solver) for r, case, solver in records.done if r == run}
+    found: dict[tuple[str, str], dict[Any, Any]] = {key: {} for key in closed}
+    for case, solver in closed:
+        if case in records.cases:
+            found[case, solver]["case"] = records.cases[case]
+    for skip in records.skips:
+        for key in closed if not skip.solver else ((skip.case, skip.solver),):
+            if skip.run == run and key in closed and key[0] == skip.case:
+                found[key]["skip"] = skip
+    for r in records.records:
+        if r.run == run and (r.case, r.solver) in closed:
+            found[r.case, r.solver][r.key] = r  # written again after a kill: the later one
+    return {key: list(entries.values()) for key, entries in found.items()}
+
+
+def _travels(item: Item) -> Any:
+    # A name or path is read again by the worker: a cluster shares the files, or the suite.
+    return item.source if item.given is None else replace(item.given, copy=False)
+
+
+def _hand_out(
+    pairs: list[Pair], plan: CampaignPlan, run: str, workers: int, backend: str
+) -> Iterator[tuple[int, list[Any]]]:
+    """Results as they come; ends early, without an exception, when workers were lost."""
+    import joblib
+
+    try:
+        context = joblib.parallel_config(backend=backend, n_jobs=workers)
+    except (ValueError, ImportError, RuntimeError) as error:
+        raise InputError(
+            f"joblib has no backend {backend!r} here ({error}); 'loky' runs processes on this machine, 'dask' needs "
+            "the extra 'cluster' and a client"
+        ) from None
+    lost: tuple[type[BaseException], ...] = (BrokenPipeError, ConnectionError)
+    with contextlib.suppress(ImportError):
+        from joblib.externals.loky.process_executor import BrokenProcessPool
+
+        lost = (*lost, BrokenProcessPool)
+    with contextlib.suppress(ImportError):
+        from distributed.scheduler import KilledWorker
+
+        lost = (*lost, KilledWorker)
+    with context:
+        parallel = joblib.Parallel(return_as="generator_unordered", batch_size=1)
+        results = parallel(joblib.delayed(work)(pair, plan, run) for pair in pairs)
+        try:
+            yield from results
+        except lost:
+            return
+
+
+_worker: Worker | None = None  # one for each process, kept between pairs
+
+
+def work(pair: Pair, plan: CampaignPlan, run: str) -> tuple[int, list[Any]]:
+    """All entries of one pair; runs in a worker."""
+    global _worker
+    item = Item(pair.case, str(pair.source), _missing, pair.reason)
+    try:
+        (found,) = resolve([pair.source])
+        item = Item(pair.case, found.source, found.load, pair.reason)
+        info = describe(item, run)
+    except (LavenderError, OSError) as error:
+        return pair.index, [Skip(run, pair.case, "", _not_loaded(item, error))]
+    spec = registry.get(pair.solver)
+    problem = item.problem
+    reason = spec.refuses(problem)
+    if reason:
+        return pair.index, [info, Skip(run, pair.case, pair.solver, reason)]
+    entries: list[Any] = [info]
+    tasks = plan.tasks(info, problem, spec)
+    record: Record | None = None
+    while True:
+        try:
+            task = tasks.send(record)  # type: ignore[attr-defined]
+        except StopIteration:
+            return pair.index, entries
+        task = _by_iterations(task, plan.cap)
+        if is_foreign(spec):
+            if _worker is None:
+                _worker = Worker()
+            record = _without_times(_worker.measure(replace(problem, copy=False), task))
+        else:
+            record = _without_times(measure(problem, replace(task, time_limit=math.inf)))
+        record = replace(record, time_limit=plan.time_limit)
+        entries.append(record)
+
+
+def _missing() -> Problem:
+    raise InputError("the case is not known to the worker")
+
+
+def _by_iterations(task: Task, cap: int) -> Task:
+    return replace(task, max_iter=min(task.max_iter, cap)) if task.mode == "tol" and task.max_iter else task
+
+
+def _without_times(record: Record) -> Record:
+    nan = math.nan
+    return replace(
+        record, setup_min=nan, setup_median=nan, solve_min=nan, solve_median=nan, time_min=nan, time_median=nan
+    )  # fmt: skip
