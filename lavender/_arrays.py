@@ -74,8 +74,10 @@ def as_array(
 
 
 def _check_finite(what: str, array: np.ndarray) -> None:
-    # One sum sees every NaN and infinity; only a failing array pays for the search.
-    if not np.isfinite(array.sum()):
+    # One sum sees every NaN and infinity; only a failing array, or one whose sum overflows, pays for the search.
+    with np.errstate(over="ignore", invalid="ignore"):
+        total = array.sum()
+    if not np.isfinite(total):
         bad = np.argwhere(~np.isfinite(array))
         if len(bad):
             where = ", ".join(map(str, bad[0]))

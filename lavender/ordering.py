@@ -71,7 +71,11 @@ def block_order(
     if not isinstance(seed, (int, np.integer)) or seed < 0:
         raise InputError(f"seed is {seed!r}; a whole number >= 0 is needed")
     rng = np.array([int(seed) % 2**64], np.uint64)
+    if seed and not (isinstance(order, str) and order == "random"):
+        raise InputError(f"seed={seed} goes with order='random'; no other order draws lots")
     if not isinstance(order, str):
+        if ground is not None:
+            raise InputError("ground= goes with bottom_up and top_down, not with an array of blocks")
         blocks = as_array("order", order, (k,), dtype=np.int32).copy()
         if not np.array_equal(np.sort(blocks), np.arange(k)):
             raise InputError(f"order must hold every block from 0 to {k - 1} once")

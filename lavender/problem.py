@@ -265,7 +265,7 @@ class Problem:
             put(self, "key", read_only(key.astype(np.uint64)))
         if self.names is not None:
             names = tuple(map(str, self.names))
-            if len(names) != k:
+            if isinstance(self.names, str) or len(names) != k:
                 raise InputError(f"{len(names)} names for {k} blocks; one for each block is needed")
             put(self, "names", names)
         put(self, "name", str(self.name))

@@ -80,10 +80,11 @@ def reference(problem: Problem) -> tuple[float, float]:
         # The norms of b: sqrt(sum b^2 / d), max |b| sqrt(nu / d). Scaled, so that 1e-200 does not vanish.
         x = np.abs(problem.b) / np.sqrt(data.d)
         big = x.max(initial=0.0)
-        rhs_energy = big * float(np.sqrt(np.sum((x / big) ** 2))) if big > 0.0 else 0.0
+        rhs_energy = float(big) * float(np.sqrt(np.sum((x / big) ** 2))) if big > 0.0 else 0.0
         if energy <= 2.0**-48 * rhs_energy:
             energy, velocity = rhs_energy, float((x * np.sqrt(data.nu)).max(initial=0.0))
-        data.set_start(energy, velocity)
+        # A size that overflows measures nothing: 0 makes every error beside it infinite.
+        data.set_start(energy if energy < np.inf else 0.0, velocity if velocity < np.inf else 0.0)
     return data.start_energy, data.start_velocity
 
 
@@ -111,9 +112,12 @@ def residual(problem: Problem, impulse: Any) -> Residual:
     Raises
     ------
     InputError
-        `impulse` has the wrong length.
+        `impulse` has the wrong length or holds no numbers.
     """
-    impulse = np.ascontiguousarray(impulse, float)
+    try:
+        impulse = np.ascontiguousarray(impulse, float)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"impulse is not an array of numbers ({error})") from None
     if impulse.shape != (problem.m,):
         raise InputError(f"impulse has shape {impulse.shape}; ({problem.m},) is needed")
     w, e = np.empty(problem.m), np.empty(problem.m)

@@ -111,7 +111,7 @@ class Prepared:
         self.options = dict(options)
         self.problem = problem
         start = perf_counter()
-        self._solver = spec.load()(**options)
+        self._solver = _make(spec, options)
         self._state = self._solver.prepare(problem)
         self.setup_time = perf_counter() - start
         self._fresh = True
@@ -130,6 +130,10 @@ class Prepared:
         """As `lavender.solve`; `problem`, if given, replaces the prepared one."""
         spec = self.spec
         tol, max_iter, time_limit = _check_budget(spec, tol, max_iter, time_limit)
+        if callback is not None and not callable(callback):
+            raise InputError(
+                f"callback is {callback!r}; a function of (iterations, impulse, residual) is needed"
+            )
         if (callback is not None and not spec.callback) or (history and not spec.history):
             raise CapabilityError(
                 f"solver {spec.name!r} runs in one call; it takes no callback and records no history"
@@ -165,6 +169,16 @@ class Prepared:
             self.setup_time = perf_counter() - start
             self.problem = problem
         self._fresh = False
+
+
+def _make(spec: SolverSpec, options: dict[str, Any]) -> Any:
+    factory = spec.load()
+    try:
+        return factory(**options)
+    except (TypeError, ValueError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"solver {spec.name!r} cannot take the options {options}: {error}") from error
 
 
 def same_structure(p: Problem, q: Problem) -> bool:

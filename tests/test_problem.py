@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+import warnings
 
 import numpy as np
 import pytest
@@ -75,7 +76,9 @@ def test_the_assembled_matrix_is_symmetric_to_the_bit_and_sorted(seed):
     np.testing.assert_array_equal(a.toarray(), a.toarray().T)
     minv = problem.rows.inverse_mass_matrix()
     expected = (problem.jacobian @ minv @ problem.jacobian.T).toarray() + np.diag(problem.compliance)
-    np.testing.assert_allclose(a.toarray(), expected, atol=1e-13 * np.abs(expected).max())  # a dozen roundings
+    np.testing.assert_allclose(
+        a.toarray(), expected, atol=1e-13 * np.abs(expected).max()
+    )  # a dozen roundings
 
 
 def test_from_rows_forms_b_from_target_and_free_velocity():
@@ -254,6 +257,9 @@ BAD_CALLS = {
     "NaN warm start": ({"impulse": [NAN] * 12}, lv.InputError, "must be finite"),
     "seed": ({"order": "random", "seed": -1}, lv.InputError, "seed is -1"),
     "ground": ({"order": "given", "ground": [0]}, lv.InputError, "bottom_up"),
+    "ground beside an array": ({"order": range(12), "ground": [0]}, lv.InputError, "bottom_up"),
+    "seed of an order without lots": ({"order": "given", "seed": 3}, lv.InputError, "random"),
+    "callback": ({"callback": 3}, lv.InputError, "callback is 3"),
     "unknown option": ({"omga": 1.0}, lv.UnknownName, "omga"),
 }
 
@@ -263,6 +269,27 @@ def test_bad_calls_say_what_came_and_what_was_needed(case):
     options, kind, message = BAD_CALLS[case]
     with pytest.raises(kind, match=message):
         lv.solve(random_lcp(0), "pgs", **options)
+
+
+def test_options_of_the_wrong_type_are_input_errors():
+    with pytest.raises(lv.InputError, match=r"'jacobi' cannot take the options .*omega"):
+        lv.solve(random_lcp(0), "jacobi", omega="0.5")
+    with pytest.raises(lv.InputError, match="not an array of numbers"):
+        lv.residual(random_lcp(0), ["a"] * 12)
+    with pytest.raises(lv.InputError, match="one for each block"):
+        lv.Problem.lcp(I2, [1.0, 1.0], names="ab")
+
+
+def test_large_finite_numbers_are_finite():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        problem = lv.Problem.lcp(I2, [1.2e308, 1.2e308])
+        assert lv.solve(problem, "pgs").success
+        np.testing.assert_array_equal(lv.solve(problem, "pgs").impulse, problem.b)
+    # |b| itself overflows: nothing to measure against, so nothing is judged solved but an error of 0.
+    problem = lv.Problem.lcp(I2, [1.7e308, 1.7e308])
+    assert lv.residual(problem, problem.b).relative == 0.0
+    assert lv.residual(problem, 0.999 * problem.b).relative == np.inf
 
 
 def test_an_unknown_solver_gets_the_nearest_names():

@@ -214,7 +214,7 @@ def test_coincident_contacts_defeat_undamped_jacobi(k):
 @pytest.mark.parametrize("order", ORDERS)
 def test_named_orders_are_permutations_with_joints_first(order, seed):
     problem = random_contact_problem(seed)
-    o = block_order(problem, order, seed=seed)
+    o = block_order(problem, order, seed=seed if order == "random" else 0)
     assert sorted(o.blocks.tolist()) == list(range(problem.n_blocks))
     assert o.split == problem.rows.n_joints
     assert sorted(o.blocks[: o.split].tolist()) == list(range(o.split))
