@@ -1,0 +1,569 @@
+"""Pages made from what the package says of itself: SPECs, docstrings, examples, scenes, cases, and a small benchmark.
+
+    python docs/generate.py         writes docs/generated/, as the Sphinx build does
+
+Nothing here is checked in. The benchmark keeps its records beside the build and measures again only what is
+missing: another version, machine or plan.
+"""
+
+import contextlib
+import importlib.util
+import inspect
+import io
+import os
+import re
+import sys
+import warnings
+from pathlib import Path
+
+for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+    os.environ.setdefault(variable, "1")
+os.environ.setdefault("MPLBACKEND", "Agg")
+
+import docstrings
+import tried
+
+import lavender as lv
+from lavender import bench, registry, suite
+from lavender.bench import level_name
+from lavender.ordering import ORDERS
+from lavender.problem import LAWS
+from lavender.report import advice_by_level, advice_by_time, claims, geometric_means, reaches
+from lavender.report.style import looks
+from lavender.report.tables import shift_of, time_budgets
+from lavender.report.text import residual, seconds
+from lavender.scene.gallery import SCENES
+
+ROOT = Path(__file__).resolve().parent.parent
+LEVELS = (1e-3, 1e-6, 1e-9)
+CASES = (
+    "random_spd(n=100, condition=1e4)",
+    "chain(n=33, tip_mass=1e4)",
+    "hang(n=33)",
+    "stack(n=64)",
+    "box_stack(n=10)",
+    "box_stack(n=10, mass_ratio=1e6)",
+    "pyramid(k=10)",
+    "granular(n=4)",
+    "granular(n=9)",
+    "box_stackF(n=10)",
+    "pyramidF(k=6, sliding=0.5)",
+    "granularF(n=3, sliding=0.5)",
+    "pyramid(k=6, friction=cone)",
+    "granular(n=4, friction=cone)",
+)
+PLAN = bench.Plan(LEVELS, budgets=(4, 16, 64), repeats=2, time_limit=0.1, warm=False, orders=())
+# Beside the solvers of lavender: one backend of each kind (splitting, interior point, cones).
+BACKENDS = ("osqp", "scs", "piqp", "clarabel", "clarabel_cone")
+NEAR = 1.25  # times the fastest: differences below say nothing on a machine that does other work
+LAW_NAMES = {
+    "linear": "linear systems",
+    "lcp": "bounded rows and contacts without friction",
+    "coulomb": "Coulomb friction",
+    "cone": "relaxed (convex) friction",
+}
+
+
+class Site:
+    """Where pages go; a page that has not changed is not touched, so that Sphinx need not read it again."""
+
+    def __init__(self, folder):
+        self.folder = folder
+        self.kept = set()
+
+    def path(self, name):
+        """Path of a file below `generated/`, with its folder made."""
+        path = self.folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self.kept.add(path)
+        return path
+
+    def write(self, name, text):
+        """Write a text if it differs from what is there."""
+        path = self.path(name)
+        text = text.rstrip() + "\n"
+        if not path.exists() or path.read_text(encoding="utf-8") != text:
+            path.write_text(text, encoding="utf-8")
+
+    def forget_others(self):
+        """Remove what an earlier build left and this one did not write."""
+        for path in self.folder.rglob("*"):
+            if path.is_file() and path not in self.kept:
+                path.unlink()
+
+
+def table(head, rows):
+    """A markdown table."""
+    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
+    return "\n".join(lines + ["| " + " | ".join(str(c).replace("|", "\\|") for c in row) + " |" for row in rows])
+
+
+def join_laws(spec):
+    """Laws of a spec in the order of the classes."""
+    return ", ".join(law for law in LAWS if law in spec.laws)
+
+
+def built_in():
+    """Specs by name, without plug-ins that happen to be installed."""
+    return {name: spec for name, spec in registry.specs().items() if _module_of(spec).startswith("lavender.")}
+
+
+def measure(cache):
+    """Records of every solver of lavender and some backends on CASES."""
+    ours = [name for name, spec in built_in().items() if not spec.external]
+    cache.mkdir(parents=True, exist_ok=True)
+    solvers = ours + [name for name in BACKENDS if registry.specs()[name].missing() is None]
+    return bench.run(CASES, solvers, PLAN, cache / "records.jsonl").latest()
+
+
+# -- figures ----------------------------------------------------------------------------------------
+
+
+def pareto(runs):
+    """Runs in order of time, each better than all before it: what a solver can do in a time."""
+    best, kept = float("inf"), []
+    for run in sorted(runs, key=lambda r: r.time_min):
+        if run.relative < best:
+            best = run.relative
+            kept.append(run)
+    return kept
+
+
+def law_figures(records):
+    """Law -> SVG text: error against time, a panel for each case, lines with the solver's name as id."""
+    import matplotlib
+    from matplotlib.figure import Figure
+
+    look = looks(r.solver for r in records)
+    out = {}
+    for law in LAWS:
+        cases = [c for c, info in records.cases.items() if info.law == law]
+        if not cases:
+            continue
+        columns = min(3, len(cases))
+        lines = -(-len(cases) // columns)
+        canvas = Figure(figsize=(3.2 * columns, 2.6 * lines), layout="constrained")
+        shown = {}
+        for i, axes in enumerate(canvas.subplots(lines, columns, squeeze=False).flat):
+            if i >= len(cases):
+                axes.set_axis_off()
+                continue
+            axes.set(title=cases[i], xscale="log", yscale="log", ylim=(1e-17, 3.0))
+            floors = []
+            for solver, k in look.items():
+                runs = [r for r in records if r.case == cases[i] and r.solver == solver and r.usable]
+                if not runs:
+                    continue
+                runs = pareto(runs)
+                (line,) = axes.plot(
+                    [r.time_min for r in runs],
+                    [min(max(r.relative, 1e-17), 3.0) for r in runs],
+                    color=k.color, marker=k.marker, markersize=3, linewidth=1.0, label=solver,
+                )  # fmt: skip
+                line.set_gid(f"{solver}--{i}")
+                shown.setdefault(solver, line)
+                floors.append(min((r.relative, r.floor) for r in runs))
+            floor = min(floors, default=(0.0, 0.0))[1]
+            if floor > 0.0:
+                axes.axhline(floor, color="0.3", linewidth=0.8, linestyle=":")
+            axes.title.set_fontsize(8)
+            axes.tick_params(labelsize=7)
+            axes.grid(True, linewidth=0.3)
+        canvas.supxlabel("time: set-up and solve [s]", fontsize=8)
+        canvas.supylabel("relative residual [-]", fontsize=8)
+        legend = canvas.legend(shown.values(), shown.keys(), loc="outside right upper", fontsize=7, frameon=False)
+        legend.set_gid("legend")
+        text = io.StringIO()
+        with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": "lavender"}):
+            canvas.savefig(text, format="svg", metadata={"Date": None})
+        out[law] = text.getvalue()
+    return out
+
+
+def highlighted(svg, solver):
+    """The figure with one solver's curve in colour before the others in grey."""
+    style = (
+        '<style type="text/css">[id*="--"] path, [id*="--"] use {stroke: #d5d5d5 !important; fill-opacity: 0}'
+        f'[id^="{solver}--"] path, [id^="{solver}--"] use {{stroke: #5b2a9d !important; stroke-width: 2.2 !important}}'
+        "#legend {display: none}</style>"
+    )
+    return svg.replace("</metadata>", "</metadata>" + style, 1) if "</metadata>" in svg else _after_head(svg, style)
+
+
+def _after_head(svg, style):
+    head = re.search(r"<svg[^>]*>", svg)
+    return svg[: head.end()] + style + svg[head.end() :]
+
+
+def image(path, text):
+    """An image of this site in markdown."""
+    return f"```{{image}} {path}\n:class: figure\n:alt: {text}\n```"
+
+
+# -- solvers ----------------------------------------------------------------------------------------
+
+
+def abilities(spec):
+    """What a spec declares, in words."""
+    reads = {
+        "rows": "body velocities (`Problem.from_rows`); A is never formed",
+        "matrix": "the matrix A (formed once from rows where needed)",
+        "either": "rows or matrix, as given",
+    }
+    yes = {
+        "impulse": "starts from `impulse=`",
+        "order": "`order=`, `ground=`",
+        "seed": "`seed=`",
+        "threads": "`threads=` (with `order=\"colored\"`)",
+        "callback": "`callback=`",
+        "history": "`history=True`",
+    }
+    rows = [
+        ("laws", join_laws(spec)),
+        ("reads", reads[spec.operator]),
+        ("ends", "after finitely many steps or at rounding, whatever `tol`" if spec.exact else "where its test at `tol` is met"),
+        ("runs", "in steps that can be stopped and continued" if spec.resumable else "in one call"),
+        ("takes", "; ".join(text for name, text in yes.items() if getattr(spec, name)) or "neither start nor order"),
+        ("budget", f"{spec.max_iter:,} iterations unless `max_iter=` says otherwise"),
+    ]
+    if spec.delegates:
+        rows.append(("hands over", "to other solvers; its message and `work` say to which"))
+    if spec.requires:
+        rows.append(("needs", f"`pip install {spec.install or ' '.join(spec.requires)}`"))
+    if spec.reference:
+        rows.append(("source", spec.reference))
+    return table(("", ""), rows)
+
+
+def standing(records, solver):
+    """Where a solver is the fastest, and where it does not arrive, in this build's measurements."""
+    by_case = {}
+    for reach in reaches(records, LEVELS):
+        by_case.setdefault(reach.case, []).append(reach)
+    rows, best = [], {level: [] for level in LEVELS}
+    for case, all_reaches in by_case.items():
+        mine = next((r for r in all_reaches if r.solver == solver), None)
+        if mine is None:
+            continue
+        cells = [f"`{case}`"]
+        for level in LEVELS:
+            others = [r.times[level] for r in all_reaches if r.solver not in (solver, "auto")]
+            fastest = min(others, default=float("inf"))
+            t = mine.times[level]
+            if t == float("inf"):
+                cells.append("–")
+                continue
+            if t <= NEAR * fastest:
+                best[level].append(case)
+            ratio = "" if fastest == float("inf") else f" ({t / fastest:.2g} ×)"
+            cells.append(f"{seconds(t)}{ratio}")
+        cells.append(residual(mine.best) + (" (floor)" if mine.at_floor else ""))
+        rows.append(cells)
+    if not rows:
+        return "Not measured here: it is not installed, or takes none of the cases."
+    lines = []
+    for level, cases in best.items():
+        if cases:
+            shown = ", ".join(f"`{c}`" for c in cases)
+            lines.append(f"- to {level_name(level)} it is the fastest, or within a quarter of it, on {shown};")
+    if lines:
+        lines[-1] = lines[-1].rstrip(";") + "."
+        said = "In the measurements of this build:\n\n" + "\n".join(lines)
+    else:
+        said = "In the measurements of this build another solver was faster on every case, to every level."
+    head = ("case", *(f"to {level_name(x)}" for x in LEVELS), "best residual")
+    note = "Times are set-up and solve; in brackets, relative to the fastest *other* solver (`auto` aside); – was not reached."
+    return f"{said}\n\n{table(head, rows)}\n\n{note}"
+
+
+def solver_page(site, spec, records, figures):
+    """One page: formula and remarks from the module, abilities and options from the SPEC, curves from the records."""
+    module = importlib.import_module(_module_of(spec))
+    title = f"# {spec.name}\n\n{spec.summary[:1].upper() + spec.summary[1:]}."
+    parts = [title, docstrings.markdown(module.__doc__ or ""), "## What it takes", abilities(spec)]
+    if spec.options:
+        rows = [(f"`{name}`", text) for name, text in spec.options.items()]
+        parts += ["## Options", table(("option", "meaning"), rows)]
+    parts += [
+        "## When to use it",
+        standing(records, spec.name),
+        "## Error against time",
+        "Its curve in colour, all other solvers of the same cases in grey; the dotted line is the floor of float64.",
+    ]
+    for name in LAWS:
+        if name in spec.laws and name in figures and f'id="{spec.name}--' in figures[name]:
+            file = f"figures/{spec.name}-{name}.svg"
+            site.write(file, highlighted(figures[name], spec.name))
+            parts += [f"**{LAW_NAMES[name].capitalize()}**", image("../" + file, f"{spec.name} on {LAW_NAMES[name]}")]
+    site.write(f"solvers/{spec.name}.md", "\n\n".join(p for p in parts if p))
+
+
+def _module_of(spec):
+    if isinstance(spec.factory, str):
+        return spec.factory.partition(":")[0]
+    function = getattr(spec.factory, "func", spec.factory)  # backends are partials of one class
+    return function.__module__
+
+
+def solver_pages(site, records, figures):
+    """The table of solvers, a page for each of ours, one page for the backends."""
+    specs = built_in()
+    ours = [s for s in specs.values() if not s.external]
+    others = [s for s in specs.values() if s.external]
+    for spec in ours:
+        solver_page(site, spec, records, figures)
+    rows = [
+        (
+            f"[{s.name}]({s.name}.md)" if not s.external else f"[{s.name}](backends.md#{s.name})",
+            join_laws(s),
+            s.operator,
+            "yes" if s.exact else "",
+            "yes" if s.resumable else "",
+            s.summary,
+        )
+        for s in specs.values()
+    ]
+    site.write(
+        "solvers/index.md",
+        "# Solvers\n\nEvery name that `lavender.solve` takes. *Reads*: rows (body velocities), the matrix A, or either. "
+        "*Exact*: ends after\nfinitely many steps. *Resumable*: n₁ and then n₂ iterations give the bits of n₁ + n₂.\n\n"
+        + table(("name", "laws", "reads", "exact", "resumable", ""), rows)
+        + "\n\n```{toctree}\n:hidden:\n\n"
+        + "\n".join([*(s.name for s in ours), "backends"])
+        + "\n```\n",
+    )
+    parts = [
+        "# Backends of other packages",
+        docstrings.markdown(sys.modules["lavender.external.qpsolvers_"].__doc__),
+        "Each runs under its own name. What is not installed says what to install. Options of all of them:",
+        table(("option", "meaning"), [(f"`{n}`", t) for n, t in next(s for s in others if s.options).options.items()]),
+    ]
+    for s in others:
+        parts += [f"## {s.name}", f"{s.summary[:1].upper() + s.summary[1:]}.", abilities(s)]
+        if any(r.solver == s.name for r in records):
+            parts.append(standing(records, s.name))
+    site.write("solvers/backends.md", "\n\n".join(parts))
+
+
+# -- measured ---------------------------------------------------------------------------------------
+
+
+def measured_page(site, records, figures):
+    """Advice by structure from the records of this build, and the curves behind it."""
+    run = next(iter(records.runs.values()))
+    families = {}
+    for a in advice_by_level(records):
+        families.setdefault(a.family, {})[a.target] = a
+    timed = {}
+    for a in advice_by_time(records):
+        timed.setdefault(a.family, {})[a.target] = a
+    times = time_budgets(records)
+    rows = []
+    for family, by_level in families.items():
+        cells = [family]
+        for level in LEVELS:
+            best = by_level[level].best
+            cells.append(f"**{best.solver}** {seconds(best.typical)} ({best.solved}/{best.cases})" if best else "nobody")
+        for t in times:
+            best = timed[family][t].best
+            cells.append(f"**{best.solver}** to {residual(best.score)}" if best else "nobody")
+        rows.append(cells)
+    head = ("structure", *(f"to {level_name(x)}" for x in LEVELS), *(f"in {seconds(t)}" for t in times))
+    shown = ", ".join(f"{n} {v}" for n, v in run.versions.items())
+    parts = [
+        "# Measured in this build",
+        f"{len(records)} runs on {len(records.cases)} cases of `lavender.suite`, made while these pages were built: "
+        f"{run.cpu}, {run.threads} thread,\nlavender {run.lavender}, Python {run.python}, {shown}. Minimum of "
+        f"{PLAN.repeats} repeats, set-up and solve together, at most {seconds(PLAN.time_limit)}\na solve. It is a "
+        "glance, not a benchmark: `lavender report` on your own problems says more.",
+        "## By structure",
+        "Who brings most cases of a structure to a level, and of those the fastest by shifted geometric mean of time; "
+        "its median time\nwhere it arrives, and on how many cases. In a time: the mean residual reached.",
+        table(head, rows),
+        "## By law",
+    ]
+    for law, by_level in geometric_means(records).items():
+        rows = [
+            (solver, *(f"{seconds(by_level[x][solver][0])} ({by_level[x][solver][1]}/{by_level[x][solver][2]})" for x in LEVELS))
+            for solver in by_level[LEVELS[0]]
+        ]
+        parts += [
+            f"### {LAW_NAMES.get(law, law).capitalize()}",
+            f"Geometric means of time, shifted by {seconds(shift_of(records))}, of the solvers that take every case of the "
+            f"class; a miss\ncosts {seconds(PLAN.time_limit)}. In brackets, cases that arrived.",
+            table(("solver", *(f"to {level_name(x)}" for x in LEVELS)), rows),
+        ]
+        if law in figures:
+            site.write(f"figures/all-{law}.svg", figures[law])
+            parts.append(image(f"figures/all-{law}.svg", f"error against time on {LAW_NAMES[law]}"))
+    rows = [
+        (c.solver, c.claims, c.wrong, f"{c.reached} of {c.asked}") for c in sorted(claims(records), key=lambda c: c.solver)
+    ]
+    parts += [
+        "## Claims",
+        "How often a solver said that it had solved, how often the judge disagrees, and how many of the levels asked for "
+        "it reached.",
+        table(("solver", "claims", "wrong", "levels reached"), rows),
+        "## Cases",
+        table(("case", "law", "rows", "why it is there"), [(f"`{i.case}`", i.law, i.rows, i.reason) for i in records.cases.values()]),
+    ]
+    site.write("measured.md", "\n\n".join(parts))
+
+
+# -- examples, scenes, cases, parts -----------------------------------------------------------------
+
+
+def example_page(site, cache):
+    """Every example: its docstring, what it prints, its figure, its source."""
+    parts = ["# Examples", "Each is run, and its figure drawn, when these pages are built; a test checks what it shows."]
+    for path in sorted((ROOT / "examples").glob("*.py")):
+        spec = importlib.util.spec_from_file_location(path.stem, path)
+        module = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(module)
+        figure = site.path(f"figures/example-{path.stem}.svg")
+        printed = io.StringIO()
+        with contextlib.redirect_stdout(printed):
+            module.main(str(figure))
+        first, _, rest = inspect.cleandoc(module.__doc__).partition("\n")
+        rest = re.sub(r"\n+ +python examples/\S+ .*", "", rest)
+        output = "\n".join(line for line in printed.getvalue().splitlines() if str(figure) not in line)
+        output = output.replace(str(figure), figure.name)
+        parts += [
+            f"## {path.stem}",
+            f"**{first}**",
+            docstrings.markdown(rest),
+            image(f"figures/{figure.name}", first),
+            f"```text\n{output}\n```",
+            f"Source: `examples/{path.name}`.",
+        ]
+    site.write("examples.md", "\n\n".join(p for p in parts if p))
+
+
+def _signature(function, leave=()):
+    shown = []
+    for name, p in inspect.signature(function).parameters.items():
+        if name in leave:
+            continue
+        shown.append(name if p.default is inspect.Parameter.empty else f"{name}={p.default!r}")
+    return ", ".join(shown)
+
+
+def scene_page(site):
+    """The gallery."""
+    parts = [
+        "# Scenes",
+        "`lavender.Scene(name, **parameters)` builds a scene of the gallery; parameters that all scenes share "
+        "(`dt`, `friction`,\n`solver_iterations`, `warm_start`, …) are those of `lavender.Scene`. Lengths in m, masses in "
+        "kg, angles in rad.",
+    ]
+    for name, build in SCENES.items():
+        parts += [f"## {name}", f"```python\nlv.Scene(\"{name}\", {_signature(build, ('scene',))})\n```" , docstrings.markdown(build.__doc__)]
+    site.write("scenes.md", "\n\n".join(parts).replace("```python\nlv.Scene", "```text\nlv.Scene"))
+
+
+def suite_page(site):
+    """Families and sets of cases."""
+    parts = [
+        "# Cases",
+        "`lavender.suite` makes problems from a name: `suite.case(\"pyramid(k=10, mass_ratio=1e6)\")`, or the same text on "
+        "the command\nline. Each says why it is there; where the solution is known by closed form, exact arithmetic or proof, "
+        "`case.reference` holds it.",
+        "## Families",
+    ]
+    seen = set()
+    for name, family in sorted(suite.FAMILIES.items()):
+        if family.make in seen:
+            continue
+        seen.add(family.make)
+        others = [f"`{f.name}`" for f in suite.FAMILIES.values() if f.make is family.make and f.name != name]
+        text = next(t for t in suite.families() if t.partition("(")[0] == name)
+        also = f"\n\nAlso as {', '.join(others)}." if others else ""
+        parts += [f"### {name}", f"`{text}`", docstrings.markdown(family.make.__doc__ or "") + also]
+    parts.append("## Sets")
+    for name, cases in suite.SETS.items():
+        parts += [f"`{name}`: {len(cases)} cases.", ", ".join(f"`{c}`" for c in cases) + "."]
+    site.write("cases.md", "\n\n".join(parts))
+
+
+def part_pages(site):
+    """Tables that hand-written pages include."""
+    rows = [(f"`{s.name}`", s.value) for s in lv.Status]
+    site.write("parts/statuses.md", table(("status", "claim"), rows))
+    text = inspect.getdoc(sys.modules["lavender.ordering"])
+    assert all(order in text for order in ORDERS)
+    site.write("parts/orders.md", docstrings.markdown(text.partition("\n")[2]))
+    fields = ", ".join(f"`{name}`" for name in lv.SOLVER_FIELDS)
+    site.write("parts/solver_fields.md", fields + ".")
+
+
+def api_page(site):
+    """Public names by room."""
+    rooms = {
+        "Problems": ("Problem", "Rows", "Cones"),
+        "Solving": ("solve", "prepare", "Solution", "Status", "Claim"),
+        "Judging": ("residual", "Residual", "cross_check", "CrossCheck"),
+        "Registry": ("available", "known", "get", "register", "SolverSpec"),
+        "Simulating": ("Scene", "Simulation", "Snapshot"),
+        "Errors": ("LavenderError", "InputError", "UnknownName", "SolverUnavailable", "CapabilityError", "SolveFailed"),
+    }
+    constants = {"CONTACT", "CONTACT_SPIN", "ROW", "SOLVER_FIELDS", "__version__"}
+    modules = {"bench", "engine", "io", "report", "scene", "suite"}
+    listed = {name for names in rooms.values() for name in names}
+    rest = sorted(set(lv.__all__) - listed - constants - modules)
+    if rest:
+        rooms["More"] = tuple(rest)
+    parts = ["# Python interface", "Everything below is in `lavender`; arrays are float64 and C-contiguous, shapes and units as said."]
+    for room, names in rooms.items():
+        parts.append(f"## {room}")
+        for name in names:
+            thing = getattr(lv, name, None)
+            if thing is None:
+                continue
+            if inspect.ismodule(thing):
+                parts.append(f"```{{eval-rst}}\n.. automodule:: {thing.__name__}\n```")
+            elif not inspect.isclass(thing):
+                parts.append(f"```{{eval-rst}}\n.. autofunction:: lavender.{name}\n```")
+            else:
+                members = "\n   :members:" if not issubclass(thing, (Exception, lv.Status)) else ""
+                parts.append(f"```{{eval-rst}}\n.. autoclass:: lavender.{name}{members}\n```")
+    parts.append("## Files, cases, measurements, reports")
+    public = {
+        "lavender.io": ("load", "save", "read"),
+        "lavender.suite": ("case", "cases", "families", "Case", "Reference"),
+        "lavender.bench": ("run", "read", "Plan", "Record", "CaseInfo", "Records"),
+        "lavender.report": tuple(lv.report.__all__),
+        "lavender.residuals": ("natural_map", "qp_residual", "siconos_error", "check_certificate"),
+    }
+    for module, names in public.items():
+        parts.append(f"### {module}")
+        held = importlib.import_module(module)
+        for name in names:
+            if not hasattr(held, name):
+                continue
+            kind = "autoclass" if inspect.isclass(getattr(held, name)) else "autofunction"
+            members = "\n   :members:" if kind == "autoclass" else ""
+            parts.append(f"```{{eval-rst}}\n.. {kind}:: {module}.{name}{members}\n```")
+    site.write("api.md", "\n\n".join(parts))
+
+
+def write(source, cache):
+    """Write every generated page below `source`/generated; records are kept in `cache`."""
+    site = Site(Path(source) / "generated")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of backends that talk while they are measured
+        records = measure(Path(cache))
+    figures = law_figures(records)
+    solver_pages(site, records, figures)
+    measured_page(site, records, figures)
+    example_page(site, cache)
+    scene_page(site)
+    suite_page(site)
+    part_pages(site)
+    api_page(site)
+    site.write("tried.md", tried.page(LEVELS))
+    site.forget_others()
+
+
+if __name__ == "__main__":
+    here = Path(__file__).resolve().parent
+    write(here, here / "_build")
