@@ -1,4 +1,4 @@
-"""Sphinx: python -m sphinx -W --keep-going -b html docs SITE
+"""Sphinx: python -m sphinx -W --keep-going -b html docs SITE.
 
 Pages below `generated/` are written by `generate.py` before Sphinx reads the sources: one page for each
 solver, the examples' output and figures, scenes, cases, measured curves.

@@ -84,7 +84,10 @@ def field_comments(cls):
             continue
         if node.target.id.startswith("_"):
             continue
-        comments = [re.search(r"\s#\s(?!type:|noqa|fmt:)(.*)$", lines[n - 1]) for n in range(node.lineno, node.end_lineno + 1)]
+        comments = [
+            re.search(r"\s#\s(?!type:|noqa|fmt:)(.*)$", lines[n - 1])
+            for n in range(node.lineno, node.end_lineno + 1)
+        ]
         text = " ".join(c.group(1) for c in comments if c)
         found[node.target.id] = (ast.unparse(node.annotation), text)
     return found
@@ -94,7 +97,14 @@ def _fields(cls):
     rows = field_comments(cls)
     if not any(text for _, text in rows.values()):
         return []
-    out = [".. list-table::", "   :header-rows: 1", "", "   * - field", "     - type", "     - shape, unit, meaning"]
+    out = [
+        ".. list-table::",
+        "   :header-rows: 1",
+        "",
+        "   * - field",
+        "     - type",
+        "     - shape, unit, meaning",
+    ]
     for name, (kind, text) in rows.items():
         out += [f"   * - `{name}`", f"     - `{kind}`", f"     - {_plain(text)}"]
     return out

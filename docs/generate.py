@@ -95,7 +95,9 @@ class Site:
 def table(head, rows):
     """A markdown table."""
     lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
-    return "\n".join(lines + ["| " + " | ".join(str(c).replace("|", "\\|") for c in row) + " |" for row in rows])
+    return "\n".join(
+        lines + ["| " + " | ".join(str(c).replace("|", "\\|") for c in row) + " |" for row in rows]
+    )
 
 
 def join_laws(spec):
@@ -171,7 +173,9 @@ def law_figures(records):
             axes.grid(True, linewidth=0.3)
         canvas.supxlabel("time: set-up and solve [s]", fontsize=8)
         canvas.supylabel("relative residual [-]", fontsize=8)
-        legend = canvas.legend(shown.values(), shown.keys(), loc="outside right upper", fontsize=7, frameon=False)
+        legend = canvas.legend(
+            shown.values(), shown.keys(), loc="outside right upper", fontsize=7, frameon=False
+        )
         legend.set_gid("legend")
         text = io.StringIO()
         with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": "lavender"}):
@@ -183,11 +187,18 @@ def law_figures(records):
 def highlighted(svg, solver):
     """The figure with one solver's curve in colour before the others in grey."""
     style = (
-        '<style type="text/css">[id*="--"] path, [id*="--"] use {stroke: #d5d5d5 !important; fill-opacity: 0}'
-        f'[id^="{solver}--"] path, [id^="{solver}--"] use {{stroke: #5b2a9d !important; stroke-width: 2.2 !important}}'
+        '<style type="text/css">'
+        '[id*="--"] path, [id*="--"] use {stroke: #d0d0d0 !important}'
+        '[id*="--"] use {fill: #d0d0d0 !important}'
+        f'[id^="{solver}--"] path, [id^="{solver}--"] use {{stroke: #5b2a9d !important; stroke-width: 2 !important}}'
+        f'[id^="{solver}--"] use {{fill: #5b2a9d !important}}'
         "#legend {display: none}</style>"
     )
-    return svg.replace("</metadata>", "</metadata>" + style, 1) if "</metadata>" in svg else _after_head(svg, style)
+    return (
+        svg.replace("</metadata>", "</metadata>" + style, 1)
+        if "</metadata>" in svg
+        else _after_head(svg, style)
+    )
 
 
 def _after_head(svg, style):
@@ -214,16 +225,24 @@ def abilities(spec):
         "impulse": "starts from `impulse=`",
         "order": "`order=`, `ground=`",
         "seed": "`seed=`",
-        "threads": "`threads=` (with `order=\"colored\"`)",
+        "threads": '`threads=` (with `order="colored"`)',
         "callback": "`callback=`",
         "history": "`history=True`",
     }
     rows = [
         ("laws", join_laws(spec)),
         ("reads", reads[spec.operator]),
-        ("ends", "after finitely many steps or at rounding, whatever `tol`" if spec.exact else "where its test at `tol` is met"),
+        (
+            "ends",
+            "after finitely many steps or at rounding, whatever `tol`"
+            if spec.exact
+            else "where its test at `tol` is met",
+        ),
         ("runs", "in steps that can be stopped and continued" if spec.resumable else "in one call"),
-        ("takes", "; ".join(text for name, text in yes.items() if getattr(spec, name)) or "neither start nor order"),
+        (
+            "takes",
+            "; ".join(text for name, text in yes.items() if getattr(spec, name)) or "neither start nor order",
+        ),
         ("budget", f"{spec.max_iter:,} iterations unless `max_iter=` says otherwise"),
     ]
     if spec.delegates:
@@ -233,6 +252,10 @@ def abilities(spec):
     if spec.reference:
         rows.append(("source", spec.reference))
     return table(("", ""), rows)
+
+
+def _times(ratio):
+    return f"{ratio:.2g}" if ratio < 100.0 else f"{ratio:.0f}"
 
 
 def standing(records, solver):
@@ -255,7 +278,7 @@ def standing(records, solver):
                 continue
             if t <= NEAR * fastest:
                 best[level].append(case)
-            ratio = "" if fastest == float("inf") else f" ({t / fastest:.2g} ×)"
+            ratio = "" if fastest == float("inf") else f" ({_times(t / fastest)} ×)"
             cells.append(f"{seconds(t)}{ratio}")
         cells.append(residual(mine.best) + (" (floor)" if mine.at_floor else ""))
         rows.append(cells)
@@ -265,14 +288,19 @@ def standing(records, solver):
     for level, cases in best.items():
         if cases:
             shown = ", ".join(f"`{c}`" for c in cases)
-            lines.append(f"- to {level_name(level)} it is the fastest, or within a quarter of it, on {shown};")
+            lines.append(
+                f"- to {level_name(level)} it is the fastest, or within a quarter of it, on {shown};"
+            )
     if lines:
         lines[-1] = lines[-1].rstrip(";") + "."
         said = "In the measurements of this build:\n\n" + "\n".join(lines)
     else:
         said = "In the measurements of this build another solver was faster on every case, to every level."
     head = ("case", *(f"to {level_name(x)}" for x in LEVELS), "best residual")
-    note = "Times are set-up and solve; in brackets, relative to the fastest *other* solver (`auto` aside); – was not reached."
+    note = (
+        "Times are set-up and solve; in brackets, relative to the fastest *other* solver (`auto` aside); "
+        "– was not reached."
+    )
     return f"{said}\n\n{table(head, rows)}\n\n{note}"
 
 
@@ -294,7 +322,10 @@ def solver_page(site, spec, records, figures):
         if name in spec.laws and name in figures and f'id="{spec.name}--' in figures[name]:
             file = f"figures/{spec.name}-{name}.svg"
             site.write(file, highlighted(figures[name], spec.name))
-            parts += [f"**{LAW_NAMES[name].capitalize()}**", image("../" + file, f"{spec.name} on {LAW_NAMES[name]}")]
+            parts += [
+                f"**{LAW_NAMES[name].capitalize()}**",
+                image("../" + file, f"{spec.name} on {LAW_NAMES[name]}"),
+            ]
     site.write(f"solvers/{spec.name}.md", "\n\n".join(p for p in parts if p))
 
 
@@ -325,8 +356,8 @@ def solver_pages(site, records, figures):
     ]
     site.write(
         "solvers/index.md",
-        "# Solvers\n\nEvery name that `lavender.solve` takes. *Reads*: rows (body velocities), the matrix A, or either. "
-        "*Exact*: ends after\nfinitely many steps. *Resumable*: n₁ and then n₂ iterations give the bits of n₁ + n₂.\n\n"
+        "# Solvers\n\nEvery name that `lavender.solve` takes. *Reads*: rows (body velocities), the matrix A, "
+        "or either.\n*Exact*: ends after finitely many steps. *Resumable*: n₁ and then n₂ iterations give the bits of n₁ + n₂.\n\n"
         + table(("name", "laws", "reads", "exact", "resumable", ""), rows)
         + "\n\n```{toctree}\n:hidden:\n\n"
         + "\n".join([*(s.name for s in ours), "backends"])
@@ -336,7 +367,10 @@ def solver_pages(site, records, figures):
         "# Backends of other packages",
         docstrings.markdown(sys.modules["lavender.external.qpsolvers_"].__doc__),
         "Each runs under its own name. What is not installed says what to install. Options of all of them:",
-        table(("option", "meaning"), [(f"`{n}`", t) for n, t in next(s for s in others if s.options).options.items()]),
+        table(
+            ("option", "meaning"),
+            [(f"`{n}`", t) for n, t in next(s for s in others if s.options).options.items()],
+        ),
     ]
     for s in others:
         parts += [f"## {s.name}", f"{s.summary[:1].upper() + s.summary[1:]}.", abilities(s)]
@@ -363,7 +397,11 @@ def measured_page(site, records, figures):
         cells = [family]
         for level in LEVELS:
             best = by_level[level].best
-            cells.append(f"**{best.solver}** {seconds(best.typical)} ({best.solved}/{best.cases})" if best else "nobody")
+            cells.append(
+                f"**{best.solver}** {seconds(best.typical)} ({best.solved}/{best.cases})"
+                if best
+                else "nobody"
+            )
         for t in times:
             best = timed[family][t].best
             cells.append(f"**{best.solver}** to {residual(best.score)}" if best else "nobody")
@@ -372,40 +410,58 @@ def measured_page(site, records, figures):
     shown = ", ".join(f"{n} {v}" for n, v in run.versions.items())
     parts = [
         "# Measured in this build",
-        f"{len(records)} runs on {len(records.cases)} cases of `lavender.suite`, made while these pages were built: "
-        f"{run.cpu}, {run.threads} thread,\nlavender {run.lavender}, Python {run.python}, {shown}. Minimum of "
-        f"{PLAN.repeats} repeats, set-up and solve together, at most {seconds(PLAN.time_limit)}\na solve. It is a "
-        "glance, not a benchmark: `lavender report` on your own problems says more.",
+        (
+            f"{len(records)} runs on {len(records.cases)} cases of `lavender.suite`, made while these pages were built: "
+            f"{run.cpu}, {run.threads} thread,\nlavender {run.lavender}, Python {run.python}, {shown}. Minimum of "
+            f"{PLAN.repeats} repeats, set-up and solve together, at most {seconds(PLAN.time_limit)}\na solve. It is a "
+            "glance, not a benchmark: `lavender report` on your own problems says more."
+        ),
         "## By structure",
-        "Who brings most cases of a structure to a level, and of those the fastest by shifted geometric mean of time; "
-        "its median time\nwhere it arrives, and on how many cases. In a time: the mean residual reached.",
+        (
+            "Who brings most cases of a structure to a level, and of those the fastest by shifted geometric mean of time; "
+            "its median time\nwhere it arrives, and on how many cases. In a time: the mean residual reached."
+        ),
         table(head, rows),
         "## By law",
     ]
     for law, by_level in geometric_means(records).items():
         rows = [
-            (solver, *(f"{seconds(by_level[x][solver][0])} ({by_level[x][solver][1]}/{by_level[x][solver][2]})" for x in LEVELS))
+            (
+                solver,
+                *(
+                    f"{seconds(by_level[x][solver][0])} ({by_level[x][solver][1]}/{by_level[x][solver][2]})"
+                    for x in LEVELS
+                ),
+            )
             for solver in by_level[LEVELS[0]]
         ]
         parts += [
             f"### {LAW_NAMES.get(law, law).capitalize()}",
-            f"Geometric means of time, shifted by {seconds(shift_of(records))}, of the solvers that take every case of the "
-            f"class; a miss\ncosts {seconds(PLAN.time_limit)}. In brackets, cases that arrived.",
+            (
+                f"Geometric means of time, shifted by {seconds(shift_of(records))}, of the solvers that take every case "
+                f"of the class; a miss\ncosts {seconds(PLAN.time_limit)}. In brackets, cases that arrived."
+            ),
             table(("solver", *(f"to {level_name(x)}" for x in LEVELS)), rows),
         ]
         if law in figures:
             site.write(f"figures/all-{law}.svg", figures[law])
             parts.append(image(f"figures/all-{law}.svg", f"error against time on {LAW_NAMES[law]}"))
     rows = [
-        (c.solver, c.claims, c.wrong, f"{c.reached} of {c.asked}") for c in sorted(claims(records), key=lambda c: c.solver)
+        (c.solver, c.claims, c.wrong, f"{c.reached} of {c.asked}")
+        for c in sorted(claims(records), key=lambda c: c.solver)
     ]
     parts += [
         "## Claims",
-        "How often a solver said that it had solved, how often the judge disagrees, and how many of the levels asked for "
-        "it reached.",
+        (
+            "How often a solver said that it had solved, how often the judge disagrees, and how many of the levels "
+            "asked for it reached."
+        ),
         table(("solver", "claims", "wrong", "levels reached"), rows),
         "## Cases",
-        table(("case", "law", "rows", "why it is there"), [(f"`{i.case}`", i.law, i.rows, i.reason) for i in records.cases.values()]),
+        table(
+            ("case", "law", "rows", "why it is there"),
+            [(f"`{i.case}`", i.law, i.rows, i.reason) for i in records.cases.values()],
+        ),
     ]
     site.write("measured.md", "\n\n".join(parts))
 
@@ -415,7 +471,10 @@ def measured_page(site, records, figures):
 
 def example_page(site, cache):
     """Every example: its docstring, what it prints, its figure, its source."""
-    parts = ["# Examples", "Each is run, and its figure drawn, when these pages are built; a test checks what it shows."]
+    parts = [
+        "# Examples",
+        "Each is run, and its figure drawn, when these pages are built; a test checks what it shows.",
+    ]
     for path in sorted((ROOT / "examples").glob("*.py")):
         spec = importlib.util.spec_from_file_location(path.stem, path)
         module = importlib.util.module_from_spec(spec)
@@ -452,12 +511,18 @@ def scene_page(site):
     """The gallery."""
     parts = [
         "# Scenes",
-        "`lavender.Scene(name, **parameters)` builds a scene of the gallery; parameters that all scenes share "
-        "(`dt`, `friction`,\n`solver_iterations`, `warm_start`, …) are those of `lavender.Scene`. Lengths in m, masses in "
-        "kg, angles in rad.",
+        (
+            "`lavender.Scene(name, **parameters)` builds a scene of the gallery; parameters that all scenes share "
+            "(`dt`, `friction`,\n`solver_iterations`, `warm_start`, …) are those of `lavender.Scene`. Lengths in m, "
+            "masses in kg, angles in rad."
+        ),
     ]
     for name, build in SCENES.items():
-        parts += [f"## {name}", f"```python\nlv.Scene(\"{name}\", {_signature(build, ('scene',))})\n```" , docstrings.markdown(build.__doc__)]
+        parts += [
+            f"## {name}",
+            f'```python\nlv.Scene("{name}", {_signature(build, ("scene",))})\n```',
+            docstrings.markdown(build.__doc__),
+        ]
     site.write("scenes.md", "\n\n".join(parts).replace("```python\nlv.Scene", "```text\nlv.Scene"))
 
 
@@ -465,9 +530,11 @@ def suite_page(site):
     """Families and sets of cases."""
     parts = [
         "# Cases",
-        "`lavender.suite` makes problems from a name: `suite.case(\"pyramid(k=10, mass_ratio=1e6)\")`, or the same text on "
-        "the command\nline. Each says why it is there; where the solution is known by closed form, exact arithmetic or proof, "
-        "`case.reference` holds it.",
+        (
+            '`lavender.suite` makes problems from a name: `suite.case("pyramid(k=10, mass_ratio=1e6)")`, or the same text '
+            "on the command\nline. Each says why it is there; where the solution is known by closed form, exact arithmetic "
+            "or proof, `case.reference` holds it."
+        ),
         "## Families",
     ]
     seen = set()
@@ -504,7 +571,14 @@ def api_page(site):
         "Judging": ("residual", "Residual", "cross_check", "CrossCheck"),
         "Registry": ("available", "known", "get", "register", "SolverSpec"),
         "Simulating": ("Scene", "Simulation", "Snapshot"),
-        "Errors": ("LavenderError", "InputError", "UnknownName", "SolverUnavailable", "CapabilityError", "SolveFailed"),
+        "Errors": (
+            "LavenderError",
+            "InputError",
+            "UnknownName",
+            "SolverUnavailable",
+            "CapabilityError",
+            "SolveFailed",
+        ),
     }
     constants = {"CONTACT", "CONTACT_SPIN", "ROW", "SOLVER_FIELDS", "__version__"}
     modules = {"bench", "engine", "io", "report", "scene", "suite"}
@@ -512,7 +586,10 @@ def api_page(site):
     rest = sorted(set(lv.__all__) - listed - constants - modules)
     if rest:
         rooms["More"] = tuple(rest)
-    parts = ["# Python interface", "Everything below is in `lavender`; arrays are float64 and C-contiguous, shapes and units as said."]
+    parts = [
+        "# Python interface",
+        "Everything below is in `lavender`; arrays are float64 and C-contiguous, shapes and units as said.",
+    ]
     for room, names in rooms.items():
         parts.append(f"## {room}")
         for name in names:

@@ -25,7 +25,13 @@ def accelerated_gradient(levels):
     import lavender_apgd
 
     lv.register(lavender_apgd.SPEC, replace=True)
-    cases = ("stack(n=64)", "box_stack(n=10)", "pyramid(k=10)", "granular(n=9)", "random_spd(n=100, condition=1e4)")
+    cases = (
+        "stack(n=64)",
+        "box_stack(n=10)",
+        "pyramid(k=10)",
+        "granular(n=9)",
+        "random_spd(n=100, condition=1e4)",
+    )
     names = ("apgd", "pgs", "nncg", "anderson", "newton")
     rows, first, fewer = [], 0, 0
     for case in cases:
@@ -46,7 +52,8 @@ def accelerated_gradient(levels):
             fewer += counts[0] < counts[names.index("anderson")]
             rows.append((f"`{case}`", level_name(level), *cells))
     return table(("case", "to", *names), rows), (
-        f"It is the fastest of the five in {first} of {len(rows)} lines, and needs fewer iterations than `anderson` in {fewer}."
+        f"It is the fastest of the five in {first} of {len(rows)} lines, and needs fewer iterations than "
+        f"`anderson` in {fewer}."
     )
 
 
@@ -110,13 +117,20 @@ def tangent_steps():
     sliding = np.diag([1.0, 10.0]), (1.0, 4.0)
     rank_1 = np.ones((2, 2)), (0.2, 0.2)  # sticks: A_tt is singular, and b_t in its range
     rows = [(name, _tangents(step, *sliding), _tangents(step, *rank_1)) for name, step in steps.items()]
-    return table(("step, then radial projection", "sliding, A_tt = diag(1, 10)", "sticking, A_tt of rank 1"), rows)
+    return table(
+        ("step, then radial projection", "sliding, A_tt = diag(1, 10)", "sticking, A_tt of rank 1"), rows
+    )
 
 
 def forms():
     """QP backends in impulse and in velocity form."""
     rows = []
-    for name in ("box_stack(n=10)", "box_stack(n=10, mass_ratio=1e6)", "pyramid(k=10, mass_ratio=1e6)", "granular(n=4)"):
+    for name in (
+        "box_stack(n=10)",
+        "box_stack(n=10, mass_ratio=1e6)",
+        "pyramid(k=10, mass_ratio=1e6)",
+        "granular(n=4)",
+    ):
         problem = suite.case(name).problem
         for solver in ("osqp", "clarabel", "piqp"):
             if registry.specs()[solver].missing() is not None:
@@ -156,7 +170,13 @@ def mass_ratios():
 def relaxation():
     """The answer of relaxed friction, judged by Coulomb's law."""
     rows = []
-    for name in ("ramp(angle=20)", "ramp(angle=30)", "slider(mu=0.3)", "granularF(n=3)", "pyramidF(k=6, sliding=0.5)"):
+    for name in (
+        "ramp(angle=20)",
+        "ramp(angle=30)",
+        "slider(mu=0.3)",
+        "granularF(n=3)",
+        "pyramidF(k=6, sliding=0.5)",
+    ):
         problem = suite.case(name).problem
         relaxed = lv.solve(problem.relaxed("cone"), "newton", tol=1e-9)
         judged = lv.residual(problem, relaxed.impulse)
@@ -166,7 +186,9 @@ def relaxation():
         rows.append((
             f"`{name}`", residual(relaxed.residual.relative), residual(judged.relative), f"{slip:.2g}", f"{lift:.2g}",
         ))  # fmt: skip
-    return table(("case", "by its own law", "by Coulomb's law", "fastest slip [m/s]", "fastest lift [m/s]"), rows)
+    return table(
+        ("case", "by its own law", "by Coulomb's law", "fastest slip [m/s]", "fastest lift [m/s]"), rows
+    )
 
 
 def symmetric_order():
@@ -177,47 +199,54 @@ def symmetric_order():
         cells = [f"`{name}`"]
         for solver, order in (("pgs", "given"), ("nncg", "given"), ("nncg", "symmetric")):
             s = lv.solve(problem, solver, tol=1e-9, max_iter=100_000, time_limit=1.0, order=order)
-            cells.append(f"{s.work['sweeps']:,}" if s.success else f"{s.status.name} at {residual(s.residual.relative)}")
+            cells.append(
+                f"{s.work['sweeps']:,}"
+                if s.success
+                else f"{s.status.name} at {residual(s.residual.relative)}"
+            )
         rows.append(cells)
     return table(("case", "pgs", "nncg, given order", "nncg, symmetric order"), rows)
 
 
 PAGE = """# What was tried and lost
 
-A solver stays in the registry where error against time shows a family of problems on which nothing else there beats it. What
-follows was tried and is not what `lavender` does by default. Every number is measured when these pages are built.
+A solver stays in the registry where error against time shows a family of problems on which nothing else
+there beats it. What follows was tried and is not what `lavender` does by default. Every number is measured
+when these pages are built.
 
 ## Accelerated projected gradients
 
-Nesterov's method on the bounded quadratic program, with restart, is the plug-in of [Add a solver](../plugin.md). Its step is
-one product with A; a sweep costs about the same and uses each new impulse at once. Time to a relative residual, and
-iterations:
+Nesterov's method on the bounded quadratic program, with restart, is the plug-in of [Add a
+solver](../plugin.md). Its step is one product with A; a sweep costs about the same and uses each new
+impulse at once. Time to a relative residual, and iterations:
 
 {apgd}
 
-{verdict} Written with NumPy and SciPy, it pays a price to the interpreter in every iteration; the counts are free of that.
+{verdict} Written with NumPy and SciPy, it pays a price to the interpreter in every iteration; the counts
+are free of that.
 
 ## Jacobi without damping
 
-One contact repeated k times. With ω = 1 every copy is changed as if it were alone, which together is k times too much; the
-projection turns that into a cycle.
+One contact repeated k times. With ω = 1 every copy is changed as if it were alone, which together is k
+times too much; the projection turns that into a cycle.
 
 {jacobi}
 
 ## Other steps for the tangents
 
-One contact with two tangents. Each step is followed by the radial projection on the disk of radius μ λ_n; after 2,000 sweeps
-the judge says:
+One contact with two tangents. Each step is followed by the radial projection on the disk of radius μ λ_n;
+after 2,000 sweeps the judge says:
 
 {tangents}
 
-A step of its own for each direction, or the exact one, turns the direction before it is projected: the sweep stands still at a
-point that is not the solution. The mean of the diagonal is too long a step where one eigenvalue holds the whole trace.
+A step of its own for each direction, or the exact one, turns the direction before it is projected: the
+sweep stands still at a point that is not the solution. The mean of the diagonal is too long a step where
+one eigenvalue holds the whole trace.
 
 ## One form for every backend
 
-The same quadratic program over impulses (A is the Hessian) or over body velocities (J is a constraint and is never squared).
-Relative residual and time at tol 1e-9, at most a second:
+The same quadratic program over impulses (A is the Hessian) or over body velocities (J is a constraint and
+is never squared). Relative residual and time at tol 1e-9, at most a second:
 
 {forms}
 
@@ -231,8 +260,9 @@ Stacks of six boxes, the top one heavier by the mass ratio, to 1e-6, half a seco
 
 ## Relaxed friction as the answer
 
-The convex relaxation is solved to its own tolerance, then judged by Coulomb's law. Where everything sticks, both laws have
-the same answer; where something slides, the relaxation lifts it off the surface at μ times the speed of sliding.
+The convex relaxation is solved to its own tolerance, then judged by Coulomb's law. Where everything sticks,
+both laws have the same answer; where something slides, the relaxation lifts it off the surface at μ times
+the speed of sliding.
 
 {relaxation}
 
@@ -244,8 +274,9 @@ Sweeps to 1e-9; with a symmetric order an iteration is one sweep and the same sw
 
 ## Solving, then clamping
 
-Solving A λ = b and setting the negative impulses to zero, once, leaves the neighbours of an opening contact with impulses
-that were computed for one that is no longer there: *toy_stack* in [Examples](examples.md) has the numbers.
+Solving A λ = b and setting the negative impulses to zero, once, leaves the neighbours of an opening contact
+with impulses that were computed for one that is no longer there: *toy_stack* in [Examples](examples.md) has
+the numbers.
 """
 
 

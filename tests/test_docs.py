@@ -1,0 +1,108 @@
+"""What the documentation says runs: its Python, the doctests of the docstrings, and its command lines."""
+
+import doctest
+import importlib
+import pkgutil
+import re
+import shlex
+from pathlib import Path
+
+import click
+import numpy as np
+import pytest
+
+import lavender as lv
+from lavender.cli import cli
+
+ROOT = Path(__file__).resolve().parent.parent
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+BLOCK = re.compile(r"^```(python|pycon|sh)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+FLAGS = doctest.NORMALIZE_WHITESPACE | doctest.ELLIPSIS
+
+
+def blocks(page, *kinds):
+    """(line, kind, text) of the fenced blocks of a page."""
+    text = page.read_text(encoding="utf-8")
+    return [
+        (text.count("\n", 0, found.start(2)) + 1, found[1], found[2])
+        for found in BLOCK.finditer(text)
+        if found[1] in kinds
+    ]
+
+
+def modules_with_doctests():
+    names = (
+        m.name for m in pkgutil.walk_packages(lv.__path__, "lavender.") if not m.name.endswith("__main__")
+    )
+    for name in names:
+        spec = importlib.util.find_spec(name)
+        if (
+            spec.origin
+            and spec.origin.endswith(".py")
+            and ">>> " in Path(spec.origin).read_text(encoding="utf-8")
+        ):
+            yield name
+
+
+def run_session(text, names, where):
+    """A `>>>` session in the namespace of its page."""
+    test = doctest.DocTestParser().get_doctest(text, names, where, where, 0)
+    found = []
+    runner = doctest.DocTestRunner(optionflags=FLAGS)
+    runner.run(test, out=found.append, clear_globs=False)
+    names.update(test.globs)
+    assert runner.failures == 0, "".join(found)
+
+
+@pytest.fixture
+def files(tmp_path, monkeypatch):
+    """A folder with the files that pages speak of."""
+    problem = lv.Problem.contact(np.diag([1.0, 2.0, 2.0] * 2), [1.0, 0.5, 0.0] * 2, mu=[0.5, 0.5])
+    solution = lv.solve(problem, "newton", tol=1e-10)
+    lv.io.save(problem, tmp_path / "problem.npz")
+    if importlib.util.find_spec("h5py") is not None:
+        lv.io.save(problem, tmp_path / "pile.hdf5", impulse=solution.impulse)
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_python_of_a_page_runs(page, files, capsys):
+    if ".hdf5" in "".join(text for *_, text in blocks(page, "python")):
+        pytest.importorskip("h5py", reason="the page reads HDF5 files")
+    names = {"np": np, "lv": lv}
+    for line, kind, text in blocks(page, "python", "pycon"):
+        where = f"{page.name}:{line}"
+        if kind == "pycon":
+            run_session(text, names, where)
+        else:
+            exec(compile("\n" * (line - 1) + text, str(page), "exec"), names)
+
+
+@pytest.mark.parametrize("name", list(modules_with_doctests()))
+def test_doctests_of_a_module(name):
+    failures, tried = doctest.testmod(importlib.import_module(name), optionflags=FLAGS)
+    assert tried > 0
+    assert failures == 0
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_command_lines_of_a_page_are_understood(page):
+    for line, _, text in blocks(page, "sh"):
+        for command in text.splitlines():
+            words = shlex.split(command, comments=True)
+            if words[:1] != ["lavender"]:
+                continue
+            where = f"{page.name}, block at line {line}: {command}"
+            assert words[1] in cli.commands, where
+            sub = cli.commands[words[1]]
+            try:
+                sub.make_context(words[1], words[2:])
+            except click.ClickException as error:
+                pytest.fail(f"{where}: {error.format_message()}")
+
+
+def test_pages_link_to_pages_that_exist():
+    for page in PAGES[1:]:
+        for target in re.findall(r"\]\(([\w/.-]+\.md)(?:#[\w-]+)?\)", page.read_text(encoding="utf-8")):
+            if not target.startswith("generated/"):  # those are written, and checked, by the build
+                assert (page.parent / target).is_file(), f"{page.name} links to {target}"
