@@ -498,9 +498,21 @@ def _check_writable(path: Path) -> None:
 
 @cli.command()
 @click.argument("scene")
-@click.option("--steps", type=int, default=120, show_default=True, help="Steps to run.")
-@click.option("--iterations", type=int, default=None, help="Sweeps of the velocity solve, 4 to 64.")
-@click.option("--cold", is_flag=True, help="Do not carry impulses from step to step.")
+@click.option("--steps", type=int, default=240, show_default=True, help="Steps to run.")
+@click.option("--iterations", type=int, default=None, help="Budget of the velocity solve; 4 to 64 sweeps.")
+@click.option(
+    "--warm-start/--no-warm-start", default=True, show_default=True, help="Carry impulses from step to step."
+)
+@click.option(
+    "--set",
+    "parameters",
+    multiple=True,
+    metavar="NAME=VALUE",
+    help="A parameter of the scene, e.g. n=20 or order=top_down; may be repeated.",
+)
+@click.option("--residual", is_flag=True, help="Judge all rows of every step too.")
+@click.option("--plot", type=click.Path(path_type=Path), default=None, help="Figure of the run (.svg, .png).")
+@click.option("--trace", type=click.Path(path_type=Path), default=None, help="Every step's values, .csv.")
 @click.option(
     "--record",
     type=click.Path(path_type=Path),
@@ -510,33 +522,72 @@ def _check_writable(path: Path) -> None:
 @click.option(
     "--skip", type=int, default=0, show_default=True, help="Steps before the first that is recorded."
 )
-def run(scene: str, steps: int, iterations: int | None, cold: bool, record: Path | None, skip: int) -> None:
-    """Run a LavenderSim scene of the gallery; record its steps as a sequence for `report --sequence`."""
-    from lavender import io
-    from lavender.engine import SOLVER_FIELDS, Simulation
+def run(
+    scene: str,
+    steps: int,
+    iterations: int | None,
+    warm_start: bool,
+    parameters: tuple[str, ...],
+    residual: bool,
+    plot: Path | None,
+    trace: Path | None,
+    record: Path | None,
+    skip: int,
+) -> None:
+    """Run a LavenderSim scene of the gallery; record its steps as a sequence for `report --sequence`.
 
-    simulation = Simulation(scene)
-    if iterations is not None:
-        simulation.set_solver_iterations(iterations)
-    simulation.set_warm_start(not cold)
+    SCENE is stack, pyramid, card_house, pile, chain, bridge, heavy_on_light, table, ramp, spinner,
+    newtons_cradle or four_bar.
+    """
+    from lavender.engine import run_scene
+
+    live = sys.stdout.isatty()
+
+    def show(text: str) -> None:
+        # on a terminal each line takes the place of the one before
+        click.echo(f"\r{text}\x1b[K" if live else text, nl=not live)
+
+    found = run_scene(
+        scene,
+        steps=steps,
+        iterations=iterations,
+        warm_start=warm_start,
+        parameters=_parameters(parameters),
+        residual=residual,
+        trace=trace,
+        plot=plot,
+        record=record,
+        skip=skip,
+        every=1 if live else max(1, steps // 20),
+        show=show,
+    )
+    if live:
+        click.echo()
+    best = 1e3 * found.cost.min()
+    click.echo(f"{found.scene}: {len(found)} steps, {found.time[-1]:.3f} s, {best:.3g} ms a step at best")
+    for name, path in (("trace", trace), ("figure", plot)):
+        if path is not None:
+            click.echo(f"{name}: {path}")
     if record is not None:
+        click.echo(f"{found.recorded} problems in {record}: lavender report --sequence {record}")
+
+
+def _parameters(words: tuple[str, ...]) -> dict[str, Any]:
+    """`n=20` as {"n": 20}: numbers, true and false, none; else a word."""
+    found: dict[str, Any] = {}
+    for word in words:
+        name, equals, value = word.partition("=")
+        if not equals or not name:
+            raise InputError(f"--set {word!r}; NAME=VALUE is needed")
+        known = {"true": True, "false": False, "none": None}
+        if value.lower() in known:
+            found[name] = known[value.lower()]
+            continue
         try:
-            record.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise _unwritable(record, error) from None
-    observation: dict[str, Any] = {}
-    saved = 0
-    for step in range(steps):
-        if record is not None and step >= skip:
-            io.save(simulation.constraint_problem(), record / f"step_{step:05d}.npz")
-            saved += 1
-        observation = simulation.step()[0]
-    click.echo(f"{scene}: {steps} steps, {simulation.time:.3f} s simulated")
-    if observation:
-        for name, value in zip(SOLVER_FIELDS, observation["solver"], strict=True):
-            click.echo(f"  {name:<18} {value:.6g}")
-    if record is not None:
-        click.echo(f"{saved} problems in {record}: lavender report --sequence {record}")
+            found[name] = float(value) if not value.lstrip("+-").isdigit() else int(value)
+        except ValueError:
+            found[name] = value
+    return found
 
 
 @cli.command()

@@ -8,7 +8,7 @@ faces touch:
     plane-box       the box's corner, bit k set where its axis k counts positive
     box-box, faces  reference face (4 bits), other face (3 bits), and the two lines whose crossing the
                     point is (3 bits each): 0-3 edges of the other face, 4-7 sides of the reference face
-    box-box, edges  4096 + the two axes and four signs that name the edges
+    box-box, edges  8192 + the two axes and four signs that name the edges
 
 Box-box: the axis of least penetration among 3 + 3 face normals and 9 cross products (Gottschalk, Lin,
 Manocha 1996); faces are preferred to edges, and faces of a to those of b, by a tolerance, so that a
@@ -371,7 +371,7 @@ cdef inline void edge_point(const double* xa, const double* ra, const double* ha
         m.point[k] = 0.5 * (p[k] + s * ra[3 * k + i] + q[k] + t * rb[3 * k + j])
         m.normal[k] = n[k]
     m.gap[0] = gap
-    m.feature[0] = 4096 + (i * 3 + j) * 16 + bits
+    m.feature[0] = 8192 + (i * 3 + j) * 16 + bits
     m.n = 1
 
 

@@ -71,3 +71,51 @@ def test_two_particles_agree_with_the_closed_form():
     np.testing.assert_allclose(
         found["momentum"], np.tile(module.MASS @ module.SPEED, (module.STEPS, 1)), atol=1e-12
     )
+
+
+def test_lavender_run_shows_a_line_and_writes_what_was_asked_for(tmp_path, capsys):
+    from lavender.cli import main
+    from lavender.io import load
+
+    paths = [tmp_path / name for name in ("trace.csv", "figure.svg", "problems")]
+    words = [
+        "run",
+        "stack",
+        "--iterations",
+        "8",
+        "--no-warm-start",
+        "--steps",
+        "12",
+        "--set",
+        "n=2",
+        "--residual",
+    ]
+    files = ["--trace", paths[0], "--plot", paths[1], "--record", paths[2], "--skip", "9"]
+    with pytest.raises(SystemExit) as code:
+        main([*words, *map(str, files)])
+    assert not code.value.code
+    printed = capsys.readouterr().out
+    assert "step     12" in printed and "contacts     8  matches     0" in printed and "worst" in printed
+    table = np.genfromtxt(paths[0], delimiter=",", names=True)
+    assert table.shape == (12,) and np.all(table["iterations"] == 8) and np.all(table["contacts"] == 8)
+    assert table["residual_final"].max() < table["residual_initial"].max()
+    assert paths[1].read_text().lstrip().startswith("<?xml")
+    assert [load(p).n_blocks for p in sorted(paths[2].iterdir())] == [8, 8, 8]
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["run", "stac"],
+        ["run", "stack", "--set", "n"],
+        ["run", "stack", "--set", "mu=1"],
+        ["run", "stack", "--iterations", "3"],
+    ],
+)
+def test_lavender_run_refuses_what_it_cannot_do(words, capsys):
+    from lavender.cli import main
+
+    with pytest.raises(SystemExit) as code:
+        main(words)
+    assert code.value.code == 2
+    assert "Traceback" not in capsys.readouterr().err

@@ -32,6 +32,7 @@ class Trace:
     depth: FloatArray  # (steps,) m, deepest penetration
     cost: FloatArray  # (steps,) s, wall time of the step
     lost_body: str = ""  # name of the body that ended the run, or empty
+    recorded: int = 0  # problems written
 
     def __len__(self) -> int:
         return len(self.time)
@@ -91,6 +92,7 @@ def run(
     steps: int,
     *,
     record: str | PathLike[str] | None = None,
+    skip: int = 0,
     watch: Callable[[int, dict[str, Any], dict[str, Any]], Any] | None = None,
 ) -> Trace:
     """Step a simulation and keep its trace; stops where the state is no longer finite.
@@ -100,16 +102,19 @@ def run(
     simulation : Simulation
     steps : int
     record : path, optional
-        Folder for the problem of every step, as `Simulation.record` writes them.
+        Folder for the problem of every step, one file each; made if it does not exist.
+    skip : int
+        Steps before the first that is recorded.
     watch : callable (step, observation, info), optional
         Called after every step.
     """
-    steps = whole("steps", steps, 1)
+    steps, skip = whole("steps", steps, 1), whole("skip", skip)
+    recorded = 0
     solver, depth, cost, time = np.zeros((steps, 8)), np.zeros(steps), np.zeros(steps), np.zeros(steps)
     lost, done = "", 0
     while done < steps and not lost:
-        if record is not None:
-            _write_problem(simulation, Path(record))
+        if record is not None and done >= skip:
+            recorded += _write_problem(simulation, Path(record))
         start = perf_counter()
         observation, _, _, _, info = simulation.step()
         cost[done] = perf_counter() - start
@@ -120,10 +125,12 @@ def run(
         done += 1
         if watch is not None:
             watch(done, observation, info)
-    return Trace(repr(simulation.scene), time[:done], solver[:done], depth[:done], cost[:done], lost)
+    return Trace(
+        repr(simulation.scene), time[:done], solver[:done], depth[:done], cost[:done], lost, recorded
+    )
 
 
-def _write_problem(simulation: Simulation, folder: Path) -> None:
+def _write_problem(simulation: Simulation, folder: Path) -> bool:
     problem = simulation.constraint_problem()
     if problem.m:
         try:
@@ -131,6 +138,7 @@ def _write_problem(simulation: Simulation, folder: Path) -> None:
         except OSError as error:
             raise InputError(f"cannot make the folder {str(folder)!r}: {error.strerror}") from None
         io.save(problem, folder / f"{simulation.scene.name or 'scene'}-{simulation.steps + 1:06d}.npz")
+    return problem.m > 0
 
 
 def line(step: int, observation: Mapping[str, Any], info: Mapping[str, Any]) -> str:
@@ -161,6 +169,7 @@ def run_scene(
     trace: str | PathLike[str] | None = None,
     plot: str | PathLike[str] | None = None,
     record: str | PathLike[str] | None = None,
+    skip: int = 0,
     every: int = 1,
     show: Callable[[str], Any] = print,
 ) -> Trace:
@@ -178,6 +187,8 @@ def run_scene(
         Judge all rows of every step.
     trace, plot, record : path, optional
         CSV of the trace, figure, folder of the problems.
+    skip : int
+        Steps before the first that is recorded.
     every : int
         Show one line in so many, and always the last.
     show : callable
@@ -198,7 +209,7 @@ def run_scene(
         if step % every == 0 or step == steps or "lost_body" in info:
             show(line(step, observation, info))
 
-    found = run(simulation, steps, record=record, watch=watch)
+    found = run(simulation, steps, record=record, skip=skip, watch=watch)
     if found.lost_body:
         show(f"stopped: the state of {found.lost_body!r} is not finite")
     if trace is not None:

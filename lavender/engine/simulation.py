@@ -256,7 +256,7 @@ class Simulation:
                 "point": a["point"][:c].copy(),
                 "normal": a["normal"][:c].copy(),
                 "tangent": a["tangent"][:c].copy(),
-                "depth": -a["gap"][:c],
+                "depth": 0.0 - a["gap"][:c],
                 "impulses": impulses,
             },
             "joint_impulses": a["joint_impulse"].copy(),
