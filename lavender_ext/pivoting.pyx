@@ -248,7 +248,7 @@ cdef public void lav_pivot_place(pivoting_t* s) noexcept nogil:
             s.x[i] = s.p.upper[i]
 
 
-cdef public void lav_pivot_score(const pivoting_t* s, double* out) noexcept nogil:
+cdef public void lav_pivot_score(const pivoting_t* s, const double* nu, double* out) noexcept nogil:
     """The judge's four sums for x as it stands, s = 0: energy, velocity of e, then of f, into out[4].
 
     e = w / d on free rows and where w has the wrong sign at a bound, 0 elsewhere.
@@ -260,7 +260,7 @@ cdef public void lav_pivot_score(const pivoting_t* s, double* out) noexcept nogi
         if s.p.lower[i] == s.p.upper[i] or (s.at[i] == AT_LOWER and t > 0.0) or (
                 s.at[i] == AT_UPPER and t < 0.0):
             t = 0.0
-        v = s.p.nu[i] * s.p.step[i]
+        v = nu[i] * s.p.step[i]
         t = t * t
         energy += t * s.p.step[i]
         t = t * v
@@ -507,11 +507,11 @@ cdef class Pivoting:
         self.s.n_free = k
         return k
 
-    def score(self):
-        """(energy, velocity, floor energy, floor velocity) as the judge's, for x as it is; without shift."""
+    def score(self, const double[::1] nu):
+        """(energy, velocity, floor energy, floor velocity) as the judge's, for x as it is; nu (m,); no shift."""
         cdef double out[4]
         with nogil:
-            lav_pivot_score(&self.s, out)
+            lav_pivot_score(&self.s, &nu[0], out)
         return out[0], out[1], out[2], out[3]
 
     def sweep(self, int n):

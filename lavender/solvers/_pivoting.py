@@ -23,9 +23,11 @@ SLOP = 8.0  # roundings of w within which a sign means nothing, as there
 class PivotState:
     """A problem's rows, free or at a bound, and the factorisation that serves them."""
 
-    def __init__(self, problem: Problem) -> None:
+    def __init__(self, problem: Problem, like: PivotState | None = None) -> None:
         self.problem = problem
-        self.form, band, order = choose(problem)
+        known = like.chosen if like is not None and _same_pattern(like.problem, problem) else None
+        self.chosen = choose(problem) if known is None else known
+        self.form, band, order = self.chosen
         self.rows = Pivoting(problem.csr_data, band if self.form == "band" else -1, order, TINY)
         self.factor: Factor | None = None
         if self.form != "band":
@@ -170,3 +172,8 @@ class PivotState:
             scale = 1.0 / np.sqrt(d)
             return int(lapack.dpstrf(scale[:, None] * self.problem.dense() * scale, tol=TINY)[2])
         return m - self.factor.factor(np.arange(m, dtype=np.int32), m, 1e-10, 1e-8)
+
+
+def _same_pattern(p: Problem, q: Problem) -> bool:
+    a, b = p.csr, q.csr
+    return np.array_equal(a.indptr, b.indptr) and np.array_equal(a.indices, b.indices)

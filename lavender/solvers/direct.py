@@ -56,10 +56,10 @@ class DirectState:
 class Direct:
     """Direct solution of linear systems and of symmetric positive semidefinite boxed LCPs."""
 
-    def prepare(self, problem: Problem) -> DirectState:
+    def prepare(self, problem: Problem, like: PivotState | None = None) -> DirectState:
         if not problem.is_symmetric:
             return _general(problem, "A is not symmetric")
-        state = DirectState(problem, PivotState(problem))
+        state = DirectState(problem, PivotState(problem, like))
         if problem.law == "linear" and state.pivot is not None:
             state.outcome = state.pivot.factorise()
             if state.outcome == INDEFINITE:
@@ -67,7 +67,7 @@ class Direct:
         return state
 
     def update(self, state: DirectState, problem: Problem) -> DirectState:
-        return self.prepare(problem)
+        return self.prepare(problem, state.pivot)
 
     def run(
         self, state: DirectState, impulse: FloatArray, n: int, tol: float, time_limit: float | None = None
@@ -114,12 +114,11 @@ class _Run:
         return self.keep(*quick(self.problem, x, self.w, self.e, floor=True), x)
 
     def judge_pivot(self, pivot: PivotState, solved: bool) -> float:
-        """The same for the pivoting's x, clipped; from its own w and rounding where these are the judge's."""
-        if solved and pivot.rows.shift == 0.0 and self.problem.rows is None:
+        """The same for the pivoting's x, clipped; from its own w and rounding where no shift is in them."""
+        if solved and pivot.rows.shift == 0.0:
             energy, velocity = reference(self.problem)
-            e, v, floor_e, floor_v = pivot.rows.score()
-            # Its plain sums of squares: trusted where the floor's neither over- nor underflow.
-            if energy > 0.0 and velocity > 0.0 and np.isfinite(e) and floor_v > 1e-145:
+            e, v, floor_e, floor_v = pivot.rows.score(self.problem.data.nu)
+            if energy > 0.0 and velocity > 0.0 and np.isfinite(e):
                 relative, floor = max(e / energy, v / velocity), max(floor_e / energy, floor_v / velocity)
                 return self.keep(relative, floor, pivot.impulse(self.candidate), sure=False)
         return self.judge(pivot.impulse(self.candidate))
@@ -149,7 +148,7 @@ class _Run:
     def verdict(self) -> Claim:
         """What the best iterate deserves, when nothing is left to do."""
         if not self.sure and self.best > 0.1 * self.tol:
-            # Clipping x moved w by some roundings: near tol the judge's own pass decides.
+            # Clipping x, or assembling A from rows, moved w by some roundings: near tol the judge decides.
             self.best, self.floor = quick(self.problem, self.impulse, self.w, self.e, floor=True)
         if self.best <= self.tol:
             return self.claim(Status.CONVERGED)
