@@ -7,16 +7,19 @@ With x = D^1/2 lam, B = D^-1/2 A D^-1/2, c = D^-1/2 b, cones K in the same scale
     (B + rho) x = c - s + rho z - y                                                               (1)
     u <- u + alpha (x - z)                          then mixing.pxd
 
-At rest x = z: B z - c + s + y = 0. The shift comes in once both imbalances below are at most 1e-3, that
-is from the convex answer: where contacts stick that is the answer, elsewhere a start. (1) is solved with a factorisation made by the caller: Cholesky of a
-dense matrix, L D L^T or L U of a sparse one, or L D L^T of I + K^T diag(1 / (theta + rho)) K over bodies
-where B = K K^T + diag(theta):
+At rest x = z: B z - c + s + y = 0. The shift comes in once both imbalances below are at most 1e-3 (or
+after 200 iterations), that is from the convex answer: where contacts stick that is the answer, elsewhere a
+start. (1) is solved with a factorisation made by the caller: Cholesky of a dense matrix, L D L^T or L U of
+a sparse one, or L D L^T of I + K^T diag(1 / (theta + rho)) K over bodies where B = K K^T + diag(theta):
 
     x = E (r - K t),  (I + K^T E K) t = K^T E r,  E = diag(1 / (theta + rho))                     (2)
 
-After 20 iterations, then at every quarter more of them (20 at least), rho is weighed: the square root of |x - z| / max(|x|, |z|) over
-rho |z - z before| / max(|y|, |c|). Where that is outside 1/3 .. 3 the kernel stops and asks for a factorisation
-with the new rho; u then becomes z + y / rho.
+At 20 iterations, then after every quarter more of them (20 at least), rho is weighed by its imbalances,
+
+    primal = |x - z| / |max(|x|, |z|)|,   dual = rho |z - z before| / |max(|y|, |c|)|                  (3)
+
+Where sqrt(primal / dual) is outside 1/3 .. 3 the kernel stops and asks for a factorisation with rho times
+that; u then becomes z + y / rho.
 """
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t, int64_t

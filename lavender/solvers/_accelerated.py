@@ -12,13 +12,14 @@ from lavender.problem import Problem
 from lavender.solution import Claim
 from lavender.solvers._sweeping import Sweeping, SweepState, claim
 from lavender_ext import accelerate as kernels
-from lavender_ext import block_gs, judge
-from lavender_ext.watch import Watch
+from lavender_ext import block_gs, judge, watch
 
 SWEEPS = ("pgs", "blocks")
 LARGEST_MEMORY = 16
 PATIENCE = 500  # iterations: on mass ratios the residual of a conjugate gradient rises for hundreds first
-SWEEP_OPTION = "'pgs' or 'blocks' (each contact and joint solved exactly); default: pgs, blocks for the cone law"
+SWEEP_OPTION = (
+    "'pgs' or 'blocks' (each contact and joint solved exactly); default: pgs, blocks for the cone law"
+)
 
 
 class AcceleratedState(SweepState):
@@ -26,7 +27,7 @@ class AcceleratedState(SweepState):
 
     def __init__(self, problem: Problem, data: Any, order: Order, blocks: bool, memory: int) -> None:
         super().__init__(problem, data, order)
-        self.watch = Watch(problem.data, PATIENCE)
+        self.watch = watch.Watch(problem.data, PATIENCE)
         self.prepared = block_gs.prepare(data) if blocks else None
         self.memory = memory
         self.space = kernels.allocate(data, memory)
@@ -54,14 +55,20 @@ class Accelerated(Sweeping):
         return AcceleratedState(problem, problem.data, order, blocks, self._memory)
 
     def run(
-        self, state: AcceleratedState, impulse: FloatArray, n: int, tol: float, time_limit: float | None = None
+        self,
+        state: AcceleratedState,
+        impulse: FloatArray,
+        n: int,
+        tol: float,
+        time_limit: float | None = None,
     ) -> Claim:
         """n iterations, or fewer where a check ends them."""
         o, data = state.order, state.data
         if state.first and data.factored:
             judge.velocity_change(data, impulse, state.space[-1])
         status, done, sweeps, restarts = kernels.run(
-            data, state.watch, impulse, n, tol, state.memory, state.prepared, state.space, o.blocks, o.split, o.mode, o.rng
+            data, state.watch, impulse, n, tol, state.memory, state.prepared, state.space, o.blocks, o.split,
+            o.mode, o.rng,
         )  # fmt: skip
         work = {"sweeps": sweeps, "restarts": restarts - state.restarts}
         state.restarts = restarts

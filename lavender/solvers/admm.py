@@ -4,7 +4,8 @@
 
 in the metric of d: B = D^-1/2 A D^-1/2, c = D^-1/2 b, K the bounds and cones of all blocks at once, s De
 Saxce's shift of Coulomb's law (`lavender_ext/admm.pyx`). One triangular solve an iteration instead of a
-sweep, so mass ratios and long chains cost factorisations (rho is weighed at 20 iterations, later ever more rarely), not sweeps.
+sweep, so mass ratios and long chains cost factorisations (rho is weighed ever more rarely), not sweeps.
+Friction starts from the convex answer.
 Cholesky of a dense A, L D L^T of a sparse one or, where rows have fewer body unknowns than rows, of the
 body form; L U where A is not symmetric.
 """
@@ -28,7 +29,7 @@ from lavender.solution import Claim, Status
 from lavender.solvers._accelerated import LARGEST_MEMORY
 from lavender.solvers._sweeping import claim
 from lavender_ext import admm as kernels
-from lavender_ext.watch import Watch
+from lavender_ext import watch
 
 _DENSE, _SYMMETRIC, _GENERAL, _BODIES = 0, 1, 2, 3
 _DENSE_ABOVE = 0.15  # share of nonzeros from which LAPACK on the full matrix is the faster factorisation
@@ -47,7 +48,7 @@ class AdmmState:
         reference(problem)
         self.problem = problem
         self.data = problem.data
-        self.watch = Watch(problem.data, _PATIENCE)
+        self.watch = watch.Watch(problem.data, _PATIENCE)
         self.root = np.sqrt(problem.d)
         self.c = problem.b / self.root
         self.space = kernels.allocate(self.data, memory)
@@ -91,7 +92,9 @@ class AdmmState:
             try:
                 return _DENSE, m, (np.ascontiguousarray(np.linalg.cholesky(shifted)),)
             except np.linalg.LinAlgError as error:
-                raise _Failed(f"A + rho D is not positive definite at rho = {self.rho:.1e}: {error}") from None
+                raise _Failed(
+                    f"A + rho D is not positive definite at rho = {self.rho:.1e}: {error}"
+                ) from None
         if self.kind == _GENERAL:
             try:
                 lu = splu(sp.csc_array(self.matrix + self.rho * sp.eye_array(m)))
@@ -139,7 +142,9 @@ class ADMM:
 
     def __post_init__(self) -> None:
         if not isinstance(self.memory, int) or not 0 <= self.memory <= LARGEST_MEMORY:
-            raise InputError(f"memory is {self.memory!r}; a whole number from 0 to {LARGEST_MEMORY} is needed")
+            raise InputError(
+                f"memory is {self.memory!r}; a whole number from 0 to {LARGEST_MEMORY} is needed"
+            )
         if not 0.0 < self.relaxation < 2.0:
             raise InputError(f"relaxation is {self.relaxation!r}; a number between 0 and 2 is needed")
 

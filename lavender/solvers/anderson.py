@@ -25,7 +25,9 @@ class Anderson(Accelerated):
 
     def __post_init__(self) -> None:
         if not isinstance(self.memory, int) or not 1 <= self.memory <= LARGEST_MEMORY:
-            raise InputError(f"memory is {self.memory!r}; a whole number from 1 to {LARGEST_MEMORY} is needed")
+            raise InputError(
+                f"memory is {self.memory!r}; a whole number from 1 to {LARGEST_MEMORY} is needed"
+            )
 
     @property
     def _memory(self) -> int:

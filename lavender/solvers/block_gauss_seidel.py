@@ -53,7 +53,17 @@ class BlockGaussSeidel(Sweeping):
             if data.factored:
                 judge.velocity_change(data, impulse, state.velocity)
         status, done, fallbacks = kernels.run(
-            data, state.watch, impulse, n, tol, *state.prepared, state.velocity, o.blocks, o.split, o.mode, o.rng
+            data,
+            state.watch,
+            impulse,
+            n,
+            tol,
+            *state.prepared,
+            state.velocity,
+            o.blocks,
+            o.split,
+            o.mode,
+            o.rng,
         )
         form = "body velocities" if data.factored else "rows of A"
         return replace(claim(status, done), work={"sweeps": done, "fallbacks": fallbacks}, form=form)
