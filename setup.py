@@ -16,12 +16,14 @@ from pathlib import Path
 
 import Cython
 from Cython.Build import cythonize
-from setuptools import Extension, setup
+from setuptools import Command, Extension, setup
+from setuptools.command.build import build
 from setuptools.command.build_ext import build_ext
 
 MODE = os.environ.get("LAVENDER_DEBUG", "")
 DEBUG = MODE not in ("", "0")
 OPTIONS = runpy.run_path("lavender_ext/build_options.py")
+WASM = runpy.run_path("lavender/web/compile.py")
 DIRECTIVES = OPTIONS["directives"](debug=DEBUG)
 
 LINK_ARGS = []
@@ -63,6 +65,55 @@ class BuildKernels(build_ext):
         stamp.write_text(how)
 
 
+class BuildWasm(Command):
+    """Compiles the kernels to WebAssembly where a compiler for it is installed (the extra `wasm`)."""
+
+    user_options = [("build-lib=", None, "folder of what is installed")]  # noqa: RUF012 - as the base class asks
+
+    def initialize_options(self):
+        """Nothing is known yet."""
+        self.build_lib = None
+        self.editable_mode = False
+
+    def finalize_options(self):
+        """As for the other parts of a build."""
+        self.set_undefined_options("build", ("build_lib", "build_lib"))
+
+    def run(self):
+        """Build the module, or say why there will be none."""
+        if self.editable_mode:
+            return  # `lavender web` builds it when it is first needed
+        out = Path(self.build_lib, "lavender", "web", "lavender.wasm")
+        out.parent.mkdir(parents=True, exist_ok=True)
+        here = Path("lavender", "web", "lavender.wasm")
+        if here.exists():
+            data = here.read_bytes()
+            if WASM["read_module"](data).sources == WASM["source_hash"](Path()):
+                out.write_bytes(data)
+                return
+        reason = WASM["why_not"]()
+        if reason:
+            self.announce(f"no WebAssembly module: {reason}", level=2)
+        else:
+            WASM["build"](out, Path().resolve())
+
+    def get_outputs(self):
+        """The module, where it could be built."""
+        out = Path(self.build_lib, "lavender", "web", "lavender.wasm")
+        return [str(out)] if out.exists() else []
+
+    def get_output_mapping(self):
+        """No file is linked to a source."""
+        return {}
+
+    def get_source_files(self):
+        """Nothing beyond what the kernels list."""
+        return []
+
+
+build.sub_commands = [*build.sub_commands, ("build_wasm", None)]
+
+
 def extension(path):
     """One module, named after its file; *_threads.pyx alone use OpenMP."""
     openmp = []
@@ -78,5 +129,5 @@ def extension(path):
 
 setup(
     ext_modules=[extension(path) for path in sorted(Path("lavender_ext").glob("*.pyx"))],
-    cmdclass={"build_ext": BuildKernels},
+    cmdclass={"build_ext": BuildKernels, "build_wasm": BuildWasm},
 )

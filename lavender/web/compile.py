@@ -12,12 +12,16 @@ core functions reach, and nothing else; three checks make that safe:
   pointer is filled by the initialisation of a Python module, which never runs here;
 * the finished module is read back: no imports, exactly the expected functions, a size below `LARGEST`.
 
+A custom section of the module holds the hash of the sources it was built from, so that one from other sources
+is noticed.
+
 The compiler is ziglang's (PyPI, the extra `wasm`), or what LAVENDER_WASM_CC and LAVENDER_WASM_LD name, such
 as `clang --target=wasm32-wasi` and `wasm-ld`.
 """
 
 from __future__ import annotations
 
+import hashlib
 import importlib.util
 import os
 import re
@@ -33,12 +37,15 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
-__all__ = ["LARGEST", "MODULES", "BuildFailed", "Built", "build", "core_functions", "read_module", "why_not"]
+__all__ = ["LARGEST", "MODULES", "BuildFailed", "Built", "build", "read_module", "source_hash", "why_not"]
 
 #: Modules of lavender_ext that the page and the checks use.
 MODULES = ("engine", "host", "judge", "orders", "problem", "sweeps")
 #: Largest size of the finished module [bytes].
 LARGEST = 200_000
+CIMPORT = re.compile(r"^from lavender_ext\.(\w+) cimport", re.MULTILINE)
+#: Name of the custom section with the hash of the sources.
+SECTION = "lavender.sources"
 #: What the host needs beside the functions: where free memory begins, and the proof that no data is left.
 EDGES = ("__heap_base", "__data_end", "__global_base")
 
@@ -89,12 +96,15 @@ def why_not() -> str:
     """Why no module can be built here; empty when it can."""
     if importlib.util.find_spec("Cython") is None:
         return "Cython is not installed (pip install 'lavender[wasm]')"
-    if not os.environ.get("LAVENDER_WASM_CC") and importlib.util.find_spec("ziglang") is None:
+    named = os.environ.get("LAVENDER_WASM_CC", "")
+    if named and shutil.which(shlex.split(named)[0]) is None:
+        return f"LAVENDER_WASM_CC names {shlex.split(named)[0]!r}, which is not there"
+    if not named and importlib.util.find_spec("ziglang") is None:
         return (
             "no compiler for WebAssembly: pip install 'lavender[wasm]' brings ziglang, or set LAVENDER_WASM_CC and "
             "LAVENDER_WASM_LD"
         )
-    if not os.environ.get("LAVENDER_WASM_CC") and sys.version_info < (3, 11):
+    if not named and sys.version_info < (3, 11):
         return (
             f"the headers of CPython {sys.version_info[0]}.{sys.version_info[1]} do not compile for wasm32; "
             "build with CPython 3.11 or newer"
@@ -109,7 +119,30 @@ def core_functions(text: str) -> list[str]:
     return re.findall(r"^cdef public [^(\n]*?\b(lav_\w+)\(", text, re.MULTILINE)
 
 
-def build(out: Path, root: Path, modules: Iterable[str | Path] = MODULES, *, include: Path | None = None) -> Built:
+def source_hash(root: Path, modules: Iterable[str | Path] = MODULES) -> str:
+    """Hash of everything that a build of these modules reads of lavender_ext; arguments as for `build`."""
+    folder = root / "lavender_ext"
+    open_, seen = _paths(root, modules), set()
+    while open_:
+        path = open_.pop()
+        if path in seen or not path.exists():
+            continue
+        seen.add(path)
+        text = path.read_text(encoding="utf-8")
+        open_ += [folder / f"{name}.pxd" for name in {path.stem, *CIMPORT.findall(text)}]
+    found = hashlib.sha256()
+    for path in sorted({*seen, folder / "build_options.py"}):
+        found.update(path.name.encode() + b"\0" + path.read_text(encoding="utf-8").encode() + b"\0")
+    return found.hexdigest()
+
+
+def _paths(root: Path, modules: Iterable[str | Path]) -> list[Path]:
+    return [m if isinstance(m, Path) else root / "lavender_ext" / f"{m}.pyx" for m in modules]
+
+
+def build(
+    out: Path, root: Path, modules: Iterable[str | Path] = MODULES, *, include: Path | None = None
+) -> Built:
     """Build one module of the core functions of several kernel modules.
 
     Parameters
@@ -135,10 +168,11 @@ def build(out: Path, root: Path, modules: Iterable[str | Path] = MODULES, *, inc
     reason = why_not()
     if reason:
         raise BuildFailed(reason)
-    paths = [m if isinstance(m, Path) else root / "lavender_ext" / f"{m}.pyx" for m in modules]
+    paths = _paths(root, modules)
     names = [name for path in paths for name in core_functions(path.read_text(encoding="utf-8"))]
-    compiler = shlex.split(os.environ.get("LAVENDER_WASM_CC", "")) or [sys.executable, "-m", "ziglang", "cc", "-target", "wasm32-wasi"]
-    linker = shlex.split(os.environ.get("LAVENDER_WASM_LD", "")) or [sys.executable, "-m", "ziglang", "wasm-ld"]
+    zig = [sys.executable, "-m", "ziglang"]
+    compiler = shlex.split(os.environ.get("LAVENDER_WASM_CC", "")) or [*zig, "cc", "-target", "wasm32-wasi"]
+    linker = shlex.split(os.environ.get("LAVENDER_WASM_LD", "")) or [*zig, "wasm-ld"]
     options = runpy.run_path(str(root / "lavender_ext" / "build_options.py"))
     with tempfile.TemporaryDirectory(prefix="lavender-wasm-") as folder:
         work = Path(folder)
@@ -146,7 +180,11 @@ def build(out: Path, root: Path, modules: Iterable[str | Path] = MODULES, *, inc
         shutil.copytree(include or sysconfig.get_paths()["include"], headers)
         (headers / "pyconfig.h").write_text(PYCONFIG)
         directives = [f"-X{name}={value}" for name, value in options["directives"]().items()]
-        flags = [*options["COMPILE_FLAGS"], "-O3", "-g0", "-w", "-ffunction-sections", "-fdata-sections", f"-I{headers}"]
+        flags = [
+            *options["COMPILE_FLAGS"],
+            *["-O3", "-g0", "-w", "-ffunction-sections", "-fdata-sections"],
+            f"-I{headers}",
+        ]
 
         def compile_one(path: Path) -> Path:
             source, target = work / f"{path.stem}.c", work / f"{path.stem}.o"
@@ -157,16 +195,19 @@ def build(out: Path, root: Path, modules: Iterable[str | Path] = MODULES, *, inc
         with ThreadPoolExecutor(os.cpu_count()) as pool:
             objects = list(pool.map(compile_one, paths))
         module = work / "module.wasm"
-        exports = [f"--export={name}" for name in (*names, *EDGES)]
+        keep = ["--no-entry", "--gc-sections", "-s", *(f"--export={name}" for name in (*names, *EDGES))]
         try:
-            _run([*linker, "--no-entry", "--gc-sections", "-s", *exports, *map(str, objects), "-o", str(module)], root)
+            _run([*linker, *keep, *map(str, objects), "-o", str(module)], root)
         except BuildFailed as error:
-            if "undefined symbol" in str(error):
-                raise BuildFailed(f"a kernel needs what WebAssembly does not have (Python, libm, malloc):\n{error}") from None
-            raise
+            if "undefined symbol" not in str(error):
+                raise
+            raise BuildFailed(
+                f"a kernel needs Python, libm or malloc, which are not there:\n{error}"
+            ) from None
         data = module.read_bytes()
         found = read_module(data)
         _check(found, names, len(data))
+        data += _section(SECTION, source_hash(root, paths).encode())
         # Moved into place in one step: whoever reads `out` at the same time sees the old file or the new one.
         part = out.with_name(out.name + f".{os.getpid()}")
         try:
@@ -205,12 +246,13 @@ def _check(found: Module, names: list[str], size: int) -> None:
 
 @dataclass(frozen=True)
 class Module:
-    """What a WebAssembly file says of itself: imports, exported functions and constants, data segments."""
+    """What a WebAssembly file says of itself: imports, exports, data segments, hash of its sources."""
 
     imports: tuple[str, ...]
     functions: tuple[str, ...]
     globals: dict[str, int]  # exported constants
     data_segments: int
+    sources: str  # empty where the file does not say
 
 
 def read_module(data: bytes) -> Module:
@@ -233,11 +275,17 @@ def read_module(data: bytes) -> Module:
     if data[:8] != b"\0asm\1\0\0\0":
         raise BuildFailed("not a WebAssembly module of version 1")
     sections = {}
+    sources = ""
     at = 8
     while at < len(data):
         kind = data[at]
         size, at = _number(data, at + 1)
-        sections[kind] = (at, at + size)
+        if kind:
+            sections[kind] = (at, at + size)
+        else:
+            name, start = _name(data, at)
+            if name == SECTION:
+                sources = data[start : at + size].decode()
         at += size
     imports, functions, constants = [], [], {}
     if 2 in sections:
@@ -267,7 +315,7 @@ def read_module(data: bytes) -> Module:
             elif kind == 3:
                 constants[name] = values[index]
     segments = _number(data, sections[11][0])[0] if 11 in sections else 0
-    return Module(tuple(imports), tuple(functions), constants, segments)
+    return Module(tuple(imports), tuple(functions), constants, segments, sources)
 
 
 def _number(data: bytes, at: int, signed: bool = False) -> tuple[int, int]:
@@ -283,6 +331,14 @@ def _number(data: bytes, at: int, signed: bool = False) -> tuple[int, int]:
     if signed and byte & 0x40:
         value -= 1 << shift
     return value, at
+
+
+def _section(name: str, content: bytes) -> bytes:
+    # A custom section; lengths below 128 are one byte in LEB128.
+    body = bytes([len(name)]) + name.encode() + content
+    if len(body) >= 128:
+        raise ValueError("a custom section longer than 127 bytes")
+    return bytes([0, len(body)]) + body
 
 
 def _name(data: bytes, at: int) -> tuple[str, int]:

@@ -1,0 +1,65 @@
+"""The command `lavender web`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+__all__ = ["web"]
+
+
+@click.group(invoke_without_command=True)
+@click.option(
+    "--port", type=click.IntRange(0, 65535), default=0, help="Of the page's server; 0 takes a free one."
+)
+@click.option("--no-browser", is_flag=True, help="Only say where the page is.")
+@click.pass_context
+def web(context: click.Context, port: int, no_browser: bool) -> None:
+    """The kernels in WebAssembly: without a subcommand, open the page that runs them in a browser."""
+    if context.invoked_subcommand is None:
+        _show(port, no_browser)
+
+
+def _say(text: str) -> None:
+    click.echo(text, err=True)
+
+
+def _show(port: int, no_browser: bool) -> None:
+    import webbrowser
+    from tempfile import TemporaryDirectory
+
+    from lavender.web import pages
+
+    with TemporaryDirectory(prefix="lavender-web-") as folder:
+        pages.write_page(Path(folder), _say)
+        with pages.server(Path(folder), port) as server:
+            address = f"http://127.0.0.1:{server.server_address[1]}/"
+            click.echo(f"{address}   Ctrl-C ends")
+            if not no_browser:
+                webbrowser.open(address)
+            try:
+                server.serve_forever()
+            except KeyboardInterrupt:
+                click.echo()
+
+
+@web.command()
+@click.argument("out", type=click.Path(dir_okay=False, path_type=Path), metavar="OUT.wasm")
+def build(out: Path) -> None:
+    """Compile the kernels to one WebAssembly module; needs the extra `wasm`, or a compiler named in
+    LAVENDER_WASM_CC and LAVENDER_WASM_LD.
+    """
+    from lavender.web import pages
+
+    built = pages.build_module(out)
+    click.echo(f"{out}: {built.size} bytes, {len(built.functions)} functions, no imports ({built.compiler})")
+
+
+@web.command()
+@click.argument("folder", type=click.Path(file_okay=False, path_type=Path))
+def page(folder: Path) -> None:
+    """Write the page into FOLDER, for any file server; nothing in it needs Python or a network."""
+    from lavender.web import pages
+
+    click.echo(str(pages.write_page(folder, _say)))

@@ -1,0 +1,462 @@
+// The page: two simulations of one scene with settings of their own, stepped together, drawn and plotted.
+
+import { View } from "./draw.js";
+import { Kernels, ORDERS, Simulation, SOLVER_FIELDS } from "./lavender.js";
+
+const KEPT = 720; // steps in the plots over time
+const MOST_STEPS = 6; // in one frame; a slower machine runs slower than real time
+const PLOT_EVERY = 80; // ms
+const DEFAULTS = [{ warm_start: 1 }, { warm_start: 0 }];
+const WHOLE = new Set(["iterations", "warm_start", "contacts", "cache_matches"]);
+const UNITS = { residual_initial: "N s", residual_final: "N s", violation_initial: "m/s", violation_final: "m/s" };
+
+const find = (id) => document.getElementById(id);
+
+export function shown(field, value) {
+  return WHOLE.has(field) || value === 0 ? String(value) : value.toExponential(5);
+}
+
+// -- plots -------------------------------------------------------------------------------------------------
+
+const positive = (x) => (x > 0 ? x : null);
+
+function decades(plot, low, high) {
+  if (low === null || high === null) {
+    return [1e-6, 1];
+  }
+  const [from, to] = [Math.floor(Math.log10(low)), Math.ceil(Math.log10(high))];
+  return [10 ** from, 10 ** Math.max(to, from + 1)];
+}
+
+function upwards(plot, low, high) {
+  return [0, high === null || high <= 0 ? 1 : 1.08 * high];
+}
+
+class Chart {
+  // series: { side, dash, scale } each; `log`: powers of ten on the left.
+  constructor(place, series, { log = false, right = false, x = "time [s]" } = {}) {
+    this.place = find(place);
+    this.series = series;
+    this.options = { log, right, x };
+    this.data = null;
+    this.make();
+    new ResizeObserver(() => this.#resize()).observe(this.place);
+  }
+
+  get size() {
+    return { width: Math.max(200, this.place.clientWidth), height: 190 };
+  }
+
+  // Also after a change between light and dark.
+  make() {
+    this.plot?.destroy();
+    const style = getComputedStyle(document.documentElement);
+    const color = (name) => style.getPropertyValue(name).trim();
+    const colors = [color("--a"), color("--b")];
+    const { log, right, x } = this.options;
+    const axis = { stroke: color("--soft"), font: "12px system-ui", grid: { stroke: color("--line"), width: 1 }, ticks: { show: false } };
+    const powers = (plot, axis, low, high) => {
+      const [from, to] = [low, high].map((v) => Math.round(Math.log10(v)));
+      const every = Math.ceil((to - from + 1) / 6);
+      return Array.from({ length: Math.floor((to - from) / every) + 1 }, (_, i) => 10 ** (from + i * every));
+    };
+    const power = (plot, values) => values.map((v) => `1e${Math.round(Math.log10(v))}`);
+    this.plot = new uPlot(
+      {
+        ...this.size,
+        legend: { show: false },
+        cursor: { show: false },
+        scales: {
+          x: { time: false },
+          y: log ? { distr: 3, range: decades } : { range: upwards },
+          ...(right ? { right: { range: [0, 1.08] } } : {}),
+        },
+        axes: [
+          { ...axis, size: 34, label: x, labelSize: 16, labelFont: "12px system-ui" },
+          { ...axis, size: 52, ...(log ? { splits: powers, filter: (plot, splits) => splits, values: power } : {}) },
+          ...(right ? [{ ...axis, scale: "right", side: 1, size: 30, grid: { show: false }, splits: () => [0, 1] }] : []),
+        ],
+        series: [
+          {},
+          ...this.series.map(({ side, dash, scale }) => ({
+            stroke: colors[side], width: dash ? 1.25 : 2, dash: dash ? [4, 4] : undefined, points: { show: false },
+            scale: scale ?? "y", spanGaps: false,
+          })),
+        ],
+      },
+      this.data ?? [[], ...this.series.map(() => [])],
+      this.place,
+    );
+  }
+
+  set(data) {
+    this.data = data;
+    this.place.classList.toggle("empty", data[0].length > 0 && data.slice(1).every((ys) => ys.every((y) => y === null)));
+    this.plot.setData(data);
+  }
+
+  #resize() {
+    if (this.plot.width !== this.size.width) {
+      this.plot.setSize(this.size);
+    }
+  }
+}
+
+// -- one side ----------------------------------------------------------------------------------------------
+
+class Side {
+  constructor(place, index, app) {
+    this.index = index;
+    this.app = app;
+    place.append(find("side").content.cloneNode(true));
+    place.querySelector("h2").textContent = "AB"[index];
+    const pick = (what) => place.querySelector(what);
+    this.sweeps = pick(".sweeps input");
+    this.sweepsShown = pick(".sweeps output");
+    this.warm = pick(".warm input");
+    this.order = pick(".order");
+    this.canvas = pick("canvas");
+    this.order.append(...ORDERS.map((name, i) => new Option(name.replace("_", " "), i)));
+    this.cells = {};
+    for (const field of SOLVER_FIELDS) {
+      const row = pick("tbody").insertRow();
+      const head = document.createElement("th");
+      head.scope = "row";
+      head.textContent = field.replace("_", " ");
+      if (UNITS[field]) {
+        head.append(Object.assign(document.createElement("small"), { textContent: UNITS[field] }));
+      }
+      this.cells[field] = document.createElement("td");
+      this.cells[field].dataset.field = field;
+      row.append(head, this.cells[field]);
+    }
+    this.sweeps.addEventListener("input", () => this.set({ iterations: Number(this.sweeps.value) }));
+    this.warm.addEventListener("change", () => this.set({ warm_start: Number(this.warm.checked) }));
+    this.order.addEventListener("change", () => this.set({ order: Number(this.order.value) }));
+    this.view = new View(this.canvas);
+    this.view.onlook = () => this.draw();
+    this.history = null;
+    this.kept = null;
+  }
+
+  load(scene) {
+    const before = this.simulation?.settings;
+    this.simulation = new Simulation(new Kernels(this.app.module, this.app.contents.layout), scene);
+    const { iterations, warm_start, order } = before ?? { ...this.simulation.settings, ...DEFAULTS[this.index] };
+    this.simulation.set({ iterations, warm_start, order });
+    this.forget();
+    this.readSettings();
+  }
+
+  forget() {
+    this.history = { time: [], values: [] };
+    this.curve = null;
+    this.kept = null;
+  }
+
+  set(changes) {
+    this.simulation.set(changes);
+    this.readSettings();
+  }
+
+  readSettings() {
+    const { iterations, warm_start, order } = this.simulation.settings;
+    this.sweeps.value = iterations;
+    this.sweepsShown.textContent = iterations;
+    this.warm.checked = Boolean(warm_start);
+    this.order.value = order;
+  }
+
+  step(time) {
+    this.curve = this.simulation.stepWatched();
+    this.history.time.push(time);
+    this.history.values.push(this.simulation.values);
+    if (this.history.time.length > KEPT) {
+      this.history.time.shift();
+      this.history.values.shift();
+    }
+    return this.curve.finite;
+  }
+
+  snapshot() {
+    this.kept = {
+      state: this.simulation.snapshot(),
+      history: { time: [...this.history.time], values: [...this.history.values] },
+      curve: this.curve,
+    };
+  }
+
+  restore() {
+    const { state, history, curve } = this.kept;
+    this.simulation.restore(state);
+    this.history = { time: [...history.time], values: [...history.values] };
+    this.curve = curve;
+    this.readSettings();
+  }
+
+  push(random) {
+    const [v, dynamic] = [this.simulation.array("v"), this.simulation.array("dyn")];
+    for (let i = 0; i < dynamic.length; i++) {
+      for (let k = 0; k < 6; k++) {
+        const share = random();
+        if (dynamic[i] >= 0) {
+          v[6 * i + k] += k === 2 ? 0 : 0.6 * (share - 0.5);
+        }
+      }
+    }
+  }
+
+  draw() {
+    this.view.draw(this.simulation, this.app.colors);
+  }
+
+  show() {
+    const values = this.simulation.values;
+    SOLVER_FIELDS.forEach((field, i) => {
+      const cell = this.cells[field];
+      const stepped = this.simulation.steps > 0;
+      cell.textContent = stepped ? shown(field, values[i]) : "–";
+      cell.dataset.value = stepped ? String(values[i]) : "";
+    });
+    this.draw();
+    const what = `Side ${"AB"[this.index]}: ${this.app.scene.title}, ${values[2]} contacts`;
+    if (this.canvas.getAttribute("aria-label") !== what) {
+      this.canvas.setAttribute("aria-label", what);
+    }
+  }
+}
+
+// -- the page ----------------------------------------------------------------------------------------------
+
+class App {
+  constructor(module, contents) {
+    this.module = module;
+    this.contents = contents;
+    this.playing = false;
+    this.owed = 0; // s, simulated time that the frames have not stepped yet
+    this.last = null;
+    this.plotted = 0;
+    this.readColors();
+    this.sides = Array.from(document.querySelectorAll(".side"), (place, i) => new Side(place, i, this));
+    const views = this.sides.map((side) => side.view);
+    views.forEach((view) => {
+      view.linked = views;
+    });
+    this.makeCharts();
+    this.listen();
+    const names = contents.scenes.map((scene) => scene.name);
+    find("scene").append(...contents.scenes.map((scene) => new Option(scene.title, scene.name)));
+    const asked = location.hash.slice(1);
+    this.choose(names.includes(asked) ? asked : names[0]);
+    requestAnimationFrame((now) => this.frame(now));
+  }
+
+  readColors() {
+    const style = getComputedStyle(document.documentElement);
+    const dark = matchMedia("(prefers-color-scheme: dark)").matches;
+    this.colors = {
+      dark,
+      ground: style.getPropertyValue("--ground").trim(),
+      edge: dark ? "rgb(0 0 0 / 60%)" : "rgb(40 25 60 / 55%)",
+      mark: dark ? "#f0a35e" : "#ffffff",
+      joint: dark ? "#ece8f2" : "#262130",
+      contact: dark ? "#ffd166" : "#d61f69",
+    };
+  }
+
+  makeCharts() {
+    const both = [{ side: 0 }, { side: 1 }];
+    const four = [{ side: 0, dash: true }, { side: 1, dash: true }, ...both];
+    this.charts = {
+      energy: new Chart("chart-energy", both, { log: true, x: "sweep" }),
+      normal: new Chart("chart-normal", both, { log: true, x: "sweep" }),
+      residual: new Chart("chart-residual", four, { log: true }),
+      violation: new Chart("chart-violation", four, { log: true }),
+      contacts: new Chart("chart-contacts", four),
+      settings: new Chart("chart-settings", four.map((s) => (s.dash ? { ...s, scale: "right" } : s)), { right: true }),
+    };
+  }
+
+  listen() {
+    const click = (id, act) => find(id).addEventListener("click", act);
+    click("play", () => this.play(!this.playing));
+    click("step", () => this.advance(1));
+    click("second", () => this.advance(Math.round(1 / this.scene.dt)));
+    click("reset", () => this.choose(this.scene.name));
+    click("snapshot", () => this.snapshot());
+    click("restore", () => this.restore());
+    click("push", () => this.push());
+    find("scene").addEventListener("change", (event) => this.choose(event.target.value));
+    document.addEventListener("keydown", (event) => this.key(event));
+    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => {
+      this.readColors();
+      Object.values(this.charts).forEach((chart) => chart.make());
+      this.show(true);
+    });
+    window.addEventListener("resize", () => this.show(true));
+  }
+
+  key(event) {
+    const typing = /^(SELECT|INPUT|BUTTON)$/.test(event.target.tagName);
+    if (event.ctrlKey || event.metaKey || event.altKey || (typing && (event.key === " " || event.key === "Enter"))) {
+      return;
+    }
+    if (event.target.tagName === "SELECT" && event.key.length === 1) {
+      return; // a letter or digit there chooses an option
+    }
+    const side = this.sides[event.shiftKey ? 1 : 0];
+    const sweeps = (by) => side.set({ iterations: Math.min(64, Math.max(4, side.simulation.settings.iterations + by)) });
+    const scene = this.contents.scenes[Number(event.key) - 1];
+    const acts = {
+      " ": () => this.play(!this.playing),
+      ".": () => this.advance(1),
+      0: () => this.choose(this.scene.name),
+      s: () => this.snapshot(),
+      r: () => this.restore(),
+      p: () => this.push(),
+      w: () => side.set({ warm_start: 1 - side.simulation.settings.warm_start }),
+      "+": () => sweeps(4),
+      "=": () => sweeps(4),
+      "*": () => sweeps(4),
+      "-": () => sweeps(-4),
+      _: () => sweeps(-4),
+    };
+    const act = acts[event.key.toLowerCase()] ?? (scene ? () => this.choose(scene.name) : null);
+    if (act) {
+      act();
+      event.preventDefault();
+    }
+  }
+
+  choose(name) {
+    const another = this.scene?.name !== name;
+    this.scene = this.contents.scenes.find((scene) => scene.name === name);
+    find("scene").value = name;
+    find("note").textContent = this.scene.note;
+    if (another) {
+      history.replaceState(null, "", `#${name}`);
+    }
+    this.steps = 0;
+    this.seed = 1;
+    this.owed = 0;
+    for (const side of this.sides) {
+      side.load(this.scene);
+      side.view.fit(side.simulation);
+    }
+    find("restore").disabled = true;
+    find("failure").hidden = true;
+    this.show(true);
+  }
+
+  play(on) {
+    this.playing = on;
+    this.last = null;
+    find("play").textContent = on ? "Pause" : "Play";
+    find("play").setAttribute("aria-pressed", on);
+  }
+
+  // The same steps on both sides.
+  advance(steps) {
+    for (let i = 0; i < steps; i++) {
+      const lost = this.sides.find((side) => side.simulation.lost >= 0);
+      if (lost) {
+        this.play(false);
+        const body = this.scene.bodies[lost.simulation.lost];
+        fail(`Side ${"AB"[lost.index]}: the state of ${body} is no longer finite. Reset, or restore a snapshot.`);
+        break;
+      }
+      this.steps += 1;
+      this.sides.forEach((side) => side.step(this.steps * this.scene.dt));
+    }
+    this.show(!this.playing);
+  }
+
+  snapshot() {
+    this.sides.forEach((side) => side.snapshot());
+    this.keptSteps = [this.steps, this.seed];
+    find("restore").disabled = false;
+  }
+
+  restore() {
+    if (find("restore").disabled) {
+      return;
+    }
+    [this.steps, this.seed] = this.keptSteps;
+    this.sides.forEach((side) => side.restore());
+    find("failure").hidden = true;
+    this.show(true);
+  }
+
+  // The same push on both sides, the same after every reset.
+  push() {
+    const start = this.seed;
+    for (const side of this.sides) {
+      this.seed = start;
+      side.push(() => {
+        this.seed = (Math.imul(this.seed, 1664525) + 1013904223) >>> 0;
+        return this.seed / 2 ** 32;
+      });
+    }
+    this.show(true);
+  }
+
+  frame(now) {
+    if (this.playing) {
+      this.owed += this.last === null ? 0 : Math.min(0.1, (now - this.last) / 1000) * Number(find("speed").value);
+      this.last = now;
+      const steps = Math.min(MOST_STEPS, Math.floor(this.owed / this.scene.dt));
+      if (steps > 0) {
+        this.owed = Math.min(this.owed - steps * this.scene.dt, this.scene.dt);
+        this.advance(steps);
+      }
+    }
+    requestAnimationFrame((next) => this.frame(next));
+  }
+
+  show(always) {
+    this.sides.forEach((side) => side.show());
+    find("clock").textContent = `${(this.steps * this.scene.dt).toFixed(3)} s, step ${this.steps}`;
+    const now = performance.now();
+    if (always || now - this.plotted > PLOT_EVERY) {
+      this.plotted = now;
+      this.plot();
+    }
+  }
+
+  plot() {
+    const [a, b] = this.sides;
+    const sweeps = Math.max(...this.sides.map((side) => side.curve?.energy.length ?? 0));
+    const along = Array.from({ length: sweeps }, (_, i) => i);
+    for (const name of ["energy", "normal"]) {
+      this.charts[name].set([along, ...this.sides.map((side) => along.map((i) => positive(side.curve?.[name][i] ?? 0)))]);
+    }
+    const time = a.history.time;
+    const column = (side, field) => side.history.values.map((values) => values[SOLVER_FIELDS.indexOf(field)]);
+    const pairs = (one, two, change = (x) => x) => [
+      time, ...[column(a, one), column(b, one), column(a, two), column(b, two)].map((values) => values.map(change)),
+    ];
+    this.charts.residual.set(pairs("residual_initial", "residual_final", positive));
+    this.charts.violation.set(pairs("violation_initial", "violation_final", positive));
+    this.charts.contacts.set(pairs("contacts", "cache_matches"));
+    this.charts.settings.set(pairs("warm_start", "iterations"));
+  }
+}
+
+function fail(text) {
+  find("failure").textContent = text;
+  find("failure").hidden = false;
+}
+
+async function start() {
+  const [module, contents] = await Promise.all([
+    fetch("lavender.wasm").then((answer) => answer.arrayBuffer()).then((bytes) => WebAssembly.compile(bytes)),
+    fetch("scenes.json").then((answer) => answer.json()),
+  ]);
+  window.lavender = new App(module, contents);
+  document.documentElement.dataset.ready = "true";
+}
+
+start().catch((error) => {
+  fail(`The page could not start: ${error.message}`);
+  throw error;
+});

@@ -1,0 +1,341 @@
+// The kernels of lavender.wasm for JavaScript: memory, structs, and a simulation over three buffers.
+//
+// The module has no imports and no allocator: whatever it works on lies where this file puts it. Where the
+// fields of a struct lie is computed here by C's rules, asked of the module, and the two are compared.
+
+const SIZES = 10; // entries of size[], see engine_types.pxd
+const MOST_SWEEPS = 64;
+const OK = 0;
+const NEED_ROOM = 1;
+const NOT_FINITE = 2;
+
+export const SOLVER_FIELDS = [
+  "iterations",
+  "warm_start",
+  "contacts",
+  "cache_matches",
+  "residual_initial",
+  "residual_final",
+  "violation_initial",
+  "violation_final",
+];
+export const ORDERS = ["given", "reverse", "symmetric", "random", "bottom_up", "top_down", "colored"];
+
+const WIDTH = { i4: 4, f8: 8, p: 4 };
+
+// Size and field offsets of a struct by C's rules on wasm32.
+export function layOut(fields) {
+  const offsets = {};
+  let at = 0;
+  let widest = 1;
+  for (const [name, type] of Object.entries(fields)) {
+    const [, count, kind] = /^(\d*)(i4|f8|p)$/.exec(type);
+    const width = WIDTH[kind];
+    at = Math.ceil(at / width) * width;
+    offsets[name] = at;
+    at += width * (count ? Number(count) : 1);
+    widest = Math.max(widest, width);
+  }
+  return { size: Math.ceil(at / widest) * widest, offsets };
+}
+
+export class Kernels {
+  // `module`: a WebAssembly.Module; `layout`: structs and arrays as lavender_ext.host lists them, with the
+  // sizes of the native build. Throws where the module has others.
+  constructor(module, layout) {
+    this.functions = new WebAssembly.Instance(module, {}).exports;
+    this.memory = this.functions.memory;
+    this.layout = layout;
+    this.top = this.functions.__heap_base.value;
+    this.structs = {};
+    this.#compare();
+  }
+
+  #compare() {
+    let count = 0;
+    for (const fields of Object.values(this.layout.structs)) {
+      count += 1 + Object.keys(fields).length;
+    }
+    const mark = this.top;
+    const place = this.alloc(4 * count);
+    this.functions.lav_layout(place);
+    const said = this.i32(place, count);
+    let k = 0;
+    for (const [name, fields] of Object.entries(this.layout.structs)) {
+      const expected = layOut(fields);
+      const pointers = Object.values(fields).includes("p");
+      const native = this.layout.native[name];
+      const size = said[k++];
+      if (size !== expected.size || (!pointers && size !== native.size)) {
+        throw new Error(`${name} has ${size} bytes in the module, ${expected.size} here, ${native.size} natively`);
+      }
+      for (const field of Object.keys(fields)) {
+        const offset = said[k++];
+        if (offset !== expected.offsets[field] || (!pointers && offset !== native.offsets[field])) {
+          throw new Error(`${name}.${field} is at ${offset} in the module, at ${expected.offsets[field]} here`);
+        }
+      }
+      this.structs[name] = expected;
+    }
+    this.top = mark;
+  }
+
+  // Zeroed bytes; they stay until `top` is set back.
+  alloc(bytes) {
+    const place = Math.ceil(this.top / 16) * 16;
+    this.top = place + bytes;
+    const missing = this.top - this.memory.buffer.byteLength;
+    if (missing > 0) {
+      this.memory.grow(Math.ceil(missing / 65536));
+    }
+    new Uint8Array(this.memory.buffer, place, bytes).fill(0);
+    return place;
+  }
+
+  // Views are made when they are used: growing the memory detaches older ones.
+  f64(place, n) {
+    return new Float64Array(this.memory.buffer, place, n);
+  }
+
+  i32(place, n) {
+    return new Int32Array(this.memory.buffer, place, n);
+  }
+
+  u64(place, n) {
+    return new BigUint64Array(this.memory.buffer, place, n);
+  }
+
+  bytes(place, n) {
+    return new Uint8Array(this.memory.buffer, place, n);
+  }
+
+  // Copies of arrays in the module's memory; returns where.
+  putReals(values) {
+    const place = this.alloc(8 * Math.max(values.length, 1));
+    this.f64(place, values.length).set(values);
+    return place;
+  }
+
+  putInts(values) {
+    const place = this.alloc(4 * Math.max(values.length, 1));
+    this.i32(place, values.length).set(values);
+    return place;
+  }
+
+  putKeys(values) {
+    const place = this.alloc(8 * Math.max(values.length, 1));
+    this.u64(place, values.length).set(values);
+    return place;
+  }
+
+  // A struct with the given fields; pointers and int32 as numbers, doubles as numbers.
+  putStruct(name, values) {
+    const { size, offsets } = this.structs[name];
+    const place = this.alloc(size);
+    this.writeStruct(name, place, values);
+    if (Object.keys(values).some((field) => !(field in offsets))) {
+      throw new Error(`${name} has no field among ${Object.keys(values)}`);
+    }
+    return place;
+  }
+
+  writeStruct(name, place, values) {
+    const view = new DataView(this.memory.buffer);
+    const fields = this.layout.structs[name];
+    for (const [field, value] of Object.entries(values)) {
+      const at = place + this.structs[name].offsets[field];
+      if (fields[field].endsWith("f8")) {
+        [value].flat().forEach((x, k) => view.setFloat64(at + 8 * k, x, true));
+      } else {
+        view.setInt32(at, value, true);
+      }
+    }
+  }
+
+  readStruct(name, place) {
+    const view = new DataView(this.memory.buffer);
+    const out = {};
+    for (const [field, type] of Object.entries(this.layout.structs[name])) {
+      const at = place + this.structs[name].offsets[field];
+      const count = parseInt(type, 10);
+      if (type.length > 2) {
+        out[field] = Array.from({ length: count }, (_, k) => view.getFloat64(at + 8 * k, true));
+      } else {
+        out[field] = type === "f8" ? view.getFloat64(at, true) : view.getInt32(at, true);
+      }
+    }
+    return out;
+  }
+}
+
+// A scene that runs: everything it knows lies in `size` and three buffers of `kernels.memory`.
+export class Simulation {
+  // scene: { size, arrays, substeps, dt }; arrays that are left out are zero. One Kernels for each Simulation:
+  // memory that became too small is not given back before both go.
+  constructor(kernels, scene) {
+    this.k = kernels;
+    this.scene = scene;
+    this.substeps = scene.substeps;
+    this.steps = 0;
+    this.lost = -1;
+    this.#allocate(scene.size);
+    for (const [name, values] of Object.entries(scene.arrays)) {
+      this.array(name).set(name === "key" || name === "cache_key" ? values.map(BigInt) : values);
+    }
+    this.out = this.k.alloc(64);
+    this.done = this.k.alloc(8);
+    this.settingsPlace = this.k.alloc(this.k.structs.settings_t.size);
+    this.curve = this.k.alloc(16 * (MOST_SWEEPS + 1));
+  }
+
+  #allocate(size) {
+    this.size = this.k.putInts(size);
+    const used = this.k.alloc(12);
+    this.k.functions.lav_engine_lengths(this.size, used);
+    this.lengths = Array.from(this.k.i32(used, 3));
+    if (Math.min(...this.lengths) < 0) {
+      throw new Error("the scene needs more than 2^31 entries in one buffer");
+    }
+    this.real = this.k.alloc(8 * Math.max(this.lengths[0], 1));
+    this.index = this.k.alloc(4 * Math.max(this.lengths[1], 1));
+    this.keys = this.k.alloc(8 * Math.max(this.lengths[2], 1));
+    this.#findArrays();
+    const { joints, joint_rows, rows_per_contact, cap_contact } = this.k.layout.size;
+    this.joints = size[joints];
+    this.rows = size[joint_rows] + size[rows_per_contact] * size[cap_contact];
+    this.scratch = this.k.alloc(16 * (this.rows + 1));
+  }
+
+  #findArrays() {
+    const { real, index, keys } = this.k.layout.arrays;
+    const names = [...real, ...index, ...keys];
+    const place = this.k.alloc(4 * names.length);
+    this.k.functions.lav_engine_offsets(...this.buffers, place);
+    const first = this.k.i32(place, names.length);
+    this.places = {};
+    let i = 0;
+    [real, index, keys].forEach((list, buffer) => {
+      list.forEach((name, j) => {
+        const end = j + 1 < list.length ? first[i + 1] : this.lengths[buffer];
+        this.places[name] = [buffer, first[i], end - first[i]];
+        i += 1;
+      });
+    });
+  }
+
+  get buffers() {
+    return [this.size, this.real, this.index, this.keys];
+  }
+
+  // A live view of one of the engine's arrays.
+  array(name) {
+    const [buffer, first, n] = this.places[name];
+    if (buffer === 0) {
+      return this.k.f64(this.real + 8 * first, n);
+    }
+    return buffer === 1 ? this.k.i32(this.index + 4 * first, n) : this.k.u64(this.keys + 8 * first, n);
+  }
+
+  get sizes() {
+    return Array.from(this.k.i32(this.size, SIZES));
+  }
+
+  get settings() {
+    this.k.functions.lav_engine_read_settings(...this.buffers, this.settingsPlace);
+    return this.k.readStruct("settings_t", this.settingsPlace);
+  }
+
+  set(changes) {
+    this.k.functions.lav_engine_read_settings(...this.buffers, this.settingsPlace);
+    this.k.writeStruct("settings_t", this.settingsPlace, changes);
+    this.k.functions.lav_engine_write_settings(...this.buffers, this.settingsPlace);
+  }
+
+  // The eight values of SOLVER_FIELDS.
+  get values() {
+    this.k.functions.lav_engine_values(...this.buffers, this.out);
+    return Array.from(this.k.f64(this.out, 8));
+  }
+
+  #grow() {
+    const old = this.buffers;
+    const room = this.k.alloc(4 * SIZES);
+    this.k.functions.lav_engine_more_room(...old, room);
+    this.#allocate(Array.from(this.k.i32(room, SIZES)));
+    this.k.functions.lav_engine_move(...old, ...this.buffers);
+  }
+
+  // One step; false when the state is no longer finite.
+  step() {
+    let left = this.substeps;
+    for (;;) {
+      const status = this.k.functions.lav_engine_substeps(...this.buffers, left, this.done);
+      left -= this.k.i32(this.done, 1)[0];
+      if (status !== NEED_ROOM) {
+        return this.#finished(status);
+      }
+      this.#grow();
+    }
+  }
+
+  // The same step, bit for bit, and the error before and after every sweep of its last substep:
+  // { normal: max |e_n| [N s], energy: E [sqrt J] }, each of 1 + sweeps numbers.
+  stepWatched() {
+    let status = OK;
+    const sweeps = this.settings.iterations;
+    if (sweeps > MOST_SWEEPS) {
+      throw new Error(`${sweeps} sweeps; at most ${MOST_SWEEPS} are watched`);
+    }
+    const n = 1 + sweeps;
+    for (let s = 0; s < this.substeps && status === OK; s++) {
+      while (this.k.functions.lav_engine_prepare(...this.buffers) === NEED_ROOM) {
+        this.#grow();
+      }
+      this.k.functions.lav_engine_solve_watched(...this.buffers, this.curve, this.scratch);
+      status = this.k.functions.lav_engine_finish(...this.buffers);
+    }
+    const numbers = this.k.f64(this.curve, 2 * n);
+    const normal = [];
+    const energy = [];
+    for (let i = 0; i < n; i++) {
+      normal.push(numbers[2 * i]);
+      energy.push(numbers[2 * i + 1]);
+    }
+    return { finite: this.#finished(status), normal, energy };
+  }
+
+  #finished(status) {
+    this.steps += 1;
+    if (status === NOT_FINITE) {
+      this.lost = this.array("head")[this.k.layout.head.lost];
+    }
+    return status === OK;
+  }
+
+  // Bytes of everything the simulation knows; `restore` continues from there to the last bit.
+  snapshot() {
+    const copy = [8 * this.lengths[0], 4 * this.lengths[1], 8 * this.lengths[2]].map((n) => this.k.alloc(n));
+    this.k.functions.lav_engine_copy(...this.buffers, ...copy);
+    const snapshot = {
+      size: this.sizes,
+      steps: this.steps,
+      lost: this.lost,
+      real: this.k.f64(copy[0], this.lengths[0]).slice(),
+      index: this.k.i32(copy[1], this.lengths[1]).slice(),
+      keys: this.k.u64(copy[2], this.lengths[2]).slice(),
+    };
+    this.k.top = copy[0];
+    return snapshot;
+  }
+
+  restore(snapshot) {
+    if (snapshot.size.some((n, i) => n !== this.sizes[i])) {
+      this.#allocate(snapshot.size);
+    }
+    this.k.f64(this.real, this.lengths[0]).set(snapshot.real);
+    this.k.i32(this.index, this.lengths[1]).set(snapshot.index);
+    this.k.u64(this.keys, this.lengths[2]).set(snapshot.keys);
+    this.steps = snapshot.steps;
+    this.lost = snapshot.lost;
+  }
+}

@@ -1,0 +1,160 @@
+"""The page: its folder, its module, and a server on this machine."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+
+import lavender_ext
+from lavender.errors import InputError, LavenderError
+from lavender.web import compile as wasm
+from lavender.web.scenes import page_scenes
+
+__all__ = ["build_module", "module", "server", "write_page"]
+
+HERE = Path(__file__).resolve().parent
+ROOT = Path(lavender_ext.__file__).resolve().parent.parent  # the folder that holds lavender_ext
+SHIPPED = HERE / "lavender.wasm"
+
+
+def build_module(out: Path) -> wasm.Built:
+    """Compile the kernels to one WebAssembly module without imports.
+
+    Parameters
+    ----------
+    out : Path
+        File to write.
+
+    Returns
+    -------
+    Built
+        size [bytes], functions, imports (none), compiler.
+
+    Raises
+    ------
+    LavenderError
+        No compiler here, or kernels that WebAssembly cannot run.
+    InputError
+        A folder that does not exist.
+    """
+    if not out.resolve().parent.is_dir():
+        raise InputError(f"the folder {out.resolve().parent} does not exist; make it first")
+    try:
+        return wasm.build(out, ROOT)
+    except wasm.BuildFailed as error:
+        raise LavenderError(str(error)) from None
+
+
+def module(say: Callable[[str], Any] = lambda text: None) -> bytes:
+    """The module of the kernels as they are: the one that lies in the package, or a new one, kept there.
+
+    Parameters
+    ----------
+    say : callable
+        Told when something takes time.
+
+    Returns
+    -------
+    bytes
+
+    Raises
+    ------
+    LavenderError
+        There is none for these sources, and none can be built.
+    """
+    sources = wasm.source_hash(ROOT)
+    if SHIPPED.exists():
+        data = SHIPPED.read_bytes()
+        if wasm.read_module(data).sources == sources:
+            return data
+    reason = wasm.why_not()
+    if reason:
+        state = "is of other kernels" if SHIPPED.exists() else "is not in this installation"
+        raise LavenderError(f"the WebAssembly module {state} and cannot be built: {reason}")
+    say("building the WebAssembly module (some 10 s, kept for the next time)")
+    try:
+        build_module(SHIPPED)
+        return SHIPPED.read_bytes()
+    except LavenderError as error:
+        if not str(error).startswith("cannot write"):
+            raise
+    from tempfile import TemporaryDirectory
+
+    with TemporaryDirectory() as folder:  # the package is read-only
+        out = Path(folder, "lavender.wasm")
+        build_module(out)
+        return out.read_bytes()
+
+
+def write_page(folder: Path, say: Callable[[str], Any] = lambda text: None) -> Path:
+    """Write the page into a folder that any file server can serve; nothing in it needs Python or a network.
+
+    Parameters
+    ----------
+    folder : Path
+        Made if it does not exist; files of the page in it are replaced.
+    say : callable
+        Told when something takes time.
+
+    Returns
+    -------
+    Path
+        The page, index.html.
+
+    Raises
+    ------
+    InputError
+        A folder that cannot be written.
+    LavenderError
+        No module; see `module`.
+    """
+    data = module(say)
+    try:
+        shutil.copytree(HERE / "page", folder, dirs_exist_ok=True)
+        (folder / "lavender.wasm").write_bytes(data)
+        text = json.dumps(page_scenes(), allow_nan=False, separators=(",", ":"))
+        (folder / "scenes.json").write_text(text, encoding="utf-8")
+    except (OSError, shutil.Error) as error:
+        raise InputError(f"cannot write the page into {folder}: {error}") from None
+    return folder / "index.html"
+
+
+class _Handler(SimpleHTTPRequestHandler):
+    # Types are said here, since a machine's own table may lack or miscall them.
+    extensions_map = {  # noqa: RUF012 - as the base class has it
+        "": "application/octet-stream",
+        ".css": "text/css",
+        ".html": "text/html; charset=utf-8",
+        ".js": "text/javascript; charset=utf-8",
+        ".json": "application/json",
+        ".txt": "text/plain; charset=utf-8",
+        ".wasm": "application/wasm",
+    }
+
+    def end_headers(self) -> None:
+        self.send_header("Cache-Control", "no-cache")
+        super().end_headers()
+
+    def log_message(self, format: str, *arguments: Any) -> None:  # noqa: A002 - the base class names it so
+        """Say nothing about single requests."""
+
+
+def server(folder: Path, port: int = 0) -> ThreadingHTTPServer:
+    """A server of `folder` on the loopback address, not yet running; port 0 takes a free one.
+
+    Raises
+    ------
+    InputError
+        A port that is taken.
+    """
+    try:
+        return ThreadingHTTPServer(("127.0.0.1", port), partial(_Handler, directory=str(folder)))
+    except OSError as error:
+        raise InputError(
+            f"port {port} cannot be used ({error.strerror or error}); give another with --port"
+        ) from None

@@ -1,0 +1,454 @@
+"""The kernels in WebAssembly give the bits of the native ones: under Node, and under wasmtime from Python."""
+
+import hashlib
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import lavender as lv
+from lavender.errors import InputError, LavenderError
+from lavender.web import compile as wasm
+from lavender.web import pages
+from lavender.web.scenes import describe, layout, page_scenes
+
+HERE = Path(__file__).resolve().parent
+ROOT = HERE.parent
+CHECK = HERE / "wasm" / "check_wasm_exports.mjs"
+# Left out where the kernels run with every check on: the module is compiled without them either way.
+pytestmark = pytest.mark.slow
+
+needs_compiler = pytest.mark.skipif(bool(wasm.why_not()), reason=wasm.why_not())
+
+
+@pytest.fixture(scope="session")
+def module():
+    """The module of these sources, as bytes; built once for each state of the sources."""
+    try:
+        return pages.module()
+    except LavenderError as error:
+        pytest.skip(str(error))
+
+
+@pytest.fixture(scope="session")
+def recording(tmp_path_factory):
+    """Folder of what the native kernels did."""
+    folder = tmp_path_factory.mktemp("recording")
+    subprocess.run([sys.executable, str(HERE / "wasm" / "record.py"), str(folder)], check=True, cwd=ROOT)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def host():
+    return pytest.importorskip("wasmtime", reason="wasmtime is not installed (extra: wasm)") and __import__(
+        "wasm_host"
+    )
+
+
+# -- the module ------------------------------------------------------------------------------------------------
+
+
+def test_module_stands_alone(module):
+    found = wasm.read_module(module)
+    assert found.imports == ()
+    assert found.data_segments == 0
+    assert found.globals["__data_end"] == found.globals["__global_base"]
+    assert len(module) < wasm.LARGEST
+    assert {"lav_pgs_sweeps", "lav_impulse_sweeps", "lav_engine_substeps", "lav_engine_copy"} <= set(
+        found.functions
+    )
+    assert found.sources == wasm.source_hash(ROOT)
+
+
+HEAD = "from libc.stdint cimport int32_t\n"
+BAD = {
+    "Python": """
+cdef public double lav_bad(double x) noexcept nogil:
+    with gil:
+        return <double>len(str(x))
+""",
+    "libm": """
+from libc.math cimport sin
+cdef public double lav_bad(double x) noexcept nogil:
+    return sin(x)
+""",
+    "malloc": """
+from libc.stdlib cimport malloc
+cdef public void lav_bad(void** out) noexcept nogil:
+    out[0] = malloc(8)
+""",
+    "a module-level variable": """
+cdef double EPS = 1e-9
+cdef public double lav_bad(double x) noexcept nogil:
+    return x + EPS
+""",
+    "a function of another module": """
+from elsewhere cimport half
+cdef public double lav_bad(double x) noexcept nogil:
+    return half(x)
+""",
+    "a table": """
+cdef extern from *:
+    '''
+    static const double TABLE[64] = {3, 1, 4, 1, 5};
+    '''
+    const double TABLE[64]
+cdef public double lav_bad(int32_t i) noexcept nogil:
+    return TABLE[i]
+""",
+}
+SIGNS = ("PyGILState_Ensure", "symbol: sin", "symbol: malloc", "static data", "static data", "static data")
+
+
+@needs_compiler
+@pytest.mark.parametrize("kind, sign", list(zip(BAD, SIGNS, strict=True)), ids=list(BAD))
+def test_a_kernel_that_needs_more_does_not_link(tmp_path, kind, sign):
+    path = tmp_path / "bad.pyx"
+    path.write_text(HEAD + BAD[kind])
+    (tmp_path / "elsewhere.pxd").write_text("cdef double half(double x) noexcept nogil\n")
+    with pytest.raises(wasm.BuildFailed, match=sign):
+        wasm.build(tmp_path / "bad.wasm", ROOT, [path])
+    assert not (tmp_path / "bad.wasm").exists()
+
+
+GOOD = (
+    HEAD
+    + "cdef public int32_t lav_good(int32_t x) noexcept nogil:\n    return 2 * x + <int32_t>sizeof(void*)\n"
+)
+
+
+@needs_compiler
+def test_headers_of_another_machine_do_no_harm(tmp_path):
+    # Debian's pyconfig.h refuses targets that it does not know; ours stands in for it.
+    import sysconfig
+
+    headers = tmp_path / "include"
+    shutil.copytree(sysconfig.get_paths()["include"], headers)
+    (headers / "pyconfig.h").write_text("#error unknown multiarch location for pyconfig.h\n")
+    path = tmp_path / "good.pyx"
+    path.write_text(GOOD)
+    built = wasm.build(tmp_path / "good.wasm", ROOT, [path], include=headers)
+    assert built.functions == ("lav_good",)
+    assert wasm.read_module((tmp_path / "good.wasm").read_bytes()).functions == ("lav_good",)
+    assert built.size < 1000
+
+
+@needs_compiler
+def test_a_module_that_is_too_large_is_refused(tmp_path, monkeypatch):
+    path = tmp_path / "good.pyx"
+    path.write_text(GOOD)
+    monkeypatch.setattr(wasm, "LARGEST", 10)
+    with pytest.raises(wasm.BuildFailed, match="below 10 are allowed"):
+        wasm.build(tmp_path / "good.wasm", ROOT, [path])
+
+
+def test_a_compiler_that_is_not_there_is_named(tmp_path, monkeypatch):
+    monkeypatch.setenv("LAVENDER_WASM_CC", "no-such-compiler --target=wasm32-wasi")
+    with pytest.raises(LavenderError, match="names 'no-such-compiler', which is not there"):
+        pages.build_module(tmp_path / "a.wasm")
+
+
+def test_a_folder_that_is_not_there_is_named(tmp_path):
+    with pytest.raises(InputError, match="does not exist"):
+        pages.build_module(tmp_path / "none" / "a.wasm")
+
+
+def test_a_file_that_is_no_module_is_refused():
+    with pytest.raises(wasm.BuildFailed, match="not a WebAssembly module"):
+        wasm.read_module(b"#!/bin/sh\n")
+
+
+def test_without_compiler_a_missing_or_stale_module_says_what_to_do(tmp_path, monkeypatch):
+    monkeypatch.setattr(wasm, "why_not", lambda: "no compiler")
+    monkeypatch.setattr(pages, "SHIPPED", tmp_path / "lavender.wasm")
+    with pytest.raises(LavenderError, match="is not in this installation and cannot be built: no compiler"):
+        pages.module()
+    other = b"\0asm\1\0\0\0" + wasm._section(wasm.SECTION, b"0" * 64)
+    (tmp_path / "lavender.wasm").write_bytes(other)
+    with pytest.raises(LavenderError, match="is of other kernels"):
+        pages.module()
+    fresh = b"\0asm\1\0\0\0" + wasm._section(wasm.SECTION, wasm.source_hash(ROOT).encode())
+    (tmp_path / "lavender.wasm").write_bytes(fresh)
+    assert pages.module() == fresh
+
+
+def test_a_build_of_the_package_ships_the_module(tmp_path, module):
+    # As `pip wheel --no-build-isolation` runs it: built, or taken from the checkout where it is of these sources.
+    shipped = tmp_path / "lavender" / "web" / "lavender.wasm"
+    command = [sys.executable, "setup.py", "-q", "build_wasm", "--build-lib", str(tmp_path)]
+    subprocess.run(command, check=True, cwd=ROOT)
+    assert shipped.read_bytes() == module
+
+
+@needs_compiler
+def test_the_same_sources_give_the_same_bytes(tmp_path):
+    path = tmp_path / "good.pyx"
+    path.write_text(GOOD)
+    for name in ("one.wasm", "two.wasm"):
+        wasm.build(tmp_path / name, ROOT, [path])
+    assert (tmp_path / "one.wasm").read_bytes() == (tmp_path / "two.wasm").read_bytes()
+
+
+def test_hash_covers_what_is_cimported():
+    # rows.pxd cimports nothing that the judge does not reach; newton.pyx is no part of the module.
+    with_rows = wasm.source_hash(ROOT, ["judge"])
+    assert with_rows != wasm.source_hash(ROOT, ["sweeps"]) != wasm.source_hash(ROOT)
+    assert wasm.CIMPORT.findall(
+        "from lavender_ext.rows cimport (a,\n  b)\nfrom libc.math cimport sqrt\n"
+    ) == ["rows"]
+
+
+# -- Node ------------------------------------------------------------------------------------------------------
+
+
+def node(*arguments):
+    if shutil.which("node") is None:
+        pytest.skip("Node is not installed")
+    return subprocess.run(["node", *map(str, arguments)], capture_output=True, text=True, check=False)
+
+
+@pytest.fixture(scope="session")
+def module_file(module, tmp_path_factory):
+    path = tmp_path_factory.mktemp("wasm") / "lavender.wasm"
+    path.write_bytes(module)
+    return path
+
+
+def test_node_finds_every_bit_the_same(module_file, recording):
+    done = node(CHECK, module_file, recording)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "all the same: 12 scenes, 7200 steps, 378 problems" in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("what", "sign"),
+    [("values", "eight values"), ("states", "x,q,v"), ("hashes", "other array"), ("problem", "impulse")],
+)
+def test_node_sees_one_wrong_bit(module_file, recording, tmp_path, what, sign):
+    contents = json.loads((recording / "recording.json").read_text())
+    numbers = bytearray((recording / "recording.bin").read_bytes())
+    if what == "problem":
+        contents["scenes"] = contents["scenes"][:1]
+        at = contents["problems"][-1]["expected"]["impulse"][0]
+    else:
+        contents["problems"] = []
+        at = contents["scenes"][0][what][0] + 1000
+    numbers[at] ^= 1  # the last bit of a number's mantissa: bytes are little-endian
+    (tmp_path / "recording.json").write_text(json.dumps(contents))
+    (tmp_path / "recording.bin").write_bytes(numbers)
+    done = node(CHECK, module_file, tmp_path)
+    assert done.returncode == 1
+    assert sign in done.stderr
+
+
+# -- wasmtime --------------------------------------------------------------------------------------------------
+
+
+class Recording:
+    def __init__(self, folder):
+        self.contents = json.loads((folder / "recording.json").read_text())
+        self.numbers = (folder / "recording.bin").read_bytes()
+
+    def array(self, place):
+        at, n, kind = place
+        return np.frombuffer(self.numbers, np.dtype(f"<{kind}" if kind != "u1" else "u1"), n, at)
+
+
+@pytest.fixture(scope="session")
+def recorded(recording):
+    return Recording(recording)
+
+
+def same_bits(found, expected):
+    return np.asarray(found, expected.dtype).tobytes() == expected.tobytes()
+
+
+def test_wasmtime_structs_are_those_of_c_and_of_the_native_build(module, host):
+    # C's rules: every field at a multiple of its width, the whole at a multiple of the widest.
+    described = layout()
+    kernels = host.Kernels(module, described)
+    for pointer, (sizes, offsets) in {
+        4: (kernels.sizes, kernels.offsets),
+        np.dtype(np.intp).itemsize: (
+            {name: entry["size"] for name, entry in described["native"].items()},
+            {
+                (name, f): at
+                for name, entry in described["native"].items()
+                for f, at in entry["offsets"].items()
+            },
+        ),
+    }.items():
+        for name, fields in described["structs"].items():
+            at, widest = 0, 1
+            for field, kind in fields.items():
+                width = pointer if kind == "p" else int(kind[-1])
+                at = -(-at // width) * width
+                assert offsets[name, field] == at, (name, field)
+                at += width * int(kind[:-2] or 1)
+                widest = max(widest, width)
+            assert sizes[name] == -(-at // widest) * widest, name
+
+
+def test_wasmtime_scenes_are_the_same_to_the_bit(module, host, recorded):
+    steps = 0
+    for scene in recorded.contents["scenes"]:
+        simulation = host.Simulation(host.Kernels(module, recorded.contents["layout"]), scene)
+        assert simulation.read_settings() == bytes(scene["settings"])
+        values = recorded.array(scene["values"]).reshape(-1, 8)
+        states = recorded.array(scene["states"]).reshape(len(values), -1)
+        hashes = recorded.array(scene["hashes"]).reshape(-1, 32)
+        assert len(values) >= 600
+        for step in range(len(values)):
+            if str(step) in scene["changes"]:
+                simulation.set(**scene["changes"][str(step)])
+            assert simulation.step() == 0
+            where = f"{scene['name']}, step {step + 1}"
+            assert same_bits(simulation.values(), values[step]), where
+            state = np.concatenate([simulation.array(name) for name in recorded.contents["body_arrays"]])
+            assert same_bits(state, states[step]), where
+            assert hashlib.sha256(b"".join(simulation.everything())).digest() == hashes[step].tobytes(), where
+            steps += 1
+        assert same_bits(simulation.array("x"), states[-1][: 3 * scene["size"][0]])
+    assert steps == 7200
+
+
+def test_wasmtime_problems_are_the_same_to_the_bit(module, host, recorded):
+    for problem in recorded.contents["problems"]:
+        k = host.Kernels(module, recorded.contents["layout"])
+        n = problem["counts"]
+        put = {name: k.put(recorded.array(at)) for name, at in (problem["ints"] | problem["reals"]).items()}
+        out = {name: k.alloc(8 * (n["rows"] + 1)) for name in ("d", "nu", "step", "slack", "error")}
+        out["impulse"] = put["start"]
+        blocks = k.put_struct(
+            "blocks_t", n_blocks=n["blocks"], n_rows=n["rows"], law=problem["law"],
+            **{key: put[key] for key in ("ptr", "kind", "lower", "upper", "mu", "patch_radius", "b")},
+            **{key: out[key] for key in ("d", "nu", "step")},
+        )  # fmt: skip
+        empty, rng = k.alloc(4 * (n["rows"] + 1)), k.put(np.array([int(problem["seed"])], np.uint64))
+        score = k.alloc(k.sizes["score_t"])
+        order = (put["order"], problem["split"], problem["mode"], rng, 1, problem["sweeps"])
+        if problem["factored"]:
+            more = {
+                "minv_jac": 96 * (n["rows"] + 1),
+                "coupling": 40 * (n["contacts"] + 1),
+                "swing": 48 * (n["rows"] + 1),
+            }
+            put |= {name: k.alloc(size) for name, size in more.items()}
+            fields = recorded.contents["layout"]["structs"]["rows_t"]
+            rows = k.put_struct(
+                "rows_t", n_bodies=n["bodies"], n_joints=n["joints"], n_contacts=n["contacts"],
+                **{key: put[key] for key in fields if not key.startswith("n_")},
+            )  # fmt: skip
+            velocity, scratch = k.alloc(48 * (n["bodies"] + 1)), k.alloc(48 * (n["bodies"] + 1))
+            k.call(
+                "lav_rows_diagonal",
+                blocks,
+                rows,
+                out["d"],
+                out["nu"],
+                out["step"],
+                empty,
+                *(put[m] for m in more),
+            )
+            judge = ("lav_judge_rows", blocks, rows, out["impulse"], out["slack"], out["error"])
+            k.call(*judge, velocity, 0, score)
+            k.call("lav_impulse_sweeps", blocks, rows, out["impulse"], velocity, *order)
+            k.call(*judge, scratch, 1, score)
+        else:
+            csr = k.put_struct("csr_t", **{key: put[key] for key in ("indptr", "indices", "data")})
+            k.call("lav_csr_diagonal", blocks, csr, out["d"], out["step"], empty)
+            k.call("lav_matrix_nu", blocks, out["nu"])
+            k.call("lav_pgs_sweeps", blocks, csr, out["impulse"], *order)
+            k.call("lav_judge_csr", blocks, csr, out["impulse"], out["slack"], out["error"], 1, score)
+        for name, place in problem["expected"].items():
+            assert same_bits(k.view(out[name], n["rows"], np.float64), recorded.array(place)), (
+                problem["name"],
+                name,
+            )
+        said = k.read_struct("score_t", score)
+        assert [said[key] for key in ("energy", "velocity", "worst")] == [
+            problem[key] for key in ("energy", "velocity", "worst")
+        ]
+
+
+def test_wasmtime_errors_along_the_sweeps_are_the_native_ones(module, host):
+    for name in ("stack", "chain"):
+        simulation = lv.Simulation(name)
+        twin = host.Simulation(
+            host.Kernels(module, layout()), {"substeps": 1, **describe(simulation.snapshot())}
+        )
+        for _ in range(20):
+            state = simulation._state.copy()
+            assert state.kernel.prepare() == 0
+            curve = np.zeros((simulation.solver_iterations + 1, 2))
+            state.kernel.solve_watched(curve)
+            observation = simulation.step()[0]
+            assert same_bits(twin.step_watched(simulation.solver_iterations), curve)
+            assert same_bits(twin.values(), observation["solver"])
+            assert curve[0, 0] == observation["solver"][4] and curve[-1, 0] == observation["solver"][5]
+
+
+def test_wasmtime_snapshot_leads_back(module, host):
+    (scene,) = (s for s in page_scenes()["scenes"] if s["name"] == "pyramid")
+    simulation = host.Simulation(host.Kernels(module, layout()), scene)
+    for _ in range(10):
+        simulation.step()
+    kept = simulation.everything()
+    ends = []
+    for _ in range(2):
+        for _ in range(10):
+            simulation.step()
+        ends.append(simulation.everything())
+        simulation.restore(kept)
+        simulation.set(warm_start=0)
+        simulation.step()
+        assert simulation.values()[3] == 0.0
+        simulation.restore(kept)
+    assert ends[0] == ends[1] != kept
+
+
+# -- scenes and command ----------------------------------------------------------------------------------------
+
+
+def test_page_scenes_are_the_start_of_native_ones():
+    contents = json.loads(json.dumps(page_scenes()))
+    assert [scene["name"] for scene in contents["scenes"]] == ["stack", "pyramid", "chain", "spinner"]
+    for scene in contents["scenes"]:
+        start = lv.Simulation(scene["name"]).snapshot()
+        assert scene == scene | describe(start)
+        assert len(scene["bodies"]) == scene["size"][0]
+
+
+def command(*arguments):
+    return subprocess.run(
+        [sys.executable, "-m", "lavender.cli", "web", *map(str, arguments)],
+        capture_output=True, text=True, check=False, cwd=ROOT, env={**os.environ, "COLUMNS": "100"},
+    )  # fmt: skip
+
+
+def test_command_writes_a_page_without_outside_addresses(module, tmp_path):
+    done = command("page", tmp_path / "site")
+    assert done.returncode == 0, done.stderr
+    files = {
+        path.relative_to(tmp_path / "site").as_posix()
+        for path in (tmp_path / "site").rglob("*")
+        if path.is_file()
+    }
+    assert {"index.html", "lavender.js", "lavender.wasm", "scenes.json", "vendor/uPlot-LICENSE.txt"} <= files
+    assert (tmp_path / "site" / "lavender.wasm").read_bytes() == module
+    for name in sorted(files):
+        if name.endswith((".html", ".js", ".css")) and not name.startswith("vendor/"):
+            text = (tmp_path / "site" / name).read_text(encoding="utf-8")
+            assert "http:" not in text.replace("http://www.w3.org/", "") and "https:" not in text, name
+
+
+@needs_compiler
+def test_command_says_why_it_cannot_build(tmp_path):
+    done = command("build", tmp_path / "none" / "a.wasm")
+    assert done.returncode == 2
+    assert "does not exist" in done.stderr

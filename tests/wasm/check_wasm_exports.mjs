@@ -1,0 +1,223 @@
+// The WebAssembly build under Node: what it exports, how its contact cache behaves, and that scenes and
+// problems recorded natively come out the same to the last bit.
+//
+//     node tests/wasm/check_wasm_exports.mjs MODULE.wasm [FOLDER]
+//
+// FOLDER holds recording.json and recording.bin of tests/wasm/record.py; without one they are recorded first,
+// by the interpreter that PYTHON names (python3 by default), into a temporary folder.
+
+import assert from "node:assert/strict";
+import { execFileSync } from "node:child_process";
+import { createHash } from "node:crypto";
+import { mkdtempSync, readFileSync, rmSync } from "node:fs";
+import { tmpdir } from "node:os";
+import { dirname, join } from "node:path";
+import { fileURLToPath } from "node:url";
+
+import { Kernels, ORDERS, Simulation, SOLVER_FIELDS } from "../../lavender/web/page/lavender.js";
+
+const here = dirname(fileURLToPath(import.meta.url));
+const LARGEST = 200_000; // bytes
+
+const [modulePath, given] = process.argv.slice(2);
+if (!modulePath) {
+  console.error("usage: node check_wasm_exports.mjs MODULE.wasm [FOLDER]");
+  process.exit(2);
+}
+const folder = given ?? mkdtempSync(join(tmpdir(), "lavender-"));
+let recording, numbers;
+try {
+  if (!given) {
+    execFileSync(process.env.PYTHON ?? "python3", [join(here, "record.py"), folder], { stdio: ["ignore", "ignore", "inherit"] });
+  }
+  recording = JSON.parse(readFileSync(join(folder, "recording.json"), "utf8"));
+  numbers = readFileSync(join(folder, "recording.bin"));
+} finally {
+  if (!given) {
+    rmSync(folder, { recursive: true });
+  }
+}
+const bytes = readFileSync(modulePath);
+const module = new WebAssembly.Module(bytes);
+
+// Bytes of a recorded array [offset, count, type].
+function recorded([offset, count, type]) {
+  return numbers.subarray(offset, offset + count * Number(type.slice(-1)));
+}
+
+function doubles(place) {
+  const raw = recorded(place);
+  return new Float64Array(raw.buffer.slice(raw.byteOffset, raw.byteOffset + raw.byteLength));
+}
+
+function asBytes(array) {
+  return Buffer.from(array.buffer, array.byteOffset, array.byteLength);
+}
+
+function sameBits(found, expected, what) {
+  if (Buffer.compare(asBytes(found), asBytes(expected)) !== 0) {
+    const at = found.findIndex((x, i) => !Object.is(x, expected[i]));
+    assert.fail(`${what}: entry ${at} is ${found[at]}, natively ${expected[at]}`);
+  }
+}
+
+function checkModule() {
+  assert.deepEqual(WebAssembly.Module.imports(module), [], "the module imports something");
+  assert.ok(bytes.length < LARGEST, `${bytes.length} bytes; below ${LARGEST} are allowed`);
+  const exports = WebAssembly.Module.exports(module);
+  const functions = exports.filter((e) => e.kind === "function").map((e) => e.name);
+  for (const name of [
+    "lav_pgs_sweeps", "lav_impulse_sweeps", "lav_judge_csr", "lav_judge_rows", "lav_engine_substeps", "lav_engine_prepare",
+    "lav_engine_solve_watched", "lav_engine_finish", "lav_engine_copy", "lav_engine_values", "lav_engine_read_settings",
+    "lav_engine_write_settings", "lav_layout", "lav_engine_offsets",
+  ]) {
+    assert.ok(functions.includes(name), `no function ${name}`);
+  }
+  // Kernels compares every struct with C's rules and with the native build; a wrong one must be noticed.
+  const kernels = new Kernels(module, recording.layout);
+  assert.equal(kernels.functions.__data_end.value, kernels.functions.__global_base.value, "static data is left");
+  const broken = structuredClone(recording.layout);
+  broken.structs.settings_t.warm_start = "f8";
+  assert.throws(() => new Kernels(module, broken), /settings_t/);
+  const odd = structuredClone(recording.layout);
+  odd.native.score_t.offsets.worst = 33;
+  assert.throws(() => new Kernels(module, odd), /score_t.worst/);
+  return `${bytes.length} bytes, ${functions.length} functions, no imports, structs as expected`;
+}
+
+function checkPersistentContact() {
+  const scene = recording.scenes.find((s) => s.name === "stack()");
+  const simulation = new Simulation(new Kernels(module, recording.layout), scene);
+  const at = (field) => simulation.values[SOLVER_FIELDS.indexOf(field)];
+  simulation.step();
+  const contacts = at("contacts");
+  assert.ok(contacts > 0, "no contact was made");
+  assert.equal(at("cache_matches"), 0, "a first contact cannot be in the cache");
+  simulation.step();
+  assert.equal(at("contacts"), contacts);
+  assert.equal(at("cache_matches"), contacts, "a contact that stays is found in the cache");
+  simulation.set({ warm_start: 0 });
+  simulation.step();
+  assert.equal(at("warm_start"), 0);
+  assert.equal(at("cache_matches"), 0, "without warm start nothing is taken from the cache");
+  assert.ok(at("contacts") > 0);
+  simulation.set({ warm_start: 1 });
+  simulation.step();
+  assert.equal(at("cache_matches"), at("contacts"), "the cache is kept while warm start is off");
+  return `${contacts} contacts made, kept, found; none found without warm start`;
+}
+
+function hashOf(simulation) {
+  const { k, lengths } = simulation;
+  const hash = createHash("sha256");
+  hash.update(k.bytes(simulation.real, 8 * lengths[0]));
+  hash.update(k.bytes(simulation.index, 4 * lengths[1]));
+  hash.update(k.bytes(simulation.keys, 8 * Math.max(lengths[2], 1)));
+  return hash.digest();
+}
+
+function replay(scene) {
+  const simulation = new Simulation(new Kernels(module, recording.layout), scene);
+  const { k } = simulation;
+  k.functions.lav_engine_read_settings(...simulation.buffers, simulation.settingsPlace);
+  sameBits(k.bytes(simulation.settingsPlace, scene.settings.length), Uint8Array.from(scene.settings), `${scene.name}, settings`);
+  const states = doubles(scene.states);
+  const values = doubles(scene.values);
+  const hashes = recorded(scene.hashes);
+  const width = states.length / scene.steps;
+  let snapshot = null;
+  for (let step = 0; step < scene.steps; step++) {
+    if (scene.changes[step]) {
+      simulation.set(scene.changes[step]);
+    }
+    // A detour of three steps from which a snapshot leads back.
+    if (step % 150 === 149) {
+      snapshot = simulation.snapshot();
+      simulation.set({ iterations: 9, warm_start: 0 });
+      for (let i = 0; i < 3; i++) {
+        simulation.step();
+      }
+      simulation.restore(snapshot);
+    }
+    const where = `${scene.name}, step ${step + 1}`;
+    assert.ok(step % 2 ? simulation.step() : simulation.stepWatched().finite, `${where}: not finite`);
+    sameBits(Float64Array.from(simulation.values), values.subarray(8 * step, 8 * step + 8), `${where}, eight values`);
+    const state = Float64Array.from(recording.body_arrays.flatMap((name) => Array.from(simulation.array(name))));
+    sameBits(state, states.subarray(width * step, width * (step + 1)), `${where}, ${recording.body_arrays}`);
+    if (Buffer.compare(hashOf(simulation), hashes.subarray(32 * step, 32 * step + 32)) !== 0) {
+      assert.fail(`${where}: some other array differs from the native one`);
+    }
+  }
+  sameBits(k.f64(simulation.real, simulation.lengths[0]), doubles(scene.last), `${scene.name}, last state`);
+  return Math.max(...Array.from({ length: scene.steps }, (_, i) => values[8 * i + 2]));
+}
+
+function checkProblem(problem) {
+  const k = new Kernels(module, recording.layout);
+  const f = k.functions;
+  const { blocks, rows, bodies, joints, contacts } = problem.counts;
+  const put = {};
+  for (const [name, place] of [...Object.entries(problem.ints), ...Object.entries(problem.reals)]) {
+    put[name] = k.alloc(Math.max(8, recorded(place).length));
+    k.bytes(put[name], recorded(place).length).set(recorded(place));
+  }
+  const out = {};
+  for (const name of ["d", "nu", "step", "slack", "error"]) {
+    out[name] = k.alloc(8 * (rows + 1));
+  }
+  const p = k.putStruct("blocks_t", {
+    n_blocks: blocks, n_rows: rows, law: problem.law, ptr: put.ptr, kind: put.kind, lower: put.lower, upper: put.upper,
+    mu: put.mu, patch_radius: put.patch_radius, b: put.b, d: out.d, nu: out.nu, step: out.step,
+  });
+  const empty = k.alloc(4 * (rows + 1));
+  const impulse = put.start;
+  const rng = k.putKeys([BigInt(problem.seed)]);
+  const score = k.alloc(k.structs.score_t.size);
+  if (problem.factored) {
+    const more = { minv_jac: 96 * (rows + 1), coupling: 40 * (contacts + 1), swing: 48 * (rows + 1) };
+    for (const [name, size] of Object.entries(more)) {
+      put[name] = k.alloc(size);
+    }
+    const r = k.putStruct("rows_t", {
+      n_bodies: bodies, n_joints: joints, n_contacts: contacts, jac: put.jac, minv_jac: put.minv_jac,
+      joint_body: put.joint_body, normal: put.normal, tangent: put.tangent, arm_a: put.arm_a, arm_b: put.arm_b,
+      contact_body: put.contact_body, coupling: put.coupling, swing: put.swing, inv_mass: put.inv_mass,
+      inv_inertia: put.inv_inertia, compliance: put.compliance,
+    });
+    const velocity = k.alloc(48 * (bodies + 1));
+    const scratch = k.alloc(48 * (bodies + 1));
+    f.lav_rows_diagonal(p, r, out.d, out.nu, out.step, empty, put.minv_jac, put.coupling, put.swing);
+    f.lav_judge_rows(p, r, impulse, out.slack, out.error, velocity, 0, score); // velocity of the start
+    f.lav_impulse_sweeps(p, r, impulse, velocity, put.order, problem.split, problem.mode, rng, 1, problem.sweeps);
+    f.lav_judge_rows(p, r, impulse, out.slack, out.error, scratch, 1, score);
+  } else {
+    const a = k.putStruct("csr_t", { indptr: put.indptr, indices: put.indices, data: put.data });
+    f.lav_csr_diagonal(p, a, out.d, out.step, empty);
+    f.lav_matrix_nu(p, out.nu);
+    if (problem.single_rows && problem.mode === 0 && problem.sweeps === 40) {
+      f.lav_pgs_rows_in_order(p, a, impulse, problem.sweeps);
+    } else {
+      f.lav_pgs_sweeps(p, a, impulse, put.order, problem.split, problem.mode, rng, 1, problem.sweeps);
+    }
+    f.lav_judge_csr(p, a, impulse, out.slack, out.error, 1, score);
+  }
+  out.impulse = impulse;
+  for (const [name, place] of Object.entries(problem.expected)) {
+    sameBits(k.f64(out[name], rows).slice(), doubles(place), `${problem.name}: ${name}`);
+  }
+  const said = k.readStruct("score_t", score);
+  assert.deepEqual([said.energy, said.velocity, said.worst], [problem.energy, problem.velocity, problem.worst], problem.name);
+}
+
+console.log(`module: ${checkModule()}`);
+console.log(`cache: ${checkPersistentContact()}`);
+assert.deepEqual(Object.keys(recording.layout.orders), ORDERS);
+let steps = 0;
+for (const scene of recording.scenes) {
+  const most = replay(scene);
+  steps += scene.steps;
+  console.log(`${scene.name}: ${scene.steps} steps, up to ${most} contacts, every array and value the same`);
+}
+recording.problems.forEach(checkProblem);
+console.log(`${recording.problems.length} problems: impulse, slack, error, d, nu, step and sums the same`);
+console.log(`all the same: ${recording.scenes.length} scenes, ${steps} steps, ${recording.problems.length} problems`);

@@ -1,0 +1,184 @@
+"""Record natively what WebAssembly is to repeat: scenes step by step, and problems sweep by sweep.
+
+    python tests/wasm/record.py FOLDER
+
+writes FOLDER/recording.json (what there is) and FOLDER/recording.bin (the numbers, little-endian).
+"""
+
+import hashlib
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+
+from random_problems import as_matrix, random_contact_problem, random_lcp
+
+import lavender as lv
+from lavender.ordering import block_order
+from lavender.web.scenes import describe, layout
+from lavender_ext import host
+
+STEPS = 600
+BODY_ARRAYS = ("x", "q", "v")
+
+#: Gallery scene, parameters, and what is changed before which step.
+SCENES = [
+    ("stack", {}, {200: {"warm_start": 0}, 400: {"warm_start": 1}}),
+    ("pyramid", {"base": 8}, {300: {"iterations": 4}}),
+    ("chain", {"tip_mass": 5.0}, {}),
+    ("spinner", {}, {}),
+    ("pile", {"n": 60, "kind": "mixed", "substeps": 2}, {}),
+    ("stack", {"n": 5, "order": "random", "seed": 3, "solver_iterations": 64}, {}),
+    ("pyramid", {"base": 4, "order": "symmetric"}, {}),
+    ("pyramid", {"base": 4, "order": "top_down", "solver_iterations": 4}, {}),
+    ("card_house", {"order": "bottom_up"}, {}),
+    ("bridge", {"order": "colored"}, {}),
+    ("four_bar", {"order": "reverse", "motor": 2.0}, {}),
+    ("newtons_cradle", {}, {}),
+]
+
+
+class Writer:
+    """Arrays one after the other, and where each one is."""
+
+    def __init__(self):
+        self.parts, self.at = [], 0
+
+    def put(self, values, dtype):
+        data = np.ascontiguousarray(values).astype(dtype).tobytes()
+        data += bytes(-len(data) % 8)
+        place = [self.at, int(np.size(values)), np.dtype(dtype).str[1:]]
+        self.parts.append(data)
+        self.at += len(data)
+        return place
+
+
+def record_scene(writer, name, parameters, changes, steps=STEPS):
+    """One scene over `steps` steps: poses, velocities, eight values and the hash of everything, after each."""
+    scene = lv.Scene(name, **parameters)
+    simulation = lv.Simulation(scene)
+    start = simulation.snapshot()
+    states, values, hashes = [], [], []
+    for step in range(steps):
+        change = changes.get(step, {})
+        if "iterations" in change:
+            simulation.set_solver_iterations(change["iterations"])
+        if "warm_start" in change:
+            simulation.set_warm_start(bool(change["warm_start"]))
+        observation = simulation.step()[0]
+        shot = simulation.snapshot()
+        states.append(
+            np.concatenate([observation[key].ravel() for key in ("positions", "quaternions", "velocities")])
+        )
+        values.append(observation["solver"])
+        hashes.append(
+            hashlib.sha256(shot.real.tobytes() + shot.index.tobytes() + shot.keys.tobytes()).digest()
+        )
+    given = ", ".join(f"{key}={value}" for key, value in parameters.items())
+    return {
+        "name": f"{name}({given})",
+        "substeps": scene.parameters.substeps,
+        "steps": steps,
+        "changes": {str(step): change for step, change in changes.items()},
+        **describe(start),
+        "settings": list(
+            host.read_settings(start.size, start.real.copy(), start.index.copy(), start.keys.copy())
+        ),
+        "states": writer.put(states, "<f8"),
+        "values": writer.put(values, "<f8"),
+        "hashes": writer.put(np.frombuffer(b"".join(hashes), np.uint8), "|u1"),
+        "last": writer.put(shot.real, "<f8"),
+    }
+
+
+def record_problem(writer, problem, sweeps, order, seed):
+    """Data, derived numbers, impulses after `sweeps` sweeps, and what the judge says of them."""
+    solver = "pgs" if problem.rows is None else "sequential_impulses"
+    order_options = {"seed": seed} if order == "random" else {}
+    start = problem.start() if problem.guess is None else problem.guess
+    found = lv.solve(problem, solver, tol=0, max_iter=sweeps, impulse=start, order=order, **order_options)
+    o, c = block_order(problem, order, **order_options), problem.cones
+    ints = {"ptr": c.ptr, "kind": c.kind, "order": o.blocks}
+    reals = {"lower": c.lower, "upper": c.upper, "mu": c.mu, "patch_radius": c.patch_radius}
+    reals |= {"b": problem.b, "start": start}
+    if problem.rows is None:
+        a = problem.csr
+        ints |= {"indptr": a.indptr, "indices": a.indices}
+        reals |= {"data": a.data}
+    else:
+        r = problem.rows
+        ints |= {"joint_body": r.joint_body, "contact_body": r.contact_body}
+        for key in ("jac", "normal", "tangent", "arm_a", "arm_b", "inv_mass", "inv_inertia"):
+            reals[key] = getattr(r, key)
+        reals["compliance"] = problem.compliance
+    expected = {"d": problem.d, "nu": problem.data.nu, "step": problem.data.step, "impulse": found.impulse}
+    expected |= {"slack": found.slack, "error": found.residual.error}
+    judged = found.residual
+    return {
+        "name": f"{problem.name}, {solver}, {order}, {sweeps} sweeps",
+        "counts": {
+            "blocks": problem.n_blocks,
+            "rows": problem.m,
+            "bodies": 0 if problem.rows is None else problem.rows.n_bodies,
+            "joints": 0 if problem.rows is None else problem.rows.n_joints,
+            "contacts": 0 if problem.rows is None else problem.rows.n_contacts,
+        },
+        "law": 1 if problem.friction == "cone" else 0,
+        "factored": problem.rows is not None,
+        "split": o.split,
+        "mode": o.mode,
+        "seed": str(int(o.rng[0])),
+        "sweeps": sweeps,
+        "single_rows": problem.n_blocks == problem.m and not np.any(c.kind),
+        "ints": {key: writer.put(value, "<i4") for key, value in ints.items()},
+        "reals": {key: writer.put(value, "<f8") for key, value in reals.items()},
+        "expected": {key: writer.put(value, "<f8") for key, value in expected.items()},
+        "energy": judged.energy,
+        "velocity": judged.velocity,
+        "worst": judged.worst_row,
+    }
+
+
+def problems():
+    """Linear, boxed, with contacts in two and three dimensions, with spin, factored, recorded from scenes."""
+    for seed in range(40):
+        yield random_lcp(seed, m=8 + seed, rank=6 if seed % 5 == 4 else None)
+        tangents = (0, 1, 2, None)[seed % 4]
+        factored = random_contact_problem(seed, tangents=tangents, spin=seed % 3 == 0, bodies=4 + seed % 9)
+        yield factored
+        yield as_matrix(factored)
+    rng = np.random.default_rng(40)
+    for n in (1, 7, 30):
+        g = rng.normal(size=(n, n + 2))
+        yield lv.Problem.linear(g @ g.T, rng.normal(size=n), name=f"linear {n}")
+    for name in ("stack", "pyramid", "bridge"):
+        simulation = lv.Simulation(name)
+        for _ in range(5):
+            simulation.step()
+        yield simulation.constraint_problem()
+
+
+def record(folder, steps=STEPS):
+    """Both files; returns the path of the JSON."""
+    writer = Writer()
+    scenes = [record_scene(writer, *scene, steps=steps) for scene in SCENES]
+    found = []
+    for i, problem in enumerate(problems()):
+        for sweeps, order in (
+            (1, "given"),
+            (7, ("symmetric", "random", "reverse", "colored")[i % 4]),
+            (40, "given"),
+        ):
+            found.append(record_problem(writer, problem, sweeps, order, seed=i))
+    contents = {"layout": layout(), "body_arrays": BODY_ARRAYS, "scenes": scenes, "problems": found}
+    path = Path(folder) / "recording.json"
+    path.write_text(json.dumps(contents, allow_nan=False), encoding="utf-8")
+    path.with_suffix(".bin").write_bytes(b"".join(writer.parts))
+    return path
+
+
+if __name__ == "__main__":
+    print(record(sys.argv[1]))

@@ -1,0 +1,161 @@
+"""A host of the WebAssembly module in Python, by wasmtime: the twin of lavender/web/page/lavender.js."""
+
+import ctypes
+
+import numpy as np
+import wasmtime
+
+SIZES = 10  # entries of size[]
+NEED_ROOM = 1
+
+
+class Kernels:
+    """An instance of the module, its memory, and places in it."""
+
+    def __init__(self, data, layout):
+        self.store = wasmtime.Store()
+        module = wasmtime.Module(self.store.engine, data)
+        self.exports = wasmtime.Instance(self.store, module, []).exports(self.store)
+        self.memory = self.exports["memory"]
+        self.layout = layout
+        self.top = self.exports["__heap_base"].value(self.store)
+        self.offsets = {}
+        self.sizes = {}
+        names = [(name, field) for name, fields in layout["structs"].items() for field in (None, *fields)]
+        place = self.alloc(4 * len(names))
+        self.call("lav_layout", place)
+        for (name, field), at in zip(names, self.view(place, len(names), np.int32).tolist(), strict=True):
+            if field is None:
+                self.sizes[name] = at
+            else:
+                self.offsets[name, field] = at
+
+    def call(self, name, *arguments):
+        return self.exports[name](self.store, *arguments)
+
+    def alloc(self, size):
+        """Zeroed bytes (memory starts as zeros and is never given back)."""
+        place = -(-self.top // 16) * 16
+        self.top = place + size
+        missing = self.top - self.memory.data_len(self.store)
+        if missing > 0:
+            self.memory.grow(self.store, -(-missing // 65536))
+        return place
+
+    def view(self, place, n, dtype):
+        """A live view of memory; growing detaches it."""
+        start = ctypes.addressof(self.memory.data_ptr(self.store).contents) + place
+        size = n * np.dtype(dtype).itemsize
+        return np.frombuffer((ctypes.c_ubyte * size).from_address(start), dtype)
+
+    def put(self, values):
+        values = np.ascontiguousarray(values)
+        place = self.alloc(max(values.nbytes, 8))
+        self.view(place, values.size, values.dtype)[:] = values.ravel()
+        return place
+
+    def put_struct(self, name, **values):
+        """A struct of pointers and 32-bit integers."""
+        place = self.alloc(self.sizes[name])
+        for field, value in values.items():
+            self.view(place + self.offsets[name, field], 1, np.int32)[0] = value
+        return place
+
+    def read_struct(self, name, place):
+        """A struct without arrays."""
+        kinds = {"i4": np.int32, "f8": np.float64}
+        return {
+            field: self.view(place + self.offsets[name, field], 1, kinds[kind])[0].item()
+            for field, kind in self.layout["structs"][name].items()
+        }
+
+
+class Simulation:
+    """A scene as lavender.web.scenes.describe gives it."""
+
+    def __init__(self, kernels, scene):
+        self.k = kernels
+        self.substeps = scene["substeps"]
+        self.allocate(np.array(scene["size"], np.int32))
+        for name, values in scene["arrays"].items():
+            self.array(name)[:] = values
+        self.done = kernels.alloc(8)
+        self.out = kernels.alloc(64)
+        self.settings_place = kernels.alloc(kernels.sizes["settings_t"])
+        self.curve = kernels.alloc(16 * 65)
+
+    def allocate(self, size):
+        k = self.k
+        self.size = k.put(size)
+        used = k.alloc(12)
+        k.call("lav_engine_lengths", self.size, used)
+        self.lengths = k.view(used, 3, np.int32).tolist()
+        self.real, self.index, self.keys = (
+            k.alloc(width * max(n, 1)) for width, n in zip((8, 4, 8), self.lengths, strict=True)
+        )
+        self.buffers = (self.size, self.real, self.index, self.keys)
+        number = k.layout["size"]
+        rows = size[number["joint_rows"]] + size[number["rows_per_contact"]] * size[number["cap_contact"]]
+        self.scratch = k.alloc(16 * (int(rows) + 1))
+        lists = list(k.layout["arrays"].values())
+        place = k.alloc(4 * sum(map(len, lists)))
+        k.call("lav_engine_offsets", *self.buffers, place)
+        first = iter(k.view(place, sum(map(len, lists)), np.int32).tolist())
+        self.places = {}
+        for base, dtype, names, n in zip(
+            self.buffers[1:], (np.float64, np.int32, np.uint64), lists, self.lengths, strict=True
+        ):
+            starts = [next(first) for _ in names]
+            for name, start, end in zip(names, starts, [*starts[1:], n], strict=True):
+                self.places[name] = (base + start * np.dtype(dtype).itemsize, end - start, dtype)
+
+    def array(self, name):
+        return self.k.view(*self.places[name])
+
+    def read_settings(self):
+        self.k.call("lav_engine_read_settings", *self.buffers, self.settings_place)
+        return self.k.view(self.settings_place, self.k.sizes["settings_t"], np.uint8).tobytes()
+
+    def set(self, **changes):
+        """Settings that are whole numbers."""
+        self.read_settings()
+        for name, value in changes.items():
+            self.k.view(self.settings_place + self.k.offsets["settings_t", name], 1, np.int32)[0] = value
+        self.k.call("lav_engine_write_settings", *self.buffers, self.settings_place)
+
+    def values(self):
+        self.k.call("lav_engine_values", *self.buffers, self.out)
+        return self.k.view(self.out, 8, np.float64).copy()
+
+    def grow(self):
+        old = self.buffers
+        room = self.k.alloc(4 * SIZES)
+        self.k.call("lav_engine_more_room", *old, room)
+        self.allocate(self.k.view(room, SIZES, np.int32).copy())
+        self.k.call("lav_engine_move", *old, *self.buffers)
+
+    def step(self):
+        left, status = self.substeps, NEED_ROOM
+        while status == NEED_ROOM:
+            status = self.k.call("lav_engine_substeps", *self.buffers, left, self.done)
+            left -= int(self.k.view(self.done, 1, np.int32)[0])
+            if status == NEED_ROOM:
+                self.grow()
+        return status
+
+    def step_watched(self, sweeps):
+        """One substep; the error along the sweeps (sweeps + 1, 2)."""
+        while self.k.call("lav_engine_prepare", *self.buffers) == NEED_ROOM:
+            self.grow()
+        self.k.call("lav_engine_solve_watched", *self.buffers, self.curve, self.scratch)
+        self.k.call("lav_engine_finish", *self.buffers)
+        return self.k.view(self.curve, 2 * (sweeps + 1), np.float64).reshape(-1, 2).copy()
+
+    def everything(self):
+        """The three buffers as bytes."""
+        sizes = (8 * self.lengths[0], 4 * self.lengths[1], 8 * max(self.lengths[2], 1))
+        return [self.k.view(at, n, np.uint8).tobytes() for at, n in zip(self.buffers[1:], sizes, strict=True)]
+
+    def restore(self, everything):
+        for at, data in zip(self.buffers[1:], everything, strict=True):
+            self.k.view(at, len(data), np.uint8)[:] = np.frombuffer(data, np.uint8)
