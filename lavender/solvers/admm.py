@@ -16,7 +16,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import qdldl
 import scipy.sparse as sp
 from scipy.sparse.linalg import splu
 
@@ -116,6 +115,8 @@ class AdmmState:
         else:
             n, extra = m, ()
             normal = sp.csc_array(self.matrix + self.rho * sp.eye_array(m))
+        import qdldl  # 60 ms, at first use
+
         lower, diag, order = qdldl.Solver(sp.csc_matrix(normal)).factors()
         if not (np.isfinite(diag).all() and np.all(diag != 0.0)):
             raise _Failed(f"L D L^T broke down at rho = {self.rho:.1e}")
