@@ -77,19 +77,20 @@ cdef inline void score_rows(const blocks_t* p, const double* lam, const double* 
     cdef int32_t i, j, k, nt, worst = -1
     cdef double v, t, energy = 0.0, big = -1.0
     cdef sum_t total = sum_t(0.0, 0.0)
-    # Plain sums of squares, one division a row; kept where they can neither have over- nor underflown.
+    # Plain sums of squares, one division a row; kept where they can neither have over- nor underflown:
+    # (d e) e and (d e)(nu e), for e^2 alone may vanish beside a d of 1e160.
     for i in range(p.n_blocks):
         block_error(p, i, lam, w, e)
         j = p.ptr[i]
         nt = 0 if p.kind[i] == ROW else n_tangents(p.kind[i], p.ptr[i + 1] - j)
         for k in range(j, p.ptr[i + 1]):
-            v = e[k] * e[k]
-            t = p.d[k] * v
-            energy += t
+            v = p.d[k] * e[k]
+            energy += v * e[k]
+            t = v * (p.nu[k] * e[k])
             if nt == 2 and k == j + 1:
-                t = p.d[k] * (v + e[k + 1] * e[k + 1])
-            if p.nu[k] * t > big and not (nt == 2 and k == j + 2):
-                big = p.nu[k] * t
+                t += (p.d[k] * e[k + 1]) * (p.nu[k] * e[k + 1])
+            if t > big and not (nt == 2 and k == j + 2):
+                big = t
                 worst = k
     if 1e-250 < energy < 1e250 and 1e-250 < big < 1e250:
         out.worst = worst
@@ -133,12 +134,12 @@ cdef inline void add_floor(const blocks_t* p, int32_t i, double size, sum_t* tot
 cdef inline void csr_floor(const blocks_t* p, const csr_t* a, const double* lam, score_t* out) noexcept nogil:
     cdef int32_t i
     cdef sum_t total = sum_t(0.0, 0.0)
-    cdef double t, energy = 0.0, big = 0.0
+    cdef double f, t, energy = 0.0, big = 0.0
     for i in range(p.n_rows):
-        t = 1.1102230246251565e-16 * (csr_abs_dot(a, i, lam) + fabs(p.b[i]))
-        t = t * t / p.d[i]
-        energy += t
-        t = p.nu[i] * t
+        f = 1.1102230246251565e-16 * (csr_abs_dot(a, i, lam) + fabs(p.b[i]))
+        t = f / p.d[i]
+        energy += t * f
+        t = p.nu[i] * t * f
         if t > big:
             big = t
     if 1e-250 < energy < 1e250 and 1e-250 < big < 1e250:

@@ -428,6 +428,19 @@ def test_the_floor_of_a_tiny_matrix_does_not_underflow():
     assert (tiny.relative, tiny.floor) == pytest.approx((usual.relative, usual.floor), rel=1e-12)
 
 
+@given(seed=seeds)
+def test_the_size_of_the_numbers_changes_no_residual(seed):
+    """Powers of two, so that A, b and lambda keep their bits: squares of e, w or d alone would vanish or overflow."""
+    problem = random_lcp(seed, boxed=False)
+    lam = np.random.default_rng(seed).normal(size=problem.m)
+    usual = lv.residual(problem, lam)
+    for a, b in ((530, 0), (-530, 0), (0, -600), (0, 600), (600, -300), (-900, -800), (900, 900), (-300, -990)):
+        scaled = lv.Problem.lcp(problem.matrix * 2.0**a, problem.b * 2.0**b)
+        got = lv.residual(scaled, lam * 2.0 ** (b - a))
+        # A dozen sums of positive terms: 1e-13 is a hundred roundings.
+        assert (got.relative, got.floor) == pytest.approx((usual.relative, usual.floor), rel=1e-13)
+
+
 def test_the_inequality_between_two_points_holds():
     """|D|_A^2 <= |D|_A |eps|_A + |eps|_D |D|_D for symmetric PSD boxed problems (D = difference, eps = e1 - e2)."""
     for seed in range(200):

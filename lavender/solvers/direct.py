@@ -118,7 +118,8 @@ class _Run:
         if solved and pivot.rows.shift == 0.0:
             energy, velocity = reference(self.problem)
             e, v, floor_e, floor_v = pivot.rows.score(self.problem.data.nu)
-            if energy > 0.0 and velocity > 0.0 and np.isfinite(e):
+            # Its plain sums of squares: trusted where the floor's neither over- nor underflow.
+            if energy > 0.0 and velocity > 0.0 and np.isfinite(e) and floor_v > 1e-145:
                 relative, floor = max(e / energy, v / velocity), max(floor_e / energy, floor_v / velocity)
                 return self.keep(relative, floor, pivot.impulse(self.candidate), sure=False)
         return self.judge(pivot.impulse(self.candidate))
