@@ -1,0 +1,162 @@
+"""ADMM: mass ratios, redundancy, friction and every kind of factorisation."""
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+from random_problems import as_matrix, random_contact_problem, random_lcp
+
+import lavender as lv
+
+
+def box_stack(n, ratio, friction=None, speed=0.0):
+    """n unit cubes on four corner points each, the top one `ratio` times as heavy: A has rank deficiency."""
+    mass = np.ones(n)
+    mass[-1] = ratio
+    corners = np.array([(x, y) for x in (-0.5, 0.5) for y in (-0.5, 0.5)])
+    c = 4 * n
+    body = np.repeat(np.stack([np.arange(n) - 1, np.arange(n)], 1), 4, axis=0)
+    arm_b = np.c_[np.tile(corners, (n, 1)), np.full(c, -0.5)]
+    arm_a = np.where(body[:, :1] >= 0, arm_b * [1, 1, -1], 0.0)
+    v = np.zeros((n, 6))
+    v[:, 2], v[:, 0] = -0.0981, speed
+    rows = lv.Rows(
+        1.0 / mass, (6.0 / mass)[:, None, None] * np.eye(3), v, normal=np.tile([0.0, 0.0, 1.0], (c, 1)),
+        tangent=np.tile([1.0, 0.0, 0.0], (c, 1)), arm_a=arm_a, arm_b=arm_b, contact_body=body,
+    )  # fmt: skip
+    return lv.Problem.from_rows(rows, mu=friction or 0.0, tangents=0 if friction is None else 2)
+
+
+@pytest.mark.parametrize("ratio", [1.0, 1e3, 1e6])
+def test_heavy_box_on_light_ones(ratio):
+    problem = box_stack(6, ratio)
+    solution = lv.solve(problem, "admm", tol=1e-9)
+    assert solution.success or solution.residual.relative <= 2 * solution.residual.floor
+    # Four points carry what lies above them; velocities vanish.
+    above = np.r_[np.full(5, 1.0), ratio][::-1].cumsum()[::-1] * 0.0981
+    np.testing.assert_allclose(solution.impulse.reshape(6, 4).sum(1), above, rtol=1e-6)
+
+
+@pytest.mark.parametrize(("ratio", "speed"), [(1.0, 0.5), (1e3, 0.0), (1e3, 0.5), (1e6, 0.5)])
+def test_coulomb_with_mass_ratios(ratio, speed):
+    # Sweeps do not get below 1e-2 here in 20,000.
+    problem = box_stack(4, ratio, friction=0.5, speed=speed)
+    solution = lv.solve(problem, "admm", tol=1e-7, max_iter=20_000)
+    assert solution.success, solution
+
+
+def test_iterations_do_not_grow_with_the_mass_ratio_as_sweeps_do():
+    counts = [lv.solve(box_stack(6, ratio), "admm", tol=1e-8).iterations for ratio in (1.0, 1e2, 1e4)]
+    assert max(counts) < 500  # Gauss-Seidel: contraction R / (1 + R), 200,000 sweeps at 1e4
+
+
+@pytest.mark.parametrize("law", ["linear", "lcp", "coulomb", "cone"])
+def test_every_factorisation_gives_the_same(law):
+    base = random_contact_problem(51, friction="cone" if law == "cone" else "coulomb", contacts=14, bodies=4)
+    cones = base.cones
+    if law == "linear":
+        cones = lv.Cones.free(base.m)
+    elif law == "lcp":
+        cones = lv.Cones.bounded(
+            np.where(np.isfinite(cones.lower), cones.lower, -1.0), np.full(base.m, np.inf)
+        )
+    a = base.dense() + 0.3 * np.eye(base.m)
+    problem = lv.Problem(base.b, cones, a, friction=base.friction)
+    assert problem.law == law
+    dense = lv.solve(problem, "admm", tol=1e-10, max_iter=20_000)
+    assert dense.solver.form == "dense Cholesky"
+    results = [dense]
+    slightly = a + 1e-13 * np.abs(a).max() * np.triu(np.ones_like(a), 1)
+    lu = lv.solve(
+        lv.Problem(base.b, cones, slightly, friction=base.friction), "admm", tol=1e-10, max_iter=20_000
+    )
+    assert lu.solver.form == "sparse LU"
+    results.append(lu)
+    # Eight of them side by side make a matrix that is sparse enough.
+    big = sp.block_diag([a] * 8, format="csr")
+    ptr = np.concatenate([cones.ptr[:-1] + k * base.m for k in range(8)] + [[8 * base.m]])
+    many = lv.Cones(
+        ptr, *(np.tile(getattr(cones, n), 8) for n in ("kind", "lower", "upper", "mu", "patch_radius"))
+    )
+    eight = lv.solve(
+        lv.Problem(np.tile(base.b, 8), many, big, friction=base.friction), "admm", tol=1e-10, max_iter=20_000
+    )
+    assert eight.solver.form == "sparse LDLT"
+    for solution in results:
+        assert solution.success
+        # Eigenvalues of A from 0.3 to about 30.
+        np.testing.assert_allclose(solution.impulse, dense.impulse, atol=1e-7 * np.abs(dense.impulse).max())
+    assert eight.success
+    np.testing.assert_allclose(
+        eight.impulse[: base.m], dense.impulse, atol=1e-7 * np.abs(dense.impulse).max()
+    )
+
+
+def test_the_body_form_solves_the_same_problem():
+    base = random_contact_problem(52, contacts=16, bodies=3, joints=2)
+    problem = lv.Problem(base.b, base.cones, rows=base.rows, compliance=base.compliance + 0.2)
+    assert problem.m > 18
+    bodies = lv.solve(problem, "admm", tol=1e-10, max_iter=20_000)
+    matrix = lv.solve(as_matrix(problem), "admm", tol=1e-10, max_iter=20_000)
+    assert bodies.solver.form == "LDLT over bodies"
+    assert bodies.success
+    assert matrix.success
+    # Eigenvalues of A from 0.2 to about 30.
+    np.testing.assert_allclose(bodies.impulse, matrix.impulse, atol=1e-7 * np.abs(matrix.impulse).max())
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_singular_boxed_problems(seed):
+    problem = random_lcp(seed, m=14, rank=6)
+    solution = lv.solve(problem, "admm", tol=1e-9, max_iter=20_000)
+    assert solution.success, solution
+
+
+def test_far_from_symmetric():
+    rng = np.random.default_rng(9)
+    for _ in range(5):
+        g = rng.standard_normal((8, 8))
+        k = rng.standard_normal((8, 8))
+        problem = lv.Problem.lcp(g @ g.T + 0.5 * np.eye(8) + k - k.T, rng.standard_normal(8))
+        # Monotone: the symmetric part is definite, so the splitting converges.
+        assert lv.solve(problem, "admm", tol=1e-9, max_iter=20_000).success
+
+
+def test_without_memory_it_is_plain_admm_by_hand():
+    """Five iterations against the formulas in NumPy with a dense inverse."""
+    problem = random_lcp(4, m=7)
+    root = np.sqrt(problem.d)
+    b_ = problem.dense() / root[:, None] / root
+    c = problem.b / root
+    low, high = problem.cones.lower * root, problem.cones.upper * root
+    rho = 0.1
+    inverse = np.linalg.inv(b_ + rho * np.eye(7))
+    start = problem.start()
+    u = root * start + (c - b_ @ (root * start)) / rho
+    for n in range(1, 6):
+        z = np.clip(u, low, high)
+        y = rho * (u - z)
+        x = inverse @ (c + rho * z - y)
+        got = lv.solve(problem, "admm", memory=0, tol=0.0, max_iter=n)
+        np.testing.assert_allclose(
+            got.impulse, z / root, rtol=1e-10, atol=1e-12
+        )  # the inverse loses some digits
+        u = u + 1.6 * (x - z)
+
+
+def test_an_indefinite_matrix_is_named():
+    problem = lv.Problem.lcp([[-1.0, 2.0], [2.0, -1.0]], [1.0, 1.0])
+    solution = lv.solve(problem, "admm")
+    assert np.isfinite(solution.impulse).all()
+    assert not solution.contradicted
+    if solution.status is lv.Status.NUMERICAL_ERROR:
+        assert "definite" in solution.message or "broke down" in solution.message
+
+
+def test_wrong_options_are_refused():
+    problem = random_lcp(1)
+    for memory in (-1, 17, 0.5):
+        with pytest.raises(lv.InputError, match="memory"):
+            lv.solve(problem, "admm", memory=memory)
+    for alpha in (0.0, 2.0):
+        with pytest.raises(lv.InputError, match="relaxation"):
+            lv.solve(problem, "admm", relaxation=alpha)

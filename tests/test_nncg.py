@@ -1,0 +1,150 @@
+"""NNCG and Anderson mixing: the same answers as the sweeps they accelerate, in fewer sweeps."""
+
+import numpy as np
+import pytest
+from random_problems import as_matrix, random_contact_problem, random_lcp
+
+import lavender as lv
+
+
+def stack(n, ratio=1.0):
+    """n equal spheres in a column, the top one heavier: tridiagonal, impulse i carries all above it."""
+    mass = np.ones(n)
+    mass[-1] = ratio
+    below = np.r_[0.0, 1.0 / mass[:-1]]
+    a = np.diag(below + 1.0 / mass) - np.diag(1.0 / mass[:-1], 1) - np.diag(1.0 / mass[:-1], -1)
+    b = np.r_[0.1, np.zeros(n - 1)]
+    return lv.Problem.lcp(a, b, name=f"stack {n}"), np.cumsum(mass[::-1])[::-1] * 0.1
+
+
+@pytest.mark.parametrize("name", ["nncg", "anderson"])
+@pytest.mark.parametrize("sweep", ["pgs", "blocks"])
+def test_stack_has_its_closed_form(name, sweep):
+    problem, exact = stack(20)
+    solution = lv.solve(problem, name, sweep=sweep, tol=1e-10, max_iter=20_000)
+    assert solution.success
+    # cond(A) is near 650 for 20 bodies
+    np.testing.assert_allclose(solution.impulse, exact, rtol=1e-7)
+
+
+def test_fewer_sweeps_than_pgs():
+    problem, _ = stack(20)
+    sweeps = {
+        key: lv.solve(problem, *key[:1], tol=1e-9, max_iter=50_000, **dict(key[1:])).work["sweeps"]
+        for key in (("pgs",), ("nncg",), ("nncg", ("order", "symmetric")), ("anderson",))
+    }
+    # Gauss-Seidel contracts by cos^2(pi / 40) a sweep: 3,360 sweeps for nine digits. A conjugate gradient's count
+    # goes with the square root of the condition.
+    assert sweeps["pgs",] > 3000
+    assert sweeps["nncg",] < sweeps["pgs",] / 2
+    assert sweeps["nncg", ("order", "symmetric")] < sweeps["pgs",] / 6
+    assert sweeps["anderson",] < sweeps["pgs",] / 12
+
+
+@pytest.mark.parametrize("name", ["nncg", "anderson"])
+@pytest.mark.parametrize("friction", ["coulomb", "cone"])
+def test_rows_and_matrix_agree(name, friction):
+    base = random_contact_problem(41, friction=friction, contacts=10)
+    problem = lv.Problem(
+        base.b, base.cones, rows=base.rows, compliance=base.compliance + 0.2, friction=friction
+    )
+    x, y = (lv.solve(p, name, tol=1e-11, max_iter=20_000) for p in (problem, as_matrix(problem)))
+    assert x.success
+    assert y.success
+    assert x.solver.form.endswith("body velocities")
+    assert y.solver.form.endswith("rows of A")
+    # Eigenvalues of A from 0.2 to about 20, and 1e-11 asked for.
+    np.testing.assert_allclose(x.impulse, y.impulse, atol=1e-8 * np.abs(y.impulse).max())
+
+
+@pytest.mark.parametrize("name", ["nncg", "anderson"])
+def test_velocity_stays_that_of_the_impulse(name):
+    # Hundreds of combinations on: the residual is judged on an impulse whose velocity is formed anew.
+    problem = random_contact_problem(42, tangents=0, spin=False, contacts=12)
+    soft = lv.Problem(problem.b, problem.cones, rows=problem.rows, compliance=problem.compliance + 1e-3)
+    solution = lv.solve(soft, name, tol=1e-13, max_iter=20_000)
+    assert solution.success or solution.status is lv.Status.FLOOR
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("name", ["nncg", "anderson"])
+def test_boxed_lcp_has_the_velocities_of_pgs(name, seed):
+    problem = random_lcp(seed, m=10)
+    x = lv.solve(problem, name, tol=1e-11, max_iter=200_000)
+    y = lv.solve(problem, "pgs", tol=1e-11, max_iter=500_000)
+    assert x.success
+    assert y.success
+    # Slack is unique for positive semidefinite A; its error is about cond(A) <= 1e3 times tol.
+    np.testing.assert_allclose(x.slack, y.slack, atol=1e-7 * np.abs(problem.b).max())
+
+
+@pytest.mark.parametrize("name", ["nncg", "anderson"])
+def test_symmetric_order_is_two_sweeps_an_iteration(name):
+    problem, _ = stack(8)
+    solution = lv.solve(problem, name, order="symmetric", tol=0.0, max_iter=7)
+    assert (solution.iterations, solution.work["sweeps"]) == (7, 14)
+
+
+def test_first_iterations_by_hand():
+    """Two iterations of nncg against the formulas written in NumPy over single sweeps of pgs."""
+    problem = random_lcp(5, m=9)
+    d = problem.d
+
+    def sweep(x):
+        return np.array(lv.solve(problem, "pgs", impulse=x, tol=0.0, max_iter=1).impulse)
+
+    x = problem.start()
+    p = norm = None
+    for k in range(4):
+        y = sweep(x)
+        g = x - y
+        beta = 0.0 if p is None else g @ (d * g) / norm
+        if beta > 1.0:
+            beta = 0.0
+        norm = g @ (d * g)
+        q = np.zeros_like(g) if p is None else beta * p
+        p = q - g
+        got = lv.solve(problem, "nncg", tol=0.0, max_iter=k + 1).impulse
+        np.testing.assert_allclose(got, y, rtol=1e-12, atol=1e-14)  # sums in another order
+        x = y + q
+
+
+def test_anderson_is_exact_after_as_many_sweeps_as_unknowns():
+    # On a linear problem the mixed iterate is that of GMRES: with memory >= m - 1 it ends.
+    rng = np.random.default_rng(3)
+    a = rng.standard_normal((5, 7))
+    problem = lv.Problem.linear(a @ a.T, rng.standard_normal(5))
+    mixed = lv.solve(problem, "anderson", memory=8, tol=1e-9, max_iter=40)
+    assert mixed.success
+    assert mixed.iterations <= 16  # 6 in exact arithmetic; normal equations lose half the digits
+    assert lv.solve(problem, "gauss_seidel", tol=1e-9, max_iter=10_000).iterations > 3 * mixed.iterations
+
+
+def test_wrong_options_are_refused():
+    problem, _ = stack(3)
+    for name in ("nncg", "anderson"):
+        with pytest.raises(lv.UnknownName, match="blocks"):
+            lv.solve(problem, name, sweep="block")
+    for memory in (0, 17, 2.5):
+        with pytest.raises(lv.InputError, match="memory"):
+            lv.solve(problem, "anderson", memory=memory)
+    cone = random_contact_problem(1, friction="cone")
+    with pytest.raises(lv.InputError, match="cone law"):
+        lv.solve(cone, "nncg", sweep="pgs")
+
+
+@pytest.mark.parametrize("name", ["nncg", "anderson"])
+def test_a_sliding_pile_is_solved(name):
+    # Contacts that slide: the map is not a gradient, and is accelerated all the same.
+    base = random_contact_problem(77, tangents=2, spin=False, contacts=20, bodies=8, joints=0)
+    problem = lv.Problem(base.b, base.cones, rows=base.rows, compliance=base.compliance + 0.05)
+    plain = lv.solve(problem, "sequential_impulses", tol=1e-9, max_iter=50_000)
+    solution = lv.solve(problem, name, tol=1e-9, max_iter=50_000)
+    assert plain.success
+    assert solution.success
+    slides = [
+        np.linalg.norm(solution.impulse[i + 1 : i + 3]) > 0.999 * mu * solution.impulse[i] > 0.0
+        for i, mu in zip(problem.cones.ptr, problem.cones.mu, strict=False)
+    ]
+    assert sum(slides) >= 3
+    assert solution.work["sweeps"] < plain.work["sweeps"]
