@@ -1650,21 +1650,6 @@ cdef class Factor:
                 lav_block_solve(&self.f, &y[0])
             lav_to_rows(&e.e, &y[0], &out[0])
 
-    def refine(self, Elements e, const double[::1] dz, double[::1] dy, double[::1] t, double[::1] out):
-        """dy <- dy + N^-1 (K^T dz - dy), out <- K (change); t (n s) is scratch."""
-        cdef int32_t i, n = self.n * self.s
-        with nogil:
-            lav_to_bodies(&e.e, self.n, &dz[0], &t[0])
-            for i in range(n):
-                t[i] -= dy[i]
-            if self.lu:
-                lav_block_lu_solve(&self.f, &t[0])
-            else:
-                lav_block_solve(&self.f, &t[0])
-            for i in range(n):
-                dy[i] += t[i]
-            lav_to_rows(&e.e, &t[0], &out[0])
-
     def gram(self, Elements e, const double[::1] x, double[::1] y, double[::1] out):
         """out <- K K^T x, y <- K^T x."""
         with nogil:

@@ -248,8 +248,9 @@ class VelocitySystem(System):
         self.s, self.n = s, rows.n_bodies
         self.elements = self._elements(node, slot, halves, s)
         self.structure = (nptr, nind, *kernels.symbolic(nptr, nind))
-        self.y, self.y2 = np.zeros((2, self.n * s + 1))
-        self.cones = len(sc.kind) < sc.m
+        self.y = np.zeros(self.n * s + 1)
+        if len(sc.kind) < sc.m and not sc.theta.any():
+            self.bt = np.zeros_like(self.v)
         self.factor: Any = None
         self.factor_unsymmetric = False
 
@@ -276,12 +277,12 @@ class VelocitySystem(System):
         self.elements.times(self.v, r, t)
         self.factor.solve(self.elements, t, self.y, q)
         out = np.empty_like(r)
-        self.elements.times(self.v, r - q, out)
-        if self.cones:
-            # dy = K^T dz again after rounding: near the boundary of a cone V spans ten decades and more.
-            self.factor.refine(self.elements, out, self.y, self.y2, q)
-            self.elements.times(self.v, q, t)
-            out -= t
+        if self.bt is None:
+            self.elements.times(self.v, r - q, out)
+        else:
+            # B (B^T ...): V itself has lost the small end of its scaling to the large one.
+            self.elements.times(self.bt, r - q, t)
+            self.elements.times_transposed(self.bt, t, out)
         return out
 
     def factor_natural(self, eps: float) -> bool:
