@@ -7,7 +7,7 @@ list.
 
 Few bodies: every pair is tested. Many: a hash grid with one level for each power of two in size; a body
 lies in the cell of its centre, at the level whose cells are no smaller than its box, and looks into
-the neighbouring cells of its own and of coarser levels. Cost is linear in bodies and pairs for any mix
+the neighbouring cells of coarser levels and, on its own, into those ahead. Cost is linear in bodies and pairs for any mix
 of sizes; counting sorts put the pairs in order.
 """
 from libc.math cimport fabs, floor
@@ -105,6 +105,7 @@ cdef inline void grid_pairs(engine_t* e, int32_t* n_pairs) noexcept nogil:
     cdef int32_t low[3]
     cdef int32_t high[3]
     cdef const double* f
+    cdef const int32_t* own
     for i in range(n):
         if e.kind_of_shape[i] < SPHERE:
             continue
@@ -156,17 +157,24 @@ cdef inline void grid_pairs(engine_t* e, int32_t* n_pairs) noexcept nogil:
                     low[k] = cell_of(f[k] - half, size)
                     high[k] = cell_of(f[3 + k] + half, size)
                 c[3] = level
+                # on its own level a body looks ahead only: cells before its own look at it
+                own = e.cell + 4 * i if level == e.cell[4 * i + 3] else NULL
+                if own != NULL:
+                    low[0] = own[0]
                 for x in range(low[0], high[0] + 1):
                     c[0] = x
-                    for y in range(low[1], high[1] + 1):
+                    for y in range(own[1] if own != NULL and x == own[0] else low[1], high[1] + 1):
                         c[1] = y
                         for z in range(low[2], high[2] + 1):
+                            if own != NULL and x == own[0] and y == own[1] and z < own[2]:
+                                continue
                             c[2] = z
                             j = e.bucket[cell_hash(c, mask)]
                             while j >= 0:
                                 if (e.cell[4 * j] == x and e.cell[4 * j + 1] == y and e.cell[4 * j + 2] == z
                                         and e.cell[4 * j + 3] == level
-                                        and (level > e.cell[4 * i + 3] or j < i)
+                                        and (j < i or own == NULL or x != own[0] or y != own[1]
+                                             or z != own[2])
                                         and may_meet(e, i, j) and boxes_meet(e, i, j)):
                                     add_pair(e, i, j, n_pairs)
                                 j = e.chain[j]

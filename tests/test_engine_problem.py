@@ -210,6 +210,15 @@ def test_foreign_and_damaged_snapshots_are_refused(tmp_path):
         sim.restore({"x": 1})
 
 
+def test_substeps_are_steps_of_a_fraction():
+    one = lv.Simulation(lv.Scene("stack", n=3, dt=0.01, substeps=2))
+    two = lv.Simulation(lv.Scene("stack", n=3, dt=0.005))
+    for _ in range(30):
+        two.step()
+        assert_same(trajectory(one, 1), trajectory(two, 1))
+    assert one.time == pytest.approx(two.time, rel=1e-15)
+
+
 def test_arrays_grow_without_changing_the_trajectory():
     scene = lv.Scene("pile", n=60, kind="boxes")
     sim, tight = lv.Simulation(scene), lv.Simulation(scene)
@@ -278,6 +287,15 @@ def test_a_failed_solve_is_counted_and_dealt_with(policy):
         assert sim.steps == 0
         for name in ("x", "q", "v", "cache_key", "cache_impulse", "joint_impulse"):
             np.testing.assert_array_equal(sim._state.a[name], twin._state.a[name])
+        # The same where a later substep fails.
+        scene = lv.Scene(dt=0.2, substeps=4, solver="pgs", solver_iterations=1, on_failure="raise")
+        scene.add_plane()
+        scene.add_box(position=(0, 0, 0.62), quaternion=(1, 0.02, 0.03, 0))
+        sim = lv.Simulation(scene)
+        before = sim.snapshot()
+        with pytest.raises(lv.SolveFailed):
+            sim.step()
+        np.testing.assert_array_equal(sim.snapshot().real, before.real)
         return
     problem = sim.constraint_problem()
     found = lv.solve(problem, "pgs", max_iter=1).impulse
@@ -350,6 +368,12 @@ def test_recorded_problems_are_the_problems_of_the_steps(tmp_path):
     assert sim.steps == 3
     with pytest.raises(lv.UnknownName, match="form"):
         sim.record(tmp_path, 1, form="csv")
+    chain = lv.Simulation("chain")
+    pytest.importorskip("h5py")
+    assert sim.record(tmp_path / "fclib", 1, form="fclib")[0].suffix == ".hdf5"
+    with pytest.raises(lv.CapabilityError):  # joints
+        chain.record(tmp_path / "fclib", 1, form="fclib")
+    assert chain.steps == 0
     (tmp_path / "file").write_text("")
     with pytest.raises(lv.InputError, match="cannot make the folder"):
         sim.record(tmp_path / "file", 1)

@@ -207,6 +207,16 @@ class Simulation:
             self._state = self._state.grown()
 
     def _solver_substeps(self) -> int:
+        p = self._parameters
+        before = self._state.copy() if p.on_failure == "raise" and p.substeps > 1 else None
+        try:
+            return self._solve_substeps()
+        except SolveFailed:
+            if before is not None:
+                self._state = before
+            raise
+
+    def _solve_substeps(self) -> int:
         status = OK
         for _ in range(self._parameters.substeps):
             self._prepare()

@@ -140,6 +140,7 @@ class State:
         head[HEAD["order"]] = ORDER_NUMBER[p.order]
         head[HEAD["seed"]] = p.seed
         head[HEAD["lost"]] = -1
+        setting[SETTING["out"] : SETTING["out"] + 2] = p.solver_iterations, p.warm_start
         dynamic = 0
         for i, b in enumerate(bodies):
             a["x"][i], a["q"][i] = b.position, b.quaternion
