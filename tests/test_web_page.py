@@ -1,0 +1,296 @@
+"""The page in a real browser without a window: what it shows is what the native kernels compute."""
+
+import os
+import shutil
+import threading
+
+import numpy as np
+import pytest
+
+import lavender as lv
+from lavender.engine import SOLVER_FIELDS
+from lavender.errors import LavenderError
+from lavender.web import pages
+
+pytestmark = pytest.mark.slow  # the module is the same whatever checks the native kernels are built with
+
+SCENES = ("stack", "pyramid", "chain", "spinner")
+WHOLE = ("iterations", "warm_start", "contacts", "cache_matches")
+
+
+@pytest.fixture(scope="module")
+def address(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("page")
+    try:
+        pages.write_page(folder)
+    except LavenderError as error:
+        pytest.skip(str(error))
+    server = pages.server(folder)
+    thread = threading.Thread(target=server.serve_forever)
+    thread.start()
+    yield f"http://127.0.0.1:{server.server_address[1]}/"
+    server.shutdown()
+    server.server_close()
+    thread.join()
+
+
+@pytest.fixture(scope="module")
+def browser():
+    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed (extra: dev)")
+    names = ("chromium", "chromium-browser", "google-chrome")
+    found = os.environ.get("CHROMIUM") or next(filter(None, map(shutil.which, names)), None)
+    if found is None:
+        pytest.skip(f"none of {', '.join(names)} is installed, and CHROMIUM names no browser")
+    with playwright.sync_playwright() as p:
+        # Containers and root have no user namespaces to build the sandbox from.
+        browser = p.chromium.launch(executable_path=found, args=["--no-sandbox"])
+        yield browser
+        browser.close()
+
+
+class Visit:
+    """A page with what it complained of and what it asked for."""
+
+    def __init__(self, browser, address, **options):
+        self.context = browser.new_context(**{"viewport": {"width": 1280, "height": 900}, **options})
+        self.page = self.context.new_page()
+        self.complaints, self.requests = [], []
+        self.page.on("console", lambda m: m.type in ("error", "warning") and self.complaints.append(m.text))
+        self.page.on("pageerror", lambda error: self.complaints.append(str(error)))
+        self.page.on("requestfailed", lambda request: self.complaints.append(request.url))
+        self.page.on("request", lambda request: self.requests.append(request.url))
+        self.page.goto(address)
+        self.page.wait_for_selector("html[data-ready=true]")
+
+    def side(self, i):
+        return self.page.locator(f".side[data-side='{i}']")
+
+    def values(self, i):
+        """The eight values of a side: exactly, and as they are shown."""
+        cells = [self.side(i).locator(f"td[data-field='{field}']") for field in SOLVER_FIELDS]
+        return [float(c.get_attribute("data-value")) for c in cells], [c.text_content() for c in cells]
+
+    def js(self, expression):
+        return self.page.evaluate(expression)
+
+
+@pytest.fixture
+def visit(browser, address):
+    visits = []
+
+    def start(path="", **options):
+        visits.append(Visit(browser, address + path, **options))
+        return visits[-1]
+
+    yield start
+    for v in visits:
+        assert v.complaints == []
+        assert {url.rsplit("/", 1)[0] for url in v.requests if "/vendor/" not in url} == {address[:-1]}
+        v.context.close()
+
+
+def native(scene, steps, **parameters):
+    """The eight values of the last of `steps` steps."""
+    simulation = lv.Simulation(lv.Scene(scene, **parameters))
+    for _ in range(steps):
+        observation = simulation.step()[0]
+    return observation["solver"].tolist()
+
+
+def as_shown(values):
+    """How the page writes them: whole numbers and zeros as they are, else six digits."""
+    return [
+        str(int(v)) if field in WHOLE or v == 0 else f"{v:.5e}"
+        for field, v in zip(SOLVER_FIELDS, values, strict=True)
+    ]
+
+
+def readable(text):
+    # JavaScript writes 1.5e-4 where Python writes 1.5e-04.
+    head, e, power = text.partition("e")
+    return f"{head}e{int(power):+03d}" if e else head
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_120_steps_show_the_native_numbers(visit, scene):
+    v = visit(f"#{scene}")
+    assert v.page.locator("#scene").input_value() == scene
+    v.page.click("#second")
+    assert v.page.locator("#clock").text_content() == "1.000 s, step 120"
+    for i, warm in enumerate((True, False)):
+        exact, shown = v.values(i)
+        expected = native(scene, 120, warm_start=warm)
+        assert exact == expected
+        assert [readable(text) for text in shown] == as_shown(expected)
+    contacts, matches = v.values(0)[0][2:4]
+    assert contacts == matches
+    assert (contacts > 0) == (scene != "chain")
+
+
+def test_warm_start_off_leaves_no_matches(visit):
+    v = visit()
+    v.page.click("#second")
+    assert v.values(0)[0][2:4] == [24, 24]
+    v.side(0).locator(".warm input").uncheck()
+    v.page.click("#step")
+    assert v.values(0)[0][1:4] == [0, 24, 0]
+    assert v.values(0)[1][3] == "0"
+    v.side(0).locator(".warm input").check()
+    v.page.click("#step")
+    assert v.values(0)[0][1:4] == [1, 24, 24]
+
+
+def test_settings_of_each_side_are_the_native_ones(visit):
+    v = visit("#pyramid")
+    v.side(0).locator(".sweeps input").fill("40")
+    v.side(0).locator(".order").select_option(label="top down")
+    v.side(1).locator(".sweeps input").fill("4")
+    v.side(1).locator(".warm input").check()
+    v.side(1).locator(".order").select_option(label="random")
+    assert v.side(0).locator(".sweeps output").text_content() == "40"
+    for _ in range(3):
+        v.page.click("#step")
+    v.page.click("#reset")  # settings stay
+    for _ in range(5):
+        v.page.click("#step")
+    assert v.values(0)[0] == native("pyramid", 5, order="top_down", solver_iterations=40)
+    assert v.values(1)[0] == native("pyramid", 5, order="random", solver_iterations=4)
+
+
+def test_plots_hold_the_native_errors(visit):
+    v = visit()
+    for _ in range(10):
+        v.page.click("#step")
+    simulation = lv.Simulation("stack")
+    for _ in range(9):
+        simulation.step()
+    state = simulation._state.copy()
+    assert state.kernel.prepare() == 0
+    curve = np.zeros((17, 2))
+    state.kernel.solve_watched(curve)
+    for k, name in enumerate(("normal", "energy")):
+        assert v.js(f"lavender.charts.{name}.data[0]") == list(range(17))
+        assert v.js(f"lavender.charts.{name}.data[1]") == curve[:, k].tolist()
+    matched = v.js("lavender.charts.contacts.data")
+    assert matched[1] == [24] * 10  # made, A
+    assert matched[3] == [0] + [24] * 9  # matched, A
+    assert matched[4] == [0] * 10  # matched, B: no warm start
+    assert v.js("lavender.charts.settings.data")[3] == [16] * 10
+
+
+def test_restore_leads_back(visit):
+    v = visit()
+    v.page.keyboard.press("p")  # a push, so that there is something to differ
+    v.page.click("#second")
+    v.page.click("#snapshot")
+    v.page.click("#second")
+    first = [v.values(i)[0] for i in (0, 1)]
+    v.side(0).locator(".sweeps input").fill("64")
+    v.side(1).locator(".warm input").check()
+    v.page.click("#second")
+    assert [v.values(i)[0] for i in (0, 1)] != first
+    v.page.click("#restore")
+    assert v.page.locator("#clock").text_content() == "1.000 s, step 120"
+    assert v.side(0).locator(".sweeps input").input_value() == "16"
+    assert not v.side(1).locator(".warm input").is_checked()
+    v.page.click("#second")
+    assert [v.values(i)[0] for i in (0, 1)] == first
+
+
+def test_keyboard_does_everything(visit):
+    v = visit()
+    press = v.page.keyboard.press
+    press("2")
+    assert v.page.locator("#scene").input_value() == "pyramid"
+    press(".")
+    assert v.page.locator("#clock").text_content().endswith("step 1")
+    press("w")
+    assert not v.side(0).locator(".warm input").is_checked()
+    press("Shift+W")
+    assert v.side(1).locator(".warm input").is_checked()
+    press("+")
+    press("Shift+_")
+    assert [v.side(i).locator(".sweeps input").input_value() for i in (0, 1)] == ["20", "12"]
+    press("s")
+    press(" ")
+    assert v.page.locator("#play").get_attribute("aria-pressed") == "true"
+    v.page.wait_for_function("lavender.steps > 3")
+    press(" ")
+    assert v.page.locator("#play").text_content() == "Play"
+    press("r")
+    assert v.page.locator("#clock").text_content().endswith("step 1")
+    press("0")
+    assert v.page.locator("#clock").text_content().endswith("step 0")
+    turn = v.js("lavender.sides[1].view.turn")
+    v.side(0).locator("canvas").focus()
+    press("ArrowLeft")
+    assert v.js("lavender.sides[1].view.turn") != turn  # both pictures turn together
+    press("s")
+    # Every control is reached by Tab alone.
+    v.page.locator("#scene").focus()
+    reached = set()
+    for _ in range(25):
+        press("Tab")
+        reached.add(
+            v.js(
+                "document.activeElement.id || document.activeElement.className || document.activeElement.type"
+            )
+        )
+    assert {
+        "play",
+        "step",
+        "second",
+        "reset",
+        "speed",
+        "snapshot",
+        "restore",
+        "push",
+        "order",
+        "range",
+    } <= reached
+
+
+def colors_in(v, i):
+    return v.js(
+        "(() => { const c = document.querySelectorAll('.side canvas')[" + str(i) + "];"
+        "const d = new Uint32Array(c.getContext('2d').getImageData(0, 0, c.width, c.height).data.buffer);"
+        "return new Set(d).size; })()"
+    )
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_phone_without_network(visit, scene):
+    v = visit(
+        f"#{scene}",
+        viewport={"width": 360, "height": 640},
+        device_scale_factor=2,
+        has_touch=True,
+        is_mobile=True,
+    )
+    v.context.set_offline(True)
+    assert v.js("document.documentElement.scrollWidth") == 360
+    v.page.locator("#second").tap()
+    assert v.values(0)[0] == native(scene, 120)
+    for name in ("#play", "#step", "#reset", "#snapshot", "#push"):
+        box = v.page.locator(name).bounding_box()
+        assert box["x"] >= 0 and box["x"] + box["width"] <= 360 and box["height"] >= 32
+    assert all(colors_in(v, i) > 10 for i in (0, 1))  # background, faces, edges, marks: something is drawn
+
+
+def test_a_page_that_cannot_start_says_so(browser, address):
+    context = browser.new_context()
+    page = context.new_page()
+    page.route("**/scenes.json", lambda route: route.fulfill(body="{", content_type="application/json"))
+    page.goto(address)
+    page.wait_for_selector("#failure:not([hidden])")
+    assert page.locator("#failure").text_content().startswith("The page could not start")
+    context.close()
+
+
+def test_a_lost_state_is_named(visit):
+    v = visit()
+    v.js("lavender.sides[1].simulation.array('v')[6] = Infinity")
+    v.page.click("#second")
+    assert "Side B: the state of" in v.page.locator("#failure").text_content()
+    v.page.click("#reset")
+    assert v.page.locator("#failure").is_hidden()
