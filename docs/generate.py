@@ -7,6 +7,8 @@ missing: another version, machine or plan.
 """
 
 import contextlib
+import hashlib
+import importlib
 import importlib.util
 import inspect
 import io
@@ -24,6 +26,7 @@ import docstrings
 import tried
 
 import lavender as lv
+import lavender_ext
 from lavender import bench, registry, suite
 from lavender.bench import level_name
 from lavender.ordering import ORDERS
@@ -56,6 +59,10 @@ PLAN = bench.Plan(LEVELS, budgets=(4, 16, 64), repeats=2, time_limit=0.1, warm=F
 # Beside the solvers of lavender: one backend of each kind (splitting, interior point, cones).
 BACKENDS = ("osqp", "scs", "piqp", "clarabel", "clarabel_cone")
 NEAR = 1.25  # times the fastest: differences below say nothing on a machine that does other work
+ADVICE = (
+    "Who brings most cases of a structure to a level, and of those the fastest by shifted geometric mean of time; its\n"
+    "median time where it arrives, and on how many cases. In a time: the mean residual reached."
+)
 LAW_NAMES = {
     "linear": "linear systems",
     "lcp": "bounded rows and contacts without friction",
@@ -115,7 +122,17 @@ def measure(cache):
     ours = [name for name, spec in built_in().items() if not spec.external]
     cache.mkdir(parents=True, exist_ok=True)
     solvers = ours + [name for name in BACKENDS if registry.specs()[name].missing() is None]
-    return bench.run(CASES, solvers, PLAN, cache / "records.jsonl").latest()
+    return bench.run(CASES, solvers, PLAN, cache / f"records-{fingerprint()}.jsonl").latest()
+
+
+def fingerprint():
+    """Of the sources and the compiled kernels: records of other code are not shown as this code's."""
+    digest = hashlib.sha256()
+    package, kernels = Path(lv.__file__).parent, Path(lavender_ext.__file__).parent
+    for path in sorted([*package.rglob("*.py"), *kernels.glob("*.px[id]"), *kernels.glob("*.so")]):
+        digest.update(path.name.encode())
+        digest.update(path.read_bytes())
+    return digest.hexdigest()[:12]
 
 
 # -- figures ----------------------------------------------------------------------------------------
@@ -160,7 +177,8 @@ def law_figures(records):
                 (line,) = axes.plot(
                     [r.time_min for r in runs],
                     [min(max(r.relative, 1e-17), 3.0) for r in runs],
-                    color=k.color, marker=k.marker, markersize=3, linewidth=1.0, label=solver,
+                    color=k.color, marker=k.marker, markersize=4, markeredgewidth=0.0, linewidth=1.0,
+                    linestyle=k.line, label=solver,
                 )  # fmt: skip
                 line.set_gid(f"{solver}--{i}")
                 shown.setdefault(solver, line)
@@ -174,7 +192,12 @@ def law_figures(records):
         canvas.supxlabel("time: set-up and solve [s]", fontsize=8)
         canvas.supylabel("relative residual [-]", fontsize=8)
         legend = canvas.legend(
-            shown.values(), shown.keys(), loc="outside right upper", fontsize=7, frameon=False
+            shown.values(),
+            shown.keys(),
+            loc="outside right upper",
+            fontsize=6,
+            frameon=False,
+            labelspacing=0.3,
         )
         legend.set_gid("legend")
         text = io.StringIO()
@@ -190,7 +213,8 @@ def highlighted(svg, solver):
         '<style type="text/css">'
         '[id*="--"] path, [id*="--"] use {stroke: #d0d0d0 !important}'
         '[id*="--"] use {fill: #d0d0d0 !important}'
-        f'[id^="{solver}--"] path, [id^="{solver}--"] use {{stroke: #5b2a9d !important; stroke-width: 2 !important}}'
+        f'[id^="{solver}--"] path, [id^="{solver}--"] use {{stroke: #5b2a9d !important; stroke-width: 2 !important; '
+        "stroke-dasharray: none !important}"
         f'[id^="{solver}--"] use {{fill: #5b2a9d !important}}'
         "#legend {display: none}</style>"
     )
@@ -357,7 +381,8 @@ def solver_pages(site, records, figures):
     site.write(
         "solvers/index.md",
         "# Solvers\n\nEvery name that `lavender.solve` takes. *Reads*: rows (body velocities), the matrix A, "
-        "or either.\n*Exact*: ends after finitely many steps. *Resumable*: n₁ and then n₂ iterations give the bits of n₁ + n₂.\n\n"
+        "or either.\n*Exact*: ends after finitely many steps. *Resumable*: n₁ and then n₂ iterations "
+        "give the bits of n₁ + n₂.\n\n"
         + table(("name", "laws", "reads", "exact", "resumable", ""), rows)
         + "\n\n```{toctree}\n:hidden:\n\n"
         + "\n".join([*(s.name for s in ours), "backends"])
@@ -408,23 +433,28 @@ def measured_page(site, records, figures):
         rows.append(cells)
     head = ("structure", *(f"to {level_name(x)}" for x in LEVELS), *(f"in {seconds(t)}" for t in times))
     shown = ", ".join(f"{n} {v}" for n, v in run.versions.items())
+    site.write("parts/advice.md", f"{ADVICE}\n\n{table(head, rows)}")
     parts = [
         "# Measured in this build",
         (
-            f"{len(records)} runs on {len(records.cases)} cases of `lavender.suite`, made while these pages were built: "
-            f"{run.cpu}, {run.threads} thread,\nlavender {run.lavender}, Python {run.python}, {shown}. Minimum of "
-            f"{PLAN.repeats} repeats, set-up and solve together, at most {seconds(PLAN.time_limit)}\na solve. It is a "
-            "glance, not a benchmark: `lavender report` on your own problems says more."
+            f"{len(records)} runs on {len(records.cases)} cases of `lavender.suite`, made while these pages were "
+            f"built: {run.cpu}, {run.threads} thread,\nlavender {run.lavender}, Python {run.python}, {shown}. "
+            f"Minimum of {PLAN.repeats} repeats, set-up and solve together, at most {seconds(PLAN.time_limit)}\n"
+            "a solve. It is a glance, not a benchmark: `lavender report` on your own problems says more."
         ),
         "## By structure",
-        (
-            "Who brings most cases of a structure to a level, and of those the fastest by shifted geometric mean of time; "
-            "its median time\nwhere it arrives, and on how many cases. In a time: the mean residual reached."
-        ),
+        ADVICE,
         table(head, rows),
         "## By law",
     ]
+    first = []
     for law, by_level in geometric_means(records).items():
+        cells = []
+        for level in LEVELS:
+            most = max(solved for _, solved, _ in by_level[level].values())
+            names = sorted((t, name) for name, (t, solved, _) in by_level[level].items() if solved == most)
+            cells.append(", ".join(f"**{name}** {seconds(t)}" for t, name in names[:3]) if most else "nobody")
+        first.append((LAW_NAMES.get(law, law), *cells))
         rows = [
             (
                 solver,
@@ -438,7 +468,8 @@ def measured_page(site, records, figures):
         parts += [
             f"### {LAW_NAMES.get(law, law).capitalize()}",
             (
-                f"Geometric means of time, shifted by {seconds(shift_of(records))}, of the solvers that take every case "
+                f"Geometric means of time, shifted by {seconds(shift_of(records))}, of the solvers that take "
+                "every case "
                 f"of the class; a miss\ncosts {seconds(PLAN.time_limit)}. In brackets, cases that arrived."
             ),
             table(("solver", *(f"to {level_name(x)}" for x in LEVELS)), rows),
@@ -464,6 +495,7 @@ def measured_page(site, records, figures):
         ),
     ]
     site.write("measured.md", "\n\n".join(parts))
+    site.write("parts/advice_by_law.md", table(("", *(f"to {level_name(x)}" for x in LEVELS)), first))
 
 
 # -- examples, scenes, cases, parts -----------------------------------------------------------------
@@ -531,8 +563,10 @@ def suite_page(site):
     parts = [
         "# Cases",
         (
-            '`lavender.suite` makes problems from a name: `suite.case("pyramid(k=10, mass_ratio=1e6)")`, or the same text '
-            "on the command\nline. Each says why it is there; where the solution is known by closed form, exact arithmetic "
+            '`lavender.suite` makes problems from a name: `suite.case("pyramid(k=10, mass_ratio=1e6)")`, or the '
+            "same text "
+            "on the command\nline. Each says why it is there; where the solution is known by closed form, exact "
+            "arithmetic "
             "or proof, `case.reference` holds it."
         ),
         "## Families",
