@@ -12,7 +12,7 @@ import numpy as np
 from lavender_ext.pivoting import Pivoting
 from scipy.linalg import lapack
 
-from lavender._arrays import FloatArray
+from lavender._arrays import FloatArray, IntArray
 from lavender.problem import Problem
 from lavender.solvers._factor import TINY, DenseFactor, Factor, SparseFactor, choose
 
@@ -22,6 +22,8 @@ SLOP = 8.0  # roundings of w within which a sign means nothing, as there
 
 class PivotState:
     """A problem's rows, free or at a bound, and the factorisation that serves them."""
+
+    chosen: tuple[str, int, IntArray]
 
     def __init__(self, problem: Problem, like: PivotState | None = None) -> None:
         self.problem = problem
