@@ -59,7 +59,7 @@ cdef inline void sweep(const sweep_data_t* c, double* lam, int32_t first) noexce
     for k in range(2 if c.mode == SYMMETRIC else 1):
         advance_order(c.mode, first and k == 0, c.order, 0, c.split, c.rng)
         advance_order(c.mode, first and k == 0, c.order, c.split, p.n_blocks, c.rng)
-        if c.nv == 0:
+        if c.csr != NULL:
             if c.start == NULL:
                 for q in range(p.n_blocks):
                     relax_csr_block(p, c.csr, c.order[q], lam)
@@ -228,7 +228,7 @@ def run(Data p, Watch watch, double[::1] lam, int n, double tol, int memory, pre
             return CONVERGED, 0, 0, 0
         return RUNNING, n, n, 0
     c.blocks = &p.blocks
-    c.csr = &p.csr
+    c.csr = NULL if p.factored else &p.csr
     c.rows = &p.rows
     c.start = NULL
     c.g = NULL

@@ -282,6 +282,16 @@ def test_time_limit_returns_the_iterate(name):
     assert solution.solve_time < 0.05 * 1.1 + 0.05
 
 
+def soft_static_contacts():
+    """Two contacts between static bodies, no body at all: compliance alone makes A = diag(1, 2, 1, 2)."""
+    z, x, o = np.tile([0.0, 0.0, 1.0], (2, 1)), np.tile([1.0, 0.0, 0.0], (2, 1)), np.zeros((2, 3))
+    rows = lv.Rows(
+        np.zeros(0), np.zeros((0, 3, 3)), np.zeros((0, 6)), normal=z, tangent=x, arm_a=o, arm_b=o,
+        contact_body=np.full((2, 2), -1),
+    )  # fmt: skip
+    return lv.Problem.from_rows(rows, [1.0, 2.0, 1.0, -2.0], mu=0.5, tangents=1, compliance=[1.0, 2.0, 1.0, 2.0])
+
+
 @pytest.mark.parametrize("name", HERE)
 def test_legal_oddities_are_solved_or_refused_by_reason(name):
     """0 rows, 1 row, all-static rows, zero rows of A, singular and indefinite A: a result or a CapabilityError."""
@@ -299,6 +309,7 @@ def test_legal_oddities_are_solved_or_refused_by_reason(name):
         lv.Problem.lcp([[-1.0, 2.0], [2.0, -1.0]], [1.0, 1.0]),
         lv.Problem.lcp([[2.0, 1.0], [-1.0, 2.0]], [1.0, 1.0]),
         lv.Problem.contact(np.diag([1.0, 0.0, 0.0]), [1.0, 0.2, 0.1], [0.5]),
+        soft_static_contacts(),
     ]
     for problem in cases:
         try:
