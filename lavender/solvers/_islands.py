@@ -6,12 +6,11 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-import scipy.sparse as sp
-from scipy.sparse.csgraph import connected_components
 
 from lavender._arrays import FloatArray, IntArray
 from lavender.cones import Cones
 from lavender.problem import Problem
+from lavender_ext import graph as kernels
 
 
 def islands(problem: Problem) -> tuple[int, IntArray]:
@@ -19,24 +18,21 @@ def islands(problem: Problem) -> tuple[int, IntArray]:
 
     A block between static bodies alone, or with an empty row of A, is an island of its own.
     """
-    k = problem.n_blocks
-    if k == 0:
-        return 0, np.zeros(0, np.int32)
+    cones = problem.cones
     if problem.rows is not None:
-        body = np.concatenate([problem.rows.joint_body, problem.rows.contact_body])
-        block, side = np.nonzero(body >= 0)
-        index = k + body[block, side]
-        graph = sp.coo_array((np.ones(len(block)), (block, index)), shape=(k + problem.rows.n_bodies,) * 2)
-    else:
-        a = problem.csr
-        of_row = np.repeat(np.arange(k), np.diff(problem.cones.ptr))
-        entry_row = np.repeat(np.arange(problem.m), np.diff(a.indptr))
-        graph = sp.coo_array((np.ones(a.nnz), (of_row[entry_row], of_row[a.indices])), shape=(k, k))
-    _, label = connected_components(graph, directed=False)
-    _, first, inverse = np.unique(label[:k], return_index=True, return_inverse=True)
-    rank = np.empty(len(first), np.int32)
-    rank[np.argsort(first)] = np.arange(len(first))
-    return len(first), rank[inverse.ravel()]
+        return kernels.body_components(block_bodies(problem), problem.rows.n_bodies)
+    block = np.repeat(np.arange(cones.n_blocks, dtype=np.int32), np.diff(cones.ptr))
+    a = problem.csr
+    return kernels.matrix_components(cones.ptr, block, a.indptr, a.indices)
+
+
+def block_bodies(problem: Problem) -> IntArray:
+    """Bodies of each block (k, 2), -1 static; only with rows."""
+    rows = problem.rows
+    assert rows is not None
+    if rows.n_joints == 0:
+        return rows.contact_body
+    return np.concatenate([rows.joint_body, rows.contact_body])
 
 
 def rows_of(problem: Problem, blocks: IntArray) -> IntArray:

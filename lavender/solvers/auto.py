@@ -27,7 +27,8 @@ from lavender.problem import Problem
 from lavender.registry import SolverSpec, specs
 from lavender.residuals import check_certificate, quick, reference
 from lavender.solution import Claim, Status
-from lavender.solvers._islands import islands, restrict, rows_of
+from lavender.solvers._islands import block_bodies, islands, restrict, rows_of
+from lavender_ext import graph as kernels
 
 NARROW = 12  # half-bandwidth up to which a band factorisation costs less than anything else
 FEW = 64  # rows up to which a dense factorisation does
@@ -206,7 +207,7 @@ def _sweeps_first(problem: Problem) -> bool:
     """Whether sweeps are worth a try, by what is known without looking closer."""
     if problem.law == "lcp":
         return problem.is_symmetric and not (
-            _is_small_or_narrow(problem) or _is_heavy(problem) or _is_redundant(problem)
+            _is_heavy(problem) or _is_redundant(problem) or _is_small_or_narrow(problem)
         )
     return not _is_heavy(problem)
 
@@ -377,17 +378,7 @@ def _bandwidth(problem: Problem) -> int:
         a = problem.csr
         row = np.repeat(np.arange(problem.m), np.diff(a.indptr))
         return int(np.abs(a.indices - row).max(initial=0))
-    # Rows couple through bodies: the widest spread of rows over one body.
-    rows = problem.rows
-    body = np.concatenate([rows.joint_body, rows.contact_body])
-    first, last = problem.cones.ptr[:-1], problem.cones.ptr[1:] - 1
-    low = np.full(rows.n_bodies, problem.m)
-    high = np.full(rows.n_bodies, -1)
-    for side in (0, 1):
-        moving = body[:, side] >= 0
-        np.minimum.at(low, body[moving, side], first[moving])
-        np.maximum.at(high, body[moving, side], last[moving])
-    return int((high - low).max(initial=0))
+    return kernels.body_spread(problem.cones.ptr, block_bodies(problem), problem.rows.n_bodies)
 
 
 SPEC = SolverSpec(

@@ -1,0 +1,127 @@
+"""What a problem's structure alone tells: connected components of its blocks, and how far rows couple.
+
+Two blocks are connected where they share a moving body, or where A has an entry between them. Union-find
+with path halving; labels are numbered in the order of the first block of each component.
+"""
+from libc.stdint cimport int32_t
+
+import numpy as np
+
+
+cdef inline int32_t root_of(int32_t* parent, int32_t i) noexcept nogil:
+    while parent[i] != i:
+        parent[i] = parent[parent[i]]
+        i = parent[i]
+    return i
+
+
+cdef inline void join(int32_t* parent, int32_t i, int32_t j) noexcept nogil:
+    # the smaller number stays the root, so that a root is the first block of its component
+    i = root_of(parent, i)
+    j = root_of(parent, j)
+    if i < j:
+        parent[j] = i
+    else:
+        parent[i] = j
+
+
+cdef inline int32_t number(int32_t k, int32_t* parent, int32_t* label) noexcept nogil:
+    cdef int32_t i, r, count = 0
+    for i in range(k):
+        r = root_of(parent, i)
+        if r == i:
+            label[i] = count
+            count += 1
+        else:
+            label[i] = label[r]
+    return count
+
+
+cdef public int32_t lav_body_components(int32_t k, const int32_t* body, int32_t n_bodies, int32_t* parent,
+                                        int32_t* first, int32_t* label) noexcept nogil:
+    """Label of each of k blocks, body (k, 2) with -1 static; parent (k), first (n_bodies) are scratch."""
+    cdef int32_t i, h, b
+    for i in range(k):
+        parent[i] = i
+    for b in range(n_bodies):
+        first[b] = -1
+    for i in range(k):
+        for h in range(2):
+            b = body[2 * i + h]
+            if b < 0:
+                continue
+            if first[b] < 0:
+                first[b] = i
+            else:
+                join(parent, first[b], i)
+    return number(k, parent, label)
+
+
+cdef public int32_t lav_matrix_components(int32_t k, const int32_t* ptr, const int32_t* block, const int32_t* indptr,
+                                          const int32_t* indices, int32_t* parent, int32_t* label) noexcept nogil:
+    """The same by the entries of A in compressed rows; block (m) is the block of each row."""
+    cdef int32_t i, j, q
+    for i in range(k):
+        parent[i] = i
+    for i in range(k):
+        for j in range(ptr[i], ptr[i + 1]):
+            for q in range(indptr[j], indptr[j + 1]):
+                if block[indices[q]] != i:
+                    join(parent, i, block[indices[q]])
+    return number(k, parent, label)
+
+
+cdef public int32_t lav_body_spread(int32_t k, const int32_t* ptr, const int32_t* body, int32_t n_bodies, int32_t* low,
+                                    int32_t* high) noexcept nogil:
+    """Half-bandwidth of A at most: the widest spread of rows over one body; low, high (n_bodies) are scratch."""
+    cdef int32_t i, h, b, widest = 0
+    for b in range(n_bodies):
+        low[b] = -1
+        high[b] = -1
+    for i in range(k):
+        if ptr[i + 1] - ptr[i] - 1 > widest:
+            widest = ptr[i + 1] - ptr[i] - 1
+        for h in range(2):
+            b = body[2 * i + h]
+            if b < 0:
+                continue
+            if low[b] < 0:
+                low[b] = ptr[i]
+            high[b] = ptr[i + 1] - 1
+            if high[b] - low[b] > widest:
+                widest = high[b] - low[b]
+    return widest
+
+
+def body_components(const int32_t[:, ::1] body, int n_bodies):
+    """(number of components, label (k,)) of blocks between bodies (k, 2)."""
+    cdef int32_t k = <int32_t>body.shape[0], count = 0
+    label_array = np.zeros(k, np.int32)
+    cdef int32_t[::1] label = label_array, parent = np.empty(k + 1, np.int32), first = np.empty(n_bodies + 1, np.int32)
+    if k:
+        with nogil:
+            count = lav_body_components(k, &body[0, 0], n_bodies, &parent[0], &first[0], &label[0])
+    return count, label_array
+
+
+def matrix_components(const int32_t[::1] ptr, const int32_t[::1] block, const int32_t[::1] indptr,
+                      const int32_t[::1] indices):
+    """(number of components, label (k,)) of the blocks of a matrix in compressed rows."""
+    cdef int32_t k = <int32_t>ptr.shape[0] - 1, count = 0
+    label_array = np.zeros(k, np.int32)
+    cdef int32_t[::1] label = label_array, parent = np.empty(k + 1, np.int32)
+    cdef const int32_t* entries = &indices[0] if indices.shape[0] else NULL
+    if k:
+        with nogil:
+            count = lav_matrix_components(k, &ptr[0], &block[0], &indptr[0], entries, &parent[0], &label[0])
+    return count, label_array
+
+
+def body_spread(const int32_t[::1] ptr, const int32_t[:, ::1] body, int n_bodies):
+    """Half-bandwidth of A at most, from the bodies of each block (k, 2)."""
+    cdef int32_t k = <int32_t>body.shape[0], widest = 0
+    cdef int32_t[::1] low = np.empty(n_bodies + 1, np.int32), high = np.empty(n_bodies + 1, np.int32)
+    if k:
+        with nogil:
+            widest = lav_body_spread(k, &ptr[0], &body[0, 0], n_bodies, &low[0], &high[0])
+    return widest
