@@ -38,7 +38,7 @@ def reach_table(records: Records, levels: Sequence[float]) -> Any:
             Text(seconds(row.times[level]), style="" if row.times[level] < float("inf") else "dim")
             for level in levels
         ]
-        best = residual(row.best) + (" (floor)" if row.at_floor else "")
+        best = residual(row.best) + ("*" if row.at_floor else " ")
         status = Text(row.status, style="green" if row.status in GOOD else "yellow")
         claim = Text("✗ contradicted", style="bold red") if row.contradicted else Text("")
         if shown and row.case != shown:
@@ -141,6 +141,7 @@ def print_report(
         console.print(robustness_table(records, levels), highlight=False)
     elif any(r.step < 0 for r in records):
         console.print(reach_table(records, levels))
+        console.print("* at the floor: rounding to float64 allows no better", style="dim", highlight=False)
         console.print()
     lost = [s for s in records.skips if not s.solver]
     for skip in lost:
