@@ -9,17 +9,18 @@ D = diag d, so that both work in energy. S is a sweep of pgs or of exact blocks 
 compressed rows or over the factored form with v = M^-1 J^T lam. With the symmetric order S is a sweep and the same sweep backwards. An iterate that is shown
 is always a swept one, y. All sums run in a fixed order.
 
-(2) and its safeguards are those of mixing.pxd.
+(2) and its safeguards are those of mixing.pxd. The first `convex` iterations may sweep under the cone law:
+where contacts stick, its answer is Coulomb's.
 """
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t, uint64_t
 
 import numpy as np
 
-from lavender_ext.block cimport (CONTACT_SPIN, ROW, blocks_t, clip, n_tangents, norm2)
+from lavender_ext.block cimport (CONE, CONTACT_SPIN, ROW, blocks_t, clip, n_tangents, norm2)
 from lavender_ext.block_gs cimport solve_csr_block, solve_rows_block
 from lavender_ext.csr cimport csr_t
-from lavender_ext.mixing cimport CONTROL, MAX_MEMORY, UNDONE, mix, mixing_t, take
+from lavender_ext.mixing cimport CONTROL, MAX_MEMORY, UNDONE, forget, mix, mixing_t, take
 from lavender_ext.order cimport SYMMETRIC, advance_order
 from lavender_ext.pgs cimport relax_csr_block
 from lavender_ext.problem cimport Data
@@ -30,17 +31,20 @@ cdef enum:
     REFRESH = 64                # iterations of nncg after which v is formed anew: rounding adds up in it
 
 cdef enum:                      # places in control of nncg
-    TURN = 0                    # iterations done
-    NORM = 1                    # g.Dg of the last sweep
-    RESTARTS = 2                # beta > 1
+    NORM = 0                    # g.Dg of the last sweep
+    RESTARTS = 1                # beta > 1
 
 
 cdef struct sweep_data_t:
     const blocks_t* blocks
     const csr_t* csr            # NULL where factored
     const rows_t* rows
-    const int32_t* start        # prepared blocks, NULL for pgs
+    const int32_t* start        # prepared blocks, read where `exact` or under the cone law
     const double* g
+    int32_t exact               # sweeps over exact blocks, else pgs
+    int32_t convex              # iterations under the cone law first
+    int32_t turn                # iterations done
+    blocks_t cone               # the blocks under the cone law
     int32_t* order
     int32_t split
     int32_t mode
@@ -54,20 +58,20 @@ cdef struct sweep_data_t:
 
 
 cdef inline void sweep(const sweep_data_t* c, double* lam, int32_t first) noexcept nogil:
-    cdef const blocks_t* p = c.blocks
-    cdef int32_t i, q, k
+    cdef const blocks_t* p = &c.cone if c.turn < c.convex else c.blocks
+    cdef int32_t i, q, k, exact = c.exact or c.turn < c.convex
     for k in range(2 if c.mode == SYMMETRIC else 1):
         advance_order(c.mode, first and k == 0, c.order, 0, c.split, c.rng)
         advance_order(c.mode, first and k == 0, c.order, c.split, p.n_blocks, c.rng)
         if c.csr != NULL:
-            if c.start == NULL:
+            if not exact:
                 for q in range(p.n_blocks):
                     relax_csr_block(p, c.csr, c.order[q], lam)
             else:
                 for q in range(p.n_blocks):
                     i = c.order[q]
                     solve_csr_block(p, c.csr, i, c.g + c.start[i], lam)
-        elif c.start == NULL:
+        elif not exact:
             for q in range(p.n_blocks):
                 relax_rows_block(p, c.rows, c.order[q], lam, c.v)
         else:
@@ -127,7 +131,7 @@ cdef public void lav_nncg(sweep_data_t* c, double* lam, int32_t first_sweep, int
     cdef const double* d = c.blocks.d
     cdef double s0, s1, s2, s3, beta
     for s in range(n):
-        if control[TURN] > 0.0 and <int32_t>control[TURN] % REFRESH == 0:
+        if c.turn > 0 and c.turn % REFRESH == 0:
             form_velocity(c, lam)
         for i in range(m):
             lam[i] += q[i]
@@ -154,12 +158,14 @@ cdef public void lav_nncg(sweep_data_t* c, double* lam, int32_t first_sweep, int
         s0 = (s0 + s1) + (s2 + s3)
         for i in range(c.nv):
             x[m + i] -= c.v[i]
-        beta = s0 / control[NORM] if control[TURN] > 0.0 and control[NORM] > 0.0 else 0.0
+        beta = s0 / control[NORM] if control[NORM] > 0.0 else 0.0
         if not beta <= 1.0:
             beta = 0.0
             control[RESTARTS] += 1.0
         control[NORM] = s0
-        control[TURN] += 1.0
+        c.turn += 1
+        if c.turn == c.convex:
+            control[NORM] = 0.0                         # another map: start anew
         for i in range(m + c.nv):
             q[i] = beta * p[i]
             p[i] = q[i] - x[i]
@@ -192,6 +198,9 @@ cdef public void lav_anderson(sweep_data_t* c, double* lam, int32_t first_sweep,
             x[i] = sqrt(d[i]) * (lam[i] - x[i])
         if not take(&mixing, mixed, lam, x):
             form_velocity(c, lam)
+        c.turn += 1
+        if c.turn == c.convex:
+            forget(&mixing)                             # another map
 
 
 cdef void nncg_step(void* context, double* lam, int32_t first_sweep, int32_t n) noexcept nogil:
@@ -211,12 +220,12 @@ def allocate(Data p, int memory):
             np.zeros((nv // 6 + 1, 6)))
 
 
-def run(Data p, Watch watch, double[::1] lam, int n, double tol, int memory, prepared, space, int32_t[::1] order, int split,
-        int mode, uint64_t[::1] rng):
+def run(Data p, Watch watch, double[::1] lam, int n, double tol, int memory, prepared, bint exact, int convex, space,
+        int32_t[::1] order, int split, int mode, uint64_t[::1] rng):
     """`n` iterations in place under `watch`, GIL released: (status, iterations, sweeps, restarts so far).
 
-    prepared is None for sweeps of pgs, else (start, numbers) of block_gs.prepare; space comes from
-    `allocate`, v in it holding M^-1 J^T lam.
+    prepared is (start, numbers) of block_gs.prepare, or None where neither `exact` nor `convex` asks for it;
+    space comes from `allocate`, v in it holding M^-1 J^T lam.
     """
     cdef sweep_data_t c
     cdef int32_t status, done = 0
@@ -232,6 +241,11 @@ def run(Data p, Watch watch, double[::1] lam, int n, double tol, int memory, pre
     c.rows = &p.rows
     c.start = NULL
     c.g = NULL
+    c.exact = exact
+    c.convex = convex
+    c.turn = watch.state.total
+    c.cone = p.blocks
+    c.cone.law = CONE
     if prepared is not None:
         start, g = prepared
         c.start = &start[0]

@@ -148,3 +148,24 @@ def test_a_sliding_pile_is_solved(name):
     ]
     assert sum(slides) >= 3
     assert solution.work["sweeps"] < plain.work["sweeps"]
+
+
+@pytest.mark.parametrize("name", ["nncg", "anderson"])
+def test_starting_from_the_convex_answer(name):
+    # b is that of impulses well inside their cones: nothing slides, and the cone law's answer is Coulomb's.
+    rng = np.random.default_rng(3)
+    base = random_contact_problem(78, tangents=2, spin=False, contacts=20, bodies=8, joints=0)
+    compliance = base.compliance + 0.05
+    inside = np.c_[np.ones(20), rng.uniform(-0.1, 0.1, (20, 2))].ravel()
+    cones = lv.Cones.contacts(np.full(20, 0.8))
+    b = lv.Problem(base.b, cones, rows=base.rows, compliance=compliance).slack(inside) + base.b
+    problem = lv.Problem(b, cones, rows=base.rows, compliance=compliance)
+    convex = lv.solve(problem, name, convex=500, tol=1e-10, max_iter=50_000)
+    assert convex.success
+    assert convex.iterations < 500
+    np.testing.assert_allclose(convex.impulse, inside, atol=1e-7)  # eigenvalues of A from 0.05 to about 30
+    # And where contacts slide, the Coulomb iterations that follow correct it.
+    slippery = lv.solve(base, name, convex=10, tol=1e-8, max_iter=50_000)
+    assert slippery.success
+    with pytest.raises(lv.InputError, match="convex"):
+        lv.solve(base, name, convex=-1)

@@ -17,6 +17,7 @@ from lavender_ext import block_gs, judge, watch
 SWEEPS = ("pgs", "blocks")
 LARGEST_MEMORY = 16
 PATIENCE = 500  # iterations: on mass ratios the residual of a conjugate gradient rises for hundreds first
+CONVEX_OPTION = "iterations under the cone law first, for piles that stick; default 0"
 SWEEP_OPTION = (
     "'pgs' or 'blocks' (each contact and joint solved exactly); default: pgs, blocks for the cone law"
 )
@@ -25,10 +26,13 @@ SWEEP_OPTION = (
 class AcceleratedState(SweepState):
     """A sweep state with the memory of the acceleration and, where there are rows, v = M^-1 J^T lambda."""
 
-    def __init__(self, problem: Problem, data: Any, order: Order, blocks: bool, memory: int) -> None:
+    def __init__(
+        self, problem: Problem, data: Any, order: Order, exact: bool, convex: int, memory: int
+    ) -> None:
         super().__init__(problem, data, order)
         self.watch = watch.Watch(problem.data, PATIENCE)
-        self.prepared = block_gs.prepare(data) if blocks else None
+        self.exact, self.convex = exact, convex
+        self.prepared = block_gs.prepare(data) if exact or convex else None
         self.memory = memory
         self.space = kernels.allocate(data, memory)
         self.restarts = 0
@@ -39,6 +43,7 @@ class Accelerated(Sweeping):
     """Life cycle of an accelerated sweep; `memory` 0 is nncg."""
 
     sweep: str | None = None
+    convex: int = 0
 
     @property
     def _memory(self) -> int:
@@ -50,9 +55,12 @@ class Accelerated(Sweeping):
             raise UnknownName("sweep", self.sweep, SWEEPS)
         if self.sweep == "pgs" and problem.law == "cone":
             raise InputError("sweep='pgs' has no update for the cone law; sweep='blocks' has")
-        blocks = self.sweep == "blocks" or (self.sweep is None and problem.law == "cone")
+        if not isinstance(self.convex, int) or self.convex < 0:
+            raise InputError(f"convex is {self.convex!r}; a whole number of iterations >= 0 is needed")
+        exact = self.sweep == "blocks" or (self.sweep is None and problem.law == "cone")
+        convex = self.convex if problem.law == "coulomb" else 0
         order = block_order(problem, self.order, seed=self.seed, ground=self.ground)
-        return AcceleratedState(problem, problem.data, order, blocks, self._memory)
+        return AcceleratedState(problem, problem.data, order, exact, convex, self._memory)
 
     def run(
         self,
@@ -67,11 +75,11 @@ class Accelerated(Sweeping):
         if state.first and data.factored:
             judge.velocity_change(data, impulse, state.space[-1])
         status, done, sweeps, restarts = kernels.run(
-            data, state.watch, impulse, n, tol, state.memory, state.prepared, state.space, o.blocks, o.split,
-            o.mode, o.rng,
+            data, state.watch, impulse, n, tol, state.memory, state.prepared, state.exact, state.convex,
+            state.space, o.blocks, o.split, o.mode, o.rng,
         )  # fmt: skip
         work = {"sweeps": sweeps, "restarts": restarts - state.restarts}
         state.restarts = restarts
-        sweep = "pgs" if state.prepared is None else "blocks"
+        sweep = "blocks" if state.exact else "pgs"
         form = f"{sweep} on {'body velocities' if data.factored else 'rows of A'}"
         return replace(claim(status, done), work=work, form=form)

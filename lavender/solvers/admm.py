@@ -56,7 +56,7 @@ class AdmmState:
         self.factorisations = 0
         rows = problem.rows
         self.matrix: Any = None
-        if rows is not None and 6 * rows.n_bodies < problem.m:
+        if rows is not None and 0 < 6 * rows.n_bodies < problem.m:
             form = problem.velocity_form()
             k = form.jacobian
             # In the metric of D = diag d of the judge, which is the scale of the form.

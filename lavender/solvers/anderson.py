@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 from lavender.errors import InputError
 from lavender.registry import SolverSpec
-from lavender.solvers._accelerated import LARGEST_MEMORY, SWEEP_OPTION, Accelerated
+from lavender.solvers._accelerated import CONVEX_OPTION, LARGEST_MEMORY, SWEEP_OPTION, Accelerated
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,11 @@ SPEC = SolverSpec(
     order=True,
     seed=True,
     max_iter=1000,
-    options={"sweep": SWEEP_OPTION, "memory": "sweeps that are combined, 1 to 16; default 5"},
+    options={
+        "sweep": SWEEP_OPTION,
+        "convex": CONVEX_OPTION,
+        "memory": "sweeps that are combined, 1 to 16; default 5",
+    },
     summary="Anderson acceleration of Gauss-Seidel sweeps",
     reference="Anderson 1965; Walker, Ni 2011; Zhang, O'Donoghue, Boyd 2020 (safeguards)",
 )

@@ -14,7 +14,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from lavender.registry import SolverSpec
-from lavender.solvers._accelerated import SWEEP_OPTION, Accelerated
+from lavender.solvers._accelerated import CONVEX_OPTION, SWEEP_OPTION, Accelerated
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ SPEC = SolverSpec(
     order=True,
     seed=True,
     max_iter=1000,
-    options={"sweep": SWEEP_OPTION},
+    options={"sweep": SWEEP_OPTION, "convex": CONVEX_OPTION},
     summary="nonlinear conjugate gradients over Gauss-Seidel sweeps",
     reference="Silcowitz-Hansen, Niebe, Erleben 2010, A nonsmooth nonlinear conjugate gradient method",
 )
