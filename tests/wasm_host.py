@@ -1,6 +1,7 @@
 """A host of the WebAssembly module in Python, by wasmtime: the twin of lavender/web/page/lavender.js."""
 
 import ctypes
+import functools
 
 import numpy as np
 import wasmtime
@@ -9,12 +10,19 @@ SIZES = 10  # entries of size[]
 NEED_ROOM = 1
 
 
+@functools.cache
+def compiled(data):
+    """Engine and module: compiling takes longer than most of what the tests then run."""
+    engine = wasmtime.Engine()
+    return engine, wasmtime.Module(engine, data)
+
+
 class Kernels:
     """An instance of the module, its memory, and places in it."""
 
     def __init__(self, data, layout):
-        self.store = wasmtime.Store()
-        module = wasmtime.Module(self.store.engine, data)
+        engine, module = compiled(data)
+        self.store = wasmtime.Store(engine)
         self.exports = wasmtime.Instance(self.store, module, []).exports(self.store)
         self.memory = self.exports["memory"]
         self.layout = layout

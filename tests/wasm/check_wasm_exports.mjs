@@ -14,6 +14,7 @@ import { tmpdir } from "node:os";
 import { dirname, join } from "node:path";
 import { fileURLToPath } from "node:url";
 
+import { load } from "./problem.mjs";
 import { Kernels, ORDERS, Simulation, SOLVER_FIELDS } from "../../lavender/web/page/lavender.js";
 
 const here = dirname(fileURLToPath(import.meta.url));
@@ -154,58 +155,13 @@ function replay(scene) {
 
 function checkProblem(problem) {
   const k = new Kernels(module, recording.layout);
-  const f = k.functions;
-  const { blocks, rows, bodies, joints, contacts } = problem.counts;
-  const put = {};
-  for (const [name, place] of [...Object.entries(problem.ints), ...Object.entries(problem.reals)]) {
-    put[name] = k.alloc(Math.max(8, recorded(place).length));
-    k.bytes(put[name], recorded(place).length).set(recorded(place));
-  }
-  const out = {};
-  for (const name of ["d", "nu", "step", "slack", "error"]) {
-    out[name] = k.alloc(8 * (rows + 1));
-  }
-  const p = k.putStruct("blocks_t", {
-    n_blocks: blocks, n_rows: rows, law: problem.law, ptr: put.ptr, kind: put.kind, lower: put.lower, upper: put.upper,
-    mu: put.mu, patch_radius: put.patch_radius, b: put.b, d: out.d, nu: out.nu, step: out.step,
-  });
-  const empty = k.alloc(4 * (rows + 1));
-  const impulse = put.start;
-  const rng = k.putKeys([BigInt(problem.seed)]);
-  const score = k.alloc(k.structs.score_t.size);
-  if (problem.factored) {
-    const more = { minv_jac: 96 * (rows + 1), coupling: 40 * (contacts + 1), swing: 48 * (rows + 1) };
-    for (const [name, size] of Object.entries(more)) {
-      put[name] = k.alloc(size);
-    }
-    const r = k.putStruct("rows_t", {
-      n_bodies: bodies, n_joints: joints, n_contacts: contacts, jac: put.jac, minv_jac: put.minv_jac,
-      joint_body: put.joint_body, normal: put.normal, tangent: put.tangent, arm_a: put.arm_a, arm_b: put.arm_b,
-      contact_body: put.contact_body, coupling: put.coupling, swing: put.swing, inv_mass: put.inv_mass,
-      inv_inertia: put.inv_inertia, compliance: put.compliance,
-    });
-    const velocity = k.alloc(48 * (bodies + 1));
-    const scratch = k.alloc(48 * (bodies + 1));
-    f.lav_rows_diagonal(p, r, out.d, out.nu, out.step, empty, put.minv_jac, put.coupling, put.swing);
-    f.lav_judge_rows(p, r, impulse, out.slack, out.error, velocity, 0, score); // velocity of the start
-    f.lav_impulse_sweeps(p, r, impulse, velocity, put.order, problem.split, problem.mode, rng, 1, problem.sweeps);
-    f.lav_judge_rows(p, r, impulse, out.slack, out.error, scratch, 1, score);
-  } else {
-    const a = k.putStruct("csr_t", { indptr: put.indptr, indices: put.indices, data: put.data });
-    f.lav_csr_diagonal(p, a, out.d, out.step, empty);
-    f.lav_matrix_nu(p, out.nu);
-    if (problem.single_rows && problem.mode === 0 && problem.sweeps === 40) {
-      f.lav_pgs_rows_in_order(p, a, impulse, problem.sweeps);
-    } else {
-      f.lav_pgs_sweeps(p, a, impulse, put.order, problem.split, problem.mode, rng, 1, problem.sweeps);
-    }
-    f.lav_judge_csr(p, a, impulse, out.slack, out.error, 1, score);
-  }
-  out.impulse = impulse;
+  const loaded = load(k, problem, recorded);
+  const inOrder = problem.single_rows && problem.mode === 0 && problem.sweeps === 40;
+  loaded.sweep(problem.sweeps, inOrder);
+  const said = loaded.judge();
   for (const [name, place] of Object.entries(problem.expected)) {
-    sameBits(k.f64(out[name], rows).slice(), doubles(place), `${problem.name}: ${name}`);
+    sameBits(k.f64(loaded.out[name], problem.counts.rows).slice(), doubles(place), `${problem.name}: ${name}`);
   }
-  const said = k.readStruct("score_t", score);
   assert.deepEqual([said.energy, said.velocity, said.worst], [problem.energy, problem.velocity, problem.worst], problem.name);
 }
 

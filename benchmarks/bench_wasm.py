@@ -1,0 +1,179 @@
+"""Cost of the kernels in WebAssembly (Node) beside the native ones, on the same numbers.
+
+    python benchmarks/bench_wasm.py [--rounds 5] [--json FILE]
+
+Both sides start from the same bytes and do the same arithmetic to the last bit (tests/test_wasm.py), so a
+ratio compares code, never work. A substep is timed as a run of substeps from a settled state, restored before
+every repetition; a sweep as a run of sweeps that goes on where the last stopped. Native and Node take turns,
+round by round, and the least time of each side counts: other work on the machine only adds. One thread. Node repeats
+for at least half a second, since it first runs code that it has made quickly and replaces it between two calls.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import subprocess
+import sys
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from time import perf_counter
+from typing import Any
+
+for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(variable, "1")
+
+import numpy as np  # noqa: E402
+import scipy.sparse as sp  # noqa: E402
+
+import lavender as lv  # noqa: E402
+from lavender import registry  # noqa: E402
+from lavender.engine import Snapshot  # noqa: E402
+from lavender.engine.state import State  # noqa: E402
+from lavender.web import pages  # noqa: E402
+from lavender.web.scenes import layout  # noqa: E402
+from lavender_ext import host  # noqa: E402
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(ROOT / "tests" / "wasm"))
+
+from record import Writer, record_problem  # noqa: E402
+
+#: Scene, parameters, steps to settle, substeps of one repetition.
+SCENES: dict[str, tuple[str, dict[str, Any], int, int]] = {
+    "stack of 6": ("stack", {}, 240, 2000),
+    "pyramid of 55": ("pyramid", {}, 240, 100),
+    "chain of 20": ("chain", {}, 60, 2000),
+    "pile of 300": ("pile", {"n": 300}, 240, 50),
+}
+TARGET = 1.3  # times native
+
+
+def problems() -> dict[str, tuple[lv.Problem, int]]:
+    """Problem and sweeps of one repetition: PGS over A, sequential impulses over the factored form."""
+    rng = np.random.default_rng(0)
+    n = 20_000
+    g = sp.random_array((n, n), density=3.0 / n, rng=rng, format="csr")
+    a = (g @ g.T + sp.diags_array(np.full(n, 1.0))).tocsr()
+    simulation = lv.Simulation("pyramid")
+    for _ in range(60):
+        simulation.step()
+    factored = simulation.constraint_problem()
+    matrix = lv.Problem(
+        factored.b, factored.cones, factored.delassus(), guess=factored.guess, name="pyramid, A"
+    )
+    return {
+        f"pgs, {n} rows, {a.nnz / n:.0f} entries each": (lv.Problem.lcp(a, rng.normal(size=n)), 20),
+        f"pgs, pyramid, {matrix.m} rows with friction": (matrix, 100),
+        f"sequential impulses, pyramid, {factored.m} rows": (factored, 100),
+    }
+
+
+def give_room(simulation: lv.Simulation, substeps: int) -> None:
+    """Buffers in which the coming substeps fit, so that no repetition has to grow them."""
+    while True:
+        start = simulation.snapshot()
+        if simulation._state.kernel.substeps(substeps)[1] == substeps:
+            simulation.restore(start)
+            return
+        room = State(simulation._state.grown().size)
+        buffers = (start.size, start.real.copy(), start.index.copy(), start.keys.copy())
+        host.move(*buffers, room.size, room.real, room.index, room.keys)
+        simulation._state = room
+
+
+def start_of(writer: Writer, start: Snapshot) -> dict[str, Any]:
+    """Sizes of a snapshot, and where its buffers are."""
+    kinds = {"real": "<f8", "index": "<i4", "keys": "<u8"}
+    places = {name: writer.put(getattr(start, name), kind) for name, kind in kinds.items()}
+    return {"size": start.size.tolist(), "buffers": places}
+
+
+def native_substeps(simulation: lv.Simulation, substeps: int) -> float:
+    """Seconds of one substep."""
+    kernel = simulation._state.kernel
+    start = perf_counter()
+    _, done = kernel.substeps(substeps)
+    time = perf_counter() - start
+    if done != substeps:
+        raise RuntimeError(f"{done} of {substeps} substeps were done")
+    return time / substeps
+
+
+def native_sweeps(problem: lv.Problem, sweeps: int, repeats: int) -> float:
+    """Seconds of one sweep, the least of some runs that go on where the last stopped."""
+    spec = registry.get("pgs" if problem.rows is None else "sequential_impulses")
+    solver = spec.factory()
+    state = solver.prepare(problem)
+    impulse = problem.start() if problem.guess is None else problem.guess.copy()
+    best = np.inf
+    for _ in range(repeats):
+        start = perf_counter()
+        solver.run(state, impulse, sweeps, 0.0)
+        best = min(best, (perf_counter() - start) / sweeps)
+    return float(best)
+
+
+def main() -> None:
+    """Print the table; write it as JSON on request."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--rounds", type=int, default=5, help="turns of native and Node")
+    parser.add_argument("--repeats", type=int, default=4, help="repetitions within a turn")
+    parser.add_argument("--json", type=Path, help="file for the numbers")
+    arguments = parser.parse_args()
+    node = subprocess.run(["node", "--version"], capture_output=True, text=True, check=True).stdout.strip()
+    best: dict[str, dict[str, float]] = {}
+    with TemporaryDirectory() as folder:
+        work, writer = Path(folder), Writer()
+        (work / "lavender.wasm").write_bytes(pages.module(print))
+        scenes, starts = {}, {}
+        for name, (gallery, parameters, settle, substeps) in SCENES.items():
+            simulation = lv.Simulation(lv.Scene(gallery, **parameters))
+            for _ in range(settle):
+                simulation.step()
+            give_room(simulation, substeps)
+            starts[name] = (simulation, simulation.snapshot(), substeps)
+            scenes[name] = start_of(writer, starts[name][1]) | {"substeps": substeps}
+        cases = problems()
+        recorded = {
+            name: record_problem(writer, p, 1, "given", 0) | {"run": n} for name, (p, n) in cases.items()
+        }
+        (work / "bench.json").write_text(
+            json.dumps({"layout": layout(), "scenes": scenes, "problems": recorded}, allow_nan=False)
+        )
+        (work / "bench.bin").write_bytes(b"".join(writer.parts))
+        script = ROOT / "benchmarks" / "bench_wasm.mjs"
+        for _ in range(arguments.rounds):
+            times: dict[str, dict[str, float]] = {"native": {}, "wasm": {}}
+            for name, (simulation, snapshot, substeps) in starts.items():
+                found = []
+                for _ in range(arguments.repeats):
+                    simulation.restore(snapshot)
+                    found.append(native_substeps(simulation, substeps))
+                times["native"][name] = min(found)
+            for name, (problem, sweeps) in cases.items():
+                times["native"][name] = native_sweeps(problem, sweeps, arguments.repeats)
+            command = ["node", str(script), folder, str(arguments.repeats)]
+            done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
+            times["wasm"] = json.loads(done.stdout)
+            for side, found_times in times.items():
+                for name, time in found_times.items():
+                    entry = best.setdefault(name, {})
+                    entry[side] = min(time, entry.get(side, np.inf))
+    where = f"{platform.machine()}, CPython {platform.python_version()}, Node {node}"
+    print(f"{where}, {arguments.rounds} turns, least times\n")
+    print(f"{'':44}{'native':>12}{'wasm':>12}{'ratio':>8}")
+    for name, entry in best.items():
+        entry["ratio"] = entry["wasm"] / entry["native"]
+        unit = "sweep" if name in cases else "substep"
+        late = "" if entry["ratio"] <= TARGET else f"   above {TARGET}"
+        times_shown = "".join(f"{1e6 * entry[side]:9.2f} us" for side in ("native", "wasm"))
+        print(f"{name:44}{times_shown}{entry['ratio']:8.2f}  per {unit}{late}")
+    if arguments.json:
+        arguments.json.write_text(json.dumps({"node": node, "cases": best}, indent=1))
+
+
+if __name__ == "__main__":
+    main()

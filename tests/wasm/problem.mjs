@@ -1,0 +1,72 @@
+// A recorded problem in the memory of the module, ready to be swept and judged.
+
+// `recorded` gives the bytes of a place in the recording.
+export function load(k, problem, recorded) {
+  const f = k.functions;
+  const { blocks, rows, bodies, joints, contacts } = problem.counts;
+  const put = {};
+  for (const [name, place] of [...Object.entries(problem.ints), ...Object.entries(problem.reals)]) {
+    const bytes = recorded(place);
+    put[name] = k.alloc(Math.max(8, bytes.length));
+    k.bytes(put[name], bytes.length).set(bytes);
+  }
+  const out = { impulse: put.start };
+  for (const name of ["d", "nu", "step", "slack", "error"]) {
+    out[name] = k.alloc(8 * (rows + 1));
+  }
+  const p = k.putStruct("blocks_t", {
+    n_blocks: blocks, n_rows: rows, law: problem.law, ptr: put.ptr, kind: put.kind, lower: put.lower, upper: put.upper,
+    mu: put.mu, patch_radius: put.patch_radius, b: put.b, d: out.d, nu: out.nu, step: out.step,
+  });
+  const empty = k.alloc(4 * (rows + 1));
+  const rng = k.putKeys([BigInt(problem.seed)]);
+  const score = k.alloc(k.structs.score_t.size);
+  const order = [put.order, problem.split, problem.mode, rng];
+  let first = 1;
+  if (problem.factored) {
+    const more = { minv_jac: 96 * (rows + 1), coupling: 40 * (contacts + 1), swing: 48 * (rows + 1) };
+    for (const [name, size] of Object.entries(more)) {
+      put[name] = k.alloc(size);
+    }
+    const r = k.putStruct("rows_t", {
+      n_bodies: bodies, n_joints: joints, n_contacts: contacts, jac: put.jac, minv_jac: put.minv_jac,
+      joint_body: put.joint_body, normal: put.normal, tangent: put.tangent, arm_a: put.arm_a, arm_b: put.arm_b,
+      contact_body: put.contact_body, coupling: put.coupling, swing: put.swing, inv_mass: put.inv_mass,
+      inv_inertia: put.inv_inertia, compliance: put.compliance,
+    });
+    const velocity = k.alloc(48 * (bodies + 1));
+    const scratch = k.alloc(48 * (bodies + 1));
+    f.lav_rows_diagonal(p, r, out.d, out.nu, out.step, empty, put.minv_jac, put.coupling, put.swing);
+    f.lav_judge_rows(p, r, out.impulse, out.slack, out.error, velocity, 0, score); // velocity of the start
+    return {
+      out,
+      sweep(n) {
+        f.lav_impulse_sweeps(p, r, out.impulse, velocity, ...order, first, n);
+        first = 0;
+      },
+      judge() {
+        f.lav_judge_rows(p, r, out.impulse, out.slack, out.error, scratch, 1, score);
+        return k.readStruct("score_t", score);
+      },
+    };
+  }
+  const a = k.putStruct("csr_t", { indptr: put.indptr, indices: put.indices, data: put.data });
+  f.lav_csr_diagonal(p, a, out.d, out.step, empty);
+  f.lav_matrix_nu(p, out.nu);
+  return {
+    out,
+    // inOrder: row by row without the order array, where every block is one row and the order is as given.
+    sweep(n, inOrder = false) {
+      if (inOrder) {
+        f.lav_pgs_rows_in_order(p, a, out.impulse, n);
+      } else {
+        f.lav_pgs_sweeps(p, a, out.impulse, ...order, first, n);
+      }
+      first = 0;
+    },
+    judge() {
+      f.lav_judge_csr(p, a, out.impulse, out.slack, out.error, 1, score);
+      return k.readStruct("score_t", score);
+    },
+  };
+}
