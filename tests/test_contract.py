@@ -301,6 +301,7 @@ def test_legal_oddities_are_solved_or_refused_by_reason(name):
         lv.Problem.linear([[2.0]], [1.0]),
         lv.Problem.lcp([[2.0]], [1.0]),
         lv.Problem.lcp([[2.0]], [-1.0]),
+        lv.Problem.lcp([[-2.0]], [1.0]),
         lv.Problem.lcp(np.diag([1.0, 0.0]), [1.0, -1.0]),
         lv.Problem.lcp(np.diag([1.0, 0.0]), [1.0, 1.0], upper=3.0),
         lv.Problem.lcp(np.ones((3, 3)), [1.0, 1.0, 1.0]),

@@ -117,7 +117,10 @@ class AdmmState:
             normal = sp.csc_array(self.matrix + self.rho * sp.eye_array(m))
         import qdldl  # 60 ms, at first use
 
-        lower, diag, order = qdldl.Solver(sp.csc_matrix(normal)).factors()
+        try:
+            lower, diag, order = qdldl.Solver(sp.csc_matrix(normal)).factors()
+        except (RuntimeError, ValueError) as error:  # a zero pivot, or nothing stored at all
+            raise _Failed(f"A + rho D has no L D L^T at rho = {self.rho:.1e}: {error}") from None
         if not (np.isfinite(diag).all() and np.all(diag != 0.0)):
             raise _Failed(f"L D L^T broke down at rho = {self.rho:.1e}")
         order = np.ascontiguousarray(order, np.int32)
