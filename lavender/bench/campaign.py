@@ -21,7 +21,7 @@ from lavender.bench.plan import Plan
 from lavender.bench.record import Done, Record, Skip
 from lavender.bench.runner import Event, Watch, _not_loaded, is_foreign, solver_names
 from lavender.bench.store import Records, Store
-from lavender.bench.timing import Task, measure
+from lavender.bench.timing import Task, measure, one_thread
 from lavender.bench.worker import Worker
 from lavender.errors import InputError, LavenderError
 from lavender.problem import Problem
@@ -211,7 +211,12 @@ _worker: Worker | None = None  # one for each process, kept between pairs
 
 
 def work(pair: Pair, plan: CampaignPlan, run: str) -> tuple[int, list[Any]]:
-    """All entries of one pair; runs in a worker."""
+    """All entries of one pair; runs in a worker, on one thread: the pairs are what runs side by side."""
+    with one_thread(pair.solver):
+        return _work(pair, plan, run)
+
+
+def _work(pair: Pair, plan: CampaignPlan, run: str) -> tuple[int, list[Any]]:
     global _worker
     item = Item(pair.case, str(pair.source), _missing, pair.reason)
     try:

@@ -14,7 +14,7 @@ from lavender.bench.plan import Plan
 from lavender.bench.record import CaseInfo, Record, Run, Skip
 from lavender.bench.sequences import carry, passes
 from lavender.bench.store import Records, Store
-from lavender.bench.timing import Task, measure, measure_impulse
+from lavender.bench.timing import Task, measure, measure_impulse, one_thread
 from lavender.bench.worker import Worker
 from lavender.errors import LavenderError
 from lavender.problem import Problem
@@ -106,7 +106,8 @@ def run(
         runner = _Runner(this, plan, names, store, watch, worker if isolate else None)
         if into is not None:
             into.append(runner.out)
-        return runner.run(items)
+        with one_thread():  # describing a case computes too
+            return runner.run(items)
 
 
 class _Runner:

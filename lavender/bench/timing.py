@@ -109,11 +109,18 @@ def _thread_pools(solver: str) -> Any:
 
 @contextmanager
 def one_thread(solver: str = "") -> Iterator[None]:
-    """BLAS and OpenMP limited to one thread, the garbage collector off; after `solver` was imported."""
+    """BLAS and OpenMP limited to one thread; those that `solver` brought too, once it was imported."""
+    with _thread_pools(solver).limit(limits=1):
+        yield
+
+
+@contextmanager
+def _undisturbed(solver: str) -> Iterator[None]:
+    # One thread, the garbage collector off.
     collects = gc.isenabled()
     gc.disable()
     try:
-        with _thread_pools(solver).limit(limits=1):
+        with one_thread(solver):
             yield
     finally:
         if collects:
@@ -144,7 +151,7 @@ def measure_impulse(problem: Problem, task: Task, impulse: Any = None) -> tuple[
     solution = None
     try:
         _warm_up(task.solver)
-        with one_thread(task.solver):
+        with _undisturbed(task.solver):
             begun = perf_counter()
             for _ in range(max(1, task.repeats)):
                 solution = _once(problem, task, impulse)
