@@ -11,6 +11,7 @@ perhaps one spin row. With lambda [N s] the bounds are
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 
@@ -166,6 +167,10 @@ class Cones:
         return all(equal(getattr(self, f.name), getattr(other, f.name)) for f in fields(self))
 
     __hash__ = None  # type: ignore[assignment]
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # Arrays stay read-only in copies and pickles.
+        return type(self), tuple(getattr(self, f.name) for f in fields(self))
 
 
 def project(cones: Cones, impulse: FloatArray) -> FloatArray:

@@ -165,6 +165,10 @@ class Rows:
 
     __hash__ = None  # type: ignore[assignment]
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        # Arrays stay read-only in copies and pickles.
+        return type(self), tuple(f.name != "copy" and getattr(self, f.name) for f in fields(self))
+
 
 @dataclass(frozen=True)
 class VelocityForm:
@@ -635,6 +639,10 @@ class Problem:
         return type(self.matrix) is type(other.matrix) and equal(self.matrix, other.matrix)
 
     __hash__ = None  # type: ignore[assignment]
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # Copies and pickles hold what was given; derived numbers are made anew, arrays stay read-only.
+        return type(self), tuple(f.name != "copy" and getattr(self, f.name) for f in fields(self))
 
     def __repr__(self) -> str:
         kind = "rows" if self.rows is not None else "CSR" if sp.issparse(self.matrix) else "dense"

@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from lavender._arrays import FloatArray
+from lavender._arrays import FloatArray, read_only
 from lavender.cones import CONTACT_SPIN, ROW
 from lavender.errors import InputError
 from lavender.problem import Problem
@@ -134,8 +134,8 @@ def residual(problem: Problem, impulse: Any) -> Residual:
         worst_row=worst,
         energy_start=start_energy,
         velocity_start=start_velocity,
-        error=e,
-        slack=w,
+        error=read_only(e),
+        slack=read_only(w),
         _problem=problem,
     )
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from enum import Enum
 from types import MappingProxyType
 from typing import Any
@@ -91,6 +91,11 @@ class Solution:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "work", MappingProxyType(dict(self.work)))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # A read-only view of a dict has no pickle.
+        values = {f.name: getattr(self, f.name) for f in fields(self)}
+        return type(self), (*(values | {"work": dict(self.work)}).values(),)
 
     @property
     def slack(self) -> FloatArray:

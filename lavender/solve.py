@@ -146,11 +146,11 @@ class Prepared:
             lam = problem.start() if problem.guess is None else problem.guess.copy()
         setup_time, self.setup_time = self.setup_time, 0.0
         proof = _decide_empty_rows(problem, lam)
+        loop = _Loop(problem, self._solver, self._state, lam, tol, time_limit, history, callback)
         if proof is not None:
             claim = Claim(Status.INFEASIBLE, 0, {}, proof[0], certificate=proof[1])
-            return _finish(problem, spec, self.options, lam, claim, tol, setup_time, 0.0, None)
-        loop = _Loop(problem, self._solver, self._state, lam, tol, time_limit, history, callback)
-        claim = loop.run(max_iter) if spec.resumable else loop.run_once(max_iter)
+        else:
+            claim = loop.run(max_iter) if spec.resumable else loop.run_once(max_iter)
         return _finish(
             problem, spec, self.options, loop.impulse, claim, tol, setup_time, loop.time, loop.recorded()
         )

@@ -1,5 +1,7 @@
 """Problems: what they derive, what they keep, and every kind of bad input by its message."""
 
+import copy
+import pickle
 import subprocess
 import sys
 import warnings
@@ -278,6 +280,36 @@ def test_options_of_the_wrong_type_are_input_errors():
         lv.residual(random_lcp(0), ["a"] * 12)
     with pytest.raises(lv.InputError, match="one for each block"):
         lv.Problem.lcp(I2, [1.0, 1.0], names="ab")
+
+
+@pytest.mark.parametrize("again", [copy.copy, copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))])
+def test_problems_and_solutions_are_copied_and_pickled_after_use(again):
+    for problem in (random_lcp(0), random_contact_problem(0), as_matrix(random_contact_problem(0))):
+        solution = lv.solve(problem, "pgs", history=True)
+        twin, result = again(problem), again(solution)
+        assert twin == problem
+        assert not twin.b.flags.writeable
+        assert not twin.cones.ptr.flags.writeable
+        assert twin.rows is None or not twin.rows.jac.flags.writeable
+        np.testing.assert_array_equal(lv.solve(twin, "pgs").impulse, solution.impulse)
+        np.testing.assert_array_equal(result.slack, solution.slack)
+        assert str(result) == str(solution)
+        assert result.work == solution.work
+
+
+def test_a_solution_cannot_be_changed():
+    solution = lv.solve(random_lcp(0), "pgs")
+    for array in (solution.impulse, solution.slack, solution.residual.error):
+        with pytest.raises(ValueError, match="read-only"):
+            array[0] = 1.0
+    with pytest.raises(TypeError):
+        solution.work["sweeps"] = 0
+
+
+def test_history_is_there_where_empty_rows_decide():
+    solution = lv.solve(lv.Problem.lcp(np.diag([1.0, 0.0]), [1.0, 1.0]), "pgs", history=True)
+    assert solution.status is lv.Status.INFEASIBLE
+    assert solution.history.iterations.tolist() == [0]
 
 
 def test_large_finite_numbers_are_finite():
