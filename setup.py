@@ -8,6 +8,7 @@ Environment:
 """
 
 import json
+import logging
 import multiprocessing
 import os
 import runpy
@@ -30,7 +31,8 @@ LINK_ARGS = []
 if sys.platform == "win32":
     COMPILE_ARGS = ["/Od", "/fp:precise"] if DEBUG else ["/O2", "/fp:precise"]
 else:
-    COMPILE_ARGS = ["-O1", "-g"] if DEBUG else ["-O3", "-g0"]
+    # The update of a block goes into the sweep's loop whole: 7 to 20 % of a sweep with gcc, no change of bits.
+    COMPILE_ARGS = ["-O1", "-g"] if DEBUG else ["-O3", "-g0", "-finline-limit=2000"]
     COMPILE_ARGS += [*OPTIONS["COMPILE_FLAGS"], "-Wno-unused-function"]
     if MODE == "asan":
         LINK_ARGS = ["-fsanitize=address,undefined", "-fno-sanitize-recover=undefined"]
@@ -93,7 +95,7 @@ class BuildWasm(Command):
                 return
         reason = WASM["why_not"]()
         if reason:
-            self.announce(f"no WebAssembly module: {reason}", level=2)
+            self.announce(f"no WebAssembly module: {reason}", level=logging.INFO)
         else:
             WASM["build"](out, Path().resolve())
 

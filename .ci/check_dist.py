@@ -3,6 +3,7 @@
 python .ci/check_dist.py FOLDER        the folder with one .tar.gz and one .whl
 """
 
+import importlib.util
 import sys
 import tarfile
 import zipfile
@@ -27,7 +28,7 @@ def problems(in_sdist: set[str], in_wheel: set[str]) -> list[str]:
     sources = {
         path.relative_to(ROOT).as_posix()
         for path in packages
-        if path.is_file() and path.suffix not in {".pyc", ".so", ".pyd", ".c", ".h"}
+        if path.is_file() and path.suffix not in {".pyc", ".so", ".pyd", ".c", ".h", ".wasm"}
     }
     tests = {path.relative_to(ROOT).as_posix() for path in (ROOT / "tests").rglob("*.py")}
     kernels = {Path(name).stem for name in sources if name.endswith(".pyx")}
@@ -44,6 +45,8 @@ def problems(in_sdist: set[str], in_wheel: set[str]) -> list[str]:
         found += [] if name in in_sdist else [f"sdist lacks {name}"]
     found += [f"wheel lacks {name}" for name in sorted(sources - in_wheel)]
     found += [f"wheel lacks the compiled module lavender_ext.{name}" for name in sorted(kernels - modules)]
+    if importlib.util.find_spec("ziglang") and "lavender/web/lavender.wasm" not in in_wheel:
+        found.append("wheel lacks lavender/web/lavender.wasm, though its compiler is installed")
     if not any(name.endswith("/licenses/LICENSE") for name in in_wheel):
         found.append("wheel lacks LICENSE")
     left = [f"sdist holds {name}" for name in in_sdist if name.endswith((".c", ".h", ".so", ".pyc", ".o"))]
