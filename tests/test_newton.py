@@ -114,15 +114,18 @@ def test_interior_point_system_is_solved_and_its_steps_stay_inside(form, seed):
             assert np.linalg.norm(t) <= sc.a_t[i] * z[i] * (1 + 1e-12)
 
 
-def test_block_factor_on_a_grid_of_bodies_matches_dense():
+@pytest.mark.parametrize("few", [0, 1500])
+def test_block_factor_on_a_graph_of_bodies_matches_dense(few, monkeypatch):
     rng = np.random.default_rng(3)
     n, s = 12, 3
     body = np.array(
         [(i, j) for i in range(n) for j in range(i) if rng.random() < 0.3] + [(0, -1), (5, -1)], np.int32
     )
-    nptr, nind, rank, slot = _ipm.block_pattern(n, body)
-    node = np.where(body >= 0, rank[np.maximum(body, 0)], -1).astype(np.int32)
-    node = -np.sort(-node, axis=1)
+    monkeypatch.setattr(_ipm, "FEW_BODIES", few)
+    nptr, nind, node, slot, turned = _ipm.block_pattern(n, body)
+    assert np.array_equal(np.sort(node[turned], axis=1), node[turned][:, ::-1])
+    rank = {tuple(sorted(pair)) for pair in node.tolist()}
+    assert len(rank) == len(body)
     m = len(body)
     panel = rng.normal(size=(m, 2, s))
     panel[node[:, 1] < 0, 1] = 0.0
@@ -134,7 +137,7 @@ def test_block_factor_on_a_grid_of_bodies_matches_dense():
     index = np.arange(m + 1, dtype=np.int32)
     zero = np.zeros(m)
     elements = kernels.Elements(
-        index, np.zeros(m, np.int32), index, np.ascontiguousarray(node), slot, panel.copy(), zero, zero.copy(),
+        index, np.zeros(m, np.int32), index, node, slot, panel.copy(), zero, zero.copy(),
         zero.copy(), zero + np.inf, zero.copy(), zero.copy(), s,
     )  # fmt: skip
     structure = kernels.symbolic(nptr, nind)

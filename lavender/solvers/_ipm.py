@@ -23,9 +23,11 @@ from scipy.linalg.lapack import dpotrs as potrs
 from lavender._arrays import FloatArray, IntArray
 from lavender.cones import CONTACT, CONTACT_SPIN, ROW
 from lavender.problem import Problem
+from lavender_ext import graph
 from lavender_ext import newton as kernels
 
 CONVEX, COULOMB, AUGMENTED = 0, 1, 2  # natural maps, as in the kernel
+FEW_BODIES = 1500  # up to here bits hold the neighbours of a body
 DENSE_ROWS = 400  # below: dense LAPACK beats sparse bookkeeping
 DENSE_FILL = 0.1  # nonzero share of A above which a sparse factor is full anyway
 DENSE_LIMIT = 6000  # rows; 288 MB of A
@@ -238,10 +240,7 @@ class VelocitySystem(System):
         columns.sort()
         halves = full.reshape(-1, 2, 6)[:, :, columns] if s < 6 else full.reshape(-1, 2, 6)
         body = sc.bodies
-        nptr, nind, rank, slot = block_pattern(rows.n_bodies, body)
-        node = np.where(body >= 0, rank[np.maximum(body, 0)], -1).astype(np.int32)
-        swap = node[:, 0] < node[:, 1]
-        node[swap] = node[swap][:, ::-1]
+        nptr, nind, node, slot, swap = block_pattern(rows.n_bodies, body)
         turned = np.repeat(swap, np.diff(sc.ptr))
         halves = np.ascontiguousarray(halves)
         halves[turned] = halves[turned][:, ::-1]
@@ -407,8 +406,11 @@ class MatrixSystem(System):
         return self.solver(r)
 
 
-def block_pattern(n: int, body: IntArray) -> tuple[IntArray, IntArray, IntArray, IntArray]:
-    """Lower block rows (nptr, nind), the rank of each body in the elimination order, and slots (elements, 3)."""
+def block_pattern(n: int, body: IntArray) -> tuple[IntArray, IntArray, IntArray, IntArray, Any]:
+    """Lower block rows (nptr, nind); places (larger first) and slots of each element; which ones were turned."""
+    if n <= FEW_BODIES:
+        nptr, nind, node, slot, turned = graph.body_pattern(body, n)
+        return nptr, nind, node, slot, turned.astype(bool)
     a, b = body[:, 0].astype(np.int64), body[:, 1].astype(np.int64)
     both = (a >= 0) & (b >= 0)
     code = np.unique(np.minimum(a, b)[both] * n + np.maximum(a, b)[both])
@@ -420,13 +422,15 @@ def block_pattern(n: int, body: IntArray) -> tuple[IntArray, IntArray, IntArray,
     key = np.sort(row * n + column)
     nptr = np.concatenate([[0], np.cumsum(np.bincount(key // n, minlength=n))]).astype(np.int32)
     nind = (key % n).astype(np.int32)
-    ra, rb = np.where(a >= 0, rank[np.maximum(a, 0)], -1), np.where(b >= 0, rank[np.maximum(b, 0)], -1)
-    first, second = np.maximum(ra, rb), np.minimum(ra, rb)
+    node = np.where(body >= 0, rank[np.maximum(body, 0)], -1).astype(np.int32)
+    turned = node[:, 0] < node[:, 1]
+    node[turned] = node[turned][:, ::-1]
+    first, second = node[:, 0].astype(np.int64), node[:, 1].astype(np.int64)
     slot = np.zeros((len(body), 3), np.int32)
     slot[:, 0] = nptr[np.maximum(first, 0) + 1] - 1
     slot[:, 1] = nptr[np.maximum(second, 0) + 1] - 1
     slot[both, 2] = np.searchsorted(key, first[both] * n + second[both])
-    return nptr, nind, rank, slot
+    return nptr, nind, node, slot, turned
 
 
 def _fill_reducing(n: int, low: Any, high: Any) -> Any:

@@ -116,8 +116,8 @@ class EnergyRun(Run):
         """Of the relaxation there may be a proof, of Coulomb's problem it says nothing."""
 
 
-def refined(system: System, rhs: FloatArray, rounds: int = 8) -> FloatArray:
-    """Solve the Newton system without its proximal weight, by refinement until it gains nothing."""
+def refined(system: System, rhs: FloatArray, rounds: int = 2) -> FloatArray:
+    """Solve the Newton system without its proximal weight, by a little refinement: the next Newton step does the rest."""
     x = system.solve_natural(rhs)
     size = float(np.abs(rhs).max(initial=0.0))
     last = np.inf
