@@ -299,7 +299,7 @@ def test_threads_change_no_bit(name, monkeypatch):
     monkeypatch.setattr(_sweeping, "GRAIN", 0)
     problem = random_contact_problem(3, bodies=40, joints=20, contacts=200)
     results = {
-        t: lv.solve(problem, name, order="colored", threads=t, tol=1e-8, max_iter=300) for t in (1, 2, 3, 4)
+        t: lv.solve(problem, name, order="colored", threads=t, tol=1e-8, max_iter=40) for t in (1, 2, 3, 4)
     }
     assert len({s.impulse.tobytes() for s in results.values()}) == 1
     assert len({s.iterations for s in results.values()}) == 1
