@@ -6,8 +6,8 @@
               f = D^1/2 (y - x), over the last `memory` sweeps                                        (2)
 
 D = diag d, so that both work in energy. S is a sweep of pgs or of exact blocks (block_gs.pxd), over A in
-compressed rows or over the factored form with v = M^-1 J^T lam. With the symmetric order S is a sweep and the same sweep backwards. An iterate that is shown
-is always a swept one, y. All sums run in a fixed order.
+compressed rows or over the factored form with v = M^-1 J^T lam; with the symmetric order a sweep and the
+same sweep backwards. An iterate that is shown is always a swept one, y. All sums run in a fixed order.
 
 (2) and its safeguards are those of mixing.pxd. The first `convex` iterations may sweep under the cone law:
 where contacts stick, its answer is Coulomb's.

@@ -74,8 +74,7 @@ cdef struct admm_t:
     double* g                   # (m)
     double* before              # (m) z of the iteration before
     double* work                # (m + n)
-    double* turn                # iterations done; whether u was mixed; iterations at the next
-                                # weighing of rho; whether the shift is on
+    double* turn                # (4) iterations done; u was mixed; iterations at the next weighing; the shift is on
 
 
 cdef inline void solve_factor(const factor_t* f, double* x, double* work) noexcept nogil:
@@ -157,7 +156,8 @@ cdef inline void solve_shifted(const factor_t* f, int32_t m, double* x, double* 
         x[i] = f.e[i] * s
 
 
-cdef inline void project_block(const blocks_t* p, const double* root, int32_t i, const double* u, double* z) noexcept nogil:
+cdef inline void project_block(const blocks_t* p, const double* root, int32_t i, const double* u,
+                               double* z) noexcept nogil:
     """z = Pi_K(u) of one block, u, z whole scaled vectors; block.pxd (7)."""
     cdef int32_t j = p.ptr[i], n = p.ptr[i + 1] - j, k, nt
     cdef double at, as_, t, s, c
@@ -228,7 +228,8 @@ cdef inline double weighed(const admm_t* c) noexcept nogil:
     return s if s > 3.0 * c.rho or 3.0 * s < c.rho else c.rho
 
 
-cdef public double lav_admm(admm_t* c, const factor_t* f, const mixing_t* mixing, double* lam, int32_t* n) noexcept nogil:
+cdef public double lav_admm(admm_t* c, const factor_t* f, const mixing_t* mixing, double* lam,
+                            int32_t* n) noexcept nogil:
     """At most n iterations; n is what is left on return. Returns 0, or the rho that should be factored next."""
     cdef const blocks_t* p = c.blocks
     cdef int32_t m = p.n_rows, i, mixed

@@ -27,7 +27,8 @@ cdef inline int32_t prepared_size(const blocks_t* p, int32_t i) noexcept nogil:
     return n * n
 
 
-cdef inline void prepare_block(const blocks_t* p, int32_t i, const double* W, int32_t one_pattern, double* g) noexcept nogil:
+cdef inline void prepare_block(const blocks_t* p, int32_t i, const double* W, int32_t one_pattern,
+                               double* g) noexcept nogil:
     """g from the block's part W (n, n) of A; not for blocks of one row or of more than MAX_ROWS."""
     cdef int32_t j = p.ptr[i], n = p.ptr[i + 1] - j, q, k, free = 1
     cdef double inf = 1.0 / 0.0
@@ -66,7 +67,8 @@ cdef inline void prepare_block(const blocks_t* p, int32_t i, const double* W, in
             g[q] = W[q]
 
 
-cdef inline int32_t solve_block(const blocks_t* p, int32_t i, const double* g, const double* w, double* lam) noexcept nogil:
+cdef inline int32_t solve_block(const blocks_t* p, int32_t i, const double* g, const double* w,
+                                double* lam) noexcept nogil:
     """The exact update of block i from its slack w; lam at its first row. 1 where it fell back."""
     cdef int32_t j = p.ptr[i], n = p.ptr[i + 1] - j, kind = p.kind[i], k, t, nt, found
     cdef double q[4]
@@ -147,7 +149,8 @@ cdef inline void csr_dot3(const csr_t* a, int32_t i, const double* x, double* ou
     out[2] = s2 + t2
 
 
-cdef inline int32_t solve_csr_block(const blocks_t* p, const csr_t* a, int32_t i, const double* g, double* lam) noexcept nogil:
+cdef inline int32_t solve_csr_block(const blocks_t* p, const csr_t* a, int32_t i, const double* g,
+                                    double* lam) noexcept nogil:
     cdef int32_t j = p.ptr[i], n = p.ptr[i + 1] - j, k
     cdef double w[MAX_ROWS]
     if n > MAX_ROWS:                                    # ROW: row by row
@@ -177,7 +180,7 @@ cdef inline int32_t solve_rows_block(const blocks_t* p, const rows_t* r, int32_t
     cdef double twist[3]
     cdef const double* normal
     cdef const double* t1
-    w[0] = 0.0
+    w[0] = t2[0] = t2[1] = t2[2] = 0.0
     if c < 0:
         if n > MAX_ROWS:
             relax_joint(p, r, i, lam, v)

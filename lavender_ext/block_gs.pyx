@@ -73,7 +73,8 @@ cdef public void lav_prepare_rows(const blocks_t* p, const rows_t* r, const int3
         for k in range(n):
             change = r.minv_jac + 12 * (j + k)
             if c >= 0:
-                minv_times(row + 12 * k, r.inv_mass, r.inv_inertia, r.contact_body[2 * c], r.contact_body[2 * c + 1], push)
+                minv_times(row + 12 * k, r.inv_mass, r.inv_inertia, r.contact_body[2 * c],
+                           r.contact_body[2 * c + 1], push)
                 change = push
             for q in range(n):
                 W[n * q + k] = dot12(row + 12 * q, change)
@@ -84,9 +85,9 @@ cdef public void lav_prepare_rows(const blocks_t* p, const rows_t* r, const int3
         prepare_block(p, i, W, 0, g + start[i])
 
 
-cdef public double lav_block_sweeps_csr(const blocks_t* p, const csr_t* a, const int32_t* start, const double* g, double* lam,
-                                         int32_t* order, int32_t split, int32_t mode, uint64_t* rng, int32_t first_sweep,
-                                         int32_t n) noexcept nogil:
+cdef public double lav_block_sweeps_csr(const blocks_t* p, const csr_t* a, const int32_t* start, const double* g,
+                                        double* lam, int32_t* order, int32_t split, int32_t mode, uint64_t* rng,
+                                        int32_t first_sweep, int32_t n) noexcept nogil:
     """n sweeps over (1), order as in lav_pgs_sweeps; returns how often a block fell back."""
     cdef int32_t s, q, i
     cdef double fallbacks = 0
@@ -99,9 +100,9 @@ cdef public double lav_block_sweeps_csr(const blocks_t* p, const csr_t* a, const
     return fallbacks
 
 
-cdef public double lav_block_sweeps_rows(const blocks_t* p, const rows_t* r, const int32_t* start, const double* g, double* lam,
-                                          double* v, int32_t* order, int32_t split, int32_t mode, uint64_t* rng,
-                                          int32_t first_sweep, int32_t n) noexcept nogil:
+cdef public double lav_block_sweeps_rows(const blocks_t* p, const rows_t* r, const int32_t* start, const double* g,
+                                         double* lam, double* v, int32_t* order, int32_t split, int32_t mode,
+                                         uint64_t* rng, int32_t first_sweep, int32_t n) noexcept nogil:
     """n sweeps over (2), v (n_bodies, 6) = M^-1 J^T lam."""
     cdef int32_t s, q, i
     cdef double fallbacks = 0
@@ -146,10 +147,11 @@ cdef struct context_t:          # what a sweep needs besides lam
 cdef void step(void* context, double* lam, int32_t first_sweep, int32_t n) noexcept nogil:
     cdef context_t* c = <context_t*>context
     if c.csr == NULL:
-        c.fallbacks += lav_block_sweeps_rows(c.blocks, c.rows, c.start, c.g, lam, c.velocity, c.order, c.split, c.mode, c.rng,
-                                             first_sweep, n)
+        c.fallbacks += lav_block_sweeps_rows(c.blocks, c.rows, c.start, c.g, lam, c.velocity, c.order, c.split, c.mode,
+                                             c.rng, first_sweep, n)
     else:
-        c.fallbacks += lav_block_sweeps_csr(c.blocks, c.csr, c.start, c.g, lam, c.order, c.split, c.mode, c.rng, first_sweep, n)
+        c.fallbacks += lav_block_sweeps_csr(c.blocks, c.csr, c.start, c.g, lam, c.order, c.split, c.mode, c.rng,
+                                            first_sweep, n)
 
 
 def run(Data p, Watch watch, double[::1] lam, int n, double tol, const int32_t[::1] start, const double[::1] g,
@@ -180,8 +182,8 @@ def run(Data p, Watch watch, double[::1] lam, int n, double tol, const int32_t[:
     return status, done, int(c.fallbacks)
 
 
-def solve_contacts(int law, int tangents, bint spin, const double[:, :, ::1] W, const double[:, ::1] q, const double[::1] mu,
-                   const double[::1] patch_radius, double[:, ::1] lam):
+def solve_contacts(int law, int tangents, bint spin, const double[:, :, ::1] W, const double[:, ::1] q,
+                   const double[::1] mu, const double[::1] patch_radius, double[:, ::1] lam):
     """One-contact problems, one after the other: lam (n, rows) in place (the guess of spin on entry).
 
     Returns (n,) int32: 0 open, 1 stick, 2 slip, -1 no exact answer (lam left alone).
@@ -196,11 +198,12 @@ def solve_contacts(int law, int tangents, bint spin, const double[:, :, ::1] W, 
     return np.asarray(found)
 
 
-def solve_boxed(const double[:, :, ::1] W, const double[:, ::1] w, const double[:, ::1] step, const double[:, ::1] lower,
-                const double[:, ::1] upper, double[:, ::1] lam):
+def solve_boxed(const double[:, :, ::1] W, const double[:, ::1] w, const double[:, ::1] step,
+                const double[:, ::1] lower, const double[:, ::1] upper, double[:, ::1] lam):
     """Boxed blocks, one after the other, lam (n, rows) in place from slack w; (n,) int32: 1 exact, -1 not."""
     cdef Py_ssize_t i, n = W.shape[0]
     cdef int32_t[::1] found = np.empty(n, np.int32)
     for i in range(n):
-        found[i] = boxed_rows(<int32_t>W.shape[1], &W[i, 0, 0], &w[i, 0], &step[i, 0], &lower[i, 0], &upper[i, 0], &lam[i, 0])
+        found[i] = boxed_rows(<int32_t>W.shape[1], &W[i, 0, 0], &w[i, 0], &step[i, 0], &lower[i, 0], &upper[i, 0],
+                              &lam[i, 0])
     return np.asarray(found)

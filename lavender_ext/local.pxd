@@ -154,7 +154,7 @@ cdef inline int32_t coulomb3(const double* g, const double* q, double mu, double
     cdef double a, h0, h1, r0, r1, u0, u1, x0, x1, det, tr, hr, delta, n, P, U, U2, f, step, lo = 0.0, hi = -1.0
     cdef double hu, size
     cdef double y[3]
-    cdef int32_t i, done = 0
+    cdef int32_t i, _turn, done = 0
     if q[0] >= 0.0:
         lam[0] = 0.0
         lam[1] = 0.0
@@ -215,7 +215,7 @@ cdef inline int32_t coulomb3(const double* g, const double* q, double mu, double
             beta = lo + 1e-3 * (fabs(tr) + lo)
             if not beta > 0.0:
                 return FAILED
-    for i in range(100):
+    for _turn in range(100):
         delta = det + beta * (tr + beta)
         x0 = u0 - beta * r0
         x1 = u1 - beta * r1
@@ -262,7 +262,7 @@ cdef inline int32_t coulomb3(const double* g, const double* q, double mu, double
 cdef inline int32_t coulomb2(const double* W, const double* q, double mu, double* lam) noexcept nogil:
     """One tangent: (1)-(3) in closed form; W (2, 2)."""
     cdef double a, h, s, r, n, t, det
-    cdef int32_t k
+    cdef int32_t _side
     if q[0] >= 0.0:
         lam[0] = 0.0
         lam[1] = 0.0
@@ -280,7 +280,7 @@ cdef inline int32_t coulomb2(const double* W, const double* q, double mu, double
         lam[1] = t
         return STICK
     s = -1.0 if r > 0.0 else 1.0
-    for k in range(2):
+    for _side in range(2):
         det = 1.0 + mu * h * s
         if det > 0.0:
             n = a / det
@@ -294,10 +294,12 @@ cdef inline int32_t coulomb2(const double* W, const double* q, double mu, double
     return FAILED
 
 
-cdef inline int32_t on_ray(const double* W, const double* q, double mu, double s0, double s1, double* lam) noexcept nogil:
+cdef inline int32_t on_ray(const double* W, const double* q, double mu, double s0, double s1,
+                           double* lam) noexcept nogil:
     # The least of the energy on lam = l (1, mu s), l > 0: lam.w = 0.
     cdef double x0 = mu * s0, x1 = mu * s1
-    cdef double n = W[0] + (W[1] + W[3]) * x0 + (W[2] + W[6]) * x1 + W[4] * x0 * x0 + (W[5] + W[7]) * x0 * x1 + W[8] * x1 * x1
+    cdef double n = (W[0] + (W[1] + W[3]) * x0 + (W[2] + W[6]) * x1 + W[4] * x0 * x0 + (W[5] + W[7]) * x0 * x1
+                     + W[8] * x1 * x1)
     cdef double l = -(q[0] + q[1] * x0 + q[2] * x1) / n
     cdef double y[3]
     if not n > 0.0 or not l >= 0.0 or not l < 1e300:
@@ -317,10 +319,10 @@ cdef inline int32_t rests_singular(const double* W, const double* q, double* x) 
     # Nearly the shortest x with W x = -q, W singular: refined from W + 1e-6 diag W. 0 where there is none.
     cdef double a[9]
     cdef double y[3]
-    cdef int32_t i, j, k
+    cdef int32_t i, j, _turn
     for i in range(3):
         x[i] = 0.0
-    for k in range(4):
+    for _turn in range(4):
         for i in range(3):
             y[i] = -q[i]
             for j in range(3):
@@ -336,12 +338,12 @@ cdef inline int32_t rests_singular(const double* W, const double* q, double* x) 
 
 cdef inline int32_t cone3(const double* W, const double* q, double mu, double* lam) noexcept nogil:
     """lam (3) of (5); FAILED leaves lam alone."""
-    cdef double m2 = mu * mu, det, d1, d2, beta, top, x, t, n, f, df, step, lo, hi, side, P, U, d0
+    cdef double m2 = mu * mu, d1, d2, beta, top, f, df, step, lo, hi, side, P, U, d0
     cdef double v0[3]
     cdef double v1[3]
     cdef double v2[3]
     cdef double v[3]
-    cdef int32_t i, k, done = 0
+    cdef int32_t _turn, k, done = 0
     if q[0] >= mu * norm2(q[1], q[2]):
         lam[0] = 0.0
         lam[1] = 0.0
@@ -355,9 +357,12 @@ cdef inline int32_t cone3(const double* W, const double* q, double mu, double* l
         lam[2] = 0.0
         return SLIP if lam[0] < 1e300 else FAILED
     # v(beta) = v0 + beta v1 + beta^2 v2, det(W + beta J) = d0 + d1 beta + d2 beta^2 - mu^2 beta^3
-    v0[0] = -((W[4] * W[8] - W[5] * W[7]) * q[0] + (W[2] * W[7] - W[1] * W[8]) * q[1] + (W[1] * W[5] - W[2] * W[4]) * q[2])
-    v0[1] = -((W[5] * W[6] - W[3] * W[8]) * q[0] + (W[0] * W[8] - W[2] * W[6]) * q[1] + (W[2] * W[3] - W[0] * W[5]) * q[2])
-    v0[2] = -((W[3] * W[7] - W[4] * W[6]) * q[0] + (W[1] * W[6] - W[0] * W[7]) * q[1] + (W[0] * W[4] - W[1] * W[3]) * q[2])
+    v0[0] = -((W[4] * W[8] - W[5] * W[7]) * q[0] + (W[2] * W[7] - W[1] * W[8]) * q[1]
+              + (W[1] * W[5] - W[2] * W[4]) * q[2])
+    v0[1] = -((W[5] * W[6] - W[3] * W[8]) * q[0] + (W[0] * W[8] - W[2] * W[6]) * q[1]
+              + (W[2] * W[3] - W[0] * W[5]) * q[2])
+    v0[2] = -((W[3] * W[7] - W[4] * W[6]) * q[0] + (W[1] * W[6] - W[0] * W[7]) * q[1]
+              + (W[0] * W[4] - W[1] * W[3]) * q[2])
     v1[0] = -((W[4] + W[8]) * q[0] - W[1] * q[1] - W[2] * q[2])
     v1[1] = -(-W[3] * q[0] + (W[0] - m2 * W[8]) * q[1] + m2 * W[5] * q[2])
     v1[2] = -(-W[6] * q[0] + m2 * W[7] * q[1] + (W[0] - m2 * W[4]) * q[2])
@@ -381,7 +386,7 @@ cdef inline int32_t cone3(const double* W, const double* q, double mu, double* l
         return STICK
     # beta*: Newton from the right of every root falls onto the largest.
     top = W[0] / m2
-    for i in range(60):
+    for _turn in range(60):
         f = d0 + top * (d1 + top * (d2 - m2 * top))
         df = d1 + top * (2.0 * d2 - 3.0 * m2 * top)
         if not f < 0.0 or not df < 0.0:
@@ -398,7 +403,7 @@ cdef inline int32_t cone3(const double* W, const double* q, double mu, double* l
     lo = 0.0 if side > 0.0 else top
     hi = top if side > 0.0 else -1.0
     beta = 0.5 * top if side > 0.0 else 2.0 * top
-    for i in range(200):
+    for _turn in range(200):
         for k in range(3):
             v[k] = v0[k] + beta * (v1[k] + beta * v2[k])
         U = norm2(v[1], v[2])
@@ -435,7 +440,7 @@ cdef inline int32_t cone2(const double* W, const double* q, double mu, double* l
     """One tangent under the cone law, in closed form; W (2, 2)."""
     cdef double det, n, t, s, l
     cdef double y[2]
-    cdef int32_t k
+    cdef int32_t _side
     if q[0] >= mu * fabs(q[1]):
         lam[0] = 0.0
         lam[1] = 0.0
@@ -451,7 +456,7 @@ cdef inline int32_t cone2(const double* W, const double* q, double mu, double* l
             lam[1] = y[1]
             return STICK
     s = 1.0 if t > 0.0 else -1.0
-    for k in range(2):
+    for _side in range(2):
         n = W[0] + mu * s * (W[1] + W[2]) + mu * mu * W[3]
         l = -(q[0] + mu * s * q[1])
         if n > 0.0 and l >= 0.0 and l < 1e300 * n:
@@ -547,14 +552,15 @@ cdef inline void local_slack(int32_t m, const double* W, const double* q, const 
 
 
 cdef inline void project_locally(int32_t law, int32_t nt, int32_t spin, const double* W, const double* q,
-                                 const double* d, const double* step, double mu, double patch_radius, double* lam) noexcept nogil:
+                                 const double* d, const double* step, double mu, double patch_radius,
+                                 double* lam) noexcept nogil:
     """Where no exact answer is found: the update of block.pxd (cone: projected gradient) on the block alone."""
-    cdef int32_t m = 1 + nt + spin, sweep, i, j
+    cdef int32_t m = 1 + nt + spin, _sweep, i
     cdef double w[4]
     cdef double e[4]
     cdef double high[4]
     cdef double change, bound
-    for sweep in range(20):
+    for _sweep in range(20):
         change = 0.0
         for i in range(m):
             e[i] = lam[i]
@@ -596,7 +602,7 @@ cdef inline int32_t boxed_rows(int32_t n, const double* W, const double* w, cons
     cdef double y[MAX_ROWS]
     cdef double z[MAX_ROWS]
     cdef double s, size, change
-    cdef int32_t i, j, m, trial, wrong
+    cdef int32_t i, j, m, trial, wrong, _sweep
     for i in range(n):
         s = lam[i] - w[i] * step[i]
         at[i] = -1 if s < low[i] else (1 if s > high[i] else 0)
@@ -645,7 +651,7 @@ cdef inline int32_t boxed_rows(int32_t n, const double* W, const double* w, cons
             break
     for i in range(n):
         x[i] = lam[i]
-    for trial in range(50):
+    for _sweep in range(50):
         change = 0.0
         for i in range(n):
             s = w[i]

@@ -160,3 +160,16 @@ def test_wrong_options_are_refused():
     for alpha in (0.0, 2.0):
         with pytest.raises(lv.InputError, match="relaxation"):
             lv.solve(problem, "admm", relaxation=alpha)
+
+
+#: Real friction problems on which 20,000 sweeps fail or take thousands.
+HARD = ["fc3d_2cubes_t0", "fc3d_OneObject-i100000-499", "fc3d_LMGC_100_PR_PerioBox-i00361-60-03000"]
+
+
+@pytest.mark.parametrize("name", HARD)
+def test_real_friction_problems(problem_dir, name):
+    pytest.importorskip("h5py")
+    import lavender.io
+
+    solution = lv.solve(lavender.io.load(problem_dir / f"{name}.hdf5"), "admm", tol=1e-8, max_iter=5000)
+    assert solution.success, solution
