@@ -21,7 +21,6 @@ version = release = lavender.__version__
 
 extensions = ["sphinx.ext.autodoc", "numpydoc", "myst_parser"]
 exclude_patterns = ["_build", "generated/parts"]
-nitpicky = False
 default_role = "code"
 
 myst_enable_extensions = ["colon_fence", "deflist", "attrs_inline"]
