@@ -884,10 +884,25 @@ cdef inline bint is_high(const elements_t* e, int32_t j) noexcept nogil:
     return e.upper[j] < 1.7976931348623157e308
 
 
-cdef public double lav_ipm_start(const elements_t* e, const double* hz, double* z, double* u1, double* u2) noexcept nogil:
+cdef inline void slack_dual(const elements_t* e, int32_t i, int32_t which, const double* hz, double* c) noexcept nogil:
+    # u with G^T u = H z - g where the contact has one cone
+    cdef int32_t j = e.ptr[i], k
+    cdef double a = e.at[i] if which == 0 else e.as_[i]
+    c[0] = (hz[j] - e.g[j]) / on_normal(a)
+    if which == 0:
+        for k in range(1, cone_size(e, i, 0)):
+            c[k] = (hz[j + k] - e.g[j + k]) / on_tangent(a)
+    else:
+        k = e.ptr[i + 1] - 1
+        c[1] = (hz[k] - e.g[k]) / on_tangent(a)
+
+
+cdef public double lav_ipm_start(const elements_t* e, const double* hz, double dual, double* z, double* u1,
+                                 double* u2) noexcept nogil:
     """Puts z and u inside their cones, starting from z with (H + I) z = g; returns the degree (number of cones).
 
-    Vandenberghe 2010, section 7.3: both are shifted along the cones' axes, by one amount each.
+    Vandenberghe 2010, section 7.3: both are shifted along the cones' axes, by one amount each; u's beyond the
+    worst violation is `dual` times z's, because most rows carry load in the end.
     """
     cdef int32_t i, j, k, which, n
     cdef double worst_z = -1e300, worst_u = -1e300, size = 0.0, x, degree = 0.0, width
@@ -910,20 +925,20 @@ cdef public double lav_ipm_start(const elements_t* e, const double* hz, double* 
                 if z[j] > e.upper[j] - x:
                     z[j] = e.upper[j] - x
                 x = hz[j] - e.g[j]
-                u1[j] = size + (x if x > 0.0 else 0.0)
-                u2[j] = size + (-x if x < 0.0 else 0.0)
+                u1[j] = dual * size + (x if x > 0.0 else 0.0)
+                u2[j] = dual * size + (-x if x < 0.0 else 0.0)
                 degree += 2.0
             elif is_low(e, j):
                 x = e.lower[j] - z[j]
                 worst_z = x if x > worst_z else worst_z
-                worst_u = -x if -x > worst_u else worst_u
-                u1[j] = x
+                u1[j] = hz[j] - e.g[j]
+                worst_u = -u1[j] if -u1[j] > worst_u else worst_u
                 degree += 1.0
             elif is_high(e, j):
                 x = z[j] - e.upper[j]
                 worst_z = x if x > worst_z else worst_z
-                worst_u = -x if -x > worst_u else worst_u
-                u2[j] = x
+                u2[j] = e.g[j] - hz[j]
+                worst_u = -u2[j] if -u2[j] > worst_u else worst_u
                 degree += 1.0
             continue
         for which in range(2):
@@ -933,14 +948,13 @@ cdef public double lav_ipm_start(const elements_t* e, const double* hz, double* 
             gather(e, i, which, z, c)
             x = -cone_gap(c, n) / on_normal(e.at[i] if which == 0 else e.as_[i])
             worst_z = x if x > worst_z else worst_z
-            for k in range(n):
-                c[k] = -c[k]
+            slack_dual(e, i, which, hz, c)
             x = -cone_gap(c, n)
             worst_u = x if x > worst_u else worst_u
             store_dual(e, i, which, c, u1, u2)
             degree += 1.0
     worst_z = worst_z + size if worst_z > -1e-8 * size else 0.0
-    worst_u = worst_u + size if worst_u > -1e-8 * size else 0.0
+    worst_u = worst_u + dual * size if worst_u > -1e-8 * size else 0.0
     for i in range(e.n):
         j = e.ptr[i]
         if e.kind[i] == ROW:
@@ -1507,9 +1521,9 @@ cdef class Elements:
             <double*>address(g), <double*>address(lower), <double*>address(upper), <double*>address(at),
             <double*>address(as_), <double*>address(scaling))
 
-    def start(self, const double[::1] hz, double[::1] z, double[::1] u1, double[::1] u2):
+    def start(self, const double[::1] hz, double dual, double[::1] z, double[::1] u1, double[::1] u2):
         """z, u inside their cones; returns the degree."""
-        return lav_ipm_start(&self.e, &hz[0], &z[0], &u1[0], &u2[0])
+        return lav_ipm_start(&self.e, &hz[0], dual, &z[0], &u1[0], &u2[0])
 
     def scale(self, const double[::1] z, const double[::1] u1, const double[::1] u2, double delta, double[::1] v,
               double[::1] bt=None):

@@ -34,7 +34,8 @@ DENSE_LIMIT = 6000  # rows; 288 MB of A
 
 # Weight of the proximal term in an interior point system, relative to d: far below any step that
 # matters, far above the rounding of a pivot.
-START = 1e-6
+START = 1e-6  # W of the first point: nearly H z = g
+DUAL_START = 0.01  # size of the first duals, relative to the first impulses (measured: 0.001 to 1)
 DELTA = 1e-10
 
 
@@ -489,7 +490,7 @@ class InteriorPoint:
         sy.factor_barrier()
         self.z = sy.solve_barrier(sc.g)
         self.everything = self.z.copy()  # nearly H z = g on every row: where all of them hold, the answer
-        self.degree = sy.elements.start(sy.times(self.z), self.z, self.u1, self.u2)
+        self.degree = sy.elements.start(sy.times(self.z), DUAL_START, self.z, self.u1, self.u2)
 
     def step(self) -> bool:
         """One predictor-corrector step; False where the factorisation or the step fails."""
