@@ -7,8 +7,8 @@ list.
 
 Few bodies: every pair is tested. Many: a hash grid with one level for each power of two in size; a body
 lies in the cell of its centre, at the level whose cells are no smaller than its box, and looks into
-the neighbouring cells of coarser levels and, on its own, into those ahead. Cost is linear in bodies and pairs for any mix
-of sizes; counting sorts put the pairs in order.
+the neighbouring cells of coarser levels and, on its own, into those ahead. Cost is linear in bodies and
+pairs for any mix of sizes; counting sorts put the pairs in order.
 """
 from libc.math cimport fabs, floor
 from libc.stdint cimport int32_t, uint32_t

@@ -253,7 +253,7 @@ def test_what_lacks_room_says_so_before_any_state_has_changed():
 # -- other solvers ---------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["pgs", "block_gauss_seidel"])
+@pytest.mark.parametrize("name", ["pgs", "block_gauss_seidel", "newton", "nncg", "anderson", "admm"])
 def test_any_registered_solver_steps_the_scene(name):
     sim = lv.Simulation(lv.Scene("stack", n=3, solver=name, solver_iterations=2000))
     for _ in range(30):
