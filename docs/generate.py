@@ -641,7 +641,7 @@ def api_page(site):
     public = {
         "lavender.io": ("load", "save", "read"),
         "lavender.suite": ("case", "cases", "families", "Case", "Reference"),
-        "lavender.bench": ("run", "read", "Plan", "Record", "CaseInfo", "Records"),
+        "lavender.bench": tuple(sorted(lv.bench.__all__, key=str.lower)),
         "lavender.report": tuple(lv.report.__all__),
         "lavender.residuals": ("natural_map", "qp_residual", "siconos_error", "check_certificate"),
     }
