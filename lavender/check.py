@@ -23,7 +23,7 @@ from lavender.errors import InputError, LavenderError
 from lavender.problem import Problem
 from lavender.registry import available, get, known
 from lavender.residuals import qp_residual
-from lavender.solution import Solution
+from lavender.solution import Solution, Status
 from lavender.solve import solve
 
 __all__ = ["REFERENCES", "CrossCheck", "CrossCheckRow", "cross_check"]
@@ -35,6 +35,7 @@ SIGN_TOL = 1e-6  # multipliers of a reference: the judge has measured its accura
 
 AGREES = "agrees"
 AGREES_UNCOMPARED = "solved, nothing to compare with"
+PROVED = "no solution, as proved"
 NOT_SOLVED = "not solved"
 CONTRADICTED = "claim contradicted"
 BREACH = "breach: a residual is computed wrongly"
@@ -295,6 +296,8 @@ def _compare(problem: Problem, name: str, solution: Solution, optimum: Solution 
         return CrossCheckRow(
             name, CONTRADICTED, note=f"{solution.contradicted}; {note}".rstrip("; "), **shared
         )
+    if solution.status is Status.INFEASIBLE:  # its certificate holds, or the claim would be contradicted
+        return CrossCheckRow(name, PROVED, note=note, **shared)
     if not (solution.success or r.relative <= 2.0 * r.floor):
         return CrossCheckRow(name, NOT_SOLVED, note=note, **shared)
     return CrossCheckRow(name, AGREES if "allowed" in shared else AGREES_UNCOMPARED, note=note, **shared)

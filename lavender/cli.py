@@ -643,19 +643,23 @@ def _plain(text: str) -> str:
 @click.option("--reference", default="osqp", show_default=True, help="Whose answer to compare with.")
 @click.option("--tol", type=float, default=1e-6, show_default=True)
 def check(files: tuple[str, ...], solvers: tuple[str, ...] | None, reference: str, tol: float) -> None:
-    """Compare solvers with a reference and with the judge; exit 1 when a claim is contradicted."""
+    """Compare solvers with a reference and with the judge.
+
+    Exits with 1 when a claim is contradicted, with 2 when a file cannot be read.
+    """
     from lavender import bench
     from lavender.check import cross_check
 
     _one_thread()
     console = _console()
-    contradicted = 0
+    contradicted = unread = 0
     bench.solver_names(solvers)
     for item in bench.resolve(files):
         try:
             found = cross_check(item.problem, solvers=solvers, reference=reference, tol=tol)
         except LavenderError as error:
             console.print(f"{item.name}: {_plain(str(error))}", style="yellow", highlight=False)
+            unread += isinstance(error, InputError)
             continue
         finally:
             item.forget()
@@ -665,6 +669,8 @@ def check(files: tuple[str, ...], solvers: tuple[str, ...] | None, reference: st
     if contradicted:
         console.print(f"[bold red]{contradicted} claims are contradicted[/]")
         raise click.exceptions.Exit(EXIT_CONTRADICTED)
+    if unread:
+        raise click.exceptions.Exit(EXIT_BAD_INPUT)
 
 
 cli.add_command(web)
