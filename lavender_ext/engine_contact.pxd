@@ -164,8 +164,8 @@ cdef inline void make_contact(engine_t* e, const rows_t* r, int32_t c, int32_t r
                          e.swing + 6 * (row - e.size[N_JOINT_ROW]))
         contact_slack(r, c, 2, 0, e.v_free, w)
     else:
-        contact_diagonal(e.normal + 3 * c, e.tangent + 3 * c, e.arm_a + 3 * c, e.arm_b + 3 * c, nt, spin, da, db,
-                         e.inv_mass, e.inv_inertia, d, &t12, e.coupling + 5 * c,
+        contact_diagonal(e.normal + 3 * c, e.tangent + 3 * c, e.arm_a + 3 * c, e.arm_b + 3 * c, nt, spin,
+                         da, db, e.inv_mass, e.inv_inertia, d, &t12, e.coupling + 5 * c,
                          e.swing + 6 * (row - e.size[N_JOINT_ROW]))
         contact_slack(r, c, nt, spin, e.v_free, w)
     for k in range(1 + nt + spin):
