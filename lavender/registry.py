@@ -203,7 +203,7 @@ def get(name: str) -> SolverSpec:
         Its package is not installed; the message says what to install.
     """
     table = specs()
-    if name not in table:
+    if not isinstance(name, str) or name not in table:
         raise UnknownName("solver", name, table)
     reason = table[name].missing()
     if reason:
@@ -212,7 +212,15 @@ def get(name: str) -> SolverSpec:
 
 
 def known(problem: Problem | None = None) -> dict[str, str | None]:
-    """Every solver: None where it can be used here (and takes `problem`), else the reason it cannot."""
+    """Every solver: None where it can be used here (and takes `problem`), else the reason it cannot.
+
+    Raises
+    ------
+    InputError
+        Not a Problem.
+    """
+    if problem is not None and not isinstance(problem, Problem):
+        raise InputError(f"problem is a {type(problem).__name__}; a lavender.Problem is needed")
     return {
         name: spec.missing() or (spec.refuses(problem) if problem is not None else None)
         for name, spec in sorted(specs().items())

@@ -92,6 +92,20 @@ def test_a_contradicted_claim_is_marked(lavender, path, monkeypatch):
     assert "claim contradicted" in out
 
 
+def test_check_fails_on_a_file_it_cannot_read(lavender, path):
+    broken = path.parent / "broken.npz"
+    broken.write_bytes(path.read_bytes()[:100])
+    code, out, _ = lavender("check", broken, path, "--solvers", "direct")
+    assert code == cli.EXIT_BAD_INPUT
+    assert "broken" in out
+    assert "agrees" in out  # what can be read is checked all the same
+
+
+def test_the_package_runs_as_a_module():
+    words = [sys.executable, "-m", "lavender", "--version"]
+    assert lv.__version__ in subprocess.run(words, capture_output=True, text=True, check=True).stdout
+
+
 def test_check_passes_honest_solvers(lavender, path):
     code, out, _ = lavender("check", path, "--solvers", "pgs", "direct")
     assert code == 0

@@ -273,6 +273,13 @@ def test_suite_cases_have_a_reference_and_no_false_claims(case):
         assert row.distance is None or row.distance <= row.allowed
 
 
+def test_a_proof_that_there_is_no_solution_counts():
+    table = lv.cross_check(lv.Problem.lcp([[1.0, -1.0], [-1.0, 1.0]], [1.0, 1.0]), ["direct", "lemke", "pgs"])
+    assert [row.verdict for row in table] == [check.PROVED, check.PROVED, check.NOT_SOLVED]
+    assert table.reference is None
+    assert table.ok
+
+
 def test_the_example_runs_and_its_relation_holds(tmp_path, capsys):
     path = Path(__file__).resolve().parent.parent / "examples" / "cross_validate.py"
     spec = importlib.util.spec_from_file_location("cross_validate", path)

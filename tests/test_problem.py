@@ -330,6 +330,11 @@ def test_an_unknown_solver_gets_the_nearest_names():
     assert isinstance(raised.value, KeyError)
     with pytest.raises(lv.InputError, match="Problem is needed"):
         lv.solve(I2, "pgs")
+    for ask in (lv.available, lv.known, lv.cross_check):
+        with pytest.raises(lv.InputError, match="Problem is needed"):
+            ask(I2)
+    with pytest.raises(lv.UnknownName, match="unknown solver"):
+        lv.solve(random_lcp(0), ["pgs"])
     with pytest.raises(lv.InputError, match="capability 'fast'"):
         lv.available(fast=True)
     with pytest.raises(lv.UnknownName, match="law"):
