@@ -1,0 +1,5 @@
+"""`python -m lavender`: the command line."""
+
+from lavender.cli import main
+
+main()
