@@ -310,8 +310,13 @@ class MatrixSystem(System):
         if not sc.whole:
             a = a[sc.keep][:, sc.keep]
         self.dense = m <= DENSE_ROWS or (a.nnz > DENSE_FILL * m * m and m <= DENSE_LIMIT)
-        h = sp.diags_array(sc.scale) @ a @ sp.diags_array(sc.scale)
-        self.h: Any = np.ascontiguousarray(h.toarray()) if self.dense else sp.csr_array(h)
+        self.h: Any
+        if self.dense:
+            self.h = a.toarray()
+            self.h *= sc.scale[:, None]
+            self.h *= sc.scale
+        else:
+            self.h = sp.csr_array(sp.diags_array(sc.scale) @ a @ sp.diags_array(sc.scale))
         if len(sc.kind) < m:
             self.bt = np.zeros_like(self.v)
         # theta is on the diagonal of A already.
@@ -350,10 +355,12 @@ class MatrixSystem(System):
 
     def _sparse_lu(self, matrix: Any) -> bool:
         self.factorisations += 1
+        self.solver = lambda r: np.full_like(r, np.nan)
+        if not np.isfinite(matrix.data).all():
+            return False
         try:
             factor = ssl.splu(sp.csc_array(matrix), permc_spec="COLAMD")
         except RuntimeError:
-            self.solver = lambda r: np.full_like(r, np.nan)
             return False
         self.solver = factor.solve
         return True

@@ -35,7 +35,9 @@ FEW = 64  # rows up to which a dense factorisation does
 HEAVY = 1e3  # mass ratio at which sweeps are not tried
 LARGE = 4000  # rows from which friction goes through the relaxation
 FIRST_LOOK = 16  # sweeps before the first look at the residual
+CLOCK = 0.01  # s between two looks at the clock, at a nanosecond for each unit of work
 CAP = 800  # sweeps that may be promised; twice that for large problems
+WARM = 1e-3  # relative residual from which an iterate is worth starting from
 CERTIFICATE_ROWS = 3000  # rows up to which a linear program is asked for a certificate
 
 
@@ -138,7 +140,8 @@ def _whole(trail: Trail, name: str, budget: int) -> bool:
         return trail.done
     solver = spec.load()()
     state = solver.prepare(trail.problem)
-    impulse = trail.impulse.copy()
+    # Half-finished sweeps mislead a Newton method; Pi(0) does not.
+    impulse = trail.impulse.copy() if trail.best <= WARM else trail.problem.start()
     left = None if np.isinf(trail.deadline) else max(trail.deadline - perf_counter(), 1e-3)
     limit = min(spec.max_iter, budget - trail.iterations)
     claim: Claim = solver.run(state, impulse, limit, trail.tol, left)
@@ -163,14 +166,21 @@ def _sweeps(trail: Trail, name: str, budget: int, cap: int, tol: float | None = 
     total: dict[str, int] = {}
     done, step = 0, FIRST_LOOK
     last = trail.best
+    chunk = 10**9 if np.isinf(trail.deadline) else max(1, int(CLOCK * 1e9) // max(1, problem.data.work))
     while not trail.late:
         step = min(step, cap - done, budget - trail.iterations - done)
         if step <= 0:
             break
-        claim: Claim = solver.run(state, impulse, step, tol, None)
-        done += claim.iterations
-        for kind, count in claim.work.items():
-            total[kind] = total.get(kind, 0) + count
+        # In short runs for the clock alone: cut anywhere, sweeps give the same bits.
+        left = step
+        while left > 0:
+            claim: Claim = solver.run(state, impulse, min(left, chunk), tol, None)
+            done += claim.iterations
+            left -= claim.iterations
+            for kind, count in claim.work.items():
+                total[kind] = total.get(kind, 0) + count
+            if claim.status is not Status.MAX_ITERATIONS or trail.late:
+                break
         now = trail.offer(impulse)
         if claim.status is not Status.MAX_ITERATIONS or now <= tol:
             break
