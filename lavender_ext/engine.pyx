@@ -356,8 +356,8 @@ cdef class Buffers:
         rows = self.size[N_JOINT_ROW] + self.size[CAP_CONTACT] * self.size[ROWS_PER_CONTACT]
         cdef double[::1] scratch = np.empty(2 * rows + 1)
         with nogil:
-            lav_engine_solve_watched(&self.size[0], &self.real[0], &self.index[0], &self.keys[0], &curve[0, 0],
-                                     &scratch[0])
+            lav_engine_solve_watched(&self.size[0], &self.real[0], &self.index[0], &self.keys[0],
+                                     &curve[0, 0], &scratch[0])
 
     def apply(self):
         with nogil:
