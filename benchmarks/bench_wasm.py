@@ -5,8 +5,10 @@
 Both sides start from the same bytes and do the same arithmetic to the last bit (tests/test_wasm.py), so a
 ratio compares code, never work. A substep is timed as a run of substeps from a settled state, restored before
 every repetition; a sweep as a run of sweeps that goes on where the last stopped. Native and Node take turns,
-round by round, and the least time of each side counts: other work on the machine only adds. One thread. Node repeats
-for at least half a second, since it first runs code that it has made quickly and replaces it between two calls.
+round by round, and the least time of each side counts: other work on the machine only adds. One thread. A
+repetition takes some 2 ms, so that on a busy machine too some pass without an interruption, and each side
+repeats for at least half a second, since Node first runs code that it has made quickly and replaces it between
+two calls.
 """
 
 from __future__ import annotations
@@ -43,12 +45,13 @@ from record import Writer, record_problem  # noqa: E402
 
 #: Scene, parameters, steps to settle, substeps of one repetition.
 SCENES: dict[str, tuple[str, dict[str, Any], int, int]] = {
-    "stack of 6": ("stack", {}, 240, 2000),
-    "pyramid of 55": ("pyramid", {}, 240, 100),
-    "chain of 20": ("chain", {}, 60, 2000),
-    "pile of 300": ("pile", {"n": 300}, 240, 50),
+    "stack of 6": ("stack", {}, 240, 100),
+    "pyramid of 55": ("pyramid", {}, 240, 8),
+    "chain of 20": ("chain", {}, 60, 80),
+    "pile of 300": ("pile", {"n": 300}, 240, 4),
 }
 TARGET = 1.3  # times native
+LEAST = 0.5  # s, of repetitions in a turn, here and in bench_wasm.mjs
 
 
 def problems() -> dict[str, tuple[lv.Problem, int]]:
@@ -65,7 +68,7 @@ def problems() -> dict[str, tuple[lv.Problem, int]]:
         factored.b, factored.cones, factored.delassus(), guess=factored.guess, name="pyramid, A"
     )
     return {
-        f"pgs, {n} rows, {a.nnz / n:.0f} entries each": (lv.Problem.lcp(a, rng.normal(size=n)), 20),
+        f"pgs, {n} rows, {a.nnz / n:.0f} entries each": (lv.Problem.lcp(a, rng.normal(size=n)), 4),
         f"pgs, pyramid, {matrix.m} rows with friction": (matrix, 100),
         f"sequential impulses, pyramid, {factored.m} rows": (factored, 100),
     }
@@ -108,11 +111,12 @@ def native_sweeps(problem: lv.Problem, sweeps: int, repeats: int) -> float:
     solver = spec.factory()
     state = solver.prepare(problem)
     impulse = problem.start() if problem.guess is None else problem.guess.copy()
-    best = np.inf
-    for _ in range(repeats):
+    best, begun, done = np.inf, perf_counter(), 0
+    while done < repeats or perf_counter() - begun < LEAST:
         start = perf_counter()
         solver.run(state, impulse, sweeps, 0.0)
         best = min(best, (perf_counter() - start) / sweeps)
+        done += 1
     return float(best)
 
 
@@ -148,8 +152,8 @@ def main() -> None:
         for _ in range(arguments.rounds):
             times: dict[str, dict[str, float]] = {"native": {}, "wasm": {}}
             for name, (simulation, snapshot, substeps) in starts.items():
-                found = []
-                for _ in range(arguments.repeats):
+                begun, found = perf_counter(), []
+                while len(found) < arguments.repeats or perf_counter() - begun < LEAST:
                     simulation.restore(snapshot)
                     found.append(native_substeps(simulation, substeps))
                 times["native"][name] = min(found)
