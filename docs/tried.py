@@ -137,7 +137,7 @@ def forms():
                 continue
             cells = []
             for form in ("impulse", "velocity"):
-                s = lv.solve(problem, solver, tol=1e-9, time_limit=1.0, form=form)
+                s = lv.solve(problem, solver, tol=1e-9, time_limit=0.5, form=form)
                 cells += [residual(s.residual.relative), seconds(s.setup_time + s.solve_time)]
             rows.append((f"`{name}`", solver, *cells))
     return table(("case", "backend", "impulse form", "time", "velocity form", "time"), rows)
@@ -246,7 +246,7 @@ one eigenvalue holds the whole trace.
 ## One form for every backend
 
 The same quadratic program over impulses (A is the Hessian) or over body velocities (J is a constraint and
-is never squared). Relative residual and time at tol 1e-9, at most a second:
+is never squared). Relative residual and time at tol 1e-9, at most half a second:
 
 {forms}
 
