@@ -13,6 +13,7 @@ import numpy as np
 import lavender as lv
 
 CHECK_EVERY = 10  # iterations between two looks at the residual, counted from the start of the state
+GROWN = 1e12  # relative residual above which nothing is to be hoped for: A has a negative eigenvalue
 
 
 @dataclass
@@ -48,9 +49,12 @@ class APGD:
         problem, cones = state.problem, state.problem.cones
         before = impulse.copy() if state.before is None else state.before
         for i in range(n):
-            if tol > 0.0 and state.done % CHECK_EVERY == 0 and lv.residual(problem, impulse).relative <= tol:
-                state.before = before
-                return lv.Claim(lv.Status.CONVERGED, i, {"matvecs": i})
+            if tol > 0.0 and state.done % CHECK_EVERY == 0:
+                relative = lv.residual(problem, impulse).relative
+                if not tol < relative < GROWN:
+                    state.before = before
+                    status = lv.Status.CONVERGED if relative <= tol else lv.Status.DIVERGED
+                    return lv.Claim(status, i, {"matvecs": i})
             theta, now = state.theta, impulse.copy()
             after = 0.5 * theta * (sqrt(theta * theta + 4.0) - theta)
             y = now + theta * (1.0 - theta) / (theta * theta + after) * (now - before)
