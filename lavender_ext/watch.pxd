@@ -6,7 +6,7 @@ Checks fall at 1, 2, ... 16 sweeps, then an eighth more each time. The relative 
     r not finite, or > 1e6 max(1, r at the start)   DIVERGED
     no better than the best so far, and
         best <= 1e-6 and best <= 2 floor            AT_FLOOR
-        sweeps > 8 * sweeps of the best + patience  STALLED
+        sweeps > 32 * sweeps of the best + patience STALLED
 
 On the last three the best iterate is put back. A check costs about one sweep.
 """
@@ -88,7 +88,7 @@ cdef inline int32_t check(watch_t* s, const blocks_t* p, const csr_t* a, const r
         if s.best_relative <= 2.0 * relative(s, x.floor_energy, x.floor_velocity):
             copy(s.best, lam, p.n_rows)
             return AT_FLOOR
-    if s.total > 8 * <double>s.best_at + s.patience:
+    if s.total > 32 * <double>s.best_at + s.patience:
         copy(s.best, lam, p.n_rows)
         return STALLED
     return RUNNING
