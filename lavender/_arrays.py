@@ -67,7 +67,7 @@ def as_array(
         raise InputError(f"{what} has shape {given.shape}; {wanted} is needed")
     if dtype is np.int32 and given.size and (given.min() < -(2**31) or given.max() >= 2**31):
         raise InputError(f"{what} holds numbers beyond 32 bits")
-    array = np.array(given, dtype, order="C") if copy else np.ascontiguousarray(given, dtype)
+    array: np.ndarray = np.array(given, dtype, order="C") if copy else np.ascontiguousarray(given, dtype)
     if finite and array.dtype.kind == "f":
         _check_finite(what, array)
     return read_only(array)

@@ -27,7 +27,8 @@ def random_rows(rng, bodies=5, joints=3, contacts=8):
     """Bodies of mixed mass, joints of 1 to 3 rows (some angular), contacts; some against the ground."""
     mass = rng.uniform(0.5, 3.0, bodies)
     inertia = [
-        r @ np.diag(rng.uniform(5.0, 12.0, 3)) @ r.T / m for m, r in zip(mass, (rotation(rng) for _ in mass))
+        r @ np.diag(rng.uniform(5.0, 12.0, 3)) @ r.T / m
+        for m, r in zip(mass, (rotation(rng) for _ in mass), strict=True)
     ]
 
     def pair():
