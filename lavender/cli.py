@@ -695,6 +695,9 @@ def main(args: Sequence[str] | None = None) -> None:
         # `lavender solvers | head`: nobody reads any more.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         code = 0
+    except OSError as error:  # a full disk behind stdout, for one
+        click.echo(f"lavender: {error}", err=True)
+        code = EXIT_BAD_INPUT
     raise SystemExit(code if isinstance(code, int) else 0)
 
 

@@ -101,6 +101,16 @@ def test_check_fails_on_a_file_it_cannot_read(lavender, path):
     assert "agrees" in out  # what can be read is checked all the same
 
 
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="the device that is always full is Linux's")
+def test_a_full_disk_behind_stdout_is_one_line():
+    words = [sys.executable, "-m", "lavender", "solvers"]
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(words, stdout=full, stderr=subprocess.PIPE, text=True)
+    assert done.returncode == cli.EXIT_BAD_INPUT
+    assert done.stderr.startswith("lavender: ")
+    assert "Traceback" not in done.stderr
+
+
 def test_the_package_runs_as_a_module():
     words = [sys.executable, "-m", "lavender", "--version"]
     assert lv.__version__ in subprocess.run(words, capture_output=True, text=True, check=True).stdout
