@@ -171,7 +171,8 @@ def build(
     paths = _paths(root, modules)
     names = [name for path in paths for name in core_functions(path.read_text(encoding="utf-8"))]
     zig = [sys.executable, "-m", "ziglang"]
-    compiler = shlex.split(os.environ.get("LAVENDER_WASM_CC", "")) or [*zig, "cc", "-target", "wasm32-wasi"]
+    named = shlex.split(os.environ.get("LAVENDER_WASM_CC", ""))
+    compiler = named or [*zig, "cc", "-target", "wasm32-wasi"]
     linker = shlex.split(os.environ.get("LAVENDER_WASM_LD", "")) or [*zig, "wasm-ld"]
     options = runpy.run_path(str(root / "lavender_ext" / "build_options.py"))
     with tempfile.TemporaryDirectory(prefix="lavender-wasm-") as folder:
@@ -183,6 +184,8 @@ def build(
         flags = [
             *options["COMPILE_FLAGS"],
             *["-O3", "-g0", "-w", "-ffunction-sections", "-fdata-sections"],
+            # Older clangs call memset and memcpy where zig writes the instructions that stand for them.
+            *(["-mbulk-memory"] if named else []),
             f"-I{headers}",
         ]
 
