@@ -167,6 +167,7 @@ class System:
     form = ""
     factorisations = 0
     law = CONVEX  # of the last natural map
+    cost = 0.0  # multiply-adds of one factorisation, roughly
 
     def __init__(self, sc: Scaled) -> None:
         self.sc = sc
@@ -249,6 +250,8 @@ class VelocitySystem(System):
         self.elements = self._elements(node, slot, halves, s)
         self.structure = (nptr, nind, *kernels.symbolic(nptr, nind))
         self.y = np.zeros(self.n * s + 1)
+        columns_of_l = np.diff(self.structure[2]).astype(float)
+        self.cost = float(s**3 * np.sum(0.5 * columns_of_l**2 + columns_of_l + 1.0))
         if len(sc.kind) < sc.m and not sc.theta.any():
             self.bt = np.zeros_like(self.v)
         self.factor: Any = None
@@ -310,6 +313,7 @@ class MatrixSystem(System):
         if not sc.whole:
             a = a[sc.keep][:, sc.keep]
         self.dense = m <= DENSE_ROWS or (a.nnz > DENSE_FILL * m * m and m <= DENSE_LIMIT)
+        self.cost = m**3 / 3.0 if self.dense else 50.0 * a.nnz
         self.h: Any
         if self.dense:
             self.h = a.toarray()

@@ -34,6 +34,7 @@ NARROW = 12  # half-bandwidth up to which a band factorisation costs less than a
 FEW = 64  # rows up to which a dense factorisation does
 HEAVY = 1e3  # mass ratio at which sweeps are not tried
 LARGE = 4000  # rows from which friction goes through the relaxation
+HUGE = 40_000  # rows from which friction is left to sweeps before any factorisation
 FIRST_LOOK = 16  # sweeps before the first look at the residual
 CLOCK = 0.01  # s between two looks at the clock, at a nanosecond for each unit of work
 CAP = 800  # sweeps that may be promised; twice that for large problems
@@ -153,14 +154,14 @@ def _whole(trail: Trail, name: str, budget: int) -> bool:
     return trail.done
 
 
-def _sweeps(trail: Trail, name: str, budget: int, cap: int, tol: float | None = None) -> bool:
-    """Sweep from the best impulse as long as an end within `cap` sweeps is promised."""
+def _sweeps(trail: Trail, name: str, budget: int, cap: int, patient: bool = False, **options: Any) -> bool:
+    """Sweep from the best impulse as long as an end within `cap` sweeps is promised, or up to `cap` if patient."""
     problem = trail.problem
     spec = _usable(name, problem)
     if spec is None:
         return trail.done
-    tol = trail.tol if tol is None else tol
-    solver: Any = spec.load()()
+    tol = trail.tol
+    solver: Any = spec.load()(**options)
     state = solver.prepare(problem)
     impulse = trail.impulse.copy()
     total: dict[str, int] = {}
@@ -184,7 +185,7 @@ def _sweeps(trail: Trail, name: str, budget: int, cap: int, tol: float | None = 
         now = trail.offer(impulse)
         if claim.status is not Status.MAX_ITERATIONS or now <= tol:
             break
-        if done > 2 * FIRST_LOOK:
+        if done > 2 * FIRST_LOOK and not patient:
             gain = np.log(last / now) if 0.0 < now < last else 0.0
             if gain <= 0.0 or done + step * np.log(now / max(tol, 1e-16)) / gain > cap:
                 break
@@ -226,13 +227,12 @@ def _sweep(trail: Trail, budget: int) -> bool:
     problem = trail.problem
     if problem.law == "lcp":
         return _sweeps(trail, "nncg", budget, _cap(problem))
-    if (
-        problem.law == "coulomb"
-        and problem.m >= LARGE
-        and problem.rows is not None
-        and _relaxation(trail, budget)
-    ):
-        return True
+    if problem.law == "coulomb" and problem.m >= LARGE and problem.rows is not None:
+        if _relaxation(trail, budget):
+            return True
+        if problem.m >= HUGE:
+            # A factorisation is out of reach: sweeps, however many they take.
+            return _sweeps(trail, "nncg", budget, 10 * CAP, patient=True, order="symmetric")
     return _sweeps(trail, "anderson", budget, _cap(problem))
 
 
@@ -307,12 +307,15 @@ def _connected(trail: Trail, budget: int, swept: bool) -> None:
 
 def _relaxation(trail: Trail, budget: int) -> bool:
     """Sweep the convex relaxation, to tighter and tighter residuals as long as Coulomb's follows."""
-    convex = Trail(trail.problem.relaxed("cone"), trail.tol, trail.deadline)
+    problem = trail.problem
+    convex = Trail(problem.relaxed("cone"), trail.tol, trail.deadline)
     convex.offer(trail.impulse)
     for k in range(4):
         before = trail.best
+        if problem.m >= HUGE and k == 1:
+            break
         convex.tol = trail.tol * 0.1**k
-        _sweeps(convex, "anderson", budget - trail.iterations, _cap(trail.problem))
+        _sweeps(convex, "anderson", budget - trail.iterations, _cap(problem))
         trail.offer(convex.impulse)
         if trail.done or trail.best > 0.5 * before or convex.best > convex.tol:
             break

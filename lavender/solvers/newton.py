@@ -98,10 +98,10 @@ class Newton:
             status = Status.CONVERGED
         elif run.at_floor():
             status = Status.FLOOR
-        elif perf_counter() >= deadline:
-            status = Status.TIME_LIMIT
         elif system.factorisations >= n:
             status = Status.MAX_ITERATIONS
+        elif run.spent():
+            status = Status.TIME_LIMIT
         else:
             status = Status.STALLED
         work = {"factorisations": system.factorisations}
