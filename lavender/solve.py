@@ -240,7 +240,7 @@ class _Loop:
             while self.done < max_iter:
                 n = min(chunk, max_iter - self.done)
                 if records:
-                    n = min(n, next_count(self.done) - self.done)
+                    n = min(n, self._next_record - self.done)
                 start = perf_counter()
                 claim = self.solver.run(self.state, self.impulse, n, self.tol, None)
                 elapsed = perf_counter() - start

@@ -306,6 +306,15 @@ def test_a_solution_cannot_be_changed():
         solution.work["sweeps"] = 0
 
 
+def test_history_does_not_depend_on_the_clock(monkeypatch):
+    problem = random_lcp(0)
+    usual = lv.solve(problem, "pgs", tol=0.0, max_iter=300, history=True).history
+    monkeypatch.setattr("lavender.solve.CHUNK_TIME", 0.0)  # one sweep at a time, as on a huge problem
+    slow = lv.solve(problem, "pgs", tol=0.0, max_iter=300, history=True).history
+    np.testing.assert_array_equal(slow.iterations, usual.iterations)
+    np.testing.assert_array_equal(slow.relative, usual.relative)
+
+
 def test_history_is_there_where_empty_rows_decide():
     solution = lv.solve(lv.Problem.lcp(np.diag([1.0, 0.0]), [1.0, 1.0]), "pgs", history=True)
     assert solution.status is lv.Status.INFEASIBLE
