@@ -120,7 +120,7 @@ class EnergyRun(Run):
 
 
 def refined(system: System, rhs: FloatArray, rounds: int = 2) -> FloatArray:
-    """Solve the Newton system without its proximal weight, by a little refinement: the next Newton step does the rest."""
+    """Solve the Newton system with its proximal weight mostly refined away; the next Newton step does the rest."""
     x = system.solve_natural(rhs)
     size = float(np.abs(rhs).max(initial=0.0))
     last = np.inf
