@@ -6,7 +6,6 @@ more each time.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -53,13 +52,6 @@ def claim(status: int, done: int) -> Claim:
     return Claim(_STATUS[status], done, {"sweeps": done})
 
 
-def run_sweeps(
-    state: SweepState, impulse: FloatArray, n: int, tol: float, sweep: Callable[[int], None]
-) -> Claim:
-    """n sweeps by a Python callable, or fewer where a check ends them; tol = 0 checks nothing."""
-    return claim(*state.watch.run_python(lambda count, first: sweep(count), impulse, n, tol))
-
-
 def run_kernel(
     state: SweepState,
     impulse: FloatArray,
@@ -69,7 +61,7 @@ def run_kernel(
     omega: float = 1.0,
     scratch: FloatArray | None = None,
 ) -> Claim:
-    """The same in one call of `lavender_ext.sweeps.run`."""
+    """n sweeps in one call of `lavender_ext.sweeps.run`, or fewer where a check ends them; tol = 0 checks nothing."""
     o = state.order
     # The same bits with or without an order array; without one the kernel skips two look-ups a row.
     blocks = _ROW_BY_ROW if kind == kernels.PGS and state.data.single_rows and o.is_given else o.blocks
