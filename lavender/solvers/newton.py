@@ -86,13 +86,19 @@ class Newton:
         cold = bool(np.array_equal(impulse, problem.start()))
         z = system.sc.unknown(impulse)
         run.score(z)
-        if not run.done():
-            if problem.law == "coulomb":
-                solve_coulomb(run, z, cold)
-            else:
-                solve_convex(run, z, cold)
+        interrupted = False
+        try:
+            if not run.done():
+                if problem.law == "coulomb":
+                    solve_coulomb(run, z, cold)
+                else:
+                    solve_convex(run, z, cold)
+        except KeyboardInterrupt:
+            interrupted = True  # the best iterate goes back all the same
         impulse[:] = system.sc.impulse(run.best_z)
-        if run.certificate is not None:
+        if interrupted:
+            status = Status.INTERRUPTED
+        elif run.certificate is not None:
             status = Status.INFEASIBLE
         elif run.reached():
             status = Status.CONVERGED
