@@ -109,10 +109,16 @@ class Auto:
         if problem.m == 0:
             return Claim(Status.CONVERGED, 0, {}, "nothing to solve")
         trail.offer(impulse)
-        if n > 0 and not trail.best <= tol:
-            _solve(trail, n)
+        interrupted = False
+        try:
+            if n > 0 and not trail.best <= tol:
+                _solve(trail, n)
+        except KeyboardInterrupt:
+            interrupted = True  # the best impulse goes back all the same
         impulse[:] = trail.impulse
-        if trail.certificate is not None:
+        if interrupted:
+            status = Status.INTERRUPTED
+        elif trail.certificate is not None:
             status = Status.INFEASIBLE
         elif trail.best <= tol:
             status = Status.CONVERGED
@@ -149,6 +155,8 @@ def _whole(trail: Trail, name: str, budget: int) -> bool:
     trail.add(name, claim)
     if np.isfinite(impulse).all():
         trail.offer(impulse)
+    if claim.status is Status.INTERRUPTED:
+        raise KeyboardInterrupt
     if claim.certificate is not None and check_certificate(trail.problem, claim.certificate) is None:
         trail.certificate = claim.certificate
     return trail.done
@@ -167,12 +175,12 @@ def _sweeps(trail: Trail, name: str, budget: int, cap: int, patient: bool = Fals
     total: dict[str, int] = {}
     done, step = 0, FIRST_LOOK
     last = trail.best
-    chunk = 10**9 if np.isinf(trail.deadline) else max(1, int(CLOCK * 1e9) // max(1, problem.data.work))
+    chunk = max(1, int(CLOCK * 1e9) // max(1, problem.data.work))
     while not trail.late:
         step = min(step, cap - done, budget - trail.iterations - done)
         if step <= 0:
             break
-        # In short runs for the clock alone: cut anywhere, sweeps give the same bits.
+        # In short runs for the clock and Ctrl-C alone: cut anywhere, sweeps give the same bits.
         left = step
         while left > 0:
             claim: Claim = solver.run(state, impulse, min(left, chunk), tol, None)
@@ -262,8 +270,13 @@ def _apart(trail: Trail, count: int, label: IntArray, budget: int) -> None:
         sub = Trail(part, min(tol, 1.0) if np.isfinite(tol) else trail.tol, trail.deadline)
         sub.offer(impulse[rows])
         swept = part.m < problem.m // 2 and _sweeps_first(part)
-        if not (swept and _sweep(sub, budget - trail.iterations)):
-            _connected(sub, budget - trail.iterations, swept)
+        try:
+            if not (swept and _sweep(sub, budget - trail.iterations)):
+                _connected(sub, budget - trail.iterations, swept)
+        except KeyboardInterrupt:
+            impulse[rows] = sub.impulse
+            trail.offer(impulse)
+            raise
         impulse[rows] = sub.impulse
         trail.iterations += sub.iterations
         for kind, number in sub.work.items():
