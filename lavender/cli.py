@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import sys
 from collections.abc import Callable, Sequence
@@ -57,6 +58,7 @@ class ManyValues(click.Command):
     FITS: dict[str, Callable[[str], bool]] = {  # noqa: RUF012 - a constant of the class
         "--levels": _is_number,
         "--budgets": _is_number,
+        "--time-budgets": _is_number,
         "--solvers": _is_solver,
         "--orders": _is_order,
     }
@@ -233,6 +235,13 @@ def _plan(
     type=click.Path(path_type=Path),
     help="Earlier records (.jsonl, or their folder) to compare with.",
 )
+@click.option(
+    "--time-budgets",
+    type=Numbers(),
+    default=(),
+    metavar="S,S,...",
+    help="Seconds for which a solver is recommended; default: three decades about the fastest times.",
+)
 @click.option("--no-figures", is_flag=True, help="Leave out the SVG and PNG files.")
 def report(
     files: tuple[str, ...],
@@ -251,6 +260,7 @@ def report(
     workers: int,
     backend: str,
     compare: Path | None,
+    time_budgets: tuple[float, ...],
     no_figures: bool,
 ) -> None:
     """Speed against error: every solver on every case, to each level and at each budget.
@@ -263,6 +273,9 @@ def report(
     from lavender.report.terminal import print_report
     from lavender.report.write import write
 
+    for limit in time_budgets:
+        if not (math.isfinite(limit) and limit > 0.0):
+            raise InputError(f"time budget {limit} must be a positive number of seconds")
     console = _console()
     old = None if compare is None else bench.read(compare)
     shown = [Path(f) for f in files if f.endswith(".jsonl")]
@@ -277,8 +290,8 @@ def report(
     else:
         plan = _plan(files, levels, budgets, orders, repeats, time_limit)
         records, stopped = _measure(files, solvers, plan, out / "records.jsonl", memory, in_process, sequence)
-    print_report(records, console, old=old)
-    index = write(records, out, figures=not no_figures, old=old)
+    print_report(records, console, old=old, times=time_budgets)
+    index = write(records, out, figures=not no_figures, old=old, times=time_budgets)
     console.print(f"\n{len(records)} runs in {out / 'records.csv'}, page: [bold]{index}[/]", highlight=False)
     if stopped:
         console.print("[yellow]Stopped; the same command goes on from here.[/]")

@@ -341,10 +341,11 @@ def two_bodies(copies, ratio=1.0):
     return rows
 
 
-def pile():
-    rng = np.random.default_rng(0)
-    x = rng.standard_normal((12, 20))
-    return lv.Problem.lcp(x @ x.T, rng.standard_normal(12))
+def a_pile_among_separate_rows():
+    """Six rows, each coupled to the next two, among a hundred that nothing couples: the six decide."""
+    a = np.eye(106)
+    a[:6, :6] += np.diag(np.full(5, 0.1), 1) + np.diag(np.full(4, 0.1), 2)
+    return lv.Problem.lcp(np.maximum(a, a.T), np.ones(106))
 
 
 @pytest.mark.parametrize(
@@ -356,8 +357,11 @@ def pile():
         (lv.Problem.from_rows(two_bodies(1, 1e4)), ("stack", "large mass ratio")),
         (lv.Problem.from_rows(two_bodies(3)), ("stack", "redundant")),
         (lv.Problem.from_rows(two_bodies(1), mu=0.5, tangents=2), ("stack", "friction")),
-        (lv.Problem.lcp(lv.Problem.from_rows(two_bodies(3)).dense(), np.zeros(6)), ("stack", "redundant")),
-        (lv.Problem.linear(np.array([[2.0, 0.5], [0.0, 2.0]]), np.ones(2)), ("chain", "asymmetric")),
+        (lv.Problem.lcp(lv.Problem.from_rows(two_bodies(3)).dense(), np.zeros(6)), ("separate", "redundant")),
+        (lv.Problem.linear(np.array([[2.0, 0.01], [0.0, 2.0]]), np.ones(2)), ("separate", "asymmetric")),
+        (lv.Problem.linear(np.array([[2.0, 0.5], [0.0, 2.0]]), np.ones(2)), ("asymmetric",)),
+        (lv.Problem.contact(np.eye(9), np.ones(9), np.full(3, 0.5)), ("separate", "friction")),
+        (a_pile_among_separate_rows(), ("pile",)),
         (lv.Problem.linear(np.zeros((0, 0)), np.zeros(0)), ("empty",)),
     ],
 )
@@ -367,7 +371,7 @@ def test_structure_is_recognised(problem, words):
 
 def test_a_dense_matrix_is_no_chain():
     a = np.random.default_rng(0).standard_normal((20, 20))
-    assert bench.structure_of(lv.Problem.linear(a @ a.T + np.eye(20), np.ones(20))) == ("mesh",)
+    assert bench.structure_of(lv.Problem.linear(a @ a.T + np.eye(20), np.ones(20))) == ("dense",)
 
 
 def test_what_couples_everywhere_is_a_pile():

@@ -81,12 +81,12 @@ def test_an_unknown_backend_is_an_input_error():
 def test_the_report_of_a_campaign_shows_shares_and_no_times(tmp_path):
     records = bench.campaign(NAMES, ["pgs", "direct"], PLAN, workers=1)
     rows = {(r.family, r.solver): r for r in tables.robustness(records)}
-    mesh = rows["mesh", "direct"]
-    assert (mesh.cases, mesh.reached[1e-6], mesh.wrong, mesh.died) == (4, 4, 0, 0)
+    dense = rows["dense", "direct"]
+    assert (dense.cases, dense.reached[1e-6], dense.wrong, dense.died) == (4, 4, 0, 0)
     budget = [
         r.relative for r in records if "random_spd" in r.case and r.max_iter == 8 and r.order == "given"
     ]
-    assert rows["mesh", "pgs"].budgets[8] == (np.median(budget), max(budget))
+    assert rows["dense", "pgs"].budgets[8] == (np.median(budget), max(budget))
     text = report.write(records, tmp_path).read_text()
     assert "Campaign" in text
     assert "Which solver</h2>" not in text

@@ -183,6 +183,7 @@ def test_solvers_lists_all_with_reasons(lavender):
         (("solve", "stack(n=4)", "--solver", "pgs", "--output", "no/such/folder.npz"), "cannot write"),
         (("check", "nothing.npz"), "no such file"),
         (("report", "--levels", "many"), "not a list of numbers"),
+        (("report", "--time-budgets", "0"), "time budget 0.0 must be"),
         (("nonsense",), "No such command"),
     ],
 )

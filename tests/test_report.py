@@ -132,6 +132,25 @@ def test_advice_by_time_takes_the_best_residual_within_the_budget():
     assert by[0].best.solver == "fine"
 
 
+def test_time_budgets_are_those_given_and_the_sweeps_are_named(tmp_path):
+    budget = {"mode": "budget", "tol": 0.0, "status": "MAX_ITERATIONS", "claims": False}
+    found = records_of(
+        record("a", "pgs", 0.25, 1e-4, max_iter=8, work={"sweeps": 8}, **budget),
+        record("a", "pgs", 3.0, 1e-7, work={"sweeps": 90}),
+        record("a", "direct", 4.0, 1e-12, work={"factorisations": 1}),
+    )
+    (line,) = report.advice(found, [0.5, 5.0])
+    assert (line.name, line.size, line.sequence) == ("stack", 1, False)
+    assert {x: (a.best.solver, a.best.how) for x, a in line.by_level.items()} == {
+        1e-3: ("pgs", "8 sweeps"),
+        1e-6: ("pgs", "90 sweeps"),
+    }
+    assert {t: a.best.solver for t, a in line.by_time.items()} == {0.5: "pgs", 5.0: "direct"}
+    text = report.write(found, tmp_path, figures=False, times=[0.5, 5.0]).read_text()
+    assert "<th>in 500 ms</th><th>in 5.00 s</th>" in text.replace("\n", "")
+    assert "| in 500 ms | in 5.00 s |" in (tmp_path / "summary.md").read_text()
+
+
 def test_claims_failures_and_spreads():
     found = records_of(
         record("a", "x", 1.0, 1e-7), record("a", "x", 1.0, 1e-2, contradicted="says CONVERGED"),
@@ -209,12 +228,13 @@ class Page(html.parser.HTMLParser):
 
 @pytest.fixture(scope="module")
 def real():
-    """Records of two real problems, one named as an attacker would."""
+    """Records of three real problems, one named as an attacker would."""
     a = np.diag(np.full(8, 2.0)) - np.diag(np.ones(7), 1) - np.diag(np.ones(7), -1)
     evil = '</script><script>alert("x")</script>&|'
     problems = [
         lv.Problem.lcp(a, np.ones(8), name=evil, names=[f"<b>row {i}" for i in range(8)], guess=np.ones(8)),
         lv.Problem.linear(a, np.ones(8), name="chain"),
+        lv.Problem.lcp(a, np.linspace(1.0, 0.1, 8), name="another stack"),
     ]
     plan = bench.Plan(levels=LEVELS, budgets=(2, 4, 8), repeats=1)
     return bench.run(problems, ["pgs", "direct", "jacobi", "gauss_seidel"], plan), evil
@@ -244,8 +264,13 @@ def test_everything_asked_for_is_in_the_folder(real, tmp_path):
     report.write(records, tmp_path)
     names = {p.name for p in tmp_path.iterdir()}
     assert names == {"records.csv", "records.json", "index.html", "summary.md", "figures"}
-    figures = sorted(p.name for p in (tmp_path / "figures").iterdir())
-    assert len(figures) == 8  # two cases, two diagrams, two formats
+    shown = json.loads(
+        re.search(r'id="figures">(.*?)</script>', (tmp_path / "index.html").read_text(), re.DOTALL)[1]
+    )
+    saved = sorted(p.name for p in (tmp_path / "figures").iterdir())
+    assert saved == sorted(f"{name}.{suffix}" for name in shown for suffix in ("svg", "png"))
+    kinds = [name.split("_")[0] for name in shown]
+    assert [kinds.count(kind) for kind in ("work-precision", "budget", "family", "profile")] == [3, 3, 1, 2]
     assert all(p.stat().st_size > 1000 for p in (tmp_path / "figures").iterdir())
     text = (tmp_path / "summary.md").read_text()
     for solver in ("pgs", "direct", "jacobi", "gauss_seidel"):
@@ -312,8 +337,24 @@ def test_sequences_are_compared_carried_against_cold(tmp_path):
     assert level.iterations["carried"] < level.iterations["cold"]
     assert set(exact.residuals) == {"cold"}
     text = report.write(records, tmp_path, figures=False).read_text()
-    assert "Only sequences ran" in text
-    assert 'id="sequences"' in text
+    assert 'id="sequence-load"' in text
+    (line,) = report.advice(records, [1e-9, 10.0])
+    assert (line.name, line.size, line.sequence) == ("load", 4, True)
+    # Only an exact solver, or a run to the level, brings all four steps there; nothing is done in a nanosecond.
+    best = line.by_level[1e-6].best
+    assert (best.solved, best.cases, best.how in ("to 1e-6, cold", "to 1e-6, carried")) == (4, 4, True)
+    assert line.by_time[1e-9].best is None
+    reached = {c.solver: c for c in line.by_time[10.0].ranking}
+    means = {
+        f"{w.asked}, {start}": math.exp(np.mean(np.log(np.clip(w.residuals[start], 1e-17, 1.0))))
+        for w in (budget, level)
+        for start in ("cold", "carried")
+    }
+    assert reached["pgs"].how == min(means, key=lambda how: means[how])
+    assert reached["pgs"].score == pytest.approx(min(means.values()))
+    drawn = curves.figures(records)
+    assert [c.label for c in drawn.sequences["load"][0].curves] == ["pgs", "pgs (cold)"]
+    assert len(list(drawn)) == len(drawn.sequences["load"]) == 2  # the budget, and to the level
     assert report.reaches(records) == []  # steps are no cases of their own
 
 

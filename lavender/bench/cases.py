@@ -11,8 +11,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from lavender.bench.record import CaseInfo
+from lavender.bench.record import CaseInfo, file_name
 from lavender.cones import ROW
 from lavender.errors import InputError
 from lavender.problem import Problem
@@ -20,10 +21,11 @@ from lavender.suite import Case
 
 __all__ = ["SUFFIXES", "Item", "describe", "resolve", "structure_of"]
 
-SUFFIXES = (".npz", ".hdf5", ".h5")
+SUFFIXES = (".npz", ".hdf5", ".h5", ".hdf")
 RANK_ROWS = 300  # rows up to which the rank of A is computed, a fraction of a second
 MANIFOLD = 8  # blocks between one pair of bodies, at most
 LARGE_RATIO = 1e3  # mass ratio from which the velocity form changes everything
+ASYMMETRY = 0.1  # of A, relative: recorded contact problems stay below a hundredth
 
 
 @dataclass(eq=False)
@@ -113,9 +115,11 @@ def _from_file(path: Path) -> Item:
 
 
 def _unique_names(items: list[Item]) -> list[Item]:
+    # As files on a system that does not tell capitals, too: figures are named after cases.
     seen: dict[str, int] = {}
     for item in items:
-        n = seen[item.name] = seen.get(item.name, 0) + 1
+        key = file_name(item.name).lower()
+        n = seen[key] = seen.get(key, 0) + 1
         if n > 1:
             item.name = f"{item.name} #{n}"
     return items
@@ -173,46 +177,85 @@ def mass_ratio(problem: Problem) -> float:
 
 
 def structure_of(problem: Problem) -> tuple[str, ...]:
-    """Words that decide which solver suits: chain, stack, pile, redundant, friction, large mass ratio, asymmetric.
+    """Words that decide which solver suits, read off the numbers; a problem may have several.
 
-    From the graph of blocks (an entry of A couples them), those of one pair of bodies taken together
-    (they couple to the same blocks): at most two neighbours on average is a chain (bilateral) or a stack
-    (contacts), more is a mesh of joints or a pile. Redundant: fewer independent rows than rows, where the
-    rank is cheap to know or the counts alone prove it.
+    - The largest part of the graph that hangs together. One moving body (in a matrix: a few blocks that all
+      couple with each other, as its contacts do): "separate". At most two neighbours on average: "chain"
+      (bilateral) or "stack" (contacts). More: "mesh" of joints or "pile". A matrix that couples more than
+      half of all pairs: "dense".
+    - "redundant": fewer independent rows than rows, where the rank is cheap to know or the counts alone
+      prove it.
+    - "friction": the law. "large mass ratio": from 1000 on.
+    - "asymmetric": A is not symmetric. A matrix that is not even nearly so comes from no scene of
+      bodies, and gets no word for its shape or masses.
     """
     if problem.m == 0:
         return ("empty",)
     found = []
-    line = _neighbours(problem) <= 2.0
-    if problem.law == "linear":
-        found.append("chain" if line else "mesh")
-    else:
-        found.append("stack" if line else "pile")
+    mechanical = _asymmetry(problem) <= ASYMMETRY
+    if mechanical:
+        found.append(_shape(problem))
     if _redundant(problem):
         found.append("redundant")
     if problem.law in ("coulomb", "cone"):
         found.append("friction")
-    if mass_ratio(problem) >= LARGE_RATIO:
+    if mechanical and mass_ratio(problem) >= LARGE_RATIO:
         found.append("large mass ratio")
     if not problem.is_symmetric:
         found.append("asymmetric")
     return tuple(found)
 
 
-def _neighbours(problem: Problem) -> float:
-    # Mean number of neighbours of a group of blocks.
+def _asymmetry(problem: Problem) -> float:
+    # Largest entry of A - A^T over the largest of A.
+    if problem.rows is not None or problem.is_symmetric:
+        return 0.0
+    a = problem.csr
+    return float(abs(a - a.T).max() / abs(a).max())
+
+
+def _shape(problem: Problem) -> str:
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    n, i, j = _coupled_bodies(problem) if problem.rows is not None else _coupled_blocks(problem)
+    graph = coo_array((np.ones(len(i)), (i, j)), shape=(n, n))
+    part = connected_components(graph, directed=False)[1]
+    largest = np.bincount(part).argmax()
+    size = np.count_nonzero(part == largest)
+    neighbours = 2.0 * np.count_nonzero(part[i] == largest) / size
+    bilateral = problem.law == "linear"
+    if size == 1:
+        return "separate"
+    if neighbours <= 2.0:
+        return "chain" if bilateral else "stack"
+    if problem.rows is None and size > MANIFOLD and neighbours > 0.5 * (size - 1):
+        return "dense"
+    return "mesh" if bilateral else "pile"
+
+
+Edges = tuple[int, NDArray[np.int64], NDArray[np.int64]]  # nodes, and the ends of each edge, once
+
+
+def _coupled_bodies(problem: Problem) -> Edges:
+    # Moving bodies that a joint or a contact connects.
+    r = problem.rows
+    assert r is not None
+    ends = np.concatenate([r.joint_body, r.contact_body])
+    pairs = np.unique(np.sort(ends[(ends >= 0).any(axis=1)], axis=1), axis=0)
+    bodies, place = np.unique(pairs, return_inverse=True)
+    place = place.reshape(pairs.shape)[pairs[:, 0] >= 0]
+    # The ground, -1, stands first where there is one; bodies count from it.
+    ground = int(len(bodies) > 0 and bodies[0] < 0)
+    return max(1, len(bodies) - ground), place[:, 0] - ground, place[:, 1] - ground
+
+
+def _coupled_blocks(problem: Problem) -> Edges:
+    # Blocks that an entry of A couples; those that couple to the same blocks are the points of one manifold.
     import scipy.sparse as sp
 
     c = problem.cones
     block = np.repeat(np.arange(c.n_blocks), np.diff(c.ptr))
-    if problem.rows is not None:
-        r = problem.rows
-        body = np.concatenate([r.joint_body, r.contact_body])
-        body = np.sort(body[(body >= 0).any(axis=1)], axis=1)
-        pairs = np.unique(body, axis=0)
-        inner = pairs[pairs[:, 0] >= 0]
-        bodies = np.unique(pairs[pairs >= 0])
-        return 2.0 * len(inner) / max(1, len(bodies))
     a = problem.csr.tocoo()
     i, j = block[a.coords[0]], block[a.coords[1]]
     graph = sp.csr_array((np.ones(len(i)), (i, j)), shape=(c.n_blocks, c.n_blocks))
@@ -225,8 +268,9 @@ def _neighbours(problem: Problem) -> float:
     keys = [p if count[p] <= MANIFOLD else k for k, p in enumerate(patterns)]
     label = np.array([groups.setdefault(key, len(groups)) for key in keys])
     g = graph.tocoo()
-    edges = np.unique(np.stack([label[g.coords[0]], label[g.coords[1]]]), axis=1)
-    return float(np.count_nonzero(edges[0] != edges[1])) / max(1, len(groups))
+    i, j = label[g.coords[0]], label[g.coords[1]]
+    edges = np.unique(np.stack([i[i < j], j[i < j]]), axis=1)
+    return len(groups), edges[0], edges[1]
 
 
 def _redundant(problem: Problem) -> bool:

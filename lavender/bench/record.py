@@ -3,11 +3,23 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
 from typing import Any
 
-__all__ = ["CaseInfo", "Done", "Entry", "Record", "Run", "Skip", "from_json", "level_name", "to_json"]
+__all__ = [
+    "CaseInfo",
+    "Done",
+    "Entry",
+    "Record",
+    "Run",
+    "Skip",
+    "file_name",
+    "from_json",
+    "level_name",
+    "to_json",
+]
 
 # Beside the statuses of a solve: what can happen to a run that brings no solution back.
 ERROR, KILLED, CRASHED = "ERROR", "KILLED", "CRASHED"
@@ -18,6 +30,11 @@ def level_name(level: float) -> str:
     mantissa, _, exponent = f"{level:.3e}".partition("e")
     mantissa = mantissa.rstrip("0").rstrip(".")
     return f"{mantissa}e{int(exponent)}"
+
+
+def file_name(name: str) -> str:
+    """A name that every file system, and the address of a part of a page, takes."""
+    return re.sub(r"[^A-Za-z0-9._-]+", "_", name).strip("_.")[:120] or "figure"
 
 
 @dataclass(frozen=True)

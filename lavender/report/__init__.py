@@ -6,7 +6,9 @@ lavender.report.write(records, "report")  # records.csv, records.json, figures, 
 """
 
 from lavender.report.tables import (
+    advice,
     advice_by_level,
+    advice_by_sequence,
     advice_by_time,
     claims,
     failures,
@@ -15,11 +17,14 @@ from lavender.report.tables import (
     profiles,
     reaches,
     spreads,
+    walks,
 )
 from lavender.report.write import write
 
 __all__ = [
+    "advice",
     "advice_by_level",
+    "advice_by_sequence",
     "advice_by_time",
     "claims",
     "failures",
@@ -28,5 +33,6 @@ __all__ = [
     "profiles",
     "reaches",
     "spreads",
+    "walks",
     "write",
 ]

@@ -1,9 +1,9 @@
-"""Points of every figure, once, for the interactive page and for SVG and PNG alike."""
+"""Points of every figure, once: `figures` lists those of a report, for its page and for SVG and PNG alike."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from statistics import median
 
@@ -12,7 +12,17 @@ from lavender.bench.store import Records
 from lavender.report import tables
 from lavender.report.text import residual, seconds
 
-__all__ = ["Curve", "Figure", "budget_figure", "profile_figure", "walk_figure", "work_precision"]
+__all__ = [
+    "Curve",
+    "Figure",
+    "Figures",
+    "budget_figure",
+    "family_figure",
+    "figures",
+    "profile_figure",
+    "walk_figure",
+    "work_precision",
+]
 
 TINY = 1e-17  # where a residual of exactly zero is drawn
 
@@ -162,23 +172,24 @@ def budget_figure(records: Records, case: str) -> Figure:
     )  # fmt: skip
 
 
-def walk_figure(walk: tables.Walk) -> Figure:
-    """Residual of each step of a sequence, cold and carried."""
-    asked = f"{walk.max_iter} iterations" if walk.mode == "budget" else f"to {level_name(walk.tol)}"
+def walk_figure(sequence: str, walks: list[tables.Walk]) -> Figure:
+    """Residual of each step of a sequence at one budget: carried (solid marks) and cold (open), by solver."""
     curves = [
         Curve(
-            walk.solver,
-            start,
+            w.solver,
+            w.solver if start == "carried" or len(w.residuals) == 1 else f"{w.solver} ({start})",
             tuple(float(i) for i in range(len(values))),
             tuple(max(x, TINY) if math.isfinite(x) else math.nan for x in values),
-            tuple(f"{walk.solver} ({start}), step {i}: relative {residual(x)}" for i, x in enumerate(values)),
-            thin=start == "cold",
+            tuple(f"{w.solver} ({start}), step {i}: relative {residual(x)}" for i, x in enumerate(values)),
+            thin=start == "cold" and len(w.residuals) > 1,
         )
-        for start, values in sorted(walk.residuals.items())
+        for w in walks
+        for start, values in sorted(w.residuals.items())
     ]
+    asked = walks[0].asked
     return Figure(
-        f"sequence {walk.sequence} {walk.solver} {asked}", f"{walk.sequence}: {walk.solver}, {asked}",
-        "step", "relative residual [-]", tuple(curves), x_log=False,
+        f"sequence {sequence} {asked}", f"{sequence}: {asked}", "step", "relative residual [-]", tuple(curves),
+        x_log=False,
     )  # fmt: skip
 
 
@@ -203,3 +214,49 @@ def profile_figure(profile: tables.Profile) -> Figure:
         f"{profile.law}, to {level_name(profile.level)} ({profile.cases} cases)",
         "time / fastest time", "cases solved [%]", tuple(curves), y_log=False,
     )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Figures:
+    """Every figure of a report, in the places where its page shows them; those without a curve are left out."""
+
+    cases: Mapping[str, tuple[Figure, ...]]  # error against time, residual against iterations
+    families: Mapping[str, Figure]
+    profiles: Mapping[str, tuple[Figure, ...]]  # by problem class, one for each level
+    sequences: Mapping[str, tuple[Figure, ...]]
+
+    def __iter__(self) -> Iterator[Figure]:
+        yield from self.families.values()
+        for group in (self.profiles, self.sequences, self.cases):
+            for some in group.values():
+                yield from some
+
+
+def figures(records: Records) -> Figures:
+    """The figures of the records; none of a campaign, whose tables say it."""
+    if tables.is_campaign(records):
+        return Figures({}, {}, {}, {})
+    cases = dict.fromkeys(r.case for r in records if r.step < 0)
+    families = {f: family_figure(records, f, cs) for f, cs in tables.families(records).items() if len(cs) > 1}
+    profiles: dict[str, list[Figure]] = {}
+    for profile in tables.profiles(records):
+        if profile.cases > 1:
+            profiles.setdefault(profile.law, []).append(profile_figure(profile))
+    return Figures(
+        {c: _drawn(work_precision(records, c), budget_figure(records, c)) for c in cases},
+        {f: figure for f, figure in families.items() if figure.curves},
+        {law: _drawn(*some) for law, some in profiles.items()},
+        {name: _walk_figures(name, walks) for name, walks in tables.by_sequence(records).items()},
+    )
+
+
+def _drawn(*some: Figure) -> tuple[Figure, ...]:
+    return tuple(figure for figure in some if figure.curves)
+
+
+def _walk_figures(name: str, walks: list[tables.Walk]) -> tuple[Figure, ...]:
+    # The middle budget, and the solvers that have none.
+    budgets = sorted({w.max_iter for w in walks if w.mode == "budget"})
+    middle = [w for w in walks if w.mode == "budget" and w.max_iter == budgets[len(budgets) // 2]]
+    levels = [w for w in walks if w.mode == "tol"]
+    return tuple(walk_figure(name, some) for some in (middle, levels) if some)

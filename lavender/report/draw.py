@@ -2,22 +2,15 @@
 
 from __future__ import annotations
 
-import io
 import math
-import re
 from pathlib import Path
 from typing import Any
 
-from lavender.bench.record import level_name
+from lavender.bench.record import file_name, level_name
 from lavender.report.curves import Figure
 from lavender.report.style import Look
 
-__all__ = ["file_name", "matplotlib_figure", "plotly_data", "save", "svg"]
-
-
-def file_name(name: str) -> str:
-    """A name that every file system takes."""
-    return re.sub(r"[^A-Za-z0-9._-]+", "_", name).strip("_.")[:120] or "figure"
+__all__ = ["matplotlib_figure", "plotly_data", "save"]
 
 
 def seconds_on_axis(t: float, _position: object = None) -> str:
@@ -100,14 +93,6 @@ def save(figure: Figure, look: dict[str, Look], folder: Path) -> None:
     path = folder / file_name(figure.name)
     canvas.savefig(path.with_name(path.name + ".svg"), metadata={"Date": None})
     canvas.savefig(path.with_name(path.name + ".png"), dpi=110, metadata={"Software": None})
-
-
-def svg(figure: Figure, look: dict[str, Look]) -> str:
-    """The figure as an <svg> element for a page."""
-    out = io.StringIO()
-    matplotlib_figure(figure, look).savefig(out, format="svg", metadata={"Date": None})
-    text = out.getvalue()
-    return text[text.index("<svg") :]
 
 
 def plotly_data(figure: Figure, look: dict[str, Look]) -> dict[str, Any]:

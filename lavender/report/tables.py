@@ -18,26 +18,34 @@ from lavender.bench.store import Records
 __all__ = [
     "Advice",
     "Change",
+    "Choice",
     "Claims",
     "Failure",
+    "Line",
     "Profile",
     "Reach",
     "Robustness",
     "Spread",
     "Walk",
+    "advice",
     "advice_by_level",
+    "advice_by_sequence",
     "advice_by_time",
     "budgets",
+    "by_sequence",
     "changes",
     "claims",
     "failures",
     "families",
     "geometric_means",
+    "is_campaign",
     "levels_of",
+    "limit_of",
     "pairs",
     "profiles",
     "reaches",
     "robustness",
+    "shift_of",
     "spreads",
     "time_budgets",
     "walks",
@@ -105,13 +113,14 @@ class Claims:
 
 @dataclass(frozen=True)
 class Choice:
-    """One solver's standing in a family."""
+    """One solver's standing in a family of cases, or over the steps of a sequence."""
 
     solver: str
     solved: int
     cases: int
     score: float  # what ranks: shifted geometric mean of times [s], or geometric mean of residuals
     typical: float  # s, median time on the cases it solved; nan for a time budget
+    how: str = ""  # the budget that does it, and for a sequence whether impulses are carried
 
 
 @dataclass(frozen=True)
@@ -126,6 +135,17 @@ class Advice:
     def best(self) -> Choice | None:
         """The recommended one; None when nobody got there."""
         return self.ranking[0] if self.ranking and self.ranking[0].solved else None
+
+
+@dataclass(frozen=True)
+class Line:
+    """A line of the table of recommendations: a structure and its cases, or a sequence and its steps."""
+
+    name: str
+    size: int
+    sequence: bool
+    by_level: Mapping[float, Advice]
+    by_time: Mapping[float, Advice]
 
 
 @dataclass(frozen=True)
@@ -148,9 +168,20 @@ class Walk:
     tol: float
     max_iter: int
     steps: int
-    time: Mapping[str, float]  # start -> s, all steps
+    times: Mapping[str, tuple[float, ...]]  # start -> s of each step
     iterations: Mapping[str, int]
     residuals: Mapping[str, tuple[float, ...]]  # start -> of each step
+    wrong: Mapping[str, int]  # start -> steps with a claim that does not hold
+
+    @property
+    def asked(self) -> str:
+        """The budget or the level."""
+        return f"{self.max_iter} iterations" if self.mode == "budget" else f"to {level_name(self.tol)}"
+
+    @property
+    def time(self) -> dict[str, float]:
+        """start -> s, all steps."""
+        return {start: sum(times) for start, times in self.times.items()}
 
     def middle(self, start: str) -> float:
         """Median residual over the steps."""
@@ -246,7 +277,9 @@ def families(records: Records) -> dict[str, list[str]]:
         if name in ran:
             for word in info.structure:
                 found[word].append(name)
-    order = ("chain", "mesh", "stack", "pile", "redundant", "friction", "large mass ratio", "asymmetric")
+    order = (
+        "separate", "chain", "mesh", "stack", "pile", "dense", "redundant", "friction", "large mass ratio", "asymmetric",
+    )  # fmt: skip
     return {
         w: found[w] for w in sorted(found, key=lambda w: (order.index(w) if w in order else len(order), w))
     }
@@ -451,6 +484,23 @@ def profiles(records: Records) -> list[Profile]:
     return out
 
 
+def advice(records: Records, times: Sequence[float] = ()) -> list[Line]:
+    """Every recommendation: structures, then sequences; at each level and within each time [s]."""
+    times = tuple(times) or time_budgets(records)
+    steps = {name: walks[0].steps for name, walks in by_sequence(records).items()}
+    sizes = {name: len(cases) for name, cases in families(records).items()}
+    lines = []
+    by_sequence_level, by_sequence_time = advice_by_sequence(records, times)
+    for sizes_of, sequence, by_level, by_time in (
+        (sizes, False, advice_by_level(records), advice_by_time(records, times)),
+        (steps, True, by_sequence_level, by_sequence_time),
+    ):
+        for name, size in sizes_of.items():
+            found = ({a.target: a for a in some if a.family == name} for some in (by_level, by_time))
+            lines.append(Line(name, size, sequence, *found))
+    return lines
+
+
 def advice_by_level(records: Records) -> list[Advice]:
     """For each structure and level: first who solves most cases, then who is fastest (shifted geometric mean).
 
@@ -458,61 +508,119 @@ def advice_by_level(records: Records) -> list[Advice]:
     """
     shift, limit = shift_of(records), limit_of(records)
     liars = {(r.case, r.solver) for r in records if r.contradicted}
+    groups = _cold(records)
     out = []
     for family, cases in families(records).items():
+        solvers = sorted({s for c, s in groups if c in cases})
         for level in levels_of(records):
-            times = _times(records, level)
             choices = []
-            for solver in sorted({s for c in cases for s in times.get(c, {})}):
-                t = [times.get(c, {}).get(solver, math.inf) for c in cases]
-                score = geometric_mean([x if math.isfinite(x) else limit for x in t], shift)
-                solved = [x for x in t if math.isfinite(x)]
-                choices.append(
-                    Choice(solver, len(solved), len(cases), score, median(solved) if solved else math.nan)
-                )
+            for solver in solvers:
+                runs = [
+                    min(
+                        (r for r in groups.get((c, solver), ()) if r.relative <= level),
+                        key=lambda r: r.time_min,
+                        default=None,
+                    )
+                    for c in cases
+                ]
+                solved = [r for r in runs if r is not None]
+                t = [r.time_min for r in solved]
+                score = geometric_mean(t + [limit] * (len(cases) - len(t)), shift)
+                sweeps = [r.work["sweeps"] for r in solved if "sweeps" in r.work]
+                how = f"{median(sweeps):.0f} sweeps" if solved and len(sweeps) == len(solved) else ""
+                choices.append(Choice(solver, len(t), len(cases), score, median(t) if t else math.nan, how))
             choices.sort(key=lambda k: (any((c, k.solver) in liars for c in cases), -k.solved, k.score))
             out.append(Advice(family, level, tuple(choices)))
     return out
 
 
+def _cold(records: Records) -> dict[tuple[str, str], list[Record]]:
+    # Usable runs from a cold start by (case, solver); a pair that has none is there, with none.
+    return {
+        (c, s): [r for r in g if r.usable] for (c, s, start), g in pairs(records).items() if start == "cold"
+    }
+
+
 def time_budgets(records: Records) -> tuple[float, ...]:
     """Three decades of time [s] about the median of the fastest times to the middle level."""
     levels = levels_of(records)
-    fastest = [min(by.values()) for by in _times(records, levels[len(levels) // 2]).values() if by]
-    fastest = [t for t in fastest if math.isfinite(t)]
+    level = levels[len(levels) // 2]
+    fastest = [min(by.values()) for by in _times(records, level).values() if by]
+    for walks in by_sequence(records).values():
+        reached = [
+            median(w.times[start]) for w in walks for start in w.residuals if max(w.residuals[start]) <= level
+        ]
+        fastest.append(min(reached, default=math.inf))
+    fastest = [t for t in fastest if 0.0 < t < math.inf]
     middle = math.ceil(math.log10(median(fastest))) if fastest else -3
     return tuple(10.0**k for k in (middle - 1, middle, middle + 1))
 
 
-def advice_by_time(records: Records) -> list[Advice]:
+def advice_by_time(records: Records, times: Sequence[float] = ()) -> list[Advice]:
     """For each structure and time budget: the smallest geometric mean of residuals reached in that time.
 
     A solver with nothing to show in the time scores 1 on that case: doing nothing. "Solved" counts the
-    cases on which it brought anything back.
+    cases on which it brought anything back. `times` [s]; `time_budgets` if none are given.
     """
     out = []
-    groups = {k: [r for r in g if r.usable] for k, g in pairs(records).items() if k[2] == "cold"}
+    groups = _cold(records)
     for family, cases in families(records).items():
-        solvers = sorted({s for (c, s, _) in groups if c in cases})
-        for limit in time_budgets(records):
+        solvers = sorted({s for c, s in groups if c in cases})
+        for limit in tuple(times) or time_budgets(records):
             choices = []
             for solver in solvers:
                 got = [
                     min(
-                        (
-                            max(r.relative, 1e-17)
-                            for r in groups.get((c, solver, "cold"), ())
-                            if r.time_min <= limit
-                        ),
-                        default=None,
+                        (r.relative for r in groups.get((c, solver), ()) if r.time_min <= limit), default=None
                     )
                     for c in cases
                 ]
-                score = geometric_mean([1.0 if g is None else min(g, 1.0) for g in got])
+                score = geometric_mean([1.0 if g is None else _score(g) for g in got])
                 choices.append(Choice(solver, sum(g is not None for g in got), len(cases), score, math.nan))
             choices.sort(key=lambda k: (k.score, -k.solved))
             out.append(Advice(family, limit, tuple(choices)))
     return out
+
+
+def _score(residual: float) -> float:
+    # What counts in a geometric mean: nothing is better than exact, or worse than doing nothing.
+    return min(max(residual, 1e-17), 1.0) if residual == residual else 1.0
+
+
+def advice_by_sequence(records: Records, times: Sequence[float] = ()) -> tuple[list[Advice], list[Advice]]:
+    """For each sequence, by level and by time of a step: which solver, which budget, carried or cold.
+
+    To a level: who brings most steps there, then who takes least time over all steps. In a time (the median
+    step keeps to it): the smallest geometric mean of the residuals. A false claim on any step comes last.
+    """
+    times = tuple(times) or time_budgets(records)
+    by_level, by_time = [], []
+    for name, walks in by_sequence(records).items():
+        runs = [(w, start, f"{w.asked}, {start}") for w in walks for start in w.residuals]
+        for level in levels_of(records):
+            ranked: list[tuple[tuple[float, ...], Choice]] = []
+            for w, start, how in runs:
+                solved = sum(r <= level for r in w.residuals[start])
+                choice = Choice(w.solver, solved, w.steps, w.time[start], median(w.times[start]), how)
+                ranked.append(((bool(w.wrong[start]), -solved, choice.score), choice))
+            by_level.append(Advice(name, level, _best_of_each(ranked)))
+        for limit in times:
+            ranked = []
+            for w, start, how in runs:
+                if median(w.times[start]) <= limit:
+                    score = geometric_mean([_score(r) for r in w.residuals[start]])
+                    choice = Choice(w.solver, w.steps, w.steps, score, math.nan, how)
+                    ranked.append(((bool(w.wrong[start]), score, w.time[start]), choice))
+            by_time.append(Advice(name, limit, _best_of_each(ranked)))
+    return by_level, by_time
+
+
+def _best_of_each(ranked: Iterable[tuple[tuple[float, ...], Choice]]) -> tuple[Choice, ...]:
+    # The best way of each solver, best solver first.
+    first: dict[str, Choice] = {}
+    for _, choice in sorted(ranked, key=lambda pair: pair[0]):
+        first.setdefault(choice.solver, choice)
+    return tuple(first.values())
 
 
 def walks(records: Records) -> list[Walk]:
@@ -532,12 +640,21 @@ def walks(records: Records) -> list[Walk]:
             Walk(
                 *key,
                 max(len(g) for g in by_start.values()),
-                {s: sum(r.time_min for r in g) for s, g in by_start.items()},
+                {s: tuple(r.time_min for r in g) for s, g in by_start.items()},
                 {s: sum(r.iterations for r in g) for s, g in by_start.items()},
                 {s: tuple(r.relative for r in g) for s, g in by_start.items()},
+                {s: sum(bool(r.contradicted) for r in g) for s, g in by_start.items()},
             )
         )
     return out
+
+
+def by_sequence(records: Records) -> dict[str, list[Walk]]:
+    """Walks of each sequence."""
+    out: dict[str, list[Walk]] = defaultdict(list)
+    for walk in walks(records):
+        out[walk.sequence].append(walk)
+    return dict(out)
 
 
 NOISE = 1.25  # a factor of time below which nothing is said: what a busy machine does to a minimum of repeats

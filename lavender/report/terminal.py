@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from lavender.bench.record import level_name
 from lavender.bench.store import Records
 from lavender.report import tables
-from lavender.report.text import residual, seconds
+from lavender.report.text import in_time, residual, seconds, to_level
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -48,24 +48,18 @@ def reach_table(records: Records, levels: Sequence[float]) -> Any:
     return table
 
 
-def advice_table(records: Records) -> Any:
-    """Per structure and level: the recommended solver, its mean time, and on how many cases it got there."""
+def advice_table(records: Records, times: Sequence[float] = ()) -> Any:
+    """Per structure or sequence, at each level and in each time: the recommended solver and how it does."""
     from rich.table import Table
 
-    rows = tables.advice_by_level(records)
-    levels = sorted({a.target for a in rows}, reverse=True)
+    levels, times = tables.levels_of(records), tuple(times) or tables.time_budgets(records)
     table = Table(box=None, pad_edge=False, header_style="bold")
-    table.add_column("structure", no_wrap=True)
-    for level in levels:
-        table.add_column(f"to {level_name(level)}")
-    for family in dict.fromkeys(a.family for a in rows):
-        cells = []
-        for level in levels:
-            best = next(a for a in rows if a.family == family and a.target == level).best
-            cells.append(
-                f"{best.solver}, {seconds(best.typical)}, {best.solved}/{best.cases}" if best else "nobody"
-            )
-        table.add_row(family, *cells)
+    table.add_column("structure")
+    for head in (*(f"to {level_name(x)}" for x in levels), *(f"in {seconds(t)}" for t in times)):
+        table.add_column(head, overflow="fold")
+    for line in tables.advice(records, times):
+        cells = [*map(to_level, line.by_level.values()), *map(in_time, line.by_time.values())]
+        table.add_row(line.name, *cells)
     return table
 
 
@@ -79,10 +73,9 @@ def walk_table(records: Records) -> Any:
             name, no_wrap=True, justify="left" if name in ("sequence", "solver", "asked") else "right"
         )
     for w in tables.walks(records):
-        asked = f"{w.max_iter} iterations" if w.mode == "budget" else f"to {level_name(w.tol)}"
         cells = [residual(w.middle(s)) if s in w.residuals else "–" for s in ("carried", "cold")]
         cells += [seconds(w.time[s]) if s in w.time else "–" for s in ("carried", "cold")]
-        table.add_row(w.sequence, w.solver, asked, str(w.steps), *cells)
+        table.add_row(w.sequence, w.solver, w.asked, str(w.steps), *cells)
     return table
 
 
@@ -129,10 +122,10 @@ def change_table(old: Records, new: Records) -> Any:
 
 
 def print_report(
-    records: Records, console: Console, levels: Sequence[float] | None = None, old: Records | None = None
+    records: Records, console: Console, old: Records | None = None, times: Sequence[float] = ()
 ) -> None:
     """Everything the terminal shows after a run."""
-    levels = tables.levels_of(records) if levels is None else levels
+    levels = tables.levels_of(records)
     campaign = tables.is_campaign(records)
     if campaign:
         console.print(
@@ -155,16 +148,17 @@ def print_report(
             highlight=False,
             style="dim",
         )
-    if any(r.step < 0 for r in records) and not campaign:
-        console.print(
-            "\n[bold]Recommended[/] (solver, median time where it gets there, cases it brings to the level)"
-        )
-        console.print(advice_table(records), highlight=False)
     if any(r.step >= 0 for r in records):
         console.print(
             "\n[bold]Sequences[/] (median residual, time of all steps; carried from step to step, or cold)"
         )
         console.print(walk_table(records), highlight=False)
+    if len(records) and not campaign:
+        console.print(
+            "\n[bold]Recommended[/] (to a level: median time, share of cases that get there, budget; "
+            "in a time: mean residual)"
+        )
+        console.print(advice_table(records, times), highlight=False)
     if old is not None:
         table = change_table(old, records)
         console.print(

@@ -1,10 +1,12 @@
-"""Numbers as people read them."""
+"""Numbers and recommendations as people read them."""
 
 from __future__ import annotations
 
 import math
 
-__all__ = ["residual", "seconds"]
+from lavender.report.tables import Advice
+
+__all__ = ["in_time", "residual", "seconds", "to_level"]
 
 
 def seconds(t: float, missing: str = "–") -> str:
@@ -27,3 +29,21 @@ def residual(x: float) -> str:
         return "0"
     mantissa, _, exponent = f"{x:.1e}".partition("e")
     return f"{mantissa}e{int(exponent)}"
+
+
+def to_level(advice: Advice) -> str:
+    """Who gets to a level, in what time, on how many cases and with which budget, in one line."""
+    best = advice.best
+    if best is None:
+        return "nobody"
+    return f"{best.solver} {seconds(best.typical)} ({best.solved}/{best.cases})" + _how(best.how)
+
+
+def in_time(advice: Advice) -> str:
+    """Who comes closest within a time, and how close, in one line."""
+    best = advice.best
+    return "nobody" if best is None else f"{best.solver} to {residual(best.score)}" + _how(best.how)
+
+
+def _how(how: str) -> str:
+    return f", {how}" if how else ""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from lavender.bench.store import Records, write_csv, write_json
@@ -10,7 +11,14 @@ from lavender.errors import InputError
 __all__ = ["write"]
 
 
-def write(records: Records, folder: str | Path, *, figures: bool = True, old: Records | None = None) -> Path:
+def write(
+    records: Records,
+    folder: str | Path,
+    *,
+    figures: bool = True,
+    old: Records | None = None,
+    times: Sequence[float] = (),
+) -> Path:
     """Write `records.csv`, `records.json`, `figures/*.svg`, `figures/*.png`, `summary.md` and `index.html`.
 
     Parameters
@@ -20,9 +28,10 @@ def write(records: Records, folder: str | Path, *, figures: bool = True, old: Re
     folder : path
     figures : bool
         False leaves out the SVG and PNG files, which take most of the time.
-
     old : Records, optional
         An earlier run to compare with.
+    times : s, optional
+        Time budgets of the recommendation; `tables.time_budgets` if none are given.
 
     Returns
     -------
@@ -34,29 +43,28 @@ def write(records: Records, folder: str | Path, *, figures: bool = True, old: Re
     InputError
         The folder cannot be written.
     """
-    from lavender.report.curves import budget_figure, work_precision
+    from lavender.report.curves import figures as figures_of
     from lavender.report.draw import save
     from lavender.report.markdown import summary
     from lavender.report.page import page
     from lavender.report.style import looks
-    from lavender.report.tables import is_campaign
 
     folder = Path(folder)
     shown = records.latest()
+    drawn = figures_of(shown)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         write_csv(records, folder / "records.csv")
         write_json(records, folder / "records.json")
         index = folder / "index.html"
-        index.write_text(page(shown, old=None if old is None else old.latest()), encoding="utf-8")
-        (folder / "summary.md").write_text(summary(shown), encoding="utf-8")
-        if figures and not is_campaign(shown):
+        before = None if old is None else old.latest()
+        index.write_text(page(shown, drawn, old=before, times=times, saved=figures), encoding="utf-8")
+        (folder / "summary.md").write_text(summary(shown, times), encoding="utf-8")
+        if figures and list(drawn):
             (folder / "figures").mkdir(exist_ok=True)
             look = looks(r.solver for r in shown)
-            for case in dict.fromkeys(r.case for r in shown if r.step < 0):
-                for figure in (work_precision(shown, case), budget_figure(shown, case)):
-                    if figure.curves:
-                        save(figure, look, folder / "figures")
+            for figure in drawn:
+                save(figure, look, folder / "figures")
     except OSError as error:
         raise InputError(
             f"cannot write {error.filename or folder} ({error.strerror or error}): give a folder that you may write to"
