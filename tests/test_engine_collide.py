@@ -67,10 +67,11 @@ def test_box_box_agrees_with_the_slow_twin(numbers):
     if exact > MARGIN + 1e-9:
         assert len(found["gap"]) == 0
         return
-    if exact < MARGIN - 0.12 * abs(exact) - 3 * tol:
-        # Faces are preferred to edges, and those of a, by 5 % and a tolerance each: the deepest gap may be
-        # that much below the exact one.
-        assert 1 <= len(found["gap"]) <= 4
+    assert len(found["gap"]) <= 4
+    if exact < -0.12 * abs(exact) - 3 * tol:
+        # Overlapping boxes touch somewhere. Boxes apart may lose a speculative point: a corner nearest along
+        # an axis can lie beside the face that it faces.
+        assert len(found["gap"]) >= 1
     for n, p, gap in zip(found["normal"], found["point"], found["gap"], strict=True):
         assert abs(np.linalg.norm(n) - 1) < 1e-12
         # The normal points from a to b: moving b along it by the overlap separates the boxes.
@@ -83,7 +84,10 @@ def test_box_box_agrees_with_the_slow_twin(numbers):
         for half_box, centre, r in (a, b):
             assert np.all(np.abs(r.T @ (p - centre)) <= half_box + slack)
     if len(found["gap"]):
-        assert found["gap"].min() <= exact + 0.12 * abs(exact) + 3 * tol
+        if exact < 0.0:
+            # Faces are preferred to edges, and those of a, by 5 % and a tolerance each: the deepest gap may
+            # be that much above the exact one.
+            assert found["gap"].min() <= exact + 0.12 * abs(exact) + 3 * tol
         assert len(set(found["key"].tolist())) == len(found["key"])
 
 
