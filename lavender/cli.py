@@ -214,9 +214,10 @@ def _plan(
     help="Folder of the report.",
 )
 @click.option(
-    "--sequence",
-    is_flag=True,
-    help="Each FOLDER holds the steps of a simulation: carry impulses from step to step.",
+    "--sequence/--no-sequence",
+    default=None,
+    help="Each FOLDER holds the steps of a simulation: carry impulses from step to step. Known by itself of what "
+    "`lavender run --record` leaves.",
 )
 @click.option("--campaign", is_flag=True, help="Error and robustness by many workers; no times.")
 @click.option(
@@ -254,7 +255,7 @@ def report(
     memory: float | None,
     in_process: bool,
     out: Path,
-    sequence: bool,
+    sequence: bool | None,
     campaign: bool,
     seeds: int,
     workers: int,
@@ -265,9 +266,9 @@ def report(
 ) -> None:
     """Speed against error: every solver on every case, to each level and at each budget.
 
-    FILES are problems (.npz, .hdf5), folders of them, or cases of the built-in suite such as
-    "stack(n=64)"; without any, the built-in suite runs. A records.jsonl is shown again without
-    solving. The same command goes on where it was stopped.
+    FILES are problems (.npz, .hdf5), folders of them, folders of recorded steps, or cases of the built-in
+    suite such as "stack(n=64)"; without any, the built-in suite runs. A records.jsonl is shown again
+    without solving. The same command goes on where it was stopped.
     """
     from lavender import bench
     from lavender.report.terminal import print_report
@@ -335,21 +336,17 @@ def _measure(
     path: Path,
     memory: float | None,
     in_process: bool,
-    sequence: bool = False,
+    sequence: bool | None = None,
 ) -> tuple[Records, bool]:
     """Run with a progress bar; (records, was it stopped by Ctrl-C)."""
     from lavender import bench
 
     _one_thread()
     bench.solver_names(solvers)  # before anything is loaded: names first
+    if sequence and not files:
+        raise InputError("--sequence needs a folder of problem files, one for each step")
     with bench.Store(path) as store:
-        items = (
-            [step for folder in files for step in bench.steps_in(folder)]
-            if sequence
-            else bench.resolve(files)
-        )
-        if sequence and not items:
-            raise InputError("--sequence needs a folder of problem files, one for each step")
+        items = bench.resolve(files, sequence)
         found: list[Records] = []
         with _progress() as watch:
             try:
@@ -547,7 +544,7 @@ def run(
     record: Path | None,
     skip: int,
 ) -> None:
-    """Run a LavenderSim scene of the gallery; record its steps as a sequence for `report --sequence`.
+    """Run a LavenderSim scene of the gallery; record its steps as a sequence for `report`.
 
     SCENE is stack, pyramid, card_house, pile, chain, bridge, heavy_on_light, table, ramp, spinner,
     newtons_cradle or four_bar.
@@ -582,7 +579,7 @@ def run(
         if path is not None:
             click.echo(f"{name}: {path}")
     if record is not None:
-        click.echo(f"{found.recorded} problems in {record}: lavender report --sequence {record}")
+        click.echo(f"{found.recorded} problems in {record}: lavender report {record}")
 
 
 def _parameters(words: tuple[str, ...]) -> dict[str, Any]:

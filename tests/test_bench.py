@@ -539,6 +539,23 @@ def test_a_sequence_that_was_stopped_carries_on_with_the_same_bits(tmp_path):
     assert len(bench.read(tmp_path / "b.jsonl")) == len(whole)  # only the missing two were made
 
 
+def test_recorded_steps_are_known_by_themselves_and_kept_apart(tmp_path):
+    from lavender import io
+
+    p = lv.Problem.contact(np.eye(4), np.ones(4), np.full(2, 0.5), key=np.array([7, 9], np.uint64))
+    for folder in ("a/steps", "b/steps", "mixed"):
+        (tmp_path / folder).mkdir(parents=True)
+        for i in (1, 2):
+            io.save(p, tmp_path / folder / f"scene-{i:06d}.npz")
+    io.save(p, tmp_path / "mixed" / "other.npz")
+    items = bench.resolve([tmp_path / "a" / "steps", tmp_path / "b" / "steps", tmp_path / "mixed"])
+    assert [(i.sequence, i.step) for i in items] == [
+        ("steps", 0), ("steps", 1), ("steps #2", 0), ("steps #2", 1), ("", -1), ("", -1), ("", -1),
+    ]  # fmt: skip
+    assert len({i.name for i in items}) == len(items)
+    assert all(i.sequence == "" for i in bench.resolve([tmp_path / "a" / "steps"], sequences=False))
+
+
 def test_a_folder_is_a_sequence_in_numeric_order(tmp_path):
     from lavender import io
 
@@ -549,6 +566,11 @@ def test_a_folder_is_a_sequence_in_numeric_order(tmp_path):
         "step_9.npz",
         "step_10.npz",
     ]
+    # Files that name no blocks may be anything: steps only where that is said.
+    assert [(i.name, i.sequence) for i in bench.resolve([tmp_path])] == [
+        ("step_1", ""), ("step_9", ""), ("step_10", ""),
+    ]  # fmt: skip
+    assert [i.step for i in bench.resolve([tmp_path], sequences=True)] == [0, 1, 2]
     empty = tmp_path / "empty"
     empty.mkdir()
     with pytest.raises(lv.InputError, match="needs two"):

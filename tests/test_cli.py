@@ -263,7 +263,6 @@ def test_a_recorded_scene_is_reported_as_a_sequence(lavender, tmp_path):
     assert len(list(folder.glob("*.npz"))) == 4
     words = (
         "report",
-        "--sequence",
         folder,
         "--solvers",
         "sequential_impulses",

@@ -7,12 +7,12 @@ Nothing here draws or prints; `lavender.report` reads the records.
 """
 
 from lavender.bench.campaign import CampaignPlan, campaign, seeds
-from lavender.bench.cases import Item, resolve, structure_of
+from lavender.bench.cases import Item, resolve, sequence, steps_in, structure_of
 from lavender.bench.machine import cpu_name
 from lavender.bench.plan import Plan
 from lavender.bench.record import CaseInfo, Record, Run, Skip, level_name
 from lavender.bench.runner import Event, run, solver_names
-from lavender.bench.sequences import carry, sequence, steps_in
+from lavender.bench.sequences import carry
 from lavender.bench.store import Records, Store, read, write_csv, write_json
 from lavender.bench.timing import Task, measure, one_thread
 

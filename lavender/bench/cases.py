@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import hashlib
+import re
 from collections import Counter
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -15,11 +16,11 @@ from numpy.typing import NDArray
 
 from lavender.bench.record import CaseInfo, file_name
 from lavender.cones import ROW
-from lavender.errors import InputError
+from lavender.errors import InputError, LavenderError
 from lavender.problem import Problem
 from lavender.suite import Case
 
-__all__ = ["SUFFIXES", "Item", "describe", "resolve", "structure_of"]
+__all__ = ["SUFFIXES", "Item", "describe", "resolve", "sequence", "steps_in", "structure_of"]
 
 SUFFIXES = (".npz", ".hdf5", ".h5", ".hdf")
 RANK_ROWS = 300  # rows up to which the rank of A is computed, a fraction of a second
@@ -53,10 +54,17 @@ class Item:
 Source = str | Path | Problem | Case | Item
 
 
-def resolve(words: Iterable[Source]) -> list[Item]:
+def resolve(words: Iterable[Source], sequences: bool | None = None) -> list[Item]:
     """Cases behind files, folders (their problem files), names or cases of the suite, problems; all of it if none.
 
-    Nothing is loaded yet, but every word is checked to exist.
+    Nothing is solved, and as a rule nothing loaded yet, but every word is checked to exist.
+
+    Parameters
+    ----------
+    words : files, folders, names or cases of the suite, problems
+    sequences : bool, optional
+        Folders hold the steps of a simulation. If None, those do whose files differ in a number alone and
+        name their blocks (`Problem.key`), as recorded steps do.
 
     Raises
     ------
@@ -79,8 +87,10 @@ def resolve(words: Iterable[Source]) -> list[Item]:
             items.append(word)
         elif isinstance(word, Case):
             items.append(_from_case(word, word.name))
+        elif sequences or (sequences is None and _holds_steps(Path(word))):
+            items += _another(steps_in(word), items)
         elif Path(word).is_dir():
-            paths = sorted(p for p in Path(word).iterdir() if p.suffix.lower() in SUFFIXES)
+            paths = _problem_files(Path(word))
             if not paths:
                 raise InputError(f"{word} holds no problem file ({', '.join(SUFFIXES)})")
             items += [_from_file(path) for path in paths]
@@ -95,6 +105,65 @@ def resolve(words: Iterable[Source]) -> list[Item]:
 
             items += [_from_case(case, case.name) for case in suite.cases(str(word))]
     return _unique_names(items)
+
+
+def sequence(problems: Iterable[Problem], name: str) -> list[Item]:
+    """Consecutive problems as the steps of one sequence."""
+    return [
+        Item(f"{name}[{i}]", name, _constant(problem), sequence=name, step=i)
+        for i, problem in enumerate(problems)
+    ]
+
+
+def steps_in(folder: str | Path) -> list[Item]:
+    """Problem files of a folder as the steps of one sequence, numbers in their names in numeric order.
+
+    Raises
+    ------
+    InputError
+        Not a folder, or fewer than two problem files in it.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise InputError(
+            f"{folder} is not a folder; a sequence is a folder of problem files, one for each step"
+        )
+    paths = _problem_files(folder)
+    if len(paths) < 2:
+        raise InputError(
+            f"{folder} holds {len(paths)} problem files ({', '.join(SUFFIXES)}); a sequence needs two"
+        )
+    name = folder.resolve().name
+    return [
+        replace(_from_file(path), name=f"{name}[{i}]", sequence=name, step=i) for i, path in enumerate(paths)
+    ]
+
+
+def _problem_files(folder: Path) -> list[Path]:
+    return sorted((p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES), key=_natural)
+
+
+def _natural(path: Path) -> list[tuple[int, int | str]]:
+    return [(0, int(t)) if t.isdigit() else (1, t) for t in re.split(r"(\d+)", path.name) if t]
+
+
+def _holds_steps(folder: Path) -> bool:
+    paths = _problem_files(folder) if folder.is_dir() else []
+    if len(paths) < 2 or len({re.sub(r"\d+$", "", p.stem) for p in paths}) > 1:
+        return False
+    try:
+        return _from_file(paths[0]).problem.key is not None
+    except (LavenderError, OSError):
+        return False
+
+
+def _another(steps: list[Item], items: list[Item]) -> list[Item]:
+    # Two folders of one name are two sequences.
+    names = {item.sequence for item in items}
+    name, n = steps[0].sequence, 1
+    while (unique := f"{name} #{n}" if n > 1 else name) in names:
+        n += 1
+    return [replace(item, name=f"{unique}[{item.step}]", sequence=unique) for item in steps]
 
 
 def _constant(problem: Problem) -> Callable[[], Problem]:

@@ -6,63 +6,16 @@ where the step before has the same blocks in the same places, else they start fr
 
 from __future__ import annotations
 
-import re
-from collections.abc import Callable, Iterable, Mapping
-from pathlib import Path
+from collections.abc import Mapping
 
 import numpy as np
 
 from lavender._arrays import FloatArray
-from lavender.bench.cases import SUFFIXES, Item
 from lavender.bench.plan import UNLIMITED, Plan
-from lavender.errors import InputError
 from lavender.problem import Problem
 from lavender.registry import SolverSpec
 
-__all__ = ["carry", "passes", "sequence", "steps_in"]
-
-
-def sequence(problems: Iterable[Problem], name: str) -> list[Item]:
-    """Consecutive problems as the steps of one sequence."""
-    items = []
-    for i, problem in enumerate(problems):
-        items.append(Item(f"{name}[{i}]", name, _give(problem), sequence=name, step=i))
-    return items
-
-
-def _give(problem: Problem) -> Callable[[], Problem]:
-    return lambda: problem
-
-
-def steps_in(folder: str | Path) -> list[Item]:
-    """Problem files of a folder as the steps of one sequence, numbers in their names in numeric order.
-
-    Raises
-    ------
-    InputError
-        Not a folder, or fewer than two problem files in it.
-    """
-    from lavender import io
-
-    folder = Path(folder)
-    if not folder.is_dir():
-        raise InputError(
-            f"{folder} is not a folder; a sequence is a folder of problem files, one for each step"
-        )
-    paths = sorted((p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES), key=_natural)
-    if len(paths) < 2:
-        raise InputError(
-            f"{folder} holds {len(paths)} problem files ({', '.join(SUFFIXES)}); a sequence needs two"
-        )
-    name = folder.resolve().name
-    return [
-        Item(f"{name}[{i}]", str(path), lambda path=path: io.load(path), sequence=name, step=i)  # type: ignore[misc]
-        for i, path in enumerate(paths)
-    ]
-
-
-def _natural(path: Path) -> list[tuple[int, int | str]]:
-    return [(0, int(t)) if t.isdigit() else (1, t) for t in re.split(r"(\d+)", path.name) if t]
+__all__ = ["carry", "passes"]
 
 
 def carry(before: Problem, impulse: FloatArray, problem: Problem) -> FloatArray:

@@ -277,9 +277,8 @@ def families(records: Records) -> dict[str, list[str]]:
         if name in ran:
             for word in info.structure:
                 found[word].append(name)
-    order = (
-        "separate", "chain", "mesh", "stack", "pile", "dense", "redundant", "friction", "large mass ratio", "asymmetric",
-    )  # fmt: skip
+    shapes = ("separate", "chain", "mesh", "stack", "pile", "dense")
+    order = (*shapes, "redundant", "friction", "large mass ratio", "asymmetric")
     return {
         w: found[w] for w in sorted(found, key=lambda w: (order.index(w) if w in order else len(order), w))
     }
