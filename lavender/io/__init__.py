@@ -6,7 +6,8 @@
 | `.npz` | plain box problems: A, b, lo, hi, friction cones | no |
 | `.hdf5`, `.h5` | FCLIB, local (W, q, mu) and global (M, H, f, w, mu), 2D, 3D; extra `fclib` | yes |
 
-What a format cannot hold is refused by name. `docs/formats.md` lists every entry.
+What a format cannot hold is refused by name. `docs/formats.md` lists every entry. Not from a file but from another
+engine's memory: `from_mujoco`.
 """
 
 from __future__ import annotations
@@ -18,11 +19,12 @@ from typing import Any
 
 from lavender._arrays import FloatArray
 from lavender.errors import InputError
-from lavender.io import fclib, npz
+from lavender.io import fclib, mujoco, npz
+from lavender.io.mujoco import from_mujoco
 from lavender.io.stored import MAX_BYTES, Stored, first_bytes
 from lavender.problem import Problem
 
-__all__ = ["Stored", "load", "load_solution", "read", "save"]
+__all__ = ["Stored", "from_mujoco", "load", "load_solution", "mujoco", "read", "save"]
 
 NPZ = (".npz",)
 HDF5 = (".hdf5", ".h5", ".hdf")

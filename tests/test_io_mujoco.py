@@ -1,0 +1,166 @@
+"""MuJoCo's constraint problem read from memory: its own solution is the judge's solution too."""
+
+import numpy as np
+import pytest
+
+import lavender as lv
+from lavender.io import mujoco as adapter
+
+mj = pytest.importorskip("mujoco", reason="needs MuJoCo: pip install 'lavender[peers]'")
+
+# MuJoCo's solvers stop where the cost no longer falls; in float64 that is 1e-16 of it, and the residual of a
+# minimiser is the square root of what is left.
+NEWTON = 1e-8
+PGS = 1e-6  # its improvement of a whole sweep is small long before the distance is
+
+SCENE = """<mujoco><option cone="{cone}" solver="{solver}" timestep="0.004" tolerance="1e-15" iterations="2000"
+  jacobian="{jacobian}"/>
+  <default><geom friction="0.5 0.02 0.001" condim="{condim}"/></default><worldbody>
+  <geom type="plane" size="0 0 1"/>
+  <body pos="0 0 .1"><freejoint/><geom name="low" type="box" size=".1 .1 .1"/></body>
+  <body pos="0 0 .3"><freejoint/><geom name="high" type="box" size=".1 .1 .1" mass="40"/></body>
+  <body pos="1 0 .3"><joint name="door" type="hinge" axis="0 1 0" frictionloss="0.1" limited="true" range="-20 20"/>
+    <geom type="capsule" fromto="0 0 0 .5 0 0" size=".05"/>
+    <body pos=".5 0 0"><joint type="ball" frictionloss="0.01"/><geom type="sphere" size=".1" pos=".1 0 0"/></body>
+  </body>
+  <body name="bob" pos="0 2 1"><freejoint/><geom type="sphere" size=".1"/></body>
+  </worldbody><equality><connect name="string" body1="bob" anchor="0 0 .2"/></equality></mujoco>"""
+
+
+def state(cone="elliptic", solver="Newton", condim=3, jacobian="dense", steps=25):
+    """The upper box slides and turns on the lower one, which sticks; a hinge and a ball move. After `mj_forward`."""
+    text = SCENE.format(cone=cone, solver=solver, condim=condim, jacobian=jacobian)
+    model = mj.MjModel.from_xml_string(text)
+    data = mj.MjData(model)
+    for _ in range(steps):
+        mj.mj_step(model, data)
+    data.qvel[6:12] = 0.2, 0.1, 0.0, 0.0, 0.0, 0.5
+    data.qvel[12:16] = 0.3, 1.0, -1.0, 0.5
+    mj.mj_forward(model, data)
+    return model, data
+
+
+@pytest.mark.parametrize("jacobian", ["dense", "sparse"])
+@pytest.mark.parametrize(
+    ("cone", "condim"), [("elliptic", 3), ("elliptic", 1), ("pyramidal", 3), ("pyramidal", 6)]
+)
+def test_the_solution_of_newton_is_a_solution_here(cone, condim, jacobian):
+    model, data = state(cone, condim=condim, jacobian=jacobian)
+    problem = lv.io.from_mujoco(model, data)
+    found = lv.residual(problem, adapter.impulse(model, data))
+    assert data.ncon >= 3
+    assert problem.law == ("cone" if (cone, condim) == ("elliptic", 3) else "lcp")
+    assert found.relative < NEWTON
+    assert found.velocity_start > 1e-3  # m/s: there was something to do
+
+
+def test_friction_slides_and_sticks_in_the_scene():
+    # Otherwise the test above would not see a wrong bound of the disk.
+    model, data = state()
+    problem, own = lv.io.from_mujoco(model, data), adapter.impulse(*state())
+    c = problem.cones
+    ratio = [
+        np.hypot(*own[j + 1 : j + 3]) / (mu * own[j])
+        for j, mu, kind in zip(c.ptr, c.mu, c.kind, strict=False)
+        if kind == lv.CONTACT and own[j] > 0.0
+    ]
+    assert max(ratio) == pytest.approx(1.0, abs=1e-9)  # on the cone, to rounding
+    assert min(ratio) < 0.99
+
+
+def test_a_wrong_bound_or_frame_is_seen():
+    model, data = state()
+    own, right = adapter.impulse(model, data), lv.io.from_mujoco(model, data)
+    c = right.cones
+    weaker = lv.Cones(c.ptr, c.kind, c.lower, c.upper, 0.9 * c.mu, c.patch_radius)
+    assert lv.residual(lv.Problem(right.b, weaker, right.matrix, friction="cone"), own).relative > 1e-3
+    at = int(c.ptr[np.flatnonzero(c.kind == lv.CONTACT)[0]])
+    order = np.arange(right.m)
+    order[[at, at + 1]] = order[[at + 1, at]]
+    swapped = lv.Problem(right.b[order], c, right.csr[order][:, order], friction="cone")
+    assert lv.residual(swapped, own).relative > 1e-3
+
+
+def test_sweeps_of_mujoco_are_judged_too():
+    model, data = state(solver="PGS")
+    assert lv.residual(lv.io.from_mujoco(model, data), adapter.impulse(model, data)).relative < PGS
+    model.opt.iterations, model.opt.tolerance, data.qacc_warmstart[:] = 2, 0.0, 0.0
+    mj.mj_forward(model, data)
+    assert lv.residual(lv.io.from_mujoco(model, data), adapter.impulse(model, data)).relative > 1e-3
+
+
+def test_what_solvers_here_find_is_the_acceleration_of_mujoco():
+    model, data = state()
+    problem = lv.io.from_mujoco(model, data)
+    solution = lv.solve(problem, "admm", tol=1e-10, max_iter=100_000)
+    assert solution.success
+    # tol times the largest acceleration asked of a row, over dt and the least mass: 1e-10 * 1e3 with room.
+    assert np.abs(adapter.acceleration(model, data, solution.impulse) - data.qacc).max() < 1e-5
+    # Its forces and its accelerations agree as far as it converged: 1e-8 of about 25 m/s2.
+    assert np.abs(adapter.acceleration(model, data, adapter.impulse(model, data)) - data.qacc).max() < 1e-6
+
+
+def test_matrix_and_vector_are_those_of_mujoco():
+    model, data = state(jacobian="sparse")
+    problem = lv.io.from_mujoco(model, data)
+    jac, mass = adapter.jacobian(model, data).toarray(), np.zeros((model.nv, model.nv))
+    for i, column in enumerate(np.eye(model.nv)):
+        mj.mj_mulM(model, data, mass[i], column)
+    a = jac @ np.linalg.solve(mass, jac.T) + np.diag(data.efc_R)
+    # 1e-12: rounding of a dense solve with the condition number of M, about 1e3.
+    np.testing.assert_allclose(problem.dense(), a, atol=1e-12 * np.abs(a).max())
+    np.testing.assert_allclose(
+        problem.b, -model.opt.timestep * data.efc_b, atol=1e-14 * np.abs(data.efc_b).max()
+    )
+    assert problem.asymmetry == 0.0
+
+
+def test_blocks_are_named_and_of_their_kind():
+    model, data = state(condim=4)
+    problem = lv.io.from_mujoco(model, data)
+    c = problem.cones
+    assert problem.names[0] == "equality string"
+    assert list(c.ptr[:2]) == [0, 3] and np.isinf(c.upper[:3]).all()
+    door = problem.names.index("friction of joint door")
+    row = c.ptr[door]
+    assert (c.lower[row], c.upper[row]) == pytest.approx(
+        (-0.1 * model.opt.timestep, 0.1 * model.opt.timestep)
+    )
+    spin = np.flatnonzero(c.kind == lv.CONTACT_SPIN)
+    assert len(spin) and c.mu[spin] == pytest.approx(0.5) and c.patch_radius[spin] == pytest.approx(0.04)
+    assert any("(low, high)" in name for name in problem.names)
+    limit = [i for i, name in enumerate(problem.names) if name == "limit of joint door"]
+    assert all(c.lower[c.ptr[i]] == 0.0 and c.upper[c.ptr[i]] == np.inf for i in limit)
+
+
+def test_torque_and_disk_bounded_apart_is_another_law():
+    model, data = state(condim=4)
+    problem = lv.io.from_mujoco(model, data)
+    own = lv.residual(problem, adapter.impulse(model, data)).relative
+    assert NEWTON < own < 1.0
+
+
+def test_nothing_touches():
+    model = mj.MjModel.from_xml_string(
+        "<mujoco><worldbody><body><freejoint/><geom size='1'/></body></worldbody></mujoco>"
+    )
+    data = mj.MjData(model)
+    mj.mj_forward(model, data)
+    assert lv.io.from_mujoco(model, data).m == 0
+
+
+def test_what_has_no_block_is_refused():
+    with pytest.raises(lv.CapabilityError, match=r"rolling friction.*pyramidal"):
+        lv.io.from_mujoco(*state(condim=6))
+    model, data = state()
+    data.contact.friction[0, 1] = 0.1
+    with pytest.raises(lv.CapabilityError, match="two coefficients"):
+        lv.io.from_mujoco(model, data)
+
+
+def test_something_else_is_an_input_error():
+    model, data = state(steps=1)
+    with pytest.raises(lv.InputError, match=r"MjModel.*needed"):
+        lv.io.from_mujoco(data, model)
+    with pytest.raises(lv.InputError, match="one for each row"):
+        adapter.acceleration(model, data, np.zeros(int(data.nefc) + 1))
