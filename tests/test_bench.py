@@ -301,6 +301,7 @@ def test_infinite_and_undefined_numbers_survive_json():
         ({"levels": (), "budgets": ()}, "nothing to run"),
         ({"repeats": 0}, "repeats is 0"),
         ({"time_limit": 0.0}, "time limit is 0.0"),
+        ({"pass_limit": 0.0}, "pass limit is 0.0"),
     ],
 )
 def test_a_senseless_plan_is_refused(change, sign):
@@ -537,6 +538,22 @@ def test_a_sequence_that_was_stopped_carries_on_with_the_same_bits(tmp_path):
     again = bench.run(items, ["pgs"], plan, tmp_path / "b.jsonl")
     assert [(r.key, r.relative) for r in again] == [(r.key, r.relative) for r in whole]
     assert len(bench.read(tmp_path / "b.jsonl")) == len(whole)  # only the missing two were made
+
+
+def test_a_pass_that_takes_too_long_ends_and_says_so(tmp_path, monkeypatch):
+    items = bench.sequence(moving_stack(5), "load")
+    # No solve takes less than a picosecond: each pass ends after its first step.
+    plan = bench.Plan(levels=(), budgets=(6,), repeats=1, pass_limit=1e-12)
+    path = tmp_path / "records.jsonl"
+    records = bench.run(items, ["pgs"], plan, path)
+    assert [(r.step, r.start) for r in records] == [(0, "cold"), (0, "carried")]
+    assert [s.case for s in records.skips] == ["load, 6 iterations, cold", "load, 6 iterations, carried"]
+    assert all("after 1 of 5 steps" in s.reason for s in records.skips)
+    monkeypatch.setattr(runner, "measure_impulse", None)  # nothing is solved again
+    assert bench.run(items, ["pgs"], plan, path).records == records.records
+    (line,) = lv.report.advice(records, [1.0])
+    assert line.by_time[1.0].best.solved == 1
+    assert line.by_time[1.0].best.score > max(r.relative for r in records)  # four steps count as not done
 
 
 def test_recorded_steps_are_known_by_themselves_and_kept_apart(tmp_path):

@@ -28,8 +28,10 @@ class Plan:
     levels : relative residuals to reach, each a solve with that `tol`
     budgets : exact iteration counts (`tol=0`), for solvers that can stop anywhere
     repeats : solves of each kind; minimum and median are recorded. Repeats end early once they have
-        taken `time_limit` together.
+        taken `time_limit` together. Steps of a sequence of more than twenty are solved once.
     time_limit : s, of one solve
+    pass_limit : s, of one solver over a sequence at one budget or level; five solves if None. The steps
+        that are left over are not solved, and a note says so.
     warm : also start from the problem's guess, where it has one
     orders : sweep orders beside "given", each at the middle budget, for solvers that take an order;
         "random:3" is random with seed 3
@@ -46,6 +48,7 @@ class Plan:
     budgets: Sequence[int] = (4, 8, 16, 32, 64)
     repeats: int = 3
     time_limit: float = 1.0
+    pass_limit: float | None = None
     warm: bool = True
     orders: Sequence[str] = ("reverse", "symmetric", "random:0", "random:1", "random:2")
     campaign: bool = False
@@ -61,6 +64,10 @@ class Plan:
             raise InputError(f"repeats is {self.repeats}; at least 1 is needed")
         if not (math.isfinite(self.time_limit) and self.time_limit > 0.0):
             raise InputError(f"time limit is {self.time_limit}; a positive number of seconds is needed")
+        if self.pass_limit is None:
+            object.__setattr__(self, "pass_limit", 5.0 * self.time_limit)
+        elif not self.pass_limit > 0.0:
+            raise InputError(f"pass limit is {self.pass_limit}; a positive number of seconds is needed")
         for word in self.orders:
             name, _, seed = word.partition(":")
             if name not in ORDERS:

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from lavender import registry
+from lavender._arrays import FloatArray
 from lavender.bench import machine
 from lavender.bench.cases import Item, Source, describe, resolve
 from lavender.bench.plan import Plan
-from lavender.bench.record import CaseInfo, Record, Run, Skip
+from lavender.bench.record import CaseInfo, Record, Run, Skip, level_name
 from lavender.bench.sequences import carry, passes
 from lavender.bench.store import Records, Store
 from lavender.bench.timing import Task, measure, measure_impulse, one_thread
@@ -21,6 +23,8 @@ from lavender.problem import Problem
 from lavender.registry import SolverSpec
 
 __all__ = ["Event", "run", "solver_names"]
+
+FEW_STEPS = 20  # up to which the steps of a sequence are repeated; the sum over more evens out by itself
 
 Watch = Callable[["Event"], Any]
 
@@ -206,31 +210,51 @@ class _Runner:
         tol: float,
         max_iter: int,
     ) -> None:
-        """One pass; a carried pass that was stopped solves its earlier steps again, without recording them."""
+        """One pass. It ends where its steps have taken `Plan.pass_limit` together, and a note says so."""
+        repeats = self.plan.repeats if len(steps) <= FEW_STEPS else 1
         tasks = [
             Task(
                 self.this.run, info.case, info.sha, spec.name, mode, tol, max_iter, self.plan.time_limit,
-                start, {}, self.plan.repeats, info.step,
+                start, {}, repeats, info.step,
             )
             for _, info in steps
         ]  # fmt: skip
-        missing = [task.key not in self.known for task in tasks]
-        before: tuple[Problem, Any] | None = None
-        for (item, info), task, new in zip(steps, tasks, missing, strict=True):
-            problem, impulse = item.problem, None
-            if start == "carried":
-                impulse = problem.start() if before is None else carry(*before, problem)
-            if new:
-                record, out = self.make_impulse(problem, task, spec, impulse)
-                self.keep(record)
-            else:
-                record, out = self.known[task.key], None
-                self.out.add(record)
-                if start == "carried" and any(missing):
-                    out = self.make_impulse(problem, replace(task, repeats=1), spec, impulse)[1]
-            if start == "carried":
-                before = None if out is None else (problem, out)
-            self.tell(info.case, spec.name, record, not new)
+        problems = [item for item, _ in steps]
+        limit, spent, made = self.plan.pass_limit or math.inf, 0.0, 0
+        for task in tasks:
+            record = self.known.get(task.key)
+            if record is None or spent > limit:
+                break
+            spent, made = spent + _cost(record), made + 1
+            self.out.add(record)
+            self.tell(task.case, spec.name, record, True)
+        before: tuple[Problem, FloatArray] | None = None
+        if start == "carried" and 0 < made < len(tasks) and spent <= limit:
+            # Stopped on the way: the impulses of the last step come from the same steps again, unrecorded.
+            for item, task in zip(problems[:made], tasks, strict=False):
+                again = replace(task, repeats=1)
+                before = self.step(item.problem, again, spec, before)[1]
+        while made < len(tasks) and spent <= limit:
+            record, before = self.step(problems[made].problem, tasks[made], spec, before)
+            self.keep(record)
+            self.tell(record.case, spec.name, record)
+            spent, made = spent + _cost(record), made + 1
+        if made < len(tasks):
+            asked = f"{max_iter} iterations" if mode == "budget" else f"to {level_name(tol)}"
+            reason = (
+                f"stopped after {made} of {len(tasks)} steps, which took more than {limit:.3g} s together"
+            )
+            self.keep(Skip(self.this.run, f"{problems[0].sequence}, {asked}, {start}", spec.name, reason))
+
+    def step(
+        self, problem: Problem, task: Task, spec: SolverSpec, before: tuple[Problem, FloatArray] | None
+    ) -> tuple[Record, tuple[Problem, FloatArray] | None]:
+        """One step, carried on from the problem and impulses before if the task asks for it."""
+        start = None
+        if task.start == "carried":
+            start = problem.start() if before is None else carry(*before, problem)
+        record, impulse = self.make_impulse(problem, task, spec, start)
+        return record, None if impulse is None else (problem, impulse)
 
     def pair(self, info: CaseInfo, problem: Problem, name: str) -> None:
         spec = self.specs[name]
@@ -265,6 +289,12 @@ class _Runner:
         if self.worker is not None and is_foreign(spec):
             return self.worker.measure_impulse(replace(problem, copy=False), task, impulse)
         return measure_impulse(problem, task, impulse)
+
+
+def _cost(record: Record) -> float:
+    """Time [s] that a record took to make, from what it holds, so that a resumed pass ends where the first did."""
+    spent = record.time_median * record.repeats
+    return spent if math.isfinite(spent) else record.time_limit
 
 
 def _sequences(items: list[Item]) -> list[tuple[str, list[Item]]]:

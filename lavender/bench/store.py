@@ -6,9 +6,11 @@ off before the next one is written.
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import json
 import os
+import time
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
@@ -18,6 +20,8 @@ from lavender.bench.record import CaseInfo, Done, Entry, Record, Run, Skip, from
 from lavender.errors import InputError
 
 __all__ = ["Records", "Store", "read", "write_csv", "write_json"]
+
+SYNC = 1.0  # s, at most, of records that a power cut could take; a killed process takes none
 
 
 @dataclass
@@ -119,21 +123,27 @@ class Store:
             self.records = read(self.path) if self.path.exists() else Records()
             _cut_torn_line(self.path)
             self._file = self.path.open("a", encoding="utf-8")
+            self._synced = time.monotonic()
         except OSError as error:
             raise InputError(
                 f"cannot write {self.path} ({error.strerror or error}): give a folder that you may write to"
             ) from None
 
     def add(self, entry: Entry) -> None:
-        """Write one entry and hand it to the operating system before anything else happens."""
+        """Write one entry and hand it to the operating system before anything else happens.
+
+        Raises
+        ------
+        InputError
+            No room, or the folder is gone; what was written before is there.
+        """
         line = json.dumps(to_json(entry), allow_nan=False)
         try:
             self._file.write(line + "\n")
             self._file.flush()
-            if isinstance(entry, Record):
-                os.fdatasync(self._file.fileno()) if hasattr(os, "fdatasync") else os.fsync(
-                    self._file.fileno()
-                )
+            if time.monotonic() - self._synced > SYNC:
+                os.fsync(self._file.fileno())
+                self._synced = time.monotonic()
         except OSError as error:
             raise InputError(
                 f"cannot write {self.path} ({error.strerror or error}): make room and run the same command again; "
@@ -142,8 +152,9 @@ class Store:
         self.records.add(entry)
 
     def close(self) -> None:
-        """Close the file."""
-        self._file.close()
+        """Close the file; what the disk had no room for was reported when it was written."""
+        with contextlib.suppress(OSError):
+            self._file.close()
 
     def __enter__(self) -> Store:
         return self
@@ -180,7 +191,7 @@ def read(path: str | Path) -> Records:
             f"cannot read {path} ({error.strerror or error}); a records.jsonl is needed"
         ) from None
     found = Records(source=str(path))
-    last = lines.pop()  # without a newline: empty, or torn
+    lines.pop()  # without a newline: empty, or torn
     for number, line in enumerate(lines, 1):
         if not line.strip():
             continue
@@ -188,7 +199,6 @@ def read(path: str | Path) -> Records:
             found.add(from_json(json.loads(line)))
         except ValueError as error:
             raise InputError(f"{path}, line {number}: {error}; a records.jsonl is needed") from None
-    del last
     return found
 
 

@@ -7,7 +7,7 @@ for: runs are matched by the accuracy they reached, never by the one they were a
 from __future__ import annotations
 
 import math
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from statistics import median
@@ -167,7 +167,7 @@ class Walk:
     mode: str
     tol: float
     max_iter: int
-    steps: int
+    steps: int  # of the sequence; a pass that was stopped has fewer
     times: Mapping[str, tuple[float, ...]]  # start -> s of each step
     iterations: Mapping[str, int]
     residuals: Mapping[str, tuple[float, ...]]  # start -> of each step
@@ -191,9 +191,10 @@ class Walk:
     def gain(self) -> float:
         """Median over the steps of cold over carried residual; nan without both."""
         cold, carried = self.residuals.get("cold"), self.residuals.get("carried")
-        if not cold or not carried or len(cold) != len(carried):
+        if not cold or not carried:
             return math.nan
-        pairs = [(c, w) for c, w in zip(cold, carried, strict=True) if w > 0.0 and math.isfinite(c)]
+        # A pass that was stopped has fewer steps.
+        pairs = [(c, w) for c, w in zip(cold, carried, strict=False) if w > 0.0 and math.isfinite(c)]
         return median(c / w for c, w in pairs) if pairs else math.nan
 
 
@@ -547,7 +548,10 @@ def time_budgets(records: Records) -> tuple[float, ...]:
     fastest = [min(by.values()) for by in _times(records, level).values() if by]
     for walks in by_sequence(records).values():
         reached = [
-            median(w.times[start]) for w in walks for start in w.residuals if max(w.residuals[start]) <= level
+            median(w.times[start])
+            for w in walks
+            for start, residuals in w.residuals.items()
+            if len(residuals) == w.steps and max(residuals) <= level
         ]
         fastest.append(min(reached, default=math.inf))
     fastest = [t for t in fastest if 0.0 < t < math.inf]
@@ -590,7 +594,8 @@ def advice_by_sequence(records: Records, times: Sequence[float] = ()) -> tuple[l
     """For each sequence, by level and by time of a step: which solver, which budget, carried or cold.
 
     To a level: who brings most steps there, then who takes least time over all steps. In a time (the median
-    step keeps to it): the smallest geometric mean of the residuals. A false claim on any step comes last.
+    step keeps to it): the smallest geometric mean of the residuals; a step that was not solved counts 1. A
+    false claim on any step comes last.
     """
     times = tuple(times) or time_budgets(records)
     by_level, by_time = [], []
@@ -607,8 +612,9 @@ def advice_by_sequence(records: Records, times: Sequence[float] = ()) -> tuple[l
             ranked = []
             for w, start, how in runs:
                 if median(w.times[start]) <= limit:
-                    score = geometric_mean([_score(r) for r in w.residuals[start]])
-                    choice = Choice(w.solver, w.steps, w.steps, score, math.nan, how)
+                    done = [_score(r) for r in w.residuals[start]]
+                    score = geometric_mean(done + [1.0] * (w.steps - len(done)))
+                    choice = Choice(w.solver, len(done), w.steps, score, math.nan, how)
                     ranked.append(((bool(w.wrong[start]), score, w.time[start]), choice))
             by_time.append(Advice(name, limit, _best_of_each(ranked)))
     return by_level, by_time
@@ -631,6 +637,7 @@ def walks(records: Records) -> list[Walk]:
         if r.step >= 0 and r.case in records.cases:
             name = records.cases[r.case].sequence
             groups[name, r.solver, r.mode, r.tol, r.max_iter][r.start].append(r)
+    steps = Counter(info.sequence for info in records.cases.values())
     out = []
     for key, by_start in groups.items():
         for group in by_start.values():
@@ -638,14 +645,19 @@ def walks(records: Records) -> list[Walk]:
         out.append(
             Walk(
                 *key,
-                max(len(g) for g in by_start.values()),
-                {s: tuple(r.time_min for r in g) for s, g in by_start.items()},
+                steps[key[0]],
+                {s: tuple(_step_time(r) for r in g) for s, g in by_start.items()},
                 {s: sum(r.iterations for r in g) for s, g in by_start.items()},
                 {s: tuple(r.relative for r in g) for s, g in by_start.items()},
                 {s: sum(bool(r.contradicted) for r in g) for s, g in by_start.items()},
             )
         )
     return out
+
+
+def _step_time(r: Record) -> float:
+    # A step that brought nothing back took its limit.
+    return r.time_min if math.isfinite(r.time_min) else r.time_limit
 
 
 def by_sequence(records: Records) -> dict[str, list[Walk]]:

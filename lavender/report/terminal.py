@@ -143,8 +143,8 @@ def print_report(
     if refused:
         names = sorted({s.solver for s in refused})
         console.print(
-            f"{len(refused)} pairs were not run because the solver does not take the problem "
-            f"({', '.join(names)}); the page says why.",
+            f"{len(refused)} pairs of case and solver were not run, or not to the end ({', '.join(names)}); "
+            "the page says why.",
             highlight=False,
             style="dim",
         )
