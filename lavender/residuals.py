@@ -77,11 +77,14 @@ def reference(problem: Problem) -> tuple[float, float]:
         m = problem.m
         w, e = np.empty(m), np.empty(m)
         energy, velocity, *_ = kernels.judge(data, problem.start(), w, e, False)
-        # The norms of b: sqrt(sum b^2 / d), max |b| sqrt(nu / d). Scaled, so that 1e-200 does not vanish.
+        # The norms of b: sqrt(sum b^2 / d), max |b| sqrt(nu / d), |b| the pair's norm on tangents. Scaled, so
+        # that 1e-200 does not vanish.
         x = np.abs(problem.b) / np.sqrt(data.d)
         big = x.max(initial=0.0)
         rhs_energy = float(big) * float(np.sqrt(np.sum((x / big) ** 2))) if big > 0.0 else 0.0
         if energy <= 2.0**-48 * rhs_energy:
+            pair = problem.cones.ptr[:-1][problem.cones.n_tangents == 2] + 1
+            x[pair] = np.hypot(x[pair], x[pair + 1])
             energy, velocity = rhs_energy, float((x * np.sqrt(data.nu)).max(initial=0.0))
         # A size that overflows measures nothing: 0 makes every error beside it infinite.
         data.set_start(energy if energy < np.inf else 0.0, velocity if velocity < np.inf else 0.0)
