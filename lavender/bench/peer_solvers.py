@@ -1,0 +1,831 @@
+"""Time to a given error: every solver here against the solvers of others, on the same problems, by one judge.
+
+A contestant runs a problem at tighter and tighter settings of its own; each run gives a time and the judge's
+residual, and the time to an error is the least time of a run that has it, whatever was asked. Ours get a
+problem whose A is known and pay for the solver's set-up and solve; "from scratch" they pay for forming A too.
+The others get it in their better form (impulse or velocity form of `lavender.external.as_qp`, scaled, in the
+layout they read): conversion and judging are not counted, the call of their own interface is. CPU time, least
+of several; each contestant runs in a process of its own, which may die or be ended; contestants take turns, and
+the quick ones run again in later rounds.
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib.util
+import math
+import multiprocessing
+import os
+import subprocess
+import tempfile
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from time import monotonic, process_time
+from typing import Any
+
+import numpy as np
+import scipy.sparse as sp
+
+from lavender import registry
+from lavender._arrays import FloatArray
+from lavender.bench.timing import one_thread
+from lavender.cones import CONTACT
+from lavender.errors import CapabilityError, InputError
+from lavender.external._running import Limits, quiet
+from lavender.external.as_qp import QP, impulse_form, velocity_form
+from lavender.external.qpsolvers_ import BACKENDS, Backend, QPSolver, refusal
+from lavender.problem import Problem
+from lavender.residuals import reference, residual
+from lavender.solve import prepare
+
+__all__ = ["TARGETS", "Contestant", "Result", "contestants", "geometric_means", "losses", "race"]
+
+TARGETS = (1e-3, 1e-6, 1e-9)
+#: Settings of other solvers, loose to tight: their own measures, in units where unknowns are near 1.
+LADDER = (1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10, 1e-12, 1e-14)
+LARGE = 1000  # rows from which a problem counts as large
+REPEATS, REPEAT_TIME = 30, 0.1  # of one setting: at most so many, and as long as they take so long [s]
+AGAIN = 4.0  # a contestant runs again in later rounds when it is within so many times the fastest of its side
+START = 60.0  # s, wall: imports of a backend on a loaded machine
+SCRATCH = ", from scratch"
+DENSE_ROWS = 1700  # rows up to which Siconos' solvers of dense matrices are asked
+
+Call = Callable[[], tuple[float, FloatArray]]  # one run: s of CPU, impulse (m,) [N s]
+Runs = Callable[[Problem, float], Iterator[Call]]  # problem, limit [s] -> a call for each setting
+
+
+@dataclass(frozen=True)
+class Contestant:
+    """A solver with its form."""
+
+    name: str
+    peer: bool
+    runs: Runs = field(repr=False)
+    refuses: Callable[[Problem], str | None] = field(default=lambda _: None, repr=False)
+
+
+@dataclass
+class Result:
+    """What one contestant reached on one problem."""
+
+    problem: str
+    rows: int
+    law: str
+    solver: str
+    peer: bool
+    runs: list[tuple[float, float]] = field(default_factory=list)  # s, relative residual, of every setting
+    note: str = ""
+
+    def time(self, target: float) -> float:
+        """Least time [s] of a run with at most this relative residual; inf without one."""
+        return min((t for t, r in self.runs if r <= target), default=math.inf)
+
+
+# -- ours ------------------------------------------------------------------------------------------
+
+
+def _ours(name: str, scratch: bool) -> Contestant:
+    """`prepare` and `solve` of a problem of which A and d are known, or of one of which nothing is yet."""
+
+    def runs(problem: Problem, limit: float) -> Iterator[Call]:
+        def once(tol: float) -> tuple[float, FloatArray]:
+            given = replace(problem, copy=False) if scratch else problem
+            start = process_time()
+            prepared = prepare(given, name)
+            seconds = process_time() - start
+            reference(given)  # the judge's
+            first = given.start()
+            start = process_time()
+            impulse = prepared.solve(impulse=first, tol=tol, max_iter=2**31 - 1, time_limit=limit).impulse
+            return seconds + process_time() - start, impulse
+
+        if not scratch:
+            reference(problem)
+            if problem.csr_data.d.size and registry.get(name).operator != "matrix":
+                _ = problem.data
+        for tol in TARGETS:
+            yield functools.partial(once, tol)
+
+    return Contestant(name + SCRATCH * scratch, False, runs, registry.get(name).refuses)
+
+
+# -- QP and cone backends --------------------------------------------------------------------------
+
+
+def _limits(eps: float, n: int, limit: float) -> Limits:
+    # A gap falls towards eps^2 where impulse and slack vanish together; below 1e-18 sums lose it.
+    return Limits(eps, max(1e-2 * eps, 1e-18), max(1e-4 * eps, 1e-16), n, limit)
+
+
+def _timed(
+    qp: QP, call: Callable[[], tuple[FloatArray | None, FloatArray | None]]
+) -> tuple[float, FloatArray]:
+    start = process_time()
+    x, zeta = call()
+    seconds = process_time() - start
+    blank = qp.problem.start()
+    if x is None or len(x) != qp.n:
+        return seconds, blank
+    if qp.form == "velocity" and (zeta is None or len(zeta) != len(qp.b)):
+        return seconds, blank
+    return seconds, qp.impulse(x, np.zeros(0) if zeta is None else zeta)
+
+
+def _backend(backend: Backend, form: str) -> Contestant:
+    from lavender.external.qpsolvers_ import _through_qpsolvers
+
+    call = functools.partial(_through_qpsolvers, backend) if backend.call is None else backend.call
+
+    def runs(problem: Problem, limit: float) -> Iterator[Call]:
+        qp = QPSolver(backend, form=form).prepare(problem).qp
+        if form == "velocity" and backend.definite and not qp.is_definite:
+            return
+        start = problem.start()
+
+        def once(eps: float) -> tuple[float, FloatArray]:
+            def solve() -> tuple[FloatArray | None, FloatArray | None]:
+                answer = call(qp, start, _limits(eps, backend.max_iter, limit), {})
+                return answer.x, answer.zeta
+
+            return _timed(qp, solve)
+
+        own = backend.call is None and backend.settings is None  # runs at its own tolerance
+        for eps in LADDER[:1] if own else LADDER:
+            yield functools.partial(once, eps)
+
+    def refuses(problem: Problem) -> str | None:
+        if form == "velocity" and problem.rows is None:
+            return "no rows"
+        return registry.get(backend.name).refuses(problem)
+
+    return Contestant(f"{backend.name} ({form})", True, runs, refuses)
+
+
+def _direct(name: str, form: str) -> Contestant:
+    """Backends whose call is quick enough for an adapter to weigh: arrays ready, their own interface alone."""
+
+    def runs(problem: Problem, limit: float) -> Iterator[Call]:
+        qp = velocity_form(problem) if form == "velocity" else impulse_form(problem)
+        if name == "quadprog" and form == "velocity" and not qp.is_definite:
+            return
+        solve = {"daqp": _daqp, "quadprog": _quadprog}.get(name) or functools.partial(
+            {"piqp": _piqp, "proxqp": _proxqp}[name.split()[0]], dense=name.endswith("dense")
+        )
+        call = solve(qp, limit)
+        for eps in LADDER[-1:] if name == "quadprog" else LADDER:
+            yield functools.partial(_timed, qp, functools.partial(call, eps))
+
+    def refuses(problem: Problem) -> str | None:
+        if problem.law not in ("linear", "lcp"):
+            return "for bounded rows"
+        if form == "velocity" and problem.rows is None:
+            return "no rows"
+        if problem.m > DENSE_ROWS and not name.endswith("sparse"):
+            return "a dense matrix"
+        return refusal(problem)
+
+    return Contestant(f"{name}, own interface ({form})", True, runs, refuses)
+
+
+Solve = Callable[[float], tuple[FloatArray | None, FloatArray | None]]
+
+
+def _bounds(qp: QP) -> tuple[FloatArray, FloatArray]:
+    none = np.full(qp.n, np.inf)
+    return -none if qp.lb is None else qp.lb, none if qp.ub is None else qp.ub
+
+
+def _daqp(qp: QP, limit: float) -> Solve:
+    import daqp
+
+    low, high = _bounds(qp)
+    bounded = qp.lb is not None
+    k, z = qp.n if bounded else 0, qp.n_zero
+    below = np.full(len(qp.b), -1e30)
+    below[:z] = qp.b[:z]
+    upper = np.clip(np.concatenate([high[:k], qp.b]), -1e30, 1e30)
+    lower = np.clip(np.concatenate([low[:k], below]), -1e30, 1e30)
+    sense = np.zeros(len(upper), np.int32)
+    sense[k : k + z] = 5  # an equation
+    h, f, a = qp.P.toarray(), qp.q.copy(), np.ascontiguousarray(qp.A.toarray())
+
+    def solve(eps: float) -> tuple[Any, Any]:
+        x, _, _, info = daqp.solve(
+            h, f, a, upper, lower, sense, primal_tol=max(eps, 1e-11), dual_tol=max(eps, 1e-13),
+            iter_limit=100_000, time_limit=limit,
+        )  # fmt: skip
+        return np.asarray(x), np.asarray(info["lam"])[k:]
+
+    return solve
+
+
+def _quadprog(qp: QP, limit: float) -> Solve:
+    import quadprog
+
+    z = qp.n_zero
+    low, high = _bounds(qp)
+    at, to = np.flatnonzero(np.isfinite(low)), np.flatnonzero(np.isfinite(high))
+    eye = np.eye(qp.n)
+    rows, p = qp.A.toarray(), qp.P.toarray()
+    if not len(qp.b) + len(at) + len(to):
+        raise CapabilityError("quadprog takes no problem without constraints")
+    c = np.asfortranarray(np.vstack([rows[:z], -rows[z:], eye[at], -eye[to]]).T)
+    d = np.concatenate([qp.b[:z], -qp.b[z:], low[at], -high[to]])
+
+    def solve(eps: float) -> tuple[Any, Any]:
+        x, _, _, _, lagrangian, _ = quadprog.solve_qp(p, -qp.q, c, d, z)
+        zeta = lagrangian[: len(qp.b)].copy()
+        zeta[:z] *= -1.0
+        return x, zeta
+
+    return solve
+
+
+def _piqp(qp: QP, limit: float, dense: bool) -> Solve:
+    import piqp
+
+    z = qp.n_zero
+    low, high = _bounds(qp)
+    p, rows = (qp.P.toarray(), qp.A.toarray()) if dense else (qp.P, qp.A.tocsr())
+    equal, unequal = (rows[:z], rows[z:]) if dense else (sp.csc_matrix(rows[:z]), sp.csc_matrix(rows[z:]))
+    below = np.full(len(qp.b) - z, -np.inf)
+
+    def solve(eps: float) -> tuple[Any, Any]:
+        solver = piqp.DenseSolver() if dense else piqp.SparseSolver()
+        bounds = _limits(eps, 250, limit)
+        s = solver.settings
+        s.eps_abs, s.eps_rel, s.max_iter, s.check_duality_gap = bounds.eps, 0.0, 250, True
+        s.eps_duality_gap_abs, s.eps_duality_gap_rel = bounds.gap, bounds.gap_relative
+        solver.setup(p, qp.q, equal, qp.b[:z], unequal, below, qp.b[z:], low, high)
+        solver.solve()
+        found = solver.result
+        return np.array(found.x), np.concatenate([found.y, np.asarray(found.z_u) - np.asarray(found.z_l)])
+
+    return solve
+
+
+def _proxqp(qp: QP, limit: float, dense: bool) -> Solve:
+    from proxsuite import proxqp
+
+    z, n = qp.n_zero, qp.n
+    boxed = qp.lb is not None
+    low, high = (np.clip(x, -1e20, 1e20) for x in _bounds(qp))
+    below = np.full(len(qp.b) - z, -1e20)
+    if dense:
+        p, rows = qp.P.toarray(), qp.A.toarray()
+        equal, unequal = rows[:z], rows[z:]
+    else:
+        # Its sparse solver has no box: bounds are rows.
+        p, equal, unequal = qp.P, sp.csc_matrix(qp.A[:z]), sp.csc_matrix(qp.A[z:])
+        if boxed:
+            unequal = sp.csc_matrix(sp.vstack([unequal, sp.eye_array(n)]))
+    over = qp.b[z:]
+    if boxed and not dense:
+        below, over = np.concatenate([below, low]), np.concatenate([over, high])
+
+    def solve(eps: float) -> tuple[Any, Any]:
+        solver = proxqp.dense.QP(n, z, len(over), boxed) if dense else proxqp.sparse.QP(n, z, len(over))
+        s, bounds = solver.settings, _limits(eps, 10_000, limit)
+        s.eps_abs, s.eps_rel, s.max_iter, s.check_duality_gap = bounds.eps, 0.0, 10_000, True
+        s.eps_duality_gap_abs, s.eps_duality_gap_rel = bounds.gap, bounds.gap_relative
+        box = (low, high) if dense and boxed else ()
+        solver.init(p, qp.q, equal, qp.b[:z], unequal, below, over, *box)
+        solver.solve()
+        found = solver.results
+        return np.array(found.x), np.concatenate([found.y, np.asarray(found.z)[: len(qp.b) - z]])
+
+    return solve
+
+
+def _stacked(qp: QP, first: int) -> tuple[sp.csc_matrix, FloatArray, int]:
+    # Rows and right-hand side with the finite bounds put in after `first` rows, and how many there are.
+    if qp.lb is None or qp.ub is None:
+        return qp.A, qp.b, 0
+    low, high = np.flatnonzero(np.isfinite(qp.lb)), np.flatnonzero(np.isfinite(qp.ub))
+    eye = sp.csr_matrix(sp.eye_array(qp.n))
+    rows = sp.csc_matrix(sp.vstack([qp.A[:first], -eye[low], eye[high], qp.A[first:]]))
+    rhs = np.concatenate([qp.b[:first], -qp.lb[low], qp.ub[high], qp.b[first:]])
+    return rows, rhs, len(low) + len(high)
+
+
+def _cone(name: str, form: str) -> Contestant:
+    """Solvers of second-order cone programs by their own interface."""
+
+    def runs(problem: Problem, limit: float) -> Iterator[Call]:
+        qp = velocity_form(problem) if form == "velocity" else impulse_form(problem)
+        first = qp.n_zero + qp.n_nonneg
+        rows, rhs, more = _stacked(qp, first)
+        upper = sp.csc_matrix(sp.triu(qp.P))
+
+        def zeta(y: Any) -> FloatArray:
+            return np.delete(np.asarray(y, float), np.s_[first : first + more])
+
+        def scs(eps: float) -> tuple[Any, Any]:
+            import scs
+
+            cone = {"z": qp.n_zero, "l": qp.n_nonneg + more, "q": list(qp.soc)}
+            data = {"P": upper, "A": rows, "b": rhs, "c": qp.q}
+            found = scs.SCS(
+                data, cone, eps_abs=eps, eps_rel=0.0, eps_infeas=1e-14, max_iters=10**7,
+                time_limit_secs=limit, verbose=False,
+            ).solve()  # fmt: skip
+            return found["x"], zeta(found["y"])
+
+        def clarabel(eps: float) -> tuple[Any, Any]:
+            import clarabel
+
+            cones: list[Any] = [clarabel.ZeroConeT(qp.n_zero)] if qp.n_zero else []
+            cones += [clarabel.NonnegativeConeT(qp.n_nonneg + more)] if qp.n_nonneg + more else []
+            cones += [clarabel.SecondOrderConeT(size) for size in qp.soc]
+            settings = clarabel.DefaultSettings()
+            settings.verbose, settings.max_threads, settings.time_limit = False, 1, limit
+            bounds = _limits(eps, 200, limit)
+            settings.tol_feas, settings.tol_gap_abs = bounds.eps, bounds.gap
+            settings.tol_gap_rel = bounds.gap_relative
+            found = clarabel.DefaultSolver(upper, qp.q, rows, rhs, cones, settings).solve()
+            return np.asarray(found.x), zeta(found.z)
+
+        def qoco(eps: float) -> tuple[Any, Any]:
+            import qoco
+
+            z = qp.n_zero
+            solver = qoco.QOCO()
+            equal = (rows[:z], rhs[:z]) if z else (None, None)
+            solver.setup(
+                qp.n, len(rhs) - z, z, upper, qp.q, *equal, sp.csc_matrix(rows[z:]), rhs[z:], qp.n_nonneg + more,
+                len(qp.soc), np.asarray(qp.soc, np.int32), abstol=max(eps, 1e-13), reltol=1e-16, verbose=0,
+                max_iters=200,
+            )  # fmt: skip
+            found = solver.solve()
+            return np.asarray(found.x), zeta(np.concatenate([np.asarray(found.y)[:z], np.asarray(found.z)]))
+
+        solve: Callable[[float], tuple[Any, Any]] = {"scs": scs, "clarabel": clarabel, "qoco": qoco}[name]
+        for eps in LADDER:
+            yield functools.partial(_timed, qp, functools.partial(solve, eps))
+
+    def refuses(problem: Problem) -> str | None:
+        if problem.law != "cone":
+            return "for the convex law of friction"
+        return "no rows" if form == "velocity" and problem.rows is None else refusal(problem)
+
+    return Contestant(f"{name} cones ({form})", True, runs, refuses)
+
+
+# -- Pinocchio -------------------------------------------------------------------------------------
+
+
+def _three_rows_each(problem: Problem) -> bool:
+    c = problem.cones
+    return bool(problem.m and np.all(c.kind == CONTACT) and np.all(np.diff(c.ptr) == 3))
+
+
+def _pinocchio(lanczos: int | None) -> Contestant:
+    """Pinocchio's ADMM on the Delassus matrix, tangents first as it wants them; lanczos None: its default."""
+
+    def runs(problem: Problem, limit: float) -> Iterator[Call]:
+        import pinocchio as pin
+
+        m, c = problem.m, problem.n_blocks
+        order = (np.arange(c)[:, None] * 3 + np.array([1, 2, 0])).ravel()
+        unit, speed = float(np.mean(problem.d)), max(reference(problem)[1], 1e-300)  # 1/kg, m/s
+        a = sp.csc_matrix(problem.csr[order][:, order] / unit)
+        g = -problem.b[order] / speed
+        model = pin.Model()
+        joint = model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "body")
+        models, datas = pin.StdVec_ConstraintModel(), pin.StdVec_ConstraintData()
+        for mu in problem.cones.mu:
+            one = pin.PointContactConstraintModel(model, joint)
+            one.setFriction(float(mu))
+            models.append(pin.ConstraintModel(one))
+            datas.append(models[len(models) - 1].createData())
+
+        def once(eps: float, cap: int) -> tuple[float, FloatArray]:
+            settings = pin.ADMMSolverSettings()
+            settings.absolute_feasibility_tol = settings.absolute_complementarity_tol = eps
+            settings.relative_feasibility_tol = settings.relative_complementarity_tol = 0.0
+            settings.max_iterations, settings.solve_ncp = cap, problem.law == "coulomb"
+            if lanczos is not None:
+                settings.lanczos_size = lanczos
+            start = process_time()
+            result = pin.ADMMSolverResult()
+            pin.ADMMConstraintSolver(m).solve(
+                pin.DelassusOperatorSparse(a), g, models, datas, settings, result
+            )
+            seconds = process_time() - start
+            x = np.empty(m)
+            x[order] = np.asarray(result.retrieveConstraintImpulses()).ravel()
+            return seconds, x * (speed / unit)
+
+        # What 50 iterations cost says how many the limit allows.
+        most = int(min(10**6, max(50, limit / max(once(1e-16, 50)[0] / 50, 1e-7))))
+        for eps in LADDER:
+            yield functools.partial(once, eps, most)
+
+    def refuses(problem: Problem) -> str | None:
+        if not _three_rows_each(problem):
+            return "for contacts with two tangents each"
+        return None if problem.is_symmetric else "for a symmetric A"
+
+    return Contestant(
+        "pinocchio ADMM" + ("" if lanczos is None else f", lanczos {lanczos}"), True, runs, refuses
+    )
+
+
+# -- SciPy, for linear systems ---------------------------------------------------------------------
+
+
+def _scipy(name: str) -> Contestant:
+    def runs(problem: Problem, limit: float) -> Iterator[Call]:
+        from scipy.linalg import solveh_banded
+        from scipy.sparse.linalg import spsolve
+
+        a = sp.csc_matrix(problem.csr)
+        width = max(problem.bandwidth)
+
+        def banded() -> FloatArray:
+            entries = a.tocoo()
+            band = np.zeros((width + 1, problem.m))
+            keep = entries.col >= entries.row
+            row, col = entries.row[keep], entries.col[keep]
+            band[width + row - col, col] = entries.data[keep]
+            return solveh_banded(band, problem.b)
+
+        def once() -> tuple[float, FloatArray]:
+            start = process_time()
+            x = banded() if name == "banded" else spsolve(a, problem.b)
+            return process_time() - start, np.asarray(x)
+
+        yield once
+
+    def refuses(problem: Problem) -> str | None:
+        if problem.law != "linear":
+            return "for linear systems"
+        return "a wide band" if name == "banded" and max(problem.bandwidth) > 100 else None
+
+    return Contestant(f"scipy {name}", True, runs, refuses)
+
+
+# -- Siconos, in an interpreter of its own ---------------------------------------------------------
+
+SICONOS_FRICTION = ("NSGS", "NSGS+projection", "NSN_AC", "ADMM")
+SICONOS_LCP = ("PGS", "LEMKE", "MURTY", "NEWTON_FB_FBLSA", "NEWTON_MIN_FBLSA")
+
+
+def _siconos(python: str, name: str, friction: bool) -> Contestant:
+    def runs(problem: Problem, limit: float) -> Iterator[Call]:
+        a = problem.csr
+        ladder = LADDER if name not in ("LEMKE", "MURTY") else LADDER[-1:]
+        with tempfile.TemporaryDirectory() as folder:
+            given = Path(folder) / "problem.npz"
+            np.savez(
+                given, A_data=a.data, A_indices=a.indices, A_indptr=a.indptr, b=problem.b, solver=name,
+                mu=problem.cones.mu if friction else np.zeros(0), tolerances=np.array(ladder), limit=limit,
+            )  # fmt: skip
+            script = Path(__file__).with_name("siconos_server.py")
+            with subprocess.Popen(
+                [python, "-I", str(script), str(given), folder],
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.DEVNULL,
+            ) as process:
+                try:
+                    for i in range(len(ladder)):
+                        answer = Path(folder) / f"{i}.npz"
+                        patience = monotonic() + START + 4.0 * limit
+                        while not answer.exists() and process.poll() is None and monotonic() < patience:
+                            _nap()
+                        if not answer.exists():
+                            return
+                        with np.load(answer, allow_pickle=False) as found:
+                            yield functools.partial(
+                                _found, float(found["seconds"]), np.array(found["impulse"])
+                            )
+                finally:
+                    process.kill()
+
+    def refuses(problem: Problem) -> str | None:
+        c = problem.cones
+        if friction:
+            wrong = problem.law != "coulomb" or not _three_rows_each(problem)
+            return "for Coulomb contacts with two tangents each" if wrong else None
+        if problem.law != "lcp" or np.any(c.lower != 0.0) or np.any(np.isfinite(c.upper)):
+            return "for impulses >= 0"
+        return "a dense matrix" if name != "PGS" and problem.m > DENSE_ROWS else None
+
+    return Contestant(f"siconos {name}", True, runs, refuses)
+
+
+def _nap() -> None:
+    from time import sleep
+
+    sleep(0.005)
+
+
+def _found(seconds: float, impulse: FloatArray) -> tuple[float, FloatArray]:
+    return seconds, impulse
+
+
+def check_siconos(python: str) -> None:
+    """That an interpreter has Siconos.
+
+    Raises
+    ------
+    InputError
+        It cannot be run, or cannot import siconos.numerics.
+    """
+    try:
+        done = subprocess.run(
+            [python, "-I", "-c", "import siconos.numerics"], capture_output=True, text=True, timeout=START
+        )
+    except (OSError, subprocess.TimeoutExpired) as error:
+        raise InputError(f"{python} cannot be run as the interpreter of Siconos: {error}") from None
+    if done.returncode:
+        last = (done.stderr.strip().splitlines() or [f"exit status {done.returncode}"])[-1]
+        raise InputError(f"{python} has no Siconos ({last}); on Debian: apt install python3-siconos")
+
+
+# -- all of them -----------------------------------------------------------------------------------
+
+
+def _installed(module: str) -> bool:
+    return importlib.util.find_spec(module) is not None
+
+
+def contestants(siconos: str = "") -> list[Contestant]:
+    """Every solver of ours, and every installed one of others in each of its forms.
+
+    Parameters
+    ----------
+    siconos : path, optional
+        Python interpreter that has Siconos.
+
+    Raises
+    ------
+    InputError
+        That interpreter has none.
+    """
+    ours = [name for name, spec in registry.specs().items() if not spec.external and spec.missing() is None]
+    made = [_ours(name, scratch) for name in ours for scratch in (False, True)]
+    for backend in BACKENDS:
+        if registry.specs()[backend.name].missing() is None:
+            made += [_backend(backend, "impulse"), _backend(backend, "velocity")]
+    quick = {"daqp": ("",), "quadprog": ("",), "piqp": (" sparse", " dense"), "proxqp": (" sparse", " dense")}
+    for name, ways in quick.items():
+        if registry.specs()[name].missing() is None:
+            made += [_direct(name + way, form) for way in ways for form in ("impulse", "velocity")]
+    for name in ("scs", "clarabel", "qoco"):
+        if _installed(name):
+            made += [_cone(name, "impulse"), _cone(name, "velocity")]
+    if _installed("pinocchio"):
+        made += [_pinocchio(None), _pinocchio(20)]
+    made += [_scipy("banded"), _scipy("spsolve")]
+    if siconos:
+        check_siconos(siconos)
+        made += [_siconos(siconos, name, True) for name in SICONOS_FRICTION]
+        made += [_siconos(siconos, name, False) for name in SICONOS_LCP]
+    return made
+
+
+# -- running ---------------------------------------------------------------------------------------
+
+
+def _child(pipe: Any, contestant: Contestant, problem: Problem, limit: float) -> None:
+    # In a process of its own: (seconds, residual) of each setting, then None or why it stopped.
+    try:
+        with one_thread(contestant.name), quiet(noisy=True):
+            least = max(min(TARGETS), 2.0 * residual(problem, problem.start()).floor)
+            for call in contestant.runs(problem, limit):
+                seconds, impulse = call()
+                judged = residual(problem, impulse)
+                spent = seconds
+                for _ in range(REPEATS):
+                    if spent > REPEAT_TIME:
+                        break
+                    again = call()[0]
+                    spent, seconds = spent + max(again, 1e-6), min(seconds, again)
+                pipe.send((seconds, judged.relative))
+                if judged.relative <= max(least, 2.0 * judged.floor) or seconds > limit:
+                    break
+        pipe.send(None)
+    except BaseException as error:  # whatever another project's code does
+        pipe.send(f"{type(error).__name__}: {error}"[:200])
+
+
+def _run(contestant: Contestant, problem: Problem, limit: float) -> tuple[list[tuple[float, float]], str]:
+    context: Any = multiprocessing.get_context("fork" if hasattr(os, "fork") else "spawn")
+    mine, other = context.Pipe(duplex=False)
+    process = context.Process(target=_child, args=(other, contestant, problem, limit), daemon=False)
+    process.start()
+    other.close()
+    runs: list[tuple[float, float]] = []
+    note = ""
+    try:
+        while True:
+            # CPU time of a call is limited by the solver where it can be; wall time here, on a loaded machine.
+            patience = 4.0 * limit + 10.0
+            if not mine.poll(patience):
+                note = f"ended after {patience:g} s without an answer"
+                break
+            try:
+                said = mine.recv()
+            except EOFError:
+                process.join(5.0)
+                note = f"its process died ({process.exitcode})"
+                break
+            if said is None or isinstance(said, str):
+                note = said or ""
+                break
+            runs.append(said)
+    finally:
+        process.kill()
+        process.join()
+        mine.close()
+    return runs, note
+
+
+def race(
+    problems: Iterable[tuple[str, Problem]],
+    all_of: Sequence[Contestant],
+    *,
+    limit: float = 5.0,
+    rounds: int = 3,
+    watch: Callable[[str], None] = lambda _: None,
+) -> list[Result]:
+    """Every contestant that takes a problem, on every problem.
+
+    Parameters
+    ----------
+    problems : (name, Problem) pairs
+    all_of : contestants
+    limit : s
+        Of CPU for one call; what takes longer ends a contestant's ladder.
+    rounds : int
+        In the second and later ones, in turns, only those near the fastest of their side run.
+    watch : callable
+        Told what runs.
+    """
+    results: list[Result] = []
+    for name, problem in problems:
+        here: dict[str, Result] = {}
+        running = [c for c in all_of if c.refuses(problem) is None]
+        for number in range(rounds):
+            for c in running if number % 2 == 0 else running[::-1]:
+                watch(f"{name}: {c.name}")
+                runs, note = _run(c, problem, limit)
+                result = here.setdefault(c.name, Result(name, problem.m, problem.law, c.name, c.peer))
+                result.runs += runs
+                result.note = result.note or note
+            running = [c for c in running if _near(here[c.name], list(here.values()))]
+        results += here.values()
+    return results
+
+
+def _near(one: Result, all_of: Sequence[Result]) -> bool:
+    for target in TARGETS:
+        side = [
+            r
+            for r in all_of
+            if (r.peer, r.solver.endswith(SCRATCH)) == (one.peer, one.solver.endswith(SCRATCH))
+        ]
+        fastest = min((r.time(target) for r in side), default=math.inf)
+        if math.isfinite(one.time(target)) and one.time(target) <= AGAIN * fastest:
+            return True
+    return False
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """The fastest of ours and of others at one error on one problem."""
+
+    problem: str
+    rows: int
+    law: str
+    target: float
+    ours: str
+    our_time: float  # s, inf: nobody reached it
+    peer: str
+    peer_time: float
+    scratch: float  # s, the fastest of ours from scratch
+    auto: float  # s, "auto"
+
+    @property
+    def ratio(self) -> float:
+        """Ours over theirs; nan where no peer reached the error, inf where only a peer did."""
+        return self.over_peer(self.our_time)
+
+    def over_peer(self, time: float) -> float:
+        """A time over the fastest peer's; nan where there is none."""
+        return time / self.peer_time if math.isfinite(self.peer_time) else math.nan
+
+
+def compare(results: Sequence[Result]) -> list[Comparison]:
+    """One line for each problem and error."""
+    found = []
+    for name in dict.fromkeys(r.problem for r in results):
+        here = [r for r in results if r.problem == name]
+        scratch = [r for r in here if r.solver.endswith(SCRATCH)]
+        ours = [r for r in here if not r.peer and not r.solver.endswith(SCRATCH)]
+        for target in TARGETS:
+            best = [_fastest(side, target) for side in (ours, [r for r in here if r.peer])]
+            found.append(
+                Comparison(
+                    name,
+                    here[0].rows,
+                    here[0].law,
+                    target,
+                    *best[0],
+                    *best[1],
+                    _fastest(scratch, target)[1],
+                    next((r.time(target) for r in ours if r.solver == "auto"), math.inf),
+                )
+            )
+    return found
+
+
+def _fastest(side: Sequence[Result], target: float) -> tuple[str, float]:
+    best = min(side, key=lambda r: r.time(target), default=None)
+    if best is None or not math.isfinite(best.time(target)):
+        return "-", math.inf
+    return best.solver, best.time(target)
+
+
+@dataclass(frozen=True)
+class Mean:
+    """Geometric means of times over the fastest peer's, where both sides reached the error."""
+
+    which: str  # problems
+    target: float
+    ours: float
+    scratch: float
+    auto: float
+    compared: int
+
+
+def geometric_means(compared: Sequence[Comparison]) -> list[Mean]:
+    """For large and smaller problems, and each error."""
+    out = []
+    for which, large in ((f"{LARGE} rows and more", True), ("smaller", False)):
+        for target in TARGETS:
+            some = [c for c in compared if c.target == target and (c.rows >= LARGE) is large]
+            some = [c for c in some if math.isfinite(c.peer_time)]
+            ours, scratch, auto = (
+                _mean([c.over_peer(time) for c, time in zip(some, times, strict=True)])
+                for times in ([c.our_time for c in some], [c.scratch for c in some], [c.auto for c in some])
+            )
+            out.append(Mean(which, target, ours, scratch, auto, sum(math.isfinite(c.our_time) for c in some)))
+    return out
+
+
+def _mean(ratios: Sequence[float]) -> float:
+    known = [x for x in ratios if math.isfinite(x)]
+    return float(np.exp(np.mean(np.log(known)))) if known else math.nan
+
+
+def losses(compared: Sequence[Comparison]) -> list[Comparison]:
+    """Where a peer is faster, or alone, worst first."""
+    return sorted((c for c in compared if c.ratio > 1.0), key=lambda c: -c.ratio)
+
+
+def tables(results: Sequence[Result]) -> list[str]:
+    """Markdown: every problem and error, geometric means, losses, and what nobody reached."""
+    compared = compare(results)
+    lines = [
+        "| problem | rows | law | error | ours | fastest peer | ours / peer | from scratch | auto |",
+        "|---|---|---|---|---|---|---|---|---|",
+    ]
+    for c in compared:
+        if math.isfinite(c.peer_time) or math.isfinite(c.our_time):
+            ratios = (_ratio(c.over_peer(t)) for t in (c.our_time, c.scratch, c.auto))
+            start = f"| {c.problem} | {c.rows} | {c.law} | {c.target:.0e} | {c.ours} | {c.peer} | "
+            lines.append(start + " | ".join(ratios) + " |")
+    lines += [
+        "",
+        "| problems | error | ours / peer | from scratch | auto | compared |",
+        "|---|---|---|---|---|---|",
+    ]
+    for mean in geometric_means(compared):
+        ratios = (_ratio(x) for x in (mean.ours, mean.scratch, mean.auto))
+        lines.append(f"| {mean.which} | {mean.target:.0e} | " + " | ".join(ratios) + f" | {mean.compared} |")
+    lost = losses(compared)
+    lines += ["", f"Lost: {len(lost)} of {sum(math.isfinite(c.peer_time) for c in compared)}."]
+    lines += [f"- {c.problem} at {c.target:.0e}: {c.peer} against {c.ours}, {_ratio(c.ratio)}" for c in lost]
+    alone = [c for c in compared if math.isinf(c.peer_time) and math.isfinite(c.our_time)]
+    if alone:
+        lines += ["", "Reached by no peer: " + _list(alone)]
+    nobody = [c for c in compared if math.isinf(c.peer_time) and math.isinf(c.our_time)]
+    if nobody:
+        lines += ["", "Reached by nobody: " + _list(nobody)]
+    return lines
+
+
+def _list(compared: Sequence[Comparison]) -> str:
+    return ", ".join(f"{c.problem} at {c.target:.0e}" for c in compared) + "."
+
+
+def _ratio(x: float) -> str:
+    return "-" if math.isnan(x) else "only the peer" if math.isinf(x) else f"{x:.3g}"
+
+
+def as_records(results: Sequence[Result]) -> list[dict[str, Any]]:
+    """Plain dictionaries."""
+    return [asdict(r) for r in results]
