@@ -180,6 +180,13 @@ class GeneralFactor:
         u, s, vt = np.linalg.svd(a)
         self.rank = int(np.count_nonzero(s > len(a) * TINY / 10.0 * s[0])) if len(s) and s[0] > 0.0 else 0
         self.svd = (u[:, : self.rank], s[: self.rank], vt[: self.rank])
+        self.null = u[:, self.rank :]
+
+    def outside(self, rhs: FloatArray) -> FloatArray:
+        """The part y of D^-1 rhs with A^T y = 0, from the left singular vectors; 0 where they are not known."""
+        if self.dense is None:
+            return np.zeros_like(rhs)
+        return self.scale * (self.null @ (self.null.T @ (self.scale * rhs)))
 
     @property
     def usable(self) -> bool:

@@ -180,7 +180,7 @@ class _Run:
         if not self.good() and singular:
             # What least squares in the metric of D leaves of b is orthogonal to the range of A.
             judge.slack(problem.csr_data, x, w)
-            proof = self.certificate(-w / problem.csr_data.d)
+            proof = self.certificate(-w / problem.csr_data.d) or self.certificate(factor.outside(problem.b))
             if proof is not None:
                 return proof
         return self.verdict()
