@@ -4,6 +4,7 @@ import json
 import math
 import os
 import signal
+import sys
 import threading
 import time
 
@@ -73,9 +74,41 @@ def test_problems_and_files_travel_too(tmp_path):
     assert ["did not load" in s.reason for s in records.skips] == [True]
 
 
-def test_an_unknown_backend_is_an_input_error():
-    with pytest.raises(lv.InputError, match="nowhere"):
-        bench.campaign(NAMES[:1], ["pgs"], PLAN, backend="nowhere")
+@pytest.mark.parametrize(
+    ("backend", "sign"),
+    [
+        ("nowhere", "'loky' runs processes"),
+        ("loky=here", "'loky' runs processes"),
+        ("dask=tcp://127.0.0.1:1", "no dask scheduler answers"),
+        ("dask", "DASK_SCHEDULER_ADDRESS"),
+    ],
+)
+def test_a_backend_that_is_not_there_is_an_input_error(backend, sign, monkeypatch):
+    if backend.startswith("dask"):
+        pytest.importorskip("distributed", reason="a cluster needs dask.distributed (extra: cluster)")
+        monkeypatch.setattr(sys.modules["lavender.bench.campaign"], "CONNECT", 0.2)
+    with pytest.raises(lv.InputError, match=sign):
+        bench.campaign(NAMES[:1], ["pgs"], PLAN, backend=backend)
+
+
+@pytest.mark.parametrize(
+    ("backend", "package"), [("dask", "lavender\\[cluster\\]"), ("ray", "ray\\[default\\]")]
+)
+def test_a_cluster_without_its_package_says_what_to_install(backend, package, monkeypatch):
+    monkeypatch.setitem(sys.modules, "distributed" if backend == "dask" else "ray", None)
+    with pytest.raises(lv.InputError, match=f"pip install '{package}'"):
+        bench.campaign(NAMES[:1], ["pgs"], PLAN, backend=backend)
+
+
+@pytest.mark.slow
+def test_ray_gives_the_same_bits():
+    ray = pytest.importorskip("ray", reason="a ray cluster needs ray")
+    expected = bench.campaign(NAMES[:2], ["pgs"], PLAN, workers=1)
+    ray.init(num_cpus=1, include_dashboard=False, log_to_driver=False)
+    try:
+        assert lines(bench.campaign(NAMES[:2], ["pgs"], PLAN, workers=1, backend="ray")) == lines(expected)
+    finally:
+        ray.shutdown()
 
 
 def test_the_report_of_a_campaign_shows_shares_and_no_times(tmp_path):
@@ -98,7 +131,7 @@ def test_a_cluster_that_loses_a_worker_midway_loses_no_record():
     distributed = pytest.importorskip(
         "distributed", reason="a cluster needs dask.distributed (extra: cluster)"
     )
-    names = bench.seeds(["granular(n=2)"], 60)
+    names = bench.seeds(["granular(n=2)"], 40)
     plan = bench.CampaignPlan(levels=(1e-6,), budgets=(8, 64), orders=())
     expected = bench.campaign(names, ["pgs", "jacobi"], plan, workers=1)
     with (

@@ -8,7 +8,9 @@ end by iterations, never by the clock, and times are left out.
 from __future__ import annotations
 
 import contextlib
+import itertools
 import math
+import os
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,7 +20,7 @@ from lavender import registry
 from lavender.bench import machine
 from lavender.bench.cases import Item, Source, describe, resolve
 from lavender.bench.plan import Plan
-from lavender.bench.record import Done, Record, Skip
+from lavender.bench.record import CaseInfo, Done, Record, Skip
 from lavender.bench.runner import Event, Watch, _not_loaded, is_foreign, solver_names
 from lavender.bench.store import Records, Store
 from lavender.bench.timing import Task, measure, one_thread
@@ -29,6 +31,8 @@ from lavender.problem import Problem
 __all__ = ["CampaignPlan", "campaign", "seeds"]
 
 ATTEMPTS = 5  # times that the remaining pairs are handed out again after workers were lost
+ROUND = 256  # pairs handed out together to a backend that cannot give results one by one
+CONNECT = 10.0  # s, for a scheduler to answer
 HANG = 60.0  # s, after which a backend of another package is killed; the only clock, and it costs its record
 
 
@@ -92,8 +96,8 @@ def campaign(
     cases, solvers, store, watch : as `lavender.bench.run`
     plan : CampaignPlan
     workers : number of processes; -1: one for each core. A cluster has as many as it has.
-    backend : a backend of joblib: "loky" (processes here), "dask" (of the current
-        dask.distributed client), "ray"
+    backend : a backend of joblib: "loky" (processes here), "dask" (of the current dask.distributed client,
+        or of DASK_SCHEDULER_ADDRESS), "ray"; "dask=ADDRESS" and "ray=ADDRESS" connect to a cluster
 
     Returns
     -------
@@ -130,24 +134,25 @@ def campaign(
     out.add(this)
     if store is not None:
         store.add(this)
-    for attempt in range(ATTEMPTS + 1):
-        left = [p for p in pairs if p.index not in done]
-        if not left:
-            break
-        if attempt == ATTEMPTS:
-            raise InputError(
-                f"{len(left)} of {len(pairs)} pairs are not done: workers were lost {ATTEMPTS} times; "
-                "run the same command again, with fewer workers if memory is short"
-            )
-        for index, entries in _hand_out(left, plan, this.run, workers, backend):
-            done[index] = entries
-            if store is not None:
-                for entry in entries:
-                    store.add(entry)
-                store.add(Done(this.run, pairs[index].case, pairs[index].solver))
-            if watch is not None:
-                pair = pairs[index]
-                watch(Event(len(done), len(pairs), pair.case, pair.solver))
+    with _backend(backend) as name:
+        for attempt in range(ATTEMPTS + 1):
+            left = [p for p in pairs if p.index not in done]
+            if not left:
+                break
+            if attempt == ATTEMPTS:
+                raise InputError(
+                    f"{len(left)} of {len(pairs)} pairs are not done: workers were lost {ATTEMPTS} times; "
+                    "run the same command again, with fewer workers if memory is short"
+                )
+            for index, entries in _hand_out(left, plan, this.run, workers, name):
+                done[index] = entries
+                if store is not None:
+                    for entry in entries:
+                        store.add(entry)
+                    store.add(Done(this.run, pairs[index].case, pairs[index].solver))
+                if watch is not None:
+                    pair = pairs[index]
+                    watch(Event(len(done), len(pairs), pair.case, pair.solver))
     for index in sorted(done):
         for entry in done[index]:
             out.add(entry)
@@ -182,13 +187,6 @@ def _hand_out(
     """Results as they come; ends early, without an exception, when workers were lost."""
     import joblib
 
-    try:
-        context = joblib.parallel_config(backend=backend, n_jobs=workers)
-    except (ValueError, ImportError, RuntimeError) as error:
-        raise InputError(
-            f"joblib has no backend {backend!r} here ({error}); 'loky' runs processes on this machine, 'dask' needs "
-            "the extra 'cluster' and a client"
-        ) from None
     lost: tuple[type[BaseException], ...] = (BrokenPipeError, ConnectionError)
     with contextlib.suppress(ImportError):
         from joblib.externals.loky.process_executor import BrokenProcessPool
@@ -198,13 +196,85 @@ def _hand_out(
         from distributed.scheduler import KilledWorker
 
         lost = (*lost, KilledWorker)
-    with context:
-        parallel = joblib.Parallel(return_as="generator_unordered", batch_size=1)
-        results = parallel(joblib.delayed(work)(pair, plan, run) for pair in pairs)
+    with joblib.parallel_config(backend=backend, n_jobs=workers):
+        calls = (joblib.delayed(work)(pair, plan, run) for pair in pairs)
         try:
-            yield from results
+            try:
+                parallel = joblib.Parallel(return_as="generator_unordered", batch_size=1)
+            except ValueError:  # ray's backend gives whole lists alone: in rounds, each kept when it is done
+                parallel = joblib.Parallel(batch_size=1)
+                while some := list(itertools.islice(calls, ROUND)):
+                    yield from parallel(some)
+                return
+            yield from parallel(calls)
         except lost:
             return
+
+
+@contextlib.contextmanager
+def _backend(word: str) -> Iterator[str]:
+    """The name by which joblib knows a backend, once that is ready: "dask=tcp://host:8786" connects to a scheduler.
+
+    Raises
+    ------
+    InputError
+        A package is missing, nobody listens, or joblib does not know the name.
+    """
+    from joblib.parallel import BACKENDS
+
+    name, _, address = word.partition("=")
+    if name == "dask":
+        with _dask(address):
+            yield name
+        return
+    if name == "ray":
+        _ray(address)
+    elif name not in BACKENDS or address:
+        raise InputError(
+            f"joblib has no backend {word!r}: 'loky' runs processes on this machine, 'dask' or 'dask=ADDRESS' and "
+            "'ray' or 'ray=ADDRESS' a cluster"
+        )
+    yield name
+
+
+@contextlib.contextmanager
+def _dask(address: str) -> Iterator[None]:
+    try:
+        import dask
+        import distributed
+    except ImportError:
+        raise InputError("backend 'dask' needs distributed: pip install 'lavender[cluster]'") from None
+    address = address or dask.config.get("scheduler-address", "")
+    if not address:
+        try:
+            distributed.get_client()
+        except ValueError:
+            raise InputError(
+                "backend 'dask' needs a scheduler: give dask=tcp://HOST:8786, set DASK_SCHEDULER_ADDRESS, or make a "
+                "distributed.Client first"
+            ) from None
+        yield
+        return
+    try:
+        client = distributed.Client(address, timeout=CONNECT)  # type: ignore[no-untyped-call]
+    except (OSError, ValueError) as error:
+        raise InputError(f"no dask scheduler answers at {address!r} ({error}); start one there") from None
+    with client:
+        yield
+
+
+def _ray(address: str) -> None:
+    try:
+        import ray
+        from ray.util.joblib import register_ray
+    except ImportError:
+        raise InputError("backend 'ray' needs ray: pip install 'ray[default]'") from None
+    if address and not ray.is_initialized():
+        try:
+            ray.init(address=address)
+        except (ConnectionError, ValueError) as error:
+            raise InputError(f"no ray cluster answers at {address!r} ({error}); start one there") from None
+    register_ray()
 
 
 _worker: Worker | None = None  # one for each process, kept between pairs
@@ -218,15 +288,12 @@ def work(pair: Pair, plan: CampaignPlan, run: str) -> tuple[int, list[Any]]:
 
 def _work(pair: Pair, plan: CampaignPlan, run: str) -> tuple[int, list[Any]]:
     global _worker
-    item = Item(pair.case, str(pair.source), _missing, pair.reason)
     try:
-        (found,) = resolve([pair.source])
-        item = Item(pair.case, found.source, found.load, pair.reason)
-        info = describe(item, run)
+        problem, info = _look(pair, run)
     except (LavenderError, OSError) as error:
+        item = Item(pair.case, str(pair.source), _missing, pair.reason)
         return pair.index, [Skip(run, pair.case, "", _not_loaded(item, error))]
     spec = registry.get(pair.solver)
-    problem = item.problem
     reason = spec.refuses(problem)
     if reason:
         return pair.index, [info, Skip(run, pair.case, pair.solver, reason)]
@@ -247,6 +314,25 @@ def _work(pair: Pair, plan: CampaignPlan, run: str) -> tuple[int, list[Any]]:
             record = _without_times(measure(problem, replace(task, time_limit=math.inf)))
         record = replace(record, time_limit=plan.time_limit)
         entries.append(record)
+
+
+_seen: tuple[Any, tuple[Problem, CaseInfo]] | None = None  # the case before: pairs of one case come together
+
+
+def _look(pair: Pair, run: str) -> tuple[Problem, CaseInfo]:
+    """The problem of a pair, and what the report says of it."""
+    global _seen
+    key: Any = None
+    if not isinstance(pair.source, Problem):
+        changed = os.stat(pair.source).st_mtime_ns if os.path.exists(pair.source) else 0
+        key = (run, pair.case, pair.source, changed)
+        if _seen is not None and _seen[0] == key:
+            return _seen[1]
+    (found,) = resolve([pair.source])
+    item = Item(pair.case, found.source, found.load, pair.reason)
+    looked = item.problem, describe(item, run)
+    _seen = (key, looked) if key is not None else None
+    return looked
 
 
 def _missing() -> Problem:
