@@ -49,6 +49,7 @@ REPEATS, REPEAT_TIME = 30, 0.1  # of one setting: at most so many, and as long a
 AGAIN = 4.0  # a contestant runs again in later rounds when it is within so many times the fastest of its side
 START = 60.0  # s, wall: imports of a backend on a loaded machine
 SCRATCH = ", from scratch"
+PATIENCE = 10.0  # s, wall, beyond four times the limit of a call, before a contestant is ended
 DENSE_ROWS = 1700  # rows up to which Siconos' solvers of dense matrices are asked
 
 Call = Callable[[], tuple[float, FloatArray]]  # one run: s of CPU, impulse (m,) [N s]
@@ -622,7 +623,7 @@ def _run(contestant: Contestant, problem: Problem, limit: float) -> tuple[list[t
     try:
         while True:
             # CPU time of a call is limited by the solver where it can be; wall time here, on a loaded machine.
-            patience = 4.0 * limit + 10.0
+            patience = 4.0 * limit + PATIENCE
             if not mine.poll(patience):
                 note = f"ended after {patience:g} s without an answer"
                 break

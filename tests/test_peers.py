@@ -1,0 +1,218 @@
+"""`lavender bench peers`: what is compared is the same problem and the same scene, and losses are kept."""
+
+import importlib.util
+import json
+import math
+import os
+import time
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+import lavender as lv
+from lavender import suite
+from lavender.bench import peer_engines, peer_solvers, peers
+from lavender.bench.peer_solvers import Contestant, Result
+
+SMALL = {  # laws and kinds of bounds that adapters must translate
+    "lcp": "box_stack(n=2)",
+    "linear": "chain(n=4)",
+    "boxed": "boxed_friction(n=2, scene=granular)",
+    "cone": "box_stack(n=2, friction=cone)",
+    "coulomb": "box_stackF(n=2)",
+}
+
+
+def reached(contestant, problem, limit=5.0):
+    """The least residual of a contestant's settings, in this process; None where it has no way."""
+    found = [lv.residual(problem, call()[1]).relative for call in contestant.runs(problem, limit)]
+    return min(found, default=None)
+
+
+def is_adapter(name):
+    """Whether the conversion is of `peer_solvers` itself; those of `lavender.external` have tests of their own."""
+    return any(word in name for word in ("own interface", " cones ", "pinocchio", "scipy"))
+
+
+@pytest.mark.parametrize("kind", SMALL)
+def test_every_adapter_solves_the_same_problem(kind):
+    # A wrong sign, bound or order of rows would leave a residual near 1.
+    problem = suite.case(SMALL[kind]).problem
+    for contestant in peer_solvers.contestants():
+        if not is_adapter(contestant.name) or contestant.refuses(problem) is not None:
+            continue
+        if contestant.name.startswith("quadprog") and "impulse" in contestant.name:
+            continue  # needs a definite A, which contacts of a face do not have
+        least = reached(contestant, problem)
+        # 1e-4: all get there at their tightest setting, some interior points no further with friction.
+        assert least is None or least < 1e-4, f"{contestant.name} on {SMALL[kind]}: {least:.1e}"
+
+
+def test_quadprog_needs_a_definite_matrix_and_constraints():
+    pytest.importorskip("quadprog", reason="needs quadprog: pip install 'lavender[qp]'")
+    contestant = peer_solvers._direct("quadprog", "impulse")
+    assert reached(contestant, suite.case("stack(n=4)").problem) < 1e-9
+    with pytest.raises(lv.CapabilityError, match="without constraints"):
+        reached(contestant, suite.case("chain(n=4)").problem)
+
+
+def test_race_keeps_times_residuals_and_sides():
+    problem = suite.case("stack(n=4)").problem
+    chosen = [c for c in peer_solvers.contestants() if c.name in ("pgs", "direct", "direct, from scratch")]
+    linear = peer_solvers._scipy("spsolve")
+    told = []
+    results = peer_solvers.race([("a", problem)], [*chosen, linear], rounds=2, watch=told.append)
+    assert {r.solver for r in results} == {"pgs", "direct", "direct, from scratch"}  # an LCP is not linear
+    for r in results:
+        assert r.note == "" and not r.peer
+        assert r.time(1e-9) > 0.0 and math.isfinite(r.time(1e-9))
+        assert r.time(1e-3) <= r.time(1e-9)
+        assert math.isinf(r.time(0.0)) or min(relative for _, relative in r.runs) == 0.0
+    assert told[0] == "a: direct" or told[0].startswith("a: ")
+
+
+def _dies(problem, limit):
+    os._exit(3)
+    yield
+
+
+def _raises(problem, limit):
+    yield lambda: (1e-3, problem.start())
+    raise RuntimeError("no more")
+
+
+def _hangs(problem, limit):
+    yield lambda: (1e-3, problem.start())
+    time.sleep(60.0)
+    yield
+
+
+@pytest.mark.parametrize(
+    ("runs", "kept", "note"), [(_dies, 0, "died"), (_raises, 1, "no more"), (_hangs, 1, "without an answer")]
+)
+def test_a_contestant_that_fails_costs_its_own_runs(runs, kept, note, monkeypatch):
+    monkeypatch.setattr(peer_solvers, "PATIENCE", 0.5)
+    problem = suite.case("two_particles").problem
+    (result,) = peer_solvers.race([("a", problem)], [Contestant("x", True, runs)], limit=0.1, rounds=1)
+    assert len(result.runs) == kept
+    assert note in result.note
+
+
+def results_by_hand():
+    """Two problems: one where ours is faster, one where a peer is, and alone at the smallest error."""
+
+    def of(problem, rows, solver, peer, *runs):
+        return Result(problem, rows, "lcp", solver, peer, list(runs))
+
+    return [
+        of("big", 2000, "pgs", False, (1.0, 1e-4), (4.0, 1e-10)),
+        of("big", 2000, "auto", False, (2.0, 1e-10)),
+        of("big", 2000, "pgs, from scratch", False, (3.0, 1e-10)),
+        of("big", 2000, "osqp", True, (10.0, 1e-7), (40.0, 1e-11)),
+        of("small", 8, "pgs", False, (6.0, 1e-7)),
+        of("small", 8, "auto", False, (8.0, 1e-7)),
+        of("small", 8, "daqp", True, (2.0, 1e-12)),
+        of("small", 8, "osqp", True, (1.0, 1e-2)),
+    ]
+
+
+def test_ratios_means_and_losses():
+    compared = peer_solvers.compare(results_by_hand())
+    by = {(c.problem, c.target): c for c in compared}
+    assert by["big", 1e-3].ratio == 0.1 and by["big", 1e-3].ours == "pgs"
+    assert by["big", 1e-9].ratio == 0.05 and by["big", 1e-9].ours == "auto"
+    assert by["big", 1e-6].scratch == 3.0
+    assert by["small", 1e-3].ratio == 3.0 and by["small", 1e-3].peer == "daqp"
+    assert math.isinf(by["small", 1e-9].ratio)
+    means = {(m.which, m.target): m for m in peer_solvers.geometric_means(compared)}
+    assert means["1000 rows and more", 1e-6].ours == pytest.approx(0.2)
+    assert means["smaller", 1e-3].auto == pytest.approx(4.0)
+    assert means["smaller", 1e-9].compared == 0 and math.isnan(means["smaller", 1e-9].ours)
+    assert [(c.problem, c.target) for c in peer_solvers.losses(compared)] == [
+        ("small", 1e-9),
+        ("small", 1e-3),
+        ("small", 1e-6),
+    ]
+    text = "\n".join(peer_solvers.tables(results_by_hand()))
+    assert "Lost: 3 of 6." in text
+    assert "- small at 1e-09: daqp against -, only the peer" in text
+
+
+def test_names_of_problems():
+    (found,) = peers.problems(["scene:stack6"])
+    assert found[0] == "scene:stack6" and found[1].law == "coulomb" and found[1].n_blocks == 24
+    with pytest.raises(lv.UnknownName, match="stack6"):
+        list(peers.problems(["scene:stack7"]))
+    with pytest.raises(lv.InputError, match="elliptic"):
+        list(peers.problems(["mujoco:stack6"]))
+
+
+def test_another_interpreter_without_siconos_is_named():
+    with pytest.raises(lv.InputError, match="cannot be run"):
+        peer_solvers.check_siconos("/no/such/python")
+
+
+def test_siconos_solves_the_same_problems():
+    python = os.environ.get("LAVENDER_SICONOS", "")
+    if not python:
+        pytest.skip("LAVENDER_SICONOS names no interpreter with Siconos")
+    for kind, name in (("coulomb", "NSGS"), ("coulomb", "NSN_AC"), ("lcp", "PGS")):
+        contestant = peer_solvers._siconos(python, name, kind == "coulomb")
+        assert reached(contestant, suite.case(SMALL[kind]).problem) < 1e-6
+
+
+# -- engines ---------------------------------------------------------------------------------------
+
+
+def test_engines_step_the_same_scene():
+    steps = peer_engines.run("stack6", settle=200, rounds=1)
+    names = [s.engine for s in steps]
+    assert names[:2] == ["lavender, 16 sweeps", "lavender newton"]
+    for s in steps:
+        assert s.time > 0.0 and s.note == ""
+        # Four points under each of six boxes; MuJoCo adds a few between edges while PGS lets boxes tilt.
+        assert 24 <= s.contacts <= 40
+        assert 0.0 <= s.depth < 0.01 and s.speed < 0.1
+        assert math.isnan(s.relative) == ("pybullet" in s.engine)
+    text = peer_engines.table(steps)
+    assert len(text) == 2 + len(steps)
+
+
+def test_mujoco_carries_the_same_weight():
+    pytest.importorskip("mujoco", reason="needs MuJoCo: pip install 'lavender[peers]'")
+    problem = peer_engines.export("stack6", settle=480)
+    solution = lv.solve(problem, "newton", tol=1e-8)
+    normals = solution.impulse[problem.cones.ptr[:-1]]
+    ground = [i for i, name in enumerate(problem.names) if "(0, 1)" in name]
+    mass = sum(b.mass for b in lv.Scene("stack").bodies)
+    # The stack of 16 sweeps still moves a little; a box more or less would be a sixth.
+    assert normals[ground].sum() == pytest.approx(9.81 * mass * peer_engines.DT, rel=0.1)
+    assert np.all(problem.cones.mu == 0.5)
+
+
+def test_unknown_scenes_and_engines_are_named():
+    with pytest.raises(lv.UnknownName, match="stack6"):
+        peer_engines.run("stack")
+    with pytest.raises(lv.UnknownName, match="mujoco"):
+        peer_engines.run("stack6", engines=["mujoko"])
+
+
+def test_an_engine_that_does_not_settle_is_left_out_and_said(monkeypatch):
+    monkeypatch.setattr(peer_engines, "SETTLE_LIMIT", 0.0)
+    steps = peer_engines.run("stack6", engines=["lavender"], rounds=1)
+    assert all("did not settle" in s.note and math.isnan(s.time) for s in steps)
+    assert "did not settle" in peer_engines.table(steps)[2]
+
+
+def test_command(tmp_path):
+    out = tmp_path / "peers.json"
+    done = CliRunner().invoke(
+        peers.command, ["--no-solvers", "--scenes", "stack6", "--out", str(out)], catch_exceptions=False
+    )
+    assert done.exit_code == 0
+    record = json.loads(out.read_text())
+    assert record["steps"][0]["engine"] == "lavender, 16 sweeps"
+    if importlib.util.find_spec("pybullet") is not None:
+        assert any("pybullet" in s["engine"] for s in record["steps"])
+    assert "not here: " in done.output and "| stack6 | lavender newton |" in done.output
