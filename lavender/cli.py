@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import math
 import os
 import sys
@@ -79,6 +80,23 @@ class ManyValues(click.Command):
                     i += 1
                 folded.append(",".join(values))
         return super().parse_args(ctx, folded)
+
+
+class Suites(ManyValues):
+    """`lavender bench peers` is a command of its own; any other first word is a file (or ./peers)."""
+
+    OWN = {"peers": "lavender.bench.peers:command"}  # noqa: RUF012 - a constant of the class
+
+    def make_context(
+        self, info_name: str | None, args: list[str], parent: click.Context | None = None, **extra: Any
+    ) -> click.Context:
+        """The context of the command that the first word names, or of this one."""
+        if not args or args[0] not in self.OWN:
+            return super().make_context(info_name, args, parent, **extra)
+        module, _, attribute = self.OWN[args[0]].partition(":")
+        _one_thread()
+        own: click.Command = getattr(importlib.import_module(module), attribute)
+        return own.make_context(f"{info_name} {args[0]}", args[1:], parent, **extra)
 
 
 class Numbers(_ParamType):
@@ -299,7 +317,7 @@ def report(
         raise click.exceptions.Exit(EXIT_INTERRUPTED)
 
 
-@cli.command(cls=ManyValues)
+@cli.command(cls=Suites)
 @click.argument("files", nargs=-1, metavar="[FILES | FOLDERS | NAMES]...")
 @_plan_options
 @click.option(
@@ -321,7 +339,10 @@ def bench(
     in_process: bool,
     out: Path,
 ) -> None:
-    """As `report`, but only the records: a .jsonl file that `lavender report` shows later."""
+    """As `report`, but only the records: a .jsonl file that `lavender report` shows later.
+
+    `lavender bench peers` compares with other engines and solvers instead; see its own --help.
+    """
     plan = _plan(files, levels, budgets, orders, repeats, time_limit)
     records, stopped = _measure(files, solvers, plan, out, memory, in_process)
     _console().print(f"{len(records)} runs in {out}", highlight=False)

@@ -216,3 +216,12 @@ def test_command(tmp_path):
     if importlib.util.find_spec("pybullet") is not None:
         assert any("pybullet" in s["engine"] for s in record["steps"])
     assert "not here: " in done.output and "| stack6 | lavender newton |" in done.output
+
+
+def test_command_line_finds_it_below_bench(capsys):
+    from lavender import cli
+
+    with pytest.raises(SystemExit) as stop:
+        cli.main(["bench", "peers", "--no-solvers", "--scenes", "stack7"])
+    assert stop.value.code == 2
+    assert "unknown scene 'stack7'" in capsys.readouterr().err
