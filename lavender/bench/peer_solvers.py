@@ -596,7 +596,9 @@ def _child(pipe: Any, contestant: Contestant, problem: Problem, limit: float) ->
         with one_thread(contestant.name), quiet(noisy=True):
             least = max(min(TARGETS), 2.0 * residual(problem, problem.start()).floor)
             for call in contestant.runs(problem, limit):
+                began = monotonic()
                 seconds, impulse = call()
+                late = max(seconds, monotonic() - began) > 0.9 * limit  # solvers' own limits are wall time
                 judged = residual(problem, impulse)
                 spent = seconds
                 for _ in range(REPEATS):
@@ -605,7 +607,7 @@ def _child(pipe: Any, contestant: Contestant, problem: Problem, limit: float) ->
                     again = call()[0]
                     spent, seconds = spent + max(again, 1e-6), min(seconds, again)
                 pipe.send((seconds, judged.relative))
-                if judged.relative <= max(least, 2.0 * judged.floor) or seconds > limit:
+                if judged.relative <= max(least, 2.0 * judged.floor) or late:
                     break
         pipe.send(None)
     except BaseException as error:  # whatever another project's code does
@@ -661,14 +663,16 @@ def race(
     limit : s
         Of CPU for one call; what takes longer ends a contestant's ladder.
     rounds : int
-        In the second and later ones, in turns, only those near the fastest of their side run.
+        In the second and later ones, in turns, only those near the fastest of their side run, and ours also from
+        scratch.
     watch : callable
         Told what runs.
     """
     results: list[Result] = []
     for name, problem in problems:
         here: dict[str, Result] = {}
-        running = [c for c in all_of if c.refuses(problem) is None]
+        takers = [c for c in all_of if c.refuses(problem) is None]
+        running = [c for c in takers if not c.name.endswith(SCRATCH)]
         for number in range(rounds):
             for c in running if number % 2 == 0 else running[::-1]:
                 watch(f"{name}: {c.name}")
@@ -676,7 +680,8 @@ def race(
                 result = here.setdefault(c.name, Result(name, problem.m, problem.law, c.name, c.peer))
                 result.runs += runs
                 result.note = result.note or note
-            running = [c for c in running if _near(here[c.name], list(here.values()))]
+            near = {c.name for c in running if _near(here[c.name], list(here.values()))}
+            running = [c for c in takers if c.name.removesuffix(SCRATCH) in near]
         results += here.values()
     return results
 

@@ -113,7 +113,13 @@ def problems(
 @click.option(
     "--limit", default=2.0, show_default=True, metavar="S", help="CPU time of one call of a solver."
 )
-@click.option("--rounds", default=2, show_default=True, help="Turns of the solvers near the fastest.")
+@click.option(
+    "--rounds",
+    type=click.IntRange(2),
+    default=2,
+    show_default=True,
+    help="Turns of the solvers near the fastest.",
+)
 @click.option(
     "--siconos",
     default="",
