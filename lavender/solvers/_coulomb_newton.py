@@ -1,9 +1,9 @@
-"""Coulomb friction by Newton's method: convex start, Alart-Curnier map, De Saxce's fixed point.
+"""Coulomb friction by Newton's method: from the start on the Alart-Curnier map, then De Saxce's interior point.
 
-    convex    K* contains u, r in K:               what the "cone" law solves
-    Coulomb   K* contains u + mu |u_t| n, r in K   (De Saxce, Feng 1998)
-
-so the Coulomb answer is the convex answer of the problem whose normal rhs is lowered by mu |u_t|.
+1. Proximal Newton on the Alart-Curnier map, from the start and from the solution of H z = g.
+2. Interior points on De Saxce's form of the law (`_desaxce.py`), each ended by the proximal Newton; first
+   where the bodies are known, after it where only a matrix is, whose factors cost more.
+3. Longer proximal walks from where the interior points ended, with smaller and smaller weights.
 """
 
 from __future__ import annotations
@@ -12,65 +12,83 @@ import numpy as np
 
 from lavender._arrays import FloatArray
 from lavender.cones import ROW
+from lavender.solvers._desaxce import SHARES, apart, solve_desaxce, solve_desaxce_augmented
 from lavender.solvers._ipm import AUGMENTED, InteriorPoint
-from lavender.solvers._polish import EnergyRun, Proximal, Run, solve_convex
+from lavender.solvers._polish import Proximal, Run
 
-CONVEX_TOL = 1e-4  # of the convex start, in energy
-STRETCH = 60  # factorisations between two looks at whether a method gets anywhere
+FIRST, SECOND = 20, 30  # factorisations of the first two walks
+STRETCH = 60  # factorisations between two looks at whether a walk gets anywhere
 LARGE = 1000  # rows from which the first proximal weight is larger
-HEAVY = 1e3  # mass ratio from which the convex answer is asked first
-OUTER = 30  # fixed points at most
+HEAVY = 1e3  # mass ratio from which the walks are not tried from a cold start
+LAST = (1e-6, 1e-8)  # proximal weights of the last walks
+CANDIDATES = 3  # ends of interior points from which these start
+LONG = 50  # Newton steps of one of their rounds: sticking changes to sliding contact by contact
 
 
 def solve_coulomb(run: Run, z: FloatArray, cold: bool) -> None:
-    """From the start, then from the convex answer, then from De Saxce's fixed points."""
+    """Walks from the start, interior points, walks from where they ended; until the judge is content."""
     system = run.system
     plain = Proximal(z, AUGMENTED, 1e-3 if system.sc.m < LARGE else 1e-2)
-    if not cold or not _is_heavy(run):
-        plain.advance(run, STRETCH // 3)
+    walks = not (cold and _is_heavy(run))
+    if walks:
+        plain.advance(run, FIRST)
         if run.done() or run.at_floor():
             return
-        near = Proximal(InteriorPoint(system).everything, AUGMENTED, 1e-4)
-        near.advance(run, STRETCH // 2)
-        if run.done() or run.at_floor():
-            return
-        _pursue(run, plain)
-    if run.done() or run.at_floor():
-        return
-    g = system.sc.g
-    given = g.copy()
-    point = run.best_z.copy()
-    try:
-        for outer in range(OUTER):
-            convex = EnergyRun(system, CONVEX_TOL * 0.1 ** min(outer, 4), run.budget, run.deadline)
-            solve_convex(convex, point, cold=outer == 0)
-            point = convex.best_z
-            g[:] = given
-            run.count("convex starts")
-            for stage, number in convex.stages.items():
-                run.stages[stage] = run.stages.get(stage, 0) + number
-            run.score(point)
-            if run.done():
-                return
-            _pursue(run, Proximal(point.copy(), AUGMENTED, 1e-3))
+    ends: list[tuple[float, FloatArray]] = []
+    stages = [_interior, _walk] if system.form == "velocity" else [_walk, _interior]
+    for stage in stages:
+        if stage is _interior or walks:
+            stage(run, plain, ends)
             if run.done() or run.at_floor():
                 return
-            if not plain.stuck:
-                plain.advance(run, STRETCH)
-                if run.done() or run.at_floor():
-                    return
-            _lower_normals(run, given, point)
-    finally:
-        g[:] = given
+    ends += solve_desaxce(run, SHARES[2:])
+    ends.sort(key=lambda end: end[0])
+    for alpha in LAST:
+        for _, start in ends[:CANDIDATES]:
+            if run.done() or run.at_floor():
+                return
+            _pursue(run, Proximal(start.copy(), AUGMENTED, alpha, LONG))
+    if not (run.done() or run.at_floor() or _has_free_rows(run)):
+        solve_desaxce_augmented(run)
+    if not (run.done() or run.at_floor()):
+        plain.advance(run)
+
+
+def _interior(run: Run, plain: Proximal, ends: list[tuple[float, FloatArray]]) -> None:
+    ends += solve_desaxce(run, SHARES[:1])
+    if run.done() or run.at_floor():
+        return
+    if _has_free_rows(run):
+        # Closed loops of joints: their rows nearly depend on each other.
+        solve_desaxce_augmented(run)
+        if run.done() or run.at_floor():
+            return
+    ends += solve_desaxce(run, SHARES[1:2])
+
+
+def _walk(run: Run, plain: Proximal, ends: list[tuple[float, FloatArray]]) -> None:
+    near = Proximal(InteriorPoint(run.system).everything, AUGMENTED, 1e-4)
+    near.advance(run, SECOND)
+    for method in (plain, near):
+        if run.done() or run.at_floor():
+            return
+        _pursue(run, method)
 
 
 def _pursue(run: Run, method: Proximal) -> None:
-    # As long as each stretch brings the residual down to a third.
+    # As long as each stretch brings its residual down to a third.
+    last = np.inf
     while not run.done() and not method.stuck:
-        before = run.best
-        method.advance(run, STRETCH)
-        if run.best > 0.3 * before or run.at_floor():
+        best, _ = apart(run, method, STRETCH)
+        if best > 0.3 * last or run.at_floor():
             return
+        last = best
+
+
+def _has_free_rows(run: Run) -> bool:
+    sc = run.system.sc
+    first = sc.ptr[:-1][sc.kind == ROW]
+    return bool(np.any(np.isinf(sc.lower[first]) & np.isinf(sc.upper[first])))
 
 
 def _is_heavy(run: Run) -> bool:
@@ -79,14 +97,3 @@ def _is_heavy(run: Run) -> bool:
         return False
     moving = rows.inv_mass[rows.inv_mass > 0.0]
     return len(moving) > 0 and bool(moving.max() >= HEAVY * moving.min())
-
-
-def _lower_normals(run: Run, plain: FloatArray, z: FloatArray) -> None:
-    # g_n <- g_n - a |s_t| - a_s |s_s| in scaled units
-    sc = run.system.sc
-    s = run.system.times(z) - plain
-    for i in np.flatnonzero(sc.kind != ROW):
-        j, end = sc.ptr[i], sc.ptr[i + 1]
-        spin = sc.kind[i] == 2
-        t = s[j + 1 : end - spin]
-        sc.g[j] = plain[j] - sc.a_t[i] * np.sqrt(t @ t) - (sc.a_s[i] * abs(s[end - 1]) if spin else 0.0)

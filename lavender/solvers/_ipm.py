@@ -473,6 +473,7 @@ class InteriorPoint:
     """Iterates of a Mehrotra predictor-corrector; `step()` takes one, `z` is the current point."""
 
     system: System
+    delta: float = DELTA
     z: FloatArray = field(init=False)
     everything: FloatArray = field(init=False)
     gap: float = field(init=False, default=np.inf)  # G z . u / degree
@@ -508,7 +509,7 @@ class InteriorPoint:
         sy, sc, e = self.system, self.system.sc, self.system.elements
         z, u1, u2 = self.z, self.u1, self.u2
         hz = sy.times(z)
-        gap = e.scale(z, u1, u2, DELTA, sy.v, sy.bt)
+        gap = e.scale(z, u1, u2, self.delta, sy.v, sy.bt)
         if not sy.factor_barrier() and not np.isfinite(gap):
             return False
         da = sy.solve_barrier(sc.g - hz)

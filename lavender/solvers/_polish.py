@@ -15,12 +15,11 @@ import numpy as np
 
 from lavender._arrays import FloatArray
 from lavender.residuals import check_certificate, quick
-from lavender.solvers._ipm import AUGMENTED, CONVEX, InteriorPoint, System
+from lavender.solvers._ipm import CONVEX, System
 
 EPS = 1e-9  # proximal weight of the polish, relative to d; refinement takes it away again
 INNER_STEPS = 20  # Newton steps of one proximal round at most
 INNER_TOL = 0.1  # |F_c| at which a round ends, relative to its start
-IPM_PATIENCE = 15  # interior point steps that halve neither residual nor gap
 MEMORY = 6  # steps that the non-monotone line search looks back
 CERTIFY = 1e-8  # relative residual below which there is a solution
 PROBE = 1e-7  # proximal weight below which a round is as good as a plain Newton step
@@ -95,30 +94,6 @@ class Run:
             self.certificate = whole
 
 
-@dataclass
-class EnergyRun(Run):
-    """The same where the problem solved is the convex relaxation: |F| / |F(0)|, the energy part alone."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self.f = np.empty(self.system.sc.m)
-        zero = np.zeros(self.system.sc.m)
-        self.start = self.system.natural_size(zero, -self.system.sc.g, CONVEX, self.f) or 1.0
-
-    def score(self, z: FloatArray) -> float:
-        sy = self.system
-        relative = sy.natural_size(z, sy.times(z) - sy.sc.g, CONVEX, self.f) / self.start
-        if relative < self.best:
-            self.best, self.best_z = relative, z.copy()
-        return relative
-
-    def at_floor(self) -> bool:
-        return self.best <= 1e-14
-
-    def certify(self, y: FloatArray) -> None:
-        """Of the relaxation there may be a proof, of Coulomb's problem it says nothing."""
-
-
 def refined(system: System, rhs: FloatArray, rounds: int = 2) -> FloatArray:
     """Solve the Newton system with its proximal weight mostly refined away; the next Newton step does the rest."""
     x = system.solve_natural(rhs)
@@ -173,6 +148,7 @@ class Proximal:
     z: FloatArray
     law: int = CONVEX
     alpha: float = 1e-2
+    inner: int = INNER_STEPS
     slowest: float = 0.1  # alpha falls at most by this factor; closer to 1 after a failure
     failures: int = 0
     idle: int = 0
@@ -212,7 +188,7 @@ class Proximal:
         hz = system.times(z)
         history: list[float] = []
         solved = False
-        for _ in range(INNER_STEPS):
+        for _ in range(self.inner):
             size = system.natural(z, hz - g + alpha * (z - c), law, alpha, f)
             history.append(size)
             if (size <= INNER_TOL * history[0] and len(history) > 1) or size == 0.0:
@@ -255,43 +231,3 @@ class Proximal:
             self.slowest = 0.2 if self.slowest < 0.2 else min(0.7, 2.0 * self.slowest)
             self.alpha *= 5.0
         self.stuck = self.idle > 3 or self.failures > 6 or self.alpha > 10.0
-
-
-def solve_convex(run: Run, z: FloatArray, cold: bool) -> None:
-    """Warm start, then H z = g on every row, then an interior point with a polish at each new decade."""
-    system = run.system
-    rows = len(system.sc.kind) == system.sc.m
-    if not cold:
-        polish(run, z, patience=1)
-        if run.done():
-            return
-    ip = InteriorPoint(system)
-    if rows:
-        polish(run, ip.everything, patience=1, limit=3)
-    trigger = 1e-2
-    lowest, idle = np.inf, 0
-    while not run.done():
-        if not ip.step():
-            break
-        run.count("interior point steps")
-        relative = run.score(ip.z)
-        idle = 0 if relative < 0.5 * lowest or ip.gap < 0.5 * ip.lowest_gap else idle + 1
-        lowest = min(lowest, relative)
-        if idle > IPM_PATIENCE:
-            break
-        if relative < trigger:
-            trigger = 0.1 * relative
-            if rows:
-                polish(run, ip.z.copy())
-            else:
-                Proximal(ip.z.copy(), alpha=min(1e-4, relative), probed=0.0).advance(run, 12)
-            trigger = min(trigger, 0.1 * run.best) if run.best < 1e-6 else trigger
-            if run.at_floor():
-                return
-        if ip.length < 1e-6 or ip.gap < 1e-24 * ip.first_gap:
-            break
-    if not run.done():
-        Proximal(run.best_z.copy(), alpha=1e-3).advance(run)
-
-
-__all__ = ["AUGMENTED", "CONVEX", "EnergyRun", "Proximal", "Run", "polish", "refined", "solve_convex"]

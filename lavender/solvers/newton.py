@@ -5,9 +5,10 @@
 1. Newton's method on the natural map from the warm start, then from the solution of H z = g.
 2. A cold Mehrotra interior point (`_ipm.py`), polished on the identified rows (`_polish.py`) as soon as
    it has found them, to the floor of float64.
-3. Coulomb friction starts from the convex answer and ends with a proximal Newton method on the
-   Alart-Curnier map; where that fails, De Saxce's fixed point on the normals moves the convex problem
-   towards it.
+3. Where that stops short on rows that nearly depend on each other: both again through the augmented
+   system of the bodies (`_augmented.py`).
+4. Coulomb friction by a proximal Newton method on the Alart-Curnier map, and by interior points on
+   De Saxce's form of the law, whose convex problem moves with every step (`_desaxce.py`).
 
 Form "velocity" factors I + K^T V K over the bodies and never squares J; "impulse" factors over the rows.
 """
@@ -24,9 +25,10 @@ from lavender.errors import InputError
 from lavender.problem import Problem
 from lavender.registry import SolverSpec
 from lavender.solution import Claim, Status
+from lavender.solvers._convex_newton import solve_convex
 from lavender.solvers._coulomb_newton import solve_coulomb
 from lavender.solvers._ipm import System, make_system
-from lavender.solvers._polish import Run, solve_convex
+from lavender.solvers._polish import Run
 
 FORMS = ("auto", "velocity", "impulse")
 
@@ -127,8 +129,9 @@ SPEC = SolverSpec(
     laws=frozenset({"linear", "lcp", "coulomb", "cone"}),
     operator="either",
     resumable=False,
-    max_iter=500,
+    max_iter=1500,
     options={"form": "auto, velocity (bodies) or impulse (rows): unknowns of the factorisation"},
     summary="interior point, active-set polish and proximal semismooth Newton",
-    reference="Mehrotra 1992; Nesterov, Todd 1997; Hintermueller, Ito, Kunisch 2002; Alart, Curnier 1991",
+    reference="Mehrotra 1992; Nesterov, Todd 1997; Hintermueller, Ito, Kunisch 2002; Alart, Curnier 1991; "
+    "De Saxce, Feng 1998",
 )

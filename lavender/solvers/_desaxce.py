@@ -1,0 +1,226 @@
+"""Coulomb friction by an interior point method on De Saxce's change of variable.
+
+    s = H z - g,   u = s + phi(s_t) e_n,   phi = a_t |s_t| + a_s |s_s|        (De Saxce, Feng 1998)   (1)
+    z in K,  u in K*,  z . u = 0     on every contact                                                   (2)
+
+With phi frozen, (1) and (2) are the convex problem of the "cone" law with its normals lowered by phi, and
+phi <- phi(s_t) is Cadoux's fixed point (Cadoux 2009; Acary, Cadoux, Lemarechal, Malick 2011): dozens of
+convex problems. Here phi moves with every step of one interior point, and so does its derivative: with
+psi = phi'(s_t) on the tangents and the spin, 0 on the normal, C = I - e_n psi^T and B = C^-1 = I + e_n psi^T,
+
+    du = -q - W dz,    C du = H dz - r_d,    r_d = u - s - phi e_n,                                      (3)
+    (H + C W) dz = r_d - C q = r_d - q + (psi . q) e_n,                                                  (4)
+
+q and W = G^T T^-2 G as in the convex method (`lavender_ext/newton.pyx`), whose kernels take every step; phi
+and psi are read off u, which shares its tangents with s. W^-1 = L L^T gives (C W)^-1 = L P, P = L^T B, so
+
+    velocity   N = I + K^T L P K,   N dy = K^T L P r,   dz = L P (r - K dy)                              (5)
+    impulse    (I + P H L) y = P r,   dz = L y                                                           (6)
+
+Both matrices lack symmetry and are factored by LU. The central path of a problem that is not monotone may
+turn back: steps then shrink to nothing. With `share` psi for psi in B, share a little below 1, the method is
+between Newton's and the fixed point and passes such folds, at a linear rate, after which Newton's method on
+the Alart-Curnier map ends it. Several shares are tried in turn.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lavender._arrays import FloatArray
+from lavender.cones import CONTACT_SPIN, ROW
+from lavender.solvers._augmented import SHIFT, AugmentedSystem, advance
+from lavender.solvers._ipm import AUGMENTED, InteriorPoint, MatrixSystem, Scaled, VelocitySystem
+from lavender.solvers._polish import Proximal, Run
+
+SHARES = (0.95, 1.0, 0.85, 0.98, 0.7, 0.9)  # of phi's derivative, tried in turn
+# First weight, steps of a round and factorisations of the proximal Newton methods after each interior point.
+FINISH = ((1e-3, 20, 30), (1e-7, 50, 40))
+
+
+class _Slip:
+    """Index arrays of (1): which rows are tangents and spins, and of which contact."""
+
+    def __init__(self, sc: Scaled) -> None:
+        ptr, kind, wptr = sc.ptr, sc.kind, sc.wptr
+        size = np.diff(ptr)
+        self.n, self.m = len(size), int(ptr[-1])
+        self.first = ptr[:-1]
+        self.element = np.repeat(np.arange(self.n), size)
+        position = np.arange(self.m) - np.repeat(self.first, size)
+        contact = (kind != ROW)[self.element]
+        spin = (kind == CONTACT_SPIN)[self.element] & (position == size[self.element] - 1)
+        tangent = contact & (position > 0) & ~spin
+        self.a_t = np.where(np.bincount(self.element, tangent, minlength=self.n) > 0, sc.a_t, 0.0)
+        self.a_s = np.where(kind == CONTACT_SPIN, sc.a_s, 0.0)
+        # G^T: the cones' own coordinates are (a z_n, z_t) where a > 1, else (z_n, z_t / a).
+        one_t, one_s = np.minimum(self.a_t, 1.0)[self.element], np.minimum(self.a_s, 1.0)[self.element]
+        self.from_u1 = np.divide(1.0, one_t, out=np.zeros(self.m), where=tangent)
+        self.from_u2 = np.divide(1.0, one_s, out=np.zeros(self.m), where=spin)
+        self.normal_u1 = np.where(self.a_t > 0.0, np.maximum(self.a_t, 1.0), np.where(kind == ROW, 1.0, 0.0))
+        self.normal_u2 = np.where(
+            kind == CONTACT_SPIN, np.maximum(self.a_s, 1.0), np.where(kind == ROW, -1.0, 0.0)
+        )
+        # Entries (r, c) of every element's small matrix: the row c of the problem, and where (r, 0) is.
+        square = np.repeat(size, size**2)
+        inner = np.arange(int(wptr[-1])) - np.repeat(wptr[:-1], size**2)
+        self.column = np.repeat(self.first, size**2) + inner % square
+        self.row = np.repeat(self.first, size**2) + inner // square
+        self.first_entry = np.repeat(wptr[:-1], size**2) + (inner // square) * square
+
+    def dual(self, u1: FloatArray, u2: FloatArray) -> FloatArray:
+        """G^T u (m,): u on every row."""
+        out: FloatArray = self.from_u1 * u1 + self.from_u2 * u2
+        out[self.first] = self.normal_u1 * u1[self.first] + self.normal_u2 * u2[self.first]
+        return out
+
+    def slip(self, s: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """phi (n,) of s (m,), and psi (m,)."""
+        st = np.where(self.from_u1 > 0.0, s, 0.0)
+        ss = np.where(self.from_u2 > 0.0, s, 0.0)
+        t = np.sqrt(np.bincount(self.element, st * st, minlength=self.n))
+        spin = np.bincount(self.element, np.abs(ss), minlength=self.n)
+        along = np.divide(self.a_t, t, out=np.zeros(self.n), where=t > 0.0)
+        psi = along[self.element] * st + self.a_s[self.element] * np.sign(ss)
+        return self.a_t * t + self.a_s * spin, psi
+
+    def dot(self, psi: FloatArray, x: FloatArray) -> FloatArray:
+        """psi . x (n,) on every element."""
+        out: FloatArray = np.asarray(np.bincount(self.element, psi * x, minlength=self.n), np.float64)
+        return out
+
+
+@dataclass
+class DeSaxce(InteriorPoint):
+    """The interior point of (3) and (4); `share` of phi's derivative enters."""
+
+    share: float = 1.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.slips = _Slip(self.system.sc)
+
+    def step(self) -> bool:
+        """One predictor-corrector step; False where the factorisation or the step fails."""
+        sy, sc, e, of = self.system, self.system.sc, self.system.elements, self.slips
+        z, u1, u2, first = self.z, self.u1, self.u2, self.slips.first
+        hz = sy.times(z)
+        u = of.dual(u1, u2)
+        phi, psi = of.slip(u)
+        psi *= self.share
+        gap = e.scale(z, u1, u2, self.delta, sy.v, sy.bt)
+        if not self._factor(psi) and not np.isfinite(gap):
+            return False
+        lowered = sc.g.copy()
+        lowered[first] -= phi
+        # The predictor's q is u itself.
+        r = lowered - hz
+        r[first] += of.dot(psi, u)
+        da = self._solve(r)
+        mu = gap / max(self.degree, 1.0)
+        _, after = e.affine(z, u1, u2, da)
+        sigma = min(1.0, max(after / gap, 0.0)) ** 3 if gap > 0 else 0.0
+        # The convex right-hand side is r_d - q for u - s alone; q comes back by difference.
+        e.rhs(z, u1, u2, hz, da, sigma * mu, self.r)
+        q = u - (hz - sc.g) - self.r
+        self.r[first] += of.dot(psi, q) - phi
+        dz = self._solve(self.r)
+        if not np.isfinite(dz).all():
+            return False
+        self.length = e.step(z, u1, u2, dz, da, sigma * mu, 0.995, self.t1, self.t2)
+        self.lowest_gap = min(self.lowest_gap, self.gap)
+        self.gap = mu
+        self.first_gap = max(self.first_gap, mu)
+        return self.length > 0.0
+
+    def _factor(self, psi: FloatArray) -> bool:
+        sy, of = self.system, self.slips
+        wide = psi[of.column]
+        if sy.bt is None:
+            self._with_compliance(psi, wide)
+        else:
+            self.p = sy.bt + sy.bt[of.first_entry] * wide
+            sy.v += sy.v[of.first_entry] * wide
+        if isinstance(sy, AugmentedSystem):
+            sy.factor_pair(sy.v if sy.bt is None else self.p, sy.bt)
+            return True
+        if isinstance(sy, VelocitySystem):
+            return sy._factor(True)
+        assert isinstance(sy, MatrixSystem) and sy.bt is not None
+        if sy.dense:
+            left = np.ascontiguousarray(sy._product(self.p, sy.h, 0.0, 0.0, 0.0).T)
+            return sy._dense_lu(np.ascontiguousarray(sy._product(sy.bt, left, 0.0, 0.0, 1.0).T))
+        identity = sy.small(np.where(of.row == of.column, 1.0, 0.0))
+        return sy._sparse_lu(sy.small(self.p) @ sy.h @ sy.small(sy.bt).T + identity)
+
+    def _with_compliance(self, psi: FloatArray, wide: FloatArray) -> None:
+        # (theta + C W)^-1 = (V^-1 + e_n (psi theta)^T)^-1 B with V = (theta + W)^-1     (Sherman, Morrison)
+        sy, of = self.system, self.slips
+        v, normal = sy.v, sy.v[of.first_entry]
+        across = np.bincount(of.column, (psi * sy.sc.theta)[of.row] * v, minlength=of.m)
+        own = across[of.first][of.element]
+        sy.v[:] = v + normal * wide - normal * ((across + own * psi) / (1.0 + own))[of.column]
+
+    def _solve(self, r: FloatArray) -> FloatArray:
+        sy, t, q = self.system, self.system.t, self.system.q
+        out = np.empty_like(r)
+        if isinstance(sy, AugmentedSystem):
+            return sy.solve_pair(r)
+        if isinstance(sy, VelocitySystem):
+            sy.elements.times(sy.v, r, t)
+            sy.factor.solve(sy.elements, t, sy.y, q)
+            r = r - q
+            if sy.bt is None:
+                sy.elements.times(sy.v, r, out)
+                return out
+            sy.elements.times(self.p, r, t)
+            sy.elements.times_transposed(sy.bt, t, out)
+            return out
+        assert isinstance(sy, MatrixSystem) and sy.bt is not None
+        sy.elements.times(self.p, r, t)
+        sy.elements.times_transposed(sy.bt, sy.solver(t), out)
+        return out
+
+
+def solve_desaxce(run: Run, shares: tuple[float, ...] = SHARES) -> list[tuple[float, FloatArray]]:
+    """Interior points, each ended by Newton's method on the Alart-Curnier map, until the judge is content.
+
+    Returns where each of them ended: relative residual and z.
+    """
+    ends: list[tuple[float, FloatArray]] = []
+    for share in shares:
+        best, z = advance(run, DeSaxce(run.system, share=share), AUGMENTED, "De Saxce steps")
+        if run.done() or run.at_floor():
+            break
+        for alpha, inner, limit in FINISH:
+            best, z = apart(run, Proximal(z, AUGMENTED, min(alpha, best), inner), limit)
+            if run.done() or run.at_floor():
+                return ends
+        ends.append((best, z))
+    return ends
+
+
+def solve_desaxce_augmented(run: Run, shares: tuple[float, ...] = SHARES[:2]) -> None:
+    """The same through the augmented system of the bodies, for rows that nearly depend on each other."""
+    if not isinstance(run.system, VelocitySystem):
+        return
+    system = AugmentedSystem(run.system)
+    for share in shares:
+        advance(run, DeSaxce(system, SHIFT, share=share), AUGMENTED, "augmented De Saxce steps")
+        if run.done() or run.at_floor():
+            return
+
+
+def apart(run: Run, method: Proximal, limit: int) -> tuple[float, FloatArray]:
+    """`limit` factorisations of a method judged by its own progress; the lowest residual and its z."""
+    before, z = run.best, run.best_z
+    run.best = np.inf
+    try:
+        method.advance(run, limit)
+    finally:
+        best, own = run.best, run.best_z
+        if before <= best:
+            run.best, run.best_z = before, z
+    return best, own
