@@ -13,15 +13,17 @@ import numpy as np
 from lavender._arrays import FloatArray
 from lavender.cones import ROW
 from lavender.solvers._desaxce import SHARES, apart, solve_desaxce, solve_desaxce_augmented
-from lavender.solvers._ipm import AUGMENTED, InteriorPoint
+from lavender.solvers._ipm import AUGMENTED, CONVEX, InteriorPoint
 from lavender.solvers._polish import Proximal, Run
 
 FIRST, SECOND = 20, 30  # factorisations of the first two walks
+CONVEX_TOL = 1e-4  # of the convex answer that a walk starts from, in energy
+CONVEX_STEPS = 30  # that it may cost
 STRETCH = 60  # factorisations between two looks at whether a walk gets anywhere
 LARGE = 1000  # rows from which the first proximal weight is larger
 HEAVY = 1e3  # mass ratio from which the walks are not tried from a cold start
-LAST = (1e-6, 1e-8)  # proximal weights of the last walks
-CANDIDATES = 3  # ends of interior points from which these start
+LAST = (1e-6, 1e-7, 1e-8)  # proximal weights of the last walks
+CANDIDATES = 2  # ends of interior points from which these start
 LONG = 50  # Newton steps of one of their rounds: sticking changes to sliding contact by contact
 
 
@@ -43,11 +45,12 @@ def solve_coulomb(run: Run, z: FloatArray, cold: bool) -> None:
                 return
     ends += solve_desaxce(run, SHARES[2:])
     ends.sort(key=lambda end: end[0])
-    for alpha in LAST:
-        for _, start in ends[:CANDIDATES]:
+    for _, start in ends[:CANDIDATES]:
+        for alpha in LAST:
             if run.done() or run.at_floor():
                 return
-            _pursue(run, Proximal(start.copy(), AUGMENTED, alpha, LONG))
+            walk = Proximal(start.copy(), AUGMENTED, alpha, LONG)
+            start = _pursue(run, walk, 0.7)
     if not (run.done() or run.at_floor() or _has_free_rows(run)):
         solve_desaxce_augmented(run)
     if not (run.done() or run.at_floor()):
@@ -63,7 +66,25 @@ def _interior(run: Run, plain: Proximal, ends: list[tuple[float, FloatArray]]) -
         solve_desaxce_augmented(run)
         if run.done() or run.at_floor():
             return
+    _from_convex(run)
+    if run.done() or run.at_floor():
+        return
     ends += solve_desaxce(run, SHARES[1:2])
+
+
+def _from_convex(run: Run) -> None:
+    system = run.system
+    ip, f = InteriorPoint(system), np.empty(system.sc.m)
+    start = system.natural_size(np.zeros(system.sc.m), -system.sc.g, CONVEX, f)
+    for _ in range(CONVEX_STEPS):
+        if run.done() or not ip.step():
+            break
+        run.count("convex steps")
+        run.score(ip.z)
+        if system.natural_size(ip.z, system.times(ip.z) - system.sc.g, CONVEX, f) <= CONVEX_TOL * start:
+            break
+    if not run.done():
+        _pursue(run, Proximal(ip.z.copy(), AUGMENTED, 1e-3))
 
 
 def _walk(run: Run, plain: Proximal, ends: list[tuple[float, FloatArray]]) -> None:
@@ -75,14 +96,17 @@ def _walk(run: Run, plain: Proximal, ends: list[tuple[float, FloatArray]]) -> No
         _pursue(run, method)
 
 
-def _pursue(run: Run, method: Proximal) -> None:
-    # As long as each stretch brings its residual down to a third.
-    last = np.inf
+def _pursue(run: Run, method: Proximal, share: float = 0.5) -> FloatArray:
+    # As long as each stretch brings its residual down to a share of the last; its best z.
+    last, z = np.inf, method.z
     while not run.done() and not method.stuck:
-        best, _ = apart(run, method, STRETCH)
-        if best > 0.3 * last or run.at_floor():
-            return
+        best, own = apart(run, method, STRETCH)
+        if best < last:
+            z = own
+        if best > share * last or run.at_floor():
+            break
         last = best
+    return z
 
 
 def _has_free_rows(run: Run) -> bool:
