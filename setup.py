@@ -117,15 +117,12 @@ build.sub_commands = [*build.sub_commands, ("build_wasm", None)]
 
 
 def extension(path):
-    """One module, named after its file; *_threads.pyx alone use OpenMP."""
-    openmp = []
-    if path.stem.endswith("_threads") and sys.platform != "darwin":  # Apple's clang ships without OpenMP
-        openmp = ["/openmp"] if sys.platform == "win32" else ["-fopenmp"]
+    """One module, named after its file."""
     return Extension(
         f"lavender_ext.{path.stem}",
         [path.as_posix()],
-        extra_compile_args=COMPILE_ARGS + openmp,
-        extra_link_args=LINK_ARGS + (openmp if sys.platform != "win32" else []),
+        extra_compile_args=COMPILE_ARGS,
+        extra_link_args=LINK_ARGS,
     )
 
 

@@ -38,7 +38,7 @@ OPTIONS = runpy.run_path(str(ROOT / "lavender_ext" / "build_options.py"))
 #: sqrt and floor are exact, so every libm gives the same bits; compilers write the mem functions themselves.
 ALLOWED = frozenset({"sqrt", "floor", "memcpy", "memset", "memmove"})
 
-#: A threaded module is exempt by name: prange needs the OpenMP runtime and the thread state of Python. Its
+#: A threaded module is exempt by name: it yields and sleeps by the system's calls. Its
 #: arithmetic is the inline functions of the .pxd files, which the serial modules compile and this check sees.
 EXEMPT_SUFFIX = "_threads"
 

@@ -83,9 +83,12 @@ class ManyValues(click.Command):
 
 
 class Suites(ManyValues):
-    """`lavender bench peers` is a command of its own; any other first word is a file (or ./peers)."""
+    """`lavender bench kernels` and `peers` are commands of their own; any other first word is a file (or ./peers)."""
 
-    OWN = {"peers": "lavender.bench.peers:command"}  # noqa: RUF012 - a constant of the class
+    OWN = {  # noqa: RUF012 - a constant of the class
+        "kernels": "lavender.bench.kernels:command",
+        "peers": "lavender.bench.peers:command",
+    }
 
     def make_context(
         self, info_name: str | None, args: list[str], parent: click.Context | None = None, **extra: Any

@@ -5,7 +5,7 @@ import pytest
 
 import lavender as lv
 from lavender.engine.layout import HEAD, SETTING
-from lavender.ordering import ORDERS
+from lavender.ordering import ENGINE_ORDERS
 
 SCENES = {
     "stack": {},
@@ -42,7 +42,7 @@ def test_the_step_reports_the_bits_of_the_front_door(name, warm):
     assert rows > 0
 
 
-@pytest.mark.parametrize("order", ORDERS)
+@pytest.mark.parametrize("order", ENGINE_ORDERS)
 @pytest.mark.parametrize("name", ["stack", "bridge"])
 def test_every_order_is_the_order_of_that_name(name, order):
     sim = lv.Simulation(lv.Scene(name, order=order, seed=5, **SCENES[name]))

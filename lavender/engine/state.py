@@ -17,7 +17,7 @@ from lavender.engine.layout import (
     SIZE,
 )
 from lavender.errors import InputError
-from lavender.ordering import ORDERS
+from lavender.ordering import ENGINE_ORDERS
 from lavender.scene import Box, Plane, Scene, Sphere
 from lavender_ext import engine as kernels
 
@@ -33,7 +33,7 @@ ORDER_NUMBER = {
     "top_down": 5,
     "colored": 6,
 }
-assert set(ORDER_NUMBER) == set(ORDERS)
+assert set(ORDER_NUMBER) == set(ENGINE_ORDERS)
 
 BRUTE_FORCE = 32  # bodies up to which testing all pairs is quicker than the grid
 BETA = 0.2  # -, share of the position error removed per substep

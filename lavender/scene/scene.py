@@ -13,7 +13,7 @@ import numpy as np
 
 from lavender._arrays import FloatArray
 from lavender.errors import InputError, UnknownName
-from lavender.ordering import ORDERS
+from lavender.ordering import ENGINE_ORDERS
 from lavender.registry import get
 from lavender.scene.parts import (
     BALL,
@@ -85,8 +85,8 @@ class Parameters:
         if not isinstance(self.warm_start, (bool, np.bool_)):
             raise InputError(f"warm_start is {self.warm_start!r}; True or False is needed")
         put(self, "warm_start", bool(self.warm_start))
-        if self.order not in ORDERS:
-            raise UnknownName("order", self.order, ORDERS)
+        if self.order not in ENGINE_ORDERS:
+            raise UnknownName("order", self.order, ENGINE_ORDERS)
         if self.order != "given" and self.solver != "sequential_impulses":
             raise InputError(
                 f"order={self.order!r} is for sequential_impulses; give {self.solver} its own in solver_options"

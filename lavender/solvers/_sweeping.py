@@ -6,7 +6,9 @@ more each time.
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -24,18 +26,20 @@ from lavender_ext import sweeps_threads as threaded
 _STATUS = (Status.MAX_ITERATIONS, Status.CONVERGED, Status.DIVERGED, Status.STALLED, Status.FLOOR)
 # Multiply-adds per colour from which a second thread gains (measured: where both take the same time).
 GRAIN = 20_000
+LEAST = 400_000  # multiply-adds of a sweep: 4,000 contacts, below which starting threads costs what they save
+MOST_THREADS = 64
 _ROW_BY_ROW = np.empty(0, np.int32)
 
 
 class SweepState:
     """Where a run stands; the watch counts sweeps and keeps the best checked iterate."""
 
-    def __init__(self, problem: Problem, data: Any, order: Order) -> None:
+    def __init__(self, problem: Problem, data: Any, order: Order, judged: Any = None) -> None:
         reference(problem)  # the watch reads the error of doing nothing
         self.problem = problem
         self.data = data  # lavender_ext.problem.Data that the kernel sweeps over
         self.order = order
-        self.watch = Watch(problem.data)
+        self.watch = Watch(problem.data if judged is None else judged)
 
     @property
     def first(self) -> bool:
@@ -82,9 +86,16 @@ def run_threads(
 ) -> Claim:
     """Coloured sweeps on several threads: the bits of one thread."""
     o = state.order
-    return claim(
-        *threaded.run(state.data, state.watch, impulse, n, tol, o.blocks, o.color_ptr, threads, velocity)
-    )
+    team = threaded.Team(state.data, state.watch, impulse, o.blocks, o.color_ptr, threads, velocity)
+    for thread in range(1, threads):
+        _helpers().submit(team.help, thread)
+    return claim(*team.lead(n, tol))
+
+
+@cache
+def _helpers() -> ThreadPoolExecutor:
+    # Threads for all runs; one that is started late finds nothing left to do.
+    return ThreadPoolExecutor(MOST_THREADS - 1, thread_name_prefix="lavender")
 
 
 @dataclass(frozen=True)
@@ -123,4 +134,5 @@ class Threaded(Sweeping):
         ptr = state.order.color_ptr
         if self.threads == 1 or ptr is None or len(ptr) < 2:
             return False
-        return (len(state.order.blocks) / (len(ptr) - 1)) * state.data.work >= GRAIN * len(state.order.blocks)
+        work = state.data.work
+        return work >= LEAST and work >= GRAIN * (len(ptr) - 1)

@@ -9,24 +9,49 @@ rounding; a contact costs the same whatever the number of its neighbours.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from lavender._arrays import FloatArray
-from lavender.ordering import block_order
+from lavender.ordering import Order, block_order
 from lavender.problem import Problem
 from lavender.registry import SolverSpec
+from lavender.residuals import reference
 from lavender.solution import Claim
+from lavender.solvers._layout import lay_out
+from lavender.solvers._layout import pays as layout_pays
 from lavender.solvers._sweeping import SweepState, Threaded, run_kernel, run_threads
 from lavender_ext import judge
 from lavender_ext import sweeps as kernels
 
 
 class ImpulseState(SweepState):
-    """A sweep state with v = M^-1 J^T lambda (n + 1, 6), formed once and kept by the sweeps."""
+    """A sweep state with v = M^-1 J^T lambda (n + 1, 6), formed once and kept by the sweeps.
+
+    A large problem that is swept in an order of its own is written out in that order; the impulse of the sweeps
+    is then `laid`.
+    """
 
     velocity: FloatArray | None = None
+
+    def __init__(self, problem: Problem, order: Order) -> None:
+        self.layout = lay_out(problem, order.blocks) if layout_pays(problem, order) else None
+        if self.layout is None:
+            super().__init__(problem, problem.data, order)
+            return
+        self.layout.data.set_start(*reference(problem))
+        order = replace(order, blocks=np.arange(problem.n_blocks, dtype=np.int32))
+        super().__init__(problem, self.layout.data, order, self.layout.data)
+
+    @property
+    def best(self) -> tuple[float, FloatArray | None]:
+        relative, laid = super().best
+        if laid is None or self.layout is None:
+            return relative, laid
+        impulse = np.empty_like(laid)
+        self.layout.put(laid, impulse)
+        return relative, impulse
 
 
 @dataclass(frozen=True)
@@ -36,19 +61,23 @@ class SequentialImpulses(Threaded):
     """
 
     def prepare(self, problem: Problem) -> ImpulseState:
-        order = block_order(problem, self.order, seed=self.seed, ground=self.ground)
-        return ImpulseState(problem, problem.data, order)
+        return ImpulseState(problem, block_order(problem, self.order, seed=self.seed, ground=self.ground))
 
     def run(
         self, state: ImpulseState, impulse: FloatArray, n: int, tol: float, time_limit: float | None = None
     ) -> Claim:
+        lam = impulse if state.layout is None else state.layout.take(impulse)
         if state.velocity is None:
             state.velocity = np.zeros((state.data.n_bodies + 1, 6))
-            judge.velocity_change(state.data, impulse, state.velocity)
+            judge.velocity_change(state.data, lam, state.velocity)
         velocity = state.velocity.ravel()
         if self.uses_threads(state):
-            return run_threads(state, impulse, n, tol, self.threads, velocity)
-        return run_kernel(state, impulse, n, tol, kernels.IMPULSES, scratch=velocity)
+            claim = run_threads(state, lam, n, tol, self.threads, velocity)
+        else:
+            claim = run_kernel(state, lam, n, tol, kernels.IMPULSES, scratch=velocity)
+        if state.layout is not None:
+            state.layout.put(lam, impulse)
+        return claim
 
 
 SPEC = SolverSpec(

@@ -1,0 +1,72 @@
+"""A factored problem written out in sweep order, so that a sweep reads memory from front to back.
+
+Blocks stand in the order of the sweep, bodies are numbered by `lavender.ordering.body_ranks`. What a block reads
+has the same value, so the impulses have the same bits; only sums over all rows run in another order.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from lavender._arrays import FloatArray, IntArray
+from lavender.ordering import Order, body_ranks
+from lavender.problem import FRICTION, Problem
+from lavender_ext.problem import Data
+
+__all__ = ["Layout", "lay_out"]
+
+# Contacts from which writing out pays: their arrays leave the second-level cache (measured: 1.0 to 1.1 times as
+# fast at 10,000, twice at 100,000).
+LARGE = 8_000
+
+
+@dataclass(frozen=True)
+class Layout:
+    """The problem in sweep order, and where its rows came from."""
+
+    data: Any  # lavender_ext.problem.Data
+    rows: IntArray  # (m,) row of the problem at each place
+
+    def take(self, impulse: FloatArray) -> FloatArray:
+        """Impulse (m,) in sweep order; a new array."""
+        return impulse[self.rows]
+
+    def put(self, laid: FloatArray, impulse: FloatArray) -> None:
+        """Impulse (m,) of sweep order into the problem's order."""
+        impulse[self.rows] = laid
+
+
+def pays(problem: Problem, order: Order) -> bool:
+    """A large problem, swept in one order that is not its own, joints first."""
+    rows = problem.rows
+    if rows is None or order.is_given or not order.is_fixed or rows.n_contacts < LARGE:
+        return False
+    return bool(np.all(order.blocks[: rows.n_joints] < rows.n_joints))
+
+
+def lay_out(problem: Problem, blocks: IntArray) -> Layout:
+    """`problem` with its blocks in the order `blocks` (k,), joints first."""
+    r, c = problem.rows, problem.cones
+    assert r is not None
+    assert problem.compliance is not None
+    kj, mj = r.n_joints, len(r.jac)
+    size = np.diff(c.ptr)[blocks]
+    ptr = np.zeros(len(blocks) + 1, np.int32)
+    np.cumsum(size, out=ptr[1:])
+    rows = np.arange(problem.m, dtype=np.int32) + np.repeat(c.ptr[blocks] - ptr[:-1], size)
+    joint, contact = blocks[:kj], blocks[kj:] - kj
+    rank = np.append(body_ranks(problem), np.int32(-1))  # a static body, -1, stays -1
+    body = np.argsort(rank[:-1])
+    data = Data(
+        ptr, c.kind[blocks], c.lower[rows], c.upper[rows], c.mu[blocks], c.patch_radius[blocks], problem.b[rows],
+        FRICTION.index(problem.friction),
+        rows=(
+            r.jac[rows[:mj]], rank[r.joint_body[joint]], r.normal[contact], r.tangent[contact], r.arm_a[contact],
+            r.arm_b[contact], rank[r.contact_body[contact]], r.inv_mass[body], r.inv_inertia[body],
+            problem.compliance[rows],
+        ),
+    )  # fmt: skip
+    return Layout(data, rows)
