@@ -1,0 +1,202 @@
+"""De Saxce's interior point and the augmented system: against dense algebra, and on scenes at rest and sliding."""
+
+import dataclasses
+import itertools
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from random_problems import as_matrix, random_contact_problem, seeds
+
+import lavender as lv
+from lavender import suite
+from lavender.solvers._augmented import AugmentedSystem
+from lavender.solvers._desaxce import DeSaxce, _Slip
+from lavender.solvers._ipm import AUGMENTED, CONVEX, DELTA, make_system
+
+
+def good(solution, tol):
+    return solution.residual.relative <= max(tol, 2.0 * solution.residual.floor) and not solution.contradicted
+
+
+def dense(system, values):
+    """The elements' small matrices as one block diagonal matrix."""
+    sc = system.sc
+    out = np.zeros((sc.m, sc.m))
+    for i, q in enumerate(sc.wptr[:-1]):
+        j, end = sc.ptr[i], sc.ptr[i + 1]
+        out[j:end, j:end] = values[q : sc.wptr[i + 1]].reshape(end - j, end - j)
+    return out
+
+
+def dense_h(system):
+    return np.array([system.times(e) for e in np.eye(system.sc.m)]).T
+
+
+def problem_of(seed, compliant, friction="coulomb"):
+    problem = random_contact_problem(seed, friction=friction, bodies=5, contacts=8)
+    return problem if compliant else dataclasses.replace(problem, compliance=np.zeros(problem.m))
+
+
+# -- equations ----------------------------------------------------------------------------------------
+
+
+@given(seed=seeds)
+@settings(max_examples=30)
+def test_slip_is_de_saxces_term_and_psi_its_derivative(seed):
+    sc = make_system(problem_of(seed, True), "velocity").sc
+    rng = np.random.default_rng(seed)
+    slip, s, ds = _Slip(sc), rng.normal(size=sc.m), rng.normal(size=sc.m)
+    phi, psi = slip.slip(s)
+    for i in range(len(sc.kind)):
+        j, end, spin = sc.ptr[i], sc.ptr[i + 1], sc.kind[i] == 2
+        expected = 0.0
+        if sc.kind[i] != 0:
+            expected = sc.a_t[i] * np.linalg.norm(s[j + 1 : end - spin])
+            expected += sc.a_s[i] * abs(s[end - 1]) if spin else 0.0
+        assert phi[i] == pytest.approx(expected, rel=1e-14, abs=1e-300)
+        assert psi[j] == 0.0
+    step = 1e-6
+    difference = (slip.slip(s + step * ds)[0] - slip.slip(s - step * ds)[0]) / (2.0 * step)
+    # The third derivative of |s_t| grows like 1/|s_t|^2, and spin has a kink: only where nothing is near 0.
+    smooth = [
+        i
+        for i in range(len(sc.kind))
+        if sc.kind[i] == 0 or np.abs(s[sc.ptr[i] + 1 : sc.ptr[i + 1]]).min(initial=1.0) > 1e-2
+    ]
+    np.testing.assert_allclose(difference[smooth], slip.dot(psi, ds)[smooth], rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("compliant", [True, False])
+@pytest.mark.parametrize("form", ["velocity", "impulse", "augmented"])
+@given(seed=seeds)
+@settings(max_examples=15)
+def test_the_system_of_a_step_is_solved(form, compliant, seed):
+    problem = problem_of(seed, compliant)
+    system = make_system(problem, "impulse" if form == "impulse" else "velocity")
+    if form == "augmented":
+        system = AugmentedSystem(system)
+    sc = system.sc
+    ip = DeSaxce(system, share=0.9)
+    for _ in range(3):
+        slip = ip.slips
+        u = slip.dual(ip.u1, ip.u2)
+        _, psi = slip.slip(u)
+        psi *= 0.9
+        system.elements.scale(ip.z, ip.u1, ip.u2, DELTA, system.v, system.bt)
+        w = np.linalg.inv(dense(system, system.v)) - np.diag(sc.theta)
+        c = np.eye(sc.m)
+        np.subtract.at(c, (slip.first[slip.element], np.arange(sc.m)), psi)
+        assert ip._factor(psi)
+        r = np.random.default_rng(seed).normal(size=sc.m)
+        x = ip._solve(r)
+        expected = np.linalg.solve(dense_h(system) + c @ w, r)
+        # W holds entries up to 1e10 of DELTA's reciprocal beside 1: what the dense inverse keeps of 16 digits.
+        np.testing.assert_allclose(x, expected, rtol=0, atol=2e-5 * np.abs(expected).max())
+        assert ip.step()
+
+
+@pytest.mark.parametrize("law", [CONVEX, AUGMENTED])
+@given(seed=seeds)
+@settings(max_examples=15)
+def test_augmented_system_is_the_same_newton_system(law, seed):
+    problem = problem_of(seed, True, "cone" if law == CONVEX else "coulomb")
+    given_system = make_system(problem, "velocity")
+    system = AugmentedSystem(given_system)
+    m = system.sc.m
+    rng = np.random.default_rng(seed)
+    z, r, f = rng.normal(size=m), rng.normal(size=m), np.empty(m)
+    system.natural(z, system.times(z) - system.sc.g, law, 1e-3, f)
+    assert system.factor_natural(1e-3)
+    p = dense(system, system.p)
+    matrix = np.eye(m) - p + p @ (dense_h(system) + 1e-3 * np.eye(m))
+    x = system.solve_natural(r)
+    # eps = 1e-3 bounds the condition number by about 1e4 for these sizes.
+    np.testing.assert_allclose(matrix @ x, r, rtol=0, atol=1e-9 * (1.0 + np.abs(x).max()))
+    assert given_system.factorisations == 1
+
+
+# -- scenes at rest: many redundant points, few of which slip -------------------------------------------
+
+
+def problem_in(scene, step, **parameters):
+    """What `step + 1` steps of a scene lead to, without its warm start."""
+    sim = lv.Simulation(lv.Scene(scene, **parameters))
+    for _ in range(step + 1):
+        sim.step()
+    return dataclasses.replace(sim.constraint_problem(), guess=None)
+
+
+@pytest.mark.parametrize(
+    ("scene", "step", "parameters"),
+    [
+        ("pyramid", 1, {}),
+        ("pyramid", 3, {"friction": 0.2}),
+        ("pyramid", 12, {"friction": 0.2}),
+        ("card_house", 3, {}),
+        ("table", 1, {"friction": 1.0}),
+        ("table", 3, {"friction": 1.0}),
+    ],
+)
+def test_redundant_contacts_at_rest(scene, step, parameters):
+    problem = problem_in(scene, step, **parameters)
+    assert problem.law == "coulomb"
+    solution = lv.solve(problem, "newton", tol=1e-8)
+    assert good(solution, 1e-8), str(solution)
+    assert "De Saxce steps" in solution.message
+    # Coulomb's law itself, apart from the judge: w_n >= 0, friction in its disk and against the sliding.
+    lam, w = solution.impulse, problem.slack(solution.impulse)
+    cones, size = problem.cones, np.abs(problem.b).max()
+    j = cones.ptr[:-1][np.diff(cones.ptr) == 3]
+    mu = cones.mu[np.diff(cones.ptr) == 3]
+    normal, tangent, slip = lam[j], lam[np.stack([j + 1, j + 2])], w[np.stack([j + 1, j + 2])]
+    # 1e-8 of doing nothing, times the square root of the mass ratio and of the number of contacts.
+    near = 1e-6
+    assert normal.min() >= -near * normal.max()
+    assert w[j].min() >= -near * size
+    assert np.all(np.hypot(*tangent) <= mu * normal + near * normal.max())
+    power = (tangent * slip).sum(axis=0) + mu * normal * np.hypot(*slip)
+    assert np.abs(power).max() <= near * normal.max() * size
+
+
+@pytest.mark.parametrize("law", ["coulomb", "cone"])
+@pytest.mark.parametrize(("step", "friction"), [(45, 0.5), (60, 0.1), (99, 0.5)])
+def test_bridge_whose_hinges_nearly_depend_on_each_other(step, friction, law):
+    problem = problem_in("bridge", step, friction=friction)
+    rows = np.flatnonzero(np.isinf(problem.cones.upper) & np.isinf(problem.cones.lower))
+    scale = 1.0 / np.sqrt(problem.d)
+    h = problem.dense() * scale[:, None] * scale[None, :]
+    joints = rows[rows < problem.cones.ptr[problem.rows.n_joints]]
+    smallest = np.linalg.eigvalsh(h[np.ix_(joints, joints)])[0]
+    assert smallest < 1e-9  # far below what K K^T keeps beside contacts with W of 1e-10 to 1e10
+    solution = lv.solve(problem if law == "coulomb" else problem.relaxed("cone"), "newton", tol=1e-8)
+    assert good(solution, 1e-8), str(solution)
+
+
+@pytest.mark.parametrize("name", ["auto", "newton"])
+@pytest.mark.parametrize("ratio", [1.0, 1e3, 1e6])
+def test_sliding_pyramid_at_any_mass_ratio(ratio, name):
+    problem = suite.pyramid(k=6, mass_ratio=ratio, friction="coulomb", sliding=0.5).problem
+    assert good(lv.solve(problem, name, tol=1e-8), 1e-8)
+
+
+@pytest.mark.parametrize("ratio", [1e3, 1e6])
+def test_slow_box_stack_given_as_a_matrix(ratio):
+    problem = suite.box_stack(n=5, mass_ratio=ratio, friction="coulomb", sliding=0.05).problem
+    assert good(lv.solve(as_matrix(problem), "newton", tol=1e-8), 1e-8)
+
+
+def test_the_same_bits_every_time():
+    problem = problem_in("card_house", 3)
+    first, second = (lv.solve(problem, "newton", tol=1e-8) for _ in range(2))
+    assert first.impulse.tobytes() == second.impulse.tobytes()
+    assert first.work == second.work
+    assert first.work["factorisations"] <= 1500
+
+
+def test_the_best_point_is_kept_when_a_walk_apart_finds_nothing_better():
+    problem = problem_in("table", 1, friction=1.0)
+    budgets = [
+        lv.solve(problem, "newton", tol=1e-8, max_iter=n).residual.relative for n in (30, 60, 120, 240)
+    ]
+    assert all(later <= earlier for earlier, later in itertools.pairwise(budgets))
