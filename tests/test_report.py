@@ -171,6 +171,7 @@ def test_claims_failures_and_spreads():
     ]
     (spread,) = report.spreads(found)
     assert (spread.budget, spread.factor) == (8, 4.0)
+    assert tables.Spread("a", "x", 8, {"given": 1e-16, "reverse": 4e-15}, floor=2e-15).factor == 2.0
 
 
 @pytest.mark.parametrize(
@@ -353,7 +354,13 @@ def test_sequences_are_compared_carried_against_cold(tmp_path):
     assert reached["pgs"].how == min(means, key=lambda how: means[how])
     assert reached["pgs"].score == pytest.approx(min(means.values()))
     drawn = curves.figures(records)
-    assert [c.label for c in drawn.sequences["load"][0].curves] == ["pgs", "pgs (cold)"]
+    at_budget, to_level = drawn.sequences["load"]
+    assert [(c.label, c.y) for c in at_budget.curves] == [
+        ("pgs", budget.residuals["carried"]), ("pgs (cold)", budget.residuals["cold"]),
+    ]  # fmt: skip
+    assert [(c.label, c.y) for c in to_level.curves if c.solver == "direct"] == [
+        ("direct", exact.times["cold"])
+    ]
     assert len(list(drawn)) == len(drawn.sequences["load"]) == 2  # the budget, and to the level
     assert report.reaches(records) == []  # steps are no cases of their own
 

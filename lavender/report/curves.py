@@ -173,23 +173,31 @@ def budget_figure(records: Records, case: str) -> Figure:
 
 
 def walk_figure(sequence: str, walks: list[tables.Walk]) -> Figure:
-    """Residual of each step of a sequence at one budget: carried (solid marks) and cold (open), by solver."""
-    curves = [
-        Curve(
-            w.solver,
-            w.solver if start == "carried" or len(w.residuals) == 1 else f"{w.solver} ({start})",
-            tuple(float(i) for i in range(len(values))),
-            tuple(max(x, TINY) if math.isfinite(x) else math.nan for x in values),
-            tuple(f"{w.solver} ({start}), step {i}: relative {residual(x)}" for i, x in enumerate(values)),
-            thin=start == "cold" and len(w.residuals) > 1,
-        )
-        for w in walks
-        for start, values in sorted(w.residuals.items())
-    ]
+    """Each step of a sequence, carried and cold (thin): its residual at one budget, its time to one level."""
+    timed = walks[0].mode == "tol"
+    curves = []
+    for w in walks:
+        for start, residuals in sorted(w.residuals.items()):
+            values = w.times[start] if timed else residuals
+            hover = tuple(
+                f"{w.solver} ({start}), step {i}: {seconds(t)}, relative {residual(x)}"
+                for i, (t, x) in enumerate(zip(w.times[start], residuals, strict=True))
+            )
+            cold = start == "cold" and len(w.residuals) > 1
+            curves.append(
+                Curve(
+                    w.solver,
+                    f"{w.solver} (cold)" if cold else w.solver,
+                    tuple(float(i) for i in range(len(values))),
+                    tuple(max(v, TINY) if math.isfinite(v) else math.nan for v in values),
+                    hover,
+                    thin=cold,
+                )
+            )
     asked = walks[0].asked
     return Figure(
-        f"sequence {sequence} {asked}", f"{sequence}: {asked}", "step", "relative residual [-]", tuple(curves),
-        x_log=False,
+        f"sequence {sequence} {asked}", f"{sequence}: {asked}", "step",
+        "time: set-up and solve [s]" if timed else "relative residual [-]", tuple(curves), x_log=False,
     )  # fmt: skip
 
 

@@ -13,6 +13,10 @@ from lavender.report.style import Look
 __all__ = ["matplotlib_figure", "plotly_data", "save"]
 
 
+FULL = 12  # curves, above which the thin ones of a page show when their name is clicked
+MANY = 60  # points of a curve, above which marks would cover it
+
+
 def seconds_on_axis(t: float, _position: object = None) -> str:
     """1 ms, 20 µs: a tick of an axis of times."""
     scale, unit = next(
@@ -50,7 +54,7 @@ def matplotlib_figure(figure: Figure, look: dict[str, Look]) -> Any:
             axes.plot(
                 c.x,
                 c.y,
-                marker=k.marker,
+                marker=k.marker if len(c.x) <= MANY else "",
                 markersize=4,
                 markerfacecolor="none" if c.thin else k.color,
                 **style,
@@ -66,7 +70,7 @@ def matplotlib_figure(figure: Figure, look: dict[str, Look]) -> Any:
             axes.xaxis.set_minor_formatter("")
     if figure.y_log:
         axes.set_yscale("log")
-        axes.yaxis.set_major_formatter(power_on_axis)
+        axes.yaxis.set_major_formatter(seconds_on_axis if "[s]" in figure.y_title else power_on_axis)
         axes.yaxis.set_minor_formatter("")
     for level in figure.levels:
         axes.axhline(level, color="0.8", linewidth=0.6, zorder=0)
@@ -109,8 +113,9 @@ def plotly_data(figure: Figure, look: dict[str, Look]) -> dict[str, Any]:
             "y": [v if math.isfinite(v) else None for v in y],
             "name": c.label,
             "text": [_html(t) for t in c.hover],
+            "visible": "legendonly" if c.thin and len(figure.curves) > FULL else True,
             "hoverinfo": "text" if c.hover else "name",
-            "mode": "lines" if c.steps else "lines+markers",
+            "mode": "lines" if c.steps or len(x) > MANY else "lines+markers",
             "line": {
                 "color": k.color,
                 "dash": k.dash,
@@ -123,7 +128,7 @@ def plotly_data(figure: Figure, look: dict[str, Look]) -> dict[str, Any]:
         "traces": traces,
         "title": figure.title,
         "x": {"title": figure.x_title, "log": figure.x_log, "seconds": "[s]" in figure.x_title},
-        "y": {"title": figure.y_title, "log": figure.y_log},
+        "y": {"title": figure.y_title, "log": figure.y_log, "seconds": "[s]" in figure.y_title},
         "levels": list(figure.levels),
         "floor": figure.floor if math.isfinite(figure.floor) and figure.floor > 0.0 else None,
     }

@@ -121,7 +121,7 @@ def _content(
         "changes": [c for c in changes if c.kind != "same"],
         "n_changes": len(changes),
         "n_records": len(records),
-        "n_cases": len({r.case for r in records}),
+        "n_cases": len({r.case for r in records if r.step < 0}),
         "look": look,
     }
 

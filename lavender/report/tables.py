@@ -242,11 +242,12 @@ class Spread:
     solver: str
     budget: int
     by_order: Mapping[str, float]
+    floor: float = 0.0  # below it residuals are rounding
 
     @property
     def factor(self) -> float:
-        """Worst over best order."""
-        values = [v for v in self.by_order.values() if v > 0.0]
+        """Worst over best order, neither counted as better than the floor."""
+        values = [max(v, self.floor) for v in self.by_order.values() if max(v, self.floor) > 0.0]
         return max(values) / min(values) if values else 1.0
 
 
@@ -371,12 +372,16 @@ def claims(records: Records) -> list[Claims]:
 
 def spreads(records: Records) -> list[Spread]:
     """Where one budget was run in several sweep orders, the residual of each."""
-    groups: dict[tuple[str, str, int], dict[str, float]] = defaultdict(dict)
+    groups: dict[tuple[str, str, int], dict[str, Record]] = defaultdict(dict)
     for r in records:
         if r.mode == "budget" and r.start == "cold" and r.step < 0:
             name = f"{r.order} {r.seed}" if r.order == "random" else r.order
-            groups[r.case, r.solver, r.max_iter][name] = r.relative
-    return [Spread(*key, by_order) for key, by_order in groups.items() if len(by_order) > 1]
+            groups[r.case, r.solver, r.max_iter][name] = r
+    return [
+        Spread(*key, {name: r.relative for name, r in by.items()}, max(r.floor for r in by.values()))
+        for key, by in groups.items()
+        if len(by) > 1
+    ]
 
 
 def budgets(records: Records) -> dict[tuple[str, str, str], list[tuple[int, float]]]:

@@ -3,6 +3,7 @@
   const figures = JSON.parse(document.getElementById("figures").textContent);
   const root = document.documentElement;
   const drawn = new Set();
+  const PAPER = 680;  // px, the width of a sheet within its margins
 
   function theme() {
     const css = getComputedStyle(root);
@@ -37,7 +38,8 @@
       });
     }
     const below = phone || width < 620;
-    const entry = phone ? 92 : 110;
+    const longest = Math.max(...figure.traces.map((trace) => trace.name.length));
+    const entry = Math.max(phone ? 92 : 110, 5.5 * longest);
     const columns = Math.max(1, Math.floor((width - 76) / (entry + 42)));
     const rows = below ? Math.ceil(figure.traces.length / columns) : 0;
     const legend = 20 * rows + (below ? 14 : 0);
@@ -56,21 +58,28 @@
     };
   }
 
+  function config(box) {
+    return {
+      responsive: true, displaylogo: false,
+      displayModeBar: box.clientWidth < 520 ? false : "hover",  // it would cover the title
+      toImageButtonOptions: { format: "svg", filename: box.dataset.figure },
+      modeBarButtonsToRemove: ["select2d", "lasso2d", "autoScale2d"],
+    };
+  }
+
   function draw(box) {
     const figure = figures[box.dataset.figure];
     if (!figure || drawn.has(box)) return;
     drawn.add(box);
-    Plotly.newPlot(box, figure.traces, layout(figure, box.clientWidth), {
-      responsive: true, displaylogo: false,
-      toImageButtonOptions: { format: "svg", filename: box.dataset.figure },
-      modeBarButtonsToRemove: ["select2d", "lasso2d", "autoScale2d"],
-    });
+    Plotly.newPlot(box, figure.traces, layout(figure, box.clientWidth), config(box));
   }
 
-  function redraw() {
+  function redraw(paper) {
     drawn.forEach((box) => {
       const figure = figures[box.dataset.figure];
-      Plotly.react(box, figure.traces, layout(figure, box.clientWidth), { responsive: true, displaylogo: false });
+      const whole = layout(figure, paper || box.clientWidth);
+      if (paper) whole.width = paper;
+      Plotly.react(box, figure.traces, whole, config(box));
     });
   }
 
@@ -86,13 +95,13 @@
     root.dataset.theme = isDark() ? "light" : "dark";
     redraw();
   });
-  dark.addEventListener("change", redraw);
+  dark.addEventListener("change", () => redraw());
   let before = "";
   addEventListener("beforeprint", () => {
     before = root.dataset.theme || "";
     root.dataset.theme = "light";
     boxes.forEach(draw);
-    redraw();
+    redraw(PAPER);
     document.querySelectorAll("details").forEach((d) => { d.open = true; });
   });
   addEventListener("afterprint", () => {
