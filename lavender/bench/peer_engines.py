@@ -370,28 +370,38 @@ def run(
         ]
 
 
+def over_ours(step: Step, steps: Sequence[Step]) -> float:
+    """Time over that of ours on the same scene in the same mode, sweeps or accurate; nan where there is none."""
+    own = [
+        s.time
+        for s in steps
+        if s.engine.startswith("lavender") and (s.scene, s.accurate) == (step.scene, step.accurate)
+    ]
+    return step.time / own[0] if own else NAN
+
+
 def table(steps: Sequence[Step]) -> list[str]:
-    """Markdown: each engine beside the fastest of ours in the same mode, sweeps or accurate."""
+    """Markdown: each engine beside ours in the same mode, then where ours takes longer."""
     lines = [
         "| scene | engine | time / ours | contacts | depth [mm] | speed left [m/s] | residual |",
         "|---|---|---|---|---|---|---|",
     ]
     for s in steps:
-        own = [
-            t.time
-            for t in steps
-            if (t.scene, t.accurate) == (s.scene, s.accurate) and t.engine[:8] == "lavender"
-        ]
         if not np.isfinite(s.time):
             lines.append(f"| {s.scene} | {s.engine} | {s.note} | | | | |")
             continue
-        ratio = f"{s.time / own[0]:.2f}" if own and np.isfinite(own[0]) else "-"
-        if s.engine[:8] == "lavender":
-            ratio = f"1 ({1e3 * s.time:.3g} ms)"
+        ratio = over_ours(s, steps)
+        shown = f"{ratio:.2f}" if np.isfinite(ratio) else "-"
+        if s.engine.startswith("lavender"):
+            shown = f"1 ({1e3 * s.time:.3g} ms)"
         known = f"{s.relative:.1e}" if np.isfinite(s.relative) else "not known"
         lines.append(
-            f"| {s.scene} | {s.engine} | {ratio} | {s.contacts} | {1e3 * s.depth:.3g} | {s.speed:.1e} | {known} |"
+            f"| {s.scene} | {s.engine} | {shown} | {s.contacts} | {1e3 * s.depth:.3g} | {s.speed:.1e} | {known} |"
         )
+    lost = sorted(((over_ours(s, steps), s) for s in steps if over_ours(s, steps) < 1.0), key=lambda x: x[0])
+    if lost:
+        lines += ["", f"Lost: {len(lost)}."]
+        lines += [f"- {s.scene}: {s.engine}, {ratio:.2f} of the time of ours" for ratio, s in lost]
     return lines
 
 
