@@ -136,6 +136,23 @@ class Names(_ParamType):
         return tuple(value.replace(",", " ").split()) if isinstance(value, str) else tuple(value)
 
 
+class Seeds(_ParamType):
+    """N or A:B, whole numbers."""
+
+    name = "n"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> range:
+        """The seeds."""
+        if isinstance(value, range):
+            return value
+        first, colon, last = str(value).partition(":")
+        if not colon:
+            first, last = "0", first
+        if not (first.isdecimal() and last.isdecimal() and int(first) < int(last)):
+            return self.fail(f"{value!r} is not N or A:B, whole numbers with A < B", param, ctx)
+        return range(int(first), int(last))
+
+
 @click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
 @click.version_option(__version__, prog_name="lavender")
 def cli() -> None:
@@ -243,10 +260,10 @@ def _plan(
 @click.option("--campaign", is_flag=True, help="Error and robustness by many workers; no times.")
 @click.option(
     "--seeds",
-    type=int,
-    default=1,
-    metavar="N",
-    help="With --campaign: seeds 0 to N - 1 of cases that take one.",
+    type=Seeds(),
+    default="1",
+    metavar="N | A:B",
+    help="With --campaign: seeds 0 to N - 1, or A to B - 1, of cases that take one.",
 )
 @click.option("--workers", type=int, default=-1, help="With --campaign: processes; -1 is one for each core.")
 @click.option(
@@ -278,7 +295,7 @@ def report(
     out: Path,
     sequence: bool | None,
     campaign: bool,
-    seeds: int,
+    seeds: range,
     workers: int,
     backend: str,
     compare: Path | None,
@@ -307,7 +324,7 @@ def report(
         records, stopped = bench.read(shown[0]), False
     elif campaign:
         many = bench.CampaignPlan(levels=levels, budgets=budgets, orders=orders or ())
-        words = bench.seeds(files, seeds)
+        words = bench.seeds(files, len(seeds), seeds.start)
         records, stopped = _campaign(words, solvers, many, out / "records.jsonl", workers, backend)
     else:
         plan = _plan(files, levels, budgets, orders, repeats, time_limit)

@@ -31,6 +31,7 @@ def test_seeds_are_spread_over_cases_that_take_one():
         "random_spd(seed=5)",
         "toy_stack",
     ]
+    assert bench.seeds(["granular(n=2)"], 2, first=7) == ["granular(n=2, seed=7)", "granular(n=2, seed=8)"]
     with pytest.raises(lv.InputError):
         bench.seeds(["2 +"], 2)
 

@@ -183,6 +183,7 @@ def test_solvers_lists_all_with_reasons(lavender):
         (("solve", "stack(n=4)", "--solver", "pgs", "--output", "no/such/folder.npz"), "cannot write"),
         (("check", "nothing.npz"), "no such file"),
         (("report", "--levels", "many"), "not a list of numbers"),
+        (("report", "--campaign", "--seeds", "9:3"), "whole numbers with A < B"),
         (("report", "--time-budgets", "0"), "time budget 0.0 must be"),
         (("nonsense",), "No such command"),
     ],
@@ -253,6 +254,22 @@ def test_ctrl_c_keeps_the_records_and_writes_the_page(tmp_path):
     assert (out / "index.html").exists()
     kept = [json.loads(line) for line in records.read_text().splitlines()]
     assert any(r["kind"] == "record" and r["case"] == "easy" for r in kept)
+
+
+def test_campaigns_over_parts_of_the_seeds_are_one_when_put_together(lavender, tmp_path):
+    more = ("--solvers", "pgs", "--levels", "1e-3", "--budgets", "4", "--workers", 1)
+    parts = []
+    for name, seeds in (("a", "2"), ("b", "2:4")):
+        code, *_ = lavender(
+            "report", "--campaign", "granular(n=2)", "--seeds", seeds, *more, "--out", tmp_path / name
+        )
+        assert code == 0
+        parts.append((tmp_path / name / "records.jsonl").read_text())
+    (tmp_path / "all.jsonl").write_text("".join(parts))
+    code, out, _ = lavender("report", tmp_path / "all.jsonl", "--out", tmp_path / "all")
+    assert code == 0
+    assert "4 cases" in (tmp_path / "all" / "index.html").read_text()
+    assert "100.0 %" in out
 
 
 def test_a_recorded_scene_is_reported_as_a_sequence(lavender, tmp_path):

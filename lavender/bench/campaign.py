@@ -57,8 +57,8 @@ class Pair:
     solver: str
 
 
-def seeds(words: Iterable[str], n: int) -> list[str]:
-    """Cases of the suite with seed=0 .. n - 1, where their family takes a seed; others once.
+def seeds(words: Iterable[str], n: int, first: int = 0) -> list[str]:
+    """Cases of the suite with seed=first .. first + n - 1, where their family takes a seed; others once.
 
     Raises
     ------
@@ -71,7 +71,7 @@ def seeds(words: Iterable[str], n: int) -> list[str]:
     for word in words:
         name, given = parse(word)
         if name in FAMILIES and "seed" in FAMILIES[name].signature.parameters and "seed" not in given:
-            for seed in range(n):
+            for seed in range(first, first + n):
                 inside = ", ".join(f"{k}={v}" for k, v in {**given, "seed": seed}.items())
                 out.append(f"{name}({inside})")
         else:

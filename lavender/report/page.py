@@ -20,6 +20,8 @@ from lavender.report.text import residual, seconds
 
 __all__ = ["page"]
 
+MOST = 2000  # failures on a page, for browsers' sake; a campaign may have more
+
 
 @cache
 def plotly_source() -> str:
@@ -104,6 +106,7 @@ def _content(
         "family_figures": {f: file_name(figure.name) for f, figure in figures.families.items()},
         "claims": tables.claims(records),
         "failures": tables.failures(records),
+        "most": MOST,
         "cases": cases,
         "profiles": {law: _keys(some) for law, some in figures.profiles.items()},
         "means": tables.geometric_means(records),

@@ -67,6 +67,7 @@ def write(
                 save(figure, look, folder / "figures")
     except OSError as error:
         raise InputError(
-            f"cannot write {error.filename or folder} ({error.strerror or error}): give a folder that you may write to"
+            f"cannot write {error.filename or folder} ({error.strerror or error}): make room, or give a folder that "
+            "you may write to; the records are kept"
         ) from None
     return index
