@@ -34,6 +34,17 @@ def dense_small(system, values):
     return out
 
 
+def test_contacts_alone_are_scaled_as_any_other_problem(monkeypatch):
+    problem = suite.pyramid(k=3, mass_ratio=1e3, friction="coulomb", sliding=0.5).problem
+    assert _ipm._all_slide(problem)
+    quick = _ipm.scaled(problem)
+    monkeypatch.setattr(_ipm, "_all_slide", lambda _: False)
+    general = _ipm.scaled(problem)
+    for name, value in vars(general).items():
+        if name != "problem":
+            assert np.array_equal(getattr(quick, name), value), name
+
+
 # -- linear algebra ---------------------------------------------------------------------------------
 
 

@@ -20,7 +20,7 @@ FIRST, SECOND = 20, 30  # factorisations of the first two walks
 CONVEX_TOL = 1e-4  # of the convex answer that a walk starts from, in energy
 CONVEX_STEPS = 30  # that it may cost
 STRETCH = 60  # factorisations between two looks at whether a walk gets anywhere
-LARGE = 1000  # rows from which the first proximal weight is larger
+SMALL, LARGE = 64, 1000  # rows up to which the first proximal weight is smaller, from which it is larger
 HEAVY = 1e3  # mass ratio from which the walks are not tried from a cold start
 LAST = (1e-6, 1e-7, 1e-8)  # proximal weights of the last walks
 CANDIDATES = 2  # ends of interior points from which these start
@@ -30,7 +30,8 @@ LONG = 50  # Newton steps of one of their rounds: sticking changes to sliding co
 def solve_coulomb(run: Run, z: FloatArray, cold: bool) -> None:
     """Walks from the start, interior points, walks from where they ended; until the judge is content."""
     system = run.system
-    plain = Proximal(z, AUGMENTED, 1e-3 if system.sc.m < LARGE else 1e-2)
+    m = system.sc.m
+    plain = Proximal(z, AUGMENTED, 1e-5 if m <= SMALL else 1e-3 if m < LARGE else 1e-2)
     walks = not (cold and _is_heavy(run))
     if walks:
         plain.advance(run, FIRST)

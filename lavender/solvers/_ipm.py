@@ -10,6 +10,7 @@ factored in compiled code), `MatrixSystem` holds it (dense LAPACK or sparse LU).
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -76,8 +77,45 @@ class Scaled:
         return (impulse if self.whole else impulse[self.keep]) / self.scale
 
 
+def _all_slide(problem: Problem) -> bool:
+    """Nothing but contacts with two tangents that all move, the usual friction problem."""
+    cones = problem.cones
+    return (
+        3 * len(cones.kind) == problem.m
+        and len(problem.data.empty) == 0
+        and bool(np.all(cones.kind == CONTACT))
+        and bool(np.all(cones.ptr[1:] - cones.ptr[:-1] == 3))
+        and bool(np.all(cones.mu > 0.0))
+    )
+
+
+def _scaled_contacts(problem: Problem) -> Scaled:
+    cones, m, n = problem.cones, problem.m, len(problem.cones.kind)
+    scale = 1.0 / np.sqrt(problem.d)
+    root = 1.0 / scale
+    rows, compliance = problem.rows, problem.compliance
+    return Scaled(
+        problem,
+        np.arange(m, dtype=np.int32),
+        np.zeros(m),
+        scale,
+        problem.b * scale,
+        np.zeros(m) if compliance is None else compliance * scale * scale,
+        np.array(cones.ptr, np.int32),
+        np.full(n, CONTACT, np.int32),
+        np.arange(0, 9 * n + 1, 9, dtype=np.int32),
+        cones.lower / scale,
+        cones.upper / scale,
+        cones.mu * root[1::3] / root[::3],
+        np.zeros(n),
+        None if rows is None else np.ascontiguousarray(rows.contact_body, np.int32),
+    )
+
+
 def scaled(problem: Problem) -> Scaled:
     """Scale, and take out what cannot move."""
+    if problem.m and _all_slide(problem):
+        return _scaled_contacts(problem)
     cones, d, m = problem.cones, problem.d, problem.m
     size: IntArray = np.diff(cones.ptr).astype(np.int32)
     single = cones.is_bounded_rows
@@ -330,17 +368,20 @@ class MatrixSystem(System):
         self.elements = self._elements(
             np.full((n, 2), -1, np.int32), np.zeros((n, 3), np.int32), np.zeros((m, 2)), 1
         )
-        # Rows and columns of the elements' small matrices, row by row of each.
-        size = np.diff(sc.ptr)
+        self.solver: Any = None
+
+    @cached_property
+    def places(self) -> tuple[IntArray, IntArray]:
+        """Rows and columns of the elements' small matrices, row by row of each."""
+        sc, size = self.sc, np.diff(self.sc.ptr)
         nr = np.repeat(size, size**2)
         inner = np.arange(int(sc.wptr[-1])) - np.repeat(sc.wptr[:-1], size**2)
         base = np.repeat(sc.ptr[:-1], size**2)
-        self.small_row, self.small_column = base + inner // nr, base + inner % nr
-        self.solver: Any = None
+        return base + inner // nr, base + inner % nr
 
     def small(self, values: FloatArray) -> sp.csr_array:
         m = self.sc.m
-        return sp.csr_array((values, (self.small_row, self.small_column)), shape=(m, m))
+        return sp.csr_array((values, self.places), shape=(m, m))
 
     def times(self, z: FloatArray) -> FloatArray:
         return self.h @ z

@@ -5,8 +5,9 @@
                       can tell apart or mass ratios of 1e3; else nncg as long as it gets on, then newton
     lcp, other        newton, lemke
     cone              anderson as long as it gets on, then newton
-    coulomb           the same; large ones through the convex relaxation, whose answer is the Coulomb answer
-                      wherever contacts stick
+    coulomb           the same; a few contacts by a dozen sweeps of block_gauss_seidel too; large ones
+                      through the convex relaxation, whose answer is the Coulomb answer wherever
+                      contacts stick
 
 Sweeps get on as long as their contraction so far promises an end within a fixed number of them: counted,
 never timed. Islands are solved apart once sweeps over all of them have not ended it, each to its share
@@ -39,6 +40,7 @@ FIRST_LOOK = 16  # sweeps before the first look at the residual
 CLOCK = 0.01  # s between two looks at the clock, at a nanosecond for each unit of work
 CAP = 800  # sweeps that may be promised; twice that for large problems
 WARM = 1e-3  # relative residual from which an iterate is worth starting from
+NEARLY = 1e-2  # relative residual after the first sweeps from which more of them are worth it
 CERTIFICATE_ROWS = 3000  # rows up to which a linear program is asked for a certificate
 
 
@@ -241,6 +243,12 @@ def _sweep(trail: Trail, budget: int) -> bool:
         if problem.m >= HUGE:
             # A factorisation is out of reach: sweeps, however many they take.
             return _sweeps(trail, "nncg", budget, 10 * CAP, patient=True, order="symmetric")
+    if problem.law == "coulomb" and problem.m <= FEW:
+        # A few contacts end within a dozen sweeps, accelerated or exact on each contact, or hardly ever.
+        for name in ("anderson", "block_gauss_seidel"):
+            if _sweeps(trail, name, budget, FIRST_LOOK):
+                return True
+        return trail.best <= NEARLY and _sweeps(trail, "anderson", budget, _cap(problem))
     return _sweeps(trail, "anderson", budget, _cap(problem))
 
 
