@@ -139,17 +139,7 @@ class Record:
     @property
     def key(self) -> tuple[Any, ...]:
         """What makes two records the same measurement."""
-        return task_key(
-            self.case,
-            self.sha,
-            self.solver,
-            self.options,
-            self.start,
-            self.mode,
-            self.tol,
-            self.max_iter,
-            self.time_limit,
-        )
+        return measurement_key(self)
 
     @property
     def usable(self) -> bool:
@@ -157,19 +147,11 @@ class Record:
         return math.isfinite(self.relative) and math.isfinite(self.time_min)
 
 
-def task_key(
-    case: str,
-    sha: str,
-    solver: str,
-    options: Mapping[str, Any],
-    start: str,
-    mode: str,
-    tol: float,
-    max_iter: int,
-    time_limit: float,
-) -> tuple[Any, ...]:
-    """The identity of a measurement, before it is made."""
-    return (case, sha, solver, repr(sorted(_plain(options).items())), start, mode, tol, max_iter, time_limit)
+def measurement_key(what: Any) -> tuple[Any, ...]:
+    """The identity of a measurement, of its `Task` as of its `Record`."""
+    options = repr(sorted(_plain(what.options).items()))
+    asked = (what.start, what.mode, what.tol, what.max_iter, what.time_limit)
+    return (what.case, what.sha, what.solver, options, *asked)
 
 
 Entry = Run | CaseInfo | Skip | Done | Record

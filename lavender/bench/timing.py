@@ -20,7 +20,7 @@ import numpy as np
 
 from lavender import registry
 from lavender._arrays import FloatArray
-from lavender.bench.record import ERROR, Record, task_key
+from lavender.bench.record import ERROR, Record, measurement_key
 from lavender.problem import Problem
 from lavender.residuals import reference
 from lavender.solution import Solution, Status
@@ -51,17 +51,7 @@ class Task:
     @property
     def key(self) -> tuple[Any, ...]:
         """As `Record.key` of what comes out."""
-        return task_key(
-            self.case,
-            self.sha,
-            self.solver,
-            self.options,
-            self.start,
-            self.mode,
-            self.tol,
-            self.max_iter,
-            self.time_limit,
-        )
+        return measurement_key(self)
 
     def record(self, **what: Any) -> Record:
         """A record of this task."""
