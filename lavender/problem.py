@@ -531,7 +531,11 @@ class Problem:
 
     def start(self) -> FloatArray:
         """Pi(0) (m,) [N s]: doing nothing, clipped to the bounds; a new array."""
-        return np.clip(np.zeros(self.m), self.cones.lower, self.cones.upper)
+        return self._start.copy()
+
+    @cached_property
+    def _start(self) -> FloatArray:
+        return read_only(np.clip(np.zeros(self.m), self.cones.lower, self.cones.upper))
 
     def impulse_array(self, impulse: Any, name: str = "impulse") -> FloatArray:
         """A writable private copy of `impulse`, checked: (m,) [N s], finite."""
@@ -666,7 +670,9 @@ def _checked_matrix(matrix: Any, m: int, copy: bool) -> Any:
     try:
         given.check_format(full_check=True)  # kernels trust every index
     except ValueError as error:
-        raise InputError(f"A is not a valid compressed matrix ({error}); check its indices and pointers") from None
+        raise InputError(
+            f"A is not a valid compressed matrix ({error}); check its indices and pointers"
+        ) from None
     as_array("A", given.data, (None,), unit="1/kg", copy=False)
     return _canonical(given, m)
 

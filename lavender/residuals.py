@@ -16,6 +16,7 @@ norms of b stand in for E0 and V0. E sees heavy bodies, V sees light ones.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -65,8 +66,8 @@ class Residual:
 def _ratio(x: float, reference: float) -> float:
     if x == 0.0:
         return 0.0
-    if not np.isfinite(x):
-        return np.inf
+    if not math.isfinite(x):
+        return math.inf
     return x / reference if reference > 0.0 else np.inf
 
 

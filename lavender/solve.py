@@ -27,6 +27,7 @@ __all__ = ["Prepared", "prepare", "solve"]
 CHUNK_TIME = 0.025  # s, aim; twice that is still below what a person notices on Ctrl-C
 FIRST_CHUNK = 256  # iterations: 25 ms at 100 us each, slower than any compiled sweep of few rows
 Callback = Callable[[int, FloatArray, Residual], Any]
+NOTHING_DONE = Claim(Status.MAX_ITERATIONS, 0)
 FRONT_DOOR = ("impulse", "tol", "max_iter", "time_limit", "history", "callback")
 
 
@@ -233,7 +234,7 @@ class _Loop:
         # About a nanosecond per unit of work: the first guess, then measured. Capped, for solvers in Python.
         chunk = min(FIRST_CHUNK, max(1, int(CHUNK_TIME * 1e9) // max(1, self.problem.data.work)))
         records = self.rows is not None or self.callback is not None
-        claim = Claim(Status.MAX_ITERATIONS, 0)
+        claim = NOTHING_DONE
         try:
             if records and self._record():
                 return self._total(Claim(Status.INTERRUPTED, 0, {}, "stopped by the callback"))
@@ -257,7 +258,8 @@ class _Loop:
                 if self.time_limit is not None and self.time >= self.time_limit:
                     claim = Claim(Status.TIME_LIMIT, 0, {}, claim.message)
                     break
-                chunk = self._next_chunk(n, elapsed)
+                if self.done < max_iter:
+                    chunk = self._next_chunk(n, elapsed)
         except KeyboardInterrupt:
             claim = Claim(Status.INTERRUPTED, 0, {}, "Ctrl-C")
         self._keep_best()
@@ -271,8 +273,10 @@ class _Loop:
 
     def _keep_best(self) -> None:
         # A solver whose residual may rise keeps its best checked iterate; a budget (tol = 0) means the last one.
+        if self.tol == 0.0:
+            return
         best = getattr(self.state, "best", None)
-        if self.tol == 0.0 or best is None or best[1] is None:
+        if best is None or best[1] is None:
             return
         if not residual(self.problem, self.impulse).relative <= best[0]:
             self.impulse[:] = best[1]
@@ -319,10 +323,10 @@ def _finish(
     judged = residual(problem, impulse)
     status, message = claim.status, claim.message
     relative = judged.relative
-    if not np.isfinite(impulse).all() and status is not Status.NUMERICAL_ERROR:
+    if status is not Status.NUMERICAL_ERROR and not np.isfinite(impulse).all():
         status = Status.DIVERGED
     elif (
-        status in (Status.MAX_ITERATIONS, Status.TIME_LIMIT, Status.STALLED) and tol > 0.0 and relative <= tol
+        tol > 0.0 and relative <= tol and status in (Status.MAX_ITERATIONS, Status.TIME_LIMIT, Status.STALLED)
     ):
         status = Status.CONVERGED
     elif tol < relative <= 2.0 * judged.floor and status in (Status.CONVERGED, Status.STALLED):

@@ -21,9 +21,12 @@ cdef inline double csr_dot(const csr_t* a, int32_t i, const double* x) noexcept 
         s2 += val[p + 2] * x[idx[p + 2]]
         s3 += val[p + 3] * x[idx[p + 3]]
         p += 4
-    while p < end:
+    if p < end:
         s0 += val[p] * x[idx[p]]
-        p += 1
+        if p + 1 < end:
+            s1 += val[p + 1] * x[idx[p + 1]]
+            if p + 2 < end:
+                s2 += val[p + 2] * x[idx[p + 2]]
     return (s0 + s1) + (s2 + s3)
 
 

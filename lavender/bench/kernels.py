@@ -635,13 +635,15 @@ def instructions(name: str, calls: int = 50) -> float:
         for n in (0, calls):
             out = Path(folder, f"{n}.out")
             done = subprocess.run(
-                ["valgrind", "--tool=callgrind", f"--callgrind-out-file={out}"]
-                + [sys.executable, "-c", _COUNT, name, str(n)],
+                [
+                    "valgrind", "--tool=callgrind", f"--callgrind-out-file={out}",
+                    sys.executable, "-c", _COUNT, name, str(n),
+                ],
                 capture_output=True,
                 text=True,
                 check=False,
                 env={**_environment(), "PYTHONHASHSEED": "0"},
-            )
+            )  # fmt: skip
             found = re.search(
                 r"^(?:summary|totals):\s*(\d+)", out.read_text() if out.exists() else "", re.MULTILINE
             )

@@ -10,11 +10,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from lavender_ext.problem import Data
 
 from lavender._arrays import FloatArray, IntArray
 from lavender.ordering import Order, body_ranks
 from lavender.problem import FRICTION, Problem
-from lavender_ext.problem import Data
 
 __all__ = ["Layout", "lay_out"]
 
