@@ -40,6 +40,7 @@ FIRST_LOOK = 16  # sweeps before the first look at the residual
 CLOCK = 0.01  # s between two looks at the clock, at a nanosecond for each unit of work
 CAP = 800  # sweeps that may be promised; twice that for large problems
 WARM = 1e-3  # relative residual from which an iterate is worth starting from
+HOPELESS = 0.5  # relative residual after the first sweeps of a few contacts with which they end
 NEARLY = 1e-2  # relative residual after the first sweeps from which more of them are worth it
 CERTIFICATE_ROWS = 3000  # rows up to which a linear program is asked for a certificate
 
@@ -246,6 +247,8 @@ def _sweep(trail: Trail, budget: int) -> bool:
     if problem.law == "coulomb" and problem.m <= FEW:
         # A few contacts end within a dozen sweeps, accelerated or exact on each contact, or hardly ever.
         for name in ("anderson", "block_gauss_seidel"):
+            if trail.best > HOPELESS and trail.iterations:
+                return False
             if _sweeps(trail, name, budget, FIRST_LOOK):
                 return True
         return trail.best <= NEARLY and _sweeps(trail, "anderson", budget, _cap(problem))
