@@ -31,7 +31,7 @@ import numpy as np
 
 from lavender._arrays import FloatArray
 from lavender.cones import CONTACT_SPIN, ROW
-from lavender.solvers._augmented import SHIFT, AugmentedSystem, advance
+from lavender.solvers._augmented import ROWS, SHIFT, AugmentedSystem, advance
 from lavender.solvers._ipm import AUGMENTED, InteriorPoint, MatrixSystem, Scaled, VelocitySystem
 from lavender.solvers._polish import Proximal, Run
 
@@ -204,7 +204,7 @@ def solve_desaxce(run: Run, shares: tuple[float, ...] = SHARES) -> list[tuple[fl
 
 def solve_desaxce_augmented(run: Run, shares: tuple[float, ...] = SHARES[:2]) -> None:
     """The same through the augmented system of the bodies, for rows that nearly depend on each other."""
-    if not isinstance(run.system, VelocitySystem):
+    if not isinstance(run.system, VelocitySystem) or run.system.sc.m > ROWS:
         return
     system = AugmentedSystem(run.system)
     for share in shares:
