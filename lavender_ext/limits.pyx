@@ -32,25 +32,25 @@ cdef public void lav_limit_triad(double* a, const double* b, const double* c, in
 
 cdef public int32_t lav_limit_chase(const int32_t* next, int64_t n) noexcept nogil:
     cdef int32_t i = 0
-    cdef int64_t k
-    for k in range(n):
+    cdef int64_t _k
+    for _k in range(n):
         i = next[i]
     return i
 
 
 cdef public double lav_limit_chain(double a, double b, int64_t n) noexcept nogil:
     cdef double y = 1.0
-    cdef int64_t k
-    for k in range(n):
+    cdef int64_t _k
+    for _k in range(n):
         y = a * y + b
     return y
 
 
 cdef public void lav_limit_csr(int32_t m, const int32_t* indptr, const int32_t* indices, const double* data,
                                const double* b, const double* step, double* lam, int32_t n) noexcept nogil:
-    cdef int32_t s, i, k
+    cdef int32_t _s, i, k
     cdef double w, y
-    for s in range(n):
+    for _s in range(n):
         for i in range(m):
             w = -b[i]
             for k in range(indptr[i], indptr[i + 1]):
@@ -100,7 +100,7 @@ cdef inline void limit_push(limit_body_t* x, const double* arm, const double* im
 
 cdef public void lav_limit_contact(limit_contact_t* contacts, limit_body_t* bodies, int32_t m, int32_t n) noexcept nogil:
     """bodies[0] is the ground: without mass, at rest."""
-    cdef int32_t s, i, k
+    cdef int32_t _s, i, k
     cdef limit_contact_t* c
     cdef limit_body_t* a
     cdef limit_body_t* b
@@ -110,7 +110,7 @@ cdef public void lav_limit_contact(limit_contact_t* contacts, limit_body_t* bodi
     cdef double t2[3]
     cdef double impulse[3]
     cdef double y, dn, x0, x1, size, radius
-    for s in range(n):
+    for _s in range(n):
         for i in range(m):
             c = contacts + i
             a = bodies + c.a
@@ -145,16 +145,16 @@ cdef public void lav_limit_contact(limit_contact_t* contacts, limit_body_t* bodi
 def read(const uint64_t[::1] x, int n):
     """Read x n times; something that depends on all of it."""
     cdef uint64_t s = 0
-    cdef int i
-    for i in range(n):
+    cdef int _i
+    for _i in range(n):
         s += lav_limit_read(&x[0], x.shape[0])
     return s
 
 
 def triad(double[::1] a, const double[::1] b, const double[::1] c, int n):
     """a = b + 3 c, n times."""
-    cdef int i
-    for i in range(n):
+    cdef int _i
+    for _i in range(n):
         lav_limit_triad(&a[0], &b[0], &c[0], a.shape[0])
 
 

@@ -147,7 +147,7 @@ cdef inline void solve_right(double* y, const double* l, const int32_t s) noexce
 
 
 cdef inline int32_t factor_blocks(const factor_t* f, const int32_t s) noexcept nogil:
-    cdef int32_t k, q, p, j, i, c, r, lost = 0
+    cdef int32_t k, q, p, j, c, r, lost = 0
     cdef int64_t b = s * s
     cdef double *y
     cdef double *l
@@ -410,7 +410,8 @@ cdef public int32_t lav_inertia_root(int32_t n, const double* inv_inertia, doubl
     return 0
 
 
-cdef public void lav_panel(const blocks_t* p, const rows_t* r, const double* root, const double* root_mass, double* panel) noexcept nogil:
+cdef public void lav_panel(const blocks_t* p, const rows_t* r, const double* root, const double* root_mass,
+                           double* panel) noexcept nogil:
     """K (m, 12): D^-1/2 J M^-1/2, columns of body a then b."""
     cdef int32_t i, j, q, c, k, h, a, b, body
     cdef double jac[48]
@@ -904,7 +905,7 @@ cdef public double lav_ipm_start(const elements_t* e, const double* hz, double d
     Vandenberghe 2010, section 7.3: both are shifted along the cones' axes, by one amount each; u's beyond the
     worst violation is `dual` times z's, because most rows carry load in the end.
     """
-    cdef int32_t i, j, k, which, n
+    cdef int32_t i, j, which, n
     cdef double worst_z = -1e300, worst_u = -1e300, size = 0.0, x, degree = 0.0, width
     cdef double c[4]
     for j in range(e.m):

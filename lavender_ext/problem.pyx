@@ -304,4 +304,3 @@ def rows_velocity(Data p, const double[:, ::1] v, double[::1] out):
         rows_times(&p.blocks, &p.rows, &v[0, 0], &out[0])
     else:
         out[:] = 0.0
-

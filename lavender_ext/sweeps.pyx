@@ -34,8 +34,8 @@ cdef public void lav_pgs_sweeps(const blocks_t* p, const csr_t* a, double* lam, 
 
 cdef public void lav_pgs_rows_in_order(const blocks_t* p, const csr_t* a, double* lam, int32_t n) noexcept nogil:
     """(1) where every block is one row and the order is as given: the same bits, without the look-ups."""
-    cdef int32_t s, i
-    for s in range(n):
+    cdef int32_t _s, i
+    for _s in range(n):
         for i in range(p.n_rows):
             lam[i] = relax_row(lam[i], csr_dot(a, i, lam) - p.b[i], p.step[i], p.lower[i], p.upper[i])
 
@@ -55,9 +55,9 @@ cdef public void lav_sor_sweeps(const blocks_t* p, const csr_t* a, double omega,
 cdef public void lav_jacobi_sweeps(const blocks_t* p, const csr_t* a, double omega, double* lam, double* w,
                                    int32_t n) noexcept nogil:
     """n sweeps of (3); w (m) is scratch."""
-    cdef int32_t s, i, j, q, nt, end
+    cdef int32_t _s, i, j, q, nt, end
     cdef double bound
-    for s in range(n):
+    for _s in range(n):
         for i in range(p.n_rows):
             w[i] = csr_dot(a, i, lam) - p.b[i]
         for i in range(p.n_blocks):

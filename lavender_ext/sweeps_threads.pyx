@@ -18,7 +18,7 @@ from lavender_ext.csr cimport csr_t
 from lavender_ext.pgs cimport relax_csr_block
 from lavender_ext.problem cimport Data
 from lavender_ext.rows cimport relax_rows_block, rows_t
-from lavender_ext.watch cimport CONVERGED, RUNNING, Watch, sweep_t
+from lavender_ext.watch cimport CONVERGED, RUNNING, Watch
 
 
 cdef extern from *:
@@ -131,8 +131,8 @@ cdef inline void wait(int32_t* spins) noexcept nogil:
 
 cdef void lead(void* context, double* lam, int32_t first_sweep, int32_t n) noexcept nogil:
     cdef colored_t* x = <colored_t*>context
-    cdef int32_t s, c, t, spins
-    for s in range(n):
+    cdef int32_t _s, c, t, spins
+    for _s in range(n):
         for c in range(x.n_colors):
             lav_store(&x.done[0], 0)
             for t in range(x.team):

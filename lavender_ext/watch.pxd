@@ -98,5 +98,5 @@ cdef class Watch:
     cdef Data data
     cdef watch_t state
     cdef object keep
-    cdef int32_t check(self, double* lam, double tol) noexcept nogil
+    cdef int32_t check_now(self, double* lam, double tol) noexcept nogil
     cdef int32_t run(self, sweep_t sweep, void* context, double* lam, int32_t n, double tol, int32_t* done) noexcept nogil

@@ -47,7 +47,7 @@ cdef class Watch:
             return self.state.best_relative, None
         return self.state.best_relative, np.array(self.keep)[:self.data.blocks.n_rows]
 
-    cdef int32_t check(self, double* lam, double tol) noexcept nogil:
+    cdef int32_t check_now(self, double* lam, double tol) noexcept nogil:
         return check(&self.state, &self.data.blocks, &self.data.csr, &self.data.rows, self.data.factored, lam, tol)
 
     cdef int32_t run(self, sweep_t sweep, void* context, double* lam, int32_t n, double tol, int32_t* done) noexcept nogil:
@@ -58,7 +58,7 @@ cdef class Watch:
             step = n - done[0]
             if tol > 0.0:
                 if self.state.total == self.state.check_at:
-                    status = self.check(lam, tol)
+                    status = self.check_now(lam, tol)
                     if status != RUNNING:
                         return status
                 if self.state.check_at - self.state.total < step:
@@ -80,7 +80,7 @@ cdef class Watch:
             if tol > 0.0:
                 if self.state.total == self.state.check_at:
                     with nogil:
-                        status = self.check(&lam[0], tol)
+                        status = self.check_now(&lam[0], tol)
                     if status != RUNNING:
                         return status, done
                 step = min(step, self.state.check_at - self.state.total)
