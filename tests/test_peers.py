@@ -62,7 +62,7 @@ def test_race_keeps_times_residuals_and_sides():
     chosen = [c for c in peer_solvers.contestants() if c.name in ("pgs", "direct", "direct, from scratch")]
     linear = peer_solvers._scipy("spsolve")
     told = []
-    results = peer_solvers.race([("a", problem)], [*chosen, linear], rounds=2, watch=told.append)
+    (results,) = peer_solvers.race([("a", problem)], [*chosen, linear], rounds=2, watch=told.append)
     assert {r.solver for r in results} == {"pgs", "direct", "direct, from scratch"}  # an LCP is not linear
     for r in results:
         assert r.note == "" and not r.peer
@@ -94,7 +94,7 @@ def _hangs(problem, limit):
 def test_a_contestant_that_fails_costs_its_own_runs(runs, kept, note, monkeypatch):
     monkeypatch.setattr(peer_solvers, "PATIENCE", 0.5)
     problem = suite.case("two_particles").problem
-    (result,) = peer_solvers.race([("a", problem)], [Contestant("x", True, runs)], limit=0.1, rounds=1)
+    ((result,),) = peer_solvers.race([("a", problem)], [Contestant("x", True, runs)], limit=0.1, rounds=1)
     assert len(result.runs) == kept
     assert note in result.note
 

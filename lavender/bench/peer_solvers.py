@@ -567,13 +567,20 @@ def contestants(siconos: str = "") -> list[Contestant]:
     """
     ours = [name for name, spec in registry.specs().items() if not spec.external and spec.missing() is None]
     made = [_ours(name, scratch) for name in ours for scratch in (False, True)]
+    direct = {
+        "daqp": ("",),
+        "quadprog": ("",),
+        "piqp": (" sparse", " dense"),
+        "proxqp": (" sparse", " dense"),
+    }
     for backend in BACKENDS:
-        if registry.specs()[backend.name].missing() is None:
-            made += [_backend(backend, "impulse"), _backend(backend, "velocity")]
-    quick = {"daqp": ("",), "quadprog": ("",), "piqp": (" sparse", " dense"), "proxqp": (" sparse", " dense")}
-    for name, ways in quick.items():
-        if registry.specs()[name].missing() is None:
-            made += [_direct(name + way, form) for way in ways for form in ("impulse", "velocity")]
+        if registry.specs()[backend.name].missing() is not None:
+            continue
+        for form in ("impulse", "velocity"):
+            ways = direct.get(backend.name)
+            made += (
+                [_backend(backend, form)] if ways is None else [_direct(backend.name + w, form) for w in ways]
+            )
     for name in ("scs", "clarabel", "qoco"):
         if _installed(name):
             made += [_cone(name, "impulse"), _cone(name, "velocity")]
@@ -653,8 +660,8 @@ def race(
     limit: float = 5.0,
     rounds: int = 3,
     watch: Callable[[str], None] = lambda _: None,
-) -> list[Result]:
-    """Every contestant that takes a problem, on every problem.
+) -> Iterator[list[Result]]:
+    """Every contestant that takes a problem, on every problem; the results of each problem when it is done.
 
     Parameters
     ----------
@@ -668,7 +675,6 @@ def race(
     watch : callable
         Told what runs.
     """
-    results: list[Result] = []
     for name, problem in problems:
         here: dict[str, Result] = {}
         takers = [c for c in all_of if c.refuses(problem) is None]
@@ -682,8 +688,7 @@ def race(
                 result.note = result.note or note
             near = {c.name for c in running if _near(here[c.name], list(here.values()))}
             running = [c for c in takers if c.name.removesuffix(SCRATCH) in near]
-        results += here.values()
-    return results
+        yield list(here.values())
 
 
 def _near(one: Result, all_of: Sequence[Result]) -> bool:

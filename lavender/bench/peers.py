@@ -163,10 +163,25 @@ def command(
         click.echo("\n".join(peer_engines.table(steps)) + "\n")
         record["steps"] = peer_engines.as_records(steps)
     if solvers:
-        contestants = peer_solvers.contestants(siconos)
-        given = problems(files or PROBLEMS, note)
-        results = peer_solvers.race(given, contestants, limit=limit, rounds=rounds, watch=note)
+        results: list[peer_solvers.Result] = []
+        race = peer_solvers.race(
+            problems(files or PROBLEMS, note),
+            peer_solvers.contestants(siconos),
+            limit=limit,
+            rounds=rounds,
+            watch=note,
+        )
+        try:
+            for found in race:
+                results += found
+                record["solvers"] = peer_solvers.as_records(results)
+                _write(out, record)  # an interruption costs one problem
+        except KeyboardInterrupt:
+            note("stopped")
         click.echo("\n".join(peer_solvers.tables(results)))
-        record["solvers"] = peer_solvers.as_records(results)
+    _write(out, record)
+
+
+def _write(out: Path | None, record: dict[str, Any]) -> None:
     if out is not None:
         out.write_text(json.dumps(record, indent=1))
