@@ -8,7 +8,9 @@ One thread leads: it opens a colour, sweeps chunks of it, and opens the next whe
 others help: each starts on a range of its own, the same in each sweep, then takes chunks from other ranges.
 What is left of a range is one number, (colour, next place), so that taking a chunk says of which colour it is.
 Nobody waits for a thread that the system has put aside, or has not started, unless it holds a chunk; who waits
-spins for some microseconds, yields its core, then sleeps. The threads are the caller's: Python's serve, where
+spins for some microseconds, yields its core, then sleeps. A leader that had to yield works alone for a while,
+twice as long each time and half as long after a sweep without it: on busy cores a second thread costs little,
+on idle ones nothing is lost. The threads are the caller's: Python's serve, where
 OpenMP would make the end of every run wait for all of them.
 """
 from libc.stdint cimport int32_t, int64_t
@@ -61,6 +63,8 @@ cdef enum:
     CHUNK = 32                  # blocks taken at once, about a microsecond of work
     SPINS = 1000                # pauses before a waiting thread yields its core,
     YIELDS = 200                # and how often it does before it sleeps
+    ALONE = 50_000              # blocks that a leader sweeps alone after its first wait, about a millisecond,
+    LONGEST = 12_800_000        # and at most
 
 
 cdef struct colored_t:
@@ -73,6 +77,8 @@ cdef struct colored_t:
     const int32_t* color_ptr    # (n_colors + 1)
     int32_t n_colors
     int32_t team                # threads that may take part, one range each
+    int64_t penalty             # blocks to sweep alone after the next wait
+    int64_t alone               # blocks still to sweep alone
     int64_t stop[LINE]          # 1: no more sweeps
     int64_t done[LINE]          # blocks of the open colour that are done
     int64_t left[LINE * MOST]   # of each range: 2^32 colour + first place that nobody has taken
@@ -131,16 +137,29 @@ cdef inline void wait(int32_t* spins) noexcept nogil:
 
 cdef void lead(void* context, double* lam, int32_t first_sweep, int32_t n) noexcept nogil:
     cdef colored_t* x = <colored_t*>context
-    cdef int32_t _s, c, t, spins
+    cdef int32_t _s, c, t, spins, size, waited
     for _s in range(n):
+        waited = 0
         for c in range(x.n_colors):
+            size = x.color_ptr[c + 1] - x.color_ptr[c]
+            if x.alone > 0:
+                x.alone -= size
+                waited = 1
+                sweep_chunk(x, x.color_ptr[c], x.color_ptr[c + 1])
+                continue
             lav_store(&x.done[0], 0)
             for t in range(x.team):
                 lav_store(&x.left[LINE * t], (<int64_t>c << 32) + range_start(x, c, t))
             take_part(x, 0)
             spins = 0
-            while lav_load(&x.done[0]) < x.color_ptr[c + 1] - x.color_ptr[c]:
+            while lav_load(&x.done[0]) < size:
                 wait(&spins)
+            if spins >= SPINS:
+                waited = 1
+                x.alone = x.penalty
+                x.penalty = min(2 * x.penalty, <int64_t>LONGEST)
+        if not waited and x.penalty > ALONE:
+            x.penalty = x.penalty // 2
 
 
 cdef void follow(colored_t* x, int32_t thread) noexcept nogil:
@@ -163,8 +182,9 @@ cdef class Team:
     cdef object keep
 
     def __init__(self, Data p, Watch watch, double[::1] lam, const int32_t[::1] order,
-                 const int32_t[::1] color_ptr, int threads, double[::1] v=None):
+                 const int32_t[::1] color_ptr, int threads, double[::1] v=None, alone=(0, ALONE)):
         cdef int32_t t
+        self.x.alone, self.x.penalty = alone
         self.watch = watch
         self.keep = (p, lam, order, color_ptr, v)
         self.x.blocks = &p.blocks
@@ -198,6 +218,11 @@ cdef class Team:
             status = self.watch.run(lead, &self.x, self.x.lam, n, tol, &done)
             lav_store(&self.x.stop[0], 1)
         return status, done
+
+    @property
+    def alone(self):
+        """(blocks still to sweep alone, blocks after the next wait): where the next run of these sweeps goes on."""
+        return self.x.alone, self.x.penalty
 
     def help(self, int thread):
         """Sweep chunks until the leader has done; thread = 1, 2, ... names the range to begin with."""

@@ -287,7 +287,7 @@ def _sweeps(
 
 
 def _count(work: float) -> int:
-    return max(1, int(2e5 / work))  # sweeps of one call: a Python call is then nothing
+    return max(4, int(2e5 / work))  # sweeps of one call: a Python call is then nothing
 
 
 def _impulses(contacts: int, seconds: float, shuffle: bool = False, **options: Any) -> Row:

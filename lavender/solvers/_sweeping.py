@@ -34,6 +34,8 @@ _ROW_BY_ROW = np.empty(0, np.int32)
 class SweepState:
     """Where a run stands; the watch counts sweeps and keeps the best checked iterate."""
 
+    alone: dict[str, Any] | None = None  # how long the leader of several threads goes on alone
+
     def __init__(self, problem: Problem, data: Any, order: Order, judged: Any = None) -> None:
         reference(problem)  # the watch reads the error of doing nothing
         self.problem = problem
@@ -86,10 +88,13 @@ def run_threads(
 ) -> Claim:
     """Coloured sweeps on several threads: the bits of one thread."""
     o = state.order
-    team = threaded.Team(state.data, state.watch, impulse, o.blocks, o.color_ptr, threads, velocity)
+    alone = state.alone or {}
+    team = threaded.Team(state.data, state.watch, impulse, o.blocks, o.color_ptr, threads, velocity, **alone)
     for thread in range(1, threads):
         _helpers().submit(team.help, thread)
-    return claim(*team.lead(n, tol))
+    result = claim(*team.lead(n, tol))
+    state.alone = {"alone": team.alone}
+    return result
 
 
 @cache

@@ -34,6 +34,7 @@ class ImpulseState(SweepState):
     """
 
     velocity: FloatArray | None = None
+    laid: FloatArray | None = None  # (m,) impulse in sweep order, as the last run left it
 
     def __init__(self, problem: Problem, order: Order) -> None:
         self.layout = lay_out(problem, order.blocks) if layout_pays(problem, order) else None
@@ -66,7 +67,11 @@ class SequentialImpulses(Threaded):
     def run(
         self, state: ImpulseState, impulse: FloatArray, n: int, tol: float, time_limit: float | None = None
     ) -> Claim:
-        lam = impulse if state.layout is None else state.layout.take(impulse)
+        lam = impulse
+        if state.layout is not None:
+            if state.laid is None:
+                state.laid = state.layout.take(impulse)
+            lam = state.laid
         if state.velocity is None:
             state.velocity = np.zeros((state.data.n_bodies + 1, 6))
             judge.velocity_change(state.data, lam, state.velocity)
