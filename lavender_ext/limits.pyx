@@ -11,36 +11,36 @@ The two sweeps are the same mathematics as `sweeps.pyx` (their impulses agree to
 adds: block kinds, laws, joints, compliance, orders, stopping tests.
 """
 from libc.math cimport sqrt
-from libc.stdint cimport int32_t, int64_t, uint64_t
+from libc.stdint cimport int32_t, uint64_t
 
 import numpy as np
 
 
-cdef public uint64_t lav_limit_read(const uint64_t* x, int64_t n) noexcept nogil:
+cdef public void lav_limit_read(const uint64_t* x, int32_t n, uint64_t* out) noexcept nogil:
     cdef uint64_t s = 0
-    cdef int64_t i
+    cdef int32_t i
     for i in range(n):
         s ^= x[i]
-    return s
+    out[0] = s
 
 
-cdef public void lav_limit_triad(double* a, const double* b, const double* c, int64_t n) noexcept nogil:
-    cdef int64_t i
+cdef public void lav_limit_triad(double* a, const double* b, const double* c, int32_t n) noexcept nogil:
+    cdef int32_t i
     for i in range(n):
         a[i] = b[i] + 3.0 * c[i]
 
 
-cdef public int32_t lav_limit_chase(const int32_t* next, int64_t n) noexcept nogil:
+cdef public int32_t lav_limit_chase(const int32_t* next, int32_t n) noexcept nogil:
     cdef int32_t i = 0
-    cdef int64_t _k
+    cdef int32_t _k
     for _k in range(n):
         i = next[i]
     return i
 
 
-cdef public double lav_limit_chain(double a, double b, int64_t n) noexcept nogil:
+cdef public double lav_limit_chain(double a, double b, int32_t n) noexcept nogil:
     cdef double y = 1.0
-    cdef int64_t _k
+    cdef int32_t _k
     for _k in range(n):
         y = a * y + b
     return y
@@ -144,10 +144,11 @@ cdef public void lav_limit_contact(limit_contact_t* contacts, limit_body_t* bodi
 
 def read(const uint64_t[::1] x, int n):
     """Read x n times; something that depends on all of it."""
-    cdef uint64_t s = 0
+    cdef uint64_t s = 0, once
     cdef int _i
     for _i in range(n):
-        s += lav_limit_read(&x[0], x.shape[0])
+        lav_limit_read(&x[0], <int32_t>x.shape[0], &once)
+        s += once
     return s
 
 
@@ -155,15 +156,15 @@ def triad(double[::1] a, const double[::1] b, const double[::1] c, int n):
     """a = b + 3 c, n times."""
     cdef int _i
     for _i in range(n):
-        lav_limit_triad(&a[0], &b[0], &c[0], a.shape[0])
+        lav_limit_triad(&a[0], &b[0], &c[0], <int32_t>a.shape[0])
 
 
-def chase(const int32_t[::1] next, int64_t n):
+def chase(const int32_t[::1] next, int32_t n):
     """n loads, each at the place that the last one gave."""
     return lav_limit_chase(&next[0], n)
 
 
-def chain(double a, double b, int64_t n):
+def chain(double a, double b, int32_t n):
     """n dependent products and sums."""
     return lav_limit_chain(a, b, n)
 
