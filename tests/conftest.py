@@ -28,3 +28,21 @@ def problem_dir() -> Path:
     if not any(folder.glob("*.npz")) and not any(folder.glob("*.hdf5")):
         pytest.fail(f"LAVENDER_PROBLEMS={PROBLEMS} holds no .npz or .hdf5 file")
     return folder
+
+
+@pytest.fixture
+def interrupted_newton(monkeypatch) -> list[float]:
+    """Ctrl-C at newton's fifth look at the residual; the list fills with what it saw."""
+    from lavender.solvers import _polish
+
+    looks: list[float] = []
+    original = _polish.Run.score
+
+    def interrupt(self, z):
+        looks.append(original(self, z))
+        if len(looks) == 5:
+            raise KeyboardInterrupt
+        return looks[-1]
+
+    monkeypatch.setattr(_polish.Run, "score", interrupt)
+    return looks

@@ -150,21 +150,10 @@ def test_budget_clock_and_warm_start():
     assert again.iterations == 0
 
 
-def test_ctrl_c_inside_a_solver_ends_the_chain(monkeypatch):
+def test_ctrl_c_inside_a_solver_ends_the_chain(interrupted_newton):
     """A chosen solver that was interrupted is the last one, and its iterate comes back."""
-    from lavender.solvers import _polish
-
     problem = lv.suite.case("pyramidF(k=4, mass_ratio=1e3)").problem
-    looks = []
-    original = _polish.Run.score
-
-    def interrupt(self, z):
-        looks.append(original(self, z))
-        if len(looks) == 5:
-            raise KeyboardInterrupt
-        return looks[-1]
-
-    monkeypatch.setattr(_polish.Run, "score", interrupt)
+    looks = interrupted_newton
     solution = lv.solve(problem, "auto", tol=1e-12)
     assert len(looks) == 5
     assert solution.status is lv.Status.INTERRUPTED

@@ -365,21 +365,10 @@ def test_a_form_that_does_not_exist_is_refused():
         lv.solve(lv.Problem.lcp([[1.0]], [1.0]), "newton", form="velocity")
 
 
-def test_ctrl_c_returns_the_best_iterate(monkeypatch):
+def test_ctrl_c_returns_the_best_iterate(interrupted_newton):
     """Interrupted at the fifth look at the residual: what the first four found is kept."""
-    from lavender.solvers import _polish
-
     problem = lv.suite.case("pyramidF(k=4)").problem
-    looks = []
-    original = _polish.Run.score
-
-    def interrupt(self, z):
-        looks.append(original(self, z))
-        if len(looks) == 5:
-            raise KeyboardInterrupt
-        return looks[-1]
-
-    monkeypatch.setattr(_polish.Run, "score", interrupt)
+    looks = interrupted_newton
     solution = lv.solve(problem, "newton", tol=1e-12)
     assert solution.status is lv.Status.INTERRUPTED
     assert solution.residual.relative == min(looks)
