@@ -238,13 +238,14 @@ def _sweep(trail: Trail, budget: int) -> bool:
     problem = trail.problem
     if problem.law == "lcp":
         return _sweeps(trail, "nncg", budget, _cap(problem))
-    if problem.law == "coulomb" and problem.m >= LARGE and problem.rows is not None:
-        if _relaxation(trail, budget):
+    few = problem.law == "coulomb" and problem.m <= FEW
+    if problem.law == "coulomb" and not few and problem.rows is not None:
+        if (problem.m >= LARGE or _is_loose(problem)) and _relaxation(trail, budget):
             return True
         if problem.m >= HUGE:
             # A factorisation is out of reach: sweeps, however many they take.
             return _sweeps(trail, "nncg", budget, 10 * CAP, patient=True, order="symmetric")
-    if problem.law == "coulomb" and problem.m <= FEW:
+    if few:
         # A few contacts end within a dozen sweeps, accelerated or exact on each contact, or hardly ever.
         for name in ("anderson", "block_gauss_seidel"):
             if trail.best > HOPELESS and trail.iterations:
@@ -408,6 +409,14 @@ def _is_redundant(problem: Problem) -> bool:
     if problem.rows is None:
         return False
     return problem.m > 6 * problem.rows.n_bodies and bool(np.all(problem.compliance == 0.0))
+
+
+def _is_loose(problem: Problem) -> bool:
+    """Nearly every contact between two bodies of its own, not one of a face: sweeps then settle which ones stick."""
+    assert problem.rows is not None
+    bodies = np.sort(block_bodies(problem), axis=1)
+    pairs = bodies[:, 0].astype(np.int64) * problem.rows.n_bodies + bodies[:, 1]
+    return 4 * len(np.unique(pairs)) > 3 * len(pairs)
 
 
 def _bandwidth(problem: Problem) -> int:
