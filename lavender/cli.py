@@ -281,6 +281,12 @@ def _plan(
     metavar="S,S,...",
     help="Seconds for which a solver is recommended; default: three decades about the fastest times.",
 )
+@click.option(
+    "--peers",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="What `lavender bench peers --out FILE` measured, to show beside.",
+)
 @click.option("--no-figures", is_flag=True, help="Leave out the SVG and PNG files.")
 def report(
     files: tuple[str, ...],
@@ -300,6 +306,7 @@ def report(
     backend: str,
     compare: Path | None,
     time_budgets: tuple[float, ...],
+    peers: Path | None,
     no_figures: bool,
 ) -> None:
     """Speed against error: every solver on every case, to each level and at each budget.
@@ -309,6 +316,7 @@ def report(
     without solving. The same command goes on where it was stopped.
     """
     from lavender import bench
+    from lavender.bench.peers import read as read_peers
     from lavender.report.terminal import print_report
     from lavender.report.write import write
 
@@ -317,6 +325,7 @@ def report(
             raise InputError(f"time budget {limit} must be a positive number of seconds")
     console = _console()
     old = None if compare is None else bench.read(compare)
+    rivals = None if peers is None else read_peers(peers)
     shown = [Path(f) for f in files if f.endswith(".jsonl")]
     if shown:
         if len(files) > 1:
@@ -330,7 +339,7 @@ def report(
         plan = _plan(files, levels, budgets, orders, repeats, time_limit)
         records, stopped = _measure(files, solvers, plan, out / "records.jsonl", memory, in_process, sequence)
     print_report(records, console, old=old, times=time_budgets)
-    index = write(records, out, figures=not no_figures, old=old, times=time_budgets)
+    index = write(records, out, figures=not no_figures, old=old, times=time_budgets, peers=rivals)
     console.print(f"\n{len(records)} runs in {out / 'records.csv'}, page: [bold]{index}[/]", highlight=False)
     if stopped:
         console.print("[yellow]Stopped; the same command goes on from here.[/]")

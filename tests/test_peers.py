@@ -125,10 +125,16 @@ def test_ratios_means_and_losses():
     assert by["big", 1e-6].scratch == 3.0
     assert by["small", 1e-3].ratio == 3.0 and by["small", 1e-3].peer == "daqp"
     assert math.isinf(by["small", 1e-9].ratio)
-    means = {(m.which, m.target): m for m in peer_solvers.geometric_means(compared)}
-    assert means["1000 rows and more", 1e-6].ours == pytest.approx(0.2)
-    assert means["smaller", 1e-3].auto == pytest.approx(4.0)
-    assert means["smaller", 1e-9].compared == 0 and math.isnan(means["smaller", 1e-9].ours)
+    means = {(m.which, m.target): m for m in peer_solvers.geometric_means(results_by_hand())}
+    assert means["cases, 1000 rows and more", 1e-6].ours == pytest.approx(0.2)
+    assert means["cases, smaller", 1e-3].auto == pytest.approx(4.0)
+    assert means["cases, smaller", 1e-9].compared == 0 and math.isnan(means["cases, smaller", 1e-9].ours)
+    # SciPy's factorisations are peers of the last group alone.
+    more = [*results_by_hand(), Result("big", 2000, "linear", "scipy banded", True, [(1.0, 1e-15)])]
+    means = {(m.which, m.target): m for m in peer_solvers.geometric_means(more)}
+    assert means["cases, 1000 rows and more", 1e-6].ours == pytest.approx(0.2)
+    assert means["all, SciPy too, 1000 rows and more", 1e-6].ours == pytest.approx(2.0)
+    assert not any(which.startswith("exported") for which, _ in means)
     assert [(c.problem, c.target) for c in peer_solvers.losses(compared)] == [
         ("small", 1e-9),
         ("small", 1e-3),
@@ -227,3 +233,61 @@ def test_command_line_finds_it_below_bench(capsys):
         cli.main(["bench", "peers", "--no-solvers", "--scenes", "stack7"])
     assert stop.value.code == 2
     assert "unknown scene 'stack7'" in capsys.readouterr().err
+
+
+# -- in the report ---------------------------------------------------------------------------------
+
+
+def written(tmp_path):
+    """A run of `lavender bench peers --out`: engines on one scene by hand, and `results_by_hand`."""
+    step = peer_engines.Step("stack6", "lavender, 16 sweeps", False, 1e-5, 24, 1e-4, 1e-9, 1e-6)
+    other = peer_engines.Step("stack6", "<b>other</b>", False, 5e-6, 24, 1e-4, 1e-3, math.nan)
+    late = peer_engines.Step(
+        "stack6", "late", False, math.nan, 0, math.nan, math.nan, math.nan, "did not settle"
+    )
+    path = tmp_path / "peers.json"
+    steps = peer_engines.as_records([step, other, late])
+    solvers = peer_solvers.as_records(results_by_hand())
+    path.write_text(
+        json.dumps({"cpu": "a cpu", "versions": {"osqp": "1"}, "steps": steps, "solvers": solvers})
+    )
+    return path
+
+
+def test_what_was_written_is_read(tmp_path):
+    found = peers.read(written(tmp_path))
+    assert found.results == results_by_hand()
+    assert [s.engine for s in found.steps] == ["lavender, 16 sweeps", "<b>other</b>", "late"]
+    assert found.cpu == "a cpu" and found.versions == {"osqp": "1"}
+
+
+@pytest.mark.parametrize(
+    "text", ["", "{", "[]", "{}", '{"cpu": "", "versions": {}, "steps": [{"no": 1}], "solvers": []}', "\0"]
+)
+def test_other_files_are_refused(tmp_path, text):
+    path = tmp_path / "p.json"
+    path.write_text(text)
+    with pytest.raises(lv.InputError, match=r"bench peers --out"):
+        peers.read(path)
+    with pytest.raises(lv.InputError, match="cannot read"):
+        peers.read(tmp_path / "absent.json")
+
+
+def test_the_report_shows_peers_with_losses(tmp_path):
+    records = lv.bench.run(
+        ["stack(n=2)"], ["pgs"], plan=lv.bench.Plan(levels=(1e-3,), budgets=(4,), repeats=1)
+    )
+    index = lv.report.write(records, tmp_path / "r", peers=peers.read(written(tmp_path)))
+    text = index.read_text()
+    assert "Other engines and solvers" in text and 'data-figure="peers"' in text
+    assert "Lost: 3 of 6." in text
+    assert "did not settle" in text
+    assert "<b>other</b>" not in text.replace("\\u003cb", "") and "&lt;b&gt;other" in text
+    for name in ("peers", "peers_scene_stack6", "peers_big"):
+        assert (tmp_path / "r" / "figures" / f"{name}.svg").stat().st_size > 1000
+    figures = json.loads(text.split('id="figures">')[1].split("</script>")[0])
+    ratios = {t["name"]: dict(zip(t["x"], t["y"], strict=True)) for t in figures["peers"]["traces"]}
+    assert ratios["to 1e-3"] == {2000.0: 0.1, 8.0: 3.0}
+    assert all(t["mode"] == "markers" for t in figures["peers"]["traces"])
+    without = lv.report.write(records, tmp_path / "q", figures=False).read_text()
+    assert "Other engines and solvers" not in without

@@ -9,7 +9,7 @@ beside it, and the judge's residual where the engine's problem is known: ours, a
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from time import process_time
@@ -408,3 +408,14 @@ def table(steps: Sequence[Step]) -> list[str]:
 def as_records(steps: Sequence[Step]) -> list[dict[str, Any]]:
     """Plain dictionaries."""
     return [asdict(s) for s in steps]
+
+
+def from_records(records: Iterable[dict[str, Any]]) -> list[Step]:
+    """What `as_records` gave, perhaps through JSON.
+
+    Raises
+    ------
+    TypeError
+        Not such records.
+    """
+    return [Step(**r) for r in records]

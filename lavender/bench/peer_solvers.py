@@ -49,6 +49,7 @@ REPEATS, REPEAT_TIME = 30, 0.1  # of one setting: at most so many, and as long a
 AGAIN = 4.0  # a contestant runs again in later rounds when it is within so many times the fastest of its side
 START = 60.0  # s, wall: imports of a backend on a loaded machine
 SCRATCH = ", from scratch"
+SCIPY = "scipy "  # what these names begin with
 PATIENCE = 10.0  # s, wall, beyond four times the limit of a call, before a contestant is ended
 DENSE_ROWS = 1700  # rows up to which Siconos' solvers of dense matrices are asked
 
@@ -729,8 +730,9 @@ class Comparison:
         return time / self.peer_time if math.isfinite(self.peer_time) else math.nan
 
 
-def compare(results: Sequence[Result]) -> list[Comparison]:
-    """One line for each problem and error."""
+def compare(results: Sequence[Result], scipy: bool = True) -> list[Comparison]:
+    """One line for each problem and error; `scipy` False leaves out SciPy's factorisations of linear systems."""
+    results = [r for r in results if scipy or not r.solver.startswith(SCIPY)]
     found = []
     for name in dict.fromkeys(r.problem for r in results):
         here = [r for r in results if r.problem == name]
@@ -772,19 +774,34 @@ class Mean:
     compared: int
 
 
-def geometric_means(compared: Sequence[Comparison]) -> list[Mean]:
-    """For large and smaller problems, and each error."""
+def geometric_means(results: Sequence[Result]) -> list[Mean]:
+    """For cases (and files) and for what engines export, large and smaller, at each error.
+
+    Peers are QP and cone backends, Pinocchio and Siconos; the last group counts SciPy's factorisations of linear
+    systems among them, which are no solvers of constraint problems.
+    """
+    plain, every = compare(results, scipy=False), compare(results)
+    groups = (
+        ("cases", [c for c in plain if ":" not in c.problem]),
+        ("exported by engines", [c for c in plain if ":" in c.problem]),
+        ("all, SciPy too", every),
+    )
     out = []
-    for which, large in ((f"{LARGE} rows and more", True), ("smaller", False)):
-        for target in TARGETS:
-            some = [c for c in compared if c.target == target and (c.rows >= LARGE) is large]
-            some = [c for c in some if math.isfinite(c.peer_time)]
-            ours, scratch, auto = (
-                _mean([c.over_peer(time) for c, time in zip(some, times, strict=True)])
-                for times in ([c.our_time for c in some], [c.scratch for c in some], [c.auto for c in some])
-            )
-            out.append(Mean(which, target, ours, scratch, auto, sum(math.isfinite(c.our_time) for c in some)))
+    for group, compared in groups:
+        for size, large in ((f"{LARGE} rows and more", True), ("smaller", False)):
+            of_size = [c for c in compared if (c.rows >= LARGE) is large and math.isfinite(c.peer_time)]
+            for target in TARGETS:
+                some = [c for c in of_size if c.target == target]
+                if some:
+                    out.append(_mean_of(f"{group}, {size}", target, some))
     return out
+
+
+def _mean_of(which: str, target: float, some: Sequence[Comparison]) -> Mean:
+    ours = _mean([c.ratio for c in some])
+    scratch = _mean([c.over_peer(c.scratch) for c in some])
+    auto = _mean([c.over_peer(c.auto) for c in some])
+    return Mean(which, target, ours, scratch, auto, sum(math.isfinite(c.our_time) for c in some))
 
 
 def _mean(ratios: Sequence[float]) -> float:
@@ -814,7 +831,7 @@ def tables(results: Sequence[Result]) -> list[str]:
         "| problems | error | ours / peer | from scratch | auto | compared |",
         "|---|---|---|---|---|---|",
     ]
-    for mean in geometric_means(compared):
+    for mean in geometric_means(results):
         ratios = (_ratio(x) for x in (mean.ours, mean.scratch, mean.auto))
         lines.append(f"| {mean.which} | {mean.target:.0e} | " + " | ".join(ratios) + f" | {mean.compared} |")
     lost = losses(compared)
@@ -840,3 +857,14 @@ def _ratio(x: float) -> str:
 def as_records(results: Sequence[Result]) -> list[dict[str, Any]]:
     """Plain dictionaries."""
     return [asdict(r) for r in results]
+
+
+def from_records(records: Iterable[dict[str, Any]]) -> list[Result]:
+    """What `as_records` gave, perhaps through JSON.
+
+    Raises
+    ------
+    TypeError, ValueError
+        Not such records.
+    """
+    return [Result(**{**r, "runs": [(float(t), float(x)) for t, x in r["runs"]]}) for r in records]

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,7 @@ from lavender.errors import InputError, UnknownName
 from lavender.problem import Problem
 from lavender.scene import Scene
 
-__all__ = ["PROBLEMS", "command", "problems"]
+__all__ = ["PROBLEMS", "Peers", "command", "problems", "read"]
 
 #: Cases of the suite, `mujoco:SCENE:CONE` (what MuJoCo exports), `scene:SCENE` (what LavenderSim exports).
 PROBLEMS = (
@@ -42,13 +43,17 @@ PROBLEMS = (
     "scene:stack6",
     "stack(n=4096)",
     "pyramid(k=20)",
+    "pyramid(k=20, mass_ratio=1e3)",
     "pyramid(k=20, mass_ratio=1e6)",
     "granular(n=9)",
-    "chain(n=999)",
-    "hang(n=999)",
+    "granular(n=18)",
+    "chain(n=3333)",
+    "hang(n=3333)",
     "pyramidF(k=10, sliding=0.5)",
+    "granularF(n=9)",
     "granularF(n=6, sliding=0.5)",
     "pyramid(k=10, friction=cone)",
+    "pyramid(k=10, friction=cone, mass_ratio=1e6)",
     "granular(n=6, friction=cone)",
     "mujoco:pyramid55:elliptic",
     "mujoco:pyramid55:pyramidal",
@@ -56,6 +61,46 @@ PROBLEMS = (
 )
 PACKAGES = ("mujoco", "pybullet", "pin", "clarabel", "daqp", "highspy", "piqp", "proxsuite", "qoco", "qpalm",
             "quadprog", "scs")  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Peers:
+    """What a run of `lavender bench peers --out` measured."""
+
+    cpu: str
+    versions: dict[str, str]
+    steps: list[peer_engines.Step]
+    results: list[peer_solvers.Result]
+
+
+def read(path: str | Path) -> Peers:
+    """The file of `lavender bench peers --out`.
+
+    Raises
+    ------
+    InputError
+        No such file, or another one.
+    """
+    path = Path(path)
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(
+            f"cannot read {path} ({error}); a file of `lavender bench peers --out` is needed"
+        ) from None
+    try:
+        found = json.loads(text)
+        return Peers(
+            str(found["cpu"]),
+            dict(found["versions"]),
+            peer_engines.from_records(found["steps"]),
+            peer_solvers.from_records(found["solvers"]),
+        )
+    except (ValueError, TypeError, KeyError, AttributeError) as error:
+        kind = type(error).__name__
+        raise InputError(
+            f"{path} is no file of `lavender bench peers --out` ({kind}: {error}); give the one it wrote"
+        ) from None
 
 
 def problems(

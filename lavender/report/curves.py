@@ -38,6 +38,7 @@ class Curve:
     hover: tuple[str, ...] = ()
     thin: bool = False  # warm starts
     steps: bool = False
+    points: bool = False  # without a line between them
 
 
 @dataclass(frozen=True)
@@ -232,10 +233,11 @@ class Figures:
     families: Mapping[str, Figure]
     profiles: Mapping[str, tuple[Figure, ...]]  # by problem class, one for each level
     sequences: Mapping[str, tuple[Figure, ...]]
+    peers: Mapping[str, tuple[Figure, ...]] = field(default_factory=dict)  # `lavender.report.rivals`
 
     def __iter__(self) -> Iterator[Figure]:
         yield from self.families.values()
-        for group in (self.profiles, self.sequences, self.cases):
+        for group in (self.profiles, self.sequences, self.cases, self.peers):
             for some in group.values():
                 yield from some
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from lavender.bench.record import file_name, level_name
-from lavender.report.curves import Figure
+from lavender.report.curves import Curve, Figure
 from lavender.report.style import Look
 
 __all__ = ["matplotlib_figure", "plotly_data", "save"]
@@ -47,6 +47,8 @@ def matplotlib_figure(figure: Figure, look: dict[str, Look]) -> Any:
             "label": c.label,
             "linewidth": 0.8 if c.thin else 1.5,
         }
+        if c.points:
+            style["linestyle"] = "none"
         if c.steps:
             last = max(x for d in figure.curves for x in d.x) * 1.3
             axes.step([*c.x, last], [*c.y, c.y[-1]], where="post", **style)
@@ -115,7 +117,7 @@ def plotly_data(figure: Figure, look: dict[str, Look]) -> dict[str, Any]:
             "text": [_html(t) for t in c.hover],
             "visible": "legendonly" if c.thin and len(figure.curves) > FULL else True,
             "hoverinfo": "text" if c.hover else "name",
-            "mode": "lines" if c.steps or len(x) > MANY else "lines+markers",
+            "mode": _mode(c, len(x)),
             "line": {
                 "color": k.color,
                 "dash": k.dash,
@@ -132,6 +134,12 @@ def plotly_data(figure: Figure, look: dict[str, Look]) -> dict[str, Any]:
         "levels": list(figure.levels),
         "floor": figure.floor if math.isfinite(figure.floor) and figure.floor > 0.0 else None,
     }
+
+
+def _mode(curve: Curve, points: int) -> str:
+    if curve.points:
+        return "markers"
+    return "lines" if curve.steps or points > MANY else "lines+markers"
 
 
 def _html(text: str) -> str:

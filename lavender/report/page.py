@@ -8,7 +8,7 @@ import math
 from collections.abc import Iterable, Sequence
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from lavender.bench.record import file_name, level_name
 from lavender.bench.store import Records
@@ -17,6 +17,9 @@ from lavender.report.curves import Figure, Figures
 from lavender.report.draw import plotly_data
 from lavender.report.style import looks
 from lavender.report.text import residual, seconds
+
+if TYPE_CHECKING:
+    from lavender.bench.peers import Peers
 
 __all__ = ["page"]
 
@@ -43,6 +46,7 @@ def page(
     old: Records | None = None,
     times: Sequence[float] = (),
     saved: bool = True,
+    peers: Peers | None = None,
 ) -> str:
     """The whole page. Every text that came from a file, a problem or a backend is escaped.
 
@@ -57,6 +61,8 @@ def page(
         Time budgets of the recommendation.
     saved : bool
         The figures are beside the page as SVG and PNG.
+    peers : Peers, optional
+        A run of `lavender bench peers`, whose figures are among `figures`.
     """
     import jinja2
 
@@ -68,7 +74,7 @@ def page(
         lstrip_blocks=True,
     )
     environment.filters.update(seconds=seconds, residual=residual, level=level_name, anchor=file_name)
-    content = _content(records, figures, old, tuple(times) or tables.time_budgets(records))
+    content = _content(records, figures, old, tuple(times) or tables.time_budgets(records), peers)
     figures_json = json.dumps(content.pop("figures"), allow_nan=False).replace("<", "\\u003c")
     return environment.get_template("index.html.j2").render(
         title=title,
@@ -82,9 +88,9 @@ def page(
 
 
 def _content(
-    records: Records, figures: Figures, old: Records | None, times: Sequence[float]
+    records: Records, figures: Figures, old: Records | None, times: Sequence[float], peers: Peers | None
 ) -> dict[str, Any]:
-    look = looks(r.solver for r in records)
+    look = looks({r.solver for r in records} | ({c.solver for f in figures for c in f.curves}))
     levels = tables.levels_of(records)
     campaign = tables.is_campaign(records)
     by_case: dict[str, list[tables.Reach]] = {}
@@ -96,6 +102,11 @@ def _content(
         for name, rows in by_case.items()
     ]
     changes = tables.changes(old, records) if old is not None else []
+    rivals = None
+    if peers is not None:
+        from lavender.report.rivals import content  # with the engine behind it
+
+        rivals = content(peers)
     return {
         "figures": {file_name(figure.name): plotly_data(figure, look) for figure in figures},
         "runs": list(records.runs.values()),
@@ -126,6 +137,8 @@ def _content(
         "n_records": len(records),
         "n_cases": len({r.case for r in records if r.step < 0}),
         "look": look,
+        "peers": rivals,
+        "peer_figures": {place: _keys(some) for place, some in figures.peers.items()},
     }
 
 

@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from lavender.bench.store import Records, write_csv, write_json
 from lavender.errors import InputError
+
+if TYPE_CHECKING:
+    from lavender.bench.peers import Peers
 
 __all__ = ["write"]
 
@@ -18,6 +23,7 @@ def write(
     figures: bool = True,
     old: Records | None = None,
     times: Sequence[float] = (),
+    peers: Peers | None = None,
 ) -> Path:
     """Write `records.csv`, `records.json`, `figures/*.svg`, `figures/*.png`, `summary.md` and `index.html`.
 
@@ -32,6 +38,8 @@ def write(
         An earlier run to compare with.
     times : s, optional
         Time budgets of the recommendation; `tables.time_budgets` if none are given.
+    peers : Peers, optional
+        A run of `lavender bench peers` (`lavender.bench.peers.read`) to show beside them.
 
     Returns
     -------
@@ -52,17 +60,23 @@ def write(
     folder = Path(folder)
     shown = records.latest()
     drawn = figures_of(shown)
+    if peers is not None:
+        from lavender.report.rivals import figures as figures_of_peers  # with the engine behind it
+
+        drawn = replace(drawn, peers=figures_of_peers(peers))
     try:
         folder.mkdir(parents=True, exist_ok=True)
         write_csv(records, folder / "records.csv")
         write_json(records, folder / "records.json")
         index = folder / "index.html"
         before = None if old is None else old.latest()
-        index.write_text(page(shown, drawn, old=before, times=times, saved=figures), encoding="utf-8")
+        index.write_text(
+            page(shown, drawn, old=before, times=times, saved=figures, peers=peers), encoding="utf-8"
+        )
         (folder / "summary.md").write_text(summary(shown, times), encoding="utf-8")
         if figures and list(drawn):
             (folder / "figures").mkdir(exist_ok=True)
-            look = looks(r.solver for r in shown)
+            look = looks({r.solver for r in shown} | {c.solver for figure in drawn for c in figure.curves})
             for figure in drawn:
                 save(figure, look, folder / "figures")
     except OSError as error:
