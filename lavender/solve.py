@@ -152,7 +152,7 @@ class Prepared:
             claim = Claim(Status.INFEASIBLE, 0, {}, proof[0], certificate=proof[1])
         else:
             claim = loop.run(max_iter) if spec.resumable else loop.run_once(max_iter)
-        return _finish(
+        return finish(
             problem, spec, self.options, loop.impulse, claim, tol, setup_time, loop.time, loop.recorded()
         )
 
@@ -309,7 +309,7 @@ def next_count(n: int) -> int:
     return n + max(1, n >> 3)
 
 
-def _finish(
+def finish(
     problem: Problem,
     spec: SolverSpec,
     options: dict[str, Any],

@@ -14,18 +14,19 @@ from libc.stdint cimport int32_t, int64_t, uint64_t
 
 import numpy as np
 
-from lavender_ext.block cimport CONTACT_SPIN, COULOMB, blocks_t, n_tangents, row_error
+from lavender_ext.block cimport CONTACT_SPIN, blocks_t, n_tangents, row_error
 from lavender_ext.engine_body cimport drift_bodies, start_bodies
 from lavender_ext.engine_broad cimport update_pairs
 from lavender_ext.engine_contact cimport make_contacts, store_contacts
 from lavender_ext.engine_joint cimport make_joints
 from lavender_ext.engine_project cimport normal_speed, project_positions
-from lavender_ext.engine_types cimport (CAP_CONTACT, CAP_PAIR, H_CONTACTS, H_CONTACT_ROWS, H_ITERATIONS,
+from lavender_ext.engine_types cimport (CAP_CONTACT, CAP_PAIR, H_CONTACTS, H_ITERATIONS,
                                         H_LOST, H_MATCHES, H_NEED_CONTACTS, H_NEED_PAIRS, H_ORDER, H_SEED,
                                         H_STEP, H_WARM_START, NEED_ROOM, NOT_FINITE, N_BODY,
                                         N_DYNAMIC, N_EXCLUDED, N_FRAME, N_HEAD, N_JOINT, N_JOINT_REAL,
                                         N_JOINT_ROW, N_SETTINGS, OK, ROWS_PER_CONTACT, S_OUT,
                                         bind, engine_t)
+from lavender_ext.engine_view cimport view
 from lavender_ext.judge cimport rows_slack, score_rows, score_t
 from lavender_ext.order cimport (RANDOM, SYMMETRIC, advance_order, block_levels, body_levels,
                                  color_by_bodies, reverse, sort_by_level)
@@ -41,39 +42,6 @@ cdef enum:
     BOTTOM_UP = 4
     TOP_DOWN = 5
     COLORED = 6
-
-
-cdef inline void view(const engine_t* e, blocks_t* p, rows_t* r) noexcept nogil:
-    # the velocity problem as the shared kernels see it
-    p.n_blocks = e.size[N_JOINT] + e.head[H_CONTACTS]
-    p.n_rows = e.size[N_JOINT_ROW] + e.head[H_CONTACT_ROWS]
-    p.law = COULOMB
-    p.ptr = e.ptr
-    p.kind = e.kind
-    p.lower = e.lower
-    p.upper = e.upper
-    p.mu = e.mu
-    p.patch_radius = e.patch_radius
-    p.b = e.b
-    p.d = e.d
-    p.nu = e.d
-    p.step = e.step
-    r.n_bodies = e.size[N_DYNAMIC]
-    r.n_joints = e.size[N_JOINT]
-    r.n_contacts = e.head[H_CONTACTS]
-    r.jac = e.jac
-    r.minv_jac = e.minv_jac
-    r.joint_body = e.joint_body
-    r.normal = e.normal
-    r.tangent = e.tangent
-    r.arm_a = e.arm_a
-    r.arm_b = e.arm_b
-    r.contact_body = e.contact_body
-    r.coupling = e.coupling
-    r.swing = e.swing
-    r.inv_mass = e.inv_mass
-    r.inv_inertia = e.inv_inertia
-    r.compliance = e.compliance
 
 
 cdef int32_t prepare(engine_t* e) noexcept nogil:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
+from time import perf_counter
 from typing import Any
 
 import numpy as np
@@ -16,12 +18,15 @@ from lavender.engine.snapshot import Snapshot
 from lavender.engine.state import State
 from lavender.errors import InputError, LavenderError, SolveFailed, UnknownName
 from lavender.problem import Problem, Rows
+from lavender.registry import get
 from lavender.residuals import Residual, residual
 from lavender.scene import Scene
 from lavender.scene.parts import whole
 from lavender.scene.scene import SWEEPS
 from lavender.solution import Solution
-from lavender.solve import solve
+from lavender.solve import finish, solve
+from lavender.solvers._warm import warm_claim
+from lavender.solvers.newton import SPEC as NEWTON_SPEC
 
 __all__ = ["SOLVER_FIELDS", "Simulation"]
 
@@ -39,6 +44,18 @@ SOLVER_FIELDS = (
     "violation_final",
 )
 PARTS = ("joint", "normal", "disk", "spin")
+NEWTON = NEWTON_SPEC.factory
+TOL = 1e-6  # of lavender.solve
+
+
+@dataclass(frozen=True)
+class _Pending:
+    """How a substep's solve ended; its `Solution` is made when it is asked for."""
+
+    how: int
+    sweeps: int
+    factorisations: int
+    time: float  # s
 
 
 class Simulation:
@@ -76,10 +93,15 @@ class Simulation:
         self._state = State.of_scene(scene)
         self._fingerprint = scene.fingerprint()
         self._own_sweeps = p.solver == "sequential_impulses"
+        # `newton` with nothing but a tolerance asked for: its first phase runs on the engine's own arrays
+        tol = p.solver_options.get("tol", TOL)
+        self._warm_tol = 0.0
+        if p.solver == "newton" and set(p.solver_options) <= {"tol"} and isinstance(tol, (int, float)):
+            self._warm_tol = float(tol) if 0.0 < tol < np.inf else 0.0
         self._steps = 0
         self._failed = 0
         self._lost = ""
-        self._last: Solution | None = None
+        self._last: Solution | _Pending | None = None
 
     # -- running --------------------------------------------------------------------------------
 
@@ -105,7 +127,12 @@ class Simulation:
 
     @property
     def last_solution(self) -> Solution | None:
-        """What the registered solver returned for the last substep; None with the built-in sweeps."""
+        """What the registered solver returned for the last substep.
+
+        None with the built-in sweeps, and where the last substep had no rows.
+        """
+        if isinstance(self._last, _Pending):
+            self._last = self._told(self._last)
         return self._last
 
     @property
@@ -218,18 +245,41 @@ class Simulation:
 
     def _solve_substeps(self) -> int:
         status = OK
+        warm = self._warm_tol > 0.0 and get("newton").factory == NEWTON
         for _ in range(self._parameters.substeps):
+            self._last = None
             self._prepare()
             kernel, a = self._state.kernel, self._state.a
             kernel.solve(False)
-            problem = self._problem(self._state)
-            if problem.m:
-                a["impulse"][: problem.m] = self._solve(problem)
-            kernel.apply()
+            if not (warm and self._solve_in_place()):
+                problem = self._problem(self._state)
+                if problem.m:
+                    a["impulse"][: problem.m] = self._solve(problem)
+                kernel.apply()
             status = kernel.finish()
             if status != OK:
                 break
         return int(status)
+
+    def _solve_in_place(self) -> bool:
+        # The bits of lavender.solve(problem, "newton"), whose first phase this is, without making the problem.
+        start = perf_counter()
+        how, sweeps, factorisations = self._state.warm.solve(self._warm_tol)
+        if how:
+            self._last = _Pending(how, sweeps, factorisations, perf_counter() - start)
+        return bool(how)
+
+    def _told(self, pending: _Pending) -> Solution:
+        # The arrays of the last substep's problem stay as they were until the next one.
+        problem = self._problem(self._state, steps=self._steps)
+        claim = warm_claim(pending.how, pending.sweeps, pending.factorisations)
+        assert claim is not None
+        impulse = self._state.a["impulse"][: problem.m].copy()
+        options = dict(self._parameters.solver_options)
+        options.pop("tol", None)
+        return finish(
+            problem, get("newton"), options, impulse, claim, self._warm_tol, 0.0, pending.time, None
+        )
 
     def _solve(self, problem: Problem) -> FloatArray:
         p = self._parameters
@@ -309,7 +359,7 @@ class Simulation:
         head = self._state.head
         return (int(head[HEAD["seed"]]) << 32) ^ int(head[HEAD["step"]])
 
-    def _problem(self, state: State) -> Problem:
+    def _problem(self, state: State, steps: int | None = None) -> Problem:
         a = state.a
         kj, mj = int(state.size[SIZE["joints"]]), int(state.size[SIZE["joint_rows"]])
         c = int(state.head[HEAD["contacts"]])
@@ -352,7 +402,7 @@ class Simulation:
             guess=guess,
             key=self._block_keys(state, kj, c),
             names=self._block_names(a["contact_pair"][:c], a["key"][:c]),
-            name=f"{self.scene.name or 'scene'}, step {self._steps + 1}",
+            name=f"{self.scene.name or 'scene'}, step {self._steps + 1 if steps is None else steps}",
             copy=False,
         )
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,7 @@ from lavender.errors import InputError
 from lavender.ordering import ENGINE_ORDERS
 from lavender.scene import Box, Plane, Scene, Sphere
 from lavender_ext import engine as kernels
+from lavender_ext import warm as kernels_warm
 
 __all__ = ["ORDER_NUMBER", "State"]
 
@@ -61,6 +63,11 @@ class State:
         self.kernel = kernels.Buffers(self.size, self.real, self.index, self.keys)
         self.a: dict[str, np.ndarray] = self.kernel.arrays()
         self.head, self.setting = self.a["head"], self.a["setting"]
+
+    @cached_property
+    def warm(self) -> kernels_warm.Warm:
+        """The first phase of `newton` on these buffers."""
+        return kernels_warm.Warm(self.size, self.real, self.index, self.keys)
 
     @property
     def nbytes(self) -> int:

@@ -2,6 +2,8 @@
 
     z = D^1/2 lambda,   H = D^-1/2 A D^-1/2,   s = H z - g complementary to z on every block
 
+0. A warm start over bodies is judged first, then carried to tol by at most 64 sweeps (counted in `work`), or
+   by one banded factorisation of joints alone, where these will do (`_warm.py`).
 1. Newton's method on the natural map from the warm start, then from the solution of H z = g.
 2. A cold Mehrotra interior point (`_ipm.py`), polished on the identified rows (`_polish.py`) as soon as
    it has found them, to the floor of float64.
@@ -29,6 +31,7 @@ from lavender.solvers._convex_newton import solve_convex
 from lavender.solvers._coulomb_newton import solve_coulomb
 from lavender.solvers._ipm import System, make_system
 from lavender.solvers._polish import Run
+from lavender.solvers._warm import solve_warm
 
 FORMS = ("auto", "velocity", "impulse")
 
@@ -82,10 +85,14 @@ class Newton:
             system = make_system(problem, "impulse")
             impulse[:] = system.sc.fixed
             return Claim(Status.STALLED, 0, {"factorisations": 0}, "no row can move")
+        cold = bool(np.array_equal(impulse, problem.start()))
+        if not cold and self.form == "auto":
+            claim = solve_warm(problem, impulse, tol, n)
+            if claim is not None:
+                return claim
         system.factorisations = 0
         deadline = np.inf if time_limit is None else perf_counter() + time_limit
         run = Run(system, tol, n, deadline)
-        cold = bool(np.array_equal(impulse, problem.start()))
         z = system.sc.unknown(impulse)
         run.score(z)
         interrupted = False

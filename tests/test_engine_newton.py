@@ -1,0 +1,144 @@
+"""Steps of `newton`: its first phase on the engine's arrays is the one of `lavender.solve`, bit for bit."""
+
+import numpy as np
+import pytest
+
+import lavender as lv
+from lavender import registry
+from lavender.solvers import newton
+
+SCENES = [
+    ("stack", {"n": 5}),
+    ("stack", {"n": 4, "friction": 0.0}),
+    ("stack", {"n": 4, "patch_radius": 0.1}),
+    ("pyramid", {"base": 5}),
+    ("ramp", {}),
+    ("chain", {"n": 12}),
+    ("bridge", {"n": 5}),
+    ("four_bar", {}),
+    ("newtons_cradle", {"substeps": 1}),
+    ("pile", {"n": 12}),
+]
+
+
+def impulses(sim, observation):
+    s = sim._state
+    return np.concatenate([observation["joint_impulses"], _contact_rows(s)])
+
+
+def _contact_rows(state):
+    first, rows = len(state.a["joint_impulse"]), int(state.head[1])
+    return state.a["impulse"][first : first + rows]
+
+
+@pytest.mark.parametrize(("name", "more"), SCENES)
+def test_a_step_is_what_solve_returns(name, more):
+    sim = lv.Simulation(lv.Scene(name, solver="newton", **more))
+    ended = set()
+    for step in range(60):
+        problem = sim.constraint_problem()
+        observation = sim.step()[0]
+        if problem.m == 0:
+            assert sim.last_solution is None
+            continue
+        found = lv.solve(problem, "newton", max_iter=sim.solver_iterations)
+        told = sim.last_solution
+        np.testing.assert_array_equal(impulses(sim, observation), found.impulse, err_msg=f"step {step}")
+        np.testing.assert_array_equal(told.impulse, found.impulse)
+        assert (told.status, dict(told.work), told.message) == (found.status, dict(found.work), found.message)
+        assert told.residual.relative == found.residual.relative
+        assert not told.contradicted
+        assert not found.contradicted
+        # what the observation says of the normal rows, to rounding: the judge forms w in another order
+        contact = problem.cones.ptr[:-1][problem.cones.kind > 0]
+        error = np.abs(found.residual.error[contact]).max(initial=0.0)
+        size = np.abs(found.impulse).max() + np.abs(problem.b / problem.d).max()
+        assert observation["solver"][5] == pytest.approx(error, abs=1e-12 * size)
+        ended.add(told.message)
+    assert len(ended) >= 1
+
+
+def test_the_first_phase_ends_in_each_of_its_ways():
+    def messages(name, **more):
+        sim = lv.Simulation(lv.Scene(name, solver="newton", **more))
+        for _ in range(40):
+            sim.step()
+            yield sim.last_solution
+
+    seen = list(messages("stack"))
+    assert seen[-1].message == "as it came" and dict(seen[-1].work) == {"factorisations": 0}
+    chain = list(messages("chain", n=12))
+    # the first step is cold: no warm start to carry on
+    assert {s.message for s in chain[1:]} == {"joints solved directly"}
+    assert all(dict(s.work) == {"factorisations": 1} for s in chain[1:])
+    assert all(s.residual.relative <= 1e-10 for s in chain[1:])
+    swept = [s for s in messages("pyramid", base=6, dt=1 / 240) if s.message == "warm sweeps"]
+    assert all(s.work["sweeps"] in (4, 8, 16, 32, 64) and s.success for s in swept)
+    problem = lv.Simulation("table").constraint_problem()
+    exact = lv.solve(problem, "newton", tol=1e-12).impulse
+    near = lv.solve(problem, "newton", impulse=exact * (1.0 + 1e-5))
+    assert near.message == "warm sweeps" and near.success and near.work["factorisations"] == 0
+
+
+def test_a_warm_start_within_tol_comes_back_as_it_is():
+    sim = lv.Simulation(lv.Scene("pyramid", base=4))
+    for _ in range(100):
+        sim.step()
+    problem = sim.constraint_problem()
+    exact = lv.solve(problem, "newton", tol=1e-10).impulse
+    again = lv.solve(problem, "newton", impulse=exact, tol=1e-8)
+    np.testing.assert_array_equal(again.impulse, exact)
+    assert dict(again.work) == {"factorisations": 0} and again.message == "as it came"
+
+
+def test_what_the_first_phase_does_not_reach_is_left_as_it_came():
+    from lavender_ext import warm
+
+    sim = lv.Simulation(lv.Scene("four_bar", solver="newton"))  # a closed loop: its rows depend on each other
+    sim.step()
+    problem = sim.constraint_problem()
+    lam = problem.guess.copy()
+    how, _, factorisations = warm.from_guess(problem.data, lam, 1e-6)
+    assert (how, factorisations) == (0, 1)
+    np.testing.assert_array_equal(lam, problem.guess)
+    # 64 sweeps do not carry ten boxes from a fifth of their load to 1e-12
+    problem = lv.Simulation(lv.Scene("stack", n=10)).constraint_problem()
+    lam = 0.2 * lv.solve(problem, "newton", tol=1e-10).impulse
+    before = lam.copy()
+    assert warm.from_guess(problem.data, lam, 1e-12)[0] == 0
+    np.testing.assert_array_equal(lam, before)
+    assert lv.solve(problem, "newton", impulse=before, tol=1e-10).success
+
+
+def test_another_newton_is_asked_itself():
+    asked = []
+
+    class Mine(newton.Newton):
+        def prepare(self, problem):
+            asked.append(problem.m)
+            return super().prepare(problem)
+
+    spec = registry.get("newton")
+    mine = lv.SolverSpec(
+        name="newton", factory=Mine, laws=spec.laws, resumable=False, max_iter=10, summary="counts its calls"
+    )
+    sim = lv.Simulation(lv.Scene("stack", n=2, solver="newton"))
+    registry.register(mine, replace=True)
+    try:
+        for _ in range(3):
+            sim.step()
+    finally:
+        registry.register(spec, replace=True)
+    assert asked == [24, 24, 24]
+
+
+def test_snapshots_carry_on_bit_for_bit_with_newton():
+    sim = lv.Simulation(lv.Scene("pyramid", base=5, solver="newton"))
+    for _ in range(20):
+        sim.step()
+    state = sim.snapshot()
+    first = [sim.step()[0]["positions"] for _ in range(10)]
+    sim.restore(state)
+    assert sim.last_solution is None
+    for expected in first:
+        np.testing.assert_array_equal(sim.step()[0]["positions"], expected)
