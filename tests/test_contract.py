@@ -292,7 +292,9 @@ def soft_static_contacts():
         np.zeros(0), np.zeros((0, 3, 3)), np.zeros((0, 6)), normal=z, tangent=x, arm_a=o, arm_b=o,
         contact_body=np.full((2, 2), -1),
     )  # fmt: skip
-    return lv.Problem.from_rows(rows, [1.0, 2.0, 1.0, -2.0], mu=0.5, tangents=1, compliance=[1.0, 2.0, 1.0, 2.0])
+    return lv.Problem.from_rows(
+        rows, [1.0, 2.0, 1.0, -2.0], mu=0.5, tangents=1, compliance=[1.0, 2.0, 1.0, 2.0]
+    )
 
 
 @pytest.mark.parametrize("name", HERE)

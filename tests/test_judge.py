@@ -434,7 +434,16 @@ def test_the_size_of_the_numbers_changes_no_residual(seed):
     problem = random_lcp(seed, boxed=False)
     lam = np.random.default_rng(seed).normal(size=problem.m)
     usual = lv.residual(problem, lam)
-    for a, b in ((530, 0), (-530, 0), (0, -600), (0, 600), (600, -300), (-900, -800), (900, 900), (-300, -990)):
+    for a, b in (
+        (530, 0),
+        (-530, 0),
+        (0, -600),
+        (0, 600),
+        (600, -300),
+        (-900, -800),
+        (900, 900),
+        (-300, -990),
+    ):
         scaled = lv.Problem.lcp(problem.matrix * 2.0**a, problem.b * 2.0**b)
         got = lv.residual(scaled, lam * 2.0 ** (b - a))
         # A dozen sums of positive terms: 1e-13 is a hundred roundings.

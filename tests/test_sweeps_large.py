@@ -1,5 +1,7 @@
 """Large piles: threads, written-out orders and neighbours in space change speed, never the answer."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from lavender_ext.sweeps_threads import Team
@@ -116,3 +118,21 @@ def test_local_takes_a_matrix_too(pile):
     blocks = block_order(matrix, "local").blocks
     assert sorted(blocks.tolist()) == list(range(matrix.n_blocks))
     assert lv.solve(matrix, "pgs", order="local", tol=1e-6, max_iter=5000).success
+
+
+@pytest.mark.parametrize("order", ("given", *ORDERS, "symmetric", "random"))
+def test_update_keeps_what_comes_from_the_structure(order, pile, monkeypatch):
+    monkeypatch.setattr("lavender.ordering.NEAR", 0)
+    monkeypatch.setattr(_layout, "LARGE", 1)
+    other = replace(pile, b=pile.b * 1.25)
+    prepared = lv.prepare(pile, "sequential_impulses", order=order)
+    prepared.solve(tol=0.0, max_iter=3)
+    fresh = sweeps(other, 3, order=order)
+    found = []
+    for module, name in ((_sweeping, "block_order"), (_layout, "body_ranks")):
+        true = getattr(module, name)
+        monkeypatch.setattr(module, name, lambda *a, _true=true, **kw: found.append(_true) or _true(*a, **kw))
+    changed = prepared.solve(other, tol=0.0, max_iter=3)
+    assert changed.impulse.tobytes() == fresh.tobytes()
+    # An order that changes with every sweep begins anew; of the others nothing is looked for again.
+    assert len(found) == (order in ("random", "symmetric"))

@@ -7,7 +7,7 @@ from typing import Any
 
 from lavender._arrays import FloatArray
 from lavender.errors import InputError, UnknownName
-from lavender.ordering import Order, block_order
+from lavender.ordering import Order
 from lavender.problem import Problem
 from lavender.solution import Claim
 from lavender.solvers._sweeping import Sweeping, SweepState, claim
@@ -51,15 +51,21 @@ class Accelerated(Sweeping):
 
     def prepare(self, problem: Problem) -> AcceleratedState:
         """Order, memory, and each block's own part of A where blocks are solved exactly."""
+        self._check(problem)
+        state: AcceleratedState = super().prepare(problem)
+        return state
+
+    def _check(self, problem: Problem) -> None:
         if self.sweep is not None and self.sweep not in SWEEPS:
             raise UnknownName("sweep", self.sweep, SWEEPS)
         if self.sweep == "pgs" and problem.law == "cone":
             raise InputError("sweep='pgs' has no update for the cone law; sweep='blocks' has")
         if not isinstance(self.convex, int) or self.convex < 0:
             raise InputError(f"convex is {self.convex!r}; a whole number of iterations >= 0 is needed")
+
+    def _state(self, problem: Problem, order: Order, before: AcceleratedState | None) -> AcceleratedState:
         exact = self.sweep == "blocks" or (self.sweep is None and problem.law == "cone")
         convex = self.convex if problem.law == "coulomb" else 0
-        order = block_order(problem, self.order, seed=self.seed, ground=self.ground)
         return AcceleratedState(problem, problem.data, order, exact, convex, self._memory)
 
     def run(

@@ -30,6 +30,7 @@ class Layout:
     data: Any  # lavender_ext.problem.Data
     rows: np.ndarray  # (m,) intp, row of the problem at each place
     place: np.ndarray  # (m,) intp, place of each row
+    rank: IntArray  # (n,) place of each body
 
     def take(self, impulse: FloatArray) -> FloatArray:
         """Impulse (m,) in sweep order; a new array."""
@@ -48,8 +49,11 @@ def pays(problem: Problem, order: Order) -> bool:
     return bool(np.all(order.blocks[: rows.n_joints] < rows.n_joints))
 
 
-def lay_out(problem: Problem, blocks: IntArray) -> Layout:
-    """`problem` with its blocks in the order `blocks` (k,), joints first."""
+def lay_out(problem: Problem, blocks: IntArray, before: Layout | None = None) -> Layout:
+    """`problem` with its blocks in the order `blocks` (k,), joints first.
+
+    `before`: of a problem of the same structure, in the same order.
+    """
     r, c = problem.rows, problem.cones
     assert r is not None
     assert problem.compliance is not None
@@ -57,9 +61,15 @@ def lay_out(problem: Problem, blocks: IntArray) -> Layout:
     size = np.diff(c.ptr)[blocks]
     ptr = np.zeros(len(blocks) + 1, np.int32)
     np.cumsum(size, out=ptr[1:])
-    rows = np.arange(problem.m, dtype=np.int32) + np.repeat(c.ptr[blocks] - ptr[:-1], size)
+    if before is None:
+        rows = np.arange(problem.m) + np.repeat(c.ptr[blocks] - ptr[:-1], size)
+        place = np.empty(problem.m, np.intp)
+        place[rows] = np.arange(problem.m)
+        ranks = body_ranks(problem)
+    else:
+        rows, place, ranks = before.rows, before.place, before.rank
     joint, contact = blocks[:kj], blocks[kj:] - kj
-    rank = np.append(body_ranks(problem), np.int32(-1))  # a static body, -1, stays -1
+    rank = np.append(ranks, np.int32(-1))  # a static body, -1, stays -1
     body = np.argsort(rank[:-1])
     given = _apart(
         ptr, c.kind[blocks], c.lower[rows], c.upper[rows], c.mu[blocks], c.patch_radius[blocks], problem.b[rows],
@@ -68,9 +78,7 @@ def lay_out(problem: Problem, blocks: IntArray) -> Layout:
         problem.compliance[rows],
     )  # fmt: skip
     data = Data(*given[:7], FRICTION.index(problem.friction), rows=tuple(given[7:]))
-    place = np.empty(problem.m, np.intp)
-    place[rows] = np.arange(problem.m)
-    return Layout(data, rows.astype(np.intp), place)
+    return Layout(data, rows, place, ranks)
 
 
 def _apart(*arrays: np.ndarray) -> list[np.ndarray]:

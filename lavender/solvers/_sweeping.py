@@ -40,7 +40,7 @@ class SweepState:
         reference(problem)  # the watch reads the error of doing nothing
         self.problem = problem
         self.data = data  # lavender_ext.problem.Data that the kernel sweeps over
-        self.order = order
+        self.order = self.plan = order  # `plan` is of the problem's own blocks
         self.watch = Watch(problem.data if judged is None else judged)
 
     @property
@@ -111,13 +111,20 @@ class Sweeping:
     ground: Any = None
     seed: int = 0
 
-    def prepare(self, problem: Problem) -> SweepState:
+    def prepare(self, problem: Problem) -> Any:
+        """The state at the first sweep; its order is found anew."""
         order = block_order(problem, self.order, seed=self.seed, ground=self.ground)
-        return SweepState(problem, problem.csr_data, order)
+        return self._state(problem, order, None)
 
-    def update(self, state: SweepState, problem: Problem) -> SweepState:
-        # Levels and colours come from the structure, but cost little beside a sweep; made anew they are never stale.
-        return self.prepare(problem)
+    def update(self, state: Any, problem: Problem) -> Any:
+        """The same of new numbers: levels, colours and places of a fixed order come from the structure, and stay."""
+        if not state.plan.is_fixed:
+            return self.prepare(problem)
+        return self._state(problem, state.plan, state)
+
+    def _state(self, problem: Problem, order: Order, before: Any) -> SweepState:
+        """`before`: the state of a problem of the same structure and order, None the first time."""
+        return SweepState(problem, problem.csr_data, order)
 
 
 @dataclass(frozen=True)
@@ -127,7 +134,11 @@ class Threaded(Sweeping):
     threads: int = 1
 
     def __post_init__(self) -> None:
-        if isinstance(self.threads, bool) or not isinstance(self.threads, (int, np.integer)) or self.threads < 1:
+        if (
+            isinstance(self.threads, bool)
+            or not isinstance(self.threads, (int, np.integer))
+            or self.threads < 1
+        ):
             raise InputError(f"threads is {self.threads!r}; a whole number from 1 is needed")
         if self.threads > 1 and not (isinstance(self.order, str) and self.order == "colored"):
             raise InputError(

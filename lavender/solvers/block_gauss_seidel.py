@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from lavender._arrays import FloatArray
-from lavender.ordering import Order, block_order
+from lavender.ordering import Order
 from lavender.problem import Problem
 from lavender.registry import SolverSpec
 from lavender.solution import Claim
@@ -40,8 +40,7 @@ class BlockState(SweepState):
 class BlockGaussSeidel(Sweeping):
     """Block Gauss-Seidel; `order`, `ground`, `seed` as in `lavender.ordering`."""
 
-    def prepare(self, problem: Problem) -> BlockState:
-        order = block_order(problem, self.order, seed=self.seed, ground=self.ground)
+    def _state(self, problem: Problem, order: Order, before: BlockState | None) -> BlockState:
         return BlockState(problem, problem.data, order)
 
     def run(

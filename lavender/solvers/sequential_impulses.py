@@ -14,12 +14,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lavender._arrays import FloatArray
-from lavender.ordering import Order, block_order
+from lavender.ordering import Order
 from lavender.problem import Problem
 from lavender.registry import SolverSpec
 from lavender.residuals import reference
 from lavender.solution import Claim
-from lavender.solvers._layout import lay_out
+from lavender.solvers._layout import Layout, lay_out
 from lavender.solvers._layout import pays as layout_pays
 from lavender.solvers._sweeping import SweepState, Threaded, run_kernel, run_threads
 from lavender_ext import judge
@@ -36,14 +36,15 @@ class ImpulseState(SweepState):
     velocity: FloatArray | None = None
     laid: FloatArray | None = None  # (m,) impulse in sweep order, as the last run left it
 
-    def __init__(self, problem: Problem, order: Order) -> None:
-        self.layout = lay_out(problem, order.blocks) if layout_pays(problem, order) else None
+    def __init__(self, problem: Problem, order: Order, before: Layout | None) -> None:
+        self.layout = lay_out(problem, order.blocks, before) if layout_pays(problem, order) else None
         if self.layout is None:
             super().__init__(problem, problem.data, order)
             return
         self.layout.data.set_start(*reference(problem))
-        order = replace(order, blocks=np.arange(problem.n_blocks, dtype=np.int32))
-        super().__init__(problem, self.layout.data, order, self.layout.data)
+        laid = replace(order, blocks=np.arange(problem.n_blocks, dtype=np.int32))
+        super().__init__(problem, self.layout.data, laid, self.layout.data)
+        self.plan = order
 
     @property
     def best(self) -> tuple[float, FloatArray | None]:
@@ -61,8 +62,8 @@ class SequentialImpulses(Threaded):
     `threads` with "colored".
     """
 
-    def prepare(self, problem: Problem) -> ImpulseState:
-        return ImpulseState(problem, block_order(problem, self.order, seed=self.seed, ground=self.ground))
+    def _state(self, problem: Problem, order: Order, before: ImpulseState | None) -> ImpulseState:
+        return ImpulseState(problem, order, None if before is None else before.layout)
 
     def run(
         self, state: ImpulseState, impulse: FloatArray, n: int, tol: float, time_limit: float | None = None
