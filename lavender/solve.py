@@ -305,7 +305,7 @@ class _Loop:
 
 
 def next_count(n: int) -> int:
-    """The iteration count of the check or record after n: 1, 2, ... 16, then an eighth more each time."""
+    """The iteration count of the record after n: 1, 2, ... 16, then an eighth more each time."""
     return n + max(1, n >> 3)
 
 

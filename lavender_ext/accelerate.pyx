@@ -54,7 +54,7 @@ cdef struct sweep_data_t:
     int32_t nv
     double* control             # (CONTROL) of mixing.pxd
     double* gram                # (MAX_MEMORY, MAX_MEMORY)
-    double* work                # nncg 3 (m + nv); anderson (3 + 2 memory) m
+    double* work                # nncg 3 (m + nv); anderson (4 + 2 memory) m
 
 
 cdef inline void sweep(const sweep_data_t* c, double* lam, int32_t first) noexcept nogil:
@@ -176,6 +176,7 @@ cdef public void lav_anderson(sweep_data_t* c, double* lam, int32_t first_sweep,
     cdef int32_t m = c.blocks.n_rows, i, s, mixed
     cdef double* x = c.work                             # x, later f
     cdef const double* d = c.blocks.d
+    cdef double* root                                   # (m) square roots of d
     cdef mixing_t mixing
     mixing.m = m
     mixing.memory = c.memory
@@ -185,6 +186,10 @@ cdef public void lav_anderson(sweep_data_t* c, double* lam, int32_t first_sweep,
     mixing.g = mixing.v + m
     mixing.dv = mixing.g + m
     mixing.dg = mixing.dv + c.memory * m
+    root = mixing.dg + c.memory * m
+    if c.turn == 0:
+        for i in range(m):
+            root[i] = sqrt(d[i])
     for s in range(n):
         mixed = mix(&mixing, lam)
         if mixed:
@@ -195,7 +200,7 @@ cdef public void lav_anderson(sweep_data_t* c, double* lam, int32_t first_sweep,
             x[i] = lam[i]
         sweep(c, lam, first_sweep and s == 0)
         for i in range(m):
-            x[i] = sqrt(d[i]) * (lam[i] - x[i])
+            x[i] = root[i] * (lam[i] - x[i])
         if not take(&mixing, mixed, lam, x):
             form_velocity(c, lam)
         c.turn += 1
@@ -216,7 +221,7 @@ def allocate(Data p, int memory):
     cdef Py_ssize_t m = p.blocks.n_rows, nv = 6 * p.rows.n_bodies if p.factored else 0
     if not 0 <= memory <= MAX_MEMORY:
         raise ValueError(f"memory is {memory}; 0 to {MAX_MEMORY} is needed")
-    return (np.zeros(CONTROL), np.zeros(MAX_MEMORY * MAX_MEMORY), np.zeros(3 * (m + nv) + 2 * memory * m + 1),
+    return (np.zeros(CONTROL), np.zeros(MAX_MEMORY * MAX_MEMORY), np.zeros(3 * (m + nv) + (1 + 2 * memory) * m + 1),
             np.zeros((nv // 6 + 1, 6)))
 
 

@@ -1,6 +1,9 @@
-"""The stopping test of a sweep solver: the judge's own arithmetic at fixed sweep counts.
+"""The stopping test of a sweep solver: the judge's own arithmetic at sweep counts that depend on the numbers alone.
 
-Checks fall at 1, 2, ... 16 sweeps, then an eighth more each time. The relative residual r decides:
+A check falls at the start and after the first sweep. From the residuals r0, r of the last two, k sweeps apart, the
+end is expected after n more, r (r/r0)^(n/k) <= tol, and the next check is half way there: no nearer than an eighth
+of the sweeps done so far, no further than as many again. A residual that does not fall is looked at again after
+that eighth. The relative residual r decides:
 
     r <= tol                                        CONVERGED
     r not finite, or > 1e6 max(1, r at the start)   DIVERGED
@@ -30,9 +33,11 @@ cdef enum:
 cdef struct watch_t:
     int32_t total               # sweeps done
     int32_t check_at            # sweeps at the next check
+    int32_t last_at             # sweeps at the last check
     int32_t best_at             # sweeps at the best check, -1 before any
     int32_t patience            # sweeps that may always pass without a better check
     double start                # relative residual at the first check
+    double last                 # at the last one
     double best_relative        # of the best check
     double start_energy         # sqrt J, of doing nothing
     double start_velocity       # m/s
@@ -62,6 +67,23 @@ cdef inline void copy(const double* x, double* out, int32_t n) noexcept nogil:
         out[i] = x[i]
 
 
+cdef inline int32_t until_next(const watch_t* s, double now, double tol) noexcept nogil:
+    """Sweeps until the next check."""
+    cdef double least = s.total >> 3, most = s.total, n = 0.0, gap = s.total - s.last_at, fall, r = now
+    if least < 1.0:
+        least = 1.0
+    if gap >= 1.0 and now < s.last:
+        fall = now / s.last
+        while r > tol and n < 2.0 * most:
+            r *= fall
+            n += gap
+        n = 0.5 * n
+    n = n if n < most else most
+    n = n if n > least else least
+    most = 2147483647.0 - s.total
+    return <int32_t>(n if n < most else most)
+
+
 cdef inline int32_t check(watch_t* s, const blocks_t* p, const csr_t* a, const rows_t* r, int32_t factored,
                           double* lam, double tol) noexcept nogil:
     """One check; sets the sweeps of the next."""
@@ -71,7 +93,9 @@ cdef inline int32_t check(watch_t* s, const blocks_t* p, const csr_t* a, const r
     now = relative(s, x.energy, x.velocity) if x.finite else inf
     if s.total == 0:
         s.start = now
-    s.check_at = s.total + (s.total >> 3 if s.total >= 16 else 1)
+    s.check_at = s.total + until_next(s, now, tol)
+    s.last = now
+    s.last_at = s.total
     if now <= tol:
         return CONVERGED
     if now < s.best_relative:

@@ -28,7 +28,8 @@ cdef class Watch:
         self.state.w = &scratch[m]
         self.state.e = &scratch[2 * m]
         self.state.v = &scratch[3 * m]
-        self.state.total = self.state.check_at = 0
+        self.state.total = self.state.check_at = self.state.last_at = 0
+        self.state.last = 1.0 / 0.0
         self.state.best_at = -1
         self.state.patience = patience
         self.state.best_relative = 1.0 / 0.0

@@ -1,7 +1,6 @@
-"""What every sweep solver shares: an order, a count of sweeps, and checks at fixed counts.
+"""What every sweep solver shares: an order, a count of sweeps, and checks at counts that the numbers set.
 
-The checks are in `lavender_ext/watch.pyx`: the judge's arithmetic at 1, 2, ... 16 sweeps, then an eighth
-more each time.
+The checks are in `lavender_ext/watch.pxd`: the judge's arithmetic, half way to the expected end each time.
 """
 
 from __future__ import annotations
