@@ -42,6 +42,11 @@ cdef enum:                      # which natural map
     COULOMB = 1                 # radius a_t z_n; P is then the derivative for fixed radius alone
     AUGMENTED = 2               # radius a_t (z_n - s_n), Alart-Curnier
 
+cdef enum:                      # what is kept of a cone: w (4), eta, 1 / eta, 1 / (1 + w_0), and
+    CONE = 16
+    V = 8                       # v (3)
+    C = 12                      # v \\ c of the combined step (3)
+
 cdef struct factor_t:
     int32_t n                   # block columns
     int32_t s                   # rows of a block, 1 to 6
@@ -70,6 +75,8 @@ cdef struct elements_t:
     const int32_t* wptr         # (n + 1) first entry of the element's small square matrices
     const int32_t* node         # (n, 2) block columns, the first the larger, -1 where static
     const int32_t* slot         # (n, 3) blocks of N: first-first, second-second, first-second
+    int32_t n_groups            # runs of elements between the same bodies: one manifold each, usually
+    const int32_t* group        # (n_groups + 1) first element
     const double* panel         # (m, 2 s) K
     const double* theta         # (m)
     const double* g             # (m)
@@ -77,8 +84,30 @@ cdef struct elements_t:
     const double* upper         # (m)
     const double* at            # (n) a_t
     const double* as_           # (n) a_s
-    double* scaling             # (n, 10) w and eta of the element's cones, once lav_ipm_scale has run
+    double* scaling             # (n, 2, CONE) of the element's cones, once lav_ipm_scale has run
 
+
+cdef struct interior_t:         # an interior point of the velocity form and its scratch
+    double delta                # proximal weight
+    double damping              # share of the step to the boundary
+    double degree               # cones
+    double* z                   # (m)
+    double* u1                  # (m) duals
+    double* u2                  # (m)
+    double* hz                  # (m) H z
+    double* v                   # V of every element
+    double* bt                  # B^T with V = B B^T, or NULL
+    double* da                  # (m) affine direction
+    double* dz                  # (m)
+    double* r                   # (m)
+    double* t                   # (m)
+    double* q                   # (m)
+    double* y                   # (n s)
+    const double* speed         # (m) velocity error per unit of f
+    double length               # of the last step
+    double gap                  # G z . u / degree before it
+    double energy               # |F| after it, the judge's energy error
+    double velocity             # the judge's velocity error
 
 # -- small dense blocks ---------------------------------------------------------------------------
 
@@ -99,16 +128,20 @@ cdef inline void sub_product(double* w, const double* y, const double* lt, const
             w[r * s + c] = row[c]
 
 
-cdef inline void sub_square(double* w, const double* y, const int32_t s) noexcept nogil:
-    # w -= y y^T, lower triangle
+cdef inline void sub_transposed(double* wt, const double* yt, const double* lt, const int32_t s) noexcept nogil:
+    # w -= y l^T with all three transposed: w^T -= l y^T
     cdef int32_t r, c, t
     cdef double x
-    for r in range(s):
-        for c in range(r + 1):
-            x = 0.0
-            for t in range(s):
-                x += y[r * s + t] * y[c * s + t]
-            w[r * s + c] -= x
+    cdef double row[6]
+    for c in range(s):
+        for r in range(s):
+            row[r] = wt[c * s + r]
+        for t in range(s):
+            x = lt[t * s + c]
+            for r in range(s):
+                row[r] -= x * yt[t * s + r]
+        for r in range(s):
+            wt[c * s + r] = row[r]
 
 
 cdef inline int32_t small_cholesky(double* a, const int32_t s) noexcept nogil:
@@ -134,19 +167,25 @@ cdef inline int32_t small_cholesky(double* a, const int32_t s) noexcept nogil:
     return lost
 
 
-cdef inline void solve_right(double* y, const double* l, const int32_t s) noexcept nogil:
-    # y <- y l^-T, row by row: the forward solve of each row
+cdef inline void solve_right(double* yt, const double* l, const int32_t s) noexcept nogil:
+    # y <- y l^-T, held transposed: y^T <- l^-1 y^T, a row of y^T at a time
     cdef int32_t r, c, t
     cdef double x
-    for r in range(s):
-        for c in range(s):
-            x = y[r * s + c]
-            for t in range(c):
-                x -= y[r * s + t] * l[c * s + t]
-            y[r * s + c] = x * l[c * s + c]
+    cdef double row[6]
+    for c in range(s):
+        for r in range(s):
+            row[r] = yt[c * s + r]
+        for t in range(c):
+            x = l[c * s + t]
+            for r in range(s):
+                row[r] -= x * yt[t * s + r]
+        x = l[c * s + c]
+        for r in range(s):
+            yt[c * s + r] = row[r] * x
 
 
 cdef inline int32_t factor_blocks(const factor_t* f, const int32_t s) noexcept nogil:
+    # Row k of N and of L as transposed blocks: every loop inside runs along a row of them.
     cdef int32_t k, q, p, j, c, r, lost = 0
     cdef int64_t b = s * s
     cdef double *y
@@ -156,21 +195,21 @@ cdef inline int32_t factor_blocks(const factor_t* f, const int32_t s) noexcept n
     for k in range(f.n):
         for q in range(f.nptr[k], f.nptr[k + 1]):
             y = f.work + f.nind[q] * b
-            for c in range(s * s):
-                y[c] = f.nval[q * b + c]
+            for r in range(s):
+                for c in range(s):
+                    y[c * s + r] = f.nval[q * b + r * s + c]
         for q in range(f.rptr[k], f.rptr[k + 1]):
             j = f.rind[q]
             y = f.work + j * b
             solve_right(y, f.dval + j * b, s)
             for p in range(f.lptr[j], f.next[j]):
-                sub_product(f.work + f.lind[p] * b, y, f.lval + p * b, s)
-            sub_square(f.work + k * b, y, s)
+                sub_transposed(f.work + f.lind[p] * b, y, f.lval + p * b, s)
+            sub_transposed(f.work + k * b, y, y, s)
             l = f.lval + f.next[j] * b
             f.next[j] += 1
-            for r in range(s):
-                for c in range(s):
-                    l[c * s + r] = y[r * s + c]
-                    y[r * s + c] = 0.0
+            for c in range(s * s):
+                l[c] = y[c]
+                y[c] = 0.0
         y = f.work + k * b
         lost += small_cholesky(y, s)
         for c in range(s * s):
@@ -496,40 +535,46 @@ cdef public void lav_block_pattern(int32_t n, const int32_t* nptr, const int32_t
 # -- the normal matrix ------------------------------------------------------------------------------
 
 
-cdef inline void add_outer(double* out, const double* left, const double* right, double x, const int32_t s) noexcept nogil:
-    cdef int32_t i, j
-    cdef double t
-    for i in range(s):
-        t = x * left[i]
-        for j in range(s):
-            out[i * s + j] += t * right[j]
-
-
-cdef inline void add_product(double* out, const double* left, const double* right, int32_t nr, bint lower,
+cdef inline void add_product(double* out, const double* left, const double* right, int32_t nr,
                              const int32_t s) noexcept nogil:
-    # out += left^T right, (nr, 2 s) rows of which s columns are read; the lower triangle alone on request
+    # out += left^T right, (nr, 2 s) rows of which s columns are read
     cdef int32_t i, j, r
     cdef double x
     cdef double row[6]
     for i in range(s):
         for j in range(s):
-            row[j] = 0.0
+            row[j] = out[i * s + j]
         for r in range(nr):
             x = left[r * 2 * s + i]
             for j in range(s):
                 row[j] += x * right[r * 2 * s + j]
-        for j in range(i + 1 if lower else s):
-            out[i * s + j] += row[j]
+        for j in range(s):
+            out[i * s + j] = row[j]
+
+
+cdef inline void weigh(const double* v, const double* rows, double* t, int32_t nr, const int32_t s) noexcept nogil:
+    # t = V rows, (nr, 2 s)
+    cdef int32_t r, k, c
+    cdef double x
+    cdef double row[12]
+    for r in range(nr):
+        x = v[r * nr]
+        for c in range(2 * s):
+            row[c] = x * rows[c]
+        for k in range(1, nr):
+            x = v[r * nr + k]
+            for c in range(2 * s):
+                row[c] += x * rows[k * 2 * s + c]
+        for c in range(2 * s):
+            t[r * 2 * s + c] = row[c]
 
 
 cdef inline void add_elements(const elements_t* e, const double* v, const factor_t* f, int32_t lu, const int32_t s) noexcept nogil:
-    cdef int32_t i, j, k, r, c, nr, first, second, n_blocks = f.nptr[f.n]
+    cdef int32_t h, i, j, r, c, nr, first, second, n_blocks = f.nptr[f.n], done
     cdef int64_t b = s * s, q
-    cdef double t[48]
+    cdef double t[192]                                  # V K of up to 16 rows between two bodies, (16, 2 s)
     cdef const double *pr
-    cdef const double *pc
     cdef const int32_t *slot
-    cdef double x
     for q in range(n_blocks * b):
         f.nval[q] = 0.0
     if lu:
@@ -541,40 +586,34 @@ cdef inline void add_elements(const elements_t* e, const double* v, const factor
             f.nval[q + c * s + c] = 1.0
             if lu:
                 f.mval[q + c * s + c] = 1.0
-    for i in range(e.n):
-        j = e.ptr[i]
-        nr = e.ptr[i + 1] - j
+    for h in range(e.n_groups):
+        i = e.group[h]
         first = e.node[2 * i]
         second = e.node[2 * i + 1]
         slot = e.slot + 3 * i
         if first < 0:
             continue
-        pr = e.panel + <int64_t>j * 2 * s
-        if nr == 1:
-            x = v[e.wptr[i]]
-            if x != 0.0:
-                add_outer(f.nval + slot[0] * b, pr, pr, x, s)
-                if second >= 0:
-                    add_outer(f.nval + slot[1] * b, pr + s, pr + s, x, s)
-                    add_outer(f.nval + slot[2] * b, pr, pr + s, x, s)
-                    if lu:
-                        add_outer(f.mval + slot[2] * b, pr, pr + s, x, s)
-            continue
-        for r in range(nr):                             # t = V K of this element, (nr, 2 s)
-            for c in range(2 * s):
-                t[r * 2 * s + c] = 0.0
-            for k in range(nr):
-                x = v[e.wptr[i] + r * nr + k]
-                pc = pr + k * 2 * s
-                for c in range(2 * s):
-                    t[r * 2 * s + c] += x * pc[c]
-        add_product(f.nval + slot[0] * b, pr, t, nr, not lu, s)
-        if second >= 0:
-            add_product(f.nval + slot[1] * b, pr + s, t + s, nr, not lu, s)
-            add_product(f.nval + slot[2] * b, pr, t + s, nr, False, s)
-            if lu:
-                # block (second, first) of K^T V K, transposed: (V K_first)^T K_second
-                add_product(f.mval + slot[2] * b, t, pr + s, nr, False, s)
+        while i < e.group[h + 1]:
+            j = e.ptr[i]
+            pr = e.panel + <int64_t>j * 2 * s
+            done = 0
+            while i < e.group[h + 1] and done <= 12:
+                nr = e.ptr[i + 1] - e.ptr[i]
+                if nr == 1:
+                    weigh(v + e.wptr[i], pr + done * 2 * s, t + done * 2 * s, 1, s)
+                elif nr == 3:
+                    weigh(v + e.wptr[i], pr + done * 2 * s, t + done * 2 * s, 3, s)
+                else:
+                    weigh(v + e.wptr[i], pr + done * 2 * s, t + done * 2 * s, nr, s)
+                done += nr
+                i += 1
+            add_product(f.nval + slot[0] * b, pr, t, done, s)
+            if second >= 0:
+                add_product(f.nval + slot[1] * b, pr + s, t + s, done, s)
+                add_product(f.nval + slot[2] * b, pr, t + s, done, s)
+                if lu:
+                    # block (second, first) of K^T V K, transposed: (V K_first)^T K_second
+                    add_product(f.mval + slot[2] * b, t, pr + s, done, s)
     if lu:
         # The mirror of a diagonal block is its transpose; only off-diagonal blocks are read there.
         for i in range(f.n):
@@ -596,48 +635,76 @@ cdef public void lav_normal_matrix(const elements_t* e, const double* v, const f
         add_elements(e, v, f, lu, f.s)
 
 
-cdef public void lav_to_bodies(const elements_t* e, int32_t n, const double* x, double* y) noexcept nogil:
-    """y = K^T x, (n, s)."""
-    cdef int32_t i, j, c, s = e.s
+cdef inline void to_bodies(const elements_t* e, int32_t n, const double* x, double* y, const int32_t s) noexcept nogil:
+    cdef int32_t h, i, j, c, first, second
     cdef const double *p
-    cdef double *a
-    cdef double *b
+    cdef double u
+    cdef double sum[12]
     for i in range(n * s):
         y[i] = 0.0
-    for i in range(e.n):
-        if e.node[2 * i] < 0:
+    for h in range(e.n_groups):
+        i = e.group[h]
+        first = e.node[2 * i]
+        second = e.node[2 * i + 1]
+        if first < 0:
             continue
-        a = y + e.node[2 * i] * s
-        b = y + e.node[2 * i + 1] * s if e.node[2 * i + 1] >= 0 else NULL
-        for j in range(e.ptr[i], e.ptr[i + 1]):
+        for c in range(2 * s):
+            sum[c] = 0.0
+        for j in range(e.ptr[i], e.ptr[e.group[h + 1]]):
             p = e.panel + <int64_t>j * 2 * s
+            u = x[j]
+            for c in range(2 * s):
+                sum[c] += p[c] * u
+        for c in range(s):
+            y[first * s + c] += sum[c]
+        if second >= 0:
             for c in range(s):
-                a[c] += p[c] * x[j]
-            if b != NULL:
-                for c in range(s):
-                    b[c] += p[s + c] * x[j]
+                y[second * s + c] += sum[s + c]
+
+
+cdef inline void to_rows(const elements_t* e, const double* y, double* x, const int32_t s) noexcept nogil:
+    cdef int32_t h, i, j, c, first, second
+    cdef const double *p
+    cdef double t, u
+    cdef double of[12]
+    for h in range(e.n_groups):
+        i = e.group[h]
+        first = e.node[2 * i]
+        second = e.node[2 * i + 1]
+        for c in range(s):
+            of[c] = y[first * s + c] if first >= 0 else 0.0
+            of[s + c] = y[second * s + c] if second >= 0 else 0.0
+        for j in range(e.ptr[i], e.ptr[e.group[h + 1]]):
+            p = e.panel + <int64_t>j * 2 * s
+            t = u = 0.0
+            for c in range(s):
+                t += p[2 * c] * of[2 * c]
+                u += p[2 * c + 1] * of[2 * c + 1]
+            x[j] = t + u
+
+
+cdef public void lav_to_bodies(const elements_t* e, int32_t n, const double* x, double* y) noexcept nogil:
+    """y = K^T x, (n, s)."""
+    if e.s == 1:
+        to_bodies(e, n, x, y, 1)
+    elif e.s == 3:
+        to_bodies(e, n, x, y, 3)
+    elif e.s == 6:
+        to_bodies(e, n, x, y, 6)
+    else:
+        to_bodies(e, n, x, y, e.s)
 
 
 cdef public void lav_to_rows(const elements_t* e, const double* y, double* x) noexcept nogil:
     """x = K y, (m)."""
-    cdef int32_t i, j, c, s = e.s
-    cdef const double *p
-    cdef const double *a
-    cdef const double *b
-    cdef double t
-    for i in range(e.n):
-        a = y + e.node[2 * i] * s if e.node[2 * i] >= 0 else NULL
-        b = y + e.node[2 * i + 1] * s if e.node[2 * i + 1] >= 0 else NULL
-        for j in range(e.ptr[i], e.ptr[i + 1]):
-            p = e.panel + <int64_t>j * 2 * s
-            t = 0.0
-            if a != NULL:
-                for c in range(s):
-                    t += p[c] * a[c]
-            if b != NULL:
-                for c in range(s):
-                    t += p[s + c] * b[c]
-            x[j] = t
+    if e.s == 1:
+        to_rows(e, y, x, 1)
+    elif e.s == 3:
+        to_rows(e, y, x, 3)
+    elif e.s == 6:
+        to_rows(e, y, x, 6)
+    else:
+        to_rows(e, y, x, e.s)
 
 
 # -- small square matrices of an element, at most 4 x 4 ------------------------------------------------
@@ -681,6 +748,10 @@ cdef inline void invert_small(double* a, double* inv, int32_t n) noexcept nogil:
 cdef inline void element_times(const elements_t* e, const double* w, const double* x, double* out) noexcept nogil:
     cdef int32_t i, j, r, c, nr
     cdef double t
+    if e.n == e.m:
+        for i in range(e.m):
+            out[i] = w[i] * x[i]
+        return
     for i in range(e.n):
         j = e.ptr[i]
         nr = e.ptr[i + 1] - j
@@ -856,14 +927,28 @@ cdef inline void nt_scaling(const double* s, const double* u, int32_t n, double*
     eta[0] = sqrt(ds / du)
 
 
-cdef inline void scale_times(const double* w, double eta, int32_t n, const double* x, bint inverse, double* out) noexcept nogil:
-    cdef double t = 0.0, sign = -1.0 if inverse else 1.0, f = 1.0 / eta if inverse else eta
+cdef inline void scale_times(const double* w, int32_t n, const double* x, double* out) noexcept nogil:
+    # T x
+    cdef double t = 0.0
     cdef int32_t k
     for k in range(1, n):
         t += w[k] * x[k]
-    out[0] = f * (w[0] * x[0] + sign * t)
+    out[0] = w[4] * (w[0] * x[0] + t)
+    t = x[0] + t * w[6]
     for k in range(1, n):
-        out[k] = f * (x[k] + w[k] * (sign * x[0] + t / (1.0 + w[0])))
+        out[k] = w[4] * (x[k] + w[k] * t)
+
+
+cdef inline void scale_back(const double* w, int32_t n, const double* x, double* out) noexcept nogil:
+    # T^-1 x
+    cdef double t = 0.0
+    cdef int32_t k
+    for k in range(1, n):
+        t += w[k] * x[k]
+    out[0] = w[5] * (w[0] * x[0] - t)
+    t = t * w[6] - x[0]
+    for k in range(1, n):
+        out[k] = w[5] * (x[k] + w[k] * t)
 
 
 cdef inline void cone_divide(const double* v, const double* c, int32_t n, double* out) noexcept nogil:
@@ -976,17 +1061,82 @@ cdef public double lav_ipm_start(const elements_t* e, const double* hz, double d
     return degree
 
 
+cdef public double lav_ipm_start_apart(const elements_t* e, const double* hz, double margin, double* z, double* u1,
+                                       double* u2) noexcept nogil:
+    """Puts z and u inside their cones, starting from z with (H + I) z = g; returns the degree (number of cones).
+
+    Each cone apart, by no more than it needs: z and u keep at least `margin` times the mean |z| and the mean |g|
+    from the boundary.
+    """
+    cdef int32_t i, j, which, n
+    cdef double size_z = 0.0, size_u = 0.0, x, degree = 0.0, width
+    cdef double c[4]
+    for j in range(e.m):
+        size_z += fabs(z[j])
+        size_u += fabs(e.g[j])
+    size_z = margin * size_z / (e.m if e.m > 0 else 1)
+    size_u = margin * size_u / (e.m if e.m > 0 else 1)
+    if not size_z > 0.0:
+        size_z = 1.0
+    if not size_u > 0.0:
+        size_u = 1.0
+    for i in range(e.n):
+        j = e.ptr[i]
+        if e.kind[i] == ROW:
+            u1[j] = 0.0
+            u2[j] = 0.0
+            x = hz[j] - e.g[j]
+            if is_low(e, j) and is_high(e, j):
+                width = 0.1 * (e.upper[j] - e.lower[j])
+                if z[j] < e.lower[j] + width:
+                    z[j] = e.lower[j] + width
+                if z[j] > e.upper[j] - width:
+                    z[j] = e.upper[j] - width
+                u1[j] = x if x > size_u else size_u
+                u2[j] = -x if -x > size_u else size_u
+                degree += 2.0
+            elif is_low(e, j):
+                if z[j] < e.lower[j] + size_z:
+                    z[j] = e.lower[j] + size_z
+                u1[j] = x if x > size_u else size_u
+                degree += 1.0
+            elif is_high(e, j):
+                if z[j] > e.upper[j] - size_z:
+                    z[j] = e.upper[j] - size_z
+                u2[j] = -x if -x > size_u else size_u
+                degree += 1.0
+            continue
+        for which in range(2):
+            if not has_cone(e, i, which):
+                continue
+            n = cone_size(e, i, which)
+            slack_dual(e, i, which, hz, c)
+            x = size_u - cone_gap(c, n)
+            if x > 0.0:
+                c[0] += x
+            store_dual(e, i, which, c, u1, u2)
+            gather(e, i, which, z, c)
+            x = (size_z - cone_gap(c, n)) / on_normal(e.at[i] if which == 0 else e.as_[i])
+            if x > 0.0:
+                z[j] += x
+            degree += 1.0
+    return degree
+
+
 cdef inline double cone_parts(const double* s, const double* u, int32_t n, double a, double delta, double* w,
                               double* h, double* c, double* root) noexcept nogil:
     # (T^-2 + delta)^-1 between G^-1 and G^-T as x [1 h][1 h]^T + [0 0; 0 c]: returns x, the normal's own entry.
     # Through the eigenvalues of T^2, eta^2 (w0 +- |w1|)^2 along (1, +-w1/|w1|) and eta^2 across: as a matrix
     # T^-2 would lose the small ones. c and its square root are (n - 1, n - 1).
-    # w (5) keeps the scaling and eta.
+    # w (CONE) keeps the scaling, and v.
     cdef double d[4]
     cdef double eta, size = 0.0, grow, shrink, across, along, x, gn = on_normal(a), gt = on_tangent(a)
     cdef int32_t k, l, nt = n - 1
     nt_scaling(s, u, n, w, &eta)
     w[4] = eta
+    w[5] = 1.0 / eta
+    w[6] = 1.0 / (1.0 + w[0])
+    scale_times(w, n, u, w + V)
     for k in range(1, n):
         size += w[k] * w[k]
     size = sqrt(size)
@@ -1053,13 +1203,13 @@ cdef public void lav_ipm_scale(const elements_t* e, const double* z, const doubl
             load_dual(e, i, 0, u1, u2, u)
             for k in range(n):
                 total += s[k] * u[k]
-            x = cone_parts(s, u, n, e.at[i], delta, e.scaling + 10 * i, h, c, root)
+            x = cone_parts(s, u, n, e.at[i], delta, e.scaling + 2 * CONE * i, h, c, root)
         if e.kind[i] == SPIN:
             # Two cones share the normal: their parallel sum there, each of the others follows it.
             gather(e, i, 1, z, s)
             load_dual(e, i, 1, u1, u2, u)
             total += s[0] * u[0] + s[1] * u[1]
-            y = cone_parts(s, u, 2, e.as_[i], delta, e.scaling + 10 * i + 5, hs, cs, rs)
+            y = cone_parts(s, u, 2, e.as_[i], delta, e.scaling + 2 * CONE * i + CONE, hs, cs, rs)
             x = x * (y / (x + y)) if n > 1 else y
         for k in range(nr * nr):
             v[q + k] = 0.0
@@ -1109,44 +1259,56 @@ cdef inline double row_limit(double x, double dx, double best) noexcept nogil:
     return best
 
 
-cdef inline void dual_step(const elements_t* e, int32_t i, int32_t which, const double* z, const double* u1,
-                           const double* u2, const double* dz, const double* da, double sigma_mu, double* s,
-                           double* u, double* ds, double* du, double* rhs) noexcept nogil:
-    # (3) where da is NULL, else (4); rhs = T^-1 (v \ c) in the cone's coordinates. dz NULL: rhs alone.
-    cdef double v[4]
+# Steps of a cone are taken in the scaled coordinates, where T^-1 s = T u = v: with y = T^-1 G dz, T du = -v - y for
+# the affine step and -(v \\ c) - y for the combined one. T maps the cone onto itself, so lengths are the same.
+cdef inline void cone_affine(const elements_t* e, int32_t i, int32_t which, const double* da, const int32_t n,
+                             double* y, double* back) noexcept nogil:
+    # y = T^-1 G dz_a, back = T du_a
+    cdef const double *w = e.scaling + 2 * CONE * i + CONE * which
+    cdef double x[4]
+    cdef int32_t k
+    gather(e, i, which, da, x)
+    scale_back(w, n, x, y)
+    for k in range(n):
+        back[k] = -w[V + k] - y[k]
+
+
+cdef inline void cone_combined(const elements_t* e, int32_t i, int32_t which, const double* da, double sigma_mu,
+                               const int32_t n, double* rhs) noexcept nogil:
+    # v \\ c of (4) into the cone's store; rhs = T^-1 (v \\ c)
+    cdef double *w = e.scaling + 2 * CONE * i + CONE * which
+    cdef const double *v = w + V
     cdef double x[4]
     cdef double y[4]
-    cdef double c[4]
-    cdef const double *w = e.scaling + 10 * i + 5 * which
-    cdef double eta = w[4]
-    cdef int32_t n = cone_size(e, i, which), k
-    gather(e, i, which, z, s)
-    load_dual(e, i, which, u1, u2, u)
-    if da == NULL:
-        for k in range(n):
-            rhs[k] = u[k]
-    else:
-        scale_times(w, eta, n, u, False, v)
-        gather(e, i, which, da, x)
-        scale_times(w, eta, n, x, True, y)              # T^-1 G dz_a
-        scale_times(w, eta, n, y, True, x)              # T^-2 G dz_a
-        for k in range(n):
-            x[k] = -u[k] - x[k]                         # du_a
-        scale_times(w, eta, n, x, False, c)             # T du_a
-        # v o v + y o c - sigma mu e
-        x[0] = -sigma_mu
-        for k in range(n):
-            x[0] += v[k] * v[k] + y[k] * c[k]
-        for k in range(1, n):
-            x[k] = 2.0 * v[0] * v[k] + y[0] * c[k] + c[0] * y[k]
-        cone_divide(v, x, n, c)
-        scale_times(w, eta, n, c, True, rhs)
-    if dz != NULL:
-        gather(e, i, which, dz, ds)
-        scale_times(w, eta, n, ds, True, x)
-        scale_times(w, eta, n, x, True, y)
-        for k in range(n):
-            du[k] = -rhs[k] - y[k]
+    cdef double back[4]
+    cdef int32_t k
+    cone_affine(e, i, which, da, n, y, back)
+    x[0] = -sigma_mu
+    for k in range(n):
+        x[0] += v[k] * v[k] + y[k] * back[k]
+    for k in range(1, n):
+        x[k] = 2.0 * v[0] * v[k] + y[0] * back[k] + back[0] * y[k]
+    cone_divide(v, x, n, w + C)
+    scale_back(w, n, w + C, rhs)
+
+
+cdef inline double cone_length(const elements_t* e, int32_t i, int32_t which, const double* dz, double best,
+                               const int32_t n, double* du) noexcept nogil:
+    # the combined step's length, at most `best`; du
+    cdef const double *w = e.scaling + 2 * CONE * i + CONE * which
+    cdef double x[4]
+    cdef double y[4]
+    cdef double a
+    cdef int32_t k
+    gather(e, i, which, dz, x)
+    scale_back(w, n, x, y)
+    a = cone_step(w + V, y, n)
+    best = a if a < best else best
+    for k in range(n):
+        y[k] = -w[C + k] - y[k]
+    a = cone_step(w + V, y, n)
+    scale_back(w, n, y, du)
+    return a if a < best else best
 
 
 cdef public double lav_ipm_affine(const elements_t* e, const double* z, const double* u1, const double* u2,
@@ -1154,11 +1316,9 @@ cdef public double lav_ipm_affine(const elements_t* e, const double* z, const do
     """Largest step (at most 1) of the affine direction, and the gap G z . u after it."""
     cdef int32_t i, j, k, which, n
     cdef double best = 1.0, a, b, x, t00 = 0.0, t01 = 0.0, t11 = 0.0
-    cdef double s[4]
-    cdef double u[4]
-    cdef double ds[4]
-    cdef double du[4]
-    cdef double rhs[4]
+    cdef double y[4]
+    cdef double back[4]
+    cdef const double *v
     for i in range(e.n):
         j = e.ptr[i]
         if e.kind[i] == ROW:
@@ -1183,15 +1343,21 @@ cdef public double lav_ipm_affine(const elements_t* e, const double* z, const do
             if not has_cone(e, i, which):
                 continue
             n = cone_size(e, i, which)
-            dual_step(e, i, which, z, u1, u2, dz, NULL, 0.0, s, u, ds, du, rhs)
-            a = cone_step(s, ds, n)
-            b = cone_step(u, du, n)
+            v = e.scaling + 2 * CONE * i + CONE * which + V
+            if n == 3:
+                cone_affine(e, i, which, dz, 3, y, back)
+                a = cone_step(v, y, 3)
+                b = cone_step(v, back, 3)
+            else:
+                cone_affine(e, i, which, dz, n, y, back)
+                a = cone_step(v, y, n)
+                b = cone_step(v, back, n)
             best = a if a < best else best
             best = b if b < best else best
             for k in range(n):
-                t00 += s[k] * u[k]
-                t01 += s[k] * du[k] + u[k] * ds[k]
-                t11 += ds[k] * du[k]
+                t00 += v[k] * v[k]
+                t01 -= v[k] * v[k]
+                t11 += y[k] * back[k]
     gap[0] = t00 + best * (t01 + best * t11)
     return best
 
@@ -1201,7 +1367,6 @@ cdef public void lav_ipm_rhs(const elements_t* e, const double* z, const double*
     """Right-hand side of (4)."""
     cdef int32_t i, j, k, which, n
     cdef double a, x
-    cdef double s[4]
     cdef double u[4]
     cdef double t[4]
     for i in range(e.n):
@@ -1223,7 +1388,11 @@ cdef public void lav_ipm_rhs(const elements_t* e, const double* z, const double*
             if not has_cone(e, i, which):
                 continue
             n = cone_size(e, i, which)
-            dual_step(e, i, which, z, u1, u2, NULL, da, sigma_mu, s, u, NULL, NULL, t)
+            load_dual(e, i, which, u1, u2, u)
+            if n == 3:
+                cone_combined(e, i, which, da, sigma_mu, 3, t)
+            else:
+                cone_combined(e, i, which, da, sigma_mu, n, t)
             for k in range(n):
                 t[k] = u[k] - t[k]
             scatter(e, i, which, t, rhs)
@@ -1231,14 +1400,10 @@ cdef public void lav_ipm_rhs(const elements_t* e, const double* z, const double*
 
 cdef public double lav_ipm_update(const elements_t* e, double* z, double* u1, double* u2, const double* dz,
                                   const double* da, double sigma_mu, double damping, double* du1, double* du2) noexcept nogil:
-    """Takes the combined step in place; returns its length. du1, du2 (m) are scratch."""
+    """Takes the combined step of the last `lav_ipm_rhs` in place; returns its length. du1, du2 (m) are scratch."""
     cdef int32_t i, j, k, which, n
-    cdef double best = 1.0 / damping, a, b, x
-    cdef double s[4]
-    cdef double u[4]
-    cdef double ds[4]
+    cdef double best = 1.0 / damping, a, x
     cdef double du[4]
-    cdef double rhs[4]
     for i in range(e.n):
         j = e.ptr[i]
         if e.kind[i] == ROW:
@@ -1261,11 +1426,10 @@ cdef public double lav_ipm_update(const elements_t* e, double* z, double* u1, do
             if not has_cone(e, i, which):
                 continue
             n = cone_size(e, i, which)
-            dual_step(e, i, which, z, u1, u2, dz, da, sigma_mu, s, u, ds, du, rhs)
-            a = cone_step(s, ds, n)
-            b = cone_step(u, du, n)
-            best = a if a < best else best
-            best = b if b < best else best
+            if n == 3:
+                best = cone_length(e, i, which, dz, best, 3, du)
+            else:
+                best = cone_length(e, i, which, dz, best, n, du)
             store_dual(e, i, which, du, du1, du2)
     best = best * damping
     for j in range(e.m):
@@ -1484,6 +1648,197 @@ cdef public double lav_natural(const elements_t* e, const double* z, const doubl
     return sqrt(total)
 
 
+# -- a whole interior point step, velocity form ---------------------------------------------------------
+
+
+cdef public void lav_convex_error(const elements_t* e, const double* z, const double* hz, const double* speed,
+                                  double* energy, double* velocity) noexcept nogil:
+    """|F| of the convex natural map, and the largest speed |f|, by norm where a contact has two tangents."""
+    cdef int32_t i, j, k, nr
+    cdef double total = 0.0, worst = 0.0, x
+    cdef double s[4]
+    cdef double f[4]
+    cdef double p[16]
+    for i in range(e.n):
+        j = e.ptr[i]
+        if e.kind[i] == ROW:
+            x = hz[j] - e.g[j]
+            if z[j] - x < e.lower[j]:
+                x = z[j] - e.lower[j]
+            elif z[j] - x > e.upper[j]:
+                x = z[j] - e.upper[j]
+            total += x * x
+            x = fabs(x) * speed[j]
+            worst = x if x > worst else worst
+            continue
+        nr = e.ptr[i + 1] - j
+        for k in range(nr):
+            s[k] = hz[j + k] - e.g[j + k]
+        natural_contact(e, i, z + j, s, f, p)
+        for k in range(nr):
+            total += f[k] * f[k]
+            x = fabs(f[k]) * speed[j + k]
+            if k == 1 and nr - (e.kind[i] == SPIN) == 3:
+                x = sqrt(f[1] * f[1] + f[2] * f[2]) * speed[j + 1]
+            worst = x if x > worst else worst
+    energy[0] = sqrt(total)
+    velocity[0] = worst
+
+
+cdef inline double z_end(const elements_t* e, int32_t j, double y) noexcept nogil:
+    # which bound y is beyond: -1, 1 or 0 for none
+    return -1.0 if y < e.lower[j] else 1.0 if y > e.upper[j] else 0.0
+
+
+cdef inline void times_h(const elements_t* e, int32_t n, const double* z, double* y, double* hz) noexcept nogil:
+    cdef int32_t j
+    lav_to_bodies(e, n, z, y)
+    lav_to_rows(e, y, hz)
+    for j in range(e.m):
+        hz[j] += e.theta[j] * z[j]
+
+
+cdef inline void solve_barrier(const elements_t* e, const factor_t* f, const interior_t* p, const double* r,
+                               double* out) noexcept nogil:
+    # (2) for the V of `p`
+    cdef int32_t j
+    element_times(e, p.v, r, p.t)
+    lav_to_bodies(e, f.n, p.t, p.y)
+    lav_block_solve(f, p.y)
+    lav_to_rows(e, p.y, p.q)
+    for j in range(e.m):
+        p.q[j] = r[j] - p.q[j]
+    if p.bt == NULL:
+        element_times(e, p.v, p.q, out)
+    else:
+        # B (B^T ...): V itself has lost the small end of its scaling to the large one.
+        element_times(e, p.bt, p.q, p.t)
+        element_times_transposed(e, p.bt, p.t, out)
+
+
+cdef public void lav_interior_first(const elements_t* e, const factor_t* f, interior_t* p, double weight,
+                                    double free_weight) noexcept nogil:
+    """z with (H + weight) z = g on rows that have a bound, `free_weight` on others."""
+    cdef int32_t i, j, k, q, nr
+    cdef double x
+    for i in range(e.n):
+        j = e.ptr[i]
+        nr = e.ptr[i + 1] - j
+        q = e.wptr[i]
+        for k in range(nr * nr):
+            p.v[q + k] = 0.0
+            if p.bt != NULL:
+                p.bt[q + k] = 0.0
+        x = free_weight if e.kind[i] == ROW and not is_low(e, j) and not is_high(e, j) else weight
+        for k in range(nr):
+            p.v[q + k * nr + k] = 1.0 / (e.theta[j + k] + x)
+            if p.bt != NULL:
+                p.bt[q + k * nr + k] = sqrt(p.v[q + k * nr + k])
+    lav_normal_matrix(e, p.v, f, 0)
+    lav_block_cholesky(f)
+    solve_barrier(e, f, p, e.g, p.z)
+    times_h(e, f.n, p.z, p.y, p.hz)
+
+
+cdef public void lav_interior_refine(const elements_t* e, const factor_t* f, interior_t* p) noexcept nogil:
+    """z <- z + (H + W)^-1 (g - H z) with the factor of the last W: the weight of the first point goes away."""
+    cdef int32_t j
+    for j in range(e.m):
+        p.r[j] = e.g[j] - p.hz[j]
+    solve_barrier(e, f, p, p.r, p.dz)
+    for j in range(e.m):
+        p.z[j] += p.dz[j]
+    times_h(e, f.n, p.z, p.y, p.hz)
+
+
+cdef inline void solve_free(const elements_t* e, const factor_t* f, const interior_t* p, const double* r,
+                            double* out) noexcept nogil:
+    # (5) on bounded rows, V = 0 where a row rests on its bound
+    cdef int32_t j
+    for j in range(e.m):
+        p.t[j] = p.v[j] * r[j] if p.v[j] > 0.0 else r[j]
+    lav_to_bodies(e, f.n, p.t, p.y)
+    lav_block_solve(f, p.y)
+    lav_to_rows(e, p.y, p.q)
+    for j in range(e.m):
+        out[j] = p.v[j] * (r[j] - p.q[j]) if p.v[j] > 0.0 else r[j]
+
+
+cdef public int32_t lav_interior_newton(const elements_t* e, const factor_t* f, interior_t* p, double eps,
+                                        int32_t rounds) noexcept nogil:
+    """One Newton step (5) of bounded rows from z and hz = H z, in which refinement takes eps away again.
+
+    Returns 0 where the step is not finite; z is then as it was.
+    """
+    cdef int32_t j, _
+    cdef double x, left, last = 1.7976931348623157e308, size = 0.0
+    for j in range(e.m):
+        x = z_end(e, j, p.z[j] - p.hz[j] + e.g[j])
+        p.v[j] = 0.0 if x != 0.0 else 1.0 / (e.theta[j] + eps)
+        p.r[j] = -(p.hz[j] - e.g[j]) if x == 0.0 else -(p.z[j] - (e.lower[j] if x < 0.0 else e.upper[j]))
+        size = fabs(p.r[j]) if fabs(p.r[j]) > size else size
+    lav_normal_matrix(e, p.v, f, 0)
+    lav_block_cholesky(f)
+    solve_free(e, f, p, p.r, p.dz)
+    for _ in range(rounds):
+        times_h(e, f.n, p.dz, p.y, p.q)
+        left = 0.0
+        for j in range(e.m):                            # what the step leaves of -F
+            x = p.r[j] - (p.q[j] if p.v[j] > 0.0 else p.dz[j])
+            p.hz[j] = x
+            left = fabs(x) if fabs(x) > left else left
+        if not left < 0.5 * last or left <= 1e-16 * size:
+            break
+        last = left
+        solve_free(e, f, p, p.hz, p.da)
+        for j in range(e.m):
+            p.dz[j] += p.da[j]
+    x = 0.0
+    for j in range(e.m):
+        x += p.dz[j] * 0.0
+    if x == 0.0:
+        for j in range(e.m):
+            p.z[j] += p.dz[j]
+    times_h(e, f.n, p.z, p.y, p.hz)
+    lav_convex_error(e, p.z, p.hz, p.speed, &p.energy, &p.velocity)
+    return x == 0.0
+
+
+cdef public int32_t lav_interior_step(const elements_t* e, const factor_t* f, interior_t* p) noexcept nogil:
+    """(3) and (4) from z, u1, u2 and hz = H z; returns 0 where the factorisation or the step fails.
+
+    The elements' bounds are read at every step, so e may not change between steps.
+    """
+    cdef int32_t j, lost
+    cdef double gap, after, sigma = 0.0, x
+    lav_ipm_scale(e, p.z, p.u1, p.u2, p.delta, p.v, p.bt, &gap)
+    lav_normal_matrix(e, p.v, f, 0)
+    lost = lav_block_cholesky(f)
+    if lost > 0 and gap - gap != 0.0:
+        return 0
+    for j in range(e.m):
+        p.r[j] = e.g[j] - p.hz[j]
+    solve_barrier(e, f, p, p.r, p.da)
+    if p.degree > 0.0 and gap > 0.0:
+        lav_ipm_affine(e, p.z, p.u1, p.u2, p.da, &after)
+        x = after / gap
+        x = 1.0 if x > 1.0 else x if x > 0.0 else 0.0
+        sigma = x * x * x
+    x = sigma * gap / (p.degree if p.degree > 1.0 else 1.0)
+    lav_ipm_rhs(e, p.z, p.u1, p.u2, p.hz, p.da, x, p.r)
+    solve_barrier(e, f, p, p.r, p.dz)
+    after = 0.0
+    for j in range(e.m):
+        after += p.dz[j] * 0.0
+    if after != 0.0:
+        return 0
+    p.length = lav_ipm_update(e, p.z, p.u1, p.u2, p.dz, p.da, x, p.damping, p.t, p.q)
+    p.gap = gap / (p.degree if p.degree > 1.0 else 1.0)
+    times_h(e, f.n, p.z, p.y, p.hz)
+    lav_convex_error(e, p.z, p.hz, p.speed, &p.energy, &p.velocity)
+    return p.length > 0.0
+
+
 # -- Python entry -----------------------------------------------------------------------------------
 
 
@@ -1511,20 +1866,31 @@ cdef class Elements:
     cdef readonly int m, n, n_small
 
     def __init__(self, ptr, kind, wptr, node, slot, panel, theta, g, lower, upper, at, as_, int s):
-        scaling = np.zeros(10 * len(kind) if len(kind) < len(g) else 0)
-        self.keep = [ptr, kind, wptr, node, slot, panel, theta, g, lower, upper, at, as_, scaling]
+        scaling = np.empty(2 * CONE * len(kind) if len(kind) < len(g) else 0)
+        cdef const int32_t[:, ::1] of = node
+        cdef int32_t i, k = 0
+        group_array = np.empty(len(kind) + 1, np.int32)
+        cdef int32_t[::1] group = group_array
+        for i in range(of.shape[0]):
+            if i == 0 or of[i, 0] != of[i - 1, 0] or of[i, 1] != of[i - 1, 1]:
+                group[k] = i
+                k += 1
+        group[k] = <int32_t>of.shape[0]
+        self.keep = [ptr, kind, wptr, node, slot, panel, theta, g, lower, upper, at, as_, scaling, group_array]
         self.n = len(kind)
         self.m = len(g)
         self.n_small = int(wptr[len(kind)])
         self.e = elements_t(
             self.n, self.m, s, <int32_t*>address(ptr), <int32_t*>address(kind), <int32_t*>address(wptr),
-            <int32_t*>address(node), <int32_t*>address(slot), <double*>address(panel), <double*>address(theta),
+            <int32_t*>address(node), <int32_t*>address(slot), k, &group[0], <double*>address(panel), <double*>address(theta),
             <double*>address(g), <double*>address(lower), <double*>address(upper), <double*>address(at),
             <double*>address(as_), <double*>address(scaling))
 
-    def start(self, const double[::1] hz, double dual, double[::1] z, double[::1] u1, double[::1] u2):
-        """z, u inside their cones; returns the degree."""
-        return lav_ipm_start(&self.e, &hz[0], dual, &z[0], &u1[0], &u2[0])
+    def start(self, const double[::1] hz, double size, double[::1] z, double[::1] u1, double[::1] u2, bint apart):
+        """z, u inside their cones, one shift for all of them or each `apart`; returns the degree."""
+        if apart:
+            return lav_ipm_start_apart(&self.e, &hz[0], size, &z[0], &u1[0], &u2[0])
+        return lav_ipm_start(&self.e, &hz[0], size, &z[0], &u1[0], &u2[0])
 
     def scale(self, const double[::1] z, const double[::1] u1, const double[::1] u2, double delta, double[::1] v,
               double[::1] bt=None):
@@ -1590,14 +1956,38 @@ def element_product(Elements e, const double[::1] w, const double[:, ::1] h, dou
 
 
 def panel(Data p, const double[:, :, ::1] inv_inertia, const double[::1] root_mass, double[:, ::1] out):
-    """K = D^-1/2 J M^-1/2 (m, 12) of a factored problem; root_mass (n,) = sqrt(inv_mass)."""
-    cdef int32_t n = <int32_t>root_mass.shape[0]
+    """K = D^-1/2 J M^-1/2 (m, 12) of a factored problem; root_mass (n,) = sqrt(inv_mass).
+
+    Returns the columns that hold anything, of a body's six, as bits.
+    """
+    cdef int32_t n = <int32_t>root_mass.shape[0], used = 0, c
+    cdef int64_t i
     cdef double[::1] root = np.empty(9 * n + 1)
     if out.shape[0] == 0 or n == 0:
-        return
+        return 0
     with nogil:
         lav_inertia_root(n, &inv_inertia[0, 0, 0], &root[0])
         lav_panel(&p.blocks, &p.rows, &root[0], &root_mass[0], &out[0, 0])
+        for i in range(out.shape[0]):
+            for c in range(12):
+                if out[i, c] != 0.0:
+                    used = used | (1 << (c if c < 6 else c - 6))
+            if used == 63:
+                break
+    return used
+
+
+def narrow(const double[:, ::1] panel, const int32_t[::1] keep, const int32_t[::1] ptr, const int32_t[::1] turned,
+           const int32_t[::1] columns, double[:, :, ::1] out):
+    """Rows `keep` and `columns` of a panel (m, 12) into out (mk, 2, s), bodies changed over where `turned` (n,)."""
+    cdef int32_t i, j, c, s = <int32_t>columns.shape[0], h
+    with nogil:
+        for i in range(turned.shape[0]):
+            h = 1 if turned[i] else 0
+            for j in range(ptr[i], ptr[i + 1]):
+                for c in range(s):
+                    out[j, h, c] = panel[keep[j], columns[c]]
+                    out[j, 1 - h, c] = panel[keep[j], 6 + columns[c]]
 
 
 def symbolic(const int32_t[::1] nptr, const int32_t[::1] nind):
@@ -1670,3 +2060,83 @@ cdef class Factor:
         with nogil:
             lav_to_bodies(&e.e, self.n, &x[0], &y[0])
             lav_to_rows(&e.e, &y[0], &out[0])
+
+
+cdef class Interior:
+    """An interior point of the velocity form: `first`, then `step` after `step`."""
+    cdef interior_t p
+    cdef Elements e
+    cdef Factor f
+    cdef list keep
+    cdef readonly object z, hz
+
+    def __init__(self, Elements e, Factor f, v, bt, u1, u2, speed, double delta, double damping):
+        buffer = np.empty((8, e.m + 1))
+        y = np.empty(f.n * f.s + 1)
+        self.e, self.f = e, f
+        self.keep = [v, bt, u1, u2, speed, buffer, y]
+        self.z, self.hz = buffer[0, : e.m], buffer[1, : e.m]
+        cdef double[:, ::1] b = buffer
+        cdef double* root = NULL
+        if bt is not None:
+            root = <double*>address(bt)
+        self.p = interior_t(
+            delta, damping, 0.0, &b[0, 0], <double*>address(u1), <double*>address(u2), &b[1, 0], <double*>address(v),
+            root, &b[2, 0], &b[3, 0], &b[4, 0], &b[5, 0], &b[6, 0],
+            <double*>address(y), <double*>address(speed), 0.0, 0.0, 0.0, 0.0)
+
+    def first(self, double weight, double free_weight):
+        """z with (H + weight) z = g, hz = H z."""
+        self.f.lu = False
+        with nogil:
+            lav_interior_first(&self.e.e, &self.f.f, &self.p, weight, free_weight)
+
+    def refine(self):
+        """One refinement of the first point, with the factor of `first`."""
+        with nogil:
+            lav_interior_refine(&self.e.e, &self.f.f, &self.p)
+
+    def outside(self):
+        """How many rows z puts beyond their bounds."""
+        cdef int32_t j, count = 0
+        for j in range(self.e.m):
+            count += z_end(&self.e.e, j, self.p.z[j]) != 0.0
+        return count
+
+    def place(self, const double[::1] z):
+        """z as the point of `newton`: (|F|, velocity error)."""
+        cdef int32_t j
+        for j in range(self.e.m):
+            self.p.z[j] = z[j]
+        times_h(&self.e.e, self.f.n, self.p.z, self.p.y, self.p.hz)
+        return self.error()
+
+    def error(self):
+        """(|F|, velocity error) of z, hz."""
+        lav_convex_error(&self.e.e, self.p.z, self.p.hz, self.p.speed, &self.p.energy, &self.p.velocity)
+        return self.p.energy, self.p.velocity
+
+    def newton(self, double eps, int rounds):
+        """One Newton step of bounded rows: (whether it is finite, |F|, velocity error)."""
+        cdef int32_t ok
+        self.f.lu = False
+        with nogil:
+            ok = lav_interior_newton(&self.e.e, &self.f.f, &self.p, eps, rounds)
+        return bool(ok), self.p.energy, self.p.velocity
+
+    def begin(self, double size, bint apart):
+        """z, u1, u2 inside their cones, one shift for all of them or each `apart`; returns the degree."""
+        if apart:
+            self.p.degree = lav_ipm_start_apart(&self.e.e, self.p.hz, size, self.p.z, self.p.u1, self.p.u2)
+        else:
+            self.p.degree = lav_ipm_start(&self.e.e, self.p.hz, size, self.p.z, self.p.u1, self.p.u2)
+        times_h(&self.e.e, self.f.n, self.p.z, self.p.y, self.p.hz)
+        return self.p.degree
+
+    def step(self):
+        """One predictor-corrector step: (whether it went, length, gap / degree before it, |F| and velocity error)."""
+        cdef int32_t ok
+        self.f.lu = False
+        with nogil:
+            ok = lav_interior_step(&self.e.e, &self.f.f, &self.p)
+        return bool(ok), self.p.length, self.p.gap, self.p.energy, self.p.velocity

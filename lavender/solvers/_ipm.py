@@ -37,7 +37,9 @@ DENSE_LIMIT = 6000  # rows; 288 MB of A
 # matters, far above the rounding of a pivot.
 START = 1e-6  # W of the first point: nearly H z = g
 DUAL_START = 0.01  # size of the first duals, relative to the first impulses (measured: 0.001 to 1)
+MARGIN = 0.1  # distance of a first point from its cones' boundaries, of mean sizes (measured: 0.03 to 1)
 DELTA = 1e-10
+DAMPING = 0.995  # share of the way to the boundary that a step takes
 
 
 @dataclass
@@ -63,6 +65,12 @@ class Scaled:
     @property
     def m(self) -> int:
         return len(self.keep)
+
+    @cached_property
+    def speed(self) -> FloatArray:
+        """Velocity error (m,) per unit of the natural map."""
+        weight = self.problem.data.weight
+        return np.asarray((weight if self.whole else weight[self.keep]) * self.scale)
 
     def impulse(self, z: FloatArray) -> FloatArray:
         """lambda (m,) of z."""
@@ -112,11 +120,43 @@ def _scaled_contacts(problem: Problem) -> Scaled:
     )
 
 
+def _scaled_rows(problem: Problem) -> Scaled:
+    """Bounded rows that all move."""
+    cones, m = problem.cones, problem.m
+    scale = 1.0 / np.sqrt(problem.d)
+    rows, compliance = problem.rows, problem.compliance
+    index, zero = np.arange(m + 1, dtype=np.int32), np.zeros(m)
+    bodies = None
+    if rows is not None:
+        bodies = np.concatenate([rows.joint_body, rows.contact_body]) if rows.n_joints else rows.contact_body
+        if len(bodies) < m:
+            bodies = np.repeat(bodies, np.diff(cones.ptr), axis=0)
+        bodies = np.ascontiguousarray(bodies, np.int32)
+    return Scaled(
+        problem,
+        index[:-1],
+        zero,
+        scale,
+        problem.b * scale,
+        zero if compliance is None else compliance * scale * scale,
+        index,
+        np.zeros(m, np.int32),
+        index,
+        cones.lower / scale,
+        cones.upper / scale,
+        zero,
+        zero,
+        bodies,
+    )
+
+
 def scaled(problem: Problem) -> Scaled:
     """Scale, and take out what cannot move."""
     if problem.m and _all_slide(problem):
         return _scaled_contacts(problem)
     cones, d, m = problem.cones, problem.d, problem.m
+    if cones.is_bounded_rows and len(problem.data.empty) == 0 and bool(np.all(cones.lower < cones.upper)):
+        return _scaled_rows(problem)
     size: IntArray = np.diff(cones.ptr).astype(np.int32)
     single = cones.is_bounded_rows
     fixed = np.zeros(m)
@@ -267,23 +307,14 @@ class VelocitySystem(System):
         super().__init__(sc)
         rows = sc.problem.rows
         assert rows is not None and sc.bodies is not None
-        full = np.zeros((sc.problem.m, 12))
-        kernels.panel(sc.problem.data, rows.inv_inertia, np.sqrt(rows.inv_mass), full)
-        if not sc.whole:
-            full = full[sc.keep]
-        used = np.any(full.reshape(-1, 2, 6), axis=(0, 1)).reshape(6)
-        s = max(1, int(used.sum()))
-        s = next(k for k in (1, 2, 3, 6) if k >= s)
-        columns = np.flatnonzero(used)
-        if len(columns) < s:
-            columns = np.concatenate([columns, np.flatnonzero(~used)])[:s]
-        columns.sort()
-        halves = full.reshape(-1, 2, 6)[:, :, columns] if s < 6 else full.reshape(-1, 2, 6)
-        body = sc.bodies
-        nptr, nind, node, slot, swap = block_pattern(rows.n_bodies, body)
-        turned = np.repeat(swap, np.diff(sc.ptr))
-        halves = np.ascontiguousarray(halves)
-        halves[turned] = halves[turned][:, ::-1]
+        full = np.zeros((sc.problem.m, 12)) if rows.n_bodies == 0 else np.empty((sc.problem.m, 12))
+        used = kernels.panel(sc.problem.data, rows.inv_inertia, np.sqrt(rows.inv_mass), full)
+        columns = [c for c in range(6) if used >> c & 1]
+        s = next(k for k in (1, 2, 3, 6) if k >= len(columns))
+        columns = sorted((columns + [c for c in range(6) if not used >> c & 1])[:s])
+        nptr, nind, node, slot, turned = block_pattern(rows.n_bodies, sc.bodies)
+        halves = np.empty((sc.m, 2, s))
+        kernels.narrow(full, sc.keep, sc.ptr, turned, np.array(columns, np.int32), halves)
         self.s, self.n = s, rows.n_bodies
         self.elements = self._elements(node, slot, halves, s)
         self.structure = (nptr, nind, *kernels.symbolic(nptr, nind))
@@ -295,19 +326,31 @@ class VelocitySystem(System):
         self.factor: Any = None
         self.factor_unsymmetric = False
 
-    def _factor(self, lu: bool) -> bool:
+    @cached_property
+    def newton(self) -> Any:
+        """Newton steps of bounded rows; None where there are cones."""
+        sc = self.sc
+        if type(self) is not VelocitySystem or len(sc.kind) < sc.m:
+            return None
+        u = np.empty(sc.m)
+        return kernels.Interior(
+            self.elements, self.blocks(False), self.v, None, u, u, sc.speed, DELTA, DAMPING
+        )
+
+    def blocks(self, lu: bool) -> Any:
+        """The factor's storage, made when it is first needed."""
         if self.factor is None or (lu and not self.factor_unsymmetric):
             self.factor = kernels.Factor(*self.structure, self.s, lu)
             self.factor_unsymmetric = lu
+        return self.factor
+
+    def _factor(self, lu: bool) -> bool:
         self.factorisations += 1
-        return self.factor.factor(self.elements, self.v, lu) == 0
+        return self.blocks(lu).factor(self.elements, self.v, lu) == 0
 
     def times(self, z: FloatArray) -> FloatArray:
-        if self.factor is None:
-            self.factor = kernels.Factor(*self.structure, self.s, False)
-            self.factor_unsymmetric = False
         out = np.empty_like(z)
-        self.factor.gram(self.elements, z, self.y, out)
+        self.blocks(False).gram(self.elements, z, self.y, out)
         return out + self.sc.theta * z
 
     def factor_barrier(self) -> bool:
@@ -459,11 +502,11 @@ class MatrixSystem(System):
         return self.solver(r)
 
 
-def block_pattern(n: int, body: IntArray) -> tuple[IntArray, IntArray, IntArray, IntArray, Any]:
+def block_pattern(n: int, body: IntArray) -> tuple[IntArray, IntArray, IntArray, IntArray, IntArray]:
     """Lower block rows (nptr, nind); places (larger first) and slots of each element; which ones were turned."""
     if n <= FEW_BODIES:
         nptr, nind, node, slot, turned = graph.body_pattern(body, n)
-        return nptr, nind, node, slot, turned.astype(bool)
+        return nptr, nind, node, slot, turned
     a, b = body[:, 0].astype(np.int64), body[:, 1].astype(np.int64)
     both = (a >= 0) & (b >= 0)
     code = np.unique(np.minimum(a, b)[both] * n + np.maximum(a, b)[both])
@@ -478,12 +521,13 @@ def block_pattern(n: int, body: IntArray) -> tuple[IntArray, IntArray, IntArray,
     node = np.where(body >= 0, rank[np.maximum(body, 0)], -1).astype(np.int32)
     turned = node[:, 0] < node[:, 1]
     node[turned] = node[turned][:, ::-1]
+    node = np.ascontiguousarray(node)
     first, second = node[:, 0].astype(np.int64), node[:, 1].astype(np.int64)
     slot = np.zeros((len(body), 3), np.int32)
     slot[:, 0] = nptr[np.maximum(first, 0) + 1] - 1
     slot[:, 1] = nptr[np.maximum(second, 0) + 1] - 1
     slot[both, 2] = np.searchsorted(key, first[both] * n + second[both])
-    return nptr, nind, node, slot, turned
+    return nptr, nind, node, slot, turned.astype(np.int32)
 
 
 def _fill_reducing(n: int, low: Any, high: Any) -> Any:
@@ -515,16 +559,30 @@ class InteriorPoint:
 
     system: System
     delta: float = DELTA
+    apart: bool = False  # the first point leaves each boundary by what that one needs, not all by the worst
     z: FloatArray = field(init=False)
     everything: FloatArray = field(init=False)
     gap: float = field(init=False, default=np.inf)  # G z . u / degree
     lowest_gap: float = field(init=False, default=np.inf)  # before this step
     first_gap: float = field(init=False, default=0.0)
     length: float = field(init=False, default=1.0)
+    error: tuple[float, float] | None = field(init=False, default=None)  # of z, where a step has it anyway
 
     def __post_init__(self) -> None:
         sy, sc = self.system, self.system.sc
         m = sc.m
+        self.u1, self.u2 = np.zeros(m), np.zeros(m)
+        self.inner: Any = None
+        if type(sy) is VelocitySystem and type(self) is InteriorPoint:
+            self.inner = kernels.Interior(
+                sy.elements, sy.blocks(False), sy.v, sy.bt, self.u1, self.u2, sc.speed, self.delta, DAMPING
+            )
+            sy.factorisations += 1
+            self.inner.first(START, DELTA)
+            self.z = self.inner.z
+            self.everything = self.z.copy()
+            self.degree = self.inner.begin(MARGIN if self.apart else DUAL_START, self.apart)
+            return
         size = np.diff(sc.ptr)
         free = (
             (sc.kind == ROW) & np.isinf(sc.lower[sc.ptr[:-1]]) & np.isinf(sc.upper[sc.ptr[:-1]])
@@ -538,16 +596,24 @@ class InteriorPoint:
         sy.v[diagonal] = 1.0 / (sc.theta + np.where(np.repeat(free, size), DELTA, START))
         if sy.bt is not None:
             sy.bt[:] = np.sqrt(sy.v)
-        self.u1, self.u2 = np.zeros(m), np.zeros(m)
         self.t1, self.t2, self.r = np.zeros(m), np.zeros(m), np.zeros(m)
         sy.factor_barrier()
         self.z = sy.solve_barrier(sc.g)
         self.everything = self.z.copy()  # nearly H z = g on every row: where all of them hold, the answer
-        self.degree = sy.elements.start(sy.times(self.z), DUAL_START, self.z, self.u1, self.u2)
+        shift = MARGIN if self.apart else DUAL_START
+        self.degree = sy.elements.start(sy.times(self.z), shift, self.z, self.u1, self.u2, self.apart)
 
     def step(self) -> bool:
         """One predictor-corrector step; False where the factorisation or the step fails."""
         sy, sc, e = self.system, self.system.sc, self.system.elements
+        if self.inner is not None:
+            sy.factorisations += 1
+            went, self.length, mu, energy, velocity = self.inner.step()
+            self.error = energy, velocity
+            self.lowest_gap = min(self.lowest_gap, self.gap)
+            self.gap = mu
+            self.first_gap = max(self.first_gap, mu)
+            return went
         z, u1, u2 = self.z, self.u1, self.u2
         hz = sy.times(z)
         gap = e.scale(z, u1, u2, self.delta, sy.v, sy.bt)
@@ -564,7 +630,7 @@ class InteriorPoint:
         dz = sy.solve_barrier(self.r)
         if not np.isfinite(dz).all():
             return False
-        self.length = e.step(z, u1, u2, dz, da, sigma * mu, 0.995, self.t1, self.t2)
+        self.length = e.step(z, u1, u2, dz, da, sigma * mu, DAMPING, self.t1, self.t2)
         self.lowest_gap = min(self.lowest_gap, self.gap)
         self.gap = mu
         self.first_gap = max(self.first_gap, mu)

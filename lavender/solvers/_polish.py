@@ -14,8 +14,8 @@ from time import perf_counter
 import numpy as np
 
 from lavender._arrays import FloatArray
-from lavender.residuals import check_certificate, quick
-from lavender.solvers._ipm import CONVEX, System
+from lavender.residuals import check_certificate, quick, reference
+from lavender.solvers._ipm import CONVEX, InteriorPoint, System, VelocitySystem
 
 EPS = 1e-9  # proximal weight of the polish, relative to d; refinement takes it away again
 INNER_STEPS = 20  # Newton steps of one proximal round at most
@@ -59,6 +59,17 @@ class Run:
         if relative < self.best:
             self.best, self.best_z = relative, z.copy()
         return relative
+
+    def error(self, ip: InteriorPoint) -> float:
+        """Relative residual of an interior point of the convex law; the judge's where a step does not know it."""
+        return self.score(ip.z) if ip.error is None else self.relative(*ip.error)
+
+    def relative(self, energy: float, velocity: float) -> float:
+        """Relative residual of the judge's two errors; inf where one is not finite."""
+        energy_start, velocity_start = reference(self.system.sc.problem)
+        energy = 0.0 if energy == 0.0 else energy / energy_start if energy_start > 0.0 else np.inf
+        velocity = 0.0 if velocity == 0.0 else velocity / velocity_start if velocity_start > 0.0 else np.inf
+        return max(energy, velocity) if energy + velocity < np.inf else np.inf
 
     def reached(self) -> bool:
         return self.best <= self.tol
@@ -112,6 +123,9 @@ def refined(system: System, rhs: FloatArray, rounds: int = 2) -> FloatArray:
 def polish(run: Run, z: FloatArray, law: int = CONVEX, *, patience: int = 2, limit: int = 12) -> None:
     """Newton steps from z until the judge is content or `patience` of them gain nothing."""
     system = run.system
+    if law == CONVEX and isinstance(system, VelocitySystem) and system.newton is not None:
+        _polish_rows(run, system, z, patience, limit)
+        return
     f = np.empty_like(z)
     worse = 0
     best = run.score(z)
@@ -131,6 +145,42 @@ def polish(run: Run, z: FloatArray, law: int = CONVEX, *, patience: int = 2, lim
         best = min(best, relative)
         if worse >= patience or (worse and run.at_floor()):
             return
+
+
+def _polish_rows(run: Run, system: VelocitySystem, z: FloatArray, patience: int, limit: int) -> None:
+    """The same for bounded rows, a whole step in compiled code."""
+    steps = system.newton
+    best = relative = run.relative(*steps.place(z))
+    worse, kept, judged = 0, z, False
+    try:
+        for _ in range(limit):
+            if best <= run.tol:
+                judged = True
+                if run.score(kept) <= run.tol:
+                    return
+            if run.done():
+                return
+            system.factorisations += 1
+            finite, energy, velocity = steps.newton(EPS, 2)
+            run.count("polish steps")
+            if not finite:
+                return
+            relative = run.relative(energy, velocity)
+            if relative > 1e3 * best:
+                return
+            worse = 0 if relative < 0.5 * best else worse + 1
+            if relative < best:
+                best, kept, judged = relative, steps.z.copy(), False
+            if worse >= patience:
+                return
+            if worse and best < 1e-5:
+                judged = True
+                run.score(kept)
+                if run.at_floor():
+                    return
+    finally:
+        if not judged:
+            run.score(kept)
 
 
 @dataclass
