@@ -104,6 +104,8 @@ class SolverSpec:
 
     def missing(self) -> str | None:
         """None when the solver can run here, else what to install."""
+        if not self.requires:
+            return None
         absent = [m for m in self.requires if not _importable(m)]
         if not absent:
             return None
@@ -202,13 +204,14 @@ def get(name: str) -> SolverSpec:
     SolverUnavailable
         Its package is not installed; the message says what to install.
     """
-    table = specs()
-    if not isinstance(name, str) or name not in table:
-        raise UnknownName("solver", name, table)
-    reason = table[name].missing()
+    _load_builtin_and_plugins()
+    spec = _registered.get(name) if isinstance(name, str) else None
+    if spec is None:
+        raise UnknownName("solver", name, specs())
+    reason = spec.missing()
     if reason:
         raise SolverUnavailable(f"solver {name!r} {reason}")
-    return table[name]
+    return spec
 
 
 def known(problem: Problem | None = None) -> dict[str, str | None]:

@@ -13,6 +13,7 @@ from time import perf_counter
 from typing import Any
 
 import numpy as np
+from lavender_ext.judge import all_finite
 
 from lavender._arrays import FloatArray, equal
 from lavender.cones import ROW
@@ -224,7 +225,7 @@ class _Loop:
         try:
             return self.solver.run(self.state, self.impulse, max_iter, self.tol, self.time_limit)
         except KeyboardInterrupt:
-            if not np.isfinite(self.impulse).all():
+            if not all_finite(self.impulse):
                 self.impulse[:] = start_point
             return Claim(Status.INTERRUPTED, 0, {}, "Ctrl-C")
         finally:
@@ -291,6 +292,8 @@ class _Loop:
     _next_record = 0
 
     def _total(self, claim: Claim) -> Claim:
+        if claim.iterations == self.done and claim.work == self.work:
+            return claim  # of a single chunk
         return Claim(
             claim.status, self.done, self.work, claim.message, claim.form, claim.dual, claim.certificate
         )
@@ -323,7 +326,7 @@ def finish(
     judged = residual(problem, impulse)
     status, message = claim.status, claim.message
     relative = judged.relative
-    if status is not Status.NUMERICAL_ERROR and not np.isfinite(impulse).all():
+    if status is not Status.NUMERICAL_ERROR and not all_finite(impulse):
         status = Status.DIVERGED
     elif (
         tol > 0.0 and relative <= tol and status in (Status.MAX_ITERATIONS, Status.TIME_LIMIT, Status.STALLED)
@@ -344,21 +347,21 @@ def finish(
         )
         contradicted = f"says INFEASIBLE, {reason}" if reason else ""
     impulse.flags.writeable = False
-    return Solution(
-        impulse=impulse,
-        residual=judged,
-        status=status,
-        tol=tol,
-        iterations=claim.iterations,
-        work=claim.work,
-        setup_time=setup_time,
-        solve_time=solve_time,
-        solver=SolverRun(spec.name, options, claim.form),
-        message=message,
-        history=history,
-        dual=claim.dual,
-        certificate=claim.certificate,
-        contradicted=contradicted,
+    return Solution._trusted(
+        impulse,
+        judged,
+        status,
+        tol,
+        claim.iterations,
+        claim.work,
+        setup_time,
+        solve_time,
+        SolverRun(spec.name, options, claim.form),
+        message,
+        history,
+        claim.dual,
+        claim.certificate,
+        contradicted,
     )
 
 

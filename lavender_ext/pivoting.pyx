@@ -10,7 +10,7 @@ s > 0 is the proximal shift of a singular matrix. Free rows are numbered compact
 elimination, so the bandwidth of A never grows; a dense matrix is a band of full width. A linear system is
 the case of all rows free.
 """
-from libc.math cimport fabs, sqrt
+from libc.math cimport fabs
 from libc.stdint cimport int32_t, int64_t
 
 import numpy as np
@@ -42,7 +42,7 @@ cdef struct pivoting_t:
     const blocks_t* p           # b, d, lower, upper
     int32_t n
     int32_t band                # half bandwidth in order of elimination
-    const int32_t* order        # (n) row eliminated first, second, ...
+    const int32_t* order        # (n) row eliminated first, second, ...; not read where natural
     int32_t natural             # order is 0, 1, ...
     int32_t* at                 # (n) FREE | AT_LOWER | AT_UPPER
     int32_t* place              # (n) place among the free rows, -1
@@ -116,7 +116,7 @@ cdef public void lav_pivot_factor(pivoting_t* s) noexcept nogil:
     cdef const csr_t* a = s.a
     cdef double* col
     for r in range(s.n):
-        i = s.order[r]
+        i = r if s.natural else s.order[r]
         s.place[i] = -1
         if s.at[i] == FREE:
             s.place[i] = k
@@ -248,31 +248,19 @@ cdef public void lav_pivot_place(pivoting_t* s) noexcept nogil:
             s.x[i] = s.p.upper[i]
 
 
-cdef public void lav_pivot_score(const pivoting_t* s, const double* nu, double* out) noexcept nogil:
-    """The judge's four sums for x as it stands, s = 0: energy, velocity of e, then of f, into out[4].
-
-    e = w / d on free rows and where w has the wrong sign at a bound, 0 elsewhere.
-    """
+cdef public void lav_pivot_predict(pivoting_t* s) noexcept nogil:
+    """Sides from x and w: where x - w / d falls; w of this x."""
     cdef int32_t i
-    cdef double t, v, energy = 0.0, floor = 0.0, fast = 0.0, fast_floor = 0.0
+    cdef double y
     for i in range(s.n):
-        t = s.w[i]
-        if s.p.lower[i] == s.p.upper[i] or (s.at[i] == AT_LOWER and t > 0.0) or (
-                s.at[i] == AT_UPPER and t < 0.0):
-            t = 0.0
-        v = nu[i] * s.p.step[i]
-        t = t * t
-        energy += t * s.p.step[i]
-        t = t * v
-        fast = t if t > fast else fast
-        t = s.f[i] * s.f[i]
-        floor += t * s.p.step[i]
-        t = t * v
-        fast_floor = t if t > fast_floor else fast_floor
-    out[0] = sqrt(energy)
-    out[1] = sqrt(fast)
-    out[2] = sqrt(floor)
-    out[3] = sqrt(fast_floor)
+        y = s.x[i] - s.w[i] / s.p.d[i]
+        if y <= s.p.lower[i] or s.p.lower[i] == s.p.upper[i]:
+            s.at[i] = AT_LOWER
+        elif y >= s.p.upper[i]:
+            s.at[i] = AT_UPPER
+        else:
+            s.at[i] = FREE
+    s.is_factored = 0
 
 
 cdef public void lav_pivot_sweep(pivoting_t* s, int32_t n) noexcept nogil:
@@ -292,6 +280,37 @@ cdef public void lav_pivot_sweep(pivoting_t* s, int32_t n) noexcept nogil:
         for i in range(s.n - 1, -1, -1):
             w = csr_dot(s.a, i, x) - s.p.b[i]
             x[i] = relax_row(x[i], w, omega * s.p.step[i], s.p.lower[i], s.p.upper[i])
+
+
+cdef public void lav_pivot_solve_free(pivoting_t* s) noexcept nogil:
+    """x = A^-1 b, all rows free and factored; w is left alone."""
+    cdef int32_t i
+    cdef double* y = s.x if s.natural else s.y
+    for i in range(s.n):
+        y[i if s.natural else s.place[i]] = s.p.b[i]
+    ldl_solve(s.n, s.width, s.c, y)
+    if not s.natural:
+        for i in range(s.n):
+            s.x[i] = y[s.place[i]]
+
+
+cdef public int32_t lav_pivot_all_free(pivoting_t* s) noexcept nogil:
+    """Are all rows free at the solution? 1, with x, where A is positive definite and x within its bounds."""
+    cdef int32_t i
+    for i in range(s.n):
+        if s.p.lower[i] == s.p.upper[i]:
+            return 0
+        s.at[i] = FREE
+    lav_pivot_factor(s)
+    if s.found.negative > 0 or s.found.small > 0:
+        s.is_factored = 0
+        return 0
+    lav_pivot_solve_free(s)
+    for i in range(s.n):
+        if not s.p.lower[i] <= s.x[i] <= s.p.upper[i]:
+            s.is_factored = 0
+            return 0
+    return 1
 
 
 cdef public int32_t lav_pivot_rounds(pivoting_t* s, int32_t rounds) noexcept nogil:
@@ -377,7 +396,7 @@ def free_block(const int32_t[::1] indptr, const int32_t[::1] indices, const doub
 
 
 cdef class Pivoting:
-    """Work arrays of one problem; all methods but `rounds` serve drivers with another factorisation.
+    """Work arrays of one problem; all methods but `rounds` and `solve` serve drivers with another factorisation.
 
     Parameters
     ----------
@@ -385,42 +404,43 @@ cdef class Pivoting:
         Of A in compressed rows.
     band : int
         Half bandwidth of A in order of elimination, at most m - 1; -1: no room for a factor.
-    order : (m,) int32
-        Row eliminated first, second, ...
+    order : (m,) int32 or None
+        Row eliminated first, second, ...; None: as they stand.
     """
 
     cdef pivoting_t s
     cdef Data p
-    cdef readonly object at, place, x, w, f, center
-    cdef object keep
+    cdef object reals, ints, order
 
-    def __init__(self, Data p, int band, const int32_t[::1] order, double tiny):
+    def __init__(self, Data p, int band, order, double tiny):
         cdef int32_t m = p.blocks.n_rows, i
         cdef int64_t room = 1 if band < 0 else <int64_t>m * (band + 1) + 1
+        cdef const int32_t[::1] given
+        cdef double[::1] reals
+        cdef int32_t[::1] ints
         # One block for the vectors and the factor: two allocations in all.
-        cdef double[::1] reals = np.empty(6 * m + room)
-        cdef int32_t[::1] ints = np.zeros(2 * m + 1, np.int32)
+        self.reals = np.empty(6 * m + room)
+        self.ints = np.zeros(2 * m + 1, np.int32)
+        reals, ints = self.reals, self.ints
         cdef double* base = &reals[0]
         if p.factored:
             raise ValueError("Pivoting reads A in compressed rows")
-        if order.shape[0] != m:
-            raise ValueError("order must name every row once")
         self.p = p
-        whole, whole_ints = np.asarray(reals), np.asarray(ints)
-        self.keep = (whole, whole_ints, order)
-        self.x, self.w = whole[:m], whole[m:2 * m]
-        self.f, self.center = whole[2 * m:3 * m], whole[3 * m:4 * m]
-        self.at, self.place = whole_ints[:m], whole_ints[m:2 * m]
+        self.order = order
         self.s.a = &p.csr
         self.s.p = &p.blocks
         self.s.n = m
         self.s.band = band
         self.s.tiny = tiny
         self.s.natural = 1
-        for i in range(m):
-            self.s.natural &= order[i] == i
-        if m:
-            self.s.order = &order[0]
+        if order is not None:
+            given = order
+            if given.shape[0] != m:
+                raise ValueError("order must name every row once")
+            for i in range(m):
+                self.s.natural &= given[i] == i
+            if m:
+                self.s.order = &given[0]
         self.s.x = base
         self.s.w = base + m
         self.s.f = base + 2 * m
@@ -432,6 +452,36 @@ cdef class Pivoting:
         self.s.place = &ints[0] + m
         self.start(0.0)
 
+    @property
+    def x(self):
+        """(m,) N s"""
+        return self.reals[:self.s.n]
+
+    @property
+    def w(self):
+        """(m,) m/s, (2)"""
+        return self.reals[self.s.n:2 * self.s.n]
+
+    @property
+    def f(self):
+        """(m,) m/s, rounding of w"""
+        return self.reals[2 * self.s.n:3 * self.s.n]
+
+    @property
+    def center(self):
+        """(m,) N s"""
+        return self.reals[3 * self.s.n:4 * self.s.n]
+
+    @property
+    def at(self):
+        """(m,) 0 free, -1 at the lower bound, 1 at the upper"""
+        return self.ints[:self.s.n]
+
+    @property
+    def place(self):
+        """(m,) place among the free rows, -1"""
+        return self.ints[self.s.n:2 * self.s.n]
+
     def start(self, double shift):
         """A fresh count of infeasible rows, with this shift; nothing factored."""
         self.s.shift = shift
@@ -442,20 +492,6 @@ cdef class Pivoting:
         """A fresh count of infeasible rows; the factor stays."""
         self.s.best = self.s.n + 1
         self.s.patience = PATIENCE
-
-    def predict(self):
-        """Sides from x and w: where x - w / d falls; w of this x."""
-        cdef int32_t i
-        cdef double y
-        for i in range(self.s.n):
-            y = self.s.x[i] - self.s.w[i] / self.s.p.d[i]
-            if y <= self.s.p.lower[i] or self.s.p.lower[i] == self.s.p.upper[i]:
-                self.s.at[i] = AT_LOWER
-            elif y >= self.s.p.upper[i]:
-                self.s.at[i] = AT_UPPER
-            else:
-                self.s.at[i] = FREE
-        self.s.is_factored = 0
 
     def recenter(self):
         """center <- x."""
@@ -475,14 +511,32 @@ cdef class Pivoting:
             lav_pivot_correct(&self.s)
 
     def solve_free(self):
-        """x = A^-1 b with all rows free and factored, then w."""
-        cdef int32_t i
+        """x = A^-1 b with all rows free and factored; w is left alone."""
         with nogil:
-            for i in range(self.s.n):
-                self.s.x[i] = 0.0
-                self.s.w[i] = -self.s.p.b[i]
-            lav_pivot_correct(&self.s)
-            lav_pivot_slack(&self.s)
+            lav_pivot_solve_free(&self.s)
+
+    def solve(self, const double[::1] start, int sweeps, int n):
+        """A boxed problem: (code as of `rounds`, whether it was swept).
+
+        Where that costs less than the sweeps all rows free first, which may be the end of it. Else `sweeps` symmetric
+        sweeps from `start` (m,), the rows free that they leave free, and at most n rounds.
+        """
+        cdef int32_t i, code = SOLVED, swept
+        # Multiply-adds: (band + 1)^2 / 2 a row against two for each nonzero and sweep.
+        cdef bint cheap = self.s.band >= 0 and n > 0 and self.s.n > 0 and (
+            (self.s.band + 1.0) * (self.s.band + 1) * self.s.n <= 4.0 * sweeps * self.p.csr.indptr[self.s.n])
+        with nogil:
+            swept = not (cheap and lav_pivot_all_free(&self.s))
+            if swept:
+                for i in range(self.s.n):
+                    self.s.x[i] = start[i]
+                lav_pivot_sweep(&self.s, sweeps)
+                lav_pivot_slack(&self.s)
+                lav_pivot_predict(&self.s)
+                code = lav_pivot_rounds(&self.s, n)
+            else:
+                self.s.n_rounds += 1
+        return code, bool(swept)
 
     def slack(self):
         with nogil:
@@ -506,19 +560,6 @@ cdef class Pivoting:
                 k += 1
         self.s.n_free = k
         return k
-
-    def score(self, const double[::1] nu):
-        """(energy, velocity, floor energy, floor velocity) as the judge's, for x as it is; nu (m,); no shift."""
-        cdef double out[4]
-        with nogil:
-            lav_pivot_score(&self.s, &nu[0], out)
-        return out[0], out[1], out[2], out[3]
-
-    def sweep(self, int n):
-        """n symmetric sweeps of projected Gauss-Seidel on x, then w."""
-        with nogil:
-            lav_pivot_sweep(&self.s, n)
-            lav_pivot_slack(&self.s)
 
     def clipped(self, double[::1] out):
         """x within its bounds, into out (m,)."""
@@ -558,12 +599,13 @@ cdef class Pivoting:
 
     def skipped(self):
         """Rows whose pivots were small in the last factorisation, in order of elimination."""
-        cdef int32_t i, at
+        cdef int32_t i, at, row
         found = []
         for i in range(self.s.n):
-            at = self.s.place[self.s.order[i]]
+            row = i if self.s.natural else self.s.order[i]
+            at = self.s.place[row]
             if at >= 0 and self.s.c[<int64_t>at * self.s.width] == 0.0:
-                found.append(self.s.order[i])
+                found.append(row)
         return found
 
     @property

@@ -431,19 +431,3 @@ cdef inline double dot12(const double* x, const double* y) noexcept nogil:
     for k in range(12):
         s += x[k] * y[k]
     return s
-
-
-cdef inline void abs_push(const double* jac, double change, const double* inv_mass, const double* inv_inertia,
-                          int32_t a, int32_t b, double* v) noexcept nogil:
-    # v += |M^-1| |J|^T |lam| of one row, for the rounding floor.
-    cdef int32_t k, i
-    if a >= 0:
-        for k in range(3):
-            v[6 * a + k] += inv_mass[a] * fabs(jac[k]) * change
-            for i in range(3):
-                v[6 * a + 3 + k] += fabs(inv_inertia[9 * a + 3 * k + i]) * fabs(jac[3 + i]) * change
-    if b >= 0:
-        for k in range(3):
-            v[6 * b + k] += inv_mass[b] * fabs(jac[6 + k]) * change
-            for i in range(3):
-                v[6 * b + 3 + k] += fabs(inv_inertia[9 * b + 3 * k + i]) * fabs(jac[9 + i]) * change

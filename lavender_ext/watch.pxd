@@ -44,7 +44,7 @@ cdef struct watch_t:
     double* best                # (m) N s
     double* w                   # (m) scratch
     double* e                   # (m) scratch
-    double* v                   # (n_bodies, 6) scratch
+    double* v                   # (n_bodies, 12) scratch
 
 
 ctypedef void (*sweep_t)(void* context, double* lam, int32_t first_sweep, int32_t n) noexcept nogil

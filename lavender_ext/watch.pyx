@@ -21,7 +21,7 @@ cdef class Watch:
 
     def __init__(self, Data data, int patience=64):
         cdef Py_ssize_t m = data.blocks.n_rows
-        cdef double[::1] scratch = np.empty(3 * m + 6 * data.rows.n_bodies + 4)
+        cdef double[::1] scratch = np.empty(3 * m + 12 * <Py_ssize_t>data.rows.n_bodies + 4)
         self.data = data
         self.keep = scratch
         self.state.best = &scratch[0]

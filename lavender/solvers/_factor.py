@@ -30,15 +30,15 @@ DENSE_LIMIT = 6000  # rows, 288 MB
 GENERAL_LIMIT = 2000  # rows up to which a singular matrix that is not symmetric is decomposed as a dense one
 
 
-def choose(problem: Problem) -> tuple[str, int, IntArray]:
-    """Factorisation, half bandwidth and order of elimination for a symmetric A; by structure alone."""
-    m, nnz = problem.m, problem.csr.nnz
-    order = np.arange(m, dtype=np.int32)
+def choose(problem: Problem) -> tuple[str, int, IntArray | None]:
+    """Factorisation, half bandwidth and order of elimination (None: as given) for a symmetric A; by structure alone."""
+    m = problem.m
     band = max(problem.bandwidth)
     if m <= SMALL_SIZE or band <= SMALL_BAND:
-        return "band", band, order
+        return "band", band, None
+    nnz = problem.csr.nnz
     if nnz >= DENSE_SHARE * m * m and m <= DENSE_LIMIT:
-        return "dense", m - 1, order
+        return "dense", m - 1, None
     # A band needs 2 band + 1 places a row: a mean row of more nonzeros than that has none so narrow.
     if nnz <= (2 * SMALL_BAND + 1) * m:
         from scipy.sparse.csgraph import reverse_cuthill_mckee
@@ -47,7 +47,7 @@ def choose(problem: Problem) -> tuple[str, int, IntArray]:
         band = permuted_band(problem, order)
         if band <= SMALL_BAND:
             return "band", band, order
-    return "sparse", m - 1, np.arange(m, dtype=np.int32)
+    return "sparse", m - 1, None
 
 
 def permuted_band(problem: Problem, order: IntArray) -> int:

@@ -23,7 +23,7 @@ SLOP = 8.0  # roundings of w within which a sign means nothing, as there
 class PivotState:
     """A problem's rows, free or at a bound, and the factorisation that serves them."""
 
-    chosen: tuple[str, int, IntArray]
+    chosen: tuple[str, int, IntArray | None]
 
     def __init__(self, problem: Problem, like: PivotState | None = None) -> None:
         self.problem = problem
@@ -44,13 +44,14 @@ class PivotState:
 
     @property
     def work(self) -> dict[str, int]:
-        """Counted since the state was made."""
+        """Counted since the state was made, what is not 0."""
         r = self.rows
-        return {
-            "factorisations": r.factorisations + self.factorisations,
-            "pivots": r.exchanged + self.exchanged,
-            "line_searches": self.searches,
-        }
+        counts = (
+            ("factorisations", r.factorisations + self.factorisations),
+            ("pivots", r.exchanged + self.exchanged),
+            ("line_searches", self.searches),
+        )
+        return {what: count for what, count in counts if count}
 
     def factorise(self) -> int:
         """Factor the free rows: SOLVED, SMALL or INDEFINITE."""
@@ -64,12 +65,20 @@ class PivotState:
         return SMALL if self.factor.factor(self.rows.place, n_free, self.rows.shift) else SOLVED
 
     def solve_free(self) -> None:
-        """x = A^-1 b with all rows free and factored, then w."""
+        """x = A^-1 b with all rows free and factored."""
         if self.factor is None:
             self.rows.solve_free()
         else:
             self.rows.x[:] = self.factor.solve(self.problem.b)
-            self.rows.slack()
+
+    def solve(self, start: FloatArray, sweeps: int, n: int, stop_at: float | None) -> tuple[int, int, bool]:
+        """A boxed problem from `start`: (outcome, rounds done, whether it was swept)."""
+        rows, before = self.rows, self.rows.n_rounds
+        if self.factor is None:
+            code, swept = rows.solve(start, sweeps, n)
+            return code, rows.n_rounds - before, swept
+        rows.solve(start, sweeps, 0)
+        return *self.rounds(n, stop_at), True
 
     def newton(self) -> None:
         """x_F <- x_F - (A_FF + s D_FF)^-1 w_F."""
@@ -156,8 +165,9 @@ class PivotState:
                 return ROUNDS, done
         return ROUNDS, n
 
-    def impulse(self, out: FloatArray) -> FloatArray:
-        """x clipped to the bounds, into out (m,)."""
+    def impulse(self) -> FloatArray:
+        """x clipped to the bounds (m,); a new array."""
+        out = np.empty(self.problem.m)
         self.rows.clipped(out)
         return out
 

@@ -24,7 +24,7 @@ import numpy as np
 from lavender._arrays import FloatArray
 from lavender.problem import Problem
 from lavender.registry import SolverSpec
-from lavender.residuals import check_certificate, quick, reference
+from lavender.residuals import check_certificate, judged, remember
 from lavender.solution import Claim, Status
 from lavender.solvers._factor import GeneralFactor
 from lavender.solvers._pivoting import INDEFINITE, ROUNDS, SMALL, SOLVED, STUCK, PivotState
@@ -77,9 +77,10 @@ class Direct:
             return run.claim(Status.CONVERGED)
         if n == 0:
             return run.claim(Status.MAX_ITERATIONS)
-        if state.general is not None:
-            return run.linear_general(state.general)
-        return run.pivoting()
+        try:
+            return run.pivoting() if state.general is None else run.linear_general(state.general)
+        finally:
+            run.put_best()
 
 
 def _general(problem: Problem, why: str) -> DirectState:
@@ -99,10 +100,8 @@ class _Run:
     ) -> None:
         self.state, self.problem, self.impulse, self.budget, self.tol = state, state.problem, impulse, n, tol
         self.stop_at = None if time_limit is None else perf_counter() + time_limit
-        m = state.problem.m
-        self.start = impulse.copy()
-        self.w, self.e, self.candidate = np.empty(m), np.empty(m), np.empty(m)
-        self.best, self.floor, self.sure = np.inf, 0.0, True
+        self.kept: judge.Judged | None = None
+        self.best, self.floor, self.last = np.inf, 0.0, np.inf
         self.iterations = 0
         self.work: dict[str, int] = {}
         self.notes = [state.note] if state.note else []
@@ -110,29 +109,32 @@ class _Run:
     # -- judging ---------------------------------------------------------------------------------
 
     def judge(self, x: FloatArray) -> float:
-        """Relative residual of x; the best x becomes the result."""
-        return self.keep(*quick(self.problem, x, self.w, self.e, floor=True), x)
-
-    def judge_pivot(self, pivot: PivotState, solved: bool) -> float:
-        """The same for the pivoting's x, clipped; from its own w and rounding where no shift is in them."""
-        if solved and pivot.rows.shift == 0.0:
-            energy, velocity = reference(self.problem)
-            e, v, floor_e, floor_v = pivot.rows.score(self.problem.data.nu)
-            # Its plain sums of squares: trusted where the floor's neither over- nor underflow.
-            if energy > 0.0 and velocity > 0.0 and np.isfinite(e) and floor_v > 1e-145:
-                relative, floor = max(e / energy, v / velocity), max(floor_e / energy, floor_v / velocity)
-                return self.keep(relative, floor, pivot.impulse(self.candidate), sure=False)
-        return self.judge(pivot.impulse(self.candidate))
-
-    def keep(self, relative: float, floor: float, x: FloatArray, sure: bool = True) -> float:
+        """Relative residual of x, which must not change any more; the best becomes the result."""
+        found = judged(self.problem, x)
+        relative: float = found.relative
         if relative < self.best:
-            self.best, self.floor, self.sure = relative, floor, sure
-            self.impulse[:] = x
+            self.kept, self.best, self.floor = found, relative, found.floor
+        self.last = relative
         return relative
+
+    def put_best(self) -> None:
+        if self.kept is not None:
+            self.impulse[:] = self.kept.impulse
+            remember(self.problem, self.kept)
+
+    @property
+    def impulse_now(self) -> FloatArray:
+        """The best so far, (m,) N s; not to be changed."""
+        return self.impulse if self.kept is None else self.kept.impulse
 
     def good(self) -> bool:
         # A floor above 1e-6 belongs to an impulse that ran away, not to the problem.
         return self.best <= max(GOOD, min(self.floor, RUNAWAY))
+
+    @property
+    def spent(self) -> bool:
+        """No rounds or no time left."""
+        return self.iterations >= self.budget or self.out_of_time
 
     @property
     def out_of_time(self) -> bool:
@@ -143,14 +145,11 @@ class _Run:
         form = "LU" if state.general is not None else state.pivot.form if state.pivot is not None else ""
         work = dict(self.work)
         if state.pivot is not None:
-            work.update({k: v for k, v in state.pivot.work.items() if v})
+            work.update(state.pivot.work)
         return Claim(status, self.iterations, work, "; ".join(self.notes), form=form, **more)
 
     def verdict(self) -> Claim:
         """What the best iterate deserves, when nothing is left to do."""
-        if not self.sure and self.best > 0.1 * self.tol:
-            # Clipping x, or assembling A from rows, moved w by some roundings: near tol the judge decides.
-            self.best, self.floor = quick(self.problem, self.impulse, self.w, self.e, floor=True)
         if self.best <= self.tol:
             return self.claim(Status.CONVERGED)
         if self.best <= 2.0 * self.floor:
@@ -166,12 +165,12 @@ class _Run:
         if not factor.usable:
             return self.claim(Status.NUMERICAL_ERROR)
         singular = factor.rank < problem.m
-        x = self.impulse.copy() if singular else np.zeros(problem.m)
+        x = self.impulse_now if singular else np.zeros(problem.m)
         w = np.empty(problem.m)
         previous = np.inf
         for k in range(8):
             judge.slack(problem.csr_data, x, w)
-            x -= factor.solve(w)
+            x = x - factor.solve(w)
             relative = self.judge(x)
             self.work["refinements"] = k
             if self.good() or not relative < 0.5 * previous:
@@ -193,21 +192,26 @@ class _Run:
         rows = pivot.rows
         code = self.state.outcome
         if self.problem.law == "linear":
-            rows.x[:] = self.impulse
             if code == SOLVED:
                 pivot.solve_free()
                 self.iterations = 1
-                self.refine(pivot, self.judge_pivot(pivot, True))
+                relative = self.judge(pivot.impulse())
+                if not self.good():
+                    rows.slack()
+                    self.refine(pivot, relative)
         else:
-            # Which rows will be free? Where a few sweeps put them.
-            rows.x[:] = self.impulse
-            rows.sweep(SWEEPS)
-            self.work["sweeps"] = 2 * SWEEPS
-            rows.predict()
-            code = self.rounds(pivot)
+            # Which rows will be free? All, or where a few sweeps put them.
+            code, self.iterations, swept = pivot.solve(
+                self.impulse, SWEEPS, min(BATCH, self.budget), self.stop_at
+            )
+            if swept:
+                self.work["sweeps"] = 2 * SWEEPS
+            code = self.after_rounds(pivot, code)
+            if code == ROUNDS and not self.spent:
+                code = self.rounds(pivot)
         if self.good():
             return self.verdict()
-        if code == ROUNDS and (self.iterations >= self.budget or self.out_of_time):
+        if code == ROUNDS and self.spent:
             return self.out_of_budget()
         if code == INDEFINITE:
             return self.indefinite()
@@ -220,14 +224,20 @@ class _Run:
         while True:
             code, done = pivot.rounds(min(BATCH, self.budget - self.iterations), self.stop_at)
             self.iterations += done
-            if code in (SMALL, INDEFINITE):
-                return code
-            relative = self.judge_pivot(pivot, code == SOLVED)
-            if code == SOLVED and pivot.rows.shift == 0.0:
-                code = self.refine(pivot, relative)
+            code = self.after_rounds(pivot, code)
             # Signs that differ by rounding alone exchange for ever; the judge sees that nothing is wrong.
-            if code != ROUNDS or self.good() or self.iterations >= self.budget or self.out_of_time:
+            if code != ROUNDS or self.good() or self.spent:
                 return code
+
+    def after_rounds(self, pivot: PivotState, code: int) -> int:
+        """Judge what rounds left, and refine it."""
+        if code in (SMALL, INDEFINITE):
+            return code
+        relative = self.judge(pivot.impulse())
+        if code == SOLVED and pivot.rows.shift == 0.0 and not self.good():
+            pivot.rows.slack()
+            code = self.refine(pivot, relative)
+        return code
 
     def refine(self, pivot: PivotState, relative: float) -> int:
         """x <- x - A_FF^-1 w while that halves the residual; ROUNDS where it changes a sign."""
@@ -238,7 +248,7 @@ class _Run:
             self.work["refinements"] = self.work.get("refinements", 0) + 1
             if pivot.exchange():
                 return ROUNDS
-            relative = self.judge_pivot(pivot, True)
+            relative = self.judge(pivot.impulse())
         return SOLVED
 
     def out_of_budget(self) -> Claim:
@@ -263,7 +273,7 @@ class _Run:
         problem, rows = self.problem, pivot.rows
         path = list(PATH if stuck else PATH[-1:])
         reference, waited = np.inf, 0
-        rows.x[:] = self.impulse if self.floor <= RUNAWAY else self.start
+        rows.x[:] = self.impulse_now if self.floor <= RUNAWAY else self.impulse
         self.work["shifts"] = 0
         shift = 0.0
         for _ in range(PASSES):
@@ -311,20 +321,20 @@ class _Run:
         code, done = pivot.descend(self.budget - self.iterations, self.stop_at)
         self.iterations += done
         if code in (SOLVED, ROUNDS):
-            self.judge(pivot.impulse(self.candidate))
+            self.judge(pivot.impulse())
         return code
 
     def settle(self, pivot: PivotState) -> None:
         """Refine on the rows found, whatever signs rounding gives: more passes with the same factor."""
         rows, previous = pivot.rows, np.inf
-        relative = self.judge(pivot.impulse(self.candidate))
+        relative = self.last  # of this x
         while not self.good() and relative < 0.5 * previous:
             kept, previous = rows.x.copy(), relative
             rows.recenter()
             rows.slack()
             pivot.correct()
             self.work["refinements"] = self.work.get("refinements", 0) + 1
-            relative = self.judge(pivot.impulse(self.candidate))
+            relative = self.judge(pivot.impulse())
             if not relative < previous:
                 rows.x[:] = kept
 

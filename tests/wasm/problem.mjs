@@ -35,9 +35,9 @@ export function load(k, problem, recorded) {
       inv_inertia: put.inv_inertia, compliance: put.compliance,
     });
     const velocity = k.alloc(48 * (bodies + 1));
-    const scratch = k.alloc(48 * (bodies + 1));
+    const scratch = k.alloc(96 * (bodies + 1));
     f.lav_rows_diagonal(p, r, out.d, out.nu, out.step, empty, put.minv_jac, put.coupling, put.swing);
-    f.lav_judge_rows(p, r, out.impulse, out.slack, out.error, velocity, 0, score); // velocity of the start
+    f.lav_rows_velocity(p, r, out.impulse, velocity);
     return {
       out,
       sweep(n) {
