@@ -800,6 +800,98 @@ cdef public void lav_element_product(const elements_t* e, const double* w, const
             y[j + r] += one
 
 
+# -- H as a band: c[j width + t] = H[j + t, j] of rows in another order, elements whole ---------------------
+
+
+cdef public void lav_band(int32_t m, const int32_t* indptr, const int32_t* indices, const double* a,
+                          const int32_t* place, const double* scale, int32_t width, double* c) noexcept nogil:
+    """Lower half of diag(scale) A diag(scale), its row i at place[i]; scale (m) in A's order."""
+    cdef int32_t i, j, q
+    cdef int64_t n
+    for n in range(<int64_t>m * width):
+        c[n] = 0.0
+    for i in range(m):
+        for q in range(indptr[i], indptr[i + 1]):
+            j = indices[q]
+            if place[i] >= place[j]:
+                c[<int64_t>place[j] * width + place[i] - place[j]] = scale[i] * scale[j] * a[q]
+
+
+cdef public void lav_band_free(int32_t m, int32_t width, const double* c, const double* free, double eps,
+                               double* out) noexcept nogil:
+    """H + eps where free (m), in the band's order, is not 0; the identity elsewhere."""
+    cdef int32_t j, t
+    cdef int64_t q
+    for j in range(m):
+        q = <int64_t>j * width
+        if free[j] == 0.0:
+            for t in range(width):
+                out[q + t] = 0.0
+            out[q] = 1.0
+            continue
+        for t in range(width):
+            out[q + t] = c[q + t] if j + t < m and free[j + t] != 0.0 else 0.0
+        out[q] += eps
+
+
+cdef inline void band_block(const double* c, double* out, int32_t p, int32_t q, int32_t width, const double* left,
+                            const double* right, bint diagonal, const int32_t ni, const int32_t nj) noexcept nogil:
+    # out_ij = left H_ij right^T (+ I) of the block whose first row is p and first column q
+    cdef int32_t k, l, t, r
+    cdef bint some = False
+    cdef double x
+    cdef double block[16]
+    cdef double half[16]
+    for k in range(ni):
+        for l in range(nj):
+            r = p + k - q - l
+            if r < 0:                                   # above the diagonal, of a diagonal block alone
+                x = c[<int64_t>(p + k) * width - r]
+            else:
+                x = c[<int64_t>(q + l) * width + r] if r < width else 0.0
+            block[k * nj + l] = x
+            some = some or x != 0.0
+    if not some and not diagonal:
+        return
+    for k in range(ni):
+        for l in range(nj):
+            x = 0.0
+            for t in range(ni):
+                x += left[k * ni + t] * block[t * nj + l]
+            half[k * nj + l] = x
+    for k in range(ni):
+        for l in range(nj):
+            r = p + k - q - l
+            if 0 <= r < width:
+                x = 1.0 if r == 0 else 0.0
+                for t in range(nj):
+                    x += half[k * nj + t] * right[l * nj + t]
+                out[<int64_t>(q + l) * width + r] = x
+
+
+cdef public void lav_band_scaled(const elements_t* e, const int32_t* order, const int32_t* place, int32_t width,
+                                 const double* c, const double* bt, double* out) noexcept nogil:
+    """I + B^T H B; elements in the band's order (n), place (m) of each row."""
+    cdef int32_t h, g, i, j, p, q, ni, nj
+    cdef int64_t n
+    for n in range(<int64_t>e.m * width):
+        out[n] = 0.0
+    for h in range(e.n):
+        j = order[h]
+        nj = e.ptr[j + 1] - e.ptr[j]
+        q = place[e.ptr[j]]
+        for g in range(h, e.n):
+            i = order[g]
+            ni = e.ptr[i + 1] - e.ptr[i]
+            p = place[e.ptr[i]]
+            if p - q >= width + nj:
+                break
+            if ni == 3 and nj == 3:
+                band_block(c, out, p, q, width, bt + e.wptr[i], bt + e.wptr[j], g == h, 3, 3)
+            else:
+                band_block(c, out, p, q, width, bt + e.wptr[i], bt + e.wptr[j], g == h, ni, nj)
+
+
 # -- interior point ---------------------------------------------------------------------------------
 
 
@@ -1945,6 +2037,28 @@ cdef class Elements:
         """out = W x, one small matrix for each element."""
         with nogil:
             element_times(&self.e, &w[0], &x[0], &out[0])
+
+
+def band(const int32_t[::1] indptr, const int32_t[::1] indices, const double[::1] a, const int32_t[::1] place,
+         const double[::1] scale, double[:, ::1] out):
+    """diag(scale) A diag(scale) into a band (m, width), row i at place[i]."""
+    if out.shape[0] and a.shape[0]:
+        with nogil:
+            lav_band(<int32_t>out.shape[0], &indptr[0], &indices[0], &a[0], &place[0], &scale[0],
+                     <int32_t>out.shape[1], &out[0, 0])
+
+
+def band_free(const double[:, ::1] c, const double[::1] free, double eps, double[:, ::1] out):
+    """H + eps on free rows, the identity elsewhere."""
+    with nogil:
+        lav_band_free(<int32_t>c.shape[0], <int32_t>c.shape[1], &c[0, 0], &free[0], eps, &out[0, 0])
+
+
+def band_scaled(Elements e, const int32_t[::1] order, const int32_t[::1] place, const double[:, ::1] c,
+                const double[::1] bt, double[:, ::1] out):
+    """I + B^T H B."""
+    with nogil:
+        lav_band_scaled(&e.e, &order[0], &place[0], <int32_t>c.shape[1], &c[0, 0], &bt[0], &out[0, 0])
 
 
 def element_product(Elements e, const double[::1] w, const double[:, ::1] h, double eps, double own, double one,

@@ -102,6 +102,20 @@ def test_the_message_names_what_ran_and_work_counts_it(problem, word):
     assert named <= set(lv.available())
 
 
+@pytest.mark.parametrize(
+    "problem",
+    [
+        lambda: suite.pyramid(k=5, friction="coulomb").problem.relaxed("cone"),
+        lambda: as_matrix(suite.boxed_friction(n=30).problem),
+    ],
+    ids=["faces on faces", "narrow matrix"],
+)
+def test_sweeps_are_not_tried_where_a_factor_is_cheap_or_they_hardly_move(problem):
+    solution = lv.solve(problem(), "auto", tol=1e-9)
+    assert good(solution, 1e-9), solution
+    assert solution.message.startswith("newton"), solution.message
+
+
 @given(seed=seeds)
 @settings(max_examples=40)
 def test_every_random_lcp_is_solved(seed):

@@ -1,6 +1,7 @@
 """newton: its linear algebra against dense NumPy, its answers against enumeration and closed forms."""
 
 import time
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ import lavender as lv
 from lavender import suite
 from lavender.solvers import _ipm
 from lavender.solvers._ipm import AUGMENTED, CONVEX, InteriorPoint, make_system
+from lavender.solvers._polish import refined
 from lavender_ext import newton as kernels
 
 
@@ -45,7 +47,30 @@ def test_contacts_alone_are_scaled_as_any_other_problem(monkeypatch):
             assert np.array_equal(getattr(quick, name), value), name
 
 
+@pytest.mark.parametrize(
+    "problem", [suite.pyramid(k=3).problem, random_lcp(1, m=6)], ids=["bodies", "matrix, boxed"]
+)
+def test_rows_alone_are_scaled_as_any_other_problem(problem, monkeypatch):
+    assert _ipm._all_rows(problem)
+    quick = _ipm.scaled(problem)
+    monkeypatch.setattr(_ipm, "_all_rows", lambda _: False)
+    general = _ipm.scaled(problem)
+    for name, value in vars(general).items():
+        if name != "problem":
+            assert np.array_equal(getattr(quick, name), value), name
+
+
 # -- linear algebra ---------------------------------------------------------------------------------
+
+
+def system_in(problem, form):
+    """The system of a problem; "band" is the impulse form factored as a band whatever it costs."""
+    if form != "band":
+        return make_system(problem, form)
+    with mock.patch.multiple(_ipm, BAND_ROWS=0, BAND_SHARE=4.0, BAND_FILL=np.inf):
+        system = make_system(problem, "impulse")
+    assert system.band is not None
+    return system
 
 
 @given(seed=seeds)
@@ -60,14 +85,14 @@ def test_velocity_form_is_h_without_forming_it(seed):
 
 
 @pytest.mark.parametrize("law", [CONVEX, AUGMENTED])
-@pytest.mark.parametrize("form", ["velocity", "impulse"])
+@pytest.mark.parametrize("form", ["velocity", "impulse", "band"])
 @given(seed=seeds)
 @settings(max_examples=20)
 def test_newton_system_is_the_derivative_and_is_solved(form, law, seed):
     problem = random_contact_problem(
         seed, friction="cone" if law == CONVEX else "coulomb", bodies=6, contacts=10
     )
-    system = make_system(problem, form)
+    system = system_in(problem, form)
     m, g, eps = system.sc.m, system.sc.g, 1e-3
     rng = np.random.default_rng(seed)
     z, dz, f = rng.normal(size=m), rng.normal(size=m), np.empty(m)
@@ -96,12 +121,12 @@ def test_newton_system_is_the_derivative_and_is_solved(form, law, seed):
     np.testing.assert_allclose(matrix @ x, r, rtol=0, atol=1e-9 * (1.0 + np.abs(x).max()))
 
 
-@pytest.mark.parametrize("form", ["velocity", "impulse"])
+@pytest.mark.parametrize("form", ["velocity", "impulse", "band"])
 @given(seed=seeds)
 @settings(max_examples=20)
 def test_interior_point_system_is_solved_and_its_steps_stay_inside(form, seed):
     problem = random_contact_problem(seed, friction="cone", bodies=6, contacts=10)
-    system = make_system(problem, form)
+    system = system_in(problem, form)
     ip = InteriorPoint(system)
     sc = system.sc
     # V holds theta, the compliance, where H is K K^T + theta.
@@ -123,6 +148,66 @@ def test_interior_point_system_is_solved_and_its_steps_stay_inside(form, seed):
         for i in np.flatnonzero(~row):
             t = ip.z[sc.ptr[i] + 1 : sc.ptr[i + 1] - (sc.kind[i] == 2)]
             assert np.linalg.norm(t) <= sc.a_t[i] * z[i] * (1 + 1e-12)
+
+
+class PlainInteriorPoint(InteriorPoint):
+    """The same steps, one kernel after the other."""
+
+
+@pytest.mark.parametrize("apart", [False, True])
+@given(seed=seeds)
+@settings(max_examples=20)
+def test_a_step_in_one_call_is_the_same_step(apart, seed):
+    problem = random_contact_problem(seed, friction="cone", bodies=6, contacts=10)
+    one = InteriorPoint(make_system(problem, "velocity"), 1e-6, apart)
+    other = PlainInteriorPoint(make_system(problem, "velocity"), 1e-6, apart)
+    assert one.inner is not None
+    assert other.inner is None
+    for _ in range(4):
+        # Sums are rounded in another order; a system that weighs rows by 1e6 carries that to 1e-9, and with 1e10
+        # on rows without bounds in the first point to 1e-5.
+        assert np.abs(one.z - other.z).max() <= 1e-4 * np.abs(one.z).max()
+        assert one.step()
+        assert other.step()
+        assert one.length == pytest.approx(other.length, rel=1e-3)
+        assert one.gap == pytest.approx(other.gap, rel=1e-3)
+    sc = one.system.sc
+    lam = sc.impulse(one.z)
+    truth = lv.residual(problem, lam)
+    assert one.error is not None
+    # The running slack against one computed afresh; fixed rows are right by construction.
+    assert one.error[0] == pytest.approx(truth.energy, rel=1e-6, abs=1e-9 * truth.energy_start)
+    assert one.error[1] == pytest.approx(truth.velocity, rel=1e-6, abs=1e-9 * truth.velocity_start)
+
+
+@given(seed=seeds)
+@settings(max_examples=20)
+def test_a_newton_step_in_one_call_is_the_same_step(seed):
+    problem = suite.stack(n=9, mass_ratio=5.0).problem
+    z = np.random.default_rng(seed).normal(size=problem.m)
+    system = make_system(problem, "velocity")
+    steps = system.newton
+    energy, velocity = steps.place(z)
+    truth = lv.residual(problem, system.sc.impulse(z))
+    assert energy == pytest.approx(truth.energy, rel=1e-12)
+    assert velocity == pytest.approx(truth.velocity, rel=1e-12)
+    finite, *_ = steps.newton(1e-9, 2)
+    assert finite
+    f = np.empty(problem.m)
+    system.natural(z, system.times(z) - system.sc.g, CONVEX, 1e-9, f)
+    system.factor_natural(1e-9)
+    # Nine bodies: H has a condition number of some hundreds, the normal matrix 1e9 times that before refinement.
+    expected = z + refined(system, -f)
+    np.testing.assert_allclose(steps.z, expected, rtol=0, atol=1e-10 * np.abs(z).max())
+
+
+def test_a_narrow_matrix_is_factored_as_a_band():
+    problem = as_matrix(suite.box_stack(n=40).problem)
+    system = make_system(problem, "impulse")
+    assert system.band is not None
+    assert system.band.h.shape[1] <= 8  # two boxes, four points each
+    # Redundant points: A is singular, to rounding of either sign.
+    assert good(lv.solve(problem, "newton", tol=1e-9), 1e-9)
 
 
 @pytest.mark.parametrize("few", [0, 1500])

@@ -18,6 +18,8 @@ import scipy.sparse as sp
 import scipy.sparse.linalg as ssl
 from scipy.linalg.lapack import dgetrf as getrf
 from scipy.linalg.lapack import dgetrs as getrs
+from scipy.linalg.lapack import dpbtrf as pbtrf
+from scipy.linalg.lapack import dpbtrs as pbtrs
 from scipy.linalg.lapack import dpotrf as potrf
 from scipy.linalg.lapack import dpotrs as potrs
 
@@ -32,6 +34,9 @@ FEW_BODIES = 1500  # up to here bits hold the neighbours of a body
 DENSE_ROWS = 400  # below: dense LAPACK beats sparse bookkeeping
 DENSE_FILL = 0.1  # nonzero share of A above which a sparse factor is full anyway
 DENSE_LIMIT = 6000  # rows; 288 MB of A
+BAND_ROWS = 100  # below: dense LAPACK
+BAND_SHARE = 0.25  # of rows that the half bandwidth may have
+BAND_FILL = 1000.0  # multiply-adds for each nonzero of A up to which LAPACK's band beats SuperLU
 
 # Weight of the proximal term in an interior point system, relative to d: far below any step that
 # matters, far above the rounding of a pivot.
@@ -120,8 +125,13 @@ def _scaled_contacts(problem: Problem) -> Scaled:
     )
 
 
+def _all_rows(problem: Problem) -> bool:
+    """Nothing but bounded rows that all move."""
+    cones = problem.cones
+    return cones.is_bounded_rows and len(problem.data.empty) == 0 and bool(np.all(cones.lower < cones.upper))
+
+
 def _scaled_rows(problem: Problem) -> Scaled:
-    """Bounded rows that all move."""
     cones, m = problem.cones, problem.m
     scale = 1.0 / np.sqrt(problem.d)
     rows, compliance = problem.rows, problem.compliance
@@ -155,7 +165,7 @@ def scaled(problem: Problem) -> Scaled:
     if problem.m and _all_slide(problem):
         return _scaled_contacts(problem)
     cones, d, m = problem.cones, problem.d, problem.m
-    if cones.is_bounded_rows and len(problem.data.empty) == 0 and bool(np.all(cones.lower < cones.upper)):
+    if _all_rows(problem):
         return _scaled_rows(problem)
     size: IntArray = np.diff(cones.ptr).astype(np.int32)
     single = cones.is_bounded_rows
@@ -382,6 +392,43 @@ class VelocitySystem(System):
         return out
 
 
+@dataclass
+class _Band:
+    """H in an order of its elements that makes it narrow."""
+
+    h: FloatArray  # (m, width), h[j, t] = H[j + t, j]
+    order: IntArray  # (m,) row at each place
+    place: IntArray  # (m,) place of each row
+    elements: IntArray  # (n,) element at each place
+
+
+def _band(sc: Scaled, a: Any) -> _Band | None:
+    """Where a band costs less than a sparse factor, and far less than a dense one."""
+    m, n = sc.m, len(sc.kind)
+    if m < BAND_ROWS or a.nnz > 0.5 * BAND_SHARE * m * m:
+        return None  # a mean row of more nonzeros than that has no narrow band
+    from scipy.sparse.csgraph import reverse_cuthill_mckee
+
+    if n == m:
+        elements = order = reverse_cuthill_mckee(a, symmetric_mode=True).astype(np.int32)
+    else:
+        of = np.repeat(np.arange(n), np.diff(sc.ptr))
+        index, other = np.repeat(of, np.diff(a.indptr)), of[a.indices]
+        graph = sp.csr_array((np.ones(len(index), np.int8), (index, other)), shape=(n, n))
+        elements = reverse_cuthill_mckee(graph, symmetric_mode=True).astype(np.int32)
+        size = np.diff(sc.ptr)[elements]
+        ends = np.cumsum(size)
+        order = (np.arange(m) + np.repeat(sc.ptr[:-1][elements] - (ends - size), size)).astype(np.int32)
+    place = np.empty(m, np.int32)
+    place[order] = np.arange(m, dtype=np.int32)
+    width = int(np.abs(np.repeat(place, np.diff(a.indptr)) - place[a.indices]).max(initial=0)) + 1
+    if width > BAND_SHARE * m or m * width**2 > BAND_FILL * a.nnz:
+        return None
+    h = np.empty((m, width))
+    kernels.band(a.indptr, a.indices, a.data, place, sc.scale, h)
+    return _Band(h, order, place, elements)
+
+
 class MatrixSystem(System):
     """H as a matrix: dense LAPACK, or sparse LU."""
 
@@ -393,7 +440,11 @@ class MatrixSystem(System):
         a = sc.problem.csr
         if not sc.whole:
             a = a[sc.keep][:, sc.keep]
-        self.dense = m <= DENSE_ROWS or (a.nnz > DENSE_FILL * m * m and m <= DENSE_LIMIT)
+        self.symmetric = sc.problem.is_symmetric
+        self.band: _Band | None = _band(sc, a) if self.symmetric else None
+        self.dense = self.band is None and (
+            m <= DENSE_ROWS or (a.nnz > DENSE_FILL * m * m and m <= DENSE_LIMIT)
+        )
         self.cost = m**3 / 3.0 if self.dense else 50.0 * a.nnz
         self.h: Any
         if self.dense:
@@ -401,17 +452,19 @@ class MatrixSystem(System):
             self.h *= sc.scale[:, None]
             self.h *= sc.scale
         else:
-            self.h = sp.csr_array(sp.diags_array(sc.scale) @ a @ sp.diags_array(sc.scale))
+            values = a.data * np.repeat(sc.scale, np.diff(a.indptr))
+            values *= sc.scale[a.indices]
+            self.h = sp.csr_array((values, a.indices, a.indptr), shape=(m, m))
         if len(sc.kind) < m:
             self.bt = np.zeros_like(self.v)
         # theta is on the diagonal of A already.
         sc.theta = np.zeros(m)
-        self.symmetric = sc.problem.is_symmetric
         n = len(sc.kind)
         self.elements = self._elements(
             np.full((n, 2), -1, np.int32), np.zeros((n, 3), np.int32), np.zeros((m, 2)), 1
         )
         self.solver: Any = None
+        self.free: FloatArray | None = None  # rows that the band of the last `factor_natural` holds
 
     @cached_property
     def places(self) -> tuple[IntArray, IntArray]:
@@ -455,6 +508,8 @@ class MatrixSystem(System):
 
     def factor_barrier(self) -> bool:
         # H + V^-1, or with cones I + B^T H B and dz = B (...): V^-1 would lose the small eigenvalues of V.
+        if self.band is not None and self._factor_band(self.band):
+            return True
         if self.bt is None:
             w = 1.0 / self.v
             if not self.dense:
@@ -476,6 +531,21 @@ class MatrixSystem(System):
             return True
         return self._dense_lu(np.ascontiguousarray(matrix.T))
 
+    def _factor_band(self, band: _Band) -> bool:
+        if self.bt is None:
+            matrix = band.h.copy()
+            matrix[:, 0] += (1.0 / self.v)[band.order]
+        else:
+            matrix = np.empty_like(band.h)
+            kernels.band_scaled(self.elements, band.elements, band.place, band.h, self.bt, matrix)
+        return self._cholesky_band(band, matrix)
+
+    def _cholesky_band(self, band: _Band, matrix: FloatArray) -> bool:
+        self.factorisations += 1
+        c, info = pbtrf(matrix.T, lower=1, overwrite_ab=True)
+        self.solver = lambda r: pbtrs(c, r[band.order], lower=1, overwrite_b=True)[0][band.place]
+        return info == 0
+
     def _cholesky(self, matrix: FloatArray) -> bool:
         c, info = potrf(matrix.T, lower=1, clean=0, overwrite_a=True)
         if info != 0:
@@ -493,12 +563,22 @@ class MatrixSystem(System):
         return out
 
     def factor_natural(self, eps: float) -> bool:
+        self.free = None
+        if self.band is not None and self.bt is None:
+            matrix = np.empty_like(self.band.h)
+            kernels.band_free(self.band.h, self.p[self.band.order], eps, matrix)
+            if self._cholesky_band(self.band, matrix):
+                self.free = self.p
+                return True
         if self.dense:
             return self._dense_lu(self._product(self.p, self.h, eps, 1.0, 1.0))
         p = self.small(self.p)
         return self._sparse_lu(p @ self.h + (eps - 1.0) * p + sp.eye_array(self.sc.m))
 
     def solve_natural(self, r: FloatArray) -> FloatArray:
+        if self.free is not None:
+            # H_FF dz_F = r_F - H_FN r_N, dz_N = r_N
+            r = r - self.free * (self.h @ (r - self.free * r))
         return self.solver(r)
 
 

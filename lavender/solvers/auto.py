@@ -1,10 +1,11 @@
 """The only solver that hands over to others: which ones, by law, size, structure, form and tol.
 
     linear            direct; newton where that stops early
-    lcp, symmetric    direct on narrow bands and few rows; newton where there are more rows than the bodies
-                      can tell apart or mass ratios of 1e3; else nncg as long as it gets on, then newton
+    lcp, symmetric    direct on narrow bands and few rows; newton on wider bands, and where there are more
+                      rows than the bodies can tell apart or mass ratios of 1e3; else nncg as long as it
+                      gets on, then newton
     lcp, other        newton, lemke
-    cone              anderson as long as it gets on, then newton
+    cone              newton on faces that rest on faces; else anderson as long as it gets on, then newton
     coulomb           the same; a few contacts by a dozen sweeps of block_gauss_seidel too; large ones
                       through the convex relaxation, whose answer is the Coulomb answer wherever
                       contacts stick
@@ -35,6 +36,7 @@ NARROW = 12  # half-bandwidth up to which a band factorisation costs less than a
 FEW = 64  # rows up to which a dense factorisation does
 HEAVY = 1e3  # mass ratio at which sweeps are not tried
 LARGE = 4000  # rows from which friction goes through the relaxation
+BANDED = 1200.0  # multiply-adds of a band's factor for each nonzero of A up to which sweeps are not tried
 HUGE = 40_000  # rows from which friction is left to sweeps before any factorisation
 FIRST_LOOK = 16  # sweeps before the first look at the residual
 CLOCK = 0.01  # s between two looks at the clock, at a nanosecond for each unit of work
@@ -229,8 +231,13 @@ def _sweeps_first(problem: Problem) -> bool:
     """Whether sweeps are worth a try, by what is known without looking closer."""
     if problem.law == "lcp":
         return problem.is_symmetric and not (
-            _is_heavy(problem) or _is_redundant(problem) or _is_small_or_narrow(problem)
+            _is_heavy(problem)
+            or _is_redundant(problem)
+            or _is_small_or_narrow(problem)
+            or _is_banded(problem)
         )
+    if problem.law == "cone" and _is_redundant(problem) and not _is_loose(problem):
+        return False  # faces on faces: the same weight rests on several points, and sweeps hardly move it
     return not _is_heavy(problem)
 
 
@@ -409,6 +416,16 @@ def _is_redundant(problem: Problem) -> bool:
     if problem.rows is None:
         return False
     return problem.m > 6 * problem.rows.n_bodies and bool(np.all(problem.compliance == 0.0))
+
+
+def _is_banded(problem: Problem) -> bool:
+    """A matrix so narrow that a dozen factorisations cost less than the sweeps that would be promised."""
+    if problem.rows is not None:
+        return False
+    from lavender.solvers._ipm import BAND_SHARE  # loads SciPy's sparse solvers, which few problems need
+
+    width = max(problem.bandwidth)
+    return width <= BAND_SHARE * problem.m and problem.m * width**2 <= BANDED * problem.csr.nnz
 
 
 def _is_loose(problem: Problem) -> bool:
