@@ -118,8 +118,23 @@ cdef inline int32_t check(watch_t* s, const blocks_t* p, const csr_t* a, const r
     return RUNNING
 
 
+cdef inline int32_t confirmed(const watch_t* s, const blocks_t* p, const csr_t* a, const rows_t* r, int32_t factored,
+                              const double* lam, double tol, int32_t status) noexcept nogil:
+    """The claim `status`, judged in another form: what does not hold there goes on, or has stalled."""
+    cdef score_t x
+    cdef double now
+    judge_into(p, a, r, factored, lam, s.w, s.e, s.v, status == AT_FLOOR, &x)
+    now = relative(s, x.energy, x.velocity) if x.finite else 1.0 / 0.0
+    if now <= tol:
+        return CONVERGED
+    if status == CONVERGED:
+        return RUNNING
+    return AT_FLOOR if now <= 2.0 * relative(s, x.floor_energy, x.floor_velocity) else STALLED
+
+
 cdef class Watch:
     cdef Data data
+    cdef Data confirm           # or None
     cdef watch_t state
     cdef object keep
     cdef int32_t check_now(self, double* lam, double tol) noexcept nogil

@@ -7,7 +7,7 @@ from lavender_ext.block cimport blocks_t
 from lavender_ext.csr cimport csr_t
 from lavender_ext.problem cimport Data
 from lavender_ext.rows cimport rows_t
-from lavender_ext.watch cimport CONVERGED, RUNNING, check, sweep_t, watch_t
+from lavender_ext.watch cimport AT_FLOOR, CONVERGED, RUNNING, check, confirmed, sweep_t, watch_t
 
 
 cdef public int32_t lav_watch_check(watch_t* s, const blocks_t* p, const csr_t* a, const rows_t* r, int32_t factored,
@@ -17,12 +17,17 @@ cdef public int32_t lav_watch_check(watch_t* s, const blocks_t* p, const csr_t* 
 
 
 cdef class Watch:
-    """Where a run of sweeps stands; `data` is what the judge reads, its start error known."""
+    """Where a run of sweeps stands; `data` is what the judge reads, its start error known.
 
-    def __init__(self, Data data, int patience=64):
+    `confirm`: the same problem in another form, which a claim must hold in too.
+    """
+
+    def __init__(self, Data data, int patience=64, Data confirm=None):
         cdef Py_ssize_t m = data.blocks.n_rows
-        cdef double[::1] scratch = np.empty(3 * m + 12 * <Py_ssize_t>data.rows.n_bodies + 4)
+        cdef Py_ssize_t n = data.rows.n_bodies if confirm is None else confirm.rows.n_bodies
+        cdef double[::1] scratch = np.empty(3 * m + 12 * n + 4)
         self.data = data
+        self.confirm = confirm
         self.keep = scratch
         self.state.best = &scratch[0]
         self.state.w = &scratch[m]
@@ -49,7 +54,12 @@ cdef class Watch:
         return self.state.best_relative, np.array(self.keep)[:self.data.blocks.n_rows]
 
     cdef int32_t check_now(self, double* lam, double tol) noexcept nogil:
-        return check(&self.state, &self.data.blocks, &self.data.csr, &self.data.rows, self.data.factored, lam, tol)
+        cdef int32_t status = check(&self.state, &self.data.blocks, &self.data.csr, &self.data.rows,
+                                    self.data.factored, lam, tol)
+        if self.confirm is not None and (status == CONVERGED or status == AT_FLOOR):
+            return confirmed(&self.state, &self.confirm.blocks, &self.confirm.csr, &self.confirm.rows,
+                             self.confirm.factored, lam, tol, status)
+        return status
 
     cdef int32_t run(self, sweep_t sweep, void* context, double* lam, int32_t n, double tol, int32_t* done) noexcept nogil:
         """n sweeps, fewer where a check ends them; tol = 0 checks nothing. Counts them in `done`."""

@@ -86,7 +86,7 @@ def test_only_the_island_that_needs_it_goes_to_newton():
     [
         (lambda: suite.stack(n=200).problem, "direct"),
         (lambda: suite.hang(n=24).problem, "direct"),
-        (lambda: suite.granular(n=4).problem, "nncg"),
+        (lambda: suite.granular(n=4).problem, "anderson"),
         (lambda: suite.granular(n=3, friction="coulomb").problem, "anderson"),
         (lambda: suite.granular(n=3, friction="coulomb").problem.relaxed("cone"), "anderson"),
         (lambda: suite.pyramid(k=6, mass_ratio=1e6).problem, "newton"),

@@ -27,6 +27,7 @@ _STATUS = (Status.MAX_ITERATIONS, Status.CONVERGED, Status.DIVERGED, Status.STAL
 GRAIN = 20_000
 LEAST = 400_000  # multiply-adds of a sweep: 4,000 contacts, below which starting threads costs what they save
 MOST_THREADS = 64
+PATIENCE = 64  # sweeps that may always pass without a better check
 _ROW_BY_ROW = np.empty(0, np.int32)
 
 
@@ -35,12 +36,16 @@ class SweepState:
 
     alone: dict[str, Any] | None = None  # how long the leader of several threads goes on alone
 
-    def __init__(self, problem: Problem, data: Any, order: Order, judged: Any = None) -> None:
-        reference(problem)  # the watch reads the error of doing nothing
+    def __init__(self, problem: Problem, data: Any, order: Order, patience: int = PATIENCE) -> None:
         self.problem = problem
-        self.data = data  # lavender_ext.problem.Data that the kernel sweeps over
+        self.data = data  # lavender_ext.problem.Data that the kernel sweeps over, and that checks read
         self.order = self.plan = order  # `plan` is of the problem's own blocks
-        self.watch = Watch(problem.data if judged is None else judged)
+        start = reference(problem)
+        if data is not problem.data:
+            data.set_start(*start)  # the error of doing nothing is the judge's, in whatever form
+        # Rows of A that were formed of a factored problem: its own form has the last word.
+        other = problem.data if problem.data.factored and not data.factored else None
+        self.watch = Watch(data, patience, other)
 
     @property
     def first(self) -> bool:

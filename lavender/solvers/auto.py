@@ -2,11 +2,12 @@
 
     linear            direct; newton where that stops early
     lcp, symmetric    direct on narrow bands and few rows; newton on wider bands, and where there are more
-                      rows than the bodies can tell apart or mass ratios of 1e3; else nncg as long as it
+                      rows than the bodies can tell apart or mass ratios of 1e3; else anderson as long as it
                       gets on, then newton
     lcp, other        newton, lemke
     cone              newton on faces that rest on faces; else anderson as long as it gets on, then newton
-    coulomb           the same; a few contacts by a dozen sweeps of block_gauss_seidel too; large ones
+    coulomb           anderson as long as it gets on, then newton; a few contacts by a dozen sweeps of
+                      block_gauss_seidel too; loose and large piles first
                       through the convex relaxation, whose answer is the Coulomb answer wherever
                       contacts stick
 
@@ -244,7 +245,7 @@ def _sweeps_first(problem: Problem) -> bool:
 def _sweep(trail: Trail, budget: int) -> bool:
     problem = trail.problem
     if problem.law == "lcp":
-        return _sweeps(trail, "nncg", budget, _cap(problem))
+        return _sweeps(trail, "anderson", budget, _cap(problem))
     few = problem.law == "coulomb" and problem.m <= FEW
     if problem.law == "coulomb" and not few and problem.rows is not None:
         if (problem.m >= LARGE or _is_loose(problem)) and _relaxation(trail, budget):

@@ -17,7 +17,6 @@ from lavender._arrays import FloatArray
 from lavender.ordering import Order
 from lavender.problem import Problem
 from lavender.registry import SolverSpec
-from lavender.residuals import reference
 from lavender.solution import Claim
 from lavender.solvers._layout import Layout, lay_out
 from lavender.solvers._layout import pays as layout_pays
@@ -41,9 +40,8 @@ class ImpulseState(SweepState):
         if self.layout is None:
             super().__init__(problem, problem.data, order)
             return
-        self.layout.data.set_start(*reference(problem))
         laid = replace(order, blocks=np.arange(problem.n_blocks, dtype=np.int32))
-        super().__init__(problem, self.layout.data, laid, self.layout.data)
+        super().__init__(problem, self.layout.data, laid)
         self.plan = order
 
     @property
