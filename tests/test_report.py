@@ -386,3 +386,21 @@ def test_changes_beyond_noise_are_named(tmp_path):
     moved = records_of(record("a", "x", 3.0, 1e-7))
     moved.cases["a"] = CaseInfo(**{**vars(info("a")), "sha": "another"})
     assert tables.changes(old, moved) == []
+
+
+def test_a_full_disk_leaves_the_page_of_the_last_time(tmp_path, monkeypatch):
+    found = records_of(record("a", "pgs", 1.0, 1e-7))
+    index = report.write(found, tmp_path, figures=False)
+    before = index.read_text()
+    true = type(index).write_text
+
+    def full(path, text, **kwargs):
+        if path.suffix != ".part":
+            return true(path, text, **kwargs)
+        true(path, text[: len(text) // 2], **kwargs)
+        raise OSError(28, "No space left on device", str(path))
+
+    monkeypatch.setattr(type(index), "write_text", full)
+    with pytest.raises(lv.InputError, match="No space left"):
+        report.write(records_of(record("b", "pgs", 2.0, 1e-7)), tmp_path, figures=False)
+    assert index.read_text() == before

@@ -70,9 +70,12 @@ def write(
         write_json(records, folder / "records.json")
         index = folder / "index.html"
         before = None if old is None else old.latest()
-        index.write_text(
+        # Whole or not at all: on a full disk the page of the last time stays.
+        unfinished = index.with_suffix(".html.part")
+        unfinished.write_text(
             page(shown, drawn, old=before, times=times, saved=figures, peers=peers), encoding="utf-8"
         )
+        unfinished.replace(index)
         (folder / "summary.md").write_text(summary(shown, times), encoding="utf-8")
         if figures and list(drawn):
             (folder / "figures").mkdir(exist_ok=True)
