@@ -104,6 +104,8 @@ cdef struct interior_t:         # an interior point of the velocity form and its
     double* q                   # (m)
     double* y                   # (n s)
     const double* speed         # (m) velocity error per unit of f
+    int32_t* side               # (n) bound that a row rests on by its natural map, after the last step
+    int32_t changed             # rows that took another side in it
     double length               # of the last step
     double gap                  # G z . u / degree before it
     double energy               # |F| after it, the judge's energy error
@@ -815,6 +817,36 @@ cdef public void lav_band(int32_t m, const int32_t* indptr, const int32_t* indic
             j = indices[q]
             if place[i] >= place[j]:
                 c[<int64_t>place[j] * width + place[i] - place[j]] = scale[i] * scale[j] * a[q]
+
+
+cdef public int32_t lav_band_width(int32_t m, const int32_t* indptr, const int32_t* indices,
+                                   const int32_t* place) noexcept nogil:
+    """Half bandwidth of A with row i at place[i]."""
+    cdef int32_t i, q, x, widest = 0
+    for i in range(m):
+        for q in range(indptr[i], indptr[i + 1]):
+            x = place[i] - place[indices[q]]
+            widest = x if x > widest else widest
+    return widest
+
+
+cdef public int32_t lav_element_graph(int32_t n, const int32_t* ptr, const int32_t* element, const int32_t* indptr,
+                                      const int32_t* indices, int32_t* mark, int32_t* to, int32_t* other) noexcept nogil:
+    """Which elements an element's rows of A reach: (to, other) as compressed rows, other as long as A's indices."""
+    cdef int32_t i, j, q, k, count = 0
+    for i in range(n):
+        mark[i] = -1
+    for i in range(n):
+        to[i] = count
+        for j in range(ptr[i], ptr[i + 1]):
+            for q in range(indptr[j], indptr[j + 1]):
+                k = element[indices[q]]
+                if mark[k] != i:
+                    mark[k] = i
+                    other[count] = k
+                    count += 1
+    to[n] = count
+    return count
 
 
 cdef public void lav_band_free(int32_t m, int32_t width, const double* c, const double* free, double eps,
@@ -1901,7 +1933,7 @@ cdef public int32_t lav_interior_step(const elements_t* e, const factor_t* f, in
 
     The elements' bounds are read at every step, so e may not change between steps.
     """
-    cdef int32_t j, lost
+    cdef int32_t i, j, lost, side
     cdef double gap, after, sigma = 0.0, x
     lav_ipm_scale(e, p.z, p.u1, p.u2, p.delta, p.v, p.bt, &gap)
     lav_normal_matrix(e, p.v, f, 0)
@@ -1928,6 +1960,13 @@ cdef public int32_t lav_interior_step(const elements_t* e, const factor_t* f, in
     p.gap = gap / (p.degree if p.degree > 1.0 else 1.0)
     times_h(e, f.n, p.z, p.y, p.hz)
     lav_convex_error(e, p.z, p.hz, p.speed, &p.energy, &p.velocity)
+    p.changed = 0
+    for i in range(e.n):
+        if e.kind[i] == ROW:
+            j = e.ptr[i]
+            side = <int32_t>z_end(e, j, p.z[j] - p.hz[j] + e.g[j])
+            p.changed += side != p.side[i]
+            p.side[i] = side
     return p.length > 0.0
 
 
@@ -2046,6 +2085,37 @@ def band(const int32_t[::1] indptr, const int32_t[::1] indices, const double[::1
         with nogil:
             lav_band(<int32_t>out.shape[0], &indptr[0], &indices[0], &a[0], &place[0], &scale[0],
                      <int32_t>out.shape[1], &out[0, 0])
+
+
+def band_width(const int32_t[::1] indptr, const int32_t[::1] indices, const int32_t[::1] place):
+    """Half bandwidth of A with row i at place[i]; A not empty, its pattern symmetric."""
+    cdef int32_t width
+    with nogil:
+        width = lav_band_width(<int32_t>place.shape[0], &indptr[0], &indices[0], &place[0])
+    return width
+
+
+def element_graph(const int32_t[::1] ptr, const int32_t[::1] element, const int32_t[::1] indptr,
+                  const int32_t[::1] indices):
+    """(indptr, indices) of the graph of elements that A couples; A not empty."""
+    cdef int32_t n = <int32_t>ptr.shape[0] - 1, count
+    to_array, other_array = np.empty(n + 1, np.int32), np.empty(indices.shape[0] + 1, np.int32)
+    cdef int32_t[::1] mark = np.empty(n + 1, np.int32), to = to_array, other = other_array
+    with nogil:
+        count = lav_element_graph(n, &ptr[0], &element[0], &indptr[0], &indices[0], &mark[0], &to[0], &other[0])
+    return to_array, other_array[:count].copy()
+
+
+def scaled_entries(const int32_t[::1] indptr, const int32_t[::1] indices, const double[::1] a, const double[::1] scale):
+    """Entries of diag(scale) A diag(scale)."""
+    out_array = np.empty(a.shape[0])
+    cdef double[::1] out = out_array
+    cdef int32_t i, q
+    with nogil:
+        for i in range(indptr.shape[0] - 1):
+            for q in range(indptr[i], indptr[i + 1]):
+                out[q] = scale[i] * a[q] * scale[indices[q]]
+    return out_array
 
 
 def band_free(const double[:, ::1] c, const double[::1] free, double eps, double[:, ::1] out):
@@ -2186,9 +2256,9 @@ cdef class Interior:
 
     def __init__(self, Elements e, Factor f, v, bt, u1, u2, speed, double delta, double damping):
         buffer = np.empty((8, e.m + 1))
-        y = np.empty(f.n * f.s + 1)
+        y, side = np.empty(f.n * f.s + 1), np.full(e.n + 1, 2, np.int32)
         self.e, self.f = e, f
-        self.keep = [v, bt, u1, u2, speed, buffer, y]
+        self.keep = [v, bt, u1, u2, speed, buffer, y, side]
         self.z, self.hz = buffer[0, : e.m], buffer[1, : e.m]
         cdef double[:, ::1] b = buffer
         cdef double* root = NULL
@@ -2197,7 +2267,7 @@ cdef class Interior:
         self.p = interior_t(
             delta, damping, 0.0, &b[0, 0], <double*>address(u1), <double*>address(u2), &b[1, 0], <double*>address(v),
             root, &b[2, 0], &b[3, 0], &b[4, 0], &b[5, 0], &b[6, 0],
-            <double*>address(y), <double*>address(speed), 0.0, 0.0, 0.0, 0.0)
+            <double*>address(y), <double*>address(speed), <int32_t*>address(side), 0, 0.0, 0.0, 0.0, 0.0)
 
     def first(self, double weight, double free_weight):
         """z with (H + weight) z = g, hz = H z."""
@@ -2248,9 +2318,13 @@ cdef class Interior:
         return self.p.degree
 
     def step(self):
-        """One predictor-corrector step: (whether it went, length, gap / degree before it, |F| and velocity error)."""
+        """One predictor-corrector step.
+
+        Returns whether it went, its length, gap / degree before it, |F|, velocity error, and how many rows changed
+        their side.
+        """
         cdef int32_t ok
         self.f.lu = False
         with nogil:
             ok = lav_interior_step(&self.e.e, &self.f.f, &self.p)
-        return bool(ok), self.p.length, self.p.gap, self.p.energy, self.p.velocity
+        return bool(ok), self.p.length, self.p.gap, self.p.energy, self.p.velocity, self.p.changed

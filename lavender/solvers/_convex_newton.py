@@ -16,6 +16,10 @@ from lavender.solvers._polish import Proximal, Run, polish
 IPM_PATIENCE = 15  # interior point steps that halve neither residual nor gap
 HOLD = 0.1  # share of rows beyond their bounds up to which exchanging those is worth a try
 REFINEMENTS = 3
+FIRST = 1e-2  # relative residual of the first polish of an interior point; the next at each decade
+SETTLED = (
+    0.0025  # share of rows that may change their side in the step after which one polish is tried sooner
+)
 CLOSE = 1e-6  # relative residual from which rounding is what holds an interior point up,
 STILL = 3  # where so many steps do not halve it
 # Proximal weight on cones: their scaling spans more than that of rows, and what N loses to rounding is 2^-53 over
@@ -71,7 +75,7 @@ def _everything(run: Run, ip: InteriorPoint) -> None:
 
 def _interior(run: Run, ip: InteriorPoint, rows: bool) -> None:
     """Steps until the judge is content or they get nowhere; rows are polished at each new decade, cones at the end."""
-    trigger = 1e-2
+    trigger, untried = FIRST, True
     lowest, idle, still, kept = np.inf, 0, 0, ip.z.copy()
     try:
         while not run.done() and ip.step():
@@ -85,8 +89,9 @@ def _interior(run: Run, ip: InteriorPoint, rows: bool) -> None:
                 kept[:] = ip.z
             if relative <= run.tol and run.score(ip.z) <= run.tol:
                 return
-            if rows and relative < trigger:
-                trigger = 0.1 * relative
+            settled = untried and ip.changed is not None and ip.changed <= SETTLED * len(kept)
+            if rows and (relative < trigger or settled):
+                untried, trigger = False, min(FIRST, 0.1 * relative)
                 polish(run, ip.z.copy())
                 trigger = min(trigger, 0.1 * run.best) if run.best < 1e-6 else trigger
                 if run.done() or run.at_floor():

@@ -400,33 +400,34 @@ class _Band:
     order: IntArray  # (m,) row at each place
     place: IntArray  # (m,) place of each row
     elements: IntArray  # (n,) element at each place
+    work: FloatArray  # (m, width) the last factor
 
 
 def _band(sc: Scaled, a: Any) -> _Band | None:
     """Where a band costs less than a sparse factor, and far less than a dense one."""
     m, n = sc.m, len(sc.kind)
-    if m < BAND_ROWS or a.nnz > 0.5 * BAND_SHARE * m * m:
+    if m < BAND_ROWS or a.nnz == 0 or a.nnz > 0.5 * BAND_SHARE * m * m:
         return None  # a mean row of more nonzeros than that has no narrow band
     from scipy.sparse.csgraph import reverse_cuthill_mckee
 
     if n == m:
         elements = order = reverse_cuthill_mckee(a, symmetric_mode=True).astype(np.int32)
     else:
-        of = np.repeat(np.arange(n), np.diff(sc.ptr))
-        index, other = np.repeat(of, np.diff(a.indptr)), of[a.indices]
-        graph = sp.csr_array((np.ones(len(index), np.int8), (index, other)), shape=(n, n))
+        of = np.repeat(np.arange(n, dtype=np.int32), np.diff(sc.ptr))
+        to, other = kernels.element_graph(sc.ptr, of, a.indptr, a.indices)
+        graph = sp.csr_array((np.ones(len(other), np.int8), other, to), shape=(n, n))
         elements = reverse_cuthill_mckee(graph, symmetric_mode=True).astype(np.int32)
         size = np.diff(sc.ptr)[elements]
         ends = np.cumsum(size)
         order = (np.arange(m) + np.repeat(sc.ptr[:-1][elements] - (ends - size), size)).astype(np.int32)
     place = np.empty(m, np.int32)
     place[order] = np.arange(m, dtype=np.int32)
-    width = int(np.abs(np.repeat(place, np.diff(a.indptr)) - place[a.indices]).max(initial=0)) + 1
+    width = kernels.band_width(a.indptr, a.indices, place) + 1
     if width > BAND_SHARE * m or m * width**2 > BAND_FILL * a.nnz:
         return None
     h = np.empty((m, width))
     kernels.band(a.indptr, a.indices, a.data, place, sc.scale, h)
-    return _Band(h, order, place, elements)
+    return _Band(h, order, place, elements, np.empty_like(h))
 
 
 class MatrixSystem(System):
@@ -452,8 +453,7 @@ class MatrixSystem(System):
             self.h *= sc.scale[:, None]
             self.h *= sc.scale
         else:
-            values = a.data * np.repeat(sc.scale, np.diff(a.indptr))
-            values *= sc.scale[a.indices]
+            values = kernels.scaled_entries(a.indptr, a.indices, a.data, sc.scale)
             self.h = sp.csr_array((values, a.indices, a.indptr), shape=(m, m))
         if len(sc.kind) < m:
             self.bt = np.zeros_like(self.v)
@@ -533,16 +533,16 @@ class MatrixSystem(System):
 
     def _factor_band(self, band: _Band) -> bool:
         if self.bt is None:
-            matrix = band.h.copy()
+            matrix = band.work
+            matrix[:] = band.h
             matrix[:, 0] += (1.0 / self.v)[band.order]
         else:
-            matrix = np.empty_like(band.h)
-            kernels.band_scaled(self.elements, band.elements, band.place, band.h, self.bt, matrix)
-        return self._cholesky_band(band, matrix)
+            kernels.band_scaled(self.elements, band.elements, band.place, band.h, self.bt, band.work)
+        return self._cholesky_band(band)
 
-    def _cholesky_band(self, band: _Band, matrix: FloatArray) -> bool:
+    def _cholesky_band(self, band: _Band) -> bool:
         self.factorisations += 1
-        c, info = pbtrf(matrix.T, lower=1, overwrite_ab=True)
+        c, info = pbtrf(band.work.T, lower=1, overwrite_ab=True)
         self.solver = lambda r: pbtrs(c, r[band.order], lower=1, overwrite_b=True)[0][band.place]
         return info == 0
 
@@ -565,9 +565,8 @@ class MatrixSystem(System):
     def factor_natural(self, eps: float) -> bool:
         self.free = None
         if self.band is not None and self.bt is None:
-            matrix = np.empty_like(self.band.h)
-            kernels.band_free(self.band.h, self.p[self.band.order], eps, matrix)
-            if self._cholesky_band(self.band, matrix):
+            kernels.band_free(self.band.h, self.p[self.band.order], eps, self.band.work)
+            if self._cholesky_band(self.band):
                 self.free = self.p
                 return True
         if self.dense:
@@ -647,6 +646,7 @@ class InteriorPoint:
     first_gap: float = field(init=False, default=0.0)
     length: float = field(init=False, default=1.0)
     error: tuple[float, float] | None = field(init=False, default=None)  # of z, where a step has it anyway
+    changed: int | None = field(init=False, default=None)  # rows that changed their side, likewise
 
     def __post_init__(self) -> None:
         sy, sc = self.system, self.system.sc
@@ -688,7 +688,7 @@ class InteriorPoint:
         sy, sc, e = self.system, self.system.sc, self.system.elements
         if self.inner is not None:
             sy.factorisations += 1
-            went, self.length, mu, energy, velocity = self.inner.step()
+            went, self.length, mu, energy, velocity, self.changed = self.inner.step()
             self.error = energy, velocity
             self.lowest_gap = min(self.lowest_gap, self.gap)
             self.gap = mu
