@@ -246,6 +246,23 @@ def test_block_factor_on_a_graph_of_bodies_matches_dense(few, monkeypatch):
         np.testing.assert_allclose(out, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
 
 
+def test_a_chain_of_bodies_gets_the_pattern_of_any_graph(monkeypatch):
+    rng = np.random.default_rng(5)
+    n = 40
+    low = rng.integers(0, n - 1, 60)
+    body = np.stack([low, low + 1], axis=1)
+    body[::2] = body[::2, ::-1]
+    body[3::9, 1] = -1
+    body[5::9, 0] = -1
+    body = np.ascontiguousarray(body, np.int32)
+    monkeypatch.setattr(_ipm, "FEW_BODIES", 0)
+    chain = _ipm.block_pattern(n, body)
+    assert kernels.chain_pattern(body, n) is not None
+    monkeypatch.setattr(kernels, "chain_pattern", lambda *_: None)
+    for one, other in zip(chain, _ipm.block_pattern(n, body), strict=True):
+        assert np.array_equal(one, other)
+
+
 # -- answers ------------------------------------------------------------------------------------------
 
 

@@ -128,7 +128,8 @@ def _scaled_contacts(problem: Problem) -> Scaled:
 def _all_rows(problem: Problem) -> bool:
     """Nothing but bounded rows that all move."""
     cones = problem.cones
-    return cones.is_bounded_rows and len(problem.data.empty) == 0 and bool(np.all(cones.lower < cones.upper))
+    single = len(cones.kind) == problem.m or cones.is_bounded_rows
+    return single and len(problem.data.empty) == 0 and bool((cones.lower < cones.upper).all())
 
 
 def _scaled_rows(problem: Problem) -> Scaled:
@@ -329,8 +330,8 @@ class VelocitySystem(System):
         self.elements = self._elements(node, slot, halves, s)
         self.structure = (nptr, nind, *kernels.symbolic(nptr, nind))
         self.y = np.zeros(self.n * s + 1)
-        columns_of_l = np.diff(self.structure[2]).astype(float)
-        self.cost = float(s**3 * np.sum(0.5 * columns_of_l**2 + columns_of_l + 1.0))
+        of_column = np.diff(self.structure[2]).astype(float)  # blocks of L
+        self.cost = s**3 * (0.5 * float(of_column @ of_column) + float(self.structure[2][-1]) + self.n)
         if len(sc.kind) < sc.m and not sc.theta.any():
             self.bt = np.zeros_like(self.v)
         self.factor: Any = None
@@ -586,6 +587,9 @@ def block_pattern(n: int, body: IntArray) -> tuple[IntArray, IntArray, IntArray,
     if n <= FEW_BODIES:
         nptr, nind, node, slot, turned = graph.body_pattern(body, n)
         return nptr, nind, node, slot, turned
+    chain = kernels.chain_pattern(body, n)
+    if chain is not None:
+        return chain
     a, b = body[:, 0].astype(np.int64), body[:, 1].astype(np.int64)
     both = (a >= 0) & (b >= 0)
     code = np.unique(np.minimum(a, b)[both] * n + np.maximum(a, b)[both])
