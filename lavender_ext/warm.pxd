@@ -4,6 +4,7 @@
     contacts     sequential impulses, judged after 4, 8, 16, 32 and 64 sweeps; from 16 on given up
                  where r_s (r_s / r_s/2)^(2 (64 - s)/s), what 64 would leave, is above tol       (2)
     free joints  A lam = b by LDL^T on the band of A, one round of refinement                   (3)
+    contacts     after the sweeps, Newton steps of warm_newton.pxd                                (4)
 
 The arithmetic of a block and of its error is that of block.pxd, in the order of judge.pxd: the residual
 found here has the judge's bits. What is not decided here (dependent joints, numbers near the ends of the
@@ -17,12 +18,15 @@ from lavender_ext.block cimport (CONTACT_SPIN, COULOMB, ROW, blocks_t, clip, cou
 from lavender_ext.judge cimport rows_velocity
 from lavender_ext.ldl cimport ldl_factor, ldl_solve, pivots_t
 from lavender_ext.rows cimport contact_slack, joint_velocity, relax_rows_block, rows_t
+from lavender_ext.warm_newton cimport body_band, newton_step
 
 
 cdef enum:
     FIRST_SWEEPS = 4            # of (2); fewer leave a residual just below tol, and the next step begins above it
     PATIENT_SWEEPS = 16         # from here on (2) is given up where it will not do
     MOST_SWEEPS = 64
+    MOST_STEPS = 6              # of (4)
+    MOST_ROWS = 200000          # so that all of it takes a fraction of a second
     MOST_BAND = 48              # rows between the first and the last of one body's joints, for (3)
 
 cdef enum:                      # how it ended
@@ -30,6 +34,7 @@ cdef enum:                      # how it ended
     JUDGED = 1                  # met tol as it came
     SWEPT = 2                   # met it after some sweeps
     SOLVED = 3                  # met it after one factorisation
+    STEPPED = 4                 # met it after sweeps and Newton steps
 
 
 cdef struct score_sums_t:
@@ -43,9 +48,12 @@ cdef struct warm_t:
     double* nu                  # (m)
     double* kept                # (m) lam as it came
     double* band                # (m, width) of (3)
+    double* change              # (n_bodies, 6) of Newton steps
+    double* slack               # (m)
+    int32_t* state              # (c)
     int32_t* last               # (n_bodies) last joint seen on a body
     int32_t* before             # (2 kj) the one before on the same body: 2 joint + side, or -1
-    int32_t width               # of the band, 0 where (3) does not apply
+    int32_t width               # of the band, 0 where neither (3) nor (4) applies
     int32_t sweeps              # done
     int32_t factorisations      # done
     double relative             # of lam as it is left
@@ -181,9 +189,11 @@ cdef inline double relative_of(const score_sums_t* s, double e0, double v0) noex
 
 
 cdef inline int32_t band_width(const blocks_t* p, const rows_t* r, int32_t* last) noexcept nogil:
-    """Width of the band of A in the given order, joints alone and all free; 0 where (3) does not apply."""
+    """Width of the band of A in the given order, joints alone and all free, or of N; 0 where none applies."""
     cdef int32_t i, j, h, b, width = 1
-    if r.n_contacts > 0 or r.n_joints == 0:
+    if r.n_contacts > 0:
+        return body_band(p, r)
+    if r.n_joints == 0:
         return 0
     for b in range(r.n_bodies):
         last[b] = -1
@@ -276,9 +286,12 @@ cdef inline int32_t solve_joints(const blocks_t* p, const rows_t* r, warm_t* s, 
 cdef inline int32_t sweep_contacts(const blocks_t* p, const rows_t* r, warm_t* s, double tol, double e0, double v0,
                                    double* lam, double* v, score_sums_t* out) noexcept nogil:
     """(2)"""
-    cdef int32_t i, n = 0, next_ = FIRST_SWEEPS
+    cdef int32_t i, n = 0, last = 0, next_ = FIRST_SWEEPS, most = MOST_SWEEPS, patient = PATIENT_SWEEPS
     cdef double before, now = s.relative, ahead
-    while n < MOST_SWEEPS:
+    if s.width > 0:                                     # (4) costs less than many sweeps
+        most = PATIENT_SWEEPS
+        patient = FIRST_SWEEPS
+    while n < most:
         while n < next_:
             for i in range(p.n_blocks):
                 relax_rows_block(p, r, i, lam, v)
@@ -291,15 +304,35 @@ cdef inline int32_t sweep_contacts(const blocks_t* p, const rows_t* r, warm_t* s
             s.relative = judged(p, r, s, lam, v, e0, v0, out)
             if s.relative <= tol:
                 return SWEPT
-        if n >= PATIENT_SWEEPS:
+        if n >= patient:
             ahead = now
             i = n
-            while i < MOST_SWEEPS:
+            while i < most:
                 ahead = ahead * (now / before)
-                i += n >> 1
+                i += n - last
             if not ahead <= tol:
                 return UNDECIDED
+        last = n
         next_ = 2 * n
+    return UNDECIDED
+
+
+cdef inline int32_t step_contacts(const blocks_t* p, const rows_t* r, warm_t* s, double tol, double e0, double v0,
+                                  double* lam, double* v, score_sums_t* out) noexcept nogil:
+    """(4)"""
+    cdef double before = s.relative, eps
+    while s.factorisations < MOST_STEPS:
+        s.factorisations += 1
+        # what no impulse of the set can meet moves lam by w / (eps d): a tenth of b / d
+        eps = clip(10.0 * s.relative, 1e-8, 1e-4)
+        if not newton_step(p, r, s.state, s.width, s.band, eps, 0.3 * tol * e0 / sqrt(p.n_rows), 0.3 * tol * v0, lam, v,
+                           s.change, s.slack):
+            return UNDECIDED
+        s.relative = judged(p, r, s, lam, v, e0, v0, out)
+        if s.relative <= tol:
+            return STEPPED
+        if not s.relative < 1e3 * before:
+            return UNDECIDED
     return UNDECIDED
 
 
@@ -317,7 +350,7 @@ cdef inline int32_t warm_solve(const blocks_t* p, const rows_t* r, warm_t* s, do
         if lam[j] != 0.0:
             cold = 0
             break
-    if cold:
+    if cold or p.n_rows > MOST_ROWS:
         return UNDECIDED
     joint_weights(p, r, s.nu)
     if not has_velocity:
@@ -333,12 +366,14 @@ cdef inline int32_t warm_solve(const blocks_t* p, const rows_t* r, warm_t* s, do
         return JUDGED
     for j in range(p.n_rows):
         s.kept[j] = lam[j]
-    if s.width > 0:
-        found = solve_joints(p, r, s, tol, e0, v0, lam, v, last)
-    elif r.n_contacts > 0:
+    found = UNDECIDED
+    if r.n_contacts > 0:
         found = sweep_contacts(p, r, s, tol, e0, v0, lam, v, last)
-    else:
-        found = UNDECIDED
+        if found == UNDECIDED and s.width > 0:
+            rows_velocity(p, r, lam, v)
+            found = step_contacts(p, r, s, tol, e0, v0, lam, v, last)
+    elif s.width > 0:
+        found = solve_joints(p, r, s, tol, e0, v0, lam, v, last)
     if found == UNDECIDED:
         for j in range(p.n_rows):
             lam[j] = s.kept[j]

@@ -4,7 +4,7 @@ from libc.stdint cimport int32_t, int64_t, uint64_t
 import numpy as np
 
 from lavender_ext.block cimport blocks_t
-from lavender_ext.engine_types cimport H_CONTACTS, N_DYNAMIC, N_JOINT, S_OUT, bind, engine_t
+from lavender_ext.engine_types cimport CAP_CONTACT, H_CONTACTS, N_DYNAMIC, N_JOINT, S_OUT, bind, engine_t
 from lavender_ext.engine_view cimport view
 from lavender_ext.problem cimport Data
 from lavender_ext.rows cimport rows_t
@@ -30,21 +30,32 @@ def from_guess(Data data, double[::1] impulse, double tol):
     cdef score_sums_t first, last
     if m == 0 or not data.factored:
         return 0, 0, 0
-    cdef int32_t[::1] index = np.empty(data.rows.n_bodies + 2 * data.rows.n_joints + 1, np.int32)
+    cdef int32_t[::1] index = np.empty(data.rows.n_bodies + 2 * data.rows.n_joints + data.rows.n_contacts + 1,
+                                       np.int32)
     s.width = lav_warm_band(&data.blocks, &data.rows, &index[0])
-    cdef double[::1] real = np.empty(6 * data.rows.n_bodies + <int64_t>(2 + s.width) * m)
-    _lay(&s, &real[6 * data.rows.n_bodies], &index[0], m, data.rows.n_bodies)
+    cdef double[::1] real = np.empty(6 * data.rows.n_bodies + _room(&data.blocks, &data.rows, s.width))
+    _lay(&s, &real[6 * data.rows.n_bodies], &index[0], &data.blocks, &data.rows)
     with nogil:
         how = lav_warm_solve(&data.blocks, &data.rows, &s, tol, &impulse[0], &real[0], 0, &first, &last)
     return how, s.sweeps, s.factorisations
 
 
-cdef void _lay(warm_t* s, double* real, int32_t* index, int32_t m, int32_t n_bodies) noexcept:
+cdef int64_t _room(const blocks_t* p, const rows_t* r, int32_t width) noexcept:
+    # doubles that `_lay` hands out
+    cdef int64_t m = p.n_rows, n = 6 * <int64_t>r.n_bodies
+    return 3 * m + n + width * (n if r.n_contacts > 0 else m)
+
+
+cdef void _lay(warm_t* s, double* real, int32_t* index, const blocks_t* p, const rows_t* r) noexcept:
+    # index (n_bodies + 2 joints + contacts)
     s.nu = real
-    s.kept = real + m
-    s.band = real + 2 * m
+    s.kept = real + p.n_rows
+    s.slack = s.kept + p.n_rows
+    s.change = s.slack + p.n_rows
+    s.band = s.change + 6 * <int64_t>r.n_bodies
     s.last = index
-    s.before = index + n_bodies
+    s.before = index + r.n_bodies
+    s.state = s.before + 2 * r.n_joints
 
 
 cdef class Warm:
@@ -62,7 +73,7 @@ cdef class Warm:
         self.index = index
         self.keys = keys
         self.scratch = np.empty(1)
-        self.scratch_index = np.empty(size[N_DYNAMIC] + 2 * size[N_JOINT] + 1, np.int32)
+        self.scratch_index = np.empty(size[N_DYNAMIC] + 2 * size[N_JOINT] + size[CAP_CONTACT] + 1, np.int32)
 
     def solve(self, double tol):
         """After `prepare` and `solve(False)`: (how it ended, sweeps, factorisations); 0: nothing has changed.
@@ -76,16 +87,15 @@ cdef class Warm:
         cdef warm_t s
         cdef score_sums_t first, last
         cdef double* out
-        cdef int32_t how, m
+        cdef int32_t how
         cdef int64_t room
         bind(&self.size[0], &self.real[0], &self.index[0], &self.keys[0], &e, used)
         view(&e, &p, &r)
-        m = p.n_rows
         s.width = lav_warm_band(&p, &r, &self.scratch_index[0])
-        room = <int64_t>(2 + s.width) * m
+        room = _room(&p, &r, s.width)
         if self.scratch.shape[0] < room:
             self.scratch = np.empty(room + room // 4)
-        _lay(&s, &self.scratch[0], &self.scratch_index[0], m, r.n_bodies)
+        _lay(&s, &self.scratch[0], &self.scratch_index[0], &p, &r)
         with nogil:
             how = lav_warm_solve(&p, &r, &s, tol, e.impulse, e.dv, 1, &first, &last)
         if how != 0:

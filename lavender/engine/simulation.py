@@ -25,7 +25,7 @@ from lavender.scene.parts import whole
 from lavender.scene.scene import SWEEPS
 from lavender.solution import Solution
 from lavender.solve import finish, solve
-from lavender.solvers._warm import warm_claim
+from lavender.solvers._warm import MOST_STEPS, note_tried, warm_claim
 from lavender.solvers.newton import SPEC as NEWTON_SPEC
 
 __all__ = ["SOLVER_FIELDS", "Simulation"]
@@ -245,14 +245,19 @@ class Simulation:
 
     def _solve_substeps(self) -> int:
         status = OK
-        warm = self._warm_tol > 0.0 and get("newton").factory == NEWTON
+        warm = (
+            self._warm_tol > 0.0 and self.solver_iterations >= MOST_STEPS and get("newton").factory == NEWTON
+        )
         for _ in range(self._parameters.substeps):
             self._last = None
             self._prepare()
             kernel, a = self._state.kernel, self._state.a
             kernel.solve(False)
-            if not (warm and self._solve_in_place()):
+            spent = self._solve_in_place() if warm else (0, 0)
+            if spent is not None:
                 problem = self._problem(self._state)
+                if warm:
+                    note_tried(problem, self._warm_tol, *spent)
                 if problem.m:
                     a["impulse"][: problem.m] = self._solve(problem)
                 kernel.apply()
@@ -261,13 +266,15 @@ class Simulation:
                 break
         return int(status)
 
-    def _solve_in_place(self) -> bool:
+    def _solve_in_place(self) -> tuple[int, int] | None:
         # The bits of lavender.solve(problem, "newton"), whose first phase this is, without making the problem.
+        # None, or sweeps and factorisations done in vain.
         start = perf_counter()
         how, sweeps, factorisations = self._state.warm.solve(self._warm_tol)
         if how:
             self._last = _Pending(how, sweeps, factorisations, perf_counter() - start)
-        return bool(how)
+            return None
+        return sweeps, factorisations
 
     def _told(self, pending: _Pending) -> Solution:
         # The arrays of the last substep's problem stay as they were until the next one.

@@ -1,10 +1,12 @@
-"""The first phase of `newton` from a warm start: judge it, then a few sweeps, or one banded solve of free joints.
+"""The first phase of `newton` from a warm start: judge it, a few sweeps, few Newton steps; or free joints at once.
 
-The step of a simulation at rest, or of a chain, ends here. `lavender_ext/warm.pxd` has the equations; what is not
-within tol after it goes on from the start it came with.
+The step of a simulation at rest, or of a chain, ends here. `lavender_ext/warm.pxd` and `warm_newton.pxd` have the
+equations; what is not within tol after it goes on from the start it came with.
 """
 
 from __future__ import annotations
+
+import numpy as np
 
 from lavender._arrays import FloatArray
 from lavender.problem import Problem
@@ -12,7 +14,11 @@ from lavender.solution import Claim, Status
 from lavender_ext import warm as kernels
 
 #: How it ended, by number of lavender_ext/warm.pxd: None where nothing was decided.
-ENDED = (None, "as it came", "warm sweeps", "joints solved directly")
+ENDED = (None, "as it came", "warm sweeps", "joints solved directly", "warm sweeps, Newton steps over bodies")
+
+MOST_STEPS = 6  # factorisations that the first phase may cost, as in lavender_ext/warm.pxd
+MOST_SWEEPS = 64
+TRIED = "_warm_tried"  # in a problem's __dict__: tol at which its guess was tried in vain, and what that cost
 
 
 def warm_claim(how: int, sweeps: int, factorisations: int) -> Claim | None:
@@ -23,11 +29,29 @@ def warm_claim(how: int, sweeps: int, factorisations: int) -> Claim | None:
     work = {"factorisations": factorisations}
     if sweeps:
         work["sweeps"] = sweeps
-    return Claim(Status.CONVERGED, factorisations, work, message, form="velocity" if how < 3 else "impulse")
+    return Claim(Status.CONVERGED, factorisations, work, message, form="impulse" if how == 3 else "velocity")
 
 
-def solve_warm(problem: Problem, impulse: FloatArray, tol: float, budget: int) -> Claim | None:
-    """Carry `impulse` (m,) to tol in place; None, and nothing changed, where the first phase does not suffice."""
-    if problem.rows is None or problem.friction != "coulomb" or tol <= 0.0 or budget < 1:
-        return None
-    return warm_claim(*kernels.from_guess(problem.data, impulse, tol))
+def solve_warm(
+    problem: Problem, impulse: FloatArray, tol: float, budget: int, time_limit: float | None = None
+) -> tuple[Claim | None, int, int]:
+    """Carry `impulse` (m,) to tol in place: the claim, or None and nothing changed; sweeps, factorisations done."""
+    if problem.rows is None or problem.friction != "coulomb" or tol <= 0.0 or budget < MOST_STEPS:
+        return None, 0, 0
+    if time_limit is not None and MOST_SWEEPS * 1e-9 * problem.data.work > time_limit:
+        return None, 0, 0
+    tried = problem.__dict__.get(TRIED)
+    if (
+        tried is None
+        or tried[0] != tol
+        or problem.guess is None
+        or not np.array_equal(impulse, problem.guess)
+    ):
+        tried = (tol, *kernels.from_guess(problem.data, impulse, tol))
+    _, how, sweeps, factorisations = tried
+    return warm_claim(how, sweeps, factorisations), sweeps, factorisations
+
+
+def note_tried(problem: Problem, tol: float, sweeps: int, factorisations: int) -> None:
+    """The guess of `problem` was tried at tol, in vain."""
+    problem.__dict__[TRIED] = (tol, 0, sweeps, factorisations)

@@ -2,8 +2,8 @@
 
     z = D^1/2 lambda,   H = D^-1/2 A D^-1/2,   s = H z - g complementary to z on every block
 
-0. A warm start over bodies is judged first, then carried to tol by at most 64 sweeps (counted in `work`), or
-   by one banded factorisation of joints alone, where these will do (`_warm.py`).
+0. A warm start over bodies is judged first; then at most 64 sweeps (counted in `work`) and, for contacts, at most
+   six Newton steps over the bodies, or one banded factorisation of joints alone, where these will do (`_warm.py`).
 1. Newton's method on the natural map from the warm start, then from the solution of H z = g.
 2. A cold Mehrotra interior point (`_ipm.py`), polished on the identified rows (`_polish.py`) as soon as
    it has found them, to the floor of float64.
@@ -86,11 +86,11 @@ class Newton:
             impulse[:] = system.sc.fixed
             return Claim(Status.STALLED, 0, {"factorisations": 0}, "no row can move")
         cold = bool(np.array_equal(impulse, problem.start()))
+        sweeps = system.factorisations = 0
         if not cold and self.form == "auto":
-            claim = solve_warm(problem, impulse, tol, n)
+            claim, sweeps, system.factorisations = solve_warm(problem, impulse, tol, n, time_limit)
             if claim is not None:
                 return claim
-        system.factorisations = 0
         deadline = np.inf if time_limit is None else perf_counter() + time_limit
         run = Run(system, tol, n, deadline)
         z = system.sc.unknown(impulse)
@@ -119,7 +119,7 @@ class Newton:
             status = Status.TIME_LIMIT
         else:
             status = Status.STALLED
-        work = {"factorisations": system.factorisations}
+        work = {"factorisations": system.factorisations} | ({"sweeps": sweeps} if sweeps else {})
         return Claim(
             status,
             system.factorisations,
