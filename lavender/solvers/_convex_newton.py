@@ -14,7 +14,8 @@ from lavender.solvers._ipm import DELTA, InteriorPoint
 from lavender.solvers._polish import Proximal, Run, polish
 
 IPM_PATIENCE = 15  # interior point steps that halve neither residual nor gap
-HOLD = 0.1  # share of rows beyond their bounds up to which exchanging those is worth a try
+HOLD = 0.1  # share of rows beyond their bounds up to which exchanging those is worth a try,
+FEW = 64  # or rows up to which it always is
 REFINEMENTS = 3
 FIRST = 1e-2  # relative residual of the first polish of an interior point; the next at each decade
 SETTLED = (
@@ -69,7 +70,7 @@ def _everything(run: Run, ip: InteriorPoint) -> None:
                 break
         if run.relative(size, 0.0) <= run.tol and run.score(z) <= run.tol:
             return
-    if wrong <= HOLD * sc.m and not run.done():
+    if (sc.m <= FEW or wrong <= HOLD * sc.m) and not run.done():
         polish(run, z, patience=1, limit=3)
 
 

@@ -3,8 +3,8 @@
     H z - g = s,   H = D^-1/2 A D^-1/2,   g = D^-1/2 b,   z, s complementary on every block
 
 Two forms of H: `VelocitySystem` never forms it (K K^T + theta with one small dense block for each body,
-factored in compiled code), `MatrixSystem` holds it (dense LAPACK or sparse LU). The equations are in
-`lavender_ext/newton.pyx`.
+factored in compiled code), `MatrixSystem` holds it (dense LAPACK, LAPACK's band where one is narrow, else
+sparse LU). The equations are in `lavender_ext/newton.pyx`.
 """
 
 from __future__ import annotations
