@@ -7,8 +7,9 @@ when sweep s is through with it, T levels later:
 
     time of contact c in sweep s = level(c) + s T,    T = max over bodies of last - first level + 1     (1)
 
-Contacts of one slot, level mod T, share no body: they stand in pairs, one in each lane of a vector. Pass k
-visits all slots, and in each the contacts whose sweep k - floor(level / T) is due. Every contact still sees
+Contacts of one slot, level mod T, share no body: they stand in pairs, one in each lane of a vector, the last
+of a slot beside one of the next. Pass k visits all slots, and in each the contacts whose sweep
+k - floor(level / T) is due. Every contact still sees
 its bodies as in one sweep after another. Behind joints, which come first in every sweep, T is the number of
 levels. A record holds what the update of rows.pxd reads, and the second tangent.
 """
@@ -36,7 +37,7 @@ cdef enum:                      # one record, in pairs
     R_IMPULSE = 46
     R_PLACE = 49                # int64, of each lane: where a, b are read; where they are written; stage
     RECORD = 54
-    ROOM_CONTACT = 109          # doubles: a record, as every slot may hold one contact alone, and two int32
+    ROOM_CONTACT = 110          # doubles: a record, as every contact may stand alone, and three int32
     ROOM_BODY = 7
     ROOM_MORE = 16
     SLOTS = 32768               # more than there are slots: level // SLOTS is the stage, the rest the slot
@@ -86,56 +87,55 @@ cdef inline int32_t set_levels(const rows_t* r, const int32_t* order, int32_t* l
     return t
 
 
-cdef inline void put3(double* out, int32_t field, const double* x) noexcept nogil:
-    # three entries of one lane; out is at the lane
+cdef inline void put(pair_t* out, int32_t n, const double* x, const double* y) noexcept nogil:
     cdef int32_t k
-    for k in range(3):
-        out[LANES * (field + k)] = x[k]
+    for k in range(n):
+        out[k] = gather(x + k, y + k)
 
 
-cdef inline void pack_contact(const blocks_t* p, const rows_t* r, int32_t c, const double* lam, int32_t stage,
-                              double* out, int64_t* place) noexcept nogil:
-    cdef int32_t i = r.n_joints + c, j = p.ptr[i], k, a = r.contact_body[2 * c], b = r.contact_body[2 * c + 1]
-    cdef double t2[3]
-    cdef const double* swing = r.swing + 6 * (j - p.ptr[r.n_joints])
-    put3(out, R_NORMAL, r.normal + 3 * c)
-    put3(out, R_TANGENT, r.tangent + 3 * c)
+cdef inline void pack_contacts(const blocks_t* p, const rows_t* r, int32_t c, int32_t d, int32_t stage_c,
+                               int32_t stage_d, const double* lam, pair_t* out) noexcept nogil:
+    """The record of contacts c and d; d = c where it stands alone: the other lane then stays as it is."""
+    cdef int32_t i = p.ptr[r.n_joints + c], j = p.ptr[r.n_joints + d], k, a, b, first = p.ptr[r.n_joints]
+    cdef double t2[6]
+    cdef double mass[4]
+    cdef int64_t* place = <int64_t*>(out + R_PLACE)
+    cdef double* x = <double*>out
+    put(out + R_NORMAL, 3, r.normal + 3 * c, r.normal + 3 * d)
+    put(out + R_TANGENT, 3, r.tangent + 3 * c, r.tangent + 3 * d)
     cross(r.normal + 3 * c, r.tangent + 3 * c, t2)
-    put3(out, R_TANGENT_2, t2)
-    put3(out, R_ARM_A, r.arm_a + 3 * c)
-    put3(out, R_ARM_B, r.arm_b + 3 * c)
-    put3(out, R_COMPLIANCE, r.compliance + j)
-    put3(out, R_RHS, p.b + j)
-    put3(out, R_IMPULSE, lam + j)
-    for k in range(6):
-        put3(out, R_SWING + 3 * k, swing + 3 * k)
-    out[LANES * R_STEP] = p.step[j]
-    out[LANES * (R_STEP + 1)] = p.step[j + 1]
-    out[LANES * R_MU] = p.mu[i]
-    out[LANES * R_COUPLING] = r.coupling[5 * c]
-    out[LANES * (R_COUPLING + 1)] = r.coupling[5 * c + 1]
-    out[LANES * R_MASS_A] = r.inv_mass[a] if a >= 0 else 0.0
-    out[LANES * R_MASS_B] = r.inv_mass[b] if b >= 0 else 0.0
-    # behind the last body: zeros that are read for a static one, and a place that nobody reads
-    place[0] = 6 * <int64_t>(a if a >= 0 else r.n_bodies)
-    place[LANES] = 6 * <int64_t>(b if b >= 0 else r.n_bodies)
-    place[2 * LANES] = 6 * <int64_t>(a if a >= 0 else r.n_bodies + 1)
-    place[3 * LANES] = 6 * <int64_t>(b if b >= 0 else r.n_bodies + 1)
-    place[4 * LANES] = stage
-
-
-cdef inline void pack_nothing(const rows_t* r, double* out, int64_t* place) noexcept nogil:
-    # a lane that stays as it is: no step, sticking well inside its disk
-    cdef int32_t k
-    for k in range(R_PLACE):
-        out[LANES * k] = 0.0
-    out[LANES * R_MU] = 1.0
-    out[LANES * R_IMPULSE] = 1.0
-    out[LANES * (R_IMPULSE + 1)] = 0.5
-    for k in range(2):
-        place[k * LANES] = 6 * <int64_t>r.n_bodies
-        place[(2 + k) * LANES] = 6 * <int64_t>(r.n_bodies + 1)
-    place[4 * LANES] = 0
+    cross(r.normal + 3 * d, r.tangent + 3 * d, t2 + 3)
+    put(out + R_TANGENT_2, 3, t2, t2 + 3)
+    put(out + R_ARM_A, 3, r.arm_a + 3 * c, r.arm_a + 3 * d)
+    put(out + R_ARM_B, 3, r.arm_b + 3 * c, r.arm_b + 3 * d)
+    put(out + R_COMPLIANCE, 3, r.compliance + i, r.compliance + j)
+    put(out + R_RHS, 3, p.b + i, p.b + j)
+    put(out + R_STEP, 2, p.step + i, p.step + j)
+    put(out + R_MU, 1, p.mu + r.n_joints + c, p.mu + r.n_joints + d)
+    put(out + R_COUPLING, 2, r.coupling + 5 * c, r.coupling + 5 * d)
+    put(out + R_SWING, 18, r.swing + 6 * (i - first), r.swing + 6 * (j - first))
+    put(out + R_IMPULSE, 3, lam + i, lam + j)
+    for k in range(LANES):
+        a = r.contact_body[2 * (c if k == 0 else d)]
+        b = r.contact_body[2 * (c if k == 0 else d) + 1]
+        mass[k] = r.inv_mass[a] if a >= 0 else 0.0
+        mass[2 + k] = r.inv_mass[b] if b >= 0 else 0.0
+        # behind the last body: zeros that are read for a static one, and a place that nobody reads
+        place[k] = 6 * <int64_t>(a if a >= 0 else r.n_bodies)
+        place[LANES + k] = 6 * <int64_t>(b if b >= 0 else r.n_bodies)
+        place[2 * LANES + k] = 6 * <int64_t>(a if a >= 0 else r.n_bodies + 1)
+        place[3 * LANES + k] = 6 * <int64_t>(b if b >= 0 else r.n_bodies + 1)
+        place[4 * LANES + k] = stage_c if k == 0 else stage_d
+    out[R_MASS_A] = gather(mass, mass + 1)
+    out[R_MASS_B] = gather(mass + 2, mass + 3)
+    if LANES > 1 and c == d:
+        # no step, sticking well inside its disk
+        for k in range(R_COMPLIANCE, R_MASS_A):
+            x[2 * k + 1] = 1.0 if k == R_MU else 0.0
+        for k in range(3):
+            x[2 * (R_IMPULSE + k) + 1] = 1.0 - 0.5 * k
+        for k in range(4):
+            place[2 * k + 1] = 6 * <int64_t>(r.n_bodies if k < 2 else r.n_bodies + 1)
 
 
 cdef inline void relax_pair(pair_t* c, double* v, const int64_t* to_a, const int64_t* to_b) noexcept nogil:
@@ -242,6 +242,30 @@ cdef inline void relax_due(pair_t* c, double* v, int32_t pass_, int32_t sweeps, 
                 lam[LANES * k + l] = kept[3 * l + k]
 
 
+cdef inline int32_t share(const rows_t* r, int32_t c, int32_t d) noexcept nogil:
+    # a moving body in common
+    cdef int32_t a = r.contact_body[2 * c], b = r.contact_body[2 * c + 1]
+    cdef int32_t e = r.contact_body[2 * d], f = r.contact_body[2 * d + 1]
+    return (a >= 0 and (a == e or a == f)) or (b >= 0 and (b == e or b == f))
+
+
+cdef inline int32_t find_partner(const rows_t* r, const int32_t* contacts, int32_t kj, int32_t* line, int32_t i,
+                                 int32_t end, const int32_t* level, const int32_t* ends) noexcept nogil:
+    """Whether line[i + 1] may stand beside line[i]: of one slot, which ends at `end`, or, the last of it, beside
+    one of the next slot that shares no body with it and is brought to the front."""
+    cdef int32_t q, top
+    if i + 1 < end:
+        return 1
+    top = ends[level[line[i + 1]] % SLOTS]
+    for q in range(i + 1, top):
+        if not share(r, contacts[line[i]] - kj, contacts[line[q]] - kj):
+            top = line[q]
+            line[q] = line[i + 1]
+            line[i + 1] = top
+            return 1
+    return 0
+
+
 cdef inline void sweep_packed(const blocks_t* p, const rows_t* r, const int32_t* order, int32_t sweeps,
                               double* room, double* lam, double* v) noexcept nogil:
     """`sweeps` sweeps over joints and contacts, order (k) of blocks; v (n_bodies, 6).
@@ -251,8 +275,9 @@ cdef inline void sweep_packed(const blocks_t* p, const rows_t* r, const int32_t*
     cdef int32_t n = r.n_contacts, kj = r.n_joints
     cdef int32_t* first = <int32_t*>room
     cdef int32_t* level = first + 2 * r.n_bodies
-    cdef int32_t* start = level + n
-    cdef int32_t i, _i, j, k, l, t, top, stages, pairs, stage
+    cdef int32_t* line = level + n                      # contacts in the order of their slots
+    cdef int32_t* start = line + n                      # of each slot; then its end
+    cdef int32_t i, _i, j, k, t, top, stages, pairs, stage
     cdef const int32_t* contacts = order + kj
     cdef pair_t* record
     cdef pair_t* x
@@ -268,29 +293,37 @@ cdef inline void sweep_packed(const blocks_t* p, const rows_t* r, const int32_t*
         level[i] -= stage * t
         start[level[i]] += 1
         level[i] += SLOTS * stage
-    pairs = 0
+    k = 0
     for i in range(t):
-        k = start[i]
-        start[i] = LANES * pairs                        # place of the slot's next contact
-        pairs += (k + LANES - 1) // LANES
-    room += r.n_bodies + n + 1
+        j = start[i]
+        start[i] = k
+        k += j
+    for i in range(n):
+        j = level[i] % SLOTS
+        line[start[j]] = i
+        start[j] += 1
+    room += r.n_bodies + n + n // 2 + 2
     # records begin on a multiple of 16 bytes
     record = <pair_t*>(room + ((<uintptr_t>room >> 3) & 1))
-    body = <double*>(record + <int64_t>pairs * RECORD)
-    for i in range(n):
-        stage = level[i] // SLOTS
-        j = level[i] % SLOTS
-        k = start[j]
-        start[j] += 1
-        level[i] = k
-        x = record + <int64_t>(k // LANES) * RECORD
-        l = k % LANES
-        pack_contact(p, r, contacts[i] - kj, lam, stage, <double*>x + l, <int64_t*>(x + R_PLACE) + l)
-    for i in range(t):
-        k = start[i]
-        if k % LANES != 0:
-            x = record + <int64_t>(k // LANES) * RECORD
-            pack_nothing(r, <double*>x + 1, <int64_t*>(x + R_PLACE) + 1)
+    x = record
+    pairs = 0
+    i = 0
+    while i < n:
+        k = line[i]
+        stage = level[k] // SLOTS
+        j = level[k] % SLOTS
+        level[k] = LANES * pairs
+        if LANES > 1 and i + 1 < n and find_partner(r, contacts, kj, line, i, start[j], level, start):
+            i += 1
+            j = line[i]
+            pack_contacts(p, r, contacts[k] - kj, contacts[j] - kj, stage, level[j] // SLOTS, lam, x)
+            level[j] = LANES * pairs + 1
+        else:
+            pack_contacts(p, r, contacts[k] - kj, contacts[k] - kj, stage, stage, lam, x)
+        pairs += 1
+        i += 1
+        x += RECORD
+    body = <double*>x
     for i in range(6 * r.n_bodies):
         body[i] = v[i]
     for i in range(12):

@@ -13,7 +13,7 @@ import numpy as np
 from lavender import io
 from lavender._arrays import FloatArray, read_only
 from lavender.cones import CONTACT_SPIN, Cones
-from lavender.engine.layout import HEAD, NEED_ROOM, NOT_FINITE, OK, SETTING, SIZE
+from lavender.engine.layout import HEAD, NEED_ROOM, NOT_FINITE, OK, SIZE
 from lavender.engine.snapshot import Snapshot
 from lavender.engine.state import State
 from lavender.errors import InputError, LavenderError, SolveFailed, UnknownName
@@ -307,27 +307,23 @@ class Simulation:
 
     def _observe(self) -> dict[str, Any]:
         s = self._state
-        a, mj = s.a, int(s.size[SIZE["joint_rows"]])
-        c, rows = int(s.head[HEAD["contacts"]]), int(s.head[HEAD["contact_rows"]])
-        per = int(s.size[SIZE["rows_per_contact"]])
-        if rows == c * per:
-            impulses = a["impulse"][mj : mj + rows].reshape(c, per).copy()
-        else:
-            impulses = self._spread(c, per)
+        c, rows = s.head.item(HEAD["contacts"]), s.head.item(HEAD["contact_rows"])
+        seen = s.seen(c, rows)
+        impulses = seen.impulses() if seen.impulses is not None else self._spread(c, seen.per)
         return {
-            "positions": a["x"].copy(),
-            "quaternions": a["q"].copy(),
-            "velocities": a["v"].copy(),
+            "positions": seen.positions(),
+            "quaternions": seen.quaternions(),
+            "velocities": seen.velocities(),
             "contacts": {
-                "pair": a["contact_pair"][:c].copy(),
-                "point": a["point"][:c].copy(),
-                "normal": a["normal"][:c].copy(),
-                "tangent": a["tangent"][:c].copy(),
-                "depth": 0.0 - a["gap"][:c],
+                "pair": seen.pair(),
+                "point": seen.point(),
+                "normal": seen.normal(),
+                "tangent": seen.tangent(),
+                "depth": 0.0 - seen.gap,
                 "impulses": impulses,
             },
-            "joint_impulses": a["joint_impulse"].copy(),
-            "solver": s.setting[SETTING["out"] : SETTING["out"] + 8].copy(),
+            "joint_impulses": seen.joint_impulses(),
+            "solver": seen.solver(),
         }
 
     def _spread(self, c: int, per: int) -> FloatArray:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -24,6 +25,8 @@ from lavender_ext import engine as kernels
 from lavender_ext import warm as kernels_warm
 
 __all__ = ["ORDER_NUMBER", "State"]
+
+Copy = Callable[[], np.ndarray]
 
 # H_ORDER of lavender_ext/engine.pyx
 ORDER_NUMBER = {
@@ -49,6 +52,23 @@ KEPT = (
 )  # fmt: skip
 
 
+class Seen(NamedTuple):
+    """Copies of what an observation shows, for one number of contacts and of their rows."""
+
+    positions: Copy
+    quaternions: Copy
+    velocities: Copy
+    joint_impulses: Copy
+    solver: Copy
+    pair: Copy
+    point: Copy
+    normal: Copy
+    tangent: Copy
+    gap: np.ndarray  # (c,) m
+    impulses: Copy | None  # None where contacts differ in their number of rows
+    per: int  # rows that a contact of this scene can have
+
+
 class State:
     """Three buffers with the arrays of `lavender_ext/engine_types.pxd` by name, as attributes of `a`."""
 
@@ -63,11 +83,37 @@ class State:
         self.kernel = kernels.Buffers(self.size, self.real, self.index, self.keys)
         self.a: dict[str, np.ndarray] = self.kernel.arrays()
         self.head, self.setting = self.a["head"], self.a["setting"]
+        self._seen: tuple[int, int, Seen] | None = None
 
     @cached_property
     def warm(self) -> kernels_warm.Warm:
         """The first phase of `newton` on these buffers."""
         return kernels_warm.Warm(self.size, self.real, self.index, self.keys)
+
+    def seen(self, contacts: int, rows: int) -> Seen:
+        """What to copy for an observation; kept while the numbers stay."""
+        if self._seen is None or self._seen[:2] != (contacts, rows):
+            a, first = self.a, int(self.size[SIZE["joint_rows"]])
+            per = int(self.size[SIZE["rows_per_contact"]])
+            even = rows == contacts * per
+            block = a["impulse"][first : first + rows].reshape(contacts, per).copy if even else None
+            out = self.setting[SETTING["out"] : SETTING["out"] + 8]
+            seen = Seen(
+                positions=a["x"].copy,
+                quaternions=a["q"].copy,
+                velocities=a["v"].copy,
+                joint_impulses=a["joint_impulse"].copy,
+                solver=out.copy,
+                pair=a["contact_pair"][:contacts].copy,
+                point=a["point"][:contacts].copy,
+                normal=a["normal"][:contacts].copy,
+                tangent=a["tangent"][:contacts].copy,
+                gap=a["gap"][:contacts],
+                impulses=block,
+                per=per,
+            )
+            self._seen = contacts, rows, seen
+        return self._seen[2]
 
     @property
     def nbytes(self) -> int:
