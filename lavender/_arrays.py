@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from lavender_ext.judge import all_finite
 
 from lavender.errors import InputError
 
@@ -14,7 +15,7 @@ IntArray = npt.NDArray[np.int32]
 
 
 def read_only(array: np.ndarray) -> np.ndarray:
-    array.flags.writeable = False
+    array.setflags(write=False)
     return array
 
 
@@ -74,16 +75,12 @@ def as_array(
 
 
 def _check_finite(what: str, array: np.ndarray) -> None:
-    # One sum sees every NaN and infinity; only a failing array, or one whose sum overflows, pays for the search.
-    with np.errstate(over="ignore", invalid="ignore"):
-        total = array.sum()
-    if not np.isfinite(total):
+    if not all_finite(array.reshape(-1)):
         bad = np.argwhere(~np.isfinite(array))
-        if len(bad):
-            where = ", ".join(map(str, bad[0]))
-            raise InputError(
-                f"{what} must be finite; entry [{where}] is {array[tuple(bad[0])]}, {len(bad)} in all"
-            )
+        where = ", ".join(map(str, bad[0]))
+        raise InputError(
+            f"{what} must be finite; entry [{where}] is {array[tuple(bad[0])]}, {len(bad)} in all"
+        )
 
 
 def check_not_nan(what: str, array: np.ndarray) -> None:

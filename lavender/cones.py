@@ -11,6 +11,7 @@ perhaps one spin row. With lambda [N s] the bounds are
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -112,7 +113,7 @@ class Cones:
     @classmethod
     def free(cls, m: int) -> Cones:
         """m unbounded rows, each its own block: a linear system."""
-        return cls._trusted(
+        cones = cls._trusted(
             np.arange(m + 1, dtype=np.int32),
             np.zeros(m, np.int32),
             np.full(m, -np.inf),
@@ -120,6 +121,8 @@ class Cones:
             np.zeros(m),
             np.zeros(m),
         )
+        cones.__dict__["is_free"] = True
+        return cones
 
     @classmethod
     def contacts(cls, mu: FloatArray, tangents: int = 2, patch_radius: FloatArray | None = None) -> Cones:
@@ -144,7 +147,7 @@ class Cones:
         """Number of rows, m."""
         return int(self.ptr[-1])
 
-    @property
+    @cached_property
     def is_free(self) -> bool:
         """Every row is unbounded."""
         return bool(

@@ -77,6 +77,8 @@ def block_order(
     """
     k = problem.n_blocks
     split = 0 if problem.rows is None else problem.rows.n_joints
+    if type(order) is str and order == "given" and ground is None and type(seed) is int and seed == 0:
+        return Order(np.arange(k, dtype=np.int32), split, _GIVEN, np.zeros(1, np.uint64), is_given=True)
     if not isinstance(seed, (int, np.integer)) or seed < 0:
         raise InputError(f"seed is {seed!r}; a whole number >= 0 is needed")
     rng = np.array([int(seed) % 2**64], np.uint64)

@@ -539,6 +539,10 @@ class Problem:
 
     def impulse_array(self, impulse: Any, name: str = "impulse") -> FloatArray:
         """A writable private copy of `impulse`, checked: (m,) [N s], finite."""
+        if type(impulse) is np.ndarray and impulse.dtype == np.float64 and impulse.shape == self.b.shape:
+            own = impulse.copy()
+            if judge.all_finite(own):
+                return own
         return as_array(name, impulse, (self.m,), unit="N s").copy()
 
     # -- names -----------------------------------------------------------------------------------

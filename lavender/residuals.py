@@ -71,24 +71,24 @@ def _ratio(x: float, reference: float) -> float:
     return x / reference if reference > 0.0 else np.inf
 
 
+def _relative(data: Any, energy: float, velocity: float) -> float:
+    return max(_ratio(energy, data.start_energy), _ratio(velocity, data.start_velocity))
+
+
 def reference(problem: Problem) -> tuple[float, float]:
     """E0 [sqrt J] and V0 [m/s]; computed once per problem."""
     data = problem.data
     if data.start_energy < 0.0:
         m = problem.m
         w, e = np.empty(m), np.empty(m)
-        energy, velocity, *_ = kernels.judge(data, problem.start(), w, e, False)
-        # The norms of b: sqrt(sum b^2 / d), max |b| sqrt(nu / d), |b| the pair's norm on tangents. Scaled, so
-        # that 1e-200 does not vanish.
-        x = np.abs(problem.b) / np.sqrt(data.d)
-        big = x.max(initial=0.0)
-        rhs_energy = float(big) * float(np.sqrt(np.sum((x / big) ** 2))) if big > 0.0 else 0.0
+        energy, velocity, *_ = own = kernels.judge(data, problem.start(), w, e, False)
+        # The norms of b: sqrt(sum b^2 / d), max |b| sqrt(nu / d), |b| the pair's norm on tangents.
+        rhs_energy, rhs_velocity = kernels.rhs_norms(data)
         if energy <= 2.0**-48 * rhs_energy:
-            pair = problem.cones.ptr[:-1][problem.cones.n_tangents == 2] + 1
-            x[pair] = np.hypot(x[pair], x[pair + 1])
-            energy, velocity = rhs_energy, float((x * np.sqrt(data.nu)).max(initial=0.0))
+            energy, velocity = rhs_energy, rhs_velocity
         # A size that overflows measures nothing: 0 makes every error beside it infinite.
         data.set_start(energy if energy < np.inf else 0.0, velocity if velocity < np.inf else 0.0)
+        problem.__dict__["_start_relative"] = _relative(data, *own[:2])
     return data.start_energy, data.start_velocity
 
 
@@ -103,6 +103,15 @@ def judged(problem: Problem, impulse: FloatArray) -> kernels.Judged:
 def remember(problem: Problem, last: kernels.Judged) -> None:
     """Leave a result for the next `residual` of this problem, which takes it for the same impulse, bit for bit."""
     problem.__dict__["_judged"] = last
+
+
+def known(problem: Problem, impulse: FloatArray) -> float | None:
+    """Relative residual of doing nothing, or of what `remember` was given, where `impulse` is that, bit for bit."""
+    last = problem.__dict__.get("_judged")
+    if last is not None and kernels.same_bits(last.impulse, impulse):
+        return float(last.relative)
+    start: float | None = problem.__dict__.get("_start_relative")
+    return start if start is not None and kernels.same_bits(problem._start, impulse) else None
 
 
 def quick(

@@ -17,6 +17,12 @@ from lavender.residuals import Residual
 __all__ = ["Claim", "History", "Solution", "SolverRun", "Status"]
 
 
+def _fill(made: object, values: dict[str, Any]) -> None:
+    # All fields of a frozen dataclass at once: its own __init__ writes them one by one, which takes three times as
+    # long, and a solve of a few rows makes several of these.
+    object.__setattr__(made, "__dict__", values)
+
+
 class Status(str, Enum):
     """The solver's claim; the value is its meaning in words."""
 
@@ -34,7 +40,7 @@ class Status(str, Enum):
         return self.name
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, init=False)
 class Claim:
     """What one call of a solver's `run` says of itself."""
 
@@ -45,6 +51,29 @@ class Claim:
     form: str = ""  # which formulation ran, where there is a choice
     dual: Any = None  # the backend's own multipliers, as it returned them
     certificate: FloatArray | None = None  # (m,), with INFEASIBLE
+
+    def __init__(
+        self,
+        status: Status,
+        iterations: int,
+        work: Mapping[str, int] | None = None,
+        message: str = "",
+        form: str = "",
+        dual: Any = None,
+        certificate: FloatArray | None = None,
+    ) -> None:
+        _fill(
+            self,
+            {
+                "status": status,
+                "iterations": iterations,
+                "work": {} if work is None else work,
+                "message": message,
+                "form": form,
+                "dual": dual,
+                "certificate": certificate,
+            },
+        )
 
 
 @dataclass(frozen=True)
@@ -61,7 +90,7 @@ class History:
         return len(self.iterations)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, init=False)
 class SolverRun:
     """Which solver ran, how."""
 
@@ -69,8 +98,11 @@ class SolverRun:
     options: Mapping[str, Any]
     form: str = ""
 
+    def __init__(self, name: str, options: Mapping[str, Any], form: str = "") -> None:
+        _fill(self, {"name": name, "options": options, "form": form})
 
-@dataclass(frozen=True)
+
+@dataclass(frozen=True, init=False)
 class Solution:
     """Result of `solve`; returned for every status, with the iterate. `str()` is one line."""
 
@@ -89,18 +121,42 @@ class Solution:
     certificate: FloatArray | None = None  # (m,), with INFEASIBLE
     contradicted: str = ""  # why the judge disagrees with `status`; empty where it does not
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "work", MappingProxyType(dict(self.work)))
-
-    @classmethod
-    def _trusted(cls, *values: Any) -> Solution:
-        # The front door's own values, in order of the fields: nothing is checked, and a frozen dataclass's
-        # __init__ would take four times as long.
-        made: Solution = object.__new__(cls)
-        state = dict(zip(_FIELDS, values, strict=True))
-        state["work"] = MappingProxyType(dict(state["work"]))
-        object.__setattr__(made, "__dict__", state)
-        return made
+    def __init__(
+        self,
+        impulse: FloatArray,
+        residual: Residual,
+        status: Status,
+        tol: float,
+        iterations: int,
+        work: Mapping[str, int],
+        setup_time: float,
+        solve_time: float,
+        solver: SolverRun,
+        message: str = "",
+        history: History | None = None,
+        dual: Any = None,
+        certificate: FloatArray | None = None,
+        contradicted: str = "",
+    ) -> None:
+        _fill(
+            self,
+            {
+                "impulse": impulse,
+                "residual": residual,
+                "status": status,
+                "tol": tol,
+                "iterations": iterations,
+                "work": MappingProxyType(dict(work)),
+                "setup_time": setup_time,
+                "solve_time": solve_time,
+                "solver": solver,
+                "message": message,
+                "history": history,
+                "dual": dual,
+                "certificate": certificate,
+                "contradicted": contradicted,
+            },
+        )
 
     def __reduce__(self) -> tuple[Any, ...]:
         # A read-only view of a dict has no pickle.
@@ -138,6 +194,3 @@ class Solution:
             f"{work or f'{self.iterations} iterations'}, "
             f"{1e3 * (self.setup_time + self.solve_time):.3g} ms{note}{wrong}"
         )
-
-
-_FIELDS = tuple(f.name for f in fields(Solution))

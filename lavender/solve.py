@@ -347,7 +347,7 @@ def finish(
         )
         contradicted = f"says INFEASIBLE, {reason}" if reason else ""
     impulse.flags.writeable = False
-    return Solution._trusted(
+    return Solution(
         impulse,
         judged,
         status,

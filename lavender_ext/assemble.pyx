@@ -72,7 +72,11 @@ cdef public void lav_body_blocks(const blocks_t* p, const rows_t* r, int32_t* st
         start[i] = start[i - 1]
         i -= 1
     start[0] = 0
-    bound[0] = p.n_rows
+    bound[0] = 0
+    for i in range(p.n_blocks):
+        here = p.ptr[i + 1] - p.ptr[i]
+        t = (body_of(r, i, 0) >= 0) + (body_of(r, i, 1) >= 0)
+        bound[0] += here if t == 0 else (1 - t) * here * here    # a block meets itself once, not at both bodies
     for i in range(r.n_bodies):
         here = 0
         for x in range(start[i], start[i + 1]):
@@ -127,33 +131,74 @@ cdef inline double meeting(const double* jac, const double* minv_jac, int32_t bi
     return value
 
 
+cdef inline int32_t single(int32_t bits) noexcept nogil:
+    # Which of the four bits, where it is one alone; else -1.
+    if bits == 1:
+        return 0
+    if bits == 2:
+        return 1
+    if bits == 4:
+        return 2
+    return 3 if bits == 8 else -1
+
+
 cdef public void lav_assemble(const blocks_t* p, const rows_t* r, const double* jac, const double* minv_jac,
                               const int32_t* start, const int32_t* blocks, int32_t* near, int32_t* sides,
-                              int32_t* indptr, int32_t* indices, double* data) noexcept nogil:
-    """Rows of A into indptr (m + 1), indices, data; near, sides (2 k + 1) are scratch."""
-    cdef int32_t i, n, q, j, row, col, nnz = 0
+                              int32_t* next_, int32_t* indptr, int32_t* indices, double* data) noexcept nogil:
+    """Rows of A into indptr (m + 1), indices, data; near, sides (2 k + 1), next_ (m) are scratch.
+
+    next_[c] is the entry of row c that the row of its column, which comes later, copies.
+    """
+    cdef int32_t i, n, q, j, row, col, end, at, bit, nnz = 0
     cdef double value
+    cdef const double* x
+    cdef const double* y
     indptr[0] = 0
     for i in range(p.n_blocks):
         n = meet(r, i, start, blocks, near)
         for q in range(n):
-            # The lower block gives J, the higher M^-1 J^T, whichever of them is i.
-            j = near[q]
-            sides[q] = shared_sides(r, i, j) if i <= j else shared_sides(r, j, i)
+            sides[q] = shared_sides(r, i, near[q]) if i <= near[q] else 0
         for row in range(p.ptr[i], p.ptr[i + 1]):
             for q in range(n):
                 j = near[q]
-                for col in range(p.ptr[j], p.ptr[j + 1]):
-                    if row <= col:
-                        value = meeting(jac + 12 * row, minv_jac + 12 * col, sides[q])
-                    else:
-                        value = meeting(jac + 12 * col, minv_jac + 12 * row, sides[q])
-                    if row == col:
-                        value += r.compliance[row]
-                    if value != 0.0:
+                col = p.ptr[j]
+                end = p.ptr[j + 1]
+                while col < end and col < row:
+                    at = next_[col]
+                    if at < indptr[col + 1] and indices[at] == row:
                         indices[nnz] = col
+                        data[nnz] = data[at]
+                        nnz += 1
+                        next_[col] = at + 1
+                    col += 1
+                if col == end:
+                    continue
+                # The lower block gives J, the higher M^-1 J^T.
+                if col == row:
+                    value = (meeting(jac + 12 * row, minv_jac + 12 * row, sides[q]) + r.compliance[row])
+                    if value != 0.0:
+                        indices[nnz] = row
                         data[nnz] = value
                         nnz += 1
+                    next_[row] = nnz
+                    col += 1
+                bit = single(sides[q])
+                if bit >= 0:
+                    x = jac + 12 * row + 6 * (bit >> 1)
+                    y = minv_jac + 6 * (bit & 1)
+                    while col < end:
+                        value = dot6(x, y + 12 * col)
+                        indices[nnz] = col
+                        data[nnz] = value
+                        nnz += value != 0.0
+                        col += 1
+                else:
+                    while col < end:
+                        value = meeting(jac + 12 * row, minv_jac + 12 * col, sides[q])
+                        indices[nnz] = col
+                        data[nnz] = value
+                        nnz += value != 0.0
+                        col += 1
             indptr[row + 1] = nnz
 
 
@@ -172,10 +217,14 @@ def delassus(Data p, Py_ssize_t most, int32_t[::1] start, int32_t[::1] blocks):
     cdef int32_t nnz
     cdef double[::1] jac = np.empty(12 * m + 1), minv_jac = np.empty(12 * m + 1), data = np.empty(most + 1)
     cdef int32_t[::1] indices = np.empty(most + 1, np.int32), indptr = np.zeros(m + 1, np.int32)
-    cdef int32_t[::1] near = np.empty(4 * p.blocks.n_blocks + 2, np.int32)
+    cdef int32_t[::1] near = np.empty(4 * p.blocks.n_blocks + 2 + m, np.int32)
     with nogil:
         lav_expand_rows(&p.blocks, &p.rows, &jac[0], &minv_jac[0])
         lav_assemble(&p.blocks, &p.rows, &jac[0], &minv_jac[0], &start[0], &blocks[0], &near[0],
-                     &near[2 * p.blocks.n_blocks + 1], &indptr[0], &indices[0], &data[0])
+                     &near[2 * p.blocks.n_blocks + 1], &near[0] + 4 * p.blocks.n_blocks + 2, &indptr[0], &indices[0],
+                     &data[0])
     nnz = indptr[m]
-    return np.asarray(indptr), np.asarray(indices)[:nnz].copy(), np.asarray(data)[:nnz].copy()
+    found = np.asarray(indices)[:nnz], np.asarray(data)[:nnz]
+    if nnz < 0.75 * most:                               # a copy costs more than a quarter of unused room
+        found = found[0].copy(), found[1].copy()
+    return (np.asarray(indptr), *found)

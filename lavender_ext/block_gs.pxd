@@ -13,9 +13,9 @@ from libc.stdint cimport int32_t
 from lavender_ext.block cimport (CONE, CONTACT_SPIN, ROW, blocks_t, n_tangents, relax_normal, relax_row)
 from lavender_ext.csr cimport csr_dot, csr_t
 from lavender_ext.local cimport (FAILED, MAX_ROWS, PREPARED, boxed_rows, cone3, contact_with_spin,
-                                 contact_without_spin, coulomb3, eliminate, prepare3, project_locally)
+                                 contact_without_spin, coulomb3_from, eliminate, prepare3, project_locally)
 from lavender_ext.rows cimport (cross, dot3, joint_push, joint_velocity, push_bodies, relative_velocity,
-                                relax_joint, rows_t)
+                                relax_joint, rows_t, swing_body)
 
 
 cdef inline int32_t prepared_size(const blocks_t* p, int32_t i) noexcept nogil:
@@ -70,10 +70,10 @@ cdef inline void prepare_block(const blocks_t* p, int32_t i, const double* W, in
 cdef inline int32_t solve_block(const blocks_t* p, int32_t i, const double* g, const double* w,
                                 double* lam) noexcept nogil:
     """The exact update of block i from its slack w; lam at its first row. 1 where it fell back."""
-    cdef int32_t j = p.ptr[i], n = p.ptr[i + 1] - j, kind = p.kind[i], k, t, nt, found
+    cdef int32_t j = p.ptr[i], n = p.ptr[i + 1] - j, kind = p.kind[i], k, t, nt, found = FAILED
     cdef double q[4]
     cdef double x[MAX_ROWS]
-    cdef double s, f
+    cdef double s
     if kind == ROW:
         if n == 1:
             lam[0] = relax_row(lam[0], w[0], p.step[j], p.lower[j], p.upper[j])
@@ -92,28 +92,21 @@ cdef inline int32_t solve_block(const blocks_t* p, int32_t i, const double* g, c
         lam[0] = relax_normal(lam[0], w[0], p.step[j])
         return 0
     nt = n_tangents(kind, n)
-    if n == 3 and kind != CONTACT_SPIN:
-        # q = w - W lam
-        q[0] = w[0] - (g[0] * lam[0] + g[1] * lam[1] + g[2] * lam[2])
-        q[1] = w[1] - (g[3] * lam[0] + g[4] * lam[1] + g[5] * lam[2])
-        q[2] = w[2] - (g[6] * lam[0] + g[7] * lam[1] + g[8] * lam[2])
-        if p.law == CONE:
-            found = cone3(g, q, p.mu[i], lam) if g[9] > 0.0 or q[0] >= 0.0 else FAILED
-        else:
-            # Sliding as now would need beta = |w_t| / |lam_t|.
-            s = lam[1] * lam[1] + lam[2] * lam[2]
-            f = -(w[1] * lam[1] + w[2] * lam[2])
-            found = coulomb3(g, q, p.mu[i], f / s if s > 0.0 and f > 0.0 else 0.0, lam)
-    else:
-        for k in range(n):
-            s = w[k]
-            for t in range(n):
-                s -= g[n * k + t] * lam[t]
-            q[k] = s
-        if kind == CONTACT_SPIN:
-            found = contact_with_spin(p.law, nt, g, q, p.mu[i], p.patch_radius[i], lam)
-        else:
-            found = contact_without_spin(p.law, nt, g, q, p.mu[i], lam)
+    if n == 3 and kind != CONTACT_SPIN and p.law != CONE:
+        if coulomb3_from(g, w, p.mu[i], lam) != FAILED:
+            return 0
+    # q = w - W lam
+    for k in range(n):
+        s = w[k]
+        for t in range(n):
+            s -= g[n * k + t] * lam[t]
+        q[k] = s
+    if kind == CONTACT_SPIN:
+        found = contact_with_spin(p.law, nt, g, q, p.mu[i], p.patch_radius[i], lam)
+    elif n < 3:
+        found = contact_without_spin(p.law, nt, g, q, p.mu[i], lam)
+    elif p.law == CONE:
+        found = cone3(g, q, p.mu[i], lam) if g[9] > 0.0 or q[0] >= 0.0 else FAILED
     if found == FAILED:
         project_locally(p.law, nt, kind == CONTACT_SPIN, g, q, p.d + j, p.step + j, p.mu[i], p.patch_radius[i], lam)
         return 1
@@ -168,6 +161,40 @@ cdef inline int32_t solve_csr_block(const blocks_t* p, const csr_t* a, int32_t i
     return solve_block(p, i, g, w, lam + j)
 
 
+cdef inline int32_t solve_sliding_contact(const blocks_t* p, const rows_t* r, int32_t i, const double* g, double* lam,
+                                          double* v) noexcept nogil:
+    # The common kind, normal and two tangents under Coulomb's law; lam at its normal.
+    cdef int32_t j = p.ptr[i], c = i - r.n_joints, a = r.contact_body[2 * c], b = r.contact_body[2 * c + 1], k
+    cdef double w[3]
+    cdef double u[3]
+    cdef double omega[3]
+    cdef double t2[3]
+    cdef double impulse[3]
+    cdef double n = lam[0], x = lam[1], y = lam[2]
+    cdef const double* normal = r.normal + 3 * c
+    cdef const double* t1 = r.tangent + 3 * c
+    cdef const double* swing = r.swing + 6 * (j - p.ptr[r.n_joints])
+    relative_velocity(v, a, b, r.arm_a + 3 * c, r.arm_b + 3 * c, u, omega)
+    cross(normal, t1, t2)
+    w[0] = dot3(normal, u) + (r.compliance[j] * n - p.b[j])
+    w[1] = dot3(t1, u) + (r.compliance[j + 1] * x - p.b[j + 1])
+    w[2] = dot3(t2, u) + (r.compliance[j + 2] * y - p.b[j + 2])
+    k = 0
+    if coulomb3_from(g, w, p.mu[i], lam) == FAILED:
+        k = solve_block(p, i, g, w, lam)
+    n = lam[0] - n
+    x = lam[1] - x
+    y = lam[2] - y
+    impulse[0] = n * normal[0] + x * t1[0] + y * t2[0]
+    impulse[1] = n * normal[1] + x * t1[1] + y * t2[1]
+    impulse[2] = n * normal[2] + x * t1[2] + y * t2[2]
+    if a >= 0:
+        swing_body(v + 6 * a, r.inv_mass[a], swing, impulse, n, x, y, 0.0, 2, 0, -1.0)
+    if b >= 0:
+        swing_body(v + 6 * b, r.inv_mass[b], swing + 3, impulse, n, x, y, 0.0, 2, 0, 1.0)
+    return k
+
+
 cdef inline int32_t solve_rows_block(const blocks_t* p, const rows_t* r, int32_t i, const double* g, double* lam,
                                      double* v) noexcept nogil:
     cdef int32_t j = p.ptr[i], n = p.ptr[i + 1] - j, c = i - r.n_joints, k, a, b, nt, spin, found
@@ -181,6 +208,8 @@ cdef inline int32_t solve_rows_block(const blocks_t* p, const rows_t* r, int32_t
     cdef const double* normal
     cdef const double* t1
     w[0] = t2[0] = t2[1] = t2[2] = 0.0
+    if c >= 0 and n == 3 and p.kind[i] != CONTACT_SPIN and p.law != CONE:
+        return solve_sliding_contact(p, r, i, g, lam + j, v)
     if c < 0:
         if n > MAX_ROWS:
             relax_joint(p, r, i, lam, v)

@@ -6,7 +6,7 @@ import numpy as np
 
 from lavender_ext.block cimport blocks_t
 from lavender_ext.csr cimport csr_t
-from lavender_ext.judge cimport csr_slack, judge_into, rows_slack, rows_velocity, score_rows, score_t, wrenches
+from lavender_ext.judge cimport csr_slack, judge_into, norms_of_rhs, rows_slack, rows_velocity, score_rows, score_t, wrenches
 from lavender_ext.problem cimport Data
 from lavender_ext.rows cimport rows_t
 
@@ -117,6 +117,14 @@ def all_finite(const double[::1] x):
         s += 0.0 * x[i]
         i += 1
     return (s + t) + (u + v) == 0.0
+
+
+def rhs_norms(Data p):
+    """(sqrt J, m/s): b in the judge's two norms."""
+    cdef double energy, velocity
+    with nogil:
+        norms_of_rhs(&p.blocks, &energy, &velocity)
+    return energy, velocity
 
 
 def same_bits(const double[::1] x, const double[::1] y):

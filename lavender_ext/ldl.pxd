@@ -20,6 +20,13 @@ cdef struct pivots_t:
     int32_t first_small         # place of the first small pivot, -1
 
 
+cdef inline void no_pivots(pivots_t* out) noexcept nogil:
+    out.small = 0
+    out.negative = 0
+    out.least = 1.7976931348623157e308
+    out.first_small = -1
+
+
 cdef inline double pivot_2(double p, double size, int32_t i, double tiny, pivots_t* out) noexcept nogil:
     # 1 / p, or 0 for a small pivot.
     if p < out.least * size:
@@ -35,10 +42,11 @@ cdef inline double pivot_2(double p, double size, int32_t i, double tiny, pivots
     return 1.0 / p
 
 
-cdef inline void ldl_factor_2(int32_t n, double* c, const double* size, double tiny,
+cdef inline void ldl_factor_2(int32_t n, double* c, const double* size, double tiny, double* x,
                               pivots_t* out) noexcept nogil:
     # (1) for a tridiagonal matrix, from both ends to the middle row h (twisted factorisation): two chains of
-    # divisions that do not wait for each other. c[2 i] = 1 / p_i; the off-diagonals stay.
+    # divisions that do not wait for each other. c[2 i] = 1 / p_i; the off-diagonals stay. Where x is not NULL the
+    # first half of ldl_solve_2 goes along while the divisions run.
     cdef int32_t i = 0, j = n - 1, h = n // 2
     cdef double p = c[0], r = c[2 * (n - 1)], off
     while i < h or j > h:
@@ -46,12 +54,16 @@ cdef inline void ldl_factor_2(int32_t n, double* c, const double* size, double t
             p = pivot_2(p, size[i], i, tiny, out)
             c[2 * i] = p
             off = c[2 * i + 1]
+            if x != NULL:
+                x[i + 1] -= off * p * x[i]
             p = (c[2 * i + 2] if i + 1 < h else 0.0) - off * off * p
             i += 1
         if j > h:
             r = pivot_2(r, size[j], j, tiny, out)
             c[2 * j] = r
             off = c[2 * j - 1]
+            if x != NULL:
+                x[j - 1] -= off * r * x[j]
             r = (c[2 * j - 2] if j - 1 > h else 0.0) - off * off * r
             j -= 1
     # Both chains end with what they take from the diagonal of row h, itself still untouched.
@@ -63,18 +75,10 @@ cdef inline void ldl_factor_2(int32_t n, double* c, const double* size, double t
     c[2 * h] = pivot_2(off, size[h], h, tiny, out)
 
 
-cdef inline void ldl_solve_2(int32_t n, const double* c, double* x) noexcept nogil:
-    cdef int32_t i = 0, j = n - 1, h = n // 2
-    while i < h or j > h:
-        if i < h:
-            x[i + 1] -= c[2 * i + 1] * c[2 * i] * x[i]
-            i += 1
-        if j > h:
-            x[j - 1] -= c[2 * j - 1] * c[2 * j] * x[j]
-            j -= 1
+cdef inline void ldl_back_2(int32_t n, const double* c, double* x) noexcept nogil:
+    # The second half, from the middle to both ends.
+    cdef int32_t h = n // 2, i = h - 1, j = h + 1
     x[h] *= c[2 * h]
-    i = h - 1
-    j = h + 1
     while i >= 0 or j < n:
         if i >= 0:
             x[i] = x[i] * c[2 * i] - c[2 * i + 1] * c[2 * i] * x[i + 1]
@@ -84,6 +88,18 @@ cdef inline void ldl_solve_2(int32_t n, const double* c, double* x) noexcept nog
             j += 1
 
 
+cdef inline void ldl_solve_2(int32_t n, const double* c, double* x) noexcept nogil:
+    cdef int32_t i = 0, j = n - 1, h = n // 2
+    while i < h or j > h:
+        if i < h:
+            x[i + 1] -= c[2 * i + 1] * c[2 * i] * x[i]
+            i += 1
+        if j > h:
+            x[j - 1] -= c[2 * j - 1] * c[2 * j] * x[j]
+            j -= 1
+    ldl_back_2(n, c, x)
+
+
 cdef inline void ldl_factor(int32_t n, int32_t width, double* c, const double* size, double tiny,
                             pivots_t* out) noexcept nogil:
     # (1); size (n) > 0 is what a pivot is compared with.
@@ -91,12 +107,9 @@ cdef inline void ldl_factor(int32_t n, int32_t width, double* c, const double* s
     cdef double p, inv, l
     cdef double* col
     cdef double* to
-    out.small = 0
-    out.negative = 0
-    out.least = 1.7976931348623157e308
-    out.first_small = -1
+    no_pivots(out)
     if width == 2:
-        ldl_factor_2(n, c, size, tiny, out)
+        ldl_factor_2(n, c, size, tiny, NULL, out)
         return
     for i in range(n):
         col = c + <int64_t>i * width

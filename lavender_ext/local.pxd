@@ -40,12 +40,12 @@ cdef enum:
 
 cdef enum:
     MAX_ROWS = 8                # of a ROW block that is solved exactly
-    PREPARED = 16               # doubles of a prepared 3x3 block
+    PREPARED = 25               # doubles of a prepared 3x3 block
 
 
 cdef inline void prepare3(const double* W, double* g) noexcept nogil:
-    """g (16): W row by row, 1 / W_nn (0: not positive), S row by row, det S (0: singular), 0."""
-    cdef double h0, h1, inv, det, size
+    """g (25): W row by row, 1 / W_nn (0: not positive), S row by row, det S (0: singular), 0, W^-1 where det S > 0."""
+    cdef double h0, h1, k0, k1, inv, det, size, t00, t01, t10, t11
     cdef int32_t i
     for i in range(9):
         g[i] = W[i]
@@ -65,6 +65,25 @@ cdef inline void prepare3(const double* W, double* g) noexcept nogil:
     # S is a difference: below 1e-14 of what was subtracted nothing of its determinant is left.
     size = fabs(W[4]) + fabs(W[8]) + fabs(W[3] * h0) + fabs(W[6] * h1)
     g[14] = det if fabs(det) > 1e-14 * size * size else 0.0
+    if not g[14] > 0.0:
+        return
+    # T = S^-1 stands in the corner of W^-1.
+    det = 1.0 / det
+    t00 = g[13] * det
+    t01 = -g[11] * det
+    t10 = -g[12] * det
+    t11 = g[10] * det
+    k0 = W[3] * inv
+    k1 = W[6] * inv
+    g[17] = -(h0 * t00 + h1 * t10)
+    g[18] = -(h0 * t01 + h1 * t11)
+    g[19] = -(t00 * k0 + t01 * k1)
+    g[20] = t00
+    g[21] = t01
+    g[22] = -(t10 * k0 + t11 * k1)
+    g[23] = t10
+    g[24] = t11
+    g[16] = inv - (h0 * g[19] + h1 * g[22])
 
 
 cdef inline int32_t eliminate(int32_t n, double* a, double* x) noexcept nogil:
@@ -226,6 +245,9 @@ cdef inline int32_t coulomb3(const double* g, const double* q, double mu, double
         if done or not U > 0.0:
             break
         f = P - U
+        if fabs(f) <= 1e-15 * U:
+            done = 1
+            break
         if f < 0.0:
             lo = beta
         else:
@@ -257,6 +279,34 @@ cdef inline int32_t coulomb3(const double* g, const double* q, double mu, double
     for i in range(3):
         lam[i] = y[i]
     return SLIP
+
+
+cdef inline int32_t coulomb3_from(const double* g, const double* w, double mu, double* lam) noexcept nogil:
+    """The same from the slack w (3) of the present lam: open and sticking contacts by products alone."""
+    cdef double q[3]
+    cdef double n, x, y, s, f
+    q[0] = w[0] - (g[0] * lam[0] + g[1] * lam[1] + g[2] * lam[2])
+    if q[0] >= 0.0:
+        lam[0] = 0.0
+        lam[1] = 0.0
+        lam[2] = 0.0
+        return OPEN
+    if g[14] > 0.0 and g[9] > 0.0:
+        # w = 0 at lam - W^-1 w
+        n = lam[0] - (g[16] * w[0] + g[17] * w[1] + g[18] * w[2])
+        x = lam[1] - (g[19] * w[0] + g[20] * w[1] + g[21] * w[2])
+        y = lam[2] - (g[22] * w[0] + g[23] * w[1] + g[24] * w[2])
+        if n >= 0.0 and x * x + y * y <= mu * mu * n * n and mu > 0.0:
+            lam[0] = n
+            lam[1] = x
+            lam[2] = y
+            return STICK
+    q[1] = w[1] - (g[3] * lam[0] + g[4] * lam[1] + g[5] * lam[2])
+    q[2] = w[2] - (g[6] * lam[0] + g[7] * lam[1] + g[8] * lam[2])
+    # Sliding as now would need beta = |w_t| / |lam_t|.
+    s = lam[1] * lam[1] + lam[2] * lam[2]
+    f = -(w[1] * lam[1] + w[2] * lam[2])
+    return coulomb3(g, q, mu, f / s if s > 0.0 and f > 0.0 else 0.0, lam)
 
 
 cdef inline int32_t coulomb2(const double* W, const double* q, double mu, double* lam) noexcept nogil:

@@ -17,7 +17,7 @@ import numpy as np
 
 from lavender_ext.block cimport blocks_t, relax_row
 from lavender_ext.csr cimport csr_dot, csr_t
-from lavender_ext.ldl cimport ldl_factor, ldl_solve, pivots_t
+from lavender_ext.ldl cimport ldl_back_2, ldl_factor, ldl_factor_2, ldl_solve, no_pivots, pivots_t
 from lavender_ext.problem cimport Data
 
 
@@ -58,6 +58,7 @@ cdef struct pivoting_t:
     int32_t n_free
     int32_t width
     int32_t is_factored         # of the present set and shift
+    int32_t is_half_solved      # x holds what the factorisation made of b on its way
     pivots_t found
     int32_t best                # least number of infeasible rows so far
     int32_t patience
@@ -115,6 +116,7 @@ cdef public void lav_pivot_factor(pivoting_t* s) noexcept nogil:
     cdef int32_t i, j, k = 0, q, r, at, to, in_place
     cdef const csr_t* a = s.a
     cdef double* col
+    s.is_half_solved = 0
     for r in range(s.n):
         i = r if s.natural else s.order[r]
         s.place[i] = -1
@@ -146,6 +148,37 @@ cdef public void lav_pivot_factor(pivoting_t* s) noexcept nogil:
                     col[to] = a.data[q]
         col[at] += s.shift * s.p.d[i]
     ldl_factor(k, s.width, s.c, s.size, s.tiny, &s.found)
+    s.factorisations += 1
+    s.is_factored = 1
+
+
+cdef public void lav_pivot_factor_all(pivoting_t* s) noexcept nogil:
+    """LDL^T of A, all rows free and no shift; of a tridiagonal A with the first half of x = A^-1 b, for nothing."""
+    cdef int32_t i, q, end
+    cdef const csr_t* a = s.a
+    s.is_half_solved = s.natural and s.band == 1 and s.n > 1
+    if not s.is_half_solved:
+        for i in range(s.n):
+            s.at[i] = FREE
+        lav_pivot_factor(s)
+        return
+    s.n_free = s.n
+    s.width = 2
+    for i in range(s.n):
+        s.at[i] = FREE
+        s.place[i] = i
+        s.size[i] = s.p.d[i]
+        s.x[i] = s.p.b[i]
+        s.c[2 * i] = 0.0
+        s.c[2 * i + 1] = 0.0
+        end = a.indptr[i + 1]
+        q = end - 2 if end - 2 > a.indptr[i] else a.indptr[i]
+        while q < end:                                  # the last two entries hold the upper half
+            if a.indices[q] >= i:
+                s.c[i + a.indices[q]] = a.data[q]
+            q += 1
+    no_pivots(&s.found)
+    ldl_factor_2(s.n, s.c, s.size, s.tiny, s.x, &s.found)
     s.factorisations += 1
     s.is_factored = 1
 
@@ -286,6 +319,10 @@ cdef public void lav_pivot_solve_free(pivoting_t* s) noexcept nogil:
     """x = A^-1 b, all rows free and factored; w is left alone."""
     cdef int32_t i
     cdef double* y = s.x if s.natural else s.y
+    if s.is_half_solved:
+        s.is_half_solved = 0
+        ldl_back_2(s.n, s.c, s.x)
+        return
     for i in range(s.n):
         y[i if s.natural else s.place[i]] = s.p.b[i]
     ldl_solve(s.n, s.width, s.c, y)
@@ -300,8 +337,7 @@ cdef public int32_t lav_pivot_all_free(pivoting_t* s) noexcept nogil:
     for i in range(s.n):
         if s.p.lower[i] == s.p.upper[i]:
             return 0
-        s.at[i] = FREE
-    lav_pivot_factor(s)
+    lav_pivot_factor_all(s)
     if s.found.negative > 0 or s.found.small > 0:
         s.is_factored = 0
         return 0
@@ -503,6 +539,12 @@ cdef class Pivoting:
         """Factor the free rows; (small, negative) pivots."""
         with nogil:
             lav_pivot_factor(&self.s)
+        return self.s.found.small, self.s.found.negative
+
+    def factor_all(self):
+        """Factor A, all rows free; (small, negative) pivots."""
+        with nogil:
+            lav_pivot_factor_all(&self.s)
         return self.s.found.small, self.s.found.negative
 
     def correct(self):

@@ -296,3 +296,29 @@ def test_a_problem_of_tiny_numbers_is_not_taken_for_solved():
         tiny = lv.solve(lv.Problem.lcp(a * 2.0**-670, b * 2.0**-700, -box, box), "direct")
         assert not tiny.contradicted
         np.testing.assert_allclose(tiny.impulse, one.impulse * 2.0**-30, rtol=1e-12, atol=1e-24)
+
+
+def test_all_rows_free_is_tried_first_only_where_that_is_cheap():
+    """A narrow band is factored whole at once; where a row is not free, or the band is wide, sweeps guess."""
+    a, rng = tridiagonal(50), np.random.default_rng(1)
+    free = lv.solve(lv.Problem.lcp(a, a @ rng.uniform(0.5, 1.0, 50)), "direct")
+    assert (dict(free.work), free.iterations) == ({"factorisations": 1}, 1)
+    assert accurate(free)
+    mixed = lv.solve(lv.Problem.lcp(a, rng.normal(size=50)), "direct")
+    assert mixed.work["sweeps"] == 4
+    assert mixed.work["factorisations"] >= 2
+    assert accurate(mixed)
+    wide = lv.solve(lv.Problem.lcp(symmetric(spd(rng, 40)), rng.normal(size=40)), "direct")
+    assert wide.work["sweeps"] == 4
+    assert accurate(wide)
+
+
+@pytest.mark.parametrize("m", [1, 2, 3, 4, 9])
+def test_short_tridiagonal_systems(m):
+    """The factorisation that solves on its way, from both ends."""
+    a = tridiagonal(m)
+    b = np.random.default_rng(m).normal(size=m)
+    solution = lv.solve(lv.Problem.linear(a, b), "direct")
+    assert accurate(solution)
+    # Condition below 4 / 0.01.
+    np.testing.assert_allclose(solution.impulse, np.linalg.solve(a.toarray(), b), rtol=1e-11, atol=1e-11)

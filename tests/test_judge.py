@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from random_problems import as_matrix, random_contact_problem, random_lcp, seeds
 
 import lavender as lv
-from lavender.residuals import check_certificate, natural_map, qp_residual
+from lavender.residuals import check_certificate, judged, known, natural_map, qp_residual, remember
 
 # -- the twin --------------------------------------------------------------------------------------
 
@@ -473,3 +473,23 @@ def test_residual_reads_as_one_line_and_names_the_worst_row():
     assert dataclasses.is_dataclass(judged)
     by_row = judged.velocity_by_row
     assert by_row.max() <= judged.velocity * (1 + 1e-12)
+
+
+def test_a_remembered_result_serves_its_own_impulse_alone():
+    problem = random_contact_problem(2)
+    first = np.linspace(0.1, 1.0, problem.m)
+    other = first.copy()
+    other[-1] = np.nextafter(other[-1], 2.0)
+    fresh = [lv.residual(problem, x) for x in (first, other)]
+    remember(problem, judged(problem, first.copy()))
+    for x, expected in ((other, fresh[1]), (first, fresh[0])):
+        found = lv.residual(problem, x)
+        assert (found.relative, found.floor, found.worst_row) == (
+            expected.relative, expected.floor, expected.worst_row
+        )  # fmt: skip
+        np.testing.assert_array_equal(found.error, expected.error)
+        np.testing.assert_array_equal(found.slack, expected.slack)
+    assert known(problem, problem.start()) == lv.residual(problem, problem.start()).relative
+    assert known(problem, other) is None
+    remember(problem, judged(problem, other))
+    assert known(problem, other) == fresh[1].relative

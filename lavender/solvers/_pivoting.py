@@ -53,10 +53,10 @@ class PivotState:
         )
         return {what: count for what, count in counts if count}
 
-    def factorise(self) -> int:
-        """Factor the free rows: SOLVED, SMALL or INDEFINITE."""
+    def factorise(self, whole: bool = False) -> int:
+        """Factor the free rows, or all rows before anything else is done: SOLVED, SMALL or INDEFINITE."""
         if self.factor is None:
-            small, negative = self.rows.factor()
+            small, negative = self.rows.factor_all() if whole else self.rows.factor()
             self.is_factored = True
             return INDEFINITE if negative else SMALL if small else SOLVED
         n_free = self.rows.number()

@@ -26,9 +26,10 @@ from typing import Any
 import numpy as np
 
 from lavender._arrays import FloatArray, IntArray
+from lavender.errors import SolverUnavailable, UnknownName
 from lavender.problem import Problem
-from lavender.registry import SolverSpec, specs
-from lavender.residuals import check_certificate, quick, reference
+from lavender.registry import SolverSpec, get
+from lavender.residuals import check_certificate, known, quick, reference
 from lavender.solution import Claim, Status
 from lavender.solvers._islands import block_bodies, islands, restrict, rows_of
 from lavender_ext import graph as kernels
@@ -61,6 +62,7 @@ class Trail:
     work: dict[str, int] = field(default_factory=dict)
     iterations: int = 0
     certificate: FloatArray | None = None
+    tried: set[str] = field(default_factory=set)  # solvers run on the whole of it
 
     def __post_init__(self) -> None:
         m = self.problem.m
@@ -69,7 +71,8 @@ class Trail:
 
     def offer(self, impulse: FloatArray) -> float:
         """Judge an impulse and keep it if it is the best."""
-        relative, _ = quick(self.problem, impulse, self.w, self.e)
+        found = known(self.problem, impulse)
+        relative = quick(self.problem, impulse, self.w, self.e)[0] if found is None else found
         if relative < self.best:
             self.best, self.impulse = relative, impulse.copy()
         return relative
@@ -142,8 +145,11 @@ class Auto:
 
 
 def _usable(name: str, problem: Problem) -> SolverSpec | None:
-    spec = specs().get(name)
-    return spec if spec is not None and spec.missing() is None and spec.refuses(problem) is None else None
+    try:
+        spec = get(name)
+    except (UnknownName, SolverUnavailable):
+        return None
+    return spec if spec.refuses(problem) is None else None
 
 
 def _whole(trail: Trail, name: str, budget: int) -> bool:
@@ -151,6 +157,7 @@ def _whole(trail: Trail, name: str, budget: int) -> bool:
     spec = _usable(name, trail.problem)
     if spec is None or budget <= trail.iterations:
         return trail.done
+    trail.tried.add(name)
     solver = spec.load()()
     state = solver.prepare(trail.problem)
     # Half-finished sweeps mislead a Newton method; Pi(0) does not.
@@ -221,6 +228,10 @@ def _solve(trail: Trail, budget: int) -> None:
     swept = _sweeps_first(problem)
     if swept and _sweep(trail, budget):
         return
+    # A band factorisation takes islands apart by itself, too.
+    narrow = not swept and problem.law == "lcp" and problem.is_symmetric and _bandwidth(problem) <= NARROW
+    if narrow and _whole(trail, "direct", budget):
+        return
     count, label = islands(problem)
     if count <= 1:
         _connected(trail, budget, swept)
@@ -232,9 +243,9 @@ def _sweeps_first(problem: Problem) -> bool:
     """Whether sweeps are worth a try, by what is known without looking closer."""
     if problem.law == "lcp":
         return problem.is_symmetric and not (
-            _is_heavy(problem)
+            _is_small_or_narrow(problem)
+            or _is_heavy(problem)
             or _is_redundant(problem)
-            or _is_small_or_narrow(problem)
             or _is_banded(problem)
         )
     if problem.law == "cone" and _is_redundant(problem) and not _is_loose(problem):
@@ -331,7 +342,7 @@ def _connected(trail: Trail, budget: int, swept: bool) -> None:
     else:
         names = ("newton", "direct", "lemke")
     for name in names:
-        if _whole(trail, name, budget):
+        if name not in trail.tried and _whole(trail, name, budget):
             return
     if problem.law == "coulomb" and _sweeps(trail, "block_gauss_seidel", budget, 10 * CAP):
         return
@@ -439,10 +450,12 @@ def _is_loose(problem: Problem) -> bool:
 
 def _bandwidth(problem: Problem) -> int:
     if problem.rows is None:
-        a = problem.csr
-        row = np.repeat(np.arange(problem.m), np.diff(a.indptr))
-        return int(np.abs(a.indices - row).max(initial=0))
-    return kernels.body_spread(problem.cones.ptr, block_bodies(problem), problem.rows.n_bodies)
+        return max(problem.bandwidth)
+    spread: int | None = problem.__dict__.get("_spread")
+    if spread is None:
+        spread = kernels.body_spread(problem.cones.ptr, block_bodies(problem), problem.rows.n_bodies)
+        problem.__dict__["_spread"] = spread
+    return spread
 
 
 SPEC = SolverSpec(

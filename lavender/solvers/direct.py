@@ -1,8 +1,9 @@
 """Factor and solve; with bounds, block principal pivoting on the same factorisation.
 
     linear   A lambda = b by band, dense or sparse factorisation, then lambda <- lambda - A^-1 w (refinement)
-    boxed    w = A lambda - b complementary to lower <= lambda <= upper: guess which rows are free, solve
-             them, exchange the rows of the wrong sign, repeat (`lavender_ext/pivoting.pyx`)
+    boxed    w = A lambda - b complementary to lower <= lambda <= upper: guess which rows are free (all of a
+             narrow band, else those that a few sweeps leave free), solve them, exchange the rows of the
+             wrong sign, repeat (`lavender_ext/pivoting.pyx`)
     singular the same on A + s D, s = 1e-10, around the last answer c: (A + s D) lambda = b + s D c. A fixed
              point solves A itself (proximal point method); on the rows it settles on, each pass is one
              refinement that shrinks what A sees by s / (s + sigma). On a problem without a solution the
@@ -61,7 +62,7 @@ class Direct:
             return _general(problem, "A is not symmetric")
         state = DirectState(problem, PivotState(problem, like))
         if problem.law == "linear" and state.pivot is not None:
-            state.outcome = state.pivot.factorise()
+            state.outcome = state.pivot.factorise(whole=True)
             if state.outcome == INDEFINITE:
                 return _general(problem, "A is indefinite")
         return state
