@@ -26,7 +26,7 @@ cdef enum:
 cdef inline int32_t body_band(const blocks_t* p, const rows_t* r) noexcept nogil:
     """Width of the band of N; 0 where there are joints, other contacts than with two tangents, or it is wide."""
     cdef int32_t c, a, b, k, far = 0
-    if r.n_joints > 0 or r.n_contacts == 0:
+    if r.n_joints > 0 or r.n_contacts == 0 or r.n_bodies == 0:
         return 0
     for c in range(r.n_contacts):
         if p.kind[c] != CONTACT or p.ptr[c + 1] - p.ptr[c] != 3:
