@@ -169,6 +169,36 @@ cdef inline int32_t small_cholesky(double* a, const int32_t s) noexcept nogil:
     return lost
 
 
+cdef inline void sub_column_3(const factor_t* f, int32_t start, int32_t end, const double* y) noexcept nogil:
+    # w^T -= l y^T for blocks `start` to `end` of a column, 3 x 3 each; y in locals, which no store can change
+    cdef double a0 = y[0], a1 = y[1], a2 = y[2], b0 = y[3], b1 = y[4], b2 = y[5], c0 = y[6], c1 = y[7], c2 = y[8]
+    cdef double u, v, w
+    cdef int32_t p
+    cdef double *to
+    cdef const double *l = f.lval + 9 * <int64_t>start
+    for p in range(start, end):
+        to = f.work + 9 * f.lind[p]
+        u = l[0]
+        v = l[3]
+        w = l[6]
+        to[0] -= u * a0 + v * b0 + w * c0
+        to[1] -= u * a1 + v * b1 + w * c1
+        to[2] -= u * a2 + v * b2 + w * c2
+        u = l[1]
+        v = l[4]
+        w = l[7]
+        to[3] -= u * a0 + v * b0 + w * c0
+        to[4] -= u * a1 + v * b1 + w * c1
+        to[5] -= u * a2 + v * b2 + w * c2
+        u = l[2]
+        v = l[5]
+        w = l[8]
+        to[6] -= u * a0 + v * b0 + w * c0
+        to[7] -= u * a1 + v * b1 + w * c1
+        to[8] -= u * a2 + v * b2 + w * c2
+        l += 9
+
+
 cdef inline void solve_right(double* yt, const double* l, const int32_t s) noexcept nogil:
     # y <- y l^-T, held transposed: y^T <- l^-1 y^T, a row of y^T at a time
     cdef int32_t r, c, t
@@ -204,8 +234,11 @@ cdef inline int32_t factor_blocks(const factor_t* f, const int32_t s) noexcept n
             j = f.rind[q]
             y = f.work + j * b
             solve_right(y, f.dval + j * b, s)
-            for p in range(f.lptr[j], f.next[j]):
-                sub_transposed(f.work + f.lind[p] * b, y, f.lval + p * b, s)
+            if s == 3:
+                sub_column_3(f, f.lptr[j], f.next[j], y)
+            else:
+                for p in range(f.lptr[j], f.next[j]):
+                    sub_transposed(f.work + f.lind[p] * b, y, f.lval + p * b, s)
             sub_transposed(f.work + k * b, y, y, s)
             l = f.lval + f.next[j] * b
             f.next[j] += 1
