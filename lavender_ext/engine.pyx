@@ -19,7 +19,7 @@ from lavender_ext.engine_body cimport drift_bodies, start_bodies
 from lavender_ext.engine_broad cimport update_pairs
 from lavender_ext.engine_contact cimport make_contacts, store_contacts
 from lavender_ext.engine_joint cimport make_joints
-from lavender_ext.engine_packed cimport MOST, ROOM_BODY, ROOM_CONTACT, ROOM_MORE, packs, sweep_packed
+from lavender_ext.packed cimport MOST, ROOM_BODY, ROOM_CONTACT, ROOM_MORE, packs, sweep_packed
 from lavender_ext.engine_project cimport normal_speed, project_positions
 from lavender_ext.engine_types cimport (CAP_CONTACT, CAP_PAIR, H_CONTACTS, H_ITERATIONS,
                                         H_LOST, H_MATCHES, H_NEED_CONTACTS, H_NEED_PAIRS, H_ORDER, H_SEED,

@@ -8,11 +8,14 @@
 The update of one block is block.pxd (1)-(4) everywhere. Invariant of (2), on entry and after every
 block: v = M^-1 J^T lam to rounding.
 """
-from libc.stdint cimport int32_t, uint64_t
+from libc.stdint cimport int32_t, int64_t, uint64_t
+
+import numpy as np
 
 from lavender_ext.block cimport (CONTACT_SPIN, ROW, blocks_t, n_tangents, relax_normal, relax_row,
                                  relax_tangents)
 from lavender_ext.csr cimport csr_dot, csr_t
+from lavender_ext.packed cimport ROOM_BODY, ROOM_CONTACT, ROOM_MORE, packs, sweep_packed
 from lavender_ext.order cimport advance_order
 from lavender_ext.pgs cimport relax_csr_block
 from lavender_ext.problem cimport Data
@@ -89,6 +92,10 @@ cdef public void lav_impulse_sweeps(const blocks_t* p, const rows_t* r, double* 
             relax_rows_block(p, r, order[i], lam, v)
 
 
+cdef enum:
+    PACKED_SWEEPS = 6           # from which packing contacts costs less than it gains
+
+
 cdef struct context_t:          # what a sweep needs besides lam
     const blocks_t* blocks
     const csr_t* csr
@@ -99,6 +106,7 @@ cdef struct context_t:          # what a sweep needs besides lam
     int32_t split
     int32_t mode
     uint64_t* rng
+    double* room                # for packed contacts, or NULL
 
 
 cdef void pgs_step(void* context, double* lam, int32_t first_sweep, int32_t n) noexcept nogil:
@@ -121,7 +129,19 @@ cdef void jacobi_step(void* context, double* lam, int32_t first_sweep, int32_t n
 
 cdef void impulse_step(void* context, double* lam, int32_t first_sweep, int32_t n) noexcept nogil:
     cdef context_t* c = <context_t*>context
+    if c.room != NULL and n >= PACKED_SWEEPS:
+        sweep_packed(c.blocks, c.rows, c.order, n, c.room, lam, c.scratch)
+        return
     lav_impulse_sweeps(c.blocks, c.rows, lam, c.scratch, c.order, c.split, c.mode, c.rng, first_sweep, n)
+
+
+cdef int32_t _may_pack(const context_t* c) noexcept nogil:
+    # contacts of the common kind alone, behind the joints
+    cdef int32_t i
+    for i in range(c.rows.n_joints):
+        if c.order[i] >= c.rows.n_joints:
+            return 0
+    return packs(c.blocks, c.rows)
 
 
 PGS, SOR, JACOBI, IMPULSES = range(4)
@@ -155,6 +175,11 @@ def run(int kind, Data p, Watch watch, double[::1] lam, int n, double tol, int32
     c.split = split
     c.mode = mode
     c.rng = &rng[0]
+    c.room = NULL
+    cdef double[::1] room
+    if kind == 3 and n >= PACKED_SWEEPS and mode == 0 and _may_pack(&c):
+        room = np.empty(ROOM_CONTACT * <int64_t>p.rows.n_contacts + ROOM_BODY * <int64_t>p.rows.n_bodies + ROOM_MORE)
+        c.room = &room[0]
     with nogil:
         status = watch.run(step, &c, &lam[0], n, tol, &done)
     return status, done

@@ -5,6 +5,7 @@ import pytest
 
 import lavender as lv
 from lavender.engine.layout import HEAD
+from lavender.solvers.sequential_impulses import SequentialImpulses
 
 CASES = [
     ("stack", {}),
@@ -80,3 +81,27 @@ def test_packed_contacts_of_boxes_thrown_together():
         same(before, twin)
         most = max(most, int(before.head[HEAD["contacts"]]))
     assert most > 40
+
+
+@pytest.mark.parametrize("order", ["given", "reverse", "bottom_up", "colored", "symmetric", "random"])
+@pytest.mark.parametrize("name", ["pyramid", "bridge", "pile"])
+def test_the_solver_packs_long_runs_and_changes_no_bit(name, order):
+    sim = lv.Simulation(lv.Scene(name))
+    for _ in range(30):
+        sim.step()
+    problem = sim.constraint_problem()
+    solver = SequentialImpulses(order=order)
+    whole, single = np.zeros(problem.m), np.zeros(problem.m)
+    solver.run(solver.prepare(problem), whole, 40, 0.0)
+    state = solver.prepare(problem)
+    for _ in range(40):  # too short a run for packing
+        solver.run(state, single, 1, 0.0)
+    np.testing.assert_array_equal(whole.view(np.uint8), single.view(np.uint8))
+    # an order that mixes joints and contacts is swept one by one
+    mixed = np.random.default_rng(2).permutation(problem.n_blocks).astype(np.int32)
+    a = lv.solve(problem, "sequential_impulses", tol=0, max_iter=40, order=mixed).impulse
+    state, b = SequentialImpulses(order=mixed).prepare(problem), np.zeros(problem.m)
+    b[:] = problem.start() if problem.guess is None else problem.guess
+    for _ in range(40):
+        SequentialImpulses(order=mixed).run(state, b, 1, 0.0)
+    np.testing.assert_array_equal(a.view(np.uint8), b.view(np.uint8))
