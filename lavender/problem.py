@@ -408,10 +408,13 @@ class Problem:
         gap, big = self._scan[2:]
         return gap / big if big > 0.0 else 0.0
 
-    @property
+    @cached_property
     def bandwidth(self) -> tuple[int, int]:
         """Lower and upper half bandwidth of A: the largest i - j and j - i of a stored entry."""
-        return self._scan[:2]
+        if self.rows is None:
+            return self._scan[:2]
+        a = self.csr
+        return pivoting.bandwidth(a.indptr, a.indices)
 
     @cached_property
     def _scan(self) -> tuple[int, int, float, float]:

@@ -81,7 +81,10 @@ def reference(problem: Problem) -> tuple[float, float]:
     if data.start_energy < 0.0:
         m = problem.m
         w, e = np.empty(m), np.empty(m)
-        energy, velocity, *_ = own = kernels.judge(data, problem.start(), w, e, False)
+        if problem._start.any():
+            energy, velocity, *_ = own = kernels.judge(data, problem._start, w, e, False)
+        else:  # the same numbers without a pass over A
+            energy, velocity, *_ = own = kernels.score(data, problem._start, np.negative(problem.b, out=w), e)
         # The norms of b: sqrt(sum b^2 / d), max |b| sqrt(nu / d), |b| the pair's norm on tangents.
         rhs_energy, rhs_velocity = kernels.rhs_norms(data)
         if energy <= 2.0**-48 * rhs_energy:

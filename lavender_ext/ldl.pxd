@@ -100,18 +100,15 @@ cdef inline void ldl_solve_2(int32_t n, const double* c, double* x) noexcept nog
     ldl_back_2(n, c, x)
 
 
-cdef inline void ldl_factor(int32_t n, int32_t width, double* c, const double* size, double tiny,
-                            pivots_t* out) noexcept nogil:
-    # (1); size (n) > 0 is what a pivot is compared with.
+cdef inline void ldl_columns(int32_t begin, int32_t end, int32_t width, int32_t reach, double* c, const double* size,
+                             double tiny, double* x, pivots_t* out) noexcept nogil:
+    # (1) for columns begin, ... end - 1 of height reach; 0: they end with row end - 1. Where x is not NULL,
+    # ldl_forward goes along.
     cdef int32_t i, s, t, last
     cdef double p, inv, l
     cdef double* col
     cdef double* to
-    no_pivots(out)
-    if width == 2:
-        ldl_factor_2(n, c, size, tiny, NULL, out)
-        return
-    for i in range(n):
+    for i in range(begin, end):
         col = c + <int64_t>i * width
         p = col[0]
         if p < out.least * size[i]:
@@ -128,32 +125,83 @@ cdef inline void ldl_factor(int32_t n, int32_t width, double* c, const double* s
                 continue
         inv = 1.0 / p
         col[0] = inv
-        last = width if width <= n - i else n - i
+        last = reach if reach > 0 else end - i
         for s in range(1, last):
             l = col[s] * inv
             to = col + <int64_t>s * width
             for t in range(s, last):
                 to[t - s] -= l * col[t]
+        if x != NULL:
+            l = x[i] * inv
+            for t in range(1, last):
+                x[i + t] -= col[t] * l
+
+
+cdef inline void ldl_factor(int32_t n, int32_t width, double* c, const double* size, double tiny, double* x,
+                            pivots_t* out) noexcept nogil:
+    # (1); size (n) > 0 is what a pivot is compared with. Where x is not NULL it goes half way of ldl_solve, while
+    # one pivot waits for the other.
+    cdef int32_t whole = n - width + 1 if n >= width else 0     # columns of full height
+    no_pivots(out)
+    if width == 2:
+        ldl_factor_2(n, c, size, tiny, x, out)
+        return
+    if width == 6:                                      # joints of three rows in a chain: the width a constant
+        ldl_columns(0, whole, 6, 6, c, size, tiny, x, out)
+    else:
+        ldl_columns(0, whole, width, width, c, size, tiny, x, out)
+    ldl_columns(whole, n, width, 0, c, size, tiny, x, out)
+
+
+cdef inline void ldl_forward(int32_t begin, int32_t end, int32_t width, int32_t reach, const double* c,
+                             double* x) noexcept nogil:
+    cdef int32_t i, t, last
+    cdef double y
+    cdef const double* col
+    for i in range(begin, end):
+        col = c + <int64_t>i * width
+        y = x[i] * col[0]
+        last = reach if reach > 0 else end - i
+        for t in range(1, last):
+            x[i + t] -= col[t] * y
+
+
+cdef inline void ldl_back(int32_t begin, int32_t end, int32_t width, int32_t reach, const double* c,
+                          double* x) noexcept nogil:
+    cdef int32_t i, t, last
+    cdef double y
+    cdef const double* col
+    for i in range(end - 1, begin - 1, -1):
+        col = c + <int64_t>i * width
+        y = x[i]
+        last = reach if reach > 0 else end - i
+        for t in range(1, last):
+            y -= col[t] * x[i + t]
+        x[i] = y * col[0]
+
+
+cdef inline void ldl_back_all(int32_t n, int32_t width, const double* c, double* x) noexcept nogil:
+    # The second half of ldl_solve.
+    cdef int32_t whole = n - width + 1 if n >= width else 0
+    if width == 2:
+        ldl_back_2(n, c, x)
+        return
+    ldl_back(whole, n, width, 0, c, x)
+    if width == 6:
+        ldl_back(0, whole, 6, 6, c, x)
+    else:
+        ldl_back(0, whole, width, width, c, x)
 
 
 cdef inline void ldl_solve(int32_t n, int32_t width, const double* c, double* x) noexcept nogil:
     # x <- (L D L^T)^-1 x; 0 on skipped places.
-    cdef int32_t i, t, last
-    cdef double y
-    cdef const double* col
+    cdef int32_t whole = n - width + 1 if n >= width else 0
     if width == 2:
         ldl_solve_2(n, c, x)
         return
-    for i in range(n):
-        col = c + <int64_t>i * width
-        y = x[i] * col[0]
-        last = width if width <= n - i else n - i
-        for t in range(1, last):
-            x[i + t] -= col[t] * y
-    for i in range(n - 1, -1, -1):
-        col = c + <int64_t>i * width
-        y = x[i]
-        last = width if width <= n - i else n - i
-        for t in range(1, last):
-            y -= col[t] * x[i + t]
-        x[i] = y * col[0]
+    if width == 6:
+        ldl_forward(0, whole, 6, 6, c, x)
+    else:
+        ldl_forward(0, whole, width, width, c, x)
+    ldl_forward(whole, n, width, 0, c, x)
+    ldl_back_all(n, width, c, x)

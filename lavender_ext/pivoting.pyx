@@ -17,7 +17,7 @@ import numpy as np
 
 from lavender_ext.block cimport blocks_t, relax_row
 from lavender_ext.csr cimport csr_dot, csr_t
-from lavender_ext.ldl cimport ldl_back_2, ldl_factor, ldl_factor_2, ldl_solve, no_pivots, pivots_t
+from lavender_ext.ldl cimport ldl_back_all, ldl_factor, ldl_factor_2, ldl_solve, no_pivots, pivots_t
 from lavender_ext.problem cimport Data
 
 
@@ -111,8 +111,8 @@ cdef public void lav_csr_scan(const csr_t* a, int32_t n, int32_t* cursor, int32_
     size[1] = big
 
 
-cdef public void lav_pivot_factor(pivoting_t* s) noexcept nogil:
-    """LDL^T of A_FF + s D_FF, (1)."""
+cdef inline void factor_free(pivoting_t* s, double* x) noexcept nogil:
+    # x: what ldl_factor takes along, or NULL
     cdef int32_t i, j, k = 0, q, r, at, to, in_place
     cdef const csr_t* a = s.a
     cdef double* col
@@ -147,21 +147,28 @@ cdef public void lav_pivot_factor(pivoting_t* s) noexcept nogil:
                 if to >= at:
                     col[to] = a.data[q]
         col[at] += s.shift * s.p.d[i]
-    ldl_factor(k, s.width, s.c, s.size, s.tiny, &s.found)
+    ldl_factor(k, s.width, s.c, s.size, s.tiny, x, &s.found)
     s.factorisations += 1
     s.is_factored = 1
 
 
+cdef public void lav_pivot_factor(pivoting_t* s) noexcept nogil:
+    """LDL^T of A_FF + s D_FF, (1)."""
+    factor_free(s, NULL)
+
+
 cdef public void lav_pivot_factor_all(pivoting_t* s) noexcept nogil:
-    """LDL^T of A, all rows free and no shift; of a tridiagonal A with the first half of x = A^-1 b, for nothing."""
+    """LDL^T of A, all rows free and no shift, with the first half of x = A^-1 b on the way."""
     cdef int32_t i, q, end
     cdef const csr_t* a = s.a
-    s.is_half_solved = s.natural and s.band == 1 and s.n > 1
-    if not s.is_half_solved:
+    if not (s.natural and s.band == 1 and s.n > 1):
         for i in range(s.n):
             s.at[i] = FREE
-        lav_pivot_factor(s)
+            s.x[i] = s.p.b[i]
+        factor_free(s, s.x if s.natural else NULL)
+        s.is_half_solved = s.natural
         return
+    s.is_half_solved = 1
     s.n_free = s.n
     s.width = 2
     for i in range(s.n):
@@ -321,7 +328,7 @@ cdef public void lav_pivot_solve_free(pivoting_t* s) noexcept nogil:
     cdef double* y = s.x if s.natural else s.y
     if s.is_half_solved:
         s.is_half_solved = 0
-        ldl_back_2(s.n, s.c, s.x)
+        ldl_back_all(s.n, s.width, s.c, s.x)
         return
     for i in range(s.n):
         y[i if s.natural else s.place[i]] = s.p.b[i]
@@ -370,6 +377,17 @@ cdef public int32_t lav_pivot_rounds(pivoting_t* s, int32_t rounds) noexcept nog
         if bad < 0:
             return STUCK
     return ROUNDS
+
+
+def bandwidth(const int32_t[::1] indptr, const int32_t[::1] indices):
+    """(lower, upper) bandwidth of a canonical CSR matrix, from the ends of its rows."""
+    cdef Py_ssize_t i, n = indptr.shape[0] - 1
+    cdef int32_t lower = 0, upper = 0
+    for i in range(n):
+        if indptr[i] < indptr[i + 1]:
+            lower = max(lower, <int32_t>i - indices[indptr[i]])
+            upper = max(upper, indices[indptr[i + 1] - 1] - <int32_t>i)
+    return lower, upper
 
 
 def scan(const int32_t[::1] indptr, const int32_t[::1] indices, const double[::1] data):

@@ -261,7 +261,7 @@ cdef inline int32_t solve_joints(const blocks_t* p, const rows_t* r, warm_t* s, 
     cdef int32_t i, j, turn
     fill_band(p, r, s)
     s.factorisations = 1
-    ldl_factor(p.n_rows, s.width, s.band, p.d, 1e-13, &pivot)
+    ldl_factor(p.n_rows, s.width, s.band, p.d, 1e-13, NULL, &pivot)
     if pivot.small or pivot.negative:
         return UNDECIDED
     for j in range(p.n_rows):
