@@ -474,3 +474,10 @@ def test_ctrl_c_returns_the_best_iterate(interrupted_newton):
     solution = lv.solve(problem, "newton", tol=1e-12)
     assert solution.status is lv.Status.INTERRUPTED
     assert solution.residual.relative == min(looks)
+
+
+def test_faces_under_the_cone_law_where_the_first_interior_point_stops_short():
+    problem = suite.pyramid(k=30, friction="coulomb").problem.relaxed("cone")
+    solution = lv.solve(problem, "newton", tol=1e-9)
+    assert good(solution, 1e-9), solution
+    assert solution.work["factorisations"] <= 300, solution

@@ -44,6 +44,11 @@ def solve_convex(run: Run, z: FloatArray, cold: bool) -> None:
         _interior(run, ip, rows)
     if run.done() or run.at_floor():
         return
+    if not rows:
+        # Where the weight itself is what is in the way (large faces, most of whose points carry nothing).
+        _interior(run, InteriorPoint(system, DELTA, sc.problem.is_symmetric), rows)
+        if run.done() or run.at_floor():
+            return
     if run.best < WORTH:
         solve_augmented(run)
         if run.at_floor():
@@ -108,4 +113,4 @@ def _interior(run: Run, ip: InteriorPoint, rows: bool) -> None:
         if lowest < run.best:
             run.score(kept)
     if not rows and lowest < CLOSE and not run.done() and not run.at_floor():
-        Proximal(run.best_z.copy(), alpha=min(1e-4, lowest), probed=0.0).advance(run, 12)
+        Proximal(kept.copy(), alpha=min(1e-4, lowest), probed=0.0).advance(run, 12)
