@@ -273,7 +273,10 @@ class Proximal:
         if solved:
             self.failures = 0
             fall = 0.05 if used <= 2 else 0.15 if used <= 4 else 0.4 if used <= 8 else 1.0
-            self.alpha = max(ALPHA_LOW, self.alpha * max(fall, self.slowest))
+            fall = max(fall, self.slowest)
+            if used <= 1 and self.slowest <= 0.1:
+                fall = 2e-3  # a single step: the pieces are found, and only alpha is in the way
+            self.alpha = max(ALPHA_LOW, self.alpha * fall)
             self.slowest = max(0.05, 0.5 * self.slowest)
             self.idle = self.idle + 1 if self.alpha == ALPHA_LOW and idle else 0
         else:
