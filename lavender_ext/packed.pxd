@@ -266,26 +266,38 @@ cdef inline int32_t find_partner(const rows_t* r, const int32_t* contacts, int32
     return 0
 
 
-cdef inline void sweep_packed(const blocks_t* p, const rows_t* r, const int32_t* order, int32_t sweeps,
-                              double* room, double* lam, double* v) noexcept nogil:
-    """`sweeps` sweeps over joints and contacts, order (k) of blocks; v (n_bodies, 6).
+cdef struct packed_t:           # the contacts of an order, packed; pointers into `room`
+    int32_t pairs
+    int32_t stages
+    int32_t* lane               # (n_contacts) LANES * record + lane of each contact, in the order's order
+    pair_t* record              # (pairs, RECORD)
+    double* behind              # what follows the records
 
-    room: ROOM_CONTACT c + ROOM_BODY n_bodies + ROOM_MORE doubles, scratch.
+
+cdef inline int32_t pack_order(const blocks_t* p, const rows_t* r, const int32_t* order, int32_t width,
+                               int32_t least, double* room, const double* lam, packed_t* out) noexcept nogil:
+    """Records of the contacts of order (k), joints first; 0, and none, where a slot has fewer than `least` on average.
+
+    Any T from that of (1) on will do; a longer one, up to all levels, makes fewer stages, and slots of fewer
+    contacts. T is as long as slots of `width` contacts on average allow.
+
+    room: ROOM_CONTACT c + ROOM_BODY n_bodies + ROOM_MORE doubles.
     """
     cdef int32_t n = r.n_contacts, kj = r.n_joints
     cdef int32_t* first = <int32_t*>room
     cdef int32_t* level = first + 2 * r.n_bodies
     cdef int32_t* line = level + n                      # contacts in the order of their slots
     cdef int32_t* start = line + n                      # of each slot; then its end
-    cdef int32_t i, _i, j, k, t, top, stages, pairs, stage
+    cdef int32_t i, j, k, t, top, pairs, stage
     cdef const int32_t* contacts = order + kj
-    cdef pair_t* record
     cdef pair_t* x
-    cdef double* body
     t = set_levels(r, contacts, first + r.n_bodies, first, level, &top)
     if kj > 0:
         t = top
-    stages = (top + t - 1) // t
+    if t < n // width:
+        t = n // width if n // width < top else top
+    if n < least * t:
+        return 0
     for i in range(t):
         start[i] = 0
     for i in range(n):
@@ -304,8 +316,10 @@ cdef inline void sweep_packed(const blocks_t* p, const rows_t* r, const int32_t*
         start[j] += 1
     room += r.n_bodies + n + n // 2 + 2
     # records begin on a multiple of 16 bytes
-    record = <pair_t*>(room + ((<uintptr_t>room >> 3) & 1))
-    x = record
+    out.record = <pair_t*>(room + ((<uintptr_t>room >> 3) & 1))
+    out.lane = level
+    out.stages = (top + t - 1) // t
+    x = out.record
     pairs = 0
     i = 0
     while i < n:
@@ -323,28 +337,67 @@ cdef inline void sweep_packed(const blocks_t* p, const rows_t* r, const int32_t*
         pairs += 1
         i += 1
         x += RECORD
-    body = <double*>x
+    out.pairs = pairs
+    out.behind = <double*>x
+    return 1
+
+
+cdef inline void put_impulses(const blocks_t* p, const rows_t* r, const int32_t* order, const packed_t* packed,
+                              const double* lam) noexcept nogil:
+    cdef int32_t i, j, k
+    cdef pair_t* x
+    for i in range(r.n_contacts):
+        x = packed.record + <int64_t>(packed.lane[i] // LANES) * RECORD + R_IMPULSE
+        j = p.ptr[order[r.n_joints + i]]
+        for k in range(3):
+            (<double*>(x + k))[packed.lane[i] % LANES] = lam[j + k]
+
+
+cdef inline void take_impulses(const blocks_t* p, const rows_t* r, const int32_t* order, const packed_t* packed,
+                               double* lam) noexcept nogil:
+    cdef int32_t i, j, k
+    cdef pair_t* x
+    for i in range(r.n_contacts):
+        x = packed.record + <int64_t>(packed.lane[i] // LANES) * RECORD + R_IMPULSE
+        j = p.ptr[order[r.n_joints + i]]
+        for k in range(3):
+            lam[j + k] = (<double*>(x + k))[packed.lane[i] % LANES]
+
+
+cdef inline void sweep_records(const blocks_t* p, const rows_t* r, const int32_t* order, const packed_t* packed,
+                               int32_t sweeps, double* lam, double* body) noexcept nogil:
+    """`sweeps` sweeps over joints and records, drained at the end; body (n_bodies + 2, 6), behind the last body
+    zeros. The impulses of contacts stay in the records."""
+    cdef int32_t k, i, _i, stages = packed.stages
+    cdef pair_t* x
+    for k in range(sweeps + stages - 1):
+        x = packed.record
+        for i in range(r.n_joints):
+            relax_joint(p, r, order[i], lam, body)
+        if k < stages - 1 or k >= sweeps:
+            for _i in range(packed.pairs):
+                relax_due(x, body, k, sweeps, 6 * <int64_t>(r.n_bodies + 1))
+                x += RECORD
+        else:
+            for _i in range(packed.pairs):
+                relax_pair(x, body, <const int64_t*>(x + R_PLACE) + 2 * LANES,
+                           <const int64_t*>(x + R_PLACE) + 3 * LANES)
+                x += RECORD
+
+
+cdef inline void sweep_packed(const blocks_t* p, const rows_t* r, const int32_t* order, int32_t sweeps,
+                              double* room, double* lam, double* v) noexcept nogil:
+    """`sweeps` sweeps over joints and contacts, order (k) of blocks; v (n_bodies, 6); room as of pack_order."""
+    cdef packed_t packed
+    cdef double* body
+    cdef int32_t i
+    pack_order(p, r, order, MOST + 1, 0, room, lam, &packed)
+    body = packed.behind
     for i in range(6 * r.n_bodies):
         body[i] = v[i]
     for i in range(12):
         body[6 * r.n_bodies + i] = 0.0
-    for k in range(sweeps + stages - 1):
-        x = record
-        for i in range(kj):
-            relax_joint(p, r, order[i], lam, body)
-        if k < stages - 1 or k >= sweeps:
-            for _i in range(pairs):
-                relax_due(x, body, k, sweeps, 6 * <int64_t>(r.n_bodies + 1))
-                x += RECORD
-        else:
-            for _i in range(pairs):
-                relax_pair(x, body, <const int64_t*>(x + R_PLACE) + 2 * LANES,
-                           <const int64_t*>(x + R_PLACE) + 3 * LANES)
-                x += RECORD
+    sweep_records(p, r, order, &packed, sweeps, lam, body)
     for i in range(6 * r.n_bodies):
         v[i] = body[i]
-    for i in range(n):
-        x = record + <int64_t>(level[i] // LANES) * RECORD + R_IMPULSE
-        j = p.ptr[contacts[i]]
-        for k in range(3):
-            lam[j + k] = (<double*>(x + k))[level[i] % LANES]
+    take_impulses(p, r, order, &packed, lam)

@@ -15,8 +15,9 @@ import numpy as np
 from lavender_ext.block cimport (CONTACT_SPIN, ROW, blocks_t, n_tangents, relax_normal, relax_row,
                                  relax_tangents)
 from lavender_ext.csr cimport csr_dot, csr_t
-from lavender_ext.packed cimport ROOM_BODY, ROOM_CONTACT, ROOM_MORE, packs, sweep_packed
 from lavender_ext.order cimport advance_order
+from lavender_ext.packed cimport (ROOM_BODY, ROOM_CONTACT, ROOM_MORE, pack_order, packed_t, packs, put_impulses,
+                                  sweep_records, take_impulses)
 from lavender_ext.pgs cimport relax_csr_block
 from lavender_ext.problem cimport Data
 from lavender_ext.rows cimport relax_rows_block, rows_t
@@ -93,7 +94,39 @@ cdef public void lav_impulse_sweeps(const blocks_t* p, const rows_t* r, double* 
 
 
 cdef enum:
-    PACKED_SWEEPS = 6           # from which packing contacts costs less than it gains
+    WIDTH = 6                   # contacts of a slot: pairs enough to hide how long one takes
+    FEWEST = 24                 # contacts: below, calls cost more than sweeps
+    FIRST = 8                   # sweeps of the run that packs: packing costs two to four
+    FIRST_FAR = 16              # from FAR contacts, whose records leave the second-level cache
+    FAR = 4000
+    LEAST_WIDTH = 2             # fewer on average, and pairs would stand half empty
+
+
+cdef enum:                      # of a packing
+    NOT_YET = 0
+    READY = 1
+    USELESS = 2
+
+
+cdef struct packing_t:          # contacts in pairs, made at the first run of sweeps that is long enough
+    packed_t packed
+    double* room
+    int32_t status
+    int32_t first               # sweeps of a run that makes it
+
+
+cdef inline int32_t impulse_sweeps_packed(const blocks_t* p, const rows_t* r, double* lam, double* v, const int32_t* order,
+                                          packing_t* x, int32_t n) noexcept nogil:
+    """n sweeps of (2) with the same bits, or 0 and none where one contact after the other is faster; order (k) has
+    joints first; v (n_bodies + 2, 6), behind the last body zeros."""
+    if x.status == NOT_YET and n >= x.first:
+        x.status = READY if pack_order(p, r, order, WIDTH, LEAST_WIDTH, x.room, lam, &x.packed) else USELESS
+    if x.status != READY or n < x.packed.stages:
+        return 0
+    put_impulses(p, r, order, &x.packed, lam)
+    sweep_records(p, r, order, &x.packed, n, lam, v)
+    take_impulses(p, r, order, &x.packed, lam)
+    return 1
 
 
 cdef struct context_t:          # what a sweep needs besides lam
@@ -106,7 +139,7 @@ cdef struct context_t:          # what a sweep needs besides lam
     int32_t split
     int32_t mode
     uint64_t* rng
-    double* room                # for packed contacts, or NULL
+    packing_t* packing          # NULL: one contact after the other
 
 
 cdef void pgs_step(void* context, double* lam, int32_t first_sweep, int32_t n) noexcept nogil:
@@ -129,29 +162,62 @@ cdef void jacobi_step(void* context, double* lam, int32_t first_sweep, int32_t n
 
 cdef void impulse_step(void* context, double* lam, int32_t first_sweep, int32_t n) noexcept nogil:
     cdef context_t* c = <context_t*>context
-    if c.room != NULL and n >= PACKED_SWEEPS:
-        sweep_packed(c.blocks, c.rows, c.order, n, c.room, lam, c.scratch)
+    if c.packing != NULL and impulse_sweeps_packed(c.blocks, c.rows, lam, c.scratch, c.order, c.packing, n):
         return
     lav_impulse_sweeps(c.blocks, c.rows, lam, c.scratch, c.order, c.split, c.mode, c.rng, first_sweep, n)
-
-
-cdef int32_t _may_pack(const context_t* c) noexcept nogil:
-    # contacts of the common kind alone, behind the joints
-    cdef int32_t i
-    for i in range(c.rows.n_joints):
-        if c.order[i] >= c.rows.n_joints:
-            return 0
-    return packs(c.blocks, c.rows)
 
 
 PGS, SOR, JACOBI, IMPULSES = range(4)
 
 
+cdef class Packing:
+    """Contacts of `p` in pairs, for sequential impulses in one fixed order with joints first.
+
+    Made at the first run of sweeps that is long enough; `before`, of another problem, hands over its room.
+    """
+    cdef packing_t state
+    cdef object keep
+
+    def __init__(self, Data p, Packing before=None):
+        cdef int64_t size = (ROOM_CONTACT * <int64_t>p.rows.n_contacts + ROOM_BODY * <int64_t>p.rows.n_bodies
+                             + ROOM_MORE)
+        cdef double[::1] room
+        self.keep = None
+        if before is not None:
+            self.keep, before.keep = before.keep, None
+            before.state.status = USELESS
+        if self.keep is None or len(self.keep) < size:
+            self.keep = np.empty(size)
+        room = self.keep
+        self.state.room = &room[0]
+        self.state.first = FIRST if p.rows.n_contacts < FAR else FIRST_FAR
+        self.state.status = NOT_YET
+
+    @property
+    def shape(self):
+        """(records, stages); (0, 0) where nothing is packed."""
+        if self.state.status != READY:
+            return 0, 0
+        return self.state.packed.pairs, self.state.packed.stages
+
+
+def may_pack(Data p, const int32_t[::1] order):
+    """Whether contacts have two tangents and no spin alone, behind the joints, and are as many as gain by packing."""
+    cdef int32_t i
+    if not p.factored or p.rows.n_contacts < FEWEST:
+        return False
+    for i in range(p.rows.n_joints):
+        if order[i] >= p.rows.n_joints:
+            return False
+    return packs(&p.blocks, &p.rows) != 0
+
+
 def run(int kind, Data p, Watch watch, double[::1] lam, int n, double tol, int32_t[::1] order, int split, int mode,
-        uint64_t[::1] rng, double omega=1.0, double[::1] scratch=None):
+        uint64_t[::1] rng, double omega=1.0, double[::1] scratch=None, Packing packing=None):
     """`n` sweeps in place under `watch`, GIL released: (status, sweeps done).
 
     kind is PGS, SOR, JACOBI or IMPULSES; an empty order means row by row, for PGS over single rows.
+    `packing`, of this `p` and `order`, makes impulses pack; scratch is then (n_bodies + 2, 6).
     """
     cdef context_t c
     cdef int32_t status, done = 0
@@ -175,11 +241,9 @@ def run(int kind, Data p, Watch watch, double[::1] lam, int n, double tol, int32
     c.split = split
     c.mode = mode
     c.rng = &rng[0]
-    c.room = NULL
-    cdef double[::1] room
-    if kind == 3 and n >= PACKED_SWEEPS and mode == 0 and _may_pack(&c):
-        room = np.empty(ROOM_CONTACT * <int64_t>p.rows.n_contacts + ROOM_BODY * <int64_t>p.rows.n_bodies + ROOM_MORE)
-        c.room = &room[0]
+    c.packing = NULL
+    if packing is not None:
+        c.packing = &packing.state
     with nogil:
         status = watch.run(step, &c, &lam[0], n, tol, &done)
     return status, done

@@ -1,10 +1,15 @@
 """Sweeps over packed contacts give the bits of one contact after the other, whatever the order and the scene."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from random_problems import random_contact_problem
 
 import lavender as lv
+from lavender.bench.kernels import lattice_pile
 from lavender.engine.layout import HEAD
+from lavender.solvers import _layout
 from lavender.solvers.sequential_impulses import SequentialImpulses
 
 CASES = [
@@ -105,3 +110,147 @@ def test_the_solver_packs_long_runs_and_changes_no_bit(name, order):
     for _ in range(40):
         SequentialImpulses(order=mixed).run(state, b, 1, 0.0)
     np.testing.assert_array_equal(a.view(np.uint8), b.view(np.uint8))
+
+
+FIXED = ["given", "reverse", "bottom_up", "top_down", "local", "colored", "array"]
+
+
+def tangled(seed, contacts, joints, bodies=None):
+    return random_contact_problem(
+        seed, tangents=2, spin=False, bodies=bodies or max(3, contacts // 2), joints=joints, contacts=contacts
+    )
+
+
+def in_chunks(problem, order, counts, start, *, packs=True):
+    """Impulse and velocities after runs of those many sweeps each, and how the contacts were packed."""
+    if order == "array":
+        kj = problem.rows.n_joints
+        rng = np.random.default_rng(problem.n_blocks)
+        order = np.concatenate([rng.permutation(kj), kj + rng.permutation(problem.n_blocks - kj)])
+    prepared = lv.prepare(problem, "sequential_impulses", order=order)
+    solver, state = prepared._solver, prepared._state
+    if not packs:
+        state.packing = None
+    lam = start.copy()
+    for n in counts:
+        solver.run(state, lam, n, 0.0)
+    return lam, state.velocity[:-2], state.packing
+
+
+@pytest.mark.parametrize("order", FIXED)
+@pytest.mark.parametrize(
+    ("contacts", "joints", "packed"),
+    [(1, 0, False), (23, 4, False), (24, 0, True), (25, 3, True), (300, 0, True), (301, 40, True)],
+)
+def test_packed_runs_of_any_length_are_the_plain_ones(order, contacts, joints, packed):
+    problem = tangled(contacts, contacts, joints)
+    rng = np.random.default_rng(contacts)
+    warm = np.abs(rng.normal(size=problem.m)) * 0.05
+    for start in (problem.start(), warm):
+        for counts in ([1], [7], [8], [40], [1, 2, 16, 1, 3, 9, 2], [*rng.integers(1, 20, 6).tolist(), 30]):
+            lam, v, packing = in_chunks(problem, order, counts, start)
+            one, v_one, _ = in_chunks(problem, order, counts, start, packs=False)
+            np.testing.assert_array_equal(lam.view(np.uint8), one.view(np.uint8))
+            np.testing.assert_array_equal(v.view(np.uint8), v_one.view(np.uint8))
+            assert (packing is not None) == packed
+            if packed:
+                pairs, stages = packing.shape
+                if max(counts) < 8:
+                    assert pairs == 0
+                elif contacts > 100 or joints == 0:  # else too few may be free of each other
+                    assert pairs > 0
+                assert pairs <= contacts
+                assert stages <= 1 or joints == 0
+
+
+@pytest.mark.parametrize("order", ["given", "reverse"])
+def test_a_tall_stack_is_packed_over_sweeps(order):
+    """Few contacts are free of each other in one sweep: those of several sweeps stand in pairs."""
+    sim = lv.Simulation(lv.Scene("stack", n=40))
+    for _ in range(5):
+        sim.step()
+    problem = sim.constraint_problem()
+    counts = [8, 1, 2, 3, 5, 30, 4]
+    lam, v, packing = in_chunks(problem, order, counts, problem.start())
+    one, v_one, _ = in_chunks(problem, order, counts, problem.start(), packs=False)
+    assert packing.shape[1] > 1
+    np.testing.assert_array_equal(lam.view(np.uint8), one.view(np.uint8))
+    np.testing.assert_array_equal(v.view(np.uint8), v_one.view(np.uint8))
+
+
+def test_large_piles_pack_at_longer_runs_and_written_out(monkeypatch):
+    pile = lattice_pile(5_000, shuffle=True)
+    for least in (_layout.LARGE, 1):
+        monkeypatch.setattr(_layout, "LARGE", least)
+        for counts, packed in (([8], False), ([16, 3], True)):
+            lam, _, packing = in_chunks(pile, "reverse", counts, pile.start())
+            one = in_chunks(pile, "reverse", counts, pile.start(), packs=False)[0]
+            np.testing.assert_array_equal(lam.view(np.uint8), one.view(np.uint8))
+            assert (packing.shape[0] > 0) == packed
+
+
+@pytest.mark.parametrize("tol", [1e-2, 1e-6])
+def test_checks_between_packed_sweeps_see_what_they_would(tol):
+    pile = lattice_pile(300)
+    solutions = []
+    for packs in (True, False):
+        prepared = lv.prepare(pile, "sequential_impulses")
+        if not packs:
+            prepared._state.packing = None
+        solutions.append(prepared.solve(tol=tol, max_iter=300))
+        assert not packs or prepared._state.packing.shape[0] > 0
+    a, b = solutions
+    assert (a.status, a.iterations) == (b.status, b.iterations)
+    np.testing.assert_array_equal(a.impulse.view(np.uint8), b.impulse.view(np.uint8))
+
+
+def test_a_new_problem_takes_over_the_room():
+    problem = tangled(3, 120, 10)
+    other = replace(problem, b=problem.b + 0.01)
+    prepared = lv.prepare(problem, "sequential_impulses")
+    prepared.solve(tol=0.0, max_iter=20)
+    state, lam = prepared._state, np.zeros(problem.m)
+    again = prepared.solve(other, tol=0.0, max_iter=20)
+    fresh = lv.solve(other, "sequential_impulses", tol=0.0, max_iter=20)
+    np.testing.assert_array_equal(again.impulse.view(np.uint8), fresh.impulse.view(np.uint8))
+    # what was there before goes on one by one
+    assert state.packing.shape == (0, 0)
+    state.velocity = None
+    prepared._solver.run(state, lam, 20, 0.0)
+    one = in_chunks(problem, "given", [20], np.zeros(problem.m), packs=False)[0]
+    np.testing.assert_array_equal(lam.view(np.uint8), one.view(np.uint8))
+
+
+def test_contacts_of_one_body_are_not_packed():
+    problem = tangled(1, 40, 0, bodies=3)
+    ground = np.stack([np.full(40, -1), np.zeros(40)], axis=1).astype(np.int32)
+    rows = problem.rows
+    alone = lv.Problem.from_rows(
+        lv.Rows(
+            rows.inv_mass, rows.inv_inertia, rows.v_free, normal=rows.normal, tangent=rows.tangent,
+            arm_a=rows.arm_a, arm_b=rows.arm_b, contact_body=ground,
+        ),
+        mu=0.5, tangents=2,
+    )  # fmt: skip
+    lam, _, packing = in_chunks(alone, "given", [20], alone.start())
+    assert packing.shape == (0, 0)
+    one = in_chunks(alone, "given", [20], alone.start(), packs=False)[0]
+    np.testing.assert_array_equal(lam, one)
+
+
+@pytest.mark.parametrize("order", ["symmetric", "random", "mixed"])
+def test_orders_that_change_or_mix_joints_and_contacts_are_not_packed(order):
+    problem = tangled(2, 60, 10)
+    if order == "mixed":
+        order = np.arange(problem.n_blocks)[::-1]
+    assert lv.prepare(problem, "sequential_impulses", order=order)._state.packing is None
+
+
+def test_contacts_of_other_kinds_are_not_packed():
+    for more in (
+        {"tangents": 1, "spin": False},
+        {"tangents": 2, "spin": True},
+        {"tangents": None, "spin": False},
+    ):
+        problem = random_contact_problem(4, bodies=20, joints=3, contacts=60, **more)
+        assert lv.prepare(problem, "sequential_impulses")._state.packing is None

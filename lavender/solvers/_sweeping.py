@@ -70,6 +70,7 @@ def run_kernel(
     kind: int,
     omega: float = 1.0,
     scratch: FloatArray | None = None,
+    packing: Any = None,
 ) -> Claim:
     """n sweeps in one call of `lavender_ext.sweeps.run`, or fewer where a check ends them; tol = 0 checks nothing."""
     o = state.order
@@ -77,9 +78,9 @@ def run_kernel(
     blocks = _ROW_BY_ROW if kind == kernels.PGS and state.data.single_rows and o.is_given else o.blocks
     return claim(
         *kernels.run(
-            kind, state.data, state.watch, impulse, n, tol, blocks, o.split, o.mode, o.rng, omega, scratch
+            kind, state.data, state.watch, impulse, n, tol, blocks, o.split, o.mode, o.rng, omega, scratch, packing,
         )
-    )
+    )  # fmt: skip
 
 
 def run_threads(

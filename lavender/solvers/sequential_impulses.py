@@ -4,12 +4,14 @@
     v <- v + M^-1 J_i^T (change of lambda_i)
 
 with v = M^-1 J^T lambda, the change of velocity. Equal to `pgs` on the same order, sweep by sweep, to
-rounding; a contact costs the same whatever the number of its neighbours.
+rounding; a contact costs the same whatever the number of its neighbours. In a fixed order contacts of two
+tangents are swept in pairs, with the same bits (`lavender_ext/packed.pxd`).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -26,23 +28,28 @@ from lavender_ext import sweeps as kernels
 
 
 class ImpulseState(SweepState):
-    """A sweep state with v = M^-1 J^T lambda (n + 1, 6), formed once and kept by the sweeps.
+    """A sweep state with v = M^-1 J^T lambda (n + 2, 6), formed once and kept by the sweeps.
 
-    A large problem that is swept in an order of its own is written out in that order; the impulse of the sweeps
-    is then `laid`.
+    Behind the bodies stand zeros, and what packed contacts write for a static one. A large problem that is swept
+    in an order of its own is written out in that order; the impulse of the sweeps is then `laid`.
     """
 
     velocity: FloatArray | None = None
     laid: FloatArray | None = None  # (m,) impulse in sweep order, as the last run left it
+    layout: Layout | None
+    packing: Any  # lavender_ext.sweeps.Packing, or None
 
-    def __init__(self, problem: Problem, order: Order, before: Layout | None) -> None:
-        self.layout = lay_out(problem, order.blocks, before) if layout_pays(problem, order) else None
+    def __init__(self, problem: Problem, order: Order, before: ImpulseState | None) -> None:
+        layout, packing = (None, None) if before is None else (before.layout, before.packing)
+        self.layout = lay_out(problem, order.blocks, layout) if layout_pays(problem, order) else None
         if self.layout is None:
             super().__init__(problem, problem.data, order)
-            return
-        laid = replace(order, blocks=np.arange(problem.n_blocks, dtype=np.int32))
-        super().__init__(problem, self.layout.data, laid)
-        self.plan = order
+        else:
+            laid = replace(order, blocks=np.arange(problem.n_blocks, dtype=np.int32))
+            super().__init__(problem, self.layout.data, laid)
+            self.plan = order
+        packs = order.is_fixed and kernels.may_pack(self.data, self.order.blocks)
+        self.packing = kernels.Packing(self.data, packing) if packs else None
 
     @property
     def best(self) -> tuple[float, FloatArray | None]:
@@ -61,7 +68,7 @@ class SequentialImpulses(Threaded):
     """
 
     def _state(self, problem: Problem, order: Order, before: ImpulseState | None) -> ImpulseState:
-        return ImpulseState(problem, order, None if before is None else before.layout)
+        return ImpulseState(problem, order, before)
 
     def run(
         self, state: ImpulseState, impulse: FloatArray, n: int, tol: float, time_limit: float | None = None
@@ -72,13 +79,13 @@ class SequentialImpulses(Threaded):
                 state.laid = state.layout.take(impulse)
             lam = state.laid
         if state.velocity is None:
-            state.velocity = np.zeros((state.data.n_bodies + 1, 6))
+            state.velocity = np.zeros((state.data.n_bodies + 2, 6))
             judge.velocity_change(state.data, lam, state.velocity)
         velocity = state.velocity.ravel()
         if self.uses_threads(state):
             claim = run_threads(state, lam, n, tol, self.threads, velocity)
         else:
-            claim = run_kernel(state, lam, n, tol, kernels.IMPULSES, scratch=velocity)
+            claim = run_kernel(state, lam, n, tol, kernels.IMPULSES, scratch=velocity, packing=state.packing)
         if state.layout is not None:
             state.layout.put(lam, impulse)
         return claim
