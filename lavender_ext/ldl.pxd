@@ -137,11 +137,16 @@ cdef inline void ldl_columns(int32_t begin, int32_t end, int32_t width, int32_t 
                 x[i + t] -= col[t] * l
 
 
+cdef inline int32_t full_columns(int32_t n, int32_t width) noexcept nogil:
+    # Columns of full height come first; of no rows (width 0) there are none.
+    return n - width + 1 if n >= width > 0 else 0
+
+
 cdef inline void ldl_factor(int32_t n, int32_t width, double* c, const double* size, double tiny, double* x,
                             pivots_t* out) noexcept nogil:
     # (1); size (n) > 0 is what a pivot is compared with. Where x is not NULL it goes half way of ldl_solve, while
     # one pivot waits for the other.
-    cdef int32_t whole = n - width + 1 if n >= width else 0     # columns of full height
+    cdef int32_t whole = full_columns(n, width)
     no_pivots(out)
     if width == 2:
         ldl_factor_2(n, c, size, tiny, x, out)
@@ -182,7 +187,7 @@ cdef inline void ldl_back(int32_t begin, int32_t end, int32_t width, int32_t rea
 
 cdef inline void ldl_back_all(int32_t n, int32_t width, const double* c, double* x) noexcept nogil:
     # The second half of ldl_solve.
-    cdef int32_t whole = n - width + 1 if n >= width else 0
+    cdef int32_t whole = full_columns(n, width)
     if width == 2:
         ldl_back_2(n, c, x)
         return
@@ -195,7 +200,7 @@ cdef inline void ldl_back_all(int32_t n, int32_t width, const double* c, double*
 
 cdef inline void ldl_solve(int32_t n, int32_t width, const double* c, double* x) noexcept nogil:
     # x <- (L D L^T)^-1 x; 0 on skipped places.
-    cdef int32_t whole = n - width + 1 if n >= width else 0
+    cdef int32_t whole = full_columns(n, width)
     if width == 2:
         ldl_solve_2(n, c, x)
         return
