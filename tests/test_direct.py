@@ -328,7 +328,13 @@ def test_short_tridiagonal_systems(m):
 def test_a_band_without_free_rows_has_no_pivots(band):
     """Whatever the work arrays held: with every row at a bound there is nothing to read of them."""
     m = 6
-    a = sp.csr_array(np.eye(m)) if band == 0 else tridiagonal(m) if band == 1 else sp.csr_array(np.ones((m, m)))
+    a = (
+        sp.csr_array(np.eye(m))
+        if band == 0
+        else tridiagonal(m)
+        if band == 1
+        else sp.csr_array(np.ones((m, m)))
+    )
     pivoting = kernels.Pivoting(lv.Problem.lcp(a, np.ones(m), 0.1, 0.1).csr_data, band, None, 1e-13)
     pivoting.x.base[:] = -1.0  # a pivot of -1 would be a negative one
     pivoting.at[:] = -1

@@ -1,6 +1,7 @@
 """newton: its linear algebra against dense NumPy, its answers against enumeration and closed forms."""
 
 import time
+from dataclasses import replace
 from unittest import mock
 
 import numpy as np
@@ -481,3 +482,25 @@ def test_faces_under_the_cone_law_where_the_first_interior_point_stops_short():
     solution = lv.solve(problem, "newton", tol=1e-9)
     assert good(solution, 1e-9), solution
     assert solution.work["factorisations"] <= 300, solution
+
+
+def test_rows_are_exchanged_where_an_interior_point_stops_short():
+    """An asymmetric A, most rows beyond their bounds at H z = g: not tried first, but tried."""
+    rng, m = np.random.default_rng(41), 80
+    g = rng.normal(size=(m, m))
+    a = g - g.T + np.diag(rng.uniform(0.1, 1.0, m))
+    b = rng.normal(size=m)
+    problem = lv.Problem.lcp(a, b, -rng.uniform(0.0, 1.0, m), rng.uniform(0.0, 1.0, m))
+    assert good(lv.solve(problem, "newton", tol=1e-10), 1e-10)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_coulomb_contacts_without_friction_are_bounded_rows(seed):
+    """mu = 0, rows that depend on each other, a matrix: the law has no slip, and the cone law is the same."""
+    p = random_contact_problem(seed, bodies=3, joints=5, contacts=25, tangents=2, spin=False)
+    p = replace(p, compliance=np.zeros(p.m), cones=replace(p.cones, mu=np.zeros(p.n_blocks)))
+    for problem in (p, as_matrix(p)):
+        coulomb, cone = lv.solve(problem, "newton"), lv.solve(problem.relaxed("cone"), "newton")
+        assert not coulomb.contradicted
+        assert coulomb.status == cone.status
+        assert np.array_equal(coulomb.impulse, cone.impulse)

@@ -38,12 +38,16 @@ def solve_convex(run: Run, z: FloatArray, cold: bool) -> None:
         if run.done():
             return
     ip = InteriorPoint(system, DELTA if rows else CONE_DELTA, apart=sc.problem.is_symmetric)
-    if rows:
-        _everything(run, ip)
+    tried = not rows or _everything(run, ip)
     if not run.done():
         _interior(run, ip, rows)
     if run.done() or run.at_floor():
         return
+    if not tried:
+        # An asymmetric A may hold an interior point up at once where exchanging rows ends it.
+        polish(run, ip.everything, patience=1, limit=3)
+        if run.done() or run.at_floor():
+            return
     if not rows:
         # Where the weight itself is what is in the way (large faces, most of whose points carry nothing).
         _interior(run, InteriorPoint(system, DELTA, sc.problem.is_symmetric), rows)
@@ -57,8 +61,8 @@ def solve_convex(run: Run, z: FloatArray, cold: bool) -> None:
         Proximal(run.best_z.copy(), alpha=1e-3).advance(run)
 
 
-def _everything(run: Run, ip: InteriorPoint) -> None:
-    """H z = g where nearly every row holds."""
+def _everything(run: Run, ip: InteriorPoint) -> bool:
+    """H z = g where nearly every row holds; whether it was pursued."""
     system, sc = run.system, run.system.sc
     z = ip.everything
     wrong = np.count_nonzero((z < sc.lower) | (z > sc.upper))
@@ -74,9 +78,11 @@ def _everything(run: Run, ip: InteriorPoint) -> None:
             if not size < 0.1 * before or run.relative(size, 0.0) <= 1e-3 * run.tol:
                 break
         if run.relative(size, 0.0) <= run.tol and run.score(z) <= run.tol:
-            return
-    if (sc.m <= FEW or wrong <= HOLD * sc.m) and not run.done():
+            return True
+    worth = bool(sc.m <= FEW or wrong <= HOLD * sc.m)
+    if worth and not run.done():
         polish(run, z, patience=1, limit=3)
+    return worth
 
 
 def _interior(run: Run, ip: InteriorPoint, rows: bool) -> None:

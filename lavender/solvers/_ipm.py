@@ -71,6 +71,11 @@ class Scaled:
     def m(self) -> int:
         return len(self.keep)
 
+    @property
+    def has_friction(self) -> bool:
+        """Some element has more rows than one: a contact with tangents or spin that move."""
+        return len(self.kind) < self.m
+
     @cached_property
     def speed(self) -> FloatArray:
         """Velocity error (m,) per unit of the natural map."""
@@ -512,7 +517,8 @@ class MatrixSystem(System):
         if self.band is not None and self._factor_band(self.band):
             return True
         if self.bt is None:
-            w = 1.0 / self.v
+            with np.errstate(divide="ignore", over="ignore"):  # a row that no longer moves: the step is not finite
+                w = 1.0 / self.v
             if not self.dense:
                 return self._sparse_lu(self.h + sp.diags_array(w))
             matrix = self.h.copy()

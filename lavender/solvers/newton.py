@@ -98,7 +98,7 @@ class Newton:
         interrupted = False
         try:
             if not run.done():
-                if problem.law == "coulomb":
+                if problem.law == "coulomb" and system.sc.has_friction:
                     solve_coulomb(run, z, cold)
                 else:
                     solve_convex(run, z, cold)
