@@ -517,8 +517,8 @@ class MatrixSystem(System):
         if self.band is not None and self._factor_band(self.band):
             return True
         if self.bt is None:
-            with np.errstate(divide="ignore", over="ignore"):  # a row that no longer moves: the step is not finite
-                w = 1.0 / self.v
+            with np.errstate(divide="ignore", over="ignore"):
+                w = 1.0 / self.v  # inf for a row that no longer moves, and the step fails
             if not self.dense:
                 return self._sparse_lu(self.h + sp.diags_array(w))
             matrix = self.h.copy()
