@@ -173,3 +173,12 @@ def test_real_friction_problems(problem_dir, name):
 
     solution = lv.solve(lavender.io.load(problem_dir / f"{name}.hdf5"), "admm", tol=1e-8, max_iter=5000)
     assert solution.success, solution
+
+
+@pytest.mark.parametrize("m", [0, 4])
+def test_work_is_told_once_however_a_run_is_cut(m):
+    problem = lv.Problem.lcp(np.eye(m), np.ones(m))
+    whole = lv.solve(problem, "admm", tol=0.0, max_iter=9)
+    cut = lv.solve(problem, "admm", tol=0.0, max_iter=9, callback=lambda *_: False)
+    assert dict(whole.work) == dict(cut.work)
+    assert whole.work["factorisations"] >= 1

@@ -53,7 +53,7 @@ class AdmmState:
         self.space = kernels.allocate(self.data, memory)
         self.rho = _START_RHO
         self.undone = 0
-        self.factorisations = 0
+        self.factorisations = self.reported = 0  # all, and those that an earlier run has told
         rows = problem.rows
         self.matrix: Any = None
         if rows is not None and 0 < 6 * rows.n_bodies < problem.m:
@@ -173,7 +173,6 @@ class ADMM:
         if state.watch.total == 0 and len(impulse):
             # y of the start: minus its slack, shifted; at a solution the first iteration stays there.
             kernels.start(data, impulse, state.problem.slack(impulse), state.root, state.rho, state.space)
-        before = state.factorisations if state.watch.total else 0
         undone, message = state.undone, ""
 
         def iterate(count: int, first: bool) -> None:
@@ -193,9 +192,10 @@ class ADMM:
             result, message = Claim(Status.NUMERICAL_ERROR, state.watch.total), str(failure)
         work = {
             "solves": result.iterations,
-            "factorisations": state.factorisations - before,
+            "factorisations": state.factorisations - state.reported,
             "undone": state.undone - undone,
         }
+        state.reported = state.factorisations
         form = ("dense Cholesky", "sparse LDLT", "sparse LU", "LDLT over bodies")[state.kind]
         return replace(result, work=work, form=form, message=message)
 
