@@ -1,0 +1,31 @@
+"""Print what extras of the installed lavender ask for, one requirement a line, so that pip need not build it again.
+
+python .ci/requirements.py EXTRA ...
+"""
+
+import re
+import sys
+from collections.abc import Iterator
+from importlib.metadata import requires
+
+
+def of(extra: str) -> Iterator[str]:
+    """Requirements of one extra; where it names other extras of lavender, theirs."""
+    found = 0
+    for line in requires("lavender") or []:
+        requirement, _, marker = line.partition(";")
+        if not re.search(rf"""extra == ["']{re.escape(extra)}["']""", marker):
+            continue
+        found += 1
+        own = re.fullmatch(r"lavender\[([\w,-]+)\]", requirement.strip())
+        if own:
+            for other in own[1].split(","):
+                yield from of(other)
+        else:
+            yield requirement.strip()
+    if not found:
+        raise LookupError(f"lavender has no extra {extra!r}")
+
+
+if __name__ == "__main__":
+    print("\n".join(dict.fromkeys(line for extra in sys.argv[1:] for line in of(extra))))
