@@ -163,7 +163,7 @@ def test_siconos_solves_the_same_problems():
     python = os.environ.get("LAVENDER_SICONOS", "")
     if not python:
         pytest.skip("LAVENDER_SICONOS names no interpreter with Siconos")
-    for kind, name in (("coulomb", "NSGS"), ("coulomb", "NSN_AC"), ("lcp", "PGS")):
+    for kind, name in (("coulomb", "NSGS"), ("coulomb", "NSGS dense"), ("coulomb", "NSN_AC"), ("lcp", "PGS")):
         contestant = peer_solvers._siconos(python, name, kind == "coulomb")
         assert reached(contestant, suite.case(SMALL[kind]).problem) < 1e-6
 

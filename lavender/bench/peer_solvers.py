@@ -470,7 +470,7 @@ def _scipy(name: str) -> Contestant:
 
 # -- Siconos, in an interpreter of its own ---------------------------------------------------------
 
-SICONOS_FRICTION = ("NSGS", "NSGS+projection", "NSN_AC", "ADMM")
+SICONOS_FRICTION = ("NSGS", "NSGS dense", "NSGS+projection", "NSN_AC", "NSN_AC dense", "ADMM")
 SICONOS_LCP = ("PGS", "LEMKE", "MURTY", "NEWTON_FB_FBLSA", "NEWTON_MIN_FBLSA")
 
 
@@ -508,8 +508,9 @@ def _siconos(python: str, name: str, friction: bool) -> Contestant:
     def refuses(problem: Problem) -> str | None:
         c = problem.cones
         if friction:
-            wrong = problem.law != "coulomb" or not _three_rows_each(problem)
-            return "for Coulomb contacts with two tangents each" if wrong else None
+            if problem.law != "coulomb" or not _three_rows_each(problem):
+                return "for Coulomb contacts with two tangents each"
+            return "a dense matrix" if name.endswith("dense") and problem.m > DENSE_ROWS else None
         if problem.law != "lcp" or np.any(c.lower != 0.0) or np.any(np.isfinite(c.upper)):
             return "for impulses >= 0"
         return "a dense matrix" if name != "PGS" and problem.m > DENSE_ROWS else None

@@ -1,7 +1,8 @@
 """Siconos in an interpreter of its own, which need not have lavender: `python siconos_server.py IN.npz FOLDER`.
 
 IN.npz holds A_data, A_indices, A_indptr (compressed rows), b, mu (c,) or empty, solver, tolerances, limit [s].
-With contacts it is FC3D (three rows each, normal first), else an LCP with lambda >= 0. For each tolerance, from the
+With contacts it is FC3D (three rows each, normal first; a solver named "... dense" gets W as a dense matrix), else an
+LCP with lambda >= 0. For each tolerance, from the
 loosest on, FOLDER/<i>.npz appears with impulse (m,), seconds (least CPU time of the driver alone), info. The
 matrix is built outside the clock. A call that takes more than the limit is the last.
 """
@@ -50,8 +51,10 @@ def main():
     columns = sp.csc_matrix((a.data, a.indices.astype(np.int64), a.indptr.astype(np.int64)), shape=(m, m))
     contact = len(mu) > 0
     if contact:
+        full = name.endswith(" dense")
+        name = name.replace(" dense", "")
         problem = sn.FrictionContactProblem(
-            3, len(mu), columns, np.ascontiguousarray(q), np.ascontiguousarray(mu)
+            3, len(mu), a.toarray() if full else columns, np.ascontiguousarray(q), np.ascontiguousarray(mu)
         )
         drive = sn.fc3d_driver
     else:
