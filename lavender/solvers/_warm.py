@@ -16,8 +16,7 @@ from lavender_ext import warm as kernels
 #: How it ended, by number of lavender_ext/warm.pxd: None where nothing was decided.
 ENDED = (None, "as it came", "warm sweeps", "joints solved directly", "warm sweeps, Newton steps over bodies")
 
-MOST_STEPS = 6  # factorisations that the first phase may cost, as in lavender_ext/warm.pxd
-MOST_SWEEPS = 64
+MOST_SWEEPS, MOST_STEPS = kernels.limits()  # sweeps and factorisations that the first phase may cost
 TRIED = "_warm_tried"  # in a problem's __dict__: tol at which its guess was tried in vain, and what that cost
 
 
