@@ -17,10 +17,11 @@ from lavender.errors import (
     SolverUnavailable,
     UnknownName,
 )
-from lavender.problem import Problem, Rows
+from lavender.problem import Problem
 from lavender.redundancy import Redundancy, redundancy
 from lavender.registry import SolverSpec, available, get, known, register
 from lavender.residuals import Residual, residual
+from lavender.rows import Rows
 from lavender.solution import Claim, Solution, Status
 from lavender.solve import prepare, solve
 

@@ -17,6 +17,7 @@ LEVELS = [
     {"errors"},
     {"_arrays"},
     {"cones"},
+    {"rows"},
     {"problem"},
     {"residuals"},
     {"solution"},

@@ -31,8 +31,9 @@ from lavender._arrays import FloatArray
 from lavender.bench import machine
 from lavender.engine.simulation import Simulation
 from lavender.errors import InputError, SolverUnavailable
-from lavender.problem import Problem, Rows
+from lavender.problem import Problem
 from lavender.residuals import residual
+from lavender.rows import Rows
 from lavender.scene.scene import Scene
 from lavender.solve import Prepared, prepare, solve
 from lavender.suite import granular

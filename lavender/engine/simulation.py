@@ -17,9 +17,10 @@ from lavender.engine.layout import HEAD, NEED_ROOM, NOT_FINITE, OK, SIZE
 from lavender.engine.snapshot import Snapshot
 from lavender.engine.state import State
 from lavender.errors import InputError, LavenderError, SolveFailed, UnknownName
-from lavender.problem import Problem, Rows
+from lavender.problem import Problem
 from lavender.registry import get
 from lavender.residuals import Residual, residual
+from lavender.rows import Rows
 from lavender.scene import Scene
 from lavender.scene.parts import whole
 from lavender.scene.scene import SWEEPS

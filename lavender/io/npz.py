@@ -26,7 +26,8 @@ from lavender._arrays import FloatArray
 from lavender.cones import CONTACT, ROW, Cones
 from lavender.errors import InputError
 from lavender.io.stored import MAX_BYTES, Stored, write_atomically
-from lavender.problem import Problem, Rows
+from lavender.problem import Problem
+from lavender.rows import Rows
 
 __all__ = ["VERSION", "read", "write"]
 

@@ -8,7 +8,8 @@ import numpy as np
 
 from lavender._arrays import FloatArray, IntArray
 from lavender.errors import InputError
-from lavender.problem import Problem, Rows
+from lavender.problem import Problem
+from lavender.rows import Rows
 
 __all__ = [
     "GRAVITY",

@@ -14,7 +14,8 @@ import numpy as np
 from lavender._arrays import FloatArray
 from lavender.cones import ROW
 from lavender.errors import InputError
-from lavender.problem import Problem, Rows
+from lavender.problem import Problem
+from lavender.rows import Rows
 from lavender.suite.build import FALL, Bodies, Contacts, contact_problem, joint_problem, manifold, sideways
 from lavender.suite.case import Draft, Reference, family
 from lavender.suite.exact import solve_linear

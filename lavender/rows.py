@@ -1,0 +1,156 @@
+"""The factored operator: J and M^-1 of bodies of six velocities, in the layout that sweeps want."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+import numpy as np
+import scipy.sparse as sp
+
+from lavender._arrays import FloatArray, IntArray, as_array, check_not_negative, equal
+from lavender.cones import CONTACT_SPIN, Cones
+from lavender.errors import InputError
+
+__all__ = ["Rows"]
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """J and M^-1 in the layout that sweeps want: joint rows dense, contacts compact.
+
+    Row of a contact from body a to body b (n normal, t1, t2 = n x t1 tangents, arms from the centres):
+    n.u, t.u with u = v_b + omega_b x arm_b - v_a - omega_a x arm_a, and n.(omega_b - omega_a) for spin.
+    Body -1 is static. Joints come first.
+
+    Raises
+    ------
+    InputError
+        Shapes that do not fit, a body that does not exist, a row between a body and itself, negative
+        inverse mass, a normal or tangent that is not a unit vector or not orthogonal.
+    """
+
+    inv_mass: FloatArray  # (n,) 1/kg
+    inv_inertia: FloatArray  # (n, 3, 3) 1/(kg m^2), world axes, symmetric
+    v_free: FloatArray  # (n, 6) m/s, rad/s: v*, the velocity without constraint impulses
+    jac: FloatArray = field(
+        default_factory=lambda: np.zeros((0, 12))
+    )  # (mj, 12) linear, angular of a, then of b
+    joint_ptr: IntArray = field(
+        default_factory=lambda: np.zeros(1, np.int32)
+    )  # (kj + 1,) first row of each joint
+    joint_body: IntArray = field(default_factory=lambda: np.zeros((0, 2), np.int32))  # (kj, 2)
+    normal: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))  # (c, 3) unit, from a to b
+    tangent: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))  # (c, 3) unit, orthogonal to normal
+    arm_a: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))  # (c, 3) m
+    arm_b: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))  # (c, 3) m
+    contact_body: IntArray = field(default_factory=lambda: np.zeros((0, 2), np.int32))  # (c, 2)
+    copy: bool = field(default=True, repr=False)  # False: adopt arrays that fit, and mark them read-only
+
+    def __post_init__(self) -> None:
+        n = np.shape(self.inv_mass)[0] if np.ndim(self.inv_mass) == 1 else None
+        c = np.shape(self.normal)[0] if np.ndim(self.normal) == 2 else None
+        ptr = as_array("joint_ptr", self.joint_ptr, (None,), dtype=np.int32, copy=self.copy)
+        if len(ptr) == 0 or ptr[0] != 0 or np.any(np.diff(ptr) <= 0):
+            raise InputError(
+                "joint_ptr must start with 0 and increase: the first row of each joint, then the "
+                "number of joint rows"
+            )
+        shapes: dict[str, tuple[int | None, ...]] = {
+            "inv_mass": (n,), "inv_inertia": (n, 3, 3), "v_free": (n, 6), "jac": (int(ptr[-1]), 12),
+            "normal": (c, 3), "tangent": (c, 3), "arm_a": (c, 3), "arm_b": (c, 3),
+        }  # fmt: skip
+        object.__setattr__(self, "joint_ptr", ptr)
+        for name, shape in shapes.items():
+            object.__setattr__(self, name, as_array(name, getattr(self, name), shape, copy=self.copy))
+        for name, shape in (("joint_body", (len(ptr) - 1, 2)), ("contact_body", (c, 2))):
+            body = as_array(name, getattr(self, name), shape, dtype=np.int32, copy=self.copy)
+            object.__setattr__(self, name, body)
+            if body.size and (body.min() < -1 or body.max() >= len(self.inv_mass)):
+                stray = body.max() if body.max() >= len(self.inv_mass) else body.min()
+                raise InputError(
+                    f"{name} names body {stray}; there are {len(self.inv_mass)} bodies, and -1 is static"
+                )
+            same = np.flatnonzero((body[:, 0] == body[:, 1]) & (body[:, 0] >= 0))
+            if len(same):
+                raise InputError(f"{name}[{same[0]}] joins body {body[same[0], 0]} to itself")
+        check_not_negative("inv_mass", self.inv_mass)
+        if self.n_contacts:
+            # 1e-9: far above rounding of a normalised vector, far below anything meant otherwise.
+            off = np.abs(np.stack([
+                np.einsum("ij,ij->i", self.normal, self.normal) - 1.0,
+                np.einsum("ij,ij->i", self.tangent, self.tangent) - 1.0,
+                np.einsum("ij,ij->i", self.normal, self.tangent),
+            ])).max(axis=0)  # fmt: skip
+            if off.max() > 1e-9:
+                i = int(np.argmax(off))
+                raise InputError(
+                    f"contact {i}: normal {self.normal[i]} and tangent {self.tangent[i]} must be "
+                    "orthogonal unit vectors"
+                )
+
+    @property
+    def n_bodies(self) -> int:
+        """Number of moving bodies, n."""
+        return len(self.inv_mass)
+
+    @property
+    def n_joints(self) -> int:
+        """Number of joints, kj: the first blocks."""
+        return len(self.joint_body)
+
+    @property
+    def n_contacts(self) -> int:
+        """Number of contacts, c: the blocks after the joints."""
+        return len(self.contact_body)
+
+    def jacobian(self, cones: Cones) -> sp.csr_array:
+        """J as CSR (m, 6 n); the columns of body i are 6 i .. 6 i + 5, linear then angular."""
+        tangents, spin = cones.n_tangents[self.n_joints :], cones.kind[self.n_joints :] == CONTACT_SPIN
+        first = cones.ptr[self.n_joints : -1]
+        m = cones.n_rows
+        dense = np.zeros((m, 12))
+        body = np.empty((m, 2), np.int64)
+        mj = len(self.jac)
+        dense[:mj] = self.jac
+        body[:mj] = np.repeat(self.joint_body, np.diff(self.joint_ptr), axis=0)
+        body[mj:] = np.repeat(self.contact_body, np.diff(cones.ptr[self.n_joints :]), axis=0)
+        t2 = np.cross(self.normal, self.tangent)
+        for axis, row in ((self.normal, 0), (self.tangent, 1), (t2, 2)):
+            has = np.flatnonzero(tangents >= row)
+            dense[first[has] + row] = np.hstack([
+                -axis[has], -np.cross(self.arm_a[has], axis[has]),
+                axis[has], np.cross(self.arm_b[has], axis[has]),
+            ])  # fmt: skip
+        last = cones.ptr[self.n_joints + 1 :][spin] - 1
+        dense[last] = 0.0
+        dense[last, 3:6], dense[last, 9:12] = -self.normal[spin], self.normal[spin]
+        keep = np.repeat(body >= 0, 6, axis=1) & (dense != 0.0)
+        columns = (6 * body[:, [0, 1], None] + np.arange(6)).reshape(m, 12)
+        indptr = np.concatenate([[0], np.cumsum(keep.sum(axis=1))])
+        jac = sp.csr_array((dense[keep], columns[keep], indptr), shape=(m, 6 * self.n_bodies))
+        jac.sort_indices()
+        return jac
+
+    def inverse_mass_matrix(self) -> sp.csr_array:
+        """M^-1 as CSR (6 n, 6 n)."""
+        n = self.n_bodies
+        diagonal = np.repeat(np.arange(n) * 6, 3) + np.tile(np.arange(3), n)
+        block = np.repeat(np.arange(n) * 6 + 3, 9)
+        i = np.concatenate([diagonal, block + np.tile(np.repeat(np.arange(3), 3), n)])
+        j = np.concatenate([diagonal, block + np.tile(np.arange(3), 3 * n)])
+        x = np.concatenate([np.repeat(self.inv_mass, 3), self.inv_inertia.ravel()])
+        return sp.csr_array((x, (i, j)), shape=(6 * n, 6 * n))
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Rows):
+            return NotImplemented
+        return all(
+            equal(getattr(self, f.name), getattr(other, f.name)) for f in fields(self) if f.name != "copy"
+        )
+
+    __hash__ = None  # type: ignore[assignment]
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # Arrays stay read-only in copies and pickles.
+        return type(self), tuple(f.name != "copy" and getattr(self, f.name) for f in fields(self))
