@@ -1,4 +1,4 @@
-"""Print what extras of the installed lavender ask for, one requirement a line, so that pip need not build it again.
+"""Print what extras of the installed package ask for, one requirement a line, so that pip need not build it again.
 
 python .ci/requirements.py EXTRA ...
 """
@@ -10,21 +10,21 @@ from importlib.metadata import requires
 
 
 def of(extra: str) -> Iterator[str]:
-    """Requirements of one extra; where it names other extras of lavender, theirs."""
+    """Requirements of one extra; where it names other extras of the package, theirs."""
     found = 0
-    for line in requires("lavender") or []:
+    for line in requires("lavender-contact") or []:
         requirement, _, marker = line.partition(";")
         if not re.search(rf"""extra == ["']{re.escape(extra)}["']""", marker):
             continue
         found += 1
-        own = re.fullmatch(r"lavender\[([\w,-]+)\]", requirement.strip())
+        own = re.fullmatch(r"lavender-contact\[([\w,-]+)\]", requirement.strip())
         if own:
             for other in own[1].split(","):
                 yield from of(other)
         else:
             yield requirement.strip()
     if not found:
-        raise LookupError(f"lavender has no extra {extra!r}")
+        raise LookupError(f"lavender-contact has no extra {extra!r}")
 
 
 if __name__ == "__main__":

@@ -7,6 +7,7 @@ Scenes, the engine, files, cases and reports are imported at their first use: `l
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+import lavender._built  # noqa: F401 - first: says what to do where nothing is built
 from lavender._version import __version__
 from lavender.cones import CONTACT, CONTACT_SPIN, ROW, Cones
 from lavender.errors import (

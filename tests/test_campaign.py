@@ -93,7 +93,7 @@ def test_a_backend_that_is_not_there_is_an_input_error(backend, sign, monkeypatc
 
 
 @pytest.mark.parametrize(
-    ("backend", "package"), [("dask", "lavender\\[cluster\\]"), ("ray", "ray\\[default\\]")]
+    ("backend", "package"), [("dask", "lavender-contact\\[cluster\\]"), ("ray", "ray\\[default\\]")]
 )
 def test_a_cluster_without_its_package_says_what_to_install(backend, package, monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed" if backend == "dask" else "ray", None)

@@ -6,7 +6,7 @@ import pytest
 import lavender as lv
 from lavender.io import mujoco as adapter
 
-mj = pytest.importorskip("mujoco", reason="needs MuJoCo: pip install 'lavender[peers]'")
+mj = pytest.importorskip("mujoco", reason="needs MuJoCo: pip install 'lavender-contact[peers]'")
 
 # MuJoCo's solvers stop where the cost no longer falls; in float64 that is 1e-16 of it, and the residual of a
 # minimiser is the square root of what is left.

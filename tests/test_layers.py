@@ -13,7 +13,7 @@ ROOT = Path(__file__).resolve().parent.parent
 
 #: Bottom to top; names on one line are of one level and do not import each other.
 LEVELS = [
-    {"_version"},
+    {"_version", "_built"},
     {"errors"},
     {"_arrays"},
     {"cones"},

@@ -4,7 +4,9 @@ import ast
 import importlib.metadata
 import importlib.util
 import json
+import os
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -26,8 +28,51 @@ def python(code):
 
 
 def test_version_is_the_installed_one_and_in_the_changelog():
-    assert lavender.__version__ == importlib.metadata.version("lavender")
+    assert lavender.__version__ == importlib.metadata.version("lavender-contact")
     assert f"## [{lavender.__version__}]" in (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+
+
+def test_what_is_not_built_says_what_to_do(tmp_path):
+    # A fresh clone hides an installed lavender from whoever starts Python in it.
+    kernels = tmp_path / "lavender_ext"
+    kernels.mkdir()
+    (kernels / "__init__.py").touch()
+    shutil.copytree(
+        Path(lavender.__file__).parent, tmp_path / "lavender", ignore=shutil.ignore_patterns("*.wasm")
+    )
+    env = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    done = subprocess.run(
+        [sys.executable, "-c", "import lavender"],
+        capture_output=True, text=True, check=False, cwd=tmp_path, env=env,
+    )  # fmt: skip
+    assert done.returncode == 1
+    last = done.stderr.strip().splitlines()[-1]
+    assert last.startswith("ImportError: the kernels in ")
+    assert "pip install -e ." in last
+
+
+def test_no_text_offers_the_package_of_someone_else():
+    # `lavender` on PyPI is another project; ours is installed as lavender-contact.
+    offers = re.compile(r"pip install[^\n`&|;]*?[\s'\"]lavender(?![\w-])|\blavender\[\w")
+    texts = [
+        path
+        for folder in ("lavender", "lavender_ext", "docs", "examples", "tests", "benchmarks", ".ci")
+        for path in (ROOT / folder).rglob("*")
+        if path.suffix in {".py", ".md", ".html", ".jinja", ".j2", ".toml", ".js", ".mjs", ".pyx", ".pxd"}
+        and path != Path(__file__).resolve()
+        and "generated" not in path.parts
+    ]
+    texts += [ROOT / "README.md", ROOT / "CHANGELOG.md", ROOT / "pyproject.toml", ROOT / ".ci" / "run"]
+    assert len(texts) > 100
+    found = [
+        f"{path.relative_to(ROOT)}: {m[0]}"
+        for path in texts
+        for m in offers.finditer(path.read_text("utf-8"))
+    ]
+    assert found == []
+    assert offers.search("pip install lavender")
+    assert offers.search("pip install 'lavender[wasm]'")
+    assert not offers.search("pip install 'lavender-contact[wasm]'")
 
 
 def test_types_ship():

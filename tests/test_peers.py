@@ -50,7 +50,7 @@ def test_every_adapter_solves_the_same_problem(kind):
 
 
 def test_quadprog_needs_a_definite_matrix_and_constraints():
-    pytest.importorskip("quadprog", reason="needs quadprog: pip install 'lavender[qp]'")
+    pytest.importorskip("quadprog", reason="needs quadprog: pip install 'lavender-contact[qp]'")
     contestant = peer_solvers._direct("quadprog", "impulse")
     assert reached(contestant, suite.case("stack(n=4)").problem) < 1e-9
     with pytest.raises(lv.CapabilityError, match="without constraints"):
@@ -188,7 +188,7 @@ def test_engines_step_the_same_scene():
 
 
 def test_mujoco_carries_the_same_weight():
-    pytest.importorskip("mujoco", reason="needs MuJoCo: pip install 'lavender[peers]'")
+    pytest.importorskip("mujoco", reason="needs MuJoCo: pip install 'lavender-contact[peers]'")
     problem = peer_engines.export("stack6", settle=480)
     solution = lv.solve(problem, "newton", tol=1e-8)
     normals = solution.impulse[problem.cones.ptr[:-1]]

@@ -243,7 +243,9 @@ def _dask(address: str) -> Iterator[None]:
         import dask
         import distributed
     except ImportError:
-        raise InputError("backend 'dask' needs distributed: pip install 'lavender[cluster]'") from None
+        raise InputError(
+            "backend 'dask' needs distributed: pip install 'lavender-contact[cluster]'"
+        ) from None
     address = address or dask.config.get("scheduler-address", "")
     if not address:
         try:

@@ -513,6 +513,6 @@ def _h5py() -> Any:
         import h5py
     except ImportError:
         raise InputError(
-            "FCLIB files are HDF5, which needs h5py: pip install 'lavender[fclib]' (an .npz needs nothing)"
+            "FCLIB files are HDF5, which needs h5py: pip install 'lavender-contact[fclib]' (an .npz needs nothing)"
         ) from None
     return h5py

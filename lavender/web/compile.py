@@ -95,14 +95,14 @@ class Built:
 def why_not() -> str:
     """Why no module can be built here; empty when it can."""
     if importlib.util.find_spec("Cython") is None:
-        return "Cython is not installed (pip install 'lavender[wasm]')"
+        return "Cython is not installed (pip install 'lavender-contact[wasm]')"
     named = os.environ.get("LAVENDER_WASM_CC", "")
     if named and shutil.which(shlex.split(named)[0]) is None:
         return f"LAVENDER_WASM_CC names {shlex.split(named)[0]!r}, which is not there"
     if not named and importlib.util.find_spec("ziglang") is None:
         return (
-            "no compiler for WebAssembly: pip install 'lavender[wasm]' brings ziglang, or set LAVENDER_WASM_CC and "
-            "LAVENDER_WASM_LD"
+            "no compiler for WebAssembly: pip install 'lavender-contact[wasm]' brings ziglang, or set "
+            "LAVENDER_WASM_CC and LAVENDER_WASM_LD"
         )
     if not named and sys.version_info < (3, 11):
         return (
