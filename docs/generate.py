@@ -241,9 +241,9 @@ def image(path, text):
 def abilities(spec):
     """What a spec declares, in words."""
     reads = {
-        "rows": "body velocities (`Problem.from_rows`); A is never formed",
-        "matrix": "the matrix A (formed once from rows where needed)",
-        "either": "rows or matrix, as given",
+        frozenset({"rows"}): "body velocities (`Problem.from_rows`); A is never formed",
+        frozenset({"matrix"}): "the matrix A (formed once from rows where needed)",
+        frozenset({"rows", "matrix"}): "rows or matrix, as given",
     }
     yes = {
         "impulse": "starts from `impulse=`",
@@ -255,7 +255,7 @@ def abilities(spec):
     }
     rows = [
         ("laws", join_laws(spec)),
-        ("reads", reads[spec.operator]),
+        ("reads", reads[spec.operators]),
         (
             "ends",
             "after finitely many steps or at rounding, whatever `tol`"
@@ -371,7 +371,7 @@ def solver_pages(site, records, figures):
         (
             f"[{s.name}]({s.name}.md)" if not s.external else f"[{s.name}](backends.md#{s.name})",
             join_laws(s),
-            s.operator,
+            " ".join(sorted(s.operators)),
             "yes" if s.exact else "",
             "yes" if s.resumable else "",
             s.summary,
@@ -380,9 +380,9 @@ def solver_pages(site, records, figures):
     ]
     site.write(
         "solvers/index.md",
-        "# Solvers\n\nEvery name that `lavender.solve` takes. *Reads*: rows (body velocities), the matrix A, "
-        "or either.\n*Exact*: ends after finitely many steps. *Resumable*: n₁ and then n₂ iterations "
-        "give the bits of n₁ + n₂.\n\n"
+        "# Solvers\n\nEvery name that `lavender.solve` takes. *Reads*: rows (body velocities), the matrix A "
+        "(formed where it was not given), or both.\n*Exact*: ends after finitely many "
+        "steps. *Resumable*: n₁ and then n₂ iterations give the bits of n₁ + n₂.\n\n"
         + table(("name", "laws", "reads", "exact", "resumable", ""), rows)
         + "\n\n```{toctree}\n:hidden:\n\n"
         + "\n".join([*(s.name for s in ours), "backends"])

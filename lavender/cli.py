@@ -657,6 +657,7 @@ def solvers(problem: str | None) -> None:
     from rich.table import Table
 
     from lavender import bench, registry
+    from lavender.problem import OPERATORS
 
     given = bench.resolve([problem])[0].problem if problem else None
     table = Table(box=None, pad_edge=False, header_style="bold")
@@ -683,7 +684,7 @@ def solvers(problem: str | None) -> None:
         table.add_row(
             name,
             " ".join(laws),
-            spec.operator,
+            " ".join(o for o in OPERATORS if o in spec.operators),
             ", ".join(abilities),
             what,
             style="" if reason is None else "dim",

@@ -23,11 +23,13 @@ from lavender.rows import Rows
 from lavender_ext import assemble, judge, pivoting
 from lavender_ext import problem as kernels
 
-__all__ = ["LAWS", "Problem", "VelocityForm"]
+__all__ = ["LAWS", "OPERATORS", "Problem", "VelocityForm"]
 
 FRICTION = ("coulomb", "cone")
 # A solver that takes a law takes every law before it that it contains: linear < lcp < coulomb | cone.
 LAWS = ("linear", "lcp", "coulomb", "cone")
+# How A is given.
+OPERATORS = ("rows", "matrix")
 
 
 @dataclass(frozen=True)
@@ -249,6 +251,11 @@ class Problem:
         return len(self.b)
 
     @property
+    def operator(self) -> str:
+        """How A is given, of OPERATORS: "rows" or "matrix"."""
+        return "matrix" if self.rows is None else "rows"
+
+    @property
     def n_blocks(self) -> int:
         """Number of blocks, k."""
         return self.cones.n_blocks
@@ -337,7 +344,7 @@ class Problem:
             if most >= 2**31:
                 raise InputError(
                     f"A would have up to {most} entries, more than 32-bit indices reach: "
-                    "use a solver that takes rows (operator 'rows' or 'either')"
+                    "use a solver that reads rows"
                 )
             indptr, indices, data = assemble.delassus(self.data, most, start, blocks)
         elif isinstance(self.matrix, np.ndarray):

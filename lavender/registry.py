@@ -25,12 +25,10 @@ from typing import Any, Protocol
 
 from lavender._arrays import FloatArray
 from lavender.errors import InputError, SolverUnavailable, UnknownName
-from lavender.problem import LAWS, Problem
+from lavender.problem import LAWS, OPERATORS, Problem
 from lavender.solution import Claim
 
 __all__ = ["Solver", "SolverSpec", "available", "get", "known", "register"]
-
-OPERATORS = ("rows", "matrix", "either")
 
 
 class Solver(Protocol):
@@ -61,7 +59,8 @@ class SolverSpec:
     laws: frozenset[str]  # of LAWS: "linear", "lcp", "coulomb", "cone"
     summary: str
     reference: str = ""  # paper or manual
-    operator: str = "either"  # what it reads: "rows", "matrix" (formed from rows where needed) or "either"
+    # Of OPERATORS, those that it reads as they are given; with "matrix" A is formed where another was given.
+    operators: frozenset[str] = frozenset(OPERATORS)
     exact: bool = False  # finite or to rounding, not to tol
     resumable: bool = True
     impulse: bool = True  # a warm start changes what it does
@@ -83,13 +82,15 @@ class SolverSpec:
             not self.name
             or not set(self.laws) <= set(LAWS)
             or not self.laws
-            or self.operator not in OPERATORS
+            or not set(self.operators) <= set(OPERATORS)
+            or not self.operators
         ):
             raise InputError(
-                f"solver {self.name!r}: laws {sorted(self.laws)} must be of {LAWS}, operator "
-                f"{self.operator!r} of {OPERATORS}"
+                f"solver {self.name!r}: laws {sorted(self.laws)} must be of {LAWS}, operators "
+                f"{self.operators!r} a set of {OPERATORS}"
             )
         object.__setattr__(self, "laws", frozenset(self.laws))
+        object.__setattr__(self, "operators", frozenset(self.operators))
         if not self.resumable:
             object.__setattr__(self, "callback", False)
             object.__setattr__(self, "history", False)
@@ -116,7 +117,7 @@ class SolverSpec:
         if problem.law not in self.laws:
             takes = ", ".join(law for law in LAWS if law in self.laws)
             return f"takes laws {takes}, not {problem.law!r}{_way_round(problem.law, self.laws)}"
-        if self.operator == "rows" and problem.rows is None:
+        if "matrix" not in self.operators and problem.operator not in self.operators:
             return "needs a problem with rows (Problem.from_rows); this one was given as a matrix"
         return self.refusal(problem) if self.refusal is not None else None
 

@@ -462,7 +462,6 @@ SPEC = SolverSpec(
     name="auto",
     factory=Auto,
     laws=frozenset({"linear", "lcp", "coulomb", "cone"}),
-    operator="either",
     resumable=False,
     delegates=True,
     max_iter=1_000_000,

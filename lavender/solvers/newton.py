@@ -134,7 +134,6 @@ SPEC = SolverSpec(
     name="newton",
     factory=Newton,
     laws=frozenset({"linear", "lcp", "coulomb", "cone"}),
-    operator="either",
     resumable=False,
     max_iter=1500,
     options={"form": "auto, velocity (bodies) or impulse (rows): unknowns of the factorisation"},
