@@ -33,7 +33,8 @@ def test_version_is_the_installed_one_and_in_the_changelog():
 
 
 def test_what_is_not_built_says_what_to_do(tmp_path):
-    # A fresh clone hides an installed lavender from whoever starts Python in it.
+    # A fresh clone hides an installed lavender from whoever starts Python in it. Without site-packages (-S), since
+    # an editable installation finds its kernels even so.
     kernels = tmp_path / "lavender_ext"
     kernels.mkdir()
     (kernels / "__init__.py").touch()
@@ -42,7 +43,7 @@ def test_what_is_not_built_says_what_to_do(tmp_path):
     )
     env = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
     done = subprocess.run(
-        [sys.executable, "-c", "import lavender"],
+        [sys.executable, "-S", "-c", "import lavender"],
         capture_output=True, text=True, check=False, cwd=tmp_path, env=env,
     )  # fmt: skip
     assert done.returncode == 1
@@ -53,7 +54,7 @@ def test_what_is_not_built_says_what_to_do(tmp_path):
 
 def test_no_text_offers_the_package_of_someone_else():
     # `lavender` on PyPI is another project; ours is installed as lavender-contact.
-    offers = re.compile(r"pip install[^\n`&|;]*?[\s'\"]lavender(?![\w-])|\blavender\[\w")
+    offers = re.compile(r"pip install[^\n`&|;]*?[ '\"]lavender(?![\w-])|\blavender\[\w")
     texts = [
         path
         for folder in ("lavender", "lavender_ext", "docs", "examples", "tests", "benchmarks", ".ci")
