@@ -249,19 +249,9 @@ def test_node_sees_one_wrong_bit(module_file, recording, tmp_path, what, sign):
 # -- wasmtime --------------------------------------------------------------------------------------------------
 
 
-class Recording:
-    def __init__(self, folder):
-        self.contents = json.loads((folder / "recording.json").read_text())
-        self.numbers = (folder / "recording.bin").read_bytes()
-
-    def array(self, place):
-        at, n, kind = place
-        return np.frombuffer(self.numbers, np.dtype(f"<{kind}" if kind != "u1" else "u1"), n, at)
-
-
 @pytest.fixture(scope="session")
-def recorded(recording):
-    return Recording(recording)
+def recorded(recording, host):
+    return host.Recording(recording)
 
 
 def same_bits(found, expected):
@@ -319,59 +309,10 @@ def test_wasmtime_scenes_are_the_same_to_the_bit(module, host, recorded):
 
 def test_wasmtime_problems_are_the_same_to_the_bit(module, host, recorded):
     for problem in recorded.contents["problems"]:
-        k = host.Kernels(module, recorded.contents["layout"])
-        n = problem["counts"]
-        put = {name: k.put(recorded.array(at)) for name, at in (problem["ints"] | problem["reals"]).items()}
-        out = {name: k.alloc(8 * (n["rows"] + 1)) for name in ("d", "nu", "step", "slack", "error")}
-        out["impulse"] = put["start"]
-        blocks = k.put_struct(
-            "blocks_t", n_blocks=n["blocks"], n_rows=n["rows"], law=problem["law"],
-            **{key: put[key] for key in ("ptr", "kind", "lower", "upper", "mu", "patch_radius", "b")},
-            **{key: out[key] for key in ("d", "nu", "step")},
-        )  # fmt: skip
-        empty, rng = k.alloc(4 * (n["rows"] + 1)), k.put(np.array([int(problem["seed"])], np.uint64))
-        score = k.alloc(k.sizes["score_t"])
-        order = (put["order"], problem["split"], problem["mode"], rng, 1, problem["sweeps"])
-        if problem["factored"]:
-            more = {
-                "minv_jac": 96 * (n["rows"] + 1),
-                "coupling": 40 * (n["contacts"] + 1),
-                "swing": 48 * (n["rows"] + 1),
-            }
-            put |= {name: k.alloc(size) for name, size in more.items()}
-            fields = recorded.contents["layout"]["structs"]["rows_t"]
-            rows = k.put_struct(
-                "rows_t", n_bodies=n["bodies"], n_joints=n["joints"], n_contacts=n["contacts"],
-                **{key: put[key] for key in fields if not key.startswith("n_")},
-            )  # fmt: skip
-            velocity, scratch = k.alloc(48 * (n["bodies"] + 1)), k.alloc(96 * (n["bodies"] + 1))
-            k.call(
-                "lav_rows_diagonal",
-                blocks,
-                rows,
-                out["d"],
-                out["nu"],
-                out["step"],
-                empty,
-                *(put[m] for m in more),
-            )
-            judge = ("lav_judge_rows", blocks, rows, out["impulse"], out["slack"], out["error"])
-            k.call("lav_rows_velocity", blocks, rows, out["impulse"], velocity)
-            k.call("lav_impulse_sweeps", blocks, rows, out["impulse"], velocity, *order)
-            k.call(*judge, scratch, 1, score)
-        else:
-            csr = k.put_struct("csr_t", **{key: put[key] for key in ("indptr", "indices", "data")})
-            k.call("lav_csr_diagonal", blocks, csr, out["d"], out["step"], empty)
-            k.call("lav_matrix_nu", blocks, out["nu"])
-            k.call("lav_pgs_sweeps", blocks, csr, out["impulse"], *order)
-            k.call("lav_judge_csr", blocks, csr, out["impulse"], out["slack"], out["error"], 1, score)
+        found = host.run_problem(host.Kernels(module, recorded.contents["layout"]), problem, recorded)
         for name, place in problem["expected"].items():
-            assert same_bits(k.view(out[name], n["rows"], np.float64), recorded.array(place)), (
-                problem["name"],
-                name,
-            )
-        said = k.read_struct("score_t", score)
-        assert [said[key] for key in ("energy", "velocity", "worst")] == [
+            assert same_bits(found[name], recorded.array(place)), (problem["name"], name)
+        assert [found[key] for key in ("energy", "velocity", "worst")] == [
             problem[key] for key in ("energy", "velocity", "worst")
         ]
 

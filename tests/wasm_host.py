@@ -2,6 +2,7 @@
 
 import ctypes
 import functools
+import json
 
 import numpy as np
 import wasmtime
@@ -167,3 +168,78 @@ class Simulation:
     def restore(self, everything):
         for at, data in zip(self.buffers[1:], everything, strict=True):
             self.k.view(at, len(data), np.uint8)[:] = np.frombuffer(data, np.uint8)
+
+
+class Recording:
+    def __init__(self, folder):
+        self.contents = json.loads((folder / "recording.json").read_text())
+        self.numbers = (folder / "recording.bin").read_bytes()
+
+    def array(self, place):
+        at, n, kind = place
+        return np.frombuffer(self.numbers, np.dtype(f"<{kind}" if kind != "u1" else "u1"), n, at)
+
+
+def run_scene(k, scene, recorded):
+    """Eight values and x, q, v after every step of a recorded scene."""
+    simulation = Simulation(k, scene)
+    values, states = [], []
+    for step in range(scene["steps"]):
+        if str(step) in scene["changes"]:
+            simulation.set(**scene["changes"][str(step)])
+        assert simulation.step() == 0
+        values.append(simulation.values())
+        states.append(np.concatenate([simulation.array(name) for name in recorded.contents["body_arrays"]]))
+    return np.array(values), np.array(states)
+
+
+def run_problem(k, problem, recorded):
+    """What was recorded of a problem, computed again: d, nu, step, impulse, slack, error and the score."""
+    n = problem["counts"]
+    put = {name: k.put(recorded.array(at)) for name, at in (problem["ints"] | problem["reals"]).items()}
+    out = {name: k.alloc(8 * (n["rows"] + 1)) for name in ("d", "nu", "step", "slack", "error")}
+    out["impulse"] = put["start"]
+    blocks = k.put_struct(
+        "blocks_t", n_blocks=n["blocks"], n_rows=n["rows"], law=problem["law"],
+        **{key: put[key] for key in ("ptr", "kind", "lower", "upper", "mu", "patch_radius", "b")},
+        **{key: out[key] for key in ("d", "nu", "step")},
+    )  # fmt: skip
+    empty, rng = k.alloc(4 * (n["rows"] + 1)), k.put(np.array([int(problem["seed"])], np.uint64))
+    score = k.alloc(k.sizes["score_t"])
+    order = (put["order"], problem["split"], problem["mode"], rng, 1, problem["sweeps"])
+    if problem["factored"]:
+        more = {
+            "minv_jac": 96 * (n["rows"] + 1),
+            "coupling": 40 * (n["contacts"] + 1),
+            "swing": 48 * (n["rows"] + 1),
+        }
+        put |= {name: k.alloc(size) for name, size in more.items()}
+        fields = recorded.contents["layout"]["structs"]["rows_t"]
+        rows = k.put_struct(
+            "rows_t", n_bodies=n["bodies"], n_joints=n["joints"], n_contacts=n["contacts"],
+            **{key: put[key] for key in fields if not key.startswith("n_")},
+        )  # fmt: skip
+        velocity, scratch = k.alloc(48 * (n["bodies"] + 1)), k.alloc(96 * (n["bodies"] + 1))
+        k.call(
+            "lav_rows_diagonal",
+            blocks,
+            rows,
+            out["d"],
+            out["nu"],
+            out["step"],
+            empty,
+            *(put[m] for m in more),
+        )
+        judge = ("lav_judge_rows", blocks, rows, out["impulse"], out["slack"], out["error"])
+        k.call("lav_rows_velocity", blocks, rows, out["impulse"], velocity)
+        k.call("lav_impulse_sweeps", blocks, rows, out["impulse"], velocity, *order)
+        k.call(*judge, scratch, 1, score)
+    else:
+        csr = k.put_struct("csr_t", **{key: put[key] for key in ("indptr", "indices", "data")})
+        k.call("lav_csr_diagonal", blocks, csr, out["d"], out["step"], empty)
+        k.call("lav_matrix_nu", blocks, out["nu"])
+        k.call("lav_pgs_sweeps", blocks, csr, out["impulse"], *order)
+        k.call("lav_judge_csr", blocks, csr, out["impulse"], out["slack"], out["error"], 1, score)
+    said = k.read_struct("score_t", score)
+    found = {name: k.view(out[name], n["rows"], np.float64).copy() for name in problem["expected"]}
+    return found | {key: said[key] for key in ("energy", "velocity", "worst")}
