@@ -83,9 +83,10 @@ class ManyValues(click.Command):
 
 
 class Suites(ManyValues):
-    """`lavender bench kernels` and `peers` are commands of their own; any other first word is a file (or ./peers)."""
+    """`lavender bench auto`, `kernels`, `peers` are commands of their own; other first words are files (or ./peers)."""
 
     OWN = {  # noqa: RUF012 - a constant of the class
+        "auto": "lavender.bench.regret:command",
         "kernels": "lavender.bench.kernels:command",
         "peers": "lavender.bench.peers:command",
     }
@@ -370,7 +371,8 @@ def bench(
 ) -> None:
     """As `report`, but only the records: a .jsonl file that `lavender report` shows later.
 
-    `lavender bench peers` compares with other engines and solvers instead; see its own --help.
+    `lavender bench peers` compares with other engines and solvers instead, `lavender bench auto` measures what auto
+    loses against the best of our own solvers; see their own --help.
     """
     plan = _plan(files, levels, budgets, orders, repeats, time_limit)
     records, stopped = _measure(files, solvers, plan, out, memory, in_process)

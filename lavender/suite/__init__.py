@@ -30,6 +30,7 @@ from lavender.suite.families import (
     toy_stack,
     two_particles,
 )
+from lavender.suite.wild import wild
 
 __all__ = [
     "FAMILIES",
@@ -52,6 +53,7 @@ __all__ = [
     "stack",
     "toy_stack",
     "two_particles",
+    "wild",
 ]
 
 #: Lists of cases by name. "default" is what `lavender report` runs with no files: one case for each thing that
