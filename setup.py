@@ -119,7 +119,7 @@ build.sub_commands = [*build.sub_commands, ("build_wasm", None)]
 def extension(path):
     """One module, named after its file."""
     return Extension(
-        f"lavender_ext.{path.stem}",
+        ".".join(path.with_suffix("").parts),
         [path.as_posix()],
         extra_compile_args=COMPILE_ARGS,
         extra_link_args=LINK_ARGS,
@@ -127,6 +127,6 @@ def extension(path):
 
 
 setup(
-    ext_modules=[extension(path) for path in sorted(Path("lavender_ext").glob("*.pyx"))],
+    ext_modules=[extension(path) for path in sorted(Path("lavender_ext").rglob("*.pyx"))],
     cmdclass={"build_ext": BuildKernels, "build_wasm": BuildWasm},
 )

@@ -31,8 +31,8 @@ def problems(in_sdist: set[str], in_wheel: set[str]) -> list[str]:
         if path.is_file() and path.suffix not in {".pyc", ".so", ".pyd", ".c", ".h", ".wasm"}
     }
     tests = {path.relative_to(ROOT).as_posix() for path in (ROOT / "tests").rglob("*.py")}
-    kernels = {Path(name).stem for name in sources if name.endswith(".pyx")}
-    modules = {name.split("/")[1].split(".")[0] for name in in_wheel if name.endswith((".so", ".pyd"))}
+    kernels = {name.removesuffix(".pyx") for name in sources if name.endswith(".pyx")}
+    modules = {name.split(".")[0] for name in in_wheel if name.endswith((".so", ".pyd"))}
     found = [f"sdist lacks {name}" for name in sorted((sources | tests) - in_sdist)]
     for name in (
         "LICENSE",
@@ -44,7 +44,7 @@ def problems(in_sdist: set[str], in_wheel: set[str]) -> list[str]:
     ):
         found += [] if name in in_sdist else [f"sdist lacks {name}"]
     found += [f"wheel lacks {name}" for name in sorted(sources - in_wheel)]
-    found += [f"wheel lacks the compiled module lavender_ext.{name}" for name in sorted(kernels - modules)]
+    found += [f"wheel lacks the compiled module {name}" for name in sorted(kernels - modules)]
     if importlib.util.find_spec("ziglang") and "lavender/web/lavender.wasm" not in in_wheel:
         found.append("wheel lacks lavender/web/lavender.wasm, though its compiler is installed")
     if not any(name.endswith("/licenses/LICENSE") for name in in_wheel):

@@ -38,9 +38,9 @@ OPTIONS = runpy.run_path(str(ROOT / "lavender_ext" / "build_options.py"))
 #: sqrt and floor are exact, so every libm gives the same bits; compilers write the mem functions themselves.
 ALLOWED = frozenset({"sqrt", "floor", "memcpy", "memset", "memmove"})
 
-#: A threaded module is exempt by name: it yields and sleeps by the system's calls. Its
+#: A module of this name is exempt, for it has threads: it yields and sleeps by the system's calls. Its
 #: arithmetic is the inline functions of the .pxd files, which the serial modules compile and this check sees.
-EXEMPT_SUFFIX = "_threads"
+EXEMPT = "threaded"
 
 #: Types that have one size everywhere, as a host outside C must build them; structs end in _t too.
 FIXED = re.compile(r"(void|float|double|u?int(8|16|32|64)_t|\w+_t)$")
@@ -204,13 +204,16 @@ def check(path: Path, root: Path = ROOT) -> Verdict:
     RuntimeError
         If Cython, the compiler or the linker fails.
     """
-    if path.stem.endswith(EXEMPT_SUFFIX):
-        return Verdict(path.stem, exempt="threads")
-    verdict = Verdict(path.stem)
+    path, root = path.resolve(), root.resolve()
+    inside = path.relative_to(root) if path.is_relative_to(root) else Path(path.name)
+    name = ".".join(inside.with_suffix("").parts)
+    if path.stem == EXEMPT:
+        return Verdict(name, exempt="threads")
+    verdict = Verdict(name)
     verdict.functions, verdict.breaches = read_source(path)
     if verdict.functions:
         with tempfile.TemporaryDirectory() as work:
-            core = link_core(path.resolve(), verdict.functions, root, Path(work))
+            core = link_core(path, verdict.functions, root, Path(work))
             verdict.code, found = read_object(core)
             verdict.breaches += found
     return verdict
@@ -231,7 +234,7 @@ def main(arguments: list[str]) -> int:
     if missing:
         print(missing, file=sys.stderr)
         return 2
-    paths = [Path(name) for name in arguments] or sorted((ROOT / "lavender_ext").glob("*.pyx"))
+    paths = [Path(name) for name in arguments] or sorted((ROOT / "lavender_ext").rglob("*.pyx"))
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         verdicts = list(pool.map(check, paths))
     for verdict in verdicts:

@@ -6,15 +6,15 @@ python .ci/smoke.py FOLDER        lavender and its kernels must be imported from
 import sys
 from pathlib import Path
 
-import lavender_ext.sweeps
 import numpy as np
 
 import lavender as lv
+import lavender_ext.sweep.serial
 
 
 def main(folder: Path) -> None:
     """Raise AssertionError where an answer or an origin is wrong."""
-    for module in (lv, lavender_ext.sweeps):
+    for module in (lv, lavender_ext.sweep.serial):
         origin = Path(module.__file__).resolve()
         assert origin.is_relative_to(folder.resolve()), (
             f"{module.__name__} came from {origin}, not from {folder}"

@@ -36,7 +36,7 @@ from lavender.engine import Snapshot  # noqa: E402
 from lavender.engine.state import State  # noqa: E402
 from lavender.web import pages  # noqa: E402
 from lavender.web.scenes import layout  # noqa: E402
-from lavender_ext import host  # noqa: E402
+from lavender_ext.host import memory  # noqa: E402
 
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT / "tests" / "wasm"))
@@ -83,7 +83,7 @@ def give_room(simulation: lv.Simulation, substeps: int) -> None:
             return
         room = State(simulation._state.grown().size)
         buffers = (start.size, start.real.copy(), start.index.copy(), start.keys.copy())
-        host.move(*buffers, room.size, room.real, room.index, room.keys)
+        memory.move(*buffers, room.size, room.real, room.index, room.keys)
         simulation._state = room
 
 

@@ -129,7 +129,7 @@ def fingerprint():
     """Of the sources and the compiled kernels: records of other code are not shown as this code's."""
     digest = hashlib.sha256()
     package, kernels = Path(lv.__file__).parent, Path(lavender_ext.__file__).parent
-    for path in sorted([*package.rglob("*.py"), *kernels.glob("*.px[id]"), *kernels.glob("*.so")]):
+    for path in sorted([*package.rglob("*.py"), *kernels.rglob("*.px[id]"), *kernels.rglob("*.so")]):
         digest.update(path.name.encode())
         digest.update(path.read_bytes())
     return digest.hexdigest()[:12]

@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from lavender_ext.judge import all_finite
 
 from lavender.errors import InputError
+from lavender_ext.judge.measure import all_finite
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int32]

@@ -4,7 +4,7 @@ import importlib.util
 from pathlib import Path
 
 #: Every solve passes through the judge; where its module is there, the build has run to its end.
-MODULE = "lavender_ext.judge"
+MODULE = "lavender_ext.judge.measure"
 
 
 def check(module: str = MODULE) -> None:

@@ -22,14 +22,14 @@ from scipy.sparse.csgraph import reverse_cuthill_mckee
 from lavender._arrays import IntArray, as_array
 from lavender.errors import CapabilityError, InputError, UnknownName
 from lavender.problem import Problem
-from lavender_ext import orders as kernels
+from lavender_ext.core.order import body_colors, body_order_levels, graph_colors, stable_order
 
 __all__ = ["ENGINE_ORDERS", "ORDERS", "Order", "block_order", "body_ranks", "colors", "levels", "local_order"]
 
 # The engine makes its contacts in the order of its bodies; "local" is for problems from elsewhere.
 ENGINE_ORDERS = ("given", "reverse", "symmetric", "random", "colored", "bottom_up", "top_down")
 ORDERS = (*ENGINE_ORDERS, "local")
-# Modes of lavender_ext/order.pxd.
+# Modes of lavender_ext/core/order.pxd.
 _GIVEN, _SYMMETRIC, _RANDOM = 0, 1, 2
 
 
@@ -118,7 +118,7 @@ def _by_key(key: IntArray, split: int) -> tuple[IntArray, IntArray]:
     # Stable order by key within joints and within contacts; first place of each key, then k.
     parts, starts, base = [], [np.zeros(1, np.int32)], 0
     for part in (key[:split], key[split:]):
-        blocks, start = kernels.stable_order(np.ascontiguousarray(part, np.int32))
+        blocks, start = stable_order(np.ascontiguousarray(part, np.int32))
         parts.append(blocks + base)
         ends = start[1:] + base
         starts.append(ends[np.diff(start) > 0])
@@ -140,7 +140,7 @@ def levels(problem: Problem, ground: Any = None) -> IntArray:
             raise InputError(
                 "ground= is for problems given as a matrix; with rows the static bodies are known"
             )
-        return kernels.body_order_levels(_block_bodies(problem), problem.rows.n_bodies)
+        return body_order_levels(_block_bodies(problem), problem.rows.n_bodies)
     if ground is None:
         raise CapabilityError(
             "levels of a matrix need ground=: the blocks that touch the ground (with rows they are known)"
@@ -203,10 +203,10 @@ def colors(problem: Problem) -> IntArray:
     Blocks of one colour share no moving body (rows), or no entry of A (matrix).
     """
     if problem.rows is not None:
-        return kernels.body_colors(_block_bodies(problem), problem.rows.n_bodies)
+        return body_colors(_block_bodies(problem), problem.rows.n_bodies)
     graph = _block_graph(problem)
     k = problem.n_blocks
-    return kernels.graph_colors(
+    return graph_colors(
         np.arange(k + 1, dtype=np.int32),
         np.arange(k, dtype=np.int32),
         graph.indptr.astype(np.int32),

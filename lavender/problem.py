@@ -20,8 +20,10 @@ from lavender._arrays import FloatArray, as_array, check_not_negative, equal, re
 from lavender.cones import CONTACT_SPIN, ROW, Cones
 from lavender.errors import CapabilityError, InputError
 from lavender.rows import Rows
-from lavender_ext import assemble, judge, pivoting
-from lavender_ext import problem as kernels
+from lavender_ext.core import assemble
+from lavender_ext.core.problem import Data, dense_to_csr, rows_velocity
+from lavender_ext.judge import measure
+from lavender_ext.pivot import principal
 
 __all__ = ["LAWS", "OPERATORS", "Problem", "VelocityForm"]
 
@@ -240,7 +242,7 @@ class Problem:
         jv = np.zeros(m + 1)
         # b = target - J v*: the slack kernel with lambda = 0 and v = v* gives J v* - 0.
         blank = cls(np.zeros(m), cones, rows=rows, **more)
-        kernels.rows_velocity(blank.data, np.ascontiguousarray(rows.v_free), jv)
+        rows_velocity(blank.data, np.ascontiguousarray(rows.v_free), jv)
         return replace(blank, b=target - jv[:m], copy=False)
 
     # -- size and kind --------------------------------------------------------------------------
@@ -281,12 +283,12 @@ class Problem:
         if self.rows is None:
             return self._scan[:2]
         a = self.csr
-        return pivoting.bandwidth(a.indptr, a.indices)
+        return principal.bandwidth(a.indptr, a.indices)
 
     @cached_property
     def _scan(self) -> tuple[int, int, float, float]:
         a = self.csr
-        return pivoting.scan(a.indptr, a.indices, a.data)
+        return principal.scan(a.indptr, a.indices, a.data)
 
     @property
     def is_symmetric(self) -> bool:
@@ -296,7 +298,7 @@ class Problem:
     # -- derived, computed once ------------------------------------------------------------------
 
     @cached_property
-    def data(self) -> kernels.Data:
+    def data(self) -> Data:
         """What the kernels read: pointers, d, nu, sweep steps. Of the rows where there are rows."""
         if self.rows is None:
             return self.csr_data
@@ -317,14 +319,14 @@ class Problem:
         )
 
     @cached_property
-    def csr_data(self) -> kernels.Data:
+    def csr_data(self) -> Data:
         """The same over A in compressed rows; forms A where only rows are given."""
         a = self.csr
         return self._data(csr=(a.indptr, a.indices, a.data))
 
-    def _data(self, **operator: Any) -> kernels.Data:
+    def _data(self, **operator: Any) -> Data:
         c = self.cones
-        return kernels.Data(
+        return Data(
             c.ptr,
             c.kind,
             c.lower,
@@ -348,7 +350,7 @@ class Problem:
                 )
             indptr, indices, data = assemble.delassus(self.data, most, start, blocks)
         elif isinstance(self.matrix, np.ndarray):
-            indptr, indices, data = kernels.dense_to_csr(self.matrix)
+            indptr, indices, data = dense_to_csr(self.matrix)
         else:
             return self.matrix
         return sp.csr_array((data, indices, indptr), shape=(self.m, self.m))
@@ -385,7 +387,7 @@ class Problem:
     def slack(self, impulse: Any) -> FloatArray:
         """w = A lambda - b (m,) [m/s], recomputed from the problem's data."""
         w = np.empty(self.m)
-        judge.slack(self.data, self.impulse_array(impulse), w)
+        measure.slack(self.data, self.impulse_array(impulse), w)
         return w
 
     def velocity(self, impulse: Any) -> FloatArray:
@@ -396,7 +398,7 @@ class Problem:
                 "Problem.from_rows)"
             )
         v = np.zeros((self.rows.n_bodies, 6))
-        judge.velocity_change(self.data, self.impulse_array(impulse), v)
+        measure.velocity_change(self.data, self.impulse_array(impulse), v)
         return self.rows.v_free + v
 
     def start(self) -> FloatArray:
@@ -411,7 +413,7 @@ class Problem:
         """A writable private copy of `impulse`, checked: (m,) [N s], finite."""
         if type(impulse) is np.ndarray and impulse.dtype == np.float64 and impulse.shape == self.b.shape:
             own = impulse.copy()
-            if judge.all_finite(own):
+            if measure.all_finite(own):
                 return own
         return as_array(name, impulse, (self.m,), unit="N s").copy()
 

@@ -18,7 +18,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import scipy.sparse as sp
-from lavender_ext.pivoting import Pivoting, free_block
 
 from lavender._arrays import FloatArray
 from lavender.cones import Cones
@@ -26,6 +25,7 @@ from lavender.errors import CapabilityError, InputError, SolveFailed
 from lavender.problem import Problem
 from lavender.residuals import residual
 from lavender.solve import solve
+from lavender_ext.pivot.principal import Pivoting, free_block
 
 __all__ = ["Redundancy", "redundancy"]
 

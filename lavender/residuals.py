@@ -1,7 +1,7 @@
 """The one judge: how wrong an impulse is, in units, row by row. No solver decides success.
 
 With w = A lambda - b recomputed from the problem's data, d = diag(A) (`Problem.d`), e the error of a
-block (an inactive row: w / d, the step that is missing; formulas in `lavender_ext/block.pxd`):
+block (an inactive row: w / d, the step that is missing; formulas in `lavender_ext/core/block.pxd`):
 
     energy    E = sqrt(sum d e^2)                    [sqrt J]
     velocity  V = max sqrt(nu d) |e|                 [m/s]
@@ -26,7 +26,7 @@ from lavender._arrays import FloatArray, read_only
 from lavender.cones import CONTACT_SPIN, ROW
 from lavender.errors import InputError
 from lavender.problem import Problem
-from lavender_ext import judge as kernels
+from lavender_ext.judge import measure
 
 __all__ = ["Residual", "check_certificate", "natural_map", "qp_residual", "residual", "siconos_error"]
 
@@ -82,11 +82,11 @@ def reference(problem: Problem) -> tuple[float, float]:
         m = problem.m
         w, e = np.empty(m), np.empty(m)
         if problem._start.any():
-            energy, velocity, *_ = own = kernels.judge(data, problem._start, w, e, False)
+            energy, velocity, *_ = own = measure.judge(data, problem._start, w, e, False)
         else:  # the same numbers without a pass over A
-            energy, velocity, *_ = own = kernels.score(data, problem._start, np.negative(problem.b, out=w), e)
+            energy, velocity, *_ = own = measure.score(data, problem._start, np.negative(problem.b, out=w), e)
         # The norms of b: sqrt(sum b^2 / d), max |b| sqrt(nu / d), |b| the pair's norm on tangents.
-        rhs_energy, rhs_velocity = kernels.rhs_norms(data)
+        rhs_energy, rhs_velocity = measure.rhs_norms(data)
         if energy <= 2.0**-48 * rhs_energy:
             energy, velocity = rhs_energy, rhs_velocity
         # A size that overflows measures nothing: 0 makes every error beside it infinite.
@@ -95,15 +95,15 @@ def reference(problem: Problem) -> tuple[float, float]:
     return data.start_energy, data.start_velocity
 
 
-def judged(problem: Problem, impulse: FloatArray) -> kernels.Judged:
+def judged(problem: Problem, impulse: FloatArray) -> measure.Judged:
     """The judge's pass over an impulse (m,) [N s], which is kept as it is: it must not change any more."""
     data = problem.data
     if data.start_energy < 0.0:
         reference(problem)
-    return kernels.Judged(data, impulse)
+    return measure.Judged(data, impulse)
 
 
-def remember(problem: Problem, last: kernels.Judged) -> None:
+def remember(problem: Problem, last: measure.Judged) -> None:
     """Leave a result for the next `residual` of this problem, which takes it for the same impulse, bit for bit."""
     problem.__dict__["_judged"] = last
 
@@ -111,10 +111,10 @@ def remember(problem: Problem, last: kernels.Judged) -> None:
 def known(problem: Problem, impulse: FloatArray) -> float | None:
     """Relative residual of doing nothing, or of what `remember` was given, where `impulse` is that, bit for bit."""
     last = problem.__dict__.get("_judged")
-    if last is not None and kernels.same_bits(last.impulse, impulse):
+    if last is not None and measure.same_bits(last.impulse, impulse):
         return float(last.relative)
     start: float | None = problem.__dict__.get("_start_relative")
-    return start if start is not None and kernels.same_bits(problem._start, impulse) else None
+    return start if start is not None and measure.same_bits(problem._start, impulse) else None
 
 
 def quick(
@@ -122,7 +122,7 @@ def quick(
 ) -> tuple[float, float]:
     """(relative, floor) with w, e as scratch (m,): the solvers' own stopping test, the judge's arithmetic."""
     start_energy, start_velocity = reference(problem)
-    energy, velocity, _, floor_energy, floor_velocity, finite = kernels.judge(
+    energy, velocity, _, floor_energy, floor_velocity, finite = measure.judge(
         problem.data, impulse, w, e, floor
     )
     if not finite:
@@ -151,7 +151,7 @@ def residual(problem: Problem, impulse: Any) -> Residual:
     if impulse.shape != (problem.m,):
         raise InputError(f"impulse has shape {impulse.shape}; ({problem.m},) is needed")
     last = problem.__dict__.pop("_judged", None)
-    if last is None or not kernels.same_bits(last.impulse, impulse):
+    if last is None or not measure.same_bits(last.impulse, impulse):
         last = judged(problem, impulse)
     made: Residual = object.__new__(Residual)
     state = {

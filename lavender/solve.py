@@ -13,7 +13,6 @@ from time import perf_counter
 from typing import Any
 
 import numpy as np
-from lavender_ext.judge import all_finite
 
 from lavender._arrays import FloatArray, equal
 from lavender.cones import ROW
@@ -22,6 +21,7 @@ from lavender.problem import Problem
 from lavender.registry import SolverSpec, get
 from lavender.residuals import Residual, check_certificate, residual
 from lavender.solution import Claim, History, Solution, SolverRun, Status
+from lavender_ext.judge.measure import all_finite
 
 __all__ = ["Prepared", "prepare", "solve"]
 

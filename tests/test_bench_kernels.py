@@ -11,14 +11,14 @@ from click.testing import CliRunner
 import lavender as lv
 from lavender.bench import kernels
 from lavender.cli import cli
-from lavender_ext import limits
+from lavender_ext.bench import microbenchmarks
 
 
 @pytest.mark.parametrize("shuffle", [False, True])
 def test_the_bare_contact_sweep_is_sequential_impulses(shuffle):
     problem = kernels.lattice_pile(200, shuffle=shuffle)
     contacts, bodies = kernels.bare_contacts(problem)
-    limits.contact(contacts.view(np.uint8).reshape(-1), bodies.view(np.uint8).reshape(-1), 20)
+    microbenchmarks.contact(contacts.view(np.uint8).reshape(-1), bodies.view(np.uint8).reshape(-1), 20)
     impulse = lv.solve(problem, "sequential_impulses", tol=0.0, max_iter=20).impulse
     # The same sweep with I^-1 applied on the way: rounding of 20 sweeps.
     np.testing.assert_allclose(contacts["lam"].ravel(), impulse, rtol=0, atol=1e-12 * np.abs(impulse).max())
@@ -32,7 +32,7 @@ def test_the_bare_contact_sweep_is_sequential_impulses(shuffle):
 def test_the_bare_row_sweep_is_pgs():
     problem = kernels.tridiagonal(50)
     a, lam = problem.csr, problem.start()
-    limits.csr(a.indptr, a.indices, a.data, problem.b, problem.data.step.copy(), lam, 30)
+    microbenchmarks.csr(a.indptr, a.indices, a.data, problem.b, problem.data.step.copy(), lam, 30)
     impulse = lv.solve(problem, "pgs", tol=0.0, max_iter=30).impulse
     np.testing.assert_allclose(lam, impulse, rtol=0, atol=1e-13 * np.abs(impulse).max())
 

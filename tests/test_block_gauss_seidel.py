@@ -7,7 +7,7 @@ import pytest
 from random_problems import as_matrix, random_contact_problem
 
 import lavender as lv
-from lavender_ext import block_gs as kernels
+from lavender_ext.local import gauss_seidel
 
 COULOMB, CONE = 0, 1
 FAILED, OPEN, STICK, SLIP = -1, 0, 1, 2
@@ -50,7 +50,7 @@ def contacts(kind, seed, n=N, tangents=2, spin=False):
 
 def solve(law, w, q, mu, radius, tangents, spin):
     lam = np.zeros_like(q)
-    found = kernels.solve_contacts(law, tangents, spin, w, q, mu, radius, lam)
+    found = gauss_seidel.solve_contacts(law, tangents, spin, w, q, mu, radius, lam)
     return found, lam
 
 
@@ -228,7 +228,7 @@ def test_boxed_rows_against_enumeration(n):
     high = np.where(rng.random((cases, n)) < 0.3, np.inf, rng.uniform(0.0, 0.5, (cases, n)))
     lam = np.zeros((cases, n))
     step = np.ascontiguousarray(1.0 / np.einsum("nii->ni", w))
-    found = kernels.solve_boxed(w, np.ascontiguousarray(-b), step, low, high, lam)
+    found = gauss_seidel.solve_boxed(w, np.ascontiguousarray(-b), step, low, high, lam)
     assert np.all(found == 1)
     for i in range(cases):
         for at in itertools.product((-1, 0, 1), repeat=n):  # the one active set that fits

@@ -10,7 +10,7 @@ from random_problems import as_matrix, random_contact_problem, random_lcp, seeds
 
 import lavender as lv
 from lavender.residuals import check_certificate
-from lavender_ext import pivoting as kernels
+from lavender_ext.pivot import principal
 
 
 def accurate(solution):
@@ -83,7 +83,7 @@ def test_the_compiled_factorisation_solves_any_free_set(seed, m, band, bound):
     problem = lv.Problem.lcp(a, rng.normal(size=m))
     order = rng.permutation(m).astype(np.int32)
     for p, wide in ((np.arange(m, dtype=np.int32), max(problem.bandwidth)), (order, m - 1)):
-        rows = kernels.Pivoting(problem.csr_data, wide, p, 1e-13)
+        rows = principal.Pivoting(problem.csr_data, wide, p, 1e-13)
         rows.at[:] = [-((bound >> i) & 1) for i in range(m)]
         free = rows.at == 0
         rows.x[:] = 0.0
@@ -335,7 +335,7 @@ def test_a_band_without_free_rows_has_no_pivots(band):
         if band == 1
         else sp.csr_array(np.ones((m, m)))
     )
-    pivoting = kernels.Pivoting(lv.Problem.lcp(a, np.ones(m), 0.1, 0.1).csr_data, band, None, 1e-13)
+    pivoting = principal.Pivoting(lv.Problem.lcp(a, np.ones(m), 0.1, 0.1).csr_data, band, None, 1e-13)
     pivoting.x.base[:] = -1.0  # a pivot of -1 would be a negative one
     pivoting.at[:] = -1
     assert pivoting.factor() == (0, 0)

@@ -8,11 +8,11 @@ import pytest
 import lavender as lv
 from lavender.engine.layout import HEAD, SETTING
 from lavender.engine.state import State
-from lavender_ext import host
+from lavender_ext.host import memory
 
 C_TYPES = {"i4": ctypes.c_int32, "f8": ctypes.c_double, "3f8": 3 * ctypes.c_double, "p": ctypes.c_void_p}
 SETTINGS = np.dtype(
-    [(f, {"3f8": ("f8", 3)}.get(kind, kind)) for f, kind in host.STRUCTS["settings_t"].items()]
+    [(f, {"3f8": ("f8", 3)}.get(kind, kind)) for f, kind in memory.STRUCTS["settings_t"].items()]
 )
 
 
@@ -27,12 +27,12 @@ def running(name, steps=30, **parameters):
     return simulation
 
 
-@pytest.mark.parametrize("name", host.STRUCTS)
+@pytest.mark.parametrize("name", memory.STRUCTS)
 def test_structs_lie_as_the_compiler_lays_them(name):
     # ctypes follows the rules of this machine's C compiler by itself.
-    fields = [(field, C_TYPES[kind]) for field, kind in host.STRUCTS[name].items()]
+    fields = [(field, C_TYPES[kind]) for field, kind in memory.STRUCTS[name].items()]
     struct = type(name, (ctypes.Structure,), {"_fields_": fields})
-    size, offsets = host.layout()[name]
+    size, offsets = memory.layout()[name]
     assert size == ctypes.sizeof(struct)
     assert offsets == {field: getattr(struct, field).offset for field, _ in fields}
 
@@ -40,9 +40,9 @@ def test_structs_lie_as_the_compiler_lays_them(name):
 @pytest.mark.parametrize("name", ["stack", "chain", "spinner", "pile", "four_bar"])
 def test_arrays_lie_where_the_engine_has_them(name):
     state = State.of_scene(lv.Scene(name))
-    first = host.offsets(state.size)
+    first = memory.offsets(state.size)
     total = {"real": state.real, "index": state.index, "keys": state.keys}
-    for buffer, names in host.ARRAYS.items():
+    for buffer, names in memory.ARRAYS.items():
         starts = [first[n] for n in names]
         assert starts[0] == 0 and starts == sorted(starts)
         ends = [*starts[1:], len(total[buffer])]
@@ -53,14 +53,14 @@ def test_arrays_lie_where_the_engine_has_them(name):
                 if view.size:
                     assert np.shares_memory(view, total[buffer][start:end]), n
                     assert view.ctypes.data == total[buffer][start:].ctypes.data, n
-    named = {n for names in host.ARRAYS.values() for n in names}
+    named = {n for names in memory.ARRAYS.values() for n in names}
     assert set(state.a) <= named
 
 
 def test_settings_are_those_of_the_scene():
     scene = lv.Scene("stack", solver_iterations=24, warm_start=False, order="top_down", seed=7, slop=2e-3)
     state = State.of_scene(scene)
-    (found,) = np.frombuffer(host.read_settings(*buffers(state)), SETTINGS)
+    (found,) = np.frombuffer(memory.read_settings(*buffers(state)), SETTINGS)
     p = scene.parameters
     assert [found[k].item() for k in ("iterations", "warm_start", "position_iterations", "seed", "unused")] == [
         24, 0, p.position_iterations, 7, 0,
@@ -78,15 +78,15 @@ def test_settings_are_those_of_the_scene():
 def test_settings_read_and_written_change_nothing_else():
     simulation = running("pyramid", base=4)
     state, before = simulation._state, simulation.snapshot()
-    given = np.frombuffer(host.read_settings(*buffers(state)), SETTINGS).copy()
-    host.write_settings(*buffers(state), given)
+    given = np.frombuffer(memory.read_settings(*buffers(state)), SETTINGS).copy()
+    memory.write_settings(*buffers(state), given)
     assert state.real.tobytes() == before.real.tobytes()
     assert state.index.tobytes() == before.index.tobytes()
     for field in SETTINGS.names:
         if field != "unused":
             given[field] = given[field] * 2 + 3
-    host.write_settings(*buffers(state), given)
-    assert host.read_settings(*buffers(state)) == given.tobytes()
+    memory.write_settings(*buffers(state), given)
+    assert memory.read_settings(*buffers(state)) == given.tobytes()
     assert state.head[HEAD["pairs_valid"]] == 0  # another margin: the pair list no longer holds
     changed = np.flatnonzero(state.real != before.real)
     assert changed.max() < state.setting.size and SETTING["out"] > changed.max()
@@ -97,10 +97,10 @@ def test_room_is_made_as_the_simulation_makes_it():
     state = simulation._state
     assert state.kernel.prepare() == 1  # the first pair list does not fit
     expected = state.grown()
-    size = host.more_room(*buffers(state))
+    size = memory.more_room(*buffers(state))
     assert size.tolist() == expected.size.tolist() != state.size.tolist()
     moved = State(size)
-    host.move(*buffers(state), *buffers(moved))
+    memory.move(*buffers(state), *buffers(moved))
     assert moved.real.tobytes() == expected.real.tobytes()
     assert moved.index.tobytes() == expected.index.tobytes()
     assert moved.keys.tobytes() == expected.keys.tobytes()
@@ -112,7 +112,7 @@ def test_moving_while_running_keeps_the_motion():
     size = state.size.copy()
     size[8:] += 100
     moved = State(size)
-    host.move(*buffers(state), *buffers(moved))
+    memory.move(*buffers(state), *buffers(moved))
     simulation._state = moved
     for _ in range(30):
         a, b = simulation.step()[0], twin.step()[0]

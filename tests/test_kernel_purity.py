@@ -154,7 +154,7 @@ def test_a_breach_in_the_text_is_named(tmp_path, text, sign):
 
 
 def test_a_module_with_threads_is_exempt_by_name(tmp_path):
-    assert verdict(tmp_path, "sweeps_threads", IMPURE).exempt
+    assert verdict(tmp_path, "threaded", IMPURE).exempt
     assert not verdict(tmp_path, "sweeps", CLEAN).exempt
 
 

@@ -15,7 +15,7 @@ from lavender import suite
 from lavender.solvers import _ipm
 from lavender.solvers._ipm import AUGMENTED, CONVEX, InteriorPoint, make_system
 from lavender.solvers._polish import refined
-from lavender_ext import newton as kernels
+from lavender_ext.newton import newton
 
 
 def good(solution, tol):
@@ -233,15 +233,15 @@ def test_block_factor_on_a_graph_of_bodies_matches_dense(few, monkeypatch):
             k[i, b * s : b * s + s] = panel[i, 1]
     index = np.arange(m + 1, dtype=np.int32)
     zero = np.zeros(m)
-    elements = kernels.Elements(
+    elements = newton.Elements(
         index, np.zeros(m, np.int32), index, node, slot, panel.copy(), zero, zero.copy(),
         zero.copy(), zero + np.inf, zero.copy(), zero.copy(), s,
     )  # fmt: skip
-    structure = kernels.symbolic(nptr, nind)
+    structure = newton.symbolic(nptr, nind)
     v, x, y, out = rng.uniform(0.1, 10.0, m), rng.normal(size=m), np.zeros(n * s), np.zeros(m)
     expected = k @ np.linalg.solve(np.eye(n * s) + k.T @ (v[:, None] * k), k.T @ x)
     for unsymmetric in (False, True):
-        factor = kernels.Factor(nptr, nind, *structure, s, unsymmetric)
+        factor = newton.Factor(nptr, nind, *structure, s, unsymmetric)
         assert factor.factor(elements, v, unsymmetric) == 0
         factor.solve(elements, x, y, out)
         np.testing.assert_allclose(out, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
@@ -258,8 +258,8 @@ def test_a_chain_of_bodies_gets_the_pattern_of_any_graph(monkeypatch):
     body = np.ascontiguousarray(body, np.int32)
     monkeypatch.setattr(_ipm, "FEW_BODIES", 0)
     chain = _ipm.block_pattern(n, body)
-    assert kernels.chain_pattern(body, n) is not None
-    monkeypatch.setattr(kernels, "chain_pattern", lambda *_: None)
+    assert newton.chain_pattern(body, n) is not None
+    monkeypatch.setattr(newton, "chain_pattern", lambda *_: None)
     for one, other in zip(chain, _ipm.block_pattern(n, body), strict=True):
         assert np.array_equal(one, other)
 

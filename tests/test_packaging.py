@@ -18,7 +18,7 @@ import lavender_ext
 
 ROOT = Path(__file__).resolve().parent.parent
 KERNELS = Path(lavender_ext.__file__).parent
-MODULES = sorted(path.stem for path in KERNELS.glob("*.pyx"))
+MODULES = sorted(".".join(path.relative_to(KERNELS).with_suffix("").parts) for path in KERNELS.rglob("*.pyx"))
 
 
 def python(code):
@@ -35,9 +35,7 @@ def test_version_is_the_installed_one_and_in_the_changelog():
 def test_what_is_not_built_says_what_to_do(tmp_path):
     # A fresh clone hides an installed lavender from whoever starts Python in it. Without site-packages (-S), since
     # an editable installation finds its kernels even so.
-    kernels = tmp_path / "lavender_ext"
-    kernels.mkdir()
-    (kernels / "__init__.py").touch()
+    shutil.copytree(KERNELS, tmp_path / "lavender_ext", ignore=shutil.ignore_patterns("*.so", "*.pyd"))
     shutil.copytree(
         Path(lavender.__file__).parent, tmp_path / "lavender", ignore=shutil.ignore_patterns("*.wasm")
     )
@@ -85,7 +83,7 @@ def test_kernel_is_compiled_from_source_that_ships(name):
     spec = importlib.util.find_spec(f"lavender_ext.{name}")
     assert spec is not None
     assert spec.origin.endswith((".so", ".pyd"))
-    assert (KERNELS / f"{name}.pyx").exists()
+    assert (KERNELS / f"{name.replace('.', '/')}.pyx").exists()
 
 
 def test_import_is_light():

@@ -4,13 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from lavender_ext.sweeps_threads import Team
 from random_problems import random_contact_problem
 
 import lavender as lv
 from lavender.bench.kernels import lattice_pile
 from lavender.ordering import block_order, body_ranks
 from lavender.solvers import _layout, _sweeping
+from lavender_ext.sweep.threaded import Team
 
 ORDERS = ("reverse", "colored", "bottom_up", "top_down", "local")
 

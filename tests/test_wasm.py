@@ -195,12 +195,12 @@ def test_the_same_sources_give_the_same_bytes(tmp_path):
 
 
 def test_hash_covers_what_is_cimported():
-    # rows.pxd cimports nothing that the judge does not reach; newton.pyx is no part of the module.
-    with_rows = wasm.source_hash(ROOT, ["judge"])
-    assert with_rows != wasm.source_hash(ROOT, ["sweeps"]) != wasm.source_hash(ROOT)
+    # core/rows.pxd cimports nothing that the judge does not reach; newton.pyx is no part of the module.
+    with_rows = wasm.source_hash(ROOT, ["judge.measure"])
+    assert with_rows != wasm.source_hash(ROOT, ["sweep.serial"]) != wasm.source_hash(ROOT)
     assert wasm.CIMPORT.findall(
-        "from lavender_ext.rows cimport (a,\n  b)\nfrom libc.math cimport sqrt\n"
-    ) == ["rows"]
+        "from lavender_ext.core.rows cimport (a,\n  b)\nfrom libc.math cimport sqrt\n"
+    ) == ["core.rows"]
 
 
 # -- Node ------------------------------------------------------------------------------------------------------

@@ -1,7 +1,7 @@
 """Kernels, small calls and whole jobs: time, time per unit of work, bytes per unit, share of the machine's limit.
 
 Every case is timed beside its limit, in turns, as the least CPU time of many short batches (other programs only
-add time). The limit is measured in the same run (`lavender_ext/limits.pyx`, compiled with the kernels' flags):
+add time). The limit is measured in the same run (`lavender_ext/bench/`, compiled with the kernels' flags):
 
     bare     the same mathematics in a loop with nothing else around it
     stream   the bytes that a unit needs at the speed of the memory they fit in
@@ -38,7 +38,9 @@ from lavender.scene.scene import Scene
 from lavender.solve import Prepared, prepare, solve
 from lavender.suite import granular
 from lavender.suite.families import at_least
-from lavender_ext import assemble, judge, limits
+from lavender_ext.bench import microbenchmarks
+from lavender_ext.core import assemble
+from lavender_ext.judge import measure
 
 __all__ = [
     "CASES",
@@ -139,17 +141,22 @@ def measure_limits(seconds: float = 0.1) -> tuple[Limit, ...]:
         n = kib * 128
         x = np.arange(n, dtype=np.uint64)
         found.append(
-            Limit("read", kib, 8.0 * n / least(partial(limits.read, x, 1), seconds=seconds)[0] * 1e-9, "GB/s")
+            Limit(
+                "read",
+                kib,
+                8.0 * n / least(partial(microbenchmarks.read, x, 1), seconds=seconds)[0] * 1e-9,
+                "GB/s",
+            )
         )
         a, b, c = np.zeros(n // 3), np.ones(n // 3), np.ones(n // 3)
-        time = least(partial(limits.triad, a, b, c, 1), seconds=seconds)[0]
+        time = least(partial(microbenchmarks.triad, a, b, c, 1), seconds=seconds)[0]
         found.append(Limit("triad", kib, 24.0 * len(a) / time * 1e-9, "GB/s"))
         ring = np.random.default_rng(kib).permutation(kib * 16).astype(np.int32)  # one entry a cache line
         step = np.zeros(kib * 256, np.int32)
         step[16 * ring] = 16 * np.roll(ring, -1)
-        time = least(partial(limits.chase, step, 20_000), seconds=seconds)[0]
+        time = least(partial(microbenchmarks.chase, step, 20_000), seconds=seconds)[0]
         found.append(Limit("chase", kib, time / 20_000 * 1e9, "ns"))
-    time = least(partial(limits.chain, 0.5, 1.0, 20_000), seconds=seconds)[0]
+    time = least(partial(microbenchmarks.chain, 0.5, 1.0, 20_000), seconds=seconds)[0]
     return (*found, Limit("chain", 0, time / 20_000 * 1e9, "ns"))
 
 
@@ -232,10 +239,13 @@ def tridiagonal(m: int) -> Problem:
 
 
 def bare_contacts(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
-    """Contacts and bodies of `problem` (two tangents each, no joints) as the records of `limits.contact`."""
+    """Contacts and bodies of `problem` (two tangents each, no joints) as the records of `microbenchmarks.contact`."""
     rows, data = problem.rows, problem.data
     assert rows is not None
-    contacts, bodies = np.zeros(rows.n_contacts, limits.CONTACT), np.zeros(rows.n_bodies + 1, limits.BODY)
+    contacts, bodies = (
+        np.zeros(rows.n_contacts, microbenchmarks.CONTACT),
+        np.zeros(rows.n_bodies + 1, microbenchmarks.BODY),
+    )
     contacts["body"] = rows.contact_body + 1
     for name in ("normal", "tangent", "arm_a", "arm_b"):
         contacts[name] = getattr(rows, name)
@@ -298,8 +308,8 @@ def _impulses(contacts: int, seconds: float, shuffle: bool = False, **options: A
     ours, _, lam = _sweeps(problem, "sequential_impulses", n, **options)
     records, bodies = bare_contacts(problem)
     raw = _bytes(records), _bytes(bodies)
-    limits.contact(*raw, _ADD)
-    time, bare = least(ours, partial(limits.contact, *raw, n), seconds=seconds)
+    microbenchmarks.contact(*raw, _ADD)
+    time, bare = least(ours, partial(microbenchmarks.contact, *raw, n), seconds=seconds)
     label = "sequential impulses" + "".join(f", {v}" for v in options.values())
     return Row(
         label, f"{c} contacts" + (" shuffled" if shuffle else ""), "contact", c, time / n, contact_bytes(problem),
@@ -331,8 +341,8 @@ def _matrix(problem: Problem, size: str, name: str, seconds: float, bare: bool) 
     if bare:
         a, other = problem.csr, problem.start()
         arrays = (a.indptr, a.indices, a.data, problem.b, np.ascontiguousarray(problem.csr_data.step))
-        limits.csr(*arrays, other, _ADD)
-        calls.append(partial(limits.csr, *arrays, other, n))
+        microbenchmarks.csr(*arrays, other, _ADD)
+        calls.append(partial(microbenchmarks.csr, *arrays, other, n))
     times = least(*calls, seconds=seconds)
     per = csr_bytes(problem)
     limit = times[1] / n if bare else stream_time(per * nnz)
@@ -366,7 +376,7 @@ def _judge(contacts: int, seconds: float) -> Row:
     problem = lattice_pile(contacts)
     c, m = problem.n_blocks, problem.m
     lam, w, e = solve(problem, "sequential_impulses", tol=0.0, max_iter=8).impulse, np.empty(m), np.empty(m)
-    time = least(lambda: judge.judge(problem.data, lam, w, e, False), seconds=seconds)[0]
+    time = least(lambda: measure.judge(problem.data, lam, w, e, False), seconds=seconds)[0]
     per = contact_bytes(problem) - 6 * 24.0  # no swing
     return Row(
         "residual", f"{c} contacts", "contact", c, time, per, stream_time(per * c), "stream",
@@ -575,8 +585,8 @@ def scaling(
         n = _count(20 * c)
         ours, _, _ = _sweeps(problem, "sequential_impulses", n)
         raw = tuple(map(_bytes, bare_contacts(problem)))
-        limits.contact(*raw, _ADD)
-        sweep, bare = least(ours, partial(limits.contact, *raw, n), seconds=seconds)
+        microbenchmarks.contact(*raw, _ADD)
+        sweep, bare = least(ours, partial(microbenchmarks.contact, *raw, n), seconds=seconds)
         yield {
             "contacts": c, "build": build, "solve": took, "residual": solution.residual.relative,
             "sweep": 1e9 * sweep / n / c, "bare": 1e9 * bare / n / c, "megabytes": peak,
@@ -606,7 +616,7 @@ def counted(name: str) -> tuple[Callable[[], Any], float]:
     if name == "judge":
         problem = lattice_pile(1_000)
         lam, w, e = problem.start() + 0.01, np.empty(problem.m), np.empty(problem.m)
-        return lambda: judge.judge(problem.data, lam, w, e, False), float(problem.n_blocks)
+        return lambda: measure.judge(problem.data, lam, w, e, False), float(problem.n_blocks)
     solver = {"impulses": "sequential_impulses", "block": "block_gauss_seidel"}.get(
         name, name.partition("-")[0]
     )

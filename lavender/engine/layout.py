@@ -1,4 +1,4 @@
-"""Places of numbers in the engine's small arrays, as `lavender_ext/engine_types.pxd` numbers them."""
+"""Places of numbers in the engine's small arrays, as `lavender_ext/engine/arrays.pxd` numbers them."""
 
 SIZE = {
     "bodies": 0, "dynamic": 1, "joints": 2, "joint_rows": 3, "excluded": 4, "buckets": 5, "frames": 6,

@@ -17,7 +17,7 @@ import numpy as np
 
 from lavender.engine.layout import N_SIZES
 from lavender.errors import InputError
-from lavender_ext import engine as kernels
+from lavender_ext.engine import substep
 
 __all__ = ["Snapshot"]
 
@@ -88,7 +88,7 @@ class Snapshot:
                 arrays[name] = x.astype(x.dtype.newbyteorder("="))
             if end != len(body) or len(arrays["size"]) != N_SIZES or min(arrays["size"]) < 0:
                 raise ValueError("lengths")
-            used = kernels.lengths(arrays["size"])
+            used = substep.lengths(arrays["size"])
             if [max(n, 1) for n in used] != [max(n, 1) for n in header["lengths"][1:]]:
                 raise ValueError("lengths")
             return cls(

@@ -21,14 +21,14 @@ from lavender.engine.layout import (
 from lavender.errors import InputError
 from lavender.ordering import ENGINE_ORDERS
 from lavender.scene import Box, Plane, Scene, Sphere
-from lavender_ext import engine as kernels
-from lavender_ext import warm as kernels_warm
+from lavender_ext.engine import substep
+from lavender_ext.warm.start import Warm
 
 __all__ = ["ORDER_NUMBER", "State"]
 
 Copy = Callable[[], np.ndarray]
 
-# H_ORDER of lavender_ext/engine.pyx
+# H_ORDER of lavender_ext/engine/substep.pyx
 ORDER_NUMBER = {
     "given": 0,
     "reverse": 1,
@@ -70,25 +70,25 @@ class Seen(NamedTuple):
 
 
 class State:
-    """Three buffers with the arrays of `lavender_ext/engine_types.pxd` by name, as attributes of `a`."""
+    """Three buffers with the arrays of `lavender_ext/engine/arrays.pxd` by name, as attributes of `a`."""
 
     def __init__(self, size: np.ndarray) -> None:
         self.size = np.ascontiguousarray(size, np.int32)
-        used = kernels.lengths(self.size)
+        used = substep.lengths(self.size)
         if min(used) < 0:
             raise InputError("the scene needs more than 2^31 entries in one buffer; make it smaller")
         self.real = np.zeros(used[0])
         self.index = np.zeros(used[1], np.int32)
         self.keys = np.zeros(max(used[2], 1), np.uint64)
-        self.kernel = kernels.Buffers(self.size, self.real, self.index, self.keys)
+        self.kernel = substep.Buffers(self.size, self.real, self.index, self.keys)
         self.a: dict[str, np.ndarray] = self.kernel.arrays()
         self.head, self.setting = self.a["head"], self.a["setting"]
         self._seen: tuple[int, int, Seen] | None = None
 
     @cached_property
-    def warm(self) -> kernels_warm.Warm:
+    def warm(self) -> Warm:
         """The first phase of `newton` on these buffers."""
-        return kernels_warm.Warm(self.size, self.real, self.index, self.keys)
+        return Warm(self.size, self.real, self.index, self.keys)
 
     def seen(self, contacts: int, rows: int) -> Seen:
         """What to copy for an observation; kept while the numbers stay."""

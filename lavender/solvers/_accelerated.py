@@ -11,8 +11,10 @@ from lavender.ordering import Order
 from lavender.problem import Problem
 from lavender.solution import Claim
 from lavender.solvers._sweeping import Sweeping, SweepState, claim
-from lavender_ext import accelerate as kernels
-from lavender_ext import assemble, block_gs, judge
+from lavender_ext.accelerate import accelerated
+from lavender_ext.core import assemble
+from lavender_ext.judge import measure
+from lavender_ext.local import gauss_seidel
 
 SWEEPS = ("pgs", "blocks")
 LARGEST_MEMORY = 16
@@ -34,9 +36,9 @@ class AcceleratedState(SweepState):
     ) -> None:
         super().__init__(problem, data, order, PATIENCE)
         self.exact, self.convex = exact, convex
-        self.prepared = block_gs.prepare(data) if exact or convex else None
+        self.prepared = gauss_seidel.prepare(data) if exact or convex else None
         self.memory = memory
-        self.space = kernels.allocate(data, memory)
+        self.space = accelerated.allocate(data, memory)
         self.restarts = 0
 
 
@@ -81,8 +83,8 @@ class Accelerated(Sweeping):
         """n iterations, or fewer where a check ends them."""
         o, data = state.order, state.data
         if state.first and data.factored:
-            judge.velocity_change(data, impulse, state.space[-1])
-        status, done, sweeps, restarts = kernels.run(
+            measure.velocity_change(data, impulse, state.space[-1])
+        status, done, sweeps, restarts = accelerated.run(
             data, state.watch, impulse, n, tol, state.memory, state.prepared, state.exact, state.convex,
             state.space, o.blocks, o.split, o.mode, o.rng,
         )  # fmt: skip

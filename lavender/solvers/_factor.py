@@ -20,7 +20,7 @@ from scipy.linalg import lapack
 
 from lavender._arrays import FloatArray, IntArray
 from lavender.problem import Problem
-from lavender_ext import pivoting as kernels
+from lavender_ext.pivot import principal
 
 TINY = 1e-13  # -, of d
 SMALL_SIZE = 64  # rows up to which the compiled factorisation beats LAPACK behind SciPy
@@ -111,7 +111,7 @@ class SparseFactor:
         import qdldl
 
         a = self.csr
-        upper = kernels.free_block(a.indptr, a.indices, a.data, place, self.d, shift, n_free)
+        upper = principal.free_block(a.indptr, a.indices, a.data, place, self.d, shift, n_free)
         self.n = n_free
         if n_free == 0:
             return 0

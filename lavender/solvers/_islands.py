@@ -10,7 +10,7 @@ import numpy as np
 from lavender._arrays import FloatArray, IntArray
 from lavender.cones import Cones
 from lavender.problem import Problem
-from lavender_ext import graph as kernels
+from lavender_ext.factor import graph
 
 
 def islands(problem: Problem) -> tuple[int, IntArray]:
@@ -20,10 +20,10 @@ def islands(problem: Problem) -> tuple[int, IntArray]:
     """
     cones = problem.cones
     if problem.rows is not None:
-        return kernels.body_components(block_bodies(problem), problem.rows.n_bodies)
+        return graph.body_components(block_bodies(problem), problem.rows.n_bodies)
     block = np.repeat(np.arange(cones.n_blocks, dtype=np.int32), np.diff(cones.ptr))
     a = problem.csr
-    return kernels.matrix_components(cones.ptr, block, a.indptr, a.indices)
+    return graph.matrix_components(cones.ptr, block, a.indptr, a.indices)
 
 
 def block_bodies(problem: Problem) -> IntArray:

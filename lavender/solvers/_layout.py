@@ -10,11 +10,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from lavender_ext.problem import Data
 
 from lavender._arrays import FloatArray, IntArray
 from lavender.ordering import Order, body_ranks
 from lavender.problem import FRICTION, Problem
+from lavender_ext.core.problem import Data
 
 __all__ = ["Layout", "lay_out"]
 
@@ -27,7 +27,7 @@ LARGE = 8_000
 class Layout:
     """The problem in sweep order, and where its rows came from."""
 
-    data: Any  # lavender_ext.problem.Data
+    data: Any  # lavender_ext.core.problem.Data
     rows: np.ndarray  # (m,) intp, row of the problem at each place
     place: np.ndarray  # (m,) intp, place of each row
     rank: IntArray  # (n,) place of each body

@@ -1,4 +1,4 @@
-"""Principal pivoting with any factorisation: the loop of `lavender_ext/pivoting.pyx`, step by step in Python.
+"""Principal pivoting with any factorisation: the loop of `lavender_ext/pivot/principal.pyx`, step by step in Python.
 
 Where the compiled factorisation serves, the whole loop runs there; with LAPACK or QDLDL each step is one
 call into the same compiled code.
@@ -9,14 +9,14 @@ from __future__ import annotations
 from time import perf_counter
 
 import numpy as np
-from lavender_ext.pivoting import Pivoting
 from scipy.linalg import lapack
 
 from lavender._arrays import FloatArray, IntArray
 from lavender.problem import Problem
 from lavender.solvers._factor import TINY, DenseFactor, Factor, SparseFactor, choose
+from lavender_ext.pivot.principal import Pivoting
 
-SOLVED, ROUNDS, SMALL, INDEFINITE, STUCK = range(5)  # outcomes, as in lavender_ext/pivoting.pyx
+SOLVED, ROUNDS, SMALL, INDEFINITE, STUCK = range(5)  # outcomes, as in lavender_ext/pivot/principal.pyx
 SLOP = 8.0  # roundings of w within which a sign means nothing, as there
 
 

@@ -1,6 +1,6 @@
 """What every sweep solver shares: an order, a count of sweeps, and checks at counts that the numbers set.
 
-The checks are in `lavender_ext/watch.pxd`: the judge's arithmetic, half way to the expected end each time.
+The checks are in `lavender_ext/judge/watch.pxd`: the judge's arithmetic, half way to the expected end each time.
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-from lavender_ext.watch import Watch
 
 from lavender._arrays import FloatArray
 from lavender.errors import InputError
@@ -19,8 +18,8 @@ from lavender.ordering import Order, block_order
 from lavender.problem import Problem
 from lavender.residuals import reference
 from lavender.solution import Claim, Status
-from lavender_ext import sweeps as kernels
-from lavender_ext import sweeps_threads as threaded
+from lavender_ext.judge.watch import Watch
+from lavender_ext.sweep import serial, threaded
 
 _STATUS = (Status.MAX_ITERATIONS, Status.CONVERGED, Status.DIVERGED, Status.STALLED, Status.FLOOR)
 # Multiply-adds per colour from which a second thread gains (measured: where both take the same time).
@@ -38,7 +37,7 @@ class SweepState:
 
     def __init__(self, problem: Problem, data: Any, order: Order, patience: int = PATIENCE) -> None:
         self.problem = problem
-        self.data = data  # lavender_ext.problem.Data that the kernel sweeps over, and that checks read
+        self.data = data  # lavender_ext.core.problem.Data that the kernel sweeps over, and that checks read
         self.order = self.plan = order  # `plan` is of the problem's own blocks
         start = reference(problem)
         if data is not problem.data:
@@ -72,12 +71,12 @@ def run_kernel(
     scratch: FloatArray | None = None,
     packing: Any = None,
 ) -> Claim:
-    """n sweeps in one call of `lavender_ext.sweeps.run`, or fewer where a check ends them; tol = 0 checks nothing."""
+    """n sweeps in one call of `serial.run`, or fewer where a check ends them; tol = 0 checks nothing."""
     o = state.order
     # The same bits with or without an order array; without one the kernel skips two look-ups a row.
-    blocks = _ROW_BY_ROW if kind == kernels.PGS and state.data.single_rows and o.is_given else o.blocks
+    blocks = _ROW_BY_ROW if kind == serial.PGS and state.data.single_rows and o.is_given else o.blocks
     return claim(
-        *kernels.run(
+        *serial.run(
             kind, state.data, state.watch, impulse, n, tol, blocks, o.split, o.mode, o.rng, omega, scratch, packing,
         )
     )  # fmt: skip

@@ -1,6 +1,6 @@
 """The first phase of `newton` from a warm start: judge it, a few sweeps, few Newton steps; or free joints at once.
 
-The step of a simulation at rest, or of a chain, ends here. `lavender_ext/warm.pxd` and `warm_newton.pxd` have the
+The step of a simulation at rest, or of a chain, ends here. `lavender_ext/warm/start.pxd` and `active_set.pxd` have the
 equations; what is not within tol after it goes on from the start it came with.
 """
 
@@ -11,12 +11,12 @@ import numpy as np
 from lavender._arrays import FloatArray
 from lavender.problem import Problem
 from lavender.solution import Claim, Status
-from lavender_ext import warm as kernels
+from lavender_ext.warm.start import from_guess, limits
 
-#: How it ended, by number of lavender_ext/warm.pxd: None where nothing was decided.
+#: How it ended, by number of lavender_ext/warm/start.pxd: None where nothing was decided.
 ENDED = (None, "as it came", "warm sweeps", "joints solved directly", "warm sweeps, Newton steps over bodies")
 
-MOST_SWEEPS, MOST_STEPS = kernels.limits()  # sweeps and factorisations that the first phase may cost
+MOST_SWEEPS, MOST_STEPS = limits()  # sweeps and factorisations that the first phase may cost
 TRIED = "_warm_tried"  # in a problem's __dict__: tol at which its guess was tried in vain, and what that cost
 
 
@@ -46,7 +46,7 @@ def solve_warm(
         or problem.guess is None
         or not np.array_equal(impulse, problem.guess)
     ):
-        tried = (tol, *kernels.from_guess(problem.data, impulse, tol))
+        tried = (tol, *from_guess(problem.data, impulse, tol))
     _, how, sweeps, factorisations = tried
     return warm_claim(how, sweeps, factorisations), sweeps, factorisations
 

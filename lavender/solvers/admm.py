@@ -3,7 +3,7 @@
     z = Pi_K(u),  y = rho (u - z),  (B + rho) x = c - s + rho z - y,  u <- u + alpha (x - z), then mixed
 
 in the metric of d: B = D^-1/2 A D^-1/2, c = D^-1/2 b, K the bounds and cones of all blocks at once, s De
-Saxce's shift of Coulomb's law (`lavender_ext/admm.pyx`). One triangular solve an iteration instead of a
+Saxce's shift of Coulomb's law (`lavender_ext/accelerate/admm.pyx`). One triangular solve an iteration instead of a
 sweep, so mass ratios and long chains cost factorisations (rho is weighed ever more rarely), not sweeps.
 Friction starts from the convex answer.
 Cholesky of a dense A, L D L^T of a sparse one or, where rows have fewer body unknowns than rows, of the
@@ -27,8 +27,8 @@ from lavender.residuals import reference
 from lavender.solution import Claim, Status
 from lavender.solvers._accelerated import LARGEST_MEMORY
 from lavender.solvers._sweeping import claim
-from lavender_ext import admm as kernels
-from lavender_ext import watch
+from lavender_ext.accelerate import admm
+from lavender_ext.judge import watch
 
 _DENSE, _SYMMETRIC, _GENERAL, _BODIES = 0, 1, 2, 3
 _DENSE_ABOVE = 0.15  # share of nonzeros from which LAPACK on the full matrix is the faster factorisation
@@ -50,7 +50,7 @@ class AdmmState:
         self.watch = watch.Watch(problem.data, _PATIENCE)
         self.root = np.sqrt(problem.d)
         self.c = problem.b / self.root
-        self.space = kernels.allocate(self.data, memory)
+        self.space = admm.allocate(self.data, memory)
         self.rho = _START_RHO
         self.undone = 0
         self.factorisations = self.reported = 0  # all, and those that an earlier run has told
@@ -172,12 +172,12 @@ class ADMM:
         data = state.data
         if state.watch.total == 0 and len(impulse):
             # y of the start: minus its slack, shifted; at a solution the first iteration stays there.
-            kernels.start(data, impulse, state.problem.slack(impulse), state.root, state.rho, state.space)
+            admm.start(data, impulse, state.problem.slack(impulse), state.root, state.rho, state.space)
         undone, message = state.undone, ""
 
         def iterate(count: int, first: bool) -> None:
             while count:
-                done, rho, state.undone = kernels.run(
+                done, rho, state.undone = admm.run(
                     data, impulse, count, state.rho, self.relaxation, self.memory, state.space, state.root,
                     state.c, state.factor,
                 )  # fmt: skip

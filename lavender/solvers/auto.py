@@ -32,7 +32,7 @@ from lavender.registry import SolverSpec, get
 from lavender.residuals import check_certificate, known, quick, reference
 from lavender.solution import Claim, Status
 from lavender.solvers._islands import block_bodies, islands, restrict, rows_of
-from lavender_ext import graph as kernels
+from lavender_ext.factor import graph
 
 NARROW = 12  # half-bandwidth up to which a band factorisation costs less than anything else
 FEW = 64  # rows up to which a dense factorisation does
@@ -453,7 +453,7 @@ def _bandwidth(problem: Problem) -> int:
         return max(problem.bandwidth)
     spread: int | None = problem.__dict__.get("_spread")
     if spread is None:
-        spread = kernels.body_spread(problem.cones.ptr, block_bodies(problem), problem.rows.n_bodies)
+        spread = graph.body_spread(problem.cones.ptr, block_bodies(problem), problem.rows.n_bodies)
         problem.__dict__["_spread"] = spread
     return spread
 

@@ -3,7 +3,7 @@
     find lam_i:   w_i = A_ii lam_i + q_i complementary to lam_i,   q_i = sum_{j != i} A_ij lam_j - b_i
 
 A contact is open, sticks, or slips in the direction that a scalar Newton iteration finds
-(`lavender_ext/local.pxd`); the rows of a joint are a small boxed problem, solved by pivoting. Normal and
+(`lavender_ext/local/exact.pxd`); the rows of a joint are a small boxed problem, solved by pivoting. Normal and
 friction of one contact no longer wait for each other as in `pgs`; contacts still do. Works on the rows of
 A, or on body velocities where the problem has rows. `work["fallbacks"]` counts blocks without an exact
 answer that were relaxed instead.
@@ -22,8 +22,8 @@ from lavender.problem import Problem
 from lavender.registry import SolverSpec
 from lavender.solution import Claim
 from lavender.solvers._sweeping import Sweeping, SweepState, claim
-from lavender_ext import block_gs as kernels
-from lavender_ext import judge
+from lavender_ext.judge import measure
+from lavender_ext.local import gauss_seidel
 
 
 class BlockState(SweepState):
@@ -33,7 +33,7 @@ class BlockState(SweepState):
 
     def __init__(self, problem: Problem, data: Any, order: Order) -> None:
         super().__init__(problem, data, order)
-        self.prepared = kernels.prepare(data)
+        self.prepared = gauss_seidel.prepare(data)
 
 
 @dataclass(frozen=True)
@@ -50,8 +50,8 @@ class BlockGaussSeidel(Sweeping):
         if state.velocity is None:
             state.velocity = np.zeros((data.n_bodies + 1, 6))
             if data.factored:
-                judge.velocity_change(data, impulse, state.velocity)
-        status, done, fallbacks = kernels.run(
+                measure.velocity_change(data, impulse, state.velocity)
+        status, done, fallbacks = gauss_seidel.run(
             data,
             state.watch,
             impulse,

@@ -3,7 +3,7 @@
     linear   A lambda = b by band, dense or sparse factorisation, then lambda <- lambda - A^-1 w (refinement)
     boxed    w = A lambda - b complementary to lower <= lambda <= upper: guess which rows are free (all of a
              narrow band, else those that a few sweeps leave free), solve them, exchange the rows of the
-             wrong sign, repeat (`lavender_ext/pivoting.pyx`)
+             wrong sign, repeat (`lavender_ext/pivot/principal.pyx`)
     singular the same on A + s D, s = 1e-10, around the last answer c: (A + s D) lambda = b + s D c. A fixed
              point solves A itself (proximal point method); on the rows it settles on, each pass is one
              refinement that shrinks what A sees by s / (s + sigma). On a problem without a solution the
@@ -29,7 +29,7 @@ from lavender.residuals import check_certificate, judged, remember
 from lavender.solution import Claim, Status
 from lavender.solvers._factor import GeneralFactor
 from lavender.solvers._pivoting import INDEFINITE, ROUNDS, SMALL, SOLVED, STUCK, PivotState
-from lavender_ext import judge
+from lavender_ext.judge import measure
 
 # -, s: the last is far above the rounding of a factorisation and below what a mass ratio of 1e8 leaves.
 PATH = (1e-2, 1e-4, 1e-6, 1e-8, 1e-10)
@@ -101,7 +101,7 @@ class _Run:
     ) -> None:
         self.state, self.problem, self.impulse, self.budget, self.tol = state, state.problem, impulse, n, tol
         self.stop_at = None if time_limit is None else perf_counter() + time_limit
-        self.kept: judge.Judged | None = None
+        self.kept: measure.Judged | None = None
         self.best, self.floor, self.last = np.inf, 0.0, np.inf
         self.iterations = 0
         self.work: dict[str, int] = {}
@@ -170,7 +170,7 @@ class _Run:
         w = np.empty(problem.m)
         previous = np.inf
         for k in range(8):
-            judge.slack(problem.csr_data, x, w)
+            measure.slack(problem.csr_data, x, w)
             x = x - factor.solve(w)
             relative = self.judge(x)
             self.work["refinements"] = k
@@ -179,7 +179,7 @@ class _Run:
             previous = relative
         if not self.good() and singular:
             # What least squares in the metric of D leaves of b is orthogonal to the range of A.
-            judge.slack(problem.csr_data, x, w)
+            measure.slack(problem.csr_data, x, w)
             proof = self.certificate(-w / problem.csr_data.d) or self.certificate(factor.outside(problem.b))
             if proof is not None:
                 return proof

@@ -20,7 +20,7 @@ from lavender.problem import Problem
 from lavender.registry import SolverSpec
 from lavender.solution import Claim
 from lavender.solvers._sweeping import SweepState, run_kernel
-from lavender_ext import sweeps as kernels
+from lavender_ext.sweep import serial
 
 
 class JacobiState(SweepState):
@@ -59,7 +59,7 @@ class Jacobi:
     def run(
         self, state: JacobiState, impulse: FloatArray, n: int, tol: float, time_limit: float | None = None
     ) -> Claim:
-        return run_kernel(state, impulse, n, tol, kernels.JACOBI, state.omega, state.scratch)
+        return run_kernel(state, impulse, n, tol, serial.JACOBI, state.omega, state.scratch)
 
 
 def safe_damping(problem: Problem) -> float:

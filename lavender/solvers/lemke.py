@@ -23,7 +23,6 @@ from time import perf_counter
 
 import numpy as np
 import numpy.typing as npt
-from lavender_ext.tableau import Dictionary
 from scipy.linalg import lapack
 
 from lavender._arrays import FloatArray, IntArray
@@ -31,7 +30,8 @@ from lavender.problem import Problem
 from lavender.registry import SolverSpec
 from lavender.residuals import check_certificate, quick
 from lavender.solution import Claim, Status
-from lavender_ext import judge
+from lavender_ext.judge import measure
+from lavender_ext.pivot.tableau import Dictionary
 
 LIMIT = 2000  # rows: a dictionary of 32 MB
 # -, entries of a column this much below its largest are not pivoted on; the finer one for a second path, on
@@ -43,7 +43,7 @@ BATCH = 200  # pivots between two looks at the clock; then the dictionary is for
 PATHS = 8  # covering vectors tried
 PIVOTS_A_ROW = 20  # on one path, before it counts as lost
 GOOD = 1e-12  # relative residual at which no other path is tried
-DONE, PIVOTS, RAY = range(3)  # as in lavender_ext/tableau.pyx
+DONE, PIVOTS, RAY = range(3)  # as in lavender_ext/pivot/tableau.pyx
 
 
 Places = npt.NDArray[np.intp]
@@ -352,7 +352,7 @@ class _Run:
             x[free] = self.impulse[free]
         w, previous = np.empty(problem.m), np.inf
         for _ in range(6):
-            judge.slack(problem.csr_data, x, w)
+            measure.slack(problem.csr_data, x, w)
             rhs = scale * w[free]
             step = np.linalg.lstsq(a, rhs, rcond=1e-13)[0] if singular else lapack.dgetrs(lu, pivot, rhs)[0]
             x[free] -= scale * step

@@ -4,7 +4,7 @@
     contact   lambda_n <- max(0, lambda_n - w_n / d_n), then the tangents together with one scalar step
               1 / lambda_max(A_tt) projected radially on mu lambda_n, then spin
 
-Linear convergence for symmetric positive semidefinite A; the update is that of `lavender_ext/block.pxd`.
+Linear convergence for symmetric positive semidefinite A; the update is that of `lavender_ext/core/block.pxd`.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from lavender._arrays import FloatArray
 from lavender.registry import SolverSpec
 from lavender.solution import Claim
 from lavender.solvers._sweeping import SweepState, Threaded, run_kernel, run_threads
-from lavender_ext import sweeps as kernels
+from lavender_ext.sweep import serial
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class PGS(Threaded):
     ) -> Claim:
         if self.uses_threads(state):
             return run_threads(state, impulse, n, tol, self.threads)
-        return run_kernel(state, impulse, n, tol, kernels.PGS)
+        return run_kernel(state, impulse, n, tol, serial.PGS)
 
 
 SPEC = SolverSpec(

@@ -1,11 +1,11 @@
 """Sequential impulses: projected Gauss-Seidel on body velocities, A never formed.
 
-    w_i = J_i v - b_i + c_i lambda_i,   lambda_i <- update of `lavender_ext/block.pxd`,
+    w_i = J_i v - b_i + c_i lambda_i,   lambda_i <- update of `lavender_ext/core/block.pxd`,
     v <- v + M^-1 J_i^T (change of lambda_i)
 
 with v = M^-1 J^T lambda, the change of velocity. Equal to `pgs` on the same order, sweep by sweep, to
 rounding; a contact costs the same whatever the number of its neighbours. In a fixed order contacts of two
-tangents are swept in pairs, with the same bits (`lavender_ext/packed.pxd`).
+tangents are swept in pairs, with the same bits (`lavender_ext/sweep/packed.pxd`).
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from lavender.solution import Claim
 from lavender.solvers._layout import Layout, lay_out
 from lavender.solvers._layout import pays as layout_pays
 from lavender.solvers._sweeping import SweepState, Threaded, run_kernel, run_threads
-from lavender_ext import judge
-from lavender_ext import sweeps as kernels
+from lavender_ext.judge import measure
+from lavender_ext.sweep import serial
 
 
 class ImpulseState(SweepState):
@@ -37,7 +37,7 @@ class ImpulseState(SweepState):
     velocity: FloatArray | None = None
     laid: FloatArray | None = None  # (m,) impulse in sweep order, as the last run left it
     layout: Layout | None
-    packing: Any  # lavender_ext.sweeps.Packing, or None
+    packing: Any  # lavender_ext.sweep.serial.Packing, or None
 
     def __init__(self, problem: Problem, order: Order, before: ImpulseState | None) -> None:
         layout, packing = (None, None) if before is None else (before.layout, before.packing)
@@ -48,8 +48,8 @@ class ImpulseState(SweepState):
             laid = replace(order, blocks=np.arange(problem.n_blocks, dtype=np.int32))
             super().__init__(problem, self.layout.data, laid)
             self.plan = order
-        packs = order.is_fixed and kernels.may_pack(self.data, self.order.blocks)
-        self.packing = kernels.Packing(self.data, packing) if packs else None
+        packs = order.is_fixed and serial.may_pack(self.data, self.order.blocks)
+        self.packing = serial.Packing(self.data, packing) if packs else None
 
     @property
     def best(self) -> tuple[float, FloatArray | None]:
@@ -80,12 +80,12 @@ class SequentialImpulses(Threaded):
             lam = state.laid
         if state.velocity is None:
             state.velocity = np.zeros((state.data.n_bodies + 2, 6))
-            judge.velocity_change(state.data, lam, state.velocity)
+            measure.velocity_change(state.data, lam, state.velocity)
         velocity = state.velocity.ravel()
         if self.uses_threads(state):
             claim = run_threads(state, lam, n, tol, self.threads, velocity)
         else:
-            claim = run_kernel(state, lam, n, tol, kernels.IMPULSES, scratch=velocity, packing=state.packing)
+            claim = run_kernel(state, lam, n, tol, serial.IMPULSES, scratch=velocity, packing=state.packing)
         if state.layout is not None:
             state.layout.put(lam, impulse)
         return claim

@@ -12,7 +12,7 @@ from lavender.errors import InputError
 from lavender.registry import SolverSpec
 from lavender.solution import Claim
 from lavender.solvers._sweeping import Sweeping, SweepState, run_kernel
-from lavender_ext import sweeps as kernels
+from lavender_ext.sweep import serial
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class SOR(Sweeping):
     def run(
         self, state: SweepState, impulse: FloatArray, n: int, tol: float, time_limit: float | None = None
     ) -> Claim:
-        return run_kernel(state, impulse, n, tol, kernels.SOR, self.omega)
+        return run_kernel(state, impulse, n, tol, serial.SOR, self.omega)
 
 
 SPEC = SolverSpec(

@@ -40,10 +40,10 @@ from pathlib import Path
 __all__ = ["LARGEST", "MODULES", "BuildFailed", "Built", "build", "read_module", "source_hash", "why_not"]
 
 #: Modules of lavender_ext that the page and the checks use.
-MODULES = ("engine", "host", "judge", "orders", "problem", "sweeps")
+MODULES = ("core.order", "core.problem", "engine.substep", "host.memory", "judge.measure", "sweep.serial")
 #: Largest size of the finished module [bytes].
 LARGEST = 200_000
-CIMPORT = re.compile(r"^from lavender_ext\.(\w+) cimport", re.MULTILINE)
+CIMPORT = re.compile(r"^from lavender_ext\.([\w.]+) cimport", re.MULTILINE)
 #: Name of the custom section with the hash of the sources.
 SECTION = "lavender.sources"
 #: What the host needs beside the functions: where free memory begins, and the proof that no data is left.
@@ -121,7 +121,6 @@ def core_functions(text: str) -> list[str]:
 
 def source_hash(root: Path, modules: Iterable[str | Path] = MODULES) -> str:
     """Hash of everything that a build of these modules reads of lavender_ext; arguments as for `build`."""
-    folder = root / "lavender_ext"
     open_, seen = _paths(root, modules), set()
     while open_:
         path = open_.pop()
@@ -129,15 +128,19 @@ def source_hash(root: Path, modules: Iterable[str | Path] = MODULES) -> str:
             continue
         seen.add(path)
         text = path.read_text(encoding="utf-8")
-        open_ += [folder / f"{name}.pxd" for name in {path.stem, *CIMPORT.findall(text)}]
+        open_ += [path.with_suffix(".pxd"), *(_path(root, name, ".pxd") for name in CIMPORT.findall(text))]
     found = hashlib.sha256()
-    for path in sorted({*seen, folder / "build_options.py"}):
+    for path in sorted({*seen, _path(root, "build_options", ".py")}):
         found.update(path.name.encode() + b"\0" + path.read_text(encoding="utf-8").encode() + b"\0")
     return found.hexdigest()
 
 
+def _path(root: Path, name: str, suffix: str) -> Path:
+    return root.joinpath("lavender_ext", *name.split(".")).with_suffix(suffix)
+
+
 def _paths(root: Path, modules: Iterable[str | Path]) -> list[Path]:
-    return [m if isinstance(m, Path) else root / "lavender_ext" / f"{m}.pyx" for m in modules]
+    return [m if isinstance(m, Path) else _path(root, m, ".pyx") for m in modules]
 
 
 def build(
@@ -152,7 +155,7 @@ def build(
     root : Path
         Folder that holds the package lavender_ext with its sources.
     modules : iterable of str or Path
-        Names in lavender_ext, or paths of .pyx files.
+        Names in lavender_ext, as `judge.measure`, or paths of .pyx files.
     include : Path, optional
         CPython's headers; None: those of this interpreter.
 
@@ -190,7 +193,8 @@ def build(
         ]
 
         def compile_one(path: Path) -> Path:
-            source, target = work / f"{path.stem}.c", work / f"{path.stem}.o"
+            name = f"{path.parent.name}-{path.stem}"
+            source, target = work / f"{name}.c", work / f"{name}.o"
             _run([sys.executable, "-m", "cython", *directives, str(path), "-o", str(source)], root)
             _run([*compiler, *flags, "-c", str(source), "-o", str(target)], root)
             return target

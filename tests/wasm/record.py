@@ -19,7 +19,7 @@ from random_problems import as_matrix, random_contact_problem, random_lcp
 import lavender as lv
 from lavender.ordering import block_order
 from lavender.web.scenes import describe, layout
-from lavender_ext import host
+from lavender_ext.host import memory
 
 STEPS = 600
 BODY_ARRAYS = ("x", "q", "v")
@@ -85,7 +85,7 @@ def record_scene(writer, name, parameters, changes, steps=STEPS):
         "changes": {str(step): change for step, change in changes.items()},
         **describe(start),
         "settings": list(
-            host.read_settings(start.size, start.real.copy(), start.index.copy(), start.keys.copy())
+            memory.read_settings(start.size, start.real.copy(), start.index.copy(), start.keys.copy())
         ),
         "states": writer.put(states, "<f8"),
         "values": writer.put(values, "<f8"),

@@ -3,7 +3,7 @@
 // The module has no imports and no allocator: whatever it works on lies where this file puts it. Where the
 // fields of a struct lie is computed here by C's rules, asked of the module, and the two are compared.
 
-const SIZES = 10; // entries of size[], see engine_types.pxd
+const SIZES = 10; // entries of size[], see lavender_ext/engine/arrays.pxd
 const MOST_SWEEPS = 64;
 const OK = 0;
 const NEED_ROOM = 1;

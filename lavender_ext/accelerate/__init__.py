@@ -1,0 +1,1 @@
+"""Fixed-point iterations that remember: Anderson mixing, accelerated sweeps, proximal splitting."""

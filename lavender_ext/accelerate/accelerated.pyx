@@ -1,0 +1,270 @@
+"""Sweeps of Gauss-Seidel type, accelerated: one sweep y = S(x) is the map, g = x - y its step.
+
+    nncg      x_k = y_{k-1} + beta_{k-1} p_{k-2},  y_k = S(x_k),  g_k = x_k - y_k,                    (1)
+              beta_k = g_k.D g_k / g_{k-1}.D g_{k-1},  p_k = beta_k p_{k-1} - g_k  (p_k = -g_k where beta_k > 1)
+    anderson  x_k = Pi(y - sum_i gamma_i (y_i+1 - y_i)),  gamma least squares of f = sum_i gamma_i (f_i+1 - f_i),
+              f = D^1/2 (y - x), over the last `memory` sweeps                                        (2)
+
+D = diag d, so that both work in energy. S is a sweep of pgs or of exact blocks (local/gauss_seidel.pxd), over A in
+compressed rows or over the factored form with v = M^-1 J^T lam; with the symmetric order a sweep and the
+same sweep backwards. An iterate that is shown is always a swept one, y. All sums run in a fixed order.
+
+(2) and its safeguards are those of accelerate/mixing.pxd. The first `convex` iterations may sweep under the cone law:
+where contacts stick, its answer is Coulomb's.
+"""
+from libc.math cimport fabs, sqrt
+from libc.stdint cimport int32_t, uint64_t
+
+import numpy as np
+
+from lavender_ext.accelerate.mixing cimport CONTROL, MAX_MEMORY, UNDONE, forget, mix, mixing_t, take
+from lavender_ext.core.block cimport CONE, CONTACT_SPIN, ROW, blocks_t, clip, n_tangents, norm2
+from lavender_ext.core.csr cimport csr_t
+from lavender_ext.core.order cimport SYMMETRIC, advance_order
+from lavender_ext.core.problem cimport Data
+from lavender_ext.core.rows cimport contact_push, joint_push, relax_rows_block, rows_t
+from lavender_ext.judge.watch cimport CONVERGED, RUNNING, Watch
+from lavender_ext.local.gauss_seidel cimport solve_csr_block, solve_rows_block
+from lavender_ext.sweep.pgs cimport relax_csr_block
+
+cdef enum:
+    REFRESH = 64                # iterations of nncg after which v is formed anew: rounding adds up in it
+
+cdef enum:                      # places in control of nncg
+    NORM = 0                    # g.Dg of the last sweep
+    RESTARTS = 1                # beta > 1
+
+
+cdef struct sweep_data_t:
+    const blocks_t* blocks
+    const csr_t* csr            # NULL where factored
+    const rows_t* rows
+    const int32_t* start        # prepared blocks, read where `exact` or under the cone law
+    const double* g
+    int32_t exact               # sweeps over exact blocks, else pgs
+    int32_t convex              # iterations under the cone law first
+    int32_t turn                # iterations done
+    blocks_t cone               # the blocks under the cone law
+    int32_t* order
+    int32_t split
+    int32_t mode
+    int32_t memory
+    uint64_t* rng
+    double* v                   # (n_bodies, 6), with nv = 6 n_bodies; nv = 0 where not factored
+    int32_t nv
+    double* control             # (CONTROL) of accelerate/mixing.pxd
+    double* gram                # (MAX_MEMORY, MAX_MEMORY)
+    double* work                # nncg 3 (m + nv); anderson (4 + 2 memory) m
+
+
+cdef inline void sweep(const sweep_data_t* c, double* lam, int32_t first) noexcept nogil:
+    cdef const blocks_t* p = &c.cone if c.turn < c.convex else c.blocks
+    cdef int32_t i, q, k, exact = c.exact or c.turn < c.convex
+    for k in range(2 if c.mode == SYMMETRIC else 1):
+        advance_order(c.mode, first and k == 0, c.order, 0, c.split, c.rng)
+        advance_order(c.mode, first and k == 0, c.order, c.split, p.n_blocks, c.rng)
+        if c.csr != NULL:
+            if not exact:
+                for q in range(p.n_blocks):
+                    relax_csr_block(p, c.csr, c.order[q], lam)
+            else:
+                for q in range(p.n_blocks):
+                    i = c.order[q]
+                    solve_csr_block(p, c.csr, i, c.g + c.start[i], lam)
+        elif not exact:
+            for q in range(p.n_blocks):
+                relax_rows_block(p, c.rows, c.order[q], lam, c.v)
+        else:
+            for q in range(p.n_blocks):
+                i = c.order[q]
+                solve_rows_block(p, c.rows, i, c.g + c.start[i], lam, c.v)
+
+
+cdef inline void form_velocity(const sweep_data_t* c, const double* lam) noexcept nogil:
+    # v = M^-1 J^T lam; nothing to do where not factored.
+    cdef const blocks_t* p = c.blocks
+    cdef const rows_t* r = c.rows
+    cdef int32_t i, j, k
+    for i in range(c.nv):
+        c.v[i] = 0.0
+    if c.nv == 0:
+        return
+    for i in range(r.n_joints):
+        for j in range(p.ptr[i], p.ptr[i + 1]):
+            joint_push(r.minv_jac + 12 * j, lam[j], c.v, r.joint_body[2 * i], r.joint_body[2 * i + 1])
+    for k in range(r.n_contacts):
+        i = r.n_joints + k
+        j = p.ptr[i]
+        contact_push(r, k, n_tangents(p.kind[i], p.ptr[i + 1] - j), p.kind[i] == CONTACT_SPIN, lam + j, c.v)
+
+
+cdef inline void project_block(const blocks_t* p, int32_t i, double* lam) noexcept nogil:
+    """lam of block i into its bounds, normal first."""
+    cdef int32_t j = p.ptr[i], n = p.ptr[i + 1] - j, k, nt
+    cdef double bound, size
+    if p.kind[i] == ROW:
+        for k in range(j, j + n):
+            lam[k] = clip(lam[k], p.lower[k], p.upper[k])
+        return
+    if lam[j] < 0.0:
+        lam[j] = 0.0
+    bound = p.mu[i] * lam[j]
+    nt = n_tangents(p.kind[i], n)
+    if nt > 0:
+        size = norm2(lam[j + 1], lam[j + 2]) if nt == 2 else fabs(lam[j + 1])
+        if size > bound:
+            size = bound / size
+            for k in range(1, 1 + nt):
+                lam[j + k] *= size
+    if p.kind[i] == CONTACT_SPIN:
+        bound = bound * p.patch_radius[i]
+        lam[j + n - 1] = clip(lam[j + n - 1], -bound, bound)
+
+
+cdef public void lav_nncg(sweep_data_t* c, double* lam, int32_t first_sweep, int32_t n) noexcept nogil:
+    """n iterations of (1)."""
+    cdef int32_t m = c.blocks.n_rows, i, s
+    cdef double* x = c.work                             # x, then g; behind lam's part that of v
+    cdef double* q = c.work + m + c.nv                  # beta p, to be added
+    cdef double* p = q + m + c.nv
+    cdef double* control = c.control
+    cdef const double* d = c.blocks.d
+    cdef double s0, s1, s2, s3, beta
+    for s in range(n):
+        if c.turn > 0 and c.turn % REFRESH == 0:
+            form_velocity(c, lam)
+        for i in range(m):
+            lam[i] += q[i]
+            x[i] = lam[i]
+        for i in range(c.nv):
+            c.v[i] += q[m + i]
+            x[m + i] = c.v[i]
+        sweep(c, lam, first_sweep and s == 0)
+        s0 = s1 = s2 = s3 = 0.0
+        i = 0
+        while i < m:
+            x[i] -= lam[i]
+            i += 1
+        i = 0
+        while i + 4 <= m:
+            s0 += d[i] * x[i] * x[i]
+            s1 += d[i + 1] * x[i + 1] * x[i + 1]
+            s2 += d[i + 2] * x[i + 2] * x[i + 2]
+            s3 += d[i + 3] * x[i + 3] * x[i + 3]
+            i += 4
+        while i < m:
+            s0 += d[i] * x[i] * x[i]
+            i += 1
+        s0 = (s0 + s1) + (s2 + s3)
+        for i in range(c.nv):
+            x[m + i] -= c.v[i]
+        beta = s0 / control[NORM] if control[NORM] > 0.0 else 0.0
+        if not beta <= 1.0:
+            beta = 0.0
+            control[RESTARTS] += 1.0
+        control[NORM] = s0
+        c.turn += 1
+        if c.turn == c.convex:
+            control[NORM] = 0.0                         # another map: start anew
+        for i in range(m + c.nv):
+            q[i] = beta * p[i]
+            p[i] = q[i] - x[i]
+
+
+cdef public void lav_anderson(sweep_data_t* c, double* lam, int32_t first_sweep, int32_t n) noexcept nogil:
+    """n iterations of (2)."""
+    cdef int32_t m = c.blocks.n_rows, i, s, mixed
+    cdef double* x = c.work                             # x, later f
+    cdef const double* d = c.blocks.d
+    cdef double* root                                   # (m) square roots of d
+    cdef mixing_t mixing
+    mixing.m = m
+    mixing.memory = c.memory
+    mixing.control = c.control
+    mixing.gram = c.gram
+    mixing.v = x + m
+    mixing.g = mixing.v + m
+    mixing.dv = mixing.g + m
+    mixing.dg = mixing.dv + c.memory * m
+    root = mixing.dg + c.memory * m
+    if c.turn == 0:
+        for i in range(m):
+            root[i] = sqrt(d[i])
+    for s in range(n):
+        mixed = mix(&mixing, lam)
+        if mixed:
+            for i in range(c.blocks.n_blocks):
+                project_block(c.blocks, i, lam)
+            form_velocity(c, lam)
+        for i in range(m):
+            x[i] = lam[i]
+        sweep(c, lam, first_sweep and s == 0)
+        for i in range(m):
+            x[i] = root[i] * (lam[i] - x[i])
+        if not take(&mixing, mixed, lam, x):
+            form_velocity(c, lam)
+        c.turn += 1
+        if c.turn == c.convex:
+            forget(&mixing)                             # another map
+
+
+cdef void nncg_step(void* context, double* lam, int32_t first_sweep, int32_t n) noexcept nogil:
+    lav_nncg(<sweep_data_t*>context, lam, first_sweep, n)
+
+
+cdef void anderson_step(void* context, double* lam, int32_t first_sweep, int32_t n) noexcept nogil:
+    lav_anderson(<sweep_data_t*>context, lam, first_sweep, n)
+
+
+def allocate(Data p, int memory):
+    """Zeroed (control, gram, work, v) for a run; memory 0 is nncg."""
+    cdef Py_ssize_t m = p.blocks.n_rows, nv = 6 * p.rows.n_bodies if p.factored else 0
+    if not 0 <= memory <= MAX_MEMORY:
+        raise ValueError(f"memory is {memory}; 0 to {MAX_MEMORY} is needed")
+    return (np.zeros(CONTROL), np.zeros(MAX_MEMORY * MAX_MEMORY), np.zeros(3 * (m + nv) + (1 + 2 * memory) * m + 1),
+            np.zeros((nv // 6 + 1, 6)))
+
+
+def run(Data p, Watch watch, double[::1] lam, int n, double tol, int memory, prepared, bint exact, int convex, space,
+        int32_t[::1] order, int split, int mode, uint64_t[::1] rng):
+    """`n` iterations in place under `watch`, GIL released: (status, iterations, sweeps, restarts so far).
+
+    prepared is (start, numbers) of gauss_seidel.prepare, or None where neither `exact` nor `convex` asks for it;
+    space comes from `allocate`, v in it holding M^-1 J^T lam.
+    """
+    cdef sweep_data_t c
+    cdef int32_t status, done = 0
+    cdef double[::1] control = space[0], gram = space[1], work = space[2], g
+    cdef double[:, ::1] v = space[3]
+    cdef int32_t[::1] start
+    if lam.shape[0] == 0:
+        if tol > 0.0:
+            return CONVERGED, 0, 0, 0
+        return RUNNING, n, n, 0
+    c.blocks = &p.blocks
+    c.csr = NULL if p.factored else &p.csr
+    c.rows = &p.rows
+    c.start = NULL
+    c.g = NULL
+    c.exact = exact
+    c.convex = convex
+    c.turn = watch.state.total
+    c.cone = p.blocks
+    c.cone.law = CONE
+    if prepared is not None:
+        start, g = prepared
+        c.start = &start[0]
+        c.g = &g[0]
+    c.order = &order[0]
+    c.split = split
+    c.mode = mode
+    c.memory = memory
+    c.rng = &rng[0]
+    c.v = &v[0, 0]
+    c.nv = 6 * p.rows.n_bodies if p.factored else 0
+    c.control = &control[0]
+    c.gram = &gram[0]
+    c.work = &work[0]
+    with nogil:
+        status = watch.run(nncg_step if memory == 0 else anderson_step, &c, &lam[0], n, tol, &done)
+    return status, done, done * (2 if mode == SYMMETRIC else 1), int(control[RESTARTS if memory == 0 else UNDONE])

@@ -1,0 +1,359 @@
+"""Proximal splitting on the bounds or cones of all blocks, in the metric of d, with Anderson mixing.
+
+With x = D^1/2 lam, B = D^-1/2 A D^-1/2, c = D^-1/2 b, cones K in the same scale, one vector u carries all:
+
+    z = Pi_K(u),   y = rho (u - z)                  (Moreau: y in the normal cone of K at z)
+    s = a |y_t| + a_s |y_s| on normals (Coulomb: De Saxce's shift, a = mu sqrt(d_t / d_n)), else 0
+    (B + rho) x = c - s + rho z - y                                                               (1)
+    u <- u + alpha (x - z)                          then accelerate/mixing.pxd
+
+At rest x = z: B z - c + s + y = 0. The shift comes in once both imbalances below are at most 1e-3 (or
+after 200 iterations), that is from the convex answer: where contacts stick that is the answer, elsewhere a
+start. (1) is solved with a factorisation made by the caller: Cholesky of a dense matrix, L D L^T or L U of
+a sparse one, or L D L^T of I + K^T diag(1 / (theta + rho)) K over bodies where B = K K^T + diag(theta):
+
+    x = E (r - K t),  (I + K^T E K) t = K^T E r,  E = diag(1 / (theta + rho))                     (2)
+
+At 20 iterations, then after every quarter more of them (20 at least), rho is weighed by its imbalances,
+
+    primal = |x - z| / |max(|x|, |z|)|,   dual = rho |z - z before| / |max(|y|, |c|)|                  (3)
+
+Where sqrt(primal / dual) is outside 1/3 .. 3 the kernel stops and asks for a factorisation with rho times
+that; u then becomes z + y / rho.
+"""
+from libc.math cimport fabs, sqrt
+from libc.stdint cimport int32_t, int64_t
+
+import numpy as np
+
+from lavender_ext.accelerate.mixing cimport CONTROL, MAX_MEMORY, UNDONE, forget, mix, mixing_t, product, take
+from lavender_ext.core.block cimport CONE, CONTACT_SPIN, ROW, blocks_t, clip, n_tangents, norm2
+from lavender_ext.core.problem cimport Data
+
+
+cdef enum:
+    DENSE = 0
+    SYMMETRIC = 1
+    GENERAL = 2
+    BODIES = 3
+
+cdef enum:
+    RHO_EVERY = 20              # iterations between weighings of rho at first, later a quarter of those done
+    CONVEX_AT_MOST = 200        # iterations without the shift
+
+
+cdef struct factor_t:           # of B + rho, or of the body form
+    int32_t kind
+    int32_t n                   # its order
+    const double* dense         # (n, n) Cholesky, row by row, lower
+    const int32_t* l_ptr        # L by columns: strictly lower (SYMMETRIC, BODIES), with unit diagonal (GENERAL)
+    const int32_t* l_row
+    const double* l_val
+    const double* diag          # (n) D
+    const int32_t* u_ptr        # U by columns (GENERAL), the diagonal last in each
+    const int32_t* u_row
+    const double* u_val
+    const int32_t* p            # (n) row of the matrix that stands at place i
+    const int32_t* q            # (n) column of the matrix at place i; = p where symmetric
+    const int32_t* k_ptr        # K by rows (BODIES)
+    const int32_t* k_col
+    const double* k_val
+    const double* e             # (m) E
+
+
+cdef struct admm_t:
+    const blocks_t* blocks
+    const double* root          # (m) sqrt d
+    const double* c             # (m)
+    double rho
+    double alpha
+    double* u                   # (m)
+    double* z                   # (m)
+    double* y                   # (m)
+    double* x                   # (m)
+    double* g                   # (m)
+    double* before              # (m) z of the iteration before
+    double* work                # (m + n)
+    double* turn                # (4) iterations done; u was mixed; iterations at the next weighing; the shift is on
+
+
+cdef inline void solve_factor(const factor_t* f, double* x, double* work) noexcept nogil:
+    # x (n) <- matrix^-1 x
+    cdef int32_t i, j, k, n = f.n
+    cdef double s, s0, s1, s2, s3
+    cdef const double* row
+    if f.kind == DENSE:
+        for i in range(n):
+            row = f.dense + <int64_t>n * i
+            x[i] = (x[i] - product(row, x, i)) / row[i]
+        i = n - 1
+        while i >= 0:
+            row = f.dense + <int64_t>n * i
+            s = x[i] / row[i]
+            x[i] = s
+            for j in range(i):
+                x[j] -= row[j] * s
+            i -= 1
+        return
+    for i in range(n):
+        work[i] = x[f.p[i]]
+    for j in range(n):
+        s = work[j]
+        if s != 0.0:
+            for k in range(f.l_ptr[j], f.l_ptr[j + 1]):
+                if f.l_row[k] != j:
+                    work[f.l_row[k]] -= f.l_val[k] * s
+    if f.kind == GENERAL:
+        j = n - 1
+        while j >= 0:
+            s = work[j] / f.u_val[f.u_ptr[j + 1] - 1]
+            work[j] = s
+            if s != 0.0:
+                for k in range(f.u_ptr[j], f.u_ptr[j + 1] - 1):
+                    work[f.u_row[k]] -= f.u_val[k] * s
+            j -= 1
+    else:
+        for i in range(n):
+            work[i] /= f.diag[i]
+        j = n - 1
+        while j >= 0:
+            s0 = s1 = s2 = s3 = 0.0
+            k = f.l_ptr[j]
+            while k + 4 <= f.l_ptr[j + 1]:
+                s0 += f.l_val[k] * work[f.l_row[k]]
+                s1 += f.l_val[k + 1] * work[f.l_row[k + 1]]
+                s2 += f.l_val[k + 2] * work[f.l_row[k + 2]]
+                s3 += f.l_val[k + 3] * work[f.l_row[k + 3]]
+                k += 4
+            while k < f.l_ptr[j + 1]:
+                s0 += f.l_val[k] * work[f.l_row[k]]
+                k += 1
+            work[j] -= (s0 + s1) + (s2 + s3)
+            j -= 1
+    for i in range(n):
+        x[f.q[i]] = work[i]
+
+
+cdef inline void solve_shifted(const factor_t* f, int32_t m, double* x, double* work) noexcept nogil:
+    # (1): x (m) <- (B + rho)^-1 x; work (m + n)
+    cdef int32_t i, k
+    cdef double s
+    cdef double* t = work + m
+    if f.kind != BODIES:
+        solve_factor(f, x, work)
+        return
+    for i in range(f.n):
+        t[i] = 0.0
+    for i in range(m):
+        s = f.e[i] * x[i]
+        for k in range(f.k_ptr[i], f.k_ptr[i + 1]):
+            t[f.k_col[k]] += f.k_val[k] * s
+    solve_factor(f, t, work)
+    for i in range(m):
+        s = x[i]
+        for k in range(f.k_ptr[i], f.k_ptr[i + 1]):
+            s -= f.k_val[k] * t[f.k_col[k]]
+        x[i] = f.e[i] * s
+
+
+cdef inline void project_block(const blocks_t* p, const double* root, int32_t i, const double* u,
+                               double* z) noexcept nogil:
+    """z = Pi_K(u) of one block, u, z whole scaled vectors; core/block.pxd (7)."""
+    cdef int32_t j = p.ptr[i], n = p.ptr[i + 1] - j, k, nt
+    cdef double at, as_, t, s, c
+    if p.kind[i] == ROW:
+        for k in range(j, j + n):
+            z[k] = clip(u[k], p.lower[k] * root[k], p.upper[k] * root[k])
+        return
+    nt = n_tangents(p.kind[i], n)
+    at = p.mu[i] * root[j + 1] / root[j] if nt > 0 else 0.0
+    as_ = p.mu[i] * p.patch_radius[i] * root[j + n - 1] / root[j] if p.kind[i] == CONTACT_SPIN else 0.0
+    t = norm2(u[j + 1], u[j + 2]) if nt == 2 else (fabs(u[j + 1]) if nt == 1 else 0.0)
+    c = fabs(u[j + n - 1]) if p.kind[i] == CONTACT_SPIN else 0.0
+    s = u[j] if u[j] > 0.0 else 0.0
+    if (u[j] + at * t) / (1.0 + at * at) > s:
+        s = (u[j] + at * t) / (1.0 + at * at)
+    if p.kind[i] == CONTACT_SPIN:
+        if (u[j] + as_ * c) / (1.0 + as_ * as_) > s:
+            s = (u[j] + as_ * c) / (1.0 + as_ * as_)
+        if (u[j] + at * t + as_ * c) / (1.0 + at * at + as_ * as_) > s:
+            s = (u[j] + at * t + as_ * c) / (1.0 + at * at + as_ * as_)
+        z[j + n - 1] = clip(u[j + n - 1], -as_ * s, as_ * s)
+    z[j] = s
+    c = at * s / t if t > at * s else 1.0
+    for k in range(j + 1, j + 1 + nt):
+        z[k] = c * u[k]
+
+
+cdef inline double shift(const blocks_t* p, const double* root, int32_t i, const double* y) noexcept nogil:
+    # s of the normal of contact i
+    cdef int32_t j = p.ptr[i], n = p.ptr[i + 1] - j, nt = n_tangents(p.kind[i], n)
+    cdef double s = 0.0
+    if nt > 0:
+        s = p.mu[i] * root[j + 1] / root[j] * (norm2(y[j + 1], y[j + 2]) if nt == 2 else fabs(y[j + 1]))
+    if p.kind[i] == CONTACT_SPIN:
+        s += p.mu[i] * p.patch_radius[i] * root[j + n - 1] / root[j] * fabs(y[j + n - 1])
+    return s
+
+
+cdef inline double imbalance(const admm_t* c, double* primal, double* dual) noexcept nogil:
+    # |x - z| and rho |z - z before|, each over the size of its vectors; the larger of both.
+    cdef int32_t i, m = c.blocks.n_rows
+    cdef double x = 0.0, y = 0.0, s, t
+    primal[0] = dual[0] = 0.0
+    for i in range(m):
+        s = c.x[i] - c.z[i]
+        t = c.z[i] - c.before[i]
+        primal[0] += s * s
+        dual[0] += t * t
+        s = c.x[i] * c.x[i]
+        t = c.z[i] * c.z[i]
+        x += s if s > t else t
+        s = c.y[i] * c.y[i]
+        t = c.c[i] * c.c[i]
+        y += s if s > t else t
+    primal[0] = sqrt(primal[0] / x) if x > 0.0 else 0.0
+    dual[0] = c.rho * sqrt(dual[0] / y) if y > 0.0 else 0.0
+    return primal[0] if primal[0] > dual[0] else dual[0]
+
+
+cdef inline double weighed(const admm_t* c) noexcept nogil:
+    # The rho that the last iteration asks for, or the present one.
+    cdef double primal, dual, s
+    imbalance(c, &primal, &dual)
+    if not primal > 0.0:
+        return c.rho
+    s = clip(sqrt(primal / dual) if dual > 0.0 else 10.0, 0.1, 10.0)
+    s = clip(s * c.rho, 1e-9, 1e4)
+    return s if s > 3.0 * c.rho or 3.0 * s < c.rho else c.rho
+
+
+cdef public double lav_admm(admm_t* c, const factor_t* f, const mixing_t* mixing, double* lam,
+                            int32_t* n) noexcept nogil:
+    """At most n iterations; n is what is left on return. Returns 0, or the rho that should be factored next."""
+    cdef const blocks_t* p = c.blocks
+    cdef int32_t m = p.n_rows, i, mixed
+    cdef double rho = c.rho, primal, dual
+    while n[0] > 0:
+        n[0] -= 1
+        mixed = c.turn[1] > 0.0
+        for i in range(p.n_blocks):
+            project_block(p, c.root, i, c.u, c.z)
+        for i in range(m):
+            c.y[i] = rho * (c.u[i] - c.z[i])
+            c.x[i] = c.c[i] + rho * c.z[i] - c.y[i]
+        if p.law != CONE and c.turn[3] > 0.0:
+            for i in range(p.n_blocks):
+                if p.kind[i] != ROW:
+                    c.x[p.ptr[i]] -= shift(p, c.root, i, c.y)
+        solve_shifted(f, m, c.x, c.work)
+        c.turn[0] += 1.0
+        for i in range(m):
+            c.g[i] = c.alpha * (c.x[i] - c.z[i])
+            c.u[i] += c.g[i]
+        if not take(mixing, mixed, c.u, c.g):
+            c.turn[1] = 0.0
+            continue
+        if c.turn[3] == 0.0 and (c.turn[0] >= CONVEX_AT_MOST or imbalance(c, &primal, &dual) <= 1e-3):
+            c.turn[3] = 1.0
+            forget(mixing)
+        if c.turn[0] >= c.turn[2]:
+            if c.turn[2] > 0.0:
+                rho = weighed(c)
+            c.turn[2] = c.turn[0] + (0.25 * c.turn[0] if c.turn[0] > 4.0 * RHO_EVERY else RHO_EVERY)
+        for i in range(m):
+            c.before[i] = c.z[i]
+            lam[i] = c.z[i] / c.root[i]
+        if rho != c.rho:
+            for i in range(m):
+                c.u[i] = c.z[i] + c.y[i] / rho
+            forget(mixing)
+            c.turn[1] = 0.0
+            return rho
+        c.turn[1] = mix(mixing, c.u)
+    return 0.0
+
+
+cdef public void lav_admm_start(const blocks_t* p, const double* lam, const double* w, const double* root, double rho,
+                                double* u, double* y) noexcept nogil:
+    """u (m) of a start: lam, its slack w; y (m) is scratch."""
+    cdef int32_t i
+    for i in range(p.n_rows):
+        y[i] = -w[i] / root[i]
+    for i in range(p.n_rows):
+        u[i] = y[i]
+    if p.law != CONE:
+        for i in range(p.n_blocks):
+            if p.kind[i] != ROW:
+                u[p.ptr[i]] -= shift(p, root, i, y)
+    for i in range(p.n_rows):
+        u[i] = root[i] * lam[i] + u[i] / rho
+
+
+def allocate(Data p, int memory):
+    """Zeroed vectors of a run: (control, gram, turn, work)."""
+    if not 0 <= memory <= MAX_MEMORY:
+        raise ValueError(f"memory is {memory}; 0 to {MAX_MEMORY} is needed")
+    return (np.zeros(CONTROL), np.zeros(MAX_MEMORY * MAX_MEMORY), np.zeros(4),
+            np.zeros((8 + 2 * memory) * p.blocks.n_rows + 1))
+
+
+def start(Data p, const double[::1] lam, const double[::1] w, const double[::1] root, double rho, space):
+    """u of an impulse and its slack: z + y / rho with y = -(w + s) in the scale of u."""
+    cdef double[::1] v = space[3]
+    cdef Py_ssize_t m = p.blocks.n_rows
+    lav_admm_start(&p.blocks, &lam[0], &w[0], &root[0], rho, &v[0], &v[m])
+
+
+def run(Data p, double[::1] lam, int n, double rho, double alpha, int memory, space, const double[::1] root,
+        const double[::1] c, factor):
+    """At most `n` iterations in place, GIL released: (iterations done, 0 or the rho to factor next, undone so far).
+
+    factor: (kind, order, arrays) with the arrays that `factor_t` names, in its order; None where a kind has none.
+    """
+    cdef admm_t run
+    cdef factor_t f
+    cdef mixing_t mixing
+    cdef Py_ssize_t m = p.blocks.n_rows
+    cdef int32_t left = n
+    cdef double wanted
+    cdef double[::1] control = space[0], gram = space[1], turn = space[2], v = space[3]
+    cdef double[::1] work
+    cdef const double[:, ::1] dense
+    cdef const double[::1] l_val, diag, u_val, k_val, e
+    cdef const int32_t[::1] l_ptr, l_row, u_ptr, u_row, pp, qq, k_ptr, k_col
+    f.kind = factor[0]
+    f.n = factor[1]
+    if f.kind == DENSE:
+        dense = factor[2][0]
+        f.dense = &dense[0, 0]
+    else:
+        l_ptr, l_row, l_val, pp, qq = factor[2][:5]
+        f.l_ptr, f.l_row, f.l_val, f.p, f.q = &l_ptr[0], &l_row[0], &l_val[0], &pp[0], &qq[0]
+        if f.kind == GENERAL:
+            u_ptr, u_row, u_val = factor[2][5:]
+            f.u_ptr, f.u_row, f.u_val = &u_ptr[0], &u_row[0], &u_val[0]
+        else:
+            diag = factor[2][5]
+            f.diag = &diag[0]
+        if f.kind == BODIES:
+            k_ptr, k_col, k_val, e = factor[2][6:]
+            f.k_ptr, f.k_col, f.k_val, f.e = &k_ptr[0], &k_col[0], &k_val[0], &e[0]
+    work = np.empty(m + f.n + 1)
+    run.blocks = &p.blocks
+    run.root = &root[0]
+    run.c = &c[0]
+    run.rho = rho
+    run.alpha = alpha
+    run.u, run.z, run.y, run.x, run.g, run.before = &v[0], &v[m], &v[2 * m], &v[3 * m], &v[4 * m], &v[5 * m]
+    run.work = &work[0]
+    run.turn = &turn[0]
+    mixing.m = <int32_t>m
+    mixing.memory = memory
+    mixing.control = &control[0]
+    mixing.gram = &gram[0]
+    mixing.v, mixing.g, mixing.dv = &v[6 * m], &v[7 * m], &v[8 * m]
+    mixing.dg = mixing.dv + memory * m
+    with nogil:
+        wanted = lav_admm(&run, &f, &mixing, &lam[0], &left)
+    return n - left, wanted, int(control[UNDONE])

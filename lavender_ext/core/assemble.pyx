@@ -1,0 +1,230 @@
+"""A = J M^-1 J^T + diag(compliance) in compressed rows, from the factored form, in time linear in its entries.
+
+    A_rc = sum over the bodies that rows r and c share of J_r . (M^-1 J^T)_c
+
+Blocks that meet at a body are found from the blocks of each body; entries that are exactly zero are left out.
+A_rc is formed once, from r <= c, so that A is symmetric to the bit.
+"""
+from libc.stdint cimport int32_t, int64_t
+
+import numpy as np
+
+from lavender_ext.core.block cimport CONTACT_SPIN, blocks_t, n_tangents
+from lavender_ext.core.problem cimport Data
+from lavender_ext.core.rows cimport contact_jacobian, minv_times, rows_t
+
+
+cdef inline int32_t body_of(const rows_t* r, int32_t block, int32_t side) noexcept nogil:
+    if block < r.n_joints:
+        return r.joint_body[2 * block + side]
+    return r.contact_body[2 * (block - r.n_joints) + side]
+
+
+cdef inline double dot6(const double* x, const double* y) noexcept nogil:
+    return ((x[0] * y[0] + x[1] * y[1]) + (x[2] * y[2] + x[3] * y[3])) + (x[4] * y[4] + x[5] * y[5])
+
+
+cdef public void lav_expand_rows(const blocks_t* p, const rows_t* r, double* jac, double* minv_jac) noexcept nogil:
+    """J and M^-1 J^T of every row as (m, 12), in the layout of joint rows."""
+    cdef int32_t i, j, k, c, a, b, end
+    for i in range(p.n_blocks):
+        j = p.ptr[i]
+        end = p.ptr[i + 1]
+        a = body_of(r, i, 0)
+        b = body_of(r, i, 1)
+        if i < r.n_joints:
+            for k in range(12 * j, 12 * end):
+                jac[k] = r.jac[k]
+        else:
+            c = i - r.n_joints
+            contact_jacobian(r, c, n_tangents(p.kind[i], end - j), p.kind[i] == CONTACT_SPIN, jac + 12 * j)
+        for k in range(j, end):
+            minv_times(jac + 12 * k, r.inv_mass, r.inv_inertia, a, b, minv_jac + 12 * k)
+
+
+cdef public void lav_body_blocks(const blocks_t* p, const rows_t* r, int32_t* start, int32_t* blocks,
+                                 int64_t* bound) noexcept nogil:
+    """Blocks of each body: blocks[start[i]:start[i + 1]], increasing; start (n + 1), blocks (2 k).
+
+    bound[0] becomes a bound on the entries of A.
+    """
+    cdef int32_t i, s, x, t, sum_ = 0
+    cdef int64_t here
+    for i in range(r.n_bodies + 1):
+        start[i] = 0
+    for i in range(p.n_blocks):
+        for s in range(2):
+            x = body_of(r, i, s)
+            if x >= 0:
+                start[x] += 1
+    for i in range(r.n_bodies + 1):
+        t = start[i]
+        start[i] = sum_
+        sum_ += t
+    for i in range(p.n_blocks):
+        for s in range(2):
+            x = body_of(r, i, s)
+            if x >= 0:
+                blocks[start[x]] = i
+                start[x] += 1
+    i = r.n_bodies
+    while i > 0:
+        start[i] = start[i - 1]
+        i -= 1
+    start[0] = 0
+    bound[0] = 0
+    for i in range(p.n_blocks):
+        here = p.ptr[i + 1] - p.ptr[i]
+        t = (body_of(r, i, 0) >= 0) + (body_of(r, i, 1) >= 0)
+        bound[0] += here if t == 0 else (1 - t) * here * here    # a block meets itself once, not at both bodies
+    for i in range(r.n_bodies):
+        here = 0
+        for x in range(start[i], start[i + 1]):
+            here += p.ptr[blocks[x] + 1] - p.ptr[blocks[x]]
+        bound[0] += here * here
+
+
+cdef inline int32_t meet(const rows_t* r, int32_t i, const int32_t* start, const int32_t* blocks, int32_t* out) noexcept nogil:
+    # Blocks that share a body with block i, increasing: the merge of two sorted lists; i itself always.
+    cdef int32_t a = body_of(r, i, 0), b = body_of(r, i, 1), x = 0, y = 0, xe = 0, ye = 0, n = 0, u, v
+    if a >= 0:
+        x = start[a]
+        xe = start[a + 1]
+    if b >= 0:
+        y = start[b]
+        ye = start[b + 1]
+    if x == xe and y == ye:
+        out[0] = i
+        return 1
+    while x < xe or y < ye:
+        u = blocks[x] if x < xe else 2147483647
+        v = blocks[y] if y < ye else 2147483647
+        out[n] = u if u < v else v
+        n += 1
+        x += u <= v
+        y += v <= u
+    return n
+
+
+cdef inline int32_t shared_sides(const rows_t* r, int32_t i, int32_t j) noexcept nogil:
+    # Bit 2 s + t: side s of block i and side t of block j are the same moving body.
+    cdef int32_t s, t, x, bits = 0
+    for s in range(2):
+        x = body_of(r, i, s)
+        for t in range(2):
+            if x >= 0 and x == body_of(r, j, t):
+                bits |= 1 << (2 * s + t)
+    return bits
+
+
+cdef inline double meeting(const double* jac, const double* minv_jac, int32_t bits) noexcept nogil:
+    # sum over the shared bodies; bit 2 s + t: side s of jac, side t of minv_jac.
+    cdef double value = 0.0
+    if bits & 1:
+        value += dot6(jac, minv_jac)
+    if bits & 2:
+        value += dot6(jac, minv_jac + 6)
+    if bits & 4:
+        value += dot6(jac + 6, minv_jac)
+    if bits & 8:
+        value += dot6(jac + 6, minv_jac + 6)
+    return value
+
+
+cdef inline int32_t single(int32_t bits) noexcept nogil:
+    # Which of the four bits, where it is one alone; else -1.
+    if bits == 1:
+        return 0
+    if bits == 2:
+        return 1
+    if bits == 4:
+        return 2
+    return 3 if bits == 8 else -1
+
+
+cdef public void lav_assemble(const blocks_t* p, const rows_t* r, const double* jac, const double* minv_jac,
+                              const int32_t* start, const int32_t* blocks, int32_t* near, int32_t* sides,
+                              int32_t* next_, int32_t* indptr, int32_t* indices, double* data) noexcept nogil:
+    """Rows of A into indptr (m + 1), indices, data; near, sides (2 k + 1), next_ (m) are scratch.
+
+    next_[c] is the entry of row c that the row of its column, which comes later, copies.
+    """
+    cdef int32_t i, n, q, j, row, col, end, at, bit, nnz = 0
+    cdef double value
+    cdef const double* x
+    cdef const double* y
+    indptr[0] = 0
+    for i in range(p.n_blocks):
+        n = meet(r, i, start, blocks, near)
+        for q in range(n):
+            sides[q] = shared_sides(r, i, near[q]) if i <= near[q] else 0
+        for row in range(p.ptr[i], p.ptr[i + 1]):
+            for q in range(n):
+                j = near[q]
+                col = p.ptr[j]
+                end = p.ptr[j + 1]
+                while col < end and col < row:
+                    at = next_[col]
+                    if at < indptr[col + 1] and indices[at] == row:
+                        indices[nnz] = col
+                        data[nnz] = data[at]
+                        nnz += 1
+                        next_[col] = at + 1
+                    col += 1
+                if col == end:
+                    continue
+                # The lower block gives J, the higher M^-1 J^T.
+                if col == row:
+                    value = (meeting(jac + 12 * row, minv_jac + 12 * row, sides[q]) + r.compliance[row])
+                    if value != 0.0:
+                        indices[nnz] = row
+                        data[nnz] = value
+                        nnz += 1
+                    next_[row] = nnz
+                    col += 1
+                bit = single(sides[q])
+                if bit >= 0:
+                    x = jac + 12 * row + 6 * (bit >> 1)
+                    y = minv_jac + 6 * (bit & 1)
+                    while col < end:
+                        value = dot6(x, y + 12 * col)
+                        indices[nnz] = col
+                        data[nnz] = value
+                        nnz += value != 0.0
+                        col += 1
+                else:
+                    while col < end:
+                        value = meeting(jac + 12 * row, minv_jac + 12 * col, sides[q])
+                        indices[nnz] = col
+                        data[nnz] = value
+                        nnz += value != 0.0
+                        col += 1
+            indptr[row + 1] = nnz
+
+
+def bound(Data p):
+    """(most entries A can have, start, blocks): how large A gets before it is formed."""
+    cdef int32_t[::1] start = np.empty(p.rows.n_bodies + 1, np.int32)
+    cdef int32_t[::1] blocks = np.empty(2 * p.blocks.n_blocks + 1, np.int32)
+    cdef int64_t most
+    lav_body_blocks(&p.blocks, &p.rows, &start[0], &blocks[0], &most)
+    return most, np.asarray(start), np.asarray(blocks)
+
+
+def delassus(Data p, Py_ssize_t most, int32_t[::1] start, int32_t[::1] blocks):
+    """A as (indptr, indices, data) of compressed rows with sorted columns; arguments are `bound(p)`, most < 2^31."""
+    cdef Py_ssize_t m = p.blocks.n_rows
+    cdef int32_t nnz
+    cdef double[::1] jac = np.empty(12 * m + 1), minv_jac = np.empty(12 * m + 1), data = np.empty(most + 1)
+    cdef int32_t[::1] indices = np.empty(most + 1, np.int32), indptr = np.zeros(m + 1, np.int32)
+    cdef int32_t[::1] near = np.empty(4 * p.blocks.n_blocks + 2 + m, np.int32)
+    with nogil:
+        lav_expand_rows(&p.blocks, &p.rows, &jac[0], &minv_jac[0])
+        lav_assemble(&p.blocks, &p.rows, &jac[0], &minv_jac[0], &start[0], &blocks[0], &near[0],
+                     &near[2 * p.blocks.n_blocks + 1], &near[0] + 4 * p.blocks.n_blocks + 2, &indptr[0], &indices[0],
+                     &data[0])
+    nnz = indptr[m]
+    found = np.asarray(indices)[:nnz], np.asarray(data)[:nnz]
+    if nnz < 0.75 * most:                               # a copy costs more than a quarter of unused room
+        found = found[0].copy(), found[1].copy()
+    return (np.asarray(indptr), *found)

@@ -1,0 +1,93 @@
+"""Orders and colours of blocks for Python: thin entries of core/order.pxd, and colours of a matrix's blocks."""
+from libc.stdint cimport int32_t, uint64_t
+
+import numpy as np
+
+from lavender_ext.core.order cimport block_levels, body_levels, color_by_bodies, sort_by_level
+
+
+cdef public int32_t lav_body_levels(int32_t n_blocks, const int32_t* body, int32_t n_bodies, int32_t* level,
+                                    int32_t* out) noexcept nogil:
+    """Level of every block (n_blocks) from the static bodies; level (n_bodies) is scratch. Returns the number of levels."""
+    cdef int32_t n = body_levels(n_blocks, body, n_bodies, level)
+    block_levels(n_blocks, body, level, out)
+    return n + 2
+
+
+cdef public int32_t lav_body_colors(int32_t n_blocks, const int32_t* body, int32_t n_bodies, uint64_t* used,
+                                    int32_t* color) noexcept nogil:
+    return color_by_bodies(n_blocks, body, n_bodies, used, color)
+
+
+cdef public int32_t lav_graph_colors(int32_t n_blocks, const int32_t* block_ptr, const int32_t* block_of,
+                                     const int32_t* indptr, const int32_t* indices, int32_t* mark,
+                                     int32_t* color) noexcept nogil:
+    """Greedy colours of blocks that meet in A (pattern of rows and columns given symmetrically).
+
+    mark (n_blocks + 1) is scratch. Returns the number of colours.
+    """
+    cdef int32_t i, j, q, c, top = 0
+    for i in range(n_blocks):
+        color[i] = -1
+        mark[i] = -1
+    mark[n_blocks] = -1
+    for i in range(n_blocks):
+        for j in range(block_ptr[i], block_ptr[i + 1]):
+            for q in range(indptr[j], indptr[j + 1]):
+                c = color[block_of[indices[q]]]
+                if c >= 0:
+                    mark[c] = i
+        c = 0
+        while mark[c] == i:
+            c += 1
+        color[i] = c
+        if c + 1 > top:
+            top = c + 1
+    return top
+
+
+cdef public void lav_sort_by_key(int32_t n, const int32_t* key, int32_t n_keys, int32_t* start, int32_t* order) noexcept nogil:
+    sort_by_level(n, key, n_keys, start, order)
+
+
+def body_order_levels(const int32_t[:, ::1] body, int n_bodies):
+    """Level (k,) of each block from the static bodies; `body` (k, 2)."""
+    cdef int32_t k = <int32_t>body.shape[0]
+    cdef int32_t[::1] level = np.empty(n_bodies + 1, np.int32), out = np.empty(k + 1, np.int32)
+    if k:
+        lav_body_levels(k, &body[0, 0], n_bodies, &level[0], &out[0])
+    return np.asarray(out)[:k]
+
+
+def body_colors(const int32_t[:, ::1] body, int n_bodies):
+    """Colour (k,) of each block: within one colour no two share a moving body."""
+    cdef int32_t k = <int32_t>body.shape[0]
+    cdef uint64_t[::1] used = np.zeros(n_bodies + 1, np.uint64)
+    cdef int32_t[::1] color = np.empty(k + 1, np.int32)
+    if k:
+        lav_body_colors(k, &body[0, 0], n_bodies, &used[0], &color[0])
+    return np.asarray(color)[:k]
+
+
+def graph_colors(const int32_t[::1] block_ptr, const int32_t[::1] block_of, const int32_t[::1] indptr,
+                 const int32_t[::1] indices):
+    """Colour (k,) of each block: within one colour no two meet in the symmetric pattern given."""
+    cdef int32_t k = <int32_t>block_ptr.shape[0] - 1
+    cdef int32_t[::1] mark = np.empty(k + 1, np.int32), color = np.empty(k + 1, np.int32)
+    if k and indices.shape[0]:
+        lav_graph_colors(k, &block_ptr[0], &block_of[0], &indptr[0], &indices[0], &mark[0], &color[0])
+    elif k:
+        color[:] = 0
+    return np.asarray(color)[:k]
+
+
+def stable_order(const int32_t[::1] key):
+    """Block numbers sorted by key (>= 0), stable: (order (n,), start of each key (max + 2,))."""
+    cdef int32_t n = <int32_t>key.shape[0], top = -1, i
+    for i in range(n):
+        if key[i] > top:
+            top = key[i]
+    cdef int32_t[::1] start = np.zeros(top + 2, np.int32), order = np.empty(n + 1, np.int32)
+    if n:
+        lav_sort_by_key(n, &key[0], top + 1, &start[0], &order[0])
+    return np.asarray(order)[:n], np.asarray(start)

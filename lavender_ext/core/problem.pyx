@@ -1,0 +1,306 @@
+"""A problem's derived numbers: diagonal d, velocity weight nu, sweep step, coupling of a contact's rows.
+
+    d_i     = A_ii; where A_ii <= 1e-10 max_j |A_ij| that maximum; an empty row: the mean of the positive
+              d, or 1 (factored: only empty rows fall back); on two tangents the mean of both     (1)
+    nu_i    = d_i; on a spin row d of its normal; on an angular joint row 1/m_a + 1/m_b           (2)
+    step_i  = 1/d_i; on tangents 1/lambda_max of the symmetric part of A_tt, d_t where not positive (3)
+"""
+from libc.math cimport fabs
+from libc.stdint cimport int32_t
+
+import numpy as np
+
+from lavender_ext.core.block cimport CONTACT_SPIN, ROW, blocks_t, n_tangents
+from lavender_ext.core.csr cimport csr_t
+from lavender_ext.core.rows cimport (contact_diagonal, dot12, largest_eigenvalue, minv_times, reciprocal,
+                                     rows_t, rows_times)
+
+
+cdef public int32_t lav_csr_diagonal(const blocks_t* p, const csr_t* a, double* d, double* step,
+                                     int32_t* empty) noexcept nogil:
+    """d and step of (1), (3) from the rows of A; marks empty rows, returns how many."""
+    cdef int32_t i, j, k, t, q, nt, kind, n_empty = 0, n_positive = 0
+    cdef double diag, big, total = 0.0, mean, x, off, e
+    for i in range(p.n_rows):
+        diag = 0.0
+        big = 0.0
+        for q in range(a.indptr[i], a.indptr[i + 1]):
+            x = fabs(a.data[q])
+            if x > big:
+                big = x
+            if a.indices[q] == i:
+                diag += a.data[q]
+        d[i] = diag if diag > 1e-10 * big else big
+        empty[i] = big == 0.0
+        n_empty += empty[i]
+        step[i] = big                                   # held for (3) below
+        if d[i] > 0.0:
+            n_positive += 1
+            total += d[i] / p.n_rows
+    mean = total * p.n_rows / n_positive if n_positive > 0 and total > 0.0 else 1.0
+    for i in range(p.n_rows):
+        if not d[i] > 0.0:
+            d[i] = mean
+    for i in range(p.n_blocks):
+        j = p.ptr[i]
+        kind = p.kind[i]
+        nt = 0 if kind == ROW else n_tangents(kind, p.ptr[i + 1] - j)
+        if nt == 2:
+            d[j + 1] = 0.5 * (d[j + 1] + d[j + 2])
+            d[j + 2] = d[j + 1]
+        if nt > 0:
+            big = step[j + 1]
+            if nt == 2 and step[j + 2] > big:
+                big = step[j + 2]
+            e = csr_entry(a, j + 1, j + 1)
+            if nt == 2:
+                off = 0.5 * (csr_entry(a, j + 1, j + 2) + csr_entry(a, j + 2, j + 1))
+                e = largest_eigenvalue(e, off, csr_entry(a, j + 2, j + 2))
+            if not e > 1e-10 * big:
+                e = d[j + 1]
+        for k in range(j, p.ptr[i + 1]):
+            step[k] = reciprocal(d[k])
+        for t in range(1, 1 + nt):
+            step[j + t] = reciprocal(e)
+    return n_empty
+
+
+cdef inline double csr_entry(const csr_t* a, int32_t i, int32_t j) noexcept nogil:
+    cdef int32_t q
+    cdef double s = 0.0
+    for q in range(a.indptr[i], a.indptr[i + 1]):
+        if a.indices[q] == j:
+            s += a.data[q]
+    return s
+
+
+cdef public void lav_matrix_nu(const blocks_t* p, double* nu) noexcept nogil:
+    """(2) where only a matrix is known."""
+    cdef int32_t i, j
+    for i in range(p.n_blocks):
+        for j in range(p.ptr[i], p.ptr[i + 1]):
+            nu[j] = p.d[j]
+        if p.kind[i] == CONTACT_SPIN:
+            nu[p.ptr[i + 1] - 1] = p.d[p.ptr[i]]
+
+
+cdef public int32_t lav_rows_diagonal(const blocks_t* p, const rows_t* r, double* d, double* nu, double* step,
+                                      int32_t* empty, double* minv_jac, double* coupling,
+                                      double* swing) noexcept nogil:
+    """d, nu, step, M^-1 J^T of joints, coupling and swing of contacts, from the factored form."""
+    cdef int32_t i, j, q, c, t, nt, spin, end, n_empty = 0, n_positive = 0, a, b
+    cdef double total = 0.0, mean, e, off, linear, inv
+    for i in range(r.n_joints):
+        a = r.joint_body[2 * i]
+        b = r.joint_body[2 * i + 1]
+        for j in range(p.ptr[i], p.ptr[i + 1]):
+            minv_times(r.jac + 12 * j, r.inv_mass, r.inv_inertia, a, b, minv_jac + 12 * j)
+            d[j] = dot12(r.jac + 12 * j, minv_jac + 12 * j) + r.compliance[j]
+            step[j] = 0.0
+    for c in range(r.n_contacts):
+        i = r.n_joints + c
+        j = p.ptr[i]
+        end = p.ptr[i + 1]
+        spin = p.kind[i] == CONTACT_SPIN
+        nt = n_tangents(p.kind[i], end - j)
+        contact_diagonal(r.normal + 3 * c, r.tangent + 3 * c, r.arm_a + 3 * c, r.arm_b + 3 * c, nt, spin,
+                         r.contact_body[2 * c], r.contact_body[2 * c + 1], r.inv_mass, r.inv_inertia, d + j, &off,
+                         coupling + 5 * c, swing + 6 * (j - p.ptr[r.n_joints]))
+        for q in range(end - j):
+            d[j + q] += r.compliance[j + q]
+            step[j + q] = 0.0
+        if nt > 0:
+            step[j + 1] = largest_eigenvalue(d[j + 1], off, d[j + 2]) if nt == 2 else d[j + 1]
+    for j in range(p.n_rows):
+        empty[j] = not d[j] > 0.0
+        n_empty += empty[j]
+        if d[j] > 0.0:
+            n_positive += 1
+            total += d[j] / p.n_rows
+    mean = total * p.n_rows / n_positive if n_positive > 0 and total > 0.0 else 1.0
+    for j in range(p.n_rows):
+        if not d[j] > 0.0:
+            d[j] = mean
+    for i in range(p.n_blocks):
+        j = p.ptr[i]
+        end = p.ptr[i + 1]
+        nt = 0 if p.kind[i] == ROW else n_tangents(p.kind[i], end - j)
+        if nt == 2:
+            d[j + 1] = 0.5 * (d[j + 1] + d[j + 2])
+            d[j + 2] = d[j + 1]
+        e = step[j + 1] if nt > 0 and step[j + 1] > 0.0 else (d[j + 1] if nt > 0 else 0.0)
+        for q in range(j, end):
+            step[q] = reciprocal(d[q])
+            nu[q] = d[q]
+        for t in range(1, 1 + nt):
+            step[j + t] = reciprocal(e)
+        if p.kind[i] == CONTACT_SPIN:
+            nu[end - 1] = d[j]
+        if i < r.n_joints:
+            for q in range(j, end):
+                linear = 0.0
+                for t in range(3):
+                    linear += fabs(r.jac[12 * q + t]) + fabs(r.jac[12 * q + 6 + t])
+                if linear == 0.0:
+                    inv = 0.0
+                    if r.joint_body[2 * i] >= 0:
+                        inv += r.inv_mass[r.joint_body[2 * i]]
+                    if r.joint_body[2 * i + 1] >= 0:
+                        inv += r.inv_mass[r.joint_body[2 * i + 1]]
+                    if inv > 0.0:
+                        nu[q] = inv
+    return n_empty
+
+
+cdef class Data:
+    """Pointers to a problem's arrays, and the numbers derived from them once.
+
+    The caller passes checked, C-contiguous float64 / int32 arrays; they are kept alive here. Either
+    `csr` = (indptr, indices, data) or `rows` = (joint_jac, joint_body, normal, tangent, arm_a, arm_b,
+    contact_body, inv_mass, inv_inertia, compliance).
+    """
+
+    def __init__(self, const int32_t[::1] ptr, const int32_t[::1] kind, const double[::1] lower,
+                 const double[::1] upper, const double[::1] mu, const double[::1] patch_radius,
+                 const double[::1] b, int law, csr=None, rows=None):
+        cdef int32_t m = <int32_t>b.shape[0], k = <int32_t>kind.shape[0], n_empty, i
+        cdef double[::1] d = np.empty(m + 1)
+        cdef double[::1] nu = np.empty(m + 1)
+        cdef double[::1] step = np.empty(m + 1)
+        cdef int32_t[::1] empty = np.zeros(m + 1, np.int32)
+        cdef const int32_t[::1] indptr, indices
+        cdef const double[::1] data
+        self.keep = [ptr, kind, lower, upper, mu, patch_radius, b, d, nu, step, csr, rows]
+        self.blocks.n_blocks = k
+        self.blocks.n_rows = m
+        self.blocks.law = law
+        self.blocks.ptr = &ptr[0]
+        self.blocks.d = &d[0]
+        self.blocks.nu = &nu[0]
+        self.blocks.step = &step[0]
+        if m > 0:
+            self.blocks.kind = &kind[0]
+            self.blocks.lower = &lower[0]
+            self.blocks.upper = &upper[0]
+            self.blocks.mu = &mu[0]
+            self.blocks.patch_radius = &patch_radius[0]
+            self.blocks.b = &b[0]
+        self.start_energy = self.start_velocity = -1.0
+        self.factored = rows is not None
+        self.single_rows = k == m
+        for i in range(k):
+            if kind[i] != ROW:
+                self.single_rows = False
+        if self.factored:
+            self._set_rows(rows)
+            n_empty = lav_rows_diagonal(&self.blocks, &self.rows, &d[0], &nu[0], &step[0], &empty[0],
+                                        <double*>self.rows.minv_jac, <double*>self.rows.coupling,
+                                        <double*>self.rows.swing)
+        else:
+            indptr, indices, data = csr
+            self.csr.indptr = &indptr[0]
+            if data.shape[0] > 0:
+                self.csr.indices = &indices[0]
+                self.csr.data = &data[0]
+            n_empty = lav_csr_diagonal(&self.blocks, &self.csr, &d[0], &step[0], &empty[0])
+            lav_matrix_nu(&self.blocks, &nu[0])
+        self.d = _read_only(np.asarray(d)[:m])
+        self.nu = _read_only(np.asarray(nu)[:m])
+        self.step = _read_only(np.asarray(step)[:m])
+        self.empty = np.flatnonzero(np.asarray(empty)[:m]) if n_empty else np.empty(0, np.intp)
+
+    def _set_rows(self, rows):
+        cdef const double[:, ::1] jac, normal, tangent, arm_a, arm_b
+        cdef const int32_t[:, ::1] joint_body, contact_body
+        cdef const double[::1] inv_mass, compliance
+        cdef const double[:, :, ::1] inv_inertia
+        cdef double[:, ::1] minv_jac, coupling, swing
+        jac, joint_body, normal, tangent, arm_a, arm_b, contact_body, inv_mass, inv_inertia, compliance = rows
+        minv_jac = np.zeros((jac.shape[0] + 1, 12))
+        coupling = np.zeros((normal.shape[0] + 1, 5))
+        swing = np.zeros((self.blocks.n_rows - jac.shape[0] + 1, 6))
+        self.keep += [minv_jac, coupling, swing]
+        self.rows.n_bodies = <int32_t>inv_mass.shape[0]
+        self.rows.n_joints = <int32_t>joint_body.shape[0]
+        self.rows.n_contacts = <int32_t>contact_body.shape[0]
+        self.rows.minv_jac = &minv_jac[0, 0]
+        self.rows.coupling = &coupling[0, 0]
+        self.rows.swing = &swing[0, 0]
+        if jac.shape[0]:
+            self.rows.jac = &jac[0, 0]
+        if self.rows.n_joints:
+            self.rows.joint_body = &joint_body[0, 0]
+        if self.rows.n_contacts:
+            self.rows.normal = &normal[0, 0]
+            self.rows.tangent = &tangent[0, 0]
+            self.rows.arm_a = &arm_a[0, 0]
+            self.rows.arm_b = &arm_b[0, 0]
+            self.rows.contact_body = &contact_body[0, 0]
+        if self.rows.n_bodies:
+            self.rows.inv_mass = &inv_mass[0]
+            self.rows.inv_inertia = &inv_inertia[0, 0, 0]
+        if compliance.shape[0]:
+            self.rows.compliance = &compliance[0]
+
+    @property
+    def n_rows(self):
+        return self.blocks.n_rows
+
+    @property
+    def n_blocks(self):
+        return self.blocks.n_blocks
+
+    @property
+    def n_bodies(self):
+        return self.rows.n_bodies
+
+    @property
+    def work(self):
+        """Rough number of multiply-adds of one sweep; the front door sizes its chunks by it."""
+        if self.factored:
+            return 24 * self.rows.n_joints + 60 * self.rows.n_contacts + 12 * self.blocks.n_rows
+        return self.csr.indptr[self.blocks.n_rows] + 4 * self.blocks.n_rows
+
+    @property
+    def weight(self):
+        """sqrt(nu d) (m,) 1/kg: velocity error of a row per N s of e."""
+        if self._weight is None:
+            self._weight = _read_only(np.sqrt(self.nu) * np.sqrt(self.d))
+        return self._weight
+
+    def set_start(self, double energy, double velocity):
+        """Error of doing nothing [sqrt J, m/s], once known; negative before."""
+        self.start_energy = energy
+        self.start_velocity = velocity
+
+
+def _read_only(x):
+    x.flags.writeable = False
+    return x
+
+
+def dense_to_csr(const double[:, ::1] a):
+    """Nonzeros of a dense matrix as (indptr, indices, data), int32; nnz must be below 2^31."""
+    cdef Py_ssize_t i, j, n = a.shape[0], m = a.shape[1], nnz = 0, q = 0
+    for i in range(n):
+        for j in range(m):
+            nnz += a[i, j] != 0.0
+    cdef int32_t[::1] indptr = np.zeros(n + 1, np.int32)
+    cdef int32_t[::1] indices = np.empty(max(nnz, 1), np.int32)
+    cdef double[::1] data = np.empty(max(nnz, 1))
+    for i in range(n):
+        for j in range(m):
+            if a[i, j] != 0.0:
+                indices[q] = <int32_t>j
+                data[q] = a[i, j]
+                q += 1
+        indptr[i + 1] = <int32_t>q
+    return np.asarray(indptr), np.asarray(indices)[:nnz], np.asarray(data)[:nnz]
+
+
+def rows_velocity(Data p, const double[:, ::1] v, double[::1] out):
+    """J v (m,) of a factored problem, v (n, 6) [m/s, rad/s]."""
+    if p.blocks.n_rows and p.rows.n_bodies:
+        rows_times(&p.blocks, &p.rows, &v[0, 0], &out[0])
+    else:
+        out[:] = 0.0

@@ -1,0 +1,433 @@
+"""The factored form: joint rows, compact contacts, and the bodies between them.
+
+A body's velocity is six numbers (linear [m/s], angular [rad/s]); body -1 is static, read as zero and
+never written. Relative velocity at a contact, from body a to body b,
+
+    u = (v_b + omega_b x arm_b) - (v_a + omega_a x arm_a)                                      (1)
+    w_n = n.u,  w_t = t.u with t2 = n x t1,  w_s = n.(omega_b - omega_a)                       (2)
+
+and an impulse P [N s] with spin s [N m s] along n changes
+
+    v_b += P / m_b,  omega_b += I_b^-1 (arm_b x P + s n),  and the opposite on a.              (3)
+
+Because the rows of one contact couple by A_tn, A_sn, A_st alone, a sweep reads u once, follows it
+through these couplings, and writes both bodies once, omega by the stored I^-1 (arm x axis) of each row
+(`swing`: a product instead of two on the way from one contact to the next, 1.3 times as fast):
+
+    w_t after the normal's step = t.u + A_tn (change of lam_n), and so on.                     (4)
+"""
+from libc.float cimport DBL_MAX
+from libc.math cimport fabs, sqrt
+from libc.stdint cimport int32_t
+
+from lavender_ext.core.block cimport (CONTACT_SPIN, blocks_t, n_tangents, relax_normal, relax_row,
+                                      relax_tangents)
+
+
+cdef struct rows_t:
+    int32_t n_bodies            # n
+    int32_t n_joints            # kj: the first kj blocks are joints, the others contacts
+    int32_t n_contacts          # c
+    const double* jac           # (mj, 12) rows of a joint: linear and angular on a, then on b
+    const double* minv_jac      # (mj, 12) M^-1 J^T, same layout
+    const int32_t* joint_body   # (kj, 2)
+    const double* normal        # (c, 3) unit, from a to b
+    const double* tangent       # (c, 3) unit, normal to `normal`; t2 = n x t1
+    const double* arm_a         # (c, 3) m, contact point minus centre of a
+    const double* arm_b         # (c, 3) m
+    const int32_t* contact_body  # (c, 2)
+    const double* coupling      # (c, 5) 1/kg: A_t1n, A_t2n, A_sn, A_st1, A_st2 without compliance
+    const double* swing         # (contact rows, 6) 1/(kg m): change of -omega_a and omega_b by a unit impulse
+    const double* inv_mass      # (n) 1/kg
+    const double* inv_inertia   # (n, 9) 1/(kg m^2), world
+    const double* compliance    # (m) 1/kg
+
+
+cdef inline double dot3(const double* a, const double* b) noexcept nogil:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+cdef inline void cross(const double* a, const double* b, double* out) noexcept nogil:
+    out[0] = a[1] * b[2] - a[2] * b[1]
+    out[1] = a[2] * b[0] - a[0] * b[2]
+    out[2] = a[0] * b[1] - a[1] * b[0]
+
+
+cdef inline void relative_velocity(const double* v, int32_t a, int32_t b, const double* arm_a,
+                                   const double* arm_b, double* u, double* spin) noexcept nogil:
+    # (1) in u, and omega_b - omega_a in spin.
+    cdef const double* x
+    cdef int32_t k
+    for k in range(3):
+        u[k] = 0.0
+        spin[k] = 0.0
+    if b >= 0:
+        x = v + 6 * b
+        u[0] = x[0] + (x[4] * arm_b[2] - x[5] * arm_b[1])
+        u[1] = x[1] + (x[5] * arm_b[0] - x[3] * arm_b[2])
+        u[2] = x[2] + (x[3] * arm_b[1] - x[4] * arm_b[0])
+        for k in range(3):
+            spin[k] = x[3 + k]
+    if a >= 0:
+        x = v + 6 * a
+        u[0] -= x[0] + (x[4] * arm_a[2] - x[5] * arm_a[1])
+        u[1] -= x[1] + (x[5] * arm_a[0] - x[3] * arm_a[2])
+        u[2] -= x[2] + (x[3] * arm_a[1] - x[4] * arm_a[0])
+        for k in range(3):
+            spin[k] -= x[3 + k]
+
+
+cdef inline void push(double* v, double inv_mass, const double* inv_inertia, const double* arm,
+                      const double* impulse, const double* twist, double sign) noexcept nogil:
+    # (3) for one body; twist = s n, or NULL.
+    cdef double l[3]
+    cdef int32_t k
+    cross(arm, impulse, l)
+    if twist != NULL:
+        for k in range(3):
+            l[k] += twist[k]
+    for k in range(3):
+        l[k] = sign * l[k]
+        v[k] += sign * inv_mass * impulse[k]
+    for k in range(3):
+        v[3 + k] += dot3(inv_inertia + 3 * k, l)
+
+
+cdef inline void push_bodies(double* v, int32_t a, int32_t b, const double* inv_mass,
+                             const double* inv_inertia, const double* arm_a, const double* arm_b,
+                             const double* impulse, const double* twist) noexcept nogil:
+    if a >= 0:
+        push(v + 6 * a, inv_mass[a], inv_inertia + 9 * a, arm_a, impulse, twist, -1.0)
+    if b >= 0:
+        push(v + 6 * b, inv_mass[b], inv_inertia + 9 * b, arm_b, impulse, twist, 1.0)
+
+
+cdef inline double joint_velocity(const double* jac, const double* v, int32_t a, int32_t b) noexcept nogil:
+    cdef double s = 0.0, t = 0.0
+    cdef int32_t k
+    if a >= 0:
+        for k in range(6):
+            s += jac[k] * v[6 * a + k]
+    if b >= 0:
+        for k in range(6):
+            t += jac[6 + k] * v[6 * b + k]
+    return s + t
+
+
+cdef inline void joint_push(const double* minv_jac, double change, double* v, int32_t a,
+                            int32_t b) noexcept nogil:
+    cdef int32_t k
+    if a >= 0:
+        for k in range(6):
+            v[6 * a + k] += change * minv_jac[k]
+    if b >= 0:
+        for k in range(6):
+            v[6 * b + k] += change * minv_jac[6 + k]
+
+
+cdef inline void relax_joint(const blocks_t* p, const rows_t* r, int32_t i, double* lam,
+                             double* v) noexcept nogil:
+    """One joint, its rows in turn: w = J v + c lam - b, equation (1) of core/block.pxd."""
+    cdef int32_t j, a = r.joint_body[2 * i], b = r.joint_body[2 * i + 1]
+    cdef double w, y
+    for j in range(p.ptr[i], p.ptr[i + 1]):
+        w = joint_velocity(r.jac + 12 * j, v, a, b) + r.compliance[j] * lam[j] - p.b[j]
+        y = relax_row(lam[j], w, p.step[j], p.lower[j], p.upper[j])
+        joint_push(r.minv_jac + 12 * j, y - lam[j], v, a, b)
+        lam[j] = y
+
+
+cdef inline void swing_body(double* v, double inv_mass, const double* swing, const double* impulse, double dn,
+                            double d0, double d1, double ds, int32_t nt, int32_t spin,
+                            double sign) noexcept nogil:
+    # (3) for one body: swing is at the first row of this contact and this side.
+    cdef int32_t k
+    cdef double w
+    for k in range(3):
+        v[k] += sign * (inv_mass * impulse[k])
+        w = dn * swing[k]
+        if nt > 0:
+            w += d0 * swing[6 + k]
+        if nt > 1:
+            w += d1 * swing[12 + k]
+        if spin:
+            w += ds * swing[6 * (1 + nt) + k]
+        v[3 + k] += sign * w
+
+
+cdef inline void relax_contact(const double* normal, const double* tangent, const double* arm_a,
+                               const double* arm_b, const double* coupling, const double* swing,
+                               const double* compliance, const double* rhs, const double* step, double mu,
+                               double patch_radius, int32_t nt, int32_t spin, int32_t a, int32_t b,
+                               const double* inv_mass, double* lam, double* v) noexcept nogil:
+    """One contact: normal, tangents together, spin; all pointers are at this contact's first entry."""
+    cdef double u[3]
+    cdef double omega[3]
+    cdef double t2[3]
+    cdef double impulse[3]
+    cdef double w[2]
+    cdef double old[2]
+    cdef double y, dn, ds = 0.0, d0 = 0.0, d1 = 0.0
+    cdef int32_t k, js = 1 + nt
+    relative_velocity(v, a, b, arm_a, arm_b, u, omega)
+    y = relax_normal(lam[0], dot3(normal, u) + (compliance[0] * lam[0] - rhs[0]), step[0])
+    dn = y - lam[0]
+    lam[0] = y
+    for k in range(3):
+        impulse[k] = dn * normal[k]
+    if nt > 0:
+        old[0] = lam[1]
+        w[0] = (dot3(tangent, u) + (compliance[1] * lam[1] - rhs[1])) + coupling[0] * dn
+        if nt == 2:
+            cross(normal, tangent, t2)
+            old[1] = lam[2]
+            w[1] = (dot3(t2, u) + (compliance[2] * lam[2] - rhs[2])) + coupling[1] * dn
+        relax_tangents(lam + 1, w, step[1], mu * y, nt)
+        d0 = lam[1] - old[0]
+        for k in range(3):
+            impulse[k] += d0 * tangent[k]
+        if nt == 2:
+            d1 = lam[2] - old[1]
+            for k in range(3):
+                impulse[k] += d1 * t2[k]
+    if spin:
+        w[0] = (dot3(normal, omega) + (compliance[js] * lam[js] - rhs[js])
+                + coupling[2] * dn + coupling[3] * d0 + coupling[4] * d1)
+        y = relax_row(lam[js], w[0], step[js], -(mu * patch_radius * y), mu * patch_radius * y)
+        ds = y - lam[js]
+        lam[js] = y
+    if a >= 0:
+        swing_body(v + 6 * a, inv_mass[a], swing, impulse, dn, d0, d1, ds, nt, spin, -1.0)
+    if b >= 0:
+        swing_body(v + 6 * b, inv_mass[b], swing + 3, impulse, dn, d0, d1, ds, nt, spin, 1.0)
+
+
+cdef inline void relax_contact_block(const blocks_t* p, const rows_t* r, int32_t i, double* lam,
+                                     double* v) noexcept nogil:
+    # The two common kinds with their sizes as constants: a compiler then leaves out the rows that are not
+    # there.
+    cdef int32_t c = i - r.n_joints, j = p.ptr[i], kind = p.kind[i], nt = n_tangents(kind, p.ptr[i + 1] - j)
+    cdef const double* swing = r.swing + 6 * (j - p.ptr[r.n_joints])
+    if kind == CONTACT_SPIN or nt == 1:
+        relax_contact(r.normal + 3 * c, r.tangent + 3 * c, r.arm_a + 3 * c, r.arm_b + 3 * c,
+                      r.coupling + 5 * c, swing, r.compliance + j, p.b + j, p.step + j, p.mu[i],
+                      p.patch_radius[i],
+                      nt, kind == CONTACT_SPIN, r.contact_body[2 * c], r.contact_body[2 * c + 1], r.inv_mass,
+                      lam + j, v)
+    elif nt == 2:
+        relax_contact(r.normal + 3 * c, r.tangent + 3 * c, r.arm_a + 3 * c, r.arm_b + 3 * c,
+                      r.coupling + 5 * c, swing, r.compliance + j, p.b + j, p.step + j, p.mu[i], 0.0, 2, 0,
+                      r.contact_body[2 * c], r.contact_body[2 * c + 1], r.inv_mass, lam + j, v)
+    else:
+        relax_contact(r.normal + 3 * c, NULL, r.arm_a + 3 * c, r.arm_b + 3 * c, NULL, swing, r.compliance + j,
+                      p.b + j, p.step + j, 0.0, 0.0, 0, 0, r.contact_body[2 * c], r.contact_body[2 * c + 1],
+                      r.inv_mass, lam + j, v)
+
+
+cdef inline void relax_rows_block(const blocks_t* p, const rows_t* r, int32_t i, double* lam,
+                                  double* v) noexcept nogil:
+    if i < r.n_joints:
+        relax_joint(p, r, i, lam, v)
+    else:
+        relax_contact_block(p, r, i, lam, v)
+
+
+cdef inline void contact_slack(const rows_t* r, int32_t c, int32_t nt, int32_t spin, const double* v,
+                               double* w) noexcept nogil:
+    # (2): J v of one contact.
+    cdef double u[3]
+    cdef double omega[3]
+    cdef double t2[3]
+    cdef const double* n = r.normal + 3 * c
+    relative_velocity(v, r.contact_body[2 * c], r.contact_body[2 * c + 1], r.arm_a + 3 * c,
+                      r.arm_b + 3 * c, u, omega)
+    w[0] = dot3(n, u)
+    if nt > 0:
+        w[1] = dot3(r.tangent + 3 * c, u)
+    if nt == 2:
+        cross(n, r.tangent + 3 * c, t2)
+        w[2] = dot3(t2, u)
+    if spin:
+        w[1 + nt] = dot3(n, omega)
+
+
+cdef inline void rows_times(const blocks_t* p, const rows_t* r, const double* v, double* out) noexcept nogil:
+    # J v (m) of all rows; v (n, 6).
+    cdef int32_t i, j, c
+    for i in range(r.n_joints):
+        for j in range(p.ptr[i], p.ptr[i + 1]):
+            out[j] = joint_velocity(r.jac + 12 * j, v, r.joint_body[2 * i], r.joint_body[2 * i + 1])
+    for c in range(r.n_contacts):
+        i = r.n_joints + c
+        j = p.ptr[i]
+        contact_slack(r, c, n_tangents(p.kind[i], p.ptr[i + 1] - j), p.kind[i] == CONTACT_SPIN, v, out + j)
+
+
+cdef inline void contact_push(const rows_t* r, int32_t c, int32_t nt, int32_t spin, const double* lam,
+                              double* v) noexcept nogil:
+    # v += M^-1 J^T lam of one contact.
+    cdef double t2[3]
+    cdef double impulse[3]
+    cdef double twist[3]
+    cdef const double* n = r.normal + 3 * c
+    cdef int32_t k
+    for k in range(3):
+        impulse[k] = lam[0] * n[k]
+        twist[k] = 0.0
+    if nt > 0:
+        for k in range(3):
+            impulse[k] += lam[1] * r.tangent[3 * c + k]
+    if nt == 2:
+        cross(n, r.tangent + 3 * c, t2)
+        for k in range(3):
+            impulse[k] += lam[2] * t2[k]
+    if spin:
+        for k in range(3):
+            twist[k] = lam[1 + nt] * n[k]
+    push_bodies(v, r.contact_body[2 * c], r.contact_body[2 * c + 1], r.inv_mass, r.inv_inertia,
+                r.arm_a + 3 * c, r.arm_b + 3 * c, impulse, twist)
+
+
+cdef inline void contact_jacobian(const rows_t* r, int32_t c, int32_t nt, int32_t spin,
+                                  double* jac) noexcept nogil:
+    # Rows of one contact as (1 + nt + spin, 12), in the layout of joint rows.
+    cdef double axis[3]
+    cdef double arm[3]
+    cdef const double* n = r.normal + 3 * c
+    cdef int32_t row, k
+    for row in range(1 + nt + spin):
+        for k in range(12):
+            jac[12 * row + k] = 0.0
+        if row > nt:                                    # spin
+            for k in range(3):
+                jac[12 * row + 3 + k] = -n[k]
+                jac[12 * row + 9 + k] = n[k]
+            continue
+        if row == 0:
+            for k in range(3):
+                axis[k] = n[k]
+        elif row == 1:
+            for k in range(3):
+                axis[k] = r.tangent[3 * c + k]
+        else:
+            cross(n, r.tangent + 3 * c, axis)
+        cross(r.arm_a + 3 * c, axis, arm)
+        for k in range(3):
+            jac[12 * row + k] = -axis[k]
+            jac[12 * row + 3 + k] = -arm[k]
+            jac[12 * row + 6 + k] = axis[k]
+        cross(r.arm_b + 3 * c, axis, arm)
+        for k in range(3):
+            jac[12 * row + 9 + k] = arm[k]
+    # A static side has no columns.
+    for row in range(1 + nt + spin):
+        for k in range(6):
+            if r.contact_body[2 * c] < 0:
+                jac[12 * row + k] = 0.0
+            if r.contact_body[2 * c + 1] < 0:
+                jac[12 * row + 6 + k] = 0.0
+
+
+cdef inline void minv_times(const double* jac, const double* inv_mass, const double* inv_inertia, int32_t a,
+                            int32_t b, double* out) noexcept nogil:
+    # M^-1 J^T of one row, in the layout of joint rows.
+    cdef int32_t k
+    for k in range(12):
+        out[k] = 0.0
+    if a >= 0:
+        for k in range(3):
+            out[k] = inv_mass[a] * jac[k]
+            out[3 + k] = dot3(inv_inertia + 9 * a + 3 * k, jac + 3)
+    if b >= 0:
+        for k in range(3):
+            out[6 + k] = inv_mass[b] * jac[6 + k]
+            out[9 + k] = dot3(inv_inertia + 9 * b + 3 * k, jac + 9)
+
+
+cdef inline void contact_diagonal(const double* normal, const double* tangent, const double* arm_a,
+                                  const double* arm_b,
+                                  int32_t nt, int32_t spin, int32_t a, int32_t b, const double* inv_mass,
+                                  const double* inv_inertia, double* d, double* t12, double* coupling,
+                                  double* swing) noexcept nogil:
+    """A among the rows of one contact, without compliance: diagonal d (1 + nt + spin), t12 = A_t1t2,
+    coupling (5).
+
+    And swing (1 + nt + spin, 6): I_a^-1 (arm_a x axis), I_b^-1 (arm_b x axis) of each row, 0 where static.
+
+    With l = arm x axis (for spin l = n), A_pq = (sum 1/m) p.q + sum l_p . I^-1 l_q over both bodies.
+    """
+    cdef double axis[12]        # n, t1, t2
+    cdef double l[9]
+    cdef double k[9]
+    cdef double ks[3]
+    cdef double m = 0.0
+    cdef const double* arm
+    cdef const double* inv
+    cdef int32_t side, body, i, q
+    for i in range(3):
+        axis[i] = normal[i]
+    if nt > 0:
+        for i in range(3):
+            axis[3 + i] = tangent[i]
+    if nt > 1:
+        cross(normal, tangent, axis + 6)
+    for i in range(1 + nt + spin):
+        d[i] = 0.0
+    for i in range(6 * (1 + nt + spin)):
+        swing[i] = 0.0
+    t12[0] = 0.0
+    if nt + spin > 0:
+        for i in range(5):
+            coupling[i] = 0.0
+    for side in range(2):
+        body = a if side == 0 else b
+        if body < 0:
+            continue
+        arm = arm_a if side == 0 else arm_b
+        inv = inv_inertia + 9 * body
+        m += inv_mass[body]
+        for i in range(1 + nt):
+            cross(arm, axis + 3 * i, l + 3 * i)
+            for q in range(3):
+                k[3 * i + q] = dot3(inv + 3 * q, l + 3 * i)
+                swing[6 * i + 3 * side + q] = k[3 * i + q]
+            d[i] += dot3(l + 3 * i, k + 3 * i)
+        if nt > 0:
+            coupling[0] += dot3(l + 3, k)
+        if nt > 1:
+            coupling[1] += dot3(l + 6, k)
+            t12[0] += dot3(l + 3, k + 6)
+        if spin:
+            for q in range(3):
+                ks[q] = dot3(inv + 3 * q, normal)
+                swing[6 * (1 + nt) + 3 * side + q] = ks[q]
+            d[1 + nt] += dot3(normal, ks)
+            coupling[2] += dot3(normal, k)
+            for i in range(nt):
+                coupling[3 + i] += dot3(normal, k + 3 + 3 * i)
+    for i in range(1 + nt):
+        d[i] += m * dot3(axis + 3 * i, axis + 3 * i)
+    if nt > 0:
+        coupling[0] += m * dot3(axis + 3, axis)
+    if nt > 1:
+        coupling[1] += m * dot3(axis + 6, axis)
+        t12[0] += m * dot3(axis + 3, axis + 6)
+
+
+cdef inline double reciprocal(double x) noexcept nogil:
+    # 1/x kept finite where x is denormal.
+    return 1.0 / x if x * DBL_MAX > 1.0 else DBL_MAX
+
+
+cdef inline double largest_eigenvalue(double a, double b, double c) noexcept nogil:
+    # of [[a, b], [b, c]]
+    cdef double h = 0.5 * (a - c)
+    return 0.5 * (a + c) + sqrt(h * h + b * b)
+
+
+cdef inline double dot12(const double* x, const double* y) noexcept nogil:
+    cdef double s = 0.0
+    cdef int32_t k
+    for k in range(12):
+        s += x[k] * y[k]
+    return s

@@ -1,0 +1,276 @@
+"""The flat arrays of LavenderSim: three buffers, one layout.
+
+Everything the engine knows lies in a buffer of doubles, one of int32 and one of uint64, allocated by the
+caller. `bind` lays the arrays out one after the other, so that a host (Python, WebAssembly) needs the
+sizes and three pointers, and a snapshot is a copy of three buffers. An array that the scene does not
+need has length 0: no frames for spheres, no tangents without friction, no joint rows without joints.
+
+Bodies stand in the order of the scene, static ones among them; the velocity solve sees the dynamic ones
+only, by their number `dyn` (-1 = static), as core/rows.pxd asks.
+"""
+from libc.stdint cimport int32_t, int64_t, uint64_t
+
+
+# size[]: what `bind` needs to know
+cdef enum:
+    N_BODY = 0
+    N_DYNAMIC = 1
+    N_JOINT = 2
+    N_JOINT_ROW = 3
+    N_EXCLUDED = 4
+    N_BUCKET = 5            # buckets of the hash grid, a power of two; 0: all pairs are tested
+    N_FRAME = 6             # rotation matrices: n_bodies where boxes, joints or uneven inertia are, else 0
+    ROWS_PER_CONTACT = 7    # 1 without friction, 3 with, 4 with patch friction
+    CAP_PAIR = 8
+    CAP_CONTACT = 9
+    N_SIZES = 10
+
+# head[]: integers that change
+cdef enum:
+    H_CONTACTS = 0
+    H_CONTACT_ROWS = 1
+    H_PAIRS = 2
+    H_PAIRS_VALID = 3       # 0: the pair list must be rebuilt
+    H_MATCHES = 4
+    H_CACHED = 5            # contacts in the cache
+    H_ITERATIONS = 6
+    H_WARM_START = 7
+    H_POSITION_ITERATIONS = 8
+    H_ORDER = 9
+    H_SEED = 10
+    H_STEP = 11             # substeps done, wraps
+    H_NEED_PAIRS = 12
+    H_NEED_CONTACTS = 13
+    H_REBUILDS = 14
+    H_PROJECTED = 15        # position sweeps done in the last substep
+    H_LOST = 16             # first body whose state is not finite, or -1
+    N_HEAD = 24
+
+# setting[]: real numbers; those from S_OUT on are written by the engine
+cdef enum:
+    S_H = 0                 # s, substep
+    S_GRAVITY = 1           # m/s^2, three
+    S_SLOP = 4              # m
+    S_MARGIN = 5            # m, contacts are made below this gap
+    S_SKIN = 6              # m, by which the boxes of the pair list are larger
+    S_BETA = 7              # -, share of the position error removed per substep
+    S_MAX_PUSH = 8          # m, largest error corrected per substep
+    S_BOUNCE = 9            # m/s, closing speed below which restitution is 0
+    S_MATCH = 10            # m, a cached contact further away than this is stale
+    S_OUT = 12              # the eight solver values
+    S_DEPTH = 20            # m, deepest penetration
+    S_JOINT_ERROR = 21      # m or rad, largest joint error
+    N_SETTINGS = 24
+
+# status of a substep
+cdef enum:
+    OK = 0
+    NEED_ROOM = 1           # H_NEED_PAIRS, H_NEED_CONTACTS say how much; no state has changed
+    NOT_FINITE = 2          # H_LOST names the body
+
+# shapes
+cdef enum:
+    NO_SHAPE = 0
+    PLANE = 1
+    SPHERE = 2
+    BOX = 3
+
+# joints
+cdef enum:
+    DISTANCE = 0
+    BALL = 1
+    HINGE = 2
+
+# joint parameters, in doubles
+cdef enum:
+    J_ANCHOR_A = 0          # m, in the frame of a, three
+    J_ANCHOR_B = 3          # m, in the frame of b, three
+    J_AXIS_A = 6            # -, unit, in the frame of a, three
+    J_AXIS_B = 9            # -, unit, in the frame of b, three
+    J_SIDE_A = 12           # -, unit, normal to the axis, in the frame of a, three
+    J_LENGTH = 15           # m
+    J_HERTZ = 16            # 1/s, 0 = rigid
+    J_DAMPING = 17          # -, damping ratio
+    J_SPEED = 18            # rad/s, of b against a
+    J_TORQUE = 19           # N m, largest of the motor
+    N_JOINT_REAL = 20
+
+# how a cached contact stores its impulse: normal, friction as a world vector, spin
+cdef enum:
+    N_CACHE_IMPULSE = 5
+
+
+cdef struct engine_t:
+    const int32_t* size
+    double* setting         # (N_SETTINGS)
+    int32_t* head           # (N_HEAD)
+    # bodies
+    double* x               # (n, 3) m
+    double* q               # (n, 4) unit quaternion w, x, y, z
+    double* v               # (n, 6) m/s, rad/s
+    double* inv_mass_body   # (n) 1/kg, 0 = static
+    double* inertia         # (n, 9) kg m^2, in the body's frame
+    double* inv_inertia_body  # (n, 9) 1/(kg m^2), in the body's frame
+    double* shape           # (n, 4) m: plane normal and offset, sphere radius, box half extents
+    double* friction        # (n) -
+    double* restitution     # (n) -
+    double* patch           # (n) m
+    double* rot             # (N_FRAME, 9) body to world
+    double* fat             # (n, 6) m, box of the pair list: low, high
+    int32_t* kind_of_shape  # (n)
+    int32_t* dyn            # (n) number among the dynamic bodies, -1 = static
+    int32_t* uneven         # (n) 1 where the inertia has a direction
+    # joints
+    double* joint           # (kj, N_JOINT_REAL)
+    double* joint_error     # (mj) m or rad
+    int32_t* joint_kind     # (kj)
+    int32_t* joint_motor    # (kj) 0 or 1
+    int32_t* joint_bodies   # (kj, 2) bodies, -1 = the world
+    int32_t* joint_body     # (kj, 2) dynamic numbers, -1 = static; contact_body follows
+    double* jac             # (mj, 12)
+    double* minv_jac        # (mj, 12)
+    int32_t* excluded       # (N_EXCLUDED, 2) pairs that never collide, sorted
+    # pairs
+    int32_t* pair           # (CAP_PAIR, 2) bodies a < b, sorted
+    int32_t* pair_scratch   # (CAP_PAIR, 2)
+    int32_t* count          # (n + 1)
+    int32_t* bucket         # (N_BUCKET) first body of the chain
+    int32_t* chain          # (n) next body of the chain
+    int32_t* cell           # (n, 4) cell and level
+    # contacts
+    int32_t* contact_pair   # (c, 2) bodies
+    int32_t* contact_body   # (c, 2) dynamic numbers; right after joint_body, so that all blocks follow
+    double* point           # (c, 3) m
+    double* gap             # (c) m, negative = penetration
+    double* normal          # (c, 3)
+    double* tangent         # (c, 3), absent without friction
+    double* arm_a           # (c, 3) m
+    double* arm_b           # (c, 3) m
+    double* coupling        # (c, 5) 1/kg, absent without friction
+    double* swing           # (contact rows, 6) 1/(kg m)
+    double* local           # (c, 6) m, arms in the frames of a and b
+    double* target          # (m) m/s
+    double* push            # (c + mj) N s / s: multipliers of the position projection
+    uint64_t* key           # (c)
+    # the cache
+    uint64_t* cache_key     # (c)
+    double* cache_impulse   # (c, N_CACHE_IMPULSE) N s, N m s
+    double* cache_local     # (c, 6) m
+    double* joint_impulse   # (mj) N s, N m s
+    # the velocity problem, as blocks_t and rows_t see it
+    int32_t* ptr            # (kj + c + 1)
+    int32_t* kind           # (kj + c)
+    double* lower           # (mj) N s, of the joint rows
+    double* upper           # (mj) N s
+    double* mu              # (kj + c)
+    double* patch_radius    # (kj + c) m
+    double* b               # (m) m/s
+    double* d               # (m) 1/kg
+    double* step            # (m) kg
+    double* compliance      # (m) 1/kg
+    double* impulse         # (m) N s, N m s
+    double* inv_mass        # (nd) 1/kg
+    double* inv_inertia     # (nd, 9) 1/(kg m^2), world
+    double* v_free          # (nd, 6) m/s, rad/s
+    double* dv              # (nd, 6) m/s, rad/s
+    double* shift           # (nd, 6) m, rad: the position projection
+    int32_t* body_of        # (nd) body of a dynamic number
+    int32_t* order          # (kj + c) sweep order of the blocks
+    int32_t* order_scratch  # (2 (n + kj + c) + 8): level of each body, of each block, places
+    uint64_t* color_scratch  # (nd)
+
+
+cdef inline double* reals(double* base, int64_t* at, int64_t count) noexcept nogil:
+    cdef double* p = base + at[0]
+    at[0] += count
+    return p
+
+
+cdef inline int32_t* ints(int32_t* base, int64_t* at, int64_t count) noexcept nogil:
+    cdef int32_t* p = base + at[0]
+    at[0] += count
+    return p
+
+
+cdef inline void bind(const int32_t* size, double* real, int32_t* index, uint64_t* keys, engine_t* e,
+                      int64_t* used) noexcept nogil:
+    """Point every array of `e` into the three buffers; used (3): entries that the buffers must hold."""
+    cdef int64_t n = size[N_BODY], nd = size[N_DYNAMIC], kj = size[N_JOINT], mj = size[N_JOINT_ROW]
+    cdef int64_t c = size[CAP_CONTACT], p = size[CAP_PAIR], k = kj + c, m = mj + c * size[ROWS_PER_CONTACT]
+    cdef int64_t frames = size[N_FRAME], nt = c if size[ROWS_PER_CONTACT] > 1 else 0
+    cdef int64_t grid = n if size[N_BUCKET] > 0 else 0
+    cdef int64_t i = 0, j = 0
+    e.size = size
+    e.setting = reals(real, &i, N_SETTINGS)
+    e.x = reals(real, &i, 3 * n)
+    e.q = reals(real, &i, 4 * n)
+    e.v = reals(real, &i, 6 * n)
+    e.inv_mass_body = reals(real, &i, n)
+    e.inertia = reals(real, &i, 9 * n)
+    e.inv_inertia_body = reals(real, &i, 9 * n)
+    e.shape = reals(real, &i, 4 * n)
+    e.friction = reals(real, &i, n)
+    e.restitution = reals(real, &i, n)
+    e.patch = reals(real, &i, n)
+    e.rot = reals(real, &i, 9 * frames)
+    e.fat = reals(real, &i, 6 * n)
+    e.joint = reals(real, &i, N_JOINT_REAL * kj)
+    e.joint_error = reals(real, &i, mj)
+    e.jac = reals(real, &i, 12 * mj)
+    e.minv_jac = reals(real, &i, 12 * mj)
+    e.joint_impulse = reals(real, &i, mj)
+    e.inv_mass = reals(real, &i, nd)
+    e.inv_inertia = reals(real, &i, 9 * nd)
+    e.v_free = reals(real, &i, 6 * nd)
+    e.dv = reals(real, &i, 6 * nd)
+    e.shift = reals(real, &i, 6 * nd)
+    e.point = reals(real, &i, 3 * c)
+    e.gap = reals(real, &i, c)
+    e.normal = reals(real, &i, 3 * c)
+    e.tangent = reals(real, &i, 3 * nt)
+    e.arm_a = reals(real, &i, 3 * c)
+    e.arm_b = reals(real, &i, 3 * c)
+    e.coupling = reals(real, &i, 5 * nt)
+    e.swing = reals(real, &i, 6 * (m - mj))
+    e.local = reals(real, &i, 6 * c)
+    e.cache_impulse = reals(real, &i, N_CACHE_IMPULSE * c)
+    e.cache_local = reals(real, &i, 6 * c)
+    e.push = reals(real, &i, mj + c)
+    e.target = reals(real, &i, m)
+    e.lower = reals(real, &i, mj)
+    e.upper = reals(real, &i, mj)
+    e.b = reals(real, &i, m)
+    e.d = reals(real, &i, m)
+    e.step = reals(real, &i, m)
+    e.compliance = reals(real, &i, m)
+    e.impulse = reals(real, &i, m)
+    e.mu = reals(real, &i, k)
+    e.patch_radius = reals(real, &i, k)
+    e.head = ints(index, &j, N_HEAD)
+    e.kind_of_shape = ints(index, &j, n)
+    e.dyn = ints(index, &j, n)
+    e.uneven = ints(index, &j, n)
+    e.body_of = ints(index, &j, nd)
+    e.joint_kind = ints(index, &j, kj)
+    e.joint_motor = ints(index, &j, kj)
+    e.joint_bodies = ints(index, &j, 2 * kj)
+    e.excluded = ints(index, &j, 2 * size[N_EXCLUDED])
+    e.pair = ints(index, &j, 2 * p)
+    e.pair_scratch = ints(index, &j, 2 * p)
+    e.count = ints(index, &j, n + 1)
+    e.bucket = ints(index, &j, size[N_BUCKET])
+    e.chain = ints(index, &j, grid)
+    e.cell = ints(index, &j, 4 * grid)
+    e.contact_pair = ints(index, &j, 2 * c)
+    e.joint_body = ints(index, &j, 2 * k)
+    e.contact_body = e.joint_body + 2 * kj
+    e.ptr = ints(index, &j, k + 1)
+    e.kind = ints(index, &j, k)
+    e.order = ints(index, &j, k)
+    e.order_scratch = ints(index, &j, 2 * (n + k) + 8)
+    e.key = keys
+    e.cache_key = keys + c
+    used[0] = i
+    used[1] = j
+    e.color_scratch = keys + 2 * c
+    used[2] = 2 * c + nd

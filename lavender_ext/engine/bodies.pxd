@@ -1,0 +1,162 @@
+"""Bodies in free flight: frames, quaternions, and a drift that keeps angular momentum.
+
+    q <- q + 1/2 h (0, omega) q, normalised                                                    (1)
+    I = R I_body R^T,   L = I omega                                                            (2)
+
+A body whose inertia has a direction drifts by the midpoint rule at constant L [N m s]:
+
+    q' = (1) over h/2 with omega,  omega' = I(q')^-1 L,                                        (3)
+    q <- (1) over h with omega',   omega <- I(q)^-1 L
+
+so the gyroscopic term costs nothing in angular momentum (kept to rounding) and O(h^2) in energy. Even
+inertia (spheres, cubes) needs (1) alone.
+"""
+from libc.math cimport sqrt
+from libc.stdint cimport int32_t
+
+from lavender_ext.core.rows cimport dot3
+from lavender_ext.engine.arrays cimport N_BODY, N_DYNAMIC, N_FRAME, S_GRAVITY, S_H, engine_t
+
+
+cdef inline void rotation(const double* q, double* r) noexcept nogil:
+    # body to world, of a unit quaternion w, x, y, z
+    cdef double w = q[0], x = q[1], y = q[2], z = q[3]
+    r[0] = 1.0 - 2.0 * (y * y + z * z)
+    r[1] = 2.0 * (x * y - w * z)
+    r[2] = 2.0 * (x * z + w * y)
+    r[3] = 2.0 * (x * y + w * z)
+    r[4] = 1.0 - 2.0 * (x * x + z * z)
+    r[5] = 2.0 * (y * z - w * x)
+    r[6] = 2.0 * (x * z - w * y)
+    r[7] = 2.0 * (y * z + w * x)
+    r[8] = 1.0 - 2.0 * (x * x + y * y)
+
+
+cdef inline void to_world(const double* r, const double* a, double* out) noexcept nogil:
+    # R a
+    cdef int32_t k
+    for k in range(3):
+        out[k] = r[3 * k] * a[0] + r[3 * k + 1] * a[1] + r[3 * k + 2] * a[2]
+
+
+cdef inline void to_body(const double* r, const double* a, double* out) noexcept nogil:
+    # R^T a
+    cdef int32_t k
+    for k in range(3):
+        out[k] = r[k] * a[0] + r[3 + k] * a[1] + r[6 + k] * a[2]
+
+
+cdef inline void turn(double* q, const double* omega, double h) noexcept nogil:
+    # (1)
+    cdef double w = q[0], x = q[1], y = q[2], z = q[3], s, f = 0.5 * h
+    cdef double a = f * omega[0], b = f * omega[1], c = f * omega[2]
+    q[0] = w - (a * x + b * y + c * z)
+    q[1] = x + (a * w + b * z - c * y)
+    q[2] = y + (b * w + c * x - a * z)
+    q[3] = z + (c * w + a * y - b * x)
+    s = 1.0 / sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
+    q[0] *= s
+    q[1] *= s
+    q[2] *= s
+    q[3] *= s
+
+
+cdef inline void world_tensor(const double* r, const double* body, double* out) noexcept nogil:
+    # R T R^T, symmetric to the bit
+    cdef double t[9]
+    cdef int32_t i, j
+    for i in range(3):
+        for j in range(3):
+            t[3 * i + j] = r[3 * i] * body[j] + r[3 * i + 1] * body[3 + j] + r[3 * i + 2] * body[6 + j]
+    for i in range(3):
+        for j in range(i, 3):
+            out[3 * i + j] = t[3 * i] * r[3 * j] + t[3 * i + 1] * r[3 * j + 1] + t[3 * i + 2] * r[3 * j + 2]
+            out[3 * j + i] = out[3 * i + j]
+
+
+cdef inline void world_times(const double* r, const double* body, const double* a,
+                             double* out) noexcept nogil:
+    # R T R^T a
+    cdef double s[3]
+    cdef double t[3]
+    cdef int32_t k
+    to_body(r, a, s)
+    for k in range(3):
+        t[k] = dot3(body + 3 * k, s)
+    to_world(r, t, out)
+
+
+cdef inline void drift_rotation(double* q, double* omega, const double* inertia, const double* inv_inertia,
+                                double h) noexcept nogil:
+    # (3)
+    cdef double r[9]
+    cdef double half[4]
+    cdef double momentum[3]
+    cdef double middle[3]
+    cdef int32_t k
+    rotation(q, r)
+    world_times(r, inertia, omega, momentum)
+    for k in range(4):
+        half[k] = q[k]
+    turn(half, omega, 0.5 * h)
+    rotation(half, r)
+    world_times(r, inv_inertia, momentum, middle)
+    turn(q, middle, h)
+    rotation(q, r)
+    world_times(r, inv_inertia, momentum, omega)
+
+
+cdef inline void start_bodies(engine_t* e) noexcept nogil:
+    """Frames, world inverse inertia and v* = v + h g of the coming substep."""
+    cdef int32_t i, k, b
+    cdef double h = e.setting[S_H]
+    cdef const double* g = e.setting + S_GRAVITY
+    if e.size[N_FRAME] > 0:
+        for i in range(e.size[N_BODY]):
+            rotation(e.q + 4 * i, e.rot + 9 * i)
+    for i in range(e.size[N_DYNAMIC]):
+        b = e.body_of[i]
+        if e.uneven[b]:
+            world_tensor(e.rot + 9 * b, e.inv_inertia_body + 9 * b, e.inv_inertia + 9 * i)
+        for k in range(3):
+            e.v_free[6 * i + k] = e.v[6 * b + k] + h * g[k]
+            e.v_free[6 * i + 3 + k] = e.v[6 * b + 3 + k]
+
+
+cdef inline int32_t drift_bodies(engine_t* e, int32_t shifted) noexcept nogil:
+    """v = v* + dv, then poses over h, then the shift of the position projection.
+
+    Returns the first body whose state is not finite, or -1.
+    """
+    cdef int32_t i, k, b, lost = -1
+    cdef double h = e.setting[S_H], total
+    cdef double* v
+    cdef double* x
+    cdef double* q
+    for i in range(e.size[N_DYNAMIC]):
+        b = e.body_of[i]
+        v = e.v + 6 * b
+        x = e.x + 3 * b
+        q = e.q + 4 * b
+        for k in range(6):
+            v[k] = e.v_free[6 * i + k] + e.dv[6 * i + k]
+        for k in range(3):
+            x[k] += h * v[k]
+        if e.uneven[b]:
+            drift_rotation(q, v + 3, e.inertia + 9 * b, e.inv_inertia_body + 9 * b, h)
+        elif v[3] != 0.0 or v[4] != 0.0 or v[5] != 0.0:
+            turn(q, v + 3, h)
+        if shifted:
+            for k in range(3):
+                x[k] += e.shift[6 * i + k]
+            turn(q, e.shift + 6 * i + 3, 1.0)
+        total = 0.0
+        for k in range(6):
+            total += v[k] - v[k]
+        for k in range(3):
+            total += x[k] - x[k]
+        for k in range(4):
+            total += q[k] - q[k]
+        if total != 0.0 and lost < 0:
+            lost = b
+    return lost

@@ -1,0 +1,486 @@
+"""The narrow phase: plane, sphere and box against each other, to a manifold of at most four points.
+
+The normal points from a to b. A point lies halfway between the two surfaces; its gap is the distance
+between them along the normal [m], negative inside. Points with a gap below the margin are kept
+(speculative contacts). Each has a feature number that stays the same while the same corners and
+faces touch:
+
+    plane-box       the box's corner, bit k set where its axis k counts positive
+    box-box, faces  reference face (4 bits), other face (3 bits), and the two lines whose crossing the
+                    point is (3 bits each): 0-3 edges of the other face, 4-7 sides of the reference face
+    box-box, edges  8192 + the two axes and four signs that name the edges
+
+Box-box: the axis of least penetration among 3 + 3 face normals and 9 cross products (Gottschalk, Lin,
+Manocha 1996); faces are preferred to edges, and faces of a to those of b, by a tolerance, so that a
+resting pair keeps its manifold. The face that looks most against the reference face is clipped by its
+four sides (Sutherland, Hodgman 1974).
+"""
+from libc.math cimport fabs, sqrt
+from libc.stdint cimport int32_t
+
+from lavender_ext.core.rows cimport cross, dot3
+from lavender_ext.engine.arrays cimport BOX, PLANE, SPHERE, engine_t
+from lavender_ext.engine.bodies cimport to_body, to_world
+
+
+cdef struct manifold_t:
+    int32_t n
+    int32_t feature[4]
+    double normal[3]
+    double point[12]
+    double gap[4]
+
+
+cdef inline void sphere_sphere(const double* xa, double ra, const double* xb, double rb, double margin,
+                               manifold_t* m) noexcept nogil:
+    cdef double d[3]
+    cdef double s, f
+    cdef int32_t k
+    for k in range(3):
+        d[k] = xb[k] - xa[k]
+    s = dot3(d, d)
+    if s > (ra + rb + margin) * (ra + rb + margin):
+        return
+    s = sqrt(s)
+    if s > 1e-150:
+        for k in range(3):
+            m.normal[k] = d[k] / s
+    else:                                               # one centre: any normal will do, the same every time
+        s = 0.0
+        m.normal[0] = 0.0
+        m.normal[1] = 0.0
+        m.normal[2] = 1.0
+    f = 0.5 * (ra - rb + s)                             # halfway between the surfaces
+    for k in range(3):
+        m.point[k] = xa[k] + f * m.normal[k]
+    m.gap[0] = s - ra - rb
+    m.feature[0] = 0
+    m.n = 1
+
+
+cdef inline void plane_sphere(const double* plane, const double* x, double r, double margin,
+                              manifold_t* m) noexcept nogil:
+    cdef double gap = dot3(plane, x) - plane[3] - r
+    cdef int32_t k
+    if gap > margin:
+        return
+    for k in range(3):
+        m.normal[k] = plane[k]
+        m.point[k] = x[k] - (r + 0.5 * gap) * plane[k]
+    m.gap[0] = gap
+    m.feature[0] = 0
+    m.n = 1
+
+
+cdef inline void plane_box(const double* plane, const double* x, const double* rot, const double* half,
+                           double margin, manifold_t* m) noexcept nogil:
+    # Corner gaps are g + sum +-p_k; the four lowest below the margin, ties to the lower corner number.
+    cdef double p[3]
+    cdef double gap[8]
+    cdef double low, g = dot3(plane, x) - plane[3]
+    cdef int32_t i, _j, k, best, taken = 0
+    to_body(rot, plane, p)
+    low = g
+    for k in range(3):
+        p[k] *= half[k]
+        low -= fabs(p[k])
+    if low > margin:
+        return
+    for i in range(8):
+        gap[i] = g + (p[0] if i & 1 else -p[0]) + (p[1] if i & 2 else -p[1]) + (p[2] if i & 4 else -p[2])
+    for k in range(3):
+        m.normal[k] = plane[k]
+    for _j in range(4):
+        best = -1
+        for i in range(8):
+            if not (taken >> i) & 1 and gap[i] <= margin and (best < 0 or gap[i] < gap[best]):
+                best = i
+        if best < 0:
+            break
+        taken |= 1 << best
+    m.n = 0
+    for i in range(8):
+        if (taken >> i) & 1:
+            for k in range(3):
+                m.point[3 * m.n + k] = (x[k] + (half[0] if i & 1 else -half[0]) * rot[3 * k]
+                                        + (half[1] if i & 2 else -half[1]) * rot[3 * k + 1]
+                                        + (half[2] if i & 4 else -half[2]) * rot[3 * k + 2]
+                                        - 0.5 * gap[i] * plane[k])
+            m.gap[m.n] = gap[i]
+            m.feature[m.n] = i
+            m.n += 1
+
+
+cdef inline void box_sphere(const double* xa, const double* rot, const double* half, const double* xb,
+                            double r, double margin, manifold_t* m) noexcept nogil:
+    cdef double d[3]
+    cdef double c[3]
+    cdef double near[3]
+    cdef double s, best
+    cdef int32_t k, axis = -1
+    for k in range(3):
+        d[k] = xb[k] - xa[k]
+    to_body(rot, d, c)
+    s = 0.0
+    for k in range(3):
+        near[k] = -half[k] if c[k] < -half[k] else (half[k] if c[k] > half[k] else c[k])
+        d[k] = c[k] - near[k]
+        s += d[k] * d[k]
+    if s > (r + margin) * (r + margin):
+        return
+    if s > 1e-300:
+        s = sqrt(s)
+        for k in range(3):
+            d[k] = d[k] / s
+    else:                                               # the centre is inside: out by the nearest face
+        best = -1.0 / 0.0
+        for k in range(3):
+            if fabs(c[k]) - half[k] > best:
+                best = fabs(c[k]) - half[k]
+                axis = k
+        for k in range(3):
+            d[k] = 0.0
+        d[axis] = -1.0 if c[axis] < 0.0 else 1.0
+        near[axis] = d[axis] * half[axis]
+        s = best
+    m.gap[0] = s - r
+    to_world(rot, d, m.normal)
+    for k in range(3):
+        c[k] = near[k] + 0.5 * m.gap[0] * d[k]
+    to_world(rot, c, m.point)
+    for k in range(3):
+        m.point[k] += xa[k]
+    m.feature[0] = 0
+    m.n = 1
+
+
+cdef inline int32_t clip_side(int32_t n, const double* p, const int32_t* code, int32_t axis, double sign,
+                              double bound, double tol, int32_t line, double* out,
+                              int32_t* out_code) noexcept nogil:
+    # Polygon p (n, 3), edge code[i] from point i to i + 1, against sign * p[axis] <= bound. A corner within
+    # tol of the side counts as inside: a pair that lies edge on edge keeps its corners.
+    cdef int32_t i, j, k, kept = 0
+    cdef double a, b, t
+    for i in range(n):
+        j = i + 1 if i + 1 < n else 0
+        a = sign * p[3 * i + axis] - bound
+        b = sign * p[3 * j + axis] - bound
+        if a <= tol:
+            for k in range(3):
+                out[3 * kept + k] = p[3 * i + k]
+            out_code[kept] = code[i]
+            kept += 1
+        if (a <= tol) != (b <= tol):
+            t = a / (a - b)
+            t = 0.0 if t < 0.0 else (1.0 if t > 1.0 else t)
+            for k in range(3):
+                out[3 * kept + k] = p[3 * i + k] + t * (p[3 * j + k] - p[3 * i + k])
+            # the polygon goes on along the side where it leaves, along its own edge where it comes back
+            out_code[kept] = line if a <= tol else code[i]
+            kept += 1
+    return kept
+
+
+cdef inline void face_points(const double* xr, const double* rr, const double* hr, int32_t axis, double sign,
+                             const double* xo, const double* ro, const double* ho, int32_t on_b,
+                             double margin, manifold_t* m) noexcept nogil:
+    # Reference face `axis`, `sign` of one box, the other box clipped; (x, y, z) is the frame of the face.
+    cdef double poly[36]
+    cdef double more[36]
+    cdef int32_t code[12]
+    cdef int32_t more_code[12]
+    cdef double n[3]
+    cdef double d[3]
+    cdef double c[3]
+    cdef double u[3]
+    cdef double w[3]
+    cdef double s, best, hx, hy, tol, deep
+    cdef int32_t i, j, k, ax = axis + 1 if axis < 2 else 0, ay = axis - 1 if axis > 0 else 2
+    cdef int32_t face = 0, fx, fy, count, kept, at, other, feature
+    cdef int32_t pick[4]
+    hx = hr[ax]
+    hy = hr[ay]
+    for k in range(3):
+        n[k] = sign * rr[3 * k + axis]
+        d[k] = xo[k] - xr[k]
+    # the other box's face that looks most against n
+    best = -1.0
+    for i in range(3):
+        s = n[0] * ro[i] + n[1] * ro[3 + i] + n[2] * ro[6 + i]
+        u[i] = s
+        if fabs(s) > best:
+            best = fabs(s)
+            face = i
+    fx = face + 1 if face < 2 else 0
+    fy = face - 1 if face > 0 else 2
+    s = -ho[face] if u[face] > 0.0 else ho[face]
+    # its centre and half edges in the frame of the reference face
+    for k in range(3):
+        c[k] = d[k] + s * ro[3 * k + face]
+    w[0] = c[0] * rr[ax] + c[1] * rr[3 + ax] + c[2] * rr[6 + ax]
+    w[1] = c[0] * rr[ay] + c[1] * rr[3 + ay] + c[2] * rr[6 + ay]
+    w[2] = dot3(c, n) - hr[axis]
+    for i in range(2):
+        j = fx if i == 0 else fy
+        for k in range(3):
+            c[k] = ho[j] * ro[3 * k + j]
+        u[0] = c[0] * rr[ax] + c[1] * rr[3 + ax] + c[2] * rr[6 + ax]
+        u[1] = c[0] * rr[ay] + c[1] * rr[3 + ay] + c[2] * rr[6 + ay]
+        u[2] = dot3(c, n)
+        for k in range(3):
+            more[3 * i + k] = u[k]
+    for k in range(3):
+        poly[k] = w[k] - more[k] - more[3 + k]
+        poly[3 + k] = w[k] + more[k] - more[3 + k]
+        poly[6 + k] = w[k] + more[k] + more[3 + k]
+        poly[9 + k] = w[k] - more[k] + more[3 + k]
+    for i in range(4):
+        code[i] = i
+    count = 4
+    tol = 1e-3 * (hx if hx < hy else hy)
+    # clip only where a corner is outside
+    for i in range(4):
+        k = i >> 1
+        s = 1.0 if i & 1 else -1.0
+        best = hx if k == 0 else hy
+        kept = 0
+        for j in range(count):
+            if s * poly[3 * j + k] - best > tol:
+                kept += 1
+        if kept == 0:
+            continue
+        kept = clip_side(count, poly, code, k, s, best, tol, 4 + i, more, more_code)
+        count = kept
+        for j in range(count):
+            code[j] = more_code[j]
+            for at in range(3):
+                poly[3 * j + at] = more[3 * j + at]
+    # points above the margin go; a point is the crossing of the lines before and after it
+    kept = 0
+    for i in range(count):
+        if poly[3 * i + 2] <= margin:
+            j = code[i - 1] if i > 0 else code[count - 1]
+            more_code[kept] = j * 8 + code[i]
+            for k in range(3):
+                more[3 * kept + k] = poly[3 * i + k]
+            kept += 1
+    if kept > 4:
+        # The outermost along four directions, askew so that no two corners of a square tie; the deepest
+        # takes the place of its neighbour if it is among none of them.
+        for i in range(4):
+            best = -1.0 / 0.0
+            pick[i] = 0
+            for j in range(kept):
+                if i & 1:
+                    s = more[3 * j + 1] - 0.3 * more[3 * j]
+                else:
+                    s = more[3 * j] + 0.3 * more[3 * j + 1]
+                if i < 2:
+                    s = -s
+                if s > best:
+                    best = s
+                    pick[i] = j
+        at = 0
+        for j in range(kept):
+            if more[3 * j + 2] < more[3 * at + 2]:
+                at = j
+        deep = 1.0 / 0.0
+        for i in range(4):
+            if more[3 * pick[i] + 2] < deep:
+                deep = more[3 * pick[i] + 2]
+        if more[3 * at + 2] < deep - 1e-3 * margin:
+            best = 1.0 / 0.0
+            other = 0
+            for i in range(4):
+                s = (more[3 * pick[i]] - more[3 * at]) * (more[3 * pick[i]] - more[3 * at])
+                s += (more[3 * pick[i] + 1] - more[3 * at + 1]) * (more[3 * pick[i] + 1] - more[3 * at + 1])
+                if s < best:
+                    best = s
+                    other = i
+            pick[other] = at
+    else:
+        for i in range(kept):
+            pick[i] = i
+        for i in range(kept, 4):
+            pick[i] = pick[0] if kept > 0 else 0
+    feature = (((on_b * 8 + axis * 2 + (sign > 0.0)) * 8) + face) * 64
+    m.n = 0
+    # from round the face to row by row, as the corners of a box count
+    if kept >= 4:
+        i = pick[2]
+        pick[2] = pick[3]
+        pick[3] = i
+    for i in range(4 if kept > 4 else kept):
+        at = pick[i]
+        for j in range(i):
+            if pick[j] == at:
+                at = -1
+                break
+        if at < 0:
+            continue
+        s = hr[axis] + 0.5 * more[3 * at + 2]
+        for k in range(3):
+            m.point[3 * m.n + k] = (xr[k] + more[3 * at] * rr[3 * k + ax] + more[3 * at + 1] * rr[3 * k + ay]
+                                    + s * n[k])
+        m.gap[m.n] = more[3 * at + 2]
+        m.feature[m.n] = feature + more_code[at]
+        m.n += 1
+    for k in range(3):
+        m.normal[k] = -n[k] if on_b else n[k]
+
+
+cdef inline void edge_point(const double* xa, const double* ra, const double* ha, int32_t i, const double* xb,
+                            const double* rb, const double* hb, int32_t j, double* n, double gap,
+                            manifold_t* m) noexcept nogil:
+    # nearest points of the two edges along axes i of a and j of b that face each other along n
+    cdef double p[3]
+    cdef double q[3]
+    cdef double d[3]
+    cdef double u, v, w, s, t, f
+    cdef int32_t k, r, bits = 0
+    for k in range(3):
+        p[k] = xa[k]
+        q[k] = xb[k]
+    for r in range(3):
+        if r != i:
+            s = n[0] * ra[r] + n[1] * ra[3 + r] + n[2] * ra[6 + r]
+            bits = bits * 2 + (s > 0.0)
+            f = ha[r] if s > 0.0 else -ha[r]
+            for k in range(3):
+                p[k] += f * ra[3 * k + r]
+    for r in range(3):
+        if r != j:
+            s = n[0] * rb[r] + n[1] * rb[3 + r] + n[2] * rb[6 + r]
+            bits = bits * 2 + (s > 0.0)
+            f = -hb[r] if s > 0.0 else hb[r]
+            for k in range(3):
+                q[k] += f * rb[3 * k + r]
+    u = 0.0
+    v = 0.0
+    w = 0.0
+    for k in range(3):
+        d[k] = q[k] - p[k]
+        u += ra[3 * k + i] * rb[3 * k + j]
+        v += ra[3 * k + i] * d[k]
+        w += rb[3 * k + j] * d[k]
+    s = (v - u * w) / (1.0 - u * u)
+    t = (u * v - w) / (1.0 - u * u)
+    s = -ha[i] if s < -ha[i] else (ha[i] if s > ha[i] else s)
+    t = -hb[j] if t < -hb[j] else (hb[j] if t > hb[j] else t)
+    for k in range(3):
+        m.point[k] = 0.5 * (p[k] + s * ra[3 * k + i] + q[k] + t * rb[3 * k + j])
+        m.normal[k] = n[k]
+    m.gap[0] = gap
+    m.feature[0] = 8192 + (i * 3 + j) * 16 + bits
+    m.n = 1
+
+
+cdef inline void box_box(const double* xa, const double* ra, const double* ha, const double* xb,
+                         const double* rb, const double* hb, double margin, manifold_t* m) noexcept nogil:
+    cdef double c[9]            # R_a^T R_b
+    cdef double f[9]            # |c|
+    cdef double d[3]
+    cdef double ta[3]
+    cdef double tb[3]
+    cdef double n[3]
+    cdef double l[3]
+    cdef double s, t, length, face_a = -1.0 / 0.0, face_b = -1.0 / 0.0, edge = -1.0 / 0.0, tol, best, small
+    cdef int32_t i, j, k, i1, i2, j1, j2, axis_a = 0, axis_b = 0, edge_i = -1, edge_j = -1, parallel = 0
+    for k in range(3):
+        d[k] = xb[k] - xa[k]
+    to_body(ra, d, ta)
+    to_body(rb, d, tb)
+    for i in range(3):
+        for j in range(3):
+            s = ra[i] * rb[j] + ra[3 + i] * rb[3 + j] + ra[6 + i] * rb[6 + j]
+            c[3 * i + j] = s
+            f[3 * i + j] = fabs(s)
+    for i in range(3):
+        s = fabs(ta[i]) - ha[i] - (f[3 * i] * hb[0] + f[3 * i + 1] * hb[1] + f[3 * i + 2] * hb[2])
+        if s > margin:
+            return
+        if s > face_a:
+            face_a = s
+            axis_a = i
+    for j in range(3):
+        s = fabs(tb[j]) - hb[j] - (f[j] * ha[0] + f[3 + j] * ha[1] + f[6 + j] * ha[2])
+        if s > margin:
+            return
+        if s > face_b:
+            face_b = s
+            axis_b = j
+    small = ha[0]
+    for k in range(3):
+        small = ha[k] if ha[k] < small else small
+        small = hb[k] if hb[k] < small else small
+    tol = 1e-3 * small
+    best = face_a if face_a > face_b else face_b
+    for k in range(9):
+        if f[k] > 0.9999995:                            # two axes within 1 mrad: edge axes add nothing
+            parallel = 1
+    if not parallel:
+        for i in range(3):
+            i1 = i + 1 if i < 2 else 0
+            i2 = i - 1 if i > 0 else 2
+            for j in range(3):
+                j1 = j + 1 if j < 2 else 0
+                j2 = j - 1 if j > 0 else 2
+                length = 1.0 - c[3 * i + j] * c[3 * i + j]
+                if length < 1e-6:
+                    continue
+                # the axis a_i x b_j in the frame of a is (0, -c_i2j, c_i1j) in the places i, i1, i2
+                t = ta[i2] * c[3 * i1 + j] - ta[i1] * c[3 * i2 + j]
+                s = (fabs(t) - (ha[i1] * f[3 * i2 + j] + ha[i2] * f[3 * i1 + j] + hb[j1] * f[3 * i + j2]
+                                + hb[j2] * f[3 * i + j1])) / sqrt(length)
+                if s > margin:
+                    return
+                if s > edge:
+                    edge = s
+                    edge_i = i
+                    edge_j = j
+    if edge_i >= 0 and edge > best + tol + 0.05 * fabs(best):
+        for k in range(3):
+            n[k] = ra[3 * k + edge_i]
+            l[k] = rb[3 * k + edge_j]
+        cross(n, l, m.normal)
+        length = sqrt(dot3(m.normal, m.normal))
+        s = 1.0 / length if dot3(m.normal, d) >= 0.0 else -1.0 / length
+        for k in range(3):
+            n[k] = s * m.normal[k]
+        edge_point(xa, ra, ha, edge_i, xb, rb, hb, edge_j, n, edge, m)
+    elif face_b > face_a + tol + 0.05 * fabs(face_a):
+        face_points(xb, rb, hb, axis_b, -1.0 if tb[axis_b] > 0.0 else 1.0, xa, ra, ha, 1, margin, m)
+    else:
+        face_points(xa, ra, ha, axis_a, -1.0 if ta[axis_a] < 0.0 else 1.0, xb, rb, hb, 0, margin, m)
+
+
+cdef inline void collide(const engine_t* e, int32_t a, int32_t b, double margin,
+                         manifold_t* m) noexcept nogil:
+    """Manifold of bodies a < b; n = 0 where they are further apart than the margin."""
+    cdef int32_t ka = e.kind_of_shape[a], kb = e.kind_of_shape[b], k, flip = 0
+    cdef const double* xa = e.x + 3 * a
+    cdef const double* xb = e.x + 3 * b
+    cdef const double* sa = e.shape + 4 * a
+    cdef const double* sb = e.shape + 4 * b
+    m.n = 0
+    if ka == SPHERE and kb == SPHERE:
+        sphere_sphere(xa, sa[0], xb, sb[0], margin, m)
+        return
+    if ka == BOX and kb == BOX:
+        box_box(xa, e.rot + 9 * a, sa, xb, e.rot + 9 * b, sb, margin, m)
+        return
+    if ka > kb if kb == PLANE or ka == PLANE else kb == BOX:     # the plane first, then the box
+        flip = 1
+        a, b = b, a
+        ka, kb = kb, ka
+        xa, xb = xb, xa
+        sa, sb = sb, sa
+    if ka == PLANE and kb == SPHERE:
+        plane_sphere(sa, xb, sb[0], margin, m)
+    elif ka == PLANE and kb == BOX:
+        plane_box(sa, xb, e.rot + 9 * b, sb, margin, m)
+    elif ka == BOX and kb == SPHERE:
+        box_sphere(xa, e.rot + 9 * a, sa, xb, sb[0], margin, m)
+    if flip:
+        for k in range(3):
+            m.normal[k] = -m.normal[k]

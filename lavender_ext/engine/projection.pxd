@@ -1,0 +1,99 @@
+"""Position projection: a split impulse that moves bodies and leaves their velocities alone.
+
+To first order the gap of a contact at the end of the substep is g + h (J v)_n, and the error of a rigid
+joint row C + h J v. Sweeps over multipliers p [N s^2] find a shift s = M^-1 J^T p [m, rad] with
+
+    contact   J s >= -min(beta (g' + slop), push),  p >= 0,  g' = g + h (J v)_n  the gap to come      (1)
+    joint     J s  = -clip(beta C', push)                                                            (2)
+
+Velocities are untouched, so that it adds no kinetic energy; where nothing is deeper than the slop and no
+joint is off, it is skipped.
+"""
+from libc.math cimport fabs
+from libc.stdint cimport int32_t
+
+from lavender_ext.core.block cimport clip, relax_normal
+from lavender_ext.core.rows cimport dot3, joint_push, joint_velocity, push_bodies, relative_velocity
+from lavender_ext.engine.arrays cimport (H_CONTACTS, H_POSITION_ITERATIONS, H_PROJECTED, J_HERTZ, N_DYNAMIC,
+                                         N_JOINT, N_JOINT_REAL, N_JOINT_ROW, S_BETA, S_DEPTH, S_H,
+                                         S_JOINT_ERROR, S_MAX_PUSH, S_SLOP, engine_t)
+
+
+cdef inline int32_t rigid_row(const engine_t* e, int32_t i, int32_t row) noexcept nogil:
+    # soft rows pull by themselves; a motor has no position
+    return e.joint[N_JOINT_REAL * i + J_HERTZ] == 0.0 and not (e.joint_motor[i] and row == e.ptr[i + 1] - 1)
+
+
+cdef inline double normal_speed(const engine_t* e, const double* v, int32_t c) noexcept nogil:
+    cdef double u[3]
+    cdef double s[3]
+    relative_velocity(v, e.contact_body[2 * c], e.contact_body[2 * c + 1], e.arm_a + 3 * c, e.arm_b + 3 * c,
+                      u, s)
+    return dot3(e.normal + 3 * c, u)
+
+
+cdef inline int32_t project_positions(engine_t* e) noexcept nogil:
+    """Fill e.shift; returns 1 where there is any. Writes S_DEPTH, S_JOINT_ERROR as the substep began."""
+    cdef int32_t n = e.head[H_CONTACTS], mj = e.size[N_JOINT_ROW], _sweep, i, j, c, a, b, due = 0
+    cdef double h = e.setting[S_H], slop = e.setting[S_SLOP], beta = e.setting[S_BETA]
+    cdef double most = e.setting[S_MAX_PUSH]
+    cdef double depth = 0.0, off = 0.0, x, y, p
+    cdef double impulse[3]
+    cdef const double* normal
+    # free after the solve: J s wanted, by contact and joint row
+    cdef double* goal = e.target
+    e.head[H_PROJECTED] = 0
+    for c in range(n):
+        if -e.gap[c] > depth:
+            depth = -e.gap[c]
+    for i in range(e.size[N_JOINT]):
+        for j in range(e.ptr[i], e.ptr[i + 1]):
+            if rigid_row(e, i, j) and fabs(e.joint_error[j]) > off:
+                off = fabs(e.joint_error[j])
+    e.setting[S_DEPTH] = depth
+    e.setting[S_JOINT_ERROR] = off
+    if e.head[H_POSITION_ITERATIONS] == 0 or not (depth > slop or off > 0.0):
+        return 0
+    for i in range(6 * e.size[N_DYNAMIC]):
+        e.shift[i] = e.v_free[i] + e.dv[i]              # v+ for the moment
+    for i in range(e.size[N_JOINT]):
+        a = e.joint_body[2 * i]
+        b = e.joint_body[2 * i + 1]
+        for j in range(e.ptr[i], e.ptr[i + 1]):
+            e.push[j] = 0.0
+            x = e.joint_error[j] + h * joint_velocity(e.jac + 12 * j, e.shift, a, b)
+            goal[j] = -clip(beta * x, -most, most)
+            if fabs(x) > 1e-3 * slop and rigid_row(e, i, j):
+                due = 1
+    for c in range(n):
+        e.push[mj + c] = 0.0
+        x = -beta * (e.gap[c] + h * normal_speed(e, e.shift, c) + slop)
+        if x > 0.0:
+            due = 1
+        goal[mj + c] = x if x < most else most
+    if not due:
+        return 0
+    for i in range(6 * e.size[N_DYNAMIC]):
+        e.shift[i] = 0.0
+    for _sweep in range(e.head[H_POSITION_ITERATIONS]):
+        for i in range(e.size[N_JOINT]):
+            a = e.joint_body[2 * i]
+            b = e.joint_body[2 * i + 1]
+            for j in range(e.ptr[i], e.ptr[i + 1]):
+                if rigid_row(e, i, j):
+                    p = (goal[j] - joint_velocity(e.jac + 12 * j, e.shift, a, b)) * e.step[j]      # (2)
+                    joint_push(e.minv_jac + 12 * j, p, e.shift, a, b)
+        for c in range(n):
+            normal = e.normal + 3 * c
+            y = relax_normal(e.push[mj + c], normal_speed(e, e.shift, c) - goal[mj + c],
+                             e.step[e.ptr[e.size[N_JOINT] + c]])                                   # (1)
+            p = y - e.push[mj + c]
+            if p == 0.0:
+                continue
+            e.push[mj + c] = y
+            for i in range(3):
+                impulse[i] = p * normal[i]
+            push_bodies(e.shift, e.contact_body[2 * c], e.contact_body[2 * c + 1], e.inv_mass, e.inv_inertia,
+                        e.arm_a + 3 * c, e.arm_b + 3 * c, impulse, NULL)
+    e.head[H_PROJECTED] = e.head[H_POSITION_ITERATIONS]
+    return 1

@@ -1,0 +1,428 @@
+"""LavenderSim's substep: broad phase, narrow phase, cache, velocity solve, position projection, drift.
+
+    start       frames, world inverse inertia, v* = v + h g
+    pairs       boxes that meet
+    contacts    manifolds, rows, guesses from the cache; joint rows before them
+    solve       dv = M^-1 J^T lam, then `iterations` sweeps: all joints, then all contacts
+    finish      shift of the position projection, v = v* + dv, poses, cache
+
+`prepare` is the first three, and changes no state: where the capacities do not suffice it says what is
+needed. Between `prepare` and `finish` any solver may take the place of `solve`: the velocity problem
+lies in the arrays, the impulses go back into them.
+"""
+from libc.stdint cimport int32_t, int64_t, uint64_t
+
+import numpy as np
+
+from lavender_ext.core.block cimport CONTACT_SPIN, blocks_t, n_tangents, row_error
+from lavender_ext.core.order cimport (RANDOM, SYMMETRIC, advance_order, block_levels, body_levels,
+                                      color_by_bodies, reverse, sort_by_level)
+from lavender_ext.core.rows cimport contact_push, joint_push, relax_contact_block, relax_joint, rows_t
+from lavender_ext.engine.arrays cimport (CAP_CONTACT, CAP_PAIR, H_CONTACTS, H_ITERATIONS, H_LOST, H_MATCHES,
+                                         H_NEED_CONTACTS, H_NEED_PAIRS, H_ORDER, H_SEED, H_STEP, H_WARM_START,
+                                         NEED_ROOM, NOT_FINITE, N_BODY, N_DYNAMIC, N_EXCLUDED, N_FRAME,
+                                         N_HEAD, N_JOINT, N_JOINT_REAL, N_JOINT_ROW, N_SETTINGS, OK,
+                                         ROWS_PER_CONTACT, S_OUT, bind, engine_t)
+from lavender_ext.engine.bodies cimport drift_bodies, start_bodies
+from lavender_ext.engine.broad_phase cimport update_pairs
+from lavender_ext.engine.contacts cimport make_contacts, store_contacts
+from lavender_ext.engine.joints cimport make_joints
+from lavender_ext.engine.projection cimport normal_speed, project_positions
+from lavender_ext.engine.view cimport view
+from lavender_ext.judge.measure cimport rows_slack, score_rows, score_t
+from lavender_ext.sweep.packed cimport MOST, ROOM_BODY, ROOM_CONTACT, ROOM_MORE, packs, sweep_packed
+
+
+# H_ORDER: how the blocks of a sweep are ordered, joints and contacts each among themselves
+cdef enum:
+    AS_GIVEN = 0
+    REVERSED = 1
+    SYMMETRICALLY = 2
+    AT_RANDOM = 3
+    BOTTOM_UP = 4
+    TOP_DOWN = 5
+    COLORED = 6
+
+
+cdef int32_t prepare(engine_t* e) noexcept nogil:
+    cdef blocks_t p
+    cdef rows_t r
+    cdef int32_t pairs, contacts
+    start_bodies(e)
+    pairs = update_pairs(e)
+    e.head[H_NEED_PAIRS] = pairs
+    if pairs > e.size[CAP_PAIR]:
+        return NEED_ROOM
+    view(e, &p, &r)
+    if e.size[N_JOINT] > 0:
+        make_joints(e)
+    contacts = make_contacts(e, &r)
+    e.head[H_NEED_CONTACTS] = contacts
+    return NEED_ROOM if contacts > e.size[CAP_CONTACT] else OK
+
+
+cdef inline void measure(const engine_t* e, double* residual, double* violation) noexcept nogil:
+    # max |e_n| [N s] and max(0, -w_n) [m/s] over the contacts, w_n = J dv + c lam - b
+    cdef int32_t c, row
+    cdef double w, x, inf = 1.0 / 0.0, big = 0.0, low = 0.0
+    for c in range(e.head[H_CONTACTS]):
+        row = e.ptr[e.size[N_JOINT] + c]
+        w = normal_speed(e, e.dv, c) + (e.compliance[row] * e.impulse[row] - e.b[row])
+        x = row_error(e.impulse[row], w, e.d[row], 0.0, inf)
+        x = -x if x < 0.0 else x
+        if not x <= big:
+            big = x
+        if not -w <= low:
+            low = -w
+    residual[0] = big
+    violation[0] = low
+
+
+cdef inline void warm(engine_t* e, const rows_t* r) noexcept nogil:
+    # dv = M^-1 J^T lam, block by block
+    cdef int32_t i, j, c
+    for i in range(6 * e.size[N_DYNAMIC]):
+        e.dv[i] = 0.0
+    if not e.head[H_WARM_START]:
+        return
+    for i in range(r.n_joints):
+        for j in range(e.ptr[i], e.ptr[i + 1]):
+            joint_push(e.minv_jac + 12 * j, e.impulse[j], e.dv, e.joint_body[2 * i], e.joint_body[2 * i + 1])
+    for c in range(r.n_contacts):
+        i = r.n_joints + c
+        j = e.ptr[i]
+        contact_push(r, c, n_tangents(e.kind[i], e.ptr[i + 1] - j), e.kind[i] == CONTACT_SPIN, e.impulse + j,
+                     e.dv)
+
+
+cdef inline void order_blocks(engine_t* e) noexcept nogil:
+    """Sweep order of all blocks into e.order, as lavender.ordering makes it: joints, then contacts."""
+    cdef int32_t kj = e.size[N_JOINT], n = kj + e.head[H_CONTACTS], nd = e.size[N_DYNAMIC]
+    cdef int32_t mode = e.head[H_ORDER]
+    cdef int32_t* level = e.order_scratch
+    cdef int32_t* of_block = level + nd
+    cdef int32_t i, levels
+    for i in range(n):
+        e.order[i] = i
+    if mode == REVERSED:
+        reverse(e.order, 0, kj)
+        reverse(e.order, kj, n)
+    elif mode == BOTTOM_UP or mode == TOP_DOWN or mode == COLORED:
+        if mode == COLORED:
+            levels = color_by_bodies(n, e.joint_body, nd, e.color_scratch, of_block)
+        else:
+            levels = body_levels(n, e.joint_body, nd, level) + 2
+            block_levels(n, e.joint_body, level, of_block)
+        if mode == TOP_DOWN:
+            for i in range(n):
+                of_block[i] = levels - 1 - of_block[i]
+        sort_by_level(kj, of_block, levels, of_block + n, e.order)
+        sort_by_level(n - kj, of_block + kj, levels, of_block + n, e.order + kj)
+        for i in range(kj, n):
+            e.order[i] += kj
+
+
+cdef inline void note_sweep(const engine_t* e, const blocks_t* p, const rows_t* r, double* out,
+                            double* scratch) noexcept nogil:
+    # max |e_n| [N s] over the contacts, E = sqrt(sum d e^2) [sqrt J] over all rows; scratch (2 m)
+    cdef double violation
+    cdef score_t s
+    measure(e, out, &violation)
+    rows_slack(p, r, e.impulse, e.dv, scratch)
+    score_rows(p, e.impulse, scratch, scratch + p.n_rows, &s)
+    out[1] = s.energy
+
+
+cdef void sweep_all(engine_t* e, const blocks_t* p, const rows_t* r, double* curve,
+                    double* scratch) noexcept nogil:
+    """The budgeted sweeps: joints, then contacts; curve (sweeps + 1, 2) or NULL."""
+    cdef int32_t s, i, kj = r.n_joints, k = p.n_blocks, mode
+    cdef uint64_t rng
+    order_blocks(e)
+    mode = SYMMETRIC if e.head[H_ORDER] == SYMMETRICALLY else (RANDOM if e.head[H_ORDER] == AT_RANDOM else 0)
+    # every substep has its own stream, a function of seed and substep alone
+    rng = ((<uint64_t>(<int64_t>e.head[H_SEED])) << 32) ^ (<uint64_t>(<int64_t>e.head[H_STEP]))
+    for s in range(e.head[H_ITERATIONS]):
+        advance_order(mode, s == 0, e.order, 0, kj, &rng)
+        advance_order(mode, s == 0, e.order, kj, k, &rng)
+        for i in range(kj):
+            relax_joint(p, r, e.order[i], e.impulse, e.dv)
+        for i in range(kj, k):
+            relax_contact_block(p, r, e.order[i], e.impulse, e.dv)
+        if curve != NULL:
+            note_sweep(e, p, r, curve + 2 * (s + 1), scratch)
+
+
+cdef inline int32_t sweep_fast(engine_t* e, const blocks_t* p, const rows_t* r, double* room) noexcept nogil:
+    # the same bits by packed contacts; 0 where the scene has other blocks, or an order that changes
+    if e.head[H_ORDER] == SYMMETRICALLY or e.head[H_ORDER] == AT_RANDOM or not packs(p, r):
+        return 0
+    order_blocks(e)
+    sweep_packed(p, r, e.order, e.head[H_ITERATIONS], room, e.impulse, e.dv)
+    return 1
+
+
+cdef inline void solve(engine_t* e, int32_t sweeps, double* room, double* curve, double* scratch) noexcept nogil:
+    cdef blocks_t p
+    cdef rows_t r
+    cdef double* out = e.setting + S_OUT
+    view(e, &p, &r)
+    warm(e, &r)
+    measure(e, out + 4, out + 6)
+    if curve != NULL:
+        note_sweep(e, &p, &r, curve, scratch)
+    if sweeps:
+        if room == NULL or not sweep_fast(e, &p, &r, room):
+            sweep_all(e, &p, &r, curve, scratch)
+        measure(e, out + 5, out + 7)
+
+
+cdef int32_t finish(engine_t* e) noexcept nogil:
+    cdef int32_t i, shifted
+    cdef double* out = e.setting + S_OUT
+    out[0] = e.head[H_ITERATIONS]
+    out[1] = 1.0 if e.head[H_WARM_START] else 0.0
+    out[2] = e.head[H_CONTACTS]
+    out[3] = e.head[H_MATCHES]
+    for i in range(e.size[N_JOINT_ROW]):
+        e.joint_impulse[i] = e.impulse[i]
+    store_contacts(e)
+    shifted = project_positions(e)
+    e.head[H_LOST] = drift_bodies(e, shifted)
+    e.head[H_STEP] = 0 if e.head[H_STEP] == 2147483647 else e.head[H_STEP] + 1
+    return OK if e.head[H_LOST] < 0 else NOT_FINITE
+
+
+cdef public void lav_engine_lengths(const int32_t* size, int32_t* used) noexcept nogil:
+    """Entries (3) of the buffers of doubles, int32 and uint64 for these sizes; -1 where beyond 2^31."""
+    cdef engine_t e
+    cdef int64_t n[3]
+    cdef double real = 0.0
+    cdef int32_t index = 0, k
+    cdef uint64_t key = 0
+    bind(size, &real, &index, &key, &e, n)
+    for k in range(3):
+        used[k] = <int32_t>n[k] if n[k] < 2147483647 else -1
+
+
+cdef public int32_t lav_engine_pairs(const int32_t* size, double* real, int32_t* index,
+                                     uint64_t* keys) noexcept nogil:
+    """The first two stages alone; returns the number of pairs needed."""
+    cdef engine_t e
+    cdef int64_t n[3]
+    bind(size, real, index, keys, &e, n)
+    start_bodies(&e)
+    return update_pairs(&e)
+
+
+cdef public int32_t lav_engine_prepare(const int32_t* size, double* real, int32_t* index,
+                                       uint64_t* keys) noexcept nogil:
+    """The coming substep's velocity problem; changes no state. Returns OK or NEED_ROOM."""
+    cdef engine_t e
+    cdef int64_t n[3]
+    bind(size, real, index, keys, &e, n)
+    return prepare(&e)
+
+
+cdef public void lav_engine_solve(const int32_t* size, double* real, int32_t* index, uint64_t* keys,
+                                  int32_t sweeps) noexcept nogil:
+    """Sequential impulses on the prepared problem; sweeps = 0 applies the guesses and measures them only."""
+    cdef engine_t e
+    cdef int64_t n[3]
+    bind(size, real, index, keys, &e, n)
+    solve(&e, sweeps, NULL, NULL, NULL)
+
+
+cdef public void lav_engine_solve_watched(const int32_t* size, double* real, int32_t* index, uint64_t* keys,
+                                          double* curve, double* scratch) noexcept nogil:
+    """All sweeps, bit for bit, with the error before the first and after every one: curve (iterations + 1, 2)
+    holds max |e_n| [N s] over the contacts and E [sqrt J] over all rows; scratch (2 m)."""
+    cdef engine_t e
+    cdef int64_t n[3]
+    bind(size, real, index, keys, &e, n)
+    solve(&e, 1, NULL, curve, scratch)
+
+
+cdef public void lav_engine_apply(const int32_t* size, double* real, int32_t* index,
+                                  uint64_t* keys) noexcept nogil:
+    """dv and the final measures of impulses that another solver has written."""
+    cdef engine_t e
+    cdef int64_t n[3]
+    cdef blocks_t p
+    cdef rows_t r
+    cdef int32_t held
+    bind(size, real, index, keys, &e, n)
+    view(&e, &p, &r)
+    held = e.head[H_WARM_START]
+    e.head[H_WARM_START] = 1
+    warm(&e, &r)
+    e.head[H_WARM_START] = held
+    measure(&e, e.setting + S_OUT + 5, e.setting + S_OUT + 7)
+
+
+cdef public int32_t lav_engine_finish(const int32_t* size, double* real, int32_t* index,
+                                      uint64_t* keys) noexcept nogil:
+    """Positions, velocities and cache after the solve. Returns OK or NOT_FINITE."""
+    cdef engine_t e
+    cdef int64_t n[3]
+    bind(size, real, index, keys, &e, n)
+    return finish(&e)
+
+
+cdef inline int32_t substeps(const int32_t* size, double* real, int32_t* index, uint64_t* keys,
+                             int32_t n_substeps, double* room, int32_t* done) noexcept nogil:
+    cdef engine_t e
+    cdef int64_t n[3]
+    cdef int32_t status
+    bind(size, real, index, keys, &e, n)
+    done[0] = 0
+    while done[0] < n_substeps:
+        status = prepare(&e)
+        if status != OK:
+            return status
+        solve(&e, 1, room, NULL, NULL)
+        status = finish(&e)
+        done[0] += 1
+        if status != OK:
+            return status
+    return OK
+
+
+cdef public int32_t lav_engine_substeps(const int32_t* size, double* real, int32_t* index, uint64_t* keys,
+                                        int32_t n_substeps, int32_t* done) noexcept nogil:
+    """Whole substeps with sequential impulses; done: how many were completed before the status."""
+    return substeps(size, real, index, keys, n_substeps, NULL, done)
+
+
+cdef public int32_t lav_engine_substeps_packed(const int32_t* size, double* real, int32_t* index, uint64_t* keys,
+                                               int32_t n_substeps, double* room, int32_t* done) noexcept nogil:
+    """The same bits in less time, with room for packed contacts, as sweep_packed asks."""
+    return substeps(size, real, index, keys, n_substeps, room, done)
+
+
+def lengths(const int32_t[::1] size):
+    """Entries of the three buffers (doubles, int32, uint64) that these sizes (10,) need; -1: too many."""
+    cdef int32_t used[3]
+    lav_engine_lengths(&size[0], used)
+    return used[0], used[1], used[2]
+
+
+cdef class Buffers:
+    """Three buffers and their sizes, kept alive for the kernels; `arrays()` names what lies in them.
+
+    The caller passes buffers of at least `lengths(size)` entries.
+    """
+    cdef const int32_t[::1] size
+    cdef double[::1] real
+    cdef int32_t[::1] index
+    cdef uint64_t[::1] keys
+    cdef double[::1] room
+
+    def __init__(self, const int32_t[::1] size, double[::1] real, int32_t[::1] index, uint64_t[::1] keys):
+        self.size = size
+        self.real = real
+        self.index = index
+        self.keys = keys
+        self.room = np.empty(ROOM_CONTACT * min(<int64_t>size[CAP_CONTACT], MOST)
+                             + ROOM_BODY * <int64_t>size[N_DYNAMIC] + ROOM_MORE)
+
+    def pairs(self):
+        """Run the broad phase; returns the number of pairs needed."""
+        cdef int32_t n
+        with nogil:
+            n = lav_engine_pairs(&self.size[0], &self.real[0], &self.index[0], &self.keys[0])
+        return n
+
+    def prepare(self):
+        cdef int32_t status
+        with nogil:
+            status = lav_engine_prepare(&self.size[0], &self.real[0], &self.index[0], &self.keys[0])
+        return status
+
+    def solve(self, bint sweeps=True):
+        with nogil:
+            lav_engine_solve(&self.size[0], &self.real[0], &self.index[0], &self.keys[0], sweeps)
+
+    def solve_watched(self, double[:, ::1] curve):
+        """All sweeps; curve (iterations + 1, 2) takes max |e_n| [N s] and E [sqrt J] along the way."""
+        rows = self.size[N_JOINT_ROW] + self.size[CAP_CONTACT] * self.size[ROWS_PER_CONTACT]
+        cdef double[::1] scratch = np.empty(2 * rows + 1)
+        with nogil:
+            lav_engine_solve_watched(&self.size[0], &self.real[0], &self.index[0], &self.keys[0],
+                                     &curve[0, 0], &scratch[0])
+
+    def apply(self):
+        with nogil:
+            lav_engine_apply(&self.size[0], &self.real[0], &self.index[0], &self.keys[0])
+
+    def finish(self):
+        cdef int32_t status
+        with nogil:
+            status = lav_engine_finish(&self.size[0], &self.real[0], &self.index[0], &self.keys[0])
+        return status
+
+    def substeps(self, int32_t n):
+        """Run n substeps; returns (status, how many were completed)."""
+        cdef int32_t status, done = 0
+        with nogil:
+            status = lav_engine_substeps_packed(&self.size[0], &self.real[0], &self.index[0], &self.keys[0], n,
+                                                &self.room[0], &done)
+        return status, done
+
+    def arrays(self):
+        """Name -> writable view of one of the buffers, with the shape that engine/arrays.pxd gives."""
+        cdef engine_t e
+        cdef int64_t used[3]
+        cdef double* r = &self.real[0]
+        cdef int32_t* i = &self.index[0]
+        cdef uint64_t* k = &self.keys[0]
+        bind(&self.size[0], r, i, k, &e, used)
+        n, nd, kj, mj = self.size[N_BODY], self.size[N_DYNAMIC], self.size[N_JOINT], self.size[N_JOINT_ROW]
+        c, p, per = self.size[CAP_CONTACT], self.size[CAP_PAIR], self.size[ROWS_PER_CONTACT]
+        nt, m = c if per > 1 else 0, mj + c * per
+        real, index, keys = np.asarray(self.real), np.asarray(self.index), np.asarray(self.keys)
+        table = {
+            "setting": (real, e.setting - r, (N_SETTINGS,)), "x": (real, e.x - r, (n, 3)),
+            "q": (real, e.q - r, (n, 4)),
+            "v": (real, e.v - r, (n, 6)), "inv_mass_body": (real, e.inv_mass_body - r, (n,)),
+            "inertia": (real, e.inertia - r, (n, 3, 3)),
+            "inv_inertia_body": (real, e.inv_inertia_body - r, (n, 3, 3)),
+            "shape": (real, e.shape - r, (n, 4)), "friction": (real, e.friction - r, (n,)),
+            "restitution": (real, e.restitution - r, (n,)), "patch": (real, e.patch - r, (n,)),
+            "rot": (real, e.rot - r, (self.size[N_FRAME], 3, 3)), "fat": (real, e.fat - r, (n, 6)),
+            "joint": (real, e.joint - r, (kj, N_JOINT_REAL)), "joint_error": (real, e.joint_error - r, (mj,)),
+            "jac": (real, e.jac - r, (mj, 12)), "minv_jac": (real, e.minv_jac - r, (mj, 12)),
+            "joint_impulse": (real, e.joint_impulse - r, (mj,)), "inv_mass": (real, e.inv_mass - r, (nd,)),
+            "inv_inertia": (real, e.inv_inertia - r, (nd, 3, 3)), "v_free": (real, e.v_free - r, (nd, 6)),
+            "dv": (real, e.dv - r, (nd, 6)), "shift": (real, e.shift - r, (nd, 6)),
+            "point": (real, e.point - r, (c, 3)),
+            "gap": (real, e.gap - r, (c,)), "normal": (real, e.normal - r, (c, 3)),
+            "tangent": (real, e.tangent - r, (nt, 3)),
+            "arm_a": (real, e.arm_a - r, (c, 3)), "arm_b": (real, e.arm_b - r, (c, 3)),
+            "coupling": (real, e.coupling - r, (nt, 5)), "swing": (real, e.swing - r, (m - mj, 6)),
+            "local": (real, e.local - r, (c, 6)),
+            "cache_impulse": (real, e.cache_impulse - r, (c, 5)),
+            "cache_local": (real, e.cache_local - r, (c, 6)),
+            "push": (real, e.push - r, (mj + c,)), "target": (real, e.target - r, (m,)),
+            "lower": (real, e.lower - r, (mj,)),
+            "upper": (real, e.upper - r, (mj,)), "b": (real, e.b - r, (m,)), "d": (real, e.d - r, (m,)),
+            "step": (real, e.step - r, (m,)), "compliance": (real, e.compliance - r, (m,)),
+            "impulse": (real, e.impulse - r, (m,)), "mu": (real, e.mu - r, (kj + c,)),
+            "patch_radius": (real, e.patch_radius - r, (kj + c,)),
+            "head": (index, e.head - i, (N_HEAD,)), "kind_of_shape": (index, e.kind_of_shape - i, (n,)),
+            "dyn": (index, e.dyn - i, (n,)), "uneven": (index, e.uneven - i, (n,)),
+            "body_of": (index, e.body_of - i, (nd,)),
+            "joint_kind": (index, e.joint_kind - i, (kj,)), "joint_motor": (index, e.joint_motor - i, (kj,)),
+            "joint_bodies": (index, e.joint_bodies - i, (kj, 2)),
+            "joint_body": (index, e.joint_body - i, (kj, 2)),
+            "excluded": (index, e.excluded - i, (self.size[N_EXCLUDED], 2)),
+            "pair": (index, e.pair - i, (p, 2)),
+            "contact_pair": (index, e.contact_pair - i, (c, 2)),
+            "contact_body": (index, e.contact_body - i, (c, 2)),
+            "ptr": (index, e.ptr - i, (kj + c + 1,)), "kind": (index, e.kind - i, (kj + c,)),
+            "key": (keys, e.key - k, (c,)), "cache_key": (keys, e.cache_key - k, (c,)),
+        }
+        out = {}
+        for name, (base, at, shape) in table.items():
+            out[name] = base[at : at + int(np.prod(shape, dtype=np.int64))].reshape(shape)
+        return out

@@ -1,0 +1,37 @@
+"""The engine's velocity problem as the shared kernels see it."""
+from lavender_ext.core.block cimport COULOMB, blocks_t
+from lavender_ext.core.rows cimport rows_t
+from lavender_ext.engine.arrays cimport H_CONTACTS, H_CONTACT_ROWS, N_DYNAMIC, N_JOINT, N_JOINT_ROW, engine_t
+
+
+cdef inline void view(const engine_t* e, blocks_t* p, rows_t* r) noexcept nogil:
+    # nu = d: right for contacts without spin and for linear joint rows; whoever judges other rows sets it
+    p.n_blocks = e.size[N_JOINT] + e.head[H_CONTACTS]
+    p.n_rows = e.size[N_JOINT_ROW] + e.head[H_CONTACT_ROWS]
+    p.law = COULOMB
+    p.ptr = e.ptr
+    p.kind = e.kind
+    p.lower = e.lower
+    p.upper = e.upper
+    p.mu = e.mu
+    p.patch_radius = e.patch_radius
+    p.b = e.b
+    p.d = e.d
+    p.nu = e.d
+    p.step = e.step
+    r.n_bodies = e.size[N_DYNAMIC]
+    r.n_joints = e.size[N_JOINT]
+    r.n_contacts = e.head[H_CONTACTS]
+    r.jac = e.jac
+    r.minv_jac = e.minv_jac
+    r.joint_body = e.joint_body
+    r.normal = e.normal
+    r.tangent = e.tangent
+    r.arm_a = e.arm_a
+    r.arm_b = e.arm_b
+    r.contact_body = e.contact_body
+    r.coupling = e.coupling
+    r.swing = e.swing
+    r.inv_mass = e.inv_mass
+    r.inv_inertia = e.inv_inertia
+    r.compliance = e.compliance

@@ -1,0 +1,1 @@
+"""What a host without Python needs beside the kernels: where numbers lie, settings, copies, room."""

@@ -1,0 +1,586 @@
+"""The judge's pass: w = A lam - b formed anew, error e of every block, three sums over rows.
+
+    E   = sqrt(sum d e^2)                       [sqrt J]
+    V   = max sqrt(nu d) |e|                    [m/s], |e| the pair's norm on tangents
+    F_i = 2^-53 (|A| |lam| + |b|)_i             [m/s]; factored: |J| |M^-1| |J|^T |lam| + c |lam| for |A| |lam|
+    floor energy sqrt(sum F^2 / d), floor velocity max F sqrt(nu / d)
+
+A row's products serve w and F, and its error and sums follow while they are at hand: A is read once. Factored, a
+first loop gathers the wrench J^T lam on each body, M^-1 is applied once a body, a second loop reads J v.
+"""
+from libc.math cimport fabs, sqrt
+from libc.stdint cimport int32_t
+
+from lavender_ext.core.block cimport (CONE, CONTACT_SPIN, ROW, block_error, blocks_t, cone_error,
+                                      coulomb_error, n_tangents, norm2, row_error)
+from lavender_ext.core.csr cimport csr_abs_dot, csr_dot, csr_dot_size, csr_t
+from lavender_ext.core.rows cimport (contact_push, contact_slack, cross, dot3, joint_push, joint_velocity,
+                                     rows_t, rows_times)
+
+
+cdef struct score_t:
+    double energy               # sqrt J
+    double velocity             # m/s
+    double floor_energy         # sqrt J
+    double floor_velocity       # m/s
+    int32_t worst               # row of the largest velocity error, -1 where there is none
+    int32_t finite              # 0 where e holds a NaN or an infinity
+
+
+cdef struct tally_t:            # plain sums and squares: kept where they can neither have over- nor underflown
+    double energy               # sum (d e) e, for e^2 alone may vanish beside a d of 1e160
+    double fast                 # max (d e) (nu e)
+    double floor_energy         # sum (F / d) F
+    double floor_fast           # max nu (F / d) F
+    int32_t worst
+
+
+cdef struct sum_t:              # sum of squares as scale^2 * ssq: neither over- nor underflows
+    double scale
+    double ssq
+
+
+cdef inline void add_square(sum_t* s, double x) noexcept nogil:
+    cdef double r
+    x = fabs(x)
+    if x > s.scale:
+        r = s.scale / x
+        s.ssq = 1.0 + s.ssq * r * r
+        s.scale = x
+    elif x > 0.0:
+        r = x / s.scale
+        s.ssq += r * r
+
+
+cdef inline double root(const sum_t* s) noexcept nogil:
+    return s.scale * sqrt(s.ssq)
+
+
+cdef inline tally_t nothing() noexcept nogil:
+    cdef tally_t s
+    s.energy = 0.0
+    s.fast = -1.0
+    s.floor_energy = 0.0
+    s.floor_fast = 0.0
+    s.worst = -1
+    return s
+
+
+cdef inline void tally_row(const blocks_t* p, int32_t k, double e, tally_t* s) noexcept nogil:
+    cdef double v = p.d[k] * e, t = v * (p.nu[k] * e)
+    s.energy += v * e
+    if t > s.fast:
+        s.fast = t
+        s.worst = k
+
+
+cdef inline void tally_contact(const blocks_t* p, int32_t j, int32_t nt, int32_t spin, const double* e,
+                               tally_t* s) noexcept nogil:
+    # A pair of tangents counts once in the maximum, by its norm.
+    cdef double x, y
+    tally_row(p, j, e[j], s)
+    if nt == 1:
+        tally_row(p, j + 1, e[j + 1], s)
+    elif nt == 2:
+        x = p.d[j + 1] * e[j + 1]
+        y = p.d[j + 1] * e[j + 2]
+        s.energy += x * e[j + 1] + y * e[j + 2]
+        x = x * (p.nu[j + 1] * e[j + 1]) + y * (p.nu[j + 1] * e[j + 2])
+        if x > s.fast:
+            s.fast = x
+            s.worst = j + 1
+    if spin:
+        tally_row(p, j + 1 + nt, e[j + 1 + nt], s)
+
+
+cdef inline void tally_block(const blocks_t* p, int32_t i, const double* e, tally_t* s) noexcept nogil:
+    cdef int32_t k, j = p.ptr[i], end = p.ptr[i + 1]
+    if p.kind[i] == ROW:
+        for k in range(j, end):
+            tally_row(p, k, e[k], s)
+    else:
+        tally_contact(p, j, n_tangents(p.kind[i], end - j), p.kind[i] == CONTACT_SPIN, e, s)
+
+
+cdef inline void tally_floor(const blocks_t* p, int32_t k, double size, tally_t* s) noexcept nogil:
+    # size = (|A| |lam|)_k
+    cdef double f = 1.1102230246251565e-16 * (size + fabs(p.b[k])), t = f / p.d[k]
+    s.floor_energy += t * f
+    t = p.nu[k] * t * f
+    if t > s.floor_fast:
+        s.floor_fast = t
+
+
+cdef inline int32_t is_plain(double energy, double fast) noexcept nogil:
+    return 1e-250 < energy < 1e250 and 1e-250 < fast < 1e250
+
+
+cdef inline void score_from(const blocks_t* p, const double* e, const tally_t* s, score_t* out) noexcept nogil:
+    """The two sums over e (m); the floor entries are left alone."""
+    cdef int32_t i, j, k, nt
+    cdef double v, big = -1.0
+    cdef sum_t total = sum_t(0.0, 0.0)
+    out.worst = s.worst
+    out.finite = 1
+    if is_plain(s.energy, s.fast):
+        out.energy = sqrt(s.energy)
+        out.velocity = sqrt(s.fast)
+        return
+    out.worst = -1
+    for i in range(p.n_blocks):
+        j = p.ptr[i]
+        nt = 0 if p.kind[i] == ROW else n_tangents(p.kind[i], p.ptr[i + 1] - j)
+        for k in range(j, p.ptr[i + 1]):
+            add_square(&total, sqrt(p.d[k]) * e[k])
+            if nt == 2 and k == j + 2:
+                continue                                # the pair counts once, below
+            v = norm2(e[k], e[k + 1]) if nt == 2 and k == j + 1 else fabs(e[k])
+            v = sqrt(p.nu[k]) * sqrt(p.d[k]) * v
+            if v > big:
+                big = v
+                out.worst = k
+            elif v != v and out.finite:
+                out.finite = 0
+                out.worst = k
+                big = 1.0 / 0.0
+    if big > 1.7976931348623157e308:
+        out.finite = 0
+    out.energy = root(&total)
+    out.velocity = big if big > 0.0 else 0.0
+
+
+cdef inline void score_rows(const blocks_t* p, const double* lam, const double* w, double* e, score_t* out) noexcept nogil:
+    """Errors e (m) of all blocks and their two sums; the floor entries are left alone."""
+    cdef int32_t i
+    cdef tally_t s = nothing()
+    for i in range(p.n_blocks):
+        block_error(p, i, lam, w, e)
+        tally_block(p, i, e, &s)
+    score_from(p, e, &s, out)
+
+
+cdef inline void norms_of_rhs(const blocks_t* p, double* energy, double* velocity) noexcept nogil:
+    """sqrt(sum b^2 / d) and max |b| sqrt(nu / d), the pair's norm on tangents."""
+    cdef int32_t i, j, k, nt
+    cdef double x, t, sum_ = 0.0, fast = 0.0, big = 0.0
+    cdef sum_t total = sum_t(0.0, 0.0)
+    for i in range(p.n_blocks):
+        j = p.ptr[i]
+        nt = 0 if p.kind[i] == ROW else n_tangents(p.kind[i], p.ptr[i + 1] - j)
+        for k in range(j, p.ptr[i + 1]):
+            t = (p.b[k] / p.d[k]) * p.b[k]
+            sum_ += t
+            if nt == 2 and k == j + 1:
+                t += (p.b[k + 1] / p.d[k + 1]) * p.b[k + 1]
+            t = t * p.nu[k]
+            if t > fast:
+                fast = t
+    if is_plain(sum_, fast):
+        energy[0] = sqrt(sum_)
+        velocity[0] = sqrt(fast)
+        return
+    for i in range(p.n_blocks):                         # scaled: 1e-200 does not vanish
+        j = p.ptr[i]
+        nt = 0 if p.kind[i] == ROW else n_tangents(p.kind[i], p.ptr[i + 1] - j)
+        for k in range(j, p.ptr[i + 1]):
+            x = p.b[k] / sqrt(p.d[k])
+            add_square(&total, x)
+            if nt == 2 and k == j + 1:
+                x = norm2(x, p.b[k + 1] / sqrt(p.d[k + 1]))
+            x = fabs(x) * sqrt(p.nu[k])
+            if x > big:
+                big = x
+    energy[0] = root(&total)
+    velocity[0] = big
+
+
+cdef inline void add_floor(const blocks_t* p, int32_t i, double size, sum_t* total, double* big) noexcept nogil:
+    cdef double f = 1.1102230246251565e-16 * (size + fabs(p.b[i])), v
+    add_square(total, f / sqrt(p.d[i]))
+    v = f * (sqrt(p.nu[i]) / sqrt(p.d[i]))
+    if v > big[0]:
+        big[0] = v
+
+
+# -- A in compressed rows ----------------------------------------------------------------------------
+
+
+cdef inline void csr_slack(const blocks_t* p, const csr_t* a, const double* lam, double* w) noexcept nogil:
+    cdef int32_t i
+    for i in range(p.n_rows):
+        w[i] = csr_dot(a, i, lam) - p.b[i]
+
+
+cdef inline tally_t csr_pass(const blocks_t* p, const csr_t* a, const double* lam, double* w, double* e) noexcept nogil:
+    # All in one loop; without F two loops are the quicker ones.
+    cdef int32_t i = 0, j, k, n
+    cdef double size, low, high, inf = 1.0 / 0.0
+    cdef tally_t s = nothing()
+    for k in range(p.n_rows):
+        w[k] = csr_dot_size(a, k, lam, &size) - p.b[k]
+        tally_floor(p, k, size, &s)
+        j = p.ptr[i]
+        n = p.ptr[i + 1] - j
+        if n == 1:                                      # a row, or a normal alone: the same formula under both laws
+            low = p.lower[k] if p.kind[i] == ROW else 0.0
+            high = p.upper[k] if p.kind[i] == ROW else inf
+            e[k] = row_error(lam[k], w[k], p.d[k], low, high)
+            tally_row(p, k, e[k], &s)
+            i += 1
+        elif k == j + n - 1:                            # the last row of a block
+            block_error(p, i, lam, w, e)
+            tally_block(p, i, e, &s)
+            i += 1
+    return s
+
+
+cdef inline void csr_judge(const blocks_t* p, const csr_t* a, const double* lam, double* w, double* e, bint floor,
+                           score_t* out) noexcept nogil:
+    cdef int32_t i
+    cdef tally_t s
+    cdef sum_t total = sum_t(0.0, 0.0)
+    cdef double big = 0.0
+    if not floor:
+        csr_slack(p, a, lam, w)
+        score_rows(p, lam, w, e, out)
+        return
+    s = csr_pass(p, a, lam, w, e)
+    score_from(p, e, &s, out)
+    if is_plain(s.floor_energy, s.floor_fast):
+        out.floor_energy = sqrt(s.floor_energy)
+        out.floor_velocity = sqrt(s.floor_fast)
+        return
+    for i in range(p.n_rows):
+        add_floor(p, i, csr_abs_dot(a, i, lam), &total, &big)
+    out.floor_energy = root(&total)
+    out.floor_velocity = big
+
+
+# -- the factored form -------------------------------------------------------------------------------
+
+
+cdef inline void rows_velocity(const blocks_t* p, const rows_t* r, const double* lam, double* v) noexcept nogil:
+    """v = M^-1 J^T lam, (n, 6), block by block as sweeps change it: where they start."""
+    cdef int32_t i, j, c
+    for i in range(6 * r.n_bodies):
+        v[i] = 0.0
+    for i in range(r.n_joints):
+        for j in range(p.ptr[i], p.ptr[i + 1]):
+            joint_push(r.minv_jac + 12 * j, lam[j], v, r.joint_body[2 * i], r.joint_body[2 * i + 1])
+    for c in range(r.n_contacts):
+        i = r.n_joints + c
+        j = p.ptr[i]
+        contact_push(r, c, n_tangents(p.kind[i], p.ptr[i + 1] - j), p.kind[i] == CONTACT_SPIN, lam + j, v)
+
+
+cdef inline void rows_slack(const blocks_t* p, const rows_t* r, const double* lam, const double* v,
+                                double* w) noexcept nogil:
+    """w = J v + c lam - b, v = M^-1 J^T lam."""
+    cdef int32_t j
+    rows_times(p, r, v, w)
+    for j in range(p.n_rows):
+        w[j] += r.compliance[j] * lam[j] - p.b[j]
+
+
+cdef inline void add6(double* to, const double* x) noexcept nogil:
+    cdef int32_t k
+    for k in range(6):
+        to[k] += x[k]
+
+
+cdef inline void joint_wrench(const blocks_t* p, const rows_t* r, int32_t i, const double* lam, bint floor, double* v,
+                              double* size) noexcept nogil:
+    # J^T lam of joint i onto its bodies in v; |J|^T |lam| in size.
+    cdef double sum_[12]
+    cdef double all_[12]
+    cdef const double* row
+    cdef int32_t j, k, a = r.joint_body[2 * i], b = r.joint_body[2 * i + 1]
+    for k in range(12):
+        sum_[k] = 0.0
+        all_[k] = 0.0
+    for j in range(p.ptr[i], p.ptr[i + 1]):
+        row = r.jac + 12 * j
+        for k in range(12):
+            sum_[k] += row[k] * lam[j]
+        if floor:
+            for k in range(12):
+                all_[k] += fabs(row[k] * lam[j])
+    if a >= 0:
+        add6(v + 6 * a, sum_)
+        if floor:
+            add6(size + 6 * a, all_)
+    if b >= 0:
+        add6(v + 6 * b, sum_ + 6)
+        if floor:
+            add6(size + 6 * b, all_ + 6)
+
+
+cdef inline void contact_wrench(const rows_t* r, int32_t c, int32_t nt, int32_t spin, const double* lam,
+                                double* v) noexcept nogil:
+    # The same of one contact; lam at its normal.
+    cdef double t2[3]
+    cdef double x[3]
+    cdef double l[3]
+    cdef const double* n = r.normal + 3 * c
+    cdef int32_t k, a = r.contact_body[2 * c], b = r.contact_body[2 * c + 1]
+    if nt > 1:
+        cross(n, r.tangent + 3 * c, t2)
+    for k in range(3):
+        x[k] = lam[0] * n[k]
+        if nt > 0:
+            x[k] += lam[1] * r.tangent[3 * c + k]
+        if nt > 1:
+            x[k] += lam[2] * t2[k]
+    if a >= 0:
+        cross(r.arm_a + 3 * c, x, l)
+        for k in range(3):
+            v[6 * a + k] -= x[k]
+            v[6 * a + 3 + k] -= l[k] + lam[1 + nt] * n[k] if spin else l[k]
+    if b >= 0:
+        cross(r.arm_b + 3 * c, x, l)
+        for k in range(3):
+            v[6 * b + k] += x[k]
+            v[6 * b + 3 + k] += l[k] + lam[1 + nt] * n[k] if spin else l[k]
+
+
+cdef inline double abs_cross(const double* x, const double* y, int32_t k) noexcept nogil:
+    # |(x x y)_k|
+    if k == 0:
+        return fabs(x[1] * y[2] - x[2] * y[1])
+    if k == 1:
+        return fabs(x[2] * y[0] - x[0] * y[2])
+    return fabs(x[0] * y[1] - x[1] * y[0])
+
+
+cdef inline void side_wrench_size(const double* n, const double* t1, const double* t2, const double* arm, int32_t nt,
+                                  int32_t spin, double x, double y, double z, double u, double* out) noexcept nogil:
+    # x, y, z, u: |lam| of normal, tangents and spin.
+    cdef int32_t k
+    cdef double s, l
+    for k in range(3):
+        s = fabs(n[k]) * x
+        l = abs_cross(arm, n, k) * x
+        if nt > 0:
+            s += fabs(t1[k]) * y
+            l += abs_cross(arm, t1, k) * y
+        if nt > 1:
+            s += fabs(t2[k]) * z
+            l += abs_cross(arm, t2, k) * z
+        if spin:
+            l += fabs(n[k]) * u
+        out[k] += s
+        out[3 + k] += l
+
+
+cdef inline void contact_wrench_size(const rows_t* r, int32_t c, int32_t nt, int32_t spin, const double* lam,
+                                     double* size) noexcept nogil:
+    # |J|^T |lam| of one contact.
+    cdef double t2[3]
+    cdef double y = 0.0, z = 0.0, u = 0.0
+    cdef const double* n = r.normal + 3 * c
+    cdef const double* t1 = r.tangent + 3 * c
+    cdef int32_t a = r.contact_body[2 * c], b = r.contact_body[2 * c + 1]
+    if nt > 0:
+        y = fabs(lam[1])
+    if nt > 1:
+        z = fabs(lam[2])
+        cross(n, t1, t2)
+    if spin:
+        u = fabs(lam[1 + nt])
+    if a >= 0:
+        side_wrench_size(n, t1, t2, r.arm_a + 3 * c, nt, spin, fabs(lam[0]), y, z, u, size + 6 * a)
+    if b >= 0:
+        side_wrench_size(n, t1, t2, r.arm_b + 3 * c, nt, spin, fabs(lam[0]), y, z, u, size + 6 * b)
+
+
+cdef inline void wrenches(const blocks_t* p, const rows_t* r, const double* lam, bint floor, double* v) noexcept nogil:
+    """v = M^-1 J^T lam (n, 6), summed as wrenches first; with the floor |M^-1| |J|^T |lam| behind it, (n, 6)."""
+    cdef int32_t i, j, c, k, nt, n = r.n_bodies
+    cdef double* size = v + 6 * <ssize_t>n
+    cdef double* x
+    cdef const double* inv
+    cdef double t[3]
+    for i in range(12 * n if floor else 6 * n):
+        v[i] = 0.0
+    for i in range(r.n_joints):
+        joint_wrench(p, r, i, lam, floor, v, size)
+    for c in range(r.n_contacts):
+        i = r.n_joints + c
+        j = p.ptr[i]
+        nt = n_tangents(p.kind[i], p.ptr[i + 1] - j)
+        if p.kind[i] == CONTACT_SPIN or nt == 1:        # the two common kinds with their sizes as constants
+            contact_wrench(r, c, nt, p.kind[i] == CONTACT_SPIN, lam + j, v)
+            if floor:
+                contact_wrench_size(r, c, nt, p.kind[i] == CONTACT_SPIN, lam + j, size)
+        elif nt == 2:
+            contact_wrench(r, c, 2, 0, lam + j, v)
+            if floor:
+                contact_wrench_size(r, c, 2, 0, lam + j, size)
+        else:
+            contact_wrench(r, c, 0, 0, lam + j, v)
+            if floor:
+                contact_wrench_size(r, c, 0, 0, lam + j, size)
+    for i in range(n):
+        x = v + 6 * <ssize_t>i
+        inv = r.inv_inertia + 9 * <ssize_t>i
+        for k in range(3):
+            x[k] *= r.inv_mass[i]
+            t[k] = x[3 + k]
+        for k in range(3):
+            x[3 + k] = dot3(inv + 3 * k, t)
+        if floor:
+            x = size + 6 * <ssize_t>i
+            for k in range(3):
+                x[k] *= r.inv_mass[i]
+                t[k] = x[3 + k]
+            for k in range(3):
+                x[3 + k] = (fabs(inv[3 * k]) * t[0] + fabs(inv[3 * k + 1]) * t[1]) + fabs(inv[3 * k + 2]) * t[2]
+
+
+cdef inline double joint_size(const double* jac, const double* size, int32_t a, int32_t b) noexcept nogil:
+    # |J| size of one row; two sums side by side, for two lanes.
+    cdef double s = 0.0, t = 0.0
+    cdef const double* x
+    cdef int32_t k
+    if a >= 0:
+        x = size + 6 * a
+        for k in range(3):
+            s += fabs(jac[2 * k]) * x[2 * k]
+            t += fabs(jac[2 * k + 1]) * x[2 * k + 1]
+    if b >= 0:
+        x = size + 6 * b
+        for k in range(3):
+            s += fabs(jac[6 + 2 * k]) * x[2 * k]
+            t += fabs(jac[7 + 2 * k]) * x[2 * k + 1]
+    return s + t
+
+
+cdef inline double side_size(const double* axis, const double* arm, const double* size) noexcept nogil:
+    # |axis| . linear + |arm x axis| . angular
+    cdef double s = 0.0, t = 0.0
+    cdef int32_t k
+    for k in range(3):
+        s += fabs(axis[k]) * size[k]
+        t += abs_cross(arm, axis, k) * size[3 + k]
+    return s + t
+
+
+cdef inline void contact_sizes(const rows_t* r, int32_t c, int32_t nt, int32_t spin, const double* size,
+                               double* out) noexcept nogil:
+    # |J| size of the rows of one contact
+    cdef double t2[3]
+    cdef const double* n = r.normal + 3 * c
+    cdef const double* t1 = r.tangent + 3 * c
+    cdef const double* arm
+    cdef const double* x
+    cdef int32_t k, side, body
+    if nt > 1:
+        cross(n, t1, t2)
+    for k in range(1 + nt + spin):
+        out[k] = 0.0
+    for side in range(2):
+        body = r.contact_body[2 * c + side]
+        if body < 0:
+            continue
+        arm = r.arm_b + 3 * c if side else r.arm_a + 3 * c
+        x = size + 6 * body
+        out[0] += side_size(n, arm, x)
+        if nt > 0:
+            out[1] += side_size(t1, arm, x)
+        if nt > 1:
+            out[2] += side_size(t2, arm, x)
+        if spin:
+            for k in range(3):
+                out[1 + nt] += fabs(n[k]) * x[3 + k]
+
+
+cdef inline void judge_contact(const blocks_t* p, const rows_t* r, int32_t c, int32_t j, int32_t nt, int32_t spin,
+                               const double* lam, double* w, double* e, const double* v,
+                               tally_t* s) noexcept nogil:
+    cdef int32_t k, i = r.n_joints + c
+    cdef double size[4]
+    contact_slack(r, c, nt, spin, v, w + j)
+    for k in range(j, j + 1 + nt + spin):
+        w[k] += r.compliance[k] * lam[k] - p.b[k]
+    if p.law == CONE:
+        cone_error(lam + j, w + j, p.d + j, p.mu[i], p.patch_radius[i], nt, spin, e + j)
+    else:
+        coulomb_error(lam + j, w + j, p.d + j, p.mu[i], p.patch_radius[i], nt, spin, e + j)
+    tally_contact(p, j, nt, spin, e, s)
+    contact_sizes(r, c, nt, spin, v + 6 * <ssize_t>r.n_bodies, size)
+    for k in range(1 + nt + spin):
+        tally_floor(p, j + k, r.compliance[j + k] * fabs(lam[j + k]) + size[k], s)
+
+
+cdef inline tally_t rows_pass(const blocks_t* p, const rows_t* r, const double* lam, double* w, double* e,
+                              const double* v) noexcept nogil:
+    # With the floor; without it two loops are the quicker ones.
+    cdef int32_t i, j, c, a, b, nt
+    cdef tally_t s = nothing()
+    cdef const double* size = v + 6 * <ssize_t>r.n_bodies
+    for i in range(r.n_joints):
+        a = r.joint_body[2 * i]
+        b = r.joint_body[2 * i + 1]
+        for j in range(p.ptr[i], p.ptr[i + 1]):
+            w[j] = joint_velocity(r.jac + 12 * j, v, a, b) + (r.compliance[j] * lam[j] - p.b[j])
+            e[j] = row_error(lam[j], w[j], p.d[j], p.lower[j], p.upper[j])
+            tally_row(p, j, e[j], &s)
+            tally_floor(p, j, r.compliance[j] * fabs(lam[j]) + joint_size(r.jac + 12 * j, size, a, b), &s)
+    for c in range(r.n_contacts):
+        i = r.n_joints + c
+        j = p.ptr[i]
+        nt = n_tangents(p.kind[i], p.ptr[i + 1] - j)
+        if p.kind[i] == CONTACT_SPIN or nt == 1:
+            judge_contact(p, r, c, j, nt, p.kind[i] == CONTACT_SPIN, lam, w, e, v, &s)
+        elif nt == 2:
+            judge_contact(p, r, c, j, 2, 0, lam, w, e, v, &s)
+        else:
+            judge_contact(p, r, c, j, 0, 0, lam, w, e, v, &s)
+    return s
+
+
+cdef inline void rows_judge(const blocks_t* p, const rows_t* r, const double* lam, double* w, double* e, double* v,
+                            bint floor, score_t* out) noexcept nogil:
+    cdef int32_t i, j, c, k, nt
+    cdef double size[4]
+    cdef const double* sizes = v + 6 * <ssize_t>r.n_bodies
+    cdef tally_t s
+    cdef sum_t total = sum_t(0.0, 0.0)
+    cdef double big = 0.0
+    wrenches(p, r, lam, floor, v)
+    if not floor:
+        rows_slack(p, r, lam, v, w)
+        score_rows(p, lam, w, e, out)
+        return
+    s = rows_pass(p, r, lam, w, e, v)
+    score_from(p, e, &s, out)
+    if is_plain(s.floor_energy, s.floor_fast):
+        out.floor_energy = sqrt(s.floor_energy)
+        out.floor_velocity = sqrt(s.floor_fast)
+        return
+    for i in range(p.n_blocks):
+        j = p.ptr[i]
+        c = i - r.n_joints
+        if c < 0:
+            for k in range(j, p.ptr[i + 1]):
+                add_floor(p, k, r.compliance[k] * fabs(lam[k])
+                          + joint_size(r.jac + 12 * k, sizes, r.joint_body[2 * i], r.joint_body[2 * i + 1]), &total, &big)
+            continue
+        nt = n_tangents(p.kind[i], p.ptr[i + 1] - j)
+        contact_sizes(r, c, nt, p.kind[i] == CONTACT_SPIN, sizes, size)
+        for k in range(p.ptr[i + 1] - j):
+            add_floor(p, j + k, r.compliance[j + k] * fabs(lam[j + k]) + size[k], &total, &big)
+    out.floor_energy = root(&total)
+    out.floor_velocity = big
+
+
+cdef inline void judge_into(const blocks_t* p, const csr_t* a, const rows_t* r, bint factored, const double* lam, double* w,
+                     double* e, double* v, bint floor, score_t* out) noexcept nogil:
+    """Slack into w (m), error into e (m), the sums into out; v (n_bodies, 12) is scratch, read where factored.
+
+    Without the floor (n_bodies, 6) of v suffice.
+    """
+    if factored:
+        rows_judge(p, r, lam, w, e, v, floor, out)
+    else:
+        csr_judge(p, a, lam, w, e, floor, out)

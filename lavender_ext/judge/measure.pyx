@@ -1,0 +1,155 @@
+"""The judge for Python: thin entries of judge/measure.pxd, and the same pass exported by name."""
+from libc.stdint cimport int32_t
+from libc.string cimport memcmp
+
+import numpy as np
+
+from lavender_ext.core.block cimport blocks_t
+from lavender_ext.core.csr cimport csr_t
+from lavender_ext.core.problem cimport Data
+from lavender_ext.core.rows cimport rows_t
+from lavender_ext.judge.measure cimport (csr_slack, judge_into, norms_of_rhs, rows_slack, rows_velocity,
+                                         score_rows, score_t, wrenches)
+
+
+cdef public void lav_judge_csr(const blocks_t* p, const csr_t* a, const double* lam, double* w, double* e,
+                               int32_t floor, score_t* out) noexcept nogil:
+    """Slack w (m), error e (m) and the sums of lam (m) for a problem given by A."""
+    judge_into(p, a, NULL, 0, lam, w, e, NULL, floor, out)
+
+
+cdef public void lav_judge_rows(const blocks_t* p, const rows_t* r, const double* lam, double* w, double* e, double* v,
+                                int32_t floor, score_t* out) noexcept nogil:
+    """The same for a factored problem; v (n_bodies, 6), with the floor (n_bodies, 12), is scratch."""
+    judge_into(p, NULL, r, 1, lam, w, e, v, floor, out)
+
+
+cdef public void lav_rows_velocity(const blocks_t* p, const rows_t* r, const double* lam, double* v) noexcept nogil:
+    """v = M^-1 J^T lam (n_bodies, 6), from which sweeps over bodies start."""
+    rows_velocity(p, r, lam, v)
+
+
+def slack(Data p, const double[::1] lam, double[::1] w):
+    """w = A lam - b [m/s] into w (m,)."""
+    cdef double[::1] v
+    if p.blocks.n_rows == 0:
+        return
+    if p.factored:
+        v = np.empty(6 * p.rows.n_bodies + 1)
+        with nogil:
+            wrenches(&p.blocks, &p.rows, &lam[0], False, &v[0])
+            rows_slack(&p.blocks, &p.rows, &lam[0], &v[0], &w[0])
+    else:
+        with nogil:
+            csr_slack(&p.blocks, &p.csr, &lam[0], &w[0])
+
+
+def judge(Data p, const double[::1] lam, double[::1] w, double[::1] e, bint floor=True):
+    """Slack into w, error into e, and (energy, velocity, worst row, floor energy, floor velocity, finite)."""
+    cdef score_t s = score_t(0.0, 0.0, 0.0, 0.0, -1, 1)
+    cdef double[::1] bodies
+    cdef double* v = NULL
+    if p.blocks.n_rows == 0:
+        return 0.0, 0.0, -1, 0.0, 0.0, True
+    if p.factored:
+        bodies = np.empty((12 if floor else 6) * p.rows.n_bodies + 1)
+        v = &bodies[0]
+    with nogil:
+        judge_into(&p.blocks, &p.csr, &p.rows, p.factored, &lam[0], &w[0], &e[0], v, floor, &s)
+    return s.energy, s.velocity, s.worst, s.floor_energy, s.floor_velocity, bool(s.finite)
+
+
+cdef inline double ratio(double x, double reference) noexcept nogil:
+    # 0 where x is, inf where x is not finite or has nothing to be compared with
+    if x == 0.0:
+        return 0.0
+    return x / reference if x < 1.0 / 0.0 and reference > 0.0 else 1.0 / 0.0
+
+
+cdef class Judged:
+    """The judge's pass over one impulse, with its floor, beside the error of doing nothing, which `p` must know.
+
+    `impulse` (m,) is kept as it is and must not change any more; the other arrays belong to this.
+    """
+
+    cdef readonly object impulse, slack, error          # (m,) N s; w (m,) m/s; e (m,) N s
+    cdef readonly double energy, velocity               # sqrt J, m/s; inf where e is not finite
+    cdef readonly double relative, floor                # -
+    cdef readonly int worst                             # row of the largest velocity error, -1
+
+    def __init__(self, Data p, impulse):
+        cdef const double[::1] lam = impulse
+        cdef double[::1] w, e, bodies
+        cdef double* v = NULL
+        cdef score_t s = score_t(0.0, 0.0, 0.0, 0.0, -1, 1)
+        cdef double x, y
+        self.impulse = impulse
+        self.slack = w = np.empty(lam.shape[0])
+        self.error = e = np.empty(lam.shape[0])
+        if p.blocks.n_rows > 0:
+            if p.factored:
+                bodies = np.empty(12 * <Py_ssize_t>p.rows.n_bodies + 1)
+                v = &bodies[0]
+            with nogil:
+                judge_into(&p.blocks, &p.csr, &p.rows, p.factored, &lam[0], &w[0], &e[0], v, True, &s)
+        self.energy = s.energy if s.finite else 1.0 / 0.0
+        self.velocity = s.velocity if s.finite else 1.0 / 0.0
+        self.worst = s.worst
+        x = ratio(self.energy, p.start_energy)
+        y = ratio(self.velocity, p.start_velocity)
+        self.relative = x if x > y else y
+        x = ratio(s.floor_energy, p.start_energy)
+        y = ratio(s.floor_velocity, p.start_velocity)
+        self.floor = x if x > y else y
+
+
+def all_finite(const double[::1] x):
+    """Does x hold neither NaN nor infinity?"""
+    cdef Py_ssize_t i, n = x.shape[0]
+    cdef double s = 0.0, t = 0.0, u = 0.0, v = 0.0      # stay 0, or become NaN
+    i = 0
+    while i + 4 <= n:
+        s += 0.0 * x[i]
+        t += 0.0 * x[i + 1]
+        u += 0.0 * x[i + 2]
+        v += 0.0 * x[i + 3]
+        i += 4
+    while i < n:
+        s += 0.0 * x[i]
+        i += 1
+    return (s + t) + (u + v) == 0.0
+
+
+def rhs_norms(Data p):
+    """(sqrt J, m/s): b in the judge's two norms."""
+    cdef double energy, velocity
+    with nogil:
+        norms_of_rhs(&p.blocks, &energy, &velocity)
+    return energy, velocity
+
+
+def same_bits(const double[::1] x, const double[::1] y):
+    """Are two arrays equal to the bit?"""
+    cdef Py_ssize_t n = x.shape[0]
+    return y.shape[0] == n and (n == 0 or memcmp(&x[0], &y[0], n * sizeof(double)) == 0)
+
+
+def score(Data p, const double[::1] lam, const double[::1] w, double[::1] e):
+    """Error of (lam, w) as they are, w given: (energy, velocity, worst row, finite)."""
+    cdef score_t s = score_t(0.0, 0.0, 0.0, 0.0, -1, 1)
+    if p.blocks.n_rows == 0:
+        return 0.0, 0.0, -1, True
+    with nogil:
+        score_rows(&p.blocks, &lam[0], &w[0], &e[0], &s)
+    return s.energy, s.velocity, s.worst, bool(s.finite)
+
+
+def velocity_change(Data p, const double[::1] lam, double[:, ::1] v):
+    """M^-1 J^T lam (n, 6) of a factored problem, into v."""
+    if not p.factored or p.rows.n_bodies == 0:
+        return
+    if p.blocks.n_rows == 0:
+        v[:, :] = 0.0
+        return
+    with nogil:
+        rows_velocity(&p.blocks, &p.rows, &lam[0], &v[0, 0])

@@ -1,0 +1,141 @@
+"""The stopping test of a sweep solver: the judge's own arithmetic at sweep counts that depend on the numbers alone.
+
+A check falls at the start and after the first sweep. From the residuals r0, r of the last two, k sweeps apart, the
+end is expected after n more, r (r/r0)^(n/k) <= tol, and the next check is half way there: no nearer than an eighth
+of the sweeps done so far, no further than as many again. A residual that does not fall is looked at again after
+that eighth. The relative residual r decides:
+
+    r <= tol                                        CONVERGED
+    r not finite, or > 1e6 max(1, r at the start)   DIVERGED
+    no better than the best so far, and
+        best <= 1e-6 and best <= 2 floor            AT_FLOOR
+        sweeps > 32 * sweeps of the best + patience STALLED
+
+On the last three the best iterate is put back. A check costs about one sweep.
+"""
+from libc.stdint cimport int32_t
+
+from lavender_ext.core.block cimport blocks_t
+from lavender_ext.core.csr cimport csr_t
+from lavender_ext.core.problem cimport Data
+from lavender_ext.core.rows cimport rows_t
+from lavender_ext.judge.measure cimport judge_into, score_t
+
+
+cdef enum:
+    RUNNING = 0
+    CONVERGED = 1
+    DIVERGED = 2
+    STALLED = 3
+    AT_FLOOR = 4
+
+
+cdef struct watch_t:
+    int32_t total               # sweeps done
+    int32_t check_at            # sweeps at the next check
+    int32_t last_at             # sweeps at the last check
+    int32_t best_at             # sweeps at the best check, -1 before any
+    int32_t patience            # sweeps that may always pass without a better check
+    double start                # relative residual at the first check
+    double last                 # at the last one
+    double best_relative        # of the best check
+    double start_energy         # sqrt J, of doing nothing
+    double start_velocity       # m/s
+    double* best                # (m) N s
+    double* w                   # (m) scratch
+    double* e                   # (m) scratch
+    double* v                   # (n_bodies, 12) scratch
+
+
+ctypedef void (*sweep_t)(void* context, double* lam, int32_t first_sweep, int32_t n) noexcept nogil
+
+
+cdef inline double ratio(double x, double reference) noexcept nogil:
+    if x == 0.0:
+        return 0.0
+    return x / reference if reference > 0.0 else 1.0 / 0.0
+
+
+cdef inline double relative(const watch_t* s, double energy, double velocity) noexcept nogil:
+    cdef double x = ratio(energy, s.start_energy), y = ratio(velocity, s.start_velocity)
+    return x if x > y else y
+
+
+cdef inline void copy(const double* x, double* out, int32_t n) noexcept nogil:
+    cdef int32_t i
+    for i in range(n):
+        out[i] = x[i]
+
+
+cdef inline int32_t until_next(const watch_t* s, double now, double tol) noexcept nogil:
+    """Sweeps until the next check."""
+    cdef double least = s.total >> 3, most = s.total, n = 0.0, gap = s.total - s.last_at, fall, r = now
+    if least < 1.0:
+        least = 1.0
+    if gap >= 1.0 and now < s.last:
+        fall = now / s.last
+        while r > tol and n < 2.0 * most:
+            r *= fall
+            n += gap
+        n = 0.5 * n
+    n = n if n < most else most
+    n = n if n > least else least
+    most = 2147483647.0 - s.total
+    return <int32_t>(n if n < most else most)
+
+
+cdef inline int32_t check(watch_t* s, const blocks_t* p, const csr_t* a, const rows_t* r, int32_t factored,
+                          double* lam, double tol) noexcept nogil:
+    """One check; sets the sweeps of the next."""
+    cdef score_t x
+    cdef double now, inf = 1.0 / 0.0
+    judge_into(p, a, r, factored, lam, s.w, s.e, s.v, 0, &x)
+    now = relative(s, x.energy, x.velocity) if x.finite else inf
+    if s.total == 0:
+        s.start = now
+    s.check_at = s.total + until_next(s, now, tol)
+    s.last = now
+    s.last_at = s.total
+    if now <= tol:
+        return CONVERGED
+    if now < s.best_relative:
+        s.best_relative = now
+        s.best_at = s.total
+        copy(lam, s.best, p.n_rows)
+        return RUNNING
+    if not now < inf or now > 1e6 * (s.start if s.start > 1.0 else 1.0):
+        if s.best_at >= 0:
+            copy(s.best, lam, p.n_rows)
+        return DIVERGED
+    if s.best_at >= 0 and s.best_relative <= 1e-6:
+        judge_into(p, a, r, factored, s.best, s.w, s.e, s.v, 1, &x)
+        if s.best_relative <= 2.0 * relative(s, x.floor_energy, x.floor_velocity):
+            copy(s.best, lam, p.n_rows)
+            return AT_FLOOR
+    if s.total > 32 * <double>s.best_at + s.patience:
+        copy(s.best, lam, p.n_rows)
+        return STALLED
+    return RUNNING
+
+
+cdef inline int32_t confirmed(const watch_t* s, const blocks_t* p, const csr_t* a, const rows_t* r, int32_t factored,
+                              const double* lam, double tol, int32_t status) noexcept nogil:
+    """The claim `status`, judged in another form: what does not hold there goes on, or has stalled."""
+    cdef score_t x
+    cdef double now
+    judge_into(p, a, r, factored, lam, s.w, s.e, s.v, status == AT_FLOOR, &x)
+    now = relative(s, x.energy, x.velocity) if x.finite else 1.0 / 0.0
+    if now <= tol:
+        return CONVERGED
+    if status == CONVERGED:
+        return RUNNING
+    return AT_FLOOR if now <= 2.0 * relative(s, x.floor_energy, x.floor_velocity) else STALLED
+
+
+cdef class Watch:
+    cdef Data data
+    cdef Data confirm           # or None
+    cdef watch_t state
+    cdef object keep
+    cdef int32_t check_now(self, double* lam, double tol) noexcept nogil
+    cdef int32_t run(self, sweep_t sweep, void* context, double* lam, int32_t n, double tol, int32_t* done) noexcept nogil

@@ -1,0 +1,101 @@
+"""The watch of judge/watch.pxd for Python: where a run of sweeps stands, and the loop of sweeps and checks."""
+from libc.stdint cimport int32_t
+
+import numpy as np
+
+from lavender_ext.core.block cimport blocks_t
+from lavender_ext.core.csr cimport csr_t
+from lavender_ext.core.problem cimport Data
+from lavender_ext.core.rows cimport rows_t
+from lavender_ext.judge.watch cimport AT_FLOOR, CONVERGED, RUNNING, check, confirmed, sweep_t, watch_t
+
+
+cdef public int32_t lav_watch_check(watch_t* s, const blocks_t* p, const csr_t* a, const rows_t* r, int32_t factored,
+                                    double* lam, double tol) noexcept nogil:
+    """One check of `s` on lam (m); the status."""
+    return check(s, p, a, r, factored, lam, tol)
+
+
+cdef class Watch:
+    """Where a run of sweeps stands; `data` is what the judge reads, its start error known.
+
+    `confirm`: the same problem in another form, which a claim must hold in too.
+    """
+
+    def __init__(self, Data data, int patience=64, Data confirm=None):
+        cdef Py_ssize_t m = data.blocks.n_rows
+        cdef Py_ssize_t n = data.rows.n_bodies if confirm is None else confirm.rows.n_bodies
+        cdef double[::1] scratch = np.empty(3 * m + 12 * n + 4)
+        self.data = data
+        self.confirm = confirm
+        self.keep = scratch
+        self.state.best = &scratch[0]
+        self.state.w = &scratch[m]
+        self.state.e = &scratch[2 * m]
+        self.state.v = &scratch[3 * m]
+        self.state.total = self.state.check_at = self.state.last_at = 0
+        self.state.last = 1.0 / 0.0
+        self.state.best_at = -1
+        self.state.patience = patience
+        self.state.best_relative = 1.0 / 0.0
+        self.state.start_energy = data.start_energy
+        self.state.start_velocity = data.start_velocity
+
+    @property
+    def total(self):
+        """Sweeps done."""
+        return self.state.total
+
+    @property
+    def best(self):
+        """(relative residual, impulse) of the best check; (inf, None) before any."""
+        if self.state.best_at < 0:
+            return self.state.best_relative, None
+        return self.state.best_relative, np.array(self.keep)[:self.data.blocks.n_rows]
+
+    cdef int32_t check_now(self, double* lam, double tol) noexcept nogil:
+        cdef int32_t status = check(&self.state, &self.data.blocks, &self.data.csr, &self.data.rows,
+                                    self.data.factored, lam, tol)
+        if self.confirm is not None and (status == CONVERGED or status == AT_FLOOR):
+            return confirmed(&self.state, &self.confirm.blocks, &self.confirm.csr, &self.confirm.rows,
+                             self.confirm.factored, lam, tol, status)
+        return status
+
+    cdef int32_t run(self, sweep_t sweep, void* context, double* lam, int32_t n, double tol, int32_t* done) noexcept nogil:
+        """n sweeps, fewer where a check ends them; tol = 0 checks nothing. Counts them in `done`."""
+        cdef int32_t step, status
+        done[0] = 0
+        while done[0] < n:
+            step = n - done[0]
+            if tol > 0.0:
+                if self.state.total == self.state.check_at:
+                    status = self.check_now(lam, tol)
+                    if status != RUNNING:
+                        return status
+                if self.state.check_at - self.state.total < step:
+                    step = self.state.check_at - self.state.total
+            sweep(context, lam, self.state.total == 0, step)
+            done[0] += step
+            self.state.total += step
+        return RUNNING
+
+    def run_python(self, sweep, double[::1] lam, int n, double tol):
+        """`run` with a Python callable sweep(count, first); returns (status, sweeps done)."""
+        cdef int32_t done = 0, step, status
+        if lam.shape[0] == 0:
+            if tol > 0.0:
+                return CONVERGED, 0
+            return RUNNING, n
+        while done < n:
+            step = n - done
+            if tol > 0.0:
+                if self.state.total == self.state.check_at:
+                    with nogil:
+                        status = self.check_now(&lam[0], tol)
+                    if status != RUNNING:
+                        return status, done
+                step = min(step, self.state.check_at - self.state.total)
+            sweep(step, self.state.total == 0)
+            done += step
+            self.state.total += step
+        return RUNNING, done

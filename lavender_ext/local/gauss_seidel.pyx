@@ -1,0 +1,209 @@
+"""Sweeps of block Gauss-Seidel: each block solved exactly with the others held still (local/exact.pxd).
+
+    over A in compressed rows    w = A lam - b of the block's rows                                  (1)
+    over the factored form       w = J v + c lam - b, then v += M^-1 J^T (change)                   (2)
+"""
+from libc.stdint cimport int32_t, uint64_t
+
+import numpy as np
+
+from lavender_ext.core.block cimport CONTACT_SPIN, blocks_t, n_tangents
+from lavender_ext.core.csr cimport csr_t
+from lavender_ext.core.order cimport advance_order
+from lavender_ext.core.problem cimport Data
+from lavender_ext.core.rows cimport contact_jacobian, dot12, minv_times, rows_t
+from lavender_ext.judge.watch cimport CONVERGED, RUNNING, Watch
+from lavender_ext.local.exact cimport MAX_ROWS, boxed_rows, contact_with_spin, contact_without_spin
+from lavender_ext.local.gauss_seidel cimport prepare_block, prepared_size, solve_csr_block, solve_rows_block
+
+
+cdef public double lav_prepared_sizes(const blocks_t* p, int32_t* start) noexcept nogil:
+    """First place of each block's prepared numbers, start (k); returns their number."""
+    cdef int32_t i
+    cdef double n = 0
+    for i in range(p.n_blocks):
+        start[i] = <int32_t>n
+        n += prepared_size(p, i)
+    return n
+
+
+cdef public void lav_prepare_csr(const blocks_t* p, const csr_t* a, const int32_t* start, double* g) noexcept nogil:
+    cdef int32_t i, j, n, k, q, one
+    cdef double W[MAX_ROWS * MAX_ROWS]
+    for i in range(p.n_blocks):
+        if prepared_size(p, i) == 0:
+            continue
+        j = p.ptr[i]
+        n = p.ptr[i + 1] - j
+        one = 1
+        for k in range(n):
+            for q in range(n):
+                W[n * k + q] = 0.0
+            if a.indptr[j + k + 1] - a.indptr[j + k] != a.indptr[j + 1] - a.indptr[j]:
+                one = 0
+            for q in range(a.indptr[j + k], a.indptr[j + k + 1]):
+                if j <= a.indices[q] < j + n:
+                    W[n * k + a.indices[q] - j] += a.data[q]
+                if one and a.indices[q] != a.indices[q - a.indptr[j + k] + a.indptr[j]]:
+                    one = 0
+        prepare_block(p, i, W, one, g + start[i])
+
+
+cdef public void lav_prepare_rows(const blocks_t* p, const rows_t* r, const int32_t* start, double* g) noexcept nogil:
+    """The same from J and M^-1: the slack that each row's unit impulse makes on the block."""
+    cdef int32_t i, j, n, k, q, c, nt, spin
+    cdef double W[MAX_ROWS * MAX_ROWS]
+    cdef double jac[48]
+    cdef double push[12]
+    cdef const double* row
+    cdef const double* change
+    for i in range(p.n_blocks):
+        if prepared_size(p, i) == 0:
+            continue
+        j = p.ptr[i]
+        n = p.ptr[i + 1] - j
+        c = i - r.n_joints
+        if c >= 0:
+            spin = p.kind[i] == CONTACT_SPIN
+            nt = n_tangents(p.kind[i], n)
+            contact_jacobian(r, c, nt, spin, jac)
+            row = jac
+        else:
+            row = r.jac + 12 * j
+        for k in range(n):
+            change = r.minv_jac + 12 * (j + k)
+            if c >= 0:
+                minv_times(row + 12 * k, r.inv_mass, r.inv_inertia, r.contact_body[2 * c],
+                           r.contact_body[2 * c + 1], push)
+                change = push
+            for q in range(n):
+                W[n * q + k] = dot12(row + 12 * q, change)
+        for k in range(n):
+            W[(n + 1) * k] += r.compliance[j + k]
+        if c >= 0 and W[0] > 0.0:
+            W[0] = p.d[j]                               # the same number summed in another order
+        prepare_block(p, i, W, 0, g + start[i])
+
+
+cdef public double lav_block_sweeps_csr(const blocks_t* p, const csr_t* a, const int32_t* start, const double* g,
+                                        double* lam, int32_t* order, int32_t split, int32_t mode, uint64_t* rng,
+                                        int32_t first_sweep, int32_t n) noexcept nogil:
+    """n sweeps over (1), order as in lav_pgs_sweeps; returns how often a block fell back."""
+    cdef int32_t s, q, i
+    cdef double fallbacks = 0
+    for s in range(n):
+        advance_order(mode, first_sweep and s == 0, order, 0, split, rng)
+        advance_order(mode, first_sweep and s == 0, order, split, p.n_blocks, rng)
+        for q in range(p.n_blocks):
+            i = order[q]
+            fallbacks += solve_csr_block(p, a, i, g + start[i], lam)
+    return fallbacks
+
+
+cdef public double lav_block_sweeps_rows(const blocks_t* p, const rows_t* r, const int32_t* start, const double* g,
+                                         double* lam, double* v, int32_t* order, int32_t split, int32_t mode,
+                                         uint64_t* rng, int32_t first_sweep, int32_t n) noexcept nogil:
+    """n sweeps over (2), v (n_bodies, 6) = M^-1 J^T lam."""
+    cdef int32_t s, q, i
+    cdef double fallbacks = 0
+    for s in range(n):
+        advance_order(mode, first_sweep and s == 0, order, 0, split, rng)
+        advance_order(mode, first_sweep and s == 0, order, split, p.n_blocks, rng)
+        for q in range(p.n_blocks):
+            i = order[q]
+            fallbacks += solve_rows_block(p, r, i, g + start[i], lam, v)
+    return fallbacks
+
+
+def prepare(Data p):
+    """(start (k,) int32, numbers) of every block, for the sweeps."""
+    cdef int32_t[::1] start = np.zeros(p.blocks.n_blocks + 1, np.int32)
+    cdef double size = lav_prepared_sizes(&p.blocks, &start[0])
+    if size > 2147483647:
+        raise MemoryError(f"{size:.0f} prepared numbers do not fit 32-bit places")
+    cdef double[::1] g = np.zeros(<Py_ssize_t>size + 1)
+    with nogil:
+        if p.factored:
+            lav_prepare_rows(&p.blocks, &p.rows, &start[0], &g[0])
+        else:
+            lav_prepare_csr(&p.blocks, &p.csr, &start[0], &g[0])
+    return np.asarray(start), np.asarray(g)
+
+
+cdef struct context_t:          # what a sweep needs besides lam
+    const blocks_t* blocks
+    const csr_t* csr            # NULL where factored
+    const rows_t* rows
+    const int32_t* start
+    const double* g
+    double* velocity            # (n_bodies, 6) where factored
+    int32_t* order
+    int32_t split
+    int32_t mode
+    uint64_t* rng
+    double fallbacks
+
+
+cdef void step(void* context, double* lam, int32_t first_sweep, int32_t n) noexcept nogil:
+    cdef context_t* c = <context_t*>context
+    if c.csr == NULL:
+        c.fallbacks += lav_block_sweeps_rows(c.blocks, c.rows, c.start, c.g, lam, c.velocity, c.order, c.split, c.mode,
+                                             c.rng, first_sweep, n)
+    else:
+        c.fallbacks += lav_block_sweeps_csr(c.blocks, c.csr, c.start, c.g, lam, c.order, c.split, c.mode, c.rng,
+                                            first_sweep, n)
+
+
+def run(Data p, Watch watch, double[::1] lam, int n, double tol, const int32_t[::1] start, const double[::1] g,
+        double[:, ::1] velocity, int32_t[::1] order, int split, int mode, uint64_t[::1] rng):
+    """`n` sweeps in place under `watch`, GIL released: (status, sweeps done, fallbacks).
+
+    velocity (n_bodies + 1, 6) holds M^-1 J^T lam of a factored problem.
+    """
+    cdef context_t c
+    cdef int32_t status, done = 0
+    if lam.shape[0] == 0:
+        if tol > 0.0:
+            return CONVERGED, 0, 0
+        return RUNNING, n, 0
+    c.blocks = &p.blocks
+    c.csr = NULL if p.factored else &p.csr
+    c.rows = &p.rows
+    c.start = &start[0]
+    c.g = &g[0]
+    c.velocity = &velocity[0, 0]
+    c.order = &order[0]
+    c.split = split
+    c.mode = mode
+    c.rng = &rng[0]
+    c.fallbacks = 0
+    with nogil:
+        status = watch.run(step, &c, &lam[0], n, tol, &done)
+    return status, done, int(c.fallbacks)
+
+
+def solve_contacts(int law, int tangents, bint spin, const double[:, :, ::1] W, const double[:, ::1] q,
+                   const double[::1] mu, const double[::1] patch_radius, double[:, ::1] lam):
+    """One-contact problems, one after the other: lam (n, rows) in place (the guess of spin on entry).
+
+    Returns (n,) int32: 0 open, 1 stick, 2 slip, -1 no exact answer (lam left alone).
+    """
+    cdef Py_ssize_t i, n = W.shape[0]
+    cdef int32_t[::1] found = np.empty(n, np.int32)
+    for i in range(n):
+        if spin:
+            found[i] = contact_with_spin(law, tangents, &W[i, 0, 0], &q[i, 0], mu[i], patch_radius[i], &lam[i, 0])
+        else:
+            found[i] = contact_without_spin(law, tangents, &W[i, 0, 0], &q[i, 0], mu[i], &lam[i, 0])
+    return np.asarray(found)
+
+
+def solve_boxed(const double[:, :, ::1] W, const double[:, ::1] w, const double[:, ::1] step,
+                const double[:, ::1] lower, const double[:, ::1] upper, double[:, ::1] lam):
+    """Boxed blocks, one after the other, lam (n, rows) in place from slack w; (n,) int32: 1 exact, -1 not."""
+    cdef Py_ssize_t i, n = W.shape[0]
+    cdef int32_t[::1] found = np.empty(n, np.int32)
+    for i in range(n):
+        found[i] = boxed_rows(<int32_t>W.shape[1], &W[i, 0, 0], &w[i, 0], &step[i, 0], &lower[i, 0], &upper[i, 0],
+                              &lam[i, 0])
+    return np.asarray(found)

@@ -1,0 +1,1 @@
+"""Complementary and principal pivoting, with the dense and banded factorisations under them."""

@@ -1,0 +1,675 @@
+"""Principal pivoting on a symmetric boxed LCP, and the symmetric factorisations under it.
+
+    free rows F: (A_FF + s D_FF) x_F = b_F - A_FB x_B + s D_FF center_F,  bound rows B: x = its bound    (1)
+    w = A x - b + s D (x - center),   D = diag(d)                                                       (2)
+    infeasible: x_i outside its bounds on F, w_i < 0 at a lower, w_i > 0 at an upper bound              (3)
+    exchange all infeasible rows, while their number falls within `patience` tries                      (4)
+
+Judice, Pires 1994 (block principal pivoting; when (4) is stuck the caller descends on the energy instead).
+s > 0 is the proximal shift of a singular matrix. Free rows are numbered compactly in a fixed order of
+elimination, so the bandwidth of A never grows; a dense matrix is a band of full width. A linear system is
+the case of all rows free.
+"""
+from libc.math cimport fabs
+from libc.stdint cimport int32_t, int64_t
+
+import numpy as np
+
+from lavender_ext.core.block cimport blocks_t, relax_row
+from lavender_ext.core.csr cimport csr_dot, csr_t
+from lavender_ext.core.problem cimport Data
+from lavender_ext.factor.band cimport ldl_back_all, ldl_factor, ldl_factor_2, ldl_solve, no_pivots, pivots_t
+
+
+cdef enum:
+    FREE = 0
+    AT_LOWER = -1
+    AT_UPPER = 1
+
+cdef enum:
+    SOLVED = 0
+    ROUNDS = 1                  # all rounds used
+    SMALL = 2                   # a pivot too small for s = 0
+    INDEFINITE = 3              # a negative pivot
+    STUCK = 4                   # patience used up
+
+cdef enum:
+    PATIENCE = 8                # exchanges without a new least number of infeasible rows
+
+
+cdef struct pivoting_t:
+    const csr_t* a
+    const blocks_t* p           # b, d, lower, upper
+    int32_t n
+    int32_t band                # half bandwidth in order of elimination
+    const int32_t* order        # (n) row eliminated first, second, ...; not read where natural
+    int32_t natural             # order is 0, 1, ...
+    int32_t* at                 # (n) FREE | AT_LOWER | AT_UPPER
+    int32_t* place              # (n) place among the free rows, -1
+    double* x                   # (n) N s
+    double* w                   # (n) m/s, (2)
+    double* f                   # (n) m/s, 2^-53 (|A| |x| + |b|): rounding of w
+    double* center              # (n) N s
+    double* y                   # (n) scratch
+    double* size                # (n) d of the free rows, by place
+    double* c                   # (n (band + 1)) factor
+    double shift                # s
+    double tiny                 # pivots below tiny d are small
+    int32_t n_free
+    int32_t width
+    int32_t is_factored         # of the present set and shift
+    int32_t is_half_solved      # x holds what the factorisation made of b on its way
+    pivots_t found
+    int32_t best                # least number of infeasible rows so far
+    int32_t patience
+    int32_t exchanged           # rows that changed sides so far
+    int32_t factorisations
+    int32_t n_rounds
+
+
+cdef public void lav_csr_scan(const csr_t* a, int32_t n, int32_t* cursor, int32_t* band,
+                              double* size) noexcept nogil:
+    """Lower and upper bandwidth into band[2]; max |A - A^T|, max |A| into size[2]; columns are sorted.
+
+    cursor (n) is scratch: the first entry of row j that no earlier row has looked up as its mirror image.
+    """
+    cdef int32_t i, j, q
+    cdef double x, gap = 0.0, big = 0.0
+    band[0] = 0
+    band[1] = 0
+    for i in range(n):
+        cursor[i] = a.indptr[i]
+    for i in range(n):
+        if a.indptr[i] < a.indptr[i + 1]:
+            j = i - a.indices[a.indptr[i]]
+            if j > band[0]:
+                band[0] = j
+            j = a.indices[a.indptr[i + 1] - 1] - i
+            if j > band[1]:
+                band[1] = j
+        for q in range(a.indptr[i], a.indptr[i + 1]):
+            x = fabs(a.data[q])
+            if x > big:
+                big = x
+            j = a.indices[q]
+            if j < i:
+                if q >= cursor[i] and x > gap:
+                    gap = x                             # no mirror image above the diagonal
+                continue
+            if j == i:
+                continue
+            while cursor[j] < a.indptr[j + 1] and a.indices[cursor[j]] < i:
+                if fabs(a.data[cursor[j]]) > gap:
+                    gap = fabs(a.data[cursor[j]])
+                cursor[j] += 1
+            if cursor[j] < a.indptr[j + 1] and a.indices[cursor[j]] == i:
+                x = fabs(a.data[q] - a.data[cursor[j]])
+                cursor[j] += 1
+            if x > gap:
+                gap = x
+    size[0] = gap
+    size[1] = big
+
+
+cdef inline void factor_free(pivoting_t* s, double* x) noexcept nogil:
+    # x: what ldl_factor takes along, or NULL
+    cdef int32_t i, j, k = 0, q, r, at, to, in_place
+    cdef const csr_t* a = s.a
+    cdef double* col
+    s.is_half_solved = 0
+    for r in range(s.n):
+        i = r if s.natural else s.order[r]
+        s.place[i] = -1
+        if s.at[i] == FREE:
+            s.place[i] = k
+            s.size[k] = s.p.d[i]
+            k += 1
+    s.n_free = k
+    s.width = s.band + 1 if s.band < k else k
+    in_place = s.natural and k == s.n
+    for i in range(s.n):
+        at = s.place[i]
+        if at < 0:
+            continue
+        col = s.c + <int64_t>at * s.width
+        for j in range(s.width):
+            col[j] = 0.0
+        col -= at
+        q = a.indptr[i]
+        if in_place:
+            q = a.indptr[i + 1]                         # places are rows: the upper half, from the right
+            while q > a.indptr[i] and a.indices[q - 1] >= i:
+                q -= 1
+                col[a.indices[q]] = a.data[q]
+        else:
+            for q in range(a.indptr[i], a.indptr[i + 1]):
+                to = s.place[a.indices[q]]
+                if to >= at:
+                    col[to] = a.data[q]
+        col[at] += s.shift * s.p.d[i]
+    ldl_factor(k, s.width, s.c, s.size, s.tiny, x, &s.found)
+    s.factorisations += 1
+    s.is_factored = 1
+
+
+cdef public void lav_pivot_factor(pivoting_t* s) noexcept nogil:
+    """LDL^T of A_FF + s D_FF, (1)."""
+    factor_free(s, NULL)
+
+
+cdef public void lav_pivot_factor_all(pivoting_t* s) noexcept nogil:
+    """LDL^T of A, all rows free and no shift, with the first half of x = A^-1 b on the way."""
+    cdef int32_t i, q, end
+    cdef const csr_t* a = s.a
+    if not (s.natural and s.band == 1 and s.n > 1):
+        for i in range(s.n):
+            s.at[i] = FREE
+            s.x[i] = s.p.b[i]
+        factor_free(s, s.x if s.natural else NULL)
+        s.is_half_solved = s.natural
+        return
+    s.is_half_solved = 1
+    s.n_free = s.n
+    s.width = 2
+    for i in range(s.n):
+        s.at[i] = FREE
+        s.place[i] = i
+        s.size[i] = s.p.d[i]
+        s.x[i] = s.p.b[i]
+        s.c[2 * i] = 0.0
+        s.c[2 * i + 1] = 0.0
+        end = a.indptr[i + 1]
+        q = end - 2 if end - 2 > a.indptr[i] else a.indptr[i]
+        while q < end:                                  # the last two entries hold the upper half
+            if a.indices[q] >= i:
+                s.c[i + a.indices[q]] = a.data[q]
+            q += 1
+    no_pivots(&s.found)
+    ldl_factor_2(s.n, s.c, s.size, s.tiny, s.x, &s.found)
+    s.factorisations += 1
+    s.is_factored = 1
+
+
+cdef public void lav_pivot_correct(pivoting_t* s) noexcept nogil:
+    """x_F <- x_F - (A_FF + s D_FF)^-1 w_F."""
+    cdef int32_t i
+    if s.natural and s.n_free == s.n:
+        for i in range(s.n):
+            s.y[i] = s.w[i]
+        ldl_solve(s.n, s.width, s.c, s.y)
+        for i in range(s.n):
+            s.x[i] -= s.y[i]
+        return
+    for i in range(s.n):
+        if s.place[i] >= 0:
+            s.y[s.place[i]] = s.w[i]
+    ldl_solve(s.n_free, s.width, s.c, s.y)
+    for i in range(s.n):
+        if s.place[i] >= 0:
+            s.x[i] -= s.y[s.place[i]]
+
+
+cdef public void lav_pivot_slack(pivoting_t* s) noexcept nogil:
+    """w of (2) and its rounding f."""
+    cdef int32_t i, q, end
+    cdef const int32_t* idx = s.a.indices
+    cdef const double* val = s.a.data
+    cdef double t, u, s0, s1, f0, f1
+    for i in range(s.n):
+        q = s.a.indptr[i]
+        end = s.a.indptr[i + 1]
+        s0 = 0.0
+        s1 = 0.0
+        f0 = 0.0
+        f1 = 0.0
+        while q + 2 <= end:
+            t = val[q] * s.x[idx[q]]
+            u = val[q + 1] * s.x[idx[q + 1]]
+            s0 += t
+            s1 += u
+            f0 += fabs(t)
+            f1 += fabs(u)
+            q += 2
+        if q < end:
+            t = val[q] * s.x[idx[q]]
+            s0 += t
+            f0 += fabs(t)
+        s.w[i] = (s0 + s1) - s.p.b[i]
+        s.f[i] = 1.1102230246251565e-16 * ((f0 + f1) + fabs(s.p.b[i]))
+        if s.shift > 0.0:
+            s.w[i] += s.shift * s.p.d[i] * (s.x[i] - s.center[i])
+
+
+cdef inline int32_t wanted(const pivoting_t* s, int32_t i) noexcept nogil:
+    # Side of row i after (3). 8 f: a few roundings of w, and of x through d.
+    cdef double lower = s.p.lower[i], upper = s.p.upper[i], slop = 8.0 * s.f[i]
+    if lower == upper:
+        return AT_LOWER
+    if s.at[i] == AT_LOWER:
+        return FREE if s.w[i] < -slop else AT_LOWER
+    if s.at[i] == AT_UPPER:
+        return FREE if s.w[i] > slop else AT_UPPER
+    slop = slop / s.p.d[i]
+    if s.x[i] < lower - slop:
+        return AT_LOWER
+    if s.x[i] > upper + slop:
+        return AT_UPPER
+    return FREE
+
+
+cdef public int32_t lav_pivot_exchange(pivoting_t* s) noexcept nogil:
+    """(3), (4); the number of infeasible rows before, as a negative number where patience was used up."""
+    cdef int32_t i, bad = 0
+    for i in range(s.n):
+        bad += wanted(s, i) != s.at[i]
+    if bad == 0:
+        return 0
+    if bad < s.best:
+        s.best = bad
+        s.patience = PATIENCE
+    elif s.patience > 0:
+        s.patience -= 1
+    else:
+        return -bad
+    s.is_factored = 0
+    for i in range(s.n):
+        s.at[i] = wanted(s, i)
+    s.exchanged += bad
+    return bad
+
+
+cdef public void lav_pivot_place(pivoting_t* s) noexcept nogil:
+    """x of bound rows."""
+    cdef int32_t i
+    for i in range(s.n):
+        if s.at[i] == AT_LOWER:
+            s.x[i] = s.p.lower[i]
+        elif s.at[i] == AT_UPPER:
+            s.x[i] = s.p.upper[i]
+
+
+cdef public void lav_pivot_predict(pivoting_t* s) noexcept nogil:
+    """Sides from x and w: where x - w / d falls; w of this x."""
+    cdef int32_t i
+    cdef double y
+    for i in range(s.n):
+        y = s.x[i] - s.w[i] / s.p.d[i]
+        if y <= s.p.lower[i] or s.p.lower[i] == s.p.upper[i]:
+            s.at[i] = AT_LOWER
+        elif y >= s.p.upper[i]:
+            s.at[i] = AT_UPPER
+        else:
+            s.at[i] = FREE
+    s.is_factored = 0
+
+
+cdef public void lav_pivot_sweep(pivoting_t* s, int32_t n) noexcept nogil:
+    """n times: all rows upwards, then downwards, x_i <- clip(x_i - omega w_i / d_i), omega = 1.7, then 1.
+
+    Along a stack each contact gets 0.85 of what the one before got: over-relaxed, the news travels 4000
+    contacts before it underflows; at 0.5 it would be 1000.
+    """
+    cdef int32_t i, k
+    cdef double* x = s.x
+    cdef double omega, w
+    for k in range(n):
+        omega = 1.7 if k == 0 else 1.0
+        for i in range(s.n):
+            w = csr_dot(s.a, i, x) - s.p.b[i]
+            x[i] = relax_row(x[i], w, omega * s.p.step[i], s.p.lower[i], s.p.upper[i])
+        for i in range(s.n - 1, -1, -1):
+            w = csr_dot(s.a, i, x) - s.p.b[i]
+            x[i] = relax_row(x[i], w, omega * s.p.step[i], s.p.lower[i], s.p.upper[i])
+
+
+cdef public void lav_pivot_solve_free(pivoting_t* s) noexcept nogil:
+    """x = A^-1 b, all rows free and factored; w is left alone."""
+    cdef int32_t i
+    cdef double* y = s.x if s.natural else s.y
+    if s.is_half_solved:
+        s.is_half_solved = 0
+        ldl_back_all(s.n, s.width, s.c, s.x)
+        return
+    for i in range(s.n):
+        y[i if s.natural else s.place[i]] = s.p.b[i]
+    ldl_solve(s.n, s.width, s.c, y)
+    if not s.natural:
+        for i in range(s.n):
+            s.x[i] = y[s.place[i]]
+
+
+cdef public int32_t lav_pivot_all_free(pivoting_t* s) noexcept nogil:
+    """Are all rows free at the solution? 1, with x, where A is positive definite and x within its bounds."""
+    cdef int32_t i
+    for i in range(s.n):
+        if s.p.lower[i] == s.p.upper[i]:
+            return 0
+    lav_pivot_factor_all(s)
+    if s.found.negative > 0 or s.found.small > 0:
+        s.is_factored = 0
+        return 0
+    lav_pivot_solve_free(s)
+    for i in range(s.n):
+        if not s.p.lower[i] <= s.x[i] <= s.p.upper[i]:
+            s.is_factored = 0
+            return 0
+    return 1
+
+
+cdef public int32_t lav_pivot_rounds(pivoting_t* s, int32_t rounds) noexcept nogil:
+    """At most `rounds` rounds of: factor, solve, exchange; until no row is infeasible."""
+    cdef int32_t _r, bad
+    for _r in range(rounds):
+        s.n_rounds += 1
+        lav_pivot_place(s)
+        lav_pivot_slack(s)
+        if not s.is_factored:
+            lav_pivot_factor(s)
+        if s.found.negative > 0:
+            return INDEFINITE
+        if s.found.small > 0 and s.shift == 0.0:
+            return SMALL
+        lav_pivot_correct(s)
+        lav_pivot_slack(s)
+        bad = lav_pivot_exchange(s)
+        if bad == 0:
+            return SOLVED
+        if bad < 0:
+            return STUCK
+    return ROUNDS
+
+
+def bandwidth(const int32_t[::1] indptr, const int32_t[::1] indices):
+    """(lower, upper) bandwidth of a canonical CSR matrix, from the ends of its rows."""
+    cdef Py_ssize_t i, n = indptr.shape[0] - 1
+    cdef int32_t lower = 0, upper = 0
+    for i in range(n):
+        if indptr[i] < indptr[i + 1]:
+            lower = max(lower, <int32_t>i - indices[indptr[i]])
+            upper = max(upper, indices[indptr[i + 1] - 1] - <int32_t>i)
+    return lower, upper
+
+
+def scan(const int32_t[::1] indptr, const int32_t[::1] indices, const double[::1] data):
+    """(lower bandwidth, upper bandwidth, max |A - A^T|, max |A|) of a canonical CSR matrix."""
+    cdef int32_t n = <int32_t>indptr.shape[0] - 1
+    cdef int32_t band[2]
+    cdef double size[2]
+    cdef csr_t a
+    cdef int32_t[::1] cursor
+    if n <= 0 or data.shape[0] == 0:
+        return 0, 0, 0.0, 0.0
+    a.indptr = &indptr[0]
+    a.indices = &indices[0]
+    a.data = &data[0]
+    cursor = np.empty(n, np.int32)
+    with nogil:
+        lav_csr_scan(&a, n, &cursor[0], band, size)
+    return band[0], band[1], size[0], size[1]
+
+
+def free_block(const int32_t[::1] indptr, const int32_t[::1] indices, const double[::1] data,
+               const int32_t[::1] place, const double[::1] d, double shift, int n_free):
+    """Upper triangle of A_FF + shift D_FF by columns: (data, indices, indptr); place (m,) of `Pivoting`."""
+    cdef int32_t i, j, q, k = 0, at, n = <int32_t>indptr.shape[0] - 1, missing
+    cdef int32_t[::1] ptr = np.empty(n_free + 1, np.int32)
+    cdef int32_t[::1] idx
+    cdef double[::1] val
+    # Rows in order: place increases with the row, so column `at` holds the lower half of row i.
+    for i in range(n):
+        if place[i] >= 0:
+            for q in range(indptr[i], indptr[i + 1]):
+                k += indices[q] < i and place[indices[q]] >= 0
+            k += 1
+    idx = np.empty(max(k, 1), np.int32)
+    val = np.empty(max(k, 1))
+    k = 0
+    for i in range(n):
+        at = place[i]
+        if at < 0:
+            continue
+        ptr[at] = k
+        missing = 1
+        for q in range(indptr[i], indptr[i + 1]):
+            j = indices[q]
+            if j > i:
+                break
+            if place[j] >= 0:
+                idx[k] = place[j]
+                val[k] = data[q]
+                if j == i:
+                    val[k] += shift * d[i]
+                    missing = 0
+                k += 1
+        if missing:
+            idx[k] = at
+            val[k] = shift * d[i]
+            k += 1
+    ptr[n_free] = k
+    return np.asarray(val)[:k], np.asarray(idx)[:k], np.asarray(ptr)
+
+
+cdef class Pivoting:
+    """Work arrays of one problem; all methods but `rounds` and `solve` serve drivers with another factorisation.
+
+    Parameters
+    ----------
+    p : Data
+        Of A in compressed rows.
+    band : int
+        Half bandwidth of A in order of elimination, at most m - 1; -1: no room for a factor.
+    order : (m,) int32 or None
+        Row eliminated first, second, ...; None: as they stand.
+    """
+
+    cdef pivoting_t s
+    cdef Data p
+    cdef object reals, ints, order
+
+    def __init__(self, Data p, int band, order, double tiny):
+        cdef int32_t m = p.blocks.n_rows, i
+        cdef int64_t room = 1 if band < 0 else <int64_t>m * (band + 1) + 1
+        cdef const int32_t[::1] given
+        cdef double[::1] reals
+        cdef int32_t[::1] ints
+        # One block for the vectors and the factor: two allocations in all.
+        self.reals = np.empty(6 * m + room)
+        self.ints = np.zeros(2 * m + 1, np.int32)
+        reals, ints = self.reals, self.ints
+        cdef double* base = &reals[0]
+        if p.factored:
+            raise ValueError("Pivoting reads A in compressed rows")
+        self.p = p
+        self.order = order
+        self.s.a = &p.csr
+        self.s.p = &p.blocks
+        self.s.n = m
+        self.s.band = band
+        self.s.tiny = tiny
+        self.s.natural = 1
+        if order is not None:
+            given = order
+            if given.shape[0] != m:
+                raise ValueError("order must name every row once")
+            for i in range(m):
+                self.s.natural &= given[i] == i
+            if m:
+                self.s.order = &given[0]
+        self.s.x = base
+        self.s.w = base + m
+        self.s.f = base + 2 * m
+        self.s.center = base + 3 * m
+        self.s.y = base + 4 * m
+        self.s.size = base + 5 * m
+        self.s.c = base + 6 * m
+        self.s.at = &ints[0]
+        self.s.place = &ints[0] + m
+        self.start(0.0)
+
+    @property
+    def x(self):
+        """(m,) N s"""
+        return self.reals[:self.s.n]
+
+    @property
+    def w(self):
+        """(m,) m/s, (2)"""
+        return self.reals[self.s.n:2 * self.s.n]
+
+    @property
+    def f(self):
+        """(m,) m/s, rounding of w"""
+        return self.reals[2 * self.s.n:3 * self.s.n]
+
+    @property
+    def center(self):
+        """(m,) N s"""
+        return self.reals[3 * self.s.n:4 * self.s.n]
+
+    @property
+    def at(self):
+        """(m,) 0 free, -1 at the lower bound, 1 at the upper"""
+        return self.ints[:self.s.n]
+
+    @property
+    def place(self):
+        """(m,) place among the free rows, -1"""
+        return self.ints[self.s.n:2 * self.s.n]
+
+    def start(self, double shift):
+        """A fresh count of infeasible rows, with this shift; nothing factored."""
+        self.s.shift = shift
+        self.s.is_factored = 0
+        self.restart()
+
+    def restart(self):
+        """A fresh count of infeasible rows; the factor stays."""
+        self.s.best = self.s.n + 1
+        self.s.patience = PATIENCE
+
+    def recenter(self):
+        """center <- x."""
+        cdef int32_t i
+        for i in range(self.s.n):
+            self.s.center[i] = self.s.x[i]
+
+    def factor(self):
+        """Factor the free rows; (small, negative) pivots."""
+        with nogil:
+            lav_pivot_factor(&self.s)
+        return self.s.found.small, self.s.found.negative
+
+    def factor_all(self):
+        """Factor A, all rows free; (small, negative) pivots."""
+        with nogil:
+            lav_pivot_factor_all(&self.s)
+        return self.s.found.small, self.s.found.negative
+
+    def correct(self):
+        """x_F less the solve of w_F."""
+        with nogil:
+            lav_pivot_correct(&self.s)
+
+    def solve_free(self):
+        """x = A^-1 b with all rows free and factored; w is left alone."""
+        with nogil:
+            lav_pivot_solve_free(&self.s)
+
+    def solve(self, const double[::1] start, int sweeps, int n):
+        """A boxed problem: (code as of `rounds`, whether it was swept).
+
+        Where that costs less than the sweeps all rows free first, which may be the end of it. Else `sweeps` symmetric
+        sweeps from `start` (m,), the rows free that they leave free, and at most n rounds.
+        """
+        cdef int32_t i, code = SOLVED, swept
+        # Multiply-adds: (band + 1)^2 / 2 a row against two for each nonzero and sweep.
+        cdef bint cheap = self.s.band >= 0 and n > 0 and self.s.n > 0 and (
+            (self.s.band + 1.0) * (self.s.band + 1) * self.s.n <= 4.0 * sweeps * self.p.csr.indptr[self.s.n])
+        with nogil:
+            swept = not (cheap and lav_pivot_all_free(&self.s))
+            if swept:
+                for i in range(self.s.n):
+                    self.s.x[i] = start[i]
+                lav_pivot_sweep(&self.s, sweeps)
+                lav_pivot_slack(&self.s)
+                lav_pivot_predict(&self.s)
+                code = lav_pivot_rounds(&self.s, n)
+            else:
+                self.s.n_rounds += 1
+        return code, bool(swept)
+
+    def slack(self):
+        with nogil:
+            lav_pivot_slack(&self.s)
+
+    def exchange(self):
+        """Number of infeasible rows, which have changed sides; negative: out of patience, none has."""
+        return lav_pivot_exchange(&self.s)
+
+    def put_bounds(self):
+        """x of bound rows."""
+        lav_pivot_place(&self.s)
+
+    def number(self):
+        """Places of the free rows in order of rows; their number."""
+        cdef int32_t i, k = 0
+        for i in range(self.s.n):
+            self.s.place[i] = -1
+            if self.s.at[i] == FREE:
+                self.s.place[i] = k
+                k += 1
+        self.s.n_free = k
+        return k
+
+    def clipped(self, double[::1] out):
+        """x within its bounds, into out (m,)."""
+        cdef int32_t i
+        cdef double v
+        for i in range(self.s.n):
+            v = self.s.x[i]
+            out[i] = self.s.p.lower[i] if v < self.s.p.lower[i] else (
+                self.s.p.upper[i] if v > self.s.p.upper[i] else v)
+
+    def rounds(self, int n):
+        """At most n rounds; 0 solved, 1 rounds used, 2 small pivot, 3 negative pivot, 4 stuck."""
+        cdef int32_t code
+        with nogil:
+            code = lav_pivot_rounds(&self.s, n)
+        return code
+
+    @property
+    def shift(self):
+        return self.s.shift
+
+    @property
+    def n_free(self):
+        return self.s.n_free
+
+    @property
+    def exchanged(self):
+        return self.s.exchanged
+
+    @property
+    def factorisations(self):
+        return self.s.factorisations
+
+    @property
+    def n_rounds(self):
+        return self.s.n_rounds
+
+    def skipped(self):
+        """Rows whose pivots were small in the last factorisation, in order of elimination."""
+        cdef int32_t i, at, row
+        found = []
+        for i in range(self.s.n):
+            row = i if self.s.natural else self.s.order[i]
+            at = self.s.place[row]
+            if at >= 0 and self.s.c[<int64_t>at * self.s.width] == 0.0:
+                found.append(row)
+        return found
+
+    @property
+    def pivots(self):
+        """(small, negative, least, first small place) of the last factorisation."""
+        f = self.s.found
+        return f.small, f.negative, f.least, f.first_small

@@ -1,0 +1,249 @@
+"""Sweeps of Gauss-Seidel and Jacobi type, on the rows of A or on the factored form.
+
+    pgs                   block i, then the next, each on w = A lam - b with the lam of now          (1)
+    sequential impulses   the same sweep on v = M^-1 J^T lam: w = J v + c lam - b, A never formed     (2)
+    jacobi                all blocks on the w of before the sweep, each step times omega              (3)
+    sor                   lam_i <- lam_i - omega w_i / d_i on free rows                              (4)
+
+The update of one block is core/block.pxd (1)-(4) everywhere. Invariant of (2), on entry and after every
+block: v = M^-1 J^T lam to rounding.
+"""
+from libc.stdint cimport int32_t, int64_t, uint64_t
+
+import numpy as np
+
+from lavender_ext.core.block cimport (CONTACT_SPIN, ROW, blocks_t, n_tangents, relax_normal, relax_row,
+                                      relax_tangents)
+from lavender_ext.core.csr cimport csr_dot, csr_t
+from lavender_ext.core.order cimport advance_order
+from lavender_ext.core.problem cimport Data
+from lavender_ext.core.rows cimport relax_rows_block, rows_t
+from lavender_ext.judge.watch cimport CONVERGED, RUNNING, Watch, sweep_t
+from lavender_ext.sweep.packed cimport (ROOM_BODY, ROOM_CONTACT, ROOM_MORE, pack_order, packed_t, packs,
+                                        put_impulses, sweep_records, take_impulses)
+from lavender_ext.sweep.pgs cimport relax_csr_block
+
+
+cdef public void lav_pgs_sweeps(const blocks_t* p, const csr_t* a, double* lam, int32_t* order, int32_t split, int32_t mode,
+                                uint64_t* rng, int32_t first_sweep, int32_t n) noexcept nogil:
+    """n sweeps of (1); order (k) is advanced before each, within order[:split] and order[split:] apart;
+    `first_sweep` says that none came before."""
+    cdef int32_t s, i
+    for s in range(n):
+        advance_order(mode, first_sweep and s == 0, order, 0, split, rng)
+        advance_order(mode, first_sweep and s == 0, order, split, p.n_blocks, rng)
+        for i in range(p.n_blocks):
+            relax_csr_block(p, a, order[i], lam)
+
+
+cdef public void lav_pgs_rows_in_order(const blocks_t* p, const csr_t* a, double* lam, int32_t n) noexcept nogil:
+    """(1) where every block is one row and the order is as given: the same bits, without the look-ups."""
+    cdef int32_t _s, i
+    for _s in range(n):
+        for i in range(p.n_rows):
+            lam[i] = relax_row(lam[i], csr_dot(a, i, lam) - p.b[i], p.step[i], p.lower[i], p.upper[i])
+
+
+cdef public void lav_sor_sweeps(const blocks_t* p, const csr_t* a, double omega, double* lam, int32_t* order,
+                                int32_t split, int32_t mode, uint64_t* rng, int32_t first_sweep, int32_t n) noexcept nogil:
+    """n sweeps of (4) over free rows."""
+    cdef int32_t s, i, q
+    for s in range(n):
+        advance_order(mode, first_sweep and s == 0, order, 0, split, rng)
+        advance_order(mode, first_sweep and s == 0, order, split, p.n_blocks, rng)
+        for i in range(p.n_blocks):
+            for q in range(p.ptr[order[i]], p.ptr[order[i] + 1]):
+                lam[q] = lam[q] - omega * p.step[q] * (csr_dot(a, q, lam) - p.b[q])
+
+
+cdef public void lav_jacobi_sweeps(const blocks_t* p, const csr_t* a, double omega, double* lam, double* w,
+                                   int32_t n) noexcept nogil:
+    """n sweeps of (3); w (m) is scratch."""
+    cdef int32_t _s, i, j, q, nt, end
+    cdef double bound
+    for _s in range(n):
+        for i in range(p.n_rows):
+            w[i] = csr_dot(a, i, lam) - p.b[i]
+        for i in range(p.n_blocks):
+            j = p.ptr[i]
+            end = p.ptr[i + 1]
+            if p.kind[i] == ROW:
+                for q in range(j, end):
+                    lam[q] = relax_row(lam[q], w[q], omega * p.step[q], p.lower[q], p.upper[q])
+                continue
+            nt = n_tangents(p.kind[i], end - j)
+            lam[j] = relax_normal(lam[j], w[j], omega * p.step[j])
+            bound = p.mu[i] * lam[j]
+            if nt > 0:
+                relax_tangents(lam + j + 1, w + j + 1, omega * p.step[j + 1], bound, nt)
+            if p.kind[i] == CONTACT_SPIN:
+                q = end - 1
+                bound = p.patch_radius[i] * bound
+                lam[q] = relax_row(lam[q], w[q], omega * p.step[q], -bound, bound)
+
+
+cdef public void lav_impulse_sweeps(const blocks_t* p, const rows_t* r, double* lam, double* v, int32_t* order,
+                                    int32_t split, int32_t mode, uint64_t* rng, int32_t first_sweep, int32_t n) noexcept nogil:
+    """n sweeps of (2); v (n_bodies, 6)."""
+    cdef int32_t s, i
+    for s in range(n):
+        advance_order(mode, first_sweep and s == 0, order, 0, split, rng)
+        advance_order(mode, first_sweep and s == 0, order, split, p.n_blocks, rng)
+        for i in range(p.n_blocks):
+            relax_rows_block(p, r, order[i], lam, v)
+
+
+cdef enum:
+    WIDTH = 6                   # contacts of a slot: pairs enough to hide how long one takes
+    FEWEST = 24                 # contacts: below, calls cost more than sweeps
+    FIRST = 8                   # sweeps of the run that packs: packing costs two to four
+    FIRST_FAR = 16              # from FAR contacts, whose records leave the second-level cache
+    FAR = 4000
+    LEAST_WIDTH = 2             # fewer on average, and pairs would stand half empty
+
+
+cdef enum:                      # of a packing
+    NOT_YET = 0
+    READY = 1
+    USELESS = 2
+
+
+cdef struct packing_t:          # contacts in pairs, made at the first run of sweeps that is long enough
+    packed_t packed
+    double* room
+    int32_t status
+    int32_t first               # sweeps of a run that makes it
+
+
+cdef inline int32_t impulse_sweeps_packed(const blocks_t* p, const rows_t* r, double* lam, double* v, const int32_t* order,
+                                          packing_t* x, int32_t n) noexcept nogil:
+    """n sweeps of (2) with the same bits, or 0 and none where one contact after the other is faster; order (k) has
+    joints first; v (n_bodies + 2, 6), behind the last body zeros."""
+    if x.status == NOT_YET and n >= x.first:
+        x.status = READY if pack_order(p, r, order, WIDTH, LEAST_WIDTH, x.room, lam, &x.packed) else USELESS
+    if x.status != READY or n < x.packed.stages:
+        return 0
+    put_impulses(p, r, order, &x.packed, lam)
+    sweep_records(p, r, order, &x.packed, n, lam, v)
+    take_impulses(p, r, order, &x.packed, lam)
+    return 1
+
+
+cdef struct context_t:          # what a sweep needs besides lam
+    const blocks_t* blocks
+    const csr_t* csr
+    const rows_t* rows
+    double omega
+    double* scratch             # (m) Jacobi; (n_bodies, 6) velocity of sequential impulses
+    int32_t* order
+    int32_t split
+    int32_t mode
+    uint64_t* rng
+    packing_t* packing          # NULL: one contact after the other
+
+
+cdef void pgs_step(void* context, double* lam, int32_t first_sweep, int32_t n) noexcept nogil:
+    cdef context_t* c = <context_t*>context
+    if c.order == NULL:
+        lav_pgs_rows_in_order(c.blocks, c.csr, lam, n)
+    else:
+        lav_pgs_sweeps(c.blocks, c.csr, lam, c.order, c.split, c.mode, c.rng, first_sweep, n)
+
+
+cdef void sor_step(void* context, double* lam, int32_t first_sweep, int32_t n) noexcept nogil:
+    cdef context_t* c = <context_t*>context
+    lav_sor_sweeps(c.blocks, c.csr, c.omega, lam, c.order, c.split, c.mode, c.rng, first_sweep, n)
+
+
+cdef void jacobi_step(void* context, double* lam, int32_t first_sweep, int32_t n) noexcept nogil:
+    cdef context_t* c = <context_t*>context
+    lav_jacobi_sweeps(c.blocks, c.csr, c.omega, lam, c.scratch, n)
+
+
+cdef void impulse_step(void* context, double* lam, int32_t first_sweep, int32_t n) noexcept nogil:
+    cdef context_t* c = <context_t*>context
+    if c.packing != NULL and impulse_sweeps_packed(c.blocks, c.rows, lam, c.scratch, c.order, c.packing, n):
+        return
+    lav_impulse_sweeps(c.blocks, c.rows, lam, c.scratch, c.order, c.split, c.mode, c.rng, first_sweep, n)
+
+
+PGS, SOR, JACOBI, IMPULSES = range(4)
+
+
+cdef class Packing:
+    """Contacts of `p` in pairs, for sequential impulses in one fixed order with joints first.
+
+    Made at the first run of sweeps that is long enough; `before`, of another problem, hands over its room.
+    """
+    cdef packing_t state
+    cdef object keep
+
+    def __init__(self, Data p, Packing before=None):
+        cdef int64_t size = (ROOM_CONTACT * <int64_t>p.rows.n_contacts + ROOM_BODY * <int64_t>p.rows.n_bodies
+                             + ROOM_MORE)
+        cdef double[::1] room
+        self.keep = None
+        if before is not None:
+            self.keep, before.keep = before.keep, None
+            before.state.status = USELESS
+        if self.keep is None or len(self.keep) < size:
+            self.keep = np.empty(size)
+        room = self.keep
+        self.state.room = &room[0]
+        self.state.first = FIRST if p.rows.n_contacts < FAR else FIRST_FAR
+        self.state.status = NOT_YET
+
+    @property
+    def shape(self):
+        """(records, stages); (0, 0) where nothing is packed."""
+        if self.state.status != READY:
+            return 0, 0
+        return self.state.packed.pairs, self.state.packed.stages
+
+
+def may_pack(Data p, const int32_t[::1] order):
+    """Whether contacts have two tangents and no spin alone, behind the joints, and are as many as gain by packing."""
+    cdef int32_t i
+    if not p.factored or p.rows.n_contacts < FEWEST:
+        return False
+    for i in range(p.rows.n_joints):
+        if order[i] >= p.rows.n_joints:
+            return False
+    return packs(&p.blocks, &p.rows) != 0
+
+
+def run(int kind, Data p, Watch watch, double[::1] lam, int n, double tol, int32_t[::1] order, int split, int mode,
+        uint64_t[::1] rng, double omega=1.0, double[::1] scratch=None, Packing packing=None):
+    """`n` sweeps in place under `watch`, GIL released: (status, sweeps done).
+
+    kind is PGS, SOR, JACOBI or IMPULSES; an empty order means row by row, for PGS over single rows.
+    `packing`, of this `p` and `order`, makes impulses pack; scratch is then (n_bodies + 2, 6).
+    """
+    cdef context_t c
+    cdef int32_t status, done = 0
+    cdef sweep_t step = pgs_step
+    if lam.shape[0] == 0:
+        if tol > 0.0:
+            return CONVERGED, 0
+        return RUNNING, n
+    if kind == 1:
+        step = sor_step
+    elif kind == 2:
+        step = jacobi_step
+    elif kind == 3:
+        step = impulse_step
+    c.blocks = &p.blocks
+    c.csr = &p.csr
+    c.rows = &p.rows
+    c.omega = omega
+    c.scratch = &scratch[0] if scratch is not None else NULL
+    c.order = &order[0] if order.shape[0] else NULL
+    c.split = split
+    c.mode = mode
+    c.rng = &rng[0]
+    c.packing = NULL
+    if packing is not None:
+        c.packing = &packing.state
+    with nogil:
+        status = watch.run(step, &c, &lam[0], n, tol, &done)
+    return status, done

@@ -1,0 +1,110 @@
+"""Warm starts of warm/start.pxd: on a problem's data, and on the engine's arrays in place."""
+from libc.stdint cimport int32_t, int64_t, uint64_t
+
+import numpy as np
+
+from lavender_ext.core.block cimport blocks_t
+from lavender_ext.core.problem cimport Data
+from lavender_ext.core.rows cimport rows_t
+from lavender_ext.engine.arrays cimport CAP_CONTACT, H_CONTACTS, N_DYNAMIC, N_JOINT, S_OUT, bind, engine_t
+from lavender_ext.engine.view cimport view
+from lavender_ext.warm.start cimport MOST_STEPS, MOST_SWEEPS, band_width, score_sums_t, warm_solve, warm_t
+
+
+cdef public int32_t lav_warm_band(const blocks_t* p, const rows_t* r, int32_t* last) noexcept nogil:
+    """Entries of the band that joints alone need in the given order, each row; last (n_bodies) is scratch."""
+    return band_width(p, r, last)
+
+
+cdef public int32_t lav_warm_solve(const blocks_t* p, const rows_t* r, warm_t* s, double tol, double* lam,
+                                   double* v, int32_t has_velocity, score_sums_t* first,
+                                   score_sums_t* last) noexcept nogil:
+    """lam (m) to tol where a few sweeps or one banded factorisation do; how it ended."""
+    return warm_solve(p, r, s, tol, lam, v, has_velocity, first, last)
+
+
+def limits():
+    """Most (sweeps, factorisations) of the first phase."""
+    return MOST_SWEEPS, MOST_STEPS
+
+
+def from_guess(Data data, double[::1] impulse, double tol):
+    """impulse (m,) of a factored problem to tol: (how it ended, sweeps, factorisations); as it came where 0."""
+    cdef int32_t m = data.blocks.n_rows, how
+    cdef warm_t s
+    cdef score_sums_t first, last
+    if m == 0 or not data.factored:
+        return 0, 0, 0
+    cdef int32_t[::1] index = np.empty(data.rows.n_bodies + 2 * data.rows.n_joints + data.rows.n_contacts + 1,
+                                       np.int32)
+    s.width = lav_warm_band(&data.blocks, &data.rows, &index[0])
+    cdef double[::1] real = np.empty(6 * data.rows.n_bodies + _room(&data.blocks, &data.rows, s.width))
+    _lay(&s, &real[6 * data.rows.n_bodies], &index[0], &data.blocks, &data.rows)
+    with nogil:
+        how = lav_warm_solve(&data.blocks, &data.rows, &s, tol, &impulse[0], &real[0], 0, &first, &last)
+    return how, s.sweeps, s.factorisations
+
+
+cdef int64_t _room(const blocks_t* p, const rows_t* r, int32_t width) noexcept:
+    # doubles that `_lay` hands out
+    cdef int64_t m = p.n_rows, n = 6 * <int64_t>r.n_bodies
+    return 3 * m + n + width * (n if r.n_contacts > 0 else m)
+
+
+cdef void _lay(warm_t* s, double* real, int32_t* index, const blocks_t* p, const rows_t* r) noexcept:
+    # index (n_bodies + 2 joints + contacts)
+    s.nu = real
+    s.kept = real + p.n_rows
+    s.slack = s.kept + p.n_rows
+    s.change = s.slack + p.n_rows
+    s.band = s.change + 6 * <int64_t>r.n_bodies
+    s.last = index
+    s.before = index + r.n_bodies
+    s.state = s.before + 2 * r.n_joints
+
+
+cdef class Warm:
+    """Scratch beside an engine's three buffers; `solve` carries the prepared substep's guess to tol in place."""
+    cdef const int32_t[::1] size
+    cdef double[::1] real
+    cdef int32_t[::1] index
+    cdef uint64_t[::1] keys
+    cdef double[::1] scratch
+    cdef int32_t[::1] scratch_index
+
+    def __init__(self, const int32_t[::1] size, double[::1] real, int32_t[::1] index, uint64_t[::1] keys):
+        self.size = size
+        self.real = real
+        self.index = index
+        self.keys = keys
+        self.scratch = np.empty(1)
+        self.scratch_index = np.empty(size[N_DYNAMIC] + 2 * size[N_JOINT] + size[CAP_CONTACT] + 1, np.int32)
+
+    def solve(self, double tol):
+        """After `prepare` and `solve(False)`: (how it ended, sweeps, factorisations); 0: nothing has changed.
+
+        Else impulses, dv and the solver values of the observation are those of the answer.
+        """
+        cdef engine_t e
+        cdef int64_t used[3]
+        cdef blocks_t p
+        cdef rows_t r
+        cdef warm_t s
+        cdef score_sums_t first, last
+        cdef double* out
+        cdef int32_t how
+        cdef int64_t room
+        bind(&self.size[0], &self.real[0], &self.index[0], &self.keys[0], &e, used)
+        view(&e, &p, &r)
+        s.width = lav_warm_band(&p, &r, &self.scratch_index[0])
+        room = _room(&p, &r, s.width)
+        if self.scratch.shape[0] < room:
+            self.scratch = np.empty(room + room // 4)
+        _lay(&s, &self.scratch[0], &self.scratch_index[0], &p, &r)
+        with nogil:
+            how = lav_warm_solve(&p, &r, &s, tol, e.impulse, e.dv, 1, &first, &last)
+        if how != 0:
+            out = e.setting + S_OUT
+            out[5] = last.normal if e.head[H_CONTACTS] else 0.0
+            out[7] = last.closing if e.head[H_CONTACTS] else 0.0
+        return how, s.sweeps, s.factorisations
