@@ -14,14 +14,13 @@ from __future__ import annotations
 
 import os
 from collections.abc import Collection
-from pathlib import Path
 from typing import Any
 
 from lavender._arrays import FloatArray
 from lavender.errors import InputError
 from lavender.io import fclib, mujoco, npz
 from lavender.io.mujoco import from_mujoco
-from lavender.io.stored import MAX_BYTES, Stored, first_bytes
+from lavender.io.stored import MAX_BYTES, Stored, as_path, first_bytes
 from lavender.problem import Problem
 
 __all__ = ["Stored", "from_mujoco", "load", "load_solution", "mujoco", "read", "save"]
@@ -39,7 +38,9 @@ def read(path: str | os.PathLike[str], *, max_bytes: int = MAX_BYTES) -> Stored:
     ----------
     path : path
     max_bytes : int, default 2^31
-        Refuse files that declare more than this many bytes of arrays.
+        Refuse files that would make more than this many bytes of arrays, before any is made. What counts is
+        the size in memory, with numbers as float64 and a global FCLIB problem condensed; while an entry is
+        converted, it is there twice.
 
     Raises
     ------
@@ -48,6 +49,7 @@ def read(path: str | os.PathLike[str], *, max_bytes: int = MAX_BYTES) -> Stored:
     CapabilityError
         A problem that has no block here, such as rolling friction.
     """
+    path = as_path(path)
     start = first_bytes(path)
     if start[:2] == b"PK":
         return npz.read(path, max_bytes=max_bytes)
@@ -96,7 +98,8 @@ def save(
     CapabilityError
         The format cannot hold something of this problem; the message names it.
     """
-    suffix = Path(path).suffix.lower()
+    path = as_path(path)
+    suffix = path.suffix.lower()
     if suffix in NPZ:
         if form is not None or drop:
             raise InputError("form= and drop= are for FCLIB files (.hdf5); an .npz holds everything")

@@ -10,8 +10,9 @@ FCLIB's vector `w` is an offset of the velocity, not our slack. Format: Acary, B
 
 from __future__ import annotations
 
+import math
 import os
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -19,19 +20,23 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 import scipy.sparse.linalg as spla
+from scipy.sparse import csgraph
 
 from lavender._arrays import FloatArray, as_array
 from lavender.cones import CONTACT, ROW, Cones
 from lavender.errors import CapabilityError, InputError
 from lavender.io.npz import compressed
-from lavender.io.stored import MAX_BYTES, Stored, write_atomically
+from lavender.io.stored import MAX_BYTES, NUMBER, Budget, Stored, write_atomically
 from lavender.problem import Problem
 
 __all__ = ["Contents", "contents", "read", "read_contents", "write", "write_contents"]
 
 LOCAL, GLOBAL = "fclib_local", "fclib_global"
 ROLLING = ("fclib_local_rolling", "fclib_global_rolling")
-CONDENSE_CHUNK = 2**23  # numbers of M^-1 H held dense at a time: 64 MiB
+CONDENSE_CHUNK = 2**23  # numbers of M^-1 H, or of H^T M^-1 H, held dense at a time: 64 MiB
+ENTRY = 16  # bytes of an entry of a sparse matrix: number and index
+BLOCK = 64  # bytes of the bounds of a row: Cones, b
+CHUNK_OF_ONE = 2**17  # most numbers in the chunk of a single number
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,15 +69,15 @@ class Contents:
         """Which form: "local" or "global"."""
         return "local" if self.W is not None else "global"
 
-    def problem(self, name: str = "") -> Problem:
+    def problem(self, name: str = "", *, max_bytes: int = MAX_BYTES) -> Problem:
         """The problem, condensed to a matrix where it is global.
 
         Raises
         ------
         InputError
-            M is singular, or parts do not fit each other.
+            M is singular, parts do not fit each other, or A may take more than `max_bytes`.
         """
-        a, b = self._local() if self.form == "local" else self._condensed()
+        a, b = self._local() if self.form == "local" else self._condensed(Budget(max_bytes))
         c, d = len(self.mu), self.spacedim
         p = len(b) - c * d
         ptr = np.concatenate([np.arange(0, c * d + 1, d), c * d + 1 + np.arange(p)])
@@ -90,7 +95,7 @@ class Contents:
         a = sp.block_array([[self.W, self.V], [self.V.T, self.R]])
         return sp.csr_array(a), -np.concatenate([self.q, self.s])
 
-    def _condensed(self) -> tuple[sp.csr_array, FloatArray]:
+    def _condensed(self, budget: Budget) -> tuple[sp.csr_array, FloatArray]:
         # J = [H G]^T: contact rows and equations alike.
         assert self.M is not None
         assert self.H is not None
@@ -100,23 +105,21 @@ class Contents:
             jt, offset = sp.csr_array(sp.hstack([self.H, self.G])), np.concatenate([self.w, self.b])
         if self.M.shape[0] == 0:
             return sp.csr_array((len(offset), len(offset))), -offset
-        try:
-            factor = spla.splu(sp.csc_matrix(self.M))
-        except RuntimeError as error:
-            raise InputError(f"M cannot be factorised ({error}); an invertible M is needed") from None
+        label = csgraph.connected_components(self.M, directed=False)[1]
+        budget.spend(ENTRY * _most_entries(label, jt), "A = H^T M^-1 H")
+        solve = _factor(self.M, label, budget)
         m = jt.shape[1]
-        step = max(1, CONDENSE_CHUNK // max(1, jt.shape[0]))
+        step = max(1, CONDENSE_CHUNK // max(1, *jt.shape))
         columns = sp.csc_array(jt)
         j = sp.csr_array(jt.T)
         parts = [
-            sp.csr_array(j @ factor.solve(columns[:, k : min(k + step, m)].toarray()))
-            for k in range(0, m, step)
+            sp.csr_array(j @ solve(columns[:, k : min(k + step, m)].toarray())) for k in range(0, m, step)
         ]
         a = sp.csr_array(sp.hstack(parts)) if parts else sp.csr_array((0, 0))
         gap = self.M - self.M.T
         if gap.nnz == 0 or not np.any(gap.data):
             a = sp.csr_array(0.5 * (a + a.T))  # what the order of additions left, where M is symmetric
-        return a, -(offset + j @ factor.solve(self.f))
+        return a, -(offset + j @ solve(np.asarray(self.f)))
 
     def _impulse(self, point: Mapping[str, FloatArray]) -> FloatArray:
         return np.concatenate([point["r"], point["l"]]) if "l" in point else point["r"]
@@ -130,6 +133,42 @@ class Contents:
         if "u" not in self.solution:
             return None
         return np.concatenate([self.solution["u"], np.zeros(len(self.solution.get("l", ())))])
+
+
+def _most_entries(label: np.ndarray, jt: sp.csr_array) -> int:
+    """At most so many entries has J M^-1 J^T; `label` (n,) says which parts of M hang together.
+
+    A row of J that touches a part meets there every row that touches it: a part with r rows makes at most r^2.
+    """
+    m = jt.shape[1]
+    part = np.repeat(label.astype(np.int64), np.diff(jt.indptr))
+    touched = np.unique(part * m + jt.indices) // m if len(part) else part
+    rows = np.bincount(touched, minlength=1).astype(float)
+    return int(min(rows @ rows, float(m) ** 2))
+
+
+def _factor(matrix: sp.csr_array, label: np.ndarray, budget: Budget) -> Callable[[np.ndarray], np.ndarray]:
+    """x = M^-1 y by LU factors whose size is bounded beforehand.
+
+    A part of n unknowns has at most n^2 entries in its factors. Where that is too much, the order is one of small
+    bandwidth: with l below and u above the diagonal, L and U with row exchanges stay within n (2 l + u + 1).
+    """
+    n = matrix.shape[0]
+    size = np.bincount(label).astype(float)
+    dense = ENTRY * int(size @ size)
+    try:
+        if dense <= budget.left:
+            return spla.splu(sp.csc_matrix(matrix)).solve
+        order = csgraph.reverse_cuthill_mckee(sp.csr_array(matrix), symmetric_mode=False)
+        permuted = sp.coo_array(matrix[order][:, order])
+        off = permuted.row.astype(np.int64) - permuted.col
+        width = 2 * int(off.max(initial=0)) - int(off.min(initial=0)) + 1
+        budget.spend(ENTRY * n * min(width, n), "the factors of M")
+        factor = spla.splu(sp.csc_matrix(permuted), permc_spec="NATURAL")
+    except RuntimeError as error:
+        raise InputError(f"M cannot be factorised ({error}); an invertible M is needed") from None
+    back = np.argsort(order)
+    return lambda y: factor.solve(y[order])[back]
 
 
 # -- reading --------------------------------------------------------------------------------------
@@ -149,7 +188,7 @@ def read(path: str | os.PathLike[str], *, max_bytes: int = MAX_BYTES) -> Stored:
     """
     file = read_contents(path, max_bytes=max_bytes)
     try:
-        problem = file.problem(Path(path).stem)
+        problem = file.problem(Path(path).stem, max_bytes=max_bytes)
         guesses = tuple(problem.impulse_array(file._impulse(g), "guess") for g in file.guesses)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
@@ -182,7 +221,7 @@ class _Reader:
     """Datasets of one HDF5 file; follows no link out of it and allocates no more than allowed."""
 
     def __init__(self, h5py: Any, file: Any, max_bytes: int) -> None:
-        self.h5py, self.file, self.left = h5py, file, max_bytes
+        self.h5py, self.file, self.budget = h5py, file, Budget(max_bytes)
 
     def node(self, path: str) -> Any:
         """Group or dataset at a path, or None."""
@@ -201,8 +240,16 @@ class _Reader:
     def has(self, path: str) -> bool:
         return self.node(path) is not None
 
-    def array(self, path: str, kinds: str, count: int | None = None) -> np.ndarray:
-        """A dataset as a flat array of `count` numbers (None: any)."""
+    def spend(self, paths: Iterable[str]) -> None:
+        """Take what these datasets make, where they are there, off the budget."""
+        for path in paths:
+            data = self.node(path)
+            if isinstance(data, self.h5py.Dataset) and data.shape is not None:
+                chunk = math.prod(data.chunks) * data.dtype.itemsize if data.chunks else 0
+                self.budget.spend(data.size * max(NUMBER, data.dtype.itemsize) + chunk, path)
+
+    def dataset(self, path: str, kinds: str, count: int | None = None) -> Any:
+        """A dataset of `count` numbers (None: any), not yet read."""
         data = self.node(path)
         if not isinstance(data, self.h5py.Dataset):
             raise InputError(f"{path} is missing or not a dataset")
@@ -213,13 +260,17 @@ class _Reader:
             raise InputError(f"{path} has type {data.dtype}; {wanted} are needed")
         if count is not None and data.size != count:
             raise InputError(f"{path} has {data.size} entries; {count} are needed")
-        self.left -= data.nbytes
-        if self.left < 0:
-            raise InputError(f"{path} brings the declared size above max_bytes=; pass more if that is meant")
-        return np.asarray(data[()]).reshape(-1)
+        return data
+
+    def array(self, path: str, kinds: str, count: int | None = None) -> np.ndarray:
+        """A dataset as a flat array of `count` numbers (None: any)."""
+        return np.asarray(self.dataset(path, kinds, count)[()]).reshape(-1)
 
     def whole(self, path: str) -> int:
-        value = int(self.array(path, "iu", 1)[0])
+        data = self.dataset(path, "iu", 1)
+        if data.chunks and math.prod(data.chunks) > CHUNK_OF_ONE:  # the whole chunk would be unpacked
+            raise InputError(f"{path} is one number in a chunk of {math.prod(data.chunks)}")
+        value = int(np.asarray(data[()]).reshape(-1)[0])
         if not -(2**31) <= value < 2**31:
             raise InputError(f"{path} is {value}, beyond 32 bits")
         return value
@@ -231,14 +282,23 @@ class _Reader:
         data = self.node(path)
         if not isinstance(data, self.h5py.Dataset) or data.size != 1 or data.nbytes > 2**20:
             return ""
+        if data.chunks and math.prod(data.chunks) > CHUNK_OF_ONE:
+            return ""
         value = data[()]
         value = value.flat[0] if isinstance(value, np.ndarray) else value
         return value.decode("utf-8", "replace").rstrip("\0") if isinstance(value, bytes) else str(value)
 
+    def shape(self, path: str) -> tuple[int, int]:
+        """Rows and columns that a matrix announces."""
+        m, n = (self.whole(f"{path}/{name}") for name in ("m", "n"))
+        if min(m, n) < 0:
+            raise InputError(f"{path}: m {m}, n {n}; sizes are not negative")
+        return m, n
+
     def matrix(self, path: str, shape: tuple[int | None, int | None]) -> sp.csr_array:
         """nz = -2 compressed rows, -1 compressed columns, >= 0 triplets (p columns, i rows)."""
-        m, n, nz, nzmax = (self.whole(f"{path}/{name}") for name in ("m", "n", "nz", "nzmax"))
-        if min(m, n, nzmax) < 0 or nz < -2 or nz > nzmax:
+        (m, n), nz, nzmax = self.shape(path), self.whole(f"{path}/nz"), self.whole(f"{path}/nzmax")
+        if nzmax < 0 or nz < -2 or nz > nzmax:
             raise InputError(f"{path}: m {m}, n {n}, nz {nz}, nzmax {nzmax}; nz is -2, -1 or 0 to nzmax")
         if any(want is not None and have != want for have, want in zip((m, n), shape, strict=True)):
             wanted = " x ".join("any" if s is None else str(s) for s in shape)
@@ -280,34 +340,41 @@ def _read_file(r: _Reader) -> Contents:
     spacedim = r.whole(f"{group}/spacedim")
     if spacedim not in (2, 3):
         raise InputError(f"{group}/spacedim is {spacedim}; 2 or 3 is needed")
-    parts: dict[str, Any] = {}
     vectors = f"{group}/vectors"
-    if group == LOCAL:
-        parts["W"] = w = r.matrix(f"{group}/W", (None, None))
-        n, m, p = 0, w.shape[0], 0
-        if w.shape != (m, m):
-            raise InputError(f"{group}/W is {w.shape[0]} x {w.shape[1]}; a square matrix is needed")
-        parts["q"] = r.vector(f"{vectors}/q", m)
-        if r.has(f"{group}/V") or r.has(f"{group}/R"):
-            parts["V"] = v = r.matrix(f"{group}/V", (m, None))
-            p = v.shape[1]
-            parts["R"], parts["s"] = r.matrix(f"{group}/R", (p, p)), r.vector(f"{vectors}/s", p)
-    else:
-        parts["H"] = h = r.matrix(f"{group}/H", (None, None))
-        (n, m), p = h.shape, 0
-        parts["M"] = r.matrix(f"{group}/M", (n, n))
-        parts["f"], parts["w"] = r.vector(f"{vectors}/f", n), r.vector(f"{vectors}/w", m)
-        if r.has(f"{group}/G"):
-            parts["G"] = g = r.matrix(f"{group}/G", (n, None))
-            p = g.shape[1]
-            parts["b"] = r.vector(f"{vectors}/b", p)
+    local = group == LOCAL
+    first = r.shape(f"{group}/{'W' if local else 'H'}")
+    more = f"{group}/{'V' if local else 'G'}"
+    has_equations = r.has(more) or (local and r.has(f"{group}/R"))
+    n, m, p = 0 if local else first[0], first[1], r.shape(more)[1] if has_equations else 0
+    if local and first != (m, m):
+        raise InputError(f"{group}/W is {first[0]} x {m}; a square matrix is needed")
     if m % spacedim:
         raise InputError(f"{m} rows are not a multiple of spacedim = {spacedim}")
+    length = {"q": m, "s": p, "f": n, "w": m, "b": p, "mu": m // spacedim}
+    wanted: dict[str, tuple[int, int]] = {"W": (m, m)} if local else {"H": (n, m), "M": (n, n)}
+    if has_equations:
+        wanted |= {"V": (m, p), "R": (p, p)} if local else {"G": (n, p)}
+    names = [
+        "q" if local else "f",
+        *([] if local else ["w"]),
+        *([("s" if local else "b")] if p else []),
+        "mu",
+    ]
+    for name in names:  # lengths, then bytes, then numbers
+        r.dataset(f"{vectors}/{name}", "iuf", length[name])
+    r.budget.spend(BLOCK * (m + p), f"{m + p} rows")
+    for name, shape in wanted.items():
+        r.budget.spend(NUMBER * (shape[0] + 1), f"{group}/{name}")
+        r.spend(f"{group}/{name}/{part}" for part in ("p", "i", "x"))
+    r.spend(f"{vectors}/{name}" for name in names)
+    guesses = _guesses(r)
+    r.spend(f"{point}/{name}" for point in ("solution", *guesses) for name in "ruvl")
+    parts: dict[str, Any] = {name: r.matrix(f"{group}/{name}", shape) for name, shape in wanted.items()}
+    parts |= {name: r.vector(f"{vectors}/{name}", length[name]) for name in names}
     return Contents(
         spacedim,
-        r.vector(f"{vectors}/mu", m // spacedim),
         solution=_point(r, "solution", n, m, p) if r.has("solution") else {},
-        guesses=_guesses(r, n, m, p),
+        guesses=tuple(_point(r, guess, n, m, p) for guess in guesses),
         info={name: r.text(f"{group}/info/{name}") for name in ("title", "description", "math_info")},
         compare=r.text("reference/compare"),
         **parts,
@@ -324,13 +391,14 @@ def _point(r: _Reader, group: str, n: int, m: int, p: int) -> dict[str, FloatArr
     return point
 
 
-def _guesses(r: _Reader, n: int, m: int, p: int) -> tuple[dict[str, FloatArray], ...]:
+def _guesses(r: _Reader) -> list[str]:
+    """Groups of the guesses."""
     if not r.has("guesses"):
-        return ()
+        return []
     count = r.whole("guesses/number_of_guesses")
     if count < 0 or count > len(r.node("guesses")):
         raise InputError(f"guesses/number_of_guesses is {count}; there are {len(r.node('guesses')) - 1}")
-    return tuple(_point(r, f"guesses/{i + 1}", n, m, p) for i in range(count))
+    return [f"guesses/{i + 1}" for i in range(count)]
 
 
 # -- writing --------------------------------------------------------------------------------------

@@ -1,7 +1,7 @@
 """Problems in NumPy archives (.npz): our own format, the plain box format, the benchmark generator's.
 
-Nothing in an archive is executed or unpickled. Sizes are checked against what the archive declares before
-anything is allocated, and the parts against each other before a kernel sees them. `docs/formats.md`
+Nothing in an archive is executed or unpickled. What all entries take in memory is added up from their headers
+before the first is read, and the parts are checked against each other before a kernel sees them. `docs/formats.md`
 describes each entry.
 """
 
@@ -15,9 +15,9 @@ import struct
 import zipfile
 import zlib
 from collections.abc import Collection, Mapping
-from dataclasses import fields
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 import scipy.sparse as sp
@@ -25,7 +25,7 @@ import scipy.sparse as sp
 from lavender._arrays import FloatArray
 from lavender.cones import CONTACT, ROW, Cones
 from lavender.errors import InputError
-from lavender.io.stored import MAX_BYTES, Stored, write_atomically
+from lavender.io.stored import MAX_BYTES, NUMBER, Budget, Stored, write_atomically
 from lavender.problem import Problem
 from lavender.rows import Rows
 
@@ -33,6 +33,9 @@ __all__ = ["VERSION", "read", "write"]
 
 VERSION = 1
 MAX_HEADER = 10_000  # bytes of a .npy header: 100 are usual
+MAX_ENTRIES = 1000  # of an archive: a problem has at most 30
+JSON_GROWTH = 40  # bytes of Python objects that a byte of JSON text can make; nested empty lists make 24
+PACKED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # what NumPy writes; others choose the memory they take
 CONES = tuple(f"cones_{f.name}" for f in fields(Cones))
 ROWS = tuple(f"rows_{f.name}" for f in fields(Rows) if f.name != "copy")
 CSR = ("A_data", "A_indices", "A_indptr", "A_shape")
@@ -54,53 +57,93 @@ BROKEN = (
 )
 
 
+@dataclass(frozen=True)
+class _Header:
+    """What the beginning of a .npy says, and the stream behind it."""
+
+    stream: IO[bytes]
+    dtype: np.dtype[Any]
+    shape: tuple[int, ...]
+    fortran: bool
+
+    @property
+    def count(self) -> int:
+        return math.prod(self.shape)
+
+    def read(self) -> np.ndarray:
+        size = self.count * self.dtype.itemsize
+        raw = self.stream.read(size)
+        if len(raw) != size or self.stream.read(1):
+            raise EOFError(f"{len(raw)} of {size} bytes are there")
+        return np.frombuffer(raw, self.dtype).reshape(self.shape, order="F" if self.fortran else "C")
+
+
 class _Archive(Mapping[str, np.ndarray]):
     """Arrays of an .npz by name, each read once when asked for."""
 
     def __init__(self, path: str | os.PathLike[str], max_bytes: int) -> None:
         self.path = path
         self._arrays: dict[str, np.ndarray] = {}
+        self._headers: dict[str, _Header] = {}
+        budget = Budget(max_bytes)
         try:
             self._zip = zipfile.ZipFile(path)
         except BROKEN as error:
             raise InputError(f"{path} is not a complete .npz archive ({error}); save it again") from None
-        self._entries: dict[str, zipfile.ZipInfo] = {}
-        for entry in self._zip.infolist():
+        try:
+            self._open_entries(budget)
+        except BaseException:
+            self.close()
+            raise
+
+    def _open_entries(self, budget: Budget) -> None:
+        entries = self._zip.infolist()
+        if len(entries) > MAX_ENTRIES:
+            raise InputError(f"{self.path} holds {len(entries)} entries, more than {MAX_ENTRIES}")
+        for entry in entries:
             name = entry.filename.removesuffix(".npy")
-            if name == entry.filename or name in self._entries:
-                raise InputError(f"{path} holds {entry.filename!r}; an .npz holds one .npy under each name")
-            self._entries[name] = entry
-        declared = sum(entry.file_size for entry in self._entries.values())
-        if declared > max_bytes:
-            raise InputError(
-                f"{path} declares {declared} bytes of arrays, more than {max_bytes}; "
-                "pass max_bytes= if the file is meant to be that large"
-            )
+            if name == entry.filename or name in self._headers:
+                raise InputError(
+                    f"{self.path} holds {entry.filename!r}; an .npz holds one .npy under each name"
+                )
+            try:
+                if entry.compress_type not in PACKED:
+                    raise ValueError(f"it is packed by method {entry.compress_type}; deflate is read")
+                self._headers[name] = _npy_header(self._zip.open(entry), entry.file_size)
+            except BROKEN as error:
+                raise InputError(f"{self.path}: entry {name!r} cannot be read: {error}") from None
+        for name, header in self._headers.items():
+            width = header.dtype.itemsize
+            if header.dtype.kind in "buif":
+                width = JSON_GROWTH if name == "meta" else max(width, NUMBER)
+            budget.spend(header.count * width, f"{self.path}: entry {name!r}")
 
     def __getitem__(self, name: str) -> np.ndarray:
         if name not in self._arrays:
             try:
-                entry = self._entries[name]
+                header = self._headers[name]
             except KeyError:
-                has = ", ".join(self._entries) or "nothing"
+                has = ", ".join(self._headers) or "nothing"
                 raise InputError(f"{self.path} has no entry {name!r}; it has {has}") from None
             try:
-                with self._zip.open(entry) as stream:
-                    self._arrays[name] = _read_npy(stream, entry.file_size)
+                with header.stream:
+                    self._arrays[name] = header.read()
             except BROKEN as error:
                 raise InputError(f"{self.path}: entry {name!r} cannot be read: {error}") from None
         return self._arrays[name]
 
     def __contains__(self, name: object) -> bool:
-        return name in self._entries
+        return name in self._headers
 
     def __iter__(self) -> Any:
-        return iter(self._entries)
+        return iter(self._headers)
 
     def __len__(self) -> int:
-        return len(self._entries)
+        return len(self._headers)
 
     def close(self) -> None:
+        for header in self._headers.values():
+            header.stream.close()
         self._zip.close()
 
     def scalar(self, name: str) -> Any:
@@ -110,8 +153,8 @@ class _Archive(Mapping[str, np.ndarray]):
         return value.reshape(()).item()
 
 
-def _read_npy(stream: Any, size: int) -> np.ndarray:
-    """One array of numbers or text; `size` is what the archive declares for header and data together."""
+def _npy_header(stream: IO[bytes], size: int) -> _Header:
+    """Of an array of numbers or text; `size` is what the archive declares for header and data together."""
     start = stream.read(8)
     if start[:6] != b"\x93NUMPY" or len(start) < 8 or start[6] not in (1, 2, 3):
         raise ValueError("it is not an array (.npy)")
@@ -133,10 +176,7 @@ def _read_npy(stream: Any, size: int) -> np.ndarray:
     data = math.prod(shape) * dtype.itemsize
     if data + 8 + (4 if wide else 2) + length != size:
         raise ValueError(f"its shape {shape} needs {data} bytes, but the archive declares {size}")
-    raw = stream.read(data)
-    if len(raw) != data or stream.read(1):
-        raise EOFError(f"{len(raw)} of {data} bytes are there")
-    return np.frombuffer(raw, dtype).reshape(shape, order="F" if header["fortran_order"] is True else "C")
+    return _Header(stream, dtype, shape, header["fortran_order"] is True)
 
 
 def read(path: str | os.PathLike[str], *, max_bytes: int = MAX_BYTES) -> Stored:
@@ -220,6 +260,11 @@ def _read_own(archive: _Archive) -> Stored:
     for name in archive:
         if archive[name].dtype.kind not in "iuf":
             raise InputError(f"entry {name!r} has dtype {archive[name].dtype}; numbers are needed")
+    b, ptr = archive["b"], archive["cones_ptr"]
+    if b.ndim != 1:
+        raise InputError(f"b has shape {b.shape}; one dimension is needed")
+    if ptr.ndim != 1 or len(ptr) == 0 or ptr[-1] != len(b):  # before bounds of as many rows are made
+        raise InputError(f"b has shape {b.shape}; cones.ptr must end with the number of its rows")
     more: dict[str, Any] = {name: archive[name] for name in ("guess", "key") if name in archive}
     if meta["operator"] == "rows":
         parts: dict[str, Any] = {name.removeprefix("rows_"): archive[name] for name in ROWS}
@@ -228,9 +273,7 @@ def _read_own(archive: _Archive) -> Stored:
     else:
         more["matrix"] = _matrix(archive)
     cones = Cones(**{name.removeprefix("cones_"): archive[name] for name in CONES})
-    problem = Problem(
-        archive["b"], cones, friction=meta["friction"], names=meta["names"], name=meta["name"], **more
-    )
+    problem = Problem(b, cones, friction=meta["friction"], names=meta["names"], name=meta["name"], **more)
     return Stored(problem, "lavender", impulse=_vector(archive, "impulse", problem))
 
 

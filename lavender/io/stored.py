@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import stat
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,7 +17,8 @@ from lavender.problem import Problem
 
 __all__ = ["MAX_BYTES", "Stored"]
 
-MAX_BYTES = 2**31  # declared size of all arrays of a file; a megabyte can declare a terabyte
+MAX_BYTES = 2**31  # of what a file makes in memory; a megabyte can declare a terabyte
+NUMBER = 8  # bytes of a number once it is read: float64, or an index before it is checked
 
 
 @dataclass(frozen=True)
@@ -58,17 +60,61 @@ def write_atomically(path: str | os.PathLike[str], write: Callable[[Path], None]
             temporary.unlink(missing_ok=True)
 
 
-def first_bytes(path: str | os.PathLike[str], count: int = 8) -> bytes:
+def as_path(path: str | os.PathLike[str]) -> Path:
+    """A path; numbers, which the operating system takes for open files, are refused.
+
+    Raises
+    ------
+    InputError
+        Not a text or a path, or not one that a file can have.
+    """
+    if not isinstance(path, (str, os.PathLike)) or not isinstance(os.fspath(path), str):
+        raise InputError(f"path is {path!r} ({type(path).__name__}); the path of a file as text is needed")
+    if "\0" in os.fspath(path):
+        raise InputError(f"path {path!r} holds a NUL character; no file has such a name")
+    return Path(path)
+
+
+def first_bytes(path: Path, count: int = 8) -> bytes:
     """The first bytes of a file.
 
     Raises
     ------
     InputError
-        The file does not exist or cannot be read.
+        The file does not exist, is no regular file (reading a pipe would wait), or cannot be read.
     """
     try:
+        if not stat.S_ISREG(path.stat().st_mode):
+            what = "a folder" if path.is_dir() else "a pipe, a socket or a device"
+            raise InputError(f"cannot read {path}: it is {what}; a file is needed")
         stream: BinaryIO
         with open(path, "rb") as stream:
             return stream.read(count)
-    except OSError as error:
-        raise InputError(f"cannot read {path}: {error.strerror or error}") from None
+    except (OSError, ValueError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"cannot read {path}: {getattr(error, 'strerror', None) or error}") from None
+
+
+class Budget:
+    """Bytes that a file may still make; spent before anything is allocated."""
+
+    def __init__(self, max_bytes: int) -> None:
+        if isinstance(max_bytes, bool) or not isinstance(max_bytes, int) or max_bytes < 0:
+            raise InputError(f"max_bytes is {max_bytes!r}; a whole number of bytes is needed")
+        self.limit = self.left = max_bytes
+
+    def spend(self, count: int, what: str) -> None:
+        """Take `count` bytes off for `what`.
+
+        Raises
+        ------
+        InputError
+            More than is left.
+        """
+        self.left -= count
+        if self.left < 0:
+            raise InputError(
+                f"{what} would take {self.limit - self.left} bytes of memory with what comes before, more than "
+                f"{self.limit}; pass max_bytes= if the file is meant to be that large"
+            )

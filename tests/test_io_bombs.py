@@ -1,0 +1,312 @@
+"""Small files that would make large arrays: refused before anything is made. What is no file is not opened.
+
+Every file is loaded in a process whose address space may grow by 100 MB.
+"""
+
+import json
+import os
+import re
+import subprocess
+import sys
+import zipfile
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+
+import lavender as lv
+import lavender.io
+from lavender.io import fclib
+
+h5py = pytest.importorskip("h5py")
+resource = pytest.importorskip("resource")
+
+HUGE = 2**31 - 1
+ROOM = 100_000_000  # bytes that refusing a file may take
+LOAD = f"""
+import json, resource, sys, time
+import h5py, lavender as lv
+from scipy.sparse import linalg
+def used():
+    with open("/proc/self/statm") as file:
+        return int(file.read().split()[0]) * resource.getpagesize()
+def load(path):
+    begin = time.process_time()
+    try:
+        lv.io.load(path)
+    except lv.LavenderError as error:
+        return type(error).__name__, str(error), time.process_time() - begin
+    except BaseException as error:
+        return "raw " + type(error).__name__, str(error), time.process_time() - begin
+    return "loaded", "", time.process_time() - begin
+load(sys.argv[1])  # what a first load imports
+resource.setrlimit(resource.RLIMIT_AS, (used() + {ROOM},) * 2)
+peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+print(json.dumps([*load(sys.argv[2]), 1024 * (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - peak)]))
+"""
+
+
+def npy_start(kind, shape):
+    text = repr({"descr": kind, "fortran_order": False, "shape": shape}).encode()
+    text += b" " * (63 - (10 + len(text)) % 64) + b"\n"
+    return b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text
+
+
+def write_npz(path, method=zipfile.ZIP_DEFLATED, **entries):
+    """Arrays, or (kind, shape, byte) of an array of one repeated text of bytes."""
+    with zipfile.ZipFile(path, "w", method) as out:
+        for name, entry in entries.items():
+            with out.open(f"{name}.npy", "w", force_zip64=True) as stream:
+                if isinstance(entry, tuple):
+                    kind, shape, text = entry
+                    stream.write(npy_start(kind, shape))
+                    left = int(np.prod(shape)) * np.dtype(kind).itemsize
+                    block = text * (2**20 // len(text))
+                    while left > 0:
+                        stream.write(block[:left])
+                        left -= len(block)
+                else:
+                    np.lib.format.write_array(stream, np.asarray(entry), allow_pickle=False)
+    return path
+
+
+META = {"operator": "dense", "friction": "coulomb", "name": "", "names": None}
+OWN = {
+    "lavender_format": np.int64(1),
+    "meta": np.frombuffer(json.dumps(META).encode(), np.uint8),
+    "b": np.zeros(2),
+    "cones_ptr": [0, 1, 2],
+    "cones_kind": [0, 0],
+    "cones_lower": np.zeros(2),
+    "cones_upper": np.ones(2),
+    "cones_mu": np.zeros(2),
+    "cones_patch_radius": np.zeros(2),
+    "A": np.eye(2),
+}
+
+
+def hdf5(path, parts):
+    """Datasets by path; (shape, kind) is one whose chunks were never written."""
+    with h5py.File(path, "w") as out:
+        for name, value in parts.items():
+            if isinstance(value, tuple):
+                out.create_dataset(name, value[0], value[1], chunks=(2**16,))
+            else:
+                out[name] = np.asarray(value)
+    return path
+
+
+def matrix(name, m, n, nz, p, i, x):
+    parts = {"m": [m], "n": [n], "nz": [nz], "nzmax": [max(nz, 0)], "p": p, "i": i, "x": x}
+    return {
+        f"{name}/{key}": np.array(v, np.int32) if key in ("m", "n", "nz", "nzmax") else v
+        for key, v in parts.items()
+    }
+
+
+NO = np.zeros(0)
+NONE = np.zeros(0, np.int32)
+LOCAL = {"fclib_local/spacedim": np.array([3], np.int32)}
+GLOBAL = {"fclib_global/spacedim": np.array([3], np.int32)}
+
+
+def one_wide_body(path):
+    m = 36_000
+    h = sp.csr_array(np.ones((1, m)))
+    return hdf5(
+        path,
+        GLOBAL
+        | matrix("fclib_global/H", 1, m, -2, h.indptr, h.indices, h.data)
+        | matrix("fclib_global/M", 1, 1, -2, np.array([0, 1]), np.array([0]), np.array([1.0]))
+        | {"fclib_global/vectors/f": np.zeros(1), "fclib_global/vectors/w": np.zeros(m)}
+        | {"fclib_global/vectors/mu": np.full(m // 3, 0.5)},
+    )
+
+
+def large_chunk(path):
+    with h5py.File(path, "w") as out:
+        out.create_dataset(
+            "fclib_local/spacedim",
+            (1,),
+            "i4",
+            maxshape=(None,),
+            chunks=(2**27,),
+            compression="gzip",
+            fillvalue=3,
+        )
+    return path
+
+
+BOMBS = {
+    "pointers that announce rows, bounds that one number fills": (
+        lambda path: write_npz(
+            path, **OWN | {"cones_ptr": [0, HUGE], "cones_kind": [0], "cones_lower": 0.0, "cones_upper": 1.0}
+        ),
+        "must end with the number of its rows",
+    ),
+    "one number for every b": (lambda path: write_npz(path, **OWN | {"b": 0.0}), "one dimension"),
+    "a dense matrix of bytes": (
+        lambda path: write_npz(path, **OWN | {"A": ("|b1", (17_000, 17_000), b"\0")}),
+        "max_bytes=",
+    ),
+    "an entry before the one that is too much": (
+        lambda path: write_npz(
+            path, **OWN | {"A": ("|i1", (11_500, 11_500), b"\0"), "guess": ("|i1", (200_000_000,), b"\0")}
+        ),
+        "max_bytes=",
+    ),
+    "text that makes many objects": (
+        lambda path: write_npz(path, **OWN | {"meta": ("|u1", (60_000_000,), b"[{},{}],")}),
+        "max_bytes=",
+    ),
+    "a packing that chooses its memory": (
+        lambda path: write_npz(path, zipfile.ZIP_LZMA, **OWN),
+        "packed by method",
+    ),
+    "one body under many contacts": (one_wide_body, "max_bytes="),
+    "triplets of a huge matrix": (
+        lambda path: hdf5(
+            path,
+            LOCAL
+            | matrix("fclib_local/W", HUGE, HUGE, 0, NONE, NONE, NO)
+            | {"fclib_local/vectors/q": NO, "fclib_local/vectors/mu": NO},
+        ),
+        "are needed|not a multiple",
+    ),
+    "triplets of a huge matrix, with vectors that nobody wrote": (
+        lambda path: hdf5(
+            path,
+            LOCAL
+            | matrix("fclib_local/W", HUGE // 3 * 3, HUGE // 3 * 3, 0, NONE, NONE, NO)
+            | {"fclib_local/vectors/q": ((HUGE // 3 * 3,), "f8"), "fclib_local/vectors/mu": ((HUGE // 3,), "f8")},
+        ),
+        "max_bytes=",
+    ),
+    "numbers that nobody wrote, one byte each": (
+        lambda path: hdf5(
+            path,
+            LOCAL
+            | matrix("fclib_local/W", 3, 3, -2, [0, 0, 0, 0], ((2**28,), "i1"), ((2**28,), "i1"))
+            | {"fclib_local/vectors/q": np.zeros(3), "fclib_local/vectors/mu": [0.5]},
+        ),
+        "max_bytes=",
+    ),
+    "compressed columns of a huge number of rows": (
+        lambda path: hdf5(
+            path,
+            GLOBAL
+            | matrix("fclib_global/H", HUGE, 3, -1, [0, 0, 0, 0], NONE, NO)
+            | matrix("fclib_global/M", HUGE, HUGE, 0, NONE, NONE, NO)
+            | {"fclib_global/vectors/f": ((HUGE,), "i1"), "fclib_global/vectors/w": np.zeros(3)}
+            | {"fclib_global/vectors/mu": [0.5]},
+        ),
+        "max_bytes=",
+    ),
+    "one number in a large chunk": (large_chunk, "in a chunk of"),
+}  # fmt: skip
+
+
+@pytest.mark.slow  # the sanitizers reserve the whole address space
+@pytest.mark.parametrize("name", BOMBS)
+def test_a_small_file_that_would_make_large_arrays_is_refused_first(tmp_path, name):
+    make, sign = BOMBS[name]
+    good = tmp_path / "good.hdf5"
+    lavender.io.save(lv.Problem.contact(np.eye(3), np.ones(3), [0.5]), good)
+    path = make(tmp_path / "bomb")
+    assert path.stat().st_size < 2_000_000
+    done = subprocess.run(
+        [sys.executable, "-c", LOAD, str(good), str(path)],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    kind, message, seconds, grown = json.loads(done.stdout)
+    print(f"{name}: {1e3 * seconds:.1f} ms, {grown / 1e6:.1f} MB, {path.stat().st_size} bytes: {message}")
+    assert kind == "InputError", message
+    assert re.search(sign, message), message
+    assert str(path) in message
+    assert grown < ROOM
+
+
+def test_max_bytes_is_what_the_arrays_take(tmp_path):
+    # A as bytes, 300 x 300: 90 kB to be read, 720 kB to be made.
+    m = 300
+    path = write_npz(
+        tmp_path / "p.npz", b=np.zeros(m), lo=np.zeros(m), hi=np.ones(m), A=np.eye(m, dtype=np.int8)
+    )  # fmt: skip
+    needed = 8 * (m * m + 3 * m)
+    assert lavender.io.load(path, max_bytes=needed).m == m
+    with pytest.raises(lv.InputError, match=f"would take {needed} bytes .* more than {needed - 1}"):
+        lavender.io.load(path, max_bytes=needed - 1)
+    for wrong in (-1, 1e9, "2G", None, True):
+        with pytest.raises(lv.InputError, match="max_bytes is"):
+            lavender.io.load(path, max_bytes=wrong)
+
+
+def contents(mass, h):
+    m = h.shape[1]
+    return fclib.Contents(
+        3, np.full(m // 3, 0.5), M=sp.csr_array(mass), H=sp.csr_array(h), f=np.ones(len(h)), w=np.zeros(m)
+    )
+
+
+def test_a_condensed_matrix_is_never_larger_than_expected():
+    rng = np.random.default_rng(1)
+    for _ in range(20):
+        n, m = int(rng.integers(1, 30)), 3 * int(rng.integers(1, 12))
+        h = np.where(rng.random((n, m)) < 0.15, rng.standard_normal((n, m)), 0.0)
+        mass = np.diag(rng.uniform(1.0, 2.0, n))
+        for _ in range(int(rng.integers(0, n))):
+            i, j = rng.integers(0, n, 2)
+            mass[i, j] = mass[j, i] = mass[i, j] + (1.0 if i == j else 0.1)
+        file = contents(mass, h)
+        label = fclib.csgraph.connected_components(file.M, directed=False)[1]
+        assert file.problem().csr.nnz <= fclib._most_entries(label, file.H)
+
+
+def test_factors_that_would_fill_are_refused_and_narrow_ones_are_not():
+    n = 1200
+    rng = np.random.default_rng(2)
+    h = np.zeros((n, 3))
+    h[:3] = np.eye(3)
+    chain = sp.diags_array([np.full(n - 1, -1.0), np.full(n, 2.5), np.full(n - 1, -1.0)], offsets=[-1, 0, 1])
+    shuffled = rng.permutation(n)
+    chain = sp.csr_array(chain)[shuffled][:, shuffled]
+    got = contents(chain, h).problem(max_bytes=400_000).csr.toarray()  # 1200^2 entries: 23 MB
+    expected = np.linalg.inv(chain.toarray())[:3, :3]
+    np.testing.assert_allclose(got, expected, rtol=1e-12)
+    wild = sp.csr_array(sp.eye_array(n) * 10.0 + sp.random_array((n, n), density=5e-3, rng=rng))
+    with pytest.raises(lv.InputError, match="factors of M"):
+        contents(wild, h).problem(max_bytes=10**6)
+
+
+# -- what is no file -------------------------------------------------------------------------------------------
+
+
+def test_a_number_is_not_taken_for_an_open_file(tmp_path):
+    path = tmp_path / "p.npz"
+    lavender.io.save(lv.Problem.linear(np.eye(2), np.ones(2)), path)
+    for number in (0, 1, 2, True):
+        with pytest.raises(lv.InputError, match="path is"):
+            lavender.io.load(number)
+    with open(path, "rb") as stream:
+        with pytest.raises(lv.InputError, match=r"\(int\); the path of a file"):
+            lavender.io.load(stream.fileno())
+        assert stream.read(2) == b"PK"  # neither read nor closed
+    for wrong in (None, 1.5, b"p.npz", path.open, ["p.npz"]):
+        for act in (lavender.io.load, lambda p: lavender.io.save(lv.Problem.linear(np.eye(1), [1.0]), p)):
+            with pytest.raises(lv.InputError, match="path is"):
+                act(wrong)
+    with pytest.raises(lv.InputError, match="NUL"):
+        lavender.io.load("a\0.npz")
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes with names here")
+def test_a_pipe_is_refused_instead_of_waited_for(tmp_path):
+    os.mkfifo(tmp_path / "p.npz")
+    with pytest.raises(lv.InputError, match="a file is needed"):
+        lavender.io.load(tmp_path / "p.npz")
+    with pytest.raises(lv.InputError, match="a file is needed"):
+        lavender.io.load("/dev/zero")
