@@ -441,5 +441,5 @@ def test_without_h5py_the_extra_is_named(tmp_path, monkeypatch):
         lambda: lavender.io.load(tmp_path / "p.hdf5"),
         lambda: lavender.io.save(local_problem(), tmp_path / "q.h5"),
     ):
-        with pytest.raises(lv.InputError, match=r"lavender\[fclib\]"):
+        with pytest.raises(lv.InputError, match=r"lavender-contact\[fclib\]"):
             act()
