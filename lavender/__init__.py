@@ -27,14 +27,17 @@ from lavender.solution import Claim, Solution, Status
 from lavender.solve import prepare, solve
 
 if TYPE_CHECKING:
-    from lavender import bench, engine, io, report, scene, suite
+    from lavender import bench, engine, io, motion, report, scene, suite
     from lavender.check import CrossCheck, cross_check
     from lavender.engine import SOLVER_FIELDS, Simulation, Snapshot
+    from lavender.motion import MotionError, Motions, motion_error, motions
     from lavender.scene import Scene
 
 # Public name -> module that holds it; the module itself where both are the same.
 _LATER = {
     "CrossCheck": "lavender.check",
+    "MotionError": "lavender.motion",
+    "Motions": "lavender.motion",
     "SOLVER_FIELDS": "lavender.engine",
     "Scene": "lavender.scene",
     "Simulation": "lavender.engine",
@@ -43,6 +46,9 @@ _LATER = {
     "cross_check": "lavender.check",
     "engine": "lavender.engine",
     "io": "lavender.io",
+    "motion": "lavender.motion",
+    "motion_error": "lavender.motion",
+    "motions": "lavender.motion",
     "report": "lavender.report",
     "scene": "lavender.scene",
     "suite": "lavender.suite",
@@ -59,6 +65,8 @@ __all__ = [
     "CrossCheck",
     "InputError",
     "LavenderError",
+    "MotionError",
+    "Motions",
     "Problem",
     "Redundancy",
     "Residual",
@@ -80,6 +88,9 @@ __all__ = [
     "get",
     "io",
     "known",
+    "motion",
+    "motion_error",
+    "motions",
     "prepare",
     "redundancy",
     "register",

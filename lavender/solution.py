@@ -6,13 +6,16 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from enum import Enum
 from types import MappingProxyType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from lavender._arrays import FloatArray
 from lavender.errors import SolveFailed
 from lavender.residuals import Residual
+
+if TYPE_CHECKING:
+    from lavender.motion import MotionError
 
 __all__ = ["Claim", "History", "Solution", "SolverRun", "Status"]
 
@@ -172,6 +175,12 @@ class Solution:
     def success(self) -> bool:
         """The judge's relative residual is at most `tol`."""
         return self.residual.relative <= self.tol
+
+    def motion_error(self, reference: Any = None) -> MotionError:
+        """How wrong the motion is, in units, with a bound: see `lavender.motion_error`."""
+        from lavender.motion import motion_error
+
+        return motion_error(self.residual._problem, self.impulse, reference)
 
     def raise_for_status(self) -> Solution:
         """Return self when the judge accepts the result (within tol, or at the floor of float64).

@@ -26,7 +26,7 @@ LEVELS = [
     {"external"},
     {"solvers"},  # its table lists the external ones too
     {"solve"},
-    {"check", "redundancy"},
+    {"check", "motion", "redundancy"},
     {"scene"},
     {"engine"},
     {"suite"},
@@ -36,8 +36,11 @@ LEVELS = [
     {"cli"},
     {"__main__"},
 ]
-#: Imports upwards that happen inside a function, when it is first called.
-LATE = {("registry", "solvers")}  # the registry reads the table of built-in solvers when it is first asked
+#: Imports upwards that happen inside a function, when it is first called, or for a type checker alone.
+LATE = {
+    ("registry", "solvers"),  # the registry reads the table of built-in solvers when it is first asked
+    ("solution", "motion"),  # Solution.motion_error is a short way to lavender.motion_error
+}
 HEIGHT = {name: height for height, level in enumerate(LEVELS) for name in level}
 
 #: The same for the rooms of lavender_ext, whose modules share inline headers by cimport.
@@ -58,6 +61,10 @@ def room_of(path: Path, package: Path) -> str:
     return "" if first == "__init__" else first
 
 
+def _is_type_checking(test: ast.expr) -> bool:
+    return isinstance(test, ast.Name) and test.id == "TYPE_CHECKING"
+
+
 def imports(path: Path, package: Path) -> list[tuple[int, str, bool]]:
     """Line, dotted name, and whether inside a function, of everything that a file imports from lavender."""
     found = []
@@ -65,6 +72,9 @@ def imports(path: Path, package: Path) -> list[tuple[int, str, bool]]:
     tree = ast.parse(path.read_text(encoding="utf-8"))
     functions = (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda)
     late = {id(node) for f in ast.walk(tree) if isinstance(f, functions) for node in ast.walk(f)}
+    # What only a type checker reads counts as late too: nothing is imported.
+    checked = [node for node in ast.walk(tree) if isinstance(node, ast.If) and _is_type_checking(node.test)]
+    late |= {id(node) for branch in checked for part in branch.body for node in ast.walk(part)}
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             found += [(node.lineno, alias.name, id(node) in late) for alias in node.names]

@@ -1,0 +1,27 @@
+"""How wrong the motion is, not only the impulse: distances to the solution, with a bound; several solutions.
+
+```python
+error = lv.motion_error(problem, solution.impulse)     # or solution.motion_error()
+error.relative, error.speed, error.bound
+lv.motions(problem).spread                             # m/s that Coulomb's law leaves open
+```
+"""
+
+from lavender.motion.bound import Witness
+from lavender.motion.error import MotionError, motion_error
+from lavender.motion.reference import Reference, adopt, reference
+from lavender.motion.several import Motion, Motions, motions
+from lavender.motion.unique import uniqueness
+
+__all__ = [
+    "Motion",
+    "MotionError",
+    "Motions",
+    "Reference",
+    "Witness",
+    "adopt",
+    "motion_error",
+    "motions",
+    "reference",
+    "uniqueness",
+]

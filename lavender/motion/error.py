@@ -1,0 +1,210 @@
+"""How wrong the motion is: distance of an impulse to the solution, in units of motion."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from lavender._arrays import FloatArray
+from lavender.errors import InputError
+from lavender.motion.bound import difference
+from lavender.motion.operator import U
+from lavender.motion.reference import Reference, as_reference, kept
+from lavender.motion.reference import reference as reference_of
+from lavender.problem import Problem
+
+__all__ = ["MotionError", "motion_error"]
+
+
+@dataclass(frozen=True)
+class MotionError:
+    """Distance of one impulse to the solution. None where a number means nothing; `str()` is one line."""
+
+    kinetic: float | None  # sqrt J, of the difference of body velocities; None where M is not known
+    energy: float | None  # sqrt J, with what compliance stores
+    relative: float | None  # -, over the same of the constraints' own motion M^-1 J^T lambda*
+    speed: float | None  # m/s, of the body that is furthest off
+    spin: float | None  # rad/s, of the body that is furthest off
+    rows: float | None  # m/s (rad/s on angular rows), max |w - w*|
+    body: int  # that of `speed`, -1 without one
+    spin_body: int  # that of `spin`, -1 without one
+    row: int  # that of `rows`, -1 without one
+    bound: float | None  # sqrt J, `energy` is no more; see lavender.motion.bound
+    bound_speed: float | None  # m/s, `speed` is no more
+    bound_spin: float | None  # rad/s, `spin` is no more
+    moved: float | None  # m/s, what the targets are moved by in the problem that the bound holds for
+    reference: Reference  # what was compared with
+    note: str  # why a number is missing
+    # Coulomb: the largest distance between two motions that both solve the problem, as far as they were searched.
+    spread: float | None = None  # sqrt J
+    spread_speed: float | None = None  # m/s, of a body; of a row where bodies are not known
+    count: int = 1  # motions that the distance is the shortest of
+    unique: str = ""  # why there is one motion alone; empty where nothing proves it
+    _problem: Problem | None = field(default=None, repr=False)
+
+    @property
+    def body_name(self) -> str:
+        """Name of the body that is furthest off, e.g. "body 3"; empty without one."""
+        return f"body {self.body}" if self.body >= 0 else ""
+
+    @property
+    def row_name(self) -> str:
+        """Name of the row that is furthest off, e.g. "contact 3, normal"; empty without one."""
+        return self._problem.row_name(self.row) if self._problem is not None and self.row >= 0 else ""
+
+    def __str__(self) -> str:
+        parts = []
+        if self.relative is not None:
+            parts.append(f"relative {self.relative:.2e}")
+        if self.kinetic is not None or self.energy is not None:
+            parts.append(f"{self.kinetic if self.kinetic is not None else self.energy:.2e} sqrt(J)")
+        if self.speed is not None:
+            parts.append(f"{self.body_name or 'bodies'} {self.speed:.2g} m/s, {self.spin:.2g} rad/s")
+        if self.rows is not None:
+            parts.append(f"{self.row_name or 'rows'} {self.rows:.2g} m/s")
+        if self.bound is not None:
+            speed = "" if self.bound_speed is None else f" ({self.bound_speed:.2g} m/s)"
+            parts.append(
+                f"at most {self.bound:.2e} sqrt(J){speed} with targets moved by {self.moved:.1e} m/s"
+            )
+        if self.spread_speed is not None and self.count > 1:
+            parts.append(f"nearest of {self.count} motions {self.spread_speed:.2g} m/s apart")
+        if self.unique:
+            parts.append(f"unique: {self.unique}")
+        parts.append(f"to {self.reference}")
+        if self.note:
+            parts.append(self.note)
+        return f"motion error: {', '.join(parts)}"
+
+
+def motion_error(problem: Problem, impulse: Any, reference: Any = None) -> MotionError:
+    """How wrong the motion of an impulse is: its distance to the solution, with a bound.
+
+    With lambda* the reference and M^-1 J^T (lambda - lambda*) the difference dv of body velocities,
+
+        kinetic = sqrt(1/2 dv.M dv)        energy = sqrt(1/2 (lambda - lambda*).A (lambda - lambda*))
+
+    so that two impulses which differ by what moves nothing (a table on four legs) are at distance 0. The
+    bound needs no trust in the reference: with e the judge's error of lambda* and targets moved by d e,
+    the solution is within sqrt(1/2) |e|_A of it (proof in `lavender.motion.bound`).
+
+    Parameters
+    ----------
+    problem : Problem
+    impulse : (m,) N s
+    reference : (m,) N s, Solution or Reference, optional
+        What stands for the solution. Default: what `auto` finds at the floor, solved for once and kept
+        with the problem; under Coulomb's law the nearest of the motions that `lavender.motions` finds.
+
+    Returns
+    -------
+    MotionError
+        No estimate where the reference is no solution (relative above 1e-10 and above twice its floor); no
+        energies where A is asymmetric or indefinite; no bound under Coulomb's law. `note` says so.
+
+    Raises
+    ------
+    InputError
+        An impulse or reference of the wrong length, or one that is not finite.
+    """
+    if not isinstance(problem, Problem):
+        raise InputError(f"problem is a {type(problem).__name__}; a lavender.Problem is needed")
+    x = problem.impulse_array(impulse)
+    if reference is not None:
+        return measure(problem, x, as_reference(problem, reference))
+    if problem.law != "coulomb":
+        return measure(problem, x, reference_of(problem))
+    from lavender.motion.several import motions
+
+    return nearest(problem, x, kept(problem).motions or motions(problem))
+
+
+def nearest(problem: Problem, x: FloatArray, found: Any) -> MotionError:
+    """The distance of an impulse x (m,) to the nearest of several motions."""
+    if not found:
+        return measure(problem, x, reference_of(problem))
+    best = min((measure(problem, x, motion.reference) for motion in found), key=_distance)
+    own = dict(best.__dict__)
+    own |= {
+        "spread": found.spread_energy,
+        "spread_speed": found.spread,
+        "count": len(found),
+        "unique": found.unique,
+    }
+    return MotionError(**own)
+
+
+def _distance(error: MotionError) -> float:
+    known = error.energy if error.energy is not None else error.rows
+    return math.inf if known is None else known
+
+
+def measure(problem: Problem, x: FloatArray, reference: Reference) -> MotionError:
+    """The distance of an impulse x (m,) [N s] to one reference."""
+    operator = kept(problem).operator
+    delta, size = difference(operator, x, reference.impulse)
+    notes = [reference.refusal and f"{reference.refusal}: no energies"]
+    energies = reference.accepted and not reference.refusal
+    if not reference.accepted:
+        notes.append("nothing reached the floor: no estimate")
+    values: dict[str, Any] = dict.fromkeys(
+        (
+            "kinetic",
+            "energy",
+            "relative",
+            "speed",
+            "spin",
+            "rows",
+            "bound",
+            "bound_speed",
+            "bound_spin",
+            "moved",
+        )
+    )
+    values |= {"body": -1, "spin_body": -1, "row": -1}
+    velocity = operator.velocity(delta, U * np.abs(delta))
+    speed = spin = fast = swift = np.zeros(0)
+    if velocity is not None:
+        (speed, spin), (fast, swift) = (_lengths(v) for v in (velocity[0], np.abs(velocity[0]) + velocity[1]))
+    if energies:
+        own = operator.size(reference.impulse, np.zeros(problem.m))
+        values |= {"kinetic": size.kinetic, "energy": size.energy}
+        values["relative"] = (
+            _ratio(size.energy, own.energy)
+            if size.kinetic is None or own.kinetic is None
+            else _ratio(size.kinetic, own.kinetic)
+        )
+    if reference.accepted:
+        if velocity is not None:
+            values["body"], values["speed"] = _largest(speed)
+            values["spin_body"], values["spin"] = _largest(spin)
+        values["row"], values["rows"] = _largest(np.abs(operator.slack(delta)[0] + problem.b))
+    proof = reference.witness
+    if proof is None and not reference.refusal:
+        notes.append("no bound under Coulomb's law")
+    if proof is not None:
+        values["bound"], values["moved"] = size.most + proof.radius, proof.moved
+        reach = operator.reach(proof.radius)
+        if reach is not None:
+            values["bound_speed"] = float(fast.max(initial=0.0)) * (1.0 + 8.0 * U) + reach[0]
+            values["bound_spin"] = float(swift.max(initial=0.0)) * (1.0 + 8.0 * U) + reach[1]
+    return MotionError(**values, reference=reference, note="; ".join(n for n in notes if n), _problem=problem)
+
+
+def _ratio(x: float, reference: float) -> float:
+    return 0.0 if x == 0.0 else x / reference if reference > 0.0 else math.inf
+
+
+def _lengths(velocity: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Linear and angular speed (n,) of each body."""
+    return np.linalg.norm(velocity[:, :3], axis=1), np.linalg.norm(velocity[:, 3:], axis=1)
+
+
+def _largest(x: FloatArray) -> tuple[int, float]:
+    if not len(x):
+        return -1, 0.0
+    i = int(np.argmax(x))
+    return i, float(x[i])

@@ -1,0 +1,130 @@
+"""The solution that motions are compared with: found once per problem, judged, and kept with it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from lavender._arrays import FloatArray, read_only
+from lavender.errors import InputError
+from lavender.motion import operator as operators
+from lavender.motion.bound import Witness, witness
+from lavender.problem import Problem
+from lavender.residuals import Residual, residual
+from lavender.solution import Solution
+from lavender.solve import solve
+
+if TYPE_CHECKING:
+    from lavender.motion.several import Motions
+
+__all__ = ["Reference", "adopt", "reference"]
+
+SOLVER = "auto"
+ASKED = 1e-15  # relative residual asked of it: it stops at the floor by itself
+ACCEPTED = 1e-10  # relative residual that makes a reference, or twice the floor
+CONVEX = ("linear", "lcp", "cone")
+
+
+@dataclass(frozen=True)
+class Reference:
+    """An impulse that stands for the solution, or the best that was found. `str()` is one line."""
+
+    impulse: FloatArray = field(repr=False)  # (m,) N s
+    residual: Residual
+    solver: str  # who found it, e.g. "auto: direct 1 factorisations"
+    refusal: str  # why there are no energies: asymmetric or indefinite A; empty where there are
+    witness: Witness | None = field(repr=False)  # what it proves; None under Coulomb's law, or where refused
+
+    @property
+    def accepted(self) -> bool:
+        """Near enough to a solution that distances to it are told: relative <= 1e-10, or twice the floor."""
+        return self.residual.relative <= max(ACCEPTED, 2.0 * self.residual.floor)
+
+    def __str__(self) -> str:
+        quality = "" if self.accepted else ", no solution"
+        return (
+            f"{self.solver}, relative {self.residual.relative:.1e}, floor {self.residual.floor:.1e}{quality}"
+        )
+
+
+@dataclass
+class Kept:
+    """Everything that this room keeps with a problem."""
+
+    operator: operators.Operator
+    refusal: str
+    reference: Reference | None = None
+    motions: Motions | None = None
+
+
+def kept(problem: Problem) -> Kept:
+    """What is kept with a problem, made when first asked for."""
+    own = problem.__dict__.get("_motion")
+    if own is None:
+        operator = operators.make(problem)
+        own = problem.__dict__["_motion"] = Kept(operator, operator.refusal() or "")
+    state: Kept = own
+    return state
+
+
+def reference(problem: Problem) -> Reference:
+    """The problem's reference; solved for by `auto` when first asked, then kept with the problem.
+
+    Parameters
+    ----------
+    problem : Problem
+
+    Returns
+    -------
+    Reference
+        The best that was found, also where it is no solution: ask `accepted`.
+    """
+    own = kept(problem)
+    if own.reference is None:
+        found = solve(problem, SOLVER, tol=ASKED)
+        own.reference = judged(problem, found.impulse, f"{SOLVER}: {found.message}")
+    return own.reference
+
+
+def adopt(problem: Problem, impulse: Any, solver: str = "given") -> Reference:
+    """Judge an impulse (m,) [N s] and keep it as the problem's reference if it is better than the one kept.
+
+    Raises
+    ------
+    InputError
+        Wrong length, or not finite.
+    """
+    own = kept(problem)
+    new = judged(problem, problem.impulse_array(impulse, "reference"), solver)
+    if own.reference is None or new.residual.relative < own.reference.residual.relative:
+        own.reference = new
+    return own.reference
+
+
+def judged(problem: Problem, impulse: FloatArray, solver: str) -> Reference:
+    """A reference of an impulse that is finite and of the right length."""
+    own = kept(problem)
+    impulse = read_only(np.array(impulse))
+    proof = None
+    if not own.refusal and problem.law in CONVEX:
+        proof = witness(problem, own.operator, impulse)
+    return Reference(impulse, residual(problem, impulse), solver, own.refusal, proof)
+
+
+def as_reference(problem: Problem, given: Any) -> Reference:
+    """A reference of what a caller gave: one already, a Solution, or an impulse (m,) [N s].
+
+    Raises
+    ------
+    InputError
+        Of another problem's length, or not finite.
+    """
+    if isinstance(given, Reference):
+        if given.impulse.shape != (problem.m,):
+            raise InputError(f"the reference has {len(given.impulse)} rows; the problem has {problem.m}")
+        return given
+    if isinstance(given, Solution):
+        return judged(problem, problem.impulse_array(given.impulse, "reference"), given.solver.name)
+    return judged(problem, problem.impulse_array(given, "reference"), "given")

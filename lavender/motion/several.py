@@ -1,0 +1,340 @@
+"""The motions that solve one problem: Coulomb's law may leave several, and no accuracy of a solver chooses.
+
+Runs from different starts, in different orders, by different solvers end at solutions; those whose motions
+agree are one. A search finds motions, it does not prove that there are no more: only `uniqueness` can.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+import scipy.sparse as sp
+
+from lavender._arrays import FloatArray
+from lavender.cones import ROW, project
+from lavender.errors import CapabilityError, InputError, LavenderError
+from lavender.motion.bound import difference
+from lavender.motion.reference import Reference, judged, kept
+from lavender.motion.reference import reference as reference_of
+from lavender.motion.unique import uniqueness
+from lavender.problem import Problem
+from lavender.registry import available, get
+from lavender.residuals import residual
+from lavender.solve import solve
+
+__all__ = ["CHOICES", "Motion", "Motions", "Pick", "motions"]
+
+RUNS = 12  # of a search, after `auto` itself
+SOLVERS = ("anderson", "newton", "sequential_impulses", "block_gauss_seidel", "admm", "nncg")
+ORDERS = ("given", "reverse", "random")
+ASKED = 1e-11  # relative residual asked of a run, which nobody but its own solver ends
+WORK = 2e9  # of `Data.work`, about nanoseconds: what the sweeps of one run may cost
+SWEEPS = (400, 20_000)  # least and most of one run
+# Motions nearer than this are one, as a share of the constraints' own motion: a residual of 1e-10 moves by up to
+# 1e-7 of it on the worst conditioned piles of the suite.
+SAME = 1e-6
+CHOICES = ("nearest", "dissipation", "compliant")
+SOFTEST, STEP = 1.0, 0.1  # softness of "compliant" as a share of d, and what each round leaves of it
+HARDEST = 1e-12
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """One solution, as a motion. `str()` is one line."""
+
+    impulse: FloatArray = field(repr=False)  # (m,) N s
+    slack: FloatArray = field(repr=False)  # (m,) m/s, w
+    reference: Reference = field(repr=False)
+    relative: float  # -, residual
+    energy: float  # J, 1/2 lambda.A lambda - b.lambda: what the constraints add to the bodies' energy at rest targets
+    dissipation: float  # J, -sum w.lambda over friction rows
+    lift: (
+        float  # m/s, largest normal slack of a contact that presses: what the cone law pays for being convex
+    )
+    count: int  # runs that ended here
+    found_by: tuple[str, ...]  # their solvers, orders and starts
+
+    def __str__(self) -> str:
+        return (
+            f"relative {self.relative:.1e}, energy {self.energy:.6g} J, friction takes {self.dissipation:.4g} J, "
+            f"lift {self.lift:.1e} m/s, found {self.count} times"
+        )
+
+
+class Pick(NamedTuple):
+    """Where a solver ends without being told."""
+
+    motion: int  # place of the nearest one
+    distance: float  # m/s to it: more than rounding where the search has not found this motion
+
+
+@dataclass(frozen=True, eq=False)
+class Motions:
+    """Motions that all solve one problem, most often found first; `str()` is a line each."""
+
+    problem: Problem = field(repr=False)
+    motions: tuple[Motion, ...]
+    spread: float  # m/s, the largest distance of two: of a body, or of a row where bodies are not known
+    spread_energy: float | None  # sqrt J, sqrt(1/2) |.|_A of the same; None where A is no energy
+    unique: str  # the criterion that proves there is one; empty where none does
+    runs: int  # that ended at a solution
+    failed: int  # runs that did not
+
+    def __iter__(self) -> Iterator[Motion]:
+        return iter(self.motions)
+
+    def __len__(self) -> int:
+        return len(self.motions)
+
+    def __getitem__(self, i: int) -> Motion:
+        return self.motions[i]
+
+    def select(self, choice: str, impulse: Any = None) -> Motion:
+        """One of the motions by a rule that has a name.
+
+        Parameters
+        ----------
+        choice : {"nearest", "dissipation", "compliant"}
+            Nearest to a warm start; the one in which friction takes most energy; the limit of vanishing
+            softness: compliance d s on every row, s from 1 to 1e-12 by tenths, each solved from the last, as
+            far as the search found where this path ends.
+        impulse : (m,) N s, optional
+            With "nearest": the warm start. Default: the problem's guess, else doing nothing.
+
+        Raises
+        ------
+        InputError
+            No such choice, a wrong impulse, or no motion to choose from.
+        """
+        if choice not in CHOICES:
+            raise InputError(f"select is {choice!r}; one of {', '.join(CHOICES)} is needed")
+        if not self.motions:
+            raise InputError("no run ended at a solution; there is nothing to choose from")
+        if choice == "dissipation":
+            return max(self.motions, key=lambda motion: motion.dissipation)
+        p = self.problem
+        if choice == "compliant":
+            return self.nearest(compliant(p))
+        if impulse is None:
+            impulse = p.start() if p.guess is None else p.guess
+        return self.nearest(p.impulse_array(impulse))
+
+    def nearest(self, impulse: FloatArray) -> Motion:
+        """The motion at the least distance from an impulse (m,) [N s]."""
+        return min(self.motions, key=lambda motion: _distance(self.problem, impulse, motion.impulse)[1])
+
+    def picks(
+        self, solvers: Iterable[str] | None = None, *, tol: float = 1e-9, max_iter: int = SWEEPS[1]
+    ) -> dict[str, Pick | None]:
+        """Which motion each solver ends at without being told; None where it does not get to `tol`.
+
+        Parameters
+        ----------
+        solvers : names, optional
+            Default: all that take the problem here.
+        tol : float
+            Relative residual asked of them, or twice the floor.
+        max_iter : int
+            Budget of those that sweep; the others keep their own.
+        """
+        p = self.problem
+        out: dict[str, Pick | None] = {}
+        for name in available(p) if solvers is None else solvers:
+            try:
+                found = solve(p, name, tol=tol, max_iter=max_iter if get(name).resumable else None)
+            except CapabilityError:
+                continue
+            out[name] = None
+            if self.motions and found.residual.relative <= max(tol, 2.0 * found.residual.floor):
+                near = self.nearest(found.impulse)
+                distance = _distance(p, found.impulse, near.impulse)[0]
+                out[name] = Pick(self.motions.index(near), distance)
+        return out
+
+    def __str__(self) -> str:
+        name = self.problem.name or f"{self.problem.m} rows"
+        if not self.motions:
+            return f"{name}: none of {self.failed} runs ended at a solution"
+        energy = "" if self.spread_energy is None else f", {self.spread_energy:.2e} sqrt(J)"
+        kind = f"one motion, unique: {self.unique}" if self.unique else f"{len(self)} motions found"
+        spread = f", up to {self.spread:.2g} m/s{energy} apart" if len(self) > 1 else ""
+        failed = f", {self.failed} did not end at one" if self.failed else ""
+        head = f"{name} ({self.problem.law}): {kind}{spread}; {self.runs} runs{failed}"
+        return "\n".join([head, *(f"  {i}: {motion}" for i, motion in enumerate(self.motions))])
+
+
+def motions(problem: Problem, n: int = RUNS, seed: int = 0) -> Motions:
+    """Search the motions that solve a problem, from several starts, in several orders, by several solvers.
+
+    Parameters
+    ----------
+    problem : Problem
+    n : int, default 12
+        Runs, after the one of `auto`; none where the motion is proved to be unique.
+    seed : int, default 0
+        Of starts and random orders: equal seeds give equal results.
+
+    Returns
+    -------
+    Motions
+        Kept with the problem, for `motion_error`.
+
+    Raises
+    ------
+    InputError
+        `n` or `seed` is no whole number, or negative.
+    """
+    if not isinstance(problem, Problem):
+        raise InputError(f"problem is a {type(problem).__name__}; a lavender.Problem is needed")
+    for name, value in (("n", n), ("seed", seed)):
+        if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 0:
+            raise InputError(f"{name} is {value!r}; a whole number from 0 is needed")
+    proof = uniqueness(problem)
+    own = reference_of(problem)
+    found = [(own, "auto")] if own.accepted else []
+    failed = 0 if own.accepted else 1
+    if not proof:
+        for label, impulse in _runs(problem, own, int(n), int(seed)):
+            candidate = judged(problem, impulse, label)
+            if candidate.accepted:
+                found.append((candidate, label))
+            else:
+                failed += 1
+    merged = _merge(problem, found)
+    speed, energy = 0.0, 0.0
+    for i, one in enumerate(merged):
+        for two in merged[:i]:
+            v, e, _ = _distance(problem, one.impulse, two.impulse)
+            speed, energy = max(speed, v), max(energy, e)
+    result = Motions(
+        problem,
+        tuple(merged),
+        speed,
+        None if own.refusal else energy,
+        proof.reason if proof else "",
+        len(found),
+        failed,
+    )
+    kept(problem).motions = result
+    return result
+
+
+def compliant(problem: Problem) -> FloatArray:
+    """Where softness that vanishes leads: compliance s d on every row, s from 1 to 1e-12, then none; (m,) [N s]."""
+    x, s = problem.start(), SOFTEST
+    while s >= HARDEST:
+        x = np.array(solve(softened(problem, s), "auto", impulse=x, tol=1e-12).impulse)
+        s *= STEP
+    return np.array(solve(problem, "auto", impulse=x, tol=1e-13).impulse)
+
+
+def softened(problem: Problem, share: float) -> Problem:
+    """The problem with compliance `share` d [1/kg] added to every row."""
+    soft = share * problem.d
+    if problem.rows is not None:
+        assert problem.compliance is not None
+        return replace(problem, compliance=problem.compliance + soft, guess=None, copy=False)
+    return replace(problem, matrix=sp.csr_array(problem.csr + sp.diags_array(soft)), guess=None, copy=False)
+
+
+def _runs(problem: Problem, own: Reference, n: int, seed: int) -> Iterator[tuple[str, FloatArray]]:
+    """n runs: what each was, and where it ended."""
+    here = set(available(problem))
+    solvers = [name for name in SOLVERS if name in here] or ["auto"]
+    if "sequential_impulses" not in here and "pgs" in here:
+        solvers.append("pgs")
+    rng = np.random.default_rng(seed)
+    budget = int(min(max(WORK / max(1, problem.data.work), SWEEPS[0]), SWEEPS[1]))
+    for i in range(n):
+        turn, which = divmod(i, len(solvers))
+        spec = get(solvers[which])
+        options: dict[str, Any] = {}
+        label = spec.name
+        if spec.order:
+            options["order"] = ORDERS[(i + turn) % len(ORDERS)]
+            label += f" {options['order']}"
+            if options["order"] == "random":
+                options["seed"] = int(rng.integers(2**31))
+        # Two turns start where nobody has moved anything, in different orders; a solver without orders starts anew.
+        start = _start(problem, own, rng, max(turn - spec.order, 0))
+        limit = budget if spec.resumable else spec.max_iter
+        try:
+            end = solve(problem, spec.name, impulse=start[1], tol=ASKED, max_iter=limit, **options)
+        except LavenderError:  # refused after a look at the numbers
+            continue
+        if np.isfinite(end.impulse).all():
+            yield f"{label} from {start[0]}", end.impulse
+
+
+def _start(problem: Problem, own: Reference, rng: np.random.Generator, i: int) -> tuple[str, FloatArray]:
+    """A start and its name: doing nothing, the guess, then the reference with its normals and tangents at random."""
+    if i == 0:
+        return ("doing nothing", problem.start()) if problem.guess is None else ("the guess", problem.guess)
+    c = problem.cones
+    x = own.impulse * rng.lognormal(sigma=0.7, size=problem.m)
+    size = float(np.median(np.abs(own.impulse[own.impulse != 0.0]))) if own.impulse.any() else 1.0
+    normal = c.ptr[:-1][c.kind != ROW]
+    x[normal] = np.maximum(x[normal], size * rng.random(len(normal)))
+    tangents = np.repeat(c.kind != ROW, np.diff(c.ptr))
+    tangents[normal] = False
+    x[tangents] = size * rng.normal(size=int(tangents.sum()))
+    return "a random start", project(c, x)
+
+
+def _merge(problem: Problem, found: list[tuple[Reference, str]]) -> list[Motion]:
+    """One motion of all that agree, the best solved of each; most often found first."""
+    groups: list[list[tuple[Reference, str]]] = []
+    for one in found:
+        for group in groups:
+            if _distance(problem, one[0].impulse, group[0][0].impulse)[2] <= SAME:
+                group.append(one)
+                break
+        else:
+            groups.append([one])
+    out = []
+    for group in groups:
+        best = min((reference for reference, _ in group), key=lambda r: r.residual.relative)
+        out.append(_motion(problem, best, tuple(label for _, label in group)))
+    return sorted(out, key=lambda motion: -motion.count)
+
+
+def _motion(problem: Problem, reference: Reference, labels: tuple[str, ...]) -> Motion:
+    x = reference.impulse
+    w = residual(problem, x).slack
+    c = problem.cones
+    normal = c.ptr[:-1][c.kind != ROW]
+    friction = np.repeat(c.kind != ROW, np.diff(c.ptr))
+    friction[normal] = False
+    pressed = normal[x[normal] > 0.0]
+    return Motion(
+        x,
+        w,
+        reference,
+        reference.residual.relative,
+        float(0.5 * (x @ (w - problem.b))),
+        -float(w[friction] @ x[friction]),
+        float(np.max(w[pressed], initial=0.0)),
+        len(labels),
+        labels,
+    )
+
+
+def _distance(problem: Problem, x: FloatArray, y: FloatArray) -> tuple[float, float, float]:
+    """Of two impulses: m/s of a body (or row, without bodies); sqrt J (m/s where A is no energy); that as a share."""
+    own = kept(problem)
+    operator = own.operator
+    delta, size = difference(operator, x, y)
+    velocity = operator.velocity(delta, np.zeros(problem.m))
+    rows = np.abs(operator.slack(delta)[0] + problem.b)
+    speed = rows if velocity is None else np.linalg.norm(velocity[0][:, :3], axis=1)
+    fastest = float(np.max(speed, initial=0.0))
+    if own.refusal:
+        far = float(np.max(rows, initial=0.0))
+        whole = max(float(np.max(np.abs(operator.slack(z)[0] + problem.b), initial=0.0)) for z in (x, y))
+    else:
+        far = size.energy
+        whole = max(operator.size(z, np.zeros(problem.m)).energy for z in (x, y))
+    return fastest, far, far / whole if whole > 0.0 else (0.0 if far == 0.0 else np.inf)

@@ -1,0 +1,162 @@
+"""Where one motion alone solves a problem, by a proof: none of these says that there are several.
+
+Islands (blocks that no body, directly or through others, connects) are looked at apart. One is unique where
+
+    the law is convex    A symmetric positive semidefinite, no friction in it or the law `cone`:
+                         w and the velocities are those of a convex program
+    normals feel no      A_tn = 0 between its friction rows and all others, A positive definite on the
+    friction             others: these are a boxed LCP of their own, whose lambda_n is unique; it fixes every
+                         disk, and what is left is convex. One contact on a body, its normal through the centre
+    friction is small    kappa < 1, below: a contraction has one fixed point
+
+De Saxce's change of variable makes a Coulomb solution the solution of a convex cone problem whose normal targets
+are raised by s_i = mu_i (|u_t| + r |u_s|), s being a fixed point of s -> lambda(s) -> s (Acary, Cadoux, Lemarechal,
+Malick 2011, ZAMM 91, 155-175). For two values of s, with Z the block of A^-1 on the normals, S = diag(mu) on the
+friction rows (mu r on spin), and any positive diagonal T (one entry a contact),
+
+    |D lambda|_A^2 <= - D s . D lambda_n <= |D s|_Z |D lambda|_A          the cone is convex, A positive definite
+    |T D s|^2 <= c |T S (A D lambda)_t|^2 <= c max eig(T S A_tt S T) |D lambda|_A^2     c = 2 with spin, else 1
+
+    kappa^2 = c max eig(T S A_tt S T) max eig(T^-1 Z T^-1)                                               (1)
+
+That friction which is small against the coupling leaves one solution is known since Haslinger 1983 (Math. Meth.
+Appl. Sci. 5, 422-437); that it need not otherwise, also for one contact, since Klarbring 1990 (Ing.-Archiv 60,
+529-541).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sp
+
+from lavender._arrays import FloatArray
+from lavender.cones import CONTACT_SPIN, ROW
+from lavender.motion.reference import kept
+from lavender.problem import Problem
+
+__all__ = ["Uniqueness", "uniqueness"]
+
+LARGEST = 600  # rows of an island up to which (1) is looked for, dense
+UNCOUPLED = 1e-14  # of sqrt(d_t d_n): A_tn that is nothing but rounding
+DEFINITE = 1e-10  # smallest eigenvalue of D^-1/2 A D^-1/2 that counts as positive definite
+
+
+@dataclass(frozen=True)
+class Uniqueness:
+    """Whether one motion alone is proved to solve a problem."""
+
+    proved: bool
+    reason: str  # the criterion that proves it, or where none does
+    kappa: float  # -, the largest contraction number (1) that was needed; 0 where none was, inf where none was found
+
+    def __bool__(self) -> bool:
+        return self.proved
+
+    def __str__(self) -> str:
+        return f"unique: {self.reason}" if self.proved else f"not proved to be unique: {self.reason}"
+
+
+def uniqueness(problem: Problem) -> Uniqueness:
+    """Whether the motion that solves a problem is proved to be the only one.
+
+    Parameters
+    ----------
+    problem : Problem
+
+    Returns
+    -------
+    Uniqueness
+        With the criterion, or the first island for which none holds. Islands of more than 600 rows with
+        friction are not looked at.
+    """
+    refusal = kept(problem).refusal
+    if refusal:
+        return Uniqueness(False, refusal, np.inf)
+    if problem.law != "coulomb":
+        return Uniqueness(True, "the law is convex", 0.0)
+    c = problem.cones
+    friction = np.zeros(problem.m, bool)
+    count = np.diff(c.ptr)
+    for i in np.flatnonzero((c.kind != ROW) & (c.mu > 0.0) & (count > 1)):
+        friction[c.ptr[i] + 1 : c.ptr[i + 1]] = True
+        if c.kind[i] == CONTACT_SPIN and c.patch_radius[i] == 0.0:
+            friction[c.ptr[i + 1] - 1] = False
+    if not friction.any():
+        return Uniqueness(True, "no contact has friction", 0.0)
+    from scipy.sparse import csgraph
+
+    a = problem.csr
+    block = np.repeat(np.arange(c.n_blocks), count)
+    # Rows of one contact belong together whatever A says: the disk joins them.
+    chain = sp.csr_array((np.ones(problem.m), (np.arange(problem.m), c.ptr[block])), shape=a.shape)
+    _, label = csgraph.connected_components(abs(a) + chain, directed=False)
+    reasons, kappa = [], 0.0
+    for island in _islands(label):
+        if not friction[island].any():
+            continue
+        reason, k = _island(problem, island, friction[island])
+        if reason is None:
+            first = problem.row_name(int(island[np.argmax(friction[island])])).rsplit(", ", 1)[0]
+            told = f" (kappa {k:.2g})" if np.isfinite(k) else ""
+            return Uniqueness(False, f"no criterion holds at {first}{told}", k)
+        if reason not in reasons:
+            reasons.append(reason)
+        kappa = max(kappa, k)
+    return Uniqueness(True, " and ".join(reasons) + (f" (kappa {kappa:.2g})" if kappa > 0.0 else ""), kappa)
+
+
+def _islands(label: np.ndarray) -> list[np.ndarray]:
+    order = np.argsort(label, kind="stable")
+    return np.split(order, np.flatnonzero(np.diff(label[order])) + 1)
+
+
+def _island(problem: Problem, rows: np.ndarray, friction: np.ndarray) -> tuple[str | None, float]:
+    """(criterion, kappa) of one island that has friction; None where none holds."""
+    if len(rows) > LARGEST:
+        return None, np.inf
+    scale = 1.0 / np.sqrt(problem.csr_data.d[rows])
+    a = problem.csr[rows][:, rows].toarray() * scale[:, None] * scale
+    a = 0.5 * (a + a.T)
+    others = a[np.ix_(~friction, ~friction)]
+    if np.all(np.abs(a[np.ix_(friction, ~friction)]) <= UNCOUPLED) and _definite(others):
+        return "normals feel no friction", 0.0
+    if not _definite(a):
+        return None, np.inf
+    kappa = _kappa(problem, rows, friction, a, scale)
+    return ("friction is small" if kappa < 1.0 - 1e-6 else None), kappa
+
+
+def _kappa(
+    problem: Problem, rows: np.ndarray, friction: np.ndarray, a: FloatArray, scale: FloatArray
+) -> float:
+    # In the scaled rows: (A_tt)_ij = a_ij / (scale_i scale_j), Z_ij = (a^-1)_ij scale_i scale_j.
+    c = problem.cones
+    block = np.searchsorted(c.ptr, rows, side="right") - 1
+    radius = np.where(
+        (c.kind[block] == CONTACT_SPIN) & (rows == c.ptr[block + 1] - 1), c.patch_radius[block], 1.0
+    )
+    tangents = np.flatnonzero(friction)
+    contacts, place = np.unique(block[tangents], return_inverse=True)
+    normals = np.searchsorted(rows, c.ptr[contacts])
+    size = c.mu[block[tangents]] * radius[tangents] / scale[tangents]
+    sliding = a[np.ix_(tangents, tangents)] * size[:, None] * size
+    lifting = np.linalg.inv(a)[np.ix_(normals, normals)] * scale[normals][:, None] * scale[normals]
+    spin = 2.0 if np.any(c.kind[contacts] == CONTACT_SPIN) and np.any(c.n_tangents[contacts] > 0) else 1.0
+    strongest = np.zeros(len(contacts))
+    np.maximum.at(strongest, place, np.diagonal(sliding))
+    best = np.inf
+    for t in (np.sqrt(np.diagonal(lifting)), 1.0 / np.sqrt(strongest)):
+        one = np.linalg.eigvalsh(sliding * t[place][:, None] * t[place])[-1]
+        two = np.linalg.eigvalsh(lifting / t[:, None] / t)[-1]
+        best = min(best, float(np.sqrt(spin * max(one, 0.0) * max(two, 0.0))))
+    return best
+
+
+def _definite(a: FloatArray) -> bool:
+    try:
+        np.linalg.cholesky(a - DEFINITE * np.eye(len(a)))
+    except np.linalg.LinAlgError:
+        return False
+    return True

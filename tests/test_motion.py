@@ -1,0 +1,347 @@
+"""Motion errors: the bound against a truth in long double, distances that mean what they say, several motions."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from motion_truth import HAS_WIDE, project_cone, solve_wide, trial, wide_matrix
+from random_problems import as_matrix, random_contact_problem, random_lcp, seeds
+
+import lavender as lv
+from lavender import suite
+
+LAWS = ("linear", "lcp", "cone")
+
+
+def problems(law, seed):
+    """One factored problem of a convex law."""
+    if law == "linear":
+        p = random_contact_problem(seed, contacts=0, joints=3)
+        return lv.Problem.from_rows(p.rows, 0.1)
+    return random_contact_problem(
+        seed, friction="cone", tangents=0 if law == "lcp" else 2, spin=law == "cone"
+    )
+
+
+# -- the bound -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.skipif(
+    not HAS_WIDE, reason="no long double beyond float64 here: there is no truth to hold it beside"
+)
+@settings(max_examples=150)
+@given(seed=seeds)
+def test_no_bound_is_broken(seed):
+    found = trial(np.random.default_rng(seed))
+    if found is None:
+        return
+    bound, energy, kinetic, _, problem = found
+    assert energy <= bound, problem.name
+    assert kinetic is None or kinetic <= bound, problem.name
+
+
+@pytest.mark.skipif(not HAS_WIDE, reason="no long double beyond float64 here")
+def test_the_bound_is_not_loose_and_trials_have_a_truth():
+    """The median is 1.0 where the witness is at the floor; 200 trials with a fixed seed."""
+    rng = np.random.default_rng(5)
+    trials = [found for found in (trial(rng) for _ in range(200)) if found is not None]
+    ratios = [float(b / e) for b, e, _, good, _ in trials if good and 0 < e < np.inf]
+    assert len(trials) > 150
+    assert len(ratios) > 80
+    assert np.median(ratios) <= 1.5
+
+
+@pytest.mark.skipif(not HAS_WIDE, reason="no long double beyond float64 here")
+def test_a_bound_that_is_too_small_would_be_found():
+    """The truth is near enough that nine tenths of the distance alone, without the witness's part, breaks it."""
+    rng = np.random.default_rng(6)
+    found = [t for t in (trial(rng) for _ in range(60)) if t is not None and t[3] and 0 < t[1] < np.inf]
+    assert any(0.9 * bound < energy for bound, energy, *_ in found)
+
+
+@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.skipif(not HAS_WIDE, reason="no long double beyond float64 here")
+def test_public_bounds_hold_for_every_body(law):
+    rng = np.random.default_rng(3)
+    checked = 0
+    for seed in range(12):
+        p = problems(law, seed)
+        error = lv.motion_error(p, np.zeros(p.m))
+        a, _ = wide_matrix(p)
+        shift = error.reference.witness.shift.astype(np.longdouble)
+        truth = solve_wide(p, a, p.b.astype(np.longdouble) + shift)
+        if truth is None:
+            continue
+        for scale in (1e-12, 1e-6, 1e-1):
+            x = error.reference.impulse * (1.0 + scale * rng.normal(size=p.m))
+            e = lv.motion_error(p, x)
+            delta = (x - truth[0]).astype(float)
+            v = p.velocity(delta) - p.rows.v_free
+            # 1e-13: the truth's own rounding where it becomes float64.
+            slack = 1e-13 * np.abs(p.velocity(error.reference.impulse)).max()
+            assert np.linalg.norm(v[:, :3], axis=1).max() <= e.bound_speed + slack
+            assert np.linalg.norm(v[:, 3:], axis=1).max() <= e.bound_spin + slack
+            assert e.energy <= e.bound
+            checked += 1
+    assert checked >= 12
+
+
+@given(seed=seeds)
+def test_the_projection_of_the_truth_is_the_judges(seed):
+    """The twin that finds the truth projects as the judge does: its e is the one of `residual`."""
+    p = random_contact_problem(seed, friction="cone", joints=0, bodies=3, contacts=3, tangents=2)
+    x = np.random.default_rng(seed).normal(size=p.m)
+    r = lv.residual(p, x)
+    for i in range(p.n_blocks):
+        s = slice(p.cones.ptr[i], p.cones.ptr[i + 1])
+        z = (x - r.slack / p.d)[s].astype(np.longdouble)
+        near = project_cone(z, p.d[s], p.cones.mu[i], p.cones.patch_radius[i], 2, True)
+        assert np.allclose((x[s] - near).astype(float), r.error[s], atol=1e-12 * (1 + np.abs(z).max()))
+
+
+def test_a_good_reference_moves_targets_by_rounding_alone():
+    for name in suite.SETS["default"]:
+        p = suite.case(name).problem
+        if p.law == "coulomb" or p.m > 1000:
+            continue
+        e = lv.motion_error(p, p.start())
+        assert e.reference.accepted, name
+        # The floor adds rounding as it may fall, the bound as it must not exceed: some hundred sums of it.
+        assert e.moved <= 300 * e.reference.residual.floor * np.abs(p.b).max(), name
+        assert e.bound == pytest.approx(e.energy, rel=1e-6), name
+
+
+# -- the estimate --------------------------------------------------------------------------------------
+
+
+@given(seed=seeds)
+def test_kinetic_is_the_energy_of_the_velocities(seed):
+    p = random_contact_problem(seed, friction="cone")
+    x = np.random.default_rng(seed).normal(size=p.m)
+    e = lv.motion_error(p, x)
+    if not e.reference.accepted:
+        return
+    dv = p.velocity(x) - p.velocity(e.reference.impulse)
+    mass = np.linalg.inv(p.rows.inverse_mass_matrix().toarray())
+    assert e.kinetic == pytest.approx(np.sqrt(0.5 * dv.ravel() @ mass @ dv.ravel()), rel=1e-9)
+    assert e.speed == pytest.approx(np.linalg.norm(dv[:, :3], axis=1).max(), rel=1e-9)
+    assert e.spin == pytest.approx(np.linalg.norm(dv[:, 3:], axis=1).max(), rel=1e-9)
+    assert e.rows == pytest.approx(np.abs(p.slack(x) - p.slack(e.reference.impulse)).max(), rel=1e-9)
+    assert e.body_name == f"body {np.linalg.norm(dv[:, :3], axis=1).argmax()}"
+    delta = x - e.reference.impulse
+    assert e.energy == pytest.approx(np.sqrt(0.5 * delta @ p.dense() @ delta), rel=1e-9)
+    assert e.kinetic <= e.energy * (1 + 1e-12)
+
+
+def test_impulses_that_move_nothing_are_no_error():
+    """A table on four legs: the null vector of A shifts the load between legs and changes no velocity."""
+    p = suite.case("box_stack(n=2)").problem
+    e = lv.motion_error(p, p.start())
+    _, s, vt = np.linalg.svd(p.dense())
+    assert s[-1] < 1e-12 * s[0]
+    x = e.reference.impulse + vt[-1]
+    assert lv.motion_error(p, x).relative < 1e-12
+    assert lv.motion_error(p, x).bound < 1e-12 * e.energy + 1e-12
+
+
+def test_units_do_not_change_the_relative_error():
+    p = problems("cone", 11)
+    x = 0.9 * lv.solve(p, "newton", tol=1e-10).impulse
+    one = lv.motion_error(p, x)
+    k = 1024.0  # kg -> g and so on: A / k, impulses k
+    two = lv.motion_error(lv.Problem(p.b, _boxes(p, k), p.dense() / k, friction="cone"), k * x)
+    matrix = lv.motion_error(as_matrix(p), x)
+    assert matrix.relative == pytest.approx(matrix.energy / _energy(p, matrix.reference.impulse), rel=1e-9)
+    assert two.relative == pytest.approx(matrix.relative, rel=1e-9)
+    assert two.energy == pytest.approx(np.sqrt(k) * one.energy, rel=1e-6)
+
+
+def _boxes(p, k):
+    c = p.cones
+    return lv.Cones(c.ptr, c.kind, k * c.lower, k * c.upper, c.mu, c.patch_radius)
+
+
+def _energy(p, x):
+    return np.sqrt(0.5 * x @ p.dense() @ x)
+
+
+def test_a_matrix_has_energies_and_rows_but_no_bodies():
+    p = random_lcp(4)
+    e = lv.motion_error(p, np.zeros(p.m))
+    assert e.kinetic is None
+    assert e.speed is None
+    assert e.bound_speed is None
+    assert e.energy > 0.0
+    assert e.rows > 0.0
+    assert e.bound >= e.energy
+
+
+@pytest.mark.parametrize(
+    ("matrix", "word"),
+    [(np.array([[2.0, 0.5], [0.0, 2.0]]), "not symmetric"), (np.diag([1.0, -1.0]), "semidefinite")],
+)
+def test_asymmetric_and_indefinite_matrices_have_no_energies(matrix, word):
+    p = lv.Problem.lcp(matrix, [1.0, -1.0], upper=1.0)
+    e = lv.motion_error(p, [0.3, 0.0])
+    assert e.energy is None
+    assert e.bound is None
+    assert e.relative is None
+    assert word in e.note
+    assert word in str(e)
+
+
+def test_without_a_solution_there_is_a_bound_and_no_estimate():
+    p = lv.Problem.lcp([[1.0, -1.0], [-1.0, 1.0]], [1.0, 1.0])  # infeasible
+    e = lv.motion_error(p, [0.0, 0.0])
+    assert not e.reference.accepted
+    assert e.energy is None
+    assert e.speed is None
+    assert e.rows is None
+    assert e.bound is not None
+    assert e.moved > 0.1  # the problem that has this solution is another one, and it is said how much
+    assert "no estimate" in e.note
+
+
+def test_the_reference_is_solved_once_and_a_given_one_is_used():
+    p = problems("cone", 5)
+    first = lv.motion.reference(p)
+    assert lv.motion.reference(p) is first
+    assert first.solver.startswith("auto: ")
+    own = lv.solve(p, "newton", tol=1e-12)
+    e = lv.motion_error(p, p.start(), reference=own)
+    assert e.reference.solver == "newton"
+    assert lv.motion.reference(p) is first
+    given = lv.motion_error(p, p.start(), reference=own.impulse)
+    assert given.energy == e.energy
+    rough = lv.motion_error(p, p.start(), reference=0.5 * own.impulse)
+    assert not rough.reference.accepted
+    assert rough.energy is None
+    assert lv.solve(p, "newton").motion_error().relative < 1e-3
+
+
+def test_a_worse_reference_is_not_adopted():
+    p = problems("cone", 6)
+    good = lv.solve(p, "newton", tol=1e-12).impulse
+    assert lv.motion.adopt(p, good, "mine").solver == "mine"
+    assert lv.motion.adopt(p, 0.9 * good, "worse").solver == "mine"
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_zero_at_the_reference_and_one_where_nothing_is_done(law):
+    p = problems(law, 8)
+    e = lv.motion_error(p, lv.motion.reference(p).impulse)
+    assert e.energy == 0.0
+    assert e.rows == 0.0
+    assert lv.motion_error(p, np.zeros(p.m)).relative == pytest.approx(1.0)
+
+
+def test_wrong_input_is_refused():
+    p = problems("cone", 5)
+    with pytest.raises(lv.InputError, match="impulse"):
+        lv.motion_error(p, np.zeros(p.m + 1))
+    with pytest.raises(lv.InputError, match="reference"):
+        lv.motion_error(p, p.start(), reference=np.zeros(3))
+    with pytest.raises(lv.InputError, match="Problem"):
+        lv.motion_error("p", p.start())
+    with pytest.raises(lv.InputError, match="n is"):
+        lv.motions(p, n=-1)
+
+
+def test_an_empty_problem_has_no_error():
+    p = lv.Problem.lcp(np.zeros((0, 0)), [])
+    e = lv.motion_error(p, [])
+    assert e.energy == 0.0
+    assert e.bound == 0.0
+    assert e.row_name == ""
+
+
+# -- several motions -----------------------------------------------------------------------------------
+
+
+def test_coulombs_law_leaves_several_motions():
+    """Two solutions by the judge's word, at the floor, decimetres per second apart."""
+    p = suite.case("granularF(n=3, sliding=0.5)").problem
+    found = lv.motions(p, n=6)
+    assert len(found) >= 2
+    assert found.spread > 0.1
+    assert not found.unique
+    for motion in found:
+        assert lv.residual(p, motion.impulse).relative <= 1e-10
+        assert motion.lift < 1e-9  # Coulomb's law lifts nothing that presses
+    one, two = found[0], found[1]
+    dv = np.linalg.norm((p.velocity(one.impulse) - p.velocity(two.impulse))[:, :3], axis=1).max()
+    assert dv == pytest.approx(found.spread, rel=1e-6)
+    e = lv.motion_error(p, two.impulse)
+    assert e.energy == 0.0  # the nearest, not the first
+    assert e.count == len(found)
+    assert e.spread_speed == found.spread
+    assert "no bound" in e.note
+
+
+def test_equal_seeds_find_equal_motions():
+    p = suite.case("box_stackF(n=4)").problem
+    one, two = (lv.motions(p, n=8, seed=3) for _ in range(2))
+    assert [m.impulse.tobytes() for m in one] == [m.impulse.tobytes() for m in two]
+    assert [m.count for m in one] == [m.count for m in two]
+
+
+def test_choices_have_names_and_are_motions():
+    p = suite.case("granularF(n=3, sliding=0.5)").problem
+    found = lv.motions(p, n=6)
+    most = found.select("dissipation")
+    assert most.dissipation == max(m.dissipation for m in found)
+    for motion in found:
+        assert found.select("nearest", motion.impulse) is motion
+    assert found.select("compliant") in found
+    with pytest.raises(lv.InputError, match="select is"):
+        found.select("best")
+    picks = found.picks(["anderson", "newton", "jacobi"], max_iter=1000)
+    assert picks["jacobi"] is None  # 1000 sweeps end before it gets there
+    assert picks["anderson"].motion != picks["newton"].motion
+
+
+def test_the_cone_law_has_one_motion_and_shows_its_lift():
+    p = suite.case("pyramidF(k=6, sliding=0.5)").problem.relaxed("cone")
+    found = lv.motions(p)
+    assert len(found) == 1
+    assert found.unique == "the law is convex"
+    assert found[0].lift > 1e-3
+
+
+def one_contact(a, mu, b=(1.0, 0.5, -0.3)):
+    return lv.Problem.contact(a, b, [mu])
+
+
+def test_uniqueness_names_its_criterion():
+    sphere = np.diag([1.0, 3.5, 3.5])
+    assert "normals feel no friction" in lv.motions(one_contact(sphere, 5.0)).unique
+    coupled = sphere + 0.3 * (np.eye(3)[:, [0]] @ np.eye(3)[[1]] + np.eye(3)[:, [1]] @ np.eye(3)[[0]])
+    small = lv.motion.uniqueness(one_contact(coupled, 0.1))
+    assert small
+    assert "friction is small" in small.reason
+    assert 0.0 < small.kappa < 1.0
+    large = lv.motion.uniqueness(one_contact(coupled, 5.0))
+    assert not large
+    assert large.kappa > 1.0
+    assert "no contact has friction" in lv.motion.uniqueness(one_contact(coupled, 0.0)).reason
+    asymmetric = coupled.copy()
+    asymmetric[0, 1] += 0.1
+    assert "not symmetric" in lv.motion.uniqueness(one_contact(asymmetric, 0.1)).reason
+
+
+@given(seed=seeds)
+def test_where_uniqueness_is_proved_every_start_ends_at_one_motion(seed):
+    """The contraction number is a theorem: no start may find a second motion below it."""
+    rng = np.random.default_rng(seed)
+    g = rng.normal(size=(6, 6))
+    a = np.diag(rng.uniform(1.0, 2.0, 6)) + 0.05 * (g @ g.T)
+    p = lv.Problem.contact(a, rng.normal(size=6), rng.uniform(0.05, 0.5, 2))
+    proof = lv.motion.uniqueness(p)
+    if not proof:
+        return
+    ends = [
+        lv.solve(p, "block_gauss_seidel", impulse=rng.normal(size=6) * s, tol=1e-12, max_iter=5000)
+        for s in (0.0, 1.0, 10.0)
+    ]
+    done = [e.slack for e in ends if e.residual.relative <= 1e-11]
+    for w in done[1:]:
+        assert np.abs(w - done[0]).max() < 1e-7
