@@ -40,7 +40,7 @@ from lavender._arrays import FloatArray
 from lavender.cones import ROW
 from lavender.motion.operator import Operator, Size, U
 from lavender.problem import Problem
-from lavender_ext import judge
+from lavender_ext.judge import measure
 
 __all__ = ["Witness", "difference", "witness"]
 
@@ -60,7 +60,7 @@ def witness(problem: Problem, operator: Operator, impulse: FloatArray) -> Witnes
     d = problem.d
     w, off = operator.slack(impulse)
     e = np.empty(problem.m)
-    judge.score(problem.data, impulse, w, e)
+    measure.score(problem.data, impulse, w, e)
     fuzz = _rounding_of_projection(problem, impulse, w)
     radius = operator.size(e, fuzz).most
     shift = d * e
