@@ -15,7 +15,9 @@ from lavender import suite
 from lavender.solvers import _ipm
 from lavender.solvers._ipm import AUGMENTED, CONVEX, InteriorPoint, make_system
 from lavender.solvers._polish import refined
-from lavender_ext.newton import newton
+from lavender_ext.factor import symbolic
+from lavender_ext.newton.elements import Elements
+from lavender_ext.newton.normal_matrix import Factor
 
 
 def good(solution, tol):
@@ -233,15 +235,15 @@ def test_block_factor_on_a_graph_of_bodies_matches_dense(few, monkeypatch):
             k[i, b * s : b * s + s] = panel[i, 1]
     index = np.arange(m + 1, dtype=np.int32)
     zero = np.zeros(m)
-    elements = newton.Elements(
+    elements = Elements(
         index, np.zeros(m, np.int32), index, node, slot, panel.copy(), zero, zero.copy(),
         zero.copy(), zero + np.inf, zero.copy(), zero.copy(), s,
     )  # fmt: skip
-    structure = newton.symbolic(nptr, nind)
+    structure = symbolic.factor_pattern(nptr, nind)
     v, x, y, out = rng.uniform(0.1, 10.0, m), rng.normal(size=m), np.zeros(n * s), np.zeros(m)
     expected = k @ np.linalg.solve(np.eye(n * s) + k.T @ (v[:, None] * k), k.T @ x)
     for unsymmetric in (False, True):
-        factor = newton.Factor(nptr, nind, *structure, s, unsymmetric)
+        factor = Factor(nptr, nind, *structure, s, unsymmetric)
         assert factor.factor(elements, v, unsymmetric) == 0
         factor.solve(elements, x, y, out)
         np.testing.assert_allclose(out, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
@@ -258,8 +260,8 @@ def test_a_chain_of_bodies_gets_the_pattern_of_any_graph(monkeypatch):
     body = np.ascontiguousarray(body, np.int32)
     monkeypatch.setattr(_ipm, "FEW_BODIES", 0)
     chain = _ipm.block_pattern(n, body)
-    assert newton.chain_pattern(body, n) is not None
-    monkeypatch.setattr(newton, "chain_pattern", lambda *_: None)
+    assert symbolic.chain_pattern(body, n) is not None
+    monkeypatch.setattr(symbolic, "chain_pattern", lambda *_: None)
     for one, other in zip(chain, _ipm.block_pattern(n, body), strict=True):
         assert np.array_equal(one, other)
 

@@ -24,7 +24,7 @@ import scipy.sparse.linalg as ssl
 from lavender._arrays import FloatArray
 from lavender.solvers._ipm import CONVEX, InteriorPoint, VelocitySystem
 from lavender.solvers._polish import Run, polish, refined
-from lavender_ext.newton import newton
+from lavender_ext.newton.panel import scaled_jacobian
 
 SHIFT = 1e-14  # of d; squared singular values below it count as zero
 WORTH = 1e-3  # relative residual from which near-dependent rows may be what is in the way
@@ -45,7 +45,7 @@ class AugmentedSystem(VelocitySystem):
         assert rows is not None and sc.bodies is not None
         self.given = system
         panel = np.zeros((sc.problem.m, 12))
-        newton.panel(sc.problem.data, rows.inv_inertia, np.sqrt(rows.inv_mass), panel)
+        scaled_jacobian(sc.problem.data, rows.inv_inertia, np.sqrt(rows.inv_mass), panel)
         size, m = np.diff(sc.ptr), sc.m
         body = np.repeat(sc.bodies, size, axis=0)
         values = panel[sc.keep].reshape(m, 2, 6)

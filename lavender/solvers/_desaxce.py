@@ -11,7 +11,7 @@ psi = phi'(s_t) on the tangents and the spin, 0 on the normal, C = I - e_n psi^T
     du = -q - W dz,    C du = H dz - r_d,    r_d = u - s - phi e_n,                                      (3)
     (H + C W) dz = r_d - C q = r_d - q + (psi . q) e_n,                                                  (4)
 
-q and W = G^T T^-2 G as in the convex method (`lavender_ext/newton/newton.pyx`), whose kernels take every step; phi
+q and W = G^T T^-2 G as in the convex method (`lavender_ext/newton/interior.pxd`), whose kernels take every step; phi
 and psi are read off u, which shares its tangents with s. W^-1 = L L^T gives (C W)^-1 = L P, P = L^T B, so
 
     velocity   N = I + K^T L P K,   N dy = K^T L P r,   dz = L P (r - K dy)                              (5)

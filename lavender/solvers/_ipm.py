@@ -4,7 +4,7 @@
 
 Two forms of H: `VelocitySystem` never forms it (K K^T + theta with one small dense block for each body,
 factored in compiled code), `MatrixSystem` holds it (dense LAPACK, LAPACK's band where one is narrow, else
-sparse LU). The equations are in `lavender_ext/newton/newton.pyx`.
+sparse LU). The equations are in `lavender_ext/newton/`.
 """
 
 from __future__ import annotations
@@ -26,8 +26,19 @@ from scipy.linalg.lapack import dpotrs as potrs
 from lavender._arrays import FloatArray, IntArray
 from lavender.cones import CONTACT, CONTACT_SPIN, ROW
 from lavender.problem import Problem
-from lavender_ext.factor import graph
-from lavender_ext.newton import newton
+from lavender_ext.factor import graph, symbolic
+from lavender_ext.newton.band import (
+    band_free,
+    band_scaled,
+    band_width,
+    element_graph,
+    scaled_band,
+    scaled_entries,
+)
+from lavender_ext.newton.elements import Elements, element_product
+from lavender_ext.newton.fused_step import Interior
+from lavender_ext.newton.normal_matrix import Factor
+from lavender_ext.newton.panel import narrow, scaled_jacobian
 
 CONVEX, COULOMB, AUGMENTED = 0, 1, 2  # natural maps, as in the kernel
 FEW_BODIES = 1500  # up to here bits hold the neighbours of a body
@@ -276,7 +287,7 @@ class System:
 
     def _elements(self, node: IntArray, slot: IntArray, panel: FloatArray, s: int) -> Any:
         sc = self.sc
-        return newton.Elements(
+        return Elements(
             sc.ptr, sc.kind, sc.wptr, node, slot, panel, sc.theta, sc.g, sc.lower, sc.upper,
             np.ascontiguousarray(sc.a_t, float), np.ascontiguousarray(sc.a_s, float), s,
         )  # fmt: skip
@@ -324,16 +335,16 @@ class VelocitySystem(System):
         rows = sc.problem.rows
         assert rows is not None and sc.bodies is not None
         full = np.zeros((sc.problem.m, 12)) if rows.n_bodies == 0 else np.empty((sc.problem.m, 12))
-        used = newton.panel(sc.problem.data, rows.inv_inertia, np.sqrt(rows.inv_mass), full)
+        used = scaled_jacobian(sc.problem.data, rows.inv_inertia, np.sqrt(rows.inv_mass), full)
         columns = [c for c in range(6) if used >> c & 1]
         s = next(k for k in (1, 2, 3, 6) if k >= len(columns))
         columns = sorted((columns + [c for c in range(6) if not used >> c & 1])[:s])
         nptr, nind, node, slot, turned = block_pattern(rows.n_bodies, sc.bodies)
         halves = np.empty((sc.m, 2, s))
-        newton.narrow(full, sc.keep, sc.ptr, turned, np.array(columns, np.int32), halves)
+        narrow(full, sc.keep, sc.ptr, turned, np.array(columns, np.int32), halves)
         self.s, self.n = s, rows.n_bodies
         self.elements = self._elements(node, slot, halves, s)
-        self.structure = (nptr, nind, *newton.symbolic(nptr, nind))
+        self.structure = (nptr, nind, *symbolic.factor_pattern(nptr, nind))
         self.y = np.zeros(self.n * s + 1)
         of_column = np.diff(self.structure[2]).astype(float)  # blocks of L
         self.cost = s**3 * (0.5 * float(of_column @ of_column) + float(self.structure[2][-1]) + self.n)
@@ -349,14 +360,12 @@ class VelocitySystem(System):
         if type(self) is not VelocitySystem or len(sc.kind) < sc.m:
             return None
         u = np.empty(sc.m)
-        return newton.Interior(
-            self.elements, self.blocks(False), self.v, None, u, u, sc.speed, DELTA, DAMPING
-        )
+        return Interior(self.elements, self.blocks(False), self.v, None, u, u, sc.speed, DELTA, DAMPING)
 
     def blocks(self, lu: bool) -> Any:
         """The factor's storage, made when it is first needed."""
         if self.factor is None or (lu and not self.factor_unsymmetric):
-            self.factor = newton.Factor(*self.structure, self.s, lu)
+            self.factor = Factor(*self.structure, self.s, lu)
             self.factor_unsymmetric = lu
         return self.factor
 
@@ -420,7 +429,7 @@ def _band(sc: Scaled, a: Any) -> _Band | None:
         elements = order = reverse_cuthill_mckee(a, symmetric_mode=True).astype(np.int32)
     else:
         of = np.repeat(np.arange(n, dtype=np.int32), np.diff(sc.ptr))
-        to, other = newton.element_graph(sc.ptr, of, a.indptr, a.indices)
+        to, other = element_graph(sc.ptr, of, a.indptr, a.indices)
         graph = sp.csr_array((np.ones(len(other), np.int8), other, to), shape=(n, n))
         elements = reverse_cuthill_mckee(graph, symmetric_mode=True).astype(np.int32)
         size = np.diff(sc.ptr)[elements]
@@ -428,11 +437,11 @@ def _band(sc: Scaled, a: Any) -> _Band | None:
         order = (np.arange(m) + np.repeat(sc.ptr[:-1][elements] - (ends - size), size)).astype(np.int32)
     place = np.empty(m, np.int32)
     place[order] = np.arange(m, dtype=np.int32)
-    width = newton.band_width(a.indptr, a.indices, place) + 1
+    width = band_width(a.indptr, a.indices, place) + 1
     if width > BAND_SHARE * m or m * width**2 > BAND_FILL * a.nnz:
         return None
     h = np.empty((m, width))
-    newton.band(a.indptr, a.indices, a.data, place, sc.scale, h)
+    scaled_band(a.indptr, a.indices, a.data, place, sc.scale, h)
     return _Band(h, order, place, elements, np.empty_like(h))
 
 
@@ -459,7 +468,7 @@ class MatrixSystem(System):
             self.h *= sc.scale[:, None]
             self.h *= sc.scale
         else:
-            values = newton.scaled_entries(a.indptr, a.indices, a.data, sc.scale)
+            values = scaled_entries(a.indptr, a.indices, a.data, sc.scale)
             self.h = sp.csr_array((values, a.indices, a.indptr), shape=(m, m))
         if len(sc.kind) < m:
             self.bt = np.zeros_like(self.v)
@@ -497,7 +506,7 @@ class MatrixSystem(System):
 
     def _product(self, w: FloatArray, h: FloatArray, eps: float, own: float, one: float) -> FloatArray:
         out = np.empty_like(self.h)
-        newton.element_product(self.elements, w, h, eps, own, one, out)
+        element_product(self.elements, w, h, eps, own, one, out)
         return out
 
     def _sparse_lu(self, matrix: Any) -> bool:
@@ -544,7 +553,7 @@ class MatrixSystem(System):
             matrix[:] = band.h
             matrix[:, 0] += (1.0 / self.v)[band.order]
         else:
-            newton.band_scaled(self.elements, band.elements, band.place, band.h, self.bt, band.work)
+            band_scaled(self.elements, band.elements, band.place, band.h, self.bt, band.work)
         return self._cholesky_band(band)
 
     def _cholesky_band(self, band: _Band) -> bool:
@@ -572,7 +581,7 @@ class MatrixSystem(System):
     def factor_natural(self, eps: float) -> bool:
         self.free = None
         if self.band is not None and self.bt is None:
-            newton.band_free(self.band.h, self.p[self.band.order], eps, self.band.work)
+            band_free(self.band.h, self.p[self.band.order], eps, self.band.work)
             if self._cholesky_band(self.band):
                 self.free = self.p
                 return True
@@ -593,7 +602,7 @@ def block_pattern(n: int, body: IntArray) -> tuple[IntArray, IntArray, IntArray,
     if n <= FEW_BODIES:
         nptr, nind, node, slot, turned = graph.body_pattern(body, n)
         return nptr, nind, node, slot, turned
-    chain = newton.chain_pattern(body, n)
+    chain = symbolic.chain_pattern(body, n)
     if chain is not None:
         return chain
     a, b = body[:, 0].astype(np.int64), body[:, 1].astype(np.int64)
@@ -664,7 +673,7 @@ class InteriorPoint:
         self.u1, self.u2 = np.zeros(m), np.zeros(m)
         self.inner: Any = None
         if type(sy) is VelocitySystem and type(self) is InteriorPoint:
-            self.inner = newton.Interior(
+            self.inner = Interior(
                 sy.elements, sy.blocks(False), sy.v, sy.bt, self.u1, self.u2, sc.speed, self.delta, DAMPING
             )
             sy.factorisations += 1

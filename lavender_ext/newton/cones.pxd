@@ -1,0 +1,288 @@
+"""Second-order cones of a contact in their own coordinates: scaling, steps to the boundary, divisions."""
+from libc.math cimport sqrt
+from libc.stdint cimport int32_t
+
+from lavender_ext.core.block cimport CONTACT_SPIN as SPIN
+from lavender_ext.newton.elements cimport elements_t
+
+
+cdef enum:                      # what is kept of a cone: w (4), eta, 1 / eta, 1 / (1 + w_0), and
+    CONE = 16
+    V = 8                       # v (3)
+    C = 12                      # v \\ c of the combined step (3)
+
+
+cdef inline double cone_gap(const double* x, int32_t n) noexcept nogil:
+    # x_0 - |x_1..|
+    cdef double t = 0.0
+    cdef int32_t i
+    for i in range(1, n):
+        t += x[i] * x[i]
+    return x[0] - sqrt(t)
+
+
+cdef inline double cone_det(const double* x, int32_t n) noexcept nogil:
+    cdef double t = 0.0
+    cdef int32_t i
+    for i in range(1, n):
+        t += x[i] * x[i]
+    t = sqrt(t)
+    return (x[0] - t) * (x[0] + t)
+
+
+cdef inline double cone_step(const double* x, const double* dx, int32_t n) noexcept nogil:
+    # largest step to the boundary of the second-order cone; 1e30 where there is none
+    cdef double a = dx[0] * dx[0], b = x[0] * dx[0], c = cone_det(x, n), disc, q
+    cdef int32_t i
+    for i in range(1, n):
+        a -= dx[i] * dx[i]
+        b -= x[i] * dx[i]
+    if c <= 0.0:
+        return 0.0
+    disc = b * b - a * c
+    if disc < 0.0:
+        return 1e30
+    q = -b + sqrt(disc)
+    if q <= 0.0:
+        return 1e30
+    return c / q
+
+
+# One cone of a contact in its own coordinates: x_0 = a z_n, then the tangents (which = 0) or the spin (1).
+cdef inline int32_t cone_size(const elements_t* e, int32_t i, int32_t which) noexcept nogil:
+    cdef int32_t nr = e.ptr[i + 1] - e.ptr[i]
+    if which == 0:
+        return nr - 1 if e.kind[i] == SPIN else nr
+    return 2 if e.kind[i] == SPIN else 0
+
+
+cdef inline double on_normal(double a) noexcept nogil:
+    return a if a > 1.0 else 1.0
+
+
+cdef inline double on_tangent(double a) noexcept nogil:
+    return 1.0 / a if a < 1.0 else 1.0
+
+
+cdef inline void gather(const elements_t* e, int32_t i, int32_t which, const double* z, double* x) noexcept nogil:
+    # x = G z, G = diag(1, 1/a) or diag(a, 1): no entry below 1, so that G never blows a proximal term up
+    cdef int32_t j = e.ptr[i], n, k
+    cdef double a = e.at[i] if which == 0 else e.as_[i]
+    x[0] = on_normal(a) * z[j]
+    if which == 0:
+        n = cone_size(e, i, 0)
+        for k in range(1, n):
+            x[k] = on_tangent(a) * z[j + k]
+    else:
+        x[1] = on_tangent(a) * z[e.ptr[i + 1] - 1]
+
+
+cdef inline void scatter(const elements_t* e, int32_t i, int32_t which, const double* x, double* z) noexcept nogil:
+    # z += G^T x
+    cdef int32_t j = e.ptr[i], n, k
+    cdef double a = e.at[i] if which == 0 else e.as_[i]
+    z[j] += on_normal(a) * x[0]
+    if which == 0:
+        n = cone_size(e, i, 0)
+        for k in range(1, n):
+            z[j + k] += on_tangent(a) * x[k]
+    else:
+        z[e.ptr[i + 1] - 1] += on_tangent(a) * x[1]
+
+
+# u1 (m): dual of the lower bound, or of the tangent cone. u2 (m): of the upper bound, or of the spin cone
+# (its two entries on the normal and the spin row).
+cdef inline void load_dual(const elements_t* e, int32_t i, int32_t which, const double* u1, const double* u2,
+                           double* x) noexcept nogil:
+    cdef int32_t j = e.ptr[i], k
+    if which == 0:
+        for k in range(cone_size(e, i, 0)):
+            x[k] = u1[j + k]
+    else:
+        x[0] = u2[j]
+        x[1] = u2[e.ptr[i + 1] - 1]
+
+
+cdef inline void store_dual(const elements_t* e, int32_t i, int32_t which, const double* x, double* u1,
+                            double* u2) noexcept nogil:
+    cdef int32_t j = e.ptr[i], k
+    if which == 0:
+        for k in range(cone_size(e, i, 0)):
+            u1[j + k] = x[k]
+    else:
+        u2[j] = x[0]
+        u2[e.ptr[i + 1] - 1] = x[1]
+
+
+cdef inline bint has_cone(const elements_t* e, int32_t i, int32_t which) noexcept nogil:
+    # a contact without tangents is a plain normal: its cone is the half-line, a = 1
+    return which == 0 and (cone_size(e, i, 0) > 1 or e.kind[i] != SPIN) or which == 1 and e.kind[i] == SPIN
+
+
+cdef inline void nt_scaling(const double* s, const double* u, int32_t n, double* w, double* eta) noexcept nogil:
+    # T = eta [w0 w1'; w1 I + w1 w1'/(1 + w0)], T u = T^-1 s
+    cdef double ds = sqrt(cone_det(s, n)), du = sqrt(cone_det(u, n)), dot = 0.0, gamma
+    cdef int32_t k
+    for k in range(n):
+        dot += s[k] * u[k]
+    gamma = sqrt(0.5 * (1.0 + dot / (ds * du)))
+    w[0] = (s[0] / ds + u[0] / du) / (2.0 * gamma)
+    for k in range(1, n):
+        w[k] = (s[k] / ds - u[k] / du) / (2.0 * gamma)
+    dot = 1.0
+    for k in range(1, n):
+        dot += w[k] * w[k]
+    w[0] = sqrt(dot)                                    # w0^2 - |w1|^2 = 1 again after rounding
+    eta[0] = sqrt(ds / du)
+
+
+cdef inline void scale_times(const double* w, int32_t n, const double* x, double* out) noexcept nogil:
+    # T x
+    cdef double t = 0.0
+    cdef int32_t k
+    for k in range(1, n):
+        t += w[k] * x[k]
+    out[0] = w[4] * (w[0] * x[0] + t)
+    t = x[0] + t * w[6]
+    for k in range(1, n):
+        out[k] = w[4] * (x[k] + w[k] * t)
+
+
+cdef inline void scale_back(const double* w, int32_t n, const double* x, double* out) noexcept nogil:
+    # T^-1 x
+    cdef double t = 0.0
+    cdef int32_t k
+    for k in range(1, n):
+        t += w[k] * x[k]
+    out[0] = w[5] * (w[0] * x[0] - t)
+    t = t * w[6] - x[0]
+    for k in range(1, n):
+        out[k] = w[5] * (x[k] + w[k] * t)
+
+
+cdef inline void cone_divide(const double* v, const double* c, int32_t n, double* out) noexcept nogil:
+    # v o out = c
+    cdef double det = cone_det(v, n), dot = 0.0
+    cdef int32_t k
+    for k in range(1, n):
+        dot += v[k] * c[k]
+    out[0] = (v[0] * c[0] - dot) / det
+    for k in range(1, n):
+        out[k] = (c[k] - out[0] * v[k]) / v[0]
+
+
+cdef inline bint is_low(const elements_t* e, int32_t j) noexcept nogil:
+    return e.lower[j] > -1.7976931348623157e308
+
+
+cdef inline bint is_high(const elements_t* e, int32_t j) noexcept nogil:
+    return e.upper[j] < 1.7976931348623157e308
+
+
+cdef inline void slack_dual(const elements_t* e, int32_t i, int32_t which, const double* hz, double* c) noexcept nogil:
+    # u with G^T u = H z - g where the contact has one cone
+    cdef int32_t j = e.ptr[i], k
+    cdef double a = e.at[i] if which == 0 else e.as_[i]
+    c[0] = (hz[j] - e.g[j]) / on_normal(a)
+    if which == 0:
+        for k in range(1, cone_size(e, i, 0)):
+            c[k] = (hz[j + k] - e.g[j + k]) / on_tangent(a)
+    else:
+        k = e.ptr[i + 1] - 1
+        c[1] = (hz[k] - e.g[k]) / on_tangent(a)
+
+
+cdef inline double cone_parts(const double* s, const double* u, int32_t n, double a, double delta, double* w,
+                              double* h, double* c, double* root) noexcept nogil:
+    # (T^-2 + delta)^-1 between G^-1 and G^-T as x [1 h][1 h]^T + [0 0; 0 c]: returns x, the normal's own entry.
+    # Through the eigenvalues of T^2, eta^2 (w0 +- |w1|)^2 along (1, +-w1/|w1|) and eta^2 across: as a matrix
+    # T^-2 would lose the small ones. c and its square root are (n - 1, n - 1).
+    # w (CONE) keeps the scaling, and v.
+    cdef double d[4]
+    cdef double eta, size = 0.0, grow, shrink, across, along, x, gn = on_normal(a), gt = on_tangent(a)
+    cdef int32_t k, l, nt = n - 1
+    nt_scaling(s, u, n, w, &eta)
+    w[4] = eta
+    w[5] = 1.0 / eta
+    w[6] = 1.0 / (1.0 + w[0])
+    scale_times(w, n, u, w + V)
+    for k in range(1, n):
+        size += w[k] * w[k]
+    size = sqrt(size)
+    grow = eta * (w[0] + size)
+    shrink = eta / (w[0] + size)
+    grow = grow * grow
+    shrink = shrink * shrink
+    across = eta * eta
+    grow = grow / (1.0 + delta * grow)
+    shrink = shrink / (1.0 + delta * shrink)
+    across = across / (1.0 + delta * across)
+    along = 2.0 * shrink * (grow / (grow + shrink)) / (gt * gt)
+    across = across / (gt * gt)
+    for k in range(nt):
+        d[k] = w[1 + k] / size if size > 0.0 else (1.0 if k == 0 else 0.0)
+        h[k] = (grow - shrink) / (grow + shrink) * (gn / gt) * d[k]
+    for k in range(nt):
+        for l in range(nt):
+            x = 1.0 if k == l else 0.0
+            c[k * nt + l] = across * x + (along - across) * d[k] * d[l]
+            root[k * nt + l] = sqrt(across) * x + (sqrt(along) - sqrt(across)) * d[k] * d[l]
+    return 0.5 * (grow + shrink) / (gn * gn)
+
+
+cdef inline double row_limit(double x, double dx, double best) noexcept nogil:
+    if dx < 0.0 and -x / dx < best:
+        return -x / dx
+    return best
+
+
+# Steps of a cone are taken in the scaled coordinates, where T^-1 s = T u = v: with y = T^-1 G dz, T du = -v - y for
+# the affine step and -(v \\ c) - y for the combined one. T maps the cone onto itself, so lengths are the same.
+cdef inline void cone_affine(const elements_t* e, int32_t i, int32_t which, const double* da, const int32_t n,
+                             double* y, double* back) noexcept nogil:
+    # y = T^-1 G dz_a, back = T du_a
+    cdef const double *w = e.scaling + 2 * CONE * i + CONE * which
+    cdef double x[4]
+    cdef int32_t k
+    gather(e, i, which, da, x)
+    scale_back(w, n, x, y)
+    for k in range(n):
+        back[k] = -w[V + k] - y[k]
+
+
+cdef inline void cone_combined(const elements_t* e, int32_t i, int32_t which, const double* da, double sigma_mu,
+                               const int32_t n, double* rhs) noexcept nogil:
+    # v \\ c of (4) into the cone's store; rhs = T^-1 (v \\ c)
+    cdef double *w = e.scaling + 2 * CONE * i + CONE * which
+    cdef const double *v = w + V
+    cdef double x[4]
+    cdef double y[4]
+    cdef double back[4]
+    cdef int32_t k
+    cone_affine(e, i, which, da, n, y, back)
+    x[0] = -sigma_mu
+    for k in range(n):
+        x[0] += v[k] * v[k] + y[k] * back[k]
+    for k in range(1, n):
+        x[k] = 2.0 * v[0] * v[k] + y[0] * back[k] + back[0] * y[k]
+    cone_divide(v, x, n, w + C)
+    scale_back(w, n, w + C, rhs)
+
+
+cdef inline double cone_length(const elements_t* e, int32_t i, int32_t which, const double* dz, double best,
+                               const int32_t n, double* du) noexcept nogil:
+    # the combined step's length, at most `best`; du
+    cdef const double *w = e.scaling + 2 * CONE * i + CONE * which
+    cdef double x[4]
+    cdef double y[4]
+    cdef double a
+    cdef int32_t k
+    gather(e, i, which, dz, x)
+    scale_back(w, n, x, y)
+    a = cone_step(w + V, y, n)
+    best = a if a < best else best
+    for k in range(n):
+        y[k] = -w[C + k] - y[k]
+    a = cone_step(w + V, y, n)
+    scale_back(w, n, y, du)
+    return a if a < best else best

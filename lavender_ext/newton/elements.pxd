@@ -1,0 +1,109 @@
+"""The scaled problem and its elements: a bounded row or a contact each, with small square matrices, at most 4 x 4.
+
+With d = diag(A): z = D^1/2 lambda [sqrt J], g = D^-1/2 b, s = H z - g,
+
+    H = D^-1/2 A D^-1/2 = K K^T + diag(theta),   K = D^-1/2 J M^-1/2                              (1)
+
+An element is a bounded row, or a contact (normal, tangents, spin) whose cones in z are |z_t| <= a_t z_n and
+|z_s| <= a_s z_n. Interior point and natural map both ask for (H + W) dz = r with one small W for each element; in
+the velocity form, with V = (theta + W)^-1 per element,
+
+    N = I + K^T V K,   N dy = K^T V r,   dz = V (r - K dy)                                        (2)
+
+and N (normal_matrix.pxd), one block of `s` columns for each body, is factored by block Cholesky in a fixed order.
+Nothing here squares J twice, and rows that depend on each other cost nothing.
+"""
+from libc.math cimport fabs
+from libc.stdint cimport int32_t, int64_t
+
+
+cdef struct elements_t:
+    int32_t n                   # elements
+    int32_t m                   # rows
+    int32_t s                   # columns of a body in the panel
+    const int32_t* ptr          # (n + 1) first row
+    const int32_t* kind         # (n) ROW (one row each) | CONTACT | SPIN
+    const int32_t* wptr         # (n + 1) first entry of the element's small square matrices
+    const int32_t* node         # (n, 2) block columns, the first the larger, -1 where static
+    const int32_t* slot         # (n, 3) blocks of N: first-first, second-second, first-second
+    int32_t n_groups            # runs of elements between the same bodies: one manifold each, usually
+    const int32_t* group        # (n_groups + 1) first element
+    const double* panel         # (m, 2 s) K
+    const double* theta         # (m)
+    const double* g             # (m)
+    const double* lower         # (m) scaled, read on ROW
+    const double* upper         # (m)
+    const double* at            # (n) a_t
+    const double* as_           # (n) a_s
+    double* scaling             # (n, 2, CONE) of the element's cones, once lav_ipm_scale has run
+
+
+cdef class Elements:
+    cdef elements_t e
+    cdef list keep
+    cdef readonly int m, n, n_small
+
+
+cdef inline void invert_small(double* a, double* inv, int32_t n) noexcept nogil:
+    # Gauss-Jordan with row pivots; a is lost. A zero pivot leaves zeros in its column.
+    cdef int32_t i, j, k, best
+    cdef double x
+    for i in range(n * n):
+        inv[i] = 0.0
+    for i in range(n):
+        inv[i * n + i] = 1.0
+    for k in range(n):
+        best = k
+        for i in range(k + 1, n):
+            if fabs(a[i * n + k]) > fabs(a[best * n + k]):
+                best = i
+        if best != k:
+            for j in range(n):
+                x = a[k * n + j]
+                a[k * n + j] = a[best * n + j]
+                a[best * n + j] = x
+                x = inv[k * n + j]
+                inv[k * n + j] = inv[best * n + j]
+                inv[best * n + j] = x
+        x = a[k * n + k]
+        x = 1.0 / x if fabs(x) > 1e-300 else 0.0
+        for j in range(n):
+            a[k * n + j] *= x
+            inv[k * n + j] *= x
+        for i in range(n):
+            if i != k:
+                x = a[i * n + k]
+                if x != 0.0:
+                    for j in range(n):
+                        a[i * n + j] -= x * a[k * n + j]
+                        inv[i * n + j] -= x * inv[k * n + j]
+
+
+cdef inline void element_times(const elements_t* e, const double* w, const double* x, double* out) noexcept nogil:
+    cdef int32_t i, j, r, c, nr
+    cdef double t
+    if e.n == e.m:
+        for i in range(e.m):
+            out[i] = w[i] * x[i]
+        return
+    for i in range(e.n):
+        j = e.ptr[i]
+        nr = e.ptr[i + 1] - j
+        for r in range(nr):
+            t = 0.0
+            for c in range(nr):
+                t += w[e.wptr[i] + r * nr + c] * x[j + c]
+            out[j + r] = t
+
+
+cdef inline void element_times_transposed(const elements_t* e, const double* w, const double* x, double* out) noexcept nogil:
+    cdef int32_t i, j, r, c, nr
+    cdef double t
+    for i in range(e.n):
+        j = e.ptr[i]
+        nr = e.ptr[i + 1] - j
+        for r in range(nr):
+            t = 0.0
+            for c in range(nr):
+                t += w[e.wptr[i] + c * nr + r] * x[j + c]
+            out[j + r] = t

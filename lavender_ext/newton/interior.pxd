@@ -1,0 +1,388 @@
+"""Interior point steps, part by part (Mehrotra 1992; Nesterov and Todd 1997 for the cones; Vandenberghe 2010, 5 and 7).
+
+u dual to G z, G z and u inside every cone, W = G^T T^-2 G with T u = T^-1 G z = v the scaling,
+
+    affine     (H + W) dz = -(H z - g),                    du = -u - T^-2 G dz                    (3)
+    combined   c = v o v + (T^-1 G dz_a) o (T du_a) - sigma mu e,   sigma = (mu_a / mu)^3
+               (H + W) dz = -(H z - g - G^T u) - G^T T^-1 (v \\ c),  du = -T^-1 (v \\ c) - T^-2 G dz  (4)
+"""
+from libc.math cimport fabs, sqrt
+from libc.stdint cimport int32_t
+
+from lavender_ext.core.block cimport CONTACT, CONTACT_SPIN as SPIN, ROW
+from lavender_ext.newton.cones cimport (C, CONE, V, cone_affine, cone_combined, cone_gap, cone_length,
+                                        cone_parts, cone_size, cone_step, gather, has_cone, is_high, is_low,
+                                        load_dual, on_normal, row_limit, scatter, slack_dual, store_dual)
+from lavender_ext.newton.elements cimport elements_t, invert_small
+
+
+cdef inline double ipm_start(const elements_t* e, const double* hz, double dual, double* z, double* u1,
+                                 double* u2) noexcept nogil:
+    """Puts z and u inside their cones, starting from z with (H + I) z = g; returns the degree (number of cones).
+
+    Vandenberghe 2010, section 7.3: both are shifted along the cones' axes, by one amount each; u's beyond the
+    worst violation is `dual` times z's, because most rows carry load in the end.
+    """
+    cdef int32_t i, j, which, n
+    cdef double worst_z = -1e300, worst_u = -1e300, size = 0.0, x, degree = 0.0, width
+    cdef double c[4]
+    for j in range(e.m):
+        size += z[j] * z[j] + (hz[j] - e.g[j]) * (hz[j] - e.g[j])
+    size = sqrt(size / (e.m if e.m > 0 else 1))
+    if not size > 0.0:
+        size = 1.0
+    for i in range(e.n):
+        j = e.ptr[i]
+        if e.kind[i] == ROW:
+            u1[j] = 0.0
+            u2[j] = 0.0
+            if is_low(e, j) and is_high(e, j):
+                width = e.upper[j] - e.lower[j]
+                x = 0.1 * width
+                if z[j] < e.lower[j] + x:
+                    z[j] = e.lower[j] + x
+                if z[j] > e.upper[j] - x:
+                    z[j] = e.upper[j] - x
+                x = hz[j] - e.g[j]
+                u1[j] = dual * size + (x if x > 0.0 else 0.0)
+                u2[j] = dual * size + (-x if x < 0.0 else 0.0)
+                degree += 2.0
+            elif is_low(e, j):
+                x = e.lower[j] - z[j]
+                worst_z = x if x > worst_z else worst_z
+                u1[j] = hz[j] - e.g[j]
+                worst_u = -u1[j] if -u1[j] > worst_u else worst_u
+                degree += 1.0
+            elif is_high(e, j):
+                x = z[j] - e.upper[j]
+                worst_z = x if x > worst_z else worst_z
+                u2[j] = e.g[j] - hz[j]
+                worst_u = -u2[j] if -u2[j] > worst_u else worst_u
+                degree += 1.0
+            continue
+        for which in range(2):
+            if not has_cone(e, i, which):
+                continue
+            n = cone_size(e, i, which)
+            gather(e, i, which, z, c)
+            x = -cone_gap(c, n) / on_normal(e.at[i] if which == 0 else e.as_[i])
+            worst_z = x if x > worst_z else worst_z
+            slack_dual(e, i, which, hz, c)
+            x = -cone_gap(c, n)
+            worst_u = x if x > worst_u else worst_u
+            store_dual(e, i, which, c, u1, u2)
+            degree += 1.0
+    worst_z = worst_z + size if worst_z > -1e-8 * size else 0.0
+    worst_u = worst_u + dual * size if worst_u > -1e-8 * size else 0.0
+    for i in range(e.n):
+        j = e.ptr[i]
+        if e.kind[i] == ROW:
+            if is_low(e, j) and not is_high(e, j):
+                z[j] += worst_z
+                u1[j] += worst_u
+            elif is_high(e, j) and not is_low(e, j):
+                z[j] -= worst_z
+                u2[j] += worst_u
+            continue
+        z[j] += worst_z
+        for which in range(2):
+            if has_cone(e, i, which):
+                if which == 0:
+                    u1[j] += worst_u
+                else:
+                    u2[j] += worst_u
+    return degree
+
+
+cdef inline double ipm_start_apart(const elements_t* e, const double* hz, double margin, double* z, double* u1,
+                                       double* u2) noexcept nogil:
+    """Puts z and u inside their cones, starting from z with (H + I) z = g; returns the degree (number of cones).
+
+    Each cone apart, by no more than it needs: z and u keep at least `margin` times the mean |z| and the mean |g|
+    from the boundary.
+    """
+    cdef int32_t i, j, which, n
+    cdef double size_z = 0.0, size_u = 0.0, x, degree = 0.0, width
+    cdef double c[4]
+    for j in range(e.m):
+        size_z += fabs(z[j])
+        size_u += fabs(e.g[j])
+    size_z = margin * size_z / (e.m if e.m > 0 else 1)
+    size_u = margin * size_u / (e.m if e.m > 0 else 1)
+    if not size_z > 0.0:
+        size_z = 1.0
+    if not size_u > 0.0:
+        size_u = 1.0
+    for i in range(e.n):
+        j = e.ptr[i]
+        if e.kind[i] == ROW:
+            u1[j] = 0.0
+            u2[j] = 0.0
+            x = hz[j] - e.g[j]
+            if is_low(e, j) and is_high(e, j):
+                width = 0.1 * (e.upper[j] - e.lower[j])
+                if z[j] < e.lower[j] + width:
+                    z[j] = e.lower[j] + width
+                if z[j] > e.upper[j] - width:
+                    z[j] = e.upper[j] - width
+                u1[j] = x if x > size_u else size_u
+                u2[j] = -x if -x > size_u else size_u
+                degree += 2.0
+            elif is_low(e, j):
+                if z[j] < e.lower[j] + size_z:
+                    z[j] = e.lower[j] + size_z
+                u1[j] = x if x > size_u else size_u
+                degree += 1.0
+            elif is_high(e, j):
+                if z[j] > e.upper[j] - size_z:
+                    z[j] = e.upper[j] - size_z
+                u2[j] = -x if -x > size_u else size_u
+                degree += 1.0
+            continue
+        for which in range(2):
+            if not has_cone(e, i, which):
+                continue
+            n = cone_size(e, i, which)
+            slack_dual(e, i, which, hz, c)
+            x = size_u - cone_gap(c, n)
+            if x > 0.0:
+                c[0] += x
+            store_dual(e, i, which, c, u1, u2)
+            gather(e, i, which, z, c)
+            x = (size_z - cone_gap(c, n)) / on_normal(e.at[i] if which == 0 else e.as_[i])
+            if x > 0.0:
+                z[j] += x
+            degree += 1.0
+    return degree
+
+
+cdef inline void ipm_scale(const elements_t* e, const double* z, const double* u1, const double* u2, double delta,
+                               double* v, double* bt, double* gap) noexcept nogil:
+    """V = (W + theta + delta)^-1 of (3) for each element, B^T with V = B B^T where theta = 0, and the gap G z . u.
+
+    bt may be NULL.
+    """
+    cdef int32_t i, j, k, l, n, nr, q, t
+    cdef double x, y, r, total = 0.0
+    cdef double s[4]
+    cdef double u[4]
+    cdef double h[4]
+    cdef double c[4]
+    cdef double root[4]
+    cdef double hs[1]
+    cdef double cs[1]
+    cdef double rs[1]
+    cdef double a[16]
+    cdef double b[16]
+    hs[0] = cs[0] = rs[0] = 0.0
+    for i in range(e.n):
+        j = e.ptr[i]
+        nr = e.ptr[i + 1] - j
+        q = e.wptr[i]
+        if e.kind[i] == ROW:
+            x = e.theta[j] + delta
+            if is_low(e, j):
+                x += u1[j] / (z[j] - e.lower[j])
+                total += u1[j] * (z[j] - e.lower[j])
+            if is_high(e, j):
+                x += u2[j] / (e.upper[j] - z[j])
+                total += u2[j] * (e.upper[j] - z[j])
+            v[q] = 1.0 / x
+            if bt != NULL:
+                bt[q] = sqrt(v[q])
+            continue
+        n = nr if e.kind[i] == CONTACT else nr - 1
+        x = 0.0
+        if n > 1:
+            gather(e, i, 0, z, s)
+            load_dual(e, i, 0, u1, u2, u)
+            for k in range(n):
+                total += s[k] * u[k]
+            x = cone_parts(s, u, n, e.at[i], delta, e.scaling + 2 * CONE * i, h, c, root)
+        if e.kind[i] == SPIN:
+            # Two cones share the normal: their parallel sum there, each of the others follows it.
+            gather(e, i, 1, z, s)
+            load_dual(e, i, 1, u1, u2, u)
+            total += s[0] * u[0] + s[1] * u[1]
+            y = cone_parts(s, u, 2, e.as_[i], delta, e.scaling + 2 * CONE * i + CONE, hs, cs, rs)
+            x = x * (y / (x + y)) if n > 1 else y
+        for k in range(nr * nr):
+            v[q + k] = 0.0
+        a[0] = 1.0
+        for k in range(1, n):
+            a[k] = h[k - 1]
+            for l in range(1, n):
+                v[q + k * nr + l] = c[(k - 1) * (n - 1) + l - 1]
+        if e.kind[i] == SPIN:
+            a[nr - 1] = hs[0]
+            v[q + nr * nr - 1] = cs[0]
+        for k in range(nr):
+            for l in range(nr):
+                v[q + k * nr + l] += x * a[k] * a[l]
+        if bt != NULL:
+            r = sqrt(x)
+            for k in range(nr * nr):
+                bt[q + k] = 0.0
+            for k in range(nr):
+                bt[q + k] = r * a[k]
+            for k in range(1, n):
+                for l in range(1, n):
+                    bt[q + k * nr + l] = root[(k - 1) * (n - 1) + l - 1]
+            if e.kind[i] == SPIN:
+                bt[q + nr * nr - 1] = rs[0]
+        y = 0.0
+        for k in range(nr):
+            y += e.theta[j + k]
+        if y > 0.0:                                     # V <- (I + V theta)^-1 V
+            for k in range(nr):
+                for l in range(nr):
+                    a[k * nr + l] = v[q + k * nr + l] * e.theta[j + l] + (1.0 if k == l else 0.0)
+            invert_small(a, b, nr)
+            for k in range(nr):
+                for l in range(nr):
+                    a[k * nr + l] = 0.0
+                    for t in range(nr):
+                        a[k * nr + l] += b[k * nr + t] * v[q + t * nr + l]
+            for k in range(nr * nr):
+                v[q + k] = a[k]
+    gap[0] = total
+
+
+cdef inline double ipm_affine(const elements_t* e, const double* z, const double* u1, const double* u2,
+                                  const double* dz, double* gap) noexcept nogil:
+    """Largest step (at most 1) of the affine direction, and the gap G z . u after it."""
+    cdef int32_t i, j, k, which, n
+    cdef double best = 1.0, a, b, x, t00 = 0.0, t01 = 0.0, t11 = 0.0
+    cdef double y[4]
+    cdef double back[4]
+    cdef const double *v
+    for i in range(e.n):
+        j = e.ptr[i]
+        if e.kind[i] == ROW:
+            if is_low(e, j):
+                a = z[j] - e.lower[j]
+                x = -u1[j] - u1[j] / a * dz[j]
+                best = row_limit(a, dz[j], best)
+                best = row_limit(u1[j], x, best)
+                t00 += a * u1[j]
+                t01 += a * x + u1[j] * dz[j]
+                t11 += x * dz[j]
+            if is_high(e, j):
+                a = e.upper[j] - z[j]
+                x = -u2[j] + u2[j] / a * dz[j]
+                best = row_limit(a, -dz[j], best)
+                best = row_limit(u2[j], x, best)
+                t00 += a * u2[j]
+                t01 += a * x - u2[j] * dz[j]
+                t11 -= x * dz[j]
+            continue
+        for which in range(2):
+            if not has_cone(e, i, which):
+                continue
+            n = cone_size(e, i, which)
+            v = e.scaling + 2 * CONE * i + CONE * which + V
+            if n == 3:
+                cone_affine(e, i, which, dz, 3, y, back)
+                a = cone_step(v, y, 3)
+                b = cone_step(v, back, 3)
+            else:
+                cone_affine(e, i, which, dz, n, y, back)
+                a = cone_step(v, y, n)
+                b = cone_step(v, back, n)
+            best = a if a < best else best
+            best = b if b < best else best
+            for k in range(n):
+                t00 += v[k] * v[k]
+                t01 -= v[k] * v[k]
+                t11 += y[k] * back[k]
+    gap[0] = t00 + best * (t01 + best * t11)
+    return best
+
+
+cdef inline void ipm_rhs(const elements_t* e, const double* z, const double* u1, const double* u2, const double* hz,
+                             const double* da, double sigma_mu, double* rhs) noexcept nogil:
+    """Right-hand side of (4)."""
+    cdef int32_t i, j, k, which, n
+    cdef double a, x
+    cdef double u[4]
+    cdef double t[4]
+    for i in range(e.n):
+        for j in range(e.ptr[i], e.ptr[i + 1]):
+            rhs[j] = -(hz[j] - e.g[j])
+        j = e.ptr[i]
+        if e.kind[i] == ROW:
+            # -(H z - g - u1 + u2) - c1/s1 + c2/s2, c = s u + ds du - sigma mu: the u cancel
+            if is_low(e, j):
+                a = z[j] - e.lower[j]
+                x = -u1[j] - u1[j] / a * da[j]
+                rhs[j] -= (da[j] * x - sigma_mu) / a
+            if is_high(e, j):
+                a = e.upper[j] - z[j]
+                x = -u2[j] + u2[j] / a * da[j]
+                rhs[j] += (-da[j] * x - sigma_mu) / a
+            continue
+        for which in range(2):
+            if not has_cone(e, i, which):
+                continue
+            n = cone_size(e, i, which)
+            load_dual(e, i, which, u1, u2, u)
+            if n == 3:
+                cone_combined(e, i, which, da, sigma_mu, 3, t)
+            else:
+                cone_combined(e, i, which, da, sigma_mu, n, t)
+            for k in range(n):
+                t[k] = u[k] - t[k]
+            scatter(e, i, which, t, rhs)
+
+
+cdef inline double ipm_update(const elements_t* e, double* z, double* u1, double* u2, const double* dz,
+                                  const double* da, double sigma_mu, double damping, double* du1, double* du2) noexcept nogil:
+    """Takes the combined step of the last `ipm_rhs` in place; returns its length. du1, du2 (m) are scratch."""
+    cdef int32_t i, j, k, which, n
+    cdef double best = 1.0 / damping, a, x
+    cdef double du[4]
+    for i in range(e.n):
+        j = e.ptr[i]
+        if e.kind[i] == ROW:
+            if is_low(e, j):
+                a = z[j] - e.lower[j]
+                x = -u1[j] - u1[j] / a * da[j]
+                x = -u1[j] - (da[j] * x - sigma_mu) / a - u1[j] / a * dz[j]
+                best = row_limit(a, dz[j], best)
+                best = row_limit(u1[j], x, best)
+                du1[j] = x
+            if is_high(e, j):
+                a = e.upper[j] - z[j]
+                x = -u2[j] + u2[j] / a * da[j]
+                x = -u2[j] - (-da[j] * x - sigma_mu) / a + u2[j] / a * dz[j]
+                best = row_limit(a, -dz[j], best)
+                best = row_limit(u2[j], x, best)
+                du2[j] = x
+            continue
+        for which in range(2):
+            if not has_cone(e, i, which):
+                continue
+            n = cone_size(e, i, which)
+            if n == 3:
+                best = cone_length(e, i, which, dz, best, 3, du)
+            else:
+                best = cone_length(e, i, which, dz, best, n, du)
+            store_dual(e, i, which, du, du1, du2)
+    best = best * damping
+    for j in range(e.m):
+        z[j] += best * dz[j]
+    for i in range(e.n):
+        j = e.ptr[i]
+        if e.kind[i] == ROW:
+            if is_low(e, j):
+                u1[j] += best * du1[j]
+            if is_high(e, j):
+                u2[j] += best * du2[j]
+            continue
+        for k in range(j, e.ptr[i + 1]):
+            if has_cone(e, i, 0) and k - j < cone_size(e, i, 0):
+                u1[k] += best * du1[k]
+        if has_cone(e, i, 1):
+            u2[j] += best * du2[j]
+            u2[e.ptr[i + 1] - 1] += best * du2[e.ptr[i + 1] - 1]
+    return best

@@ -1,0 +1,112 @@
+"""The normal matrix N = I + K^T V K, block by block, a run of elements between the same two bodies at once."""
+from libc.stdint cimport int32_t, int64_t
+
+from lavender_ext.factor.blocks cimport factor_t
+from lavender_ext.newton.elements cimport elements_t
+
+
+cdef class Factor:
+    cdef factor_t f
+    cdef list keep
+    cdef readonly int n, s
+    cdef bint lu, unsymmetric
+
+
+cdef inline void add_product(double* out, const double* left, const double* right, int32_t nr,
+                             const int32_t s) noexcept nogil:
+    # out += left^T right, (nr, 2 s) rows of which s columns are read
+    cdef int32_t i, j, r
+    cdef double x
+    cdef double row[6]
+    for i in range(s):
+        for j in range(s):
+            row[j] = out[i * s + j]
+        for r in range(nr):
+            x = left[r * 2 * s + i]
+            for j in range(s):
+                row[j] += x * right[r * 2 * s + j]
+        for j in range(s):
+            out[i * s + j] = row[j]
+
+
+cdef inline void weigh(const double* v, const double* rows, double* t, int32_t nr, const int32_t s) noexcept nogil:
+    # t = V rows, (nr, 2 s)
+    cdef int32_t r, k, c
+    cdef double x
+    cdef double row[12]
+    for r in range(nr):
+        x = v[r * nr]
+        for c in range(2 * s):
+            row[c] = x * rows[c]
+        for k in range(1, nr):
+            x = v[r * nr + k]
+            for c in range(2 * s):
+                row[c] += x * rows[k * 2 * s + c]
+        for c in range(2 * s):
+            t[r * 2 * s + c] = row[c]
+
+
+cdef inline void add_elements(const elements_t* e, const double* v, const factor_t* f, int32_t lu, const int32_t s) noexcept nogil:
+    cdef int32_t h, i, j, r, c, nr, first, second, n_blocks = f.nptr[f.n], done
+    cdef int64_t b = s * s, q
+    cdef double t[192]                                  # V K of up to 16 rows between two bodies, (16, 2 s)
+    cdef const double *pr
+    cdef const int32_t *slot
+    for q in range(n_blocks * b):
+        f.nval[q] = 0.0
+    if lu:
+        for q in range(n_blocks * b):
+            f.mval[q] = 0.0
+    for i in range(f.n):
+        q = (f.nptr[i + 1] - 1) * b
+        for c in range(s):
+            f.nval[q + c * s + c] = 1.0
+            if lu:
+                f.mval[q + c * s + c] = 1.0
+    for h in range(e.n_groups):
+        i = e.group[h]
+        first = e.node[2 * i]
+        second = e.node[2 * i + 1]
+        slot = e.slot + 3 * i
+        if first < 0:
+            continue
+        while i < e.group[h + 1]:
+            j = e.ptr[i]
+            pr = e.panel + <int64_t>j * 2 * s
+            done = 0
+            while i < e.group[h + 1] and done <= 12:
+                nr = e.ptr[i + 1] - e.ptr[i]
+                if nr == 1:
+                    weigh(v + e.wptr[i], pr + done * 2 * s, t + done * 2 * s, 1, s)
+                elif nr == 3:
+                    weigh(v + e.wptr[i], pr + done * 2 * s, t + done * 2 * s, 3, s)
+                else:
+                    weigh(v + e.wptr[i], pr + done * 2 * s, t + done * 2 * s, nr, s)
+                done += nr
+                i += 1
+            add_product(f.nval + slot[0] * b, pr, t, done, s)
+            if second >= 0:
+                add_product(f.nval + slot[1] * b, pr + s, t + s, done, s)
+                add_product(f.nval + slot[2] * b, pr, t + s, done, s)
+                if lu:
+                    # block (second, first) of K^T V K, transposed: (V K_first)^T K_second
+                    add_product(f.mval + slot[2] * b, t, pr + s, done, s)
+    if lu:
+        # The mirror of a diagonal block is its transpose; only off-diagonal blocks are read there.
+        for i in range(f.n):
+            q = (f.nptr[i + 1] - 1) * b
+            for r in range(s):
+                for c in range(s):
+                    f.mval[q + c * s + r] = f.nval[q + r * s + c]
+
+
+cdef inline void normal_matrix(const elements_t* e, const double* v, const factor_t* f, int32_t lu) noexcept nogil:
+    """N = I + K^T V K of (2) into the blocks of `f`; with `lu` the upper blocks too."""
+    if f.s == 1:
+        add_elements(e, v, f, lu, 1)
+    elif f.s == 3:
+        add_elements(e, v, f, lu, 3)
+    elif f.s == 6:
+        add_elements(e, v, f, lu, 6)
+    else:
+        add_elements(e, v, f, lu, f.s)
