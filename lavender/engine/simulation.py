@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import wraps
 from os import PathLike
 from pathlib import Path
+from threading import RLock
 from time import perf_counter
-from typing import Any
+from typing import Any, Concatenate, ParamSpec, TypeVar
 
 import numpy as np
 
 from lavender import io
 from lavender._arrays import FloatArray, read_only
 from lavender.cones import CONTACT_SPIN, Cones
-from lavender.engine.layout import HEAD, NEED_ROOM, NOT_FINITE, OK, SIZE
+from lavender.engine.check import same_scene, well_formed, whole_state
+from lavender.engine.layout import HEAD, NEED_ROOM, OK, SIZE
 from lavender.engine.snapshot import Snapshot
 from lavender.engine.state import State
 from lavender.errors import InputError, LavenderError, SolveFailed, UnknownName
@@ -24,10 +28,11 @@ from lavender.rows import Rows
 from lavender.scene import Scene
 from lavender.scene.parts import whole
 from lavender.scene.scene import SWEEPS
-from lavender.solution import Solution
+from lavender.solution import Solution, Status
 from lavender.solve import finish, solve
 from lavender.solvers._warm import MOST_STEPS, note_tried, warm_claim
 from lavender.solvers.newton import SPEC as NEWTON_SPEC
+from lavender_ext.engine import substep
 
 __all__ = ["SOLVER_FIELDS", "Simulation"]
 
@@ -47,6 +52,10 @@ SOLVER_FIELDS = (
 PARTS = ("joint", "normal", "disk", "spin")
 NEWTON = NEWTON_SPEC.factory
 TOL = 1e-6  # of lavender.solve
+INSIDE = "this simulation is inside a step; a solver or callback may not use it until the step has ended"
+LAST_STEP = 2**31 - 1  # head's count of substeps begins again after it
+P = ParamSpec("P")
+R = TypeVar("R")
 
 
 @dataclass(frozen=True)
@@ -59,8 +68,26 @@ class _Pending:
     time: float  # s
 
 
+def _alone(
+    method: Callable[Concatenate[Simulation, P], R],
+) -> Callable[Concatenate[Simulation, P], R]:
+    """One call at a time: other threads wait, and a call from inside a step is refused."""
+
+    @wraps(method)
+    def call(self: Simulation, /, *args: P.args, **kwargs: P.kwargs) -> R:
+        with self._lock:
+            if self._inside:
+                raise LavenderError(INSIDE)
+            return method(self, *args, **kwargs)
+
+    return call
+
+
 class Simulation:
     """Steps a scene. The scene is read once; changing it later changes nothing here.
+
+    Threads may share one: a call waits until those of the others have ended. What a solver calls from inside
+    a step is refused.
 
     Parameters
     ----------
@@ -85,6 +112,7 @@ class Simulation:
             raise InputError("the scene has no bodies; add some (add_box, add_sphere, add_plane)")
         self.scene = scene
         self.report_residual = report_residual
+        self._lock, self._inside = RLock(), False
         self._load(scene)
 
     def _load(self, scene: Scene) -> None:
@@ -101,7 +129,7 @@ class Simulation:
             self._warm_tol = float(tol) if 0.0 < tol < np.inf else 0.0
         self._steps = 0
         self._failed = 0
-        self._lost = ""
+        self._half = False  # stopped between two substeps, where nothing leads back
         self._last: Solution | _Pending | None = None
 
     # -- running --------------------------------------------------------------------------------
@@ -127,6 +155,7 @@ class Simulation:
         return bool(self._state.head[HEAD["warm_start"]])
 
     @property
+    @_alone
     def last_solution(self) -> Solution | None:
         """What the registered solver returned for the last substep.
 
@@ -141,6 +170,7 @@ class Simulation:
         """Bytes of the engine's arrays."""
         return self._state.nbytes
 
+    @_alone
     def set_solver_iterations(self, n: int) -> None:
         """Budget from the next step on.
 
@@ -152,12 +182,14 @@ class Simulation:
         low, high = SWEEPS if self._own_sweeps else (1, 2**31 - 1)
         self._state.head[HEAD["iterations"]] = whole("solver_iterations", n, low, high)
 
+    @_alone
     def set_warm_start(self, flag: bool) -> None:
         """Warm starting from the next step on; the cache is kept up to date either way."""
         if not isinstance(flag, (bool, np.bool_)):
             raise InputError(f"warm_start is {flag!r}; True or False is needed")
         self._state.head[HEAD["warm_start"]] = bool(flag)
 
+    @_alone
     def reset(self, seed: int | None = None) -> tuple[dict[str, Any], dict[str, Any]]:
         """Back to the start of the scene; with `seed`, of the scene built with that seed.
 
@@ -205,47 +237,78 @@ class Simulation:
         ------
         SolveFailed
             With `on_failure="raise"`, before the state has changed.
+        KeyboardInterrupt
+            Ctrl-C while a registered solver runs: the state is that of before the step, or of after it where it
+            was done already; never of a part.
         LavenderError
             The simulation had terminated: reset it or restore a snapshot.
         """
         if action is not None:
             raise InputError(f"action is {action!r}; this simulation takes none")
-        if self._lost:
-            raise LavenderError(f"the state of {self._lost!r} is not finite; reset() or restore a snapshot")
-        if self._own_sweeps:
-            status = self._sweep_substeps()
-        else:
-            status = self._solver_substeps()
-        self._steps += 1
-        if status == NOT_FINITE:
-            self._lost = self._names[int(self._state.head[HEAD["lost"]])]
-        return self._observe(), 0.0, bool(self._lost), False, self._info()
+        with self._lock:
+            if self._inside:
+                raise LavenderError(INSIDE)
+            if self._lost or self._half:
+                raise LavenderError(
+                    f"the state of {self._lost!r} is not finite; reset() or restore a snapshot"
+                    if self._lost
+                    else "a step ended between its substeps; reset() or restore a snapshot"
+                )
+            self._inside = True
+            try:
+                self._advance()
+                return self._observe(), 0.0, bool(self._lost), False, self._info()
+            finally:
+                self._inside = False
 
-    def _sweep_substeps(self) -> int:
+    def _advance(self) -> None:
+        substeps, first = self._parameters.substeps, self._state
+        begun, failed = first.head.item(HEAD["step"]), self._failed
+        # A registered solver may raise or be stopped in any substep, which then must be as if none had been;
+        # until the first has ended, nothing has changed that the next step starts from.
+        keeps = substeps > 1 and not self._own_sweeps
+        if keeps:
+            first.kernel.keep()
+        try:
+            if self._own_sweeps:
+                self._sweep_substeps()
+            else:
+                self._solve_substeps()
+        except BaseException as error:
+            done = (self._state.head.item(HEAD["step"]) - begun) % (LAST_STEP + 1)
+            if done == substeps or self._lost:
+                self._steps += 1  # it was whole
+                raise
+            if done and keeps:
+                first.kernel.put_back()
+                self._state = first
+            self._half = bool(done) and not keeps
+            self._failed = failed
+            if not isinstance(error, SolveFailed):
+                self._last = None  # it may lie in arrays that have been written over
+            raise
+        self._steps += 1
+
+    @property
+    def _lost(self) -> str:
+        # name of the body whose state is not finite, or empty
+        lost = self._state.head.item(HEAD["lost"])
+        return self._names[lost] if lost >= 0 else ""
+
+    def _sweep_substeps(self) -> None:
         left = self._parameters.substeps
         while True:
             status, done = self._state.kernel.substeps(left)
             left -= done
             if status != NEED_ROOM:
-                return int(status)
+                return
             self._state = self._state.grown()
 
     def _prepare(self) -> None:
         while self._state.kernel.prepare() == NEED_ROOM:
             self._state = self._state.grown()
 
-    def _solver_substeps(self) -> int:
-        p = self._parameters
-        before = self._state.copy() if p.on_failure == "raise" and p.substeps > 1 else None
-        try:
-            return self._solve_substeps()
-        except SolveFailed:
-            if before is not None:
-                self._state = before
-            raise
-
-    def _solve_substeps(self) -> int:
-        status = OK
+    def _solve_substeps(self) -> None:
         warm = (
             self._warm_tol > 0.0 and self.solver_iterations >= MOST_STEPS and get("newton").factory == NEWTON
         )
@@ -256,16 +319,25 @@ class Simulation:
             kernel.solve(False)
             spent = self._solve_in_place() if warm else (0, 0)
             if spent is not None:
-                problem = self._problem(self._state)
+                try:
+                    problem = self._problem(self._state)
+                except InputError:  # its numbers are not finite
+                    self._lose()
+                    return
                 if warm:
                     note_tried(problem, self._warm_tol, *spent)
                 if problem.m:
                     a["impulse"][: problem.m] = self._solve(problem)
                 kernel.apply()
-            status = kernel.finish()
-            if status != OK:
-                break
-        return int(status)
+            if kernel.finish() != OK:
+                return
+
+    def _lose(self) -> None:
+        # no solver takes the prepared problem: the run ends here, at the body that finish() finds
+        self._state.kernel.apply()
+        if self._state.kernel.finish() == OK:
+            bodies = [*self._state.a["contact_pair"][0].tolist(), int(self._state.a["body_of"][0])]
+            self._state.head[HEAD["lost"]] = next(i for i in bodies if self._state.a["dyn"][i] >= 0)
 
     def _solve_in_place(self) -> tuple[int, int] | None:
         # The bits of lavender.solve(problem, "newton"), whose first phase this is, without making the problem.
@@ -295,6 +367,8 @@ class Simulation:
         solution = solve(
             problem, p.solver, impulse=guess, max_iter=self.solver_iterations, **p.solver_options
         )
+        if solution.status is Status.INTERRUPTED and "callback" not in p.solver_options:
+            raise KeyboardInterrupt  # the front door has turned it into a result; half a solve is no step
         self._last = solution
         judged = solution.residual
         if solution.success or judged.relative <= 2.0 * judged.floor:
@@ -342,11 +416,12 @@ class Simulation:
         if self._lost:
             info["lost_body"] = self._lost
         if self.report_residual and not self._lost:
-            info["residual"] = self.residual()
+            info["residual"] = self._judged()
         return info
 
     # -- the problem ----------------------------------------------------------------------------
 
+    @_alone
     def constraint_problem(self) -> Problem:
         """The next substep's velocity problem, with its warm start as `guess`; changes no state.
 
@@ -426,6 +501,7 @@ class Simulation:
             ),
         ]
 
+    @_alone
     def residual(self) -> dict[str, Any]:
         """The judge over all rows of the last substep, with the impulses that it used.
 
@@ -441,8 +517,11 @@ class Simulation:
         InputError
             No step has been done.
         """
-        if self._state.head[HEAD["step"]] == 0:
-            raise InputError("no step has been done yet")
+        return self._judged()
+
+    def _judged(self) -> dict[str, Any]:
+        if not self._state.head[HEAD["solved"]]:
+            raise InputError("no step has been done yet, or the last was stopped; call step() and ask again")
         problem = self._problem(self._state)
         judged = residual(problem, self._state.a["impulse"][: problem.m].copy())
         return {
@@ -501,8 +580,17 @@ class Simulation:
 
     # -- snapshots ------------------------------------------------------------------------------
 
+    @_alone
     def snapshot(self) -> Snapshot:
-        """The whole state: bodies, contact cache, joint impulses, sweep budget, warm-start mode, counters."""
+        """The whole state: bodies, contact cache, joint impulses, sweep budget, warm-start mode, counters.
+
+        Raises
+        ------
+        LavenderError
+            A step ended between its substeps.
+        """
+        if self._half:
+            raise LavenderError("a step ended between its substeps; reset() or restore a snapshot")
         s = self._state
         return Snapshot(
             fingerprint=self._fingerprint,
@@ -515,13 +603,14 @@ class Simulation:
             keys=read_only(s.keys.copy()),
         )
 
+    @_alone
     def restore(self, snapshot: Snapshot) -> None:
         """Continue from a snapshot of this scene, bit for bit.
 
         Raises
         ------
         InputError
-            Not a snapshot, or of another scene.
+            Not a snapshot, of another scene, or with a number in it that no step can have left. Nothing changes.
         """
         if not isinstance(snapshot, Snapshot):
             raise InputError(
@@ -529,20 +618,26 @@ class Simulation:
             )
         if snapshot.fingerprint != self._fingerprint:
             raise InputError("the snapshot is of another scene: bodies, joints or parameters differ")
-        state = State(snapshot.size)
-        if any(
-            len(x) != len(y)
-            for x, y in (
-                (state.real, snapshot.real),
-                (state.index, snapshot.index),
-                (state.keys, snapshot.keys),
-            )
-        ):
-            raise InputError("the snapshot's arrays do not fit its sizes; it is damaged")
+        well_formed(snapshot)
+        size = snapshot.size.copy()
+        same_scene(self._state, size)
+        lengths = (len(snapshot.real), len(snapshot.index), len(snapshot.keys))
+        used = substep.lengths(size)
+        if lengths != (used[0], used[1], max(used[2], 1)):
+            raise InputError("the snapshot is damaged: its arrays do not fit its sizes")
+        state = State(size)
         state.real[:], state.index[:], state.keys[:] = snapshot.real, snapshot.index, snapshot.keys
+        lost = snapshot.lost
+        whole_state(self._state, state, SWEEPS if self._own_sweeps else (1, 2**31 - 1), bool(lost))
+        if lost != (self._names[state.head[HEAD["lost"]]] if lost else ""):
+            raise InputError(
+                f"the snapshot is damaged: {lost[:40]!r} is not the body whose state it says is lost"
+            )
+        for name in ("pairs_valid", "need_pairs", "need_contacts"):
+            state.head[HEAD[name]] = 0  # the list of pairs is made anew
         self._state = state
-        self._steps, self._failed, self._lost = snapshot.steps, snapshot.failed, snapshot.lost
-        self._last = None
+        self._steps, self._failed = snapshot.steps, snapshot.failed
+        self._last, self._half = None, False
 
     def save(self, path: str | PathLike[str]) -> None:
         """Write a snapshot to a file; see `Snapshot.save`."""

@@ -9,20 +9,25 @@ from __future__ import annotations
 
 import hashlib
 import json
+import stat
 from dataclasses import dataclass, field
-from os import PathLike
+from os import PathLike, fsync
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from lavender.engine.check import well_formed
 from lavender.engine.layout import N_SIZES
 from lavender.errors import InputError
+from lavender.io.stored import write_atomically
 from lavender_ext.engine import substep
 
 __all__ = ["Snapshot"]
 
 MAGIC = b"LAVENDER-SNAPSHOT\n"
 VERSION = 1
+MOST_HEADER = 2**20  # bytes
 ARRAYS = (("size", "<i4"), ("real", "<f8"), ("index", "<i4"), ("keys", "<u8"))
 
 
@@ -40,7 +45,14 @@ class Snapshot:
     keys: np.ndarray = field(repr=False)  # uint64
 
     def save(self, path: str | PathLike[str]) -> None:
-        """Write to a file, versioned and checksummed."""
+        """Write to a file, versioned and checksummed; a file of that name is replaced when the new one is whole.
+
+        Raises
+        ------
+        InputError
+            The path cannot be written, the disk is full (the old file stays), or a field is of a wrong type.
+        """
+        well_formed(self)
         arrays = [np.ascontiguousarray(getattr(self, name), code).tobytes() for name, code in ARRAYS]
         header = json.dumps(
             {
@@ -53,7 +65,8 @@ class Snapshot:
             }
         ).encode()
         body = b"".join([MAGIC, len(header).to_bytes(8, "little"), header, *arrays])
-        Path(path).write_bytes(body + hashlib.sha256(body).digest())
+        checksum = hashlib.sha256(body).digest()
+        write_atomically(_path(path), lambda part: _write(part, body + checksum))
 
     @classmethod
     def load(cls, path: str | PathLike[str]) -> Snapshot:
@@ -64,41 +77,68 @@ class Snapshot:
         InputError
             No such file, not a snapshot, of another version, or damaged.
         """
-        try:
-            data = Path(path).read_bytes()
-        except OSError as error:
-            raise InputError(f"cannot read the snapshot {str(path)!r}: {error.strerror}") from None
+        data = _read(path)
         if not data.startswith(MAGIC):
             raise InputError(f"{str(path)!r} is not a lavender snapshot")
         body, checksum = data[:-32], data[-32:]
         if hashlib.sha256(body).digest() != checksum:
             raise InputError(f"the snapshot {str(path)!r} is damaged: its checksum does not fit")
         try:
-            start = len(MAGIC) + 8
-            end = start + int.from_bytes(body[len(MAGIC) : start], "little")
-            header = json.loads(body[start:end])
-            if header["version"] != VERSION:
-                raise InputError(
-                    f"the snapshot {str(path)!r} has version {header['version']}; {VERSION} is read here"
-                )
-            arrays = {}
-            for (name, code), n in zip(ARRAYS, header["lengths"], strict=True):
-                x = np.frombuffer(body, code, n, end)
-                end += x.nbytes
-                arrays[name] = x.astype(x.dtype.newbyteorder("="))
-            if end != len(body) or len(arrays["size"]) != N_SIZES or min(arrays["size"]) < 0:
-                raise ValueError("lengths")
-            used = substep.lengths(arrays["size"])
-            if [max(n, 1) for n in used] != [max(n, 1) for n in header["lengths"][1:]]:
-                raise ValueError("lengths")
-            return cls(
-                str(header["fingerprint"]),
-                int(header["steps"]),
-                int(header["failed"]),
-                str(header["lost"]),
-                **arrays,
-            )
-        except (ValueError, KeyError, TypeError, UnicodeDecodeError) as error:
+            found = cls._parsed(body)
+        except (ValueError, KeyError, TypeError, RecursionError) as error:
             if isinstance(error, InputError):
-                raise
+                raise InputError(f"the snapshot {str(path)!r} cannot be read: {error}") from None
             raise InputError(f"the snapshot {str(path)!r} does not hold what its header says") from None
+        return found
+
+    @classmethod
+    def _parsed(cls, body: bytes) -> Snapshot:
+        start = len(MAGIC) + 8
+        end = start + int.from_bytes(body[len(MAGIC) : start], "little")
+        if not start < end <= min(len(body), start + MOST_HEADER):
+            raise ValueError("header")
+        header: Any = json.loads(body[start:end])
+        if header["version"] != VERSION:
+            raise InputError(f"it has version {str(header['version'])[:40]}; {VERSION} is read here")
+        arrays = {}
+        for (name, code), n in zip(ARRAYS, header["lengths"], strict=True):
+            if type(n) is not int or n < 0:
+                raise ValueError("lengths")
+            x = np.frombuffer(body, code, n, end)
+            end += x.nbytes
+            arrays[name] = x.astype(x.dtype.newbyteorder("="))
+        if end != len(body) or len(arrays["size"]) != N_SIZES or min(arrays["size"]) < 0:
+            raise ValueError("lengths")
+        used = substep.lengths(arrays["size"])
+        if [max(n, 1) for n in used] != [max(n, 1) for n in header["lengths"][1:]]:
+            raise ValueError("lengths")
+        found = cls(header["fingerprint"], header["steps"], header["failed"], header["lost"], **arrays)
+        well_formed(found)
+        return found
+
+
+def _path(path: str | PathLike[str]) -> Path:
+    try:
+        found = Path(path)
+    except TypeError:
+        raise InputError(f"path is a {type(path).__name__}; the name of a file is needed") from None
+    if "\0" in str(found):
+        raise InputError(f"path is {str(path)!r}; the name of a file has no zero byte")
+    return found
+
+
+def _read(path: str | PathLike[str]) -> bytes:
+    found = _path(path)
+    try:
+        if not stat.S_ISREG(found.stat().st_mode):  # a pipe or a device has no end
+            raise InputError(f"cannot read the snapshot {str(path)!r}: it is no file")
+        return found.read_bytes()
+    except OSError as error:
+        raise InputError(f"cannot read the snapshot {str(path)!r}: {error.strerror or error}") from None
+
+
+def _write(part: Path, data: bytes) -> None:
+    with open(part, "wb") as stream:
+        stream.write(data)
+        stream.flush()
+        fsync(stream.fileno())

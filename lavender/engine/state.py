@@ -14,9 +14,11 @@ from lavender.engine.layout import (
     HEAD,
     JOINT,
     JOINT_KINDS,
+    MOST_PAIRS,
     N_SIZES,
     SETTING,
     SIZE,
+    TOO_MANY,
 )
 from lavender.errors import InputError
 from lavender.ordering import ENGINE_ORDERS
@@ -43,6 +45,7 @@ assert set(ORDER_NUMBER) == set(ENGINE_ORDERS)
 BRUTE_FORCE = 32  # bodies up to which testing all pairs is quicker than the grid
 BETA = 0.2  # -, share of the position error removed per substep
 MAX_PUSH = 0.2  # m, largest position error corrected per substep
+MOST_BYTES = 2**32  # of the three buffers
 # What the kernels carry from one substep to the next or a scene gives; the rest is scratch of one substep.
 KEPT = (
     "setting", "x", "q", "v", "inv_mass_body", "inertia", "inv_inertia_body", "shape", "friction", "restitution",
@@ -75,8 +78,12 @@ class State:
     def __init__(self, size: np.ndarray) -> None:
         self.size = np.ascontiguousarray(size, np.int32)
         used = substep.lengths(self.size)
-        if min(used) < 0:
-            raise InputError("the scene needs more than 2^31 entries in one buffer; make it smaller")
+        if min(used) < 0 or 8 * used[0] + 4 * used[1] + 8 * used[2] > MOST_BYTES:
+            raise InputError(
+                f"{self.size[SIZE['bodies']]} bodies with room for {self.size[CAP_PAIR]} pairs and "
+                f"{self.size[CAP_CONTACT]} contacts need more than the {MOST_BYTES >> 30} GiB that a simulation "
+                "may take: move the bodies apart or take fewer"
+            )
         self.real = np.zeros(used[0])
         self.index = np.zeros(used[1], np.int32)
         self.keys = np.zeros(max(used[2], 1), np.uint64)
@@ -133,11 +140,22 @@ class State:
         self.keys[:] = other.keys
 
     def grown(self) -> State:
-        """A copy with room for what the last substep found missing."""
+        """A copy with room for what the last substep found missing.
+
+        Raises
+        ------
+        InputError
+            More than `MOST_PAIRS` pairs of bodies are close together, or more than `MOST_BYTES` are needed.
+        """
         size = self.size.copy()
+        if self.head[HEAD["need_pairs"]] == TOO_MANY:
+            raise InputError(
+                f"more than {MOST_PAIRS} pairs of bodies are close together ({size[SIZE['bodies']]} bodies): "
+                "move them apart"
+            )
         for cap, need in ((CAP_PAIR, HEAD["need_pairs"]), (CAP_CONTACT, HEAD["need_contacts"])):
             if self.head[need] > size[cap]:
-                size[cap] = int(self.head[need] * 1.25) + 16
+                size[cap] = min(int(self.head[need] * 1.25) + 16, 2**31 - 1)
         other = State(size)
         for name in KEPT:
             source, goal = self.a[name], other.a[name]

@@ -30,7 +30,7 @@ class Sphere:
 
     def inertia(self, mass: float) -> FloatArray:
         """Inertia (3, 3) [kg m^2] of a solid ball."""
-        return np.eye(3) * (0.4 * mass * self.radius**2)
+        return np.diag(np.full(3, 0.4 * mass * (self.radius * self.radius)))
 
 
 @dataclass(frozen=True)
@@ -161,8 +161,19 @@ def whole(what: str, value: object, low: int = 0, high: int = 2**31 - 1) -> int:
 
 def unit(what: str, value: object) -> FloatArray:
     """`value` as a unit vector (3,)."""
-    x = numbers(what, value, 3)
-    size = np.linalg.norm(x)
-    if not size > 0.0:
+    x = normalised(numbers(what, value, 3))
+    if x is None:
         raise InputError(f"{what} is zero; a direction is needed")
-    return x / size
+    return x
+
+
+def normalised(x: FloatArray, least: float = 0.0) -> FloatArray | None:
+    """`x` (n,) at length 1, whatever its scale; None where its length is at most `least`."""
+    scale = float(np.abs(x).max())
+    if not 1e-150 < scale < 1e150:  # its square would leave the range of float64
+        if scale == 0.0 or scale <= least:
+            return None
+        x = x / scale
+        least = 0.0
+    size = float(np.linalg.norm(x))
+    return x / size if size > least else None

@@ -24,6 +24,7 @@ from lavender.scene.parts import (
     Joint,
     Plane,
     Sphere,
+    normalised,
     number,
     numbers,
     unit,
@@ -34,6 +35,7 @@ __all__ = ["ON_FAILURE", "Parameters", "Scene"]
 
 ON_FAILURE = ("use", "keep", "damp", "raise")
 SWEEPS = (4, 64)  # sweep budget of sequential impulses
+MOST = {"restitution": 1.0, "friction": 1e100}  # the product of two coefficients of friction is finite
 MAX_BODIES = 2**24 - 1  # a contact's key has 24 bits for each body
 
 
@@ -95,7 +97,7 @@ class Parameters:
             put(
                 self,
                 name,
-                number(name, getattr(self, name), low=0.0, high=1.0 if name == "restitution" else np.inf),
+                number(name, getattr(self, name), low=0.0, high=MOST.get(name, np.inf)),
             )
         put(self, "margin", number("margin", self.margin, low=0.0))
         put(self, "position_iterations", whole("position_iterations", self.position_iterations, 0, 1000))
@@ -238,8 +240,8 @@ class Scene:
         if mass < 0.0 or (mass == 0.0 and not static):
             raise InputError(f"mass of {label} is {mass:g} kg; a positive mass is needed, or static=True")
         q = numbers(f"quaternion of {label}", quaternion, 4)
-        size = float(np.linalg.norm(q))
-        if not size > 1e-12:
+        unit_q = normalised(q, 1e-12)
+        if unit_q is None:
             raise InputError(f"quaternion of {label} is {q.tolist()}; one that is not zero is needed")
         v = numbers(f"velocity of {label} [m/s]", velocity, 3)
         omega = numbers(f"angular_velocity of {label} [rad/s]", angular_velocity, 3)
@@ -251,10 +253,12 @@ class Scene:
             mass=mass,
             inertia=np.zeros((3, 3)) if static else _inertia(label, inertia, shape, mass),
             position=numbers(f"position of {label} [m]", position, 3),
-            quaternion=q / size,
+            quaternion=unit_q,
             velocity=v,
             angular_velocity=omega,
-            friction=None if friction is None else number(f"friction of {label}", friction, low=0.0),
+            friction=None
+            if friction is None
+            else number(f"friction of {label}", friction, low=0.0, high=MOST["friction"]),
             restitution=None
             if restitution is None
             else number(f"restitution of {label}", restitution, low=0.0, high=1.0),
@@ -431,7 +435,30 @@ class Scene:
 
 def _inertia(label: str, given: Any, shape: Any, mass: float) -> FloatArray:
     if given is None:
-        return (shape if shape is not None else Sphere(0.1)).inertia(mass)
+        with np.errstate(all="ignore"):
+            x = np.asarray((shape if shape is not None else Sphere(0.1)).inertia(mass))
+        what = f"inertia of {label}, of mass {mass:g} kg and {shape or 'radius 0.1 m'},"
+    else:
+        x, what = _tensor(label, given), f"inertia of {label}"
+    if not np.isfinite(x).all() or not _has_reciprocal(mass, x):
+        raise InputError(
+            f"{what} is {np.diag(x).tolist()} kg m^2; it and the mass must have a finite reciprocal: use other "
+            "units of mass or length"
+        )
+    return x
+
+
+def _has_reciprocal(mass: float, inertia: FloatArray) -> bool:
+    # the engine works with 1/m and I^-1
+    with np.errstate(all="ignore"):
+        try:
+            inverse = np.linalg.inv(inertia)
+        except np.linalg.LinAlgError:
+            return False
+        return bool(np.isfinite(np.divide(1.0, mass)) and np.isfinite(inverse + inverse.T).all())
+
+
+def _tensor(label: str, given: Any) -> FloatArray:
     try:
         x = np.array(given, float)
     except (TypeError, ValueError):
@@ -440,9 +467,10 @@ def _inertia(label: str, given: Any, shape: Any, mass: float) -> FloatArray:
         x = np.diag(x)
     if x.shape != (3, 3) or not np.isfinite(x).all():
         raise InputError(f"inertia of {label} is {x.tolist()}; 3 finite moments or a (3, 3) tensor is needed")
-    if np.abs(x - x.T).max() > 1e-12 * np.abs(x).max():
+    scale = np.abs(x).max()
+    if scale > 0.0 and np.abs(x / scale - x.T / scale).max() > 1e-12:
         raise InputError(f"inertia of {label} is not symmetric")
-    x = 0.5 * (x + x.T)
+    x = 0.5 * x + 0.5 * x.T
     value = np.linalg.eigvalsh(x)
     if not value[0] > 1e-14 * value[-1] or not value[0] > 0.0:
         raise InputError(f"inertia of {label} has moments {value.tolist()} kg m^2; all must be positive")

@@ -44,6 +44,7 @@ cdef enum:
     H_REBUILDS = 14
     H_PROJECTED = 15        # position sweeps done in the last substep
     H_LOST = 16             # first body whose state is not finite, or -1
+    H_SOLVED = 17           # 1: the arrays hold the last substep's problem and its impulses
     N_HEAD = 24
 
 # setting[]: real numbers; those from S_OUT on are written by the engine
@@ -61,6 +62,11 @@ cdef enum:
     S_DEPTH = 20            # m, deepest penetration
     S_JOINT_ERROR = 21      # m or rad, largest joint error
     N_SETTINGS = 24
+
+# the pair list: what stops the broad phase, and what it then says is needed, which no capacity meets
+cdef enum:
+    MOST_PAIRS = 16777216
+    TOO_MANY = 2147483647
 
 # status of a substep
 cdef enum:

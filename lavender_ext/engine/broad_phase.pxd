@@ -8,13 +8,15 @@ list.
 Few bodies: every pair is tested. Many: a hash grid with one level for each power of two in size; a body
 lies in the cell of its centre, at the level whose cells are no smaller than its box, and looks into
 the neighbouring cells of coarser levels and, on its own, into those ahead. Cost is linear in bodies and
-pairs for any mix of sizes; counting sorts put the pairs in order.
+pairs for any mix of sizes; counting sorts put the pairs in order. Where more than MOST_PAIRS boxes meet
+the search ends there.
 """
 from libc.math cimport fabs, floor
 from libc.stdint cimport int32_t, uint32_t
 
-from lavender_ext.engine.arrays cimport (BOX, CAP_PAIR, H_PAIRS, H_PAIRS_VALID, H_REBUILDS, N_BODY, N_BUCKET,
-                                         N_EXCLUDED, NO_SHAPE, PLANE, SPHERE, S_MARGIN, S_SKIN, engine_t)
+from lavender_ext.engine.arrays cimport (BOX, CAP_PAIR, H_PAIRS, H_PAIRS_VALID, H_REBUILDS, MOST_PAIRS, N_BODY,
+                                         N_BUCKET, N_EXCLUDED, NO_SHAPE, PLANE, SPHERE, S_MARGIN, S_SKIN,
+                                         TOO_MANY, engine_t)
 
 
 cdef inline void half_box(const engine_t* e, int32_t i, double* half) noexcept nogil:
@@ -176,6 +178,8 @@ cdef inline void grid_pairs(engine_t* e, int32_t* n_pairs) noexcept nogil:
                                              or z != own[2])
                                         and may_meet(e, i, j) and boxes_meet(e, i, j)):
                                     add_pair(e, i, j, n_pairs)
+                                    if n_pairs[0] > MOST_PAIRS:
+                                        return
                                 j = e.chain[j]
             size *= 2.0
     for i in range(n):
@@ -183,6 +187,8 @@ cdef inline void grid_pairs(engine_t* e, int32_t* n_pairs) noexcept nogil:
             for j in range(n):
                 if e.kind_of_shape[j] >= SPHERE and may_meet(e, i, j) and boxes_meet(e, i, j):
                     add_pair(e, i, j, n_pairs)
+                    if n_pairs[0] > MOST_PAIRS:
+                        return
 
 
 cdef inline void sort_pairs(engine_t* e, int32_t n_pairs) noexcept nogil:
@@ -242,6 +248,8 @@ cdef inline int32_t update_pairs(engine_t* e) noexcept nogil:
             e.fat[6 * i + 3 + k] = e.x[3 * i + k] + half[k] + reach
     if e.size[N_BUCKET] > 0:
         grid_pairs(e, &n_pairs)
+        if n_pairs > MOST_PAIRS:
+            return TOO_MANY
         if n_pairs > e.size[CAP_PAIR]:
             return n_pairs
         sort_pairs(e, n_pairs)
@@ -255,5 +263,5 @@ cdef inline int32_t update_pairs(engine_t* e) noexcept nogil:
             return n_pairs
     e.head[H_PAIRS] = drop_excluded(e, n_pairs)
     e.head[H_PAIRS_VALID] = 1
-    e.head[H_REBUILDS] += 1
+    e.head[H_REBUILDS] = 0 if e.head[H_REBUILDS] == 2147483647 else e.head[H_REBUILDS] + 1
     return e.head[H_PAIRS]

@@ -18,8 +18,9 @@ from lavender_ext.core.block cimport CONTACT_SPIN, blocks_t, n_tangents, row_err
 from lavender_ext.core.order cimport (RANDOM, SYMMETRIC, advance_order, block_levels, body_levels,
                                       color_by_bodies, reverse, sort_by_level)
 from lavender_ext.core.rows cimport contact_push, joint_push, relax_contact_block, relax_joint, rows_t
-from lavender_ext.engine.arrays cimport (CAP_CONTACT, CAP_PAIR, H_CONTACTS, H_ITERATIONS, H_LOST, H_MATCHES,
-                                         H_NEED_CONTACTS, H_NEED_PAIRS, H_ORDER, H_SEED, H_STEP, H_WARM_START,
+from lavender_ext.engine.arrays cimport (CAP_CONTACT, CAP_PAIR, H_CACHED, H_CONTACTS, H_CONTACT_ROWS, H_ITERATIONS,
+                                         H_LOST, H_MATCHES, H_NEED_CONTACTS, H_NEED_PAIRS, H_ORDER, H_SEED,
+                                         H_SOLVED, H_STEP, H_WARM_START,
                                          NEED_ROOM, NOT_FINITE, N_BODY, N_DYNAMIC, N_EXCLUDED, N_FRAME,
                                          N_HEAD, N_JOINT, N_JOINT_REAL, N_JOINT_ROW, N_SETTINGS, OK,
                                          ROWS_PER_CONTACT, S_OUT, bind, engine_t)
@@ -27,6 +28,7 @@ from lavender_ext.engine.bodies cimport drift_bodies, start_bodies
 from lavender_ext.engine.broad_phase cimport update_pairs
 from lavender_ext.engine.contacts cimport make_contacts, store_contacts
 from lavender_ext.engine.joints cimport make_joints
+from lavender_ext.engine.kept cimport keep, kept_reals, put_back
 from lavender_ext.engine.projection cimport normal_speed, project_positions
 from lavender_ext.engine.view cimport view
 from lavender_ext.judge.measure cimport rows_slack, score_rows, score_t
@@ -48,6 +50,7 @@ cdef int32_t prepare(engine_t* e) noexcept nogil:
     cdef blocks_t p
     cdef rows_t r
     cdef int32_t pairs, contacts
+    e.head[H_SOLVED] = 0
     start_bodies(e)
     pairs = update_pairs(e)
     e.head[H_NEED_PAIRS] = pairs
@@ -177,8 +180,36 @@ cdef inline void solve(engine_t* e, int32_t sweeps, double* room, double* curve,
         measure(e, out + 5, out + 7)
 
 
+cdef inline int32_t finite(const double* x, int32_t n) noexcept nogil:
+    cdef double total = 0.0
+    cdef int32_t i
+    for i in range(n):
+        total += x[i] - x[i]
+    return total == 0.0
+
+
+cdef inline int32_t moving_body(const engine_t* e, const int32_t* pair) noexcept nogil:
+    return pair[0] if pair[0] >= 0 and e.dyn[pair[0]] >= 0 else pair[1]
+
+
+cdef inline int32_t unsolved_body(const engine_t* e) noexcept nogil:
+    """A moving body of the first block whose impulses are not finite, or the solver's measures; -1 if all are."""
+    cdef int32_t i, kj = e.size[N_JOINT], c = e.head[H_CONTACTS]
+    if (finite(e.impulse, e.size[N_JOINT_ROW] + e.head[H_CONTACT_ROWS]) and finite(e.gap, c)
+            and finite(e.setting + S_OUT, 8)):
+        return -1
+    for i in range(kj):
+        if not finite(e.impulse + e.ptr[i], e.ptr[i + 1] - e.ptr[i]):
+            return moving_body(e, e.joint_bodies + 2 * i)
+    for i in range(kj, kj + c):
+        if not (finite(e.impulse + e.ptr[i], e.ptr[i + 1] - e.ptr[i]) and finite(e.b + e.ptr[i], 1)
+                and finite(e.gap + (i - kj), 1)):
+            return moving_body(e, e.contact_pair + 2 * (i - kj))
+    return moving_body(e, e.contact_pair) if c > 0 else e.body_of[0]
+
+
 cdef int32_t finish(engine_t* e) noexcept nogil:
-    cdef int32_t i, shifted
+    cdef int32_t i, shifted, unsolved
     cdef double* out = e.setting + S_OUT
     out[0] = e.head[H_ITERATIONS]
     out[1] = 1.0 if e.head[H_WARM_START] else 0.0
@@ -186,9 +217,13 @@ cdef int32_t finish(engine_t* e) noexcept nogil:
     out[3] = e.head[H_MATCHES]
     for i in range(e.size[N_JOINT_ROW]):
         e.joint_impulse[i] = e.impulse[i]
+    unsolved = unsolved_body(e)
     store_contacts(e)
     shifted = project_positions(e)
     e.head[H_LOST] = drift_bodies(e, shifted)
+    if e.head[H_LOST] < 0:
+        e.head[H_LOST] = unsolved
+    e.head[H_SOLVED] = 1
     e.head[H_STEP] = 0 if e.head[H_STEP] == 2147483647 else e.head[H_STEP] + 1
     return OK if e.head[H_LOST] < 0 else NOT_FINITE
 
@@ -317,6 +352,9 @@ cdef class Buffers:
     cdef int32_t[::1] index
     cdef uint64_t[::1] keys
     cdef double[::1] room
+    cdef double[::1] kept_real
+    cdef int32_t[::1] kept_index
+    cdef uint64_t[::1] kept_keys
 
     def __init__(self, const int32_t[::1] size, double[::1] real, int32_t[::1] index, uint64_t[::1] keys):
         self.size = size
@@ -325,6 +363,7 @@ cdef class Buffers:
         self.keys = keys
         self.room = np.empty(ROOM_CONTACT * min(<int64_t>size[CAP_CONTACT], MOST)
                              + ROOM_BODY * <int64_t>size[N_DYNAMIC] + ROOM_MORE)
+        self.kept_real, self.kept_index, self.kept_keys = np.empty(1), np.empty(N_HEAD, np.int32), np.empty(1, np.uint64)
 
     def pairs(self):
         """Run the broad phase; returns the number of pairs needed."""
@@ -368,6 +407,24 @@ cdef class Buffers:
             status = lav_engine_substeps_packed(&self.size[0], &self.real[0], &self.index[0], &self.keys[0], n,
                                                 &self.room[0], &done)
         return status, done
+
+    def keep(self):
+        """Copy what the next substep starts from; `put_back` returns to it."""
+        cdef engine_t e
+        cdef int64_t used[3]
+        bind(&self.size[0], &self.real[0], &self.index[0], &self.keys[0], &e, used)
+        cdef int64_t c = e.head[H_CACHED], n = kept_reals(e.size, c)
+        if n > self.kept_real.shape[0] or c > self.kept_keys.shape[0]:
+            self.kept_real = np.empty(n + n // 4)
+            self.kept_keys = np.empty(c + c // 4 + 1, np.uint64)
+        keep(&e, &self.kept_real[0], &self.kept_index[0], &self.kept_keys[0])
+
+    def put_back(self):
+        """The state that `keep` has copied."""
+        cdef engine_t e
+        cdef int64_t used[3]
+        bind(&self.size[0], &self.real[0], &self.index[0], &self.keys[0], &e, used)
+        put_back(&e, &self.kept_real[0], &self.kept_index[0], &self.kept_keys[0])
 
     def arrays(self):
         """Name -> writable view of one of the buffers, with the shape that engine/arrays.pxd gives."""

@@ -19,6 +19,7 @@ from lavender_ext.engine.arrays cimport (CAP_CONTACT, CAP_PAIR, H_ITERATIONS, H_
                                          N_JOINT_REAL, N_JOINT_ROW, N_SETTINGS, N_SIZES, S_BETA, S_BOUNCE,
                                          S_GRAVITY, S_H, S_MARGIN, S_MATCH, S_MAX_PUSH, S_OUT, S_SKIN, S_SLOP,
                                          bind, engine_t)
+from lavender_ext.engine.kept cimport copy_ints, copy_keys, copy_reals
 from lavender_ext.judge.measure cimport score_t
 
 
@@ -250,24 +251,6 @@ cdef public void lav_engine_values(const int32_t* size, double* real, int32_t* i
         out[k] = e.setting[S_OUT + k]
 
 
-cdef inline void copy_reals(const double* source, double* goal, int64_t n) noexcept nogil:
-    cdef int64_t k
-    for k in range(n):
-        goal[k] = source[k]
-
-
-cdef inline void copy_ints(const int32_t* source, int32_t* goal, int64_t n) noexcept nogil:
-    cdef int64_t k
-    for k in range(n):
-        goal[k] = source[k]
-
-
-cdef inline void copy_keys(const uint64_t* source, uint64_t* goal, int64_t n) noexcept nogil:
-    cdef int64_t k
-    for k in range(n):
-        goal[k] = source[k]
-
-
 cdef public void lav_engine_copy(const int32_t* size, const double* real, const int32_t* index, const uint64_t* keys,
                                  double* to_real, int32_t* to_index, uint64_t* to_keys) noexcept nogil:
     """All three buffers: a snapshot is a copy, and restoring one is a copy back."""
@@ -277,6 +260,11 @@ cdef public void lav_engine_copy(const int32_t* size, const double* real, const 
     copy_reals(real, to_real, n[0])
     copy_ints(index, to_index, n[1])
     copy_keys(keys, to_keys, n[2])
+
+
+cdef inline int32_t quarter_more(int32_t need) noexcept nogil:
+    cdef double room = need * 1.25
+    return 2147483647 if room > 2147483000.0 else <int32_t>room + 16
 
 
 cdef public void lav_engine_more_room(const int32_t* size, double* real, int32_t* index, uint64_t* keys,
@@ -289,9 +277,9 @@ cdef public void lav_engine_more_room(const int32_t* size, double* real, int32_t
     for k in range(N_SIZES):
         out[k] = size[k]
     if e.head[H_NEED_PAIRS] > size[CAP_PAIR]:
-        out[CAP_PAIR] = <int32_t>(e.head[H_NEED_PAIRS] * 1.25) + 16
+        out[CAP_PAIR] = quarter_more(e.head[H_NEED_PAIRS])
     if e.head[H_NEED_CONTACTS] > size[CAP_CONTACT]:
-        out[CAP_CONTACT] = <int32_t>(e.head[H_NEED_CONTACTS] * 1.25) + 16
+        out[CAP_CONTACT] = quarter_more(e.head[H_NEED_CONTACTS])
 
 
 cdef public void lav_engine_move(const int32_t* size, double* real, int32_t* index, uint64_t* keys,
