@@ -53,6 +53,7 @@ PARTS = ("joint", "normal", "disk", "spin")
 NEWTON = NEWTON_SPEC.factory
 TOL = 1e-6  # of lavender.solve
 INSIDE = "this simulation is inside a step; a solver or callback may not use it until the step has ended"
+HALF = "a step ended between its substeps"
 LAST_STEP = 2**31 - 1  # head's count of substeps begins again after it
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -129,7 +130,7 @@ class Simulation:
             self._warm_tol = float(tol) if 0.0 < tol < np.inf else 0.0
         self._steps = 0
         self._failed = 0
-        self._half = False  # stopped between two substeps, where nothing leads back
+        self._over = ""  # why no step can follow
         self._last: Solution | _Pending | None = None
 
     # -- running --------------------------------------------------------------------------------
@@ -198,7 +199,7 @@ class Simulation:
         Returns
         -------
         observation, info
-            As `step`.
+            As `step`, without a residual.
         """
         sweeps, warm = self.solver_iterations, self.warm_start
         if seed is not None:
@@ -248,16 +249,13 @@ class Simulation:
         with self._lock:
             if self._inside:
                 raise LavenderError(INSIDE)
-            if self._lost or self._half:
-                raise LavenderError(
-                    f"the state of {self._lost!r} is not finite; reset() or restore a snapshot"
-                    if self._lost
-                    else "a step ended between its substeps; reset() or restore a snapshot"
-                )
+            if self._over:
+                raise LavenderError(f"{self._over}; reset() or restore a snapshot")
             self._inside = True
             try:
                 self._advance()
-                return self._observe(), 0.0, bool(self._lost), False, self._info()
+                lost = self._lost_body()
+                return self._observe(), 0.0, bool(lost), False, self._info(lost)
             finally:
                 self._inside = False
 
@@ -276,24 +274,27 @@ class Simulation:
                 self._solve_substeps()
         except BaseException as error:
             done = (self._state.head.item(HEAD["step"]) - begun) % (LAST_STEP + 1)
-            if done == substeps or self._lost:
+            if done == substeps or self._lost_body():
                 self._steps += 1  # it was whole
                 raise
             if done and keeps:
                 first.kernel.put_back()
                 self._state = first
-            self._half = bool(done) and not keeps
+            if done and not keeps:
+                self._over = HALF
             self._failed = failed
             if not isinstance(error, SolveFailed):
                 self._last = None  # it may lie in arrays that have been written over
             raise
         self._steps += 1
 
-    @property
-    def _lost(self) -> str:
-        # name of the body whose state is not finite, or empty
+    def _lost_body(self) -> str:
+        # name of the body whose state is not finite, or empty; no step follows
         lost = self._state.head.item(HEAD["lost"])
-        return self._names[lost] if lost >= 0 else ""
+        if lost < 0:
+            return ""
+        self._over = f"the state of {self._names[lost]!r} is not finite"
+        return self._names[lost]
 
     def _sweep_substeps(self) -> None:
         left = self._parameters.substeps
@@ -411,11 +412,11 @@ class Simulation:
             out[has, row] = a["impulse"][first[has] + row]
         return out
 
-    def _info(self) -> dict[str, Any]:
+    def _info(self, lost: str = "") -> dict[str, Any]:
         info: dict[str, Any] = {"time": self.time, "step": self._steps, "failed_solves": self._failed}
-        if self._lost:
-            info["lost_body"] = self._lost
-        if self.report_residual and not self._lost:
+        if lost:
+            info["lost_body"] = lost
+        elif self.report_residual and self._state.head.item(HEAD["solved"]):
             info["residual"] = self._judged()
         return info
 
@@ -589,14 +590,14 @@ class Simulation:
         LavenderError
             A step ended between its substeps.
         """
-        if self._half:
-            raise LavenderError("a step ended between its substeps; reset() or restore a snapshot")
+        if self._over == HALF:
+            raise LavenderError(f"{HALF}; reset() or restore a snapshot")
         s = self._state
         return Snapshot(
             fingerprint=self._fingerprint,
             steps=self._steps,
             failed=self._failed,
-            lost=self._lost,
+            lost=self._lost_body(),
             size=read_only(s.size.copy()),
             real=read_only(s.real.copy()),
             index=read_only(s.index.copy()),
@@ -637,7 +638,8 @@ class Simulation:
             state.head[HEAD[name]] = 0  # the list of pairs is made anew
         self._state = state
         self._steps, self._failed = snapshot.steps, snapshot.failed
-        self._last, self._half = None, False
+        self._last, self._over = None, ""
+        self._lost_body()
 
     def save(self, path: str | PathLike[str]) -> None:
         """Write a snapshot to a file; see `Snapshot.save`."""
