@@ -1,0 +1,354 @@
+"""What is promised of one input: each check takes a spec and gives what was broken, as (what, detail).
+
+What lavender refuses, it refuses by an error of its own (`LavenderError`); all other exceptions are findings, and
+so are warnings that reach the caller.
+"""
+
+import base64
+import hashlib
+import math
+import os
+import tempfile
+import traceback
+import warnings
+from pathlib import Path
+
+import files
+import folders
+import judge
+import numpy as np
+import problems
+import scenes
+
+import lavender as lv
+
+REFUSED = (lv.LavenderError,)
+COUNTS = {"solves": 0, "refused": 0, "files": 0, "loaded": 0, "steps": 0, "scenes": 0, "snapshots": 0, "restored": 0,
+          "folders": 0, "judged": 0, "repeated": 0, "lost": 0}  # fmt: skip
+# Below this, numbers on the way are far from the edges of float64, and both judges must say the same.
+MODERATE = 90.0
+
+
+def run(spec):
+    """Findings of one input, by its kind."""
+    with warnings.catch_warnings(record=True) as heard:
+        warnings.simplefilter("always")
+        found = []
+        try:
+            found = list(CHECKS[spec["kind"]](spec))
+        except REFUSED:
+            COUNTS["refused"] += 1
+        except MemoryError as error:
+            found = [("overrun", f"memory: {place(error)}")]
+        except Exception as error:
+            found = [(f"raw {type(error).__name__}", place(error))]
+        for warning in heard[:1]:
+            name = os.path.basename(warning.filename)
+            found.append(("warning", f"{spec.get('solver', '')} {name}:{warning.lineno}: {warning.message}"))
+        return found
+
+
+def place(error):
+    """Message, and where: the last frame inside the packages."""
+    frames = traceback.extract_tb(error.__traceback__)
+    own = [f for f in frames if "/lavender" in f.filename and "/tests/" not in f.filename] or frames
+    where = f"{os.path.basename(own[-1].filename)}:{own[-1].name}"
+    return f"{where}: {type(error).__name__}: {str(error)[:300]}"
+
+
+# -- solves ----------------------------------------------------------------------------------------------------
+
+
+def bits(solution):
+    """Everything that must be the same again."""
+    r = solution.residual
+    numbers = np.array([r.relative, r.energy, r.velocity, r.floor])
+    return (
+        solution.impulse.tobytes(),
+        solution.slack.tobytes(),
+        numbers.tobytes(),
+        solution.status.name,
+        solution.iterations,
+        tuple(sorted(solution.work.items())),
+    )
+
+
+def data_of(problem):
+    """Hash of everything a solver could have changed."""
+    out = hashlib.sha256()
+    c, parts = problem.cones, [problem.b, problem.d, problem.guess]
+    parts += [c.ptr, c.kind, c.lower, c.upper, c.mu, c.patch_radius]
+    a = problem.csr
+    parts += [a.indptr, a.indices, a.data]
+    for x in parts:
+        if x is not None:
+            out.update(np.ascontiguousarray(x).tobytes())
+    return out.digest()
+
+
+def check_solve(spec):
+    problem = problems.build(spec["problem"])
+    options = spec["options"]
+    if spec["solver"] == "lemke" and not any(problem.cones.kind):
+        problem.csr  # noqa: B018 - formed before it is compared
+    before = data_of(problem) if spec["again"] else None
+    if spec.get("prepared"):
+        mine = {k: v for k, v in options.items() if k in ("order", "seed", "threads")}
+        rest = {k: v for k, v in options.items() if k not in mine}
+        prepared = lv.prepare(problem, spec["solver"], **mine)
+        first = prepared.solve(**rest)
+        solution = prepared.solve(problem, **rest)
+        if "time_limit" not in options and bits(first) != bits(solution):
+            yield "changed bits", f"{spec['solver']}: solved twice by one Prepared"
+    else:
+        solution = lv.solve(problem, spec["solver"], **options)
+    COUNTS["solves"] += 1
+    yield from claims(spec, problem, solution)
+    if spec["again"]:
+        COUNTS["repeated"] += 1
+        if data_of(problem) != before:
+            yield "changed data", f"{spec['solver']} changed the problem that it was given"
+        if "time_limit" not in options:
+            fresh = lv.solve(problems.build(spec["problem"]), spec["solver"], **options)
+            if bits(fresh) != bits(solution):
+                yield "changed bits", f"{spec['solver']}: solved twice"
+
+
+def claims(spec, problem, solution):
+    """Status, success and numbers against the judge in long double."""
+    name, status, r = spec["solver"], solution.status.name, solution.residual
+    budget = spec["options"].get("max_iter", lv.get(name).max_iter)
+    if solution.iterations > budget:
+        yield "overrun", f"{name}: {solution.iterations} iterations of {budget}"
+    if (
+        status == "MAX_ITERATIONS"
+        and spec["options"]["tol"] == 0.0
+        and solution.iterations != budget
+        and lv.get(name).resumable
+    ):
+        yield "overrun", f"{name}: {solution.iterations} iterations where {budget} were asked for"
+    finite = bool(np.isfinite(solution.impulse).all())
+    if not finite and status not in ("DIVERGED", "NUMERICAL_ERROR"):
+        yield "false claim", f"{name}: {status} with an impulse that is not finite"
+    for what in ("relative", "energy", "velocity", "floor"):
+        if math.isnan(getattr(r, what)):
+            yield "false claim", f"{name}: {what} is NaN"
+    accepted = True
+    try:
+        solution.raise_for_status()
+    except lv.SolveFailed:
+        accepted = False
+    claimed = solution.success or accepted or status in ("CONVERGED", "FLOOR", "INFEASIBLE")
+    wanted = claimed or spec["again"]
+    if not wanted:
+        return
+    COUNTS["judged"] += 1
+    twin = judge.Problem(spec["problem"])
+    j = twin.judge(solution.impulse)
+    slop = 1.0 + 1e-6
+    if status == "INFEASIBLE" and not solution.contradicted:
+        if solution.success:
+            yield "false claim", f"{name}: INFEASIBLE and success"
+        if solution.certificate is None:
+            yield "false claim", f"{name}: INFEASIBLE without a certificate"
+        else:
+            wrong = twin.refutes(solution.certificate)
+            if wrong:
+                yield "false claim", f"{name}: INFEASIBLE, {wrong}"
+    if j.nothing or twin.d_edge:
+        return
+    within = solution.tol * slop + j.allowed
+    floor = 2.0 * j.floor * slop + j.allowed
+    if (
+        solution.success or (status == "CONVERGED" and not solution.contradicted)
+    ) and not j.relative <= within:
+        yield (
+            "false claim",
+            f"{name}: {status}, success {solution.success}, relative {r.relative:.3e}, in long double {j.relative:.3e}",
+        )
+    if ((status == "FLOOR" and not solution.contradicted) or accepted) and not j.relative <= max(
+        within, floor
+    ):
+        yield (
+            "false claim",
+            f"{name}: {status} accepted, relative {r.relative:.3e} floor {r.floor:.3e}, "
+            f"in long double {j.relative:.3e}",
+        )
+    if (status == "FLOOR" or accepted) and not (math.isfinite(r.relative) and math.isfinite(r.floor)):
+        yield "false claim", f"{name}: {status} accepted with relative {r.relative} and floor {r.floor}"
+    if finite and j.range < MODERATE:
+        if not abs(r.relative - j.relative) <= 1e-6 * j.relative + j.allowed:
+            yield (
+                "wrong number",
+                f"{name}: relative {r.relative:.6e}, in long double {j.relative:.6e}, {j.allowed:.1e} allowed",
+            )
+        if not abs(problem.d - np.array(twin.d, float)).max(initial=0.0) <= 1e-6 * float(
+            np.abs(twin.d).max(initial=0)
+        ):
+            yield "wrong number", f"{name}: d"
+
+
+# -- files -----------------------------------------------------------------------------------------------------
+
+FOLDER = tempfile.TemporaryDirectory(prefix="fuzz-")
+
+
+def check_file(spec):
+    path = Path(FOLDER.name, f"{os.getpid()}{spec['suffix']}")
+    path.write_bytes(base64.b64decode(spec["data"]))
+    COUNTS["files"] += 1
+    stored = lv.io.read(path, max_bytes=spec.get("max_bytes", 10**7))
+    COUNTS["loaded"] += 1
+    problem = stored.problem
+    for x in (problem.b, problem.cones.mu, *stored.guesses):
+        if not np.isfinite(x).all():
+            yield "bad problem", "a number that is not finite"
+    if stored.impulse is not None and len(stored.impulse) != problem.m:
+        yield "bad problem", "an impulse of another length"
+    if problem.m <= 200:
+        for solver in ("auto", "pgs"):
+            if lv.get(solver).refuses(problem) is None:
+                lv.solve(problem, solver, max_iter=20)
+
+
+# -- engine ----------------------------------------------------------------------------------------------------
+
+
+def check_steps(spec):
+    scene = scenes.build(spec)
+    COUNTS["scenes"] += 1
+    found, first = play(scene, spec)
+    yield from found
+    if spec["again"]:
+        COUNTS["repeated"] += 1
+        if play(scenes.build(spec), spec)[1] != first:
+            yield "changed bits", "stepped twice"
+
+
+def play(scene, spec):
+    """Findings, and a hash of all that was seen."""
+    simulation = lv.Simulation(scene)
+    seen, found = hashlib.sha256(), []
+    kept = None
+    for action in spec["actions"]:
+        word = action[0]
+        if word == "step":
+            for _ in range(action[1]):
+                try:
+                    observation, _, terminated, _, info = simulation.step()
+                except REFUSED as error:
+                    seen.update(type(error).__name__.encode())
+                    return found, seen.digest()
+                COUNTS["steps"] += 1
+                look(observation, terminated, info, found)
+                for key in ("positions", "quaternions", "velocities", "joint_impulses", "solver"):
+                    seen.update(observation[key].tobytes())
+                seen.update(observation["contacts"]["impulses"].tobytes())
+                if terminated:
+                    COUNTS["lost"] += 1
+                    return found, seen.digest()
+        else:
+            try:
+                kept = do(simulation, word, action, kept, seen, found)
+            except REFUSED as error:
+                seen.update(type(error).__name__.encode())
+    return found, seen.digest()
+
+
+def do(simulation, word, action, kept, seen, found):
+    """One action beside steps; returns the snapshot that is kept."""
+    if word == "sweeps":
+        simulation.set_solver_iterations(action[1])
+    elif word == "warm":
+        simulation.set_warm_start(bool(action[1]))
+    elif word == "snapshot":
+        return simulation.snapshot()
+    elif word == "restore" and kept is not None:
+        simulation.restore(kept)
+    elif word == "file":
+        path = Path(FOLDER.name, f"{os.getpid()}.state")
+        before = simulation.snapshot()
+        simulation.save(path)
+        simulation.load(path)
+        after = simulation.snapshot()
+        if any(
+            getattr(before, x).tobytes() != getattr(after, x).tobytes()
+            for x in ("size", "real", "index", "keys")
+        ):
+            found.append(("changed bits", "a snapshot that was saved and loaded"))
+    elif word == "problem":
+        problem = simulation.constraint_problem()
+        if problem.m:
+            seen.update(lv.solve(problem, "sequential_impulses", max_iter=4).impulse.tobytes())
+    elif word == "residual":
+        simulation.residual()
+    elif word in ("reset", "reseed"):
+        simulation.reset(*action[1:])
+    return kept
+
+
+def look(observation, terminated, info, found):
+    """Numbers that are not finite are told by `terminated`, in the step in which they appear."""
+    state = [observation[key] for key in ("positions", "quaternions", "velocities")]
+    finite = all(bool(np.isfinite(x).all()) for x in state)
+    if finite == terminated:
+        found.append(
+            ("false claim", f"terminated is {terminated}, the state is {'' if finite else 'not '}finite")
+        )
+    if not terminated:
+        for key in ("solver", "joint_impulses"):
+            if not np.isfinite(observation[key]).all():
+                found.append(("false claim", f"{key} holds a number that is not finite, without terminated"))
+        q = observation["quaternions"]
+        with np.errstate(all="ignore"):
+            lengths = np.einsum("ij,ij->i", q, q)
+        if len(q) and not (np.abs(lengths - 1.0).max() < 1e-9):
+            found.append(("false claim", "a quaternion that is not of unit length, without terminated"))
+    elif "lost_body" not in info:
+        found.append(("false claim", "terminated, and no body is named"))
+
+
+def check_snapshot(spec):
+    COUNTS["snapshots"] += 1
+    simulation = lv.Simulation(lv.Scene(spec["name"], **spec["parameters"]))
+    for _ in range(spec["steps"]):
+        simulation.step()
+    path = Path(FOLDER.name, f"{os.getpid()}.snapshot")
+    simulation.save(path)
+    path.write_bytes(scenes.tampered(path.read_bytes(), spec))
+    simulation.load(path)
+    COUNTS["restored"] += 1
+    for _ in range(4):  # what a forged state says of itself is not promised; that nothing breaks is
+        try:
+            terminated = simulation.step()[2]
+        except REFUSED:
+            return ()
+        COUNTS["steps"] += 1
+        if terminated:
+            return ()
+    simulation.constraint_problem()
+    return ()
+
+
+# -- folders ---------------------------------------------------------------------------------------------------
+
+
+def check_folder(spec):
+    COUNTS["folders"] += 1
+    yield from folders.check(spec)
+
+
+CHECKS = {
+    "solve": check_solve,
+    "file": check_file,
+    "steps": check_steps,
+    "snapshot": check_snapshot,
+    "folder": check_folder,
+}
+MAKE = {
+    "solve": problems.solve_spec,
+    "file": files.file_spec,
+    "steps": scenes.scene_spec,
+    "snapshot": scenes.snapshot_spec,
+    "folder": folders.folder_spec,
+}

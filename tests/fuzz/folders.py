@@ -1,0 +1,242 @@
+"""Folders that a report or a campaign may be pointed at: names, files and records that nobody meant; as plain data."""
+
+import base64
+import contextlib
+import functools
+import io
+import json
+import os
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+import lavender as lv
+import lavender.cli
+
+NAMES = (
+    "a.npz", "[/x].npz", "[bold].npz", "²1.npz", "a$\\frac$b.npz", "a$b.npz", "<img src=x onerror=alert(1)>.npz",
+    "a\nb.npz",
+    "a\tb.npz", "'; DROP.npz", '".npz', "&amp;.npz", "-x.npz", "--out.npz", "..npz", " .npz", "%s.npz", 
+    "{0}.npz", "ä\u0308.npz",
+    "\u202ex.npz", "a|b.npz", "`a`.npz", "*_#.npz", "a\x1b[31m.npz", "x.hdf5", "x.jsonl", "case(n=1).npz", "1.npz", 
+    "01.npz",
+    "step-1.npz", "step-٣.npz", "😀.npz",
+)  # fmt: skip
+RAW_NAMES = (b"\xff\xfe.npz", b"a\x80.npz")
+INSIDE = (
+    "names",
+    "name",
+    "lone surrogate",
+    "huge numbers",
+    "infeasible",
+    "empty",
+    "zero",
+    "garbage",
+    "good",
+    "good",
+)
+WILD = (
+    None,
+    True,
+    False,
+    -1,
+    0,
+    1e400,
+    float("nan"),
+    10**400,
+    "",
+    "<b>",
+    "[/x]",
+    "\ud800",
+    "\x00",
+    [],
+    [[]],
+    {},
+    {"a": 1},
+    "a" * 1000,
+)
+
+
+def folder_spec(draw):
+    """Files by name, or records; and the command."""
+    if draw.chance(0.6):
+        return records_spec(draw)
+    entries = []
+    for _ in range(draw.whole(1, 4)):
+        name = draw.pick(NAMES) if draw.chance(0.9) else None
+        raw = None if name is not None else base64.b64encode(draw.pick(RAW_NAMES)).decode()
+        entries.append({"name": name, "raw": raw, "inside": draw.pick(INSIDE)})
+    if draw.chance(0.1):
+        entries.append({"name": "loop", "raw": None, "inside": "link"})
+    if draw.chance(0.1):
+        entries.append({"name": "pipe.npz", "raw": None, "inside": "pipe"})
+    command = draw.pick(("report", "report", "report", "bench", "check", "files"))
+    return {
+        "kind": "folder",
+        "entries": entries,
+        "command": command,
+        "figures": draw.chance(0.1),
+        "twice": draw.chance(0.3),
+    }
+
+
+def records_spec(draw):
+    """A records.jsonl with some of its lines, fields or bytes changed."""
+    lines = [json.loads(line) for line in good_records()]
+    edits = []
+    for _ in range(draw.pick((1, 1, 2, 4))):
+        at = draw.whole(0, len(lines) - 1)
+        how = draw.pick(("field", "field", "field", "field", "gone", "line", "again", "cut", "bytes"))
+        keys = sorted(lines[at])
+        edit = [how, at, draw.pick(keys), draw.whole(0, len(WILD) - 1)]
+        edits.append(edit)
+    return {"kind": "folder", "records": edits, "show": draw.chance(0.3)}
+
+
+@functools.cache
+def good_records():
+    """Lines of a small run."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, "records.jsonl")
+        quiet(["bench", "two_particles", "slider(mu=1)", "--solvers", "pgs,nncg", "--levels", "1e-3", 
+               "--budgets", "4", "--repeats", "1",
+               "--out", str(path)])  # fmt: skip
+        return tuple(path.read_text(encoding="utf-8").splitlines())
+
+
+def quiet(arguments):
+    """Exit status of a command, and what it wrote."""
+    out = io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(out):
+        try:
+            lavender.cli.main(arguments)
+        except SystemExit as end:
+            return end.code, out.getvalue()
+    return 0, out.getvalue()
+
+
+def problem_of(inside):
+    """A problem with something strange in it."""
+    a = np.array([[2.0, 0.5], [0.5, 1.0]])
+    if inside == "names":
+        return lv.Problem.lcp(
+            a,
+            [1.0, 1.0],
+            names=["[/x]", "<script>alert(1)</script>"],
+            name="[bold]<img src=x onerror=alert(1)>",
+        )
+    if inside == "name":
+        return lv.Problem.lcp(a, [1.0, -1.0], name="a\nb$\\frac$|`")
+    if inside == "lone surrogate":
+        return lv.Problem.lcp(a, [1.0, 1.0], names=["\ud800", "b"], name="\udcff")
+    if inside == "huge numbers":
+        return lv.Problem.lcp(1e300 * a, [1e300, -1e300])
+    if inside == "infeasible":
+        return lv.Problem.lcp(-np.eye(2), [1.0, 1.0])
+    if inside == "empty":
+        return lv.Problem.linear(np.zeros((0, 0)), [])
+    if inside == "zero":
+        return lv.Problem.lcp(np.zeros((2, 2)), [0.0, 0.0])
+    return lv.Problem.contact(np.eye(3), [1.0, 0.2, 0.1], [0.5])
+
+
+def lay_out(spec, folder):
+    """Write the entries of a spec; names that this file system refuses are left out."""
+    for entry in spec["entries"]:
+        name = entry["name"] if entry["name"] is not None else os.fsdecode(base64.b64decode(entry["raw"]))
+        path = Path(folder, name)
+        try:
+            if entry["inside"] == "link":
+                path.symlink_to(folder)
+            elif entry["inside"] == "pipe":
+                os.mkfifo(path)
+            elif entry["inside"] == "garbage":
+                path.write_bytes(b"PK\x03\x04" + name.encode(errors="replace"))
+            else:
+                whole = Path(folder, "whole.tmp.npz")
+                lv.io.save(problem_of(entry["inside"]), whole)
+                os.replace(whole, path)
+        except OSError:
+            continue
+
+
+def check(spec):
+    """What was broken."""
+    with tempfile.TemporaryDirectory() as root:
+        if "records" in spec:
+            yield from check_records(spec, Path(root))
+            return
+        folder, out = Path(root, "problems"), Path(root, "out")
+        folder.mkdir()
+        lay_out(spec, folder)
+        plan = ["--solvers", "pgs,nncg", "--levels", "1e-3", "--budgets", "4", "--repeats", "1"]
+        command = {
+            "report": [
+                "report",
+                str(folder),
+                *plan,
+                "--out",
+                str(out),
+                *([] if spec["figures"] else ["--no-figures"]),
+            ],
+            "bench": ["bench", str(folder), *plan, "--out", str(Path(root, "r.jsonl"))],
+            "check": ["check", str(folder), "--solvers", "pgs,nncg"],
+            "files": [
+                "report",
+                *(str(p) for p in sorted(folder.iterdir())),
+                *plan,
+                "--out",
+                str(out),
+                "--no-figures",
+            ],
+        }[spec["command"]]
+        for _ in range(1 + spec["twice"]):
+            code, text = quiet(command)
+            yield from told(code, text, command[0])
+        for page in out.glob("*.html"):
+            html = page.read_text(encoding="utf-8")
+            for tag in ("<img src=x", "<script>alert"):
+                if tag in html:
+                    yield "not escaped", f"{tag} stands in {page.name}"
+        for page in out.glob("*.md"):
+            if "<img src=x" in page.read_text(encoding="utf-8"):
+                yield "not escaped", f"<img src=x stands in {page.name}"
+
+
+def told(code, text, command):
+    """A status that is documented, no traceback."""
+    if code not in (0, 1, 2, 3):
+        yield "raw exit", f"{command}: status {code}"
+    if "Traceback (most recent call last)" in text:
+        yield "raw traceback", f"{command}: {text[-300:]}"
+    if code == 2 and not text.strip():
+        yield "raw exit", f"{command}: status 2 without a word"
+
+
+def check_records(spec, root):
+    path = root / "records.jsonl"
+    lines = [json.loads(line) for line in good_records()]
+    texts = []
+    for how, at, key, value in spec["records"]:
+        if how == "field":
+            lines[at % len(lines)][key] = WILD[value]
+        elif how == "gone":
+            lines[at % len(lines)].pop(key, None)
+        elif how == "again":
+            lines.append(dict(lines[at % len(lines)]))
+        elif how == "line":
+            lines[at % len(lines)] = {"": WILD[value]}
+    texts = [json.dumps(line, ensure_ascii=value != 1).encode(errors="surrogatepass") for line in lines]
+    for how, at, _, value in spec["records"]:
+        if how == "cut":
+            texts[at % len(texts)] = texts[at % len(texts)][: 3 * value]
+        elif how == "bytes":
+            texts[at % len(texts)] = bytes([255, 0, value]) + texts[at % len(texts)]
+    path.write_bytes(b"\n".join(texts) + b"\n")
+    records = lv.bench.read(path)
+    records.latest()
+    records.rows()
+    if spec["show"]:
+        code, text = quiet(["report", str(path), "--no-figures", "--out", str(root / "out")])
+        yield from told(code, text, "report records.jsonl")

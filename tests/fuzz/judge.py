@@ -1,0 +1,307 @@
+"""The judge once more, in long double and from the data alone: it imports nothing of lavender.
+
+With w = A lambda - b and d as docs/concepts.md defines them, E = sqrt(sum d e^2), V = max sqrt(nu d) |e|, and
+
+    relative = max(E / E0, V / V0),   floor = 2^-53 (|A| |lambda| + |b|) in the same two norms.
+
+Long double has 11 more bits and 2^14 instead of 2^10 as its largest exponent, so nothing here overflows, and what
+it rounds is far below what float64 may round. `Judgement.allowed` is what float64 may add: each of the m + 20
+operations of a row rounds by 2^-53, or by the smallest denormal.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+L = np.longdouble
+ROW, CONTACT, CONTACT_SPIN = 0, 1, 2
+DENORMAL = L(2.0) ** -1074
+ZERO = L(0.0)
+
+
+@dataclass
+class Judgement:
+    relative: float
+    floor: float
+    allowed: float  # relative residual that float64 may add
+    energy: float
+    velocity: float
+    nothing: bool  # doing nothing is near the line below which the norms of b stand in
+    range: float  # largest |log10| of the numbers on the way
+
+
+class Problem:
+    """A, |A| (as sums of absolute products), d and nu of a problem given as plain arrays."""
+
+    def __init__(self, spec):
+        self.b = np.array(spec["b"], L)
+        self.cones = {key: np.array(value) for key, value in spec["cones"].items()}
+        self.law = spec["friction"]
+        self.m = len(self.b)
+        if "rows" in spec:
+            self._of_rows(spec)
+        else:
+            self.A = np.array(spec["A"], L).reshape(self.m, self.m)
+            self.size = np.abs(self.A)
+            self._of_matrix()
+        self._pairs()
+
+    # -- the operator ------------------------------------------------------------------------------
+
+    def _of_matrix(self):
+        diag, big = np.diag(self.A).copy(), self.size.max(axis=1, initial=ZERO)
+        d = np.where(diag > L(1e-10) * big, diag, big)
+        self.d = self._filled(d)
+        self.nu = self.d.copy()
+        self.d_edge = bool(np.any(np.abs(diag - L(1e-10) * big) <= L(1e-14) * big))
+
+    def _filled(self, d):
+        positive = d[d > 0]
+        return np.where(d > 0, d, positive.mean() if len(positive) else L(1.0))
+
+    def _of_rows(self, spec):
+        r = {key: np.array(value) for key, value in spec["rows"].items()}
+        n, m = len(r["inv_mass"]), self.m
+        ptr, kind = self.cones["ptr"], self.cones["kind"]
+        joints = len(r["joint_ptr"]) - 1
+        jac, size = np.zeros((m, n, 6), L), np.zeros((m, n, 6), L)
+        angular = np.zeros(m, bool)
+        for j in range(joints):
+            for row in range(r["joint_ptr"][j], r["joint_ptr"][j + 1]):
+                line = np.array(r["jac"][row], L)
+                angular[row] = not line[[0, 1, 2, 6, 7, 8]].any()
+                for side, body in enumerate(r["joint_body"][j]):
+                    if body >= 0:
+                        jac[row, body] = line[6 * side : 6 * side + 6]
+                        size[row, body] = np.abs(jac[row, body])
+        for c in range(len(kind) - joints):
+            k = joints + c
+            normal, tangent = np.array(r["normal"][c], L), np.array(r["tangent"][c], L)
+            axes = [normal, tangent, np.cross(normal, tangent)]
+            spin = kind[k] == CONTACT_SPIN
+            rows = range(ptr[k], ptr[k + 1])
+            for q, row in enumerate(rows):
+                for sign, arm, body in (
+                    (-1, r["arm_a"][c], r["contact_body"][c][0]),
+                    (1, r["arm_b"][c], r["contact_body"][c][1]),
+                ):
+                    if body < 0:
+                        continue
+                    if spin and q == len(rows) - 1:
+                        jac[row, body, 3:] = sign * normal
+                        size[row, body, 3:] = np.abs(normal)
+                    else:
+                        arm = np.array(arm, L)
+                        jac[row, body, :3], jac[row, body, 3:] = sign * axes[q], sign * np.cross(arm, axes[q])
+                        # a cross product may cancel, and its float64 keeps only the digits of its terms
+                        reach = np.sqrt(arm @ arm)
+                        size[row, body, :3] = 1.0
+                        size[row, body, 3:] = reach
+        minv, minv_size = np.zeros((n, 6, 6), L), np.zeros((n, 6, 6), L)
+        for i in range(n):
+            minv[i, [0, 1, 2], [0, 1, 2]] = r["inv_mass"][i]
+            minv[i, 3:, 3:] = np.array(r["inv_inertia"][i], L)
+        minv_size = np.abs(minv)
+        soft = np.array(spec.get("compliance", np.zeros(m)), L)
+        half = np.einsum("mni,nij->mnj", jac, minv)
+        half_size = np.einsum("mni,nij->mnj", size, minv_size)
+        self.A = half.reshape(m, 6 * n) @ jac.reshape(m, 6 * n).T + np.diag(soft)
+        self.size = half_size.reshape(m, 6 * n) @ size.reshape(m, 6 * n).T + np.diag(soft)
+        d = np.diag(self.A).copy()
+        self.d = self._filled(d)
+        self.d_edge = bool(np.any((d > 0) & (d < L(1e-12) * np.diag(self.size))))
+        self.nu = self.d.copy()
+        for j in range(joints):
+            for row in range(r["joint_ptr"][j], r["joint_ptr"][j + 1]):
+                inverse = sum(L(r["inv_mass"][body]) for body in r["joint_body"][j] if body >= 0)
+                if angular[row] and inverse > 0:
+                    self.nu[row] = inverse
+        self.rows = True
+
+    def _pairs(self):
+        ptr, kind = self.cones["ptr"], self.cones["kind"]
+        for k in range(len(kind)):
+            j, nt = ptr[k], self.tangents(k)
+            if nt == 2:
+                same = self.nu[j + 1] == self.d[j + 1]
+                self.d[j + 1 : j + 3] = L(0.5) * (self.d[j + 1] + self.d[j + 2])
+                if same:
+                    self.nu[j + 1 : j + 3] = self.d[j + 1]
+            if kind[k] == CONTACT_SPIN:
+                self.nu[ptr[k + 1] - 1] = self.d[j]
+
+    def tangents(self, k):
+        kind, ptr = self.cones["kind"], self.cones["ptr"]
+        return 0 if kind[k] == ROW else int(ptr[k + 1] - ptr[k] - kind[k])
+
+    # -- the error of an impulse -------------------------------------------------------------------
+
+    def slack(self, lam):
+        return self.A @ lam - self.b
+
+    def error(self, lam, w):
+        """e (m,), by the law."""
+        e = np.zeros(self.m, L)
+        c, d = self.cones, self.d
+        for k in range(len(c["kind"])):
+            j, end = c["ptr"][k], c["ptr"][k + 1]
+            part = slice(j, end)
+            if c["kind"][k] == ROW:
+                low, high = np.array(c["lower"][part], L), np.array(c["upper"][part], L)
+                free = np.isinf(low) & np.isinf(high)
+                step = w[part] / d[part]
+                e[part] = np.where(free, step, lam[part] - np.clip(lam[part] - step, low, high))
+            elif self.law == "cone" and end - j > 1:
+                e[part] = lam[part] - self._cone(k, lam[part] - w[part] / d[part])
+            else:
+                e[part] = lam[part] - self._coulomb(k, lam[part], lam[part] - w[part] / d[part])
+        return e
+
+    def _coulomb(self, k, lam, y):
+        c, nt = self.cones, self.tangents(k)
+        out = np.zeros_like(y)
+        out[0] = max(ZERO, y[0])
+        rim = L(c["mu"][k]) * max(ZERO, lam[0])
+        if nt:
+            size = np.sqrt(y[1 : 1 + nt] @ y[1 : 1 + nt])
+            out[1 : 1 + nt] = y[1 : 1 + nt] * (min(L(1.0), rim / size) if size > 0 else L(1.0))
+        if c["kind"][k] == CONTACT_SPIN:
+            edge = rim * L(c["patch_radius"][k])
+            out[-1] = min(max(y[-1], -edge), edge)
+        return out
+
+    def _cone(self, k, point):
+        """Projection in the metric of d, by the formula of the five candidates."""
+        c, nt, j = self.cones, self.tangents(k), self.cones["ptr"][k]
+        root = np.sqrt(self.d[j : c["ptr"][k + 1]])
+        y = root * point
+        spin = c["kind"][k] == CONTACT_SPIN
+        mu, radius = L(c["mu"][k]), L(c["patch_radius"][k])
+        t = np.sqrt(y[1 : 1 + nt] @ y[1 : 1 + nt]) if nt else ZERO
+        s = abs(y[-1]) if spin else ZERO
+        at = mu * root[1] / root[0] if nt else ZERO
+        a_s = mu * radius * root[-1] / root[0] if spin else ZERO
+        top = max(
+            ZERO,
+            y[0],
+            (y[0] + at * t) / (1 + at * at),
+            (y[0] + a_s * s) / (1 + a_s * a_s),
+            (y[0] + at * t + a_s * s) / (1 + at * at + a_s * a_s),
+        )
+        out = np.zeros_like(y)
+        out[0] = top
+        if nt:
+            out[1 : 1 + nt] = y[1 : 1 + nt] * (min(L(1.0), at * top / t) if t > 0 else L(1.0))
+        if spin:
+            out[-1] = min(max(y[-1], -a_s * top), a_s * top)
+        return out / root
+
+    def norms(self, e):
+        """E and V."""
+        c, weight = self.cones, np.sqrt(self.nu * self.d)
+        size = np.abs(e)
+        for k in range(len(c["kind"])):
+            nt, j = self.tangents(k), c["ptr"][k]
+            if nt == 2:
+                size[j + 1 : j + 3] = np.sqrt(e[j + 1] ** 2 + e[j + 2] ** 2)
+        return np.sqrt((self.d * e * e).sum()), (weight * size).max(initial=ZERO)
+
+    def judge(self, impulse):
+        """Judgement of an impulse (m,) float64."""
+        lam = np.array(impulse, L)
+        if not np.isfinite(lam).all():
+            return Judgement(np.inf, 0.0, 0.0, np.inf, np.inf, False, np.inf)
+        with np.errstate(all="ignore"):
+            return self._judge(lam)
+
+    def _judge(self, lam):
+        w = self.slack(lam)
+        size = self.size @ np.abs(lam) + np.abs(self.b)
+        energy, velocity = self.norms(self.error(lam, w))
+        start = np.where(self._bounded(), np.clip(ZERO, self._low(), self._high()), ZERO).astype(L)
+        energy0, velocity0 = self.norms(self.error(start, self.slack(start)))
+        rhs_energy, rhs_velocity = self.norms(self.b / self.d)
+        line = L(2.0) ** -48 * rhs_energy
+        below = energy0 <= line
+        nothing = bool(line / 16 <= energy0 <= line * 16)
+        if below:
+            energy0, velocity0 = rhs_energy, rhs_velocity
+        f = L(2.0) ** -53 * size
+        more = (self.m + 20) * (f + DENORMAL * (1 + np.abs(lam).max(initial=ZERO)))
+        floor = self._ratio(*self._floor(f), energy0, velocity0)
+        allowed = self._ratio(*self._floor(more), energy0, velocity0)
+        seen = np.abs(np.concatenate([lam, w, self.d, self.b, [energy, velocity, energy0, velocity0]]))
+        seen = seen[(seen > 0) & np.isfinite(seen)]
+        span = float(np.abs(np.log10(seen)).max(initial=0.0))
+        return Judgement(
+            float(self._ratio(energy, velocity, energy0, velocity0)),
+            float(floor),
+            float(allowed),
+            float(energy),
+            float(velocity),
+            nothing,
+            span,
+        )
+
+    def _floor(self, f):
+        return np.sqrt((f * f / self.d).sum()), (f * np.sqrt(self.nu / self.d)).max(initial=ZERO)
+
+    def _ratio(self, x, y, x0, y0):
+        return max(ZERO if a == 0 else (a / a0 if a0 > 0 else L(np.inf)) for a, a0 in ((x, x0), (y, y0)))
+
+    def _bounded(self):
+        c = self.cones
+        return np.repeat(c["kind"] == ROW, np.diff(c["ptr"]))
+
+    def _low(self):
+        return np.array(self.cones["lower"], L)
+
+    def _high(self):
+        return np.array(self.cones["upper"], L)
+
+    # -- no solution -------------------------------------------------------------------------------
+
+    def refutes(self, y):
+        """Why y (m,) does not prove that there is no solution, or None where it does.
+
+        Wanted: y in the recession cone of the bounds, and b.y > max (A^T y).lambda over the bounds.
+        """
+        y = np.array(y, L)
+        if y.shape != (self.m,) or not np.isfinite(y).all():
+            return "not finite numbers"
+        c = self.cones
+        gain, most = self.b @ y, np.abs(self.b) @ np.abs(y)
+        if not gain > 0:
+            return "b.y is not positive"
+        z, scale = self.A.T @ y, self.size.T @ np.abs(y)
+        z = np.where(np.abs(z) <= L(1e-9) * (gain / most) * scale, ZERO, z)
+        pull = ZERO
+        for k in range(len(c["kind"])):
+            part = slice(c["ptr"][k], c["ptr"][k + 1])
+            nt = self.tangents(k)
+            if c["kind"][k] == ROW:
+                low, high = np.array(c["lower"][part], L), np.array(c["upper"][part], L)
+                if np.any((y[part] > 0) & np.isfinite(high)) or np.any((y[part] < 0) & np.isfinite(low)):
+                    return "y leaves the bounds"
+                pull += sum(
+                    x * (h if x > 0 else lo) for x, lo, h in zip(z[part], low, high, strict=True) if x != 0
+                )
+                continue
+            mu = L(c["mu"][k])
+            spin = L(c["patch_radius"][k]) if c["kind"][k] == CONTACT_SPIN else ZERO
+            yk, zk = y[part], z[part]
+            limit = mu * yk[0] * (1 + L(1e-11))
+            if (
+                yk[0] < 0
+                or np.sqrt(yk[1 : 1 + nt] @ yk[1 : 1 + nt]) > limit
+                or (spin and abs(yk[-1]) > limit * spin)
+            ):
+                return "y leaves a cone"
+            if self.law == "coulomb" and yk[1:].any():
+                return "y is not along a normal"
+            rim = np.sqrt(zk[1 : 1 + nt] @ zk[1 : 1 + nt]) + (
+                spin * abs(zk[-1]) if c["kind"][k] == CONTACT_SPIN else ZERO
+            )
+            if zk[0] + mu * rim > L(1e-9) * (gain / most) * scale[c["ptr"][k]]:
+                return "impulses of a contact can meet b.y"
+        return None if gain > pull else "impulses within the bounds can meet b.y"

@@ -1,0 +1,148 @@
+"""The fuzzer sees what it is there to see: its judge, its watchdog, its findings; and what it found stays mended."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from random_problems import random_contact_problem, random_lcp
+
+import lavender as lv
+
+FUZZ = Path(__file__).resolve().parent / "fuzz"
+sys.path.insert(0, str(FUZZ))
+
+import checks
+import fuzz
+import judge
+import problems
+
+
+def spec_of(problem):
+    """A problem as plain data."""
+    c = problem.cones
+    spec = {"operator": problem.operator, "friction": problem.friction, "b": problem.b.tolist()}
+    spec["cones"] = {
+        key: getattr(c, key).tolist() for key in ("ptr", "kind", "lower", "upper", "mu", "patch_radius")
+    }
+    if problem.rows is None:
+        return spec | {"operator": "dense", "A": problem.csr.toarray().tolist()}
+    keys = (*problems.SHAPES, "inv_mass", "joint_ptr")
+    spec["rows"] = {key: getattr(problem.rows, key).tolist() for key in keys}
+    return spec | {"compliance": problem.compliance.tolist()}
+
+
+# -- the judge in long double ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_both_judges_say_the_same(seed):
+    law = ("coulomb", "cone")[seed % 2]
+    for problem in (random_contact_problem(seed, friction=law), random_lcp(seed), random_lcp(seed, rank=4)):
+        spec = json.loads(json.dumps(spec_of(problem)))
+        assert problems.build(spec) == problem or problem.name
+        twin = judge.Problem(spec)
+        np.testing.assert_allclose(np.array(twin.d, float), problem.d, rtol=1e-12)
+        np.testing.assert_allclose(np.array(twin.nu, float), problem.data.nu, rtol=1e-12)
+        rng = np.random.default_rng(seed)
+        for impulse in (rng.normal(size=problem.m), lv.solve(problem, "auto", tol=1e-9).impulse):
+            r, j = lv.residual(problem, impulse), twin.judge(impulse)
+            assert abs(r.relative - j.relative) <= 1e-10 * j.relative + j.allowed
+            # The floor takes absolute products of three factors; sizes of arms stand for those of their products here.
+            assert 0.1 * r.floor <= j.floor <= 10.0 * r.floor
+
+
+def test_the_judge_sees_a_false_claim():
+    problem = random_lcp(3)
+    spec = {
+        "kind": "solve",
+        "problem": spec_of(problem),
+        "solver": "direct",
+        "options": {"tol": 1e-9},
+        "again": False,
+    }
+    good = lv.solve(problem, "direct", tol=1e-9)
+    assert list(checks.claims(spec, problem, good)) == []
+
+    def changed(**fields):
+        made = object.__new__(lv.Solution)
+        object.__setattr__(made, "__dict__", {**good.__dict__, **fields})
+        return made
+
+    off = good.impulse * (1.0 + 1e-6)
+    assert any(what == "false claim" for what, _ in checks.claims(spec, problem, changed(impulse=off)))
+    lost = changed(impulse=np.full(problem.m, np.nan))
+    assert any(what == "false claim" for what, _ in checks.claims(spec, problem, lost))
+    proof = changed(status=lv.Status.INFEASIBLE, certificate=np.ones(problem.m))
+    details = [detail for what, detail in checks.claims(spec, problem, proof) if what == "false claim"]
+    assert any("INFEASIBLE and success" in d for d in details)
+    assert any("INFEASIBLE, " in d for d in details)
+    assert any(what == "overrun" for what, _ in checks.claims(spec, problem, changed(iterations=10**9)))
+
+
+def test_a_certificate_that_proves_is_taken():
+    problem = lv.Problem.lcp(-np.eye(2), [1.0, 1.0])
+    twin = judge.Problem(spec_of(problem))
+    assert twin.refutes(np.array([1.0, 0.0])) is None
+    assert twin.refutes(np.array([-1.0, 0.0])) is not None
+    assert judge.Problem(spec_of(lv.Problem.lcp(np.eye(2), [1.0, 1.0]))).refutes(np.ones(2)) is not None
+
+
+# -- the harness -------------------------------------------------------------------------------------------------
+
+
+BROKEN = """
+import os, sys, time
+sys.path.insert(0, {fuzz!r})
+import checks, fuzz
+def broken(spec):
+    how = {how!r}
+    if spec["options"]["tol"] == 2.0:
+        if how == "crash":
+            os.abort()
+        if how == "hang":
+            while True:
+                pass
+        if how == "raw":
+            raise ZeroDivisionError("in a kernel")
+    return ()
+checks.CHECKS["solve"] = broken
+sys.argv[0] = "fuzz.py"
+sys.exit(fuzz.main())
+"""
+
+
+@pytest.mark.parametrize("how", ["crash", "hang", "raw"])
+def test_crashes_hangs_and_raw_exceptions_are_found_and_kept(tmp_path, monkeypatch, how):
+    script = tmp_path / "broken.py"
+    script.write_text(BROKEN.format(fuzz=str(FUZZ), how=how))
+    monkeypatch.setenv("LAVENDER_FUZZ_FOUND", str(tmp_path / "found"))
+    monkeypatch.setenv("LAVENDER_FUZZ_SCRIPT", str(script))
+    done = subprocess.run(
+        [sys.executable, str(script), "1", "--seed", "1", "--kinds", "solve",
+         "--most", "12", "--limit", "0.5", "--keep"],
+        capture_output=True, text=True, timeout=200, check=False,
+    )  # fmt: skip
+    assert done.returncode == 1, done.stdout + done.stderr
+    assert "inputs: 12 solve" in done.stdout
+    (file,) = {path.name.split("-")[1] for path in (tmp_path / "found").iterdir()}
+    assert file == how
+    for path in (tmp_path / "found").iterdir():
+        assert json.loads(path.read_text())["spec"]["options"]["tol"] == 2.0
+
+
+def test_the_same_seed_gives_the_same_inputs():
+    for kind in fuzz.KINDS:
+        one, two = (json.dumps(fuzz.make(kind, 5, 7)) for _ in range(2))
+        assert one == two
+        assert json.dumps(fuzz.make(kind, 5, 8)) != one
+
+
+# -- what was found ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("path", sorted((FUZZ / "found").glob("*.json")), ids=lambda path: path.stem)
+def test_what_was_found_stays_mended(path):
+    assert checks.run(json.loads(path.read_text(encoding="utf-8"))["spec"]) == []
