@@ -324,3 +324,36 @@ def test_anchors_lie_where_they_were_given():
     sim = lv.Simulation(scene)
     sim._prepare()
     np.testing.assert_allclose(sim._state.a["joint_error"], 0.0, atol=1e-15)
+
+
+def test_a_builder_registers_itself_and_is_a_scene_like_those_of_the_gallery(monkeypatch):
+    from lavender.scene import scene as table
+
+    monkeypatch.setattr(table, "SCENES", dict(table.SCENES))
+    monkeypatch.setattr(table, "DEFAULTS", dict(table.DEFAULTS))
+
+    @table.named_scene(friction=0.2, dt=0.01)
+    def slab(scene, size=2.0):
+        scene.add_plane()
+        scene.add_box((size, size, 0.1), position=(0, 0, 0.05))
+
+    scene = lv.Scene("slab", size=3.0, dt=0.02)
+    assert (scene.parameters.friction, scene.parameters.dt) == (0.2, 0.02)
+    assert scene.bodies[1].shape.size == (3.0, 3.0, 0.1)
+    lv.Simulation(scene).reset(seed=4)
+    with pytest.raises(lv.UnknownName, match="size"):
+        lv.Scene("slab", sise=3.0)
+    with pytest.raises(lv.InputError, match="registered already"):
+        table.named_scene()(slab)
+    with pytest.raises(lv.UnknownName, match="frction"):
+        table.named_scene(frction=0.2)
+
+    def clash(scene, friction=1.0):
+        pass
+
+    def bare(scene, n):
+        pass
+
+    for build in (clash, bare):
+        with pytest.raises(lv.InputError, match="parameter"):
+            table.named_scene()(build)

@@ -2,6 +2,17 @@
 
 from lavender.scene.gallery import SCENES
 from lavender.scene.parts import Body, Box, Joint, Plane, Sphere
-from lavender.scene.scene import ON_FAILURE, Parameters, Scene
+from lavender.scene.scene import ON_FAILURE, Parameters, Scene, named_scene
 
-__all__ = ["ON_FAILURE", "SCENES", "Body", "Box", "Joint", "Parameters", "Plane", "Scene", "Sphere"]
+__all__ = [
+    "ON_FAILURE",
+    "SCENES",
+    "Body",
+    "Box",
+    "Joint",
+    "Parameters",
+    "Plane",
+    "Scene",
+    "Sphere",
+    "named_scene",
+]

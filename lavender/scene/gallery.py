@@ -1,41 +1,24 @@
 """The gallery: named scenes, each with its parameters, its sizes and why it exists.
 
 Lengths in m, masses in kg, angles in rad. Bodies are numbered from the ground up, so that the order of the
-contacts is bottom-up.
+contacts is bottom-up. Each builder registers itself; importing this module fills the table.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from lavender.errors import InputError, UnknownName
 from lavender.scene.parts import number, quaternion, rotation, whole
-
-if TYPE_CHECKING:
-    from lavender.scene.scene import Scene
+from lavender.scene.scene import SCENES, Scene, named_scene
 
 __all__ = ["SCENES"]
 
-Builder = Callable[..., None]
-SCENES: dict[str, Builder] = {}
 
-
-def _named(**defaults: Any) -> Callable[[Builder], Builder]:
-    """Enter a builder in SCENES; `defaults` are its values of the parameters that every scene has."""
-
-    def enter(build: Builder) -> Builder:
-        build.defaults = defaults  # type: ignore[attr-defined]
-        SCENES[build.__name__] = build
-        return build
-
-    return enter
-
-
-@_named()
+@named_scene()
 def stack(scene: Scene, n: int = 6, size: float = 1.0, mass: float = 1.0) -> None:
     """`n` equal boxes on each other: 4 n contacts, the slowest mode of Gauss-Seidel in closed form.
 
@@ -48,7 +31,7 @@ def stack(scene: Scene, n: int = 6, size: float = 1.0, mass: float = 1.0) -> Non
         scene.add_box((size, size, size), mass, position=(0.0, 0.0, (i + 0.5) * size))
 
 
-@_named()
+@named_scene()
 def pyramid(scene: Scene, base: int = 10, size: float = 1.0, mass: float = 1.0, gap: float = 0.05) -> None:
     """Rows of boxes, each one shorter: coupling in two directions, more rows than the bodies can tell apart.
 
@@ -64,7 +47,7 @@ def pyramid(scene: Scene, base: int = 10, size: float = 1.0, mass: float = 1.0, 
             scene.add_box((size, size, size), mass, position=(x, 0.0, (row + 0.5) * size))
 
 
-@_named(friction=0.6)
+@named_scene(friction=0.6)
 def card_house(scene: Scene, levels: int = 2, lean: float = 0.3) -> None:
     """Cards leaning against each other: stands by friction alone, thin boxes, edge on edge.
 
@@ -99,7 +82,7 @@ def card_house(scene: Scene, levels: int = 2, lean: float = 0.3) -> None:
         z += height + thick
 
 
-@_named()
+@named_scene()
 def pile(scene: Scene, n: int = 100, kind: str = "spheres", size: float = 0.5, walls: bool = True) -> None:
     """`n` bodies dropped into a bin: many contacts, irregular, moving; kind "spheres", "boxes" or "mixed".
 
@@ -129,7 +112,7 @@ def pile(scene: Scene, n: int = 100, kind: str = "spheres", size: float = 0.5, w
             scene.add_box(edges, position=place, quaternion=turn)
 
 
-@_named()
+@named_scene()
 def chain(scene: Scene, n: int = 20, tip_mass: float = 1.0, length: float = 0.25, angle: float = 1.2) -> None:
     """`n` links on ball joints with a tip of another mass: joints alone, information travels one link a sweep.
 
@@ -153,7 +136,7 @@ def chain(scene: Scene, n: int = 20, tip_mass: float = 1.0, length: float = 0.25
         before = link
 
 
-@_named()
+@named_scene()
 def bridge(scene: Scene, n: int = 16, load: float = 10.0) -> None:
     """`n` planks on hinges between two banks, with a box of mass `load` on them: joints and contacts together.
 
@@ -173,7 +156,7 @@ def bridge(scene: Scene, n: int = 16, load: float = 10.0) -> None:
         scene.add_box((0.6, 0.6, 0.6), load, position=(0.0, 0.0, 3.36), name="load")
 
 
-@_named()
+@named_scene()
 def heavy_on_light(scene: Scene, ratio: float = 100.0, n: int = 2) -> None:
     """Boxes of mass 1, the top one `ratio` times as heavy: a sweep leaves R/(1 + R) of the error.
 
@@ -186,7 +169,7 @@ def heavy_on_light(scene: Scene, ratio: float = 100.0, n: int = 2) -> None:
         scene.add_box(mass=ratio if i == n - 1 else 1.0, position=(0.0, 0.0, i + 0.5))
 
 
-@_named()
+@named_scene()
 def table(scene: Scene, legs: int = 9, top_mass: float = 10.0) -> None:
     """A top on more legs than it needs: how the load is shared is not unique, the motion is.
 
@@ -203,7 +186,7 @@ def table(scene: Scene, legs: int = 9, top_mass: float = 10.0) -> None:
     scene.add_box((edge, edge, 0.2), top_mass, position=(0.0, 0.0, 1.1), name="top")
 
 
-@_named()
+@named_scene()
 def ramp(scene: Scene, angle: float = 0.35, size: float = 1.0) -> None:
     """A box on a slope of `angle`: sticks where tan(angle) < friction, slides with g (sin - mu cos) above.
 
@@ -216,7 +199,7 @@ def ramp(scene: Scene, angle: float = 0.35, size: float = 1.0) -> None:
     scene.add_box((size, size, size), position=0.5 * size * normal, quaternion=turn)
 
 
-@_named(patch_radius=0.1)
+@named_scene(patch_radius=0.1)
 def spinner(scene: Scene, spin: float = 20.0, radius: float = 0.5) -> None:
     """A ball spinning on the spot: patch friction slows it with mu r N.
 
@@ -226,7 +209,7 @@ def spinner(scene: Scene, spin: float = 20.0, radius: float = 0.5) -> None:
     scene.add_sphere(radius, position=(0.0, 0.0, radius), angular_velocity=(0.0, 0.0, number("spin", spin)))
 
 
-@_named(restitution=1.0, friction=0.0, restitution_threshold=0.01, dt=1.0 / 240.0, substeps=4)
+@named_scene(restitution=1.0, friction=0.0, restitution_threshold=0.01, dt=1.0 / 240.0, substeps=4)
 def newtons_cradle(scene: Scene, n: int = 5, lifted: int = 1, angle: float = 0.6, gap: float = 0.01) -> None:
     """Balls on strings, `lifted` of them let go: impacts one after the other, no energy to be gained.
 
@@ -246,7 +229,7 @@ def newtons_cradle(scene: Scene, n: int = 5, lifted: int = 1, angle: float = 0.6
             scene.add_joint("distance", -1, ball, anchor_a=pivot + np.array([0.0, side * apart, 0.0]))
 
 
-@_named()
+@named_scene()
 def four_bar(scene: Scene, motor: float | None = None, torque: float = 200.0, tilt: float = 0.4) -> None:
     """A closed loop of three bars and the ground on four hinges, oblique, bars side by side: redundant rows.
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import inspect
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any
 
@@ -31,7 +31,7 @@ from lavender.scene.parts import (
     whole,
 )
 
-__all__ = ["ON_FAILURE", "Parameters", "Scene"]
+__all__ = ["ON_FAILURE", "SCENES", "Parameters", "Scene", "named_scene"]
 
 ON_FAILURE = ("use", "keep", "damp", "raise")
 SWEEPS = (4, 64)  # sweep budget of sequential impulses
@@ -108,6 +108,62 @@ class Parameters:
 
 COMMON = tuple(f.name for f in fields(Parameters))
 
+Builder = Callable[..., None]
+SCENES: dict[str, Builder] = {}  # named scenes; the builders of the gallery stand here once it is imported
+DEFAULTS: dict[str, dict[str, Any]] = {}  # of a named scene, where they are not those of Parameters
+
+
+def named_scene(**defaults: Any) -> Callable[[Builder], Builder]:
+    """Register the decorated builder as a scene of its name.
+
+    Parameters
+    ----------
+    **defaults
+        Its values of the parameters that every scene has (see `Parameters`), where they are others.
+
+    Returns
+    -------
+    callable
+        Decorator of a function (scene, ...) that adds bodies and joints to the scene. Its further parameters are the
+        scene's own and need defaults.
+
+    Raises
+    ------
+    InputError
+        The name is taken, a parameter is one that every scene has or lacks a default.
+    UnknownName
+        A default of no parameter.
+
+    Examples
+    --------
+    >>> import lavender as lv
+    >>> @lv.scene.named_scene(friction=0.2)
+    ... def slab(scene, size=2.0):
+    ...     scene.add_plane()
+    ...     scene.add_box((size, size, 0.1), position=(0, 0, 0.05))
+    >>> lv.Scene("slab", size=3.0).n_bodies
+    2
+    """
+    for key in defaults:
+        if key not in COMMON:
+            raise UnknownName("scene parameter", key, COMMON)
+
+    def enter(build: Builder) -> Builder:
+        name = build.__name__
+        first, *own = inspect.signature(build).parameters.values()
+        if name in SCENES:
+            raise InputError(f"a scene {name!r} is registered already; give the builder another name")
+        for p in own:
+            if p.name in COMMON or p.default is p.empty or p.kind is p.VAR_KEYWORD:
+                raise InputError(
+                    f"parameter {p.name!r} of the scene {name!r}: a name that no other scene parameter has, with a "
+                    f"default, is needed after {first.name!r}"
+                )
+        SCENES[name], DEFAULTS[name] = build, defaults
+        return build
+
+    return enter
+
 
 class Scene:
     """Bodies and joints with their parameters: a named scene of the gallery, or an empty one to build.
@@ -115,7 +171,7 @@ class Scene:
     Parameters
     ----------
     name : str, optional
-        A scene of the gallery (`lavender.scene.gallery.SCENES`); None: empty.
+        A scene of the gallery, or another that `named_scene` has registered; None: empty.
     **parameters
         Those of `Parameters`, and the named scene's own (sizes, numbers, angles; see its docstring).
 
@@ -137,12 +193,9 @@ class Scene:
     """
 
     def __init__(self, name: str | None = None, **parameters: Any) -> None:
-        from lavender.scene.gallery import SCENES
-
         if name is not None and name not in SCENES:
             raise UnknownName("scene", name, SCENES)
-        own = dict(inspect.signature(SCENES[name]).parameters) if name is not None else {}
-        own.pop("scene", None)
+        own = list(inspect.signature(SCENES[name]).parameters)[1:] if name is not None else []
         for key in parameters:
             if key not in COMMON and key not in own:
                 what = f"parameter of scene {name!r}" if name else "scene parameter"
@@ -150,7 +203,7 @@ class Scene:
         self.name = name or ""
         common = {k: v for k, v in parameters.items() if k in COMMON}
         if name is not None:
-            common = {**getattr(SCENES[name], "defaults", {}), **common}
+            common = {**DEFAULTS[name], **common}
         self.parameters = Parameters(**common)
         self.own = {k: v for k, v in parameters.items() if k in own}
         self.bodies: list[Body] = []
