@@ -611,6 +611,7 @@ def api_page(site):
             "UnknownName",
             "SolverUnavailable",
             "CapabilityError",
+            "InUse",
             "SolveFailed",
         ),
     }

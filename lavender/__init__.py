@@ -13,6 +13,7 @@ from lavender.cones import CONTACT, CONTACT_SPIN, ROW, Cones
 from lavender.errors import (
     CapabilityError,
     InputError,
+    InUse,
     LavenderError,
     SolveFailed,
     SolverUnavailable,
@@ -63,6 +64,7 @@ __all__ = [
     "Claim",
     "Cones",
     "CrossCheck",
+    "InUse",
     "InputError",
     "LavenderError",
     "MotionError",

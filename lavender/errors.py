@@ -8,6 +8,7 @@ from typing import Any
 
 __all__ = [
     "CapabilityError",
+    "InUse",
     "InputError",
     "LavenderError",
     "SolveFailed",
@@ -59,6 +60,10 @@ class SolverUnavailable(LavenderError):
 
 class CapabilityError(LavenderError):
     """A solver or format that cannot take this problem or option; the message says which can."""
+
+
+class InUse(LavenderError, RuntimeError):
+    """An object that serves one thread at a time is at work for another one, or for the caller of this callback."""
 
 
 class SolveFailed(LavenderError):

@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from lavender._arrays import FloatArray, as_array, check_not_negative, equal, read_only
+from lavender._arrays import FloatArray, IntArray, as_array, check_not_negative, equal, read_only
+from lavender._derived import Derived, once
 from lavender.cones import CONTACT_SPIN, ROW, Cones
 from lavender.errors import CapabilityError, InputError
 from lavender.rows import Rows
@@ -99,6 +100,7 @@ class Problem:
     names: Sequence[str] | None = None
     name: str = ""
     copy: bool = field(default=True, repr=False)
+    derived: Derived = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         put = object.__setattr__
@@ -107,6 +109,7 @@ class Problem:
                 f"cones is a {type(self.cones).__name__}; a Cones is needed (Cones.bounded, Cones.contacts)"
             )
         m, k = self.cones.n_rows, self.cones.n_blocks
+        put(self, "derived", Derived())
         put(self, "b", as_array("b", self.b, (m,), unit="m/s", copy=self.copy))
         if (self.matrix is None) == (self.rows is None):
             raise InputError("give either matrix= or rows=, one of them")
@@ -297,7 +300,7 @@ class Problem:
 
     # -- derived, computed once ------------------------------------------------------------------
 
-    @cached_property
+    @once
     def data(self) -> Data:
         """What the kernels read: pointers, d, nu, sweep steps. Of the rows where there are rows."""
         if self.rows is None:
@@ -318,11 +321,10 @@ class Problem:
             )
         )
 
-    @cached_property
+    @once
     def csr_data(self) -> Data:
         """The same over A in compressed rows; forms A where only rows are given."""
-        a = self.csr
-        return self._data(csr=(a.indptr, a.indices, a.data))
+        return self._data(csr=self._compressed)
 
     def _data(self, **operator: Any) -> Data:
         c = self.cones
@@ -338,9 +340,18 @@ class Problem:
             **operator,
         )
 
-    @cached_property
+    @once
     def csr(self) -> sp.csr_array:
-        """A in compressed rows (m, m), int32 indices; do not modify."""
+        """A in compressed rows (m, m), int32 indices, read-only."""
+        if sp.issparse(self.matrix):
+            return self.matrix
+        indptr, indices, data = self._compressed
+        return sp.csr_array((data, indices, indptr), shape=(self.m, self.m))
+
+    @once
+    def _compressed(self) -> tuple[IntArray, IntArray, FloatArray]:
+        # (indptr, indices, data) of A. Kernels and the judge read these: `csr` is an object whose arrays whoever
+        # has it may exchange.
         if self.rows is not None:
             most, start, blocks = assemble.bound(self.data)
             if most >= 2**31:
@@ -349,15 +360,14 @@ class Problem:
                     "use a solver that reads rows"
                 )
             indptr, indices, data = assemble.delassus(self.data, most, start, blocks)
-        elif isinstance(self.matrix, np.ndarray):
-            indptr, indices, data = dense_to_csr(self.matrix)
-        else:
-            return self.matrix
-        return sp.csr_array((data, indices, indptr), shape=(self.m, self.m))
+            return read_only(indptr), read_only(indices), read_only(data)
+        if isinstance(self.matrix, np.ndarray):
+            return dense_to_csr(self.matrix)
+        return self.matrix.indptr, self.matrix.indices, self.matrix.data
 
-    @cached_property
+    @once
     def jacobian(self) -> sp.csr_array:
-        """J (m, 6 n) as CSR; only with rows.
+        """J (m, 6 n) as CSR, read-only; only with rows.
 
         Raises
         ------
@@ -369,7 +379,10 @@ class Problem:
                 "this problem was given as a matrix; its Jacobian is not known (make it with "
                 "Problem.from_rows)"
             )
-        return self.rows.jacobian(self.cones)
+        jac = self.rows.jacobian(self.cones)
+        for part in (jac.data, jac.indices, jac.indptr):
+            read_only(part)
+        return jac
 
     @property
     def d(self) -> FloatArray:
@@ -405,7 +418,7 @@ class Problem:
         """Pi(0) (m,) [N s]: doing nothing, clipped to the bounds; a new array."""
         return self._start.copy()
 
-    @cached_property
+    @once
     def _start(self) -> FloatArray:
         return read_only(np.clip(np.zeros(self.m), self.cones.lower, self.cones.upper))
 
@@ -522,7 +535,7 @@ class Problem:
 
     def __reduce__(self) -> tuple[Any, ...]:
         # Copies and pickles hold what was given; derived numbers are made anew, arrays stay read-only.
-        return type(self), tuple(f.name != "copy" and getattr(self, f.name) for f in fields(self))
+        return type(self), tuple(f.name != "copy" and getattr(self, f.name) for f in fields(self) if f.init)
 
     def __repr__(self) -> str:
         kind = "rows" if self.rows is not None else "CSR" if sp.issparse(self.matrix) else "dense"

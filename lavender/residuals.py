@@ -47,6 +47,11 @@ class Residual:
     _problem: Problem = field(repr=False)
 
     @property
+    def at_floor(self) -> bool:
+        """Within twice what float64 allows; a floor that is not finite allows nothing."""
+        return at_floor(self.relative, self.floor)
+
+    @property
     def worst_name(self) -> str:
         """Name of the worst row, e.g. "contact 3, tangent 1"; empty for an empty problem."""
         return self._problem.row_name(self.worst_row) if self.worst_row >= 0 else ""
@@ -61,6 +66,11 @@ class Residual:
         return (
             f"relative {self.relative:.2e}, energy {self.energy:.2e} sqrt(J){worst}, floor {self.floor:.1e}"
         )
+
+
+def at_floor(relative: float, floor: float) -> bool:
+    """Whether a relative residual is within twice its floor, both finite."""
+    return relative <= 2.0 * floor < math.inf
 
 
 def _ratio(x: float, reference: float) -> float:
@@ -91,7 +101,7 @@ def reference(problem: Problem) -> tuple[float, float]:
             energy, velocity = rhs_energy, rhs_velocity
         # A size that overflows measures nothing: 0 makes every error beside it infinite.
         data.set_start(energy if energy < np.inf else 0.0, velocity if velocity < np.inf else 0.0)
-        problem.__dict__["_start_relative"] = _relative(data, *own[:2])
+        problem.derived.start_relative = _relative(data, *own[:2])
     return data.start_energy, data.start_velocity
 
 
@@ -105,15 +115,15 @@ def judged(problem: Problem, impulse: FloatArray) -> measure.Judged:
 
 def remember(problem: Problem, last: measure.Judged) -> None:
     """Leave a result for the next `residual` of this problem, which takes it for the same impulse, bit for bit."""
-    problem.__dict__["_judged"] = last
+    problem.derived.judged = last
 
 
 def known(problem: Problem, impulse: FloatArray) -> float | None:
     """Relative residual of doing nothing, or of what `remember` was given, where `impulse` is that, bit for bit."""
-    last = problem.__dict__.get("_judged")
+    last = problem.derived.judged
     if last is not None and measure.same_bits(last.impulse, impulse):
         return float(last.relative)
-    start: float | None = problem.__dict__.get("_start_relative")
+    start = problem.derived.start_relative
     return start if start is not None and measure.same_bits(problem._start, impulse) else None
 
 
@@ -150,8 +160,8 @@ def residual(problem: Problem, impulse: Any) -> Residual:
         raise InputError(f"impulse is not an array of numbers ({error})") from None
     if impulse.shape != (problem.m,):
         raise InputError(f"impulse has shape {impulse.shape}; ({problem.m},) is needed")
-    last = problem.__dict__.pop("_judged", None)
-    if last is None or not measure.same_bits(last.impulse, impulse):
+    last, problem.derived.judged = problem.derived.judged, None
+    if last is None or last.data is not problem.data or not measure.same_bits(last.impulse, impulse):
         last = judged(problem, impulse)
     made: Residual = object.__new__(Residual)
     state = {
@@ -304,7 +314,11 @@ def check_certificate(problem: Problem, y: Any) -> str | None:
     1e-10 (b.y / |b|.|y|) (|A|^T |y|)_i: with more a solution could exist, but only one with
     |A| |lambda| > 1e10 |b| in the weights |y|, whose floor is above 1e-6.
     """
-    y = np.asarray(y, float)
+    with np.errstate(all="ignore"):  # what overflows proves nothing
+        return _disproof(problem, np.asarray(y, float))
+
+
+def _disproof(problem: Problem, y: FloatArray) -> str | None:
     if y.shape != (problem.m,) or not np.isfinite(y).all() or not np.any(y):
         return f"certificate of shape {y.shape} must be {problem.m} finite numbers, not all zero"
     gain, most = float(problem.b @ y), float(np.abs(problem.b) @ np.abs(y))
@@ -313,8 +327,10 @@ def check_certificate(problem: Problem, y: Any) -> str | None:
     outside = _recession_violation(problem, y)
     if outside:
         return outside
-    a = problem.csr
-    z, zero = a.T @ y, 1e-10 * (gain / most) * (abs(a).T @ np.abs(y))
+    # Only the rows that y takes part in: others may have overflown.
+    rows = np.flatnonzero(y)
+    a = problem.csr[rows]
+    z, zero = a.T @ y[rows], 1e-10 * (gain / most) * (abs(a).T @ np.abs(y[rows]))
     z[np.abs(z) <= zero] = 0.0
     pull = _pull(problem, z, zero)
     if gain - pull.sum() > 1e-10 * (most + np.abs(pull).sum()):

@@ -190,7 +190,7 @@ class Solution:
         SolveFailed
             Otherwise, with the one-line summary.
         """
-        if self.success or self.residual.relative <= 2.0 * self.residual.floor:
+        if self.success or self.residual.at_floor:
             return self
         raise SolveFailed(str(self))
 

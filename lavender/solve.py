@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from threading import Lock
 from time import perf_counter
 from typing import Any
 
@@ -16,10 +17,10 @@ import numpy as np
 
 from lavender._arrays import FloatArray, equal
 from lavender.cones import ROW
-from lavender.errors import CapabilityError, InputError, UnknownName
+from lavender.errors import CapabilityError, InputError, InUse, UnknownName
 from lavender.problem import Problem
 from lavender.registry import SolverSpec, get
-from lavender.residuals import Residual, check_certificate, residual
+from lavender.residuals import Residual, check_certificate, reference, residual
 from lavender.solution import Claim, History, Solution, SolverRun, Status
 from lavender_ext.judge.measure import all_finite
 
@@ -29,6 +30,8 @@ CHUNK_TIME = 0.025  # s, aim; twice that is still below what a person notices on
 FIRST_CHUNK = 256  # iterations: 25 ms at 100 us each, slower than any compiled sweep of few rows
 Callback = Callable[[int, FloatArray, Residual], Any]
 NOTHING_DONE = Claim(Status.MAX_ITERATIONS, 0)
+# What arithmetic on legal numbers may end in: a result, with the solver's last word as its message.
+BREAKDOWN = (ArithmeticError, np.linalg.LinAlgError, MemoryError)
 FRONT_DOOR = ("impulse", "tol", "max_iter", "time_limit", "history", "callback")
 
 
@@ -97,7 +100,11 @@ def prepare(problem: Problem, solver: str, **options: Any) -> Prepared:
 
 
 class Prepared:
-    """A solver ready for a problem; `solve(problem2)` reuses what the structure allows."""
+    """A solver ready for a problem; `solve(problem2)` reuses what the structure allows.
+
+    It serves one thread at a time: `solve` while another `solve` of it runs, in another thread or above this
+    one (from its callback), raises `InUse`. Threads share a `Problem` freely, and prepare each their own.
+    """
 
     def __init__(self, problem: Problem, spec: SolverSpec, options: dict[str, Any]) -> None:
         _check_problem(problem, spec)
@@ -112,9 +119,10 @@ class Prepared:
         self.spec = spec
         self.options = dict(options)
         self.problem = problem
+        self._lock = Lock()
         start = perf_counter()
         self._solver = _make(spec, options)
-        self._state = self._solver.prepare(problem)
+        self._set_up(problem, anew=True)
         self.setup_time = perf_counter() - start
         self._fresh = True
 
@@ -129,7 +137,33 @@ class Prepared:
         history: bool = False,
         callback: Callback | None = None,
     ) -> Solution:
-        """As `lavender.solve`; `problem`, if given, replaces the prepared one."""
+        """As `lavender.solve`; `problem`, if given, replaces the prepared one.
+
+        Raises
+        ------
+        InUse
+            Another call of it has not returned yet.
+        """
+        if not self._lock.acquire(blocking=False):
+            raise InUse(
+                f"this prepared {self.spec.name!r} is solving already, and its state is for one solve at a time: "
+                "make another one for every thread (lavender.prepare)"
+            )
+        try:
+            return self._solve(problem, impulse, tol, max_iter, time_limit, history, callback)
+        finally:
+            self._lock.release()
+
+    def _solve(
+        self,
+        problem: Problem | None,
+        impulse: Any,
+        tol: float,
+        max_iter: int | None,
+        time_limit: float | None,
+        history: bool,
+        callback: Callback | None,
+    ) -> Solution:
         spec = self.spec
         tol, max_iter, time_limit = _check_budget(spec, tol, max_iter, time_limit)
         if callback is not None and not callable(callback):
@@ -151,6 +185,8 @@ class Prepared:
         loop = _Loop(problem, self._solver, self._state, lam, tol, time_limit, history, callback)
         if proof is not None:
             claim = Claim(Status.INFEASIBLE, 0, {}, proof[0], certificate=proof[1])
+        elif self._broken:
+            claim = Claim(Status.NUMERICAL_ERROR, 0, {}, self._broken)
         else:
             claim = loop.run(max_iter) if spec.resumable else loop.run_once(max_iter)
         return finish(
@@ -160,17 +196,33 @@ class Prepared:
     def _refresh(self, problem: Problem | None) -> None:
         if problem is None or problem is self.problem:
             if not self._fresh:
-                self._state = self._solver.update(self._state, self.problem)
+                self._set_up(self.problem, anew=False)
         else:
             _check_problem(problem, self.spec)
             start = perf_counter()
-            if same_structure(self.problem, problem):
-                self._state = self._solver.update(self._state, problem)
-            else:
-                self._state = self._solver.prepare(problem)
+            self._set_up(problem, anew=not same_structure(self.problem, problem))
             self.setup_time = perf_counter() - start
             self.problem = problem
         self._fresh = False
+
+    _broken = ""  # why there is no state
+
+    def _set_up(self, problem: Problem, anew: bool) -> None:
+        """Prepare, or update the state of a problem of the same structure."""
+        if problem.data.start_energy < 0.0:
+            reference(problem)  # of the judge, before any solver has the problem in its hands
+        anew, self._broken = anew or bool(self._broken), ""
+        try:
+            if anew:
+                self._state = self._solver.prepare(problem)
+            else:
+                self._state = self._solver.update(self._state, problem)
+        except BREAKDOWN as error:
+            self._state, self._broken = None, _last_words(error)
+
+
+def _last_words(error: BaseException) -> str:
+    return f"{type(error).__name__}: {error}".removesuffix(": ")
 
 
 def _make(spec: SolverSpec, options: dict[str, Any]) -> Any:
@@ -223,13 +275,23 @@ class _Loop:
         start_point = self.impulse.copy()
         start = perf_counter()
         try:
-            return self.solver.run(self.state, self.impulse, max_iter, self.tol, self.time_limit)
+            claim = self._call(max_iter, self.time_limit)
+            if claim.status is not Status.NUMERICAL_ERROR:
+                return claim
         except KeyboardInterrupt:
-            if not all_finite(self.impulse):
-                self.impulse[:] = start_point
-            return Claim(Status.INTERRUPTED, 0, {}, "Ctrl-C")
+            claim = Claim(Status.INTERRUPTED, 0, {}, "Ctrl-C")
         finally:
             self.time = perf_counter() - start
+        if not all_finite(self.impulse):
+            self.impulse[:] = start_point
+        return claim
+
+    def _call(self, n: int, time_limit: float | None) -> Claim:
+        """At most n iterations of the solver; what its arithmetic could not do is a claim."""
+        try:
+            return self.solver.run(self.state, self.impulse, n, self.tol, time_limit)
+        except BREAKDOWN as error:
+            return Claim(Status.NUMERICAL_ERROR, 0, {}, _last_words(error))
 
     def run(self, max_iter: int) -> Claim:
         # About a nanosecond per unit of work: the first guess, then measured. Capped, for solvers in Python.
@@ -244,7 +306,7 @@ class _Loop:
                 if records:
                     n = min(n, self._next_record - self.done)
                 start = perf_counter()
-                claim = self.solver.run(self.state, self.impulse, n, self.tol, None)
+                claim = self._call(n, None)
                 elapsed = perf_counter() - start
                 self.time += elapsed
                 self.done += claim.iterations
@@ -252,6 +314,11 @@ class _Loop:
                     self.work[kind] = self.work.get(kind, 0) + count
                 stopped = records and self.done == self._next_record and self._record()
                 if claim.status is not Status.MAX_ITERATIONS:
+                    break
+                if claim.iterations < 1:
+                    claim = Claim(
+                        Status.STALLED, 0, {}, f"did none of the {n} iterations that it was asked for"
+                    )
                     break
                 if stopped:
                     claim = Claim(Status.INTERRUPTED, 0, {}, "stopped by the callback")
@@ -332,18 +399,21 @@ def finish(
         tol > 0.0 and relative <= tol and status in (Status.MAX_ITERATIONS, Status.TIME_LIMIT, Status.STALLED)
     ):
         status = Status.CONVERGED
-    elif tol < relative <= 2.0 * judged.floor and status in (Status.CONVERGED, Status.STALLED):
+    elif tol < relative and judged.at_floor and status in (Status.CONVERGED, Status.STALLED):
         status = Status.FLOOR
+    certificate = claim.certificate
+    if status is Status.INFEASIBLE and relative <= tol:
+        # What meets tol is a solution to tol, whatever can be said of an exact one.
+        status, certificate = Status.CONVERGED, None
+        message = f"{message}; the impulse meets tol all the same".removeprefix("; ")
     contradicted = ""
     if status is Status.CONVERGED and not relative <= tol:
         contradicted = f"says CONVERGED, relative residual {relative:.2e} is above tol {tol:.1e}"
-    elif status is Status.FLOOR and not relative <= 2.0 * judged.floor:
+    elif status is Status.FLOOR and not judged.at_floor:
         contradicted = f"says FLOOR, relative residual {relative:.2e} is above twice {judged.floor:.2e}"
     elif status is Status.INFEASIBLE:
         reason = (
-            "no certificate was given"
-            if claim.certificate is None
-            else check_certificate(problem, claim.certificate)
+            "no certificate was given" if certificate is None else check_certificate(problem, certificate)
         )
         contradicted = f"says INFEASIBLE, {reason}" if reason else ""
     impulse.flags.writeable = False
@@ -360,7 +430,7 @@ def finish(
         message,
         history,
         claim.dual,
-        claim.certificate,
+        certificate,
         contradicted,
     )
 
@@ -381,6 +451,8 @@ def _decide_empty_rows(problem: Problem, impulse: FloatArray) -> tuple[str, Floa
             continue
         y = np.zeros(problem.m)
         y[i] = math.copysign(1.0, b)
+        if check_certificate(problem, y) is not None:
+            continue  # its products vanish or overflow, but it is not zero
         return f"{problem.row_name(int(i))}: its row of A is zero, so nothing can meet b = {b:.3g} m/s", y
     return None
 

@@ -15,7 +15,7 @@ ROOT = Path(__file__).resolve().parent.parent
 LEVELS = [
     {"_version", "_built"},
     {"errors"},
-    {"_arrays"},
+    {"_arrays", "_derived"},
     {"cones"},
     {"rows"},
     {"problem"},

@@ -82,6 +82,9 @@ def ask(
         return Claim(Status.CONVERGED, 0, work, "every row was decided by its bounds", qp.form)
     if n == 0:
         return Claim(Status.MAX_ITERATIONS, 0, work, "", qp.form)
+    if not qp.fits:
+        words = "as a quadratic program the problem has numbers that overflow; the backend was not called"
+        return Claim(Status.NUMERICAL_ERROR, 0, work, words, qp.form)
     start = impulse.copy()
     eps = max(0.5 * target(problem, tol), EPS_MIN)
     # Unknowns are near 1, so objectives lie between 1 and m: a gap below 1e-13 is often lost in its own sums.
@@ -152,10 +155,14 @@ def _once(
     found = x is not None and len(x) == qp.n and bool(np.isfinite(x).all())
     if qp.form == "velocity":
         found = found and zeta is not None and len(zeta) == len(qp.b) and bool(np.isfinite(zeta).all())
-    dual = None
+    dual, lam = None, impulse
+    if found:
+        assert x is not None
+        lam = qp.impulse(x, np.zeros(0) if zeta is None else zeta)
+        found = bool(np.isfinite(lam).all())
     if found and status is not Status.INFEASIBLE:
         assert x is not None
-        impulse[:] = qp.impulse(x, np.zeros(0) if zeta is None else zeta)
+        impulse[:] = lam
         xi = answer.xi if answer.xi is not None and len(answer.xi) == qp.n else np.full(qp.n, np.nan)
         dual = qp.multiplier(x, xi)
     elif status is not Status.INFEASIBLE:

@@ -46,6 +46,7 @@ __all__ = ["FORMS", "QP", "impulse_form", "pick_form", "target", "velocity_form"
 
 FORMS = ("impulse", "velocity", "auto")
 IntpArray = npt.NDArray[np.intp]
+LARGEST = 1e20  # of a program's numbers: from there on backends read infinity, or break
 MASS_RATIO = 1e3  # from here on the velocity form is more accurate, whatever the sizes
 
 
@@ -84,6 +85,23 @@ class QP:
         return len(self.b) == 0 and no_bound
 
     @property
+    def fits(self) -> bool:
+        """Its numbers are below LARGEST; bounds may be infinite on their own side.
+
+        Where nothing overflows in the program's units they are near 1.
+        """
+        numbers = (self.P.data, self.q, self.A.data, self.b)
+        if not all(np.abs(x).max(initial=0.0) < LARGEST for x in numbers):
+            return False
+        if not (
+            np.isfinite(self.root).all() and np.isfinite(self.shift).all() and np.isfinite(self.fixed).all()
+        ):
+            return False
+        return (
+            self.lb is None or self.ub is None or bool(np.all(self.lb < np.inf) and np.all(self.ub > -np.inf))
+        )
+
+    @property
     def is_definite(self) -> bool:
         """Velocity form: P has no zero on its diagonal, as no row needs a t."""
         return self.form == "velocity" and self.n == self.lift.shape[1]
@@ -119,6 +137,8 @@ class QP:
         if self.form == "impulse":
             lam = self.fixed.copy()
             lam[self.kept] = self.sigma * self.root * x
+            if not np.isfinite(lam).all():
+                return np.full(self.problem.m, np.nan)
             z = -self.problem.slack(lam)
             z[self.kept] = xi * (self.sigma / self.root)
             return z

@@ -12,6 +12,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
+
 from lavender._arrays import FloatArray
 from lavender.errors import InputError
 from lavender.external._running import ask, definite_refusal, symmetric_refusal
@@ -36,6 +38,7 @@ class ClarabelCone:
                 f"settings is a {type(self.settings).__name__}; a mapping of names to values is needed"
             )
 
+    @np.errstate(all="ignore")  # what overflows is judged
     def prepare(self, problem: Problem) -> tuple[Problem, QP]:
         if pick_form(problem, self.form) == "velocity":
             return problem, velocity_form(problem)
@@ -44,6 +47,7 @@ class ClarabelCone:
     def update(self, state: tuple[Problem, QP], problem: Problem) -> tuple[Problem, QP]:
         return self.prepare(problem)
 
+    @np.errstate(all="ignore")  # what overflows is judged
     def run(
         self,
         state: tuple[Problem, QP],

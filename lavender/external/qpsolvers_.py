@@ -94,6 +94,7 @@ class QPSolver:
                 f"settings is a {type(self.settings).__name__}; a mapping of names to values is needed"
             )
 
+    @np.errstate(all="ignore")  # what overflows is judged
     def prepare(self, problem: Problem) -> State:
         b = self.backend
         qp = velocity_form(problem) if pick_form(problem, self.form, b.definite) == "velocity" else None
@@ -120,6 +121,7 @@ class QPSolver:
     def update(self, state: State, problem: Problem) -> State:
         return self.prepare(problem)
 
+    @np.errstate(all="ignore")  # what overflows is judged
     def run(
         self, state: State, impulse: FloatArray, n: int, tol: float, time_limit: float | None = None
     ) -> Claim:

@@ -13,6 +13,7 @@ from lavender.solvers._augmented import WORTH, solve_augmented
 from lavender.solvers._ipm import DELTA, InteriorPoint
 from lavender.solvers._polish import Proximal, Run, polish
 
+IPM_STEPS = 1000  # of one interior point at most, whatever the budget
 IPM_PATIENCE = 15  # interior point steps that halve neither residual nor gap
 HOLD = 0.1  # share of rows beyond their bounds up to which exchanging those is worth a try,
 FEW = 64  # or rows up to which it always is
@@ -90,7 +91,9 @@ def _interior(run: Run, ip: InteriorPoint, rows: bool) -> None:
     trigger, untried = FIRST, True
     lowest, idle, still, kept = np.inf, 0, 0, ip.z.copy()
     try:
-        while not run.done() and ip.step():
+        for _ in range(IPM_STEPS):
+            if run.done() or not ip.step():
+                break
             run.count("interior point steps")
             relative = run.error(ip)
             gains = relative < 0.5 * lowest

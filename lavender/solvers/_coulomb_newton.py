@@ -20,6 +20,7 @@ FIRST, SECOND = 20, 30  # factorisations of the first two walks
 CONVEX_TOL = 1e-4  # of the convex answer that a walk starts from, in energy
 CONVEX_STEPS = 30  # that it may cost
 STRETCH = 60  # factorisations between two looks at whether a walk gets anywhere
+STRETCHES = 1000  # of one walk at most, whatever its budget
 SMALL, LARGE = 64, 1000  # rows up to which the first proximal weight is smaller, from which it is larger
 HEAVY = 1e3  # mass ratio from which the walks are not tried from a cold start
 LAST = (1e-6, 1e-7, 1e-8)  # proximal weights of the last walks
@@ -100,11 +101,13 @@ def _walk(run: Run, plain: Proximal, ends: list[tuple[float, FloatArray]]) -> No
 def _pursue(run: Run, method: Proximal, share: float = 0.5) -> FloatArray:
     # As long as each stretch brings its residual down to a share of the last; its best z.
     last, z = np.inf, method.z
-    while not run.done() and not method.stuck:
+    for _ in range(STRETCHES):
+        if run.done() or method.stuck:
+            break
         best, own = apart(run, method, STRETCH)
         if best < last:
             z = own
-        if best > share * last or run.at_floor():
+        if best > share * last or best == np.inf or run.at_floor():
             break
         last = best
     return z
@@ -121,4 +124,4 @@ def _is_heavy(run: Run) -> bool:
     if rows is None:
         return False
     moving = rows.inv_mass[rows.inv_mass > 0.0]
-    return len(moving) > 0 and bool(moving.max() >= HEAVY * moving.min())
+    return len(moving) > 0 and bool(moving.max() >= HEAVY * float(moving.min()))

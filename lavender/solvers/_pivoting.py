@@ -17,6 +17,7 @@ from lavender.solvers._factor import TINY, DenseFactor, Factor, SparseFactor, ch
 from lavender_ext.pivot.principal import Pivoting
 
 SOLVED, ROUNDS, SMALL, INDEFINITE, STUCK = range(5)  # outcomes, as in lavender_ext/pivot/principal.pyx
+HALVINGS = 41  # step lengths tried in a line search: 1, 1/2, ... 2^-40
 SLOP = 8.0  # roundings of w within which a sign means nothing, as there
 
 
@@ -146,13 +147,13 @@ class PivotState:
             self.newton()
             step = rows.x - x
             t = 1.0
-            while True:
+            for _ in range(HALVINGS):
                 np.clip(x + t * step, low, high, out=rows.x)
                 rows.slack()
                 self.searches += 1
                 move = rows.x - x
                 # phi(y) - phi(x) = 1/2 (w(x) + w(y)).(y - x): no cancellation
-                if 0.5 * ((w + rows.w) @ move) <= 1e-4 * (w @ move) or t < 1e-12:
+                if 0.5 * ((w + rows.w) @ move) <= 1e-4 * (w @ move):
                     break
                 t *= 0.5
             slop = SLOP * rows.f

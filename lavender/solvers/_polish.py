@@ -14,7 +14,7 @@ from time import perf_counter
 import numpy as np
 
 from lavender._arrays import FloatArray
-from lavender.residuals import check_certificate, quick, reference
+from lavender.residuals import at_floor, check_certificate, quick, reference
 from lavender.solvers._ipm import CONVEX, InteriorPoint, System, VelocitySystem
 
 EPS = 1e-9  # proximal weight of the polish, relative to d; refinement takes it away again
@@ -23,6 +23,7 @@ INNER_TOL = 0.1  # |F_c| at which a round ends, relative to its start
 MEMORY = 6  # steps that the non-monotone line search looks back
 CERTIFY = 1e-8  # relative residual below which there is a solution
 PROBE = 1e-7  # proximal weight below which a round is as good as a plain Newton step
+FREE = 20  # rounds in a row that cost no factorisation, and so change nothing but the weight
 ALPHA_LOW = 1e-12  # proximal weight below which a factorisation sees none
 
 
@@ -86,7 +87,7 @@ class Run:
             return False
         sc = self.system.sc
         relative, self.floor = quick(sc.problem, sc.impulse(self.best_z), self.w, self.e, True)
-        return relative <= 2.0 * self.floor
+        return at_floor(relative, self.floor)
 
     def done(self) -> bool:
         return self.reached() or self.certificate is not None or self.spent()
@@ -208,7 +209,7 @@ class Proximal:
     def advance(self, run: Run, limit: int = 10_000) -> None:
         """Rounds until the judge is content, `limit` factorisations are spent, or nothing moves."""
         system = run.system
-        last = system.factorisations + limit
+        last, free = system.factorisations + limit, 0
         run.score(self.z)
         while not run.done() and not self.stuck and system.factorisations < last:
             if run.best < self.probed and self.alpha > PROBE:
@@ -228,7 +229,9 @@ class Proximal:
             run.count("proximal rounds")
             if run.best > 0.5 * before and run.at_floor():
                 break
-            self._adapt(solved, used, run.best > 0.5 * before)
+            self._adapt(solved, used, run.best > 0.5 * before or run.best == np.inf)
+            free = free + 1 if used == 0 else 0
+            self.stuck = self.stuck or free > FREE
 
     def _round(self, run: Run) -> bool:
         system, alpha, law = run.system, self.alpha, self.law

@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from lavender._arrays import FloatArray
+from lavender._derived import Tried
 from lavender.problem import Problem
 from lavender.solution import Claim, Status
 from lavender_ext.warm.start import from_guess, limits
@@ -17,7 +18,6 @@ from lavender_ext.warm.start import from_guess, limits
 ENDED = (None, "as it came", "warm sweeps", "joints solved directly", "warm sweeps, Newton steps over bodies")
 
 MOST_SWEEPS, MOST_STEPS = limits()  # sweeps and factorisations that the first phase may cost
-TRIED = "_warm_tried"  # in a problem's __dict__: tol at which its guess was tried in vain, and what that cost
 
 
 def warm_claim(how: int, sweeps: int, factorisations: int) -> Claim | None:
@@ -39,18 +39,18 @@ def solve_warm(
         return None, 0, 0
     if time_limit is not None and MOST_SWEEPS * 1e-9 * problem.data.work > time_limit:
         return None, 0, 0
-    tried = problem.__dict__.get(TRIED)
+    tried = problem.derived.tried
     if (
         tried is None
-        or tried[0] != tol
+        or tried.tol != tol
         or problem.guess is None
         or not np.array_equal(impulse, problem.guess)
     ):
-        tried = (tol, *from_guess(problem.data, impulse, tol))
+        tried = Tried(tol, *from_guess(problem.data, impulse, tol))
     _, how, sweeps, factorisations = tried
     return warm_claim(how, sweeps, factorisations), sweeps, factorisations
 
 
 def note_tried(problem: Problem, tol: float, sweeps: int, factorisations: int) -> None:
     """The guess of `problem` was tried at tol, in vain."""
-    problem.__dict__[TRIED] = (tol, 0, sweeps, factorisations)
+    problem.derived.tried = Tried(tol, 0, sweeps, factorisations)

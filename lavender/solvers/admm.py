@@ -152,6 +152,7 @@ class ADMM:
         if not 0.0 < self.relaxation < 2.0:
             raise InputError(f"relaxation is {self.relaxation!r}; a number between 0 and 2 is needed")
 
+    @np.errstate(all="ignore")  # what overflows is judged
     def prepare(self, problem: Problem) -> AdmmState | str:
         """Scale and factor; a text where the factorisation broke down."""
         try:
@@ -163,6 +164,7 @@ class ADMM:
         """A fresh state: the penalty starts anew, so that a solve depends on its problem alone."""
         return self.prepare(problem)
 
+    @np.errstate(all="ignore")  # what overflows is judged
     def run(
         self, state: AdmmState | str, impulse: FloatArray, n: int, tol: float, time_limit: float | None = None
     ) -> Claim:

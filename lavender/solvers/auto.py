@@ -29,7 +29,7 @@ from lavender._arrays import FloatArray, IntArray
 from lavender.errors import SolverUnavailable, UnknownName
 from lavender.problem import Problem
 from lavender.registry import SolverSpec, get
-from lavender.residuals import check_certificate, known, quick, reference
+from lavender.residuals import at_floor, check_certificate, known, quick, reference
 from lavender.solution import Claim, Status
 from lavender.solvers._islands import block_bodies, islands, restrict, rows_of
 from lavender_ext.factor import graph
@@ -47,6 +47,7 @@ WARM = 1e-3  # relative residual from which an iterate is worth starting from
 HOPELESS = 0.5  # relative residual after the first sweeps of a few contacts with which they end
 NEARLY = 1e-2  # relative residual after the first sweeps from which more of them are worth it
 CERTIFICATE_ROWS = 3000  # rows up to which a linear program is asked for a certificate
+CERTIFICATE_STEPS = 100  # of the simplex method for each row at most
 
 
 @dataclass
@@ -88,8 +89,7 @@ class Trail:
     def at_floor(self) -> bool:
         if self.best > 1e-5:
             return False
-        relative, floor = quick(self.problem, self.impulse, self.w, self.e, True)
-        return relative <= 2.0 * floor
+        return at_floor(*quick(self.problem, self.impulse, self.w, self.e, True))
 
     def add(self, name: str, claim: Claim) -> None:
         self.iterations += claim.iterations
@@ -194,17 +194,16 @@ def _sweeps(trail: Trail, name: str, budget: int, cap: int, patient: bool = Fals
         if step <= 0:
             break
         # In short runs for the clock and Ctrl-C alone: cut anywhere, sweeps give the same bits.
-        left = step
-        while left > 0:
-            claim: Claim = solver.run(state, impulse, min(left, chunk), tol, None)
+        before = done
+        for start in range(0, step, chunk):
+            claim: Claim = solver.run(state, impulse, min(chunk, step - start), tol, None)
             done += claim.iterations
-            left -= claim.iterations
             for kind, count in claim.work.items():
                 total[kind] = total.get(kind, 0) + count
             if claim.status is not Status.MAX_ITERATIONS or trail.late:
                 break
         now = trail.offer(impulse)
-        if claim.status is not Status.MAX_ITERATIONS or now <= tol:
+        if claim.status is not Status.MAX_ITERATIONS or now <= tol or done == before:
             break
         if done > 2 * FIRST_LOOK and not patient:
             gain = np.log(last / now) if 0.0 < now < last else 0.0
@@ -275,6 +274,7 @@ def _sweep(trail: Trail, budget: int) -> bool:
     return _sweeps(trail, "anderson", budget, _cap(problem))
 
 
+@np.errstate(all="ignore")  # what overflows is judged
 def _apart(trail: Trail, count: int, label: IntArray, budget: int) -> None:
     """Solve every island that misses its share of the whole tolerance."""
     problem = trail.problem
@@ -370,6 +370,7 @@ def _relaxation(trail: Trail, budget: int) -> bool:
     return trail.done
 
 
+@np.errstate(all="ignore")  # what overflows is judged
 def _certify(trail: Trail) -> None:
     """Look for a proof that an LCP without upper bounds has no solution, whatever its A."""
     problem = trail.problem
@@ -389,13 +390,17 @@ def _certify(trail: Trail) -> None:
     # max b.y, A^T y <= 0 (= 0 on free rows), 0 <= y <= 1, in units of d.
     scale = 1.0 / np.sqrt(problem.d)
     at = (problem.csr.T.multiply(scale[:, None])).multiply(scale[None, :]).tocsr()
+    if not (np.isfinite(at.data).all() and np.isfinite(scale * problem.b).all()):
+        return
     bounds = np.stack([np.where(free, -1.0, 0.0), np.ones(problem.m)], 1)
-    left = None if np.isinf(trail.deadline) else max(trail.deadline - perf_counter(), 1e-3)
+    options: dict[str, Any] = {"maxiter": CERTIFICATE_STEPS * problem.m}
+    if trail.deadline < np.inf:
+        options["time_limit"] = max(trail.deadline - perf_counter(), 1e-3)
     found = linprog(
         -(scale * problem.b),
         A_ub=at[~free] if (~free).any() else None, b_ub=np.zeros(int((~free).sum())) if (~free).any() else None,
         A_eq=at[free] if free.any() else None, b_eq=np.zeros(int(free.sum())) if free.any() else None,
-        bounds=bounds, method="highs", options={} if left is None else {"time_limit": left},
+        bounds=bounds, method="highs", options=options,
     )  # fmt: skip
     trail.steps.append("linear program for a certificate")
     trail.work["certificates"] = trail.work.get("certificates", 0) + 1
@@ -420,7 +425,7 @@ def _is_heavy(problem: Problem) -> bool:
     if problem.rows is None:
         return False
     moving = problem.rows.inv_mass[problem.rows.inv_mass > 0.0]
-    return len(moving) > 0 and bool(moving.max() >= HEAVY * moving.min())
+    return len(moving) > 0 and bool(moving.max() >= HEAVY * float(moving.min()))
 
 
 def _is_redundant(problem: Problem) -> bool:
@@ -451,10 +456,10 @@ def _is_loose(problem: Problem) -> bool:
 def _bandwidth(problem: Problem) -> int:
     if problem.rows is None:
         return max(problem.bandwidth)
-    spread: int | None = problem.__dict__.get("_spread")
+    spread = problem.derived.spread
     if spread is None:
         spread = graph.body_spread(problem.cones.ptr, block_bodies(problem), problem.rows.n_bodies)
-        problem.__dict__["_spread"] = spread
+        problem.derived.spread = spread
     return spread
 
 

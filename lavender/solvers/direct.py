@@ -25,7 +25,7 @@ import numpy as np
 from lavender._arrays import FloatArray
 from lavender.problem import Problem
 from lavender.registry import SolverSpec
-from lavender.residuals import check_certificate, judged, remember
+from lavender.residuals import at_floor, check_certificate, judged, remember
 from lavender.solution import Claim, Status
 from lavender.solvers._factor import GeneralFactor
 from lavender.solvers._pivoting import INDEFINITE, ROUNDS, SMALL, SOLVED, STUCK, PivotState
@@ -39,6 +39,7 @@ RUNAWAY = 1e-6
 PASSES = 100  # proximal passes at most
 PATIENCE = 6  # passes without halving the best residual
 SWEEPS = 2  # symmetric sweeps of Gauss-Seidel that guess the free rows
+CORRECTIONS = 100  # refinements at a time at most; each halves the residual
 BATCH = 32  # rounds between two looks at the clock and the judge
 
 
@@ -84,6 +85,7 @@ class Direct:
             run.put_best()
 
 
+@np.errstate(all="ignore")  # what overflows is judged
 def _general(problem: Problem, why: str) -> DirectState:
     factor = GeneralFactor(problem)
     if not factor.usable:
@@ -153,12 +155,13 @@ class _Run:
         """What the best iterate deserves, when nothing is left to do."""
         if self.best <= self.tol:
             return self.claim(Status.CONVERGED)
-        if self.best <= 2.0 * self.floor:
+        if at_floor(self.best, self.floor):
             return self.claim(Status.FLOOR)
         return self.claim(Status.STALLED)
 
     # -- linear systems that are not symmetric definite -------------------------------------------
 
+    @np.errstate(all="ignore")  # what overflows is judged
     def linear_general(self, factor: GeneralFactor) -> Claim:
         problem = self.problem
         self.iterations = 1
@@ -243,7 +246,9 @@ class _Run:
     def refine(self, pivot: PivotState, relative: float) -> int:
         """x <- x - A_FF^-1 w while that halves the residual; ROUNDS where it changes a sign."""
         previous = np.inf
-        while not self.good() and relative < 0.5 * previous:
+        for _ in range(CORRECTIONS):
+            if self.good() or not relative < 0.5 * previous:
+                break
             previous = relative
             pivot.correct()
             self.work["refinements"] = self.work.get("refinements", 0) + 1
@@ -269,6 +274,7 @@ class _Run:
         else:
             self.notes.append("A is singular on the free rows: shifted and refined")
 
+    @np.errstate(all="ignore")  # what overflows is judged
     def proximal(self, pivot: PivotState, stuck: bool) -> Claim:
         """Passes on A + s D around the last answer; where pivoting is stuck, descent along falling s."""
         problem, rows = self.problem, pivot.rows
@@ -329,7 +335,9 @@ class _Run:
         """Refine on the rows found, whatever signs rounding gives: more passes with the same factor."""
         rows, previous = pivot.rows, np.inf
         relative = self.last  # of this x
-        while not self.good() and relative < 0.5 * previous:
+        for _ in range(CORRECTIONS):
+            if self.good() or not relative < 0.5 * previous:
+                break
             kept, previous = rows.x.copy(), relative
             rows.recenter()
             rows.slack()

@@ -62,6 +62,7 @@ class Jacobi:
         return run_kernel(state, impulse, n, tol, serial.JACOBI, state.omega, state.scratch)
 
 
+@np.errstate(all="ignore")  # what overflows is judged
 def safe_damping(problem: Problem) -> float:
     """min(1, 1.6 / max_i sum_j |A_ij| s_i), s the step of row i [kg] (1/d_i, on tangents 1/lambda_max)."""
     if problem.m == 0:

@@ -28,7 +28,7 @@ from scipy.linalg import lapack
 from lavender._arrays import FloatArray, IntArray
 from lavender.problem import Problem
 from lavender.registry import SolverSpec
-from lavender.residuals import check_certificate, quick
+from lavender.residuals import at_floor, check_certificate, quick
 from lavender.solution import Claim, Status
 from lavender_ext.judge import measure
 from lavender_ext.pivot.tableau import Dictionary
@@ -170,12 +170,14 @@ def _principal_pivot(m: FloatArray, q: FloatArray, rows: Places) -> tuple[FloatA
 class Lemke:
     """Lemke's complementary pivoting; one path, no options."""
 
+    @np.errstate(all="ignore")  # what overflows is judged
     def prepare(self, problem: Problem) -> Standard:
         return standard_form(problem)
 
     def update(self, state: Standard, problem: Problem) -> Standard:
-        return standard_form(problem)
+        return self.prepare(problem)
 
+    @np.errstate(all="ignore")  # what overflows is judged
     def run(
         self, state: Standard, impulse: FloatArray, n: int, tol: float, time_limit: float | None = None
     ) -> Claim:
@@ -215,7 +217,7 @@ class _Run:
         if self.best <= self.tol:
             self.message = ""
             return self.claim(Status.CONVERGED)
-        return self.claim(Status.FLOOR if self.best <= 2.0 * self.floor else Status.STALLED)
+        return self.claim(Status.FLOOR if at_floor(self.best, self.floor) else Status.STALLED)
 
     def count(self, what: str) -> None:
         self.work[what] = self.work.get(what, 0) + 1

@@ -57,6 +57,7 @@ class Newton:
 
     form: str = "auto"
 
+    @np.errstate(all="ignore")  # what overflows is judged
     def prepare(self, problem: Problem) -> NewtonState:
         if self.form not in FORMS:
             raise InputError(f"form is {self.form!r}; one of {', '.join(FORMS)} is needed")
@@ -75,6 +76,7 @@ class Newton:
     def update(self, state: NewtonState, problem: Problem) -> NewtonState:
         return self.prepare(problem)
 
+    @np.errstate(all="ignore")  # what overflows is judged
     def run(
         self, state: NewtonState, impulse: FloatArray, n: int, tol: float, time_limit: float | None = None
     ) -> Claim:

@@ -58,10 +58,10 @@ cdef inline int32_t body_levels(int32_t n_blocks, const int32_t* body, int32_t n
     `body` is (n_blocks, 2). Relaxed edge by edge until nothing changes, forwards then backwards: as many
     passes as the longest run against both directions, linear for scenes built bottom-up.
     """
-    cdef int32_t i, a, b, la, lb, changed = 1, top = 0, far = 2147483647
+    cdef int32_t i, a, b, la, lb, changed, top = 0, far = 2147483647, _pass
     for i in range(n_bodies):
         level[i] = far
-    while changed:
+    for _pass in range(n_bodies + 1):                   # the last of them changes nothing
         changed = 0
         for i in range(2 * n_blocks):
             a = body[2 * i] if i < n_blocks else body[2 * (2 * n_blocks - 1 - i)]
@@ -74,6 +74,8 @@ cdef inline int32_t body_levels(int32_t n_blocks, const int32_t* body, int32_t n
             if b >= 0 and la != far and la + 1 < lb:
                 level[b] = la + 1
                 changed = 1
+        if not changed:
+            break
     for i in range(n_bodies):
         if level[i] != far and level[i] > top:
             top = level[i]

@@ -112,7 +112,7 @@ cdef public int32_t lav_rows_diagonal(const blocks_t* p, const rows_t* r, double
         if nt > 0:
             step[j + 1] = largest_eigenvalue(d[j + 1], off, d[j + 2]) if nt == 2 else d[j + 1]
     for j in range(p.n_rows):
-        empty[j] = not d[j] > 0.0
+        empty[j] = d[j] == 0.0                          # what overflowed is not empty
         n_empty += empty[j]
         if d[j] > 0.0:
             n_positive += 1
@@ -207,7 +207,7 @@ cdef class Data:
         self.d = _read_only(np.asarray(d)[:m])
         self.nu = _read_only(np.asarray(nu)[:m])
         self.step = _read_only(np.asarray(step)[:m])
-        self.empty = np.flatnonzero(np.asarray(empty)[:m]) if n_empty else np.empty(0, np.intp)
+        self.empty = _read_only(np.flatnonzero(np.asarray(empty)[:m]) if n_empty else np.empty(0, np.intp))
 
     def _set_rows(self, rows):
         cdef const double[:, ::1] jac, normal, tangent, arm_a, arm_b
@@ -269,7 +269,9 @@ cdef class Data:
         return self._weight
 
     def set_start(self, double energy, double velocity):
-        """Error of doing nothing [sqrt J, m/s], once known; negative before."""
+        """Error of doing nothing [sqrt J, m/s], once known; negative before. It cannot be changed."""
+        if self.start_energy >= 0.0 and (energy != self.start_energy or velocity != self.start_velocity):
+            raise ValueError("the error of doing nothing is known already, and is another")
         self.start_energy = energy
         self.start_velocity = velocity
 
@@ -295,7 +297,7 @@ def dense_to_csr(const double[:, ::1] a):
                 data[q] = a[i, j]
                 q += 1
         indptr[i + 1] = <int32_t>q
-    return np.asarray(indptr), np.asarray(indices)[:nnz], np.asarray(data)[:nnz]
+    return _read_only(np.asarray(indptr)), _read_only(np.asarray(indices)[:nnz]), _read_only(np.asarray(data)[:nnz])
 
 
 def rows_velocity(Data p, const double[:, ::1] v, double[::1] out):

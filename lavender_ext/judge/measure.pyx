@@ -72,6 +72,7 @@ cdef class Judged:
     `impulse` (m,) is kept as it is and must not change any more; the other arrays belong to this.
     """
 
+    cdef readonly Data data                             # of the problem
     cdef readonly object impulse, slack, error          # (m,) N s; w (m,) m/s; e (m,) N s
     cdef readonly double energy, velocity               # sqrt J, m/s; inf where e is not finite
     cdef readonly double relative, floor                # -
@@ -83,6 +84,7 @@ cdef class Judged:
         cdef double* v = NULL
         cdef score_t s = score_t(0.0, 0.0, 0.0, 0.0, -1, 1)
         cdef double x, y
+        self.data = p
         self.impulse = impulse
         self.slack = w = np.empty(lam.shape[0])
         self.error = e = np.empty(lam.shape[0])

@@ -88,7 +88,7 @@ cdef inline int32_t check(watch_t* s, const blocks_t* p, const csr_t* a, const r
                           double* lam, double tol) noexcept nogil:
     """One check; sets the sweeps of the next."""
     cdef score_t x
-    cdef double now, inf = 1.0 / 0.0
+    cdef double now, floor, inf = 1.0 / 0.0
     judge_into(p, a, r, factored, lam, s.w, s.e, s.v, 0, &x)
     now = relative(s, x.energy, x.velocity) if x.finite else inf
     if s.total == 0:
@@ -109,7 +109,8 @@ cdef inline int32_t check(watch_t* s, const blocks_t* p, const csr_t* a, const r
         return DIVERGED
     if s.best_at >= 0 and s.best_relative <= 1e-6:
         judge_into(p, a, r, factored, s.best, s.w, s.e, s.v, 1, &x)
-        if s.best_relative <= 2.0 * relative(s, x.floor_energy, x.floor_velocity):
+        floor = relative(s, x.floor_energy, x.floor_velocity)
+        if s.best_relative <= 2.0 * floor and floor < inf:
             copy(s.best, lam, p.n_rows)
             return AT_FLOOR
     if s.total > 32 * <double>s.best_at + s.patience:
@@ -122,14 +123,15 @@ cdef inline int32_t confirmed(const watch_t* s, const blocks_t* p, const csr_t* 
                               const double* lam, double tol, int32_t status) noexcept nogil:
     """The claim `status`, judged in another form: what does not hold there goes on, or has stalled."""
     cdef score_t x
-    cdef double now
+    cdef double now, floor
     judge_into(p, a, r, factored, lam, s.w, s.e, s.v, status == AT_FLOOR, &x)
     now = relative(s, x.energy, x.velocity) if x.finite else 1.0 / 0.0
     if now <= tol:
         return CONVERGED
     if status == CONVERGED:
         return RUNNING
-    return AT_FLOOR if now <= 2.0 * relative(s, x.floor_energy, x.floor_velocity) else STALLED
+    floor = relative(s, x.floor_energy, x.floor_velocity)
+    return AT_FLOOR if now <= 2.0 * floor and floor < 1.0 / 0.0 else STALLED
 
 
 cdef class Watch:

@@ -1,0 +1,62 @@
+"""What is worked out of a problem once: by one thread, while the others wait, and kept in one declared place."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from threading import RLock
+from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TypeVar, overload
+
+if TYPE_CHECKING:
+    from lavender_ext.judge.measure import Judged
+
+T = TypeVar("T")
+
+
+class Tried(NamedTuple):
+    """What the first phase of `newton` made of a problem's guess."""
+
+    tol: float
+    how: int  # how it ended, a number of the kernel; 0 where it decided nothing
+    sweeps: int
+    factorisations: int
+
+
+class Derived:
+    """Numbers that a problem keeps beside its data; a field is None as long as nobody has asked for it.
+
+    Every field is written whole and read once, so threads that share a problem see a value or None; two that find
+    None work out the same numbers, to the bit.
+    """
+
+    __slots__ = ("judged", "lock", "spread", "start_relative", "tried")
+
+    def __init__(self) -> None:
+        self.lock = RLock()  # held while a `once` is worked out
+        self.start_relative: float | None = None  # -, of doing nothing
+        self.judged: Judged | None = None  # the judge's pass over a result that is about to be returned
+        self.tried: Tried | None = None
+        self.spread: int | None = None  # how far apart blocks that share a body stand
+
+
+class once(Generic[T]):
+    """A property of an object with `derived`, worked out at first use by one thread, then an attribute."""
+
+    def __init__(self, function: Callable[[Any], T]) -> None:
+        self.function = function
+        self.__doc__ = function.__doc__
+        self.name = function.__name__
+
+    @overload
+    def __get__(self, instance: None, owner: type) -> once[T]: ...
+
+    @overload
+    def __get__(self, instance: object, owner: type) -> T: ...
+
+    def __get__(self, instance: Any, owner: type) -> Any:
+        if instance is None:
+            return self
+        kept = instance.__dict__
+        with instance.derived.lock:
+            if self.name not in kept:
+                kept[self.name] = self.function(instance)
+            return kept[self.name]

@@ -1,0 +1,235 @@
+"""What no solver can talk the judge into: claims need finite numbers, and the problem is out of its reach."""
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+from random_problems import as_matrix, random_contact_problem, random_lcp
+
+import lavender as lv
+from lavender import registry
+
+#: Its solution, 1e310, is no number, and so the error of every impulse is infinite.
+FLOORLESS = lv.Problem.linear(1e-310 * np.eye(2), [1.0, 1.0])
+
+
+@pytest.fixture
+def plug_in():
+    """Registers a solver whose `run(problem, impulse)` is given; taken out again."""
+    names = []
+
+    def add(run, **more):
+        class PlugIn:
+            def prepare(self, problem):
+                return problem
+
+            def update(self, state, problem):
+                return problem
+
+            def run(self, state, impulse, n, tol, time_limit=None):
+                return run(state, impulse)
+
+        name = f"plug-in {len(names)}"
+        spec = lv.SolverSpec(
+            name=name, factory=PlugIn, laws=frozenset({"linear", "lcp", "coulomb", "cone"}), summary="a test",
+            **{"resumable": False, **more},
+        )  # fmt: skip
+        registry.register(spec)
+        names.append(name)
+        return name
+
+    yield add
+    for name in names:
+        del registry._registered[name]
+
+
+def says(status, **more):
+    return lv.Claim(status, 1, **more)
+
+
+# -- finite numbers -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", lv.available(FLOORLESS, external=False))
+def test_a_floor_that_is_not_finite_excuses_nothing(name):
+    solution = lv.solve(FLOORLESS, name)
+    assert not np.isfinite(solution.residual.floor)
+    assert not solution.residual.at_floor
+    assert solution.status is not lv.Status.FLOOR
+    assert not solution.success
+    with pytest.raises(lv.errors.SolveFailed):
+        solution.raise_for_status()
+
+
+def test_a_claim_of_floor_needs_finite_numbers(plug_in):
+    name = plug_in(lambda problem, impulse: says(lv.Status.FLOOR))
+    solution = lv.solve(FLOORLESS, name, impulse=[1e300, 1e300])
+    assert solution.contradicted
+    with pytest.raises(lv.errors.SolveFailed):
+        solution.raise_for_status()
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_values_that_are_not_finite_are_divergence(plug_in, value):
+    def run(problem, impulse):
+        impulse[0] = value
+        return says(lv.Status.CONVERGED)
+
+    solution = lv.solve(random_lcp(3), plug_in(run))
+    assert solution.status is lv.Status.DIVERGED
+    assert solution.residual.relative == np.inf
+    assert not solution.success
+
+
+def test_infeasible_and_a_success_exclude_each_other():
+    # No impulse meets the second row, and doing nothing is within a tolerance of 1 of it.
+    problem = lv.Problem.lcp([[1.0, 0.0], [0.0, 0.0]], [0.0, 1.0])
+    assert lv.solve(problem, "pgs").status is lv.Status.INFEASIBLE
+    assert not lv.solve(problem, "pgs").success
+    loose = lv.solve(problem, "pgs", tol=1.0)
+    assert loose.success
+    assert loose.status is lv.Status.CONVERGED
+    assert loose.certificate is None
+
+
+@pytest.mark.parametrize(
+    "error", [FloatingPointError("underflow"), np.linalg.LinAlgError("singular"), MemoryError()]
+)
+@pytest.mark.parametrize("where", ["prepare", "run"])
+def test_what_arithmetic_breaks_on_is_a_result(error, where):
+    class Breaks:
+        def prepare(self, problem):
+            if where == "prepare":
+                raise error
+
+        def update(self, state, problem):
+            return self.prepare(problem)
+
+        def run(self, state, impulse, n, tol, time_limit=None):
+            impulse[0] = np.nan
+            raise error
+
+    registry.register(lv.SolverSpec(name="breaks", factory=Breaks, laws={"lcp"}, summary="", resumable=False))
+    try:
+        solver = lv.prepare(random_lcp(4), "breaks")
+        for _ in range(2):
+            solution = solver.solve()
+            assert solution.status is lv.Status.NUMERICAL_ERROR
+            assert type(error).__name__ in solution.message
+            assert np.isfinite(solution.impulse).all()
+    finally:
+        del registry._registered["breaks"]
+
+
+def test_a_solver_that_does_nothing_is_stopped(plug_in):
+    name = plug_in(lambda problem, impulse: says(lv.Status.MAX_ITERATIONS).__class__(lv.Status.MAX_ITERATIONS, 0),
+                   resumable=True)  # fmt: skip
+    solution = lv.solve(random_lcp(5), name, max_iter=10**9)
+    assert solution.status is lv.Status.STALLED
+    assert "none of the" in solution.message
+
+
+def test_an_exception_of_a_callback_is_its_callers():
+    def callback(iterations, impulse, residual):
+        raise ZeroDivisionError("mine")
+
+    with pytest.raises(ZeroDivisionError, match="mine"):
+        lv.solve(random_lcp(6), "pgs", tol=1e-12, callback=callback)
+
+
+# -- the problem is out of reach ----------------------------------------------------------------------
+
+
+def problems():
+    rows = random_contact_problem(7)
+    dense = rows.dense()
+    return {
+        "rows": rows,
+        "csr": as_matrix(rows),
+        "dense": lv.Problem(rows.b, rows.cones, dense, guess=np.zeros(rows.m)),
+    }
+
+
+def arrays_of(thing, name, seen, depth=0):
+    """(name, array) of every array that can be reached from a thing's public attributes."""
+    if isinstance(thing, np.ndarray):
+        yield name, thing
+    elif sp.issparse(thing):
+        for part in ("data", "indices", "indptr"):
+            yield f"{name}.{part}", getattr(thing, part)
+    elif type(thing).__module__.startswith("lavender") and id(thing) not in seen and depth < 4:
+        seen.add(id(thing))
+        for attribute in dir(type(thing)):
+            if attribute.startswith("__"):
+                continue
+            kind = getattr(type(thing), attribute)
+            if callable(kind) and not isinstance(kind, type):
+                continue
+            try:
+                value = getattr(thing, attribute)
+            except lv.LavenderError:
+                continue
+            yield from arrays_of(value, f"{name}.{attribute}", seen, depth + 1)
+        for attribute, value in getattr(thing, "__dict__", {}).items():
+            yield from arrays_of(value, f"{name}.{attribute}", seen, depth + 1)
+
+
+@pytest.mark.parametrize("form", ["rows", "csr", "dense"])
+def test_every_array_of_a_problem_is_read_only(form):
+    problem = problems()[form]
+    lv.solve(problem, "pgs", max_iter=3)
+    kept = [
+        (name, array)
+        for name, array in arrays_of(problem, "problem", set())
+        # Worked out anew at each call, and the caller's own.
+        if not name.endswith(("cones.n_tangents",))
+    ]
+    names = {name for name, _ in kept}
+    assert {"problem.b", "problem.csr.data", "problem.csr_data.d", "problem.cones.lower"} <= names
+    assert ("problem.jacobian.data" in names) == (form == "rows")
+    assert [name for name, array in kept if array.flags.writeable] == []
+    for matrix in (problem.csr, problem.delassus()):
+        data = matrix.data if sp.issparse(matrix) else matrix
+        with pytest.raises(ValueError, match="read-only"):
+            data[...] = 0.0
+
+
+@pytest.mark.parametrize("form", ["rows", "csr", "dense"])
+def test_a_matrix_exchanged_by_a_solver_changes_no_verdict(form, plug_in):
+    """The arrays of a sparse matrix cannot be written, but exchanged: the judge does not look there."""
+    honest = problems()[form]
+    before = lv.solve(honest, "block_gauss_seidel", tol=1e-9)
+
+    def run(problem, impulse):
+        problem.csr.data = np.zeros_like(problem.csr.data)
+        y = np.zeros(problem.m)
+        y[int(problem.cones.ptr[problem.n_blocks - 1])] = 1.0
+        impulse[:] = before.impulse
+        return says(lv.Status.INFEASIBLE, certificate=y)
+
+    solution = lv.solve(problems()[form], plug_in(run), tol=1e-300)
+    assert "INFEASIBLE" in solution.contradicted
+    assert solution.residual.relative == before.residual.relative
+
+
+def test_the_error_of_doing_nothing_cannot_be_raised(plug_in):
+    def run(problem, impulse):
+        problem.data.set_start(1e300, 1e300)
+        return says(lv.Status.CONVERGED)
+
+    with pytest.raises(ValueError, match="known already"):
+        lv.solve(random_lcp(8), plug_in(run))
+
+
+def test_a_verdict_on_another_problem_is_not_taken(plug_in):
+    from lavender.residuals import judged, remember
+
+    def run(problem, impulse):
+        easy = lv.Problem.lcp(problem.delassus(), np.zeros(problem.m) - 1.0)
+        impulse[:] = 0.0
+        remember(problem, judged(easy, impulse.copy()))
+        return says(lv.Status.CONVERGED)
+
+    problem = random_lcp(9)
+    solution = lv.solve(problem, plug_in(run))
+    assert solution.contradicted
+    np.testing.assert_array_equal(solution.residual.slack, -problem.b)

@@ -1,0 +1,100 @@
+"""Threads: a problem is shared freely, a prepared solver serves one of them at a time and says so."""
+
+import sys
+import threading
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+from random_problems import as_matrix, random_contact_problem, random_lcp
+
+import lavender as lv
+from lavender.errors import InUse
+
+
+def test_a_prepared_solver_refuses_a_second_thread():
+    solver = lv.prepare(random_lcp(1), "pgs")
+    inside, leave = threading.Event(), threading.Event()
+
+    def callback(iterations, impulse, residual):
+        inside.set()
+        assert leave.wait(60)
+        return True
+
+    with ThreadPoolExecutor(1) as pool:
+        first = pool.submit(solver.solve, tol=1e-12, callback=callback)
+        assert inside.wait(60)
+        with pytest.raises(InUse, match="make another one for every thread"):
+            solver.solve()
+        leave.set()
+        assert first.result().status is lv.Status.INTERRUPTED
+    assert solver.solve(tol=1e-6, max_iter=10_000).success  # free again
+
+
+def test_a_prepared_solver_refuses_its_own_callback():
+    solver = lv.prepare(random_lcp(2), "pgs")
+    with pytest.raises(InUse):
+        solver.solve(callback=lambda *_: solver.solve())
+    assert solver.solve(max_iter=10_000).success
+
+
+def test_an_error_leaves_a_prepared_solver_free():
+    solver = lv.prepare(random_lcp(3), "pgs")
+    with pytest.raises(lv.InputError):
+        solver.solve(tol=-1.0)
+    assert solver.solve(max_iter=10_000).success
+
+
+def at_once(function, n=8):
+    """Results of n threads that begin together."""
+    gate = threading.Barrier(n)
+
+    def run():
+        gate.wait(60)
+        return function()
+
+    with ThreadPoolExecutor(n) as pool:
+        return [future.result() for future in [pool.submit(run) for _ in range(n)]]
+
+
+@pytest.fixture
+def often():
+    """Threads change as often as they can."""
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    yield
+    sys.setswitchinterval(before)
+
+
+def unseen(seed, form):
+    """A problem without friction of which nothing was worked out yet."""
+    problem = random_contact_problem(seed, tangents=0, spin=False, joints=0, contacts=12)
+    return as_matrix(problem) if form == "matrix" else problem
+
+
+@pytest.mark.parametrize(
+    ("form", "name"),
+    [(form, name) for form in ("rows", "matrix") for name in lv.available(unseen(0, form), external=False)],
+)
+def test_threads_share_a_problem_that_nobody_has_looked_at(name, form, often):
+    """Everything derived is worked out at first use, by whichever thread comes first: the bits are those of one."""
+    for seed in range(3):
+        alone, problem = lv.solve(unseen(seed, form), name, max_iter=30), unseen(seed, form)
+        for found in at_once(lambda p=problem: lv.solve(p, name, max_iter=30)):
+            assert found.impulse.tobytes() == alone.impulse.tobytes()
+            assert found.residual.relative == alone.residual.relative
+            assert (found.status, found.work) == (alone.status, alone.work)
+
+
+def test_what_is_derived_is_one_object_for_all_threads(often):
+    for seed in range(20):
+        problem = random_contact_problem(seed)
+        for name in ("data", "csr", "csr_data", "jacobian"):
+            assert len({id(x) for x in at_once(lambda p=problem, n=name: getattr(p, n))}) == 1
+
+
+def test_threads_prepare_each_their_own(often):
+    problem = random_contact_problem(5)
+    alone = lv.solve(problem, "block_gauss_seidel", max_iter=50)
+    for found in at_once(lambda: lv.prepare(problem, "block_gauss_seidel").solve(max_iter=50)):
+        np.testing.assert_array_equal(found.impulse, alone.impulse)
