@@ -97,6 +97,9 @@ class Simulation:
     report_residual : bool, default False
         Put the judge's residual over all rows of the final substep into `info["residual"]`; costs about as
         much as a step.
+    report_motion : bool, default False
+        Put how wrong the bodies move after the final substep into `info["motion"]`; costs a solve to the floor,
+        under Coulomb's law two.
 
     Raises
     ------
@@ -104,7 +107,9 @@ class Simulation:
         Not a scene, or one without bodies.
     """
 
-    def __init__(self, scene: Scene | str, *, report_residual: bool = False) -> None:
+    def __init__(
+        self, scene: Scene | str, *, report_residual: bool = False, report_motion: bool = False
+    ) -> None:
         if isinstance(scene, str):
             scene = Scene(scene)
         if not isinstance(scene, Scene):
@@ -113,6 +118,7 @@ class Simulation:
             raise InputError("the scene has no bodies; add some (add_box, add_sphere, add_plane)")
         self.scene = scene
         self.report_residual = report_residual
+        self.report_motion = report_motion
         self._lock, self._inside = RLock(), False
         self._load(scene)
 
@@ -232,7 +238,7 @@ class Simulation:
         truncated : bool
             False
         info : dict
-            time [s], step, failed_solves, and on request residual.
+            time [s], step, failed_solves, and on request residual and motion.
 
         Raises
         ------
@@ -416,8 +422,11 @@ class Simulation:
         info: dict[str, Any] = {"time": self.time, "step": self._steps, "failed_solves": self._failed}
         if lost:
             info["lost_body"] = lost
-        elif self.report_residual and self._state.head.item(HEAD["solved"]):
-            info["residual"] = self._judged()
+        elif self._state.head.item(HEAD["solved"]):
+            if self.report_residual:
+                info["residual"] = self._judged()
+            if self.report_motion:
+                info["motion"] = self._moved()
         return info
 
     # -- the problem ----------------------------------------------------------------------------
@@ -533,6 +542,47 @@ class Simulation:
             "worst": judged.worst_name,
             "share": _shares(problem, judged),
         }
+
+    @_alone
+    def motion(self) -> dict[str, Any]:
+        """How wrong the bodies move after the last substep: distance to its solution, see `lavender.motion_error`.
+
+        Under Coulomb's law, where several motions may be right, the distance is to the nearer of what `auto`
+        finds and of what the step's own impulses lead to.
+
+        Returns
+        -------
+        dict
+            relative [-], kinetic [sqrt J], speed [m/s] and body (its name), spin [rad/s], bound [sqrt J] and
+            bound_speed [m/s]; None where there is no number. open [m/s]: how far apart those two solutions are, 0
+            without friction.
+
+        Raises
+        ------
+        InputError
+            No step has been done.
+        """
+        return self._moved()
+
+    def _moved(self) -> dict[str, Any]:
+        if not self._state.head[HEAD["solved"]]:
+            raise InputError("no step has been done yet, or the last was stopped; call step() and ask again")
+        problem = self._problem(self._state)
+        impulse = self._state.a["impulse"][: problem.m].copy()
+        from lavender import motion
+
+        error, apart = motion.measure(problem, impulse, motion.reference(problem)), 0.0
+        if problem.law == "coulomb":
+            own = motion.branch(problem, impulse)
+            near = motion.measure(problem, impulse, own)
+            if own.accepted and error.reference.accepted:
+                apart = motion.measure(problem, own.impulse, error.reference).speed or 0.0
+            if near.kinetic is not None and (error.kinetic is None or near.kinetic < error.kinetic):
+                error = near
+        names = ("relative", "kinetic", "speed", "spin", "bound", "bound_speed")
+        moving = [b.name for b in self.scene.bodies if not b.is_static]
+        body = moving[error.body] if error.body >= 0 else ""
+        return {**{name: getattr(error, name) for name in names}, "body": body, "open": apart}
 
     def record(self, folder: str | PathLike[str], steps: int, *, form: str = "npz") -> list[Path]:
         """Step `steps` times and write the problem of each (of its first substep), with its warm start.

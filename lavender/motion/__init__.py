@@ -8,9 +8,9 @@ lv.motions(problem).spread                             # m/s that Coulomb's law 
 """
 
 from lavender.motion.bound import Witness
-from lavender.motion.error import MotionError, motion_error
+from lavender.motion.error import MotionError, measure, motion_error
 from lavender.motion.reference import Reference, adopt, reference
-from lavender.motion.several import Motion, Motions, motions
+from lavender.motion.several import Motion, Motions, branch, distance, motions
 from lavender.motion.unique import uniqueness
 
 __all__ = [
@@ -20,6 +20,9 @@ __all__ = [
     "Reference",
     "Witness",
     "adopt",
+    "branch",
+    "distance",
+    "measure",
     "motion_error",
     "motions",
     "reference",

@@ -17,6 +17,7 @@ from lavender._arrays import FloatArray
 from lavender.cones import ROW, project
 from lavender.errors import CapabilityError, InputError, LavenderError
 from lavender.motion.bound import difference
+from lavender.motion.error import SAME
 from lavender.motion.reference import Reference, judged, kept
 from lavender.motion.reference import reference as reference_of
 from lavender.motion.unique import uniqueness
@@ -25,7 +26,7 @@ from lavender.registry import available, get
 from lavender.residuals import residual
 from lavender.solve import solve
 
-__all__ = ["CHOICES", "Motion", "Motions", "Pick", "motions"]
+__all__ = ["CHOICES", "Motion", "Motions", "Pick", "branch", "motions"]
 
 RUNS = 12  # of a search, after `auto` itself
 SOLVERS = ("anderson", "newton", "sequential_impulses", "block_gauss_seidel", "admm", "nncg")
@@ -33,9 +34,6 @@ ORDERS = ("given", "reverse", "random")
 ASKED = 1e-11  # relative residual asked of a run, which nobody but its own solver ends
 WORK = 2e9  # of `Data.work`, about nanoseconds: what the sweeps of one run may cost
 SWEEPS = (400, 20_000)  # least and most of one run
-# Motions nearer than this are one, as a share of the constraints' own motion: a residual of 1e-10 moves by up to
-# 1e-7 of it on the worst conditioned piles of the suite.
-SAME = 1e-6
 CHOICES = ("nearest", "dissipation", "compliant")
 SOFTEST, STEP = 1.0, 0.1  # softness of "compliant" as a share of d, and what each round leaves of it
 HARDEST = 1e-12
@@ -62,6 +60,14 @@ class Motion:
             f"relative {self.relative:.1e}, energy {self.energy:.6g} J, friction takes {self.dissipation:.4g} J, "
             f"lift {self.lift:.1e} m/s, found {self.count} times"
         )
+
+
+class Distance(NamedTuple):
+    """Of two motions."""
+
+    speed: float  # m/s of a body; of a row where bodies are not known
+    energy: float  # sqrt J, sqrt(1/2) |.|_A; m/s of a row where A is no energy
+    share: float  # -, that over the larger of the same of both
 
 
 class Pick(NamedTuple):
@@ -124,7 +130,7 @@ class Motions:
 
     def nearest(self, impulse: FloatArray) -> Motion:
         """The motion at the least distance from an impulse (m,) [N s]."""
-        return min(self.motions, key=lambda motion: _distance(self.problem, impulse, motion.impulse)[1])
+        return min(self.motions, key=lambda motion: distance(self.problem, impulse, motion.impulse).energy)
 
     def picks(
         self, solvers: Iterable[str] | None = None, *, tol: float = 1e-9, max_iter: int = SWEEPS[1]
@@ -150,8 +156,8 @@ class Motions:
             out[name] = None
             if self.motions and found.residual.relative <= max(tol, 2.0 * found.residual.floor):
                 near = self.nearest(found.impulse)
-                distance = _distance(p, found.impulse, near.impulse)[0]
-                out[name] = Pick(self.motions.index(near), distance)
+                off = distance(p, found.impulse, near.impulse)
+                out[name] = Pick(self.motions.index(near), off.speed)
         return out
 
     def __str__(self) -> str:
@@ -207,8 +213,8 @@ def motions(problem: Problem, n: int = RUNS, seed: int = 0) -> Motions:
     speed, energy = 0.0, 0.0
     for i, one in enumerate(merged):
         for two in merged[:i]:
-            v, e, _ = _distance(problem, one.impulse, two.impulse)
-            speed, energy = max(speed, v), max(energy, e)
+            apart = distance(problem, one.impulse, two.impulse)
+            speed, energy = max(speed, apart.speed), max(energy, apart.energy)
     result = Motions(
         problem,
         tuple(merged),
@@ -220,6 +226,26 @@ def motions(problem: Problem, n: int = RUNS, seed: int = 0) -> Motions:
     )
     kept(problem).motions = result
     return result
+
+
+def branch(problem: Problem, impulse: Any) -> Reference:
+    """The solution that an impulse (m,) [N s] leads to: sweeps from it to the floor, then `newton` where they stop.
+
+    Where Coulomb's law leaves several motions, this is the one that a solver stopped early was on its way to.
+    Kept by nobody; `accepted` says whether it is a solution.
+    """
+    found = None
+    x = problem.impulse_array(impulse)
+    for name in ("anderson", "newton"):
+        if name not in available(problem):
+            continue
+        end = solve(problem, name, impulse=x, tol=ASKED)
+        new = judged(problem, end.impulse, f"{name} from it") if np.isfinite(end.impulse).all() else None
+        if new is not None and (found is None or new.residual.relative < found.residual.relative):
+            found = new
+        if found is not None and found.accepted:
+            break
+    return reference_of(problem) if found is None else found
 
 
 def compliant(problem: Problem) -> FloatArray:
@@ -289,7 +315,7 @@ def _merge(problem: Problem, found: list[tuple[Reference, str]]) -> list[Motion]
     groups: list[list[tuple[Reference, str]]] = []
     for one in found:
         for group in groups:
-            if _distance(problem, one[0].impulse, group[0][0].impulse)[2] <= SAME:
+            if distance(problem, one[0].impulse, group[0][0].impulse).share <= SAME:
                 group.append(one)
                 break
         else:
@@ -322,8 +348,8 @@ def _motion(problem: Problem, reference: Reference, labels: tuple[str, ...]) -> 
     )
 
 
-def _distance(problem: Problem, x: FloatArray, y: FloatArray) -> tuple[float, float, float]:
-    """Of two impulses: m/s of a body (or row, without bodies); sqrt J (m/s where A is no energy); that as a share."""
+def distance(problem: Problem, x: FloatArray, y: FloatArray) -> Distance:
+    """How far apart the motions of two impulses (m,) [N s] are."""
     own = kept(problem)
     operator = own.operator
     delta, size = difference(operator, x, y)
@@ -337,4 +363,4 @@ def _distance(problem: Problem, x: FloatArray, y: FloatArray) -> tuple[float, fl
     else:
         far = size.energy
         whole = max(operator.size(z, np.zeros(problem.m)).energy for z in (x, y))
-    return fastest, far, far / whole if whole > 0.0 else (0.0 if far == 0.0 else np.inf)
+    return Distance(fastest, far, far / whole if whole > 0.0 else (0.0 if far == 0.0 else np.inf))
