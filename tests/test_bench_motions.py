@@ -80,4 +80,4 @@ def test_the_command_writes_both_tables(tmp_path):
     with open(tmp_path / "motions.csv", newline="") as stream:
         assert [row["case"] for row in csv.DictReader(stream)] == ["stack(n=8)", "box_stackF(n=2)"]
     bad = CliRunner().invoke(cli.cli, ["bench", "motions", "stack(n=8)", "--out", str(tmp_path / "no")])
-    assert bad.exit_code == 2
+    assert isinstance(bad.exception, lv.InputError)
