@@ -8,6 +8,7 @@ from random_problems import as_matrix, random_contact_problem, random_lcp, seeds
 
 import lavender as lv
 from lavender import registry, suite
+from lavender.solvers._costs import Costs
 from lavender.solvers._islands import islands, restrict, rows_of
 
 
@@ -113,7 +114,33 @@ def test_the_message_names_what_ran_and_work_counts_it(problem, word):
 def test_sweeps_are_not_tried_where_a_factor_is_cheap_or_they_hardly_move(problem):
     solution = lv.solve(problem(), "auto", tol=1e-9)
     assert good(solution, 1e-9), solution
-    assert solution.message.startswith("newton"), solution.message
+    assert solution.message.split()[0] in ("newton", "direct"), solution.message
+
+
+def test_costs_order_what_is_known_to_be_ordered():
+    # A chain's factor is cheap, a pile's is not; a tighter tolerance asks for more sweeps, not for more factors.
+    chain, pile = (Costs(suite.case(name).problem, 1e-6) for name in ("stack(n=1000)", "granular(n=9)"))
+    assert chain.exact[0].cost < chain.sweeping
+    assert chain.guess < chain.sweeping
+    assert pile.sweeping < pile.exact[0].cost
+    assert pile.guess > pile.sweeping  # so that nothing is factored to find out
+    tight = Costs(suite.case("granular(n=9)").problem, 1e-9)
+    assert tight.sweeping > pile.sweeping
+    assert tight.exact == pile.exact
+
+
+def test_costs_are_counted_and_not_timed():
+    # The same numbers whenever they are asked for: a choice depends on the problem alone.
+    for seed in range(20):
+        one, two = (Costs(suite.wild(seed=seed, rows=300).problem, 1e-6) for _ in range(2))
+        assert (one.sweeping, one.guess, one.exact) == (two.sweeping, two.guess, two.exact)
+
+
+@pytest.mark.parametrize("seed", range(3, 60, 6))
+def test_a_drawn_problem_is_solved_the_same_way_twice(seed):
+    one, two = (lv.solve(suite.wild(seed=seed, rows=300).problem, "auto", tol=1e-6) for _ in range(2))
+    assert one.message == two.message
+    assert one.impulse.tobytes() == two.impulse.tobytes()
 
 
 @given(seed=seeds)

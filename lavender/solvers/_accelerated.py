@@ -100,8 +100,19 @@ def _operator(problem: Problem) -> Any:
 
     Of one row the rows of A cost what body velocities cost, and mixing then need not form the velocities anew.
     """
+    return problem.data if _entries(problem) is None else problem.csr_data
+
+
+def sweep_work(problem: Problem) -> int:
+    """Rough number of multiply-adds of one sweep, over what it runs over (`Data.work`), without forming that."""
+    entries = _entries(problem)
+    return int(problem.data.work) if entries is None else entries + 4 * problem.m
+
+
+def _entries(problem: Problem) -> int | None:
+    """Entries of A at most, where sweeps over its rows beat body velocities."""
     rows = problem.rows
     if rows is None or problem.law != "lcp" or rows.n_joints or problem.m > problem.n_blocks:
-        return problem.data
-    entries = assemble.bound(problem.data)[0]
-    return problem.csr_data if entries <= min(NEIGHBOURS * problem.m, ENTRIES) else problem.data
+        return None
+    entries = int(assemble.bound(problem.data)[0])
+    return entries if entries <= min(NEIGHBOURS * problem.m, ENTRIES) else None

@@ -1,25 +1,24 @@
-"""The only solver that hands over to others: which ones, by law, size, structure, form and tol.
+"""The only solver that hands over to others: each in its turn, by what it would cost from here on.
 
-    linear            direct; newton where that stops early
-    lcp, symmetric    direct on narrow bands and few rows; newton on wider bands, and where there are more
-                      rows than the bodies can tell apart or mass ratios of 1e3; else anderson as long as it
-                      gets on, then newton
-    lcp, other        newton, lemke
-    cone              newton on faces that rest on faces; else anderson as long as it gets on, then newton
-    coulomb           anderson as long as it gets on, then newton; a few contacts by a dozen sweeps of
-                      block_gauss_seidel too; loose and large piles first
-                      through the convex relaxation, whose answer is the Coulomb answer wherever
-                      contacts stick
+    linear            direct, newton
+    others            a finite solver at once where its factor costs less than sweeps usually do; else anderson
+                      as long as what it still needs, by its contraction so far, costs less than the cheapest
+                      finite solver (direct, newton, lemke, as the law allows); then that one, with twice the
+                      factorisations that it is expected to need; then anderson again, from where it stood, with
+                      twice the allowance; and so on
+    coulomb           loose and large piles first through the convex relaxation, whose answer is the Coulomb
+                      answer wherever contacts stick
 
-Sweeps get on as long as their contraction so far promises an end within a fixed number of them: counted,
-never timed. Islands are solved apart once sweeps over all of them have not ended it, each to its share
-of the whole error. What is left unsolved is asked for a certificate that it has no solution. The message
-and `work` say what ran.
+Costs are counted from the structure (`_costs.py`) and from the contraction of sweeps that were done, never timed:
+the same problem is solved the same way everywhere. Islands are solved apart, each to its share of the
+whole error, where that costs less than the whole. What is left unsolved is asked for a certificate that it
+has no solution. The message and `work` say what ran.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from time import perf_counter
 from typing import Any
 
@@ -31,21 +30,24 @@ from lavender.problem import Problem
 from lavender.registry import SolverSpec, get
 from lavender.residuals import at_floor, check_certificate, known, quick, reference
 from lavender.solution import Claim, Status
-from lavender.solvers._islands import block_bodies, islands, restrict, rows_of
-from lavender_ext.factor import graph
+from lavender.solvers._costs import ISLAND, LOOK, SWEEP_START, Costs, is_loose, islands_cost
+from lavender.solvers._islands import islands, restrict, rows_of
+from lavender.solvers.newton import NewtonState
 
-NARROW = 12  # half-bandwidth up to which a band factorisation costs less than anything else
-FEW = 64  # rows up to which a dense factorisation does
-HEAVY = 1e3  # mass ratio at which sweeps are not tried
 LARGE = 4000  # rows from which friction goes through the relaxation
-BANDED = 1200.0  # multiply-adds of a band's factor for each nonzero of A up to which sweeps are not tried
 HUGE = 40_000  # rows from which friction is left to sweeps before any factorisation
 FIRST_LOOK = 16  # sweeps before the first look at the residual
 CLOCK = 0.01  # s between two looks at the clock, at a nanosecond for each unit of work
-CAP = 800  # sweeps that may be promised; twice that for large problems
+CAP = 800  # sweeps of the relaxation that may be promised; twice that for large problems
+FEW = 64  # rows up to which Python's share decides: `direct` for an LCP
+FEW_JOINTS = 300  # rows up to which a linear system is not looked at more closely
+RELAXED = 0.3e6  # ns that sweeps usually take from which Coulomb's law is relaxed first: a problem of its own
 WARM = 1e-3  # relative residual from which an iterate is worth starting from
-HOPELESS = 0.5  # relative residual after the first sweeps of a few contacts with which they end
-NEARLY = 1e-2  # relative residual after the first sweeps from which more of them are worth it
+HOPE = 0.4  # share of a finite solver's cost that sweeps may take without promising an end
+BELIEVED = 2.0  # times a finite solver's cost that sweeps may take, whatever they promise
+GLANCE = 0.35  # share of a finite solver's cost for which a first look at sweeps is always worth it
+APART = 10.0  # islands' worth of Python from which a finite solver is compared with islands solved apart
+ROUNDS = 8  # times that sweeps and finite solvers take turns, the allowance doubled each time
 CERTIFICATE_ROWS = 3000  # rows up to which a linear program is asked for a certificate
 CERTIFICATE_STEPS = 100  # of the simplex method for each row at most
 
@@ -63,10 +65,13 @@ class Trail:
     work: dict[str, int] = field(default_factory=dict)
     iterations: int = 0
     certificate: FloatArray | None = None
-    tried: set[str] = field(default_factory=set)  # solvers run on the whole of it
+    ended: dict[str, float] = field(
+        default_factory=dict
+    )  # finite solvers that gave up: residual they started from
 
     def __post_init__(self) -> None:
         m = self.problem.m
+        self.costs = Costs(self.problem, self.tol)
         self.impulse = self.problem.start()
         self.w, self.e = np.empty(m), np.empty(m)
 
@@ -77,6 +82,34 @@ class Trail:
         if relative < self.best:
             self.best, self.impulse = relative, impulse.copy()
         return relative
+
+    @cached_property
+    def islands(self) -> tuple[int, IntArray]:
+        """How many, and the island of each block."""
+        return islands(self.problem)
+
+    def wrong_islands(self) -> tuple[IntArray, IntArray]:
+        """Which islands (count,) miss their share of the whole tolerance, and the island of each row (m,)."""
+        count, label = self.islands
+        problem = self.problem
+        energy, velocity = reference(problem)
+        quick(problem, self.impulse, self.w, self.e)
+        of_row = np.repeat(label, np.diff(problem.cones.ptr))
+        own_energy = np.sqrt(np.bincount(of_row, problem.d * self.e**2, minlength=count))
+        own_velocity = np.zeros(count)
+        np.maximum.at(own_velocity, of_row, problem.data.weight * np.abs(self.e))
+        # A pair of tangents counts by its norm, at most sqrt(2) times its larger entry.
+        wrong = (own_energy > self.tol * energy / np.sqrt(count)) | (
+            np.sqrt(2.0) * own_velocity > self.tol * velocity
+        )
+        return np.flatnonzero(wrong).astype(np.int32), of_row.astype(np.int32)
+
+    def apart_cost(self) -> float:
+        """Of the islands that are wrong, each solved apart [ns]; inf where there is one island."""
+        if self.islands[0] <= 1:
+            return np.inf
+        wrong, of_row = self.wrong_islands()
+        return islands_cost(self.problem, np.bincount(of_row, minlength=self.islands[0])[wrong])
 
     @property
     def done(self) -> bool:
@@ -152,147 +185,202 @@ def _usable(name: str, problem: Problem) -> SolverSpec | None:
     return spec if spec.refuses(problem) is None else None
 
 
-def _whole(trail: Trail, name: str, budget: int) -> bool:
-    """Run a solver to its end from the best impulse; True when nothing is left to do."""
+def _whole(trail: Trail, name: str, budget: int, limit: int = 0) -> bool:
+    """Run a finite solver from the best impulse, to its end or `limit` iterations; True when nothing is left to do."""
     spec = _usable(name, trail.problem)
     if spec is None or budget <= trail.iterations:
         return trail.done
-    trail.tried.add(name)
     solver = spec.load()()
-    state = solver.prepare(trail.problem)
+    state = _newton_state(trail) if name == "newton" else solver.prepare(trail.problem)
     # Half-finished sweeps mislead a Newton method; Pi(0) does not.
-    impulse = trail.impulse.copy() if trail.best <= WARM else trail.problem.start()
+    before = trail.best
+    impulse = trail.impulse.copy() if before <= WARM else trail.problem.start()
     left = None if np.isinf(trail.deadline) else max(trail.deadline - perf_counter(), 1e-3)
-    limit = min(spec.max_iter, budget - trail.iterations)
-    claim: Claim = solver.run(state, impulse, limit, trail.tol, left)
+    most = min(limit or spec.max_iter, spec.max_iter, budget - trail.iterations)
+    claim: Claim = solver.run(state, impulse, most, trail.tol, left)
     trail.add(name, claim)
     if np.isfinite(impulse).all():
         trail.offer(impulse)
     if claim.status is Status.INTERRUPTED:
         raise KeyboardInterrupt
+    if claim.status is not Status.MAX_ITERATIONS:
+        trail.ended[name] = before
     if claim.certificate is not None and check_certificate(trail.problem, claim.certificate) is None:
         trail.certificate = claim.certificate
     return trail.done
 
 
-def _sweeps(trail: Trail, name: str, budget: int, cap: int, patient: bool = False, **options: Any) -> bool:
-    """Sweep from the best impulse as long as an end within `cap` sweeps is promised, or up to `cap` if patient."""
-    problem = trail.problem
-    spec = _usable(name, problem)
-    if spec is None:
+def _newton_state(trail: Trail) -> NewtonState:
+    """What `newton` prepares, from the system whose cost was looked at."""
+    system = trail.costs.system
+    return NewtonState(trail.problem, system if system.sc.m else None)
+
+
+class _Sweeps:
+    """Accelerated sweeps of one problem, which go on where they stood."""
+
+    def __init__(self, trail: Trail, name: str = "anderson", **options: Any) -> None:
+        self.trail, self.name = trail, name
+        spec = _usable(name, trail.problem)
+        self.usable = spec is not None
+        if spec is not None:
+            self.solver: Any = spec.load()(**options)
+            self.state = self.solver.prepare(trail.problem)
+            self.impulse = trail.impulse.copy()
+        self.done = 0  # sweeps
+        self.last, self.at = trail.best, 0  # residual of the last look, and when it was
+        self.ended = False  # by a claim of its own, or because the residual does not fall
+
+    def run(self, budget: int, worth: float | None = None, cap: int | None = None) -> bool:
+        """Sweep while the rest is expected to cost at most `worth` [ns]; a share of that may be spent on hope alone.
+
+        Without `worth`, that is the cheapest finite solver. With `cap`, an end within that many sweeps must be
+        promised instead.
+        """
+        trail, problem, tol = self.trail, self.trail.problem, self.trail.tol
+        if not self.usable or self.ended:
+            return trail.done
+        per = trail.costs.sweep
+        chunk = max(1, int(CLOCK * 1e9) // max(1, problem.data.work))
+        begun, looks, total = self.done, 0, dict[str, int]()
+        step = FIRST_LOOK
+        while not trail.late:
+            step = min(step, budget - trail.iterations - (self.done - begun))
+            if cap is not None:
+                step = min(step, cap - self.done)
+            if step <= 0:
+                break
+            # In short runs for the clock and Ctrl-C alone: cut anywhere, sweeps give the same bits.
+            before = self.done
+            for start in range(0, step, chunk):
+                claim: Claim = self.solver.run(self.state, self.impulse, min(chunk, step - start), tol, None)
+                self.done += claim.iterations
+                for kind, count in claim.work.items():
+                    total[kind] = total.get(kind, 0) + count
+                if claim.status is not Status.MAX_ITERATIONS or trail.late:
+                    break
+            now = trail.offer(self.impulse)
+            looks += 1
+            if claim.status is not Status.MAX_ITERATIONS or now <= tol or self.done == before:
+                self.ended = not now <= tol
+                break
+            rest = self.expected(now, tol)
+            self.last, self.at = now, self.done
+            if cap is not None:
+                if self.done - begun > 2 * FIRST_LOOK and self.done + rest > cap:
+                    break
+            elif self.dearer(rest * per, looks * LOOK + (self.done - begun) * per, worth):
+                break
+            step = max(FIRST_LOOK, self.done // 2)
+        trail.add(self.name, Claim(Status.MAX_ITERATIONS, self.done - begun, total))
         return trail.done
-    tol = trail.tol
-    solver: Any = spec.load()(**options)
-    state = solver.prepare(problem)
-    impulse = trail.impulse.copy()
-    total: dict[str, int] = {}
-    done, step = 0, FIRST_LOOK
-    last = trail.best
-    chunk = max(1, int(CLOCK * 1e9) // max(1, problem.data.work))
-    while not trail.late:
-        step = min(step, cap - done, budget - trail.iterations - done)
-        if step <= 0:
-            break
-        # In short runs for the clock and Ctrl-C alone: cut anywhere, sweeps give the same bits.
-        before = done
-        for start in range(0, step, chunk):
-            claim: Claim = solver.run(state, impulse, min(chunk, step - start), tol, None)
-            done += claim.iterations
-            for kind, count in claim.work.items():
-                total[kind] = total.get(kind, 0) + count
-            if claim.status is not Status.MAX_ITERATIONS or trail.late:
-                break
-        now = trail.offer(impulse)
-        if claim.status is not Status.MAX_ITERATIONS or now <= tol or done == before:
-            break
-        if done > 2 * FIRST_LOOK and not patient:
-            gain = np.log(last / now) if 0.0 < now < last else 0.0
-            if gain <= 0.0 or done + step * np.log(now / max(tol, 1e-16)) / gain > cap:
-                break
-        last = now
-        step = max(FIRST_LOOK, done // 2)
-    trail.add(name, Claim(Status.MAX_ITERATIONS, done, total))
-    return trail.done
+
+    def dearer(self, rest: float, spent: float, worth: float | None) -> bool:
+        """Whether what is left costs more than what else there is; looked at closely only where it may."""
+
+        def than(other: float) -> bool:
+            # What was promised before and did not come about is not believed for ever.
+            return (rest > other and spent > HOPE * other) or spent > BELIEVED * other
+
+        if worth is not None:
+            return than(worth)
+        if min(rest, spent) > APART * ISLAND and than(self.trail.apart_cost()):
+            return True
+        return than(self.trail.costs.guess) and than(self.trail.costs.exact[0].cost)
+
+    def expected(self, now: float, tol: float) -> float:
+        """Sweeps left at the contraction since the last look."""
+        gain = np.log(self.last / now) if 0.0 < now < self.last else 0.0
+        return (self.done - self.at) * np.log(now / max(tol, 1e-16)) / gain if gain > 0.0 else np.inf
 
 
 # -- the plan ---------------------------------------------------------------------------------------
 
 
-def _solve(trail: Trail, budget: int) -> None:
-    problem = trail.problem
-    if problem.law == "linear":
-        # A sparse factorisation takes islands apart by itself.
-        _connected(trail, budget, swept=False)
-        return
-    swept = _sweeps_first(problem)
-    if swept and _sweep(trail, budget):
-        return
-    # A band factorisation takes islands apart by itself, too.
-    narrow = not swept and problem.law == "lcp" and problem.is_symmetric and _bandwidth(problem) <= NARROW
-    if narrow and _whole(trail, "direct", budget):
-        return
-    count, label = islands(problem)
-    if count <= 1:
-        _connected(trail, budget, swept)
-    else:
-        _apart(trail, count, label, budget)
-
-
-def _sweeps_first(problem: Problem) -> bool:
-    """Whether sweeps are worth a try, by what is known without looking closer."""
-    if problem.law == "lcp":
-        return problem.is_symmetric and not (
-            _is_small_or_narrow(problem)
-            or _is_heavy(problem)
-            or _is_redundant(problem)
-            or _is_banded(problem)
-        )
-    if problem.law == "cone" and _is_redundant(problem) and not _is_loose(problem):
-        return False  # faces on faces: the same weight rests on several points, and sweeps hardly move it
-    return not _is_heavy(problem)
-
-
-def _sweep(trail: Trail, budget: int) -> bool:
-    problem = trail.problem
-    if problem.law == "lcp":
-        return _sweeps(trail, "anderson", budget, _cap(problem))
-    few = problem.law == "coulomb" and problem.m <= FEW
-    if problem.law == "coulomb" and not few and problem.rows is not None:
-        if (problem.m >= LARGE or _is_loose(problem)) and _relaxation(trail, budget):
-            return True
-        if problem.m >= HUGE:
-            # A factorisation is out of reach: sweeps, however many they take.
-            return _sweeps(trail, "nncg", budget, 10 * CAP, patient=True, order="symmetric")
-    if few:
-        # A few contacts end within a dozen sweeps, accelerated or exact on each contact, or hardly ever.
-        for name in ("anderson", "block_gauss_seidel"):
-            if trail.best > HOPELESS and trail.iterations:
-                return False
-            if _sweeps(trail, name, budget, FIRST_LOOK):
-                return True
-        return trail.best <= NEARLY and _sweeps(trail, "anderson", budget, _cap(problem))
-    return _sweeps(trail, "anderson", budget, _cap(problem))
-
-
 @np.errstate(all="ignore")  # what overflows is judged
-def _apart(trail: Trail, count: int, label: IntArray, budget: int) -> None:
+def _solve(trail: Trail, budget: int) -> None:
+    problem, costs = trail.problem, trail.costs
+    if problem.law == "linear":
+        # A sparse factorisation takes islands apart by itself; newton where that stops early.
+        names = [e.name for e in costs.exact] if problem.m > FEW_JOINTS else ["direct", "newton"]
+        if not any(_whole(trail, name, budget) for name in names):
+            _certify(trail)
+        return
+    sweeps = None
+    if problem.law == "lcp" and problem.m <= FEW and problem.is_symmetric:
+        # START of sweeps alone costs more than a dense factor of so few rows.
+        if _whole(trail, "direct", budget):
+            return
+    elif not _at_once(costs):
+        if _relaxed_first(trail, budget):
+            return
+        sweeps = _Sweeps(trail)
+        if sweeps.run(budget):
+            return
+    whole = costs.exact[0].cost
+    if whole > 2.0 * ISLAND and trail.apart_cost() < whole and _apart(trail, budget):
+        return
+    _finish(trail, sweeps, budget)
+
+
+def _at_once(costs: Costs) -> bool:
+    """A finite solver costs less than sweeps usually do, and even a first look at them would be dear beside it."""
+    glance = SWEEP_START + LOOK + FIRST_LOOK * costs.sweep
+    for cost in (costs.guess, costs.exact[0].cost) if costs.guess <= costs.sweeping else (np.inf,):
+        if cost > costs.sweeping or (glance < GLANCE * cost and not costs.redundant):
+            return False
+    return True
+
+
+def _relaxed_first(trail: Trail, budget: int) -> bool:
+    problem = trail.problem
+    if problem.law != "coulomb" or problem.rows is None or trail.costs.sweeping < RELAXED:
+        return False
+    return (problem.m >= LARGE or is_loose(problem)) and _relaxation(trail, budget)
+
+
+def _finish(trail: Trail, sweeps: _Sweeps | None, budget: int) -> None:
+    """Finite solvers and sweeps in turn, the allowance doubled each time, until one is there or all have given up."""
+    problem, costs = trail.problem, trail.costs
+    if problem.law == "coulomb" and problem.m >= HUGE and problem.rows is not None:
+        # A factorisation is out of reach: sweeps, however many they take.
+        last = _Sweeps(trail, "nncg", order="symmetric")
+        if last.run(budget, np.inf, cap=10 * CAP):
+            return
+    allowance = 0.0
+    for k in range(ROUNDS):
+        before, spent = trail.best, trail.iterations
+        for candidate in costs.exact:
+            if trail.best <= trail.tol or budget <= trail.iterations:
+                return
+            started = trail.ended.get(candidate.name)
+            if started is not None and not trail.best <= 0.1 * started:
+                continue  # it gave up, and would do so again
+            if _whole(trail, candidate.name, budget, candidate.limit << k):
+                return
+        allowance = max(2.0 * allowance, 2.0 * costs.exact[0].cost)
+        sweeps = sweeps or _Sweeps(trail)
+        if sweeps.run(budget, allowance):
+            return
+        if trail.late or (spent == trail.iterations and trail.best >= before):
+            break
+    if problem.law == "coulomb" and _Sweeps(trail, "block_gauss_seidel").run(budget, np.inf, cap=10 * CAP):
+        return
+    _certify(trail)
+
+
+def _apart(trail: Trail, budget: int) -> bool:
     """Solve every island that misses its share of the whole tolerance."""
     problem = trail.problem
+    count, label = trail.islands
     energy, velocity = reference(problem)
-    quick(problem, trail.impulse, trail.w, trail.e)
-    of_row = np.repeat(label, np.diff(problem.cones.ptr))
-    d, weight = problem.d, problem.data.weight
     share = trail.tol * energy / np.sqrt(count)
-    own_energy = np.sqrt(np.bincount(of_row, d * trail.e**2, minlength=count))
-    own_velocity = np.zeros(count)
-    np.maximum.at(own_velocity, of_row, weight * np.abs(trail.e))
-    # A pair of tangents counts by its norm, at most sqrt(2) times its larger entry.
-    wrong = (own_energy > share) | (np.sqrt(2.0) * own_velocity > trail.tol * velocity)
+    wrong, _ = trail.wrong_islands()
     order = np.argsort(label, kind="stable")
     ends = np.searchsorted(label[order], np.arange(count + 1))
     kinds: dict[str, int] = {}
     impulse = trail.impulse.copy()
-    for i in np.flatnonzero(wrong):
+    for i in wrong:
         blocks: IntArray = order[ends[i] : ends[i + 1]].astype(np.int32)
         rows = rows_of(problem, blocks)
         part = restrict(problem, blocks, rows)
@@ -300,10 +388,9 @@ def _apart(trail: Trail, count: int, label: IntArray, budget: int) -> None:
         tol = min(share / e0 if e0 > 0.0 else np.inf, trail.tol * velocity / v0 if v0 > 0.0 else np.inf)
         sub = Trail(part, min(tol, 1.0) if np.isfinite(tol) else trail.tol, trail.deadline)
         sub.offer(impulse[rows])
-        swept = part.m < problem.m // 2 and _sweeps_first(part)
         try:
-            if not (swept and _sweep(sub, budget - trail.iterations)):
-                _connected(sub, budget - trail.iterations, swept)
+            if not sub.done:
+                _solve_island(sub, budget - trail.iterations)
         except KeyboardInterrupt:
             impulse[rows] = sub.impulse
             trail.offer(impulse)
@@ -322,31 +409,17 @@ def _apart(trail: Trail, count: int, label: IntArray, budget: int) -> None:
             break
     trail.offer(impulse)
     parts = "; ".join(f"{number} x {text}" if number > 1 else text for text, number in kinds.items())
-    trail.steps.append(f"{int(wrong.sum())} of {count} islands: {parts}")
+    trail.steps.append(f"{len(wrong)} of {count} islands: {parts}")
+    return trail.done
 
 
-def _connected(trail: Trail, budget: int, swept: bool) -> None:
-    """One island after its sweeps, or a linear system."""
-    problem = trail.problem
-    if trail.best <= trail.tol or budget <= trail.iterations:
-        return
-    names: tuple[str, ...]
-    if problem.law == "linear":
-        names = ("direct", "newton")
-    elif problem.law != "lcp":
-        names = ("newton",)
-    elif not problem.is_symmetric:
-        names = ("newton", "lemke")
-    elif not swept and _is_small_or_narrow(problem):
-        names = ("direct", "newton", "lemke")
-    else:
-        names = ("newton", "direct", "lemke")
-    for name in names:
-        if name not in trail.tried and _whole(trail, name, budget):
+def _solve_island(trail: Trail, budget: int) -> None:
+    sweeps = None
+    if not _at_once(trail.costs):
+        sweeps = _Sweeps(trail)
+        if sweeps.run(budget):
             return
-    if problem.law == "coulomb" and _sweeps(trail, "block_gauss_seidel", budget, 10 * CAP):
-        return
-    _certify(trail)
+    _finish(trail, sweeps, budget)
 
 
 def _relaxation(trail: Trail, budget: int) -> bool:
@@ -359,7 +432,7 @@ def _relaxation(trail: Trail, budget: int) -> bool:
         if problem.m >= HUGE and k == 1:
             break
         convex.tol = trail.tol * 0.1**k
-        _sweeps(convex, "anderson", budget - trail.iterations, _cap(problem))
+        _Sweeps(convex).run(budget - trail.iterations, np.inf, cap=_cap(problem))
         trail.offer(convex.impulse)
         if trail.done or trail.best > 0.5 * before or convex.best > convex.tol:
             break
@@ -413,54 +486,8 @@ def _certify(trail: Trail) -> None:
 # -- what a problem looks like ------------------------------------------------------------------------
 
 
-def _is_small_or_narrow(problem: Problem) -> bool:
-    return problem.m <= FEW or _bandwidth(problem) <= NARROW
-
-
 def _cap(problem: Problem) -> int:
     return CAP if problem.m < LARGE else 2 * CAP
-
-
-def _is_heavy(problem: Problem) -> bool:
-    if problem.rows is None:
-        return False
-    moving = problem.rows.inv_mass[problem.rows.inv_mass > 0.0]
-    return len(moving) > 0 and bool(moving.max() >= HEAVY * float(moving.min()))
-
-
-def _is_redundant(problem: Problem) -> bool:
-    """More rows than degrees of freedom: sweeps then converge slowly, and a factorisation over bodies is small."""
-    if problem.rows is None:
-        return False
-    return problem.m > 6 * problem.rows.n_bodies and bool(np.all(problem.compliance == 0.0))
-
-
-def _is_banded(problem: Problem) -> bool:
-    """A matrix so narrow that a dozen factorisations cost less than the sweeps that would be promised."""
-    if problem.rows is not None:
-        return False
-    from lavender.solvers._ipm import BAND_SHARE  # loads SciPy's sparse solvers, which few problems need
-
-    width = max(problem.bandwidth)
-    return width <= BAND_SHARE * problem.m and problem.m * width**2 <= BANDED * problem.csr.nnz
-
-
-def _is_loose(problem: Problem) -> bool:
-    """Nearly every contact between two bodies of its own, not one of a face: sweeps then settle which ones stick."""
-    assert problem.rows is not None
-    bodies = np.sort(block_bodies(problem), axis=1)
-    pairs = bodies[:, 0].astype(np.int64) * problem.rows.n_bodies + bodies[:, 1]
-    return 4 * len(np.unique(pairs)) > 3 * len(pairs)
-
-
-def _bandwidth(problem: Problem) -> int:
-    if problem.rows is None:
-        return max(problem.bandwidth)
-    spread = problem.derived.spread
-    if spread is None:
-        spread = graph.body_spread(problem.cones.ptr, block_bodies(problem), problem.rows.n_bodies)
-        problem.derived.spread = spread
-    return spread
 
 
 SPEC = SolverSpec(

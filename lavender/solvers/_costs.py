@@ -1,0 +1,258 @@
+"""What each candidate of `auto` would cost on a problem, counted from its structure.
+
+    sweeps         START + n (SWEEP work + SWEEP_ROW m)         work: multiply-adds of one sweep (`Data.work`)
+    factorising    START + f (STEP + ROW m + rate flops)        flops: multiply-adds of one factor, f: how many
+
+The rates below are nanoseconds of one core, the same constants on every machine, so that a choice depends on the
+problem alone: no clock is read. `lavender bench auto` measures what is lost by them; a rate that is off by
+two moves a choice only where two candidates cost about the same.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from lavender.problem import Problem
+from lavender.solvers._accelerated import sweep_work
+from lavender.solvers._factor import choose
+from lavender.solvers._ipm import MatrixSystem, System, VelocitySystem, make_system
+from lavender.solvers._islands import block_bodies
+from lavender_ext.factor import graph
+
+__all__ = ["Costs", "Exact", "is_loose", "islands_cost"]
+
+# Rates [ns], from times and counts of drawn problems that `lavender bench auto --out` writes.
+# For each multiply-add of a sweep, mixing included; the cone law solves each contact exactly.
+SWEEP = {"linear": 1.2, "lcp": 1.2, "coulomb": 0.9, "cone": 2.2}
+SWEEP_ROW = 5.0  # for each row of a sweep
+SWEEP_START = 80e3  # what Python needs for sweeps,
+LOOK = 20e3  # for each look at their residual,
+ROWS_OF_A = 80e3  # and where they run over rows of A that must be formed first
+START = {"direct": 60e3, "newton": 300e3, "lemke": 500e3}  # of a call, before anything is factored
+STEP = {"direct": 10e3, "newton": 35e3}  # beside each factor
+ROW = 30.0  # for each row beside each factor of `direct`,
+NEWTON_ROW = {"linear": 150.0, "lcp": 150.0, "cone": 300.0, "coulomb": 300.0}  # and of `newton`
+DENSE = 0.1  # for each multiply-add of a dense factor
+BAND = 0.4  # of a band's
+BLOCK = 0.35  # of one over bodies
+SPARSE = 100.0  # for each nonzero of a sparse factor's matrix,
+SPARSE_ROWS = 1000.0  # as many times more as it has thousands of rows: fill grows with the size
+PIVOT, PIVOT_ENTRY = 60e3, 0.5  # of each pivot of lemke, and for each entry of its tableau
+
+# Factorisations to expect, by law: medians over drawn problems. Friction has a long tail.
+DIRECT = {"linear": 1.5, "lcp": 6.0}
+NEWTON = {"linear": 2.0, "lcp": 16.0, "cone": 22.0, "coulomb": 8.0}
+PER_ROW = {
+    "linear": 0.0,
+    "lcp": 0.0,
+    "cone": 0.0,
+    "coulomb": 1.0 / 40.0,
+}  # more of them: contacts change their side
+TAIL = {"linear": 2, "lcp": 10, "cone": 10, "coulomb": 60}  # more that are granted before another is asked
+MOST = 30.0  # of what rows add
+AT_REST = 8.0  # of faces on faces, most of whose rows hold
+UNSYMMETRIC = 2.0  # LU against Cholesky, where friction or A asks for it
+SINGULAR = 6.0  # factorisations of `direct` where A is singular: it shifts and refines
+
+# Sweeps to expect before anything was swept, to six decades: median over drawn problems, and where the same weight
+# rests on more points than are needed.
+SWEEPS, SWEEPS_REDUNDANT = 60.0, 400.0
+
+FILL = 5.0  # of a factor over rows against one over bodies, for the same unknowns: rows of one body are all neighbours
+ISLAND = 400e3  # what Python takes for an island of its own
+NARROW = 40  # half bandwidth up to which a band is what `direct` takes
+TREE = 1.05  # neighbours of a body, in the mean, up to which bodies form trees
+TINY_FACTOR = 20e3  # ns, below which a factor is not looked at more closely
+LOOKS = 4  # at so many sweeps
+LEMKE_ROWS = 1000  # beyond, a dense tableau of 8 MB and more
+
+
+@dataclass(frozen=True)
+class Exact:
+    """A finite solver, what it is expected to cost [ns], and its budget: twice the iterations expected."""
+
+    name: str
+    cost: float
+    limit: int
+
+
+class Costs:
+    """Of one problem; what takes time to find out is found when it is first asked."""
+
+    def __init__(self, problem: Problem, tol: float) -> None:
+        self.problem = problem
+        self.decades = float(-np.log10(min(max(tol, 1e-16), 0.1)))
+        self.sweep = SWEEP[problem.law] * sweep_work(problem) + SWEEP_ROW * problem.m  # [ns] of one
+
+    @cached_property
+    def redundant(self) -> bool:
+        """The same weight rests on more points than the bodies can tell apart, and none of them is soft.
+
+        Faces on faces; sweeps then hardly move it. With Coulomb friction a Newton method suffers as much.
+        """
+        p = self.problem
+        if p.rows is None or p.law == "coulomb" or p.m <= 6 * p.rows.n_bodies:
+            return False
+        assert p.compliance is not None
+        return not p.compliance.any() and (p.law != "cone" or not is_loose(p))
+
+    @cached_property
+    def sweeping(self) -> float:
+        """Sweeps to the end as they usually go [ns], before the first of them."""
+        n = SWEEPS_REDUNDANT if self.redundant else SWEEPS
+        formed = ROWS_OF_A if self.problem.law == "lcp" and self.problem.rows is not None else 0.0
+        return SWEEP_START + formed + LOOKS * LOOK + n * self.decades / 6.0 * self.sweep
+
+    @cached_property
+    def system(self) -> System:
+        """Newton's system, which knows what its factor costs; `newton` takes it over."""
+        rows = self.problem.rows
+        return make_system(self.problem, "impulse" if rows is None or rows.n_bodies == 0 else "velocity")
+
+    @property
+    def guess(self) -> float:
+        """What the cheapest finite solver hardly costs less than [ns], without looking closer."""
+        count = self._newton_count
+        if START["newton"] + count * STEP["newton"] > self.sweeping and not self._direct_takes:
+            return START["newton"] + count * STEP["newton"]  # whatever the factor costs
+        if not self._direct_takes:
+            return self._newton_guess
+        m = self.problem.m
+        return min(self._newton_guess, self._direct(BAND * m * max(3.0, self._width(m)) ** 2))
+
+    @cached_property
+    def exact(self) -> list[Exact]:
+        """The finite solvers that take this problem, cheapest first."""
+        # Newton's system is made only where it may be the cheapest: it costs as much as a small solve.
+        cost = self._newton_guess if self._others_win else self._newton(self._newton_factor)
+        newton = Exact("newton", cost, int(2.0 * self._newton_count) + TAIL[self.problem.law])
+        return sorted([*self._others, newton], key=lambda e: e.cost)
+
+    @cached_property
+    def _others(self) -> list[Exact]:
+        p = self.problem
+        found = []
+        if self._direct_takes:
+            found.append(Exact("direct", self._direct(self._matrix), 0))
+        if p.law == "lcp" and p.m <= LEMKE_ROWS:
+            found.append(Exact("lemke", START["lemke"] + p.m * (PIVOT + PIVOT_ENTRY * float(p.m) ** 2), 0))
+        return found
+
+    def _direct(self, factor: float) -> float:
+        p = self.problem
+        count = DIRECT[p.law] * (SINGULAR if self.redundant and p.law == "lcp" else 1.0)
+        return self._finite("direct", count, factor * (1.0 if p.is_symmetric else UNSYMMETRIC))
+
+    @cached_property
+    def _others_win(self) -> bool:
+        return min([e.cost for e in self._others], default=np.inf) <= self._newton_guess
+
+    @cached_property
+    def _newton_guess(self) -> float:
+        """Its factor is at least that of a tree of bodies, or of a diagonal; loops fill it."""
+        p = self.problem
+        if p.rows is not None and p.rows.n_bodies:
+            s = 6 if p.rows.inv_inertia.any() else 3
+            n = p.rows.n_bodies
+            return self._newton(BLOCK * s**3 * (1.0 + 0.5 * max(1.0, self._width(n)) ** 2) * n)
+        return self._newton(BAND * p.m)
+
+    def _width(self, n: int) -> float:
+        """Neighbours that elimination leaves each of n unknowns, at a guess: none in a tree, as in a plane else."""
+        return 0.5 * float(np.sqrt(n)) * self._loops if self._loops > TREE else 0.0
+
+    @cached_property
+    def _loops(self) -> float:
+        """Pairs of bodies with a block between them, for each body: 1 in a chain, 2 or 3 in a lattice; at least 1."""
+        p = self.problem
+        if p.rows is None or p.rows.n_bodies == 0:
+            return 1.0
+        bodies = block_bodies(p)
+        both = np.sort(bodies[(bodies >= 0).all(axis=1)], axis=1).astype(np.int64)
+        pairs = len(np.unique(both[:, 0] * p.rows.n_bodies + both[:, 1]))
+        return max(1.0, pairs / p.rows.n_bodies)
+
+    @property
+    def _direct_takes(self) -> bool:
+        return self.problem.law == "linear" or (self.problem.law == "lcp" and self.problem.is_symmetric)
+
+    def _finite(self, name: str, count: float, factor: float) -> float:
+        row = NEWTON_ROW[self.problem.law] if name == "newton" else ROW
+        return START[name] + count * (STEP[name] + row * self.problem.m + factor)
+
+    def _newton(self, factor: float) -> float:
+        p = self.problem
+        lu = UNSYMMETRIC if p.law == "coulomb" or not p.is_symmetric else 1.0
+        return self._finite("newton", self._newton_count, lu * factor)
+
+    @property
+    def _newton_count(self) -> float:
+        p = self.problem
+        if p.law == "lcp" and self.redundant:
+            return AT_REST
+        return NEWTON[p.law] + min(MOST, PER_ROW[p.law] * p.m)
+
+    @property
+    def _newton_factor(self) -> float:
+        system = self.system
+        if not isinstance(system, MatrixSystem):
+            return BLOCK * system.cost
+        if system.dense:
+            return DENSE * system.cost
+        if system.band is not None:
+            return BAND * system.sc.m * float(system.band.h.shape[1]) ** 2
+        return self._sparse(system.h.nnz, system.sc.m)
+
+    @property
+    def _matrix(self) -> float:
+        """One factor of A as `direct` makes it [ns]; of a factored problem without forming A."""
+        p, m = self.problem, self.problem.m
+        dense = DENSE * float(m) ** 3 / 3.0
+        if p.rows is not None and p.rows.n_bodies:
+            bodies, n = block_bodies(p), p.rows.n_bodies
+            width = graph.body_spread(p.cones.ptr, bodies, n) + 1
+            of = np.repeat(bodies, np.diff(p.cones.ptr), axis=0)
+            clique = int(np.bincount(of[of >= 0], minlength=1).max())  # rows of one body are all neighbours
+            if self._loops <= TREE:
+                width = min(width, 2 * clique)
+            found = min(dense, BAND * m * float(width) ** 2)
+            if width > NARROW and found > TINY_FACTOR and isinstance(self.system, VelocitySystem):
+                share = m / n / self.system.s  # rows for each unknown of a body
+                over_bodies = FILL * BAND * self.system.cost * share**3
+                found = min(found, max(over_bodies, DENSE * float(clique) ** 3 / 3.0))
+            return found
+        form, band, _ = choose(p) if p.is_symmetric else ("general", max(p.bandwidth), None)
+        if form == "band":
+            return BAND * m * float(min(band, m) + 1) ** 2
+        return min(dense, self._sparse(p.csr.nnz, m))
+
+    @staticmethod
+    def _sparse(nnz: int, m: int) -> float:
+        return SPARSE * nnz * (1.0 + m / SPARSE_ROWS)
+
+
+def islands_cost(problem: Problem, sizes: Any) -> float:
+    """Islands of so many rows, solved apart by Newton's method, by their sizes alone [ns]."""
+    m = np.asarray(sizes, float)
+    count = NEWTON[problem.law] + np.minimum(MOST, PER_ROW[problem.law] * m)
+    factor = np.minimum(
+        DENSE * m**3 / 3.0, SPARSE * problem.data.work / max(problem.m, 1) * m * (1.0 + m / SPARSE_ROWS)
+    )
+    each = (
+        ISLAND
+        + START["newton"]
+        + count * (STEP["newton"] + NEWTON_ROW[problem.law] * m + UNSYMMETRIC * factor)
+    )
+    return float(each.sum())
+
+
+def is_loose(problem: Problem) -> bool:
+    """Nearly every contact between two bodies of its own, not one of a face: sweeps then settle which ones stick."""
+    assert problem.rows is not None
+    bodies = np.sort(block_bodies(problem), axis=1)
+    pairs = bodies[:, 0].astype(np.int64) * problem.rows.n_bodies + bodies[:, 1]
+    return 4 * len(np.unique(pairs)) > 3 * len(pairs)
