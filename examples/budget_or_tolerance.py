@@ -1,4 +1,4 @@
-"""Stop at a tolerance, or after a fixed number of sweeps? Cost and error over a sequence of steps.
+"""Exercise: stop at a tolerance, or after a fixed number of sweeps? Cost and error over a sequence of steps.
 
 A scene of the gallery is recorded step by step; each step is solved by projected Gauss-Seidel from the
 impulses of the step before, twice: until the relative residual is at most TOL, and with the same number of sweeps
@@ -57,20 +57,26 @@ def numbers():
     }
 
 
+def beside(axes):
+    """The legend beside the axes, where it covers nothing."""
+    axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8, frameon=False)
+
+
 def figure(found, path):
     """Cost and error of every step."""
     from matplotlib.figure import Figure
 
-    canvas = Figure(figsize=(10, 4), layout="constrained")
-    left, right = canvas.subplots(1, 2)
+    canvas = Figure(figsize=(8, 6), layout="constrained")
+    top, bottom = canvas.subplots(2, 1, sharex=True)
     for name, style in (("tolerance", "o"), ("fixed", "x")):
         sweeps, residuals = found[name]
-        left.plot(sweeps, style, label=name, markersize=4)
-        right.semilogy(residuals, style, label=name, markersize=4)
-    left.set(xlabel="step", ylabel="sweeps", yscale="symlog")
-    right.set(xlabel="step", ylabel="relative residual")
-    right.axhline(TOL, color="0.6", linewidth=0.8)
-    left.legend()
+        top.plot(sweeps, style, label=name, markersize=4)
+        bottom.semilogy(residuals, style, label=name, markersize=4)
+    top.set(title="cost", ylabel="sweeps", yscale="symlog")
+    bottom.set(title="error", xlabel="step", ylabel="relative residual")
+    bottom.axhline(TOL, color="0.6", linewidth=0.8, label=f"tolerance {TOL:g}")
+    beside(top)
+    beside(bottom)
     canvas.savefig(path)
 
 

@@ -1,4 +1,4 @@
-"""Do the solvers agree? Each one beside an optimum that OSQP found and the judge has accepted.
+"""Exercise: do the solvers agree? Each one beside an optimum that OSQP found and the judge has accepted.
 
 On the optimum of a symmetric positive semidefinite problem the slack w = A l - b is unique, the impulses
 need not be: four corners of a box share its weight in many ways. So solvers are compared in the energy norm
@@ -42,7 +42,7 @@ def figure(found, path):
     """Distance to the reference against the distance that the residuals allow."""
     from matplotlib.figure import Figure
 
-    canvas = Figure(figsize=(6, 5), layout="constrained")
+    canvas = Figure(figsize=(8, 4.5), layout="constrained")
     axes = canvas.subplots()
     for i, (name, table) in enumerate(found.items()):
         compared = [row for row in table if row.distance is not None]
@@ -60,7 +60,7 @@ def figure(found, path):
         ylabel="distance to the reference $|\\Delta|_A$ [sqrt J]",
         title="no point may lie above the line",
     )
-    axes.legend(fontsize=7)
+    axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8, frameon=False)
     canvas.savefig(path)
 
 

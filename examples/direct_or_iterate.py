@@ -1,8 +1,16 @@
-"""Solve A x = b directly, or iterate? One factorisation against Gauss-Seidel and Jacobi as A gets worse.
+"""Experiment 1: solve A x = b directly, or iterate? What sweeps know on the way, and what either costs.
 
 A is symmetric positive definite with 40 rows, unit diagonal and a given condition number. The direct
 solver does the same work for each and ends at the floor of float64. Gauss-Seidel needs more sweeps the
-larger the condition number is, Jacobi (damped, so that it converges) more still.
+larger the condition number is, Jacobi (damped, so that it converges) more still. Row by row, a few sweeps
+find the rough shape of x; what is left is what neighbours must agree on.
+
+What a factorisation costs is its structure. On a square lattice of n = k^2 rows, row i tied to its four
+neighbours, multiplications are counted:
+
+    dense    n^3/6               banded   n k (k + 3)/2, bandwidth k
+    sparse   sum over the columns of c (c + 3)/2, c entries below the diagonal of the factor, by minimum degree
+    sweeps   nonzeros of A for each, until the relative residual is 1e-6
 
     python examples/direct_or_iterate.py [FIGURE.png]
 """
@@ -10,13 +18,17 @@ larger the condition number is, Jacobi (damped, so that it converges) more still
 import sys
 
 import numpy as np
+from scipy import sparse
 
 import lavender as lv
 
 CONDITIONS = (1e1, 1e2, 1e3, 1e4)
 ROWS = 40
 TOL = 1e-6  # relative residual
-SOLVERS = ("gauss_seidel", "jacobi")
+SOLVERS = {"gauss_seidel": "Gauss-Seidel", "jacobi": "Jacobi"}
+SWEEPS = (4, 16, 64)  # after which single rows are shown
+SHOWN = 1e2  # condition number of the system whose rows are shown
+SIDES = (4, 6, 8, 12, 16, 24, 32)  # k
 
 
 def spd(condition, seed=0):
@@ -32,8 +44,34 @@ def spd(condition, seed=0):
     return a, rng.standard_normal(ROWS)
 
 
+def lattice(k):
+    """The matrix (k^2, k^2) of a square lattice: 4 on the diagonal, -1 for each neighbour."""
+    line = sparse.diags([2.0 * np.ones(k), -np.ones(k - 1), -np.ones(k - 1)], [0, 1, -1])
+    return sparse.csr_matrix(sparse.kron(line, sparse.eye(k)) + sparse.kron(sparse.eye(k), line))
+
+
+def cost(k):
+    """Multiplications of each way on the lattice of side k."""
+    a = lattice(k)
+    n = k * k
+    factor = sparse.linalg.splu(
+        a.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
+    )
+    below = np.diff(factor.L.indptr) - 1
+    sweeps = {}
+    for solver in SOLVERS:
+        solution = lv.solve(lv.Problem.linear(a, np.ones(n)), solver, tol=TOL, max_iter=1_000_000)
+        sweeps[solver] = solution.work["sweeps"] * a.nnz
+    return {
+        "dense": n**3 / 6,
+        "banded": n * k * (k + 3) / 2,
+        "sparse": float((below * (below + 3) / 2).sum()),
+        **sweeps,
+    }
+
+
 def numbers():
-    """Results by condition number: sweeps to TOL, residual histories, and what the direct solver reached."""
+    """By condition number the sweeps to TOL, histories and what the direct solver reached; rows; counted cost."""
     out = {}
     for condition in CONDITIONS:
         a, b = spd(condition)
@@ -42,39 +80,79 @@ def numbers():
         for solver in SOLVERS:
             row[solver] = lv.solve(problem, solver, tol=TOL, max_iter=1_000_000, history=True)
         out[condition] = row
-    return out
+    shown = lv.Problem.linear(*spd(SHOWN))
+    after = {n: lv.solve(shown, "gauss_seidel", tol=0.0, max_iter=n).impulse for n in SWEEPS}
+    return {"systems": out, "after": after, "cost": {k * k: cost(k) for k in SIDES}}
+
+
+def beside(axes):
+    """The legend beside the axes, where it covers nothing."""
+    axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8, frameon=False)
 
 
 def figure(found, path):
-    """Residual against sweeps, one panel for each condition number."""
+    """Histories, one panel for each condition number; rows after some sweeps; cost against n."""
     from matplotlib.figure import Figure
 
-    canvas = Figure(figsize=(9, 6), layout="constrained")
-    for axes, row in zip(canvas.subplots(2, 2, sharey=True).flat, found.values(), strict=True):
+    canvas = Figure(figsize=(8, 9), layout="constrained")
+    grid = canvas.add_gridspec(4, 2)
+    first = None
+    for i, row in enumerate(found["systems"].values()):
+        axes = canvas.add_subplot(grid[i // 2, i % 2], sharey=first)
+        first = first or axes
         for solver, style in zip(SOLVERS, ("-", "--"), strict=True):
             h = row[solver].history
-            axes.loglog(h.iterations[1:], h.relative[1:], style, label=solver)
+            axes.loglog(h.iterations[1:], h.relative[1:], style, label=SOLVERS[solver])
         axes.axhline(
-            row["direct"].residual.relative, color="k", linestyle=":", label="direct, one factorisation"
+            row["direct"].residual.relative, color="k", linestyle=":", label="direct, one\nfactorisation"
         )
-        axes.set_title(f"condition {row['condition']:.1e}")
+        axes.set_title(f"condition number {row['condition']:,.0f}", fontsize=10)
         axes.set_xlabel("sweeps")
-    canvas.axes[0].set_ylabel("relative residual")
-    canvas.axes[2].set_ylabel("relative residual")
-    canvas.axes[0].legend()
+        if i % 2 == 0:
+            axes.set_ylabel("relative residual")
+        else:
+            beside(axes)
+    rows = canvas.add_subplot(grid[2, :])
+    exact = found["systems"][SHOWN]["direct"].impulse
+    rows.plot(exact, "k_", markersize=10, label="direct")
+    for n, marker in zip(SWEEPS, "^so", strict=True):
+        rows.plot(found["after"][n], marker, markersize=4, fillstyle="none", label=f"{n} sweeps")
+    rows.set(title=f"each row, condition number near {SHOWN:.0f}", xlabel="row", ylabel="impulse [N s]")
+    beside(rows)
+    work = canvas.add_subplot(grid[3, :])
+    n = list(found["cost"])
+    for (name, style), color in zip(
+        (("dense", "s-"), ("banded", "o-"), ("sparse", "^-"), ("gauss_seidel", "x--"), ("jacobi", "+--")),
+        ("k", "C2", "C4", "C0", "C1"),
+        strict=True,
+    ):
+        label = f"{SOLVERS[name]} sweeps" if name in SOLVERS else f"{name} factorisation"
+        work.loglog(n, [found["cost"][i][name] for i in n], style, color=color, markersize=5, label=label)
+    work.set(title="a square lattice", xlabel="rows n", ylabel="multiplications")
+    beside(work)
     canvas.savefig(path)
 
 
 def main(path="direct_or_iterate.png"):
-    """Print the table, save the figure."""
+    """Print the tables, save the figure."""
     found = numbers()
     print(f"{'condition':>10} {'direct':>9} {'Gauss-Seidel':>14} {'Jacobi':>10}")
     print(f"{'':>10} {'residual':>9} {'sweeps':>14} {'sweeps':>10}   (to a relative residual of {TOL:g})")
-    for row in found.values():
+    for row in found["systems"].values():
         sweeps = [row[s].work["sweeps"] for s in SOLVERS]
         print(
             f"{row['condition']:>10.1e} {row['direct'].residual.relative:>9.1e} {sweeps[0]:>14} {sweeps[1]:>10}"
         )
+    exact = found["systems"][SHOWN]["direct"].impulse
+    for n, x in found["after"].items():
+        print(
+            f"after {n:>2} sweeps rows differ by {np.abs(x - exact).max():.3f} N s of {np.abs(exact).max():.2f}"
+        )
+    print("\nmultiplications on a square lattice")
+    names = ("dense", "banded", "sparse", *SOLVERS)
+    print(f"{'rows':>6}" + "".join(f"{name:>14}" for name in names))
+    for n, by in found["cost"].items():
+        print(f"{n:>6}" + "".join(f"{by[name]:>14.2e}" for name in names))
     figure(found, path)
     print(f"figure: {path}")
 

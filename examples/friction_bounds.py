@@ -1,4 +1,4 @@
-"""Friction bounds added to the toy QP: fixed boxes on the tangents, filled in by the normals.
+"""Exercise: friction bounds added to the toy QP: fixed boxes on the tangents, filled in by the normals.
 
 Six unit boxes stand on each other, a contact each with a normal and one tangent (no rotation, so the
 two directions do not couple). The top box is hit sideways. As a QP the tangents are bounded by
@@ -62,15 +62,20 @@ def numbers():
     }
 
 
+def beside(axes):
+    """The legend beside the axes, where it covers nothing."""
+    axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8, frameon=False)
+
+
 def figure(found, path):
     """Tangential impulses against their bounds, and what the boxes do."""
     from matplotlib.figure import Figure
 
-    canvas = Figure(figsize=(9, 4), layout="constrained")
-    left, right = canvas.subplots(1, 2)
+    canvas = Figure(figsize=(8, 6), layout="constrained")
+    left, right = canvas.subplots(2, 1)
     contacts = np.arange(1, N + 1)
     bound = MU * found["rounds"][-1][0::2]
-    left.fill_between(contacts, -bound, bound, alpha=0.2, label="|l_t| <= mu l_n")
+    left.fill_between(contacts, -bound, bound, alpha=0.2, label=r"$|\lambda_t| \leq \mu \lambda_n$")
     for name, impulse, style in (
         ("no friction", found["rounds"][0], "o:"),
         ("glued", found["glued"], "s--"),
@@ -79,9 +84,10 @@ def figure(found, path):
     ):
         left.plot(contacts, impulse[1::2], style, label=name)
         right.plot(contacts, sideways_velocity(impulse), style, label=name)
-    left.set(xlabel="contact, from the ground", ylabel="tangential impulse [N s]")
-    right.set(xlabel="box, from the ground", ylabel="velocity sideways [m/s]")
-    left.legend(fontsize=8)
+    left.set(title="friction", xlabel="contact, from the ground", ylabel="tangential impulse [N s]")
+    right.set(title="what the boxes do", xlabel="box, from the ground", ylabel="velocity sideways [m/s]")
+    beside(left)
+    beside(right)
     canvas.savefig(path)
 
 

@@ -1,4 +1,4 @@
-"""Eight contacts of a stack as an LCP: what each sweep of projected Gauss-Seidel knows, and a wrong way.
+"""Experiment 2: eight contacts of a stack as an LCP: what sweeps know, two residuals, two wrong conclusions.
 
 Eight unit boxes stand on each other; contact i lies under box i. Box 5 has just been hit from below and
 moves up, so contact 5 will open while the boxes above it are pushed. With v* the velocities before
@@ -6,8 +6,14 @@ the impulses and J the difference of neighbours,
 
     w = A l - b,   A = J J^T,   b = -J v*,       0 <= l  complementary to  w >= 0
 
-The wrong way: solve A l = b, then clamp the negative impulses to zero, once. The clamped contacts no
-longer pull, but their neighbours were computed as if they did.
+At contact 5 the ordinary residual |w| is 0 for A^-1 b, which pulls there, and is not 0 at the solution, where
+the contact opens; r_p = |l - max(0, l - w)| is the other way round. That is why projections are measured by r_p.
+
+Wrong: solve A l = b, then clamp the negative impulses to zero, once. The clamped contacts no longer pull, but
+their neighbours were computed as if they did.
+
+Wrong too: a residual of 0 means no penetration. The conditions are on velocities; a box that lies 50 mm
+deep and does not approach is a solution. Depth is removed by the position projection, step by step.
 
     python examples/toy_stack.py [FIGURE.png]
 """
@@ -20,63 +26,104 @@ import lavender as lv
 from lavender.residuals import natural_map
 
 N = 8
+OPEN = 4  # index of the contact that opens
 GRAVITY_STEP = 9.81 / 60.0  # m/s, gravity over one step
 KICK = 1.0  # m/s, box 5 upwards
 SWEEPS = 400
+DEEP = 0.05  # m, penetration of the box at the start
+STEPS = 40
 
 
 def problem():
     """The toy stack: A (8, 8) [1/kg], b (8,) [m/s]."""
     jacobian = np.eye(N) - np.eye(N, k=-1)  # velocity of a box minus that of the one below
     velocity = np.full(N, -GRAVITY_STEP)
-    velocity[4] += KICK
+    velocity[OPEN] += KICK
     return lv.Problem.lcp(jacobian @ jacobian.T, -jacobian @ velocity, name="toy stack")
 
 
+def deep_box():
+    """Relative residual over all rows [-] and depth [m] of each step of a box that starts DEEP in the ground."""
+    scene = lv.Scene(solver="newton")
+    scene.add_plane()
+    scene.add_box(position=(0.0, 0.0, 0.5 - DEEP))
+    sim = lv.Simulation(scene, report_residual=True)
+    out = []
+    for _ in range(STEPS):
+        observation, *_, info = sim.step()
+        out.append((info["residual"]["relative"], observation["contacts"]["depth"].max()))
+    return np.array(out)
+
+
 def numbers():
-    """Impulse and slack of every contact after each sweep, r_p, and the wrong way beside them."""
+    """Impulse and slack of every contact after each sweep, both residuals, the wrong way, and the deep box."""
     toy = problem()
     impulse = np.zeros((SWEEPS + 1, N))
     for sweep in range(SWEEPS):
         impulse[sweep + 1] = lv.solve(toy, "pgs", impulse=impulse[sweep], tol=0.0, max_iter=1).impulse
-    clamped = np.maximum(np.linalg.solve(toy.dense(), toy.b), 0.0)
+    equations = np.linalg.solve(toy.dense(), toy.b)
+    clamped = np.maximum(equations, 0.0)
+    exact = lv.solve(toy, "direct", tol=1e-12).impulse
+    points = {"A^-1 b": equations, "clamped": clamped, "solution": exact}
     return {
         "problem": toy,
         "impulse": impulse,  # (SWEEPS + 1, N) N s
         "slack": np.array([toy.slack(x) for x in impulse]),  # (SWEEPS + 1, N) m/s
         "r_p": np.array([natural_map(toy, x) for x in impulse]),
-        "exact": lv.solve(toy, "direct", tol=1e-12).impulse,
+        "exact": exact,
         "clamped": clamped,
         "clamped_slack": toy.slack(clamped),
         "clamped_r_p": natural_map(toy, clamped),
+        "points": points,
+        # at the contact that opens: the ordinary residual [m/s] and r_p
+        "ordinary": {k: abs(toy.slack(x)[OPEN]) for k, x in points.items()},
+        "projected": {k: abs(x[OPEN] - max(0.0, x[OPEN] - toy.slack(x)[OPEN])) for k, x in points.items()},
+        "deep": deep_box(),  # (STEPS, 2)
     }
 
 
+def beside(axes):
+    """The legend beside the axes, where it covers nothing."""
+    axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8, frameon=False)
+
+
 def figure(found, path):
-    """Impulse, slack and r_p against sweeps."""
+    """Impulse and slack against sweeps; r_p; both residuals at the contact that opens; the deep box."""
     from matplotlib.figure import Figure
 
-    canvas = Figure(figsize=(12, 4), layout="constrained")
-    left, middle, right = canvas.subplots(1, 3)
+    canvas = Figure(figsize=(8, 9), layout="constrained")
+    grid = canvas.add_gridspec(4, 2)
+    left, middle = canvas.add_subplot(grid[0, :]), canvas.add_subplot(grid[1, :])
     sweeps = np.arange(SWEEPS + 1)
     for i in range(N):
         left.plot(sweeps, found["impulse"][:, i], color=f"C{i}", label=f"contact {i + 1}")
         left.plot(SWEEPS, found["clamped"][i], "x", color=f"C{i}")
-        middle.plot(sweeps, found["slack"][:, i], color=f"C{i}")
-    left.set(
-        title="impulse (x: solved, then clamped)", ylabel="impulse [N s]", xlabel="sweeps", xscale="symlog"
-    )
-    left.legend(fontsize=7)
-    middle.set(title="slack", ylabel="slack [m/s]", xlabel="sweeps", xscale="symlog")
-    right.semilogy(sweeps, np.maximum(found["r_p"], 1e-17), label="projected Gauss-Seidel")
-    right.axhline(found["clamped_r_p"], color="k", linestyle="--", label="solved, then clamped once")
-    right.set(title="$r_p$ = |l - max(0, l - w)|", xlabel="sweeps")
-    right.legend(fontsize=8)
+        middle.plot(sweeps, found["slack"][:, i], color=f"C{i}", label=f"contact {i + 1}")
+    left.set(title="impulse (crosses: solved, then clamped)", ylabel="[N s]", xscale="symlog")
+    middle.set(title="slack", ylabel="[m/s]", xlabel="sweeps", xscale="symlog")
+    beside(left)
+    beside(middle)
+    curve = canvas.add_subplot(grid[2, :])
+    curve.semilogy(sweeps, np.maximum(found["r_p"], 1e-17), label="projected\nGauss-Seidel")
+    curve.axhline(found["clamped_r_p"], color="k", linestyle="--", label="solved, then\nclamped once")
+    curve.set(title="$r_p$ over all contacts", xlabel="sweeps", ylabel="[N s]")
+    beside(curve)
+    bars = canvas.add_subplot(grid[3, 0])
+    place = np.arange(len(found["points"]))
+    bars.bar(place - 0.2, list(found["ordinary"].values()), 0.4, label="|w|  [m/s]")
+    bars.bar(place + 0.2, list(found["projected"].values()), 0.4, label="$r_p$  [N s]")
+    bars.set_xticks(place, ["$A^{-1}b$" if k == "A^-1 b" else k for k in found["points"]])
+    bars.set_title("two residuals where contact 5 opens", fontsize=10)
+    bars.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.15), ncols=2, frameon=False)
+    deep = canvas.add_subplot(grid[3, 1])
+    deep.plot(1e3 * found["deep"][:, 1])
+    deep.set(xlabel="step", ylabel="depth [mm]", ylim=(0, None))
+    deep.set_title(f"a box in the ground: residual at most {found['deep'][:, 0].max():.0e}", fontsize=10)
     canvas.savefig(path)
 
 
 def main(path="toy_stack.png"):
-    """Print the table, save the figure."""
+    """Print the tables, save the figure."""
     found = numbers()
     print(f"{'contact':<14}" + "".join(f"{i + 1:>9}" for i in range(N)))
     for name in ("exact", "clamped", "clamped_slack"):
@@ -86,6 +133,16 @@ def main(path="toy_stack.png"):
     print(
         f"solved, then clamped once  r_p {found['clamped_r_p']:.2e}: "
         f"boxes still approach at {-found['clamped_slack'].min():.3f} m/s"
+    )
+    print(f"\n{'contact 5':<12}{'impulse':>10}{'|A l - b|':>12}{'r_p':>10}")
+    for name, x in found["points"].items():
+        print(
+            f"{name:<12}{x[OPEN] + 0.0:>10.4f}{found['ordinary'][name]:>12.4f}{found['projected'][name]:>10.4f}"
+        )
+    first, last = found["deep"][0], found["deep"][-1]
+    print(
+        f"\na box {1e3 * DEEP:.0f} mm in the ground: relative residual {first[0]:.0e} at {1e3 * first[1]:.1f} mm, "
+        f"{last[0]:.0e} at {1e3 * last[1]:.1f} mm after {STEPS} steps"
     )
     figure(found, path)
     print(f"figure: {path}")

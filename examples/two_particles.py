@@ -1,12 +1,17 @@
-"""Two particles joined by one distance row: the smallest constraint problem of an engine, by hand and by engine.
+"""Exercise 1: two particles joined by one distance row: derived, by hand and by engine.
 
-Particle 1 (1 kg) stands still, particle 2 (3 kg) flies off at an angle. The row n.(v2 - v1) = 0 along
-the line between them has
+Positions x1, x2, masses m1, m2, velocities v1*, v2* before the constraint acts. The joint keeps the length l:
 
-    A = 1/m1 + 1/m2,   b = -n.(v2* - v1*),   lambda = b / A
+    C(x) = |x2 - x1| - l = 0
+    dC/dt = n.(v2 - v1),  n = (x2 - x1)/|x2 - x1|         so J = [-n^T, n^T], one row of six entries
+    v+ = v* + M^-1 J^T lambda                              an impulse lambda along n, equal and opposite
+    0 = J v+ = J v* + A lambda,  A = J M^-1 J^T = n.n/m1 + n.n/m2 = 1/m1 + 1/m2
+    lambda = b / A,  b = -J v* = -n.(v2* - v1*)
 
-One impulse along n makes their speeds along n equal; what is across stays, and so does momentum. The
-engine's problem is the same number, and its pair turns about the common centre from then on.
+A is a number here; b is the speed at which the joint would come apart. Particle 1 (1 kg) stands still,
+particle 2 (3 kg) flies off at an angle. One impulse along n makes their speeds along n equal; what is across
+stays, and so does momentum: J^T lambda adds up to zero over both. The engine's problem is the same
+number, and its pair turns about the common centre from then on.
 
     python examples/two_particles.py [FIGURE.png]
 """
@@ -68,14 +73,14 @@ def figure(found, path):
     """Tracks, and the distance over time."""
     from matplotlib.figure import Figure
 
-    canvas = Figure(figsize=(9, 3.6), layout="constrained")
+    canvas = Figure(figsize=(8, 3.6), layout="constrained")
     left, right = canvas.subplots(1, 2)
     for i in range(2):
         left.plot(found["track"][:, i, 0], found["track"][:, i, 1], label=f"{MASS[i]:g} kg")
-    left.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
-    left.legend(fontsize=8)
+    left.set(title="tracks", xlabel="x [m]", ylabel="y [m]", aspect="equal")
+    left.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.2), ncols=2, frameon=False)
     right.plot(1e6 * (found["apart"] - 1.0))
-    right.set(xlabel="step", ylabel="distance - 1 m [µm]")
+    right.set(title="distance from 1 m", xlabel="step", ylabel="[µm]")
     canvas.savefig(path)
 
 

@@ -17,7 +17,7 @@ def example(name):
     return module
 
 
-@pytest.mark.parametrize("name", ["engine_sweeps", "engine_warm_start", "two_particles"])
+@pytest.mark.parametrize("name", ["engine_sweeps", "engine_warm_start", "two_particles", "all_rows"])
 def test_prints_its_numbers_and_saves_its_figure(name, tmp_path, capsys):
     path = tmp_path / "figure.png"
     example(name).main(str(path))
@@ -71,6 +71,22 @@ def test_two_particles_agree_with_the_closed_form():
     np.testing.assert_allclose(
         found["momentum"], np.tile(module.MASS @ module.SPEED, (module.STEPS, 1)), atol=1e-12
     )
+
+
+def test_the_judge_sees_what_the_normals_do_not():
+    module = example("all_rows")
+    found = module.numbers()
+    bridge, pile = found["bridge"], found["pile"]
+    touching = bridge["normals"] > 0.0
+    # With the load on the planks: normals at 5e-4 N s and less, half of the error left, and all of it in the hinges.
+    assert touching.sum() > 20
+    assert np.median(bridge["normals"][touching]) < 5e-4
+    assert np.median(bridge["relative"]) > 0.2
+    assert bridge["shares"][20:, module.KINDS.index("joint")].min() > 0.9
+    assert all(name.startswith("hinge ") for name in bridge["worst"][20:])
+    disk = pile["shares"][:, module.KINDS.index("disk")]
+    assert disk.max() > 0.4 and np.median(disk[20:]) > 0.1
+    np.testing.assert_allclose(bridge["shares"][1:].sum(axis=1), 1.0, rtol=1e-12)
 
 
 def test_lavender_run_shows_a_line_and_writes_what_was_asked_for(tmp_path, capsys):

@@ -461,3 +461,28 @@ def test_reset_judges_nothing_and_does_not_fail():
     sim = lv.Simulation("stack", report_residual=True)
     assert "residual" in sim.step()[4]
     assert "residual" not in sim.reset()[1]
+
+
+DENORMAL = """
+import sys
+import lavender as lv
+for solver in ("newton", "auto"):
+    for mass, size in ((5e-324, 1.0), (1e-308, 1.0), (2e-308, 1e-3), (1e300, 1e-3), (1.0, 1e-100), (1.0, 1e-150)):
+        for dt in (1e-310, 1e-3, 1e300):
+            scene = lv.Scene(solver=solver, dt=dt, solver_iterations=20)
+            scene.add_plane()
+            try:
+                scene.add_box((size, size, size), mass, position=(0, 0, 0.4 * size))
+                scene.add_sphere(size, mass, position=(0, 0, 1.2 * size))
+                sim = lv.Simulation(scene)
+                for _ in range(3):
+                    if sim.step()[2]:
+                        break
+            except lv.LavenderError:
+                pass
+"""
+
+
+def test_steps_end_whatever_the_numbers_are():
+    done = run_apart(DENORMAL, 120.0)
+    assert done.returncode == 0, done.stderr

@@ -19,7 +19,14 @@ def example(name):
 
 @pytest.mark.parametrize(
     "name",
-    ["direct_or_iterate", "toy_stack", "friction_bounds", "order_and_warm_start", "budget_or_tolerance"],
+    [
+        "direct_or_iterate",
+        "toy_stack",
+        "friction_bounds",
+        "order_and_warm_start",
+        "budget_or_tolerance",
+        "jacobi",
+    ],
 )
 def test_prints_its_numbers_and_saves_its_figure(name, tmp_path, capsys):
     path = tmp_path / "figure.png"
@@ -30,7 +37,8 @@ def test_prints_its_numbers_and_saves_its_figure(name, tmp_path, capsys):
 
 def test_direct_does_not_mind_the_condition_number_and_sweeps_do():
     module = example("direct_or_iterate")
-    rows = list(module.numbers().values())
+    found = module.numbers()
+    rows = list(found["systems"].values())
     for row in rows:
         assert row["direct"].work["factorisations"] == 1
         # Backward stable: the residual stays within a modest factor of rounding, whatever the condition.
@@ -45,6 +53,31 @@ def test_direct_does_not_mind_the_condition_number_and_sweeps_do():
             growth = hard[solver].work["sweeps"] / easy[solver].work["sweeps"]
             assert ratio / 3 < growth < 3 * ratio
     assert all(row["gauss_seidel"].work["sweeps"] < row["jacobi"].work["sweeps"] for row in rows)
+    exact = found["systems"][module.SHOWN]["direct"].impulse
+    off = [np.abs(x - exact).max() for x in found["after"].values()]
+    assert off[0] > 3 * off[1] > 30 * off[2]
+
+
+def test_what_a_factorisation_costs_is_its_structure():
+    module = example("direct_or_iterate")
+    # the count of a dense factor of the same matrix: n^3/6 to leading order, and a band fills its band
+    k = 6
+    a, n = module.lattice(k).toarray(), k * k
+    factor = np.linalg.cholesky(a)
+    below = np.array([np.count_nonzero(np.abs(factor[i + 1 :, i]) > 1e-14) for i in range(n)])
+    by = module.cost(k)
+    assert below.max() == k
+    assert (below * (below + 3) / 2).sum() == pytest.approx(by["banded"], rel=0.25)  # the band's corners
+    assert by["sparse"] < by["banded"] < by["dense"]
+    costs = {k: module.cost(k) for k in (8, 16, 32)}
+    growth = {name: np.log2(costs[32][name] / costs[16][name]) for name in by}
+    # n^3, n k^2 = n^2, and for sweeps nonzeros times a number of sweeps that grows like the condition number, n
+    assert growth["dense"] == pytest.approx(6.0)
+    assert growth["banded"] == pytest.approx(4.0, abs=0.15)
+    assert growth["sparse"] < growth["banded"]
+    assert growth["gauss_seidel"] == pytest.approx(4.0, abs=0.4)
+    assert costs[32]["banded"] < costs[32]["gauss_seidel"] < costs[32]["dense"]
+    assert costs[8]["dense"] < 1.5 * costs[8]["gauss_seidel"]
 
 
 def test_sweeps_solve_the_toy_stack_and_clamping_once_does_not():
@@ -65,6 +98,20 @@ def test_sweeps_solve_the_toy_stack_and_clamping_once_does_not():
     assert found["clamped_r_p"] > 0.1 > 1e6 * found["r_p"][-1]
     assert found["r_p"][1] < found["clamped_r_p"]  # one sweep is better already
     np.testing.assert_allclose(found["slack"][-1], toy.dense() @ found["impulse"][-1] - toy.b, atol=1e-14)
+    # Where the contact opens each residual is 0 at the other's wrong point.
+    assert found["points"]["A^-1 b"][4] == pytest.approx(-0.346, abs=5e-4)  # it pulls
+    assert found["ordinary"]["A^-1 b"] < 1e-12 and found["projected"]["A^-1 b"] == pytest.approx(
+        0.346, abs=5e-4
+    )
+    assert (
+        found["ordinary"]["solution"] == pytest.approx(0.0865, abs=5e-5)
+        and found["projected"]["solution"] == 0.0
+    )
+    # Complementarity says nothing of depth: solved in every step, and 50 mm deep in the first.
+    residual, depth = found["deep"].T
+    assert residual.max() <= 1e-6
+    assert depth[0] == pytest.approx(0.05, rel=1e-6) and depth[-1] < 1.1e-3
+    assert np.all(np.diff(depth) < 0.0)
 
 
 def test_friction_bounds_are_met_and_the_right_bounds_give_coulomb():
@@ -95,9 +142,37 @@ def test_the_order_that_follows_the_impulse_wins_and_warm_starts_are_closer():
     for by in found["orders"].values():
         assert len(by["random"]) == 20
         assert len(set(by["random"])) > 10  # the seed matters
-    # The start is off by CHANGE instead of by everything: about 1 / CHANGE = 20 times closer at every budget.
-    gains = np.array(found["cold"]) / np.array(found["warm"])
+    # The start is off by CHANGE instead of by everything: 1 / CHANGE = 20 times closer, before any sweep.
+    gains = found["cold"] / found["warm"]
+    assert gains[0] == pytest.approx(20.0)
     assert np.all((gains > 10) & (gains < 60))
+    # Matched in reverse: the lowest contact, which needs the whole weight, gets the least.
+    assert found["stale"][0] == pytest.approx(9.0 * found["cold"][0], rel=1e-6)
+    behind = np.array(example("order_and_warm_start").SWEEPS)[found["stale"] > found["cold"]]
+    assert behind.max() == 8
+    for by in found["histories"].values():
+        assert by["Jacobi"][-1] > 2 * max(by[k][-1] for k in ("bottom up", "top down", "colored"))
+        for name in ("bottom up", "top down", "colored"):
+            assert by[name][0] == 1.0 and by[name][-1] < 0.06
+    falling_lighter = found["histories"]["falling, lighter above"]
+    assert falling_lighter["bottom up"][-1] < falling_lighter["random"][:, -1].min()
+
+
+def test_jacobi_costs_twice_the_sweeps_and_lets_all_rows_go_at_once():
+    module = example("jacobi")
+    found = module.numbers()
+    sweeps = {name: s.work["sweeps"] for name, s in found["stack"].items()}
+    assert all(s.success for s in found["stack"].values())
+    # Two colours: a coloured sweep is two undamped Jacobi sweeps of every other row.
+    assert sweeps["Jacobi, undamped"] == pytest.approx(2 * sweeps["Gauss-Seidel, coloured"], rel=0.02)
+    assert sweeps["Gauss-Seidel"] < sweeps["Gauss-Seidel, coloured"] < 1.2 * sweeps["Gauss-Seidel"]
+    assert sweeps["Jacobi, safe damping"] > sweeps["Jacobi, undamped"]
+    assert not found["repeated"]["Jacobi, undamped"].success
+    assert all(s.success for name, s in found["repeated"].items() if name != "Jacobi, undamped")
+    waiting = {name: np.array(x) for name, x in found["waiting"].items()}
+    assert len(set(waiting["Gauss-Seidel"])) == 1  # threads are no use to it
+    assert waiting["Jacobi, undamped"][0] > 2 * waiting["Gauss-Seidel"][0]
+    assert waiting["Jacobi, undamped"][-1] < 0.1 * waiting["Gauss-Seidel"][-1]
 
 
 def test_a_tolerance_bounds_the_error_and_a_budget_the_cost():
