@@ -28,7 +28,8 @@ import tried
 import lavender as lv
 import lavender_ext
 from lavender import bench, registry, suite
-from lavender.bench import level_name
+from lavender.bench import level_name, motions
+from lavender.bench.cases import structure_of
 from lavender.ordering import ORDERS
 from lavender.problem import LAWS
 from lavender.report import advice_by_level, advice_by_time, claims, geometric_means, reaches
@@ -597,12 +598,26 @@ def part_pages(site):
     site.write("parts/solver_fields.md", fields + ".")
 
 
+def calibration_part(site):
+    """Residual against motion error on CASES: a table and a figure for the page on motion."""
+    seen = []
+    for name in CASES:
+        case = suite.case(name)
+        seen += motions.samples(name, case.problem, " + ".join(structure_of(case.problem)))
+    motions.figure(seen, site.path("figures/calibration.svg"))
+    site.write(
+        "parts/calibration.md",
+        f"{motions.table(seen)}\n\n{image('generated/figures/calibration.svg', 'Motion error over residual')}",
+    )
+
+
 def api_page(site):
     """Public names by room."""
     rooms = {
         "Problems": ("Problem", "Rows", "Cones"),
         "Solving": ("solve", "prepare", "Solution", "Status", "Claim"),
         "Judging": ("residual", "Residual", "cross_check", "CrossCheck"),
+        "Moving": ("motion_error", "MotionError", "motions", "Motions"),
         "Registry": ("available", "known", "get", "register", "SolverSpec"),
         "Simulating": ("Scene", "Simulation", "Snapshot"),
         "Errors": (
@@ -616,7 +631,7 @@ def api_page(site):
         ),
     }
     constants = {"CONTACT", "CONTACT_SPIN", "ROW", "SOLVER_FIELDS", "__version__"}
-    modules = {"bench", "engine", "io", "report", "scene", "suite"}
+    modules = {"bench", "engine", "io", "motion", "report", "scene", "suite"}
     listed = {name for names in rooms.values() for name in names}
     rest = sorted(set(lv.__all__) - listed - constants - modules)
     if rest:
@@ -644,6 +659,16 @@ def api_page(site):
         "lavender.suite": ("case", "cases", "families", "Case", "Reference"),
         "lavender.bench": tuple(sorted(lv.bench.__all__, key=str.lower)),
         "lavender.report": tuple(lv.report.__all__),
+        "lavender.motion": (
+            "reference",
+            "adopt",
+            "branch",
+            "distance",
+            "uniqueness",
+            "Motion",
+            "Reference",
+            "Witness",
+        ),
         "lavender.residuals": ("natural_map", "qp_residual", "siconos_error", "check_certificate"),
     }
     for module, names in public.items():
@@ -671,6 +696,7 @@ def write(source, cache):
     scene_page(site)
     suite_page(site)
     part_pages(site)
+    calibration_part(site)
     api_page(site)
     site.write("tried.md", tried.page(LEVELS))
     site.forget_others()

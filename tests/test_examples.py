@@ -7,6 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import lavender as lv
+
 FOLDER = Path(__file__).resolve().parent.parent / "examples"
 
 
@@ -26,6 +28,8 @@ def example(name):
         "order_and_warm_start",
         "budget_or_tolerance",
         "jacobi",
+        "residual_or_motion",
+        "two_motions",
     ],
 )
 def test_prints_its_numbers_and_saves_its_figure(name, tmp_path, capsys):
@@ -184,3 +188,44 @@ def test_a_tolerance_bounds_the_error_and_a_budget_the_cost():
     assert abs(sweeps.mean() - found["budget"]) <= 0.5  # the same cost
     assert sweeps.max() > 3 * found["budget"]  # but not every step
     assert np.any(fixed_residuals > module.TOL)  # nor the same error
+
+
+def test_residual_and_motion_error_part_as_the_theory_says():
+    module = example("residual_or_motion")
+    found = module.numbers()
+    factors = []
+    for n in module.HEIGHTS[:2]:
+        values = found["curves"][f"stack(n={n})"]
+        late = values[values[:, 1] < 5e-2]
+        factors.append(np.median(late[:, 2] / late[:, 1]))
+        # 2 sqrt(2 n) / pi for a stack without end; a finite one stays some percent below.
+        assert 0.85 < factors[-1] / (2.0 * np.sqrt(2.0 * n) / np.pi) < 1.05
+    hang = found["curves"]["hang(n=33, tip_mass=1e4)"]
+    assert hang[-1, 1] < 0.2 and hang[-1, 2] > 0.9  # nearly content, and the weight falls all the same
+    residual, error = found["gram"]
+    assert residual.relative == pytest.approx(1.0)
+    # Its share of the energy: sqrt(1e-3 / (3000 + 1e-3)), at equal speeds.
+    assert error.relative == pytest.approx(np.sqrt(1e-3 / 3000.001), rel=1e-6)
+
+
+def test_every_motion_of_the_example_is_a_solution_and_they_differ():
+    module = example("two_motions")
+    found = module.numbers()
+    motions = found["motions"]
+    i, j = module.furthest(motions)
+    assert len(motions) > 3
+    for k in (i, j):
+        assert lv.residual(found["problem"], motions[k].impulse).relative < 1e-10
+    assert (
+        lv.motion.distance(found["problem"], motions[i].impulse, motions[j].impulse).speed == motions.spread
+    )
+    assert found["cone"].lift > 0.1
+
+
+def test_drift_follows_the_motion_error_over_runs(tmp_path):
+    module = example("motion_over_a_run")
+    module.STEPS, module.SWEEPS = 30, (4, 64)
+    found = module.numbers()
+    assert all(value > 0.8 for value in module.ranks(found).values())
+    by = {(run["sweeps"], run["order"], run["warm"]): run for run in found}
+    assert by[4, "bottom_up", False]["drift"][-1] > 10 * by[64, "bottom_up", True]["drift"][-1]

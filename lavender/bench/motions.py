@@ -195,7 +195,7 @@ def predictors(found: Sequence[Sample]) -> list[tuple[str, int, float, float]]:
         ("max(E / E0, V / V0)", [s.relative for s in same]),
         ("E / E0 alone", [s.energy for s in same]),
         ("V / V0 alone", [s.velocity for s in same]),
-        ("unit step, |lambda - Pi(lambda - w)|", [s.plain for s in same]),
+        ("unit step, lambda - Pi(lambda - w)", [s.plain for s in same]),
     )
     for name, values in measures:
         kept = [(s.motion, v) for s, v in zip(same, values, strict=True) if s.motion > 0.0 and v > 0.0]

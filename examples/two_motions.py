@@ -1,0 +1,116 @@
+"""One problem, several right answers: Coulomb's law does not always say how bodies move.
+
+A pyramid of boxes slides over the ground. Solvers end at residuals at the floor of float64 and do not agree: they
+find different motions, decimetres per second apart, and each satisfies every condition of the law. No accuracy
+decides between them; a rule with a name does: nearest to the warm start, most energy taken by friction, or what is
+left when softness vanishes. The convex cone law has one motion, and pays for it by lifting what slides.
+
+    python examples/two_motions.py [FIGURE.png]
+"""
+
+import sys
+
+import numpy as np
+
+import lavender as lv
+from lavender import suite
+
+CASE = "pyramidF(k=4, sliding=0.5)"
+RULES = ("nearest", "dissipation", "compliant")
+
+
+def places(problem):
+    """Centres (n, 3) [m] of the bodies, from the arms of their contacts: x_a + arm_a = x_b + arm_b."""
+    rows = problem.rows
+    at = np.full((rows.n_bodies, 3), np.nan)
+    at[0] = 0.0
+    for _ in range(rows.n_bodies):
+        for (a, b), arm_a, arm_b in zip(rows.contact_body, rows.arm_a, rows.arm_b, strict=True):
+            if min(a, b) < 0:
+                continue
+            if np.isnan(at[b, 0]):
+                at[b] = at[a] + arm_a - arm_b
+            elif np.isnan(at[a, 0]):
+                at[a] = at[b] + arm_b - arm_a
+    return at
+
+
+def numbers():
+    """The motions, who picks which, what the rules choose, and the motion of the cone law."""
+    problem = suite.case(CASE).problem
+    found = lv.motions(problem)
+    cone = lv.motions(problem.relaxed("cone"))[0]
+    return {
+        "problem": problem,
+        "motions": found,
+        "rules": {rule: found.motions.index(found.select(rule)) for rule in RULES},
+        "picks": found.picks(),
+        "cone": cone,
+        "cone distance": lv.motion_error(problem, cone.impulse, reference=found[0].impulse),
+    }
+
+
+def furthest(motions):
+    """The two motions that are furthest apart."""
+    p = motions.problem
+    pairs = [(i, j) for i in range(len(motions)) for j in range(i)]
+    return min(pairs, key=lambda ij: -lv.motion.distance(p, *(motions[k].impulse for k in ij)).speed)[::-1]
+
+
+def figure(found, path):
+    """Side view of the two motions that are furthest apart: velocities in this plane, and their difference."""
+    from matplotlib.figure import Figure
+
+    problem, motions = found["problem"], found["motions"]
+    at = places(problem)[:, [0, 2]]
+    half = np.abs(problem.rows.arm_b[problem.rows.contact_body[:, 1] >= 0][0][[0, 2]])
+    i, j = furthest(motions)
+    velocities = [problem.velocity(motions[k].impulse)[:, [0, 2]] for k in (i, j)]
+    apart = velocities[1] - velocities[0]
+    shown = [
+        (f"motion {i}", velocities[0]),
+        (f"motion {j}", velocities[1]),
+        (f"motion {j} less motion {i}", apart),
+    ]
+    canvas = Figure(figsize=(12, 3.6), layout="constrained")
+    panels = canvas.subplots(1, 3, sharex=True, sharey=True)
+    for ax, (name, v) in zip(panels, shown, strict=True):
+        for centre in at:
+            ax.add_patch(_box(centre, half))
+        size = float(np.hypot(*v.T).max())
+        ax.quiver(
+            *at.T, *v.T, angles="xy", scale_units="xy", scale=size / half.min() / 1.6, color="C3", width=0.006
+        )
+        ax.set(title=f"{name}: up to {size:.2g} m/s", xlabel="x [m]", aspect="equal")
+    panels[0].set(ylabel="height [m]")
+    panels[0].autoscale_view()
+    canvas.savefig(path)
+
+
+def _box(centre, half):
+    from matplotlib.patches import Rectangle
+
+    return Rectangle(centre - half, *(2.0 * half), facecolor="0.9", edgecolor="0.4", lw=0.8)
+
+
+def main(path="two_motions.png"):
+    """Print the motions, the choices and the picks, and save the figure."""
+    found = numbers()
+    print(found["motions"])
+    for rule, i in found["rules"].items():
+        print(f"rule {rule:<12} motion {i}")
+    for solver, pick in found["picks"].items():
+        where = (
+            "not solved within 20000 sweeps"
+            if pick is None
+            else f"motion {pick.motion}, {pick.distance:.0e} m/s off"
+        )
+        print(f"{solver:<20} {where}")
+    cone, error = found["cone"], found["cone distance"]
+    print(f"cone law: one motion, lift {cone.lift:.2g} m/s, {error.speed:.2g} m/s from motion 0")
+    figure(found, path)
+    print(f"figure: {path}")
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
