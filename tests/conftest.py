@@ -33,10 +33,10 @@ def problem_dir() -> Path:
 @pytest.fixture
 def interrupted_newton(monkeypatch) -> list[float]:
     """Ctrl-C at newton's fifth look at the residual; the list fills with what it saw."""
-    from lavender.solvers import _polish
+    from lavender.solvers._newton.run import Run
 
     looks: list[float] = []
-    original = _polish.Run.score
+    original = Run.score
 
     def interrupt(self, z):
         looks.append(original(self, z))
@@ -44,5 +44,5 @@ def interrupted_newton(monkeypatch) -> list[float]:
             raise KeyboardInterrupt
         return looks[-1]
 
-    monkeypatch.setattr(_polish.Run, "score", interrupt)
+    monkeypatch.setattr(Run, "score", interrupt)
     return looks

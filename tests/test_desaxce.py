@@ -10,9 +10,9 @@ from random_problems import as_matrix, random_contact_problem, seeds
 
 import lavender as lv
 from lavender import suite
-from lavender.solvers._augmented import AugmentedSystem
-from lavender.solvers._desaxce import DeSaxce, _Slip
-from lavender.solvers._ipm import AUGMENTED, CONVEX, DELTA, make_system
+from lavender.solvers._newton.augmented import AugmentedSystem
+from lavender.solvers._newton.desaxce import DeSaxce, _Slip
+from lavender.solvers._newton.systems import AUGMENTED, CONVEX, DELTA, make_system
 
 
 def good(solution, tol):
@@ -89,7 +89,7 @@ def test_the_system_of_a_step_is_solved(form, compliant, seed):
         np.subtract.at(c, (slip.first[slip.element], np.arange(sc.m)), psi)
         assert ip._factor(psi)
         r = np.random.default_rng(seed).normal(size=sc.m)
-        x = ip._solve(r)
+        x = system.solve_pair(r)
         expected = np.linalg.solve(dense_h(system) + c @ w, r)
         # W holds entries up to 1e10 of DELTA's reciprocal beside 1: what the dense inverse keeps of 16 digits.
         np.testing.assert_allclose(x, expected, rtol=0, atol=2e-5 * np.abs(expected).max())

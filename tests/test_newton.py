@@ -12,9 +12,11 @@ from random_problems import as_matrix, random_contact_problem, random_lcp, seeds
 
 import lavender as lv
 from lavender import suite
-from lavender.solvers import _ipm
-from lavender.solvers._ipm import AUGMENTED, CONVEX, InteriorPoint, make_system
-from lavender.solvers._polish import refined
+from lavender.solvers._newton import pattern, systems
+from lavender.solvers._newton import scaled as scaling
+from lavender.solvers._newton.interior_point import InteriorPoint
+from lavender.solvers._newton.polish import refined
+from lavender.solvers._newton.systems import AUGMENTED, CONVEX, make_system
 from lavender_ext.factor import symbolic
 from lavender_ext.newton.elements import Elements
 from lavender_ext.newton.normal_matrix import Factor
@@ -39,25 +41,20 @@ def dense_small(system, values):
     return out
 
 
-def test_contacts_alone_are_scaled_as_any_other_problem(monkeypatch):
-    problem = suite.pyramid(k=3, mass_ratio=1e3, friction="coulomb", sliding=0.5).problem
-    assert _ipm._all_slide(problem)
-    quick = _ipm.scaled(problem)
-    monkeypatch.setattr(_ipm, "_all_slide", lambda _: False)
-    general = _ipm.scaled(problem)
-    for name, value in vars(general).items():
-        if name != "problem":
-            assert np.array_equal(getattr(quick, name), value), name
-
-
 @pytest.mark.parametrize(
-    "problem", [suite.pyramid(k=3).problem, random_lcp(1, m=6)], ids=["bodies", "matrix, boxed"]
+    "problem",
+    [
+        suite.pyramid(k=3, mass_ratio=1e3, friction="coulomb", sliding=0.5).problem,
+        suite.pyramid(k=3).problem,
+        random_lcp(1, m=6),
+    ],
+    ids=["contacts alone", "rows over bodies", "rows of a matrix, boxed"],
 )
-def test_rows_alone_are_scaled_as_any_other_problem(problem, monkeypatch):
-    assert _ipm._all_rows(problem)
-    quick = _ipm.scaled(problem)
-    monkeypatch.setattr(_ipm, "_all_rows", lambda _: False)
-    general = _ipm.scaled(problem)
+def test_usual_problems_are_scaled_as_any_other(problem, monkeypatch):
+    quick = scaling.scaled(problem)
+    monkeypatch.setattr(scaling, "_elements", scaling._mixed_elements)
+    general = scaling.scaled(problem)
+    assert quick.whole
     for name, value in vars(general).items():
         if name != "problem":
             assert np.array_equal(getattr(quick, name), value), name
@@ -70,7 +67,7 @@ def system_in(problem, form):
     """The system of a problem; "band" is the impulse form factored as a band whatever it costs."""
     if form != "band":
         return make_system(problem, form)
-    with mock.patch.multiple(_ipm, BAND_ROWS=0, BAND_SHARE=4.0, BAND_FILL=np.inf):
+    with mock.patch.multiple(systems, BAND_ROWS=0, BAND_SHARE=4.0, BAND_FILL=np.inf):
         system = make_system(problem, "impulse")
     assert system.band is not None
     return system
@@ -156,6 +153,8 @@ def test_interior_point_system_is_solved_and_its_steps_stay_inside(form, seed):
 class PlainInteriorPoint(InteriorPoint):
     """The same steps, one kernel after the other."""
 
+    compiled = False
+
 
 @pytest.mark.parametrize("apart", [False, True])
 @given(seed=seeds)
@@ -220,8 +219,8 @@ def test_block_factor_on_a_graph_of_bodies_matches_dense(few, monkeypatch):
     body = np.array(
         [(i, j) for i in range(n) for j in range(i) if rng.random() < 0.3] + [(0, -1), (5, -1)], np.int32
     )
-    monkeypatch.setattr(_ipm, "FEW_BODIES", few)
-    nptr, nind, node, slot, turned = _ipm.block_pattern(n, body)
+    monkeypatch.setattr(pattern, "FEW_BODIES", few)
+    nptr, nind, node, slot, turned = pattern.block_pattern(n, body)
     assert np.array_equal(np.sort(node[turned], axis=1), node[turned][:, ::-1])
     rank = {tuple(sorted(pair)) for pair in node.tolist()}
     assert len(rank) == len(body)
@@ -258,11 +257,11 @@ def test_a_chain_of_bodies_gets_the_pattern_of_any_graph(monkeypatch):
     body[3::9, 1] = -1
     body[5::9, 0] = -1
     body = np.ascontiguousarray(body, np.int32)
-    monkeypatch.setattr(_ipm, "FEW_BODIES", 0)
-    chain = _ipm.block_pattern(n, body)
+    monkeypatch.setattr(pattern, "FEW_BODIES", 0)
+    chain = pattern.block_pattern(n, body)
     assert symbolic.chain_pattern(body, n) is not None
     monkeypatch.setattr(symbolic, "chain_pattern", lambda *_: None)
-    for one, other in zip(chain, _ipm.block_pattern(n, body), strict=True):
+    for one, other in zip(chain, pattern.block_pattern(n, body), strict=True):
         assert np.array_equal(one, other)
 
 

@@ -30,8 +30,8 @@ from lavender.scene.parts import whole
 from lavender.scene.scene import SWEEPS
 from lavender.solution import Solution, Status
 from lavender.solve import finish, solve
-from lavender.solvers._warm import MOST_STEPS, note_tried, warm_claim
 from lavender.solvers.newton import SPEC as NEWTON_SPEC
+from lavender.solvers.warm_start import MOST_STEPS, Tried, claim_of
 from lavender_ext.engine import substep
 
 __all__ = ["SOLVER_FIELDS", "Simulation"]
@@ -332,7 +332,7 @@ class Simulation:
                     self._lose()
                     return
                 if warm:
-                    note_tried(problem, self._warm_tol, *spent)
+                    problem.derived.tried = Tried(self._warm_tol, 0, *spent)
                 if problem.m:
                     a["impulse"][: problem.m] = self._solve(problem)
                 kernel.apply()
@@ -359,7 +359,7 @@ class Simulation:
     def _told(self, pending: _Pending) -> Solution:
         # The arrays of the last substep's problem stay as they were until the next one.
         problem = self._problem(self._state, steps=self._steps)
-        claim = warm_claim(pending.how, pending.sweeps, pending.factorisations)
+        claim = claim_of(Tried(self._warm_tol, pending.how, pending.sweeps, pending.factorisations))
         assert claim is not None
         impulse = self._state.a["impulse"][: problem.m].copy()
         options = dict(self._parameters.solver_options)

@@ -19,8 +19,8 @@ import numpy as np
 from lavender.problem import Problem
 from lavender.solvers._accelerated import sweep_work
 from lavender.solvers._factor import choose
-from lavender.solvers._ipm import MatrixSystem, System, VelocitySystem, make_system
 from lavender.solvers._islands import block_bodies
+from lavender.solvers._newton.systems import MatrixSystem, System, VelocitySystem, make_system
 from lavender_ext.factor import graph
 
 __all__ = ["Costs", "Exact", "is_loose", "islands_cost"]

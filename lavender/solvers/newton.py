@@ -3,16 +3,18 @@
     z = D^1/2 lambda,   H = D^-1/2 A D^-1/2,   s = H z - g complementary to z on every block
 
 0. A warm start over bodies is judged first; then at most 64 sweeps (counted in `work`) and, for contacts, at most
-   six Newton steps over the bodies, or one banded factorisation of joints alone, where these will do (`_warm.py`).
+   six Newton steps over the bodies, or one banded factorisation of joints alone, where these will do
+   (`warm_start.py`).
 1. Newton's method on the natural map from the warm start, then from the solution of H z = g.
-2. A cold Mehrotra interior point (`_ipm.py`), polished on the identified rows (`_polish.py`) as soon as
-   it has found them, to the floor of float64.
+2. A cold Mehrotra interior point, polished on the identified rows as soon as it has found them, to the floor of
+   float64.
 3. Where that stops short on rows that nearly depend on each other: both again through the augmented
-   system of the bodies (`_augmented.py`).
+   system of the bodies.
 4. Coulomb friction by a proximal Newton method on the Alart-Curnier map, and by interior points on
-   De Saxce's form of the law, whose convex problem moves with every step (`_desaxce.py`).
+   De Saxce's form of the law, whose convex problem moves with every step.
 
-Form "velocity" factors I + K^T V K over the bodies and never squares J; "impulse" factors over the rows.
+The parts stand in `_newton/`. Form "velocity" factors I + K^T V K over the bodies and never squares J; "impulse"
+factors over the rows.
 """
 
 from __future__ import annotations
@@ -27,11 +29,11 @@ from lavender.errors import InputError
 from lavender.problem import Problem
 from lavender.registry import SolverSpec
 from lavender.solution import Claim, Status
-from lavender.solvers._convex_newton import solve_convex
-from lavender.solvers._coulomb_newton import solve_coulomb
-from lavender.solvers._ipm import System, make_system
-from lavender.solvers._polish import Run
-from lavender.solvers._warm import solve_warm
+from lavender.solvers._newton.convex import solve_convex
+from lavender.solvers._newton.coulomb import solve_coulomb
+from lavender.solvers._newton.run import Run
+from lavender.solvers._newton.systems import System, make_system
+from lavender.solvers.warm_start import claim_of, warm_start
 
 FORMS = ("auto", "velocity", "impulse")
 
@@ -90,7 +92,8 @@ class Newton:
         cold = bool(np.array_equal(impulse, problem.start()))
         sweeps = system.factorisations = 0
         if not cold and self.form == "auto":
-            claim, sweeps, system.factorisations = solve_warm(problem, impulse, tol, n, time_limit)
+            tried = warm_start(problem, impulse, tol, n, time_limit)
+            claim, sweeps, system.factorisations = claim_of(tried), tried.sweeps, tried.factorisations
             if claim is not None:
                 return claim
         deadline = np.inf if time_limit is None else perf_counter() + time_limit

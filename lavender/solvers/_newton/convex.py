@@ -1,6 +1,6 @@
 """Bounded rows and the convex cone law: interior point and polish, and what follows where those stop short.
 
-Rows that nearly depend on each other are asked through the augmented system (`_augmented.py`); proximal
+Rows that nearly depend on each other are asked through the augmented system (`_newton/augmented.py`); proximal
 rounds end it, or find the certificate that there is no solution.
 """
 
@@ -9,9 +9,12 @@ from __future__ import annotations
 import numpy as np
 
 from lavender._arrays import FloatArray
-from lavender.solvers._augmented import WORTH, solve_augmented
-from lavender.solvers._ipm import DELTA, InteriorPoint
-from lavender.solvers._polish import Proximal, Run, polish
+from lavender.solvers._newton.augmented import WORTH, solve_augmented
+from lavender.solvers._newton.interior_point import InteriorPoint
+from lavender.solvers._newton.polish import polish
+from lavender.solvers._newton.proximal import Proximal
+from lavender.solvers._newton.run import Run
+from lavender.solvers._newton.systems import DELTA
 
 IPM_STEPS = 1000  # of one interior point at most, whatever the budget
 IPM_PATIENCE = 15  # interior point steps that halve neither residual nor gap

@@ -26,14 +26,18 @@ the Alart-Curnier map ends it. Several shares are tried in turn.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
 from lavender._arrays import FloatArray
 from lavender.cones import CONTACT_SPIN, ROW
-from lavender.solvers._augmented import ROWS, SHIFT, AugmentedSystem, advance
-from lavender.solvers._ipm import AUGMENTED, InteriorPoint, MatrixSystem, Scaled, VelocitySystem
-from lavender.solvers._polish import Proximal, Run
+from lavender.solvers._newton.augmented import ROWS, SHIFT, AugmentedSystem, advance
+from lavender.solvers._newton.interior_point import InteriorPoint
+from lavender.solvers._newton.proximal import Proximal
+from lavender.solvers._newton.run import Run
+from lavender.solvers._newton.scaled import Scaled
+from lavender.solvers._newton.systems import AUGMENTED, VelocitySystem
 
 SHARES = (0.95, 1.0, 0.85, 0.98, 0.7, 0.9)  # of phi's derivative, tried in turn
 # First weight, steps of a round and factorisations of the proximal Newton methods after each interior point.
@@ -96,6 +100,7 @@ class _Slip:
 class DeSaxce(InteriorPoint):
     """The interior point of (3) and (4); `share` of phi's derivative enters."""
 
+    compiled: ClassVar[bool] = False
     share: float = 1.0
 
     def __post_init__(self) -> None:
@@ -118,7 +123,7 @@ class DeSaxce(InteriorPoint):
         # The predictor's q is u itself.
         r = lowered - hz
         r[first] += of.dot(psi, u)
-        da = self._solve(r)
+        da = self.system.solve_pair(r)
         mu = gap / max(self.degree, 1.0)
         _, after = e.affine(z, u1, u2, da)
         sigma = min(1.0, max(after / gap, 0.0)) ** 3 if gap > 0 else 0.0
@@ -126,7 +131,7 @@ class DeSaxce(InteriorPoint):
         e.rhs(z, u1, u2, hz, da, sigma * mu, self.r)
         q = u - (hz - sc.g) - self.r
         self.r[first] += of.dot(psi, q) - phi
-        dz = self._solve(self.r)
+        dz = self.system.solve_pair(self.r)
         if not np.isfinite(dz).all():
             return False
         self.length = e.step(z, u1, u2, dz, da, sigma * mu, 0.995, self.t1, self.t2)
@@ -143,17 +148,7 @@ class DeSaxce(InteriorPoint):
         else:
             self.p = sy.bt + sy.bt[of.first_entry] * wide
             sy.v += sy.v[of.first_entry] * wide
-        if isinstance(sy, AugmentedSystem):
-            sy.factor_pair(sy.v if sy.bt is None else self.p, sy.bt)
-            return True
-        if isinstance(sy, VelocitySystem):
-            return sy._factor(True)
-        assert isinstance(sy, MatrixSystem) and sy.bt is not None
-        if sy.dense:
-            left = np.ascontiguousarray(sy._product(self.p, sy.h, 0.0, 0.0, 0.0).T)
-            return sy._dense_lu(np.ascontiguousarray(sy._product(sy.bt, left, 0.0, 0.0, 1.0).T))
-        identity = sy.small(np.where(of.row == of.column, 1.0, 0.0))
-        return sy._sparse_lu(sy.small(self.p) @ sy.h @ sy.small(sy.bt).T + identity)
+        return sy.factor_pair(sy.v if sy.bt is None else self.p, sy.bt)
 
     def _with_compliance(self, psi: FloatArray, wide: FloatArray) -> None:
         # (theta + C W)^-1 = (V^-1 + e_n (psi theta)^T)^-1 B with V = (theta + W)^-1     (Sherman, Morrison)
@@ -162,26 +157,6 @@ class DeSaxce(InteriorPoint):
         across = np.bincount(of.column, (psi * sy.sc.theta)[of.row] * v, minlength=of.m)
         own = across[of.first][of.element]
         sy.v[:] = v + normal * wide - normal * ((across + own * psi) / (1.0 + own))[of.column]
-
-    def _solve(self, r: FloatArray) -> FloatArray:
-        sy, t, q = self.system, self.system.t, self.system.q
-        out = np.empty_like(r)
-        if isinstance(sy, AugmentedSystem):
-            return sy.solve_pair(r)
-        if isinstance(sy, VelocitySystem):
-            sy.elements.times(sy.v, r, t)
-            sy.factor.solve(sy.elements, t, sy.y, q)
-            r = r - q
-            if sy.bt is None:
-                sy.elements.times(sy.v, r, out)
-                return out
-            sy.elements.times(self.p, r, t)
-            sy.elements.times_transposed(sy.bt, t, out)
-            return out
-        assert isinstance(sy, MatrixSystem) and sy.bt is not None
-        sy.elements.times(self.p, r, t)
-        sy.elements.times_transposed(sy.bt, sy.solver(t), out)
-        return out
 
 
 def solve_desaxce(run: Run, shares: tuple[float, ...] = SHARES) -> list[tuple[float, FloatArray]]:

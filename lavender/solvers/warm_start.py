@@ -14,31 +14,39 @@ from lavender.problem import Problem
 from lavender.solution import Claim, Status
 from lavender_ext.warm.start import from_guess, limits
 
+__all__ = ["MOST_STEPS", "Tried", "claim_of", "warm_start"]
+
 #: How it ended, by number of lavender_ext/warm/start.pxd: None where nothing was decided.
 ENDED = (None, "as it came", "warm sweeps", "joints solved directly", "warm sweeps, Newton steps over bodies")
 
+JOINTS = 3  # the one that factors over rows
 MOST_SWEEPS, MOST_STEPS = limits()  # sweeps and factorisations that the first phase may cost
 
 
-def warm_claim(how: int, sweeps: int, factorisations: int) -> Claim | None:
+def claim_of(tried: Tried) -> Claim | None:
     """What `newton` says of a warm start that ended in its first phase; None where it did not."""
-    message = ENDED[how]
+    message = ENDED[tried.how]
     if message is None:
         return None
-    work = {"factorisations": factorisations}
-    if sweeps:
-        work["sweeps"] = sweeps
-    return Claim(Status.CONVERGED, factorisations, work, message, form="impulse" if how == 3 else "velocity")
+    work = {"factorisations": tried.factorisations}
+    if tried.sweeps:
+        work["sweeps"] = tried.sweeps
+    form = "impulse" if tried.how == JOINTS else "velocity"
+    return Claim(Status.CONVERGED, tried.factorisations, work, message, form=form)
 
 
-def solve_warm(
+def warm_start(
     problem: Problem, impulse: FloatArray, tol: float, budget: int, time_limit: float | None = None
-) -> tuple[Claim | None, int, int]:
-    """Carry `impulse` (m,) to tol in place: the claim, or None and nothing changed; sweeps, factorisations done."""
+) -> Tried:
+    """Carry `impulse` (m,) to tol in place where the first phase can; else nothing is changed.
+
+    Where `problem.derived.tried` says that this was tried on the guess before, as a simulation does on its own
+    arrays, it is not tried again.
+    """
     if problem.rows is None or problem.friction != "coulomb" or tol <= 0.0 or budget < MOST_STEPS:
-        return None, 0, 0
+        return Tried(tol, 0, 0, 0)
     if time_limit is not None and MOST_SWEEPS * 1e-9 * problem.data.work > time_limit:
-        return None, 0, 0
+        return Tried(tol, 0, 0, 0)
     tried = problem.derived.tried
     if (
         tried is None
@@ -47,10 +55,4 @@ def solve_warm(
         or not np.array_equal(impulse, problem.guess)
     ):
         tried = Tried(tol, *from_guess(problem.data, impulse, tol))
-    _, how, sweeps, factorisations = tried
-    return warm_claim(how, sweeps, factorisations), sweeps, factorisations
-
-
-def note_tried(problem: Problem, tol: float, sweeps: int, factorisations: int) -> None:
-    """The guess of `problem` was tried at tol, in vain."""
-    problem.derived.tried = Tried(tol, 0, sweeps, factorisations)
+    return tried

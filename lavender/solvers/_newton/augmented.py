@@ -22,8 +22,10 @@ import scipy.sparse as sp
 import scipy.sparse.linalg as ssl
 
 from lavender._arrays import FloatArray
-from lavender.solvers._ipm import CONVEX, InteriorPoint, VelocitySystem
-from lavender.solvers._polish import Run, polish, refined
+from lavender.solvers._newton.interior_point import InteriorPoint
+from lavender.solvers._newton.polish import polish, refined
+from lavender.solvers._newton.run import Run
+from lavender.solvers._newton.systems import CONVEX, System, VelocitySystem
 from lavender_ext.newton.panel import scaled_jacobian
 
 SHIFT = 1e-14  # of d; squared singular values below it count as zero
@@ -36,11 +38,16 @@ IDLE = 15  # steps in a row that do not halve the residual, likewise, once it is
 NEAR = 1e-5  # relative residual from which Newton steps are asked at each new decade
 
 
-class AugmentedSystem(VelocitySystem):
+class AugmentedSystem(System):
     """A velocity form whose Newton systems of the natural map are solved through (1)."""
 
+    form = "velocity"
+
     def __init__(self, system: VelocitySystem) -> None:
-        self.__dict__.update(system.__dict__)
+        # Elements and the vectors between calls are those of the given system.
+        self.sc, self.elements, self.law, self.cost = system.sc, system.elements, system.law, system.cost
+        self.v, self.einv, self.bt, self.p = system.v, system.einv, system.bt, system.p
+        self.t, self.q = system.t, system.q
         sc, rows = self.sc, self.sc.problem.rows
         assert rows is not None and sc.bodies is not None
         self.given = system
@@ -61,6 +68,9 @@ class AugmentedSystem(VelocitySystem):
         self.small = base + inner // square, base + inner % square
         self.lu: Any = None
 
+    def times(self, z: FloatArray) -> FloatArray:
+        return self.given.times(z)
+
     def factor_natural(self, eps: float) -> bool:
         """Factor (1) for the P of the last `natural`, `eps` added to theta."""
         p = self._small(self.p)
@@ -72,16 +82,15 @@ class AugmentedSystem(VelocitySystem):
         return self._solve_whole(r)
 
     def factor_barrier(self) -> bool:
-        self.factor_pair(self.v if self.bt is None else self.bt, self.bt)
-        return self.lu is not None
+        return self.factor_pair(self.v if self.bt is None else self.bt, self.bt)
 
     def solve_barrier(self, r: FloatArray) -> FloatArray:
         return self.solve_pair(r)
 
-    def factor_pair(self, left: FloatArray, right: FloatArray | None) -> None:
+    def factor_pair(self, left: FloatArray, right: FloatArray | None) -> bool:
         """Factor (2); `right` None is I."""
         self.left, self.right = self._small(left), None if right is None else self._small(right)
-        self._factor_whole(self.left, self.right, sp.eye_array(self.sc.m))
+        return self._factor_whole(self.left, self.right, sp.eye_array(self.sc.m))
 
     def solve_pair(self, r: FloatArray) -> FloatArray:
         """dz of (2)."""

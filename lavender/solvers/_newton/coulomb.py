@@ -1,7 +1,7 @@
 """Coulomb friction by Newton's method: from the start on the Alart-Curnier map, then De Saxce's interior point.
 
 1. Proximal Newton on the Alart-Curnier map, from the start and from the solution of H z = g.
-2. Interior points on De Saxce's form of the law (`_desaxce.py`), each ended by the proximal Newton; first
+2. Interior points on De Saxce's form of the law (`_newton/desaxce.py`), each ended by the proximal Newton; first
    where the bodies are known, after it where only a matrix is, whose factors cost more.
 3. Longer proximal walks from where the interior points ended, with smaller and smaller weights.
 """
@@ -12,9 +12,11 @@ import numpy as np
 
 from lavender._arrays import FloatArray
 from lavender.cones import ROW
-from lavender.solvers._desaxce import SHARES, apart, solve_desaxce, solve_desaxce_augmented
-from lavender.solvers._ipm import AUGMENTED, CONVEX, InteriorPoint
-from lavender.solvers._polish import Proximal, Run
+from lavender.solvers._newton.desaxce import SHARES, apart, solve_desaxce, solve_desaxce_augmented
+from lavender.solvers._newton.interior_point import InteriorPoint
+from lavender.solvers._newton.proximal import Proximal
+from lavender.solvers._newton.run import Run
+from lavender.solvers._newton.systems import AUGMENTED, CONVEX
 
 FIRST, SECOND = 20, 30  # factorisations of the first two walks
 CONVEX_TOL = 1e-4  # of the convex answer that a walk starts from, in energy

@@ -1,0 +1,92 @@
+"""Budget, clock and best iterate of one solve by Newton's method."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from time import perf_counter
+
+import numpy as np
+
+from lavender._arrays import FloatArray
+from lavender.residuals import at_floor, check_certificate, quick, reference
+from lavender.solvers._newton.interior_point import InteriorPoint
+from lavender.solvers._newton.systems import System
+
+
+@dataclass
+class Run:
+    """Budget, clock and best iterate of one solve; `score` is the judge's relative residual."""
+
+    system: System
+    tol: float
+    budget: int  # factorisations
+    deadline: float  # of perf_counter
+    best: float = np.inf
+    best_z: FloatArray = field(init=False)
+    floor: float = 0.0
+    stages: dict[str, int] = field(default_factory=dict)  # what ran, for the message
+    certificate: FloatArray | None = None  # (m,) N s: no solution exists
+
+    def __post_init__(self) -> None:
+        m = self.system.sc.problem.m
+        self.w, self.e = np.empty(m), np.empty(m)
+        self.best_z = np.zeros(self.system.sc.m)
+
+    def count(self, stage: str) -> None:
+        self.stages[stage] = self.stages.get(stage, 0) + 1
+
+    @property
+    def message(self) -> str:
+        return ", ".join(f"{n} {stage}" for stage, n in self.stages.items())
+
+    def score(self, z: FloatArray) -> float:
+        """Relative residual of z; keeps the best."""
+        sc = self.system.sc
+        relative, _ = quick(sc.problem, sc.impulse(z), self.w, self.e)
+        if relative < self.best:
+            self.best, self.best_z = relative, z.copy()
+        return relative
+
+    def error(self, ip: InteriorPoint) -> float:
+        """Relative residual of an interior point of the convex law; the judge's where a step does not know it."""
+        return self.score(ip.z) if ip.error is None else self.relative(*ip.error)
+
+    def relative(self, energy: float, velocity: float) -> float:
+        """Relative residual of the judge's two errors; inf where one is not finite."""
+        energy_start, velocity_start = reference(self.system.sc.problem)
+        energy = 0.0 if energy == 0.0 else energy / energy_start if energy_start > 0.0 else np.inf
+        velocity = 0.0 if velocity == 0.0 else velocity / velocity_start if velocity_start > 0.0 else np.inf
+        return max(energy, velocity) if energy + velocity < np.inf else np.inf
+
+    def reached(self) -> bool:
+        return self.best <= self.tol
+
+    def spent(self) -> bool:
+        """No budget or time for another factorisation, at about a nanosecond for each multiply-add."""
+        if self.system.factorisations >= self.budget:
+            return True
+        return self.deadline < np.inf and perf_counter() + 1e-9 * self.system.cost >= self.deadline
+
+    def at_floor(self) -> bool:
+        """The best point is within twice the floor."""
+        if self.best > 1e-5:
+            return False
+        sc = self.system.sc
+        relative, self.floor = quick(sc.problem, sc.impulse(self.best_z), self.w, self.e, True)
+        return at_floor(relative, self.floor)
+
+    def done(self) -> bool:
+        return self.reached() or self.certificate is not None or self.spent()
+
+    def certify(self, y: FloatArray) -> None:
+        """Keep the direction y (scaled) if it proves that there is no solution."""
+        sc = self.system.sc
+        largest = float(np.abs(y).max(initial=0.0))
+        if not 0.0 < largest < np.inf:
+            return
+        # Rounding leaves rows that do not take part slightly on the wrong side of their bounds.
+        y = np.where(np.abs(y) > 1e-11 * largest, y / largest, 0.0)
+        whole = np.zeros(sc.problem.m)
+        whole[sc.keep] = y * sc.scale
+        if check_certificate(sc.problem, whole) is None:
+            self.certificate = whole
