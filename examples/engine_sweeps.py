@@ -20,18 +20,21 @@ import lavender as lv
 BUDGETS = (4, 8, 16, 32, 64)
 STEPS = 60
 SETTLED = 20  # steps before the medians are taken
+WHOLE = {"substeps": 1, "order": "bottom_up"}  # one solve a step, always from the ground up
 
 
 def first_solve(sweeps, order="bottom_up", friction=0.0):
     """max |e_n| [N s] of the first step's problem after `sweeps` sweeps from zero."""
-    problem = lv.Simulation(lv.Scene("stack", friction=friction, warm_start=False)).constraint_problem()
+    scene = lv.Scene("stack", friction=friction, warm_start=False, **WHOLE)
+    problem = lv.Simulation(scene).constraint_problem()
     impulse = lv.solve(problem, "sequential_impulses", tol=0, max_iter=sweeps, order=order).impulse
     return np.abs(lv.residual(problem, impulse).error[problem.cones.ptr[:-1]]).max()
 
 
 def run(sweeps, friction=0.0):
     """Medians of residual [N s] and violation [m/s] over the settled steps, and the deepest penetration [m]."""
-    sim = lv.Simulation(lv.Scene("stack", friction=friction, warm_start=False, solver_iterations=sweeps))
+    scene = lv.Scene("stack", friction=friction, warm_start=False, solver_iterations=sweeps, **WHOLE)
+    sim = lv.Simulation(scene)
     residual, violation, depth = [], [], []
     for _ in range(STEPS):
         observation, *_ = sim.step()

@@ -21,7 +21,7 @@ def run(sim, steps):
 def test_a_projectile_follows_the_integrator_exactly_and_physics_to_first_order():
     errors = []
     for n in (100, 200):
-        scene = lv.Scene(dt=1.0 / n)
+        scene = lv.Scene(dt=1.0 / n, substeps=1)
         scene.add_sphere(position=(0, 0, 5), velocity=(3, 0, 4))
         x = run(lv.Simulation(scene), n)["positions"][0]
         # Semi-implicit Euler over 1 s: z = z0 + v0 - g h^2 n (n + 1) / 2.
@@ -175,7 +175,7 @@ def test_a_closed_system_keeps_its_momentum(kind):
 def test_a_tumbling_body_keeps_its_energy_to_second_order():
     drift = []
     for dt in (1 / 120, 1 / 240):
-        scene = lv.Scene(gravity=0.0, dt=dt)
+        scene = lv.Scene(gravity=0.0, dt=dt, substeps=1)
         body = scene.bodies[scene.add_box((0.2, 0.7, 1.3), 2.0, angular_velocity=(0.1, 4.0, 0.2))]
         sim = lv.Simulation(scene)
         energies = []
@@ -212,7 +212,7 @@ def test_a_motor_turns_and_its_torque_is_bounded():
     assert speed == pytest.approx(2.0, rel=1e-3)
     weak = lv.Simulation(lv.Scene("four_bar", motor=50.0, torque=3.0))
     impulses = run(weak, 5)["joint_impulses"]
-    assert impulses[5] == pytest.approx(3.0 / 120.0, rel=1e-12)  # torque times dt, at its bound
+    assert impulses[5] == pytest.approx(3.0 / 240.0, rel=1e-12)  # torque times the substep, at its bound
 
 
 def test_a_soft_joint_swings_at_its_frequency():
@@ -251,7 +251,8 @@ def test_with_the_friction_disk_it_falls_too_and_friction_acts():
 
 
 def steady(sweeps, steps=60, **more):
-    sim = lv.Simulation(lv.Scene("stack", solver_iterations=sweeps, **more))
+    # one direction of sweeping and whole steps, as the dense twin has it
+    sim = lv.Simulation(lv.Scene("stack", solver_iterations=sweeps, substeps=1, order="given", **more))
     rows = [(run(sim, 1)["solver"], sim._observe()["contacts"]["depth"].max()) for _ in range(steps)]
     return np.array([r[0] for r in rows[20:]]), np.array([r[1] for r in rows[20:]])
 
@@ -298,7 +299,7 @@ def test_a_stack_stands_for_ten_minutes_on_eight_warm_sweeps():
     start = sim.reset()[0]["positions"]
     end = run(sim, 600 * 120)
     slop = sim.scene.parameters.slop
-    assert np.abs(end["positions"] - start).max() < 4 * slop
+    assert np.abs(end["positions"] - start).max() < slop
     assert np.abs(end["velocities"]).max() < 1e-12
     assert end["contacts"]["depth"].max() < 1.01 * slop
 

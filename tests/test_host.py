@@ -67,7 +67,7 @@ def test_settings_are_those_of_the_scene():
     ]  # fmt: skip
     assert found["gravity"].tolist() == list(p.gravity)
     assert [found[k].item() for k in ("h", "slop", "margin", "bounce")] == [
-        p.dt, p.slop, p.margin, p.restitution_threshold,
+        p.dt / p.substeps, p.slop, p.margin, p.restitution_threshold,
     ]  # fmt: skip
     names = {"skin": "skin", "beta": "beta", "max_push": "max_push", "match_distance": "match"}
     for field, place in names.items():

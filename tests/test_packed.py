@@ -25,7 +25,7 @@ CASES = [
     ("stack", {"n": 3, "friction": 0.0}),  # not packed: no tangents
     ("stack", {"n": 3, "patch_radius": 0.1}),  # not packed: spin
 ]
-ORDERS = ["given", "reverse", "symmetric", "random", "bottom_up", "top_down", "colored"]
+ORDERS = ["given", "reverse", "symmetric", "random", "bottom_up", "top_down", "colored", "alternating"]
 
 
 def one_by_one(state):

@@ -435,8 +435,10 @@ class Simulation:
     def constraint_problem(self) -> Problem:
         """The next substep's velocity problem, with its warm start as `guess`; changes no state.
 
-        With `substeps=1`, `lavender.solve(problem, "sequential_impulses", tol=0, max_iter=n)` returns the
-        impulses that the next step reports, bit for bit (n = `solver_iterations`; the scene's `order`).
+        `lavender.solve(problem, "sequential_impulses", tol=0, max_iter=n)` returns the impulses of that substep,
+        bit for bit, n being `solver_iterations`; with the scene's `order`, unless that is `alternating`: the
+        contacts of such a problem stand in the order in which they are swept. The step publishes the
+        impulses of its last substep.
         """
         state = self._state.copy()
         while state.kernel.prepare() == NEED_ROOM:

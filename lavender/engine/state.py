@@ -21,8 +21,8 @@ from lavender.engine.layout import (
     TOO_MANY,
 )
 from lavender.errors import InputError
-from lavender.ordering import ENGINE_ORDERS
 from lavender.scene import Box, Plane, Scene, Sphere
+from lavender.scene.scene import SCENE_ORDERS
 from lavender_ext.engine import substep
 from lavender_ext.warm.start import Warm
 
@@ -39,8 +39,9 @@ ORDER_NUMBER = {
     "bottom_up": 4,
     "top_down": 5,
     "colored": 6,
+    "alternating": 7,
 }
-assert set(ORDER_NUMBER) == set(ENGINE_ORDERS)
+assert set(ORDER_NUMBER) == set(SCENE_ORDERS)
 
 BRUTE_FORCE = 32  # bodies up to which testing all pairs is quicker than the grid
 BETA = 0.2  # -, share of the position error removed per substep

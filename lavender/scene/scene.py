@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import inspect
 import json
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any
@@ -33,9 +34,11 @@ from lavender.scene.parts import (
 
 __all__ = ["ON_FAILURE", "SCENES", "Parameters", "Scene", "named_scene"]
 
+SCENE_ORDERS = (*ENGINE_ORDERS, "alternating")  # alternating: contacts turned round every substep
 ON_FAILURE = ("use", "keep", "damp", "raise")
 SWEEPS = (4, 64)  # sweep budget of sequential impulses
 MOST = {"restitution": 1.0, "friction": 1e100}  # the product of two coefficients of friction is finite
+MAX_SUBSTEP = 1.0 / 240.0  # s, within which four warm sweeps hold a stack
 MAX_BODIES = 2**24 - 1  # a contact's key has 24 bits for each body
 
 
@@ -44,13 +47,17 @@ class Parameters:
     """Parameters that every scene has."""
 
     dt: float = 1.0 / 120.0  # s, of one step
-    substeps: int = 1
+    # None: as few as keep each at most max_substep long
+    substeps: int = None  # type: ignore[assignment]
+    # s; None: 1/240 for sequential impulses, dt for other solvers
+    max_substep: float = None  # type: ignore[assignment]
     gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)  # m/s^2
     solver: str = "sequential_impulses"
     solver_options: Mapping[str, Any] = field(default_factory=dict)
     solver_iterations: int | None = None  # None: 16 sweeps, or the solver's own default
     warm_start: bool = True
-    order: str = "given"
+    # None: alternating for sequential impulses, given for other solvers
+    order: str = None  # type: ignore[assignment]
     friction: float = 0.5  # -, of bodies that say nothing else
     restitution: float = 0.0  # -, of bodies that say nothing else
     patch_radius: float = 0.0  # m, of bodies that say nothing else; 0: no spin friction
@@ -64,7 +71,6 @@ class Parameters:
     def __post_init__(self) -> None:
         put = object.__setattr__
         put(self, "dt", number("dt", self.dt, above=0.0))
-        put(self, "substeps", whole("substeps", self.substeps, 1))
         gravity: Any = self.gravity
         if isinstance(gravity, (int, float)):
             gravity = (0.0, 0.0, -number("gravity", gravity))
@@ -73,8 +79,17 @@ class Parameters:
         if not isinstance(self.solver_options, Mapping):
             raise InputError(f"solver_options is {self.solver_options!r}; a mapping is needed")
         put(self, "solver_options", dict(self.solver_options))
-        sweeps = self.solver_iterations
-        if self.solver == "sequential_impulses":
+        sweeps, own = self.solver_iterations, self.solver == "sequential_impulses"
+        longest: Any = self.max_substep
+        if longest is None:
+            longest = MAX_SUBSTEP if own else self.dt
+        put(self, "max_substep", number("max_substep", longest, above=0.0))
+        substeps: Any = self.substeps
+        if substeps is None:
+            ratio = min(self.dt / self.max_substep - 1e-9, 2.0**31)  # whole steps whatever their rounding
+            substeps = max(1, math.ceil(ratio))
+        put(self, "substeps", whole("substeps", substeps, 1))
+        if own:
             if self.solver_options:
                 raise InputError(
                     f"solver_options {sorted(self.solver_options)} are for other solvers; sequential_impulses "
@@ -87,9 +102,12 @@ class Parameters:
         if not isinstance(self.warm_start, (bool, np.bool_)):
             raise InputError(f"warm_start is {self.warm_start!r}; True or False is needed")
         put(self, "warm_start", bool(self.warm_start))
-        if self.order not in ENGINE_ORDERS:
-            raise UnknownName("order", self.order, ENGINE_ORDERS)
-        if self.order != "given" and self.solver != "sequential_impulses":
+        order: Any = self.order
+        if order is None:
+            put(self, "order", "alternating" if own else "given")
+        if self.order not in SCENE_ORDERS:
+            raise UnknownName("order", self.order, SCENE_ORDERS)
+        if self.order != "given" and not own:
             raise InputError(
                 f"order={self.order!r} is for sequential_impulses; give {self.solver} its own in solver_options"
             )
@@ -205,6 +223,7 @@ class Scene:
         if name is not None:
             common = {**DEFAULTS[name], **common}
         self.parameters = Parameters(**common)
+        self._given = common
         self.own = {k: v for k, v in parameters.items() if k in own}
         self.bodies: list[Body] = []
         self.joints: list[Joint] = []
@@ -224,18 +243,19 @@ class Scene:
     def with_parameters(self, **changes: Any) -> Scene:
         """The same scene with other parameters; one of the gallery is built anew.
 
+        What was left to its default follows the others: `substeps` the new `dt`, `order` the new `solver`.
+
         Raises
         ------
         UnknownName
             No such parameter; of a scene built by hand only those of `Parameters` can change.
         """
-        common = {f.name: getattr(self.parameters, f.name) for f in fields(Parameters)}
         if self.name:
-            return Scene(self.name, **{**common, **self.own, **changes})
+            return Scene(self.name, **{**self._given, **self.own, **changes})
         for key in changes:
             if key not in COMMON:
                 raise UnknownName("scene parameter", key, COMMON)
-        scene = Scene(**{**common, **changes})
+        scene = Scene(**{**self._given, **changes})
         scene.bodies, scene.joints = list(self.bodies), list(self.joints)
         return scene
 

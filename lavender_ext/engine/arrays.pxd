@@ -47,6 +47,17 @@ cdef enum:
     H_SOLVED = 17           # 1: the arrays hold the last substep's problem and its impulses
     N_HEAD = 24
 
+# H_ORDER: how the blocks of a sweep are ordered, joints and contacts each among themselves
+cdef enum:
+    AS_GIVEN = 0
+    REVERSED = 1
+    SYMMETRICALLY = 2
+    AT_RANDOM = 3
+    BOTTOM_UP = 4
+    TOP_DOWN = 5
+    COLORED = 6
+    ALTERNATING = 7         # as given, and contacts are made from the last pair to the first in odd substeps
+
 # setting[]: real numbers; those from S_OUT on are written by the engine
 cdef enum:
     S_H = 0                 # s, substep

@@ -3,12 +3,22 @@
 A contact's rows are normal, two tangents where mu > 0, spin where mu and the patch radius are. With v the
 velocities before the substep and v* those after gravity, g the gap and e the restitution,
 
-    target_n = -g/h              where g > 0: the gap may close, not more                      (1)
-             = -e v_n            where v_n < -bounce and g + h v*_n <= 0, if that is more       (2)
-             = 0                 otherwise; penetration is left to the position projection
-    b = target - J v*                                                                          (3)
+    target_n = -g/h                     where g > 0: the gap may close, not more               (1)
+             = -beta max(0, g - slop)/h where g > 0 and the cache says that the contact bears  (2)
+             = -e v_n                   where v_n < -bounce and g + h v*_n <= 0, if more       (3)
+             = 0                        otherwise; penetration is left to the position projection
+    b = target - J v*                                                                          (4)
+
+(2) is what lets a tower stand on few sweeps. A warm-started sweep takes a share kappa of what is left of a
+slow mode in each substep; that mode rings like a spring with a damper of |z| = sqrt(1 - kappa). (1) closes
+the whole gap in one substep: feedback of gain 1 on the same mode, unstable where it exceeds kappa or so. A
+bearing contact is in place within a slop above as below, and comes back at the rate of the projection.
 
 Combined: mu = sqrt(mu_a mu_b), e = max, patch radius = min.
+
+Contacts are made pair by pair, and under the alternating order in every other substep from the last point of
+the last pair to the first: what one direction of sweeping leaves behind on one side of a face, the next
+leaves on the other.
 
 The cache holds key, impulse and arms of the last substep's contacts, sorted by pair as the pair list is.
 A contact takes the impulse of the entry with its key, if its point is within the match distance in the
@@ -21,9 +31,9 @@ from libc.stdint cimport int32_t, uint64_t
 from lavender_ext.core.block cimport CONTACT, CONTACT_SPIN
 from lavender_ext.core.rows cimport (contact_diagonal, contact_slack, cross, dot3, largest_eigenvalue,
                                      reciprocal, relative_velocity, rows_t)
-from lavender_ext.engine.arrays cimport (BOX, CAP_CONTACT, H_CACHED, H_CONTACTS, H_CONTACT_ROWS, H_MATCHES,
-                                         H_PAIRS, H_WARM_START, N_CACHE_IMPULSE, N_JOINT, N_JOINT_ROW,
-                                         S_BOUNCE, S_H, S_MARGIN, S_MATCH, engine_t)
+from lavender_ext.engine.arrays cimport (ALTERNATING, BOX, CAP_CONTACT, H_CACHED, H_CONTACTS, H_CONTACT_ROWS,
+                                         H_MATCHES, H_ORDER, H_PAIRS, H_STEP, H_WARM_START, N_CACHE_IMPULSE, N_JOINT, N_JOINT_ROW,
+                                         S_BETA, S_BOUNCE, S_H, S_MARGIN, S_MATCH, S_SLOP, engine_t)
 from lavender_ext.engine.bodies cimport to_body
 from lavender_ext.engine.narrow_phase cimport collide, manifold_t
 
@@ -126,9 +136,9 @@ cdef inline double normal_velocity(const engine_t* e, int32_t a, int32_t b, int3
 
 cdef inline void make_contact(engine_t* e, const rows_t* r, int32_t c, int32_t row, int32_t a, int32_t b,
                               const manifold_t* m, int32_t at, const double* tangent, int32_t nt,
-                              int32_t spin, double bounce) noexcept nogil:
-    """Row data of contact c, rows row .. row + nt + spin, of point `at` of the manifold."""
-    cdef double h = e.setting[S_H], vn, t12, gap = m.gap[at], target
+                              int32_t spin) noexcept nogil:
+    """Row data of contact c, rows row .. row + nt + spin, of point `at` of the manifold, but for its target."""
+    cdef double t12
     cdef double w[4]
     cdef int32_t k, da = e.dyn[a], db = e.dyn[b]
     cdef double* d = e.d + row
@@ -137,7 +147,7 @@ cdef inline void make_contact(engine_t* e, const rows_t* r, int32_t c, int32_t r
     e.contact_body[2 * c] = da
     e.contact_body[2 * c + 1] = db
     e.key[c] = contact_key(a, b, m.feature[at])
-    e.gap[c] = gap
+    e.gap[c] = m.gap[at]
     for k in range(3):
         e.point[3 * c + k] = m.point[3 * at + k]
         e.normal[3 * c + k] = m.normal[k]
@@ -178,16 +188,29 @@ cdef inline void make_contact(engine_t* e, const rows_t* r, int32_t c, int32_t r
         d[2] = d[1]
     if spin:
         e.step[row + 1 + nt] = reciprocal(d[1 + nt])
-    target = -gap / h if gap > 0.0 else 0.0             # (1)
-    if bounce > 0.0 and gap + h * w[0] <= 0.0:          # (2)
+    for k in range(1 + nt + spin):
+        e.target[row + k] = 0.0
+        e.b[row + k] = 0.0 - w[k]
+
+
+cdef inline void aim_contact(engine_t* e, int32_t c, int32_t row, int32_t a, int32_t b, double bounce) noexcept nogil:
+    # Target of the normal row, once the guess is there: b = -J v* so far.
+    cdef double h = e.setting[S_H], gap = e.gap[c], target = 0.0, vn
+    if gap > 0.0:
+        if e.impulse[row] > 0.0:                        # (2)
+            gap = e.setting[S_BETA] * (gap - e.setting[S_SLOP])
+        if gap > 0.0:
+            target = -gap / h                           # (1)
+    if bounce > 0.0 and e.gap[c] - h * e.b[row] <= 0.0:  # (3)
         vn = normal_velocity(e, a, b, c)
         if vn < -e.setting[S_BOUNCE] and -bounce * vn > target:
             target = -bounce * vn
     e.target[row] = target
-    e.b[row] = target - w[0]                            # (3)
-    for k in range(1, 1 + nt + spin):
-        e.target[row + k] = 0.0
-        e.b[row + k] = 0.0 - w[k]
+    e.b[row] = target + e.b[row]                        # (4)
+
+
+cdef inline int32_t backwards(const engine_t* e) noexcept nogil:
+    return e.head[H_ORDER] == ALTERNATING and e.head[H_STEP] & 1
 
 
 cdef inline int32_t make_contacts(engine_t* e, const rows_t* r) noexcept nogil:
@@ -195,14 +218,16 @@ cdef inline int32_t make_contacts(engine_t* e, const rows_t* r) noexcept nogil:
     cdef manifold_t m
     cdef double tangent[3]
     cdef int32_t entry[4]
-    cdef int32_t i, j, k, a, b, nt, spin, start, c = 0, row = e.size[N_JOINT_ROW], block, first = 0
-    cdef int32_t matches = 0
+    cdef int32_t i, j, k, a, b, nt, spin, start, c = 0, row = e.size[N_JOINT_ROW], block
+    cdef int32_t matches = 0, last_first = backwards(e), cached = e.head[H_CACHED]
+    cdef int32_t first = cached if last_first else 0
     cdef double mu, patch, bounce, margin = e.setting[S_MARGIN]
     cdef uint64_t pair
     e.ptr[e.size[N_JOINT]] = row
     for i in range(e.head[H_PAIRS]):
-        a = e.pair[2 * i]
-        b = e.pair[2 * i + 1]
+        k = e.head[H_PAIRS] - 1 - i if last_first else i
+        a = e.pair[2 * k]
+        b = e.pair[2 * k + 1]
         collide(e, a, b, margin, &m)
         if m.n == 0:
             continue
@@ -217,11 +242,14 @@ cdef inline int32_t make_contacts(engine_t* e, const rows_t* r) noexcept nogil:
         if nt > 0:
             tangent_of(m.normal, tangent)
         pair = contact_key(a, b, 0)
-        while first < e.head[H_CACHED] and e.cache_key[first] < pair:
+        # the first entry of this pair, or where it would stand
+        while first < cached and e.cache_key[first] < pair:
             first += 1
+        while first > 0 and e.cache_key[first - 1] >= pair:
+            first -= 1
         start = c
         for j in range(m.n):
-            make_contact(e, r, c, row, a, b, &m, j, tangent, nt, spin, bounce)
+            make_contact(e, r, c, row, a, b, &m, m.n - 1 - j if last_first else j, tangent, nt, spin)
             block = e.size[N_JOINT] + c
             e.kind[block] = CONTACT_SPIN if spin else CONTACT
             e.mu[block] = mu
@@ -231,13 +259,15 @@ cdef inline int32_t make_contacts(engine_t* e, const rows_t* r) noexcept nogil:
             row += 1 + nt + spin
             c += 1
             e.ptr[block + 1] = row
-        if e.head[H_WARM_START] and first < e.head[H_CACHED]:
+        if e.head[H_WARM_START] and first < cached:
             match_pair(e, start, m.n, first, entry)
             for j in range(m.n):
                 if entry[j] >= 0:
                     k = e.ptr[e.size[N_JOINT] + start + j]
                     guess_contact(e, start + j, entry[j], nt, spin, e.impulse + k)
                     matches += 1
+        for j in range(start, c):
+            aim_contact(e, j, e.ptr[e.size[N_JOINT] + j], a, b, bounce)
     if c <= e.size[CAP_CONTACT]:
         e.head[H_CONTACTS] = c
         e.head[H_CONTACT_ROWS] = row - e.size[N_JOINT_ROW]
@@ -247,14 +277,15 @@ cdef inline int32_t make_contacts(engine_t* e, const rows_t* r) noexcept nogil:
 
 cdef inline void store_contacts(engine_t* e) noexcept nogil:
     """The cache of the next substep; kept up to date whether warm starting is on or not."""
-    cdef int32_t c, k, row, nt
+    cdef int32_t c, k, row, nt, at, n = e.head[H_CONTACTS], last_first = backwards(e)
     cdef double t2[3]
     cdef double* p
-    for c in range(e.head[H_CONTACTS]):
+    for c in range(n):
+        at = n - 1 - c if last_first else c
         row = e.ptr[e.size[N_JOINT] + c]
         nt = 2 if e.mu[e.size[N_JOINT] + c] > 0.0 else 0
-        p = e.cache_impulse + N_CACHE_IMPULSE * c
-        e.cache_key[c] = e.key[c]
+        p = e.cache_impulse + N_CACHE_IMPULSE * at
+        e.cache_key[at] = e.key[c]
         p[0] = e.impulse[row]
         if nt > 0:
             cross(e.normal + 3 * c, e.tangent + 3 * c, t2)
@@ -265,5 +296,5 @@ cdef inline void store_contacts(engine_t* e) noexcept nogil:
                 p[1 + k] = 0.0
         p[4] = e.impulse[row + 3] if e.kind[e.size[N_JOINT] + c] == CONTACT_SPIN else 0.0
         for k in range(6):
-            e.cache_local[6 * c + k] = e.local[6 * c + k]
-    e.head[H_CACHED] = e.head[H_CONTACTS]
+            e.cache_local[6 * at + k] = e.local[6 * c + k]
+    e.head[H_CACHED] = n

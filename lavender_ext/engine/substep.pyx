@@ -18,12 +18,13 @@ from lavender_ext.core.block cimport CONTACT_SPIN, blocks_t, n_tangents, row_err
 from lavender_ext.core.order cimport (RANDOM, SYMMETRIC, advance_order, block_levels, body_levels,
                                       color_by_bodies, reverse, sort_by_level)
 from lavender_ext.core.rows cimport contact_push, joint_push, relax_contact_block, relax_joint, rows_t
-from lavender_ext.engine.arrays cimport (CAP_CONTACT, CAP_PAIR, H_CACHED, H_CONTACTS, H_CONTACT_ROWS, H_ITERATIONS,
-                                         H_LOST, H_MATCHES, H_NEED_CONTACTS, H_NEED_PAIRS, H_ORDER, H_SEED,
-                                         H_SOLVED, H_STEP, H_WARM_START,
+from lavender_ext.engine.arrays cimport (AT_RANDOM, BOTTOM_UP, CAP_CONTACT, CAP_PAIR, COLORED, H_CACHED, H_CONTACTS,
+                                         H_CONTACT_ROWS, H_ITERATIONS, H_LOST, H_MATCHES, H_NEED_CONTACTS,
+                                         H_NEED_PAIRS, H_ORDER, H_SEED, H_SOLVED, H_STEP, H_WARM_START,
                                          NEED_ROOM, NOT_FINITE, N_BODY, N_DYNAMIC, N_EXCLUDED, N_FRAME,
                                          N_HEAD, N_JOINT, N_JOINT_REAL, N_JOINT_ROW, N_SETTINGS, OK,
-                                         ROWS_PER_CONTACT, S_OUT, bind, engine_t)
+                                         REVERSED, ROWS_PER_CONTACT, SYMMETRICALLY, S_OUT, TOP_DOWN, bind,
+                                         engine_t)
 from lavender_ext.engine.bodies cimport drift_bodies, start_bodies
 from lavender_ext.engine.broad_phase cimport update_pairs
 from lavender_ext.engine.contacts cimport make_contacts, store_contacts
@@ -33,17 +34,6 @@ from lavender_ext.engine.projection cimport normal_speed, project_positions
 from lavender_ext.engine.view cimport view
 from lavender_ext.judge.measure cimport rows_slack, score_rows, score_t
 from lavender_ext.sweep.packed cimport MOST, ROOM_BODY, ROOM_CONTACT, ROOM_MORE, packs, sweep_packed
-
-
-# H_ORDER: how the blocks of a sweep are ordered, joints and contacts each among themselves
-cdef enum:
-    AS_GIVEN = 0
-    REVERSED = 1
-    SYMMETRICALLY = 2
-    AT_RANDOM = 3
-    BOTTOM_UP = 4
-    TOP_DOWN = 5
-    COLORED = 6
 
 
 cdef int32_t prepare(engine_t* e) noexcept nogil:

@@ -87,7 +87,7 @@ function checkModule() {
 }
 
 function checkPersistentContact() {
-  const scene = recording.scenes.find((s) => s.name === "stack()");
+  const scene = recording.scenes.find((s) => s.name === "stack(substeps=1)");
   const simulation = new Simulation(new Kernels(module, recording.layout), scene);
   const at = (field) => simulation.values[SOLVER_FIELDS.indexOf(field)];
   simulation.step();

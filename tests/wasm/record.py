@@ -27,6 +27,7 @@ BODY_ARRAYS = ("x", "q", "v")
 #: Gallery scene, parameters, and what is changed before which step.
 SCENES = [
     ("stack", {}, {200: {"warm_start": 0}, 400: {"warm_start": 1}}),
+    ("stack", {"substeps": 1}, {}),
     ("pyramid", {"base": 8}, {300: {"iterations": 4}}),
     ("chain", {"tip_mass": 5.0}, {}),
     ("spinner", {}, {}),

@@ -19,7 +19,7 @@ export const SOLVER_FIELDS = [
   "violation_initial",
   "violation_final",
 ];
-export const ORDERS = ["given", "reverse", "symmetric", "random", "bottom_up", "top_down", "colored"];
+export const ORDERS = ["given", "reverse", "symmetric", "random", "bottom_up", "top_down", "colored", "alternating"];
 
 const WIDTH = { i4: 4, f8: 8, p: 4 };
 
