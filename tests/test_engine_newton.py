@@ -35,7 +35,7 @@ def _contact_rows(state):
 @pytest.mark.parametrize(("name", "more"), SCENES)
 def test_a_step_is_what_solve_returns(name, more):
     sim = lv.Simulation(lv.Scene(name, solver="newton", **more))
-    ended = set()
+    judged = 0
     for step in range(60):
         problem = sim.constraint_problem()
         observation = sim.step()[0]
@@ -55,8 +55,8 @@ def test_a_step_is_what_solve_returns(name, more):
         error = np.abs(found.residual.error[contact]).max(initial=0.0)
         size = np.abs(found.impulse).max() + np.abs(problem.b / problem.d).max()
         assert observation["solver"][5] == pytest.approx(error, abs=1e-12 * size)
-        ended.add(told.message)
-    assert len(ended) >= 1
+        judged += 1
+    assert judged >= 30  # the scenes touch something from the first half second on
 
 
 def test_the_first_phase_ends_in_each_of_its_ways():

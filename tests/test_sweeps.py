@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from random_problems import as_matrix, random_contact_problem, random_lcp, seeds
 
 import lavender as lv
-from lavender.ordering import ORDERS, block_order, colors, levels
+from lavender.ordering import ORDERS
 from lavender.solvers import _sweeping
 
 # -- the twin ------------------------------------------------------------------------------------------
@@ -104,18 +104,6 @@ def test_gauss_seidel_and_sor_are_their_formulas(seed):
         np.testing.assert_allclose(sweeps(linear, name, 3, **options), lam, atol=1e-12 * np.abs(lam).max())
 
 
-@given(seed=seeds)
-def test_jacobi_is_its_formula(seed):
-    problem = random_lcp(seed)
-    a, b, c = problem.matrix, problem.b, problem.cones
-    lam = np.zeros(len(b))
-    for _ in range(4):
-        lam = np.clip(lam - 0.3 * (a @ lam - b) / np.diag(a), c.lower, c.upper)
-    np.testing.assert_allclose(
-        sweeps(problem, "jacobi", 4, omega=0.3), lam, atol=1e-12 * (1 + np.abs(lam).max())
-    )
-
-
 # -- tangent blocks -------------------------------------------------------------------------------------
 
 BLOCKS = {
@@ -195,103 +183,6 @@ def test_heavy_on_light_contracts_by_r_over_one_plus_r(ratio):
     """Mass R on mass 1 on the ground: A = [[1, -1], [-1, 1 + 1/R]]."""
     problem = lv.Problem.lcp([[1.0, -1.0], [-1.0, 1.0 + 1.0 / ratio]], [0.1, 0.0])
     assert contraction(problem, "pgs", 2, 6) == pytest.approx(ratio / (1.0 + ratio), rel=1e-9)
-
-
-@pytest.mark.parametrize("k", [2, 3, 5])
-def test_coincident_contacts_defeat_undamped_jacobi(k):
-    """k contacts at one place: A is all ones. Unprojected factor k - 1; projected from 0, period 2."""
-    a, b = np.ones((k, k)), np.ones(k)
-    free = lv.Problem.linear(a, b)
-    size = [abs(lv.solve(free, "jacobi", omega=1.0, tol=0.0, max_iter=n).slack[0]) for n in (3, 4)]
-    assert size[1] / size[0] == pytest.approx(k - 1.0)
-    lcp = lv.Problem.lcp(a, b)
-    for n in range(4):
-        np.testing.assert_array_equal(sweeps(lcp, "jacobi", n, omega=1.0), np.full(k, float(n % 2)))
-    assert lv.solve(lcp, "jacobi", omega=1.0, tol=1e-6).status is lv.Status.STALLED
-    assert lv.solve(lcp, "jacobi", tol=1e-9).success
-
-
-# -- orders ------------------------------------------------------------------------------------------------
-
-
-@given(seed=seeds)
-@pytest.mark.parametrize("order", ORDERS)
-def test_named_orders_are_permutations_with_joints_first(order, seed):
-    problem = random_contact_problem(seed)
-    o = block_order(problem, order, seed=seed if order == "random" else 0)
-    assert sorted(o.blocks.tolist()) == list(range(problem.n_blocks))
-    assert o.split == problem.rows.n_joints
-    assert sorted(o.blocks[: o.split].tolist()) == list(range(o.split))
-
-
-@given(seed=seeds)
-def test_colors_share_no_moving_body(seed):
-    problem = random_contact_problem(seed, bodies=6, contacts=20)
-    o = block_order(problem, "colored")
-    body = np.concatenate([problem.rows.joint_body, problem.rows.contact_body])
-    assert o.color_ptr[0] == 0
-    assert o.color_ptr[-1] == problem.n_blocks
-    for first, end in zip(o.color_ptr[:-1], o.color_ptr[1:], strict=True):
-        moving = body[o.blocks[first:end]].ravel()
-        moving = moving[moving >= 0]
-        assert len(moving) == len(set(moving.tolist()))
-
-
-@given(seed=seeds)
-def test_colors_of_a_matrix_share_no_entry(seed):
-    problem = as_matrix(random_contact_problem(seed, bodies=6, contacts=20))
-    color, a, ptr = colors(problem), problem.dense(), problem.cones.ptr
-    for i in range(problem.n_blocks):
-        for j in range(i):
-            if color[i] == color[j]:
-                assert not a[ptr[i] : ptr[i + 1], ptr[j] : ptr[j + 1]].any()
-
-
-def test_more_than_63_colors_are_found():
-    """100 contacts of one body with 100 others: every one needs its own colour."""
-    n = 100
-    rng = np.random.default_rng(0)
-    normal = np.tile([0.0, 0.0, 1.0], (n, 1))
-    rows = lv.Rows(
-        inv_mass=np.ones(n + 1), inv_inertia=np.tile(np.eye(3), (n + 1, 1, 1)), v_free=rng.normal(size=(n + 1, 6)),
-        normal=normal, tangent=np.tile([1.0, 0.0, 0.0], (n, 1)), arm_a=np.zeros((n, 3)), arm_b=np.zeros((n, 3)),
-        contact_body=np.stack([np.zeros(n), np.arange(1, n + 1)], axis=1),
-    )  # fmt: skip
-    assert sorted(colors(lv.Problem.from_rows(rows)).tolist()) == list(range(n))
-
-
-def test_levels_count_from_the_ground():
-    n = 6
-    body = np.stack([np.arange(-1, n - 1), np.arange(n)], axis=1)
-    shuffled = np.random.default_rng(3).permutation(n)
-    rows = lv.Rows(
-        inv_mass=np.ones(n), inv_inertia=np.tile(np.eye(3), (n, 1, 1)), v_free=np.zeros((n, 6)),
-        normal=np.tile([0.0, 0.0, 1.0], (n, 1)), tangent=np.tile([1.0, 0.0, 0.0], (n, 1)),
-        arm_a=np.zeros((n, 3)), arm_b=np.zeros((n, 3)), contact_body=body[shuffled],
-    )  # fmt: skip
-    problem = lv.Problem.from_rows(rows)
-    np.testing.assert_array_equal(levels(problem), shuffled)
-    np.testing.assert_array_equal(shuffled[block_order(problem, "bottom_up").blocks], np.arange(n))
-    np.testing.assert_array_equal(shuffled[block_order(problem, "top_down").blocks], np.arange(n)[::-1])
-    matrix = as_matrix(problem)
-    ground = np.flatnonzero(shuffled == 0)
-    np.testing.assert_array_equal(levels(matrix, ground), shuffled)
-    with pytest.raises(lv.CapabilityError, match="ground"):
-        block_order(matrix, "bottom_up")
-
-
-def test_random_order_depends_on_the_seed_alone():
-    problem = random_lcp(2)
-    x = sweeps(problem, "pgs", 9, order="random", seed=5)
-    np.testing.assert_array_equal(x, sweeps(problem, "pgs", 9, order="random", seed=5))
-    assert not np.array_equal(x, sweeps(problem, "pgs", 9, order="random", seed=6))
-
-
-def test_symmetric_is_forwards_then_backwards():
-    problem = random_lcp(4)
-    forwards = lv.solve(problem, "pgs", tol=0.0, max_iter=1)
-    both = sweeps(problem, "pgs", 1, order="reverse", impulse=forwards.impulse)
-    np.testing.assert_array_equal(sweeps(problem, "pgs", 2, order="symmetric"), both)
 
 
 # -- threads -------------------------------------------------------------------------------------------------

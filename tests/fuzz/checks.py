@@ -169,11 +169,8 @@ def claims(spec, problem, solution):
     if ((status == "FLOOR" and not solution.contradicted) or accepted) and not j.relative <= max(
         within, floor
     ):
-        yield (
-            "false claim",
-            f"{name}: {status} accepted, relative {r.relative:.3e} floor {r.floor:.3e}, "
-            f"in long double {j.relative:.3e}",
-        )
+        found = f"relative {r.relative:.3e} floor {r.floor:.3e}, in long double {j.relative:.3e}"
+        yield "false claim", f"{name}: {status} accepted, {found}"
     if (status == "FLOOR" or accepted) and not (math.isfinite(r.relative) and math.isfinite(r.floor)):
         yield "false claim", f"{name}: {status} accepted with relative {r.relative} and floor {r.floor}"
     if finite and j.range < MODERATE:

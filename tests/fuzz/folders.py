@@ -17,9 +17,9 @@ import lavender.cli
 NAMES = (
     "a.npz", "[/x].npz", "[bold].npz", "²1.npz", "a$\\frac$b.npz", "a$b.npz", "<img src=x onerror=alert(1)>.npz",
     "a\nb.npz",
-    "a\tb.npz", "'; DROP.npz", '".npz', "&amp;.npz", "-x.npz", "--out.npz", "..npz", " .npz", "%s.npz", 
+    "a\tb.npz", "'; DROP.npz", '".npz', "&amp;.npz", "-x.npz", "--out.npz", "..npz", " .npz", "%s.npz",
     "{0}.npz", "ä\u0308.npz",
-    "\u202ex.npz", "a|b.npz", "`a`.npz", "*_#.npz", "a\x1b[31m.npz", "x.hdf5", "x.jsonl", "case(n=1).npz", "1.npz", 
+    "\u202ex.npz", "a|b.npz", "`a`.npz", "*_#.npz", "a\x1b[31m.npz", "x.hdf5", "x.jsonl", "case(n=1).npz", "1.npz",
     "01.npz",
     "step-1.npz", "step-٣.npz", "😀.npz",
 )  # fmt: skip
@@ -99,7 +99,7 @@ def good_records():
     """Lines of a small run."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, "records.jsonl")
-        quiet(["bench", "two_particles", "slider(mu=1)", "--solvers", "pgs,nncg", "--levels", "1e-3", 
+        quiet(["bench", "two_particles", "slider(mu=1)", "--solvers", "pgs,nncg", "--levels", "1e-3",
                "--budgets", "4", "--repeats", "1",
                "--out", str(path)])  # fmt: skip
         return tuple(path.read_text(encoding="utf-8").splitlines())
