@@ -1,0 +1,146 @@
+"""The front door: what it refuses before anything runs, budgets, clocks, history, callbacks, Ctrl-C."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+import lavender as lv
+from lavender import registry, suite
+from lavender.solution import Claim, Status
+
+TINY = lv.Problem.lcp([[2.0, 1.0], [1.0, 2.0]], [1.0, -1.0])
+
+REFUSED = {
+    "no problem": (lambda: lv.solve(np.eye(2), "pgs"), lv.InputError, "Problem"),
+    "no such solver": (lambda: lv.solve(TINY, "psg"), lv.UnknownName, "pgs"),
+    "no such option": (lambda: lv.solve(TINY, "jacobi", omgea=1.0), lv.UnknownName, "omega"),
+    "an option of others": (lambda: lv.solve(TINY, "direct", order="reverse"), lv.CapabilityError, "order"),
+    "negative tol": (lambda: lv.solve(TINY, "pgs", tol=-1.0), lv.InputError, "tol"),
+    "tol nan": (lambda: lv.solve(TINY, "pgs", tol=np.nan), lv.InputError, "tol"),
+    "tol a word": (lambda: lv.solve(TINY, "pgs", tol="tight"), lv.InputError, "tol"),
+    "half an iteration": (lambda: lv.solve(TINY, "pgs", max_iter=0.5), lv.InputError, "max_iter"),
+    "negative budget": (lambda: lv.solve(TINY, "pgs", max_iter=-1), lv.InputError, "max_iter"),
+    "no time": (lambda: lv.solve(TINY, "pgs", time_limit=-1.0), lv.InputError, "time_limit"),
+    "time nan": (lambda: lv.solve(TINY, "pgs", time_limit=np.nan), lv.InputError, "time_limit"),
+    "a start too short": (lambda: lv.solve(TINY, "pgs", impulse=[1.0]), lv.InputError, "shape"),
+    "a start not finite": (lambda: lv.solve(TINY, "pgs", impulse=[1.0, np.inf]), lv.InputError, "impulse"),
+    "a start of words": (lambda: lv.solve(TINY, "pgs", impulse=["a", "b"]), lv.InputError, "impulse"),
+    "no callback": (lambda: lv.solve(TINY, "pgs", callback=3), lv.InputError, "callback"),
+    "history of a finite solver": (
+        lambda: lv.solve(TINY, "direct", history=True),
+        lv.CapabilityError,
+        "history",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_a_senseless_request_is_refused_with_its_reason(name):
+    call, error, sign = REFUSED[name]
+    with pytest.raises(error, match=sign):
+        call()
+
+
+def test_nothing_ran_where_a_request_is_refused(monkeypatch):
+    ran = []
+    spec = dataclasses.replace(registry.get("pgs"), factory=lambda **options: ran.append(options))
+    monkeypatch.setitem(registry._registered, "pgs", spec)
+    with pytest.raises(lv.LavenderError):
+        lv.solve(TINY, "pgs", nothing=1)
+    assert ran == []
+
+
+def test_the_start_is_the_impulse_given_then_the_guess_then_zero_within_bounds():
+    problem = lv.Problem.lcp(np.eye(2), [5.0, 5.0], lower=1.0, upper=9.0, guess=[2.0, 3.0])
+    at_start = lambda p, **more: lv.solve(p, "pgs", max_iter=0, tol=0.0, **more).impulse.tolist()  # noqa: E731
+    assert at_start(problem, impulse=[4.0, 4.5]) == [4.0, 4.5]
+    assert at_start(problem) == [2.0, 3.0]
+    assert at_start(dataclasses.replace(problem, guess=None)) == [1.0, 1.0]
+
+
+def test_history_and_callback_fall_at_the_same_counts_and_change_no_bit():
+    problem = suite.granular(3).problem
+    seen = []
+    plain = lv.solve(problem, "pgs", tol=1e-9, max_iter=5000)
+    told = lv.solve(
+        problem, "pgs", tol=1e-9, max_iter=5000, history=True,
+        callback=lambda n, impulse, residual: seen.append((n, residual.relative)) and None,
+    )  # fmt: skip
+    assert plain.impulse.tobytes() == told.impulse.tobytes()
+    assert [n for n, _ in seen] == told.history.iterations.tolist()[-len(seen) :]
+    assert told.history.relative[-1] == told.residual.relative
+    assert np.all(np.diff(told.history.iterations) > 0)
+    assert np.all(np.diff(told.history.time) >= 0.0)
+
+
+def test_what_a_callback_raises_comes_through():
+    class Enough(Exception):
+        pass
+
+    def callback(n, impulse, residual):
+        raise Enough
+
+    with pytest.raises(Enough):
+        lv.solve(suite.stack(64).problem, "pgs", callback=callback)
+
+
+class Interrupted:
+    """Ctrl-C in the middle of the second call."""
+
+    def __init__(self):
+        self.calls = 0
+
+    def prepare(self, problem):
+        return problem
+
+    def update(self, state, problem):
+        return problem
+
+    def run(self, state, impulse, n, tol, time_limit=None):
+        self.calls += 1
+        impulse += 1.0
+        if self.calls > 1:
+            raise KeyboardInterrupt
+        return Claim(Status.MAX_ITERATIONS, n)
+
+
+def test_ctrl_c_is_a_result(monkeypatch):
+    spec = dataclasses.replace(registry.get("pgs"), name="interrupted", factory=Interrupted, options={})
+    monkeypatch.setitem(registry._registered, "interrupted", spec)
+    problem = lv.Problem.lcp(np.eye(2), [50.0, 50.0])
+    solution = lv.solve(problem, "interrupted", tol=1e-9, max_iter=10**6)
+    assert solution.status is Status.INTERRUPTED
+    assert np.isfinite(solution.impulse).all()
+    assert not solution.success
+    with pytest.raises(lv.SolveFailed):
+        solution.raise_for_status()
+
+
+def test_a_claim_above_tol_is_contradicted_and_no_success(monkeypatch):
+    class Boasts(Interrupted):
+        def run(self, state, impulse, n, tol, time_limit=None):
+            return Claim(Status.CONVERGED, 1)
+
+    spec = dataclasses.replace(registry.get("pgs"), name="boasts", factory=Boasts, options={})
+    monkeypatch.setitem(registry._registered, "boasts", spec)
+    solution = lv.solve(TINY, "boasts")
+    assert solution.status is Status.CONVERGED  # what it says,
+    assert solution.contradicted  # what we say of that,
+    assert not solution.success  # and what counts
+    with pytest.raises(lv.SolveFailed):
+        solution.raise_for_status()
+
+
+def test_a_prepared_solver_takes_problems_of_the_same_structure_and_others():
+    prepared = lv.prepare(TINY, "direct")
+    same = lv.Problem.lcp([[3.0, 1.0], [1.0, 2.0]], [1.0, 2.0])
+    other = lv.Problem.lcp(np.eye(3), np.ones(3))
+    for problem in (same, other, TINY):
+        assert prepared.solve(problem).impulse.tobytes() == lv.solve(problem, "direct").impulse.tobytes()
+
+
+def test_zero_iterations_judge_the_start():
+    solution = lv.solve(TINY, "pgs", max_iter=0)
+    assert solution.iterations == 0
+    assert solution.residual.relative == lv.residual(TINY, TINY.start()).relative == 1.0
