@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import lavender._built  # noqa: F401 - first: says what to do where nothing is built
 from lavender._version import __version__
-from lavender.cones import CONTACT, CONTACT_SPIN, ROW, Cones
+from lavender.cones import CONTACT, CONTACT_SPIN, ROUND, ROW, Cones
 from lavender.errors import (
     CapabilityError,
     InputError,
@@ -19,6 +19,7 @@ from lavender.errors import (
     SolverUnavailable,
     UnknownName,
 )
+from lavender.generalized import Generalized
 from lavender.problem import Problem
 from lavender.redundancy import Redundancy, redundancy
 from lavender.registry import SolverSpec, available, get, known, register
@@ -58,12 +59,14 @@ _LATER = {
 __all__ = [
     "CONTACT",
     "CONTACT_SPIN",
+    "ROUND",
     "ROW",
     "SOLVER_FIELDS",
     "CapabilityError",
     "Claim",
     "Cones",
     "CrossCheck",
+    "Generalized",
     "InUse",
     "InputError",
     "LavenderError",

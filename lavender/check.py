@@ -324,7 +324,10 @@ def _distance(problem: Problem, one: Solution, two: Solution) -> tuple[float, fl
 
 
 def _apply(problem: Problem, x: Any) -> Any:
-    """A x (m,), without forming A where rows are known."""
+    """A x (m,), without forming A where J and M are known."""
+    if problem.generalized is not None:
+        y = problem.whitened
+        return y @ (y.T @ x) + problem.compliance * x
     if problem.rows is None:
         return problem.csr @ x
     assert problem.compliance is not None
@@ -334,6 +337,9 @@ def _apply(problem: Problem, x: Any) -> Any:
 
 def _apply_abs(problem: Problem, x: Any) -> Any:
     """A bound of abs(A) x for x >= 0."""
+    if problem.generalized is not None:
+        y = abs(problem.whitened)
+        return y @ (y.T @ x) + problem.compliance * x
     if problem.rows is None:
         return abs(problem.csr) @ x
     assert problem.compliance is not None

@@ -6,6 +6,8 @@ perhaps one spin row. With lambda [N s] the bounds are
     ROW           lower <= lambda_i <= upper on each of its rows
     CONTACT       0 <= lambda_n,  |lambda_t| <= mu lambda_n
     CONTACT_SPIN  the same, and |lambda_s| <= mu r lambda_n, r = patch radius [m]
+    ROUND         0 <= lambda_n, |lambda_T| <= mu lambda_n over three to five tangents together: two that slide, one
+                  that spins, two that roll; each row scaled by its own coefficient over mu, so that one mu bounds all
 """
 
 from __future__ import annotations
@@ -19,9 +21,9 @@ import numpy as np
 from lavender._arrays import FloatArray, IntArray, as_array, check_not_nan, check_not_negative, equal
 from lavender.errors import InputError
 
-__all__ = ["CONTACT", "CONTACT_SPIN", "ROW", "Cones", "project"]
+__all__ = ["CONTACT", "CONTACT_SPIN", "ROUND", "ROW", "Cones", "project"]
 
-ROW, CONTACT, CONTACT_SPIN = 0, 1, 2
+ROW, CONTACT, CONTACT_SPIN, ROUND = 0, 1, 2, 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,11 +34,11 @@ class Cones:
     ------
     InputError
         Shapes that do not fit, lower > upper, NaN bounds, negative mu or patch radius, a contact with
-        more rows than normal, two tangents and spin.
+        more rows than normal, two tangents and spin, a round cone of more than five tangents.
     """
 
     ptr: IntArray  # (k + 1,) first row of each block, then m
-    kind: IntArray  # (k,) ROW | CONTACT | CONTACT_SPIN
+    kind: IntArray  # (k,) ROW | CONTACT | CONTACT_SPIN | ROUND
     lower: FloatArray  # (m,) N s, read on ROW blocks, -inf allowed
     upper: FloatArray  # (m,) N s, read on ROW blocks, +inf allowed
     mu: FloatArray  # (k,) -, read on contacts
@@ -51,12 +53,23 @@ class Cones:
             )
         k, m = len(ptr) - 1, int(ptr[-1])
         kind = as_array("cones.kind", self.kind, (k,), dtype=np.int32)
-        if k and not np.isin(kind, (ROW, CONTACT, CONTACT_SPIN)).all():
+        if k and not np.isin(kind, (ROW, CONTACT, CONTACT_SPIN, ROUND)).all():
             raise InputError(
-                f"cones.kind holds {sorted(set(kind.tolist()))}; ROW=0, CONTACT=1, CONTACT_SPIN=2 are known"
+                f"cones.kind holds {sorted(set(kind.tolist()))}; ROW=0, CONTACT=1, CONTACT_SPIN=2, ROUND=3 are known"
             )
         size = np.diff(ptr)
-        bad = np.flatnonzero((kind != ROW) & ((size < kind) | (size > kind + 2)))
+        if np.any(kind == ROUND):
+            flat = (kind == ROUND) & (size <= 3)
+            if flat.any():  # with up to two tangents it is a contact
+                kind = np.where(flat, CONTACT, kind).astype(np.int32)
+                kind.flags.writeable = False
+            bad = np.flatnonzero((kind == ROUND) & (size > 6))
+            if len(bad):
+                raise InputError(
+                    f"block {bad[0]} is a round cone of {size[bad[0]]} rows; a normal and up to five tangents "
+                    "(two slide, one spins, two roll) are known"
+                )
+        bad = np.flatnonzero((kind != ROW) & (kind != ROUND) & ((size < kind) | (size > kind + 2)))
         if len(bad):
             raise InputError(
                 f"block {bad[0]} is a contact of {size[bad[0]]} rows; a contact has a normal, up to "
@@ -125,16 +138,44 @@ class Cones:
         return cones
 
     @classmethod
-    def contacts(cls, mu: FloatArray, tangents: int = 2, patch_radius: FloatArray | None = None) -> Cones:
-        """Contacts only, the same rows for each: mu (k,), and with a radius (k,) [m] a spin row."""
-        mu = np.atleast_1d(np.asarray(mu, float))
-        k, spin = len(mu), patch_radius is not None
+    def contacts(
+        cls, mu: Any, tangents: int = 2, patch_radius: Any = None, *, count: int | None = None
+    ) -> Cones:
+        """Contacts only, the same rows for each: normal, `tangents`, and with a radius a spin row.
+
+        Parameters
+        ----------
+        mu : scalar or (k,)
+        tangents : int, 0 to 5
+            More than two make one round cone (ROUND) and take no patch radius.
+        patch_radius : scalar or (k,) m, optional
+        count : int, optional
+            k, where mu is a scalar; default 1.
+        """
+        if (
+            isinstance(tangents, bool)
+            or not isinstance(tangents, (int, np.integer))
+            or not 0 <= tangents <= 5
+        ):
+            raise InputError(f"tangents is {tangents!r}; a whole number from 0 to 5 is needed")
+        spin = patch_radius is not None
+        if tangents > 2 and spin:
+            raise InputError(
+                f"{tangents} tangents make a round cone, which bounds spin itself: no patch_radius"
+            )
+        if count is not None and (
+            isinstance(count, bool) or not isinstance(count, (int, np.integer)) or count < 0
+        ):
+            raise InputError(f"count is {count!r}; a whole number of contacts is needed")
+        mu = np.asarray(mu, float)
+        k = count if count is not None else len(mu) if mu.ndim else 1
+        mu = as_array("mu", mu, (k,))
         size = 1 + tangents + spin
         radius = (
-            np.zeros(k) if patch_radius is None else np.broadcast_to(np.asarray(patch_radius, float), (k,))
+            np.zeros(k) if patch_radius is None else as_array("patch_radius", patch_radius, (k,), unit="m")
         )
         m = k * size
-        kind = np.full(k, CONTACT_SPIN if spin else CONTACT, np.int32)
+        kind = np.full(k, ROUND if tangents > 2 else CONTACT_SPIN if spin else CONTACT, np.int32)
         return cls(np.arange(0, m + 1, size, dtype=np.int32), kind, np.zeros(m), np.zeros(m), mu, radius)
 
     @property
@@ -159,10 +200,24 @@ class Cones:
         """Every row has constant bounds: ROW blocks and contacts of a normal alone."""
         return bool(np.all((self.kind == ROW) | (np.diff(self.ptr) == 1)))
 
+    @cached_property
+    def has_round(self) -> bool:
+        """Some contact has more than two tangents in one cone."""
+        return bool(np.any(self.kind == ROUND))
+
     @property
     def n_tangents(self) -> IntArray:
         """(k,) tangent rows of each block, 0 on ROW."""
-        return np.where(self.kind == ROW, 0, np.diff(self.ptr) - self.kind).astype(np.int32)
+        own = np.diff(self.ptr) - 1 - (self.kind == CONTACT_SPIN)
+        return np.where(self.kind == ROW, 0, own).astype(np.int32)
+
+    def __add__(self, other: object) -> Cones:
+        """These blocks, then those of `other`."""
+        if not isinstance(other, Cones):
+            return NotImplemented
+        pairs = [(getattr(self, f.name), getattr(other, f.name)) for f in fields(self)]
+        ptr = np.concatenate([self.ptr, self.n_rows + other.ptr[1:]])
+        return Cones._trusted(ptr.astype(np.int32), *(np.concatenate(pair) for pair in pairs[1:]))
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Cones):

@@ -2,8 +2,8 @@
 
     A = J M^-1 J^T + diag(compliance)  [1/kg],   b = target - J v*  [m/s],   w = A lambda - b  [m/s]
 
-`Problem` holds either rows (J and M^-1 factored, `lavender/rows.py`) or a matrix, never both, and derives
-the rest on first use.
+`Problem` holds rows (J and M^-1 of bodies, `lavender/rows.py`), J and M in generalised coordinates
+(`lavender/generalized.py`) or a matrix, one of them, and derives the rest on first use.
 """
 
 from __future__ import annotations
@@ -18,8 +18,9 @@ import scipy.sparse as sp
 
 from lavender._arrays import FloatArray, IntArray, as_array, check_not_negative, equal, read_only
 from lavender._derived import Derived, once
-from lavender.cones import CONTACT_SPIN, ROW, Cones
+from lavender.cones import CONTACT_SPIN, ROUND, ROW, Cones
 from lavender.errors import CapabilityError, InputError
+from lavender.generalized import Generalized
 from lavender.rows import Rows
 from lavender_ext.core import assemble
 from lavender_ext.core.problem import Data, dense_to_csr, rows_velocity
@@ -32,7 +33,7 @@ FRICTION = ("coulomb", "cone")
 # A solver that takes a law takes every law before it that it contains: linear < lcp < coulomb | cone.
 LAWS = ("linear", "lcp", "coulomb", "cone")
 # How A is given.
-OPERATORS = ("rows", "matrix")
+OPERATORS = ("rows", "matrix", "generalized")
 
 
 @dataclass(frozen=True)
@@ -68,10 +69,12 @@ class Problem:
     matrix : (m, m) array or sparse, 1/kg
         A, kept exactly as given (asymmetric, indefinite and singular are legal); or
     rows : Rows
-        J and M^-1; A is then J M^-1 J^T + diag(compliance) and is formed only on request.
+        J and M^-1; A is then J M^-1 J^T + diag(compliance) and is formed only on request; or
+    generalized : Generalized
+        J and M in generalised coordinates; the same.
     friction : {"coulomb", "cone"}
         Exact Coulomb friction (non-associated), or its convex relaxation.
-    compliance : (m,) 1/kg, only with `rows`
+    compliance : (m,) 1/kg, not with a matrix
         Softness of each row, >= 0.
     guess : (m,) N s, optional
         Warm start that travels with the problem.
@@ -86,7 +89,7 @@ class Problem:
     Raises
     ------
     InputError
-        Wrong shapes, NaN or infinity, both or neither of matrix and rows, nnz >= 2^31.
+        Wrong shapes, NaN or infinity, none or several of matrix, rows and generalized, nnz >= 2^31.
     """
 
     b: FloatArray
@@ -100,6 +103,7 @@ class Problem:
     names: Sequence[str] | None = None
     name: str = ""
     copy: bool = field(default=True, repr=False)
+    generalized: Generalized | None = None
     derived: Derived = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -111,12 +115,18 @@ class Problem:
         m, k = self.cones.n_rows, self.cones.n_blocks
         put(self, "derived", Derived())
         put(self, "b", as_array("b", self.b, (m,), unit="m/s", copy=self.copy))
-        if (self.matrix is None) == (self.rows is None):
-            raise InputError("give either matrix= or rows=, one of them")
+        if (self.matrix is None) + (self.rows is None) + (self.generalized is None) != 2:
+            raise InputError("give matrix=, rows= or generalized=, one of them")
         if self.friction not in FRICTION:
             raise InputError(f"friction is {self.friction!r}; 'coulomb' or 'cone' is needed")
+        if self.friction != "cone" and self.cones.has_round:
+            raise InputError(
+                "a round cone of more than two tangents has no Coulomb law here: give friction='cone'"
+            )
         if self.rows is not None:
             self._check_rows(self.rows, m, k)
+        elif self.generalized is not None:
+            self._check_generalized(self.generalized, m)
         else:
             put(self, "matrix", _checked_matrix(self.matrix, m, self.copy))
             if self.compliance is not None:
@@ -142,18 +152,33 @@ class Problem:
         put(self, "name", str(self.name))
 
     def _check_rows(self, rows: Rows, m: int, k: int) -> None:
-        put = object.__setattr__
         if not isinstance(rows, Rows):
             raise InputError(f"rows is a {type(rows).__name__}; a Rows is needed")
         kj = rows.n_joints
         kind = self.cones.kind
-        if kj + rows.n_contacts != k or np.any(kind[:kj] != ROW) or np.any(kind[kj:] == ROW):
+        if (
+            kj + rows.n_contacts != k
+            or np.any(kind[:kj] != ROW)
+            or np.any(kind[kj:] == ROW)
+            or self.cones.has_round
+        ):
             raise InputError(
                 f"rows has {kj} joints and {rows.n_contacts} contacts; cones must have as many ROW "
                 f"blocks, then contacts (it has {k} blocks)"
             )
         if not np.array_equal(self.cones.ptr[: kj + 1], rows.joint_ptr):
             raise InputError("cones.ptr and rows.joint_ptr disagree about the rows of the joints")
+        self._check_compliance(m)
+
+    def _check_generalized(self, generalized: Generalized, m: int) -> None:
+        if not isinstance(generalized, Generalized):
+            raise InputError(f"generalized is a {type(generalized).__name__}; a Generalized is needed")
+        if generalized.m != m:
+            raise InputError(f"J has {generalized.m} rows; {m} are needed, as the cones have")
+        self._check_compliance(m)
+
+    def _check_compliance(self, m: int) -> None:
+        put = object.__setattr__
         compliance = np.zeros(m) if self.compliance is None else self.compliance
         put(self, "compliance", as_array("compliance", compliance, (m,), unit="1/kg", copy=self.copy))
         check_not_negative("compliance", self.compliance)  # type: ignore[arg-type]
@@ -248,6 +273,61 @@ class Problem:
         rows_velocity(blank.data, np.ascontiguousarray(rows.v_free), jv)
         return replace(blank, b=target - jv[:m], copy=False)
 
+    @classmethod
+    def from_jacobian(
+        cls,
+        J: Any,
+        M: Any,
+        v_free: Any,
+        *,
+        target: Any = 0.0,
+        cones: Cones,
+        compliance: Any = None,
+        friction: str = "coulomb",
+        names: Sequence[str] | None = None,
+        dof_names: Sequence[str] | None = None,
+        **more: Any,
+    ) -> Problem:
+        """Problem of a step in generalised coordinates: w = J v+ - target + compliance lambda.
+
+        Parameters
+        ----------
+        J : (m, nv) array or sparse
+            Rows in the order of `cones`, e.g. `Cones.free(6) + Cones.contacts(0.5, count=8)`.
+        M : (nv, nv) array or sparse, or a sequence of square blocks, one for each kinematic tree
+            Mass matrix, symmetric positive definite.
+        v_free : (nv,) m/s, rad/s
+            v*, the velocity after the step without constraint impulses.
+        target : scalar or (m,) m/s
+            Wanted relative velocity after the step: 0 holds, -depth/dt pushes out, -e v_n bounces.
+        cones : Cones
+        compliance : scalar or (m,) 1/kg, optional
+        friction : {"coulomb", "cone"}
+        names, dof_names : sequence of str (k,), (nv,), optional
+            Names of blocks and of velocities.
+
+        Raises
+        ------
+        InputError
+            As `Generalized` and `Problem`.
+        """
+        generalized = J if isinstance(J, Generalized) else Generalized(J, M, v_free, dof_names)
+        m = generalized.m
+        if isinstance(cones, Cones) and cones.n_rows != m:
+            raise InputError(f"J has {m} rows; {cones.n_rows} are needed, as the cones have")
+        target = as_array("target", target, (m,), unit="m/s")
+        if compliance is not None:
+            compliance = as_array("compliance", compliance, (m,), unit="1/kg")
+        return cls(
+            target - generalized.velocity_of(generalized.v_free),
+            cones,
+            friction=friction,
+            compliance=compliance,
+            names=names,
+            generalized=generalized,
+            **more,
+        )
+
     # -- size and kind --------------------------------------------------------------------------
 
     @property
@@ -257,8 +337,8 @@ class Problem:
 
     @property
     def operator(self) -> str:
-        """How A is given, of OPERATORS: "rows" or "matrix"."""
-        return "matrix" if self.rows is None else "rows"
+        """How A is given, of OPERATORS: "rows", "matrix" or "generalized"."""
+        return "rows" if self.rows is not None else "matrix" if self.generalized is None else "generalized"
 
     @property
     def n_blocks(self) -> int:
@@ -274,8 +354,8 @@ class Problem:
 
     @cached_property
     def asymmetry(self) -> float:
-        """max |A - A^T| / max |A|; exactly 0 with rows."""
-        if self.rows is not None:
+        """max |A - A^T| / max |A|; exactly 0 with J and M."""
+        if self.matrix is None:
             return 0.0
         gap, big = self._scan[2:]
         return gap / big if big > 0.0 else 0.0
@@ -302,7 +382,7 @@ class Problem:
 
     @once
     def data(self) -> Data:
-        """What the kernels read: pointers, d, nu, sweep steps. Of the rows where there are rows."""
+        """What kernels that sweep read: pointers, d, nu, steps. Of the rows where there are rows, else of A."""
         if self.rows is None:
             return self.csr_data
         r = self.rows
@@ -323,8 +403,21 @@ class Problem:
 
     @once
     def csr_data(self) -> Data:
-        """The same over A in compressed rows; forms A where only rows are given."""
-        return self._data(csr=self._compressed)
+        """The same over A in compressed rows; forms A where J and M are given."""
+        data = self._data(csr=self._compressed)
+        if self.generalized is not None and self.metric.start_energy >= 0.0:
+            data.set_start(self.metric.start_energy, self.metric.start_velocity)
+        return data
+
+    @once
+    def metric(self) -> Data:
+        """What the judge reads: `data`, or in generalised coordinates J and M as they are, d, Y = J L^-1 D^-1/2."""
+        if self.generalized is None:
+            return self.data
+        try:
+            return self._data(general=(self.generalized.operator, self.compliance))
+        except OverflowError as error:
+            raise InputError(f"the problem is too large: {error}") from None
 
     def _data(self, **operator: Any) -> Data:
         c = self.cones
@@ -352,6 +445,8 @@ class Problem:
     def _compressed(self) -> tuple[IntArray, IntArray, FloatArray]:
         # (indptr, indices, data) of A. Kernels and the judge read these: `csr` is an object whose arrays whoever
         # has it may exchange.
+        if self.generalized is not None:
+            return self._product()
         if self.rows is not None:
             most, start, blocks = assemble.bound(self.data)
             if most >= 2**31:
@@ -365,19 +460,39 @@ class Problem:
             return dense_to_csr(self.matrix)
         return self.matrix.indptr, self.matrix.indices, self.matrix.data
 
+    def _product(self) -> tuple[IntArray, IntArray, FloatArray]:
+        # A = Y Y^T + diag(compliance): symmetric to the bit, as SciPy adds both triangles in the same order.
+        y = self.whitened
+        most = float(np.sum(np.bincount(y.indices, minlength=1).astype(float) ** 2))
+        if most >= 2**31:
+            raise InputError(
+                f"A would have up to {most:.3g} entries, more than 32-bit indices reach: use a solver that takes "
+                "J and M as they are (operator 'generalized')"
+            )
+        a = _canonical(sp.csr_array(y @ y.T + sp.diags_array(np.asarray(self.compliance))), self.m)
+        return a.indptr, a.indices, a.data
+
+    @once
+    def whitened(self) -> sp.csr_array:
+        """Y (m, nv) with J M^-1 J^T = Y Y^T; only in generalised coordinates."""
+        assert self.generalized is not None
+        return sp.csr_array(self.metric.whitened(), shape=(self.m, self.generalized.nv))
+
     @once
     def jacobian(self) -> sp.csr_array:
-        """J (m, 6 n) as CSR, read-only; only with rows.
+        """J as CSR, read-only: (m, 6 n) with rows, (m, nv) in generalised coordinates.
 
         Raises
         ------
         CapabilityError
             The problem was given as a matrix.
         """
+        if self.generalized is not None:
+            return self.generalized.jac
         if self.rows is None:
             raise CapabilityError(
                 "this problem was given as a matrix; its Jacobian is not known (make it with "
-                "Problem.from_rows)"
+                "Problem.from_rows or Problem.from_jacobian)"
             )
         jac = self.rows.jacobian(self.cones)
         for part in (jac.data, jac.indices, jac.indptr):
@@ -387,7 +502,7 @@ class Problem:
     @property
     def d(self) -> FloatArray:
         """(m,) 1/kg: diagonal of A with fallbacks, the judge's metric."""
-        return self.data.d
+        return self.metric.d
 
     def delassus(self) -> Any:
         """A (m, m) [1/kg]: the matrix as given, or J M^-1 J^T + diag(compliance) as CSR."""
@@ -400,15 +515,23 @@ class Problem:
     def slack(self, impulse: Any) -> FloatArray:
         """w = A lambda - b (m,) [m/s], recomputed from the problem's data."""
         w = np.empty(self.m)
-        measure.slack(self.data, self.impulse_array(impulse), w)
+        measure.slack(self.metric, self.impulse_array(impulse), w)
         return w
 
     def velocity(self, impulse: Any) -> FloatArray:
-        """v+ = v* + M^-1 J^T lambda (n, 6) [m/s, rad/s]; only with rows."""
+        """v+ = v* + M^-1 J^T lambda [m/s, rad/s]: (n, 6) with rows, (nv,) in generalised coordinates.
+
+        Raises
+        ------
+        CapabilityError
+            The problem was given as a matrix.
+        """
+        if self.generalized is not None:
+            return self.generalized.v_free + self.generalized.change(self.impulse_array(impulse))
         if self.rows is None:
             raise CapabilityError(
-                "this problem was given as a matrix; body velocities need rows (make it with "
-                "Problem.from_rows)"
+                "this problem was given as a matrix; velocities need J and M (make it with "
+                "Problem.from_rows or Problem.from_jacobian)"
             )
         v = np.zeros((self.rows.n_bodies, 6))
         measure.velocity_change(self.data, self.impulse_array(impulse), v)
@@ -452,15 +575,25 @@ class Problem:
             name = self.names[i] if self.names else f"row {row}" if size == 1 else f"joint {i}"
             return name if size == 1 else f"{name}, axis {offset}"
         first_contact = 0 if self.rows is None else self.rows.n_joints
+        if self.generalized is not None:
+            first_contact = int(np.count_nonzero(self.cones.kind[:i] == ROW))
         name = self.names[i] if self.names else f"contact {i - first_contact}"
         if offset == 0:
             return f"{name}, normal"
+        if kind == ROUND and offset > 2:
+            return f"{name}, spin" if offset == 3 else f"{name}, roll {offset - 3}"
         return f"{name}, spin" if kind == CONTACT_SPIN and offset == size - 1 else f"{name}, tangent {offset}"
 
     # -- other forms -----------------------------------------------------------------------------
 
     def relaxed(self, friction: str = "cone") -> Problem:
-        """The same problem under another friction law: "cone" is the convex relaxation."""
+        """The same problem under another friction law: "cone" is the convex relaxation.
+
+        Raises
+        ------
+        InputError
+            "coulomb" for round cones of more than two tangents.
+        """
         return replace(self, friction=friction, copy=False)
 
     def boxed(self, normal_impulse: Any) -> Problem:
@@ -484,18 +617,21 @@ class Problem:
             lower[j + 1 : end], upper[j + 1 : end] = -bound[1:], bound[1:]
             upper[j] = np.inf
         names = None if self.names is None else [self.row_name(i) for i in range(self.m)]
+        more: dict[str, Any] = {"matrix": self.csr} if self.generalized is None else {
+            "generalized": self.generalized, "compliance": self.compliance
+        }  # fmt: skip
         return Problem(
             self.b,
             Cones.bounded(lower, upper),
-            self.csr,
             guess=self.guess,
             names=names,
             name=self.name,
             copy=False,
+            **more,
         )
 
     def velocity_form(self) -> VelocityForm:
-        """The mass-scaled velocity form (see `VelocityForm`); only with rows.
+        """The mass-scaled velocity form (see `VelocityForm`); not with a matrix.
 
         Raises
         ------
@@ -503,6 +639,10 @@ class Problem:
             The problem was given as a matrix.
         """
         jac = self.jacobian
+        scale = 1.0 / np.sqrt(self.d)
+        if self.generalized is not None:
+            k = sp.csr_array(sp.diags_array(scale) @ self.whitened)
+            return VelocityForm(k, scale * self.b, self.compliance * scale**2, scale)  # type: ignore[operator]
         rows = self.rows
         assert rows is not None
         n = rows.n_bodies
@@ -512,7 +652,6 @@ class Problem:
         half = replace(
             rows, inv_mass=np.sqrt(rows.inv_mass), inv_inertia=root, copy=False
         ).inverse_mass_matrix()
-        scale = 1.0 / np.sqrt(self.d)
         k = sp.csr_array(sp.diags_array(scale) @ (jac @ half))
         return VelocityForm(k, scale * self.b, self.compliance * scale**2, scale)  # type: ignore[operator]
 
@@ -521,7 +660,18 @@ class Problem:
             return NotImplemented
         if not all(
             equal(getattr(self, n), getattr(other, n))
-            for n in ("b", "cones", "rows", "friction", "compliance", "guess", "key", "names", "name")
+            for n in (
+                "b",
+                "cones",
+                "rows",
+                "generalized",
+                "friction",
+                "compliance",
+                "guess",
+                "key",
+                "names",
+                "name",
+            )
         ):
             return False
         if sp.issparse(self.matrix) and sp.issparse(other.matrix):
@@ -538,7 +688,7 @@ class Problem:
         return type(self), tuple(f.name != "copy" and getattr(self, f.name) for f in fields(self) if f.init)
 
     def __repr__(self) -> str:
-        kind = "rows" if self.rows is not None else "CSR" if sp.issparse(self.matrix) else "dense"
+        kind = self.operator if self.matrix is None else "CSR" if sp.issparse(self.matrix) else "dense"
         name = f"{self.name!r}, " if self.name else ""
         return f"<Problem {name}{self.law}, {self.m} rows in {self.n_blocks} blocks, {kind}>"
 

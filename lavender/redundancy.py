@@ -179,7 +179,7 @@ def redundancy(problem: Problem, *, tol: float = 1e-12) -> Redundancy:
         from scipy.sparse import csgraph
 
         root = None
-        if problem.rows is not None and not np.any(problem.compliance):
+        if problem.matrix is None and not np.any(problem.compliance):
             root = problem.velocity_form().jacobian
         count, label = csgraph.connected_components(scaled, directed=False)
         by_island = np.split(

@@ -60,7 +60,7 @@ class SolverSpec:
     summary: str
     reference: str = ""  # paper or manual
     # Of OPERATORS, those that it reads as they are given; with "matrix" A is formed where another was given.
-    operators: frozenset[str] = frozenset(OPERATORS)
+    operators: frozenset[str] = frozenset({"rows", "matrix"})
     exact: bool = False  # finite or to rounding, not to tol
     resumable: bool = True
     impulse: bool = True  # a warm start changes what it does
@@ -70,6 +70,7 @@ class SolverSpec:
     callback: bool = True  # takes callback=; needs resumable
     history: bool = True  # records history; needs resumable
     delegates: bool = False  # may hand over to other solvers: only "auto"
+    round_cones: bool = False  # takes contacts of more than two tangents in one cone
     external: bool = False  # another project's code solves; its claims are its own
     max_iter: int = 1000  # default budget
     options: Mapping[str, str] = field(default_factory=dict)  # own options: name -> one line
@@ -118,7 +119,15 @@ class SolverSpec:
             takes = ", ".join(law for law in LAWS if law in self.laws)
             return f"takes laws {takes}, not {problem.law!r}{_way_round(problem.law, self.laws)}"
         if "matrix" not in self.operators and problem.operator not in self.operators:
-            return "needs a problem with rows (Problem.from_rows); this one was given as a matrix"
+            makers = {"rows": "Problem.from_rows", "generalized": "Problem.from_jacobian"}
+            needs = " or ".join(f"{o} ({makers[o]})" for o in OPERATORS if o in self.operators)
+            given = "as a matrix" if problem.operator == "matrix" else f"by its {problem.operator} form"
+            return f"needs a problem with {needs}; this one was given {given}"
+        if problem.cones.has_round and not self.round_cones:
+            return (
+                "takes no round cones (more than two tangents in one): use one of those that do, "
+                "lavender.available(problem) lists them, or give the edges of a pyramid as rows"
+            )
         return self.refusal(problem) if self.refusal is not None else None
 
     def load(self) -> Callable[..., Solver]:

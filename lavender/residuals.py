@@ -59,7 +59,7 @@ class Residual:
     @property
     def velocity_by_row(self) -> FloatArray:
         """sqrt(nu d) |e| (m,) [m/s]; each tangent of a pair alone."""
-        return self._problem.data.weight * np.abs(self.error)
+        return self._problem.metric.weight * np.abs(self.error)
 
     def __str__(self) -> str:
         worst = f", worst {self.worst_name} {self.velocity:.2g} m/s" if self.worst_row >= 0 else ""
@@ -87,7 +87,7 @@ def _relative(data: Any, energy: float, velocity: float) -> float:
 
 def reference(problem: Problem) -> tuple[float, float]:
     """E0 [sqrt J] and V0 [m/s]; computed once per problem."""
-    data = problem.data
+    data = problem.metric
     if data.start_energy < 0.0:
         m = problem.m
         w, e = np.empty(m), np.empty(m)
@@ -102,12 +102,14 @@ def reference(problem: Problem) -> tuple[float, float]:
         # A size that overflows measures nothing: 0 makes every error beside it infinite.
         data.set_start(energy if energy < np.inf else 0.0, velocity if velocity < np.inf else 0.0)
         problem.derived.start_relative = _relative(data, *own[:2])
+        if problem.generalized is not None and "csr_data" in problem.__dict__:
+            problem.csr_data.set_start(data.start_energy, data.start_velocity)
     return data.start_energy, data.start_velocity
 
 
 def judged(problem: Problem, impulse: FloatArray) -> measure.Judged:
     """The judge's pass over an impulse (m,) [N s], which is kept as it is: it must not change any more."""
-    data = problem.data
+    data = problem.metric
     if data.start_energy < 0.0:
         reference(problem)
     return measure.Judged(data, impulse)
@@ -133,7 +135,7 @@ def quick(
     """(relative, floor) with w, e as scratch (m,): the solvers' own stopping test, the judge's arithmetic."""
     start_energy, start_velocity = reference(problem)
     energy, velocity, _, floor_energy, floor_velocity, finite = measure.judge(
-        problem.data, impulse, w, e, floor
+        problem.metric, impulse, w, e, floor
     )
     if not finite:
         return np.inf, 0.0
@@ -170,8 +172,8 @@ def residual(problem: Problem, impulse: Any) -> Residual:
         "velocity": last.velocity,
         "floor": last.floor,
         "worst_row": last.worst,
-        "energy_start": problem.data.start_energy,
-        "velocity_start": problem.data.start_velocity,
+        "energy_start": problem.metric.start_energy,
+        "velocity_start": problem.metric.start_velocity,
         "error": read_only(last.error),
         "slack": read_only(last.slack),
         "_problem": problem,

@@ -236,7 +236,7 @@ def _make(spec: SolverSpec, options: dict[str, Any]) -> Any:
 
 
 def same_structure(p: Problem, q: Problem) -> bool:
-    """Same blocks, same kind of operator, same bodies or same pattern of A."""
+    """Same blocks, same kind of operator, same bodies or same pattern of J and M or of A."""
     if not (equal(p.cones.ptr, q.cones.ptr) and equal(p.cones.kind, q.cones.kind)) or p.law != q.law:
         return False
     if p.rows is not None and q.rows is not None:
@@ -245,8 +245,16 @@ def same_structure(p: Problem, q: Problem) -> bool:
             and equal(p.rows.joint_body, q.rows.joint_body)
             and equal(p.rows.contact_body, q.rows.contact_body)
         )
-    if p.rows is not None or q.rows is not None:
+    if p.operator != q.operator:
         return False
+    if p.generalized is not None and q.generalized is not None:
+        return all(
+            equal(x, y)
+            for of in ("jac", "mass")
+            for x, y in zip(
+                getattr(p.generalized.operator, of)[:2], getattr(q.generalized.operator, of)[:2], strict=True
+            )
+        )
     return equal(p.csr.indptr, q.csr.indptr) and equal(p.csr.indices, q.csr.indices)
 
 
@@ -295,7 +303,7 @@ class _Loop:
 
     def run(self, max_iter: int) -> Claim:
         # About a nanosecond per unit of work: the first guess, then measured. Capped, for solvers in Python.
-        chunk = min(FIRST_CHUNK, max(1, int(CHUNK_TIME * 1e9) // max(1, self.problem.data.work)))
+        chunk = min(FIRST_CHUNK, max(1, int(CHUNK_TIME * 1e9) // max(1, self.problem.metric.work)))
         records = self.rows is not None or self.callback is not None
         claim = NOTHING_DONE
         try:
@@ -438,7 +446,7 @@ def finish(
 def _decide_empty_rows(problem: Problem, impulse: FloatArray) -> tuple[str, FloatArray] | None:
     """Rows of A that are all zero: put on the bound that b asks for, or prove that there is none."""
     cones = problem.cones
-    for i in problem.data.empty:
+    for i in problem.metric.empty:
         block = problem.block_of(int(i))
         if cones.kind[block] != ROW and i != cones.ptr[block]:
             continue  # tangents and spin: bounded by mu lambda_n

@@ -17,7 +17,7 @@ LEVELS = [
     {"errors"},
     {"_arrays", "_derived"},
     {"cones"},
-    {"rows"},
+    {"generalized", "rows"},
     {"problem"},
     {"residuals"},
     {"solution"},
@@ -47,7 +47,7 @@ HEIGHT = {name: height for height, level in enumerate(LEVELS) for name in level}
 KERNEL_LEVELS = [
     {"core"},
     {"factor", "judge"},
-    {"local", "newton", "pivot", "sweep"},
+    {"generalized", "local", "newton", "pivot", "sweep"},
     {"accelerate", "engine"},
     {"warm"},
     {"bench", "host"},

@@ -25,6 +25,7 @@ import scipy.sparse as sp
 from lavender._arrays import FloatArray
 from lavender.cones import CONTACT, ROW, Cones
 from lavender.errors import InputError
+from lavender.generalized import Generalized
 from lavender.io.stored import MAX_BYTES, NUMBER, Budget, Stored, write_atomically
 from lavender.problem import Problem
 from lavender.rows import Rows
@@ -38,6 +39,10 @@ JSON_GROWTH = 40  # bytes of Python objects that a byte of JSON text can make; n
 PACKED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # what NumPy writes; others choose the memory they take
 CONES = tuple(f"cones_{f.name}" for f in fields(Cones))
 ROWS = tuple(f"rows_{f.name}" for f in fields(Rows) if f.name != "copy")
+GENERAL = (
+    *(f"general_{name}_{part}" for name in ("jac", "mass") for part in ("data", "indices", "indptr")),
+    "general_v_free",
+)
 CSR = ("A_data", "A_indices", "A_indptr", "A_shape")
 OPTIONAL = ("guess", "key", "impulse")
 BROKEN = (
@@ -224,6 +229,14 @@ def write(problem: Problem, path: str | os.PathLike[str], *, impulse: Any = None
             arrays[name] = getattr(problem.rows, name.removeprefix("rows_"))
         arrays["compliance"] = problem.compliance
         operator = "rows"
+    elif problem.generalized is not None:
+        general = problem.generalized
+        for name, x in (("jac", general.jac), ("mass", general.mass)):
+            for part in ("data", "indices", "indptr"):
+                arrays[f"general_{name}_{part}"] = getattr(x, part)
+        arrays["general_v_free"] = general.v_free
+        arrays["compliance"] = problem.compliance
+        operator = "generalized"
     elif sp.issparse(problem.matrix):
         a = problem.matrix
         arrays |= dict(zip(CSR, (a.data, a.indices, a.indptr, np.array(a.shape, np.int64)), strict=True))
@@ -238,6 +251,8 @@ def write(problem: Problem, path: str | os.PathLike[str], *, impulse: Any = None
     if impulse is not None:
         arrays["impulse"] = problem.impulse_array(impulse)
     meta = {"operator": operator, "friction": problem.friction, "name": problem.name, "names": problem.names}
+    if problem.generalized is not None:
+        meta["dof_names"] = problem.generalized.names
     arrays["meta"] = np.frombuffer(json.dumps(meta).encode("ascii"), np.uint8)
 
     def write_to(temporary: Path) -> None:
@@ -254,7 +269,12 @@ def _read_own(archive: _Archive) -> Stored:
             f"lavender_format is {version!r}; this lavender reads {VERSION}: update it, or save again"
         )
     meta = _meta(archive)
-    operator = {"dense": ("A",), "csr": CSR, "rows": (*ROWS, "compliance")}[meta["operator"]]
+    operator = {
+        "dense": ("A",),
+        "csr": CSR,
+        "rows": (*ROWS, "compliance"),
+        "generalized": (*GENERAL, "compliance"),
+    }[meta["operator"]]
     needed = ("lavender_format", "meta", "b", *CONES, *operator)
     _check_entries(archive, needed, OPTIONAL)
     for name in archive:
@@ -270,6 +290,9 @@ def _read_own(archive: _Archive) -> Stored:
         parts: dict[str, Any] = {name.removeprefix("rows_"): archive[name] for name in ROWS}
         more["rows"] = Rows(**parts)
         more["compliance"] = archive["compliance"]
+    elif meta["operator"] == "generalized":
+        more["generalized"] = _generalized(archive, meta["dof_names"])
+        more["compliance"] = archive["compliance"]
     else:
         more["matrix"] = _matrix(archive)
     cones = Cones(**{name.removeprefix("cones_"): archive[name] for name in CONES})
@@ -284,14 +307,34 @@ def _meta(archive: _Archive) -> dict[str, Any]:
         raise InputError(f"entry 'meta' is not JSON text in bytes ({error})") from None
     if (
         not isinstance(meta, dict)
-        or set(meta) != {"operator", "friction", "name", "names"}
-        or meta["operator"] not in ("dense", "csr", "rows")
+        or set(meta) - {"dof_names"} != {"operator", "friction", "name", "names"}
+        or meta["operator"] not in ("dense", "csr", "rows", "generalized")
+        or ("dof_names" in meta) != (meta["operator"] == "generalized")
+        or not _is_names(meta.get("dof_names"))
         or not isinstance(meta["name"], str)
         or not isinstance(meta["friction"], str)
         or not _is_names(meta["names"])
     ):
-        raise InputError("entry 'meta' must hold operator (dense, csr or rows), friction, name and names")
+        raise InputError(
+            "entry 'meta' must hold operator (dense, csr, rows or generalized), friction, name and names"
+        )
     return meta
+
+
+def _generalized(archive: _Archive, names: list[str] | None) -> Generalized:
+    v_free = archive["general_v_free"]
+    n, m = v_free.size, archive["b"].size
+    jac, mass = (
+        compressed(
+            archive[f"general_{name}_indptr"],
+            archive[f"general_{name}_indices"],
+            archive[f"general_{name}_data"],
+            rows,
+            n,
+        )
+        for name, rows in (("jac", m), ("mass", n))
+    )
+    return Generalized(jac, mass, v_free, names)
 
 
 def _is_names(value: Any) -> bool:

@@ -1,4 +1,4 @@
-"""Islands: blocks that share no moving body (rows) or no entry of A (matrix) are problems of their own."""
+"""Islands: blocks that share no moving body, no kinematic tree or no entry of A are problems of their own."""
 
 from __future__ import annotations
 
@@ -22,8 +22,26 @@ def islands(problem: Problem) -> tuple[int, IntArray]:
     if problem.rows is not None:
         return graph.body_components(block_bodies(problem), problem.rows.n_bodies)
     block = np.repeat(np.arange(cones.n_blocks, dtype=np.int32), np.diff(cones.ptr))
+    if problem.generalized is not None:
+        return _tree_islands(problem, block)
     a = problem.csr
     return graph.matrix_components(cones.ptr, block, a.indptr, a.indices)
+
+
+def _tree_islands(problem: Problem, block: IntArray) -> tuple[int, IntArray]:
+    from scipy.sparse import coo_array, csgraph
+
+    assert problem.generalized is not None
+    jac, k = problem.generalized.jac, problem.n_blocks
+    trees = problem.generalized.trees
+    row = np.repeat(block, np.diff(jac.indptr))
+    n = k + int(trees.max(initial=-1)) + 1
+    graph = coo_array((np.ones(len(row), np.int8), (row, k + trees[jac.indices])), shape=(n, n))
+    label = csgraph.connected_components(graph, directed=False)[1][:k]
+    first, which = np.unique(label, return_index=True)[1], np.unique(label, return_inverse=True)[1]
+    number = np.empty(len(first), np.int32)
+    number[np.argsort(first)] = np.arange(len(first), dtype=np.int32)
+    return len(first), np.ascontiguousarray(number[which], np.int32)
 
 
 def block_bodies(problem: Problem) -> IntArray:
@@ -53,6 +71,12 @@ def restrict(problem: Problem, blocks: IntArray, rows: IntArray) -> Problem:
     names = None if problem.names is None else [problem.names[i] for i in blocks]
     more: dict[str, Any] = {"friction": problem.friction, "names": names, "name": problem.name}
     b: FloatArray = problem.b[rows]
+    if problem.generalized is not None:
+        assert problem.compliance is not None
+        trees = problem.generalized.trees
+        touched = np.isin(trees, np.unique(trees[problem.generalized.jac[rows].indices]))
+        general = problem.generalized.restrict(rows, np.flatnonzero(touched))
+        return Problem(b, cones, generalized=general, compliance=problem.compliance[rows], **more)
     if problem.rows is None:
         return Problem(b, cones, problem.csr[rows][:, rows], **more)
     given = problem.rows

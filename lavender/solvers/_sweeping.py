@@ -40,7 +40,7 @@ class SweepState:
         self.data = data  # lavender_ext.core.problem.Data that the kernel sweeps over, and that checks read
         self.order = self.plan = order  # `plan` is of the problem's own blocks
         start = reference(problem)
-        if data is not problem.data:
+        if data is not problem.metric:
             data.set_start(*start)  # the error of doing nothing is the judge's, in whatever form
         # Rows of A that were formed of a factored problem: its own form has the last word.
         other = problem.data if problem.data.factored and not data.factored else None

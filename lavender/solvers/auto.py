@@ -1,6 +1,7 @@
 """The only solver that hands over to others: each in its turn, by what it would cost from here on.
 
     linear            direct, newton
+    J and M           newton over the velocities; what that leaves, as below, on the rows of A
     others            a finite solver at once where its factor costs less than sweeps usually do; else anderson
                       as long as what it still needs, by its contraction so far, costs less than the cheapest
                       finite solver (direct, newton, lemke, as the law allows); then that one, with twice the
@@ -26,7 +27,7 @@ import numpy as np
 
 from lavender._arrays import FloatArray, IntArray
 from lavender.errors import SolverUnavailable, UnknownName
-from lavender.problem import Problem
+from lavender.problem import OPERATORS, Problem
 from lavender.registry import SolverSpec, get
 from lavender.residuals import at_floor, check_certificate, known, quick, reference
 from lavender.solution import Claim, Status
@@ -48,6 +49,7 @@ BELIEVED = 2.0  # times a finite solver's cost that sweeps may take, whatever th
 GLANCE = 0.35  # share of a finite solver's cost for which a first look at sweeps is always worth it
 APART = 10.0  # islands' worth of Python from which a finite solver is compared with islands solved apart
 ROUNDS = 8  # times that sweeps and finite solvers take turns, the allowance doubled each time
+GENERAL_ROWS = 3000  # up to which A is formed of J and M that newton left unsolved
 CERTIFICATE_ROWS = 3000  # rows up to which a linear program is asked for a certificate
 CERTIFICATE_STEPS = 100  # of the simplex method for each row at most
 
@@ -191,7 +193,8 @@ def _whole(trail: Trail, name: str, budget: int, limit: int = 0) -> bool:
     if spec is None or budget <= trail.iterations:
         return trail.done
     solver = spec.load()()
-    state = _newton_state(trail) if name == "newton" else solver.prepare(trail.problem)
+    own = name == "newton" and trail.problem.generalized is None
+    state = _newton_state(trail) if own else solver.prepare(trail.problem)
     # Half-finished sweeps mislead a Newton method; Pi(0) does not.
     before = trail.best
     impulse = trail.impulse.copy() if before <= WARM else trail.problem.start()
@@ -299,7 +302,10 @@ class _Sweeps:
 
 @np.errstate(all="ignore")  # what overflows is judged
 def _solve(trail: Trail, budget: int) -> None:
-    problem, costs = trail.problem, trail.costs
+    problem = trail.problem
+    if problem.generalized is not None and _general(trail, budget):
+        return
+    costs = trail.costs
     if problem.law == "linear":
         # A sparse factorisation takes islands apart by itself; newton where that stops early.
         names = [e.name for e in costs.exact] if problem.m > FEW_JOINTS else ["direct", "newton"]
@@ -321,6 +327,13 @@ def _solve(trail: Trail, budget: int) -> None:
     if whole > 2.0 * ISLAND and trail.apart_cost() < whole and _apart(trail, budget):
         return
     _finish(trail, sweeps, budget)
+
+
+def _general(trail: Trail, budget: int) -> bool:
+    """Newton over the velocities; True where nothing is left to do, or A would be too large to go on."""
+    if _whole(trail, "newton", budget) or trail.at_floor():
+        return True
+    return trail.problem.m > GENERAL_ROWS or trail.problem.cones.has_round
 
 
 def _at_once(costs: Costs) -> bool:
@@ -490,10 +503,17 @@ def _cap(problem: Problem) -> int:
     return CAP if problem.m < LARGE else 2 * CAP
 
 
+def _refusal(problem: Problem) -> str | None:
+    return get("newton").refuses(problem) if problem.cones.has_round else None
+
+
 SPEC = SolverSpec(
     name="auto",
     factory=Auto,
     laws=frozenset({"linear", "lcp", "coulomb", "cone"}),
+    operators=frozenset(OPERATORS),
+    round_cones=True,
+    refusal=_refusal,
     resumable=False,
     delegates=True,
     max_iter=1_000_000,

@@ -13,6 +13,9 @@
 4. Coulomb friction by a proximal Newton method on the Alart-Curnier map, and by interior points on
    De Saxce's form of the law, whose convex problem moves with every step.
 
+Problems in generalised coordinates go over their velocities first (`_newton/general.py`), where A is never formed; what
+that leaves goes on as above, over the rows of A, unless form="velocity".
+
 The parts stand in `_newton/`. Form "velocity" factors I + K^T V K over the bodies and never squares J; "impulse"
 factors over the rows.
 """
@@ -21,14 +24,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from time import perf_counter
+from typing import Any
 
 import numpy as np
 
 from lavender._arrays import FloatArray
 from lavender.errors import InputError
-from lavender.problem import Problem
+from lavender.problem import OPERATORS, Problem
 from lavender.registry import SolverSpec
+from lavender.residuals import quick
 from lavender.solution import Claim, Status
+from lavender.solvers._newton import general
 from lavender.solvers._newton.convex import solve_convex
 from lavender.solvers._newton.coulomb import solve_coulomb
 from lavender.solvers._newton.run import Run
@@ -36,6 +42,8 @@ from lavender.solvers._newton.systems import System, make_system
 from lavender.solvers.warm_start import claim_of, warm_start
 
 FORMS = ("auto", "velocity", "impulse")
+ROWS = 3000  # up to which A is formed where velocities did not end it
+WARM = 1e-3  # relative residual from which rows of A go on from what velocities left
 
 
 @dataclass
@@ -44,6 +52,7 @@ class NewtonState:
 
     problem: Problem
     system: System | None  # None where nothing moves
+    general: Any = None  # lavender_ext.generalized.newton.Newton, in generalised coordinates
 
 
 @dataclass(frozen=True)
@@ -53,7 +62,7 @@ class Newton:
     Parameters
     ----------
     form : {"auto", "velocity", "impulse"}
-        Unknowns of the factorisation: the bodies (needs rows) or the rows of A. "auto": the bodies where
+        Unknowns of the factorisation: velocities (needs J and M) or the rows of A. "auto": velocities where
         they are known.
     """
 
@@ -63,12 +72,15 @@ class Newton:
     def prepare(self, problem: Problem) -> NewtonState:
         if self.form not in FORMS:
             raise InputError(f"form is {self.form!r}; one of {', '.join(FORMS)} is needed")
-        if self.form == "velocity" and problem.rows is None:
+        if self.form == "velocity" and problem.matrix is not None:
             raise InputError(
-                "form='velocity' needs a problem with rows (Problem.from_rows); this one was given as a matrix"
+                "form='velocity' needs a problem with J and M (Problem.from_rows, Problem.from_jacobian); this one "
+                "was given as a matrix"
             )
         if problem.m == 0:
             return NewtonState(problem, None)
+        if problem.generalized is not None and self.form != "impulse":
+            return NewtonState(problem, None, general.prepare(problem))
         form = self.form
         if form == "auto":
             form = "impulse" if problem.rows is None or problem.rows.n_bodies == 0 else "velocity"
@@ -85,13 +97,54 @@ class Newton:
         problem, system = state.problem, state.system
         if problem.m == 0:
             return Claim(Status.CONVERGED, 0)
+        if state.general is not None:
+            return self._run_general(state, impulse, n, tol, time_limit)
+        return self._run_system(problem, system, impulse, n, tol, time_limit)
+
+    def _run_general(
+        self, state: NewtonState, impulse: FloatArray, n: int, tol: float, time_limit: float | None
+    ) -> Claim:
+        problem, start = state.problem, perf_counter()
+        claim = general.run(problem, state.general, impulse, n, tol, time_limit)
+        left = n - claim.iterations
+        ended = claim.status not in (Status.STALLED, Status.NUMERICAL_ERROR, Status.DIVERGED)
+        if ended or self.form == "velocity" or left <= 0 or problem.m > ROWS or problem.cones.has_round:
+            return claim
+        w, e = np.empty(problem.m), np.empty(problem.m)
+        best, floor = quick(problem, impulse, w, e, True)
+        if best <= 2.0 * floor:
+            return claim
+        before = impulse.copy()
+        if not best <= WARM:
+            impulse[:] = problem.start()
+        system = make_system(problem, "impulse")
+        seconds = None if time_limit is None else max(time_limit - (perf_counter() - start), 1e-3)
+        more = self._run_system(problem, system if system.sc.m else None, impulse, left, tol, seconds)
+        if not quick(problem, impulse, w, e)[0] <= best:
+            impulse[:] = before
+        work = dict(claim.work)
+        for kind, count in more.work.items():
+            work[kind] = work.get(kind, 0) + count
+        form = f"{claim.form}, then {more.form or 'impulse'}"
+        total = claim.iterations + more.iterations
+        return Claim(more.status, total, work, more.message, form=form, certificate=more.certificate)
+
+    def _run_system(
+        self,
+        problem: Problem,
+        system: System | None,
+        impulse: FloatArray,
+        n: int,
+        tol: float,
+        time_limit: float | None,
+    ) -> Claim:
         if system is None:
             system = make_system(problem, "impulse")
             impulse[:] = system.sc.fixed
             return Claim(Status.STALLED, 0, {"factorisations": 0}, "no row can move")
         cold = bool(np.array_equal(impulse, problem.start()))
         sweeps = system.factorisations = 0
-        if not cold and self.form == "auto":
+        if not cold and self.form == "auto" and problem.rows is not None:
             tried = warm_start(problem, impulse, tol, n, time_limit)
             claim, sweeps, system.factorisations = claim_of(tried), tried.sweeps, tried.factorisations
             if claim is not None:
@@ -135,13 +188,22 @@ class Newton:
         )
 
 
+def _refusal(problem: Problem) -> str | None:
+    if problem.cones.has_round and problem.generalized is None:
+        return "takes round cones of more than two tangents with J and M alone (Problem.from_jacobian)"
+    return None
+
+
 SPEC = SolverSpec(
     name="newton",
     factory=Newton,
     laws=frozenset({"linear", "lcp", "coulomb", "cone"}),
+    operators=frozenset(OPERATORS),
+    round_cones=True,
+    refusal=_refusal,
     resumable=False,
     max_iter=1500,
-    options={"form": "auto, velocity (bodies) or impulse (rows): unknowns of the factorisation"},
+    options={"form": "auto, velocity (bodies, joints) or impulse (rows): unknowns of the factorisation"},
     summary="interior point, active-set polish and proximal semismooth Newton",
     reference="Mehrotra 1992; Nesterov, Todd 1997; Hintermueller, Ito, Kunisch 2002; Alart, Curnier 1991; "
     "De Saxce, Feng 1998",

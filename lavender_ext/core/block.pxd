@@ -1,7 +1,8 @@
 """The arithmetic of one block: the update of a sweep and the error of the judge.
 
 A block is one or more bounded rows (ROW), or a contact: a normal row, then 0, 1 or 2 tangent rows
-(CONTACT), then one spin row (CONTACT_SPIN). With w = A lam - b [m/s] and d = diag(A) [1/kg]:
+(CONTACT), then one spin row (CONTACT_SPIN); or a contact of three to five tangents in one cone (ROUND:
+two that slide, one that spins, two that roll, scaled to one mu; law CONE only). With w = A lam - b [m/s] and d = diag(A) [1/kg]:
 
     update   row      lam  <- clip(lam - w / d, lower, upper)                                  (1)
              normal   lam_n <- max(0, lam_n - w_n / d_n)                                       (2)
@@ -23,6 +24,7 @@ cdef enum:
     ROW = 0
     CONTACT = 1
     CONTACT_SPIN = 2
+    ROUND = 3
 
 cdef enum:
     COULOMB = 0
@@ -34,7 +36,7 @@ cdef struct blocks_t:
     int32_t n_rows              # m
     int32_t law                 # COULOMB | CONE
     const int32_t* ptr          # (k + 1) first row of each block; ptr[0] = 0, increasing
-    const int32_t* kind         # (k) ROW | CONTACT | CONTACT_SPIN
+    const int32_t* kind         # (k) ROW | CONTACT | CONTACT_SPIN | ROUND
     const double* lower         # (m) N s, read on ROW blocks
     const double* upper         # (m) N s, read on ROW blocks
     const double* mu            # (k) -, >= 0
@@ -69,7 +71,12 @@ cdef inline double norm2(double x, double y) noexcept nogil:
 
 
 cdef inline int32_t n_tangents(int32_t kind, int32_t size) noexcept nogil:
-    return size - kind                                  # CONTACT = 1 normal, CONTACT_SPIN = 1 more
+    return size - 1 - (kind == CONTACT_SPIN)
+
+
+cdef inline bint is_pair(int32_t nt, int32_t offset) noexcept nogil:
+    # Do the rows at this offset in a contact and behind it count by their norm? The two that slide, the two that roll.
+    return offset == 1 and nt >= 2 or offset == 4 and nt == 5
 
 
 cdef inline double relax_row(double lam, double w, double step, double low, double high) noexcept nogil:
@@ -195,6 +202,64 @@ cdef inline void cone_error(const double* lam, const double* w, const double* d,
         e[0] = yn + t + ys                              # NaN: comparisons above would hide it
 
 
+cdef inline void round_error(const double* lam, const double* w, const double* d, double mu, int32_t nt,
+                             double* e) noexcept nogil:
+    # (7) of ROUND, |lam_T| <= mu lam_n over all tangents together. Groups g (slide, spin, roll) have one d each: with
+    # y = sqrt(d) (lam - w / d), T_g = |y_g|, a_g = mu sqrt(d_g / d_n) the projection's normal part is the root s of
+    #     sum (a_g T_g)^2 / ((1 + a_g^2) s - y_n)^2 = 1,        Pi_g = y_g a_g^2 s / ((1 + a_g^2) s - y_n)       (8)
+    # by Newton's method from below: the left side falls and is convex.
+    cdef double t[3]
+    cdef double a[3]
+    cdef double rn = sqrt(d[0]), yn = rn * (lam[0] - w[0] / d[0]), y, s = 0.0, f, h, slope, q, inside = 0.0, polar = 0.0
+    cdef int32_t i, g, _step
+    t[0] = t[1] = t[2] = 0.0
+    a[0] = a[1] = a[2] = 0.0
+    for i in range(1, 1 + nt):
+        g = 0 if i < 3 else (1 if i == 3 else 2)
+        y = sqrt(d[i]) * (lam[i] - w[i] / d[i])
+        t[g] = norm2(t[g], y)
+        a[g] = mu * sqrt(d[i]) / rn
+    for g in range(3):
+        if t[g] > 0.0:
+            inside = norm2(inside, t[g] / a[g])         # infinite without friction
+            polar = norm2(polar, a[g] * t[g])
+            f = (yn + a[g] * t[g]) / (1.0 + a[g] * a[g])
+            if f > s:
+                s = f
+    if inside <= yn:
+        for i in range(1 + nt):
+            e[i] = w[i] / d[i]
+        return
+    if yn + polar <= 0.0:
+        for i in range(1 + nt):
+            e[i] = lam[i]
+        return
+    if polar > 0.0:
+        for _step in range(64):
+            h = -1.0
+            slope = 0.0
+            for g in range(3):
+                if t[g] > 0.0:
+                    q = (1.0 + a[g] * a[g]) * s - yn
+                    f = a[g] * t[g] / q
+                    h += f * f
+                    slope += 2.0 * f * f * (1.0 + a[g] * a[g]) / q
+            if not h > 0.0:
+                break
+            f = s + h / slope
+            if not f > s:
+                break
+            s = f
+    e[0] = lam[0] - s / rn
+    for i in range(1, 1 + nt):
+        g = 0 if i < 3 else (1 if i == 3 else 2)
+        q = (1.0 + a[g] * a[g]) * s - yn
+        f = a[g] * a[g] * s / q if a[g] > 0.0 else 0.0
+        e[i] = lam[i] - f * (lam[i] - w[i] / d[i])
+    if not (yn == yn and inside == inside):
+        e[0] = yn + inside                              # NaN: comparisons above would hide it
+
+
 cdef inline void block_error(const blocks_t* p, int32_t i, const double* lam, const double* w,
                              double* e) noexcept nogil:
     """Error e of block i [N s]; lam, w, e are whole vectors (m)."""
@@ -205,7 +270,9 @@ cdef inline void block_error(const blocks_t* p, int32_t i, const double* lam, co
             j += 1
         return
     nt = n_tangents(kind, end - j)
-    if p.law == CONE:
+    if kind == ROUND:
+        round_error(lam + j, w + j, p.d + j, p.mu[i], nt, e + j)
+    elif p.law == CONE:
         cone_error(lam + j, w + j, p.d + j, p.mu[i], p.patch_radius[i], nt, kind == CONTACT_SPIN, e + j)
     else:
         coulomb_error(lam + j, w + j, p.d + j, p.mu[i], p.patch_radius[i], nt, kind == CONTACT_SPIN, e + j)

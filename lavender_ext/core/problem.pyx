@@ -1,7 +1,8 @@
 """A problem's derived numbers: diagonal d, velocity weight nu, sweep step, coupling of a contact's rows.
 
     d_i     = A_ii; where A_ii <= 1e-10 max_j |A_ij| that maximum; an empty row: the mean of the positive
-              d, or 1 (factored: only empty rows fall back); on two tangents the mean of both     (1)
+              d, or 1 (factored: only empty rows fall back); on two tangents the mean of both, and on
+              the two that roll                                                                   (1)
     nu_i    = d_i; on a spin row d of its normal; on an angular joint row 1/m_a + 1/m_b           (2)
     step_i  = 1/d_i; on tangents 1/lambda_max of the symmetric part of A_tt, d_t where not positive (3)
 """
@@ -10,8 +11,9 @@ from libc.stdint cimport int32_t
 
 import numpy as np
 
-from lavender_ext.core.block cimport CONTACT_SPIN, ROW, blocks_t, n_tangents
+from lavender_ext.core.block cimport CONTACT_SPIN, ROUND, ROW, blocks_t, is_pair, n_tangents
 from lavender_ext.core.csr cimport csr_t
+from lavender_ext.core.generalized cimport Operator, dot, generalized_t, panel_pattern, panel_whiten
 from lavender_ext.core.rows cimport (contact_diagonal, dot12, largest_eigenvalue, minv_times, reciprocal,
                                      rows_t, rows_times)
 
@@ -45,10 +47,10 @@ cdef public int32_t lav_csr_diagonal(const blocks_t* p, const csr_t* a, double* 
         j = p.ptr[i]
         kind = p.kind[i]
         nt = 0 if kind == ROW else n_tangents(kind, p.ptr[i + 1] - j)
-        if nt == 2:
-            d[j + 1] = 0.5 * (d[j + 1] + d[j + 2])
-            d[j + 2] = d[j + 1]
-        if nt > 0:
+        pair_means(nt, d + j)
+        if nt > 0 and kind == ROUND:
+            e = 0.0
+        elif nt > 0:
             big = step[j + 1]
             if nt == 2 and step[j + 2] > big:
                 big = step[j + 2]
@@ -60,9 +62,19 @@ cdef public int32_t lav_csr_diagonal(const blocks_t* p, const csr_t* a, double* 
                 e = d[j + 1]
         for k in range(j, p.ptr[i + 1]):
             step[k] = reciprocal(d[k])
-        for t in range(1, 1 + nt):
-            step[j + t] = reciprocal(e)
+        if kind != ROUND:                               # which no sweep relaxes
+            for t in range(1, 1 + nt):
+                step[j + t] = reciprocal(e)
     return n_empty
+
+
+cdef inline void pair_means(int32_t nt, double* d) noexcept nogil:
+    # One d for the two tangents that slide, one for the two that roll; d at the normal.
+    cdef int32_t t
+    for t in range(1, nt):
+        if is_pair(nt, t):
+            d[t] = 0.5 * (d[t] + d[t + 1])
+            d[t + 1] = d[t]
 
 
 cdef inline double csr_entry(const csr_t* a, int32_t i, int32_t j) noexcept nogil:
@@ -152,32 +164,82 @@ cdef public int32_t lav_rows_diagonal(const blocks_t* p, const rows_t* r, double
     return n_empty
 
 
+cdef public int32_t lav_general_diagonal(const blocks_t* p, const generalized_t* g, double* d, double* nu, double* step,
+                                         int32_t* empty, int32_t* place, double* y) noexcept nogil:
+    """Y, d, nu and step of a problem in generalised coordinates; place (n) is scratch. Returns how many rows are empty."""
+    cdef int32_t i, j, k, b, nc, nt, n_empty = 0, n_positive = 0
+    cdef double total = 0.0, mean, e
+    cdef const double* row
+    for b in range(g.n_panels):
+        panel_whiten(g, b, place, y + g.pval[b])
+        nc = g.pcol[b + 1] - g.pcol[b]
+        row = y + g.pval[b]
+        for i in range(g.prow[b], g.prow[b + 1]):
+            d[i] = dot(row, row, nc) + g.compliance[i]
+            empty[i] = not d[i] > 0.0
+            if d[i] > 0.0:
+                n_positive += 1
+                total += d[i] / p.n_rows
+            else:
+                n_empty += 1
+            row += nc
+    mean = total * p.n_rows / n_positive if n_positive > 0 and total > 0.0 else 1.0
+    if n_empty > 0:
+        for i in range(p.n_rows):
+            if empty[i]:
+                d[i] = mean
+    b = 0
+    for i in range(p.n_blocks):
+        j = p.ptr[i]
+        while g.prow[b + 1] <= j:
+            b += 1
+        nt = 0 if p.kind[i] == ROW else n_tangents(p.kind[i], p.ptr[i + 1] - j)
+        e = d[j + 1] if nt > 0 else 0.0
+        if nt == 2:
+            nc = g.pcol[b + 1] - g.pcol[b]
+            row = y + g.pval[b] + (j + 1 - g.prow[b]) * nc
+            e = largest_eigenvalue(d[j + 1], dot(row, row + nc, nc), d[j + 2])
+        pair_means(nt, d + j)
+        for k in range(j, p.ptr[i + 1]):
+            step[k] = reciprocal(d[k])
+            nu[k] = d[k]
+        if nt > 0 and p.kind[i] != ROUND:
+            if not e > 0.0:
+                e = d[j + 1]
+            for k in range(1, 1 + nt):
+                step[j + k] = reciprocal(e)
+        if p.kind[i] == CONTACT_SPIN:
+            nu[p.ptr[i + 1] - 1] = d[j]
+    return n_empty
+
+
 cdef class Data:
     """Pointers to a problem's arrays, and the numbers derived from them once.
 
     The caller passes checked, C-contiguous float64 / int32 arrays; they are kept alive here. Either
     `csr` = (indptr, indices, data) or `rows` = (joint_jac, joint_body, normal, tangent, arm_a, arm_b,
-    contact_body, inv_mass, inv_inertia, compliance).
+    contact_body, inv_mass, inv_inertia, compliance), or `general` = (core.generalized.Operator, compliance).
     """
 
     def __init__(self, const int32_t[::1] ptr, const int32_t[::1] kind, const double[::1] lower,
                  const double[::1] upper, const double[::1] mu, const double[::1] patch_radius,
-                 const double[::1] b, int law, csr=None, rows=None):
+                 const double[::1] b, int law, csr=None, rows=None, general=None):
         cdef int32_t m = <int32_t>b.shape[0], k = <int32_t>kind.shape[0], n_empty, i
-        cdef double[::1] d = np.empty(m + 1)
-        cdef double[::1] nu = np.empty(m + 1)
-        cdef double[::1] step = np.empty(m + 1)
+        cdef double[::1] numbers = np.empty(3 * m + 3)
+        cdef double* d = &numbers[0]
+        cdef double* nu = d + m + 1
+        cdef double* step = nu + m + 1
         cdef int32_t[::1] empty = np.zeros(m + 1, np.int32)
         cdef const int32_t[::1] indptr, indices
         cdef const double[::1] data
-        self.keep = [ptr, kind, lower, upper, mu, patch_radius, b, d, nu, step, csr, rows]
+        self.keep = [ptr, kind, lower, upper, mu, patch_radius, b, numbers, csr, rows]
         self.blocks.n_blocks = k
         self.blocks.n_rows = m
         self.blocks.law = law
         self.blocks.ptr = &ptr[0]
-        self.blocks.d = &d[0]
-        self.blocks.nu = &nu[0]
-        self.blocks.step = &step[0]
+        self.blocks.d = d
+        self.blocks.nu = nu
+        self.blocks.step = step
         if m > 0:
             self.blocks.kind = &kind[0]
             self.blocks.lower = &lower[0]
@@ -187,13 +249,18 @@ cdef class Data:
             self.blocks.b = &b[0]
         self.start_energy = self.start_velocity = -1.0
         self.factored = rows is not None
+        self.is_general = general is not None
         self.single_rows = k == m
         for i in range(k):
             if kind[i] != ROW:
                 self.single_rows = False
-        if self.factored:
+        if self.is_general:
+            self._set_general(general)
+            n_empty = lav_general_diagonal(&self.blocks, &self.general, d, nu, step, &empty[0],
+                                           <int32_t*>self._place, <double*>self.general.y)
+        elif self.factored:
             self._set_rows(rows)
-            n_empty = lav_rows_diagonal(&self.blocks, &self.rows, &d[0], &nu[0], &step[0], &empty[0],
+            n_empty = lav_rows_diagonal(&self.blocks, &self.rows, d, nu, step, &empty[0],
                                         <double*>self.rows.minv_jac, <double*>self.rows.coupling,
                                         <double*>self.rows.swing)
         else:
@@ -202,12 +269,44 @@ cdef class Data:
             if data.shape[0] > 0:
                 self.csr.indices = &indices[0]
                 self.csr.data = &data[0]
-            n_empty = lav_csr_diagonal(&self.blocks, &self.csr, &d[0], &step[0], &empty[0])
-            lav_matrix_nu(&self.blocks, &nu[0])
-        self.d = _read_only(np.asarray(d)[:m])
-        self.nu = _read_only(np.asarray(nu)[:m])
-        self.step = _read_only(np.asarray(step)[:m])
-        self.empty = _read_only(np.flatnonzero(np.asarray(empty)[:m]) if n_empty else np.empty(0, np.intp))
+            n_empty = lav_csr_diagonal(&self.blocks, &self.csr, d, step, &empty[0])
+            lav_matrix_nu(&self.blocks, nu)
+        self._numbers = numbers.base
+        self.empty = _read_only(np.flatnonzero(empty.base[:m])) if n_empty else _NONE
+
+    def _set_general(self, general):
+        cdef Operator operator
+        cdef const double[::1] compliance
+        cdef int32_t[::1] whole
+        cdef double[::1] y
+        cdef int32_t n, m = self.blocks.n_rows, k = self.blocks.n_blocks, count, n_cols
+        cdef Py_ssize_t room, head
+        cdef double values
+        operator, compliance = general
+        self.general = operator.g
+        n = operator.g.n
+        head = 2 * n + 3 * (k + 1)
+        room = 2 * <Py_ssize_t>operator.g.jptr[m] + 64
+        while True:
+            whole = np.empty(head + room, np.int32)
+            count = panel_pattern(&self.general, k, self.blocks.ptr, &whole[0], &whole[2 * n], &whole[2 * n + k + 1],
+                                  &whole[2 * n + 2 * (k + 1)], &whole[head], <int32_t>room, &n_cols, &values)
+            if count >= 0:
+                break
+            room = min(2 * room, 2147483647 - head)
+        if values >= 2147483647.0:
+            raise OverflowError(f"M^-1 J^T has {values:.3g} entries, more than 32-bit indices reach")
+        y = np.empty(<Py_ssize_t>values + 1)
+        self.keep += [general, whole, y]
+        self._place = &whole[0]
+        self.general.n_panels = count
+        self.general.prow = &whole[2 * n]
+        self.general.pcol = &whole[2 * n + k + 1]
+        self.general.pval = &whole[2 * n + 2 * (k + 1)]
+        self.general.cols = &whole[head]
+        self.general.y = &y[0]
+        if m:
+            self.general.compliance = &compliance[0]
 
     def _set_rows(self, rows):
         cdef const double[:, ::1] jac, normal, tangent, arm_a, arm_b
@@ -243,6 +342,27 @@ cdef class Data:
             self.rows.compliance = &compliance[0]
 
     @property
+    def d(self):
+        """(m,) 1/kg: diagonal of A with fallbacks."""
+        if self._d is None:
+            self._d = _read_only(self._numbers[:self.blocks.n_rows])
+        return self._d
+
+    @property
+    def nu(self):
+        """(m,) 1/kg: velocity error = sqrt(nu d) |e|."""
+        if self._nu is None:
+            self._nu = _read_only(self._numbers[self.blocks.n_rows + 1:2 * self.blocks.n_rows + 1])
+        return self._nu
+
+    @property
+    def step(self):
+        """(m,) kg: steps of a sweep."""
+        if self._step is None:
+            self._step = _read_only(self._numbers[2 * self.blocks.n_rows + 2:3 * self.blocks.n_rows + 2])
+        return self._step
+
+    @property
     def n_rows(self):
         return self.blocks.n_rows
 
@@ -257,6 +377,8 @@ cdef class Data:
     @property
     def work(self):
         """Rough number of multiply-adds of one sweep; the front door sizes its chunks by it."""
+        if self.is_general:
+            return 2 * self.general.pval[self.general.n_panels] + 4 * self.blocks.n_rows
         if self.factored:
             return 24 * self.rows.n_joints + 60 * self.rows.n_contacts + 12 * self.blocks.n_rows
         return self.csr.indptr[self.blocks.n_rows] + 4 * self.blocks.n_rows
@@ -268,12 +390,39 @@ cdef class Data:
             self._weight = _read_only(np.sqrt(self.nu) * np.sqrt(self.d))
         return self._weight
 
+    def whitened(self):
+        """(data, indices, indptr) of Y (m, n) in generalised coordinates; entries that are zero are left out."""
+        cdef const generalized_t* g = &self.general
+        cdef int32_t b, i, a, nc, at = 0
+        cdef const double* y
+        indptr_ = np.zeros(self.blocks.n_rows + 1, np.int32)
+        indices_ = np.empty(g.pval[g.n_panels], np.int32)
+        data_ = np.empty(g.pval[g.n_panels])
+        cdef int32_t[::1] indptr = indptr_, indices = indices_
+        cdef double[::1] data = data_
+        for b in range(g.n_panels):
+            nc = g.pcol[b + 1] - g.pcol[b]
+            y = g.y + g.pval[b]
+            for i in range(g.prow[b], g.prow[b + 1]):
+                for a in range(nc):
+                    if y[a] != 0.0:
+                        indices[at] = g.cols[g.pcol[b] + a]
+                        data[at] = y[a]
+                        at += 1
+                y += nc
+                indptr[i + 1] = at
+        return data_[:at], indices_[:at], indptr_
+
     def set_start(self, double energy, double velocity):
         """Error of doing nothing [sqrt J, m/s], once known; negative before. It cannot be changed."""
         if self.start_energy >= 0.0 and (energy != self.start_energy or velocity != self.start_velocity):
             raise ValueError("the error of doing nothing is known already, and is another")
         self.start_energy = energy
         self.start_velocity = velocity
+
+
+_NONE = np.empty(0, np.intp)
+_NONE.flags.writeable = False
 
 
 def _read_only(x):

@@ -11,9 +11,11 @@ first loop gathers the wrench J^T lam on each body, M^-1 is applied once a body,
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.block cimport (CONE, CONTACT_SPIN, ROW, block_error, blocks_t, cone_error,
-                                      coulomb_error, n_tangents, norm2, row_error)
+from lavender_ext.core.block cimport (CONE, CONTACT_SPIN, ROUND, ROW, block_error, blocks_t, cone_error,
+                                      coulomb_error, is_pair, n_tangents, norm2, row_error)
 from lavender_ext.core.csr cimport csr_abs_dot, csr_dot, csr_dot_size, csr_t
+from lavender_ext.core.generalized cimport (generalized_t, jac_push, jac_row, panel_push_size, panel_size,
+                                            tree_solve)
 from lavender_ext.core.rows cimport (contact_push, contact_slack, cross, dot3, joint_push, joint_velocity,
                                      rows_t, rows_times)
 
@@ -93,11 +95,33 @@ cdef inline void tally_contact(const blocks_t* p, int32_t j, int32_t nt, int32_t
         tally_row(p, j + 1 + nt, e[j + 1 + nt], s)
 
 
+cdef inline void tally_pair(const blocks_t* p, int32_t k, const double* e, tally_t* s) noexcept nogil:
+    # Rows k, k + 1, by the norm of the two in the maximum.
+    cdef double x = p.d[k] * e[k], y = p.d[k] * e[k + 1]
+    s.energy += x * e[k] + y * e[k + 1]
+    x = x * (p.nu[k] * e[k]) + y * (p.nu[k] * e[k + 1])
+    if x > s.fast:
+        s.fast = x
+        s.worst = k
+
+
+cdef inline void tally_round(const blocks_t* p, int32_t j, int32_t nt, const double* e, tally_t* s) noexcept nogil:
+    tally_row(p, j, e[j], s)
+    tally_pair(p, j + 1, e, s)
+    tally_row(p, j + 3, e[j + 3], s)
+    if nt == 4:
+        tally_row(p, j + 4, e[j + 4], s)
+    elif nt == 5:
+        tally_pair(p, j + 4, e, s)
+
+
 cdef inline void tally_block(const blocks_t* p, int32_t i, const double* e, tally_t* s) noexcept nogil:
     cdef int32_t k, j = p.ptr[i], end = p.ptr[i + 1]
     if p.kind[i] == ROW:
         for k in range(j, end):
             tally_row(p, k, e[k], s)
+    elif p.kind[i] == ROUND:
+        tally_round(p, j, n_tangents(p.kind[i], end - j), e, s)
     else:
         tally_contact(p, j, n_tangents(p.kind[i], end - j), p.kind[i] == CONTACT_SPIN, e, s)
 
@@ -132,9 +156,9 @@ cdef inline void score_from(const blocks_t* p, const double* e, const tally_t* s
         nt = 0 if p.kind[i] == ROW else n_tangents(p.kind[i], p.ptr[i + 1] - j)
         for k in range(j, p.ptr[i + 1]):
             add_square(&total, sqrt(p.d[k]) * e[k])
-            if nt == 2 and k == j + 2:
+            if is_pair(nt, k - j - 1):
                 continue                                # the pair counts once, below
-            v = norm2(e[k], e[k + 1]) if nt == 2 and k == j + 1 else fabs(e[k])
+            v = norm2(e[k], e[k + 1]) if is_pair(nt, k - j) else fabs(e[k])
             v = sqrt(p.nu[k]) * sqrt(p.d[k]) * v
             if v > big:
                 big = v
@@ -170,7 +194,7 @@ cdef inline void norms_of_rhs(const blocks_t* p, double* energy, double* velocit
         for k in range(j, p.ptr[i + 1]):
             t = (p.b[k] / p.d[k]) * p.b[k]
             sum_ += t
-            if nt == 2 and k == j + 1:
+            if is_pair(nt, k - j):
                 t += (p.b[k + 1] / p.d[k + 1]) * p.b[k + 1]
             t = t * p.nu[k]
             if t > fast:
@@ -185,7 +209,7 @@ cdef inline void norms_of_rhs(const blocks_t* p, double* energy, double* velocit
         for k in range(j, p.ptr[i + 1]):
             x = p.b[k] / sqrt(p.d[k])
             add_square(&total, x)
-            if nt == 2 and k == j + 1:
+            if is_pair(nt, k - j):
                 x = norm2(x, p.b[k + 1] / sqrt(p.d[k + 1]))
             x = fabs(x) * sqrt(p.nu[k])
             if x > big:
@@ -570,6 +594,51 @@ cdef inline void rows_judge(const blocks_t* p, const rows_t* r, const double* la
         contact_sizes(r, c, nt, p.kind[i] == CONTACT_SPIN, sizes, size)
         for k in range(p.ptr[i + 1] - j):
             add_floor(p, j + k, r.compliance[j + k] * fabs(lam[j + k]) + size[k], &total, &big)
+    out.floor_energy = root(&total)
+    out.floor_velocity = big
+
+
+# -- generalised coordinates ---------------------------------------------------------------------------
+
+
+cdef inline void general_slack(const blocks_t* p, const generalized_t* g, const double* lam, double* x,
+                               double* w) noexcept nogil:
+    """w = J x + c lam - b, x = M^-1 J^T lam by M's factor; x (n)."""
+    cdef int32_t i
+    jac_push(g, lam, x)
+    tree_solve(g, x)
+    for i in range(p.n_rows):
+        w[i] = jac_row(g, i, x) + (g.compliance[i] * lam[i] - p.b[i])
+
+
+cdef inline void general_judge(const blocks_t* p, const generalized_t* g, const double* lam, double* w, double* e,
+                               double* x, bint floor, score_t* out) noexcept nogil:
+    """The pass over J and M; |Y| |Y|^T |lam| + c |lam| stands for |A| |lam|. x (n) is scratch, with the floor (n + m)."""
+    cdef int32_t i
+    cdef tally_t s
+    cdef sum_t total = sum_t(0.0, 0.0)
+    cdef double big = 0.0
+    cdef double* size = x + g.n
+    general_slack(p, g, lam, x, w)
+    score_rows(p, lam, w, e, out)
+    if not floor:
+        return
+    for i in range(g.n):
+        x[i] = 0.0
+    for i in range(g.n_panels):
+        panel_push_size(g, i, lam, x)
+    for i in range(g.n_panels):
+        panel_size(g, i, x, size)
+    s = nothing()
+    for i in range(p.n_rows):
+        size[i] += g.compliance[i] * fabs(lam[i])
+        tally_floor(p, i, size[i], &s)
+    if is_plain(s.floor_energy, s.floor_fast):
+        out.floor_energy = sqrt(s.floor_energy)
+        out.floor_velocity = sqrt(s.floor_fast)
+        return
+    for i in range(p.n_rows):
+        add_floor(p, i, size[i], &total, &big)
     out.floor_energy = root(&total)
     out.floor_velocity = big
 

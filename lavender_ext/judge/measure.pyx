@@ -6,10 +6,11 @@ import numpy as np
 
 from lavender_ext.core.block cimport blocks_t
 from lavender_ext.core.csr cimport csr_t
+from lavender_ext.core.generalized cimport generalized_t
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.rows cimport rows_t
-from lavender_ext.judge.measure cimport (csr_slack, judge_into, norms_of_rhs, rows_slack, rows_velocity,
-                                         score_rows, score_t, wrenches)
+from lavender_ext.judge.measure cimport (csr_slack, general_judge, general_slack, judge_into, norms_of_rhs,
+                                         rows_slack, rows_velocity, score_rows, score_t, wrenches)
 
 
 cdef public void lav_judge_csr(const blocks_t* p, const csr_t* a, const double* lam, double* w, double* e,
@@ -24,6 +25,12 @@ cdef public void lav_judge_rows(const blocks_t* p, const rows_t* r, const double
     judge_into(p, NULL, r, 1, lam, w, e, v, floor, out)
 
 
+cdef public void lav_judge_general(const blocks_t* p, const generalized_t* g, const double* lam, double* w, double* e,
+                                   double* x, int32_t floor, score_t* out) noexcept nogil:
+    """The same in generalised coordinates; x (n), with the floor (n + m), is scratch."""
+    general_judge(p, g, lam, w, e, x, floor, out)
+
+
 cdef public void lav_rows_velocity(const blocks_t* p, const rows_t* r, const double* lam, double* v) noexcept nogil:
     """v = M^-1 J^T lam (n_bodies, 6), from which sweeps over bodies start."""
     rows_velocity(p, r, lam, v)
@@ -34,7 +41,11 @@ def slack(Data p, const double[::1] lam, double[::1] w):
     cdef double[::1] v
     if p.blocks.n_rows == 0:
         return
-    if p.factored:
+    if p.is_general:
+        v = np.empty(p.general.n + 1)
+        with nogil:
+            general_slack(&p.blocks, &p.general, &lam[0], &v[0], &w[0])
+    elif p.factored:
         v = np.empty(6 * p.rows.n_bodies + 1)
         with nogil:
             wrenches(&p.blocks, &p.rows, &lam[0], False, &v[0])
@@ -51,6 +62,11 @@ def judge(Data p, const double[::1] lam, double[::1] w, double[::1] e, bint floo
     cdef double* v = NULL
     if p.blocks.n_rows == 0:
         return 0.0, 0.0, -1, 0.0, 0.0, True
+    if p.is_general:
+        bodies = np.empty(p.general.n + p.blocks.n_rows)
+        with nogil:
+            general_judge(&p.blocks, &p.general, &lam[0], &w[0], &e[0], &bodies[0], floor, &s)
+        return s.energy, s.velocity, s.worst, s.floor_energy, s.floor_velocity, bool(s.finite)
     if p.factored:
         bodies = np.empty((12 if floor else 6) * p.rows.n_bodies + 1)
         v = &bodies[0]
@@ -88,7 +104,11 @@ cdef class Judged:
         self.impulse = impulse
         self.slack = w = np.empty(lam.shape[0])
         self.error = e = np.empty(lam.shape[0])
-        if p.blocks.n_rows > 0:
+        if p.blocks.n_rows > 0 and p.is_general:
+            bodies = np.empty(p.general.n + p.blocks.n_rows)
+            with nogil:
+                general_judge(&p.blocks, &p.general, &lam[0], &w[0], &e[0], &bodies[0], True, &s)
+        elif p.blocks.n_rows > 0:
             if p.factored:
                 bodies = np.empty(12 * <Py_ssize_t>p.rows.n_bodies + 1)
                 v = &bodies[0]

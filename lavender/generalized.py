@@ -1,0 +1,355 @@
+"""Generalised coordinates: J and M of articulated bodies, as simulators hold them.
+
+    w = J v+ - target + compliance lambda,   v+ = v* + M^-1 J^T lambda,   A = J M^-1 J^T + diag(compliance)
+
+M is factored once, M = L^T D L, rows from the last to the first: in the order of a kinematic tree, where parents
+come before their children, leaves are eliminated first and nothing fills in. Any other matrix is put into an order
+that fills in less; see `lavender_ext/core/generalized.pxd`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import scipy.sparse as sp
+
+from lavender._arrays import FloatArray, IntArray, as_array, equal, read_only
+from lavender.errors import InputError
+from lavender_ext.core import generalized as kernels
+from lavender_ext.core.problem import dense_to_csr
+
+__all__ = ["Generalized"]
+
+ASYMMETRY = 1e-12  # -, of sqrt(M_ii M_jj): above any rounding of sums over bodies, below anything meant
+Compressed = tuple[IntArray, IntArray, FloatArray]
+
+
+class Generalized:
+    """J, M and v* of one step in generalised coordinates; frozen, M factored and checked.
+
+    Parameters
+    ----------
+    jac : (m, nv) array or sparse
+        J: row i of J times generalised velocities is the velocity of constraint row i [m/s or rad/s].
+    mass : (nv, nv) array or sparse, or a sequence of square blocks, kg or kg m^2
+        M, symmetric positive definite; blocks stand on the diagonal, one for each kinematic tree.
+    v_free : (nv,) m/s, rad/s
+        v*, the velocity without constraint impulses.
+    names : sequence of str (nv,), optional
+        Names of the velocities, for messages.
+
+    Raises
+    ------
+    InputError
+        Shapes that do not fit, numbers that are not finite, M not symmetric or not positive definite: the velocity
+        where that shows is named.
+    """
+
+    v_free: FloatArray  # (nv,) m/s, rad/s
+    names: tuple[str, ...] | None
+    order: IntArray | None  # (nv,) velocity that stands at each place of the factor; None: as given
+    operator: kernels.Operator  # J, M and M's factor in that order, for kernels
+
+    def __init__(self, jac: Any, mass: Any, v_free: Any, names: Sequence[str] | None = None) -> None:
+        m_lower, n = _lower(mass, names)
+        j = _rows(jac, n)
+        self._fill(j, m_lower, as_array("v_free", v_free, (n,), unit="m/s, rad/s"), names)
+
+    @classmethod
+    def compressed(
+        cls, jac: Compressed, mass: Compressed, v_free: Any, names: Sequence[str] | None = None
+    ) -> Generalized:
+        """From (indptr, indices, data) of J and of M's lower triangle with its diagonal, columns ascending.
+
+        The quick way for adapters, whose engines hold these arrays: int32 and float64, adopted as they are. Only
+        finiteness and definiteness are checked.
+        """
+        made = object.__new__(cls)
+        n = len(mass[0]) - 1
+        for name, x in (("J", jac[2]), ("M", mass[2])):
+            as_array(name, x, (None,), copy=False)
+        made._fill(jac, mass, as_array("v_free", v_free, (n,), unit="m/s, rad/s"), names)
+        return made
+
+    def _fill(
+        self, jac: Compressed, mass: Compressed, v_free: FloatArray, names: Sequence[str] | None
+    ) -> None:
+        put = self.__dict__
+        n = len(v_free)
+        if names is not None:
+            names = tuple(map(str, names))
+            if len(names) != n:
+                raise InputError(f"{len(names)} names for {n} velocities; one for each is needed")
+        put["v_free"], put["names"], put["order"] = v_free, names, None
+        operator = kernels.Operator(*jac, *mass)
+        if operator.fill > 0 and operator.failed < 0:
+            order = _order(mass, n)
+            other = kernels.Operator(*_permuted_columns(jac, order), *_permuted_lower(mass, order))
+            if other.fill < operator.fill:
+                put["order"], operator = read_only(order), other
+        if operator.failed >= 0:
+            at = operator.failed if put["order"] is None else int(put["order"][operator.failed])
+            raise InputError(
+                f"M is not positive definite: the pivot of {self.velocity_name(at)} is no more than rounding of its "
+                "diagonal entry; a body without mass or inertia needs some (MuJoCo: armature), or the velocity "
+                "must be left out"
+            )
+        put["operator"] = operator
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        raise AttributeError(f"Generalized is frozen; {name} cannot be set (make another)")
+
+    def __delattr__(self, name: str) -> None:
+        raise AttributeError(f"Generalized is frozen; {name} cannot be deleted")
+
+    @property
+    def m(self) -> int:
+        """Rows of J."""
+        return int(self.operator.m)
+
+    @property
+    def nv(self) -> int:
+        """Generalised velocities."""
+        return len(self.v_free)
+
+    def velocity_name(self, i: int) -> str:
+        """Name of velocity i."""
+        return f"velocity {i}" if self.names is None else self.names[i]
+
+    @cached_property
+    def jac(self) -> sp.csr_array:
+        """J (m, nv) in compressed rows, as given but for entries that are zero."""
+        return sp.csr_array(self._columns(self.operator.jac), shape=(self.m, self.nv))
+
+    def _columns(self, jac: Compressed) -> tuple[FloatArray, IntArray, IntArray]:
+        indptr, indices, data = jac
+        if self.order is not None:
+            back = sp.csr_array((data, self.order[indices], indptr), shape=(self.m, self.nv))
+            back.sort_indices()
+            indices, data = back.indices, back.data
+        return read_only(data), read_only(indices), read_only(indptr)
+
+    @cached_property
+    def mass(self) -> sp.csr_array:
+        """M (nv, nv) in compressed rows, both triangles."""
+        indptr, indices, data = self.operator.mass
+        lower = sp.csr_array((data, indices, indptr), shape=(self.nv, self.nv))
+        whole = sp.csr_array(lower + sp.tril(lower, -1).T)
+        if self.order is not None:
+            place = np.argsort(self.order)
+            whole = sp.csr_array(whole[place][:, place])
+        whole.sort_indices()
+        return whole
+
+    @cached_property
+    def trees(self) -> IntArray:
+        """Tree of each velocity (nv,): those that M couples, directly or through others; numbered in order."""
+        parent = self.operator.parents
+        label = np.empty(self.nv, np.int32)
+        count = 0
+        for i, p in enumerate(parent):
+            if p < 0:
+                label[i], count = count, count + 1
+            else:
+                label[i] = label[p]
+        if self.order is None:
+            return read_only(label)
+        given = np.empty_like(label)
+        given[self.order] = label
+        return read_only(np.unique(given, return_inverse=True)[1].astype(np.int32))
+
+    def velocity_of(self, v: FloatArray) -> FloatArray:
+        """J v (m,) [m/s, rad/s] of velocities v (nv,)."""
+        out = np.empty(self.m)
+        own = np.ascontiguousarray(v, np.float64)
+        self.operator.times(own if self.order is None else own[self.order], out)
+        return out
+
+    def solve(self, x: Any) -> FloatArray:
+        """M^-1 x (nv,)."""
+        x = as_array("x", x, (self.nv,))
+        out = x.copy() if self.order is None else x[self.order]
+        self.operator.solve(out)
+        return self._given(out)
+
+    def change(self, impulse: FloatArray) -> FloatArray:
+        """M^-1 J^T impulse (nv,) [m/s, rad/s] of impulses (m,)."""
+        out = np.empty(self.nv)
+        self.operator.change(impulse, out)
+        return self._given(out)
+
+    def _given(self, x: FloatArray) -> FloatArray:
+        # from the factor's order to the order given
+        if self.order is None:
+            return x
+        out = np.empty_like(x)
+        out[self.order] = x
+        return out
+
+    def restrict(self, rows: Any, velocities: Any) -> Generalized:
+        """These rows on these velocities alone; exact where M couples them to no others and J's rows touch none."""
+        rows, velocities = np.asarray(rows, np.intp), np.asarray(velocities, np.intp)
+        names = None if self.names is None else [self.names[i] for i in velocities]
+        jac = sp.csr_array(self.jac[rows][:, velocities])
+        mass = sp.csr_array(self.mass[velocities][:, velocities])
+        return Generalized(jac, mass, self.v_free[velocities], names)
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Generalized):
+            return NotImplemented
+        if self.names != other.names or not equal(self.v_free, other.v_free):
+            return False
+        return all(
+            equal(getattr(a, n), getattr(b, n))
+            for a, b in ((self.jac, other.jac), (self.mass, other.mass))
+            for n in ("indptr", "indices", "data")
+        )
+
+    __hash__ = None  # type: ignore[assignment]
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Generalized, (self.jac, self.mass, self.v_free, self.names)
+
+    def __repr__(self) -> str:
+        return f"<Generalized {self.m} rows, {self.nv} velocities>"
+
+
+# -- what is given ------------------------------------------------------------------------------------
+
+
+def _rows(jac: Any, n: int) -> Compressed:
+    if sp.issparse(jac):
+        if jac.shape[1] != n:
+            raise InputError(f"J has shape {jac.shape}; (any, {n}) is needed, as M has {n} velocities")
+        data = _compressed("J", jac)
+        return data.indptr, data.indices, data.data
+    dense = as_array("J", jac, (None, n), copy=False)
+    return dense_to_csr(dense)
+
+
+def _lower(mass: Any, names: Sequence[str] | None) -> tuple[Compressed, int]:
+    if isinstance(mass, (list, tuple)) and all(np.ndim(block) == 2 for block in mass) and mass:
+        given = [as_array(f"block {i} of M", block, (None, None)) for i, block in enumerate(mass)]
+        mass = sp.block_diag(given, format="csr")
+    if not sp.issparse(mass):
+        dense = as_array("M", mass, (None, None), copy=False)
+        n = len(dense)
+        if dense.shape != (n, n):
+            raise InputError(f"M has shape {dense.shape}; a square matrix is needed")
+        lower, (i, j, worst) = kernels.lower_of_dense(dense)
+        if worst > ASYMMETRY:
+            _refuse(i, j, dense[i, j], dense[j, i], names)
+        return lower, n
+    n = mass.shape[0]
+    if mass.shape != (n, n):
+        raise InputError(f"M has shape {mass.shape}; a square matrix is needed")
+    whole = _compressed("M", mass)
+    diagonal = whole.diagonal()
+    scale = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
+    off = sp.coo_array(whole - whole.T)
+    share = np.abs(off.data) / (scale[off.row] * scale[off.col])
+    if len(share) and share.max() > ASYMMETRY:
+        at = int(np.argmax(share))
+        i, j = int(off.row[at]), int(off.col[at])
+        _refuse(i, j, whole[i, j], whole[j, i], names)
+    # A diagonal entry in every row, zero or not: the factor says what is wrong with it.
+    lower = sp.coo_array(sp.tril(whole, -1))
+    rows, cols = np.concatenate([lower.row, np.arange(n)]), np.concatenate([lower.col, np.arange(n)])
+    return _arrays(rows, cols, np.concatenate([lower.data, diagonal]), n), n
+
+
+def _refuse(i: int, j: int, x: float, y: float, names: Sequence[str] | None) -> None:
+    where = f"({i}, {j})" if names is None else f"({names[i]}, {names[j]})"
+    raise InputError(
+        f"M is not symmetric: at {where} it is {x:.6g} above and {y:.6g} below the diagonal, or the other way round; "
+        "give both triangles (Pinocchio's crba fills the upper one)"
+    )
+
+
+def _compressed(name: str, given: Any) -> sp.csr_array:
+    if given.dtype.kind not in "buif":
+        raise InputError(f"{name} has dtype {given.dtype}; real numbers are needed")
+    if given.nnz >= 2**31:
+        raise InputError(f"{name} has {given.nnz} nonzeros, more than 32-bit indices reach")
+    out = sp.csr_array(given, dtype=np.float64, copy=True)
+    try:
+        out.check_format(full_check=True)  # kernels trust every index
+    except ValueError as error:
+        raise InputError(f"{name} is not a valid compressed matrix ({error})") from None
+    out.sum_duplicates()
+    as_array(name, out.data, (None,), copy=False)
+    out.data.setflags(write=True)
+    out.eliminate_zeros()
+    parts = (
+        read_only(np.ascontiguousarray(out.data, np.float64)),
+        read_only(np.ascontiguousarray(out.indices, np.int32)),
+        read_only(np.ascontiguousarray(out.indptr, np.int32)),
+    )
+    return sp.csr_array(parts, shape=out.shape)
+
+
+# -- orders without fill -----------------------------------------------------------------------------
+
+
+def _arrays(rows: Any, cols: Any, data: FloatArray, n: int) -> Compressed:
+    at = np.lexsort((cols, rows))
+    indptr = np.concatenate([[0], np.cumsum(np.bincount(rows, minlength=n))]).astype(np.int32)
+    return indptr, cols[at].astype(np.int32), np.ascontiguousarray(data[at])
+
+
+def _permuted_lower(mass: Compressed, order: IntArray) -> Compressed:
+    indptr, indices, data = mass
+    place = np.argsort(order)
+    rows, cols = place[np.repeat(np.arange(len(order)), np.diff(indptr))], place[indices]
+    return _arrays(np.maximum(rows, cols), np.minimum(rows, cols), data, len(order))
+
+
+def _permuted_columns(jac: Compressed, order: IntArray) -> Compressed:
+    indptr, indices, data = jac
+    rows = np.repeat(np.arange(len(indptr) - 1), np.diff(indptr))
+    return _arrays(rows, np.argsort(order)[indices], data, len(indptr) - 1)
+
+
+def _order(mass: Compressed, n: int) -> IntArray:
+    """Velocity at each place, eliminated from the last: the order of least fill among those tried.
+
+    Maximum cardinality search finds one without fill wherever there is one (Tarjan, Yannakakis 1984); reverse
+    Cuthill-McKee keeps the band of a mesh.
+    """
+    from scipy.sparse.csgraph import reverse_cuthill_mckee
+
+    indptr, indices, data = mass
+    lower = sp.csr_array((np.ones(len(data)), indices, indptr), shape=(n, n))
+    whole = sp.csr_array(lower + lower.T)
+    found = [_cardinality(whole, n), reverse_cuthill_mckee(whole, symmetric_mode=True).astype(np.int32)]
+    fills = [kernels.pattern_fill(*_permuted_lower(mass, order)[:2]) for order in found]
+    return found[int(np.argmin(fills))]
+
+
+def _cardinality(whole: sp.csr_array, n: int) -> IntArray:
+    # Next comes the velocity with the most neighbours among those that have come; buckets by their number.
+    weight = np.zeros(n, np.int64)
+    done = np.zeros(n, bool)
+    buckets: list[list[int]] = [list(range(n - 1, -1, -1))]
+    order = np.empty(n, np.int32)
+    top = 0
+    for place in range(n):
+        while True:
+            while not buckets[top]:
+                top -= 1
+            i = buckets[top].pop()
+            if not done[i] and weight[i] == top:
+                break
+        done[i] = True
+        order[place] = i
+        for j in whole.indices[whole.indptr[i] : whole.indptr[i + 1]]:
+            if not done[j]:
+                weight[j] += 1
+                if weight[j] == len(buckets):
+                    buckets.append([])
+                buckets[weight[j]].append(int(j))
+        top = min(top + 1, len(buckets) - 1)
+    return order

@@ -1,0 +1,387 @@
+"""Generalised coordinates: J (m, nv) and M (nv, nv), known by the factor of M and by the whitened Jacobian.
+
+    M = L^T D L, L unit lower triangular: row k is eliminated into rows before it, k = nv - 1 ... 0, so that a leaf
+    of a kinematic tree comes before its ancestors and nothing fills in (Featherstone 2008, section 6.5)     (1)
+    Y = J L^-1 D^-1/2,   J M^-1 J^T = Y Y^T                                                                 (2)
+    w = J x + compliance lambda - b,   M x = J^T lambda                                                     (3)
+
+A row of Y has entries in the columns of its row of J and in their ancestors, the rows that (1) reaches from them.
+Rows that stand together and reach the same columns share a panel: one list of columns, values row by row.
+"""
+from libc.math cimport fabs, sqrt
+from libc.stdint cimport int32_t
+
+
+cdef enum:
+    PANEL_ROWS = 16             # most rows of a panel, unless one block has more
+
+
+cdef struct generalized_t:
+    int32_t n                   # velocities, nv
+    int32_t m                   # rows
+    const int32_t* jptr         # (m + 1) rows of J
+    const int32_t* jidx         # columns, ascending
+    const double* jval
+    const int32_t* lptr         # (n + 1) rows of L, left of the diagonal
+    const int32_t* lidx         # columns, ascending
+    const double* lval
+    const int32_t* parent       # (n) last column of the row of L, -1 at a root
+    const double* inv_pivot     # (n) 1 / D
+    const double* compliance    # (m) 1/kg, >= 0
+    int32_t n_panels
+    const int32_t* prow         # (n_panels + 1) first row of each panel
+    const int32_t* pcol         # (n_panels + 1) its first place in `cols`
+    const int32_t* pval         # (n_panels + 1) its first place in `y`
+    const int32_t* cols         # columns of each panel, ascending
+    const double* y             # Y
+
+
+# -- M = L^T D L -------------------------------------------------------------------------------------
+
+
+cdef inline int32_t tree_pattern(int32_t n, const int32_t* mptr, const int32_t* midx, int32_t room, int32_t* lptr,
+                                 int32_t* lidx, int32_t* parent, int32_t* mark, int32_t* next_child,
+                                 int32_t* first_child) noexcept nogil:
+    """Pattern of L from the lower triangle of M; entries of L, or -1 where `room` does not hold them.
+
+    Rows are found from the last: row k has the entries of M and those that rows below it, whose last column is k,
+    leave there. They are written from the end of `lidx` backwards; `lptr` counts from the front afterwards.
+    """
+    cdef int32_t k, q, c, j, at = room, start, end, i, x
+    for k in range(n):
+        mark[k] = -1
+        first_child[k] = -1
+    for k in range(n - 1, -1, -1):
+        end = at
+        mark[k] = k
+        for q in range(mptr[k + 1] - 1, mptr[k] - 1, -1):   # backwards, so that the row stands ascending
+            j = midx[q]
+            if j < k and mark[j] != k:
+                mark[j] = k
+                at -= 1
+                if at < 0:
+                    return -1
+                lidx[at] = j
+        c = first_child[k]
+        while c >= 0:
+            for q in range(lptr[c] + parent[c] - 1, lptr[c] - 1, -1):   # parent holds the length until the end
+                j = lidx[q]
+                if mark[j] != k:
+                    mark[j] = k
+                    at -= 1
+                    if at < 0:
+                        return -1
+                    lidx[at] = j
+            c = next_child[c]
+        start = at
+        for i in range(start + 1, end):                     # rows of a tree come sorted
+            x = lidx[i]
+            j = i - 1
+            while j >= start and lidx[j] > x:
+                lidx[j + 1] = lidx[j]
+                j -= 1
+            lidx[j + 1] = x
+        lptr[k] = start
+        parent[k] = end - start
+        if end > start:
+            j = lidx[end - 1]
+            next_child[k] = first_child[j]
+            first_child[j] = k
+    for k in range(n):
+        lptr[k] -= at
+    lptr[n] = room - at
+    for q in range(at, room):
+        lidx[q - at] = lidx[q]
+    for k in range(n):
+        parent[k] = lidx[lptr[k + 1] - 1] if lptr[k + 1] > lptr[k] else -1
+    return lptr[n]
+
+
+cdef inline int32_t tree_factor(int32_t n, const int32_t* mptr, const int32_t* midx, const double* mval,
+                                const int32_t* lptr, const int32_t* lidx, double* lval, double* pivot,
+                                double* inv_pivot) noexcept nogil:
+    """L and 1 / D of (1); -1, or the row whose pivot is no more than rounding of M_kk."""
+    cdef int32_t k, q, a, b, j, first, count, at, i
+    cdef double inv, f
+    for q in range(lptr[n]):
+        lval[q] = 0.0
+    for k in range(n):
+        pivot[k] = 0.0
+        inv_pivot[k] = 0.0
+        at = lptr[k]
+        for q in range(mptr[k], mptr[k + 1]):
+            j = midx[q]
+            if j == k:
+                pivot[k] = mval[q]
+                inv_pivot[k] = mval[q]                      # M_kk, until its row is eliminated
+            elif j < k:
+                while lidx[at] != j:
+                    at += 1
+                lval[at] = mval[q]
+    for k in range(n - 1, -1, -1):
+        if not pivot[k] > 8.8817841970012523e-16 * inv_pivot[k]:
+            return k
+        inv = 1.0 / pivot[k]
+        inv_pivot[k] = inv
+        first = lptr[k]
+        for a in range(lptr[k + 1] - 1, first - 1, -1):
+            j = lidx[a]
+            f = lval[a] * inv
+            pivot[j] -= f * lval[a]
+            count = a - first
+            at = lptr[j]
+            if lptr[j + 1] - at == count:                   # the same columns
+                for b in range(count):
+                    lval[at + b] -= f * lval[first + b]
+            else:
+                for b in range(count):
+                    i = lidx[first + b]
+                    while lidx[at] != i:
+                        at += 1
+                    lval[at] -= f * lval[first + b]
+            lval[a] = f
+    return -1
+
+
+cdef inline void tree_solve(const generalized_t* g, double* x) noexcept nogil:
+    """x <- M^-1 x."""
+    cdef int32_t k, q
+    cdef double z
+    for k in range(g.n - 1, -1, -1):                        # L^T z = x
+        z = x[k]
+        if z != 0.0:
+            for q in range(g.lptr[k], g.lptr[k + 1]):
+                x[g.lidx[q]] -= g.lval[q] * z
+    for k in range(g.n):                                    # D, then L x = z
+        z = x[k] * g.inv_pivot[k]
+        for q in range(g.lptr[k], g.lptr[k + 1]):
+            z -= g.lval[q] * x[g.lidx[q]]
+        x[k] = z
+
+
+cdef inline void tree_unwhiten(const generalized_t* g, double* x) noexcept nogil:
+    """x <- L^-1 D^-1/2 x: velocities of whitened ones."""
+    cdef int32_t k, q
+    cdef double z
+    for k in range(g.n):
+        z = x[k] * sqrt(g.inv_pivot[k])
+        for q in range(g.lptr[k], g.lptr[k + 1]):
+            z -= g.lval[q] * x[g.lidx[q]]
+        x[k] = z
+
+
+# -- J ---------------------------------------------------------------------------------------------------
+
+
+cdef inline void jac_push(const generalized_t* g, const double* lam, double* x) noexcept nogil:
+    """x = J^T lam (n)."""
+    cdef int32_t i, q
+    cdef double s
+    for i in range(g.n):
+        x[i] = 0.0
+    for i in range(g.m):
+        s = lam[i]
+        if s != 0.0:
+            for q in range(g.jptr[i], g.jptr[i + 1]):
+                x[g.jidx[q]] += g.jval[q] * s
+
+
+cdef inline double jac_row(const generalized_t* g, int32_t i, const double* x) noexcept nogil:
+    cdef int32_t q
+    cdef double s = 0.0
+    for q in range(g.jptr[i], g.jptr[i + 1]):
+        s += g.jval[q] * x[g.jidx[q]]
+    return s
+
+
+# -- Y ---------------------------------------------------------------------------------------------------
+
+
+cdef inline int32_t reached(const generalized_t* g, int32_t first, int32_t last, int32_t stamp, int32_t before,
+                            int32_t* mark, int32_t* out, int32_t* same) noexcept nogil:
+    """Columns that rows [first, last) reach, unsorted, into out (n); how many. `same`: of those, marked `before`."""
+    cdef int32_t q, k, count = 0, hits = 0
+    for q in range(g.jptr[last] - 1, g.jptr[first] - 1, -1):
+        k = g.jidx[q]
+        while k >= 0 and mark[k] != stamp:
+            hits += mark[k] == before
+            mark[k] = stamp
+            out[count] = k
+            count += 1
+            k = g.parent[k]
+    same[0] = hits
+    return count
+
+
+cdef inline void sort_falling(int32_t* x, int32_t n) noexcept nogil:
+    """Ascending order of what comes in a few falling runs."""
+    cdef int32_t i, j, t
+    for i in range(n // 2):
+        t = x[i]
+        x[i] = x[n - 1 - i]
+        x[n - 1 - i] = t
+    for i in range(1, n):
+        t = x[i]
+        j = i - 1
+        while j >= 0 and x[j] > t:
+            x[j + 1] = x[j]
+            j -= 1
+        x[j + 1] = t
+
+
+cdef inline int32_t panel_pattern(const generalized_t* g, int32_t n_blocks, const int32_t* ptr, int32_t* mark,
+                                  int32_t* prow, int32_t* pcol, int32_t* pval, int32_t* cols, int32_t room,
+                                  int32_t* n_cols, double* n_values) noexcept nogil:
+    """Panels of consecutive blocks that reach the same columns; how many, or -1 where `room` columns do not suffice.
+
+    mark (2 n) is scratch; of n_cols and n_values the caller makes arrays.
+    """
+    cdef int32_t i, first, last, count, same, before = -1, held = 0, at = 0, n = 0, stamp = 0
+    cdef int32_t* out = mark + g.n
+    n_values[0] = 0.0
+    prow[0] = 0
+    pcol[0] = 0
+    pval[0] = 0
+    for i in range(g.n):
+        mark[i] = -1
+    for i in range(n_blocks):
+        first = ptr[i]
+        last = ptr[i + 1]
+        count = reached(g, first, last, stamp, before, mark, out, &same)
+        n_values[0] += <double>count * (last - first)
+        if n > 0 and count == held and same == count and last - prow[n - 1] <= PANEL_ROWS:
+            prow[n] = last                                  # the panel grows
+        else:
+            if at + count > room:
+                return -1
+            sort_falling(out, count)
+            for same in range(count):
+                cols[at + same] = out[same]
+            at += count
+            held = count
+            n += 1
+            prow[n] = last
+            pcol[n] = at
+        pval[n] = pval[n - 1] + count * (last - prow[n - 1])
+        if n_values[0] >= 2147483647.0:
+            break
+        before = stamp
+        stamp += 1
+    n_cols[0] = at
+    return n
+
+
+cdef inline void panel_whiten(const generalized_t* g, int32_t panel, int32_t* place, double* y) noexcept nogil:
+    """Rows of Y of one panel: L^T y = J^T on its columns, then D^-1/2. place (n) is scratch."""
+    cdef int32_t first = g.prow[panel], last = g.prow[panel + 1], c0 = g.pcol[panel], nc = g.pcol[panel + 1] - c0
+    cdef const int32_t* cols = g.cols + c0
+    cdef int32_t a, k, q, i, p, count
+    cdef double z, l
+    cdef double* x
+    for a in range(nc):
+        place[cols[a]] = a
+    for i in range((last - first) * nc):
+        y[i] = 0.0
+    for i in range(first, last):
+        x = y + (i - first) * nc
+        for q in range(g.jptr[i], g.jptr[i + 1]):
+            x[place[g.jidx[q]]] = g.jval[q]
+    for a in range(nc - 1, -1, -1):
+        k = cols[a]
+        count = g.lptr[k + 1] - g.lptr[k]
+        for i in range(last - first):
+            x = y + i * nc
+            z = x[a]
+            if z == 0.0:
+                continue
+            if count == a:                                  # every column before it
+                for p in range(a):
+                    x[p] -= g.lval[g.lptr[k] + p] * z
+            else:
+                for q in range(g.lptr[k], g.lptr[k + 1]):
+                    x[place[g.lidx[q]]] -= g.lval[q] * z
+        l = sqrt(g.inv_pivot[k])
+        for i in range(last - first):
+            y[i * nc + a] *= l
+
+
+cdef inline double dot(const double* x, const double* y, int32_t n) noexcept nogil:
+    # Four running sums: a fixed order of additions.
+    cdef double s0 = 0.0, s1 = 0.0, s2 = 0.0, s3 = 0.0
+    cdef int32_t i = 0
+    while i + 4 <= n:
+        s0 += x[i] * y[i]
+        s1 += x[i + 1] * y[i + 1]
+        s2 += x[i + 2] * y[i + 2]
+        s3 += x[i + 3] * y[i + 3]
+        i += 4
+    while i < n:
+        s0 += x[i] * y[i]
+        i += 1
+    return (s0 + s1) + (s2 + s3)
+
+
+cdef inline void panel_times(const generalized_t* g, int32_t panel, const double* x, double* out) noexcept nogil:
+    """out (m) = Y x on the rows of a panel."""
+    cdef int32_t i, a, nc = g.pcol[panel + 1] - g.pcol[panel]
+    cdef const int32_t* cols = g.cols + g.pcol[panel]
+    cdef const double* y = g.y + g.pval[panel]
+    cdef double s0, s1
+    for i in range(g.prow[panel], g.prow[panel + 1]):
+        s0 = 0.0
+        s1 = 0.0
+        a = 0
+        while a + 2 <= nc:
+            s0 += y[a] * x[cols[a]]
+            s1 += y[a + 1] * x[cols[a + 1]]
+            a += 2
+        if a < nc:
+            s0 += y[a] * x[cols[a]]
+        out[i] = s0 + s1
+        y += nc
+
+
+cdef inline void panel_push(const generalized_t* g, int32_t panel, const double* lam, double* x) noexcept nogil:
+    """x (n) += Y^T lam of the rows of a panel."""
+    cdef int32_t i, a, nc = g.pcol[panel + 1] - g.pcol[panel]
+    cdef const int32_t* cols = g.cols + g.pcol[panel]
+    cdef const double* y = g.y + g.pval[panel]
+    for i in range(g.prow[panel], g.prow[panel + 1]):
+        if lam[i] != 0.0:
+            for a in range(nc):
+                x[cols[a]] += y[a] * lam[i]
+        y += nc
+
+
+cdef inline void panel_push_size(const generalized_t* g, int32_t panel, const double* lam, double* x) noexcept nogil:
+    """x (n) += |Y|^T |lam| of the rows of a panel."""
+    cdef int32_t i, a, nc = g.pcol[panel + 1] - g.pcol[panel]
+    cdef const int32_t* cols = g.cols + g.pcol[panel]
+    cdef const double* y = g.y + g.pval[panel]
+    for i in range(g.prow[panel], g.prow[panel + 1]):
+        if lam[i] != 0.0:
+            for a in range(nc):
+                x[cols[a]] += fabs(y[a] * lam[i])
+        y += nc
+
+
+cdef inline void panel_size(const generalized_t* g, int32_t panel, const double* x, double* out) noexcept nogil:
+    """out (m) = |Y| x on the rows of a panel, x >= 0."""
+    cdef int32_t i, a, nc = g.pcol[panel + 1] - g.pcol[panel]
+    cdef const int32_t* cols = g.cols + g.pcol[panel]
+    cdef const double* y = g.y + g.pval[panel]
+    cdef double s
+    for i in range(g.prow[panel], g.prow[panel + 1]):
+        s = 0.0
+        for a in range(nc):
+            s += fabs(y[a]) * x[cols[a]]
+        out[i] = s
+        y += nc
+
+
+cdef class Operator:
+    cdef generalized_t g                # without panels and compliance
+    cdef readonly int failed            # the row of M whose pivot is not positive, or -1
+    cdef readonly object jac            # (indptr, indices, data) of J
+    cdef readonly object mass           # the same of the lower triangle of M
+    cdef list keep

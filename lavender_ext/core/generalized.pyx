@@ -1,0 +1,171 @@
+"""J and M of generalised coordinates for Python: M's factor, kept, and what the judge and the solvers read of it."""
+from libc.math cimport fabs, sqrt
+from libc.stdint cimport int32_t
+
+import numpy as np
+
+from lavender_ext.core.generalized cimport (generalized_t, jac_push, jac_row, tree_factor, tree_pattern, tree_solve,
+                                            tree_unwhiten)
+
+
+cdef public int32_t lav_tree_pattern(int32_t n, const int32_t* mptr, const int32_t* midx, int32_t room, int32_t* lptr,
+                                     int32_t* lidx, int32_t* parent, int32_t* scratch) noexcept nogil:
+    """Pattern of L; scratch (3 n). Entries, or -1 where `room` is too small."""
+    return tree_pattern(n, mptr, midx, room, lptr, lidx, parent, scratch, scratch + n, scratch + 2 * n)
+
+
+cdef public int32_t lav_tree_factor(int32_t n, const int32_t* mptr, const int32_t* midx, const double* mval,
+                                    const int32_t* lptr, const int32_t* lidx, double* lval, double* pivot,
+                                    double* inv_pivot) noexcept nogil:
+    """L and 1 / D; -1, or the row that shows M to be no positive definite matrix."""
+    return tree_factor(n, mptr, midx, mval, lptr, lidx, lval, pivot, inv_pivot)
+
+
+cdef public void lav_tree_solve(const generalized_t* g, double* x) noexcept nogil:
+    """x <- M^-1 x."""
+    tree_solve(g, x)
+
+
+cdef class Operator:
+    """J in compressed rows and M by its lower triangle, diagonal included, with M = L^T D L.
+
+    The caller passes checked int32 and float64 arrays with ascending columns; they are kept alive here. `failed`
+    is the row of M whose pivot is not positive, -1 where M is positive definite.
+    """
+
+    def __init__(self, const int32_t[::1] jptr, const int32_t[::1] jidx, const double[::1] jval,
+                 const int32_t[::1] mptr, const int32_t[::1] midx, const double[::1] mval):
+        cdef int32_t m = <int32_t>jptr.shape[0] - 1, n = <int32_t>mptr.shape[0] - 1, count, room
+        cdef int32_t[::1] whole, indices
+        cdef double[::1] numbers
+        self.jac = (jptr.base, jidx.base, jval.base)
+        self.mass = (mptr.base, midx.base, mval.base)
+        self.g.n = n
+        self.g.m = m
+        self.g.jptr = &jptr[0]
+        if jidx.shape[0]:
+            self.g.jidx = &jidx[0]
+            self.g.jval = &jval[0]
+        room = <int32_t>midx.shape[0] + 1
+        whole = np.empty(5 * n + 2 + room, np.int32)
+        # lptr, parent, scratch, then the columns of L
+        count = tree_pattern(n, &mptr[0], &midx[0] if n else NULL, room, &whole[0], &whole[5 * n + 1], &whole[n + 1],
+                             &whole[2 * n + 1], &whole[3 * n + 1], &whole[4 * n + 1])
+        indices = whole[5 * n + 1:]
+        while count < 0:                                # M's pattern is no tree's: L has more entries
+            room = min(2 * room, n * n // 2 + 1)
+            indices = np.empty(room, np.int32)
+            count = tree_pattern(n, &mptr[0], &midx[0], room, &whole[0], &indices[0], &whole[n + 1],
+                                 &whole[2 * n + 1], &whole[3 * n + 1], &whole[4 * n + 1])
+        numbers = np.empty(2 * n + count + 1)
+        self.keep = [jptr, jidx, jval, mptr, midx, mval, whole, indices, numbers]
+        self.g.lptr = &whole[0]
+        self.g.parent = &whole[n + 1]
+        self.g.lidx = &indices[0]
+        self.g.lval = &numbers[2 * n]
+        self.g.inv_pivot = &numbers[0]
+        self.failed = -1
+        if n:
+            self.failed = tree_factor(n, &mptr[0], &midx[0], &mval[0], &whole[0], &indices[0], &numbers[2 * n],
+                                      &numbers[n], &numbers[0])
+
+    @property
+    def n(self):
+        """Velocities, nv."""
+        return self.g.n
+
+    @property
+    def m(self):
+        """Rows of J."""
+        return self.g.m
+
+    @property
+    def fill(self):
+        """Entries of L left of the diagonal that M does not have."""
+        return self.g.lptr[self.g.n] - (len(self.mass[1]) - self.g.n)
+
+    @property
+    def parents(self):
+        """Parent of each velocity in the tree of M's factor (n,), -1 at a root; a new array."""
+        cdef int32_t i
+        cdef int32_t[::1] out = np.empty(self.g.n, np.int32)
+        for i in range(self.g.n):
+            out[i] = self.g.parent[i]
+        return out.base
+
+    def solve(self, double[::1] x):
+        """x <- M^-1 x (n,)."""
+        if self.g.n:
+            tree_solve(&self.g, &x[0])
+
+    def unwhiten(self, double[::1] x):
+        """x <- L^-1 D^-1/2 x (n,)."""
+        if self.g.n:
+            tree_unwhiten(&self.g, &x[0])
+
+    def change(self, const double[::1] lam, double[::1] x):
+        """x = M^-1 J^T lam (n,)."""
+        if self.g.n:
+            if self.g.m == 0:
+                x[:] = 0.0
+                return
+            jac_push(&self.g, &lam[0], &x[0])
+            tree_solve(&self.g, &x[0])
+
+    def times(self, const double[::1] x, double[::1] out):
+        """out = J x (m,)."""
+        cdef int32_t i
+        for i in range(self.g.m):
+            out[i] = jac_row(&self.g, i, &x[0]) if self.g.n else 0.0
+
+
+def lower_of_dense(const double[:, ::1] a):
+    """(indptr, indices, data) of the lower triangle with its diagonal, and the worst asymmetry.
+
+    The asymmetry is (i, j, |a_ij - a_ji| / sqrt(a_ii a_jj)), the largest; rows whose diagonal is not positive count
+    with 1 there.
+    """
+    cdef int32_t n = <int32_t>a.shape[0], i, j, nnz = 0, at_i = 0, at_j = 0
+    cdef double worst = 0.0, x, s
+    for i in range(n):
+        for j in range(i):
+            nnz += a[i, j] != 0.0 or a[j, i] != 0.0
+    whole = np.empty(n + 1 + nnz + n, np.int32)
+    values = np.empty(nnz + n)
+    cdef int32_t[::1] k = whole
+    cdef double[::1] v = values
+    nnz = 0
+    k[0] = 0
+    for i in range(n):
+        for j in range(i):
+            if a[i, j] != 0.0 or a[j, i] != 0.0:
+                k[n + 1 + nnz] = j
+                v[nnz] = a[i, j]
+                nnz += 1
+                x = fabs(a[i, j] - a[j, i])
+                if x > 0.0:
+                    s = a[i, i] * a[j, j]
+                    x = x / sqrt(s) if s > 0.0 else x
+                    if x > worst:
+                        worst = x
+                        at_i = i
+                        at_j = j
+        k[n + 1 + nnz] = i
+        v[nnz] = a[i, i]
+        nnz += 1
+        k[i + 1] = nnz
+    return (whole[:n + 1], whole[n + 1:], values), (at_i, at_j, worst)
+
+
+def pattern_fill(const int32_t[::1] mptr, const int32_t[::1] midx):
+    """Entries that the factor of a matrix with this lower triangle has beyond it."""
+    cdef int32_t n = <int32_t>mptr.shape[0] - 1, count, room = <int32_t>midx.shape[0] + 1
+    cdef int32_t[::1] scratch = np.empty(5 * n + 1, np.int32)
+    cdef int32_t[::1] indices
+    while True:
+        indices = np.empty(room, np.int32)
+        count = tree_pattern(n, &mptr[0], &midx[0], room, &scratch[0], &indices[0], &scratch[n + 1],
+                             &scratch[2 * n + 1], &scratch[3 * n + 1], &scratch[4 * n + 1])
+        if count >= 0:
+            return count - (midx.shape[0] - n)
+        room = min(2 * room, n * n // 2 + 1)

@@ -1,0 +1,122 @@
+"""Dense factorisations in the order that leaves a tree's branches apart: from the last row to the first.
+
+    symmetric   N = L^T D L, the lower triangle row by row; what is zero in a row costs nothing            (1)
+    general     N = P L U, partial pivoting                                                                 (2)
+
+Inner loops run along a row, so that lanes of any width give the same bits.
+"""
+from libc.math cimport fabs
+from libc.stdint cimport int32_t
+
+from lavender_ext.core.generalized cimport dot
+
+
+cdef inline void take(double* x, const double* a, double f, int32_t n) noexcept nogil:
+    cdef int32_t i
+    for i in range(n):
+        x[i] -= f * a[i]
+
+
+cdef inline void take4(double* x, const double* a, const double* b, const double* c, const double* d, double f,
+                       double g, double h, double k, int32_t n) noexcept nogil:
+    cdef int32_t i
+    for i in range(n):
+        x[i] = (((x[i] - f * a[i]) - g * b[i]) - h * c[i]) - k * d[i]
+
+
+cdef inline int32_t ltdl_factor(int32_t n, double* a, double* inv) noexcept nogil:
+    """(1) in place, inv = 1 / D (n); 0 where a pivot is not positive. Four rows are eliminated at a time."""
+    cdef int32_t k = n - 1, i, j, b
+    cdef double f, g, h, l
+    cdef double* r0
+    cdef double* r1
+    cdef double* r2
+    cdef double* r3
+    cdef double* x
+    while k >= 0:
+        b = 4 if k >= 3 else k + 1
+        for i in range(k, k - b, -1):                   # within the rows that go together
+            r0 = a + <ssize_t>i * n
+            if not r0[i] > 0.0:
+                return 0
+            inv[i] = 1.0 / r0[i]
+            for j in range(i - 1, k - b, -1):
+                if r0[j] != 0.0:
+                    take(a + <ssize_t>j * n, r0, r0[j] * inv[i], j + 1)
+        if b == 4:
+            r0 = a + <ssize_t>k * n
+            r1 = r0 - n
+            r2 = r1 - n
+            r3 = r2 - n
+            for i in range(k - 3):
+                f = r0[i] * inv[k]
+                g = r1[i] * inv[k - 1]
+                h = r2[i] * inv[k - 2]
+                l = r3[i] * inv[k - 3]
+                x = a + <ssize_t>i * n
+                if g == 0.0 and h == 0.0 and l == 0.0:
+                    if f != 0.0:
+                        take(x, r0, f, i + 1)
+                else:
+                    take4(x, r0, r1, r2, r3, f, g, h, l, i + 1)
+        for i in range(k, k - b, -1):
+            r0 = a + <ssize_t>i * n
+            for j in range(i):
+                r0[j] *= inv[i]
+        k -= b
+    return 1
+
+
+cdef inline void ltdl_solve(int32_t n, const double* a, const double* inv, double* x) noexcept nogil:
+    cdef int32_t k
+    for k in range(n - 1, -1, -1):                      # L^T z = x
+        if x[k] != 0.0:
+            take(x, a + <ssize_t>k * n, x[k], k)
+    for k in range(n):                                  # D, then L x = z
+        x[k] = x[k] * inv[k] - dot(a + <ssize_t>k * n, x, k)
+
+
+cdef inline int32_t lu_factor(int32_t n, double* a, int32_t* swap) noexcept nogil:
+    """(2) in place, rows exchanged with `swap`; 0 where a pivot is zero or not finite."""
+    cdef int32_t k, i, j, best
+    cdef double big, t, inv
+    cdef double* row
+    cdef double* other
+    for k in range(n):
+        best = k
+        big = fabs(a[<ssize_t>k * n + k])
+        for i in range(k + 1, n):
+            t = fabs(a[<ssize_t>i * n + k])
+            if t > big:
+                big = t
+                best = i
+        if not 0.0 < big < 1.0 / 0.0:
+            return 0
+        swap[k] = best
+        row = a + <ssize_t>k * n
+        if best != k:
+            other = a + <ssize_t>best * n
+            for j in range(n):
+                t = row[j]
+                row[j] = other[j]
+                other[j] = t
+        inv = 1.0 / row[k]
+        for i in range(k + 1, n):
+            other = a + <ssize_t>i * n
+            if other[k] != 0.0:
+                other[k] *= inv
+                take(other + k + 1, row + k + 1, other[k], n - k - 1)
+    return 1
+
+
+cdef inline void lu_solve(int32_t n, const double* a, const int32_t* swap, double* x) noexcept nogil:
+    cdef int32_t k
+    cdef double t
+    for k in range(n):
+        t = x[swap[k]]
+        x[swap[k]] = x[k]
+        x[k] = t
+    for k in range(n):
+        x[k] -= dot(a + <ssize_t>k * n, x, k)
+    for k in range(n - 1, -1, -1):
+        x[k] = (x[k] - dot(a + <ssize_t>k * n + k + 1, x + k + 1, n - k - 1)) / a[<ssize_t>k * n + k]

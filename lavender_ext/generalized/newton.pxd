@@ -1,0 +1,694 @@
+"""Newton's method over the velocities of generalised coordinates, island by island; A is never formed.
+
+With y = D^1/2 L (v - v*), whitened, s = Y y - b, and the answer lambda(s) of softened blocks (`soft.pxd`):
+
+    G(y) = y - Y^T lambda(s),    N = I + Y^T V Y,    N p = -G,    y <- y + t p                            (1)
+    theta' = theta + rho,        z = (rho c - s) / theta'                                                 (2)
+    s_n <- s_n + phi                                                                                      (3)
+
+Without Coulomb friction G is the gradient of a convex function with kinks in its second derivative, N is symmetric,
+and t is where the derivative along p vanishes (Todorov 2014; Castro et al. 2022): it ends in a few steps. rho (2)
+is nothing where the problem's own theta is no less than 1e-6 d; below, and between tangents that differ, it is a
+proximal term about the centre c, which follows lambda (Rockafellar 1976), and the limit is the problem given.
+
+Coulomb's law has no such function. Newton's method goes on from the convex relaxation's answer with the derivative
+that lacks symmetry, as long as |G| falls; where it does not, normals are lowered by phi = mu |w_t| + mu r |w_s| (3)
+and the convex problem is solved again (De Saxce, Feng 1998; Cadoux 2009).
+
+The test of the end is the judge's, on lambda itself: w = Y (Y^T lambda) - b + theta lambda, error e of every block.
+N is kept between steps; where few blocks have changed their V only those change it.
+"""
+from libc.math cimport fabs, sqrt
+from libc.stdint cimport int32_t
+
+from lavender_ext.core.block cimport CONE, COULOMB, CONTACT_SPIN, ROW, block_error, blocks_t, n_tangents
+from lavender_ext.core.generalized cimport generalized_t, panel_push, panel_times
+from lavender_ext.generalized.dense cimport ltdl_factor, ltdl_solve, lu_factor, lu_solve
+from lavender_ext.generalized.soft cimport INSIDE, OFF, SLIDES, cone_map, coulomb_map, size_of
+from lavender_ext.judge.measure cimport nothing, tally_block, tally_t
+
+
+cdef enum:
+    DONE = 0                    # the test at tol was met
+    SPENT = 1                   # the steps asked for are done
+    STUCK = 2                   # nothing moves any more
+    FAILED = 3                  # a factorisation failed
+    LOST = 4                    # numbers are no longer finite
+
+cdef enum:
+    IDLE_STEPS = 30             # steps without a better iterate after which an island is stuck
+    LINE_STEPS = 24             # evaluations of one line search
+    RENEW = 16                  # steps after which s and N are formed anew
+    ROUNDS = 60                 # rounds of Coulomb friction
+
+
+cdef struct flow_t:
+    blocks_t p                  # a copy: its law is that of the convex problem while one is solved
+    const generalized_t* g
+    int32_t law                 # of the problem
+    int32_t n_islands
+    const int32_t* iptr         # (n_islands + 1) panels of each island in `ipanel`
+    const int32_t* ipanel       # (n_panels)
+    const int32_t* cptr         # (n_islands + 1) columns of each island in `icols`
+    const int32_t* icols        # (<= n) ascending in each
+    const int32_t* local        # (n) number of a column in its island
+    const int32_t* pblock       # (n_panels + 1) first block of each panel
+    const int32_t* vptr         # (k + 1) V of each block: its diagonal for ROW, else square
+    double* theta               # (m) theta', > 0
+    double* rho                 # (m) >= 0
+    double* y                   # (n)
+    double* u                   # (n) Y^T lambda
+    double* grad                # (n) G
+    double* step                # (n) p
+    double* s                   # (m) Y y - b + phi
+    double* q                   # (m) Y p
+    double* phi                 # (m)
+    double* center              # (m)
+    double* lam                 # (m)
+    double* trial               # (m)
+    double* best                # (m) of one descent
+    double* first_best          # (m) of one island, under the problem's own law
+    double* w                   # (m)
+    double* e                   # (m)
+    double* v                   # V at s
+    double* held                # V inside `normal`
+    double* normal              # N of the present island, lower triangle by rows; whole where it lacks symmetry
+    double* factor              # its factor
+    double* inv                 # (s) 1 / D
+    double* turned              # (rows of a panel, columns) changes of V times Y
+    double* line                # (columns)
+    double* local_rhs           # (s)
+    int32_t* swap               # (s)
+    double energy_limit         # sqrt J of one island
+    double velocity_limit       # m/s
+    int32_t steps               # Newton steps left
+    int32_t factorisations
+    int32_t updates             # of N by changed blocks alone
+    int32_t rounds              # of Coulomb friction
+    int32_t evaluations         # of lambda(s) along a line
+
+
+# -- lambda(s) and V -------------------------------------------------------------------------------------
+
+
+cdef inline void respond(const flow_t* f, int32_t i, const double* s, double* lam, double* v) noexcept nogil:
+    """lambda of block i; v (its V), or NULL."""
+    cdef int32_t j = f.p.ptr[i], end = f.p.ptr[i + 1], k, nt, spin
+    cdef double z
+    for k in range(j, end):
+        lam[k] = (f.rho[k] * f.center[k] - s[k]) / f.theta[k]
+    if f.p.kind[i] == ROW:
+        for k in range(j, end):
+            z = lam[k]
+            if z < f.p.lower[k]:
+                lam[k] = f.p.lower[k]
+            elif z > f.p.upper[k]:
+                lam[k] = f.p.upper[k]
+            if v != NULL:
+                v[k - j] = 1.0 / f.theta[k] if f.p.lower[k] < z < f.p.upper[k] else 0.0
+        return
+    nt = n_tangents(f.p.kind[i], end - j)
+    spin = f.p.kind[i] == CONTACT_SPIN
+    if f.p.law == CONE:
+        cone_map(nt, spin, f.theta + j, f.p.mu[i], f.p.patch_radius[i], lam + j, v)
+    else:
+        coulomb_map(nt, spin, f.theta + j, f.p.mu[i], f.p.patch_radius[i], lam + j, v)
+
+
+cdef inline void respond_all(const flow_t* f, int32_t island, const double* s, double* lam, double* v) noexcept nogil:
+    cdef int32_t a, b, i
+    for a in range(f.iptr[island], f.iptr[island + 1]):
+        b = f.ipanel[a]
+        for i in range(f.pblock[b], f.pblock[b + 1]):
+            respond(f, i, s, lam, NULL if v == NULL else v + f.vptr[i])
+
+
+cdef inline void gather(const flow_t* f, int32_t island, const double* lam, double* x) noexcept nogil:
+    """x = Y^T lam on the island's columns."""
+    cdef int32_t a
+    for a in range(f.cptr[island], f.cptr[island + 1]):
+        x[f.icols[a]] = 0.0
+    for a in range(f.iptr[island], f.iptr[island + 1]):
+        panel_push(f.g, f.ipanel[a], lam, x)
+
+
+cdef inline void spread(const flow_t* f, int32_t island, const double* x, double* out) noexcept nogil:
+    """out = Y x on the island's rows."""
+    cdef int32_t a
+    for a in range(f.iptr[island], f.iptr[island + 1]):
+        panel_times(f.g, f.ipanel[a], x, out)
+
+
+cdef inline void renew(const flow_t* f, int32_t island) noexcept nogil:
+    """s = Y y - b + phi."""
+    cdef int32_t a, k
+    spread(f, island, f.y, f.s)
+    for a in range(f.iptr[island], f.iptr[island + 1]):
+        for k in range(f.g.prow[f.ipanel[a]], f.g.prow[f.ipanel[a] + 1]):
+            f.s[k] += f.phi[k] - f.p.b[k]
+
+
+cdef inline double measure(const flow_t* f, int32_t island, const double* lam, double* velocity) noexcept nogil:
+    """Energy [sqrt J] and velocity [m/s] of the errors of lam, with u = Y^T lam; NaN where it is not finite."""
+    cdef int32_t a, b, i, k
+    cdef tally_t t = nothing()
+    spread(f, island, f.u, f.w)
+    for a in range(f.iptr[island], f.iptr[island + 1]):
+        b = f.ipanel[a]
+        for k in range(f.g.prow[b], f.g.prow[b + 1]):
+            f.w[k] += f.g.compliance[k] * lam[k] - f.p.b[k] + f.phi[k]
+        for i in range(f.pblock[b], f.pblock[b + 1]):
+            block_error(&f.p, i, lam, f.w, f.e)
+            tally_block(&f.p, i, f.e, &t)
+    velocity[0] = sqrt(t.fast) if t.fast > 0.0 else 0.0
+    return sqrt(t.energy)
+
+
+# -- N -------------------------------------------------------------------------------------------------------
+
+
+cdef inline int32_t turn_block(const flow_t* f, int32_t i, int32_t row, int32_t nc, const double* y, bint whole,
+                               int32_t n) noexcept nogil:
+    """Rows n ... of `turned` = (V - held) Y of block i, of which `row` is the first in its panel; one past the last.
+
+    `line`, behind the columns, holds which rows of Y they belong to. `whole`: nothing is held.
+    """
+    cdef int32_t j = f.p.ptr[i], size = f.p.ptr[i + 1] - j, r, c, a
+    cdef const double* v = f.v + f.vptr[i]
+    cdef double* held = f.held + f.vptr[i]
+    cdef double* out
+    cdef double x
+    cdef bint any_
+    if f.p.kind[i] == ROW:
+        for r in range(size):
+            x = v[r] if whole else v[r] - held[r]
+            held[r] = v[r]
+            if x != 0.0:
+                out = f.turned + n * nc
+                for a in range(nc):
+                    out[a] = x * y[(row + r) * nc + a]
+                f.line[nc + n] = row + r
+                n += 1
+        return n
+    for r in range(size):
+        out = f.turned + n * nc
+        any_ = False
+        for c in range(size):
+            x = v[r * size + c] if whole else v[r * size + c] - held[r * size + c]
+            if x != 0.0:
+                if any_:
+                    for a in range(nc):
+                        out[a] += x * y[(row + c) * nc + a]
+                else:
+                    for a in range(nc):
+                        out[a] = x * y[(row + c) * nc + a]
+                any_ = True
+        if any_:
+            f.line[nc + n] = row + r
+            n += 1
+    for r in range(size * size):
+        held[r] = v[r]
+    return n
+
+
+cdef inline void add_panel(const flow_t* f, int32_t panel, int32_t n, int32_t size, bint square) noexcept nogil:
+    """N += Y^T turned of one panel: its lower triangle, or all of it."""
+    cdef int32_t nc = f.g.pcol[panel + 1] - f.g.pcol[panel], a, b, r, end
+    cdef const int32_t* cols = f.g.cols + f.g.pcol[panel]
+    cdef const double* y = f.g.y + f.g.pval[panel]
+    cdef const double* t = f.turned
+    cdef const double* y0
+    cdef double* line = f.line
+    cdef double* row
+    cdef double f0, f1, f2
+    for a in range(nc):
+        end = nc if square else a + 1
+        r = 0
+        f0 = y[<int32_t>line[nc] * nc + a]
+        if n == 1:
+            for b in range(end):
+                line[b] = f0 * t[b]
+            r = 1
+        elif n == 2:
+            f1 = y[<int32_t>line[nc + 1] * nc + a]
+            for b in range(end):
+                line[b] = f0 * t[b] + f1 * t[nc + b]
+            r = 2
+        else:
+            f1 = y[<int32_t>line[nc + 1] * nc + a]
+            f2 = y[<int32_t>line[nc + 2] * nc + a]
+            for b in range(end):
+                line[b] = (f0 * t[b] + f1 * t[nc + b]) + f2 * t[2 * nc + b]
+            r = 3
+        while r + 3 <= n:
+            f0 = y[<int32_t>line[nc + r] * nc + a]
+            f1 = y[<int32_t>line[nc + r + 1] * nc + a]
+            f2 = y[<int32_t>line[nc + r + 2] * nc + a]
+            y0 = t + r * nc
+            for b in range(end):
+                line[b] += (f0 * y0[b] + f1 * y0[nc + b]) + f2 * y0[2 * nc + b]
+            r += 3
+        while r < n:
+            f0 = y[<int32_t>line[nc + r] * nc + a]
+            y0 = t + r * nc
+            for b in range(end):
+                line[b] += f0 * y0[b]
+            r += 1
+        row = f.normal + <ssize_t>f.local[cols[a]] * size
+        for b in range(end):
+            row[f.local[cols[b]]] += line[b]
+
+
+cdef inline bint is_other(const flow_t* f, int32_t i) noexcept nogil:
+    cdef int32_t k
+    for k in range(f.vptr[i], f.vptr[i + 1]):
+        if f.v[k] != f.held[k]:
+            return True
+    return False
+
+
+cdef inline bint has_any(const flow_t* f, int32_t i) noexcept nogil:
+    cdef int32_t k
+    for k in range(f.vptr[i], f.vptr[i + 1]):
+        if f.v[k] != 0.0:
+            return True
+    return False
+
+
+cdef inline int32_t form(flow_t* f, int32_t island, bint anew, bint square) noexcept nogil:
+    """N of the present V, by what changed where that is less; 0 where nothing changed, 1 where it did."""
+    cdef int32_t a, b, i, n, nc, size = f.cptr[island + 1] - f.cptr[island]
+    cdef double other = 0.0, all_ = 0.0, cost
+    for a in range(f.iptr[island], f.iptr[island + 1]):
+        b = f.ipanel[a]
+        nc = f.g.pcol[b + 1] - f.g.pcol[b]
+        for i in range(f.pblock[b], f.pblock[b + 1]):
+            cost = <double>nc * nc * (f.p.ptr[i + 1] - f.p.ptr[i])
+            if has_any(f, i):
+                all_ += cost
+            if not anew and is_other(f, i):
+                other += cost
+    if not anew and other == 0.0:
+        return 0
+    if not anew and other >= all_:
+        anew = True
+    if anew:
+        for a in range(size):
+            for b in range(size if square else a + 1):
+                f.normal[<ssize_t>a * size + b] = 0.0
+            f.normal[<ssize_t>a * size + a] = 1.0
+    else:
+        f.updates += 1
+    for a in range(f.iptr[island], f.iptr[island + 1]):
+        b = f.ipanel[a]
+        nc = f.g.pcol[b + 1] - f.g.pcol[b]
+        n = 0
+        for i in range(f.pblock[b], f.pblock[b + 1]):
+            if anew or is_other(f, i):
+                n = turn_block(f, i, f.p.ptr[i] - f.g.prow[b], nc, f.g.y + f.g.pval[b], anew, n)
+        if n > 0:
+            add_panel(f, b, n, size, square)
+    return 1
+
+
+cdef inline int32_t factor(flow_t* f, int32_t island, bint square) noexcept nogil:
+    cdef int32_t a, b, size = f.cptr[island + 1] - f.cptr[island]
+    cdef ssize_t at
+    f.factorisations += 1
+    for a in range(size):
+        at = <ssize_t>a * size
+        for b in range(size if square else a + 1):
+            f.factor[at + b] = f.normal[at + b]
+    return lu_factor(size, f.factor, f.swap) if square else ltdl_factor(size, f.factor, f.inv)
+
+
+cdef inline void newton_step(const flow_t* f, int32_t island, bint square) noexcept nogil:
+    """p of (1) and q = Y p."""
+    cdef int32_t a, c0 = f.cptr[island], size = f.cptr[island + 1] - c0
+    for a in range(size):
+        f.local_rhs[a] = -f.grad[f.icols[c0 + a]]
+    if square:
+        lu_solve(size, f.factor, f.swap, f.local_rhs)
+    else:
+        ltdl_solve(size, f.factor, f.inv, f.local_rhs)
+    for a in range(size):
+        f.step[f.icols[c0 + a]] = f.local_rhs[a]
+    spread(f, island, f.step, f.q)
+
+
+# -- along a line ----------------------------------------------------------------------------------------------
+
+
+cdef inline double slope(flow_t* f, int32_t island, double py, double pp, double t) noexcept nogil:
+    """Derivative along p of the convex function, at y + t p; lambda there in `trial`."""
+    cdef int32_t a, b, i, k
+    cdef double out = py + t * pp, part
+    f.evaluations += 1
+    for a in range(f.iptr[island], f.iptr[island + 1]):
+        b = f.ipanel[a]
+        for k in range(f.g.prow[b], f.g.prow[b + 1]):
+            f.w[k] = f.s[k] + t * f.q[k]
+        part = 0.0
+        for i in range(f.pblock[b], f.pblock[b + 1]):
+            respond(f, i, f.w, f.trial, NULL)
+        for k in range(f.g.prow[b], f.g.prow[b + 1]):
+            part += f.q[k] * f.trial[k]
+        out -= part
+    return out
+
+
+cdef inline double search(flow_t* f, int32_t island) noexcept nogil:
+    """t where the derivative along p is at most a tenth of what it was; 0 where p is no descent."""
+    cdef int32_t a, c, n
+    cdef double py = 0.0, pp = 0.0, pg = 0.0, low = 0.0, high, at_low, at_high, t, x, enough
+    cdef int32_t side = 0
+    for a in range(f.cptr[island], f.cptr[island + 1]):
+        c = f.icols[a]
+        py += f.step[c] * f.y[c]
+        pp += f.step[c] * f.step[c]
+        pg += f.step[c] * f.grad[c]
+    if not pg < 0.0:
+        return 0.0
+    enough = -0.1 * pg
+    at_low = pg
+    high = 1.0
+    at_high = slope(f, island, py, pp, high)
+    n = 1
+    while at_high < -enough and n < LINE_STEPS // 2:        # the minimum is beyond
+        low = high
+        at_low = at_high
+        high = 2.0 * high
+        at_high = slope(f, island, py, pp, high)
+        n += 1
+    if fabs(at_high) <= enough or at_high < 0.0 or at_high != at_high:
+        return high if at_high == at_high else 0.0
+    t = high
+    while n < LINE_STEPS:                                   # regula falsi with halved ends (Dowell, Jarratt 1971)
+        t = low - at_low * (high - low) / (at_high - at_low)
+        if not low < t < high:
+            t = 0.5 * (low + high)
+        x = slope(f, island, py, pp, t)
+        n += 1
+        if fabs(x) <= enough:
+            return t
+        if x < 0.0:
+            low = t
+            at_low = x
+            if side < 0:
+                at_high *= 0.5
+            side = -1
+        else:
+            high = t
+            at_high = x
+            if side > 0:
+                at_low *= 0.5
+            side = 1
+    return t
+
+
+cdef inline double backtrack(flow_t* f, int32_t island, double bound) noexcept nogil:
+    """t where |G| falls below the bound (Coulomb); 0 where no step tried does it."""
+    cdef int32_t a, b, k, c, _n
+    cdef double t = 1.0, size
+    for _n in range(8):
+        f.evaluations += 1
+        for a in range(f.iptr[island], f.iptr[island + 1]):
+            b = f.ipanel[a]
+            for k in range(f.g.prow[b], f.g.prow[b + 1]):
+                f.w[k] = f.s[k] + t * f.q[k]
+        respond_all(f, island, f.w, f.trial, NULL)
+        gather(f, island, f.trial, f.u)
+        size = 0.0
+        for a in range(f.cptr[island], f.cptr[island + 1]):
+            c = f.icols[a]
+            size += (f.y[c] + t * f.step[c] - f.u[c]) * (f.y[c] + t * f.step[c] - f.u[c])
+        if sqrt(size) <= (1.0 - 1e-4 * t) * bound:
+            return t
+        t *= 0.5
+    return 0.0
+
+
+# -- one island --------------------------------------------------------------------------------------------------
+
+
+cdef inline void follow(const flow_t* f, int32_t island) noexcept nogil:
+    """The centre of the proximal terms moves to lambda."""
+    cdef int32_t a, k
+    for a in range(f.iptr[island], f.iptr[island + 1]):
+        for k in range(f.g.prow[f.ipanel[a]], f.g.prow[f.ipanel[a] + 1]):
+            f.center[k] = f.lam[k]
+
+
+cdef inline void soften(const flow_t* f, int32_t island, double share) noexcept nogil:
+    """theta' of (2): rho is `share` d on rows with less than 1e-6 d of their own; a disk's tangents get the largest."""
+    cdef int32_t a, b, i, j, k, nt
+    cdef double big, low = share if share < 1e-6 else 1e-6
+    for a in range(f.iptr[island], f.iptr[island + 1]):
+        b = f.ipanel[a]
+        for i in range(f.pblock[b], f.pblock[b + 1]):
+            j = f.p.ptr[i]
+            for k in range(j, f.p.ptr[i + 1]):
+                f.theta[k] = f.g.compliance[k]
+                if not f.theta[k] >= low * f.p.d[k]:
+                    f.theta[k] += share * f.p.d[k]
+            nt = 0 if f.p.kind[i] == ROW else n_tangents(f.p.kind[i], f.p.ptr[i + 1] - j)
+            if nt > 1:
+                big = 0.0
+                for k in range(j + 1, j + 1 + nt):
+                    if f.theta[k] > big:
+                        big = f.theta[k]
+                for k in range(j + 1, j + 1 + nt):
+                    f.theta[k] = big
+            for k in range(j, f.p.ptr[i + 1]):
+                f.rho[k] = f.theta[k] - f.g.compliance[k]
+
+
+cdef inline bint is_rigid(const flow_t* f, int32_t island) noexcept nogil:
+    """Is there any proximal term that matters?"""
+    cdef int32_t a, k
+    for a in range(f.iptr[island], f.iptr[island + 1]):
+        for k in range(f.g.prow[f.ipanel[a]], f.g.prow[f.ipanel[a] + 1]):
+            if f.rho[k] > 1e-13 * f.theta[k]:
+                return True
+    return False
+
+
+cdef inline void keep(const flow_t* f, int32_t island, const double* lam, double* to) noexcept nogil:
+    cdef int32_t a, k
+    for a in range(f.iptr[island], f.iptr[island + 1]):
+        for k in range(f.g.prow[f.ipanel[a]], f.g.prow[f.ipanel[a] + 1]):
+            to[k] = lam[k]
+
+
+cdef inline double excess(const flow_t* f, double energy, double velocity) noexcept nogil:
+    """How many times over its limits an error is; at most 1 where the test is met, NaN where it is lost."""
+    cdef double x = 0.0, v = 0.0
+    if energy != energy or velocity != velocity:
+        return energy + velocity
+    if energy > 0.0:
+        x = energy / f.energy_limit if f.energy_limit > 0.0 else 1.0 / 0.0
+    if velocity > 0.0:
+        v = velocity / f.velocity_limit if f.velocity_limit > 0.0 else 1.0 / 0.0
+    return x if x > v else v
+
+
+cdef inline int32_t descend(flow_t* f, int32_t island, double goal, double* share, double* least) noexcept nogil:
+    """Newton steps under the law of f.p until the error is `goal` times its limits, or nothing moves.
+
+    The iterate with the least error stands in `best`, that error in least[0]; `share` of d is the softness of rows
+    without one, lowered where the centre's progress is slow.
+    """
+    cdef int32_t a, c, idle = 0, n = 0
+    cdef bint square = f.p.law == COULOMB, rigid, stale = True, fresh = True
+    cdef double energy, velocity, over, t, size, last_center = -1.0, bound
+    cdef double sizes[3]
+    sizes[0] = sizes[1] = sizes[2] = -1.0
+    soften(f, island, share[0])
+    rigid = is_rigid(f, island)
+    renew(f, island)
+    while True:
+        respond_all(f, island, f.s, f.lam, f.v)
+        gather(f, island, f.lam, f.u)
+        energy = measure(f, island, f.lam, &velocity)
+        over = excess(f, energy, velocity)
+        if over != over:
+            return LOST
+        if over < least[0]:
+            idle = idle if over > 0.9 * least[0] else 0
+            least[0] = over
+            keep(f, island, f.lam, f.best)
+        if over <= goal:
+            return DONE
+        if f.steps <= 0:
+            return SPENT
+        idle += 1
+        n += 1
+        if idle > IDLE_STEPS:
+            return STUCK
+        size = 0.0
+        for a in range(f.cptr[island], f.cptr[island + 1]):
+            c = f.icols[a]
+            f.grad[c] = f.y[c] - f.u[c]
+            size += f.grad[c] * f.grad[c]
+        size = sqrt(size)
+        if rigid and (size <= 0.1 * energy or size == 0.0):
+            # The softened problem is solved as well as it needs to be: its centre moves.
+            if last_center >= 0.0 and energy > 0.3 * last_center and share[0] > 1e-9:
+                share[0] = 0.1 * share[0]
+                follow(f, island)
+                soften(f, island, share[0])
+                stale = True
+            else:
+                follow(f, island)
+            last_center = energy
+            f.steps -= 1
+            sizes[0] = sizes[1] = sizes[2] = -1.0
+            continue
+        f.steps -= 1
+        if form(f, island, stale or n % RENEW == 0, square) or stale:
+            if not factor(f, island, square):
+                if not stale:
+                    stale = True
+                    continue
+                return FAILED
+        stale = False
+        newton_step(f, island, square)
+        if square:
+            bound = size
+            for a in range(3):
+                if sizes[a] > bound:
+                    bound = sizes[a]
+            sizes[n % 3] = size
+            t = backtrack(f, island, bound)
+        else:
+            t = search(f, island)
+        if t == 0.0:
+            if fresh:
+                return STUCK
+            fresh = True                                # s anew, once: rounding may be in the way
+            stale = True
+            renew(f, island)
+            continue
+        for a in range(f.cptr[island], f.cptr[island + 1]):
+            c = f.icols[a]
+            f.y[c] += t * f.step[c]
+        if n % RENEW == 0:
+            renew(f, island)
+            fresh = True
+        else:
+            for a in range(f.iptr[island], f.iptr[island + 1]):
+                for c in range(f.g.prow[f.ipanel[a]], f.g.prow[f.ipanel[a] + 1]):
+                    f.s[c] += t * f.q[c]
+            fresh = False
+
+
+cdef inline double slip(const flow_t* f, int32_t i) noexcept nogil:
+    """phi of (3) from w of block i, whose normal it leaves out."""
+    cdef int32_t j = f.p.ptr[i], end = f.p.ptr[i + 1], nt = n_tangents(f.p.kind[i], end - j)
+    cdef double out = f.p.mu[i] * size_of(f.w + j + 1, nt)
+    if f.p.kind[i] == CONTACT_SPIN:
+        out += f.p.mu[i] * f.p.patch_radius[i] * fabs(f.w[end - 1])
+    return out
+
+
+cdef inline void lower_normals(const flow_t* f, int32_t island, const double* lam) noexcept nogil:
+    """phi of what lam leaves; it must be 0 before."""
+    cdef int32_t a, b, i
+    cdef double velocity
+    gather(f, island, lam, f.u)
+    measure(f, island, lam, &velocity)
+    for a in range(f.iptr[island], f.iptr[island + 1]):
+        b = f.ipanel[a]
+        for i in range(f.pblock[b], f.pblock[b + 1]):
+            if f.p.kind[i] != ROW and f.p.ptr[i + 1] - f.p.ptr[i] > 1:
+                f.phi[f.p.ptr[i]] = slip(f, i)
+
+
+cdef inline void level(const flow_t* f, int32_t island) noexcept nogil:
+    """phi = 0."""
+    cdef int32_t a, k
+    for a in range(f.iptr[island], f.iptr[island + 1]):
+        for k in range(f.g.prow[f.ipanel[a]], f.g.prow[f.ipanel[a] + 1]):
+            f.phi[k] = 0.0
+
+
+cdef inline void restart(const flow_t* f, int32_t island, const double* lam) noexcept nogil:
+    """y = Y^T lam and the centre at lam."""
+    cdef int32_t a, c
+    keep(f, island, lam, f.lam)
+    follow(f, island)
+    gather(f, island, lam, f.u)
+    for a in range(f.cptr[island], f.cptr[island + 1]):
+        c = f.icols[a]
+        f.y[c] = f.u[c]
+
+
+cdef inline bint offer(flow_t* f, int32_t island, const double* lam, double* least) noexcept nogil:
+    """Keep lam in `first_best` where its error under the problem's own law is the least; phi must be 0."""
+    cdef double energy, velocity, over
+    f.p.law = f.law
+    gather(f, island, lam, f.u)
+    energy = measure(f, island, lam, &velocity)
+    over = excess(f, energy, velocity)
+    if over < least[0]:
+        least[0] = over
+        keep(f, island, lam, f.first_best)
+        return True
+    return False
+
+
+cdef inline int32_t with_coulomb(flow_t* f, int32_t island, double* impulse, bint cold, double soft,
+                                 double* least) noexcept nogil:
+    """Rounds of Newton's method on Coulomb's law, each from the answer of a convex problem."""
+    cdef int32_t n, rounds
+    cdef double found, share
+    for rounds in range(ROUNDS):
+        f.rounds += 1
+        if rounds > 0 or cold:
+            f.p.law = CONE
+            found = 1.0 / 0.0
+            share = soft
+            n = descend(f, island, 1e-2 * least[0] if least[0] > 1e2 else 1.0, &share, &found)
+            if n == LOST or n == FAILED:
+                return n
+            keep(f, island, f.best, impulse)
+            level(f, island)
+            offer(f, island, impulse, least)
+            if least[0] <= 1.0:
+                return DONE
+            if f.steps <= 0:
+                return SPENT
+        restart(f, island, impulse)
+        f.p.law = COULOMB
+        found = 1.0 / 0.0
+        share = soft
+        n = descend(f, island, 1.0, &share, &found)
+        if n != LOST and offer(f, island, f.best, least):
+            keep(f, island, f.best, impulse)
+        if least[0] <= 1.0:
+            return DONE
+        if f.steps <= 0:
+            return SPENT
+        lower_normals(f, island, impulse)
+        restart(f, island, impulse)
+    return STUCK
+
+
+cdef inline int32_t solve_island(flow_t* f, int32_t island, double* impulse, bint cold, double soft) noexcept nogil:
+    """One island from `impulse`, into it; how it ended."""
+    cdef int32_t end
+    cdef double least = 1.0 / 0.0, share = soft
+    restart(f, island, impulse)
+    level(f, island)
+    if not offer(f, island, impulse, &least):
+        return LOST
+    if least <= 1.0:
+        return DONE
+    if f.law == COULOMB:
+        end = with_coulomb(f, island, impulse, cold, soft, &least)
+        keep(f, island, f.first_best, impulse)
+    else:
+        keep(f, island, impulse, f.best)
+        end = descend(f, island, 1.0, &share, &least)
+        keep(f, island, f.best, impulse)
+    return end

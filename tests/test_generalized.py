@@ -1,0 +1,442 @@
+"""Generalised coordinates: J and M as simulators hold them, against A formed densely and twins that share nothing."""
+
+import copy
+import pickle
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+from hypothesis import given, settings
+from random_problems import seeds
+
+import lavender as lv
+from lavender.solvers._islands import islands, restrict, rows_of
+
+
+def random_tree(rng, n):
+    """Parents (n,), each before its child, -1 at a root; about three trees."""
+    return [-1 if i == 0 or rng.random() < 3.0 / n else int(rng.integers(0, i)) for i in range(n)]
+
+
+def tree_mass(rng, parent):
+    """A mass matrix of that tree: entries between a velocity and its ancestors alone, condition about 1e2."""
+    n = len(parent)
+    lower = np.eye(n)
+    for i in range(n):
+        a = parent[i]
+        while a >= 0:
+            lower[i, a] = rng.normal() * 0.4
+            a = parent[a]
+    return lower.T @ np.diag(rng.uniform(0.2, 3.0, n)) @ lower
+
+
+def chain(parent, i):
+    out = []
+    while i >= 0:
+        out.append(i)
+        i = parent[i]
+    return out
+
+
+def random_general(seed, friction="cone", n=14, compliance=True, contacts=5, tangents=2, spin=False):
+    """Free and bounded rows and contacts, each row on one or two chains of a random forest."""
+    rng = np.random.default_rng(seed)
+    parent = random_tree(rng, n)
+    cones = lv.Cones.free(2) + lv.Cones.bounded(np.array([0.0, -0.3]), np.array([np.inf, 0.3]))
+    more = {"patch_radius": rng.uniform(0.0, 0.4, contacts)} if spin else {}
+    if contacts:
+        cones = cones + lv.Cones.contacts(rng.uniform(0.0, 1.2, contacts), tangents, **more)
+    jac = np.zeros((cones.n_rows, n))
+    for first, last in zip(cones.ptr[:-1], cones.ptr[1:], strict=True):
+        on = chain(parent, int(rng.integers(0, n))) + (
+            chain(parent, int(rng.integers(0, n))) * (rng.random() < 0.5)
+        )
+        jac[first:last, sorted(set(on))] = rng.normal(size=(last - first, len(set(on))))
+    m = cones.n_rows
+    soft = rng.uniform(0.01, 0.3, m) if compliance else np.zeros(m)
+    # Some velocities keep every constraint with room to spare, so that the rigid problem has a solution.
+    room = np.zeros(m)
+    room[2:][cones.lower[2:] == 0.0] = 0.5
+    return lv.Problem.from_jacobian(
+        jac, tree_mass(rng, parent), rng.normal(size=n), target=jac @ rng.normal(size=n) - room, cones=cones,
+        compliance=soft, friction=friction, name=f"general {seed}",
+    )  # fmt: skip
+
+
+def as_matrix(problem):
+    """The same problem given by a dense A of its own."""
+    mass, jac = problem.generalized.mass.toarray(), problem.jacobian.toarray()
+    a = jac @ np.linalg.solve(mass, jac.T) + np.diag(problem.compliance)
+    return lv.Problem(problem.b, problem.cones, 0.5 * (a + a.T), friction=problem.friction)
+
+
+# -- the operator ----------------------------------------------------------------------------------
+
+
+@given(seed=seeds)
+def test_slack_d_and_velocity_equal_the_dense_twin_in_long_double(seed):
+    problem = random_general(seed)
+    lam = np.random.default_rng(seed).normal(size=problem.m)
+    jac, mass = problem.jacobian.toarray(), problem.generalized.mass.toarray()
+    # M^-1 by refinement of float64's in long double: 1e-18 of its own size after two steps.
+    inverse = np.linalg.inv(mass).astype(np.longdouble)
+    for _ in range(3):
+        inverse = inverse @ (
+            2 * np.eye(len(mass), dtype=np.longdouble) - mass.astype(np.longdouble) @ inverse
+        )
+    a = jac.astype(np.longdouble) @ inverse @ jac.T + np.diag(problem.compliance.astype(np.longdouble))
+    w = a @ lam - problem.b
+    size = np.abs(a) @ np.abs(lam) + np.abs(problem.b)
+    # 1e-13: a solve with a condition number of about 1e2, and 14 terms a row.
+    assert np.abs((problem.slack(lam) - w) / size.max()).max() < 1e-13
+    d = np.diag(a).astype(float)
+    for i in range(problem.n_blocks):
+        if problem.cones.n_tangents[i] == 2:
+            j = problem.cones.ptr[i] + 1
+            d[j : j + 2] = d[j : j + 2].mean()
+    np.testing.assert_allclose(problem.d, d, rtol=1e-13)
+    v = problem.generalized.v_free + (inverse @ (jac.T @ lam.astype(np.longdouble))).astype(float)
+    np.testing.assert_allclose(problem.velocity(lam), v, atol=1e-13 * (1 + np.abs(v).max()))
+    np.testing.assert_allclose(problem.dense(), a.astype(float), atol=1e-13 * float(np.abs(a).max()))
+    assert np.array_equal(problem.dense(), problem.dense().T)
+
+
+@given(seed=seeds)
+@pytest.mark.parametrize("friction", ["coulomb", "cone"])
+@pytest.mark.parametrize("spin", [False, True])
+def test_the_judge_says_of_j_and_m_what_it_says_of_a(friction, spin, seed):
+    problem = random_general(seed, friction, spin=spin)
+    lam = np.random.default_rng(seed + 1).normal(size=problem.m)
+    own, other = lv.residual(problem, lam), lv.residual(as_matrix(problem), lam)
+    # 1e-10: A formed by a dense solve, and a projection whose branch both sides may see at once.
+    np.testing.assert_allclose([own.energy, own.velocity, own.relative],
+                               [other.energy, other.velocity, other.relative], rtol=1e-10)  # fmt: skip
+    np.testing.assert_allclose(problem.metric.nu, problem.csr_data.nu, rtol=1e-12)
+    np.testing.assert_allclose(problem.metric.step, problem.csr_data.step, rtol=1e-9)
+    # |Y| |Y|^T bounds |A|: the floor is no smaller, and not by orders of magnitude larger.
+    assert other.floor * (1 - 1e-9) <= own.floor <= 30 * other.floor
+
+
+def test_the_factor_of_a_tree_has_no_fill_whatever_the_order_of_its_velocities():
+    rng = np.random.default_rng(5)
+    parent = random_tree(rng, 30)
+    mass = tree_mass(rng, parent)
+    jac = rng.normal(size=(4, 30))
+    general = lv.Generalized(jac, mass, np.zeros(30))
+    assert general.order is None
+    assert general.operator.fill == 0
+    shuffle = rng.permutation(30)
+    mixed = lv.Generalized(jac[:, shuffle], mass[np.ix_(shuffle, shuffle)], np.zeros(30))
+    assert mixed.operator.fill == 0
+    assert mixed.order is not None
+    np.testing.assert_allclose(mixed.jac.toarray(), jac[:, shuffle])
+    np.testing.assert_allclose(mixed.mass.toarray(), mass[np.ix_(shuffle, shuffle)])
+    x = rng.normal(size=30)
+    np.testing.assert_allclose(mixed.solve(x[shuffle]), np.linalg.solve(mass, x)[shuffle], rtol=1e-10)
+    assert len(np.unique(mixed.trees)) == sum(p < 0 for p in parent)
+
+
+def test_a_mesh_fills_in_but_less_than_as_given():
+    # A grid of 12 x 12 masses coupled to their neighbours, numbered at random.
+    side = 12
+    graph = sp.kron(sp.eye(side), sp.diags([1.0, 1.0], [-1, 1], (side, side))) + sp.kron(
+        sp.diags([1.0, 1.0], [-1, 1], (side, side)), sp.eye(side)
+    )
+    mass = (6.0 * sp.eye(side**2) - graph).toarray()
+    order = np.random.default_rng(0).permutation(side**2)
+    mass = mass[np.ix_(order, order)]
+    general = lv.Generalized(np.eye(side**2)[:3], mass, np.zeros(side**2))
+    assert 0 < general.operator.fill < 3000  # a band of 12 holds 1,700; the numbering given fills 4,000
+    x = np.random.default_rng(1).normal(size=side**2)
+    np.testing.assert_allclose(mass @ general.solve(x), x, atol=1e-12)
+
+
+def test_m_is_refused_where_it_is_no_mass_matrix():
+    jac, good = np.ones((1, 2)), np.array([[2.0, 0.5], [0.5, 1.0]])
+    with pytest.raises(lv.InputError, match=r"not positive definite: the pivot of knee"):
+        lv.Generalized(jac, np.diag([1.0, 0.0]), np.zeros(2), ["hip", "knee"])
+    with pytest.raises(lv.InputError, match="not positive definite"):
+        lv.Generalized(jac, [[1.0, 2.0], [2.0, 1.0]], np.zeros(2))
+    with pytest.raises(
+        lv.InputError, match=r"not symmetric: at \(hip, knee\)|not symmetric: at \(knee, hip\)"
+    ):
+        lv.Generalized(jac, np.triu(good), np.zeros(2), ["hip", "knee"])
+    with pytest.raises(lv.InputError, match="not symmetric"):
+        lv.Generalized(jac, sp.csr_array(np.triu(good)), np.zeros(2))
+    with pytest.raises(lv.InputError, match="must be finite"):
+        lv.Generalized(jac, [[np.nan, 0.0], [0.0, 1.0]], np.zeros(2))
+    with pytest.raises(lv.InputError, match=r"J has shape \(1, 3\)"):
+        lv.Generalized(np.ones((1, 3)), good, np.zeros(2))
+    with pytest.raises(lv.InputError, match=r"v_free .* has shape \(3,\)"):
+        lv.Generalized(jac, good, np.zeros(3))
+    with pytest.raises(lv.InputError, match="a square matrix"):
+        lv.Generalized(jac, np.ones((2, 3)), np.zeros(2))
+    with pytest.raises(lv.InputError, match="1 names for 2"):
+        lv.Generalized(jac, good, np.zeros(2), ["hip"])
+    with pytest.raises(lv.InputError, match="J has 1 rows; 2 are needed"):
+        lv.Problem.from_jacobian(jac, good, np.zeros(2), cones=lv.Cones.free(2))
+    with pytest.raises(lv.InputError, match="one of them"):
+        lv.Problem(
+            np.zeros(1), lv.Cones.free(1), np.eye(1), generalized=lv.Generalized(jac, good, np.zeros(2))
+        )
+    with pytest.raises(AttributeError, match="frozen"):
+        lv.Generalized(jac, good, np.zeros(2)).v_free = np.ones(2)
+
+
+def test_every_way_to_give_j_and_m_is_one_problem():
+    rng = np.random.default_rng(3)
+    blocks = [tree_mass(rng, [-1, 0, 1]), tree_mass(rng, [-1, 0])]
+    mass = sp.block_diag(blocks).toarray()
+    jac = rng.normal(size=(3, 5)) * (rng.random((3, 5)) < 0.7)
+    v = rng.normal(size=5)
+    problems = [
+        lv.Problem.from_jacobian(j, m, v, cones=lv.Cones.contacts(0.5))
+        for j in (jac, sp.csr_array(jac), sp.coo_matrix(jac))
+        for m in (mass, sp.csc_array(mass), blocks)
+    ]
+    assert all(p == problems[0] for p in problems)
+    assert problems[0].operator == "generalized"
+    assert problems[0] != lv.Problem.from_jacobian(jac, 2.0 * mass, v, cones=lv.Cones.contacts(0.5))
+    for made in (copy.deepcopy(problems[0]), pickle.loads(pickle.dumps(problems[0]))):
+        assert made == problems[0]
+        assert not made.generalized.jac.data.flags.writeable
+
+
+def test_npz_keeps_every_bit(tmp_path):
+    rng = np.random.default_rng(8)
+    order = rng.permutation(9)
+    mass = tree_mass(rng, random_tree(rng, 9))[np.ix_(order, order)]
+    problem = lv.Problem.from_jacobian(
+        rng.normal(size=(4, 9)), mass, rng.normal(size=9), cones=lv.Cones.contacts(0.3, 3), friction="cone",
+        compliance=0.1, names=["foot"], dof_names=[f"q{i}" for i in range(9)],
+    )  # fmt: skip
+    lv.io.save(problem, tmp_path / "p.npz")
+    again = lv.io.load(tmp_path / "p.npz")
+    assert again == problem
+    assert again.generalized.names == problem.generalized.names
+    lam = rng.normal(size=4)
+    assert again.slack(lam).tobytes() == problem.slack(lam).tobytes()
+
+
+def test_islands_are_trees_and_each_can_stand_alone():
+    problem = random_general(5, n=30, contacts=8)
+    count, label = islands(problem)
+    by_matrix = islands(as_matrix(problem))[0]
+    assert 1 < count == by_matrix
+    lam = np.random.default_rng(0).normal(size=problem.m)
+    w = problem.slack(lam)
+    for i in range(count):
+        blocks = np.flatnonzero(label == i)
+        rows = rows_of(problem, blocks)
+        part = restrict(problem, blocks, rows)
+        assert part.operator == "generalized"
+        assert part.generalized.nv < 30
+        np.testing.assert_allclose(part.slack(lam[rows]), w[rows], atol=1e-13 * (1 + np.abs(w).max()))
+
+
+def test_other_forms_know_the_operator():
+    problem = random_general(2, "coulomb", compliance=False)
+    assert problem.relaxed("cone").generalized is problem.generalized
+    boxed = problem.boxed(0.7)
+    assert boxed.law == "lcp"
+    assert boxed.generalized is problem.generalized
+    form = problem.velocity_form()
+    scale = np.outer(form.scale, form.scale)
+    np.testing.assert_allclose(
+        (form.jacobian @ form.jacobian.T).toarray(), problem.dense() * scale, atol=1e-13
+    )
+    found = lv.redundancy(problem)
+    assert found.rank == np.linalg.matrix_rank(problem.dense())
+    assert found.rank < problem.m
+    assert lv.solve(problem, "pgs", order="colored", max_iter=3, tol=0.0).iterations == 3
+
+
+def test_no_velocities_no_rows_and_rows_on_nothing():
+    none = lv.Problem.from_jacobian(np.zeros((0, 3)), np.eye(3), np.ones(3), cones=lv.Cones.free(0))
+    assert lv.solve(none, "newton").success
+    assert np.array_equal(none.velocity([]), np.ones(3))
+    still = lv.Problem.from_jacobian(np.zeros((2, 0)), np.zeros((0, 0)), [], cones=lv.Cones.free(2))
+    assert lv.solve(still, "newton").success
+    jac = np.array([[1.0, 0.0], [0.0, 0.0]])
+    bounds = lv.Cones.bounded(np.zeros(2), np.full(2, 4.0))
+    empty = lv.Problem.from_jacobian(jac, np.eye(2), [-1.0, 0.0], target=[0.0, 1.0], cones=bounds)
+    solution = lv.solve(empty, "newton", tol=1e-12)
+    np.testing.assert_allclose(solution.impulse, [1.0, 4.0])  # the row on nothing: decided on the spot
+    hopeless = lv.Problem.from_jacobian(
+        jac, np.eye(2), [-1.0, 0.0], target=[0.0, 1.0], cones=lv.Cones.free(2)
+    )
+    assert lv.solve(hopeless, "newton").status is lv.Status.INFEASIBLE
+
+
+# -- cones that are easy to build -------------------------------------------------------------------
+
+
+def test_cones_add_up():
+    cones = lv.Cones.free(6) + lv.Cones.bounded([0.0, -1.0], [1.0, 1.0]) + lv.Cones.contacts(0.5, 2, count=8)
+    assert (cones.n_rows, cones.n_blocks) == (6 + 2 + 24, 6 + 2 + 8)
+    assert np.array_equal(cones.mu[8:], np.full(8, 0.5))
+    # What was put together passes the door of what is made whole.
+    assert lv.Cones(cones.ptr, cones.kind, cones.lower, cones.upper, cones.mu, cones.patch_radius) == cones
+    assert not cones.ptr.flags.writeable
+    assert lv.Cones.contacts(0.5).n_blocks == 1
+    assert lv.Cones.contacts([0.5, 0.6], patch_radius=0.1).n_rows == 8
+    assert lv.Cones.contacts(0.5, 5, count=2).kind.tolist() == [lv.ROUND] * 2
+    assert lv.Cones.free(0) + lv.Cones.free(1) == lv.Cones.free(1)
+
+
+@pytest.mark.parametrize(
+    ("call", "says"),
+    [
+        (lambda: lv.Cones.contacts([0.5, 0.6], count=3), r"mu has shape \(2,\)"),
+        (lambda: lv.Cones.contacts(0.5, 6), "tangents is 6"),
+        (lambda: lv.Cones.contacts(0.5, 3, 0.1), "no patch_radius"),
+        (lambda: lv.Cones.contacts(-0.5), "mu must not be negative"),
+        (lambda: lv.Cones.contacts(0.5, count=-1), "count is -1"),
+        (
+            lambda: lv.Cones([0, 7], [lv.ROUND], np.zeros(7), np.zeros(7), [1.0], [0.0]),
+            "a round cone of 7 rows",
+        ),
+    ],
+)
+def test_cones_are_checked(call, says):
+    with pytest.raises(lv.InputError, match=says):
+        call()
+
+
+# -- newton over velocities -------------------------------------------------------------------------
+
+
+@settings(deadline=None)
+@given(seed=seeds)
+@pytest.mark.parametrize("soft", [True, False])
+@pytest.mark.parametrize("friction", ["coulomb", "cone"])
+def test_newton_over_velocities_reaches_the_floor_or_tol(friction, soft, seed):
+    problem = random_general(seed, friction, compliance=soft)
+    solution = lv.solve(problem, "newton", form="velocity", tol=1e-10)
+    if soft or friction == "cone":
+        assert solution.residual.relative <= max(1e-10, 2 * solution.residual.floor), str(solution)
+    assert not solution.contradicted
+    assert "csr" not in problem.__dict__  # A was not formed
+    assert solution.solver.form == "generalized velocities"
+
+
+@given(seed=seeds)
+def test_its_velocities_are_those_of_another_solver_on_a(seed):
+    problem = random_general(seed, "cone")
+    own = lv.solve(problem, "newton", form="velocity", tol=1e-11)
+    other = lv.solve(as_matrix(problem), "newton", tol=1e-11)
+    if own.success and other.success:
+        # Compliance above 0.01 makes A definite: the impulse is unique; 1e-11 over the least share of A, about 1e-3.
+        np.testing.assert_allclose(own.impulse, other.impulse, atol=1e-7 * (1 + np.abs(other.impulse).max()))
+
+
+@pytest.mark.parametrize("kind", ["linear", "lcp"])
+def test_bounded_rows_and_equations_need_few_steps(kind):
+    rng = np.random.default_rng(4)
+    parent = random_tree(rng, 20)
+    m = 40 if kind == "lcp" else 12
+    jac = np.zeros((m, 20))
+    for row in jac:
+        on = chain(parent, int(rng.integers(0, 20)))
+        row[on] = rng.normal(size=len(on))
+    cones = lv.Cones.free(m) if kind == "linear" else lv.Cones.bounded(np.zeros(m), np.full(m, np.inf))
+    problem = lv.Problem.from_jacobian(
+        jac, tree_mass(rng, parent), rng.normal(size=20), cones=cones, compliance=0.05
+    )
+    assert problem.law == kind
+    solution = lv.solve(problem, "newton", tol=1e-12)
+    assert solution.residual.relative <= max(1e-12, 2 * solution.residual.floor)
+    assert solution.iterations <= (3 if kind == "linear" else 15)  # measured: 2 and 6
+    again = lv.solve(problem, "newton", tol=1e-12, impulse=solution.impulse)
+    assert again.iterations == 0
+
+
+def test_a_warm_start_saves_steps():
+    problem = random_general(21, "cone", n=30, contacts=12)
+    cold = lv.solve(problem, "newton", tol=1e-10)
+    moved = lv.Problem(1.001 * problem.b, problem.cones, friction="cone", generalized=problem.generalized,
+                       compliance=problem.compliance)  # fmt: skip
+    warm = lv.solve(moved, "newton", tol=1e-10, impulse=cold.impulse)
+    assert cold.success
+    assert warm.success
+    assert warm.iterations < cold.iterations
+
+
+def test_a_budget_of_steps_is_kept_and_the_answer_comes_back():
+    problem = random_general(21, "cone", n=30, contacts=12)
+    one = lv.solve(problem, "newton", form="velocity", tol=1e-13, max_iter=2)
+    assert one.iterations == 2
+    assert one.status is lv.Status.MAX_ITERATIONS
+    assert one.residual.relative <= 1.0
+
+
+@pytest.mark.parametrize("tangents", [3, 4, 5])
+def test_a_round_cone_is_one_cone(tangents):
+    problem = random_general(13, "cone", tangents=tangents)
+    solution = lv.solve(problem, "newton", tol=1e-11)
+    assert solution.residual.relative <= max(1e-11, 2 * solution.residual.floor)
+    lam, w, c = solution.impulse, solution.slack, problem.cones
+    for i in np.flatnonzero(c.kind == lv.ROUND):
+        j, end = c.ptr[i], c.ptr[i + 1]
+        # In the cone, in its dual, and at right angles: what (de)fines the solution, without any metric.
+        assert np.linalg.norm(lam[j + 1 : end]) <= c.mu[i] * lam[j] * (1 + 1e-8) + 1e-9
+        assert c.mu[i] * np.linalg.norm(w[j + 1 : end]) <= w[j] * (1 + 1e-8) + 1e-9
+        assert abs(lam[j:end] @ w[j:end]) < 1e-8
+    assert problem.row_name(int(c.ptr[4]) + 3).endswith("spin")
+    with pytest.raises(lv.InputError, match="no Coulomb law"):
+        problem.relaxed("coulomb")
+    refused = [name for name in lv.available() if name not in lv.available(problem)]
+    assert "nncg" in refused
+    assert "round cones" in lv.known(problem)["nncg"]
+
+
+def brute_round(y, a):
+    """Projection of (y_n, y_g ...) on sum (|y_g| / a_g)^2 <= y_n^2 by bisection on the multiplier, in long double."""
+    y = np.asarray(y, np.longdouble)
+    a = np.asarray(a, np.longdouble)
+    t = np.abs(y[1:])
+    if np.sum((t / a) ** 2) <= y[0] ** 2 and y[0] >= 0:
+        return y
+    if y[0] + np.sqrt(np.sum((a * t) ** 2)) <= 0:
+        return np.zeros_like(y)
+
+    def excess(s):
+        return np.sum((a * t / ((1 + a * a) * s - y[0])) ** 2) - 1
+
+    low = max(np.longdouble(0), np.max((y[0] + a * t) / (1 + a * a)))
+    high = low + np.abs(y).sum() + 1
+    while excess(high) > 0:
+        high *= 2
+    for _ in range(200):
+        mid = (low + high) / 2
+        low, high = (mid, high) if excess(mid) > 0 else (low, mid)
+    s = (low + high) / 2
+    return np.concatenate([[s], y[1:] * a * a * s / ((1 + a * a) * s - y[0])])
+
+
+@given(seed=seeds)
+def test_the_judge_projects_on_round_cones_in_the_metric_of_d(seed):
+    rng = np.random.default_rng(seed)
+    mu = rng.uniform(0.05, 1.5)
+    # A diagonal A: d is its diagonal, made equal within the groups by hand, so that both sides share nothing.
+    d = rng.uniform(0.1, 10.0, 4)[[0, 1, 1, 2, 3, 3]]
+    problem = lv.Problem(rng.normal(size=6), lv.Cones.contacts(mu, 5), np.diag(d), friction="cone")
+    lam = rng.normal(size=6)
+    w = d * lam - problem.b
+    y = np.sqrt(d) * (lam - w / d)
+    # One tangent of each group carries its norm: the projection scales a group as a whole.
+    groups = [[1, 2], [3], [4, 5]]
+    size = np.array([y[0], *(np.linalg.norm(y[g]) for g in groups)])
+    a = np.array([mu * np.sqrt(d[g[0]] / d[0]) for g in groups])
+    out = brute_round(size, a)
+    pi = np.zeros(6)
+    pi[0] = out[0]
+    for g, before, after in zip(groups, size[1:], out[1:], strict=True):
+        pi[g] = y[g] * float(after / before) if before > 0 else 0.0
+    e = lam - pi / np.sqrt(d)
+    found = lv.residual(problem, lam)
+    # 2e-15 of the largest entry and the conditioning of the root, which is at most a few tens here.
+    np.testing.assert_allclose(found.error, e, atol=1e-12 * (1 + np.abs(y).max()))
+    speeds = [d[0] * abs(e[0]), *(d[g[0]] * np.linalg.norm(e[g]) for g in groups)]
+    np.testing.assert_allclose(found.velocity, max(speeds), rtol=1e-10)
+    np.testing.assert_allclose(found.energy, np.sqrt(np.sum(d * e * e)), rtol=1e-10)
