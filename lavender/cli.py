@@ -83,13 +83,14 @@ class ManyValues(click.Command):
 
 
 class Suites(ManyValues):
-    """`lavender bench auto`, `kernels`, `peers` are commands of their own; other first words are files (or ./peers)."""
+    """`lavender bench auto`, `kernels`, `peers`, `stand` are commands; other first words are files (or ./peers)."""
 
     OWN = {  # noqa: RUF012 - a constant of the class
         "auto": "lavender.bench.regret:command",
         "motions": "lavender.bench.motions:command",
         "kernels": "lavender.bench.kernels:command",
         "peers": "lavender.bench.peers:command",
+        "stand": "lavender.bench.stand:command",
     }
 
     def make_context(
@@ -372,8 +373,9 @@ def bench(
 ) -> None:
     """As `report`, but only the records: a .jsonl file that `lavender report` shows later.
 
-    `lavender bench peers` compares with other engines and solvers instead, `lavender bench auto` measures what auto
-    loses against the best of our own solvers; see their own --help.
+    `lavender bench peers` compares with other engines and solvers instead, `lavender bench stand` says how long towers
+    stand in each, `lavender bench auto` measures what auto loses against the best of our own solvers; see their own
+    --help.
     """
     plan = _plan(files, levels, budgets, orders, repeats, time_limit)
     records, stopped = _measure(files, solvers, plan, out, memory, in_process)
