@@ -6,7 +6,8 @@ step of gravity on bodies of one structure,
     structure  lattice, heap, towers, wall, tree, net, ragdolls, snake, anvil
     masses     equal, uniform in [0.5, 2], log-uniform over 1e2 ... 1e8, two classes, one heavy body
     law        none, coulomb, cone, box (friction in bounds of fixed size), with joints wherever the structure has them
-    form       rows, matrix as CSR, dense, or CSR with asymmetric errors as recorded problems have (1e-5 to 2e-3)
+    form       rows, matrix as CSR, dense, CSR with asymmetric errors as recorded problems have (1e-5 to 2e-3), or
+               J and M (`Problem.from_jacobian`)
 
 and every problem of symmetric form has a solution: bodies at rest meet all its targets.
 """
@@ -30,7 +31,7 @@ __all__ = ["STRUCTURES", "wild"]
 
 MASSES = ("equal", "uniform", "spectrum", "two classes", "one heavy")
 LAWS = ("none", "coulomb", "cone", "box")
-FORMS = ("rows", "csr", "dense", "asymmetric")
+FORMS = ("rows", "csr", "dense", "asymmetric", "generalized")
 LARGEST_DENSE = 1_500  # rows of a dense matrix: 18 MB
 
 
@@ -213,7 +214,11 @@ def wild(seed: int = 0, rows: int = 3000) -> Draft:
     problem = _problem(rng, world, bodies, law)
     if form == "dense" and problem.m > LARGEST_DENSE:
         form = "csr"
-    if form != "rows":
+    if form == "generalized" and problem.rows is None:
+        form = "csr"  # friction in a box was given as a matrix
+    if form == "generalized":
+        problem = _as_generalized(problem)
+    elif form != "rows":
         problem = _as_matrix(rng, problem, form)
     return Draft(problem, f"{name}, masses {masses}, friction {law}, given as {form}: drawn, not chosen")
 
@@ -257,6 +262,23 @@ def _as_matrix(rng: np.random.Generator, problem: Problem, form: str) -> Problem
         a.data[off] *= 1.0 + size * rng.uniform(-1.0, 1.0, int(off.sum()))
     matrix = a.toarray() if form == "dense" else a
     return Problem(problem.b, problem.cones, matrix=matrix, friction=problem.friction)
+
+
+def _as_generalized(problem: Problem) -> Problem:
+    """J and M, one block of six velocities for each body."""
+    rows = problem.rows
+    assert rows is not None
+    mass = np.zeros((rows.n_bodies, 6, 6))
+    mass[:, [0, 1, 2], [0, 1, 2]] = (1.0 / rows.inv_mass)[:, None]
+    mass[:, 3:, 3:] = np.linalg.inv(rows.inv_inertia)
+    return Problem.from_jacobian(
+        rows.jacobian(problem.cones),
+        list(mass),
+        rows.v_free.ravel(),
+        cones=problem.cones,
+        compliance=problem.compliance,
+        friction=problem.friction,
+    )
 
 
 def _masses(rng: np.random.Generator, word: str, n: int) -> FloatArray:
