@@ -14,7 +14,7 @@ import click
 
 from lavender._version import __version__
 from lavender.errors import InputError, LavenderError
-from lavender.web.command import web
+from lavender.web.command import view, web
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -587,6 +587,13 @@ def _check_writable(path: Path) -> None:
 @click.option(
     "--skip", type=int, default=0, show_default=True, help="Steps before the first that is recorded."
 )
+@click.option("--view", is_flag=True, help="Show the run in a page on this machine, live, then until Ctrl-C.")
+@click.option(
+    "--film",
+    type=click.Path(path_type=Path),
+    default=None,
+    help="Film of the run: .gif or .png pictures, or a file for `lavender view`.",
+)
 def run(
     scene: str,
     steps: int,
@@ -598,6 +605,8 @@ def run(
     trace: Path | None,
     record: Path | None,
     skip: int,
+    view: bool,
+    film: Path | None,
 ) -> None:
     """Run a LavenderSim scene of the gallery; record its steps as a sequence for `report`.
 
@@ -623,6 +632,8 @@ def run(
         plot=plot,
         record=record,
         skip=skip,
+        view=view,
+        film=film,
         every=1 if live else max(1, steps // 20),
         show=show,
     )
@@ -630,7 +641,7 @@ def run(
         click.echo()
     best = 1e3 * found.cost.min()
     click.echo(f"{found.scene}: {len(found)} steps, {found.time[-1]:.3f} s, {best:.3g} ms a step at best")
-    for name, path in (("trace", trace), ("figure", plot)):
+    for name, path in (("trace", trace), ("figure", plot), ("film", film)):
         if path is not None:
             click.echo(f"{name}: {path}")
     if record is not None:
@@ -740,6 +751,7 @@ def check(files: tuple[str, ...], solvers: tuple[str, ...] | None, reference: st
 
 
 cli.add_command(web)
+cli.add_command(view)
 
 
 def main(args: Sequence[str] | None = None) -> None:

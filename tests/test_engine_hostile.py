@@ -176,6 +176,34 @@ def test_steps_of_threads_are_the_steps_of_one():
     assert sim.snapshot().real.tobytes() == twin.snapshot().real.tobytes()
 
 
+def test_ctrl_c_between_very_many_substeps_is_told():
+    # a step of a million substeps is stopped between them, and says that it is neither here nor there
+    code = """
+import _thread, threading
+import lavender as lv
+sim = lv.Simulation(lv.Scene("pyramid", substeps=10**6))
+start = sim.snapshot()
+threading.Timer(0.3, _thread.interrupt_main).start()
+try:
+    sim.step()
+except KeyboardInterrupt:
+    pass
+else:
+    raise SystemExit("not stopped")
+for call in (sim.step, sim.snapshot):
+    try:
+        call()
+    except lv.LavenderError as error:
+        assert "between its substeps" in str(error), error
+    else:
+        raise SystemExit("taken")
+sim.restore(start)
+sim.constraint_problem()
+"""
+    done = run_apart(code, 60.0)
+    assert done.returncode == 0, done.stderr
+
+
 class Caller:
     """A solver that does something else in the middle of a step: `now` is called in its n-th run."""
 
@@ -340,7 +368,7 @@ COINCIDENT = """
 import resource, sys
 import lavender as lv
 n = int(sys.argv[1])
-scene = lv.Scene()
+scene = lv.Scene(substeps=1)
 scene.add_sphere(0.5, position=(0, 0, 1))
 scene.bodies = scene.bodies * n
 resource.setrlimit(resource.RLIMIT_AS, (3 * 2**30, 3 * 2**30))

@@ -39,6 +39,7 @@ LEVELS = [
 #: Imports upwards that happen inside a function, when it is first called, or for a type checker alone.
 LATE = {
     ("registry", "solvers"),  # the registry reads the table of built-in solvers when it is first asked
+    ("engine", "web"),  # Simulation.view shows itself in the page
     ("solution", "motion"),  # Solution.motion_error is a short way to lavender.motion_error
 }
 HEIGHT = {name: height for height, level in enumerate(LEVELS) for name in level}

@@ -295,3 +295,31 @@ def test_a_lost_state_is_named(visit):
     assert "Side B: the state of" in v.page.locator("#failure").text_content()
     v.page.click("#reset")
     assert v.page.locator("#failure").is_hidden()
+
+
+@pytest.mark.parametrize("width", [1200, 420])
+def test_a_run_is_shown_live_and_again(browser, width):
+    simulation = lv.Simulation("bridge")
+    with simulation.view(browser=False) as viewer:
+        v = Visit(browser, viewer.address, viewport={"width": width, "height": 800})
+        for _ in range(60):
+            simulation.step()
+        v.page.wait_for_function("lavender.frames.length === 61")
+        assert v.page.text_content("#clock") == "0.500 s, frame 61 of 61"
+        shown = v.js("Array.from(lavender.state.array('x'))")
+        assert shown == simulation._state.a["x"].astype(np.float32).ravel().tolist()
+        # something is painted, in the middle of the picture and not at its edge
+        painted = """(() => {
+            const c = document.querySelector("canvas");
+            const colors = new Uint32Array(c.getContext("2d").getImageData(0, 0, c.width, c.height).data.buffer);
+            return [new Set(colors).size, new Set(colors.subarray(0, 2 * c.width)).size];
+        })()"""
+        everywhere, edge = v.js(painted)
+        assert everywhere > 20 and edge == 1
+        v.page.evaluate("lavender.seek(10)")
+        assert v.page.text_content("#clock") == "0.083 s, frame 11 of 61"
+        viewer.film.ended = True
+        v.page.wait_for_function("document.querySelector('#live').disabled")
+        assert v.js("document.documentElement.scrollWidth") <= width
+        assert v.complaints == []
+        v.context.close()

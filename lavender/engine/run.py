@@ -7,13 +7,14 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
-from time import perf_counter
+from time import perf_counter, sleep
 from typing import Any
 
 import numpy as np
 
 from lavender import io
 from lavender._arrays import FloatArray
+from lavender.engine.picture import PICTURES, save_picture
 from lavender.engine.simulation import SOLVER_FIELDS, Simulation
 from lavender.errors import InputError
 from lavender.scene import Scene
@@ -33,6 +34,7 @@ class Trace:
     cost: FloatArray  # (steps,) s, wall time of the step
     lost_body: str = ""  # name of the body that ended the run, or empty
     recorded: int = 0  # problems written
+    title: str = ""  # of figures
 
     def __len__(self) -> int:
         return len(self.time)
@@ -69,18 +71,22 @@ class Trace:
         """
         from matplotlib.figure import Figure
 
-        canvas = Figure(figsize=(12, 3.6), layout="constrained")
-        left, middle, right = canvas.subplots(1, 3)
-        for name in ("residual_initial", "residual_final"):
-            left.semilogy(self.time, np.maximum(self.column(name), 1e-18), label=name.replace("_", " "))
-        left.set(xlabel="time [s]", ylabel="max $|e_n|$ [N s]", title=self.scene)
-        left.legend(fontsize=8)
+        canvas = Figure(figsize=(8, 7), layout="constrained")
+        top, middle, bottom = canvas.subplots(3, 1, sharex=True)
+        for name, label in (
+            ("residual_initial", "before the\nfirst sweep"),
+            ("residual_final", "after the last"),
+        ):
+            value = self.column(name)
+            top.semilogy(self.time, np.where(value > 0.0, value, np.nan), label=label)
+        top.set(title=f"{self.title}: residual of the normals", ylabel="max $|e_n|$ [N s]")
         for name in ("contacts", "cache_matches"):
-            middle.plot(self.time, self.column(name), label=name.replace("_", " "))
-        middle.set(xlabel="time [s]")
-        middle.legend(fontsize=8)
-        right.plot(self.time, 1e3 * self.depth)
-        right.set(xlabel="time [s]", ylabel="deepest penetration [mm]")
+            middle.plot(self.time, self.column(name), label=name.replace("cache_", "").replace("_", " "))
+        middle.set(title="contacts, and those found in the cache", ylim=(0, None))
+        for axes in (top, middle):
+            axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8, frameon=False)
+        bottom.plot(self.time, 1e3 * self.depth)
+        bottom.set(title="deepest penetration", xlabel="time [s]", ylabel="[mm]", ylim=(0, None))
         try:
             canvas.savefig(path)
         except (OSError, ValueError) as error:
@@ -125,8 +131,17 @@ def run(
         done += 1
         if watch is not None:
             watch(done, observation, info)
+    scene = simulation.scene
     return Trace(
-        repr(simulation.scene), time[:done], solver[:done], depth[:done], cost[:done], lost, recorded
+        scene=repr(scene),
+        time=time[:done],
+        solver=solver[:done],
+        depth=depth[:done],
+        cost=cost[:done],
+        lost_body=lost,
+        recorded=recorded,
+        title=f"{scene.name or 'scene'}, {simulation.solver_iterations} iterations, "
+        f"{'warm' if simulation.warm_start else 'cold'}",
     )
 
 
@@ -170,6 +185,8 @@ def run_scene(
     plot: str | PathLike[str] | None = None,
     record: str | PathLike[str] | None = None,
     skip: int = 0,
+    film: str | PathLike[str] | None = None,
+    view: bool = False,
     every: int = 1,
     show: Callable[[str], Any] = print,
 ) -> Trace:
@@ -189,6 +206,10 @@ def run_scene(
         CSV of the trace, figure, folder of the problems.
     skip : int
         Steps before the first that is recorded.
+    film : path, optional
+        Film of the run: `.gif`, `.png`, `.svg` or `.pdf` are pictures, anything else a file for `lavender view`.
+    view : bool
+        Show the run in a page while it goes on, no faster than it would, and after it until Ctrl-C.
     every : int
         Show one line in so many, and always the last.
     show : callable
@@ -205,15 +226,34 @@ def run_scene(
         given["solver_iterations"] = iterations
     simulation = Simulation(Scene(name, **{**given, "warm_start": warm_start}), report_residual=residual)
 
+    viewer = simulation.view() if view else None
+    taken = viewer.film if viewer is not None else simulation.start_film() if film is not None else None
+    begun = perf_counter()
+    if viewer is not None:
+        show(f"{viewer.address}   Ctrl-C ends")
+
     def watch(step: int, observation: dict[str, Any], info: dict[str, Any]) -> None:
         if step % every == 0 or step == steps or "lost_body" in info:
             show(line(step, observation, info))
+        if viewer is not None:
+            sleep(max(0.0, info["time"] - (perf_counter() - begun)))
 
-    found = run(simulation, steps, record=record, skip=skip, watch=watch)
-    if found.lost_body:
-        show(f"stopped: the state of {found.lost_body!r} is not finite")
-    if trace is not None:
-        found.save(trace)
-    if plot is not None:
-        found.plot(plot)
+    try:
+        found = run(simulation, steps, record=record, skip=skip, watch=watch)
+        if found.lost_body:
+            show(f"stopped: the state of {found.lost_body!r} is not finite")
+        if trace is not None:
+            found.save(trace)
+        if plot is not None:
+            found.plot(plot)
+        if film is not None and taken is not None:
+            if Path(film).suffix.lower() in PICTURES:
+                save_picture(taken, film)
+            else:
+                taken.save(film)
+        if viewer is not None:
+            viewer.wait()
+    finally:
+        if viewer is not None:
+            viewer.close()
     return found

@@ -9,7 +9,7 @@ from os import PathLike
 from pathlib import Path
 from threading import RLock
 from time import perf_counter
-from typing import Any, Concatenate, ParamSpec, TypeVar
+from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, TypeVar
 
 import numpy as np
 
@@ -17,7 +17,9 @@ from lavender import io
 from lavender._arrays import FloatArray, read_only
 from lavender.cones import CONTACT_SPIN, Cones
 from lavender.engine.check import same_scene, well_formed, whole_state
+from lavender.engine.film import Film, header_of
 from lavender.engine.layout import HEAD, NEED_ROOM, OK, SIZE
+from lavender.engine.picture import save_picture
 from lavender.engine.snapshot import Snapshot
 from lavender.engine.state import State
 from lavender.errors import InputError, LavenderError, SolveFailed, UnknownName
@@ -33,6 +35,9 @@ from lavender.solve import finish, solve
 from lavender.solvers.newton import SPEC as NEWTON_SPEC
 from lavender.solvers.warm_start import MOST_STEPS, Tried, claim_of
 from lavender_ext.engine import substep
+
+if TYPE_CHECKING:
+    from lavender.web.view import Viewer
 
 __all__ = ["SOLVER_FIELDS", "Simulation"]
 
@@ -53,6 +58,7 @@ PARTS = ("joint", "normal", "disk", "spin")
 NEWTON = NEWTON_SPEC.factory
 TOL = 1e-6  # of lavender.solve
 INSIDE = "this simulation is inside a step; a solver or callback may not use it until the step has ended"
+AT_ONCE = 256  # compiled substeps between two looks for Ctrl-C
 HALF = "a step ended between its substeps"
 LAST_STEP = 2**31 - 1  # head's count of substeps begins again after it
 P = ParamSpec("P")
@@ -120,6 +126,7 @@ class Simulation:
         self.report_residual = report_residual
         self.report_motion = report_motion
         self._lock, self._inside = RLock(), False
+        self._films: list[Film] = []  # that every step is added to
         self._load(scene)
 
     def _load(self, scene: Scene) -> None:
@@ -261,7 +268,11 @@ class Simulation:
             try:
                 self._advance()
                 lost = self._lost_body()
-                return self._observe(), 0.0, bool(lost), False, self._info(lost)
+                observation = self._observe()
+                if self._films:
+                    for film in self._films:
+                        film.add(self.time, observation)
+                return observation, 0.0, bool(lost), False, self._info(lost)
             finally:
                 self._inside = False
 
@@ -305,11 +316,12 @@ class Simulation:
     def _sweep_substeps(self) -> None:
         left = self._parameters.substeps
         while True:
-            status, done = self._state.kernel.substeps(left)
+            status, done = self._state.kernel.substeps(min(left, AT_ONCE))
             left -= done
-            if status != NEED_ROOM:
+            if status == NEED_ROOM:
+                self._state = self._state.grown()
+            elif left == 0 or status != OK:
                 return
-            self._state = self._state.grown()
 
     def _prepare(self) -> None:
         while self._state.kernel.prepare() == NEED_ROOM:
@@ -630,6 +642,104 @@ class Simulation:
             if self.step()[2]:
                 break
         return written
+
+    # -- pictures -------------------------------------------------------------------------------
+
+    def film(self, steps: int) -> Film:
+        """Step `steps` times and keep the poses, from the present ones on; stops where the state is no longer finite.
+
+        Parameters
+        ----------
+        steps : int
+
+        Returns
+        -------
+        Film
+            steps + 1 frames; `save` writes a file that `lavender view` opens.
+        """
+        steps = whole("steps", steps, 1)
+        film = self.start_film()
+        try:
+            for _ in range(steps):
+                if self.step()[2]:
+                    break
+        finally:
+            self.end_film(film)
+        return film
+
+    @_alone
+    def start_film(self) -> Film:
+        """A film of the present poses, to which every step is added until `end_film`."""
+        film = Film(header_of(self.scene, self._state))
+        film.add(self.time, self._observe())
+        self._films.append(film)
+        return film
+
+    @_alone
+    def end_film(self, film: Film) -> None:
+        """No step is added to that film any more."""
+        film.ended = True
+        self._films = [other for other in self._films if other is not film]
+
+    def frames(self, path: str | PathLike[str], steps: int = 120, **more: Any) -> Path:
+        """Step `steps` times and write pictures by matplotlib: `.gif` an animation, `.png`, `.svg`, `.pdf` a strip.
+
+        Parameters
+        ----------
+        path : path
+        steps : int
+        **more
+            frames (4, of a strip), turn, tilt [rad], size [inch], rate [1/s, of an animation].
+
+        Returns
+        -------
+        Path
+
+        Raises
+        ------
+        InputError
+            Another suffix, a path that cannot be written.
+        """
+        return save_picture(self.film(steps), path, **more)
+
+    def view(self, *, port: int = 0, browser: bool = True) -> Viewer:
+        """Show this simulation in a page on this machine: every step from now on, live, and all of them again.
+
+        Parameters
+        ----------
+        port : int
+            On the loopback address; 0 takes a free one.
+        browser : bool
+            Open the page.
+
+        Returns
+        -------
+        Viewer
+            A context manager; `address`, `film`, `wait()` until Ctrl-C, `close()`.
+
+        Raises
+        ------
+        InputError
+            A port that is taken.
+
+        Examples
+        --------
+        >>> import lavender as lv
+        >>> sim = lv.Simulation("stack")
+        >>> with sim.view(browser=False) as viewer:
+        ...     for _ in range(10):
+        ...         _ = sim.step()
+        >>> len(viewer.film)
+        11
+        """
+        from lavender.web.view import Viewer  # above this room: only when it is asked for
+
+        film = self.start_film()
+        try:
+            return Viewer(film, port=port, browser=browser, end=lambda: self.end_film(film))
+        except BaseException:
+            self.end_film(film)
+            raise
 
     # -- snapshots ------------------------------------------------------------------------------
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-__all__ = ["web"]
+__all__ = ["view", "web"]
 
 
 @click.group(invoke_without_command=True)
@@ -63,3 +63,19 @@ def page(folder: Path) -> None:
     from lavender.web import pages
 
     click.echo(str(pages.write_page(folder, _say)))
+
+
+@click.command()
+@click.argument("film", type=click.Path(path_type=Path), metavar="FILM")
+@click.option(
+    "--port", type=click.IntRange(0, 65535), default=0, help="Of the page's server; 0 takes a free one."
+)
+@click.option("--no-browser", is_flag=True, help="Only say where the page is.")
+def view(film: Path, port: int, no_browser: bool) -> None:
+    """Show a film that `lavender run NAME --film FILM` has written, in a page on this machine."""
+    from lavender.engine import Film
+    from lavender.web.view import Viewer
+
+    with Viewer(Film.load(film), port=port, browser=not no_browser) as viewer:
+        click.echo(f"{viewer.address}   Ctrl-C ends")
+        viewer.wait()

@@ -124,7 +124,7 @@ def write_page(folder: Path, say: Callable[[str], Any] = lambda text: None) -> P
     return folder / "index.html"
 
 
-class _Handler(SimpleHTTPRequestHandler):
+class Handler(SimpleHTTPRequestHandler):
     # Types are said here, since a machine's own table may lack or miscall them.
     extensions_map = {  # noqa: RUF012 - as the base class has it
         "": "application/octet-stream",
@@ -153,7 +153,7 @@ def server(folder: Path, port: int = 0) -> ThreadingHTTPServer:
         A port that is taken.
     """
     try:
-        return ThreadingHTTPServer(("127.0.0.1", port), partial(_Handler, directory=str(folder)))
+        return ThreadingHTTPServer(("127.0.0.1", port), partial(Handler, directory=str(folder)))
     except OSError as error:
         raise InputError(
             f"port {port} cannot be used ({error.strerror or error}); give another with --port"

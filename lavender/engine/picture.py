@@ -1,0 +1,197 @@
+"""Pictures of a film by matplotlib: a strip of frames or an animation, for documents.
+
+An orthographic view: `turn` [rad] about the vertical, `tilt` [rad] from above. With r, a, t the directions to the
+right, away from the eye and upwards on the paper, a point p is at (p.r, p.t); faces are painted from far to near.
+"""
+
+from __future__ import annotations
+
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lavender._arrays import FloatArray
+from lavender.engine.film import Film
+from lavender.errors import InputError
+from lavender.io.stored import write_atomically
+from lavender.scene.parts import rotation
+
+__all__ = ["PICTURES", "save_picture"]
+
+PICTURES = (".gif", ".png", ".svg", ".pdf")
+
+PLANE, SPHERE, BOX = 1, 2, 3
+CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
+FACES = (
+    (0, 1, 3, 2),
+    (4, 6, 7, 5),
+    (0, 4, 5, 1),
+    (2, 3, 7, 6),
+    (0, 2, 6, 4),
+    (1, 5, 7, 3),
+)  # -x +x -y +y -z +z
+LIGHT = np.array([-0.45, -0.62, 0.64])
+COLORS = ("#7a5fb5", "#4f7cac", "#5b9279", "#b5895f", "#a85f7a", "#6b8fb5", "#8a7fb0")
+
+
+def save_picture(
+    film: Film,
+    path: str | PathLike[str],
+    *,
+    frames: int = 4,
+    turn: float = 0.45,
+    tilt: float = 0.22,
+    size: float = 3.0,
+    rate: int = 30,
+) -> Path:
+    """Write a film as pictures.
+
+    Parameters
+    ----------
+    film : Film
+    path : path
+        `.gif`: an animation at `rate`; `.png`, `.svg`, `.pdf`: `frames` of them side by side, evenly spaced.
+    frames : int
+        In a strip.
+    turn, tilt : float, rad
+        Where the eye is.
+    size : float, inch
+        Width of one frame; its height is that of what is seen.
+    rate : int, 1/s
+        Frames of an animation in a second of simulated time.
+
+    Raises
+    ------
+    InputError
+        An empty film, a path that cannot be written, another suffix.
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if suffix not in PICTURES:
+        raise InputError(f"{str(path)!r} ends in {path.suffix!r}; .gif, .png, .svg or .pdf is needed")
+    if not len(film):
+        raise InputError("the film has no frames; step first")
+    if not (isinstance(frames, int) and frames >= 1 and rate > 0.0 and 0.5 <= size <= 50.0):
+        raise InputError("frames must be at least 1, rate positive and size 0.5 to 50 inch")
+    stage = _Stage(film, turn, tilt)
+    if suffix == ".gif":
+        _animate(stage, path, size, rate)
+    else:
+        _strip(stage, path, frames, size)
+    return path
+
+
+class _Stage:
+    """One view for all frames: directions, bounds, and bodies as painted shapes."""
+
+    def __init__(self, film: Film, turn: float, tilt: float) -> None:
+        s, c, up, flat = np.sin(turn), np.cos(turn), np.sin(tilt), np.cos(tilt)
+        self.right = np.array([c, s, 0.0])
+        self.away = np.array([-s * flat, c * flat, -up])
+        self.top = np.array([-s * up, c * up, flat])
+        self.film, self.bodies = film, film.header["bodies"]
+        self.x, self.q, self.time = film.positions, film.quaternions, film.time
+        seen = [i for i, body in enumerate(self.bodies) if body["kind"] >= SPHERE]
+        reach = np.array([np.linalg.norm(self.bodies[i]["shape"][:3]) for i in seen])
+        centre = self.x[:, seen] if seen else np.zeros((1, 1, 3))
+        reach = reach if seen else np.ones(1)
+        across, tall = centre @ self.right, centre @ self.top
+        self.bounds = (
+            float((across - reach).min()),
+            float((across + reach).max()),
+            float((tall - reach).min()),
+            float((tall + reach).max()),
+        )
+
+    @property
+    def height(self) -> float:
+        """Height over width, within what a page can hold."""
+        left, right, low, high = self.bounds
+        return float(np.clip((high - low) / (right - left), 0.3, 2.5))
+
+    def project(self, points: FloatArray) -> FloatArray:
+        return np.stack([points @ self.right, points @ self.top], axis=-1)
+
+    def paint(self, axes: Any, frame: int) -> None:
+        from matplotlib.colors import to_rgb
+        from matplotlib.patches import Circle, Polygon
+
+        axes.clear()
+        axes.set_axis_off()
+        left, right, low, high = self.bounds
+        axes.set(xlim=(left, right), ylim=(low, high), aspect="equal")
+        items: list[tuple[float, Any]] = []
+        for i, body in enumerate(self.bodies):
+            x, q, size = self.x[frame, i], self.q[frame, i], np.array(body["shape"][:3])
+            color = np.array(to_rgb(COLORS[i % len(COLORS)]))
+            if body["kind"] == BOX:
+                r = rotation(q)
+                corners = x + (CORNERS * size) @ r.T
+                for f, face in enumerate(FACES):
+                    normal = (1.0 if f & 1 else -1.0) * r[:, f >> 1]
+                    if normal @ self.away < 0.0:
+                        points = corners[list(face)]
+                        bright = 0.6 + 0.4 * (normal @ LIGHT)
+                        fill = np.clip(color * bright + 0.25 * max(bright - 0.6, 0.0), 0.0, 1.0)
+                        shape = Polygon(self.project(points), fc=fill, ec="#2a2035", lw=0.5)
+                        items.append((float((points @ self.away).mean()), shape))
+            elif body["kind"] == SPHERE:
+                across, up = self.project(x)
+                fill = np.clip(color * 1.1, 0.0, 1.0)
+                ball = Circle((across, up), size[0], fc=fill, ec="#2a2035", lw=0.5)
+                items.append((float(x @ self.away), ball))
+        for depth, (_, shape) in enumerate(sorted(items, key=lambda item: -item[0])):
+            shape.set_zorder(2 + depth / (len(items) + 1))
+            axes.add_patch(shape)
+        self._ground(axes)
+        self._joints(axes, frame)
+        axes.set_title(f"{self.time[frame]:.2f} s", fontsize=8)
+
+    def _ground(self, axes: Any) -> None:
+        if any(body["kind"] == PLANE and body["shape"][2] > 0.99 for body in self.bodies):
+            left, right, *_ = self.bounds
+            offset = next(b["shape"][3] for b in self.bodies if b["kind"] == PLANE and b["shape"][2] > 0.99)
+            level = float(np.array([0.0, 0.0, offset]) @ self.top)
+            axes.plot([left, right], [level, level], color="0.6", lw=0.8, zorder=1)
+
+    def _joints(self, axes: Any, frame: int) -> None:
+        for joint in self.film.header["joints"]:
+            i = joint["body"]
+            place = self.x[frame, i] + rotation(self.q[frame, i]) @ np.array(joint["anchor"])
+            axes.plot(*self.project(np.stack([self.x[frame, i], place])).T, color="k", lw=0.6, zorder=4)
+            axes.plot(*self.project(place), "k.", markersize=3, zorder=4)
+
+
+def _strip(stage: _Stage, path: Path, count: int, size: float) -> None:
+    from matplotlib.figure import Figure
+
+    chosen = np.unique(np.linspace(0, len(stage.film) - 1, count).round().astype(int))
+    height = size * stage.height + 0.3
+    canvas = Figure(figsize=(size * len(chosen), height), layout="constrained")
+    for axes, frame in zip(np.atleast_1d(canvas.subplots(1, len(chosen))), chosen, strict=True):
+        stage.paint(axes, int(frame))
+    write_atomically(path, lambda part: canvas.savefig(part, format=path.suffix[1:].lower(), dpi=150))
+
+
+def _animate(stage: _Stage, path: Path, size: float, rate: int) -> None:
+    from matplotlib.animation import PillowWriter
+    from matplotlib.figure import Figure
+
+    time = stage.time
+    # evenly in simulated time, each step at most once
+    wanted = np.arange(time[0], time[-1] + 0.5 / rate, 1.0 / rate)
+    chosen = np.unique(np.searchsorted(time, wanted - 1e-9).clip(0, len(time) - 1))
+    canvas = Figure(figsize=(size, size * stage.height + 0.3), layout="constrained")
+    axes = canvas.subplots()
+    writer = PillowWriter(fps=rate)
+
+    def write(part: Path) -> None:
+        with writer.saving(canvas, str(part) + ".gif", dpi=80):
+            for frame in chosen:
+                stage.paint(axes, int(frame))
+                writer.grab_frame()
+        Path(str(part) + ".gif").replace(part)
+
+    write_atomically(path, write)
