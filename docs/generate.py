@@ -669,7 +669,8 @@ def api_page(site):
             "Reference",
             "Witness",
         ),
-        "lavender.residuals": ("natural_map", "qp_residual", "siconos_error", "check_certificate"),
+        "lavender.measures": ("natural_map", "qp_residual", "siconos_error"),
+        "lavender.certificates": ("check_certificate",),
     }
     for module, names in public.items():
         parts.append(f"### {module}")

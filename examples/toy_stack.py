@@ -23,7 +23,7 @@ import sys
 import numpy as np
 
 import lavender as lv
-from lavender.residuals import natural_map
+from lavender.measures import natural_map
 
 N = 8
 OPEN = 4  # index of the contact that opens

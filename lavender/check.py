@@ -20,9 +20,9 @@ import numpy as np
 
 from lavender._arrays import FloatArray
 from lavender.errors import InputError, LavenderError
+from lavender.measures import qp_residual
 from lavender.problem import Problem
 from lavender.registry import available, get, known
-from lavender.residuals import qp_residual
 from lavender.solution import Solution, Status
 from lavender.solve import solve
 

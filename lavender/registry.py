@@ -28,7 +28,22 @@ from lavender.errors import InputError, SolverUnavailable, UnknownName
 from lavender.problem import LAWS, OPERATORS, Problem
 from lavender.solution import Claim
 
-__all__ = ["Solver", "SolverSpec", "available", "get", "known", "register"]
+__all__ = ["Solver", "SolverSpec", "State", "available", "get", "known", "register"]
+
+
+# Modules whose SPECS are registered first, by name: they import this one.
+TABLES = ("lavender.solvers", "lavender.external")
+
+
+class State(Protocol):
+    """What `prepare` returns: anything; the front door asks a resumable solver's state for what it may have."""
+
+    @property
+    def best(self) -> tuple[float, FloatArray | None]:
+        """(relative residual, impulse (m,)) of the best iterate that the solver's own checks saw; (inf, None) before.
+
+        Optional, for residuals that rise on the way: where a solve ends at something worse, this is the result.
+        """
 
 
 class Solver(Protocol):
@@ -161,10 +176,9 @@ _registered: dict[str, SolverSpec] = {}
 
 @cache
 def _load_builtin_and_plugins() -> None:
-    from lavender.solvers import SPECS  # the table imports this module
-
-    for spec in SPECS:
-        _registered.setdefault(spec.name, spec)
+    for table in TABLES:
+        for spec in importlib.import_module(table).SPECS:
+            _registered.setdefault(spec.name, spec)
     for entry in entry_points(group="lavender.solvers"):
         try:
             spec = entry.load()

@@ -16,11 +16,12 @@ from typing import Any
 import numpy as np
 
 from lavender._arrays import FloatArray, equal
+from lavender.certificates import check_certificate
 from lavender.cones import ROW
 from lavender.errors import CapabilityError, InputError, InUse, UnknownName
 from lavender.problem import Problem
-from lavender.registry import SolverSpec, get
-from lavender.residuals import Residual, check_certificate, reference, residual
+from lavender.registry import SolverSpec, State, get
+from lavender.residuals import Residual, reference, residual
 from lavender.solution import Claim, History, Solution, SolverRun, Status
 from lavender_ext.judge.measure import all_finite
 
@@ -209,7 +210,7 @@ class Prepared:
 
     def _set_up(self, problem: Problem, anew: bool) -> None:
         """Prepare, or update the state of a problem of the same structure."""
-        if problem.data.start_energy < 0.0:
+        if problem.metric.start_energy < 0.0:
             reference(problem)  # of the judge, before any solver has the problem in its hands
         anew, self._broken = anew or bool(self._broken), ""
         try:
@@ -284,7 +285,7 @@ class _Loop:
         start = perf_counter()
         try:
             claim = self._call(max_iter, self.time_limit)
-            if claim.status is not Status.NUMERICAL_ERROR:
+            if not self.broken:
                 return claim
         except KeyboardInterrupt:
             claim = Claim(Status.INTERRUPTED, 0, {}, "Ctrl-C")
@@ -299,7 +300,10 @@ class _Loop:
         try:
             return self.solver.run(self.state, self.impulse, n, self.tol, time_limit)
         except BREAKDOWN as error:
+            self.broken = True
             return Claim(Status.NUMERICAL_ERROR, 0, {}, _last_words(error))
+
+    broken = False  # the solver did not return
 
     def run(self, max_iter: int) -> Claim:
         # About a nanosecond per unit of work: the first guess, then measured. Capped, for solvers in Python.
@@ -351,7 +355,8 @@ class _Loop:
         # A solver whose residual may rise keeps its best checked iterate; a budget (tol = 0) means the last one.
         if self.tol == 0.0:
             return
-        best = getattr(self.state, "best", None)
+        state: State = self.state
+        best = getattr(state, "best", None)
         if best is None or best[1] is None:
             return
         if not residual(self.problem, self.impulse).relative <= best[0]:

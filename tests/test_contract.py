@@ -10,8 +10,8 @@ from random_problems import as_matrix, random_contact_problem
 
 import lavender as lv
 from lavender import registry
+from lavender.certificates import check_certificate
 from lavender.problem import LAWS
-from lavender.residuals import check_certificate
 
 NAMES = sorted(registry.specs())
 HERE = lv.available()

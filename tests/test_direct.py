@@ -9,7 +9,7 @@ from hypothesis import assume, given
 from random_problems import as_matrix, random_contact_problem, random_lcp, seeds
 
 import lavender as lv
-from lavender.residuals import check_certificate
+from lavender.certificates import check_certificate
 from lavender_ext.pivot import principal
 
 

@@ -10,9 +10,10 @@ from random_problems import as_matrix, random_contact_problem, random_rows
 
 import lavender as lv
 from lavender import registry
+from lavender.certificates import check_certificate
 from lavender.external import qpsolvers_
 from lavender.external._running import Answer
-from lavender.residuals import check_certificate, qp_residual
+from lavender.measures import qp_residual
 
 BACKENDS = sorted(n for n in lv.available(law="lcp") if registry.specs()[n].external)
 DEFINITE = {"quadprog", "ecos", "pyqpmad"}

@@ -8,7 +8,9 @@ from hypothesis import given, settings
 from random_problems import as_matrix, random_contact_problem, random_lcp, seeds
 
 import lavender as lv
-from lavender.residuals import check_certificate, judged, known, natural_map, qp_residual, remember
+from lavender.certificates import check_certificate
+from lavender.measures import natural_map, qp_residual
+from lavender.residuals import judged, known, remember
 
 # -- the twin --------------------------------------------------------------------------------------
 

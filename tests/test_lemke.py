@@ -9,7 +9,7 @@ from hypothesis import given
 from random_problems import random_lcp, seeds
 
 import lavender as lv
-from lavender.residuals import check_certificate
+from lavender.certificates import check_certificate
 
 
 def accurate(solution):

@@ -5,7 +5,7 @@ import pytest
 
 import lavender as lv
 from lavender import suite
-from lavender.residuals import check_certificate
+from lavender.certificates import check_certificate
 from lavender.suite import build, hard
 
 LARGE = {"hang(n=10000)"}  # seconds

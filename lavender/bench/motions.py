@@ -20,9 +20,9 @@ from lavender import motion
 from lavender.bench.cases import resolve, structure_of
 from lavender.cones import ROW
 from lavender.errors import CapabilityError, InputError
+from lavender.measures import natural_map, siconos_error
 from lavender.problem import Problem
 from lavender.registry import available, get
-from lavender.residuals import natural_map, siconos_error
 from lavender.solve import solve
 
 __all__ = ["Branches", "Sample", "branches", "calibration", "command", "samples", "several_table", "table"]

@@ -19,6 +19,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from lavender._arrays import FloatArray
+from lavender.certificates import check_certificate
 from lavender.errors import CapabilityError, InputError
 from lavender.external._running import (
     Answer,
@@ -32,7 +33,6 @@ from lavender.external._running import (
 from lavender.external.as_qp import QP, impulse_form, pick_form, velocity_form
 from lavender.problem import Problem
 from lavender.registry import SolverSpec
-from lavender.residuals import check_certificate
 from lavender.solution import Claim, Status
 
 __all__ = ["BACKENDS", "SPECS", "Backend", "QPSolver"]

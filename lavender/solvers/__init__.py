@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from importlib import import_module
 
-from lavender import external
 from lavender.registry import SolverSpec
 
 # File in this folder, with its SPEC; from the exact to the plain.
@@ -24,7 +23,4 @@ _TABLE = (
     "gauss_seidel",
 )
 
-SPECS: tuple[SolverSpec, ...] = (
-    *(import_module(f"{__name__}.{name}").SPEC for name in _TABLE),
-    *external.SPECS,
-)
+SPECS: tuple[SolverSpec, ...] = tuple(import_module(f"{__name__}.{name}").SPEC for name in _TABLE)

@@ -26,10 +26,11 @@ from typing import Any
 import numpy as np
 
 from lavender._arrays import FloatArray, IntArray
+from lavender.certificates import check_certificate
 from lavender.errors import SolverUnavailable, UnknownName
 from lavender.problem import OPERATORS, Problem
 from lavender.registry import SolverSpec, get
-from lavender.residuals import at_floor, check_certificate, known, quick, reference
+from lavender.residuals import at_floor, known, quick, reference
 from lavender.solution import Claim, Status
 from lavender.solvers._costs import ISLAND, LOOK, SWEEP_START, Costs, is_loose, islands_cost
 from lavender.solvers._islands import islands, restrict, rows_of

@@ -23,9 +23,10 @@ from typing import Any
 import numpy as np
 
 from lavender._arrays import FloatArray
+from lavender.certificates import check_certificate
 from lavender.problem import Problem
 from lavender.registry import SolverSpec
-from lavender.residuals import at_floor, check_certificate, judged, remember
+from lavender.residuals import at_floor, judged, remember
 from lavender.solution import Claim, Status
 from lavender.solvers._factor import GeneralFactor
 from lavender.solvers._pivoting import INDEFINITE, ROUNDS, SMALL, SOLVED, STUCK, PivotState

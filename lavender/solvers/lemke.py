@@ -26,9 +26,10 @@ import numpy.typing as npt
 from scipy.linalg import lapack
 
 from lavender._arrays import FloatArray, IntArray
+from lavender.certificates import check_certificate
 from lavender.problem import Problem
 from lavender.registry import SolverSpec
-from lavender.residuals import at_floor, check_certificate, quick
+from lavender.residuals import at_floor, quick
 from lavender.solution import Claim, Status
 from lavender_ext.judge import measure
 from lavender_ext.pivot.tableau import Dictionary

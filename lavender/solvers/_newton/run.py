@@ -8,7 +8,8 @@ from time import perf_counter
 import numpy as np
 
 from lavender._arrays import FloatArray
-from lavender.residuals import at_floor, check_certificate, quick, reference
+from lavender.certificates import check_certificate
+from lavender.residuals import at_floor, quick, reference, relative_of
 from lavender.solvers._newton.interior_point import InteriorPoint
 from lavender.solvers._newton.systems import System
 
@@ -53,10 +54,9 @@ class Run:
 
     def relative(self, energy: float, velocity: float) -> float:
         """Relative residual of the judge's two errors; inf where one is not finite."""
-        energy_start, velocity_start = reference(self.system.sc.problem)
-        energy = 0.0 if energy == 0.0 else energy / energy_start if energy_start > 0.0 else np.inf
-        velocity = 0.0 if velocity == 0.0 else velocity / velocity_start if velocity_start > 0.0 else np.inf
-        return max(energy, velocity) if energy + velocity < np.inf else np.inf
+        problem = self.system.sc.problem
+        reference(problem)
+        return relative_of(problem.metric, energy, velocity)
 
     def reached(self) -> bool:
         return self.best <= self.tol
