@@ -468,7 +468,7 @@ def test_a_backend_that_hangs_or_dies_costs_its_own_record(plugin):
     assert found["hang"].status == "KILLED"
     assert found["segfault"].status == "CRASHED (SIGSEGV)"
     assert found["exit"].status == "CRASHED (exit status 3)"
-    assert found["eat"].status == "ERROR"
+    assert found["eat"].status == "NUMERICAL_ERROR"
     assert "MemoryError" in found["eat"].message
     for record in (found["talk"], after):
         assert record.status == "CONVERGED"
