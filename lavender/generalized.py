@@ -142,6 +142,8 @@ class Generalized:
             place = np.argsort(self.order)
             whole = sp.csr_array(whole[place][:, place])
         whole.sort_indices()
+        for part in (whole.data, whole.indices, whole.indptr):
+            read_only(part)
         return whole
 
     @cached_property

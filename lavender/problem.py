@@ -474,9 +474,19 @@ class Problem:
 
     @once
     def whitened(self) -> sp.csr_array:
-        """Y (m, nv) with J M^-1 J^T = Y Y^T; only in generalised coordinates."""
-        assert self.generalized is not None
-        return sp.csr_array(self.metric.whitened(), shape=(self.m, self.generalized.nv))
+        """Y (m, nv) with J M^-1 J^T = Y Y^T, read-only; only in generalised coordinates.
+
+        Raises
+        ------
+        CapabilityError
+            The problem was given otherwise.
+        """
+        if self.generalized is None:
+            raise CapabilityError(
+                f"this problem was given as {self.operator}; Y is known in generalised coordinates "
+                "(Problem.from_jacobian)"
+            )
+        return _read_only(sp.csr_array(self.metric.whitened(), shape=(self.m, self.generalized.nv)))
 
     @once
     def jacobian(self) -> sp.csr_array:
@@ -494,10 +504,7 @@ class Problem:
                 "this problem was given as a matrix; its Jacobian is not known (make it with "
                 "Problem.from_rows or Problem.from_jacobian)"
             )
-        jac = self.rows.jacobian(self.cones)
-        for part in (jac.data, jac.indices, jac.indptr):
-            read_only(part)
-        return jac
+        return _read_only(self.rows.jacobian(self.cones))
 
     @property
     def d(self) -> FloatArray:
@@ -691,6 +698,12 @@ class Problem:
         kind = self.operator if self.matrix is None else "CSR" if sp.issparse(self.matrix) else "dense"
         name = f"{self.name!r}, " if self.name else ""
         return f"<Problem {name}{self.law}, {self.m} rows in {self.n_blocks} blocks, {kind}>"
+
+
+def _read_only(matrix: sp.csr_array) -> sp.csr_array:
+    for part in (matrix.data, matrix.indices, matrix.indptr):
+        read_only(part)
+    return matrix
 
 
 def _checked_matrix(matrix: Any, m: int, copy: bool) -> Any:

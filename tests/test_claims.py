@@ -146,6 +146,14 @@ def problems():
         "rows": rows,
         "csr": as_matrix(rows),
         "dense": lv.Problem(rows.b, rows.cones, dense, guess=np.zeros(rows.m)),
+        "generalized": lv.Problem.from_jacobian(
+            rows.jacobian,
+            np.linalg.inv(rows.rows.inverse_mass_matrix().toarray()),
+            np.zeros(rows.jacobian.shape[1]),
+            target=rows.b,
+            cones=rows.cones,
+            compliance=rows.compliance,
+        ),
     }
 
 
@@ -173,7 +181,7 @@ def arrays_of(thing, name, seen, depth=0):
             yield from arrays_of(value, f"{name}.{attribute}", seen, depth + 1)
 
 
-@pytest.mark.parametrize("form", ["rows", "csr", "dense"])
+@pytest.mark.parametrize("form", ["rows", "csr", "dense", "generalized"])
 def test_every_array_of_a_problem_is_read_only(form):
     problem = problems()[form]
     lv.solve(problem, "pgs", max_iter=3)
@@ -181,11 +189,11 @@ def test_every_array_of_a_problem_is_read_only(form):
         (name, array)
         for name, array in arrays_of(problem, "problem", set())
         # Worked out anew at each call, and the caller's own.
-        if not name.endswith(("cones.n_tangents",))
+        if not name.endswith(("cones.n_tangents", "operator.parents"))
     ]
     names = {name for name, _ in kept}
     assert {"problem.b", "problem.csr.data", "problem.csr_data.d", "problem.cones.lower"} <= names
-    assert ("problem.jacobian.data" in names) == (form == "rows")
+    assert ("problem.jacobian.data" in names) == (form in ("rows", "generalized"))
     assert [name for name, array in kept if array.flags.writeable] == []
     for matrix in (problem.csr, problem.delassus()):
         data = matrix.data if sp.issparse(matrix) else matrix
@@ -193,7 +201,7 @@ def test_every_array_of_a_problem_is_read_only(form):
             data[...] = 0.0
 
 
-@pytest.mark.parametrize("form", ["rows", "csr", "dense"])
+@pytest.mark.parametrize("form", ["rows", "csr", "dense", "generalized"])
 def test_a_matrix_exchanged_by_a_solver_changes_no_verdict(form, plug_in):
     """The arrays of a sparse matrix cannot be written, but exchanged: the judge does not look there."""
     honest = problems()[form]
