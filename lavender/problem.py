@@ -8,7 +8,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import Any
@@ -34,6 +34,34 @@ FRICTION = ("coulomb", "cone")
 LAWS = ("linear", "lcp", "coulomb", "cone")
 # How A is given.
 OPERATORS = ("rows", "matrix", "generalized")
+
+
+class Names(Sequence[str]):
+    """Names of blocks that are made when they are first asked for; equal to a tuple of the same words."""
+
+    def __init__(self, count: int, make: Callable[[], Sequence[str]]) -> None:
+        self._count, self._make = count, make
+        self._made: tuple[str, ...] | None = None
+
+    def _words(self) -> tuple[str, ...]:
+        if self._made is None:
+            self._made = tuple(self._make())
+        return self._made
+
+    def __len__(self) -> int:
+        return self._count
+
+    def __getitem__(self, i: Any) -> Any:
+        return self._words()[i]
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, (Names, tuple)) and self._words() == tuple(other)
+
+    def __hash__(self) -> int:
+        return hash(self._words())
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return tuple, (self._words(),)
 
 
 @dataclass(frozen=True)
@@ -145,7 +173,7 @@ class Problem:
                 )
             put(self, "key", read_only(key.astype(np.uint64)))
         if self.names is not None:
-            names = tuple(map(str, self.names))
+            names = self.names if isinstance(self.names, Names) else tuple(map(str, self.names))
             if isinstance(self.names, str) or len(names) != k:
                 raise InputError(f"{len(names)} names for {k} blocks; one for each block is needed")
             put(self, "names", names)

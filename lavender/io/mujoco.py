@@ -13,7 +13,8 @@ One step dt turns that into impulses and velocities, without changing it:
 
     lambda = dt f      A = J M^-1 J^T + diag(R)      b = dt (aref - J a0)      w = A lambda - b = dt (J a + R f - aref)
 
-Rows keep MuJoCo's order, so `impulse(model, data)` is `dt efc_force` row by row. What becomes what:
+The problem holds J and M as they are (`Problem.generalized`), R as its compliance. Rows keep MuJoCo's order; what
+becomes what:
 
 | MuJoCo | here |
 |---|---|
@@ -21,36 +22,57 @@ Rows keep MuJoCo's order, so `impulse(model, data)` is `dt efc_force` row by row
 | friction loss of a joint or tendon | ROW, abs(lambda) <= dt frictionloss |
 | limit of a joint or tendon; `condim="1"` | ROW, or a contact of a normal alone: lambda >= 0 |
 | elliptic cone, `condim="3"` | CONTACT: normal (from geom 1 to geom 2), two tangents, mu = friction[0] |
-| elliptic cone, `condim="4"` | CONTACT_SPIN, patch radius = friction[2] / friction[0] [m] |
+| elliptic cone, `condim="4"`, `"6"` | ROUND: normal, two tangents, spin, then two that roll, in one cone |
 | pyramidal cone, any condim | its edges as ROWs with lambda >= 0: MuJoCo's own linear complementarity problem |
+
+Coefficients of friction that differ make an ellipsoid; rows of tangents are scaled by friction[j] / friction[0], which
+makes it round without changing the problem: `scaling(model, data)` has the factors, `impulse` heeds them.
 
 Differences to know:
 
-- MuJoCo's constraints are soft: R is compliance, on the diagonal of A, and no row is rigid. `solref` and `solimp`
-  are inside R and aref.
-- Its friction is the convex relaxation, so the law is "cone". `problem.relaxed("coulomb")` asks for Coulomb's.
-- With condim 4 its cone bounds disk and torque together by an ellipsoid; here each has its own bound. The two
-  agree where the contact slides or spins, not both; MuJoCo's forces then leave a residual.
+- MuJoCo's constraints are soft: R is compliance, and no row is rigid. `solref` and `solimp` are inside R and aref.
+- Its friction is the convex relaxation, so the law is "cone". `problem.relaxed("coulomb")` asks for Coulomb's where no
+  contact has more than two tangents.
 - It evaluates accelerations at the start of the step: v + dt a is the velocity after the step only for the Euler
   integrator without implicit damping. The pass of `noslip_iterations` comes after the problem and is not in it.
-- Generalised coordinates have no pair of bodies behind each row, so the problem holds a matrix, not rows.
+
+What MuJoCo holds is checked against itself: M a0 must be its smooth force, 1 / R its efc_D, and J (a - a0) must be
+J M^-1 J^T f as far as its solver has come. Data of another problem than M's are refused, with the option that makes
+them.
 """
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
 
-from lavender._arrays import FloatArray
-from lavender.cones import CONTACT, CONTACT_SPIN, ROW, Cones
+from lavender._arrays import FloatArray, read_only
+from lavender.cones import Cones
 from lavender.errors import CapabilityError, InputError
-from lavender.problem import Problem
+from lavender.generalized import Generalized
+from lavender.problem import Names, Problem
+from lavender_ext.core.generalized import lower_of_dense
+from lavender_ext.generalized import export
 
-__all__ = ["acceleration", "from_mujoco", "impulse", "jacobian"]
+__all__ = ["acceleration", "from_mujoco", "impulse", "jacobian", "scaling"]
 
-CHUNK = 2**22  # numbers of a dense slice of J while it is whitened: 32 MiB
+ROUNDING = 2.0**-46  # 64 roundings: M a0 against the smooth force, which MuJoCo solved for by the same factor
+UNSOLVED = (
+    1e-2  # J (a - a0) against J M^-1 J^T f, of their size: primal solvers stop where the cost hardly falls
+)
+_CODES = (
+    "mjCNSTR_EQUALITY",
+    "mjCNSTR_FRICTION_DOF",
+    "mjCNSTR_FRICTION_TENDON",
+    "mjCNSTR_LIMIT_JOINT",
+    "mjCNSTR_LIMIT_TENDON",
+    "mjCNSTR_CONTACT_FRICTIONLESS",
+    "mjCNSTR_CONTACT_PYRAMIDAL",
+    "mjCNSTR_CONTACT_ELLIPTIC",
+)
 
 
 def from_mujoco(model: Any, data: Any, *, name: str = "mujoco") -> Problem:
@@ -62,45 +84,80 @@ def from_mujoco(model: Any, data: Any, *, name: str = "mujoco") -> Problem:
     data : mujoco.MjData
         After `mj_forward` or `mj_step`.
     name : str
-        Name of the problem.
+        Name of the problem; "(noslip)" is added where `noslip_iterations` moved MuJoCo's impulses off its solution.
 
     Returns
     -------
     Problem
-        Law "cone" with elliptic friction cones, "lcp" with pyramidal ones or without friction, "linear"
-        with equalities alone. Its matrix is A (m, m) in compressed rows, symmetric to the bit.
+        In generalised coordinates, with v*, keys of blocks (geoms and number of a contact, joint, tendon, equality)
+        and, without `noslip_iterations`, MuJoCo's own impulses as `guess`. Law "cone" with elliptic friction cones,
+        "lcp" with pyramidal ones or without friction, "linear" with equalities alone.
 
     Raises
     ------
     InputError
-        Not a model and its data.
+        Not a model and its data, or before `mj_forward`.
     CapabilityError
-        Elliptic cones with rolling friction (condim 6) or with two different tangential coefficients.
+        The data belong to another problem than J, M and R: an integrator that treats damping inside M
+        (`integrator="discrete"`), or a copy that lacks what the problem needs.
     """
     mj = _mujoco(model, data)
-    m, dt = int(data.nefc), float(model.opt.timestep)
-    jac = jacobian(model, data)
-    half = _whitened(mj, model, data, jac)
-    a = sp.csr_array(half @ half.T + sp.diags_array(np.array(data.efc_R[:m], float)))
-    b = dt * (np.array(data.efc_aref[:m], float) - jac @ np.array(data.qacc_smooth, float))
-    cones, names = _blocks(mj, model, data, dt)
-    return Problem(b, cones, a, friction="cone", names=names, name=name, copy=False)
+    m, n, dt = int(data.nefc), int(model.nv), float(model.opt.timestep)
+    smooth, force = data.qacc_smooth, data.efc_force[:m]
+    mass = _mass(mj, model, data)
+    cones, scale, key = _blocks(mj, model, data, m, dt)
+    jac = _rows(mj, model, data, m, n, scale)
+    _check_smooth(model, data, mass, smooth)
+    general = Generalized.compressed(jac, mass, data.qvel + dt * smooth)
+    own = np.divide(dt * force, scale, out=np.zeros(m), where=scale != 0.0)
+    _check_forces(model, data, general, jac, own, smooth, dt)
+    noslip = int(model.opt.noslip_iterations) > 0
+    return Problem(
+        dt * scale * data.efc_aref[:m] - general.velocity_of(dt * smooth),
+        cones,
+        generalized=general,
+        compliance=_compliance(data, m) * scale * scale,
+        friction="cone",
+        guess=None if noslip else own,
+        key=key,
+        names=_names(mj, model, data, m, cones.n_blocks),
+        name=f"{name} (noslip)" if noslip else name,
+        copy=False,
+    )
 
 
 def impulse(model: Any, data: Any) -> FloatArray:
-    """MuJoCo's own answer as impulses (m,) [N s, N m s]: dt efc_force.
+    """MuJoCo's own answer as impulses of the problem's rows (m,) [N s]: dt efc_force over `scaling`.
+
+    After `noslip_iterations` it is no solution of the problem.
 
     Raises
     ------
     InputError
         Not a model and its data.
     """
-    _mujoco(model, data)
-    return float(model.opt.timestep) * np.array(data.efc_force[: int(data.nefc)], float)
+    mj = _mujoco(model, data)
+    m, dt = int(data.nefc), float(model.opt.timestep)
+    scale = _blocks(mj, model, data, m, dt)[1]
+    return np.divide(dt * data.efc_force[:m], scale, out=np.zeros(m), where=scale != 0.0)
+
+
+def scaling(model: Any, data: Any) -> FloatArray:
+    """Factor of each row (m,) of the problem: row of the problem = factor times MuJoCo's row.
+
+    1, and friction[j] / friction[0] on the tangents of an elliptic cone. Impulses are MuJoCo's over it.
+
+    Raises
+    ------
+    InputError
+        Not a model and its data.
+    """
+    mj = _mujoco(model, data)
+    return _blocks(mj, model, data, int(data.nefc), float(model.opt.timestep))[1]
 
 
 def acceleration(model: Any, data: Any, impulse: Any) -> FloatArray:
-    """MuJoCo's `qacc` (nv,) under impulses (m,) [N s] of its constraints: a0 + M^-1 J^T lambda / dt.
+    """MuJoCo's `qacc` (nv,) under impulses (m,) [N s] of the problem's rows: a0 + M^-1 J^T lambda / dt.
 
     Raises
     ------
@@ -113,7 +170,7 @@ def acceleration(model: Any, data: Any, impulse: Any) -> FloatArray:
         raise InputError(
             f"impulse has shape {lam.shape}; ({int(data.nefc)},) is needed, one for each row of efc_J"
         )
-    push = (jacobian(model, data).T @ lam)[None, :] / float(model.opt.timestep)
+    push = (jacobian(model, data).T @ (scaling(model, data) * lam))[None, :] / float(model.opt.timestep)
     change = np.zeros_like(push)
     mj.mj_solveM(model, data, change, np.ascontiguousarray(push))
     return np.array(data.qacc_smooth, float) + change[0]
@@ -160,101 +217,152 @@ def _mujoco(model: Any, data: Any) -> Any:
     return mj
 
 
-def _whitened(mj: Any, model: Any, data: Any, jac: sp.csr_array) -> sp.csr_array:
-    """Y = J L^-1 D^-1/2 (m, nv) with M = L^T D L, so that Y Y^T = J M^-1 J^T is symmetric to the bit."""
-    m, nv = jac.shape
-    if m == 0 or nv == 0:
-        return jac
-    root = np.sqrt(np.array(data.qLDiagInv, float))[None, :]
-    step = max(1, CHUNK // nv)
-    parts = []
-    for i in range(0, m, step):
-        y = np.ascontiguousarray(jac[i : i + step].toarray())
-        x = np.empty_like(y)
-        mj.mj_solveM2(model, data, x, y, root)
-        parts.append(sp.csr_array(x))
-    whole = sp.csr_array(sp.vstack(parts, format="csr"))
-    whole.sort_indices()
-    return whole
+@cache
+def _codes(mj: Any) -> Any:
+    return read_only(np.array([int(getattr(mj.mjtConstraint, name)) for name in _CODES], np.int32))
 
 
-def _blocks(mj: Any, model: Any, data: Any, dt: float) -> tuple[Cones, list[str]]:
-    kinds = mj.mjtConstraint
-    m = int(data.nefc)
-    # An enumeration equals plain integers, not NumPy's.
-    types, ids = [int(x) for x in data.efc_type[:m]], [int(x) for x in data.efc_id[:m]]
-    loss = dt * np.array(data.efc_frictionloss[:m], float)
+def _mass(mj: Any, model: Any, data: Any) -> Any:
+    """(indptr, indices, data) of M's lower triangle."""
+    if hasattr(data, "M") and hasattr(model, "M_rownnz"):
+        first, count = model.M_rowadr, model.M_rownnz
+        n = len(first)
+        indptr = np.empty(n + 1, np.int32)
+        indptr[0] = 0
+        np.cumsum(count, out=indptr[1:])
+        if np.array_equal(indptr[:-1], first):
+            return indptr, np.array(model.M_colind, np.int32), np.array(data.M, float)
+    whole = np.zeros((int(model.nv), int(model.nv)))
+    if hasattr(data, "qM"):
+        mj.mj_fullM(model, whole, data.qM)
+    else:
+        mj.mj_fullM(model, data, whole)
+    return lower_of_dense(whole)[0]
+
+
+def _rows(mj: Any, model: Any, data: Any, m: int, n: int, scale: FloatArray) -> Any:
+    """(indptr, indices, data) of J, scaled by row."""
+    if not mj.mj_isSparse(model):
+        return export.rows_of_dense(np.ravel(data.efc_J), m, n, scale)
+    count = np.ascontiguousarray(data.efc_J_rownnz[:m], np.int32)
+    first = np.ascontiguousarray(data.efc_J_rowadr[:m], np.int32)
+    columns = np.ascontiguousarray(np.ravel(data.efc_J_colind), np.int32)
+    found = export.rows_of_sparse(np.ravel(data.efc_J), count, first, columns, scale)
+    if found is None:
+        whole = sp.csr_array(sp.diags_array(scale) @ jacobian(model, data))
+        whole.sort_indices()
+        found = (whole.indptr.astype(np.int32), whole.indices.astype(np.int32), whole.data)
+    return found
+
+
+def _compliance(data: Any, m: int) -> FloatArray:
+    """R (m,) [1/kg]: efc_R, and 1 / efc_D where a copy did not fill it."""
+    r, inverse = data.efc_R[:m], data.efc_D[:m]
+    if m and float(np.abs(r * inverse - 1.0).max()) > 1e-9:
+        empty = r == 0.0
+        if np.any(inverse <= 0.0) or np.any(np.abs(r * inverse - 1.0)[~empty] > 1e-9):
+            raise CapabilityError(
+                "efc_R and 1 / efc_D disagree: the softness of these constraints is not known. Run mj_forward on "
+                "this MjData, or copy both from where the step ran"
+            )
+        return np.where(empty, 1.0 / inverse, r)
+    return r
+
+
+def _check_smooth(model: Any, data: Any, mass: Any, smooth: Any) -> None:
+    """M a0 must be the smooth force: otherwise another matrix than M has made a0, and made the problem."""
+    gap = export.mass_mismatch(*mass, np.ascontiguousarray(smooth), np.ascontiguousarray(data.qfrc_smooth))
+    if not gap <= ROUNDING:
+        raise CapabilityError(
+            f"M qacc_smooth differs from qfrc_smooth by {gap:.1e} of their size: these data are not those of M. "
+            f"{_reason(model)}"
+        )
+
+
+def _check_forces(
+    model: Any, data: Any, general: Generalized, jac: Any, own: FloatArray, smooth: Any, dt: float
+) -> None:
+    """J (a - a0) must be J M^-1 J^T f, as far as MuJoCo's solver has come."""
+    if len(own) == 0 or int(model.opt.noslip_iterations) > 0:
+        return
+    gap = export.row_mismatch(*jac, np.ascontiguousarray(data.qacc - smooth), general.change(own) / dt)
+    if not gap <= UNSOLVED:
+        raise CapabilityError(
+            f"J (qacc - qacc_smooth) differs from J M^-1 J^T efc_force by {gap:.1e} of their size: the accelerations "
+            f"are not those of these forces. {_reason(model)}"
+        )
+
+
+def _reason(model: Any) -> str:
+    import mujoco as mj
+
+    word = mj.mjtIntegrator(int(model.opt.integrator)).name.removeprefix("mjINT_").lower()
+    return (
+        f"The option integrator={word!r} may put damping into M (use 'euler', 'implicitfast' or 'RK4' for the problem "
+        "with M itself), a solver with few iterations may have stopped early, or MjData was changed or copied in part "
+        "since its forward pass: run mj_forward"
+    )
+
+
+def _blocks(mj: Any, model: Any, data: Any, m: int, dt: float) -> tuple[Cones, FloatArray, Any]:
+    """Cones, factor of each row, key of each block."""
     contact = data.contact
-    lower, upper = np.full(m, -np.inf), np.full(m, np.inf)
-    first: list[int] = []
-    kind: list[int] = []
-    mu: list[float] = []
-    radius: list[float] = []
+    found = export.blocks(
+        np.ascontiguousarray(data.efc_type[:m], np.int32),
+        np.ascontiguousarray(data.efc_id[:m], np.int32),
+        _codes(mj),
+        np.ascontiguousarray(contact.dim, np.int32),
+        np.ascontiguousarray(contact.friction, float).reshape(-1, 5),
+        np.ascontiguousarray(contact.geom, np.int32).reshape(-1, 2),
+        np.ascontiguousarray(data.efc_frictionloss[:m], float),
+        dt,
+    )
+    if isinstance(found, int):
+        raise CapabilityError(
+            f"constraint row {found} is of type {data.efc_type[found]}, which is not known here"
+        )
+    ptr, kind, lower, upper, mu, scale, key = found
+    return Cones._trusted(ptr, kind, lower, upper, mu, np.zeros(len(mu))), scale, key
+
+
+def _names(mj: Any, model: Any, data: Any, m: int, count: int) -> Names:
+    # What names depend on is copied now, for the data go on; words are made when they are asked for.
+    types, ids = np.array(data.efc_type[:m]), np.array(data.efc_id[:m])
+    geom, dim = np.array(data.contact.geom), np.array(data.contact.dim)
+    return Names(count, lambda: _words(mj, model, types.tolist(), ids.tolist(), geom, dim))
+
+
+def _words(mj: Any, model: Any, types: list[int], ids: list[int], geom: Any, dim: Any) -> list[str]:
+    kinds = mj.mjtConstraint
     names: list[str] = []
     i = 0
-    while i < m:
+    while i < len(types):
         of, which = types[i], ids[i]
-        size, what, friction, patch = 1, ROW, 0.0, 0.0
+        size = 1
         if of == kinds.mjCNSTR_EQUALITY:
-            while i + size < m and types[i + size] == of and ids[i + size] == which:
+            while i + size < len(types) and types[i + size] == of and ids[i + size] == which:
                 size += 1
-            name = _name(mj, model, "EQUALITY", which, "equality")
-        elif of in (kinds.mjCNSTR_FRICTION_DOF, kinds.mjCNSTR_FRICTION_TENDON):
-            lower[i], upper[i] = -loss[i], loss[i]
-            if of == kinds.mjCNSTR_FRICTION_DOF:
-                joint = int(model.dof_jntid[which])
-                name = f"friction of {_name(mj, model, 'JOINT', joint, 'joint')}"
-                axis = which - int(model.jnt_dofadr[joint])
-                name += f", axis {axis}" if int(model.jnt_type[joint]) < int(mj.mjtJoint.mjJNT_SLIDE) else ""
-            else:
-                name = f"friction of {_name(mj, model, 'TENDON', which, 'tendon')}"
+            names.append(_name(mj, model, "EQUALITY", which, "equality"))
+        elif of == kinds.mjCNSTR_FRICTION_DOF:
+            joint = int(model.dof_jntid[which])
+            axis = which - int(model.jnt_dofadr[joint])
+            turns = int(model.jnt_type[joint]) < int(mj.mjtJoint.mjJNT_SLIDE)
+            names.append(f"friction of {_name(mj, model, 'JOINT', joint, 'joint')}{f', axis {axis}' * turns}")
+        elif of == kinds.mjCNSTR_FRICTION_TENDON:
+            names.append(f"friction of {_name(mj, model, 'TENDON', which, 'tendon')}")
         elif of in (kinds.mjCNSTR_LIMIT_JOINT, kinds.mjCNSTR_LIMIT_TENDON):
-            lower[i] = 0.0
             word = "joint" if of == kinds.mjCNSTR_LIMIT_JOINT else "tendon"
-            name = f"limit of {_name(mj, model, word.upper(), which, word)}"
+            names.append(f"limit of {_name(mj, model, word.upper(), which, word)}")
         else:
-            name = _contact_name(mj, model, contact, which)
-            if of == kinds.mjCNSTR_CONTACT_FRICTIONLESS:
-                what = CONTACT
-            elif of == kinds.mjCNSTR_CONTACT_PYRAMIDAL:
-                # An edge each: J_n + mu_j J_j and J_n - mu_j J_j, j = 1 ... condim - 1.
-                edges = 2 * (int(contact.dim[which]) - 1)
-                lower[i : i + edges] = 0.0
-                for edge in range(edges):
-                    first.append(i + edge)
-                    names.append(f"{name}, edge {edge}")
-                kind += [ROW] * edges
-                mu += [0.0] * edges
-                radius += [0.0] * edges
-                i += edges
-                continue
+            name = _contact_name(mj, model, geom[which], which)
+            if of == kinds.mjCNSTR_CONTACT_PYRAMIDAL:
+                size = 2 * (int(dim[which]) - 1)
+                names += [f"{name}, edge {edge}" for edge in range(size)]
             else:
-                size = int(contact.dim[which])
-                what = CONTACT_SPIN if size == 4 else CONTACT
-                friction, patch = _friction(np.array(contact.friction[which], float), size, name)
-        first.append(i)
-        kind.append(what)
-        mu.append(friction)
-        radius.append(patch)
-        names.append(name)
+                size = int(dim[which]) if of == kinds.mjCNSTR_CONTACT_ELLIPTIC else 1
+                names.append(name)
         i += size
-    ptr = np.array([*first, m], np.int32)
-    return Cones(ptr, np.array(kind, np.int32), lower, upper, np.array(mu), np.array(radius)), names
-
-
-def _friction(friction: FloatArray, size: int, name: str) -> tuple[float, float]:
-    # mu and patch radius [m]: MuJoCo's torsional coefficient is a length already multiplied by mu.
-    if size > 4:
-        raise CapabilityError(
-            f"{name} has rolling friction (condim {size}), which has no block here: use condim 1, 3 or 4, or "
-            "cone='pyramidal', whose edges are plain rows"
-        )
-    if friction[0] != friction[1]:
-        raise CapabilityError(
-            f"{name} has two coefficients of friction, {friction[0]:g} and {friction[1]:g}; a disk has one: give "
-            "the pair equal ones, or use cone='pyramidal', whose edges are plain rows"
-        )
-    return float(friction[0]), float(friction[2] / friction[0]) if size == 4 else 0.0
+    return names
 
 
 def _name(mj: Any, model: Any, kind: str, which: int, word: str) -> str:
@@ -262,7 +370,7 @@ def _name(mj: Any, model: Any, kind: str, which: int, word: str) -> str:
     return f"{word} {given or which}"
 
 
-def _contact_name(mj: Any, model: Any, contact: Any, which: int) -> str:
-    geoms = [int(g) for g in contact.geom[which]]
+def _contact_name(mj: Any, model: Any, geom: Any, which: int) -> str:
+    geoms = [int(g) for g in geom]
     sides = [_name(mj, model, "GEOM", g, "geom").removeprefix("geom ") if g >= 0 else "flex" for g in geoms]
     return f"contact {which} ({sides[0]}, {sides[1]})"

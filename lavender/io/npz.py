@@ -250,7 +250,13 @@ def write(problem: Problem, path: str | os.PathLike[str], *, impulse: Any = None
         arrays["key"] = problem.key
     if impulse is not None:
         arrays["impulse"] = problem.impulse_array(impulse)
-    meta = {"operator": operator, "friction": problem.friction, "name": problem.name, "names": problem.names}
+    names = None if problem.names is None else list(problem.names)
+    meta: dict[str, Any] = {
+        "operator": operator,
+        "friction": problem.friction,
+        "name": problem.name,
+        "names": names,
+    }
     if problem.generalized is not None:
         meta["dof_names"] = problem.generalized.names
     arrays["meta"] = np.frombuffer(json.dumps(meta).encode("ascii"), np.uint8)
