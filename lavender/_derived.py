@@ -7,6 +7,7 @@ from threading import RLock
 from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TypeVar, overload
 
 if TYPE_CHECKING:
+    from lavender.motion.reference import Kept
     from lavender_ext.judge.measure import Judged
 
 T = TypeVar("T")
@@ -28,14 +29,16 @@ class Derived:
     None work out the same numbers, to the bit.
     """
 
-    __slots__ = ("judged", "lock", "spread", "start_relative", "tried")
+    __slots__ = ("judged", "lock", "motion", "nothing", "spread", "start_relative", "tried")
 
     def __init__(self) -> None:
         self.lock = RLock()  # held while a `once` is worked out
         self.start_relative: float | None = None  # -, of doing nothing
+        self.nothing: bool | None = None  # whether doing nothing is right
         self.judged: Judged | None = None  # the judge's pass over a result that is about to be returned
         self.tried: Tried | None = None
         self.spread: int | None = None  # how far apart blocks that share a body stand
+        self.motion: Kept | None = None  # the reference that motion errors are told from, and its operator
 
 
 class once(Generic[T]):

@@ -37,6 +37,7 @@ AGREES = "agrees"
 AGREES_UNCOMPARED = "solved, nothing to compare with"
 PROVED = "no solution, as proved"
 NOT_SOLVED = "not solved"
+NOTHING = "nothing to do"
 CONTRADICTED = "claim contradicted"
 BREACH = "breach: a residual is computed wrongly"
 REFUSED = "refused"
@@ -298,6 +299,9 @@ def _compare(problem: Problem, name: str, solution: Solution, optimum: Solution 
         )
     if solution.status is Status.INFEASIBLE:  # its certificate holds, or the claim would be contradicted
         return CrossCheckRow(name, PROVED, note=note, **shared)
+    if r.nothing_to_do:
+        units = f"{r.velocity:.1e} m/s, {r.energy:.1e} sqrt(J)"
+        return CrossCheckRow(name, NOTHING, note=f"{units}; {note}".rstrip("; "), **shared)
     if not (solution.success or r.relative <= 2.0 * r.floor):
         return CrossCheckRow(name, NOT_SOLVED, note=note, **shared)
     return CrossCheckRow(name, AGREES if "allowed" in shared else AGREES_UNCOMPARED, note=note, **shared)

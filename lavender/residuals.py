@@ -27,7 +27,9 @@ from lavender.errors import InputError
 from lavender.problem import Problem
 from lavender_ext.judge import measure
 
-__all__ = ["Residual", "residual"]
+__all__ = ["Residual", "nothing_to_do", "residual"]
+
+AT_REST = 1e-9  # m/s, V0 below which nobody could tell doing nothing from a solution
 
 
 @dataclass(frozen=True)
@@ -49,6 +51,11 @@ class Residual:
     def at_floor(self) -> bool:
         """Within twice what float64 allows; a floor that is not finite allows nothing."""
         return at_floor(self.relative, self.floor)
+
+    @property
+    def nothing_to_do(self) -> bool:
+        """Doing nothing is right (see `nothing_to_do`): neither solved nor failed, read `energy` and `velocity`."""
+        return nothing_to_do(self._problem)
 
     @property
     def worst_name(self) -> str:
@@ -105,6 +112,20 @@ def reference(problem: Problem) -> tuple[float, float]:
         if problem.generalized is not None and "csr_data" in problem.__dict__:
             problem.csr_data.set_start(data.start_energy, data.start_velocity)
     return data.start_energy, data.start_velocity
+
+
+def nothing_to_do(problem: Problem) -> bool:
+    """Whether doing nothing is right: E0 <= 2^-48 of the energy norm of b, or V0 < 1e-9 m/s.
+
+    Such a problem is neither solved nor failed by anybody. Relative to nothing, rounding is everything: a residual of
+    it means something in units alone.
+    """
+    kept = problem.derived
+    if kept.nothing is None:
+        m = problem.m
+        energy, velocity, *_ = measure.judge(problem.data, problem._start, np.empty(m), np.empty(m), False)
+        kept.nothing = bool(energy <= 2.0**-48 * measure.rhs_norms(problem.data)[0] or velocity < AT_REST)
+    return kept.nothing
 
 
 def judged(problem: Problem, impulse: FloatArray) -> measure.Judged:

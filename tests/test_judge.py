@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from random_problems import as_matrix, random_contact_problem, random_lcp, seeds
 
 import lavender as lv
+from lavender import residuals
 from lavender.certificates import check_certificate
 from lavender.measures import natural_map, qp_residual
 from lavender.residuals import judged, known, remember
@@ -495,3 +496,34 @@ def test_a_remembered_result_serves_its_own_impulse_alone():
     assert known(problem, other) is None
     remember(problem, judged(problem, other))
     assert known(problem, other) == fresh[1].relative
+
+
+# -- nothing to do ----------------------------------------------------------------------------------
+
+
+def test_where_doing_nothing_is_right_nobody_solves_and_nobody_fails():
+    a = np.diag([1.0, 2.0])
+    for b, nothing in (
+        ([-1.0, -2.0], True),  # separating: zero is the solution
+        ([1e-10, -1.0], True),  # below a nanometre per second
+        ([2e-9, -1.0], False),
+        ([1.0, 0.0], False),
+    ):
+        p = lv.Problem.lcp(a, b)
+        assert residuals.nothing_to_do(p) is nothing
+        assert lv.residual(p, [0.0, 0.0]).nothing_to_do is nothing
+    # In the unit of speed, whatever the masses: V0 is a velocity.
+    assert residuals.nothing_to_do(lv.Problem.lcp(1e12 * a, [1e-10, -1.0]))
+    assert not residuals.nothing_to_do(lv.Problem.lcp(1e-12 * a, [2e-9, -1.0]))
+    # Doing nothing is zero clipped to the bounds.
+    assert residuals.nothing_to_do(lv.Problem.lcp(a, [0.0, 0.0], lower=1.0))
+    assert not residuals.nothing_to_do(lv.Problem.lcp(a, [0.0, 5.0], lower=1.0))
+    assert residuals.nothing_to_do(lv.Problem.lcp(np.zeros((0, 0)), []))
+
+
+def test_cross_check_neither_agrees_nor_fails_where_there_is_nothing_to_do():
+    table = lv.cross_check(lv.Problem.lcp(np.eye(2), [-1.0, -1.0]), ["pgs", "direct"])
+    assert [row.verdict for row in table] == ["nothing to do"] * 2
+    assert "m/s" in table["pgs"].note
+    assert table.ok
+    assert table.agreed == ()

@@ -19,11 +19,12 @@ from typing import Any
 from lavender import registry
 from lavender.bench import machine
 from lavender.bench.cases import Item, Source, describe, resolve
+from lavender.bench.moved import with_motion
 from lavender.bench.plan import Plan
 from lavender.bench.record import CaseInfo, Done, Record, Skip
 from lavender.bench.runner import Event, Watch, _not_loaded, is_foreign, solver_names
 from lavender.bench.store import Records, Store
-from lavender.bench.timing import Task, measure, one_thread
+from lavender.bench.timing import Task, measure_impulse, one_thread
 from lavender.bench.worker import Worker
 from lavender.errors import InputError, LavenderError
 from lavender.problem import Problem
@@ -311,9 +312,10 @@ def _work(pair: Pair, plan: CampaignPlan, run: str) -> tuple[int, list[Any]]:
         if is_foreign(spec):
             if _worker is None:
                 _worker = Worker()
-            record = _without_times(_worker.measure(replace(problem, copy=False), task))
+            record, impulse = _worker.measure_impulse(replace(problem, copy=False), task)
         else:
-            record = _without_times(measure(problem, replace(task, time_limit=math.inf)))
+            record, impulse = measure_impulse(problem, replace(task, time_limit=math.inf))
+        record = _without_times(with_motion(record, problem, impulse) if plan.motion else record)
         record = replace(record, time_limit=plan.time_limit)
         entries.append(record)
 

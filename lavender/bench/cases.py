@@ -18,6 +18,7 @@ from lavender.bench.record import CaseInfo, file_name
 from lavender.cones import ROW
 from lavender.errors import InputError, LavenderError
 from lavender.problem import Problem
+from lavender.residuals import nothing_to_do
 from lavender.suite import Case
 
 __all__ = ["SUFFIXES", "Item", "describe", "resolve", "sequence", "steps_in", "structure_of"]
@@ -215,6 +216,7 @@ def describe(item: Item, run: str) -> CaseInfo:
         reason=item.reason,
         sequence=item.sequence,
         step=item.step,
+        nothing_to_do=nothing_to_do(p),
     )
 
 

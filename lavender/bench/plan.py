@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -16,6 +16,8 @@ from lavender.registry import SolverSpec
 
 __all__ = ["Plan"]
 
+# A speed level: the residual that is asked for first, the tightest, and how often a tighter one is tried.
+FIRST_TOL, LAST_TOL, SPEED_TRIES = 1e-2, 1e-13, 6
 UNLIMITED = 10_000_000  # iterations of a run to a tolerance: the time limit ends it first
 
 
@@ -35,6 +37,9 @@ class Plan:
     warm : also start from the problem's guess, where it has one
     orders : sweep orders beside "given", each at the middle budget, for solvers that take an order;
         "random:3" is random with seed 3
+    motion : tell how wrong the bodies move, by a reference that is solved for once a case
+    speed_levels : m/s, motion errors to reach; implies `motion`. Each solver is asked for the residual that takes it
+        there: again and tighter while it misses, at most `SPEED_TRIES` times a level
 
     Raises
     ------
@@ -52,9 +57,15 @@ class Plan:
     warm: bool = True
     orders: Sequence[str] = ("reverse", "symmetric", "random:0", "random:1", "random:2")
     campaign: bool = False
+    motion: bool = False
+    speed_levels: Sequence[float] = ()
 
     def __post_init__(self) -> None:
-        for name, values in (("level", self.levels), ("budget", self.budgets)):
+        for name, values in (
+            ("level", self.levels),
+            ("budget", self.budgets),
+            ("speed level", self.speed_levels),
+        ):
             for value in values:
                 if not (math.isfinite(value) and value > 0):
                     raise InputError(f"{name} {value} must be a positive number")
@@ -77,6 +88,8 @@ class Plan:
         object.__setattr__(self, "levels", tuple(sorted(map(float, self.levels), reverse=True)))
         object.__setattr__(self, "budgets", tuple(sorted(map(int, self.budgets))))
         object.__setattr__(self, "orders", tuple(self.orders))
+        object.__setattr__(self, "speed_levels", tuple(sorted(map(float, self.speed_levels), reverse=True)))
+        object.__setattr__(self, "motion", self.motion or bool(self.speed_levels))
 
     def as_dict(self) -> dict[str, Any]:
         """For the description of a run."""
@@ -109,6 +122,8 @@ class Plan:
                     and (spec.resumable or _hopeless(record))
                 ):
                     break
+            if not spec.exact:
+                yield from self._to_speeds(task, spec, start)
             if spec.resumable and not spec.exact:
                 for n in self.budgets:
                     yield task("budget", 0.0, n, start)
@@ -120,6 +135,22 @@ class Plan:
                     continue  # without bodies nobody knows the ground
                 more = {"seed": int(seed)} if seed else {}
                 yield task("budget", 0.0, middle, "cold", order=name, **more)
+
+    def _to_speeds(self, task: Callable[..., Task], spec: SolverSpec, start: str) -> Iterator[Task | None]:
+        """Solves to each speed level: the motion error follows the residual by a factor that the last solve tells."""
+        tol = FIRST_TOL
+        last: Record | None = None
+        for level in self.speed_levels:
+            for _ in range(SPEED_TRIES):
+                if last is not None:
+                    speed = math.inf if last.motion_speed is None else last.motion_speed
+                    if speed <= level:
+                        break
+                    # Neither this level nor a tighter one: the residual was missed, or no motion error is known.
+                    if not (last.relative <= tol and speed < math.inf) or tol <= LAST_TOL:
+                        return
+                    tol = max(LAST_TOL, min(0.3 * tol, 0.5 * last.relative * level / speed))
+                last = yield task("tol", tol, UNLIMITED if spec.resumable else 0, start)
 
 
 def _hopeless(record: Record) -> bool:

@@ -73,6 +73,7 @@ class CaseInfo:
     reason: str = ""  # why the case is in the suite
     sequence: str = ""  # name of the sequence that this is a step of
     step: int = -1
+    nothing_to_do: bool = False  # doing nothing is right: nobody solves it, nobody fails
 
 
 @dataclass(frozen=True)
@@ -117,6 +118,9 @@ class Record:
     energy: float = math.inf  # sqrt J
     velocity: float = math.inf  # m/s
     floor: float = math.nan  # -
+    motion: float | None = None  # -, relative motion error; None where nobody asked, or where there is none
+    motion_speed: float | None = None  # m/s, of the body that is furthest off (row, without bodies)
+    bound: float | None = None  # sqrt J, proved bound of the motion error
     worst_row: int = -1
     worst_name: str = ""
     success: bool = False  # the judge: relative <= tol (a budget: false)
@@ -180,7 +184,7 @@ def from_json(line: Mapping[str, Any]) -> Entry:
         if f.name not in line:
             continue
         value = line[f.name]
-        if f.type == "float" and isinstance(value, str):
+        if f.type in ("float", "float | None") and isinstance(value, str):
             value = float(value)
         elif f.name == "structure":
             value = tuple(value)

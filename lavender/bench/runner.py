@@ -12,6 +12,7 @@ from lavender import registry
 from lavender._arrays import FloatArray
 from lavender.bench import machine
 from lavender.bench.cases import Item, Source, describe, resolve
+from lavender.bench.moved import with_motion
 from lavender.bench.plan import Plan
 from lavender.bench.record import CaseInfo, Record, Run, Skip, level_name
 from lavender.bench.sequences import carry, passes
@@ -254,6 +255,8 @@ class _Runner:
         if task.start == "carried":
             start = problem.start() if before is None else carry(*before, problem)
         record, impulse = self.make_impulse(problem, task, spec, start)
+        if self.plan.motion:
+            record = with_motion(record, problem, impulse)
         return record, None if impulse is None else (problem, impulse)
 
     def pair(self, info: CaseInfo, problem: Problem, name: str) -> None:
@@ -279,6 +282,9 @@ class _Runner:
             self.tell(info.case, name, record, found is not None)
 
     def make(self, problem: Problem, task: Task, spec: SolverSpec) -> Record:
+        if self.plan.motion:
+            record, impulse = self.make_impulse(problem, task, spec, None)
+            return with_motion(record, problem, impulse)
         if self.worker is not None and is_foreign(spec):
             return self.worker.measure(replace(problem, copy=False), task)
         return measure(problem, task)

@@ -8,9 +8,9 @@ lv.motions(problem).spread                             # m/s that Coulomb's law 
 """
 
 from lavender.motion.bound import Witness
-from lavender.motion.error import MotionError, measure, motion_error
+from lavender.motion.error import MotionError, measure, motion_error, nearest
 from lavender.motion.reference import Reference, adopt, reference
-from lavender.motion.several import Motion, Motions, branch, distance, motions
+from lavender.motion.several import Motion, Motions, branch, distance, motions, motions_of
 from lavender.motion.unique import uniqueness
 
 __all__ = [
@@ -25,6 +25,8 @@ __all__ = [
     "measure",
     "motion_error",
     "motions",
+    "motions_of",
+    "nearest",
     "reference",
     "uniqueness",
 ]

@@ -125,9 +125,9 @@ def motion_error(problem: Problem, impulse: Any, reference: Any = None) -> Motio
         return measure(problem, x, as_reference(problem, reference))
     if problem.law != "coulomb":
         return measure(problem, x, reference_of(problem))
-    from lavender.motion.several import motions
+    from lavender.motion.several import motions_of
 
-    return nearest(problem, x, kept(problem).motions or motions(problem))
+    return nearest(problem, x, motions_of(problem))
 
 
 def nearest(problem: Problem, x: FloatArray, found: Motions) -> MotionError:

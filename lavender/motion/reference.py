@@ -61,12 +61,12 @@ class Kept:
 
 def kept(problem: Problem) -> Kept:
     """What is kept with a problem, made when first asked for."""
-    own = problem.__dict__.get("_motion")
-    if own is None:
-        operator = operators.make(problem)
-        own = problem.__dict__["_motion"] = Kept(operator, operator.refusal() or "")
-    state: Kept = own
-    return state
+    with problem.derived.lock:
+        own = problem.derived.motion
+        if own is None:
+            operator = operators.make(problem)
+            own = problem.derived.motion = Kept(operator, operator.refusal() or "")
+        return own
 
 
 def reference(problem: Problem) -> Reference:

@@ -26,7 +26,7 @@ from lavender.registry import available, get
 from lavender.residuals import residual
 from lavender.solve import solve
 
-__all__ = ["CHOICES", "Motion", "Motions", "Pick", "branch", "motions"]
+__all__ = ["CHOICES", "Motion", "Motions", "Pick", "branch", "motions", "motions_of"]
 
 RUNS = 12  # of a search, after `auto` itself
 SOLVERS = ("anderson", "newton", "sequential_impulses", "block_gauss_seidel", "admm", "nncg")
@@ -94,6 +94,9 @@ class Motions:
 
     def __len__(self) -> int:
         return len(self.motions)
+
+    def __bool__(self) -> bool:
+        return True  # also where none was found: the search has been
 
     def __getitem__(self, i: int) -> Motion:
         return self.motions[i]
@@ -226,6 +229,11 @@ def motions(problem: Problem, n: int = RUNS, seed: int = 0) -> Motions:
     )
     kept(problem).motions = result
     return result
+
+
+def motions_of(problem: Problem, n: int = RUNS) -> Motions:
+    """The motions that were searched already, whatever their number of runs, or a search of `n` runs."""
+    return kept(problem).motions or motions(problem, n)
 
 
 def branch(problem: Problem, impulse: Any) -> Reference:
