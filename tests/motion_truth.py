@@ -26,12 +26,28 @@ CLOSE = 1e-15  # of the problem's size: what a condition may miss in float64's l
 
 def wide_matrix(problem):
     """A (m, m) and its kinetic part in long double, of the numbers as they are stored."""
-    if problem.rows is None:
+    if problem.operator == "matrix":
         a = problem.dense().astype(WIDE)
         return (a + a.T) / 2, None
     jac = problem.jacobian.toarray().astype(WIDE)
+    if problem.generalized is not None:
+        moving = jac @ wide_solve(problem.generalized.mass.toarray(), jac.T)
+        return moving + np.diag(problem.compliance.astype(WIDE)), moving
     moving = jac @ problem.rows.inverse_mass_matrix().toarray().astype(WIDE) @ jac.T
     return moving + np.diag(problem.compliance.astype(WIDE)), moving
+
+
+def wide_solve(m, x):
+    """M^-1 x in long double, M positive definite, by elimination."""
+    m, x = m.astype(WIDE), x.astype(WIDE).copy()
+    for k in range(len(m)):
+        for i in range(k + 1, len(m)):
+            f = m[i, k] / m[k, k]
+            m[i] -= f * m[k]
+            x[i] -= f * x[k]
+    for k in reversed(range(len(m))):
+        x[k] = (x[k] - m[k, k + 1 :] @ x[k + 1 :]) / m[k, k]
+    return x
 
 
 def solve_wide(problem, a, b):

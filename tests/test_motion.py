@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given, settings
 from motion_truth import HAS_WIDE, project_cone, solve_wide, trial, wide_matrix
 from random_problems import as_matrix, random_contact_problem, random_lcp, seeds
+from test_generalized import random_general
 
 import lavender as lv
 from lavender import suite
@@ -252,6 +253,34 @@ def test_an_empty_problem_has_no_error():
     assert e.energy == 0.0
     assert e.bound == 0.0
     assert e.row_name == ""
+
+
+# -- generalised coordinates ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.skipif(not HAS_WIDE, reason="no long double beyond float64 here")
+def test_in_generalised_coordinates_kinetic_is_by_m_itself_and_the_bound_holds(seed):
+    p = random_general(seed, spin=seed % 2 == 1)
+    rng = np.random.default_rng(seed)
+    start = lv.motion_error(p, np.zeros(p.m))
+    assert start.relative == pytest.approx(1.0)
+    a, moving = wide_matrix(p)
+    y = start.reference.impulse
+    truth = solve_wide(p, a, p.b.astype(np.longdouble) + start.reference.witness.shift.astype(np.longdouble))
+    for scale in (1e-13, 1e-7, 1e-1):
+        x = y + scale * np.abs(y).max() * rng.normal(size=p.m)
+        e = lv.motion_error(p, x)
+        dv = p.generalized.change(x - y)
+        assert e.kinetic == pytest.approx(np.sqrt(0.5 * dv @ (p.generalized.mass @ dv)), rel=1e-6)
+        assert e.speed == pytest.approx(np.abs(dv).max(), rel=1e-9)
+        assert e.body_name == p.generalized.velocity_name(int(np.abs(dv).argmax()))
+        assert e.spin is None
+        if truth is not None:
+            delta = x - truth[0]
+            # 1e-14: the shift is stored in float64.
+            assert np.sqrt(delta @ a @ delta / 2) <= e.bound * (1 + 1e-14)
+            assert np.sqrt(delta @ moving @ delta / 2) <= e.bound * (1 + 1e-14)
 
 
 # -- several motions -----------------------------------------------------------------------------------

@@ -33,8 +33,8 @@ class MotionError:
     kinetic: float | None  # sqrt J, of the difference of body velocities; None where M is not known
     energy: float | None  # sqrt J, with what compliance stores
     relative: float | None  # -, over the same of the constraints' own motion M^-1 J^T lambda*
-    speed: float | None  # m/s, of the body that is furthest off
-    spin: float | None  # rad/s, of the body that is furthest off
+    speed: float | None  # m/s, of the body that is furthest off; m/s or rad/s of a generalised velocity
+    spin: float | None  # rad/s, of the body that is furthest off; None in generalised coordinates
     rows: float | None  # m/s (rad/s on angular rows), max |w - w*|
     body: int  # that of `speed`, -1 without one
     spin_body: int  # that of `spin`, -1 without one
@@ -54,8 +54,12 @@ class MotionError:
 
     @property
     def body_name(self) -> str:
-        """Name of the body that is furthest off, e.g. "body 3"; empty without one."""
-        return f"body {self.body}" if self.body >= 0 else ""
+        """Name of the body (the generalised velocity) that is furthest off, e.g. "body 3"; empty without one."""
+        return (
+            kept(self._problem).operator.name(self.body)
+            if self._problem is not None and self.body >= 0
+            else ""
+        )
 
     @property
     def row_name(self) -> str:
@@ -69,7 +73,9 @@ class MotionError:
         if self.kinetic is not None or self.energy is not None:
             parts.append(f"{self.kinetic if self.kinetic is not None else self.energy:.2e} sqrt(J)")
         if self.speed is not None:
-            parts.append(f"{self.body_name or 'bodies'} {self.speed:.2g} m/s, {self.spin:.2g} rad/s")
+            spin = "" if self.spin is None else f", {self.spin:.2g} rad/s"
+            unit = " m/s" if self.spin is not None else ""  # a generalised velocity is m/s or rad/s
+            parts.append(f"{self.body_name or 'bodies'} {self.speed:.2g}{unit}{spin}")
         if self.rows is not None:
             parts.append(f"{self.row_name or 'rows'} {self.rows:.2g} m/s")
         if self.bound is not None:
@@ -117,6 +123,8 @@ def motion_error(problem: Problem, impulse: Any, reference: Any = None) -> Motio
     ------
     InputError
         An impulse or reference of the wrong length, or one that is not finite.
+    CapabilityError
+        Generalised coordinates in which M couples more than 2000 velocities.
     """
     if not isinstance(problem, Problem):
         raise InputError(f"problem is a {type(problem).__name__}; a lavender.Problem is needed")
@@ -178,9 +186,12 @@ def measure(problem: Problem, x: FloatArray, reference: Reference) -> MotionErro
     )
     values |= {"body": -1, "spin_body": -1, "row": -1}
     velocity = operator.velocity(delta, U * np.abs(delta))
-    speed = spin = fast = swift = np.zeros(0)
+    speed = fast = np.zeros(0)
+    spin: FloatArray | None = None
+    swift: FloatArray | None = None
     if velocity is not None:
-        (speed, spin), (fast, swift) = (_lengths(v) for v in (velocity[0], np.abs(velocity[0]) + velocity[1]))
+        speed, spin = operator.lengths(velocity[0])
+        fast, swift = operator.lengths(np.abs(velocity[0]) + velocity[1])
     if energies:
         own = operator.size(reference.impulse, np.zeros(problem.m))
         values |= {"kinetic": size.kinetic, "energy": size.energy}
@@ -192,7 +203,8 @@ def measure(problem: Problem, x: FloatArray, reference: Reference) -> MotionErro
     if reference.accepted:
         if velocity is not None:
             values["body"], values["speed"] = _largest(speed)
-            values["spin_body"], values["spin"] = _largest(spin)
+            if spin is not None:
+                values["spin_body"], values["spin"] = _largest(spin)
         values["row"], values["rows"] = _largest(np.abs(operator.slack(delta)[0] + problem.b))
     proof = reference.witness
     if proof is None and not reference.refusal:
@@ -202,17 +214,13 @@ def measure(problem: Problem, x: FloatArray, reference: Reference) -> MotionErro
         reach = operator.reach(proof.radius)
         if reach is not None:
             values["bound_speed"] = float(fast.max(initial=0.0)) * (1.0 + 8.0 * U) + reach[0]
-            values["bound_spin"] = float(swift.max(initial=0.0)) * (1.0 + 8.0 * U) + reach[1]
+            if swift is not None and reach[1] is not None:
+                values["bound_spin"] = float(swift.max(initial=0.0)) * (1.0 + 8.0 * U) + reach[1]
     return MotionError(**values, reference=reference, note="; ".join(n for n in notes if n), _problem=problem)
 
 
 def _ratio(x: float, reference: float) -> float:
     return 0.0 if x == 0.0 else x / reference if reference > 0.0 else math.inf
-
-
-def _lengths(velocity: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Linear and angular speed (n,) of each body."""
-    return np.linalg.norm(velocity[:, :3], axis=1), np.linalg.norm(velocity[:, 3:], axis=1)
 
 
 def _largest(x: FloatArray) -> tuple[int, float]:

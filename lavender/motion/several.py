@@ -268,8 +268,7 @@ def compliant(problem: Problem) -> FloatArray:
 def softened(problem: Problem, share: float) -> Problem:
     """The problem with compliance `share` d [1/kg] added to every row."""
     soft = share * problem.d
-    if problem.rows is not None:
-        assert problem.compliance is not None
+    if problem.compliance is not None:
         return replace(problem, compliance=problem.compliance + soft, guess=None, copy=False)
     return replace(problem, matrix=sp.csr_array(problem.csr + sp.diags_array(soft)), guess=None, copy=False)
 
@@ -363,7 +362,7 @@ def distance(problem: Problem, x: FloatArray, y: FloatArray) -> Distance:
     delta, size = difference(operator, x, y)
     velocity = operator.velocity(delta, np.zeros(problem.m))
     rows = np.abs(operator.slack(delta)[0] + problem.b)
-    speed = rows if velocity is None else np.linalg.norm(velocity[0][:, :3], axis=1)
+    speed = rows if velocity is None else operator.lengths(velocity[0])[0]
     fastest = float(np.max(speed, initial=0.0))
     if own.refusal:
         far = float(np.max(rows, initial=0.0))
