@@ -49,39 +49,47 @@ def _disproof(problem: Problem, y: FloatArray) -> str | None:
     return f"A^T y reaches {np.abs(z).max(initial=0.0):.2e}, above rounding; impulses within the bounds can meet b.y"
 
 
+def _rims(problem: Problem, x: FloatArray) -> tuple[Any, Any, FloatArray, FloatArray]:
+    """Contact blocks and their normal rows; |x_t| over the tangents of each and |x_s| of its spin row, else 0."""
+    c = problem.cones
+    contact = np.flatnonzero(c.kind != ROW)
+    first = c.ptr[contact]
+    block = np.repeat(np.arange(c.n_blocks), np.diff(c.ptr))
+    place = np.arange(problem.m) - c.ptr[block]
+    tangent = (place > 0) & (place <= c.n_tangents[block])
+    rim = np.sqrt(np.bincount(block[tangent], x[tangent] ** 2, minlength=c.n_blocks)[contact])
+    spin = np.where(c.kind[contact] == CONTACT_SPIN, np.abs(x[c.ptr[contact + 1] - 1]), 0.0)
+    return contact, first, rim, spin
+
+
 def _pull(problem: Problem, z: FloatArray, zero: FloatArray) -> FloatArray:
     """Largest z_i lambda_i (m,) of each row within its bounds; of a contact's together, on its normal."""
     c = problem.cones
     bound = np.where(z > 0.0, c.upper, c.lower)
     pull = np.zeros(problem.m)
     np.multiply(z, bound, out=pull, where=z != 0.0)
-    for i in np.flatnonzero(c.kind != ROW):
-        j, end, nt = c.ptr[i], c.ptr[i + 1], int(c.n_tangents[i])
-        rim = float(np.linalg.norm(z[j + 1 : j + 1 + nt]))
-        if c.kind[i] == CONTACT_SPIN:
-            rim += c.patch_radius[i] * abs(z[end - 1])
-        pull[j:end] = 0.0
-        pull[j] = np.inf if z[j] + c.mu[i] * rim > zero[j] else 0.0
+    contact, first, rim, spin = _rims(problem, z)
+    pull[np.repeat(c.kind != ROW, np.diff(c.ptr))] = 0.0
+    most = z[first] + c.mu[contact] * (rim + c.patch_radius[contact] * spin)
+    pull[first] = np.where(most > zero[first], np.inf, 0.0)
     return pull
 
 
 def _recession_violation(problem: Problem, y: FloatArray) -> str | None:
     c = problem.cones
-    bad = ((y > 0.0) & np.isfinite(c.upper)) | ((y < 0.0) & np.isfinite(c.lower))
     contact_rows = np.repeat(c.kind != ROW, np.diff(c.ptr))
+    bad = ((y > 0.0) & np.isfinite(c.upper)) | ((y < 0.0) & np.isfinite(c.lower))
     bad[contact_rows] = False
     if bad.any():
         i = int(np.flatnonzero(bad)[0])
         return f"y[{i}] = {y[i]:.2e} leaves the bounds of {problem.row_name(i)}"
-    for k in np.flatnonzero(c.kind != ROW):
-        part = y[c.ptr[k] : c.ptr[k + 1]]
-        nt = int(c.n_tangents[k])
-        limit = c.mu[k] * part[0] * (1 + 1e-12)
-        spin = abs(part[-1]) if c.kind[k] == CONTACT_SPIN else 0.0
-        if problem.law == "coulomb" and part[1:].any():
-            return (
-                f"y is not along the normal of {problem.row_name(int(c.ptr[k]))}, as Coulomb friction needs"
-            )
-        if part[0] < 0.0 or np.linalg.norm(part[1 : 1 + nt]) > limit or spin > limit * c.patch_radius[k]:
-            return f"y leaves the cone of {problem.row_name(int(c.ptr[k]))}"
+    contact, first, rim, spin = _rims(problem, y)
+    limit = c.mu[contact] * y[first] * (1 + 1e-12)
+    if problem.law == "coulomb":
+        across = np.flatnonzero((rim > 0.0) | (spin > 0.0))
+        if len(across):
+            return f"y is not along the normal of {problem.row_name(int(first[across[0]]))}, as Coulomb friction needs"
+    out = np.flatnonzero((y[first] < 0.0) | (rim > limit) | (spin > limit * c.patch_radius[contact]))
+    if len(out):
+        return f"y leaves the cone of {problem.row_name(int(first[out[0]]))}"
     return None
