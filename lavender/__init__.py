@@ -20,6 +20,7 @@ from lavender.errors import (
     UnknownName,
 )
 from lavender.generalized import Generalized
+from lavender.many import solve_many
 from lavender.problem import Problem
 from lavender.redundancy import Redundancy, redundancy
 from lavender.registry import SolverSpec, available, get, known, register
@@ -103,6 +104,7 @@ __all__ = [
     "residual",
     "scene",
     "solve",
+    "solve_many",
     "suite",
 ]
 

@@ -88,6 +88,7 @@ class Suites(ManyValues):
     OWN = {  # noqa: RUF012 - a constant of the class
         "auto": "lavender.bench.regret:command",
         "motions": "lavender.bench.motions:command",
+        "mujoco": "lavender.bench.simulators:command",
         "kernels": "lavender.bench.kernels:command",
         "peers": "lavender.bench.peers:command",
         "stand": "lavender.bench.stand:command",

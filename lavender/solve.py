@@ -38,7 +38,7 @@ FRONT_DOOR = ("impulse", "tol", "max_iter", "time_limit", "history", "callback")
 
 def solve(
     problem: Problem,
-    solver: str,
+    solver: str = "auto",
     *,
     impulse: Any = None,
     tol: float = 1e-6,
@@ -48,7 +48,7 @@ def solve(
     callback: Callback | None = None,
     **options: Any,
 ) -> Solution:
-    """Solve a constraint problem with the solver of that name.
+    """Solve a constraint problem with the solver of that name, by default with what `auto` chooses.
 
     Parameters
     ----------
@@ -182,7 +182,7 @@ class Prepared:
         else:
             lam = problem.start() if problem.guess is None else problem.guess.copy()
         setup_time, self.setup_time = self.setup_time, 0.0
-        proof = _decide_empty_rows(problem, lam)
+        proof = decide_empty_rows(problem, lam)
         loop = _Loop(problem, self._solver, self._state, lam, tol, time_limit, history, callback)
         if proof is not None:
             claim = Claim(Status.INFEASIBLE, 0, {}, proof[0], certificate=proof[1])
@@ -448,7 +448,7 @@ def finish(
     )
 
 
-def _decide_empty_rows(problem: Problem, impulse: FloatArray) -> tuple[str, FloatArray] | None:
+def decide_empty_rows(problem: Problem, impulse: FloatArray) -> tuple[str, FloatArray] | None:
     """Rows of A that are all zero: put on the bound that b asks for, or prove that there is none."""
     cones = problem.cones
     for i in problem.metric.empty:

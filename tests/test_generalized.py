@@ -440,3 +440,38 @@ def test_the_judge_projects_on_round_cones_in_the_metric_of_d(seed):
     speeds = [d[0] * abs(e[0]), *(d[g[0]] * np.linalg.norm(e[g]) for g in groups)]
     np.testing.assert_allclose(found.velocity, max(speeds), rtol=1e-10)
     np.testing.assert_allclose(found.energy, np.sqrt(np.sum(d * e * e)), rtol=1e-10)
+
+
+# -- many at once -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("solver", ["auto", "newton"])
+@pytest.mark.parametrize("threads", [1, 2])
+def test_many_at_once_have_the_bits_of_one_by_one(solver, threads):
+    problems = [random_general(s, ["cone", "coulomb"][s % 2], compliance=s % 3 > 0) for s in range(12)]
+    problems.insert(3, as_matrix(problems[0]))  # one that does not go through the compiled loop
+    many = lv.solve_many(problems, solver, threads=threads, tol=1e-8)
+    assert len(many) == 13
+    for problem, found in zip(problems, many, strict=True):
+        one = lv.solve(copy.deepcopy(problem), solver, tol=1e-8)
+        assert found.impulse.tobytes() == one.impulse.tobytes()
+        assert (found.status, found.iterations, found.message) == (one.status, one.iterations, one.message)
+        assert dict(found.work) == dict(one.work)
+    assert [s.iterations for s in many[2:5]] == [many[i].iterations for i in (2, 3, 4)]
+
+
+def test_many_start_where_they_are_told():
+    problem = random_general(4, "cone")
+    cold = lv.solve(problem, tol=1e-9)
+    warm = lv.solve_many([problem, problem], impulses=[cold.impulse, None], tol=1e-8)
+    assert warm[0].iterations == 0
+    assert warm[1].iterations > 0
+    with pytest.raises(lv.InputError, match="1 impulses for 2"):
+        lv.solve_many([problem, problem], impulses=[None])
+    with pytest.raises(lv.InputError, match="threads is 0"):
+        lv.solve_many([problem], threads=0)
+    with pytest.raises(lv.UnknownName):
+        lv.solve_many([problem], "pgss")
+    with pytest.raises(lv.InputError):
+        lv.solve_many([3])
+    assert len(lv.solve_many([])) == 0

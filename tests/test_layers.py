@@ -25,7 +25,7 @@ LEVELS = [
     {"registry"},
     {"external", "solvers"},
     {"solve"},
-    {"check", "motion", "redundancy"},
+    {"check", "many", "motion", "redundancy"},
     {"scene"},
     {"engine"},
     {"suite"},

@@ -34,6 +34,7 @@ from lavender.residuals import at_floor, known, quick, reference
 from lavender.solution import Claim, Status
 from lavender.solvers._costs import ISLAND, LOOK, SWEEP_START, Costs, is_loose, islands_cost
 from lavender.solvers._islands import islands, restrict, rows_of
+from lavender.solvers._newton import general
 from lavender.solvers.newton import NewtonState
 
 LARGE = 4000  # rows from which friction goes through the relaxation
@@ -149,6 +150,15 @@ class Auto:
         self, state: Problem, impulse: FloatArray, n: int, tol: float, time_limit: float | None = None
     ) -> Claim:
         problem = state
+        if problem.generalized is not None and problem.m and n > 0:
+            # Newton over the velocities ends nearly all of them: nothing is looked at, and nothing noted, before.
+            lam = impulse.copy()
+            claim = general.run(
+                problem, general.prepare(problem), lam, min(n, general.CLOCK), tol, time_limit
+            )
+            if claim.status is Status.CONVERGED:
+                impulse[:] = lam
+                return general.named(claim, "auto")
         deadline = np.inf if time_limit is None else perf_counter() + time_limit
         trail = Trail(problem, tol, deadline)
         if problem.m == 0:

@@ -221,18 +221,21 @@ cdef class Data:
     contact_body, inv_mass, inv_inertia, compliance), or `general` = (core.generalized.Operator, compliance).
     """
 
-    def __init__(self, const int32_t[::1] ptr, const int32_t[::1] kind, const double[::1] lower,
-                 const double[::1] upper, const double[::1] mu, const double[::1] patch_radius,
-                 const double[::1] b, int law, csr=None, rows=None, general=None):
+    def __init__(self, ptr_, kind_, lower_, upper_, mu_, patch_radius_, b_, int law, csr=None, rows=None,
+                 general=None):
+        # Kept as they came: a view made an object again costs more than the view.
+        cdef const int32_t[::1] ptr = ptr_, kind = kind_
+        cdef const double[::1] lower = lower_, upper = upper_, mu = mu_, patch_radius = patch_radius_, b = b_
         cdef int32_t m = <int32_t>b.shape[0], k = <int32_t>kind.shape[0], n_empty, i
-        cdef double[::1] numbers = np.empty(3 * m + 3)
+        numbers_ = np.empty(3 * m + 3)
+        cdef double[::1] numbers = numbers_
         cdef double* d = &numbers[0]
         cdef double* nu = d + m + 1
         cdef double* step = nu + m + 1
         cdef int32_t[::1] empty = np.zeros(m + 1, np.int32)
         cdef const int32_t[::1] indptr, indices
         cdef const double[::1] data
-        self.keep = [ptr, kind, lower, upper, mu, patch_radius, b, numbers, csr, rows]
+        self.keep = [ptr_, kind_, lower_, upper_, mu_, patch_radius_, b_, numbers_, csr, rows]
         self.blocks.n_blocks = k
         self.blocks.n_rows = m
         self.blocks.law = law
@@ -271,7 +274,7 @@ cdef class Data:
                 self.csr.data = &data[0]
             n_empty = lav_csr_diagonal(&self.blocks, &self.csr, d, step, &empty[0])
             lav_matrix_nu(&self.blocks, nu)
-        self._numbers = numbers.base
+        self._numbers = numbers_
         self.empty = _read_only(np.flatnonzero(empty.base[:m])) if n_empty else _NONE
 
     def _set_general(self, general):
@@ -288,7 +291,8 @@ cdef class Data:
         head = 2 * n + 3 * (k + 1)
         room = 2 * <Py_ssize_t>operator.g.jptr[m] + 64
         while True:
-            whole = np.empty(head + room, np.int32)
+            whole_ = np.empty(head + room, np.int32)
+            whole = whole_
             count = panel_pattern(&self.general, k, self.blocks.ptr, &whole[0], &whole[2 * n], &whole[2 * n + k + 1],
                                   &whole[2 * n + 2 * (k + 1)], &whole[head], <int32_t>room, &n_cols, &values)
             if count >= 0:
@@ -296,8 +300,9 @@ cdef class Data:
             room = min(2 * room, 2147483647 - head)
         if values >= 2147483647.0:
             raise OverflowError(f"M^-1 J^T has {values:.3g} entries, more than 32-bit indices reach")
-        y = np.empty(<Py_ssize_t>values + 1)
-        self.keep += [general, whole, y]
+        y_ = np.empty(<Py_ssize_t>values + 1)
+        y = y_
+        self.keep += [general, whole_, y_]
         self._place = &whole[0]
         self.general.n_panels = count
         self.general.prow = &whole[2 * n]

@@ -1,5 +1,5 @@
 """Newton's method over generalised velocities for Python: islands, room, and one call that solves (`newton.pxd`)."""
-from libc.stdint cimport int32_t
+from libc.stdint cimport int32_t, int64_t
 
 import numpy as np
 
@@ -215,3 +215,44 @@ cdef class Newton:
             with nogil:
                 end = lav_general_newton(&self.f, &impulse[0], cold, soft)
         return end, (steps - self.f.steps, self.f.factorisations, self.f.updates, self.f.rounds, self.f.evaluations)
+
+
+def run_many(list kernels, list impulses, double tol, int steps, cold, double soft=1e-4):
+    """`Newton.run` on each impulse (m,) in turn, in one loop without the interpreter.
+
+    cold (n,) bool. Returns (n,) how each ended and (n, 5) what each took, as `run` does.
+    """
+    cdef Py_ssize_t i, n = len(kernels)
+    cdef Newton kernel
+    cdef double[::1] impulse
+    cdef double share
+    ends_ = np.zeros(n, np.int32)
+    counts_ = np.zeros((n, 5), np.int64)
+    flows_ = np.empty(n, np.intp)
+    places_ = np.empty(n, np.intp)
+    cdef int32_t[::1] ends = ends_
+    cdef int64_t[:, ::1] counts = counts_
+    cdef Py_ssize_t[::1] flows = flows_, places = places_
+    cdef const unsigned char[::1] is_cold = np.ascontiguousarray(cold, np.uint8)
+    cdef flow_t* f
+    for i in range(n):
+        kernel = kernels[i]
+        impulse = impulses[i]
+        share = 1.0 / (<double>kernel.f.n_islands) ** 0.5 if kernel.f.n_islands > 1 else 1.0
+        kernel.f.energy_limit = tol * kernel.data.start_energy * share
+        kernel.f.velocity_limit = tol * kernel.data.start_velocity
+        kernel.f.steps = steps
+        kernel.f.factorisations = kernel.f.updates = kernel.f.rounds = kernel.f.evaluations = 0
+        flows[i] = <Py_ssize_t>&kernel.f
+        places[i] = <Py_ssize_t>&impulse[0] if impulse.shape[0] else 0
+    with nogil:
+        for i in range(n):
+            f = <flow_t*>flows[i]
+            if places[i]:
+                ends[i] = lav_general_newton(f, <double*>places[i], is_cold[i], soft)
+                counts[i, 0] = steps - f.steps
+                counts[i, 1] = f.factorisations
+                counts[i, 2] = f.updates
+                counts[i, 3] = f.rounds
+                counts[i, 4] = f.evaluations
+    return ends_, counts_

@@ -6,6 +6,7 @@ One compiled call solves every island of trees; here stand the clock and the wor
 from __future__ import annotations
 
 from time import perf_counter
+from typing import Any
 
 import numpy as np
 
@@ -14,7 +15,9 @@ from lavender.problem import Problem
 from lavender.residuals import reference
 from lavender.solution import Claim, Status
 from lavender_ext.generalized.newton import ENDS, Newton
+from lavender_ext.generalized.newton import run_many as kernel_many
 
+FORM = "generalized velocities"
 CLOCK = 64  # steps between two looks at the clock and at Ctrl-C
 LIMIT = 3000  # velocities of one island up to which N is kept dense: 144 MB with its factor
 _STATUS = {
@@ -38,7 +41,7 @@ def run(
 ) -> Claim:
     """At most n Newton steps on `impulse`, in place, until the judge's test at tol is met."""
     deadline = np.inf if time_limit is None else perf_counter() + time_limit
-    cold = not impulse.any() or bool(np.array_equal(impulse, problem._start))
+    cold = _is_cold(problem, impulse)
     counts = np.zeros(5, np.int64)
     status = Status.MAX_ITERATIONS
     while counts[0] < n:
@@ -51,5 +54,36 @@ def run(
             status = Status.TIME_LIMIT
             break
         cold = False
-    work = {word: int(c) for word, c in zip(_WORDS, counts[1:], strict=True) if c or word == _WORDS[0]}
-    return Claim(status, int(counts[0]), work, form="generalized velocities")
+    return _claim(status, counts)
+
+
+def _claim(status: Status, counts: Any) -> Claim:
+    done, *parts = (int(c) for c in counts)
+    work = {word: c for word, c in zip(_WORDS, parts, strict=True) if c or word == _WORDS[0]}
+    return Claim(status, done, work, form=FORM)
+
+
+def run_many(
+    problems: list[Problem], kernels: list[Newton], impulses: list[FloatArray], tol: float
+) -> list[Claim | None]:
+    """`run` on each in one compiled loop, without a clock; the claim of those that converge, None for the others."""
+    cold = [_is_cold(p, lam) for p, lam in zip(problems, impulses, strict=True)]
+    ends, counts = kernel_many(kernels, impulses, tol, CLOCK, cold)
+    return [
+        _claim(Status.CONVERGED, count) if end == ENDS["done"] else None
+        for end, count in zip(ends.tolist(), counts.tolist(), strict=True)
+    ]
+
+
+def named(claim: Claim, solver: str) -> Claim:
+    """The claim as `newton` or `auto` makes it."""
+    if solver == "newton":
+        return claim
+    if claim.iterations == 0:
+        return Claim(claim.status, 0, {}, "the start is a solution")
+    done = ", ".join(f"{count} {kind}" for kind, count in claim.work.items() if count)
+    return Claim(claim.status, claim.iterations, claim.work, f"newton {done}")
+
+
+def _is_cold(problem: Problem, impulse: FloatArray) -> bool:
+    return not impulse.any() or bool(np.array_equal(impulse, problem._start))

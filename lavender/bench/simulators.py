@@ -1,0 +1,218 @@
+"""`lavender bench mujoco MODEL.xml ...`: our Newton and MuJoCo's on the steps of models that one has, in one run.
+
+Each model runs under random controls. At some of its steps the constraint problem is taken from memory and solved cold
+by both sides to the same judged residual:
+
+    MuJoCo   `mj_fwdConstraint` with the Newton solver, at the loosest tolerance whose answer the judge accepts
+    ours     `lavender.solve(problem)`: prepare, solve and judge; and the same in `solve_many`
+
+Construction of the problem, with M's factor, is apart, as `mj_factorM` is not counted either. Times are the least of
+several repetitions, taken in turns.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import click
+import numpy as np
+
+from lavender.bench.machine import cpu_name, versions
+from lavender.errors import LavenderError
+from lavender.io import mujoco as adapter
+from lavender.many import solve_many
+from lavender.problem import Problem
+from lavender.residuals import reference, residual
+from lavender.solve import solve
+
+TARGET = 1e-6  # judged relative residual that both sides must reach
+STRICT = 1e-9  # that ours is asked for besides
+TOLERANCES = (1e-2, 1e-4, 1e-6, 1e-8, 1e-10, 1e-12, 1e-15)  # of MuJoCo, loosest first
+CLASSES = ((0, 10), (10, 50), (50, 300), (300, 10**9))  # rows
+REPEATS = 5
+MANY = 8  # problems in one call of solve_many
+
+
+@dataclass(frozen=True)
+class Step:
+    """One problem, both sides; times in s, residuals relative."""
+
+    model: str
+    step: int
+    rows: int
+    nv: int
+    law: str
+    tolerance: float  # of MuJoCo, the loosest accepted; 0 where none was
+    engine: float
+    ours: float  # one call
+    many: float  # each in solve_many
+    kernel: float  # of one call, its solver alone
+    engine_residual: float
+    residual: float
+    strict: float  # residual of ours when asked for STRICT
+    coulomb: float | None  # the same under Coulomb's law; None where a contact has more than two tangents
+
+
+def fresh(problem: Problem) -> Problem:
+    """The same problem with nothing worked out of it."""
+    return replace(problem, copy=False)
+
+
+def least(run: Callable[[], Any], repeats: int = REPEATS) -> float:
+    """Least time of several runs [s]."""
+    best = np.inf
+    for _ in range(repeats):
+        start = perf_counter()
+        run()
+        best = min(best, perf_counter() - start)
+    return float(best)
+
+
+def engine_time(mj: Any, model: Any, data: Any, problem: Problem) -> tuple[float, float, float]:
+    """(tolerance, time, residual) of MuJoCo's Newton at the loosest tolerance that is accepted; else 0, its default."""
+    kept = model.opt.solver, model.opt.tolerance, model.opt.disableflags
+    default = kept[1]
+    model.opt.solver = mj.mjtSolver.mjSOL_NEWTON
+    model.opt.disableflags |= int(mj.mjtDisableBit.mjDSBL_WARMSTART)
+    found = 0.0, np.inf
+    try:
+        for tolerance in TOLERANCES:
+            model.opt.tolerance = tolerance
+            mj.mj_fwdConstraint(model, data)
+            found = tolerance, residual(problem, adapter.impulse(model, data)).relative
+            if found[1] <= TARGET:
+                break
+        else:
+            model.opt.tolerance = default
+            mj.mj_fwdConstraint(model, data)
+            found = 0.0, residual(problem, adapter.impulse(model, data)).relative
+        seconds = least(lambda: mj.mj_fwdConstraint(model, data), 4 * REPEATS)
+    finally:
+        model.opt.solver, model.opt.tolerance, model.opt.disableflags = kept
+    return found[0], seconds, found[1]
+
+
+def our_times(problem: Problem) -> tuple[float, float, float, float]:
+    """(one call, each of many, its kernel, residual), cold."""
+    start = problem.start()
+    one, kernel, found = np.inf, np.inf, np.inf
+    for _ in range(REPEATS):
+        made = fresh(problem)
+        begin = perf_counter()
+        solution = solve(made, tol=TARGET, impulse=start)
+        one = min(one, perf_counter() - begin)
+        kernel, found = min(kernel, solution.solve_time), solution.residual.relative
+    many = np.inf
+    for _ in range(REPEATS):
+        batch = [fresh(problem) for _ in range(MANY)]
+        begin = perf_counter()
+        for solution in solve_many(batch, tol=TARGET, impulses=[start] * MANY):
+            found = max(found, solution.residual.relative)
+        many = min(many, (perf_counter() - begin) / MANY)
+    return float(one), float(many), float(kernel), float(found)
+
+
+def measure(mj: Any, path: Path, steps: int, every: int, seed: int = 0) -> list[Step]:
+    """Steps of one model under random controls; those without constraints or nothing to do are left out."""
+    model = mj.MjModel.from_xml_path(os.fspath(path))
+    data = mj.MjData(model)
+    rng = np.random.default_rng(seed)
+    out: list[Step] = []
+    low, high = np.where(model.actuator_ctrllimited[:, None], model.actuator_ctrlrange, [-1.0, 1.0]).T
+    for step in range(20 * steps * every):
+        data.ctrl[:] = rng.uniform(low, high)
+        mj.mj_step(model, data)
+        if (step + 1) % every:
+            continue
+        mj.mj_forward(model, data)
+        if int(data.nefc) == 0:
+            continue
+        problem = adapter.from_mujoco(model, data, name=f"{path.stem} {step}")
+        if reference(problem)[1] < 1e-9:
+            continue
+        tolerance, engine, engine_residual = engine_time(mj, model, data, problem)
+        ours, many, kernel, found = our_times(problem)
+        strict = solve(fresh(problem), tol=STRICT, impulse=problem.start()).residual
+        coulomb = None
+        if not problem.cones.has_round:
+            under = solve(
+                problem.relaxed("coulomb"), tol=STRICT, impulse=problem.start(), time_limit=5.0
+            ).residual
+            coulomb = 0.0 if under.relative <= 2.0 * under.floor else under.relative
+        out.append(Step(
+            path.stem, step, problem.m, int(model.nv), problem.law, tolerance, engine, ours, many, kernel,
+            engine_residual, found, 0.0 if strict.relative <= 2.0 * strict.floor else strict.relative, coulomb,
+        ))  # fmt: skip
+        if len(out) == steps:
+            break
+    return out
+
+
+def _mean(x: Sequence[float]) -> float:
+    return float(np.exp(np.mean(np.log(x)))) if len(x) else float("nan")
+
+
+def table(steps: Sequence[Step]) -> str:
+    """Geometric means of ours / MuJoCo's by the number of rows, and what was solved, as Markdown."""
+    lines = [
+        "| rows | models | problems | MuJoCo [µs] | one call | `solve_many` | kernel alone | worst one call |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for low, high in CLASSES:
+        part = [s for s in steps if low <= s.rows < high]
+        if not part:
+            continue
+        name = f"under {high}" if low == 0 else f"{low} and more" if high > 10**6 else f"{low}-{high}"
+        worst = max(part, key=lambda s: s.ours / s.engine)
+        lines.append(
+            f"| {name} | {len({s.model for s in part})} | {len(part)} | {1e6 * _mean([s.engine for s in part]):.1f} "
+            f"| {_mean([s.ours / s.engine for s in part]):.2f} | {_mean([s.many / s.engine for s in part]):.2f} "
+            f"| {_mean([s.kernel / s.engine for s in part]):.2f} "
+            f"| {worst.ours / worst.engine:.1f} ({worst.model}, {worst.rows} rows) |"
+        )
+    convex = [s for s in steps if s.strict <= STRICT]
+    coulomb = [s for s in steps if s.coulomb is not None]
+    solved = sum(s.coulomb <= STRICT for s in coulomb if s.coulomb is not None)
+    never = sum(s.tolerance == 0.0 for s in steps)
+    lines += [
+        "",
+        (
+            f"{len(convex)} of {len(steps)} solved to {STRICT:.0e} or the floor of float64 under MuJoCo's own law, "
+            f"{solved} of {len(coulomb)} under Coulomb's (contacts of up to two tangents); {never} that MuJoCo brings "
+            f"to {TARGET:.0e} at no tolerance count with its default."
+        ),
+    ]
+    return "\n".join(lines)
+
+
+@click.command("mujoco")
+@click.argument("models", nargs=-1, required=True, type=click.Path(exists=True, path_type=Path))
+@click.option("--steps", default=10, show_default=True, help="problems of each model")
+@click.option("--every", default=20, show_default=True, help="steps of the simulator between two problems")
+@click.option("--out", type=click.Path(path_type=Path), help="every problem's numbers, JSON lines")
+def command(models: tuple[Path, ...], steps: int, every: int, out: Path | None) -> None:
+    """Our Newton and MuJoCo's on the steps of your own models (MJCF files), in one run."""
+    try:
+        import mujoco as mj
+    except ImportError:
+        raise click.UsageError("mujoco cannot be imported: pip install mujoco") from None
+    found: list[Step] = []
+    for path in models:
+        try:
+            new = measure(mj, path, steps, every)
+        except (ValueError, LavenderError) as error:  # MuJoCo's own word about a file is a ValueError
+            click.echo(f"{path.name}: left out: {str(error).splitlines()[0][:140]}", err=True)
+            continue
+        found += new
+        click.echo(f"{path.name}: {len(new)} problems", err=True)
+    if out is not None:
+        lines = [json.dumps({"cpu": cpu_name(), **versions(("mujoco", "numpy"))})]
+        lines += [json.dumps(asdict(s)) for s in found]
+        out.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    click.echo(table(found))
