@@ -83,10 +83,11 @@ class ManyValues(click.Command):
 
 
 class Suites(ManyValues):
-    """`lavender bench auto`, `kernels`, `peers`, `stand` are commands; other first words are files (or ./peers)."""
+    """`bench auto`, `gallery`, `kernels`, `peers`, `stand` are commands; other first words are files (or ./peers)."""
 
     OWN = {  # noqa: RUF012 - a constant of the class
         "auto": "lavender.bench.regret:command",
+        "gallery": "lavender.bench.endurance:command",
         "motions": "lavender.bench.motions:command",
         "mujoco": "lavender.bench.simulators:command",
         "kernels": "lavender.bench.kernels:command",
@@ -375,8 +376,8 @@ def bench(
     """As `report`, but only the records: a .jsonl file that `lavender report` shows later.
 
     `lavender bench peers` compares with other engines and solvers instead, `lavender bench stand` says how long towers
-    stand in each, `lavender bench auto` measures what auto loses against the best of our own solvers; see their own
-    --help.
+    stand in each, `lavender bench gallery` runs every scene for ten minutes, `lavender bench auto` measures what auto
+    loses against the best of our own solvers; see their own --help.
     """
     plan = _plan(files, levels, budgets, orders, repeats, time_limit)
     records, stopped = _measure(files, solvers, plan, out, memory, in_process)

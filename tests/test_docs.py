@@ -106,3 +106,29 @@ def test_pages_link_to_pages_that_exist():
         for target in re.findall(r"\]\(([\w/.-]+\.md)(?:#[\w-]+)?\)", page.read_text(encoding="utf-8")):
             if not target.startswith("generated/"):  # those are written, and checked, by the build
                 assert (page.parent / target).is_file(), f"{page.name} links to {target}"
+
+
+def test_the_chapter_names_examples_tests_and_functions_that_exist():
+    text = (ROOT / "docs" / "chapter.md").read_text(encoding="utf-8")
+    examples = set(re.findall(r"python (examples/\w+\.py)", text))
+    assert len(examples) == 11
+    assert examples <= {f"examples/{path.name}" for path in (ROOT / "examples").glob("*.py")}
+    figures = set(re.findall(r"figures/example-(\w+)\.svg", text))
+    assert figures and figures <= {path.stem for path in (ROOT / "examples").glob("*.py")}
+    named = re.findall(r"`(tests/\w+\.py)(?:::(\w+))?`", text)
+    assert len(named) > 12
+    for file, test in named:
+        source = (ROOT / file).read_text(encoding="utf-8")
+        assert not test or f"def {test}(" in source, f"{file}::{test}"
+    for function, file in (
+        ("prepare", "engine/substep.pyx"),
+        ("finish", "engine/substep.pyx"),
+        ("relax_contact_block", "core/rows.pxd"),
+    ):
+        assert f" {function}(" in (ROOT / "lavender_ext" / file).read_text(encoding="utf-8")
+        assert file in text
+
+
+def test_the_readme_lists_every_example():
+    listed = set(re.findall(r"`examples/(\w+\.py)`", (ROOT / "README.md").read_text(encoding="utf-8")))
+    assert listed == {path.name for path in (ROOT / "examples").glob("*.py")}
