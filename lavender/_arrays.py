@@ -66,12 +66,20 @@ def as_array(
             + ")"
         )
         raise InputError(f"{what} has shape {given.shape}; {wanted} is needed")
-    if dtype is np.int32 and given.size and (given.min() < -(2**31) or given.max() >= 2**31):
+    if dtype is np.int32 and given.size and (float(given.min()) < -(2**31) or float(given.max()) >= 2**31):
         raise InputError(f"{what} holds numbers beyond 32 bits")
+    if given.dtype.itemsize > 8:
+        given = _narrowed(given)
     array: np.ndarray = np.array(given, dtype, order="C") if copy else np.ascontiguousarray(given, dtype)
     if finite and array.dtype.kind == "f":
         _check_finite(what, array)
     return read_only(array)
+
+
+def _narrowed(wide: np.ndarray) -> np.ndarray:
+    # Long double as float64, rounded; what does not fit becomes infinite without a warning, and is told by its place.
+    with np.errstate(over="ignore", under="ignore"):
+        return wide.astype(np.float64)
 
 
 def _check_finite(what: str, array: np.ndarray) -> None:

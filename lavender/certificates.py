@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -32,6 +33,9 @@ def check_certificate(problem: Problem, y: Any) -> str | None:
 def _disproof(problem: Problem, y: FloatArray) -> str | None:
     if y.shape != (problem.m,) or not np.isfinite(y).all() or not np.any(y):
         return f"certificate of shape {y.shape} must be {problem.m} finite numbers, not all zero"
+    y = np.ldexp(
+        y, -math.frexp(float(np.abs(y).max()))[1]
+    )  # so that products with small entries of A do not vanish
     gain, most = float(problem.b @ y), float(np.abs(problem.b) @ np.abs(y))
     if not gain > 1e-10 * most:
         return f"b.y = {gain:.2e} is not positive"

@@ -187,6 +187,8 @@ def body_ranks(problem: Problem) -> IntArray:
 def local_order(problem: Problem) -> IntArray:
     """Blocks (k,), joints first, by the bodies they touch, numbered by `body_ranks`; a matrix: by its graph."""
     if problem.rows is None:
+        if problem.n_blocks == 0:
+            return np.zeros(0, np.int32)
         graph = sp.csr_matrix(_block_graph(problem))
         return np.ascontiguousarray(reverse_cuthill_mckee(graph, symmetric_mode=True), np.int32)
     rank = np.append(body_ranks(problem), np.int32(-1))

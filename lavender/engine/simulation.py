@@ -355,7 +355,7 @@ class Simulation:
         # no solver takes the prepared problem: the run ends here, at the body that finish() finds
         self._state.kernel.apply()
         if self._state.kernel.finish() == OK:
-            bodies = [*self._state.a["contact_pair"][0].tolist(), int(self._state.a["body_of"][0])]
+            bodies = [*self._state.a["contact_pair"][:1].ravel().tolist(), int(self._state.a["body_of"][0])]
             self._state.head[HEAD["lost"]] = next(i for i in bodies if self._state.a["dyn"][i] >= 0)
 
     def _solve_in_place(self) -> tuple[int, int] | None:
@@ -838,7 +838,11 @@ def _shares(problem: Problem, judged: Residual) -> dict[str, float]:
     part[: c.ptr[joints]] = 0
     part[c.ptr[:-1][contact]] = 1
     part[c.ptr[1:][c.kind == CONTACT_SPIN] - 1] = 3
-    energy = problem.d * judged.error**2
+    with np.errstate(invalid="ignore"):
+        size = np.sqrt(problem.d) * np.abs(judged.error)
+    top = float(size.max(initial=0.0))
+    # Over the largest, so that squares neither overflow nor vanish; what is infinite has no shares.
+    energy = (size / top) ** 2 if 0.0 < top < np.inf else np.zeros(problem.m)
     total = float(energy.sum())
     sums = np.bincount(part, weights=energy, minlength=4) if problem.m else np.zeros(4)
     return {name: float(x / total) if total > 0.0 else 0.0 for name, x in zip(PARTS, sums, strict=True)}

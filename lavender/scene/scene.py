@@ -432,11 +432,9 @@ class Scene:
             if anchor is not None or axis is not None:
                 raise InputError(f"{label} takes anchor_a and anchor_b, no anchor or axis")
             pa, pb = (self._anchor(label, i, p) for i, p in ((a, anchor_a), (b, anchor_b)))
-            length = (
-                float(np.linalg.norm(pb - pa))
-                if length is None
-                else number(f"length of {label} [m]", length, low=0.0)
-            )
+            with np.errstate(over="ignore"):
+                far = float(np.linalg.norm(pb - pa))
+            length = number(f"length of {label} [m]", far if length is None else length, low=0.0)
             if length == 0.0:
                 raise InputError(f"{label} has length 0; use a ball joint")
         else:
@@ -455,8 +453,8 @@ class Scene:
             name=label,
             a=a,
             b=b,
-            anchor_a=self._local(a, pa),
-            anchor_b=self._local(b, pb),
+            anchor_a=self._local(label, a, pa),
+            anchor_b=self._local(label, b, pb),
             axis_a=world_axis if a < 0 else self.bodies[a].direction_to_local(world_axis),
             axis_b=world_axis if b < 0 else self.bodies[b].direction_to_local(world_axis),
             length=length or 0.0,
@@ -480,8 +478,11 @@ class Scene:
             raise InputError(f"{label}: the world has no centre; give the anchor at its side")
         return self.bodies[body].position
 
-    def _local(self, body: int, point: FloatArray) -> FloatArray:
-        return point if body < 0 else self.bodies[body].to_local(point)
+    def _local(self, label: str, body: int, point: FloatArray) -> FloatArray:
+        if body < 0:
+            return point
+        with np.errstate(over="ignore", invalid="ignore"):
+            return numbers(f"anchor of {label}, seen from its body [m]", self.bodies[body].to_local(point), 3)
 
     # -- identity -------------------------------------------------------------------------------
 

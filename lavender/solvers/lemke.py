@@ -241,6 +241,8 @@ class _Run:
                 return claim
             if self.best <= max(GOOD, 2.0 * self.floor):
                 break
+            if self.pivots >= self.budget:
+                return self.claim(Status.MAX_ITERATIONS)
         return self.verdict()
 
     def follow(self, cover: FloatArray, tiny: float) -> Claim | None:

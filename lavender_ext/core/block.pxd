@@ -114,10 +114,21 @@ cdef inline void relax_tangents(double* lam, const double* w, double step, doubl
     lam[1] = y
 
 
+cdef inline double quotient(double w, double d) noexcept nogil:
+    # w / d; where it would vanish, the smallest number there is (normal, if w is), so that an error stays one.
+    cdef double x = w / d
+    if fabs(x) < 2.2250738585072014e-308 and w != 0.0:
+        if fabs(w) >= 2.2250738585072014e-308:
+            return -2.2250738585072014e-308 if w < 0.0 else 2.2250738585072014e-308
+        if x == 0.0:
+            return -5e-324 if w < 0.0 else 5e-324
+    return x
+
+
 cdef inline double row_error(double lam, double w, double d, double low, double high) noexcept nogil:
     # (5) as clip(w / d, lam - high, lam - low): lam - clip(lam - w / d) would cost digits where no bound acts,
     # and would not see a bound that is huge beside w / d.
-    return clip(w / d, lam - high, lam - low)
+    return clip(quotient(w, d), lam - high, lam - low)
 
 
 cdef inline void tangent_error(const double* lam, const double* w, double d, double radius,
@@ -126,8 +137,8 @@ cdef inline void tangent_error(const double* lam, const double* w, double d, dou
     if n == 1:
         e[0] = row_error(lam[0], w[0], d, -radius, radius)
     elif n == 2:
-        e[0] = w[0] / d
-        e[1] = w[1] / d
+        e[0] = quotient(w[0], d)
+        e[1] = quotient(w[1], d)
         x = lam[0] - e[0]
         y = lam[1] - e[1]
         r = norm2(x, y)
@@ -146,8 +157,45 @@ cdef inline void coulomb_error(const double* lam, const double* w, const double*
     if nt > 0:
         tangent_error(lam + 1, w + 1, d[1], bound, nt, e + 1)
     if spin:
-        bound = bound * patch_radius
+        bound = bound * patch_radius if bound < inf else mu * patch_radius * lam[0]     # inf * 0 would be no bound
         e[1 + nt] = row_error(lam[1 + nt], w[1 + nt], d[1 + nt], -bound, bound)
+
+
+cdef inline double opening(double mu, double rt, double rn) noexcept nogil:
+    # mu rt / rn, where the product alone may overflow; at most the largest number.
+    cdef double a = mu * rt / rn
+    if a <= 1.7976931348623157e308:
+        return a
+    a = mu * (rt / rn)
+    return a if a <= 1.7976931348623157e308 else 1.7976931348623157e308
+
+
+cdef inline double wide_part(double yn, double a, double t, double b) noexcept nogil:
+    # b (yn + a t) / (1 + a^2), where a^2 or a t may overflow
+    return (yn / a + t) * (b / a) if a > 1e140 else b * ((yn + a * t) / (1.0 + a * a))
+
+
+cdef inline double wide_cone(double yn, double at, double t, double as_, double ys, double* bound_t,
+                             double* bound_s) noexcept nogil:
+    """s of (7), a_t s and a_s s where a cone is so wide that a^2 overflows: s b is what keeps its digits, b the wider."""
+    cdef double b = at if at > as_ else as_
+    cdef double p = at / b, q = as_ / b, inv = 1.0 / b
+    cdef double sb = 0.0, c
+    if yn > 0.0:
+        sb = yn * b
+    c = wide_part(yn, at, t, b)
+    if c > sb:
+        sb = c
+    c = wide_part(yn, as_, ys, b)
+    if c > sb:
+        sb = c
+    c = (yn * inv + p * t + q * ys) / (inv * inv + p * p + q * q)
+    if c > sb:
+        sb = c
+    c = yn if yn > 0.0 and sb == yn * b else sb * inv
+    bound_t[0] = p * sb if at > 1e140 else at * c
+    bound_s[0] = q * sb if as_ > 1e140 else as_ * c
+    return c
 
 
 cdef inline void cone_error(const double* lam, const double* w, const double* d, double mu,
@@ -156,48 +204,55 @@ cdef inline void cone_error(const double* lam, const double* w, const double* d,
     # largest of the four candidates for s is the projection's normal part: three pieces of one
     # convex piecewise quadratic in s.
     cdef double rn = sqrt(d[0]), rt = 1.0, rs = 1.0, at = 0.0, as_ = 0.0
-    cdef double yn, y0 = 0.0, y1 = 0.0, ys = 0.0, t = 0.0, s, c, f
+    cdef double yn, y0 = 0.0, y1 = 0.0, ys = 0.0, t = 0.0, s, c, f, bound_t, bound_s
     cdef int32_t i, js = 1 + nt
-    yn = rn * (lam[0] - w[0] / d[0])
+    yn = rn * (lam[0] - quotient(w[0], d[0]))
     if nt > 0:
         rt = sqrt(d[1])
-        at = mu * rt / rn
-        y0 = rt * (lam[1] - w[1] / d[1])
+        at = opening(mu, rt, rn)
+        y0 = rt * (lam[1] - quotient(w[1], d[1]))
         if nt == 2:
-            y1 = rt * (lam[2] - w[2] / d[2])
+            y1 = rt * (lam[2] - quotient(w[2], d[2]))
         t = norm2(y0, y1)
     if spin:
         rs = sqrt(d[js])
         as_ = mu * patch_radius * rs / rn
-        ys = rs * (lam[js] - w[js] / d[js])
-    s = yn if yn > 0.0 else 0.0
-    c = (yn + at * t) / (1.0 + at * at)
-    if c > s:
-        s = c
-    c = (yn + as_ * fabs(ys)) / (1.0 + as_ * as_)
-    if c > s:
-        s = c
-    c = (yn + at * t + as_ * fabs(ys)) / (1.0 + at * at + as_ * as_)
-    if c > s:
-        s = c
+        if not as_ <= 1.7976931348623157e308:
+            as_ = opening(mu * (rs / rn), patch_radius, 1.0)
+        ys = rs * (lam[js] - quotient(w[js], d[js]))
+    if at > 1e140 or as_ > 1e140:
+        s = wide_cone(yn, at, t, as_, fabs(ys), &bound_t, &bound_s)
+    else:
+        s = yn if yn > 0.0 else 0.0
+        c = (yn + at * t) / (1.0 + at * at)
+        if c > s:
+            s = c
+        c = (yn + as_ * fabs(ys)) / (1.0 + as_ * as_)
+        if c > s:
+            s = c
+        c = (yn + at * t + as_ * fabs(ys)) / (1.0 + at * at + as_ * as_)
+        if c > s:
+            s = c
+        bound_t = at * s
+        bound_s = as_ * s
     # e = lam - Pi: w / d where the projection moves nothing.
-    e[0] = w[0] / d[0] if s == yn else lam[0] - s / rn
+    e[0] = quotient(w[0], d[0]) if s == yn else lam[0] - s / rn
     if nt > 0:
-        if t > at * s:
-            f = at * s / (t * rt)
+        if t > bound_t:
+            f = bound_t / (t * rt)
             e[1] = lam[1] - f * y0
             if nt == 2:
                 e[2] = lam[2] - f * y1
         else:
             for i in range(1, 1 + nt):
-                e[i] = w[i] / d[i]
+                e[i] = quotient(w[i], d[i])
     if spin:
-        if ys > as_ * s:
-            e[js] = lam[js] - as_ * s / rs
-        elif ys < -as_ * s:
-            e[js] = lam[js] + as_ * s / rs
+        if ys > bound_s:
+            e[js] = lam[js] - bound_s / rs
+        elif ys < -bound_s:
+            e[js] = lam[js] + bound_s / rs
         else:
-            e[js] = w[js] / d[js]
+            e[js] = quotient(w[js], d[js])
     if not (yn == yn and t == t and ys == ys):
         e[0] = yn + t + ys                              # NaN: comparisons above would hide it
 

@@ -131,6 +131,8 @@ cdef public int32_t lav_rows_diagonal(const blocks_t* p, const rows_t* r, double
             total += d[j] / p.n_rows
     mean = total * p.n_rows / n_positive if n_positive > 0 and total > 0.0 else 1.0
     for j in range(p.n_rows):
+        if d[j] != d[j]:
+            d[j] = 1.0 / 0.0                            # its products overflow: nothing measures it
         if not d[j] > 0.0:
             d[j] = mean
     for i in range(p.n_blocks):

@@ -11,7 +11,7 @@ A body whose inertia has a direction drifts by the midpoint rule at constant L [
 so the gyroscopic term costs nothing in angular momentum (kept to rounding) and O(h^2) in energy. Even
 inertia (spheres, cubes) needs (1) alone.
 """
-from libc.math cimport sqrt
+from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t
 
 from lavender_ext.core.rows cimport dot3
@@ -48,13 +48,22 @@ cdef inline void to_body(const double* r, const double* a, double* out) noexcept
 
 cdef inline void turn(double* q, const double* omega, double h) noexcept nogil:
     # (1)
+    cdef int32_t k
     cdef double w = q[0], x = q[1], y = q[2], z = q[3], s, f = 0.5 * h
     cdef double a = f * omega[0], b = f * omega[1], c = f * omega[2]
     q[0] = w - (a * x + b * y + c * z)
     q[1] = x + (a * w + b * z - c * y)
     q[2] = y + (b * w + c * x - a * z)
     q[3] = z + (c * w + a * y - b * x)
-    s = 1.0 / sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
+    s = q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]
+    if s > 1.7976931348623157e308:                      # a turn of 1e154 in one step: its squares overflow
+        s = 0.0
+        for k in range(4):
+            s = fabs(q[k]) if fabs(q[k]) > s else s
+        for k in range(4):
+            q[k] /= s                                   # infinity over infinity is told as lost
+        s = q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]
+    s = 1.0 / sqrt(s)
     q[0] *= s
     q[1] *= s
     q[2] *= s

@@ -171,7 +171,9 @@ def claims(spec, problem, solution):
     ):
         found = f"relative {r.relative:.3e} floor {r.floor:.3e}, in long double {j.relative:.3e}"
         yield "false claim", f"{name}: {status} accepted, {found}"
-    if (status == "FLOOR" or accepted) and not (math.isfinite(r.relative) and math.isfinite(r.floor)):
+    if (status == "FLOOR" or (accepted and not solution.success)) and not (
+        math.isfinite(r.relative) and math.isfinite(r.floor)
+    ):
         yield "false claim", f"{name}: {status} accepted with relative {r.relative} and floor {r.floor}"
     if finite and j.range < MODERATE:
         if not abs(r.relative - j.relative) <= 1e-6 * j.relative + j.allowed:
@@ -218,12 +220,12 @@ def check_steps(spec):
     yield from found
     if spec["again"]:
         COUNTS["repeated"] += 1
-        if play(scenes.build(spec), spec)[1] != first:
-            yield "changed bits", "stepped twice"
+        if play(scenes.build(spec), spec, quiet=True)[1] != first:
+            yield "changed bits", "stepped twice, without looking between steps"
 
 
-def play(scene, spec):
-    """Findings, and a hash of all that was seen."""
+def play(scene, spec, quiet=False):
+    """Findings, and a hash of all that was seen; `quiet` leaves out what must change nothing."""
     simulation = lv.Simulation(scene)
     seen, found = hashlib.sha256(), []
     kept = None
@@ -244,15 +246,19 @@ def play(scene, spec):
                 if terminated:
                     COUNTS["lost"] += 1
                     return found, seen.digest()
-        else:
+        elif not (quiet and word in CHANGES_NOTHING):
             try:
-                kept = do(simulation, word, action, kept, seen, found)
-            except REFUSED as error:
-                seen.update(type(error).__name__.encode())
+                kept = do(simulation, word, action, kept)
+            except REFUSED:
+                if word not in CHANGES_NOTHING:
+                    raise
     return found, seen.digest()
 
 
-def do(simulation, word, action, kept, seen, found):
+CHANGES_NOTHING = ("file", "problem", "residual")
+
+
+def do(simulation, word, action, kept):
     """One action beside steps; returns the snapshot that is kept."""
     if word == "sweeps":
         simulation.set_solver_iterations(action[1])
@@ -264,23 +270,17 @@ def do(simulation, word, action, kept, seen, found):
         simulation.restore(kept)
     elif word == "file":
         path = Path(FOLDER.name, f"{os.getpid()}.state")
-        before = simulation.snapshot()
         simulation.save(path)
         simulation.load(path)
-        after = simulation.snapshot()
-        if any(
-            getattr(before, x).tobytes() != getattr(after, x).tobytes()
-            for x in ("size", "real", "index", "keys")
-        ):
-            found.append(("changed bits", "a snapshot that was saved and loaded"))
     elif word == "problem":
         problem = simulation.constraint_problem()
         if problem.m:
-            seen.update(lv.solve(problem, "sequential_impulses", max_iter=4).impulse.tobytes())
+            lv.solve(problem, "sequential_impulses", max_iter=4)
     elif word == "residual":
         simulation.residual()
     elif word in ("reset", "reseed"):
         simulation.reset(*action[1:])
+        return None  # a scene that seeds shake is another one
     return kept
 
 
@@ -288,10 +288,8 @@ def look(observation, terminated, info, found):
     """Numbers that are not finite are told by `terminated`, in the step in which they appear."""
     state = [observation[key] for key in ("positions", "quaternions", "velocities")]
     finite = all(bool(np.isfinite(x).all()) for x in state)
-    if finite == terminated:
-        found.append(
-            ("false claim", f"terminated is {terminated}, the state is {'' if finite else 'not '}finite")
-        )
+    if not finite and not terminated:
+        found.append(("false claim", "the state is not finite, without terminated"))
     if not terminated:
         for key in ("solver", "joint_impulses"):
             if not np.isfinite(observation[key]).all():

@@ -17,6 +17,7 @@ L = np.longdouble
 ROW, CONTACT, CONTACT_SPIN = 0, 1, 2
 DENORMAL = L(2.0) ** -1074
 ZERO = L(0.0)
+LARGEST = L(1.7976931348623157e308)  # of an impulse in float64
 
 
 @dataclass
@@ -140,41 +141,40 @@ class Problem:
         return self.A @ lam - self.b
 
     def error(self, lam, w):
-        """e (m,), by the law."""
+        """e (m,), by the law; w / d as it is where no bound acts, since lam - (lam - w / d) has fewer digits."""
         e = np.zeros(self.m, L)
-        c, d = self.cones, self.d
+        c, step = self.cones, w / self.d
         for k in range(len(c["kind"])):
-            j, end = c["ptr"][k], c["ptr"][k + 1]
-            part = slice(j, end)
+            part = slice(c["ptr"][k], c["ptr"][k + 1])
             if c["kind"][k] == ROW:
                 low, high = np.array(c["lower"][part], L), np.array(c["upper"][part], L)
-                free = np.isinf(low) & np.isinf(high)
-                step = w[part] / d[part]
-                e[part] = np.where(free, step, lam[part] - np.clip(lam[part] - step, low, high))
-            elif self.law == "cone" and end - j > 1:
-                e[part] = lam[part] - self._cone(k, lam[part] - w[part] / d[part])
+                e[part] = np.minimum(np.maximum(step[part], lam[part] - high), lam[part] - low)
+            elif self.law == "cone" and c["ptr"][k + 1] - c["ptr"][k] > 1:
+                e[part] = self._cone(k, lam[part], step[part])
             else:
-                e[part] = lam[part] - self._coulomb(k, lam[part], lam[part] - w[part] / d[part])
+                e[part] = self._coulomb(k, lam[part], step[part])
         return e
 
-    def _coulomb(self, k, lam, y):
+    def _coulomb(self, k, lam, step):
         c, nt = self.cones, self.tangents(k)
-        out = np.zeros_like(y)
-        out[0] = max(ZERO, y[0])
+        e = step.copy()
+        e[0] = min(step[0], lam[0])
         rim = L(c["mu"][k]) * max(ZERO, lam[0])
         if nt:
-            size = np.sqrt(y[1 : 1 + nt] @ y[1 : 1 + nt])
-            out[1 : 1 + nt] = y[1 : 1 + nt] * (min(L(1.0), rim / size) if size > 0 else L(1.0))
+            y = lam[1 : 1 + nt] - step[1 : 1 + nt]
+            size = np.sqrt(y @ y)
+            if size > rim:
+                e[1 : 1 + nt] = lam[1 : 1 + nt] - y * (rim / size)
         if c["kind"][k] == CONTACT_SPIN:
             edge = rim * L(c["patch_radius"][k])
-            out[-1] = min(max(y[-1], -edge), edge)
-        return out
+            e[-1] = min(max(step[-1], lam[-1] - edge), lam[-1] + edge)
+        return e
 
-    def _cone(self, k, point):
-        """Projection in the metric of d, by the formula of the five candidates."""
+    def _cone(self, k, lam, step):
+        """Error of the projection in the metric of d, by the formula of the five candidates."""
         c, nt, j = self.cones, self.tangents(k), self.cones["ptr"][k]
         root = np.sqrt(self.d[j : c["ptr"][k + 1]])
-        y = root * point
+        y = root * (lam - step)
         spin = c["kind"][k] == CONTACT_SPIN
         mu, radius = L(c["mu"][k]), L(c["patch_radius"][k])
         t = np.sqrt(y[1 : 1 + nt] @ y[1 : 1 + nt]) if nt else ZERO
@@ -188,13 +188,14 @@ class Problem:
             (y[0] + a_s * s) / (1 + a_s * a_s),
             (y[0] + at * t + a_s * s) / (1 + at * at + a_s * a_s),
         )
-        out = np.zeros_like(y)
-        out[0] = top
-        if nt:
-            out[1 : 1 + nt] = y[1 : 1 + nt] * (min(L(1.0), at * top / t) if t > 0 else L(1.0))
-        if spin:
-            out[-1] = min(max(y[-1], -a_s * top), a_s * top)
-        return out / root
+        e = step.copy()
+        if top != y[0]:
+            e[0] = lam[0] - top / root[0]
+        if nt and t > at * top:
+            e[1 : 1 + nt] = lam[1 : 1 + nt] - y[1 : 1 + nt] * (at * top / t) / root[1 : 1 + nt]
+        if spin and s > a_s * top:
+            e[-1] = lam[-1] - np.copysign(a_s * top, y[-1]) / root[-1]
+        return e
 
     def norms(self, e):
         """E and V."""
@@ -227,7 +228,8 @@ class Problem:
         if below:
             energy0, velocity0 = rhs_energy, rhs_velocity
         f = L(2.0) ** -53 * size
-        more = (self.m + 20) * (f + DENORMAL * (1 + np.abs(lam).max(initial=ZERO)))
+        rounded = L(2.0) ** -53 * self.d * np.abs(lam)  # of lambda - Pi, where d is not A_ii
+        more = (self.m + 20) * (f + rounded + DENORMAL * (1 + np.abs(lam).max(initial=ZERO)))
         floor = self._ratio(*self._floor(f), energy0, velocity0)
         allowed = self._ratio(*self._floor(more), energy0, velocity0)
         seen = np.abs(np.concatenate([lam, w, self.d, self.b, [energy, velocity, energy0, velocity0]]))
@@ -283,6 +285,7 @@ class Problem:
                 low, high = np.array(c["lower"][part], L), np.array(c["upper"][part], L)
                 if np.any((y[part] > 0) & np.isfinite(high)) or np.any((y[part] < 0) & np.isfinite(low)):
                     return "y leaves the bounds"
+                low, high = np.maximum(low, -LARGEST), np.minimum(high, LARGEST)
                 pull += sum(
                     x * (h if x > 0 else lo) for x, lo, h in zip(z[part], low, high, strict=True) if x != 0
                 )
@@ -302,6 +305,5 @@ class Problem:
             rim = np.sqrt(zk[1 : 1 + nt] @ zk[1 : 1 + nt]) + (
                 spin * abs(zk[-1]) if c["kind"][k] == CONTACT_SPIN else ZERO
             )
-            if zk[0] + mu * rim > L(1e-9) * (gain / most) * scale[c["ptr"][k]]:
-                return "impulses of a contact can meet b.y"
+            pull += max(ZERO, zk[0] + mu * rim) * LARGEST
         return None if gain > pull else "impulses within the bounds can meet b.y"
