@@ -356,6 +356,53 @@ class Problem:
             **more,
         )
 
+    def updated(
+        self,
+        *,
+        J: Any = None,
+        M: Any = None,
+        v_free: Any = None,
+        b: Any = None,
+        target: Any = None,
+        guess: Any = None,
+    ) -> Problem:
+        """The same structure with new numbers: what is not given stays.
+
+        Parameters
+        ----------
+        J, M, v_free : as in `from_jacobian`
+            Only in generalised coordinates.
+        b : (m,) m/s, optional
+            The right-hand side itself; or
+        target : scalar or (m,) m/s, optional
+            b = target - J v*.
+        guess : (m,) N s, optional
+            Default: none, as it belongs to other numbers.
+
+        Raises
+        ------
+        InputError
+            J, M, v_free or target without J and M; both b and target, or neither with a new J or v*.
+        """
+        general = self.generalized
+        new = (J, M, v_free, target)
+        if general is None and any(x is not None for x in new):
+            raise InputError("J, M, v_free and target go with a problem in generalised coordinates; give b")
+        if b is not None and target is not None:
+            raise InputError("give b or target, not both")
+        if b is None and target is None and (J is not None or v_free is not None):
+            raise InputError("with a new J or v_free the right-hand side is another: give target or b")
+        if general is not None and any(x is not None for x in (J, M, v_free)):
+            general = Generalized(
+                general.jac if J is None else J,
+                general.mass if M is None else M,
+                general.v_free if v_free is None else v_free,
+                general.names,
+            )
+        if target is not None and general is not None:
+            b = as_array("target", target, (self.m,), unit="m/s") - general.velocity_of(general.v_free)
+        return replace(self, b=self.b if b is None else b, generalized=general, guess=guess)
+
     # -- size and kind --------------------------------------------------------------------------
 
     @property

@@ -124,8 +124,8 @@ def nothing_to_do(problem: Problem) -> bool:
     kept = problem.derived
     if kept.nothing is None:
         m = problem.m
-        energy, velocity, *_ = measure.judge(problem.data, problem._start, np.empty(m), np.empty(m), False)
-        kept.nothing = bool(energy <= 2.0**-48 * measure.rhs_norms(problem.data)[0] or velocity < AT_REST)
+        energy, velocity, *_ = measure.judge(problem.metric, problem._start, np.empty(m), np.empty(m), False)
+        kept.nothing = bool(energy <= 2.0**-48 * measure.rhs_norms(problem.metric)[0] or velocity < AT_REST)
     return kept.nothing
 
 

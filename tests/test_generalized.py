@@ -475,3 +475,47 @@ def test_many_start_where_they_are_told():
     with pytest.raises(lv.InputError):
         lv.solve_many([3])
     assert len(lv.solve_many([])) == 0
+
+
+# -- every solver, and new numbers --------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("friction", ["cone", "coulomb"])
+def test_every_solver_that_takes_it_solves_it(friction):
+    names = lv.available(random_general(3, friction))
+    assert len(names) > 5
+    for name in names:
+        problem = random_general(3, friction)  # a new one: nothing that another solver worked out
+        solution = lv.solve(problem, name, tol=1e-3)  # jacobi, damped, is slow
+        assert solution.success, f"{name}: {solution}"
+        assert not solution.contradicted
+
+
+def test_updated_is_the_same_structure_with_new_numbers():
+    problem = random_general(9, "cone")
+    general = problem.generalized
+    rng = np.random.default_rng(0)
+    jac, v = general.jac.toarray() * 1.1, rng.normal(size=general.nv)
+    new = problem.updated(J=jac, M=2.0 * general.mass.toarray(), v_free=v, target=0.1)
+    made = lv.Problem.from_jacobian(jac, 2.0 * general.mass.toarray(), v, target=0.1, cones=problem.cones,
+                                    compliance=problem.compliance, friction="cone", name=problem.name)  # fmt: skip
+    assert new == made
+    assert problem.updated(b=2.0 * problem.b).b[0] == 2.0 * problem.b[0]
+    assert problem.updated(b=problem.b) == problem
+    with pytest.raises(lv.InputError, match="give target or b"):
+        problem.updated(J=jac)
+    with pytest.raises(lv.InputError, match="not both"):
+        problem.updated(b=problem.b, target=0.0)
+    with pytest.raises(lv.InputError, match="generalised coordinates"):
+        as_matrix(problem).updated(v_free=v, target=0.0)
+    with pytest.raises(lv.InputError, match="J has shape"):
+        problem.updated(J=jac[:, 1:], target=0.0)
+
+
+def test_nothing_of_the_judge_forms_a():
+    problem = random_general(6, "cone")
+    solution = lv.solve(problem, tol=1e-8)
+    lv.residual(problem, solution.impulse)
+    problem.velocity(solution.impulse)
+    assert "csr_data" not in problem.__dict__
+    assert "_compressed" not in problem.__dict__

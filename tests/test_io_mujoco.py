@@ -252,3 +252,78 @@ def test_something_else_is_an_input_error():
         lv.io.from_mujoco(data, model)
     with pytest.raises(lv.InputError, match="one for each row"):
         adapter.acceleration(model, data, np.zeros(int(data.nefc) + 1))
+
+
+# -- a folder of steps ----------------------------------------------------------------------------------
+
+
+def test_a_recording_is_a_folder_of_problems_with_the_engines_own_answer(tmp_path):
+    import json
+
+    model, data = state(steps=1)
+    found = lv.io.record(model, data, tmp_path / "steps", 40, every=10)
+    assert len(found.files) == 4
+    assert found.left_out == ()
+    lines = [json.loads(line) for line in (tmp_path / "steps" / "engine.jsonl").read_text().splitlines()]
+    assert [line["file"] for line in lines] == list(found.files)
+    for line in lines:
+        stored = lv.io.read(tmp_path / "steps" / line["file"])
+        judged = lv.residual(stored.problem, stored.impulse)
+        assert judged.relative == line["relative"] < PGS
+        assert stored.problem.key is not None
+        assert line["rows"] == stored.problem.m
+        assert line["seconds"] > 0.0
+        assert line["solver"] == "NEWTON"
+
+
+def test_what_cannot_be_exported_is_counted_not_fatal(tmp_path):
+    if not hasattr(mj.mjtIntegrator, "mjINT_DISCRETE"):
+        pytest.skip("this MuJoCo has no such integrator")
+    text = SCENE.format(cone="elliptic", solver="Newton", condim=3, jacobian="dense")
+    model = mj.MjModel.from_xml_string(text.replace('name="door"', 'name="door" damping="2"'))
+    model.opt.integrator = mj.mjtIntegrator.mjINT_DISCRETE
+    found = lv.io.record(model, mj.MjData(model), tmp_path, 20, every=10)
+    assert (len(found.files), len(found.left_out)) == (0, 2)
+    assert "discrete" in str(found)
+
+
+def test_controls_are_played_drawn_or_called(tmp_path):
+    text = """<mujoco><worldbody><body><joint name="j" range="-1 1" limited="true"/><geom size=".1"/></body></worldbody>
+      <actuator><motor joint="j" ctrlrange="-2 3" ctrllimited="true"/></actuator></mujoco>"""
+    model = mj.MjModel.from_xml_string(text)
+    seen = []
+
+    def watch(model, data, step):
+        seen.append(float(data.ctrl[0]))
+        return [0.5 * step]
+
+    lv.io.record(model, mj.MjData(model), tmp_path, 3, control=watch)
+    assert seen == [0.0, 0.0, 0.5]
+    data = mj.MjData(model)
+    lv.io.record(model, data, tmp_path, 3, control=np.array([[1.0], [2.0]]))
+    assert data.ctrl[0] == 1.0
+    lv.io.record(model, data, tmp_path, 1, control="random", seed=3)
+    assert -2.0 <= data.ctrl[0] <= 3.0
+    for wrong in ("ramp", np.zeros((3, 2)), np.zeros((0, 1))):
+        with pytest.raises(lv.InputError, match="control"):
+            lv.io.record(model, data, tmp_path, 1, control=wrong)
+    with pytest.raises(lv.InputError, match="steps is 0"):
+        lv.io.record(model, data, tmp_path, 0)
+
+
+def test_record_then_report_from_the_command_line(tmp_path):
+    from click.testing import CliRunner
+
+    from lavender.cli import cli
+
+    model = tmp_path / "scene.xml"
+    model.write_text(SCENE.format(cone="elliptic", solver="Newton", condim=3, jacobian="dense"))
+    out = tmp_path / "steps"
+    done = CliRunner().invoke(
+        cli, ["record", str(model), "--steps", "30", "--every", "15", "--out", str(out)]
+    )
+    assert done.exit_code == 0, done.output
+    assert "2 problems" in done.output
+    assert len(list(out.glob("*.npz"))) == 2
+    wrong = CliRunner().invoke(cli, ["record", str(model), "--controls", "no.npy", "--out", str(out)])
+    assert wrong.exit_code != 0

@@ -192,7 +192,7 @@ def table(steps: Sequence[Step]) -> str:
 
 
 @click.command("mujoco")
-@click.argument("models", nargs=-1, required=True, type=click.Path(exists=True, path_type=Path))
+@click.argument("models", nargs=-1, required=True, type=click.Path(path_type=Path))
 @click.option("--steps", default=10, show_default=True, help="problems of each model")
 @click.option("--every", default=20, show_default=True, help="steps of the simulator between two problems")
 @click.option("--out", type=click.Path(path_type=Path), help="every problem's numbers, JSON lines")

@@ -209,7 +209,7 @@ def target(problem: Problem, tol: float) -> float:
         start / (size * sigma)
         for start, size in (
             (energy, np.sqrt(problem.m)),
-            (velocity, np.sqrt(problem.data.nu.max(initial=0.0))),
+            (velocity, np.sqrt(problem.metric.nu.max(initial=0.0))),
         )
         if start > 0.0 and size > 0.0
     ]
@@ -400,7 +400,7 @@ class _Parts:
         fixed = np.where(known, c.lower, 0.0)
         size = np.diff(c.ptr)
         alone = np.repeat((c.kind == ROW) | (size == 1), size)
-        for i in np.asarray(problem.data.empty, int):
+        for i in np.asarray(problem.metric.empty, int):
             # A row of zeros: b alone decides, and where no finite bound meets it the front door has said so.
             if alone[i]:
                 bound = c.upper[i] if problem.b[i] > 0.0 else c.lower[i] if problem.b[i] < 0.0 else 0.0

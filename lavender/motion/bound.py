@@ -60,7 +60,7 @@ def witness(problem: Problem, operator: Operator, impulse: FloatArray) -> Witnes
     d = problem.d
     w, off = operator.slack(impulse)
     e = np.empty(problem.m)
-    measure.score(problem.data, impulse, w, e)
+    measure.score(problem.metric, impulse, w, e)
     fuzz = _rounding_of_projection(problem, impulse, w)
     radius = operator.size(e, fuzz).most
     shift = d * e

@@ -101,7 +101,7 @@ class Trail:
         of_row = np.repeat(label, np.diff(problem.cones.ptr))
         own_energy = np.sqrt(np.bincount(of_row, problem.d * self.e**2, minlength=count))
         own_velocity = np.zeros(count)
-        np.maximum.at(own_velocity, of_row, problem.data.weight * np.abs(self.e))
+        np.maximum.at(own_velocity, of_row, problem.metric.weight * np.abs(self.e))
         # A pair of tangents counts by its norm, at most sqrt(2) times its larger entry.
         wrong = (own_energy > self.tol * energy / np.sqrt(count)) | (
             np.sqrt(2.0) * own_velocity > self.tol * velocity

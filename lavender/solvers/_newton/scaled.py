@@ -51,7 +51,7 @@ class Scaled:
     @cached_property
     def speed(self) -> FloatArray:
         """Velocity error (m,) per unit of the natural map."""
-        weight = self.problem.data.weight
+        weight = self.problem.metric.weight
         return np.asarray((weight if self.whole else weight[self.keep]) * self.scale)
 
     def impulse(self, z: FloatArray) -> FloatArray:
@@ -128,7 +128,7 @@ def _elements(problem: Problem) -> _Elements:
     """Elements of a problem; the usual ones, of which every row moves, are seen at a glance."""
     cones, m = problem.cones, problem.m
     n = len(cones.kind)
-    if len(problem.data.empty) == 0:
+    if len(problem.metric.empty) == 0:
         if (
             0 < 3 * n == m
             and bool(np.all(cones.kind == CONTACT))
@@ -154,7 +154,7 @@ def _mixed_elements(problem: Problem) -> _Elements:
     still |= contact & (position > 0) & ((mu == 0.0) | (spin & (radius == 0.0)))
     fixed = np.zeros(m)
     fixed[still] = np.where(np.isfinite(cones.lower[still]), cones.lower[still], 0.0)
-    for i in problem.data.empty:
+    for i in problem.metric.empty:
         j = problem.block_of(int(i))
         if cones.kind[j] == ROW or size[j] == 1:
             still[i] = True

@@ -1,0 +1,146 @@
+"""Steps of a MuJoCo simulation as a folder of problems, with the engine's own answer beside each."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from lavender._arrays import FloatArray
+from lavender.errors import CapabilityError, InputError
+from lavender.io import mujoco as adapter
+from lavender.io import npz
+from lavender.residuals import residual
+
+__all__ = ["Recording", "record"]
+
+ENGINE = "engine.jsonl"  # beside the problems: what the engine itself said of each
+CONTROLS = ("zero", "random")
+Control = str | Callable[[Any, Any, int], Any] | Any
+
+
+@dataclass(frozen=True)
+class Recording:
+    """What `record` wrote; `str()` says it in a line."""
+
+    folder: Path
+    files: tuple[str, ...]
+    without: int  # steps looked at that had no constraint
+    left_out: tuple[str, ...] = field(default=())  # why a step could not be exported, one line each
+
+    def __str__(self) -> str:
+        more = f", {self.without} steps without constraints" if self.without else ""
+        lost = f", {len(self.left_out)} left out: {self.left_out[0]}" if self.left_out else ""
+        return f"{len(self.files)} problems in {self.folder}{more}{lost}"
+
+
+def record(
+    model: Any,
+    data: Any,
+    folder: str | os.PathLike[str],
+    steps: int,
+    *,
+    every: int = 1,
+    control: Control = "zero",
+    seed: int = 0,
+) -> Recording:
+    """Step a MuJoCo simulation and keep the problem of every `every`-th step.
+
+    Each file holds the problem with keys of its blocks and MuJoCo's own impulse. `engine.jsonl` has a line for each:
+    file, step, rows, the engine's iterations, the time of its constraint solver [s] and its residual by our judge.
+
+    Parameters
+    ----------
+    model : mujoco.MjModel
+    data : mujoco.MjData
+        Stepped on, from where it stands.
+    folder : path
+        Made where it is not; files of these names are replaced.
+    steps : int
+        Steps of the simulation.
+    every : int
+    control : {"zero", "random"}, array (any, nu), or callable (model, data, step)
+        "random" draws uniformly within the ranges of the actuators. An array is played row by row, again from its
+        start where it ends. What a callable returns is written to `data.ctrl`, unless it is None.
+    seed : int
+        Of "random".
+
+    Returns
+    -------
+    Recording
+
+    Raises
+    ------
+    InputError
+        Not a model and its data, `steps` or `every` below 1, another control.
+    """
+    mj = adapter._mujoco(model, data)
+    for word, value in (("steps", steps), ("every", every)):
+        if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
+            raise InputError(f"{word} is {value!r}; a whole number from 1 is needed")
+    drive = _drive(model, control, seed)
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    files: list[str] = []
+    left_out: list[str] = []
+    lines: list[str] = []
+    without = 0
+    width = len(str(steps))
+    for step in range(steps):
+        ctrl = drive(data, step)
+        if ctrl is not None:
+            data.ctrl[:] = ctrl
+        mj.mj_step(model, data)
+        if (step + 1) % every:
+            continue
+        mj.mj_forward(model, data)
+        start = perf_counter()
+        mj.mj_fwdConstraint(model, data)
+        seconds = perf_counter() - start
+        if int(data.nefc) == 0:
+            without += 1
+            continue
+        try:
+            problem = adapter.from_mujoco(model, data, name=f"step {step + 1}")
+        except CapabilityError as error:
+            left_out.append(f"step {step + 1}: {error}")
+            continue
+        own = adapter.impulse(model, data)
+        name = f"step_{step + 1:0{width}d}.npz"
+        npz.write(problem, folder / name, impulse=own)
+        files.append(name)
+        lines.append(json.dumps({
+            "file": name, "step": step + 1, "rows": problem.m, "iterations": int(np.sum(data.solver_niter)),
+            "seconds": seconds, "relative": residual(problem, own).relative,
+            "solver": mj.mjtSolver(int(model.opt.solver)).name.removeprefix("mjSOL_"),
+        }))  # fmt: skip
+    (folder / ENGINE).write_text("".join(f"{line}\n" for line in lines), encoding="utf-8")
+    return Recording(folder, tuple(files), without, tuple(left_out))
+
+
+def _drive(model: Any, control: Control, seed: int) -> Callable[[Any, int], FloatArray | None]:
+    n = int(model.nu)
+    if callable(control):
+        call: Callable[[Any, Any, int], Any] = control
+        return lambda data, step: call(model, data, step)
+    if isinstance(control, str):
+        if control not in CONTROLS:
+            raise InputError(
+                f"control is {control!r}; one of {', '.join(CONTROLS)}, an array or a function is needed"
+            )
+        if control == "zero":
+            return lambda data, step: np.zeros(n)
+        rng = np.random.default_rng(seed)
+        limited = np.array(model.actuator_ctrllimited, bool)[:, None]
+        low, high = np.where(limited, np.array(model.actuator_ctrlrange), [-1.0, 1.0]).T
+        return lambda data, step: rng.uniform(low, high)
+    rows = np.asarray(control, float)
+    if rows.ndim != 2 or rows.shape[1] != n or len(rows) == 0 or not np.isfinite(rows).all():
+        raise InputError(f"control has shape {rows.shape}; (any, {n}) finite numbers are needed")
+    return lambda data, step: rows[step % len(rows)]
