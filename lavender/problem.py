@@ -293,7 +293,7 @@ class Problem:
         both = np.zeros((2, kj + c))
         both[0, kj:] = as_array("mu", mu, (c,))
         both[1, kj:] = 0.0 if patch_radius is None else as_array("patch_radius", patch_radius, (c,), unit="m")
-        cones = Cones(ptr, kind, low, high, both[0], both[1])
+        cones = Cones(ptr=ptr, kind=kind, lower=low, upper=high, mu=both[0], patch_radius=both[1])
         target = as_array("target", target, (m,), unit="m/s")
         jv = np.zeros(m + 1)
         # b = target - J v*: the slack kernel with lambda = 0 and v = v* gives J v* - 0.

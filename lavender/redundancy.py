@@ -217,7 +217,14 @@ def redundancy(problem: Problem, *, tol: float = 1e-12) -> Redundancy:
             dependent += island[found].tolist()
     method = "; ".join(sorted(methods)) or "no rows"
     return Redundancy(
-        problem, m - len(dependent), used, method, tuple(sorted(dependent)), unique, scale, tuple(null)
+        problem=problem,
+        rank=m - len(dependent),
+        tol=used,
+        method=method,
+        rows=tuple(sorted(dependent)),
+        impulse_is_unique=unique,
+        _scale=scale,
+        _null=tuple(null),
     )
 
 

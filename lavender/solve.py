@@ -375,7 +375,13 @@ class _Loop:
         if claim.iterations == self.done and claim.work == self.work:
             return claim  # of a single chunk
         return Claim(
-            claim.status, self.done, self.work, claim.message, claim.form, claim.dual, claim.certificate
+            status=claim.status,
+            iterations=self.done,
+            work=self.work,
+            message=claim.message,
+            form=claim.form,
+            dual=claim.dual,
+            certificate=claim.certificate,
         )
 
     def recorded(self) -> History | None:
@@ -431,20 +437,20 @@ def finish(
         contradicted = f"says INFEASIBLE, {reason}" if reason else ""
     impulse.flags.writeable = False
     return Solution(
-        impulse,
-        judged,
-        status,
-        tol,
-        claim.iterations,
-        claim.work,
-        setup_time,
-        solve_time,
-        SolverRun(spec.name, options, claim.form),
-        message,
-        history,
-        claim.dual,
-        certificate,
-        contradicted,
+        impulse=impulse,
+        residual=judged,
+        status=status,
+        tol=tol,
+        iterations=claim.iterations,
+        work=claim.work,
+        setup_time=setup_time,
+        solve_time=solve_time,
+        solver=SolverRun(spec.name, options, claim.form),
+        message=message,
+        history=history,
+        dual=claim.dual,
+        certificate=certificate,
+        contradicted=contradicted,
     )
 
 

@@ -11,7 +11,7 @@ from random_problems import as_matrix, random_contact_problem, random_rows
 import lavender as lv
 from lavender import registry
 from lavender.certificates import check_certificate
-from lavender.external import qpsolvers_
+from lavender.external import qp_solver, qpsolvers_
 from lavender.external._running import Answer
 from lavender.measures import qp_residual
 
@@ -49,7 +49,7 @@ def replaced(monkeypatch, name, call):
     from functools import partial
 
     backend = next(b for b in qpsolvers_.BACKENDS if b.name == name)
-    fake = replace(registry.get(name), factory=partial(qpsolvers_.QPSolver, replace(backend, call=call)))
+    fake = replace(registry.get(name), factory=partial(qp_solver.QPSolver, replace(backend, call=call)))
     monkeypatch.setitem(registry._registered, name, fake)
 
 
@@ -413,7 +413,7 @@ def test_tol_zero_runs_at_the_tightest_tolerance():
 
 
 def test_dense_backends_refuse_what_would_not_fit(monkeypatch):
-    monkeypatch.setattr(qpsolvers_, "DENSE_LIMIT", 8 * 10 * 10)
+    monkeypatch.setattr(qp_solver, "DENSE_LIMIT", 8 * 10 * 10)
     problem = lv.Problem.lcp(*spd(11))
     with pytest.raises(lv.CapabilityError, match="dense matrices only"):
         lv.solve(problem, "daqp")

@@ -34,7 +34,9 @@ from lavender.cones import CONTACT
 from lavender.errors import CapabilityError, InputError
 from lavender.external._running import Limits, quiet
 from lavender.external.as_qp import QP, impulse_form, velocity_form
-from lavender.external.qpsolvers_ import BACKENDS, Backend, QPSolver, refusal
+from lavender.external.backend import Backend
+from lavender.external.qp_solver import QPSolver, refusal
+from lavender.external.qpsolvers_ import BACKENDS
 from lavender.problem import Problem
 from lavender.residuals import reference, residual
 from lavender.solve import prepare
@@ -135,9 +137,9 @@ def _timed(
 
 
 def _backend(backend: Backend, form: str) -> Contestant:
-    from lavender.external.qpsolvers_ import _through_qpsolvers
+    from lavender.external.generic import through_qpsolvers
 
-    call = functools.partial(_through_qpsolvers, backend) if backend.call is None else backend.call
+    call = functools.partial(through_qpsolvers, backend) if backend.call is None else backend.call
 
     def runs(problem: Problem, limit: float) -> Iterator[Call]:
         qp = QPSolver(backend, form=form).prepare(problem).qp

@@ -489,12 +489,12 @@ class Simulation:
         lower, upper = np.full(m, -np.inf), np.full(m, np.inf)
         lower[:mj], upper[:mj] = a["lower"][:mj], a["upper"][:mj]
         cones = Cones(
-            a["ptr"][: k + 1].copy(),
-            a["kind"][:k].copy(),
-            lower,
-            upper,
-            a["mu"][:k].copy(),
-            a["patch_radius"][:k].copy(),
+            ptr=a["ptr"][: k + 1].copy(),
+            kind=a["kind"][:k].copy(),
+            lower=lower,
+            upper=upper,
+            mu=a["mu"][:k].copy(),
+            patch_radius=a["patch_radius"][:k].copy(),
         )
         guess = a["impulse"][:m].copy() if state.head[HEAD["warm_start"]] else None
         return Problem(

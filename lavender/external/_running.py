@@ -15,13 +15,14 @@ from typing import Any
 import numpy as np
 
 from lavender._arrays import FloatArray
+from lavender.certificates import check_certificate
 from lavender.errors import InputError
 from lavender.external.as_qp import QP, target
 from lavender.problem import Problem
 from lavender.residuals import quick
 from lavender.solution import Claim, Status
 
-__all__ = ["Answer", "Limits", "ask", "definite_refusal", "quiet", "symmetric_refusal"]
+__all__ = ["Answer", "Limits", "ask", "at_least", "definite_refusal", "proof", "quiet", "symmetric_refusal"]
 
 EPS_MIN = 1e-14  # asked of a backend at the least: its own arithmetic stops there
 GAP_MIN = 1e-18
@@ -52,6 +53,19 @@ class Answer:
     work: Mapping[str, int] = field(default_factory=dict)
     direction: FloatArray | None = None  # of an unbounded x
     contradiction: FloatArray | None = None  # multipliers that prove the rows contradict each other
+
+
+def at_least(limit: float, least: float) -> float:
+    """A tolerance that a backend takes: not below `least`, not above 1e-2."""
+    return min(max(limit, least), 1e-2)
+
+
+def proof(
+    qp: QP, x: FloatArray | None, zeta: FloatArray | None
+) -> tuple[FloatArray | None, FloatArray | None]:
+    """The iterate as a certificate, where it is one: backends without a field for it return it as iterate."""
+    y = qp.direction(x, zeta)
+    return (x, zeta) if y is not None and check_certificate(qp.problem, y) is None else (None, None)
 
 
 Call = Callable[[QP, FloatArray, Limits, dict[str, Any]], Answer]
@@ -169,7 +183,15 @@ def _once(
         if status not in (Status.TIME_LIMIT, Status.INTERRUPTED):
             status = Status.NUMERICAL_ERROR
         words = f"{words}; no iterate, start point returned".removeprefix("; ")
-    return Claim(status, work.get("iterations", 0), work, words, qp.form, dual, certificate)
+    return Claim(
+        status=status,
+        iterations=work.get("iterations", 0),
+        work=work,
+        message=words,
+        form=qp.form,
+        dual=dual,
+        certificate=certificate,
+    )
 
 
 def symmetric_refusal(problem: Problem) -> str | None:

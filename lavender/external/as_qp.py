@@ -31,6 +31,7 @@ large mass ratios; a residual of x times sigma is a residual of the judge. Rows 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -42,7 +43,7 @@ from lavender.errors import CapabilityError, InputError
 from lavender.problem import Problem
 from lavender.residuals import reference
 
-__all__ = ["FORMS", "QP", "impulse_form", "pick_form", "target", "velocity_form"]
+__all__ = ["FORMS", "QP", "bound_rows", "impulse_form", "pick_form", "target", "two_sided", "velocity_form"]
 
 FORMS = ("impulse", "velocity", "auto")
 IntpArray = npt.NDArray[np.intp]
@@ -253,9 +254,25 @@ def impulse_form(problem: Problem, *, unit_diagonal: bool = True, equality: bool
         matrix = put.matrix(k)
         rhs = np.zeros(matrix.shape[0])
     return QP(
-        "impulse", p, q, matrix, rhs, n_zero, 2 * len(rows.pairs), (3,) * len(rows.disks), lb, ub,
-        problem, kept, parts.fixed, root, sigma, sp.csr_matrix((k, len(rhs))), np.zeros(k), sp.csr_matrix((k, 0)),
-    )  # fmt: skip
+        form="impulse",
+        P=p,
+        q=q,
+        A=matrix,
+        b=rhs,
+        n_zero=n_zero,
+        n_nonneg=2 * len(rows.pairs),
+        soc=(3,) * len(rows.disks),
+        lb=lb,
+        ub=ub,
+        problem=problem,
+        kept=kept,
+        fixed=parts.fixed,
+        root=root,
+        sigma=sigma,
+        back=sp.csr_matrix((k, len(rhs))),
+        shift=np.zeros(k),
+        lift=sp.csr_matrix((k, 0)),
+    )
 
 
 def velocity_form(problem: Problem) -> QP:
@@ -334,9 +351,25 @@ def velocity_form(problem: Problem) -> QP:
     diagonal[:ny] = 1.0
     n_nonneg = len(lower) + len(upper) + 2 * len(rows.pairs) + len(alone)
     return QP(
-        "velocity", sp.csc_matrix(sp.diags_array(diagonal)), q, matrix, -(back.T @ g), len(free), n_nonneg,
-        (3,) * len(rows.disks), lb, ub, problem, kept, parts.fixed, root, sigma, back, shift, lift,
-    )  # fmt: skip
+        form="velocity",
+        P=sp.csc_matrix(sp.diags_array(diagonal)),
+        q=q,
+        A=matrix,
+        b=-(back.T @ g),
+        n_zero=len(free),
+        n_nonneg=n_nonneg,
+        soc=(3,) * len(rows.disks),
+        lb=lb,
+        ub=ub,
+        problem=problem,
+        kept=kept,
+        fixed=parts.fixed,
+        root=root,
+        sigma=sigma,
+        back=back,
+        shift=shift,
+        lift=lift,
+    )
 
 
 def _sigma(problem: Problem) -> float:
@@ -444,3 +477,25 @@ class _Parts:
                 s = int(place[end - 1])
                 pairs.append((j, s, float(c.mu[i] * c.patch_radius[i] * self.root[j] / self.root[s])))
         return _FrictionRows(pairs, disks)
+
+
+def bound_rows(qp: QP) -> list[tuple[float, sp.csr_matrix, FloatArray, Any]]:
+    """Finite bounds as rows sign x[at] <= h: (sign, rows of the identity, h, at) for upper, then lower."""
+    if qp.lb is None or qp.ub is None:
+        return []
+    eye = sp.csr_matrix(sp.eye_array(qp.n))
+    found = []
+    for sign, bound in ((1.0, qp.ub), (-1.0, qp.lb)):
+        at = np.flatnonzero(np.isfinite(bound))
+        found.append((sign, eye[at], sign * bound[at], at))
+    return found
+
+
+def two_sided(qp: QP, identity: bool) -> tuple[sp.csc_matrix, FloatArray, FloatArray]:
+    """Rows l <= C x <= u; with `identity` the bounds of x as rows after them."""
+    low = np.full(len(qp.b), -np.inf)
+    low[: qp.n_zero] = qp.b[: qp.n_zero]
+    if not identity or qp.lb is None or qp.ub is None:
+        return qp.A, low, qp.b
+    rows = sp.csc_matrix(sp.vstack([qp.A, sp.eye_array(qp.n)]))
+    return rows, np.concatenate([low, qp.lb]), np.concatenate([qp.b, qp.ub])

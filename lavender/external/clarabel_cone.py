@@ -18,7 +18,8 @@ from lavender._arrays import FloatArray
 from lavender.errors import InputError
 from lavender.external._running import ask, definite_refusal, symmetric_refusal
 from lavender.external.as_qp import QP, impulse_form, pick_form, velocity_form
-from lavender.external.qpsolvers_ import OPTIONS, _clarabel
+from lavender.external.native import clarabel
+from lavender.external.qp_solver import OPTIONS
 from lavender.problem import Problem
 from lavender.registry import SolverSpec
 from lavender.solution import Claim
@@ -57,7 +58,7 @@ class ClarabelCone:
         time_limit: float | None = None,
     ) -> Claim:
         problem, qp = state
-        return ask(problem, qp, impulse, _clarabel, n, tol, time_limit, self.settings, stoppable=True)
+        return ask(problem, qp, impulse, clarabel.call, n, tol, time_limit, self.settings, stoppable=True)
 
 
 def refusal(problem: Problem) -> str | None:

@@ -84,7 +84,7 @@ class Contents:
         kind = np.repeat(np.array([CONTACT, ROW], np.int32), [c, p])
         mu = np.concatenate([self.mu, np.zeros(p)])
         free = np.full(len(b), np.inf)
-        cones = Cones(ptr, kind, -free, free, mu, np.zeros(c + p))
+        cones = Cones(ptr=ptr, kind=kind, lower=-free, upper=free, mu=mu, patch_radius=np.zeros(c + p))
         guess = self._impulse(self.guesses[0]) if self.guesses else None
         return Problem(b, cones, a, guess=guess, name=self.info.get("title", "") or name)
 

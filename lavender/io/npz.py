@@ -399,7 +399,14 @@ def _box_cones(archive: _Archive, m: int) -> Cones:
     friction = np.zeros(len(first))
     at = np.searchsorted(first, start)
     kind[at], friction[at] = CONTACT, mu
-    return Cones(np.append(first, m), kind, lower, upper, friction, np.zeros(len(first)))
+    return Cones(
+        ptr=np.append(first, m),
+        kind=kind,
+        lower=lower,
+        upper=upper,
+        mu=friction,
+        patch_radius=np.zeros(len(first)),
+    )
 
 
 def _read_generated(archive: _Archive) -> Stored:

@@ -219,13 +219,13 @@ def motions(problem: Problem, n: int = RUNS, seed: int = 0) -> Motions:
             apart = distance(problem, one.impulse, two.impulse)
             speed, energy = max(speed, apart.speed), max(energy, apart.energy)
     result = Motions(
-        problem,
-        tuple(merged),
-        speed,
-        None if own.refusal else energy,
-        proof.reason if proof else "",
-        len(found),
-        failed,
+        problem=problem,
+        motions=tuple(merged),
+        spread=speed,
+        spread_energy=None if own.refusal else energy,
+        unique=proof.reason if proof else "",
+        runs=len(found),
+        failed=failed,
     )
     kept(problem).motions = result
     return result
@@ -343,15 +343,15 @@ def _motion(problem: Problem, reference: Reference, labels: tuple[str, ...]) -> 
     friction[normal] = False
     pressed = normal[x[normal] > 0.0]
     return Motion(
-        x,
-        w,
-        reference,
-        reference.residual.relative,
-        float(0.5 * (x @ (w - problem.b))),
-        -float(w[friction] @ x[friction]),
-        float(np.max(w[pressed], initial=0.0)),
-        len(labels),
-        labels,
+        impulse=x,
+        slack=w,
+        reference=reference,
+        relative=reference.residual.relative,
+        energy=float(0.5 * (x @ (w - problem.b))),
+        dissipation=-float(w[friction] @ x[friction]),
+        lift=float(np.max(w[pressed], initial=0.0)),
+        count=len(labels),
+        found_by=labels,
     )
 
 

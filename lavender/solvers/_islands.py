@@ -67,7 +67,14 @@ def restrict(problem: Problem, blocks: IntArray, rows: IntArray) -> Problem:
     c = problem.cones
     size = np.diff(c.ptr)[blocks]
     ptr = np.concatenate([[0], np.cumsum(size)]).astype(np.int32)
-    cones = Cones(ptr, c.kind[blocks], c.lower[rows], c.upper[rows], c.mu[blocks], c.patch_radius[blocks])
+    cones = Cones(
+        ptr=ptr,
+        kind=c.kind[blocks],
+        lower=c.lower[rows],
+        upper=c.upper[rows],
+        mu=c.mu[blocks],
+        patch_radius=c.patch_radius[blocks],
+    )
     names = None if problem.names is None else [problem.names[i] for i in blocks]
     more: dict[str, Any] = {"friction": problem.friction, "names": names, "name": problem.name}
     b: FloatArray = problem.b[rows]

@@ -110,7 +110,19 @@ def standard_form(problem: Problem) -> Standard:
     m = np.block([[m, -m[:, split]], [-m[split], m[np.ix_(split, split)]]])
     q = np.concatenate([q, -q[split]])
     kept, out = rows[~gone[:k]], rows[gone[:k]]
-    return Standard(problem, m, q, base, turn, kept, place[capped], split, exchanged[stay], out, back)
+    return Standard(
+        problem=problem,
+        m=m,
+        q=q,
+        base=base,
+        turn=turn,
+        kept=kept,
+        capped=place[capped],
+        split=split,
+        exchanged=exchanged[stay],
+        out=out,
+        back=back,
+    )
 
 
 def _eliminate(m: FloatArray, q: FloatArray, free: Places) -> tuple[FloatArray, FloatArray, Mask, Mask]:

@@ -99,13 +99,13 @@ def family(**twins: Mapping[str, Any]) -> Callable[[Callable[P, Draft]], Callabl
             draft = function(**values)  # type: ignore[call-arg]
             text = _text(name, values, given)
             return Case(
-                text,
-                replace(draft.problem, name=text, copy=False),
-                draft.reason,
-                name,
-                MappingProxyType(values),
-                draft.expect,
-                draft.reference,
+                name=text,
+                problem=replace(draft.problem, name=text, copy=False),
+                reason=draft.reason,
+                family=name,
+                parameters=MappingProxyType(values),
+                expect=draft.expect,
+                solve_reference=draft.reference,
             )
 
         for alias, preset in {name: {}, **twins}.items():

@@ -1,0 +1,105 @@
+"""A QP backend as a solver: its problem in the form that suits it, and one run of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from lavender._arrays import FloatArray
+from lavender.errors import CapabilityError, InputError
+from lavender.external._running import Call, ask, definite_refusal, symmetric_refusal
+from lavender.external.as_qp import QP, impulse_form, pick_form, velocity_form
+from lavender.external.backend import Backend
+from lavender.external.generic import through_qpsolvers
+from lavender.problem import Problem
+from lavender.solution import Claim
+
+__all__ = ["OPTIONS", "QPSolver", "refusal"]
+
+DENSE_LIMIT = 2**30  # bytes of one dense matrix; beyond, a dense backend is refused
+OPTIONS = {
+    "form": "'impulse', 'velocity' (needs rows) or 'auto' (default): by size, mass ratio and backend",
+    "unit_diagonal": "impulse form: scale A to a unit diagonal, default True",
+    "settings": "mapping passed to the backend, over those that tol gives",
+}
+
+
+@dataclass
+class State:
+    """A converted problem."""
+
+    problem: Problem
+    qp: QP
+
+
+@dataclass(frozen=True)
+class QPSolver:
+    """A backend with its options.
+
+    Parameters
+    ----------
+    backend : Backend
+    form : {"auto", "impulse", "velocity"}
+    unit_diagonal : bool
+        Impulse form: scale P to a unit diagonal.
+    settings : mapping
+        Passed to the backend as they are, over those that `tol` gives.
+    """
+
+    backend: Backend
+    form: str = "auto"
+    unit_diagonal: bool = True
+    settings: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.settings, Mapping):
+            raise InputError(
+                f"settings is a {type(self.settings).__name__}; a mapping of names to values is needed"
+            )
+
+    @np.errstate(all="ignore")  # what overflows is judged
+    def prepare(self, problem: Problem) -> State:
+        b = self.backend
+        qp = velocity_form(problem) if pick_form(problem, self.form, b.definite) == "velocity" else None
+        if qp is not None and b.definite and self.form == "auto" and not qp.is_definite:
+            qp = None
+        if qp is None:
+            qp = impulse_form(
+                problem,
+                unit_diagonal=self.unit_diagonal,
+                equality=b.linear == "equality" and problem.cones.is_free,
+            )
+        if len(qp.kept) and qp.is_bounds_only and not b.linear:
+            raise CapabilityError(
+                f"solver {b.name!r} takes no problem without inequalities, and qpsolvers would hand it to LSQR; "
+                "use direct or another backend"
+            )
+        if b.dense and 8 * qp.n * max(qp.n, len(qp.b)) > DENSE_LIMIT:
+            raise CapabilityError(
+                f"solver {b.name!r} takes dense matrices only: {max(qp.n, len(qp.b))} x {qp.n} would need more "
+                f"than {DENSE_LIMIT >> 20} MiB; use a sparse backend (osqp, piqp, clarabel)"
+            )
+        return State(problem, qp)
+
+    def update(self, state: State, problem: Problem) -> State:
+        return self.prepare(problem)
+
+    @np.errstate(all="ignore")  # what overflows is judged
+    def run(
+        self, state: State, impulse: FloatArray, n: int, tol: float, time_limit: float | None = None
+    ) -> Claim:
+        b = self.backend
+        call: Call = partial(through_qpsolvers, b) if b.call is None else b.call
+        return ask(
+            state.problem, state.qp, impulse, call, n, tol, time_limit, self.settings,
+            stoppable=b.stoppable, noisy=b.noisy,
+        )  # fmt: skip
+
+
+def refusal(problem: Problem) -> str | None:
+    """Why no QP backend can take this problem, before any conversion."""
+    return symmetric_refusal(problem) or definite_refusal(problem)
