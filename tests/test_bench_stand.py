@@ -43,7 +43,7 @@ def test_ours_is_what_the_scene_says_and_its_centres_are_the_boxes():
 def test_a_tower_that_falls_is_said_to_fall():
     # ten boxes on four sweeps of whole steps in one direction
     found = measure("lavender", Tower(10, 1 / 60, 4, 1, "given", 20.0))
-    assert not found.stands and 2.0 < found.stood < 20.0 and found.drift > 0.5
+    assert not found.stands and 2.0 < found.stood < 20.0 and 0.1 < found.drift < 1.0
     assert "**fell at" in table([found])
 
 
@@ -95,3 +95,15 @@ def test_what_makes_no_sense_is_refused_before_anything_is_measured(words, error
 
 def test_lavender_is_always_installed():
     assert installed()[:2] == ["lavender", "newton"]
+
+
+@pytest.mark.parametrize("name", [n for n, c in ENGINES.items() if not isinstance(c.make, str)])
+def test_centres_before_the_first_step_are_where_the_boxes_were_put(name):
+    if missing(name):
+        pytest.skip(missing(name))
+    engine = ENGINES[name].make(Tower(3, 1 / 60))
+    up = 1 if name == "lavendersim" else 2
+    np.testing.assert_allclose(
+        engine.centres()[:, up], [0.5, 1.5, 2.5], atol=1e-6
+    )  # some are single precision
+    engine.close()

@@ -9,12 +9,13 @@ from lavender.scene.scene import SCENE_ORDERS
 
 MOST = 5e-3  # m, that a box may move between two seconds and the end
 MINUTE = 60.0  # s
+FELL = 0.05  # m, from where a box began
 
 
 def drift(name, seconds=MINUTE, *, dt=1 / 60, **parameters):
     """Largest distance [m] of a body from where it was after two seconds, looked at ten times a second."""
     sim = lv.Simulation(lv.Scene(name, dt=dt, **parameters))
-    every, start, most = round(0.1 / dt), None, 0.0
+    every, start, most, first = round(0.1 / dt), None, 0.0, sim._state.a["x"].copy()
     for step in range(every, round(seconds / dt) + 1, every):
         left = every * sim.scene.parameters.substeps
         while left:
@@ -23,6 +24,8 @@ def drift(name, seconds=MINUTE, *, dt=1 / 60, **parameters):
             if status == 1:
                 sim._state = sim._state.grown()
         x = sim._state.a["x"]
+        if np.abs(x - first).max() > FELL:  # also before it counts
+            return np.inf
         if step * dt >= 2.0 - 1e-9:
             if start is None:
                 start = x.copy()

@@ -84,6 +84,8 @@ async function jolt() {
 const engine = await { rapier, jolt }[asked.engine]();
 const every = Math.max(1, Math.round(asked.look / asked.dt));
 const looks = Math.max(1, Math.round(asked.seconds / (every * asked.dt)));
+const far = (now, then) => Math.max(...now.map((p, i) => Math.hypot(...p.map((x, k) => x - then[i][k]))));
+const first = engine.centres();
 let start = null;
 let drift = 0;
 let stood = asked.seconds;
@@ -98,15 +100,14 @@ for (let look = 0; look < looks; look++) {
   spent += 1e-6 * (used.user + used.system);
   steps += every;
   const time = steps * asked.dt;
-  if (time < asked.settle - 1e-9) {
-    continue;
-  }
   const now = engine.centres();
-  start ??= now;
-  drift = Math.max(drift, ...now.map((p, i) => Math.hypot(...p.map((x, k) => x - start[i][k]))));
-  if (!(drift <= asked.fell)) {
+  if (!(far(now, first) <= asked.fell)) {
     stood = time;
     break;
+  }
+  if (time >= asked.settle - 1e-9) {
+    start ??= now;
+    drift = Math.max(drift, far(now, start));
   }
 }
 console.log(
