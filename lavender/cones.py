@@ -20,10 +20,11 @@ import numpy as np
 
 from lavender._arrays import FloatArray, IntArray, as_array, check_not_nan, check_not_negative, equal
 from lavender.errors import InputError
+from lavender_ext.core.problem import KINDS
 
 __all__ = ["CONTACT", "CONTACT_SPIN", "ROUND", "ROW", "Cones", "project"]
 
-ROW, CONTACT, CONTACT_SPIN, ROUND = 0, 1, 2, 3
+ROW, CONTACT, CONTACT_SPIN, ROUND = KINDS
 
 
 @dataclass(frozen=True, eq=False)

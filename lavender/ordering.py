@@ -22,15 +22,21 @@ from scipy.sparse.csgraph import reverse_cuthill_mckee
 from lavender._arrays import IntArray, as_array
 from lavender.errors import CapabilityError, InputError, UnknownName
 from lavender.problem import Problem
-from lavender_ext.core.order import body_colors, body_order_levels, graph_colors, stable_order
+from lavender_ext.core.order import (
+    GIVEN,
+    RANDOM,
+    SYMMETRIC,
+    body_colors,
+    body_order_levels,
+    graph_colors,
+    stable_order,
+)
 
 __all__ = ["ENGINE_ORDERS", "ORDERS", "Order", "block_order", "body_ranks", "colors", "levels", "local_order"]
 
 # The engine makes its contacts in the order of its bodies; "local" is for problems from elsewhere.
 ENGINE_ORDERS = ("given", "reverse", "symmetric", "random", "colored", "bottom_up", "top_down")
 ORDERS = (*ENGINE_ORDERS, "local")
-# Modes of lavender_ext/core/order.pxd.
-_GIVEN, _SYMMETRIC, _RANDOM = 0, 1, 2
 
 
 @dataclass
@@ -47,7 +53,7 @@ class Order:
     @property
     def is_fixed(self) -> bool:
         """Every sweep runs in the same order."""
-        return self.mode == _GIVEN
+        return self.mode == GIVEN
 
     def fresh(self) -> Order:
         """A copy that can be swept without touching this one."""
@@ -78,7 +84,7 @@ def block_order(
     k = problem.n_blocks
     split = 0 if problem.rows is None else problem.rows.n_joints
     if type(order) is str and order == "given" and ground is None and type(seed) is int and seed == 0:
-        return Order(np.arange(k, dtype=np.int32), split, _GIVEN, np.zeros(1, np.uint64), is_given=True)
+        return Order(np.arange(k, dtype=np.int32), split, GIVEN, np.zeros(1, np.uint64), is_given=True)
     if not isinstance(seed, (int, np.integer)) or seed < 0:
         raise InputError(f"seed is {seed!r}; a whole number >= 0 is needed")
     rng = np.array([int(seed) % 2**64], np.uint64)
@@ -90,14 +96,14 @@ def block_order(
         blocks = as_array("order", order, (k,), dtype=np.int32).copy()
         if not np.array_equal(np.sort(blocks), np.arange(k)):
             raise InputError(f"order must hold every block from 0 to {k - 1} once")
-        return Order(blocks, k, _GIVEN, rng)
+        return Order(blocks, k, GIVEN, rng)
     if order not in ORDERS:
         raise UnknownName("order", order, ORDERS)
     if ground is not None and order not in ("bottom_up", "top_down"):
         raise InputError(f"ground= goes with bottom_up and top_down, not with {order!r}")
     blocks = np.arange(k, dtype=np.int32)
     if order == "given":
-        return Order(blocks, split, _GIVEN, rng, is_given=True)
+        return Order(blocks, split, GIVEN, rng, is_given=True)
     if order == "reverse":
         blocks = np.concatenate([blocks[:split][::-1], blocks[split:][::-1]])
     elif order in ("bottom_up", "top_down"):
@@ -109,8 +115,8 @@ def block_order(
         blocks = local_order(problem)
     elif order == "colored":
         blocks, ptr = _by_key(colors(problem), split)
-        return Order(blocks, split, _GIVEN, rng, ptr)
-    mode = _SYMMETRIC if order == "symmetric" else _RANDOM if order == "random" else _GIVEN
+        return Order(blocks, split, GIVEN, rng, ptr)
+    mode = SYMMETRIC if order == "symmetric" else RANDOM if order == "random" else GIVEN
     return Order(np.ascontiguousarray(blocks, np.int32), split, mode, rng)
 
 

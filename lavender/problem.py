@@ -23,13 +23,14 @@ from lavender.errors import CapabilityError, InputError
 from lavender.generalized import Generalized
 from lavender.rows import Rows
 from lavender_ext.core import assemble
+from lavender_ext.core.problem import LAWS as FRICTION_NUMBER
 from lavender_ext.core.problem import Data, dense_to_csr, rows_velocity
 from lavender_ext.judge import measure
 from lavender_ext.pivot import principal
 
 __all__ = ["LAWS", "OPERATORS", "Problem", "VelocityForm"]
 
-FRICTION = ("coulomb", "cone")
+FRICTION = tuple(FRICTION_NUMBER)
 # A solver that takes a law takes every law before it that it contains: linear < lcp < coulomb | cone.
 LAWS = ("linear", "lcp", "coulomb", "cone")
 # How A is given.
@@ -504,7 +505,7 @@ class Problem:
             c.mu,
             c.patch_radius,
             self.b,
-            FRICTION.index(self.friction),
+            FRICTION_NUMBER[self.friction],
             **operator,
         )
 

@@ -79,17 +79,9 @@ def at_floor(relative: float, floor: float) -> bool:
     return relative <= 2.0 * floor < math.inf
 
 
-def _ratio(x: float, reference: float) -> float:
-    if x == 0.0:
-        return 0.0
-    if not math.isfinite(x):
-        return math.inf
-    return x / reference if reference > 0.0 else np.inf
-
-
 def relative_of(data: Any, energy: float, velocity: float) -> float:
     """The relative residual of two errors [sqrt J, m/s]; inf where one is not finite, or has no reference."""
-    return max(_ratio(energy, data.start_energy), _ratio(velocity, data.start_velocity))
+    return measure.compare(energy, velocity, data.start_energy, data.start_velocity)
 
 
 def reference(problem: Problem) -> tuple[float, float]:

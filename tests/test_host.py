@@ -8,6 +8,7 @@ import pytest
 import lavender as lv
 from lavender.engine.layout import HEAD, SETTING
 from lavender.engine.state import State
+from lavender_ext.engine.arrays import SHAPES, offsets
 from lavender_ext.host import memory
 
 C_TYPES = {"i4": ctypes.c_int32, "f8": ctypes.c_double, "3f8": 3 * ctypes.c_double, "p": ctypes.c_void_p}
@@ -40,9 +41,9 @@ def test_structs_lie_as_the_compiler_lays_them(name):
 @pytest.mark.parametrize("name", ["stack", "chain", "spinner", "pile", "four_bar"])
 def test_arrays_lie_where_the_engine_has_them(name):
     state = State.of_scene(lv.Scene(name))
-    first = memory.offsets(state.size)
+    first = offsets(state.size)
     total = {"real": state.real, "index": state.index, "keys": state.keys}
-    for buffer, names in memory.ARRAYS.items():
+    for buffer, names in SHAPES.items():
         starts = [first[n] for n in names]
         assert starts[0] == 0 and starts == sorted(starts)
         ends = [*starts[1:], len(total[buffer])]
@@ -53,7 +54,7 @@ def test_arrays_lie_where_the_engine_has_them(name):
                 if view.size:
                     assert np.shares_memory(view, total[buffer][start:end]), n
                     assert view.ctypes.data == total[buffer][start:].ctypes.data, n
-    named = {n for names in memory.ARRAYS.values() for n in names}
+    named = {n for names in SHAPES.values() for n in names}
     assert set(state.a) <= named
 
 

@@ -1,23 +1,62 @@
-"""Places of numbers in the engine's small arrays, as `lavender_ext/engine/arrays.pxd` numbers them."""
+"""Places of numbers in the engine's small arrays, by name, as `lavender_ext/engine/arrays.pxd` numbers them."""
 
+from lavender_ext.engine import arrays
+from lavender_ext.engine.arrays import (
+    CAP_CONTACT,
+    CAP_PAIR,
+    MOST_PAIRS,
+    N_SIZES,
+    NEED_ROOM,
+    NOT_FINITE,
+    OK,
+    TOO_MANY,
+)
+
+__all__ = [
+    "CAP_CONTACT",
+    "CAP_PAIR",
+    "HEAD",
+    "JOINT",
+    "JOINT_KINDS",
+    "MOST_PAIRS",
+    "NEED_ROOM",
+    "NOT_FINITE",
+    "N_SIZES",
+    "OK",
+    "ORDER_NUMBER",
+    "SETTING",
+    "SIZE",
+    "TOO_MANY",
+]
+
+
+def _numbers(prefix: str) -> dict[str, int]:
+    return {
+        name.removeprefix(prefix).lower(): number
+        for name, number in vars(arrays).items()
+        if name.startswith(prefix) and isinstance(number, int)
+    }
+
+
+HEAD, SETTING, JOINT = _numbers("H_"), _numbers("S_"), _numbers("J_")
 SIZE = {
-    "bodies": 0, "dynamic": 1, "joints": 2, "joint_rows": 3, "excluded": 4, "buckets": 5, "frames": 6,
-    "rows_per_contact": 7,
-}  # fmt: skip
-CAP_PAIR, CAP_CONTACT, N_SIZES = 8, 9, 10
-HEAD = {
-    "contacts": 0, "contact_rows": 1, "pairs": 2, "pairs_valid": 3, "matches": 4, "cached": 5, "iterations": 6,
-    "warm_start": 7, "position_iterations": 8, "order": 9, "seed": 10, "step": 11, "need_pairs": 12,
-    "need_contacts": 13, "rebuilds": 14, "projected": 15, "lost": 16, "solved": 17,
-}  # fmt: skip
-SETTING = {
-    "h": 0, "gravity": 1, "slop": 4, "margin": 5, "skin": 6, "beta": 7, "max_push": 8, "bounce": 9, "match": 10,
-    "out": 12, "depth": 20, "joint_error": 21,
-}  # fmt: skip
-JOINT = {
-    "anchor_a": 0, "anchor_b": 3, "axis_a": 6, "axis_b": 9, "side_a": 12, "length": 15, "hertz": 16, "damping": 17,
-    "speed": 18, "torque": 19,
-}  # fmt: skip
-JOINT_KINDS = {"distance": 0, "ball": 1, "hinge": 2}
-OK, NEED_ROOM, NOT_FINITE = 0, 1, 2
-MOST_PAIRS, TOO_MANY = 2**24, 2**31 - 1  # pairs that end the broad phase, and the need that it then names
+    "bodies": arrays.N_BODY,
+    "dynamic": arrays.N_DYNAMIC,
+    "joints": arrays.N_JOINT,
+    "joint_rows": arrays.N_JOINT_ROW,
+    "excluded": arrays.N_EXCLUDED,
+    "buckets": arrays.N_BUCKET,
+    "frames": arrays.N_FRAME,
+    "rows_per_contact": arrays.ROWS_PER_CONTACT,
+}
+JOINT_KINDS = {"distance": arrays.DISTANCE, "ball": arrays.BALL, "hinge": arrays.HINGE}
+ORDER_NUMBER = {
+    "given": arrays.AS_GIVEN,
+    "reverse": arrays.REVERSED,
+    "symmetric": arrays.SYMMETRICALLY,
+    "random": arrays.AT_RANDOM,
+    "bottom_up": arrays.BOTTOM_UP,
+    "top_down": arrays.TOP_DOWN,
+    "colored": arrays.COLORED,
+    "alternating": arrays.ALTERNATING,
+}

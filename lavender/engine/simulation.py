@@ -34,7 +34,7 @@ from lavender.solution import Solution, Status
 from lavender.solve import finish, solve
 from lavender.solvers.newton import SPEC as NEWTON_SPEC
 from lavender.solvers.warm_start import MOST_STEPS, Tried, claim_of
-from lavender_ext.engine import substep
+from lavender_ext.engine.arrays import lengths
 
 if TYPE_CHECKING:
     from lavender.web.view import Viewer
@@ -784,9 +784,9 @@ class Simulation:
         well_formed(snapshot)
         size = snapshot.size.copy()
         same_scene(self._state, size)
-        lengths = (len(snapshot.real), len(snapshot.index), len(snapshot.keys))
-        used = substep.lengths(size)
-        if lengths != (used[0], used[1], max(used[2], 1)):
+        given = (len(snapshot.real), len(snapshot.index), len(snapshot.keys))
+        used = lengths(size)
+        if given != (used[0], used[1], max(used[2], 1)):
             raise InputError("the snapshot is damaged: its arrays do not fit its sizes")
         state = State(size)
         state.real[:], state.index[:], state.keys[:] = snapshot.real, snapshot.index, snapshot.keys

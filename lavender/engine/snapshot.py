@@ -21,7 +21,7 @@ from lavender.engine.check import well_formed
 from lavender.engine.layout import N_SIZES
 from lavender.errors import InputError
 from lavender.io.stored import write_atomically
-from lavender_ext.engine import substep
+from lavender_ext.engine.arrays import lengths
 
 __all__ = ["Snapshot"]
 
@@ -109,7 +109,7 @@ class Snapshot:
             arrays[name] = x.astype(x.dtype.newbyteorder("="))
         if end != len(body) or len(arrays["size"]) != N_SIZES or min(arrays["size"]) < 0:
             raise ValueError("lengths")
-        used = substep.lengths(arrays["size"])
+        used = lengths(arrays["size"])
         if [max(n, 1) for n in used] != [max(n, 1) for n in header["lengths"][1:]]:
             raise ValueError("lengths")
         found = cls(header["fingerprint"], header["steps"], header["failed"], header["lost"], **arrays)

@@ -16,6 +16,7 @@ from lavender.engine.layout import (
     JOINT_KINDS,
     MOST_PAIRS,
     N_SIZES,
+    ORDER_NUMBER,
     SETTING,
     SIZE,
     TOO_MANY,
@@ -24,23 +25,13 @@ from lavender.errors import InputError
 from lavender.scene import Box, Plane, Scene, Sphere
 from lavender.scene.scene import SCENE_ORDERS
 from lavender_ext.engine import substep
+from lavender_ext.engine.arrays import lengths
 from lavender_ext.warm.start import Warm
 
 __all__ = ["ORDER_NUMBER", "State"]
 
 Copy = Callable[[], np.ndarray]
 
-# H_ORDER of lavender_ext/engine/substep.pyx
-ORDER_NUMBER = {
-    "given": 0,
-    "reverse": 1,
-    "symmetric": 2,
-    "random": 3,
-    "bottom_up": 4,
-    "top_down": 5,
-    "colored": 6,
-    "alternating": 7,
-}
 assert set(ORDER_NUMBER) == set(SCENE_ORDERS)
 
 BRUTE_FORCE = 32  # bodies up to which testing all pairs is quicker than the grid
@@ -74,11 +65,11 @@ class Seen(NamedTuple):
 
 
 class State:
-    """Three buffers with the arrays of `lavender_ext/engine/arrays.pxd` by name, as attributes of `a`."""
+    """Three buffers with the arrays of `lavender_ext/engine/arrays.pyx` by name, as attributes of `a`."""
 
     def __init__(self, size: np.ndarray) -> None:
         self.size = np.ascontiguousarray(size, np.int32)
-        used = substep.lengths(self.size)
+        used = lengths(self.size)
         if min(used) < 0 or 8 * used[0] + 4 * used[1] + 8 * used[2] > MOST_BYTES:
             raise InputError(
                 f"{self.size[SIZE['bodies']]} bodies with room for {self.size[CAP_PAIR]} pairs and "

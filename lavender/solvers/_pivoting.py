@@ -14,9 +14,8 @@ from scipy.linalg import lapack
 from lavender._arrays import FloatArray, IntArray
 from lavender.problem import Problem
 from lavender.solvers._factor import TINY, DenseFactor, Factor, SparseFactor, choose
-from lavender_ext.pivot.principal import Pivoting
+from lavender_ext.pivot.principal import INDEFINITE, ROUNDS, SMALL, SOLVED, STUCK, Pivoting
 
-SOLVED, ROUNDS, SMALL, INDEFINITE, STUCK = range(5)  # outcomes, as in lavender_ext/pivot/principal.pyx
 HALVINGS = 41  # step lengths tried in a line search: 1, 1/2, ... 2^-40
 SLOP = 8.0  # roundings of w within which a sign means nothing, as there
 

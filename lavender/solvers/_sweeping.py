@@ -18,10 +18,16 @@ from lavender.ordering import Order, block_order
 from lavender.problem import Problem
 from lavender.residuals import reference
 from lavender.solution import Claim, Status
-from lavender_ext.judge.watch import Watch
+from lavender_ext.judge.watch import AT_FLOOR, CONVERGED, DIVERGED, RUNNING, STALLED, Watch
 from lavender_ext.sweep import serial, threaded
 
-_STATUS = (Status.MAX_ITERATIONS, Status.CONVERGED, Status.DIVERGED, Status.STALLED, Status.FLOOR)
+_STATUS = {
+    RUNNING: Status.MAX_ITERATIONS,
+    CONVERGED: Status.CONVERGED,
+    DIVERGED: Status.DIVERGED,
+    STALLED: Status.STALLED,
+    AT_FLOOR: Status.FLOOR,
+}
 # Multiply-adds per colour from which a second thread gains (measured: where both take the same time).
 GRAIN = 20_000
 LEAST = 400_000  # multiply-adds of a sweep: 4,000 contacts, below which starting threads costs what they save

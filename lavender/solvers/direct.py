@@ -29,8 +29,9 @@ from lavender.registry import SolverSpec
 from lavender.residuals import at_floor, judged, remember
 from lavender.solution import Claim, Status
 from lavender.solvers._factor import GeneralFactor
-from lavender.solvers._pivoting import INDEFINITE, ROUNDS, SMALL, SOLVED, STUCK, PivotState
+from lavender.solvers._pivoting import PivotState
 from lavender_ext.judge import measure
+from lavender_ext.pivot.principal import INDEFINITE, ROUNDS, SMALL, SOLVED, STUCK
 
 # -, s: the last is far above the rounding of a factorisation and below what a mass ratio of 1e8 leaves.
 PATH = (1e-2, 1e-4, 1e-6, 1e-8, 1e-10)

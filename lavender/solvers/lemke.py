@@ -32,7 +32,7 @@ from lavender.registry import SolverSpec
 from lavender.residuals import at_floor, quick
 from lavender.solution import Claim, Status
 from lavender_ext.judge import measure
-from lavender_ext.pivot.tableau import Dictionary
+from lavender_ext.pivot.tableau import PIVOTS, RAY, Dictionary
 
 LIMIT = 2000  # rows: a dictionary of 32 MB
 # -, entries of a column this much below its largest are not pivoted on; the finer one for a second path, on
@@ -44,7 +44,6 @@ BATCH = 200  # pivots between two looks at the clock; then the dictionary is for
 PATHS = 8  # covering vectors tried
 PIVOTS_A_ROW = 20  # on one path, before it counts as lost
 GOOD = 1e-12  # relative residual at which no other path is tried
-DONE, PIVOTS, RAY = range(3)  # as in lavender_ext/pivot/tableau.pyx
 
 
 Places = npt.NDArray[np.intp]

@@ -12,15 +12,27 @@ from lavender._arrays import FloatArray
 from lavender._derived import Tried
 from lavender.problem import Problem
 from lavender.solution import Claim, Status
-from lavender_ext.warm.start import from_guess, limits
+from lavender_ext.warm.start import (
+    JUDGED,
+    MOST_STEPS,
+    MOST_SWEEPS,
+    SOLVED,
+    STEPPED,
+    SWEPT,
+    UNDECIDED,
+    from_guess,
+)
 
 __all__ = ["MOST_STEPS", "Tried", "claim_of", "warm_start"]
 
-#: How it ended, by number of lavender_ext/warm/start.pxd: None where nothing was decided.
-ENDED = (None, "as it came", "warm sweeps", "joints solved directly", "warm sweeps, Newton steps over bodies")
-
-JOINTS = 3  # the one that factors over rows
-MOST_SWEEPS, MOST_STEPS = limits()  # sweeps and factorisations that the first phase may cost
+#: How the kernel says that it ended; None where nothing was decided.
+ENDED = {
+    UNDECIDED: None,
+    JUDGED: "as it came",
+    SWEPT: "warm sweeps",
+    SOLVED: "joints solved directly",
+    STEPPED: "warm sweeps, Newton steps over bodies",
+}
 
 
 def claim_of(tried: Tried) -> Claim | None:
@@ -31,7 +43,7 @@ def claim_of(tried: Tried) -> Claim | None:
     work = {"factorisations": tried.factorisations}
     if tried.sweeps:
         work["sweeps"] = tried.sweeps
-    form = "impulse" if tried.how == JOINTS else "velocity"
+    form = "impulse" if tried.how == SOLVED else "velocity"
     return Claim(Status.CONVERGED, tried.factorisations, work, message, form=form)
 
 

@@ -40,7 +40,15 @@ from pathlib import Path
 __all__ = ["LARGEST", "MODULES", "BuildFailed", "Built", "build", "read_module", "source_hash", "why_not"]
 
 #: Modules of lavender_ext that the page and the checks use.
-MODULES = ("core.order", "core.problem", "engine.substep", "host.memory", "judge.measure", "sweep.serial")
+MODULES = (
+    "engine.arrays",
+    "core.order",
+    "core.problem",
+    "engine.substep",
+    "host.memory",
+    "judge.measure",
+    "sweep.serial",
+)
 #: Largest size of the finished module [bytes].
 LARGEST = 200_000
 CIMPORT = re.compile(r"^from lavender_ext\.([\w.]+) cimport", re.MULTILINE)

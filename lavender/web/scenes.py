@@ -11,6 +11,7 @@ from lavender.engine.layout import CAP_CONTACT, CAP_PAIR, HEAD, JOINT, SETTING, 
 from lavender.engine.snapshot import Snapshot
 from lavender.engine.state import ORDER_NUMBER
 from lavender.scene import Scene
+from lavender_ext.engine.arrays import SHAPES, offsets
 from lavender_ext.host import memory
 
 __all__ = ["PAGE", "describe", "layout", "page_scenes"]
@@ -58,7 +59,7 @@ def layout() -> dict[str, Any]:
     return {
         "structs": memory.STRUCTS,
         "native": native,
-        "arrays": memory.ARRAYS,
+        "arrays": {buffer: tuple(names) for buffer, names in SHAPES.items()},
         "size": {**SIZE, "cap_pair": CAP_PAIR, "cap_contact": CAP_CONTACT},
         "head": HEAD,
         "setting": SETTING,
@@ -80,9 +81,9 @@ def describe(start: Snapshot) -> dict[str, Any]:
         size (10,), arrays: name -> numbers; exact when written as JSON, since the shortest text of a double
         that reads back as the same double is written.
     """
-    first = memory.offsets(start.size)
+    first = offsets(start.size)
     arrays = {}
-    for names, buffer in zip(memory.ARRAYS.values(), (start.real, start.index, start.keys), strict=True):
+    for names, buffer in zip(map(tuple, SHAPES.values()), (start.real, start.index, start.keys), strict=True):
         ends = [*(first[name] for name in names[1:]), len(buffer)]
         for name, end in zip(names, ends, strict=True):
             values = buffer[first[name] : end]

@@ -7,7 +7,7 @@ Steele, Lea, Flood 2014), so that a seed means the same sweep everywhere.
 from libc.stdint cimport int32_t, uint64_t
 
 
-cdef enum:
+cpdef enum:
     GIVEN = 0
     SYMMETRIC = 1
     RANDOM = 2

@@ -11,11 +11,17 @@ from libc.stdint cimport int32_t
 
 import numpy as np
 
-from lavender_ext.core.block cimport CONTACT_SPIN, ROUND, ROW, blocks_t, is_pair, n_tangents
+from lavender_ext.core.block cimport (CONE, CONTACT, CONTACT_SPIN, COULOMB, ROUND, ROW, blocks_t, is_pair,
+                                      n_tangents)
 from lavender_ext.core.csr cimport csr_t
 from lavender_ext.core.generalized cimport Operator, dot, generalized_t, panel_pattern, panel_whiten
 from lavender_ext.core.rows cimport (contact_diagonal, dot12, largest_eigenvalue, minv_times, reciprocal,
                                      rows_t, rows_times)
+
+
+#: Kinds of blocks and friction laws by the kernels' numbers.
+KINDS = (ROW, CONTACT, CONTACT_SPIN, ROUND)
+LAWS = {"coulomb": COULOMB, "cone": CONE}
 
 
 cdef public int32_t lav_csr_diagonal(const blocks_t* p, const csr_t* a, double* d, double* step,

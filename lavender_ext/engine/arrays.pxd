@@ -12,7 +12,7 @@ from libc.stdint cimport int32_t, int64_t, uint64_t
 
 
 # size[]: what `bind` needs to know
-cdef enum:
+cpdef enum:
     N_BODY = 0
     N_DYNAMIC = 1
     N_JOINT = 2
@@ -26,7 +26,7 @@ cdef enum:
     N_SIZES = 10
 
 # head[]: integers that change
-cdef enum:
+cpdef enum:
     H_CONTACTS = 0
     H_CONTACT_ROWS = 1
     H_PAIRS = 2
@@ -48,7 +48,7 @@ cdef enum:
     N_HEAD = 24
 
 # H_ORDER: how the blocks of a sweep are ordered, joints and contacts each among themselves
-cdef enum:
+cpdef enum:
     AS_GIVEN = 0
     REVERSED = 1
     SYMMETRICALLY = 2
@@ -59,7 +59,7 @@ cdef enum:
     ALTERNATING = 7         # as given, and contacts are made from the last pair to the first in odd substeps
 
 # setting[]: real numbers; those from S_OUT on are written by the engine
-cdef enum:
+cpdef enum:
     S_H = 0                 # s, substep
     S_GRAVITY = 1           # m/s^2, three
     S_SLOP = 4              # m
@@ -75,31 +75,31 @@ cdef enum:
     N_SETTINGS = 24
 
 # the pair list: what stops the broad phase, and what it then says is needed, which no capacity meets
-cdef enum:
+cpdef enum:
     MOST_PAIRS = 16777216
     TOO_MANY = 2147483647
 
 # status of a substep
-cdef enum:
+cpdef enum:
     OK = 0
     NEED_ROOM = 1           # H_NEED_PAIRS, H_NEED_CONTACTS say how much; no state has changed
     NOT_FINITE = 2          # H_LOST names the body
 
 # shapes
-cdef enum:
+cpdef enum:
     NO_SHAPE = 0
     PLANE = 1
     SPHERE = 2
     BOX = 3
 
 # joints
-cdef enum:
+cpdef enum:
     DISTANCE = 0
     BALL = 1
     HINGE = 2
 
 # joint parameters, in doubles
-cdef enum:
+cpdef enum:
     J_ANCHOR_A = 0          # m, in the frame of a, three
     J_ANCHOR_B = 3          # m, in the frame of b, three
     J_AXIS_A = 6            # -, unit, in the frame of a, three
@@ -112,16 +112,21 @@ cdef enum:
     J_TORQUE = 19           # N m, largest of the motor
     N_JOINT_REAL = 20
 
-# how a cached contact stores its impulse: normal, friction as a world vector, spin
+# arrays in each buffer
 cdef enum:
+    N_REAL_ARRAYS = 45
+    N_INDEX_ARRAYS = 22
+    N_KEY_ARRAYS = 3
+
+# how a cached contact stores its impulse: normal, friction as a world vector, spin
+cpdef enum:
     N_CACHE_IMPULSE = 5
 
 
 cdef struct engine_t:
     const int32_t* size
+    # the buffer of doubles, in its order: `lav_engine_offsets` walks over the fields
     double* setting         # (N_SETTINGS)
-    int32_t* head           # (N_HEAD)
-    # bodies
     double* x               # (n, 3) m
     double* q               # (n, 4) unit quaternion w, x, y, z
     double* v               # (n, 6) m/s, rad/s
@@ -134,29 +139,16 @@ cdef struct engine_t:
     double* patch           # (n) m
     double* rot             # (N_FRAME, 9) body to world
     double* fat             # (n, 6) m, box of the pair list: low, high
-    int32_t* kind_of_shape  # (n)
-    int32_t* dyn            # (n) number among the dynamic bodies, -1 = static
-    int32_t* uneven         # (n) 1 where the inertia has a direction
-    # joints
     double* joint           # (kj, N_JOINT_REAL)
     double* joint_error     # (mj) m or rad
-    int32_t* joint_kind     # (kj)
-    int32_t* joint_motor    # (kj) 0 or 1
-    int32_t* joint_bodies   # (kj, 2) bodies, -1 = the world
-    int32_t* joint_body     # (kj, 2) dynamic numbers, -1 = static; contact_body follows
     double* jac             # (mj, 12)
     double* minv_jac        # (mj, 12)
-    int32_t* excluded       # (N_EXCLUDED, 2) pairs that never collide, sorted
-    # pairs
-    int32_t* pair           # (CAP_PAIR, 2) bodies a < b, sorted
-    int32_t* pair_scratch   # (CAP_PAIR, 2)
-    int32_t* count          # (n + 1)
-    int32_t* bucket         # (N_BUCKET) first body of the chain
-    int32_t* chain          # (n) next body of the chain
-    int32_t* cell           # (n, 4) cell and level
-    # contacts
-    int32_t* contact_pair   # (c, 2) bodies
-    int32_t* contact_body   # (c, 2) dynamic numbers; right after joint_body, so that all blocks follow
+    double* joint_impulse   # (mj) N s, N m s
+    double* inv_mass        # (nd) 1/kg
+    double* inv_inertia     # (nd, 9) 1/(kg m^2), world
+    double* v_free          # (nd, 6) m/s, rad/s
+    double* dv              # (nd, 6) m/s, rad/s
+    double* shift           # (nd, 6) m, rad: the position projection
     double* point           # (c, 3) m
     double* gap             # (c) m, negative = penetration
     double* normal          # (c, 3)
@@ -166,34 +158,45 @@ cdef struct engine_t:
     double* coupling        # (c, 5) 1/kg, absent without friction
     double* swing           # (contact rows, 6) 1/(kg m)
     double* local           # (c, 6) m, arms in the frames of a and b
-    double* target          # (m) m/s
-    double* push            # (c + mj) N s / s: multipliers of the position projection
-    uint64_t* key           # (c)
-    # the cache
-    uint64_t* cache_key     # (c)
     double* cache_impulse   # (c, N_CACHE_IMPULSE) N s, N m s
     double* cache_local     # (c, 6) m
-    double* joint_impulse   # (mj) N s, N m s
-    # the velocity problem, as blocks_t and rows_t see it
-    int32_t* ptr            # (kj + c + 1)
-    int32_t* kind           # (kj + c)
+    double* push            # (c + mj) N s / s: multipliers of the position projection
+    double* target          # (m) m/s
     double* lower           # (mj) N s, of the joint rows
     double* upper           # (mj) N s
-    double* mu              # (kj + c)
-    double* patch_radius    # (kj + c) m
     double* b               # (m) m/s
     double* d               # (m) 1/kg
     double* step            # (m) kg
     double* compliance      # (m) 1/kg
     double* impulse         # (m) N s, N m s
-    double* inv_mass        # (nd) 1/kg
-    double* inv_inertia     # (nd, 9) 1/(kg m^2), world
-    double* v_free          # (nd, 6) m/s, rad/s
-    double* dv              # (nd, 6) m/s, rad/s
-    double* shift           # (nd, 6) m, rad: the position projection
+    double* mu              # (kj + c)
+    double* patch_radius    # (kj + c) m
+    # the buffer of int32, in its order: `lav_engine_offsets` walks over the fields
+    int32_t* head           # (N_HEAD)
+    int32_t* kind_of_shape  # (n)
+    int32_t* dyn            # (n) number among the dynamic bodies, -1 = static
+    int32_t* uneven         # (n) 1 where the inertia has a direction
     int32_t* body_of        # (nd) body of a dynamic number
+    int32_t* joint_kind     # (kj)
+    int32_t* joint_motor    # (kj) 0 or 1
+    int32_t* joint_bodies   # (kj, 2) bodies, -1 = the world
+    int32_t* excluded       # (N_EXCLUDED, 2) pairs that never collide, sorted
+    int32_t* pair           # (CAP_PAIR, 2) bodies a < b, sorted
+    int32_t* pair_scratch   # (CAP_PAIR, 2)
+    int32_t* count          # (n + 1)
+    int32_t* bucket         # (N_BUCKET) first body of the chain
+    int32_t* chain          # (n) next body of the chain
+    int32_t* cell           # (n, 4) cell and level
+    int32_t* contact_pair   # (c, 2) bodies
+    int32_t* joint_body     # (kj, 2) dynamic numbers, -1 = static; contact_body follows
+    int32_t* contact_body   # (c, 2) dynamic numbers; right after joint_body, so that all blocks follow
+    int32_t* ptr            # (kj + c + 1)
+    int32_t* kind           # (kj + c)
     int32_t* order          # (kj + c) sweep order of the blocks
     int32_t* order_scratch  # (2 (n + kj + c) + 8): level of each body, of each block, places
+    # the buffer of uint64, in its order: `lav_engine_offsets` walks over the fields
+    uint64_t* key           # (c)
+    uint64_t* cache_key     # (c)
     uint64_t* color_scratch  # (nd)
 
 

@@ -14,17 +14,18 @@ from libc.stdint cimport int32_t, int64_t, uint64_t
 
 import numpy as np
 
+from lavender_ext.engine.arrays import views
+
 from lavender_ext.core.block cimport CONTACT_SPIN, blocks_t, n_tangents, row_error
 from lavender_ext.core.order cimport (RANDOM, SYMMETRIC, advance_order, block_levels, body_levels,
                                       color_by_bodies, reverse, sort_by_level)
 from lavender_ext.core.rows cimport contact_push, joint_push, relax_contact_block, relax_joint, rows_t
-from lavender_ext.engine.arrays cimport (AT_RANDOM, BOTTOM_UP, CAP_CONTACT, CAP_PAIR, COLORED, H_CACHED, H_CONTACTS,
-                                         H_CONTACT_ROWS, H_ITERATIONS, H_LOST, H_MATCHES, H_NEED_CONTACTS,
-                                         H_NEED_PAIRS, H_ORDER, H_SEED, H_SOLVED, H_STEP, H_WARM_START,
-                                         NEED_ROOM, NOT_FINITE, N_BODY, N_DYNAMIC, N_EXCLUDED, N_FRAME,
-                                         N_HEAD, N_JOINT, N_JOINT_REAL, N_JOINT_ROW, N_SETTINGS, OK,
-                                         REVERSED, ROWS_PER_CONTACT, SYMMETRICALLY, S_OUT, TOP_DOWN, bind,
-                                         engine_t)
+from lavender_ext.engine.arrays cimport (AT_RANDOM, BOTTOM_UP, CAP_CONTACT, CAP_PAIR, COLORED, H_CACHED,
+                                         H_CONTACTS, H_CONTACT_ROWS, H_ITERATIONS, H_LOST, H_MATCHES,
+                                         H_NEED_CONTACTS, H_NEED_PAIRS, H_ORDER, H_SEED, H_SOLVED, H_STEP,
+                                         H_WARM_START, NEED_ROOM, NOT_FINITE, N_DYNAMIC, N_HEAD, N_JOINT,
+                                         N_JOINT_ROW, OK, REVERSED, ROWS_PER_CONTACT, SYMMETRICALLY, S_OUT,
+                                         TOP_DOWN, bind, engine_t)
 from lavender_ext.engine.bodies cimport drift_bodies, start_bodies
 from lavender_ext.engine.broad_phase cimport update_pairs
 from lavender_ext.engine.contacts cimport make_contacts, store_contacts
@@ -32,7 +33,8 @@ from lavender_ext.engine.joints cimport make_joints
 from lavender_ext.engine.kept cimport keep, kept_reals, put_back
 from lavender_ext.engine.projection cimport normal_speed, project_positions
 from lavender_ext.engine.view cimport view
-from lavender_ext.judge.measure cimport rows_slack, score_rows, score_t
+from lavender_ext.judge.measure cimport rows_slack
+from lavender_ext.judge.score cimport score_rows, score_t
 from lavender_ext.sweep.packed cimport MOST, ROOM_BODY, ROOM_CONTACT, ROOM_MORE, packs, sweep_packed
 
 
@@ -218,18 +220,6 @@ cdef int32_t finish(engine_t* e) noexcept nogil:
     return OK if e.head[H_LOST] < 0 else NOT_FINITE
 
 
-cdef public void lav_engine_lengths(const int32_t* size, int32_t* used) noexcept nogil:
-    """Entries (3) of the buffers of doubles, int32 and uint64 for these sizes; -1 where beyond 2^31."""
-    cdef engine_t e
-    cdef int64_t n[3]
-    cdef double real = 0.0
-    cdef int32_t index = 0, k
-    cdef uint64_t key = 0
-    bind(size, &real, &index, &key, &e, n)
-    for k in range(3):
-        used[k] = <int32_t>n[k] if n[k] < 2147483647 else -1
-
-
 cdef public int32_t lav_engine_pairs(const int32_t* size, double* real, int32_t* index,
                                      uint64_t* keys) noexcept nogil:
     """The first two stages alone; returns the number of pairs needed."""
@@ -325,13 +315,6 @@ cdef public int32_t lav_engine_substeps_packed(const int32_t* size, double* real
     return substeps(size, real, index, keys, n_substeps, room, done)
 
 
-def lengths(const int32_t[::1] size):
-    """Entries of the three buffers (doubles, int32, uint64) that these sizes (10,) need; -1: too many."""
-    cdef int32_t used[3]
-    lav_engine_lengths(&size[0], used)
-    return used[0], used[1], used[2]
-
-
 cdef class Buffers:
     """Three buffers and their sizes, kept alive for the kernels; `arrays()` names what lies in them.
 
@@ -417,59 +400,5 @@ cdef class Buffers:
         put_back(&e, &self.kept_real[0], &self.kept_index[0], &self.kept_keys[0])
 
     def arrays(self):
-        """Name -> writable view of one of the buffers, with the shape that engine/arrays.pxd gives."""
-        cdef engine_t e
-        cdef int64_t used[3]
-        cdef double* r = &self.real[0]
-        cdef int32_t* i = &self.index[0]
-        cdef uint64_t* k = &self.keys[0]
-        bind(&self.size[0], r, i, k, &e, used)
-        n, nd, kj, mj = self.size[N_BODY], self.size[N_DYNAMIC], self.size[N_JOINT], self.size[N_JOINT_ROW]
-        c, p, per = self.size[CAP_CONTACT], self.size[CAP_PAIR], self.size[ROWS_PER_CONTACT]
-        nt, m = c if per > 1 else 0, mj + c * per
-        real, index, keys = np.asarray(self.real), np.asarray(self.index), np.asarray(self.keys)
-        table = {
-            "setting": (real, e.setting - r, (N_SETTINGS,)), "x": (real, e.x - r, (n, 3)),
-            "q": (real, e.q - r, (n, 4)),
-            "v": (real, e.v - r, (n, 6)), "inv_mass_body": (real, e.inv_mass_body - r, (n,)),
-            "inertia": (real, e.inertia - r, (n, 3, 3)),
-            "inv_inertia_body": (real, e.inv_inertia_body - r, (n, 3, 3)),
-            "shape": (real, e.shape - r, (n, 4)), "friction": (real, e.friction - r, (n,)),
-            "restitution": (real, e.restitution - r, (n,)), "patch": (real, e.patch - r, (n,)),
-            "rot": (real, e.rot - r, (self.size[N_FRAME], 3, 3)), "fat": (real, e.fat - r, (n, 6)),
-            "joint": (real, e.joint - r, (kj, N_JOINT_REAL)), "joint_error": (real, e.joint_error - r, (mj,)),
-            "jac": (real, e.jac - r, (mj, 12)), "minv_jac": (real, e.minv_jac - r, (mj, 12)),
-            "joint_impulse": (real, e.joint_impulse - r, (mj,)), "inv_mass": (real, e.inv_mass - r, (nd,)),
-            "inv_inertia": (real, e.inv_inertia - r, (nd, 3, 3)), "v_free": (real, e.v_free - r, (nd, 6)),
-            "dv": (real, e.dv - r, (nd, 6)), "shift": (real, e.shift - r, (nd, 6)),
-            "point": (real, e.point - r, (c, 3)),
-            "gap": (real, e.gap - r, (c,)), "normal": (real, e.normal - r, (c, 3)),
-            "tangent": (real, e.tangent - r, (nt, 3)),
-            "arm_a": (real, e.arm_a - r, (c, 3)), "arm_b": (real, e.arm_b - r, (c, 3)),
-            "coupling": (real, e.coupling - r, (nt, 5)), "swing": (real, e.swing - r, (m - mj, 6)),
-            "local": (real, e.local - r, (c, 6)),
-            "cache_impulse": (real, e.cache_impulse - r, (c, 5)),
-            "cache_local": (real, e.cache_local - r, (c, 6)),
-            "push": (real, e.push - r, (mj + c,)), "target": (real, e.target - r, (m,)),
-            "lower": (real, e.lower - r, (mj,)),
-            "upper": (real, e.upper - r, (mj,)), "b": (real, e.b - r, (m,)), "d": (real, e.d - r, (m,)),
-            "step": (real, e.step - r, (m,)), "compliance": (real, e.compliance - r, (m,)),
-            "impulse": (real, e.impulse - r, (m,)), "mu": (real, e.mu - r, (kj + c,)),
-            "patch_radius": (real, e.patch_radius - r, (kj + c,)),
-            "head": (index, e.head - i, (N_HEAD,)), "kind_of_shape": (index, e.kind_of_shape - i, (n,)),
-            "dyn": (index, e.dyn - i, (n,)), "uneven": (index, e.uneven - i, (n,)),
-            "body_of": (index, e.body_of - i, (nd,)),
-            "joint_kind": (index, e.joint_kind - i, (kj,)), "joint_motor": (index, e.joint_motor - i, (kj,)),
-            "joint_bodies": (index, e.joint_bodies - i, (kj, 2)),
-            "joint_body": (index, e.joint_body - i, (kj, 2)),
-            "excluded": (index, e.excluded - i, (self.size[N_EXCLUDED], 2)),
-            "pair": (index, e.pair - i, (p, 2)),
-            "contact_pair": (index, e.contact_pair - i, (c, 2)),
-            "contact_body": (index, e.contact_body - i, (c, 2)),
-            "ptr": (index, e.ptr - i, (kj + c + 1,)), "kind": (index, e.kind - i, (kj + c,)),
-            "key": (keys, e.key - k, (c,)), "cache_key": (keys, e.cache_key - k, (c,)),
-        }
-        out = {}
-        for name, (base, at, shape) in table.items():
-            out[name] = base[at : at + int(np.prod(shape, dtype=np.int64))].reshape(shape)
-        return out
+        """Name -> writable view of one of the buffers, with the shape that engine/arrays.pyx gives."""
+        return views(self.size, np.asarray(self.real), np.asarray(self.index), np.asarray(self.keys))

@@ -25,7 +25,7 @@ from lavender_ext.core.block cimport CONE, COULOMB, CONTACT_SPIN, ROW, block_err
 from lavender_ext.core.generalized cimport generalized_t, panel_push, panel_times
 from lavender_ext.generalized.dense cimport ltdl_factor, ltdl_solve, lu_factor, lu_solve
 from lavender_ext.generalized.soft cimport INSIDE, OFF, SLIDES, cone_map, coulomb_map, size_of
-from lavender_ext.judge.measure cimport nothing, tally_block, tally_t
+from lavender_ext.judge.score cimport nothing, tally_block, tally_t
 
 
 cdef enum:

@@ -3,8 +3,8 @@
 Such a host (WebAssembly) allocates every buffer and struct itself, so it must know where things lie. It asks
 here instead of counting bytes, and what the compiler answers is compared with what the host expects.
 
-Structs are written as `STRUCTS` lists them, arrays of the engine as `ARRAYS` does, in the order of
-engine/arrays.pxd's `bind`: the length of an array is the distance to the next one of the same buffer.
+Structs are written as `STRUCTS` lists them; engine/arrays.pyx tells of the engine's arrays in the order of `bind`: the
+length of an array is the distance to the next one of the same buffer.
 """
 from libc.stdint cimport int32_t, int64_t, uint64_t
 
@@ -20,14 +20,14 @@ from lavender_ext.engine.arrays cimport (CAP_CONTACT, CAP_PAIR, H_ITERATIONS, H_
                                          S_GRAVITY, S_H, S_MARGIN, S_MATCH, S_MAX_PUSH, S_OUT, S_SKIN, S_SLOP,
                                          bind, engine_t)
 from lavender_ext.engine.kept cimport copy_ints, copy_keys, copy_reals
-from lavender_ext.judge.measure cimport score_t
+from lavender_ext.judge.score cimport score_t
 
 
 cdef struct settings_t:
     int32_t iterations          # sweeps
     int32_t warm_start          # 0 or 1
     int32_t position_iterations
-    int32_t order               # as engine/substep.pyx numbers them
+    int32_t order               # as engine/arrays.pxd numbers them
     int32_t seed
     int32_t unused              # 0
     double h                    # s, substep
@@ -110,84 +110,6 @@ cdef public void lav_layout(int32_t* out) noexcept nogil:
     out[55] = apart(&t, &t.max_push)
     out[56] = apart(&t, &t.bounce)
     out[57] = apart(&t, &t.match_distance)
-
-
-cdef public void lav_engine_offsets(const int32_t* size, double* real, int32_t* index, uint64_t* keys,
-                                    int32_t* out) noexcept nogil:
-    """First entry of each array in its buffer; see ARRAYS. The buffers are not read."""
-    cdef engine_t e
-    cdef int64_t n[3]
-    bind(size, real, index, keys, &e, n)
-    out[0] = <int32_t>(e.setting - real)
-    out[1] = <int32_t>(e.x - real)
-    out[2] = <int32_t>(e.q - real)
-    out[3] = <int32_t>(e.v - real)
-    out[4] = <int32_t>(e.inv_mass_body - real)
-    out[5] = <int32_t>(e.inertia - real)
-    out[6] = <int32_t>(e.inv_inertia_body - real)
-    out[7] = <int32_t>(e.shape - real)
-    out[8] = <int32_t>(e.friction - real)
-    out[9] = <int32_t>(e.restitution - real)
-    out[10] = <int32_t>(e.patch - real)
-    out[11] = <int32_t>(e.rot - real)
-    out[12] = <int32_t>(e.fat - real)
-    out[13] = <int32_t>(e.joint - real)
-    out[14] = <int32_t>(e.joint_error - real)
-    out[15] = <int32_t>(e.jac - real)
-    out[16] = <int32_t>(e.minv_jac - real)
-    out[17] = <int32_t>(e.joint_impulse - real)
-    out[18] = <int32_t>(e.inv_mass - real)
-    out[19] = <int32_t>(e.inv_inertia - real)
-    out[20] = <int32_t>(e.v_free - real)
-    out[21] = <int32_t>(e.dv - real)
-    out[22] = <int32_t>(e.shift - real)
-    out[23] = <int32_t>(e.point - real)
-    out[24] = <int32_t>(e.gap - real)
-    out[25] = <int32_t>(e.normal - real)
-    out[26] = <int32_t>(e.tangent - real)
-    out[27] = <int32_t>(e.arm_a - real)
-    out[28] = <int32_t>(e.arm_b - real)
-    out[29] = <int32_t>(e.coupling - real)
-    out[30] = <int32_t>(e.swing - real)
-    out[31] = <int32_t>(e.local - real)
-    out[32] = <int32_t>(e.cache_impulse - real)
-    out[33] = <int32_t>(e.cache_local - real)
-    out[34] = <int32_t>(e.push - real)
-    out[35] = <int32_t>(e.target - real)
-    out[36] = <int32_t>(e.lower - real)
-    out[37] = <int32_t>(e.upper - real)
-    out[38] = <int32_t>(e.b - real)
-    out[39] = <int32_t>(e.d - real)
-    out[40] = <int32_t>(e.step - real)
-    out[41] = <int32_t>(e.compliance - real)
-    out[42] = <int32_t>(e.impulse - real)
-    out[43] = <int32_t>(e.mu - real)
-    out[44] = <int32_t>(e.patch_radius - real)
-    out[45] = <int32_t>(e.head - index)
-    out[46] = <int32_t>(e.kind_of_shape - index)
-    out[47] = <int32_t>(e.dyn - index)
-    out[48] = <int32_t>(e.uneven - index)
-    out[49] = <int32_t>(e.body_of - index)
-    out[50] = <int32_t>(e.joint_kind - index)
-    out[51] = <int32_t>(e.joint_motor - index)
-    out[52] = <int32_t>(e.joint_bodies - index)
-    out[53] = <int32_t>(e.excluded - index)
-    out[54] = <int32_t>(e.pair - index)
-    out[55] = <int32_t>(e.pair_scratch - index)
-    out[56] = <int32_t>(e.count - index)
-    out[57] = <int32_t>(e.bucket - index)
-    out[58] = <int32_t>(e.chain - index)
-    out[59] = <int32_t>(e.cell - index)
-    out[60] = <int32_t>(e.contact_pair - index)
-    out[61] = <int32_t>(e.joint_body - index)
-    out[62] = <int32_t>(e.contact_body - index)
-    out[63] = <int32_t>(e.ptr - index)
-    out[64] = <int32_t>(e.kind - index)
-    out[65] = <int32_t>(e.order - index)
-    out[66] = <int32_t>(e.order_scratch - index)
-    out[67] = <int32_t>(e.key - keys)
-    out[68] = <int32_t>(e.cache_key - keys)
-    out[69] = <int32_t>(e.color_scratch - keys)
 
 
 cdef public void lav_engine_read_settings(const int32_t* size, double* real, int32_t* index, uint64_t* keys,
@@ -347,23 +269,6 @@ STRUCTS = {
     },
 }
 
-#: Arrays of the engine by buffer.
-ARRAYS = {
-    "real": (
-        "setting", "x", "q", "v", "inv_mass_body", "inertia", "inv_inertia_body", "shape", "friction",
-        "restitution", "patch", "rot", "fat", "joint", "joint_error", "jac", "minv_jac", "joint_impulse",
-        "inv_mass", "inv_inertia", "v_free", "dv", "shift", "point", "gap", "normal", "tangent", "arm_a",
-        "arm_b", "coupling", "swing", "local", "cache_impulse", "cache_local", "push", "target", "lower",
-        "upper", "b", "d", "step", "compliance", "impulse", "mu", "patch_radius",
-    ),
-    "index": (
-        "head", "kind_of_shape", "dyn", "uneven", "body_of", "joint_kind", "joint_motor", "joint_bodies",
-        "excluded", "pair", "pair_scratch", "count", "bucket", "chain", "cell", "contact_pair", "joint_body",
-        "contact_body", "ptr", "kind", "order", "order_scratch",
-    ),
-    "keys": ("key", "cache_key", "color_scratch"),
-}
-
 
 def layout():
     """Struct -> (size in bytes, field -> offset in bytes), as this build has them."""
@@ -371,16 +276,6 @@ def layout():
     lav_layout(&out[0])
     numbers = iter(np.asarray(out).tolist())
     return {name: (next(numbers), {field: next(numbers) for field in fields}) for name, fields in STRUCTS.items()}
-
-
-def offsets(const int32_t[::1] size):
-    """Array -> its first entry in its buffer, for these sizes (10,)."""
-    cdef double real = 0.0
-    cdef int32_t index = 0
-    cdef uint64_t key = 0
-    cdef int32_t[::1] out = np.empty(sum(len(names) for names in ARRAYS.values()), np.int32)
-    lav_engine_offsets(&size[0], &real, &index, &key, &out[0])
-    return dict(zip((name for names in ARRAYS.values() for name in names), np.asarray(out).tolist(), strict=True))
 
 
 def read_settings(const int32_t[::1] size, double[::1] real, int32_t[::1] index, uint64_t[::1] keys):

@@ -9,8 +9,9 @@ from lavender_ext.core.csr cimport csr_t
 from lavender_ext.core.generalized cimport generalized_t
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.rows cimport rows_t
-from lavender_ext.judge.measure cimport (csr_slack, general_judge, general_slack, judge_into, norms_of_rhs,
-                                         rows_slack, rows_velocity, score_rows, score_t, wrenches)
+from lavender_ext.judge.measure cimport (csr_slack, general_judge, general_slack, judge_into, rows_slack,
+                                         rows_velocity, wrenches)
+from lavender_ext.judge.score cimport norms_of_rhs, relative, score_rows, score_t
 
 
 cdef public void lav_judge_csr(const blocks_t* p, const csr_t* a, const double* lam, double* w, double* e,
@@ -75,13 +76,6 @@ def judge(Data p, const double[::1] lam, double[::1] w, double[::1] e, bint floo
     return s.energy, s.velocity, s.worst, s.floor_energy, s.floor_velocity, bool(s.finite)
 
 
-cdef inline double ratio(double x, double reference) noexcept nogil:
-    # 0 where x is, inf where x is not finite or has nothing to be compared with
-    if x == 0.0:
-        return 0.0
-    return x / reference if x < 1.0 / 0.0 and reference > 0.0 else 1.0 / 0.0
-
-
 cdef class Judged:
     """The judge's pass over one impulse, with its floor, beside the error of doing nothing, which `p` must know.
 
@@ -99,7 +93,6 @@ cdef class Judged:
         cdef double[::1] w, e, bodies
         cdef double* v = NULL
         cdef score_t s = score_t(0.0, 0.0, 0.0, 0.0, -1, 1)
-        cdef double x, y
         self.data = p
         self.impulse = impulse
         self.slack = w = np.empty(lam.shape[0])
@@ -117,12 +110,13 @@ cdef class Judged:
         self.energy = s.energy if s.finite else 1.0 / 0.0
         self.velocity = s.velocity if s.finite else 1.0 / 0.0
         self.worst = s.worst
-        x = ratio(self.energy, p.start_energy)
-        y = ratio(self.velocity, p.start_velocity)
-        self.relative = x if x > y else y
-        x = ratio(s.floor_energy, p.start_energy)
-        y = ratio(s.floor_velocity, p.start_velocity)
-        self.floor = x if x > y else y
+        self.relative = relative(self.energy, self.velocity, p.start_energy, p.start_velocity)
+        self.floor = relative(s.floor_energy, s.floor_velocity, p.start_energy, p.start_velocity)
+
+
+def compare(double energy, double velocity, double start_energy, double start_velocity):
+    """Relative residual: the larger of both errors over those of doing nothing; inf where one is not finite."""
+    return relative(energy, velocity, start_energy, start_velocity)
 
 
 def all_finite(const double[::1] x):

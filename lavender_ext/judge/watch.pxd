@@ -19,10 +19,11 @@ from lavender_ext.core.block cimport blocks_t
 from lavender_ext.core.csr cimport csr_t
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.rows cimport rows_t
-from lavender_ext.judge.measure cimport judge_into, score_t
+from lavender_ext.judge.measure cimport judge_into
+from lavender_ext.judge.score cimport relative, score_t
 
 
-cdef enum:
+cpdef enum:
     RUNNING = 0
     CONVERGED = 1
     DIVERGED = 2
@@ -50,15 +51,8 @@ cdef struct watch_t:
 ctypedef void (*sweep_t)(void* context, double* lam, int32_t first_sweep, int32_t n) noexcept nogil
 
 
-cdef inline double ratio(double x, double reference) noexcept nogil:
-    if x == 0.0:
-        return 0.0
-    return x / reference if reference > 0.0 else 1.0 / 0.0
-
-
-cdef inline double relative(const watch_t* s, double energy, double velocity) noexcept nogil:
-    cdef double x = ratio(energy, s.start_energy), y = ratio(velocity, s.start_velocity)
-    return x if x > y else y
+cdef inline double against_start(const watch_t* s, double energy, double velocity) noexcept nogil:
+    return relative(energy, velocity, s.start_energy, s.start_velocity)
 
 
 cdef inline void copy(const double* x, double* out, int32_t n) noexcept nogil:
@@ -90,7 +84,7 @@ cdef inline int32_t check(watch_t* s, const blocks_t* p, const csr_t* a, const r
     cdef score_t x
     cdef double now, floor, inf = 1.0 / 0.0
     judge_into(p, a, r, factored, lam, s.w, s.e, s.v, 0, &x)
-    now = relative(s, x.energy, x.velocity) if x.finite else inf
+    now = against_start(s, x.energy, x.velocity) if x.finite else inf
     if s.total == 0:
         s.start = now
     s.check_at = s.total + until_next(s, now, tol)
@@ -109,7 +103,7 @@ cdef inline int32_t check(watch_t* s, const blocks_t* p, const csr_t* a, const r
         return DIVERGED
     if s.best_at >= 0 and s.best_relative <= 1e-6:
         judge_into(p, a, r, factored, s.best, s.w, s.e, s.v, 1, &x)
-        floor = relative(s, x.floor_energy, x.floor_velocity)
+        floor = against_start(s, x.floor_energy, x.floor_velocity)
         if s.best_relative <= 2.0 * floor and floor < inf:
             copy(s.best, lam, p.n_rows)
             return AT_FLOOR
@@ -125,12 +119,12 @@ cdef inline int32_t confirmed(const watch_t* s, const blocks_t* p, const csr_t* 
     cdef score_t x
     cdef double now, floor
     judge_into(p, a, r, factored, lam, s.w, s.e, s.v, status == AT_FLOOR, &x)
-    now = relative(s, x.energy, x.velocity) if x.finite else 1.0 / 0.0
+    now = against_start(s, x.energy, x.velocity) if x.finite else 1.0 / 0.0
     if now <= tol:
         return CONVERGED
     if status == CONVERGED:
         return RUNNING
-    floor = relative(s, x.floor_energy, x.floor_velocity)
+    floor = against_start(s, x.floor_energy, x.floor_velocity)
     return AT_FLOOR if now <= 2.0 * floor and floor < 1.0 / 0.0 else STALLED
 
 

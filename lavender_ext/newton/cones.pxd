@@ -6,10 +6,13 @@ from lavender_ext.core.block cimport CONTACT_SPIN as SPIN
 from lavender_ext.newton.elements cimport elements_t
 
 
-cdef enum:                      # what is kept of a cone: w (4), eta, 1 / eta, 1 / (1 + w_0), and
-    CONE = 16
-    V = 8                       # v (3)
-    C = 12                      # v \\ c of the combined step (3)
+cdef enum:                      # what is kept of a cone, from w (n) on: T = eta [w_0 w_1'; w_1 I + w_1 w_1' / (1 + w_0)]
+    KEPT_ETA = 4
+    KEPT_SHRINK = 5             # 1 / eta
+    KEPT_TURN = 6               # 1 / (1 + w_0)
+    KEPT_V = 8                  # v (n)
+    KEPT_C = 12                 # v \\ c of the combined step (n)
+    KEPT = 16
 
 
 cdef inline double cone_gap(const double* x, int32_t n) noexcept nogil:
@@ -142,10 +145,10 @@ cdef inline void scale_times(const double* w, int32_t n, const double* x, double
     cdef int32_t k
     for k in range(1, n):
         t += w[k] * x[k]
-    out[0] = w[4] * (w[0] * x[0] + t)
-    t = x[0] + t * w[6]
+    out[0] = w[KEPT_ETA] * (w[0] * x[0] + t)
+    t = x[0] + t * w[KEPT_TURN]
     for k in range(1, n):
-        out[k] = w[4] * (x[k] + w[k] * t)
+        out[k] = w[KEPT_ETA] * (x[k] + w[k] * t)
 
 
 cdef inline void scale_back(const double* w, int32_t n, const double* x, double* out) noexcept nogil:
@@ -154,10 +157,10 @@ cdef inline void scale_back(const double* w, int32_t n, const double* x, double*
     cdef int32_t k
     for k in range(1, n):
         t += w[k] * x[k]
-    out[0] = w[5] * (w[0] * x[0] - t)
-    t = t * w[6] - x[0]
+    out[0] = w[KEPT_SHRINK] * (w[0] * x[0] - t)
+    t = t * w[KEPT_TURN] - x[0]
     for k in range(1, n):
-        out[k] = w[5] * (x[k] + w[k] * t)
+        out[k] = w[KEPT_SHRINK] * (x[k] + w[k] * t)
 
 
 cdef inline void cone_divide(const double* v, const double* c, int32_t n, double* out) noexcept nogil:
@@ -197,15 +200,15 @@ cdef inline double cone_parts(const double* s, const double* u, int32_t n, doubl
     # (T^-2 + delta)^-1 between G^-1 and G^-T as x [1 h][1 h]^T + [0 0; 0 c]: returns x, the normal's own entry.
     # Through the eigenvalues of T^2, eta^2 (w0 +- |w1|)^2 along (1, +-w1/|w1|) and eta^2 across: as a matrix
     # T^-2 would lose the small ones. c and its square root are (n - 1, n - 1).
-    # w (CONE) keeps the scaling, and v.
+    # w (KEPT) keeps the scaling, and v.
     cdef double d[4]
     cdef double eta, size = 0.0, grow, shrink, across, along, x, gn = on_normal(a), gt = on_tangent(a)
     cdef int32_t k, l, nt = n - 1
     nt_scaling(s, u, n, w, &eta)
-    w[4] = eta
-    w[5] = 1.0 / eta
-    w[6] = 1.0 / (1.0 + w[0])
-    scale_times(w, n, u, w + V)
+    w[KEPT_ETA] = eta
+    w[KEPT_SHRINK] = 1.0 / eta
+    w[KEPT_TURN] = 1.0 / (1.0 + w[0])
+    scale_times(w, n, u, w + KEPT_V)
     for k in range(1, n):
         size += w[k] * w[k]
     size = sqrt(size)
@@ -241,20 +244,20 @@ cdef inline double row_limit(double x, double dx, double best) noexcept nogil:
 cdef inline void cone_affine(const elements_t* e, int32_t i, int32_t which, const double* da, const int32_t n,
                              double* y, double* back) noexcept nogil:
     # y = T^-1 G dz_a, back = T du_a
-    cdef const double *w = e.scaling + 2 * CONE * i + CONE * which
+    cdef const double *w = e.scaling + 2 * KEPT * i + KEPT * which
     cdef double x[4]
     cdef int32_t k
     gather(e, i, which, da, x)
     scale_back(w, n, x, y)
     for k in range(n):
-        back[k] = -w[V + k] - y[k]
+        back[k] = -w[KEPT_V + k] - y[k]
 
 
 cdef inline void cone_combined(const elements_t* e, int32_t i, int32_t which, const double* da, double sigma_mu,
                                const int32_t n, double* rhs) noexcept nogil:
     # v \\ c of (4) into the cone's store; rhs = T^-1 (v \\ c)
-    cdef double *w = e.scaling + 2 * CONE * i + CONE * which
-    cdef const double *v = w + V
+    cdef double *w = e.scaling + 2 * KEPT * i + KEPT * which
+    cdef const double *v = w + KEPT_V
     cdef double x[4]
     cdef double y[4]
     cdef double back[4]
@@ -265,24 +268,24 @@ cdef inline void cone_combined(const elements_t* e, int32_t i, int32_t which, co
         x[0] += v[k] * v[k] + y[k] * back[k]
     for k in range(1, n):
         x[k] = 2.0 * v[0] * v[k] + y[0] * back[k] + back[0] * y[k]
-    cone_divide(v, x, n, w + C)
-    scale_back(w, n, w + C, rhs)
+    cone_divide(v, x, n, w + KEPT_C)
+    scale_back(w, n, w + KEPT_C, rhs)
 
 
 cdef inline double cone_length(const elements_t* e, int32_t i, int32_t which, const double* dz, double best,
                                const int32_t n, double* du) noexcept nogil:
     # the combined step's length, at most `best`; du
-    cdef const double *w = e.scaling + 2 * CONE * i + CONE * which
+    cdef const double *w = e.scaling + 2 * KEPT * i + KEPT * which
     cdef double x[4]
     cdef double y[4]
     cdef double a
     cdef int32_t k
     gather(e, i, which, dz, x)
     scale_back(w, n, x, y)
-    a = cone_step(w + V, y, n)
+    a = cone_step(w + KEPT_V, y, n)
     best = a if a < best else best
     for k in range(n):
-        y[k] = -w[C + k] - y[k]
-    a = cone_step(w + V, y, n)
+        y[k] = -w[KEPT_C + k] - y[k]
+    a = cone_step(w + KEPT_V, y, n)
     scale_back(w, n, y, du)
     return a if a < best else best

@@ -17,6 +17,12 @@ from libc.math cimport fabs
 from libc.stdint cimport int32_t, int64_t
 
 
+cpdef enum:                     # natural maps
+    MAP_CONVEX = 0
+    MAP_COULOMB = 1             # radius a_t z_n; P is then the derivative for fixed radius alone
+    MAP_AUGMENTED = 2           # radius a_t (z_n - s_n), Alart-Curnier
+
+
 cdef struct elements_t:
     int32_t n                   # elements
     int32_t m                   # rows
@@ -35,7 +41,7 @@ cdef struct elements_t:
     const double* upper         # (m)
     const double* at            # (n) a_t
     const double* as_           # (n) a_s
-    double* scaling             # (n, 2, CONE) of the element's cones, once lav_ipm_scale has run
+    double* scaling             # (n, 2, KEPT) of the element's cones, once ipm_scale has run
 
 
 cdef class Elements:

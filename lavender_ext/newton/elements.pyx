@@ -4,7 +4,7 @@ from libc.stdint cimport int32_t, int64_t
 import numpy as np
 
 from lavender_ext.core.arrays cimport address
-from lavender_ext.newton.cones cimport CONE
+from lavender_ext.newton.cones cimport KEPT
 from lavender_ext.newton.elements cimport element_times, element_times_transposed, elements_t
 from lavender_ext.newton.interior cimport (ipm_affine, ipm_rhs, ipm_scale, ipm_start, ipm_start_apart,
                                            ipm_update)
@@ -78,7 +78,7 @@ cdef class Elements:
     the caller.
     """
     def __init__(self, ptr, kind, wptr, node, slot, panel, theta, g, lower, upper, at, as_, int s):
-        scaling = np.empty(2 * CONE * len(kind) if len(kind) < len(g) else 0)
+        scaling = np.empty(2 * KEPT * len(kind) if len(kind) < len(g) else 0)
         cdef const int32_t[:, ::1] of = node
         cdef int32_t i, k = 0
         group_array = np.empty(len(kind) + 1, np.int32)

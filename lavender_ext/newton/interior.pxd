@@ -10,7 +10,7 @@ from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t
 
 from lavender_ext.core.block cimport CONTACT, CONTACT_SPIN as SPIN, ROW
-from lavender_ext.newton.cones cimport (C, CONE, V, cone_affine, cone_combined, cone_gap, cone_length,
+from lavender_ext.newton.cones cimport (KEPT, KEPT_V, cone_affine, cone_combined, cone_gap, cone_length,
                                         cone_parts, cone_size, cone_step, gather, has_cone, is_high, is_low,
                                         load_dual, on_normal, row_limit, scatter, slack_dual, store_dual)
 from lavender_ext.newton.elements cimport elements_t, invert_small
@@ -18,7 +18,7 @@ from lavender_ext.newton.elements cimport elements_t, invert_small
 
 cdef inline double ipm_start(const elements_t* e, const double* hz, double dual, double* z, double* u1,
                                  double* u2) noexcept nogil:
-    """Puts z and u inside their cones, starting from z with (H + I) z = g; returns the degree (number of cones).
+    """Puts z and u inside their cones, starting from z with (H + W) z = g for a small W; returns the degree (number of cones).
 
     Vandenberghe 2010, section 7.3: both are shifted along the cones' axes, by one amount each; u's beyond the
     worst violation is `dual` times z's, because most rows carry load in the end.
@@ -96,7 +96,7 @@ cdef inline double ipm_start(const elements_t* e, const double* hz, double dual,
 
 cdef inline double ipm_start_apart(const elements_t* e, const double* hz, double margin, double* z, double* u1,
                                        double* u2) noexcept nogil:
-    """Puts z and u inside their cones, starting from z with (H + I) z = g; returns the degree (number of cones).
+    """Puts z and u inside their cones, starting from z with (H + W) z = g for a small W; returns the degree (number of cones).
 
     Each cone apart, by no more than it needs: z and u keep at least `margin` times the mean |z| and the mean |g|
     from the boundary.
@@ -198,13 +198,13 @@ cdef inline void ipm_scale(const elements_t* e, const double* z, const double* u
             load_dual(e, i, 0, u1, u2, u)
             for k in range(n):
                 total += s[k] * u[k]
-            x = cone_parts(s, u, n, e.at[i], delta, e.scaling + 2 * CONE * i, h, c, root)
+            x = cone_parts(s, u, n, e.at[i], delta, e.scaling + 2 * KEPT * i, h, c, root)
         if e.kind[i] == SPIN:
             # Two cones share the normal: their parallel sum there, each of the others follows it.
             gather(e, i, 1, z, s)
             load_dual(e, i, 1, u1, u2, u)
             total += s[0] * u[0] + s[1] * u[1]
-            y = cone_parts(s, u, 2, e.as_[i], delta, e.scaling + 2 * CONE * i + CONE, hs, cs, rs)
+            y = cone_parts(s, u, 2, e.as_[i], delta, e.scaling + 2 * KEPT * i + KEPT, hs, cs, rs)
             x = x * (y / (x + y)) if n > 1 else y
         for k in range(nr * nr):
             v[q + k] = 0.0
@@ -280,7 +280,7 @@ cdef inline double ipm_affine(const elements_t* e, const double* z, const double
             if not has_cone(e, i, which):
                 continue
             n = cone_size(e, i, which)
-            v = e.scaling + 2 * CONE * i + CONE * which + V
+            v = e.scaling + 2 * KEPT * i + KEPT * which + KEPT_V
             if n == 3:
                 cone_affine(e, i, which, dz, 3, y, back)
                 a = cone_step(v, y, 3)

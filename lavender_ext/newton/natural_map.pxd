@@ -12,13 +12,7 @@ from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t
 
 from lavender_ext.core.block cimport CONTACT_SPIN as SPIN, ROW
-from lavender_ext.newton.elements cimport elements_t, invert_small
-
-
-cdef enum:                      # which natural map
-    CONVEX = 0
-    COULOMB = 1                 # radius a_t z_n; P is then the derivative for fixed radius alone
-    AUGMENTED = 2               # radius a_t (z_n - s_n), Alart-Curnier
+from lavender_ext.newton.elements cimport MAP_AUGMENTED, MAP_CONVEX, elements_t, invert_small
 
 
 cdef inline void natural_contact(const elements_t* e, int32_t i, const double* z, const double* s, double* f,
@@ -160,7 +154,7 @@ cdef inline double natural(const elements_t* e, const double* z, const double* s
                                double* f, double* p, double* einv, double* v) noexcept nogil:
     """F, P, E^-1 and V = E^-1 P of (5) for every element; returns |F|, the judge's energy error.
 
-    law: CONVEX, COULOMB or AUGMENTED. einv, v may be NULL: F and P alone.
+    law: MAP_CONVEX, MAP_COULOMB or MAP_AUGMENTED. einv, v may be NULL: F and P alone.
     """
     cdef int32_t i, j, k, l, q, nr, piece
     cdef double total = 0.0
@@ -193,10 +187,10 @@ cdef inline double natural(const elements_t* e, const double* z, const double* s
                     einv[q] = 1.0
                     v[q] = 0.0
             continue
-        if law == CONVEX:
+        if law == MAP_CONVEX:
             natural_contact(e, i, z + j, s + j, f + j, p + q)
         else:
-            natural_coulomb(e, i, z + j, s + j, law == AUGMENTED, f + j, p + q)
+            natural_coulomb(e, i, z + j, s + j, law == MAP_AUGMENTED, f + j, p + q)
         for k in range(nr):
             total += f[j + k] * f[j + k]
         if v != NULL:

@@ -19,6 +19,7 @@ from lavender_ext.core.block cimport blocks_t, relax_row
 from lavender_ext.core.csr cimport csr_dot, csr_t
 from lavender_ext.core.problem cimport Data
 from lavender_ext.factor.band cimport ldl_back_all, ldl_factor, ldl_factor_2, ldl_solve, no_pivots, pivots_t
+from lavender_ext.judge.score cimport unit_roundoff
 
 
 cdef enum:
@@ -26,7 +27,7 @@ cdef enum:
     AT_LOWER = -1
     AT_UPPER = 1
 
-cdef enum:
+cpdef enum:                     # outcomes
     SOLVED = 0
     ROUNDS = 1                  # all rounds used
     SMALL = 2                   # a pivot too small for s = 0
@@ -235,7 +236,7 @@ cdef public void lav_pivot_slack(pivoting_t* s) noexcept nogil:
             s0 += t
             f0 += fabs(t)
         s.w[i] = (s0 + s1) - s.p.b[i]
-        s.f[i] = 1.1102230246251565e-16 * ((f0 + f1) + fabs(s.p.b[i]))
+        s.f[i] = unit_roundoff() * ((f0 + f1) + fabs(s.p.b[i]))
         if s.shift > 0.0:
             s.w[i] += s.shift * s.p.d[i] * (s.x[i] - s.center[i])
 

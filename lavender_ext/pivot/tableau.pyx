@@ -15,7 +15,7 @@ from libc.math cimport fabs
 from libc.stdint cimport int32_t, int64_t
 
 
-cdef enum:
+cpdef enum:                     # how a path ended
     DONE = 0                    # z left: s solves the problem
     PIVOTS = 1                  # all pivots used
     RAY = 2                     # nothing limits the entering variable

@@ -21,7 +21,7 @@ from lavender_ext.judge.measure cimport rows_velocity
 from lavender_ext.warm.active_set cimport body_band, newton_step
 
 
-cdef enum:
+cpdef enum:
     FIRST_SWEEPS = 4            # of (2); fewer leave a residual just below tol, and the next step begins above it
     PATIENT_SWEEPS = 16         # from here on (2) is given up where it will not do
     MOST_SWEEPS = 64
@@ -29,7 +29,7 @@ cdef enum:
     MOST_ROWS = 200000          # so that all of it takes a fraction of a second
     MOST_BAND = 48              # rows between the first and the last of one body's joints, for (3)
 
-cdef enum:                      # how it ended
+cpdef enum:                     # how it ended
     UNDECIDED = 0
     JUDGED = 1                  # met tol as it came
     SWEPT = 2                   # met it after some sweeps

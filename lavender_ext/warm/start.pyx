@@ -8,7 +8,7 @@ from lavender_ext.core.problem cimport Data
 from lavender_ext.core.rows cimport rows_t
 from lavender_ext.engine.arrays cimport CAP_CONTACT, H_CONTACTS, N_DYNAMIC, N_JOINT, S_OUT, bind, engine_t
 from lavender_ext.engine.view cimport view
-from lavender_ext.warm.start cimport MOST_STEPS, MOST_SWEEPS, band_width, score_sums_t, warm_solve, warm_t
+from lavender_ext.warm.start cimport band_width, score_sums_t, warm_solve, warm_t
 
 
 cdef public int32_t lav_warm_band(const blocks_t* p, const rows_t* r, int32_t* last) noexcept nogil:
@@ -21,11 +21,6 @@ cdef public int32_t lav_warm_solve(const blocks_t* p, const rows_t* r, warm_t* s
                                    score_sums_t* last) noexcept nogil:
     """lam (m) to tol where a few sweeps or one banded factorisation do; how it ended."""
     return warm_solve(p, r, s, tol, lam, v, has_velocity, first, last)
-
-
-def limits():
-    """Most (sweeps, factorisations) of the first phase."""
-    return MOST_SWEEPS, MOST_STEPS
 
 
 def from_guess(Data data, double[::1] impulse, double tol):

@@ -34,12 +34,18 @@ from lavender_ext.newton.band import (
     scaled_band,
     scaled_entries,
 )
-from lavender_ext.newton.elements import Elements, element_product
+from lavender_ext.newton.elements import (
+    MAP_AUGMENTED,
+    MAP_CONVEX,
+    MAP_COULOMB,
+    Elements,
+    element_product,
+)
 from lavender_ext.newton.fused_step import Interior
 from lavender_ext.newton.normal_matrix import Factor
 from lavender_ext.newton.panel import narrow, scaled_jacobian
 
-CONVEX, COULOMB, AUGMENTED = 0, 1, 2  # natural maps, as in the kernel
+CONVEX, COULOMB, AUGMENTED = MAP_CONVEX, MAP_COULOMB, MAP_AUGMENTED
 DENSE_ROWS = 400  # below: dense LAPACK beats sparse bookkeeping
 DENSE_FILL = 0.1  # nonzero share of A above which a sparse factor is full anyway
 DENSE_LIMIT = 6000  # rows; 288 MB of A

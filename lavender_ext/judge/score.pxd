@@ -1,0 +1,237 @@
+"""Scores of an impulse: sums over the rows' errors, what rounding leaves of them, and both against doing nothing.
+
+    E   = sqrt(sum d e^2)                       [sqrt J]
+    V   = max sqrt(nu d) |e|                    [m/s], |e| the pair's norm on tangents
+    relative = max(E / E0, V / V0)              E0, V0 of doing nothing                            (1)
+
+The judge, the watch of a run of sweeps, warm starts and the polishes of Newton's method all score by these lines.
+"""
+from libc.math cimport fabs, sqrt
+from libc.stdint cimport int32_t
+
+from lavender_ext.core.block cimport (CONTACT_SPIN, ROUND, ROW, block_error, blocks_t, is_pair, n_tangents,
+                                      norm2)
+
+
+cdef struct score_t:
+    double energy               # sqrt J
+    double velocity             # m/s
+    double floor_energy         # sqrt J
+    double floor_velocity       # m/s
+    int32_t worst               # row of the largest velocity error, -1 where there is none
+    int32_t finite              # 0 where e holds a NaN or an infinity
+
+
+cdef struct tally_t:            # plain sums and squares: kept where they can neither have over- nor underflown
+    double energy               # sum (d e) e, for e^2 alone may vanish beside a d of 1e160
+    double fast                 # max (d e) (nu e)
+    double floor_energy         # sum (F / d) F
+    double floor_fast           # max nu (F / d) F
+    int32_t worst
+
+
+cdef struct sum_t:              # sum of squares as scale^2 * ssq: neither over- nor underflows
+    double scale
+    double ssq
+
+
+cdef inline double unit_roundoff() noexcept nogil:
+    """2^-53: the largest relative error of one operation."""
+    return 1.1102230246251565e-16
+
+
+cdef inline double ratio(double x, double reference) noexcept nogil:
+    """0 where x is, inf where x is not finite or has nothing to be compared with."""
+    if x == 0.0:
+        return 0.0
+    return x / reference if x < 1.0 / 0.0 and reference > 0.0 else 1.0 / 0.0
+
+
+cdef inline double relative(double energy, double velocity, double start_energy, double start_velocity) noexcept nogil:
+    """(1)"""
+    cdef double x = ratio(energy, start_energy), y = ratio(velocity, start_velocity)
+    return x if x > y else y
+
+
+cdef inline void add_square(sum_t* s, double x) noexcept nogil:
+    cdef double r
+    x = fabs(x)
+    if x > s.scale:
+        r = s.scale / x
+        s.ssq = 1.0 + s.ssq * r * r
+        s.scale = x
+    elif x > 0.0:
+        r = x / s.scale
+        s.ssq += r * r
+
+
+cdef inline double root(const sum_t* s) noexcept nogil:
+    return s.scale * sqrt(s.ssq)
+
+
+cdef inline tally_t nothing() noexcept nogil:
+    cdef tally_t s
+    s.energy = 0.0
+    s.fast = -1.0
+    s.floor_energy = 0.0
+    s.floor_fast = 0.0
+    s.worst = -1
+    return s
+
+
+cdef inline void tally_row(const blocks_t* p, int32_t k, double e, tally_t* s) noexcept nogil:
+    cdef double v = p.d[k] * e, t = v * (p.nu[k] * e)
+    s.energy += v * e
+    if t > s.fast:
+        s.fast = t
+        s.worst = k
+
+
+cdef inline void tally_contact(const blocks_t* p, int32_t j, int32_t nt, int32_t spin, const double* e,
+                               tally_t* s) noexcept nogil:
+    # A pair of tangents counts once in the maximum, by its norm.
+    cdef double x, y
+    tally_row(p, j, e[j], s)
+    if nt == 1:
+        tally_row(p, j + 1, e[j + 1], s)
+    elif nt == 2:
+        x = p.d[j + 1] * e[j + 1]
+        y = p.d[j + 1] * e[j + 2]
+        s.energy += x * e[j + 1] + y * e[j + 2]
+        x = x * (p.nu[j + 1] * e[j + 1]) + y * (p.nu[j + 1] * e[j + 2])
+        if x > s.fast:
+            s.fast = x
+            s.worst = j + 1
+    if spin:
+        tally_row(p, j + 1 + nt, e[j + 1 + nt], s)
+
+
+cdef inline void tally_pair(const blocks_t* p, int32_t k, const double* e, tally_t* s) noexcept nogil:
+    # Rows k, k + 1, by the norm of the two in the maximum.
+    cdef double x = p.d[k] * e[k], y = p.d[k] * e[k + 1]
+    s.energy += x * e[k] + y * e[k + 1]
+    x = x * (p.nu[k] * e[k]) + y * (p.nu[k] * e[k + 1])
+    if x > s.fast:
+        s.fast = x
+        s.worst = k
+
+
+cdef inline void tally_round(const blocks_t* p, int32_t j, int32_t nt, const double* e, tally_t* s) noexcept nogil:
+    tally_row(p, j, e[j], s)
+    tally_pair(p, j + 1, e, s)
+    tally_row(p, j + 3, e[j + 3], s)
+    if nt == 4:
+        tally_row(p, j + 4, e[j + 4], s)
+    elif nt == 5:
+        tally_pair(p, j + 4, e, s)
+
+
+cdef inline void tally_block(const blocks_t* p, int32_t i, const double* e, tally_t* s) noexcept nogil:
+    cdef int32_t k, j = p.ptr[i], end = p.ptr[i + 1]
+    if p.kind[i] == ROW:
+        for k in range(j, end):
+            tally_row(p, k, e[k], s)
+    elif p.kind[i] == ROUND:
+        tally_round(p, j, n_tangents(p.kind[i], end - j), e, s)
+    else:
+        tally_contact(p, j, n_tangents(p.kind[i], end - j), p.kind[i] == CONTACT_SPIN, e, s)
+
+
+cdef inline void tally_floor(const blocks_t* p, int32_t k, double size, tally_t* s) noexcept nogil:
+    # size = (|A| |lam|)_k
+    cdef double f = unit_roundoff() * (size + fabs(p.b[k])), t = f / p.d[k]
+    s.floor_energy += t * f
+    t = p.nu[k] * t * f
+    if t > s.floor_fast:
+        s.floor_fast = t
+
+
+cdef inline int32_t is_plain(double energy, double fast) noexcept nogil:
+    return 1e-250 < energy < 1e250 and 1e-250 < fast < 1e250
+
+
+cdef inline void score_from(const blocks_t* p, const double* e, const tally_t* s, score_t* out) noexcept nogil:
+    """The two sums over e (m); the floor entries are left alone."""
+    cdef int32_t i, j, k, nt
+    cdef double v, big = -1.0
+    cdef sum_t total = sum_t(0.0, 0.0)
+    out.worst = s.worst
+    out.finite = 1
+    if is_plain(s.energy, s.fast):
+        out.energy = sqrt(s.energy)
+        out.velocity = sqrt(s.fast)
+        return
+    out.worst = -1
+    for i in range(p.n_blocks):
+        j = p.ptr[i]
+        nt = 0 if p.kind[i] == ROW else n_tangents(p.kind[i], p.ptr[i + 1] - j)
+        for k in range(j, p.ptr[i + 1]):
+            add_square(&total, sqrt(p.d[k]) * e[k])
+            if is_pair(nt, k - j - 1):
+                continue                                # the pair counts once, below
+            v = norm2(e[k], e[k + 1]) if is_pair(nt, k - j) else fabs(e[k])
+            v = sqrt(p.nu[k]) * sqrt(p.d[k]) * v
+            if v > big:
+                big = v
+                out.worst = k
+            elif v != v and out.finite:
+                out.finite = 0
+                out.worst = k
+                big = 1.0 / 0.0
+    if big > 1.7976931348623157e308:
+        out.finite = 0
+    out.energy = root(&total)
+    out.velocity = big if big > 0.0 else 0.0
+
+
+cdef inline void score_rows(const blocks_t* p, const double* lam, const double* w, double* e, score_t* out) noexcept nogil:
+    """Errors e (m) of all blocks and their two sums; the floor entries are left alone."""
+    cdef int32_t i
+    cdef tally_t s = nothing()
+    for i in range(p.n_blocks):
+        block_error(p, i, lam, w, e)
+        tally_block(p, i, e, &s)
+    score_from(p, e, &s, out)
+
+
+cdef inline void norms_of_rhs(const blocks_t* p, double* energy, double* velocity) noexcept nogil:
+    """sqrt(sum b^2 / d) and max |b| sqrt(nu / d), the pair's norm on tangents."""
+    cdef int32_t i, j, k, nt
+    cdef double x, t, sum_ = 0.0, fast = 0.0, big = 0.0
+    cdef sum_t total = sum_t(0.0, 0.0)
+    for i in range(p.n_blocks):
+        j = p.ptr[i]
+        nt = 0 if p.kind[i] == ROW else n_tangents(p.kind[i], p.ptr[i + 1] - j)
+        for k in range(j, p.ptr[i + 1]):
+            t = (p.b[k] / p.d[k]) * p.b[k]
+            sum_ += t
+            if is_pair(nt, k - j):
+                t += (p.b[k + 1] / p.d[k + 1]) * p.b[k + 1]
+            t = t * p.nu[k]
+            if t > fast:
+                fast = t
+    if is_plain(sum_, fast):
+        energy[0] = sqrt(sum_)
+        velocity[0] = sqrt(fast)
+        return
+    for i in range(p.n_blocks):                         # scaled: 1e-200 does not vanish
+        j = p.ptr[i]
+        nt = 0 if p.kind[i] == ROW else n_tangents(p.kind[i], p.ptr[i + 1] - j)
+        for k in range(j, p.ptr[i + 1]):
+            x = p.b[k] / sqrt(p.d[k])
+            add_square(&total, x)
+            if is_pair(nt, k - j):
+                x = norm2(x, p.b[k + 1] / sqrt(p.d[k + 1]))
+            x = fabs(x) * sqrt(p.nu[k])
+            if x > big:
+                big = x
+    energy[0] = root(&total)
+    velocity[0] = big
+
+
+cdef inline void add_floor(const blocks_t* p, int32_t i, double size, sum_t* total, double* big) noexcept nogil:
+    cdef double f = unit_roundoff() * (size + fabs(p.b[i])), v
+    add_square(total, f / sqrt(p.d[i]))
+    v = f * (sqrt(p.nu[i]) / sqrt(p.d[i]))
+    if v > big[0]:
+        big[0] = v
