@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from html import escape
 from typing import Any
 
 import numpy as np
@@ -110,3 +112,9 @@ def equal(x: object, y: object) -> bool:
     if isinstance(x, np.ndarray) or isinstance(y, np.ndarray):
         return np.array_equal(x, y)  # type: ignore[arg-type]
     return bool(x == y)
+
+
+def table_of(facts: Mapping[str, Any], title: str) -> str:
+    """Facts as a small HTML table, for notebooks; every text escaped."""
+    rows = "".join(f"<tr><th>{escape(str(k))}</th><td>{escape(str(v))}</td></tr>" for k, v in facts.items())
+    return f"<table><caption>{escape(title)}</caption>{rows}</table>"

@@ -30,7 +30,8 @@ class UnknownName(LavenderError, KeyError):
 
     def __init__(self, kind: str, name: object, known: Iterable[str]) -> None:
         known = sorted(known)
-        near = difflib.get_close_matches(str(name), known, n=3, cutoff=0.5)
+        plain = {word.lower(): word for word in reversed(known)}
+        near = [plain[w] for w in difflib.get_close_matches(str(name).lower(), plain, n=3, cutoff=0.5)]
         hint = (
             f"did you mean {' or '.join(map(repr, near))}?"
             if near

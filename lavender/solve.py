@@ -116,7 +116,7 @@ class Prepared:
                         f"solver {spec.name!r} does not take {name}=; it takes: "
                         f"{', '.join(sorted(spec.accepts)) or 'no options'}"
                     )
-                raise UnknownName(f"option of solver {spec.name!r}", name, spec.accepts)
+                raise UnknownName(f"option of solver {spec.name!r}", name, {*spec.accepts, *FRONT_DOOR})
         self.spec = spec
         self.options = dict(options)
         self.problem = problem

@@ -11,6 +11,7 @@ from click.testing import CliRunner
 import lavender as lv
 from lavender.bench import kernels
 from lavender.cli import cli
+from lavender.report import kernels as tables
 from lavender_ext.bench import microbenchmarks
 
 
@@ -70,7 +71,7 @@ def test_cases_give_time_work_and_residual(case):
         assert row.seconds > 0.0 and row.work > 0
         assert row.per_unit == pytest.approx(1e9 * row.seconds / row.work)
     assert any(np.isfinite(r.residual) for r in rows)
-    text = "\n".join(kernels.table(rows))
+    text = "\n".join(tables.table(rows))
     assert all(r.case in text for r in rows)
 
 
@@ -82,7 +83,7 @@ def test_a_wrong_case_is_named():
 def test_growing_piles_are_built_and_solved():
     (row,) = kernels.scaling([200], seconds=0.01)
     assert row["contacts"] > 100 and row["sweep"] > 0.0 and row["residual"] < 0.5
-    assert "| ns / contact and sweep |" in kernels.scaling_table([row])[0]
+    assert "| ns / contact and sweep |" in tables.scaling_table([row])[0]
 
 
 def test_bytes_are_those_of_the_arrays():

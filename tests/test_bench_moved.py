@@ -23,7 +23,7 @@ def test_a_record_has_the_motion_error_of_its_run():
 
 
 def test_without_asking_there_is_none(monkeypatch):
-    monkeypatch.setattr("lavender.bench.runner.with_motion", None)
+    monkeypatch.setattr("lavender.bench.running.runner.with_motion", None)
     for r in bench.run(["stack(n=8)"], ["pgs"], bench.Plan(levels=(1e-3,), **SHORT)):
         assert r.motion is None
         assert from_json(to_json(r)) == r

@@ -10,6 +10,7 @@ import lavender as lv
 from lavender import suite
 from lavender.bench import regret
 from lavender.cli import main
+from lavender.report.regret import table
 
 ONE = regret.Regret(
     case="x",
@@ -45,7 +46,7 @@ def test_summary_counts_failures_apart():
     assert s.worst == pytest.approx(4.05e-3 / 1.5e-4)
     assert s.p95 == pytest.approx(9.5e-4 / 1.5e-4)
     assert s.mean == pytest.approx(math.exp((math.log(9.5 / 1.5) + math.log(40.5 / 1.5)) / 20))
-    assert "1 of them not by auto" in regret.table(found)
+    assert "1 of them not by auto" in table(found)
 
 
 def test_a_run_times_what_solved():

@@ -87,7 +87,7 @@ def test_problems_and_files_travel_too(tmp_path):
 def test_a_backend_that_is_not_there_is_an_input_error(backend, sign, monkeypatch):
     if backend.startswith("dask"):
         pytest.importorskip("distributed", reason="a cluster needs dask.distributed (extra: cluster)")
-        monkeypatch.setattr(sys.modules["lavender.bench.campaign"], "CONNECT", 0.2)
+        monkeypatch.setattr(sys.modules["lavender.bench.running.campaign"], "CONNECT", 0.2)
     with pytest.raises(lv.InputError, match=sign):
         bench.campaign(NAMES[:1], ["pgs"], PLAN, backend=backend)
 

@@ -54,7 +54,7 @@ def test_report_leaves_records_and_page_and_prints_times(lavender, path, tmp_pat
     assert {r.solver for r in records} == {"pgs", "direct"}
     assert {r.max_iter for r in records if r.mode == "budget"} == {2, 4}
     assert {r.tol for r in records if r.solver == "pgs" and r.mode == "tol"} == {1e-3, 1e-6}
-    for word in ("stack8", "to 1e-3", "to 1e-6", "CONVERGED", "Recommended", "index.html"):
+    for word in ("stack8", "to 1e-3", "to 1e-6", "CONVERGED", "Use ", "index.html"):
         assert word in out
 
 
@@ -297,3 +297,109 @@ def test_a_recorded_scene_is_reported_as_a_sequence(lavender, tmp_path):
     assert lavender("run", "no such scene")[0] == 2
     assert lavender("report", "--sequence")[0] == 2
     assert lavender("report", "--sequence", folder, "--compare", "nowhere")[0] == 2
+
+
+def test_the_recommendation_comes_first_and_tables_on_request(lavender, path, tmp_path):
+    words = ("report", path, "stack(n=8)", *QUICK[:-1], "--out", tmp_path / "out", "--no-figures")
+    code, out, _ = lavender(*words)
+    assert code == 0
+    first, second = out.strip().splitlines()[:2]
+    assert first.startswith("Use ")
+    assert second.strip().startswith("lv.solve(problem, ")
+    assert "--tables prints them" in out
+    assert "CONVERGED" not in out
+    code, out, _ = lavender(*words, "--tables")
+    assert "CONVERGED" in out
+    n = len(bench.read(tmp_path / "out"))
+    assert f"{n} of {n} runs reused of 20" in out
+    code, out, _ = lavender(*words, "--fresh")
+    assert "reused" not in out
+    assert len(bench.read(tmp_path / "out")) == n  # made again, they stand for the earlier ones
+
+
+def test_nothing_is_cut_off_in_a_pipe(path, tmp_path):
+    long = tmp_path / ("a" * 100 + ".npz")
+    io.save(problem(), long)
+    words = [
+        sys.executable,
+        "-m",
+        "lavender",
+        "report",
+        long,
+        "--solvers",
+        "sequential_impulses,pgs",
+        *QUICK,
+        "--tables",
+    ]
+    done = subprocess.run(
+        [*map(str, words), "--out", tmp_path / "o"], capture_output=True, text=True, check=True
+    )
+    assert "…" not in done.stdout
+    assert "a" * 100 in done.stdout.replace("\n", "")
+    assert f"page: {tmp_path / 'o' / 'index.html'}\n" in done.stdout
+
+
+def test_a_named_file_that_does_not_load_touches_nothing_and_one_in_a_folder_is_counted(
+    lavender, path, tmp_path
+):
+    folder = tmp_path / "problems"
+    folder.mkdir()
+    io.save(problem(), folder / "good.npz")
+    broken = folder / "broken.npz"
+    broken.write_bytes(path.read_bytes()[:100])
+    more = ("--solvers", "pgs", *QUICK[:-1], "--out", tmp_path / "out")
+    code, _, err = lavender("report", folder / "good.npz", broken, *more)
+    assert code == cli.EXIT_BAD_INPUT
+    assert "broken.npz" in err
+    assert not (tmp_path / "out" / "index.html").exists()
+    for command in ("report", "bench"):
+        out = tmp_path / ("out" if command == "report" else "r.jsonl")
+        code, _, _ = lavender(command, folder, *more[:-1], out)
+        assert code == cli.EXIT_UNMET
+    assert (tmp_path / "out" / "index.html").exists()
+    assert lavender("check", folder, "--solvers", "pgs")[0] == cli.EXIT_UNMET
+    assert lavender("check", broken, "--solvers", "pgs")[0] == cli.EXIT_BAD_INPUT
+    assert lavender("report", "--campaign", broken, *more[:-1], tmp_path / "c")[0] == cli.EXIT_BAD_INPUT
+
+
+def test_solve_says_by_its_exit_code_what_came_of_it(lavender, path, tmp_path):
+    assert lavender("solve", path)[0] == 0  # auto
+    assert "auto: CONVERGED" in lavender("solve", path)[1]
+    assert lavender("solve", path, "--solver", "pgs", "--max-iter", 1)[0] == cli.EXIT_UNMET
+    assert (
+        lavender("solve", path, "--solver", "pgs", "--tol", 0, "--max-iter", 1)[0] == 0
+    )  # a budget, as asked
+    impossible = lv.Problem.lcp(np.array([[1.0, -1.0], [-1.0, 1.0]]), np.ones(2))
+    io.save(impossible, tmp_path / "impossible.npz")
+    code, out, _ = lavender("solve", tmp_path / "impossible.npz", "--solver", "direct")
+    assert ("INFEASIBLE" in out, code) == (True, cli.EXIT_INFEASIBLE)
+
+
+def test_the_nearest_name_is_found_whatever_its_case(lavender):
+    assert "did you mean 'pgs'" in lavender("solve", "stack(n=4)", "--solver", "PGS")[2]
+    with pytest.raises(lv.UnknownName, match="did you mean 'max_iter'"):
+        lv.solve(problem(), "pgs", max_iters=3)
+
+
+def test_cases_lists_families_with_parameters_and_reasons(lavender):
+    from lavender.suite.case import FAMILIES
+
+    code, out, _ = lavender("cases")
+    assert code == 0
+    for name, family in FAMILIES.items():
+        assert f"\n{name}(" in "\n" + out
+        assert family.summary in out
+    code, out, _ = lavender("cases", "hang")
+    assert "hang(n=" in out
+    assert "pyramid(" not in out
+    assert "8 rows" in lavender("cases", "toy_stack", "--size")[1]
+    assert lavender("cases", "nosuchthing")[0] == 2
+
+
+def test_solvers_that_are_here_come_first(lavender):
+    reasons = registry.known()
+    lines = lavender("solvers")[1].splitlines()
+    place = {line.split()[0]: i for i, line in enumerate(lines) if line.strip()}
+    here = [place[n] for n, reason in reasons.items() if reason is None]
+    away = [place[n] for n, reason in reasons.items() if reason is not None]
+    assert max(here) < min(away, default=len(lines))

@@ -38,6 +38,8 @@ LEVELS = [
 #: Imports upwards that happen inside a function, when it is first called, or for a type checker alone.
 LATE = {
     ("_derived", "motion"),  # a problem keeps its reference, whose type is known above
+    ("problem", "io"),  # Problem.save
+    ("bench", "report"),  # Records.plot
     ("engine", "web"),  # Simulation.view shows itself in the page
     ("solution", "motion"),  # Solution.motion_error is a short way to lavender.motion_error
 }

@@ -12,8 +12,12 @@ from click.testing import CliRunner
 
 import lavender as lv
 from lavender import suite
-from lavender.bench import peer_engines, peer_solvers, peers
-from lavender.bench.peer_solvers import Contestant, Result
+from lavender.bench import peers
+from lavender.bench.peers import adapters, engines, race
+from lavender.bench.peers.contest import Contestant, Result
+from lavender.cli import bench_peers
+from lavender.report import compared as comparison
+from lavender.report import rivals
 
 SMALL = {  # laws and kinds of bounds that adapters must translate
     "lcp": "box_stack(n=2)",
@@ -31,7 +35,7 @@ def reached(contestant, problem, limit=5.0):
 
 
 def is_adapter(name):
-    """Whether the conversion is of `peer_solvers` itself; those of `lavender.external` have tests of their own."""
+    """Whether the conversion is of `adapters` itself; those of `lavender.external` have tests of their own."""
     return any(word in name for word in ("own interface", " cones ", "pinocchio", "scipy"))
 
 
@@ -39,7 +43,7 @@ def is_adapter(name):
 def test_every_adapter_solves_the_same_problem(kind):
     # A wrong sign, bound or order of rows would leave a residual near 1.
     problem = suite.case(SMALL[kind]).problem
-    for contestant in peer_solvers.contestants():
+    for contestant in adapters.contestants():
         if not is_adapter(contestant.name) or contestant.refuses(problem) is not None:
             continue
         if contestant.name.startswith("quadprog") and "impulse" in contestant.name:
@@ -51,7 +55,7 @@ def test_every_adapter_solves_the_same_problem(kind):
 
 def test_quadprog_needs_a_definite_matrix_and_constraints():
     pytest.importorskip("quadprog", reason="needs quadprog: pip install 'lavender-contact[qp]'")
-    contestant = peer_solvers._direct("quadprog", "impulse")
+    contestant = adapters._direct("quadprog", "impulse")
     assert reached(contestant, suite.case("stack(n=4)").problem) < 1e-9
     with pytest.raises(lv.CapabilityError, match="without constraints"):
         reached(contestant, suite.case("chain(n=4)").problem)
@@ -59,10 +63,10 @@ def test_quadprog_needs_a_definite_matrix_and_constraints():
 
 def test_race_keeps_times_residuals_and_sides():
     problem = suite.case("stack(n=4)").problem
-    chosen = [c for c in peer_solvers.contestants() if c.name in ("pgs", "direct", "direct, from scratch")]
-    linear = peer_solvers._scipy("spsolve")
+    chosen = [c for c in adapters.contestants() if c.name in ("pgs", "direct", "direct, from scratch")]
+    linear = adapters._scipy("spsolve")
     told = []
-    (results,) = peer_solvers.race([("a", problem)], [*chosen, linear], rounds=2, watch=told.append)
+    (results,) = race.race([("a", problem)], [*chosen, linear], rounds=2, watch=told.append)
     assert {r.solver for r in results} == {"pgs", "direct", "direct, from scratch"}  # an LCP is not linear
     for r in results:
         assert r.note == "" and not r.peer
@@ -92,9 +96,9 @@ def _hangs(problem, limit):
     ("runs", "kept", "note"), [(_dies, 0, "died"), (_raises, 1, "no more"), (_hangs, 1, "without an answer")]
 )
 def test_a_contestant_that_fails_costs_its_own_runs(runs, kept, note, monkeypatch):
-    monkeypatch.setattr(peer_solvers, "PATIENCE", 0.5)
+    monkeypatch.setattr(race, "PATIENCE", 0.5)
     problem = suite.case("two_particles").problem
-    ((result,),) = peer_solvers.race([("a", problem)], [Contestant("x", True, runs)], limit=0.1, rounds=1)
+    ((result,),) = race.race([("a", problem)], [Contestant("x", True, runs)], limit=0.1, rounds=1)
     assert len(result.runs) == kept
     assert note in result.note
 
@@ -118,29 +122,29 @@ def results_by_hand():
 
 
 def test_ratios_means_and_losses():
-    compared = peer_solvers.compare(results_by_hand())
+    compared = comparison.compare(results_by_hand())
     by = {(c.problem, c.target): c for c in compared}
     assert by["big", 1e-3].ratio == 0.1 and by["big", 1e-3].ours == "pgs"
     assert by["big", 1e-9].ratio == 0.05 and by["big", 1e-9].ours == "auto"
     assert by["big", 1e-6].scratch == 3.0
     assert by["small", 1e-3].ratio == 3.0 and by["small", 1e-3].peer == "daqp"
     assert math.isinf(by["small", 1e-9].ratio)
-    means = {(m.which, m.target): m for m in peer_solvers.geometric_means(results_by_hand())}
+    means = {(m.which, m.target): m for m in comparison.geometric_means(results_by_hand())}
     assert means["cases, 1000 rows and more", 1e-6].ours == pytest.approx(0.2)
     assert means["cases, smaller", 1e-3].auto == pytest.approx(4.0)
     assert means["cases, smaller", 1e-9].compared == 0 and math.isnan(means["cases, smaller", 1e-9].ours)
     # SciPy's factorisations are peers of the last group alone.
     more = [*results_by_hand(), Result("big", 2000, "linear", "scipy banded", True, [(1.0, 1e-15)])]
-    means = {(m.which, m.target): m for m in peer_solvers.geometric_means(more)}
+    means = {(m.which, m.target): m for m in comparison.geometric_means(more)}
     assert means["cases, 1000 rows and more", 1e-6].ours == pytest.approx(0.2)
     assert means["all, SciPy too, 1000 rows and more", 1e-6].ours == pytest.approx(2.0)
     assert not any(which.startswith("exported") for which, _ in means)
-    assert [(c.problem, c.target) for c in peer_solvers.losses(compared)] == [
+    assert [(c.problem, c.target) for c in comparison.losses(compared)] == [
         ("small", 1e-9),
         ("small", 1e-3),
         ("small", 1e-6),
     ]
-    text = "\n".join(peer_solvers.tables(results_by_hand()))
+    text = "\n".join(comparison.solvers_tables(results_by_hand()))
     assert "Lost: 3 of 6." in text
     assert "- small at 1e-09: daqp against -, only the peer" in text
 
@@ -156,7 +160,7 @@ def test_names_of_problems():
 
 def test_another_interpreter_without_siconos_is_named():
     with pytest.raises(lv.InputError, match="cannot be run"):
-        peer_solvers.check_siconos("/no/such/python")
+        adapters.check_siconos("/no/such/python")
 
 
 def test_siconos_solves_the_same_problems():
@@ -164,7 +168,7 @@ def test_siconos_solves_the_same_problems():
     if not python:
         pytest.skip("LAVENDER_SICONOS names no interpreter with Siconos")
     for kind, name in (("coulomb", "NSGS"), ("coulomb", "NSGS dense"), ("coulomb", "NSN_AC"), ("lcp", "PGS")):
-        contestant = peer_solvers._siconos(python, name, kind == "coulomb")
+        contestant = adapters._siconos(python, name, kind == "coulomb")
         assert reached(contestant, suite.case(SMALL[kind]).problem) < 1e-6
 
 
@@ -172,7 +176,7 @@ def test_siconos_solves_the_same_problems():
 
 
 def test_engines_step_the_same_scene():
-    steps = peer_engines.run("stack6", settle=200, rounds=1)
+    steps = engines.run("stack6", settle=200, rounds=1)
     names = [s.engine for s in steps]
     assert names[:2] == ["lavender, 16 sweeps", "lavender newton"]
     for s in steps:
@@ -181,42 +185,42 @@ def test_engines_step_the_same_scene():
         assert 24 <= s.contacts <= 40
         assert 0.0 <= s.depth < 0.01 and s.speed < 0.1
         assert math.isnan(s.relative) == ("pybullet" in s.engine)
-    text = peer_engines.table(steps)
-    lost = [s for s in steps if peer_engines.over_ours(s, steps) < 1.0]
+    text = comparison.engines_table(steps)
+    lost = [s for s in steps if comparison.over_ours(s, steps) < 1.0]
     assert len(text) == 2 + len(steps) + (2 + len(lost) if lost else 0)
     assert all(any(f"- stack6: {s.engine}," in line for line in text) for s in lost)
 
 
 def test_mujoco_carries_the_same_weight():
     pytest.importorskip("mujoco", reason="needs MuJoCo: pip install 'lavender-contact[peers]'")
-    problem = peer_engines.export("stack6", settle=480)
+    problem = engines.export("stack6", settle=480)
     solution = lv.solve(problem, "newton", tol=1e-8)
     normals = solution.impulse[problem.cones.ptr[:-1]]
     ground = [i for i, name in enumerate(problem.names) if "(0, 1)" in name]
     mass = sum(b.mass for b in lv.Scene("stack").bodies)
     # The stack of 16 sweeps still moves a little; a box more or less would be a sixth.
-    assert normals[ground].sum() == pytest.approx(9.81 * mass * peer_engines.DT, rel=0.1)
+    assert normals[ground].sum() == pytest.approx(9.81 * mass * engines.DT, rel=0.1)
     assert np.all(problem.cones.mu == 0.5)
 
 
 def test_unknown_scenes_and_engines_are_named():
     with pytest.raises(lv.UnknownName, match="stack6"):
-        peer_engines.run("stack")
+        engines.run("stack")
     with pytest.raises(lv.UnknownName, match="mujoco"):
-        peer_engines.run("stack6", engines=["mujoko"])
+        engines.run("stack6", engines=["mujoko"])
 
 
 def test_an_engine_that_does_not_settle_is_left_out_and_said(monkeypatch):
-    monkeypatch.setattr(peer_engines, "SETTLE_LIMIT", 0.0)
-    steps = peer_engines.run("stack6", engines=["lavender"], rounds=1)
+    monkeypatch.setattr(engines, "SETTLE_LIMIT", 0.0)
+    steps = engines.run("stack6", engines=["lavender"], rounds=1)
     assert all("did not settle" in s.note and math.isnan(s.time) for s in steps)
-    assert "did not settle" in peer_engines.table(steps)[2]
+    assert "did not settle" in comparison.engines_table(steps)[2]
 
 
 def test_command(tmp_path):
     out = tmp_path / "peers.json"
     done = CliRunner().invoke(
-        peers.command, ["--no-solvers", "--scenes", "stack6", "--out", str(out)], catch_exceptions=False
+        bench_peers.peers, ["--no-solvers", "--scenes", "stack6", "--out", str(out)], catch_exceptions=False
     )
     assert done.exit_code == 0
     record = json.loads(out.read_text())
@@ -240,14 +244,12 @@ def test_command_line_finds_it_below_bench(capsys):
 
 def written(tmp_path):
     """A run of `lavender bench peers --out`: engines on one scene by hand, and `results_by_hand`."""
-    step = peer_engines.Step("stack6", "lavender, 16 sweeps", False, 1e-5, 24, 1e-4, 1e-9, 1e-6)
-    other = peer_engines.Step("stack6", "<b>other</b>", False, 5e-6, 24, 1e-4, 1e-3, math.nan)
-    late = peer_engines.Step(
-        "stack6", "late", False, math.nan, 0, math.nan, math.nan, math.nan, "did not settle"
-    )
+    step = engines.Step("stack6", "lavender, 16 sweeps", False, 1e-5, 24, 1e-4, 1e-9, 1e-6)
+    other = engines.Step("stack6", "<b>other</b>", False, 5e-6, 24, 1e-4, 1e-3, math.nan)
+    late = engines.Step("stack6", "late", False, math.nan, 0, math.nan, math.nan, math.nan, "did not settle")
     path = tmp_path / "peers.json"
-    steps = peer_engines.as_records([step, other, late])
-    solvers = peer_solvers.as_records(results_by_hand())
+    steps = engines.as_records([step, other, late])
+    solvers = race.as_records(results_by_hand())
     path.write_text(
         json.dumps({"cpu": "a cpu", "versions": {"osqp": "1"}, "steps": steps, "solvers": solvers})
     )
@@ -279,15 +281,16 @@ def test_the_report_shows_peers_with_losses(tmp_path):
     )
     index = lv.report.write(records, tmp_path / "r", peers=peers.read(written(tmp_path)))
     text = index.read_text()
-    assert "Other engines and solvers" in text and 'data-figure="peers"' in text
+    assert "Other engines and solvers" in text
+    assert 'aria-label="ours over the fastest peer' in text
     assert "Lost: 3 of 6." in text
     assert "did not settle" in text
     assert "<b>other</b>" not in text.replace("\\u003cb", "") and "&lt;b&gt;other" in text
     for name in ("peers", "peers_scene_stack6", "peers_big"):
         assert (tmp_path / "r" / "figures" / f"{name}.svg").stat().st_size > 1000
-    figures = json.loads(text.split('id="figures">')[1].split("</script>")[0])
-    ratios = {t["name"]: dict(zip(t["x"], t["y"], strict=True)) for t in figures["peers"]["traces"]}
+    (over,) = rivals.figures(peers.read(written(tmp_path)))["over"]
+    ratios = {c.label: dict(zip(c.x, c.y, strict=True)) for c in over.curves}
     assert ratios["to 1e-3"] == {2000.0: 0.1, 8.0: 3.0}
-    assert all(t["mode"] == "markers" for t in figures["peers"]["traces"])
+    assert all(c.points for c in over.curves)
     without = lv.report.write(records, tmp_path / "q", figures=False).read_text()
     assert "Other engines and solvers" not in without

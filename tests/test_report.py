@@ -1,19 +1,24 @@
 """Tables say what the records say; the page stands alone and hides nothing."""
 
+import dataclasses
+import html
 import html.parser
-import json
 import math
+import random
 import re
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 
 import lavender as lv
 from lavender import bench, report
-from lavender.bench.record import CaseInfo, Record, Run
-from lavender.report import curves, draw, tables
+from lavender.bench.record import CaseInfo, Record, Run, file_name
+from lavender.report import curves, tables
 from lavender.report.style import looks
-from lavender.report.text import residual, seconds
+from lavender.report.svg import svg
+from lavender.report.text import residual, seconds, times
+from lavender.report.verdict import verdict
 
 LEVELS = (1e-3, 1e-6)
 
@@ -93,8 +98,7 @@ def test_shifted_geometric_means_charge_misses_the_limit():
         record("a", "z", 1.0, 1e-7),  # does not take b: not compared
     )  # fmt: skip
     means = report.geometric_means(found)["lcp"][1e-6]
-    shift = tables.shift_of(found)
-    assert shift == float(f"{np.median([1.0, 4.0]):.1g}")
+    shift = tables.SHIFT
     assert set(means) == {"x", "y"}
     assert means["x"] == (pytest.approx(math.sqrt((1 + shift) * (4 + shift)) - shift), 2, 2)
     assert means["y"] == (pytest.approx(math.sqrt((1 + shift) * (2 + shift)) - shift), 1, 2)  # limit 2 s
@@ -112,6 +116,138 @@ def test_advice_puts_who_solves_most_first_and_false_claims_last():
     assert by["stack", 1e-6].best.solved == 2
     assert by["redundant", 1e-6].best.solver == "sure"
     assert list(report.families(found)) == ["stack", "redundant"]
+
+
+def jittered(records, seed, most=1.1):
+    """The same records as another run would time them."""
+    rng = random.Random(seed)
+    made = []
+    for r in records:
+        t = r.time_min * most ** rng.uniform(-1.0, 1.0)
+        made.append(dataclasses.replace(r, time_min=t, time_median=t))
+    return records_of(*made)
+
+
+def close_race():
+    """Three that differ by less than noise, one that does not, and one that needs all of a time budget."""
+    made = []
+    for i in range(4):
+        case = f"case {i}"
+        for solver, time in (("zeta", 1.0), ("auto", 1.1), ("beta", 1.05), ("slow", 2.0)):
+            made.append(record(case, solver, (1.0 + i) * 1e-3 * time, 1e-7))
+        made.append(
+            record(case, "edge", 1e-3, 1e-9, tol=1e-12, success=False, status="STALLED", claims=False)
+        )
+    return records_of(*made)
+
+
+def test_those_within_noise_are_ties_and_a_rerun_keeps_the_recommendation():
+    first = close_race()
+    by = {a.target: a for a in report.advice_by_level(first)}
+    assert by[1e-6].best.solver == "edge"
+    assert {by[1e-6].best.solver, *by[1e-6].ties} == {"edge"}
+    level = tables.to_level(
+        records_of(*(r for r in first if r.solver != "edge")), "all", [f"case {i}" for i in range(4)], 1e-6
+    )
+    assert (level.best.solver, level.ties) == ("auto", ("beta", "zeta"))
+    times = (1e-3, 2e-3, 5e-3)
+    for seed in range(40):
+        again = jittered(first, seed)
+        for old, new in zip(
+            [*report.advice_by_level(first), *report.advice_by_time(first, times)],
+            [*report.advice_by_level(again), *report.advice_by_time(again, times)],
+            strict=True,
+        ):
+            assert (new.family, new.target) == (old.family, old.target)
+            if old.best is not None and new.best is not None:
+                assert old.best.solver in {new.best.solver, *new.ties}
+
+
+def test_another_solver_changes_nobodys_score():
+    first = close_race()
+    more = records_of(*first, *(record(f"case {i}", "new", 1e-7, 1e-9) for i in range(4)))
+    for how in (report.advice_by_level, lambda r: report.advice_by_time(r, [1e-3, 1e-2])):
+        for old, new in zip(how(first), how(more), strict=True):
+            scores = {c.solver: c.score for c in new.ranking}
+            assert {c.solver: scores[c.solver] for c in old.ranking} == {
+                c.solver: c.score for c in old.ranking
+            }
+    assert "new" in {c.solver for c in report.advice_by_level(more)[0].ranking}
+
+
+def test_the_number_shown_is_the_number_ranked_by_and_the_chart_names_the_same_winner(tmp_path):
+    found = records_of(
+        record("a", "even", 3e-3, 1e-7), record("b", "even", 3e-3, 1e-7), record("c", "even", 3e-3, 1e-7),
+        record("a", "odd", 1e-3, 1e-7), record("b", "odd", 1e-3, 1e-7), record("c", "odd", 60e-3, 1e-7),
+    )  # fmt: skip
+    (advice,) = (a for a in report.advice_by_level(found) if a.target == 1e-6)
+    assert advice.best.solver == "even"  # a median would say odd
+    odd = advice.ranking[1]
+    assert (odd.worst, odd.hardest) == (60e-3, "c")
+    assert seconds(advice.best.score) in report.write(found, tmp_path, figures=False).read_text()
+    figure = curves.family_figure(found, "stack", ["a", "b", "c"])
+    at = {c.solver: c.x[c.y.index(1e-6)] for c in figure.curves}
+    assert at == {c.solver: c.score for c in advice.ranking}
+
+
+def test_a_structure_with_two_laws_is_two_families():
+    found = records_of(record("a", "x", 1.0, 1e-7), record("b", "x", 1.0, 1e-7), law={"b": "coulomb"})
+    assert report.families(found) == {"stack, coulomb": ["b"], "stack, lcp": ["a"]}
+
+
+def test_one_sentence_and_a_line_to_copy_come_first(tmp_path):
+    budget = {
+        "mode": "budget",
+        "tol": 0.0,
+        "status": "MAX_ITERATIONS",
+        "claims": False,
+        "work": {"sweeps": 8},
+    }
+    found = records_of(
+        record("a", "auto", 4e-3, 1e-7), record("b", "auto", 4e-2, 1e-7),
+        record("a", "pgs", 1e-4, 1e-1, max_iter=8, **budget), record("b", "pgs", 1e-4, 1e-1, max_iter=8, **budget),
+    )  # fmt: skip
+    said = verdict(found, [1e-3, 1.0])
+    assert said.sentences == (
+        "Use auto: 12.7 ms to 1e-6 on your 2 stacks (at worst 40.0 ms: b).",
+        "If you have only 1.00 ms, take pgs, 8 sweeps: 1.0e-1.",
+    )
+    assert said.code == (
+        'lv.solve(problem, "auto", tol=1e-6)',
+        'lv.solve(problem, "pgs", tol=0, max_iter=8)',
+    )
+    assert said.leaders == ("auto", "pgs")
+    text = html.unescape(report.write(found, tmp_path, figures=False, times=[1e-3, 1.0]).read_text())
+    assert text.index(said.sentences[0]) < text.index(said.code[0]) < text.index("<table")
+    nobody = verdict(records_of(record("a", "x", 1.0, 0.5)))
+    assert nobody.text == "Nobody brings any of your stack to 1e-6."
+    quick = verdict(records_of(record("a", "x", 1e-4, 1e-7)))
+    assert "Python's share" in quick.text
+
+
+@pytest.mark.parametrize(("cases", "solvers", "most"), [(17, 23, 400_000), (200, 14, 3_000_000)])
+def test_a_page_is_small(cases, solvers, most, tmp_path):
+    rng = random.Random(1)
+    made = []
+    for i in range(cases):
+        for j in range(solvers):
+            for k in range(8):
+                kind = (
+                    {"mode": "budget", "tol": 0.0, "max_iter": 4**k}
+                    if k < 5
+                    else {"tol": 10.0 ** (-3 * (k - 4))}
+                )
+                made.append(
+                    record(
+                        f"pile(n={i})",
+                        f"solver_{j}",
+                        rng.uniform(1e-5, 1e-2),
+                        10.0 ** rng.uniform(-12, 0),
+                        **kind,
+                    )
+                )
+    found = records_of(*made)
+    assert report.write(found, tmp_path, figures=False).stat().st_size < most
 
 
 def test_advice_names_nobody_where_nobody_got_there():
@@ -190,6 +326,12 @@ def test_times_have_three_digits_and_a_unit(t, text):
     assert seconds(math.inf) == "–"
 
 
+def test_ratios_say_no_more_than_they_know():
+    assert [times(x) for x in (1.34, 85.0, 1234.4, 7.3e13, math.nan)] == [
+        "1.3 times", "85 times", "1234 times", "10^14 times", "–",
+    ]  # fmt: skip
+
+
 def test_residuals_have_two_digits():
     assert [residual(x) for x in (3.44e-7, 0.0, math.inf, 1.0)] == ["3.4e-7", "0", "inf", "1.0e0"]
 
@@ -253,9 +395,7 @@ def test_the_page_stands_alone_and_is_well_formed(real, tmp_path):
     assert "<b>row" not in text
     assert evil not in text
     assert page.links <= page.ids
-    figures = json.loads(re.search(r'id="figures">(.*?)</script>', text, re.DOTALL)[1])
-    places = set(re.findall(r'data-figure="([^"]+)"', text))
-    assert places == set(figures)
+    assert text.count("<svg") == len(list(curves.figures(records)))
     for name in ("pgs", "jacobi", "Limitations", bench.cpu_name(), "numpy " + np.__version__):
         assert name in text
 
@@ -265,9 +405,7 @@ def test_everything_asked_for_is_in_the_folder(real, tmp_path):
     report.write(records, tmp_path)
     names = {p.name for p in tmp_path.iterdir()}
     assert names == {"records.csv", "records.json", "index.html", "summary.md", "figures"}
-    shown = json.loads(
-        re.search(r'id="figures">(.*?)</script>', (tmp_path / "index.html").read_text(), re.DOTALL)[1]
-    )
+    shown = [file_name(figure.name) for figure in curves.figures(records)]
     saved = sorted(p.name for p in (tmp_path / "figures").iterdir())
     assert saved == sorted(f"{name}.{suffix}" for name in shown for suffix in ("svg", "png"))
     kinds = [name.split("_")[0] for name in shown]
@@ -292,9 +430,51 @@ def test_a_curve_is_the_runs_of_its_solver(real):
         key=lambda r: (r.relative, r.floor),
     )
     assert figure.floor == best.floor
-    data = draw.plotly_data(figure, looks(by))
-    assert [t["name"] for t in data["traces"]] == [c.label for c in figure.curves]
-    assert data["floor"] == figure.floor
+
+
+def read_back(drawing):
+    """Label -> (x, y) of each point of a drawing, from the places of points and the axes that it carries."""
+
+    def value(axis, place):
+        log, low, high, first, last = map(float, axis.split())
+        x = low + (high - low) * (place - first) / (last - first)
+        return 10.0**x if log else x
+
+    root = ElementTree.fromstring(drawing)
+    found = {}
+    for curve in root.iter("g"):
+        dots = next(p for p in curve.iter("path") if p.get("class") == "d")
+        places = re.findall(r"M(\d+) (\d+)", dots.get("d"))
+        found[curve.get("data-l")] = [
+            (value(root.get("data-x"), int(x)), value(root.get("data-y"), int(y))) for x, y in places
+        ]
+    return found
+
+
+def test_a_drawing_holds_the_points_of_its_figure(real):
+    records, evil = real
+    for name in ("chain", evil):
+        figure = curves.work_precision(records, name)
+        found = read_back(svg(figure, {"pgs": 1}, ["pgs"]))
+        assert list(found) == [c.label for c in figure.curves]
+        for c in figure.curves:
+            x, y = np.array(found[c.label]).T
+            # A unit of the drawing: 672 for at least a decade of time, some 17 decades of residual on 494.
+            assert np.abs(np.log10(x / np.array(c.x))).max() < 0.01
+            assert np.abs(np.log10(y / np.array(c.y))).max() < 0.04
+
+
+def test_a_drawing_survives_what_has_no_place_on_its_axes():
+    odd = curves.Curve("a", "a", (0.0, 1e-300, 1.0, math.inf), (1.0, math.nan, 0.0, 1.0))
+    for drawn in (
+        curves.Figure("f", "<t>&", "x", "y", (odd,)),
+        curves.Figure("f", "t", "x", "y", (), x_log=False, y_log=False),
+        curves.Figure(
+            "f", "t", "x [s]", "y", (curves.Curve("a", "a", (1.0,), (1.0,), ("<&",)),), levels=(0.0,)
+        ),
+        curves.Figure("f", "t", "x", "y", (curves.Curve("a", "a", (1.0, 1.0), (5.0, 5.0)),), False, False),
+    ):
+        ElementTree.fromstring(svg(drawn, {}))
 
 
 def test_warm_runs_have_their_own_curves(real):

@@ -6,15 +6,15 @@
 Nothing here draws or prints; `lavender.report` reads the records.
 """
 
-from lavender.bench.campaign import CampaignPlan, campaign, seeds
 from lavender.bench.cases import Item, resolve, sequence, steps_in, structure_of
 from lavender.bench.machine import cpu_name
-from lavender.bench.plan import Plan
 from lavender.bench.record import CaseInfo, Record, Run, Skip, level_name
-from lavender.bench.runner import Event, run, solver_names
-from lavender.bench.sequences import carry
+from lavender.bench.running.campaign import CampaignPlan, campaign, seeds
+from lavender.bench.running.plan import Plan
+from lavender.bench.running.runner import Event, run, solver_names
+from lavender.bench.running.sequences import carry
+from lavender.bench.running.timing import Task, measure, one_thread
 from lavender.bench.store import Records, Store, read, write_csv, write_json
-from lavender.bench.timing import Task, measure, one_thread
 
 __all__ = [
     "CampaignPlan",

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import hashlib
+import math
+import os
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable
@@ -14,14 +16,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lavender.bench.record import CaseInfo, file_name
+from lavender._arrays import FloatArray
+from lavender.bench.record import CaseInfo, file_name, printable
 from lavender.cones import ROW
-from lavender.errors import InputError, LavenderError
+from lavender.errors import InputError
 from lavender.problem import Problem
-from lavender.residuals import nothing_to_do
+from lavender.residuals import nothing_to_do, residual
 from lavender.suite import Case
 
-__all__ = ["SUFFIXES", "Item", "describe", "resolve", "sequence", "steps_in", "structure_of"]
+__all__ = ["SUFFIXES", "Item", "describe", "is_path", "resolve", "sequence", "steps_in", "structure_of"]
 
 SUFFIXES = (".npz", ".hdf5", ".h5", ".hdf")
 RANK_ROWS = 300  # rows up to which the rank of A is computed, a fraction of a second
@@ -41,6 +44,13 @@ class Item:
     sequence: str = ""
     step: int = -1
     given: Problem | None = None  # in memory, not behind a name
+    stored: Callable[[], FloatArray | None] = lambda: None  # (m,) N s, the answer beside the problem
+    named: bool = (
+        False  # asked for by name, not met in a folder: that it does not load is the request's fault
+    )
+
+    def __post_init__(self) -> None:
+        self.name, self.sequence = printable(self.name), printable(self.sequence)
 
     @cached_property
     def problem(self) -> Problem:
@@ -50,6 +60,15 @@ class Item:
     def forget(self) -> None:
         """Let go of the problem's memory."""
         self.__dict__.pop("problem", None)
+
+
+def is_path(word: Source) -> bool:
+    """A file or folder is meant, be it there or not; else a case of the suite."""
+    if isinstance(word, Path):
+        return True
+    return isinstance(word, str) and (
+        "/" in word or os.sep in word or Path(word).suffix.lower() in SUFFIXES or Path(word).exists()
+    )
 
 
 Source = str | Path | Problem | Case | Item
@@ -96,8 +115,8 @@ def resolve(words: Iterable[Source], sequences: bool | None = None) -> list[Item
                 raise InputError(f"{word} holds no problem file ({', '.join(SUFFIXES)})")
             items += [_from_file(path) for path in paths]
         elif Path(word).exists():
-            items.append(_from_file(Path(word)))
-        elif Path(word).suffix.lower() in SUFFIXES or "/" in str(word):
+            items.append(replace(_from_file(Path(word)), named=True))
+        elif is_path(word):
             raise InputError(
                 f"{word}: no such file; give problem files ({', '.join(SUFFIXES)}), folders or suite names"
             )
@@ -141,11 +160,16 @@ def steps_in(folder: str | Path) -> list[Item]:
 
 
 def _problem_files(folder: Path) -> list[Path]:
-    return sorted((p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES), key=_natural)
+    try:
+        return sorted((p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES), key=_natural)
+    except OSError as error:
+        raise InputError(f"cannot read the folder {folder} ({error.strerror or error})") from None
 
 
 def _natural(path: Path) -> list[tuple[int, int | str]]:
-    return [(0, int(t)) if t.isdigit() else (1, t) for t in re.split(r"(\d+)", path.name) if t]
+    # Numbers by size; what merely looks like one, such as a superscript, is a letter.
+    parts = re.split(r"([0-9]{1,18})", path.name)
+    return [(0, int(t)) if i % 2 else (1, t) for i, t in enumerate(parts) if t]
 
 
 def _holds_steps(folder: Path) -> bool:
@@ -154,7 +178,7 @@ def _holds_steps(folder: Path) -> bool:
         return False
     try:
         return _from_file(paths[0]).problem.key is not None
-    except (LavenderError, OSError):
+    except Exception:  # whatever it raises, it is told where the case is run
         return False
 
 
@@ -179,19 +203,29 @@ def _from_file(path: Path) -> Item:
     def load() -> Problem:
         from lavender import io
 
+        if path.exists() and not path.is_file():
+            raise InputError(
+                f"{path} is no file; a problem ({', '.join(SUFFIXES)}) is needed"
+            )  # a pipe never ends
         return io.load(path)
 
-    return Item(path.stem, str(path), load)
+    def stored() -> FloatArray | None:
+        from lavender import io
+
+        return io.load_solution(path)
+
+    return Item(path.stem, str(path), load, stored=stored)
 
 
 def _unique_names(items: list[Item]) -> list[Item]:
     # As files on a system that does not tell capitals, too: figures are named after cases.
-    seen: dict[str, int] = {}
+    taken: set[str] = set()
     for item in items:
-        key = file_name(item.name).lower()
-        n = seen[key] = seen.get(key, 0) + 1
-        if n > 1:
-            item.name = f"{item.name} #{n}"
+        name, n = item.name, 1
+        while file_name(item.name).lower() in taken:
+            n += 1
+            item.name = f"{name} #{n}"
+        taken.add(file_name(item.name).lower())
     return items
 
 
@@ -216,8 +250,16 @@ def describe(item: Item, run: str) -> CaseInfo:
         reason=item.reason,
         sequence=item.sequence,
         step=item.step,
+        stored=_stored(item, p),
         nothing_to_do=nothing_to_do(p),
     )
+
+
+def _stored(item: Item, problem: Problem) -> float:
+    impulse = item.stored()
+    if impulse is None or impulse.shape != (problem.m,):
+        return math.nan
+    return float(residual(problem, impulse).relative)
 
 
 def fingerprint(problem: Problem) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import os
@@ -16,7 +17,10 @@ from typing import Any
 from lavender._version import __version__
 from lavender.bench.record import Run
 
-__all__ = ["cpu_name", "describe", "versions"]
+__all__ = ["cpu_name", "describe", "memory", "memory_share", "versions"]
+
+SHARE = 0.5  # of the machine's memory, which the processes of backends may take together
+LEAST = 2 * 2**30  # bytes: below that, packages of compiled code do not start
 
 BASE = ("numpy", "scipy", "qpsolvers", "osqp", "qdldl")
 
@@ -31,6 +35,22 @@ def cpu_name() -> str:
         if found:
             return found[1].strip()
     return platform.processor() or platform.machine() or "unknown"
+
+
+def memory() -> int:
+    """Bytes of memory of this machine, or of the container that it is; 0 where that is not known."""
+    found = []
+    with contextlib.suppress(AttributeError, ValueError, OSError):
+        found.append(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
+    for path in ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes"):
+        with contextlib.suppress(ValueError, OSError):
+            found.append(int(Path(path).read_text()))
+    return min((n for n in found if n > 0), default=0)
+
+
+def memory_share(processes: int = 1) -> int:
+    """Bytes that each of so many processes of backends may take: half of the memory together, 2 GiB each at least."""
+    return max(LEAST, int(SHARE * memory() / max(1, processes))) if memory() else 0
 
 
 def versions(packages: Iterable[str] = ()) -> dict[str, str]:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, fields
 from typing import Any
 
@@ -18,6 +19,7 @@ __all__ = [
     "file_name",
     "from_json",
     "level_name",
+    "printable",
     "to_json",
 ]
 
@@ -32,13 +34,70 @@ def level_name(level: float) -> str:
     return f"{mantissa}e{int(exponent)}"
 
 
+LONGEST_NAME = 120  # characters of a file's name: file systems take 255 bytes, with a suffix
+
+
 def file_name(name: str) -> str:
-    """A name that every file system, and the address of a part of a page, takes."""
-    return re.sub(r"[^A-Za-z0-9._-]+", "_", name).strip("_.")[:120] or "figure"
+    """A name that every file system, and the address of a part of a page, takes; long ones keep their difference."""
+    plain = re.sub(r"[^A-Za-z0-9._-]+", "_", name).strip("_.") or "figure"
+    if len(plain) <= LONGEST_NAME:
+        return plain
+    digest = hashlib.sha256(name.encode("utf-8", "surrogatepass")).hexdigest()[:12]
+    return f"{plain[: LONGEST_NAME - 13]}-{digest}"
+
+
+#: What no text of a report holds: controls, lone surrogates, marks that end a line or turn the writing round.
+_UNPRINTABLE = re.compile(
+    "[\x00-\x1f\x7f-\x9f\u2028\u2029\u200e\u200f\u202a-\u202e\u2066-\u2069\ud800-\udfff]"
+)
+_NAMED = {"\n": "\\n", "\t": "\\t", "\r": "\\r"}
+
+
+def printable(text: str, lines: bool = False) -> str:
+    """Text that any terminal, file and page can show: what cannot be shown is written as its code.
+
+    A byte of a file name that is no UTF-8 (a lone surrogate in Python's text) is written as that byte.
+
+    Parameters
+    ----------
+    text : str
+    lines : keep ends of lines and tabs, as messages have them; a name stands on one line
+    """
+    if text.isprintable():
+        return text
+
+    def escape(found: re.Match[str]) -> str:
+        if lines and found[0] in "\n\t":
+            return found[0]
+        code = ord(found[0])
+        if 0xDC80 <= code <= 0xDCFF:
+            code -= 0xDC00
+        return _NAMED.get(found[0]) or (f"\\x{code:02x}" if code < 0x100 else f"\\u{code:04x}")
+
+    return _UNPRINTABLE.sub(escape, text)
+
+
+def _clean(value: Any, lines: bool = False) -> Any:
+    if isinstance(value, str):
+        return printable(value, lines)
+    if isinstance(value, Mapping):
+        return {_clean(k): _clean(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return type(value)(map(_clean, value))
+    return value
+
+
+class _Texts:
+    """An entry whose texts can be printed, wherever they came from; messages alone have several lines."""
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if isinstance(value, (str, tuple, Mapping)):
+                object.__setattr__(self, name, _clean(value, name == "message"))
 
 
 @dataclass(frozen=True)
-class Run:
+class Run(_Texts):
     """One machine, one set of versions, one plan; records refer to it by `run`."""
 
     run: str  # identity: equal where machine, versions and plan are equal
@@ -54,7 +113,7 @@ class Run:
 
 
 @dataclass(frozen=True)
-class CaseInfo:
+class CaseInfo(_Texts):
     """What a report says of a problem without holding it."""
 
     run: str
@@ -71,13 +130,14 @@ class CaseInfo:
     structure: tuple[str, ...]  # stack, chain, pile, redundant, friction, large mass ratio, ...
     symmetric: bool
     reason: str = ""  # why the case is in the suite
+    stored: float = math.nan  # - relative residual of the answer stored beside the problem, an engine's own
     sequence: str = ""  # name of the sequence that this is a step of
     step: int = -1
     nothing_to_do: bool = False  # doing nothing is right: nobody solves it, nobody fails
 
 
 @dataclass(frozen=True)
-class Skip:
+class Skip(_Texts):
     """A solver that did not run on a case, or a case that did not load (then `solver` is empty)."""
 
     run: str
@@ -87,7 +147,7 @@ class Skip:
 
 
 @dataclass(frozen=True)
-class Done:
+class Done(_Texts):
     """Closes one pair of a campaign: every entry of it stands before this one."""
 
     run: str
@@ -96,7 +156,7 @@ class Done:
 
 
 @dataclass(frozen=True)
-class Record:
+class Record(_Texts):
     """One solver on one case with one budget or tolerance. Times are seconds."""
 
     run: str
@@ -168,15 +228,15 @@ def to_json(entry: Entry) -> dict[str, Any]:
     return {"kind": kind, **{name: _plain(value) for name, value in asdict(entry).items()}}
 
 
-def from_json(line: Mapping[str, Any]) -> Entry:
+def from_json(line: Any) -> Entry:
     """Back again; fields that this version does not know are left out.
 
     Raises
     ------
     ValueError
-        Not an entry of a records file.
+        Not an entry of a records file: a field that is missing, of another type or out of its range.
     """
-    if not isinstance(line, Mapping) or line.get("kind") not in _KINDS:
+    if not isinstance(line, Mapping) or not isinstance(line.get("kind"), str) or line["kind"] not in _KINDS:
         raise ValueError("not an entry of a records file")
     cls = _KINDS[line["kind"]]
     values = {}
@@ -184,15 +244,82 @@ def from_json(line: Mapping[str, Any]) -> Entry:
         if f.name not in line:
             continue
         value = line[f.name]
-        if f.type in ("float", "float | None") and isinstance(value, str):
+        kind = str(f.type)
+        if kind.startswith("float") and (
+            _is_whole(value) or (_is_word(value) and value in ("inf", "-inf", "nan"))
+        ):
             value = float(value)
-        elif f.name == "structure":
+        elif kind.startswith("tuple") and isinstance(value, list):
             value = tuple(value)
+        wanted, holds = _TYPES[kind]
+        if not holds(value):
+            raise ValueError(f"not an entry of a records file ({f.name} is not {wanted})")
+        rule = _RANGES.get((line["kind"], f.name)) or (_RANGES[""] if isinstance(value, float) else None)
+        if rule and not rule[1](value):
+            raise ValueError(f"not an entry of a records file ({f.name} is not {rule[0]})")
         values[f.name] = value
     try:
         return cls(**values)
     except TypeError as error:
         raise ValueError(f"not an entry of a records file ({error})") from None
+
+
+def _is_whole(value: Any) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and -(2**63) <= value < 2**63
+
+
+def _is_flat(value: Any) -> bool:
+    """A number, a word, nothing, or a list of such: what options and plans hold."""
+    if isinstance(value, list):
+        return all(_is_flat(v) and not isinstance(v, list) for v in value)
+    return value is None or isinstance(value, (bool, str, float)) or _is_whole(value)
+
+
+def _is_mapping(value: Any, holds: Callable[[Any], bool]) -> bool:
+    return isinstance(value, Mapping) and all(isinstance(k, str) and holds(v) for k, v in value.items())
+
+
+def _is_word(value: Any) -> bool:
+    return isinstance(value, str)
+
+
+def _is_positive(value: Any) -> bool:
+    return (_is_whole(value) or isinstance(value, float)) and math.isfinite(value) and value > 0
+
+
+def _is_plan(plan: Mapping[str, Any]) -> bool:
+    levels = plan.get("levels", [])
+    return _is_mapping(plan, _is_flat) and isinstance(levels, list) and all(map(_is_positive, levels))
+
+
+_Rule = tuple[str, Callable[[Any], bool]]
+#: What a field of each declared type holds in a file.
+_TYPES: dict[str, _Rule] = {
+    "str": ("a text", _is_word),
+    "int": ("a whole number", _is_whole),
+    "float": ("a number", lambda v: isinstance(v, float)),
+    "float | None": ("a number, or nothing", lambda v: v is None or isinstance(v, float)),
+    "bool": ("true or false", lambda v: isinstance(v, bool)),
+    "tuple[str, ...]": ("a list of words", lambda v: isinstance(v, tuple) and all(map(_is_word, v))),
+    "Mapping[str, Any]": (
+        "a table of numbers and words",
+        lambda v: _is_mapping(v, _is_flat),
+    ),
+    "Mapping[str, str]": ("a table of words", lambda v: _is_mapping(v, _is_word)),
+    "Mapping[str, int]": ("a table of whole numbers", lambda v: _is_mapping(v, _is_whole)),
+}
+#: What their values are limited to; "" is the rule of every other number with a fraction.
+_RANGES: dict[Any, _Rule] = {
+    "": ("0 or more", lambda v: not v < 0.0),
+    ("run", "plan"): ("a plan with positive levels", _is_plan),
+    ("record", "start"): ("cold, warm or carried", lambda v: v in ("cold", "warm", "carried")),
+    ("record", "mode"): ("tol or budget", lambda v: v in ("tol", "budget")),
+    ("record", "tol"): ("a finite number of 0 or more", lambda v: 0.0 <= v < math.inf),
+    ("record", "time_limit"): ("a positive number of seconds", _is_positive),
+    ("record", "max_iter"): ("0 or more", lambda v: v >= 0),
+    ("record", "repeats"): ("0 or more", lambda v: v >= 0),
+    ("record", "iterations"): ("0 or more", lambda v: v >= 0),
+}
 
 
 def _plain(value: Any) -> Any:

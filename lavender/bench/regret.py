@@ -9,26 +9,18 @@ the machine's speed counts as regret.
 
 from __future__ import annotations
 
-import json
 import math
 import statistics
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Any
 
-import click
-
 from lavender import registry
-from lavender.bench import machine
-from lavender.bench.campaign import seeds as from_seeds
-from lavender.bench.cases import resolve
-from lavender.bench.runner import is_foreign
-from lavender.bench.timing import Task, measure
-from lavender.errors import InputError
+from lavender.bench.running.runner import is_foreign
+from lavender.bench.running.timing import Task, measure
 from lavender.problem import Problem
 
-__all__ = ["SHIFT", "Regret", "Summary", "command", "regrets", "summary", "table"]
+__all__ = ["SHIFT", "Regret", "Summary", "regrets", "summary"]
 
 SHIFT = 50e-6  # s: below it the difference of two solvers is Python's share
 LEVELS = (1e-3, 1e-6, 1e-9)
@@ -207,94 +199,3 @@ def summary(found: Iterable[Regret]) -> Summary:
         plain_p95=plain[1],
         plain_worst=plain[2],
     )
-
-
-def table(found: Sequence[Regret], rows: int = 12) -> str:
-    """The summary and the worst of `found` as text."""
-    s = summary(found)
-    counts = (
-        f"{s.count} problems and levels that one of our solvers reached, {s.unsolved} of them not by auto; "
-        f"{s.nobody} that nobody reached"
-    )
-    lines = [
-        counts,
-        f"{'regret':<28}{'geometric mean':>15}{'95th percentile':>17}{'worst':>9}",
-        f"{f'(t + {1e6 * SHIFT:.0f} us) / (best + same)':<28}{s.mean:>15.2f}{s.p95:>17.2f}{s.worst:>9.2f}",
-        f"{'t / best':<28}{s.plain_mean:>15.2f}{s.plain_p95:>17.2f}{s.plain_worst:>9.2f}",
-        "",
-    ]
-    for r in sorted(found, key=lambda r: -r.shifted)[:rows]:
-        if r.best:
-            word = f"{r.shifted:7.2f}" if r.auto_solved else " failed"
-            times = f"auto {1e3 * r.auto_time:.3f} ms, {r.best} {1e3 * r.best_time:.3f} ms"
-            lines += [
-                f"{word}  {r.case}, {r.rows} rows, {r.law}, to {r.level:.0e}: {times}",
-                f"         {r.reason}",
-                f"         {r.auto_ran[:160]}",
-            ]
-    return "\n".join(lines)
-
-
-@click.command("auto")
-@click.argument("files", nargs=-1, metavar="[FILES | FOLDERS | NAMES]...")
-@click.option(
-    "--families", default="wild", show_default=True, help="Families with seeds, commas between them."
-)
-@click.option(
-    "--seeds", default="0:60", show_default=True, metavar="A:B", help="Seeds of the families, B left out."
-)
-@click.option("--levels", default="1e-3,1e-6,1e-9", show_default=True, help="Relative residuals to reach.")
-@click.option("--limit", default=2.0, show_default=True, metavar="S", help="Time of one solve.")
-@click.option(
-    "--repeats",
-    type=click.IntRange(1),
-    default=5,
-    show_default=True,
-    help="Timed runs of auto and of the best.",
-)
-@click.option("--worst", default=12, show_default=True, help="Cases to list.")
-@click.option(
-    "--out", type=click.Path(path_type=Path), default=None, help="Write every measurement here too, JSON."
-)
-def command(
-    files: tuple[str, ...],
-    families: str,
-    seeds: str,
-    levels: str,
-    limit: float,
-    repeats: int,
-    worst: int,
-    out: Path | None,
-) -> None:
-    """How much slower auto is than the best of our own solvers.
-
-    On FILES, or on families of the suite with seeds. Published seeds should be others than those tuned on.
-    """
-    first, colon, last = seeds.partition(":")
-    if not (colon and first.isdecimal() and last.isdecimal() and int(first) < int(last)):
-        raise InputError(f"--seeds {seeds!r}: A:B is needed, whole numbers with A < B")
-    try:
-        wanted = [float(word) for word in levels.replace(",", " ").split()]
-    except ValueError:
-        raise InputError(f"--levels {levels!r}: numbers with commas between them are needed") from None
-    names = list(files) or from_seeds(families.replace(",", " ").split(), int(last) - int(first), int(first))
-    if out is not None and not out.parent.is_dir():
-        raise InputError(f"--out {out}: there is no folder {out.parent}")
-
-    def cases() -> Iterator[tuple[str, str, Problem]]:
-        for item in resolve(names):
-            yield item.name, item.reason, item.problem
-            item.forget()
-
-    found: list[Regret] = []
-    click.echo(f"{machine.cpu_name()}; {len(names)} problems, {len(wanted)} levels", err=True)
-    try:
-        for r in regrets(cases(), levels=wanted, time_limit=limit, repeats=repeats):
-            found.append(r)
-            if len(found) % 30 == 0:
-                click.echo(f"{len(found)} done, mean so far {summary(found).mean:.2f}", err=True)
-    finally:
-        if found:
-            click.echo(table(found, worst))
-            if out is not None:
-                out.write_text(json.dumps([asdict(r) for r in found], indent=1) + "\n", encoding="utf-8")

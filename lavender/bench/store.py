@@ -16,15 +16,17 @@ from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
+from lavender._arrays import table_of
+from lavender.bench.lock import Lock
 from lavender.bench.record import CaseInfo, Done, Entry, Record, Run, Skip, from_json, to_json
-from lavender.errors import InputError
+from lavender.errors import InputError, UnknownName
 
 __all__ = ["Records", "Store", "read", "write_csv", "write_json"]
 
 SYNC = 1.0  # s, at most, of records that a power cut could take; a killed process takes none
 
 
-@dataclass
+@dataclass(repr=False)
 class Records:
     """Everything that one or more runs wrote."""
 
@@ -61,16 +63,22 @@ class Records:
         return len(self.records)
 
     def latest(self) -> Records:
-        """Only the run that wrote last: ratios of times make sense within one run alone."""
-        if len(self.runs) < 2:
+        """Only the run that wrote last, and what it says of cases as they are now.
+
+        Ratios of times make sense within one run alone, and a file that changed is another problem.
+        """
+        if not self.runs:
             return self
         run = list(self.runs)[-1]
         found = Records(source=self.source)
         found.add(self.runs[run])
-        entries: list[Entry] = [*self.cases.values(), *self.skips, *self.done.values(), *self.records]
-        for entry in entries:
-            if entry.run == run:
-                found.add(entry)
+        now = {name: info.sha for name, info in self.cases.items()}
+        mine = [r for r in self.records if r.run == run and r.sha == now.get(r.case, r.sha)]
+        cases = {r.case for r in mine}
+        described = [info for info in self.cases.values() if info.run == run or info.case in cases]
+        entries: list[Entry] = [*self.skips, *self.done.values()]
+        for entry in (*described, *(e for e in entries if e.run == run), *mine):
+            found.add(entry)
         return found
 
     def rows(self) -> list[dict[str, Any]]:
@@ -94,6 +102,33 @@ class Records:
             out.append(row)
         return out
 
+    def __repr__(self) -> str:
+        return f"<Records: {len(self.records)} runs of {len(self.cases)} cases, {self.source or 'in memory'}>"
+
+    def _repr_html_(self) -> str:
+        """For notebooks: how much there is."""
+        solvers = sorted({r.solver for r in self.records})
+        facts = {"runs": len(self.records), "cases": len(self.cases), "solvers": ", ".join(solvers)}
+        return table_of(facts, self.source or "Records")
+
+    def plot(self, case: str | None = None) -> Any:
+        """Error against time, every solver on one case (the first if None), as a figure of matplotlib.
+
+        Raises
+        ------
+        UnknownName
+            No such case.
+        """
+        cases = list(dict.fromkeys(r.case for r in self.records))
+        case = cases[0] if case is None and cases else case
+        if case not in cases:
+            raise UnknownName("case", case, cases)
+        from lavender.report import curves, draw, style
+
+        return draw.matplotlib_figure(
+            curves.work_precision(self, case), style.looks({r.solver for r in self.records})
+        )
+
     def frame(self) -> Any:
         """`rows()` as a pandas frame.
 
@@ -108,21 +143,27 @@ class Records:
 
 
 class Store:
-    """Appends entries to a `.jsonl` file.
+    """Appends entries to a `.jsonl` file, which nobody else writes as long as it is open.
 
     Raises
     ------
     InputError
-        The file cannot be written; known before anything is solved.
+        The file cannot be written, another process writes it, or it holds something else; known before
+        anything is solved.
     """
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            self.records = read(self.path) if self.path.exists() else Records()
-            _cut_torn_line(self.path)
-            self._file = self.path.open("a", encoding="utf-8")
+            self._lock = Lock(self.path)
+            try:
+                self.records = read(self.path) if self.path.exists() else Records()
+                _cut_torn_line(self.path)
+                self._file = self.path.open("a", encoding="utf-8")
+            except BaseException:
+                self._lock.release()
+                raise
             self._synced = time.monotonic()
         except OSError as error:
             raise InputError(
@@ -152,9 +193,10 @@ class Store:
         self.records.add(entry)
 
     def close(self) -> None:
-        """Close the file; what the disk had no room for was reported when it was written."""
+        """Close the file and let others write it; what the disk had no room for was reported when it was written."""
         with contextlib.suppress(OSError):
             self._file.close()
+        self._lock.release()
 
     def __enter__(self) -> Store:
         return self
@@ -184,6 +226,8 @@ def read(path: str | Path) -> Records:
     path = Path(path)
     if path.is_dir():
         path = path / "records.jsonl"
+    if path.exists() and not path.is_file():
+        raise InputError(f"{path} is no file; a records.jsonl is needed")
     try:
         lines = path.read_text(encoding="utf-8", errors="replace").split("\n")
     except OSError as error:
@@ -196,9 +240,19 @@ def read(path: str | Path) -> Records:
         if not line.strip():
             continue
         try:
-            found.add(from_json(json.loads(line)))
-        except ValueError as error:
+            entry = from_json(json.loads(line))
+        except (ValueError, RecursionError) as error:
             raise InputError(f"{path}, line {number}: {error}; a records.jsonl is needed") from None
+        if isinstance(entry, Record) and not (entry.case in found.cases and entry.run in found.runs):
+            what = "case" if entry.run in found.runs else "run"
+            raise InputError(
+                f"{path}, line {number}: a record of a {what} that no line before it describes; "
+                "a records.jsonl is needed, whole"
+            )
+        found.add(entry)
+    # A measurement that was made again stands for the earlier one, in its place.
+    newest = {(r.run, r.key): r for r in found.records}
+    found.records = list(newest.values())
     return found
 
 

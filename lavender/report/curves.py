@@ -5,12 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from statistics import median
 
 from lavender.bench.record import Record, level_name
 from lavender.bench.store import Records
 from lavender.report import tables
-from lavender.report.text import residual, seconds
+from lavender.report.text import count
 
 __all__ = [
     "Curve",
@@ -29,13 +28,13 @@ TINY = 1e-17  # where a residual of exactly zero is drawn
 
 @dataclass(frozen=True)
 class Curve:
-    """One line: points, and what hovering over each says."""
+    """One line: points, and what each was asked for."""
 
     solver: str
     label: str
     x: tuple[float, ...]
     y: tuple[float, ...]
-    hover: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()  # what each point was asked for: "1e-6", "16"
     thin: bool = False  # warm starts
     steps: bool = False
     points: bool = False  # without a line between them
@@ -58,20 +57,8 @@ class Figure:
     notes: Mapping[str, str] = field(default_factory=dict)
 
 
-def _hover(r: Record) -> str:
-    asked = f"to {level_name(r.tol)}" if r.mode == "tol" else f"{r.max_iter} iterations"
-    work = ", ".join(f"{n} {k}" for k, n in r.work.items())
-    lines = [
-        f"{r.solver} ({r.start}), {asked}",
-        f"relative {residual(r.relative)}, floor {residual(r.floor)}",
-        f"{seconds(r.time_min)} (set-up {seconds(r.setup_min)}), median {seconds(r.time_median)}",
-        f"{r.status}; {work or f'{r.iterations} iterations'}{'; form ' + r.form if r.form else ''}",
-    ]
-    if r.worst_name:
-        lines.append(f"worst: {r.worst_name}, {residual(r.velocity)} m/s")
-    if r.contradicted:
-        lines.append("CONTRADICTED: " + r.contradicted)
-    return "\n".join(lines)
+def _asked(r: Record) -> str:
+    return f"to {level_name(r.tol)}" if r.mode == "tol" else f"{r.max_iter} iterations"
 
 
 def _in_order_of_work(runs: list[Record]) -> list[Record]:
@@ -97,7 +84,7 @@ def work_precision(records: Records, case: str) -> Figure:
                     solver if start == "cold" else f"{solver} ({start})",
                     tuple(r.time_min for r in runs),
                     tuple(max(r.relative, TINY) for r in runs),
-                    tuple(map(_hover, runs)),
+                    tuple(map(_asked, runs)),
                     thin=start != "cold",
                 )
             )
@@ -111,37 +98,30 @@ def work_precision(records: Records, case: str) -> Figure:
 
 
 def family_figure(records: Records, family: str, cases: list[str]) -> Figure:
-    """Work-precision over a family: geometric mean time to each residual decade that most cases reach."""
-    groups = {
-        k: [r for r in g if r.usable]
-        for k, g in tables.pairs(records).items()
-        if k[0] in cases and k[2] == "cold"
-    }
-    solvers = sorted({k[1] for k in groups})
-    decades = [10.0**-k for k in range(15)]
+    """Work-precision over a family: the mean time that ranks solvers, to each decade that all cases reach.
+
+    The same shifted geometric mean as in the table of recommendations, so that the two name the same solver.
+    """
+    groups = {k[1]: {} for k in tables.pairs(records) if k[0] in cases and k[2] == "cold"}  # type: dict[str, dict[str, list[Record]]]
+    for (case, solver, start), runs in tables.pairs(records).items():
+        if case in cases and start == "cold":
+            groups[solver][case] = [r for r in runs if r.usable]
     curves = []
-    for solver in solvers:
-        x, y, hover = [], [], []
-        for level in decades:
-            t = [
-                min(
-                    (r.time_min for r in groups.get((c, solver, "cold"), ()) if r.relative <= level),
-                    default=math.inf,
-                )
+    for solver in sorted(groups):
+        x, y = [], []
+        for level in (10.0**-k for k in range(15)):
+            times = [
+                min((r.time_min for r in groups[solver].get(c, ()) if r.relative <= level), default=math.inf)
                 for c in cases
             ]
-            reached = [v for v in t if math.isfinite(v)]
-            if 2 * len(reached) > len(cases):
-                # Median with misses at infinity: it does not flatter a solver that solves the easy half alone.
-                x.append(median(t) if math.isfinite(median(t)) else max(reached))
-                y.append(level)
-                hover.append(
-                    f"{solver}: {len(reached)} of {len(cases)} cases to {level_name(level)}, median {seconds(x[-1])}"
-                )
+            if math.isinf(max(times)):
+                break
+            x.append(tables.geometric_mean(times, tables.SHIFT))
+            y.append(level)
         if x:
-            curves.append(Curve(solver, solver, tuple(x), tuple(y), tuple(hover)))
+            curves.append(Curve(solver, solver, tuple(x), tuple(y)))
     return Figure(
-        "family " + family, f"{family} ({len(cases)} cases)", "median time [s], misses at infinity",
+        "family " + family, f"{family} ({count(len(cases), 'case')})", "mean time [s], where all cases get there",
         "relative residual [-]", tuple(curves), levels=tables.levels_of(records), floor=_family_floor(records, cases),
     )  # fmt: skip
 
@@ -163,7 +143,6 @@ def budget_figure(records: Records, case: str) -> Figure:
                     solver if start == "cold" else f"{solver} ({start})",
                     tuple(float(n) for n, _ in points),
                     tuple(max(r, TINY) for _, r in points),
-                    tuple(f"{solver} ({start}): {n} iterations, relative {residual(r)}" for n, r in points),
                     thin=start != "cold",
                 )
             )
@@ -180,10 +159,6 @@ def walk_figure(sequence: str, walks: list[tables.Walk]) -> Figure:
     for w in walks:
         for start, residuals in sorted(w.residuals.items()):
             values = w.times[start] if timed else residuals
-            hover = tuple(
-                f"{w.solver} ({start}), step {i}: {seconds(t)}, relative {residual(x)}"
-                for i, (t, x) in enumerate(zip(w.times[start], residuals, strict=True))
-            )
             cold = start == "cold" and len(w.residuals) > 1
             curves.append(
                 Curve(
@@ -191,7 +166,6 @@ def walk_figure(sequence: str, walks: list[tables.Walk]) -> Figure:
                     f"{w.solver} (cold)" if cold else w.solver,
                     tuple(float(i) for i in range(len(values))),
                     tuple(max(v, TINY) if math.isfinite(v) else math.nan for v in values),
-                    hover,
                     thin=cold,
                 )
             )
@@ -202,25 +176,37 @@ def walk_figure(sequence: str, walks: list[tables.Walk]) -> Figure:
     )  # fmt: skip
 
 
+LINES = 5  # of a profile: more cannot be told apart, and mislead about who comes second
+
+
 def profile_figure(profile: tables.Profile) -> Figure:
-    """Dolan-More profile as steps."""
-    curves = []
-    for solver, steps in profile.curves.items():
-        if not steps or steps[-1][1] <= 0.0:
-            continue
-        curves.append(
-            Curve(
-                solver,
-                solver,
-                tuple(r for r, _ in steps),
-                tuple(100.0 * s for _, s in steps),
-                tuple(f"{solver}: {100 * s:.0f}% within {r:.3g} times the fastest" for r, s in steps),
-                steps=True,
-            )
+    """Dolan-More profile as steps, of the five solvers that solve most and are nearest to the fastest."""
+
+    def standing(name: str) -> tuple[float, float, str]:
+        steps = profile.curves[name]
+        last = steps[-1][1] if steps else 0.0
+        return (
+            -last,
+            sum(r * (s - t) for (r, s), t in zip(steps, (0.0, *(s for _, s in steps)), strict=False)),
+            name,
         )
+
+    shown = [name for name in sorted(profile.curves, key=standing) if standing(name)[0] < 0.0][:LINES]
+    curves = [
+        Curve(
+            name,
+            name,
+            tuple(r for r, _ in profile.curves[name]),
+            tuple(100.0 * s for _, s in profile.curves[name]),
+            steps=True,
+        )
+        for name in shown
+    ]
+    left = sum(bool(steps) and steps[-1][1] > 0.0 for steps in profile.curves.values()) - len(curves)
     return Figure(
         f"profile {profile.law} {level_name(profile.level)}",
-        f"{profile.law}, to {level_name(profile.level)} ({profile.cases} cases)",
+        f"{profile.law}, to {level_name(profile.level)} ({count(profile.cases, 'case')}"
+        + (f"; {left} more solvers not drawn)" if left else ")"),
         "time / fastest time", "cases solved [%]", tuple(curves), y_log=False,
     )  # fmt: skip
 

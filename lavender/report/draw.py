@@ -1,4 +1,4 @@
-"""Figures as SVG and PNG (matplotlib), and as data for the interactive page (plotly.js)."""
+"""Figures as SVG and PNG files (matplotlib)."""
 
 from __future__ import annotations
 
@@ -7,13 +7,12 @@ from pathlib import Path
 from typing import Any
 
 from lavender.bench.record import file_name, level_name
-from lavender.report.curves import Curve, Figure
+from lavender.report.curves import Figure
 from lavender.report.style import Look
 
-__all__ = ["matplotlib_figure", "plotly_data", "save"]
+__all__ = ["matplotlib_figure", "power_on_axis", "save", "seconds_on_axis"]
 
 
-FULL = 12  # curves, above which the thin ones of a page show when their name is clicked
 MANY = 60  # points of a curve, above which marks would cover it
 
 
@@ -44,7 +43,7 @@ def matplotlib_figure(figure: Figure, look: dict[str, Look]) -> Any:
         style: dict[str, Any] = {
             "color": k.color,
             "linestyle": k.line,
-            "label": c.label,
+            "label": _plain(c.label),
             "linewidth": 0.8 if c.thin else 1.5,
         }
         if c.points:
@@ -85,12 +84,21 @@ def matplotlib_figure(figure: Figure, look: dict[str, Look]) -> Any:
             label="floor of float64",
             zorder=0,
         )
-    axes.set_xlabel(figure.x_title)
-    axes.set_ylabel(figure.y_title)
-    axes.set_title(figure.title, fontsize=10)
+    axes.set_xlabel(_plain(figure.x_title))
+    axes.set_ylabel(_plain(figure.y_title))
+    axes.set_title(_plain(figure.title), fontsize=10)
     if axes.get_legend_handles_labels()[0]:
         axes.legend(fontsize=7, loc="center left", bbox_to_anchor=(1.01, 0.5), frameon=False, handlelength=3)
     return canvas
+
+
+LONGEST_TITLE = 80  # characters
+
+
+def _plain(text: str) -> str:
+    # matplotlib reads formulas between dollars, and hides labels that begin with an underscore.
+    short = text if len(text) <= LONGEST_TITLE else text[: LONGEST_TITLE - 1] + "…"
+    return ("\u2009" + short if short.startswith("_") else short).replace("$", r"\$")
 
 
 def save(figure: Figure, look: dict[str, Look], folder: Path) -> None:
@@ -99,49 +107,3 @@ def save(figure: Figure, look: dict[str, Look], folder: Path) -> None:
     path = folder / file_name(figure.name)
     canvas.savefig(path.with_name(path.name + ".svg"), metadata={"Date": None})
     canvas.savefig(path.with_name(path.name + ".png"), dpi=110, metadata={"Software": None})
-
-
-def plotly_data(figure: Figure, look: dict[str, Look]) -> dict[str, Any]:
-    """Traces and layout for plotly.js; colours of paper, grid and text are the page's, set there."""
-    traces: list[dict[str, Any]] = []
-    for c in figure.curves:
-        k = look[c.solver]
-        x, y = list(c.x), list(c.y)
-        if c.steps:
-            x.append(max(v for d in figure.curves for v in d.x) * 1.3)
-            y.append(y[-1])
-        traces.append({
-            "x": x,
-            "y": [v if math.isfinite(v) else None for v in y],
-            "name": c.label,
-            "text": [_html(t) for t in c.hover],
-            "visible": "legendonly" if c.thin and len(figure.curves) > FULL else True,
-            "hoverinfo": "text" if c.hover else "name",
-            "mode": _mode(c, len(x)),
-            "line": {
-                "color": k.color,
-                "dash": k.dash,
-                "width": 1.0 if c.thin else 2.0,
-                **({"shape": "hv"} if c.steps else {}),
-            },
-            "marker": {"symbol": k.mark + ("-open" if c.thin else ""), "size": 7, "color": k.color},
-        })  # fmt: skip
-    return {
-        "traces": traces,
-        "title": figure.title,
-        "x": {"title": figure.x_title, "log": figure.x_log, "seconds": "[s]" in figure.x_title},
-        "y": {"title": figure.y_title, "log": figure.y_log, "seconds": "[s]" in figure.y_title},
-        "levels": list(figure.levels),
-        "floor": figure.floor if math.isfinite(figure.floor) and figure.floor > 0.0 else None,
-    }
-
-
-def _mode(curve: Curve, points: int) -> str:
-    if curve.points:
-        return "markers"
-    return "lines" if curve.steps or points > MANY else "lines+markers"
-
-
-def _html(text: str) -> str:
-    # plotly reads a little HTML in hover texts; names of files and rows are not meant as such.
-    return text.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;").replace("\n", "<br>")

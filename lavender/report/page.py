@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-import importlib.util
-import json
 import math
 from collections.abc import Iterable, Sequence
-from functools import cache
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lavender.bench.record import file_name, level_name
 from lavender.bench.store import Records
 from lavender.report import tables
 from lavender.report.curves import Figure, Figures
-from lavender.report.draw import plotly_data
-from lavender.report.style import looks
-from lavender.report.text import residual, seconds
+from lavender.report.svg import svg
+from lavender.report.tables.advice import NOISE, RESIDUAL_NOISE
+from lavender.report.text import count, residual, seconds, times
+from lavender.report.verdict import verdict
 
 if TYPE_CHECKING:
     from lavender.bench.peers import Peers
@@ -26,25 +23,13 @@ __all__ = ["page"]
 MOST = 2000  # failures on a page, for browsers' sake; a campaign may have more
 
 
-@cache
-def plotly_source() -> str:
-    """plotly.js as it ships in the Python package plotly, to embed."""
-    spec = importlib.util.find_spec("plotly")
-    assert spec is not None and spec.submodule_search_locations  # a dependency of lavender
-    source = Path(spec.submodule_search_locations[0], "package_data", "plotly.min.js").read_text(
-        encoding="utf-8"
-    )
-    # Nothing inside may end the script element that holds it.
-    return source.replace("</script", "<\\/script")
-
-
 def page(
     records: Records,
     figures: Figures,
     title: str = "lavender report",
     *,
     old: Records | None = None,
-    times: Sequence[float] = (),
+    budgets: Sequence[float] = (),
     saved: bool = True,
     peers: Peers | None = None,
 ) -> str:
@@ -57,7 +42,7 @@ def page(
         Of these records: `curves.figures`.
     old : Records, optional
         An earlier run to compare with.
-    times : s, optional
+    budgets : s, optional
         Time budgets of the recommendation.
     saved : bool
         The figures are beside the page as SVG and PNG.
@@ -73,14 +58,14 @@ def page(
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters.update(seconds=seconds, residual=residual, level=level_name, anchor=file_name)
-    content = _content(records, figures, old, tuple(times) or tables.time_budgets(records), peers)
-    figures_json = json.dumps(content.pop("figures"), allow_nan=False).replace("<", "\\u003c")
+    environment.filters.update(
+        seconds=seconds, residual=residual, level=level_name, anchor=file_name, times=times
+    )
+    content = _content(records, figures, old, tuple(budgets) or tables.time_budgets(records), peers)
     return environment.get_template("index.html.j2").render(
         title=title,
         saved=saved,
-        figures_json=figures_json,
-        plotly=plotly_source(),
+        count=count,
         inf=math.inf,
         isfinite=math.isfinite,
         **content,
@@ -88,9 +73,15 @@ def page(
 
 
 def _content(
-    records: Records, figures: Figures, old: Records | None, times: Sequence[float], peers: Peers | None
+    records: Records, figures: Figures, old: Records | None, budgets: Sequence[float], peers: Peers | None
 ) -> dict[str, Any]:
-    look = looks({r.solver for r in records} | ({c.solver for f in figures for c in f.curves}))
+    found = verdict(records, budgets)
+    names = sorted({r.solver for r in records} | {c.solver for f in figures for c in f.curves})
+    number = {name: i for i, name in enumerate(names)}
+    # Under the heading of a case or a family its name says nothing new.
+    titles = {f.name: "" for some in figures.cases.values() for f in some} | {
+        f.name: "" for f in figures.families.values()
+    }
     levels = tables.levels_of(records)
     campaign = tables.is_campaign(records)
     by_case: dict[str, list[tables.Reach]] = {}
@@ -98,7 +89,12 @@ def _content(
         for reach in tables.reaches(records, levels):
             by_case.setdefault(reach.case, []).append(reach)
     cases = [
-        {"info": records.cases[name], "reaches": rows, "figures": _keys(figures.cases.get(name, ()))}
+        {
+            "info": records.cases[name],
+            "reaches": rows,
+            "figures": _keys(figures.cases.get(name, ())),
+            "best": _fastest(rows, levels[len(levels) // 2]),
+        }
         for name, rows in by_case.items()
     ]
     changes = tables.changes(old, records) if old is not None else []
@@ -108,11 +104,21 @@ def _content(
 
         rivals = content(peers)
     return {
-        "figures": {file_name(figure.name): plotly_data(figure, look) for figure in figures},
+        "drawings": {  # each escapes what it holds
+            file_name(figure.name): svg(figure, number, found.leaders, titles.get(figure.name))
+            for figure in figures
+        },
+        "verdict": found,
+        "has_stored": any(math.isfinite(info.stored) for info in records.cases.values()),
+        "noise": NOISE,
+        "residual_noise": RESIDUAL_NOISE,
+        "solvers": names,
+        "number": number,
+        "level": levels[len(levels) // 2],
         "runs": list(records.runs.values()),
         "levels": levels,
-        "times": times,
-        "advice": [] if campaign else tables.advice(records, times),
+        "budgets_of_time": budgets,
+        "advice": [] if campaign else tables.advice(records, budgets),
         "families": tables.families(records),
         "family_figures": {f: file_name(figure.name) for f, figure in figures.families.items()},
         "claims": tables.claims(records),
@@ -121,7 +127,7 @@ def _content(
         "cases": cases,
         "profiles": {law: _keys(some) for law, some in figures.profiles.items()},
         "means": tables.geometric_means(records),
-        "shift": tables.shift_of(records),
+        "shift": tables.SHIFT,
         "limit": tables.limit_of(records),
         "spreads": sorted(tables.spreads(records), key=lambda s: -s.factor),
         "lost": [s for s in records.skips if not s.solver],
@@ -136,10 +142,15 @@ def _content(
         "n_changes": len(changes),
         "n_records": len(records),
         "n_cases": len({r.case for r in records if r.step < 0}),
-        "look": look,
         "peers": rivals,
         "peer_figures": {place: _keys(some) for place, some in figures.peers.items()},
     }
+
+
+def _fastest(rows: Sequence[tables.Reach], level: float) -> tables.Reach | None:
+    """Who brings a case to the level first, from a cold start, with claims that hold."""
+    honest = [r for r in rows if r.start == "cold" and not r.contradicted and math.isfinite(r.times[level])]
+    return min(honest, key=lambda r: r.times[level], default=None)
 
 
 def _keys(some: Iterable[Figure]) -> list[str]:

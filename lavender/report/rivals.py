@@ -9,11 +9,13 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-from lavender.bench import peer_engines, peer_solvers
 from lavender.bench.peers import Peers
+from lavender.bench.peers.contest import SCRATCH, TARGETS, Result
+from lavender.bench.peers.engines import Step
 from lavender.bench.record import level_name
+from lavender.report import compared
 from lavender.report.curves import TINY, Curve, Figure
-from lavender.report.text import residual, seconds
+from lavender.report.text import seconds
 
 __all__ = ["content", "figures"]
 
@@ -33,26 +35,24 @@ def figures(peers: Peers) -> dict[str, tuple[Figure, ...]]:
 
 def content(peers: Peers) -> dict[str, Any]:
     """Rows of the tables."""
-    compared = [
-        c
-        for c in peer_solvers.compare(peers.results)
-        if math.isfinite(c.our_time) or math.isfinite(c.peer_time)
+    found = [
+        c for c in compared.compare(peers.results) if math.isfinite(c.our_time) or math.isfinite(c.peer_time)
     ]
     return {
         "cpu": peers.cpu,
         "versions": peers.versions,
-        "steps": [(s, peer_engines.over_ours(s, peers.steps)) for s in peers.steps],
-        "compared": compared,
-        "means": peer_solvers.geometric_means(peers.results),
-        "lost": len(peer_solvers.losses(compared)),
+        "steps": [(s, compared.over_ours(s, peers.steps)) for s in peers.steps],
+        "compared": found,
+        "means": compared.geometric_means(peers.results),
+        "lost": len(compared.losses(found)),
     }
 
 
-def _ratios(results: Sequence[peer_solvers.Result]) -> Figure:
+def _ratios(results: Sequence[Result]) -> Figure:
     """Time of ours over the fastest peer's against the number of rows, one curve for each error."""
     curves = []
-    for target in peer_solvers.TARGETS:
-        some = [c for c in peer_solvers.compare(results) if c.target == target and 0.0 < c.ratio < math.inf]
+    for target in TARGETS:
+        some = [c for c in compared.compare(results) if c.target == target and 0.0 < c.ratio < math.inf]
         some.sort(key=lambda c: (c.rows, c.problem))
         label = "to " + level_name(target)
         curves.append(
@@ -62,7 +62,7 @@ def _ratios(results: Sequence[peer_solvers.Result]) -> Figure:
                 tuple(float(c.rows) for c in some),
                 tuple(c.ratio for c in some),
                 tuple(
-                    f"{c.problem} {label}\n{c.ours} {seconds(c.our_time)}, {c.peer} {seconds(c.peer_time)}"
+                    f"{c.problem}: {c.ours} {seconds(c.our_time)}, {c.peer} {seconds(c.peer_time)}"
                     for c in some
                 ),
                 points=True,
@@ -74,31 +74,20 @@ def _ratios(results: Sequence[peer_solvers.Result]) -> Figure:
     )  # fmt: skip
 
 
-def _scene(scene: str, steps: Sequence[peer_engines.Step]) -> Figure:
+def _scene(scene: str, steps: Sequence[Step]) -> Figure:
     """Speed left against the time of a step, one point for each engine."""
     curves = tuple(
-        Curve(s.engine, s.engine, (s.time,), (max(s.speed, TINY),), (_said(s),), points=True)
+        Curve(s.engine, s.engine, (s.time,), (max(s.speed, TINY),), points=True)
         for s in steps
         if s.scene == scene and math.isfinite(s.time) and math.isfinite(s.speed)
     )
     return Figure("peers scene " + scene, scene, "time of a step [s]", "speed left [m/s]", curves)
 
 
-def _said(s: peer_engines.Step) -> str:
-    lines = [
-        s.engine,
-        f"{seconds(s.time)} a step, {s.contacts} contacts",
-        f"speed left {s.speed:.1e} m/s, depth {s.depth:.1e} m, residual {residual(s.relative)}",
-    ]
-    return "\n".join(lines)
-
-
-def _problem(problem: str, results: Sequence[peer_solvers.Result]) -> Figure:
+def _problem(problem: str, results: Sequence[Result]) -> Figure:
     """Error against time of the fastest of both sides."""
-    here = [
-        r for r in results if r.problem == problem and r.runs and not r.solver.endswith(peer_solvers.SCRATCH)
-    ]
-    shown: list[peer_solvers.Result] = []
+    here = [r for r in results if r.problem == problem and r.runs and not r.solver.endswith(SCRATCH)]
+    shown: list[Result] = []
     for peer, most in ((False, OURS), (True, THEIRS)):
         side = sorted((r for r in here if r.peer is peer), key=_score)
         shown += side[:most]
@@ -115,18 +104,17 @@ def _problem(problem: str, results: Sequence[peer_solvers.Result]) -> Figure:
                 r.solver,
                 tuple(t for t, _ in runs),
                 tuple(max(x, TINY) for _, x in runs),
-                tuple(f"{r.solver}\n{seconds(t)}, relative {residual(x)}" for t, x in runs),
                 thin=r.peer,
             )
         )
     return Figure(
         "peers " + problem, f"{problem} (thin: of others)", "time: set-up and solve [s]", "relative residual [-]",
-        tuple(curves), levels=peer_solvers.TARGETS,
+        tuple(curves), levels=TARGETS,
     )  # fmt: skip
 
 
-def _score(r: peer_solvers.Result) -> tuple[int, float]:
+def _score(r: Result) -> tuple[int, float]:
     """Most errors reached first, then the least product of times."""
-    times = [r.time(target) for target in peer_solvers.TARGETS]
+    times = [r.time(target) for target in TARGETS]
     reached = [t for t in times if math.isfinite(t)]
     return -len(reached), math.prod(reached) ** (1.0 / max(len(reached), 1))

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 __all__ = ["Look", "looks"]
 
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#8C6D31", "#7F7F7F")
-# (plotly, matplotlib) names of the same dashes and marks.
+# Names of dashes and marks, ours and matplotlib's.
 DASHES = (("solid", "-"), ("dash", "--"), ("dot", ":"), ("dashdot", "-."))
 MARKS = (
     ("circle", "o"),
@@ -27,7 +27,7 @@ MARKS = (
 
 @dataclass(frozen=True)
 class Look:
-    """Colour, dash and mark, for plotly and for matplotlib."""
+    """Colour, dash and mark of a saved figure."""
 
     color: str
     dash: str

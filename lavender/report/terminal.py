@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from lavender.bench.record import level_name
+from lavender.bench.record import level_name, printable
 from lavender.bench.store import Records
 from lavender.report import tables
-from lavender.report.text import in_time, residual, seconds, to_level
+from lavender.report.text import count, in_time, residual, seconds, to_level
+from lavender.report.verdict import verdict
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -18,13 +19,34 @@ __all__ = ["print_report"]
 GOOD = ("CONVERGED", "FLOOR")
 
 
+class _Plain:
+    """A table of rich whose cells are taken as they are: names of files and messages hold no markup of ours."""
+
+    def __init__(self, table: Any) -> None:
+        self.table = table
+        self.add_column, self.add_section = table.add_column, table.add_section
+
+    def add_row(self, *cells: Any, style: str = "") -> None:
+        from rich.text import Text
+
+        self.table.add_row(*(Text(c) if isinstance(c, str) else c for c in cells), style=style)
+
+    def __rich__(self) -> Any:
+        return self.table
+
+
+def _table() -> _Plain:
+    from rich.table import Table
+
+    return _Plain(Table(box=None, pad_edge=False, header_style="bold"))
+
+
 def reach_table(records: Records, levels: Sequence[float]) -> Any:
     """Per case and solver: time to each level, best residual, status, and whether the claim holds."""
-    from rich.table import Table
     from rich.text import Text
 
-    table = Table(box=None, pad_edge=False, header_style="bold", show_lines=False)
-    table.add_column("case", overflow="fold", max_width=34)
+    table = _table()
+    table.add_column("case", overflow="fold")
     table.add_column("solver", no_wrap=True)
     for level in levels:
         table.add_column(f"to {level_name(level)}", justify="right", no_wrap=True)
@@ -50,10 +72,8 @@ def reach_table(records: Records, levels: Sequence[float]) -> Any:
 
 def advice_table(records: Records, times: Sequence[float] = ()) -> Any:
     """Per structure or sequence, at each level and in each time: the recommended solver and how it does."""
-    from rich.table import Table
-
     levels, times = tables.levels_of(records), tuple(times) or tables.time_budgets(records)
-    table = Table(box=None, pad_edge=False, header_style="bold")
+    table = _table()
     table.add_column("structure")
     for head in (*(f"to {level_name(x)}" for x in levels), *(f"in {seconds(t)}" for t in times)):
         table.add_column(head, overflow="fold")
@@ -65,9 +85,7 @@ def advice_table(records: Records, times: Sequence[float] = ()) -> Any:
 
 def walk_table(records: Records) -> Any:
     """Sequences: residual and time, carried against cold."""
-    from rich.table import Table
-
-    table = Table(box=None, pad_edge=False, header_style="bold")
+    table = _table()
     for name in ("sequence", "solver", "asked", "steps", "residual carried", "cold", "time carried", "cold"):
         table.add_column(
             name, no_wrap=True, justify="left" if name in ("sequence", "solver", "asked") else "right"
@@ -81,11 +99,9 @@ def walk_table(records: Records) -> Any:
 
 def robustness_table(records: Records, levels: Sequence[float]) -> Any:
     """Campaigns: shares of cases solved, false claims, residual by budget."""
-    from rich.table import Table
-
     rows = tables.robustness(records)
     budgets = sorted({n for row in rows for n in row.budgets})
-    table = Table(box=None, pad_edge=False, header_style="bold")
+    table = _table()
     table.add_column("structure", no_wrap=True)
     table.add_column("solver", no_wrap=True)
     for name in ("cases", *(f"to {level_name(x)}" for x in levels), "false claims", "died"):
@@ -104,12 +120,10 @@ def robustness_table(records: Records, levels: Sequence[float]) -> Any:
 
 def change_table(old: Records, new: Records) -> Any:
     """What differs from an earlier run beyond noise; None if nothing does."""
-    from rich.table import Table
-
     found = [c for c in tables.changes(old, new) if c.kind != "same"]
     if not found:
         return None
-    table = Table(box=None, pad_edge=False, header_style="bold")
+    table = _table()
     for name in ("case", "solver", "level", "before", "now", "change"):
         table.add_column(name, no_wrap=True)
     for c in found:
@@ -121,10 +135,20 @@ def change_table(old: Records, new: Records) -> Any:
     return table
 
 
+FEW = 20  # lines: a report that has no more is printed whole
+
+
 def print_report(
-    records: Records, console: Console, old: Records | None = None, times: Sequence[float] = ()
+    records: Records,
+    console: Console,
+    old: Records | None = None,
+    times: Sequence[float] = (),
+    whole: bool = False,
 ) -> None:
-    """Everything the terminal shows after a run."""
+    """What the terminal shows after a run: the recommendation first; every case and sequence where `whole`.
+
+    A report of few lines is shown whole anyhow.
+    """
     levels = tables.levels_of(records)
     campaign = tables.is_campaign(records)
     if campaign:
@@ -132,44 +156,66 @@ def print_report(
             "[bold]Campaign[/] (no times; share of cases brought to a level, residual at each budget)"
         )
         console.print(robustness_table(records, levels), highlight=False)
-    elif any(r.step < 0 for r in records):
-        console.print(reach_table(records, levels))
-        console.print("* at the floor: rounding to float64 allows no better", style="dim", highlight=False)
-        console.print()
-    lost = [s for s in records.skips if not s.solver]
-    for skip in lost:
-        console.print(f"[yellow]not run:[/] {skip.case}: {skip.reason}", highlight=False)
-    refused = [s for s in records.skips if s.solver]
-    if refused:
-        names = sorted({s.solver for s in refused})
+    elif len(records):
+        found = verdict(records, times)
+        console.print(found.text, style="bold", highlight=False, markup=False, soft_wrap=True)
+        for line in found.code:
+            console.print(f"    {line}", highlight=False, markup=False, soft_wrap=True)
         console.print(
-            f"{len(refused)} pairs of case and solver were not run, or not to the end ({', '.join(names)}); "
-            "the page says why.",
+            "\n[bold]By structure[/] (to a level: mean time, share of cases that get there, budget; in a time: mean "
+            "residual; ≈ as good within noise)",
             highlight=False,
-            style="dim",
-        )
-    if any(r.step >= 0 for r in records):
-        console.print(
-            "\n[bold]Sequences[/] (median residual, time of all steps; carried from step to step, or cold)"
-        )
-        console.print(walk_table(records), highlight=False)
-    if len(records) and not campaign:
-        console.print(
-            "\n[bold]Recommended[/] (to a level: median time, share of cases that get there, budget; "
-            "in a time: mean residual)"
+            soft_wrap=True,
         )
         console.print(advice_table(records, times), highlight=False)
+    _print_lost(records, console)
+    if not campaign:
+        _print_tables(records, console, levels, whole)
     if old is not None:
         table = change_table(old, records)
-        console.print(
-            f"\n[bold]Against {old.source}[/]{'' if table else ': nothing beyond noise'}", highlight=False
-        )
+        said = f"\nAgainst {printable(old.source)}{'' if table else ': nothing beyond noise'}"
+        console.print(said, highlight=False, markup=False, style="bold")
         if table:
             console.print(table, highlight=False)
     wrong = [r for r in records if r.contradicted]
     if wrong:
         console.print(f"\n[bold red]{len(wrong)} claims are contradicted by the judge:[/]")
-        for r in wrong[:20]:
-            console.print(f"  {r.case}, {r.solver}: {r.contradicted}", highlight=False)
-        if len(wrong) > 20:
-            console.print(f"  and {len(wrong) - 20} more", highlight=False)
+        for r in wrong[:FEW]:
+            console.print(f"  {r.case}, {r.solver}: {r.contradicted}", highlight=False, markup=False)
+        if len(wrong) > FEW:
+            console.print(f"  and {len(wrong) - FEW} more", highlight=False)
+
+
+def _print_lost(records: Records, console: Console) -> None:
+    for skip in records.skips:
+        if not skip.solver:
+            console.print("[yellow]not run:[/]", end=" ")
+            console.print(f"{skip.case}: {skip.reason}", highlight=False, markup=False)
+    refused = [s for s in records.skips if s.solver]
+    if refused:
+        console.print(
+            f"{count(len(refused), 'pair')} of case and solver not run, or not to the end: the page says why",
+            highlight=False,
+            markup=False,
+            style="dim",
+        )
+
+
+def _print_tables(records: Records, console: Console, levels: Sequence[float], whole: bool) -> None:
+    lines = len(tables.reaches(records, levels)) + len(tables.walks(records))
+    if not whole and lines > FEW:
+        console.print(
+            f"{count(lines, 'line')} of single cases and sequences: --tables prints them",
+            highlight=False,
+            style="dim",
+        )
+        return
+    if any(r.step < 0 for r in records):
+        console.print()
+        console.print(reach_table(records, levels))
+        console.print("* at the floor: rounding to float64 allows no better", style="dim", highlight=False)
+    if any(r.step >= 0 for r in records):
+        console.print(
+            "\n[bold]Sequences[/] (median residual, time of all steps; carried from step to step, or cold)"
+        )
+        console.print(walk_table(records), highlight=False)

@@ -6,7 +6,7 @@ import math
 
 from lavender.report.tables import Advice
 
-__all__ = ["in_time", "residual", "seconds", "to_level"]
+__all__ = ["count", "in_time", "residual", "seconds", "share", "times", "to_level"]
 
 
 def seconds(t: float, missing: str = "–") -> str:
@@ -31,19 +31,48 @@ def residual(x: float) -> str:
     return f"{mantissa}e{int(exponent)}"
 
 
+def times(x: float) -> str:
+    """A ratio as a word: 1.3 times, 850 times; beyond a million its power of ten, where digits say nothing."""
+    if not math.isfinite(x):
+        return "–"
+    return f"{x:.2g} times" if x < 100.0 else f"{x:.0f} times" if x < 1e6 else f"10^{math.log10(x):.0f} times"
+
+
+def count(n: int, what: str, plural: str = "") -> str:
+    """1 contact, 2 contacts."""
+    return f"{n} {what if n == 1 else plural or what + 's'}"
+
+
+def share(solved: int, cases: int) -> str:
+    """(7/8); nothing where all are solved."""
+    return "" if solved == cases else f" ({solved}/{cases})"
+
+
 def to_level(advice: Advice) -> str:
     """Who gets to a level, in what time, on how many cases and with which budget, in one line."""
     best = advice.best
     if best is None:
         return "nobody"
-    return f"{best.solver} {seconds(best.typical)} ({best.solved}/{best.cases})" + _how(best.how)
+    return (
+        f"{best.solver} {seconds(best.score)}{share(best.solved, best.cases)}{_how(best.how)}{_ties(advice)}"
+    )
 
 
 def in_time(advice: Advice) -> str:
     """Who comes closest within a time, and how close, in one line."""
     best = advice.best
-    return "nobody" if best is None else f"{best.solver} to {residual(best.score)}" + _how(best.how)
+    if best is None:
+        return "nobody"
+    return f"{best.solver} to {residual(best.score)}{_how(best.how)}{_ties(advice)}"
 
 
 def _how(how: str) -> str:
     return f", {how}" if how else ""
+
+
+def _ties(advice: Advice, most: int = 2) -> str:
+    names = advice.ties
+    if not names:
+        return ""
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return f" ≈ {', '.join(names[:most])}{more}"

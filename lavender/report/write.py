@@ -73,7 +73,7 @@ def write(
         # Whole or not at all: on a full disk the page of the last time stays.
         unfinished = index.with_suffix(".html.part")
         unfinished.write_text(
-            page(shown, drawn, old=before, times=times, saved=figures, peers=peers), encoding="utf-8"
+            page(shown, drawn, old=before, budgets=times, saved=figures, peers=peers), encoding="utf-8"
         )
         unfinished.replace(index)
         (folder / "summary.md").write_text(summary(shown, times), encoding="utf-8")

@@ -1,117 +1,149 @@
 "use strict";
 (function () {
-  const figures = JSON.parse(document.getElementById("figures").textContent);
   const root = document.documentElement;
-  const drawn = new Set();
-  const PAPER = 680;  // px, the width of a sheet within its margins
+  const every = (selector, from) => Array.from((from || document).querySelectorAll(selector));
 
-  function theme() {
-    const css = getComputedStyle(root);
-    const get = (name) => css.getPropertyValue(name).trim();
-    return { paper: get("--paper"), ink: get("--ink"), quiet: get("--quiet"), line: get("--line") };
-  }
-
-  function layout(figure, width) {
-    const t = theme();
-    const phone = width < 520;
-    const axis = (a) => ({
-      title: { text: a.title, font: { size: 12 } },
-      type: a.log ? "log" : "linear",
-      gridcolor: t.line,
-      zeroline: false,
-      exponentformat: a.seconds ? "SI" : a.log ? "power" : "none",
-      minexponent: 1,
-      ticksuffix: a.seconds ? "s" : "",
-      automargin: true,
-    });
-    const line = (y, color, dash) => ({
-      type: "line", xref: "paper", x0: 0, x1: 1, yref: "y", y0: y, y1: y, layer: "below",
-      line: { color: color, width: 1, dash: dash },
-    });
-    const shapes = figure.levels.map((y) => line(y, t.line, "solid"));
-    const annotations = [];
-    if (figure.floor !== null) {
-      shapes.push(line(figure.floor, t.quiet, "dot"));
-      annotations.push({
-        xref: "paper", x: 1, xanchor: "right", yref: "y", yanchor: "bottom", showarrow: false, text: "floor",
-        y: figure.y.log ? Math.log10(figure.floor) : figure.floor, font: { size: 10, color: t.quiet },
-      });
-    }
-    const below = phone || width < 620;
-    const longest = Math.max(...figure.traces.map((trace) => trace.name.length));
-    const entry = Math.max(phone ? 92 : 110, 5.5 * longest);
-    const columns = Math.max(1, Math.floor((width - 76) / (entry + 42)));
-    const rows = below ? Math.ceil(figure.traces.length / columns) : 0;
-    const legend = 20 * rows + (below ? 14 : 0);
-    return {
-      height: below ? 330 + legend : Math.max(420, 110 + 19 * figure.traces.length),
-      title: { text: figure.title.replace(/&/g, "&amp;").replace(/</g, "&lt;"), font: { size: 13 } },
-      font: { color: t.ink, family: "system-ui, sans-serif", size: 11 },
-      paper_bgcolor: t.paper, plot_bgcolor: t.paper,
-      margin: { l: 60, r: 12, t: 36, b: 48 + legend },
-      xaxis: axis(figure.x), yaxis: axis(figure.y),
-      legend: below
-        ? { orientation: "h", yref: "container", y: 0, yanchor: "bottom", font: { size: 10 }, entrywidth: entry }
-        : { font: { size: 10 } },
-      hoverlabel: { align: "left" }, hovermode: "closest",
-      shapes: shapes, annotations: annotations,
-    };
-  }
-
-  function config(box) {
-    return {
-      responsive: true, displaylogo: false,
-      displayModeBar: box.clientWidth < 520 ? false : "hover",  // it would cover the title
-      toImageButtonOptions: { format: "svg", filename: box.dataset.figure },
-      modeBarButtonsToRemove: ["select2d", "lasso2d", "autoScale2d"],
-    };
-  }
-
-  function draw(box) {
-    const figure = figures[box.dataset.figure];
-    if (!figure || drawn.has(box)) return;
-    drawn.add(box);
-    Plotly.newPlot(box, figure.traces, layout(figure, box.clientWidth), config(box));
-  }
-
-  function redraw(paper) {
-    drawn.forEach((box) => {
-      const figure = figures[box.dataset.figure];
-      const whole = layout(figure, paper || box.clientWidth);
-      if (paper) whole.width = paper;
-      Plotly.react(box, figure.traces, whole, config(box));
-    });
-  }
-
-  const boxes = Array.from(document.querySelectorAll(".chart"));
-  const watcher = new IntersectionObserver(
-    (entries) => entries.forEach((e) => { if (e.isIntersecting) { draw(e.target); watcher.unobserve(e.target); } }),
-    { rootMargin: "600px" });
-  boxes.forEach((box) => watcher.observe(box));
-
+  // -- dark or light, copying ---------------------------------------------------------------------
+  const theme = document.getElementById("theme");
   const dark = matchMedia("(prefers-color-scheme: dark)");
-  const isDark = () => (root.dataset.theme ? root.dataset.theme === "dark" : dark.matches);
-  document.getElementById("theme").addEventListener("click", () => {
-    root.dataset.theme = isDark() ? "light" : "dark";
-    redraw();
+  theme.hidden = false;
+  theme.addEventListener("click", () => {
+    const isDark = root.dataset.theme ? root.dataset.theme === "dark" : dark.matches;
+    root.dataset.theme = isDark ? "light" : "dark";
   });
-  dark.addEventListener("change", () => redraw());
-  let before = "";
-  addEventListener("beforeprint", () => {
-    before = root.dataset.theme || "";
-    root.dataset.theme = "light";
-    boxes.forEach(draw);
-    redraw(PAPER);
-    document.querySelectorAll("details").forEach((d) => { d.open = true; });
-  });
-  addEventListener("afterprint", () => {
-    if (before) root.dataset.theme = before; else delete root.dataset.theme;
-    redraw();
-  });
+  const copy = document.getElementById("copy");
+  if (copy && navigator.clipboard) {
+    copy.hidden = false;
+    copy.addEventListener("click", () => {
+      navigator.clipboard.writeText(document.getElementById("code").textContent.trim());
+      copy.textContent = "copied";
+    });
+  }
+
+  // -- one filter for all charts: who is in colour, and whether the others are there ----------------
+  const filter = document.getElementById("filter");
+  const style = document.getElementById("colours");
+  const COLOURS = 7;
+  if (filter) {
+    const boxes = every(".chip input", filter);
+    const alone = document.getElementById("alone");
+    let chosen = boxes.filter((b) => b.checked).map((b) => b.value);
+    // The leaders keep the order of their colours, which the page was made with.
+    const first = every("style").pop().textContent.match(/\.s(\d+) \{ --c/g) || [];
+    const order = first.map((rule) => rule.match(/\d+/)[0]);
+    chosen.sort((a, b) => order.indexOf(a) - order.indexOf(b));
+    const paint = () => {
+      const rules = chosen.map((n, i) => `.s${n} { --c: var(--c${i % COLOURS + 1}); }
+        .c.s${n} { stroke-width: 5; opacity: 1; visibility: visible; } .c.s${n} text { display: block; }`);
+      if (alone.checked) rules.unshift(".c { visibility: hidden; }");
+      style.textContent = rules.join("\n");
+    };
+    filter.hidden = false;
+    filter.addEventListener("change", (event) => {
+      const box = event.target;
+      if (box !== alone) {
+        chosen = box.checked ? [...chosen, box.value] : chosen.filter((n) => n !== box.value);
+        if (chosen.length > COLOURS) {
+          const gone = chosen.shift();
+          boxes.forEach((b) => { if (b.value === gone) b.checked = false; });
+        }
+      }
+      paint();
+    });
+  }
+
+  // -- what a point says ----------------------------------------------------------------------------
+  const tip = document.createElement("div");
+  tip.className = "tip";
+  tip.hidden = true;
+  document.body.append(tip);
+  const value = (axis, place) => {
+    const [log, low, high, first, last] = axis.split(" ").map(Number);
+    const x = low + (high - low) * (place - first) / (last - first);
+    return log ? 10 ** x : x;
+  };
+  const number = (x) => (x >= 0.1 && x < 1e4 ? String(+x.toPrecision(3)) : x.toExponential(1).replace("e+", "e"));
+  const seconds = (t) => {
+    const [scale, unit] = t >= 0.9995 ? [1, "s"] : t >= 0.9995e-3 ? [1e-3, "ms"] : [1e-6, "µs"];
+    return `${+(t / scale).toPrecision(3)} ${unit}`;
+  };
+  const points = (curve) => {
+    const path = curve.querySelector(".d") || curve.querySelector("path");
+    return (path.getAttribute("d").match(/M\d+ \d+/g) || []).map((p) => p.slice(1).split(" ").map(Number));
+  };
+  function show(event) {
+    const chart = event.target.closest && event.target.closest("svg.chart");
+    if (!chart) { tip.hidden = true; return; }
+    const at = new DOMPoint(event.clientX, event.clientY).matrixTransform(chart.getScreenCTM().inverse());
+    let best = { away: 40 };
+    every(".c", chart).forEach((curve) => {
+      if (getComputedStyle(curve).visibility === "hidden") return;
+      points(curve).forEach(([x, y], i) => {
+        const away = Math.hypot(x - at.x, y - at.y);
+        if (away < best.away) best = { away, curve, x, y, i };
+      });
+    });
+    every(".c.near").forEach((c) => c.classList.remove("near"));
+    if (!best.curve) { tip.hidden = true; return; }
+    best.curve.classList.add("near");
+    const [xs, ys] = chart.dataset.t;
+    const asked = (best.curve.dataset.n || "").split("|")[best.i];
+    const x = value(chart.dataset.x, best.x), y = value(chart.dataset.y, best.y);
+    tip.textContent = [best.curve.dataset.l, asked, xs === "1" ? seconds(x) : number(x), ys === "1" ? seconds(y) : number(y)]
+      .filter(Boolean).join(", ");
+    tip.hidden = false;
+    tip.style.left = Math.min(event.pageX + 12, root.clientWidth + scrollX - tip.offsetWidth - 6) + "px";
+    tip.style.top = event.pageY + 14 + "px";
+  }
+  addEventListener("pointermove", show);
+  addEventListener("pointerdown", show);
+
+  // -- cases: sorted by a column, searched ----------------------------------------------------------
+  const list = document.getElementById("list");
+  if (list) {
+    const rows = every("tbody tr", list);
+    every("thead th", list).forEach((head, column) => {
+      head.tabIndex = 0;
+      const sort = () => {
+        const down = head.dataset.sorted === "up";
+        every("thead th", list).forEach((h) => delete h.dataset.sorted);
+        head.dataset.sorted = down ? "down" : "up";
+        const key = (row) => {
+          const cell = row.cells[column];
+          const text = cell.dataset.v || cell.textContent;
+          const x = text === "inf" || text === "nan" ? Infinity : parseFloat(text);
+          return cell.classList.contains("n") ? x : text.toLowerCase();
+        };
+        const order = (a, b) => (key(a) < key(b) ? -1 : key(a) > key(b) ? 1 : 0);
+        rows.sort((a, b) => (down ? order(b, a) : order(a, b)));
+        list.tBodies[0].append(...rows);
+      };
+      head.addEventListener("click", sort);
+      head.addEventListener("keydown", (e) => { if (e.key === "Enter") sort(); });
+    });
+    const search = document.getElementById("search");
+    search.parentElement.hidden = rows.length < 6;
+    const details = every("details.case");
+    search.addEventListener("input", () => {
+      const wanted = search.value.toLowerCase().split(/\s+/);
+      const fits = (row) => wanted.every((word) => row.textContent.toLowerCase().includes(word));
+      const shown = new Set(rows.filter(fits).map((row) => row.querySelector("a").getAttribute("href").slice(1)));
+      rows.forEach((row) => { row.hidden = !fits(row); });
+      details.forEach((d) => { d.hidden = !shown.has(d.id); });
+    });
+  }
+
+  // -- links open what they lead to; print opens everything but single cases ---------------------------
   function follow() {
     const target = location.hash ? document.getElementById(decodeURIComponent(location.hash.slice(1))) : null;
-    if (target && target.closest("details")) target.closest("details").open = true;
+    if (target && target.closest("details")) { target.closest("details").open = true; target.scrollIntoView(); }
   }
   addEventListener("hashchange", follow);
   follow();
+  let opened = [];
+  addEventListener("beforeprint", () => {
+    opened = every("details:not([open])");
+    opened.forEach((d) => { d.open = true; });
+  });
+  addEventListener("afterprint", () => opened.forEach((d) => { d.open = false; }));
 })();

@@ -11,22 +11,25 @@ import contextlib
 import itertools
 import math
 import os
+import threading
+import time
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 from lavender import registry
 from lavender.bench import machine
-from lavender.bench.cases import Item, Source, describe, resolve
-from lavender.bench.moved import with_motion
-from lavender.bench.plan import Plan
+from lavender.bench.cases import Item, Source, describe, is_path, resolve
 from lavender.bench.record import CaseInfo, Done, Record, Skip
-from lavender.bench.runner import Event, Watch, _not_loaded, is_foreign, solver_names
+from lavender.bench.running.moved import with_motion
+from lavender.bench.running.plan import Plan
+from lavender.bench.running.runner import Event, Watch, is_foreign, not_loaded, solver_names
+from lavender.bench.running.timing import Task, measure_impulse, one_thread
+from lavender.bench.running.worker import Worker
 from lavender.bench.store import Records, Store
-from lavender.bench.timing import Task, measure_impulse, one_thread
-from lavender.bench.worker import Worker
-from lavender.errors import InputError, LavenderError
+from lavender.errors import InputError
 from lavender.problem import Problem
 
 __all__ = ["CampaignPlan", "campaign", "seeds"]
@@ -34,6 +37,7 @@ __all__ = ["CampaignPlan", "campaign", "seeds"]
 ATTEMPTS = 5  # times that the remaining pairs are handed out again after workers were lost
 ROUND = 256  # pairs handed out together to a backend that cannot give results one by one
 CONNECT = 10.0  # s, for a scheduler to answer
+WATCH = 0.5  # s between looks at whether the parent is still there
 HANG = 60.0  # s, after which a backend of another package is killed; the only clock, and it costs its record
 
 
@@ -58,8 +62,18 @@ class Pair:
     solver: str
 
 
+@dataclass(frozen=True)
+class Order:
+    """What every worker is told beside its pair."""
+
+    plan: CampaignPlan
+    run: str
+    memory: int | None  # bytes of each backend's process; a share of the machine it runs on if None
+    parent: int = 0  # process whose end ends its workers; 0: they belong to a cluster
+
+
 def seeds(words: Iterable[str], n: int, first: int = 0) -> list[str]:
-    """Cases of the suite with seed=first .. first + n - 1, where their family takes a seed; others once.
+    """Cases of the suite with seed=first .. first + n - 1, where their family takes a seed; others, and files, once.
 
     Raises
     ------
@@ -70,6 +84,9 @@ def seeds(words: Iterable[str], n: int, first: int = 0) -> list[str]:
 
     out = []
     for word in words:
+        if is_path(word):
+            out.append(word)
+            continue
         name, given = parse(word)
         if name in FAMILIES and "seed" in FAMILIES[name].signature.parameters and "seed" not in given:
             for seed in range(first, first + n):
@@ -89,6 +106,7 @@ def campaign(
     workers: int = -1,
     backend: str = "loky",
     watch: Watch | None = None,
+    memory: int | None = None,
 ) -> Records:
     """Run every solver on every case, without timing, by many workers.
 
@@ -99,6 +117,9 @@ def campaign(
     workers : number of processes; -1: one for each core. A cluster has as many as it has.
     backend : a backend of joblib: "loky" (processes here), "dask" (of the current dask.distributed client,
         or of DASK_SCHEDULER_ADDRESS), "ray"; "dask=ADDRESS" and "ray=ADDRESS" connect to a cluster
+    memory : bytes, optional
+        Limit of each process of a backend of another package; half of its machine's memory, shared by the workers
+        here or by the cores of a machine of a cluster, if None.
 
     Returns
     -------
@@ -119,7 +140,9 @@ def campaign(
     )
     if store is not None and not isinstance(store, Store):
         with Store(store) as opened:
-            return campaign(items, names, plan, opened, workers=workers, backend=backend, watch=watch)
+            return campaign(
+                items, names, plan, opened, workers=workers, backend=backend, watch=watch, memory=memory
+            )
     pairs = [
         Pair(len(names) * i + j, item.name, _travels(item), item.reason, name)
         for i, item in enumerate(items)
@@ -145,7 +168,7 @@ def campaign(
                     f"{len(left)} of {len(pairs)} pairs are not done: workers were lost {ATTEMPTS} times; "
                     "run the same command again, with fewer workers if memory is short"
                 )
-            for index, entries in _hand_out(left, plan, this.run, workers, name):
+            for index, entries in _hand_out(left, Order(plan, this.run, memory), workers, name):
                 done[index] = entries
                 if store is not None:
                     for entry in entries:
@@ -182,9 +205,7 @@ def _travels(item: Item) -> Any:
     return item.source if item.given is None else replace(item.given, copy=False)
 
 
-def _hand_out(
-    pairs: list[Pair], plan: CampaignPlan, run: str, workers: int, backend: str
-) -> Iterator[tuple[int, list[Any]]]:
+def _hand_out(pairs: list[Pair], order: Order, workers: int, backend: str) -> Iterator[tuple[int, list[Any]]]:
     """Results as they come; ends early, without an exception, when workers were lost."""
     import joblib
 
@@ -198,7 +219,10 @@ def _hand_out(
 
         lost = (*lost, KilledWorker)
     with joblib.parallel_config(backend=backend, n_jobs=workers):
-        calls = (joblib.delayed(work)(pair, plan, run) for pair in pairs)
+        if backend == "loky":
+            share = machine.memory_share(joblib.effective_n_jobs(workers))
+            order = replace(order, memory=order.memory or share, parent=os.getpid())
+        calls = (joblib.delayed(work)(pair, order) for pair in pairs)
         try:
             try:
                 parallel = joblib.Parallel(return_as="generator_unordered", batch_size=1)
@@ -283,19 +307,35 @@ def _ray(address: str) -> None:
 _worker: Worker | None = None  # one for each process, kept between pairs
 
 
-def work(pair: Pair, plan: CampaignPlan, run: str) -> tuple[int, list[Any]]:
+def work(pair: Pair, order: Order) -> tuple[int, list[Any]]:
     """All entries of one pair; runs in a worker, on one thread: the pairs are what runs side by side."""
+    if order.parent and order.parent != os.getpid():
+        _end_with(order.parent)
     with one_thread(pair.solver):
-        return _work(pair, plan, run)
+        return _work(pair, order)
 
 
-def _work(pair: Pair, plan: CampaignPlan, run: str) -> tuple[int, list[Any]]:
+@cache
+def _end_with(parent: int) -> None:
+    """End this process soon after its parent was killed, whatever pair it is at."""
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(WATCH)
+        os._exit(1)
+
+    if hasattr(os, "getppid"):
+        threading.Thread(target=watch, daemon=True).start()
+
+
+def _work(pair: Pair, order: Order) -> tuple[int, list[Any]]:
     global _worker
+    plan, run = order.plan, order.run
     try:
         problem, info = _look(pair, run)
-    except (LavenderError, OSError) as error:
+    except Exception as error:  # a file may make a reader raise anything
         item = Item(pair.case, str(pair.source), _missing, pair.reason)
-        return pair.index, [Skip(run, pair.case, "", _not_loaded(item, error))]
+        return pair.index, [Skip(run, pair.case, "", not_loaded(item, error))]
     spec = registry.get(pair.solver)
     reason = spec.refuses(problem)
     if reason:
@@ -311,7 +351,8 @@ def _work(pair: Pair, plan: CampaignPlan, run: str) -> tuple[int, list[Any]]:
         task = _by_iterations(task, plan.cap)
         if is_foreign(spec):
             if _worker is None:
-                _worker = Worker()
+                shared = machine.memory_share(os.cpu_count() or 1)
+                _worker = Worker(shared if order.memory is None else order.memory)
             record, impulse = _worker.measure_impulse(replace(problem, copy=False), task)
         else:
             record, impulse = measure_impulse(problem, replace(task, time_limit=math.inf))

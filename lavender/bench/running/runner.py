@@ -12,13 +12,13 @@ from lavender import registry
 from lavender._arrays import FloatArray
 from lavender.bench import machine
 from lavender.bench.cases import Item, Source, describe, resolve
-from lavender.bench.moved import with_motion
-from lavender.bench.plan import Plan
 from lavender.bench.record import CaseInfo, Record, Run, Skip, level_name
-from lavender.bench.sequences import carry, passes
+from lavender.bench.running.moved import with_motion
+from lavender.bench.running.plan import Plan
+from lavender.bench.running.sequences import carry, passes
+from lavender.bench.running.timing import Task, measure, measure_impulse, one_thread
+from lavender.bench.running.worker import Worker
 from lavender.bench.store import Records, Store
-from lavender.bench.timing import Task, measure, measure_impulse, one_thread
-from lavender.bench.worker import Worker
 from lavender.errors import LavenderError
 from lavender.problem import Problem
 from lavender.registry import SolverSpec
@@ -75,6 +75,7 @@ def run(
     isolate: bool = True,
     memory: int | None = None,
     into: list[Records] | None = None,
+    fresh: bool = False,
 ) -> Records:
     """Measure every solver that takes a case, on every case.
 
@@ -89,9 +90,10 @@ def run(
     watch : callable (Event), optional
     isolate : run solvers that other packages bring in a process of their own
     memory : bytes, optional
-        Limit of that process.
+        Limit of that process; half of the machine's memory if None.
     into : list, optional
         Receives the records before the first is made, for those who stop the run and want what there is.
+    fresh : measure again what `store` holds already
 
     Returns
     -------
@@ -106,9 +108,21 @@ def run(
     this = machine.describe(plan.as_dict(), packages)
     if store is not None and not isinstance(store, Store):
         with Store(store) as opened:
-            return run(items, names, plan, opened, watch=watch, isolate=isolate, memory=memory, into=into)
+            return run(
+                items,
+                names,
+                plan,
+                opened,
+                watch=watch,
+                isolate=isolate,
+                memory=memory,
+                into=into,
+                fresh=fresh,
+            )
     with Worker(memory) as worker:
         runner = _Runner(this, plan, names, store, watch, worker if isolate else None)
+        if fresh:
+            runner.known = {}
         if into is not None:
             into.append(runner.out)
         with one_thread():  # describing a case computes too
@@ -167,8 +181,8 @@ class _Runner:
         """Load and describe a case; None, with a note, where it does not load."""
         try:
             info = describe(item, self.this.run)
-        except (LavenderError, OSError) as error:
-            self.keep(Skip(self.this.run, item.name, "", _not_loaded(item, error)))
+        except Exception as error:  # a file may make a reader raise anything; it costs its own case
+            self.keep(Skip(self.this.run, item.name, "", not_loaded(item, error)))
             self.done += len(self.names)
             self.tell(item.name, "")
             return None
@@ -314,6 +328,9 @@ def _sequences(items: list[Item]) -> list[tuple[str, list[Item]]]:
     return out
 
 
-def _not_loaded(item: Item, error: Exception) -> str:
+def not_loaded(item: Item, error: Exception) -> str:
+    """Why a case is left out; an error that the reader did not mean to raise with its kind."""
     text = str(error)
+    if not isinstance(error, (LavenderError, OSError)):
+        text = f"{type(error).__name__}: {text}"
     return f"did not load: {text}" if text.startswith(item.source) else f"did not load: {item.source}: {text}"

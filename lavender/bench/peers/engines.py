@@ -370,41 +370,6 @@ def run(
         ]
 
 
-def over_ours(step: Step, steps: Sequence[Step]) -> float:
-    """Time over that of ours on the same scene in the same mode, sweeps or accurate; nan where there is none."""
-    own = [
-        s.time
-        for s in steps
-        if s.engine.startswith("lavender") and (s.scene, s.accurate) == (step.scene, step.accurate)
-    ]
-    return step.time / own[0] if own else NAN
-
-
-def table(steps: Sequence[Step]) -> list[str]:
-    """Markdown: each engine beside ours in the same mode, then where ours takes longer."""
-    lines = [
-        "| scene | engine | time / ours | contacts | depth [mm] | speed left [m/s] | residual |",
-        "|---|---|---|---|---|---|---|",
-    ]
-    for s in steps:
-        if not np.isfinite(s.time):
-            lines.append(f"| {s.scene} | {s.engine} | {s.note} | | | | |")
-            continue
-        ratio = over_ours(s, steps)
-        shown = f"{ratio:.2f}" if np.isfinite(ratio) else "-"
-        if s.engine.startswith("lavender"):
-            shown = f"1 ({1e3 * s.time:.3g} ms)"
-        known = f"{s.relative:.1e}" if np.isfinite(s.relative) else "not known"
-        lines.append(
-            f"| {s.scene} | {s.engine} | {shown} | {s.contacts} | {1e3 * s.depth:.3g} | {s.speed:.1e} | {known} |"
-        )
-    lost = sorted(((over_ours(s, steps), s) for s in steps if over_ours(s, steps) < 1.0), key=lambda x: x[0])
-    if lost:
-        lines += ["", f"Lost: {len(lost)}."]
-        lines += [f"- {s.scene}: {s.engine}, {ratio:.2f} of the time of ours" for ratio, s in lost]
-    return lines
-
-
 def as_records(steps: Sequence[Step]) -> list[dict[str, Any]]:
     """Plain dictionaries."""
     return [asdict(s) for s in steps]

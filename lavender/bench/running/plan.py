@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from lavender.bench.record import CaseInfo, Record
-from lavender.bench.timing import Task
+from lavender.bench.running.timing import Task
 from lavender.errors import InputError, UnknownName
 from lavender.ordering import ORDERS
 from lavender.problem import Problem

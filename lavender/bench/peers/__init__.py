@@ -11,18 +11,16 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
 
-import click
-
-from lavender.bench import machine, peer_engines, peer_solvers
 from lavender.bench.cases import resolve
+from lavender.bench.peers import engines, race
+from lavender.bench.peers.contest import Result
 from lavender.engine import Simulation
 from lavender.errors import InputError, UnknownName
 from lavender.problem import Problem
 from lavender.scene import Scene
 
-__all__ = ["PROBLEMS", "Peers", "command", "problems", "read"]
+__all__ = ["PACKAGES", "PROBLEMS", "Peers", "problems", "read"]
 
 #: Cases of the suite, `mujoco:SCENE:CONE` (what MuJoCo exports), `scene:SCENE` (what LavenderSim exports).
 PROBLEMS = (
@@ -69,8 +67,8 @@ class Peers:
 
     cpu: str
     versions: dict[str, str]
-    steps: list[peer_engines.Step]
-    results: list[peer_solvers.Result]
+    steps: list[engines.Step]
+    results: list[Result]
 
 
 def read(path: str | Path) -> Peers:
@@ -93,8 +91,8 @@ def read(path: str | Path) -> Peers:
         return Peers(
             str(found["cpu"]),
             dict(found["versions"]),
-            peer_engines.from_records(found["steps"]),
-            peer_solvers.from_records(found["solvers"]),
+            engines.from_records(found["steps"]),
+            race.from_records(found["solvers"]),
         )
     except (ValueError, TypeError, KeyError, AttributeError) as error:
         kind = type(error).__name__
@@ -112,7 +110,7 @@ def problems(
     ----------
     words : names
         As `lavender bench` takes them; `mujoco:SCENE:CONE` and `scene:SCENE` with a scene of
-        `peer_engines.SCENES`.
+        `engines.SCENES`.
     say : callable
         Told what is left out.
 
@@ -134,99 +132,14 @@ def problems(
             if find_spec("mujoco") is None:
                 say(f"left out: {word} (pip install mujoco)")
                 continue
-            yield word, peer_engines.export(scene, cone)
+            yield word, engines.export(scene, cone)
         elif engine == "scene" and rest:
-            if rest not in peer_engines.SCENES:
-                raise UnknownName("scene", rest, peer_engines.SCENES)
-            name, parameters = peer_engines.SCENES[rest]
-            simulation = Simulation(Scene(name, dt=peer_engines.DT, **parameters))
+            if rest not in engines.SCENES:
+                raise UnknownName("scene", rest, engines.SCENES)
+            name, parameters = engines.SCENES[rest]
+            simulation = Simulation(Scene(name, dt=engines.DT, **parameters))
             simulation.step()
             yield word, simulation.constraint_problem()
         else:
             for item in resolve([word]):
                 yield item.name, item.problem
-
-
-@click.command("peers")
-@click.argument("files", nargs=-1, metavar="[FILES | FOLDERS | NAMES]...")
-@click.option("--engines/--no-engines", default=True, help="Step the scenes in every engine.")
-@click.option("--solvers/--no-solvers", default=True, help="Solve the problems with every solver.")
-@click.option(
-    "--scenes", default=",".join(peer_engines.SCENES), show_default=True, help="Scenes, commas between them."
-)
-@click.option("--sweeps", default=16, show_default=True, help="Of every engine that takes a number of them.")
-@click.option(
-    "--limit", default=2.0, show_default=True, metavar="S", help="CPU time of one call of a solver."
-)
-@click.option(
-    "--rounds",
-    type=click.IntRange(2),
-    default=2,
-    show_default=True,
-    help="Turns of the solvers near the fastest.",
-)
-@click.option(
-    "--siconos",
-    default="",
-    envvar="LAVENDER_SICONOS",
-    show_envvar=True,
-    metavar="PYTHON",
-    help="Interpreter that has Siconos (Debian: python3-siconos).",
-)
-@click.option("--out", type=click.Path(path_type=Path), default=None, help="Write every run here too, JSON.")
-def command(
-    files: tuple[str, ...],
-    engines: bool,
-    solvers: bool,
-    scenes: str,
-    sweeps: int,
-    limit: float,
-    rounds: int,
-    siconos: str,
-    out: Path | None,
-) -> None:
-    """Engines on the same scenes and solvers on the same problems: time as a ratio to ours, error beside it.
-
-    FILES are problems for the solvers; without them a fixed list of small and large ones.
-    """
-
-    def note(text: str) -> None:
-        click.echo(text, err=True)
-
-    versions = machine.versions(PACKAGES)
-    click.echo(f"{machine.cpu_name()}; " + ", ".join(f"{k} {v}" for k, v in versions.items()))
-    absent = [name for name in PACKAGES if name not in versions] + (
-        [] if siconos else ["siconos (--siconos)"]
-    )
-    click.echo("not here: " + (", ".join(absent) or "nothing") + "\n")
-    record: dict[str, Any] = {"versions": versions, "cpu": machine.cpu_name(), "steps": [], "solvers": []}
-    if engines:
-        steps: list[peer_engines.Step] = []
-        for scene in filter(None, scenes.split(",")):
-            note(scene)
-            steps += peer_engines.run(scene, sweeps)
-        click.echo("\n".join(peer_engines.table(steps)) + "\n")
-        record["steps"] = peer_engines.as_records(steps)
-    if solvers:
-        results: list[peer_solvers.Result] = []
-        race = peer_solvers.race(
-            problems(files or PROBLEMS, note),
-            peer_solvers.contestants(siconos),
-            limit=limit,
-            rounds=rounds,
-            watch=note,
-        )
-        try:
-            for found in race:
-                results += found
-                record["solvers"] = peer_solvers.as_records(results)
-                _write(out, record)  # an interruption costs one problem
-        except KeyboardInterrupt:
-            note("stopped")
-        click.echo("\n".join(peer_solvers.tables(results)))
-    _write(out, record)
-
-
-def _write(out: Path | None, record: dict[str, Any]) -> None:
-    if out is not None:
-        out.write_text(json.dumps(record, indent=1))

@@ -23,10 +23,10 @@ from lavender._arrays import FloatArray
 from lavender.bench.record import ERROR, Record, measurement_key
 from lavender.problem import Problem
 from lavender.residuals import reference
-from lavender.solution import Solution, Status
-from lavender.solve import prepare
+from lavender.solution import Claim, Solution, Status
+from lavender.solve import finish, prepare
 
-__all__ = ["Task", "measure", "one_thread"]
+__all__ = ["Outcome", "Task", "attempt", "judged", "measure", "one_thread"]
 
 CLAIMS = (Status.CONVERGED, Status.FLOOR, Status.INFEASIBLE)
 
@@ -117,6 +117,21 @@ def _undisturbed(solver: str) -> Iterator[None]:
             gc.enable()
 
 
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """What the repeats of one measurement brought, before it is judged."""
+
+    impulse: FloatArray  # (m,) N s
+    status: Status
+    iterations: int
+    work: Mapping[str, int]
+    message: str
+    form: str
+    certificate: FloatArray | None  # (m,), with INFEASIBLE
+    setups: list[float]  # s, of each repeat
+    solves: list[float]  # s
+
+
 def measure(problem: Problem, task: Task) -> Record:
     """Make one measurement; what the solver raises becomes a record of status ERROR.
 
@@ -136,6 +151,11 @@ def measure_impulse(problem: Problem, task: Task, impulse: Any = None) -> tuple[
     impulse : (m,) N s, optional
         Start, for `start="carried"`. "cold" starts from Pi(0), "warm" from the problem's guess.
     """
+    return judged(problem, task, attempt(problem, task, impulse))
+
+
+def attempt(problem: Problem, task: Task, impulse: Any = None) -> Outcome | str:
+    """Run the solver as the task asks, in this process; what it raised, as text."""
     setups: list[float] = []
     solves: list[float] = []
     solution = None
@@ -153,11 +173,46 @@ def measure_impulse(problem: Problem, task: Task, impulse: Any = None) -> tuple[
                     break
     except Exception as error:
         # A backend may raise anything; it costs its own record, never the run.
-        text = f"{type(error).__name__}: {error}".strip()
-        return task.record(status=ERROR, message=text[:500], repeats=len(solves)), None
+        return f"{type(error).__name__}: {error}".strip()
     assert solution is not None  # there is at least one repeat
+    return Outcome(
+        impulse=solution.impulse,
+        status=solution.status,
+        iterations=solution.iterations,
+        work=solution.work,
+        message=solution.message,
+        form=solution.solver.form,
+        certificate=solution.certificate,
+        setups=setups,
+        solves=solves,
+    )
+
+
+def judged(problem: Problem, task: Task, found: Outcome | str) -> tuple[Record, FloatArray | None]:
+    """The record of an outcome, judged here on `problem`, and the impulses (m,) [N s] if they are numbers."""
+    if isinstance(found, str):
+        return task.record(status=ERROR, message=found[:500]), None
+    claim = Claim(
+        found.status,
+        found.iterations,
+        found.work,
+        found.message,
+        found.form,
+        certificate=found.certificate,
+    )
+    solution = finish(
+        problem,
+        registry.get(task.solver),
+        dict(task.options),
+        np.array(found.impulse),
+        claim,
+        task.tol,
+        found.setups[-1],
+        found.solves[-1],
+        None,
+    )
     impulse = solution.impulse if np.isfinite(solution.impulse).all() else None
-    return record_of(task, solution, setups, solves), impulse
+    return record_of(task, solution, found.setups, found.solves), impulse
 
 
 def _once(problem: Problem, task: Task, impulse: Any) -> Solution:

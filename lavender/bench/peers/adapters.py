@@ -13,13 +13,10 @@ from __future__ import annotations
 
 import functools
 import importlib.util
-import math
-import multiprocessing
-import os
 import subprocess
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from time import monotonic, process_time
 from typing import Any
@@ -29,62 +26,24 @@ import scipy.sparse as sp
 
 from lavender import registry
 from lavender._arrays import FloatArray
-from lavender.bench.timing import one_thread
+from lavender.bench.peers.contest import SCRATCH, TARGETS, Call, Contestant
 from lavender.cones import CONTACT
 from lavender.errors import CapabilityError, InputError
-from lavender.external._running import Limits, quiet
+from lavender.external._running import Limits
 from lavender.external.as_qp import QP, impulse_form, velocity_form
 from lavender.external.backend import Backend
 from lavender.external.qp_solver import QPSolver, refusal
 from lavender.external.qpsolvers_ import BACKENDS
 from lavender.problem import Problem
-from lavender.residuals import reference, residual
+from lavender.residuals import reference
 from lavender.solve import prepare
 
-__all__ = ["TARGETS", "Contestant", "Result", "contestants", "geometric_means", "losses", "race"]
+__all__ = ["LADDER", "check_siconos", "contestants"]
 
-TARGETS = (1e-3, 1e-6, 1e-9)
 #: Settings of other solvers, loose to tight: their own measures, in units where unknowns are near 1.
 LADDER = (1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10, 1e-12, 1e-14)
-LARGE = 1000  # rows from which a problem counts as large
-REPEATS, REPEAT_TIME = 30, 0.1  # of one setting: at most so many, and as long as they take so long [s]
-AGAIN = 4.0  # a contestant runs again in later rounds when it is within so many times the fastest of its side
 START = 60.0  # s, wall: imports of a backend on a loaded machine
-SCRATCH = ", from scratch"
-SCIPY = "scipy "  # what these names begin with
-PATIENCE = 10.0  # s, wall, beyond four times the limit of a call, before a contestant is ended
 DENSE_ROWS = 1700  # rows up to which Siconos' solvers of dense matrices are asked
-
-Call = Callable[[], tuple[float, FloatArray]]  # one run: s of CPU, impulse (m,) [N s]
-Runs = Callable[[Problem, float], Iterator[Call]]  # problem, limit [s] -> a call for each setting
-
-
-@dataclass(frozen=True)
-class Contestant:
-    """A solver with its form."""
-
-    name: str
-    peer: bool
-    runs: Runs = field(repr=False)
-    refuses: Callable[[Problem], str | None] = field(default=lambda _: None, repr=False)
-
-
-@dataclass
-class Result:
-    """What one contestant reached on one problem."""
-
-    problem: str
-    rows: int
-    law: str
-    solver: str
-    peer: bool
-    runs: list[tuple[float, float]] = field(default_factory=list)  # s, relative residual, of every setting
-    note: str = ""
-
-    def time(self, target: float) -> float:
-        """Least time [s] of a run with at most this relative residual; inf without one."""
-        return min((t for t, r in self.runs if r <= target), default=math.inf)
-
 
 # -- ours ------------------------------------------------------------------------------------------
 
@@ -596,278 +555,3 @@ def contestants(siconos: str = "") -> list[Contestant]:
         made += [_siconos(siconos, name, True) for name in SICONOS_FRICTION]
         made += [_siconos(siconos, name, False) for name in SICONOS_LCP]
     return made
-
-
-# -- running ---------------------------------------------------------------------------------------
-
-
-def _child(pipe: Any, contestant: Contestant, problem: Problem, limit: float) -> None:
-    # In a process of its own: (seconds, residual) of each setting, then None or why it stopped.
-    try:
-        with one_thread(contestant.name), quiet(noisy=True):
-            least = max(min(TARGETS), 2.0 * residual(problem, problem.start()).floor)
-            for call in contestant.runs(problem, limit):
-                began = monotonic()
-                seconds, impulse = call()
-                late = max(seconds, monotonic() - began) > 0.9 * limit  # solvers' own limits are wall time
-                judged = residual(problem, impulse)
-                spent = seconds
-                for _ in range(REPEATS):
-                    if spent > REPEAT_TIME:
-                        break
-                    again = call()[0]
-                    spent, seconds = spent + max(again, 1e-6), min(seconds, again)
-                pipe.send((seconds, judged.relative))
-                if judged.relative <= max(least, 2.0 * judged.floor) or late:
-                    break
-        pipe.send(None)
-    except BaseException as error:  # whatever another project's code does
-        pipe.send(f"{type(error).__name__}: {error}"[:200])
-
-
-def _run(contestant: Contestant, problem: Problem, limit: float) -> tuple[list[tuple[float, float]], str]:
-    context: Any = multiprocessing.get_context("fork" if hasattr(os, "fork") else "spawn")
-    mine, other = context.Pipe(duplex=False)
-    process = context.Process(target=_child, args=(other, contestant, problem, limit), daemon=False)
-    process.start()
-    other.close()
-    runs: list[tuple[float, float]] = []
-    note = ""
-    try:
-        while True:
-            # CPU time of a call is limited by the solver where it can be; wall time here, on a loaded machine.
-            patience = 4.0 * limit + PATIENCE
-            if not mine.poll(patience):
-                note = f"ended after {patience:g} s without an answer"
-                break
-            try:
-                said = mine.recv()
-            except EOFError:
-                process.join(5.0)
-                note = f"its process died ({process.exitcode})"
-                break
-            if said is None or isinstance(said, str):
-                note = said or ""
-                break
-            runs.append(said)
-    finally:
-        process.kill()
-        process.join()
-        mine.close()
-    return runs, note
-
-
-def race(
-    problems: Iterable[tuple[str, Problem]],
-    all_of: Sequence[Contestant],
-    *,
-    limit: float = 5.0,
-    rounds: int = 3,
-    watch: Callable[[str], None] = lambda _: None,
-) -> Iterator[list[Result]]:
-    """Every contestant that takes a problem, on every problem; the results of each problem when it is done.
-
-    Parameters
-    ----------
-    problems : (name, Problem) pairs
-    all_of : contestants
-    limit : s
-        Of CPU for one call; what takes longer ends a contestant's ladder.
-    rounds : int
-        In the second and later ones, in turns, only those near the fastest of their side run, and ours also from
-        scratch.
-    watch : callable
-        Told what runs.
-    """
-    for name, problem in problems:
-        here: dict[str, Result] = {}
-        takers = [c for c in all_of if c.refuses(problem) is None]
-        running = [c for c in takers if not c.name.endswith(SCRATCH)]
-        for number in range(rounds):
-            for c in running if number % 2 == 0 else running[::-1]:
-                watch(f"{name}: {c.name}")
-                runs, note = _run(c, problem, limit)
-                result = here.setdefault(c.name, Result(name, problem.m, problem.law, c.name, c.peer))
-                result.runs += runs
-                result.note = result.note or note
-            near = {c.name for c in running if _near(here[c.name], list(here.values()))}
-            running = [c for c in takers if c.name.removesuffix(SCRATCH) in near]
-        yield list(here.values())
-
-
-def _near(one: Result, all_of: Sequence[Result]) -> bool:
-    for target in TARGETS:
-        side = [
-            r
-            for r in all_of
-            if (r.peer, r.solver.endswith(SCRATCH)) == (one.peer, one.solver.endswith(SCRATCH))
-        ]
-        fastest = min((r.time(target) for r in side), default=math.inf)
-        if math.isfinite(one.time(target)) and one.time(target) <= AGAIN * fastest:
-            return True
-    return False
-
-
-@dataclass(frozen=True)
-class Comparison:
-    """The fastest of ours and of others at one error on one problem."""
-
-    problem: str
-    rows: int
-    law: str
-    target: float
-    ours: str
-    our_time: float  # s, inf: nobody reached it
-    peer: str
-    peer_time: float
-    scratch: float  # s, the fastest of ours from scratch
-    auto: float  # s, "auto"
-
-    @property
-    def ratio(self) -> float:
-        """Ours over theirs; nan where no peer reached the error, inf where only a peer did."""
-        return self.over_peer(self.our_time)
-
-    def over_peer(self, time: float) -> float:
-        """A time over the fastest peer's; nan where there is none."""
-        return time / self.peer_time if math.isfinite(self.peer_time) else math.nan
-
-
-def compare(results: Sequence[Result], scipy: bool = True) -> list[Comparison]:
-    """One line for each problem and error; `scipy` False leaves out SciPy's factorisations of linear systems."""
-    results = [r for r in results if scipy or not r.solver.startswith(SCIPY)]
-    found = []
-    for name in dict.fromkeys(r.problem for r in results):
-        here = [r for r in results if r.problem == name]
-        scratch = [r for r in here if r.solver.endswith(SCRATCH)]
-        ours = [r for r in here if not r.peer and not r.solver.endswith(SCRATCH)]
-        for target in TARGETS:
-            best = [_fastest(side, target) for side in (ours, [r for r in here if r.peer])]
-            found.append(
-                Comparison(
-                    name,
-                    here[0].rows,
-                    here[0].law,
-                    target,
-                    *best[0],
-                    *best[1],
-                    _fastest(scratch, target)[1],
-                    next((r.time(target) for r in ours if r.solver == "auto"), math.inf),
-                )
-            )
-    return found
-
-
-def _fastest(side: Sequence[Result], target: float) -> tuple[str, float]:
-    best = min(side, key=lambda r: r.time(target), default=None)
-    if best is None or not math.isfinite(best.time(target)):
-        return "-", math.inf
-    return best.solver, best.time(target)
-
-
-@dataclass(frozen=True)
-class Mean:
-    """Geometric means of times over the fastest peer's, where both sides reached the error."""
-
-    which: str  # problems
-    target: float
-    ours: float
-    scratch: float
-    auto: float
-    compared: int
-
-
-def geometric_means(results: Sequence[Result]) -> list[Mean]:
-    """For cases (and files) and for what engines export, large and smaller, at each error.
-
-    Peers are QP and cone backends, Pinocchio and Siconos; the last group counts SciPy's factorisations of linear
-    systems among them, which are no solvers of constraint problems.
-    """
-    plain, every = compare(results, scipy=False), compare(results)
-    groups = (
-        ("cases", [c for c in plain if ":" not in c.problem]),
-        ("exported by engines", [c for c in plain if ":" in c.problem]),
-        ("all, SciPy too", every),
-    )
-    out = []
-    for group, compared in groups:
-        for size, large in ((f"{LARGE} rows and more", True), ("smaller", False)):
-            of_size = [c for c in compared if (c.rows >= LARGE) is large and math.isfinite(c.peer_time)]
-            for target in TARGETS:
-                some = [c for c in of_size if c.target == target]
-                if some:
-                    out.append(_mean_of(f"{group}, {size}", target, some))
-    return out
-
-
-def _mean_of(which: str, target: float, some: Sequence[Comparison]) -> Mean:
-    ours = _mean([c.ratio for c in some])
-    scratch = _mean([c.over_peer(c.scratch) for c in some])
-    auto = _mean([c.over_peer(c.auto) for c in some])
-    return Mean(which, target, ours, scratch, auto, sum(math.isfinite(c.our_time) for c in some))
-
-
-def _mean(ratios: Sequence[float]) -> float:
-    known = [x for x in ratios if math.isfinite(x)]
-    return float(np.exp(np.mean(np.log(known)))) if known else math.nan
-
-
-def losses(compared: Sequence[Comparison]) -> list[Comparison]:
-    """Where a peer is faster, or alone, worst first."""
-    return sorted((c for c in compared if c.ratio > 1.0), key=lambda c: -c.ratio)
-
-
-def tables(results: Sequence[Result]) -> list[str]:
-    """Markdown: every problem and error, geometric means, losses, and what nobody reached."""
-    compared = compare(results)
-    lines = [
-        "| problem | rows | law | error | ours | fastest peer | ours / peer | from scratch | auto |",
-        "|---|---|---|---|---|---|---|---|---|",
-    ]
-    for c in compared:
-        if math.isfinite(c.peer_time) or math.isfinite(c.our_time):
-            ratios = (_ratio(c.over_peer(t)) for t in (c.our_time, c.scratch, c.auto))
-            start = f"| {c.problem} | {c.rows} | {c.law} | {c.target:.0e} | {c.ours} | {c.peer} | "
-            lines.append(start + " | ".join(ratios) + " |")
-    lines += [
-        "",
-        "| problems | error | ours / peer | from scratch | auto | compared |",
-        "|---|---|---|---|---|---|",
-    ]
-    for mean in geometric_means(results):
-        ratios = (_ratio(x) for x in (mean.ours, mean.scratch, mean.auto))
-        lines.append(f"| {mean.which} | {mean.target:.0e} | " + " | ".join(ratios) + f" | {mean.compared} |")
-    lost = losses(compared)
-    lines += ["", f"Lost: {len(lost)} of {sum(math.isfinite(c.peer_time) for c in compared)}."]
-    lines += [f"- {c.problem} at {c.target:.0e}: {c.peer} against {c.ours}, {_ratio(c.ratio)}" for c in lost]
-    alone = [c for c in compared if math.isinf(c.peer_time) and math.isfinite(c.our_time)]
-    if alone:
-        lines += ["", "Reached by no peer: " + _list(alone)]
-    nobody = [c for c in compared if math.isinf(c.peer_time) and math.isinf(c.our_time)]
-    if nobody:
-        lines += ["", "Reached by nobody: " + _list(nobody)]
-    return lines
-
-
-def _list(compared: Sequence[Comparison]) -> str:
-    return ", ".join(f"{c.problem} at {c.target:.0e}" for c in compared) + "."
-
-
-def _ratio(x: float) -> str:
-    return "-" if math.isnan(x) else "only the peer" if math.isinf(x) else f"{x:.3g}"
-
-
-def as_records(results: Sequence[Result]) -> list[dict[str, Any]]:
-    """Plain dictionaries."""
-    return [asdict(r) for r in results]
-
-
-def from_records(records: Iterable[dict[str, Any]]) -> list[Result]:
-    """What `as_records` gave, perhaps through JSON.
-
-    Raises
-    ------
-    TypeError, ValueError
-        Not such records.
-    """
-    return [Result(**{**r, "runs": [(float(t), float(x)) for t, x in r["runs"]]}) for r in records]

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from lavender._arrays import FloatArray
-from lavender.bench.plan import UNLIMITED, Plan
+from lavender.bench.running.plan import UNLIMITED, Plan
 from lavender.problem import Problem
 from lavender.registry import SolverSpec
 

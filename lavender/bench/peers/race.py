@@ -1,0 +1,146 @@
+"""The race: every contestant in a process of its own, in turns; the quick ones run again in later rounds."""
+
+from __future__ import annotations
+
+import math
+import multiprocessing
+import os
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import asdict
+from time import monotonic
+from typing import Any
+
+from lavender.bench.peers.contest import SCRATCH, TARGETS, Contestant, Result
+from lavender.bench.running.timing import one_thread
+from lavender.external._running import quiet
+from lavender.problem import Problem
+from lavender.residuals import residual
+
+__all__ = ["as_records", "from_records", "race"]
+
+REPEATS, REPEAT_TIME = 30, 0.1  # of one setting: at most so many, and as long as they take so long [s]
+AGAIN = 4.0  # a contestant runs again in later rounds when it is within so many times the fastest of its side
+PATIENCE = 10.0  # s, wall, beyond four times the limit of a call, before a contestant is ended
+
+
+def _child(pipe: Any, contestant: Contestant, problem: Problem, limit: float) -> None:
+    # In a process of its own: (seconds, residual) of each setting, then None or why it stopped.
+    try:
+        with one_thread(contestant.name), quiet(noisy=True):
+            least = max(min(TARGETS), 2.0 * residual(problem, problem.start()).floor)
+            for call in contestant.runs(problem, limit):
+                began = monotonic()
+                seconds, impulse = call()
+                late = max(seconds, monotonic() - began) > 0.9 * limit  # solvers' own limits are wall time
+                judged = residual(problem, impulse)
+                spent = seconds
+                for _ in range(REPEATS):
+                    if spent > REPEAT_TIME:
+                        break
+                    again = call()[0]
+                    spent, seconds = spent + max(again, 1e-6), min(seconds, again)
+                pipe.send((seconds, judged.relative))
+                if judged.relative <= max(least, 2.0 * judged.floor) or late:
+                    break
+        pipe.send(None)
+    except BaseException as error:  # whatever another project's code does
+        pipe.send(f"{type(error).__name__}: {error}"[:200])
+
+
+def _run(contestant: Contestant, problem: Problem, limit: float) -> tuple[list[tuple[float, float]], str]:
+    context: Any = multiprocessing.get_context("fork" if hasattr(os, "fork") else "spawn")
+    mine, other = context.Pipe(duplex=False)
+    process = context.Process(target=_child, args=(other, contestant, problem, limit), daemon=False)
+    process.start()
+    other.close()
+    runs: list[tuple[float, float]] = []
+    note = ""
+    try:
+        while True:
+            # CPU time of a call is limited by the solver where it can be; wall time here, on a loaded machine.
+            patience = 4.0 * limit + PATIENCE
+            if not mine.poll(patience):
+                note = f"ended after {patience:g} s without an answer"
+                break
+            try:
+                said = mine.recv()
+            except EOFError:
+                process.join(5.0)
+                note = f"its process died ({process.exitcode})"
+                break
+            if said is None or isinstance(said, str):
+                note = said or ""
+                break
+            runs.append(said)
+    finally:
+        process.kill()
+        process.join()
+        mine.close()
+    return runs, note
+
+
+def race(
+    problems: Iterable[tuple[str, Problem]],
+    all_of: Sequence[Contestant],
+    *,
+    limit: float = 5.0,
+    rounds: int = 3,
+    watch: Callable[[str], None] = lambda _: None,
+) -> Iterator[list[Result]]:
+    """Every contestant that takes a problem, on every problem; the results of each problem when it is done.
+
+    Parameters
+    ----------
+    problems : (name, Problem) pairs
+    all_of : contestants
+    limit : s
+        Of CPU for one call; what takes longer ends a contestant's ladder.
+    rounds : int
+        In the second and later ones, in turns, only those near the fastest of their side run, and ours also from
+        scratch.
+    watch : callable
+        Told what runs.
+    """
+    for name, problem in problems:
+        here: dict[str, Result] = {}
+        takers = [c for c in all_of if c.refuses(problem) is None]
+        running = [c for c in takers if not c.name.endswith(SCRATCH)]
+        for number in range(rounds):
+            for c in running if number % 2 == 0 else running[::-1]:
+                watch(f"{name}: {c.name}")
+                runs, note = _run(c, problem, limit)
+                result = here.setdefault(c.name, Result(name, problem.m, problem.law, c.name, c.peer))
+                result.runs += runs
+                result.note = result.note or note
+            near = {c.name for c in running if _near(here[c.name], list(here.values()))}
+            running = [c for c in takers if c.name.removesuffix(SCRATCH) in near]
+        yield list(here.values())
+
+
+def _near(one: Result, all_of: Sequence[Result]) -> bool:
+    for target in TARGETS:
+        side = [
+            r
+            for r in all_of
+            if (r.peer, r.solver.endswith(SCRATCH)) == (one.peer, one.solver.endswith(SCRATCH))
+        ]
+        fastest = min((r.time(target) for r in side), default=math.inf)
+        if math.isfinite(one.time(target)) and one.time(target) <= AGAIN * fastest:
+            return True
+    return False
+
+
+def as_records(results: Sequence[Result]) -> list[dict[str, Any]]:
+    """Plain dictionaries."""
+    return [asdict(r) for r in results]
+
+
+def from_records(records: Iterable[dict[str, Any]]) -> list[Result]:
+    """What `as_records` gave, perhaps through JSON.
+
+    Raises
+    ------
+    TypeError, ValueError
+        Not such records.
+    """
+    return [Result(**{**r, "runs": [(float(t), float(x)) for t, x in r["runs"]]}) for r in records]

@@ -1,0 +1,9 @@
+"""The command `lavender`: one file for each of its commands.
+
+What a command needs is imported when it runs, so that --help is quick.
+"""
+
+from lavender.cli.entry import cli, main
+from lavender.cli.options import EXIT_BAD_INPUT, EXIT_INFEASIBLE, EXIT_INTERRUPTED, EXIT_UNMET
+
+__all__ = ["EXIT_BAD_INPUT", "EXIT_INFEASIBLE", "EXIT_INTERRUPTED", "EXIT_UNMET", "cli", "main"]

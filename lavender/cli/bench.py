@@ -1,0 +1,87 @@
+"""`lavender bench`, and the commands of its own first words."""
+
+from __future__ import annotations
+
+import importlib
+from pathlib import Path
+from typing import Any
+
+import click
+
+from lavender.cli.measuring import measure
+from lavender.cli.options import (
+    EXIT_INTERRUPTED,
+    EXIT_UNMET,
+    ManyValues,
+    console,
+    make_plan,
+    one_thread,
+    plan_options,
+)
+
+__all__ = ["bench"]
+
+
+class Suites(ManyValues):
+    """`lavender bench auto`, `kernels`, `peers`, `stand` are commands; other first words are files (or ./peers)."""
+
+    OWN = {  # noqa: RUF012 - a constant of the class
+        "gallery": "lavender.bench.endurance:command",
+        "auto": "lavender.cli.bench_auto:auto",
+        "motions": "lavender.bench.motions:command",
+        "mujoco": "lavender.bench.simulators:command",
+        "kernels": "lavender.cli.bench_kernels:kernels",
+        "peers": "lavender.cli.bench_peers:peers",
+        "stand": "lavender.bench.stand:command",
+    }
+
+    def make_context(
+        self, info_name: str | None, args: list[str], parent: click.Context | None = None, **extra: Any
+    ) -> click.Context:
+        """The context of the command that the first word names, or of this one."""
+        if not args or args[0] not in self.OWN:
+            return super().make_context(info_name, args, parent, **extra)
+        module, _, attribute = self.OWN[args[0]].partition(":")
+        one_thread()
+        own: click.Command = getattr(importlib.import_module(module), attribute)
+        return own.make_context(f"{info_name} {args[0]}", args[1:], parent, **extra)
+
+
+@click.command(cls=Suites)
+@click.argument("files", nargs=-1, metavar="[FILES | FOLDERS | NAMES]...")
+@plan_options
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path),
+    default=Path("records.jsonl"),
+    show_default=True,
+    help="File of the records.",
+)
+def bench(
+    files: tuple[str, ...],
+    solvers: tuple[str, ...] | None,
+    levels: tuple[float, ...],
+    budgets: tuple[int, ...],
+    orders: tuple[str, ...] | None,
+    repeats: int,
+    time_limit: float | None,
+    memory: float | None,
+    in_process: bool,
+    out: Path,
+) -> None:
+    """As `report`, but only the records: a .jsonl file that `lavender report` shows later.
+
+    `lavender bench peers` compares with other engines and solvers instead, `lavender bench stand` says how long towers
+    stand in each, `lavender bench auto` measures what auto loses against the best of our own solvers; see their own
+    --help.
+    """
+    plan = make_plan(files, levels, budgets, orders, repeats, time_limit)
+    done = measure(files, solvers, plan, out, memory, in_process)
+    shown_on = console()
+    shown_on.print(f"{len(done.records)} runs in {out}", highlight=False, markup=False, soft_wrap=True)
+    if done.note:
+        shown_on.print(done.note.partition(";")[0], highlight=False, markup=False)
+    if done.stopped:
+        raise click.exceptions.Exit(EXIT_INTERRUPTED)
+    if done.lost:
+        raise click.exceptions.Exit(EXIT_UNMET)

@@ -1,0 +1,85 @@
+"""`lavender bench auto`."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import asdict
+from pathlib import Path
+
+import click
+
+from lavender.bench import machine
+from lavender.bench.cases import resolve
+from lavender.bench.regret import Regret, regrets, summary
+from lavender.bench.running.campaign import seeds as from_seeds
+from lavender.errors import InputError
+from lavender.problem import Problem
+from lavender.report.regret import table
+
+__all__ = ["auto"]
+
+
+@click.command("auto")
+@click.argument("files", nargs=-1, metavar="[FILES | FOLDERS | NAMES]...")
+@click.option(
+    "--families", default="wild", show_default=True, help="Families with seeds, commas between them."
+)
+@click.option(
+    "--seeds", default="0:60", show_default=True, metavar="A:B", help="Seeds of the families, B left out."
+)
+@click.option("--levels", default="1e-3,1e-6,1e-9", show_default=True, help="Relative residuals to reach.")
+@click.option("--limit", default=2.0, show_default=True, metavar="S", help="Time of one solve.")
+@click.option(
+    "--repeats",
+    type=click.IntRange(1),
+    default=5,
+    show_default=True,
+    help="Timed runs of auto and of the best.",
+)
+@click.option("--worst", default=12, show_default=True, help="Cases to list.")
+@click.option(
+    "--out", type=click.Path(path_type=Path), default=None, help="Write every measurement here too, JSON."
+)
+def auto(
+    files: tuple[str, ...],
+    families: str,
+    seeds: str,
+    levels: str,
+    limit: float,
+    repeats: int,
+    worst: int,
+    out: Path | None,
+) -> None:
+    """How much slower auto is than the best of our own solvers.
+
+    On FILES, or on families of the suite with seeds. Published seeds should be others than those tuned on.
+    """
+    first, colon, last = seeds.partition(":")
+    if not (colon and first.isdecimal() and last.isdecimal() and int(first) < int(last)):
+        raise InputError(f"--seeds {seeds!r}: A:B is needed, whole numbers with A < B")
+    try:
+        wanted = [float(word) for word in levels.replace(",", " ").split()]
+    except ValueError:
+        raise InputError(f"--levels {levels!r}: numbers with commas between them are needed") from None
+    names = list(files) or from_seeds(families.replace(",", " ").split(), int(last) - int(first), int(first))
+    if out is not None and not out.parent.is_dir():
+        raise InputError(f"--out {out}: there is no folder {out.parent}")
+
+    def cases() -> Iterator[tuple[str, str, Problem]]:
+        for item in resolve(names):
+            yield item.name, item.reason, item.problem
+            item.forget()
+
+    found: list[Regret] = []
+    click.echo(f"{machine.cpu_name()}; {len(names)} problems, {len(wanted)} levels", err=True)
+    try:
+        for r in regrets(cases(), levels=wanted, time_limit=limit, repeats=repeats):
+            found.append(r)
+            if len(found) % 30 == 0:
+                click.echo(f"{len(found)} done, mean so far {summary(found).mean:.2f}", err=True)
+    finally:
+        if found:
+            click.echo(table(found, worst))
+            if out is not None:
+                out.write_text(json.dumps([asdict(r) for r in found], indent=1) + "\n", encoding="utf-8")

@@ -1,0 +1,42 @@
+"""`lavender cases`."""
+
+from __future__ import annotations
+
+import click
+
+from lavender.cli.options import console
+
+__all__ = ["cases"]
+
+
+@click.command()
+@click.argument("pattern", default="")
+@click.option(
+    "--size", is_flag=True, help="Make each with its defaults and say how many rows it has, seconds."
+)
+def cases(pattern: str, size: bool) -> None:
+    """Families of the built-in suite: parameters, defaults, and why they are there.
+
+    PATTERN leaves those whose name or words hold it. A case is a family with parameters: "pyramid(k=20)".
+    """
+    from lavender.errors import UnknownName
+    from lavender.suite.case import FAMILIES, spell
+
+    found = {
+        name: f
+        for name, f in sorted(FAMILIES.items())
+        if pattern.lower() in name.lower() or pattern.lower() in f.summary.lower()
+    }
+    if not found:
+        raise UnknownName("family of cases", pattern, FAMILIES)
+    out = console()
+    for name, f in found.items():
+        given = {n: f.preset.get(n, p.default) for n, p in f.signature.parameters.items()}
+        words = ", ".join(n if v is p.empty else f"{n}={spell(v)}" for (n, v), p in
+                          zip(given.items(), f.signature.parameters.values(), strict=True))  # fmt: skip
+        out.print(f"{name}({words})", style="bold", highlight=False, markup=False, soft_wrap=True)
+        rows = ""
+        if size:
+            problem = f.case().problem
+            rows = f"{problem.m} rows, {problem.law}. "
+        out.print(f"    {rows}{f.summary}", highlight=False, markup=False, soft_wrap=True)

@@ -1,0 +1,173 @@
+"""Running a plan or a campaign with a progress bar, for the commands that measure."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from lavender.cli.options import bytes_of, console, one_thread
+from lavender.errors import InputError
+
+if TYPE_CHECKING:
+    from lavender.bench import Event, Item, Plan, Records
+
+__all__ = ["Measured", "check_named", "measure", "run_campaign"]
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What a command measured, or found measured."""
+
+    records: Records
+    stopped: bool  # by Ctrl-C
+    reused: int = 0  # of the records
+    since: str = ""  # when those were measured first
+
+    @property
+    def note(self) -> str:
+        """What was not measured now, in words; empty where everything was."""
+        if not self.reused:
+            return ""
+        return f"{self.reused} of {len(self.records)} runs reused of {self.since}; --fresh measures again"
+
+    @property
+    def lost(self) -> int:
+        """Cases of folders that did not load."""
+        return sum(not skip.solver for skip in self.records.skips)
+
+
+def check_named(items: Sequence[Item]) -> None:
+    """Load what was asked for by name, and let go of it.
+
+    Raises
+    ------
+    InputError
+        One of them does not load: nothing is measured, and no page touched.
+    """
+    from lavender.bench.running.runner import not_loaded
+
+    for item in items:
+        if item.named:
+            try:
+                _ = item.problem
+            except Exception as error:
+                raise InputError(not_loaded(item, error)) from None
+            item.forget()
+
+
+def measure(
+    files: Sequence[str],
+    solvers: Sequence[str] | None,
+    plan: Plan,
+    path: Path,
+    memory: float | None,
+    in_process: bool,
+    sequence: bool | None = None,
+    fresh: bool = False,
+) -> Measured:
+    """Run with a progress bar.
+
+    Raises
+    ------
+    InputError
+        A file that was named and does not load; a folder that cannot be written or that another process writes.
+    """
+    from lavender import bench
+
+    one_thread()
+    bench.solver_names(solvers)  # before anything is loaded: names first
+    if sequence and not files:
+        raise InputError("--sequence needs a folder of problem files, one for each step")
+    reused = 0
+    with bench.Store(path) as store:
+        items = bench.resolve(files, sequence)
+        check_named(items)
+        before = {name: run.started for name, run in store.records.runs.items()}
+        found: list[Records] = []
+        with _Progress() as bar:
+
+            def watch(event: Event) -> None:
+                nonlocal reused
+                reused += event.reused
+                bar(event)
+
+            stopped = False
+            try:
+                bench.run(
+                    items,
+                    solvers,
+                    plan,
+                    store,
+                    watch=watch,
+                    isolate=not in_process,
+                    memory=bytes_of(memory),
+                    into=found,
+                    fresh=fresh,
+                )
+            except KeyboardInterrupt:
+                stopped = True
+    since = before.get(next(iter(found[0].runs)), "") if reused else ""
+    return Measured(found[0], stopped, reused, since.replace("T", " ")[:16])
+
+
+def run_campaign(
+    words: Sequence[str],
+    solvers: Sequence[str] | None,
+    plan: Any,
+    path: Path,
+    *,
+    workers: int,
+    backend: str,
+    memory: float | None,
+) -> Measured:
+    """Run a campaign with a progress bar; raises as `measure`."""
+    from lavender import bench
+
+    one_thread()
+    check_named(bench.resolve(words))
+    with bench.Store(path) as store, _Progress() as watch:
+        try:
+            made = bench.campaign(
+                words,
+                solvers,
+                plan,
+                store,
+                workers=workers,
+                backend=backend,
+                watch=watch,
+                memory=bytes_of(memory),
+            )
+        except KeyboardInterrupt:
+            return Measured(bench.read(path).latest(), True)
+        return Measured(made, False)
+
+
+class _Progress:
+    """A progress bar over pairs of case and solver, on a terminal; silent elsewhere."""
+
+    def __enter__(self) -> Callable[[Event], None]:
+        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+        self.bar = Progress(
+            BarColumn(),
+            MofNCompleteColumn(),
+            TimeElapsedColumn(),
+            TextColumn("{task.fields[what]}", markup=False),
+            console=console(stderr=True),
+            transient=True,
+            refresh_per_second=4,  # drawing takes time from what is being timed
+        )
+        self.bar.start()
+        task = self.bar.add_task("", total=None, what="")
+
+        def watch(event: Event) -> None:
+            self.bar.update(
+                task, completed=event.done, total=event.total, what=f"{event.case} {event.solver}".strip()
+            )
+
+        return watch
+
+    def __exit__(self, *_: object) -> None:
+        self.bar.stop()

@@ -1,0 +1,262 @@
+"""What commands share: kinds of values, options of a plan, the console, exit codes."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from lavender.errors import InputError
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from lavender.bench import Plan
+
+    _ParamType = click.ParamType[Any]  # generic for type checkers since click 8.2, never for click 8.1
+else:
+    _ParamType = click.ParamType
+
+__all__ = [
+    "EXIT_BAD_INPUT",
+    "EXIT_INFEASIBLE",
+    "EXIT_INTERRUPTED",
+    "EXIT_UNMET",
+    "ManyValues",
+    "Names",
+    "Numbers",
+    "Seeds",
+    "bytes_of",
+    "console",
+    "make_plan",
+    "one_thread",
+    "plain",
+    "plan_options",
+]
+
+EXIT_UNMET = 1  # a claim not met: unsolved, a failed check, an unreadable file met in a folder
+EXIT_BAD_INPUT = 2  # or a folder that another process writes
+EXIT_INFEASIBLE = 3  # with a certificate that the judge confirms
+EXIT_INTERRUPTED = 130
+THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
+
+
+def _is_order(word: str) -> bool:
+    from lavender.ordering import ORDERS
+
+    return word.partition(":")[0] in ORDERS
+
+
+def _is_solver(word: str) -> bool:
+    from lavender import registry
+
+    return word in registry.specs() and not Path(word).exists()
+
+
+class ManyValues(click.Command):
+    """`--levels 1e-3 1e-6` as well as `--levels 1e-3,1e-6`: what follows is taken while it fits the option."""
+
+    FITS: dict[str, Callable[[str], bool]] = {  # noqa: RUF012 - a constant of the class
+        "--levels": _is_number,
+        "--budgets": _is_number,
+        "--time-budgets": _is_number,
+        "--solvers": _is_solver,
+        "--orders": _is_order,
+    }
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Fold the values of such an option into one word, then parse as click does."""
+        folded: list[str] = []
+        i = 0
+        while i < len(args):
+            word = args[i]
+            folded.append(word)
+            i += 1
+            if word in self.FITS and i < len(args):
+                values = [args[i]]
+                i += 1
+                while i < len(args) and not args[i].startswith("-") and self.FITS[word](args[i]):
+                    values.append(args[i])
+                    i += 1
+                folded.append(",".join(values))
+        return super().parse_args(ctx, folded)
+
+
+class Numbers(_ParamType):
+    """Numbers with commas or blanks between them."""
+
+    name = "x,x,..."
+
+    def __init__(self, kind: type = float) -> None:
+        self.kind = kind
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[Any, ...]:
+        """A tuple of numbers."""
+        if not isinstance(value, str):
+            return tuple(value)
+        try:
+            return tuple(self.kind(word) for word in value.replace(",", " ").split())
+        except ValueError:
+            return self.fail(
+                f"{value!r} is not a list of {'whole ' if self.kind is int else ''}numbers", param, ctx
+            )
+
+
+class Names(_ParamType):
+    """Words with commas or blanks between them."""
+
+    name = "a,b,..."
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[str, ...]:
+        """A tuple of words."""
+        return tuple(value.replace(",", " ").split()) if isinstance(value, str) else tuple(value)
+
+
+class Seeds(_ParamType):
+    """N or A:B, whole numbers."""
+
+    name = "n"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> range:
+        """The seeds."""
+        if isinstance(value, range):
+            return value
+        first, colon, last = str(value).partition(":")
+        if not colon:
+            first, last = "0", first
+        if not (first.isdecimal() and last.isdecimal() and int(first) < int(last)):
+            return self.fail(f"{value!r} is not N or A:B, whole numbers with A < B", param, ctx)
+        return range(int(first), int(last))
+
+
+def one_thread() -> None:
+    """One thread for libraries that are loaded later; those that are loaded are limited while timing."""
+    for name in THREADS:
+        os.environ.setdefault(name, "1")
+
+
+def console(stderr: bool = False) -> Console:
+    """A terminal to print on; into a file or a pipe as wide as tables need."""
+    from rich.console import Console
+
+    made = Console(stderr=stderr)
+    if not made.is_terminal and "COLUMNS" not in os.environ:
+        made = Console(stderr=stderr, width=10_000)  # a file or a pipe: nothing is folded or cut
+    return made
+
+
+def plan_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """The options of what is measured."""
+    options = (
+        click.option("--solvers", type=Names(), help="Solvers by name; all that are installed if not given."),
+        click.option(
+            "--levels",
+            type=Numbers(),
+            default="1e-3,1e-6,1e-9",
+            show_default=True,
+            help="Relative residuals to reach.",
+        ),
+        click.option(
+            "--budgets",
+            type=Numbers(int),
+            default="4,8,16,32,64",
+            show_default=True,
+            help="Exact iteration counts.",
+        ),
+        click.option(
+            "--orders",
+            type=Names(),
+            default=None,
+            help="Sweep orders beside 'given', at the middle budget; random:3 is seed 3.",
+        ),
+        click.option(
+            "--repeats",
+            type=int,
+            default=3,
+            show_default=True,
+            help="Solves of each kind; minimum and median count.",
+        ),
+        click.option(
+            "--time-limit",
+            type=float,
+            default=None,
+            metavar="S",
+            help="Of one solve; 1 s, or 0.25 s for the built-in suite.",
+        ),
+        click.option(
+            "--memory",
+            type=float,
+            default=None,
+            metavar="GB",
+            help="Limit of each process of a backend of another package; default: half of the machine's memory, "
+            "shared by the workers of a campaign.",
+        ),
+        click.option(
+            "--in-process",
+            is_flag=True,
+            help="Run backends of other packages here, not in a process of their own.",
+        ),
+    )
+    for option in reversed(options):
+        command = option(command)
+    return command
+
+
+def make_plan(
+    files: Sequence[str],
+    levels: Sequence[float],
+    budgets: Sequence[int],
+    orders: Sequence[str] | None,
+    repeats: int,
+    time_limit: float | None,
+) -> Plan:
+    """The plan that those options mean.
+
+    Raises
+    ------
+    InputError
+        A level, budget or limit that means nothing.
+    """
+    from lavender.bench import Plan
+
+    if time_limit is None:
+        time_limit = 1.0 if files else 0.25  # all of the suite in a minute
+    more: dict[str, Any] = {} if orders is None else {"orders": orders}
+    return Plan(levels=levels, budgets=budgets, repeats=repeats, time_limit=time_limit, **more)
+
+
+def bytes_of(gigabytes: float | None) -> int | None:
+    """Bytes of an option in GB.
+
+    Raises
+    ------
+    InputError
+        Not a positive number.
+    """
+    if gigabytes is None:
+        return None
+    if not 0.0 < gigabytes < 2**20:
+        raise InputError(f"memory is {gigabytes} GB; a positive number is needed")
+    return int(gigabytes * 2**30)
+
+
+def plain(text: str) -> str:
+    """Text with what rich would take for markup escaped."""
+    from rich.markup import escape
+
+    return escape(text)

@@ -1,0 +1,150 @@
+"""`lavender report`."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import click
+
+from lavender.cli.measuring import Measured, measure, run_campaign
+from lavender.cli.options import (
+    EXIT_INTERRUPTED,
+    EXIT_UNMET,
+    ManyValues,
+    Numbers,
+    Seeds,
+    console,
+    make_plan,
+    plan_options,
+)
+from lavender.errors import InputError
+
+__all__ = ["report"]
+
+
+@click.command(cls=ManyValues)
+@click.argument("files", nargs=-1, metavar="[FILES | FOLDERS | NAMES]...")
+@plan_options
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path),
+    default=Path("lavender-report"),
+    show_default=True,
+    help="Folder of the report.",
+)
+@click.option(
+    "--sequence/--no-sequence",
+    default=None,
+    help="Each FOLDER holds the steps of a simulation: carry impulses from step to step. Known by itself of what "
+    "`lavender run --record` leaves.",
+)
+@click.option("--campaign", is_flag=True, help="Error and robustness by many workers; no times.")
+@click.option(
+    "--seeds",
+    type=Seeds(),
+    default="1",
+    metavar="N | A:B",
+    help="With --campaign: seeds 0 to N - 1, or A to B - 1, of cases that take one.",
+)
+@click.option("--workers", type=int, default=-1, help="With --campaign: processes; -1 is one for each core.")
+@click.option(
+    "--backend", default="loky", show_default=True, help="With --campaign: a backend of joblib, such as dask."
+)
+@click.option(
+    "--compare",
+    type=click.Path(path_type=Path),
+    help="Earlier records (.jsonl, or their folder) to compare with.",
+)
+@click.option(
+    "--time-budgets",
+    type=Numbers(),
+    default=(),
+    metavar="S,S,...",
+    help="Seconds for which a solver is recommended; default: three decades about the fastest times.",
+)
+@click.option(
+    "--peers",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="What `lavender bench peers --out FILE` measured, to show beside.",
+)
+@click.option("--tables", is_flag=True, help="Print every case and sequence too.")
+@click.option("--fresh", is_flag=True, help="Measure again what the folder holds already.")
+@click.option("--no-figures", is_flag=True, help="Leave out the SVG and PNG files.")
+def report(
+    files: tuple[str, ...],
+    solvers: tuple[str, ...] | None,
+    levels: tuple[float, ...],
+    budgets: tuple[int, ...],
+    orders: tuple[str, ...] | None,
+    repeats: int,
+    time_limit: float | None,
+    memory: float | None,
+    in_process: bool,
+    out: Path,
+    sequence: bool | None,
+    campaign: bool,
+    seeds: range,
+    workers: int,
+    backend: str,
+    compare: Path | None,
+    time_budgets: tuple[float, ...],
+    peers: Path | None,
+    tables: bool,
+    fresh: bool,
+    no_figures: bool,
+) -> None:
+    """Speed against error: every solver on every case, to each level and at each budget.
+
+    FILES are problems (.npz, .hdf5), folders of them, folders of recorded steps, or cases of the built-in
+    suite such as "stack(n=64)"; without any, the built-in suite runs. A records.jsonl is shown again
+    without solving. The same command goes on where it was stopped.
+
+    Exits with 1 when a file met in a folder cannot be read, with 2 when one that was named cannot, or when
+    another report writes the folder.
+    """
+    from lavender import bench
+    from lavender.bench.peers import read as read_peers
+    from lavender.report.terminal import print_report
+    from lavender.report.text import count
+    from lavender.report.write import write
+
+    for limit in time_budgets:
+        if not (math.isfinite(limit) and limit > 0.0):
+            raise InputError(f"time budget {limit} must be a positive number of seconds")
+    shown_on = console()
+    old = None if compare is None else bench.read(compare)
+    rivals = None if peers is None else read_peers(peers)
+    shown = [Path(f) for f in files if f.endswith(".jsonl")]
+    if shown:
+        if len(files) > 1:
+            raise InputError("a records.jsonl is shown alone: give one, and no problems")
+        done = Measured(bench.read(shown[0]), False)
+    elif campaign:
+        many = bench.CampaignPlan(levels=levels, budgets=budgets, orders=orders or ())
+        words = bench.seeds(files, len(seeds), seeds.start)
+        done = run_campaign(
+            words, solvers, many, out / "records.jsonl", workers=workers, backend=backend, memory=memory
+        )
+    else:
+        plan = make_plan(files, levels, budgets, orders, repeats, time_limit)
+        done = measure(files, solvers, plan, out / "records.jsonl", memory, in_process, sequence, fresh)
+    records = done.records
+    print_report(records, shown_on, old=old, times=time_budgets, whole=tables)
+    index = write(records, out, figures=not no_figures, old=old, times=time_budgets, peers=rivals)
+    shown_on.print(
+        f"\n{len(records)} runs in {out / 'records.csv'}, page: {index}",
+        highlight=False,
+        markup=False,
+        soft_wrap=True,
+    )
+    if done.note:
+        shown_on.print(done.note, highlight=False, markup=False, soft_wrap=True)
+    if done.stopped:
+        shown_on.print("[yellow]Stopped; the same command goes on from here.[/]")
+        raise click.exceptions.Exit(EXIT_INTERRUPTED)
+    if done.lost and not shown:
+        said = f"{count(done.lost, 'case')} of a folder did not load"
+        shown_on.print(said, style="yellow", highlight=False, markup=False)
+        raise click.exceptions.Exit(EXIT_UNMET)

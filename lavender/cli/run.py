@@ -1,0 +1,118 @@
+"""`lavender run`."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import click
+
+from lavender.errors import InputError
+
+__all__ = ["run"]
+
+
+@click.command()
+@click.argument("scene")
+@click.option("--steps", type=int, default=240, show_default=True, help="Steps to run.")
+@click.option("--iterations", type=int, default=None, help="Budget of the velocity solve; 4 to 64 sweeps.")
+@click.option(
+    "--warm-start/--no-warm-start", default=True, show_default=True, help="Carry impulses from step to step."
+)
+@click.option(
+    "--set",
+    "parameters",
+    multiple=True,
+    metavar="NAME=VALUE",
+    help="A parameter of the scene, e.g. n=20 or order=top_down; may be repeated.",
+)
+@click.option("--residual", is_flag=True, help="Judge all rows of every step too.")
+@click.option("--plot", type=click.Path(path_type=Path), default=None, help="Figure of the run (.svg, .png).")
+@click.option("--trace", type=click.Path(path_type=Path), default=None, help="Every step's values, .csv.")
+@click.option(
+    "--record",
+    type=click.Path(path_type=Path),
+    default=None,
+    help="Folder for the problem of every step, .npz.",
+)
+@click.option(
+    "--skip", type=int, default=0, show_default=True, help="Steps before the first that is recorded."
+)
+@click.option("--view", is_flag=True, help="Show the run in a page on this machine, live, then until Ctrl-C.")
+@click.option(
+    "--film",
+    type=click.Path(path_type=Path),
+    default=None,
+    help="Film of the run: .gif or .png pictures, or a file for `lavender view`.",
+)
+def run(
+    scene: str,
+    steps: int,
+    iterations: int | None,
+    warm_start: bool,
+    parameters: tuple[str, ...],
+    residual: bool,
+    plot: Path | None,
+    trace: Path | None,
+    record: Path | None,
+    skip: int,
+    view: bool,
+    film: Path | None,
+) -> None:
+    """Run a LavenderSim scene of the gallery; record its steps as a sequence for `report`.
+
+    SCENE is stack, pyramid, card_house, pile, chain, bridge, heavy_on_light, table, ramp, spinner,
+    newtons_cradle or four_bar.
+    """
+    from lavender.engine import run_scene
+
+    live = sys.stdout.isatty()
+
+    def show(text: str) -> None:
+        # on a terminal each line takes the place of the one before
+        click.echo(f"\r{text}\x1b[K" if live else text, nl=not live)
+
+    found = run_scene(
+        scene,
+        steps=steps,
+        iterations=iterations,
+        warm_start=warm_start,
+        parameters=_parameters(parameters),
+        residual=residual,
+        trace=trace,
+        plot=plot,
+        record=record,
+        skip=skip,
+        view=view,
+        film=film,
+        every=1 if live else max(1, steps // 20),
+        show=show,
+    )
+    if live:
+        click.echo()
+    best = 1e3 * found.cost.min()
+    click.echo(f"{found.scene}: {len(found)} steps, {found.time[-1]:.3f} s, {best:.3g} ms a step at best")
+    for name, path in (("trace", trace), ("figure", plot), ("film", film)):
+        if path is not None:
+            click.echo(f"{name}: {path}")
+    if record is not None:
+        click.echo(f"{found.recorded} problems in {record}: lavender report {record}")
+
+
+def _parameters(words: tuple[str, ...]) -> dict[str, Any]:
+    """`n=20` as {"n": 20}: numbers, true and false, none; else a word."""
+    found: dict[str, Any] = {}
+    for word in words:
+        name, equals, value = word.partition("=")
+        if not equals or not name:
+            raise InputError(f"--set {word!r}; NAME=VALUE is needed")
+        known = {"true": True, "false": False, "none": None}
+        if value.lower() in known:
+            found[name] = known[value.lower()]
+            continue
+        try:
+            found[name] = float(value) if not value.lstrip("+-").isdigit() else int(value)
+        except ValueError:
+            found[name] = value
+    return found

@@ -1,0 +1,121 @@
+"""`lavender solve`."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import click
+
+from lavender.cli.options import EXIT_INFEASIBLE, EXIT_INTERRUPTED, EXIT_UNMET, one_thread
+from lavender.errors import InputError
+
+__all__ = ["solve"]
+
+
+@click.command()
+@click.argument("file")
+@click.option("--solver", default="auto", show_default=True, help="Name; see `lavender solvers`.")
+@click.option(
+    "--tol",
+    type=float,
+    default=1e-6,
+    show_default=True,
+    help="Relative residual asked for; 0 runs the whole budget.",
+)
+@click.option("--max-iter", type=int, default=None, help="Iteration budget; default: the solver's.")
+@click.option("--time-limit", type=float, default=None, metavar="S")
+@click.option("--order", default=None, help="Sweep order, for solvers that take one.")
+@click.option("--seed", type=int, default=None, help="Of a random order.")
+@click.option("--history", is_flag=True, help="Print the residual along the way.")
+@click.option(
+    "--output",
+    type=click.Path(path_type=Path),
+    default=None,
+    help="Write impulse, slack and what was said of them, .npz.",
+)
+def solve(
+    file: str,
+    solver: str,
+    tol: float,
+    max_iter: int | None,
+    time_limit: float | None,
+    order: str | None,
+    seed: int | None,
+    history: bool,
+    output: Path | None,
+) -> None:
+    """Solve one problem (a file, or a case of the suite) and say how wrong the answer is.
+
+    Exits with 0 when the judge accepts the answer (within tol, or at the floor of float64; with --tol 0 always),
+    with 1 when it does not, with 3 when the problem is infeasible, proved by a certificate that the judge confirms.
+    """
+    from lavender import bench
+    from lavender.report.text import residual, seconds
+    from lavender.solve import solve as solve_problem
+
+    one_thread()
+    if output is not None:
+        _check_writable(output)
+    (item, *more) = bench.resolve([file])
+    if more:
+        raise InputError(f"{file} holds {len(more) + 1} problems; give one file")
+    options: dict[str, Any] = {k: v for k, v in (("order", order), ("seed", seed)) if v is not None}
+    solution = solve_problem(
+        item.problem, solver, tol=tol, max_iter=max_iter, time_limit=time_limit, history=history, **options
+    )
+    click.echo(f"{item.name}: {item.problem.law}, {item.problem.m} rows")
+    if solution.history is not None:
+        click.echo(f"{'iterations':>10}  {'time':>9}  {'relative':>9}  {'energy':>9}  {'velocity':>9}")
+        h = solution.history
+        for n, t, r, e, v in zip(h.iterations, h.time, h.relative, h.energy, h.velocity, strict=True):
+            click.echo(f"{n:>10}  {seconds(t):>9}  {residual(r):>9}  {residual(e):>9}  {residual(v):>9}")
+    click.echo(str(solution))
+    if output is not None:
+        import numpy as np
+
+        try:
+            with output.open("wb") as f:
+                np.savez(
+                    f,
+                    impulse=solution.impulse,
+                    slack=solution.slack,
+                    error=solution.residual.error,
+                    relative=solution.residual.relative,
+                    energy=solution.residual.energy,
+                    velocity=solution.residual.velocity,
+                    floor=solution.residual.floor,
+                    status=solution.status.name,
+                    solver=solution.solver.name,
+                    iterations=solution.iterations,
+                    setup_time=solution.setup_time,
+                    solve_time=solution.solve_time,
+                )
+        except OSError as error:
+            raise _unwritable(output, error) from None
+        click.echo(f"written: {output}")
+    if solution.status.name == "INTERRUPTED":
+        raise click.exceptions.Exit(EXIT_INTERRUPTED)
+    if solution.status.name == "INFEASIBLE" and not solution.contradicted:
+        raise click.exceptions.Exit(EXIT_INFEASIBLE)
+    judged = solution.residual
+    at_floor = math.isfinite(judged.floor) and judged.relative <= 2.0 * judged.floor
+    if tol > 0.0 and not (solution.success or at_floor):
+        raise click.exceptions.Exit(EXIT_UNMET)
+
+
+def _unwritable(path: Path, error: OSError) -> InputError:
+    return InputError(f"cannot write {path} ({error.strerror or error}): give a path that you may write to")
+
+
+def _check_writable(path: Path) -> None:
+    # Opened for appending: what is there stays, and nothing is left where nothing was.
+    existed = path.exists()
+    try:
+        with path.open("ab"):
+            pass
+    except OSError as error:
+        raise _unwritable(path, error) from None
+    if not existed:
+        path.unlink()

@@ -1,0 +1,53 @@
+"""`lavender solvers`."""
+
+from __future__ import annotations
+
+import click
+
+from lavender.cli.options import console, plain
+
+__all__ = ["solvers"]
+
+
+@click.command()
+@click.option("--problem", default=None, help="Say for this problem (file or suite case) who takes it.")
+def solvers(problem: str | None) -> None:
+    """What is installed, or why not, and what each solver can do."""
+    from rich.table import Table
+
+    from lavender import bench, registry
+    from lavender.problem import OPERATORS
+
+    given = bench.resolve([problem])[0].problem if problem else None
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    for name in ("solver", "laws", "reads", "can", "what it is"):
+        table.add_column(name, no_wrap=name == "solver", overflow="fold")
+    reasons = registry.known(given)
+    # What is here, and what takes the problem, first.
+    order = sorted(registry.specs().items(), key=lambda pair: (reasons[pair[0]] is not None, pair[0]))
+    for name, spec in order:
+        abilities = [
+            word
+            for word, has in (
+                ("exact", spec.exact),
+                ("warm start", spec.impulse),
+                ("budget", spec.resumable),
+                ("order", spec.order),
+                ("seed", spec.seed),
+                ("threads", spec.threads),
+                ("history", spec.history),
+            )
+            if has
+        ]
+        reason = reasons[name]
+        what = spec.summary if reason is None else f"[yellow]{plain(reason)}[/]"
+        laws = [law for law in ("linear", "lcp", "coulomb", "cone") if law in spec.laws]
+        table.add_row(
+            name,
+            " ".join(laws),
+            " ".join(o for o in OPERATORS if o in spec.operators),
+            ", ".join(abilities),
+            what,
+            style="" if reason is None else "dim",
+        )
+    console().print(table)

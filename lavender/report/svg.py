@@ -1,0 +1,214 @@
+"""Figures as SVG within the page: drawn here, so that they are there without a script, in print and on a phone.
+
+A curve is one path in whole units of a canvas twice as fine as it is shown. It carries the number of its solver,
+by which the page colours it, and what its points were asked for; the page's script reads values back from the
+places of points and the axes that the drawing carries, so nothing is said twice.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from html import escape
+
+from lavender.report.curves import Curve, Figure
+from lavender.report.draw import power_on_axis, seconds_on_axis
+
+__all__ = ["svg"]
+
+WIDTH, HEIGHT = 1000, 640  # units, twice the pixels of a phone's width
+LEFT, RIGHT, TOP, BOTTOM = 118, 210, 54, 92  # margins: labels of the axis; names at the ends of curves
+GAP = 30  # units between two names, at least
+LEAST_DECADES = 1.0  # a logarithmic axis spans so much, at least
+
+
+class _Axis:
+    """Values to units."""
+
+    def __init__(self, values: Sequence[float], log: bool, first: float, last: float) -> None:
+        self.log, self.first, self.last = log, first, last
+        found = [math.log10(v) if log else v for v in values]
+        low, high = (min(found), max(found)) if found else (0.0, 1.0)
+        least = LEAST_DECADES if log else 1e-300
+        if high - low < least:
+            middle = 0.5 * (low + high)
+            low, high = middle - 0.5 * least, middle + 0.5 * least
+        room = 0.03 * (high - low) if high > low else 0.5
+        self.low, self.high = low - room, high + room
+
+    def __call__(self, value: float) -> int:
+        x = math.log10(value) if self.log else value
+        return round(self.first + (self.last - self.first) * (x - self.low) / (self.high - self.low))
+
+    def ticks(self) -> list[float]:
+        """Decades, every second or third where there are many; else about five round numbers."""
+        if self.log:
+            decades = list(range(math.ceil(self.low), math.floor(self.high) + 1))
+            ticks = [10.0**k for k in decades[:: max(1, -(-len(decades) // 7))]]
+            if len(decades) < 2:
+                ticks = [
+                    m * 10.0**k
+                    for k in range(math.floor(self.low), math.ceil(self.high) + 1)
+                    for m in (1, 2, 5)
+                    if self.low <= math.log10(m * 10.0**k) <= self.high
+                ]
+            return ticks
+        step = 10.0 ** math.floor(math.log10((self.high - self.low) / 2.0))
+        step *= next((m for m in (1.0, 2.0, 5.0, 10.0) if (self.high - self.low) / (m * step) <= 6.0), 10.0)
+        first = math.ceil(self.low / step)
+        return [step * k for k in range(first, first + 12) if step * k <= self.high]
+
+    def data(self) -> str:
+        """What a script needs to read a value off a place."""
+        return f"{int(self.log)} {self.low:.4f} {self.high:.4f} {self.first} {self.last}"
+
+
+def svg(
+    figure: Figure, number: Mapping[str, int], leaders: Sequence[str] = (), title: str | None = None
+) -> str:
+    """One drawing.
+
+    Parameters
+    ----------
+    figure : Figure
+    number : place of each solver among those of the page, its class
+    leaders : solvers in colour, whose names must not cover each other
+    title : in place of the figure's own, which may repeat a heading of the page
+    """
+    curves = [(c, *_finite(c, figure)) for c in figure.curves]
+    curves = [(c, x, y) for c, x, y in curves if any(not math.isnan(v) for v in y)]
+    xs = [v for _, x, y in curves for v, w in zip(x, y, strict=True) if not math.isnan(w)]
+    ys = [v for _, _, y in curves for v in y if not math.isnan(v)]
+    across = _Axis(xs, figure.x_log, LEFT, WIDTH - RIGHT)
+    up = _Axis(ys, figure.y_log, HEIGHT - BOTTOM, TOP)
+    said = f"{int('[s]' in figure.x_title)}{int('[s]' in figure.y_title)}"
+    parts = [
+        f'<svg class="chart" viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{escape(figure.title)}"',
+        f' data-x="{across.data()}" data-y="{up.data()}" data-t="{said}">',
+        f'<text class="t" x="{LEFT}" y="30">{escape(_short(figure.title if title is None else title))}</text>',
+    ]
+    parts += _grid(figure, across, up)
+    names = _names(curves, across, up, leaders)
+    for c, x, y in curves:
+        parts.append(_curve(c, x, y, across, up, number.get(c.solver, 0), names))
+    return "".join([*parts, "</svg>"])
+
+
+def _finite(curve: Curve, figure: Figure) -> tuple[list[float], list[float]]:
+    """Points that the axes can show; nan breaks a line."""
+    x, y = [], []
+    for a, b in zip(curve.x, curve.y, strict=True):
+        shown = math.isfinite(a) and (a > 0.0 or not figure.x_log)
+        x.append(a if shown else math.nan)
+        y.append(b if shown and math.isfinite(b) and (b > 0.0 or not figure.y_log) else math.nan)
+    return x, y
+
+
+def _short(text: str, most: int = 76) -> str:
+    return text if len(text) <= most else text[: most - 1] + "…"
+
+
+def _grid(figure: Figure, across: _Axis, up: _Axis) -> list[str]:
+    bottom, right = HEIGHT - BOTTOM, WIDTH - RIGHT
+    lines, words = [], []
+    for axis, title, is_x in ((across, figure.x_title, True), (up, figure.y_title, False)):
+        for value in axis.ticks():
+            place = axis(value)
+            said = _tick(value, axis.log, "[s]" in title)
+            if is_x:
+                lines.append(f"M{place} {TOP}V{bottom}")
+                words.append(
+                    f'<text class="a" x="{place}" y="{bottom + 30}" text-anchor="middle">{said}</text>'
+                )
+            else:
+                lines.append(f"M{LEFT} {place}H{right}")
+                words.append(
+                    f'<text class="a" x="{LEFT - 10}" y="{place + 8}" text-anchor="end">{said}</text>'
+                )
+    out = [f'<path class="g" d="{"".join(lines)}"/>', *words]
+    middle = (LEFT + right) // 2
+    out.append(
+        f'<text class="a" x="{middle}" y="{HEIGHT - 20}" text-anchor="middle">{escape(figure.x_title)}</text>'
+    )
+    out.append(f'<text class="a" x="{LEFT}" y="{TOP - 2}">{escape(figure.y_title)}</text>')
+    marks = [(level, "l", "") for level in figure.levels]
+    if math.isfinite(figure.floor) and figure.floor > 0.0:
+        marks.append((figure.floor, "f", "floor"))
+    for value, kind, said in marks:
+        if value > 0.0 and TOP <= up(value) <= bottom:
+            out.append(f'<path class="{kind}" d="M{LEFT} {up(value)}H{right}"/>')
+            if said:
+                out.append(
+                    f'<text class="a" x="{right - 6}" y="{up(value) - 6}" text-anchor="end">{said}</text>'
+                )
+    return out
+
+
+def _tick(value: float, log: bool, is_time: bool) -> str:
+    if is_time:
+        return seconds_on_axis(value)
+    return power_on_axis(value) if log else f"{value:.6g}"
+
+
+def _names(
+    curves: Sequence[tuple[Curve, list[float], list[float]]],
+    across: _Axis,
+    up: _Axis,
+    leaders: Sequence[str],
+) -> dict[str, tuple[int, int]]:
+    """Where the name of each curve stands: at its end, those of the leaders apart from each other."""
+    ends = {}
+    for c, x, y in curves:
+        if not c.thin:
+            a, b = next((a, b) for a, b in zip(reversed(x), reversed(y), strict=True) if not math.isnan(b))
+            ends[c.label] = (across(a) + 12, up(b) + 8)
+    taken: list[int] = []
+    for label in sorted(
+        (c.label for c, _, _ in curves if c.solver in leaders and c.label in ends), key=lambda k: ends[k][1]
+    ):
+        place = ends[label][1]
+        if taken:
+            place = max(place, taken[-1] + GAP)
+        taken.append(place)
+        ends[label] = (ends[label][0], place)
+    return ends
+
+
+def _curve(
+    c: Curve,
+    x: Sequence[float],
+    y: Sequence[float],
+    across: _Axis,
+    up: _Axis,
+    n: int,
+    names: Mapping[str, tuple[int, int]],
+) -> str:
+    line: list[str] = []
+    dots: list[str] = []
+    before: tuple[int, int] | None = None
+    for a, b in zip(x, y, strict=True):
+        if math.isnan(b):
+            before = None
+            continue
+        here = across(a), up(b)
+        if before is None:
+            line.append(f"M{here[0]} {here[1]}")
+        elif c.steps:
+            line.append(f"H{here[0]}V{here[1]}")
+        else:
+            line.append(f"L{here[0]} {here[1]}")
+        dots.append(f"M{here[0]} {here[1]}h0")
+        before = here
+    if c.steps and before is not None:
+        line.append(f"H{WIDTH - RIGHT}")
+    kind = f"c s{n}" + (" w" if c.thin else "")
+    asked = f' data-n="{escape("|".join(c.notes))}"' if c.notes else ""
+    body = "" if c.points else f'<path d="{"".join(line)}"/>'
+    if not c.steps:
+        body += f'<path class="d" d="{"".join(dots)}"/>'
+    if c.label in names and not c.thin:
+        place = names[c.label]
+        if c.steps and before is not None:
+            place = (WIDTH - RIGHT + 8, before[1] + 8)
+        body += f'<text x="{place[0]}" y="{place[1]}">{escape(_short(c.label, 24))}</text>'
+    return f'<g class="{kind}" data-l="{escape(c.label)}"{asked}>{body}</g>'

@@ -1,0 +1,81 @@
+"""Records -> plain tables (lists of small frozen rows). Nothing is solved, timed or drawn here."""
+
+from lavender.report.tables.advice import (
+    Advice,
+    Choice,
+    Line,
+    advice,
+    advice_by_level,
+    advice_by_sequence,
+    advice_by_time,
+    quantile,
+    time_budgets,
+    to_level,
+    within,
+)
+from lavender.report.tables.campaigns import Robustness, robustness
+from lavender.report.tables.cases import (
+    Claims,
+    Failure,
+    Reach,
+    Spread,
+    budgets,
+    claims,
+    failures,
+    reaches,
+    spreads,
+)
+from lavender.report.tables.changes import NOISE, Change, changes
+from lavender.report.tables.groups import families, is_campaign, levels_of, pairs
+from lavender.report.tables.means import (
+    SHIFT,
+    Profile,
+    geometric_mean,
+    geometric_means,
+    limit_of,
+    profiles,
+    times_to,
+)
+from lavender.report.tables.sequences import Walk, by_sequence, walks
+
+__all__ = [
+    "NOISE",
+    "SHIFT",
+    "Advice",
+    "Change",
+    "Choice",
+    "Claims",
+    "Failure",
+    "Line",
+    "Profile",
+    "Reach",
+    "Robustness",
+    "Spread",
+    "Walk",
+    "advice",
+    "advice_by_level",
+    "advice_by_sequence",
+    "advice_by_time",
+    "budgets",
+    "by_sequence",
+    "changes",
+    "claims",
+    "failures",
+    "families",
+    "geometric_mean",
+    "geometric_means",
+    "is_campaign",
+    "levels_of",
+    "limit_of",
+    "pairs",
+    "profiles",
+    "quantile",
+    "reaches",
+    "robustness",
+    "spreads",
+    "time_budgets",
+    "times_to",
+    "to_level",
+    "walks",
+    "within",
+]

@@ -1,0 +1,327 @@
+"""Which solver: for each structure and sequence, at each level and within each time."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from statistics import median
+
+from lavender.bench.record import Record
+from lavender.bench.store import Records
+from lavender.report.tables.groups import families, levels_of, pairs
+from lavender.report.tables.means import SHIFT, geometric_mean, limit_of, times_to
+from lavender.report.tables.sequences import by_sequence
+
+__all__ = [
+    "Advice",
+    "Choice",
+    "Line",
+    "advice",
+    "advice_by_level",
+    "advice_by_sequence",
+    "advice_by_time",
+    "quantile",
+    "time_budgets",
+    "to_level",
+    "within",
+]
+
+
+#: Factors within which two scores are the same: what a busy machine does to the minimum of a few repeats, and what
+#: one run more or less within a time does to a mean residual.
+NOISE, RESIDUAL_NOISE = 1.25, 2.0
+Groups = Mapping[tuple[str, str], Sequence[Record]]  # usable runs by (case, solver)
+FIRST = "auto"  # among equals: the only name that needs no choice
+
+
+@dataclass(frozen=True)
+class Choice:
+    """One solver's standing in a family of cases, or over the steps of a sequence."""
+
+    solver: str
+    solved: int
+    cases: int
+    score: float  # what ranks, and what is shown: shifted geometric mean of times [s], or of residuals [-]
+    p95: float = math.nan  # 95th percentile over the cases, of what `score` is the mean of; inf: not reached
+    worst: float = math.nan
+    hardest: str = ""  # the case of `worst`
+    how: str = ""  # the budget that does it, and for a sequence whether impulses are carried
+    iterations: int = 0  # of that budget, 0 where there is none
+
+
+@dataclass(frozen=True)
+class Advice:
+    """Solvers of a family in order of merit for one accuracy level or time budget."""
+
+    family: str
+    target: float  # level [-] or time [s]
+    ranking: tuple[Choice, ...]
+    equal: int = 1  # how many at the head are the best within noise; they stand in a fixed order
+
+    @property
+    def best(self) -> Choice | None:
+        """The recommended one; None when nobody got there."""
+        return self.ranking[0] if self.ranking and self.ranking[0].solved else None
+
+    @property
+    def ties(self) -> tuple[str, ...]:
+        """Names of those that are as good as the best, within noise."""
+        return tuple(c.solver for c in self.ranking[1 : self.equal]) if self.best else ()
+
+
+def ranked(
+    family: str, target: float, places: Iterable[tuple[tuple[float, ...], Choice]], noise: float
+) -> Advice:
+    """Order of merit: by key, then by score; who is within noise of the best, by name, so that a rerun agrees.
+
+    Parameters
+    ----------
+    family, target : of the advice
+    places : (key, choice); a smaller key is better whatever the score
+    noise : factor within which scores are equal
+    """
+    order = sorted(places, key=lambda place: (place[0], place[1].score, place[1].solver))
+    if not order:
+        return Advice(family, target, ())
+    key, best = order[0]
+    equal = [c for k, c in order if k == key and c.score <= noise * best.score]
+    equal.sort(key=lambda c: (c.solver != FIRST, c.solver))
+    rest = [c for _, c in order if all(c is not e for e in equal)]
+    return Advice(family, target, (*equal, *rest), len(equal))
+
+
+@dataclass(frozen=True)
+class Line:
+    """A line of the table of recommendations: a structure and its cases, or a sequence and its steps."""
+
+    name: str
+    size: int
+    sequence: bool
+    by_level: Mapping[float, Advice]
+    by_time: Mapping[float, Advice]
+
+
+def advice(records: Records, times: Sequence[float] = ()) -> list[Line]:
+    """Every recommendation: structures, then sequences; at each level and within each time [s]."""
+    times = tuple(times) or time_budgets(records)
+    steps = {name: walks[0].steps for name, walks in by_sequence(records).items()}
+    sizes = {name: len(cases) for name, cases in families(records).items()}
+    lines = []
+    by_sequence_level, by_sequence_time = advice_by_sequence(records, times)
+    for sizes_of, sequence, by_level, by_time in (
+        (sizes, False, advice_by_level(records), advice_by_time(records, times)),
+        (steps, True, by_sequence_level, by_sequence_time),
+    ):
+        for name, size in sizes_of.items():
+            found = ({a.target: a for a in some if a.family == name} for some in (by_level, by_time))
+            lines.append(Line(name, size, sequence, *found))
+    return lines
+
+
+def advice_by_level(records: Records) -> list[Advice]:
+    """For each structure and level: first who solves most cases, then who is fastest (shifted geometric mean).
+
+    A solver whose claim was wrong on a case of the family at any level comes after all that were not.
+    """
+    groups = _cold(records)
+    return [
+        to_level(records, family, cases, level, groups)
+        for family, cases in families(records).items()
+        for level in levels_of(records)
+    ]
+
+
+def to_level(
+    records: Records, family: str, cases: Sequence[str], level: float, groups: Groups | None = None
+) -> Advice:
+    """Who brings these cases to a level; see `advice_by_level`. `groups` spares another pass over the records."""
+    limit, groups = limit_of(records), groups or _cold(records)
+    liars = {(r.case, r.solver) for r in records if r.contradicted}
+    places: list[tuple[tuple[float, ...], Choice]] = []
+    for solver in sorted({s for c, s in groups if c in cases}):
+        runs = {c: _quickest(groups.get((c, solver), ()), level) for c in cases}
+        solved = [r for r in runs.values() if r is not None]
+        times = {c: math.inf if r is None else r.time_min for c, r in runs.items()}
+        charged = [min(t, limit) if math.isinf(t) else t for t in times.values()]
+        sweeps = [r.work["sweeps"] for r in solved if "sweeps" in r.work]
+        middle = round(median(sweeps)) if solved and len(sweeps) == len(solved) else 0
+        choice = Choice(
+            solver=solver,
+            solved=len(solved),
+            cases=len(cases),
+            score=geometric_mean(charged, SHIFT),
+            p95=quantile(list(times.values()), 0.95),
+            worst=max(times.values()),
+            hardest=max(times, key=lambda c: times[c]),
+            how=f"{middle} sweeps" if middle else "",
+            iterations=middle,
+        )
+        lies = any((c, solver) in liars for c in cases)
+        places.append(((lies, -len(solved)), choice))
+    return ranked(family, level, places, NOISE)
+
+
+def _quickest(runs: Iterable[Record], level: float) -> Record | None:
+    return min((r for r in runs if r.relative <= level), key=lambda r: r.time_min, default=None)
+
+
+def _cold(records: Records) -> dict[tuple[str, str], list[Record]]:
+    # Usable runs from a cold start by (case, solver); a pair that has none is there, with none.
+    return {
+        (c, s): [r for r in g if r.usable] for (c, s, start), g in pairs(records).items() if start == "cold"
+    }
+
+
+def time_budgets(records: Records) -> tuple[float, ...]:
+    """Three decades of time [s] about the median of the fastest times to the middle level."""
+    levels = levels_of(records)
+    level = levels[len(levels) // 2]
+    fastest = [min(by.values()) for by in times_to(records, level).values() if by]
+    for walks in by_sequence(records).values():
+        reached = [
+            median(w.times[start])
+            for w in walks
+            for start, residuals in w.residuals.items()
+            if len(residuals) == w.steps and max(residuals) <= level
+        ]
+        fastest.append(min(reached, default=math.inf))
+    fastest = [t for t in fastest if 0.0 < t < math.inf]
+    middle = math.ceil(math.log10(median(fastest))) if fastest else -3
+    return tuple(10.0**k for k in (middle - 1, middle, middle + 1))
+
+
+def advice_by_time(records: Records, times: Sequence[float] = ()) -> list[Advice]:
+    """For each structure and time budget: the smallest geometric mean of residuals reached in that time.
+
+    A solver with nothing to show in the time scores 1 on that case: doing nothing. "Solved" counts the
+    cases on which it brought anything back. `times` [s]; `time_budgets` if none are given.
+    """
+    times, groups = tuple(times) or time_budgets(records), _cold(records)
+    return [
+        within(records, family, cases, limit, groups)
+        for family, cases in families(records).items()
+        for limit in times
+    ]
+
+
+def within(
+    records: Records, family: str, cases: Sequence[str], limit: float, groups: Groups | None = None
+) -> Advice:
+    """Who comes closest on these cases within a time [s]; see `advice_by_time`.
+
+    A run that takes the time within noise may be in it or not the next time: who would be the best with it is
+    as good as the best.
+    """
+    groups = groups or _cold(records)
+    liars = {(r.case, r.solver) for r in records if r.contradicted}
+    places: list[tuple[tuple[float, ...], Choice]] = []
+    hopes: dict[str, float] = {}
+    for solver in sorted({s for c, s in groups if c in cases}):
+        got = {c: _closest(groups.get((c, solver), ()), limit) for c in cases}
+        hoped = (_closest(groups.get((c, solver), ()), NOISE * limit) for c in cases)
+        hopes[solver] = geometric_mean([1.0 if r is None else _score(r.relative) for r in hoped])
+        residuals = {c: 1.0 if r is None else _score(r.relative) for c, r in got.items()}
+        done = [r for r in got.values() if r is not None]
+        budgets = [r.work["sweeps"] for r in done if "sweeps" in r.work]
+        middle = round(median(budgets)) if done and len(budgets) == len(done) else 0
+        choice = Choice(
+            solver=solver,
+            solved=len(done),
+            cases=len(cases),
+            score=geometric_mean(list(residuals.values())),
+            p95=quantile(list(residuals.values()), 0.95),
+            worst=max(residuals.values()),
+            hardest=max(residuals, key=lambda c: residuals[c]),
+            how=f"{middle} sweeps" if middle else "",
+            iterations=middle,
+        )
+        places.append(((any((c, solver) in liars for c in cases),), choice))
+    found = ranked(family, limit, places, RESIDUAL_NOISE)
+    if found.best is None:
+        return found
+    best = min(c.score for c in found.ranking[: found.equal])
+    honest = {c.solver for key, c in places if not key[0]}
+    near = [
+        c
+        for c in found.ranking[found.equal :]
+        if c.solver in honest and hopes[c.solver] <= RESIDUAL_NOISE * best
+    ]
+    rest = [c for c in found.ranking[found.equal :] if all(c is not n for n in near)]
+    return Advice(family, limit, (*found.ranking[: found.equal], *near, *rest), found.equal + len(near))
+
+
+def _closest(runs: Iterable[Record], limit: float) -> Record | None:
+    return min((r for r in runs if r.time_min <= limit), key=lambda r: r.relative, default=None)
+
+
+def _score(residual: float) -> float:
+    # What counts in a geometric mean: nothing is better than exact, or worse than doing nothing.
+    return min(max(residual, 1e-17), 1.0) if residual == residual else 1.0
+
+
+def advice_by_sequence(records: Records, times: Sequence[float] = ()) -> tuple[list[Advice], list[Advice]]:
+    """For each sequence, by level and by time of a step: which solver, which budget, carried or cold.
+
+    To a level: who brings most steps there, then who takes least time for a step (the mean). In a time (the median
+    step keeps to it): the smallest geometric mean of the residuals; a step that was not solved counts 1. A
+    false claim on any step comes last.
+    """
+    times = tuple(times) or time_budgets(records)
+    by_level, by_time = [], []
+    for name, walks in by_sequence(records).items():
+        runs = [(w, start, f"{w.asked}, {start}") for w in walks for start in w.residuals]
+        for level in levels_of(records):
+            places: list[tuple[tuple[float, ...], Choice]] = []
+            for w, start, how in runs:
+                solved = sum(r <= level for r in w.residuals[start])
+                steps = list(w.times[start])
+                choice = Choice(
+                    solver=w.solver,
+                    solved=solved,
+                    cases=w.steps,
+                    score=sum(steps) / len(steps),
+                    p95=quantile(steps, 0.95),
+                    worst=max(steps),
+                    hardest=f"step {steps.index(max(steps))}",
+                    how=how,
+                    iterations=w.max_iter if w.mode == "budget" else 0,
+                )
+                places.append(((bool(w.wrong[start]), -solved), choice))
+            by_level.append(ranked(name, level, _best_of_each(places), NOISE))
+        for limit in times:
+            places = []
+            for w, start, how in runs:
+                if median(w.times[start]) <= limit:
+                    done = [_score(r) for r in w.residuals[start]]
+                    done += [1.0] * (w.steps - len(done))
+                    choice = Choice(
+                        solver=w.solver,
+                        solved=len(w.residuals[start]),
+                        cases=w.steps,
+                        score=geometric_mean(done),
+                        p95=quantile(done, 0.95),
+                        worst=max(done),
+                        hardest=f"step {done.index(max(done))}",
+                        how=how,
+                        iterations=w.max_iter if w.mode == "budget" else 0,
+                    )
+                    places.append(((bool(w.wrong[start]),), choice))
+            by_time.append(ranked(name, limit, _best_of_each(places), RESIDUAL_NOISE))
+    return by_level, by_time
+
+
+def _best_of_each(
+    places: Iterable[tuple[tuple[float, ...], Choice]],
+) -> list[tuple[tuple[float, ...], Choice]]:
+    # The best way of each solver.
+    first: dict[str, tuple[tuple[float, ...], Choice]] = {}
+    for place in sorted(places, key=lambda pair: (pair[0], pair[1].score)):
+        first.setdefault(place[1].solver, place)
+    return list(first.values())
+
+
+def quantile(values: Sequence[float], q: float) -> float:
+    """The smallest value that at least a share q of them does not exceed."""
+    ordered = sorted(values)
+    return ordered[min(len(ordered) - 1, math.ceil(q * len(ordered)) - 1)]

@@ -1,0 +1,113 @@
+"""Tables over the cases of one law: shifted geometric means and performance profiles."""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from lavender.bench.store import Records
+from lavender.report.tables.cases import reaches
+from lavender.report.tables.groups import levels_of
+
+__all__ = ["SHIFT", "Profile", "geometric_mean", "geometric_means", "limit_of", "profiles", "times_to"]
+
+
+#: s, of the geometric means, whoever takes part: what is quicker than that differs by Python's share of a call.
+SHIFT = 1e-5
+
+
+@dataclass(frozen=True)
+class Profile:
+    """Dolan-More performance profile of one level over the cases of one law."""
+
+    law: str
+    level: float
+    cases: int
+    curves: Mapping[str, tuple[tuple[float, float], ...]]  # solver -> (ratio, share) steps
+
+
+def geometric_mean(values: Sequence[float], shift: float = 0.0) -> float:
+    """exp(mean(log(x + shift))) - shift; nan for nothing."""
+    if not values:
+        return math.nan
+    return math.exp(sum(math.log(v + shift) for v in values) / len(values)) - shift
+
+
+def times_to(records: Records, level: float) -> dict[str, dict[str, float]]:
+    """Case -> solver -> time [s] to a level from a cold start, inf where missed; who refused is absent."""
+    out: dict[str, dict[str, float]] = defaultdict(dict)
+    for reach in reaches(records, [level]):
+        if reach.start == "cold":
+            out[reach.case][reach.solver] = reach.times[level]
+    return out
+
+
+def limit_of(records: Records) -> float:
+    """What a missed level is charged [s]: the time limit."""
+    return max((r.time_limit for r in records), default=1.0)
+
+
+def geometric_means(records: Records) -> dict[str, dict[float, dict[str, tuple[float, int, int]]]]:
+    """law -> level -> solver -> (shifted geometric mean [s], solved, cases); a miss costs the time limit.
+
+    A solver stands in a law's table when it takes every case of it.
+    """
+    limit = limit_of(records)
+    out: dict[str, dict[float, dict[str, tuple[float, int, int]]]] = {}
+    for law, cases in _laws(records).items():
+        out[law] = {}
+        for level in levels_of(records):
+            times = times_to(records, level)
+            by: dict[str, tuple[float, int, int]] = {}
+            for solver in _whole(times, cases):
+                t = [times[c][solver] for c in cases]
+                solved = sum(map(math.isfinite, t))
+                by[solver] = (
+                    geometric_mean([x if math.isfinite(x) else limit for x in t], SHIFT),
+                    solved,
+                    len(cases),
+                )
+            out[law][level] = dict(sorted(by.items(), key=lambda kv: kv[1][0]))
+    return out
+
+
+def _laws(records: Records) -> dict[str, list[str]]:
+    ran = {r.case for r in records if r.step < 0}
+    out: dict[str, list[str]] = defaultdict(list)
+    for name, info in records.cases.items():
+        if name in ran:
+            out[info.law].append(name)
+    return dict(out)
+
+
+def _whole(times: Mapping[str, Mapping[str, float]], cases: Sequence[str]) -> list[str]:
+    everyone = sorted({s for c in cases for s in times.get(c, {})})
+    return [s for s in everyone if all(s in times.get(c, {}) for c in cases)]
+
+
+def profiles(records: Records) -> list[Profile]:
+    """Share of cases that a solver brings to a level within `ratio` times the fastest; misses at infinity.
+
+    Over the cases of one law, and within one run (`Records.latest`); a case that nobody brought to the
+    level counts against everyone.
+    """
+    out = []
+    for law, cases in _laws(records).items():
+        for level in levels_of(records):
+            times = times_to(records, level)
+            curves: dict[str, tuple[tuple[float, float], ...]] = {}
+            for solver in sorted({s for c in cases for s in times.get(c, {})}):
+                ratios = []
+                for c in cases:
+                    t = times.get(c, {}).get(solver, math.inf)
+                    if math.isfinite(t):
+                        ratios.append(t / min(times[c].values()))
+                steps = [(1.0, sum(r <= 1.0 for r in ratios) / len(cases))]
+                steps += [
+                    (r, sum(q <= r for q in ratios) / len(cases)) for r in sorted(set(ratios)) if r > 1.0
+                ]
+                curves[solver] = tuple(steps)
+            out.append(Profile(law, level, len(cases), curves))
+    return out
