@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from lavender import bench, engine, io, motion, report, scene, suite
     from lavender.check import CrossCheck, cross_check
     from lavender.engine import SOLVER_FIELDS, Simulation, Snapshot
+    from lavender.io import load
     from lavender.motion import MotionError, Motions, motion_error, motions
     from lavender.scene import Scene
 
@@ -49,6 +50,7 @@ _LATER = {
     "cross_check": "lavender.check",
     "engine": "lavender.engine",
     "io": "lavender.io",
+    "load": "lavender.io",
     "motion": "lavender.motion",
     "motion_error": "lavender.motion",
     "motions": "lavender.motion",
@@ -94,6 +96,7 @@ __all__ = [
     "get",
     "io",
     "known",
+    "load",
     "motion",
     "motion_error",
     "motions",
@@ -119,4 +122,4 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *_LATER})
+    return sorted(__all__)

@@ -11,12 +11,13 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
+from os import PathLike
 from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
 
-from lavender._arrays import FloatArray, IntArray, as_array, check_not_negative, equal, read_only
+from lavender._arrays import FloatArray, IntArray, as_array, check_not_negative, equal, read_only, table_of
 from lavender._derived import Derived, once
 from lavender.cones import CONTACT_SPIN, ROUND, ROW, Cones
 from lavender.errors import CapabilityError, InputError
@@ -232,9 +233,28 @@ class Problem:
 
     @classmethod
     def contact(cls, A: Any, b: Any, mu: Any, patch_radius: Any = None, **more: Any) -> Problem:
-        """Contacts only, mu (k,), m / k rows each: normal, 0 to 2 tangents, spin with `patch_radius` (k,) [m]."""
+        """Contacts only, m / k rows each: normal, up to two tangents, spin with `patch_radius`.
+
+        Parameters
+        ----------
+        A : (m, m) 1/kg, array or sparse
+        b : (m,) m/s
+            Normal first in every contact.
+        mu : scalar or (k,)
+            One for each contact. A scalar stands for all of them, which then have two tangents, or for a single one.
+        patch_radius : scalar or (k,) m, optional
+            Gives each contact a spin row.
+
+        Raises
+        ------
+        InputError
+            The rows do not part among the contacts; mu > 0 where contacts have no row for friction.
+        """
         b = as_array("b", b, (None,), unit="m/s")
-        mu = as_array("mu", np.atleast_1d(np.asarray(mu)), (None,))
+        if np.ndim(mu) == 0:
+            each = 3 + (patch_radius is not None)
+            mu = np.full(max(1, len(b) // each) if len(b) % each == 0 else 1, mu)
+        mu = as_array("mu", np.asarray(mu), (None,))
         if (len(mu) == 0) != (len(b) == 0) or (len(mu) and len(b) % len(mu)):
             raise InputError(
                 f"b has {len(b)} rows for {len(mu)} values of mu; the same number of rows for each "
@@ -248,6 +268,11 @@ class Problem:
             )
         if patch_radius is not None:
             patch_radius = as_array("patch_radius", patch_radius, (len(mu),), unit="m")
+        elif tangents == 0 and np.any(mu > 0.0):
+            raise InputError(
+                f"mu has {len(mu)} values for {len(b)} rows, so each contact is a normal alone, without a row for "
+                "friction: give one mu for each contact (normal and tangents together), or mu = 0"
+            )
         return cls(b, Cones.contacts(mu, tangents, patch_radius), A, **more)
 
     @classmethod
@@ -259,7 +284,7 @@ class Problem:
         lower: Any = -np.inf,
         upper: Any = np.inf,
         mu: Any = 0.0,
-        tangents: Any = 0,
+        tangents: Any = None,
         patch_radius: Any = None,
         **more: Any,
     ) -> Problem:
@@ -273,18 +298,31 @@ class Problem:
         lower, upper : scalar or (mj,) N s
             Bounds of the joint rows.
         mu : scalar or (c,)
-        tangents : int or (c,)
-            Tangent rows of each contact, 0 to 2.
+        tangents : int or (c,), optional
+            Tangent rows of each contact, 0 to 2. Default: two where mu > 0.
         patch_radius : scalar or (c,) m, optional
             Gives each contact a spin row.
+
+        Raises
+        ------
+        InputError
+            mu > 0 at a contact without tangents and spin, which no row could feel.
         """
         if not isinstance(rows, Rows):
             raise InputError(f"rows is a {type(rows).__name__}; a Rows is needed")
         kj, c, mj = rows.n_joints, rows.n_contacts, len(rows.jac)
+        mu = as_array("mu", mu, (c,))
+        if tangents is None:
+            tangents = np.where(mu > 0.0, 2, 0)
         tangents = as_array("tangents", tangents, (c,), dtype=np.int32)
         if c and (tangents.min() < 0 or tangents.max() > 2):
             raise InputError("tangents must be 0, 1 or 2 for each contact")
         spin = patch_radius is not None
+        smooth = np.flatnonzero((mu > 0.0) & (tangents == 0))
+        if len(smooth) and not spin:
+            raise InputError(
+                f"contact {smooth[0]} has mu {mu[smooth[0]]:g} and no tangent to feel it: give tangents=2, or mu 0"
+            )
         ptr = np.concatenate([rows.joint_ptr, mj + np.cumsum(1 + tangents + spin)]).astype(np.int32)
         kind = np.repeat(np.array([ROW, 1 + spin], np.int32), [kj, c])
         m = int(ptr[-1])
@@ -292,7 +330,7 @@ class Problem:
         low[:mj] = as_array("lower", lower, (mj,), finite=False, unit="N s")
         high[:mj] = as_array("upper", upper, (mj,), finite=False, unit="N s")
         both = np.zeros((2, kj + c))
-        both[0, kj:] = as_array("mu", mu, (c,))
+        both[0, kj:] = mu
         both[1, kj:] = 0.0 if patch_radius is None else as_array("patch_radius", patch_radius, (c,), unit="m")
         cones = Cones(ptr=ptr, kind=kind, lower=low, upper=high, mu=both[0], patch_radius=both[1])
         target = as_array("target", target, (m,), unit="m/s")
@@ -773,7 +811,37 @@ class Problem:
     def __repr__(self) -> str:
         kind = self.operator if self.matrix is None else "CSR" if sp.issparse(self.matrix) else "dense"
         name = f"{self.name!r}, " if self.name else ""
-        return f"<Problem {name}{self.law}, {self.m} rows in {self.n_blocks} blocks, {kind}>"
+        return (
+            f"<Problem {name}{self.law}, {_many(self.m, 'row')} in {_many(self.n_blocks, 'block')}, {kind}>"
+        )
+
+    def _repr_html_(self) -> str:
+        """For notebooks: what it is, as a small table."""
+        contacts = int(np.count_nonzero(self.cones.kind != ROW))
+        facts = {
+            "law": self.law,
+            "rows": self.m,
+            "contacts": contacts,
+            "other blocks": self.n_blocks - contacts,
+            "given by": repr(self).rpartition(", ")[2].rstrip(">"),
+        }
+        return table_of(facts, self.name or "Problem")
+
+    def save(self, path: str | PathLike[str], **more: Any) -> None:
+        """Write the problem to a file; `lavender.io.save`, whose options `more` are.
+
+        Raises
+        ------
+        InputError
+            The suffix is of no format, or the file cannot be written.
+        """
+        from lavender.io import save
+
+        save(self, path, **more)
+
+
+def _many(n: int, what: str) -> str:
+    return f"{n} {what}" if n == 1 else f"{n} {what}s"
 
 
 def _read_only(matrix: sp.csr_array) -> sp.csr_array:

@@ -74,7 +74,14 @@ class Rows:
             same = np.flatnonzero((body[:, 0] == body[:, 1]) & (body[:, 0] >= 0))
             if len(same):
                 raise InputError(f"{name}[{same[0]}] joins body {body[same[0], 0]} to itself")
+        nobody = np.flatnonzero((self.contact_body < 0).all(axis=1))
+        if len(nobody):
+            raise InputError(
+                f"contact_body[{nobody[0]}] = [-1, -1]: both are static, and no impulse moves them; leave it out"
+            )
         check_not_negative("inv_mass", self.inv_mass)
+        if self.copy:
+            check_inertia("inv_inertia", self.inv_inertia)
         if self.n_contacts:
             # 1e-9: far above rounding of a normalised vector, far below anything meant otherwise.
             off = np.abs(np.stack([
@@ -154,3 +161,27 @@ class Rows:
     def __reduce__(self) -> tuple[Any, ...]:
         # Arrays stay read-only in copies and pickles.
         return type(self), tuple(f.name != "copy" and getattr(self, f.name) for f in fields(self))
+
+
+def check_inertia(name: str, tensors: FloatArray) -> None:
+    """Refuse tensors (n, 3, 3) that no body has: not symmetric, or not positive semidefinite, beyond rounding.
+
+    Raises
+    ------
+    InputError
+        Names the first body.
+    """
+    if not len(tensors):
+        return
+    size = np.abs(tensors).max(axis=(1, 2))
+    skew = np.abs(tensors - tensors.transpose(0, 2, 1)).max(axis=(1, 2))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        scaled = np.where(size[:, None, None] > 0.0, tensors / size[:, None, None], 0.0)
+    least = np.linalg.eigvalsh(scaled)[:, 0]
+    # 1e-9 of the largest entry: far above rounding of a rotated tensor, far below anything meant otherwise.
+    for wrong, what in ((skew > 1e-9 * size, "symmetric"), (least < -1e-9, "positive semidefinite")):
+        if wrong.any():
+            i = int(np.argmax(wrong))
+            raise InputError(
+                f"{name}[{i}] is not {what}: {tensors[i].tolist()}; an inverse inertia, world axes, is needed"
+            )

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lavender._arrays import FloatArray
-from lavender.errors import SolveFailed
+from lavender._arrays import FloatArray, table_of
+from lavender.errors import InputError, SolveFailed
 from lavender.residuals import Residual
 
 if TYPE_CHECKING:
@@ -92,6 +92,34 @@ class History:
     def __len__(self) -> int:
         return len(self.iterations)
 
+    def plot(self, against: str = "iterations") -> Any:
+        """The relative residual on the way, as a figure of matplotlib.
+
+        Parameters
+        ----------
+        against : {"iterations", "time"}
+
+        Raises
+        ------
+        InputError
+            Another word.
+        """
+        if against not in ("iterations", "time"):
+            raise InputError(f"against is {against!r}; 'iterations' or 'time' is needed")
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+
+        figure = Figure(figsize=(6.0, 4.0), layout="constrained")
+        FigureCanvasAgg(figure)
+        axes = figure.add_subplot()
+        x = self.iterations if against == "iterations" else self.time
+        shown = self.relative > 0.0
+        axes.semilogy(np.asarray(x)[shown], self.relative[shown], marker="o", markersize=3)
+        axes.set_xlabel("iterations" if against == "iterations" else "time [s]")
+        axes.set_ylabel("relative residual [-]")
+        axes.grid(alpha=0.3)
+        return figure
+
 
 @dataclass(frozen=True, init=False)
 class SolverRun:
@@ -105,7 +133,7 @@ class SolverRun:
         _fill(self, {"name": name, "options": options, "form": form})
 
 
-@dataclass(frozen=True, init=False)
+@dataclass(frozen=True, init=False, repr=False)
 class Solution:
     """Result of `solve`; returned for every status, with the iterate. `str()` is one line."""
 
@@ -193,6 +221,24 @@ class Solution:
         if self.success or self.residual.at_floor:
             return self
         raise SolveFailed(str(self))
+
+    def _repr_html_(self) -> str:
+        """For notebooks: what came of it, as a small table."""
+        work = ", ".join(f"{n} {k}" for k, n in self.work.items())
+        facts = {
+            "status": self.status.name,
+            "relative residual": f"{self.residual.relative:.2e} (asked for {self.tol:.0e})",
+            "worst row": f"{self.residual.worst_name}, {self.residual.velocity:.2g} m/s",
+            "floor of float64": f"{self.residual.floor:.1e}",
+            "work": work or f"{self.iterations} iterations",
+            "time": f"{1e3 * (self.setup_time + self.solve_time):.3g} ms",
+        }
+        if self.contradicted:
+            facts["contradicted"] = self.contradicted
+        return table_of(facts, self.solver.name)
+
+    def __repr__(self) -> str:
+        return f"<Solution {self}>"
 
     def __str__(self) -> str:
         work = ", ".join(f"{n} {k}" for k, n in self.work.items())

@@ -71,7 +71,7 @@ def bounded(rng, a, b):
         return lv.Problem.contact(a, b, mu, [float(rng.choice([0.0, 1e-300, 0.1, 1e300]))], friction=friction)
     if n <= 3:
         return lv.Problem.contact(a, b, mu, friction=friction)
-    return lv.Problem.contact(a, b, np.full(n, mu[0]), friction=friction)
+    return lv.Problem.contact(a, b, np.zeros(n), friction=friction)
 
 
 def scaled_rows(rng):

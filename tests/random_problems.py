@@ -75,7 +75,7 @@ def random_contact_problem(seed, friction="coulomb", tangents=None, spin=True, *
         target=rng.normal(size=m) * 0.1,
         lower=-high,
         upper=high,
-        mu=rng.uniform(0.0, 1.2, c),
+        mu=rng.uniform(0.0, 1.2, c) * (np.broadcast_to(tangents, c) > 0 if not spin else 1.0),
         tangents=tangents,
         patch_radius=rng.uniform(0.0, 0.4, c) if spin else None,
         friction=friction,

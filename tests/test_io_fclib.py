@@ -260,7 +260,7 @@ def test_what_fclib_cannot_hold_is_named(tmp_path):
         (lv.Problem.linear(np.eye(2), [1.0, 1.0]), {}, ["ROW blocks .*2 free rows"]),
         (random_contact_problem(0), {}, ["ROW blocks", "spin rows", "contacts of"]),
         (lv.Problem.contact(np.eye(4), np.ones(4), [0.5], patch_radius=[0.1]), {}, ["spin rows"]),
-        (lv.Problem.contact(np.eye(2), np.ones(2), [0.5, 0.5]), {}, ["contacts of 1 rows"]),
+        (lv.Problem.contact(np.eye(2), np.ones(2), [0.0, 0.0]), {}, ["contacts of 1 rows"]),
         (lv.Problem.contact(np.eye(3), np.ones(3), [0.5], friction="cone"), {}, ["'cone' law"]),
         (lv.Problem.contact(np.zeros((0, 0)), [], []), {}, ["without contacts"]),
         (named, {}, ["names of blocks", "keys of blocks"]),

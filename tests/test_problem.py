@@ -24,7 +24,7 @@ def test_the_class_follows_from_the_blocks():
     assert lv.Problem.linear(I2, [1, 1]).law == "linear"
     assert lv.Problem.lcp(I2, [1, 1]).law == "lcp"
     assert lv.Problem.lcp(I2, [1, 1], lower=-np.inf).law == "linear"
-    assert lv.Problem.contact(I2, [1, 1], [0.5, 0.5]).law == "lcp"  # normals only
+    assert lv.Problem.contact(I2, [1, 1], [0.0, 0.0]).law == "lcp"  # normals only
     assert lv.Problem.contact(I2, [1, 1], [0.5]).law == "coulomb"
     assert lv.Problem.contact(I2, [1, 1], [0.5], friction="cone").law == "cone"
     assert lv.Problem.contact(I2, [1, 1], [0.5], patch_radius=[0.1]).law == "coulomb"
@@ -139,11 +139,11 @@ def test_rows_have_names():
         random_lcp(1).row_name(99)
 
 
-def test_static_bodies_and_pinned_bodies_are_legal():
-    """All-static rows are empty rows of A; a body of infinite mass gives none of its own."""
+def test_pinned_bodies_are_legal():
+    """A body of infinite mass gives empty rows of A."""
     rows = lv.Rows(
         inv_mass=[0.0], inv_inertia=np.zeros((1, 3, 3)), v_free=np.ones((1, 6)), normal=[[0, 0, 1.0]] * 2,
-        tangent=[[1.0, 0, 0]] * 2, arm_a=np.zeros((2, 3)), arm_b=np.zeros((2, 3)), contact_body=[[-1, -1], [-1, 0]],
+        tangent=[[1.0, 0, 0]] * 2, arm_a=np.zeros((2, 3)), arm_b=np.zeros((2, 3)), contact_body=[[-1, 0], [0, -1]],
     )  # fmt: skip
     problem = lv.Problem.from_rows(rows, target=[0.0, -1.0])
     assert not problem.csr.toarray().any()

@@ -1,0 +1,99 @@
+"""What a new user meets in Python: defaults with a meaning, refusals with a way out, objects that show themselves."""
+
+import numpy as np
+import pytest
+
+import lavender as lv
+from lavender import bench
+
+UP, SIDE = [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]
+
+
+def rows(body, inertia=None, mass=(1.0, 0.5)):
+    """Bodies that touch at their centres."""
+    c, n = len(body), len(mass)
+    return lv.Rows(
+        inv_mass=mass, inv_inertia=[np.eye(3)] * n if inertia is None else inertia, v_free=np.full((n, 6), -1.0),
+        normal=[UP] * c, tangent=[SIDE] * c, arm_a=np.zeros((c, 3)), arm_b=np.zeros((c, 3)), contact_body=body,
+    )  # fmt: skip
+
+
+def test_mu_alone_means_two_tangents_and_a_mu_that_nothing_feels_is_refused():
+    made = rows([[-1, 0], [0, 1]])
+    problem = lv.Problem.from_rows(made, mu=0.5)
+    assert (problem.m, problem.law) == (6, "coulomb")
+    mixed = lv.Problem.from_rows(made, mu=[0.0, 0.5])
+    assert mixed.cones.n_tangents.tolist() == [0, 2]
+    assert lv.Problem.from_rows(made).m == 2
+    assert lv.Problem.from_rows(made, mu=0.5, tangents=0, patch_radius=0.1).m == 4  # a spin row feels it
+    with pytest.raises(lv.InputError, match=r"contact 0 has mu 0\.5 and no tangent"):
+        lv.Problem.from_rows(made, mu=0.5, tangents=0)
+
+
+def test_one_mu_for_each_contact_and_a_scalar_for_all():
+    with pytest.raises(lv.InputError, match=r"mu has 3 values for 3 rows.*one mu for each contact"):
+        lv.Problem.contact(np.eye(3), np.ones(3), mu=[0.5, 0.5, 0.5])
+    assert lv.Problem.contact(np.eye(3), np.ones(3), mu=[0.0, 0.0, 0.0]).law == "lcp"
+    assert lv.Problem.contact(np.eye(9), np.ones(9), mu=0.5) == lv.Problem.contact(
+        np.eye(9), np.ones(9), mu=[0.5] * 3
+    )
+    assert lv.Problem.contact(np.eye(8), np.ones(8), mu=0.5, patch_radius=0.1).n_blocks == 2
+    assert lv.Problem.contact(np.eye(2), np.ones(2), mu=0.5).n_blocks == 1
+
+
+@pytest.mark.parametrize(
+    ("tensor", "sign"),
+    [
+        (np.diag([1.0, 1.0, -1.0]), "not positive semidefinite"),
+        (np.array([[1.0, 2.0, 0.0], [2.0, 1.0, 0.0], [0.0, 0.0, 1.0]]), "not positive semidefinite"),
+        (np.array([[1.0, 0.5, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]), "not symmetric"),
+    ],
+)
+def test_an_inertia_that_no_body_has_is_refused(tensor, sign):
+    with pytest.raises(lv.InputError, match=rf"inv_inertia\[1\] is {sign}"):
+        rows([[-1, 0]], np.stack([np.eye(3), tensor]))
+    with pytest.raises(lv.InputError, match="both are static"):
+        rows([[-1, 0], [-1, -1]])
+    for fine in (np.zeros((3, 3)), np.diag([1.0, 0.0, 0.0]), 1e-300 * np.eye(3), 1e300 * np.eye(3)):
+        rows([[-1, 0]], np.stack([np.eye(3), fine]))
+    turn = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
+    rows([[-1, 0]], np.stack([np.eye(3), turn @ np.diag([1.0, 1e-12, 1e3]) @ turn.T]))
+
+
+def test_a_problem_is_saved_and_loaded_where_it_is_at_hand(tmp_path):
+    problem = lv.Problem.lcp(np.eye(2), np.ones(2), name="two")
+    problem.save(tmp_path / "p.npz")
+    assert lv.load(tmp_path / "p.npz") == problem
+    with pytest.raises(lv.InputError):
+        problem.save(tmp_path / "p.txt")
+
+
+def test_things_show_themselves_shortly_and_in_notebooks(tmp_path):
+    problem = lv.Problem.lcp(np.eye(1), np.ones(1), name="<b>")
+    assert repr(problem) == "<Problem '<b>', lcp, 1 row in 1 block, dense>"
+    solution = lv.solve(problem, "pgs", history=True)
+    records = bench.run([problem], ["pgs"], bench.Plan(levels=(1e-3,), budgets=(2, 4), repeats=1))
+    for thing in (problem, solution, records):
+        assert len(repr(thing)) < 400
+        html = thing._repr_html_()
+        assert html.startswith("<table>")
+        assert "<b>" not in html
+    assert "CONVERGED" in solution._repr_html_()
+    assert records.plot().axes[0].get_xscale() == "log"
+    with pytest.raises(lv.UnknownName):
+        records.plot("nothing")
+    axes = (
+        lv.solve(lv.Problem.lcp([[2.0, 1.0], [1.0, 2.0]], [1.0, 2.0]), "pgs", history=True)
+        .history.plot()
+        .axes[0]
+    )
+    assert axes.get_ylabel() == "relative residual [-]"
+    with pytest.raises(lv.InputError, match="'iterations' or 'time'"):
+        solution.history.plot("x")
+
+
+def test_dir_holds_the_public_names_alone():
+    assert dir(lv) == sorted(lv.__all__)
+    assert not {"Any", "TYPE_CHECKING", "import_module"} & set(dir(lv))
+    for name in dir(lv):
+        getattr(lv, name)
