@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from html import escape
 from typing import Any
 
 import numpy as np
@@ -116,5 +115,7 @@ def equal(x: object, y: object) -> bool:
 
 def table_of(facts: Mapping[str, Any], title: str) -> str:
     """Facts as a small HTML table, for notebooks; every text escaped."""
+    from html import escape
+
     rows = "".join(f"<tr><th>{escape(str(k))}</th><td>{escape(str(v))}</td></tr>" for k, v in facts.items())
     return f"<table><caption>{escape(title)}</caption>{rows}</table>"

@@ -132,3 +132,9 @@ def test_the_chapter_names_examples_tests_and_functions_that_exist():
 def test_the_readme_lists_every_example():
     listed = set(re.findall(r"`examples/(\w+\.py)`", (ROOT / "README.md").read_text(encoding="utf-8")))
     assert listed == {path.name for path in (ROOT / "examples").glob("*.py")}
+
+
+def test_the_page_on_failures_has_every_status_and_every_error():
+    text = (ROOT / "docs" / "failures.md").read_text(encoding="utf-8")
+    for name in (*lv.Status.__members__, "InputError", "UnknownName", "CapabilityError", "SolverUnavailable"):
+        assert f"| `{name}` |" in text
