@@ -233,7 +233,9 @@ def test_node_sees_one_wrong_bit(module_file, recording, tmp_path, what, sign):
     contents = json.loads((recording / "recording.json").read_text())
     numbers = bytearray((recording / "recording.bin").read_bytes())
     if what == "problem":
-        contents["scenes"] = contents["scenes"][:1]
+        contents["scenes"] = [
+            s for s in contents["scenes"] if s["name"] == "stack(substeps=1)"
+        ]  # its cache is looked at
         at = contents["problems"][-1]["expected"]["impulse"][0]
     else:
         contents["problems"] = []
