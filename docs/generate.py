@@ -34,7 +34,7 @@ from lavender.ordering import ORDERS
 from lavender.problem import LAWS
 from lavender.report import advice_by_level, advice_by_time, claims, geometric_means, reaches
 from lavender.report.style import looks
-from lavender.report.tables import shift_of, time_budgets
+from lavender.report.tables import SHIFT, time_budgets
 from lavender.report.text import residual, seconds
 from lavender.scene.gallery import SCENES
 
@@ -424,9 +424,7 @@ def measured_page(site, records, figures):
         for level in LEVELS:
             best = by_level[level].best
             cells.append(
-                f"**{best.solver}** {seconds(best.typical)} ({best.solved}/{best.cases})"
-                if best
-                else "nobody"
+                f"**{best.solver}** {seconds(best.score)} ({best.solved}/{best.cases})" if best else "nobody"
             )
         for t in times:
             best = timed[family][t].best
@@ -469,7 +467,7 @@ def measured_page(site, records, figures):
         parts += [
             f"### {LAW_NAMES.get(law, law).capitalize()}",
             (
-                f"Geometric means of time, shifted by {seconds(shift_of(records))}, of the solvers that take "
+                f"Geometric means of time, shifted by {seconds(SHIFT)}, of the solvers that take "
                 "every case "
                 f"of the class; a miss\ncosts {seconds(PLAN.time_limit)}. In brackets, cases that arrived."
             ),

@@ -286,11 +286,11 @@ def test_time_limit_returns_the_iterate(name):
 
 
 def soft_static_contacts():
-    """Two contacts between static bodies, no body at all: compliance alone makes A = diag(1, 2, 1, 2)."""
+    """Two contacts of a body that nothing moves: compliance alone makes A = diag(1, 2, 1, 2)."""
     z, x, o = np.tile([0.0, 0.0, 1.0], (2, 1)), np.tile([1.0, 0.0, 0.0], (2, 1)), np.zeros((2, 3))
     rows = lv.Rows(
-        np.zeros(0), np.zeros((0, 3, 3)), np.zeros((0, 6)), normal=z, tangent=x, arm_a=o, arm_b=o,
-        contact_body=np.full((2, 2), -1),
+        np.zeros(1), np.zeros((1, 3, 3)), np.zeros((1, 6)), normal=z, tangent=x, arm_a=o, arm_b=o,
+        contact_body=[[-1, 0], [-1, 0]],
     )  # fmt: skip
     return lv.Problem.from_rows(
         rows, [1.0, 2.0, 1.0, -2.0], mu=0.5, tangents=1, compliance=[1.0, 2.0, 1.0, 2.0]
