@@ -101,7 +101,8 @@ for (let look = 0; look < looks; look++) {
   steps += every;
   const time = steps * asked.dt;
   const now = engine.centres();
-  if (!(far(now, first) <= asked.fell)) {
+  const away = now.map((p, i) => [p[0], Math.min(p[1], first[i][1]), p[2]]);
+  if (!(far(away, first) <= asked.fell)) {
     stood = time;
     break;
   }
