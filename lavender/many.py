@@ -117,7 +117,12 @@ def solve_many(
 def _loop(problems: list[Problem], starts: list[Any], tol: float) -> list[tuple[Any, ...] | None]:
     """Those that the compiled loop ends: problem, impulse, claim, its share of the time; None for the others."""
     begin = perf_counter()
-    kernels = [general.prepare(p) for p in problems]
+    prepared = [general.prepare(p) for p in problems]
+    held = [i for i, kernel in enumerate(prepared) if kernel is not None]
+    if len(held) < len(problems):  # some are too large: the others alone
+        found = iter(_loop([problems[i] for i in held], [starts[i] for i in held], tol))
+        return [None if kernel is None else next(found) for kernel in prepared]
+    kernels = [kernel for kernel in prepared if kernel is not None]
     lams: list[FloatArray] = []
     proofs = []
     for p, start in zip(problems, starts, strict=True):

@@ -519,3 +519,17 @@ def test_nothing_of_the_judge_forms_a():
     problem.velocity(solution.impulse)
     assert "csr_data" not in problem.__dict__
     assert "_compressed" not in problem.__dict__
+
+
+def test_an_island_too_large_for_a_dense_matrix_goes_over_the_rows(monkeypatch):
+    from lavender.solvers._newton import general
+
+    monkeypatch.setattr(general, "LIMIT", 5)
+    problem = random_general(6, "cone")
+    solution = lv.solve(problem, "newton", tol=1e-8)
+    assert solution.success
+    assert solution.solver.form == "impulse"
+    with pytest.raises(lv.CapabilityError, match="at most 5 velocities"):
+        lv.solve(random_general(6, "cone"), "newton", form="velocity")
+    small = lv.Problem.from_jacobian([[1.0]], [[2.0]], [-1.0], cones=lv.Cones.contacts(0.0, 0))
+    assert [s.success for s in lv.solve_many([random_general(6, "cone"), small])] == [True, True]

@@ -150,20 +150,24 @@ class Auto:
         self, state: Problem, impulse: FloatArray, n: int, tol: float, time_limit: float | None = None
     ) -> Claim:
         problem = state
+        deadline = np.inf if time_limit is None else perf_counter() + time_limit
+        lam, claim = impulse.copy(), None
         if problem.generalized is not None and problem.m and n > 0:
             # Newton over the velocities ends nearly all of them: nothing is looked at, and nothing noted, before.
-            lam = impulse.copy()
-            claim = general.run(
-                problem, general.prepare(problem), lam, min(n, general.CLOCK), tol, time_limit
-            )
-            if claim.status is Status.CONVERGED:
-                impulse[:] = lam
-                return general.named(claim, "auto")
-        deadline = np.inf if time_limit is None else perf_counter() + time_limit
+            kernel = general.prepare(problem)
+            if kernel is not None:
+                claim = general.run(problem, kernel, lam, min(n, general.CLOCK), tol, time_limit)
+                if claim.status is Status.CONVERGED:
+                    impulse[:] = lam
+                    return general.named(claim, "auto")
         trail = Trail(problem, tol, deadline)
         if problem.m == 0:
             return Claim(Status.CONVERGED, 0, {}, "nothing to solve")
         trail.offer(impulse)
+        if claim is not None:
+            trail.add("newton", claim)
+            if np.isfinite(lam).all():
+                trail.offer(lam)
         interrupted = False
         try:
             if n > 0 and not trail.best <= tol:

@@ -29,7 +29,7 @@ from typing import Any
 import numpy as np
 
 from lavender._arrays import FloatArray
-from lavender.errors import InputError
+from lavender.errors import CapabilityError, InputError
 from lavender.problem import OPERATORS, Problem
 from lavender.registry import SolverSpec
 from lavender.residuals import quick
@@ -80,7 +80,14 @@ class Newton:
         if problem.m == 0:
             return NewtonState(problem, None)
         if problem.generalized is not None and self.form != "impulse":
-            return NewtonState(problem, None, general.prepare(problem))
+            kernel = general.prepare(problem)
+            if kernel is not None:
+                return NewtonState(problem, None, kernel)
+            if self.form == "velocity":
+                raise CapabilityError(
+                    f"form='velocity' keeps a dense matrix for each island of at most {general.LIMIT} velocities; "
+                    "this problem has a larger one: use form='impulse' or sweeps"
+                )
         form = self.form
         if form == "auto":
             form = "impulse" if problem.rows is None or problem.rows.n_bodies == 0 else "velocity"

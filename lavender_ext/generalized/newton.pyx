@@ -124,14 +124,17 @@ cdef public int32_t lav_general_newton(flow_t* f, double* impulse, int32_t cold,
 
 
 cdef class Newton:
-    """Room for Newton's method on a problem in generalised coordinates; `run` as often as wanted."""
+    """Room for Newton's method on a problem in generalised coordinates; `run` as often as wanted.
+
+    Where an island has more than `limit` velocities (`largest`) there is no room, and no `run`.
+    """
 
     cdef flow_t f
     cdef Data data
     cdef list keep
     cdef readonly int largest           # columns of the largest island
 
-    def __init__(self, Data p):
+    def __init__(self, Data p, int limit):
         cdef int32_t n = p.general.n, m = p.blocks.n_rows, k = p.blocks.n_blocks, panels = p.general.n_panels
         cdef int32_t most[4]
         cdef Py_ssize_t at, nv, size
@@ -159,6 +162,8 @@ cdef class Newton:
             <int32_t*>self.f.icols, <int32_t*>self.f.local, <int32_t*>self.f.pblock, <int32_t*>self.f.vptr, most)
         self.f.swap = w                                 # scratch of before
         self.largest = most[0]
+        if most[0] > limit:
+            return
         size = most[0]
         nv = self.f.vptr[k]
         room = np.empty(4 * n + 12 * <Py_ssize_t>m + 2 * nv + 2 * size * size + 2 * size + most[2] + most[1] + most[3] + 1)

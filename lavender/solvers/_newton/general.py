@@ -30,10 +30,11 @@ _STATUS = {
 _WORDS = ("factorisations", "updates", "Coulomb rounds", "line evaluations")
 
 
-def prepare(problem: Problem) -> Newton:
-    """Islands and room for them."""
+def prepare(problem: Problem) -> Newton | None:
+    """Islands and room for them; None where one has more velocities than N is kept for."""
     reference(problem)
-    return Newton(problem.metric)
+    kernel = Newton(problem.metric, LIMIT)
+    return None if kernel.largest > LIMIT else kernel
 
 
 def run(
