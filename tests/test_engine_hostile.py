@@ -97,6 +97,29 @@ def test_fields_of_a_snapshot_have_their_types(field, value, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize("name", ["pile", "bridge"])
+def test_a_snapshot_restored_is_the_snapshot_and_its_pairs_are_made_anew(name):
+    sim = lv.Simulation(lv.Scene(name))
+    for _ in range(30):
+        sim.step()
+    shot = sim.snapshot()
+    sim.restore(shot)
+    again = sim.snapshot()
+    for field in ("size", "real", "index", "keys"):
+        assert getattr(shot, field).tobytes() == getattr(again, field).tobytes()
+    expected, problem = trajectory(sim, 5), sim.constraint_problem()
+    # a list that hides every pair changes nothing
+    state = sim._state.copy()
+    state.real[:], state.index[:], state.keys[:] = shot.real, shot.index, shot.keys
+    state.head[HEAD["pairs"]] = 0
+    sim.restore(
+        lv.Snapshot(shot.fingerprint, shot.steps, 0, "", state.size, state.real, state.index, state.keys)
+    )
+    assert sim.constraint_problem().n_blocks > 0
+    assert trajectory(sim, 5) == expected
+    assert sim.constraint_problem().b.tobytes() == problem.b.tobytes()
+
+
 FULL_DISK = """
 import resource, sys
 import lavender as lv
@@ -483,6 +506,15 @@ def test_directions_of_any_length_are_normalised(scale):
     )
     plane = scene.add_plane((scale, 0.0, 0.0))
     assert scene.bodies[plane].shape.normal == (1.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize("dt", [50.0, 1e6, 1e300])
+def test_a_step_that_would_take_for_ever_is_refused(dt):
+    # 240 million substeps of 1/240 s are no step that anybody has asked for
+    with pytest.raises(lv.InputError, match="substeps"):
+        lv.Scene(dt=dt)
+    assert lv.Scene(dt=dt, substeps=3).parameters.substeps == 3
+    assert lv.Scene(dt=dt, max_substep=dt).parameters.substeps == 1
 
 
 def test_reset_judges_nothing_and_does_not_fail():

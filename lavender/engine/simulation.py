@@ -144,6 +144,7 @@ class Simulation:
         self._steps = 0
         self._failed = 0
         self._over = ""  # why no step can follow
+        self._restored = False  # the list of pairs is somebody else's
         self._last: Solution | _Pending | None = None
 
     # -- running --------------------------------------------------------------------------------
@@ -282,6 +283,9 @@ class Simulation:
         # A registered solver may raise or be stopped in any substep, which then must be as if none had been;
         # until the first has ended, nothing has changed that the next step starts from.
         keeps = substeps > 1 and not self._own_sweeps
+        if self._restored:
+            _make_pairs_anew(first)
+            self._restored = False
         if keeps:
             first.kernel.keep()
         try:
@@ -453,6 +457,8 @@ class Simulation:
         impulses of its last substep.
         """
         state = self._state.copy()
+        if self._restored:
+            _make_pairs_anew(state)
         while state.kernel.prepare() == NEED_ROOM:
             state = state.grown()
         return self._problem(state)
@@ -796,9 +802,7 @@ class Simulation:
             raise InputError(
                 f"the snapshot is damaged: {lost[:40]!r} is not the body whose state it says is lost"
             )
-        for name in ("pairs_valid", "need_pairs", "need_contacts"):
-            state.head[HEAD[name]] = 0  # the list of pairs is made anew
-        self._state = state
+        self._state, self._restored = state, True
         self._steps, self._failed = snapshot.steps, snapshot.failed
         self._last, self._over = None, ""
         self._lost_body()
@@ -819,6 +823,12 @@ class Simulation:
 
     def __repr__(self) -> str:
         return f"<Simulation of {self.scene!r}, step {self._steps}>"
+
+
+def _make_pairs_anew(state: State) -> None:
+    # a list that lacks a pair cannot be told from one that is right; contacts do not depend on its age
+    for name in ("pairs_valid", "need_pairs", "need_contacts"):
+        state.head[HEAD[name]] = 0
 
 
 def _any_tangent(normal: FloatArray) -> FloatArray:

@@ -38,6 +38,7 @@ SCENE_ORDERS = (*ENGINE_ORDERS, "alternating")  # alternating: contacts turned r
 ON_FAILURE = ("use", "keep", "damp", "raise")
 SWEEPS = (4, 64)  # sweep budget of sequential impulses
 MOST = {"restitution": 1.0, "friction": 1e100}  # the product of two coefficients of friction is finite
+MOST_SUBSTEPS = 10_000  # of a step where their number is not given; more are asked for by name
 MAX_SUBSTEP = 1.0 / 240.0  # s, within which four warm sweeps hold a stack
 MAX_BODIES = 2**24 - 1  # a contact's key has 24 bits for each body
 
@@ -86,7 +87,12 @@ class Parameters:
         put(self, "max_substep", number("max_substep", longest, above=0.0))
         substeps: Any = self.substeps
         if substeps is None:
-            ratio = min(self.dt / self.max_substep - 1e-9, 2.0**31)  # whole steps whatever their rounding
+            ratio = self.dt / self.max_substep - 1e-9  # whole steps whatever their rounding
+            if ratio > MOST_SUBSTEPS:
+                raise InputError(
+                    f"dt is {self.dt:g} s: more than {MOST_SUBSTEPS} substeps of {self.max_substep:g} s; give a "
+                    "shorter dt, a longer max_substep, or substeps="
+                )
             substeps = max(1, math.ceil(ratio))
         put(self, "substeps", whole("substeps", substeps, 1))
         if own:

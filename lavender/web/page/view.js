@@ -285,7 +285,13 @@ class Player {
 async function start() {
   const player = new Player();
   window.lavender = player;
-  player.load(await (await fetch("film.json")).json());
+  const answer = await fetch("film.json");
+  if (!answer.ok) {
+    find("title").textContent = "open a film"; // the page lies on a file server: there is no run behind it
+    find("live").disabled = true;
+    return;
+  }
+  player.load(await answer.json());
   document.documentElement.dataset.ready = "true";
   await player.listen();
 }
