@@ -1,5 +1,7 @@
 """Motion errors: the bound against a truth in long double, distances that mean what they say, several motions."""
 
+from importlib import import_module
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -224,6 +226,31 @@ def test_a_worse_reference_is_not_adopted():
     good = lv.solve(p, "newton", tol=1e-12).impulse
     assert lv.motion.adopt(p, good, "mine").solver == "mine"
     assert lv.motion.adopt(p, 0.9 * good, "worse").solver == "mine"
+
+
+def test_a_reference_beside_a_file_is_judged_before_it_is_used(tmp_path, monkeypatch):
+    p = problems("cone", 5)
+    path = tmp_path / "pile.npz"
+    lv.io.save(p, path)
+    written = lv.motion.save_reference(p, path)
+    assert written.name == "pile.npz.reference"
+    again = lv.io.load(path)
+    monkeypatch.setattr(import_module("lavender.motion.reference"), "solve", None)  # nobody solves any more
+    found = lv.motion.load_reference(again, path)
+    assert found.impulse.tobytes() == lv.motion.reference(p).impulse.tobytes()
+    assert found.solver == lv.motion.reference(p).solver
+    assert lv.motion.reference(again) is found
+    assert lv.motion_error(again, again.start()).relative == pytest.approx(1.0)
+    other = problems("cone", 6)
+    assert lv.motion.load_reference(other, path) is None  # the judge finds that it solves another problem
+    assert lv.motion.load_reference(other, tmp_path / "none.npz") is None
+    written.write_bytes(b"no reference")
+    with pytest.raises(lv.InputError, match="holds no reference"):
+        lv.motion.load_reference(again, path)
+    infeasible = lv.Problem.lcp([[1.0, -1.0], [-1.0, 1.0]], [1.0, 1.0])
+    monkeypatch.undo()
+    with pytest.raises(lv.InputError, match="nothing reached the floor"):
+        lv.motion.save_reference(infeasible, path)
 
 
 @pytest.mark.parametrize("law", LAWS)

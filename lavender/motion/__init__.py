@@ -11,6 +11,7 @@ from lavender.motion.bound import Witness
 from lavender.motion.error import MotionError, measure, motion_error, nearest
 from lavender.motion.reference import Reference, adopt, reference
 from lavender.motion.several import Motion, Motions, branch, distance, motions, motions_of
+from lavender.motion.stored import load_reference, save_reference
 from lavender.motion.unique import uniqueness
 
 __all__ = [
@@ -22,11 +23,13 @@ __all__ = [
     "adopt",
     "branch",
     "distance",
+    "load_reference",
     "measure",
     "motion_error",
     "motions",
     "motions_of",
     "nearest",
     "reference",
+    "save_reference",
     "uniqueness",
 ]

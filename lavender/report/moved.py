@@ -1,0 +1,129 @@
+"""A report by motion error: the same tables over the same records, matched by metres per second."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from lavender.bench.record import level_name
+from lavender.bench.store import Records
+from lavender.report.tables.advice import Advice, advice_by_level
+from lavender.report.tables.cases import reaches
+
+__all__ = ["Idle", "Moved", "advice_by_speed", "by_speed", "idle", "moved", "speed_levels", "speed_name", "working"]
+
+USUAL = (1e-2, 1e-3)  # m/s, where the plan names none
+
+
+@dataclass(frozen=True)
+class Idle:
+    """A case where doing nothing is right, and the worst that a solver made of it."""
+
+    case: str
+    rows: int
+    solver: str  # of the largest velocity error
+    velocity: float  # m/s
+    energy: float  # sqrt J
+
+
+@dataclass(frozen=True)
+class Moved:
+    """How far and how fast one solver came on one case, by motion error."""
+
+    case: str
+    solver: str
+    start: str
+    times: dict[float, float]  # s to each speed level [m/s], inf where it was not reached
+    best: float  # m/s, smallest motion error of any run
+    relative: float  # -, of that run; nan where there is none
+    bound: float  # sqrt J, of that run; nan where nothing is proved
+
+
+def speed_name(level: float) -> str:
+    """A speed as people write it: 1e-3 m/s."""
+    return f"{level_name(level)} m/s"
+
+
+def speed_levels(records: Records) -> tuple[float, ...]:
+    """Speed levels of the newest run's plan [m/s], the usual ones where it has none; empty without motion errors."""
+    if all(r.motion_speed is None for r in records):
+        return ()
+    for run in reversed(list(records.runs.values())):
+        if run.plan.get("speed_levels"):
+            return tuple(sorted(map(float, run.plan["speed_levels"]), reverse=True))
+    return USUAL
+
+
+def by_speed(records: Records) -> Records:
+    """The records as if m/s of motion error were their residual; runs without one reached nothing."""
+    levels = speed_levels(records)
+    out = Records(source=records.source)
+    for run in records.runs.values():
+        out.add(replace(run, plan={**run.plan, "levels": levels}))
+    for entry in (*records.cases.values(), *records.skips, *records.done.values()):
+        out.add(entry)
+    for r in records:
+        out.add(replace(r, relative=math.inf if r.motion_speed is None else r.motion_speed, floor=0.0))
+    return out
+
+
+def advice_by_speed(records: Records) -> list[Advice]:
+    """For each structure and speed level: who brings most cases there, and who is fastest."""
+    return advice_by_level(by_speed(records)) if speed_levels(records) else []
+
+
+def moved(records: Records, levels: Sequence[float] | None = None) -> list[Moved]:
+    """One row for each case, solver and start, in the order of the records; none without motion errors."""
+    levels = speed_levels(records) if levels is None else tuple(levels)
+    if not levels:
+        return []
+    runs = {}
+    for r in records:
+        if r.motion_speed is not None and r.order == "given" and r.step < 0:
+            key = (r.case, r.solver, r.start)
+            if key not in runs or r.motion_speed < runs[key].motion_speed:
+                runs[key] = r
+    out = []
+    for reach in reaches(by_speed(records), levels):
+        best = runs.get((reach.case, reach.solver, reach.start))
+        out.append(
+            Moved(
+                reach.case,
+                reach.solver,
+                reach.start,
+                dict(reach.times),
+                reach.best,
+                math.nan if best is None or best.motion is None else best.motion,
+                math.nan if best is None or best.bound is None else best.bound,
+            )
+        )
+    return out
+
+
+def working(records: Records) -> Records:
+    """The records without cases where doing nothing is right: nobody solves those, and nobody fails."""
+    still = {name for name, info in records.cases.items() if info.nothing_to_do}
+    if not still:
+        return records
+    out = Records(source=records.source)
+    for entry in (*records.runs.values(), *records.cases.values(), *records.skips, *records.done.values()):
+        if getattr(entry, "case", None) not in still:
+            out.add(entry)
+    for r in records:
+        if r.case not in still:
+            out.add(r)
+    return out
+
+
+def idle(records: Records) -> list[Idle]:
+    """Cases where doing nothing is right, with the worst residual of any run in units."""
+    out = []
+    for name, info in records.cases.items():
+        if info.nothing_to_do:
+            worst = max((r for r in records if r.case == name), key=lambda r: r.velocity, default=None)
+            if worst is None:
+                out.append(Idle(name, info.rows, "", 0.0, 0.0))
+            else:
+                out.append(Idle(name, info.rows, worst.solver, worst.velocity, worst.energy))
+    return out
