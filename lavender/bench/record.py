@@ -298,7 +298,10 @@ _TYPES: dict[str, _Rule] = {
     "str": ("a text", _is_word),
     "int": ("a whole number", _is_whole),
     "float": ("a number", lambda v: isinstance(v, float)),
-    "float | None": ("a number, or nothing", lambda v: v is None or isinstance(v, float)),
+    "float | None": (
+        "a number of 0 or more, or nothing",
+        lambda v: v is None or (isinstance(v, float) and not v < 0.0),
+    ),
     "bool": ("true or false", lambda v: isinstance(v, bool)),
     "tuple[str, ...]": ("a list of words", lambda v: isinstance(v, tuple) and all(map(_is_word, v))),
     "Mapping[str, Any]": (

@@ -61,6 +61,8 @@ def bench(
     files: tuple[str, ...],
     solvers: tuple[str, ...] | None,
     levels: tuple[float, ...],
+    motion: bool,
+    speed_levels: tuple[float, ...],
     budgets: tuple[int, ...],
     orders: tuple[str, ...] | None,
     repeats: int,
@@ -75,7 +77,7 @@ def bench(
     stand in each, `lavender bench auto` measures what auto loses against the best of our own solvers; see their own
     --help.
     """
-    plan = make_plan(files, levels, budgets, orders, repeats, time_limit)
+    plan = make_plan(files, levels, budgets, orders, repeats, time_limit, motion, speed_levels)
     done = measure(files, solvers, plan, out, memory, in_process)
     shown_on = console()
     shown_on.print(f"{len(done.records)} runs in {out}", highlight=False, markup=False, soft_wrap=True)

@@ -15,6 +15,7 @@ from lavender.cli.cases import cases
 from lavender.cli.check import check
 from lavender.cli.options import EXIT_BAD_INPUT, EXIT_INTERRUPTED
 from lavender.cli.record import record
+from lavender.cli.reference import reference
 from lavender.cli.report import report
 from lavender.cli.run import run
 from lavender.cli.solve import solve
@@ -31,7 +32,7 @@ def cli() -> None:
     """Constraint solvers of rigid-body simulation: any solver by name, its error in units, its cost."""
 
 
-for _command in (report, bench, check, solve, solvers, cases, run, record, web, view):
+for _command in (report, bench, check, solve, reference, solvers, cases, run, record, web, view):
     cli.add_command(_command)
 
 

@@ -69,6 +69,7 @@ class ManyValues(click.Command):
 
     FITS: dict[str, Callable[[str], bool]] = {  # noqa: RUF012 - a constant of the class
         "--levels": _is_number,
+        "--speed-levels": _is_number,
         "--budgets": _is_number,
         "--time-budgets": _is_number,
         "--solvers": _is_solver,
@@ -172,6 +173,18 @@ def plan_options(command: Callable[..., Any]) -> Callable[..., Any]:
             help="Relative residuals to reach.",
         ),
         click.option(
+            "--motion",
+            is_flag=True,
+            help="Tell how wrong the bodies move, too: distance to a reference that is solved for once a case.",
+        ),
+        click.option(
+            "--speed-levels",
+            type=Numbers(),
+            default=(),
+            metavar="M/S,M/S,...",
+            help="Motion errors to reach, in metres per second; implies --motion.",
+        ),
+        click.option(
             "--budgets",
             type=Numbers(int),
             default="4,8,16,32,64",
@@ -224,6 +237,8 @@ def make_plan(
     orders: Sequence[str] | None,
     repeats: int,
     time_limit: float | None,
+    motion: bool = False,
+    speed_levels: Sequence[float] = (),
 ) -> Plan:
     """The plan that those options mean.
 
@@ -237,7 +252,15 @@ def make_plan(
     if time_limit is None:
         time_limit = 1.0 if files else 0.25  # all of the suite in a minute
     more: dict[str, Any] = {} if orders is None else {"orders": orders}
-    return Plan(levels=levels, budgets=budgets, repeats=repeats, time_limit=time_limit, **more)
+    return Plan(
+        levels=levels,
+        budgets=budgets,
+        repeats=repeats,
+        time_limit=time_limit,
+        motion=motion,
+        speed_levels=speed_levels,
+        **more,
+    )
 
 
 def bytes_of(gigabytes: float | None) -> int | None:

@@ -76,6 +76,8 @@ def report(
     files: tuple[str, ...],
     solvers: tuple[str, ...] | None,
     levels: tuple[float, ...],
+    motion: bool,
+    speed_levels: tuple[float, ...],
     budgets: tuple[int, ...],
     orders: tuple[str, ...] | None,
     repeats: int,
@@ -122,13 +124,15 @@ def report(
             raise InputError("a records.jsonl is shown alone: give one, and no problems")
         done = Measured(bench.read(shown[0]), False)
     elif campaign:
-        many = bench.CampaignPlan(levels=levels, budgets=budgets, orders=orders or ())
+        many = bench.CampaignPlan(
+            levels=levels, budgets=budgets, orders=orders or (), motion=motion, speed_levels=speed_levels
+        )
         words = bench.seeds(files, len(seeds), seeds.start)
         done = run_campaign(
             words, solvers, many, out / "records.jsonl", workers=workers, backend=backend, memory=memory
         )
     else:
-        plan = make_plan(files, levels, budgets, orders, repeats, time_limit)
+        plan = make_plan(files, levels, budgets, orders, repeats, time_limit, motion, speed_levels)
         done = measure(files, solvers, plan, out / "records.jsonl", memory, in_process, sequence, fresh)
     records = done.records
     print_report(records, shown_on, old=old, times=time_budgets, whole=tables)

@@ -101,6 +101,9 @@ def solve(
         raise click.exceptions.Exit(EXIT_INFEASIBLE)
     judged = solution.residual
     at_floor = math.isfinite(judged.floor) and judged.relative <= 2.0 * judged.floor
+    if judged.nothing_to_do:
+        click.echo(f"nothing to do: doing nothing is right; this moves by {judged.velocity:.1e} m/s")
+        return
     if tol > 0.0 and not (solution.success or at_floor):
         raise click.exceptions.Exit(EXIT_UNMET)
 

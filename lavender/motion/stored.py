@@ -1,4 +1,4 @@
-"""References beside problem files: `pile.npz.reference` holds the solution of `pile.npz`, judged again when it is read."""
+"""References beside problem files: `pile.npz.reference` holds the solution of `pile.npz`, judged when it is read."""
 
 from __future__ import annotations
 

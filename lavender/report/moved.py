@@ -6,12 +6,22 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from lavender.bench.record import level_name
+from lavender.bench.record import Entry, Record, level_name
 from lavender.bench.store import Records
 from lavender.report.tables.advice import Advice, advice_by_level
 from lavender.report.tables.cases import reaches
 
-__all__ = ["Idle", "Moved", "advice_by_speed", "by_speed", "idle", "moved", "speed_levels", "speed_name", "working"]
+__all__ = [
+    "Idle",
+    "Moved",
+    "advice_by_speed",
+    "by_speed",
+    "idle",
+    "moved",
+    "speed_levels",
+    "speed_name",
+    "working",
+]
 
 USUAL = (1e-2, 1e-3)  # m/s, where the plan names none
 
@@ -61,7 +71,8 @@ def by_speed(records: Records) -> Records:
     out = Records(source=records.source)
     for run in records.runs.values():
         out.add(replace(run, plan={**run.plan, "levels": levels}))
-    for entry in (*records.cases.values(), *records.skips, *records.done.values()):
+    others: list[Entry] = [*records.cases.values(), *records.skips, *records.done.values()]
+    for entry in others:
         out.add(entry)
     for r in records:
         out.add(replace(r, relative=math.inf if r.motion_speed is None else r.motion_speed, floor=0.0))
@@ -78,15 +89,15 @@ def moved(records: Records, levels: Sequence[float] | None = None) -> list[Moved
     levels = speed_levels(records) if levels is None else tuple(levels)
     if not levels:
         return []
-    runs = {}
+    runs: dict[tuple[str, str, str], tuple[float, Record]] = {}
     for r in records:
         if r.motion_speed is not None and r.order == "given" and r.step < 0:
             key = (r.case, r.solver, r.start)
-            if key not in runs or r.motion_speed < runs[key].motion_speed:
-                runs[key] = r
+            if key not in runs or r.motion_speed < runs[key][0]:
+                runs[key] = (r.motion_speed, r)
     out = []
     for reach in reaches(by_speed(records), levels):
-        best = runs.get((reach.case, reach.solver, reach.start))
+        best = runs.get((reach.case, reach.solver, reach.start), (0.0, None))[1]
         out.append(
             Moved(
                 reach.case,
@@ -107,7 +118,13 @@ def working(records: Records) -> Records:
     if not still:
         return records
     out = Records(source=records.source)
-    for entry in (*records.runs.values(), *records.cases.values(), *records.skips, *records.done.values()):
+    others: list[Entry] = [
+        *records.runs.values(),
+        *records.cases.values(),
+        *records.skips,
+        *records.done.values(),
+    ]
+    for entry in others:
         if getattr(entry, "case", None) not in still:
             out.add(entry)
     for r in records:

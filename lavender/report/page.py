@@ -10,6 +10,7 @@ from lavender.bench.record import file_name, level_name
 from lavender.bench.store import Records
 from lavender.report import tables
 from lavender.report.curves import Figure, Figures
+from lavender.report.moved import advice_by_speed, idle, moved, speed_levels, speed_name, working
 from lavender.report.svg import svg
 from lavender.report.tables.advice import NOISE, RESIDUAL_NOISE
 from lavender.report.text import count, residual, seconds, times
@@ -59,7 +60,7 @@ def page(
         lstrip_blocks=True,
     )
     environment.filters.update(
-        seconds=seconds, residual=residual, level=level_name, anchor=file_name, times=times
+        seconds=seconds, residual=residual, level=level_name, anchor=file_name, times=times, speed=speed_name
     )
     content = _content(records, figures, old, tuple(budgets) or tables.time_budgets(records), peers)
     return environment.get_template("index.html.j2").render(
@@ -75,6 +76,8 @@ def page(
 def _content(
     records: Records, figures: Figures, old: Records | None, budgets: Sequence[float], peers: Peers | None
 ) -> dict[str, Any]:
+    still = idle(records)
+    records = working(records)
     found = verdict(records, budgets)
     names = sorted({r.solver for r in records} | {c.solver for f in figures for c in f.curves})
     number = {name: i for i, name in enumerate(names)}
@@ -109,6 +112,10 @@ def _content(
             for figure in figures
         },
         "verdict": found,
+        "idle": still,
+        "moved": [] if campaign else moved(records),
+        "speeds": speed_levels(records),
+        "speed_advice": {} if campaign else _by_family(advice_by_speed(records)),
         "has_stored": any(math.isfinite(info.stored) for info in records.cases.values()),
         "noise": NOISE,
         "residual_noise": RESIDUAL_NOISE,
@@ -145,6 +152,13 @@ def _content(
         "peers": rivals,
         "peer_figures": {place: _keys(some) for place, some in figures.peers.items()},
     }
+
+
+def _by_family(found: Iterable[tables.Advice]) -> dict[str, dict[float, tables.Advice]]:
+    out: dict[str, dict[float, tables.Advice]] = {}
+    for a in found:
+        out.setdefault(a.family, {})[a.target] = a
+    return out
 
 
 def _fastest(rows: Sequence[tables.Reach], level: float) -> tables.Reach | None:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from lavender.bench.record import level_name, printable
 from lavender.bench.store import Records
 from lavender.report import tables
+from lavender.report.moved import advice_by_speed, idle, moved, speed_levels, speed_name, working
 from lavender.report.text import count, in_time, residual, seconds, to_level
 from lavender.report.verdict import verdict
 
@@ -149,6 +151,8 @@ def print_report(
 
     A report of few lines is shown whole anyhow.
     """
+    still = idle(records)
+    records = working(records)
     levels = tables.levels_of(records)
     campaign = tables.is_campaign(records)
     if campaign:
@@ -168,6 +172,14 @@ def print_report(
             soft_wrap=True,
         )
         console.print(advice_table(records, times), highlight=False)
+        _print_motion(records, console, whole)
+    for case in still:
+        console.print(
+            f"nothing to do: {case.case}; at worst {residual(case.velocity)} m/s by {case.solver or 'nobody'}",
+            highlight=False,
+            markup=False,
+            style="dim",
+        )
     _print_lost(records, console)
     if not campaign:
         _print_tables(records, console, levels, whole)
@@ -184,6 +196,46 @@ def print_report(
             console.print(f"  {r.case}, {r.solver}: {r.contradicted}", highlight=False, markup=False)
         if len(wrong) > FEW:
             console.print(f"  and {len(wrong) - FEW} more", highlight=False)
+
+
+def motion_table(records: Records) -> Any:
+    """Per case and solver: time to each motion error in m/s, the smallest, relative, and its bound."""
+    levels = speed_levels(records)
+    table = _table()
+    table.add_column("case", overflow="fold")
+    table.add_column("solver", no_wrap=True)
+    for head in (*(f"to {speed_name(x)}" for x in levels), "best", "relative", "bound"):
+        table.add_column(head, justify="right", no_wrap=True)
+    shown = ""
+    for row in moved(records, levels):
+        name = row.solver + ("" if row.start == "cold" else f" ({row.start})")
+        known = [
+            f"{residual(x)}{unit}" if math.isfinite(x) else "–"
+            for x, unit in ((row.best, " m/s"), (row.relative, ""), (row.bound, " √J"))
+        ]
+        times = [seconds(row.times[x]) for x in levels]
+        table.add_row("" if row.case == shown else row.case, name, *times, *known)
+        shown = row.case
+    return table
+
+
+def _print_motion(records: Records, console: Console, whole: bool) -> None:
+    levels = speed_levels(records)
+    if not levels:
+        return
+    found = advice_by_speed(records)
+    table = _table()
+    table.add_column("structure")
+    for x in levels:
+        table.add_column(f"to {speed_name(x)}", overflow="fold")
+    for name in dict.fromkeys(a.family for a in found):
+        table.add_row(name, *(to_level(a) for a in found if a.family == name))
+    console.print(
+        "\n[bold]By motion error[/] (how wrong the body moves that is furthest off)", highlight=False
+    )
+    console.print(table, highlight=False)
+    if whole or len(moved(records, levels)) <= FEW:
+        console.print(motion_table(records), highlight=False)
 
 
 def _print_lost(records: Records, console: Console) -> None:

@@ -54,12 +54,14 @@ def write(
     from lavender.report.curves import figures as figures_of
     from lavender.report.draw import save
     from lavender.report.markdown import summary
+    from lavender.report.moved import working
     from lavender.report.page import page
     from lavender.report.style import looks
 
     folder = Path(folder)
     shown = records.latest()
-    drawn = figures_of(shown)
+    busy = working(shown)
+    drawn = figures_of(busy)
     if peers is not None:
         from lavender.report.rivals import figures as figures_of_peers  # with the engine behind it
 
@@ -76,7 +78,7 @@ def write(
             page(shown, drawn, old=before, budgets=times, saved=figures, peers=peers), encoding="utf-8"
         )
         unfinished.replace(index)
-        (folder / "summary.md").write_text(summary(shown, times), encoding="utf-8")
+        (folder / "summary.md").write_text(summary(busy, times), encoding="utf-8")
         if figures and list(drawn):
             (folder / "figures").mkdir(exist_ok=True)
             look = looks({r.solver for r in shown} | {c.solver for figure in drawn for c in figure.curves})

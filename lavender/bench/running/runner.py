@@ -20,6 +20,7 @@ from lavender.bench.running.timing import Task, measure, measure_impulse, one_th
 from lavender.bench.running.worker import Worker
 from lavender.bench.store import Records, Store
 from lavender.errors import LavenderError
+from lavender.motion import load_reference
 from lavender.problem import Problem
 from lavender.registry import SolverSpec
 
@@ -181,6 +182,8 @@ class _Runner:
         """Load and describe a case; None, with a note, where it does not load."""
         try:
             info = describe(item, self.this.run)
+            if self.plan.motion:
+                load_reference(item.problem, item.source)
         except Exception as error:  # a file may make a reader raise anything; it costs its own case
             self.keep(Skip(self.this.run, item.name, "", not_loaded(item, error)))
             self.done += len(self.names)

@@ -1,0 +1,47 @@
+"""`lavender reference`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from lavender.cli.options import EXIT_BAD_INPUT, EXIT_UNMET, console, one_thread
+from lavender.errors import InputError, LavenderError
+
+__all__ = ["reference"]
+
+
+@click.command()
+@click.argument("files", nargs=-1, required=True, metavar="FILES | FOLDERS...")
+def reference(files: tuple[str, ...]) -> None:
+    """Solve each problem to the floor and write the solution beside its file.
+
+    `lavender report --motion` then compares with pile.npz.reference in place of solving pile.npz again; whatever
+    such a file holds is judged before it is used.
+
+    Exits with 1 when nothing solves a problem, or a file met in a folder cannot be read.
+    """
+    from lavender import bench, motion
+
+    one_thread()
+    out = console()
+    unmet = missing = 0
+    for item in bench.resolve(files):
+        try:
+            if not Path(item.source).is_file():
+                raise InputError(f"{item.source} is no file; a reference is written beside one")
+            written = motion.save_reference(item.problem, item.source)
+            told = f"{item.name}: {motion.reference(item.problem)}, written: {written}"
+            out.print(told, highlight=False, markup=False, soft_wrap=True)
+        except LavenderError as error:
+            out.print(f"{item.name}: {error}", style="yellow", highlight=False, markup=False, soft_wrap=True)
+            unread = isinstance(error, InputError) and item.named and not Path(item.source).is_file()
+            missing += unread
+            unmet += not unread
+        finally:
+            item.forget()
+    if missing:
+        raise click.exceptions.Exit(EXIT_BAD_INPUT)
+    if unmet:
+        raise click.exceptions.Exit(EXIT_UNMET)

@@ -1,0 +1,135 @@
+"""Reports by motion error, cases with nothing to do, and references beside files."""
+
+import math
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+import lavender as lv
+from lavender import bench, report
+from lavender.cli import cli, main
+from lavender.report import moved, tables
+from lavender.report.write import write
+
+PLAN = bench.Plan(
+    levels=(1e-3,), speed_levels=(1e-2, 1e-4), budgets=(8,), repeats=1, orders=(), time_limit=0.5
+)
+
+
+def idle_problem():
+    return lv.Problem.lcp(np.eye(3), [-1.0, -2.0, -1.0], name="flying apart")
+
+
+@pytest.fixture(scope="module")
+def records():
+    return bench.run(["stack(n=16)", idle_problem()], ["pgs", "anderson"], PLAN)
+
+
+def test_times_to_a_speed_are_those_of_runs_that_reached_it(records):
+    for row in moved.moved(records):
+        runs = [r for r in records if (r.case, r.solver, r.start) == (row.case, row.solver, row.start)]
+        for level, time in row.times.items():
+            assert time == min((r.time_min for r in runs if r.motion_speed <= level), default=math.inf)
+        assert row.best == min(r.motion_speed for r in runs)
+        assert row.bound >= 0.0
+    assert moved.speed_levels(records) == (1e-2, 1e-4)
+
+
+def test_recommendations_by_speed_name_who_gets_there(records):
+    found = moved.advice_by_speed(moved.working(records))
+    assert {a.target for a in found} == {1e-2, 1e-4}
+    rows = {r.solver: r for r in moved.moved(records) if r.case == "stack(n=16)"}
+    for a in found:
+        assert a.best.solver == min(rows, key=lambda s: rows[s].times[a.target])
+
+
+def test_without_motion_errors_there_is_nothing_to_show():
+    plain = bench.run(["stack(n=4)"], ["pgs"], bench.Plan(levels=(1e-3,), budgets=(), repeats=1, orders=()))
+    assert moved.moved(plain) == []
+    assert moved.advice_by_speed(plain) == []
+    assert moved.speed_levels(plain) == ()
+
+
+def test_what_has_nothing_to_do_is_in_no_ranking(records):
+    """Nobody solves it, nobody fails: it counts in no table, and its residual is told in units."""
+    busy = moved.working(records)
+    assert "flying apart" not in busy.cases
+    assert {r.case for r in busy} == {"stack(n=16)"}
+    assert len(busy) < len(records)
+    (case,) = moved.idle(records)
+    assert (case.case, case.rows) == ("flying apart", 3)
+    assert case.velocity == max(r.velocity for r in records if r.case == "flying apart")
+    assert [a.ranking[0].cases for a in tables.advice_by_level(busy)] == [1] * len(
+        tables.advice_by_level(busy)
+    )
+    assert moved.working(busy) is busy
+
+
+def test_the_page_and_the_summary_show_both(records, tmp_path):
+    index = write(records, tmp_path, figures=False)
+    text = index.read_text(encoding="utf-8")
+    assert "By motion error" in text
+    assert "to 1e-4 m/s" in text
+    assert "Nothing to do" in text
+    assert text.count("flying apart") == 1  # in that table, and nowhere else
+    assert "flying apart" not in (tmp_path / "summary.md").read_text(encoding="utf-8")
+    assert "motion_speed" in (tmp_path / "records.csv").read_text(encoding="utf-8").splitlines()[0]
+    assert report.write is write
+
+
+def test_the_terminal_shows_speeds_on_request(tmp_path):
+    args = [
+        "report",
+        "stack(n=8)",
+        "--solvers",
+        "pgs",
+        "--levels",
+        "1e-3",
+        "--budgets",
+        "4",
+        "--repeats",
+        "1",
+    ]
+    asked = CliRunner().invoke(cli, [*args, "--speed-levels", "1e-2", "1e-3", "--out", str(tmp_path / "a")])
+    assert asked.exit_code == 0, asked.output
+    assert "By motion error" in asked.output
+    assert "to 1e-3 m/s" in asked.output
+    plain = CliRunner().invoke(cli, [*args, "--out", str(tmp_path / "b")])
+    assert "motion" not in plain.output
+
+
+def test_references_are_written_beside_files_and_used(tmp_path, monkeypatch, capsys):
+    problem = lv.suite.case("stack(n=8)").problem
+    lv.io.save(problem, tmp_path / "pile.npz")
+    with pytest.raises(SystemExit) as end:
+        main(["reference", str(tmp_path)])
+    assert end.value.code == 0
+    assert (tmp_path / "pile.npz.reference").is_file()
+    assert "auto" in capsys.readouterr().out
+    used = []
+    import lavender.bench.running.runner as runner
+
+    load = runner.load_reference
+    monkeypatch.setattr(runner, "load_reference", lambda p, path: used.append(load(p, path)))
+    plan = bench.Plan(levels=(1e-3,), budgets=(), repeats=1, orders=(), motion=True)
+    found = bench.run([tmp_path], ["pgs"], plan)  # the folder holds one problem: a reference is none
+    assert len(found.cases) == 1
+    assert used[0].accepted
+
+
+def test_nothing_solves_it_is_an_exit_code(tmp_path):
+    lv.io.save(lv.Problem.lcp([[1.0, -1.0], [-1.0, 1.0]], [1.0, 1.0]), tmp_path / "impossible.npz")
+    for words, code in (([str(tmp_path / "impossible.npz")], 1), (["stack(n=4)"], 1)):
+        with pytest.raises(SystemExit) as end:
+            main(["reference", *words])
+        assert end.value.code == code
+
+
+def test_solving_what_has_nothing_to_do_is_no_failure(tmp_path, capsys):
+    path = tmp_path / "idle.npz"
+    lv.io.save(idle_problem(), path)
+    with pytest.raises(SystemExit) as end:
+        main(["solve", str(path), "--solver", "pgs"])
+    assert end.value.code == 0
+    assert "nothing to do" in capsys.readouterr().out
