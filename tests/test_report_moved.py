@@ -41,7 +41,8 @@ def test_recommendations_by_speed_name_who_gets_there(records):
     assert {a.target for a in found} == {1e-2, 1e-4}
     rows = {r.solver: r for r in moved.moved(records) if r.case == "stack(n=16)"}
     for a in found:
-        assert a.best.solver == min(rows, key=lambda s: rows[s].times[a.target])
+        fastest = min(rows, key=lambda s: rows[s].times[a.target])
+        assert fastest in (a.best.solver, *a.ties)  # within noise an order is fixed
 
 
 def test_without_motion_errors_there_is_nothing_to_show():
