@@ -46,6 +46,8 @@ def _disproof(problem: Problem, y: FloatArray) -> str | None:
     rows = np.flatnonzero(y)
     a = problem.csr[rows]
     z, zero = a.T @ y[rows], 1e-10 * (gain / most) * (abs(a).T @ np.abs(y[rows]))
+    if not np.isfinite(z).all():
+        return "A^T y overflows"
     z[np.abs(z) <= zero] = 0.0
     pull = _pull(problem, z, zero)
     if gain - pull.sum() > 1e-10 * (most + np.abs(pull).sum()):

@@ -26,6 +26,7 @@ from lavender._arrays import FloatArray, read_only
 from lavender.errors import InputError
 from lavender.problem import Problem
 from lavender_ext.judge import measure
+from lavender_ext.judge.measure import all_finite
 
 __all__ = ["Residual", "nothing_to_do", "residual"]
 
@@ -177,7 +178,8 @@ def residual(problem: Problem, impulse: Any) -> Residual:
         last = judged(problem, impulse)
     made: Residual = object.__new__(Residual)
     state = {
-        "relative": last.relative,
+        # A slack that overflows has lost its sign, and a bound would hide it.
+        "relative": last.relative if all_finite(last.slack) else math.inf,
         "energy": last.energy,
         "velocity": last.velocity,
         "floor": last.floor,

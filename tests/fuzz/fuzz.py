@@ -63,7 +63,8 @@ def work(kind, seed, first, until, shared):
     number, last = first, time.monotonic()
     with open(shared, "r+b") as file:
         view = mmap.mmap(file.fileno(), FIELDS.size)
-        while time.time() < until["time"] and number < until["number"]:
+        parent = os.getppid()
+        while time.time() < until["time"] and number < until["number"] and os.getppid() == parent:
             FIELDS.pack_into(view, 0, number, number - first, time.process_time())
             spec = make(kind, seed, number)
             for what, detail in checks.run(spec):
