@@ -20,7 +20,6 @@ from lavender.errors import (
     UnknownName,
 )
 from lavender.generalized import Generalized
-from lavender.many import solve_many
 from lavender.problem import Problem
 from lavender.redundancy import Redundancy, redundancy
 from lavender.registry import SolverSpec, available, get, known, register
@@ -34,6 +33,7 @@ if TYPE_CHECKING:
     from lavender.check import CrossCheck, cross_check
     from lavender.engine import SOLVER_FIELDS, Simulation, Snapshot
     from lavender.io import load
+    from lavender.many import solve_many
     from lavender.motion import MotionError, Motions, motion_error, motions
     from lavender.scene import Scene
 
@@ -56,6 +56,7 @@ _LATER = {
     "motions": "lavender.motion",
     "report": "lavender.report",
     "scene": "lavender.scene",
+    "solve_many": "lavender.many",
     "suite": "lavender.suite",
 }
 

@@ -244,3 +244,19 @@ def test_an_import_downwards_passes(tmp_path, file, line):
     path.parent.mkdir(parents=True)
     path.write_text(line)
     assert breaches(tmp_path / "lavender") == []
+
+
+def test_the_page_on_architecture_names_every_room():
+    page = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+    rooms = {room for room in HEIGHT if not room.startswith("_")}
+    named = set(re.findall(r"`(\w+)`", page[page.index("## The rooms of `lavender`") :]))
+    assert rooms - named == set()
+    kernels = (ROOT / "lavender_ext" / "README.md").read_text(encoding="utf-8")
+    assert set(KERNEL_HEIGHT) == set(re.findall(r"^\| `(\w+)/`", kernels, re.MULTILINE))
+
+
+def test_files_that_the_page_on_architecture_names_are_there():
+    page = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+    paths = re.findall(r"`((?:lavender|lavender_ext|tests|\.ci)/[\w./]+)`", page)
+    assert len(paths) > 10
+    assert [path for path in paths if "NAME" not in path and not (ROOT / path).exists()] == []
