@@ -61,8 +61,8 @@ PLAN = bench.Plan(LEVELS, budgets=(4, 16, 64), repeats=2, time_limit=0.1, warm=F
 BACKENDS = ("osqp", "scs", "piqp", "clarabel", "clarabel_cone")
 NEAR = 1.25  # times the fastest: differences below say nothing on a machine that does other work
 ADVICE = (
-    "Who brings most cases of a structure to a level, and of those the fastest by shifted geometric mean of time; its\n"
-    "median time where it arrives, and on how many cases. In a time: the mean residual reached."
+    "Who brings most cases of a structure to a level, and of those the fastest by shifted geometric mean of time: the\n"
+    "number shown; and on how many cases. In a time: the mean residual reached."
 )
 LAW_NAMES = {
     "linear": "linear systems",

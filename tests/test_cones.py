@@ -25,7 +25,7 @@ REFUSED = {
         lambda: lv.Cones.contacts(np.array([0.5]), patch_radius=np.array([-1.0])),
         "patch_radius",
     ),
-    "three tangents": (lambda: lv.Cones.contacts(np.array([0.5]), tangents=3), "contact"),
+    "six tangents": (lambda: lv.Cones.contacts(np.array([0.5]), tangents=6), "tangents"),
     "spin without a row": (lambda: lv.Cones([0, 1], [2], [0], [0], [0.5], [0.1]), "contact"),
 }
 
