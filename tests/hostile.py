@@ -30,7 +30,9 @@ def one_contact(rng):
     if rng.random() < 0.3:
         a += 0.1 * rng.normal(size=(n, n))
     friction = str(rng.choice(["coulomb", "cone"]))
-    return lv.Problem.contact(a, np.zeros(n), [rng.uniform(0.0, 1.5)], friction=friction), rng.normal(size=n)
+    return lv.Problem.contact(
+        a, np.zeros(n), [rng.uniform(0.0, 1.5) * (n > 1)], friction=friction
+    ), rng.normal(size=n)
 
 
 def scaled_matrix(rng):
@@ -69,7 +71,7 @@ def bounded(rng, a, b):
     mu = [float(rng.choice([0.0, 1e-320, 1e-150, 0.5, 1e150, 1e300]))]
     if n in (3, 4) and rng.random() < 0.5:
         return lv.Problem.contact(a, b, mu, [float(rng.choice([0.0, 1e-300, 0.1, 1e300]))], friction=friction)
-    if n <= 3:
+    if 1 < n <= 3:
         return lv.Problem.contact(a, b, mu, friction=friction)
     return lv.Problem.contact(a, b, np.zeros(n), friction=friction)
 
@@ -98,6 +100,37 @@ def scaled_rows(rng):
     return problem, rng.normal(size=base.m) * rng.choice([1.0, 1e-300, 1e150, 1e300])
 
 
+def scaled_general(rng):
+    """J and M of sizes that overflow or vanish when they meet; what the door refuses is drawn again, tamer."""
+    n, c = int(rng.integers(1, 5)), int(rng.integers(0, 4))
+    friction = str(rng.choice(["coulomb", "cone"]))
+    tangents = int(rng.integers(0, 6 if friction == "cone" else 3))
+    cones = lv.Cones.free(int(rng.integers(0, 2)))
+    if c or not cones.n_rows:
+        cones = cones + lv.Cones.contacts(rng.uniform(0.0, 1.5, max(c, 1)) * (tangents > 0), tangents)
+    g = rng.normal(size=(n, n + 1))
+    for most in (len(SIZES), 8, 0):
+        sizes = np.sqrt(SIZES[1 : most or 2]) if most else np.ones(1)
+        jac = (
+            rng.normal(size=(cones.n_rows, n))
+            * rng.choice(sizes)
+            * rng.choice([1.0, 1e-3, 0.0], p=[0.8, 0.1, 0.1])
+        )
+        root = rng.choice(sizes, size=n if rng.random() < 0.5 else 1)
+        free = rng.normal(size=n) * rng.choice(sizes)
+        soft = np.full(cones.n_rows, float(rng.choice([0.0, 1e-320, 1e-3, 1e300])))
+        try:
+            with np.errstate(all="ignore"):
+                mass = np.nan_to_num(root[:, None] * (g @ g.T + np.eye(n)) * root)
+            problem = lv.Problem.from_jacobian(
+                jac, mass, free, cones=cones, compliance=soft, friction=friction
+            )
+        except lv.InputError:
+            continue
+        return problem, rng.normal(size=cones.n_rows) * rng.choice(SIZES[2:-1])
+    raise AssertionError("a problem near 1 was refused")
+
+
 def reported(rng):
     """What once hung or broke."""
     which = int(rng.integers(5))
@@ -113,7 +146,7 @@ def reported(rng):
     return lv.Problem.lcp(np.zeros((0, 0)), []), None
 
 
-GENERATORS = (one_contact, scaled_matrix, scaled_rows, reported)
+GENERATORS = (one_contact, scaled_matrix, scaled_rows, scaled_general, reported)
 BUDGETS = ((1e-6, 20), (1e-300, 20), (0.0, 3), (1e-12, 300), (1e300, 5), (1e-6, 0))
 
 
