@@ -306,7 +306,7 @@ def test_wasmtime_scenes_are_the_same_to_the_bit(module, host, recorded):
             assert hashlib.sha256(b"".join(simulation.everything())).digest() == hashes[step].tobytes(), where
             steps += 1
         assert same_bits(simulation.array("x"), states[-1][: 3 * scene["size"][0]])
-    assert steps == 7200
+    assert steps == 7800
 
 
 def test_wasmtime_problems_are_the_same_to_the_bit(module, host, recorded):
