@@ -242,9 +242,9 @@ def image(path, text):
 def abilities(spec):
     """What a spec declares, in words."""
     reads = {
-        frozenset({"rows"}): "body velocities (`Problem.from_rows`); A is never formed",
-        frozenset({"matrix"}): "the matrix A (formed once from rows where needed)",
-        frozenset({"rows", "matrix"}): "rows or matrix, as given",
+        "rows": "body velocities (`Problem.from_rows`)",
+        "matrix": "the matrix A (formed once where it is not given)",
+        "generalized": "generalised velocities (`Problem.from_jacobian`)",
     }
     yes = {
         "impulse": "starts from `impulse=`",
@@ -256,7 +256,7 @@ def abilities(spec):
     }
     rows = [
         ("laws", join_laws(spec)),
-        ("reads", reads[spec.operators]),
+        ("reads", "; ".join(text for name, text in reads.items() if name in spec.operators)),
         (
             "ends",
             "after finitely many steps or at rounding, whatever `tol`"
@@ -628,7 +628,7 @@ def api_page(site):
             "SolveFailed",
         ),
     }
-    constants = {"CONTACT", "CONTACT_SPIN", "ROW", "SOLVER_FIELDS", "__version__"}
+    constants = {"CONTACT", "CONTACT_SPIN", "ROUND", "ROW", "SOLVER_FIELDS", "__version__"}
     modules = {"bench", "engine", "io", "motion", "report", "scene", "suite"}
     listed = {name for names in rooms.values() for name in names}
     rest = sorted(set(lv.__all__) - listed - constants - modules)
