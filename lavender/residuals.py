@@ -26,7 +26,6 @@ from lavender._arrays import FloatArray, read_only
 from lavender.errors import InputError
 from lavender.problem import Problem
 from lavender_ext.judge import measure
-from lavender_ext.judge.measure import all_finite
 
 __all__ = ["Residual", "nothing_to_do", "residual"]
 
@@ -102,7 +101,7 @@ def reference(problem: Problem) -> tuple[float, float]:
             energy, velocity = rhs_energy, rhs_velocity
         # A size that overflows measures nothing: 0 makes every error beside it infinite.
         data.set_start(energy if energy < np.inf else 0.0, velocity if velocity < np.inf else 0.0)
-        problem.derived.start_relative = relative_of(data, *own[:2])
+        problem.derived.start_relative = relative_of(data, *own[:2]) if own[-1] else math.inf
         if problem.generalized is not None and "csr_data" in problem.__dict__:
             problem.csr_data.set_start(data.start_energy, data.start_velocity)
     return data.start_energy, data.start_velocity
@@ -178,8 +177,7 @@ def residual(problem: Problem, impulse: Any) -> Residual:
         last = judged(problem, impulse)
     made: Residual = object.__new__(Residual)
     state = {
-        # A slack that overflows has lost its sign, and a bound would hide it.
-        "relative": last.relative if all_finite(last.slack) else math.inf,
+        "relative": last.relative,
         "energy": last.energy,
         "velocity": last.velocity,
         "floor": last.floor,

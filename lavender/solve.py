@@ -418,7 +418,10 @@ def finish(
         tol > 0.0 and relative <= tol and status in (Status.MAX_ITERATIONS, Status.TIME_LIMIT, Status.STALLED)
     ):
         status = Status.CONVERGED
-    elif tol < relative and judged.at_floor and status in (Status.CONVERGED, Status.STALLED):
+    elif status is Status.CONVERGED and relative > tol and problem.operator not in spec.operators:
+        status = Status.STALLED
+        message = f"{message}; its test was met on A, as it was formed, alone".removeprefix("; ")
+    if tol < relative and judged.at_floor and status in (Status.CONVERGED, Status.STALLED):
         status = Status.FLOOR
     certificate = claim.certificate
     if status is Status.INFEASIBLE and relative <= tol:

@@ -154,7 +154,7 @@ class Newton:
         if not cold and self.form == "auto" and problem.rows is not None:
             tried = warm_start(problem, impulse, tol, n, time_limit)
             claim, sweeps, system.factorisations = claim_of(tried), tried.sweeps, tried.factorisations
-            if claim is not None:
+            if claim is not None and general.confirmed(problem, impulse, tol):
                 return claim
         deadline = np.inf if time_limit is None else perf_counter() + time_limit
         run = Run(system, tol, n, deadline)

@@ -11,7 +11,7 @@ from lavender_ext.core.problem cimport Data
 from lavender_ext.core.rows cimport rows_t
 from lavender_ext.judge.measure cimport (csr_slack, general_judge, general_slack, judge_into, rows_slack,
                                          rows_velocity, wrenches)
-from lavender_ext.judge.score cimport norms_of_rhs, relative, score_rows, score_t
+from lavender_ext.judge.score cimport are_numbers, norms_of_rhs, relative, score_rows, score_t
 
 
 cdef public void lav_judge_csr(const blocks_t* p, const csr_t* a, const double* lam, double* w, double* e,
@@ -57,7 +57,7 @@ def slack(Data p, const double[::1] lam, double[::1] w):
 
 
 def judge(Data p, const double[::1] lam, double[::1] w, double[::1] e, bint floor=True):
-    """Slack into w, error into e, and (energy, velocity, worst row, floor energy, floor velocity, finite)."""
+    """Slack into w, error into e, and (energy, velocity, worst row, floor energy, floor velocity, w, e finite)."""
     cdef score_t s = score_t(0.0, 0.0, 0.0, 0.0, -1, 1)
     cdef double[::1] bodies
     cdef double* v = NULL
@@ -67,13 +67,15 @@ def judge(Data p, const double[::1] lam, double[::1] w, double[::1] e, bint floo
         bodies = np.empty(p.general.n + p.blocks.n_rows)
         with nogil:
             general_judge(&p.blocks, &p.general, &lam[0], &w[0], &e[0], &bodies[0], floor, &s)
-        return s.energy, s.velocity, s.worst, s.floor_energy, s.floor_velocity, bool(s.finite)
+        return (s.energy, s.velocity, s.worst, s.floor_energy, s.floor_velocity,
+                s.finite and are_numbers(&w[0], p.blocks.n_rows))
     if p.factored:
         bodies = np.empty((12 if floor else 6) * p.rows.n_bodies + 1)
         v = &bodies[0]
     with nogil:
         judge_into(&p.blocks, &p.csr, &p.rows, p.factored, &lam[0], &w[0], &e[0], v, floor, &s)
-    return s.energy, s.velocity, s.worst, s.floor_energy, s.floor_velocity, bool(s.finite)
+    return (s.energy, s.velocity, s.worst, s.floor_energy, s.floor_velocity,
+            s.finite and are_numbers(&w[0], p.blocks.n_rows))
 
 
 cdef class Judged:
@@ -110,7 +112,9 @@ cdef class Judged:
         self.energy = s.energy if s.finite else 1.0 / 0.0
         self.velocity = s.velocity if s.finite else 1.0 / 0.0
         self.worst = s.worst
-        self.relative = relative(self.energy, self.velocity, p.start_energy, p.start_velocity)
+        self.relative = 1.0 / 0.0
+        if p.blocks.n_rows == 0 or are_numbers(&w[0], p.blocks.n_rows):
+            self.relative = relative(self.energy, self.velocity, p.start_energy, p.start_velocity)
         self.floor = relative(s.floor_energy, s.floor_velocity, p.start_energy, p.start_velocity)
 
 

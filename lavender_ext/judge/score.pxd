@@ -40,6 +40,15 @@ cdef inline double unit_roundoff() noexcept nogil:
     return 1.1102230246251565e-16
 
 
+cdef inline int32_t are_numbers(const double* x, int32_t n) noexcept nogil:
+    """Does x hold neither NaN nor infinity? A slack that overflows has lost its sign, and a bound would hide it."""
+    cdef int32_t i
+    cdef double s = 0.0                                 # stays 0, or becomes NaN
+    for i in range(n):
+        s += 0.0 * x[i]
+    return s == 0.0
+
+
 cdef inline double ratio(double x, double reference) noexcept nogil:
     """0 where x is, inf where x is not finite or has nothing to be compared with."""
     if x == 0.0:

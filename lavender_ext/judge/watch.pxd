@@ -20,7 +20,7 @@ from lavender_ext.core.csr cimport csr_t
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.rows cimport rows_t
 from lavender_ext.judge.measure cimport judge_into
-from lavender_ext.judge.score cimport relative, score_t
+from lavender_ext.judge.score cimport are_numbers, relative, score_t
 
 
 cpdef enum:
@@ -85,6 +85,8 @@ cdef inline int32_t check(watch_t* s, const blocks_t* p, const csr_t* a, const r
     cdef double now, floor, inf = 1.0 / 0.0
     judge_into(p, a, r, factored, lam, s.w, s.e, s.v, 0, &x)
     now = against_start(s, x.energy, x.velocity) if x.finite else inf
+    if now <= tol and not are_numbers(s.w, p.n_rows):
+        now = inf
     if s.total == 0:
         s.start = now
     s.check_at = s.total + until_next(s, now, tol)

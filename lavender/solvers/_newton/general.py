@@ -50,7 +50,7 @@ def run(
         end, done = kernel.run(impulse, closer * tol, min(CLOCK, n - int(counts[0])), cold)
         counts += done
         status = _STATUS[end]
-        if status is Status.CONVERGED and not _confirmed(problem, impulse, tol):
+        if status is Status.CONVERGED and not confirmed(problem, impulse, tol):
             # Its sums are rounded in another order, and vanish where squares do.
             status = Status.MAX_ITERATIONS if closer > CLOSEST else Status.STALLED
             closer *= 0.25
@@ -65,7 +65,7 @@ def run(
     return _claim(status, counts)
 
 
-def _confirmed(problem: Problem, impulse: FloatArray, tol: float) -> bool:
+def confirmed(problem: Problem, impulse: FloatArray, tol: float) -> bool:
     """Whether the judge finds what the kernel found; his pass is kept for the one who returns the impulse."""
     found = judged(problem, impulse.copy())
     remember(problem, found)
@@ -85,7 +85,7 @@ def run_many(
     cold = [_is_cold(p, lam) for p, lam in zip(problems, impulses, strict=True)]
     ends, counts = kernel_many(kernels, impulses, tol, CLOCK, cold)
     return [
-        _claim(Status.CONVERGED, count) if end == ENDS["done"] and _confirmed(p, lam, tol) else None
+        _claim(Status.CONVERGED, count) if end == ENDS["done"] and confirmed(p, lam, tol) else None
         for p, lam, end, count in zip(problems, impulses, ends.tolist(), counts.tolist(), strict=True)
     ]
 
