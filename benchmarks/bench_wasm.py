@@ -2,7 +2,7 @@
 
     python benchmarks/bench_wasm.py [--rounds 5] [--json FILE]
 
-Both sides start from the same bytes and do the same arithmetic to the last bit (tests/test_wasm.py), so a
+Both sides start from the same bytes and do the same arithmetic to the last bit (tests/web/test_wasm.py), so a
 ratio compares code, never work. A substep is timed as a run of substeps from a settled state, restored before
 every repetition; a sweep as a run of sweeps that goes on where the last stopped. Native and Node take turns,
 round by round, and the least time of each side counts: other work on the machine only adds. One thread. A

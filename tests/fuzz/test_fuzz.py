@@ -11,7 +11,7 @@ from random_problems import random_contact_problem, random_lcp
 
 import lavender as lv
 
-FUZZ = Path(__file__).resolve().parent / "fuzz"
+FUZZ = Path(__file__).resolve().parent.parent / "fuzz"
 sys.path.insert(0, str(FUZZ))
 
 import checks

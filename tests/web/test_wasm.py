@@ -17,7 +17,7 @@ from lavender.web import compile as wasm
 from lavender.web import pages
 from lavender.web.scenes import describe, layout, page_scenes
 
-HERE = Path(__file__).resolve().parent
+HERE = Path(__file__).resolve().parent.parent
 ROOT = HERE.parent
 CHECK = HERE / "wasm" / "check_wasm_exports.mjs"
 # Left out where the kernels run with every check on: the module is compiled without them either way.

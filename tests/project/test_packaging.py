@@ -16,7 +16,7 @@ import pytest
 import lavender
 import lavender_ext
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parent.parent.parent
 KERNELS = Path(lavender_ext.__file__).parent
 MODULES = sorted(".".join(path.relative_to(KERNELS).with_suffix("").parts) for path in KERNELS.rglob("*.pyx"))
 

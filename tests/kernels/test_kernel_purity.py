@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parent.parent.parent
 SPEC = importlib.util.spec_from_file_location("check_kernels", ROOT / ".ci" / "check_kernels.py")
 check_kernels = importlib.util.module_from_spec(SPEC)
 sys.modules[SPEC.name] = check_kernels

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parent.parent.parent
 FOLDER = ROOT / "examples" / "plugin"
 
 if importlib.util.find_spec("pip") is None:
@@ -77,7 +77,7 @@ def test_keeps_the_contract_of_every_solver(environment):
         "-q",
         "-p",
         "no:cacheprovider",
-        "tests/test_contract.py",
+        "tests/solvers/test_contract.py",
         "-k",
         "apgd",
     ]

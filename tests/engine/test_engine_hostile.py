@@ -17,7 +17,7 @@ from lavender.engine.layout import HEAD
 from lavender.engine.state import KEPT
 from lavender.registry import specs
 
-HERE = Path(__file__).resolve().parent
+HERE = Path(__file__).resolve().parent.parent
 CARRIED = ("setting", "x", "q", "v", "cache_key", "cache_impulse", "cache_local", "joint_impulse")
 
 

@@ -5,7 +5,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-COMMAND = Path(__file__).resolve().parent.parent / ".ci" / "fingerprint"
+COMMAND = Path(__file__).resolve().parent.parent.parent / ".ci" / "fingerprint"
 
 
 def run(*arguments, seed="0"):

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from motion_truth import HAS_WIDE, project_cone, solve_wide, trial, wide_matrix
 from random_problems import as_matrix, random_contact_problem, random_lcp, seeds
-from test_generalized import random_general
+from random_trees import random_general
 
 import lavender as lv
 from lavender import suite

@@ -450,7 +450,7 @@ def test_the_generators_layout_is_read(tmp_path):
 
 
 def test_the_documentation_lists_every_entry_of_our_format(tmp_path):
-    text = (Path(__file__).resolve().parent.parent / "docs" / "formats.md").read_text(encoding="utf-8")
+    text = (Path(__file__).resolve().parent.parent.parent / "docs" / "formats.md").read_text(encoding="utf-8")
     for _, problem in variants():
         lavender.io.save(problem, tmp_path / "p.npz", impulse=np.zeros(problem.m))
         with np.load(tmp_path / "p.npz") as saved:

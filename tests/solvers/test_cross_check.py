@@ -8,8 +8,7 @@ import hypothesis.strategies as st
 import numpy as np
 import pytest
 from hypothesis import given, settings
-from random_problems import as_matrix, random_contact_problem, random_rows
-from test_external_backends import box_stack, spd
+from random_problems import as_matrix, box_stack, random_contact_problem, random_rows, spd
 
 import lavender as lv
 from lavender import check, registry, suite
@@ -281,7 +280,7 @@ def test_a_proof_that_there_is_no_solution_counts():
 
 
 def test_the_example_runs_and_its_relation_holds(tmp_path, capsys):
-    path = Path(__file__).resolve().parent.parent / "examples" / "cross_validate.py"
+    path = Path(__file__).resolve().parent.parent.parent / "examples" / "cross_validate.py"
     spec = importlib.util.spec_from_file_location("cross_validate", path)
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)

@@ -21,7 +21,7 @@ SEEDS = {True: 80, False: 160}  # problems for a backend, for a solver of ours
 def in_its_own_process(names, seeds):
     command = [sys.executable, "hostile.py", ",".join(names), "0", str(seeds)]
     return subprocess.Popen(
-        command, cwd=Path(__file__).parent, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        command, cwd=Path(__file__).parent.parent, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
 
 
@@ -64,7 +64,11 @@ hostile.draw = lambda seed: (lv.Problem.lcp([[1.0]], [1.0]), None, 1e-6, 5)
 hostile.main(["hang", "pgs"], [0])
 """
     done = subprocess.run(
-        [sys.executable, "-c", script], cwd=Path(__file__).parent, capture_output=True, text=True, timeout=300
+        [sys.executable, "-c", script],
+        cwd=Path(__file__).parent.parent,
+        capture_output=True,
+        text=True,
+        timeout=300,
     )
     assert done.returncode != 0
     assert json.loads(done.stdout.splitlines()[-1]) == {"begins": "hang"}

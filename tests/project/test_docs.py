@@ -14,7 +14,7 @@ import pytest
 import lavender as lv
 from lavender.cli import cli
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parent.parent.parent
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 BLOCK = re.compile(r"^```(python|pycon|sh)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 FLAGS = doctest.NORMALIZE_WHITESPACE | doctest.ELLIPSIS
@@ -115,7 +115,7 @@ def test_the_chapter_names_examples_tests_and_functions_that_exist():
     assert examples <= {f"examples/{path.name}" for path in (ROOT / "examples").glob("*.py")}
     figures = set(re.findall(r"figures/example-(\w+)\.svg", text))
     assert figures and figures <= {path.stem for path in (ROOT / "examples").glob("*.py")}
-    named = re.findall(r"`(tests/\w+\.py)(?:::(\w+))?`", text)
+    named = re.findall(r"`(tests/[\w/]+\.py)(?:::(\w+))?`", text)
     assert len(named) > 12
     for file, test in named:
         source = (ROOT / file).read_text(encoding="utf-8")

@@ -9,7 +9,7 @@ import pytest
 
 import lavender as lv
 
-FOLDER = Path(__file__).resolve().parent.parent / "examples"
+FOLDER = Path(__file__).resolve().parent.parent.parent / "examples"
 
 
 def example(name):

@@ -9,7 +9,7 @@ import pytest
 import lavender
 
 PACKAGE = Path(lavender.__file__).resolve().parent
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parent.parent.parent
 
 #: Bottom to top; names on one line are of one level and do not import each other.
 LEVELS = [
@@ -98,7 +98,7 @@ def breaches(package: Path) -> list[str]:
         if room == "":
             continue  # lavender/__init__.py holds the public names: it may import every room
         if room not in HEIGHT:
-            found.append(f"{where}: the room {room!r} has no place in LEVELS of tests/test_layers.py")
+            found.append(f"{where}: the room {room!r} has no place in LEVELS of tests/project/test_layers.py")
             continue
         for line, name, late in imports(path, package):
             other = name.split(".")[1] if "." in name else ""
@@ -121,7 +121,9 @@ def kernel_breaches(package: Path) -> list[str]:
             continue  # what lies beside the rooms describes the package and its build
         room, where = inside[0], path.relative_to(package.parent).as_posix()
         if room not in KERNEL_HEIGHT:
-            found.append(f"{where}: the room {room!r} has no place in KERNEL_LEVELS of tests/test_layers.py")
+            found.append(
+                f"{where}: the room {room!r} has no place in KERNEL_LEVELS of tests/project/test_layers.py"
+            )
             continue
         for name in statement.findall(path.read_text(encoding="utf-8")):
             other = name.split(".")[1] if name else ""

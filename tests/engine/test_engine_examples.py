@@ -10,7 +10,7 @@ import pytest
 import lavender as lv
 from lavender.engine.layout import HEAD
 
-FOLDER = Path(__file__).resolve().parent.parent / "examples"
+FOLDER = Path(__file__).resolve().parent.parent.parent / "examples"
 
 
 def example(name):
