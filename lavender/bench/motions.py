@@ -89,19 +89,19 @@ def samples(name: str, problem: Problem, structure: str) -> Iterator[Sample]:
                 if error.relative is None or not math.isfinite(error.relative):
                     continue
                 yield Sample(
-                    name,
-                    problem.law,
-                    structure,
-                    solver,
-                    end.iterations,
-                    r.relative,
-                    r.energy / r.energy_start,
-                    r.velocity / r.velocity_start,
-                    _plain(problem, end.impulse),
-                    error.relative,
-                    _number(error.speed),
-                    _number(error.bound),
-                    _number(error.energy),
+                    case=name,
+                    law=problem.law,
+                    structure=structure,
+                    solver=solver,
+                    iterations=end.iterations,
+                    relative=r.relative,
+                    energy=r.energy / r.energy_start,
+                    velocity=r.velocity / r.velocity_start,
+                    plain=_plain(problem, end.impulse),
+                    motion=error.relative,
+                    speed=_number(error.speed),
+                    bound=_number(error.bound),
+                    found=_number(error.energy),
                 )
         except CapabilityError:
             continue
@@ -138,18 +138,18 @@ def branches(name: str, problem: Problem, structure: str, runs: int) -> Branches
                 sliding = max(sliding, float(np.linalg.norm(t)))
     fastest = float(np.max(np.abs(problem.slack(problem.start())), initial=0.0))
     return Branches(
-        name,
-        problem.law,
-        structure,
-        problem.m,
-        float(np.max(c.mu[contact], initial=0.0)),
-        sliding,
-        len(found),
-        found.runs,
-        found.spread,
-        found.spread / fastest if fastest > 0.0 else 0.0,
-        found.unique,
-        _warm(problem, found),
+        case=name,
+        law=problem.law,
+        structure=structure,
+        rows=problem.m,
+        friction=float(np.max(c.mu[contact], initial=0.0)),
+        sliding=sliding,
+        motions=len(found),
+        runs=found.runs,
+        spread=found.spread,
+        share=found.spread / fastest if fastest > 0.0 else 0.0,
+        unique=found.unique,
+        warm=_warm(problem, found),
     )
 
 

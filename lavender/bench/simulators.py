@@ -145,10 +145,24 @@ def measure(mj: Any, path: Path, steps: int, every: int, seed: int = 0) -> list[
                 problem.relaxed("coulomb"), tol=STRICT, impulse=problem.start(), time_limit=5.0
             ).residual
             coulomb = 0.0 if under.relative <= 2.0 * under.floor else under.relative
-        out.append(Step(
-            path.stem, step, problem.m, int(model.nv), problem.law, tolerance, engine, ours, many, kernel,
-            engine_residual, found, 0.0 if strict.relative <= 2.0 * strict.floor else strict.relative, coulomb,
-        ))  # fmt: skip
+        out.append(
+            Step(
+                model=path.stem,
+                step=step,
+                rows=problem.m,
+                nv=int(model.nv),
+                law=problem.law,
+                tolerance=tolerance,
+                engine=engine,
+                ours=ours,
+                many=many,
+                kernel=kernel,
+                engine_residual=engine_residual,
+                residual=found,
+                strict=0.0 if strict.relative <= 2.0 * strict.floor else strict.relative,
+                coulomb=coulomb,
+            )
+        )
         if len(out) == steps:
             break
     return out

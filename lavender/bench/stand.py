@@ -348,9 +348,16 @@ def _watch(engine: Engine, tower: Tower) -> Line:
             start = now if start is None else start
             drift = max(drift, float(np.linalg.norm(now - start, axis=1).max()))
     return Line(
-        engine.name, tower.boxes, tower.dt, engine.sweeps, engine.substeps, tower.seconds, stood, drift,
-        spent / steps,
-    )  # fmt: skip
+        engine=engine.name,
+        boxes=tower.boxes,
+        dt=tower.dt,
+        sweeps=engine.sweeps,
+        substeps=engine.substeps,
+        seconds=tower.seconds,
+        stood=stood,
+        drift=drift,
+        cost=spent / steps,
+    )
 
 
 def _under_node(name: str, tower: Tower) -> Line:
@@ -413,7 +420,14 @@ def lines(
                 for budget in budgets:
                     for part in substeps if c.substeps else (0,):
                         for order in orders if own else (None,):
-                            tower = Tower(n, 1.0 / rate, budget, part or None, order, seconds)
+                            tower = Tower(
+                                boxes=n,
+                                dt=1.0 / rate,
+                                sweeps=budget,
+                                substeps=part or None,
+                                order=order,
+                                seconds=seconds,
+                            )
                             line = measure(name, tower)
                             key = (line.engine, line.sweeps, line.substeps)
                             if key not in seen:

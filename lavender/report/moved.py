@@ -100,13 +100,13 @@ def moved(records: Records, levels: Sequence[float] | None = None) -> list[Moved
         best = runs.get((reach.case, reach.solver, reach.start), (0.0, None))[1]
         out.append(
             Moved(
-                reach.case,
-                reach.solver,
-                reach.start,
-                dict(reach.times),
-                reach.best,
-                math.nan if best is None or best.motion is None else best.motion,
-                math.nan if best is None or best.bound is None else best.bound,
+                case=reach.case,
+                solver=reach.solver,
+                start=reach.start,
+                times=dict(reach.times),
+                best=reach.best,
+                relative=math.nan if best is None or best.motion is None else best.motion,
+                bound=math.nan if best is None or best.bound is None else best.bound,
             )
         )
     return out

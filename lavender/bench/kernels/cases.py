@@ -91,9 +91,16 @@ def _impulses(contacts: int, seconds: float, shuffle: bool = False, **options: A
     time, bare = least(ours, partial(microbenchmarks.contact, *raw, n), seconds=seconds)
     label = "sequential impulses" + "".join(f", {v}" for v in options.values())
     return Row(
-        label, f"{c} contacts" + (" shuffled" if shuffle else ""), "contact", c, time / n, contact_bytes(problem),
-        bare / n, "bare", residual(problem, lam).relative,
-    )  # fmt: skip
+        case=label,
+        size=f"{c} contacts" + (" shuffled" if shuffle else ""),
+        unit="contact",
+        work=c,
+        seconds=time / n,
+        bytes=contact_bytes(problem),
+        limit=bare / n,
+        limit_name="bare",
+        residual=residual(problem, lam).relative,
+    )
 
 
 def _threads(contacts: int, seconds: float, threads: int = 2) -> Row:
@@ -103,9 +110,16 @@ def _threads(contacts: int, seconds: float, threads: int = 2) -> Row:
     calls = [sweeps(problem, "sequential_impulses", n, order="colored", threads=t) for t in (1, threads)]
     one, many = least(calls[0][0], calls[1][0], seconds=4 * seconds, clock=_wall)
     return Row(
-        f"colored, {threads} threads (wall)", f"{c} contacts", "contact", c, many / n, contact_bytes(problem),
-        one / n / threads, f"1 thread / {threads}", residual(problem, calls[1][2]).relative,
-    )  # fmt: skip
+        case=f"colored, {threads} threads (wall)",
+        size=f"{c} contacts",
+        unit="contact",
+        work=c,
+        seconds=many / n,
+        bytes=contact_bytes(problem),
+        limit=one / n / threads,
+        limit_name=f"1 thread / {threads}",
+        residual=residual(problem, calls[1][2]).relative,
+    )
 
 
 def _wall() -> int:
@@ -126,9 +140,16 @@ def _matrix(problem: Problem, size: str, name: str, seconds: float, bare: bool) 
     per = csr_bytes(problem)
     limit = times[1] / n if bare else stream_time(per * nnz)
     return Row(
-        name, size, "entry of A", nnz, times[0] / n, per, limit, "bare" if bare else "stream",
-        residual(problem, lam).relative,
-    )  # fmt: skip
+        case=name,
+        size=size,
+        unit="entry of A",
+        work=nnz,
+        seconds=times[0] / n,
+        bytes=per,
+        limit=limit,
+        limit_name="bare" if bare else "stream",
+        residual=residual(problem, lam).relative,
+    )
 
 
 def frictionless(contacts: int) -> Problem:
@@ -147,9 +168,16 @@ def _block_sweep(contacts: int, seconds: float) -> Row:
     time = least(ours, seconds=seconds)[0]
     per = contact_bytes(problem)
     return Row(
-        "block_gauss_seidel", f"{c} contacts", "contact", c, time / n, per, stream_time(per * c), "stream",
-        residual(problem, lam).relative,
-    )  # fmt: skip
+        case="block_gauss_seidel",
+        size=f"{c} contacts",
+        unit="contact",
+        work=c,
+        seconds=time / n,
+        bytes=per,
+        limit=stream_time(per * c),
+        limit_name="stream",
+        residual=residual(problem, lam).relative,
+    )
 
 
 def _judge(contacts: int, seconds: float) -> Row:
@@ -159,9 +187,16 @@ def _judge(contacts: int, seconds: float) -> Row:
     time = least(lambda: measure.judge(problem.data, lam, w, e, False), seconds=seconds)[0]
     per = contact_bytes(problem) - 6 * 24.0  # no swing
     return Row(
-        "residual", f"{c} contacts", "contact", c, time, per, stream_time(per * c), "stream",
-        residual(problem, lam).relative,
-    )  # fmt: skip
+        case="residual",
+        size=f"{c} contacts",
+        unit="contact",
+        work=c,
+        seconds=time,
+        bytes=per,
+        limit=stream_time(per * c),
+        limit_name="stream",
+        residual=residual(problem, lam).relative,
+    )
 
 
 def _assembly(contacts: int, seconds: float) -> Row:
@@ -172,14 +207,14 @@ def _assembly(contacts: int, seconds: float) -> Row:
     time = least(lambda: assemble.delassus(data, *bound), seconds=seconds)[0]
     per = 12.0 + (contact_bytes(problem) + 6 * 96) * problem.n_blocks / nnz
     return Row(
-        "assembly of A",
-        f"{problem.n_blocks} contacts",
-        "entry of A",
-        nnz,
-        time,
-        per,
-        stream_time(per * nnz),
-        "stream",
+        case="assembly of A",
+        size=f"{problem.n_blocks} contacts",
+        unit="entry of A",
+        work=nnz,
+        seconds=time,
+        bytes=per,
+        limit=stream_time(per * nnz),
+        limit_name="stream",
     )
 
 
@@ -247,9 +282,15 @@ def _small(m: int, seconds: float) -> Row:
     solution = solve(problem, "pgs", tol=0.0, max_iter=8)
     call, kernel = least(lambda: solve(problem, "pgs", tol=0.0, max_iter=8), kernel_alone, seconds=seconds)
     return Row(
-        "lv.solve, 8 sweeps of pgs", f"{m} rows", "call", 1, call, limit=kernel, limit_name="kernel alone",
+        "lv.solve, 8 sweeps of pgs",
+        f"{m} rows",
+        "call",
+        1,
+        call,
+        limit=kernel,
+        limit_name="kernel alone",
         residual=solution.residual.relative,
-    )  # fmt: skip
+    )
 
 
 def _job(n: int, tol: float, seconds: float) -> Row:

@@ -363,7 +363,17 @@ def run(
                     engine.step()
                 best[i] = min(best[i], (process_time() - start) / size[i])
         return [
-            Step(scene, e.name, e.accurate, NAN, 0, NAN, NAN, NAN, notes[i])
+            Step(
+                scene=scene,
+                engine=e.name,
+                accurate=e.accurate,
+                time=NAN,
+                contacts=0,
+                depth=NAN,
+                speed=NAN,
+                relative=NAN,
+                note=notes[i],
+            )
             if i in notes
             else Step(scene, e.name, e.accurate, float(best[i]), **e.left())
             for i, e in enumerate(made)

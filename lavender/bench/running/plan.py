@@ -108,9 +108,19 @@ class Plan:
 
         def task(mode: str, tol: float, max_iter: int, start: str, **options: Any) -> Task:
             return Task(
-                info.run, info.case, info.sha, spec.name, mode, tol, max_iter, self.time_limit, start, options,
-                self.repeats, info.step,
-            )  # fmt: skip
+                run=info.run,
+                case=info.case,
+                sha=info.sha,
+                solver=spec.name,
+                mode=mode,
+                tol=tol,
+                max_iter=max_iter,
+                time_limit=self.time_limit,
+                start=start,
+                options=options,
+                repeats=self.repeats,
+                step=info.step,
+            )
 
         for start in starts:
             levels = self.levels[-1:] if spec.exact else self.levels

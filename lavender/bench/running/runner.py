@@ -165,7 +165,11 @@ class _Runner:
 
     def tell(self, case: str, solver: str, record: Record | None = None, reused: bool = False) -> None:
         if self.watch is not None:
-            self.watch(Event(self.done, self.total, case, solver, record, reused))
+            self.watch(
+                Event(
+                    done=self.done, total=self.total, case=case, solver=solver, record=record, reused=reused
+                )
+            )
 
     def run(self, items: list[Item]) -> Records:
         self.total = len(items) * len(self.names)
@@ -232,11 +236,21 @@ class _Runner:
         repeats = self.plan.repeats if len(steps) <= FEW_STEPS else 1
         tasks = [
             Task(
-                self.this.run, info.case, info.sha, spec.name, mode, tol, max_iter, self.plan.time_limit,
-                start, {}, repeats, info.step,
+                run=self.this.run,
+                case=info.case,
+                sha=info.sha,
+                solver=spec.name,
+                mode=mode,
+                tol=tol,
+                max_iter=max_iter,
+                time_limit=self.plan.time_limit,
+                start=start,
+                options={},
+                repeats=repeats,
+                step=info.step,
             )
             for _, info in steps
-        ]  # fmt: skip
+        ]
         problems = [item for item, _ in steps]
         limit, spent, made = self.plan.pass_limit or math.inf, 0.0, 0
         for task in tasks:

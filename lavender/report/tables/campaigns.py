@@ -48,14 +48,14 @@ def robustness(records: Records) -> list[Robustness]:
             runs = [r for g in mine.values() for r in g]
             out.append(
                 Robustness(
-                    family,
-                    solver,
-                    len(mine),
-                    {x: sum(v <= x for v in best.values()) for x in levels},
-                    sum(bool(r.contradicted) for r in runs),
-                    sum(r.status.startswith(DIED) for r in runs),
-                    {n: (median(v), quantile(v, 0.95)) for n, v in sorted(by_budget.items())},
-                    max(best, key=lambda c: best[c]),
+                    family=family,
+                    solver=solver,
+                    cases=len(mine),
+                    reached={x: sum(v <= x for v in best.values()) for x in levels},
+                    wrong=sum(bool(r.contradicted) for r in runs),
+                    died=sum(r.status.startswith(DIED) for r in runs),
+                    budgets={n: (median(v), quantile(v, 0.95)) for n, v in sorted(by_budget.items())},
+                    hardest=max(best, key=lambda c: best[c]),
                 )
             )
     return out

@@ -103,21 +103,21 @@ def reaches(records: Records, levels: Sequence[float] | None = None) -> list[Rea
         last = asked[-1]
         out.append(
             Reach(
-                case,
-                solver,
-                start,
-                {
+                case=case,
+                solver=solver,
+                start=start,
+                times={
                     level: min((r.time_min for r in good if r.relative <= level), default=math.inf)
                     for level in levels
                 },
-                best.relative if best else math.inf,
-                best.time_min if best else math.nan,
-                best.floor if best else math.nan,
-                last.status,
-                next((r.contradicted for r in group if r.contradicted), ""),
-                last.message,
-                last.worst_name,
-                last.form,
+                best=best.relative if best else math.inf,
+                best_time=best.time_min if best else math.nan,
+                floor=best.floor if best else math.nan,
+                status=last.status,
+                contradicted=next((r.contradicted for r in group if r.contradicted), ""),
+                message=last.message,
+                worst_name=last.worst_name,
+                form=last.form,
             )
         )
     return out
@@ -138,16 +138,16 @@ def failures(records: Records) -> list[Failure]:
                 asked += f", order {r.order}"
             out.append(
                 Failure(
-                    r.case,
-                    r.solver,
-                    asked,
-                    r.start,
-                    r.status,
-                    r.relative,
-                    r.floor,
-                    r.worst_name,
-                    r.contradicted,
-                    r.message,
+                    case=r.case,
+                    solver=r.solver,
+                    asked=asked,
+                    start=r.start,
+                    status=r.status,
+                    relative=r.relative,
+                    floor=r.floor,
+                    worst_name=r.worst_name,
+                    contradicted=r.contradicted,
+                    message=r.message,
                 )
             )
     return out
@@ -161,13 +161,13 @@ def claims(records: Records) -> list[Claims]:
         asked = [r for r in mine if r.mode == "tol"]
         out.append(
             Claims(
-                solver,
-                len(mine),
-                sum(r.claims for r in mine),
-                sum(r.claims and bool(r.contradicted) for r in mine),
-                sum(r.success for r in asked),
-                len(asked),
-                sum(r.status.startswith(DIED) for r in mine),
+                solver=solver,
+                runs=len(mine),
+                claims=sum(r.claims for r in mine),
+                wrong=sum(r.claims and bool(r.contradicted) for r in mine),
+                reached=sum(r.success for r in asked),
+                asked=len(asked),
+                crashed=sum(r.status.startswith(DIED) for r in mine),
             )
         )
     return out

@@ -71,11 +71,11 @@ def walks(records: Records) -> list[Walk]:
         out.append(
             Walk(
                 *key,
-                steps[key[0]],
-                {s: tuple(_step_time(r) for r in g) for s, g in by_start.items()},
-                {s: sum(r.iterations for r in g) for s, g in by_start.items()},
-                {s: tuple(r.relative for r in g) for s, g in by_start.items()},
-                {s: sum(bool(r.contradicted) for r in g) for s, g in by_start.items()},
+                steps=steps[key[0]],
+                times={s: tuple(_step_time(r) for r in g) for s, g in by_start.items()},
+                iterations={s: sum(r.iterations for r in g) for s, g in by_start.items()},
+                residuals={s: tuple(r.relative for r in g) for s, g in by_start.items()},
+                wrong={s: sum(bool(r.contradicted) for r in g) for s, g in by_start.items()},
             )
         )
     return out
