@@ -49,7 +49,7 @@ class Residual:
 
     @property
     def at_floor(self) -> bool:
-        """Within twice what float64 allows; a floor that is not finite allows nothing."""
+        """Within twice what float64 allows, and no worse than doing nothing."""
         return at_floor(self.relative, self.floor)
 
     @property
@@ -75,8 +75,11 @@ class Residual:
 
 
 def at_floor(relative: float, floor: float) -> bool:
-    """Whether a relative residual is within twice its floor, both finite."""
-    return relative <= 2.0 * floor < math.inf
+    """Whether a relative residual is within twice its floor, both finite, and no worse than doing nothing.
+
+    Above 1 the floor is that of an impulse that ran away: it says nothing of the problem.
+    """
+    return relative <= 2.0 * floor < math.inf and relative <= 1.0
 
 
 def relative_of(data: Any, energy: float, velocity: float) -> float:

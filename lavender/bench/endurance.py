@@ -59,12 +59,12 @@ def energy(scene: Scene, observation: dict[str, Any]) -> float:
             continue
         x, v = observation["positions"][i], observation["velocities"][i]
         omega = rotation(observation["quaternions"][i]).T @ v[3:]
-        with np.errstate(over="ignore", invalid="ignore"):  # a run about to be lost
-            total += 0.5 * body.mass * float(v[:3] @ v[:3]) + 0.5 * float(omega @ body.inertia @ omega)
+        total += 0.5 * body.mass * float(v[:3] @ v[:3]) + 0.5 * float(omega @ body.inertia @ omega)
         total -= body.mass * float(g @ x)
     return total
 
 
+@np.errstate(over="ignore", invalid="ignore")  # a run about to be lost
 def stay(
     name: str, dt: float, seconds: float, *, solver: str = "sequential_impulses", **parameters: Any
 ) -> Stay:

@@ -73,8 +73,8 @@ def test_a_lost_scene_says_so_and_the_command_writes_its_table(tmp_path, capsys)
         ("ramp", 60),
         ("ramp", 120),
     ]
-    fast = endurance.stay("spinner", 1 / 60, 1.0, spin=1e200)
-    assert fast.lost == "sphere 1" and "lost: sphere 1" in endurance.table([fast])
+    fast = endurance.stay("ramp", 1 / 60, 1.0, gravity=1e307)
+    assert fast.lost == "box 1" and "lost: box 1" in endurance.table([fast])
     for words in (["--seconds", "0"], ["no_such_scene"], ["--solvers", "nwton", "ramp"]):
         with pytest.raises(SystemExit) as code:
             main(["bench", "gallery", *words])
