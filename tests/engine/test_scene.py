@@ -333,18 +333,18 @@ def test_a_builder_registers_itself_and_is_a_scene_like_those_of_the_gallery(mon
     monkeypatch.setattr(table, "DEFAULTS", dict(table.DEFAULTS))
 
     @table.named_scene(friction=0.2, dt=0.01)
-    def slab(scene, size=2.0):
+    def plank(scene, size=2.0):
         scene.add_plane()
         scene.add_box((size, size, 0.1), position=(0, 0, 0.05))
 
-    scene = lv.Scene("slab", size=3.0, dt=0.02)
+    scene = lv.Scene("plank", size=3.0, dt=0.02)
     assert (scene.parameters.friction, scene.parameters.dt) == (0.2, 0.02)
     assert scene.bodies[1].shape.size == (3.0, 3.0, 0.1)
     lv.Simulation(scene).reset(seed=4)
     with pytest.raises(lv.UnknownName, match="size"):
-        lv.Scene("slab", sise=3.0)
+        lv.Scene("plank", sise=3.0)
     with pytest.raises(lv.InputError, match="registered already"):
-        table.named_scene()(slab)
+        table.named_scene()(plank)
     with pytest.raises(lv.UnknownName, match="frction"):
         table.named_scene(frction=0.2)
 
@@ -361,7 +361,7 @@ def test_a_builder_registers_itself_and_is_a_scene_like_those_of_the_gallery(mon
 
 def test_a_step_that_would_not_end_is_refused():
     for parameters in ({"dt": 1e6}, {"dt": 1e300}, {"dt": 1.0, "max_substep": 1e-300}):
-        with pytest.raises(lv.InputError, match="give substeps="):
+        with pytest.raises(lv.InputError, match="substeps= if that many"):
             lv.Scene(**parameters)
     assert lv.Scene(dt=1e6, substeps=3).parameters.substeps == 3
-    assert lv.Scene(dt=400.0).parameters.substeps == 96_000
+    assert lv.Scene(dt=40.0).parameters.substeps == 9_600
