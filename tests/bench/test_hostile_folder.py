@@ -471,7 +471,7 @@ import sys
 from lavender import bench
 from lavender.bench.running.worker import Worker
 sys.path[:0] = [sys.argv[1]]
-from tests.test_hostile_folder import stack, task
+from test_hostile_folder import stack, task
 import dataclasses
 p = stack()
 Worker().measure(p, dataclasses.replace(task(p, "x_fork"), time_limit=30.0))
@@ -480,7 +480,7 @@ Worker().measure(p, dataclasses.replace(task(p, "x_fork"), time_limit=30.0))
 
 @PROC
 def test_a_worker_ends_when_its_parent_is_killed(hostile):
-    root = os.path.dirname(os.path.dirname(__file__))
+    root = os.path.dirname(__file__)
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([root, *filter(None, sys.path)])}
     parent = subprocess.Popen([sys.executable, "-c", HANGS, root], env=environment)
     assert wait_until(lambda: hostile.exists() and len(hostile.read_text().split()) == 2, 60.0)
