@@ -65,7 +65,8 @@ def work(kind, seed, first, until, shared):
         view = mmap.mmap(file.fileno(), FIELDS.size)
         parent = os.getppid()
         while time.time() < until["time"] and number < until["number"] and os.getppid() == parent:
-            FIELDS.pack_into(view, 0, number, number - first, time.process_time())
+            # At once: pack_into clears the buffer first, and zeros read as an input that has lasted since the start.
+            view[:] = FIELDS.pack(number, number - first, time.process_time())
             spec = make(kind, seed, number)
             for what, detail in checks.run(spec):
                 say(
@@ -82,7 +83,7 @@ def work(kind, seed, first, until, shared):
             if time.monotonic() - last > 1.0:
                 say({"counts": checks.COUNTS})
                 last = time.monotonic()
-        FIELDS.pack_into(view, 0, number, number - first, -1.0)
+        view[:] = FIELDS.pack(number, number - first, -1.0)
     say({"counts": checks.COUNTS})
 
 
