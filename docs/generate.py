@@ -33,6 +33,7 @@ from lavender.bench.cases import structure_of
 from lavender.ordering import ORDERS
 from lavender.problem import LAWS
 from lavender.report import advice_by_level, advice_by_time, claims, geometric_means, reaches
+from lavender.report import motions as motion_tables
 from lavender.report.style import looks
 from lavender.report.tables import SHIFT, time_budgets
 from lavender.report.text import residual, seconds
@@ -602,10 +603,10 @@ def calibration_part(site):
     for name in CASES:
         case = suite.case(name)
         seen += motions.samples(name, case.problem, " + ".join(structure_of(case.problem)))
-    motions.figure(seen, site.path("figures/calibration.svg"))
+    motion_tables.figure(seen, site.path("figures/calibration.svg"))
     site.write(
         "parts/calibration.md",
-        f"{motions.table(seen)}\n\n{image('generated/figures/calibration.svg', 'Motion error over residual')}",
+        f"{motion_tables.table(seen)}\n\n{image('generated/figures/calibration.svg', 'Motion error over residual')}",
     )
 
 

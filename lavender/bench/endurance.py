@@ -10,22 +10,18 @@ solver left behind; for one that swings or rolls, its motion.
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Iterable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from time import process_time
 from typing import Any
 
-import click
 import numpy as np
 
 from lavender._arrays import FloatArray
 from lavender.engine import Simulation
-from lavender.errors import InputError
-from lavender.scene import SCENES, Scene
+from lavender.scene import Scene
 from lavender.scene.parts import rotation
 
-__all__ = ["Stay", "command", "energy", "stay", "table"]
+__all__ = ["STEPS_PER_SECOND", "Stay", "energy", "stay"]
 
 STEPS_PER_SECOND = (60, 120)
 SETTLED = 2.0  # s
@@ -121,53 +117,3 @@ def stay(
         failed=info["failed_solves"],
         cost=cost / max(done, 1),
     )
-
-
-def table(found: Iterable[Stay]) -> str:
-    """Aligned text, one line a run."""
-    head = (
-        f"{'scene':<16}{'solver':<21}{'1/dt':>5}{'s':>7}{'E start J':>11}{'E end J':>11}{'gain J':>10}"
-        f"{'drift mm':>10}{'speed m/s':>11}{'depth mm':>10}{'failed':>8}{'µs a step':>11}"
-    )
-    lines = [head]
-    for f in found:
-        lost = f"   lost: {f.lost}" if f.lost else ""
-        lines.append(
-            f"{f.scene:<16}{f.solver:<21}{round(1 / f.dt):>5}{f.seconds:>7.0f}{f.start:>11.4g}{f.end:>11.4g}"
-            f"{f.gain:>10.2g}{1e3 * f.drift:>10.3g}{f.speed:>11.2g}{1e3 * f.depth:>10.3g}{f.failed:>8}"
-            f"{1e6 * f.cost:>11.0f}{lost}"
-        )
-    return "\n".join(lines)
-
-
-@click.command("gallery")
-@click.argument("scenes", nargs=-1, metavar="[SCENES]...")
-@click.option("--seconds", type=float, default=600.0, show_default=True, help="Simulated, of each run.")
-@click.option(
-    "--solvers",
-    default="sequential_impulses",
-    show_default=True,
-    help="Solvers of the substeps, commas between them.",
-)
-@click.option("--out", type=click.Path(dir_okay=False), default=None, help="Also write the numbers as JSON.")
-def command(scenes: tuple[str, ...], seconds: float, solvers: str, out: str | None) -> None:
-    """Run scenes of the gallery for ten minutes, at 60 and at 120 steps a second: energies, drifts, times.
-
-    SCENES: names; without any, the whole gallery.
-    """
-    if not seconds > 0.0:
-        raise InputError(f"seconds is {seconds:g}; more than 0 is needed")
-    found: list[Stay] = []
-    say: Callable[[str], Any] = click.echo
-    for name in scenes or tuple(SCENES):
-        for solver in solvers.split(","):
-            for rate in STEPS_PER_SECOND:
-                found.append(stay(name, 1.0 / rate, seconds, solver=solver))
-                lines = table(found[-1:]).splitlines()
-                say("\n".join(lines if len(found) == 1 else lines[1:]))
-    if out is not None:
-        try:
-            with open(out, "w", encoding="utf-8") as stream:
-                json.dump([asdict(f) for f in found], stream, indent=1)
-        except OSError as error:
-            raise InputError(f"cannot write {out!r}: {error.strerror}") from None

@@ -1,4 +1,4 @@
-"""`lavender bench mujoco MODEL.xml ...`: our Newton and MuJoCo's on the steps of models that one has, in one run.
+"""Our Newton and MuJoCo's on the steps of models that one has, in one run.
 
 Each model runs under random controls. At some of its steps the constraint problem is taken from memory and solved cold
 by both sides to the same judged residual:
@@ -12,19 +12,15 @@ several repetitions, taken in turns.
 
 from __future__ import annotations
 
-import json
 import os
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
 from time import perf_counter
 from typing import Any
 
-import click
 import numpy as np
 
-from lavender.bench.machine import cpu_name, versions
-from lavender.errors import LavenderError
 from lavender.io import mujoco as adapter
 from lavender.many import solve_many
 from lavender.problem import Problem
@@ -34,7 +30,6 @@ from lavender.solve import solve
 TARGET = 1e-6  # judged relative residual that both sides must reach
 STRICT = 1e-9  # that ours is asked for besides
 TOLERANCES = (1e-2, 1e-4, 1e-6, 1e-8, 1e-10, 1e-12, 1e-15)  # of MuJoCo, loosest first
-CLASSES = ((0, 10), (10, 50), (50, 300), (300, 10**9))  # rows
 REPEATS = 5
 MANY = 8  # problems in one call of solve_many
 
@@ -166,67 +161,3 @@ def measure(mj: Any, path: Path, steps: int, every: int, seed: int = 0) -> list[
         if len(out) == steps:
             break
     return out
-
-
-def _mean(x: Sequence[float]) -> float:
-    return float(np.exp(np.mean(np.log(x)))) if len(x) else float("nan")
-
-
-def table(steps: Sequence[Step]) -> str:
-    """Geometric means of ours / MuJoCo's by the number of rows, and what was solved, as Markdown."""
-    lines = [
-        "| rows | models | problems | MuJoCo [µs] | one call | `solve_many` | kernel alone | worst one call |",
-        "|---|---|---|---|---|---|---|---|",
-    ]
-    for low, high in CLASSES:
-        part = [s for s in steps if low <= s.rows < high]
-        if not part:
-            continue
-        name = f"under {high}" if low == 0 else f"{low} and more" if high > 10**6 else f"{low}-{high}"
-        worst = max(part, key=lambda s: s.ours / s.engine)
-        lines.append(
-            f"| {name} | {len({s.model for s in part})} | {len(part)} | {1e6 * _mean([s.engine for s in part]):.1f} "
-            f"| {_mean([s.ours / s.engine for s in part]):.2f} | {_mean([s.many / s.engine for s in part]):.2f} "
-            f"| {_mean([s.kernel / s.engine for s in part]):.2f} "
-            f"| {worst.ours / worst.engine:.1f} ({worst.model}, {worst.rows} rows) |"
-        )
-    convex = [s for s in steps if s.strict <= STRICT]
-    coulomb = [s for s in steps if s.coulomb is not None]
-    solved = sum(s.coulomb <= STRICT for s in coulomb if s.coulomb is not None)
-    never = sum(s.tolerance == 0.0 for s in steps)
-    lines += [
-        "",
-        (
-            f"{len(convex)} of {len(steps)} solved to {STRICT:.0e} or the floor of float64 under MuJoCo's own law, "
-            f"{solved} of {len(coulomb)} under Coulomb's (contacts of up to two tangents); {never} that MuJoCo brings "
-            f"to {TARGET:.0e} at no tolerance count with its default."
-        ),
-    ]
-    return "\n".join(lines)
-
-
-@click.command("mujoco")
-@click.argument("models", nargs=-1, required=True, type=click.Path(path_type=Path))
-@click.option("--steps", default=10, show_default=True, help="problems of each model")
-@click.option("--every", default=20, show_default=True, help="steps of the simulator between two problems")
-@click.option("--out", type=click.Path(path_type=Path), help="every problem's numbers, JSON lines")
-def command(models: tuple[Path, ...], steps: int, every: int, out: Path | None) -> None:
-    """Our Newton and MuJoCo's on the steps of your own models (MJCF files), in one run."""
-    try:
-        import mujoco as mj
-    except ImportError:
-        raise click.UsageError("mujoco cannot be imported: pip install mujoco") from None
-    found: list[Step] = []
-    for path in models:
-        try:
-            new = measure(mj, path, steps, every)
-        except (ValueError, LavenderError) as error:  # MuJoCo's own word about a file is a ValueError
-            click.echo(f"{path.name}: left out: {str(error).splitlines()[0][:140]}", err=True)
-            continue
-        found += new
-        click.echo(f"{path.name}: {len(new)} problems", err=True)
-    if out is not None:
-        lines = [json.dumps({"cpu": cpu_name(), **versions(("mujoco", "numpy"))})]
-        lines += [json.dumps(asdict(s)) for s in found]
-        out.write_text("\n".join(lines) + "\n", encoding="utf-8")
-    click.echo(table(found))

@@ -26,13 +26,13 @@ class Suites(ManyValues):
     """`lavender bench auto`, `kernels`, `peers`, `stand` are commands; other first words are files (or ./peers)."""
 
     OWN = {  # noqa: RUF012 - a constant of the class
-        "gallery": "lavender.bench.endurance:command",
+        "gallery": "lavender.cli.bench_gallery:gallery",
         "auto": "lavender.cli.bench_auto:auto",
-        "motions": "lavender.bench.motions:command",
-        "mujoco": "lavender.bench.simulators:command",
+        "motions": "lavender.cli.bench_motions:motions",
+        "mujoco": "lavender.cli.bench_mujoco:mujoco",
         "kernels": "lavender.cli.bench_kernels:kernels",
         "peers": "lavender.cli.bench_peers:peers",
-        "stand": "lavender.bench.stand:command",
+        "stand": "lavender.cli.bench_stand:stand",
     }
 
     def make_context(

@@ -9,6 +9,7 @@ from click.testing import CliRunner
 import lavender as lv
 from lavender import cli, suite
 from lavender.bench import motions
+from lavender.report import motions as tables
 
 
 def sample(relative, motion, law="lcp", structure="stack + redundant"):
@@ -19,15 +20,15 @@ def sample(relative, motion, law="lcp", structure="stack + redundant"):
 
 def test_factors_are_those_of_the_samples():
     found = [sample(1e-3, 2e-3), sample(1e-3, 4e-3), sample(1e-2, 9e-2, structure="stack")]
-    rows = {row[0]: row for row in motions.calibration(found)}
+    rows = {row[0]: row for row in tables.calibration(found)}
     assert set(rows) == {"stack", "redundant", "law lcp", "all"}
     assert rows["all"][1] == 3
     assert rows["all"][2] == pytest.approx(4.0)
     assert rows["all"][4] == pytest.approx(9.0)
     assert rows["redundant"][1] == 2
-    names = {name: (median, spread) for name, _, median, spread in motions.predictors(found)}
+    names = {name: (median, spread) for name, _, median, spread in tables.predictors(found)}
     assert names["V / V0 alone"][0] == pytest.approx(2 * names["E / E0 alone"][0])
-    assert "median 1" in motions.table(found)
+    assert "median 1" in tables.table(found)
 
 
 def test_samples_are_iterates_with_both_errors():
@@ -48,7 +49,7 @@ def test_shares_count_what_they_say():
             "c", "coulomb", "pile", 9, mu, sliding, found, 7, 0.1 * (found > 1), 0.1, unique, warm
         )
 
-    text = motions.several_table(
+    text = tables.several_table(
         [
             branch(3, warm="nearest"),
             branch(2, mu=0.7, warm="another"),

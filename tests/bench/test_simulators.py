@@ -7,6 +7,8 @@ import pytest
 from click.testing import CliRunner
 
 from lavender.bench import simulators
+from lavender.cli.bench_mujoco import mujoco
+from lavender.report import simulators as tables
 
 mj = pytest.importorskip("mujoco", reason="needs MuJoCo: pip install 'lavender-contact[peers]'")
 
@@ -36,7 +38,7 @@ def test_the_command_writes_a_table_and_says_what_it_left_out(tmp_path):
     (tmp_path / "torn.xml").write_text("<mujoco><worldbody>")
     out = tmp_path / "steps.jsonl"
     words = [str(tmp_path / "arm.xml"), str(tmp_path / "torn.xml"), "--steps", "2", "--out", str(out)]
-    done = CliRunner().invoke(simulators.command, words)
+    done = CliRunner().invoke(mujoco, words)
     assert done.exit_code == 0, done.output
     assert "torn.xml: left out" in done.output
     assert "2 of 2 solved" in done.output
@@ -51,8 +53,8 @@ def test_ratios_are_geometric_means_by_the_number_of_rows():
             "m", 0, rows, 3, "lcp", tolerance, engine, ours, ours / 2, ours / 4, 0.0, 0.0, 0.0, None
         )
 
-    text = simulators.table([step(4, 1e-6, 2e-6), step(5, 1e-6, 8e-6), step(400, 1e-3, 5e-4, 0.0)])
+    text = tables.table([step(4, 1e-6, 2e-6), step(5, 1e-6, 8e-6), step(400, 1e-3, 5e-4, 0.0)])
     assert "| under 10 | 1 | 2 | 1.0 | 4.00 | 2.00 | 1.00 | 8.0 (m, 5 rows) |" in text
     assert "| 300 and more | 1 | 1 | 1000.0 | 0.50 |" in text
     assert "1 that MuJoCo brings" in text
-    assert np.isnan(simulators._mean([]))
+    assert np.isnan(tables._mean([]))

@@ -10,6 +10,7 @@ import pytest
 
 import lavender as lv
 from lavender.bench import endurance
+from lavender.report.endurance import table
 from lavender.scene import SCENES
 
 SECONDS = 5.0
@@ -74,7 +75,7 @@ def test_a_lost_scene_says_so_and_the_command_writes_its_table(tmp_path, capsys)
         ("ramp", 120),
     ]
     fast = endurance.stay("ramp", 1 / 60, 1.0, gravity=1e307)
-    assert fast.lost == "box 1" and "lost: box 1" in endurance.table([fast])
+    assert fast.lost == "box 1" and "lost: box 1" in table([fast])
     for words in (["--seconds", "0"], ["no_such_scene"], ["--solvers", "nwton", "ramp"]):
         with pytest.raises(SystemExit) as code:
             main(["bench", "gallery", *words])

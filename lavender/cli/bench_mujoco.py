@@ -1,0 +1,43 @@
+"""`lavender bench mujoco MODEL.xml ...`."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+
+import click
+
+from lavender.bench.machine import cpu_name, versions
+from lavender.bench.simulators import Step, measure
+from lavender.errors import LavenderError
+from lavender.report.simulators import table
+
+__all__ = ["mujoco"]
+
+
+@click.command("mujoco")
+@click.argument("models", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.option("--steps", default=10, show_default=True, help="problems of each model")
+@click.option("--every", default=20, show_default=True, help="steps of the simulator between two problems")
+@click.option("--out", type=click.Path(path_type=Path), help="every problem's numbers, JSON lines")
+def mujoco(models: tuple[Path, ...], steps: int, every: int, out: Path | None) -> None:
+    """Our Newton and MuJoCo's on the steps of your own models (MJCF files), in one run."""
+    try:
+        import mujoco as mj
+    except ImportError:
+        raise click.UsageError("mujoco cannot be imported: pip install mujoco") from None
+    found: list[Step] = []
+    for path in models:
+        try:
+            new = measure(mj, path, steps, every)
+        except (ValueError, LavenderError) as error:  # MuJoCo's own word about a file is a ValueError
+            click.echo(f"{path.name}: left out: {str(error).splitlines()[0][:140]}", err=True)
+            continue
+        found += new
+        click.echo(f"{path.name}: {len(new)} problems", err=True)
+    if out is not None:
+        lines = [json.dumps({"cpu": cpu_name(), **versions(("mujoco", "numpy"))})]
+        lines += [json.dumps(asdict(s)) for s in found]
+        out.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    click.echo(table(found))
