@@ -13,6 +13,7 @@ from lavender_ext.judge.measure import all_finite
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int32]
+ArrayLike = npt.ArrayLike  #: numbers, nested sequences of them, or an array; the docstring has shape and unit
 
 
 def read_only(array: np.ndarray) -> np.ndarray:

@@ -6,11 +6,10 @@ The chapter's natural map, the errors of FCLIB and Siconos, and the optimality o
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
-from lavender._arrays import FloatArray
+from lavender._arrays import ArrayLike, FloatArray
 from lavender.cones import ROW
 from lavender.errors import InputError
 from lavender.problem import Problem
@@ -18,7 +17,7 @@ from lavender.problem import Problem
 __all__ = ["QPResidual", "natural_map", "qp_residual", "siconos_error"]
 
 
-def natural_map(problem: Problem, impulse: Any) -> float:
+def natural_map(problem: Problem, impulse: ArrayLike) -> float:
     """The chapter's plain r_p = |lambda - Pi(lambda - w)|_2, bounded rows only [mixes N s and m/s].
 
     Raises
@@ -40,7 +39,7 @@ def natural_map(problem: Problem, impulse: Any) -> float:
     )
 
 
-def siconos_error(problem: Problem, impulse: Any) -> dict[str, float]:
+def siconos_error(problem: Problem, impulse: ArrayLike) -> dict[str, float]:
     """The full Coulomb errors of FCLIB and Siconos (Acary, Bremond, Huber 2018), friction blocks without spin.
 
         |F|_2,  F_i = r_i - P_K(r_i - (u_i + mu |u_T| n))   on contacts, with unit step
@@ -101,7 +100,7 @@ class QPResidual:
         return max(self.primal, self.dual, self.gap, self.sign)
 
 
-def qp_residual(problem: Problem, impulse: Any, multiplier: Any = None) -> QPResidual:
+def qp_residual(problem: Problem, impulse: ArrayLike, multiplier: ArrayLike | None = None) -> QPResidual:
     """Primal, dual and gap residuals with multiplier signs checked.
 
     Parameters

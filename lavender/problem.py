@@ -17,7 +17,16 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from lavender._arrays import FloatArray, IntArray, as_array, check_not_negative, equal, read_only, table_of
+from lavender._arrays import (
+    ArrayLike,
+    FloatArray,
+    IntArray,
+    as_array,
+    check_not_negative,
+    equal,
+    read_only,
+    table_of,
+)
 from lavender._derived import Derived, once
 from lavender.cones import CONTACT_SPIN, ROUND, ROW, Cones
 from lavender.errors import CapabilityError, InputError
@@ -216,13 +225,15 @@ class Problem:
     # -- constructors ---------------------------------------------------------------------------
 
     @classmethod
-    def linear(cls, A: Any, b: Any, **more: Any) -> Problem:
+    def linear(cls, A: Any, b: ArrayLike, **more: Any) -> Problem:
         """A lambda = b: every row unbounded. A (m, m) [1/kg], b (m,) [m/s]."""
         b = as_array("b", b, (None,), unit="m/s")
         return cls(b, Cones.free(len(b)), A, **more)
 
     @classmethod
-    def lcp(cls, A: Any, b: Any, lower: Any = 0.0, upper: Any = np.inf, **more: Any) -> Problem:
+    def lcp(
+        cls, A: Any, b: ArrayLike, lower: ArrayLike = 0.0, upper: ArrayLike = np.inf, **more: Any
+    ) -> Problem:
         """Boxed LCP: lower <= lambda <= upper complementary to A lambda - b; bounds scalar or (m,) [N s]."""
         b = as_array("b", b, (None,), unit="m/s")
         bounds = [
@@ -232,7 +243,9 @@ class Problem:
         return cls(b, Cones.bounded(*bounds), A, **more)
 
     @classmethod
-    def contact(cls, A: Any, b: Any, mu: Any, patch_radius: Any = None, **more: Any) -> Problem:
+    def contact(
+        cls, A: Any, b: ArrayLike, mu: ArrayLike, patch_radius: ArrayLike | None = None, **more: Any
+    ) -> Problem:
         """Contacts only, m / k rows each: normal, up to two tangents, spin with `patch_radius`.
 
         Parameters
@@ -279,13 +292,13 @@ class Problem:
     def from_rows(
         cls,
         rows: Rows,
-        target: Any = 0.0,
+        target: ArrayLike = 0.0,
         *,
-        lower: Any = -np.inf,
-        upper: Any = np.inf,
-        mu: Any = 0.0,
-        tangents: Any = None,
-        patch_radius: Any = None,
+        lower: ArrayLike = -np.inf,
+        upper: ArrayLike = np.inf,
+        mu: ArrayLike = 0.0,
+        tangents: ArrayLike | None = None,
+        patch_radius: ArrayLike | None = None,
         **more: Any,
     ) -> Problem:
         """Problem of a step from factored rows: b = target - J v*.
@@ -345,11 +358,11 @@ class Problem:
         cls,
         J: Any,
         M: Any,
-        v_free: Any,
+        v_free: ArrayLike,
         *,
-        target: Any = 0.0,
+        target: ArrayLike = 0.0,
         cones: Cones,
-        compliance: Any = None,
+        compliance: ArrayLike | None = None,
         friction: str = "coulomb",
         names: Sequence[str] | None = None,
         dof_names: Sequence[str] | None = None,
@@ -400,10 +413,10 @@ class Problem:
         *,
         J: Any = None,
         M: Any = None,
-        v_free: Any = None,
-        b: Any = None,
-        target: Any = None,
-        guess: Any = None,
+        v_free: ArrayLike | None = None,
+        b: ArrayLike | None = None,
+        target: ArrayLike | None = None,
+        guess: ArrayLike | None = None,
     ) -> Problem:
         """The same structure with new numbers: what is not given stays.
 
@@ -440,7 +453,8 @@ class Problem:
             )
         if target is not None and general is not None:
             b = as_array("target", target, (self.m,), unit="m/s") - general.velocity_of(general.v_free)
-        return replace(self, b=self.b if b is None else b, generalized=general, guess=guess)
+        given: dict[str, Any] = {"b": self.b if b is None else b, "guess": guess}  # checked by `Problem`
+        return replace(self, generalized=general, **given)
 
     # -- size and kind --------------------------------------------------------------------------
 
@@ -633,13 +647,13 @@ class Problem:
         """A (m, m) [1/kg] as a new dense array."""
         return self.matrix.copy() if isinstance(self.matrix, np.ndarray) else self.csr.toarray()
 
-    def slack(self, impulse: Any) -> FloatArray:
+    def slack(self, impulse: ArrayLike) -> FloatArray:
         """w = A lambda - b (m,) [m/s], recomputed from the problem's data."""
         w = np.empty(self.m)
         measure.slack(self.metric, self.impulse_array(impulse), w)
         return w
 
-    def velocity(self, impulse: Any) -> FloatArray:
+    def velocity(self, impulse: ArrayLike) -> FloatArray:
         """v+ = v* + M^-1 J^T lambda [m/s, rad/s]: (n, 6) with rows, (nv,) in generalised coordinates.
 
         Raises
@@ -666,7 +680,7 @@ class Problem:
     def _start(self) -> FloatArray:
         return read_only(np.clip(np.zeros(self.m), self.cones.lower, self.cones.upper))
 
-    def impulse_array(self, impulse: Any, name: str = "impulse") -> FloatArray:
+    def impulse_array(self, impulse: ArrayLike, name: str = "impulse") -> FloatArray:
         """A writable private copy of `impulse`, checked: (m,) [N s], finite."""
         if type(impulse) is np.ndarray and impulse.dtype == np.float64 and impulse.shape == self.b.shape:
             own = impulse.copy()
@@ -717,7 +731,7 @@ class Problem:
         """
         return replace(self, friction=friction, copy=False)
 
-    def boxed(self, normal_impulse: Any) -> Problem:
+    def boxed(self, normal_impulse: ArrayLike) -> Problem:
         """Friction bounded by fixed normals: |lambda_t| <= mu N on each tangent alone: a square, not the disk.
 
         Parameters

@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from lavender._arrays import FloatArray, read_only
+from lavender._arrays import ArrayLike, FloatArray, read_only
 from lavender.errors import InputError
 from lavender.problem import Problem
 from lavender_ext.judge import measure
@@ -158,7 +158,7 @@ def quick(
     return relative_of(data, energy, velocity), relative_of(data, floor_energy, floor_velocity)
 
 
-def residual(problem: Problem, impulse: Any) -> Residual:
+def residual(problem: Problem, impulse: ArrayLike) -> Residual:
     """Judge an impulse (m,) [N s].
 
     Non-finite entries are allowed here and give an infinite relative residual.

@@ -19,15 +19,68 @@ __all__ = ["Rows"]
 class Rows:
     """J and M^-1 in the layout that sweeps want: joint rows dense, contacts compact.
 
-    Row of a contact from body a to body b (n normal, t1, t2 = n x t1 tangents, arms from the centres):
-    n.u, t.u with u = v_b + omega_b x arm_b - v_a - omega_a x arm_a, and n.(omega_b - omega_a) for spin.
-    Body -1 is static. Joints come first.
+    Bodies are numbered 0 to n - 1; -1 is static and has no number. The blocks of the problem are the kj joints, then
+    the c contacts. Row of a contact from body a to body b (n normal, t1, t2 = n x t1 tangents, arms from the centres):
+    n.u, t.u with u = v_b + omega_b x arm_b - v_a - omega_a x arm_a, and n.(omega_b - omega_a) for spin. An impulse
+    > 0 along n pushes b away from a.
+
+    Parameters
+    ----------
+    inv_mass : array-like (n,), 1/kg
+        0: a body that moves as it is told, by `v_free` alone.
+    inv_inertia : array-like (n, 3, 3), 1/(kg m^2)
+        In world axes, symmetric, positive semidefinite.
+    v_free : array-like (n, 6), m/s and rad/s
+        v*: linear and angular velocity at the end of the step without constraint impulses, gravity included.
+    jac : array-like (mj, 12), optional
+        Rows of the joints: linear and angular columns of a, then of b.
+    joint_ptr : array-like (kj + 1,) of int, optional
+        First row of each joint, then mj.
+    joint_body : array-like (kj, 2) of int, optional
+        Bodies a and b of each joint.
+    normal : array-like (c, 3), optional
+        Unit vectors from a to b.
+    tangent : array-like (c, 3), optional
+        Unit vectors t1, orthogonal to the normal; needed without friction, too.
+    arm_a, arm_b : array-like (c, 3), m, optional
+        Contact point minus centre of a, of b, in world axes.
+    contact_body : array-like (c, 2) of int, optional
+        Bodies a and b of each contact.
+    copy : bool, default True
+        False: adopt arrays that fit, and mark them read-only.
 
     Raises
     ------
     InputError
-        Shapes that do not fit, a body that does not exist, a row between a body and itself, negative
-        inverse mass, a normal or tangent that is not a unit vector or not orthogonal.
+        Shapes that do not fit, a body that does not exist, a row between a body and itself or two static ones, negative
+        inverse mass, an inertia that is not positive semidefinite, a normal or tangent that is not a unit vector or not
+        orthogonal.
+
+    Examples
+    --------
+    Three boxes of 1 kg and 1 m on the ground, four contacts under each, after a step of 1/60 s in free fall:
+
+    >>> import numpy as np
+    >>> import lavender as lv
+    >>> dt = 1 / 60
+    >>> corners = np.array([(x, y, 0.0) for x in (-0.5, 0.5) for y in (-0.5, 0.5)])
+    >>> rows = lv.Rows(
+    ...     inv_mass=np.ones(3),
+    ...     inv_inertia=np.tile(6.0 * np.eye(3), (3, 1, 1)),  # a cube's moment is m / 6
+    ...     v_free=np.tile([0.0, 0.0, -9.81 * dt, 0.0, 0.0, 0.0], (3, 1)),
+    ...     contact_body=np.repeat([(-1, 0), (0, 1), (1, 2)], 4, axis=0),  # from below to above; -1 is the ground
+    ...     normal=np.tile([0.0, 0.0, 1.0], (12, 1)),
+    ...     tangent=np.tile([1.0, 0.0, 0.0], (12, 1)),
+    ...     arm_a=np.tile(corners + (0, 0, 0.5), (3, 1)),
+    ...     arm_b=np.tile(corners - (0, 0, 0.5), (3, 1)),
+    ... )
+    >>> problem = lv.Problem.from_rows(rows, mu=0.5)
+    >>> solution = lv.solve(problem, tol=1e-9)
+    >>> force = solution.impulse.reshape(3, 4, 3) / dt  # N: box, corner, (n, t1, t2)
+    >>> force[:, :, 0].sum(axis=1).round(2).tolist()  # the ground carries three boxes, the middle one two
+    [29.43, 19.62, 9.81]
+    >>> bool(abs(problem.velocity(solution.impulse)).max() < 1e-8)  # m/s: all of them rest
+    True
     """
 
     inv_mass: FloatArray  # (n,) 1/kg

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from lavender._arrays import FloatArray, equal
+from lavender._arrays import ArrayLike, FloatArray, equal
 from lavender.certificates import check_certificate
 from lavender.cones import ROW
 from lavender.errors import CapabilityError, InputError, InUse, UnknownName
@@ -40,7 +40,7 @@ def solve(
     problem: Problem,
     solver: str = "auto",
     *,
-    impulse: Any = None,
+    impulse: ArrayLike | None = None,
     tol: float = 1e-6,
     max_iter: int | None = None,
     time_limit: float | None = None,
@@ -131,7 +131,7 @@ class Prepared:
         self,
         problem: Problem | None = None,
         *,
-        impulse: Any = None,
+        impulse: ArrayLike | None = None,
         tol: float = 1e-6,
         max_iter: int | None = None,
         time_limit: float | None = None,

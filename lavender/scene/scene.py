@@ -288,7 +288,7 @@ class Scene:
         Parameters
         ----------
         mass : float, kg
-            Positive, or 0 for a static body.
+            Positive; not read for a static body.
         inertia : (3,) or (3, 3) kg m^2, optional
             Principal moments or the tensor in the body's axes, positive definite. Default: that of the
             solid shape; of a ball of radius 0.1 m where there is none.
@@ -297,7 +297,7 @@ class Scene:
             Body to world; normalised here.
         velocity, angular_velocity : (3,) m/s, rad/s
         static : bool
-            The same as mass 0.
+            Never moves. 0 is no mass: a body that should stand still says so here.
         friction, restitution, patch_radius : float, optional
             Default: the scene's.
         shape : Plane, Sphere or Box, optional
