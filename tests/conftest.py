@@ -1,11 +1,15 @@
 """What all tests share: one thread for BLAS, no display, reproducible examples, the reference problems."""
 
 import os
+import signal
 from pathlib import Path
 
 for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(variable, "1")  # before NumPy starts its threads: small matrices only lose by them
 os.environ.setdefault("MPLBACKEND", "Agg")
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    # As shells start what runs in the background; no test of Ctrl-C could interrupt its process.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 import hypothesis
 import pytest
