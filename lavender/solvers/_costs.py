@@ -20,10 +20,11 @@ from lavender.problem import Problem
 from lavender.solvers._accelerated import sweep_work
 from lavender.solvers._factor import choose
 from lavender.solvers._islands import block_bodies
+from lavender.solvers._newton.general import factor_flops
 from lavender.solvers._newton.systems import MatrixSystem, System, VelocitySystem, make_system
 from lavender_ext.factor import graph
 
-__all__ = ["Costs", "Exact", "is_loose", "islands_cost"]
+__all__ = ["Costs", "Exact", "general_cost", "is_loose", "islands_cost"]
 
 # Rates [ns], from times and counts of drawn problems that `lavender bench auto --out` writes.
 # For each multiply-add of a sweep, mixing included; the cone law solves each contact exactly.
@@ -42,6 +43,10 @@ BLOCK = 0.35  # of one over bodies
 SPARSE = 100.0  # for each nonzero of a sparse factor's matrix,
 SPARSE_ROWS = 1000.0  # as many times more as it has thousands of rows: fill grows with the size
 PIVOT, PIVOT_ENTRY = 60e3, 0.5  # of each pivot of lemke, and for each entry of its tableau
+# Newton over generalised velocities: a call, for each row beside each factor, and each multiply-add of the dense
+# factor of an island.
+GENERAL_START, GENERAL_ROW, GENERAL = 60e3, 40.0, 0.06
+ADMM_START, ADMM_ROW, ADMM_ENTRY = 300e3, 60.0, 2.0  # a call; of each iteration for each row and each entry of L
 
 # Factorisations to expect, by law: medians over drawn problems. Friction has a long tail.
 DIRECT = {"linear": 1.5, "lcp": 6.0}
@@ -54,6 +59,9 @@ PER_ROW = {
 }  # more of them: contacts change their side
 TAIL = {"linear": 2, "lcp": 10, "cone": 10, "coulomb": 60}  # more that are granted before another is asked
 MOST = 30.0  # of what rows add
+GENERAL_COUNT = {"linear": 2.0, "lcp": 10.0, "cone": 20.0, "coulomb": 20.0}  # over generalised velocities
+ADMM_COUNT, ADMM_FACTORS = 240.0, 3.0  # iterations to six decades, and how often rho moves on the way
+ADMM_FILL = 6.0  # entries of L for each of A
 AT_REST = 8.0  # of faces on faces, most of whose rows hold
 UNSYMMETRIC = 2.0  # LU against Cholesky, where friction or A asks for it
 SINGULAR = 6.0  # factorisations of `direct` where A is singular: it shifts and refines
@@ -68,6 +76,7 @@ NARROW = 40  # half bandwidth up to which a band is what `direct` takes
 TREE = 1.05  # neighbours of a body, in the mean, up to which bodies form trees
 TINY_FACTOR = 20e3  # ns, below which a factor is not looked at more closely
 LOOKS = 4  # at so many sweeps
+GENERAL_TAIL = 200  # more steps over generalised velocities than expected that are granted
 LEMKE_ROWS = 1000  # beyond, a dense tableau of 8 MB and more
 
 
@@ -78,13 +87,29 @@ class Exact:
     name: str
     cost: float
     limit: int
+    options: tuple[tuple[str, Any], ...] = ()  # that the solver is made with
+
+    @property
+    def key(self) -> str:
+        """Name and options: what gave up once is known by it."""
+        return " ".join([self.name, *(str(value) for _, value in self.options)])
+
+
+def general_cost(problem: Problem, largest: int) -> float:
+    """Newton over generalised velocities, `largest` of them in one island [ns]."""
+    factor = GENERAL * factor_flops(problem, largest)
+    return GENERAL_START + GENERAL_COUNT[problem.law] * (GENERAL_ROW * problem.m + factor)
 
 
 class Costs:
-    """Of one problem; what takes time to find out is found when it is first asked."""
+    """Of one problem; what takes time to find out is found when it is first asked.
 
-    def __init__(self, problem: Problem, tol: float) -> None:
-        self.problem = problem
+    `largest`: velocities of the largest island of a problem in generalised coordinates, 0 where Newton's method has
+    no room for so many.
+    """
+
+    def __init__(self, problem: Problem, tol: float, largest: int = 0) -> None:
+        self.problem, self.largest = problem, largest
         self.decades = float(-np.log10(min(max(tol, 1e-16), 0.1)))
         self.sweep = SWEEP[problem.law] * sweep_work(problem) + SWEEP_ROW * problem.m  # [ns] of one
 
@@ -129,7 +154,9 @@ class Costs:
         """The finite solvers that take this problem, cheapest first."""
         # Newton's system is made only where it may be the cheapest: it costs as much as a small solve.
         cost = self._newton_guess if self._others_win else self._newton(self._newton_factor)
-        newton = Exact("newton", cost, int(2.0 * self._newton_count) + TAIL[self.problem.law])
+        p = self.problem
+        form = () if p.generalized is None else (("form", "impulse"),)
+        newton = Exact("newton", cost, int(2.0 * self._newton_count) + TAIL[p.law], form)
         return sorted([*self._others, newton], key=lambda e: e.cost)
 
     @cached_property
@@ -140,7 +167,24 @@ class Costs:
             found.append(Exact("direct", self._direct(self._matrix), 0))
         if p.law == "lcp" and p.m <= LEMKE_ROWS:
             found.append(Exact("lemke", START["lemke"] + p.m * (PIVOT + PIVOT_ENTRY * float(p.m) ** 2), 0))
+        if self.largest:
+            count = 2 * int(GENERAL_COUNT[p.law]) + GENERAL_TAIL
+            found.append(Exact("newton", general_cost(p, self.largest), count, (("form", "velocity"),)))
+        if p.law in ("cone", "coulomb"):
+            found.append(Exact("admm", self._admm, int(2.0 * self._admm_count)))
         return found
+
+    @property
+    def _admm_count(self) -> float:
+        return ADMM_COUNT * max(1.0, self.decades / 6.0)
+
+    @property
+    def _admm(self) -> float:
+        p = self.problem
+        entries = float(sweep_work(p))
+        lu = 1.0 if p.is_symmetric else UNSYMMETRIC
+        each = ADMM_ROW * p.m + ADMM_ENTRY * lu * ADMM_FILL * entries
+        return ADMM_START + ADMM_FACTORS * lu * self._sparse(int(entries), p.m) + self._admm_count * each
 
     def _direct(self, factor: float) -> float:
         p = self.problem

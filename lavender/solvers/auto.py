@@ -1,10 +1,11 @@
 """The only solver that hands over to others: each in its turn, by what it would cost from here on.
 
     linear            direct, newton
-    J and M           newton over the velocities; what that leaves, as below, on the rows of A
+    J and M           newton over the velocities at once where that costs next to nothing; else it is one of the
+                      finite solvers below, beside those that form A
     others            a finite solver at once where its factor costs less than sweeps usually do; else anderson
                       as long as what it still needs, by its contraction so far, costs less than the cheapest
-                      finite solver (direct, newton, lemke, as the law allows); then that one, with twice the
+                      finite solver (direct, newton, lemke, admm, as the law allows); then that one, with twice the
                       factorisations that it is expected to need; then anderson again, from where it stood, with
                       twice the allowance; and so on
     coulomb           loose and large piles first through the convex relaxation, whose answer is the Coulomb
@@ -32,7 +33,7 @@ from lavender.problem import OPERATORS, Problem
 from lavender.registry import SolverSpec, get
 from lavender.residuals import at_floor, known, quick, reference
 from lavender.solution import Claim, Status
-from lavender.solvers._costs import ISLAND, LOOK, SWEEP_START, Costs, is_loose, islands_cost
+from lavender.solvers._costs import ISLAND, LOOK, SWEEP_START, Costs, Exact, general_cost, is_loose, islands_cost
 from lavender.solvers._islands import islands, restrict, rows_of
 from lavender.solvers._newton import general
 from lavender.solvers.newton import NewtonState
@@ -51,7 +52,9 @@ BELIEVED = 2.0  # times a finite solver's cost that sweeps may take, whatever th
 GLANCE = 0.35  # share of a finite solver's cost for which a first look at sweeps is always worth it
 APART = 10.0  # islands' worth of Python from which a finite solver is compared with islands solved apart
 ROUNDS = 8  # times that sweeps and finite solvers take turns, the allowance doubled each time
-GENERAL_ROWS = 3000  # up to which A is formed of J and M that newton left unsolved
+GENERAL_FIRST = 0.4e6  # ns of newton over generalised velocities up to which nothing else is looked at first
+GENERAL_STEPS = 256  # that it then has
+VELOCITY = "newton velocity"  # key of newton over generalised velocities
 CERTIFICATE_ROWS = 3000  # rows up to which a linear program is asked for a certificate
 CERTIFICATE_STEPS = 100  # of the simplex method for each row at most
 
@@ -63,19 +66,21 @@ class Trail:
     problem: Problem
     tol: float
     deadline: float
+    largest: int = 0  # velocities of the largest island, 0 where newton has no room for them
     best: float = np.inf
     impulse: FloatArray = field(init=False)
     steps: list[str] = field(default_factory=list)
     work: dict[str, int] = field(default_factory=dict)
     iterations: int = 0
     certificate: FloatArray | None = None
+    begun: bool = False  # newton over generalised velocities was
     ended: dict[str, float] = field(
         default_factory=dict
     )  # finite solvers that gave up: residual they started from
 
     def __post_init__(self) -> None:
         m = self.problem.m
-        self.costs = Costs(self.problem, self.tol)
+        self.costs = Costs(self.problem, self.tol, self.largest)
         self.impulse = self.problem.start()
         self.w, self.e = np.empty(m), np.empty(m)
 
@@ -152,20 +157,25 @@ class Auto:
         problem = state
         deadline = np.inf if time_limit is None else perf_counter() + time_limit
         lam, claim = impulse.copy(), None
+        largest = 0
         if problem.generalized is not None and problem.m and n > 0:
-            # Newton over the velocities ends nearly all of them: nothing is looked at, and nothing noted, before.
+            # Newton over the velocities ends nearly all robots: nothing is looked at, and nothing noted, before.
             kernel = general.prepare(problem)
-            if kernel is not None:
-                claim = general.run(problem, kernel, lam, min(n, general.CLOCK), tol, time_limit)
+            largest = 0 if kernel is None else kernel.largest
+            if kernel is not None and general_cost(problem, largest) <= GENERAL_FIRST:
+                claim = general.run(problem, kernel, lam, min(n, GENERAL_STEPS), tol, time_limit)
                 if claim.status is Status.CONVERGED:
                     impulse[:] = lam
                     return general.named(claim, "auto")
-        trail = Trail(problem, tol, deadline)
+        trail = Trail(problem, tol, deadline, largest)
         if problem.m == 0:
             return Claim(Status.CONVERGED, 0, {}, "nothing to solve")
         trail.offer(impulse)
         if claim is not None:
             trail.add("newton", claim)
+            trail.begun = True
+            if claim.status is not Status.MAX_ITERATIONS:
+                trail.ended[VELOCITY] = trail.best
             if np.isfinite(lam).all():
                 trail.offer(lam)
         interrupted = False
@@ -202,17 +212,20 @@ def _usable(name: str, problem: Problem) -> SolverSpec | None:
     return spec if spec.refuses(problem) is None else None
 
 
-def _whole(trail: Trail, name: str, budget: int, limit: int = 0) -> bool:
+def _whole(trail: Trail, chosen: Exact, budget: int, limit: int = 0) -> bool:
     """Run a finite solver from the best impulse, to its end or `limit` iterations; True when nothing is left to do."""
+    name = chosen.name
     spec = _usable(name, trail.problem)
     if spec is None or budget <= trail.iterations:
         return trail.done
-    solver = spec.load()()
+    solver = spec.load()(**dict(chosen.options))
     own = name == "newton" and trail.problem.generalized is None
     state = _newton_state(trail) if own else solver.prepare(trail.problem)
     # Half-finished sweeps mislead a Newton method; Pi(0) does not.
     before = trail.best
-    impulse = trail.impulse.copy() if before <= WARM else trail.problem.start()
+    warm = before <= WARM and (own or chosen.key != VELOCITY or trail.begun)
+    impulse = trail.impulse.copy() if warm else trail.problem.start()
+    trail.begun = trail.begun or chosen.key == VELOCITY
     left = None if np.isinf(trail.deadline) else max(trail.deadline - perf_counter(), 1e-3)
     most = min(limit or spec.max_iter, spec.max_iter, budget - trail.iterations)
     claim: Claim = solver.run(state, impulse, most, trail.tol, left)
@@ -222,7 +235,7 @@ def _whole(trail: Trail, name: str, budget: int, limit: int = 0) -> bool:
     if claim.status is Status.INTERRUPTED:
         raise KeyboardInterrupt
     if claim.status is not Status.MAX_ITERATIONS:
-        trail.ended[name] = before
+        trail.ended[chosen.key] = before
     if claim.certificate is not None and check_certificate(trail.problem, claim.certificate) is None:
         trail.certificate = claim.certificate
     return trail.done
@@ -318,19 +331,17 @@ class _Sweeps:
 @np.errstate(all="ignore")  # what overflows is judged
 def _solve(trail: Trail, budget: int) -> None:
     problem = trail.problem
-    if problem.generalized is not None and _general(trail, budget):
-        return
     costs = trail.costs
     if problem.law == "linear":
         # A sparse factorisation takes islands apart by itself; newton where that stops early.
-        names = [e.name for e in costs.exact] if problem.m > FEW_JOINTS else ["direct", "newton"]
-        if not any(_whole(trail, name, budget) for name in names):
+        exact = costs.exact if problem.m > FEW_JOINTS else [Exact("direct", 0.0, 0), Exact("newton", 0.0, 0)]
+        if not any(_whole(trail, e, budget) for e in exact if e.key not in trail.ended):
             _certify(trail)
         return
     sweeps = None
     if problem.law == "lcp" and problem.m <= FEW and problem.is_symmetric:
         # START of sweeps alone costs more than a dense factor of so few rows.
-        if _whole(trail, "direct", budget):
+        if _whole(trail, Exact("direct", 0.0, 0), budget):
             return
     elif not _at_once(costs):
         if _relaxed_first(trail, budget):
@@ -344,20 +355,14 @@ def _solve(trail: Trail, budget: int) -> None:
     _finish(trail, sweeps, budget)
 
 
-def _general(trail: Trail, budget: int) -> bool:
-    """Newton over the velocities; True where nothing is left to do, or A would be too large to go on."""
-    if _whole(trail, "newton", budget) or trail.at_floor():
-        return True
-    return trail.problem.m > GENERAL_ROWS or trail.problem.cones.has_round
-
-
 def _at_once(costs: Costs) -> bool:
     """A finite solver costs less than sweeps usually do, and even a first look at them would be dear beside it."""
     glance = SWEEP_START + LOOK + FIRST_LOOK * costs.sweep
-    for cost in (costs.guess, costs.exact[0].cost) if costs.guess <= costs.sweeping else (np.inf,):
-        if cost > costs.sweeping or (glance < GLANCE * cost and not costs.redundant):
-            return False
-    return True
+
+    def dear(cost: float) -> bool:
+        return cost > costs.sweeping or (glance < GLANCE * cost and not costs.redundant)
+
+    return not dear(costs.guess) and not dear(costs.exact[0].cost)
 
 
 def _relaxed_first(trail: Trail, budget: int) -> bool:
@@ -381,10 +386,10 @@ def _finish(trail: Trail, sweeps: _Sweeps | None, budget: int) -> None:
         for candidate in costs.exact:
             if trail.best <= trail.tol or budget <= trail.iterations:
                 return
-            started = trail.ended.get(candidate.name)
+            started = trail.ended.get(candidate.key)
             if started is not None and not trail.best <= 0.1 * started:
                 continue  # it gave up, and would do so again
-            if _whole(trail, candidate.name, budget, candidate.limit << k):
+            if _whole(trail, candidate, budget, candidate.limit << k):
                 return
         allowance = max(2.0 * allowance, 2.0 * costs.exact[0].cost)
         sweeps = sweeps or _Sweeps(trail)

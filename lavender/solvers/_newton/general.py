@@ -18,7 +18,9 @@ from lavender_ext.generalized.newton import ENDS, Newton
 from lavender_ext.generalized.newton import run_many as kernel_many
 
 FORM = "generalized velocities"
-CLOCK = 64  # steps between two looks at the clock and at Ctrl-C
+CLOCK = 64  # steps between two looks at the clock and at Ctrl-C; with a time limit at most as many as
+LATE, LATE_SHARE = 0.05, 0.05  # s or this share of the limit are for, at
+FLOP = 1e-10  # s for each multiply-add of a dense factor
 CLOSEST = 1e-2  # of tol, up to which the kernel is asked again where the judge does not find what it found
 LIMIT = 3000  # velocities of one island up to which N is kept dense: 144 MB with its factor
 _STATUS = {
@@ -38,6 +40,13 @@ def prepare(problem: Problem) -> Newton | None:
     return None if kernel.largest > LIMIT else kernel
 
 
+def factor_flops(problem: Problem, largest: int) -> float:
+    """Multiply-adds of the dense factors of all islands at most, `largest` velocities in one of them."""
+    assert problem.generalized is not None
+    flops = float(problem.generalized.jac.shape[1]) * float(largest) ** 2 / 6.0
+    return 2.0 * flops if problem.law == "coulomb" else flops
+
+
 def run(
     problem: Problem, kernel: Newton, impulse: FloatArray, n: int, tol: float, time_limit: float | None
 ) -> Claim:
@@ -46,8 +55,15 @@ def run(
     cold = _is_cold(problem, impulse)
     counts = np.zeros(5, np.int64)
     status, closer = Status.MAX_ITERATIONS, 1.0
+    steps, step = CLOCK, FLOP * factor_flops(problem, kernel.largest)
+    if time_limit is not None:
+        # By the limit alone, not by what is left of it: the same limit gives the same bits.
+        steps = max(1, min(CLOCK, int(max(LATE, LATE_SHARE * time_limit) / max(step, 1e-6))))
     while counts[0] < n:
-        end, done = kernel.run(impulse, closer * tol, min(CLOCK, n - int(counts[0])), cold)
+        if perf_counter() + min(step, 1e6) > deadline + LATE:
+            status = Status.TIME_LIMIT
+            break
+        end, done = kernel.run(impulse, closer * tol, min(steps, n - int(counts[0])), cold)
         counts += done
         status = _STATUS[end]
         if status is Status.CONVERGED and not confirmed(problem, impulse, tol):
