@@ -46,7 +46,11 @@ PIVOT, PIVOT_ENTRY = 60e3, 0.5  # of each pivot of lemke, and for each entry of 
 # Newton over generalised velocities: a call, for each row beside each factor, and each multiply-add of the dense
 # factor of an island.
 GENERAL_START, GENERAL_ROW, GENERAL = 60e3, 40.0, 0.06
-ADMM_START, ADMM_ROW, ADMM_ENTRY = 300e3, 60.0, 2.0  # a call; of each iteration for each row and each entry of L
+ADMM_START, ADMM_ROW, ADMM_ENTRY = (
+    300e3,
+    60.0,
+    2.0,
+)  # a call; of each iteration for each row and each entry of L
 
 # Factorisations to expect, by law: medians over drawn problems. Friction has a long tail.
 DIRECT = {"linear": 1.5, "lcp": 6.0}
@@ -62,6 +66,7 @@ MOST = 30.0  # of what rows add
 GENERAL_COUNT = {"linear": 2.0, "lcp": 10.0, "cone": 20.0, "coulomb": 20.0}  # over generalised velocities
 ADMM_COUNT, ADMM_FACTORS = 240.0, 3.0  # iterations to six decades, and how often rho moves on the way
 ADMM_FILL = 6.0  # entries of L for each of A
+DIRECT_ROUNDS = 40  # of `direct` on bounded rows that are granted before another is asked
 AT_REST = 8.0  # of faces on faces, most of whose rows hold
 UNSYMMETRIC = 2.0  # LU against Cholesky, where friction or A asks for it
 SINGULAR = 6.0  # factorisations of `direct` where A is singular: it shifts and refines
@@ -77,6 +82,7 @@ TREE = 1.05  # neighbours of a body, in the mean, up to which bodies form trees
 TINY_FACTOR = 20e3  # ns, below which a factor is not looked at more closely
 LOOKS = 4  # at so many sweeps
 GENERAL_TAIL = 200  # more steps over generalised velocities than expected that are granted
+ADMM_GENERAL = 1500  # rows up to which A of J and M, whose entries are not known, is formed for `admm`
 LEMKE_ROWS = 1000  # beyond, a dense tableau of 8 MB and more
 
 
@@ -141,13 +147,14 @@ class Costs:
     @property
     def guess(self) -> float:
         """What the cheapest finite solver hardly costs less than [ns], without looking closer."""
-        count = self._newton_count
+        p, count = self.problem, self._newton_count
         if START["newton"] + count * STEP["newton"] > self.sweeping and not self._direct_takes:
             return START["newton"] + count * STEP["newton"]  # whatever the factor costs
         if not self._direct_takes:
             return self._newton_guess
-        m = self.problem.m
-        return min(self._newton_guess, self._direct(BAND * m * max(3.0, self._width(m)) ** 2))
+        m = p.m
+        width = self._width(m) if p.rows is not None else 0.5 * p.data.work / max(m, 1)
+        return min(self._newton_guess, self._direct(BAND * m * max(3.0, width) ** 2))
 
     @cached_property
     def exact(self) -> list[Exact]:
@@ -164,13 +171,14 @@ class Costs:
         p = self.problem
         found = []
         if self._direct_takes:
-            found.append(Exact("direct", self._direct(self._matrix), 0))
+            rounds = 0 if p.law == "linear" else DIRECT_ROUNDS
+            found.append(Exact("direct", self._direct(self._matrix), rounds))
         if p.law == "lcp" and p.m <= LEMKE_ROWS:
             found.append(Exact("lemke", START["lemke"] + p.m * (PIVOT + PIVOT_ENTRY * float(p.m) ** 2), 0))
         if self.largest:
             count = 2 * int(GENERAL_COUNT[p.law]) + GENERAL_TAIL
             found.append(Exact("newton", general_cost(p, self.largest), count, (("form", "velocity"),)))
-        if p.law in ("cone", "coulomb"):
+        if p.law in ("cone", "coulomb") and (p.generalized is None or p.m <= ADMM_GENERAL):
             found.append(Exact("admm", self._admm, int(2.0 * self._admm_count)))
         return found
 

@@ -19,7 +19,7 @@ has no solution. The message and `work` say what ran.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from time import perf_counter
 from typing import Any
@@ -33,19 +33,30 @@ from lavender.problem import OPERATORS, Problem
 from lavender.registry import SolverSpec, get
 from lavender.residuals import at_floor, known, quick, reference
 from lavender.solution import Claim, Status
-from lavender.solvers._costs import ISLAND, LOOK, SWEEP_START, Costs, Exact, general_cost, is_loose, islands_cost
+from lavender.solvers._costs import (
+    ISLAND,
+    LOOK,
+    SWEEP_START,
+    Costs,
+    Exact,
+    general_cost,
+    is_loose,
+    islands_cost,
+)
 from lavender.solvers._islands import islands, restrict, rows_of
 from lavender.solvers._newton import general
 from lavender.solvers.newton import NewtonState
 
 LARGE = 4000  # rows from which friction goes through the relaxation
 HUGE = 40_000  # rows from which friction is left to sweeps before any factorisation
-FIRST_LOOK = 16  # sweeps before the first look at the residual
+FIRST_LOOK, LAST_LOOK = 16, 64  # sweeps before the first look at the residual: so many at least and at most,
+LOOKED = 120e3  # ns, and as cost so much: a look and a cut in the sweeps are not free
 CLOCK = 0.01  # s between two looks at the clock, at a nanosecond for each unit of work
+CHUNK_WORK = 8  # sweeps' work that an iteration of admm is
 CAP = 800  # sweeps of the relaxation that may be promised; twice that for large problems
 FEW = 64  # rows up to which Python's share decides: `direct` for an LCP
 FEW_JOINTS = 300  # rows up to which a linear system is not looked at more closely
-RELAXED = 0.3e6  # ns that sweeps usually take from which Coulomb's law is relaxed first: a problem of its own
+RELAXED = 1e6  # ns that sweeps usually take from which Coulomb's law is relaxed first: a problem of its own
 WARM = 1e-3  # relative residual from which an iterate is worth starting from
 HOPE = 0.4  # share of a finite solver's cost that sweeps may take without promising an end
 BELIEVED = 2.0  # times a finite solver's cost that sweeps may take, whatever they promise
@@ -228,7 +239,11 @@ def _whole(trail: Trail, chosen: Exact, budget: int, limit: int = 0) -> bool:
     trail.begun = trail.begun or chosen.key == VELOCITY
     left = None if np.isinf(trail.deadline) else max(trail.deadline - perf_counter(), 1e-3)
     most = min(limit or spec.max_iter, spec.max_iter, budget - trail.iterations)
-    claim: Claim = solver.run(state, impulse, most, trail.tol, left)
+    claim: Claim
+    if spec.resumable:
+        claim = _in_chunks(trail, solver, state, impulse, most)
+    else:
+        claim = solver.run(state, impulse, most, trail.tol, left)
     trail.add(name, claim)
     if np.isfinite(impulse).all():
         trail.offer(impulse)
@@ -239,6 +254,19 @@ def _whole(trail: Trail, chosen: Exact, budget: int, limit: int = 0) -> bool:
     if claim.certificate is not None and check_certificate(trail.problem, claim.certificate) is None:
         trail.certificate = claim.certificate
     return trail.done
+
+
+def _in_chunks(trail: Trail, solver: Any, state: Any, impulse: FloatArray, n: int) -> Claim:
+    """At most n iterations of a solver that goes on where it stood, with looks at the clock and for Ctrl-C."""
+    done, work = 0, dict[str, int]()
+    chunk = max(1, int(CLOCK * 1e9) // max(1, CHUNK_WORK * trail.problem.data.work))
+    while True:
+        claim: Claim = solver.run(state, impulse, min(chunk, n - done), trail.tol, None)
+        done += claim.iterations
+        for kind, count in claim.work.items():
+            work[kind] = work.get(kind, 0) + count
+        if claim.status is not Status.MAX_ITERATIONS or done >= n or trail.late or claim.iterations == 0:
+            return replace(claim, iterations=done, work=work)
 
 
 def _newton_state(trail: Trail) -> NewtonState:
@@ -260,6 +288,7 @@ class _Sweeps:
             self.impulse = trail.impulse.copy()
         self.done = 0  # sweeps
         self.last, self.at = trail.best, 0  # residual of the last look, and when it was
+        self.rest = np.inf  # sweeps that were then expected to be left
         self.ended = False  # by a claim of its own, or because the residual does not fall
 
     def run(self, budget: int, worth: float | None = None, cap: int | None = None) -> bool:
@@ -274,7 +303,7 @@ class _Sweeps:
         per = trail.costs.sweep
         chunk = max(1, int(CLOCK * 1e9) // max(1, problem.data.work))
         begun, looks, total = self.done, 0, dict[str, int]()
-        step = FIRST_LOOK
+        step = int(min(max(FIRST_LOOK, LOOKED / per), LAST_LOOK))
         while not trail.late:
             step = min(step, budget - trail.iterations - (self.done - begun))
             if cap is not None:
@@ -295,7 +324,7 @@ class _Sweeps:
             if claim.status is not Status.MAX_ITERATIONS or now <= tol or self.done == before:
                 self.ended = not now <= tol
                 break
-            rest = self.expected(now, tol)
+            rest = self.rest = self.expected(now, tol)
             self.last, self.at = now, self.done
             if cap is not None:
                 if self.done - begun > 2 * FIRST_LOOK and self.done + rest > cap:
@@ -305,6 +334,11 @@ class _Sweeps:
             step = max(FIRST_LOOK, self.done // 2)
         trail.add(self.name, Claim(Status.MAX_ITERATIONS, self.done - begun, total))
         return trail.done
+
+    @property
+    def cost(self) -> float:
+        """What is left, by the contraction before the last look [ns]."""
+        return np.inf if self.ended else self.rest * self.trail.costs.sweep
 
     def dearer(self, rest: float, spent: float, worth: float | None) -> bool:
         """Whether what is left costs more than what else there is; looked at closely only where it may."""
@@ -389,6 +423,10 @@ def _finish(trail: Trail, sweeps: _Sweeps | None, budget: int) -> None:
             started = trail.ended.get(candidate.key)
             if started is not None and not trail.best <= 0.1 * started:
                 continue  # it gave up, and would do so again
+            # The one before gave up, or needs more than was expected of it.
+            cheaper = sweeps is not None and trail.iterations > spent and sweeps.cost < candidate.cost
+            if cheaper and sweeps is not None and sweeps.run(budget, candidate.cost):
+                return
             if _whole(trail, candidate, budget, candidate.limit << k):
                 return
         allowance = max(2.0 * allowance, 2.0 * costs.exact[0].cost)

@@ -151,6 +151,39 @@ def test_costs_order_what_is_known_to_be_ordered():
     assert tight.exact == pile.exact
 
 
+def test_large_islands_of_generalized_velocities_are_left_to_sweeps_first():
+    # 667 spheres in one heap: a dense factor of N costs seconds, sweeps milliseconds.
+    problem = suite.case("wild(seed=67)").problem
+    assert problem.generalized is not None
+    solution = lv.solve(problem, tol=1e-6)
+    assert good(solution, 1e-6)
+    assert solution.message.startswith("anderson")
+
+
+def test_small_islands_of_generalized_velocities_go_to_newton_at_once():
+    problem = suite.case("wild(seed=57)").problem
+    assert problem.generalized is not None
+    solution = lv.solve(problem, tol=1e-6)
+    assert good(solution, 1e-6)
+    assert solution.message.startswith("newton")
+
+
+def test_newton_over_velocities_is_not_asked_twice_where_it_gave_up():
+    names = [e.key for e in Costs(suite.case("wild(seed=7)").problem, 1e-6, 600).exact]
+    assert sorted(names) == ["admm", "newton impulse", "newton velocity"]
+
+
+def test_a_step_that_would_end_after_the_deadline_is_refused(monkeypatch):
+    from lavender.solvers._newton import general
+
+    problem = suite.case("wild(seed=7)").problem
+    kernel = general.prepare(problem)
+    monkeypatch.setattr(general, "FLOP", 1e-6)  # a machine ten thousand times slower: 40 s a step
+    claim = general.run(problem, kernel, problem.start(), 100, 1e-9, 1.0)
+    assert claim.status is lv.Status.TIME_LIMIT
+    assert claim.iterations == 0
+
+
 def test_costs_are_counted_and_not_timed():
     # The same numbers whenever they are asked for: a choice depends on the problem alone.
     for seed in range(20):
