@@ -22,7 +22,8 @@ from lavender_ext.core.block cimport CONE, CONTACT_SPIN, ROW, blocks_t, clip, n_
 from lavender_ext.core.csr cimport csr_t
 from lavender_ext.core.order cimport SYMMETRIC, advance_order
 from lavender_ext.core.problem cimport Data
-from lavender_ext.core.rows cimport contact_push, joint_push, relax_rows_block, rows_t
+from lavender_ext.core.rows cimport relax_rows_block, rows_t
+from lavender_ext.core.velocity cimport rows_velocity
 from lavender_ext.judge.watch cimport CONVERGED, RUNNING, Watch
 from lavender_ext.local.gauss_seidel cimport solve_csr_block, solve_rows_block
 from lavender_ext.sweep.pgs cimport relax_csr_block
@@ -81,21 +82,9 @@ cdef inline void sweep(const sweep_data_t* c, double* lam, int32_t first) noexce
 
 
 cdef inline void form_velocity(const sweep_data_t* c, const double* lam) noexcept nogil:
-    # v = M^-1 J^T lam; nothing to do where not factored.
-    cdef const blocks_t* p = c.blocks
-    cdef const rows_t* r = c.rows
-    cdef int32_t i, j, k
-    for i in range(c.nv):
-        c.v[i] = 0.0
-    if c.nv == 0:
-        return
-    for i in range(r.n_joints):
-        for j in range(p.ptr[i], p.ptr[i + 1]):
-            joint_push(r.minv_jac + 12 * j, lam[j], c.v, r.joint_body[2 * i], r.joint_body[2 * i + 1])
-    for k in range(r.n_contacts):
-        i = r.n_joints + k
-        j = p.ptr[i]
-        contact_push(r, k, n_tangents(p.kind[i], p.ptr[i + 1] - j), p.kind[i] == CONTACT_SPIN, lam + j, c.v)
+    # nothing to do where not factored
+    if c.nv > 0:
+        rows_velocity(c.blocks, c.rows, lam, c.v)
 
 
 cdef inline void project_block(const blocks_t* p, int32_t i, double* lam) noexcept nogil:

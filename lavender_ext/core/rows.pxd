@@ -263,31 +263,6 @@ cdef inline void rows_times(const blocks_t* p, const rows_t* r, const double* v,
         contact_slack(r, c, n_tangents(p.kind[i], p.ptr[i + 1] - j), p.kind[i] == CONTACT_SPIN, v, out + j)
 
 
-cdef inline void contact_push(const rows_t* r, int32_t c, int32_t nt, int32_t spin, const double* lam,
-                              double* v) noexcept nogil:
-    # v += M^-1 J^T lam of one contact.
-    cdef double t2[3]
-    cdef double impulse[3]
-    cdef double twist[3]
-    cdef const double* n = r.normal + 3 * c
-    cdef int32_t k
-    for k in range(3):
-        impulse[k] = lam[0] * n[k]
-        twist[k] = 0.0
-    if nt > 0:
-        for k in range(3):
-            impulse[k] += lam[1] * r.tangent[3 * c + k]
-    if nt == 2:
-        cross(n, r.tangent + 3 * c, t2)
-        for k in range(3):
-            impulse[k] += lam[2] * t2[k]
-    if spin:
-        for k in range(3):
-            twist[k] = lam[1 + nt] * n[k]
-    push_bodies(v, r.contact_body[2 * c], r.contact_body[2 * c + 1], r.inv_mass, r.inv_inertia,
-                r.arm_a + 3 * c, r.arm_b + 3 * c, impulse, twist)
-
-
 cdef inline void contact_jacobian(const rows_t* r, int32_t c, int32_t nt, int32_t spin,
                                   double* jac) noexcept nogil:
     # Rows of one contact as (1 + nt + spin, 12), in the layout of joint rows.

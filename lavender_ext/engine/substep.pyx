@@ -16,10 +16,11 @@ import numpy as np
 
 from lavender_ext.engine.arrays import views
 
-from lavender_ext.core.block cimport CONTACT_SPIN, blocks_t, n_tangents, row_error
+from lavender_ext.core.block cimport blocks_t, row_error
 from lavender_ext.core.order cimport (RANDOM, SYMMETRIC, advance_order, block_levels, body_levels,
                                       color_by_bodies, reverse, sort_by_level)
-from lavender_ext.core.rows cimport contact_push, joint_push, relax_contact_block, relax_joint, rows_t
+from lavender_ext.core.rows cimport relax_contact_block, relax_joint, rows_t
+from lavender_ext.core.velocity cimport rows_velocity
 from lavender_ext.engine.arrays cimport (AT_RANDOM, BOTTOM_UP, CAP_CONTACT, CAP_PAIR, COLORED, H_CACHED,
                                          H_CONTACTS, H_CONTACT_ROWS, H_ITERATIONS, H_LOST, H_MATCHES,
                                          H_NEED_CONTACTS, H_NEED_PAIRS, H_ORDER, H_SEED, H_SOLVED, H_STEP,
@@ -73,21 +74,14 @@ cdef inline void measure(const engine_t* e, double* residual, double* violation)
     violation[0] = low
 
 
-cdef inline void warm(engine_t* e, const rows_t* r) noexcept nogil:
-    # dv = M^-1 J^T lam, block by block
-    cdef int32_t i, j, c
+cdef inline void warm(engine_t* e, const blocks_t* p, const rows_t* r) noexcept nogil:
+    # dv = M^-1 J^T lam, 0 where every substep starts cold
+    cdef int32_t i
+    if e.head[H_WARM_START]:
+        rows_velocity(p, r, e.impulse, e.dv)
+        return
     for i in range(6 * e.size[N_DYNAMIC]):
         e.dv[i] = 0.0
-    if not e.head[H_WARM_START]:
-        return
-    for i in range(r.n_joints):
-        for j in range(e.ptr[i], e.ptr[i + 1]):
-            joint_push(e.minv_jac + 12 * j, e.impulse[j], e.dv, e.joint_body[2 * i], e.joint_body[2 * i + 1])
-    for c in range(r.n_contacts):
-        i = r.n_joints + c
-        j = e.ptr[i]
-        contact_push(r, c, n_tangents(e.kind[i], e.ptr[i + 1] - j), e.kind[i] == CONTACT_SPIN, e.impulse + j,
-                     e.dv)
 
 
 cdef inline void order_blocks(engine_t* e) noexcept nogil:
@@ -162,7 +156,7 @@ cdef inline void solve(engine_t* e, int32_t sweeps, double* room, double* curve,
     cdef rows_t r
     cdef double* out = e.setting + S_OUT
     view(e, &p, &r)
-    warm(e, &r)
+    warm(e, &p, &r)
     measure(e, out + 4, out + 6)
     if curve != NULL:
         note_sweep(e, &p, &r, curve, scratch)
@@ -265,13 +259,9 @@ cdef public void lav_engine_apply(const int32_t* size, double* real, int32_t* in
     cdef int64_t n[3]
     cdef blocks_t p
     cdef rows_t r
-    cdef int32_t held
     bind(size, real, index, keys, &e, n)
     view(&e, &p, &r)
-    held = e.head[H_WARM_START]
-    e.head[H_WARM_START] = 1
-    warm(&e, &r)
-    e.head[H_WARM_START] = held
+    rows_velocity(&p, &r, e.impulse, e.dv)
     measure(&e, e.setting + S_OUT + 5, e.setting + S_OUT + 7)
 
 

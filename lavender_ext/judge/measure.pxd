@@ -3,8 +3,8 @@
     F_i = 2^-53 (|A| |lam| + |b|)_i             [m/s]; factored: |J| |M^-1| |J|^T |lam| + c |lam| for |A| |lam|
     floor energy sqrt(sum F^2 / d), floor velocity max F sqrt(nu / d)
 
-A row's products serve w and F, and its error and sums follow while they are at hand: A is read once. Factored, a
-first loop gathers the wrench J^T lam on each body, M^-1 is applied once a body, a second loop reads J v.
+A row's products serve w and F, and its error and sums follow while they are at hand: A is read once. Factored,
+core/velocity.pxd forms M^-1 J^T lam, and a second loop reads J v.
 """
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t
@@ -14,8 +14,8 @@ from lavender_ext.core.block cimport (CONE, CONTACT_SPIN, ROW, block_error, bloc
 from lavender_ext.core.csr cimport csr_abs_dot, csr_dot, csr_dot_size, csr_t
 from lavender_ext.core.generalized cimport (generalized_t, jac_push, jac_row, panel_push_size, panel_size,
                                             tree_solve)
-from lavender_ext.core.rows cimport (contact_push, contact_slack, cross, dot3, joint_push, joint_velocity,
-                                     rows_t, rows_times)
+from lavender_ext.core.rows cimport contact_slack, cross, joint_velocity, rows_t, rows_times
+from lavender_ext.core.velocity cimport add6, rows_velocity
 from lavender_ext.judge.score cimport (add_floor, is_plain, nothing, root, score_from, score_rows, score_t,
                                        sum_t, tally_block, tally_contact, tally_floor, tally_row, tally_t)
 
@@ -77,20 +77,6 @@ cdef inline void csr_judge(const blocks_t* p, const csr_t* a, const double* lam,
 # -- the factored form -------------------------------------------------------------------------------
 
 
-cdef inline void rows_velocity(const blocks_t* p, const rows_t* r, const double* lam, double* v) noexcept nogil:
-    """v = M^-1 J^T lam, (n, 6), block by block as sweeps change it: where they start."""
-    cdef int32_t i, j, c
-    for i in range(6 * r.n_bodies):
-        v[i] = 0.0
-    for i in range(r.n_joints):
-        for j in range(p.ptr[i], p.ptr[i + 1]):
-            joint_push(r.minv_jac + 12 * j, lam[j], v, r.joint_body[2 * i], r.joint_body[2 * i + 1])
-    for c in range(r.n_contacts):
-        i = r.n_joints + c
-        j = p.ptr[i]
-        contact_push(r, c, n_tangents(p.kind[i], p.ptr[i + 1] - j), p.kind[i] == CONTACT_SPIN, lam + j, v)
-
-
 cdef inline void rows_slack(const blocks_t* p, const rows_t* r, const double* lam, const double* v,
                                 double* w) noexcept nogil:
     """w = J v + c lam - b, v = M^-1 J^T lam."""
@@ -100,65 +86,22 @@ cdef inline void rows_slack(const blocks_t* p, const rows_t* r, const double* la
         w[j] += r.compliance[j] * lam[j] - p.b[j]
 
 
-cdef inline void add6(double* to, const double* x) noexcept nogil:
-    cdef int32_t k
-    for k in range(6):
-        to[k] += x[k]
-
-
-cdef inline void joint_wrench(const blocks_t* p, const rows_t* r, int32_t i, const double* lam, bint floor, double* v,
-                              double* size) noexcept nogil:
-    # J^T lam of joint i onto its bodies in v; |J|^T |lam| in size.
-    cdef double sum_[12]
-    cdef double all_[12]
+cdef inline void joint_wrench_size(const blocks_t* p, const rows_t* r, int32_t i, const double* lam,
+                                   double* size) noexcept nogil:
+    # |J|^T |lam| of joint i
+    cdef double x[12]
     cdef const double* row
     cdef int32_t j, k, a = r.joint_body[2 * i], b = r.joint_body[2 * i + 1]
     for k in range(12):
-        sum_[k] = 0.0
-        all_[k] = 0.0
+        x[k] = 0.0
     for j in range(p.ptr[i], p.ptr[i + 1]):
         row = r.jac + 12 * j
         for k in range(12):
-            sum_[k] += row[k] * lam[j]
-        if floor:
-            for k in range(12):
-                all_[k] += fabs(row[k] * lam[j])
+            x[k] += fabs(row[k] * lam[j])
     if a >= 0:
-        add6(v + 6 * a, sum_)
-        if floor:
-            add6(size + 6 * a, all_)
+        add6(size + 6 * a, x)
     if b >= 0:
-        add6(v + 6 * b, sum_ + 6)
-        if floor:
-            add6(size + 6 * b, all_ + 6)
-
-
-cdef inline void contact_wrench(const rows_t* r, int32_t c, int32_t nt, int32_t spin, const double* lam,
-                                double* v) noexcept nogil:
-    # The same of one contact; lam at its normal.
-    cdef double t2[3]
-    cdef double x[3]
-    cdef double l[3]
-    cdef const double* n = r.normal + 3 * c
-    cdef int32_t k, a = r.contact_body[2 * c], b = r.contact_body[2 * c + 1]
-    if nt > 1:
-        cross(n, r.tangent + 3 * c, t2)
-    for k in range(3):
-        x[k] = lam[0] * n[k]
-        if nt > 0:
-            x[k] += lam[1] * r.tangent[3 * c + k]
-        if nt > 1:
-            x[k] += lam[2] * t2[k]
-    if a >= 0:
-        cross(r.arm_a + 3 * c, x, l)
-        for k in range(3):
-            v[6 * a + k] -= x[k]
-            v[6 * a + 3 + k] -= l[k] + lam[1 + nt] * n[k] if spin else l[k]
-    if b >= 0:
-        cross(r.arm_b + 3 * c, x, l)
-        for k in range(3):
-            v[6 * b + k] += x[k]
-            v[6 * b + 3 + k] += l[k] + lam[1 + nt] * n[k] if spin else l[k]
+        add6(size + 6 * b, x + 6)
 
 
 cdef inline double abs_cross(const double* x, const double* y, int32_t k) noexcept nogil:
@@ -211,48 +154,34 @@ cdef inline void contact_wrench_size(const rows_t* r, int32_t c, int32_t nt, int
         side_wrench_size(n, t1, t2, r.arm_b + 3 * c, nt, spin, fabs(lam[0]), y, z, u, size + 6 * b)
 
 
-cdef inline void wrenches(const blocks_t* p, const rows_t* r, const double* lam, bint floor, double* v) noexcept nogil:
-    """v = M^-1 J^T lam (n, 6), summed as wrenches first; with the floor |M^-1| |J|^T |lam| behind it, (n, 6)."""
-    cdef int32_t i, j, c, k, nt, n = r.n_bodies
-    cdef double* size = v + 6 * <ssize_t>n
+cdef inline void velocity_size(const blocks_t* p, const rows_t* r, const double* lam, double* size) noexcept nogil:
+    """|M^-1| |J|^T |lam|, (n, 6)."""
+    cdef int32_t i, j, c, k, nt
     cdef double* x
     cdef const double* inv
     cdef double t[3]
-    for i in range(12 * n if floor else 6 * n):
-        v[i] = 0.0
+    for i in range(6 * r.n_bodies):
+        size[i] = 0.0
     for i in range(r.n_joints):
-        joint_wrench(p, r, i, lam, floor, v, size)
+        joint_wrench_size(p, r, i, lam, size)
     for c in range(r.n_contacts):
         i = r.n_joints + c
         j = p.ptr[i]
         nt = n_tangents(p.kind[i], p.ptr[i + 1] - j)
         if p.kind[i] == CONTACT_SPIN or nt == 1:        # the two common kinds with their sizes as constants
-            contact_wrench(r, c, nt, p.kind[i] == CONTACT_SPIN, lam + j, v)
-            if floor:
-                contact_wrench_size(r, c, nt, p.kind[i] == CONTACT_SPIN, lam + j, size)
+            contact_wrench_size(r, c, nt, p.kind[i] == CONTACT_SPIN, lam + j, size)
         elif nt == 2:
-            contact_wrench(r, c, 2, 0, lam + j, v)
-            if floor:
-                contact_wrench_size(r, c, 2, 0, lam + j, size)
+            contact_wrench_size(r, c, 2, 0, lam + j, size)
         else:
-            contact_wrench(r, c, 0, 0, lam + j, v)
-            if floor:
-                contact_wrench_size(r, c, 0, 0, lam + j, size)
-    for i in range(n):
-        x = v + 6 * <ssize_t>i
+            contact_wrench_size(r, c, 0, 0, lam + j, size)
+    for i in range(r.n_bodies):
+        x = size + 6 * <ssize_t>i
         inv = r.inv_inertia + 9 * <ssize_t>i
         for k in range(3):
             x[k] *= r.inv_mass[i]
             t[k] = x[3 + k]
         for k in range(3):
-            x[3 + k] = dot3(inv + 3 * k, t)
-        if floor:
-            x = size + 6 * <ssize_t>i
-            for k in range(3):
-                x[k] *= r.inv_mass[i]
-                t[k] = x[3 + k]
-            for k in range(3):
-                x[3 + k] = (fabs(inv[3 * k]) * t[0] + fabs(inv[3 * k + 1]) * t[1]) + fabs(inv[3 * k + 2]) * t[2]
+            x[3 + k] = (fabs(inv[3 * k]) * t[0] + fabs(inv[3 * k + 1]) * t[1]) + fabs(inv[3 * k + 2]) * t[2]
 
 
 cdef inline double joint_size(const double* jac, const double* size, int32_t a, int32_t b) noexcept nogil:
@@ -361,15 +290,16 @@ cdef inline void rows_judge(const blocks_t* p, const rows_t* r, const double* la
                             bint floor, score_t* out) noexcept nogil:
     cdef int32_t i, j, c, k, nt
     cdef double size[4]
-    cdef const double* sizes = v + 6 * <ssize_t>r.n_bodies
+    cdef double* sizes = v + 6 * <ssize_t>r.n_bodies
     cdef tally_t s
     cdef sum_t total = sum_t(0.0, 0.0)
     cdef double big = 0.0
-    wrenches(p, r, lam, floor, v)
+    rows_velocity(p, r, lam, v)
     if not floor:
         rows_slack(p, r, lam, v, w)
         score_rows(p, lam, w, e, out)
         return
+    velocity_size(p, r, lam, sizes)
     s = rows_pass(p, r, lam, w, e, v)
     score_from(p, e, &s, out)
     if is_plain(s.floor_energy, s.floor_fast):

@@ -9,8 +9,8 @@ from lavender_ext.core.csr cimport csr_t
 from lavender_ext.core.generalized cimport generalized_t
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.rows cimport rows_t
-from lavender_ext.judge.measure cimport (csr_slack, general_judge, general_slack, judge_into, rows_slack,
-                                         rows_velocity, wrenches)
+from lavender_ext.core.velocity cimport rows_velocity
+from lavender_ext.judge.measure cimport csr_slack, general_judge, general_slack, judge_into, rows_slack
 from lavender_ext.judge.score cimport are_numbers, norms_of_rhs, relative, score_rows, score_t
 
 
@@ -49,7 +49,7 @@ def slack(Data p, const double[::1] lam, double[::1] w):
     elif p.factored:
         v = np.empty(6 * p.rows.n_bodies + 1)
         with nogil:
-            wrenches(&p.blocks, &p.rows, &lam[0], False, &v[0])
+            rows_velocity(&p.blocks, &p.rows, &lam[0], &v[0])
             rows_slack(&p.blocks, &p.rows, &lam[0], &v[0], &w[0])
     else:
         with nogil:

@@ -13,6 +13,7 @@ from libc.stdint cimport int32_t, int64_t
 
 from lavender_ext.core.block cimport CONTACT, ROW, blocks_t, n_tangents, norm2
 from lavender_ext.core.rows cimport contact_jacobian, contact_slack, cross, dot3, rows_t
+from lavender_ext.core.velocity cimport contact_wrench, wrenches_to_velocity
 
 
 cdef enum:
@@ -100,29 +101,6 @@ cdef inline void add_rows(const rows_t* r, int32_t c, const double* weight, int3
             add_block(band, width, a, b, scaled, jac + 6, rows)
         else:
             add_block(band, width, b, a, scaled + 6, jac, rows)
-
-
-cdef inline void pull(const rows_t* r, int32_t c, const double* x, double* u) noexcept nogil:
-    # u += J^T x of contact c, x (3)
-    cdef double t2[3]
-    cdef double f[3]
-    cdef double l[3]
-    cdef const double* n = r.normal + 3 * c
-    cdef const double* t1 = r.tangent + 3 * c
-    cdef int32_t k, a = r.contact_body[2 * c], b = r.contact_body[2 * c + 1]
-    cross(n, t1, t2)
-    for k in range(3):
-        f[k] = x[0] * n[k] + x[1] * t1[k] + x[2] * t2[k]
-    if a >= 0:
-        cross(r.arm_a + 3 * c, f, l)
-        for k in range(3):
-            u[6 * a + k] -= f[k]
-            u[6 * a + 3 + k] -= l[k]
-    if b >= 0:
-        cross(r.arm_b + 3 * c, f, l)
-        for k in range(3):
-            u[6 * b + k] += f[k]
-            u[6 * b + 3 + k] += l[k]
 
 
 cdef inline void choose_set(const blocks_t* p, const rows_t* r, double* lam, const double* v,
@@ -267,7 +245,7 @@ cdef inline int32_t solve_set(const blocks_t* p, const rows_t* r, const int32_t*
                 w[k] = x[3 * c + k] / (eps * p.d[j + k] + r.compliance[j + k])
             else:
                 w[k] = 0.0
-        pull(r, c, w, u)
+        contact_wrench(r, c, 2, 0, w, u)
     t = sqrt(big)
     if (t <= energy and fast <= velocity * velocity) or not t < 0.5 * left[0]:
         return 0
@@ -302,13 +280,8 @@ cdef inline int32_t newton_step(const blocks_t* p, const rows_t* r, int32_t* sta
         v[i] = 0.0
     for c in range(r.n_contacts):
         if state[c] != OPEN:
-            pull(r, c, lam + p.ptr[c], v)
-    for c in range(r.n_bodies):                         # v = M^-1 J^T lam
-        for k in range(3):
-            v[6 * c + k] *= r.inv_mass[c]
-            weight[k] = dot3(r.inv_inertia + 9 * c + 3 * k, v + 6 * c + 3)
-        for k in range(3):
-            v[6 * c + 3 + k] = weight[k]
+            contact_wrench(r, c, 2, 0, lam + p.ptr[c], v)
+    wrenches_to_velocity(r, v)
     for i in range(n * width):
         band[i] = 0.0
     if not add_mass(r, width, band, u):

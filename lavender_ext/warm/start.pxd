@@ -16,8 +16,8 @@ from libc.stdint cimport int32_t, int64_t
 from lavender_ext.core.block cimport (CONTACT_SPIN, COULOMB, ROW, blocks_t, clip, coulomb_error, n_tangents,
                                       row_error)
 from lavender_ext.core.rows cimport contact_slack, joint_velocity, relax_rows_block, rows_t
+from lavender_ext.core.velocity cimport rows_velocity
 from lavender_ext.factor.band cimport ldl_factor, ldl_solve, pivots_t
-from lavender_ext.judge.measure cimport rows_velocity
 from lavender_ext.warm.active_set cimport body_band, newton_step
 
 

@@ -1,0 +1,97 @@
+"""The change of velocity that impulses make: summed as wrenches on each body, then M^-1 once a body.
+
+    f_i = sum of J^T lam over the blocks of body i      (linear [N s], angular [N m s])
+    v_i = (f_i / m_i, I_i^-1 l_i)                                                              (1)
+"""
+from libc.stdint cimport int32_t
+
+from lavender_ext.core.block cimport CONTACT_SPIN, blocks_t, n_tangents
+from lavender_ext.core.rows cimport cross, dot3, rows_t
+
+
+cdef inline void add6(double* to, const double* x) noexcept nogil:
+    cdef int32_t k
+    for k in range(6):
+        to[k] += x[k]
+
+
+cdef inline void joint_wrench(const blocks_t* p, const rows_t* r, int32_t i, const double* lam,
+                              double* f) noexcept nogil:
+    """f (n, 6) += J^T lam of joint i."""
+    cdef double x[12]
+    cdef const double* row
+    cdef int32_t j, k, a = r.joint_body[2 * i], b = r.joint_body[2 * i + 1]
+    for k in range(12):
+        x[k] = 0.0
+    for j in range(p.ptr[i], p.ptr[i + 1]):
+        row = r.jac + 12 * j
+        for k in range(12):
+            x[k] += row[k] * lam[j]
+    if a >= 0:
+        add6(f + 6 * a, x)
+    if b >= 0:
+        add6(f + 6 * b, x + 6)
+
+
+cdef inline void contact_wrench(const rows_t* r, int32_t c, int32_t nt, int32_t spin, const double* lam,
+                                double* f) noexcept nogil:
+    """The same of contact c; lam at its normal."""
+    cdef double t2[3]
+    cdef double x[3]
+    cdef double l[3]
+    cdef const double* n = r.normal + 3 * c
+    cdef int32_t k, a = r.contact_body[2 * c], b = r.contact_body[2 * c + 1]
+    if nt > 1:
+        cross(n, r.tangent + 3 * c, t2)
+    for k in range(3):
+        x[k] = lam[0] * n[k]
+        if nt > 0:
+            x[k] += lam[1] * r.tangent[3 * c + k]
+        if nt > 1:
+            x[k] += lam[2] * t2[k]
+    if a >= 0:
+        cross(r.arm_a + 3 * c, x, l)
+        for k in range(3):
+            f[6 * a + k] -= x[k]
+            f[6 * a + 3 + k] -= l[k] + lam[1 + nt] * n[k] if spin else l[k]
+    if b >= 0:
+        cross(r.arm_b + 3 * c, x, l)
+        for k in range(3):
+            f[6 * b + k] += x[k]
+            f[6 * b + 3 + k] += l[k] + lam[1 + nt] * n[k] if spin else l[k]
+
+
+cdef inline void wrenches_to_velocity(const rows_t* r, double* v) noexcept nogil:
+    """M^-1 of (1) in place; v (n, 6)."""
+    cdef int32_t i, k
+    cdef double l[3]
+    cdef double* x = v
+    cdef const double* inv = r.inv_inertia
+    for i in range(r.n_bodies):
+        for k in range(3):
+            x[k] *= r.inv_mass[i]
+            l[k] = x[3 + k]
+        for k in range(3):
+            x[3 + k] = dot3(inv + 3 * k, l)
+        x += 6
+        inv += 9
+
+
+cdef inline void rows_velocity(const blocks_t* p, const rows_t* r, const double* lam, double* v) noexcept nogil:
+    """v = M^-1 J^T lam (n, 6) of all blocks, by (1)."""
+    cdef int32_t i, j, c, nt
+    for i in range(6 * r.n_bodies):
+        v[i] = 0.0
+    for i in range(r.n_joints):
+        joint_wrench(p, r, i, lam, v)
+    for c in range(r.n_contacts):
+        i = r.n_joints + c
+        j = p.ptr[i]
+        nt = n_tangents(p.kind[i], p.ptr[i + 1] - j)
+        if p.kind[i] == CONTACT_SPIN or nt == 1:        # the two common kinds with their sizes as constants
+            contact_wrench(r, c, nt, p.kind[i] == CONTACT_SPIN, lam + j, v)
+        elif nt == 2:
+            contact_wrench(r, c, 2, 0, lam + j, v)
+        else:
+            contact_wrench(r, c, 0, 0, lam + j, v)
+    wrenches_to_velocity(r, v)
