@@ -17,6 +17,7 @@ from lavender_ext.core.csr cimport csr_t
 from lavender_ext.core.generalized cimport Operator, dot, generalized_t, panel_pattern, panel_whiten
 from lavender_ext.core.rows cimport (contact_diagonal, dot12, largest_eigenvalue, minv_times, reciprocal,
                                      rows_t, rows_times)
+from lavender_ext.core.weights cimport block_weights, joint_weights
 
 
 #: Kinds of blocks and friction laws by the kernels' numbers.
@@ -94,12 +95,7 @@ cdef inline double csr_entry(const csr_t* a, int32_t i, int32_t j) noexcept nogi
 
 cdef public void lav_matrix_nu(const blocks_t* p, double* nu) noexcept nogil:
     """(2) where only a matrix is known."""
-    cdef int32_t i, j
-    for i in range(p.n_blocks):
-        for j in range(p.ptr[i], p.ptr[i + 1]):
-            nu[j] = p.d[j]
-        if p.kind[i] == CONTACT_SPIN:
-            nu[p.ptr[i + 1] - 1] = p.d[p.ptr[i]]
+    block_weights(p, p.d, nu)
 
 
 cdef public int32_t lav_rows_diagonal(const blocks_t* p, const rows_t* r, double* d, double* nu, double* step,
@@ -107,7 +103,7 @@ cdef public int32_t lav_rows_diagonal(const blocks_t* p, const rows_t* r, double
                                       double* swing) noexcept nogil:
     """d, nu, step, M^-1 J^T of joints, coupling and swing of contacts, from the factored form."""
     cdef int32_t i, j, q, c, t, nt, spin, end, n_empty = 0, n_positive = 0, a, b
-    cdef double total = 0.0, mean, e, off, linear, inv
+    cdef double total = 0.0, mean, e, off
     for i in range(r.n_joints):
         a = r.joint_body[2 * i]
         b = r.joint_body[2 * i + 1]
@@ -151,24 +147,10 @@ cdef public int32_t lav_rows_diagonal(const blocks_t* p, const rows_t* r, double
         e = step[j + 1] if nt > 0 and step[j + 1] > 0.0 else (d[j + 1] if nt > 0 else 0.0)
         for q in range(j, end):
             step[q] = reciprocal(d[q])
-            nu[q] = d[q]
         for t in range(1, 1 + nt):
             step[j + t] = reciprocal(e)
-        if p.kind[i] == CONTACT_SPIN:
-            nu[end - 1] = d[j]
-        if i < r.n_joints:
-            for q in range(j, end):
-                linear = 0.0
-                for t in range(3):
-                    linear += fabs(r.jac[12 * q + t]) + fabs(r.jac[12 * q + 6 + t])
-                if linear == 0.0:
-                    inv = 0.0
-                    if r.joint_body[2 * i] >= 0:
-                        inv += r.inv_mass[r.joint_body[2 * i]]
-                    if r.joint_body[2 * i + 1] >= 0:
-                        inv += r.inv_mass[r.joint_body[2 * i + 1]]
-                    if inv > 0.0:
-                        nu[q] = inv
+    block_weights(p, d, nu)
+    joint_weights(p, r, nu)
     return n_empty
 
 
@@ -210,14 +192,12 @@ cdef public int32_t lav_general_diagonal(const blocks_t* p, const generalized_t*
         pair_means(nt, d + j)
         for k in range(j, p.ptr[i + 1]):
             step[k] = reciprocal(d[k])
-            nu[k] = d[k]
         if nt > 0 and p.kind[i] != ROUND:
             if not e > 0.0:
                 e = d[j + 1]
             for k in range(1, 1 + nt):
                 step[j + k] = reciprocal(e)
-        if p.kind[i] == CONTACT_SPIN:
-            nu[p.ptr[i + 1] - 1] = d[j]
+    block_weights(p, d, nu)
     return n_empty
 
 

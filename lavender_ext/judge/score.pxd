@@ -4,8 +4,8 @@
     V   = max sqrt(nu d) |e|                    [m/s], |e| the pair's norm on tangents
     relative = max(E / E0, V / V0)              E0, V0 of doing nothing                            (1)
 
-The judge and the watch of a run of sweeps score by these lines, and the polishes of Newton's method take (1) from here;
-warm starts keep sums of their own (`warm/start.pxd`), since they score while they sweep.
+The judge, the watch of a run of sweeps and warm starts score by these lines, and the polishes of Newton's method take (1)
+from here.
 """
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t

@@ -6,9 +6,10 @@ import numpy as np
 from lavender_ext.core.block cimport blocks_t
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.rows cimport rows_t
-from lavender_ext.engine.arrays cimport CAP_CONTACT, H_CONTACTS, N_DYNAMIC, N_JOINT, S_OUT, bind, engine_t
-from lavender_ext.engine.view cimport view
-from lavender_ext.warm.start cimport band_width, score_sums_t, warm_solve, warm_t
+from lavender_ext.core.weights cimport block_weights, joint_weights
+from lavender_ext.engine.arrays cimport CAP_CONTACT, N_DYNAMIC, N_JOINT, S_OUT, bind, engine_t
+from lavender_ext.engine.view cimport measure, view
+from lavender_ext.warm.start cimport band_width, warm_solve, warm_t
 
 
 cdef public int32_t lav_warm_band(const blocks_t* p, const rows_t* r, int32_t* last) noexcept nogil:
@@ -17,17 +18,15 @@ cdef public int32_t lav_warm_band(const blocks_t* p, const rows_t* r, int32_t* l
 
 
 cdef public int32_t lav_warm_solve(const blocks_t* p, const rows_t* r, warm_t* s, double tol, double* lam,
-                                   double* v, int32_t has_velocity, score_sums_t* first,
-                                   score_sums_t* last) noexcept nogil:
+                                   double* v, int32_t has_velocity) noexcept nogil:
     """lam (m) to tol where a few sweeps or one banded factorisation do; how it ended."""
-    return warm_solve(p, r, s, tol, lam, v, has_velocity, first, last)
+    return warm_solve(p, r, s, tol, lam, v, has_velocity)
 
 
 def from_guess(Data data, double[::1] impulse, double tol):
     """impulse (m,) of a factored problem to tol: (how it ended, sweeps, factorisations); as it came where 0."""
     cdef int32_t m = data.blocks.n_rows, how
     cdef warm_t s
-    cdef score_sums_t first, last
     if m == 0 or not data.factored:
         return 0, 0, 0
     cdef int32_t[::1] index = np.empty(data.rows.n_bodies + 2 * data.rows.n_joints + data.rows.n_contacts + 1,
@@ -36,7 +35,7 @@ def from_guess(Data data, double[::1] impulse, double tol):
     cdef double[::1] real = np.empty(6 * data.rows.n_bodies + _room(&data.blocks, &data.rows, s.width))
     _lay(&s, &real[6 * data.rows.n_bodies], &index[0], &data.blocks, &data.rows)
     with nogil:
-        how = lav_warm_solve(&data.blocks, &data.rows, &s, tol, &impulse[0], &real[0], 0, &first, &last)
+        how = lav_warm_solve(&data.blocks, &data.rows, &s, tol, &impulse[0], &real[0], 0)
     return how, s.sweeps, s.factorisations
 
 
@@ -48,10 +47,10 @@ cdef int64_t _room(const blocks_t* p, const rows_t* r, int32_t width) noexcept:
 
 cdef void _lay(warm_t* s, double* real, int32_t* index, const blocks_t* p, const rows_t* r) noexcept:
     # index (n_bodies + 2 joints + contacts)
-    s.nu = real
-    s.kept = real + p.n_rows
-    s.slack = s.kept + p.n_rows
-    s.change = s.slack + p.n_rows
+    s.kept = real
+    s.slack = real + p.n_rows
+    s.error = s.slack + p.n_rows
+    s.change = s.error + p.n_rows
     s.band = s.change + 6 * <int64_t>r.n_bodies
     s.last = index
     s.before = index + r.n_bodies
@@ -85,21 +84,22 @@ cdef class Warm:
         cdef blocks_t p
         cdef rows_t r
         cdef warm_t s
-        cdef score_sums_t first, last
-        cdef double* out
+        cdef double* nu
         cdef int32_t how
         cdef int64_t room
         bind(&self.size[0], &self.real[0], &self.index[0], &self.keys[0], &e, used)
         view(&e, &p, &r)
         s.width = lav_warm_band(&p, &r, &self.scratch_index[0])
-        room = _room(&p, &r, s.width)
+        room = _room(&p, &r, s.width) + p.n_rows
         if self.scratch.shape[0] < room:
             self.scratch = np.empty(room + room // 4)
-        _lay(&s, &self.scratch[0], &self.scratch_index[0], &p, &r)
+        nu = &self.scratch[0]
+        _lay(&s, nu + p.n_rows, &self.scratch_index[0], &p, &r)
         with nogil:
-            how = lav_warm_solve(&p, &r, &s, tol, e.impulse, e.dv, 1, &first, &last)
-        if how != 0:
-            out = e.setting + S_OUT
-            out[5] = last.normal if e.head[H_CONTACTS] else 0.0
-            out[7] = last.closing if e.head[H_CONTACTS] else 0.0
+            block_weights(&p, p.d, nu)
+            joint_weights(&p, &r, nu)
+            p.nu = nu
+            how = lav_warm_solve(&p, &r, &s, tol, e.impulse, e.dv, 1)
+            if how != 0:
+                measure(&e, e.setting + S_OUT + 5, e.setting + S_OUT + 7)
         return how, s.sweeps, s.factorisations

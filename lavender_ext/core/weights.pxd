@@ -1,0 +1,41 @@
+"""nu, what a velocity error weighs: d, but for rows that turn and have a linear row beside them.
+
+    spin row            nu = d of its normal                                                   (1)
+    angular joint row   nu = 1/m_a + 1/m_b                                                     (2)
+"""
+from libc.math cimport fabs
+from libc.stdint cimport int32_t
+
+from lavender_ext.core.block cimport CONTACT_SPIN, blocks_t
+from lavender_ext.core.rows cimport rows_t
+
+
+cdef inline void block_weights(const blocks_t* p, const double* d, double* nu) noexcept nogil:
+    """nu (m) where only a matrix is known: d (m), and (1)."""
+    cdef int32_t i, j
+    for j in range(p.n_rows):
+        nu[j] = d[j]
+    for i in range(p.n_blocks):
+        if p.kind[i] == CONTACT_SPIN:
+            nu[p.ptr[i + 1] - 1] = d[p.ptr[i]]
+
+
+cdef inline void joint_weights(const blocks_t* p, const rows_t* r, double* nu) noexcept nogil:
+    """(2), after `block_weights`."""
+    cdef int32_t i, q, t, a, b
+    cdef double linear, inv
+    for i in range(r.n_joints):
+        a = r.joint_body[2 * i]
+        b = r.joint_body[2 * i + 1]
+        for q in range(p.ptr[i], p.ptr[i + 1]):
+            linear = 0.0
+            for t in range(3):
+                linear += fabs(r.jac[12 * q + t]) + fabs(r.jac[12 * q + 6 + t])
+            if linear == 0.0:
+                inv = 0.0
+                if a >= 0:
+                    inv += r.inv_mass[a]
+                if b >= 0:
+                    inv += r.inv_mass[b]
+                if inv > 0.0:
+                    nu[q] = inv
