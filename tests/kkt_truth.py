@@ -1,0 +1,307 @@
+"""Solutions of small problems beyond float64: in long double, or in rational numbers.
+
+The conditions that hold at a solution (free, at a bound, open, sticking, sliding) are read off a float64 solution;
+their equations are solved in wider numbers and every condition is then checked. Where one is broken, conditions are
+read anew off what was found. Rational numbers are exact where cones are polyhedral (rows, contacts of at most one
+tangent); where a disk slides a square root stands in the equations, and they hold to 2^-EXACT_BITS of their size.
+"""
+
+from fractions import Fraction
+from math import isqrt
+
+import numpy as np
+
+import lavender as lv
+from lavender.cones import CONTACT_SPIN, ROW
+
+HAS_WIDE = np.finfo(np.longdouble).eps < 1e-18
+ROUNDS = 6  # of reading the conditions anew
+EXACT_BITS = 240
+
+
+class Wide:
+    """Long double: conditions to a few of its last places."""
+
+    equal, close = 1e-17, 1e-16  # of sizes: what equations and inequalities may miss; its last place is 1e-19
+    steps = 6  # of a float64 Newton step each
+
+    number = staticmethod(np.longdouble)
+    sqrt = staticmethod(np.sqrt)
+
+    @staticmethod
+    def array(x):
+        return np.asarray(x).astype(np.longdouble)
+
+    @staticmethod
+    def solve(slope, f):
+        return np.linalg.lstsq(slope.astype(float), f.astype(float), rcond=1e-13)[0]
+
+    @staticmethod
+    def rounded(x):
+        return x
+
+
+class Exact:
+    """Fractions in object arrays."""
+
+    equal, close = Fraction(1, 2**200), Fraction(1, 2**200)
+    steps = (
+        5  # of Newton, from 1e-16: one where equations are linear, four double the figures up to EXACT_BITS
+    )
+
+    @staticmethod
+    def number(x):
+        return Fraction(float(x)) if np.isfinite(x) else float(x)
+
+    @staticmethod
+    def array(x):
+        x = np.asarray(x)
+        out = np.empty(x.shape, object)
+        out.flat = [Fraction(float(v)) for v in x.flat]
+        return out
+
+    @staticmethod
+    def sqrt(x):
+        """Down to 2^-EXACT_BITS of itself."""
+        x = Fraction(x)
+        if x <= 0:
+            return Fraction(0)
+        shift = max(0, 2 * EXACT_BITS - x.numerator.bit_length() + x.denominator.bit_length())
+        shift += shift % 2
+        return Fraction(isqrt((x.numerator << shift) // x.denominator), 1 << (shift // 2))
+
+    @staticmethod
+    def solve(slope, f):
+        """A solution of slope x = f by elimination; entries without a pivot are 0."""
+        m = len(f)
+        t = [[*slope[i], f[i]] for i in range(m)]
+        pivots, row = [], 0
+        for column in range(m):
+            best = max(range(row, m), key=lambda i: abs(t[i][column]), default=None)
+            if best is None or t[best][column] == 0:
+                continue
+            t[row], t[best] = t[best], t[row]
+            lead = t[row]
+            for i in range(row + 1, m):
+                if t[i][column] != 0:
+                    factor = t[i][column] / lead[column]
+                    t[i] = [p if q == 0 else p - factor * q for p, q in zip(t[i], lead, strict=True)]
+            pivots.append(column)
+            row += 1
+        x = np.array([Fraction(0)] * m, object)
+        for r in reversed(range(row)):
+            column = pivots[r]
+            x[column] = (t[r][-1] - sum(t[r][k] * x[k] for k in pivots[r + 1 :])) / t[r][column]
+        return x
+
+    @staticmethod
+    def rounded(x):
+        """To 2^-EXACT_BITS of the largest: Newton's next step needs no more, and fractions stay short."""
+        size = max((abs(v) for v in x), default=Fraction(0))
+        if size == 0:
+            return x
+        grid = Fraction(2) ** (EXACT_BITS + 30 - size.numerator.bit_length() + size.denominator.bit_length())
+        return np.array([Fraction(round(v * grid)) / grid for v in x], object)
+
+
+def matrix_in(problem, numbers):
+    """A (m, m) and its kinetic part, or None, of the numbers as they are stored."""
+    if problem.operator == "matrix":
+        a = numbers.array(problem.dense())
+        return (a + a.T) / numbers.number(2.0), None
+    jac = numbers.array(problem.jacobian.toarray())
+    if problem.generalized is not None:
+        moving = jac @ inverse_times(numbers.array(problem.generalized.mass.toarray()), jac.T)
+    else:
+        moving = jac @ numbers.array(problem.rows.inverse_mass_matrix().toarray()) @ jac.T
+    theta = numbers.array(problem.compliance)
+    a = moving.copy()
+    a[np.arange(problem.m), np.arange(problem.m)] += theta
+    return a, moving
+
+
+def inverse_times(m, x):
+    """M^-1 x, M positive definite, by elimination in its own kind of numbers."""
+    m, x = m.copy(), x.copy()
+    for k in range(len(m)):
+        for i in range(k + 1, len(m)):
+            f = m[i, k] / m[k, k]
+            m[i] = m[i] - f * m[k]
+            x[i] = x[i] - f * x[k]
+    for k in reversed(range(len(m))):
+        x[k] = (x[k] - m[k, k + 1 :] @ x[k + 1 :]) / m[k, k]
+    return x
+
+
+def curved(problem):
+    """Whether a square root stands in the conditions: a disk of two tangents."""
+    return bool(np.any((problem.cones.kind != ROW) & (problem.cones.n_tangents > 1)))
+
+
+def solution_in(problem, a, b, numbers):
+    """(lambda, w) of the problem with matrix a and right-hand side b; None where no conditions were found to hold."""
+    plain = lv.Problem(b.astype(float), problem.cones, a.astype(float), friction=problem.friction)
+    rough = lv.solve(plain, "auto", tol=1e-15)
+    if not rough.residual.relative <= max(1e-12, 2 * rough.residual.floor):
+        return None
+    x, d = numbers.array(rough.impulse), numbers.array(plain.d)
+    modes = conditions(problem, x, a @ x - b, d, numbers)
+    for _ in range(ROUNDS):
+        for _ in range(numbers.steps):
+            f, slope, _ = equations(problem, modes, a, x, a @ x - b, numbers)
+            x = x - numbers.solve(slope, f)
+            if not curved(problem) and numbers is Exact:
+                break  # linear: done
+            x = numbers.rounded(x)
+        w = a @ x - b
+        if holds(problem, modes, a, b, x, w, numbers):
+            return x, w
+        found = conditions(problem, x, w, d, numbers)
+        if found == modes:
+            return None
+        modes = found
+    return None
+
+
+def conditions(problem, x, w, d, numbers):
+    """For every row None (free) or the bound it lies on; for the first row of a contact "open" or (slides, turns)."""
+    c, modes = problem.cones, {}
+    z = x - w / d
+    for i in range(c.n_blocks):
+        j, end = c.ptr[i], c.ptr[i + 1]
+        if c.kind[i] == ROW or end - j == 1:
+            for k in range(j, end):
+                low, high = (c.lower[k], c.upper[k]) if c.kind[i] == ROW else (0.0, np.inf)
+                modes[k] = low if z[k] < low else high if z[k] > high else None
+            continue
+        nt, spin = c.n_tangents[i], c.kind[i] == CONTACT_SPIN
+        n, mu = x[j], numbers.number(c.mu[i])
+        # A share of the rim decides: on it, what is left of w moves the projection's argument outwards.
+        rim = mu * n * numbers.number(1 + 1e-12)
+        slides = nt > 0 and numbers.sqrt(np.sum(z[j + 1 : j + 1 + nt] ** 2)) > rim
+        turns = spin and abs(z[end - 1]) > rim * numbers.number(c.patch_radius[i])
+        modes[j] = "open" if z[j] <= 0 and n <= 0 else (bool(slides), bool(turns))
+    return modes
+
+
+def equations(problem, modes, a, x, w, numbers):
+    """The conditions as f(x) = 0 (m,), their slope (m, m), and which of them are of impulses, not of slacks (m,)."""
+    c = problem.cones
+    f, slope, impulse = w.copy(), a.copy(), np.zeros(problem.m, bool)
+    one, none = numbers.number(1.0), numbers.number(0.0)
+
+    def given(k, value):
+        f[k], slope[k], impulse[k] = x[k] - value, none, True
+        slope[k, k] = one
+
+    for i in range(c.n_blocks):
+        j, end = c.ptr[i], c.ptr[i + 1]
+        if c.kind[i] == ROW or end - j == 1:
+            for k in range(j, end):
+                if modes[k] is not None:
+                    given(k, numbers.number(modes[k]))
+            continue
+        if modes[j] == "open":
+            for k in range(j, end):
+                given(k, none)
+            continue
+        nt, mu = c.n_tangents[i], numbers.number(c.mu[i])
+        slides, turns = modes[j]
+        if slides:
+            t = np.arange(j + 1, j + 1 + nt)
+            size = numbers.sqrt(np.sum(w[t] ** 2))
+            u = w[t] / size if size > 0 else 0 * w[t]
+            along = u @ a[t]
+            f[j] -= mu * size
+            slope[j] = slope[j] - mu * along
+            for k, uk in zip(t, u, strict=True):
+                given(k, -mu * x[j] * uk)
+                slope[k, j] += mu * uk
+                if size > 0:
+                    slope[k] = slope[k] + mu * x[j] / size * (a[k] - uk * along)
+        if turns:
+            k = end - 1
+            reach = mu * numbers.number(c.patch_radius[i])
+            way = one if w[k] > 0 else -one if w[k] < 0 else none
+            f[j] -= reach * abs(w[k])
+            slope[j] = slope[j] - reach * way * a[k]
+            given(k, -reach * x[j] * way)
+            slope[k, j] += reach * way
+    return f, slope, impulse
+
+
+def holds(problem, modes, a, b, x, w, numbers):
+    """Every condition, to shares of the size of what is summed in it."""
+    c = problem.cones
+    size = max(np.abs(a) @ np.abs(x) + np.abs(b), default=numbers.number(0.0))
+    most = max(np.abs(x), default=numbers.number(0.0))
+    slow, small = numbers.close * size, numbers.close * most
+    f, _, impulse = equations(problem, modes, a, x, w, numbers)
+    # A diagonal entry carries an impulse into a slack: the larger of both is what rounding leaves.
+    for k in range(problem.m):
+        if abs(f[k]) > numbers.equal * (most if impulse[k] else size):
+            return False
+    for i in range(c.n_blocks):
+        j, end = c.ptr[i], c.ptr[i + 1]
+        if c.kind[i] == ROW or end - j == 1:
+            for k in range(j, end):
+                low, high = (c.lower[k], c.upper[k]) if c.kind[i] == ROW else (0.0, np.inf)
+                if x[k] - low < -small or x[k] - high > small:
+                    return False
+                if low < high and ((modes[k] == low and w[k] < -slow) or (modes[k] == high and w[k] > slow)):
+                    return False
+            continue
+        nt, mu, spin = c.n_tangents[i], numbers.number(c.mu[i]), c.kind[i] == CONTACT_SPIN
+        t = slice(j + 1, j + 1 + nt)
+        pulled, slip = numbers.sqrt(np.sum(x[t] ** 2)), numbers.sqrt(np.sum(w[t] ** 2))
+        reach = mu * numbers.number(c.patch_radius[i]) if spin else 0 * mu
+        twist, turn = (abs(x[end - 1]), abs(w[end - 1])) if spin else (0 * mu, 0 * mu)
+        if x[j] < -small or pulled > mu * x[j] + small or twist > reach * x[j] + small:
+            return False
+        if w[j] < mu * slip + reach * turn - slow:
+            return False
+    return True
+
+
+def shift_in(problem, a, y, numbers):
+    """d (y - Pi(y - w / d)) (m,), what a witness y moves targets by: the judge's projection, written apart."""
+    d, c, y = numbers.array(problem.d), problem.cones, numbers.array(y)
+    z = y - (a @ y - numbers.array(problem.b)) / d
+    p = z.copy()
+    for i in range(c.n_blocks):
+        j, end = c.ptr[i], c.ptr[i + 1]
+        if c.kind[i] == ROW or end - j == 1:
+            for k in range(j, end):
+                low, high = (c.lower[k], c.upper[k]) if c.kind[i] == ROW else (0.0, np.inf)
+                p[k] = numbers.number(low) if z[k] < low else numbers.number(high) if z[k] > high else z[k]
+            continue
+        spin = c.kind[i] == CONTACT_SPIN
+        p[j:end] = project_cone(
+            z[j:end], d[j:end], float(c.mu[i]), float(c.patch_radius[i]), int(c.n_tangents[i]), spin, numbers
+        )
+    return d * (y - p)
+
+
+def project_cone(z, d, mu, radius, nt, spin, numbers=Wide):
+    """Nearest point of {|t| <= mu n, |s| <= mu r n} in the metric of d.
+
+    Its normal part n is where the slope of 1/2 d_n (n - z_n)^2 + 1/2 d_t (t - mu n)+^2 + 1/2 d_s (s - mu r n)+^2
+    vanishes: each part counts or does not, and the slope of all that do, a line, is the largest there is at its root.
+    """
+    mu, radius = numbers.number(mu), numbers.number(radius)
+    none = 0 * d[0]
+    t = numbers.sqrt(np.sum(z[1 : 1 + nt] ** 2)) if nt else none
+    s = abs(z[-1]) if spin else none
+    dt, ds = d[1] if nt else none, d[-1] if spin else none
+    n = none
+    for along in (0, 1):
+        for about in (0, 1):
+            pull = d[0] * z[0] + along * dt * mu * t + about * ds * mu * radius * s
+            n = max(n, pull / (d[0] + along * dt * mu**2 + about * ds * (mu * radius) ** 2))
+    out = z.copy()
+    out[0] = n
+    if nt and t > mu * n:
+        out[1 : 1 + nt] = out[1 : 1 + nt] * (mu * n / t)
+    if spin:
+        out[-1] = min(max(z[-1], -mu * radius * n), mu * radius * n)
+    return out
