@@ -12,6 +12,7 @@ import math
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -161,7 +162,7 @@ def _warm(problem: Problem, found: motion.Motions) -> str:
     return "nearest" if here <= 1.01 * there else "another"
 
 
-def write_csv(found: Iterable[Sample | Branches], path: Path) -> None:
+def write_csv(found: Iterable[Any], path: Path) -> None:
     """One line for each entry, floats to their last digit."""
     entries = list(found)
     with open(path, "w", newline="", encoding="utf-8") as stream:

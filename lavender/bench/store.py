@@ -81,6 +81,11 @@ class Records:
             found.add(entry)
         return found
 
+    def success(self, record: Record) -> bool | None:
+        """What the judge said of a run; None where doing nothing is right: neither solved nor failed."""
+        info = self.cases.get(record.case)
+        return None if info is not None and info.nothing_to_do else record.success
+
     def rows(self) -> list[dict[str, Any]]:
         """Plain rows, one for each record, with its case and machine: the columns of `records.csv`."""
         out = []
@@ -88,6 +93,8 @@ class Records:
             run, info = self.runs.get(r.run), self.cases.get(r.case)
             row = {k: v for k, v in asdict(r).items() if k != "sha"}
             row |= {
+                "success": self.success(r),
+                "nothing_to_do": bool(info and info.nothing_to_do),
                 "law": info.law if info else "",
                 "rows": info.rows if info else 0,
                 "structure": ", ".join(info.structure) if info else "",
@@ -279,6 +286,9 @@ def write_json(records: Records, path: str | Path) -> None:
         "runs": plain(records.runs.values()),
         "cases": plain(records.cases.values()),
         "skips": plain(records.skips),
-        "records": plain(records.records),
+        "records": [
+            {**entry, "success": records.success(r)}
+            for entry, r in zip(plain(records.records), records.records, strict=True)
+        ],
     }
     Path(path).write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")

@@ -28,6 +28,7 @@ class Suites(ManyValues):
     OWN = {  # noqa: RUF012 - a constant of the class
         "gallery": "lavender.cli.bench_gallery:gallery",
         "auto": "lavender.cli.bench_auto:auto",
+        "branches": "lavender.cli.bench_branches:branches",
         "motions": "lavender.cli.bench_motions:motions",
         "mujoco": "lavender.cli.bench_mujoco:mujoco",
         "kernels": "lavender.cli.bench_kernels:kernels",

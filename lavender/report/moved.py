@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from lavender.bench.record import Entry, Record, level_name
 from lavender.bench.store import Records
 from lavender.report.tables.advice import Advice, advice_by_level
+from lavender.report.tables.campaigns import Robustness, robustness
 from lavender.report.tables.cases import reaches
 
 __all__ = [
@@ -18,6 +19,7 @@ __all__ = [
     "by_speed",
     "idle",
     "moved",
+    "robustness_by_speed",
     "speed_levels",
     "speed_name",
     "working",
@@ -84,6 +86,11 @@ def advice_by_speed(records: Records) -> list[Advice]:
     return advice_by_level(by_speed(records)) if speed_levels(records) else []
 
 
+def robustness_by_speed(records: Records) -> list[Robustness]:
+    """Campaigns: shares of cases brought to each speed level, motion errors [m/s] by budget; none without them."""
+    return robustness(by_speed(records)) if speed_levels(records) else []
+
+
 def moved(records: Records, levels: Sequence[float] | None = None) -> list[Moved]:
     """One row for each case, solver and start, in the order of the records; none without motion errors."""
     levels = speed_levels(records) if levels is None else tuple(levels)
@@ -135,10 +142,14 @@ def working(records: Records) -> Records:
 
 def idle(records: Records) -> list[Idle]:
     """Cases where doing nothing is right, with the worst residual of any run in units."""
+    worsts: dict[str, Record] = {}
+    for r in records:
+        if r.case not in worsts or r.velocity > worsts[r.case].velocity:
+            worsts[r.case] = r
     out = []
     for name, info in records.cases.items():
         if info.nothing_to_do:
-            worst = max((r for r in records if r.case == name), key=lambda r: r.velocity, default=None)
+            worst = worsts.get(name)
             if worst is None:
                 out.append(Idle(name, info.rows, "", 0.0, 0.0))
             else:

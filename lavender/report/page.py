@@ -10,7 +10,15 @@ from lavender.bench.record import file_name, level_name
 from lavender.bench.store import Records
 from lavender.report import tables
 from lavender.report.curves import Figure, Figures
-from lavender.report.moved import advice_by_speed, idle, moved, speed_levels, speed_name, working
+from lavender.report.moved import (
+    advice_by_speed,
+    idle,
+    moved,
+    robustness_by_speed,
+    speed_levels,
+    speed_name,
+    working,
+)
 from lavender.report.svg import svg
 from lavender.report.tables.advice import NOISE, RESIDUAL_NOISE
 from lavender.report.text import count, residual, seconds, times
@@ -141,6 +149,7 @@ def _content(
         "refused": [s for s in records.skips if s.solver],
         "campaign": campaign,
         "robustness": tables.robustness(records) if campaign else [],
+        "robustness_by_speed": robustness_by_speed(records) if campaign else [],
         "budgets": sorted({r.max_iter for r in records if r.mode == "budget"}),
         "sequences": tables.by_sequence(records),
         "sequence_figures": {name: _keys(some) for name, some in figures.sequences.items()},

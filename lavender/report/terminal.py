@@ -9,7 +9,15 @@ from typing import TYPE_CHECKING, Any
 from lavender.bench.record import level_name, printable
 from lavender.bench.store import Records
 from lavender.report import tables
-from lavender.report.moved import advice_by_speed, idle, moved, speed_levels, speed_name, working
+from lavender.report.moved import (
+    advice_by_speed,
+    idle,
+    moved,
+    robustness_by_speed,
+    speed_levels,
+    speed_name,
+    working,
+)
 from lavender.report.text import count, in_time, residual, seconds, to_level
 from lavender.report.verdict import verdict
 
@@ -99,14 +107,13 @@ def walk_table(records: Records) -> Any:
     return table
 
 
-def robustness_table(records: Records, levels: Sequence[float]) -> Any:
-    """Campaigns: shares of cases solved, false claims, residual by budget."""
-    rows = tables.robustness(records)
+def robustness_table(rows: Sequence[tables.Robustness], levels: Sequence[float], unit: str = "") -> Any:
+    """Campaigns: shares of cases solved, false claims, residual (motion error) by budget."""
     budgets = sorted({n for row in rows for n in row.budgets})
     table = _table()
     table.add_column("structure", no_wrap=True)
     table.add_column("solver", no_wrap=True)
-    for name in ("cases", *(f"to {level_name(x)}" for x in levels), "false claims", "died"):
+    for name in ("cases", *(f"to {level_name(x)}{unit}" for x in levels), "false claims", "died"):
         table.add_column(name, justify="right", no_wrap=True)
     for n in budgets:
         table.add_column(f"{n}: median, 95 %", justify="right", no_wrap=True)
@@ -137,6 +144,7 @@ def change_table(old: Records, new: Records) -> Any:
     return table
 
 
+BY_MOTION = "\n[bold]By motion error[/] (how wrong the body moves that is furthest off)"
 FEW = 20  # lines: a report that has no more is printed whole
 
 
@@ -159,7 +167,10 @@ def print_report(
         console.print(
             "[bold]Campaign[/] (no times; share of cases brought to a level, residual at each budget)"
         )
-        console.print(robustness_table(records, levels), highlight=False)
+        console.print(robustness_table(tables.robustness(records), levels), highlight=False)
+        if by_speed := robustness_by_speed(records):
+            console.print(BY_MOTION, highlight=False)
+            console.print(robustness_table(by_speed, speed_levels(records), " m/s"), highlight=False)
     elif len(records):
         found = verdict(records, times)
         console.print(found.text, style="bold", highlight=False, markup=False, soft_wrap=True)
@@ -173,13 +184,15 @@ def print_report(
         )
         console.print(advice_table(records, times), highlight=False)
         _print_motion(records, console, whole)
-    for case in still:
+    for case in still[:FEW]:
         console.print(
             f"nothing to do: {case.case}; at worst {residual(case.velocity)} m/s by {case.solver or 'nobody'}",
             highlight=False,
             markup=False,
             style="dim",
         )
+    if len(still) > FEW:
+        console.print(f"and {len(still) - FEW} more with nothing to do", highlight=False, style="dim")
     _print_lost(records, console)
     if not campaign:
         _print_tables(records, console, levels, whole)
@@ -230,9 +243,7 @@ def _print_motion(records: Records, console: Console, whole: bool) -> None:
         table.add_column(f"to {speed_name(x)}", overflow="fold")
     for name in dict.fromkeys(a.family for a in found):
         table.add_row(name, *(to_level(a) for a in found if a.family == name))
-    console.print(
-        "\n[bold]By motion error[/] (how wrong the body moves that is furthest off)", highlight=False
-    )
+    console.print(BY_MOTION, highlight=False)
     console.print(table, highlight=False)
     if whole or len(moved(records, levels)) <= FEW:
         console.print(motion_table(records), highlight=False)

@@ -1,5 +1,7 @@
 """Reports by motion error, cases with nothing to do, and references beside files."""
 
+import csv
+import json
 import math
 
 import numpy as np
@@ -134,3 +136,46 @@ def test_solving_what_has_nothing_to_do_is_no_failure(tmp_path, capsys):
         main(["solve", str(path), "--solver", "pgs"])
     assert end.value.code == 0
     assert "nothing to do" in capsys.readouterr().out
+
+
+def test_the_summary_has_every_line_of_the_motion_table(records, tmp_path):
+    write(records, tmp_path, figures=False)
+    text = (tmp_path / "summary.md").read_text(encoding="utf-8")
+    assert "| structure | to 1e-2 m/s | to 1e-4 m/s |" in text
+    for row in moved.moved(moved.working(records)):
+        name = row.solver if row.start == "cold" else f"{row.solver} ({row.start})"
+        times = " | ".join(report.text.seconds(row.times[x]) for x in (1e-2, 1e-4))
+        assert f"| {row.case} | {name} | {times} | {report.text.residual(row.best)} m/s |" in text
+
+
+def test_success_of_what_has_nothing_to_do_is_neither_true_nor_false(records, tmp_path):
+    write(records, tmp_path, figures=False)
+    with open(tmp_path / "records.csv", newline="", encoding="utf-8") as stream:
+        rows = list(csv.DictReader(stream))
+    assert {(row["success"], row["nothing_to_do"]) for row in rows if row["case"] == "flying apart"} == {
+        ("", "True")
+    }
+    assert {row["success"] for row in rows if row["case"] != "flying apart"} == {"True", "False"}
+    entries = json.loads((tmp_path / "records.json").read_text(encoding="utf-8"))["records"]
+    assert {e["success"] for e in entries if e["case"] == "flying apart"} == {None}
+
+
+def test_a_campaign_counts_cases_by_motion_error_too(tmp_path):
+    idle = tmp_path / "idle.npz"
+    lv.io.save(idle_problem(), idle)
+    plan = bench.CampaignPlan(levels=(1e-3,), budgets=(1, 64), orders=(), motion=True)
+    found = bench.campaign(["stack(n=4)", "stack(n=32)", str(idle)], ["pgs"], plan, workers=1)
+    rows = moved.robustness_by_speed(moved.working(found))
+    best = {r.case: math.inf for r in moved.working(found)}
+    for r in moved.working(found):
+        best[r.case] = min(best[r.case], r.motion_speed)
+    for row in rows:
+        assert row.cases == 2
+        for level, n in row.reached.items():
+            assert n == sum(v <= level for v in best.values())
+    assert sum(row.reached[1e-2] for row in rows) > 0
+    page = write(found, tmp_path, figures=False).read_text(encoding="utf-8")
+    assert "to 1e-3 m/s" in page
+    text = (tmp_path / "summary.md").read_text(encoding="utf-8")
+    assert f"| {rows[0].family} | pgs | 2 | " in text
+    assert "By motion error" in text
