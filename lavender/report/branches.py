@@ -51,9 +51,9 @@ def table(found: Sequence[Crossing]) -> str:
         ]
         lines += ["| to the nearest motion | warm | cold | `newton` |", "|---|---|---|---|"]
         columns = ("nearest", *(f"{way}_distance" for way in WAYS))
-        cells = []
+        middles: list[str] = []
         for column in columns:
             told = [x for one in several if not math.isnan(x := getattr(one, column))]
-            cells.append(f"{np.median(told):.2g}" if told else "")
-        lines.append("| " + " | ".join(cells) + " |")
+            middles.append(f"{np.median(told):.2g}" if told else "")
+        lines.append("| " + " | ".join(middles) + " |")
     return "\n".join(lines)
