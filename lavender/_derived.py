@@ -29,7 +29,7 @@ class Derived:
     None work out the same numbers, to the bit.
     """
 
-    __slots__ = ("judged", "lock", "motion", "nothing", "spread", "start_relative", "tried")
+    __slots__ = ("chain", "judged", "lock", "motion", "nothing", "spread", "start_relative", "tried")
 
     def __init__(self) -> None:
         self.lock = RLock()  # held while a `once` is worked out
@@ -38,6 +38,7 @@ class Derived:
         self.judged: Judged | None = None  # the judge's pass over a result that is about to be returned
         self.tried: Tried | None = None
         self.spread: int | None = None  # how far apart blocks that share a body stand
+        self.chain: Any = None  # of a problem of few rows, False where it has none
         self.motion: Kept | None = None  # the reference that motion errors are told from, and its operator
 
 

@@ -32,7 +32,18 @@ __all__ = ["Solver", "SolverSpec", "State", "available", "get", "known", "regist
 
 
 # Modules whose SPECS are registered first, by name: they import this one.
+FEW = 64  # rows up to which Python's share decides what a solve costs: a spec's `few` is asked first
 TABLES = ("lavender.solvers", "lavender.external")
+
+
+class Few(Protocol):
+    """Solves a problem of few rows to tol with the bits of `run`, or leaves it to `run`."""
+
+    def solve(self, problem: Problem, impulse: FloatArray | None, tol: float) -> Any:
+        """(what the judge finds, counts) from an impulse (m,) or from doing nothing; None where it is left."""
+
+    def claim(self, problem: Problem, counts: Any) -> Claim:
+        """What counts come to."""
 
 
 class State(Protocol):
@@ -92,6 +103,7 @@ class SolverSpec:
     requires: tuple[str, ...] = ()  # modules that must be importable
     install: str = ""  # what to install where they are not
     refusal: Callable[[Problem], str | None] | None = None  # more reasons against a problem
+    few: Few | None = None  # problems of few rows with default options, in one compiled call
 
     def __post_init__(self) -> None:
         if (

@@ -178,6 +178,11 @@ def residual(problem: Problem, impulse: ArrayLike) -> Residual:
     last, problem.derived.judged = problem.derived.judged, None
     if last is None or last.data is not problem.metric or not measure.same_bits(last.impulse, impulse):
         last = judged(problem, impulse)
+    return told(problem, last)
+
+
+def told(problem: Problem, last: measure.Judged) -> Residual:
+    """What the judge found, with its names and units."""
     made: Residual = object.__new__(Residual)
     state = {
         "relative": last.relative,

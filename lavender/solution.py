@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
 from enum import Enum
 from types import MappingProxyType
@@ -146,11 +146,11 @@ class Solution:
     setup_time: float  # s, preparing (factor, colour, allocate)
     solve_time: float  # s, iterating
     solver: SolverRun
-    message: str = ""
-    history: History | None = None
-    dual: Any = None
-    certificate: FloatArray | None = None  # (m,), with INFEASIBLE
-    contradicted: str = ""  # why the judge disagrees with `status`; empty where it does not
+    message: str
+    history: History | None
+    dual: Any
+    certificate: FloatArray | None  # (m,), with INFEASIBLE
+    contradicted: str  # why the judge disagrees with `status`; empty where it does not
 
     def __init__(
         self,
@@ -188,6 +188,25 @@ class Solution:
                 "contradicted": contradicted,
             },
         )
+
+    @classmethod
+    def late(cls, known: dict[str, Any], rest: Callable[[], dict[str, Any]]) -> Solution:
+        """Fields that are known, and a function of the others for the first who asks."""
+        made: Solution = object.__new__(cls)
+        known["_rest"] = rest
+        object.__setattr__(made, "__dict__", known)
+        return made
+
+    def __getattr__(self, name: str) -> Any:
+        # Only what is not there comes here: the first of the fields that `late` left for later, or no field at all.
+        kept = self.__dict__
+        rest = kept.get("_rest")
+        if rest is not None:
+            kept.update(rest())  # two threads write the same
+            kept.pop("_rest", None)
+        if name in kept:
+            return kept[name]
+        raise AttributeError(f"{type(self).__name__!r} has no attribute {name!r}")
 
     def __reduce__(self) -> tuple[Any, ...]:
         # A read-only view of a dict has no pickle.

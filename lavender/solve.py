@@ -9,8 +9,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import partial
 from threading import Lock
 from time import perf_counter
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -20,8 +22,8 @@ from lavender.certificates import check_certificate
 from lavender.cones import ROW
 from lavender.errors import CapabilityError, InputError, InUse, UnknownName
 from lavender.problem import Problem
-from lavender.registry import SolverSpec, State, get
-from lavender.residuals import Residual, reference, residual
+from lavender.registry import FEW, SolverSpec, State, get
+from lavender.residuals import Residual, reference, residual, told
 from lavender.solution import Claim, History, Solution, SolverRun, Status
 from lavender_ext.judge.measure import all_finite
 
@@ -86,7 +88,12 @@ def solve(
     InputError
         Wrong `impulse`, negative or NaN `tol`, `max_iter`, `time_limit`.
     """
-    return prepare(problem, solver, **options).solve(
+    spec = get(solver)
+    if spec.few is not None and not (options or history) and max_iter is time_limit is callback is None:
+        made = solve_few(problem, spec, impulse, tol)
+        if made is not None:
+            return made
+    return Prepared(problem, spec, options).solve(
         impulse=impulse, tol=tol, max_iter=max_iter, time_limit=time_limit, history=history, callback=callback
     )
 
@@ -396,6 +403,47 @@ class _Loop:
 def next_count(n: int) -> int:
     """The iteration count of the record after n: 1, 2, ... 16, then an eighth more each time."""
     return n + max(1, n >> 3)
+
+
+def solve_few(problem: Problem, spec: SolverSpec, impulse: Any, tol: float) -> Solution | None:
+    """What the solver makes of few rows in one compiled call, judged there; None where it leaves that to `Prepared`.
+
+    Claim, counts and residual are put in words when somebody asks for them.
+    """
+    if type(problem) is not Problem or problem.m > FEW or not isinstance(tol, float) or not 0.0 < tol < math.inf:
+        return None
+    start = perf_counter()
+    given = problem.guess if impulse is None else problem.impulse_array(impulse)
+    assert spec.few is not None
+    found = spec.few.solve(problem, given, tol)
+    if found is None:
+        return None
+    judged, counts = found
+    judged.impulse.flags.writeable = False
+    known = {
+        "impulse": judged.impulse,
+        "status": Status.CONVERGED,
+        "tol": tol,
+        "setup_time": 0.0,
+        "solve_time": perf_counter() - start,
+    }
+    return Solution.late(known, partial(_rest, problem, spec, judged, counts))
+
+
+def _rest(problem: Problem, spec: SolverSpec, judged: Any, counts: Any) -> dict[str, Any]:
+    assert spec.few is not None
+    claim = spec.few.claim(problem, counts)
+    return {
+        "residual": told(problem, judged),
+        "iterations": claim.iterations,
+        "work": MappingProxyType(dict(claim.work)),
+        "solver": SolverRun(spec.name, {}, claim.form),
+        "message": claim.message,
+        "history": None,
+        "dual": None,
+        "certificate": None,
+        "contradicted": "",
+    }
 
 
 def finish(

@@ -52,6 +52,9 @@ ADMM_START, ADMM_ROW, ADMM_ENTRY = (
     2.0,
 )  # a call; of each iteration for each row and each entry of L
 
+FIRST_LOOK, LAST_LOOK = 16, 64  # sweeps before the first look at the residual: so many at least and at most,
+LOOKED = 120e3  # ns, and as cost so much: a look and a cut in the sweeps are not free
+
 # Factorisations to expect, by law: medians over drawn problems. Friction has a long tail.
 DIRECT = {"linear": 1.5, "lcp": 6.0}
 NEWTON = {"linear": 2.0, "lcp": 16.0, "cone": 22.0, "coulomb": 8.0}
@@ -107,6 +110,16 @@ def general_cost(problem: Problem, largest: int) -> float:
     return GENERAL_START + GENERAL_COUNT[problem.law] * (GENERAL_ROW * problem.m + factor)
 
 
+def sweep_cost(problem: Problem) -> float:
+    """Of one sweep [ns]."""
+    return SWEEP[problem.law] * sweep_work(problem) + SWEEP_ROW * problem.m
+
+
+def first_look(per: float) -> int:
+    """Sweeps, each of cost `per` [ns], before their residual is looked at."""
+    return int(min(max(FIRST_LOOK, LOOKED / per), LAST_LOOK))
+
+
 class Costs:
     """Of one problem; what takes time to find out is found when it is first asked.
 
@@ -117,7 +130,7 @@ class Costs:
     def __init__(self, problem: Problem, tol: float, largest: int = 0) -> None:
         self.problem, self.largest = problem, largest
         self.decades = float(-np.log10(min(max(tol, 1e-16), 0.1)))
-        self.sweep = SWEEP[problem.law] * sweep_work(problem) + SWEEP_ROW * problem.m  # [ns] of one
+        self.sweep = sweep_cost(problem)
 
     @cached_property
     def redundant(self) -> bool:

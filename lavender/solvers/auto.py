@@ -1,6 +1,8 @@
 """The only solver that hands over to others: each in its turn, by what it would cost from here on.
 
     linear            direct, newton
+    few rows          a symmetric linear system or LCP: direct; else sweeps first, and on as below; all in one
+                      call (`_few.py`) where that is the end
     J and M           newton over the velocities at once where that costs next to nothing; else it is one of the
                       finite solvers below, beside those that form A
     others            a finite solver at once where its factor costs less than sweeps usually do; else anderson
@@ -30,40 +32,38 @@ from lavender._arrays import FloatArray, IntArray
 from lavender.certificates import check_certificate
 from lavender.errors import SolverUnavailable, UnknownName
 from lavender.problem import OPERATORS, Problem
-from lavender.registry import SolverSpec, get
+from lavender.registry import FEW, SolverSpec, get
 from lavender.residuals import at_floor, known, quick, reference
 from lavender.solution import Claim, Status
 from lavender.solvers._costs import (
+    FIRST_LOOK,
     ISLAND,
     LOOK,
     SWEEP_START,
     Costs,
     Exact,
+    first_look,
     general_cost,
     is_loose,
     islands_cost,
 )
+from lavender.solvers._few import AUTO, GENERAL_FIRST, WARM
 from lavender.solvers._islands import islands, restrict, rows_of
 from lavender.solvers._newton import general
 from lavender.solvers.newton import NewtonState
 
 LARGE = 4000  # rows from which friction goes through the relaxation
 HUGE = 40_000  # rows from which friction is left to sweeps before any factorisation
-FIRST_LOOK, LAST_LOOK = 16, 64  # sweeps before the first look at the residual: so many at least and at most,
-LOOKED = 120e3  # ns, and as cost so much: a look and a cut in the sweeps are not free
 CLOCK = 0.01  # s between two looks at the clock, at a nanosecond for each unit of work
 CHUNK_WORK = 8  # sweeps' work that an iteration of admm is
 CAP = 800  # sweeps of the relaxation that may be promised; twice that for large problems
-FEW = 64  # rows up to which Python's share decides: `direct` for an LCP
 FEW_JOINTS = 300  # rows up to which a linear system is not looked at more closely
 RELAXED = 1e6  # ns that sweeps usually take from which Coulomb's law is relaxed first: a problem of its own
-WARM = 1e-3  # relative residual from which an iterate is worth starting from
 HOPE = 0.4  # share of a finite solver's cost that sweeps may take without promising an end
 BELIEVED = 2.0  # times a finite solver's cost that sweeps may take, whatever they promise
 GLANCE = 0.35  # share of a finite solver's cost for which a first look at sweeps is always worth it
 APART = 10.0  # islands' worth of Python from which a finite solver is compared with islands solved apart
 ROUNDS = 8  # times that sweeps and finite solvers take turns, the allowance doubled each time
-GENERAL_FIRST = 0.4e6  # ns of newton over generalised velocities up to which nothing else is looked at first
 GENERAL_STEPS = 256  # that it then has
 VELOCITY = "newton velocity"  # key of newton over generalised velocities
 CERTIFICATE_ROWS = 3000  # rows up to which a linear program is asked for a certificate
@@ -303,7 +303,7 @@ class _Sweeps:
         per = trail.costs.sweep
         chunk = max(1, int(CLOCK * 1e9) // max(1, problem.data.work))
         begun, looks, total = self.done, 0, dict[str, int]()
-        step = int(min(max(FIRST_LOOK, LOOKED / per), LAST_LOOK))
+        step = first_look(per)
         while not trail.late:
             step = min(step, budget - trail.iterations - (self.done - begun))
             if cap is not None:
@@ -377,8 +377,9 @@ def _solve(trail: Trail, budget: int) -> None:
         # START of sweeps alone costs more than a dense factor of so few rows.
         if _whole(trail, Exact("direct", 0.0, 0), budget):
             return
-    elif not _at_once(costs):
-        if _relaxed_first(trail, budget):
+    elif problem.m <= FEW or not _at_once(costs):
+        # Of few rows a first look at sweeps costs less than Python takes to find out what anything else would.
+        if problem.m > FEW and _relaxed_first(trail, budget):
             return
         sweeps = _Sweeps(trail)
         if sweeps.run(budget):
@@ -572,6 +573,7 @@ SPEC = SolverSpec(
     operators=frozenset(OPERATORS),
     round_cones=True,
     refusal=_refusal,
+    few=AUTO,
     resumable=False,
     delegates=True,
     max_iter=1_000_000,

@@ -29,6 +29,7 @@ from lavender.registry import SolverSpec
 from lavender.residuals import at_floor, judged, remember
 from lavender.solution import Claim, Status
 from lavender.solvers._factor import GeneralFactor
+from lavender.solvers._few import DIRECT
 from lavender.solvers._pivoting import PivotState
 from lavender_ext.judge import measure
 from lavender_ext.pivot.principal import INDEFINITE, ROUNDS, SMALL, SOLVED, STUCK
@@ -388,6 +389,7 @@ SPEC = SolverSpec(
     resumable=False,
     max_iter=1000,
     refusal=_refusal,
+    few=DIRECT,
     summary="factorisation; symmetric boxed LCP by block principal pivoting",
     reference="Golub, Van Loan 2013, chapter 4; Judice, Pires 1994, Computers and Operations Research 21",
 )

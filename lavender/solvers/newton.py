@@ -34,6 +34,7 @@ from lavender.problem import OPERATORS, Problem
 from lavender.registry import SolverSpec
 from lavender.residuals import quick
 from lavender.solution import Claim, Status
+from lavender.solvers._few import NEWTON
 from lavender.solvers._newton import general
 from lavender.solvers._newton.convex import solve_convex
 from lavender.solvers._newton.coulomb import solve_coulomb
@@ -208,6 +209,7 @@ SPEC = SolverSpec(
     operators=frozenset(OPERATORS),
     round_cones=True,
     refusal=_refusal,
+    few=NEWTON,
     resumable=False,
     max_iter=1500,
     options={"form": "auto, velocity (bodies, joints) or impulse (rows): unknowns of the factorisation"},

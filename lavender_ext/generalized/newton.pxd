@@ -23,6 +23,7 @@ from libc.stdint cimport int32_t
 
 from lavender_ext.core.block cimport CONE, COULOMB, CONTACT_SPIN, ROW, block_error, blocks_t, n_tangents
 from lavender_ext.core.generalized cimport generalized_t, panel_push, panel_times
+from lavender_ext.core.problem cimport Data
 from lavender_ext.generalized.dense cimport ltdl_factor, ltdl_solve, lu_factor, lu_solve
 from lavender_ext.generalized.soft cimport INSIDE, OFF, SLIDES, cone_map, coulomb_map, size_of
 from lavender_ext.judge.score cimport nothing, tally_block, tally_t
@@ -692,3 +693,13 @@ cdef inline int32_t solve_island(flow_t* f, int32_t island, double* impulse, bin
         end = descend(f, island, 1.0, &share, &least)
         keep(f, island, f.best, impulse)
     return end
+
+
+cdef class Newton:
+    cdef flow_t f
+    cdef Data data
+    cdef list keep
+    cdef readonly int largest           # columns of the largest island
+
+    cdef void aim(self, double tol, int32_t steps) noexcept
+    cdef int32_t go(self, double* impulse, bint cold) noexcept nogil

@@ -6,7 +6,7 @@ import numpy as np
 from lavender_ext.core.block cimport ROW, blocks_t
 from lavender_ext.core.generalized cimport generalized_t
 from lavender_ext.core.problem cimport Data
-from lavender_ext.generalized.newton cimport (DONE, FAILED, LOST, SPENT, STUCK, flow_t, solve_island)
+from lavender_ext.generalized.newton cimport DONE, FAILED, LOST, SPENT, STUCK, flow_t, solve_island
 
 ENDS = {"done": DONE, "spent": SPENT, "stuck": STUCK, "failed": FAILED, "lost": LOST}
 
@@ -129,11 +129,6 @@ cdef class Newton:
     Where an island has more than `limit` velocities (`largest`) there is no room, and no `run`.
     """
 
-    cdef flow_t f
-    cdef Data data
-    cdef list keep
-    cdef readonly int largest           # columns of the largest island
-
     def __init__(self, Data p, int limit):
         cdef int32_t n = p.general.n, m = p.blocks.n_rows, k = p.blocks.n_blocks, panels = p.general.n_panels
         cdef int32_t most[4]
@@ -198,6 +193,17 @@ cdef class Newton:
         self.f.line = x + 2 * size + most[2]
         self.keep = [whole, room]
 
+    cdef void aim(self, double tol, int32_t steps) noexcept:
+        # What is asked of each island, and counts from nothing.
+        cdef double share = 1.0 / (<double>self.f.n_islands) ** 0.5 if self.f.n_islands > 1 else 1.0
+        self.f.energy_limit = tol * self.data.start_energy * share
+        self.f.velocity_limit = tol * self.data.start_velocity
+        self.f.steps = steps
+        self.f.factorisations = self.f.updates = self.f.rounds = self.f.evaluations = 0
+
+    cdef int32_t go(self, double* impulse, bint cold) noexcept nogil:
+        return lav_general_newton(&self.f, impulse, cold, 1e-4)
+
     @property
     def islands(self):
         """Problems that share no velocity."""
@@ -209,14 +215,8 @@ cdef class Newton:
         Returns how it ended (`ENDS`) and (steps, factorisations, updates of N, rounds, evaluations of a line).
         """
         cdef int32_t end = DONE
-        cdef double share = 1.0
         if self.f.p.n_rows > 0:
-            if self.f.n_islands > 1:
-                share = 1.0 / (<double>self.f.n_islands) ** 0.5
-            self.f.energy_limit = tol * self.data.start_energy * share
-            self.f.velocity_limit = tol * self.data.start_velocity
-            self.f.steps = steps
-            self.f.factorisations = self.f.updates = self.f.rounds = self.f.evaluations = 0
+            self.aim(tol, steps)
             with nogil:
                 end = lav_general_newton(&self.f, &impulse[0], cold, soft)
         return end, (steps - self.f.steps, self.f.factorisations, self.f.updates, self.f.rounds, self.f.evaluations)
@@ -230,7 +230,6 @@ def run_many(list kernels, list impulses, double tol, int steps, cold, double so
     cdef Py_ssize_t i, n = len(kernels)
     cdef Newton kernel
     cdef double[::1] impulse
-    cdef double share
     ends_ = np.zeros(n, np.int32)
     counts_ = np.zeros((n, 5), np.int64)
     flows_ = np.empty(n, np.intp)
@@ -243,11 +242,7 @@ def run_many(list kernels, list impulses, double tol, int steps, cold, double so
     for i in range(n):
         kernel = kernels[i]
         impulse = impulses[i]
-        share = 1.0 / (<double>kernel.f.n_islands) ** 0.5 if kernel.f.n_islands > 1 else 1.0
-        kernel.f.energy_limit = tol * kernel.data.start_energy * share
-        kernel.f.velocity_limit = tol * kernel.data.start_velocity
-        kernel.f.steps = steps
-        kernel.f.factorisations = kernel.f.updates = kernel.f.rounds = kernel.f.evaluations = 0
+        kernel.aim(tol, steps)
         flows[i] = <Py_ssize_t>&kernel.f
         places[i] = <Py_ssize_t>&impulse[0] if impulse.shape[0] else 0
     with nogil:

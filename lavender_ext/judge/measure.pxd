@@ -14,6 +14,7 @@ from lavender_ext.core.block cimport (CONE, CONTACT_SPIN, ROW, block_error, bloc
 from lavender_ext.core.csr cimport csr_abs_dot, csr_dot, csr_dot_size, csr_t
 from lavender_ext.core.generalized cimport (generalized_t, jac_push, jac_row, panel_push_size, panel_size,
                                             tree_solve)
+from lavender_ext.core.problem cimport Data
 from lavender_ext.core.rows cimport contact_slack, cross, joint_velocity, rows_t, rows_times
 from lavender_ext.core.velocity cimport add6, rows_velocity
 from lavender_ext.judge.score cimport (add_floor, is_plain, nothing, root, score_from, score_rows, score_t,
@@ -377,3 +378,11 @@ cdef inline void judge_into(const blocks_t* p, const csr_t* a, const rows_t* r, 
         rows_judge(p, r, lam, w, e, v, floor, out)
     else:
         csr_judge(p, a, lam, w, e, floor, out)
+
+
+cdef class Judged:
+    cdef readonly Data data                             # of the problem
+    cdef readonly object impulse, slack, error          # (m,) N s; w (m,) m/s; e (m,) N s
+    cdef readonly double energy, velocity               # sqrt J, m/s; inf where e is not finite
+    cdef readonly double relative, floor                # -
+    cdef readonly int worst                             # row of the largest velocity error, -1

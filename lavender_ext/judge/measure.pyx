@@ -84,12 +84,6 @@ cdef class Judged:
     `impulse` (m,) is kept as it is and must not change any more; the other arrays belong to this.
     """
 
-    cdef readonly Data data                             # of the problem
-    cdef readonly object impulse, slack, error          # (m,) N s; w (m,) m/s; e (m,) N s
-    cdef readonly double energy, velocity               # sqrt J, m/s; inf where e is not finite
-    cdef readonly double relative, floor                # -
-    cdef readonly int worst                             # row of the largest velocity error, -1
-
     def __init__(self, Data p, impulse):
         cdef const double[::1] lam = impulse
         cdef double[::1] w, e, bodies

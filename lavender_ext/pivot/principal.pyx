@@ -543,6 +543,15 @@ cdef class Pivoting:
         self.s.is_factored = 0
         self.restart()
 
+    def renew(self):
+        """As if made anew: no row at a bound, nothing factored, nothing counted."""
+        cdef int32_t i
+        for i in range(self.s.n):
+            self.s.at[i] = FREE
+        self.s.is_half_solved = 0
+        self.s.exchanged = self.s.factorisations = self.s.n_rounds = 0
+        self.start(0.0)
+
     def restart(self):
         """A fresh count of infeasible rows; the factor stays."""
         self.s.best = self.s.n + 1

@@ -43,7 +43,7 @@ def prepare(problem: Problem) -> Newton | None:
 def factor_flops(problem: Problem, largest: int) -> float:
     """Multiply-adds of the dense factors of all islands at most, `largest` velocities in one of them."""
     assert problem.generalized is not None
-    flops = float(problem.generalized.jac.shape[1]) * float(largest) ** 2 / 6.0
+    flops = float(problem.generalized.nv) * float(largest) ** 2 / 6.0
     return 2.0 * flops if problem.law == "coulomb" else flops
 
 
@@ -78,7 +78,7 @@ def run(
             status = Status.TIME_LIMIT
             break
         cold = False
-    return _claim(status, counts)
+    return claim(status, counts)
 
 
 def confirmed(problem: Problem, impulse: FloatArray, tol: float) -> bool:
@@ -88,7 +88,8 @@ def confirmed(problem: Problem, impulse: FloatArray, tol: float) -> bool:
     return bool(found.relative <= tol)
 
 
-def _claim(status: Status, counts: Any) -> Claim:
+def claim(status: Status, counts: Any) -> Claim:
+    """What (steps, factorisations, updates, rounds, evaluations) come to in words."""
     done, *parts = (int(c) for c in counts)
     work = {word: c for word, c in zip(_WORDS, parts, strict=True) if c or word == _WORDS[0]}
     return Claim(status, done, work, form=FORM)
@@ -101,7 +102,7 @@ def run_many(
     cold = [_is_cold(p, lam) for p, lam in zip(problems, impulses, strict=True)]
     ends, counts = kernel_many(kernels, impulses, tol, CLOCK, cold)
     return [
-        _claim(Status.CONVERGED, count) if end == ENDS["done"] and confirmed(p, lam, tol) else None
+        claim(Status.CONVERGED, count) if end == ENDS["done"] and confirmed(p, lam, tol) else None
         for p, lam, end, count in zip(problems, impulses, ends.tolist(), counts.tolist(), strict=True)
     ]
 

@@ -1,0 +1,101 @@
+"""Problems of few rows in one compiled call (`lavender_ext/few/chain.pyx`), and the claim that goes with its counts.
+
+What Python costs outweighs such a problem. The call ends with a solution or not at all: then the solver runs as on any
+problem, from the beginning.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from lavender._arrays import FloatArray
+from lavender.problem import Problem
+from lavender.registry import FEW
+from lavender.residuals import reference
+from lavender.solution import Claim, Status
+from lavender.solvers._costs import first_look, general_cost, sweep_cost
+from lavender.solvers._newton import general
+from lavender_ext.few.chain import PIVOTS, SWEEPS, VELOCITIES, Chain
+
+GENERAL_FIRST = 0.4e6  # ns of newton over generalised velocities up to which nothing else is looked at first
+WARM = 1e-3  # relative residual from which an iterate is worth starting from
+
+
+def prepared(problem: Problem) -> Chain | None:
+    """The chain of a problem, kept with it; None where it has none."""
+    kept = problem.derived.chain
+    if kept is None:
+        kept = problem.derived.chain = _make(problem) or False
+    return kept or None
+
+
+def _make(problem: Problem) -> Chain | None:
+    if not 0 < problem.m <= FEW:
+        return None
+    reference(problem)
+    data, start = problem.metric, problem._start
+    relative = problem.derived.start_relative
+    if len(data.empty) or relative is None:
+        return None
+    if problem.generalized is not None:
+        kernel = general.prepare(problem)
+        if kernel is None or general_cost(problem, kernel.largest) > GENERAL_FIRST:
+            return None
+        return Chain(data, start, relative, newton=kernel)
+    if problem.cones.has_round:
+        return None
+    law = problem.law
+    if law in ("linear", "lcp") and problem.is_symmetric:
+        band = max(problem.bandwidth)
+        return Chain(data, start, relative, matrix=problem.csr_data, band=band, linear=law == "linear")
+    if law == "linear":
+        return None
+    split = 0 if problem.rows is None else problem.rows.n_joints
+    return Chain(
+        data, start, relative, split=split, exact=law == "cone", first_look=first_look(sweep_cost(problem))
+    )
+
+
+@dataclass(frozen=True)
+class Few:
+    """What `SolverSpec.few` holds: problems of few rows as that solver solves them."""
+
+    name: str
+    kinds: tuple[int, ...]
+    looks: bool = False  # a start that is a solution is the result, one that is none is not started from
+
+    def solve(self, problem: Problem, impulse: FloatArray | None, tol: float) -> Any:
+        """(what the judge finds, counts) from an impulse (m,) or from doing nothing; None where it is left."""
+        chain = prepared(problem)
+        if chain is None or chain.kind not in self.kinds or not tol > 0.0:
+            return None
+        return chain.run(impulse, tol, self.looks, WARM)
+
+    def claim(self, problem: Problem, counts: tuple[int, ...] | None) -> Claim:
+        """What the solver says of a chain that did so much, word for word."""
+        if counts is None:
+            return Claim(Status.CONVERGED, 0, {}, "the start is a solution")
+        kind = problem.derived.chain.kind
+        if kind == VELOCITIES:
+            return general.named(general.claim(Status.CONVERGED, counts), self.name)
+        if kind == PIVOTS:
+            done, swept, refined, factored, exchanged = counts
+            named = {"sweeps": 4 * swept, "refinements": refined, "factorisations": factored, "pivots": exchanged}
+            work = {what: count for what, count in named.items() if count}
+            if self.name == "direct":
+                return Claim(Status.CONVERGED, done, work, form="band")
+            return Claim(Status.CONVERGED, done, work, _said("direct", work))
+        done, sweeps, restarts = counts
+        work = {"sweeps": sweeps, "restarts": restarts}
+        return Claim(Status.CONVERGED, done, work, _said("anderson", work))
+
+
+def _said(name: str, work: dict[str, int]) -> str:
+    done = ", ".join(f"{count} {kind}" for kind, count in work.items() if count)
+    return f"{name} {done}".strip()
+
+
+AUTO = Few("auto", (VELOCITIES, PIVOTS, SWEEPS), looks=True)
+DIRECT = Few("direct", (PIVOTS,))
+NEWTON = Few("newton", (VELOCITIES,))

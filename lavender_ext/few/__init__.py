@@ -1,0 +1,1 @@
+"""Problems of few rows: look, solve and judge in one compiled call."""

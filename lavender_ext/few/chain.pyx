@@ -1,0 +1,202 @@
+"""Problems of few rows: look, solve and judge in one call, with what is prepared kept from one call to the next.
+
+    velocities   newton on J and M, from the impulse given                              (generalized/newton.pxd)
+    pivots       the factor of a symmetric A, linear or boxed, and its refinement       (pivot/principal.pyx)
+    sweeps       the first look of accelerated sweeps                                   (accelerate/accelerated.pyx)
+
+The same kernels in the same order as the solvers call them on any problem, so the same bits and counts. What does not
+end as one hopes, below tol on the judge's own measure, is nobody's result: the caller starts again the long way.
+"""
+from libc.stdint cimport int32_t
+
+import numpy as np
+
+from lavender_ext.accelerate.accelerated import allocate
+from lavender_ext.accelerate.accelerated import run as accelerate
+from lavender_ext.core.problem cimport Data
+from lavender_ext.generalized.newton cimport DONE, Newton
+from lavender_ext.judge.measure cimport Judged
+from lavender_ext.judge.measure import same_bits, velocity_change
+from lavender_ext.judge.watch import Watch
+from lavender_ext.local import gauss_seidel
+from lavender_ext.pivot.principal import SOLVED, Pivoting
+
+
+cpdef enum:                     # kinds
+    VELOCITIES = 0
+    PIVOTS = 1
+    SWEEPS = 2
+
+cdef enum:
+    STEPS = 64                  # of newton
+    PIVOT_SWEEPS = 2            # that guess the free rows
+    PIVOT_ROUNDS = 32
+    CORRECTIONS = 100           # refinements
+    MEMORY = 5                  # sweeps that are combined
+    PATIENCE = 500              # of their watch
+
+
+cdef class Chain:
+    """One problem of few rows, its error of doing nothing known to `data`; `run` serves one thread at a time.
+
+    Parameters
+    ----------
+    data : Data
+        What the judge reads.
+    start : (m,) N s
+        Pi(0), read-only.
+    start_relative : float
+        Relative residual of `start`.
+    newton : Newton, with VELOCITIES
+    matrix : Data, with PIVOTS
+        Of A in compressed rows.
+    band, linear : int, bool, with PIVOTS
+        Half bandwidth of A; whether every row is free.
+    split, exact, first_look : int, bool, int, with SWEEPS
+        Blocks before it are swept before the others: joints, contacts; whether each is solved exactly; sweeps before
+        the residual is looked at.
+    """
+
+    cdef readonly Data data
+    cdef readonly int kind
+    cdef readonly object start
+    cdef double start_relative
+    cdef bint busy
+    cdef Newton newton
+    cdef object pivoting                                # Pivoting
+    cdef bint linear
+    cdef object order, rng, prepared
+    cdef int split, first_look
+
+    def __init__(self, Data data, start, double start_relative, Newton newton=None, Data matrix=None, int band=0,
+                 bint linear=False, int split=0, bint exact=False,
+                 int first_look=0):
+        self.data, self.start, self.start_relative = data, start, start_relative
+        self.newton, self.linear, self.split, self.first_look = newton, linear, split, first_look
+        if newton is not None:
+            self.kind = VELOCITIES
+        elif matrix is not None:
+            self.kind = PIVOTS
+            self.pivoting = Pivoting(matrix, band, None, 1e-13)
+        else:
+            self.kind = SWEEPS
+            self.order = np.arange(data.blocks.n_blocks, dtype=np.int32)
+            self.rng = np.zeros(1, np.uint64)
+            self.prepared = gauss_seidel.prepare(data) if exact else None
+
+    def run(self, impulse, double tol, bint look, double warm):
+        """From `impulse` (m,) [N s], or from `start` where it is None: (what the judge finds, what was done).
+
+        look: is `impulse` a solution? And where its residual is above `warm`, pivots start from `start`. None where it
+        does not end below tol, or another thread is here.
+
+        What was done is None where `impulse` is the solution, else counts: of newton (steps, factorisations, updates,
+        rounds, evaluations); of pivots (rounds, whether swept, refinements, factorisations, pivots); of sweeps
+        (iterations, sweeps, restarts).
+        """
+        if self.busy:
+            return None
+        self.busy = True
+        try:
+            if self.kind == VELOCITIES:
+                return self.descend(impulse, tol)
+            return self.look_and_solve(impulse, tol, look, warm)
+        finally:
+            self.busy = False
+
+    cdef descend(self, impulse, double tol):
+        cdef double[::1] lam
+        cdef int32_t i, end, m = self.data.blocks.n_rows
+        cdef bint cold = True
+        cdef Newton newton = self.newton
+        own = (self.start if impulse is None else impulse).copy()
+        lam = own
+        if impulse is not None:
+            for i in range(m):
+                if lam[i] != 0.0:
+                    cold = bool(np.array_equal(own, self.start))
+                    break
+        newton.aim(tol, STEPS)
+        with nogil:
+            end = newton.go(&lam[0], cold)
+        if end != DONE:
+            return None
+        found = Judged(self.data, own)
+        if not found.relative <= tol:
+            return None
+        return found, (STEPS - newton.f.steps, newton.f.factorisations, newton.f.updates, newton.f.rounds,
+                       newton.f.evaluations)
+
+    cdef look_and_solve(self, impulse, double tol, bint look, double warm):
+        cdef Judged found
+        cdef double before = self.start_relative
+        if look:
+            if impulse is not None and not same_bits(impulse, self.start):
+                found = Judged(self.data, impulse)
+                before = found.relative
+                if before <= tol:
+                    return found, None
+            elif before <= tol:
+                return Judged(self.data, self.start if impulse is None else impulse), None
+            if self.kind == PIVOTS and not before <= warm:
+                impulse = None
+        own = (self.start if impulse is None else impulse).copy()
+        return self.pivot(own, tol) if self.kind == PIVOTS else self.sweep(own, tol)
+
+    cdef pivot(self, own, double tol):
+        cdef Judged best, found
+        cdef double previous = 1.0 / 0.0
+        cdef int k = 0, done = 1
+        rows = self.pivoting
+        rows.renew()
+        code, swept = SOLVED, False
+        if self.linear:
+            small, negative = rows.factor_all()
+            if small or negative:
+                return None
+            rows.solve_free()
+        else:
+            code, swept = rows.solve(own, PIVOT_SWEEPS, PIVOT_ROUNDS)
+            done = rows.n_rounds
+            if code != SOLVED:
+                return None
+        found = best = self.judged(rows)
+        if not is_good(best):
+            rows.slack()
+            while k < CORRECTIONS and not is_good(best) and found.relative < 0.5 * previous:
+                previous = found.relative
+                rows.correct()
+                rows.slack()
+                k += 1
+                if rows.exchange():
+                    return None
+                found = self.judged(rows)
+                if found.relative < best.relative:
+                    best = found
+        if not is_good(best) or not best.relative <= tol:
+            return None
+        return best, (done, bool(swept), k, rows.factorisations, rows.exchanged)
+
+    cdef judged(self, rows):
+        x = np.empty(self.data.blocks.n_rows)
+        rows.clipped(x)
+        return Judged(self.data, x)
+
+    cdef sweep(self, own, double tol):
+        cdef Judged found
+        space = allocate(self.data, MEMORY)
+        if self.data.factored:
+            velocity_change(self.data, own, space[3])
+        status, done, sweeps, restarts = accelerate(
+            self.data, Watch(self.data, PATIENCE), own, self.first_look, tol, MEMORY, self.prepared,
+            self.prepared is not None, 0, space, self.order, self.split, 0, self.rng)
+        found = Judged(self.data, own)
+        if not found.relative <= tol:
+            return None
+        return found, (done, sweeps, restarts)
+
+
+cdef inline bint is_good(Judged x) noexcept:
+    # As `direct`: to rounding, or to the floor where that is not of an impulse that ran away.
+    cdef double floor = x.floor if x.floor < 1e-6 else 1e-6
+    return x.relative <= (floor if floor > 1e-13 else 1e-13)

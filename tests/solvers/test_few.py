@@ -1,0 +1,150 @@
+"""Problems of few rows take a compiled way: it must not show, but in time."""
+
+import pickle
+import threading
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from random_problems import as_matrix, random_contact_problem, random_lcp, seeds
+from random_trees import random_general
+
+import lavender as lv
+from lavender import registry, suite
+from lavender.registry import FEW
+
+SHORT = ("auto", "direct", "newton")
+TIMES = ("setup_time", "solve_time", "_rest")
+
+
+def long_way(problem, solver, **options):
+    return lv.prepare(replace(problem, copy=False), solver).solve(**options)
+
+
+def facts(solution):
+    """Everything a solution says but its times, arrays by their bits."""
+    r = solution.residual
+    told = {f.name: getattr(solution, f.name) for f in fields(solution) if f.name not in (*TIMES, "residual")}
+    told |= {f"residual {f.name}": getattr(r, f.name) for f in fields(r) if f.name != "_problem"}
+    told["line"] = str(solution).rpartition(" ms")[0].rpartition(", ")[0] + str(solution).rpartition(" ms")[2]
+    return {k: v.tobytes() if isinstance(v, np.ndarray) else v for k, v in told.items()}
+
+
+def check(problem, solver, **options):
+    short = lv.solve(problem, solver, **options)
+    expected = facts(long_way(problem, solver, **options))
+    assert facts(short) == expected
+    assert facts(lv.solve(problem, solver, **options)) == expected  # what is kept was left as it was found
+    return short
+
+
+def draw(kind, seed):
+    rng = np.random.default_rng(seed)
+    if kind == "lcp":
+        return random_lcp(seed, m=int(rng.integers(1, FEW)), rank=None if rng.random() < 0.7 else 3)
+    if kind == "linear":
+        g = rng.normal(size=(9, 9))
+        a = g @ g.T if rng.random() < 0.6 else g
+        return lv.Problem.linear(a, rng.normal(size=9))
+    if kind == "one-sided":  # unsymmetric
+        return lv.Problem.lcp(
+            rng.normal(size=(6, 6)) + 6.0 * np.eye(6), rng.normal(size=6), friction=["coulomb", "cone"][seed % 2]
+        )
+    if kind.startswith("rows"):
+        return random_contact_problem(
+            seed, kind.split()[1], bodies=3, joints=int(rng.integers(0, 3)), contacts=int(rng.integers(0, 5))
+        )
+    if kind.startswith("matrix"):
+        return as_matrix(draw("rows " + kind.split()[1], seed))
+    law = kind.split()[1]
+    tangents = int(rng.integers(1, 6)) if law == "cone" else int(rng.integers(0, 3))
+    return random_general(seed, law, n=int(rng.integers(2, 12)), compliance=seed % 3 > 0, contacts=4, tangents=tangents)
+
+
+KINDS = (
+    "lcp", "linear", "one-sided", "rows coulomb", "rows cone", "matrix coulomb", "matrix cone", "general coulomb",
+    "general cone",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@given(seed=seeds, tol=st.sampled_from([1e-3, 1e-6, 1e-9, 1e-13, 0.9]))
+@settings(max_examples=25)
+def test_the_short_way_and_the_long_way_are_one(kind, seed, tol):
+    problem = draw(kind, seed)
+    for solver in SHORT:
+        if registry.get(solver).refuses(problem) is not None:
+            continue
+        first = check(problem, solver, tol=tol)
+        check(problem, solver, tol=tol, impulse=first.impulse)
+        near = first.impulse * (1.0 + 1e-4 * np.random.default_rng(seed).normal(size=problem.m))
+        check(problem, solver, tol=tol, impulse=near)
+        check(problem, solver, tol=tol, impulse=np.zeros(problem.m))
+        check(replace(problem, guess=near, copy=False), solver, tol=tol)
+
+
+@pytest.mark.parametrize("name", suite.families())
+def test_families_of_few_rows(name):
+    problem = suite.case(name).problem
+    if problem.m > FEW:
+        pytest.skip("many rows")
+    for solver in SHORT:
+        if registry.get(solver).refuses(problem) is None:
+            check(problem, solver)
+
+
+def test_most_of_them_do_take_the_short_way():
+    took = 0
+    for kind in KINDS:
+        for seed in range(6):
+            took += registry.get("auto").few.solve(draw(kind, seed), None, 1e-6) is not None
+    assert took >= 0.6 * 6 * len(KINDS)  # a chain that gives everything up would pass the tests above
+
+
+def test_a_late_solution_is_a_solution():
+    problem = draw("general cone", 3)
+    late = lv.solve(problem)
+    again = pickle.loads(pickle.dumps(lv.solve(problem)))
+    assert facts(again) == facts(late)
+    assert late.success and late.raise_for_status() is late
+    assert not late.impulse.flags.writeable and not late.slack.flags.writeable
+    with pytest.raises(TypeError):
+        late.work["x"] = 1
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        _ = lv.solve(problem).nothing
+    assert repr(lv.solve(problem)).startswith("<Solution auto: CONVERGED")
+
+
+def test_threads_share_a_problem_of_few_rows():
+    problem = draw("general coulomb", 5)
+    expected = facts(long_way(problem, "auto"))
+    found, failed = [], []
+
+    def work():
+        try:
+            for _ in range(200):
+                found.append(facts(lv.solve(problem)))
+        except Exception as error:
+            failed.append(error)
+
+    team = [threading.Thread(target=work) for _ in range(4)]
+    for t in team:
+        t.start()
+    for t in team:
+        t.join()
+    assert not failed and len(found) == 800
+    assert all(f == expected for f in found)
+
+
+def test_what_is_refused_is_refused_the_same_way():
+    problem = draw("matrix coulomb", 1)
+    with pytest.raises(lv.errors.CapabilityError, match="takes laws"):
+        lv.solve(problem, "direct")
+    with pytest.raises(lv.errors.InputError, match="impulse"):
+        lv.solve(problem, impulse=np.zeros(problem.m + 1))
+    with pytest.raises(lv.errors.InputError, match="tol"):
+        lv.solve(problem, tol=float("nan"))
+    with pytest.raises(lv.errors.InputError, match=r"lavender\.Problem is needed"):
+        lv.solve(3)
