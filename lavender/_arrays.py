@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from math import isfinite
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,13 @@ from lavender_ext.judge.measure import all_finite
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int32]
 ArrayLike = npt.ArrayLike  #: numbers, nested sequences of them, or an array; the docstring has shape and unit
+
+
+_PLAIN: dict[Any, np.dtype[Any]] = {np.float64: np.dtype(np.float64), np.int32: np.dtype(np.int32)}
+
+
+def _fits(given: tuple[int, ...], wanted: tuple[int | None, ...]) -> bool:
+    return len(given) == len(wanted) and all(n is None or n == s for n, s in zip(wanted, given, strict=True))
 
 
 def read_only(array: np.ndarray) -> np.ndarray:
@@ -41,6 +49,28 @@ def as_array(
     InputError
         Not numeric, complex, of another shape, or not finite where it must be.
     """
+    # What most callers give: nothing to convert, and no word to be made.
+    if type(value) is np.ndarray:
+        if value.dtype is _PLAIN.get(dtype) and (value.shape == shape or _fits(value.shape, shape)):
+            plain: np.ndarray = value.copy() if copy or not value.flags.c_contiguous else value
+            if (
+                not finite
+                or dtype is not np.float64
+                or all_finite(plain if plain.ndim == 1 else plain.ravel())
+            ):
+                plain.setflags(write=False)
+                return plain
+    elif (
+        type(value) is float
+        and dtype is np.float64
+        and isfinite(value)
+        and len(shape) == 1
+        and shape[0] is not None
+    ):
+        plain = np.empty(shape[0])
+        plain.fill(value)
+        plain.setflags(write=False)
+        return plain
     what = f"{name} [{unit}]" if unit else name
     try:
         given = np.asarray(value)

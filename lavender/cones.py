@@ -20,11 +20,17 @@ import numpy as np
 
 from lavender._arrays import FloatArray, IntArray, as_array, check_not_nan, check_not_negative, equal
 from lavender.errors import InputError
-from lavender_ext.core.problem import KINDS
+from lavender_ext.core.problem import BOUNDED, FREE, KINDS, ROUND_CONES, shape_of
 
 __all__ = ["CONTACT", "CONTACT_SPIN", "ROUND", "ROW", "Cones", "project"]
 
 ROW, CONTACT, CONTACT_SPIN, ROUND = KINDS
+
+
+_FIELDS = tuple(
+    (name, np.dtype(np.int32 if name in ("ptr", "kind") else np.float64))
+    for name in ("ptr", "kind", "lower", "upper", "mu", "patch_radius")
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +52,31 @@ class Cones:
     patch_radius: FloatArray  # (k,) m, read on CONTACT_SPIN
 
     def __post_init__(self) -> None:
+        if not self._adopt():
+            self._check()
+
+    def _adopt(self) -> bool:
+        # Arrays as they should be, copied, in one pass; where anything is amiss `_check` finds the words.
+        own = []
+        for name, dtype in _FIELDS:
+            given = getattr(self, name)
+            if type(given) is not np.ndarray or given.dtype is not dtype or given.ndim != 1:
+                return False
+            own.append(given.copy())
+        bits = shape_of(*own)
+        if bits < 0:
+            return False
+        for (name, _), value in zip(_FIELDS, own, strict=True):
+            value.flags.writeable = False
+            object.__setattr__(self, name, value)
+        self._remember(bits)
+        return True
+
+    def _remember(self, bits: int) -> None:
+        for name, bit in (("is_free", FREE), ("is_bounded_rows", BOUNDED), ("has_round", ROUND_CONES)):
+            self.__dict__[name] = bool(bits & bit)
+
+    def _check(self) -> None:
         ptr = as_array("cones.ptr", self.ptr, (None,), dtype=np.int32)
         if len(ptr) == 0 or ptr[0] != 0 or np.any(np.diff(ptr) <= 0):
             raise InputError(
@@ -196,7 +227,7 @@ class Cones:
             np.all(self.kind == ROW) and np.all(np.isneginf(self.lower)) and np.all(np.isposinf(self.upper))
         )
 
-    @property
+    @cached_property
     def is_bounded_rows(self) -> bool:
         """Every row has constant bounds: ROW blocks and contacts of a normal alone."""
         return bool(np.all((self.kind == ROW) | (np.diff(self.ptr) == 1)))

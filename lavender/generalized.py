@@ -74,6 +74,23 @@ class Generalized:
         made._fill(jac, mass, as_array("v_free", v_free, (n,), unit="m/s, rad/s"), names)
         return made
 
+    def with_jacobian(self, jac: Any = None, v_free: Any = None) -> Generalized:
+        """The same M with another J or v* (None: the same)."""
+        if self.order is not None:
+            return Generalized(
+                self.jac if jac is None else jac,
+                self.mass,
+                self.v_free if v_free is None else v_free,
+                self.names,
+            )
+        own = self.operator.jac if jac is None else _rows(jac, self.nv)
+        velocity = (
+            self.v_free if v_free is None else as_array("v_free", v_free, (self.nv,), unit="m/s, rad/s")
+        )
+        made = object.__new__(Generalized)
+        made._fill(own, self.operator.mass, velocity, self.names)
+        return made
+
     def _fill(
         self, jac: Compressed, mass: Compressed, v_free: FloatArray, names: Sequence[str] | None
     ) -> None:

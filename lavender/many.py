@@ -1,7 +1,8 @@
 """Many problems in one call: the results of `solve` on each, with the same bits.
 
-Problems in generalised coordinates go through one compiled loop without the interpreter; what that leaves, and every
-other problem, is solved one by one.
+Problems in generalised coordinates go through one compiled loop without the interpreter, those of few rows each through
+its own compiled call; what that leaves, and every other problem, is solved one by one. Solutions are put in words when
+somebody asks.
 """
 
 from __future__ import annotations
@@ -9,43 +10,19 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from time import perf_counter
-from typing import Any, overload
+from typing import Any
 
 import numpy as np
 
 from lavender._arrays import FloatArray
 from lavender.errors import InputError
 from lavender.problem import Problem
-from lavender.registry import get
+from lavender.registry import FEW, SolverSpec, get
 from lavender.solution import Solution
-from lavender.solve import decide_empty_rows, finish, solve
+from lavender.solve import decide_empty_rows, late, solve
 from lavender.solvers._newton import general
 
 __all__ = ["solve_many"]
-
-
-class Solutions(Sequence[Solution]):
-    """What `solve_many` returns: solutions, each judged and made when it is first looked at."""
-
-    def __init__(self, made: list[Any], options: dict[str, Any]) -> None:
-        self._made, self._options = made, options
-
-    def __len__(self) -> int:
-        return len(self._made)
-
-    @overload
-    def __getitem__(self, i: int) -> Solution: ...
-
-    @overload
-    def __getitem__(self, i: slice) -> list[Solution]: ...
-
-    def __getitem__(self, i: int | slice) -> Solution | list[Solution]:
-        if isinstance(i, slice):
-            return [self[j] for j in range(*i.indices(len(self)))]
-        if not isinstance(self._made[i], Solution):
-            self._made[i] = finish(*self._made[i])
-        made: Solution = self._made[i]
-        return made
 
 
 def solve_many(
@@ -57,7 +34,7 @@ def solve_many(
     tol: float = 1e-6,
     max_iter: int | None = None,
     **options: Any,
-) -> Sequence[Solution]:
+) -> list[Solution]:
     """Solve every problem; the same bits as `solve` on each, whatever the number of threads.
 
     Parameters
@@ -73,8 +50,8 @@ def solve_many(
 
     Returns
     -------
-    sequence of Solution
-        In the order of the problems. Those of the compiled loop are judged when they are first looked at.
+    list of Solution
+        In the order of the problems.
 
     Raises
     ------
@@ -89,39 +66,44 @@ def solve_many(
     if impulses is not None and len(impulses) != len(given):
         raise InputError(f"{len(impulses)} impulses for {len(given)} problems; one for each is needed")
     starts = [None] * len(given) if impulses is None else list(impulses)
-    made: list[Any] = [None] * len(given)
+    made: list[Solution | None] = [None] * len(given)
     spec = get(solver)
     more = {"tol": tol, "max_iter": max_iter, **options}
-    at = [i for i, p in enumerate(given) if isinstance(p, Problem) and p.generalized is not None and p.m > 0]
+    at = [
+        i for i, p in enumerate(given) if isinstance(p, Problem) and p.generalized is not None and p.m > FEW
+    ]
     quick = not options and solver in ("auto", "newton") and max_iter is None and 0.0 <= tol < np.inf
-    parts = [at[k::threads] for k in range(threads)] if quick else []
+    parts = [at[k::threads] for k in range(min(threads, len(at)))] if quick else []
 
     def together(part: list[int]) -> None:
-        for i, arguments in zip(
-            part, _loop([given[i] for i in part], [starts[i] for i in part], tol), strict=True
-        ):
-            if arguments is not None:
-                problem, lam, claim, seconds = arguments
-                made[i] = (problem, spec, {}, lam, general.named(claim, solver), tol, 0.0, seconds, None)
+        found = _loop([given[i] for i in part], [starts[i] for i in part], tol, spec)
+        for i, solution in zip(part, found, strict=True):
+            made[i] = solution
 
     def alone(i: int) -> None:
         made[i] = solve(given[i], solver, impulse=starts[i], **more)
 
-    with ThreadPoolExecutor(threads) as pool:
-        run = map if threads == 1 else pool.map
-        list(run(together, [part for part in parts if part]))
-        list(run(alone, [i for i in range(len(given)) if made[i] is None]))
-    return Solutions(made, options)
+    if threads == 1:
+        for part in parts:
+            together(part)
+        for i in range(len(given)):
+            if made[i] is None:
+                alone(i)
+    else:
+        with ThreadPoolExecutor(threads) as pool:
+            list(pool.map(together, parts))
+            list(pool.map(alone, [i for i in range(len(given)) if made[i] is None]))
+    return [solution for solution in made if solution is not None]
 
 
-def _loop(problems: list[Problem], starts: list[Any], tol: float) -> list[tuple[Any, ...] | None]:
-    """Those that the compiled loop ends: problem, impulse, claim, its share of the time; None for the others."""
+def _loop(problems: list[Problem], starts: list[Any], tol: float, spec: SolverSpec) -> list[Solution | None]:
+    """Those that the compiled loop ends, each with its share of the time; None for the others."""
     begin = perf_counter()
     prepared = [general.prepare(p) for p in problems]
     held = [i for i, kernel in enumerate(prepared) if kernel is not None]
     if len(held) < len(problems):  # some are too large: the others alone
-        found = iter(_loop([problems[i] for i in held], [starts[i] for i in held], tol))
-        return [None if kernel is None else next(found) for kernel in prepared]
+        those = iter(_loop([problems[i] for i in held], [starts[i] for i in held], tol, spec))
+        return [None if kernel is None else next(those) for kernel in prepared]
     kernels = [kernel for kernel in prepared if kernel is not None]
     lams: list[FloatArray] = []
     proofs = []
@@ -132,9 +114,9 @@ def _loop(problems: list[Problem], starts: list[Any], tol: float) -> list[tuple[
             lam = p.start() if p.guess is None else p.guess.copy()
         proofs.append(len(p.metric.empty) > 0 and decide_empty_rows(p, lam) is not None)
         lams.append(lam)
-    claims = general.run_many(problems, kernels, lams, tol)
+    found = general.run_many(problems, kernels, lams, tol)
     seconds = (perf_counter() - begin) / max(1, len(problems))
     return [
-        None if claim is None or proof else (p, lam, claim, seconds)
-        for p, lam, claim, proof in zip(problems, lams, claims, proofs, strict=True)
+        None if end is None or proof else late(p, spec, end[0], end[1], tol, seconds)
+        for p, end, proof in zip(problems, found, proofs, strict=True)
     ]

@@ -34,7 +34,7 @@ from lavender.generalized import Generalized
 from lavender.rows import Rows
 from lavender_ext.core import assemble
 from lavender_ext.core.problem import LAWS as FRICTION_NUMBER
-from lavender_ext.core.problem import Data, dense_to_csr, rows_velocity
+from lavender_ext.core.problem import Data, dense_to_csr, nothing_done, rows_velocity
 from lavender_ext.judge import measure
 from lavender_ext.pivot import principal
 
@@ -445,11 +445,15 @@ class Problem:
         if b is None and target is None and (J is not None or v_free is not None):
             raise InputError("with a new J or v_free the right-hand side is another: give target or b")
         if general is not None and any(x is not None for x in (J, M, v_free)):
-            general = Generalized(
-                general.jac if J is None else J,
-                general.mass if M is None else M,
-                general.v_free if v_free is None else v_free,
-                general.names,
+            general = (
+                general.with_jacobian(J, v_free)
+                if M is None
+                else Generalized(
+                    general.jac if J is None else J,
+                    general.mass if M is None else M,
+                    general.v_free if v_free is None else v_free,
+                    general.names,
+                )
             )
         if target is not None and general is not None:
             b = as_array("target", target, (self.m,), unit="m/s") - general.velocity_of(general.v_free)
@@ -493,13 +497,11 @@ class Problem:
         """Lower and upper half bandwidth of A: the largest i - j and j - i of a stored entry."""
         if self.rows is None:
             return self._scan[:2]
-        a = self.csr
-        return principal.bandwidth(a.indptr, a.indices)
+        return principal.bandwidth(*self._compressed[:2])
 
     @cached_property
     def _scan(self) -> tuple[int, int, float, float]:
-        a = self.csr
-        return principal.scan(a.indptr, a.indices, a.data)
+        return principal.scan(*self._compressed)
 
     @property
     def is_symmetric(self) -> bool:
@@ -678,7 +680,7 @@ class Problem:
 
     @once
     def _start(self) -> FloatArray:
-        return read_only(np.clip(np.zeros(self.m), self.cones.lower, self.cones.upper))
+        return nothing_done(self.cones.lower, self.cones.upper)
 
     def impulse_array(self, impulse: ArrayLike, name: str = "impulse") -> FloatArray:
         """A writable private copy of `impulse`, checked: (m,) [N s], finite."""

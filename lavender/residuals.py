@@ -91,20 +91,7 @@ def reference(problem: Problem) -> tuple[float, float]:
     """E0 [sqrt J] and V0 [m/s]; computed once per problem."""
     data = problem.metric
     if data.start_energy < 0.0:
-        m = problem.m
-        w, e = np.empty(m), np.empty(m)
-        if problem._start.any():
-            energy, velocity, *_ = own = measure.judge(data, problem._start, w, e, False)
-        else:  # the same numbers without a pass over A
-            energy, velocity, *_ = own = measure.score(data, problem._start, np.negative(problem.b, out=w), e)
-        # The norms of b: sqrt(sum b^2 / d), max |b| sqrt(nu / d), |b| the pair's norm on tangents.
-        rhs_energy, rhs_velocity = measure.rhs_norms(data)
-        # Doing nothing costs no more energy than b; more is what `quotient` (block.pxd) makes of a vanishing w / d.
-        if energy <= 2.0**-48 * rhs_energy or (energy > 2.0 * rhs_energy and not problem._start.any()):
-            energy, velocity = rhs_energy, rhs_velocity
-        # A size that overflows measures nothing: 0 makes every error beside it infinite.
-        data.set_start(energy if energy < np.inf else 0.0, velocity if velocity < np.inf else 0.0)
-        problem.derived.start_relative = relative_of(data, *own[:2]) if own[-1] else math.inf
+        problem.derived.start_relative = measure.begin(data, problem._start)
         if problem.generalized is not None and "csr_data" in problem.__dict__:
             problem.csr_data.set_start(data.start_energy, data.start_velocity)
     return data.start_energy, data.start_velocity

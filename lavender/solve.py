@@ -89,7 +89,8 @@ def solve(
         Wrong `impulse`, negative or NaN `tol`, `max_iter`, `time_limit`.
     """
     spec = get(solver)
-    if spec.few is not None and not (options or history) and max_iter is time_limit is callback is None:
+    plain = max_iter is None and time_limit is None and callback is None
+    if plain and spec.few is not None and not (options or history):
         made = solve_few(problem, spec, impulse, tol)
         if made is not None:
             return made
@@ -410,7 +411,12 @@ def solve_few(problem: Problem, spec: SolverSpec, impulse: Any, tol: float) -> S
 
     Claim, counts and residual are put in words when somebody asks for them.
     """
-    if type(problem) is not Problem or problem.m > FEW or not isinstance(tol, float) or not 0.0 < tol < math.inf:
+    if (
+        type(problem) is not Problem
+        or problem.m > FEW
+        or not isinstance(tol, float)
+        or not 0.0 < tol < math.inf
+    ):
         return None
     start = perf_counter()
     given = problem.guess if impulse is None else problem.impulse_array(impulse)
@@ -419,13 +425,20 @@ def solve_few(problem: Problem, spec: SolverSpec, impulse: Any, tol: float) -> S
     if found is None:
         return None
     judged, counts = found
+    return late(problem, spec, judged, counts, tol, perf_counter() - start)
+
+
+def late(
+    problem: Problem, spec: SolverSpec, judged: Any, counts: Any, tol: float, seconds: float
+) -> Solution:
+    """A solution that the judge found below tol, in words when somebody asks; `counts` as `spec.few` tells them."""
     judged.impulse.flags.writeable = False
     known = {
         "impulse": judged.impulse,
         "status": Status.CONVERGED,
         "tol": tol,
         "setup_time": 0.0,
-        "solve_time": perf_counter() - start,
+        "solve_time": seconds,
     }
     return Solution.late(known, partial(_rest, problem, spec, judged, counts))
 

@@ -76,12 +76,17 @@ class Few:
         """What the solver says of a chain that did so much, word for word."""
         if counts is None:
             return Claim(Status.CONVERGED, 0, {}, "the start is a solution")
-        kind = problem.derived.chain.kind
+        kind = VELOCITIES if problem.generalized is not None else problem.derived.chain.kind
         if kind == VELOCITIES:
             return general.named(general.claim(Status.CONVERGED, counts), self.name)
         if kind == PIVOTS:
             done, swept, refined, factored, exchanged = counts
-            named = {"sweeps": 4 * swept, "refinements": refined, "factorisations": factored, "pivots": exchanged}
+            named = {
+                "sweeps": 4 * swept,
+                "refinements": refined,
+                "factorisations": factored,
+                "pivots": exchanged,
+            }
             work = {what: count for what, count in named.items() if count}
             if self.name == "direct":
                 return Claim(Status.CONVERGED, done, work, form="band")

@@ -414,6 +414,65 @@ cdef class Data:
         self.start_velocity = velocity
 
 
+FREE, BOUNDED, ROUND_CONES = 1, 2, 4
+
+
+def shape_of(const int32_t[::1] ptr, const int32_t[::1] kind, double[::1] lower, double[::1] upper,
+             const double[::1] mu, const double[::1] radius):
+    """What the blocks of a problem are: FREE (every row unbounded), BOUNDED (by constants), ROUND_CONES; as bits.
+
+    -1 where an array does not fit the others or holds what no block can have. Bounds of contacts, which nobody reads,
+    get one spelling: 0 on normals, else none.
+    """
+    cdef Py_ssize_t i, j, k = kind.shape[0], m = lower.shape[0], size
+    cdef double inf = 1.0 / 0.0
+    cdef bint is_free = True, is_bounded = True, is_round = False
+    if ptr.shape[0] != k + 1 or ptr[0] != 0 or mu.shape[0] != k or radius.shape[0] != k or upper.shape[0] != m:
+        return -1
+    for i in range(k):
+        size = ptr[i + 1] - ptr[i]
+        if size <= 0 or not 0.0 <= mu[i] < inf or not 0.0 <= radius[i] < inf:
+            return -1
+        if kind[i] == ROUND:
+            is_round = True
+            if not 3 < size <= 6:
+                return -1
+        elif kind[i] != ROW and (not 0 < kind[i] < ROUND or size < kind[i] or size > kind[i] + 2):
+            return -1
+    if ptr[k] != m:
+        return -1
+    for i in range(k):
+        if kind[i] == ROW:
+            for j in range(ptr[i], ptr[i + 1]):
+                if not (lower[j] <= upper[j] and lower[j] < inf and upper[j] > -inf):
+                    return -1
+                if lower[j] != -inf or upper[j] != inf:
+                    is_free = False
+        else:
+            is_free = False
+            if ptr[i + 1] - ptr[i] > 1:
+                is_bounded = False
+            for j in range(ptr[i], ptr[i + 1]):
+                if lower[j] != lower[j] or upper[j] != upper[j]:
+                    return -1
+                lower[j] = 0.0 if j == ptr[i] else -inf
+                upper[j] = inf
+    return is_free * FREE + is_bounded * BOUNDED + is_round * ROUND_CONES
+
+
+def nothing_done(const double[::1] lower, const double[::1] upper):
+    """Pi(0) (m,) [N s]: zero clipped to the bounds, read-only."""
+    cdef Py_ssize_t i, m = lower.shape[0]
+    out = np.zeros(m)
+    cdef double[::1] x = out
+    for i in range(m):
+        if lower[i] > 0.0:
+            x[i] = lower[i]
+        elif upper[i] < 0.0:
+            x[i] = upper[i]
+    return _read_only(out)
+
+
 _NONE = np.empty(0, np.intp)
 _NONE.flags.writeable = False
 

@@ -158,6 +158,35 @@ def score(Data p, const double[::1] lam, const double[::1] w, double[::1] e):
     return s.energy, s.velocity, s.worst, bool(s.finite)
 
 
+def begin(Data p, const double[::1] start):
+    """Judge `start` = Pi(0), keep E0 and V0 with the data, and return its own relative residual."""
+    cdef Py_ssize_t i, m = start.shape[0]
+    cdef bint moves = False
+    cdef double rhs_energy, rhs_velocity, energy, velocity
+    cdef double own_energy = 0.0, own_velocity = 0.0
+    cdef bint finite = True
+    cdef double[::1] room
+    if m > 0:
+        room = np.empty(2 * m)
+        for i in range(m):
+            moves |= start[i] != 0.0
+        if moves:
+            own_energy, own_velocity, _, _, _, finite = judge(p, start, room[:m], room[m:], False)
+        else:                                           # the same numbers without a pass over A
+            for i in range(m):
+                room[i] = -p.blocks.b[i]
+            own_energy, own_velocity, _, finite = score(p, start, room[:m], room[m:])
+    norms_of_rhs(&p.blocks, &rhs_energy, &rhs_velocity)
+    # The norms of b: sqrt(sum b^2 / d), max |b| sqrt(nu / d), |b| the pair's norm on tangents.
+    energy, velocity = own_energy, own_velocity
+    # Doing nothing costs no more energy than b; more is what `quotient` (block.pxd) makes of a vanishing w / d.
+    if energy <= 2.0 ** -48 * rhs_energy or (energy > 2.0 * rhs_energy and not moves):
+        energy, velocity = rhs_energy, rhs_velocity
+    # A size that overflows measures nothing: 0 makes every error beside it infinite.
+    p.set_start(energy if energy < 1.0 / 0.0 else 0.0, velocity if velocity < 1.0 / 0.0 else 0.0)
+    return relative(own_energy, own_velocity, p.start_energy, p.start_velocity) if finite else 1.0 / 0.0
+
+
 def velocity_change(Data p, const double[::1] lam, double[:, ::1] v):
     """M^-1 J^T lam (n, 6) of a factored problem, into v."""
     if not p.factored or p.rows.n_bodies == 0:

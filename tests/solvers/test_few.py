@@ -50,7 +50,9 @@ def draw(kind, seed):
         return lv.Problem.linear(a, rng.normal(size=9))
     if kind == "one-sided":  # unsymmetric
         return lv.Problem.lcp(
-            rng.normal(size=(6, 6)) + 6.0 * np.eye(6), rng.normal(size=6), friction=["coulomb", "cone"][seed % 2]
+            rng.normal(size=(6, 6)) + 6.0 * np.eye(6),
+            rng.normal(size=6),
+            friction=["coulomb", "cone"][seed % 2],
         )
     if kind.startswith("rows"):
         return random_contact_problem(
@@ -60,7 +62,9 @@ def draw(kind, seed):
         return as_matrix(draw("rows " + kind.split()[1], seed))
     law = kind.split()[1]
     tangents = int(rng.integers(1, 6)) if law == "cone" else int(rng.integers(0, 3))
-    return random_general(seed, law, n=int(rng.integers(2, 12)), compliance=seed % 3 > 0, contacts=4, tangents=tangents)
+    return random_general(
+        seed, law, n=int(rng.integers(2, 12)), compliance=seed % 3 > 0, contacts=4, tangents=tangents
+    )
 
 
 KINDS = (

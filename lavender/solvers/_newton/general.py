@@ -97,14 +97,18 @@ def claim(status: Status, counts: Any) -> Claim:
 
 def run_many(
     problems: list[Problem], kernels: list[Newton], impulses: list[FloatArray], tol: float
-) -> list[Claim | None]:
-    """`run` on each in one compiled loop, without a clock; the claim of those that converge, None for the others."""
+) -> list[tuple[Any, Any] | None]:
+    """`run` on each in one compiled loop, without a clock.
+
+    What the judge finds, which keeps the impulse, and the counts of those that converge; None for the others.
+    """
     cold = [_is_cold(p, lam) for p, lam in zip(problems, impulses, strict=True)]
     ends, counts = kernel_many(kernels, impulses, tol, CLOCK, cold)
-    return [
-        claim(Status.CONVERGED, count) if end == ENDS["done"] and confirmed(p, lam, tol) else None
-        for p, lam, end, count in zip(problems, impulses, ends.tolist(), counts.tolist(), strict=True)
-    ]
+    made: list[tuple[Any, Any] | None] = []
+    for p, lam, end, count in zip(problems, impulses, ends.tolist(), counts.tolist(), strict=True):
+        found = judged(p, lam) if end == ENDS["done"] else None
+        made.append((found, count) if found is not None and found.relative <= tol else None)
+    return made
 
 
 def named(claim: Claim, solver: str) -> Claim:
