@@ -187,7 +187,7 @@ cdef class Chain:
         space = allocate(self.data, MEMORY)
         if self.data.factored:
             velocity_change(self.data, own, space[3])
-        status, done, sweeps, restarts = accelerate(
+        _status, done, sweeps, restarts = accelerate(
             self.data, Watch(self.data, PATIENCE), own, self.first_look, tol, MEMORY, self.prepared,
             self.prepared is not None, 0, space, self.order, self.split, 0, self.rng)
         found = Judged(self.data, own)
