@@ -1,1 +1,1 @@
-"""Problems of few rows: look, solve and judge in one compiled call."""
+"""Problems of few rows: look, solve and judge in one call, over the kernels of other rooms."""
