@@ -20,6 +20,8 @@ from lavender.problem import Problem
 from lavender.registry import FEW, SolverSpec, get
 from lavender.solution import Solution
 from lavender.solve import decide_empty_rows, late, solve
+from lavender.solvers._costs import general_cost
+from lavender.solvers._few import GENERAL_FIRST
 from lavender.solvers._newton import general
 
 __all__ = ["solve_many"]
@@ -100,6 +102,10 @@ def _loop(problems: list[Problem], starts: list[Any], tol: float, spec: SolverSp
     """Those that the compiled loop ends, each with its share of the time; None for the others."""
     begin = perf_counter()
     prepared = [general.prepare(p) for p in problems]
+    if spec.name == "auto":  # which begins with it where it costs next to nothing
+        for i, kernel in enumerate(prepared):
+            if kernel is not None and general_cost(problems[i], kernel.largest) > GENERAL_FIRST:
+                prepared[i] = None
     held = [i for i, kernel in enumerate(prepared) if kernel is not None]
     if len(held) < len(problems):  # some are too large: the others alone
         those = iter(_loop([problems[i] for i in held], [starts[i] for i in held], tol, spec))

@@ -372,6 +372,11 @@ def _solve(trail: Trail, budget: int) -> None:
         if not any(_whole(trail, e, budget) for e in exact if e.key not in trail.ended):
             _certify(trail)
         return
+    if problem.cones.has_round:
+        # Nothing else takes them; what it began with may have been cut short.
+        if trail.largest:
+            _whole(trail, Exact("newton", 0.0, 0, (("form", "velocity"),)), budget)
+        return
     sweeps = None
     if problem.law == "lcp" and problem.m <= FEW and problem.is_symmetric:
         # START of sweeps alone costs more than a dense factor of so few rows.

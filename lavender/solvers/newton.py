@@ -89,6 +89,11 @@ class Newton:
                     f"form='velocity' keeps a dense matrix for each island of at most {general.LIMIT} velocities; "
                     "this problem has a larger one: use form='impulse' or sweeps"
                 )
+        if problem.cones.has_round:
+            raise CapabilityError(
+                "round cones of more than two tangents are solved over velocities alone: form='impulse' does not take "
+                f"them, and form='velocity' has room for islands of at most {general.LIMIT} velocities"
+            )
         form = self.form
         if form == "auto":
             form = "impulse" if problem.rows is None or problem.rows.n_bodies == 0 else "velocity"

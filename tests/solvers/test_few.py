@@ -152,3 +152,12 @@ def test_what_is_refused_is_refused_the_same_way():
         lv.solve(problem, tol=float("nan"))
     with pytest.raises(lv.errors.InputError, match=r"lavender\.Problem is needed"):
         lv.solve(3)
+
+
+def test_round_cones_are_never_solved_over_rows_of_a():
+    problem = random_general(0, "cone", n=8, compliance=False, contacts=4, tangents=5)
+    with pytest.raises(lv.errors.CapabilityError, match="over velocities alone"):
+        lv.solve(problem, "newton", form="impulse")
+    # What it cannot take further ends as a result, not in a solver that reads past such a block.
+    hard = lv.prepare(problem, "auto").solve(tol=1e-15)
+    assert np.isfinite(hard.residual.relative) and not hard.contradicted
