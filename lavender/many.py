@@ -17,11 +17,11 @@ import numpy as np
 from lavender._arrays import FloatArray
 from lavender.errors import InputError
 from lavender.problem import Problem
-from lavender.registry import FEW, SolverSpec, get
+from lavender.registry import SolverSpec, get
 from lavender.solution import Solution
 from lavender.solve import decide_empty_rows, late, solve
 from lavender.solvers._costs import general_cost
-from lavender.solvers._few import GENERAL_FIRST
+from lavender.solvers._few import FEW_GENERAL, GENERAL_FIRST
 from lavender.solvers._newton import general
 
 __all__ = ["solve_many"]
@@ -72,7 +72,9 @@ def solve_many(
     spec = get(solver)
     more = {"tol": tol, "max_iter": max_iter, **options}
     at = [
-        i for i, p in enumerate(given) if isinstance(p, Problem) and p.generalized is not None and p.m > FEW
+        i
+        for i, p in enumerate(given)
+        if isinstance(p, Problem) and p.generalized is not None and p.m > FEW_GENERAL
     ]
     quick = not options and solver in ("auto", "newton") and max_iter is None and 0.0 <= tol < np.inf
     parts = [at[k::threads] for k in range(min(threads, len(at)))] if quick else []

@@ -190,11 +190,19 @@ class Solution:
         )
 
     @classmethod
-    def late(cls, known: dict[str, Any], rest: Callable[[], dict[str, Any]]) -> Solution:
-        """Fields that are known, and a function of the others for the first who asks."""
+    def late(
+        cls,
+        impulse: FloatArray,
+        status: Status,
+        tol: float,
+        solve_time: float,
+        rest: tuple[Callable[..., dict[str, Any]], tuple[Any, ...]],
+    ) -> Solution:
+        """Fields that are known; `rest`, a function and its arguments, are the others for the first who asks."""
         made: Solution = object.__new__(cls)
-        known["_rest"] = rest
-        object.__setattr__(made, "__dict__", known)
+        kept = made.__dict__
+        kept["impulse"], kept["status"], kept["tol"] = impulse, status, tol
+        kept["setup_time"], kept["solve_time"], kept["_rest"] = 0.0, solve_time, rest
         return made
 
     def __getattr__(self, name: str) -> Any:
@@ -202,7 +210,8 @@ class Solution:
         kept = self.__dict__
         rest = kept.get("_rest")
         if rest is not None:
-            kept.update(rest())  # two threads write the same
+            function, arguments = rest
+            kept.update(function(*arguments))  # two threads write the same
             kept.pop("_rest", None)
         if name in kept:
             return kept[name]

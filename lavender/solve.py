@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from functools import partial
 from threading import Lock
 from time import perf_counter
 from types import MappingProxyType
@@ -22,7 +21,7 @@ from lavender.certificates import check_certificate
 from lavender.cones import ROW
 from lavender.errors import CapabilityError, InputError, InUse, UnknownName
 from lavender.problem import Problem
-from lavender.registry import FEW, SolverSpec, State, get
+from lavender.registry import SolverSpec, State, get
 from lavender.residuals import Residual, reference, residual, told
 from lavender.solution import Claim, History, Solution, SolverRun, Status
 from lavender_ext.judge.measure import all_finite
@@ -32,6 +31,7 @@ __all__ = ["Prepared", "prepare", "solve"]
 CHUNK_TIME = 0.025  # s, aim; twice that is still below what a person notices on Ctrl-C
 FIRST_CHUNK = 256  # iterations: 25 ms at 100 us each, slower than any compiled sweep of few rows
 Callback = Callable[[int, FloatArray, Residual], Any]
+_CONVERGED = Status.CONVERGED
 NOTHING_DONE = Claim(Status.MAX_ITERATIONS, 0)
 # What arithmetic on legal numbers may end in: a result, with the solver's last word as its message.
 BREAKDOWN = (ArithmeticError, np.linalg.LinAlgError, MemoryError)
@@ -411,15 +411,19 @@ def solve_few(problem: Problem, spec: SolverSpec, impulse: Any, tol: float) -> S
 
     Claim, counts and residual are put in words when somebody asks for them.
     """
-    if (
-        type(problem) is not Problem
-        or problem.m > FEW
-        or not isinstance(tol, float)
-        or not 0.0 < tol < math.inf
-    ):
+    if type(problem) is not Problem or not isinstance(tol, float) or not 0.0 < tol < math.inf:
         return None
     start = perf_counter()
-    given = problem.guess if impulse is None else problem.impulse_array(impulse)
+    if impulse is None:
+        given = problem.guess
+    elif (
+        type(impulse) is np.ndarray and impulse.dtype is problem.b.dtype and impulse.shape == problem.b.shape
+    ):
+        given = (
+            impulse if impulse.flags.c_contiguous and all_finite(impulse) else problem.impulse_array(impulse)
+        )
+    else:
+        given = problem.impulse_array(impulse)
     assert spec.few is not None
     found = spec.few.solve(problem, given, tol)
     if found is None:
@@ -432,15 +436,9 @@ def late(
     problem: Problem, spec: SolverSpec, judged: Any, counts: Any, tol: float, seconds: float
 ) -> Solution:
     """A solution that the judge found below tol, in words when somebody asks; `counts` as `spec.few` tells them."""
-    judged.impulse.flags.writeable = False
-    known = {
-        "impulse": judged.impulse,
-        "status": Status.CONVERGED,
-        "tol": tol,
-        "setup_time": 0.0,
-        "solve_time": seconds,
-    }
-    return Solution.late(known, partial(_rest, problem, spec, judged, counts))
+    impulse = judged.impulse
+    impulse.setflags(write=False)
+    return Solution.late(impulse, _CONVERGED, tol, seconds, (_rest, (problem, spec, judged, counts)))
 
 
 def _rest(problem: Problem, spec: SolverSpec, judged: Any, counts: Any) -> dict[str, Any]:

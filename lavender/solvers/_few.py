@@ -19,6 +19,7 @@ from lavender.solvers._newton import general
 from lavender_ext.few.chain import PIVOTS, SWEEPS, VELOCITIES, Chain
 
 GENERAL_FIRST = 0.4e6  # ns of newton over generalised velocities up to which nothing else is looked at first
+FEW_GENERAL = 1000  # rows in generalised coordinates, where nothing of Python's grows with them
 WARM = 1e-3  # relative residual from which an iterate is worth starting from
 
 
@@ -31,7 +32,7 @@ def prepared(problem: Problem) -> Chain | None:
 
 
 def _make(problem: Problem) -> Chain | None:
-    if not 0 < problem.m <= FEW:
+    if not 0 < problem.m <= (FEW if problem.generalized is None else FEW_GENERAL):
         return None
     reference(problem)
     data, start = problem.metric, problem._start

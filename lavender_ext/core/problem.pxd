@@ -7,6 +7,13 @@ from lavender_ext.core.generalized cimport generalized_t
 from lavender_ext.core.rows cimport rows_t
 
 
+cdef class Room:
+    cdef void* at               # freed with the object
+
+
+cdef Room room_for(Py_ssize_t bytes)
+
+
 cdef class Data:
     cdef blocks_t blocks
     cdef csr_t csr              # where A is given, or formed

@@ -8,6 +8,7 @@
 """
 from libc.math cimport fabs
 from libc.stdint cimport int32_t
+from libc.stdlib cimport free, malloc
 
 import numpy as np
 
@@ -201,6 +202,21 @@ cdef public int32_t lav_general_diagonal(const blocks_t* p, const generalized_t*
     return n_empty
 
 
+cdef class Room:
+    """Memory that lives as long as this: a quarter of what an array of NumPy and a view of it cost to make."""
+
+    def __dealloc__(self):
+        free(self.at)
+
+
+cdef Room room_for(Py_ssize_t bytes):
+    cdef Room made = Room.__new__(Room)
+    made.at = malloc(bytes if bytes > 0 else 1)
+    if made.at == NULL:
+        raise MemoryError(f"{bytes} bytes")
+    return made
+
+
 cdef class Data:
     """Pointers to a problem's arrays, and the numbers derived from them once.
 
@@ -220,7 +236,8 @@ cdef class Data:
         cdef double* d = &numbers[0]
         cdef double* nu = d + m + 1
         cdef double* step = nu + m + 1
-        cdef int32_t[::1] empty = np.zeros(m + 1, np.int32)
+        cdef Room marks = room_for((<Py_ssize_t>m + 1) * sizeof(int32_t))
+        cdef int32_t* empty = <int32_t*>marks.at
         cdef const int32_t[::1] indptr, indices
         cdef const double[::1] data
         self.keep = [ptr_, kind_, lower_, upper_, mu_, patch_radius_, b_, numbers_, csr, rows]
@@ -247,11 +264,11 @@ cdef class Data:
                 self.single_rows = False
         if self.is_general:
             self._set_general(general)
-            n_empty = lav_general_diagonal(&self.blocks, &self.general, d, nu, step, &empty[0],
+            n_empty = lav_general_diagonal(&self.blocks, &self.general, d, nu, step, empty,
                                            <int32_t*>self._place, <double*>self.general.y)
         elif self.factored:
             self._set_rows(rows)
-            n_empty = lav_rows_diagonal(&self.blocks, &self.rows, d, nu, step, &empty[0],
+            n_empty = lav_rows_diagonal(&self.blocks, &self.rows, d, nu, step, empty,
                                         <double*>self.rows.minv_jac, <double*>self.rows.coupling,
                                         <double*>self.rows.swing)
         else:
@@ -260,16 +277,18 @@ cdef class Data:
             if data.shape[0] > 0:
                 self.csr.indices = &indices[0]
                 self.csr.data = &data[0]
-            n_empty = lav_csr_diagonal(&self.blocks, &self.csr, d, step, &empty[0])
+            n_empty = lav_csr_diagonal(&self.blocks, &self.csr, d, step, empty)
             lav_matrix_nu(&self.blocks, nu)
         self._numbers = numbers_
-        self.empty = _read_only(np.flatnonzero(empty.base[:m])) if n_empty else _NONE
+        self.empty = _NONE
+        if n_empty:
+            self.empty = _read_only(np.array([i for i in range(m) if empty[i]], np.intp))
 
     def _set_general(self, general):
         cdef Operator operator
         cdef const double[::1] compliance
-        cdef int32_t[::1] whole
-        cdef double[::1] y
+        cdef Room held, values_of_y
+        cdef int32_t* whole
         cdef int32_t n, m = self.blocks.n_rows, k = self.blocks.n_blocks, count, n_cols
         cdef Py_ssize_t room, head
         cdef double values
@@ -279,8 +298,8 @@ cdef class Data:
         head = 2 * n + 3 * (k + 1)
         room = 2 * <Py_ssize_t>operator.g.jptr[m] + 64
         while True:
-            whole_ = np.empty(head + room, np.int32)
-            whole = whole_
+            held = room_for((head + room) * sizeof(int32_t))
+            whole = <int32_t*>held.at
             count = panel_pattern(&self.general, k, self.blocks.ptr, &whole[0], &whole[2 * n], &whole[2 * n + k + 1],
                                   &whole[2 * n + 2 * (k + 1)], &whole[head], <int32_t>room, &n_cols, &values)
             if count >= 0:
@@ -288,16 +307,15 @@ cdef class Data:
             room = min(2 * room, 2147483647 - head)
         if values >= 2147483647.0:
             raise OverflowError(f"M^-1 J^T has {values:.3g} entries, more than 32-bit indices reach")
-        y_ = np.empty(<Py_ssize_t>values + 1)
-        y = y_
-        self.keep += [general, whole_, y_]
-        self._place = &whole[0]
+        values_of_y = room_for((<Py_ssize_t>values + 1) * sizeof(double))
+        self.keep += [general, held, values_of_y]
+        self._place = whole
         self.general.n_panels = count
         self.general.prow = &whole[2 * n]
         self.general.pcol = &whole[2 * n + k + 1]
         self.general.pval = &whole[2 * n + 2 * (k + 1)]
         self.general.cols = &whole[head]
-        self.general.y = &y[0]
+        self.general.y = <double*>values_of_y.at
         if m:
             self.general.compliance = &compliance[0]
 

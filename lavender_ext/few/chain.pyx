@@ -135,9 +135,9 @@ cdef class Chain:
                 found = Judged(self.data, impulse)
                 before = found.relative
                 if before <= tol:
-                    return found, None
+                    return Judged(self.data, impulse.copy()), None
             elif before <= tol:
-                return Judged(self.data, self.start if impulse is None else impulse), None
+                return Judged(self.data, self.start.copy()), None
             if self.kind == PIVOTS and not before <= warm:
                 impulse = None
         own = (self.start if impulse is None else impulse).copy()

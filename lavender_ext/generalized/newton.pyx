@@ -5,7 +5,7 @@ import numpy as np
 
 from lavender_ext.core.block cimport ROW, blocks_t
 from lavender_ext.core.generalized cimport generalized_t
-from lavender_ext.core.problem cimport Data
+from lavender_ext.core.problem cimport Data, Room, room_for
 from lavender_ext.generalized.newton cimport DONE, FAILED, LOST, SPENT, STUCK, flow_t, solve_island
 
 ENDS = {"done": DONE, "spent": SPENT, "stuck": STUCK, "failed": FAILED, "lost": LOST}
@@ -134,9 +134,8 @@ cdef class Newton:
         cdef int32_t most[4]
         cdef Py_ssize_t at, nv, size
         cdef int32_t wide = n if n > panels else panels
-        cdef int32_t[::1] whole = np.empty(3 * n + wide + 4 * panels + k + 8, np.int32)
-        cdef int32_t* w = &whole[0]
-        cdef double[::1] room
+        cdef Room whole = room_for((3 * <Py_ssize_t>n + wide + 4 * panels + k + 8) * sizeof(int32_t)), room
+        cdef int32_t* w = <int32_t*>whole.at
         cdef double* x
         most[0] = most[1] = most[2] = most[3] = 0
         self.data = p
@@ -161,8 +160,9 @@ cdef class Newton:
             return
         size = most[0]
         nv = self.f.vptr[k]
-        room = np.empty(4 * n + 12 * <Py_ssize_t>m + 2 * nv + 2 * size * size + 2 * size + most[2] + most[1] + most[3] + 1)
-        x = &room[0]
+        room = room_for(sizeof(double) * (4 * n + 12 * <Py_ssize_t>m + 2 * nv + 2 * size * size + 2 * size + most[2]
+                                          + most[1] + most[3] + 1))
+        x = <double*>room.at
         self.f.y = x
         self.f.u = x + n
         self.f.grad = x + 2 * n

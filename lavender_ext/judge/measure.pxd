@@ -382,7 +382,8 @@ cdef inline void judge_into(const blocks_t* p, const csr_t* a, const rows_t* r, 
 
 cdef class Judged:
     cdef readonly Data data                             # of the problem
-    cdef readonly object impulse, slack, error          # (m,) N s; w (m,) m/s; e (m,) N s
+    cdef readonly object impulse                        # (m,) N s
+    cdef object both                                    # w (m,) m/s, then e (m,) N s
     cdef readonly double energy, velocity               # sqrt J, m/s; inf where e is not finite
     cdef readonly double relative, floor                # -
     cdef readonly int worst                             # row of the largest velocity error, -1

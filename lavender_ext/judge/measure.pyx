@@ -7,7 +7,7 @@ import numpy as np
 from lavender_ext.core.block cimport blocks_t
 from lavender_ext.core.csr cimport csr_t
 from lavender_ext.core.generalized cimport generalized_t
-from lavender_ext.core.problem cimport Data
+from lavender_ext.core.problem cimport Data, Room, room_for
 from lavender_ext.core.rows cimport rows_t
 from lavender_ext.core.velocity cimport rows_velocity
 from lavender_ext.judge.measure cimport csr_slack, general_judge, general_slack, judge_into, rows_slack
@@ -86,30 +86,46 @@ cdef class Judged:
 
     def __init__(self, Data p, impulse):
         cdef const double[::1] lam = impulse
-        cdef double[::1] w, e, bodies
-        cdef double* v = NULL
+        cdef Py_ssize_t m = lam.shape[0]
+        cdef double[::1] both
+        cdef double* w
+        cdef double* e
+        cdef Room room
+        cdef double* x = NULL
         cdef score_t s = score_t(0.0, 0.0, 0.0, 0.0, -1, 1)
         self.data = p
         self.impulse = impulse
-        self.slack = w = np.empty(lam.shape[0])
-        self.error = e = np.empty(lam.shape[0])
+        self.both = both = np.empty(2 * m + 1)
+        w = &both[0]
+        e = w + m
         if p.blocks.n_rows > 0 and p.is_general:
-            bodies = np.empty(p.general.n + p.blocks.n_rows)
+            room = room_for((<Py_ssize_t>p.general.n + m) * sizeof(double))
+            x = <double*>room.at
             with nogil:
-                general_judge(&p.blocks, &p.general, &lam[0], &w[0], &e[0], &bodies[0], True, &s)
+                general_judge(&p.blocks, &p.general, &lam[0], w, e, x, True, &s)
         elif p.blocks.n_rows > 0:
             if p.factored:
-                bodies = np.empty(12 * <Py_ssize_t>p.rows.n_bodies + 1)
-                v = &bodies[0]
+                room = room_for(12 * <Py_ssize_t>p.rows.n_bodies * sizeof(double))
+                x = <double*>room.at
             with nogil:
-                judge_into(&p.blocks, &p.csr, &p.rows, p.factored, &lam[0], &w[0], &e[0], v, True, &s)
+                judge_into(&p.blocks, &p.csr, &p.rows, p.factored, &lam[0], w, e, x, True, &s)
         self.energy = s.energy if s.finite else 1.0 / 0.0
         self.velocity = s.velocity if s.finite else 1.0 / 0.0
         self.worst = s.worst
         self.relative = 1.0 / 0.0
-        if p.blocks.n_rows == 0 or are_numbers(&w[0], p.blocks.n_rows):
+        if p.blocks.n_rows == 0 or are_numbers(w, p.blocks.n_rows):
             self.relative = relative(self.energy, self.velocity, p.start_energy, p.start_velocity)
         self.floor = relative(s.floor_energy, s.floor_velocity, p.start_energy, p.start_velocity)
+
+    @property
+    def slack(self):
+        """w (m,) m/s"""
+        return self.both[:self.data.blocks.n_rows]
+
+    @property
+    def error(self):
+        """e (m,) N s"""
+        return self.both[self.data.blocks.n_rows:2 * self.data.blocks.n_rows]
 
 
 def compare(double energy, double velocity, double start_energy, double start_velocity):
@@ -158,33 +174,45 @@ def score(Data p, const double[::1] lam, const double[::1] w, double[::1] e):
     return s.energy, s.velocity, s.worst, bool(s.finite)
 
 
-def begin(Data p, const double[::1] start):
-    """Judge `start` = Pi(0), keep E0 and V0 with the data, and return its own relative residual."""
-    cdef Py_ssize_t i, m = start.shape[0]
+def begin(Data p):
+    """Judge doing nothing and keep E0 and V0 with the data: (Pi(0) (m,), read-only; its own relative residual)."""
+    cdef Py_ssize_t i, m = p.blocks.n_rows
     cdef bint moves = False
     cdef double rhs_energy, rhs_velocity, energy, velocity
-    cdef double own_energy = 0.0, own_velocity = 0.0
-    cdef bint finite = True
-    cdef double[::1] room
+    cdef score_t s = score_t(0.0, 0.0, 0.0, 0.0, -1, 1)
+    cdef double[::1] x
+    cdef Room room
+    cdef double* w
+    start = np.zeros(m)
     if m > 0:
-        room = np.empty(2 * m)
+        x = start
+        room = room_for((3 * m + (p.general.n if p.is_general else 6 * <Py_ssize_t>p.rows.n_bodies)) * sizeof(double))
+        w = <double*>room.at
         for i in range(m):
-            moves |= start[i] != 0.0
+            if p.blocks.lower[i] > 0.0:
+                x[i] = p.blocks.lower[i]
+            elif p.blocks.upper[i] < 0.0:
+                x[i] = p.blocks.upper[i]
+            moves |= x[i] != 0.0
+            w[i] = -p.blocks.b[i]                       # A 0 - b, without a pass over A
+        if not moves:
+            score_rows(&p.blocks, &x[0], w, w + m, &s)
+        elif p.is_general:
+            general_judge(&p.blocks, &p.general, &x[0], w, w + m, w + 2 * m, False, &s)
+        else:
+            judge_into(&p.blocks, &p.csr, &p.rows, p.factored, &x[0], w, w + m, w + 2 * m, False, &s)
         if moves:
-            own_energy, own_velocity, _, _, _, finite = judge(p, start, room[:m], room[m:], False)
-        else:                                           # the same numbers without a pass over A
-            for i in range(m):
-                room[i] = -p.blocks.b[i]
-            own_energy, own_velocity, _, finite = score(p, start, room[:m], room[m:])
+            s.finite = s.finite and are_numbers(w, p.blocks.n_rows)
+    start.setflags(write=False)
     norms_of_rhs(&p.blocks, &rhs_energy, &rhs_velocity)
     # The norms of b: sqrt(sum b^2 / d), max |b| sqrt(nu / d), |b| the pair's norm on tangents.
-    energy, velocity = own_energy, own_velocity
+    energy, velocity = s.energy, s.velocity
     # Doing nothing costs no more energy than b; more is what `quotient` (block.pxd) makes of a vanishing w / d.
     if energy <= 2.0 ** -48 * rhs_energy or (energy > 2.0 * rhs_energy and not moves):
         energy, velocity = rhs_energy, rhs_velocity
     # A size that overflows measures nothing: 0 makes every error beside it infinite.
     p.set_start(energy if energy < 1.0 / 0.0 else 0.0, velocity if velocity < 1.0 / 0.0 else 0.0)
-    return relative(own_energy, own_velocity, p.start_energy, p.start_velocity) if finite else 1.0 / 0.0
+    return start, relative(s.energy, s.velocity, p.start_energy, p.start_velocity) if s.finite else 1.0 / 0.0
 
 
 def velocity_change(Data p, const double[::1] lam, double[:, ::1] v):
