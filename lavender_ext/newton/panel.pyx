@@ -75,7 +75,8 @@ cdef public void lav_panel(const blocks_t* p, const rows_t* r, const double* roo
 def scaled_jacobian(Data p, const double[:, :, ::1] inv_inertia, const double[::1] root_mass, double[:, ::1] out):
     """K = D^-1/2 J M^-1/2 (m, 12) of a factored problem; root_mass (n,) = sqrt(inv_mass).
 
-    Returns the columns that hold anything, of a body's six, as bits.
+    Returns the columns that hold anything, of a body's six, as bits. What is at most 1e-9 (spheres turned by the rounding
+    of their arms) is nothing: H = K K^T + theta has a unit diagonal, and feels 1e-18 of it.
     """
     cdef int32_t n = <int32_t>root_mass.shape[0], used = 0, c
     cdef int64_t i
@@ -87,7 +88,7 @@ def scaled_jacobian(Data p, const double[:, :, ::1] inv_inertia, const double[::
         lav_panel(&p.blocks, &p.rows, &root[0], &root_mass[0], &out[0, 0])
         for i in range(out.shape[0]):
             for c in range(12):
-                if out[i, c] != 0.0:
+                if not -1e-9 <= out[i, c] <= 1e-9:
                     used = used | (1 << (c if c < 6 else c - 6))
             if used == 63:
                 break
