@@ -1,5 +1,23 @@
 """A sparse matrix of square blocks and its factor: patterns by block rows and columns, made by symbolic.pyx."""
-from libc.stdint cimport int32_t
+from libc.stdint cimport int32_t, int64_t
+
+
+cdef struct supernodes_t:       # block columns of one pattern, as dense panels (supernodal.pxd)
+    int32_t n                   # panels
+    int32_t wide                # 1 where four lanes are one instruction
+    const int32_t* first        # (n + 1) block columns
+    const int32_t* of           # (blocks) panel of a block column
+    const int32_t* rptr         # (n + 1) block rows below a panel, ascending
+    const int32_t* rows
+    const int32_t* height       # (n) rows of a panel
+    const int64_t* at           # (n + 1) of a panel in `val`
+    const int64_t* spot         # of each lower block of N in `val`
+    double* val
+    double* temp                # what one panel takes from another, at most
+    int32_t* place              # (blocks) first row of a block row in the present panel
+    int32_t* head               # (n) panels that take from a panel next
+    int32_t* link               # (n)
+    int32_t* next               # (n) first row not yet taken
 
 
 cdef struct factor_t:
@@ -20,3 +38,4 @@ cdef struct factor_t:
     double* work2
     int32_t* pivot              # (n s), unsymmetric only
     int32_t* next               # (n)
+    const supernodes_t* super   # or NULL: L then stands in `lval` and `dval`

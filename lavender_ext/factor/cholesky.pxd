@@ -1,8 +1,9 @@
-"""Block Cholesky of a symmetric positive definite matrix, N = L L^T, up-looking by block rows."""
+"""Block Cholesky of a symmetric positive definite matrix, N = L L^T, up-looking by block rows; by panels (`supernodal.pxd`) where there are such."""
 from libc.math cimport sqrt
 from libc.stdint cimport int32_t, int64_t
 
 from lavender_ext.factor.blocks cimport factor_t
+from lavender_ext.factor.supernodal cimport super_cholesky, super_solve
 
 
 cdef inline void sub_transposed(double* wt, const double* yt, const double* lt, const int32_t s) noexcept nogil:
@@ -129,7 +130,9 @@ cdef inline int32_t factor_blocks(const factor_t* f, const int32_t s) noexcept n
 
 
 cdef inline int32_t block_cholesky(const factor_t* f) noexcept nogil:
-    """N = L L^T, up-looking by block rows; returns the number of pivots lost to rounding."""
+    """N = L L^T, by panels or up-looking by block rows; returns the number of pivots lost to rounding."""
+    if f.super != NULL:
+        return super_cholesky(f)
     if f.s == 1:
         return factor_blocks(f, 1)
     if f.s == 2:
@@ -181,6 +184,9 @@ cdef inline void solve_blocks(const factor_t* f, double* x, const int32_t s) noe
 
 cdef inline void block_solve(const factor_t* f, double* x) noexcept nogil:
     """x <- N^-1 x after `block_cholesky`, x (n, s)."""
+    if f.super != NULL:
+        super_solve(f, x)
+        return
     if f.s == 1:
         solve_blocks(f, x, 1)
     elif f.s == 3:

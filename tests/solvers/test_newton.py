@@ -247,6 +247,67 @@ def test_block_factor_on_a_graph_of_bodies_matches_dense(few, monkeypatch):
         np.testing.assert_allclose(out, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
 
 
+@pytest.mark.parametrize("s", [1, 2, 3, 6])
+@pytest.mark.parametrize(("few", "share"), [(1, 0.0), (6, 0.1), (100, 1.0)])
+def test_panels_solve_what_a_dense_matrix_solves_with_the_same_bits_at_any_width(s, few, share):
+    rng = np.random.default_rng(100 * s + few)
+    n, m = 40, 110
+    body = rng.integers(-1, n, (m, 2))
+    body = np.ascontiguousarray(body[body[:, 0] != body[:, 1]], np.int32)
+    m = len(body)
+    nptr, nind, node, _, _ = pattern.block_pattern(n, body)
+    nptr, nind, node, slot, _ = pattern.postordered(n, node, nptr, nind)
+    structure = symbolic.factor_pattern(nptr, nind)
+    panels = symbolic.supernodes(nptr, nind, *structure[:2], s, few, share)
+    assert panels[0][-1] == n and len(panels[0]) - 1 < n
+    panel = rng.normal(size=(m, 2, s))
+    panel[node[:, 1] < 0, 1] = 0.0
+    k = np.zeros((m, n * s))
+    for i, (a, b) in enumerate(node):
+        k[i, a * s : a * s + s] = panel[i, 0]
+        if b >= 0:
+            k[i, b * s : b * s + s] = panel[i, 1]
+    index, zero = np.arange(m + 1, dtype=np.int32), np.zeros(m)
+    elements = Elements(
+        index, np.zeros(m, np.int32), index, node, slot, panel.copy(), zero, zero.copy(),
+        zero.copy(), zero + np.inf, zero.copy(), zero.copy(), s,
+    )  # fmt: skip
+    v, x, y = rng.uniform(0.1, 10.0, m), rng.normal(size=m), np.zeros(n * s)
+    expected = k @ np.linalg.solve(np.eye(n * s) + k.T @ (v[:, None] * k), k.T @ x)
+    outs = []
+    for wide in (True, False):
+        factor = Factor(nptr, nind, *structure, s, False, panels, wide)
+        for _ in range(2):  # what a factor leaves behind does not reach the next
+            out = np.zeros(m)
+            assert factor.factor(elements, v) == 0
+            factor.solve(elements, x, y, out)
+        outs.append(out)
+        np.testing.assert_allclose(out, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
+    assert outs[0].tobytes() == outs[1].tobytes()
+
+
+def test_postorder_keeps_the_fill():
+    rng = np.random.default_rng(3)
+    n = 60
+    body = np.ascontiguousarray(rng.integers(0, n, (150, 2)), np.int32)
+    body = body[body[:, 0] != body[:, 1]]
+    nptr, nind, node, _, _ = pattern.block_pattern(n, body)
+    before = symbolic.factor_pattern(nptr, nind)
+    nptr, nind, *_ = pattern.postordered(n, node, nptr, nind)
+    after = symbolic.factor_pattern(nptr, nind)
+    assert sorted(np.diff(before[0])) == sorted(np.diff(after[0]))
+
+
+def test_spheres_turned_by_rounding_alone_have_three_unknowns_each():
+    problem = suite.case("wild(seed=239)").problem
+    rows = problem.rows
+    assert rows is not None and rows.inv_inertia.any()
+    system = make_system(problem, "velocity")
+    solution = lv.solve(problem, "newton", tol=1e-10)
+    assert system.s == 3
+    assert good(solution, 1e-10), solution
+
+
 def test_a_chain_of_bodies_gets_the_pattern_of_any_graph(monkeypatch):
     rng = np.random.default_rng(5)
     n = 40

@@ -13,7 +13,7 @@ from lavender_ext.factor import graph, symbolic
 FEW_BODIES = 1500  # up to here bits hold the neighbours of a body
 
 
-def block_pattern(n: int, body: IntArray) -> tuple[IntArray, IntArray, IntArray, IntArray, IntArray]:
+def block_pattern(n: int, body: IntArray) -> tuple[IntArray, ...]:
     """Lower block rows (nptr, nind); places (larger first) and slots of each element; which ones were turned."""
     if n <= FEW_BODIES:
         nptr, nind, node, slot, turned = graph.body_pattern(body, n)
@@ -25,7 +25,22 @@ def block_pattern(n: int, body: IntArray) -> tuple[IntArray, IntArray, IntArray,
     both = (a >= 0) & (b >= 0)
     code = np.unique(np.minimum(a, b)[both] * n + np.maximum(a, b)[both])
     low, high = code // n, code % n
-    rank = _fill_reducing(n, low, high)
+    return _pattern(n, body, low, high, _fill_reducing(n, low, high))
+
+
+def postordered(n: int, node: IntArray, nptr: IntArray, nind: IntArray) -> tuple[IntArray, ...]:
+    """The same pattern with columns of one pattern beside each other; node (k, 2) the places of each element.
+
+    `turned` says which elements are turned from what they were.
+    """
+    rank = symbolic.postorder(nptr, nind).astype(np.int64)
+    row = np.repeat(np.arange(n), np.diff(nptr))
+    off = nind < row
+    return _pattern(n, node, nind[off].astype(np.int64), row[off].astype(np.int64), rank)
+
+
+def _pattern(n: int, body: IntArray, low: Any, high: Any, rank: Any) -> tuple[IntArray, ...]:
+    both = (body >= 0).all(axis=1)
     r_low, r_high = rank[low], rank[high]
     row, column = np.maximum(r_low, r_high), np.minimum(r_low, r_high)
     row, column = np.concatenate([row, np.arange(n)]), np.concatenate([column, np.arange(n)])

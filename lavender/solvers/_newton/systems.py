@@ -7,6 +7,7 @@ equations are in `lavender_ext/newton/`.
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -23,7 +24,7 @@ from scipy.linalg.lapack import dpotrs as potrs
 
 from lavender._arrays import FloatArray, IntArray
 from lavender.problem import Problem
-from lavender.solvers._newton.pattern import block_pattern
+from lavender.solvers._newton.pattern import block_pattern, postordered
 from lavender.solvers._newton.scaled import Scaled, scaled
 from lavender_ext.factor import symbolic
 from lavender_ext.newton.band import (
@@ -55,7 +56,20 @@ BAND_FILL = 1000.0  # multiply-adds for each nonzero of A up to which LAPACK's b
 # Weight of the proximal term in an interior point system, relative to d: far below any step that
 # matters, far above the rounding of a pivot.
 DELTA = 1e-10
+# Multiply-adds of a factor over bodies from which dense panels beat block rows; a panel's columns up to which, and
+# share up to which (four times it for so few columns), zeros are held as numbers.
+PANELS, FEW_COLUMNS, ZEROS = 2e6, 6, 0.1
+WIDE = os.environ.get("LAVENDER_BASELINE", "0") in (
+    "",
+    "0",
+)  # four lanes where the machine has them: the same bits
 DAMPING = 0.995  # share of the way to the boundary that a step takes
+
+
+def factor_cost(lptr: IntArray, s: int) -> float:
+    """Multiply-adds of a factor over bodies of s unknowns each, by its block columns."""
+    of_column = np.diff(lptr).astype(float)
+    return float(s**3 * (0.5 * float(of_column @ of_column) + float(lptr[-1]) + len(of_column)))
 
 
 class System:
@@ -145,14 +159,20 @@ class VelocitySystem(System):
         s = next(k for k in (1, 2, 3, 6) if k >= len(columns))
         columns = sorted((columns + [c for c in range(6) if not used >> c & 1])[:s])
         nptr, nind, node, slot, turned = block_pattern(rows.n_bodies, sc.bodies)
+        structure = symbolic.factor_pattern(nptr, nind)
+        self.cost = factor_cost(structure[0], s)
+        self.panels: tuple[Any, ...] | None = None
+        if self.cost >= PANELS:
+            nptr, nind, node, slot, again = postordered(rows.n_bodies, node, nptr, nind)
+            turned = (turned != again).astype(np.int32)
+            structure = symbolic.factor_pattern(nptr, nind)
+            self.panels = symbolic.supernodes(nptr, nind, *structure[:2], s, FEW_COLUMNS, ZEROS)
         halves = np.empty((sc.m, 2, s))
         narrow(full, sc.keep, sc.ptr, turned, np.array(columns, np.int32), halves)
         self.s, self.n = s, rows.n_bodies
         self.elements = self._elements(node, slot, halves, s)
-        self.structure = (nptr, nind, *symbolic.factor_pattern(nptr, nind))
+        self.structure = (nptr, nind, *structure)
         self.y = np.zeros(self.n * s + 1)
-        of_column = np.diff(self.structure[2]).astype(float)  # blocks of L
-        self.cost = s**3 * (0.5 * float(of_column @ of_column) + float(self.structure[2][-1]) + self.n)
         if len(sc.kind) < sc.m and not sc.theta.any():
             self.bt = np.zeros_like(self.v)
         self.factor: Any = None
@@ -176,7 +196,7 @@ class VelocitySystem(System):
     def blocks(self, lu: bool) -> Any:
         """The factor's storage, made when it is first needed."""
         if self.factor is None or (lu and not self.factor_unsymmetric):
-            self.factor = Factor(*self.structure, self.s, lu)
+            self.factor = Factor(*self.structure, self.s, lu, self.panels, WIDE)
             self.factor_unsymmetric = lu
         return self.factor
 
