@@ -1,4 +1,7 @@
-"""Block Cholesky of a symmetric positive definite matrix, N = L L^T, up-looking by block rows; by panels (`supernodal.pxd`) where there are such."""
+"""Block Cholesky of a symmetric positive definite matrix, N = L L^T, up-looking by block rows.
+
+Where a factor has panels, by those (`supernodal.pxd`).
+"""
 from libc.math cimport sqrt
 from libc.stdint cimport int32_t, int64_t
 

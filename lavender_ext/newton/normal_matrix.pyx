@@ -77,7 +77,8 @@ cdef class Factor:
         self.keep += [panels, val, room, place, head, link, nxt]
         self.p = supernodes_t(
             k, wide and has_wide(), <int32_t*>address(first), <int32_t*>address(of), <int32_t*>address(rptr),
-            <int32_t*>address(rows), <int32_t*>address(height), <int64_t*>address(at.view(np.float64)), <int64_t*>address(spot.view(np.float64)),
+            <int32_t*>address(rows), <int32_t*>address(height), <int64_t*>address(at.view(np.float64)),
+            <int64_t*>address(spot.view(np.float64)),
             <double*>address(val), <double*>address(room), <int32_t*>address(place), <int32_t*>address(head),
             <int32_t*>address(link), <int32_t*>address(nxt))
         self.f.super = &self.p
