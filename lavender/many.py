@@ -20,8 +20,8 @@ from lavender.problem import Problem
 from lavender.registry import SolverSpec, get
 from lavender.solution import Solution
 from lavender.solve import decide_empty_rows, late, solve
-from lavender.solvers._costs import general_cost
-from lavender.solvers._few import FEW_GENERAL, GENERAL_FIRST
+from lavender.solvers._costs import general_first
+from lavender.solvers._few import FEW_GENERAL
 from lavender.solvers._newton import general
 
 __all__ = ["solve_many"]
@@ -106,7 +106,7 @@ def _loop(problems: list[Problem], starts: list[Any], tol: float, spec: SolverSp
     prepared = [general.prepare(p) for p in problems]
     if spec.name == "auto":  # which begins with it where it costs next to nothing
         for i, kernel in enumerate(prepared):
-            if kernel is not None and general_cost(problems[i], kernel.largest) > GENERAL_FIRST:
+            if kernel is not None and not general_first(problems[i], kernel.largest):
                 prepared[i] = None
     held = [i for i, kernel in enumerate(prepared) if kernel is not None]
     if len(held) < len(problems):  # some are too large: the others alone

@@ -46,6 +46,8 @@ PIVOT, PIVOT_ENTRY = 60e3, 0.5  # of each pivot of lemke, and for each entry of 
 # Newton over generalised velocities: a call, for each row beside each factor, and each multiply-add of the dense
 # factor of an island.
 GENERAL_START, GENERAL_ROW, GENERAL = 60e3, 40.0, 0.06
+GENERAL_FIRST = 0.4e6  # ns of it up to which nothing else is looked at first
+FORM = 1.0  # of each multiply-add of Y Y^T
 ADMM_START, ADMM_ROW, ADMM_ENTRY = (
     300e3,
     60.0,
@@ -118,6 +120,19 @@ def sweep_cost(problem: Problem) -> float:
 def first_look(per: float) -> int:
     """Sweeps, each of cost `per` [ns], before their residual is looked at."""
     return int(min(max(FIRST_LOOK, LOOKED / per), LAST_LOOK))
+
+
+def general_first(problem: Problem, largest: int) -> bool:
+    """Newton over generalised velocities costs next to nothing, or less than only to form A = Y Y^T for the others.
+
+    The columns of Y have n_c entries: sum n_c^2 >= (sum n_c)^2 / nv multiply-adds.
+    """
+    assert problem.generalized is not None
+    cost = general_cost(problem, largest)
+    if cost <= GENERAL_FIRST:
+        return True
+    entries = 0.5 * (problem.metric.work - 4.0 * problem.m)
+    return cost <= FORM * entries * entries / max(1, problem.generalized.nv)
 
 
 class Costs:

@@ -14,11 +14,10 @@ from lavender.problem import Problem
 from lavender.registry import FEW
 from lavender.residuals import reference
 from lavender.solution import Claim, Status
-from lavender.solvers._costs import first_look, general_cost, sweep_cost
+from lavender.solvers._costs import first_look, general_first, sweep_cost
 from lavender.solvers._newton import general
 from lavender_ext.few.chain import PIVOTS, SWEEPS, VELOCITIES, Chain
 
-GENERAL_FIRST = 0.4e6  # ns of newton over generalised velocities up to which nothing else is looked at first
 FEW_GENERAL = 1000  # rows in generalised coordinates, where nothing of Python's grows with them
 WARM = 1e-3  # relative residual from which an iterate is worth starting from
 
@@ -41,7 +40,7 @@ def _make(problem: Problem) -> Chain | None:
         return None
     if problem.generalized is not None:
         kernel = general.prepare(problem)
-        if kernel is None or general_cost(problem, kernel.largest) > GENERAL_FIRST:
+        if kernel is None or not general_first(problem, kernel.largest):
             return None
         return Chain(data, start, relative, newton=kernel)
     if problem.cones.has_round:

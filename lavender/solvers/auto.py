@@ -43,11 +43,11 @@ from lavender.solvers._costs import (
     Costs,
     Exact,
     first_look,
-    general_cost,
+    general_first,
     is_loose,
     islands_cost,
 )
-from lavender.solvers._few import AUTO, GENERAL_FIRST, WARM
+from lavender.solvers._few import AUTO, WARM
 from lavender.solvers._islands import islands, restrict, rows_of
 from lavender.solvers._newton import general
 from lavender.solvers.newton import NewtonState
@@ -173,7 +173,7 @@ class Auto:
             # Newton over the velocities ends nearly all robots: nothing is looked at, and nothing noted, before.
             kernel = general.prepare(problem)
             largest = 0 if kernel is None else kernel.largest
-            if kernel is not None and general_cost(problem, largest) <= GENERAL_FIRST:
+            if kernel is not None and general_first(problem, largest):
                 claim = general.run(problem, kernel, lam, min(n, GENERAL_STEPS), tol, time_limit)
                 if claim.status is Status.CONVERGED:
                     impulse[:] = lam
