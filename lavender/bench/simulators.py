@@ -7,7 +7,12 @@ by both sides to the same judged residual:
     ours     `lavender.solve(problem)`: prepare, solve and judge; and the same in `solve_many`
 
 Construction of the problem, with M's factor, is apart, as `mj_factorM` is not counted either. Times are the least of
-several repetitions, taken in turns.
+several repetitions, taken in turns. Of one call are told apart: what is worked out of the data (d, Y, the norms of
+doing nothing), the kernel, the judge; the rest is Python's. And what matters to the simulation: the momentum and the
+kinetic energy of the next step under either answer, against those of a solution to STRICT.
+
+`measure_warm` goes through consecutive steps: MuJoCo starts from its last accelerations, ours from the impulses of the
+last step, by key; MuJoCo at its own tolerance.
 """
 
 from __future__ import annotations
@@ -21,11 +26,13 @@ from typing import Any
 
 import numpy as np
 
+from lavender.bench.running.sequences import carry
 from lavender.io import mujoco as adapter
 from lavender.many import solve_many
 from lavender.problem import Problem
-from lavender.residuals import reference, residual
+from lavender.residuals import judged, reference, residual
 from lavender.solve import solve
+from lavender.solvers._newton import general
 
 TARGET = 1e-6  # judged relative residual that both sides must reach
 STRICT = 1e-9  # that ours is asked for besides
@@ -52,6 +59,12 @@ class Step:
     residual: float
     strict: float  # residual of ours when asked for STRICT
     coulomb: float | None  # the same under Coulomb's law; None where a contact has more than two tangents
+    prepare: float = 0.0  # s, of one call
+    judge: float = 0.0  # s
+    momentum: float = 0.0  # -, |M (v+ - v)| / |M v| of ours against a solution v
+    engine_momentum: float = 0.0
+    energy: float = 0.0  # -, of the kinetic energy
+    engine_energy: float = 0.0
 
 
 def fresh(problem: Problem) -> Problem:
@@ -93,24 +106,56 @@ def engine_time(mj: Any, model: Any, data: Any, problem: Problem) -> tuple[float
     return found[0], seconds, found[1]
 
 
-def our_times(problem: Problem) -> tuple[float, float, float, float]:
-    """(one call, each of many, its kernel, residual), cold."""
+def our_times(problem: Problem) -> tuple[float, float, float]:
+    """(one call, each of many, residual), cold."""
     start = problem.start()
-    one, kernel, found = np.inf, np.inf, np.inf
+    one, found = np.inf, 0.0
     for _ in range(REPEATS):
         made = fresh(problem)
         begin = perf_counter()
         solution = solve(made, tol=TARGET, impulse=start)
         one = min(one, perf_counter() - begin)
-        kernel, found = min(kernel, solution.solve_time), solution.residual.relative
+        found = max(found, solution.residual.relative)
     many = np.inf
     for _ in range(REPEATS):
         batch = [fresh(problem) for _ in range(MANY)]
         begin = perf_counter()
-        for solution in solve_many(batch, tol=TARGET, impulses=[start] * MANY):
-            found = max(found, solution.residual.relative)
+        made_of = solve_many(batch, tol=TARGET, impulses=[start] * MANY)
         many = min(many, (perf_counter() - begin) / MANY)
-    return float(one), float(many), float(kernel), float(found)
+        found = max(found, *(solution.residual.relative for solution in made_of))
+    return float(one), float(many), float(found)
+
+
+def parts(problem: Problem) -> tuple[float, float, float]:
+    """(prepare, kernel, judge) of one call [s]; the kernel is newton over velocities, with room for it made."""
+    prepare, kernel, judge = np.inf, np.inf, np.inf
+    start = problem.start()
+    for _ in range(REPEATS):
+        made = fresh(problem)
+        begin = perf_counter()
+        reference(made)
+        prepare = min(prepare, perf_counter() - begin)
+        impulse = start.copy()
+        begin = perf_counter()
+        newton = general.prepare(made)
+        if newton is not None:
+            newton.run(impulse, TARGET, general.CLOCK, True)
+        kernel = min(kernel, perf_counter() - begin)
+        judge = min(judge, least(lambda p=made, x=impulse: judged(p, x), 2))  # type: ignore[misc]
+    return float(prepare), float(kernel), float(judge)
+
+
+def next_step(problem: Problem, impulse: Any, reference_impulse: Any) -> tuple[float, float]:
+    """Relative error of the momentum M v and of the kinetic energy of the next step, against another impulse's."""
+    assert problem.generalized is not None
+    mass = problem.generalized.mass
+    v, exact = problem.velocity(impulse), problem.velocity(reference_impulse)
+    p, q = mass @ v, mass @ exact
+    size, energy = float(np.linalg.norm(q)), float(exact @ q)
+    return (
+        float(np.linalg.norm(p - q)) / size if size > 0.0 else 0.0,
+        abs(float(v @ p) - energy) / energy if energy > 0.0 else 0.0,
+    )
 
 
 def measure(mj: Any, path: Path, steps: int, every: int, seed: int = 0) -> list[Step]:
@@ -132,8 +177,14 @@ def measure(mj: Any, path: Path, steps: int, every: int, seed: int = 0) -> list[
         if reference(problem)[1] < 1e-9:
             continue
         tolerance, engine, engine_residual = engine_time(mj, model, data, problem)
-        ours, many, kernel, found = our_times(problem)
-        strict = solve(fresh(problem), tol=STRICT, impulse=problem.start()).residual
+        engine_impulse = adapter.impulse(model, data)
+        ours, many, found = our_times(problem)
+        prepare, kernel, judge = parts(problem)
+        exact = solve(fresh(problem), tol=STRICT, impulse=problem.start())
+        strict = exact.residual
+        own = solve(fresh(problem), tol=TARGET, impulse=problem.start()).impulse
+        momentum, energy = next_step(problem, own, exact.impulse)
+        engine_momentum, engine_energy = next_step(problem, engine_impulse, exact.impulse)
         coulomb = None
         if not problem.cones.has_round:
             under = solve(
@@ -156,8 +207,69 @@ def measure(mj: Any, path: Path, steps: int, every: int, seed: int = 0) -> list[
                 residual=found,
                 strict=0.0 if strict.relative <= 2.0 * strict.floor else strict.relative,
                 coulomb=coulomb,
+                prepare=prepare,
+                judge=judge,
+                momentum=momentum,
+                engine_momentum=engine_momentum,
+                energy=energy,
+                engine_energy=engine_energy,
             )
         )
         if len(out) == steps:
             break
+    return out
+
+
+@dataclass(frozen=True)
+class WarmStep:
+    """One of consecutive steps, both sides from what they knew; times in s."""
+
+    model: str
+    step: int
+    rows: int
+    engine: float
+    ours: float  # one call
+    engine_residual: float
+    residual: float
+
+
+def measure_warm(mj: Any, path: Path, steps: int, seed: int = 0) -> list[WarmStep]:
+    """Consecutive steps of one model under random controls, each solved warm by both sides."""
+    model = mj.MjModel.from_xml_path(os.fspath(path))
+    model.opt.solver = mj.mjtSolver.mjSOL_NEWTON
+    data = mj.MjData(model)
+    rng = np.random.default_rng(seed)
+    low, high = np.where(model.actuator_ctrllimited[:, None], model.actuator_ctrlrange, [-1.0, 1.0]).T
+    out: list[WarmStep] = []
+    before: tuple[Problem, Any] | None = None
+    for step in range(steps):
+        data.ctrl[:] = rng.uniform(low, high)
+        mj.mj_step(model, data)
+        mj.mj_forward(model, data)
+        if int(data.nefc) == 0:
+            before = None
+            continue
+        problem = adapter.from_mujoco(model, data, name=f"{path.stem} {step}")
+        engine = least(lambda: mj.mj_fwdConstraint(model, data))
+        start = problem.start() if before is None else carry(*before, problem)
+        ours = np.inf
+        for _ in range(REPEATS):
+            made = fresh(problem)
+            begin = perf_counter()
+            solution = solve(made, tol=TARGET, impulse=start)
+            ours = min(ours, perf_counter() - begin)
+        before = problem, solution.impulse
+        if reference(problem)[1] < 1e-9:
+            continue
+        out.append(
+            WarmStep(
+                model=path.stem,
+                step=step,
+                rows=problem.m,
+                engine=engine,
+                ours=float(ours),
+                engine_residual=residual(problem, adapter.impulse(model, data)).relative,
+                residual=solution.residual.relative,
+            )
+        )
     return out

@@ -9,9 +9,9 @@ from pathlib import Path
 import click
 
 from lavender.bench.machine import cpu_name, versions
-from lavender.bench.simulators import Step, measure
+from lavender.bench.simulators import Step, WarmStep, measure, measure_warm
 from lavender.errors import LavenderError
-from lavender.report.simulators import table
+from lavender.report.simulators import table, warm_table
 
 __all__ = ["mujoco"]
 
@@ -20,24 +20,33 @@ __all__ = ["mujoco"]
 @click.argument("models", nargs=-1, required=True, type=click.Path(path_type=Path))
 @click.option("--steps", default=10, show_default=True, help="problems of each model")
 @click.option("--every", default=20, show_default=True, help="steps of the simulator between two problems")
+@click.option(
+    "--warm", default=0, show_default=True, help="and so many consecutive steps of each model, warm"
+)
 @click.option("--out", type=click.Path(path_type=Path), help="every problem's numbers, JSON lines")
-def mujoco(models: tuple[Path, ...], steps: int, every: int, out: Path | None) -> None:
+def mujoco(models: tuple[Path, ...], steps: int, every: int, warm: int, out: Path | None) -> None:
     """Our Newton and MuJoCo's on the steps of your own models (MJCF files), in one run."""
     try:
         import mujoco as mj
     except ImportError:
         raise click.UsageError("mujoco cannot be imported: pip install mujoco") from None
     found: list[Step] = []
+    consecutive: list[WarmStep] = []
     for path in models:
         try:
             new = measure(mj, path, steps, every)
+            after = measure_warm(mj, path, warm)
         except (ValueError, LavenderError) as error:  # MuJoCo's own word about a file is a ValueError
             click.echo(f"{path.name}: left out: {str(error).splitlines()[0][:140]}", err=True)
             continue
         found += new
+        consecutive += after
         click.echo(f"{path.name}: {len(new)} problems", err=True)
     if out is not None:
         lines = [json.dumps({"cpu": cpu_name(), **versions(("mujoco", "numpy"))})]
         lines += [json.dumps(asdict(s)) for s in found]
+        lines += [json.dumps(asdict(w)) for w in consecutive]
         out.write_text("\n".join(lines) + "\n", encoding="utf-8")
     click.echo(table(found))
+    if consecutive:
+        click.echo(f"\n{warm_table(consecutive)}")

@@ -29,32 +29,46 @@ def test_both_sides_solve_every_step_to_the_same_residual(tmp_path):
         assert s.rows > 0
         assert max(s.residual, s.engine_residual) <= simulators.TARGET
         assert s.strict <= simulators.STRICT
-        assert 0.0 < s.kernel <= s.ours
-        assert min(s.engine, s.many) > 0.0
+        assert min(s.engine, s.many, s.prepare, s.judge, s.kernel) > 0.0
+        assert max(s.momentum, s.energy, s.engine_momentum, s.engine_energy) < 1e-4
 
 
 def test_the_command_writes_a_table_and_says_what_it_left_out(tmp_path):
     (tmp_path / "arm.xml").write_text(MODEL)
     (tmp_path / "torn.xml").write_text("<mujoco><worldbody>")
     out = tmp_path / "steps.jsonl"
-    words = [str(tmp_path / "arm.xml"), str(tmp_path / "torn.xml"), "--steps", "2", "--out", str(out)]
+    words = [
+        str(tmp_path / "arm.xml"),
+        str(tmp_path / "torn.xml"),
+        "--steps",
+        "2",
+        "--warm",
+        "40",
+        "--out",
+        str(out),
+    ]
     done = CliRunner().invoke(mujoco, words)
     assert done.exit_code == 0, done.output
     assert "torn.xml: left out" in done.output
     assert "2 of 2 solved" in done.output
+    assert "| momentum |" in done.output
+    assert "ours, median" in done.output.split("| kinetic energy |")[1]  # the second table
     lines = [json.loads(line) for line in out.read_text().splitlines()]
     assert "mujoco" in lines[0]
-    assert [line["model"] for line in lines[1:]] == ["arm", "arm"]
+    assert {line["model"] for line in lines[1:]} == {"arm"}
+    assert sum("kernel" in line for line in lines[1:]) == 2
+    assert max(line["residual"] for line in lines[1:]) <= simulators.TARGET
 
 
 def test_ratios_are_geometric_means_by_the_number_of_rows():
     def step(rows, engine, ours, tolerance=1e-8):
         return simulators.Step(
-            "m", 0, rows, 3, "lcp", tolerance, engine, ours, ours / 2, ours / 4, 0.0, 0.0, 0.0, None
-        )
+            "m", 0, rows, 3, "lcp", tolerance, engine, ours, ours / 2, ours / 4, 0.0, 0.0, 0.0, None,
+            prepare=ours / 8, judge=ours / 8,
+        )  # fmt: skip
 
     text = tables.table([step(4, 1e-6, 2e-6), step(5, 1e-6, 8e-6), step(400, 1e-3, 5e-4, 0.0)])
-    assert "| under 10 | 1 | 2 | 1.0 | 4.00 | 2.00 | 1.00 | 8.0 (m, 5 rows) |" in text
+    assert "| under 10 | 1 | 2 | 1.0 | 4.00 | 2.00 | 1.00 | 0.50 | 0.50 | 2.00 | 8.0 (m, 5 rows) |" in text
     assert "| 300 and more | 1 | 1 | 1000.0 | 0.50 |" in text
     assert "1 that MuJoCo brings" in text
     assert np.isnan(tables._mean([]))
