@@ -190,6 +190,13 @@ class Solution:
         )
 
     @classmethod
+    def of(cls, values: dict[str, Any]) -> Solution:
+        """The solution of all its fields by name, kept as they are."""
+        made: Solution = object.__new__(cls)
+        _fill(made, values)
+        return made
+
+    @classmethod
     def late(
         cls,
         impulse: FloatArray,

@@ -31,10 +31,19 @@ __all__ = ["Prepared", "prepare", "solve"]
 CHUNK_TIME = 0.025  # s, aim; twice that is still below what a person notices on Ctrl-C
 FIRST_CHUNK = 256  # iterations: 25 ms at 100 us each, slower than any compiled sweep of few rows
 Callback = Callable[[int, FloatArray, Residual], Any]
-_CONVERGED = Status.CONVERGED
 NOTHING_DONE = Claim(Status.MAX_ITERATIONS, 0)
 # What arithmetic on legal numbers may end in: a result, with the solver's last word as its message.
 BREAKDOWN = (ArithmeticError, np.linalg.LinAlgError, MemoryError)
+# Looked up once: a member reached through its class costs 600 instructions, a dozen times a solve.
+CONVERGED = Status.CONVERGED
+DIVERGED = Status.DIVERGED
+FLOOR = Status.FLOOR
+INFEASIBLE = Status.INFEASIBLE
+INTERRUPTED = Status.INTERRUPTED
+MAX_ITERATIONS = Status.MAX_ITERATIONS
+NUMERICAL_ERROR = Status.NUMERICAL_ERROR
+STALLED = Status.STALLED
+TIME_LIMIT = Status.TIME_LIMIT
 FRONT_DOOR = ("impulse", "tol", "max_iter", "time_limit", "history", "callback")
 
 
@@ -193,9 +202,9 @@ class Prepared:
         proof = decide_empty_rows(problem, lam)
         loop = _Loop(problem, self._solver, self._state, lam, tol, time_limit, history, callback)
         if proof is not None:
-            claim = Claim(Status.INFEASIBLE, 0, {}, proof[0], certificate=proof[1])
+            claim = Claim(INFEASIBLE, 0, {}, proof[0], certificate=proof[1])
         elif self._broken:
-            claim = Claim(Status.NUMERICAL_ERROR, 0, {}, self._broken)
+            claim = Claim(NUMERICAL_ERROR, 0, {}, self._broken)
         else:
             claim = loop.run(max_iter) if spec.resumable else loop.run_once(max_iter)
         return finish(
@@ -296,7 +305,7 @@ class _Loop:
             if not self.broken:
                 return claim
         except KeyboardInterrupt:
-            claim = Claim(Status.INTERRUPTED, 0, {}, "Ctrl-C")
+            claim = Claim(INTERRUPTED, 0, {}, "Ctrl-C")
         finally:
             self.time = perf_counter() - start
         if not all_finite(self.impulse):
@@ -309,7 +318,7 @@ class _Loop:
             return self.solver.run(self.state, self.impulse, n, self.tol, time_limit)
         except BREAKDOWN as error:
             self.broken = True
-            return Claim(Status.NUMERICAL_ERROR, 0, {}, _last_words(error))
+            return Claim(NUMERICAL_ERROR, 0, {}, _last_words(error))
 
     broken = False  # the solver did not return
 
@@ -320,7 +329,7 @@ class _Loop:
         claim = NOTHING_DONE
         try:
             if records and self._record():
-                return self._total(Claim(Status.INTERRUPTED, 0, {}, "stopped by the callback"))
+                return self._total(Claim(INTERRUPTED, 0, {}, "stopped by the callback"))
             while self.done < max_iter:
                 n = min(chunk, max_iter - self.done)
                 if records:
@@ -333,23 +342,21 @@ class _Loop:
                 for kind, count in claim.work.items():
                     self.work[kind] = self.work.get(kind, 0) + count
                 stopped = records and self.done == self._next_record and self._record()
-                if claim.status is not Status.MAX_ITERATIONS:
+                if claim.status is not MAX_ITERATIONS:
                     break
                 if claim.iterations < 1:
-                    claim = Claim(
-                        Status.STALLED, 0, {}, f"did none of the {n} iterations that it was asked for"
-                    )
+                    claim = Claim(STALLED, 0, {}, f"did none of the {n} iterations that it was asked for")
                     break
                 if stopped:
-                    claim = Claim(Status.INTERRUPTED, 0, {}, "stopped by the callback")
+                    claim = Claim(INTERRUPTED, 0, {}, "stopped by the callback")
                     break
                 if self.time_limit is not None and self.time >= self.time_limit:
-                    claim = Claim(Status.TIME_LIMIT, 0, {}, claim.message)
+                    claim = Claim(TIME_LIMIT, 0, {}, claim.message)
                     break
                 if self.done < max_iter:
                     chunk = self._next_chunk(n, elapsed)
         except KeyboardInterrupt:
-            claim = Claim(Status.INTERRUPTED, 0, {}, "Ctrl-C")
+            claim = Claim(INTERRUPTED, 0, {}, "Ctrl-C")
         self._keep_best()
         return self._total(claim)
 
@@ -438,7 +445,7 @@ def late(
     """A solution that the judge found below tol, in words when somebody asks; `counts` as `spec.few` tells them."""
     impulse = judged.impulse
     impulse.setflags(write=False)
-    return Solution.late(impulse, _CONVERGED, tol, seconds, (_rest, (problem, spec, judged, counts)))
+    return Solution.late(impulse, CONVERGED, tol, seconds, (_rest, (problem, spec, judged, counts)))
 
 
 def _rest(problem: Problem, spec: SolverSpec, judged: Any, counts: Any) -> dict[str, Any]:
@@ -471,48 +478,48 @@ def finish(
     judged = residual(problem, impulse)
     status, message = claim.status, claim.message
     relative = judged.relative
-    if status is not Status.NUMERICAL_ERROR and not all_finite(impulse):
-        status = Status.DIVERGED
-    elif (
-        tol > 0.0 and relative <= tol and status in (Status.MAX_ITERATIONS, Status.TIME_LIMIT, Status.STALLED)
-    ):
-        status = Status.CONVERGED
-    elif status is Status.CONVERGED and relative > tol and problem.operator not in spec.operators:
-        status = Status.STALLED
+    if status is not NUMERICAL_ERROR and not all_finite(impulse):
+        status = DIVERGED
+    elif tol > 0.0 and relative <= tol and status in (MAX_ITERATIONS, TIME_LIMIT, STALLED):
+        status = CONVERGED
+    elif status is CONVERGED and relative > tol and problem.operator not in spec.operators:
+        status = STALLED
         message = f"{message}; its test was met on A, as it was formed, alone".removeprefix("; ")
-    if tol < relative and judged.at_floor and status in (Status.CONVERGED, Status.STALLED):
-        status = Status.FLOOR
+    if status in (CONVERGED, STALLED) and tol < relative and judged.at_floor:
+        status = FLOOR
     certificate = claim.certificate
-    if status is Status.INFEASIBLE and relative <= tol:
+    if status is INFEASIBLE and relative <= tol:
         # What meets tol is a solution to tol, whatever can be said of an exact one.
-        status, certificate = Status.CONVERGED, None
+        status, certificate = CONVERGED, None
         message = f"{message}; the impulse meets tol all the same".removeprefix("; ")
     contradicted = ""
-    if status is Status.CONVERGED and not relative <= tol:
+    if status is CONVERGED and not relative <= tol:
         contradicted = f"says CONVERGED, relative residual {relative:.2e} is above tol {tol:.1e}"
-    elif status is Status.FLOOR and not judged.at_floor:
+    elif status is FLOOR and not judged.at_floor:
         contradicted = f"says FLOOR, relative residual {relative:.2e} is above twice {judged.floor:.2e}"
-    elif status is Status.INFEASIBLE:
+    elif status is INFEASIBLE:
         reason = (
             "no certificate was given" if certificate is None else check_certificate(problem, certificate)
         )
         contradicted = f"says INFEASIBLE, {reason}" if reason else ""
-    impulse.flags.writeable = False
-    return Solution(
-        impulse=impulse,
-        residual=judged,
-        status=status,
-        tol=tol,
-        iterations=claim.iterations,
-        work=claim.work,
-        setup_time=setup_time,
-        solve_time=solve_time,
-        solver=SolverRun(spec.name, options, claim.form),
-        message=message,
-        history=history,
-        dual=claim.dual,
-        certificate=certificate,
-        contradicted=contradicted,
+    impulse.setflags(write=False)
+    return Solution.of(
+        {
+            "impulse": impulse,
+            "residual": judged,
+            "status": status,
+            "tol": tol,
+            "iterations": claim.iterations,
+            "work": MappingProxyType(dict(claim.work)),
+            "setup_time": setup_time,
+            "solve_time": solve_time,
+            "solver": SolverRun(spec.name, options, claim.form),
+            "message": message,
+            "history": history,
+            "dual": claim.dual,
+            "certificate": certificate,
+            "contradicted": contradicted,
+        }
     )
 
 

@@ -95,7 +95,8 @@ def scaled(problem: Problem) -> Scaled:
     scale = 1.0 / np.sqrt(problem.d[pick])
     mk, compliance = len(keep), problem.compliance
     if len(e.kind) == mk:
-        wptr, a_t, a_s = e.ptr, np.zeros(mk), np.zeros(mk)
+        wptr = e.ptr
+        a_t = a_s = np.zeros(mk)
     else:
         wptr = np.concatenate([[0], np.cumsum(np.diff(e.ptr) ** 2)]).astype(np.int32)
         first, last, root = e.ptr[:-1], e.ptr[1:] - 1, 1.0 / scale
