@@ -71,7 +71,7 @@ cdef inline double norm2(double x, double y) noexcept nogil:
 
 
 cdef inline int32_t n_tangents(int32_t kind, int32_t size) noexcept nogil:
-    return size - 1 - (kind == CONTACT_SPIN)
+    return size - 2 + (kind & 1)                        # CONTACT and ROUND are odd; a spin row is no tangent
 
 
 cdef inline bint is_pair(int32_t nt, int32_t offset) noexcept nogil:
@@ -315,6 +315,15 @@ cdef inline void round_error(const double* lam, const double* w, const double* d
         e[0] = yn + inside                              # NaN: comparisons above would hide it
 
 
+cdef inline void contact_error(int32_t law, const double* lam, const double* w, const double* d, double mu,
+                               double patch_radius, int32_t nt, int32_t spin, double* e) noexcept nogil:
+    """Error of one contact of 1 + nt + spin rows under its law: where the judge tells laws apart."""
+    if law == CONE:
+        cone_error(lam, w, d, mu, patch_radius, nt, spin, e)
+    else:
+        coulomb_error(lam, w, d, mu, patch_radius, nt, spin, e)
+
+
 cdef inline void block_error(const blocks_t* p, int32_t i, const double* lam, const double* w,
                              double* e) noexcept nogil:
     """Error e of block i [N s]; lam, w, e are whole vectors (m)."""
@@ -327,7 +336,5 @@ cdef inline void block_error(const blocks_t* p, int32_t i, const double* lam, co
     nt = n_tangents(kind, end - j)
     if kind == ROUND:
         round_error(lam + j, w + j, p.d + j, p.mu[i], nt, e + j)
-    elif p.law == CONE:
-        cone_error(lam + j, w + j, p.d + j, p.mu[i], p.patch_radius[i], nt, kind == CONTACT_SPIN, e + j)
     else:
-        coulomb_error(lam + j, w + j, p.d + j, p.mu[i], p.patch_radius[i], nt, kind == CONTACT_SPIN, e + j)
+        contact_error(p.law, lam + j, w + j, p.d + j, p.mu[i], p.patch_radius[i], nt, kind == CONTACT_SPIN, e + j)

@@ -17,12 +17,19 @@ from lavender_ext.core.rows cimport dot3, joint_push, joint_velocity, push_bodie
 from lavender_ext.engine.arrays cimport (H_CONTACTS, H_POSITION_ITERATIONS, H_PROJECTED, J_HERTZ, N_DYNAMIC,
                                          N_JOINT, N_JOINT_REAL, N_JOINT_ROW, S_BETA, S_DEPTH, S_H,
                                          S_JOINT_ERROR, S_MAX_PUSH, S_SLOP, engine_t)
-from lavender_ext.engine.view cimport normal_speed
 
 
 cdef inline int32_t rigid_row(const engine_t* e, int32_t i, int32_t row) noexcept nogil:
     # soft rows pull by themselves; a motor has no position
     return e.joint[N_JOINT_REAL * i + J_HERTZ] == 0.0 and not (e.joint_motor[i] and row == e.ptr[i + 1] - 1)
+
+
+cdef inline double normal_speed(const engine_t* e, const double* v, int32_t c) noexcept nogil:
+    cdef double u[3]
+    cdef double s[3]
+    relative_velocity(v, e.contact_body[2 * c], e.contact_body[2 * c + 1], e.arm_a + 3 * c, e.arm_b + 3 * c,
+                      u, s)
+    return dot3(e.normal + 3 * c, u)
 
 
 cdef inline int32_t project_positions(engine_t* e) noexcept nogil:

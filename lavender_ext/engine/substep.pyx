@@ -16,7 +16,7 @@ import numpy as np
 
 from lavender_ext.engine.arrays import views
 
-from lavender_ext.core.block cimport blocks_t
+from lavender_ext.core.block cimport blocks_t, row_error
 from lavender_ext.core.order cimport (RANDOM, SYMMETRIC, advance_order, block_levels, body_levels,
                                       color_by_bodies, reverse, sort_by_level)
 from lavender_ext.core.rows cimport relax_contact_block, relax_joint, rows_t
@@ -32,8 +32,8 @@ from lavender_ext.engine.broad_phase cimport update_pairs
 from lavender_ext.engine.contacts cimport make_contacts, store_contacts
 from lavender_ext.engine.joints cimport make_joints
 from lavender_ext.engine.kept cimport keep, kept_reals, put_back
-from lavender_ext.engine.projection cimport project_positions
-from lavender_ext.engine.view cimport measure, view
+from lavender_ext.engine.projection cimport normal_speed, project_positions
+from lavender_ext.engine.view cimport view
 from lavender_ext.judge.measure cimport rows_slack
 from lavender_ext.judge.score cimport score_rows, score_t
 from lavender_ext.sweep.packed cimport MOST, ROOM_BODY, ROOM_CONTACT, ROOM_MORE, packs, sweep_packed
@@ -55,6 +55,23 @@ cdef int32_t prepare(engine_t* e) noexcept nogil:
     contacts = make_contacts(e, &r)
     e.head[H_NEED_CONTACTS] = contacts
     return NEED_ROOM if contacts > e.size[CAP_CONTACT] else OK
+
+
+cdef inline void measure(const engine_t* e, double* residual, double* violation) noexcept nogil:
+    # max |e_n| [N s] and max(0, -w_n) [m/s] over the contacts, w_n = J dv + c lam - b
+    cdef int32_t c, row
+    cdef double w, x, inf = 1.0 / 0.0, big = 0.0, low = 0.0
+    for c in range(e.head[H_CONTACTS]):
+        row = e.ptr[e.size[N_JOINT] + c]
+        w = normal_speed(e, e.dv, c) + (e.compliance[row] * e.impulse[row] - e.b[row])
+        x = row_error(e.impulse[row], w, e.d[row], 0.0, inf)
+        x = -x if x < 0.0 else x
+        if not x <= big:
+            big = x
+        if not -w <= low:
+            low = -w
+    residual[0] = big
+    violation[0] = low
 
 
 cdef inline void warm(engine_t* e, const blocks_t* p, const rows_t* r) noexcept nogil:

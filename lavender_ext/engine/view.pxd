@@ -1,8 +1,6 @@
-"""The engine's velocity problem as the shared kernels see it, and what an observation says of its contacts."""
-from libc.stdint cimport int32_t
-
-from lavender_ext.core.block cimport COULOMB, blocks_t, row_error
-from lavender_ext.core.rows cimport dot3, relative_velocity, rows_t
+"""The engine's velocity problem as the shared kernels see it."""
+from lavender_ext.core.block cimport COULOMB, blocks_t
+from lavender_ext.core.rows cimport rows_t
 from lavender_ext.engine.arrays cimport H_CONTACTS, H_CONTACT_ROWS, N_DYNAMIC, N_JOINT, N_JOINT_ROW, engine_t
 
 
@@ -37,28 +35,3 @@ cdef inline void view(const engine_t* e, blocks_t* p, rows_t* r) noexcept nogil:
     r.inv_mass = e.inv_mass
     r.inv_inertia = e.inv_inertia
     r.compliance = e.compliance
-
-
-cdef inline double normal_speed(const engine_t* e, const double* v, int32_t c) noexcept nogil:
-    cdef double u[3]
-    cdef double s[3]
-    relative_velocity(v, e.contact_body[2 * c], e.contact_body[2 * c + 1], e.arm_a + 3 * c, e.arm_b + 3 * c,
-                      u, s)
-    return dot3(e.normal + 3 * c, u)
-
-
-cdef inline void measure(const engine_t* e, double* residual, double* violation) noexcept nogil:
-    # max |e_n| [N s] and max(0, -w_n) [m/s] over the contacts, w_n = J dv + c lam - b
-    cdef int32_t c, row
-    cdef double w, x, inf = 1.0 / 0.0, big = 0.0, low = 0.0
-    for c in range(e.head[H_CONTACTS]):
-        row = e.ptr[e.size[N_JOINT] + c]
-        w = normal_speed(e, e.dv, c) + (e.compliance[row] * e.impulse[row] - e.b[row])
-        x = row_error(e.impulse[row], w, e.d[row], 0.0, inf)
-        x = -x if x < 0.0 else x
-        if not x <= big:
-            big = x
-        if not -w <= low:
-            low = -w
-    residual[0] = big
-    violation[0] = low

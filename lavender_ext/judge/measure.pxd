@@ -9,8 +9,7 @@ core/velocity.pxd forms M^-1 J^T lam, and a second loop reads J v.
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.block cimport (CONE, CONTACT_SPIN, ROW, block_error, blocks_t, cone_error,
-                                      coulomb_error, n_tangents, row_error)
+from lavender_ext.core.block cimport CONTACT_SPIN, ROW, block_error, blocks_t, contact_error, n_tangents, row_error
 from lavender_ext.core.csr cimport csr_abs_dot, csr_dot, csr_dot_size, csr_t
 from lavender_ext.core.generalized cimport (generalized_t, jac_push, jac_row, panel_push_size, panel_size,
                                             tree_solve)
@@ -250,10 +249,7 @@ cdef inline void judge_contact(const blocks_t* p, const rows_t* r, int32_t c, in
     contact_slack(r, c, nt, spin, v, w + j)
     for k in range(j, j + 1 + nt + spin):
         w[k] += r.compliance[k] * lam[k] - p.b[k]
-    if p.law == CONE:
-        cone_error(lam + j, w + j, p.d + j, p.mu[i], p.patch_radius[i], nt, spin, e + j)
-    else:
-        coulomb_error(lam + j, w + j, p.d + j, p.mu[i], p.patch_radius[i], nt, spin, e + j)
+    contact_error(p.law, lam + j, w + j, p.d + j, p.mu[i], p.patch_radius[i], nt, spin, e + j)
     tally_contact(p, j, nt, spin, e, s)
     contact_sizes(r, c, nt, spin, v + 6 * <ssize_t>r.n_bodies, size)
     for k in range(1 + nt + spin):
