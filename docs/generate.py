@@ -392,7 +392,7 @@ def solver_pages(site, records, figures):
     )
     parts = [
         "# Backends of other packages",
-        docstrings.markdown(sys.modules["lavender.external.qpsolvers_"].__doc__),
+        docstrings.markdown(sys.modules["lavender.external.backends"].__doc__),
         "Each runs under its own name. What is not installed says what to install. Options of all of them:",
         table(
             ("option", "meaning"),

@@ -157,7 +157,7 @@ class Problem:
         if (self.matrix is None) + (self.rows is None) + (self.generalized is None) != 2:
             raise InputError("give matrix=, rows= or generalized=, one of them")
         if self.friction not in FRICTION:
-            raise InputError(f"friction is {self.friction!r}; 'coulomb' or 'cone' is needed")
+            raise InputError(f"friction is {self.friction!r}; {' or '.join(map(repr, FRICTION))} is needed")
         if self.friction != "cone" and self.cones.has_round:
             raise InputError(
                 "a round cone of more than two tangents has no Coulomb law here: give friction='cone'"

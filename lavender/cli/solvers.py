@@ -16,7 +16,7 @@ def solvers(problem: str | None) -> None:
     from rich.table import Table
 
     from lavender import bench, registry
-    from lavender.problem import OPERATORS
+    from lavender.problem import LAWS, OPERATORS
 
     given = bench.resolve([problem])[0].problem if problem else None
     table = Table(box=None, pad_edge=False, header_style="bold")
@@ -41,7 +41,7 @@ def solvers(problem: str | None) -> None:
         ]
         reason = reasons[name]
         what = spec.summary if reason is None else f"[yellow]{plain(reason)}[/]"
-        laws = [law for law in ("linear", "lcp", "coulomb", "cone") if law in spec.laws]
+        laws = [law for law in LAWS if law in spec.laws]
         table.add_row(
             name,
             " ".join(laws),

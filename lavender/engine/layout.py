@@ -2,17 +2,22 @@
 
 from lavender_ext.engine import arrays
 from lavender_ext.engine.arrays import (
+    BOX,
     CAP_CONTACT,
     CAP_PAIR,
     MOST_PAIRS,
     N_SIZES,
     NEED_ROOM,
+    NO_SHAPE,
     NOT_FINITE,
     OK,
+    PLANE,
+    SPHERE,
     TOO_MANY,
 )
 
 __all__ = [
+    "BOX",
     "CAP_CONTACT",
     "CAP_PAIR",
     "HEAD",
@@ -21,11 +26,14 @@ __all__ = [
     "MOST_PAIRS",
     "NEED_ROOM",
     "NOT_FINITE",
+    "NO_SHAPE",
     "N_SIZES",
     "OK",
     "ORDER_NUMBER",
+    "PLANE",
     "SETTING",
     "SIZE",
+    "SPHERE",
     "TOO_MANY",
 ]
 

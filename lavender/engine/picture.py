@@ -14,6 +14,7 @@ import numpy as np
 
 from lavender._arrays import FloatArray
 from lavender.engine.film import Film
+from lavender.engine.layout import BOX, PLANE, SPHERE
 from lavender.errors import InputError
 from lavender.io.stored import write_atomically
 from lavender.scene.parts import rotation
@@ -22,7 +23,6 @@ __all__ = ["PICTURES", "save_picture"]
 
 PICTURES = (".gif", ".png", ".svg", ".pdf")
 
-PLANE, SPHERE, BOX = 1, 2, 3
 CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
 FACES = (
     (0, 1, 3, 2),

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from lavender.engine import layout
 from lavender.engine.layout import (
     CAP_CONTACT,
     CAP_PAIR,
@@ -256,9 +257,9 @@ def _is_even(inertia: np.ndarray) -> bool:
 
 def _shape(shape: Any) -> tuple[int, list[float]]:
     if isinstance(shape, Plane):
-        return 1, [*shape.normal, shape.offset]
+        return layout.PLANE, [*shape.normal, shape.offset]
     if isinstance(shape, Sphere):
-        return 2, [shape.radius, shape.radius, shape.radius, 0.0]
+        return layout.SPHERE, [shape.radius, shape.radius, shape.radius, 0.0]
     if isinstance(shape, Box):
-        return 3, [*(0.5 * np.array(shape.size)), 0.0]
-    return 0, [0.0, 0.0, 0.0, 0.0]
+        return layout.BOX, [*(0.5 * np.array(shape.size)), 0.0]
+    return layout.NO_SHAPE, [0.0, 0.0, 0.0, 0.0]

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from lavender.external import clarabel_cone, qpsolvers_
+from lavender.external import backends, clarabel_cone
 from lavender.registry import SolverSpec
 
 __all__ = ["SPECS"]
 
-SPECS: tuple[SolverSpec, ...] = (*qpsolvers_.SPECS, clarabel_cone.SPEC)
+SPECS: tuple[SolverSpec, ...] = (*backends.SPECS, clarabel_cone.SPEC)

@@ -11,7 +11,7 @@ from random_problems import as_matrix, box_stack, random_contact_problem, random
 import lavender as lv
 from lavender import registry
 from lavender.certificates import check_certificate
-from lavender.external import qp_solver, qpsolvers_
+from lavender.external import backends, qp_solver
 from lavender.external._running import Answer
 from lavender.measures import qp_residual
 
@@ -26,7 +26,7 @@ def replaced(monkeypatch, name, call):
     from dataclasses import replace
     from functools import partial
 
-    backend = next(b for b in qpsolvers_.BACKENDS if b.name == name)
+    backend = next(b for b in backends.BACKENDS if b.name == name)
     fake = replace(registry.get(name), factory=partial(qp_solver.QPSolver, replace(backend, call=call)))
     monkeypatch.setitem(registry._registered, name, fake)
 
@@ -51,7 +51,7 @@ def test_every_backend_of_qpsolvers_is_known():
 
 def test_an_absent_backend_says_what_to_install():
     reasons = lv.known()
-    absent = [b for b in qpsolvers_.BACKENDS if reasons[b.name] is not None]
+    absent = [b for b in backends.BACKENDS if reasons[b.name] is not None]
     assert absent, "no machine has all of them"
     for backend in absent:
         assert f"pip install {backend.install}" in reasons[backend.name]
@@ -251,7 +251,7 @@ def test_warm_start_is_used_where_the_spec_says_so(name):
 
 @pytest.mark.parametrize("name", BACKENDS)
 def test_no_time_limit_is_said(name):
-    backend = next((b for b in qpsolvers_.BACKENDS if b.name == name), None)
+    backend = next((b for b in backends.BACKENDS if b.name == name), None)
     solution = lv.solve(lv.Problem.lcp(*spd(5)), name, time_limit=10.0)
     stoppable = backend is None or backend.stoppable
     assert ("takes no time limit" in solution.message) == (not stoppable)

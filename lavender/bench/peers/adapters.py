@@ -32,8 +32,8 @@ from lavender.errors import CapabilityError, InputError
 from lavender.external._running import Limits
 from lavender.external.as_qp import QP, impulse_form, velocity_form
 from lavender.external.backend import Backend
+from lavender.external.backends import BACKENDS
 from lavender.external.qp_solver import QPSolver, refusal
-from lavender.external.qpsolvers_ import BACKENDS
 from lavender.problem import Problem
 from lavender.residuals import reference
 from lavender.solve import prepare
