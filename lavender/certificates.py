@@ -33,18 +33,21 @@ def check_certificate(problem: Problem, y: Any) -> str | None:
 def _disproof(problem: Problem, y: FloatArray) -> str | None:
     if y.shape != (problem.m,) or not np.isfinite(y).all() or not np.any(y):
         return f"certificate of shape {y.shape} must be {problem.m} finite numbers, not all zero"
-    y = np.ldexp(
-        y, -math.frexp(float(np.abs(y).max()))[1]
-    )  # so that products with small entries of A do not vanish
+    # Only the rows that y takes part in: others may have overflown.
+    rows = np.flatnonzero(y)
+    vanished = np.intersect1d(rows, problem.vanished_rows)
+    if len(vanished):
+        return f"products of {problem.row_name(int(vanished[0]))} vanish in float64: its row of A is not zero"
+    a = problem.csr[rows]
+    # The largest y at 1, or above by what small entries of A lack: so that products with them do not vanish.
+    lack = max(0, min(1000, *(-_exponent(x) for x in (a.data, problem.b))))
+    y = np.ldexp(y, lack - _exponent(y))
     gain, most = float(problem.b @ y), float(np.abs(problem.b) @ np.abs(y))
     if not gain > 1e-10 * most:
         return f"b.y = {gain:.2e} is not positive"
     outside = _recession_violation(problem, y)
     if outside:
         return outside
-    # Only the rows that y takes part in: others may have overflown.
-    rows = np.flatnonzero(y)
-    a = problem.csr[rows]
     z, zero = a.T @ y[rows], 1e-10 * (gain / most) * (abs(a).T @ np.abs(y[rows]))
     if not np.isfinite(z).all():
         return "A^T y overflows"
@@ -55,6 +58,11 @@ def _disproof(problem: Problem, y: FloatArray) -> str | None:
     return f"A^T y reaches {np.abs(z).max(initial=0.0):.2e}, above rounding; impulses within the bounds can meet b.y"
 
 
+def _exponent(x: FloatArray) -> int:
+    """Of the power of two above the largest of |x|; 0 for none."""
+    return math.frexp(float(np.abs(x).max(initial=0.0)))[1]
+
+
 def _rims(problem: Problem, x: FloatArray) -> tuple[Any, Any, FloatArray, FloatArray]:
     """Contact blocks and their normal rows; |x_t| over the tangents of each and |x_s| of its spin row, else 0."""
     c = problem.cones
@@ -63,7 +71,10 @@ def _rims(problem: Problem, x: FloatArray) -> tuple[Any, Any, FloatArray, FloatA
     block = np.repeat(np.arange(c.n_blocks), np.diff(c.ptr))
     place = np.arange(problem.m) - c.ptr[block]
     tangent = (place > 0) & (place <= c.n_tangents[block])
-    rim = np.sqrt(np.bincount(block[tangent], x[tangent] ** 2, minlength=c.n_blocks)[contact])
+    big = np.zeros(c.n_blocks)  # over the largest, for squares alone vanish
+    np.maximum.at(big, block[tangent], np.abs(x[tangent]))
+    part = x[tangent] / np.where(big > 0.0, big, 1.0)[block[tangent]]
+    rim = (big * np.sqrt(np.bincount(block[tangent], part**2, minlength=c.n_blocks)))[contact]
     spin = np.where(c.kind[contact] == CONTACT_SPIN, np.abs(x[c.ptr[contact + 1] - 1]), 0.0)
     return contact, first, rim, spin
 

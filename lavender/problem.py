@@ -641,6 +641,22 @@ class Problem:
         """(m,) 1/kg: diagonal of A with fallbacks, the judge's metric."""
         return self.metric.d
 
+    @property
+    def vanished_rows(self) -> IntArray:
+        """Rows with A_ii = 0 only because products of small numbers vanish: J_i has an entry where M^-1 has one."""
+        empty: IntArray = self.metric.empty
+        if not len(empty):
+            return empty
+        if self.generalized is not None:
+            pattern = self.generalized.jac[empty]  # M is positive definite
+        elif self.rows is not None:
+            inverse = self.rows.inverse_mass_matrix().astype(bool).astype(float)
+            pattern = self.rows.jacobian(self.cones)[empty].astype(bool).astype(float) @ inverse
+        else:
+            return empty[:0]
+        pattern.eliminate_zeros()
+        return empty[np.diff(pattern.indptr) > 0]
+
     def delassus(self) -> Any:
         """A (m, m) [1/kg]: the matrix as given, or J M^-1 J^T + diag(compliance) as CSR."""
         return self.csr if self.matrix is None else self.matrix

@@ -835,7 +835,9 @@ def _any_tangent(normal: FloatArray) -> FloatArray:
     out = np.zeros_like(normal)
     for i, n in enumerate(normal):
         t = np.cross(n, np.eye(3)[np.argmin(np.abs(n))])
-        out[i] = t / np.linalg.norm(t)
+        size = np.linalg.norm(t)
+        if size > 0.0:  # a body so far off that its contact has no direction: Rows says so
+            out[i] = t / size
     return out
 
 

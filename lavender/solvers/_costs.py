@@ -187,6 +187,8 @@ class Costs:
     @cached_property
     def exact(self) -> list[Exact]:
         """The finite solvers that take this problem, cheapest first."""
+        if self.problem.cones.has_round:
+            return [e for e in self._others if e.name == "newton"] or [Exact("newton", np.inf, 0)]
         # Newton's system is made only where it may be the cheapest: it costs as much as a small solve.
         cost = self._newton_guess if self._others_win else self._newton(self._newton_factor)
         p = self.problem

@@ -175,12 +175,19 @@ cdef inline double wide_part(double yn, double a, double t, double b) noexcept n
     return (yn / a + t) * (b / a) if a > 1e140 else b * ((yn + a * t) / (1.0 + a * a))
 
 
-cdef inline double wide_cone(double yn, double at, double t, double as_, double ys, double* bound_t,
+cdef inline double wide_cone(double normal, double at, double t, double as_, double ys, double* bound_t,
                              double* bound_s) noexcept nogil:
     """s of (7), a_t s and a_s s where a cone is so wide that a^2 overflows: s b is what keeps its digits, b the wider."""
     cdef double b = at if at > as_ else as_
     cdef double p = at / b, q = as_ / b, inv = 1.0 / b
-    cdef double sb = 0.0, c
+    cdef double sb = 0.0, c, yn, size = fabs(normal)
+    size = t if t > size else size
+    size = ys if ys > size else size
+    if not 0.0 < size <= 1.7976931348623157e308:
+        size = 1.0
+    yn = normal / size                                  # (7) is homogeneous: s b must not overflow
+    t = t / size
+    ys = ys / size
     if yn > 0.0:
         sb = yn * b
     c = wide_part(yn, at, t, b)
@@ -193,33 +200,39 @@ cdef inline double wide_cone(double yn, double at, double t, double as_, double 
     if c > sb:
         sb = c
     c = yn if yn > 0.0 and sb == yn * b else sb * inv
-    bound_t[0] = p * sb if at > 1e140 else at * c
-    bound_s[0] = q * sb if as_ > 1e140 else as_ * c
-    return c
+    bound_t[0] = (p * sb if at > 1e140 else at * c) * size
+    bound_s[0] = (q * sb if as_ > 1e140 else as_ * c) * size
+    return normal if c == yn else c * size
 
 
-cdef inline void cone_error(const double* lam, const double* w, const double* d, double mu,
-                            double patch_radius, int32_t nt, int32_t spin, double* e) noexcept nogil:
+cdef inline double weighed(double lam, double w, double d, double r) noexcept nogil:
+    # sqrt(d) (lam - w / d), r = sqrt(d); w / d alone may overflow.
+    cdef double x = quotient(w, d)
+    return r * (lam - x) if fabs(x) <= 1.7976931348623157e308 else r * lam - w / r
+
+
+cdef inline void project_error(const double* lam, const double* w, const double* d, double mu,
+                               double patch_radius, int32_t nt, int32_t spin, double* e) noexcept nogil:
     # (7): the projection on {|y_t| <= a_t y_n, |y_s| <= a_s y_n} after y = sqrt(d) (lam - w / d). The
     # largest of the four candidates for s is the projection's normal part: three pieces of one
     # convex piecewise quadratic in s.
     cdef double rn = sqrt(d[0]), rt = 1.0, rs = 1.0, at = 0.0, as_ = 0.0
     cdef double yn, y0 = 0.0, y1 = 0.0, ys = 0.0, t = 0.0, s, c, f, bound_t, bound_s
     cdef int32_t i, js = 1 + nt
-    yn = rn * (lam[0] - quotient(w[0], d[0]))
+    yn = weighed(lam[0], w[0], d[0], rn)
     if nt > 0:
         rt = sqrt(d[1])
         at = opening(mu, rt, rn)
-        y0 = rt * (lam[1] - quotient(w[1], d[1]))
+        y0 = weighed(lam[1], w[1], d[1], rt)
         if nt == 2:
-            y1 = rt * (lam[2] - quotient(w[2], d[2]))
+            y1 = weighed(lam[2], w[2], d[2], rt)
         t = norm2(y0, y1)
     if spin:
         rs = sqrt(d[js])
         as_ = mu * patch_radius * rs / rn
         if not as_ <= 1.7976931348623157e308:
             as_ = opening(mu * (rs / rn), patch_radius, 1.0)
-        ys = rs * (lam[js] - quotient(w[js], d[js]))
+        ys = weighed(lam[js], w[js], d[js], rs)
     if at > 1e140 or as_ > 1e140:
         s = wide_cone(yn, at, t, as_, fabs(ys), &bound_t, &bound_s)
     else:
@@ -255,6 +268,24 @@ cdef inline void cone_error(const double* lam, const double* w, const double* d,
             e[js] = quotient(w[js], d[js])
     if not (yn == yn and t == t and ys == ys):
         e[0] = yn + t + ys                              # NaN: comparisons above would hide it
+
+
+cdef inline void cone_error(const double* lam, const double* w, const double* d, double mu,
+                            double patch_radius, int32_t nt, int32_t spin, double* e) noexcept nogil:
+    # (7) is homogeneous: where all of lam and w / d would vanish, 2^600 times both, so that their ratios decide.
+    cdef double up = 4.149515568880993e180          # 2^600
+    cdef double big[8]
+    cdef int32_t i, n = 1 + nt + spin
+    for i in range(n):
+        if not (fabs(lam[i]) < 1e-290 and fabs(w[i]) < 1e-290 * d[i]):
+            project_error(lam, w, d, mu, patch_radius, nt, spin, e)
+            return
+    for i in range(n):
+        big[i] = up * lam[i]
+        big[4 + i] = up * w[i]
+    project_error(big, big + 4, d, mu, patch_radius, nt, spin, e)
+    for i in range(n):
+        e[i] = quotient(e[i], up)
 
 
 cdef inline void round_error(const double* lam, const double* w, const double* d, double mu, int32_t nt,

@@ -174,8 +174,11 @@ def score(Data p, const double[::1] lam, const double[::1] w, double[::1] e):
     return s.energy, s.velocity, s.worst, bool(s.finite)
 
 
-def begin(Data p):
-    """Judge doing nothing and keep E0 and V0 with the data: (Pi(0) (m,), read-only; its own relative residual)."""
+def begin(Data p, bint vanished):
+    """Judge doing nothing and keep E0 and V0 with the data: (Pi(0) (m,), read-only; its own relative residual).
+
+    Both are 0 where `vanished`: d of a row is a stand-in for products that are not zero, and nothing can be measured.
+    """
     cdef Py_ssize_t i, m = p.blocks.n_rows
     cdef bint moves = False
     cdef double rhs_energy, rhs_velocity, energy, velocity
@@ -211,6 +214,8 @@ def begin(Data p):
     if energy <= 2.0 ** -48 * rhs_energy or (energy > 2.0 * rhs_energy and not moves):
         energy, velocity = rhs_energy, rhs_velocity
     # A size that overflows measures nothing: 0 makes every error beside it infinite.
+    if vanished:
+        energy = velocity = 0.0
     p.set_start(energy if energy < 1.0 / 0.0 else 0.0, velocity if velocity < 1.0 / 0.0 else 0.0)
     return start, relative(s.energy, s.velocity, p.start_energy, p.start_velocity) if s.finite else 1.0 / 0.0
 

@@ -29,32 +29,39 @@ class Seeded:
 
 
 class Drawn:
-    """Choices of hypothesis, from `st.data()`."""
+    """Choices of hypothesis, by the `draw` of a composite strategy."""
 
-    def __init__(self, data):
-        self.data = data
+    def __init__(self, draw):
+        self.draw = draw
 
     def whole(self, low, high):
         import hypothesis.strategies as st
 
-        return self.data.draw(st.integers(low, high))
+        return self.draw(st.integers(low, high))
 
     def pick(self, options):
         import hypothesis.strategies as st
 
-        return self.data.draw(st.sampled_from(list(options)))
+        return self.draw(st.sampled_from(list(options)))
 
     def chance(self, p):
         import hypothesis.strategies as st
 
         # towards False when made smaller
-        return self.data.draw(st.integers(0, 99)) >= 100 - round(100 * p)
+        return self.draw(st.integers(0, 99)) >= 100 - round(100 * p)
 
     def normals(self, n):
         import hypothesis.strategies as st
 
         number = st.floats(-4.0, 4.0, allow_subnormal=False)
-        return np.array(self.data.draw(st.lists(number, min_size=n, max_size=n)), float)
+        return np.array(self.draw(st.lists(number, min_size=n, max_size=n)), float)
+
+
+def strategy(make):
+    """A generator of this folder as a strategy of hypothesis."""
+    import hypothesis.strategies as st
+
+    return st.composite(lambda draw: make(Drawn(draw)))()
 
 
 SPECIAL = (

@@ -144,6 +144,7 @@ class Campaign:
             worker = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=errors, start_new_session=True)
             os.set_blocking(worker.stdout.fileno(), False)
             text, counts, hung = b"", {}, False
+            number, started = first, -1.0
             while True:
                 ended = worker.poll() is not None
                 text += worker.stdout.read() or b""
@@ -154,10 +155,12 @@ class Campaign:
                         counts = message["counts"]
                     else:
                         self.add(message)
-                number, _, started = FIELDS.unpack(Path(shared.name).read_bytes())
+                before, seen = (number, started), FIELDS.unpack(Path(shared.name).read_bytes())
+                number, started = seen[0], seen[2]
                 if ended:
                     break
-                if started >= 0.0 and used(worker.pid) - started > limit:
+                # Twice the same: a look in the middle of a write sees zeros.
+                if started >= 0.0 and (number, started) == before and used(worker.pid) - started > limit:
                     hung = True
                     os.kill(worker.pid, signal.SIGUSR1)  # where it is
                     time.sleep(0.5)

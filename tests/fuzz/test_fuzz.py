@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, given, settings
 from random_problems import random_contact_problem, random_lcp
 
 import lavender as lv
@@ -18,6 +19,7 @@ import checks
 import fuzz
 import judge
 import problems
+from draw import strategy
 
 
 def spec_of(problem):
@@ -138,6 +140,22 @@ def test_the_same_seed_gives_the_same_inputs():
         one, two = (json.dumps(fuzz.make(kind, 5, 7)) for _ in range(2))
         assert one == two
         assert json.dumps(fuzz.make(kind, 5, 8)) != one
+
+
+# -- the same generators under hypothesis, which makes what fails small ------------------------------------------
+
+
+EXAMPLES = {"solve": 60, "file": 40, "steps": 30, "snapshot": 30, "folder": 2}  # some seconds each
+
+
+@pytest.mark.parametrize("kind", fuzz.KINDS)
+def test_drawn_by_hypothesis_every_promise_holds(kind):
+    @settings(max_examples=EXAMPLES[kind], suppress_health_check=list(HealthCheck))
+    @given(spec=strategy(checks.MAKE[kind]))
+    def holds(spec):
+        assert checks.run(json.loads(json.dumps(spec))) == []
+
+    holds()
 
 
 # -- what was found ---------------------------------------------------------------------------------------------

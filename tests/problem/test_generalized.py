@@ -11,6 +11,7 @@ from random_problems import seeds
 from random_trees import chain, random_general, random_tree, tree_mass
 
 import lavender as lv
+from lavender.solvers._costs import Costs
 from lavender.solvers._islands import islands, restrict, rows_of
 
 
@@ -363,6 +364,15 @@ def brute_round(y, a):
         low, high = (mid, high) if excess(mid) > 0 else (low, mid)
     s = (low + high) / 2
     return np.concatenate([[s], y[1:] * a * a * s / ((1 + a * a) * s - y[0])])
+
+
+def test_round_cones_are_never_handed_to_the_form_over_rows():
+    """Its kernels hold four rows of a contact: more would be written past their end."""
+    problem = random_general(13, "cone", tangents=5)
+    with pytest.raises(lv.CapabilityError, match="velocity"):
+        lv.solve(problem, "newton", form="impulse")
+    assert [e.name for e in Costs(problem, 1e-9).exact] == ["newton"]
+    assert dict(Costs(problem, 1e-9, 60).exact[0].options) == {"form": "velocity"}
 
 
 @given(seed=seeds)

@@ -467,6 +467,32 @@ def test_the_inequality_between_two_points_holds():
         assert delta_a**2 <= (delta_a * eps_a + eps_d * delta_d) * (1 + 1e-12)
 
 
+@pytest.mark.parametrize("form", ["rows", "generalized"])
+@pytest.mark.parametrize("small", [1e-170, 1e-200, 1e-300])
+def test_a_row_whose_products_vanish_makes_no_claim_about_itself(form, small):
+    """A_11 = small^2 > 0 is 0 in float64: how far others are from lambda_1 = 1 / small^2, nobody can tell."""
+    if form == "rows":
+        jac = np.zeros((2, 12))
+        jac[0, 6], jac[1, 7] = 1.0, small
+        rows = lv.Rows(
+            inv_mass=[1.0], inv_inertia=np.eye(3)[None], v_free=np.zeros((1, 6)), jac=jac, joint_ptr=[0, 1, 2],
+            joint_body=[[-1, 0], [-1, 0]], normal=np.zeros((0, 3)), tangent=np.zeros((0, 3)),
+            arm_a=np.zeros((0, 3)), arm_b=np.zeros((0, 3)), contact_body=np.zeros((0, 2), int),
+        )  # fmt: skip
+        problem = lv.Problem([0.0, 1.0], lv.Cones.free(2), rows=rows)
+    else:
+        problem = lv.Problem.from_jacobian(
+            np.diag([1.0, small]), np.eye(2), [0.0, 0.0], cones=lv.Cones.free(2), target=[0.0, 1.0]
+        )
+    assert len(problem.metric.empty) == 1
+    for impulse in ([0.0, 0.0], [0.0, 1.0], [1.0, 1e300]):
+        assert lv.residual(problem, impulse).relative == np.inf
+    for solver in ("pgs", "auto"):
+        found = lv.solve(problem, solver, max_iter=5)
+        assert not found.success
+        assert found.status is not lv.Status.INFEASIBLE or found.contradicted
+
+
 def test_residual_reads_as_one_line_and_names_the_worst_row():
     problem = random_contact_problem(0)
     judged = lv.residual(problem, problem.start())
