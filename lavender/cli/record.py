@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import click
-
-from lavender.errors import InputError
 
 __all__ = ["record"]
 
@@ -25,25 +22,7 @@ __all__ = ["record"]
 )
 def record(model: Path, steps: int, every: int, controls: str, seed: int, out: Path) -> None:
     """Run a MuJoCo model (MJCF) and keep its constraint problems, for `lavender report OUT`."""
-    import numpy as np
+    from lavender.io.recording import record_file
 
-    from lavender.io import record as record_steps
-
-    try:
-        import mujoco as mj
-    except ImportError:
-        raise InputError("mujoco cannot be imported: pip install mujoco") from None
-    try:
-        made = mj.MjModel.from_xml_path(str(model))
-    except ValueError as error:  # MuJoCo's word about a file that it cannot read
-        raise InputError(f"{model}: {error}") from None
-    control: Any = controls
-    if controls not in ("zero", "random"):
-        try:
-            control = np.load(controls, allow_pickle=False)
-        except (OSError, ValueError) as error:
-            raise InputError(f"--controls {controls}: {error}") from None
-    found = record_steps(made, mj.MjData(made), out, steps, every=every, control=control, seed=seed)
+    found = record_file(model, out, steps, every=every, control=controls, seed=seed)
     click.echo(str(found))
-    if not found.files:
-        raise InputError("no step had a constraint that could be kept: more --steps, or other --controls")

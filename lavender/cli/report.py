@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from pathlib import Path
 
@@ -69,6 +70,11 @@ __all__ = ["report"]
     metavar="FILE",
     help="What `lavender bench peers --out FILE` measured, to show beside.",
 )
+@click.option("--steps", default=500, show_default=True, help="Of MODEL.xml: steps of its simulation.")
+@click.option("--every", default=5, show_default=True, help="Of MODEL.xml: steps between two problems.")
+@click.option(
+    "--controls", default="random", show_default=True, metavar="zero|random|FILE", help="Of MODEL.xml."
+)
 @click.option("--tables", is_flag=True, help="Print every case and sequence too.")
 @click.option("--fresh", is_flag=True, help="Measure again what the folder holds already.")
 @click.option("--no-figures", is_flag=True, help="Leave out the SVG and PNG files.")
@@ -93,6 +99,9 @@ def report(
     compare: Path | None,
     time_budgets: tuple[float, ...],
     peers: Path | None,
+    steps: int,
+    every: int,
+    controls: str,
     tables: bool,
     fresh: bool,
     no_figures: bool,
@@ -100,7 +109,8 @@ def report(
     """Speed against error: every solver on every case, to each level and at each budget.
 
     FILES are problems (.npz, .hdf5), folders of them, folders of recorded steps, or cases of the built-in
-    suite such as "stack(n=64)"; without any, the built-in suite runs. A records.jsonl is shown again
+    suite such as "stack(n=64)"; without any, the built-in suite runs. A model of MuJoCo (.xml) is simulated first,
+    and its steps are recorded in the folder of the report. A records.jsonl is shown again
     without solving. The same command goes on where it was stopped.
 
     Exits with 1 when a file met in a folder cannot be read, with 2 when one that was named cannot, or when
@@ -108,6 +118,8 @@ def report(
     """
     from lavender import bench
     from lavender.bench.peers import read as read_peers
+    from lavender.report.engine import ENGINES, contestants
+    from lavender.report.engine import lines as engine_lines
     from lavender.report.terminal import print_report
     from lavender.report.text import count
     from lavender.report.write import write
@@ -116,6 +128,7 @@ def report(
         if not (math.isfinite(limit) and limit > 0.0):
             raise InputError(f"time budget {limit} must be a positive number of seconds")
     shown_on = console()
+    files = tuple(_recorded(f, out, steps, every, controls, fresh) for f in files)
     old = None if compare is None else bench.read(compare)
     rivals = None if peers is None else read_peers(peers)
     shown = [Path(f) for f in files if f.endswith(".jsonl")]
@@ -135,8 +148,15 @@ def report(
         plan = make_plan(files, levels, budgets, orders, repeats, time_limit, motion, speed_levels)
         done = measure(files, solvers, plan, out / "records.jsonl", memory, in_process, sequence, fresh)
     records = done.records
+    engines = [] if campaign else contestants(files, records.latest())
     print_report(records, shown_on, old=old, times=time_budgets, whole=tables)
-    index = write(records, out, figures=not no_figures, old=old, times=time_budgets, peers=rivals)
+    if engines:
+        shown_on.print(f"\n{ENGINES}", highlight=False, markup=False, soft_wrap=True)
+        for line in engine_lines(engines):
+            shown_on.print(line, highlight=False, markup=False, soft_wrap=True)
+    index = write(
+        records, out, figures=not no_figures, old=old, times=time_budgets, peers=rivals, engines=engines
+    )
     shown_on.print(
         f"\n{len(records)} runs in {out / 'records.csv'}, page: {index}",
         highlight=False,
@@ -152,3 +172,40 @@ def report(
         said = f"{count(done.lost, 'case')} of a folder did not load"
         shown_on.print(said, style="yellow", highlight=False, markup=False)
         raise click.exceptions.Exit(EXIT_UNMET)
+
+
+def _recorded(word: str, out: Path, steps: int, every: int, controls: str, fresh: bool) -> str:
+    """A model's file as the folder of its recorded steps, recorded now unless that was done in the same way."""
+    path = Path(word)
+    if path.suffix.lower() != ".xml":
+        return word
+    from lavender.io.recording import record_file
+
+    folder = out / "recorded" / path.stem
+    how = folder / "how.json"
+    asked = json.dumps(
+        {
+            "model": str(path.resolve()),
+            "changed": _age(path),
+            "steps": steps,
+            "every": every,
+            "controls": controls,
+        }
+    )
+    if fresh or not how.is_file() or how.read_text(encoding="utf-8") != asked:
+        for old in folder.glob("step_*.npz"):
+            old.unlink()
+        console().print(
+            str(record_file(path, folder, steps, every=every, control=controls)),
+            highlight=False,
+            markup=False,
+        )
+        how.write_text(asked, encoding="utf-8")
+    return str(folder)
+
+
+def _age(path: Path) -> float:
+    try:
+        return path.stat().st_mtime
+    except OSError as error:
+        raise InputError(f"{path}: {error.strerror or error}") from None

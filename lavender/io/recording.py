@@ -18,7 +18,7 @@ from lavender.io import mujoco as adapter
 from lavender.io import npz
 from lavender.residuals import residual
 
-__all__ = ["Recording", "record"]
+__all__ = ["Recording", "record", "record_file"]
 
 ENGINE = "engine.jsonl"  # beside the problems: what the engine itself said of each
 CONTROLS = ("zero", "random")
@@ -122,6 +122,43 @@ def record(
         }))  # fmt: skip
     (folder / ENGINE).write_text("".join(f"{line}\n" for line in lines), encoding="utf-8")
     return Recording(folder, tuple(files), without, tuple(left_out))
+
+
+def record_file(
+    path: str | os.PathLike[str],
+    folder: str | os.PathLike[str],
+    steps: int,
+    *,
+    every: int = 1,
+    control: Control = "zero",
+    seed: int = 0,
+) -> Recording:
+    """`record` of a model by its file (MJCF); an array of controls may be given by its file (.npy), too.
+
+    Raises
+    ------
+    InputError
+        As `record`; MuJoCo cannot be imported, or cannot read the model; the controls cannot be read.
+    """
+    try:
+        import mujoco as mj
+    except ImportError:
+        raise InputError("mujoco cannot be imported: pip install mujoco") from None
+    try:
+        made = mj.MjModel.from_xml_path(os.fspath(path))
+    except ValueError as error:  # MuJoCo's word about a file that it cannot read
+        raise InputError(f"{os.fspath(path)}: {error}") from None
+    if isinstance(control, str) and control not in CONTROLS:
+        try:
+            control = np.load(control, allow_pickle=False)
+        except (OSError, ValueError) as error:
+            raise InputError(f"controls {control}: {error}; {', '.join(CONTROLS)}, or a .npy file") from None
+    found = record(made, mj.MjData(made), folder, steps, every=every, control=control, seed=seed)
+    if not found.files:
+        raise InputError(
+            f"{os.fspath(path)}: no step had a constraint that could be kept: more steps, or other controls"
+        )
+    return found
 
 
 def _drive(model: Any, control: Control, seed: int) -> Callable[[Any, int], FloatArray | None]:

@@ -9,6 +9,8 @@ from collections.abc import Sequence
 from lavender.bench.record import level_name
 from lavender.bench.store import Records
 from lavender.report import tables
+from lavender.report.engine import ENGINES, Contestant
+from lavender.report.engine import lines as engine_lines
 from lavender.report.moved import advice_by_speed, moved, robustness_by_speed, speed_levels, speed_name
 from lavender.report.text import in_time, residual, seconds, to_level
 from lavender.report.verdict import verdict
@@ -18,7 +20,7 @@ __all__ = ["summary"]
 MOTION = "**By motion error** (how wrong the body moves that is furthest off)"
 
 
-def summary(records: Records, times: Sequence[float] = ()) -> str:
+def summary(records: Records, times: Sequence[float] = (), engines: Sequence[Contestant] = ()) -> str:
     """Markdown: recommendations, then every case and solver, then what failed."""
     levels = tables.levels_of(records)
     times = tuple(times) or tables.time_budgets(records)
@@ -43,6 +45,8 @@ def summary(records: Records, times: Sequence[float] = ()) -> str:
         if by_speed := robustness_by_speed(records):
             lines += ["", MOTION, "", *_campaign(by_speed, [f"to {speed_name(x)}" for x in speeds])]
         return "\n".join([*lines, *_failed(records)]) + "\n"
+    if engines:
+        lines += [ENGINES, "", *engine_lines(engines), ""]
     lines += _motion(records, speeds)
     lines += ["| case | solver | " + " | ".join(f"to {level_name(x)}" for x in levels) + " | best | status |"]
     lines += ["|---" * (len(levels) + 4) + "|"]

@@ -26,6 +26,7 @@ from lavender.report.verdict import verdict
 
 if TYPE_CHECKING:
     from lavender.bench.peers import Peers
+    from lavender.report.engine import Contestant
 
 __all__ = ["page"]
 
@@ -41,6 +42,7 @@ def page(
     budgets: Sequence[float] = (),
     saved: bool = True,
     peers: Peers | None = None,
+    engines: Sequence[Contestant] = (),
 ) -> str:
     """The whole page. Every text that came from a file, a problem or a backend is escaped.
 
@@ -57,6 +59,8 @@ def page(
         The figures are beside the page as SVG and PNG.
     peers : Peers, optional
         A run of `lavender bench peers`, whose figures are among `figures`.
+    engines : sequence of Contestant
+        Answers of the engines that recorded the steps.
     """
     import jinja2
 
@@ -74,6 +78,7 @@ def page(
     return environment.get_template("index.html.j2").render(
         title=title,
         saved=saved,
+        engines=engines,
         count=count,
         inf=math.inf,
         isfinite=math.isfinite,

@@ -12,6 +12,7 @@ from lavender.errors import InputError
 
 if TYPE_CHECKING:
     from lavender.bench.peers import Peers
+    from lavender.report.engine import Contestant
 
 __all__ = ["write"]
 
@@ -24,6 +25,7 @@ def write(
     old: Records | None = None,
     times: Sequence[float] = (),
     peers: Peers | None = None,
+    engines: Sequence[Contestant] = (),
 ) -> Path:
     """Write `records.csv`, `records.json`, `figures/*.svg`, `figures/*.png`, `summary.md` and `index.html`.
 
@@ -40,6 +42,8 @@ def write(
         Time budgets of the recommendation; `tables.time_budgets` if none are given.
     peers : Peers, optional
         A run of `lavender bench peers` (`lavender.bench.peers.read`) to show beside them.
+    engines : sequence of Contestant
+        Answers of the engines that recorded the steps: `lavender.report.engine.contestants`.
 
     Returns
     -------
@@ -75,10 +79,11 @@ def write(
         # Whole or not at all: on a full disk the page of the last time stays.
         unfinished = index.with_suffix(".html.part")
         unfinished.write_text(
-            page(shown, drawn, old=before, budgets=times, saved=figures, peers=peers), encoding="utf-8"
+            page(shown, drawn, old=before, budgets=times, saved=figures, peers=peers, engines=engines),
+            encoding="utf-8",
         )
         unfinished.replace(index)
-        (folder / "summary.md").write_text(summary(busy, times), encoding="utf-8")
+        (folder / "summary.md").write_text(summary(busy, times, engines), encoding="utf-8")
         if figures and list(drawn):
             (folder / "figures").mkdir(exist_ok=True)
             look = looks({r.solver for r in shown} | {c.solver for figure in drawn for c in figure.curves})

@@ -1,5 +1,7 @@
 """MuJoCo's constraint problem read from memory: its own solution is the judge's solution too."""
 
+import json
+
 import numpy as np
 import pytest
 
@@ -326,4 +328,32 @@ def test_record_then_report_from_the_command_line(tmp_path):
     assert "2 problems" in done.output
     assert len(list(out.glob("*.npz"))) == 2
     wrong = CliRunner().invoke(cli, ["record", str(model), "--controls", "no.npy", "--out", str(out)])
+    page = tmp_path / "report"
+    words = [
+        "report",
+        str(model),
+        "--steps",
+        "30",
+        "--every",
+        "10",
+        "--controls",
+        "zero",
+        "--solvers",
+        "auto,newton",
+    ]
+    for again in range(2):  # the second time nothing is recorded anew
+        shown = CliRunner().invoke(cli, [*words, "--no-figures", "--out", str(page)])
+        assert shown.exit_code == 0, shown.output
+        assert ("3 problems" in shown.output) == (again == 0)
+        assert "Newton (inside the engine)" in shown.output
+    lines = [
+        json.loads(line) for line in (page / "recorded" / "scene" / "engine.jsonl").read_text().splitlines()
+    ]
+    assert len(lines) == 3
+    for text in ((page / "index.html").read_text(), (page / "summary.md").read_text()):
+        row = text[text.index("Newton (inside the engine)") :][:400]
+        assert "auto" in row or "newton" in row
+    assert f"{max(line['relative'] for line in lines):.1e}" in (page / "summary.md").read_text()
+    missing = CliRunner().invoke(cli, ["report", str(tmp_path / "none.xml"), "--out", str(page)])
+    assert isinstance(missing.exception, lv.errors.InputError)
     assert wrong.exit_code != 0

@@ -1,0 +1,117 @@
+"""The answer of the engine that recorded a folder of steps, as a contestant: judged like the others, timed inside it.
+
+Its time holds neither a copy of the problem nor the judge, and it starts from what the engine kept of the step before;
+so it stands beside the table, not in it.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from lavender.bench.store import Records
+from lavender.io.recording import ENGINE
+
+__all__ = ["ENGINES", "Contestant", "contestants", "lines"]
+
+ENGINES = (
+    "Inside the engine: its own answers, judged like ours; its time holds no copy of the problem and no judge"
+)
+_NUMBERS = ("rows", "seconds", "relative", "iterations")
+
+
+@dataclass(frozen=True)
+class Contestant:
+    """One folder of recorded steps; times in s, residuals relative."""
+
+    folder: str
+    solver: str  # of the engine
+    steps: int
+    rows: float  # median
+    iterations: float  # median
+    seconds: float  # median, inside the engine
+    relative: float  # median
+    worst: float
+    ours: str  # the fastest solver that reached its tolerance in every step, carrying impulses; empty if none did
+    our_seconds: float  # median
+    our_worst: float
+
+
+def contestants(words: Sequence[str], records: Records) -> list[Contestant]:
+    """Of the folders among `words` in which an engine left its own answers; lines that cannot be read are left out."""
+    out = []
+    for word in words:
+        path = Path(word) / ENGINE
+        if not path.is_file():
+            continue
+        found = []
+        for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
+            try:
+                entry = json.loads(line)
+                numbers = [float(entry[name]) for name in _NUMBERS]
+                found.append((*numbers, str(entry["solver"])))
+            except (ValueError, KeyError, TypeError):
+                continue
+        if not found:
+            continue
+        rows, seconds, relative, iterations, solvers = zip(*found, strict=True)
+        name, ours, worst = _fastest(Path(word).name, records)
+        out.append(
+            Contestant(
+                folder=Path(word).name,
+                solver=f"{max(set(solvers), key=solvers.count).capitalize()} (inside the engine)",
+                steps=len(found),
+                rows=float(np.median(rows)),
+                iterations=float(np.median(iterations)),
+                seconds=float(np.median(seconds)),
+                relative=float(np.median(relative)),
+                worst=float(np.max(relative)),
+                ours=name,
+                our_seconds=ours,
+                our_worst=worst,
+            )
+        )
+    return out
+
+
+def _fastest(sequence: str, records: Records) -> tuple[str, float, float]:
+    # Steps of a folder are cases named "folder[step]".
+    by_solver: dict[tuple[str, str], list[tuple[float, float, bool]]] = {}
+    for r in records:
+        if r.mode == "tol" and r.case.partition("[")[0] == sequence and records.success(r) is not None:
+            by_solver.setdefault((r.solver, r.start), []).append((r.time_min, r.relative, r.success))
+    most = max((len(runs) for runs in by_solver.values()), default=0)
+    best = ("", math.nan, math.nan)
+    for (solver, start), runs in by_solver.items():
+        times, errors, reached = zip(*runs, strict=True)
+        if len(runs) == most and all(reached):
+            time = float(np.median(times))
+            if not time >= best[1]:
+                best = (f"{solver}, {start}", time, max(errors))
+    return best
+
+
+def lines(found: Sequence[Contestant]) -> list[str]:
+    """As Markdown."""
+    if not found:
+        return []
+    out = [
+        "| recorded | steps | rows | engine's own | time | residual, median | worst | fastest here | time | worst |",
+        "|---|---|---|---|---|---|---|---|---|---|",
+    ]
+    for c in found:
+        here = (
+            f"{c.ours} | {1e6 * c.our_seconds:.3g} µs | {c.our_worst:.1e}"
+            if c.ours
+            else "none in every step | – | –"
+        )
+        out.append(
+            f"| {c.folder} | {c.steps} | {c.rows:g} | {c.solver} | {1e6 * c.seconds:.3g} µs | {c.relative:.1e} "
+            f"| {c.worst:.1e} | {here} |"
+        )
+    return out
