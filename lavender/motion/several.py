@@ -175,7 +175,7 @@ class Motions:
         return "\n".join([head, *(f"  {i}: {motion}" for i, motion in enumerate(self.motions))])
 
 
-def motions(problem: Problem, n: int = RUNS, seed: int = 0) -> Motions:
+def motions(problem: Problem, n: int = RUNS, seed: int = 0, *, always: bool = False) -> Motions:
     """Search the motions that solve a problem, from several starts, in several orders, by several solvers.
 
     Parameters
@@ -185,6 +185,8 @@ def motions(problem: Problem, n: int = RUNS, seed: int = 0) -> Motions:
         Runs, after the one of `auto`; none where the motion is proved to be unique.
     seed : int, default 0
         Of starts and random orders: equal seeds give equal results.
+    always : bool, default False
+        Search also where one motion is proved: to test the proof.
 
     Returns
     -------
@@ -205,7 +207,7 @@ def motions(problem: Problem, n: int = RUNS, seed: int = 0) -> Motions:
     own = reference_of(problem)
     found = [(own, "auto")] if own.accepted else []
     failed = 0 if own.accepted else 1
-    if not proof:
+    if always or not proof:
         for label, impulse in _runs(problem, own, int(n), int(seed)):
             candidate = judged(problem, impulse, label)
             if candidate.accepted:

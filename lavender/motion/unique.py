@@ -8,6 +8,7 @@ Islands (blocks that no body, directly or through others, connects) are looked a
     friction             others: these are a boxed LCP of their own, whose lambda_n is unique; it fixes every
                          disk, and what is left is convex. One contact on a body, its normal through the centre
     friction is small    kappa < 1, below: a contraction has one fixed point
+    nothing slides       a solution has w = 0 on all rows and so much of friction left over that no other can be, (3)
 
 De Saxce's change of variable makes a Coulomb solution the solution of a convex cone problem whose normal targets
 are raised by s_i = mu_i (|u_t| + r |u_s|), s being a fixed point of s -> lambda(s) -> s (Acary, Cadoux, Lemarechal,
@@ -18,6 +19,20 @@ friction rows (mu r on spin), and any positive diagonal T (one entry a contact),
     |T D s|^2 <= c |T S (A D lambda)_t|^2 <= c max eig(T S A_tt S T) |D lambda|_A^2     c = 2 with spin, else 1
 
     kappa^2 = c max eig(T S A_tt S T) max eig(T^-1 Z T^-1)                                               (1)
+
+Where a solution lambda has w = 0, doing nothing lies within the bounds of all rows, and contact i uses the share
+sigma_i < 1 of its friction, let D be the difference of any other solution from it and s that solution's. Row by row,
+
+    |D lambda|_A^2 = w' . D lambda <= sum s_i (sigma_i lambda_n,i - lambda'_n,i)
+                  <= |s|_Z |D lambda|_A - sum (1 - sigma_i) s_i lambda_n,i <= |s|_Z (|D lambda|_A - h)    (2)
+    h = min_i (1 - sigma_i) lambda_n,i / sqrt(Z_ii)           |s|_Z <= sum s_i sqrt(Z_ii), since s >= 0
+
+so D lambda = 0 or h < |D lambda|_A <= kappa (|D lambda|_A - h). Since w'.lambda' <= 0, lambda' lies in the ball
+|lambda' - lambda / 2|_A <= |lambda|_A / 2, and so |D lambda|_A <= |lambda|_A. There is no other solution where
+
+    |lambda|_A <= h    or    (kappa - 1) |lambda|_A < kappa h                                            (3)
+
+(2) and (3) are of this project; w counts as 0 up to rounding of a solution at the floor.
 
 That friction which is small against the coupling leaves one solution is known since Haslinger 1983 (Math. Meth.
 Appl. Sci. 5, 422-437); that it need not otherwise, also for one contact, since Klarbring 1990 (Ing.-Archiv 60,
@@ -33,13 +48,15 @@ import scipy.sparse as sp
 
 from lavender._arrays import FloatArray
 from lavender.cones import CONTACT_SPIN, ROW
-from lavender.motion.reference import kept
+from lavender.motion.reference import kept, reference
 from lavender.problem import Problem
 
 __all__ = ["Uniqueness", "uniqueness"]
 
 LARGEST = 600  # rows of an island up to which (1) is looked for, dense
 UNCOUPLED = 1e-14  # of sqrt(d_t d_n): A_tn that is nothing but rounding
+MARGIN = 1e-6  # of (1) and (3), for rounding of eigenvalues
+AT_REST = 1e-10  # of the largest |b| of an island: w that is nothing but rounding
 DEFINITE = 1e-10  # smallest eigenvalue of D^-1/2 A D^-1/2 that counts as positive definite
 
 
@@ -64,6 +81,7 @@ def uniqueness(problem: Problem) -> Uniqueness:
     Parameters
     ----------
     problem : Problem
+        One with friction that is not small is solved by `auto`, once, for the last criterion.
 
     Returns
     -------
@@ -124,13 +142,46 @@ def _island(problem: Problem, rows: np.ndarray, friction: np.ndarray) -> tuple[s
         return "normals feel no friction", 0.0
     if not _definite(a):
         return None, np.inf
-    kappa = _kappa(problem, rows, friction, a, scale)
-    return ("friction is small" if kappa < 1.0 - 1e-6 else None), kappa
+    kappa, lifting = _kappa(problem, rows, friction, a, scale)
+    if kappa < 1.0 - MARGIN:
+        return "friction is small", kappa
+    return ("nothing slides" if _sticks(problem, rows, friction, kappa, lifting) else None), kappa
+
+
+def _sticks(
+    problem: Problem, rows: np.ndarray, friction: np.ndarray, kappa: float, lifting: FloatArray
+) -> bool:
+    """Whether (3) holds of the reference; `lifting` (k,) [kg] is Z_ii of the contacts with friction."""
+    found = reference(problem)
+    c, x = problem.cones, found.impulse
+    w = problem.slack(x)[rows]
+    at_rest = AT_REST * float(np.max(np.abs(problem.b[rows]), initial=0.0))
+    if not found.accepted or np.max(np.abs(w), initial=0.0) > at_rest:
+        return False
+    block = np.unique(np.searchsorted(c.ptr, rows, side="right") - 1)
+    bounded = rows[(c.kind == ROW)[np.searchsorted(c.ptr, rows, side="right") - 1]]
+    if np.any(c.lower[bounded] > 0.0) or np.any(c.upper[bounded] < 0.0):
+        return False
+    touching = set(np.searchsorted(c.ptr, rows[friction], side="right") - 1)
+    left = []
+    for i in block:
+        if i not in touching:
+            continue
+        normal, mu = x[c.ptr[i]], c.mu[i]
+        tangent = x[c.ptr[i] + 1 : c.ptr[i] + 1 + c.n_tangents[i]]
+        used = float(np.linalg.norm(tangent))
+        if c.kind[i] == CONTACT_SPIN and c.patch_radius[i] > 0.0:
+            used = max(used, abs(x[c.ptr[i + 1] - 1]) / c.patch_radius[i])
+        left.append(normal - used / mu)  # (1 - sigma) lambda_n
+    h = float(np.min(np.array(left) / np.sqrt(lifting)))
+    size = float(np.sqrt(max(x[rows] @ (w + problem.b[rows]), 0.0)))  # |lambda|_A of the island
+    return h > 0.0 and (size <= h * (1.0 - MARGIN) or (kappa - 1.0) * size < kappa * h * (1.0 - MARGIN))
 
 
 def _kappa(
     problem: Problem, rows: np.ndarray, friction: np.ndarray, a: FloatArray, scale: FloatArray
-) -> float:
+) -> tuple[float, FloatArray]:
+    """Kappa of (1), and Z_ii (k,) [kg] of the contacts that have friction."""
     # In the scaled rows: (A_tt)_ij = a_ij / (scale_i scale_j), Z_ij = (a^-1)_ij scale_i scale_j.
     c = problem.cones
     block = np.searchsorted(c.ptr, rows, side="right") - 1
@@ -151,7 +202,7 @@ def _kappa(
         one = np.linalg.eigvalsh(sliding * t[place][:, None] * t[place])[-1]
         two = np.linalg.eigvalsh(lifting / t[:, None] / t)[-1]
         best = min(best, float(np.sqrt(spin * max(one, 0.0) * max(two, 0.0))))
-    return best
+    return best, np.diagonal(lifting)
 
 
 def _definite(a: FloatArray) -> bool:

@@ -401,7 +401,7 @@ def test_uniqueness_names_its_criterion():
     assert small
     assert "friction is small" in small.reason
     assert 0.0 < small.kappa < 1.0
-    large = lv.motion.uniqueness(one_contact(coupled, 5.0))
+    large = lv.motion.uniqueness(one_contact(coupled, 5.0, coupled @ [1.0, 6.0, 0.0]))  # it slides
     assert not large
     assert large.kappa > 1.0
     assert "no contact has friction" in lv.motion.uniqueness(one_contact(coupled, 0.0)).reason
@@ -427,3 +427,50 @@ def test_where_uniqueness_is_proved_every_start_ends_at_one_motion(seed):
     done = [e.slack for e in ends if e.residual.relative <= 1e-11]
     for w in done[1:]:
         assert np.abs(w - done[0]).max() < 1e-7
+
+
+@settings(max_examples=60)
+@given(seed=seeds)
+def test_where_nothing_slides_and_friction_is_left_over_no_search_finds_another(seed):
+    """A solution with w = 0 inside its cones; where (3) of `lavender.motion.unique` holds it is the only one."""
+    rng = np.random.default_rng(seed)
+    k = int(rng.integers(1, 4))
+    g = rng.normal(size=(3 * k, 3 * k))
+    a = np.diag(rng.uniform(0.5, 2.0, 3 * k)) + rng.uniform(0.05, 1.0) * (g @ g.T)
+    mu, used, angle = rng.uniform(0.1, 1.5, k), rng.uniform(0.0, 0.6, k), rng.uniform(0.0, 7.0, k)
+    normal = rng.uniform(0.5, 2.0, k)
+    tangent = used * mu * normal * np.array([np.cos(angle), np.sin(angle)])
+    x = np.column_stack([normal, *tangent]).ravel()
+    p = lv.Problem.contact(a, a @ x, mu)
+    proof = lv.motion.uniqueness(p)
+    if proof:
+        assert len(lv.motions(p, 6, always=True)) == 1
+
+
+def test_nothing_slides_proves_more_than_small_friction():
+    coupled = np.diag([1.0, 3.5, 3.5]) + 0.8 * (
+        np.eye(3)[:, [0]] @ np.eye(3)[[1]] + np.eye(3)[:, [1]] @ np.eye(3)[[0]]
+    )
+    rest = lv.Problem.contact(coupled, coupled @ [1.0, 0.0, 0.0], [0.6])
+    proof = lv.motion.uniqueness(rest)
+    assert proof.kappa > 1.0
+    assert "nothing slides" in proof.reason
+    assert "nothing slides" in lv.motions(rest).unique
+    sliding = lv.Problem.contact(coupled, coupled @ [1.0, 0.0, 0.0] + [0.0, 5.0, 0.0], [0.6])
+    assert not lv.motion.uniqueness(sliding)
+    rim = lv.Problem.contact(coupled, coupled @ [1.0, 0.599, 0.0], [0.6])  # hardly any friction left over
+    assert not lv.motion.uniqueness(rim)
+
+
+def test_no_search_finds_several_motions_where_one_is_proved():
+    """Every Coulomb problem of the suite that is proved to have one motion and is small, searched nonetheless."""
+    names = dict.fromkeys([*suite.SETS["default"], *suite.SETS["hard"]])
+    proved = 0
+    for name in names:
+        p = suite.case(name).problem
+        if p.law != "coulomb" or p.m > 200 or not lv.motion.uniqueness(p):
+            continue
+        found = lv.motions(p, 6, always=True)
+        assert len(found) <= 1, name
+        proved += found.runs > 1
+    assert proved >= 5
