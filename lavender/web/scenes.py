@@ -7,40 +7,129 @@ from typing import Any
 import numpy as np
 
 from lavender.engine import Simulation
-from lavender.engine.layout import CAP_CONTACT, CAP_PAIR, HEAD, JOINT, SETTING, SIZE
+from lavender.engine.layout import CAP_CONTACT, CAP_PAIR, HEAD, JOINT, JOINT_KINDS, SETTING, SIZE
 from lavender.engine.snapshot import Snapshot
 from lavender.engine.state import ORDER_NUMBER
 from lavender.scene import Scene
 from lavender_ext.engine.arrays import SHAPES, offsets
 from lavender_ext.host import memory
 
-__all__ = ["PAGE", "describe", "layout", "page_scenes"]
+__all__ = ["PAGE", "PRESETS", "describe", "layout", "page_scenes"]
 
-#: Scenes of the page: name in the gallery, parameters, title, what to look for.
-PAGE: tuple[tuple[str, dict[str, Any], str, str], ...] = (
+#: Scenes of the page, the whole gallery: name, title, what to look for, what the caption measures of each side:
+#: "lean" (how far sideways of its start, or below it, a body is), "gap" (how far the ends of a joint are apart),
+#: "apart" (how far a body of B is from the same of A).
+PAGE: tuple[tuple[str, str, str, str], ...] = (
     (
         "stack",
-        {},
         "Stack of six boxes",
         "24 contacts, 72 rows. The slowest error shrinks by cos²(π/12) a sweep; warm starts go on from the last step.",
+        "lean",
     ),
     (
         "pyramid",
-        {},
         "Pyramid of 55 boxes",
         "400 contacts, more rows than the bodies can tell apart: the impulses are not unique, the motion is.",
+        "lean",
     ),
     (
         "chain",
-        {},
         "Chain of 20 links",
         "Joints alone: the eight values speak of contacts and stay 0, the error of the joint rows is E.",
+        "gap",
     ),
     (
         "spinner",
-        {},
         "Spinning ball",
         "One contact of four rows. Patch friction slows the ball with μ r N; one sweep solves a single contact.",
+        "apart",
+    ),
+    (
+        "heavy_on_light",
+        "Heavy box on a light one",
+        "A hundred times the mass on top: a sweep leaves 100/101 of the error.",
+        "lean",
+    ),
+    (
+        "card_house",
+        "House of cards",
+        "Cards that stand by friction alone: what a solver leaves over, they slide by.",
+        "lean",
+    ),
+    (
+        "bridge",
+        "Bridge of 16 planks",
+        "Hinges and contacts together, a box ten times as heavy as a plank on it: it sags by what impulses miss.",
+        "gap",
+    ),
+    (
+        "pile",
+        "Pile of a hundred bodies",
+        "Boxes and spheres that fall on each other: contacts come and go, the cache matches those that stay.",
+        "apart",
+    ),
+    (
+        "table",
+        "Table on nine legs",
+        "More legs than it needs: how they share the load is not unique, how it moves is.",
+        "lean",
+    ),
+    ("ramp", "Box on a ramp", "Sticks below tan θ = μ, slides above it: one body, four contacts.", "apart"),
+    (
+        "newtons_cradle",
+        "Newton's cradle",
+        "Distance joints and impacts: contacts of one instant, solved one after the other.",
+        "apart",
+    ),
+    (
+        "four_bar",
+        "Four-bar linkage",
+        "A motor drives a closed loop of hinges: one row more than the loop needs.",
+        "gap",
+    ),
+)
+
+#: Buttons of the page: name in its address, title, scene, settings of A and of B, what to see. The first opens it.
+PRESETS: tuple[tuple[str, str, str, dict[str, Any], dict[str, Any], str], ...] = (
+    (
+        "chain-cold",
+        "a chain, 16 sweeps: warm against cold",
+        "chain",
+        {"iterations": 16, "warm_start": True},
+        {"iterations": 16, "warm_start": False},
+        "16 sweeps a substep in both; A starts them from the impulses of the last one, B from nothing: its links part.",
+    ),
+    (
+        "4-warm-64-cold",
+        "4 warm against 64 cold",
+        "stack",
+        {"iterations": 4, "warm_start": True},
+        {"iterations": 64, "warm_start": False},
+        "B works sixteen times as hard as A and still creeps: each step starts from nothing.",
+    ),
+    (
+        "bottom-up-top-down",
+        "bottom-up against top-down, cold",
+        "stack",
+        {"iterations": 16, "warm_start": False, "order": "bottom_up"},
+        {"iterations": 16, "warm_start": False, "order": "top_down"},
+        "The same sweeps in opposite orders, each time from nothing: both towers walk sideways.",
+    ),
+    (
+        "heavy-on-light",
+        "heavy on light",
+        "heavy_on_light",
+        {"iterations": 16, "warm_start": True},
+        {"iterations": 16, "warm_start": False},
+        "The upper box is a hundred times as heavy. A carries it, B lets it slip off.",
+    ),
+    (
+        "cards",
+        "a house of cards",
+        "card_house",
+        {"iterations": 16, "warm_start": True},
+        {"iterations": 16, "warm_start": False},
+        "A stands. B slides by what its sweeps leave over, and falls after some seconds.",
     ),
 )
 
@@ -53,7 +142,7 @@ def layout() -> dict[str, Any]:
     dict
         structs: name -> field -> type ("i4", "f8", "3f8", "p" for a pointer); native: name -> size and offsets
         [bytes]; arrays: buffer -> names in order; size, head, setting,
-        joint: name -> place; orders: name -> number.
+        joint, joint_kinds: name -> place, number; orders: name -> number.
     """
     native = {name: {"size": size, "offsets": offsets} for name, (size, offsets) in memory.layout().items()}
     return {
@@ -64,6 +153,7 @@ def layout() -> dict[str, Any]:
         "head": HEAD,
         "setting": SETTING,
         "joint": JOINT,
+        "joint_kinds": JOINT_KINDS,
         "orders": ORDER_NUMBER,
     }
 
@@ -93,20 +183,38 @@ def describe(start: Snapshot) -> dict[str, Any]:
 
 
 def page_scenes() -> dict[str, Any]:
-    """Everything that the page reads: layout and scenes."""
+    """Everything that the page reads: layout, scenes and presets."""
     scenes = []
-    for name, parameters, title, note in PAGE:
-        scene = Scene(name, **parameters)
+    for name, title, note, measure in PAGE:
+        scene = Scene(name)
         common = scene.parameters
         scenes.append(
             {
                 "name": name,
                 "title": title,
                 "note": note,
+                "measure": measure,
                 "dt": common.dt,
                 "substeps": common.substeps,
                 "bodies": [body.name for body in scene.bodies],
                 **describe(Simulation(scene).snapshot()),
             }
         )
-    return {"layout": layout(), "scenes": scenes}
+    presets = [
+        {
+            "name": name,
+            "title": title,
+            "scene": scene_name,
+            "sides": [
+                {
+                    "iterations": side["iterations"],
+                    "warm_start": int(side["warm_start"]),
+                    "order": ORDER_NUMBER[side.get("order", "given")],
+                }
+                for side in (one, two)
+            ],
+            "note": note,
+        }
+        for name, title, scene_name, one, two, note in PRESETS
+    ]
+    return {"layout": layout(), "scenes": scenes, "presets": presets}

@@ -10,11 +10,14 @@ import pytest
 import lavender as lv
 from lavender.engine import SOLVER_FIELDS
 from lavender.errors import LavenderError
+from lavender.scene import SCENES as SCENES_OF_GALLERY
+from lavender.scene.parts import rotation
 from lavender.web import pages
+from lavender.web.scenes import PRESETS
 
 pytestmark = pytest.mark.slow  # the module is the same whatever checks the native kernels are built with
 
-SCENES = ("stack", "pyramid", "chain", "spinner")
+SCENES = ("stack", "pyramid", "chain", "spinner")  # of the page's, which are those of the gallery
 WHOLE = ("iterations", "warm_start", "contacts", "cache_matches")
 
 
@@ -78,7 +81,7 @@ class Visit:
 def visit(browser, address):
     visits = []
 
-    def start(path="", **options):
+    def start(path="#stack", **options):
         visits.append(Visit(browser, address + path, **options))
         return visits[-1]
 
@@ -295,6 +298,151 @@ def test_a_lost_state_is_named(visit):
     assert "Side B: the state of" in v.page.locator("#failure").text_content()
     v.page.click("#reset")
     assert v.page.locator("#failure").is_hidden()
+
+
+def test_it_opens_moving_with_two_settings_that_make_the_point(visit):
+    v = visit("")
+    _, title, scene, one, two, note = PRESETS[0]
+    assert v.page.locator("#scene").input_value() == scene
+    assert v.page.locator("#note").text_content() == note
+    assert v.page.locator("#play").get_attribute("aria-pressed") == "true"
+    assert v.page.locator("#presets button[aria-pressed=true]").text_content() == title
+    assert v.side(0).locator(".warm input").is_checked() == one["warm_start"]
+    assert v.side(1).locator(".warm input").is_checked() == two["warm_start"]
+    v.page.wait_for_function("lavender.steps > 3")
+    v.page.keyboard.press(" ")
+    v.js("lavender.advance(300 - lavender.steps)")
+    gaps = v.js("lavender.sides.map((side) => side.gap())")
+    assert gaps == [pytest.approx(native_gap(scene, 300, **s), rel=1e-9) for s in (one, two)]
+    assert gaps[1] > 5.0 * gaps[0]  # the sentence says that links part
+    caption = v.page.locator("#caption").text_content()
+    assert caption == "A's joints are open by {}, B's by {}".format(*(said(v, x) for x in gaps))
+
+
+def said(v, x):
+    return v.js(f"import('./app.js').then((module) => module.length({x!r}))")
+
+
+def native_gap(scene, steps, iterations, warm_start):
+    """Largest distance between the ends of a ball joint after some steps."""
+    simulation = lv.Simulation(lv.Scene(scene, solver_iterations=iterations, warm_start=warm_start))
+    for _ in range(steps):
+        observation = simulation.step()[0]
+    most = 0.0
+    for joint in simulation.scene.joints:
+        ends = []
+        for body, local in ((joint.a, joint.anchor_a), (joint.b, joint.anchor_b)):
+            turn = np.eye(3) if body < 0 else rotation(observation["quaternions"][body])
+            ends.append(turn @ local + (0.0 if body < 0 else observation["positions"][body]))
+        most = max(most, float(np.linalg.norm(ends[1] - ends[0])))
+    return most
+
+
+def test_reduced_motion_opens_at_rest(visit):
+    v = visit("", reduced_motion="reduce")
+    assert v.page.locator("#play").get_attribute("aria-pressed") == "false"
+
+
+@pytest.mark.parametrize("preset", PRESETS, ids=lambda preset: preset[0])
+def test_presets_set_everything_and_are_part_of_the_address(visit, preset):
+    _, title, scene, *sides, note = preset
+    v = visit()
+    v.page.get_by_role("button", name=title, exact=True).click()
+    v.page.keyboard.press("Escape")
+    v.js("lavender.play(false)")
+    v.js("lavender.choose(lavender.scene.name)")
+    assert v.page.locator("#scene").input_value() == scene
+    assert v.page.locator("#note").text_content() == note
+    v.js("lavender.advance(30)")
+    for i, side in enumerate(sides):
+        own = {
+            "solver_iterations": side["iterations"],
+            **{k: v for k, v in side.items() if k != "iterations"},
+        }
+        own.setdefault("order", "given")
+        assert v.values(i)[0] == native(scene, 30, **own)
+    leans = v.js("lavender.sides.map((side) => side.lean())")
+    assert leans == [pytest.approx(native_lean(scene, 30, **side), abs=1e-12) for side in sides]
+
+
+def native_lean(scene, steps, iterations, **settings):
+    settings.setdefault("order", "given")
+    simulation = lv.Simulation(lv.Scene(scene, solver_iterations=iterations, **settings))
+    start = np.array([body.position for body in simulation.scene.bodies])
+    for _ in range(steps):
+        observation = simulation.step()[0]
+    moved = observation["positions"] - start
+    return float(np.hypot(*moved[:, :2].T).max()), float(max(-moved[:, 2].min(), 0.0))
+
+
+def test_the_address_holds_every_setting_and_is_followed(visit):
+    v = visit("#scene=pyramid&a=8,cold,top_down&b=40,warm,random&speed=0.25&play=0")
+    assert v.page.locator("#scene").input_value() == "pyramid"
+    assert v.page.locator("#speed").input_value() == "0.25"
+    v.js("lavender.advance(3)")
+    assert v.values(0)[0] == native("pyramid", 3, solver_iterations=8, warm_start=False, order="top_down")
+    assert v.values(1)[0] == native("pyramid", 3, solver_iterations=40, order="random")
+    v.side(0).locator(".sweeps input").fill("12")
+    v.side(1).locator(".warm input").uncheck()
+    v.page.locator("#speed").select_option("0.05")
+    assert v.js("location.hash") == "#scene=pyramid&a=12,cold,top_down&b=40,cold,random&speed=0.05&play=0"
+    v.js("location.hash = '#scene=table&a=5,warm,given&b=6,warm,given&play=1'")
+    v.page.wait_for_function("lavender.scene.name === 'table' && lavender.playing")
+    assert v.side(0).locator(".sweeps output").text_content() == "5"
+    v.js("location.hash = '#no such scene'")
+    v.page.wait_for_function("lavender.scene.name === 'stack'")
+    v.js("location.hash = '#scene=stack&a=1000,x,y&b='")  # senseless values leave what was set
+    v.page.wait_for_function("!lavender.playing")
+    assert v.side(0).locator(".sweeps output").text_content() == "5"
+
+
+def test_every_scene_of_the_gallery_runs_and_is_captioned(visit):
+    v = visit()
+    names = v.js("lavender.contents.scenes.map((scene) => scene.name)")
+    assert sorted(names) == sorted(SCENES_OF_GALLERY)
+    for name in names:
+        v.page.locator("#scene").select_option(name)
+        v.js("lavender.advance(2)")
+        assert v.values(0)[0] == native(name, 2)
+        assert v.page.locator("#caption").text_content() != ""
+
+
+def test_a_body_can_be_pulled_at_and_both_sides_are_pulled_alike(visit):
+    v = visit("#scene=heavy_on_light&a=16,warm,given&b=16,warm,given")
+    box = v.side(0).locator("canvas").bounding_box()
+    upper = v.js("lavender.sides[0].view.places.find((place) => place.body === 2).middle")
+    start = v.js("Array.from(lavender.sides[0].simulation.array('x').slice(6, 9))")
+    x, y = box["x"] + upper[0], box["y"] + upper[1]
+    v.page.mouse.move(x, y)
+    v.page.mouse.down()
+    v.page.mouse.move(x, y - 60, steps=4)
+    v.js("lavender.advance(240)")
+    ends = [v.js(f"Array.from(lavender.sides[{i}].simulation.array('x').slice(6, 9))") for i in (0, 1)]
+    assert ends[0] == ends[1]
+    assert ends[0][2] > start[2] + 0.3  # lifted off
+    turn = v.js("lavender.sides[0].view.turn")
+    v.page.mouse.up()
+    v.js("lavender.advance(240)")
+    assert v.js("lavender.sides[0].simulation.array('x')[8]") < ends[0][2] - 0.2  # and falls
+    assert v.js("lavender.sides[0].view.turn") == turn
+    v.page.mouse.move(box["x"] + 8, box["y"] + 8)  # beside all bodies: the picture turns
+    v.page.mouse.down()
+    v.page.mouse.move(box["x"] + 40, box["y"] + 8)
+    v.page.mouse.up()
+    assert v.js("lavender.sides[1].view.turn") != turn
+
+
+def test_panels_with_nothing_to_show_give_way(visit):
+    v = visit("#chain")
+    v.page.click("#second")
+    hidden = {name: v.page.locator(f"#chart-{name}").is_hidden() for name in ("energy", "normal", "contacts")}
+    assert hidden == {"energy": False, "normal": True, "contacts": True}
+    v.page.locator("#scene").select_option("stack")
+    v.page.click("#second")
+    assert v.page.locator("#chart-contacts").is_visible()
+    width = v.js("lavender.charts.contacts.plot.width")
+    assert width == v.js("document.querySelector('#chart-contacts').clientWidth")
+    assert v.page.locator("figure .legend").first.text_content() == "AB"
 
 
 @pytest.mark.parametrize("width", [1200, 420])

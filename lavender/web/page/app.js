@@ -8,6 +8,8 @@ const MOST_STEPS = 6; // in one frame; a slower machine runs slower than real ti
 const PLOT_EVERY = 80; // ms
 const DEFAULTS = [{ warm_start: 1 }, { warm_start: 0 }];
 const WHOLE = new Set(["iterations", "warm_start", "contacts", "cache_matches"]);
+const PULL = 200; // 1/s^2 and, as 2 sqrt of it, 1/s: the spring a held body hangs on, critically damped
+const PLAIN = ["scene", "a", "b", "speed", "play"];
 const UNITS = { residual_initial: "N s", residual_final: "N s", violation_initial: "m/s", violation_final: "m/s" };
 
 const find = (id) => document.getElementById(id);
@@ -34,10 +36,10 @@ function upwards(plot, low, high) {
 
 class Chart {
   // series: { side, dash, scale } each; `log`: powers of ten on the left.
-  constructor(place, series, { log = false, right = false, x = "time [s]" } = {}) {
+  constructor(place, series, { log = false, right = false, empty = false, x = "time [s]" } = {}) {
     this.place = find(place);
     this.series = series;
-    this.options = { log, right, x };
+    this.options = { log, right, empty, x };
     this.data = null;
     this.make();
     new ResizeObserver(() => this.#resize()).observe(this.place);
@@ -91,7 +93,13 @@ class Chart {
 
   set(data) {
     this.data = data;
-    this.place.classList.toggle("empty", data[0].length > 0 && data.slice(1).every((ys) => ys.every((y) => y === null)));
+    // A panel that has nothing to show gives way.
+    const figure = this.place.closest("figure");
+    const nothing = data[0].length > 0 && data.slice(1).every((ys) => ys.every((y) => y === null || (this.options.empty && y === 0)));
+    if (figure.hidden !== nothing) {
+      figure.hidden = nothing;
+      this.#resize();
+    }
     this.plot.setData(data);
   }
 
@@ -135,6 +143,9 @@ class Side {
     this.order.addEventListener("change", () => this.set({ order: Number(this.order.value) }));
     this.view = new View(this.canvas);
     this.view.onlook = () => this.draw();
+    this.view.ongrab = (body) => this.app.grab(this, body);
+    this.view.onpull = (way) => this.app.pull(way);
+    this.view.onrelease = () => this.app.release();
     this.history = null;
     this.kept = null;
   }
@@ -144,6 +155,7 @@ class Side {
     this.simulation = new Simulation(new Kernels(this.app.module, this.app.contents.layout), scene);
     const { iterations, warm_start, order } = before ?? { ...this.simulation.settings, ...DEFAULTS[this.index] };
     this.simulation.set({ iterations, warm_start, order });
+    this.start = Float64Array.from(this.simulation.array("x"));
     this.forget();
     this.readSettings();
   }
@@ -157,6 +169,50 @@ class Side {
   set(changes) {
     this.simulation.set(changes);
     this.readSettings();
+    this.app.write();
+  }
+
+  // A held body follows the pointer as if on a spring, whatever its mass.
+  pull({ body, at }) {
+    const [x, v, dynamic] = ["x", "v", "dyn"].map((name) => this.simulation.array(name));
+    if (dynamic[body] < 0) {
+      return;
+    }
+    const dt = this.app.scene.dt;
+    for (let k = 0; k < 3; k++) {
+      const now = v[6 * body + k];
+      v[6 * body + k] = (now + dt * PULL * (at[k] - x[3 * body + k])) / (1 + 2 * dt * Math.sqrt(PULL));
+    }
+  }
+
+  // How far [m] a body is from its start at most: sideways, and below it.
+  lean() {
+    const [x, dynamic] = [this.simulation.array("x"), this.simulation.array("dyn")];
+    const most = [0, 0];
+    for (let i = 0; i < dynamic.length; i++) {
+      const [dx, dy, dz] = [0, 1, 2].map((k) => x[3 * i + k] - this.start[3 * i + k]);
+      if (dynamic[i] >= 0) {
+        most[0] = Math.max(most[0], Math.hypot(dx, dy));
+        most[1] = Math.max(most[1], -dz);
+      }
+    }
+    return most;
+  }
+
+  // Largest distance [m] between the ends of a joint (from its length, of a distance joint).
+  gap() {
+    const s = this.simulation;
+    const { joint: at, joint_kinds: kinds } = s.k.layout;
+    const [joint, bodies, kind] = ["joint", "joint_bodies", "joint_kind"].map((name) => s.array(name));
+    const reals = joint.length / s.joints;
+    let most = 0;
+    for (let j = 0; j < s.joints; j++) {
+      const end = (side, place) => s.point(bodies[2 * j + side], joint.subarray(j * reals + place, j * reals + place + 3));
+      const [a, b] = [end(0, at.anchor_a), end(1, at.anchor_b)];
+      const far = Math.hypot(b[0] - a[0], b[1] - a[1], b[2] - a[2]);
+      most = Math.max(most, kind[j] === kinds.distance ? Math.abs(far - joint[j * reals + at.length]) : far);
+    }
+    return most;
   }
 
   readSettings() {
@@ -244,10 +300,18 @@ class App {
     });
     this.makeCharts();
     this.listen();
-    const names = contents.scenes.map((scene) => scene.name);
     find("scene").append(...contents.scenes.map((scene) => new Option(scene.title, scene.name)));
-    const asked = location.hash.slice(1);
-    this.choose(names.includes(asked) ? asked : names[0]);
+    find("presets").append(...contents.presets.map((preset) => {
+      const button = Object.assign(document.createElement("button"), { type: "button", textContent: preset.title });
+      button.dataset.preset = preset.name;
+      button.addEventListener("click", () => {
+        this.take(preset);
+        this.play(true);
+      });
+      return button;
+    }));
+    this.read();
+    window.addEventListener("hashchange", () => location.hash !== this.written && this.read());
     requestAnimationFrame((now) => this.frame(now));
   }
 
@@ -272,7 +336,7 @@ class App {
       normal: new Chart("chart-normal", both, { log: true, x: "sweep" }),
       residual: new Chart("chart-residual", four, { log: true }),
       violation: new Chart("chart-violation", four, { log: true }),
-      contacts: new Chart("chart-contacts", four),
+      contacts: new Chart("chart-contacts", four, { empty: true }),
       settings: new Chart("chart-settings", four.map((s) => (s.dash ? { ...s, scale: "right" } : s)), { right: true }),
     };
   }
@@ -287,6 +351,7 @@ class App {
     click("restore", () => this.restore());
     click("push", () => this.push());
     find("scene").addEventListener("change", (event) => this.choose(event.target.value));
+    find("speed").addEventListener("change", () => this.write());
     document.addEventListener("keydown", (event) => this.key(event));
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => {
       this.readColors();
@@ -328,14 +393,87 @@ class App {
     }
   }
 
+  // -- the address: everything that is set, or the name of a preset or of a scene alone
+
+  read() {
+    const words = decodeURIComponent(location.hash.slice(1));
+    const given = new URLSearchParams(words.includes("=") ? words : "");
+    const preset = this.contents.presets.find((one) => one.name === words);
+    const scenes = this.contents.scenes.map((scene) => scene.name);
+    if (words === "" || preset) {
+      this.take(preset ?? this.contents.presets[0]);
+      this.play(!matchMedia("(prefers-reduced-motion: reduce)").matches);
+      return;
+    }
+    const name = given.get("scene") ?? words;
+    this.choose(scenes.includes(name) ? name : scenes[0]);
+    ["a", "b"].forEach((key, i) => {
+      const [sweeps, warm, order] = (given.get(key) ?? "").split(",");
+      const changes = {};
+      if (Number(sweeps) >= 4 && Number(sweeps) <= 64) {
+        changes.iterations = Math.round(Number(sweeps));
+      }
+      if (warm === "warm" || warm === "cold") {
+        changes.warm_start = Number(warm === "warm");
+      }
+      if (ORDERS.includes(order)) {
+        changes.order = ORDERS.indexOf(order);
+      }
+      this.sides[i].set(changes);
+    });
+    if (Array.from(find("speed").options, (option) => option.value).includes(given.get("speed"))) {
+      find("speed").value = given.get("speed");
+    }
+    this.play(given.get("play") === "1");
+    this.write();
+  }
+
+  write() {
+    if (!this.scene || this.sides.some((side) => !side.simulation)) {
+      return;
+    }
+    const said = this.sides.map(({ simulation: { settings: s } }) => [s.iterations, s.warm_start ? "warm" : "cold", ORDERS[s.order]].join(","));
+    const values = [this.scene.name, ...said, find("speed").value, this.playing ? 1 : 0];
+    this.written = "#" + PLAIN.map((name, i) => `${name}=${values[i]}`).join("&");
+    if (location.hash !== this.written) {
+      history.replaceState(null, "", this.written);
+    }
+    const now = this.contents.presets.find((preset) => preset.scene === this.scene.name
+      && preset.sides.every((side, i) => Object.entries(side).every(([key, value]) => this.sides[i].simulation.settings[key] === value)));
+    find("note").textContent = (now ?? this.scene).note;
+    for (const button of find("presets").children) {
+      button.setAttribute("aria-pressed", button.dataset.preset === now?.name);
+    }
+  }
+
+  take(preset) {
+    this.choose(preset.scene);
+    preset.sides.forEach((side, i) => this.sides[i].set(side));
+  }
+
+  // -- a body held by the pointer, on both sides alike
+
+  grab(side, body) {
+    if (side.simulation.array("dyn")[body] >= 0) {
+      const x = side.simulation.array("x");
+      this.held = { body, at: Array.from(x.subarray(3 * body, 3 * body + 3)) };
+    }
+  }
+
+  pull(way) {
+    if (this.held) {
+      this.held.at = this.held.at.map((v, k) => v + way[k]);
+    }
+  }
+
+  release() {
+    this.held = null;
+  }
+
   choose(name) {
-    const another = this.scene?.name !== name;
+    this.held = null;
     this.scene = this.contents.scenes.find((scene) => scene.name === name);
     find("scene").value = name;
-    find("note").textContent = this.scene.note;
-    if (another) {
-      history.replaceState(null, "", `#${name}`);
-    }
     this.steps = 0;
     this.seed = 1;
     this.owed = 0;
@@ -345,6 +483,7 @@ class App {
     }
     find("restore").disabled = true;
     find("failure").hidden = true;
+    this.write();
     this.show(true);
   }
 
@@ -353,6 +492,7 @@ class App {
     this.last = null;
     find("play").textContent = on ? "Pause" : "Play";
     find("play").setAttribute("aria-pressed", on);
+    this.write();
   }
 
   // The same steps on both sides.
@@ -366,6 +506,9 @@ class App {
         break;
       }
       this.steps += 1;
+      if (this.held) {
+        this.sides.forEach((side) => side.pull(this.held));
+      }
       this.sides.forEach((side) => side.step(this.steps * this.scene.dt));
     }
     this.show(!this.playing);
@@ -415,11 +558,37 @@ class App {
 
   show(always) {
     this.sides.forEach((side) => side.show());
+    this.caption();
     find("clock").textContent = `${(this.steps * this.scene.dt).toFixed(3)} s, step ${this.steps}`;
     const now = performance.now();
     if (always || now - this.plotted > PLOT_EVERY) {
       this.plotted = now;
       this.plot();
+    }
+  }
+
+  // What the two settings did, measured.
+  caption() {
+    const { measure, bodies } = this.scene;
+    const say = (a, between, b) => find("caption").replaceChildren(bold(a), between, bold(b));
+    const bold = (text) => Object.assign(document.createElement("b"), { textContent: text });
+    if (measure === "gap") {
+      const [a, b] = this.sides.map((side) => length(side.gap()));
+      say(`A's joints are open by ${a}`, ", ", `B's by ${b}`);
+    } else if (measure === "lean") {
+      const [a, b] = this.sides.map((side, i) => {
+        const [across, down] = side.lean();
+        return `${"AB"[i]} ${across >= down ? "leans" : "sinks"} ${length(Math.max(across, down))}`;
+      });
+      say(a, ", ", b);
+    } else {
+      const [a, b] = this.sides.map((side) => side.simulation.array("x"));
+      let found = [0, -1];
+      for (let i = 0; i < bodies.length; i++) {
+        const far = Math.hypot(...[0, 1, 2].map((k) => a[3 * i + k] - b[3 * i + k]));
+        found = far > found[0] ? [far, i] : found;
+      }
+      say("A", " and ", found[1] < 0 ? "B move alike" : `B are ${length(found[0])} apart at ${bodies[found[1]]}`);
     }
   }
 
@@ -440,6 +609,15 @@ class App {
     this.charts.contacts.set(pairs("contacts", "cache_matches"));
     this.charts.settings.set(pairs("warm_start", "iterations"));
   }
+}
+
+// As people say lengths: 8 cm, 0.3 mm, 1.2 m.
+export function length(x) {
+  if (!Number.isFinite(x)) {
+    return "out of sight";
+  }
+  const [scale, unit] = x >= 0.9995 ? [1, "m"] : x >= 0.00995 ? [0.01, "cm"] : [0.001, "mm"];
+  return `${x / scale >= 9.95 ? Math.round(x / scale) : (x / scale).toFixed(1)} ${unit}`;
 }
 
 function fail(text) {

@@ -48,12 +48,29 @@ export class View {
   #listen() {
     const { canvas } = this;
     let from = null;
+    let held = null;
+    const inside = (event) => {
+      const box = canvas.getBoundingClientRect();
+      return [event.clientX - box.left, event.clientY - box.top];
+    };
     canvas.addEventListener("pointerdown", (event) => {
-      from = [event.clientX, event.clientY];
+      const at = inside(event);
+      const body = this.ongrab ? this.bodyAt(at) : -1;
       canvas.setPointerCapture(event.pointerId);
+      if (body >= 0) {
+        held = { body, at };
+        this.ongrab(body);
+        canvas.style.cursor = "grabbing";
+      } else {
+        from = [event.clientX, event.clientY];
+      }
     });
     canvas.addEventListener("pointermove", (event) => {
-      if (from) {
+      if (held) {
+        const at = inside(event);
+        this.onpull(this.inScene(at[0] - held.at[0], at[1] - held.at[1]));
+        held.at = at;
+      } else if (from) {
         this.#look((event.clientX - from[0]) * 0.008, (event.clientY - from[1]) * 0.006);
         from = [event.clientX, event.clientY];
       }
@@ -61,6 +78,11 @@ export class View {
     for (const end of ["pointerup", "pointercancel"]) {
       canvas.addEventListener(end, () => {
         from = null;
+        if (held) {
+          held = null;
+          canvas.style.cursor = "";
+          this.onrelease();
+        }
       });
     }
     canvas.addEventListener("keydown", (event) => {
@@ -78,6 +100,23 @@ export class View {
       view.tilt = Math.min(1.4, Math.max(0.02, view.tilt + tilt));
       view.onlook?.();
     }
+  }
+
+  // The nearest body of the picture as it was drawn that lies under a place on the canvas, or -1.
+  bodyAt(at) {
+    let best = { body: -1, depth: Infinity };
+    for (const { body, middle, size } of this.places ?? []) {
+      if (Math.hypot(at[0] - middle[0], at[1] - middle[1]) <= Math.max(size, 9) && middle[2] < best.depth) {
+        best = { body, depth: middle[2] };
+      }
+    }
+    return best.body;
+  }
+
+  // A way on the canvas [px] as one in the scene [m], across the line of sight.
+  inScene(dx, dy) {
+    const { right, top, scale } = this.eye;
+    return [0, 1, 2].map((k) => (dx * right[k] - dy * top[k]) / scale);
   }
 
   // What the picture must hold: the bodies at the start, with room.
@@ -137,6 +176,8 @@ export class View {
     const project = (p) => [
       0.5 * width + scale * (dot(p, right) - middle[0]), 0.49 * height - scale * (dot(p, top) - middle[1]), dot(p, away),
     ];
+    this.eye = { right, top, scale };
+    this.places = [];
     if (this.hasGround) {
       this.#ground(project, colors);
     }
@@ -172,6 +213,10 @@ export class View {
       const size = shape.subarray(4 * i, 4 * i + 3);
       const hue = 262 + 17 * ((i * 5) % 7) - 51;
       const r = rotation(q, i);
+      if (what === BOX || what === SPHERE) {
+        const half = what === SPHERE ? size[0] : 0.8 * Math.max(...size);
+        this.places.push({ body: i, middle: project(centre), size: half * scale });
+      }
       if (what === BOX) {
         const corners = [];
         for (let k = 0; k < 8; k++) {

@@ -236,6 +236,19 @@ export class Simulation {
     return buffer === 1 ? this.k.i32(this.index + 4 * first, n) : this.k.u64(this.keys + 8 * first, n);
   }
 
+  // A point (3,) [m] that is fixed to a body, in the world; body -1 is the world.
+  point(body, local) {
+    if (body < 0) {
+      return Array.from(local);
+    }
+    const [x, q] = [this.array("x"), this.array("q")];
+    const [w, ...u] = q.subarray(4 * body, 4 * body + 4);
+    const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
+    const t = cross(u, local).map((v) => 2 * v);
+    const turned = cross(u, t).map((v, k) => local[k] + w * t[k] + v);
+    return turned.map((v, k) => v + x[3 * body + k]);
+  }
+
   get sizes() {
     return Array.from(this.k.i32(this.size, SIZES));
   }
