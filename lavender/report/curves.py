@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from lavender.bench.record import Record, level_name
 from lavender.bench.store import Records
 from lavender.report import tables
+from lavender.report.moved import by_speed, speed_levels
 from lavender.report.text import count
 
 __all__ = [
@@ -220,18 +222,46 @@ class Figures:
     profiles: Mapping[str, tuple[Figure, ...]]  # by problem class, one for each level
     sequences: Mapping[str, tuple[Figure, ...]]
     peers: Mapping[str, tuple[Figure, ...]] = field(default_factory=dict)  # `lavender.report.rivals`
+    moved: Figures | None = (
+        None  # the same with motion errors [m/s] in place of residuals, where they are known
+    )
 
     def __iter__(self) -> Iterator[Figure]:
         yield from self.families.values()
         for group in (self.profiles, self.sequences, self.cases, self.peers):
             for some in group.values():
                 yield from some
+        if self.moved is not None:
+            yield from self.moved
 
 
 def figures(records: Records) -> Figures:
-    """The figures of the records; none of a campaign, whose tables say it."""
+    """The figures of the records, by residual and, where it is known, by motion error; none of a campaign."""
     if tables.is_campaign(records):
         return Figures({}, {}, {}, {})
+    found = _figures(records)
+    return replace(found, moved=_by_motion(_figures(by_speed(records)))) if speed_levels(records) else found
+
+
+def _by_motion(found: Figures) -> Figures:
+    """Figures of `by_speed` records, with names, axes and levels that say what they show."""
+
+    def told(figure: Figure) -> Figure:
+        return replace(
+            figure,
+            name=f"motion {figure.name}",
+            title=re.sub(r"(, to \S+) \(", r"\1 m/s (", figure.title),
+            y_title=figure.y_title.replace("relative residual [-]", "motion error [m/s]"),
+        )
+
+    def group(some: Mapping[str, tuple[Figure, ...]]) -> dict[str, tuple[Figure, ...]]:
+        return {name: tuple(map(told, own)) for name, own in some.items()}
+
+    families = {name: told(figure) for name, figure in found.families.items()}
+    return Figures(group(found.cases), families, group(found.profiles), group(found.sequences))
+
+
+def _figures(records: Records) -> Figures:
     cases = dict.fromkeys(r.case for r in records if r.step < 0)
     families = {f: family_figure(records, f, cs) for f, cs in tables.families(records).items() if len(cs) > 1}
     profiles: dict[str, list[Figure]] = {}

@@ -98,17 +98,20 @@ def _content(
     titles = {f.name: "" for some in figures.cases.values() for f in some} | {
         f.name: "" for f in figures.families.values()
     }
+    titles |= {f"motion {name}": "" for name in titles}
     levels = tables.levels_of(records)
     campaign = tables.is_campaign(records)
     by_case: dict[str, list[tables.Reach]] = {}
     if not campaign:  # thousands of cases: the tables over all of them say it
         for reach in tables.reaches(records, levels):
             by_case.setdefault(reach.case, []).append(reach)
+    other = figures.moved or Figures({}, {}, {}, {})
     cases = [
         {
             "info": records.cases[name],
             "reaches": rows,
             "figures": _keys(figures.cases.get(name, ())),
+            "moved": _keys(other.cases.get(name, ())),
             "best": _fastest(rows, levels[len(levels) // 2]),
         }
         for name, rows in by_case.items()
@@ -146,6 +149,10 @@ def _content(
         "most": MOST,
         "cases": cases,
         "profiles": {law: _keys(some) for law, some in figures.profiles.items()},
+        "by_motion": figures.moved is not None,
+        "moved_families": {f: file_name(figure.name) for f, figure in other.families.items()},
+        "moved_profiles": {law: _keys(some) for law, some in other.profiles.items()},
+        "moved_sequences": {name: _keys(some) for name, some in other.sequences.items()},
         "means": tables.geometric_means(records),
         "shift": tables.SHIFT,
         "limit": tables.limit_of(records),

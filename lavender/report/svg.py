@@ -163,6 +163,7 @@ def _names(
             a, b = next((a, b) for a, b in zip(reversed(x), reversed(y), strict=True) if not math.isnan(b))
             ends[c.label] = (across(a) + 12, up(b) + 8)
     taken: list[int] = []
+    placed: list[str] = []
     for label in sorted(
         (c.label for c, _, _ in curves if c.solver in leaders and c.label in ends), key=lambda k: ends[k][1]
     ):
@@ -171,6 +172,11 @@ def _names(
             place = max(place, taken[-1] + GAP)
         taken.append(place)
         ends[label] = (ends[label][0], place)
+        placed.append(label)
+    lowest = HEIGHT - BOTTOM + 4  # above the numbers of the axis
+    for label in reversed(placed):
+        ends[label] = (ends[label][0], min(ends[label][1], lowest))
+        lowest = ends[label][1] - GAP
     return ends
 
 

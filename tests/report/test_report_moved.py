@@ -3,6 +3,8 @@
 import csv
 import json
 import math
+import os
+import shutil
 
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ import lavender as lv
 from lavender import bench, report
 from lavender.cli import cli, main
 from lavender.report import moved, tables
+from lavender.report.curves import figures
 from lavender.report.write import write
 
 PLAN = bench.Plan(
@@ -179,3 +182,64 @@ def test_a_campaign_counts_cases_by_motion_error_too(tmp_path):
     text = (tmp_path / "summary.md").read_text(encoding="utf-8")
     assert f"| {rows[0].family} | pgs | 2 | " in text
     assert "By motion error" in text
+
+
+# -- the switch of the axes ------------------------------------------------------------------------------
+
+
+def test_figures_by_motion_error_hold_the_speeds_of_the_records(records):
+    found = figures(moved.working(records))
+    assert set(found.moved.cases) == set(found.cases)
+    for one, other in zip(found.cases["stack(n=16)"], found.moved.cases["stack(n=16)"], strict=True):
+        assert one.y_title == "relative residual [-]"
+        assert other.y_title == "motion error [m/s]"
+        assert other.name == f"motion {one.name}"
+        assert one.x_title == other.x_title
+    error = found.moved.cases["stack(n=16)"][0]
+    told = {max(r.motion_speed, 1e-17) for r in records if r.case == "stack(n=16)" and r.usable}
+    assert {y for curve in error.curves for y in curve.y} <= told
+    assert error.levels == (1e-2, 1e-4)
+    names = [figure.name for figure in found]
+    assert len(names) == len(set(names))  # each has a file of its own
+
+
+def test_without_motion_errors_there_is_no_switch(tmp_path):
+    plain = bench.run(["stack(n=4)"], ["pgs"], bench.Plan(levels=(1e-3,), budgets=(), repeats=1, orders=()))
+    assert figures(plain).moved is None
+    assert (
+        "by-motion"
+        not in write(plain, tmp_path, figures=False).read_text(encoding="utf-8").split("<body>")[1]
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("script", [True, False], ids=["script", "no script"])
+def test_one_switch_changes_the_axes_of_all_charts(records, tmp_path, script):
+    """In a real browser, also without JavaScript, and as it is printed."""
+    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed (extra: dev)")
+    found = os.environ.get("CHROMIUM") or next(
+        filter(None, map(shutil.which, ("chromium", "google-chrome"))), None
+    )
+    if found is None:
+        pytest.skip("no Chromium is installed, and CHROMIUM names no browser")
+    index = write(records, tmp_path, figures=False)
+    with playwright.sync_playwright() as p:
+        browser = p.chromium.launch(executable_path=found, args=["--no-sandbox"])
+        page = browser.new_context(
+            java_script_enabled=script, viewport={"width": 400, "height": 800}
+        ).new_page()
+        page.goto(index.resolve().as_uri())
+        assert page.evaluate("document.documentElement.scrollWidth") <= 400
+        one, other = page.locator(".row.r .chart"), page.locator(".row.m .chart")
+        assert one.count() == other.count() > 0
+        assert one.first.is_visible()
+        assert not other.first.is_visible()
+        page.locator("label[for=by-motion]").click()
+        assert other.first.is_visible()
+        assert not any(chart.is_visible() for chart in one.all())
+        assert "motion error [m/s]" in other.first.text_content()
+        assert page.locator("#filter").is_visible() == script
+        page.emulate_media(media="print")
+        assert other.first.is_visible()
+        assert not page.locator(".axes").is_visible()
+        browser.close()

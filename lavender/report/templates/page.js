@@ -38,7 +38,7 @@
       if (alone.checked) rules.unshift(".c { visibility: hidden; }");
       style.textContent = rules.join("\n");
     };
-    filter.hidden = false;
+    filter.hidden = filter.parentElement.hidden = false;
     filter.addEventListener("change", (event) => {
       const box = event.target;
       if (box !== alone) {
