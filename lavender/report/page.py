@@ -30,7 +30,8 @@ if TYPE_CHECKING:
 
 __all__ = ["page"]
 
-MOST = 2000  # failures on a page, for browsers' sake; a campaign may have more
+MOST = 500  # failures on a page, for its weight: 200 problems are to fit into 3 MB
+MOST_SPREADS = 100  # widest spreads of sweep orders on a page
 
 
 def page(
@@ -147,6 +148,7 @@ def _content(
         "claims": tables.claims(records),
         "failures": tables.failures(records),
         "most": MOST,
+        "most_spreads": MOST_SPREADS,
         "cases": cases,
         "profiles": {law: _keys(some) for law, some in figures.profiles.items()},
         "by_motion": figures.moved is not None,

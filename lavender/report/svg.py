@@ -208,7 +208,9 @@ def _curve(
     if c.steps and before is not None:
         line.append(f"H{WIDTH - RIGHT}")
     kind = f"c s{n}" + (" w" if c.thin else "")
-    asked = f' data-n="{escape("|".join(c.notes))}"' if c.notes else ""
+    # "16" for 16 iterations: the page's script says the word.
+    said = "|".join(note.removesuffix(" iterations") for note in c.notes)
+    asked = f' data-n="{escape(said)}"' if c.notes else ""
     body = "" if c.points else f'<path d="{"".join(line)}"/>'
     if not c.steps:
         body += f'<path class="d" d="{"".join(dots)}"/>'

@@ -87,7 +87,8 @@
     if (!best.curve) { tip.hidden = true; return; }
     best.curve.classList.add("near");
     const [xs, ys] = chart.dataset.t;
-    const asked = (best.curve.dataset.n || "").split("|")[best.i];
+    const note = (best.curve.dataset.n || "").split("|")[best.i];
+    const asked = /^\d+$/.test(note) ? `${note} iterations` : note;
     const x = value(chart.dataset.x, best.x), y = value(chart.dataset.y, best.y);
     tip.textContent = [best.curve.dataset.l, asked, xs === "1" ? seconds(x) : number(x), ys === "1" ? seconds(y) : number(y)]
       .filter(Boolean).join(", ");
