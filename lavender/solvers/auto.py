@@ -10,8 +10,8 @@
                       finite solver (direct, newton, lemke, admm, as the law allows); then that one, with twice the
                       factorisations that it is expected to need; then anderson again, from where it stood, with
                       twice the allowance; and so on
-    coulomb           loose and large piles first through the convex relaxation, whose answer is the Coulomb
-                      answer wherever contacts stick
+    coulomb           loose and large piles whose sweeps promise no end go through the convex relaxation, whose answer
+                      is the Coulomb answer wherever contacts stick; where it is not, on from where they stood
 
 Costs are counted from the structure (`_costs.py`) and from the contraction of sweeps that were done, never timed:
 the same problem is solved the same way everywhere. Islands are solved apart, each to its share of the
@@ -56,7 +56,9 @@ LARGE = 4000  # rows from which friction goes through the relaxation
 HUGE = 40_000  # rows from which friction is left to sweeps before any factorisation
 CLOCK = 0.01  # s between two looks at the clock, at a nanosecond for each unit of work
 CHUNK_WORK = 8  # sweeps' work that an iteration of admm is
-CAP = 800  # sweeps of the relaxation that may be promised; twice that for large problems
+NEARER = 0.1  # share of the residual of sweeps that it must have for them to start from there
+FOLLOWS = 100.0  # times the tolerance that Coulomb's residual may be where the relaxation is at it
+CAP = 400  # sweeps of the relaxation that may be promised; twice that for large problems
 FEW_JOINTS = 300  # rows up to which a linear system is not looked at more closely
 RELAXED = 1e6  # ns that sweeps usually take from which Coulomb's law is relaxed first: a problem of its own
 HOPE = 0.4  # share of a finite solver's cost that sweeps may take without promising an end
@@ -384,9 +386,13 @@ def _solve(trail: Trail, budget: int) -> None:
             return
     elif problem.m <= FEW or not _at_once(costs):
         # Of few rows a first look at sweeps costs less than Python takes to find out what anything else would.
-        if problem.m > FEW and _relaxed_first(trail, budget):
-            return
         sweeps = _Sweeps(trail)
+        if problem.m > FEW and _may_relax(trail):
+            # Where contacts stick, and Coulomb's own sweeps promise no end, the relaxation has the answer.
+            if sweeps.run(budget, np.inf, cap=_cap(problem)) or _relaxation(trail, budget):
+                return
+            if trail.best <= FOLLOWS * trail.tol and trail.best <= NEARER * sweeps.last:
+                sweeps = _Sweeps(trail)  # from the relaxation's answer
         if sweeps.run(budget):
             return
     whole = costs.exact[0].cost
@@ -405,11 +411,11 @@ def _at_once(costs: Costs) -> bool:
     return not dear(costs.guess) and not dear(costs.exact[0].cost)
 
 
-def _relaxed_first(trail: Trail, budget: int) -> bool:
+def _may_relax(trail: Trail) -> bool:
     problem = trail.problem
     if problem.law != "coulomb" or problem.rows is None or trail.costs.sweeping < RELAXED:
         return False
-    return (problem.m >= LARGE or is_loose(problem)) and _relaxation(trail, budget)
+    return problem.m >= LARGE or is_loose(problem)
 
 
 def _finish(trail: Trail, sweeps: _Sweeps | None, budget: int) -> None:
@@ -418,7 +424,7 @@ def _finish(trail: Trail, sweeps: _Sweeps | None, budget: int) -> None:
     if problem.law == "coulomb" and problem.m >= HUGE and problem.rows is not None:
         # A factorisation is out of reach: sweeps, however many they take.
         last = _Sweeps(trail, "nncg", order="symmetric")
-        if last.run(budget, np.inf, cap=10 * CAP):
+        if last.run(budget, np.inf, cap=20 * CAP):
             return
     allowance = 0.0
     for k in range(ROUNDS):
@@ -441,7 +447,7 @@ def _finish(trail: Trail, sweeps: _Sweeps | None, budget: int) -> None:
             return
         if trail.late or (spent == trail.iterations and trail.best >= before):
             break
-    if problem.law == "coulomb" and _Sweeps(trail, "block_gauss_seidel").run(budget, np.inf, cap=10 * CAP):
+    if problem.law == "coulomb" and _Sweeps(trail, "block_gauss_seidel").run(budget, np.inf, cap=20 * CAP):
         return
     _certify(trail)
 
@@ -503,16 +509,17 @@ def _relaxation(trail: Trail, budget: int) -> bool:
     """Sweep the convex relaxation, to tighter and tighter residuals as long as Coulomb's follows."""
     problem = trail.problem
     convex = Trail(problem.relaxed("cone"), trail.tol, trail.deadline)
-    convex.offer(trail.impulse)
+    convex.offer(problem.start())
+    last = FOLLOWS * trail.tol
     for k in range(4):
-        before = trail.best
         if problem.m >= HUGE and k == 1:
             break
         convex.tol = trail.tol * 0.1**k
         _Sweeps(convex).run(budget - trail.iterations, np.inf, cap=_cap(problem))
-        trail.offer(convex.impulse)
-        if trail.done or trail.best > 0.5 * before or convex.best > convex.tol:
+        now = trail.offer(convex.impulse)
+        if trail.done or now > last or convex.best > convex.tol:
             break
+        last = 0.5 * now
     trail.iterations += convex.iterations
     for kind, count in convex.work.items():
         trail.work[kind] = trail.work.get(kind, 0) + count
