@@ -68,7 +68,7 @@ PER_ROW = {
 }  # more of them: contacts change their side
 TAIL = {"linear": 2, "lcp": 10, "cone": 10, "coulomb": 60}  # more that are granted before another is asked
 MOST = 30.0  # of what rows add
-GENERAL_COUNT = {"linear": 2.0, "lcp": 10.0, "cone": 20.0, "coulomb": 20.0}  # over generalised velocities
+GENERAL_COUNT = {"linear": 2.0, "lcp": 10.0, "cone": 12.0, "coulomb": 20.0}  # over generalised velocities
 ADMM_COUNT, ADMM_FACTORS = 240.0, 3.0  # iterations to six decades, and how often rho moves on the way
 ADMM_FILL = 6.0  # entries of L for each of A
 DIRECT_ROUNDS = 40  # of `direct` on bounded rows that are granted before another is asked

@@ -19,7 +19,10 @@ from lavender_ext.generalized.newton import run_many as kernel_many
 
 FORM = "generalized velocities"
 CLOCK = 64  # steps between two looks at the clock and at Ctrl-C; with a time limit at most as many as
-LATE, LATE_SHARE = 0.05, 0.05  # s or this share of the limit are for, at
+FIRST_SHARE = (
+    0.5  # this share of it is for at FLOP, and then as many as what is left is for at the pace so far
+)
+LATE = 0.05  # s that a step may end after the limit
 FLOP = 1e-10  # s for each multiply-add of a dense factor
 CLOSEST = 1e-2  # of tol, up to which the kernel is asked again where the judge does not find what it found
 LIMIT = 3000  # velocities of one island up to which N is kept dense: 144 MB with its factor
@@ -55,10 +58,11 @@ def run(
     cold = _is_cold(problem, impulse)
     counts = np.zeros(5, np.int64)
     status, closer = Status.MAX_ITERATIONS, 1.0
+    begun = perf_counter()
     steps, step = CLOCK, FLOP * factor_flops(problem, kernel.largest)
     if time_limit is not None:
-        # By the limit alone, not by what is left of it: the same limit gives the same bits.
-        steps = max(1, min(CLOCK, int(max(LATE, LATE_SHARE * time_limit) / max(step, 1e-6))))
+        # Every cut forgets where rounds of the kernel stood: few of them.
+        steps = max(1, min(CLOCK, int(min(FIRST_SHARE * time_limit / max(step, 1e-9), CLOCK))))
     while counts[0] < n:
         if perf_counter() + min(step, 1e6) > deadline + LATE:
             status = Status.TIME_LIMIT
@@ -74,9 +78,13 @@ def run(
             status = Status.STALLED
         if status is not Status.MAX_ITERATIONS:
             break
-        if perf_counter() > deadline:
+        now = perf_counter()
+        if now > deadline:
             status = Status.TIME_LIMIT
             break
+        if time_limit is not None:
+            step = (now - begun) / max(1, int(counts[0]))
+            steps = max(1, int(min(CLOCK, (deadline - now) / max(step, 1e-9))))
         cold = False
     return claim(status, counts)
 
