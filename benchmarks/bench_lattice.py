@@ -1,0 +1,120 @@
+"""Newton's factor on lattices of spheres, by block rows and by panels, and whole solves beside it.
+
+    python benchmarks/bench_lattice.py [--sides 6 10 14] [--ratio 1e4] [--mu 0.5]
+
+side^3 spheres, each touching its neighbours and the floor, positions 0.02 off the lattice, masses log-uniform over
+`ratio`. Times are CPU time of one thread. With `--mu` equal spheres with friction instead, and sweeps beside `newton`.
+"""
+
+from __future__ import annotations
+
+import argparse
+from time import process_time
+from typing import Any
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+import lavender as lv
+from lavender.problem import Problem
+from lavender.solvers._newton import systems
+from lavender.suite.build import Bodies, Contacts
+from lavender.suite.families import SPHERE
+
+
+def lattice(side: int, ratio: float, mu: float | None, seed: int = 0) -> Problem:
+    """side^3 spheres at rest under gravity."""
+    rng = np.random.default_rng(seed)
+    grid = np.stack(np.meshgrid(*[np.arange(side)] * 3, indexing="ij"), -1).reshape(-1, 3)
+    position = grid + np.array([0.0, 0.0, 0.5]) + 0.02 * rng.standard_normal(grid.shape)
+    a, b = cKDTree(grid).query_pairs(1.01, output_type="ndarray").T
+    a, b = np.where(position[a, 2] > position[b, 2], b, a), np.where(position[a, 2] > position[b, 2], a, b)
+    away = position[b] - position[a]
+    low = np.flatnonzero(grid[:, 2] == 0)
+    contacts = Contacts(
+        np.concatenate([np.stack([a, b], 1), np.stack([np.full(len(low), -1), low], 1)]),
+        np.concatenate([0.5 * (position[a] + position[b]), position[low] - [0.0, 0.0, 0.5]]),
+        np.concatenate(
+            [away / np.linalg.norm(away, axis=1, keepdims=True), np.tile([0.0, 0.0, 1.0], (len(low), 1))]
+        ),
+    )
+    half = 0.5 * np.log10(ratio)
+    mass = np.ones(len(grid)) if mu is not None else 10.0 ** rng.uniform(-half, half, len(grid))
+    bodies = Bodies(position, mass, SPHERE)
+    arm_a, arm_b = contacts.arms(position)
+    rows = bodies.rows(
+        jac=np.zeros((0, 12)), joint_ptr=np.zeros(1, np.int32), joint_body=np.zeros((0, 2), np.int32),
+        normal=contacts.normal, tangent=contacts.tangent(), arm_a=arm_a, arm_b=arm_b, contact_body=contacts.body,
+    )  # fmt: skip
+    if mu is None:
+        return Problem.from_rows(rows)
+    return Problem.from_rows(rows, mu=np.full(len(contacts.body), mu), tangents=2, friction="coulomb")
+
+
+def cpu(call: Any, repeats: int = 5) -> float:
+    """Least CPU time of a call [s]."""
+    times = []
+    for _ in range(repeats):
+        start = process_time()
+        call()
+        times.append(process_time() - start)
+    return min(times)
+
+
+def factors(problem: Problem) -> None:
+    """One factor of newton's matrix over bodies: by block rows, by panels with four lanes and with two."""
+    given = systems.PANELS, systems.WIDE
+    bits = []
+    for label, panels, wide in (
+        ("block rows", np.inf, True),
+        ("panels, widest", 0.0, True),
+        ("panels, baseline", 0.0, False),
+    ):
+        systems.PANELS, systems.WIDE = panels, wide
+        system = systems.make_system(problem, "velocity")
+        rng = np.random.default_rng(0)
+        system.v[:] = 10.0 ** rng.uniform(-2.0, 2.0, len(system.v))
+        time = cpu(system.factor_barrier)
+        bits.append(system.solve_barrier(rng.normal(size=system.sc.m)).tobytes())
+        print(
+            f"  {label:<18}{1e3 * time:8.2f} ms, {system.cost / time / 1e9:5.2f} G multiply-adds/s of {system.cost:.3g}"
+        )
+    systems.PANELS, systems.WIDE = given
+    print(f"  widths give {'the same bits' if bits[1] == bits[2] else 'OTHER BITS'}")
+
+
+def solves(make: Any, names: tuple[str, ...]) -> None:
+    """Whole solves, cold."""
+    for tol in (1e-3, 1e-6):
+        for name in names:
+            solution = None
+
+            def run(name: str = name, tol: float = tol) -> None:
+                nonlocal solution
+                solution = lv.solve(make(), name, tol=tol, time_limit=60.0)
+
+            time = cpu(run, 2)
+            assert solution is not None
+            print(f"  {name:<10} to {tol:.0e}: {1e3 * time:8.1f} ms {solution.status.name} {solution.work}")
+
+
+def main() -> None:
+    """Print every figure."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--sides", type=int, nargs="+", default=[6, 10, 14])
+    parser.add_argument("--ratio", type=float, default=1e4)
+    parser.add_argument("--mu", type=float, default=None)
+    args = parser.parse_args()
+    for side in args.sides:
+        problem = lattice(side, args.ratio, args.mu)
+        print(f"side {side}, {problem.m} rows, {problem.law}")
+        if args.mu is None:
+            factors(problem)
+        names = ("newton", "direct", "auto") if args.mu is None else ("newton", "anderson", "auto")
+        solves(lambda side=side: lattice(side, args.ratio, args.mu), names)
+
+
+if __name__ == "__main__":
+    main()
