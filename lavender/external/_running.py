@@ -22,7 +22,17 @@ from lavender.problem import Problem
 from lavender.residuals import quick
 from lavender.solution import Claim, Status
 
-__all__ = ["Answer", "Limits", "ask", "at_least", "definite_refusal", "proof", "quiet", "symmetric_refusal"]
+__all__ = [
+    "Answer",
+    "Limits",
+    "ask",
+    "at_least",
+    "check_settings",
+    "definite_refusal",
+    "proof",
+    "quiet",
+    "symmetric_refusal",
+]
 
 EPS_MIN = 1e-14  # asked of a backend at the least: its own arithmetic stops there
 GAP_MIN = 1e-18
@@ -39,6 +49,12 @@ class Limits:
     gap_relative: float  # the same, of the objective; either will do
     max_iter: int
     time_limit: float | None  # s
+
+
+def check_settings(settings: Any) -> None:
+    """An option `settings` maps the backend's own names to values."""
+    if not isinstance(settings, Mapping):
+        raise InputError(f"settings is a {type(settings).__name__}; a mapping of names to values is needed")
 
 
 @dataclass(frozen=True)

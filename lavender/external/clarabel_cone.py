@@ -15,8 +15,7 @@ from typing import Any
 import numpy as np
 
 from lavender._arrays import FloatArray
-from lavender.errors import InputError
-from lavender.external._running import ask, definite_refusal, symmetric_refusal
+from lavender.external._running import ask, check_settings, definite_refusal, symmetric_refusal
 from lavender.external.as_qp import QP, impulse_form, pick_form, velocity_form
 from lavender.external.native import clarabel
 from lavender.external.qp_solver import OPTIONS
@@ -34,10 +33,7 @@ class ClarabelCone:
     settings: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        if not isinstance(self.settings, Mapping):
-            raise InputError(
-                f"settings is a {type(self.settings).__name__}; a mapping of names to values is needed"
-            )
+        check_settings(self.settings)
 
     @np.errstate(all="ignore")  # what overflows is judged
     def prepare(self, problem: Problem) -> tuple[Problem, QP]:

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from lavender._arrays import FloatArray
-from lavender.errors import CapabilityError, InputError
-from lavender.external._running import Call, ask, definite_refusal, symmetric_refusal
+from lavender.errors import CapabilityError
+from lavender.external._running import Call, ask, check_settings, definite_refusal, symmetric_refusal
 from lavender.external.as_qp import QP, impulse_form, pick_form, velocity_form
 from lavender.external.backend import Backend
 from lavender.external.generic import through_qpsolvers
@@ -56,10 +56,7 @@ class QPSolver:
     settings: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        if not isinstance(self.settings, Mapping):
-            raise InputError(
-                f"settings is a {type(self.settings).__name__}; a mapping of names to values is needed"
-            )
+        check_settings(self.settings)
 
     @np.errstate(all="ignore")  # what overflows is judged
     def prepare(self, problem: Problem) -> State:
