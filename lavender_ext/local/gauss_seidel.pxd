@@ -14,9 +14,10 @@ from lavender_ext.core.block cimport CONE, CONTACT_SPIN, ROW, blocks_t, n_tangen
 from lavender_ext.core.csr cimport csr_dot, csr_t
 from lavender_ext.core.rows cimport (cross, dot3, joint_push, joint_velocity, push_bodies, relative_velocity,
                                      relax_joint, rows_t, swing_body)
-from lavender_ext.local.exact cimport (FAILED, MAX_ROWS, PREPARED, boxed_rows, cone3, contact_with_spin,
-                                       contact_without_spin, coulomb3_from, eliminate, prepare3,
-                                       project_locally)
+from lavender_ext.local.cone cimport cone3
+from lavender_ext.local.coulomb cimport PREPARED, coulomb3_from, prepare3
+from lavender_ext.local.exact cimport boxed_rows, contact_with_spin, contact_without_spin, project_locally
+from lavender_ext.local.small cimport FAILED, MAX_ROWS, eliminate
 
 
 cdef inline int32_t prepared_size(const blocks_t* p, int32_t i) noexcept nogil:

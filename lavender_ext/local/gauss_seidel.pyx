@@ -13,7 +13,8 @@ from lavender_ext.core.order cimport advance_order
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.rows cimport contact_jacobian, dot12, minv_times, rows_t
 from lavender_ext.judge.watch cimport CONVERGED, RUNNING, Watch
-from lavender_ext.local.exact cimport MAX_ROWS, boxed_rows, contact_with_spin, contact_without_spin
+from lavender_ext.local.exact cimport boxed_rows, contact_with_spin, contact_without_spin
+from lavender_ext.local.small cimport MAX_ROWS
 from lavender_ext.local.gauss_seidel cimport prepare_block, prepared_size, solve_csr_block, solve_rows_block
 
 

@@ -1,0 +1,192 @@
+"""The contact alone under the cone law, solved exactly: w = W lam + q in K*, lam.w = 0.
+
+Open where q is in K*, stick as in local/coulomb.pxd (2); instead of its (3)
+
+    (W + beta J) lam = -q,   J = diag(-mu^2, 1, 1)
+    v(beta) = -adj(W + beta J) q = det lam,  |v_t| = mu sign(det) v_n                             (1)
+
+On 0 <= beta < beta*, the positive root of det(W + beta J), W + beta J is positive definite; the sign of
+v_n at beta* says on which side of it the root of (1) with lam_n > 0 lies (W symmetric positive definite).
+"""
+from libc.math cimport fabs
+from libc.stdint cimport int32_t
+
+from lavender_ext.core.block cimport norm2
+from lavender_ext.local.coulomb cimport slides
+from lavender_ext.local.small cimport FAILED, OPEN, SLIP, STICK, eliminate, rests
+
+
+cdef inline int32_t on_ray(const double* W, const double* q, double mu, double s0, double s1,
+                           double* lam) noexcept nogil:
+    # The least of the energy on lam = l (1, mu s), l > 0: lam.w = 0.
+    cdef double x0 = mu * s0, x1 = mu * s1
+    cdef double n = (W[0] + (W[1] + W[3]) * x0 + (W[2] + W[6]) * x1 + W[4] * x0 * x0 + (W[5] + W[7]) * x0 * x1
+                     + W[8] * x1 * x1)
+    cdef double l = -(q[0] + q[1] * x0 + q[2] * x1) / n
+    cdef double y[3]
+    if not n > 0.0 or not l >= 0.0 or not l < 1e300:
+        return FAILED
+    y[0] = l
+    y[1] = l * x0
+    y[2] = l * x1
+    if not slides(W, q, s0, s1, y):
+        return FAILED
+    lam[0] = l
+    lam[1] = y[1]
+    lam[2] = y[2]
+    return SLIP
+
+
+cdef inline int32_t rests_singular(const double* W, const double* q, double* x) noexcept nogil:
+    # Nearly the shortest x with W x = -q, W singular: refined from W + 1e-6 diag W. 0 where there is none.
+    cdef double a[9]
+    cdef double y[3]
+    cdef int32_t i, j, _turn
+    for i in range(3):
+        x[i] = 0.0
+    for _turn in range(4):
+        for i in range(3):
+            y[i] = -q[i]
+            for j in range(3):
+                y[i] -= W[3 * i + j] * x[j]
+                a[3 * i + j] = W[3 * i + j]
+            a[4 * i] *= 1.000001
+        if eliminate(3, a, y) < 3:
+            return 0
+        for i in range(3):
+            x[i] += y[i]
+    return rests(3, W, q, x)
+
+
+cdef inline int32_t cone3(const double* W, const double* q, double mu, double* lam) noexcept nogil:
+    """lam (3) of (1); FAILED leaves lam alone."""
+    cdef double m2 = mu * mu, d1, d2, beta, top, f, df, step, lo, hi, side, P, U, d0
+    cdef double v0[3]
+    cdef double v1[3]
+    cdef double v2[3]
+    cdef double v[3]
+    cdef int32_t _turn, k, done = 0
+    if q[0] >= mu * norm2(q[1], q[2]):
+        lam[0] = 0.0
+        lam[1] = 0.0
+        lam[2] = 0.0
+        return OPEN
+    if not W[0] > 0.0:
+        return FAILED
+    if mu == 0.0:
+        lam[0] = -q[0] / W[0]
+        lam[1] = 0.0
+        lam[2] = 0.0
+        return SLIP if lam[0] < 1e300 else FAILED
+    # v(beta) = v0 + beta v1 + beta^2 v2, det(W + beta J) = d0 + d1 beta + d2 beta^2 - mu^2 beta^3
+    v0[0] = -((W[4] * W[8] - W[5] * W[7]) * q[0] + (W[2] * W[7] - W[1] * W[8]) * q[1]
+              + (W[1] * W[5] - W[2] * W[4]) * q[2])
+    v0[1] = -((W[5] * W[6] - W[3] * W[8]) * q[0] + (W[0] * W[8] - W[2] * W[6]) * q[1]
+              + (W[2] * W[3] - W[0] * W[5]) * q[2])
+    v0[2] = -((W[3] * W[7] - W[4] * W[6]) * q[0] + (W[1] * W[6] - W[0] * W[7]) * q[1]
+              + (W[0] * W[4] - W[1] * W[3]) * q[2])
+    v1[0] = -((W[4] + W[8]) * q[0] - W[1] * q[1] - W[2] * q[2])
+    v1[1] = -(-W[3] * q[0] + (W[0] - m2 * W[8]) * q[1] + m2 * W[5] * q[2])
+    v1[2] = -(-W[6] * q[0] + m2 * W[7] * q[1] + (W[0] - m2 * W[4]) * q[2])
+    v2[0] = -q[0]
+    v2[1] = m2 * q[1]
+    v2[2] = m2 * q[2]
+    d0 = (W[0] * (W[4] * W[8] - W[5] * W[7]) + W[1] * (W[5] * W[6] - W[3] * W[8]) + W[2] * (W[3] * W[7] - W[4] * W[6]))
+    d1 = W[0] * (W[4] + W[8]) - W[1] * W[3] - W[2] * W[6] - m2 * (W[4] * W[8] - W[5] * W[7])
+    d2 = W[0] - m2 * (W[4] + W[8])
+    if d0 > 0.0 and v0[0] >= 0.0 and norm2(v0[1], v0[2]) <= mu * v0[0] and v0[0] < 1e300 * d0:
+        for k in range(3):
+            v[k] = v0[k] / d0
+        if rests(3, W, q, v):
+            for k in range(3):
+                lam[k] = v[k]
+            return STICK
+        return FAILED
+    if d0 <= 1e-10 * (W[0] * W[4] * W[8]) and rests_singular(W, q, v) and norm2(v[1], v[2]) <= mu * v[0]:
+        for k in range(3):
+            lam[k] = v[k]
+        return STICK
+    # beta*: Newton from the right of every root falls onto the largest.
+    top = W[0] / m2
+    for _turn in range(60):
+        f = d0 + top * (d1 + top * (d2 - m2 * top))
+        df = d1 + top * (2.0 * d2 - 3.0 * m2 * top)
+        if not f < 0.0 or not df < 0.0:
+            break
+        step = f / df
+        top -= step
+        if step <= 1e-15 * top:
+            break
+    if not top > 0.0:
+        return FAILED
+    side = 1.0 if v0[0] + top * (v1[0] + top * v2[0]) >= 0.0 else -1.0
+    # side 1: |v_t| - mu v_n falls from positive at 0 to negative at beta*; side -1: |v_t| + mu v_n rises
+    # from negative at beta* to positive at infinity.
+    lo = 0.0 if side > 0.0 else top
+    hi = top if side > 0.0 else -1.0
+    beta = 0.5 * top if side > 0.0 else 2.0 * top
+    for _turn in range(200):
+        for k in range(3):
+            v[k] = v0[k] + beta * (v1[k] + beta * v2[k])
+        U = norm2(v[1], v[2])
+        if done or not U > 0.0:
+            break
+        P = side * mu * v[0]
+        f = U - P
+        if f * side > 0.0:
+            lo = beta
+        else:
+            hi = beta
+        df = ((v[1] * (v1[1] + 2.0 * beta * v2[1]) + v[2] * (v1[2] + 2.0 * beta * v2[2])) / U
+              - side * mu * (v1[0] + 2.0 * beta * v2[0]))
+        step = f / df
+        done = fabs(f) <= 1e-8 * U and fabs(step) <= 1e-7 * beta
+        step = beta - step
+        if not lo < step or (hi >= 0.0 and not step < hi) or not step < 1e300:
+            if hi >= 0.0:
+                step = 0.5 * (lo + hi)
+                done = hi - lo <= 1e-15 * hi
+            else:
+                step = 4.0 * beta
+                done = 0
+                if step > 1e290:
+                    return FAILED
+        beta = step
+    if not U > 0.0 or not done:
+        return FAILED
+    U = side / U
+    return on_ray(W, q, mu, v[1] * U, v[2] * U, lam)
+
+
+cdef inline int32_t cone2(const double* W, const double* q, double mu, double* lam) noexcept nogil:
+    """One tangent under the cone law, in closed form; W (2, 2)."""
+    cdef double det, n, t, s, l
+    cdef double y[2]
+    cdef int32_t _side
+    if q[0] >= mu * fabs(q[1]):
+        lam[0] = 0.0
+        lam[1] = 0.0
+        return OPEN
+    det = W[0] * W[3] - W[1] * W[2]
+    n = W[1] * q[1] - W[3] * q[0]
+    t = W[2] * q[0] - W[0] * q[1]
+    if det > 0.0 and n >= 0.0 and fabs(t) <= mu * n and n < 1e300 * det:
+        y[0] = n / det
+        y[1] = t / det
+        if rests(2, W, q, y):
+            lam[0] = y[0]
+            lam[1] = y[1]
+            return STICK
+    s = 1.0 if t > 0.0 else -1.0
+    for _side in range(2):
+        n = W[0] + mu * s * (W[1] + W[2]) + mu * mu * W[3]
+        l = -(q[0] + mu * s * q[1])
+        if n > 0.0 and l >= 0.0 and l < 1e300 * n:
+            l = l / n
+            if (s * (W[2] * l + W[3] * mu * s * l + q[1])
+                    <= 1e-14 * (fabs(W[2]) * l + fabs(W[3]) * mu * l + fabs(q[1]))):
+                lam[0] = l
+                lam[1] = mu * s * l
+                return SLIP
+        s = -s
+    return FAILED

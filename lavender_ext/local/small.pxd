@@ -1,0 +1,87 @@
+"""A few unknowns: elimination with pivots, what a contact may do, and whether it rests where it is.
+
+W is the block's own part of A, any 1x1 to 8x8, not necessarily symmetric; w = W lam + q.
+"""
+from libc.math cimport fabs
+from libc.stdint cimport int32_t
+
+
+cdef enum:
+    OPEN = 0
+    STICK = 1
+    SLIP = 2
+    FAILED = -1
+
+cdef enum:
+    MAX_ROWS = 8                # of a ROW block that is solved exactly
+
+
+cdef inline int32_t eliminate(int32_t n, double* a, double* x) noexcept nogil:
+    """x <- a^-1 x by elimination with row pivoting, a (n, n) destroyed; a dependent row leaves its x at 0.
+
+    Returns the rank.
+    """
+    cdef int32_t col[MAX_ROWS]
+    cdef int32_t i, j, k, p, rank = 0
+    cdef double big, f, size = 0.0
+    for i in range(n * n):
+        if fabs(a[i]) > size:
+            size = fabs(a[i])
+    for k in range(n):
+        col[k] = -1
+    for k in range(n):                                  # column k
+        p = -1
+        big = 1e-13 * size
+        for i in range(rank, n):
+            if fabs(a[n * i + k]) > big:
+                big = fabs(a[n * i + k])
+                p = i
+        if p < 0:
+            continue
+        if p != rank:
+            for j in range(n):
+                f = a[n * p + j]
+                a[n * p + j] = a[n * rank + j]
+                a[n * rank + j] = f
+            f = x[p]
+            x[p] = x[rank]
+            x[rank] = f
+        f = 1.0 / a[n * rank + k]
+        for j in range(k, n):
+            a[n * rank + j] *= f
+        x[rank] *= f
+        for i in range(n):
+            if i != rank and a[n * i + k] != 0.0:
+                f = a[n * i + k]
+                for j in range(k, n):
+                    a[n * i + j] -= f * a[n * rank + j]
+                x[i] -= f * x[rank]
+        col[rank] = k
+        rank += 1
+    if rank == n:
+        return n                                        # col is the identity
+    k = n - 1
+    p = rank - 1
+    while k >= 0:                                       # back to the columns; from the end, nothing is overwritten
+        if p >= 0 and col[p] == k:
+            x[k] = x[p]
+            p -= 1
+        else:
+            x[k] = 0.0
+        k -= 1
+    return rank
+
+
+cdef inline int32_t rests(int32_t m, const double* W, const double* q, const double* lam) noexcept nogil:
+    # w = 0 to rounding.
+    cdef int32_t i, j
+    cdef double w, size
+    for i in range(m):
+        w = q[i]
+        size = fabs(q[i])
+        for j in range(m):
+            w += W[m * i + j] * lam[j]
+            size += fabs(W[m * i + j] * lam[j])
+        if fabs(w) > 1e-11 * size:
+            return 0
+    return 1
