@@ -246,6 +246,7 @@ def _print_motion(records: Records, console: Console, whole: bool) -> None:
     console.print(BY_MOTION, highlight=False)
     console.print(table, highlight=False)
     if whole or len(moved(records, levels)) <= FEW:
+        console.print()
         console.print(motion_table(records), highlight=False)
 
 
