@@ -19,7 +19,7 @@ from lavender.errors import InputError
 from lavender.problem import Problem
 from lavender.registry import SolverSpec, get
 from lavender.solution import Solution
-from lavender.solve import decide_empty_rows, late, solve
+from lavender.solve import decide_empty_rows, late, solve, solve_few
 from lavender.solvers._costs import general_first
 from lavender.solvers._few import FEW_GENERAL
 from lavender.solvers._newton import general
@@ -84,8 +84,12 @@ def solve_many(
         for i, solution in zip(part, found, strict=True):
             made[i] = solution
 
+    short = spec.few is not None and not options and max_iter is None
+
     def alone(i: int) -> None:
-        made[i] = solve(given[i], solver, impulse=starts[i], **more)
+        made[i] = solve_few(given[i], spec, starts[i], tol) if short else None
+        if made[i] is None:
+            made[i] = solve(given[i], solver, impulse=starts[i], **more)
 
     if threads == 1:
         for part in parts:
