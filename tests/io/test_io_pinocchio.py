@@ -1,0 +1,99 @@
+"""Pinocchio's constraint models as problems; by finite differences of its own kinematics."""
+
+import numpy as np
+import pytest
+
+import lavender as lv
+
+pin = pytest.importorskip("pinocchio", reason="needs Pinocchio 4: pip install 'lavender-contact[pinocchio]'")
+
+
+def robot(seed=0):
+    """A free box with an arm: an anchor at its tip, a contact at a corner, limits and friction of the joint."""
+    rng = np.random.default_rng(seed)
+    model = pin.Model()
+    base = model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "free")
+    model.appendBodyToJoint(base, pin.Inertia.FromBox(1.0, 0.2, 0.3, 0.2), pin.SE3.Identity())
+    arm = model.addJoint(base, pin.JointModelRY(), pin.SE3(np.eye(3), np.array([0.1, 0.0, 0.0])), "arm")
+    model.appendBodyToJoint(
+        arm, pin.Inertia.FromBox(0.5, 0.3, 0.05, 0.05), pin.SE3(np.eye(3), np.array([0.15, 0, 0]))
+    )
+    model.lowerPositionLimit[-1], model.upperPositionLimit[-1] = -0.01, 0.5
+    model.upperDryFrictionLimit[-1], model.lowerDryFrictionLimit[-1] = 0.7, -0.7
+    q = pin.neutral(model)
+    q[2] = 0.1
+    ground = pin.SE3(np.eye(3), np.array([0.1, 0.1, 0.0]))
+    corner = pin.SE3(np.eye(3), np.array([0.1, 0.1, -0.1]))
+    # From the ground (0) to the body: z points away from the ground.
+    contact = pin.PointContactConstraintModel(model, 0, ground, base, corner)
+    contact.setFriction(0.4)
+    tip = pin.SE3(np.eye(3), np.array([0.3, 0.0, 0.0]))
+    anchor = pin.PointAnchorConstraintModel(model, 0, pin.SE3(np.eye(3), np.array([0.4, 0.0, 0.1])), arm, tip)
+    models = [
+        anchor, contact, pin.JointLimitConstraintModel(model, [arm]), pin.JointFrictionConstraintModel(model, [arm]),
+    ]  # fmt: skip
+    return model, models, q, 0.3 * rng.normal(size=model.nv)
+
+
+def problem_of(model, models, q, v, dt=0.01, **more):
+    return lv.io.from_pinocchio(
+        model, model.createData(), models, [m.createData() for m in models], dt, q=q, v=v, **more
+    )
+
+
+def test_the_rows_are_the_constraints_and_the_velocity_is_pinocchios():
+    model, models, q, v = robot()
+    tau = np.random.default_rng(1).normal(size=model.nv)
+    problem = problem_of(model, models, q, v, tau=tau)
+    assert (problem.operator, problem.law, problem.m) == ("generalized", "coulomb", 3 + 3 + 2 + 1)
+    assert problem.row_name(3) == "PointContact 1, normal"
+    data = model.createData()
+    np.testing.assert_allclose(
+        problem.generalized.v_free, v + 0.01 * pin.aba(model, data, q, v, tau), atol=1e-12
+    )
+    # J by differences of the two points' places, which Pinocchio's forward kinematics moves.
+    h, jac = 1e-6, problem.jacobian.toarray()
+    base, arm = 1, 2
+
+    def places(q):
+        pin.forwardKinematics(model, data, q)
+        return data.oMi[base].act(np.array([0.1, 0.1, -0.1])), data.oMi[arm].act(np.array([0.3, 0.0, 0.0]))
+
+    for k in range(model.nv):
+        step = np.zeros(model.nv)
+        step[k] = h
+        ahead, behind = places(pin.integrate(model, q, step)), places(pin.integrate(model, q, -step))
+        corner, tip = ((x - y) / (2.0 * h) for x, y in zip(ahead, behind, strict=True))
+        np.testing.assert_allclose(
+            jac[3:6, k], corner[[2, 0, 1]], atol=1e-8
+        )  # 1e-6 squared, and rounding over it
+        np.testing.assert_allclose(jac[0:3, k], tip, atol=1e-8)
+    np.testing.assert_array_equal(jac[6:, :6], 0.0)
+    np.testing.assert_array_equal(jac[6:, 6], [1.0, -1.0, 1.0])
+
+
+def test_a_step_under_the_solution_keeps_every_constraint():
+    model, models, q, v = robot()
+    v[2] = -1.0  # into the ground
+    dt = 1e-3
+    problem = problem_of(model, models, q, v, dt=dt, compliance=1e-6, friction="cone")
+    solution = lv.solve(problem, tol=1e-10).raise_for_status()
+    after = pin.integrate(model, q, dt * problem.velocity(solution.impulse))
+    data = model.createData()
+    pin.forwardKinematics(model, data, after)
+    # First order in dt: the points are off by what the step turns, some (dt |v|)^2.
+    assert data.oMi[1].act(np.array([0.1, 0.1, -0.1]))[2] > -1e-5
+    assert after[-1] > model.lowerPositionLimit[-1] - 1e-5
+    np.testing.assert_allclose(data.oMi[2].act(np.array([0.3, 0.0, 0.0])), [0.4, 0.0, 0.1], atol=1e-5)
+    assert abs(solution.impulse[-1]) <= 0.7 * dt * (1.0 + 1e-12)
+
+
+def test_what_does_not_fit_is_said():
+    model, models, q, v = robot()
+    with pytest.raises(lv.errors.InputError, match="one for each"):
+        lv.io.from_pinocchio(model, model.createData(), models, [], 0.01, q=q, v=v)
+    with pytest.raises(lv.errors.InputError, match="dt"):
+        problem_of(model, models, q, v, dt=0.0)
+    with pytest.raises(lv.errors.InputError, match=r"pinocchio\.Model"):
+        lv.io.from_pinocchio(3, model.createData(), [], [], 0.01, q=q, v=v)
+    assert problem_of(model, [], q, v).m == 0
