@@ -21,7 +21,7 @@ from lavender.solvers._accelerated import sweep_work
 from lavender.solvers._factor import choose
 from lavender.solvers._islands import block_bodies
 from lavender.solvers._newton.general import factor_flops
-from lavender.solvers._newton.systems import MatrixSystem, System, VelocitySystem, make_system
+from lavender.solvers._newton.systems import PANELS, MatrixSystem, System, VelocitySystem, make_system
 from lavender_ext.factor import graph
 
 __all__ = ["Costs", "Exact", "general_cost", "is_loose", "islands_cost"]
@@ -39,7 +39,7 @@ ROW = 30.0  # for each row beside each factor of `direct`,
 NEWTON_ROW = {"linear": 150.0, "lcp": 150.0, "cone": 300.0, "coulomb": 300.0}  # and of `newton`
 DENSE = 0.1  # for each multiply-add of a dense factor
 BAND = 0.4  # of a band's
-BLOCK = 0.35  # of one over bodies
+BLOCK, PANEL = 0.35, 0.2  # of one over bodies, by block rows and by panels
 SPARSE = 100.0  # for each nonzero of a sparse factor's matrix,
 SPARSE_ROWS = 1000.0  # as many times more as it has thousands of rows: fill grows with the size
 PIVOT, PIVOT_ENTRY = 60e3, 0.5  # of each pivot of lemke, and for each entry of its tableau
@@ -238,7 +238,9 @@ class Costs:
         """Its factor is at least that of a tree of bodies, or of a diagonal; loops fill it."""
         p = self.problem
         if p.rows is not None and p.rows.n_bodies:
-            s = 6 if p.rows.inv_inertia.any() else 3
+            # One row each, and no joint: most likely spheres, which no contact turns.
+            turns = p.rows.inv_inertia.any() and (p.rows.n_joints or p.m > p.n_blocks)
+            s = 6 if turns else 3
             n = p.rows.n_bodies
             return self._newton(BLOCK * s**3 * (1.0 + 0.5 * max(1.0, self._width(n)) ** 2) * n)
         return self._newton(BAND * p.m)
@@ -282,7 +284,7 @@ class Costs:
     def _newton_factor(self) -> float:
         system = self.system
         if not isinstance(system, MatrixSystem):
-            return BLOCK * system.cost
+            return (BLOCK if system.cost < PANELS else PANEL) * system.cost
         if system.dense:
             return DENSE * system.cost
         if system.band is not None:

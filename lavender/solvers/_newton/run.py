@@ -62,10 +62,12 @@ class Run:
         return self.best <= self.tol
 
     def spent(self) -> bool:
-        """No budget or time for another factorisation, at about a nanosecond for each multiply-add."""
+        """No budget or time for another factorisation, at the system's pace."""
         if self.system.factorisations >= self.budget:
             return True
-        return self.deadline < np.inf and perf_counter() + 1e-9 * self.system.cost >= self.deadline
+        return (
+            self.deadline < np.inf and perf_counter() + self.system.pace * self.system.cost >= self.deadline
+        )
 
     def at_floor(self) -> bool:
         """The best point is within twice the floor."""

@@ -80,6 +80,7 @@ class System:
     newton: Any = None  # Newton steps of bounded rows in compiled code, where there are such
     law = CONVEX  # of the last natural map
     cost = 0.0  # multiply-adds of one factorisation, roughly
+    pace = 1e-9  # s for each of them at most, on any machine of the last ten years
 
     def __init__(self, sc: Scaled) -> None:
         self.sc = sc
@@ -148,6 +149,7 @@ class VelocitySystem(System):
     """K K^T + theta, one block column of s unknowns for each body."""
 
     form = "velocity"
+    pace = 0.5e-9
 
     def __init__(self, sc: Scaled) -> None:
         super().__init__(sc)
@@ -310,7 +312,9 @@ class MatrixSystem(System):
         self.dense = self.band is None and (
             m <= DENSE_ROWS or (a.nnz > DENSE_FILL * m * m and m <= DENSE_LIMIT)
         )
-        self.cost = m**3 / 3.0 if self.dense else 50.0 * a.nnz
+        # Of a sparse factor by its fill, which grows with the size: nanoseconds, as `_costs.py` has them.
+        self.cost = m**3 / 3.0 if self.dense else 100.0 * a.nnz * (1.0 + m / 1000.0)
+        self.pace = 0.3e-9 if self.dense else 1e-9
         self.h: Any
         if self.dense:
             self.h = a.toarray()
