@@ -11,11 +11,12 @@ import click
 
 from lavender.bench import machine
 from lavender.bench.cases import resolve
+from lavender.bench.rates import moved
 from lavender.bench.regret import Regret, regrets, summary
 from lavender.bench.running.campaign import seeds as from_seeds
 from lavender.errors import InputError
 from lavender.problem import Problem
-from lavender.report.regret import table
+from lavender.report.regret import rates, table
 
 __all__ = ["auto"]
 
@@ -41,6 +42,12 @@ __all__ = ["auto"]
 @click.option(
     "--out", type=click.Path(path_type=Path), default=None, help="Write every measurement here too, JSON."
 )
+@click.option(
+    "--rates",
+    "only_rates",
+    is_flag=True,
+    help="Time nothing: tell how far each rate can move before choices change.",
+)
 def auto(
     files: tuple[str, ...],
     families: str,
@@ -50,6 +57,7 @@ def auto(
     repeats: int,
     worst: int,
     out: Path | None,
+    only_rates: bool,
 ) -> None:
     """How much slower auto is than the best of our own solvers.
 
@@ -71,6 +79,9 @@ def auto(
             yield item.name, item.reason, item.problem
             item.forget()
 
+    if only_rates:
+        click.echo(rates(moved([problem for _, _, problem in cases()], wanted)))
+        return
     found: list[Regret] = []
     click.echo(f"{machine.cpu_name()}; {len(names)} problems, {len(wanted)} levels", err=True)
     try:

@@ -147,6 +147,10 @@ class Costs:
         self.decades = float(-np.log10(min(max(tol, 1e-16), 0.1)))
         self.sweep = sweep_cost(problem)
 
+    def glance(self, sweeps: int) -> float:
+        """A first look at so many sweeps [ns]."""
+        return SWEEP_START + LOOK + sweeps * self.sweep
+
     @cached_property
     def redundant(self) -> bool:
         """The same weight rests on more points than the bodies can tell apart, and none of them is soft.

@@ -39,7 +39,6 @@ from lavender.solvers._costs import (
     FIRST_LOOK,
     ISLAND,
     LOOK,
-    SWEEP_START,
     Costs,
     Exact,
     first_look,
@@ -403,7 +402,7 @@ def _solve(trail: Trail, budget: int) -> None:
 
 def _at_once(costs: Costs) -> bool:
     """A finite solver costs less than sweeps usually do, and even a first look at them would be dear beside it."""
-    glance = SWEEP_START + LOOK + FIRST_LOOK * costs.sweep
+    glance = costs.glance(FIRST_LOOK)
 
     def dear(cost: float) -> bool:
         return cost > costs.sweeping or (glance < GLANCE * cost and not costs.redundant)
@@ -565,6 +564,19 @@ def _certify(trail: Trail) -> None:
         y = np.where((found.x > 0.0) | free, found.x, 0.0) * scale
         if check_certificate(problem, y) is None:
             trail.certificate = y
+
+
+def begins(problem: Problem, tol: float) -> tuple[str, str]:
+    """What a solve to tol begins with, and the finite solver that would be asked first; nothing is run."""
+    kernel = None if problem.generalized is None else general.prepare(problem)
+    largest = 0 if kernel is None else kernel.largest
+    costs = Costs(problem, tol, largest)
+    finite = costs.exact[0].key
+    if kernel is not None and general_first(problem, largest):
+        return VELOCITY, finite
+    if problem.law == "linear" or (problem.m > FEW and _at_once(costs)):
+        return finite, finite
+    return "sweeps", finite
 
 
 # -- what a problem looks like ------------------------------------------------------------------------
