@@ -252,7 +252,8 @@ cdef inline void project_error(const double* lam, const double* w, const double*
     e[0] = quotient(w[0], d[0]) if s == yn else lam[0] - s / rn
     if nt > 0:
         if t > bound_t:
-            f = bound_t / (t * rt)
+            f = t * rt
+            f = bound_t / f if 1e-300 < f <= 1.7976931348623157e308 else bound_t / t / rt
             e[1] = lam[1] - f * y0
             if nt == 2:
                 e[2] = lam[2] - f * y1
