@@ -15,6 +15,7 @@ import numpy as np
 
 L = np.longdouble
 ROW, CONTACT, CONTACT_SPIN = 0, 1, 2
+NORMAL = L(2.0) ** -1022
 DENORMAL = L(2.0) ** -1074
 ZERO = L(0.0)
 LARGEST = L(1.7976931348623157e308)  # of an impulse in float64
@@ -227,6 +228,8 @@ class Problem:
         nothing = bool(line / 16 <= energy0 <= line * 16)
         if below:
             energy0, velocity0 = rhs_energy, rhs_velocity
+        # An error w / d of the start that float64 holds no number for: there is nothing to be better than.
+        nothing |= bool(energy0 <= 2 * NORMAL * np.sqrt(self.d.sum()))
         f = L(2.0) ** -53 * size
         rounded = L(2.0) ** -53 * self.d * np.abs(lam)  # of lambda - Pi, where d is not A_ii
         more = (self.m + 20) * (f + rounded + DENORMAL * (1 + np.abs(lam).max(initial=ZERO)))
