@@ -13,6 +13,7 @@ from lavender._version import __version__
 from lavender.cli.bench import bench
 from lavender.cli.cases import cases
 from lavender.cli.check import check
+from lavender.cli.doctor import doctor
 from lavender.cli.options import EXIT_BAD_INPUT, EXIT_INTERRUPTED
 from lavender.cli.record import record
 from lavender.cli.reference import reference
@@ -32,7 +33,7 @@ def cli() -> None:
     """Constraint solvers of rigid-body simulation: any solver by name, its error in units, its cost."""
 
 
-for _command in (report, bench, check, solve, reference, solvers, cases, run, record, web, view):
+for _command in (report, bench, check, solve, reference, solvers, cases, run, record, web, view, doctor):
     cli.add_command(_command)
 
 

@@ -1,0 +1,112 @@
+"""The data file of tests/parity/driver.c: starts of scenes and problems, and what the installed extension made of them.
+
+    python tests/parity/export.py FILE [STEPS]
+
+The scenes and problems are those of the WebAssembly build (tests/wasm/record.py). Starts are recorded as numbers, so
+that nothing that builds a scene (sin and cos of NumPy, 3 x 3 inverses of LAPACK) is part of what is compared.
+"""
+
+import struct
+import sys
+from pathlib import Path
+
+import numpy as np
+
+HERE = Path(__file__).resolve().parent
+sys.path[:0] = [str(HERE.parent), str(HERE.parent / "wasm")]
+
+from record import SCENES, STEPS, problems  # noqa: E402
+
+import lavender as lv  # noqa: E402
+from lavender.ordering import block_order  # noqa: E402
+from lavender_ext.host import memory  # noqa: E402
+
+MAGIC = b"LAOVPAR1"
+ROWS = ("jac", "normal", "tangent", "arm_a", "arm_b", "inv_mass", "inv_inertia")
+SWEEPS = ((1, "given"), (7, None), (40, "given"))
+
+
+def numbers(*values):
+    return struct.pack(f"<{len(values)}q", *values)
+
+
+def array(values, dtype="<f8"):
+    data = values if isinstance(values, bytes) else np.ascontiguousarray(values).astype(dtype).tobytes()
+    return numbers(len(data)) + data + bytes(-len(data) % 8)
+
+
+def scene(name, parameters, changes, steps):
+    """Start, changes of settings, eight values after each step, the last state."""
+    made = lv.Scene(name, **parameters)
+    simulation = lv.Simulation(made)
+    start = simulation.snapshot()
+    places, edits, values = memory.layout()["settings_t"][1], [], []
+    for step in range(steps):
+        for key, value in changes.get(step, {}).items():
+            edits.append((step, places[key], value))
+            if key == "iterations":
+                simulation.set_solver_iterations(value)
+            else:
+                simulation.set_warm_start(bool(value))
+        values.append(simulation.step()[0]["solver"].copy())
+    given = ", ".join(f"{key}={value}" for key, value in parameters.items())
+    out = array(f"{name}({given})".encode() + b"\0") + numbers(made.parameters.substeps, steps)
+    out += array(start.size, "<i4") + array(start.real) + array(start.index, "<i4") + array(start.keys, "<u8")
+    inputs = out + array(np.array(edits, np.int32).reshape(-1, 3), "<i4")
+    return inputs, inputs + array(values) + array(simulation.snapshot().real)
+
+
+def problem(given, sweeps, order, seed):
+    """Counts, arrays, and what the extension made of them."""
+    solver = "pgs" if given.rows is None else "sequential_impulses"
+    more = {"seed": seed} if order == "random" else {}
+    start = given.start() if given.guess is None else given.guess
+    found = lv.solve(given, solver, tol=0, max_iter=sweeps, impulse=start, order=order, **more)
+    o, c, r = block_order(given, order, **more), given.cones, given.rows
+    counts = (0, 0, 0) if r is None else (r.n_bodies, r.n_joints, r.n_contacts)
+    out = numbers(
+        given.n_blocks, given.m, *counts, given.friction == "cone", r is not None, o.split, o.mode, sweeps
+    )
+    out += struct.pack("<Q", int(o.rng[0]))
+    out += array(c.ptr, "<i4") + array(c.kind, "<i4") + array(o.blocks, "<i4")
+    out += b"".join(array(x) for x in (c.lower, c.upper, c.mu, c.patch_radius, given.b, start))
+    if r is None:
+        a = given.csr
+        out += array(a.indptr, "<i4") + array(a.indices, "<i4") + array(a.data)
+    else:
+        out += array(r.joint_body, "<i4") + array(r.contact_body, "<i4")
+        out += b"".join(array(getattr(r, key)) for key in ROWS) + array(given.compliance)
+    judged, data = found.residual, given.data
+    made = (
+        given.d,
+        data.nu,
+        data.step,
+        found.impulse,
+        found.slack,
+        judged.error,
+        [judged.energy, judged.velocity],
+    )
+    return out, out + b"".join(array(x) for x in made)
+
+
+def record(path, steps=STEPS, scenes=SCENES):
+    """Write the file; (number of scenes, of problems, inputs alone as bytes)."""
+    flat = [(name, field) for name, fields in memory.STRUCTS.items() for field in (None, *fields)]
+    out = [MAGIC, numbers(*(flat.index((name, None)) for name in ("blocks_t", "csr_t", "rows_t", "score_t")))]
+    inputs = []
+    made = [scene(*given, steps) for given in scenes]
+    solved = [
+        problem(given, sweeps, order or ("symmetric", "random", "reverse", "colored")[i % 4], i)
+        for i, given in enumerate(problems())
+        for sweeps, order in SWEEPS
+    ]
+    for group in (made, solved):
+        out.append(numbers(len(group)))
+        out += [whole for _, whole in group]
+        inputs += [part for part, _ in group]
+    Path(path).write_bytes(b"".join(out))
+    return len(made), len(solved), b"".join(inputs)
+
+
+if __name__ == "__main__":
+    print(*record(sys.argv[1], *map(int, sys.argv[2:]))[:2])

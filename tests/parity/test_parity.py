@@ -1,0 +1,32 @@
+"""The kernels compiled without Python give the bits of the extension, on this processor and on AArch64."""
+
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent.parent
+pytestmark = pytest.mark.slow
+
+
+def why_not():
+    if shutil.which("gcc") is None:
+        return "gcc is not installed"
+    pytest.importorskip("ziglang", reason="ziglang is not installed (extra: wasm): no compiler for AArch64")
+    return "" if shutil.which("qemu-aarch64-static") else "no qemu-aarch64-static (Debian: qemu-user-static)"
+
+
+def test_x86_and_aarch64_have_the_bits_of_the_extension_and_contraction_is_seen():
+    if why_not():
+        pytest.skip(why_not())
+    done = subprocess.run(
+        [sys.executable, str(ROOT / ".ci" / "parity"), "--quick", "--steps", "40"],
+        capture_output=True, text=True, check=False, cwd=ROOT,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout + done.stderr
+    rows = [line for line in done.stdout.splitlines() if line.startswith("| ")]
+    assert [row.split(" | ")[0].strip("| ") for row in rows] == ["x86_64", "aarch64", "x86_64"]
+    assert [row.split(" | ")[-1].strip("| ") == "same" for row in rows] == [True, True, False]
+    assert "differ, as it must" in rows[2]
