@@ -263,7 +263,7 @@ def write(problem: Problem, path: str | os.PathLike[str], *, impulse: Any = None
 
     def write_to(temporary: Path) -> None:
         with open(temporary, "xb") as stream:
-            np.savez_compressed(stream, allow_pickle=False, **arrays)
+            np.savez_compressed(stream, **arrays)  # NumPy before 2.1 would keep allow_pickle as an entry
 
     write_atomically(path, write_to)
 
