@@ -144,7 +144,7 @@ def test_larger_semidefinite_problems_need_descent(m, shape):
     if shape == "dense":
         g = rng.normal(size=(m, m // 2))
     else:
-        g = sp.random_array((m, m // 2), density=3.0 / m, rng=rng).toarray()
+        g = np.where(rng.random((m, m // 2)) < 3.0 / m, rng.random((m, m // 2)), 0.0)
     a = sp.csr_array(g @ g.T)
     b = a @ np.maximum(rng.uniform(-0.3, 1.0, m), 0.0) - np.where(rng.random(m) < 0.5, rng.random(m), 0.0)
     problem = lv.Problem.lcp(a, b)
