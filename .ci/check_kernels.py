@@ -38,9 +38,10 @@ OPTIONS = runpy.run_path(str(ROOT / "lavender_ext" / "build_options.py"))
 #: sqrt and floor are exact, so every libm gives the same bits; compilers write the mem functions themselves.
 ALLOWED = frozenset({"sqrt", "floor", "memcpy", "memset", "memmove"})
 
-#: A module of this name is exempt, for it has threads: it yields and sleeps by the system's calls. Its
-#: arithmetic is the inline functions of the .pxd files, which the serial modules compile and this check sees.
-EXEMPT = "threaded"
+#: Modules of these names are exempt, with the reason. `threaded` yields and sleeps by the system's calls; `chain`
+#: calls the Python faces of kernels one after the other. The arithmetic of both is that of other modules, which this
+#: check sees.
+EXEMPT = {"threaded": "threads", "chain": "calls kernels, computes nothing"}
 
 #: Types that have one size everywhere, as a host outside C must build them; structs end in _t too.
 FIXED = re.compile(r"(void|float|double|u?int(8|16|32|64)_t|\w+_t)$")
@@ -207,8 +208,8 @@ def check(path: Path, root: Path = ROOT) -> Verdict:
     path, root = path.resolve(), root.resolve()
     inside = path.relative_to(root) if path.is_relative_to(root) else Path(path.name)
     name = ".".join(inside.with_suffix("").parts)
-    if path.stem == EXEMPT:
-        return Verdict(name, exempt="threads")
+    if path.stem in EXEMPT:
+        return Verdict(name, exempt=EXEMPT[path.stem])
     verdict = Verdict(name)
     verdict.functions, verdict.breaches = read_source(path)
     if verdict.functions:
