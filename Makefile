@@ -35,8 +35,9 @@ types:  ## mypy
 docs:  ## the documentation, in site/
 	$(PYTHON) -m sphinx -W --keep-going -q -b html docs site
 
-wasm:  ## the WebAssembly module, in lavender/web/
+wasm:  ## the WebAssembly modules, in lavender/web/
 	$(BIN)lavender web build lavender/web/lavender.wasm
+	$(BIN)lavender web build lavender/web/newton.wasm --part newton
 
 fingerprint:  ## do solvers and engine still give the bits of the stored fingerprint?
 	$(PYTHON) .ci/fingerprint --compare .ci/fingerprint.txt

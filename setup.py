@@ -76,6 +76,13 @@ class BuildKernels(build_ext):
         stamp.write_text(how)
 
 
+def is_current(path, part):
+    """Whether a WebAssembly module lies there and is of these sources."""
+    if not path.exists():
+        return False
+    return WASM["read_module"](path.read_bytes()).sources == WASM["source_hash"](Path(), part.modules)
+
+
 class BuildWasm(Command):
     """Compiles the kernels to WebAssembly where a compiler for it is installed (the extra `wasm`)."""
 
@@ -91,27 +98,26 @@ class BuildWasm(Command):
         self.set_undefined_options("build", ("build_lib", "build_lib"))
 
     def run(self):
-        """Build the module, or say why there will be none."""
+        """Take the modules that are of these sources, build the others, or say why there will be none."""
         if self.editable_mode:
             return  # `lavender web` builds it when it is first needed
-        out = Path(self.build_lib, "lavender", "web", "lavender.wasm")
-        out.parent.mkdir(parents=True, exist_ok=True)
-        here = Path("lavender", "web", "lavender.wasm")
-        if here.exists():
-            data = here.read_bytes()
-            if WASM["read_module"](data).sources == WASM["source_hash"](Path()):
-                out.write_bytes(data)
-                return
-        reason = WASM["why_not"]()
-        if reason:
-            self.announce(f"no WebAssembly module: {reason}", level=logging.INFO)
-        else:
-            WASM["build"](out, Path().resolve())
+        for name, part in WASM["PARTS"].items():
+            here = Path("lavender", "web", f"{name}.wasm")
+            out = Path(self.build_lib, here)
+            out.parent.mkdir(parents=True, exist_ok=True)
+            if is_current(here, part):
+                out.write_bytes(here.read_bytes())
+                continue
+            reason = WASM["why_not"]()
+            if reason:
+                self.announce(f"no WebAssembly module {name}: {reason}", level=logging.INFO)
+            else:
+                WASM["build"](out, Path().resolve(), part.modules, largest=part.largest, beside=part.beside)
 
     def get_outputs(self):
-        """The module, where it could be built."""
-        out = Path(self.build_lib, "lavender", "web", "lavender.wasm")
-        return [str(out)] if out.exists() else []
+        """The modules, where they could be built."""
+        found = (Path(self.build_lib, "lavender", "web", f"{name}.wasm") for name in WASM["PARTS"])
+        return [str(out) for out in found if out.exists()]
 
     def get_output_mapping(self):
         """No file is linked to a source."""

@@ -46,14 +46,22 @@ def _show(port: int, no_browser: bool) -> None:
 
 @web.command()
 @click.argument("out", type=click.Path(dir_okay=False, path_type=Path), metavar="OUT.wasm")
-def build(out: Path) -> None:
+@click.option(
+    "--part",
+    type=click.Choice(["lavender", "newton"]),
+    default="lavender",
+    show_default=True,
+    help="The module that stands alone, or the one for exact solves that is loaded beside it.",
+)
+def build(out: Path, part: str) -> None:
     """Compile the kernels to one WebAssembly module; needs the extra `wasm`, or a compiler named in
     LAVENDER_WASM_CC and LAVENDER_WASM_LD.
     """
     from lavender.web import pages
 
-    built = pages.build_module(out)
-    click.echo(f"{out}: {built.size} bytes, {len(built.functions)} functions, no imports ({built.compiler})")
+    built = pages.build_module(out, part)
+    needs = f"imports {', '.join(built.imports)}" if built.imports else "no imports"
+    click.echo(f"{out}: {built.size} bytes, {len(built.functions)} functions, {needs} ({built.compiler})")
 
 
 @web.command()

@@ -1,6 +1,9 @@
-"""The kernels as one WebAssembly module without Python: Cython's C, a C compiler for wasm32, a linker.
+"""The kernels as WebAssembly modules without Python: Cython's C, a C compiler for wasm32, a linker.
 
-    python lavender/web/compile.py OUT.wasm        from the root of the project, or wherever lavender_ext lies
+    python lavender/web/compile.py FOLDER          from the root of the project, or wherever lavender_ext lies
+
+makes lavender.wasm (`PARTS`), which stands alone, and newton.wasm, which a host that asks for exact solves loads beside
+it: it works on the memory of the first and imports nothing else.
 
 Only the standard library and Cython are imported, so that setup.py can run this before anything is built.
 
@@ -10,7 +13,8 @@ core functions reach, and nothing else; three checks make that safe:
 * no symbol may stay undefined, so a core that calls Python, libm or malloc does not link;
 * no data may be left (`__data_end == __global_base`), since a module-level variable or an imported function
   pointer is filled by the initialisation of a Python module, which never runs here;
-* the finished module is read back: no imports, exactly the expected functions, a size below `LARGEST`.
+* the finished module is read back: no imports (the memory alone, of one that works beside another), exactly the
+  expected functions, a size below its limit.
 
 A custom section of the module holds the hash of the sources it was built from, so that one from other sources
 is noticed.
@@ -37,7 +41,18 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
-__all__ = ["LARGEST", "MODULES", "BuildFailed", "Built", "build", "read_module", "source_hash", "why_not"]
+__all__ = [
+    "LARGEST",
+    "MODULES",
+    "PARTS",
+    "BuildFailed",
+    "Built",
+    "Part",
+    "build",
+    "read_module",
+    "source_hash",
+    "why_not",
+]
 
 #: Modules of lavender_ext that the page and the checks use.
 MODULES = (
@@ -49,8 +64,22 @@ MODULES = (
     "judge.measure",
     "sweep.serial",
 )
-#: Largest size of the finished module [bytes].
+#: Largest size of a finished module [bytes].
 LARGEST = 200_000
+
+
+@dataclass(frozen=True)
+class Part:
+    """One module of the page: its kernels, how large it may be [bytes], whether it works in the memory of the first."""
+
+    modules: tuple[str, ...]
+    largest: int
+    beside: bool = False
+
+
+#: Modules of the page by name; the first stands alone.
+PARTS = {"lavender": Part(MODULES, LARGEST), "newton": Part(("warm.substep",), 100_000, beside=True)}
+MEMORY = "env.memory"
 CIMPORT = re.compile(r"^from lavender_ext\.([\w.]+) cimport", re.MULTILINE)
 #: Name of the custom section with the hash of the sources.
 SECTION = "lavender.sources"
@@ -152,7 +181,13 @@ def _paths(root: Path, modules: Iterable[str | Path]) -> list[Path]:
 
 
 def build(
-    out: Path, root: Path, modules: Iterable[str | Path] = MODULES, *, include: Path | None = None
+    out: Path,
+    root: Path,
+    modules: Iterable[str | Path] = MODULES,
+    *,
+    include: Path | None = None,
+    largest: int | None = None,
+    beside: bool = False,
 ) -> Built:
     """Build one module of the core functions of several kernel modules.
 
@@ -166,6 +201,10 @@ def build(
         Names in lavender_ext, as `judge.measure`, or paths of .pyx files.
     include : Path, optional
         CPython's headers; None: those of this interpreter.
+    largest : int, optional
+        Size that is refused [bytes]; `LARGEST`.
+    beside : bool
+        The module imports its memory, as `MEMORY`: that of one that stands alone.
 
     Returns
     -------
@@ -211,6 +250,7 @@ def build(
             objects = list(pool.map(compile_one, paths))
         module = work / "module.wasm"
         keep = ["--no-entry", "--gc-sections", "-s", *(f"--export={name}" for name in (*names, *EDGES))]
+        keep += ["--import-memory"] if beside else []
         try:
             _run([*linker, *keep, *map(str, objects), "-o", str(module)], root)
         except BuildFailed as error:
@@ -221,7 +261,7 @@ def build(
             ) from None
         data = module.read_bytes()
         found = read_module(data)
-        _check(found, names, len(data))
+        _check(found, names, len(data), LARGEST if largest is None else largest, (MEMORY,) if beside else ())
         data += _section(SECTION, source_hash(root, paths).encode())
         # Moved into place in one step: whoever reads `out` at the same time sees the old file or the new one.
         part = out.with_name(out.name + f".{os.getpid()}")
@@ -243,9 +283,10 @@ def _run(command: list[str], folder: Path) -> None:
         raise BuildFailed(f"{shlex.join(command)} failed:\n{(done.stdout + done.stderr)[-4000:]}")
 
 
-def _check(found: Module, names: list[str], size: int) -> None:
-    if found.imports:
-        raise BuildFailed(f"the module imports {', '.join(found.imports)}; it must stand alone")
+def _check(found: Module, names: list[str], size: int, largest: int, imports: tuple[str, ...]) -> None:
+    if found.imports != imports:
+        may = f"{', '.join(imports)} alone may be" if imports else "it must stand alone"
+        raise BuildFailed(f"the module imports {', '.join(found.imports) or 'nothing'}; {may}")
     edges = {name: found.globals.get(name) for name in EDGES}
     if None in edges.values() or edges["__data_end"] != edges["__global_base"] or found.data_segments:
         raise BuildFailed(
@@ -255,8 +296,8 @@ def _check(found: Module, names: list[str], size: int) -> None:
     missing = sorted(set(names) ^ set(found.functions))
     if missing:
         raise BuildFailed(f"exported functions are not those of the sources: {', '.join(missing)}")
-    if size >= LARGEST:
-        raise BuildFailed(f"the module has {size} bytes; below {LARGEST} are allowed")
+    if size >= largest:
+        raise BuildFailed(f"the module has {size} bytes; below {largest} are allowed")
 
 
 @dataclass(frozen=True)
@@ -362,7 +403,10 @@ def _name(data: bytes, at: int) -> tuple[str, int]:
 
 
 if __name__ == "__main__":
+    ROOT = Path(__file__).resolve().parent.parent.parent
     try:
-        print(build(Path(sys.argv[1]), Path(__file__).resolve().parent.parent.parent))
+        for name, part in PARTS.items():
+            out = Path(sys.argv[1], f"{name}.wasm")
+            print(build(out, ROOT, part.modules, largest=part.largest, beside=part.beside))
     except BuildFailed as failure:
         sys.exit(str(failure))

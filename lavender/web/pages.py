@@ -1,4 +1,4 @@
-"""The page: its folder, its module, and a server on this machine."""
+"""The page: its folder, its modules, and a server on this machine."""
 
 from __future__ import annotations
 
@@ -19,21 +19,23 @@ __all__ = ["build_module", "module", "server", "write_page"]
 
 HERE = Path(__file__).resolve().parent
 ROOT = Path(lavender_ext.__file__).resolve().parent.parent  # the folder that holds lavender_ext
-SHIPPED = HERE / "lavender.wasm"
+SHIPPED = HERE  # the folder of the modules that come with the package
 
 
-def build_module(out: Path) -> wasm.Built:
-    """Compile the kernels to one WebAssembly module without imports.
+def build_module(out: Path, name: str = "lavender") -> wasm.Built:
+    """Compile the kernels of a part of the page to one WebAssembly module.
 
     Parameters
     ----------
     out : Path
         File to write.
+    name : {"lavender", "newton"}
+        The module that stands alone, or the one that is loaded beside it.
 
     Returns
     -------
     Built
-        size [bytes], functions, imports (none), compiler.
+        size [bytes], functions, imports (none, or the memory), compiler.
 
     Raises
     ------
@@ -44,19 +46,22 @@ def build_module(out: Path) -> wasm.Built:
     """
     if not out.resolve().parent.is_dir():
         raise InputError(f"the folder {out.resolve().parent} does not exist; make it first")
+    part = wasm.PARTS[name]
     try:
-        return wasm.build(out, ROOT)
+        return wasm.build(out, ROOT, part.modules, largest=part.largest, beside=part.beside)
     except wasm.BuildFailed as error:
         raise LavenderError(str(error)) from None
 
 
-def module(say: Callable[[str], Any] = lambda text: None) -> bytes:
-    """The module of the kernels as they are: the one that lies in the package, or a new one, kept there.
+def module(say: Callable[[str], Any] = lambda text: None, name: str = "lavender") -> bytes:
+    """A module of the kernels as they are: the one that lies in the package, or a new one, kept there.
 
     Parameters
     ----------
     say : callable
         Told when something takes time.
+    name : {"lavender", "newton"}
+        Which one.
 
     Returns
     -------
@@ -67,27 +72,28 @@ def module(say: Callable[[str], Any] = lambda text: None) -> bytes:
     LavenderError
         There is none for these sources, and none can be built.
     """
-    sources = wasm.source_hash(ROOT)
-    if SHIPPED.exists():
-        data = SHIPPED.read_bytes()
+    shipped = SHIPPED / f"{name}.wasm"
+    sources = wasm.source_hash(ROOT, wasm.PARTS[name].modules)
+    if shipped.exists():
+        data = shipped.read_bytes()
         if wasm.read_module(data).sources == sources:
             return data
     reason = wasm.why_not()
     if reason:
-        state = "is of other kernels" if SHIPPED.exists() else "is not in this installation"
-        raise LavenderError(f"the WebAssembly module {state} and cannot be built: {reason}")
-    say("building the WebAssembly module (some 10 s, kept for the next time)")
+        state = "is of other kernels" if shipped.exists() else "is not in this installation"
+        raise LavenderError(f"the WebAssembly module {name} {state} and cannot be built: {reason}")
+    say(f"building the WebAssembly module {name} (some 10 s, kept for the next time)")
     try:
-        build_module(SHIPPED)
-        return SHIPPED.read_bytes()
+        build_module(shipped, name)
+        return shipped.read_bytes()
     except LavenderError as error:
         if not str(error).startswith("cannot write"):
             raise
     from tempfile import TemporaryDirectory
 
     with TemporaryDirectory() as folder:  # the package is read-only
-        out = Path(folder, "lavender.wasm")
-        build_module(out)
+        out = Path(folder, shipped.name)
+        build_module(out, name)
         return out.read_bytes()
 
 
@@ -113,10 +119,11 @@ def write_page(folder: Path, say: Callable[[str], Any] = lambda text: None) -> P
     LavenderError
         No module; see `module`.
     """
-    data = module(say)
+    modules = {name: module(say, name) for name in wasm.PARTS}
     try:
         shutil.copytree(HERE / "page", folder, dirs_exist_ok=True)
-        (folder / "lavender.wasm").write_bytes(data)
+        for name, data in modules.items():
+            (folder / f"{name}.wasm").write_bytes(data)
         text = json.dumps(page_scenes(), allow_nan=False, separators=(",", ":"))
         (folder / "scenes.json").write_text(text, encoding="utf-8")
     except (OSError, shutil.Error) as error:

@@ -124,6 +124,14 @@ PRESETS: tuple[tuple[str, str, str, dict[str, Any], dict[str, Any], str], ...] =
         "The upper box is a hundred times as heavy. A carries it, B lets it slip off.",
     ),
     (
+        "newton-against-sweeps",
+        "newton against sweeps, cold",
+        "heavy_on_light",
+        {"iterations": 16, "warm_start": False, "solver": "newton"},
+        {"iterations": 64, "warm_start": False},
+        "Each step starts from nothing. A takes a few Newton steps to the answer; B sweeps 64 times and the box slips.",
+    ),
+    (
         "cards",
         "a house of cards",
         "card_house",
@@ -196,6 +204,7 @@ def page_scenes() -> dict[str, Any]:
                 "measure": measure,
                 "dt": common.dt,
                 "substeps": common.substeps,
+                "newton_substeps": Scene(name, solver="newton").parameters.substeps,
                 "bodies": [body.name for body in scene.bodies],
                 **describe(Simulation(scene).snapshot()),
             }
@@ -210,6 +219,7 @@ def page_scenes() -> dict[str, Any]:
                     "iterations": side["iterations"],
                     "warm_start": int(side["warm_start"]),
                     "order": ORDER_NUMBER[side.get("order", "given")],
+                    "solver": side.get("solver", "sweeps"),
                 }
                 for side in (one, two)
             ],

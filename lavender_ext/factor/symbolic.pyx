@@ -3,49 +3,20 @@ from libc.stdint cimport int32_t, int64_t
 
 import numpy as np
 
+from lavender_ext.factor.symbolic cimport block_pattern, block_tree
+
 
 cdef public void lav_block_tree(int32_t n, const int32_t* nptr, const int32_t* nind, int32_t* parent,
                                 int32_t* mark, int32_t* row_count, int32_t* column_count) noexcept nogil:
     """Elimination tree of the lower pattern, and how many blocks each row and column of L holds."""
-    cdef int32_t k, q, j
-    for k in range(n):
-        parent[k] = -1
-        mark[k] = k
-        row_count[k] = 0
-        column_count[k] = 0
-        for q in range(nptr[k], nptr[k + 1]):
-            j = nind[q]
-            while j < k and mark[j] != k:
-                if parent[j] < 0:
-                    parent[j] = k
-                mark[j] = k
-                row_count[k] += 1
-                column_count[j] += 1
-                j = parent[j]
+    block_tree(n, nptr, nind, parent, mark, row_count, column_count)
 
 
 cdef public void lav_block_pattern(int32_t n, const int32_t* nptr, const int32_t* nind, const int32_t* parent,
                                    int32_t* mark, const int32_t* lptr, const int32_t* rptr, int32_t* next,
                                    int32_t* lind, int32_t* rind) noexcept nogil:
     """Rows of every column of L, and columns of every row, both ascending."""
-    cdef int32_t k, q, j, p
-    for k in range(n):
-        mark[k] = k
-        next[k] = lptr[k]
-        for q in range(nptr[k], nptr[k + 1]):
-            j = nind[q]
-            while j < k and mark[j] != k:
-                mark[j] = k
-                lind[next[j]] = k
-                next[j] += 1
-                j = parent[j]
-    for k in range(n):
-        next[k] = rptr[k]
-    for j in range(n):
-        for p in range(lptr[j], lptr[j + 1]):
-            k = lind[p]
-            rind[next[k]] = j
-            next[k] += 1
+    block_pattern(n, nptr, nind, parent, mark, lptr, rptr, next, lind, rind)
 
 
 def factor_pattern(const int32_t[::1] nptr, const int32_t[::1] nind):

@@ -1,75 +1,24 @@
 """K = D^-1/2 J M^-1/2 of a factored problem, row by row: two bodies' columns each."""
-from libc.math cimport sqrt
 from libc.stdint cimport int32_t, int64_t
 
 import numpy as np
 
-from lavender_ext.core.block cimport CONTACT_SPIN as SPIN, blocks_t, n_tangents
+from lavender_ext.core.block cimport blocks_t
 from lavender_ext.core.problem cimport Data
-from lavender_ext.core.rows cimport contact_jacobian, rows_t
+from lavender_ext.core.rows cimport rows_t
+from lavender_ext.newton.panel cimport fill_panel, inertia_root
 
 
 cdef public int32_t lav_inertia_root(int32_t n, const double* inv_inertia, double* root) noexcept nogil:
     """Lower L with L L^T = I^-1 for each body, (n, 9); a pivot at rounding is a pinned axis, zero."""
-    cdef int32_t i, c, r, t
-    cdef double x, top
-    cdef const double *a
-    cdef double *l
-    for i in range(n):
-        a = inv_inertia + 9 * i
-        l = root + 9 * i
-        for c in range(9):
-            l[c] = 0.0
-        for c in range(3):
-            x = a[4 * c]
-            for t in range(c):
-                x -= l[3 * c + t] * l[3 * c + t]
-            if not x > 1e-14 * a[4 * c]:
-                continue
-            x = sqrt(x)
-            l[4 * c] = x
-            for r in range(c + 1, 3):
-                top = 0.5 * (a[3 * r + c] + a[3 * c + r])
-                for t in range(c):
-                    top -= l[3 * r + t] * l[3 * c + t]
-                l[3 * r + c] = top / x
+    inertia_root(n, inv_inertia, root)
     return 0
 
 
 cdef public void lav_panel(const blocks_t* p, const rows_t* r, const double* root, const double* root_mass,
                            double* panel) noexcept nogil:
     """K (m, 12): D^-1/2 J M^-1/2, columns of body a then b."""
-    cdef int32_t i, j, q, c, k, h, a, b, body
-    cdef double jac[48]
-    cdef double x
-    cdef const double *row
-    cdef const double *l
-    cdef double *out
-    for i in range(p.n_blocks):
-        j = p.ptr[i]
-        c = i - r.n_joints
-        if c < 0:
-            a = r.joint_body[2 * i]
-            b = r.joint_body[2 * i + 1]
-            row = r.jac + 12 * j
-        else:
-            a = r.contact_body[2 * c]
-            b = r.contact_body[2 * c + 1]
-            contact_jacobian(r, c, n_tangents(p.kind[i], p.ptr[i + 1] - j), p.kind[i] == SPIN, jac)
-            row = jac
-        for q in range(j, p.ptr[i + 1]):
-            out = panel + 12 * <int64_t>q
-            x = 1.0 / sqrt(p.d[q])
-            for h in range(2):
-                body = a if h == 0 else b
-                for k in range(6):
-                    out[6 * h + k] = 0.0
-                if body >= 0:
-                    l = root + 9 * body
-                    for k in range(3):
-                        out[6 * h + k] = x * row[6 * h + k] * root_mass[body]
-                        out[6 * h + 3 + k] = x * (row[6 * h + 3] * l[k] + row[6 * h + 4] * l[3 + k] + row[6 * h + 5] * l[6 + k])
-            row += 12
+    fill_panel(p, r, root, root_mass, panel)
 
 
 def scaled_jacobian(Data p, const double[:, :, ::1] inv_inertia, const double[::1] root_mass, double[:, ::1] out):

@@ -1,1 +1,1 @@
-"""A warm start carried to the judge's tolerance, on a problem's data or in the engine's arrays."""
+"""A warm start carried to the judge's tolerance, on a problem's data, in the engine's arrays, in a browser."""

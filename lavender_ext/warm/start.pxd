@@ -10,7 +10,7 @@ An impulse is scored by the judge's own lines (judge/measure.pxd, judge/score.px
 judge's. What is not decided here (dependent joints, numbers near the ends of the range, a residual that stays above
 tol) is left to the caller, with lam as it came.
 """
-from libc.math cimport sqrt
+from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t, int64_t
 
 from lavender_ext.core.block cimport COULOMB, ROW, blocks_t, clip, row_error
@@ -29,6 +29,7 @@ cpdef enum:
     MOST_STEPS = 6              # of (4)
     MOST_ROWS = 200000          # so that all of it takes a fraction of a second
     MOST_BAND = 48              # rows between the first and the last of one body's joints, for (3)
+    MOST_TRACED = 256           # scores of one solve that are noted
 
 cpdef enum:                     # how it ended
     UNDECIDED = 0
@@ -36,6 +37,7 @@ cpdef enum:                     # how it ended
     SWEPT = 2                   # met it after some sweeps
     SOLVED = 3                  # met it after one factorisation
     STEPPED = 4                 # met it after sweeps and Newton steps
+    WALKED = 5                  # met it after the proximal Newton walks of walk.pxd
 
 
 cdef struct warm_t:
@@ -51,6 +53,8 @@ cdef struct warm_t:
     int32_t sweeps              # done
     int32_t factorisations      # done
     double relative             # of lam as it is left
+    double* trace               # (MOST_TRACED, 3) or NULL: sweeps and factorisations so far, E [sqrt J], max |e_n| [N s]
+    int32_t traced              # scores noted
 
 
 cdef inline int32_t start_errors(const blocks_t* p, double* energy, double* velocity) noexcept nogil:
@@ -79,12 +83,65 @@ cdef inline int32_t start_errors(const blocks_t* p, double* energy, double* velo
     return is_plain(s.energy, s.fast) and s.energy * least > 1.3e-29 * rhs
 
 
+cdef inline void observe(const blocks_t* p, const rows_t* r, const warm_t* s, double* residual,
+                         double* violation) noexcept nogil:
+    # as the engine measures its own sweeps: max |e_n| [N s] and max(0, -w_n) [m/s] over the contacts
+    cdef int32_t i, j
+    cdef double x, big = 0.0, low = 0.0
+    for i in range(r.n_joints, p.n_blocks):
+        j = p.ptr[i]
+        x = fabs(s.error[j])
+        big = x if x > big else big
+        low = -s.slack[j] if -s.slack[j] > low else low
+    residual[0] = big
+    violation[0] = low
+
+
+cdef inline int64_t room_of(const blocks_t* p, const rows_t* r, int32_t width) noexcept nogil:
+    # doubles that `lay_out` hands out
+    cdef int64_t m = p.n_rows, n = 6 * <int64_t>r.n_bodies
+    return 3 * m + n + width * (n if r.n_contacts > 0 else m)
+
+
+cdef inline void lay_out(warm_t* s, double* real, int32_t* index, const blocks_t* p, const rows_t* r) noexcept nogil:
+    # index (n_bodies + 2 joints + contacts)
+    s.kept = real
+    s.slack = real + p.n_rows
+    s.error = s.slack + p.n_rows
+    s.change = s.error + p.n_rows
+    s.band = s.change + 6 * <int64_t>r.n_bodies
+    s.last = index
+    s.before = index + r.n_bodies
+    s.state = s.before + 2 * r.n_joints
+
+
+cdef inline void note_score(const blocks_t* p, const rows_t* r, warm_t* s, double energy) noexcept nogil:
+    # the last score of as much work counts
+    cdef int32_t i
+    cdef double x, big = 0.0, work = s.sweeps + s.factorisations
+    cdef double* out
+    if s.traced > 0 and s.trace[3 * s.traced - 3] == work:
+        s.traced -= 1
+    if s.traced == MOST_TRACED:
+        return
+    for i in range(r.n_joints, p.n_blocks):
+        x = fabs(s.error[p.ptr[i]])
+        big = x if x > big else big
+    out = s.trace + 3 * s.traced
+    out[0] = work
+    out[1] = energy
+    out[2] = big
+    s.traced += 1
+
+
 cdef inline double scored(const blocks_t* p, const rows_t* r, warm_t* s, const double* lam, const double* v, double e0,
                           double v0) noexcept nogil:
     """Relative residual of lam as the judge has it, v = M^-1 J^T lam; infinite where it is not finite."""
     cdef score_t x
     rows_slack(p, r, lam, v, s.slack)
     score_rows(p, lam, s.slack, s.error, &x)
+    if s.trace != NULL:
+        note_score(p, r, s, x.energy)
     return relative(x.energy, x.velocity, e0, v0) if x.finite else 1.0 / 0.0
 
 
@@ -236,6 +293,7 @@ cdef inline int32_t warm_solve(const blocks_t* p, const rows_t* r, warm_t* s, do
     cdef int32_t j, found, cold = 1
     s.sweeps = 0
     s.factorisations = 0
+    s.traced = 0
     for j in range(p.n_rows):
         if lam[j] != 0.0:
             cold = 0

@@ -1,5 +1,4 @@
 """Warm starts of warm/start.pxd: on a problem's data, and on the engine's arrays in place."""
-from libc.math cimport fabs
 from libc.stdint cimport int32_t, int64_t, uint64_t
 
 import numpy as np
@@ -10,7 +9,7 @@ from lavender_ext.core.rows cimport rows_t
 from lavender_ext.core.weights cimport block_weights, joint_weights
 from lavender_ext.engine.arrays cimport CAP_CONTACT, N_DYNAMIC, N_JOINT, S_OUT, bind, engine_t
 from lavender_ext.engine.view cimport view
-from lavender_ext.warm.start cimport band_width, warm_solve, warm_t
+from lavender_ext.warm.start cimport band_width, lay_out, observe, room_of, warm_solve, warm_t
 
 
 cdef public int32_t lav_warm_band(const blocks_t* p, const rows_t* r, int32_t* last) noexcept nogil:
@@ -33,43 +32,12 @@ def from_guess(Data data, double[::1] impulse, double tol):
     cdef int32_t[::1] index = np.empty(data.rows.n_bodies + 2 * data.rows.n_joints + data.rows.n_contacts + 1,
                                        np.int32)
     s.width = lav_warm_band(&data.blocks, &data.rows, &index[0])
-    cdef double[::1] real = np.empty(6 * data.rows.n_bodies + _room(&data.blocks, &data.rows, s.width))
-    _lay(&s, &real[6 * data.rows.n_bodies], &index[0], &data.blocks, &data.rows)
+    cdef double[::1] real = np.empty(6 * data.rows.n_bodies + room_of(&data.blocks, &data.rows, s.width))
+    s.trace = NULL
+    lay_out(&s, &real[6 * data.rows.n_bodies], &index[0], &data.blocks, &data.rows)
     with nogil:
         how = lav_warm_solve(&data.blocks, &data.rows, &s, tol, &impulse[0], &real[0], 0)
     return how, s.sweeps, s.factorisations
-
-
-cdef int64_t _room(const blocks_t* p, const rows_t* r, int32_t width) noexcept:
-    # doubles that `_lay` hands out
-    cdef int64_t m = p.n_rows, n = 6 * <int64_t>r.n_bodies
-    return 3 * m + n + width * (n if r.n_contacts > 0 else m)
-
-
-cdef void _lay(warm_t* s, double* real, int32_t* index, const blocks_t* p, const rows_t* r) noexcept:
-    # index (n_bodies + 2 joints + contacts)
-    s.kept = real
-    s.slack = real + p.n_rows
-    s.error = s.slack + p.n_rows
-    s.change = s.error + p.n_rows
-    s.band = s.change + 6 * <int64_t>r.n_bodies
-    s.last = index
-    s.before = index + r.n_bodies
-    s.state = s.before + 2 * r.n_joints
-
-
-cdef inline void _observe(const blocks_t* p, const rows_t* r, const warm_t* s, double* residual,
-                          double* violation) noexcept nogil:
-    # as the engine measures its own sweeps: max |e_n| [N s] and max(0, -w_n) [m/s] over the contacts
-    cdef int32_t i, j
-    cdef double x, big = 0.0, low = 0.0
-    for i in range(r.n_joints, p.n_blocks):
-        j = p.ptr[i]
-        x = fabs(s.error[j])
-        big = x if x > big else big
-        low = -s.slack[j] if -s.slack[j] > low else low
-    residual[0] = big
-    violation[0] = low
 
 
 cdef class Warm:
@@ -105,16 +73,17 @@ cdef class Warm:
         bind(&self.size[0], &self.real[0], &self.index[0], &self.keys[0], &e, used)
         view(&e, &p, &r)
         s.width = lav_warm_band(&p, &r, &self.scratch_index[0])
-        room = _room(&p, &r, s.width) + p.n_rows
+        room = room_of(&p, &r, s.width) + p.n_rows
         if self.scratch.shape[0] < room:
             self.scratch = np.empty(room + room // 4)
         nu = &self.scratch[0]
-        _lay(&s, nu + p.n_rows, &self.scratch_index[0], &p, &r)
+        s.trace = NULL
+        lay_out(&s, nu + p.n_rows, &self.scratch_index[0], &p, &r)
         with nogil:
             block_weights(&p, p.d, nu)
             joint_weights(&p, &r, nu)
             p.nu = nu
             how = lav_warm_solve(&p, &r, &s, tol, e.impulse, e.dv, 1)
             if how != 0:
-                _observe(&p, &r, &s, e.setting + S_OUT + 5, e.setting + S_OUT + 7)
+                observe(&p, &r, &s, e.setting + S_OUT + 5, e.setting + S_OUT + 7)
         return how, s.sweeps, s.factorisations

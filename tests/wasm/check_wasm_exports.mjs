@@ -3,7 +3,7 @@
 //
 //     node tests/wasm/check_wasm_exports.mjs MODULE.wasm [FOLDER]
 //
-// FOLDER holds recording.json and recording.bin of tests/wasm/record.py; without one they are recorded first,
+// newton.wasm lies beside MODULE.wasm. FOLDER holds recording.json and recording.bin of tests/wasm/record.py; without one they are recorded first,
 // by the interpreter that PYTHON names (python3 by default), into a temporary folder.
 
 import assert from "node:assert/strict";
@@ -15,10 +15,11 @@ import { dirname, join } from "node:path";
 import { fileURLToPath } from "node:url";
 
 import { load } from "./problem.mjs";
-import { Kernels, ORDERS, Simulation, SOLVER_FIELDS } from "../../lavender/web/page/lavender.js";
+import { Kernels, Newton, ORDERS, Simulation, SOLVER_FIELDS } from "../../lavender/web/page/lavender.js";
 
 const here = dirname(fileURLToPath(import.meta.url));
 const LARGEST = 200_000; // bytes
+const LARGEST_NEWTON = 100_000;
 
 const [modulePath, given] = process.argv.slice(2);
 if (!modulePath) {
@@ -40,6 +41,8 @@ try {
 }
 const bytes = readFileSync(modulePath);
 const module = new WebAssembly.Module(bytes);
+const newtonBytes = readFileSync(join(dirname(modulePath), "newton.wasm"));
+const newtonModule = new WebAssembly.Module(newtonBytes);
 
 // Bytes of a recorded array [offset, count, type].
 function recorded([offset, count, type]) {
@@ -108,6 +111,52 @@ function checkPersistentContact() {
   return `${contacts} contacts made, kept, found; none found without warm start`;
 }
 
+function checkNewtonModule() {
+  const imports = WebAssembly.Module.imports(newtonModule).map((i) => `${i.module}.${i.name} (${i.kind})`);
+  assert.deepEqual(imports, ["env.memory (memory)"], "newton.wasm imports more than a memory");
+  assert.ok(newtonBytes.length < LARGEST_NEWTON, `${newtonBytes.length} bytes; below ${LARGEST_NEWTON} are allowed`);
+  const newton = new Newton(newtonModule, new Kernels(module, recording.layout));
+  assert.equal(newton.f.__data_end.value, newton.f.__global_base.value, "static data is left in newton.wasm");
+  const kernels = new Kernels(module, recording.layout);
+  const lower = { memory: kernels.memory, alloc: () => 0, functions: { __heap_base: { value: 16 } } };
+  assert.throws(() => new Newton(newtonModule, lower), /not built alike/);
+  return `${newtonBytes.length} bytes, imports the memory alone`;
+}
+
+function replayNewton(scene) {
+  const kernels = new Kernels(module, recording.layout);
+  const simulation = new Simulation(kernels, scene);
+  simulation.use(new Newton(newtonModule, kernels));
+  const [states, values, said] = ["states", "values", "said"].map((name) => doubles(scene[name]));
+  const hashes = recorded(scene.hashes);
+  const width = states.length / scene.steps;
+  let told;
+  for (let step = 0; step < scene.steps; step++) {
+    if (scene.changes[step]) {
+      simulation.set(scene.changes[step]);
+    }
+    if (step === 50) {
+      const snapshot = simulation.snapshot();
+      simulation.use(null); // a detour by sweeps
+      simulation.step();
+      simulation.restore(snapshot);
+    }
+    const where = `${scene.name}, step ${step + 1}`;
+    told = simulation.stepWatched();
+    assert.ok(told.finite, `${where}: not finite`);
+    sameBits(Float64Array.from(simulation.values), values.subarray(8 * step, 8 * step + 8), `${where}, eight values`);
+    sameBits(Float64Array.of(told.sweeps, told.steps, told.relative, told.at.length), said.subarray(4 * step, 4 * step + 4), `${where}, what it said`);
+    const state = Float64Array.from(recording.body_arrays.flatMap((name) => Array.from(simulation.array(name))));
+    sameBits(state, states.subarray(width * step, width * (step + 1)), `${where}, ${recording.body_arrays}`);
+    if (Buffer.compare(hashOf(simulation), hashes.subarray(32 * step, 32 * step + 32)) !== 0) {
+      assert.fail(`${where}: some other array differs from the native one`);
+    }
+  }
+  const trace = Float64Array.from(told.at.flatMap((at, i) => [at, told.energy[i], told.normal[i]]));
+  sameBits(trace, doubles(scene.trace), `${scene.name}, scores of the last solve`);
+  assert.deepEqual([simulation.solved - simulation.short, simulation.solved], [scene.met, scene.solved], scene.name);
+}
+
 function hashOf(simulation) {
   const { k, lengths } = simulation;
   const hash = createHash("sha256");
@@ -166,6 +215,7 @@ function checkProblem(problem) {
 }
 
 console.log(`module: ${checkModule()}`);
+console.log(`newton: ${checkNewtonModule()}`);
 console.log(`cache: ${checkPersistentContact()}`);
 assert.deepEqual(Object.keys(recording.layout.orders), ORDERS);
 let steps = 0;
@@ -174,6 +224,12 @@ for (const scene of recording.scenes) {
   steps += scene.steps;
   console.log(`${scene.name}: ${scene.steps} steps, up to ${most} contacts, every array and value the same`);
 }
+let solved = 0;
+for (const scene of recording.newton) {
+  replayNewton(scene);
+  solved += scene.solved;
+  console.log(`${scene.name}: ${scene.steps} steps, ${scene.met} of ${scene.solved} solves within tol, all the same`);
+}
 recording.problems.forEach(checkProblem);
 console.log(`${recording.problems.length} problems: impulse, slack, error, d, nu, step and sums the same`);
-console.log(`all the same: ${recording.scenes.length} scenes, ${steps} steps, ${recording.problems.length} problems`);
+console.log(`all the same: ${recording.scenes.length} scenes, ${steps} steps, ${solved} solves by newton, ${recording.problems.length} problems`);

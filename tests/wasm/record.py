@@ -14,6 +14,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
+from newton_steps import NewtonSteps
 from random_problems import as_matrix, random_contact_problem, random_lcp
 
 import lavender as lv
@@ -39,6 +40,19 @@ SCENES = [
     ("bridge", {"order": "colored"}, {}),
     ("four_bar", {"order": "reverse", "motor": 2.0}, {}),
     ("newtons_cradle", {}, {}),
+]
+
+
+#: The same for Newton's method on both sides of the border: joints and contacts alone and together, spin, cold starts.
+NEWTON_STEPS = 120
+NEWTON_SCENES = [
+    ("stack", {}, {40: {"warm_start": 0}, 80: {"warm_start": 1}}),
+    ("pyramid", {"base": 5, "friction": 0.15}, {}),
+    ("pile", {"n": 12, "kind": "mixed"}, {}),
+    ("bridge", {"n": 5}, {}),
+    ("chain", {}, {60: {"warm_start": 0}}),
+    ("four_bar", {}, {}),
+    ("spinner", {}, {60: {"warm_start": 0}}),
 ]
 
 
@@ -92,6 +106,37 @@ def record_scene(writer, name, parameters, changes, steps=STEPS):
         "values": writer.put(values, "<f8"),
         "hashes": writer.put(np.frombuffer(b"".join(hashes), np.uint8), "|u1"),
         "last": writer.put(shot.real, "<f8"),
+    }
+
+
+def record_newton(writer, name, parameters, changes):
+    """A scene solved by Newton's method: poses, the eight values, what each last solve said, the hash of everything."""
+    run = NewtonSteps(name, **parameters)
+    start = run.simulation.snapshot()
+    states, values, said, hashes = [], [], [], []
+    for step in range(NEWTON_STEPS):
+        if step in changes:
+            run.set_warm_start(changes[step]["warm_start"])
+        values.append(run.step())
+        states.append(run.bodies())
+        said.append([*run.told[1:], len(run.trace)])
+        hashes.append(hashlib.sha256(run.everything()).digest())
+    given = ", ".join(f"{key}={value}" for key, value in parameters.items())
+    return {
+        "name": f"{name}({given}), newton",
+        "dt": run.simulation.scene.parameters.dt,
+        "substeps": run.substeps,
+        "newton_substeps": run.substeps,
+        "steps": NEWTON_STEPS,
+        "changes": {str(step): change for step, change in changes.items()},
+        **describe(start),
+        "met": sum(how > 0 for how in run.ended),
+        "solved": len(run.ended),
+        "states": writer.put(states, "<f8"),
+        "values": writer.put(values, "<f8"),
+        "said": writer.put(said, "<f8"),
+        "trace": writer.put(run.trace, "<f8"),
+        "hashes": writer.put(np.frombuffer(b"".join(hashes), np.uint8), "|u1"),
     }
 
 
@@ -166,6 +211,7 @@ def record(folder, steps=STEPS):
     """Both files; returns the path of the JSON."""
     writer = Writer()
     scenes = [record_scene(writer, *scene, steps=steps) for scene in SCENES]
+    newton = [record_newton(writer, *scene) for scene in NEWTON_SCENES]
     found = []
     for i, problem in enumerate(problems()):
         for sweeps, order in (
@@ -174,7 +220,13 @@ def record(folder, steps=STEPS):
             (40, "given"),
         ):
             found.append(record_problem(writer, problem, sweeps, order, seed=i))
-    contents = {"layout": layout(), "body_arrays": BODY_ARRAYS, "scenes": scenes, "problems": found}
+    contents = {
+        "layout": layout(),
+        "body_arrays": BODY_ARRAYS,
+        "scenes": scenes,
+        "newton": newton,
+        "problems": found,
+    }
     path = Path(folder) / "recording.json"
     path.write_text(json.dumps(contents, allow_nan=False), encoding="utf-8")
     path.with_suffix(".bin").write_bytes(b"".join(writer.parts))

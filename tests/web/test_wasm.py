@@ -37,6 +37,15 @@ def module():
 
 
 @pytest.fixture(scope="session")
+def newton_module():
+    """The module of Newton's method, likewise."""
+    try:
+        return pages.module(name="newton")
+    except LavenderError as error:
+        pytest.skip(str(error))
+
+
+@pytest.fixture(scope="session")
 def recording(tmp_path_factory):
     """Folder of what the native kernels did."""
     folder = tmp_path_factory.mktemp("recording")
@@ -64,6 +73,16 @@ def test_module_stands_alone(module):
         found.functions
     )
     assert found.sources == wasm.source_hash(ROOT)
+
+
+def test_the_module_of_newton_needs_the_memory_alone(newton_module):
+    found = wasm.read_module(newton_module)
+    assert found.imports == ("env.memory",)
+    assert found.data_segments == 0
+    assert found.globals["__data_end"] == found.globals["__global_base"]
+    assert len(newton_module) < wasm.PARTS["newton"].largest
+    assert found.functions == ("lav_newton_index_room", "lav_newton_plan", "lav_newton_substep")
+    assert found.sources == wasm.source_hash(ROOT, wasm.PARTS["newton"].modules)
 
 
 HEAD = "from libc.stdint cimport int32_t\n"
@@ -140,12 +159,11 @@ def test_headers_of_another_machine_do_no_harm(tmp_path):
 
 
 @needs_compiler
-def test_a_module_that_is_too_large_is_refused(tmp_path, monkeypatch):
+def test_a_module_that_is_too_large_is_refused(tmp_path):
     path = tmp_path / "good.pyx"
     path.write_text(GOOD)
-    monkeypatch.setattr(wasm, "LARGEST", 10)
     with pytest.raises(wasm.BuildFailed, match="below 10 are allowed"):
-        wasm.build(tmp_path / "good.wasm", ROOT, [path])
+        wasm.build(tmp_path / "good.wasm", ROOT, [path], largest=10)
 
 
 def test_a_compiler_that_is_not_there_is_named(tmp_path, monkeypatch):
@@ -166,8 +184,10 @@ def test_a_file_that_is_no_module_is_refused():
 
 def test_without_compiler_a_missing_or_stale_module_says_what_to_do(tmp_path, monkeypatch):
     monkeypatch.setattr(wasm, "why_not", lambda: "no compiler")
-    monkeypatch.setattr(pages, "SHIPPED", tmp_path / "lavender.wasm")
-    with pytest.raises(LavenderError, match="is not in this installation and cannot be built: no compiler"):
+    monkeypatch.setattr(pages, "SHIPPED", tmp_path)
+    with pytest.raises(
+        LavenderError, match="lavender is not in this installation and cannot be built: no compiler"
+    ):
         pages.module()
     other = b"\0asm\1\0\0\0" + wasm._section(wasm.SECTION, b"0" * 64)
     (tmp_path / "lavender.wasm").write_bytes(other)
@@ -178,12 +198,13 @@ def test_without_compiler_a_missing_or_stale_module_says_what_to_do(tmp_path, mo
     assert pages.module() == fresh
 
 
-def test_a_build_of_the_package_ships_the_module(tmp_path, module):
+def test_a_build_of_the_package_ships_the_modules(tmp_path, module, newton_module):
     # As `pip wheel --no-build-isolation` runs it: built, or taken from the checkout where it is of these sources.
-    shipped = tmp_path / "lavender" / "web" / "lavender.wasm"
+    shipped = tmp_path / "lavender" / "web"
     command = [sys.executable, "setup.py", "-q", "build_wasm", "--build-lib", str(tmp_path)]
     subprocess.run(command, check=True, cwd=ROOT)
-    assert shipped.read_bytes() == module
+    assert (shipped / "lavender.wasm").read_bytes() == module
+    assert (shipped / "newton.wasm").read_bytes() == newton_module
 
 
 @needs_compiler
@@ -214,21 +235,28 @@ def node(*arguments):
 
 
 @pytest.fixture(scope="session")
-def module_file(module, tmp_path_factory):
+def module_file(module, newton_module, tmp_path_factory):
     path = tmp_path_factory.mktemp("wasm") / "lavender.wasm"
     path.write_bytes(module)
+    (path.parent / "newton.wasm").write_bytes(newton_module)
     return path
 
 
 def test_node_finds_every_bit_the_same(module_file, recording):
     done = node(CHECK, module_file, recording)
     assert done.returncode == 0, done.stdout + done.stderr
-    assert "all the same: 13 scenes, 7800 steps, 378 problems" in done.stdout
+    assert "all the same: 13 scenes, 7800 steps, 840 solves by newton, 378 problems" in done.stdout
 
 
 @pytest.mark.parametrize(
     ("what", "sign"),
-    [("values", "eight values"), ("states", "x,q,v"), ("hashes", "other array"), ("problem", "impulse")],
+    [
+        ("values", "eight values"),
+        ("states", "x,q,v"),
+        ("hashes", "other array"),
+        ("newton", "what it said"),
+        ("problem", "impulse"),
+    ],
 )
 def test_node_sees_one_wrong_bit(module_file, recording, tmp_path, what, sign):
     contents = json.loads((recording / "recording.json").read_text())
@@ -238,6 +266,11 @@ def test_node_sees_one_wrong_bit(module_file, recording, tmp_path, what, sign):
             s for s in contents["scenes"] if s["name"] == "stack(substeps=1)"
         ]  # its cache is looked at
         at = contents["problems"][-1]["expected"]["impulse"][0]
+        contents["newton"] = []
+    elif what == "newton":
+        contents["problems"] = []
+        at = contents["newton"][0]["said"][0] + 1000
+        contents["scenes"] = [s for s in contents["scenes"] if s["name"] == "stack(substeps=1)"]
     else:
         contents["problems"] = []
         at = contents["scenes"][0][what][0] + 1000
@@ -308,6 +341,22 @@ def test_wasmtime_scenes_are_the_same_to_the_bit(module, host, recorded):
             steps += 1
         assert same_bits(simulation.array("x"), states[-1][: 3 * scene["size"][0]])
     assert steps == 7800
+
+
+def test_wasmtime_solves_by_newton_are_the_same_to_the_bit(module, newton_module, host, recorded):
+    for scene in recorded.contents["newton"]:
+        simulation = host.Simulation(host.Kernels(module, recorded.contents["layout"]), scene)
+        newton = host.Newton(newton_module, simulation.k)
+        values = recorded.array(scene["values"]).reshape(-1, 8)
+        said = recorded.array(scene["said"]).reshape(-1, 4)
+        hashes = recorded.array(scene["hashes"]).reshape(-1, 32)
+        for step in range(40):  # Node goes on to the end
+            if str(step) in scene["changes"]:
+                simulation.set(**scene["changes"][str(step)])
+            where = f"{scene['name']}, step {step + 1}"
+            assert same_bits(newton.step(simulation, 1e-6), said[step]), where
+            assert same_bits(simulation.values(), values[step]), where
+            assert hashlib.sha256(b"".join(simulation.everything())).digest() == hashes[step].tobytes(), where
 
 
 def test_wasmtime_problems_are_the_same_to_the_bit(module, host, recorded):
@@ -384,7 +433,8 @@ def test_command_writes_a_page_without_outside_addresses(module, tmp_path):
         for path in (tmp_path / "site").rglob("*")
         if path.is_file()
     }
-    assert {"index.html", "lavender.js", "lavender.wasm", "scenes.json", "vendor/uPlot-LICENSE.txt"} <= files
+    assert {"index.html", "lavender.js", "scenes.json", "vendor/uPlot-LICENSE.txt"} <= files
+    assert {"lavender.wasm", "newton.wasm"} <= files
     written = wasm.read_module((tmp_path / "site" / "lavender.wasm").read_bytes())
     assert written.functions == wasm.read_module(module).functions and written.imports == ()
     for name in sorted(files):

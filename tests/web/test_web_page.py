@@ -6,6 +6,7 @@ import threading
 
 import numpy as np
 import pytest
+from newton_steps import NewtonSteps
 
 import lavender as lv
 from lavender.engine import SOLVER_FIELDS
@@ -354,26 +355,73 @@ def test_presets_set_everything_and_are_part_of_the_address(visit, preset):
     v.js("lavender.choose(lavender.scene.name)")
     assert v.page.locator("#scene").input_value() == scene
     assert v.page.locator("#note").text_content() == note
+    v.page.wait_for_function("!lavender.waiting")
     v.js("lavender.advance(30)")
-    for i, side in enumerate(sides):
-        own = {
-            "solver_iterations": side["iterations"],
-            **{k: v for k, v in side.items() if k != "iterations"},
-        }
-        own.setdefault("order", "given")
-        assert v.values(i)[0] == native(scene, 30, **own)
     leans = v.js("lavender.sides.map((side) => side.lean())")
-    assert leans == [pytest.approx(native_lean(scene, 30, **side), abs=1e-12) for side in sides]
+    for i, side in enumerate(sides):
+        values, lean = run(scene, 30, **side)
+        assert v.values(i)[0] == values
+        assert leans[i] == pytest.approx(lean, abs=1e-12)
 
 
-def native_lean(scene, steps, iterations, **settings):
-    settings.setdefault("order", "given")
-    simulation = lv.Simulation(lv.Scene(scene, solver_iterations=iterations, **settings))
-    start = np.array([body.position for body in simulation.scene.bodies])
-    for _ in range(steps):
-        observation = simulation.step()[0]
-    moved = observation["positions"] - start
-    return float(np.hypot(*moved[:, :2].T).max()), float(max(-moved[:, 2].min(), 0.0))
+def run(scene, steps, iterations, solver="sweeps", **settings):
+    """The eight values of the last step, and how far a body is from its start at most: sideways, and below it."""
+    if solver == "newton":
+        steps_of = NewtonSteps(scene, **settings)
+        simulation = steps_of.simulation
+        for _ in range(steps):
+            values = steps_of.step().tolist()
+        positions = steps_of.state.a["x"].reshape(-1, 3)
+    else:
+        settings.setdefault("order", "given")
+        simulation = lv.Simulation(lv.Scene(scene, solver_iterations=iterations, **settings))
+        for _ in range(steps):
+            observation = simulation.step()[0]
+        values, positions = observation["solver"].tolist(), observation["positions"]
+    moved = positions - np.array([body.position for body in simulation.scene.bodies])
+    return values, [float(np.hypot(*moved[:, :2].T).max()), float(max(-moved[:, 2].min(), 0.0))]
+
+
+def test_the_module_of_newton_is_fetched_when_it_is_asked_for(visit):
+    v = visit("#scene=bridge&a=16,warm,given&b=16,warm,given&play=0")
+    assert not any(url.endswith("newton.wasm") for url in v.requests)
+    v.side(0).locator(".solver").select_option("newton")
+    v.page.wait_for_function("!lavender.waiting")
+    assert sum(url.endswith("newton.wasm") for url in v.requests) == 1
+    assert v.side(0).locator(".sweeps input").is_disabled()
+    v.side(1).locator(".solver").select_option("newton")
+    v.page.click("#reset")
+    v.page.wait_for_function("!lavender.waiting")
+    assert sum(url.endswith("newton.wasm") for url in v.requests) == 1
+    assert (
+        v.js("location.hash") == "#scene=bridge&a=16,warm,given,newton&b=16,warm,given,newton&speed=1&play=0"
+    )
+    v.js("lavender.advance(20)")
+    twin = NewtonSteps("bridge")
+    for _ in range(20):
+        values = twin.step().tolist()
+    assert v.values(0)[0] == v.values(1)[0] == values
+    short = sum(how == 0 for how in twin.ended)
+    told = v.side(0).locator(".told").text_content()
+    assert told.endswith(f"{short} of {len(twin.ended)} solves short of 1e-6")
+    assert v.js("lavender.charts.energy.data[0]") == twin.trace[:, 0].tolist()
+    assert v.js("lavender.charts.energy.data[1]") == twin.trace[:, 1].tolist()
+    v.side(1).locator(".solver").select_option("sweeps")
+    v.page.click("#reset")
+    v.js("lavender.advance(2)")
+    assert v.values(1)[0] == native("bridge", 2)
+
+
+def test_without_the_module_of_newton_both_sides_sweep(browser, address):
+    context = browser.new_context()
+    page = context.new_page()
+    page.route("**/newton.wasm", lambda route: route.fulfill(status=404))
+    page.goto(address + "#newton-against-sweeps")
+    page.wait_for_selector("#failure:not([hidden])")
+    assert "could not be loaded" in page.locator("#failure").text_content()
+    assert page.locator(".solver").first.input_value() == "sweeps"
+    page.wait_for_function("lavender.steps > 3")
+    context.close()
 
 
 def test_the_address_holds_every_setting_and_is_followed(visit):

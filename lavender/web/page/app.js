@@ -1,7 +1,7 @@
 // The page: two simulations of one scene with settings of their own, stepped together, drawn and plotted.
 
 import { View } from "./draw.js";
-import { Kernels, ORDERS, Simulation, SOLVER_FIELDS } from "./lavender.js";
+import { Kernels, Newton, ORDERS, Simulation, SOLVER_FIELDS, TOL } from "./lavender.js";
 
 const KEPT = 720; // steps in the plots over time
 const MOST_STEPS = 6; // in one frame; a slower machine runs slower than real time
@@ -95,7 +95,7 @@ class Chart {
     this.data = data;
     // A panel that has nothing to show gives way.
     const figure = this.place.closest("figure");
-    const nothing = data[0].length > 0 && data.slice(1).every((ys) => ys.every((y) => y === null || (this.options.empty && y === 0)));
+    const nothing = data[0].length > 0 && data.slice(1).every((ys) => ys.every((y) => y === null || y === undefined || (this.options.empty && y === 0)));
     if (figure.hidden !== nothing) {
       figure.hidden = nothing;
       this.#resize();
@@ -123,6 +123,8 @@ class Side {
     this.sweepsShown = pick(".sweeps output");
     this.warm = pick(".warm input");
     this.order = pick(".order");
+    this.solver = pick(".solver");
+    this.told = pick(".told");
     this.canvas = pick("canvas");
     this.order.append(...ORDERS.map((name, i) => new Option(name.replace("_", " "), i)));
     this.cells = {};
@@ -141,6 +143,7 @@ class Side {
     this.sweeps.addEventListener("input", () => this.set({ iterations: Number(this.sweeps.value) }));
     this.warm.addEventListener("change", () => this.set({ warm_start: Number(this.warm.checked) }));
     this.order.addEventListener("change", () => this.set({ order: Number(this.order.value) }));
+    this.solver.addEventListener("change", () => this.set({ solver: this.solver.value }));
     this.view = new View(this.canvas);
     this.view.onlook = () => this.draw();
     this.view.ongrab = (body) => this.app.grab(this, body);
@@ -151,10 +154,11 @@ class Side {
   }
 
   load(scene) {
-    const before = this.simulation?.settings;
+    const before = this.settings;
     this.simulation = new Simulation(new Kernels(this.app.module, this.app.contents.layout), scene);
-    const { iterations, warm_start, order } = before ?? { ...this.simulation.settings, ...DEFAULTS[this.index] };
+    const { iterations, warm_start, order, solver } = before ?? { ...this.settings, ...DEFAULTS[this.index] };
     this.simulation.set({ iterations, warm_start, order });
+    this.choose(solver);
     this.start = Float64Array.from(this.simulation.array("x"));
     this.forget();
     this.readSettings();
@@ -166,10 +170,29 @@ class Side {
     this.kept = null;
   }
 
-  set(changes) {
+  get settings() {
+    return this.simulation && { ...this.simulation.settings, solver: this.wanted ?? "sweeps" };
+  }
+
+  set({ solver, ...changes }) {
     this.simulation.set(changes);
+    if (solver) {
+      this.choose(solver);
+    }
     this.readSettings();
     this.app.write();
+  }
+
+  // The module of Newton's method is fetched when it is first asked for; no step is taken until it has come.
+  choose(solver) {
+    this.wanted = solver;
+    if (solver !== "newton") {
+      this.simulation.use(null);
+    } else if (this.app.newton instanceof WebAssembly.Module) {
+      this.simulation.use(new Newton(this.app.newton, this.simulation.k));
+    } else {
+      this.app.fetchNewton();
+    }
   }
 
   // A held body follows the pointer as if on a spring, whatever its mass.
@@ -216,7 +239,11 @@ class Side {
   }
 
   readSettings() {
-    const { iterations, warm_start, order } = this.simulation.settings;
+    const { iterations, warm_start, order, solver } = this.settings;
+    const newton = solver === "newton";
+    this.solver.value = solver;
+    this.sweeps.disabled = newton; // it asks for a residual, not for a number of sweeps
+    this.order.disabled = newton;
     this.sweeps.value = iterations;
     this.sweepsShown.textContent = iterations;
     this.warm.checked = Boolean(warm_start);
@@ -245,6 +272,7 @@ class Side {
   restore() {
     const { state, history, curve } = this.kept;
     this.simulation.restore(state);
+    this.wanted = state.newton ? "newton" : "sweeps";
     this.history = { time: [...history.time], values: [...history.values] };
     this.curve = curve;
     this.readSettings();
@@ -271,9 +299,18 @@ class Side {
     SOLVER_FIELDS.forEach((field, i) => {
       const cell = this.cells[field];
       const stepped = this.simulation.steps > 0;
-      cell.textContent = stepped ? shown(field, values[i]) : "–";
+      const asked = this.simulation.newton && field === "iterations" ? `to ${TOL.toExponential(0)}` : shown(field, values[i]);
+      cell.textContent = stepped ? asked : "–";
       cell.dataset.value = stepped ? String(values[i]) : "";
     });
+    const newton = this.simulation.newton && this.curve;
+    this.told.hidden = !newton;
+    if (newton) {
+      const { sweeps, steps, relative } = this.curve;
+      const { short, solved } = this.simulation;
+      this.told.textContent = `newton: ${sweeps} sweeps, ${steps} factorisations, ${relative.toExponential(0)} of the error left; `
+        + `${short} of ${solved} solves short of ${TOL.toExponential(0)}`;
+    }
     this.draw();
     const what = `Side ${"AB"[this.index]}: ${this.app.scene.title}, ${values[2]} contacts`;
     if (this.canvas.getAttribute("aria-label") !== what) {
@@ -288,6 +325,7 @@ class App {
   constructor(module, contents) {
     this.module = module;
     this.contents = contents;
+    this.newton = null; // the module, once it has been asked for and has come
     this.playing = false;
     this.owed = 0; // s, simulated time that the frames have not stepped yet
     this.last = null;
@@ -332,8 +370,8 @@ class App {
     const both = [{ side: 0 }, { side: 1 }];
     const four = [{ side: 0, dash: true }, { side: 1, dash: true }, ...both];
     this.charts = {
-      energy: new Chart("chart-energy", both, { log: true, x: "sweep" }),
-      normal: new Chart("chart-normal", both, { log: true, x: "sweep" }),
+      energy: new Chart("chart-energy", both, { log: true, x: "sweep, factorisation" }),
+      normal: new Chart("chart-normal", both, { log: true, x: "sweep, factorisation" }),
       residual: new Chart("chart-residual", four, { log: true }),
       violation: new Chart("chart-violation", four, { log: true }),
       contacts: new Chart("chart-contacts", four, { empty: true }),
@@ -380,6 +418,7 @@ class App {
       r: () => this.restore(),
       p: () => this.push(),
       w: () => side.set({ warm_start: 1 - side.simulation.settings.warm_start }),
+      n: () => side.set({ solver: side.settings.solver === "newton" ? "sweeps" : "newton" }),
       "+": () => sweeps(4),
       "=": () => sweeps(4),
       "*": () => sweeps(4),
@@ -408,8 +447,8 @@ class App {
     const name = given.get("scene") ?? words;
     this.choose(scenes.includes(name) ? name : scenes[0]);
     ["a", "b"].forEach((key, i) => {
-      const [sweeps, warm, order] = (given.get(key) ?? "").split(",");
-      const changes = {};
+      const [sweeps, warm, order, solver] = (given.get(key) ?? "").split(",");
+      const changes = { solver: solver === "newton" ? "newton" : "sweeps" };
       if (Number(sweeps) >= 4 && Number(sweeps) <= 64) {
         changes.iterations = Math.round(Number(sweeps));
       }
@@ -432,14 +471,15 @@ class App {
     if (!this.scene || this.sides.some((side) => !side.simulation)) {
       return;
     }
-    const said = this.sides.map(({ simulation: { settings: s } }) => [s.iterations, s.warm_start ? "warm" : "cold", ORDERS[s.order]].join(","));
+    const said = this.sides.map(({ settings: s }) =>
+      [s.iterations, s.warm_start ? "warm" : "cold", ORDERS[s.order], ...(s.solver === "newton" ? ["newton"] : [])].join(","));
     const values = [this.scene.name, ...said, find("speed").value, this.playing ? 1 : 0];
     this.written = "#" + PLAIN.map((name, i) => `${name}=${values[i]}`).join("&");
     if (location.hash !== this.written) {
       history.replaceState(null, "", this.written);
     }
     const now = this.contents.presets.find((preset) => preset.scene === this.scene.name
-      && preset.sides.every((side, i) => Object.entries(side).every(([key, value]) => this.sides[i].simulation.settings[key] === value)));
+      && preset.sides.every((side, i) => Object.entries(side).every(([key, value]) => this.sides[i].settings[key] === value)));
     find("note").textContent = (now ?? this.scene).note;
     for (const button of find("presets").children) {
       button.setAttribute("aria-pressed", button.dataset.preset === now?.name);
@@ -449,6 +489,31 @@ class App {
   take(preset) {
     this.choose(preset.scene);
     preset.sides.forEach((side, i) => this.sides[i].set(side));
+  }
+
+  fetchNewton() {
+    this.newton ??= fetch("newton.wasm")
+      .then((answer) => {
+        if (!answer.ok) {
+          throw new Error(`newton.wasm: ${answer.status} ${answer.statusText}`);
+        }
+        return answer.arrayBuffer();
+      })
+      .then((bytes) => WebAssembly.compile(bytes))
+      .then((module) => {
+        this.newton = module;
+        this.sides.filter((side) => side.wanted === "newton").forEach((side) => side.choose("newton"));
+      })
+      .catch((error) => {
+        this.newton = null;
+        fail(`Newton's method could not be loaded: ${error.message}. Both sides sweep.`);
+        this.sides.forEach((side) => side.set({ solver: "sweeps" }));
+      });
+  }
+
+  // Whether a side waits for the module of Newton's method.
+  get waiting() {
+    return this.sides.some((side) => side.wanted === "newton" && !side.simulation.newton);
   }
 
   // -- a body held by the pointer, on both sides alike
@@ -497,6 +562,9 @@ class App {
 
   // The same steps on both sides.
   advance(steps) {
+    if (this.waiting) {
+      return;
+    }
     for (let i = 0; i < steps; i++) {
       const lost = this.sides.find((side) => side.simulation.lost >= 0);
       if (lost) {
@@ -544,7 +612,7 @@ class App {
   }
 
   frame(now) {
-    if (this.playing) {
+    if (this.playing && !this.waiting) {
       this.owed += this.last === null ? 0 : Math.min(0.1, (now - this.last) / 1000) * Number(find("speed").value);
       this.last = now;
       const steps = Math.min(MOST_STEPS, Math.floor(this.owed / this.scene.dt));
@@ -594,10 +662,14 @@ class App {
 
   plot() {
     const [a, b] = this.sides;
-    const sweeps = Math.max(...this.sides.map((side) => side.curve?.energy.length ?? 0));
-    const along = Array.from({ length: sweeps }, (_, i) => i);
+    // Sweeps are watched one by one, Newton's method at its scores: each side has its own places, joined by lines.
+    const along = [...new Set(this.sides.flatMap((side) => side.curve?.at ?? []))].sort((x, y) => x - y);
     for (const name of ["energy", "normal"]) {
-      this.charts[name].set([along, ...this.sides.map((side) => along.map((i) => positive(side.curve?.[name][i] ?? 0)))]);
+      const columns = this.sides.map(({ curve }) => {
+        const of = new Map(curve?.at.map((at, i) => [at, curve[name][i]]) ?? []);
+        return along.map((at) => (of.has(at) ? positive(of.get(at)) : undefined));
+      });
+      this.charts[name].set([along, ...columns]);
     }
     const time = a.history.time;
     const column = (side, field) => side.history.values.map((values) => values[SOLVER_FIELDS.indexOf(field)]);

@@ -1,10 +1,13 @@
-// The kernels of lavender.wasm for JavaScript: memory, structs, and a simulation over three buffers.
+// The kernels of lavender.wasm for JavaScript: memory, structs, and a simulation over three buffers; and newton.wasm,
+// exact solves for it.
 //
 // The module has no imports and no allocator: whatever it works on lies where this file puts it. Where the
 // fields of a struct lie is computed here by C's rules, asked of the module, and the two are compared.
 
 const SIZES = 10; // entries of size[], see lavender_ext/engine/arrays.pxd
 const MOST_SWEEPS = 64;
+const MOST_TRACED = 256; // scores of one solve by Newton's method, see lavender_ext/warm/start.pxd
+export const TOL = 1e-6; // relative residual at which such a solve ends, as in Python
 const OK = 0;
 const NEED_ROOM = 1;
 const NOT_FINITE = 2;
@@ -168,6 +171,46 @@ export class Kernels {
   }
 }
 
+// Newton's method for simulations on `kernels`: a module beside the other, in its memory. `solve` is for a substep that is
+// prepared and has its guess applied.
+export class Newton {
+  constructor(module, kernels) {
+    this.k = kernels;
+    this.f = new WebAssembly.Instance(module, { env: { memory: kernels.memory } }).exports;
+    if (this.f.__heap_base.value > kernels.functions.__heap_base.value) {
+      throw new Error("newton.wasm and lavender.wasm were not built alike: the one would write over what the other keeps");
+    }
+    this.said = this.k.alloc(32);
+    this.trace = this.k.alloc(24 * MOST_TRACED);
+    this.room = [0, 0];
+    this.places = [0, 0];
+  }
+
+  // Room for n numbers of 4 or 8 bytes; what became too small is not given back.
+  #scratch(which, n) {
+    if (n < 0) {
+      throw new Error("the substep needs more than 2^31 numbers of scratch");
+    }
+    if (n > this.room[which]) {
+      this.room[which] = Math.ceil(1.25 * n) + 64;
+      this.places[which] = this.k.alloc((which === 0 ? 4 : 8) * this.room[which]);
+    }
+    return this.places[which];
+  }
+
+  // { met, sweeps, steps, relative, at, energy, normal }: whether the residual is within tol, the work, the relative
+  // residual; and of each score on the way the work so far, E [sqrt J] and max |e_n| [N s].
+  solve(buffers, tol) {
+    const whole = this.#scratch(0, this.f.lav_newton_index_room(...buffers));
+    const real = this.#scratch(1, this.f.lav_newton_plan(...buffers, whole));
+    const how = this.f.lav_newton_substep(...buffers, tol, whole, real, this.trace, this.said);
+    const [sweeps, steps, relative, n] = this.k.f64(this.said, 4);
+    const scores = this.k.f64(this.trace, 3 * n);
+    const column = (c) => Array.from({ length: n }, (_, i) => scores[3 * i + c]);
+    return { met: how > 0 || relative === 0, sweeps, steps, relative, at: column(0), energy: column(1), normal: column(2) };
+  }
+}
+
 // A scene that runs: everything it knows lies in `size` and three buffers of `kernels.memory`.
 export class Simulation {
   // scene: { size, arrays, substeps, dt }; arrays that are left out are zero. One Kernels for each Simulation:
@@ -176,6 +219,9 @@ export class Simulation {
     this.k = kernels;
     this.scene = scene;
     this.substeps = scene.substeps;
+    this.newton = null;
+    this.short = 0; // substeps that Newton's method left short of TOL
+    this.solved = 0; // all that it solved
     this.steps = 0;
     this.lost = -1;
     this.#allocate(scene.size);
@@ -278,8 +324,35 @@ export class Simulation {
     this.k.functions.lav_engine_move(...old, ...this.buffers);
   }
 
+  // From the next step on: a Newton of the same kernels, or null for sweeps. Each takes as many substeps as it does
+  // natively.
+  use(newton) {
+    this.newton = newton;
+    this.substeps = newton ? this.scene.newton_substeps : this.scene.substeps;
+    this.set({ h: this.scene.dt / this.substeps });
+  }
+
+  #stepNewton() {
+    let status = OK;
+    let told = null;
+    for (let s = 0; s < this.substeps && status === OK; s++) {
+      while (this.k.functions.lav_engine_prepare(...this.buffers) === NEED_ROOM) {
+        this.#grow();
+      }
+      this.k.functions.lav_engine_solve(...this.buffers, 0);
+      told = this.newton.solve(this.buffers, TOL);
+      this.solved += 1;
+      this.short += told.met ? 0 : 1;
+      status = this.k.functions.lav_engine_finish(...this.buffers);
+    }
+    return { ...told, finite: this.#finished(status) };
+  }
+
   // One step; false when the state is no longer finite.
   step() {
+    if (this.newton) {
+      return this.#stepNewton().finite;
+    }
     let left = this.substeps;
     for (;;) {
       const status = this.k.functions.lav_engine_substeps(...this.buffers, left, this.done);
@@ -292,8 +365,12 @@ export class Simulation {
   }
 
   // The same step, bit for bit, and the error before and after every sweep of its last substep:
-  // { normal: max |e_n| [N s], energy: E [sqrt J] }, each of 1 + sweeps numbers.
+  // { normal: max |e_n| [N s], energy: E [sqrt J], at: sweeps so far }, each of 1 + sweeps numbers. By Newton's method
+  // what `Newton.solve` says of the last substep.
   stepWatched() {
+    if (this.newton) {
+      return this.#stepNewton();
+    }
     let status = OK;
     const sweeps = this.settings.iterations;
     if (sweeps > MOST_SWEEPS) {
@@ -314,7 +391,7 @@ export class Simulation {
       normal.push(numbers[2 * i]);
       energy.push(numbers[2 * i + 1]);
     }
-    return { finite: this.#finished(status), normal, energy };
+    return { finite: this.#finished(status), normal, energy, at: normal.map((_, i) => i) };
   }
 
   #finished(status) {
@@ -333,6 +410,8 @@ export class Simulation {
       size: this.sizes,
       steps: this.steps,
       lost: this.lost,
+      newton: this.newton,
+      counts: [this.short, this.solved],
       real: this.k.f64(copy[0], this.lengths[0]).slice(),
       index: this.k.i32(copy[1], this.lengths[1]).slice(),
       keys: this.k.u64(copy[2], this.lengths[2]).slice(),
@@ -350,5 +429,8 @@ export class Simulation {
     this.k.u64(this.keys, this.lengths[2]).set(snapshot.keys);
     this.steps = snapshot.steps;
     this.lost = snapshot.lost;
+    this.newton = snapshot.newton;
+    this.substeps = this.newton ? this.scene.newton_substeps : this.scene.substeps;
+    [this.short, this.solved] = snapshot.counts;
   }
 }

@@ -1,0 +1,52 @@
+"""A scene stepped by the solve that a browser has of `newton`: lavender_ext.warm.substep on the engine's own arrays."""
+
+import numpy as np
+
+import lavender as lv
+from lavender.engine.layout import HEAD, SETTING
+from lavender.engine.simulation import TOL
+from lavender_ext.warm.substep import Substep
+
+__all__ = ["NewtonSteps"]
+
+OK, NEED_ROOM = 0, 1
+
+
+class NewtonSteps:
+    """`step` after `step`; how each solve ended is in `ended` (0: short of tol), the last one's answer in `told`."""
+
+    def __init__(self, name, *, warm_start=True, tol=TOL, **parameters):
+        scene = lv.Scene(name, solver="newton", warm_start=warm_start, solver_iterations=16, **parameters)
+        self.simulation = lv.Simulation(scene)
+        self.substeps = scene.parameters.substeps
+        self.tol, self.ended, self.told, self.trace = tol, [], None, None
+        self._take(self.simulation._state)
+
+    def _take(self, state):
+        self.state = state
+        self.solver = Substep(state.size, state.real, state.index, state.keys)
+
+    def step(self):
+        """One step; the eight values of the solver after it."""
+        for _ in range(self.substeps):
+            while self.state.kernel.prepare() == NEED_ROOM:
+                self._take(self.state.grown())
+            self.state.kernel.solve(False)
+            self.told = self.solver.solve(self.tol)
+            self.ended.append(self.told[0])
+            self.trace = self.solver.trace
+            assert self.state.kernel.finish() == OK
+        return self.values()
+
+    def values(self):
+        return self.state.a["setting"][SETTING["out"] : SETTING["out"] + 8].copy()
+
+    def set_warm_start(self, flag):
+        self.state.head[HEAD["warm_start"]] = bool(flag)
+
+    def bodies(self):
+        """Poses and velocities as the recordings have them."""
+        return np.concatenate([self.state.a[key].ravel() for key in ("x", "q", "v")])
+
+    def everything(self):
+        return self.state.real.tobytes() + self.state.index.tobytes() + self.state.keys.tobytes()
