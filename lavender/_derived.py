@@ -29,7 +29,17 @@ class Derived:
     None work out the same numbers, to the bit.
     """
 
-    __slots__ = ("chain", "judged", "lock", "motion", "nothing", "spread", "start_relative", "tried")
+    __slots__ = (
+        "chain",
+        "factor",
+        "judged",
+        "lock",
+        "motion",
+        "nothing",
+        "spread",
+        "start_relative",
+        "tried",
+    )
 
     def __init__(self) -> None:
         self.lock = RLock()  # held while a `once` is worked out
@@ -39,6 +49,7 @@ class Derived:
         self.tried: Tried | None = None
         self.spread: int | None = None  # how far apart blocks that share a body stand
         self.chain: Any = None  # of a problem of few rows, False where it has none
+        self.factor: Any = None  # the factorisation that suits A: its name, half bandwidth, order
         self.motion: Kept | None = None  # the reference that motion errors are told from, and its operator
 
 

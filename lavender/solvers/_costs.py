@@ -17,11 +17,19 @@ from typing import Any
 import numpy as np
 
 from lavender.problem import Problem
+from lavender.registry import FEW
 from lavender.solvers._accelerated import sweep_work
 from lavender.solvers._factor import choose
 from lavender.solvers._islands import block_bodies
 from lavender.solvers._newton.general import factor_flops
-from lavender.solvers._newton.systems import PANELS, MatrixSystem, System, VelocitySystem, make_system
+from lavender.solvers._newton.systems import (
+    DENSE_FILL,
+    PANELS,
+    MatrixSystem,
+    System,
+    VelocitySystem,
+    make_system,
+)
 from lavender_ext.factor import graph
 
 __all__ = ["Costs", "Exact", "general_cost", "is_loose", "islands_cost"]
@@ -55,7 +63,9 @@ ADMM_START, ADMM_ROW, ADMM_ENTRY = (
 )  # a call; of each iteration for each row and each entry of L
 
 FIRST_LOOK, LAST_LOOK = 16, 64  # sweeps before the first look at the residual: so many at least and at most,
-LOOKED = 120e3  # ns, and as cost so much: a look and a cut in the sweeps are not free
+LOOKED = 60e3  # ns, or as cost so much: a look and a cut in the sweeps are not free
+
+GLANCED = 250e3  # ns of a first look at sweeps that may come before anything else is found out
 
 # Factorisations to expect, by law: medians over drawn problems. Friction has a long tail.
 DIRECT = {"linear": 1.5, "lcp": 6.0}
@@ -82,6 +92,7 @@ SWEEPS, SWEEPS_REDUNDANT = 60.0, 400.0
 
 FILL = 5.0  # of a factor over rows against one over bodies, for the same unknowns: rows of one body are all neighbours
 ISLAND = 400e3  # what Python takes for an island of its own
+NARROW_ENTRIES = 12  # of A in a row up to which a narrow band is looked for
 NARROW = 40  # half bandwidth up to which a band is what `direct` takes
 TREE = 1.05  # neighbours of a body, in the mean, up to which bodies form trees
 TINY_FACTOR = 20e3  # ns, below which a factor is not looked at more closely
@@ -99,6 +110,7 @@ class Exact:
     cost: float
     limit: int
     options: tuple[tuple[str, Any], ...] = ()  # that the solver is made with
+    once: float = np.inf  # ns, with the first factorisation alone
 
     @property
     def key(self) -> str:
@@ -135,6 +147,47 @@ def general_first(problem: Problem, largest: int) -> bool:
     return cost <= FORM * entries * entries / max(1, problem.generalized.nv)
 
 
+def is_glanced(problem: Problem, per: float) -> bool:
+    """A first look at sweeps, each of cost `per` [ns], comes before anything else is found out."""
+    if problem.m <= FEW:
+        return not factors_at_once(problem)
+    return FIRST_LOOK * per <= GLANCED and not is_redundant(problem) and not factors_at_once(problem)
+
+
+def factors_at_once(problem: Problem) -> bool:
+    """A bounded symmetric A of few rows, or of a narrow band that is found in no time: `direct`, without a look."""
+    if problem.law != "lcp" or not problem.is_symmetric:
+        return False
+    m = problem.m
+    if m <= FEW:
+        return True
+    if problem.matrix is None or len(problem._compressed[1]) > NARROW_ENTRIES * m:
+        return False
+    form, band, _ = choose(problem)
+    return form == "band" and DIRECT["lcp"] * BAND * m * float(band + 1) ** 2 <= GLANCED
+
+
+def is_redundant(problem: Problem) -> bool:
+    """The same weight rests on more points than the bodies can tell apart, and none of them is soft.
+
+    Faces on faces; sweeps then hardly move it. With Coulomb friction a Newton method suffers as much.
+    """
+    p = problem
+    if p.rows is None or p.law == "coulomb" or p.m <= 6 * p.rows.n_bodies:
+        return False
+    assert p.compliance is not None
+    return not p.compliance.any() and (p.law != "cone" or not is_loose(p))
+
+
+def finite_least(problem: Problem) -> float:
+    """What no finite solver costs less than [ns]."""
+    if problem.law == "linear" or (problem.law == "lcp" and problem.is_symmetric):
+        m = problem.m
+        width = 3.0 if problem.matrix is None else max(3.0, 0.5 * len(problem._compressed[1]) / m)
+        return START["direct"] + DIRECT[problem.law] * (STEP["direct"] + ROW * m + BAND * m * width * width)
+    return START["newton"] + NEWTON[problem.law] * STEP["newton"]
+
+
 class Costs:
     """Of one problem; what takes time to find out is found when it is first asked.
 
@@ -153,15 +206,8 @@ class Costs:
 
     @cached_property
     def redundant(self) -> bool:
-        """The same weight rests on more points than the bodies can tell apart, and none of them is soft.
-
-        Faces on faces; sweeps then hardly move it. With Coulomb friction a Newton method suffers as much.
-        """
-        p = self.problem
-        if p.rows is None or p.law == "coulomb" or p.m <= 6 * p.rows.n_bodies:
-            return False
-        assert p.compliance is not None
-        return not p.compliance.any() and (p.law != "cone" or not is_loose(p))
+        """`is_redundant`."""
+        return is_redundant(self.problem)
 
     @cached_property
     def sweeping(self) -> float:
@@ -176,6 +222,11 @@ class Costs:
         rows = self.problem.rows
         return make_system(self.problem, "impulse" if rows is None or rows.n_bodies == 0 else "velocity")
 
+    @cached_property
+    def least(self) -> float:
+        """What no finite solver costs less than [ns]."""
+        return finite_least(self.problem)
+
     @property
     def guess(self) -> float:
         """What the cheapest finite solver hardly costs less than [ns], without looking closer."""
@@ -186,7 +237,8 @@ class Costs:
             return self._newton_guess
         m = p.m
         width = self._width(m) if p.rows is not None else 0.5 * p.data.work / max(m, 1)
-        return min(self._newton_guess, self._direct(BAND * m * max(3.0, width) ** 2))
+        times = SINGULAR if p.law == "lcp" and self.redundant else 1.0
+        return min(self._newton_guess, self._direct(BAND * m * max(3.0, width) ** 2, times))
 
     @cached_property
     def exact(self) -> list[Exact]:
@@ -197,7 +249,9 @@ class Costs:
         cost = self._newton_guess if self._others_win else self._newton(self._newton_factor)
         p = self.problem
         form = () if p.generalized is None else (("form", "impulse"),)
-        newton = Exact("newton", cost, int(2.0 * self._newton_count) + TAIL[p.law], form)
+        limit = int(2.0 * self._newton_count) + TAIL[p.law]
+        once = START["newton"] + (cost - START["newton"]) / self._newton_count
+        newton = Exact("newton", cost, limit, form, once)
         return sorted([*self._others, newton], key=lambda e: e.cost)
 
     @cached_property
@@ -206,7 +260,14 @@ class Costs:
         found = []
         if self._direct_takes:
             rounds = 0 if p.law == "linear" else DIRECT_ROUNDS
-            found.append(Exact("direct", self._direct(self._matrix), rounds))
+            singular = p.law == "lcp" and self.redundant
+            factor = self._matrix
+            once = self._direct(factor, 1.0 / DIRECT[p.law])
+            if p.law == "lcp" and not singular:
+                # Most are regular where they are free; where not, it says so and is asked again last.
+                found.append(Exact("direct", self._direct(factor), rounds, (("patience", False),), once))
+            count = SINGULAR if p.law == "lcp" else 1.0
+            found.append(Exact("direct", self._direct(factor, count), rounds, once=once))
         if p.law == "lcp" and p.m <= LEMKE_ROWS:
             found.append(Exact("lemke", START["lemke"] + p.m * (PIVOT + PIVOT_ENTRY * float(p.m) ** 2), 0))
         if self.largest:
@@ -228,10 +289,11 @@ class Costs:
         each = ADMM_ROW * p.m + ADMM_ENTRY * lu * ADMM_FILL * entries
         return ADMM_START + ADMM_FACTORS * lu * self._sparse(int(entries), p.m) + self._admm_count * each
 
-    def _direct(self, factor: float) -> float:
+    def _direct(self, factor: float, times: float = 1.0) -> float:
         p = self.problem
-        count = DIRECT[p.law] * (SINGULAR if self.redundant and p.law == "lcp" else 1.0)
-        return self._finite("direct", count, factor * (1.0 if p.is_symmetric else UNSYMMETRIC))
+        return self._finite(
+            "direct", times * DIRECT[p.law], factor * (1.0 if p.is_symmetric else UNSYMMETRIC)
+        )
 
     @cached_property
     def _others_win(self) -> bool:
@@ -247,7 +309,13 @@ class Costs:
             s = 6 if turns else 3
             n = p.rows.n_bodies
             return self._newton(BLOCK * s**3 * (1.0 + 0.5 * max(1.0, self._width(n)) ** 2) * n)
-        return self._newton(BAND * p.m)
+        m, nnz = float(p.m), float(len(p._compressed[1])) if p.generalized is None else float(p.m)
+        share = nnz / (m * m)
+        return self._newton(
+            min(BAND * m * max(1.0, 0.5 * nnz / m) ** 2, self._sparse(int(nnz), p.m), DENSE * m**3 / 3.0)
+            if share < DENSE_FILL
+            else DENSE * m**3 / 3.0
+        )
 
     def _width(self, n: int) -> float:
         """Neighbours that elimination leaves each of n unknowns, at a guess: none in a tree, as in a plane else."""

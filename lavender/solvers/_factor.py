@@ -32,6 +32,13 @@ GENERAL_LIMIT = 2000  # rows up to which a singular matrix that is not symmetric
 
 def choose(problem: Problem) -> tuple[str, int, IntArray | None]:
     """Factorisation, half bandwidth and order of elimination (None: as given) for a symmetric A; by structure alone."""
+    kept: tuple[str, int, IntArray | None] | None = problem.derived.factor
+    if kept is None:
+        kept = problem.derived.factor = _choose(problem)
+    return kept
+
+
+def _choose(problem: Problem) -> tuple[str, int, IntArray | None]:
     m = problem.m
     band = max(problem.bandwidth)
     if m <= SMALL_SIZE or band <= SMALL_BAND:

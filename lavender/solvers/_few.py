@@ -6,6 +6,7 @@ problem, from the beginning.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -90,13 +91,14 @@ class Few:
             work = {what: count for what, count in named.items() if count}
             if self.name == "direct":
                 return Claim(Status.CONVERGED, done, work, form="band")
-            return Claim(Status.CONVERGED, done, work, _said("direct", work))
+            return Claim(Status.CONVERGED, done, work, said("direct", work))
         done, sweeps, restarts = counts
         work = {"sweeps": sweeps, "restarts": restarts}
-        return Claim(Status.CONVERGED, done, work, _said("anderson", work))
+        return Claim(Status.CONVERGED, done, work, said("anderson", work))
 
 
-def _said(name: str, work: dict[str, int]) -> str:
+def said(name: str, work: Mapping[str, int]) -> str:
+    """What a solver did, in words."""
     done = ", ".join(f"{count} {kind}" for kind, count in work.items() if count)
     return f"{name} {done}".strip()
 

@@ -21,6 +21,7 @@ has no solution. The message and `work` say what ran.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from time import perf_counter
@@ -33,7 +34,7 @@ from lavender.certificates import check_certificate
 from lavender.errors import SolverUnavailable, UnknownName
 from lavender.problem import OPERATORS, Problem
 from lavender.registry import FEW, SolverSpec, get
-from lavender.residuals import at_floor, known, quick, reference
+from lavender.residuals import at_floor, judged, known, quick, reference, remember
 from lavender.solution import Claim, Status
 from lavender.solvers._costs import (
     FIRST_LOOK,
@@ -41,29 +42,36 @@ from lavender.solvers._costs import (
     LOOK,
     Costs,
     Exact,
+    factors_at_once,
+    finite_least,
     first_look,
     general_first,
+    is_glanced,
     is_loose,
     islands_cost,
+    sweep_cost,
 )
-from lavender.solvers._few import AUTO, WARM
+from lavender.solvers._few import AUTO, WARM, said
 from lavender.solvers._islands import islands, restrict, rows_of
 from lavender.solvers._newton import general
 from lavender.solvers.newton import NewtonState
 
 LARGE = 4000  # rows from which friction goes through the relaxation
 HUGE = 40_000  # rows from which friction is left to sweeps before any factorisation
+ONE_CALL = 200  # iterations that a problem of few rows, solved in one call, takes at most
 CLOCK = 0.01  # s between two looks at the clock, at a nanosecond for each unit of work
 CHUNK_WORK = 8  # sweeps' work that an iteration of admm is
 NEARER = 0.1  # share of the residual of sweeps that it must have for them to start from there
 FOLLOWS = 100.0  # times the tolerance that Coulomb's residual may be where the relaxation is at it
 CAP = 400  # sweeps of the relaxation that may be promised; twice that for large problems
 FEW_JOINTS = 300  # rows up to which a linear system is not looked at more closely
+SWEEPER = "anderson"  # whose sweeps come first
 RELAXED = 1e6  # ns that sweeps usually take from which Coulomb's law is relaxed first: a problem of its own
 HOPE = 0.4  # share of a finite solver's cost that sweeps may take without promising an end
 BELIEVED = 2.0  # times a finite solver's cost that sweeps may take, whatever they promise
 GLANCE = 0.35  # share of a finite solver's cost for which a first look at sweeps is always worth it
 APART = 10.0  # islands' worth of Python from which a finite solver is compared with islands solved apart
+PORTION = 0.25  # of a time limit that sweeps may take that will not get there within it
 ROUNDS = 8  # times that sweeps and finite solvers take turns, the allowance doubled each time
 GENERAL_STEPS = 256  # that it then has
 VELOCITY = "newton velocity"  # key of newton over generalised velocities
@@ -78,6 +86,7 @@ class Trail:
     problem: Problem
     tol: float
     deadline: float
+    limit: float = np.inf  # ns that the whole solve may take, as it was asked
     largest: int = 0  # velocities of the largest island, 0 where newton has no room for them
     best: float = np.inf
     impulse: FloatArray = field(init=False)
@@ -89,6 +98,10 @@ class Trail:
     ended: dict[str, float] = field(
         default_factory=dict
     )  # finite solvers that gave up: residual they started from
+
+    # Finite solvers that go on where they stood: solver and state, and the impulse (m,) that goes with them.
+    kept: dict[str, tuple[Any, Any]] = field(default_factory=dict)
+    left: dict[str, FloatArray] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         m = self.problem.m
@@ -149,8 +162,7 @@ class Trail:
         self.iterations += claim.iterations
         for kind, count in claim.work.items():
             self.work[kind] = self.work.get(kind, 0) + count
-        done = ", ".join(f"{count} {kind}" for kind, count in claim.work.items() if count)
-        self.steps.append(f"{name} {done}".strip())
+        self.steps.append(said(name, claim.work))
 
 
 @dataclass(frozen=True)
@@ -167,6 +179,11 @@ class Auto:
         self, state: Problem, impulse: FloatArray, n: int, tol: float, time_limit: float | None = None
     ) -> Claim:
         problem = state
+        if problem.m <= FEW and n >= ONE_CALL and (problem.law == "linear" or factors_at_once(problem)):
+            made = AUTO.solve(problem, impulse, tol)
+            if made is not None:
+                impulse[:] = made[0].impulse
+                return AUTO.claim(problem, made[1])
         deadline = np.inf if time_limit is None else perf_counter() + time_limit
         lam, claim = impulse.copy(), None
         largest = 0
@@ -179,9 +196,14 @@ class Auto:
                 if claim.status is Status.CONVERGED:
                     impulse[:] = lam
                     return general.named(claim, "auto")
-        trail = Trail(problem, tol, deadline, largest)
         if problem.m == 0:
             return Claim(Status.CONVERGED, 0, {}, "nothing to solve")
+        glance = _glance(problem, impulse, n, tol)
+        if glance is not None and glance.best <= tol:
+            impulse[:] = glance.impulse
+            return Claim(Status.CONVERGED, glance.done, glance.work, glance.message)
+        limit = np.inf if time_limit is None else 1e9 * time_limit
+        trail = Trail(problem, tol, deadline, limit, largest)
         trail.offer(impulse)
         if claim is not None:
             trail.add("newton", claim)
@@ -193,7 +215,7 @@ class Auto:
         interrupted = False
         try:
             if n > 0 and not trail.best <= tol:
-                _solve(trail, n)
+                _solve(trail, n, glance)
         except KeyboardInterrupt:
             interrupted = True  # the best impulse goes back all the same
         impulse[:] = trail.impulse
@@ -224,25 +246,41 @@ def _usable(name: str, problem: Problem) -> SolverSpec | None:
     return spec if spec.refuses(problem) is None else None
 
 
-def _whole(trail: Trail, chosen: Exact, budget: int, limit: int = 0) -> bool:
-    """Run a finite solver from the best impulse, to its end or `limit` iterations; True when nothing is left to do."""
+def _whole(
+    trail: Trail,
+    chosen: Exact,
+    budget: int,
+    limit: int = 0,
+    more: Callable[[FloatArray], int] | None = None,
+) -> bool:
+    """Run a finite solver from the best impulse, to its end or `limit` iterations; True when nothing is left to do.
+
+    `more`: where Newton's method comes to that limit, it is asked for more iterations, 0 to stop.
+    """
     name = chosen.name
     spec = _usable(name, trail.problem)
     if spec is None or budget <= trail.iterations:
         return trail.done
-    solver = spec.load()(**dict(chosen.options))
     own = name == "newton" and trail.problem.generalized is None
-    state = _newton_state(trail) if own else solver.prepare(trail.problem)
+    kept = trail.kept.get(chosen.key)
+    if kept is not None:
+        solver, state = kept
+    else:
+        solver = spec.load()(**dict(chosen.options), **({"more": more} if own and more is not None else {}))
+        state = _newton_state(trail) if own else solver.prepare(trail.problem)
     # Half-finished sweeps mislead a Newton method; Pi(0) does not.
     before = trail.best
     warm = before <= WARM and (own or chosen.key != VELOCITY or trail.begun)
     impulse = trail.impulse.copy() if warm else trail.problem.start()
+    if kept is not None:
+        impulse = trail.left[chosen.key]
     trail.begun = trail.begun or chosen.key == VELOCITY
     left = None if np.isinf(trail.deadline) else max(trail.deadline - perf_counter(), 1e-3)
     most = min(limit or spec.max_iter, spec.max_iter, budget - trail.iterations)
     claim: Claim
     if spec.resumable:
         claim = _in_chunks(trail, solver, state, impulse, most)
+        trail.kept[chosen.key], trail.left[chosen.key] = (solver, state), impulse
     else:
         claim = solver.run(state, impulse, most, trail.tol, left)
     trail.add(name, claim)
@@ -276,15 +314,80 @@ def _newton_state(trail: Trail) -> NewtonState:
     return NewtonState(trail.problem, system if system.sc.m else None)
 
 
-class _Sweeps:
-    """Accelerated sweeps of one problem, which go on where they stood."""
+@dataclass
+class Glance:
+    """A first look at sweeps of `anderson`, before anything else is looked at; they go on from here."""
 
-    def __init__(self, trail: Trail, name: str = "anderson", **options: Any) -> None:
-        self.trail, self.name = trail, name
+    solver: Any
+    state: Any
+    impulse: FloatArray  # (m,) N s
+    before: float  # relative residual before its last sweeps,
+    last: int  # so many,
+    best: float  # and after them
+    status: Status
+    done: int  # sweeps
+    work: dict[str, int]
+
+    @property
+    def message(self) -> str:
+        return said(SWEEPER, self.work) if self.done else "the start is a solution"
+
+
+def _glance(problem: Problem, impulse: FloatArray, n: int, tol: float) -> Glance | None:
+    """Sweeps from an impulse (m,) where a first look at them costs no more than to find out what else there is."""
+    if problem.generalized is not None or problem.law == "linear" or problem.cones.has_round:
+        return None
+    per = sweep_cost(problem)
+    sweeps = first_look(per)
+    if n < sweeps or not is_glanced(problem, per):
+        return None
+    spec = _usable(SWEEPER, problem)
+    if spec is None:
+        return None
+    lam = impulse.copy()
+    found = known(problem, impulse)
+    before = judged(problem, impulse.copy()).relative if found is None else found
+    if before <= tol:
+        return Glance(None, None, lam, before, 0, before, Status.CONVERGED, 0, {})
+    solver = spec.load()()
+    state = solver.prepare(problem)
+    least, done, work = finite_least(problem), 0, dict[str, int]()
+    while True:
+        claim: Claim = solver.run(state, lam, sweeps, tol, None)
+        for kind, count in claim.work.items():
+            work[kind] = work.get(kind, 0) + count
+        done += claim.iterations
+        now = judged(problem, lam.copy())
+        if now.relative <= tol:
+            remember(problem, now)
+        if now.relative <= tol or claim.status is not Status.MAX_ITERATIONS or done >= n:
+            break
+        rest = _sweeps_left(claim.iterations, before, now.relative, tol)
+        if rest * per > least or done * per > BELIEVED * least:
+            break
+        before, sweeps = now.relative, min(n - done, max(FIRST_LOOK, done // 2))
+    return Glance(solver, state, lam, before, claim.iterations, now.relative, claim.status, done, work)
+
+
+def _sweeps_left(done: int, before: float, now: float, tol: float) -> float:
+    """At the contraction of the last `done` sweeps."""
+    gain = np.log(before / now) if 0.0 < now < before else 0.0
+    return done * float(np.log(now / max(tol, 1e-16)) / gain) if gain > 0.0 else np.inf
+
+
+class _Sweeps:
+    """Accelerated sweeps of one problem, which go on where they stood, or where a glance at them did."""
+
+    def __init__(
+        self, trail: Trail, name: str = SWEEPER, glance: Glance | None = None, **options: Any
+    ) -> None:
+        self.trail, self.name, self.glance = trail, name, glance
         spec = _usable(name, trail.problem)
         self.usable = spec is not None
-        if spec is not None:
-            self.solver: Any = spec.load()(**options)
+        if glance is not None:
+            self.solver, self.state, self.impulse = glance.solver, glance.state, glance.impulse
+        elif spec is not None:
+            self.solver = spec.load()(**options)
             self.state = self.solver.prepare(trail.problem)
             self.impulse = trail.impulse.copy()
         self.done = 0  # sweeps
@@ -306,23 +409,31 @@ class _Sweeps:
         begun, looks, total = self.done, 0, dict[str, int]()
         step = first_look(per)
         while not trail.late:
-            step = min(step, budget - trail.iterations - (self.done - begun))
-            if cap is not None:
-                step = min(step, cap - self.done)
-            if step <= 0:
-                break
-            # In short runs for the clock and Ctrl-C alone: cut anywhere, sweeps give the same bits.
             before = self.done
-            for start in range(0, step, chunk):
-                claim: Claim = self.solver.run(self.state, self.impulse, min(chunk, step - start), tol, None)
-                self.done += claim.iterations
-                for kind, count in claim.work.items():
-                    total[kind] = total.get(kind, 0) + count
-                if claim.status is not Status.MAX_ITERATIONS or trail.late:
+            if self.glance is not None:
+                glance, self.glance = self.glance, None
+                status, self.done, total = glance.status, glance.done, dict(glance.work)
+                self.last, self.at = glance.before, glance.done - glance.last
+            else:
+                step = min(step, budget - trail.iterations - (self.done - begun))
+                if cap is not None:
+                    step = min(step, cap - self.done)
+                if step <= 0:
                     break
+                # In short runs for the clock and Ctrl-C alone: cut anywhere, sweeps give the same bits.
+                for start in range(0, step, chunk):
+                    claim: Claim = self.solver.run(
+                        self.state, self.impulse, min(chunk, step - start), tol, None
+                    )
+                    status = claim.status
+                    self.done += claim.iterations
+                    for kind, count in claim.work.items():
+                        total[kind] = total.get(kind, 0) + count
+                    if status is not Status.MAX_ITERATIONS or trail.late:
+                        break
             now = trail.offer(self.impulse)
             looks += 1
-            if claim.status is not Status.MAX_ITERATIONS or now <= tol or self.done == before:
+            if status is not Status.MAX_ITERATIONS or now <= tol or self.done == before:
                 self.ended = not now <= tol
                 break
             rest = self.rest = self.expected(now, tol)
@@ -337,6 +448,11 @@ class _Sweeps:
         return trail.done
 
     @property
+    def too_late(self) -> bool:
+        """Sweeps alone will not get there within the time limit, by the contraction before the last look."""
+        return (self.done + self.rest) * self.trail.costs.sweep > self.trail.limit
+
+    @property
     def cost(self) -> float:
         """What is left, by the contraction before the last look [ns]."""
         return np.inf if self.ended else self.rest * self.trail.costs.sweep
@@ -348,23 +464,28 @@ class _Sweeps:
             # What was promised before and did not come about is not believed for ever.
             return (rest > other and spent > HOPE * other) or spent > BELIEVED * other
 
+        if worth == np.inf:
+            return False
+        if self.done * self.trail.costs.sweep > PORTION * self.trail.limit and self.too_late:
+            # Sweeps will not get there in time; a factorisation that is in luck may.
+            return any(spent + other.once < self.trail.limit for other in self.trail.costs.exact)
         if worth is not None:
             return than(worth)
         if min(rest, spent) > APART * ISLAND and than(self.trail.apart_cost()):
             return True
-        return than(self.trail.costs.guess) and than(self.trail.costs.exact[0].cost)
+        costs = self.trail.costs
+        return than(costs.least) and than(costs.guess) and than(costs.exact[0].cost)
 
     def expected(self, now: float, tol: float) -> float:
         """Sweeps left at the contraction since the last look."""
-        gain = np.log(self.last / now) if 0.0 < now < self.last else 0.0
-        return (self.done - self.at) * np.log(now / max(tol, 1e-16)) / gain if gain > 0.0 else np.inf
+        return _sweeps_left(self.done - self.at, self.last, now, tol)
 
 
 # -- the plan ---------------------------------------------------------------------------------------
 
 
 @np.errstate(all="ignore")  # what overflows is judged
-def _solve(trail: Trail, budget: int) -> None:
+def _solve(trail: Trail, budget: int, glance: Glance | None = None) -> None:
     problem = trail.problem
     costs = trail.costs
     if problem.law == "linear":
@@ -379,13 +500,12 @@ def _solve(trail: Trail, budget: int) -> None:
             _whole(trail, Exact("newton", 0.0, 0, (("form", "velocity"),)), budget)
         return
     sweeps = None
-    if problem.law == "lcp" and problem.m <= FEW and problem.is_symmetric:
-        # START of sweeps alone costs more than a dense factor of so few rows.
+    if glance is None and factors_at_once(problem):
+        # START of sweeps alone costs more than this factor.
         if _whole(trail, Exact("direct", 0.0, 0), budget):
             return
-    elif problem.m <= FEW or not _at_once(costs):
-        # Of few rows a first look at sweeps costs less than Python takes to find out what anything else would.
-        sweeps = _Sweeps(trail)
+    elif glance is not None or not _at_once(costs):
+        sweeps = _Sweeps(trail, glance=glance)
         if problem.m > FEW and _may_relax(trail):
             # Where contacts stick, and Coulomb's own sweeps promise no end, the relaxation has the answer.
             if sweeps.run(budget, np.inf, cap=_cap(problem)) or _relaxation(trail, budget):
@@ -419,36 +539,88 @@ def _may_relax(trail: Trail) -> bool:
 
 def _finish(trail: Trail, sweeps: _Sweeps | None, budget: int) -> None:
     """Finite solvers and sweeps in turn, the allowance doubled each time, until one is there or all have given up."""
-    problem, costs = trail.problem, trail.costs
+    problem = trail.problem
     if problem.law == "coulomb" and problem.m >= HUGE and problem.rows is not None:
         # A factorisation is out of reach: sweeps, however many they take.
         last = _Sweeps(trail, "nncg", order="symmetric")
         if last.run(budget, np.inf, cap=20 * CAP):
             return
-    allowance = 0.0
-    for k in range(ROUNDS):
+    turns = _Turns(trail, sweeps, budget)
+    while turns.left():
+        if turns.take():
+            return
+    if problem.law == "coulomb" and _Sweeps(trail, "block_gauss_seidel").run(budget, np.inf, cap=20 * CAP):
+        return
+    _certify(trail)
+
+
+class _Turns:
+    """Turns of what there is: every finite solver with its allowance, then sweeps; twice as much in the next turn.
+
+    Newton's method, which cannot go on where it stood once it has returned, takes the turns of the others from
+    within: where its allowance is used up, they have theirs.
+    """
+
+    def __init__(self, trail: Trail, sweeps: _Sweeps | None, budget: int) -> None:
+        self.trail, self.sweeps, self.budget = trail, sweeps, budget
+        self.taken = 0
+        self.allowance = 0.0  # of sweeps [ns]
+        self.over = False  # nothing gets anywhere
+        self.inside: Exact | None = None  # Newton's method, where it waits for a turn to end
+
+    def left(self) -> bool:
+        return self.taken < ROUNDS and not self.over
+
+    def take(self) -> bool:
+        """One turn; True when nothing is left to do."""
+        trail, costs, k = self.trail, self.trail.costs, self.taken
         before, spent = trail.best, trail.iterations
         for candidate in costs.exact:
-            if trail.best <= trail.tol or budget <= trail.iterations:
-                return
+            if trail.best <= trail.tol or self.budget <= trail.iterations:
+                return True
+            if candidate is self.inside:
+                continue
             started = trail.ended.get(candidate.key)
             if started is not None and not trail.best <= 0.1 * started:
                 continue  # it gave up, and would do so again
             # The one before gave up, or needs more than was expected of it.
+            sweeps = self.sweeps
             cheaper = sweeps is not None and trail.iterations > spent and sweeps.cost < candidate.cost
-            if cheaper and sweeps is not None and sweeps.run(budget, candidate.cost):
-                return
-            if _whole(trail, candidate, budget, candidate.limit << k):
-                return
-        allowance = max(2.0 * allowance, 2.0 * costs.exact[0].cost)
-        sweeps = sweeps or _Sweeps(trail)
-        if sweeps.run(budget, allowance):
-            return
-        if trail.late or (spent == trail.iterations and trail.best >= before):
-            break
-    if problem.law == "coulomb" and _Sweeps(trail, "block_gauss_seidel").run(budget, np.inf, cap=20 * CAP):
-        return
-    _certify(trail)
+            if (
+                cheaper
+                and sweeps is not None
+                and not sweeps.too_late
+                and sweeps.run(self.budget, candidate.cost)
+            ):
+                return True
+            if _whole(trail, candidate, self.budget, candidate.limit << k, self.more(candidate)):
+                return True
+            if self.taken > k:
+                break  # turns were taken meanwhile
+        else:
+            self.taken += 1
+            self.allowance = max(2.0 * self.allowance, 2.0 * costs.exact[0].cost)
+            self.sweeps = self.sweeps or _Sweeps(trail)
+            if self.sweeps.run(self.budget, self.allowance):
+                return True
+            self.over = trail.late or (spent == trail.iterations and trail.best >= before)
+        return False
+
+    def more(self, newton: Exact) -> Callable[[FloatArray], int] | None:
+        """What Newton's method asks where its allowance is used up."""
+        if self.inside is not None:
+            return None
+
+        def ask(impulse: FloatArray) -> int:
+            self.trail.offer(impulse)
+            self.inside = newton
+            try:
+                done = self.trail.done or not self.left() or self.take()
+            finally:
+                self.inside = None
+            return 0 if done or self.trail.late else newton.limit << min(self.taken, ROUNDS)
+
+        return ask
 
 
 def _apart(trail: Trail, budget: int) -> bool:
@@ -468,7 +640,7 @@ def _apart(trail: Trail, budget: int) -> bool:
         part = restrict(problem, blocks, rows)
         e0, v0 = reference(part)
         tol = min(share / e0 if e0 > 0.0 else np.inf, trail.tol * velocity / v0 if v0 > 0.0 else np.inf)
-        sub = Trail(part, min(tol, 1.0) if np.isfinite(tol) else trail.tol, trail.deadline)
+        sub = Trail(part, min(tol, 1.0) if np.isfinite(tol) else trail.tol, trail.deadline, trail.limit)
         sub.offer(impulse[rows])
         try:
             if not sub.done:
@@ -507,7 +679,7 @@ def _solve_island(trail: Trail, budget: int) -> None:
 def _relaxation(trail: Trail, budget: int) -> bool:
     """Sweep the convex relaxation, to tighter and tighter residuals as long as Coulomb's follows."""
     problem = trail.problem
-    convex = Trail(problem.relaxed("cone"), trail.tol, trail.deadline)
+    convex = Trail(problem.relaxed("cone"), trail.tol, trail.deadline, trail.limit)
     convex.offer(problem.start())
     last = FOLLOWS * trail.tol
     for k in range(4):

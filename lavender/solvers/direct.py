@@ -59,7 +59,13 @@ class DirectState:
 
 @dataclass(frozen=True)
 class Direct:
-    """Direct solution of linear systems and of symmetric positive semidefinite boxed LCPs."""
+    """Direct solution of linear systems and of symmetric positive semidefinite boxed LCPs.
+
+    `auto` asks for patience=False first: bounded rows whose A is singular where they are free then end it at once,
+    before any shift, as STALLED.
+    """
+
+    patience: bool = True
 
     def prepare(self, problem: Problem, like: PivotState | None = None) -> DirectState:
         if not problem.is_symmetric:
@@ -77,7 +83,7 @@ class Direct:
     def run(
         self, state: DirectState, impulse: FloatArray, n: int, tol: float, time_limit: float | None = None
     ) -> Claim:
-        run = _Run(state, impulse, n, tol, time_limit)
+        run = _Run(state, impulse, n, tol, time_limit, self.patience)
         if state.problem.m == 0:
             return run.claim(Status.CONVERGED)
         if n == 0:
@@ -102,8 +108,15 @@ class _Run:
     """One solve: the best judged iterate so far, and what was spent."""
 
     def __init__(
-        self, state: DirectState, impulse: FloatArray, n: int, tol: float, time_limit: float | None
+        self,
+        state: DirectState,
+        impulse: FloatArray,
+        n: int,
+        tol: float,
+        time_limit: float | None,
+        patient: bool,
     ) -> None:
+        self.patient = patient
         self.state, self.problem, self.impulse, self.budget, self.tol = state, state.problem, impulse, n, tol
         self.stop_at = None if time_limit is None else perf_counter() + time_limit
         self.kept: measure.Judged | None = None
@@ -223,7 +236,9 @@ class _Run:
         if code == INDEFINITE:
             return self.indefinite()
         if code == SMALL:
-            self.note_singular(pivot)
+            self.note_singular(pivot, self.patient or self.problem.law == "linear")
+        if not self.patient and self.problem.law != "linear":
+            return self.verdict()
         return self.proximal(pivot, code == STUCK)
 
     def rounds(self, pivot: PivotState) -> int:
@@ -269,13 +284,13 @@ class _Run:
         self.notes.append("A is indefinite on the free rows: no solution by this method, see lemke")
         return self.claim(Status.NUMERICAL_ERROR)
 
-    def note_singular(self, pivot: PivotState) -> None:
+    def note_singular(self, pivot: PivotState, shifted: bool) -> None:
         if self.problem.law == "linear":
             rank = pivot.rank()
             self.notes.append(f"A is singular, rank {rank} of {self.problem.m}")
             self.work["rank"] = rank
         else:
-            self.notes.append("A is singular on the free rows: shifted and refined")
+            self.notes.append("A is singular on the free rows" + ": shifted and refined" * shifted)
 
     @np.errstate(all="ignore")  # what overflows is judged
     def proximal(self, pivot: PivotState, stuck: bool) -> Claim:

@@ -22,7 +22,8 @@ factors over the rows.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from time import perf_counter
 from typing import Any
 
@@ -68,6 +69,9 @@ class Newton:
     """
 
     form: str = "auto"
+    more: Callable[[FloatArray], int] | None = field(
+        default=None, compare=False, repr=False
+    )  # of `auto`, see `Run`
 
     @np.errstate(all="ignore")  # what overflows is judged
     def prepare(self, problem: Problem) -> NewtonState:
@@ -163,7 +167,7 @@ class Newton:
             if claim is not None and general.confirmed(problem, impulse, tol):
                 return claim
         deadline = np.inf if time_limit is None else perf_counter() + time_limit
-        run = Run(system, tol, n, deadline)
+        run = Run(system, tol, n, deadline, self.more)
         z = system.sc.unknown(impulse)
         run.score(z)
         interrupted = False
@@ -184,7 +188,7 @@ class Newton:
             status = Status.CONVERGED
         elif run.at_floor():
             status = Status.FLOOR
-        elif system.factorisations >= n:
+        elif system.factorisations >= run.budget:
             status = Status.MAX_ITERATIONS
         elif run.spent():
             status = Status.TIME_LIMIT

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from time import perf_counter
 
@@ -22,6 +23,9 @@ class Run:
     tol: float
     budget: int  # factorisations
     deadline: float  # of perf_counter
+    more: Callable[[FloatArray], int] | None = (
+        None  # asked for more factorisations, with the best (m,) N s so far
+    )
     best: float = np.inf
     best_z: FloatArray = field(init=False)
     floor: float = 0.0
@@ -64,7 +68,13 @@ class Run:
     def spent(self) -> bool:
         """No budget or time for another factorisation, at the system's pace."""
         if self.system.factorisations >= self.budget:
-            return True
+            if self.more is None:
+                return True
+            more = self.more(self.system.sc.impulse(self.best_z))
+            if more <= 0:
+                self.more = None
+                return True
+            self.budget += more
         return (
             self.deadline < np.inf and perf_counter() + self.system.pace * self.system.cost >= self.deadline
         )

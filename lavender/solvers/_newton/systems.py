@@ -314,7 +314,7 @@ class MatrixSystem(System):
         )
         # Of a sparse factor by its fill, which grows with the size: nanoseconds, as `_costs.py` has them.
         self.cost = m**3 / 3.0 if self.dense else 100.0 * a.nnz * (1.0 + m / 1000.0)
-        self.pace = 0.3e-9 if self.dense else 1e-9
+        self.pace = 0.15e-9 if self.dense else 1e-9
         self.h: Any
         if self.dense:
             self.h = a.toarray()
