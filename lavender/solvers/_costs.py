@@ -272,9 +272,12 @@ class Costs:
             found.append(Exact("lemke", START["lemke"] + p.m * (PIVOT + PIVOT_ENTRY * float(p.m) ** 2), 0))
         if self.largest:
             count = 2 * int(GENERAL_COUNT[p.law]) + GENERAL_TAIL
-            found.append(Exact("newton", general_cost(p, self.largest), count, (("form", "velocity"),)))
+            cost = general_cost(p, self.largest)
+            once = GENERAL_START + (cost - GENERAL_START) / GENERAL_COUNT[p.law]
+            found.append(Exact("newton", cost, count, (("form", "velocity"),), once))
         if p.law in ("cone", "coulomb") and (p.generalized is None or p.m <= ADMM_GENERAL):
-            found.append(Exact("admm", self._admm, int(2.0 * self._admm_count)))
+            cost, once = self._admm
+            found.append(Exact("admm", cost, int(2.0 * self._admm_count), once=once))
         return found
 
     @property
@@ -282,12 +285,14 @@ class Costs:
         return ADMM_COUNT * max(1.0, self.decades / 6.0)
 
     @property
-    def _admm(self) -> float:
+    def _admm(self) -> tuple[float, float]:
+        # To the end, and with the first factor alone.
         p = self.problem
         entries = float(sweep_work(p))
         lu = 1.0 if p.is_symmetric else UNSYMMETRIC
         each = ADMM_ROW * p.m + ADMM_ENTRY * lu * ADMM_FILL * entries
-        return ADMM_START + ADMM_FACTORS * lu * self._sparse(int(entries), p.m) + self._admm_count * each
+        factor = lu * self._sparse(int(entries), p.m)
+        return ADMM_START + ADMM_FACTORS * factor + self._admm_count * each, ADMM_START + factor
 
     def _direct(self, factor: float, times: float = 1.0) -> float:
         p = self.problem

@@ -1,0 +1,272 @@
+"""Accelerated sweeps as `auto` runs them: a glance, looks at what they promise, and a race with the relaxation's.
+
+rest = n log(now / tol) / log(before / now)         sweeps left, by the contraction of the last n    (1)
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from lavender._arrays import FloatArray
+from lavender.problem import Problem
+from lavender.registry import FEW
+from lavender.residuals import judged, known, remember
+from lavender.solution import Claim, Status
+from lavender.solvers._costs import FIRST_LOOK, ISLAND, LOOK, finite_least, first_look, is_glanced, sweep_cost
+from lavender.solvers._few import said
+from lavender.solvers._trail import CLOCK, Trail, usable
+
+__all__ = ["Glance", "Sweeps", "look_first", "race"]
+
+SWEEPER = "anderson"  # whose sweeps come first
+HOPE = 0.4  # share of a finite solver's cost that sweeps may take without promising an end
+BELIEVED = 2.0  # times a finite solver's cost that sweeps may take, whatever they promise
+APART = 10.0  # islands' worth of Python from which a finite solver is compared with islands solved apart
+PORTION = 0.25  # of a time limit that sweeps may take that will not get there within it
+LEAD = 0.5  # of the cost that sweeps promise, that those of the relaxation must promise to go before them
+FOLLOWS = 100.0  # times the tolerance that Coulomb's residual may be where the relaxation is at it
+
+
+@dataclass
+class Glance:
+    """A first look at sweeps of `anderson`, before anything else is looked at; they go on from here."""
+
+    solver: Any
+    state: Any
+    impulse: FloatArray  # (m,) N s
+    before: float  # relative residual before its last sweeps,
+    last: int  # so many,
+    best: float  # and after them
+    status: Status
+    done: int  # sweeps
+    work: dict[str, int]
+
+    @property
+    def message(self) -> str:
+        return said(SWEEPER, self.work) if self.done else "the start is a solution"
+
+
+def look_first(problem: Problem, impulse: FloatArray, n: int, tol: float) -> Glance | None:
+    """Sweeps from an impulse (m,) where a first look at them costs no more than to find out what else there is."""
+    if problem.generalized is not None or problem.cones.has_round:
+        return None
+    if problem.law == "linear" and problem.m > FEW:
+        return None  # fewer rows come here only where they have no factor that is small and regular
+    per = sweep_cost(problem)
+    sweeps = first_look(per)
+    if n < sweeps or not is_glanced(problem, per):
+        return None
+    spec = usable(SWEEPER, problem)
+    if spec is None:
+        return None
+    lam = impulse.copy()
+    found = known(problem, impulse)
+    before = judged(problem, impulse.copy()).relative if found is None else found
+    if before <= tol:
+        return Glance(None, None, lam, before, 0, before, Status.CONVERGED, 0, {})
+    solver = spec.load()()
+    state = solver.prepare(problem)
+    least, done, work = finite_least(problem), 0, dict[str, int]()
+    while True:
+        claim: Claim = solver.run(state, lam, sweeps, tol, None)
+        for kind, count in claim.work.items():
+            work[kind] = work.get(kind, 0) + count
+        done += claim.iterations
+        now = judged(problem, lam.copy())
+        if now.relative <= tol:
+            remember(problem, now)
+        if now.relative <= tol or claim.status is not Status.MAX_ITERATIONS or done >= n:
+            break
+        rest = _sweeps_left(claim.iterations, before, now.relative, tol)
+        if rest * per > least or done * per > BELIEVED * least:
+            break
+        before, sweeps = now.relative, min(n - done, max(FIRST_LOOK, done // 2))
+    return Glance(solver, state, lam, before, claim.iterations, now.relative, claim.status, done, work)
+
+
+def _sweeps_left(done: int, before: float, now: float, tol: float) -> float:
+    """At the contraction of the last `done` sweeps."""
+    gain = np.log(before / now) if 0.0 < now < before else 0.0
+    return done * float(np.log(now / max(tol, 1e-16)) / gain) if gain > 0.0 else np.inf
+
+
+class Sweeps:
+    """Accelerated sweeps of one problem, which go on where they stood, or where a glance at them did."""
+
+    def __init__(
+        self, trail: Trail, name: str = SWEEPER, glance: Glance | None = None, **options: Any
+    ) -> None:
+        self.trail, self.name, self.glance = trail, name, glance
+        spec = usable(name, trail.problem)
+        self.usable = spec is not None
+        if glance is not None:
+            self.solver, self.state, self.impulse = glance.solver, glance.state, glance.impulse
+        elif spec is not None:
+            self.solver = spec.load()(**options)
+            self.state = self.solver.prepare(trail.problem)
+            self.impulse = trail.impulse.copy()
+        # Of one iteration [ns]: the symmetric order sweeps twice in it.
+        self.per = trail.costs.sweep * (2.0 if options.get("order") == "symmetric" else 1.0)
+        self.tol = trail.tol
+        self.done = 0 if glance is None else glance.done  # iterations
+        self.total = {} if glance is None else dict(glance.work)  # their work that is not in the trail yet,
+        self.begun = 0  # and how many were
+        self.last, self.at = trail.best, 0  # residual of the last look, and when it was
+        self.rest = np.inf  # sweeps that were then expected to be left
+        self.ended = False  # by a claim of its own, or because the residual does not fall
+
+    def look(self, step: int) -> float:
+        """So many more iterations, or what a glance was: the relative residual; fewer where a claim ends them."""
+        trail = self.trail
+        before, status = self.done, Status.MAX_ITERATIONS
+        if self.glance is not None:
+            glance, self.glance = self.glance, None
+            status, before = glance.status, 0
+            self.last, self.at = glance.before, glance.done - glance.last
+        else:
+            # In short runs for the clock and Ctrl-C alone: cut anywhere, sweeps give the same bits.
+            chunk = max(1, int(CLOCK * 1e9) // max(1, trail.problem.data.work))
+            for start in range(0, step, chunk):
+                n = min(chunk, step - start)
+                claim: Claim = self.solver.run(self.state, self.impulse, n, self.tol, None)
+                status = claim.status
+                self.done += claim.iterations
+                for kind, count in claim.work.items():
+                    self.total[kind] = self.total.get(kind, 0) + count
+                if status is not Status.MAX_ITERATIONS or trail.late:
+                    break
+        now = self.judge(status)
+        if now > trail.tol and not (status is Status.MAX_ITERATIONS and self.done > before):
+            self.ended = self.stopped(status)
+        self.rest = _sweeps_left(self.done - self.at, self.last, now, trail.tol)
+        self.last, self.at = now, self.done
+        return now
+
+    def judge(self, status: Status) -> float:
+        """The residual that counts, and the trail's if it is the best."""
+        return self.trail.offer(self.impulse)
+
+    def stopped(self, status: Status) -> bool:
+        """Whether a claim above the tolerance is the end."""
+        return True
+
+    def next_look(self) -> int:
+        """Iterations until the next one: half as many as were done."""
+        return first_look(self.per) if not self.done else max(FIRST_LOOK, self.done // 2)
+
+    def note(self, prefix: str = "") -> None:
+        """Tell the trail what was done since the last time."""
+        if self.done > self.begun:
+            self.trail.add(
+                prefix + self.name, Claim(Status.MAX_ITERATIONS, self.done - self.begun, self.total)
+            )
+        self.begun, self.total = self.done, {}
+
+    def run(self, budget: int, worth: float | None = None, cap: int | None = None) -> bool:
+        """Sweep while the rest is expected to cost at most `worth` [ns]; a share of that may be spent on hope alone.
+
+        Without `worth`, that is the cheapest finite solver. With `cap`, no more than so many, whatever they promise.
+        """
+        trail = self.trail
+        if not self.usable or self.ended:
+            return trail.done
+        begun, looks = self.done, 0
+        while not trail.late and not self.ended:
+            step = min(self.next_look(), budget - trail.iterations - (self.done - self.begun))
+            if cap is not None:
+                step = min(step, cap - self.done)
+            if step <= 0:
+                break
+            now = self.look(step)
+            looks += 1
+            if now <= trail.tol:
+                break
+            if cap is None and self.dearer(self.cost, looks * LOOK + (self.done - begun) * self.per, worth):
+                break
+        self.note()
+        return trail.done
+
+    @property
+    def too_late(self) -> bool:
+        """Sweeps alone will not get there within the time limit, by the contraction before the last look."""
+        return (self.done + self.rest) * self.per > self.trail.limit
+
+    @property
+    def cost(self) -> float:
+        """What is left, by the contraction before the last look [ns]."""
+        return np.inf if self.ended else self.rest * self.per
+
+    def dearer(self, rest: float, spent: float, worth: float | None) -> bool:
+        """Whether what is left costs more than what else there is; looked at closely only where it may."""
+
+        def than(other: float) -> bool:
+            # What was promised before and did not come about is not believed for ever.
+            return (rest > other and spent > HOPE * other) or spent > BELIEVED * other
+
+        factored = self.trail.problem.law in ("linear", "lcp")
+        if factored and self.done * self.per > PORTION * self.trail.limit and self.too_late:
+            # Sweeps will not get there in time; a factorisation that is in luck may.
+            return any(spent + other.once < self.trail.limit for other in self.trail.costs.exact)
+        if worth is not None:
+            return than(worth)
+        if min(rest, spent) > APART * ISLAND and than(self.trail.apart_cost()):
+            return True
+        costs = self.trail.costs
+        return than(costs.least) and than(costs.guess) and than(costs.exact[0].cost)
+
+
+class Relaxed(Sweeps):
+    """Sweeps of the convex relaxation, judged by Coulomb's law, whose answer it has wherever contacts stick."""
+
+    def __init__(self, trail: Trail) -> None:
+        convex = Trail(trail.problem.relaxed("cone"), trail.tol, trail.deadline, trail.limit)
+        super().__init__(convex)
+        self.outer = trail
+        self.last = trail.best
+        self.followed = np.inf  # Coulomb's residual where the relaxation was last solved
+
+    def judge(self, status: Status) -> float:
+        now = self.outer.offer(self.impulse)
+        if status is Status.CONVERGED:
+            self.tol *= 0.1  # solved; Coulomb's residual may follow to a closer one
+        return now
+
+    def stopped(self, status: Status) -> bool:
+        before, self.followed = self.followed, self.last
+        now = self.outer.best
+        return status is not Status.CONVERGED or not now <= FOLLOWS * self.outer.tol or now > 0.5 * before
+
+    def note(self, prefix: str = "relaxation: ") -> None:
+        trail, self.trail = self.trail, self.outer
+        super().note(prefix)
+        self.trail = trail
+
+
+def race(trail: Trail, own: Sweeps, budget: int) -> bool:
+    """Sweeps under Coulomb's law and under its relaxation, look by look whichever promises to cost less from there."""
+    relaxed = Relaxed(trail)
+    relaxed.impulse[:] = trail.problem.start()
+    looks, before = 0, np.inf
+    while not trail.late and not own.ended:
+        left = budget - trail.iterations - own.done - relaxed.done
+        first = own if not own.done else relaxed if not relaxed.done and not relaxed.ended else None
+        # Where a look finds a rise, what was promised before still holds.
+        promised = min(own.cost, before)
+        racer = first or (relaxed if relaxed.cost < LEAD * promised else own)
+        before = own.cost if racer is own else before
+        step = min(racer.next_look(), left)
+        if step <= 0:
+            break
+        now = racer.look(step)
+        looks += 1
+        if now <= trail.tol:
+            break
+        spent = looks * LOOK + own.done * own.per + relaxed.done * relaxed.per
+        if relaxed.done and own.dearer(min(own.cost, relaxed.cost), spent, None):
+            break
+    relaxed.note()
+    own.note()
+    return trail.done

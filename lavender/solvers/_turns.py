@@ -1,0 +1,164 @@
+"""Finite solvers as `auto` runs them: one to the end of its allowance, and all of them in turn with sweeps."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from lavender._arrays import FloatArray
+from lavender.certificates import check_certificate
+from lavender.solution import Claim, Status
+from lavender.solvers._costs import Exact
+from lavender.solvers._few import WARM
+from lavender.solvers._sweepers import Sweeps
+from lavender.solvers._trail import CLOCK, Trail, usable
+from lavender.solvers.newton import NewtonState
+
+__all__ = ["VELOCITY", "Turns", "whole"]
+
+CHUNK_WORK = 8  # sweeps' work that an iteration of admm is
+ROUNDS = 8  # times that sweeps and finite solvers take turns, the allowance doubled each time
+VELOCITY = "newton velocity"  # key of newton over generalised velocities
+
+
+def whole(
+    trail: Trail,
+    chosen: Exact,
+    budget: int,
+    limit: int = 0,
+    more: Callable[[FloatArray], int] | None = None,
+) -> bool:
+    """Run a finite solver from the best impulse, to its end or `limit` iterations; True when nothing is left to do.
+
+    `more`: where Newton's method comes to that limit, it is asked for more iterations, 0 to stop.
+    """
+    name = chosen.name
+    spec = usable(name, trail.problem)
+    if spec is None or budget <= trail.iterations:
+        return trail.done
+    own = name == "newton" and trail.problem.generalized is None
+    kept = trail.kept.get(chosen.key)
+    if kept is not None:
+        solver, state = kept
+    else:
+        solver = spec.load()(**dict(chosen.options), **({"more": more} if own and more is not None else {}))
+        state = _newton_state(trail) if own else solver.prepare(trail.problem)
+    # Half-finished sweeps mislead a Newton method; Pi(0) does not.
+    before = trail.best
+    warm = before <= WARM and (own or chosen.key != VELOCITY or trail.begun)
+    impulse = trail.impulse.copy() if warm else trail.problem.start()
+    if kept is not None:
+        impulse = trail.left[chosen.key]
+    trail.begun = trail.begun or chosen.key == VELOCITY
+    left = None if np.isinf(trail.deadline) else max(trail.deadline - perf_counter(), 1e-3)
+    most = min(limit or spec.max_iter, spec.max_iter, budget - trail.iterations)
+    claim: Claim
+    if spec.resumable:
+        claim = _in_chunks(trail, solver, state, impulse, most)
+        trail.kept[chosen.key], trail.left[chosen.key] = (solver, state), impulse
+    else:
+        claim = solver.run(state, impulse, most, trail.tol, left)
+    trail.add(name, claim)
+    if np.isfinite(impulse).all():
+        trail.offer(impulse)
+    if claim.status is Status.INTERRUPTED:
+        raise KeyboardInterrupt
+    if claim.status is not Status.MAX_ITERATIONS:
+        trail.ended[chosen.key] = before
+    if claim.certificate is not None and check_certificate(trail.problem, claim.certificate) is None:
+        trail.certificate = claim.certificate
+    return trail.done
+
+
+def _in_chunks(trail: Trail, solver: Any, state: Any, impulse: FloatArray, n: int) -> Claim:
+    """At most n iterations of a solver that goes on where it stood, with looks at the clock and for Ctrl-C."""
+    done, work = 0, dict[str, int]()
+    chunk = max(1, int(CLOCK * 1e9) // max(1, CHUNK_WORK * trail.problem.data.work))
+    while True:
+        claim: Claim = solver.run(state, impulse, min(chunk, n - done), trail.tol, None)
+        done += claim.iterations
+        for kind, count in claim.work.items():
+            work[kind] = work.get(kind, 0) + count
+        if claim.status is not Status.MAX_ITERATIONS or done >= n or trail.late or claim.iterations == 0:
+            return replace(claim, iterations=done, work=work)
+
+
+def _newton_state(trail: Trail) -> NewtonState:
+    """What `newton` prepares, from the system whose cost was looked at."""
+    system = trail.costs.system
+    return NewtonState(trail.problem, system if system.sc.m else None)
+
+
+class Turns:
+    """Turns of what there is: every finite solver with its allowance, then sweeps; twice as much in the next turn.
+
+    Newton's method, which cannot go on where it stood once it has returned, takes the turns of the others from
+    within: where its allowance is used up, they have theirs.
+    """
+
+    def __init__(self, trail: Trail, sweeps: Sweeps | None, budget: int) -> None:
+        self.trail, self.sweeps, self.budget = trail, sweeps, budget
+        self.taken = 0
+        self.allowance = 0.0  # of sweeps [ns]
+        self.over = False  # nothing gets anywhere
+        self.inside: Exact | None = None  # Newton's method, where it waits for a turn to end
+
+    def left(self) -> bool:
+        return self.taken < ROUNDS and not self.over
+
+    def take(self) -> bool:
+        """One turn; True when nothing is left to do."""
+        trail, costs, k = self.trail, self.trail.costs, self.taken
+        before, spent = trail.best, trail.iterations
+        for candidate in costs.exact:
+            if trail.best <= trail.tol or self.budget <= trail.iterations:
+                return True
+            if candidate is self.inside:
+                continue
+            started = trail.ended.get(candidate.key)
+            if started is not None and not trail.best <= 0.1 * started:
+                continue  # it gave up, and would do so again
+            if np.isfinite(candidate.once) and perf_counter() + 1e-9 * candidate.once > trail.deadline:
+                continue  # its first factor would come too late
+            # The one before gave up, or needs more than was expected of it.
+            sweeps = self.sweeps
+            cheaper = sweeps is not None and trail.iterations > spent and sweeps.cost < candidate.cost
+            if (
+                cheaper
+                and sweeps is not None
+                and not sweeps.too_late
+                and sweeps.run(self.budget, candidate.cost)
+            ):
+                return True
+            if whole(trail, candidate, self.budget, candidate.limit << k, self.more(candidate)):
+                return True
+            if self.taken > k:
+                break  # turns were taken meanwhile
+        else:
+            self.taken += 1
+            self.allowance = max(2.0 * self.allowance, 2.0 * costs.exact[0].cost)
+            self.sweeps = self.sweeps or Sweeps(trail)
+            if self.sweeps.run(self.budget, self.allowance):
+                return True
+            self.over = trail.late or (spent == trail.iterations and trail.best >= before)
+        return False
+
+    def more(self, newton: Exact) -> Callable[[FloatArray], int] | None:
+        """What Newton's method asks where its allowance is used up."""
+        if self.inside is not None:
+            return None
+
+        def ask(impulse: FloatArray) -> int:
+            self.trail.offer(impulse)
+            self.inside = newton
+            try:
+                done = self.trail.done or not self.left() or self.take()
+            finally:
+                self.inside = None
+            return 0 if done or self.trail.late else newton.limit << min(self.taken, ROUNDS)
+
+        return ask
