@@ -7,12 +7,14 @@ Environment:
                             pointers (gcc; run Python with LD_PRELOAD="$(gcc -print-file-name=libasan.so)")
 """
 
+import gzip
 import json
 import logging
 import multiprocessing
 import os
 import runpy
 import sys
+import tarfile
 from pathlib import Path
 
 import Cython
@@ -20,7 +22,10 @@ from Cython.Build import cythonize
 from setuptools import Command, Extension, setup
 from setuptools.command.build import build
 from setuptools.command.build_ext import build_ext
+from setuptools.command.sdist import sdist
 
+# The time of every file in an archive [s]: of no meaning, but the same on every machine. Wheels read it, too.
+os.environ.setdefault("SOURCE_DATE_EPOCH", "1580601600")  # 2020-02-02, as hatchling has it
 MODE = os.environ.get("LAVENDER_DEBUG", "")
 DEBUG = MODE not in ("", "0")
 OPTIONS = runpy.run_path("lavender_ext/build_options.py")
@@ -128,6 +133,30 @@ class BuildWasm(Command):
         return []
 
 
+class ReproducibleArchive(sdist):
+    """A source distribution whose bytes follow from its files alone: no clock, owner, umask or order of a folder."""
+
+    def make_archive(self, base_name, format, root_dir=None, base_dir=None, owner=None, group=None):  # noqa: A002
+        """The archive's path; only `gztar`, the one that frontends ask for, is made here."""
+        if format != "gztar":
+            return super().make_archive(base_name, format, root_dir, base_dir, owner, group)
+        out, epoch = Path(f"{base_name}.tar.gz"), int(os.environ["SOURCE_DATE_EPOCH"])
+        out.parent.mkdir(parents=True, exist_ok=True)
+        top = Path(root_dir or ".", base_dir)
+        with (
+            out.open("wb") as raw,
+            gzip.GzipFile("", "wb", compresslevel=9, fileobj=raw, mtime=epoch) as packed,
+            tarfile.open(fileobj=packed, mode="w", format=tarfile.PAX_FORMAT) as archive,
+        ):
+            for path in sorted((p for p in top.rglob("*") if p.is_file()), key=Path.as_posix):
+                entry = tarfile.TarInfo(f"{base_dir}/{path.relative_to(top).as_posix()}")
+                entry.size, entry.mtime = path.stat().st_size, epoch
+                entry.mode = 0o755 if path.stat().st_mode & 0o100 else 0o644
+                with path.open("rb") as data:
+                    archive.addfile(entry, data)
+        return str(out)
+
+
 build.sub_commands = [*build.sub_commands, ("build_wasm", None)]
 
 
@@ -147,5 +176,5 @@ setup(
         # cythonize writes it
         extension(Path(*SHARED.split(".")).with_suffix(".c"), *PLAIN),
     ],
-    cmdclass={"build_ext": BuildKernels, "build_wasm": BuildWasm},
+    cmdclass={"build_ext": BuildKernels, "build_wasm": BuildWasm, "sdist": ReproducibleArchive},
 )

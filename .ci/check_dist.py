@@ -1,11 +1,16 @@
 """Check that a source distribution and a wheel hold what they must, and nothing a build left behind.
 
 python .ci/check_dist.py FOLDER        the folder with one .tar.gz and one .whl
+
+The source distribution is also unpacked, given other times and permissions, and made again: every byte must come back.
 """
 
 import importlib.util
+import os
+import subprocess
 import sys
 import tarfile
+import tempfile
 import zipfile
 from pathlib import Path
 
@@ -56,10 +61,33 @@ def problems(in_sdist: set[str], in_wheel: set[str]) -> list[str]:
     return found + sorted(left)
 
 
+def made_again(sdist: Path) -> list[str]:
+    """What differs when the sdist is made once more from its own files, later, elsewhere, by someone else."""
+    with tempfile.TemporaryDirectory(prefix="lavender-sdist-") as folder:
+        with tarfile.open(sdist) as archive:
+            archive.extractall(folder, filter="data")
+        (top,) = Path(folder).iterdir()
+        for number, path in enumerate(sorted(top.rglob("*"), reverse=True)):
+            path.chmod(path.stat().st_mode & 0o700)
+            os.utime(path, (1e9 + number, 1e9 + number))
+        build = [sys.executable, "-m", "build", "--sdist", "--no-isolation", "--outdir", folder, str(top)]
+        done = subprocess.run(
+            build, capture_output=True, text=True, check=False, env={**os.environ, "TZ": "Asia/Tokyo"}
+        )
+        if done.returncode:
+            return [f"sdist cannot be made from itself: {(done.stdout + done.stderr)[-2000:]}"]
+        again = Path(folder, sdist.name).read_bytes()
+    if again == sdist.read_bytes():
+        return []
+    return [f"sdist made from itself differs: {len(again)} bytes for {sdist.stat().st_size}"]
+
+
 if __name__ == "__main__":
     in_sdist, in_wheel = names_in(Path(sys.argv[1]))
     found = problems(in_sdist, in_wheel)
+    found += made_again(next(Path(sys.argv[1]).glob("*.tar.gz")))
     print(
-        "\n".join(found) or f"sdist: {len(in_sdist)} entries, wheel: {len(in_wheel)} entries, nothing amiss"
+        "\n".join(found)
+        or f"sdist: {len(in_sdist)} entries, every byte made again, wheel: {len(in_wheel)} entries, nothing amiss"
     )
     sys.exit(bool(found))
