@@ -14,7 +14,8 @@ its core functions as roots; the linker drops the Python part, and in what is le
   (else: a table or a string).
 
 The sources are read too: signatures of core functions are fixed-width and `noexcept nogil`, directives stand
-in lavender_ext/build_options.py alone, and nothing imports lavender.
+in lavender_ext/build_options.py alone, and nothing imports lavender. And the C is read as strict C11 (`DIALECT`), once
+as gcc and clang compile it, once as a compiler without vector types does: of warnings only `CYTHONS_OWN` may come.
 """
 
 from __future__ import annotations
@@ -38,9 +39,16 @@ OPTIONS = runpy.run_path(str(ROOT / "lavender_ext" / "build_options.py"))
 #: sqrt and floor are exact, so every libm gives the same bits; compilers write the mem functions themselves.
 ALLOWED = frozenset({"sqrt", "floor", "memcpy", "memset", "memmove"})
 
-#: Modules of these names are exempt, with the reason. `threaded` yields and sleeps by the system's calls; `chain`
-#: calls the Python faces of kernels one after the other. The arithmetic of both is that of other modules, which this
-#: check sees.
+#: Standard C: no extension of a compiler without a guard, no array of variable length (MSVC has none).
+DIALECT = ["-std=c11", "-pedantic", "-Wvla", "-Wall", "-Wno-unused-function"]
+#: The plain branch of every `#if defined(__GNUC__)` of ours.
+PLAIN = ["-DLAVENDER_ONE_LANE"]
+#: What Cython writes into each module: tables of functions for other modules, as pointers to objects.
+CYTHONS_OWN = "ISO C forbids conversion of function pointer to object pointer type"
+
+#: Modules of these names are exempt from the check of what a core reaches, with the reason. `threaded` yields and
+#: sleeps by the system's calls; `chain` calls the Python faces of kernels one after the other. The arithmetic of both
+#: is that of other modules, which this check sees.
 EXEMPT = {"threaded": "threads", "chain": "calls kernels, computes nothing"}
 
 #: Types that have one size everywhere, as a host outside C must build them; structs end in _t too.
@@ -57,18 +65,19 @@ HEADER = re.compile(r"#\s*cython\s*:(.*)", re.I)
 
 @dataclass
 class Verdict:
-    """What was found in one module: its core functions, their code in bytes, and every breach in words."""
+    """What was found in one module: its core functions, their code in bytes, warnings of Cython's own, breaches."""
 
     module: str
     functions: list[str] = field(default_factory=list)
     code: int = 0
+    warnings: int = 0
     breaches: list[str] = field(default_factory=list)
     exempt: str = ""
 
     def __str__(self) -> str:
-        if self.exempt:
-            return f"{self.module}: exempt ({self.exempt})"
-        lines = [f"{self.module}: {len(self.functions)} core functions, {self.code} bytes of code"]
+        core = f"{len(self.functions)} core functions, {self.code} bytes of code"
+        said = f"exempt ({self.exempt})" if self.exempt else core
+        lines = [f"{self.module}: {said}, {self.warnings} warnings of Cython's own in strict C11"]
         return "\n".join([*lines, *(f"  BREACH {text}" for text in self.breaches)])
 
 
@@ -124,12 +133,45 @@ def run(*command: str | Path, cwd: Path) -> str:
     return done.stdout
 
 
-def link_core(path: Path, names: list[str], root: Path, work: Path) -> Path:
-    """The object file that holds what the functions `names` of the module `path` reach, and nothing else."""
-    compiler = shlex.split(os.environ.get("CC", "cc"))
-    c_file, whole, core = (work / (path.stem + suffix) for suffix in (".c", ".o", ".core.o"))
+def translate(path: Path, root: Path, work: Path) -> Path:
+    """Cython's C of a module."""
+    c_file = work / f"{path.stem}.c"
     directives = [f"-X{name}={value}" for name, value in OPTIONS["directives"]().items()]
     run(sys.executable, "-m", "cython", *directives, path, "-o", c_file, cwd=root)
+    return c_file
+
+
+def read_dialect(c_file: Path) -> tuple[int, list[str]]:
+    """Warnings of Cython's own, and what is not standard C otherwise."""
+    compiler = shlex.split(os.environ.get("CC", "cc"))
+    include = "-I" + sysconfig.get_paths()["include"]
+    found: dict[str, None] = {}
+    own = 0
+    for more in ([], PLAIN):
+        command = [
+            *compiler,
+            *OPTIONS["COMPILE_FLAGS"],
+            *DIALECT,
+            *more,
+            include,
+            "-fsyntax-only",
+            str(c_file),
+        ]
+        done = subprocess.run(
+            command, capture_output=True, text=True, check=False, env={**os.environ, "LC_ALL": "C"}
+        )
+        lines = [line for line in done.stderr.splitlines() if re.search(r"\b(warning|error):", line)]
+        own = max(own, sum(CYTHONS_OWN in line for line in lines))
+        found.update(dict.fromkeys(line.partition(": ")[2] for line in lines if CYTHONS_OWN not in line))
+        if done.returncode and not found:
+            raise RuntimeError(f"{shlex.join(command)} failed:\n{done.stderr}")
+    return own, [f"not strict C11: {text}" for text in found]
+
+
+def link_core(c_file: Path, names: list[str], root: Path, work: Path) -> Path:
+    """The object file that holds what the functions `names` of a translated module reach, and nothing else."""
+    compiler = shlex.split(os.environ.get("CC", "cc"))
+    whole, core = (work / (c_file.stem + suffix) for suffix in (".o", ".core.o"))
     sections = ["-ffunction-sections", "-fdata-sections", "-fno-jump-tables", "-fno-tree-switch-conversion"]
     plain = [
         "-fno-stack-protector",
@@ -208,15 +250,18 @@ def check(path: Path, root: Path = ROOT) -> Verdict:
     path, root = path.resolve(), root.resolve()
     inside = path.relative_to(root) if path.is_relative_to(root) else Path(path.name)
     name = ".".join(inside.with_suffix("").parts)
-    if path.stem in EXEMPT:
-        return Verdict(name, exempt=EXEMPT[path.stem])
-    verdict = Verdict(name)
-    verdict.functions, verdict.breaches = read_source(path)
-    if verdict.functions:
+    verdict = Verdict(name, exempt=EXEMPT.get(path.stem, ""))
+    if not verdict.exempt:
+        verdict.functions, verdict.breaches = read_source(path)
+    if verdict.functions or verdict.exempt:
         with tempfile.TemporaryDirectory() as work:
-            core = link_core(path, verdict.functions, root, Path(work))
-            verdict.code, found = read_object(core)
+            c_file = translate(path, root, Path(work))
+            verdict.warnings, found = read_dialect(c_file)
             verdict.breaches += found
+            if verdict.functions:
+                core = link_core(c_file, verdict.functions, root, Path(work))
+                verdict.code, found = read_object(core)
+                verdict.breaches += found
     return verdict
 
 

@@ -2,13 +2,14 @@
 
 Lanes run over rows of C, the sum over columns of A and B in their order, each product rounded before it is subtracted:
 every width gives the same bits. `wide` asks for four lanes in one instruction (AVX2), which the caller has found.
+With LAVENDER_ONE_LANE, and for other compilers than gcc and clang, plain loops.
 """
 
 cdef extern from *:
     """
     #ifndef LAVENDER_TILES
     #define LAVENDER_TILES
-    #if defined(__GNUC__)
+    #if defined(__GNUC__) && !defined(LAVENDER_ONE_LANE)
     #define LAVENDER_OWN __restrict__
     #define LAVENDER_INLINE static inline __attribute__((always_inline))
     typedef double lavender_quad __attribute__((vector_size(32), aligned(8), may_alias));
@@ -66,7 +67,7 @@ cdef extern from *:
                                      long long ldb, double* c, long long ldc) {
         LAVENDER_LESS(lavender_tile_2, 2)
     }
-    #if defined(__GNUC__) && defined(__x86_64__)
+    #if defined(__GNUC__) && defined(__x86_64__) && !defined(LAVENDER_ONE_LANE)
     __attribute__((target("avx2"))) static void lavender_less_wide(int m, int n, int k, const double* a, long long lda,
                                                                    const double* b, long long ldb, double* c,
                                                                    long long ldc) {

@@ -114,6 +114,33 @@ def test_every_kind_of_breach_is_named(tmp_path):
         assert re.search(sign, found), f"{sign} not in\n{found}"
 
 
+@pytest.mark.parametrize(
+    ("body", "sign"),
+    [
+        ("double s[n]; s[0] = n; return s[0];", "forbids variable length array"),
+        ("return ({ double s = n; s; });", "forbids braced-groups"),
+        ("\n#ifdef LAVENDER_ONE_LANE\nreturn n ?: 1;\n#else\nreturn n;\n#endif\n", "middle term"),
+        ("typedef double two __attribute__((vector_size(16))); two s = {n, n}; return s[0];", None),
+    ],
+)
+def test_an_extension_of_a_compiler_is_a_breach_in_every_branch(tmp_path, body, sign):
+    text = f"""
+cdef extern from *:
+    '''
+    static inline double lavender_x(int n) {{ {body} }}
+    '''
+    double lavender_x(int n) noexcept nogil
+
+cdef public double lav_x(double n) noexcept nogil:
+    return lavender_x(<int>n)
+"""
+    found = verdict(tmp_path, "dialect", text)
+    if sign is None:
+        assert found.breaches == []
+    else:
+        assert any("not strict C11" in breach and sign in breach for breach in found.breaches)
+
+
 def test_a_division_that_raises_is_a_breach(tmp_path, monkeypatch):
     text = "cdef public double lav_ratio(double x, double y) noexcept nogil:\n    return x / y\n"
     assert verdict(tmp_path, "division", text).breaches == []
@@ -154,7 +181,9 @@ def test_a_breach_in_the_text_is_named(tmp_path, text, sign):
 
 
 def test_a_module_with_threads_is_exempt_by_name(tmp_path):
-    assert verdict(tmp_path, "threaded", IMPURE).exempt
+    found = verdict(tmp_path, "threaded", IMPURE)
+    assert found.exempt
+    assert found.breaches == []
     assert not verdict(tmp_path, "sweeps", CLEAN).exempt
 
 
