@@ -4,7 +4,7 @@
 PYTHON ?= .venv/bin/python
 BIN := $(dir $(PYTHON))
 
-.PHONY: help setup kernels test quick lint format types docs wasm fingerprint ci clean
+.PHONY: help setup kernels test quick lint format types docs wasm fingerprint ci release clean
 
 help:  ## this list
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -44,6 +44,9 @@ fingerprint:  ## do solvers and engine still give the bits of the stored fingerp
 
 ci:  ## what the continuous integration runs
 	bash .ci/run
+
+release:  ## what a release is made of, in dist/; stops where a person must act
+	$(PYTHON) .ci/release dist
 
 clean:  ## what builds leave behind
 	rm -rf build site docs/generated
