@@ -28,6 +28,7 @@ from lavender.registry import get
 from lavender.residuals import Residual, residual
 from lavender.rows import Rows
 from lavender.scene import Scene
+from lavender.scene.arithmetic import norm
 from lavender.scene.parts import whole
 from lavender.scene.scene import SWEEPS
 from lavender.solution import Solution, Status
@@ -835,7 +836,7 @@ def _any_tangent(normal: FloatArray) -> FloatArray:
     out = np.zeros_like(normal)
     for i, n in enumerate(normal):
         t = np.cross(n, np.eye(3)[np.argmin(np.abs(n))])
-        size = np.linalg.norm(t)
+        size = norm(t)
         if size > 0.0:  # a body so far off that its contact has no direction: Rows says so
             out[i] = t / size
     return out

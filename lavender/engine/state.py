@@ -23,7 +23,7 @@ from lavender.engine.layout import (
     TOO_MANY,
 )
 from lavender.errors import InputError
-from lavender.scene import Box, Plane, Scene, Sphere
+from lavender.scene import Box, Plane, Scene, Sphere, arithmetic
 from lavender.scene.scene import SCENE_ORDERS
 from lavender_ext.engine import substep
 from lavender_ext.engine.arrays import lengths
@@ -211,12 +211,12 @@ class State:
             a["v"][i, :3], a["v"][i, 3:] = b.velocity, b.angular_velocity
             a["dyn"][i] = -1
             if not b.is_static:
-                inverse = np.linalg.inv(b.inertia)
+                inverse = arithmetic.inverse(b.inertia)
                 a["dyn"][i] = dynamic
                 a["body_of"][dynamic] = i
                 a["inv_mass_body"][i] = a["inv_mass"][dynamic] = 1.0 / b.mass
                 a["inertia"][i] = b.inertia
-                a["inv_inertia_body"][i] = a["inv_inertia"][dynamic] = 0.5 * (inverse + inverse.T)
+                a["inv_inertia_body"][i] = a["inv_inertia"][dynamic] = inverse
                 a["uneven"][i] = uneven[i]
                 dynamic += 1
             a["restitution"][i] = p.restitution if b.restitution is None else b.restitution
@@ -233,7 +233,7 @@ class State:
             ):
                 values[JOINT[name] : JOINT[name] + 3] = x
             side = np.cross(j.axis_a, np.eye(3)[np.argmin(np.abs(j.axis_a))])
-            values[JOINT["side_a"] : JOINT["side_a"] + 3] = side / np.linalg.norm(side)
+            values[JOINT["side_a"] : JOINT["side_a"] + 3] = side / arithmetic.norm(side)
             values[JOINT["length"]], values[JOINT["hertz"]], values[JOINT["damping"]] = (
                 j.length,
                 j.hertz,

@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from lavender.errors import InputError, UnknownName
+from lavender.errors import UnknownName
+from lavender.scene.arithmetic import frame_quaternion, norm, sine_cosine, turned
 from lavender.scene.parts import number, quaternion, rotation, whole
 from lavender.scene.scene import SCENES, Scene, named_scene
 
@@ -56,7 +57,7 @@ def card_house(scene: Scene, levels: int = 2, lean: float = 0.3) -> None:
     whole("levels", levels, 1)
     lean = number("lean", lean, low=0.05, high=0.7)
     thick, width, tall, mass = 0.04, 0.7, 1.0, 0.2
-    s, c = np.sin(lean), np.cos(lean)
+    s, c = sine_cosine(lean)
     reach = tall * s + thick * c  # half the foot of a pair
     pitch = 2.0 * reach + thick
     height = tall * c + thick * s
@@ -92,7 +93,7 @@ def pile(scene: Scene, n: int = 100, kind: str = "spheres", size: float = 0.5, w
     size = number("size", size, above=0.0)
     if kind not in ("spheres", "boxes", "mixed"):
         raise UnknownName("kind of pile", kind, ("spheres", "boxes", "mixed"))
-    side = max(1, int(np.ceil((n / 1.25) ** (1.0 / 3.0))))
+    side = next(k for k in range(1, n + 1) if 5 * k**3 >= 4 * n)  # a quarter more high than wide
     pitch = 1.15 * size if kind == "spheres" else 1.5 * size
     half = 0.5 * side * pitch
     rng = np.random.default_rng(scene.parameters.seed)
@@ -120,7 +121,8 @@ def chain(scene: Scene, n: int = 20, tip_mass: float = 1.0, length: float = 0.25
     """
     whole("n", n, 1)
     length = number("length", length, above=0.0)
-    down = np.array([np.sin(angle), 0.0, -np.cos(angle)])
+    s, c = sine_cosine(angle)
+    down = np.array([s, 0.0, -c])
     turn = quaternion((0.0, 1.0, 0.0), np.pi - angle)
     before = -1
     for i in range(n):
@@ -218,13 +220,11 @@ def newtons_cradle(scene: Scene, n: int = 5, lifted: int = 1, angle: float = 0.6
     whole("n", n, 2)
     whole("lifted", lifted, 0, n)
     radius, string, apart = 0.25, 2.0, 0.5
-    drop = np.sqrt(string**2 - apart**2)
+    drop = np.sqrt(string * string - apart * apart)
     for i in range(n):
         pivot = np.array([(i - 0.5 * (n - 1)) * (2.0 * radius + gap), 0.0, 3.0])
-        t = -angle if i < lifted else 0.0
-        ball = scene.add_sphere(
-            radius, position=pivot + drop * np.array([np.sin(t), 0.0, -np.cos(t)]), name=f"ball {i}"
-        )
+        s, c = sine_cosine(-angle if i < lifted else 0.0)
+        ball = scene.add_sphere(radius, position=pivot + drop * np.array([s, 0.0, -c]), name=f"ball {i}")
         for side in (-1.0, 1.0):
             scene.add_joint("distance", -1, ball, anchor_a=pivot + np.array([0.0, side * apart, 0.0]))
 
@@ -237,14 +237,15 @@ def four_bar(scene: Scene, motor: float | None = None, torque: float = 200.0, ti
     speed of the crank [rad/s], `torque` its largest [N m].
     """
     r = rotation(quaternion((0.3, 0.2, 1.0), tilt))
-    corner = [r @ np.array(p) for p in ((0.0, 0.0, 0.0), (0.6, 0.0, 0.8), (2.4, 0.0, 1.6), (2.2, 0.0, 0.0))]
-    axis = r @ np.array([0.0, 1.0, 0.0])
+    flat = np.array([[0.0, 0.0, 0.0], [0.6, 0.0, 0.8], [2.4, 0.0, 1.6], [2.2, 0.0, 0.0]])
+    corner = [turned(r, p) for p in flat]
+    axis = r[:, 1].copy()
     bars = []
     for i in range(3):
         d = corner[i + 1] - corner[i]
-        long = float(np.linalg.norm(d))
+        long = norm(d)
         x = d / long
-        q = _quaternion_of(np.column_stack([x, axis, np.cross(x, axis)]))
+        q = frame_quaternion(np.column_stack([x, axis, np.cross(x, axis)]))
         # bars lie side by side along the axis: their centres are off the plane of the hinges
         place = 0.5 * (corner[i] + corner[i + 1]) + 0.15 * (i - 1) * axis
         bars.append(
@@ -255,20 +256,3 @@ def four_bar(scene: Scene, motor: float | None = None, torque: float = 200.0, ti
     for i, (a, b) in enumerate(zip([-1, *bars], [*bars, -1], strict=True)):
         drive: dict[str, Any] = {} if motor is None or i else {"motor_speed": motor, "motor_torque": torque}
         scene.add_joint("hinge", a, b, anchor=corner[i], axis=axis, **drive)
-
-
-def _quaternion_of(r: np.ndarray) -> np.ndarray:
-    # Of a rotation matrix: the eigenvector for eigenvalue 1 of q's quadratic form (Bar-Itzhack 2000).
-    k = np.array(
-        [
-            [r[0, 0] + r[1, 1] + r[2, 2], r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]],
-            [0.0, r[0, 0] - r[1, 1] - r[2, 2], r[1, 0] + r[0, 1], r[0, 2] + r[2, 0]],
-            [0.0, 0.0, r[1, 1] - r[0, 0] - r[2, 2], r[2, 1] + r[1, 2]],
-            [0.0, 0.0, 0.0, r[2, 2] - r[0, 0] - r[1, 1]],
-        ]
-    )
-    k = k + np.triu(k, 1).T
-    q = np.linalg.eigh(k)[1][:, -1]
-    if not abs(float(np.linalg.det(r)) - 1.0) < 1e-9:
-        raise InputError("axes of a bar are not a right-handed frame")
-    return q if q[0] >= 0.0 else -q

@@ -8,6 +8,7 @@ import numpy as np
 
 from lavender._arrays import FloatArray
 from lavender.errors import InputError
+from lavender.scene.arithmetic import norm, sine_cosine, turned_back
 
 __all__ = ["BALL", "DISTANCE", "HINGE", "Body", "Box", "Joint", "Plane", "Sphere"]
 
@@ -68,11 +69,11 @@ class Body:
 
     def to_local(self, point: FloatArray) -> FloatArray:
         """World point (3,) [m] in the body's frame."""
-        return rotation(self.quaternion).T @ (point - self.position)
+        return turned_back(rotation(self.quaternion), point - self.position)
 
     def direction_to_local(self, direction: FloatArray) -> FloatArray:
         """World direction (3,) in the body's frame."""
-        return rotation(self.quaternion).T @ direction
+        return turned_back(rotation(self.quaternion), direction)
 
 
 DISTANCE, BALL, HINGE = "distance", "ball", "hinge"
@@ -118,8 +119,9 @@ def rotation(q: FloatArray) -> FloatArray:
 
 def quaternion(axis: tuple[float, float, float], angle: float) -> FloatArray:
     """Unit quaternion (4,) of a turn by `angle` [rad] round `axis`."""
-    u = np.asarray(axis, float) / np.linalg.norm(axis)
-    return np.concatenate([[np.cos(angle / 2)], np.sin(angle / 2) * u])
+    x = np.asarray(axis, float)
+    sine, cosine = sine_cosine(angle / 2)
+    return np.concatenate([[cosine], sine * (x / norm(x))])
 
 
 def numbers(what: str, value: object, n: int) -> FloatArray:
@@ -175,5 +177,5 @@ def normalised(x: FloatArray, least: float = 0.0) -> FloatArray | None:
             return None
         x = x / scale
         least = 0.0
-    size = float(np.linalg.norm(x))
+    size = norm(x)
     return x / size if size > least else None

@@ -16,6 +16,7 @@ from lavender._arrays import FloatArray
 from lavender.errors import InputError, UnknownName
 from lavender.ordering import ENGINE_ORDERS
 from lavender.registry import get
+from lavender.scene import arithmetic
 from lavender.scene.parts import (
     BALL,
     DISTANCE,
@@ -439,7 +440,7 @@ class Scene:
                 raise InputError(f"{label} takes anchor_a and anchor_b, no anchor or axis")
             pa, pb = (self._anchor(label, i, p) for i, p in ((a, anchor_a), (b, anchor_b)))
             with np.errstate(over="ignore"):
-                far = float(np.linalg.norm(pb - pa))
+                far = arithmetic.norm(pb - pa)
             length = number(f"length of {label} [m]", far if length is None else length, low=0.0)
             if length == 0.0:
                 raise InputError(f"{label} has length 0; use a ball joint")
@@ -530,12 +531,9 @@ def _inertia(label: str, given: Any, shape: Any, mass: float) -> FloatArray:
 
 def _has_reciprocal(mass: float, inertia: FloatArray) -> bool:
     # the engine works with 1/m and I^-1
+    inverse = arithmetic.inverse(inertia)
     with np.errstate(all="ignore"):
-        try:
-            inverse = np.linalg.inv(inertia)
-        except np.linalg.LinAlgError:
-            return False
-        return bool(np.isfinite(np.divide(1.0, mass)) and np.isfinite(inverse + inverse.T).all())
+        return bool(inverse is not None and np.isfinite(np.divide(1.0, mass)) and np.isfinite(inverse).all())
 
 
 def _tensor(label: str, given: Any) -> FloatArray:
