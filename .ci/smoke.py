@@ -1,6 +1,6 @@
 """Import lavender from where it should come, solve a small problem, compare with the answer made by hand.
 
-python .ci/smoke.py FOLDER        lavender and its kernels must be imported from below FOLDER
+python .ci/smoke.py [FOLDER]        lavender and its kernels must be imported from below FOLDER, else this environment
 """
 
 import sys
@@ -32,4 +32,4 @@ def main(folder: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    main(Path(sys.argv[1] if len(sys.argv) > 1 else sys.prefix))
