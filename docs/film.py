@@ -1,0 +1,94 @@
+"""Make the moving picture of the page that runs the kernels: docs/static/web.gif.
+
+    python docs/film.py [OUT.gif] [--preset cards] [--seconds 5] [--pace 1.5]
+
+Chromium without a window (playwright, the extra `dev`) opens the page at a preset; every frame is some whole steps and
+a picture of both sides and of the caption that measures them, so each run makes the same film. Pillow writes it with
+one palette for all frames. A file above `MOST` bytes is not written.
+"""
+
+import argparse
+import io
+import os
+import shutil
+import sys
+import tempfile
+import threading
+from pathlib import Path
+
+from PIL import Image
+from playwright.sync_api import sync_playwright
+
+from lavender.web import pages
+
+MOST = 1_000_000  # bytes
+FRAMES = 12  # a second
+COLORS = 64
+WIDTH = 900  # pixels
+OUT = Path(__file__).resolve().parent / "static" / "web.gif"
+
+
+def frames(preset, seconds, pace):
+    """PIL images, `FRAMES` a second; `pace` simulated seconds in each."""
+    names = ("chromium", "chromium-browser", "google-chrome")
+    found = os.environ.get("CHROMIUM") or next(filter(None, map(shutil.which, names)), None)
+    if found is None:
+        sys.exit(f"none of {', '.join(names)} is installed, and CHROMIUM names no browser")
+    with tempfile.TemporaryDirectory() as folder:
+        pages.write_page(Path(folder), print)
+        server = pages.server(Path(folder))
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        with sync_playwright() as p:
+            # Containers and root have no user namespaces to build the sandbox from.
+            browser = p.chromium.launch(executable_path=found, args=["--no-sandbox"])
+            options = {"viewport": {"width": WIDTH, "height": 900}, "color_scheme": "light"}
+            page = browser.new_page(**options, reduced_motion="reduce")  # nothing moves but by the frame
+            page.goto(f"http://127.0.0.1:{server.server_address[1]}/#{preset}")
+            page.wait_for_selector("html[data-ready=true]")
+            page.wait_for_function("!lavender.waiting")
+            page.evaluate("lavender.play(false)")
+            first = page.locator("#caption").bounding_box()
+            last = page.locator(".side canvas").last.bounding_box()
+            clip = {
+                "x": 0,
+                "y": first["y"] - 6,
+                "width": WIDTH,
+                "height": last["y"] + last["height"] + 10 - first["y"],
+            }
+            dt = page.evaluate("lavender.scene.dt")
+            steps = 0
+            for k in range(int(seconds * FRAMES)):
+                due = round(k * pace / FRAMES / dt)
+                page.evaluate(f"lavender.advance({due - steps})")
+                steps = due
+                yield Image.open(io.BytesIO(page.screenshot(clip=clip))).convert("RGB")
+            browser.close()
+        server.shutdown()
+
+
+def write(out, images):
+    """One palette, made of the first, the middle and the last frame."""
+    some = [images[0], images[len(images) // 2], images[-1]]
+    sheet = Image.new("RGB", (some[0].width, 3 * some[0].height))
+    for k, image in enumerate(some):
+        sheet.paste(image, (0, k * image.height))
+    palette = sheet.quantize(COLORS, dither=Image.Dither.NONE)
+    plain = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
+    hold = [1000 // FRAMES] * (len(plain) - 1) + [1500]
+    data = io.BytesIO()
+    plain[0].save(data, "GIF", save_all=True, append_images=plain[1:], duration=hold, loop=0, optimize=True)
+    size = len(data.getvalue())
+    if size > MOST:
+        sys.exit(f"{len(plain)} frames are {size} bytes; {MOST} are allowed: fewer --seconds")
+    out.write_bytes(data.getvalue())
+    print(f"{out}: {len(plain)} frames of {plain[0].width} x {plain[0].height}, {size} bytes")
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("out", nargs="?", type=Path, default=OUT)
+    parser.add_argument("--preset", default="cards")
+    parser.add_argument("--seconds", type=float, default=5.0, help="of the film")
+    parser.add_argument("--pace", type=float, default=1.5, help="simulated seconds in a second of the film")
+    given = parser.parse_args()
+    write(given.out, list(frames(given.preset, given.seconds, given.pace)))
