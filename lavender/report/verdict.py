@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
-from lavender.bench.record import level_name
+from lavender.bench.record import Record, level_name
 from lavender.bench.store import Records
 from lavender.report import tables
+from lavender.report.moved import by_speed, speed_levels, speed_name
 from lavender.report.tables import Advice
 from lavender.report.text import count, residual, seconds
 
@@ -33,30 +34,92 @@ class Verdict:
         return " ".join(self.sentences)
 
 
+@dataclass(frozen=True)
+class _Scale:
+    """What a level is of: a residual, or metres per second of motion error."""
+
+    reached: Callable[[float], str]  # "to 1e-6"
+    short: Callable[[float], str]  # how far one came in a time
+    tol: Callable[[str, float], float]  # to ask a solver for, so that it reaches a level
+    useless: float  # how far is too far to be worth a sentence
+
+
+BY_RESIDUAL = _Scale(lambda x: f"to {level_name(x)}", residual, lambda solver, x: x, 1.0)
+
+
 def verdict(records: Records, times: Sequence[float] = ()) -> Verdict:
-    """The recommendation for everything that was measured together."""
-    cases = list(dict.fromkeys(r.case for r in records if r.step < 0))
+    """The recommendation for everything that was measured together.
+
+    By motion error where the plan names speed levels; where motion errors were measured beside residuals, a sentence
+    says who is first by them.
+    """
     if tables.is_campaign(records) or not len(records):
         return Verdict((), (), ())
+    newest = next(reversed(list(records.runs.values())), None)
+    speeds = speed_levels(records)
+    if not speeds:
+        return _of(records, times, BY_RESIDUAL)
+    moving = by_speed(records)
+    scale = _Scale(
+        lambda x: f"until no body is wrong by more than {speed_name(x)}",
+        lambda x: f"wrong by {residual(x)} m/s",
+        lambda solver, x: _tolerance(moving, solver, x),
+        math.inf,
+    )
+    if newest is not None and newest.plan.get("speed_levels"):
+        return _of(moving, times, scale)
+    found = _of(records, times, BY_RESIDUAL)
+    best = _best(moving, "all")[0].best
+    if best is None:
+        return found
+    level = speeds[len(speeds) // 2]
+    more = f"By motion error {best.solver}: {seconds(best.score)} {scale.reached(level)}."
+    return replace(found, sentences=(*found.sentences, more))
+
+
+def _best(records: Records, what: str) -> tuple[Advice, str]:
+    # of the middle level, and what it is of
     levels = tables.levels_of(records)
     level = levels[len(levels) // 2]
-    times = tuple(times) or tables.time_budgets(records)
+    cases = list(dict.fromkeys(r.case for r in records if r.step < 0))
     if cases:
-        best = tables.to_level(records, "all", cases, level)
+        return tables.to_level(records, what, cases, level), _name(records, cases)
+    best = next(a for a in tables.advice_by_sequence(records, ())[0] if a.target == level)
+    return best, f"a step of {best.family}"
+
+
+def _of(records: Records, times: Sequence[float], scale: _Scale) -> Verdict:
+    cases = list(dict.fromkeys(r.case for r in records if r.step < 0))
+    times = tuple(times) or tables.time_budgets(records)
+    best, what = _best(records, "all")
+    if cases:
         quick = [tables.within(records, "all", cases, t) for t in times]
-        return _verdict(_name(records, cases), best, quick, level)
-    by_level, by_time = tables.advice_by_sequence(records, times)
-    best = next(a for a in by_level if a.target == level)
-    quick = [a for a in by_time if a.family == best.family]
-    return _verdict(f"a step of {best.family}", best, quick, level)
+    else:
+        quick = [a for a in tables.advice_by_sequence(records, times)[1] if a.family == best.family]
+    return _verdict(what, best, quick, scale)
 
 
-def _verdict(what: str, best: Advice, quick: Sequence[Advice], level: float) -> Verdict:
-    first = best.best
+def _tolerance(records: Records, solver: str, level: float) -> float:
+    """The residual to ask for: the tightest that the quickest runs to this speed were asked for, over the cases."""
+    quickest: dict[str, Record] = {}
+    for r in records:
+        if r.solver != solver or r.mode != "tol" or r.relative > level:
+            continue
+        if r.case not in quickest or r.time_min < quickest[r.case].time_min:
+            quickest[r.case] = r
+    tightest = min((r.tol for r in quickest.values()), default=math.nan)
+    if not tightest > 0.0:
+        return math.nan
+    power = math.floor(math.log10(tightest))
+    return float(f"{math.floor(tightest / 10.0**power + 1e-9)}e{power}")  # rounded down: it still gets there
+
+
+def _verdict(what: str, best: Advice, quick: Sequence[Advice], scale: _Scale) -> Verdict:
+    first, level = best.best, best.target
     leaders = [c.solver for c in best.ranking[:3] if c.solved]
     if first is None:
-        return Verdict((f"Nobody brings any of {what} to {level_name(level)}.",), (), tuple(leaders))
-    said = f"Use {first.solver}: {seconds(first.score)} to {level_name(level)} on {what}"
+        return Verdict((f"Nobody brings any of {what} {scale.reached(level)}.",), (), tuple(leaders))
+    said = f"Use {first.solver}: {seconds(first.score)} {scale.reached(level)} on {what}"
     if first.solved < first.cases:
         said += f", of which it brings {first.solved} there"
     elif math.isfinite(first.worst) and first.worst > 3.0 * first.score:
@@ -65,17 +128,21 @@ def _verdict(what: str, best: Advice, quick: Sequence[Advice], level: float) -> 
     sentences = [said]
     if best.ties:
         sentences.append(f"As good within noise: {', '.join(best.ties)}.")
-    if first.iterations and first.how.startswith(f"{first.iterations} iterations"):
+    tol = scale.tol(first.solver, level)
+    by_budget = bool(first.iterations) and first.how.startswith(f"{first.iterations} iterations")
+    if by_budget or not math.isfinite(tol):
         code = [_budget(first.solver, first.iterations)]
     else:
-        code = [f'lv.solve(problem, "{first.solver}", tol={level_name(level)})']
-    shorter = [a for a in quick if a.target <= QUICKER * first.score and a.best and a.best.score < 1.0]
+        code = [f'lv.solve(problem, "{first.solver}", tol={level_name(tol)})']
+    shorter = [
+        a for a in quick if a.target <= QUICKER * first.score and a.best and a.best.score < scale.useless
+    ]
     if shorter:
         other = shorter[-1].best
         assert other is not None
         how = f", {other.how}" if other.how else ""
         sentences.append(
-            f"If you have only {seconds(shorter[-1].target)}, take {other.solver}{how}: {residual(other.score)}."
+            f"If you have only {seconds(shorter[-1].target)}, take {other.solver}{how}: {scale.short(other.score)}."
         )
         if other.iterations:
             code.append(_budget(other.solver, other.iterations))

@@ -5,6 +5,7 @@ import json
 import math
 import os
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from lavender import bench, report
 from lavender.cli import cli, main
 from lavender.report import moved, tables
 from lavender.report.curves import figures
+from lavender.report.verdict import verdict
 from lavender.report.write import write
 
 PLAN = bench.Plan(
@@ -39,6 +41,32 @@ def test_times_to_a_speed_are_those_of_runs_that_reached_it(records):
         assert row.best == min(r.motion_speed for r in runs)
         assert row.bound >= 0.0
     assert moved.speed_levels(records) == (1e-2, 1e-4)
+
+
+def test_the_first_sentence_is_by_motion_error_where_that_was_asked_for(records):
+    working = moved.working(records)
+    said = verdict(working)
+    best = next(a for a in moved.advice_by_speed(working) if a.target == 1e-4).best
+    assert said.sentences[0].startswith(f"Use {best.solver}: ")
+    assert "until no body is wrong by more than 1e-4 m/s on your stack" in said.sentences[0]
+    # the line to copy does what the sentence says
+    problem = lv.suite.case("stack(n=16)").problem
+    solution = eval(said.code[0], {"lv": lv, "problem": problem})
+    assert solution.motion_error().speed <= 1e-4
+    plain = records_without(records, "speed_levels")
+    found = verdict(moved.working(plain))
+    assert found.sentences[0].startswith("Use ") and " to 1e-3 on your stack" in found.sentences[0]
+    assert found.sentences[-1].startswith("By motion error ") and "1e-3 m/s" in found.sentences[-1]
+
+
+def records_without(records, name):
+    """The same, as if its plan had not had an entry."""
+    out = bench.Records()
+    for run in records.runs.values():
+        out.add(replace(run, plan={k: v for k, v in run.plan.items() if k != name}))
+    for entry in (*records.cases.values(), *records):
+        out.add(entry)
+    return out
 
 
 def test_recommendations_by_speed_name_who_gets_there(records):
