@@ -76,7 +76,7 @@ PER_ROW = {
     "cone": 0.0,
     "coulomb": 1.0 / 40.0,
 }  # more of them: contacts change their side
-TAIL = {"linear": 2, "lcp": 10, "cone": 10, "coulomb": 60}  # more that are granted before another is asked
+TAIL = {"linear": 2, "lcp": 10, "cone": 10, "coulomb": 24}  # more that are granted before another is asked
 MOST = 30.0  # of what rows add
 GENERAL_COUNT = {"linear": 2.0, "lcp": 10.0, "cone": 12.0, "coulomb": 20.0}  # over generalised velocities
 ADMM_COUNT, ADMM_FACTORS = 240.0, 3.0  # iterations to six decades, and how often rho moves on the way

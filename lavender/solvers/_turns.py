@@ -134,7 +134,13 @@ class Turns:
                 and sweeps.run(self.budget, candidate.cost)
             ):
                 return True
-            if whole(trail, candidate, self.budget, candidate.limit << k, self.more(candidate)):
+            if whole(
+                trail,
+                candidate,
+                self.budget,
+                candidate.limit << (k + 2 * (self.inside is not None)),
+                self.more(candidate),
+            ):
                 return True
             if self.taken > k:
                 break  # turns were taken meanwhile
