@@ -47,9 +47,13 @@ PLAIN = ["-DLAVENDER_ONE_LANE"]
 CYTHONS_OWN = "ISO C forbids conversion of function pointer to object pointer type"
 
 #: Modules of these names are exempt from the check of what a core reaches, with the reason. `threaded` yields and
-#: sleeps by the system's calls; `chain` calls the Python faces of kernels one after the other. The arithmetic of both
-#: is that of other modules, which this check sees.
-EXEMPT = {"threaded": "threads", "chain": "calls kernels, computes nothing"}
+#: sleeps by the system's calls; `chain` calls the Python faces of kernels one after the other, `many` the kernels
+#: themselves, and allocates what they need. The arithmetic of all is that of other modules, which this check sees.
+EXEMPT = {
+    "threaded": "threads",
+    "chain": "calls kernels, computes nothing",
+    "many": "allocates and calls kernels, computes nothing",
+}
 
 #: Types that have one size everywhere, as a host outside C must build them; structs end in _t too.
 FIXED = re.compile(r"(void|float|double|u?int(8|16|32|64)_t|\w+_t)$")

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TypeVar, overload
 
 if TYPE_CHECKING:
     from lavender.motion.reference import Kept
+    from lavender_ext.core.problem import Data
     from lavender_ext.judge.measure import Judged
 
 T = TypeVar("T")
@@ -37,15 +38,15 @@ class Derived:
         "motion",
         "nothing",
         "spread",
-        "start_relative",
         "tried",
+        "view",
     )
 
     def __init__(self) -> None:
         self.lock = RLock()  # held while a `once` is worked out
-        self.start_relative: float | None = None  # -, of doing nothing
         self.nothing: bool | None = None  # whether doing nothing is right
         self.judged: Judged | None = None  # the judge's pass over a result that is about to be returned
+        self.view: Data | None = None  # in generalised coordinates: what kernels read, from the beginning
         self.tried: Tried | None = None
         self.spread: int | None = None  # how far apart blocks that share a body stand
         self.chain: Any = None  # of a problem of few rows, False where it has none

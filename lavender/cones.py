@@ -20,7 +20,7 @@ import numpy as np
 
 from lavender._arrays import FloatArray, IntArray, as_array, check_not_nan, check_not_negative, equal
 from lavender.errors import InputError
-from lavender_ext.core.problem import BOUNDED, FREE, KINDS, ROUND_CONES, shape_of
+from lavender_ext.core.problem import BOUNDED, FREE, KINDS, ROUND_CONES, Blocks, shape_of
 
 __all__ = ["CONTACT", "CONTACT_SPIN", "ROUND", "ROW", "Cones", "project"]
 
@@ -63,18 +63,25 @@ class Cones:
             if type(given) is not np.ndarray or given.dtype is not dtype or given.ndim != 1:
                 return False
             own.append(given.copy())
-        bits = shape_of(*own)
+        bits, blocks = shape_of(*own)
         if bits < 0:
             return False
         for (name, _), value in zip(_FIELDS, own, strict=True):
             value.flags.writeable = False
             object.__setattr__(self, name, value)
-        self._remember(bits)
+        self._remember(bits, blocks)
         return True
 
-    def _remember(self, bits: int) -> None:
+    def _remember(self, bits: int, blocks: Blocks) -> None:
+        put = self.__dict__
+        put["_blocks"] = blocks
         for name, bit in (("is_free", FREE), ("is_bounded_rows", BOUNDED), ("has_round", ROUND_CONES)):
-            self.__dict__[name] = bool(bits & bit)
+            put[name] = bool(bits & bit)
+
+    @cached_property
+    def _blocks(self) -> Blocks:
+        # what kernels read
+        return Blocks(*(getattr(self, name) for name, _ in _FIELDS))
 
     def _check(self) -> None:
         ptr = as_array("cones.ptr", self.ptr, (None,), dtype=np.int32)
@@ -142,9 +149,14 @@ class Cones:
     def _trusted(cls, *values: np.ndarray) -> Cones:
         # For arrays this module has just made; nothing is checked again.
         cones = object.__new__(cls)
-        for field, value in zip(fields(cls), values, strict=True):
+        bits, blocks = shape_of(*values)
+        if bits < 0:  # numbers that another engine should not have held
+            return cls(*values)
+        cones._remember(bits, blocks)
+        put = cones.__dict__
+        for (name, _), value in zip(_FIELDS, values, strict=True):
             value.flags.writeable = False
-            object.__setattr__(cones, field.name, value)
+            put[name] = value
         return cones
 
     @classmethod
@@ -158,7 +170,7 @@ class Cones:
     @classmethod
     def free(cls, m: int) -> Cones:
         """m unbounded rows, each its own block: a linear system."""
-        cones = cls._trusted(
+        return cls._trusted(
             np.arange(m + 1, dtype=np.int32),
             np.zeros(m, np.int32),
             np.full(m, -np.inf),
@@ -166,8 +178,6 @@ class Cones:
             np.zeros(m),
             np.zeros(m),
         )
-        cones.__dict__["is_free"] = True
-        return cones
 
     @classmethod
     def contacts(

@@ -14,15 +14,14 @@ from typing import Any
 
 import numpy as np
 
-from lavender._arrays import FloatArray
 from lavender.errors import InputError
 from lavender.problem import Problem
 from lavender.registry import SolverSpec, get
 from lavender.solution import Solution
-from lavender.solve import decide_empty_rows, late, solve, solve_few
-from lavender.solvers._costs import general_first
-from lavender.solvers._few import FEW_GENERAL
+from lavender.solve import of_batch, solve, solve_few
+from lavender.solvers._costs import GENERAL_GATE as GATE
 from lavender.solvers._newton import general
+from lavender_ext.few.many import Batch
 
 __all__ = ["solve_many"]
 
@@ -71,64 +70,50 @@ def solve_many(
     made: list[Solution | None] = [None] * len(given)
     spec = get(solver)
     more = {"tol": tol, "max_iter": max_iter, **options}
-    at = [
-        i
-        for i, p in enumerate(given)
-        if isinstance(p, Problem) and p.generalized is not None and p.m > FEW_GENERAL
-    ]
-    quick = not options and solver in ("auto", "newton") and max_iter is None and 0.0 <= tol < np.inf
-    parts = [at[k::threads] for k in range(min(threads, len(at)))] if quick else []
+    plain = not options and max_iter is None
+    together = plain and solver in ("auto", "newton") and isinstance(tol, float) and 0.0 < tol < np.inf
+    at = [i for i, p in enumerate(given) if type(p) is Problem and p.generalized is not None]
 
-    def together(part: list[int]) -> None:
-        found = _loop([given[i] for i in part], [starts[i] for i in part], tol, spec)
-        for i, solution in zip(part, found, strict=True):
+    def batch(part: list[int]) -> None:
+        for i, solution in _batch(given, starts, part, tol, spec):
             made[i] = solution
 
-    short = spec.few is not None and not options and max_iter is None
+    short = spec.few is not None and plain
 
     def alone(i: int) -> None:
         made[i] = solve_few(given[i], spec, starts[i], tol) if short else None
         if made[i] is None:
             made[i] = solve(given[i], solver, impulse=starts[i], **more)
 
+    parts = [at[k::threads] for k in range(min(threads, len(at)))] if together else []
     if threads == 1:
         for part in parts:
-            together(part)
-        for i in range(len(given)):
-            if made[i] is None:
+            batch(part)
+        for i, solution in enumerate(made):
+            if solution is None:
                 alone(i)
     else:
         with ThreadPoolExecutor(threads) as pool:
-            list(pool.map(together, parts))
-            list(pool.map(alone, [i for i in range(len(given)) if made[i] is None]))
+            list(pool.map(batch, parts))
+            list(pool.map(alone, [i for i, solution in enumerate(made) if solution is None]))
     return [solution for solution in made if solution is not None]
 
 
-def _loop(problems: list[Problem], starts: list[Any], tol: float, spec: SolverSpec) -> list[Solution | None]:
-    """Those that the compiled loop ends, each with its share of the time; None for the others."""
+def _batch(
+    problems: list[Problem], starts: list[Any], at: list[int], tol: float, spec: SolverSpec
+) -> list[tuple[int, Solution]]:
+    """Solutions of those of the problems `at` that the compiled loop ends, each with its share of the time."""
     begin = perf_counter()
-    prepared = [general.prepare(p) for p in problems]
-    if spec.name == "auto":  # which begins with it where it costs next to nothing
-        for i, kernel in enumerate(prepared):
-            if kernel is not None and not general_first(problems[i], kernel.largest):
-                prepared[i] = None
-    held = [i for i, kernel in enumerate(prepared) if kernel is not None]
-    if len(held) < len(problems):  # some are too large: the others alone
-        those = iter(_loop([problems[i] for i in held], [starts[i] for i in held], tol, spec))
-        return [None if kernel is None else next(those) for kernel in prepared]
-    kernels = [kernel for kernel in prepared if kernel is not None]
-    lams: list[FloatArray] = []
-    proofs = []
-    for p, start in zip(problems, starts, strict=True):
-        if start is not None:
-            lam = p.impulse_array(start)
-        else:
-            lam = p.start() if p.guess is None else p.guess.copy()
-        proofs.append(len(p.metric.empty) > 0 and decide_empty_rows(p, lam) is not None)
-        lams.append(lam)
-    found = general.run_many(problems, kernels, lams, tol)
-    seconds = (perf_counter() - begin) / max(1, len(problems))
+    views, given = [], []
+    for i in at:
+        p, start = problems[i], starts[i]
+        views.append(p.derived.view)
+        given.append(p.guess if start is None else p.impulse_array(start))
+    work = Batch(views, given, tol, GATE if spec.name == "auto" else None, general.LIMIT)
+    work.run()
+    seconds = (perf_counter() - begin) / max(1, len(at))
     return [
-        None if end is None or proof else late(p, spec, end[0], end[1], tol, seconds)
-        for p, end, proof in zip(problems, found, proofs, strict=True)
+        (i, Solution.later((of_batch, (work, k, problems[i], spec, tol, seconds))))
+        for k, i in enumerate(at)
+        if work.is_solved(k)
     ]

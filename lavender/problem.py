@@ -34,7 +34,7 @@ from lavender.generalized import Generalized
 from lavender.rows import Rows
 from lavender_ext.core import assemble
 from lavender_ext.core.problem import LAWS as FRICTION_NUMBER
-from lavender_ext.core.problem import Data, dense_to_csr, nothing_done, rows_velocity
+from lavender_ext.core.problem import Data, dense_to_csr, general_data, nothing_done, rows_velocity
 from lavender_ext.judge import measure
 from lavender_ext.pivot import principal
 
@@ -215,6 +215,9 @@ class Problem:
         if generalized.m != m:
             raise InputError(f"J has {generalized.m} rows; {m} are needed, as the cones have")
         self._check_compliance(m)
+        self.derived.view = general_data(
+            self.cones._blocks, self.b, generalized.operator, self.compliance, FRICTION_NUMBER[self.friction]
+        )
 
     def _check_compliance(self, m: int) -> None:
         put = object.__setattr__
@@ -542,12 +545,14 @@ class Problem:
     @once
     def metric(self) -> Data:
         """What the judge reads: `data`, or in generalised coordinates J and M as they are, d, Y = J L^-1 D^-1/2."""
-        if self.generalized is None:
+        view = self.derived.view
+        if view is None:
             return self.data
         try:
-            return self._data(general=(self.generalized.operator, self.compliance))
+            view.prepare()
         except OverflowError as error:
             raise InputError(f"the problem is too large: {error}") from None
+        return view
 
     def _data(self, **operator: Any) -> Data:
         c = self.cones

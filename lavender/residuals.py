@@ -91,7 +91,7 @@ def reference(problem: Problem) -> tuple[float, float]:
     """E0 [sqrt J] and V0 [m/s]; computed once per problem."""
     data = problem.metric
     if data.start_energy < 0.0:
-        start, problem.derived.start_relative = measure.begin(data, len(problem.vanished_rows) > 0)
+        start = measure.begin(data, len(data.empty) > 0 and len(problem.vanished_rows) > 0)
         problem.__dict__.setdefault("_start", start)
         if problem.generalized is not None and "csr_data" in problem.__dict__:
             problem.csr_data.set_start(data.start_energy, data.start_velocity)
@@ -130,8 +130,8 @@ def known(problem: Problem, impulse: FloatArray) -> float | None:
     last = problem.derived.judged
     if last is not None and measure.same_bits(last.impulse, impulse):
         return float(last.relative)
-    start = problem.derived.start_relative
-    return start if start is not None and measure.same_bits(problem._start, impulse) else None
+    start: float = problem.metric.start_relative
+    return start if start >= 0.0 and measure.same_bits(problem._start, impulse) else None
 
 
 def quick(

@@ -212,6 +212,13 @@ class Solution:
         kept["setup_time"], kept["solve_time"], kept["_rest"] = 0.0, solve_time, rest
         return made
 
+    @classmethod
+    def later(cls, rest: tuple[Callable[..., dict[str, Any]], tuple[Any, ...]]) -> Solution:
+        """As `late`, with every field left for later."""
+        made: Solution = object.__new__(cls)
+        made.__dict__["_rest"] = rest
+        return made
+
     def __getattr__(self, name: str) -> Any:
         # Only what is not there comes here: the first of the fields that `late` left for later, or no field at all.
         kept = self.__dict__

@@ -448,6 +448,15 @@ def late(
     return Solution.late(impulse, CONVERGED, tol, seconds, (_rest, (problem, spec, judged, counts)))
 
 
+def of_batch(
+    batch: Any, i: int, problem: Problem, spec: SolverSpec, tol: float, seconds: float
+) -> dict[str, Any]:
+    """All fields of the solution of a `Batch`'s problem i, which converged."""
+    judged, counts = batch.judged(i)
+    made = {"impulse": judged.impulse, "status": CONVERGED, "tol": tol, "setup_time": 0.0}
+    return made | {"solve_time": seconds} | _rest(problem, spec, judged, counts)
+
+
 def _rest(problem: Problem, spec: SolverSpec, judged: Any, counts: Any) -> dict[str, Any]:
     assert spec.few is not None
     claim = spec.few.claim(problem, counts)

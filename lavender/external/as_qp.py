@@ -247,10 +247,10 @@ def impulse_form(problem: Problem, *, unit_diagonal: bool = True, equality: bool
         for n, t, ratio in rows.pairs:
             put.row([(n, -ratio), (t, 1.0)])
             put.row([(n, -ratio), (t, -1.0)])
-        for n, t1, t2, ratio in rows.disks:
-            put.row([(n, -ratio)])
-            put.row([(t1, -1.0)])
-            put.row([(t2, -1.0)])
+        for disk in rows.disks:
+            put.row([(disk.normal, -disk.ratios[0])])
+            for t, ratio in zip(disk.tangents, disk.ratios, strict=True):
+                put.row([(t, -disk.ratios[0] / ratio)])
         matrix = put.matrix(k)
         rhs = np.zeros(matrix.shape[0])
     return QP(
@@ -261,7 +261,7 @@ def impulse_form(problem: Problem, *, unit_diagonal: bool = True, equality: bool
         b=rhs,
         n_zero=n_zero,
         n_nonneg=2 * len(rows.pairs),
-        soc=(3,) * len(rows.disks),
+        soc=tuple(1 + len(disk.tangents) for disk in rows.disks),
         lb=lb,
         ub=ub,
         problem=problem,
@@ -325,14 +325,14 @@ def velocity_form(problem: Problem) -> QP:
             put.row([(tangent, sign)])
             slack.row([(n, -1.0)])
         n += 1
-    alone = [normal for normal in heads if normal not in {d[0] for d in rows.disks}]
+    alone = [normal for normal in heads if normal not in {d.normal for d in rows.disks}]
     for normal in alone:
         put.row([(normal, 1.0)])
         slack.row(heads[normal])
-    for normal, t1, t2, ratio in rows.disks:
-        put.row([(normal, 1.0)])
-        slack.row(heads.get(normal, []))
-        for tangent in (t1, t2):
+    for disk in rows.disks:
+        put.row([(disk.normal, 1.0)])
+        slack.row(heads.get(disk.normal, []))
+        for tangent, ratio in zip(disk.tangents, disk.ratios, strict=True):
             put.row([(tangent, ratio)])
             slack.row([])
     back = sp.csr_matrix(put.matrix(k).T)
@@ -358,7 +358,7 @@ def velocity_form(problem: Problem) -> QP:
         b=-(back.T @ g),
         n_zero=len(free),
         n_nonneg=n_nonneg,
-        soc=(3,) * len(rows.disks),
+        soc=tuple(1 + len(disk.tangents) for disk in rows.disks),
         lb=lb,
         ub=ub,
         problem=problem,
@@ -404,15 +404,26 @@ class _Entries:
 
 
 @dataclass(frozen=True)
+class _Disk:
+    """|(x_t / a_t over all tangents)| <= x_n: two tangents, a the same, or a round cone of up to five."""
+
+    normal: int
+    tangents: tuple[int, ...]
+    ratios: tuple[float, ...]  # a
+
+
+@dataclass(frozen=True)
 class _FrictionRows:
     """Rows of friction among the kept ones, with a = mu S_n / S_t (times r on spin) in scaled unknowns."""
 
     pairs: list[tuple[int, int, float]]  # normal, the row bounded by |x| <= a x_n, a
-    disks: list[tuple[int, int, int, float]]  # normal, two tangents, a
+    disks: list[_Disk]
 
     @property
     def members(self) -> list[int]:
-        return [i for p in self.pairs for i in p[:2]] + [i for d in self.disks for i in d[:3]]
+        return [i for p in self.pairs for i in p[:2]] + [
+            i for d in self.disks for i in (d.normal, *d.tangents)
+        ]
 
 
 @dataclass(frozen=True)
@@ -462,7 +473,7 @@ class _Parts:
         place = np.full(self.problem.m, -1)
         place[self.kept] = np.arange(len(self.kept))
         pairs: list[tuple[int, int, float]] = []
-        disks: list[tuple[int, int, int, float]] = []
+        disks: list[_Disk] = []
         for i in self.contacts:
             n, end = int(c.ptr[i]), int(c.ptr[i + 1])
             spin = c.kind[i] == CONTACT_SPIN
@@ -472,7 +483,7 @@ class _Parts:
             if len(tangents) == 1:
                 pairs.append((j, int(place[tangents[0]]), ratio[0]))
             elif tangents:
-                disks.append((j, int(place[tangents[0]]), int(place[tangents[1]]), ratio[0]))
+                disks.append(_Disk(j, tuple(int(place[t]) for t in tangents), tuple(ratio)))
             if spin and place[end - 1] >= 0:
                 s = int(place[end - 1])
                 pairs.append((j, s, float(c.mu[i] * c.patch_radius[i] * self.root[j] / self.root[s])))

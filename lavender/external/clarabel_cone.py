@@ -1,4 +1,4 @@
-"""Clarabel on the convex relaxation of friction: disk and spin as second-order cones.
+"""Clarabel on the convex relaxation of friction: disk and spin as second-order cones, a round cone as one.
 
     min 1/2 l.A l - b.l,   l_n >= 0,  |l_t| <= mu l_n,  |l_s| <= mu r l_n          (impulse form)
 
@@ -69,6 +69,7 @@ SPEC = SolverSpec(
     resumable=False,
     external=True,
     impulse=False,
+    round_cones=True,
     max_iter=200,
     options=OPTIONS,
     requires=("clarabel",),

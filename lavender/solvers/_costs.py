@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from lavender.problem import Problem
+from lavender.problem import LAWS, Problem
 from lavender.registry import FEW
 from lavender.solvers._accelerated import sweep_work
 from lavender.solvers._factor import choose
@@ -97,6 +97,15 @@ NARROW = 40  # half bandwidth up to which a band is what `direct` takes
 TREE = 1.05  # neighbours of a body, in the mean, up to which bodies form trees
 TINY_FACTOR = 20e3  # ns, below which a factor is not looked at more closely
 LOOKS = 4  # at so many sweeps
+# All that `general_first` reads, for a compiled loop over many problems.
+GENERAL_GATE = (
+    GENERAL_START,
+    GENERAL_ROW,
+    GENERAL,
+    GENERAL_FIRST,
+    FORM,
+    tuple(GENERAL_COUNT[law] for law in LAWS),
+)
 GENERAL_TAIL = 200  # more steps over generalised velocities than expected that are granted
 ADMM_GENERAL = 1500  # rows up to which A of J and M, whose entries are not known, is formed for `admm`
 LEMKE_ROWS = 1000  # beyond, a dense tableau of 8 MB and more

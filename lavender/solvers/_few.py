@@ -36,8 +36,8 @@ def _make(problem: Problem) -> Chain | None:
         return None
     reference(problem)
     data, start = problem.metric, problem._start
-    relative = problem.derived.start_relative
-    if len(data.empty) or relative is None:
+    relative = data.start_relative
+    if len(data.empty) or relative < 0.0:
         return None
     if problem.generalized is not None:
         kernel = general.prepare(problem)

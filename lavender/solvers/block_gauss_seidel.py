@@ -74,6 +74,7 @@ SPEC = SolverSpec(
     laws=frozenset({"linear", "lcp", "coulomb", "cone"}),
     order=True,
     seed=True,
+    round_cones=True,
     max_iter=1000,
     summary="Gauss-Seidel over contacts and joints, each solved exactly",
     reference="Jourdan, Alart, Jean 1998; Acary, Bremond, Huber 2018 (NSGS with an exact local solver)",

@@ -28,6 +28,7 @@ SPEC = SolverSpec(
     laws=frozenset({"linear", "lcp", "coulomb", "cone"}),
     order=True,
     seed=True,
+    round_cones=True,
     max_iter=1000,
     options={"sweep": SWEEP_OPTION, "convex": CONVEX_OPTION},
     summary="nonlinear conjugate gradients over Gauss-Seidel sweeps",

@@ -100,7 +100,9 @@ cdef inline void project_block(const blocks_t* p, int32_t i, double* lam) noexce
     bound = p.mu[i] * lam[j]
     nt = n_tangents(p.kind[i], n)
     if nt > 0:
-        size = norm2(lam[j + 1], lam[j + 2]) if nt == 2 else fabs(lam[j + 1])
+        size = norm2(lam[j + 1], lam[j + 2]) if nt >= 2 else fabs(lam[j + 1])
+        for k in range(3, 1 + nt):                      # of a round cone
+            size = norm2(size, lam[j + k])
         if size > bound:
             size = bound / size
             for k in range(1, 1 + nt):

@@ -27,7 +27,8 @@ from libc.stdint cimport int32_t, int64_t
 import numpy as np
 
 from lavender_ext.accelerate.mixing cimport CONTROL, MAX_MEMORY, UNDONE, forget, mix, mixing_t, product, take
-from lavender_ext.core.block cimport CONE, CONTACT_SPIN, ROW, blocks_t, clip, n_tangents, norm2
+from lavender_ext.core.block cimport (CONE, CONTACT_SPIN, ROUND, ROW, blocks_t, clip, n_tangents, norm2, round_group,
+                                      round_section, round_share)
 from lavender_ext.core.problem cimport Data
 
 
@@ -156,6 +157,24 @@ cdef inline void solve_shifted(const factor_t* f, int32_t m, double* x, double* 
         x[i] = f.e[i] * s
 
 
+cdef inline void project_round(int32_t n, const double* root, double mu, const double* u, double* z) noexcept nogil:
+    """The same of a round cone of n rows; core/block.pxd (8)."""
+    cdef double t[3]
+    cdef double a[3]
+    cdef double s = 0.0, size = 0.0
+    cdef int32_t i, g, zone
+    t[0] = t[1] = t[2] = 0.0
+    a[0] = a[1] = a[2] = 0.0
+    for i in range(1, n):
+        g = round_group(i)
+        t[g] = norm2(t[g], u[i])
+        a[g] = mu * root[i] / root[0]
+    zone = round_section(t, a, u[0], &s, &size)
+    z[0] = s if zone == 0 else (u[0] if zone > 0 else 0.0)
+    for i in range(1, n):
+        z[i] = (round_share(a[round_group(i)], s, u[0]) if zone == 0 else (1.0 if zone > 0 else 0.0)) * u[i]
+
+
 cdef inline void project_block(const blocks_t* p, const double* root, int32_t i, const double* u,
                                double* z) noexcept nogil:
     """z = Pi_K(u) of one block, u, z whole scaled vectors; core/block.pxd (7)."""
@@ -164,6 +183,9 @@ cdef inline void project_block(const blocks_t* p, const double* root, int32_t i,
     if p.kind[i] == ROW:
         for k in range(j, j + n):
             z[k] = clip(u[k], p.lower[k] * root[k], p.upper[k] * root[k])
+        return
+    if p.kind[i] == ROUND:
+        project_round(n, root + j, p.mu[i], u + j, z + j)
         return
     nt = n_tangents(p.kind[i], n)
     at = p.mu[i] * root[j + 1] / root[j] if nt > 0 else 0.0

@@ -289,23 +289,18 @@ cdef inline void cone_error(const double* lam, const double* w, const double* d,
         e[i] = quotient(e[i], up)
 
 
-cdef inline void round_error(const double* lam, const double* w, const double* d, double mu, int32_t nt,
-                             double* e) noexcept nogil:
-    # (7) of ROUND, |lam_T| <= mu lam_n over all tangents together. Groups g (slide, spin, roll) have one d each: with
-    # y = sqrt(d) (lam - w / d), T_g = |y_g|, a_g = mu sqrt(d_g / d_n) the projection's normal part is the root s of
+cdef inline int32_t round_group(int32_t tangent) noexcept nogil:
+    # of tangents 1 to 5: slide, slide, spin, roll, roll
+    return 0 if tangent < 3 else (1 if tangent == 3 else 2)
+
+
+cdef inline int32_t round_section(const double* t, const double* a, double yn, double* section, double* size) noexcept nogil:
+    # Where y lies, by T_g in t (3) and a_g in a (3): -1 in the polar cone, 1 in the cone, else 0 and the s of (8);
+    # size: of the tangents against the cone, NaN where y is.
     #     sum (a_g T_g)^2 / ((1 + a_g^2) s - y_n)^2 = 1,        Pi_g = y_g a_g^2 s / ((1 + a_g^2) s - y_n)       (8)
     # by Newton's method from below: the left side falls and is convex.
-    cdef double t[3]
-    cdef double a[3]
-    cdef double rn = sqrt(d[0]), yn = rn * (lam[0] - w[0] / d[0]), y, s = 0.0, f, h, slope, q, inside = 0.0, polar = 0.0
-    cdef int32_t i, g, _step
-    t[0] = t[1] = t[2] = 0.0
-    a[0] = a[1] = a[2] = 0.0
-    for i in range(1, 1 + nt):
-        g = 0 if i < 3 else (1 if i == 3 else 2)
-        y = sqrt(d[i]) * (lam[i] - w[i] / d[i])
-        t[g] = norm2(t[g], y)
-        a[g] = mu * sqrt(d[i]) / rn
+    cdef double s = 0.0, f, h, slope, q, inside = 0.0, polar = 0.0
+    cdef int32_t g, _step
     for g in range(3):
         if t[g] > 0.0:
             inside = norm2(inside, t[g] / a[g])         # infinite without friction
@@ -313,14 +308,11 @@ cdef inline void round_error(const double* lam, const double* w, const double* d
             f = (yn + a[g] * t[g]) / (1.0 + a[g] * a[g])
             if f > s:
                 s = f
+    size[0] = inside
     if inside <= yn:
-        for i in range(1 + nt):
-            e[i] = w[i] / d[i]
-        return
+        return 1
     if yn + polar <= 0.0:
-        for i in range(1 + nt):
-            e[i] = lam[i]
-        return
+        return -1
     if polar > 0.0:
         for _step in range(64):
             h = -1.0
@@ -337,11 +329,42 @@ cdef inline void round_error(const double* lam, const double* w, const double* d
             if not f > s:
                 break
             s = f
+    section[0] = s
+    return 0
+
+
+cdef inline double round_share(double a, double s, double yn) noexcept nogil:
+    # Pi_g / y_g of (8)
+    return a * a * s / ((1.0 + a * a) * s - yn) if a > 0.0 else 0.0
+
+
+cdef inline void round_error(const double* lam, const double* w, const double* d, double mu, int32_t nt,
+                             double* e) noexcept nogil:
+    # (7) of ROUND, |lam_T| <= mu lam_n over all tangents together. Groups g (slide, spin, roll) have one d each: with
+    # y = sqrt(d) (lam - w / d), T_g = |y_g|, a_g = mu sqrt(d_g / d_n) the projection's normal part is the s of (8).
+    cdef double t[3]
+    cdef double a[3]
+    cdef double rn = sqrt(d[0]), yn = rn * (lam[0] - w[0] / d[0]), y, s = 0.0, f, inside = 0.0
+    cdef int32_t i, g, zone
+    t[0] = t[1] = t[2] = 0.0
+    a[0] = a[1] = a[2] = 0.0
+    for i in range(1, 1 + nt):
+        g = round_group(i)
+        y = sqrt(d[i]) * (lam[i] - w[i] / d[i])
+        t[g] = norm2(t[g], y)
+        a[g] = mu * sqrt(d[i]) / rn
+    zone = round_section(t, a, yn, &s, &inside)
+    if zone > 0:
+        for i in range(1 + nt):
+            e[i] = w[i] / d[i]
+        return
+    if zone < 0:
+        for i in range(1 + nt):
+            e[i] = lam[i]
+        return
     e[0] = lam[0] - s / rn
     for i in range(1, 1 + nt):
-        g = 0 if i < 3 else (1 if i == 3 else 2)
-        q = (1.0 + a[g] * a[g]) * s - yn
-        f = a[g] * a[g] * s / q if a[g] > 0.0 else 0.0
+        f = round_share(a[round_group(i)], s, yn)
         e[i] = lam[i] - f * (lam[i] - w[i] / d[i])
     if not (yn == yn and inside == inside):
         e[0] = yn + inside                              # NaN: comparisons above would hide it

@@ -14,16 +14,44 @@ cdef class Room:
 cdef Room room_for(Py_ssize_t bytes)
 
 
+cdef class Blocks:
+    cdef blocks_t at            # without law, b, d, nu and step
+    cdef bint single_rows       # every block is one ROW
+    cdef tuple keep
+
+
+cdef enum:                      # how `make_numbers` ended
+    MADE = 0
+    NO_MEMORY = 1
+    TOO_MANY = 2
+
+
+cdef struct made_t:             # of a problem in generalised coordinates; `free` both
+    int32_t* marks              # scratch (2 n), prow, pcol, pval (k + 1 each), empty (m + 1), cols
+    double* numbers             # d, nu, step (m + 1 each), Y
+    int32_t* empty              # inside marks
+    int32_t n_empty
+    int32_t n_panels
+    double values               # of Y
+
+
+cdef int32_t make_numbers(blocks_t* p, generalized_t* g, made_t* out) noexcept nogil
+
+
 cdef class Data:
     cdef blocks_t blocks
     cdef csr_t csr              # where A is given, or formed
     cdef rows_t rows            # where factored
     cdef generalized_t general  # where is_general
     cdef readonly bint factored, is_general
+    cdef readonly bint ready            # d, nu, step and Y are known
     cdef readonly bint single_rows      # every block is one ROW
     cdef readonly object empty
     cdef object _numbers, _d, _nu, _step
-    cdef int32_t* _place        # (n) scratch
-    cdef readonly double start_energy, start_velocity
+    cdef made_t made            # where is_general and ready
+    cdef readonly double start_energy, start_velocity, start_relative   # negative where not known
     cdef object _weight
     cdef list keep
+
+    cdef void adopt(self, made_t* made)
+    cdef object part(self, int which)

@@ -9,6 +9,9 @@
 from libc.math cimport fabs
 from libc.stdint cimport int32_t
 from libc.stdlib cimport free, malloc
+from libc.string cimport memcpy
+
+cimport cython
 
 import numpy as np
 
@@ -202,6 +205,53 @@ cdef public int32_t lav_general_diagonal(const blocks_t* p, const generalized_t*
     return n_empty
 
 
+cdef void point_at(blocks_t* p, generalized_t* g, const made_t* made) noexcept nogil:
+    cdef ssize_t k = p.n_blocks, m = p.n_rows
+    p.d = made.numbers
+    p.nu = made.numbers + m + 1
+    p.step = made.numbers + 2 * (m + 1)
+    g.y = made.numbers + 3 * (m + 1)
+    g.n_panels = made.n_panels
+    g.prow = made.marks + 2 * <ssize_t>g.n
+    g.pcol = g.prow + k + 1
+    g.pval = g.pcol + k + 1
+    g.cols = made.empty + m + 1
+
+
+cdef int32_t make_numbers(blocks_t* p, generalized_t* g, made_t* out) noexcept nogil:
+    """Panels, Y, d, nu and step of a problem in generalised coordinates, which then points at them; how it ended."""
+    cdef int32_t n = g.n, k = p.n_blocks, m = p.n_rows, n_cols
+    cdef ssize_t head = 2 * <ssize_t>n + 3 * (<ssize_t>k + 1) + m + 1, room = 2 * <ssize_t>g.jptr[m] + 64, most
+    cdef int32_t* w
+    out.marks = NULL
+    out.numbers = NULL
+    most = 2147483647 - head
+    while True:
+        w = <int32_t*>malloc((head + room) * sizeof(int32_t))
+        out.marks = w
+        if w == NULL:
+            return NO_MEMORY
+        out.n_panels = panel_pattern(g, k, p.ptr, w, w + 2 * n, w + 2 * n + k + 1, w + 2 * n + 2 * (k + 1), w + head,
+                                     <int32_t>room, &n_cols, &out.values)
+        if out.n_panels >= 0:
+            break
+        free(w)
+        out.marks = NULL
+        if room >= most:
+            return TOO_MANY
+        room = 2 * room if 2 * room < most else most
+    if out.values < 2147483647.0:
+        out.numbers = <double*>malloc((3 * (<ssize_t>m + 1) + <ssize_t>out.values + 1) * sizeof(double))
+    if out.numbers == NULL:
+        free(w)
+        out.marks = NULL
+        return NO_MEMORY if out.values < 2147483647.0 else TOO_MANY
+    out.empty = w + head - (m + 1)
+    point_at(p, g, out)
+    out.n_empty = lav_general_diagonal(p, g, <double*>p.d, <double*>p.nu, <double*>p.step, out.empty, w, <double*>g.y)
+    return MADE
+
+
 cdef class Room:
     """Memory that lives as long as this: a quarter of what an array of NumPy and a view of it cost to make."""
 
@@ -222,11 +272,10 @@ cdef class Data:
 
     The caller passes checked, C-contiguous float64 / int32 arrays; they are kept alive here. Either
     `csr` = (indptr, indices, data) or `rows` = (joint_jac, joint_body, normal, tangent, arm_a, arm_b,
-    contact_body, inv_mass, inv_inertia, compliance), or `general` = (core.generalized.Operator, compliance).
+    contact_body, inv_mass, inv_inertia, compliance). In generalised coordinates: `general_data`.
     """
 
-    def __init__(self, ptr_, kind_, lower_, upper_, mu_, patch_radius_, b_, int law, csr=None, rows=None,
-                 general=None):
+    def __init__(self, ptr_, kind_, lower_, upper_, mu_, patch_radius_, b_, int law, csr=None, rows=None):
         # Kept as they came: a view made an object again costs more than the view.
         cdef const int32_t[::1] ptr = ptr_, kind = kind_
         cdef const double[::1] lower = lower_, upper = upper_, mu = mu_, patch_radius = patch_radius_, b = b_
@@ -255,18 +304,14 @@ cdef class Data:
             self.blocks.mu = &mu[0]
             self.blocks.patch_radius = &patch_radius[0]
             self.blocks.b = &b[0]
-        self.start_energy = self.start_velocity = -1.0
+        self.start_energy = self.start_velocity = self.start_relative = -1.0
+        self.ready = True
         self.factored = rows is not None
-        self.is_general = general is not None
         self.single_rows = k == m
         for i in range(k):
             if kind[i] != ROW:
                 self.single_rows = False
-        if self.is_general:
-            self._set_general(general)
-            n_empty = lav_general_diagonal(&self.blocks, &self.general, d, nu, step, empty,
-                                           <int32_t*>self._place, <double*>self.general.y)
-        elif self.factored:
+        if self.factored:
             self._set_rows(rows)
             n_empty = lav_rows_diagonal(&self.blocks, &self.rows, d, nu, step, empty,
                                         <double*>self.rows.minv_jac, <double*>self.rows.coupling,
@@ -284,40 +329,40 @@ cdef class Data:
         if n_empty:
             self.empty = _read_only(np.array([i for i in range(m) if empty[i]], np.intp))
 
-    def _set_general(self, general):
-        cdef Operator operator
-        cdef const double[::1] compliance
-        cdef Room held, values_of_y
-        cdef int32_t* whole
-        cdef int32_t n, m = self.blocks.n_rows, k = self.blocks.n_blocks, count, n_cols
-        cdef Py_ssize_t room, head
-        cdef double values
-        operator, compliance = general
-        self.general = operator.g
-        n = operator.g.n
-        head = 2 * n + 3 * (k + 1)
-        room = 2 * <Py_ssize_t>operator.g.jptr[m] + 64
-        while True:
-            held = room_for((head + room) * sizeof(int32_t))
-            whole = <int32_t*>held.at
-            count = panel_pattern(&self.general, k, self.blocks.ptr, &whole[0], &whole[2 * n], &whole[2 * n + k + 1],
-                                  &whole[2 * n + 2 * (k + 1)], &whole[head], <int32_t>room, &n_cols, &values)
-            if count >= 0:
-                break
-            room = min(2 * room, 2147483647 - head)
-        if values >= 2147483647.0:
-            raise OverflowError(f"M^-1 J^T has {values:.3g} entries, more than 32-bit indices reach")
-        values_of_y = room_for((<Py_ssize_t>values + 1) * sizeof(double))
-        self.keep += [general, held, values_of_y]
-        self._place = whole
-        self.general.n_panels = count
-        self.general.prow = &whole[2 * n]
-        self.general.pcol = &whole[2 * n + k + 1]
-        self.general.pval = &whole[2 * n + 2 * (k + 1)]
-        self.general.cols = &whole[head]
-        self.general.y = <double*>values_of_y.at
-        if m:
-            self.general.compliance = &compliance[0]
+    def __dealloc__(self):
+        free(self.made.marks)
+        free(self.made.numbers)
+
+    def prepare(self):
+        """d, nu, step and Y of a problem in generalised coordinates, where they are not known yet."""
+        cdef made_t made
+        cdef blocks_t blocks = self.blocks
+        cdef generalized_t general = self.general
+        cdef int32_t end
+        if self.ready:
+            return
+        end = make_numbers(&blocks, &general, &made)
+        if end == TOO_MANY:
+            raise OverflowError(f"M^-1 J^T has {made.values:.3g} entries, more than 32-bit indices reach")
+        if end != MADE:
+            raise MemoryError(f"{made.values:.3g} entries of M^-1 J^T")
+        self.adopt(&made)
+
+    cdef void adopt(self, made_t* made):
+        # What `make_numbers` made becomes this one's; freed where another thread was first with the same.
+        cdef int32_t m = self.blocks.n_rows, i
+        empty = _NONE
+        if made.n_empty:
+            empty = _read_only(np.array([i for i in range(m) if made.empty[i]], np.intp))
+        with cython.critical_section(self):
+            if self.ready:
+                free(made.marks)
+                free(made.numbers)
+                return
+            self.empty = empty
+            self.made = made[0]
+            point_at(&self.blocks, &self.general, made)
+            self.ready = True
 
     def _set_rows(self, rows):
         cdef const double[:, ::1] jac, normal, tangent, arm_a, arm_b
@@ -352,25 +397,36 @@ cdef class Data:
         if compliance.shape[0]:
             self.rows.compliance = &compliance[0]
 
+    cdef object part(self, int which):
+        cdef Py_ssize_t m = self.blocks.n_rows, at = which * (m + 1)
+        cdef double[::1] x
+        if not self.is_general:
+            return self._numbers[at:at + m]
+        out = np.empty(m)
+        if m:
+            x = out
+            memcpy(&x[0], self.made.numbers + at, m * sizeof(double))
+        return out
+
     @property
     def d(self):
         """(m,) 1/kg: diagonal of A with fallbacks."""
         if self._d is None:
-            self._d = _read_only(self._numbers[:self.blocks.n_rows])
+            self._d = _read_only(self.part(0))
         return self._d
 
     @property
     def nu(self):
         """(m,) 1/kg: velocity error = sqrt(nu d) |e|."""
         if self._nu is None:
-            self._nu = _read_only(self._numbers[self.blocks.n_rows + 1:2 * self.blocks.n_rows + 1])
+            self._nu = _read_only(self.part(1))
         return self._nu
 
     @property
     def step(self):
         """(m,) kg: steps of a sweep."""
         if self._step is None:
-            self._step = _read_only(self._numbers[2 * self.blocks.n_rows + 2:3 * self.blocks.n_rows + 2])
+            self._step = _read_only(self.part(2))
         return self._step
 
     @property
@@ -432,16 +488,63 @@ cdef class Data:
         self.start_velocity = velocity
 
 
+cdef class Blocks:
+    """Pointers to the arrays of a problem's blocks, which stay alive with it."""
+
+    def __init__(self, ptr_, kind_, lower_, upper_, mu_, radius_):
+        cdef const int32_t[::1] ptr = ptr_, kind = kind_
+        cdef const double[::1] lower = lower_, upper = upper_, mu = mu_, radius = radius_
+        cdef int32_t i
+        self.keep = (ptr_, kind_, lower_, upper_, mu_, radius_)
+        self.at.n_blocks = <int32_t>kind.shape[0]
+        self.at.n_rows = <int32_t>lower.shape[0]
+        self.at.ptr = &ptr[0]
+        if self.at.n_rows:
+            self.at.kind = &kind[0]
+            self.at.lower = &lower[0]
+            self.at.upper = &upper[0]
+            self.at.mu = &mu[0]
+            self.at.patch_radius = &radius[0]
+        self.single_rows = self.at.n_blocks == self.at.n_rows
+        for i in range(self.at.n_blocks):
+            if self.at.kind[i] != ROW:
+                self.single_rows = False
+                break
+
+
+def general_data(Blocks blocks, b_, Operator operator, compliance_, int law):
+    """Data of a problem in generalised coordinates, whose own numbers wait until `prepare`; law: COULOMB or CONE."""
+    cdef const double[::1] b = b_, compliance = compliance_
+    cdef Data made = Data.__new__(Data)
+    made.keep = [blocks, b_, operator, compliance_]
+    made.blocks = blocks.at
+    made.blocks.law = law
+    made.general = operator.g
+    made.is_general = True
+    made.single_rows = blocks.single_rows
+    made.start_energy = made.start_velocity = made.start_relative = -1.0
+    made.empty = _NONE
+    if blocks.at.n_rows:
+        made.blocks.b = &b[0]
+        made.general.compliance = &compliance[0]
+    return made
+
+
 FREE, BOUNDED, ROUND_CONES = 1, 2, 4
 
 
-def shape_of(const int32_t[::1] ptr, const int32_t[::1] kind, double[::1] lower, double[::1] upper,
-             const double[::1] mu, const double[::1] radius):
+def shape_of(ptr_, kind_, lower_, upper_, mu_, radius_):
     """What the blocks of a problem are: FREE (every row unbounded), BOUNDED (by constants), ROUND_CONES; as bits.
 
-    -1 where an array does not fit the others or holds what no block can have. Bounds of contacts, which nobody reads,
-    get one spelling: 0 on normals, else none.
+    With them `Blocks` of these arrays; -1 and None where an array does not fit the others or holds what no block can
+    have. Bounds of contacts, which nobody reads, get one spelling: 0 on normals, else none.
     """
+    bits = bits_of(ptr_, kind_, lower_, upper_, mu_, radius_)
+    return bits, None if bits < 0 else Blocks(ptr_, kind_, lower_, upper_, mu_, radius_)
+
+
+cdef int bits_of(const int32_t[::1] ptr, const int32_t[::1] kind, double[::1] lower, double[::1] upper,
+                 const double[::1] mu, const double[::1] radius) except -2:
     cdef Py_ssize_t i, j, k = kind.shape[0], m = lower.shape[0], size
     cdef double inf = 1.0 / 0.0
     cdef bint is_free = True, is_bounded = True, is_round = False

@@ -695,6 +695,9 @@ cdef inline int32_t solve_island(flow_t* f, int32_t island, double* impulse, bin
     return end
 
 
+cdef int32_t descend_all(flow_t* f, double* impulse, int32_t cold, double soft) noexcept nogil
+
+
 cdef class Newton:
     cdef flow_t f
     cdef Data data

@@ -16,8 +16,9 @@ from lavender_ext.core.generalized cimport (generalized_t, jac_push, jac_row, pa
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.rows cimport contact_slack, cross, joint_velocity, rows_t, rows_times
 from lavender_ext.core.velocity cimport add6, rows_velocity
-from lavender_ext.judge.score cimport (add_floor, is_plain, nothing, root, score_from, score_rows, score_t,
-                                       sum_t, tally_block, tally_contact, tally_floor, tally_row, tally_t)
+from lavender_ext.judge.score cimport (add_floor, are_numbers, is_plain, norms_of_rhs, nothing, relative, root,
+                                       score_from, score_rows, score_t, sum_t, tally_block, tally_contact,
+                                       tally_floor, tally_row, tally_t)
 
 
 # -- A in compressed rows ----------------------------------------------------------------------------
@@ -376,6 +377,50 @@ cdef inline void judge_into(const blocks_t* p, const csr_t* a, const rows_t* r, 
         csr_judge(p, a, lam, w, e, floor, out)
 
 
+# -- doing nothing, and what a pass over an impulse comes to beside it -----------------------------------
+
+
+cdef inline bint do_nothing(const blocks_t* p, double* x, double* w) noexcept nogil:
+    """x (m) = Pi(0), and w (m) = -b, its slack without a pass over A; is x other than 0?"""
+    cdef int32_t i
+    cdef bint moves = False
+    for i in range(p.n_rows):
+        x[i] = 0.0
+        if p.lower[i] > 0.0:
+            x[i] = p.lower[i]
+        elif p.upper[i] < 0.0:
+            x[i] = p.upper[i]
+        moves |= x[i] != 0.0
+        w[i] = -p.b[i]
+    return moves
+
+
+cdef inline void reference_of(const blocks_t* p, const score_t* s, bint moves, bint vanished, double* out) noexcept nogil:
+    """E0 [sqrt J], V0 [m/s] and the relative residual (3) of doing nothing, from its score."""
+    cdef double rhs_energy, rhs_velocity, energy = s.energy, velocity = s.velocity
+    norms_of_rhs(p, &rhs_energy, &rhs_velocity)
+    # The norms of b: sqrt(sum b^2 / d), max |b| sqrt(nu / d), |b| the pair's norm on tangents.
+    # 2^-48 of them. Doing nothing costs no more energy than b; more is what `quotient` (block.pxd) makes of a vanishing w / d.
+    if energy <= 3.5527136788005009e-15 * rhs_energy or (energy > 2.0 * rhs_energy and not moves):
+        energy, velocity = rhs_energy, rhs_velocity
+    # A size that overflows measures nothing: 0 makes every error beside it infinite.
+    if vanished:
+        energy = velocity = 0.0
+    out[0] = energy if energy < 1.0 / 0.0 else 0.0
+    out[1] = velocity if velocity < 1.0 / 0.0 else 0.0
+    out[2] = relative(s.energy, s.velocity, out[0], out[1]) if s.finite else 1.0 / 0.0
+
+
+cdef inline double relative_of(const score_t* s, const double* w, int32_t m, double start_energy,
+                               double start_velocity) noexcept nogil:
+    """Relative residual of a pass, slack w (m); inf where a number of it is not finite."""
+    if m > 0 and not are_numbers(w, m):
+        return 1.0 / 0.0
+    if not s.finite:
+        return relative(1.0 / 0.0, 1.0 / 0.0, start_energy, start_velocity)
+    return relative(s.energy, s.velocity, start_energy, start_velocity)
+
+
 cdef class Judged:
     cdef readonly Data data                             # of the problem
     cdef readonly object impulse                        # (m,) N s
@@ -383,3 +428,6 @@ cdef class Judged:
     cdef readonly double energy, velocity               # sqrt J, m/s; inf where e is not finite
     cdef readonly double relative, floor                # -
     cdef readonly int worst                             # row of the largest velocity error, -1
+
+
+cdef Judged judged_from(Data p, object impulse, object both, const score_t* s, double relative_, double floor)

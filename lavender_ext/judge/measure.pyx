@@ -10,7 +10,8 @@ from lavender_ext.core.generalized cimport generalized_t
 from lavender_ext.core.problem cimport Data, Room, room_for
 from lavender_ext.core.rows cimport rows_t
 from lavender_ext.core.velocity cimport rows_velocity
-from lavender_ext.judge.measure cimport csr_slack, general_judge, general_slack, judge_into, rows_slack
+from lavender_ext.judge.measure cimport (csr_slack, do_nothing, general_judge, general_slack, judge_into,
+                                         reference_of, relative_of, rows_slack)
 from lavender_ext.judge.score cimport are_numbers, norms_of_rhs, relative, score_rows, score_t
 
 
@@ -78,6 +79,17 @@ def judge(Data p, const double[::1] lam, double[::1] w, double[::1] e, bint floo
             s.finite and are_numbers(&w[0], p.blocks.n_rows))
 
 
+cdef Judged judged_from(Data p, impulse, both, const score_t* s, double relative_, double floor):
+    """What a pass over `impulse` found, w and e in `both` (2 m + 1)."""
+    cdef Judged made = Judged.__new__(Judged)
+    made.data, made.impulse, made.both = p, impulse, both
+    made.energy = s.energy if s.finite else 1.0 / 0.0
+    made.velocity = s.velocity if s.finite else 1.0 / 0.0
+    made.worst = s.worst
+    made.relative, made.floor = relative_, floor
+    return made
+
+
 cdef class Judged:
     """The judge's pass over one impulse, with its floor, beside the error of doing nothing, which `p` must know.
 
@@ -112,9 +124,7 @@ cdef class Judged:
         self.energy = s.energy if s.finite else 1.0 / 0.0
         self.velocity = s.velocity if s.finite else 1.0 / 0.0
         self.worst = s.worst
-        self.relative = 1.0 / 0.0
-        if p.blocks.n_rows == 0 or are_numbers(w, p.blocks.n_rows):
-            self.relative = relative(self.energy, self.velocity, p.start_energy, p.start_velocity)
+        self.relative = relative_of(&s, w, p.blocks.n_rows, p.start_energy, p.start_velocity)
         self.floor = relative(s.floor_energy, s.floor_velocity, p.start_energy, p.start_velocity)
 
     @property
@@ -175,15 +185,15 @@ def score(Data p, const double[::1] lam, const double[::1] w, double[::1] e):
 
 
 def begin(Data p, bint vanished):
-    """Judge doing nothing and keep E0 and V0 with the data: (Pi(0) (m,), read-only; its own relative residual).
+    """Judge doing nothing and keep E0, V0 and its own relative residual with the data: Pi(0) (m,), read-only.
 
     Both are 0 where `vanished`: d of a row is a stand-in for products that are not zero, and nothing can be measured.
     """
-    cdef Py_ssize_t i, m = p.blocks.n_rows
+    cdef Py_ssize_t m = p.blocks.n_rows
     cdef bint moves = False
-    cdef double rhs_energy, rhs_velocity, energy, velocity
     cdef score_t s = score_t(0.0, 0.0, 0.0, 0.0, -1, 1)
     cdef double[::1] x
+    cdef double out[3]
     cdef Room room
     cdef double* w
     start = np.zeros(m)
@@ -191,13 +201,7 @@ def begin(Data p, bint vanished):
         x = start
         room = room_for((3 * m + (p.general.n if p.is_general else 6 * <Py_ssize_t>p.rows.n_bodies)) * sizeof(double))
         w = <double*>room.at
-        for i in range(m):
-            if p.blocks.lower[i] > 0.0:
-                x[i] = p.blocks.lower[i]
-            elif p.blocks.upper[i] < 0.0:
-                x[i] = p.blocks.upper[i]
-            moves |= x[i] != 0.0
-            w[i] = -p.blocks.b[i]                       # A 0 - b, without a pass over A
+        moves = do_nothing(&p.blocks, &x[0], w)
         if not moves:
             score_rows(&p.blocks, &x[0], w, w + m, &s)
         elif p.is_general:
@@ -207,17 +211,10 @@ def begin(Data p, bint vanished):
         if moves:
             s.finite = s.finite and are_numbers(w, p.blocks.n_rows)
     start.setflags(write=False)
-    norms_of_rhs(&p.blocks, &rhs_energy, &rhs_velocity)
-    # The norms of b: sqrt(sum b^2 / d), max |b| sqrt(nu / d), |b| the pair's norm on tangents.
-    energy, velocity = s.energy, s.velocity
-    # Doing nothing costs no more energy than b; more is what `quotient` (block.pxd) makes of a vanishing w / d.
-    if energy <= 2.0 ** -48 * rhs_energy or (energy > 2.0 * rhs_energy and not moves):
-        energy, velocity = rhs_energy, rhs_velocity
-    # A size that overflows measures nothing: 0 makes every error beside it infinite.
-    if vanished:
-        energy = velocity = 0.0
-    p.set_start(energy if energy < 1.0 / 0.0 else 0.0, velocity if velocity < 1.0 / 0.0 else 0.0)
-    return start, relative(s.energy, s.velocity, p.start_energy, p.start_velocity) if s.finite else 1.0 / 0.0
+    reference_of(&p.blocks, &s, moves, vanished, out)
+    p.set_start(out[0], out[1])
+    p.start_relative = out[2]
+    return start
 
 
 def velocity_change(Data p, const double[::1] lam, double[:, ::1] v):

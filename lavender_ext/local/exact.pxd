@@ -11,7 +11,8 @@ Several rows: boxed complementarity by principal pivoting.
 from libc.math cimport fabs
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.block cimport CONE, clip, cone_error, relax_normal, relax_row, relax_tangents
+from lavender_ext.core.block cimport (CONE, CONTACT_SPIN, ROUND, clip, cone_error, relax_normal, relax_row,
+                                      relax_tangents, round_error)
 from lavender_ext.local.cone cimport cone2, cone3
 from lavender_ext.local.coulomb cimport PREPARED, coulomb2, coulomb3, prepare3
 from lavender_ext.local.small cimport FAILED, MAX_ROWS, OPEN, STICK, eliminate
@@ -98,14 +99,14 @@ cdef inline void local_slack(int32_t m, const double* W, const double* q, const 
             w[i] += W[m * i + j] * lam[j]
 
 
-cdef inline void project_locally(int32_t law, int32_t nt, int32_t spin, const double* W, const double* q,
+cdef inline void project_locally(int32_t law, int32_t nt, int32_t kind, const double* W, const double* q,
                                  const double* d, const double* step, double mu, double patch_radius,
                                  double* lam) noexcept nogil:
     """Where no exact answer is found: the update of core/block.pxd (cone: projected gradient) on the block alone."""
-    cdef int32_t m = 1 + nt + spin, _sweep, i
-    cdef double w[4]
-    cdef double e[4]
-    cdef double high[4]
+    cdef int32_t spin = kind == CONTACT_SPIN, m = 1 + nt + spin, _sweep, i
+    cdef double w[MAX_ROWS]
+    cdef double e[MAX_ROWS]
+    cdef double high[MAX_ROWS]
     cdef double change, bound
     for _sweep in range(20):
         change = 0.0
@@ -115,7 +116,10 @@ cdef inline void project_locally(int32_t law, int32_t nt, int32_t spin, const do
             for i in range(m):
                 high[i] = m * d[i]
             local_slack(m, W, q, lam, w)
-            cone_error(lam, w, high, mu, patch_radius, nt, spin, e)
+            if kind == ROUND:
+                round_error(lam, w, high, mu, nt, e)
+            else:
+                cone_error(lam, w, high, mu, patch_radius, nt, spin, e)
             for i in range(m):
                 lam[i] -= e[i]
                 change += fabs(e[i])

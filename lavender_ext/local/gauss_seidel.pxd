@@ -6,17 +6,19 @@ Prepared numbers of block i stand from g[start[i]] on:
     rows, 2 to 8, all free       W^-1 (n, n), then 1; where W is singular W, then 0
     rows, 2 to 8, bounded        W (n, n), then 0
     normal, two tangents         prepare3 of local/exact.pxd; g[15] = 1 where the rows of A share one pattern
+    round cones                  prepare_round of local/round.pxd
     other contacts               W (n, n)
 """
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.block cimport CONE, CONTACT_SPIN, ROW, blocks_t, n_tangents, relax_normal, relax_row
+from lavender_ext.core.block cimport CONE, CONTACT_SPIN, ROUND, ROW, blocks_t, n_tangents, relax_normal, relax_row
 from lavender_ext.core.csr cimport csr_dot, csr_t
 from lavender_ext.core.rows cimport (cross, dot3, joint_push, joint_velocity, push_bodies, relative_velocity,
                                      relax_joint, rows_t, swing_body)
 from lavender_ext.local.cone cimport cone3
 from lavender_ext.local.coulomb cimport PREPARED, coulomb3_from, prepare3
 from lavender_ext.local.exact cimport boxed_rows, contact_with_spin, contact_without_spin, project_locally
+from lavender_ext.local.round cimport prepare_round, round_contact
 from lavender_ext.local.small cimport FAILED, MAX_ROWS, eliminate
 
 
@@ -26,6 +28,8 @@ cdef inline int32_t prepared_size(const blocks_t* p, int32_t i) noexcept nogil:
         return n * n + 1 if 1 < n <= MAX_ROWS else 0
     if p.kind[i] != CONTACT_SPIN and n == 3:
         return PREPARED
+    if p.kind[i] == ROUND:
+        return n * n + (n - 1) * n
     return n * n
 
 
@@ -43,6 +47,10 @@ cdef inline void prepare_block(const blocks_t* p, int32_t i, const double* W, in
             if W[0] != p.d[j]:
                 g[9] = 0.0
             g[15] = one_pattern
+        elif p.kind[i] == ROUND:
+            prepare_round(n, W, g)
+            if W[0] != p.d[j]:
+                g[0] = 0.0
         else:
             for q in range(n * n):
                 g[q] = W[q]
@@ -73,7 +81,7 @@ cdef inline int32_t solve_block(const blocks_t* p, int32_t i, const double* g, c
                                 double* lam) noexcept nogil:
     """The exact update of block i from its slack w; lam at its first row. 1 where it fell back."""
     cdef int32_t j = p.ptr[i], n = p.ptr[i + 1] - j, kind = p.kind[i], k, t, nt, found = FAILED
-    cdef double q[4]
+    cdef double q[MAX_ROWS]
     cdef double x[MAX_ROWS]
     cdef double s
     if kind == ROW:
@@ -103,14 +111,16 @@ cdef inline int32_t solve_block(const blocks_t* p, int32_t i, const double* g, c
         for t in range(n):
             s -= g[n * k + t] * lam[t]
         q[k] = s
-    if kind == CONTACT_SPIN:
+    if kind == ROUND:
+        found = round_contact(n, g, q, p.d + j, p.mu[i], lam)
+    elif kind == CONTACT_SPIN:
         found = contact_with_spin(p.law, nt, g, q, p.mu[i], p.patch_radius[i], lam)
     elif n < 3:
         found = contact_without_spin(p.law, nt, g, q, p.mu[i], lam)
     elif p.law == CONE:
         found = cone3(g, q, p.mu[i], lam) if g[9] > 0.0 or q[0] >= 0.0 else FAILED
     if found == FAILED:
-        project_locally(p.law, nt, kind == CONTACT_SPIN, g, q, p.d + j, p.step + j, p.mu[i], p.patch_radius[i], lam)
+        project_locally(p.law, nt, kind, g, q, p.d + j, p.step + j, p.mu[i], p.patch_radius[i], lam)
         return 1
     return 0
 

@@ -6,11 +6,13 @@ import pickle
 import numpy as np
 import pytest
 import scipy.sparse as sp
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
 from random_problems import seeds
 from random_trees import chain, random_general, random_tree, tree_mass
 
 import lavender as lv
+from lavender import registry
 from lavender.solvers._costs import Costs
 from lavender.solvers._islands import islands, restrict, rows_of
 
@@ -337,9 +339,60 @@ def test_a_round_cone_is_one_cone(tangents):
     assert problem.row_name(int(c.ptr[4]) + 3).endswith("spin")
     with pytest.raises(lv.InputError, match="no Coulomb law"):
         problem.relaxed("coulomb")
-    refused = [name for name in lv.available() if name not in lv.available(problem)]
-    assert "nncg" in refused
-    assert "round cones" in lv.known(problem)["nncg"]
+    takes = {name for name, spec in registry.specs().items() if spec.round_cones}
+    assert {"newton", "block_gauss_seidel", "nncg", "admm", "clarabel_cone"} <= takes
+    for name, reason in lv.known(problem).items():
+        if "cone" in registry.specs()[name].laws and name not in takes:
+            assert reason and ("round cones" in reason or "pip install" in reason)
+
+
+ROUND_SOLVERS = [n for n in lv.available(law="cone") if registry.specs()[n].round_cones]
+
+
+@pytest.mark.parametrize("given_by", ["J and M", "A"])
+@pytest.mark.parametrize("name", ROUND_SOLVERS)
+@given(seed=seeds, tangents=st.integers(3, 5), soft=st.booleans())
+@settings(max_examples=8)
+def test_every_solver_of_round_cones_finds_the_one_velocity(name, given_by, seed, tangents, soft):
+    problem = random_general(seed, "cone", n=12, contacts=4, tangents=tangents, compliance=soft)
+    best = lv.solve(problem, "newton", tol=1e-11)
+    assume(best.residual.relative <= max(1e-11, 2.0 * best.residual.floor))
+    asked = as_matrix(problem) if given_by == "A" else problem
+    if lv.known(asked)[name]:
+        assert (name, given_by) in {("newton", "A"), ("auto", "A")}  # over velocities alone
+        return
+    found = lv.solve(asked, name, tol=1e-8, max_iter=20_000)
+    tol = 1e-8
+    if registry.specs()[
+        name
+    ].external:  # an interior point of others stalls near 1e-7, where A is singular at 1e-6
+        tol = found.residual.relative
+        assert tol <= 1e-4 and not found.contradicted, str(found)
+    else:
+        assert found.success, str(found)
+    # w is unique: an error e moves it by at most A e, for which 1e4 times tol leaves room.
+    size = np.abs(problem.slack(problem.start())).max()
+    np.testing.assert_allclose(found.slack, best.slack, atol=1e4 * tol * size)
+
+
+@given(seed=seeds)
+def test_a_round_cone_alone_is_solved_exactly(seed):
+    """One block, one sweep: stick, slip and open to rounding, also where W has no full rank."""
+    rng = np.random.default_rng(seed)
+    nt = int(rng.integers(3, 6))
+    rank = int(rng.integers(1, nt + 4))
+    g = rng.normal(size=(nt + 1, rank))
+    # A velocity inside the cone is reached with impulses: b in the range of A, where it has no full rank.
+    b = g @ rng.normal(size=rank) - np.eye(nt + 1)[0] * rng.uniform(0.0, 1.0) * (rng.random() < 0.5)
+    problem = lv.Problem(
+        b, lv.Cones.contacts(rng.choice([0.0, 0.05, 0.6, 2.0]), nt), g @ g.T, friction="cone"
+    )
+    assume(problem.metric.start_energy != 0.0)
+    one = lv.solve(problem, "block_gauss_seidel", tol=0.0, max_iter=1)
+    if rank > nt:
+        assert one.residual.relative <= max(1e-9, 2.0 * one.residual.floor)
+        assert one.work["fallbacks"] == 0
+    assert np.isfinite(one.residual.relative)
 
 
 def brute_round(y, a):

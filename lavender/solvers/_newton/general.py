@@ -15,7 +15,6 @@ from lavender.problem import Problem
 from lavender.residuals import judged, reference, remember
 from lavender.solution import Claim, Status
 from lavender_ext.generalized.newton import ENDS, Newton
-from lavender_ext.generalized.newton import run_many as kernel_many
 
 FORM = "generalized velocities"
 CLOCK = 64  # steps between two looks at the clock and at Ctrl-C; with a time limit at most as many as
@@ -101,22 +100,6 @@ def claim(status: Status, counts: Any) -> Claim:
     done, *parts = (int(c) for c in counts)
     work = {word: c for word, c in zip(_WORDS, parts, strict=True) if c or word == _WORDS[0]}
     return Claim(status, done, work, form=FORM)
-
-
-def run_many(
-    problems: list[Problem], kernels: list[Newton], impulses: list[FloatArray], tol: float
-) -> list[tuple[Any, Any] | None]:
-    """`run` on each in one compiled loop, without a clock.
-
-    What the judge finds, which keeps the impulse, and the counts of those that converge; None for the others.
-    """
-    cold = [_is_cold(p, lam) for p, lam in zip(problems, impulses, strict=True)]
-    ends, counts = kernel_many(kernels, impulses, tol, CLOCK, cold)
-    made: list[tuple[Any, Any] | None] = []
-    for p, lam, end, count in zip(problems, impulses, ends.tolist(), counts.tolist(), strict=True):
-        found = judged(p, lam) if end == ENDS["done"] else None
-        made.append((found, count) if found is not None and found.relative <= tol else None)
-    return made
 
 
 def named(claim: Claim, solver: str) -> Claim:

@@ -1,0 +1,310 @@
+"""Many problems in generalised coordinates, one after the other without the interpreter: prepare, solve, judge.
+
+The same kernels in the same order as on one problem alone (`chain.pyx`), so the same bits and counts. What is worked out
+of a problem's data stays with it. A problem that does not end below tol on the judge's own measure, has empty rows or is
+more than what Newton's method is asked for first, is left to the caller.
+"""
+from cpython.exc cimport PyErr_CheckSignals
+from libc.stdint cimport int32_t
+from libc.stdlib cimport calloc, free, malloc
+from libc.string cimport memcpy
+
+import numpy as np
+
+from lavender_ext.core.block cimport COULOMB, ROW, blocks_t
+from lavender_ext.core.generalized cimport generalized_t
+from lavender_ext.core.problem cimport MADE, Data, made_t, make_numbers
+from lavender_ext.generalized.islands cimport aim_at, furnish, marks_of, numbers_of, settle
+from lavender_ext.generalized.newton cimport DONE, descend_all, flow_t
+from lavender_ext.judge.measure cimport do_nothing, general_judge, judged_from, reference_of, relative_of
+from lavender_ext.judge.score cimport are_numbers, relative, score_rows, score_t
+
+
+cdef enum:
+    LEFT = 0                    # to the caller
+    SOLVED = 1
+
+cdef enum:
+    STEPS = 64                  # of newton
+    AT_A_TIME = 256             # problems between two looks for Ctrl-C
+
+
+cdef struct gate_t:             # what Newton's method may cost [ns] to be asked first; see `general_first`
+    int32_t is_open             # whatever it costs
+    double start, row, factor
+    double most
+    double form                 # of a multiply-add of A
+    double count[4]             # factorisations by law: linear, lcp, coulomb, cone
+
+
+cdef struct job_t:
+    blocks_t p
+    generalized_t g
+    made_t made                 # in this call, marks NULL where the data had it
+    double begin[3]             # E0, V0, relative residual of doing nothing; E0 < 0 where not known
+    int32_t law                 # as `gate_t.count`
+    int32_t cold                # 1: from doing nothing, else from lam as it is
+    int32_t end
+    int32_t counts[5]           # steps, factorisations, updates, rounds, evaluations
+    double* lam                 # (m)
+    double* both                # (2 m + 1) w, e
+    score_t score
+    double relative, floor
+
+
+cdef struct space_t:            # one after the other in the same room
+    int32_t* marks
+    ssize_t n_marks
+    double* numbers
+    ssize_t n_numbers
+
+
+cdef inline int32_t with_numbers(space_t* s, ssize_t n) noexcept nogil:
+    if n > s.n_numbers:
+        free(s.numbers)
+        s.n_numbers = 2 * n
+        s.numbers = <double*>malloc(s.n_numbers * sizeof(double))
+        if s.numbers == NULL:
+            s.n_numbers = 0
+            return 0
+    return 1
+
+
+cdef inline int32_t with_marks(space_t* s, ssize_t n) noexcept nogil:
+    if n > s.n_marks:
+        free(s.marks)
+        s.n_marks = 2 * n
+        s.marks = <int32_t*>malloc(s.n_marks * sizeof(int32_t))
+        if s.marks == NULL:
+            s.n_marks = 0
+            return 0
+    return 1
+
+
+cdef inline void begin(job_t* j, double* w) noexcept nogil:
+    """E0, V0 and the relative residual of doing nothing; w (3 m + n) is scratch."""
+    cdef score_t s = score_t(0.0, 0.0, 0.0, 0.0, -1, 1)
+    cdef int32_t m = j.p.n_rows
+    cdef double* x = w + 2 * <ssize_t>m
+    cdef bint moves = do_nothing(&j.p, x, w)
+    if not moves:
+        score_rows(&j.p, x, w, w + m, &s)
+    else:
+        general_judge(&j.p, &j.g, x, w, w + m, x + m, False, &s)
+        s.finite = s.finite and are_numbers(w, m)
+    reference_of(&j.p, &s, moves, False, j.begin)
+
+
+cdef inline bint is_first(const job_t* j, const gate_t* gate, int32_t largest) noexcept nogil:
+    """`general_first` of lavender/solvers/_costs.py, in the same order of operations."""
+    cdef double flops, cost, entries
+    if gate.is_open:
+        return True
+    flops = <double>j.g.n * (<double>largest * <double>largest) / 6.0
+    if j.law == 2:
+        flops = 2.0 * flops
+    cost = gate.start + gate.count[j.law] * (gate.row * j.p.n_rows + gate.factor * flops)
+    if cost <= gate.most:
+        return True
+    entries = 0.5 * (<double>(2 * <ssize_t>j.g.pval[j.g.n_panels] + 4 * <ssize_t>j.p.n_rows) - 4.0 * j.p.n_rows)
+    return cost <= gate.form * entries * entries / <double>(j.g.n if j.g.n > 1 else 1)
+
+
+cdef void solve_job(job_t* j, space_t* space, const gate_t* gate, double tol, int32_t limit) noexcept nogil:
+    cdef flow_t f
+    cdef int32_t most[4]
+    cdef int32_t m = j.p.n_rows, end, i
+    cdef bint cold = j.cold
+    if j.made.marks == NULL and make_numbers(&j.p, &j.g, &j.made) != MADE:
+        return
+    if j.made.n_empty:
+        return
+    if j.begin[0] < 0.0:
+        if not with_numbers(space, 3 * <ssize_t>m + j.g.n):
+            return
+        begin(j, space.numbers)
+    if not with_marks(space, marks_of(&j.p, &j.g)):
+        return
+    settle(&f, &j.p, &j.g, space.marks, most)
+    if most[0] > limit or not is_first(j, gate, most[0]):
+        return
+    if not with_numbers(space, numbers_of(&f, most)):
+        return
+    furnish(&f, most, space.numbers)
+    if cold:
+        do_nothing(&j.p, j.lam, j.both)
+    else:                                               # doing nothing, given as a start, is cold as well
+        cold = True
+        for i in range(m):
+            if j.lam[i] != 0.0:
+                cold = False
+                break
+        if not cold:
+            do_nothing(&j.p, j.both, j.both + m)
+            cold = True
+            for i in range(m):
+                if j.lam[i] != j.both[i]:
+                    cold = False
+                    break
+    aim_at(&f, tol, STEPS, j.begin[0], j.begin[1])
+    end = descend_all(&f, j.lam, cold, 1e-4)
+    if end != DONE:
+        return
+    j.counts[0] = STEPS - f.steps
+    j.counts[1] = f.factorisations
+    j.counts[2] = f.updates
+    j.counts[3] = f.rounds
+    j.counts[4] = f.evaluations
+    if not with_numbers(space, <ssize_t>j.g.n + m):
+        return
+    j.score = score_t(0.0, 0.0, 0.0, 0.0, -1, 1)
+    general_judge(&j.p, &j.g, j.lam, j.both, j.both + m, space.numbers, True, &j.score)
+    j.relative = relative_of(&j.score, j.both, m, j.begin[0], j.begin[1])
+    j.floor = relative(j.score.floor_energy, j.score.floor_velocity, j.begin[0], j.begin[1])
+    if j.relative <= tol:
+        j.end = SOLVED
+
+
+cdef int32_t law_of(const blocks_t* p) noexcept nogil:
+    """0 where every row is free, 1 where bounds are constants, 2 with Coulomb's friction, 3 with the cone's."""
+    cdef int32_t i, k, law = 0
+    cdef double inf = 1.0 / 0.0
+    for i in range(p.n_blocks):
+        if p.kind[i] != ROW:
+            if p.ptr[i + 1] - p.ptr[i] > 1:
+                return 2 if p.law == COULOMB else 3
+            law = 1
+        elif law == 0:
+            for k in range(p.ptr[i], p.ptr[i + 1]):
+                if p.lower[k] != -inf or p.upper[k] != inf:
+                    law = 1
+                    break
+    return law
+
+
+cdef class Batch:
+    """Problems and what came of them; `run` once.
+
+    Parameters
+    ----------
+    data : list of Data
+        In generalised coordinates, each of a problem of at least one row.
+    starts : list of (m,) N s or None
+        None: from doing nothing.
+    gate : tuple (start, row, factor, most, form, counts) or None
+        What Newton's method may cost, in the words of `general_first`; None: whatever it does.
+    limit : int
+        Velocities of one island up to which N is kept dense.
+    """
+
+    cdef job_t* jobs
+    cdef Py_ssize_t n
+    cdef space_t space
+    cdef list data
+    cdef object impulses, both
+    cdef gate_t gate
+    cdef int32_t limit
+    cdef double tol
+
+    def __init__(self, list data, list starts, double tol, gate, int limit):
+        cdef Py_ssize_t i, at = 0, n = len(data)
+        cdef Data p
+        cdef job_t* j
+        cdef double[::1] whole, measured
+        cdef const double[::1] given
+        self.data, self.tol, self.limit = data, tol, limit
+        self.gate.is_open = gate is None
+        if gate is not None:
+            (self.gate.start, self.gate.row, self.gate.factor, self.gate.most, self.gate.form,
+             counts) = gate
+            for i in range(4):
+                self.gate.count[i] = counts[i]
+        for i in range(n):
+            p = data[i]
+            at += p.blocks.n_rows
+        self.jobs = <job_t*>calloc(n if n else 1, sizeof(job_t))
+        if self.jobs == NULL:
+            raise MemoryError(f"{n} problems")
+        self.n = n
+        self.impulses = whole = np.empty(at + 1)
+        self.both = measured = np.empty(2 * at + n + 1)
+        at = 0
+        for i in range(n):
+            p = data[i]
+            j = &self.jobs[i]
+            j.p = p.blocks
+            j.g = p.general
+            j.begin[0] = j.begin[1] = j.begin[2] = -1.0
+            if p.ready:
+                j.made = p.made
+                j.begin[0] = p.start_energy
+                j.begin[1] = p.start_velocity
+            j.law = law_of(&j.p)
+            j.lam = &whole[0] + at
+            j.both = &measured[0] + 2 * at + i
+            j.cold = starts[i] is None
+            if not j.cold:
+                given = starts[i]
+                if given.shape[0] != j.p.n_rows:
+                    raise ValueError(f"{given.shape[0]} numbers for {j.p.n_rows} rows")
+                memcpy(j.lam, &given[0], j.p.n_rows * sizeof(double))
+            at += j.p.n_rows
+
+    def __dealloc__(self):
+        cdef Py_ssize_t i
+        if self.jobs != NULL:
+            for i in range(self.n):
+                self.drop(i)
+            free(self.jobs)
+        free(self.space.marks)
+        free(self.space.numbers)
+
+    cdef void drop(self, Py_ssize_t i) noexcept:
+        # What was made in this call and has no owner.
+        cdef Data p = self.data[i]
+        if self.jobs[i].made.marks != p.made.marks:
+            free(self.jobs[i].made.marks)
+            free(self.jobs[i].made.numbers)
+        self.jobs[i].made.marks = NULL
+        self.jobs[i].made.numbers = NULL
+
+    def run(self):
+        """Solve; how many were."""
+        cdef Py_ssize_t i = 0, end, solved = 0
+        cdef Data p
+        cdef job_t* j
+        while i < self.n:
+            end = i + AT_A_TIME if i + AT_A_TIME < self.n else self.n
+            with nogil:
+                while i < end:
+                    if self.jobs[i].p.n_rows > 0:
+                        solve_job(&self.jobs[i], &self.space, &self.gate, self.tol, self.limit)
+                    i += 1
+            PyErr_CheckSignals()
+        for i in range(self.n):
+            j = &self.jobs[i]
+            p = self.data[i]
+            if j.end != SOLVED:
+                continue
+            solved += 1
+            if not p.ready:
+                p.adopt(&j.made)
+                j.made = p.made
+            if p.start_energy < 0.0:
+                p.set_start(j.begin[0], j.begin[1])
+                p.start_relative = j.begin[2]
+        return solved
+
+    def is_solved(self, Py_ssize_t i):
+        """Whether the judge found problem i below tol."""
+        return self.jobs[i].end == SOLVED
+
+    def judged(self, Py_ssize_t i):
+        """What the judge found of problem i, solved, with its impulse (m,) [N s]; and its counts, as `Newton.run`."""
+        cdef job_t* j = &self.jobs[i]
+        cdef Py_ssize_t at = j.lam - self.jobs[0].lam, m = j.p.n_rows
+        impulse = self.impulses[at:at + m].copy()
+        impulse.setflags(write=False)
+        at = j.both - self.jobs[0].both
+        return judged_from(self.data[i], impulse, self.both[at:at + 2 * m + 1].copy(), &j.score, j.relative, j.floor), (
+            j.counts[0], j.counts[1], j.counts[2], j.counts[3], j.counts[4])

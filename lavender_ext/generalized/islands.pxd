@@ -1,0 +1,186 @@
+"""Where Newton's method over generalised velocities stands: islands of trees, and its arrays in room that the caller has.
+
+Panels that share a column, directly or through others, are an island: its velocities move no row of another.
+"""
+from libc.math cimport sqrt
+from libc.stdint cimport int32_t
+
+from lavender_ext.core.block cimport ROW, blocks_t
+from lavender_ext.core.generalized cimport generalized_t
+from lavender_ext.generalized.newton cimport flow_t
+
+
+cdef inline int32_t root_of(int32_t* up, int32_t i) noexcept nogil:
+    while up[i] != i:
+        up[i] = up[up[i]]
+        i = up[i]
+    return i
+
+
+cdef inline int32_t find_islands(const blocks_t* p, const generalized_t* g, int32_t* up, int32_t* label, int32_t* iptr,
+                                 int32_t* ipanel, int32_t* cptr, int32_t* icols, int32_t* local, int32_t* pblock,
+                                 int32_t* vptr, int32_t* most) noexcept nogil:
+    """Islands: panels that share no column, directly or through others, in the order of their first panel.
+
+    up (n) and label (max(n, n_panels)) are scratch; what is found stands in arrays as `flow_t` has them (iptr and cptr
+    with room for n_panels + 1). most (4): columns of the largest island, of the widest panel, rows x columns of the
+    largest panel, and its rows. A panel without columns is an island of its own.
+    """
+    cdef int32_t b, q, r, i, k, n = 0, size, nc, rows
+    for i in range(g.n):
+        up[i] = i
+        local[i] = -1
+    i = 0
+    for b in range(g.n_panels):
+        for q in range(g.pcol[b] + 1, g.pcol[b + 1]):
+            r = root_of(up, g.cols[g.pcol[b]])
+            k = root_of(up, g.cols[q])
+            if r < k:
+                up[k] = r
+            elif k < r:
+                up[r] = k
+        while p.ptr[i] < g.prow[b]:
+            i += 1
+        pblock[b] = i
+    pblock[g.n_panels] = p.n_blocks
+    vptr[0] = 0
+    for i in range(p.n_blocks):
+        size = p.ptr[i + 1] - p.ptr[i]
+        vptr[i + 1] = vptr[i] + (size if p.kind[i] == ROW else size * size)
+    # `local` numbers the islands by their root, until it numbers columns
+    for b in range(g.n_panels):
+        if g.pcol[b + 1] == g.pcol[b]:
+            label[b] = n
+            n += 1
+            continue
+        r = root_of(up, g.cols[g.pcol[b]])
+        if local[r] < 0:
+            local[r] = n
+            n += 1
+        label[b] = local[r]
+    for i in range(n + 1):
+        iptr[i] = 0
+        cptr[i] = 0
+    for b in range(g.n_panels):
+        iptr[label[b] + 1] += 1
+    for i in range(n):
+        iptr[i + 1] += iptr[i]
+    for b in range(g.n_panels):
+        ipanel[iptr[label[b]]] = b
+        iptr[label[b]] += 1
+    for i in range(n, 0, -1):
+        iptr[i] = iptr[i - 1]
+    iptr[0] = 0
+    most[0] = most[1] = most[2] = most[3] = 0
+    for b in range(g.n_panels):
+        nc = g.pcol[b + 1] - g.pcol[b]
+        rows = g.prow[b + 1] - g.prow[b]
+        if nc > most[1]:
+            most[1] = nc
+        if rows * nc > most[2]:
+            most[2] = rows * nc
+        if rows > most[3]:
+            most[3] = rows
+    # columns of each island, ascending: an island is a set of roots
+    for i in range(g.n):
+        label[i] = -1
+    for b in range(n):
+        for i in range(iptr[b], iptr[b + 1]):
+            for q in range(g.pcol[ipanel[i]], g.pcol[ipanel[i] + 1]):
+                label[root_of(up, g.cols[q])] = b
+                break
+    for i in range(g.n):
+        r = label[root_of(up, i)]
+        if r >= 0:
+            cptr[r + 1] += 1
+    for b in range(n):
+        cptr[b + 1] += cptr[b]
+    for i in range(g.n):
+        r = label[root_of(up, i)]
+        if r >= 0:
+            local[i] = cptr[r]
+            icols[cptr[r]] = i
+            cptr[r] += 1
+    for b in range(n, 0, -1):
+        cptr[b] = cptr[b - 1]
+    cptr[0] = 0
+    for b in range(n):
+        if cptr[b + 1] - cptr[b] > most[0]:
+            most[0] = cptr[b + 1] - cptr[b]
+        for i in range(cptr[b], cptr[b + 1]):
+            local[icols[i]] = i - cptr[b]
+    return n
+
+
+cdef inline ssize_t marks_of(const blocks_t* p, const generalized_t* g) noexcept nogil:
+    """int32 that `settle` needs."""
+    cdef ssize_t n = g.n, panels = g.n_panels
+    return 3 * n + (n if n > panels else panels) + 4 * panels + p.n_blocks + 8
+
+
+cdef inline void settle(flow_t* f, const blocks_t* p, const generalized_t* g, int32_t* w, int32_t* most) noexcept nogil:
+    """Islands of a problem, in w (`marks_of`); most (4) as `find_islands` tells."""
+    cdef ssize_t n = g.n, panels = g.n_panels, at = n + (n if n > panels else panels)
+    f.p = p[0]
+    f.law = p.law
+    f.g = g
+    f.iptr = w + at
+    f.cptr = w + at + panels + 1
+    f.ipanel = w + at + 2 * panels + 2
+    f.pblock = w + at + 3 * panels + 2
+    at += 4 * panels + 3
+    f.icols = w + at
+    f.local = w + at + n
+    f.vptr = w + at + 2 * n
+    f.n_islands = find_islands(p, g, w, w + n, <int32_t*>f.iptr, <int32_t*>f.ipanel, <int32_t*>f.cptr,
+                               <int32_t*>f.icols, <int32_t*>f.local, <int32_t*>f.pblock, <int32_t*>f.vptr, most)
+    f.swap = w                                          # scratch of before
+
+
+cdef inline ssize_t numbers_of(const flow_t* f, const int32_t* most) noexcept nogil:
+    """float64 that `furnish` needs."""
+    cdef ssize_t size = most[0]
+    return (4 * <ssize_t>f.g.n + 12 * <ssize_t>f.p.n_rows + 2 * <ssize_t>f.vptr[f.p.n_blocks] + 2 * size * size
+            + 2 * size + most[2] + most[1] + most[3] + 1)
+
+
+cdef inline void furnish(flow_t* f, const int32_t* most, double* x) noexcept nogil:
+    """Arrays of the iterate, of V and of N in x (`numbers_of`)."""
+    cdef ssize_t n = f.g.n, m = f.p.n_rows, nv = f.vptr[f.p.n_blocks], size = most[0]
+    f.y = x
+    f.u = x + n
+    f.grad = x + 2 * n
+    f.step = x + 3 * n
+    x += 4 * n
+    f.theta = x
+    f.rho = x + m
+    f.s = x + 2 * m
+    f.q = x + 3 * m
+    f.phi = x + 4 * m
+    f.center = x + 5 * m
+    f.lam = x + 6 * m
+    f.trial = x + 7 * m
+    f.best = x + 8 * m
+    f.first_best = x + 9 * m
+    f.w = x + 10 * m
+    f.e = x + 11 * m
+    x += 12 * m
+    f.v = x
+    f.held = x + nv
+    x += 2 * nv
+    f.normal = x
+    f.factor = x + size * size
+    x += 2 * size * size
+    f.inv = x
+    f.local_rhs = x + size
+    f.turned = x + 2 * size
+    f.line = x + 2 * size + most[2]
+
+
+cdef inline void aim_at(flow_t* f, double tol, int32_t steps, double start_energy, double start_velocity) noexcept nogil:
+    """What is asked of each island, beside the error of doing nothing; counts from nothing."""
+    cdef double share = 1.0 / <double>sqrt(<double>f.n_islands) if f.n_islands > 1 else 1.0
+    f.energy_limit = tol * start_energy * share
+    f.velocity_limit = tol * start_velocity
+    f.steps = steps
+    f.factorisations = f.updates = f.rounds = f.evaluations = 0
