@@ -81,13 +81,6 @@ class BuildKernels(build_ext):
         stamp.write_text(how)
 
 
-def is_current(path, part):
-    """Whether a WebAssembly module lies there and is of these sources."""
-    if not path.exists():
-        return False
-    return WASM["read_module"](path.read_bytes()).sources == WASM["source_hash"](Path(), part.modules)
-
-
 class BuildWasm(Command):
     """Compiles the kernels to WebAssembly where a compiler for it is installed (the extra `wasm`)."""
 
@@ -110,7 +103,7 @@ class BuildWasm(Command):
             here = Path("lavender", "web", f"{name}.wasm")
             out = Path(self.build_lib, here)
             out.parent.mkdir(parents=True, exist_ok=True)
-            if is_current(here, part):
+            if WASM["is_current"](here, Path(), part):
                 out.write_bytes(here.read_bytes())
                 continue
             reason = WASM["why_not"]()

@@ -5,8 +5,8 @@ python .ci/check_dist.py FOLDER        the folder with one .tar.gz and one .whl
 The source distribution is also unpacked, given other times and permissions, and made again: every byte must come back.
 """
 
-import importlib.util
 import os
+import runpy
 import subprocess
 import sys
 import tarfile
@@ -15,6 +15,7 @@ import zipfile
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
+WASM = runpy.run_path(str(ROOT / "lavender" / "web" / "compile.py"))
 
 
 def names_in(folder: Path) -> tuple[set[str], set[str]]:
@@ -50,8 +51,9 @@ def problems(in_sdist: set[str], in_wheel: set[str]) -> list[str]:
         found += [] if name in in_sdist else [f"sdist lacks {name}"]
     found += [f"wheel lacks {name}" for name in sorted(sources - in_wheel)]
     found += [f"wheel lacks the compiled module {name}" for name in sorted(kernels - modules)]
-    if importlib.util.find_spec("ziglang") and "lavender/web/lavender.wasm" not in in_wheel:
-        found.append("wheel lacks lavender/web/lavender.wasm, though its compiler is installed")
+    for path in (f"lavender/web/{name}.wasm" for name in WASM["PARTS"]):
+        found += [] if path in in_sdist else [f"sdist lacks {path}"]
+        found += [] if path in in_wheel else [f"wheel lacks {path}"]
     if not any(name.endswith("/licenses/LICENSE") for name in in_wheel):
         found.append("wheel lacks LICENSE")
     built = in_sdist - {"tests/parity/driver.c"}  # the one file of C that is written by hand
@@ -59,6 +61,21 @@ def problems(in_sdist: set[str], in_wheel: set[str]) -> list[str]:
     left += [f"wheel holds {name}" for name in in_wheel if name.endswith((".c", ".h", ".pyc", ".o"))]
     left += [f"wheel holds {name}" for name in in_wheel if name.split("/")[0] in {"tests", "build", "docs"}]
     return found + sorted(left)
+
+
+def stale(folder: Path) -> list[str]:
+    """WebAssembly modules in the sdist or the wheel that are of other sources than these."""
+    (sdist,), (wheel,) = folder.glob("*.tar.gz"), folder.glob("*.whl")
+    found = []
+    with tarfile.open(sdist) as archive, zipfile.ZipFile(wheel) as zipped:
+        top = archive.getnames()[0].partition("/")[0]
+        for name, part in WASM["PARTS"].items():
+            path, sources = f"lavender/web/{name}.wasm", WASM["source_hash"](ROOT, part.modules)
+            held = archive.extractfile(f"{top}/{path}")
+            for what, data in (("sdist", held.read() if held else b""), ("wheel", zipped.read(path))):
+                if WASM["read_module"](data).sources != sources:
+                    found.append(f"{path} in the {what} is of other sources")
+    return found
 
 
 def made_again(sdist: Path) -> list[str]:
@@ -85,6 +102,7 @@ def made_again(sdist: Path) -> list[str]:
 if __name__ == "__main__":
     in_sdist, in_wheel = names_in(Path(sys.argv[1]))
     found = problems(in_sdist, in_wheel)
+    found += [] if found else stale(Path(sys.argv[1]))
     found += made_again(next(Path(sys.argv[1]).glob("*.tar.gz")))
     print(
         "\n".join(found)

@@ -49,6 +49,7 @@ __all__ = [
     "Built",
     "Part",
     "build",
+    "is_current",
     "read_module",
     "source_hash",
     "why_not",
@@ -170,6 +171,11 @@ def source_hash(root: Path, modules: Iterable[str | Path] = MODULES) -> str:
     for path in sorted({*seen, _path(root, "build_options", ".py")}):
         found.update(path.name.encode() + b"\0" + path.read_text(encoding="utf-8").encode() + b"\0")
     return found.hexdigest()
+
+
+def is_current(path: Path, root: Path, part: Part) -> bool:
+    """Whether a module of a part lies at `path` and is of the sources below `root`."""
+    return path.exists() and read_module(path.read_bytes()).sources == source_hash(root, part.modules)
 
 
 def _path(root: Path, name: str, suffix: str) -> Path:

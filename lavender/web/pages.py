@@ -73,11 +73,8 @@ def module(say: Callable[[str], Any] = lambda text: None, name: str = "lavender"
         There is none for these sources, and none can be built.
     """
     shipped = SHIPPED / f"{name}.wasm"
-    sources = wasm.source_hash(ROOT, wasm.PARTS[name].modules)
-    if shipped.exists():
-        data = shipped.read_bytes()
-        if wasm.read_module(data).sources == sources:
-            return data
+    if wasm.is_current(shipped, ROOT, wasm.PARTS[name]):
+        return shipped.read_bytes()
     reason = wasm.why_not()
     if reason:
         state = "is of other kernels" if shipped.exists() else "is not in this installation"
