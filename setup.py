@@ -5,6 +5,8 @@ Environment:
     LAVENDER_DEBUG=1        every index of every memoryview is checked, -O1 -g
     LAVENDER_DEBUG=asan     the same, with the address and undefined-behaviour sanitizers, which also see raw
                             pointers (gcc; run Python with LD_PRELOAD="$(gcc -print-file-name=libasan.so)")
+    LAVENDER_FILES_URL=U    where the files of this version can be fetched: links and pictures of the long description
+                            begin with it, since an index shows the text alone
 """
 
 import gzip
@@ -12,6 +14,7 @@ import json
 import logging
 import multiprocessing
 import os
+import re
 import runpy
 import sys
 import tarfile
@@ -163,7 +166,18 @@ def extension(path, *more):
     )
 
 
+def long_description():
+    """README.md, its links and pictures absolute where it is known what they begin with."""
+    text, base = (
+        Path("README.md").read_text(encoding="utf-8"),
+        os.environ.get("LAVENDER_FILES_URL", "").rstrip("/"),
+    )
+    return re.sub(r"\]\((?![a-z]+:|#)([^)\s]+)\)", rf"]({base}/\1)", text) if base else text
+
+
 setup(
+    long_description=long_description(),
+    long_description_content_type="text/markdown",
     ext_modules=[
         *(extension(path) for path in sorted(Path("lavender_ext").rglob("*.pyx"))),
         # cythonize writes it

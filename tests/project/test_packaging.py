@@ -74,6 +74,21 @@ def test_no_text_offers_the_package_of_someone_else():
     assert not offers.search("pip install 'lavender-contact[wasm]'")
 
 
+def test_pictures_of_the_long_description_are_absolute_where_an_address_is_known():
+    def described(**env):
+        done = subprocess.run(
+            [sys.executable, "setup.py", "--long-description"],
+            capture_output=True, text=True, check=True, cwd=ROOT, env={**os.environ, **env},
+        )  # fmt: skip
+        return done.stdout
+
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    assert described().strip() == text.strip()
+    links = re.findall(r"\]\(([^)]+)\)", described(LAVENDER_FILES_URL="https://example.org/v1/"))
+    assert "https://example.org/v1/docs/static/web.gif" in links
+    assert len(links) >= 6 and all(link.startswith("https://") for link in links)
+
+
 def test_types_ship():
     assert (Path(lavender.__file__).parent / "py.typed").exists()
 
