@@ -7,7 +7,7 @@
 | `.hdf5`, `.h5` | FCLIB, local (W, q, mu) and global (M, H, f, w, mu), 2D, 3D; extra `fclib` | yes |
 
 What a format cannot hold is refused by name. `docs/formats.md` lists every entry. Not from a file but from another
-engine's memory: `from_mujoco`, `from_pinocchio`, and `record` for a folder of steps.
+engine's memory: `from_mujoco`, `from_pinocchio`, `from_drake`, and `record` for a folder of steps.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from typing import Any
 from lavender._arrays import FloatArray
 from lavender.errors import InputError
 from lavender.io import fclib, mujoco, npz
+from lavender.io.drake import from_drake
 from lavender.io.mujoco import from_mujoco
 from lavender.io.pinocchio import from_pinocchio
 from lavender.io.recording import Recording, record
@@ -28,6 +29,7 @@ from lavender.problem import Problem
 __all__ = [
     "Recording",
     "Stored",
+    "from_drake",
     "from_mujoco",
     "from_pinocchio",
     "load",

@@ -148,10 +148,10 @@ def _constraint(model: Any, data: Any, n: int, dt: float, correction: float) -> 
         return Cones.free(n), -correction / dt * np.array(data.constraint_position_error), order
     if kind == "PointContactConstraintModel":
         gap = np.array([float(data.constraint_position_error[2]), 0.0, 0.0])
-        return Cones.contacts(float(model.getFriction())), _push(gap, dt, correction), [2, 0, 1]
+        return Cones.contacts(float(model.getFriction())), closing_speed(gap, dt, correction), [2, 0, 1]
     if kind == "JointLimitConstraintModel":
         gap = np.array(data.constraint_residual, float)
-        return Cones.bounded(np.zeros(n), np.full(n, np.inf)), _push(gap, dt, correction), order
+        return Cones.bounded(np.zeros(n), np.full(n, np.inf)), closing_speed(gap, dt, correction), order
     if kind == "JointFrictionConstraintModel":
         low, high = np.array(model.getFrictionLowerLimit()), np.array(model.getFrictionUpperLimit())
         return Cones.bounded(dt * low, dt * high), np.zeros(n), order
@@ -160,6 +160,6 @@ def _constraint(model: Any, data: Any, n: int, dt: float, correction: float) -> 
     )
 
 
-def _push(gap: Any, dt: float, correction: float) -> Any:
+def closing_speed(gap: Any, dt: float, correction: float) -> Any:
     # What is apart may come as near as it is in one step; what is too near moves apart by a share.
     return -np.where(gap > 0.0, 1.0, correction) * gap / dt

@@ -139,7 +139,13 @@ def test_every_import_is_declared():
     # Anything that lavender imports at all stands in pyproject.toml under its own name.
     known = declared("dependencies") | declared("fclib") | declared("qp") | declared("frame")
     known |= declared("cluster") | declared("peers") | declared("mujoco")
-    known |= {"lavendersim", "pinocchio", "qoco", "siconos"}  # peers, used where they are installed
+    known |= {
+        "lavendersim",
+        "pinocchio",
+        "pydrake",
+        "qoco",
+        "siconos",
+    }  # peers, used where they are installed
     known |= {"ray"}  # a cluster that campaigns can use where it is installed
     known |= set(sys.stdlib_module_names) | {"lavender", "lavender_ext"}
     found = set()
