@@ -76,7 +76,7 @@ PER_ROW = {
     "cone": 0.0,
     "coulomb": 1.0 / 40.0,
 }  # more of them: contacts change their side
-TAIL = {"linear": 2, "lcp": 10, "cone": 10, "coulomb": 24}  # more that are granted before another is asked
+TAIL = {"linear": 2, "lcp": 10, "cone": 40, "coulomb": 24}  # more that are granted before another is asked
 MOST = 30.0  # of what rows add
 GENERAL_COUNT = {"linear": 2.0, "lcp": 10.0, "cone": 12.0, "coulomb": 20.0}  # over generalised velocities
 ADMM_COUNT, ADMM_FACTORS = 240.0, 3.0  # iterations to six decades, and how often rho moves on the way
@@ -92,6 +92,7 @@ SWEEPS, SWEEPS_REDUNDANT = 60.0, 400.0
 
 FILL = 5.0  # of a factor over rows against one over bodies, for the same unknowns: rows of one body are all neighbours
 ISLAND = 400e3  # what Python takes for an island of its own
+LU_ROWS = 300  # of a linear system that is not symmetric, up to which sweeps are looked at before its factor
 NARROW_ENTRIES = 12  # of A in a row up to which a narrow band is looked for
 NARROW = 40  # half bandwidth up to which a band is what `direct` takes
 TREE = 1.05  # neighbours of a body, in the mean, up to which bodies form trees
@@ -106,7 +107,7 @@ GENERAL_GATE = (
     FORM,
     tuple(GENERAL_COUNT[law] for law in LAWS),
 )
-GENERAL_TAIL = 200  # more steps over generalised velocities than expected that are granted
+GENERAL_TAIL = 60  # more steps over generalised velocities than expected that are granted
 ADMM_GENERAL = 1500  # rows up to which A of J and M, whose entries are not known, is formed for `admm`
 LEMKE_ROWS = 1000  # beyond, a dense tableau of 8 MB and more
 
@@ -158,6 +159,9 @@ def general_first(problem: Problem, largest: int) -> bool:
 
 def is_glanced(problem: Problem, per: float) -> bool:
     """A first look at sweeps, each of cost `per` [ns], comes before anything else is found out."""
+    if problem.law == "linear":
+        # LU of few rows costs as much as hundreds of sweeps, and more where they depend on each other.
+        return not problem.is_symmetric and problem.m <= LU_ROWS
     if problem.m <= FEW:
         return not factors_at_once(problem)
     return FIRST_LOOK * per <= GLANCED and not is_redundant(problem) and not factors_at_once(problem)
@@ -170,6 +174,13 @@ def factors_at_once(problem: Problem) -> bool:
     m = problem.m
     if m <= FEW:
         return True
+    if problem.rows is not None:
+        width = graph.body_spread(problem.cones.ptr, block_bodies(problem), problem.rows.n_bodies) + 1
+        return (
+            width <= NARROW
+            and DIRECT["lcp"] * BAND * m * float(width) ** 2 <= GLANCED
+            and not is_redundant(problem)
+        )
     if problem.matrix is None or len(problem._compressed[1]) > NARROW_ENTRIES * m:
         return False
     form, band, _ = choose(problem)

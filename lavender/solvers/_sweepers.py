@@ -6,13 +6,13 @@ rest = n log(now / tol) / log(before / now)         sweeps left, by the contract
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import log
 from typing import Any
 
 import numpy as np
 
 from lavender._arrays import FloatArray
 from lavender.problem import Problem
-from lavender.registry import FEW
 from lavender.residuals import judged, known, remember
 from lavender.solution import Claim, Status
 from lavender.solvers._costs import FIRST_LOOK, ISLAND, LOOK, finite_least, first_look, is_glanced, sweep_cost
@@ -49,15 +49,16 @@ class Glance:
         return said(SWEEPER, self.work) if self.done else "the start is a solution"
 
 
-def look_first(problem: Problem, impulse: FloatArray, n: int, tol: float) -> Glance | None:
-    """Sweeps from an impulse (m,) where a first look at them costs no more than to find out what else there is."""
+def look_first(problem: Problem, impulse: FloatArray, n: int, tol: float, failed: bool) -> Glance | None:
+    """Sweeps from an impulse (m,) where a first look at them costs no more than to find out what else there is.
+
+    `failed`: few rows whose factor did not end it at once.
+    """
     if problem.generalized is not None or problem.cones.has_round:
         return None
-    if problem.law == "linear" and problem.m > FEW:
-        return None  # fewer rows come here only where they have no factor that is small and regular
     per = sweep_cost(problem)
     sweeps = first_look(per)
-    if n < sweeps or not is_glanced(problem, per):
+    if n < sweeps or not (failed or is_glanced(problem, per)):
         return None
     spec = usable(SWEEPER, problem)
     if spec is None:
@@ -69,7 +70,7 @@ def look_first(problem: Problem, impulse: FloatArray, n: int, tol: float) -> Gla
         return Glance(None, None, lam, before, 0, before, Status.CONVERGED, 0, {})
     solver = spec.load()()
     state = solver.prepare(problem)
-    least, done, work = finite_least(problem), 0, dict[str, int]()
+    least, done, work = 0.0, 0, dict[str, int]()
     while True:
         claim: Claim = solver.run(state, lam, sweeps, tol, None)
         for kind, count in claim.work.items():
@@ -81,6 +82,7 @@ def look_first(problem: Problem, impulse: FloatArray, n: int, tol: float) -> Gla
         if now.relative <= tol or claim.status is not Status.MAX_ITERATIONS or done >= n:
             break
         rest = _sweeps_left(claim.iterations, before, now.relative, tol)
+        least = least or finite_least(problem)
         if rest * per > least or done * per > BELIEVED * least:
             break
         before, sweeps = now.relative, min(n - done, max(FIRST_LOOK, done // 2))
@@ -89,8 +91,8 @@ def look_first(problem: Problem, impulse: FloatArray, n: int, tol: float) -> Gla
 
 def _sweeps_left(done: int, before: float, now: float, tol: float) -> float:
     """At the contraction of the last `done` sweeps."""
-    gain = np.log(before / now) if 0.0 < now < before else 0.0
-    return done * float(np.log(now / max(tol, 1e-16)) / gain) if gain > 0.0 else np.inf
+    gain = log(before / now) if 0.0 < now < before < np.inf else 0.0
+    return done * log(now / max(tol, 1e-16)) / gain if gain > 0.0 else np.inf
 
 
 class Sweeps:

@@ -114,6 +114,8 @@ class Turns:
         """One turn; True when nothing is left to do."""
         trail, costs, k = self.trail, self.trail.costs, self.taken
         before, spent = trail.best, trail.iterations
+        # Friction that Newton's method needs so long for is as often ended by admm.
+        longer = 2 if self.inside is not None and trail.problem.law == "coulomb" else 0
         for candidate in costs.exact:
             if trail.best <= trail.tol or self.budget <= trail.iterations:
                 return True
@@ -138,7 +140,7 @@ class Turns:
                 trail,
                 candidate,
                 self.budget,
-                candidate.limit << (k + 2 * (self.inside is not None)),
+                candidate.limit << (k + longer),
                 self.more(candidate),
             ):
                 return True

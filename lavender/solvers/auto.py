@@ -76,7 +76,8 @@ class Auto:
         self, state: Problem, impulse: FloatArray, n: int, tol: float, time_limit: float | None = None
     ) -> Claim:
         problem = state
-        if problem.m <= FEW and n >= ONE_CALL and (problem.law == "linear" or factors_at_once(problem)):
+        few = problem.m <= FEW and n >= ONE_CALL and (problem.law == "linear" or factors_at_once(problem))
+        if few:
             made = AUTO.solve(problem, impulse, tol)
             if made is not None:
                 impulse[:] = made[0].impulse
@@ -95,7 +96,7 @@ class Auto:
                     return general.named(claim, "auto")
         if problem.m == 0:
             return Claim(Status.CONVERGED, 0, {}, "nothing to solve")
-        glance = look_first(problem, impulse, n, tol)
+        glance = look_first(problem, impulse, n, tol, few)
         if glance is not None and glance.best <= tol:
             impulse[:] = glance.impulse
             return Claim(Status.CONVERGED, glance.done, glance.work, glance.message)

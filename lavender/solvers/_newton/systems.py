@@ -24,7 +24,7 @@ from scipy.linalg.lapack import dpotrs as potrs
 
 from lavender._arrays import FloatArray, IntArray
 from lavender.problem import Problem
-from lavender.solvers._newton.pattern import block_pattern, postordered
+from lavender.solvers._newton.pattern import block_pattern, dissected, postordered
 from lavender.solvers._newton.scaled import Scaled, scaled
 from lavender_ext.factor import symbolic
 from lavender_ext.newton.band import (
@@ -165,6 +165,15 @@ class VelocitySystem(System):
         self.cost = factor_cost(structure[0], s)
         self.panels: tuple[Any, ...] | None = None
         if self.cost >= PANELS:
+            other = dissected(rows.n_bodies, node, nptr, nind)
+            fill = symbolic.factor_pattern(*other[:2])
+            if factor_cost(fill[0], s) < self.cost:
+                nptr, nind, node, slot, again = other
+                turned, structure, self.cost = (
+                    (turned != again).astype(np.int32),
+                    fill,
+                    factor_cost(fill[0], s),
+                )
             nptr, nind, node, slot, again = postordered(rows.n_bodies, node, nptr, nind)
             turned = (turned != again).astype(np.int32)
             structure = symbolic.factor_pattern(nptr, nind)
