@@ -43,7 +43,7 @@ if sys.platform == "win32":
 else:
     # The update of a block goes into the sweep's loop whole, however much a module has inlined before it: 7 to 20 %
     # of a sweep with gcc, 2 to 4 % of a step of Newton or of the engine, no change of bits.
-    INLINE = ["-finline-limit=2000", "--param=inline-unit-growth=200"]
+    INLINE = ["-finline-limit=2000", "--param=inline-unit-growth=100"]
     COMPILE_ARGS = ["-O1", "-g"] if DEBUG else ["-O3", "-g0", *INLINE]
     # What Cython shares has no loop of ours: the compiler's own limits, in under half of the time.
     PLAIN = [] if DEBUG else ["-O2", "-finline-limit=600", "--param=inline-unit-growth=40"]

@@ -141,7 +141,9 @@ def translate(path: Path, root: Path, work: Path) -> Path:
     """Cython's C of a module."""
     c_file = work / f"{path.stem}.c"
     directives = [f"-X{name}={value}" for name, value in OPTIONS["directives"]().items()]
-    run(sys.executable, "-m", "cython", *directives, path, "-o", c_file, cwd=root)
+    # What Python's side needs stands in a module of its own, as in an ordinary build: half of what would be compiled.
+    shared = "--shared=lavender_ext._utility"
+    run(sys.executable, "-m", "cython", *directives, shared, path, "-o", c_file, cwd=root)
     return c_file
 
 
@@ -183,7 +185,7 @@ def link_core(c_file: Path, names: list[str], root: Path, work: Path) -> Path:
         "-U_FORTIFY_SOURCE",
         "-fPIC",
         "-w",
-        "-O2",
+        "-O1",
     ]
     include = "-I" + sysconfig.get_paths()["include"]
     run(*compiler, *OPTIONS["COMPILE_FLAGS"], *sections, *plain, include, "-c", c_file, "-o", whole, cwd=root)
