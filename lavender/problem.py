@@ -401,8 +401,10 @@ class Problem:
         target = as_array("target", target, (m,), unit="m/s")
         if compliance is not None:
             compliance = as_array("compliance", compliance, (m,), unit="1/kg")
+        with np.errstate(over="ignore", invalid="ignore"):  # what is not finite, the problem refuses
+            b = target - generalized.velocity_of(generalized.v_free)
         return cls(
-            target - generalized.velocity_of(generalized.v_free),
+            b,
             cones,
             friction=friction,
             compliance=compliance,
@@ -459,7 +461,8 @@ class Problem:
                 )
             )
         if target is not None and general is not None:
-            b = as_array("target", target, (self.m,), unit="m/s") - general.velocity_of(general.v_free)
+            with np.errstate(over="ignore", invalid="ignore"):  # what is not finite, the problem refuses
+                b = as_array("target", target, (self.m,), unit="m/s") - general.velocity_of(general.v_free)
         given: dict[str, Any] = {"b": self.b if b is None else b, "guess": guess}  # checked by `Problem`
         return replace(self, generalized=general, **given)
 

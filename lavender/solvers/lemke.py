@@ -370,6 +370,8 @@ class _Run:
         for _ in range(6):
             measure.slack(problem.csr_data, x, w)
             rhs = scale * w[free]
+            if not (np.isfinite(rhs).all() and np.isfinite(a).all()):
+                break  # LAPACK would complain on the terminal, and has no answer
             step = np.linalg.lstsq(a, rhs, rcond=1e-13)[0] if singular else lapack.dgetrs(lu, pivot, rhs)[0]
             x[free] -= scale * step
             relative = self.judge(x)

@@ -78,8 +78,13 @@ def data_of(problem):
     out = hashlib.sha256()
     c, parts = problem.cones, [problem.b, problem.d, problem.guess]
     parts += [c.ptr, c.kind, c.lower, c.upper, c.mu, c.patch_radius]
-    a = problem.csr
-    parts += [a.indptr, a.indices, a.data]
+    if problem.generalized is None:
+        a = problem.csr
+        parts += [a.indptr, a.indices, a.data]
+    else:
+        for x in (problem.jacobian, problem.generalized.mass):
+            parts += [x.indptr, x.indices, x.data] if hasattr(x, "indptr") else [x]
+        parts.append(problem.generalized.v_free)
     for x in parts:
         if x is not None:
             out.update(np.ascontiguousarray(x).tobytes())

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 L = np.longdouble
-ROW, CONTACT, CONTACT_SPIN = 0, 1, 2
+ROW, CONTACT, CONTACT_SPIN, ROUND = 0, 1, 2, 3
 NORMAL = L(2.0) ** -1022
 DENORMAL = L(2.0) ** -1074
 ZERO = L(0.0)
@@ -36,11 +36,23 @@ class Problem:
     """A, |A| (as sums of absolute products), d and nu of a problem given as plain arrays."""
 
     def __init__(self, spec):
-        self.b = np.array(spec["b"], L)
+        general = spec["operator"] == "general"
+        jac = np.array(spec["J"], L).reshape(-1, len(spec["v_free"])) if general else None
+        if general:
+            v, target = np.array(spec["v_free"], L), np.array(spec["target"], L)
+            self.b, self.b_size = target - jac @ v, np.abs(target) + np.abs(jac) @ np.abs(v)
+        else:
+            self.b = np.array(spec["b"], L)
+            self.b_size = np.abs(self.b)
         self.cones = {key: np.array(value) for key, value in spec["cones"].items()}
         self.law = spec["friction"]
         self.m = len(self.b)
-        if "rows" in spec:
+        self.roundings = self.m + 20
+        if general:
+            self._of_general(
+                jac, np.array(spec["M"], L), np.array(spec.get("compliance", np.zeros(self.m)), L)
+            )
+        elif "rows" in spec:
             self._of_rows(spec)
         else:
             self.A = np.array(spec["A"], L).reshape(self.m, self.m)
@@ -120,6 +132,29 @@ class Problem:
                     self.nu[row] = inverse
         self.rows = True
 
+    def _of_general(self, jac, mass, soft):
+        """M = C C^T, Y = J C^-T, A = Y Y^T + compliance; |Y| |Y|^T for the sums of absolute products."""
+        n = len(mass)
+        lower, y = np.zeros((n, n), L), np.zeros((self.m, n), L)
+        for i in range(n):
+            for j in range(i):
+                lower[i, j] = (mass[i, j] - lower[i, :j] @ lower[j, :j]) / lower[j, j]
+            lower[i, i] = np.sqrt(mass[i, i] - lower[i, :i] @ lower[i, :i])
+            y[:, i] = (jac[:, i] - y[:, :i] @ lower[i, :i]) / lower[i, i]
+        self.A = y @ y.T + np.diag(soft)
+        self.size = np.abs(y) @ np.abs(y.T) + np.diag(soft)
+        d = np.diag(self.A).copy()
+        self.d = self._filled(d)
+        self.nu = self.d.copy()
+        # A solve by the factor of M is as exact as M in the best units of its velocities allows.
+        unit = 1 / np.sqrt(np.diag(mass))
+        scaled = (unit[:, None] * mass * unit[None, :]).astype(float)
+        condition = np.linalg.cond(scaled) if np.isfinite(scaled).all() else np.inf
+        self.roundings += 10 * n * L(condition)
+        self.d_edge = not np.isfinite(self.A).all() or bool(
+            np.any((d > 0) & (d < L(1e-12) * np.diag(self.size)))
+        )
+
     def _pairs(self):
         ptr, kind = self.cones["ptr"], self.cones["kind"]
         for k in range(len(kind)):
@@ -132,8 +167,14 @@ class Problem:
             if kind[k] == CONTACT_SPIN:
                 self.nu[ptr[k + 1] - 1] = self.d[j]
 
+            if kind[k] == ROUND and ptr[k + 1] - j == 6:
+                self.d[j + 4 : j + 6] = self.nu[j + 4 : j + 6] = L(0.5) * (self.d[j + 4] + self.d[j + 5])
+
     def tangents(self, k):
+        """Rows behind the normal that share a limit; of a round cone those that slide."""
         kind, ptr = self.cones["kind"], self.cones["ptr"]
+        if kind[k] == ROUND:
+            return 2
         return 0 if kind[k] == ROW else int(ptr[k + 1] - ptr[k] - kind[k])
 
     # -- the error of an impulse -------------------------------------------------------------------
@@ -150,6 +191,8 @@ class Problem:
             if c["kind"][k] == ROW:
                 low, high = np.array(c["lower"][part], L), np.array(c["upper"][part], L)
                 e[part] = np.minimum(np.maximum(step[part], lam[part] - high), lam[part] - low)
+            elif c["kind"][k] == ROUND:
+                e[part] = self._round(k, lam[part], step[part])
             elif self.law == "cone" and c["ptr"][k + 1] - c["ptr"][k] > 1:
                 e[part] = self._cone(k, lam[part], step[part])
             else:
@@ -198,6 +241,42 @@ class Problem:
             e[-1] = lam[-1] - np.copysign(a_s * top, y[-1]) / root[-1]
         return e
 
+    def _round(self, k, lam, step):
+        """Error of the projection on sum (|y_g| / a_g)^2 <= y_n^2 by bisection on its multiplier."""
+        c, j = self.cones, self.cones["ptr"][k]
+        d, mu = self.d[j : c["ptr"][k + 1]], L(c["mu"][k])
+        root = np.sqrt(d)
+        y = root * (lam - step)
+        normal, y = y[0], y[1:]
+        a = mu * root[1:] / root[0]
+        size = np.abs(y)
+        if mu == 0:
+            inside, top, scale = not y.any() and normal >= 0, max(ZERO, normal), np.zeros(len(y), L)
+        else:
+            inside = normal >= 0 and ((size / a) ** 2).sum() <= normal * normal
+            top, scale = ZERO, np.zeros(len(y), L)
+            if not inside and normal + np.sqrt(((a * size) ** 2).sum()) > 0:
+
+                def excess(s):
+                    return ((a * size / ((1 + a * a) * s - normal)) ** 2).sum() - 1
+
+                low = max(ZERO, ((normal + a * size) / (1 + a * a)).max())
+                high = low + size.sum() + abs(normal) + NORMAL
+                for _ in range(130):
+                    if not excess(high) > 0:
+                        break
+                    high = 2 * high
+                for _ in range(130):
+                    top = (low + high) / 2
+                    low, high = (top, high) if excess(top) > 0 else (low, top)
+                scale = a * a * top / ((1 + a * a) * top - normal)
+        if inside:
+            return step.copy()
+        e = np.empty(len(lam), L)
+        e[0] = lam[0] - top / root[0]
+        e[1:] = lam[1:] - y * scale / root[1:]
+        return e
+
     def norms(self, e):
         """E and V."""
         c, weight = self.cones, np.sqrt(self.nu * self.d)
@@ -206,6 +285,8 @@ class Problem:
             nt, j = self.tangents(k), c["ptr"][k]
             if nt == 2:
                 size[j + 1 : j + 3] = np.sqrt(e[j + 1] ** 2 + e[j + 2] ** 2)
+            if c["kind"][k] == ROUND and c["ptr"][k + 1] - j == 6:
+                size[j + 4 : j + 6] = np.sqrt(e[j + 4] ** 2 + e[j + 5] ** 2)
         return np.sqrt((self.d * e * e).sum()), (weight * size).max(initial=ZERO)
 
     def judge(self, impulse):
@@ -218,7 +299,7 @@ class Problem:
 
     def _judge(self, lam):
         w = self.slack(lam)
-        size = self.size @ np.abs(lam) + np.abs(self.b)
+        size = self.size @ np.abs(lam) + self.b_size
         energy, velocity = self.norms(self.error(lam, w))
         start = np.where(self._bounded(), np.clip(ZERO, self._low(), self._high()), ZERO).astype(L)
         energy0, velocity0 = self.norms(self.error(start, self.slack(start)))
@@ -232,7 +313,7 @@ class Problem:
         nothing |= bool(energy0 <= 2 * NORMAL * np.sqrt(self.d.sum()))
         f = L(2.0) ** -53 * size
         rounded = L(2.0) ** -53 * self.d * np.abs(lam)  # of lambda - Pi, where d is not A_ii
-        more = (self.m + 20) * (f + rounded + DENORMAL * (1 + np.abs(lam).max(initial=ZERO)))
+        more = self.roundings * (f + rounded + DENORMAL * (1 + np.abs(lam).max(initial=ZERO)))
         floor = self._ratio(*self._floor(f), energy0, velocity0)
         allowed = self._ratio(*self._floor(more), energy0, velocity0)
         seen = np.abs(np.concatenate([lam, w, self.d, self.b, [energy, velocity, energy0, velocity0]]))
@@ -283,7 +364,7 @@ class Problem:
         pull = ZERO
         for k in range(len(c["kind"])):
             part = slice(c["ptr"][k], c["ptr"][k + 1])
-            nt = self.tangents(k)
+            nt = self.tangents(k) if c["kind"][k] != ROUND else c["ptr"][k + 1] - c["ptr"][k] - 1
             if c["kind"][k] == ROW:
                 low, high = np.array(c["lower"][part], L), np.array(c["upper"][part], L)
                 if np.any((y[part] > 0) & np.isfinite(high)) or np.any((y[part] < 0) & np.isfinite(low)):

@@ -13,6 +13,8 @@ def problem_spec(draw, largest=12):
     """A problem of any law and operator."""
     if draw.chance(0.35):
         return rows_spec(draw)
+    if draw.chance(0.25):
+        return general_spec(draw, largest)
     cones = cones_spec(draw, draw.whole(0, largest))
     m = cones["ptr"][-1]
     spec = {"operator": draw.pick(("dense", "csr")), "A": matrix(draw, m), "cones": cones}
@@ -214,6 +216,66 @@ SHAPES = {
 WHOLE = ("joint_ptr", "joint_body", "contact_body")
 
 
+# -- generalised coordinates ---------------------------------------------------------------------------------------
+
+
+def general_spec(draw, largest):
+    """J, M of a forest, v*, target: rows on chains of its trees, masses and rows of any size."""
+    cones = cones_spec(draw, draw.whole(0, largest))
+    round_cones = draw.chance(0.15)
+    if round_cones:
+        k = draw.whole(1, 2)
+        tangents = draw.whole(3, 5)
+        cones = {
+            "ptr": [i * (1 + tangents) for i in range(k + 1)],
+            "kind": [lv.ROUND] * k,
+            "lower": [-np.inf] * (k * (1 + tangents)),
+            "upper": [np.inf] * (k * (1 + tangents)),
+            "mu": [draw.pick((0.0, 0.5, 1.0, 1e-3, 10.0)) for _ in range(k)],
+            "patch_radius": [0.0] * k,
+        }
+    m, n = cones["ptr"][-1], draw.whole(1, 9)
+    parent = [draw.whole(-1, i - 1) if i else -1 for i in range(n)]
+    lower = np.eye(n)
+    for i in range(n):
+        j = parent[i]
+        while j >= 0:
+            lower[i, j] = float(numbers(draw, 1, "tame")[0]) * 0.4
+            j = parent[j]
+    mass = lower.T @ np.diag(positive(draw, n, "tame") + 0.1) @ lower
+    style = "scales" if round_cones else draw.pick(("tame", "tame", "scales", "wild", "special"))
+    with np.errstate(all="ignore"):
+        if draw.chance(0.4):  # units of the velocities
+            scale = positive(draw, n, style)
+            mass = scale[:, None] * mass * scale[None, :]
+        jac = numbers(draw, m * n, draw.pick(("tame", "tame", "whole"))).reshape(m, n)
+        if draw.chance(0.3):
+            jac = jac * positive(draw, m, style)[:, None]
+    for i in range(m):
+        on = draw.whole(0, n - 1)
+        keep = {on}
+        while parent[on] >= 0:
+            on = parent[on]
+            keep.add(on)
+        if draw.chance(0.7):
+            jac[i, [j for j in range(n) if j not in keep]] = 0.0
+    numbers_of = "tame" if round_cones else None
+    spec = {
+        "operator": "general",
+        "M": np.nan_to_num(mass, nan=0.0, posinf=1e300, neginf=-1e300).tolist(),
+        "J": np.nan_to_num(jac, nan=0.0, posinf=1e300, neginf=-1e300).tolist(),
+        "v_free": numbers(draw, n, numbers_of).tolist(),
+        "target": (numbers(draw, m, numbers_of) if draw.chance(0.6) else np.zeros(m)).tolist(),
+        "cones": cones,
+        "friction": "cone" if round_cones else draw.pick(("coulomb", "cone")),
+    }
+    if draw.chance(0.4):
+        spec["compliance"] = (positive(draw, m, numbers_of) * draw.pick((0.0, 1e-6, 1.0))).tolist()
+    if draw.chance(0.2):
+        spec["guess"] = numbers(draw, m, numbers_of).tolist()
+    return spec
+
+
 def build(spec):
     """The Problem of a spec; what lavender refuses, it raises."""
     c = spec["cones"]
@@ -223,6 +285,11 @@ def build(spec):
         *(np.array(c[key], float) for key in ("lower", "upper", "mu", "patch_radius")),
     )
     more = {"friction": spec["friction"], "guess": spec.get("guess")}
+    if spec["operator"] == "general":
+        n = len(spec["v_free"])
+        jac = np.array(spec["J"], float).reshape(-1, n)
+        more |= {"target": np.array(spec["target"], float), "compliance": spec.get("compliance")}
+        return lv.Problem.from_jacobian(jac, np.array(spec["M"], float), spec["v_free"], cones=cones, **more)
     b = np.array(spec["b"], float)
     if spec["operator"] == "rows":
         rows = {
