@@ -136,13 +136,8 @@ class Turns:
                 and sweeps.run(self.budget, candidate.cost)
             ):
                 return True
-            if whole(
-                trail,
-                candidate,
-                self.budget,
-                candidate.limit << (k + longer),
-                self.more(candidate),
-            ):
+            limit = candidate.limit << (k + longer)
+            if whole(trail, candidate, self.budget, limit, self.more(candidate, limit)):
                 return True
             if self.taken > k:
                 break  # turns were taken meanwhile
@@ -155,18 +150,27 @@ class Turns:
             self.over = trail.late or (spent == trail.iterations and trail.best >= before)
         return False
 
-    def more(self, newton: Exact) -> Callable[[FloatArray], int] | None:
-        """What Newton's method asks where its allowance is used up."""
+    def more(self, newton: Exact, limit: int) -> Callable[[FloatArray], int] | None:
+        """What Newton's method asks where its first `limit` iterations are used up."""
         if self.inside is not None:
             return None
+        granted = min(limit, self.budget - self.trail.iterations)
 
         def ask(impulse: FloatArray) -> int:
+            nonlocal granted
             self.trail.offer(impulse)
             self.inside = newton
+            self.trail.iterations += granted  # until Newton's method returns and tells them itself
             try:
                 done = self.trail.done or not self.left() or self.take()
+                left = self.budget - self.trail.iterations
             finally:
+                self.trail.iterations -= granted
                 self.inside = None
-            return 0 if done or self.trail.late else newton.limit << min(self.taken, ROUNDS)
+            if done or self.trail.late:
+                return 0
+            now = max(0, min(newton.limit << min(self.taken, ROUNDS), left))
+            granted += now
+            return now
 
         return ask

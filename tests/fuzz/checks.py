@@ -103,20 +103,40 @@ def check_solve(spec):
         prepared = lv.prepare(problem, spec["solver"], **mine)
         first = prepared.solve(**rest)
         solution = prepared.solve(problem, **rest)
+        COUNTS["solves"] += 1
         if "time_limit" not in options and bits(first) != bits(solution):
             yield "changed bits", f"{spec['solver']}: solved twice by one Prepared"
     else:
         solution = lv.solve(problem, spec["solver"], **options)
     COUNTS["solves"] += 1
     yield from claims(spec, problem, solution)
+    if "others" in spec:
+        yield from together(spec, problem, solution)
     if spec["again"]:
         COUNTS["repeated"] += 1
+        COUNTS["solves"] += 1
         if data_of(problem) != before:
             yield "changed data", f"{spec['solver']} changed the problem that it was given"
         if "time_limit" not in options:
             fresh = lv.solve(problems.build(spec["problem"]), spec["solver"], **options)
             if bits(fresh) != bits(solution):
                 yield "changed bits", f"{spec['solver']}: solved twice"
+
+
+def together(spec, problem, solution):
+    """The same structure with other right sides: solved in one call as one by one, and each claim is judged."""
+    options = dict(spec["options"])
+    start = options.pop("impulse", None)
+    problems_of = [problem, *(problem.updated(b=np.array(b, float)) for b in spec["others"])]
+    starts = None if start is None else [start] * len(problems_of)
+    many = lv.solve_many(problems_of, spec["solver"], impulses=starts, threads=spec["threads"], **options)
+    if bits(many[0]) != bits(solution):
+        yield "changed bits", f"{spec['solver']}: solve_many and solve"
+    for b, other, found in zip(spec["others"], problems_of[1:], many[1:], strict=True):
+        if bits(lv.solve(other, spec["solver"], **spec["options"])) != bits(found):
+            yield "changed bits", f"{spec['solver']}: solve_many and solve, other right side"
+        yield from claims({**spec, "problem": {**spec["problem"], "b": b}}, other, found)
+    COUNTS["solves"] += 2 * len(problems_of) - 1
 
 
 def claims(spec, problem, solution):

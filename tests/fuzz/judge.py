@@ -41,6 +41,8 @@ class Problem:
         if general:
             v, target = np.array(spec["v_free"], L), np.array(spec["target"], L)
             self.b, self.b_size = target - jac @ v, np.abs(target) + np.abs(jac) @ np.abs(v)
+            if "b" in spec:  # of an update
+                self.b, self.b_size = np.array(spec["b"], L), np.abs(np.array(spec["b"], L))
         else:
             self.b = np.array(spec["b"], L)
             self.b_size = np.abs(self.b)

@@ -349,5 +349,8 @@ def solve_spec(draw):
         options["history"] = True
     if draw.chance(0.02):
         options["time_limit"] = draw.pick((0.0, 1e-6, 1e-3, 1.0))
+    if "time_limit" not in options and draw.chance(0.2):
+        spec["threads"] = draw.pick((1, 1, 1, 2))
+        spec["others"] = [numbers(draw, m).tolist() for _ in range(draw.whole(0, 3))]
     spec |= {"solver": solver, "options": options, "again": draw.chance(0.25), "prepared": draw.chance(0.1)}
     return spec
