@@ -1,4 +1,4 @@
-"""What `nncg` and `anderson` share: sweeps over rows of A or body velocities, by `pgs` or by exact blocks."""
+"""What `nncg` and `anderson` share: sweeps over rows of A, body velocities or J and M, by `pgs` or by exact blocks."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from lavender.errors import InputError, UnknownName
 from lavender.ordering import Order
 from lavender.problem import Problem
 from lavender.solution import Claim
-from lavender.solvers._sweeping import Sweeping, SweepState, claim
+from lavender.solvers._sweeping import Sweeping, SweepState, claim, over, swept
 from lavender_ext.accelerate import accelerated
 from lavender_ext.core import assemble
 from lavender_ext.judge import measure
@@ -82,7 +82,7 @@ class Accelerated(Sweeping):
     ) -> Claim:
         """n iterations, or fewer where a check ends them."""
         o, data = state.order, state.data
-        if state.first and data.factored:
+        if state.first and (data.factored or data.is_general):
             measure.velocity_change(data, impulse, state.space[-1])
         status, done, sweeps, restarts = accelerated.run(
             data, state.watch, impulse, n, tol, state.memory, state.prepared, state.exact, state.convex,
@@ -91,7 +91,7 @@ class Accelerated(Sweeping):
         work = {"sweeps": sweeps, "restarts": restarts - state.restarts}
         state.restarts = restarts
         sweep = "blocks" if state.exact else "pgs"
-        form = f"{sweep} on {'body velocities' if data.factored else 'rows of A'}"
+        form = f"{sweep} on {over(data)}"
         return replace(claim(status, done), work=work, form=form)
 
 
@@ -100,13 +100,13 @@ def _operator(problem: Problem) -> Any:
 
     Of one row the rows of A cost what body velocities cost, and mixing then need not form the velocities anew.
     """
-    return problem.data if _entries(problem) is None else problem.csr_data
+    return swept(problem) if _entries(problem) is None else problem.csr_data
 
 
 def sweep_work(problem: Problem) -> int:
     """Rough number of multiply-adds of one sweep, over what it runs over (`Data.work`), without forming that."""
     entries = _entries(problem)
-    return int(problem.data.work) if entries is None else entries + 4 * problem.m
+    return int(swept(problem).work) if entries is None else entries + 4 * problem.m
 
 
 def _entries(problem: Problem) -> int | None:

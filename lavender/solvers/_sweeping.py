@@ -48,8 +48,9 @@ class SweepState:
         start = reference(problem)
         if data is not problem.metric:
             data.set_start(*start)  # the error of doing nothing is the judge's, in whatever form
-        # Rows of A that were formed of a factored problem: its own form has the last word.
-        other = problem.data if problem.data.factored and not data.factored else None
+        # Rows of A that were formed of J and M: the form that was given has the last word.
+        formed = problem.matrix is None and not (data.factored or data.is_general)
+        other = problem.metric if formed else None
         self.watch = Watch(data, patience, other)
 
     @property
@@ -80,7 +81,8 @@ def run_kernel(
     """n sweeps in one call of `serial.run`, or fewer where a check ends them; tol = 0 checks nothing."""
     o = state.order
     # The same bits with or without an order array; without one the kernel skips two look-ups a row.
-    blocks = _ROW_BY_ROW if kind == serial.PGS and state.data.single_rows and o.is_given else o.blocks
+    rows = kind == serial.PGS and state.data.single_rows and not state.data.is_general
+    blocks = _ROW_BY_ROW if rows and o.is_given else o.blocks
     return claim(
         *serial.run(
             kind, state.data, state.watch, impulse, n, tol, blocks, o.split, o.mode, o.rng, omega, scratch, packing,
@@ -111,6 +113,24 @@ def run_threads(
 def _helpers() -> ThreadPoolExecutor:
     # Threads for all runs; one that is started late finds nothing left to do.
     return ThreadPoolExecutor(MOST_THREADS - 1, thread_name_prefix="lavender")
+
+
+def reads_whitened(problem: Problem) -> bool:
+    """Whether a sweep over J and M, twice the entries of Y, costs less than one over A, without forming A."""
+    if problem.generalized is None:
+        return False
+    data = problem.metric
+    return bool(data.work - 4 * problem.m < data.entries_of_a)  # `work` counts Y twice
+
+
+def swept(problem: Problem) -> Any:
+    """What sweeps run over: rows or a matrix as given; of J and M, those or A, whichever a sweep costs less on."""
+    return problem.metric if reads_whitened(problem) else problem.data
+
+
+def over(data: Any) -> str:
+    """What sweeps ran over, in words."""
+    return "whitened J" if data.is_general else "body velocities" if data.factored else "rows of A"
 
 
 @dataclass(frozen=True)

@@ -5,8 +5,8 @@
 A contact is open, sticks, or slips in the direction that a scalar Newton iteration finds
 (`lavender_ext/local/exact.pxd`); the rows of a joint are a small boxed problem, solved by pivoting. Normal and
 friction of one contact no longer wait for each other as in `pgs`; contacts still do. Works on the rows of
-A, or on body velocities where the problem has rows. `work["fallbacks"]` counts blocks without an exact
-answer that were relaxed instead.
+A, on body velocities where the problem has rows, on J and M where that costs less than A. `work["fallbacks"]` counts
+blocks without an exact answer that were relaxed instead.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from lavender.ordering import Order
 from lavender.problem import Problem
 from lavender.registry import SolverSpec
 from lavender.solution import Claim
-from lavender.solvers._sweeping import Sweeping, SweepState, claim
+from lavender.solvers._sweeping import Sweeping, SweepState, claim, over, swept
 from lavender_ext.judge import measure
 from lavender_ext.local import gauss_seidel
 
@@ -29,7 +29,7 @@ from lavender_ext.local import gauss_seidel
 class BlockState(SweepState):
     """A sweep state with the prepared numbers of every block, and v = M^-1 J^T lambda where there are rows."""
 
-    velocity: FloatArray | None = None  # (n + 1, 6)
+    velocity: FloatArray | None = None  # (n + 1, 6); of J and M u = Y^T lambda (nv + 1, 1)
 
     def __init__(self, problem: Problem, data: Any, order: Order) -> None:
         super().__init__(problem, data, order)
@@ -41,15 +41,17 @@ class BlockGaussSeidel(Sweeping):
     """Block Gauss-Seidel; `order`, `ground`, `seed` as in `lavender.ordering`."""
 
     def _state(self, problem: Problem, order: Order, before: BlockState | None) -> BlockState:
-        return BlockState(problem, problem.data, order)
+        return BlockState(problem, swept(problem), order)
 
     def run(
         self, state: BlockState, impulse: FloatArray, n: int, tol: float, time_limit: float | None = None
     ) -> Claim:
         o, data = state.order, state.data
         if state.velocity is None:
-            state.velocity = np.zeros((data.n_bodies + 1, 6))
-            if data.factored:
+            state.velocity = np.zeros(
+                (data.n_velocities + 1, 1) if data.is_general else (data.n_bodies + 1, 6)
+            )
+            if data.factored or data.is_general:
                 measure.velocity_change(data, impulse, state.velocity)
         status, done, fallbacks = gauss_seidel.run(
             data,
@@ -64,7 +66,7 @@ class BlockGaussSeidel(Sweeping):
             o.mode,
             o.rng,
         )
-        form = "body velocities" if data.factored else "rows of A"
+        form = over(data)
         return replace(claim(status, done), work={"sweeps": done, "fallbacks": fallbacks}, form=form)
 
 
@@ -72,6 +74,7 @@ SPEC = SolverSpec(
     name="block_gauss_seidel",
     factory=BlockGaussSeidel,
     laws=frozenset({"linear", "lcp", "coulomb", "cone"}),
+    operators=frozenset({"rows", "matrix", "generalized"}),
     order=True,
     seed=True,
     round_cones=True,

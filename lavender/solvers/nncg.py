@@ -26,6 +26,7 @@ SPEC = SolverSpec(
     name="nncg",
     factory=NNCG,
     laws=frozenset({"linear", "lcp", "coulomb", "cone"}),
+    operators=frozenset({"rows", "matrix", "generalized"}),
     order=True,
     seed=True,
     round_cones=True,

@@ -1,5 +1,7 @@
 """Projected Gauss-Seidel: one block after the other on w = A lambda - b of this moment.
 
+In generalised coordinates over u = Y^T lambda, J M^-1 J^T = Y Y^T, where that costs less than A (w = Y u - b).
+
     row       lambda <- clip(lambda - w / d, lower, upper)
     contact   lambda_n <- max(0, lambda_n - w_n / d_n), then the tangents together with one scalar step
               1 / lambda_max(A_tt) projected radially on mu lambda_n, then spin
@@ -9,13 +11,25 @@ Linear convergence for symmetric positive semidefinite A; the update is that of 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
 
 from lavender._arrays import FloatArray
+from lavender.ordering import Order
+from lavender.problem import Problem
 from lavender.registry import SolverSpec
 from lavender.solution import Claim
-from lavender.solvers._sweeping import SweepState, Threaded, run_kernel, run_threads
+from lavender.solvers._sweeping import SweepState, Threaded, reads_whitened, run_kernel, run_threads
+from lavender_ext.judge import measure
 from lavender_ext.sweep import serial
+
+
+class PGSState(SweepState):
+    """A sweep state, over J and M with u = Y^T lambda."""
+
+    velocity: FloatArray | None = None  # (nv + 1,)
 
 
 @dataclass(frozen=True)
@@ -23,22 +37,32 @@ class PGS(Threaded):
     """Projected Gauss-Seidel; `order`, `ground`, `seed` as in `lavender.ordering`; `threads` with "colored"."""
 
     def run(
-        self, state: SweepState, impulse: FloatArray, n: int, tol: float, time_limit: float | None = None
+        self, state: PGSState, impulse: FloatArray, n: int, tol: float, time_limit: float | None = None
     ) -> Claim:
+        if state.data.is_general:
+            if state.velocity is None:
+                state.velocity = np.zeros(state.data.n_velocities + 1)
+                measure.velocity_change(state.data, impulse, state.velocity[:, None])
+            made = run_kernel(state, impulse, n, tol, serial.PGS, scratch=state.velocity)
+            return replace(made, form="whitened J")
         if self.uses_threads(state):
             return run_threads(state, impulse, n, tol, self.threads)
         return run_kernel(state, impulse, n, tol, serial.PGS)
+
+    def _state(self, problem: Problem, order: Order, before: Any) -> PGSState:
+        data = problem.metric if reads_whitened(problem) else problem.csr_data
+        return PGSState(problem, data, order)
 
 
 SPEC = SolverSpec(
     name="pgs",
     factory=PGS,
     laws=frozenset({"linear", "lcp", "coulomb"}),
-    operators=frozenset({"matrix"}),
+    operators=frozenset({"matrix", "generalized"}),
     order=True,
     seed=True,
     threads=True,
     max_iter=1000,
-    summary="projected Gauss-Seidel on the rows of A",
+    summary="projected Gauss-Seidel on the rows of A, or on J and M",
     reference="Cottle, Pang, Stone 1992, section 5.2; Jourdan, Alart, Jean 1998 for friction",
 )

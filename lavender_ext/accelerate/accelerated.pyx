@@ -6,8 +6,9 @@
               f = D^1/2 (y - x), over the last `memory` sweeps                                        (2)
 
 D = diag d, so that both work in energy. S is a sweep of pgs or of exact blocks (local/gauss_seidel.pxd), over A in
-compressed rows or over the factored form with v = M^-1 J^T lam; with the symmetric order a sweep and the
-same sweep backwards. An iterate that is shown is always a swept one, y. All sums run in a fixed order.
+compressed rows, over the factored form with v = M^-1 J^T lam, or over J and M with v = Y^T lam; with the symmetric
+order a sweep and the same sweep backwards. An iterate that is shown is always a swept one, y. All sums run in a fixed
+order.
 
 (2) and its safeguards are those of accelerate/mixing.pxd. The first `convex` iterations may sweep under the cone law:
 where contacts stick, its answer is Coulomb's.
@@ -20,13 +21,14 @@ import numpy as np
 from lavender_ext.accelerate.mixing cimport CONTROL, MAX_MEMORY, UNDONE, forget, mix, mixing_t, take
 from lavender_ext.core.block cimport CONE, CONTACT_SPIN, ROW, blocks_t, clip, n_tangents, norm2
 from lavender_ext.core.csr cimport csr_t
+from lavender_ext.core.generalized cimport generalized_t, whitened_gather
 from lavender_ext.core.order cimport SYMMETRIC, advance_order
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.rows cimport relax_rows_block, rows_t
 from lavender_ext.core.velocity cimport rows_velocity
 from lavender_ext.judge.watch cimport CONVERGED, RUNNING, Watch
-from lavender_ext.local.gauss_seidel cimport solve_csr_block, solve_rows_block
-from lavender_ext.sweep.pgs cimport relax_csr_block
+from lavender_ext.local.gauss_seidel cimport solve_csr_block, solve_general_block, solve_rows_block
+from lavender_ext.sweep.pgs cimport relax_csr_block, relax_general_block
 
 cdef enum:
     REFRESH = 64                # iterations of nncg after which v is formed anew: rounding adds up in it
@@ -40,6 +42,7 @@ cdef struct sweep_data_t:
     const blocks_t* blocks
     const csr_t* csr            # NULL where factored
     const rows_t* rows
+    const generalized_t* general        # NULL but for J and M
     const int32_t* start        # prepared blocks, read where `exact` or under the cone law
     const double* g
     int32_t exact               # sweeps over exact blocks, else pgs
@@ -51,7 +54,7 @@ cdef struct sweep_data_t:
     int32_t mode
     int32_t memory
     uint64_t* rng
-    double* v                   # (n_bodies, 6), with nv = 6 n_bodies; nv = 0 where not factored
+    double* v                   # (nv): of bodies (n_bodies, 6), of J and M; nv = 0 where A is swept
     int32_t nv
     double* control             # (CONTROL) of accelerate/mixing.pxd
     double* gram                # (MAX_MEMORY, MAX_MEMORY)
@@ -64,7 +67,14 @@ cdef inline void sweep(const sweep_data_t* c, double* lam, int32_t first) noexce
     for k in range(2 if c.mode == SYMMETRIC else 1):
         advance_order(c.mode, first and k == 0, c.order, 0, c.split, c.rng)
         advance_order(c.mode, first and k == 0, c.order, c.split, p.n_blocks, c.rng)
-        if c.csr != NULL:
+        if c.general != NULL:
+            for q in range(p.n_blocks):
+                i = c.order[q]
+                if exact:
+                    solve_general_block(p, c.general, i, c.g + c.start[i], lam, c.v)
+                else:
+                    relax_general_block(p, c.general, i, lam, c.v)
+        elif c.csr != NULL:
             if not exact:
                 for q in range(p.n_blocks):
                     relax_csr_block(p, c.csr, c.order[q], lam)
@@ -82,8 +92,10 @@ cdef inline void sweep(const sweep_data_t* c, double* lam, int32_t first) noexce
 
 
 cdef inline void form_velocity(const sweep_data_t* c, const double* lam) noexcept nogil:
-    # nothing to do where not factored
-    if c.nv > 0:
+    # nothing to do where A is swept
+    if c.general != NULL:
+        whitened_gather(c.general, lam, c.v)
+    elif c.nv > 0:
         rows_velocity(c.blocks, c.rows, lam, c.v)
 
 
@@ -209,7 +221,7 @@ cdef void anderson_step(void* context, double* lam, int32_t first_sweep, int32_t
 
 def allocate(Data p, int memory):
     """Zeroed (control, gram, work, v) for a run; memory 0 is nncg."""
-    cdef Py_ssize_t m = p.blocks.n_rows, nv = 6 * p.rows.n_bodies if p.factored else 0
+    cdef Py_ssize_t m = p.blocks.n_rows, nv = p.general.n if p.is_general else 6 * p.rows.n_bodies if p.factored else 0
     if not 0 <= memory <= MAX_MEMORY:
         raise ValueError(f"memory is {memory}; 0 to {MAX_MEMORY} is needed")
     return (np.zeros(CONTROL), np.zeros(MAX_MEMORY * MAX_MEMORY), np.zeros(3 * (m + nv) + (1 + 2 * memory) * m + 1),
@@ -235,6 +247,7 @@ def run(Data p, Watch watch, double[::1] lam, int n, double tol, int memory, pre
     c.blocks = &p.blocks
     c.csr = NULL if p.factored else &p.csr
     c.rows = &p.rows
+    c.general = &p.general if p.is_general else NULL
     c.start = NULL
     c.g = NULL
     c.exact = exact
@@ -252,7 +265,7 @@ def run(Data p, Watch watch, double[::1] lam, int n, double tol, int memory, pre
     c.memory = memory
     c.rng = &rng[0]
     c.v = &v[0, 0]
-    c.nv = 6 * p.rows.n_bodies if p.factored else 0
+    c.nv = p.general.n if p.is_general else 6 * p.rows.n_bodies if p.factored else 0
     c.control = &control[0]
     c.gram = &gram[0]
     c.work = &work[0]

@@ -9,7 +9,7 @@ A row of Y has entries in the columns of its row of J and in their ancestors, th
 Rows that stand together and reach the same columns share a panel: one list of columns, values row by row.
 """
 from libc.math cimport fabs, sqrt
-from libc.stdint cimport int32_t
+from libc.stdint cimport int32_t, uint64_t
 
 
 cdef enum:
@@ -34,6 +34,7 @@ cdef struct generalized_t:
     const int32_t* pval         # (n_panels + 1) its first place in `y`
     const int32_t* cols         # columns of each panel, ascending
     const double* y             # Y
+    const int32_t* home         # (k) panel of each block
 
 
 # -- M = L^T D L -------------------------------------------------------------------------------------
@@ -229,15 +230,60 @@ cdef inline void sort_falling(int32_t* x, int32_t n) noexcept nogil:
         x[j + 1] = t
 
 
+cdef inline int32_t few_panels(const generalized_t* g, int32_t n_blocks, const int32_t* ptr, uint64_t* above,
+                               int32_t* prow, int32_t* pcol, int32_t* pval, int32_t* cols, int32_t room,
+                               int32_t* n_cols, double* n_values) noexcept nogil:
+    """`panel_pattern` of at most 64 velocities, sets of columns as bits; above (n) is scratch."""
+    cdef int32_t i, q, k, first, last, count = 0, at = 0, n = 0
+    cdef uint64_t on, held = 0
+    n_values[0] = 0.0
+    prow[0] = 0
+    pcol[0] = 0
+    pval[0] = 0
+    for k in range(g.n):                                # a column and those that it reaches, which come before it
+        above[k] = <uint64_t>1 << k
+        if g.parent[k] >= 0:
+            above[k] |= above[g.parent[k]]
+    for i in range(n_blocks):
+        first = ptr[i]
+        last = ptr[i + 1]
+        on = 0
+        for q in range(g.jptr[first], g.jptr[last]):
+            on |= above[g.jidx[q]]
+        if n > 0 and on == held and last - prow[n - 1] <= PANEL_ROWS:
+            prow[n] = last                              # the panel grows
+        else:
+            if at + g.n > room:
+                return -1
+            count = 0
+            for k in range(g.n):
+                if on >> k & 1:
+                    cols[at + count] = k
+                    count += 1
+            at += count
+            held = on
+            n += 1
+            prow[n] = last
+            pcol[n] = at
+        n_values[0] += <double>count * (last - first)
+        pval[n] = pval[n - 1] + count * (last - prow[n - 1])
+        if n_values[0] >= 2147483647.0:
+            break
+    n_cols[0] = at
+    return n
+
+
 cdef inline int32_t panel_pattern(const generalized_t* g, int32_t n_blocks, const int32_t* ptr, int32_t* mark,
                                   int32_t* prow, int32_t* pcol, int32_t* pval, int32_t* cols, int32_t room,
                                   int32_t* n_cols, double* n_values) noexcept nogil:
     """Panels of consecutive blocks that reach the same columns; how many, or -1 where `room` columns do not suffice.
 
-    mark (2 n) is scratch; of n_cols and n_values the caller makes arrays.
+    mark (2 n) is scratch, aligned to 8 bytes; of n_cols and n_values the caller makes arrays.
     """
     cdef int32_t i, first, last, count, same, before = -1, held = 0, at = 0, n = 0, stamp = 0
     cdef int32_t* out = mark + g.n
+    if g.n <= 64:
+        return few_panels(g, n_blocks, ptr, <uint64_t*>mark, prow, pcol, pval, cols, room, n_cols, n_values)
     n_values[0] = 0.0
     prow[0] = 0
     pcol[0] = 0
@@ -339,6 +385,40 @@ cdef inline void panel_times(const generalized_t* g, int32_t panel, const double
             s0 += y[a] * x[cols[a]]
         out[i] = s0 + s1
         y += nc
+
+
+cdef inline double whitened_dot(const generalized_t* g, int32_t panel, int32_t row, const double* x) noexcept nogil:
+    """Y_row x, with the bits of `panel_times`."""
+    cdef int32_t a = 0, nc = g.pcol[panel + 1] - g.pcol[panel]
+    cdef const int32_t* cols = g.cols + g.pcol[panel]
+    cdef const double* y = g.y + g.pval[panel] + <ssize_t>(row - g.prow[panel]) * nc
+    cdef double s0 = 0.0, s1 = 0.0
+    while a + 2 <= nc:
+        s0 += y[a] * x[cols[a]]
+        s1 += y[a + 1] * x[cols[a + 1]]
+        a += 2
+    if a < nc:
+        s0 += y[a] * x[cols[a]]
+    return s0 + s1
+
+
+cdef inline void whitened_push(const generalized_t* g, int32_t panel, int32_t row, double change, double* x) noexcept nogil:
+    """x (n) += Y_row^T change."""
+    cdef int32_t a, nc = g.pcol[panel + 1] - g.pcol[panel]
+    cdef const int32_t* cols = g.cols + g.pcol[panel]
+    cdef const double* y = g.y + g.pval[panel] + <ssize_t>(row - g.prow[panel]) * nc
+    if change != 0.0:
+        for a in range(nc):
+            x[cols[a]] += y[a] * change
+
+
+cdef inline void whitened_gather(const generalized_t* g, const double* lam, double* x) noexcept nogil:
+    """x (n) = Y^T lam."""
+    cdef int32_t a
+    for a in range(g.n):
+        x[a] = 0.0
+    for a in range(g.n_panels):
+        panel_push(g, a, lam, x)
 
 
 cdef inline void panel_push(const generalized_t* g, int32_t panel, const double* lam, double* x) noexcept nogil:

@@ -27,7 +27,7 @@ cdef enum:                      # how `make_numbers` ended
 
 
 cdef struct made_t:             # of a problem in generalised coordinates; `free` both
-    int32_t* marks              # scratch (2 n), prow, pcol, pval (k + 1 each), empty (m + 1), cols
+    int32_t* marks              # scratch (2 n), prow, pcol, pval (k + 1 each), empty (m + 1), home (k), cols
     double* numbers             # d, nu, step (m + 1 each), Y
     int32_t* empty              # inside marks
     int32_t n_empty

@@ -215,13 +215,15 @@ cdef void point_at(blocks_t* p, generalized_t* g, const made_t* made) noexcept n
     g.prow = made.marks + 2 * <ssize_t>g.n
     g.pcol = g.prow + k + 1
     g.pval = g.pcol + k + 1
-    g.cols = made.empty + m + 1
+    g.home = made.empty + m + 1
+    g.cols = g.home + k
 
 
 cdef int32_t make_numbers(blocks_t* p, generalized_t* g, made_t* out) noexcept nogil:
     """Panels, Y, d, nu and step of a problem in generalised coordinates, which then points at them; how it ended."""
-    cdef int32_t n = g.n, k = p.n_blocks, m = p.n_rows, n_cols
-    cdef ssize_t head = 2 * <ssize_t>n + 3 * (<ssize_t>k + 1) + m + 1, room = 2 * <ssize_t>g.jptr[m] + 64, most
+    cdef int32_t n = g.n, k = p.n_blocks, m = p.n_rows, n_cols, i, b = 0
+    cdef int32_t* home
+    cdef ssize_t head = 2 * <ssize_t>n + 3 * (<ssize_t>k + 1) + m + 1 + k, room = 2 * <ssize_t>g.jptr[m] + 64, most
     cdef int32_t* w
     out.marks = NULL
     out.numbers = NULL
@@ -246,7 +248,12 @@ cdef int32_t make_numbers(blocks_t* p, generalized_t* g, made_t* out) noexcept n
         free(w)
         out.marks = NULL
         return NO_MEMORY if out.values < 2147483647.0 else TOO_MANY
-    out.empty = w + head - (m + 1)
+    out.empty = w + head - (m + 1) - k
+    home = w + head - k
+    for i in range(k):
+        while w[2 * <ssize_t>n + b + 1] <= p.ptr[i]:        # prow
+            b += 1
+        home[i] = b
     point_at(p, g, out)
     out.n_empty = lav_general_diagonal(p, g, <double*>p.d, <double*>p.nu, <double*>p.step, out.empty, w, <double*>g.y)
     return MADE
@@ -442,6 +449,11 @@ cdef class Data:
         return self.rows.n_bodies
 
     @property
+    def n_velocities(self):
+        """nv of J and M."""
+        return self.general.n
+
+    @property
     def work(self):
         """Rough number of multiply-adds of one sweep; the front door sizes its chunks by it."""
         if self.is_general:
@@ -456,6 +468,22 @@ cdef class Data:
         if self._weight is None:
             self._weight = _read_only(np.sqrt(self.nu) * np.sqrt(self.d))
         return self._weight
+
+    @property
+    def entries_of_a(self):
+        """Entries that A would have, of J and M: rows that share a tree meet; rows on several trees may count twice."""
+        cdef const generalized_t* g = &self.general
+        cdef int32_t b, q, rows
+        cdef double out = 0.0
+        cdef double[::1] on = np.zeros(g.n + 1)
+        for b in range(g.n_panels):
+            rows = g.prow[b + 1] - g.prow[b]
+            for q in range(g.pcol[b], g.pcol[b + 1]):
+                if g.parent[g.cols[q]] < 0:
+                    on[g.cols[q]] += rows
+        for b in range(g.n):
+            out += on[b] * on[b]
+        return out
 
     def whitened(self):
         """(data, indices, indptr) of Y (m, n) in generalised coordinates; entries that are zero are left out."""

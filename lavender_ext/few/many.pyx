@@ -1,8 +1,9 @@
 """Many problems in generalised coordinates, one after the other without the interpreter: prepare, solve, judge.
 
-The same kernels in the same order as on one problem alone (`chain.pyx`), so the same bits and counts. What is worked out
-of a problem's data stays with it. A problem that does not end below tol on the judge's own measure, has empty rows or is
-more than what Newton's method is asked for first, is left to the caller.
+The same kernels in the same order as on one problem alone (`chain.pyx`), so the same bits and counts. Of what is worked
+out of a problem's data the error of doing nothing stays with it; d and Y are made in the same room for one after the
+other, since fresh pages for each cost more than both. A problem that does not end below tol on the judge's own measure,
+has empty rows or is more than what Newton's method is asked for first, is left to the caller.
 """
 from cpython.exc cimport PyErr_CheckSignals
 from libc.stdint cimport int32_t
@@ -40,7 +41,7 @@ cdef struct gate_t:             # what Newton's method may cost [ns] to be asked
 cdef struct job_t:
     blocks_t p
     generalized_t g
-    made_t made                 # in this call, marks NULL where the data had it
+    made_t made                 # of the data, or in this call; NULL between
     double begin[3]             # E0, V0, relative residual of doing nothing; E0 < 0 where not known
     int32_t law                 # as `gate_t.count`
     int32_t cold                # 1: from doing nothing, else from lam as it is
@@ -111,12 +112,22 @@ cdef inline bint is_first(const job_t* j, const gate_t* gate, int32_t largest) n
 
 
 cdef void solve_job(job_t* j, space_t* space, const gate_t* gate, double tol, int32_t limit) noexcept nogil:
+    cdef bint known = j.made.marks != NULL
+    if not known and make_numbers(&j.p, &j.g, &j.made) != MADE:
+        return
+    solve_made(j, space, gate, tol, limit)
+    if not known:
+        free(j.made.marks)
+        free(j.made.numbers)
+    j.made.marks = NULL
+    j.made.numbers = NULL
+
+
+cdef void solve_made(job_t* j, space_t* space, const gate_t* gate, double tol, int32_t limit) noexcept nogil:
     cdef flow_t f
     cdef int32_t most[4]
     cdef int32_t m = j.p.n_rows, end, i
     cdef bint cold = j.cold
-    if j.made.marks == NULL and make_numbers(&j.p, &j.g, &j.made) != MADE:
-        return
     if j.made.n_empty:
         return
     if j.begin[0] < 0.0:
@@ -251,22 +262,9 @@ cdef class Batch:
             at += j.p.n_rows
 
     def __dealloc__(self):
-        cdef Py_ssize_t i
-        if self.jobs != NULL:
-            for i in range(self.n):
-                self.drop(i)
-            free(self.jobs)
+        free(self.jobs)
         free(self.space.marks)
         free(self.space.numbers)
-
-    cdef void drop(self, Py_ssize_t i) noexcept:
-        # What was made in this call and has no owner.
-        cdef Data p = self.data[i]
-        if self.jobs[i].made.marks != p.made.marks:
-            free(self.jobs[i].made.marks)
-            free(self.jobs[i].made.numbers)
-        self.jobs[i].made.marks = NULL
-        self.jobs[i].made.numbers = NULL
 
     def run(self):
         """Solve; how many were."""
@@ -287,9 +285,6 @@ cdef class Batch:
             if j.end != SOLVED:
                 continue
             solved += 1
-            if not p.ready:
-                p.adopt(&j.made)
-                j.made = p.made
             if p.start_energy < 0.0:
                 p.set_start(j.begin[0], j.begin[1])
                 p.start_relative = j.begin[2]

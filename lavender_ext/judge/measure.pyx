@@ -6,7 +6,7 @@ import numpy as np
 
 from lavender_ext.core.block cimport blocks_t
 from lavender_ext.core.csr cimport csr_t
-from lavender_ext.core.generalized cimport generalized_t
+from lavender_ext.core.generalized cimport generalized_t, whitened_gather
 from lavender_ext.core.problem cimport Data, Room, room_for
 from lavender_ext.core.rows cimport rows_t
 from lavender_ext.core.velocity cimport rows_velocity
@@ -218,7 +218,10 @@ def begin(Data p, bint vanished):
 
 
 def velocity_change(Data p, const double[::1] lam, double[:, ::1] v):
-    """M^-1 J^T lam (n, 6) of a factored problem, into v."""
+    """M^-1 J^T lam (n, 6) of a factored problem, Y^T lam (nv) of J and M, into v."""
+    if p.is_general and p.blocks.n_rows > 0:
+        whitened_gather(&p.general, &lam[0], &v[0, 0])
+        return
     if not p.factored or p.rows.n_bodies == 0:
         return
     if p.blocks.n_rows == 0:

@@ -17,9 +17,10 @@ from libc.stdint cimport int32_t
 
 from lavender_ext.core.block cimport blocks_t
 from lavender_ext.core.csr cimport csr_t
+from lavender_ext.core.generalized cimport generalized_t
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.rows cimport rows_t
-from lavender_ext.judge.measure cimport judge_into
+from lavender_ext.judge.measure cimport general_judge, judge_into
 from lavender_ext.judge.score cimport are_numbers, relative, score_t
 
 
@@ -45,7 +46,7 @@ cdef struct watch_t:
     double* best                # (m) N s
     double* w                   # (m) scratch
     double* e                   # (m) scratch
-    double* v                   # (n_bodies, 12) scratch
+    double* v                   # (n_bodies, 12) scratch, of J and M (nv + m)
 
 
 ctypedef void (*sweep_t)(void* context, double* lam, int32_t first_sweep, int32_t n) noexcept nogil
@@ -78,12 +79,21 @@ cdef inline int32_t until_next(const watch_t* s, double now, double tol) noexcep
     return <int32_t>(n if n < most else most)
 
 
-cdef inline int32_t check(watch_t* s, const blocks_t* p, const csr_t* a, const rows_t* r, int32_t factored,
-                          double* lam, double tol) noexcept nogil:
+cdef inline void look(const watch_t* s, const blocks_t* p, const csr_t* a, const rows_t* r, const generalized_t* g,
+                      int32_t factored, const double* lam, int32_t floor, score_t* out) noexcept nogil:
+    """The judge's pass, over J and M where g is given."""
+    if g != NULL:
+        general_judge(p, g, lam, s.w, s.e, s.v, floor, out)
+    else:
+        judge_into(p, a, r, factored, lam, s.w, s.e, s.v, floor, out)
+
+
+cdef inline int32_t check(watch_t* s, const blocks_t* p, const csr_t* a, const rows_t* r, const generalized_t* g,
+                          int32_t factored, double* lam, double tol) noexcept nogil:
     """One check; sets the sweeps of the next."""
     cdef score_t x
     cdef double now, floor, inf = 1.0 / 0.0
-    judge_into(p, a, r, factored, lam, s.w, s.e, s.v, 0, &x)
+    look(s, p, a, r, g, factored, lam, 0, &x)
     now = against_start(s, x.energy, x.velocity) if x.finite else inf
     if now <= tol and not are_numbers(s.w, p.n_rows):
         now = inf
@@ -104,7 +114,7 @@ cdef inline int32_t check(watch_t* s, const blocks_t* p, const csr_t* a, const r
             copy(s.best, lam, p.n_rows)
         return DIVERGED
     if s.best_at >= 0 and s.best_relative <= 1e-6:
-        judge_into(p, a, r, factored, s.best, s.w, s.e, s.v, 1, &x)
+        look(s, p, a, r, g, factored, s.best, 1, &x)
         floor = against_start(s, x.floor_energy, x.floor_velocity)
         if s.best_relative <= 2.0 * floor and floor < inf:
             copy(s.best, lam, p.n_rows)
@@ -115,12 +125,13 @@ cdef inline int32_t check(watch_t* s, const blocks_t* p, const csr_t* a, const r
     return RUNNING
 
 
-cdef inline int32_t confirmed(const watch_t* s, const blocks_t* p, const csr_t* a, const rows_t* r, int32_t factored,
-                              const double* lam, double tol, int32_t status) noexcept nogil:
+cdef inline int32_t confirmed(const watch_t* s, const blocks_t* p, const csr_t* a, const rows_t* r,
+                              const generalized_t* g, int32_t factored, const double* lam, double tol,
+                              int32_t status) noexcept nogil:
     """The claim `status`, judged in another form: what does not hold there goes on, or has stalled."""
     cdef score_t x
     cdef double now, floor
-    judge_into(p, a, r, factored, lam, s.w, s.e, s.v, status == AT_FLOOR, &x)
+    look(s, p, a, r, g, factored, lam, status == AT_FLOOR, &x)
     now = against_start(s, x.energy, x.velocity) if x.finite else 1.0 / 0.0
     if now <= tol:
         return CONVERGED

@@ -13,7 +13,7 @@ from lavender_ext.judge.watch cimport AT_FLOOR, CONVERGED, RUNNING, check, confi
 cdef public int32_t lav_watch_check(watch_t* s, const blocks_t* p, const csr_t* a, const rows_t* r, int32_t factored,
                                     double* lam, double tol) noexcept nogil:
     """One check of `s` on lam (m); the status."""
-    return check(s, p, a, r, factored, lam, tol)
+    return check(s, p, a, r, NULL, factored, lam, tol)
 
 
 cdef class Watch:
@@ -24,8 +24,9 @@ cdef class Watch:
 
     def __init__(self, Data data, int patience=64, Data confirm=None):
         cdef Py_ssize_t m = data.blocks.n_rows
-        cdef Py_ssize_t n = data.rows.n_bodies if confirm is None else confirm.rows.n_bodies
-        cdef double[::1] scratch = np.empty(3 * m + 12 * n + 4)
+        cdef Data last = data if confirm is None else confirm
+        cdef Py_ssize_t n = last.general.n + m if last.is_general else 12 * <Py_ssize_t>last.rows.n_bodies
+        cdef double[::1] scratch = np.empty(3 * m + n + 4)
         self.data = data
         self.confirm = confirm
         self.keep = scratch
@@ -55,10 +56,11 @@ cdef class Watch:
 
     cdef int32_t check_now(self, double* lam, double tol) noexcept nogil:
         cdef int32_t status = check(&self.state, &self.data.blocks, &self.data.csr, &self.data.rows,
-                                    self.data.factored, lam, tol)
+                                    &self.data.general if self.data.is_general else NULL, self.data.factored, lam, tol)
         if self.confirm is not None and (status == CONVERGED or status == AT_FLOOR):
             return confirmed(&self.state, &self.confirm.blocks, &self.confirm.csr, &self.confirm.rows,
-                             self.confirm.factored, lam, tol, status)
+                             &self.confirm.general if self.confirm.is_general else NULL, self.confirm.factored, lam,
+                             tol, status)
         return status
 
     cdef int32_t run(self, sweep_t sweep, void* context, double* lam, int32_t n, double tol, int32_t* done) noexcept nogil:

@@ -13,6 +13,7 @@ from libc.stdint cimport int32_t
 
 from lavender_ext.core.block cimport CONE, CONTACT_SPIN, ROUND, ROW, blocks_t, n_tangents, relax_normal, relax_row
 from lavender_ext.core.csr cimport csr_dot, csr_t
+from lavender_ext.core.generalized cimport generalized_t, whitened_dot, whitened_push
 from lavender_ext.core.rows cimport (cross, dot3, joint_push, joint_velocity, push_bodies, relative_velocity,
                                      relax_joint, rows_t, swing_body)
 from lavender_ext.local.cone cimport cone3
@@ -171,6 +172,29 @@ cdef inline int32_t solve_csr_block(const blocks_t* p, const csr_t* a, int32_t i
         for k in range(n):
             w[k] = csr_dot(a, j + k, lam) - p.b[j + k]
     return solve_block(p, i, g, w, lam + j)
+
+
+cdef inline int32_t solve_general_block(const blocks_t* p, const generalized_t* o, int32_t i, const double* g, double* lam,
+                                        double* u) noexcept nogil:
+    """Over J and M, u (nv) = Y^T lam."""
+    cdef int32_t j = p.ptr[i], n = p.ptr[i + 1] - j, b = o.home[i], k, found
+    cdef double w[MAX_ROWS]
+    cdef double old[MAX_ROWS]
+    cdef double now
+    if n > MAX_ROWS:                                    # ROW: row by row
+        for k in range(j, j + n):
+            now = relax_row(lam[k], whitened_dot(o, b, k, u) + (o.compliance[k] * lam[k] - p.b[k]), p.step[k],
+                            p.lower[k], p.upper[k])
+            whitened_push(o, b, k, now - lam[k], u)
+            lam[k] = now
+        return 1
+    for k in range(n):
+        w[k] = whitened_dot(o, b, j + k, u) + (o.compliance[j + k] * lam[j + k] - p.b[j + k])
+        old[k] = lam[j + k]
+    found = solve_block(p, i, g, w, lam + j)
+    for k in range(n):
+        whitened_push(o, b, j + k, lam[j + k] - old[k], u)
+    return found
 
 
 cdef inline int32_t solve_sliding_contact(const blocks_t* p, const rows_t* r, int32_t i, const double* g, double* lam,

@@ -2,6 +2,7 @@
 
     over A in compressed rows    w = A lam - b of the block's rows                                  (1)
     over the factored form       w = J v + c lam - b, then v += M^-1 J^T (change)                   (2)
+    over J and M                 w = Y u + c lam - b, then u += Y^T (change)                        (3)
 """
 from libc.stdint cimport int32_t, uint64_t
 
@@ -9,13 +10,15 @@ import numpy as np
 
 from lavender_ext.core.block cimport CONTACT_SPIN, blocks_t, n_tangents
 from lavender_ext.core.csr cimport csr_t
+from lavender_ext.core.generalized cimport dot, generalized_t
 from lavender_ext.core.order cimport advance_order
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.rows cimport contact_jacobian, dot12, minv_times, rows_t
 from lavender_ext.judge.watch cimport CONVERGED, RUNNING, Watch
 from lavender_ext.local.exact cimport boxed_rows, contact_with_spin, contact_without_spin
 from lavender_ext.local.small cimport MAX_ROWS
-from lavender_ext.local.gauss_seidel cimport prepare_block, prepared_size, solve_csr_block, solve_rows_block
+from lavender_ext.local.gauss_seidel cimport (prepare_block, prepared_size, solve_csr_block, solve_general_block,
+                                              solve_rows_block)
 
 
 cdef public double lav_prepared_sizes(const blocks_t* p, int32_t* start) noexcept nogil:
@@ -86,6 +89,43 @@ cdef public void lav_prepare_rows(const blocks_t* p, const rows_t* r, const int3
         prepare_block(p, i, W, 0, g + start[i])
 
 
+cdef public void lav_prepare_general(const blocks_t* p, const generalized_t* o, const int32_t* start,
+                                     double* g) noexcept nogil:
+    """The same from the rows of Y."""
+    cdef int32_t i, j, n, k, q, b, nc
+    cdef double W[MAX_ROWS * MAX_ROWS]
+    cdef const double* y
+    for i in range(p.n_blocks):
+        if prepared_size(p, i) == 0:
+            continue
+        j = p.ptr[i]
+        n = p.ptr[i + 1] - j
+        b = o.home[i]
+        nc = o.pcol[b + 1] - o.pcol[b]
+        y = o.y + o.pval[b] + <ssize_t>(j - o.prow[b]) * nc
+        for k in range(n):
+            for q in range(n):
+                W[n * k + q] = dot(y + k * nc, y + q * nc, nc)
+        for k in range(n):
+            W[(n + 1) * k] += o.compliance[j + k]
+        prepare_block(p, i, W, 0, g + start[i])
+
+
+cdef public double lav_block_sweeps_general(const blocks_t* p, const generalized_t* o, const int32_t* start,
+                                            const double* g, double* lam, double* u, int32_t* order, int32_t split,
+                                            int32_t mode, uint64_t* rng, int32_t first_sweep, int32_t n) noexcept nogil:
+    """n sweeps over (3), u (nv) = Y^T lam."""
+    cdef int32_t s, q, i
+    cdef double fallbacks = 0
+    for s in range(n):
+        advance_order(mode, first_sweep and s == 0, order, 0, split, rng)
+        advance_order(mode, first_sweep and s == 0, order, split, p.n_blocks, rng)
+        for q in range(p.n_blocks):
+            i = order[q]
+            fallbacks += solve_general_block(p, o, i, g + start[i], lam, u)
+    return fallbacks
+
+
 cdef public double lav_block_sweeps_csr(const blocks_t* p, const csr_t* a, const int32_t* start, const double* g,
                                         double* lam, int32_t* order, int32_t split, int32_t mode, uint64_t* rng,
                                         int32_t first_sweep, int32_t n) noexcept nogil:
@@ -124,7 +164,9 @@ def prepare(Data p):
         raise MemoryError(f"{size:.0f} prepared numbers do not fit 32-bit places")
     cdef double[::1] g = np.zeros(<Py_ssize_t>size + 1)
     with nogil:
-        if p.factored:
+        if p.is_general:
+            lav_prepare_general(&p.blocks, &p.general, &start[0], &g[0])
+        elif p.factored:
             lav_prepare_rows(&p.blocks, &p.rows, &start[0], &g[0])
         else:
             lav_prepare_csr(&p.blocks, &p.csr, &start[0], &g[0])
@@ -135,6 +177,7 @@ cdef struct context_t:          # what a sweep needs besides lam
     const blocks_t* blocks
     const csr_t* csr            # NULL where factored
     const rows_t* rows
+    const generalized_t* general        # NULL but for J and M
     const int32_t* start
     const double* g
     double* velocity            # (n_bodies, 6) where factored
@@ -147,7 +190,10 @@ cdef struct context_t:          # what a sweep needs besides lam
 
 cdef void step(void* context, double* lam, int32_t first_sweep, int32_t n) noexcept nogil:
     cdef context_t* c = <context_t*>context
-    if c.csr == NULL:
+    if c.general != NULL:
+        c.fallbacks += lav_block_sweeps_general(c.blocks, c.general, c.start, c.g, lam, c.velocity, c.order, c.split,
+                                                c.mode, c.rng, first_sweep, n)
+    elif c.csr == NULL:
         c.fallbacks += lav_block_sweeps_rows(c.blocks, c.rows, c.start, c.g, lam, c.velocity, c.order, c.split, c.mode,
                                              c.rng, first_sweep, n)
     else:
@@ -168,6 +214,7 @@ def run(Data p, Watch watch, double[::1] lam, int n, double tol, const int32_t[:
             return CONVERGED, 0, 0
         return RUNNING, n, 0
     c.blocks = &p.blocks
+    c.general = &p.general if p.is_general else NULL
     c.csr = NULL if p.factored else &p.csr
     c.rows = &p.rows
     c.start = &start[0]

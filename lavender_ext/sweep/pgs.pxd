@@ -1,9 +1,13 @@
-"""One block of projected Gauss-Seidel over A in compressed rows; over the factored form see core/rows.pxd."""
+"""One block of projected Gauss-Seidel over A in compressed rows, or over J and M; over bodies see core/rows.pxd.
+
+Over J and M the whitened velocities u = Y^T lam are kept: w = Y u + c lam - b, then u += Y^T (change).
+"""
 from libc.stdint cimport int32_t
 
 from lavender_ext.core.block cimport (CONTACT_SPIN, ROW, blocks_t, n_tangents, relax_normal, relax_row,
                                       relax_tangents)
 from lavender_ext.core.csr cimport csr_dot, csr_t
+from lavender_ext.core.generalized cimport generalized_t, whitened_dot, whitened_push
 
 
 cdef inline void relax_csr_block(const blocks_t* p, const csr_t* a, int32_t i, double* lam) noexcept nogil:
@@ -25,3 +29,42 @@ cdef inline void relax_csr_block(const blocks_t* p, const csr_t* a, int32_t i, d
         q = end - 1
         bound = p.patch_radius[i] * bound
         lam[q] = relax_row(lam[q], csr_dot(a, q, lam) - p.b[q], p.step[q], -bound, bound)
+
+
+cdef inline void take_general(const generalized_t* g, int32_t panel, int32_t q, double now, double* lam,
+                              double* u) noexcept nogil:
+    whitened_push(g, panel, q, now - lam[q], u)
+    lam[q] = now
+
+
+cdef inline double general_slack_of(const blocks_t* p, const generalized_t* g, int32_t panel, int32_t q,
+                                    const double* lam, const double* u) noexcept nogil:
+    return whitened_dot(g, panel, q, u) + (g.compliance[q] * lam[q] - p.b[q])
+
+
+cdef inline void relax_general_block(const blocks_t* p, const generalized_t* g, int32_t i, double* lam,
+                                     double* u) noexcept nogil:
+    cdef int32_t j = p.ptr[i], end = p.ptr[i + 1], kind = p.kind[i], b = g.home[i], nt, q
+    cdef double w[2]
+    cdef double now[2]
+    cdef double bound, x
+    if kind == ROW:
+        for q in range(j, end):
+            x = general_slack_of(p, g, b, q, lam, u)
+            take_general(g, b, q, relax_row(lam[q], x, p.step[q], p.lower[q], p.upper[q]), lam, u)
+        return
+    nt = n_tangents(kind, end - j)
+    take_general(g, b, j, relax_normal(lam[j], general_slack_of(p, g, b, j, lam, u), p.step[j]), lam, u)
+    bound = p.mu[i] * lam[j]
+    if nt > 0:
+        for q in range(nt):
+            now[q] = lam[j + 1 + q]
+            w[q] = general_slack_of(p, g, b, j + 1 + q, lam, u)
+        relax_tangents(now, w, p.step[j + 1], bound, nt)
+        for q in range(nt):
+            take_general(g, b, j + 1 + q, now[q], lam, u)
+    if kind == CONTACT_SPIN:
+        q = end - 1
+        bound = p.patch_radius[i] * bound
+        x = general_slack_of(p, g, b, q, lam, u)
+        take_general(g, b, q, relax_row(lam[q], x, p.step[q], -bound, bound), lam, u)

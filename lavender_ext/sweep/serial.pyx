@@ -15,13 +15,14 @@ import numpy as np
 from lavender_ext.core.block cimport (CONTACT_SPIN, ROW, blocks_t, n_tangents, relax_normal, relax_row,
                                       relax_tangents)
 from lavender_ext.core.csr cimport csr_dot, csr_t
+from lavender_ext.core.generalized cimport generalized_t
 from lavender_ext.core.order cimport advance_order
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.rows cimport relax_rows_block, rows_t
 from lavender_ext.judge.watch cimport CONVERGED, RUNNING, Watch, sweep_t
 from lavender_ext.sweep.packed cimport (ROOM_BODY, ROOM_CONTACT, ROOM_MORE, pack_order, packed_t, packs,
                                         put_impulses, sweep_records, take_impulses)
-from lavender_ext.sweep.pgs cimport relax_csr_block
+from lavender_ext.sweep.pgs cimport relax_csr_block, relax_general_block
 
 
 cdef public void lav_pgs_sweeps(const blocks_t* p, const csr_t* a, double* lam, int32_t* order, int32_t split, int32_t mode,
@@ -34,6 +35,17 @@ cdef public void lav_pgs_sweeps(const blocks_t* p, const csr_t* a, double* lam, 
         advance_order(mode, first_sweep and s == 0, order, split, p.n_blocks, rng)
         for i in range(p.n_blocks):
             relax_csr_block(p, a, order[i], lam)
+
+
+cdef public void lav_pgs_general(const blocks_t* p, const generalized_t* g, double* lam, double* u, int32_t* order,
+                                 int32_t split, int32_t mode, uint64_t* rng, int32_t first_sweep, int32_t n) noexcept nogil:
+    """n sweeps of (1) over J and M, u (nv) = Y^T lam."""
+    cdef int32_t s, i
+    for s in range(n):
+        advance_order(mode, first_sweep and s == 0, order, 0, split, rng)
+        advance_order(mode, first_sweep and s == 0, order, split, p.n_blocks, rng)
+        for i in range(p.n_blocks):
+            relax_general_block(p, g, order[i], lam, u)
 
 
 cdef public void lav_pgs_rows_in_order(const blocks_t* p, const csr_t* a, double* lam, int32_t n) noexcept nogil:
@@ -133,8 +145,9 @@ cdef struct context_t:          # what a sweep needs besides lam
     const blocks_t* blocks
     const csr_t* csr
     const rows_t* rows
+    const generalized_t* general        # NULL where A is swept
     double omega
-    double* scratch             # (m) Jacobi; (n_bodies, 6) velocity of sequential impulses
+    double* scratch             # (m) Jacobi; (n_bodies, 6) velocity of sequential impulses; (nv) u
     int32_t* order
     int32_t split
     int32_t mode
@@ -144,7 +157,9 @@ cdef struct context_t:          # what a sweep needs besides lam
 
 cdef void pgs_step(void* context, double* lam, int32_t first_sweep, int32_t n) noexcept nogil:
     cdef context_t* c = <context_t*>context
-    if c.order == NULL:
+    if c.general != NULL:
+        lav_pgs_general(c.blocks, c.general, lam, c.scratch, c.order, c.split, c.mode, c.rng, first_sweep, n)
+    elif c.order == NULL:
         lav_pgs_rows_in_order(c.blocks, c.csr, lam, n)
     else:
         lav_pgs_sweeps(c.blocks, c.csr, lam, c.order, c.split, c.mode, c.rng, first_sweep, n)
@@ -235,6 +250,7 @@ def run(int kind, Data p, Watch watch, double[::1] lam, int n, double tol, int32
     c.blocks = &p.blocks
     c.csr = &p.csr
     c.rows = &p.rows
+    c.general = &p.general if p.is_general else NULL
     c.omega = omega
     c.scratch = &scratch[0] if scratch is not None else NULL
     c.order = &order[0] if order.shape[0] else NULL

@@ -15,6 +15,7 @@ import lavender as lv
 from lavender import registry
 from lavender.solvers._costs import Costs
 from lavender.solvers._islands import islands, restrict, rows_of
+from lavender.solvers._sweeping import reads_whitened
 
 
 def as_matrix(problem):
@@ -547,3 +548,51 @@ def test_an_island_too_large_for_a_dense_matrix_goes_over_the_rows(monkeypatch):
         lv.solve(random_general(6, "cone"), "newton", form="velocity")
     small = lv.Problem.from_jacobian([[1.0]], [[2.0]], [-1.0], cones=lv.Cones.contacts(0.0, 0))
     assert [s.success for s in lv.solve_many([random_general(6, "cone"), small])] == [True, True]
+
+
+# -- sweeps ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["pgs", "block_gauss_seidel", "nncg", "anderson"])
+@given(seed=seeds, friction=st.sampled_from(["cone", "coulomb"]), spin=st.booleans(), few=st.booleans())
+@settings(max_examples=8)
+def test_sweeps_over_j_and_m_are_those_over_a(name, seed, friction, spin, few):
+    """Many rows on few velocities are swept over Y, few rows on many over A: the same iterates to rounding."""
+    problem = random_general(seed, friction, n=30 if few else 6, contacts=2 if few else 6, spin=spin)
+    if lv.known(problem)[name]:
+        assert name == "pgs" and problem.law == "cone"
+        return
+    one = lv.solve(problem, name, tol=0.0, max_iter=12)
+    same = lv.solve(as_matrix(problem), name, tol=0.0, max_iter=12)
+    scale = 1.0 + np.abs(same.impulse).max()
+    # Sums in another order: 1e-13 of their terms, and a factor of a few on each of a dozen sweeps.
+    np.testing.assert_allclose(one.impulse, same.impulse, atol=1e-7 * scale)
+    assert ("whitened J" in one.solver.form) == reads_whitened(problem)
+    found = lv.solve(problem, name, tol=1e-6, max_iter=20_000)
+    assert found.success or found.status is not lv.Status.CONVERGED
+
+
+@given(seed=seeds)
+def test_what_a_sweep_costs_is_counted_without_forming_a(seed):
+    problem = random_general(seed, "cone", n=int(np.random.default_rng(seed).integers(4, 90)), contacts=4)
+    entries = problem.metric.entries_of_a
+    y = problem.metric.work - 4 * problem.m
+    assert "csr" not in problem.__dict__
+    whitened = problem.whitened
+    assert y >= 2 * whitened.nnz  # zeros inside a panel are stored
+    touched = (np.abs(whitened) @ np.abs(whitened).T).nnz
+    assert touched <= entries <= touched * max(1, int(problem.generalized.trees.max()) + 1)
+    assert reads_whitened(problem) == (y < entries)
+
+
+def test_many_columns_and_few_have_the_same_panels():
+    """Sets of columns as bits up to 64 velocities, as lists beyond: a chain of 64 and the same beside one more."""
+    small = random_general(5, "cone", n=64)
+    jac = sp.hstack([small.jacobian, sp.csr_array((small.m, 1))])
+    mass = sp.block_diag([small.generalized.mass, [[1.0]]])
+    large = lv.Problem.from_jacobian(
+        sp.csr_array(jac), sp.csr_array(mass), np.append(small.generalized.v_free, 0.0), cones=small.cones,
+        compliance=small.compliance, friction="cone",
+    )  # fmt: skip
+    np.testing.assert_array_equal(small.d, large.d)
+    np.testing.assert_array_equal(small.whitened.toarray(), large.whitened.toarray()[:, :-1])
