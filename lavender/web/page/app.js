@@ -253,7 +253,8 @@ class Side {
   step(time) {
     this.curve = this.simulation.stepWatched();
     this.history.time.push(time);
-    this.history.values.push(this.simulation.values);
+    const values = this.simulation.values;
+    this.history.values.push(this.simulation.newton ? [null, ...values.slice(1)] : values); // no number of sweeps
     if (this.history.time.length > KEPT) {
       this.history.time.shift();
       this.history.values.shift();
@@ -294,6 +295,21 @@ class Side {
     this.view.draw(this.simulation, this.app.colors);
   }
 
+  // What the step cost, in words.
+  work() {
+    const { newton, substeps, short, solved, settings } = this.simulation;
+    const parts = substeps === 1 ? "in one step" : `in each of ${substeps} substeps`;
+    if (!newton) {
+      return `sweeps: ${settings.iterations} ${parts}`;
+    }
+    if (!this.curve || this.curve.steps === undefined) {
+      return `newton: to ${TOL.toExponential(0)} of the error ${parts}`;
+    }
+    const { sweeps, steps, relative } = this.curve;
+    return `newton: ${sweeps} sweeps, ${steps} factorisations, ${relative.toExponential(0)} of the error left; `
+      + `${short} of ${solved} solves short of ${TOL.toExponential(0)}`;
+  }
+
   show() {
     const values = this.simulation.values;
     SOLVER_FIELDS.forEach((field, i) => {
@@ -303,14 +319,7 @@ class Side {
       cell.textContent = stepped ? asked : "–";
       cell.dataset.value = stepped ? String(values[i]) : "";
     });
-    const newton = this.simulation.newton && this.curve;
-    this.told.hidden = !newton;
-    if (newton) {
-      const { sweeps, steps, relative } = this.curve;
-      const { short, solved } = this.simulation;
-      this.told.textContent = `newton: ${sweeps} sweeps, ${steps} factorisations, ${relative.toExponential(0)} of the error left; `
-        + `${short} of ${solved} solves short of ${TOL.toExponential(0)}`;
-    }
+    this.told.textContent = this.work();
     this.draw();
     const what = `Side ${"AB"[this.index]}: ${this.app.scene.title}, ${values[2]} contacts`;
     if (this.canvas.getAttribute("aria-label") !== what) {

@@ -1,0 +1,110 @@
+"""Frames a second of the page that runs the kernels, and what one frame costs, in Chromium without a window.
+
+    python benchmarks/bench_page.py [ADDRESS ...] [--seconds 8]
+
+ADDRESS is what stands behind # in the page's address; by default the pyramid with sweeps on both sides, the pyramid
+with `newton` beside sweeps, and the pile. Frames are those that the page asked for (requestAnimationFrame);
+milliseconds are the main thread's processor time, which a busy machine does not lengthen: the script's part, not the
+painting.
+"""
+
+import argparse
+import os
+import shutil
+import sys
+import tempfile
+import threading
+from pathlib import Path
+
+from playwright.sync_api import sync_playwright
+
+from lavender.web import pages
+
+ADDRESSES = (
+    "scene=pyramid&a=16,warm,given&b=16,warm,given&speed=1&play=1",
+    "scene=pyramid&a=16,warm,given,newton&b=16,warm,given&speed=1&play=1",
+    "scene=pile&a=16,warm,given&b=16,warm,given&speed=1&play=1",
+)
+COUNT = """() => {
+  const app = window.lavender;
+  const inner = app.frame;
+  window.found = { frames: 0, from: app.steps, begun: performance.now() };
+  app.frame = function (now) {
+    window.found.frames += 1;
+    inner.call(this, now);
+  };
+}"""
+#: What a frame does at 60 a second: two steps of both sides, tables and pictures; every fifth, plots.
+PARTS = {
+    "steps": "lavender.sides.forEach((side) => { side.step(0); side.step(0); })",
+    "pictures": "lavender.sides.forEach((side) => side.draw())",
+    "the rest": "lavender.show(false)",
+    "plots": "lavender.plot()",
+}
+
+
+def cpu(page, session, code, times):
+    """Processor time of the main thread in `code` [ms], each of `times`."""
+
+    def spent():
+        found = {m["name"]: m["value"] for m in session.send("Performance.getMetrics")["metrics"]}
+        return found["TaskDuration"]
+
+    before = spent()
+    page.evaluate(f"() => {{ for (let k = 0; k < {times}; k++) {{ {code}; }} }}")
+    return 1000 * (spent() - before) / times
+
+
+def main():
+    """A line for each address."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("addresses", nargs="*", default=ADDRESSES)
+    parser.add_argument("--seconds", type=float, default=8.0)
+    given = parser.parse_args()
+    names = ("chromium", "chromium-browser", "google-chrome")
+    browser_path = os.environ.get("CHROMIUM") or next(filter(None, map(shutil.which, names)), None)
+    if browser_path is None:
+        sys.exit(f"none of {', '.join(names)} is installed, and CHROMIUM names no browser")
+    print(
+        "| address | frames/s | simulated s/s | "
+        + " | ".join(f"{name} [ms]" for name in (*PARTS, "a frame"))
+        + " |"
+    )
+    print("|---" * (len(PARTS) + 4) + "|")
+    with tempfile.TemporaryDirectory() as folder, sync_playwright() as p:
+        pages.write_page(Path(folder), print)
+        server = pages.server(Path(folder))
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        browser = p.chromium.launch(executable_path=browser_path, args=["--no-sandbox"])
+        for address in given.addresses:
+            page = browser.new_page(viewport={"width": 1280, "height": 1000})
+            page.goto(f"http://127.0.0.1:{server.server_address[1]}/#{address}")
+            page.wait_for_selector("html[data-ready=true]")
+            page.wait_for_function("!lavender.waiting && lavender.steps > 10")
+            page.evaluate(COUNT)
+            page.wait_for_timeout(1000 * given.seconds)
+            found = page.evaluate(
+                "() => ({...found, to: lavender.steps, passed: performance.now() - found.begun})"
+            )
+            dt = page.evaluate("lavender.scene.dt")
+            page.evaluate("lavender.play(false)")
+            session = page.context.new_cdp_session(page)
+            session.send("Performance.enable", {"timeDomain": "threadTicks"})
+            parts = {name: cpu(page, session, code, 40) for name, code in PARTS.items()}
+            parts["the rest"] = max(parts["the rest"] - parts["pictures"], 0.0)
+            whole = parts["steps"] + parts["pictures"] + parts["the rest"] + parts["plots"] / 5
+            seconds = found["passed"] / 1000
+            cells = [
+                address.split("&speed")[0],
+                f"{found['frames'] / seconds:.1f}",
+                f"{(found['to'] - found['from']) * dt / seconds:.2f}",
+                *(f"{ms:.2f}" for ms in (*parts.values(), whole)),
+            ]
+            print("| " + " | ".join(cells) + " |", flush=True)
+            page.close()
+        browser.close()
+        server.shutdown()
+
+
+if __name__ == "__main__":
+    main()
