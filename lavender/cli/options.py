@@ -59,9 +59,13 @@ def _is_order(word: str) -> bool:
 
 
 def _is_solver(word: str) -> bool:
-    from lavender import registry
+    from lavender import registry, suite
 
-    return word in registry.specs() and not Path(word).exists()
+    if Path(word).exists():
+        return False
+    names = {family.partition("(")[0] for family in suite.families()}
+    # What is no case and no path either is a solver's name with a mistake in it, and is refused as such.
+    return word in registry.specs() or not (word in names or set(word) & set("(*?[/\\."))
 
 
 class ManyValues(click.Command):

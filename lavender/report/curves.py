@@ -208,7 +208,7 @@ def profile_figure(profile: tables.Profile) -> Figure:
     return Figure(
         f"profile {profile.law} {level_name(profile.level)}",
         f"{profile.law}, to {level_name(profile.level)} ({count(profile.cases, 'case')}"
-        + (f"; {left} more solvers not drawn)" if left else ")"),
+        + (f"; {count(left, 'more solver')} not drawn)" if left else ")"),
         "time / fastest time", "cases solved [%]", tuple(curves), y_log=False,
     )  # fmt: skip
 

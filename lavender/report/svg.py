@@ -17,7 +17,7 @@ from lavender.report.draw import power_on_axis, seconds_on_axis
 __all__ = ["svg"]
 
 WIDTH, HEIGHT = 1000, 640  # units, twice the pixels of a phone's width
-LEFT, RIGHT, TOP, BOTTOM = 118, 210, 54, 92  # margins: labels of the axis; names at the ends of curves
+LEFT, RIGHT, TOP, BOTTOM = 118, 256, 62, 92  # margins: labels of the axis; names at the ends of curves
 GAP = 30  # units between two names, at least
 LEAST_DECADES = 1.0  # a logarithmic axis spans so much, at least
 
@@ -85,7 +85,7 @@ def svg(
     parts = [
         f'<svg class="chart" viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{escape(figure.title)}"',
         f' data-x="{across.data()}" data-y="{up.data()}" data-t="{said}">',
-        f'<text class="t" x="{LEFT}" y="30">{escape(_short(figure.title if title is None else title))}</text>',
+        f'<text class="t" x="{LEFT}" y="24">{escape(_short(figure.title if title is None else title))}</text>',
     ]
     parts += _grid(figure, across, up)
     names = _names(curves, across, up, leaders)
@@ -130,7 +130,7 @@ def _grid(figure: Figure, across: _Axis, up: _Axis) -> list[str]:
     out.append(
         f'<text class="a" x="{middle}" y="{HEIGHT - 20}" text-anchor="middle">{escape(figure.x_title)}</text>'
     )
-    out.append(f'<text class="a" x="{LEFT}" y="{TOP - 2}">{escape(figure.y_title)}</text>')
+    out.append(f'<text class="a" x="{LEFT}" y="{TOP - 8}">{escape(figure.y_title)}</text>')
     marks = [(level, "l", "") for level in figure.levels]
     if math.isfinite(figure.floor) and figure.floor > 0.0:
         marks.append((figure.floor, "f", "floor"))
@@ -160,8 +160,11 @@ def _names(
     ends = {}
     for c, x, y in curves:
         if not c.thin:
-            a, b = next((a, b) for a, b in zip(reversed(x), reversed(y), strict=True) if not math.isnan(b))
-            ends[c.label] = (across(a) + 12, up(b) + 8)
+            places = [(across(a), up(b)) for a, b in zip(x, y, strict=True) if not math.isnan(b)]
+            last = places[-1][1]
+            # Beside whatever of the curve is as high as its end.
+            right = WIDTH - RIGHT if c.steps else max(a for a, b in places if abs(b - last) < GAP)
+            ends[c.label] = (right + 12, last + 8)
     taken: list[int] = []
     placed: list[str] = []
     for label in sorted(
@@ -216,7 +219,5 @@ def _curve(
         body += f'<path class="d" d="{"".join(dots)}"/>'
     if c.label in names and not c.thin:
         place = names[c.label]
-        if c.steps and before is not None:
-            place = (WIDTH - RIGHT + 8, before[1] + 8)
         body += f'<text x="{place[0]}" y="{place[1]}">{escape(_short(c.label, 24))}</text>'
     return f'<g class="{kind}" data-l="{escape(c.label)}"{asked}>{body}</g>'

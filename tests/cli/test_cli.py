@@ -167,6 +167,8 @@ def test_solvers_lists_all_with_reasons(lavender):
     ("words", "sign"),
     [
         (("report", "--solvers", "pgz"), "did you mean 'pgs'"),
+        (("report", "stack(n=8)", "--solvers", "auto", "pgz"), "unknown solver 'pgz'; did you mean 'pgs'"),
+        (("report", "--solvers", "pgs", "stak(n=8)"), "unknown case 'stak'"),
         (("report", "no/such.npz"), "no such file"),
         (("report", "stak(n=8)"), "did you mean"),
         (("report", "--levels", "0"), "level 0.0 must be"),

@@ -464,6 +464,23 @@ def test_a_drawing_holds_the_points_of_its_figure(real):
             assert np.abs(np.log10(y / np.array(c.y))).max() < 0.04
 
 
+@pytest.mark.parametrize("steps", [True, False])
+def test_names_at_the_ends_of_curves_neither_cover_each_other_nor_leave_the_drawing(steps):
+    names = ["auto", "block_gauss_seidel", "sequential_impulses"]
+    made = [
+        curves.Curve(n, n, (1.0, 2.0 + i, 9.0), (50.0, 100.0, 100.0), steps=steps)
+        for i, n in enumerate(names)
+    ]
+    root = ElementTree.fromstring(svg(curves.Figure("f", "t", "x", "y", tuple(made), y_log=False), {}, names))
+    texts = [
+        (t.text, int(t.get("x")), int(t.get("y"))) for t in root.iter() if t.tag == "text" and t.text in names
+    ]
+    assert sorted(t[0] for t in texts) == names
+    heights = sorted(t[2] for t in texts)
+    assert min(np.diff(heights)) >= 26  # the largest letters, on a phone
+    assert all(x + 12.2 * len(name) <= 1000 for name, x, _ in texts)  # 22 units high: 0.55 of it wide
+
+
 def test_a_drawing_survives_what_has_no_place_on_its_axes():
     odd = curves.Curve("a", "a", (0.0, 1e-300, 1.0, math.inf), (1.0, math.nan, 0.0, 1.0))
     for drawn in (
