@@ -318,6 +318,8 @@ class Problem:
             Tangent rows of each contact, 0 to 2. Default: two where mu > 0.
         patch_radius : scalar or (c,) m, optional
             Gives each contact a spin row.
+        **more
+            As `Problem`: name, friction, ...; the example of `Rows` is a whole stack.
 
         Raises
         ------
@@ -376,7 +378,8 @@ class Problem:
         Parameters
         ----------
         J : (m, nv) array or sparse
-            Rows in the order of `cones`, e.g. `Cones.free(6) + Cones.contacts(0.5, count=8)`.
+            Rows in the order of `cones`, e.g. `Cones.free(6) + Cones.contacts(0.5, count=8)`; of a contact its normal,
+            then its two tangents.
         M : (nv, nv) array or sparse, or a sequence of square blocks, one for each kinematic tree
             Mass matrix, symmetric positive definite.
         v_free : (nv,) m/s, rad/s
@@ -393,11 +396,29 @@ class Problem:
         ------
         InputError
             As `Generalized` and `Problem`.
+
+        Examples
+        --------
+        A cart of 2 kg with a pole of 1 kg and 0.5 m runs with its tip into a wall, friction 0.5 in one tangent:
+
+        >>> import numpy as np
+        >>> import lavender as lv
+        >>> c, s = 0.5 * np.cos(0.3), 0.5 * np.sin(0.3)
+        >>> M = [[3.0, c], [c, 0.25]]  # of cart and hinge
+        >>> J = [[1.0, c], [0.0, s]]  # velocity of the tip off the wall, and along it
+        >>> cones = lv.Cones.contacts(0.5, tangents=1)
+        >>> problem = lv.Problem.from_jacobian(J, M, v_free=[-1.0, 0.2], cones=cones)
+        >>> solution = lv.solve(problem, tol=1e-9)
+        >>> solution.impulse.round(3).tolist()  # N s: it slides, 0.579 = 0.5 x 1.158
+        [1.158, -0.579]
         """
         generalized = J if isinstance(J, Generalized) else Generalized(J, M, v_free, dof_names)
         m = generalized.m
         if isinstance(cones, Cones) and cones.n_rows != m:
-            raise InputError(f"J has {m} rows; {cones.n_rows} are needed, as the cones have")
+            hint = (
+                " (a contact has a normal and two tangents, or tangents=0, 1)" if np.any(cones.kind) else ""
+            )
+            raise InputError(f"J has {m} rows; {cones.n_rows} are needed, as the cones have{hint}")
         target = as_array("target", target, (m,), unit="m/s")
         if compliance is not None:
             compliance = as_array("compliance", compliance, (m,), unit="1/kg")

@@ -32,7 +32,7 @@ class Walk:
     @property
     def asked(self) -> str:
         """The budget or the level."""
-        return f"{self.max_iter} iterations" if self.mode == "budget" else f"to {level_name(self.tol)}"
+        return f"{self.max_iter} iterations" if self.mode == "budget" else f"tol {level_name(self.tol)}"
 
     @property
     def time(self) -> dict[str, float]:
