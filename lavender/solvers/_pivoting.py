@@ -17,6 +17,9 @@ from lavender.solvers._factor import TINY, DenseFactor, Factor, SparseFactor, ch
 from lavender_ext.pivot.principal import INDEFINITE, ROUNDS, SMALL, SOLVED, STUCK, Pivoting
 
 HALVINGS = 41  # step lengths tried in a line search: 1, 1/2, ... 2^-40
+# s for each multiply-add of a dense factor, and for each nonzero of a sparse one, with as many times more as it has
+# thousands of rows: what a first factor is refused by where the time is short.
+DENSE, SPARSE, SPARSE_ROWS = 1.5e-10, 1e-7, 1000.0
 SLOP = 8.0  # roundings of w within which a sign means nothing, as there
 
 
@@ -35,6 +38,11 @@ class PivotState:
         if self.form != "band":
             self.factor = DenseFactor(problem) if self.form == "dense" else SparseFactor(problem)
         self.is_factored = False
+        self.late = False  # a factor was not begun that would have ended after the deadline
+        # Of the next factor [s]: the first by structure, then as long as the last took.
+        self.seconds = DENSE * problem.m**3 / 3.0
+        if self.form == "sparse":
+            self.seconds = min(self.seconds, SPARSE * problem.csr.nnz * (1.0 + problem.m / SPARSE_ROWS))
         self.factorisations = self.exchanged = self.searches = 0  # by Python
 
     def start(self, shift: float) -> None:
@@ -62,7 +70,17 @@ class PivotState:
         n_free = self.rows.number()
         self.factorisations += 1
         self.is_factored = True
-        return SMALL if self.factor.factor(self.rows.place, n_free, self.rows.shift) else SOLVED
+        start = perf_counter()
+        small = self.factor.factor(self.rows.place, n_free, self.rows.shift)
+        self.seconds = perf_counter() - start
+        return SMALL if small else SOLVED
+
+    def too_late(self, stop_at: float | None) -> bool:
+        """Whether the next factor would end after `stop_at` (of `perf_counter`), by what the last one took."""
+        if stop_at is None or self.factor is None or perf_counter() + self.seconds <= stop_at:
+            return False
+        self.late = True
+        return True
 
     def solve_free(self) -> None:
         """x = A^-1 b with all rows free and factored."""
@@ -103,6 +121,8 @@ class PivotState:
             rows.put_bounds()
             rows.slack()
             if not self.is_factored:
+                if self.too_late(stop_at):
+                    return ROUNDS, done - 1
                 code = self.factorise()
                 if code != SOLVED:
                     return code, done
@@ -140,6 +160,9 @@ class PivotState:
             if not (self.is_factored and np.array_equal(at, rows.at)):
                 self.exchanged += int(np.count_nonzero(at != rows.at))
                 rows.at[:] = at
+                if self.too_late(stop_at):
+                    rows.x[:] = x
+                    return ROUNDS, done - 1
                 code = self.factorise()
                 if code != SOLVED:
                     return code, done

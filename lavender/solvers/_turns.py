@@ -58,6 +58,8 @@ def whole(
     most = min(limit or spec.max_iter, spec.max_iter, budget - trail.iterations)
     claim: Claim
     if spec.resumable:
+        if hasattr(solver, "until"):
+            solver.until(state, trail.deadline)
         claim = _in_chunks(trail, solver, state, impulse, most)
         trail.kept[chosen.key], trail.left[chosen.key] = (solver, state), impulse
     else:

@@ -13,6 +13,7 @@ body form; L U where A is not symmetric.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from time import perf_counter
 from typing import Any
 
 import numpy as np
@@ -26,8 +27,12 @@ from lavender.registry import SolverSpec
 from lavender.residuals import reference
 from lavender.solution import Claim, Status
 from lavender.solvers._accelerated import LARGEST_MEMORY
+from lavender.solvers._islands import block_bodies
+from lavender.solvers._newton.pattern import block_pattern
+from lavender.solvers._newton.systems import factor_cost
 from lavender.solvers._sweeping import claim
 from lavender_ext.accelerate import admm
+from lavender_ext.factor import symbolic
 from lavender_ext.judge import watch
 
 _DENSE, _SYMMETRIC, _GENERAL, _BODIES = 0, 1, 2, 3
@@ -36,8 +41,19 @@ _START_RHO = 0.1  # B has unit diagonal, so 1 is its scale; measured
 _PATIENCE = 5000  # iterations: on mass ratios the residual rises while rho finds its place
 
 
+_LATE = "the next factorisation would end after the time limit"
+_AT_ONCE = 0.02  # s, that a factor may be expected to take for `prepare` to make it
+# s for each multiply-add of a factor over bodies by QDLDL, and of a dense one; for each nonzero of a sparse one, with
+# as many times more as it has thousands of rows (`_costs.py`).
+_BODY, _FULL, _SPARSE, _SPARSE_ROWS = 3.5e-9, 1.5e-10, 1e-7, 1000.0
+
+
 class _Failed(Exception):
     """A factorisation broke down; the text says how."""
+
+
+class _TooLate(Exception):
+    """A factorisation would end after the deadline."""
 
 
 class AdmmState:
@@ -73,7 +89,20 @@ class AdmmState:
                 self.kind, self.matrix = _DENSE, self.matrix.toarray()
             else:
                 self.kind = _SYMMETRIC
-        self.factor = self._factor()
+        self.stop_at = np.inf  # of perf_counter: no factor is begun that is expected to end later
+        self.seconds = self._expected()  # of the next factor
+        self.factor: Any = self._factor() if self.seconds <= _AT_ONCE else None
+
+    def _expected(self) -> float:
+        # What the first factor takes, from structure; the next ones take as long as it did.
+        problem, m = self.problem, self.problem.m
+        if self.kind == _DENSE:
+            return _FULL * m**3 / 3.0
+        if self.kind == _BODIES:
+            assert problem.rows is not None
+            nptr, nind = block_pattern(problem.rows.n_bodies, block_bodies(problem))[:2]
+            return _BODY * factor_cost(symbolic.factor_pattern(nptr, nind)[0], 6)
+        return _SPARSE * self.matrix.nnz * (1.0 + m / _SPARSE_ROWS) * (2.0 if self.kind == _GENERAL else 1.0)
 
     @property
     def best(self) -> tuple[float, FloatArray | None]:
@@ -81,6 +110,14 @@ class AdmmState:
         return self.watch.best
 
     def _factor(self) -> tuple[int, int, tuple[Any, ...]]:
+        start = perf_counter()
+        if start + self.seconds > self.stop_at:
+            raise _TooLate
+        made = self._make_factor()
+        self.seconds = perf_counter() - start
+        return made
+
+    def _make_factor(self) -> tuple[int, int, tuple[Any, ...]]:
         self.factorisations += 1
         m = self.problem.m
         if m == 0:
@@ -164,6 +201,11 @@ class ADMM:
         """A fresh state: the penalty starts anew, so that a solve depends on its problem alone."""
         return self.prepare(problem)
 
+    def until(self, state: AdmmState | str, deadline: float) -> None:
+        """Let no factor begin that is expected to end after `deadline` (of `perf_counter`)."""
+        if not isinstance(state, str):
+            state.stop_at = deadline
+
     @np.errstate(all="ignore")  # what overflows is judged
     def run(
         self, state: AdmmState | str, impulse: FloatArray, n: int, tol: float, time_limit: float | None = None
@@ -172,10 +214,17 @@ class ADMM:
         if isinstance(state, str):
             return Claim(Status.NUMERICAL_ERROR, 0, {}, state)
         data = state.data
+        if state.factor is None:
+            try:
+                state.factor = state._factor()
+            except _Failed as failure:
+                return Claim(Status.NUMERICAL_ERROR, 0, {}, str(failure))
+            except _TooLate:
+                return Claim(Status.TIME_LIMIT, 0, {}, _LATE)
         if state.watch.total == 0 and len(impulse):
             # y of the start: minus its slack, shifted; at a solution the first iteration stays there.
             admm.start(data, impulse, state.problem.slack(impulse), state.root, state.rho, state.space)
-        undone, message = state.undone, ""
+        undone, message, total = state.undone, "", state.watch.total
 
         def iterate(count: int, first: bool) -> None:
             while count:
@@ -192,6 +241,8 @@ class ADMM:
             result = claim(*state.watch.run_python(iterate, impulse, n, tol))
         except _Failed as failure:
             result, message = Claim(Status.NUMERICAL_ERROR, state.watch.total), str(failure)
+        except _TooLate:
+            result, message = Claim(Status.TIME_LIMIT, state.watch.total - total), _LATE
         work = {
             "solves": result.iterations,
             "factorisations": state.factorisations - state.reported,

@@ -129,7 +129,8 @@ class Auto:
             status = Status.TIME_LIMIT
         else:
             status = Status.MAX_ITERATIONS if n == 0 or trail.iterations >= n else Status.STALLED
-        message = " -> ".join(trail.steps) or "the start is a solution"
+        nothing = "the start is a solution" if trail.best <= tol else "no time for anything"
+        message = " -> ".join(trail.steps) or nothing
         return Claim(status, trail.iterations, trail.work, message, certificate=trail.certificate)
 
 

@@ -157,7 +157,9 @@ class _Run:
 
     @property
     def out_of_time(self) -> bool:
-        return self.stop_at is not None and perf_counter() >= self.stop_at
+        pivot = self.state.pivot
+        late = pivot is not None and pivot.late
+        return self.stop_at is not None and (late or perf_counter() >= self.stop_at)
 
     def claim(self, status: Status, **more: Any) -> Claim:
         state = self.state

@@ -182,3 +182,31 @@ def test_work_is_told_once_however_a_run_is_cut(m):
     cut = lv.solve(problem, "admm", tol=0.0, max_iter=9, callback=lambda *_: False)
     assert dict(whole.work) == dict(cut.work)
     assert whole.work["factorisations"] >= 1
+
+
+def test_a_factor_that_would_end_after_the_deadline_is_not_begun():
+    problem = box_stack(20, 10.0, 0.5)
+    prepared = lv.prepare(problem, "admm")
+    solver, state = prepared._solver, prepared._state
+    impulse, made = problem.start(), state.factorisations
+    state.factor = None  # as of a problem whose first factor is large
+    solver.until(state, -np.inf)
+    claim = solver.run(state, impulse, 50, 1e-6)
+    assert claim.status is lv.Status.TIME_LIMIT
+    assert claim.iterations == 0
+    assert state.factorisations == made
+    assert "factorisation" in claim.message
+    # With time it goes on from there.
+    solver.until(state, np.inf)
+    assert solver.run(state, impulse, 500, 1e-6).work["factorisations"] > 0
+
+
+def test_a_large_factor_is_left_to_run_with_the_same_bits(monkeypatch):
+    problem = box_stack(8, 10.0)
+    before = lv.solve(problem, "admm", max_iter=200, tol=1e-8)
+    monkeypatch.setattr("lavender.solvers.admm._AT_ONCE", -1.0)
+    prepared = lv.prepare(problem, "admm")
+    assert prepared._state.factor is None
+    after = prepared.solve(max_iter=200, tol=1e-8)
+    assert after.impulse.tobytes() == before.impulse.tobytes()
+    assert after.work == before.work

@@ -341,3 +341,16 @@ def test_a_band_without_free_rows_has_no_pivots(band):
     assert pivoting.factor() == (0, 0)
     pivoting.correct()
     assert np.all(pivoting.x.base[: 6 * m] == -1.0)
+
+
+def test_a_factor_that_would_end_after_the_deadline_is_not_begun():
+    rng = np.random.default_rng(3)
+    y = rng.normal(size=(90, 100))
+    problem = lv.Problem.lcp(y @ y.T, rng.normal(size=90))  # more than the compiled factor takes
+    prepared = lv.prepare(problem, "direct")
+    pivot = prepared._state.pivot
+    pivot.seconds = 1e9  # by which its first factor would be refused
+    refused = prepared.solve(time_limit=10.0)
+    assert refused.status is lv.Status.TIME_LIMIT
+    assert "factorisations" not in refused.work
+    assert prepared.solve(lv.Problem.lcp(y @ y.T, problem.b)).success

@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass
 from functools import cached_property
+from time import perf_counter
 from typing import Any
 
 import numpy as np
@@ -92,6 +93,11 @@ class System:
         self.t, self.q = np.zeros(m), np.zeros(m)
 
     elements: Any
+
+    def took(self, start: float) -> None:
+        """The pace of a factor that was begun at `start` (of `perf_counter`): the next one is refused by it."""
+        if self.cost > 0.0:
+            self.pace = (perf_counter() - start) / self.cost
 
     def interior(self, u1: FloatArray, u2: FloatArray, delta: float) -> Any:
         """Interior point steps in compiled code on the duals u1, u2 (m,), or None where there are none."""
@@ -363,7 +369,9 @@ class MatrixSystem(System):
     def _dense_lu(self, transposed: FloatArray) -> bool:
         # Row-major for the kernel is the transpose for LAPACK.
         self.factorisations += 1
+        start = perf_counter()
         lu, pivot, info = getrf(transposed.T, overwrite_a=True)
+        self.took(start)
         self.solver = lambda r: getrs(lu, pivot, r, trans=1)[0]
         return info == 0
 
@@ -377,10 +385,12 @@ class MatrixSystem(System):
         self.solver = lambda r: np.full_like(r, np.nan)
         if not np.isfinite(matrix.data).all():
             return False
+        start = perf_counter()
         try:
             factor = ssl.splu(sp.csc_array(matrix), permc_spec="COLAMD")
         except RuntimeError:
             return False
+        self.took(start)
         self.solver = factor.solve
         return True
 
@@ -426,7 +436,9 @@ class MatrixSystem(System):
         return info == 0
 
     def _cholesky(self, matrix: FloatArray) -> bool:
+        start = perf_counter()
         c, info = potrf(matrix.T, lower=1, clean=0, overwrite_a=True)
+        self.took(start)
         if info != 0:
             return False
         self.factorisations += 1
