@@ -60,7 +60,7 @@ class State(Protocol):
 class Solver(Protocol):
     """What a factory returns; see the module.
 
-    A resumable solver whose single steps may be long (a factorisation) may have `until(state, deadline)` besides: called
+    A resumable solver whose single steps may be long (factorisations) may have `until(state, deadline)` besides: called
     before `run` where there is a time limit, a time of `perf_counter` after which no such step should end.
     """
 

@@ -125,6 +125,7 @@ class Prepared:
     """
 
     def __init__(self, problem: Problem, spec: SolverSpec, options: dict[str, Any]) -> None:
+        start = perf_counter()  # a check may form A, which is set-up
         _check_problem(problem, spec)
         for name in options:
             if name not in spec.accepts:
@@ -138,7 +139,6 @@ class Prepared:
         self.options = dict(options)
         self.problem = problem
         self._lock = Lock()
-        start = perf_counter()
         self._solver = _make(spec, options)
         self._set_up(problem, anew=True)
         self.setup_time = perf_counter() - start
@@ -216,8 +216,8 @@ class Prepared:
             if not self._fresh:
                 self._set_up(self.problem, anew=False)
         else:
-            _check_problem(problem, self.spec)
             start = perf_counter()
+            _check_problem(problem, self.spec)
             self._set_up(problem, anew=not same_structure(self.problem, problem))
             self.setup_time = perf_counter() - start
             self.problem = problem

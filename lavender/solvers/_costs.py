@@ -92,6 +92,7 @@ SWEEPS, SWEEPS_REDUNDANT = 60.0, 400.0
 
 FILL = 5.0  # of a factor over rows against one over bodies, for the same unknowns: rows of one body are all neighbours
 ISLAND = 400e3  # what Python takes for an island of its own
+BAND_AT_ONCE = 1e6  # ns of `direct` on a narrow band up to which nothing else is looked at
 LU_ROWS = 300  # of a linear system that is not symmetric, up to which sweeps are looked at before its factor
 NARROW_ENTRIES = 12  # of A in a row up to which a narrow band is looked for
 NARROW = 40  # half bandwidth up to which a band is what `direct` takes
@@ -178,13 +179,13 @@ def factors_at_once(problem: Problem) -> bool:
         width = graph.body_spread(problem.cones.ptr, block_bodies(problem), problem.rows.n_bodies) + 1
         return (
             width <= NARROW
-            and DIRECT["lcp"] * BAND * m * float(width) ** 2 <= GLANCED
+            and DIRECT["lcp"] * BAND * m * float(width) ** 2 <= BAND_AT_ONCE
             and not is_redundant(problem)
         )
     if problem.matrix is None or len(problem._compressed[1]) > NARROW_ENTRIES * m:
         return False
     form, band, _ = choose(problem)
-    return form == "band" and DIRECT["lcp"] * BAND * m * float(band + 1) ** 2 <= GLANCED
+    return form == "band" and DIRECT["lcp"] * BAND * m * float(band + 1) ** 2 <= BAND_AT_ONCE
 
 
 def is_redundant(problem: Problem) -> bool:
