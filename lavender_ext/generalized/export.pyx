@@ -157,6 +157,39 @@ def rows_of_sparse(const double[::1] values, const int32_t[::1] count, const int
     return indptr_, indices_[:at].copy(), data_[:at].copy()
 
 
+def numbers(const double[:] force, const double[:] aref, const double[:] r, const double[:] inverse,
+            const double[::1] scale, double dt):
+    """(impulse, target, compliance) of every row from efc_force, efc_aref and efc_R; and max |efc_R efc_D - 1|."""
+    cdef Py_ssize_t i, m = scale.shape[0]
+    cdef double gap = 0.0, x
+    impulse_ = np.zeros(m)
+    target_ = np.empty(m)
+    compliance_ = np.empty(m)
+    cdef double[::1] impulse = impulse_, target = target_, compliance = compliance_
+    for i in range(m):
+        if scale[i] != 0.0:
+            impulse[i] = dt * force[i] / scale[i]
+        target[i] = dt * scale[i] * aref[i]
+        compliance[i] = r[i] * scale[i] * scale[i]
+        x = fabs(r[i] * inverse[i] - 1.0)
+        if gap == gap and not x <= gap:                 # NaN stays
+            gap = x
+    return impulse_, target_, compliance_, gap
+
+
+def row_pointers(const int32_t[::1] first, const int32_t[::1] count):
+    """Pointers (n + 1) of rows by first place and length; None where there is room between them."""
+    cdef Py_ssize_t i, n = first.shape[0]
+    out = np.empty(n + 1, np.int32)
+    cdef int32_t[::1] at = out
+    at[0] = 0
+    for i in range(n):
+        if first[i] != at[i]:
+            return None
+        at[i + 1] = at[i] + count[i]
+    return out
+
+
 def mass_mismatch(const int32_t[::1] mptr, const int32_t[::1] midx, const double[::1] mval, const double[::1] x,
                   const double[::1] y):
     """max |M x - y| over max (|M| |x| + |y|), M by its lower triangle; 0 where both vanish."""
