@@ -21,7 +21,12 @@ _PLAIN: dict[Any, np.dtype[Any]] = {np.float64: np.dtype(np.float64), np.int32: 
 
 
 def _fits(given: tuple[int, ...], wanted: tuple[int | None, ...]) -> bool:
-    return len(given) == len(wanted) and all(n is None or n == s for n, s in zip(wanted, given, strict=True))
+    if len(given) != len(wanted):
+        return False
+    for n, s in zip(wanted, given, strict=True):  # noqa: SIM110 - a generator takes as long as the rest of the gate
+        if n is not None and n != s:
+            return False
+    return True
 
 
 def read_only(array: np.ndarray) -> np.ndarray:

@@ -218,7 +218,9 @@ class Cones:
         )
         m = k * size
         kind = np.full(k, ROUND if tangents > 2 else CONTACT_SPIN if spin else CONTACT, np.int32)
-        return cls(np.arange(0, m + 1, size, dtype=np.int32), kind, np.zeros(m), np.zeros(m), mu, radius)
+        return cls._trusted(
+            np.arange(0, m + 1, size, dtype=np.int32), kind, np.zeros(m), np.zeros(m), mu, radius
+        )
 
     @property
     def n_blocks(self) -> int:
