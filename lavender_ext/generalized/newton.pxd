@@ -168,13 +168,45 @@ cdef inline double measure(const flow_t* f, int32_t island, const double* lam, d
 # -- N -------------------------------------------------------------------------------------------------------
 
 
+cdef inline void scale_row(double* out, const double* x, double f, int32_t n) noexcept nogil:
+    cdef int32_t i
+    for i in range(n):
+        out[i] = f * x[i]
+
+
+cdef inline void add_row(double* out, const double* x, double f, int32_t n) noexcept nogil:
+    cdef int32_t i
+    for i in range(n):
+        out[i] += f * x[i]
+
+
+cdef inline void scale_2(double* out, const double* x, const double* y, double f, double g, int32_t n) noexcept nogil:
+    cdef int32_t i
+    for i in range(n):
+        out[i] = f * x[i] + g * y[i]
+
+
+cdef inline void scale_3(double* out, const double* x, const double* y, const double* z, double f, double g, double h,
+                         int32_t n) noexcept nogil:
+    cdef int32_t i
+    for i in range(n):
+        out[i] = (f * x[i] + g * y[i]) + h * z[i]
+
+
+cdef inline void add_3(double* out, const double* x, const double* y, const double* z, double f, double g, double h,
+                       int32_t n) noexcept nogil:
+    cdef int32_t i
+    for i in range(n):
+        out[i] += (f * x[i] + g * y[i]) + h * z[i]
+
+
 cdef inline int32_t turn_block(const flow_t* f, int32_t i, int32_t row, int32_t nc, const double* y, bint whole,
                                int32_t n) noexcept nogil:
     """Rows n ... of `turned` = (V - held) Y of block i, of which `row` is the first in its panel; one past the last.
 
     `line`, behind the columns, holds which rows of Y they belong to. `whole`: nothing is held.
     """
-    cdef int32_t j = f.p.ptr[i], size = f.p.ptr[i + 1] - j, r, c, a
+    cdef int32_t j = f.p.ptr[i], size = f.p.ptr[i + 1] - j, r, c
     cdef const double* v = f.v + f.vptr[i]
     cdef double* held = f.held + f.vptr[i]
     cdef double* out
@@ -186,8 +218,7 @@ cdef inline int32_t turn_block(const flow_t* f, int32_t i, int32_t row, int32_t 
             held[r] = v[r]
             if x != 0.0:
                 out = f.turned + n * nc
-                for a in range(nc):
-                    out[a] = x * y[(row + r) * nc + a]
+                scale_row(out, y + <ssize_t>(row + r) * nc, x, nc)
                 f.line[nc + n] = row + r
                 n += 1
         return n
@@ -198,11 +229,9 @@ cdef inline int32_t turn_block(const flow_t* f, int32_t i, int32_t row, int32_t 
             x = v[r * size + c] if whole else v[r * size + c] - held[r * size + c]
             if x != 0.0:
                 if any_:
-                    for a in range(nc):
-                        out[a] += x * y[(row + c) * nc + a]
+                    add_row(out, y + <ssize_t>(row + c) * nc, x, nc)
                 else:
-                    for a in range(nc):
-                        out[a] = x * y[(row + c) * nc + a]
+                    scale_row(out, y + <ssize_t>(row + c) * nc, x, nc)
                 any_ = True
         if any_:
             f.line[nc + n] = row + r
@@ -227,33 +256,28 @@ cdef inline void add_panel(const flow_t* f, int32_t panel, int32_t n, int32_t si
         r = 0
         f0 = y[<int32_t>line[nc] * nc + a]
         if n == 1:
-            for b in range(end):
-                line[b] = f0 * t[b]
+            scale_row(line, t, f0, end)
             r = 1
         elif n == 2:
             f1 = y[<int32_t>line[nc + 1] * nc + a]
-            for b in range(end):
-                line[b] = f0 * t[b] + f1 * t[nc + b]
+            scale_2(line, t, t + nc, f0, f1, end)
             r = 2
         else:
             f1 = y[<int32_t>line[nc + 1] * nc + a]
             f2 = y[<int32_t>line[nc + 2] * nc + a]
-            for b in range(end):
-                line[b] = (f0 * t[b] + f1 * t[nc + b]) + f2 * t[2 * nc + b]
+            scale_3(line, t, t + nc, t + 2 * nc, f0, f1, f2, end)
             r = 3
         while r + 3 <= n:
             f0 = y[<int32_t>line[nc + r] * nc + a]
             f1 = y[<int32_t>line[nc + r + 1] * nc + a]
             f2 = y[<int32_t>line[nc + r + 2] * nc + a]
             y0 = t + r * nc
-            for b in range(end):
-                line[b] += (f0 * y0[b] + f1 * y0[nc + b]) + f2 * y0[2 * nc + b]
+            add_3(line, y0, y0 + nc, y0 + 2 * nc, f0, f1, f2, end)
             r += 3
         while r < n:
             f0 = y[<int32_t>line[nc + r] * nc + a]
             y0 = t + r * nc
-            for b in range(end):
-                line[b] += f0 * y0[b]
+            add_row(line, y0, f0, end)
             r += 1
         row = f.normal + <ssize_t>f.local[cols[a]] * size
         for b in range(end):
@@ -320,7 +344,7 @@ cdef inline int32_t factor(flow_t* f, int32_t island, bint square) noexcept nogi
         at = <ssize_t>a * size
         for b in range(size if square else a + 1):
             f.factor[at + b] = f.normal[at + b]
-    return lu_factor(size, f.factor, f.swap) if square else ltdl_factor(size, f.factor, f.inv)
+    return lu_factor(size, f.factor, f.swap) if square else ltdl_factor(size, f.factor, f.inv, f.swap)
 
 
 cdef inline void newton_step(const flow_t* f, int32_t island, bint square) noexcept nogil:
