@@ -284,10 +284,11 @@ class Costs:
             singular = p.law == "lcp" and self.redundant
             factor = self._matrix
             once = self._direct(factor, 1.0 / DIRECT[p.law])
-            if p.law == "lcp" and not singular:
-                # Most are regular where they are free; where not, it says so and is asked again last.
+            if p.law == "lcp" and not singular and p.generalized is None:
+                # Most are regular where they are free; where not, it says so and is asked again last. Not so over J and
+                # M: what comes between is a method that the same redundancy holds up.
                 found.append(Exact("direct", self._direct(factor), rounds, (("patience", False),), once))
-            count = SINGULAR if p.law == "lcp" else 1.0
+            count = SINGULAR if p.law == "lcp" and p.generalized is None else 1.0
             found.append(Exact("direct", self._direct(factor, count), rounds, once=once))
         if p.law == "lcp" and p.m <= LEMKE_ROWS:
             found.append(Exact("lemke", START["lemke"] + p.m * (PIVOT + PIVOT_ENTRY * float(p.m) ** 2), 0))
