@@ -116,6 +116,8 @@ def test_advice_puts_who_solves_most_first_and_false_claims_last():
     assert by["stack", 1e-6].best.solved == 2
     assert by["redundant", 1e-6].best.solver == "sure"
     assert list(report.families(found)) == ["stack", "redundant"]
+    alone = records_of(record("a", "x", 1.0, 1e-7), structure={"a": ("stack", "redundant", "friction")})
+    assert report.families(alone) == {"stack / redundant / friction": ["a"]}
 
 
 def jittered(records, seed, most=1.1):

@@ -31,7 +31,8 @@ def pairs(records: Iterable[Record]) -> dict[tuple[str, str, str], list[Record]]
 def families(records: Records) -> dict[str, list[str]]:
     """Structure -> cases, biggest first. A case is in every family whose word describes it.
 
-    A structure whose cases have several laws is a family for each law: "pile, coulomb".
+    A structure whose cases have several laws is a family for each law: "pile, coulomb". Words that describe the same
+    cases are one family: "stack / friction".
     """
     found: dict[str, dict[str, list[str]]] = defaultdict(lambda: defaultdict(list))
     ran = {r.case for r in records if r.step < 0}
@@ -41,12 +42,12 @@ def families(records: Records) -> dict[str, list[str]]:
                 found[word][info.law].append(name)
     shapes = ("separate", "chain", "mesh", "stack", "pile", "dense")
     order = (*shapes, "redundant", "friction", "large mass ratio", "asymmetric")
-    out = {}
+    names: dict[tuple[str, ...], list[str]] = {}
     for word in sorted(found, key=lambda w: (order.index(w) if w in order else len(order), w)):
         laws = found[word]
         for law in sorted(laws, key=lambda x: (-len(laws[x]), x)):
-            out[word if len(laws) == 1 else f"{word}, {law}"] = laws[law]
-    return out
+            names.setdefault(tuple(laws[law]), []).append(word if len(laws) == 1 else f"{word}, {law}")
+    return {" / ".join(words): list(cases) for cases, words in names.items()}
 
 
 def is_campaign(records: Records) -> bool:
