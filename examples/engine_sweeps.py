@@ -109,7 +109,7 @@ def against_budget(axes):
     axes.set_xscale("log")
     axes.set_yscale("log")
     axes.set_xticks(BUDGETS, [str(n) for n in BUDGETS])
-    axes.xaxis.minorticks_off()
+    axes.set_xticks([], minor=True)
 
 
 def figure(found, path):
@@ -142,7 +142,7 @@ def figure(found, path):
         against_budget(axes)
         beside(axes)
     stand.set_yticks([2, 5, 10, 20, 60], ["2", "5", "10", "20", "60"])
-    stand.yaxis.minorticks_off()
+    stand.set_yticks([], minor=True)
     canvas.savefig(path)
 
 

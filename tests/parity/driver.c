@@ -3,7 +3,7 @@
  *     driver DATA        DATA is written by tests/parity/export.py
  *
  * A line is NAME HASH, then "same" or where the first bit differs from what the installed extension made of it. The hash
- * runs over all arrays of the engine after every step, or over d, nu, step, impulse, slack, error and sums of a problem.
+ * runs over all arrays of the engine after every step (where Newton's method solves, over its work, too), or over d, nu, step, impulse, slack, error and sums of a problem.
  * Only kernels are called: no libm, no Python, and nothing is computed here.
  */
 #include <stdint.h>
@@ -22,6 +22,13 @@ typedef struct { double energy, velocity, floor_energy, floor_velocity; int32_t 
 void lav_layout(int32_t *out);
 void lav_engine_lengths(const int32_t *size, int32_t *used);
 int32_t lav_engine_substeps(const int32_t *size, double *real, int32_t *index, uint64_t *keys, int32_t n, int32_t *done);
+int32_t lav_engine_prepare(const int32_t *size, double *real, int32_t *index, uint64_t *keys);
+void lav_engine_solve(const int32_t *size, double *real, int32_t *index, uint64_t *keys, int32_t sweep);
+int32_t lav_engine_finish(const int32_t *size, double *real, int32_t *index, uint64_t *keys);
+int32_t lav_newton_index_room(const int32_t *size, double *real, int32_t *index, uint64_t *keys);
+int32_t lav_newton_plan(const int32_t *size, double *real, int32_t *index, uint64_t *keys, int32_t *scratch);
+int32_t lav_newton_substep(const int32_t *size, double *real, int32_t *index, uint64_t *keys, double tol, int32_t *scratch,
+                           double *numbers, double *trace, double *said);
 void lav_engine_more_room(const int32_t *size, double *real, int32_t *index, uint64_t *keys, int32_t *out);
 void lav_engine_move(const int32_t *size, double *real, int32_t *index, uint64_t *keys, const int32_t *to_size,
                      double *to_real, int32_t *to_index, uint64_t *to_keys);
@@ -88,13 +95,55 @@ static void say(const char *name, uint64_t hash, int64_t differs, const char *wh
   fflush(stdout);
 }
 
+/* An engine: sizes and three buffers. */
+typedef struct { int32_t *size; double *real; int32_t *index; uint64_t *keys; } engine_t;
+#define BUFFERS(e) (e)->size, (e)->real, (e)->index, (e)->keys
+
+static void grow(engine_t *e) {
+  int32_t *to = room(64), n[3];
+  lav_engine_more_room(BUFFERS(e), to);
+  lav_engine_lengths(to, n);
+  engine_t larger = {to, room(8 * (size_t)n[0]), room(4 * (size_t)n[1]), room(8 * (size_t)n[2])};
+  lav_engine_move(BUFFERS(e), BUFFERS(&larger));
+  free(e->size), free(e->real), free(e->index), free(e->keys);
+  *e = larger;
+}
+
+/* Sweeps, as many as the settings say. */
+static void swept_step(engine_t *e, int32_t left) {
+  int32_t status, done;
+  while ((status = lav_engine_substeps(BUFFERS(e), left, &done)) == 1) {
+    left -= done;
+    grow(e);
+  }
+  if (status) fail("a scene is lost");
+}
+
+/* Newton's method to the tolerance; what each solve said is hashed, too. */
+static void newton_step(engine_t *e, int32_t substeps, double tol, uint64_t *hash) {
+  double said[4];
+  int32_t i;
+  for (i = 0; i < substeps; i++) {
+    while (lav_engine_prepare(BUFFERS(e)) == 1) grow(e);
+    lav_engine_solve(BUFFERS(e), 0);
+    int32_t *scratch = room(4 * (size_t)lav_newton_index_room(BUFFERS(e)));
+    double *numbers = room(8 * (size_t)lav_newton_plan(BUFFERS(e), scratch));
+    lav_newton_substep(BUFFERS(e), tol, scratch, numbers, 0, said);
+    *hash = mix(*hash, said, 24);
+    free(scratch), free(numbers);
+    if (lav_engine_finish(BUFFERS(e))) fail("a scene is lost");
+  }
+}
+
 static void scene(void) {
   char *name = array(0);
   int64_t substeps = number(), steps = number(), bytes, c, step, differs = -1;
-  int32_t *size = array(0), used[3], done, left, status;
-  double *real = array(0), values[8];
-  int32_t *index = array(0);
-  uint64_t *keys = array(0), hash = 1;
+  double *tol = array(0); /* 0: sweeps */
+  engine_t e;
+  e.size = array(0), e.real = array(0), e.index = array(0), e.keys = array(0);
+  int32_t used[3];
+  double values[8];
+  uint64_t hash = 1;
   int32_t *change = array(&bytes);
   int64_t changes = bytes / 12, last_bytes;
   double *expected = array(0), *last = array(&last_bytes);
@@ -102,34 +151,22 @@ static void scene(void) {
   for (step = 0; step < steps; step++) {
     for (c = 0; c < changes; c++)
       if (change[3 * c] == step) {
-        lav_engine_read_settings(size, real, index, keys, settings);
+        lav_engine_read_settings(BUFFERS(&e), settings);
         memcpy(settings + change[3 * c + 1], change + 3 * c + 2, 4);
-        lav_engine_write_settings(size, real, index, keys, settings);
+        lav_engine_write_settings(BUFFERS(&e), settings);
       }
-    left = (int32_t)substeps;
-    while ((status = lav_engine_substeps(size, real, index, keys, left, &done)) == 1) {
-      int32_t *to = room(64), n[3];
-      left -= done;
-      lav_engine_more_room(size, real, index, keys, to);
-      lav_engine_lengths(to, n);
-      double *r = room(8 * (size_t)n[0]);
-      int32_t *i = room(4 * (size_t)n[1]);
-      uint64_t *k = room(8 * (size_t)n[2]);
-      lav_engine_move(size, real, index, keys, to, r, i, k);
-      free(size), free(real), free(index), free(keys);
-      size = to, real = r, index = i, keys = k;
-    }
-    if (status) fail("a scene is lost");
-    lav_engine_values(size, real, index, keys, values);
+    if (*tol > 0) newton_step(&e, (int32_t)substeps, *tol, &hash);
+    else swept_step(&e, (int32_t)substeps);
+    lav_engine_values(BUFFERS(&e), values);
     if (differs < 0 && memcmp(values, expected + 8 * step, 64)) differs = step + 1;
-    lav_engine_lengths(size, used);
-    hash = mix(hash, real, 8 * (size_t)used[0]);
-    hash = mix(hash, index, 4 * (size_t)used[1]);
-    hash = mix(hash, keys, 8 * (size_t)used[2]);
+    lav_engine_lengths(e.size, used);
+    hash = mix(hash, e.real, 8 * (size_t)used[0]);
+    hash = mix(hash, e.index, 4 * (size_t)used[1]);
+    hash = mix(hash, e.keys, 8 * (size_t)used[2]);
   }
-  if (differs < 0 && (last_bytes != 8 * (int64_t)used[0] || memcmp(real, last, (size_t)last_bytes))) differs = steps;
+  if (differs < 0 && (last_bytes != 8 * (int64_t)used[0] || memcmp(e.real, last, (size_t)last_bytes))) differs = steps;
   say(name, hash, differs, "step");
-  free(name), free(size), free(real), free(index), free(keys), free(change), free(expected), free(last);
+  free(name), free(tol), free(e.size), free(e.real), free(e.index), free(e.keys), free(change), free(expected), free(last);
 }
 
 /* 1 where a problem's numbers differ from those of the extension. */

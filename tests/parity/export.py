@@ -17,7 +17,8 @@ import numpy as np
 HERE = Path(__file__).resolve().parent
 sys.path[:0] = [str(HERE.parent), str(HERE.parent / "wasm")]
 
-from record import SCENES, STEPS, problems  # noqa: E402
+from newton_steps import NewtonSteps  # noqa: E402
+from record import NEWTON_SCENES, NEWTON_STEPS, SCENES, STEPS, problems  # noqa: E402
 
 import lavender as lv  # noqa: E402
 from lavender.ordering import block_order  # noqa: E402
@@ -38,11 +39,11 @@ def array(values, dtype="<f8"):
 
 
 def scene(name, parameters, changes, steps):
-    """Start, changes of settings, eight values after each step, the last state."""
+    """Start, changes of settings, eight values after each step, the last state; by sweeps."""
     made = lv.Scene(name, **parameters)
     simulation = lv.Simulation(made)
-    start = simulation.snapshot()
-    places, edits, values = memory.layout()["settings_t"][1], [], []
+    start, places = simulation.snapshot(), memory.layout()["settings_t"][1]
+    edits, values = [], []
     for step in range(steps):
         for key, value in changes.get(step, {}).items():
             edits.append((step, places[key], value))
@@ -51,11 +52,32 @@ def scene(name, parameters, changes, steps):
             else:
                 simulation.set_warm_start(bool(value))
         values.append(simulation.step()[0]["solver"].copy())
-    given = ", ".join(f"{key}={value}" for key, value in parameters.items())
-    out = array(f"{name}({given})".encode() + b"\0") + numbers(made.parameters.substeps, steps)
-    out += array(start.size, "<i4") + array(start.real) + array(start.index, "<i4") + array(start.keys, "<u8")
-    inputs = out + array(np.array(edits, np.int32).reshape(-1, 3), "<i4")
+    inputs = beginning(call(name, parameters), made.parameters.substeps, steps, 0.0, start, edits)
     return inputs, inputs + array(values) + array(simulation.snapshot().real)
+
+
+def newton_scene(name, parameters, changes, steps):
+    """The same by Newton's method on the engine's arrays."""
+    run = NewtonSteps(name, **parameters)
+    start, place = run.simulation.snapshot(), memory.layout()["settings_t"][1]["warm_start"]
+    edits, values = [], []
+    for step in range(steps):
+        if step in changes:
+            run.set_warm_start(changes[step]["warm_start"])
+            edits.append((step, place, changes[step]["warm_start"]))
+        values.append(run.step())
+    inputs = beginning(f"newton: {call(name, parameters)}", run.substeps, steps, run.tol, start, edits)
+    return inputs, inputs + array(values) + array(run.state.real)
+
+
+def call(name, parameters):
+    return f"{name}({', '.join(f'{key}={value}' for key, value in parameters.items())})"
+
+
+def beginning(name, substeps, steps, tol, start, edits):
+    out = array(name.encode() + b"\0") + numbers(substeps, steps) + array([tol])
+    out += array(start.size, "<i4") + array(start.real) + array(start.index, "<i4") + array(start.keys, "<u8")
+    return out + array(np.array(edits, np.int32).reshape(-1, 3), "<i4")
 
 
 def problem(given, sweeps, order, seed):
@@ -96,6 +118,7 @@ def record(path, steps=STEPS, scenes=SCENES):
     flat = [(name, field) for name, fields in memory.STRUCTS.items() for field in (None, *fields)]
     out = [MAGIC, numbers(*(flat.index((name, None)) for name in ("blocks_t", "csr_t", "rows_t", "score_t")))]
     made = [scene(*given, steps) for given in scenes]
+    made += [newton_scene(*given, min(steps, NEWTON_STEPS)) for given in NEWTON_SCENES]
     solved = [
         problem(given, sweeps, order or ("symmetric", "random", "reverse", "colored")[i % 4], i)
         for i, given in enumerate(problems())
