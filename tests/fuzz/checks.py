@@ -127,6 +127,7 @@ def together(spec, problem, solution):
     """The same structure with other right sides: solved in one call as one by one, and each claim is judged."""
     options = dict(spec["options"])
     start = options.pop("impulse", None)
+    options.pop("threads", None)  # within one problem; the bits are those of any number
     problems_of = [problem, *(problem.updated(b=np.array(b, float)) for b in spec["others"])]
     starts = None if start is None else [start] * len(problems_of)
     many = lv.solve_many(problems_of, spec["solver"], impulses=starts, threads=spec["threads"], **options)
