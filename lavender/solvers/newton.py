@@ -73,8 +73,12 @@ class Newton:
         default=None, compare=False, repr=False
     )  # of `auto`, see `Run`
 
-    @np.errstate(all="ignore")  # what overflows is judged
     def prepare(self, problem: Problem) -> NewtonState:
+        """The system of a problem."""
+        return self._prepare(problem, None)
+
+    @np.errstate(all="ignore")  # what overflows is judged
+    def _prepare(self, problem: Problem, like: System | None) -> NewtonState:
         if self.form not in FORMS:
             raise InputError(f"form is {self.form!r}; one of {', '.join(FORMS)} is needed")
         if self.form == "velocity" and problem.matrix is not None:
@@ -101,11 +105,12 @@ class Newton:
         form = self.form
         if form == "auto":
             form = "impulse" if problem.rows is None or problem.rows.n_bodies == 0 else "velocity"
-        system = make_system(problem, form)
+        system = make_system(problem, form, like)
         return NewtonState(problem, system if system.sc.m else None)
 
     def update(self, state: NewtonState, problem: Problem) -> NewtonState:
-        return self.prepare(problem)
+        """The same of new numbers: between the same bodies the order of elimination stays."""
+        return self._prepare(problem, state.system)
 
     @np.errstate(all="ignore")  # what overflows is judged
     def run(

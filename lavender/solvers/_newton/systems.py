@@ -156,8 +156,12 @@ class VelocitySystem(System):
 
     form = "velocity"
     pace = 0.5e-9
+    panels: tuple[Any, ...] | None = None  # of a large factor
+    structure: tuple[Any, ...]
+    pattern: tuple[IntArray, ...]  # the elements' bodies (k, 2), their places, slots, and which were turned
 
-    def __init__(self, sc: Scaled) -> None:
+    def __init__(self, sc: Scaled, like: System | None = None) -> None:
+        """`like`: an earlier system, whose order of elimination and pattern serve again between the same bodies."""
         super().__init__(sc)
         rows = sc.problem.rows
         assert rows is not None and sc.bodies is not None
@@ -166,12 +170,35 @@ class VelocitySystem(System):
         columns = [c for c in range(6) if used >> c & 1]
         s = next(k for k in (1, 2, 3, 6) if k >= len(columns))
         columns = sorted((columns + [c for c in range(6) if not used >> c & 1])[:s])
-        nptr, nind, node, slot, turned = block_pattern(rows.n_bodies, sc.bodies)
+        self.s, self.n = s, rows.n_bodies
+        if isinstance(like, VelocitySystem) and like.serves(s, rows.n_bodies, sc.bodies):
+            self.cost, self.panels = like.cost, like.panels
+            self.pattern, self.structure = like.pattern, like.structure
+        else:
+            self._analyse(rows.n_bodies, sc.bodies)
+        _, node, slot, turned = self.pattern
+        halves = np.empty((sc.m, 2, s))
+        narrow(full, sc.keep, sc.ptr, turned, np.array(columns, np.int32), halves)
+        self.elements = self._elements(node, slot, halves, s)
+        self.y = np.zeros(self.n * s + 1)
+        if len(sc.kind) < sc.m and not sc.theta.any():
+            self.bt = np.zeros_like(self.v)
+        self.factor: Any = None
+        self.factor_unsymmetric = False
+        self.pair: tuple[FloatArray, FloatArray | None]
+
+    def serves(self, s: int, n: int, bodies: IntArray) -> bool:
+        """Whether the analysis of this system is that of n bodies of s unknowns with these elements (k, 2)."""
+        return self.s == s and self.n == n and np.array_equal(self.pattern[0], bodies)
+
+    def _analyse(self, n: int, bodies: IntArray) -> None:
+        """Order of elimination and pattern of the factor."""
+        s = self.s
+        nptr, nind, node, slot, turned = block_pattern(n, bodies)
         structure = symbolic.factor_pattern(nptr, nind)
         self.cost = factor_cost(structure[0], s)
-        self.panels: tuple[Any, ...] | None = None
         if self.cost >= PANELS:
-            other = dissected(rows.n_bodies, node, nptr, nind)
+            other = dissected(n, node, nptr, nind)
             fill = symbolic.factor_pattern(*other[:2])
             if factor_cost(fill[0], s) < self.cost:
                 nptr, nind, node, slot, again = other
@@ -180,21 +207,12 @@ class VelocitySystem(System):
                     fill,
                     factor_cost(fill[0], s),
                 )
-            nptr, nind, node, slot, again = postordered(rows.n_bodies, node, nptr, nind)
+            nptr, nind, node, slot, again = postordered(n, node, nptr, nind)
             turned = (turned != again).astype(np.int32)
             structure = symbolic.factor_pattern(nptr, nind)
             self.panels = symbolic.supernodes(nptr, nind, *structure[:2], s, FEW_COLUMNS, ZEROS)
-        halves = np.empty((sc.m, 2, s))
-        narrow(full, sc.keep, sc.ptr, turned, np.array(columns, np.int32), halves)
-        self.s, self.n = s, rows.n_bodies
-        self.elements = self._elements(node, slot, halves, s)
         self.structure = (nptr, nind, *structure)
-        self.y = np.zeros(self.n * s + 1)
-        if len(sc.kind) < sc.m and not sc.theta.any():
-            self.bt = np.zeros_like(self.v)
-        self.factor: Any = None
-        self.factor_unsymmetric = False
-        self.pair: tuple[FloatArray, FloatArray | None]
+        self.pattern = (bodies, node, slot, turned)
 
     @cached_property
     def newton(self) -> Any:
@@ -488,7 +506,7 @@ class MatrixSystem(System):
         return self.solver(r)
 
 
-def make_system(problem: Problem, form: str) -> System:
-    """The system of a problem; form "velocity" or "impulse"."""
+def make_system(problem: Problem, form: str, like: System | None = None) -> System:
+    """The system of a problem; form "velocity" or "impulse". `like`: one of the same structure."""
     sc = scaled(problem)
-    return VelocitySystem(sc) if form == "velocity" else MatrixSystem(sc)
+    return VelocitySystem(sc, like) if form == "velocity" else MatrixSystem(sc)
