@@ -16,7 +16,8 @@ from lavender.solvers._costs import Exact
 from lavender.solvers._few import WARM
 from lavender.solvers._sweepers import Sweeps
 from lavender.solvers._trail import CLOCK, Trail, usable
-from lavender.solvers.newton import NewtonState
+from lavender.solvers.direct import Impatient
+from lavender.solvers.newton import NewtonState, asking
 
 __all__ = ["VELOCITY", "Turns", "whole"]
 
@@ -45,7 +46,11 @@ def whole(
     if kept is not None:
         solver, state = kept
     else:
-        solver = spec.load()(**dict(chosen.options), **({"more": more} if own and more is not None else {}))
+        options = dict(chosen.options)
+        hasty = not options.pop("patience", True)
+        solver = Impatient() if hasty else spec.load()(**options)
+        if own and more is not None:
+            solver = asking(solver, more)
         state = _newton_state(trail) if own else solver.prepare(trail.problem)
     # Half-finished sweeps mislead a Newton method; Pi(0) does not.
     before = trail.best

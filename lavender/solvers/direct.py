@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from time import perf_counter
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -59,13 +59,9 @@ class DirectState:
 
 @dataclass(frozen=True)
 class Direct:
-    """Direct solution of linear systems and of symmetric positive semidefinite boxed LCPs.
+    """Direct solution of linear systems and of symmetric positive semidefinite boxed LCPs."""
 
-    `auto` asks for patience=False first: bounded rows whose A is singular where they are free then end it at once,
-    before any shift, as STALLED.
-    """
-
-    patience: bool = True
+    patience: ClassVar[bool] = True  # to shift and refine what is singular
 
     def prepare(self, problem: Problem, like: PivotState | None = None) -> DirectState:
         if not problem.is_symmetric:
@@ -92,6 +88,12 @@ class Direct:
             return run.pivoting() if state.general is None else run.linear_general(state.general)
         finally:
             run.put_best()
+
+
+class Impatient(Direct):
+    """As `auto` asks first: bounded rows whose A is singular where they are free end it at once, as STALLED."""
+
+    patience: ClassVar[bool] = False
 
 
 @np.errstate(all="ignore")  # what overflows is judged

@@ -23,9 +23,9 @@ factors over the rows.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from time import perf_counter
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -69,9 +69,7 @@ class Newton:
     """
 
     form: str = "auto"
-    more: Callable[[FloatArray], int] | None = field(
-        default=None, compare=False, repr=False
-    )  # of `auto`, see `Run`
+    more: ClassVar[Any] = None  # see `asking`
 
     def prepare(self, problem: Problem) -> NewtonState:
         """The system of a problem."""
@@ -208,6 +206,13 @@ class Newton:
             form=system.form,
             certificate=run.certificate,
         )
+
+
+def asking(solver: Any, more: Callable[[FloatArray], int]) -> Newton:
+    """The same solver, which asks for more factorisations where its budget is used up (`_newton/run.py`)."""
+    made: Newton = replace(solver)
+    object.__setattr__(made, "more", more)
+    return made
 
 
 def _refusal(problem: Problem) -> str | None:
