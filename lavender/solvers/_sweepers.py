@@ -67,7 +67,10 @@ def look_first(problem: Problem, impulse: FloatArray, n: int, tol: float, failed
     found = known(problem, impulse)
     before = judged(problem, impulse.copy()).relative if found is None else found
     if before <= tol:
-        return Glance(None, None, lam, before, 0, before, Status.CONVERGED, 0, {})
+        return Glance(
+            solver=None, state=None, impulse=lam, before=before, last=0, best=before,
+            status=Status.CONVERGED, done=0, work={},
+        )  # fmt: skip
     solver = spec.load()()
     state = solver.prepare(problem)
     least, done, work = 0.0, 0, dict[str, int]()
@@ -86,7 +89,10 @@ def look_first(problem: Problem, impulse: FloatArray, n: int, tol: float, failed
         if rest * per > least or done * per > BELIEVED * least:
             break
         before, sweeps = now.relative, min(n - done, max(FIRST_LOOK, done // 2))
-    return Glance(solver, state, lam, before, claim.iterations, now.relative, claim.status, done, work)
+    return Glance(
+        solver=solver, state=state, impulse=lam, before=before, last=claim.iterations, best=now.relative,
+        status=claim.status, done=done, work=work,
+    )  # fmt: skip
 
 
 def _sweeps_left(done: int, before: float, now: float, tol: float) -> float:
