@@ -178,10 +178,9 @@ class Rows:
         t2 = np.cross(self.normal, self.tangent)
         for axis, row in ((self.normal, 0), (self.tangent, 1), (t2, 2)):
             has = np.flatnonzero(tangents >= row)
-            dense[first[has] + row] = np.hstack([
-                -axis[has], -np.cross(self.arm_a[has], axis[has]),
-                axis[has], np.cross(self.arm_b[has], axis[has]),
-            ])  # fmt: skip
+            with np.errstate(over="ignore", invalid="ignore"):  # arms at the edge of float64
+                turn_a, turn_b = np.cross(self.arm_a[has], axis[has]), np.cross(self.arm_b[has], axis[has])
+            dense[first[has] + row] = np.hstack([-axis[has], -turn_a, axis[has], turn_b])
         last = cones.ptr[self.n_joints + 1 :][spin] - 1
         dense[last] = 0.0
         dense[last, 3:6], dense[last, 9:12] = -self.normal[spin], self.normal[spin]

@@ -101,7 +101,7 @@ cdef inline int32_t tree_pattern(int32_t n, const int32_t* mptr, const int32_t* 
 cdef inline int32_t tree_factor(int32_t n, const int32_t* mptr, const int32_t* midx, const double* mval,
                                 const int32_t* lptr, const int32_t* lidx, double* lval, double* pivot,
                                 double* inv_pivot) noexcept nogil:
-    """L and 1 / D of (1); -1, or the row whose pivot is no more than rounding of M_kk."""
+    """L and 1 / D of (1); -1, or the row whose pivot is no more than rounding of M_kk, or has no reciprocal."""
     cdef int32_t k, q, a, b, j, first, count, at, i
     cdef double inv, f
     for q in range(lptr[n]):
@@ -123,6 +123,8 @@ cdef inline int32_t tree_factor(int32_t n, const int32_t* mptr, const int32_t* m
         if not pivot[k] > 8.8817841970012523e-16 * inv_pivot[k]:
             return k
         inv = 1.0 / pivot[k]
+        if not inv <= 1.7976931348623157e308:
+            return k
         inv_pivot[k] = inv
         first = lptr[k]
         for a in range(lptr[k + 1] - 1, first - 1, -1):
