@@ -115,8 +115,8 @@ class Generalized:
             at = operator.failed if put["order"] is None else int(put["order"][operator.failed])
             raise InputError(
                 f"M is not positive definite: the pivot of {self.velocity_name(at)} is no more than rounding of its "
-                "diagonal entry, or too small for a reciprocal in float64; a body without mass or inertia needs some (MuJoCo: armature), or the velocity "
-                "must be left out"
+                "diagonal entry, or too small for a reciprocal in float64; a body without mass or inertia needs some "
+                "(MuJoCo: armature), or the velocity must be left out"
             )
         put["operator"] = operator
 

@@ -65,7 +65,7 @@ UNSOLVED = (
     1e-2  # J (a - a0) against J M^-1 J^T f, of their size: primal solvers stop where the cost hardly falls
 )
 SAME = 1e-9  # -, R D - 1
-UNSEEN = 1e-8  # m/s: what differs by less is nothing that happens (six boxes at rest: from 4e-10 to above 1e-9)
+UNSEEN = 1e-8  # m/s: what differs by less is nothing that happens (six boxes at rest: about 1e-9)
 _CODES = (
     "mjCNSTR_EQUALITY",
     "mjCNSTR_FRICTION_DOF",
