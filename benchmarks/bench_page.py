@@ -4,8 +4,9 @@
 
 ADDRESS is what stands behind # in the page's address; by default the pyramid with sweeps on both sides, the pyramid
 with `newton` beside sweeps, and the pile. Frames are those that the page asked for (requestAnimationFrame);
-milliseconds are the main thread's processor time, which a busy machine does not lengthen: the script's part, not the
-painting.
+milliseconds are the main thread's processor time: of the parts of the script, called one by one, their sum, and of all
+that the thread did for a frame (layout, painting of canvases, hand-over to the compositor; where frames are missed, the
+steps of those, too).
 """
 
 import argparse
@@ -34,25 +35,30 @@ COUNT = """() => {
     inner.call(this, now);
   };
 }"""
-#: What a frame does at 60 a second: two steps of both sides, tables and pictures; every fifth, plots.
+#: What there is to do in a frame at 60 a second: two steps of both sides, the pictures, and one of eight parts of the
+#: page (error of every sweep, which one of sixteen steps is watched for, charts over time, tables, caption).
 PARTS = {
-    "steps": "lavender.sides.forEach((side) => { side.step(0); side.step(0); })",
+    "steps": "lavender.sides.forEach((side) => { side.step(0, false); side.step(0, false); })",
+    "watching": "lavender.sides.forEach((side) => { side.step(0, true); side.step(0, false); })",
     "pictures": "lavender.sides.forEach((side) => side.draw())",
-    "the rest": "lavender.show(false)",
-    "plots": "lavender.plot()",
+    "the rest": "lavender.parts.forEach((part) => part())",
 }
+
+
+def spent(session):
+    """Processor time of the main thread so far [ms]."""
+    found = {m["name"]: m["value"] for m in session.send("Performance.getMetrics")["metrics"]}
+    return 1000 * found["TaskDuration"]
 
 
 def cpu(page, session, code, times):
     """Processor time of the main thread in `code` [ms], each of `times`."""
-
-    def spent():
-        found = {m["name"]: m["value"] for m in session.send("Performance.getMetrics")["metrics"]}
-        return found["TaskDuration"]
-
-    before = spent()
-    page.evaluate(f"() => {{ for (let k = 0; k < {times}; k++) {{ {code}; }} }}")
-    return 1000 * (spent() - before) / times
+    before = spent(session)
+    # uPlot paints in a microtask: each time is given one.
+    page.evaluate(
+        f"async () => {{ for (let k = 0; k < {times}; k++) {{ {code}; await null; await null; }} }}"
+    )
+    return (spent(session) - before) / times
 
 
 def main():
@@ -67,10 +73,10 @@ def main():
         sys.exit(f"none of {', '.join(names)} is installed, and CHROMIUM names no browser")
     print(
         "| address | frames/s | simulated s/s | "
-        + " | ".join(f"{name} [ms]" for name in (*PARTS, "a frame"))
+        + " | ".join(f"{name} [ms]" for name in (*PARTS, "script", "main thread"))
         + " |"
     )
-    print("|---" * (len(PARTS) + 4) + "|")
+    print("|---" * (len(PARTS) + 5) + "|")
     with tempfile.TemporaryDirectory() as folder, sync_playwright() as p:
         pages.write_page(Path(folder), print)
         server = pages.server(Path(folder))
@@ -81,24 +87,28 @@ def main():
             page.goto(f"http://127.0.0.1:{server.server_address[1]}/#{address}")
             page.wait_for_selector("html[data-ready=true]")
             page.wait_for_function("!lavender.waiting && lavender.steps > 10")
+            session = page.context.new_cdp_session(page)
+            session.send("Performance.enable", {"timeDomain": "threadTicks"})
+            before = spent(session)
             page.evaluate(COUNT)
             page.wait_for_timeout(1000 * given.seconds)
             found = page.evaluate(
                 "() => ({...found, to: lavender.steps, passed: performance.now() - found.begun})"
             )
+            thread = spent(session) - before
             dt = page.evaluate("lavender.scene.dt")
             page.evaluate("lavender.play(false)")
-            session = page.context.new_cdp_session(page)
-            session.send("Performance.enable", {"timeDomain": "threadTicks"})
             parts = {name: cpu(page, session, code, 40) for name, code in PARTS.items()}
-            parts["the rest"] = max(parts["the rest"] - parts["pictures"], 0.0)
-            whole = parts["steps"] + parts["pictures"] + parts["the rest"] + parts["plots"] / 5
+            parts["watching"] = max(parts["watching"] - parts["steps"], 0.0) / 8
+            parts["the rest"] /= 8
+            parts["script"] = sum(parts.values())
+            parts["main thread"] = thread / found["frames"]
             seconds = found["passed"] / 1000
             cells = [
                 address.split("&speed")[0],
                 f"{found['frames'] / seconds:.1f}",
                 f"{(found['to'] - found['from']) * dt / seconds:.2f}",
-                *(f"{ms:.2f}" for ms in (*parts.values(), whole)),
+                *(f"{ms:.2f}" for ms in parts.values()),
             ]
             print("| " + " | ".join(cells) + " |", flush=True)
             page.close()

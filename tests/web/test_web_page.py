@@ -183,6 +183,31 @@ def test_plots_hold_the_native_errors(visit):
     assert v.js("lavender.charts.settings.data")[3] == [16] * 10
 
 
+def test_a_run_of_its_own_shows_one_step_when_it_pauses(visit):
+    """While it runs few steps are watched and the page follows in parts; a pause shows all of its last step."""
+    v = visit()
+    v.js(
+        """() => {
+          window.watched = 0;
+          const { simulation } = lavender.sides[0], inner = simulation.stepWatched;
+          simulation.stepWatched = function () { window.watched += 1; return inner.call(this); };
+        }"""
+    )
+    v.page.click("#play")
+    v.page.wait_for_function("lavender.steps > 60")
+    v.page.click("#play")
+    steps = v.js("lavender.steps")
+    assert 0 < v.js("window.watched") < steps
+    assert v.page.locator("#clock").text_content() == f"{steps / 120:.3f} s, step {steps}"
+    for i, warm in enumerate((True, False)):
+        assert v.values(i)[0] == native("stack", steps, warm_start=warm)
+    shown = v.js("lavender.charts.energy.data")
+    again = visit()
+    again.js(f"lavender.advance({steps})")
+    assert again.js("lavender.charts.energy.data") == shown
+    assert v.js("lavender.charts.residual.data[0].length") == steps
+
+
 def test_restore_leads_back(visit):
     v = visit()
     v.page.keyboard.press("p")  # a push, so that there is something to differ

@@ -1,11 +1,12 @@
 // The page: two simulations of one scene with settings of their own, stepped together, drawn and plotted.
 
-import { View } from "./draw.js";
+import { View, colors } from "./draw.js";
 import { Kernels, Newton, ORDERS, Simulation, SOLVER_FIELDS, TOL } from "./lavender.js";
 
 const KEPT = 720; // steps in the plots over time
 const MOST_STEPS = 6; // in one frame; a slower machine runs slower than real time
-const PLOT_EVERY = 80; // ms
+const PART_EVERY = 16; // ms between two parts of the page beside the pictures, of eight, while it runs
+const MOST_PARTS = 3; // in one frame
 const DEFAULTS = [{ warm_start: 1 }, { warm_start: 0 }];
 const WHOLE = new Set(["iterations", "warm_start", "contacts", "cache_matches"]);
 const PULL = 200; // 1/s^2 and, as 2 sqrt of it, 1/s: the spring a held body hangs on, critically damped
@@ -21,6 +22,13 @@ export function shown(field, value) {
 // -- plots -------------------------------------------------------------------------------------------------
 
 const positive = (x) => (x > 0 ? x : null);
+// Of each chart over time the fields of both sides, in the order of its series.
+const OVER_TIME = {
+  residual: { fields: ["residual_initial", "residual_final"], change: positive },
+  violation: { fields: ["violation_initial", "violation_final"], change: positive },
+  contacts: { fields: ["contacts", "cache_matches"] },
+  settings: { fields: ["warm_start", "iterations"] },
+};
 
 function decades(plot, low, high) {
   if (low === null || high === null) {
@@ -166,7 +174,8 @@ class Side {
 
   forget() {
     this.history = { time: [], values: [] };
-    this.curve = null;
+    this.curve = null; // of the last step whose sweeps were watched
+    this.fresh = true; // no step since then
     this.kept = null;
   }
 
@@ -250,8 +259,16 @@ class Side {
     this.order.value = order;
   }
 
-  step(time) {
-    this.curve = this.simulation.stepWatched();
+  // Watching the sweeps of a step takes as long as the step: only where their error is shown.
+  step(time, watched = true) {
+    this.fresh = watched || this.simulation.newton !== null;
+    let finite;
+    if (this.fresh) {
+      this.curve = this.simulation.stepWatched();
+      finite = this.curve.finite;
+    } else {
+      finite = this.simulation.step();
+    }
     this.history.time.push(time);
     const values = this.simulation.values;
     this.history.values.push(this.simulation.newton ? [null, ...values.slice(1)] : values); // no number of sweeps
@@ -259,7 +276,7 @@ class Side {
       this.history.time.shift();
       this.history.values.shift();
     }
-    return this.curve.finite;
+    return finite;
   }
 
   snapshot() {
@@ -267,15 +284,17 @@ class Side {
       state: this.simulation.snapshot(),
       history: { time: [...this.history.time], values: [...this.history.values] },
       curve: this.curve,
+      fresh: this.fresh,
     };
   }
 
   restore() {
-    const { state, history, curve } = this.kept;
+    const { state, history, curve, fresh } = this.kept;
     this.simulation.restore(state);
     this.wanted = state.newton ? "newton" : "sweeps";
     this.history = { time: [...history.time], values: [...history.values] };
     this.curve = curve;
+    this.fresh = fresh;
     this.readSettings();
   }
 
@@ -320,7 +339,6 @@ class Side {
       cell.dataset.value = stepped ? String(values[i]) : "";
     });
     this.told.textContent = this.work();
-    this.draw();
     const what = `Side ${"AB"[this.index]}: ${this.app.scene.title}, ${values[2]} contacts`;
     if (this.canvas.getAttribute("aria-label") !== what) {
       this.canvas.setAttribute("aria-label", what);
@@ -338,8 +356,9 @@ class App {
     this.playing = false;
     this.owed = 0; // s, simulated time that the frames have not stepped yet
     this.last = null;
-    this.plotted = 0;
-    this.readColors();
+    this.due = 0; // parts of the page that the next picture brings up to date
+    this.next = 0; // the first of them
+    this.colors = colors();
     this.sides = Array.from(document.querySelectorAll(".side"), (place, i) => new Side(place, i, this));
     const views = this.sides.map((side) => side.view);
     views.forEach((view) => {
@@ -362,19 +381,6 @@ class App {
     requestAnimationFrame((now) => this.frame(now));
   }
 
-  readColors() {
-    const style = getComputedStyle(document.documentElement);
-    const dark = matchMedia("(prefers-color-scheme: dark)").matches;
-    this.colors = {
-      dark,
-      ground: style.getPropertyValue("--ground").trim(),
-      edge: dark ? "rgb(0 0 0 / 60%)" : "rgb(40 25 60 / 55%)",
-      mark: dark ? "#f0a35e" : "#ffffff",
-      joint: dark ? "#ece8f2" : "#262130",
-      contact: dark ? "#ffd166" : "#d61f69",
-    };
-  }
-
   makeCharts() {
     const both = [{ side: 0 }, { side: 1 }];
     const four = [{ side: 0, dash: true }, { side: 1, dash: true }, ...both];
@@ -386,6 +392,11 @@ class App {
       contacts: new Chart("chart-contacts", four, { empty: true }),
       settings: new Chart("chart-settings", four.map((s) => (s.dash ? { ...s, scale: "right" } : s)), { right: true }),
     };
+    const time = (...fields) => fields.map((field) => () => this.plotTime(field));
+    this.parts = [
+      () => this.plotCurves(), ...time("residual", "violation", "contacts", "settings"),
+      () => this.sides[0].show(), () => this.sides[1].show(), () => this.caption(),
+    ];
   }
 
   listen() {
@@ -401,7 +412,7 @@ class App {
     find("speed").addEventListener("change", () => this.write());
     document.addEventListener("keydown", (event) => this.key(event));
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => {
-      this.readColors();
+      this.colors = colors();
       Object.values(this.charts).forEach((chart) => chart.make());
       this.show(true);
     });
@@ -561,9 +572,14 @@ class App {
     this.show(true);
   }
 
+  // A pause begins with a step that is watched, so that what is shown belongs to one step.
   play(on) {
+    const pauses = this.playing && !on;
     this.playing = on;
     this.last = null;
+    if (pauses) {
+      this.sides.every((side) => side.fresh) ? this.show(true) : this.advance(1);
+    }
     find("play").textContent = on ? "Pause" : "Play";
     find("play").setAttribute("aria-pressed", on);
     this.write();
@@ -574,6 +590,7 @@ class App {
     if (this.waiting) {
       return;
     }
+    const curves = (this.parts.length - this.next) % this.parts.length < this.due;
     for (let i = 0; i < steps; i++) {
       const lost = this.sides.find((side) => side.simulation.lost >= 0);
       if (lost) {
@@ -586,7 +603,8 @@ class App {
       if (this.held) {
         this.sides.forEach((side) => side.pull(this.held));
       }
-      this.sides.forEach((side) => side.step(this.steps * this.scene.dt));
+      const watched = !this.playing || (curves && i === steps - 1);
+      this.sides.forEach((side) => side.step(this.steps * this.scene.dt, watched));
     }
     this.show(!this.playing);
   }
@@ -622,8 +640,10 @@ class App {
 
   frame(now) {
     if (this.playing && !this.waiting) {
-      this.owed += this.last === null ? 0 : Math.min(0.1, (now - this.last) / 1000) * Number(find("speed").value);
+      const passed = this.last === null ? 0 : now - this.last;
+      this.owed += Math.min(0.1, passed / 1000) * Number(find("speed").value);
       this.last = now;
+      this.due = Math.min(MOST_PARTS, Math.max(1, Math.round(passed / PART_EVERY)));
       const steps = Math.min(MOST_STEPS, Math.floor(this.owed / this.scene.dt));
       if (steps > 0) {
         this.owed = Math.min(this.owed - steps * this.scene.dt, this.scene.dt);
@@ -633,19 +653,23 @@ class App {
     requestAnimationFrame((next) => this.frame(next));
   }
 
+  // The pictures, and of all else everything or what is due: text and charts that changed in every frame would cost
+  // more than the pictures.
   show(always) {
-    this.sides.forEach((side) => side.show());
-    this.caption();
-    find("clock").textContent = `${(this.steps * this.scene.dt).toFixed(3)} s, step ${this.steps}`;
-    const now = performance.now();
-    if (always || now - this.plotted > PLOT_EVERY) {
-      this.plotted = now;
-      this.plot();
+    this.sides.forEach((side) => side.draw());
+    const n = this.parts.length;
+    if (always) {
+      this.next = 0;
+    }
+    for (let left = always ? n : this.due; left > 0; left--) {
+      this.parts[this.next]();
+      this.next = (this.next + 1) % n;
     }
   }
 
   // What the two settings did, measured.
   caption() {
+    find("clock").textContent = `${(this.steps * this.scene.dt).toFixed(3)} s, step ${this.steps}`;
     const { measure, bodies } = this.scene;
     const say = (a, between, b) => find("caption").replaceChildren(bold(a), between, bold(b));
     const bold = (text) => Object.assign(document.createElement("b"), { textContent: text });
@@ -669,9 +693,8 @@ class App {
     }
   }
 
-  plot() {
-    const [a, b] = this.sides;
-    // Sweeps are watched one by one, Newton's method at its scores: each side has its own places, joined by lines.
+  // Sweeps are watched one by one, Newton's method at its scores: each side has its own places, joined by lines.
+  plotCurves() {
     const along = [...new Set(this.sides.flatMap((side) => side.curve?.at ?? []))].sort((x, y) => x - y);
     for (const name of ["energy", "normal"]) {
       const columns = this.sides.map(({ curve }) => {
@@ -680,15 +703,16 @@ class App {
       });
       this.charts[name].set([along, ...columns]);
     }
-    const time = a.history.time;
-    const column = (side, field) => side.history.values.map((values) => values[SOLVER_FIELDS.indexOf(field)]);
-    const pairs = (one, two, change = (x) => x) => [
-      time, ...[column(a, one), column(b, one), column(a, two), column(b, two)].map((values) => values.map(change)),
-    ];
-    this.charts.residual.set(pairs("residual_initial", "residual_final", positive));
-    this.charts.violation.set(pairs("violation_initial", "violation_final", positive));
-    this.charts.contacts.set(pairs("contacts", "cache_matches"));
-    this.charts.settings.set(pairs("warm_start", "iterations"));
+  }
+
+  plotTime(name) {
+    const { fields, change } = OVER_TIME[name];
+    const [a, b] = this.sides;
+    const column = (side, field) => {
+      const at = SOLVER_FIELDS.indexOf(field);
+      return side.history.values.map((values) => (change ? change(values[at]) : values[at]));
+    };
+    this.charts[name].set([a.history.time, ...fields.flatMap((field) => [column(a, field), column(b, field)])]);
   }
 }
 

@@ -10,34 +10,66 @@ const FACES = [
 ];
 const LIGHT = [-0.45, -0.62, 0.64];
 
-// Rows of the rotation matrix of a unit quaternion w, x, y, z, at q[4 i].
+// Rows of the rotation matrix of a unit quaternion w, x, y, z, at q[4 i], one after the other.
 function rotation(q, i) {
-  const [w, x, y, z] = q.subarray(4 * i, 4 * i + 4);
+  const [w, x, y, z] = [q[4 * i], q[4 * i + 1], q[4 * i + 2], q[4 * i + 3]];
   return [
-    [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-    [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-    [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+    2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+    2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
   ];
-}
-
-function times(m, v) {
-  return m.map((row) => row[0] * v[0] + row[1] * v[1] + row[2] * v[2]);
 }
 
 function dot(a, b) {
   return a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 }
 
-// hsl of a face: the body's hue, brightness by the light.
+// How far a column of a rotation points along an axis.
+function along(r, column, axis) {
+  return r[column] * axis[0] + r[3 + column] * axis[1] + r[6 + column] * axis[2];
+}
+
+// hsl of a face: the body's hue, brightness by the light in whole percents, so that few colours are ever read.
+const shades = new Map();
 function shade(hue, saturation, bright, dark) {
-  const light = dark ? 26 + 34 * bright : 44 + 36 * bright;
-  return `hsl(${hue} ${saturation}% ${light}%)`;
+  const light = Math.round(dark ? 26 + 34 * bright : 44 + 36 * bright);
+  const key = (hue * 128 + saturation) * 128 + light;
+  let said = shades.get(key);
+  if (said === undefined) {
+    said = `hsl(${hue} ${saturation}% ${light}%)`;
+    shades.set(key, said);
+  }
+  return said;
+}
+
+// What the page's style sets, light or dark.
+export function colors() {
+  const style = getComputedStyle(document.documentElement);
+  const dark = matchMedia("(prefers-color-scheme: dark)").matches;
+  return {
+    dark,
+    sky: style.getPropertyValue("--sky").trim(),
+    ground: style.getPropertyValue("--ground").trim(),
+    edge: dark ? "rgb(0 0 0 / 60%)" : "rgb(40 25 60 / 55%)",
+    mark: dark ? "#f0a35e" : "#ffffff",
+    joint: dark ? "#ece8f2" : "#262130",
+    contact: dark ? "#ffd166" : "#d61f69",
+  };
 }
 
 export class View {
   constructor(canvas) {
     this.canvas = canvas;
-    this.context = canvas.getContext("2d");
+    this.context = canvas.getContext("2d", { alpha: false }); // its own background: nothing to blend on the page
+    this.size = null; // [px], asked of the layout only after it changed
+    new ResizeObserver(() => {
+      const { clientWidth, clientHeight } = canvas;
+      const before = this.size;
+      this.size = [clientWidth, clientHeight];
+      if (before && (before[0] !== clientWidth || before[1] !== clientHeight)) {
+        this.onlook?.();
+      }
+    }).observe(canvas);
     this.turn = 0.45; // rad, about the vertical
     this.tilt = 0.22; // rad, from above
     this.linked = [this];
@@ -155,13 +187,16 @@ export class View {
   draw(simulation, colors) {
     const { canvas, context: c } = this;
     const ratio = window.devicePixelRatio || 1;
-    const [width, height] = [canvas.clientWidth, canvas.clientHeight];
+    this.size ??= [canvas.clientWidth, canvas.clientHeight];
+    const [width, height] = this.size;
     if (canvas.width !== Math.round(width * ratio) || canvas.height !== Math.round(height * ratio)) {
       canvas.width = Math.round(width * ratio);
       canvas.height = Math.round(height * ratio);
     }
     c.setTransform(ratio, 0, 0, ratio, 0, 0);
-    c.clearRect(0, 0, width, height);
+    c.fillStyle = colors.sky;
+    c.fillRect(0, 0, width, height);
+    c.lineJoin = "round";
     const [sin, cos, up, flat] = [Math.sin(this.turn), Math.cos(this.turn), Math.sin(this.tilt), Math.cos(this.tilt)];
     // Right, away from the eye, up on the screen.
     const right = [cos, sin, 0];
@@ -173,22 +208,30 @@ export class View {
     const [across, tall] = [extent(right), extent(top)];
     const scale = Math.min((0.88 * width) / (across[1] - across[0]), (0.84 * height) / (tall[1] - tall[0]));
     const middle = [0.5 * (across[0] + across[1]), 0.5 * (tall[0] + tall[1])];
-    const project = (p) => [
-      0.5 * width + scale * (dot(p, right) - middle[0]), 0.49 * height - scale * (dot(p, top) - middle[1]), dot(p, away),
-    ];
-    this.eye = { right, top, scale };
+    const [left, high] = [0.5 * width - scale * middle[0], 0.49 * height + scale * middle[1]];
+    this.eye = { right, top, away, scale, left, high };
     this.places = [];
     if (this.hasGround) {
-      this.#ground(project, colors);
+      this.#ground(colors);
     }
-    const items = this.#bodies(simulation, project, away, scale, colors);
+    const items = this.#bodies(simulation, colors);
     items.sort((a, b) => b.depth - a.depth);
-    items.forEach((item) => item.paint(c));
-    this.#joints(simulation, project, scale, colors);
-    this.#contacts(simulation, project, scale, colors);
+    items.forEach((item) => this.#paint(item, colors));
+    this.#joints(simulation, colors);
+    this.#contacts(simulation, colors);
   }
 
-  #ground(project, colors) {
+  // Where a point lies on the canvas [px], and how far away [m].
+  #project(x, y, z) {
+    const { right, top, away, scale, left, high } = this.eye;
+    return [
+      left + scale * (x * right[0] + y * right[1] + z * right[2]),
+      high - scale * (x * top[0] + y * top[1] + z * top[2]),
+      x * away[0] + y * away[1] + z * away[2],
+    ];
+  }
+
+  #ground(colors) {
     const { context: c } = this;
     const [x0, y0] = [0, 1].map((k) => Math.round(0.5 * (this.low[k] + this.high[k])));
     c.strokeStyle = colors.ground;
@@ -196,129 +239,134 @@ export class View {
     c.beginPath();
     const gap = Math.max(0.5, Math.round(this.reach / 8));
     const reach = gap * Math.ceil((0.7 * this.reach) / gap);
+    const line = (p, q) => {
+      c.moveTo(p[0], p[1]);
+      c.lineTo(q[0], q[1]);
+    };
     for (let i = -reach; i <= reach; i += gap) {
-      for (const [p, q] of [[[x0 + i, y0 - reach, 0], [x0 + i, y0 + reach, 0]], [[x0 - reach, y0 + i, 0], [x0 + reach, y0 + i, 0]]]) {
-        c.moveTo(...project(p).slice(0, 2));
-        c.lineTo(...project(q).slice(0, 2));
-      }
+      line(this.#project(x0 + i, y0 - reach, 0), this.#project(x0 + i, y0 + reach, 0));
+      line(this.#project(x0 - reach, y0 + i, 0), this.#project(x0 + reach, y0 + i, 0));
     }
     c.stroke();
   }
 
-  #bodies(simulation, project, away, scale, colors) {
+  // What there is to paint: faces of boxes that look this way, and balls; `depth` [m] is that of the middle.
+  #bodies(simulation, colors) {
+    const { away, scale } = this.eye;
     const [x, q, kind, shape] = ["x", "q", "kind_of_shape", "shape"].map((name) => simulation.array(name));
     const items = [];
-    kind.forEach((what, i) => {
-      const centre = Array.from(x.subarray(3 * i, 3 * i + 3));
-      const size = shape.subarray(4 * i, 4 * i + 3);
+    for (let i = 0; i < kind.length; i++) {
+      if (kind[i] !== BOX && kind[i] !== SPHERE) {
+        continue;
+      }
+      const middle = this.#project(x[3 * i], x[3 * i + 1], x[3 * i + 2]);
+      const size = [shape[4 * i], shape[4 * i + 1], shape[4 * i + 2]];
+      const half = kind[i] === SPHERE ? size[0] : 0.8 * Math.max(...size);
+      this.places.push({ body: i, middle, size: half * scale });
       const hue = 262 + 17 * ((i * 5) % 7) - 51;
       const r = rotation(q, i);
-      if (what === BOX || what === SPHERE) {
-        const half = what === SPHERE ? size[0] : 0.8 * Math.max(...size);
-        this.places.push({ body: i, middle: project(centre), size: half * scale });
+      if (kind[i] === SPHERE) {
+        items.push({ depth: middle[2], middle, size: size[0] * scale, hue, r });
+        continue;
       }
-      if (what === BOX) {
-        const corners = [];
-        for (let k = 0; k < 8; k++) {
-          const local = [k & 4 ? size[0] : -size[0], k & 2 ? size[1] : -size[1], k & 1 ? size[2] : -size[2]];
-          const world = times(r, local);
-          corners.push(project(world.map((v, j) => v + centre[j])));
+      const corners = [];
+      for (let k = 0; k < 8; k++) {
+        const [u, v, w] = [k & 4 ? size[0] : -size[0], k & 2 ? size[1] : -size[1], k & 1 ? size[2] : -size[2]];
+        corners.push(this.#project(
+          x[3 * i] + r[0] * u + r[1] * v + r[2] * w,
+          x[3 * i + 1] + r[3] * u + r[4] * v + r[5] * w,
+          x[3 * i + 2] + r[6] * u + r[7] * v + r[8] * w,
+        ));
+      }
+      for (let f = 0; f < 6; f++) {
+        const [axis, sign] = [f >> 1, f & 1 ? 1 : -1];
+        if (sign * along(r, axis, away) < 0) {
+          const points = FACES[f].map((k) => corners[k]);
+          const bright = 0.5 + 0.5 * sign * along(r, axis, LIGHT);
+          items.push({
+            depth: (points[0][2] + points[1][2] + points[2][2] + points[3][2]) / 4,
+            points,
+            color: shade(hue, 36, bright, colors.dark),
+          });
         }
-        FACES.forEach((face, f) => {
-          const axis = f >> 1;
-          const sign = f & 1 ? 1 : -1;
-          const normal = r.map((row) => sign * row[axis]);
-          if (dot(normal, away) < 0) {
-            const points = face.map((k) => corners[k]);
-            const bright = 0.5 + 0.5 * dot(normal, LIGHT);
-            items.push({
-              depth: points.reduce((s, p) => s + p[2], 0) / 4,
-              paint: (c) => {
-                c.beginPath();
-                points.forEach((p, k) => (k ? c.lineTo(p[0], p[1]) : c.moveTo(p[0], p[1])));
-                c.closePath();
-                c.fillStyle = shade(hue, 36, bright, colors.dark);
-                c.fill();
-                c.strokeStyle = colors.edge;
-                c.lineWidth = 1;
-                c.lineJoin = "round";
-                c.stroke();
-              },
-            });
-          }
-        });
-      } else if (what === SPHERE) {
-        items.push(this.#ball(project, centre, size[0], r, hue, away, scale, colors));
       }
-    });
+    }
     return items;
   }
 
-  // A shaded ball with three great circles, so that turning shows.
-  #ball(project, centre, radius, r, hue, away, scale, colors) {
-    const middle = project(centre);
-    return {
-      depth: middle[2],
-      paint: (c) => {
-        const size = radius * scale;
-        const light = c.createRadialGradient(
-          middle[0] - 0.35 * size, middle[1] - 0.4 * size, 0.1 * size, middle[0], middle[1], size,
-        );
-        light.addColorStop(0, shade(hue, 40, 1, colors.dark));
-        light.addColorStop(1, shade(hue, 40, 0.15, colors.dark));
-        c.beginPath();
-        c.arc(middle[0], middle[1], size, 0, 2 * Math.PI);
-        c.fillStyle = light;
-        c.fill();
-        c.strokeStyle = colors.edge;
-        c.lineWidth = 1;
-        c.stroke();
-        for (let axis = 0; axis < 3; axis++) {
-          c.beginPath();
-          let drawing = false;
-          for (let k = 0; k <= 48; k++) {
-            const angle = (2 * Math.PI * k) / 48;
-            const local = [0, 0, 0];
-            local[(axis + 1) % 3] = Math.cos(angle);
-            local[(axis + 2) % 3] = Math.sin(angle);
-            const unit = times(r, local);
-            if (dot(unit, away) > 0) {
-              drawing = false;
-              continue;
-            }
-            const p = project(unit.map((v, j) => centre[j] + radius * v));
-            if (drawing) {
-              c.lineTo(p[0], p[1]);
-            } else {
-              c.moveTo(p[0], p[1]);
-            }
-            drawing = true;
-          }
-          c.strokeStyle = axis === 0 ? colors.mark : colors.edge;
-          c.lineWidth = axis === 0 ? 2.5 : 1;
-          c.stroke();
-        }
-      },
+  #paint(item, colors) {
+    if (!item.points) {
+      this.#ball(item, colors);
+      return;
+    }
+    const { context: c } = this;
+    const [p, q, r, s] = item.points;
+    c.beginPath();
+    c.moveTo(p[0], p[1]);
+    c.lineTo(q[0], q[1]);
+    c.lineTo(r[0], r[1]);
+    c.lineTo(s[0], s[1]);
+    c.closePath();
+    c.fillStyle = item.color;
+    c.fill();
+    c.strokeStyle = colors.edge;
+    c.lineWidth = 1;
+    c.stroke();
+  }
+
+  // A shaded ball with three great circles, so that turning shows. The half of a circle that can be seen is half an
+  // ellipse: its long axis is a diameter of the ball, across the circle's normal n; its short one size |n away|.
+  #ball({ middle, size, hue, r }, colors) {
+    const { context: c } = this;
+    const { right, top, away } = this.eye;
+    const light = c.createRadialGradient(
+      middle[0] - 0.35 * size, middle[1] - 0.4 * size, 0.1 * size, middle[0], middle[1], size,
+    );
+    light.addColorStop(0, shade(hue, 40, 1, colors.dark));
+    light.addColorStop(1, shade(hue, 40, 0.15, colors.dark));
+    c.beginPath();
+    c.arc(middle[0], middle[1], size, 0, 2 * Math.PI);
+    c.fillStyle = light;
+    c.fill();
+    c.strokeStyle = colors.edge;
+    c.lineWidth = 1;
+    c.stroke();
+    const half = (axis) => {
+      const off = along(r, axis, away);
+      const turned = Math.atan2(-along(r, axis, top), along(r, axis, right)) - Math.PI / 2;
+      const [from, sign] = off > 0 ? [0, 1] : [Math.PI, -1];
+      c.moveTo(middle[0] + sign * size * Math.cos(turned), middle[1] + sign * size * Math.sin(turned));
+      c.ellipse(middle[0], middle[1], size, size * Math.abs(off), turned, from, from + Math.PI);
     };
+    c.beginPath();
+    half(1);
+    half(2);
+    c.stroke();
+    c.beginPath();
+    half(0);
+    c.strokeStyle = colors.mark;
+    c.lineWidth = 2.5;
+    c.stroke();
   }
 
   // A dot at each joint, and a line from there to the middle of its second body.
-  #joints(simulation, project, scale, colors) {
+  #joints(simulation, colors) {
     const { context: c } = this;
     const [x, q, joint, bodies] = ["x", "q", "joint", "joint_bodies"].map((name) => simulation.array(name));
-    const size = Math.min(2.5, Math.max(1, 0.04 * scale));
+    const size = Math.min(2.5, Math.max(1, 0.04 * this.eye.scale));
     c.fillStyle = colors.joint;
     c.strokeStyle = colors.joint;
     c.lineWidth = 1;
     for (let j = 0; j < simulation.joints; j++) {
       const b = bodies[2 * j + 1];
       const at = (j * joint.length) / simulation.joints + simulation.k.layout.joint.anchor_b;
-      const local = Array.from(joint.subarray(at, at + 3));
-      const arm = times(rotation(q, b), local);
-      const p = project(arm.map((v, k) => v + x[3 * b + k]));
+      const r = rotation(q, b);
+      const arm = [0, 3, 6].map((k) => r[k] * joint[at] + r[k + 1] * joint[at + 1] + r[k + 2] * joint[at + 2]);
+      const p = this.#project(x[3 * b] + arm[0], x[3 * b + 1] + arm[1], x[3 * b + 2] + arm[2]);
+      const m = this.#project(x[3 * b], x[3 * b + 1], x[3 * b + 2]);
       c.beginPath();
       c.moveTo(p[0], p[1]);
-      c.lineTo(...project(x.subarray(3 * b, 3 * b + 3)).slice(0, 2));
+      c.lineTo(m[0], m[1]);
       c.stroke();
       c.beginPath();
       c.arc(p[0], p[1], bodies[2 * j] < 0 ? 2 * size : size, 0, 2 * Math.PI);
@@ -327,7 +375,7 @@ export class View {
   }
 
   // A dot where bodies touch, as large as the normal impulse is beside the largest.
-  #contacts(simulation, project, scale, colors) {
+  #contacts(simulation, colors) {
     const { context: c } = this;
     const [point, impulse, ptr] = ["point", "impulse", "ptr"].map((name) => simulation.array(name));
     const joints = simulation.joints;
@@ -336,11 +384,11 @@ export class View {
     for (let i = 0; i < n; i++) {
       most = Math.max(most, impulse[ptr[joints + i]]);
     }
-    const size = Math.min(3.5, Math.max(1.2, 0.1 * scale));
+    const size = Math.min(3.5, Math.max(1.2, 0.1 * this.eye.scale));
     c.fillStyle = colors.contact;
     for (let i = 0; i < n; i++) {
       const share = most > 0 ? impulse[ptr[joints + i]] / most : 0;
-      const p = project(point.subarray(3 * i, 3 * i + 3));
+      const p = this.#project(point[3 * i], point[3 * i + 1], point[3 * i + 2]);
       c.beginPath();
       c.arc(p[0], p[1], size * (0.3 + Math.sqrt(share)), 0, 2 * Math.PI);
       c.fill();

@@ -1,6 +1,6 @@
 // A film: poses of a run, frame by frame, live from the Python that steps it or out of a file.
 
-import { View } from "./draw.js";
+import { View, colors } from "./draw.js";
 
 const [PLANE, SPHERE] = [1, 2];
 const LEAD = 9; // numbers of a frame before the poses: time, then the eight solver values
@@ -214,17 +214,8 @@ class Player {
     if (!this.frames?.length) {
       return;
     }
-    const style = getComputedStyle(document.documentElement);
-    const dark = matchMedia("(prefers-color-scheme: dark)").matches;
     this.state.set(this.frames[Math.min(this.at, this.frames.length - 1)]);
-    this.view.draw(this.state, {
-      dark,
-      ground: style.getPropertyValue("--ground").trim(),
-      edge: dark ? "rgb(0 0 0 / 60%)" : "rgb(40 25 60 / 55%)",
-      mark: dark ? "#f0a35e" : "#ffffff",
-      joint: dark ? "#ece8f2" : "#262130",
-      contact: dark ? "#ffd166" : "#d61f69",
-    });
+    this.view.draw(this.state, colors());
     FIELDS.forEach((field, i) => {
       const value = this.state.values[i];
       this.cells[field].textContent = i < 4 || value === 0 ? String(value) : value.toExponential(3);
