@@ -9,10 +9,11 @@ from lavender._arrays import FloatArray
 from lavender.errors import InputError, UnknownName
 from lavender.ordering import Order
 from lavender.problem import Problem
-from lavender.solution import Claim
-from lavender.solvers._sweeping import Sweeping, SweepState, claim, over, swept
+from lavender.solution import Claim, Status
+from lavender.solvers._sweeping import STATUS, Sweeping, SweepState, claim, over, swept
 from lavender_ext.accelerate import accelerated
 from lavender_ext.core import assemble
+from lavender_ext.few.looks import look
 from lavender_ext.judge import measure
 from lavender_ext.local import gauss_seidel
 
@@ -93,6 +94,33 @@ class Accelerated(Sweeping):
         sweep = "blocks" if state.exact else "pgs"
         form = f"{sweep} on {over(data)}"
         return replace(claim(status, done), work=work, form=form)
+
+    def look(
+        self,
+        state: AcceleratedState,
+        impulse: FloatArray,
+        n: int,
+        tol: float,
+        before: float,
+        steps: tuple[int, int],
+        costs: tuple[float, float, float],
+    ) -> tuple[Any, float, int, int, Status, dict[str, int]]:
+        """As `run` from the first sweep on, with looks at the judge's residual (`lavender_ext/few/looks.pyx`).
+
+        `steps` before the first look and at least before another; `costs` of a sweep, of what is left and of all.
+        (what the judge finds last, the residual before the last look, iterations since, all iterations, status, work)
+        """
+        o, data = state.order, state.data
+        if data.factored or data.is_general:
+            measure.velocity_change(data, impulse, state.space[-1])
+        sweeper = (
+            data, state.watch, state.memory, state.prepared, state.exact, state.convex, state.space, o.blocks,
+            o.split, o.mode, o.rng,
+        )  # fmt: skip
+        now, before, last, done, status, sweeps, state.restarts = look(
+            state.problem.metric, impulse, before, steps[0], n, tol, sweeper, steps[1], *costs
+        )
+        return now, before, last, done, STATUS[status], {"sweeps": sweeps, "restarts": state.restarts}
 
 
 def _operator(problem: Problem) -> Any:

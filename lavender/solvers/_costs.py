@@ -30,13 +30,14 @@ from lavender.solvers._newton.systems import (
     VelocitySystem,
     make_system,
 )
+from lavender.solvers._sweeping import reads_whitened
 from lavender_ext.factor import graph
 
 __all__ = ["Costs", "Exact", "general_cost", "is_loose", "islands_cost"]
 
 # Rates [ns], from times and counts of drawn problems that `lavender bench auto --out` writes.
 # For each multiply-add of a sweep, mixing included; the cone law solves each contact exactly.
-SWEEP = {"linear": 1.2, "lcp": 1.2, "coulomb": 0.9, "cone": 2.2}
+SWEEP = {"linear": 1.05, "lcp": 1.0, "coulomb": 0.65, "cone": 1.25}
 SWEEP_ROW = 5.0  # for each row of a sweep
 SWEEP_START = 80e3  # what Python needs for sweeps,
 LOOK = 20e3  # for each look at their residual,
@@ -45,6 +46,7 @@ START = {"direct": 60e3, "newton": 300e3, "lemke": 500e3}  # of a call, before a
 STEP = {"direct": 10e3, "newton": 35e3}  # beside each factor
 ROW = 30.0  # for each row beside each factor of `direct`,
 NEWTON_ROW = {"linear": 150.0, "lcp": 150.0, "cone": 300.0, "coulomb": 300.0}  # and of `newton`
+BODIES_START, BODIES_STEP, BODIES_ROW = 150e3, 8e3, 190.0  # of `newton` over bodies under a convex law
 DENSE = 0.1  # for each multiply-add of a dense factor
 BAND = 0.4  # of a band's
 BLOCK, PANEL = 0.35, 0.2  # of one over bodies, by block rows and by panels
@@ -56,6 +58,7 @@ PIVOT, PIVOT_ENTRY = 60e3, 0.5  # of each pivot of lemke, and for each entry of 
 GENERAL_START, GENERAL_ROW, GENERAL = 60e3, 40.0, 0.06
 GENERAL_FIRST = 0.4e6  # ns of it up to which nothing else is looked at first
 FORM = 1.0  # of each multiply-add of Y Y^T
+FORMED_START, FORMED = 280e3, 6.0  # of A formed of J and M, and of each of its entries
 ADMM_START, ADMM_ROW, ADMM_ENTRY = (
     300e3,
     60.0,
@@ -65,11 +68,12 @@ ADMM_START, ADMM_ROW, ADMM_ENTRY = (
 FIRST_LOOK, LAST_LOOK = 16, 64  # sweeps before the first look at the residual: so many at least and at most,
 LOOKED = 60e3  # ns, or as cost so much: a look and a cut in the sweeps are not free
 
-GLANCED = 250e3  # ns of a first look at sweeps that may come before anything else is found out
+GLANCED = 200e3  # ns of a first look at sweeps that may come before anything else is found out
 
 # Factorisations to expect, by law: medians over drawn problems. Friction has a long tail.
 DIRECT = {"linear": 1.5, "lcp": 6.0}
-NEWTON = {"linear": 2.0, "lcp": 16.0, "cone": 22.0, "coulomb": 8.0}
+NEWTON = {"linear": 2.0, "lcp": 9.0, "cone": 14.0, "coulomb": 8.0}
+NEWTON_DECADE = {"linear": 0.0, "lcp": 0.0, "cone": 1.5, "coulomb": 0.0}  # and more for each decade above six
 PER_ROW = {
     "linear": 0.0,
     "lcp": 0.0,
@@ -206,7 +210,22 @@ def finite_least(problem: Problem) -> float:
         m = problem.m
         width = 3.0 if problem.matrix is None else max(3.0, 0.5 * len(problem._compressed[1]) / m)
         return START["direct"] + DIRECT[problem.law] * (STEP["direct"] + ROW * m + BAND * m * width * width)
-    return START["newton"] + NEWTON[problem.law] * STEP["newton"]
+    start, step, row = newton_rates(problem)
+    return start + NEWTON[problem.law] * (step + row * problem.m)
+
+
+def newton_rates(problem: Problem) -> tuple[float, float, float]:
+    """Of `newton` [ns]: a call, and beside each factor a step and each row."""
+    if problem.rows is not None and problem.rows.n_bodies and problem.law != "coulomb":
+        return BODIES_START, BODIES_STEP, BODIES_ROW
+    return START["newton"], STEP["newton"], NEWTON_ROW[problem.law]
+
+
+def formed_cost(problem: Problem) -> float:
+    """What A costs before a solver that needs it begins, of J and M that sweeps take as they are [ns]."""
+    if problem.generalized is None or not reads_whitened(problem):
+        return 0.0
+    return FORMED_START + FORMED * float(problem.metric.entries_of_a)
 
 
 class Costs:
@@ -246,20 +265,32 @@ class Costs:
     @cached_property
     def least(self) -> float:
         """What no finite solver costs less than [ns]."""
-        return finite_least(self.problem)
+        return min(self.formed + finite_least(self.problem), self._general)
 
     @property
     def guess(self) -> float:
         """What the cheapest finite solver hardly costs less than [ns], without looking closer."""
-        p, count = self.problem, self._newton_count
-        if START["newton"] + count * STEP["newton"] > self.sweeping and not self._direct_takes:
-            return START["newton"] + count * STEP["newton"]  # whatever the factor costs
+        p = self.problem
         if not self._direct_takes:
-            return self._newton_guess
-        m = p.m
-        width = self._width(m) if p.rows is not None else 0.5 * p.data.work / max(m, 1)
-        times = SINGULAR if p.law == "lcp" and self.redundant else 1.0
-        return min(self._newton_guess, self._direct(BAND * m * max(3.0, width) ** 2, times))
+            start, step, row = newton_rates(p)
+            most = start + self._newton_count * (step + row * p.m)  # whatever the factor costs
+            found = most if most > self.sweeping else self._newton_guess
+        else:
+            m = p.m
+            width = self._width(m) if p.rows is not None else 0.5 * p.metric.work / max(m, 1)
+            times = SINGULAR if p.law == "lcp" and self.redundant else 1.0
+            found = min(self._newton_guess, self._direct(BAND * m * max(3.0, width) ** 2, times))
+        return min(self.formed + found, self._general)
+
+    @cached_property
+    def formed(self) -> float:
+        """`formed_cost`."""
+        return formed_cost(self.problem)
+
+    @cached_property
+    def _general(self) -> float:
+        """Newton over generalised velocities [ns]; inf where it has no room, or none are given."""
+        return general_cost(self.problem, self.largest) if self.largest else np.inf
 
     @cached_property
     def exact(self) -> list[Exact]:
@@ -271,8 +302,9 @@ class Costs:
         p = self.problem
         form = () if p.generalized is None else (("form", "impulse"),)
         limit = int(2.0 * self._newton_count) + TAIL[p.law]
-        once = START["newton"] + (cost - START["newton"]) / self._newton_count
-        newton = Exact("newton", cost, limit, form, once)
+        start = newton_rates(p)[0]
+        once = start + (cost - start) / self._newton_count
+        newton = Exact("newton", self.formed + cost, limit, form, self.formed + once)
         return sorted([*self._others, newton], key=lambda e: e.cost)
 
     @cached_property
@@ -283,22 +315,22 @@ class Costs:
             rounds = 0 if p.law == "linear" else DIRECT_ROUNDS
             singular = p.law == "lcp" and self.redundant
             factor = self._matrix
-            once = self._direct(factor, 1.0 / DIRECT[p.law])
+            once = self.formed + self._direct(factor, 1.0 / DIRECT[p.law])
             if p.law == "lcp" and not singular and p.generalized is None:
                 # Most are regular where they are free; where not, it says so and is asked again last. Not so over J and
                 # M: what comes between is a method that the same redundancy holds up.
                 found.append(Exact("direct", self._direct(factor), rounds, (("patience", False),), once))
             count = SINGULAR if p.law == "lcp" and p.generalized is None else 1.0
-            found.append(Exact("direct", self._direct(factor, count), rounds, once=once))
+            found.append(Exact("direct", self.formed + self._direct(factor, count), rounds, once=once))
         if p.law == "lcp" and p.m <= LEMKE_ROWS:
             found.append(Exact("lemke", START["lemke"] + p.m * (PIVOT + PIVOT_ENTRY * float(p.m) ** 2), 0))
         if self.largest:
             count = 2 * int(GENERAL_COUNT[p.law]) + GENERAL_TAIL
-            cost = general_cost(p, self.largest)
+            cost = self._general
             once = GENERAL_START + (cost - GENERAL_START) / GENERAL_COUNT[p.law]
             found.append(Exact("newton", cost, count, (("form", "velocity"),), once))
         if p.law in ("cone", "coulomb") and (p.generalized is None or p.m <= ADMM_GENERAL):
-            cost, once = self._admm
+            cost, once = (self.formed + x for x in self._admm)
             found.append(Exact("admm", cost, int(2.0 * self._admm_count), once=once))
         return found
 
@@ -364,8 +396,8 @@ class Costs:
         return self.problem.law == "linear" or (self.problem.law == "lcp" and self.problem.is_symmetric)
 
     def _finite(self, name: str, count: float, factor: float) -> float:
-        row = NEWTON_ROW[self.problem.law] if name == "newton" else ROW
-        return START[name] + count * (STEP[name] + row * self.problem.m + factor)
+        start, step, row = newton_rates(self.problem) if name == "newton" else (START[name], STEP[name], ROW)
+        return start + count * (step + row * self.problem.m + factor)
 
     def _newton(self, factor: float) -> float:
         p = self.problem
@@ -377,7 +409,8 @@ class Costs:
         p = self.problem
         if p.law == "lcp" and self.redundant:
             return AT_REST
-        return NEWTON[p.law] + min(MOST, PER_ROW[p.law] * p.m)
+        decades = max(self.decades - 6.0, -3.0)
+        return NEWTON[p.law] + NEWTON_DECADE[p.law] * decades + min(MOST, PER_ROW[p.law] * p.m)
 
     @property
     def _newton_factor(self) -> float:
@@ -422,14 +455,11 @@ def islands_cost(problem: Problem, sizes: Any) -> float:
     """Islands of so many rows, solved apart by Newton's method, by their sizes alone [ns]."""
     m = np.asarray(sizes, float)
     count = NEWTON[problem.law] + np.minimum(MOST, PER_ROW[problem.law] * m)
+    start, step, row = newton_rates(problem)
     factor = np.minimum(
         DENSE * m**3 / 3.0, SPARSE * problem.data.work / max(problem.m, 1) * m * (1.0 + m / SPARSE_ROWS)
     )
-    each = (
-        ISLAND
-        + START["newton"]
-        + count * (STEP["newton"] + NEWTON_ROW[problem.law] * m + UNSYMMETRIC * factor)
-    )
+    each = ISLAND + start + count * (step + row * m + UNSYMMETRIC * factor)
     return float(each.sum())
 
 

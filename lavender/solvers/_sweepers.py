@@ -6,7 +6,6 @@ rest = n log(now / tol) / log(before / now)         sweeps left, by the contract
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import log
 from typing import Any
 
 import numpy as np
@@ -18,12 +17,13 @@ from lavender.solution import Claim, Status
 from lavender.solvers._costs import FIRST_LOOK, ISLAND, LOOK, finite_least, first_look, is_glanced, sweep_cost
 from lavender.solvers._few import said
 from lavender.solvers._trail import CLOCK, Trail, usable
+from lavender_ext.few.looks import sweeps_left
 
 __all__ = ["Glance", "Sweeps", "look_first", "race"]
 
 SWEEPER = "anderson"  # whose sweeps come first
-HOPE = 0.4  # share of a finite solver's cost that sweeps may take without promising an end
-BELIEVED = 2.0  # times a finite solver's cost that sweeps may take, whatever they promise
+HOPE = 0.25  # share of a finite solver's cost that sweeps may take without promising an end
+BELIEVED = 1.0  # times a finite solver's cost that sweeps may take, whatever they promise
 APART = 10.0  # islands' worth of Python from which a finite solver is compared with islands solved apart
 PORTION = 0.25  # of a time limit that sweeps may take that will not get there within it
 LEAD = 0.5  # of the cost that sweeps promise, that those of the relaxation must promise to go before them
@@ -71,34 +71,18 @@ def look_first(problem: Problem, impulse: FloatArray, n: int, tol: float, failed
             solver=None, state=None, impulse=lam, before=before, last=0, best=before,
             status=Status.CONVERGED, done=0, work={},
         )  # fmt: skip
-    solver = spec.load()()
+    solver: Any = spec.load()()
     state = solver.prepare(problem)
-    least, done, work = 0.0, 0, dict[str, int]()
-    while True:
-        claim: Claim = solver.run(state, lam, sweeps, tol, None)
-        for kind, count in claim.work.items():
-            work[kind] = work.get(kind, 0) + count
-        done += claim.iterations
-        now = judged(problem, lam.copy())
-        if now.relative <= tol:
-            remember(problem, now)
-        if now.relative <= tol or claim.status is not Status.MAX_ITERATIONS or done >= n:
-            break
-        rest = _sweeps_left(claim.iterations, before, now.relative, tol)
-        least = least or finite_least(problem)
-        if rest * per > least or done * per > BELIEVED * least:
-            break
-        before, sweeps = now.relative, min(n - done, max(FIRST_LOOK, done // 2))
+    least = finite_least(problem)
+    now, before, last, done, status, work = solver.look(
+        state, lam, min(n, 2**31 - 1), tol, before, (sweeps, FIRST_LOOK), (per, least, BELIEVED * least)
+    )
+    if now.relative <= tol:
+        remember(problem, now)
     return Glance(
-        solver=solver, state=state, impulse=lam, before=before, last=claim.iterations, best=now.relative,
-        status=claim.status, done=done, work=work,
+        solver=solver, state=state, impulse=lam, before=before, last=last, best=now.relative, status=status,
+        done=done, work=work,
     )  # fmt: skip
-
-
-def _sweeps_left(done: int, before: float, now: float, tol: float) -> float:
-    """At the contraction of the last `done` sweeps."""
-    gain = log(before / now) if 0.0 < now < before < np.inf else 0.0
-    return done * log(now / max(tol, 1e-16)) / gain if gain > 0.0 else np.inf
 
 
 class Sweeps:
@@ -149,7 +133,7 @@ class Sweeps:
         now = self.judge(status)
         if now > trail.tol and not (status is Status.MAX_ITERATIONS and self.done > before):
             self.ended = self.stopped(status)
-        self.rest = _sweeps_left(self.done - self.at, self.last, now, trail.tol)
+        self.rest = sweeps_left(self.done - self.at, self.last, now, trail.tol)
         self.last, self.at = now, self.done
         return now
 
@@ -223,7 +207,8 @@ class Sweeps:
         if min(rest, spent) > APART * ISLAND and than(self.trail.apart_cost()):
             return True
         costs = self.trail.costs
-        return than(costs.least) and than(costs.guess) and than(costs.exact[0].cost)
+        # To ask closely of J and M forms A: not before that much was swept.
+        return than(costs.least) and than(costs.guess) and spent > costs.formed and than(costs.exact[0].cost)
 
 
 class Relaxed(Sweeps):

@@ -21,7 +21,7 @@ from lavender.solution import Claim, Status
 from lavender_ext.judge.watch import AT_FLOOR, CONVERGED, DIVERGED, RUNNING, STALLED, Watch
 from lavender_ext.sweep import serial, threaded
 
-_STATUS = {
+STATUS = {
     RUNNING: Status.MAX_ITERATIONS,
     CONVERGED: Status.CONVERGED,
     DIVERGED: Status.DIVERGED,
@@ -65,7 +65,7 @@ class SweepState:
 
 
 def claim(status: int, done: int) -> Claim:
-    return Claim(_STATUS[status], done, {"sweeps": done})
+    return Claim(STATUS[status], done, {"sweeps": done})
 
 
 def run_kernel(

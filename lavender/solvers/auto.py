@@ -177,7 +177,7 @@ def _at_once(costs: Costs) -> bool:
     glance = costs.glance(FIRST_LOOK)
 
     def dear(cost: float) -> bool:
-        return cost > costs.sweeping or (glance < GLANCE * cost and not costs.redundant)
+        return cost > costs.sweeping or (glance < costs.formed + GLANCE * cost and not costs.redundant)
 
     return not dear(costs.guess) and not dear(costs.exact[0].cost)
 
