@@ -457,7 +457,7 @@ def islands_cost(problem: Problem, sizes: Any) -> float:
     count = NEWTON[problem.law] + np.minimum(MOST, PER_ROW[problem.law] * m)
     start, step, row = newton_rates(problem)
     factor = np.minimum(
-        DENSE * m**3 / 3.0, SPARSE * problem.data.work / max(problem.m, 1) * m * (1.0 + m / SPARSE_ROWS)
+        DENSE * m**3 / 3.0, SPARSE * problem.metric.work / max(problem.m, 1) * m * (1.0 + m / SPARSE_ROWS)
     )
     each = ISLAND + start + count * (step + row * m + UNSYMMETRIC * factor)
     return float(each.sum())

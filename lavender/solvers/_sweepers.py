@@ -120,7 +120,7 @@ class Sweeps:
             self.last, self.at = glance.before, glance.done - glance.last
         else:
             # In short runs for the clock and Ctrl-C alone: cut anywhere, sweeps give the same bits.
-            chunk = max(1, int(CLOCK * 1e9) // max(1, trail.problem.data.work))
+            chunk = max(1, int(CLOCK * 1e9) // max(1, trail.problem.metric.work))
             for start in range(0, step, chunk):
                 n = min(chunk, step - start)
                 claim: Claim = self.solver.run(self.state, self.impulse, n, self.tol, None)
@@ -201,7 +201,8 @@ class Sweeps:
         factored = self.trail.problem.law in ("linear", "lcp")
         if factored and self.done * self.per > PORTION * self.trail.limit and self.too_late:
             # Sweeps will not get there in time; a factorisation that is in luck may.
-            return any(spent + other.once < self.trail.limit for other in self.trail.costs.exact)
+            costs, left = self.trail.costs, self.trail.limit - spent
+            return costs.formed < left and any(other.once < left for other in costs.exact)
         if worth is not None:
             return than(worth)
         if min(rest, spent) > APART * ISLAND and than(self.trail.apart_cost()):

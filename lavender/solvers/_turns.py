@@ -84,7 +84,7 @@ def whole(
 def _in_chunks(trail: Trail, solver: Any, state: Any, impulse: FloatArray, n: int) -> Claim:
     """At most n iterations of a solver that goes on where it stood, with looks at the clock and for Ctrl-C."""
     done, work = 0, dict[str, int]()
-    chunk = max(1, int(CLOCK * 1e9) // max(1, CHUNK_WORK * trail.problem.data.work))
+    chunk = max(1, int(CLOCK * 1e9) // max(1, CHUNK_WORK * trail.problem.metric.work))
     while True:
         claim: Claim = solver.run(state, impulse, min(chunk, n - done), trail.tol, None)
         done += claim.iterations
