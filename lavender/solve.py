@@ -73,7 +73,8 @@ def solve(
     max_iter : int, optional
         Budget in the solver's own iterations (sweeps, steps, pivots); default: the spec's.
     time_limit : float, optional, s
-        Of solving; checked between chunks.
+        Of solving; checked between chunks. A backend of another package that takes none itself runs in a process
+        of its own, which is kept, and ended at the limit; `isolate=False` runs it here, to its end.
     history : bool
         Record iterations, time and residual at fixed counts.
     callback : callable (iterations, impulse, residual), optional
@@ -198,6 +199,8 @@ class Prepared:
             lam = problem.impulse_array(impulse)
         else:
             lam = problem.start() if problem.guess is None else problem.guess.copy()
+        if time_limit is not None and hasattr(self._solver, "ready"):
+            self._solver.ready()
         setup_time, self.setup_time = self.setup_time, 0.0
         proof = decide_empty_rows(problem, lam)
         loop = _Loop(problem, self._solver, self._state, lam, tol, time_limit, history, callback)

@@ -24,6 +24,7 @@ from lavender.solution import Claim, Status
 
 __all__ = [
     "Answer",
+    "Failed",
     "Limits",
     "ask",
     "at_least",
@@ -85,6 +86,11 @@ def proof(
 
 
 Call = Callable[[QP, FloatArray, Limits, dict[str, Any]], Answer]
+Elsewhere = Callable[[QP, FloatArray, Limits, dict[str, Any]], "Answer | None"]
+
+
+class Failed(Exception):
+    """A backend failed in a process of its own; the text says how."""
 
 
 def ask(
@@ -99,11 +105,13 @@ def ask(
     *,
     stoppable: bool,
     noisy: bool = False,
+    apart: Elsewhere | None = None,
 ) -> Claim:
     """Run the backend and write its iterate to `impulse`, or leave the start point and say why.
 
     A backend that says it is done where the judge does not find `tol` is asked again, 100 times more
-    closely, at most three times in all: its tests are not the judge's. An interior-point method leaves
+    closely, at most three times in all: its tests are not the judge's. `apart`, where given, runs it in a
+    process of its own, or answers None where there is none. An interior-point method leaves
     sqrt(x w) on a row where impulse and slack both vanish, so its gap falls towards eps^2.
     """
     work: dict[str, int] = {"backend_calls": 0}
@@ -127,10 +135,20 @@ def ask(
         levels = levels[-1:]
     best: tuple[float, Claim, FloatArray] | None = None
     clock = perf_counter()
+    where = "and ran to its end"
+
+    def run(qp: QP, impulse: FloatArray, limit: Limits, settings: dict[str, Any]) -> Answer:
+        nonlocal where
+        found = None if apart is None else apart(qp, impulse, limit, settings)
+        if found is None:
+            return call(qp, impulse, limit, settings)
+        where = "and ran in a process of its own"
+        return found
+
     left, time_left = n, time_limit
     w, e = np.empty(problem.m), np.empty(problem.m)
     for level, gap, gap_relative in levels:
-        claim = _once(qp, impulse, call, Limits(level, gap, gap_relative, left, time_left), settings, noisy)
+        claim = _once(qp, impulse, run, Limits(level, gap, gap_relative, left, time_left), settings, noisy)
         for kind, count in claim.work.items():
             work[kind] = work.get(kind, 0) + count
         relative, floor = quick(problem, impulse, w, e, floor=True)
@@ -161,7 +179,7 @@ def ask(
     if tol == 0.0 and status is Status.CONVERGED:
         status, words = Status.STALLED, f"{words}; tol=0: ran at its tightest tolerance"
     if time_limit is not None and not stoppable:
-        words = f"{words}; takes no time limit and ran to its end"
+        words = f"{words}; takes no time limit {where}"
     return replace(claim, status=status, message=words, work=work, iterations=work.get("iterations", 0))
 
 
@@ -173,6 +191,9 @@ def _once(
             answer = call(qp, impulse, limit, dict(settings))
     except (KeyboardInterrupt, SystemExit, GeneratorExit, InputError):
         raise
+    except Failed as failure:
+        words = f"{failure}; start point returned"
+        return Claim(Status.NUMERICAL_ERROR, 0, {"backend_calls": 1}, words, qp.form)
     except BaseException as error:  # a backend may fail in any way; a panic of Rust is no Exception
         words = f"{type(error).__name__}: {error}; start point returned"
         return Claim(Status.NUMERICAL_ERROR, 0, {"backend_calls": 1}, words, qp.form)

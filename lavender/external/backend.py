@@ -5,7 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from lavender.external._running import Call
+from lavender._arrays import FloatArray
+from lavender.external._running import Answer, Call, Limits
+from lavender.external.as_qp import QP
 
 __all__ = ["Backend"]
 
@@ -29,3 +31,11 @@ class Backend:
     linear: str = "bounds"  # what keeps it at work without constraints: "bounds", "equality", or "" (refused)
     finite: bool = False  # takes no infinite bounds: the finite ones become rows
     noisy: bool = False  # prints even when told not to
+
+    def run(self, qp: QP, impulse: FloatArray, limit: Limits, settings: dict[str, Any]) -> Answer:
+        """One run of it, in this process."""
+        if self.call is not None:
+            return self.call(qp, impulse, limit, settings)
+        from lavender.external.generic import through_qpsolvers  # which asks what a Backend is
+
+        return through_qpsolvers(self, qp, impulse, limit, settings)

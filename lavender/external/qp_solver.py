@@ -10,15 +10,15 @@ from typing import Any
 import numpy as np
 
 from lavender._arrays import FloatArray
-from lavender.errors import CapabilityError
-from lavender.external._running import Call, ask, check_settings, definite_refusal, symmetric_refusal
+from lavender.errors import CapabilityError, InputError
+from lavender.external import _apart
+from lavender.external._running import ask, check_settings, definite_refusal, symmetric_refusal
 from lavender.external.as_qp import QP, impulse_form, pick_form, velocity_form
 from lavender.external.backend import Backend
-from lavender.external.generic import through_qpsolvers
 from lavender.problem import Problem
 from lavender.solution import Claim
 
-__all__ = ["OPTIONS", "QPSolver", "refusal"]
+__all__ = ["ISOLATE", "OPTIONS", "QPSolver", "refusal"]
 
 DENSE_LIMIT = 2**30  # bytes of one dense matrix; beyond, a dense backend is refused
 OPTIONS = {
@@ -26,6 +26,7 @@ OPTIONS = {
     "unit_diagonal": "impulse form: scale A to a unit diagonal, default True",
     "settings": "mapping passed to the backend, over those that tol gives",
 }
+ISOLATE = {"isolate": "run in a process of its own where a time_limit is given, which ends it; default True"}
 
 
 @dataclass
@@ -48,15 +49,20 @@ class QPSolver:
         Impulse form: scale P to a unit diagonal.
     settings : mapping
         Passed to the backend as they are, over those that `tol` gives.
+    isolate : bool
+        Run a backend that takes no time limit in a process of its own where one is given.
     """
 
     backend: Backend
     form: str = "auto"
     unit_diagonal: bool = True
     settings: Mapping[str, Any] = field(default_factory=dict)
+    isolate: bool = True
 
     def __post_init__(self) -> None:
         check_settings(self.settings)
+        if not isinstance(self.isolate, bool):
+            raise InputError(f"isolate is {self.isolate!r}; True or False is needed")
 
     @np.errstate(all="ignore")  # what overflows is judged
     def prepare(self, problem: Problem) -> State:
@@ -90,11 +96,21 @@ class QPSolver:
         self, state: State, impulse: FloatArray, n: int, tol: float, time_limit: float | None = None
     ) -> Claim:
         b = self.backend
-        call: Call = partial(through_qpsolvers, b) if b.call is None else b.call
+        apart = None if time_limit is None or not self.runs_apart else partial(_apart.call, b.name)
         return ask(
-            state.problem, state.qp, impulse, call, n, tol, time_limit, self.settings,
-            stoppable=b.stoppable, noisy=b.noisy,
+            state.problem, state.qp, impulse, b.run, n, tol, time_limit, self.settings,
+            stoppable=b.stoppable, noisy=b.noisy, apart=apart,
         )  # fmt: skip
+
+    @property
+    def runs_apart(self) -> bool:
+        """With a time limit it runs in a process of its own, which can be ended."""
+        return self.isolate and not self.backend.stoppable
+
+    def ready(self) -> None:
+        """A time limit was given, and its clock has not begun: have that process ready."""
+        if self.runs_apart:
+            _apart.ready()
 
 
 def refusal(problem: Problem) -> str | None:

@@ -257,6 +257,69 @@ def test_no_time_limit_is_said(name):
     assert ("takes no time limit" in solution.message) == (not stoppable)
 
 
+APART = [b.name for b in backends.BACKENDS if not b.stoppable and b.name in BACKENDS]
+
+
+@pytest.mark.parametrize("name", APART)
+def test_a_backend_without_a_time_limit_runs_in_a_process_of_its_own(name):
+    problem = lv.Problem.lcp(*spd(12, seed=3))
+    plain = lv.solve(problem, name)
+    apart = lv.solve(problem, name, time_limit=60.0)
+    here = lv.solve(problem, name, time_limit=60.0, isolate=False)
+    assert "ran in a process of its own" in apart.message
+    assert "ran to its end" in here.message
+    assert plain.success and "time limit" not in plain.message
+    for other in (apart, here):
+        assert other.status is plain.status
+        assert other.work == plain.work
+        assert other.impulse.tobytes() == plain.impulse.tobytes()
+
+
+def test_a_backend_that_does_not_end_is_ended_and_the_next_call_finds_another():
+    if "quadprog" not in BACKENDS:
+        pytest.skip("quadprog is not installed")
+    # A thousand rows: to send them takes longer than this limit.
+    problem = lv.Problem.lcp(*spd(1000, seed=3))
+    prepared = lv.prepare(problem, "quadprog")
+    late = prepared.solve(time_limit=1e-6)
+    assert late.status is lv.Status.TIME_LIMIT
+    assert "ended at the time limit" in late.message
+    assert late.impulse.tobytes() == problem.start().tobytes()
+    small = lv.Problem.lcp(*spd(5))
+    after = lv.solve(small, "quadprog", time_limit=60.0)
+    assert after.success and "ran in a process of its own" in after.message
+
+
+@pytest.mark.skipif(not APART, reason="no backend without a time limit is installed")
+def test_the_process_is_kept_and_its_death_costs_one_call_at_most():
+    from lavender.external import _apart
+
+    problem = lv.Problem.lcp(*spd(5))
+    lv.solve(problem, APART[0], time_limit=60.0)
+    kept = list(_apart._idle)
+    assert len(kept) == 1
+    lv.solve(problem, APART[0], time_limit=60.0)
+    assert _apart._idle == kept
+    kept[0]._process.kill()
+    kept[0]._process.wait()
+    assert lv.solve(problem, APART[0], time_limit=60.0).success
+    assert _apart._idle != kept
+
+
+@pytest.mark.skipif(not APART, reason="no backend without a time limit is installed")
+def test_errors_of_a_process_of_its_own_are_told():
+    problem = lv.Problem.lcp(*spd(5))
+    with pytest.raises(lv.InputError, match="isolate"):
+        lv.solve(problem, APART[0], isolate="yes")
+    with pytest.raises(lv.InputError, match="isolate=False"):
+        lv.solve(problem, APART[0], time_limit=60.0, settings={"verbose": lambda: None})
+    wrong = {"settings": {"bogus": 1}}
+    here = lv.solve(problem, APART[0], time_limit=60.0, isolate=False, **wrong)
+    apart = lv.solve(problem, APART[0], time_limit=60.0, **wrong)
+    assert apart.status is here.status
+    assert apart.message.split(";")[0] == here.message.split(";")[0]
+
+
 @pytest.mark.parametrize("name", ["osqp", "scs", "qpalm"])
 def test_time_limit_stops_a_backend(name):
     if name not in BACKENDS:

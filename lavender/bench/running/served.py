@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
-import pickle
-import signal
-import struct
-import threading
 import time
-from typing import IO, Any
+from typing import Any
+
+from lavender.apart.served import answer, begin, receive
 
 __all__ = ["serve"]
 
@@ -25,75 +22,26 @@ def serve(memory: int, lifeline: int) -> None:
     memory : bytes of address space, 0 for no limit
     lifeline : reading end of a pipe whose other end the parent alone holds; -1 for none
     """
-    # Ctrl-C is the parent's: it decides.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    if lifeline >= 0:
-        end_with_parent(lifeline)
+    requests, answers = begin(lifeline)
     if memory:
         with contextlib.suppress(ImportError, ValueError, OSError):
             import resource
 
             resource.setrlimit(resource.RLIMIT_AS, (memory, memory))
-    requests, answers = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
-    nowhere = os.open(os.devnull, os.O_RDWR)
-    os.dup2(nowhere, 0)
-    os.dup2(nowhere, 1)
     from lavender.bench.running.timing import attempt
 
-    _answer(answers, "{}", b"")  # ready
+    answer(answers, "{}", b"")  # ready
     problem: Any = None
     while True:
         try:
-            message = _receive(requests)
+            message = receive(requests)
         except EOFError:
             return
         if message[0] == "problem":
             problem = message[1]
         else:
             _limit_cpu(3.0 * message[1].time_limit + ORPHAN)
-            _answer(answers, *_as_data(attempt(problem, message[1], message[2])))
-
-
-def end_with_parent(lifeline: int) -> None:
-    """Let the system end this process, and those that it started, when the parent is gone, whatever they do.
-
-    On Linux the kernel itself sends the signal when the last writing end of the pipe closes, so code that never
-    returns ends too; elsewhere a thread waits for it.
-    """
-    os.set_inheritable(lifeline, False)
-    with contextlib.suppress(ImportError, AttributeError):  # F_SETSIG is Linux's
-        import fcntl
-        import select
-
-        fcntl.fcntl(lifeline, fcntl.F_SETSIG, signal.SIGKILL)
-        fcntl.fcntl(lifeline, fcntl.F_SETOWN, -os.getpgrp())
-        fcntl.fcntl(lifeline, fcntl.F_SETFL, fcntl.fcntl(lifeline, fcntl.F_GETFL) | os.O_ASYNC)
-        if select.select([lifeline], [], [], 0.0)[0]:  # it went before this was set up
-            os.killpg(0, signal.SIGKILL)
-        return
-
-    def wait() -> None:
-        os.read(lifeline, 1)
-        os.killpg(0, signal.SIGKILL)
-
-    threading.Thread(target=wait, daemon=True).start()
-
-
-def _receive(stream: IO[bytes]) -> Any:
-    head = stream.read(8)
-    if len(head) < 8:
-        raise EOFError
-    (size,) = struct.unpack("<Q", head)
-    data = stream.read(size)
-    if len(data) < size:
-        raise EOFError
-    return pickle.loads(data)  # of the parent's
-
-
-def _answer(stream: IO[bytes], words: str, numbers: bytes) -> None:
-    text = words.encode()
-    stream.write(struct.pack("<QQ", len(text), len(numbers)) + text + numbers)
-    stream.flush()
+            answer(answers, *_as_data(attempt(problem, message[1], message[2])))
 
 
 def _as_data(found: Any) -> tuple[str, bytes]:

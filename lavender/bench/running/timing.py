@@ -217,7 +217,10 @@ def judged(problem: Problem, task: Task, found: Outcome | str) -> tuple[Record, 
 
 def _once(problem: Problem, task: Task, impulse: Any) -> Solution:
     fresh = replace(problem, copy=False)  # nothing derived yet: forming A is set-up
-    prepared = prepare(fresh, task.solver, **task.options)
+    more = {"isolate": False} if "isolate" in registry.get(task.solver).accepts else {}
+    prepared = prepare(
+        fresh, task.solver, **{**more, **task.options}
+    )  # a run has processes of its own for these
     reference(fresh)  # E0, V0: the judge's, outside the clocks
     if task.start == "cold":
         impulse = fresh.start()

@@ -1,0 +1,217 @@
+"""Another Python that answers messages, ended with everything that it started, at the latest with this process.
+
+What is sent is pickled; what comes back is data, words and numbers of a stated form and size, never an object that is
+unpickled. What it prints goes to nowhere.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import pickle
+import queue
+import signal
+import struct
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Mapping
+from typing import IO, Any
+
+__all__ = ["Process"]
+
+START_TIME = 60.0  # s, to import everything on a loaded machine
+WORDS = 2**20  # bytes of the words of one answer
+PIECE = 2**20  # bytes read at once
+GROUPS = os.name == "posix"  # processes can be ended together with what they started
+END_TIME = 10.0  # s, for the system to end a killed process; one that waits for a dead disk may take longer
+
+
+def _read(stream: IO[bytes], size: int) -> bytes:
+    """Exactly so many bytes of an unbuffered stream.
+
+    Raises
+    ------
+    EOFError
+        The stream ended before.
+    """
+    parts = []
+    while size:
+        part = stream.read(min(size, PIECE))
+        if not part:
+            raise EOFError
+        parts.append(part)
+        size -= len(part)
+    return b"".join(parts)
+
+
+class Process:
+    """A Python that runs `module.serve(*arguments, lifeline)` and answers messages with it (`served.py`).
+
+    Parameters
+    ----------
+    module : dotted name
+    arguments : whole numbers
+    environment : mapping, optional
+        Beside that of this process.
+
+    Raises
+    ------
+    OSError
+        The system starts no process.
+    """
+
+    def __init__(self, module: str, *arguments: int, environment: Mapping[str, str] | None = None) -> None:
+        self.room = 0  # bytes of numbers that an answer may have
+        paths = os.pathsep.join(p or os.getcwd() for p in sys.path)
+        more: dict[str, Any] = {}
+        alive, self._lifeline = -1, -1  # the writing end of a pipe that ends when this process does
+        if GROUPS:
+            alive, self._lifeline = os.pipe()
+            more = {"start_new_session": True, "pass_fds": (alive,)}
+        # Not `-m`: that puts the current folder first, and in a checkout its sources would hide the installed package.
+        start = (
+            f"import sys; sys.path[:] = filter(None, sys.path); from {module} import serve; "
+            "serve(*map(int, sys.argv[1:]))"
+        )
+        try:
+            self._process: subprocess.Popen[bytes] | None = subprocess.Popen(
+                [sys.executable, "-c", start, *map(str, arguments), str(alive)],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.DEVNULL,
+                env={**os.environ, **(environment or {}), "PYTHONPATH": paths},
+                bufsize=0,
+                **more,
+            )
+        except BaseException:
+            if GROUPS:
+                os.close(self._lifeline)
+            raise
+        finally:
+            if alive >= 0:
+                os.close(alive)
+        self._answers: queue.Queue[Any] = queue.Queue()
+        stream = self._process.stdout
+        assert stream is not None
+        # A process of the backend's that left the group may keep the pipe open for ever: this thread then waits
+        # alone, and nobody waits for it.
+        threading.Thread(target=self._listen, args=(stream, self._answers), daemon=True).start()
+
+    @property
+    def alive(self) -> bool:
+        """It was not ended, and has not ended."""
+        return self._process is not None and self._process.poll() is None
+
+    def ready(self) -> str:
+        """Wait until it answers for the first time; why it does not, or nothing."""
+        try:
+            first = self._answers.get(timeout=START_TIME)
+        except queue.Empty:
+            first = None
+        except KeyboardInterrupt:
+            self.end()
+            raise
+        return "" if first is not None else self.cause()
+
+    def answer(self, limit: float) -> tuple[bytes, bytes] | None:
+        """The next answer: words and numbers; None where it ended.
+
+        Raises
+        ------
+        TimeoutError
+            None came within `limit` [s].
+        """
+        try:
+            found: tuple[bytes, bytes] | None = self._answers.get(timeout=max(0.0, limit))
+        except queue.Empty:
+            raise TimeoutError from None
+        return found
+
+    def send(self, messages: list[Any], limit: float) -> None:
+        """Write messages; a process that does not read them within `limit` [s] is one that does not answer.
+
+        Raises
+        ------
+        TimeoutError
+            It did not read them.
+        """
+        process = self._process
+        assert process is not None and process.stdin is not None
+        stream = process.stdin
+        frames = [pickle.dumps(m, pickle.HIGHEST_PROTOCOL) for m in messages]
+        data = memoryview(b"".join(struct.pack("<Q", len(f)) + f for f in frames))
+
+        def write() -> None:
+            done = 0
+            with contextlib.suppress(OSError, ValueError):  # it died: the answer is its end
+                while done < len(data):
+                    done += stream.write(data[done : done + PIECE]) or 0
+
+        if len(data) <= 4096:  # a pipe takes that at once, and it is empty: every message was answered
+            write()
+            return
+        writer = threading.Thread(target=write, daemon=True)
+        writer.start()
+        writer.join(limit)
+        if writer.is_alive():
+            raise TimeoutError
+
+    def _listen(self, stream: IO[bytes], answers: queue.Queue[Any]) -> None:
+        with contextlib.suppress(Exception), stream:
+            while True:
+                words, numbers = struct.unpack("<QQ", _read(stream, 16))
+                if words > WORDS or numbers > self.room:
+                    answers.put((b"", b""))  # no answer has such a size: it is not read
+                    break
+                answers.put((_read(stream, words), _read(stream, numbers)))
+        answers.put(None)  # the end, however it came
+
+    def cause(self) -> str:
+        """How it ended, after it was ended with all that it started."""
+        process = self._process
+        assert process is not None
+        code = _ended(process, 1.0)
+        self.end()
+        if code is None:
+            return "no answer"
+        if code < 0:
+            with contextlib.suppress(ValueError):
+                return signal.Signals(-code).name
+        return f"exit status {code}"
+
+    def end(self) -> None:
+        """End it and what it started."""
+        process, self._process = self._process, None
+        lifeline, self._lifeline = self._lifeline, -1
+        if process is None:
+            return
+        if GROUPS:
+            # Before it is waited for: until then nobody else can have its number.
+            with contextlib.suppress(OSError):
+                os.killpg(process.pid, signal.SIGKILL)
+            os.close(lifeline)
+        process.kill()
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.wait(END_TIME)
+        if process.stdin is not None:
+            with contextlib.suppress(OSError):
+                process.stdin.close()
+
+
+def _ended(process: subprocess.Popen[bytes], limit: float) -> int | None:
+    """Exit status of a process, -N for signal N; None where it runs on. It is not reaped: its group may live."""
+    if not GROUPS or not hasattr(os, "waitid"):
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            return process.wait(limit)
+        return None
+    until = time.monotonic() + limit
+    while True:
+        with contextlib.suppress(ChildProcessError):
+            found = os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT | os.WNOHANG)
+            if found is not None:
+                return found.si_status if found.si_code == os.CLD_EXITED else -found.si_status
+        if time.monotonic() > until:
+            return None
+        time.sleep(0.01)

@@ -1,0 +1,131 @@
+"""Backends that take no time limit, in processes of their own that are kept from call to call.
+
+A process that has not answered when the time is up is ended, and the next call finds another. Answers are data
+(`lavender.apart`): nothing that a backend sends is unpickled here.
+"""
+
+from __future__ import annotations
+
+import atexit
+import json
+import os
+import pickle
+from threading import Lock
+from time import monotonic
+from typing import Any
+
+import numpy as np
+
+from lavender._arrays import FloatArray
+from lavender.apart.process import Process
+from lavender.errors import InputError
+from lavender.external._running import Answer, Failed, Limits
+from lavender.external.as_qp import QP
+from lavender.solution import Status
+
+__all__ = ["ARRAYS", "call", "ready"]
+
+SERVED = "lavender.external._served"
+ARRAYS = ("x", "zeta", "xi", "direction", "contradiction")  # of an answer, in the order they are sent
+WORDS = 500  # characters of what a backend said
+
+_lock = Lock()
+_idle: list[Process] = []  # started, and not asked anything
+_owner = 0  # id of the process that started them: a fork's copies are not its own
+
+
+def ready() -> None:
+    """Have a process ready, started outside the clock; where the system starts none, the backend runs here."""
+    process = _take()
+    if process is None:
+        try:
+            process = Process(SERVED)
+        except OSError:
+            return
+        if process.ready():
+            return
+    _keep(process)
+
+
+def call(name: str, qp: QP, impulse: FloatArray, limit: Limits, settings: dict[str, Any]) -> Answer | None:
+    """One run of the backend of that name within `limit.time_limit`; None where no process is ready.
+
+    Raises
+    ------
+    InputError
+        Settings that the backend does not know, or that cannot be sent.
+    Failed
+        The backend raised something, or its process died.
+    """
+    assert limit.time_limit is not None
+    process, until = _take(), monotonic() + limit.time_limit
+    if process is None:
+        return None
+    process.room = 8 * (4 * qp.n + 2 * len(qp.b))
+    try:
+        process.send([(name, qp, impulse, limit, settings)], limit.time_limit)
+        found = process.answer(until - monotonic())
+    except TimeoutError:
+        process.end()
+        return Answer(Status.TIME_LIMIT, "ended at the time limit")
+    except (pickle.PicklingError, TypeError, AttributeError) as error:
+        _keep(process)
+        raise InputError(
+            f"settings cannot be sent to another process ({error}); isolate=False runs the backend in this one"
+        ) from None
+    except BaseException:
+        process.end()
+        raise
+    if found is None:
+        raise Failed(f"the process of the backend died ({process.cause()})")
+    _keep(process)
+    return _answer(found)
+
+
+def _answer(found: tuple[bytes, bytes]) -> Answer:
+    # Every part is checked: a backend may have written anything.
+    try:
+        said = json.loads(found[0])
+        if "error" in said:
+            if said.get("kind") == InputError.__name__:
+                raise InputError(str(said["error"]))
+            raise Failed(str(said["error"]))
+        numbers, at = np.frombuffer(found[1], float), 0
+        arrays: dict[str, FloatArray | None] = {}
+        for name, size in zip(ARRAYS, said["sizes"], strict=True):
+            if size is not None and not 0 <= size <= len(numbers) - at:
+                raise ValueError("arrays of another length")
+            arrays[name] = None if size is None else numbers[at : at + size].copy()
+            at += size or 0
+        work = {str(kind): int(count) for kind, count in said["work"].items()}
+        return Answer(status=Status[said["status"]], words=str(said["words"]), work=work, **arrays)
+    except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise Failed(f"the process of the backend sent what is no answer ({error})") from None
+
+
+def _take() -> Process | None:
+    global _owner
+    with _lock:
+        if _owner != os.getpid():
+            _idle.clear()
+            _owner = os.getpid()
+        while _idle:
+            process = _idle.pop()
+            if process.alive:
+                return process
+            process.end()
+    return None
+
+
+def _keep(process: Process) -> None:
+    with _lock:
+        _idle.append(process)
+
+
+@atexit.register
+def _end() -> None:
+    if _owner == os.getpid():
+        while _idle:
+            _idle.pop().end()
