@@ -14,6 +14,7 @@ from libc.stdint cimport int32_t, uint64_t
 
 cdef enum:
     PANEL_ROWS = 16             # most rows of a panel, unless one block has more
+    NEAR = 64                   # columns of a panel that are copied together where several rows need them
 
 
 cdef struct generalized_t:
@@ -27,6 +28,7 @@ cdef struct generalized_t:
     const double* lval
     const int32_t* parent       # (n) last column of the row of L, -1 at a root
     const double* inv_pivot     # (n) 1 / D
+    const double* root          # (n) D^-1/2
     const double* compliance    # (m) 1/kg, >= 0
     int32_t n_panels
     const int32_t* prow         # (n_panels + 1) first row of each panel
@@ -148,17 +150,25 @@ cdef inline int32_t tree_factor(int32_t n, const int32_t* mptr, const int32_t* m
 
 cdef inline void tree_solve(const generalized_t* g, double* x) noexcept nogil:
     """x <- M^-1 x."""
-    cdef int32_t k, q
+    cdef int32_t k, q, first, end, n = g.n
+    cdef const int32_t* lptr = g.lptr                       # what is stored to might be g, for all a compiler knows
+    cdef const int32_t* lidx = g.lidx
+    cdef const double* lval = g.lval
+    cdef const double* inv_pivot = g.inv_pivot
     cdef double z
-    for k in range(g.n - 1, -1, -1):                        # L^T z = x
+    for k in range(n - 1, -1, -1):                          # L^T z = x
         z = x[k]
         if z != 0.0:
-            for q in range(g.lptr[k], g.lptr[k + 1]):
-                x[g.lidx[q]] -= g.lval[q] * z
-    for k in range(g.n):                                    # D, then L x = z
-        z = x[k] * g.inv_pivot[k]
-        for q in range(g.lptr[k], g.lptr[k + 1]):
-            z -= g.lval[q] * x[g.lidx[q]]
+            first = lptr[k]
+            end = lptr[k + 1]
+            for q in range(first, end):
+                x[lidx[q]] -= lval[q] * z
+    for k in range(n):                                      # D, then L x = z
+        z = x[k] * inv_pivot[k]
+        first = lptr[k]
+        end = lptr[k + 1]
+        for q in range(first, end):
+            z -= lval[q] * x[lidx[q]]
         x[k] = z
 
 
@@ -167,7 +177,7 @@ cdef inline void tree_unwhiten(const generalized_t* g, double* x) noexcept nogil
     cdef int32_t k, q
     cdef double z
     for k in range(g.n):
-        z = x[k] * sqrt(g.inv_pivot[k])
+        z = x[k] * g.root[k]
         for q in range(g.lptr[k], g.lptr[k + 1]):
             z -= g.lval[q] * x[g.lidx[q]]
         x[k] = z
@@ -178,22 +188,29 @@ cdef inline void tree_unwhiten(const generalized_t* g, double* x) noexcept nogil
 
 cdef inline void jac_push(const generalized_t* g, const double* lam, double* x) noexcept nogil:
     """x = J^T lam (n)."""
-    cdef int32_t i, q
+    cdef int32_t i, q, first, end, m = g.m
+    cdef const int32_t* jptr = g.jptr
+    cdef const int32_t* jidx = g.jidx
+    cdef const double* jval = g.jval
     cdef double s
     for i in range(g.n):
         x[i] = 0.0
-    for i in range(g.m):
+    for i in range(m):
         s = lam[i]
         if s != 0.0:
-            for q in range(g.jptr[i], g.jptr[i + 1]):
-                x[g.jidx[q]] += g.jval[q] * s
+            first = jptr[i]
+            end = jptr[i + 1]
+            for q in range(first, end):
+                x[jidx[q]] += jval[q] * s
 
 
 cdef inline double jac_row(const generalized_t* g, int32_t i, const double* x) noexcept nogil:
-    cdef int32_t q
+    cdef int32_t q, first = g.jptr[i], end = g.jptr[i + 1]
+    cdef const int32_t* jidx = g.jidx
+    cdef const double* jval = g.jval
     cdef double s = 0.0
-    for q in range(g.jptr[i], g.jptr[i + 1]):
-        s += g.jval[q] * x[g.jidx[q]]
+    for q in range(first, end):
+        s += jval[q] * x[jidx[q]]
     return s
 
 
@@ -236,42 +253,61 @@ cdef inline int32_t few_panels(const generalized_t* g, int32_t n_blocks, const i
                                int32_t* prow, int32_t* pcol, int32_t* pval, int32_t* cols, int32_t room,
                                int32_t* n_cols, double* n_values) noexcept nogil:
     """`panel_pattern` of at most 64 velocities, sets of columns as bits; above (n) is scratch."""
-    cdef int32_t i, q, k, first, last, count = 0, at = 0, n = 0
+    cdef int32_t i, q, k, c, first, last, count = 0, at = 0, n = 0, top, nv = g.n, end
+    cdef const int32_t* jptr = g.jptr
+    cdef const int32_t* jidx = g.jidx
+    cdef const int32_t* parent = g.parent
     cdef uint64_t on, held = 0
-    n_values[0] = 0.0
+    cdef double values = 0.0
     prow[0] = 0
     pcol[0] = 0
     pval[0] = 0
-    for k in range(g.n):                                # a column and those that it reaches, which come before it
+    for k in range(nv):                                 # a column and those that it reaches, which come before it
         above[k] = <uint64_t>1 << k
-        if g.parent[k] >= 0:
-            above[k] |= above[g.parent[k]]
+        if parent[k] >= 0:
+            above[k] |= above[parent[k]]
     for i in range(n_blocks):
         first = ptr[i]
         last = ptr[i + 1]
         on = 0
-        for q in range(g.jptr[first], g.jptr[last]):
-            on |= above[g.jidx[q]]
+        top = -1
+        end = jptr[last]
+        for q in range(jptr[first], end):
+            k = jidx[q]
+            on |= above[k]
+            if k > top:
+                top = k
         if n > 0 and on == held and last - prow[n - 1] <= PANEL_ROWS:
             prow[n] = last                              # the panel grows
         else:
-            if at + g.n > room:
+            if at + nv > room:
                 return -1
             count = 0
-            for k in range(g.n):
-                if on >> k & 1:
-                    cols[at + count] = k
+            if top >= 0 and on == above[top]:           # one chain
+                k = top
+                while k >= 0:
                     count += 1
+                    k = parent[k]
+                k = top
+                for c in range(at + count - 1, at - 1, -1):
+                    cols[c] = k
+                    k = parent[k]
+            else:
+                for k in range(top + 1):
+                    if on >> k & 1:
+                        cols[at + count] = k
+                        count += 1
             at += count
             held = on
             n += 1
             prow[n] = last
             pcol[n] = at
-        n_values[0] += <double>count * (last - first)
+        values += <double>count * (last - first)
         pval[n] = pval[n - 1] + count * (last - prow[n - 1])
-        if n_values[0] >= 2147483647.0:
+        if values >= 2147483647.0:
             break
     n_cols[0] = at
+    n_values[0] = values
     return n
 
 
@@ -321,36 +357,55 @@ cdef inline int32_t panel_pattern(const generalized_t* g, int32_t n_blocks, cons
 
 cdef inline void panel_whiten(const generalized_t* g, int32_t panel, int32_t* place, double* y) noexcept nogil:
     """Rows of Y of one panel: L^T y = J^T on its columns, then D^-1/2. place (n) is scratch."""
-    cdef int32_t first = g.prow[panel], last = g.prow[panel + 1], c0 = g.pcol[panel], nc = g.pcol[panel + 1] - c0
+    cdef int32_t first = g.prow[panel], rows = g.prow[panel + 1] - first, c0 = g.pcol[panel]
+    cdef int32_t nc = g.pcol[panel + 1] - c0, a, k, q, i, p, count, end, before
     cdef const int32_t* cols = g.cols + c0
-    cdef int32_t a, k, q, i, p, count
-    cdef double z, l
+    cdef const int32_t* jptr = g.jptr + first
+    cdef const int32_t* jidx = g.jidx
+    cdef const double* jval = g.jval
+    cdef const int32_t* lptr = g.lptr
+    cdef const int32_t* lidx
+    cdef const double* l
+    cdef const double* root = g.root
+    cdef double z
     cdef double* x
     for a in range(nc):
         place[cols[a]] = a
-    for i in range((last - first) * nc):
+    for i in range(rows * nc):
         y[i] = 0.0
-    for i in range(first, last):
-        x = y + (i - first) * nc
-        for q in range(g.jptr[i], g.jptr[i + 1]):
-            x[place[g.jidx[q]]] = g.jval[q]
+    for i in range(rows):
+        x = y + i * nc
+        end = jptr[i + 1]
+        for q in range(jptr[i], end):
+            x[place[jidx[q]]] = jval[q]
     for a in range(nc - 1, -1, -1):
         k = cols[a]
-        count = g.lptr[k + 1] - g.lptr[k]
-        for i in range(last - first):
-            x = y + i * nc
-            z = x[a]
-            if z == 0.0:
-                continue
-            if count == a:                                  # every column before it
-                for p in range(a):
-                    x[p] -= g.lval[g.lptr[k] + p] * z
-            else:
-                for q in range(g.lptr[k], g.lptr[k + 1]):
-                    x[place[g.lidx[q]]] -= g.lval[q] * z
-        l = sqrt(g.inv_pivot[k])
-        for i in range(last - first):
-            y[i * nc + a] *= l
+        before = lptr[k]
+        count = lptr[k + 1] - before
+        l = g.lval + before
+        z = root[k]
+        if count == a:                                      # every column before it
+            x = y
+            for i in range(rows):
+                take_from(x, l, x[a], a)
+                x[a] *= z
+                x += nc
+        else:
+            lidx = g.lidx + before
+            x = y
+            for i in range(rows):
+                if x[a] != 0.0:
+                    for p in range(count):
+                        x[place[lidx[p]]] -= l[p] * x[a]
+                    x[a] *= z
+                x += nc
+
+
+cdef inline void take_from(double* x, const double* l, double z, int32_t n) noexcept nogil:
+    cdef int32_t i
+    if z != 0.0:
+        for i in range(n):
+            x[i] -= l[i] * z
 
 
 cdef inline double dot(const double* x, const double* y, int32_t n) noexcept nogil:
@@ -369,39 +424,54 @@ cdef inline double dot(const double* x, const double* y, int32_t n) noexcept nog
     return (s0 + s1) + (s2 + s3)
 
 
+cdef inline double indexed_dot(const double* y, const int32_t* cols, const double* x, int32_t n) noexcept nogil:
+    # Two running sums, as in `near_dot`: whoever reads a row of Y gets the same bits.
+    cdef int32_t a = 0
+    cdef double s0 = 0.0, s1 = 0.0
+    while a + 2 <= n:
+        s0 += y[a] * x[cols[a]]
+        s1 += y[a + 1] * x[cols[a + 1]]
+        a += 2
+    if a < n:
+        s0 += y[a] * x[cols[a]]
+    return s0 + s1
+
+
+cdef inline double near_dot(const double* y, const double* x, int32_t n) noexcept nogil:
+    # `indexed_dot` of what stands together.
+    cdef int32_t a = 0
+    cdef double s0 = 0.0, s1 = 0.0
+    while a + 2 <= n:
+        s0 += y[a] * x[a]
+        s1 += y[a + 1] * x[a + 1]
+        a += 2
+    if a < n:
+        s0 += y[a] * x[a]
+    return s0 + s1
+
+
 cdef inline void panel_times(const generalized_t* g, int32_t panel, const double* x, double* out) noexcept nogil:
     """out (m) = Y x on the rows of a panel."""
-    cdef int32_t i, a, nc = g.pcol[panel + 1] - g.pcol[panel]
+    cdef int32_t i, first = g.prow[panel], end = g.prow[panel + 1], nc = g.pcol[panel + 1] - g.pcol[panel]
     cdef const int32_t* cols = g.cols + g.pcol[panel]
     cdef const double* y = g.y + g.pval[panel]
-    cdef double s0, s1
-    for i in range(g.prow[panel], g.prow[panel + 1]):
-        s0 = 0.0
-        s1 = 0.0
-        a = 0
-        while a + 2 <= nc:
-            s0 += y[a] * x[cols[a]]
-            s1 += y[a + 1] * x[cols[a + 1]]
-            a += 2
-        if a < nc:
-            s0 += y[a] * x[cols[a]]
-        out[i] = s0 + s1
+    cdef double near[NEAR]
+    if end - first > 2 and nc <= NEAR:
+        for i in range(nc):
+            near[i] = x[cols[i]]
+        for i in range(first, end):
+            out[i] = near_dot(y, near, nc)
+            y += nc
+        return
+    for i in range(first, end):
+        out[i] = indexed_dot(y, cols, x, nc)
         y += nc
 
 
 cdef inline double whitened_dot(const generalized_t* g, int32_t panel, int32_t row, const double* x) noexcept nogil:
     """Y_row x, with the bits of `panel_times`."""
-    cdef int32_t a = 0, nc = g.pcol[panel + 1] - g.pcol[panel]
-    cdef const int32_t* cols = g.cols + g.pcol[panel]
-    cdef const double* y = g.y + g.pval[panel] + <ssize_t>(row - g.prow[panel]) * nc
-    cdef double s0 = 0.0, s1 = 0.0
-    while a + 2 <= nc:
-        s0 += y[a] * x[cols[a]]
-        s1 += y[a + 1] * x[cols[a + 1]]
-        a += 2
-    if a < nc:
-        s0 += y[a] * x[cols[a]]
-    return s0 + s1
+    cdef int32_t nc = g.pcol[panel + 1] - g.pcol[panel]
+    return indexed_dot(g.y + g.pval[panel] + <ssize_t>(row - g.prow[panel]) * nc, g.cols + g.pcol[panel], x, nc)
 
 
 cdef inline void whitened_push(const generalized_t* g, int32_t panel, int32_t row, double change, double* x) noexcept nogil:
@@ -425,22 +495,44 @@ cdef inline void whitened_gather(const generalized_t* g, const double* lam, doub
 
 cdef inline void panel_push(const generalized_t* g, int32_t panel, const double* lam, double* x) noexcept nogil:
     """x (n) += Y^T lam of the rows of a panel."""
-    cdef int32_t i, a, nc = g.pcol[panel + 1] - g.pcol[panel]
+    cdef int32_t i, a, first = g.prow[panel], end = g.prow[panel + 1], nc = g.pcol[panel + 1] - g.pcol[panel]
     cdef const int32_t* cols = g.cols + g.pcol[panel]
     cdef const double* y = g.y + g.pval[panel]
-    for i in range(g.prow[panel], g.prow[panel + 1]):
+    cdef double near[NEAR]
+    if end - first > 2 and nc <= NEAR:
+        while first < end and lam[first] == 0.0:
+            first += 1
+            y += nc
+        if first == end:
+            return
+        for a in range(nc):
+            near[a] = x[cols[a]]
+        for i in range(first, end):
+            if lam[i] != 0.0:
+                give_to(near, y, lam[i], nc)
+            y += nc
+        for a in range(nc):
+            x[cols[a]] = near[a]
+        return
+    for i in range(first, end):
         if lam[i] != 0.0:
             for a in range(nc):
                 x[cols[a]] += y[a] * lam[i]
         y += nc
 
 
+cdef inline void give_to(double* x, const double* y, double z, int32_t n) noexcept nogil:
+    cdef int32_t i
+    for i in range(n):
+        x[i] += y[i] * z
+
+
 cdef inline void panel_push_size(const generalized_t* g, int32_t panel, const double* lam, double* x) noexcept nogil:
     """x (n) += |Y|^T |lam| of the rows of a panel."""
-    cdef int32_t i, a, nc = g.pcol[panel + 1] - g.pcol[panel]
+    cdef int32_t i, a, first = g.prow[panel], end = g.prow[panel + 1], nc = g.pcol[panel + 1] - g.pcol[panel]
     cdef const int32_t* cols = g.cols + g.pcol[panel]
     cdef const double* y = g.y + g.pval[panel]
-    for i in range(g.prow[panel], g.prow[panel + 1]):
+    for i in range(first, end):
         if lam[i] != 0.0:
             for a in range(nc):
                 x[cols[a]] += fabs(y[a] * lam[i])
@@ -449,11 +541,11 @@ cdef inline void panel_push_size(const generalized_t* g, int32_t panel, const do
 
 cdef inline void panel_size(const generalized_t* g, int32_t panel, const double* x, double* out) noexcept nogil:
     """out (m) = |Y| x on the rows of a panel, x >= 0."""
-    cdef int32_t i, a, nc = g.pcol[panel + 1] - g.pcol[panel]
+    cdef int32_t i, a, first = g.prow[panel], end = g.prow[panel + 1], nc = g.pcol[panel + 1] - g.pcol[panel]
     cdef const int32_t* cols = g.cols + g.pcol[panel]
     cdef const double* y = g.y + g.pval[panel]
     cdef double s
-    for i in range(g.prow[panel], g.prow[panel + 1]):
+    for i in range(first, end):
         s = 0.0
         for a in range(nc):
             s += fabs(y[a]) * x[cols[a]]

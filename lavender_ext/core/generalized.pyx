@@ -35,7 +35,7 @@ cdef class Operator:
 
     def __init__(self, const int32_t[::1] jptr, const int32_t[::1] jidx, const double[::1] jval,
                  const int32_t[::1] mptr, const int32_t[::1] midx, const double[::1] mval):
-        cdef int32_t m = <int32_t>jptr.shape[0] - 1, n = <int32_t>mptr.shape[0] - 1, count, room
+        cdef int32_t m = <int32_t>jptr.shape[0] - 1, n = <int32_t>mptr.shape[0] - 1, count, room, i
         cdef int32_t[::1] whole, indices
         cdef double[::1] numbers
         self.jac = (jptr.base, jidx.base, jval.base)
@@ -64,10 +64,13 @@ cdef class Operator:
         self.g.lidx = &indices[0]
         self.g.lval = &numbers[2 * n]
         self.g.inv_pivot = &numbers[0]
+        self.g.root = &numbers[n]                       # the factor's pivots, until it is there
         self.failed = -1
         if n:
             self.failed = tree_factor(n, &mptr[0], &midx[0], &mval[0], &whole[0], &indices[0], &numbers[2 * n],
                                       &numbers[n], &numbers[0])
+        for i in range(n):
+            numbers[n + i] = sqrt(numbers[i])
 
     @property
     def n(self):

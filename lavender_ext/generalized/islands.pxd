@@ -17,8 +17,38 @@ cdef inline int32_t root_of(int32_t* up, int32_t i) noexcept nogil:
     return i
 
 
+cdef inline int32_t join_trees(const generalized_t* g, int32_t* up) noexcept nogil:
+    """up (n): the root of each column's tree, and roots of trees that a panel joins; how many panels have no column."""
+    cdef int32_t b, q, r, k, i, end, n = g.n, empty = 0, trees = 0
+    cdef const int32_t* parent = g.parent
+    cdef const int32_t* cols = g.cols
+    for i in range(n):
+        k = parent[i]
+        if k < 0:
+            trees += 1
+            up[i] = i
+        else:
+            up[i] = up[k]                               # which stands before it
+    for b in range(g.n_panels):
+        end = g.pcol[b + 1]
+        if end == g.pcol[b]:
+            empty += 1
+        elif trees > 1:
+            r = root_of(up, cols[g.pcol[b]])
+            for q in range(g.pcol[b] + 1, end):
+                if parent[cols[q]] >= 0:                # its root is in the panel as well
+                    continue
+                k = root_of(up, cols[q])
+                if r < k:
+                    up[k] = r
+                elif k < r:
+                    up[r] = k
+                    r = k
+    return empty
+
+
 cdef inline int32_t find_islands(const blocks_t* p, const generalized_t* g, int32_t* up, int32_t* label, int32_t* iptr,
-                                 int32_t* ipanel, int32_t* cptr, int32_t* icols, int32_t* local, int32_t* pblock,
+                                 int32_t* run, int32_t* cptr, int32_t* icols, int32_t* local, int32_t* pblock,
                                  int32_t* vptr, int32_t* most) noexcept nogil:
     """Islands: panels that share no column, directly or through others, in the order of their first panel.
 
@@ -26,53 +56,16 @@ cdef inline int32_t find_islands(const blocks_t* p, const generalized_t* g, int3
     with room for n_panels + 1). most (4): columns of the largest island, of the widest panel, rows x columns of the
     largest panel, and its rows. A panel without columns is an island of its own.
     """
-    cdef int32_t b, q, r, i, k, n = 0, size, nc, rows
-    for i in range(g.n):
-        up[i] = i
-        local[i] = -1
+    cdef int32_t b, q, r, i, k, n = 0, size, nc, rows, end, panels = g.n_panels, at, one
+    cdef const int32_t* cols = g.cols
+    cdef const int32_t* ptr = p.ptr
+    one = join_trees(g, up) == 0 and panels > 0
     i = 0
-    for b in range(g.n_panels):
-        for q in range(g.pcol[b] + 1, g.pcol[b + 1]):
-            r = root_of(up, g.cols[g.pcol[b]])
-            k = root_of(up, g.cols[q])
-            if r < k:
-                up[k] = r
-            elif k < r:
-                up[r] = k
-        while p.ptr[i] < g.prow[b]:
+    most[0] = most[1] = most[2] = most[3] = 0
+    for b in range(panels):
+        while ptr[i] < g.prow[b]:
             i += 1
         pblock[b] = i
-    pblock[g.n_panels] = p.n_blocks
-    vptr[0] = 0
-    for i in range(p.n_blocks):
-        size = p.ptr[i + 1] - p.ptr[i]
-        vptr[i + 1] = vptr[i] + (size if p.kind[i] == ROW else size * size)
-    # `local` numbers the islands by their root, until it numbers columns
-    for b in range(g.n_panels):
-        if g.pcol[b + 1] == g.pcol[b]:
-            label[b] = n
-            n += 1
-            continue
-        r = root_of(up, g.cols[g.pcol[b]])
-        if local[r] < 0:
-            local[r] = n
-            n += 1
-        label[b] = local[r]
-    for i in range(n + 1):
-        iptr[i] = 0
-        cptr[i] = 0
-    for b in range(g.n_panels):
-        iptr[label[b] + 1] += 1
-    for i in range(n):
-        iptr[i + 1] += iptr[i]
-    for b in range(g.n_panels):
-        ipanel[iptr[label[b]]] = b
-        iptr[label[b]] += 1
-    for i in range(n, 0, -1):
-        iptr[i] = iptr[i - 1]
-    iptr[0] = 0
-    most[0] = most[1] = most[2] = most[3] = 0
-    for b in range(g.n_panels):
         nc = g.pcol[b + 1] - g.pcol[b]
         rows = g.prow[b + 1] - g.prow[b]
         if nc > most[1]:
@@ -81,24 +74,77 @@ cdef inline int32_t find_islands(const blocks_t* p, const generalized_t* g, int3
             most[2] = rows * nc
         if rows > most[3]:
             most[3] = rows
-    # columns of each island, ascending: an island is a set of roots
+    pblock[panels] = p.n_blocks
+    at = 0
+    for i in range(p.n_blocks):
+        vptr[i] = at
+        size = ptr[i + 1] - ptr[i]
+        at += size if p.kind[i] == ROW else size * size
+    vptr[p.n_blocks] = at
     for i in range(g.n):
-        label[i] = -1
-    for b in range(n):
-        for i in range(iptr[b], iptr[b + 1]):
-            for q in range(g.pcol[ipanel[i]], g.pcol[ipanel[i] + 1]):
-                label[root_of(up, g.cols[q])] = b
-                break
+        local[i] = -1
+    # `local` numbers the islands by their root, until it numbers columns
+    for b in range(panels):
+        if g.pcol[b + 1] == g.pcol[b]:
+            label[b] = n
+            n += 1
+            continue
+        r = root_of(up, cols[g.pcol[b]])
+        if local[r] < 0:
+            local[r] = n
+            n += 1
+        label[b] = local[r]
+    if one and n == 1:
+        iptr[0] = 0
+        iptr[1] = 1
+        run[0] = 0
+        run[1] = panels
+        for b in range(panels):
+            end = g.pcol[b + 1]
+            for q in range(g.pcol[b], end):
+                local[cols[q]] = 0
+        k = 0
+        for i in range(g.n):
+            if local[i] == 0:
+                local[i] = k
+                icols[k] = i
+                k += 1
+        cptr[0] = 0
+        cptr[1] = k
+        most[0] = k
+        return 1
+    for i in range(n + 1):
+        iptr[i] = 0
+        cptr[i] = 0
+    for b in range(panels):                             # a run begins where the panel before is of another island
+        if b == 0 or label[b] != label[b - 1]:
+            iptr[label[b] + 1] += 1
+    for i in range(n):
+        iptr[i + 1] += iptr[i]
+    for b in range(panels):
+        i = label[b]
+        if b == 0 or i != label[b - 1]:
+            run[2 * iptr[i]] = b
+            iptr[i] += 1
+        run[2 * iptr[i] - 1] = b + 1
+    for i in range(n, 0, -1):
+        iptr[i] = iptr[i - 1]
+    iptr[0] = 0
+    # columns of each island, ascending: those of its panels
     for i in range(g.n):
-        r = label[root_of(up, i)]
-        if r >= 0:
-            cptr[r + 1] += 1
+        local[i] = -1
+    for b in range(panels):
+        end = g.pcol[b + 1]
+        for q in range(g.pcol[b], end):
+            local[cols[q]] = label[b]
+    for i in range(g.n):
+        if local[i] >= 0:
+            cptr[local[i] + 1] += 1
     for b in range(n):
         cptr[b + 1] += cptr[b]
     for i in range(g.n):
-        r = label[root_of(up, i)]
+        r = local[i]
         if r >= 0:
-            local[i] = cptr[r]
             icols[cptr[r]] = i
             cptr[r] += 1
     for b in range(n, 0, -1):
@@ -115,7 +161,7 @@ cdef inline int32_t find_islands(const blocks_t* p, const generalized_t* g, int3
 cdef inline ssize_t marks_of(const blocks_t* p, const generalized_t* g) noexcept nogil:
     """int32 that `settle` needs."""
     cdef ssize_t n = g.n, panels = g.n_panels
-    return 3 * n + (n if n > panels else panels) + 4 * panels + p.n_blocks + 8
+    return 3 * n + (n if n > panels else panels) + 5 * panels + p.n_blocks + 8
 
 
 cdef inline void settle(flow_t* f, const blocks_t* p, const generalized_t* g, int32_t* w, int32_t* most) noexcept nogil:
@@ -126,13 +172,13 @@ cdef inline void settle(flow_t* f, const blocks_t* p, const generalized_t* g, in
     f.g = g
     f.iptr = w + at
     f.cptr = w + at + panels + 1
-    f.ipanel = w + at + 2 * panels + 2
-    f.pblock = w + at + 3 * panels + 2
-    at += 4 * panels + 3
+    f.run = w + at + 2 * panels + 2
+    f.pblock = w + at + 4 * panels + 2
+    at += 5 * panels + 3
     f.icols = w + at
     f.local = w + at + n
     f.vptr = w + at + 2 * n
-    f.n_islands = find_islands(p, g, w, w + n, <int32_t*>f.iptr, <int32_t*>f.ipanel, <int32_t*>f.cptr,
+    f.n_islands = find_islands(p, g, w, w + n, <int32_t*>f.iptr, <int32_t*>f.run, <int32_t*>f.cptr,
                                <int32_t*>f.icols, <int32_t*>f.local, <int32_t*>f.pblock, <int32_t*>f.vptr, most)
     f.swap = w                                          # scratch of before
 
@@ -140,7 +186,7 @@ cdef inline void settle(flow_t* f, const blocks_t* p, const generalized_t* g, in
 cdef inline ssize_t numbers_of(const flow_t* f, const int32_t* most) noexcept nogil:
     """float64 that `furnish` needs."""
     cdef ssize_t size = most[0]
-    return (4 * <ssize_t>f.g.n + 12 * <ssize_t>f.p.n_rows + 2 * <ssize_t>f.vptr[f.p.n_blocks] + 2 * size * size
+    return (4 * <ssize_t>f.g.n + 13 * <ssize_t>f.p.n_rows + 2 * <ssize_t>f.vptr[f.p.n_blocks] + 2 * size * size
             + 2 * size + most[2] + most[1] + most[3] + 1)
 
 
@@ -164,7 +210,8 @@ cdef inline void furnish(flow_t* f, const int32_t* most, double* x) noexcept nog
     f.first_best = x + 9 * m
     f.w = x + 10 * m
     f.e = x + 11 * m
-    x += 12 * m
+    f.soft = x + 12 * m
+    x += 13 * m
     f.v = x
     f.held = x + nv
     x += 2 * nv

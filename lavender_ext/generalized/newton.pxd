@@ -20,13 +20,15 @@ N is kept between steps; where few blocks have changed their V only those change
 """
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t
+from libc.string cimport memcpy
 
-from lavender_ext.core.block cimport CONE, COULOMB, CONTACT_SPIN, ROW, block_error, blocks_t, n_tangents
-from lavender_ext.core.generalized cimport generalized_t, panel_push, panel_times
+from lavender_ext.core.block cimport (CONE, COULOMB, CONTACT_SPIN, ROW, block_error, blocks_t, n_tangents,
+                                      row_error)
+from lavender_ext.core.generalized cimport dot, generalized_t, panel_push, panel_times
 from lavender_ext.core.problem cimport Data
 from lavender_ext.generalized.dense cimport ltdl_factor, ltdl_solve, lu_factor, lu_solve
 from lavender_ext.generalized.soft cimport INSIDE, OFF, SLIDES, cone_map, coulomb_map, size_of
-from lavender_ext.judge.score cimport nothing, tally_block, tally_t
+from lavender_ext.judge.score cimport nothing, tally_block, tally_row, tally_t
 
 
 cdef enum:
@@ -48,14 +50,16 @@ cdef struct flow_t:
     const generalized_t* g
     int32_t law                 # of the problem
     int32_t n_islands
-    const int32_t* iptr         # (n_islands + 1) panels of each island in `ipanel`
-    const int32_t* ipanel       # (n_panels)
+    const int32_t* iptr         # (n_islands + 1) runs of panels of each island in `run`
+    const int32_t* run          # (2 runs) first panel and the one past the last; runs <= n_panels
     const int32_t* cptr         # (n_islands + 1) columns of each island in `icols`
     const int32_t* icols        # (<= n) ascending in each
     const int32_t* local        # (n) number of a column in its island
     const int32_t* pblock       # (n_panels + 1) first block of each panel
     const int32_t* vptr         # (k + 1) V of each block: its diagonal for ROW, else square
+    int32_t still               # y of the present island is 0
     double* theta               # (m) theta', > 0
+    double* soft                # (m) 1 / theta'
     double* rho                 # (m) >= 0
     double* y                   # (n)
     double* u                   # (n) Y^T lambda
@@ -89,78 +93,151 @@ cdef struct flow_t:
     int32_t evaluations         # of lambda(s) along a line
 
 
+# -- rows and blocks of a run of panels ------------------------------------------------------------------
+
+
+cdef inline int32_t row_from(const flow_t* f, int32_t a) noexcept nogil:
+    return f.g.prow[f.run[2 * a]]
+
+
+cdef inline int32_t row_end(const flow_t* f, int32_t a) noexcept nogil:
+    return f.g.prow[f.run[2 * a + 1]]
+
+
+cdef inline int32_t block_from(const flow_t* f, int32_t a) noexcept nogil:
+    return f.pblock[f.run[2 * a]]
+
+
+cdef inline int32_t block_end(const flow_t* f, int32_t a) noexcept nogil:
+    return f.pblock[f.run[2 * a + 1]]
+
+
 # -- lambda(s) and V -------------------------------------------------------------------------------------
 
 
-cdef inline void respond(const flow_t* f, int32_t i, const double* s, double* lam, double* v) noexcept nogil:
-    """lambda of block i; v (its V), or NULL."""
-    cdef int32_t j = f.p.ptr[i], end = f.p.ptr[i + 1], k, nt, spin
-    cdef double z
-    for k in range(j, end):
-        lam[k] = (f.rho[k] * f.center[k] - s[k]) / f.theta[k]
-    if f.p.kind[i] == ROW:
+cdef inline void respond(const flow_t* f, int32_t first, int32_t last, const double* s, double* lam,
+                         double* v) noexcept nogil:
+    """lambda and V of blocks [first, last)."""
+    cdef int32_t i, j, end, k, nt, spin, at
+    # Hoisted: what is stored to might be any of them, for all a compiler knows.
+    cdef const int32_t* ptr = f.p.ptr
+    cdef const int32_t* kind = f.p.kind
+    cdef const int32_t* vptr = f.vptr
+    cdef const double* lower = f.p.lower
+    cdef const double* upper = f.p.upper
+    cdef const double* rho = f.rho
+    cdef const double* center = f.center
+    cdef const double* soft = f.soft
+    cdef double z, low, high
+    cdef bint cone = f.p.law == CONE
+    for i in range(first, last):
+        j = ptr[i]
+        end = ptr[i + 1]
+        at = vptr[i]
+        if kind[i] == ROW:
+            at -= j
+            for k in range(j, end):
+                z = (rho[k] * center[k] - s[k]) * soft[k]
+                low = lower[k]
+                high = upper[k]
+                v[at + k] = soft[k] if low < z < high else 0.0
+                lam[k] = low if z < low else (high if z > high else z)
+            continue
         for k in range(j, end):
-            z = lam[k]
-            if z < f.p.lower[k]:
-                lam[k] = f.p.lower[k]
-            elif z > f.p.upper[k]:
-                lam[k] = f.p.upper[k]
-            if v != NULL:
-                v[k - j] = 1.0 / f.theta[k] if f.p.lower[k] < z < f.p.upper[k] else 0.0
-        return
-    nt = n_tangents(f.p.kind[i], end - j)
-    spin = f.p.kind[i] == CONTACT_SPIN
-    if f.p.law == CONE:
-        cone_map(nt, spin, f.theta + j, f.p.mu[i], f.p.patch_radius[i], lam + j, v)
-    else:
-        coulomb_map(nt, spin, f.theta + j, f.p.mu[i], f.p.patch_radius[i], lam + j, v)
+            lam[k] = (rho[k] * center[k] - s[k]) * soft[k]
+        nt = n_tangents(kind[i], end - j)
+        spin = kind[i] == CONTACT_SPIN
+        if cone:
+            cone_map(nt, spin, f.theta + j, f.p.mu[i], f.p.patch_radius[i], lam + j, v + at)
+        else:
+            coulomb_map(nt, spin, f.theta + j, f.p.mu[i], f.p.patch_radius[i], lam + j, v + at)
 
 
-cdef inline void respond_all(const flow_t* f, int32_t island, const double* s, double* lam, double* v) noexcept nogil:
-    cdef int32_t a, b, i
-    for a in range(f.iptr[island], f.iptr[island + 1]):
-        b = f.ipanel[a]
-        for i in range(f.pblock[b], f.pblock[b + 1]):
-            respond(f, i, s, lam, NULL if v == NULL else v + f.vptr[i])
-
-
-cdef inline void gather(const flow_t* f, int32_t island, const double* lam, double* x) noexcept nogil:
-    """x = Y^T lam on the island's columns."""
+cdef inline void respond_all(const flow_t* f, int32_t island, const double* s, double* lam) noexcept nogil:
     cdef int32_t a
+    for a in range(f.iptr[island], f.iptr[island + 1]):
+        respond(f, block_from(f, a), block_end(f, a), s, lam, f.v)
+
+
+cdef inline bint gather(const flow_t* f, int32_t island, const double* lam, double* x) noexcept nogil:
+    """x = Y^T lam on the island's columns; whether any lam is other than 0."""
+    cdef int32_t a, b, k
+    cdef bint moves = False
     for a in range(f.cptr[island], f.cptr[island + 1]):
         x[f.icols[a]] = 0.0
     for a in range(f.iptr[island], f.iptr[island + 1]):
-        panel_push(f.g, f.ipanel[a], lam, x)
+        for k in range(row_from(f, a), row_end(f, a)):
+            if lam[k] != 0.0:
+                moves = True
+                break
+        if moves:
+            for b in range(f.run[2 * a], f.run[2 * a + 1]):
+                panel_push(f.g, b, lam, x)
+    return moves
 
 
 cdef inline void spread(const flow_t* f, int32_t island, const double* x, double* out) noexcept nogil:
     """out = Y x on the island's rows."""
-    cdef int32_t a
+    cdef int32_t a, b, end
     for a in range(f.iptr[island], f.iptr[island + 1]):
-        panel_times(f.g, f.ipanel[a], x, out)
+        end = f.run[2 * a + 1]
+        for b in range(f.run[2 * a], end):
+            panel_times(f.g, b, x, out)
+
+
+cdef inline void blank(const flow_t* f, int32_t island, double* out) noexcept nogil:
+    """out = 0 on the island's rows."""
+    cdef int32_t a, k
+    for a in range(f.iptr[island], f.iptr[island + 1]):
+        for k in range(row_from(f, a), row_end(f, a)):
+            out[k] = 0.0
 
 
 cdef inline void renew(const flow_t* f, int32_t island) noexcept nogil:
     """s = Y y - b + phi."""
     cdef int32_t a, k
-    spread(f, island, f.y, f.s)
+    cdef double* s = f.s
+    cdef const double* phi = f.phi
+    cdef const double* b = f.p.b
+    if f.still:
+        blank(f, island, s)
+    else:
+        spread(f, island, f.y, s)
     for a in range(f.iptr[island], f.iptr[island + 1]):
-        for k in range(f.g.prow[f.ipanel[a]], f.g.prow[f.ipanel[a] + 1]):
-            f.s[k] += f.phi[k] - f.p.b[k]
+        for k in range(row_from(f, a), row_end(f, a)):
+            s[k] += phi[k] - b[k]
 
 
-cdef inline double measure(const flow_t* f, int32_t island, const double* lam, double* velocity) noexcept nogil:
-    """Energy [sqrt J] and velocity [m/s] of the errors of lam, with u = Y^T lam; NaN where it is not finite."""
-    cdef int32_t a, b, i, k
+cdef inline double measure(const flow_t* f, int32_t island, const double* lam, bint moves,
+                           double* velocity) noexcept nogil:
+    """Energy [sqrt J] and velocity [m/s] of the errors of lam, with u = Y^T lam, 0 unless it `moves`; NaN: not finite."""
+    cdef int32_t a, i, k, end, last
+    cdef const int32_t* ptr = f.p.ptr
+    cdef const int32_t* kind = f.p.kind
+    cdef const double* lower = f.p.lower
+    cdef const double* upper = f.p.upper
+    cdef const double* d = f.p.d
+    cdef const double* b = f.p.b
+    cdef const double* phi = f.phi
+    cdef const double* compliance = f.g.compliance
+    cdef double* w = f.w
     cdef tally_t t = nothing()
-    spread(f, island, f.u, f.w)
+    if moves:
+        spread(f, island, f.u, w)
+    else:
+        blank(f, island, w)
     for a in range(f.iptr[island], f.iptr[island + 1]):
-        b = f.ipanel[a]
-        for k in range(f.g.prow[b], f.g.prow[b + 1]):
-            f.w[k] += f.g.compliance[k] * lam[k] - f.p.b[k] + f.phi[k]
-        for i in range(f.pblock[b], f.pblock[b + 1]):
-            block_error(&f.p, i, lam, f.w, f.e)
-            tally_block(&f.p, i, f.e, &t)
+        for k in range(row_from(f, a), row_end(f, a)):
+            w[k] += compliance[k] * lam[k] - b[k] + phi[k]
+        last = block_end(f, a)
+        for i in range(block_from(f, a), last):
+            if kind[i] == ROW:
+                end = ptr[i + 1]
+                for k in range(ptr[i], end):
+                    tally_row(&f.p, k, row_error(lam[k], w[k], d[k], lower[k], upper[k]), &t)
+            else:
+                block_error(&f.p, i, lam, w, f.e)
+                tally_block(&f.p, i, f.e, &t)
     velocity[0] = sqrt(t.fast) if t.fast > 0.0 else 0.0
     return sqrt(t.energy)
 
@@ -251,14 +328,23 @@ cdef inline void add_panel(const flow_t* f, int32_t panel, int32_t n, int32_t si
     cdef double* line = f.line
     cdef double* row
     cdef double f0, f1, f2
+    cdef const int32_t* local = f.local
+    cdef int32_t at
+    if n == 1:
+        y0 = y + <int32_t>line[nc] * nc
+        for a in range(nc):
+            end = nc if square else a + 1
+            f0 = y0[a]
+            row = f.normal + <ssize_t>local[cols[a]] * size
+            for b in range(end):
+                at = local[cols[b]]
+                row[at] += f0 * t[b]
+        return
     for a in range(nc):
         end = nc if square else a + 1
         r = 0
         f0 = y[<int32_t>line[nc] * nc + a]
-        if n == 1:
-            scale_row(line, t, f0, end)
-            r = 1
-        elif n == 2:
+        if n == 2:
             f1 = y[<int32_t>line[nc + 1] * nc + a]
             scale_2(line, t, t + nc, f0, f1, end)
             r = 2
@@ -279,9 +365,10 @@ cdef inline void add_panel(const flow_t* f, int32_t panel, int32_t n, int32_t si
             y0 = t + r * nc
             add_row(line, y0, f0, end)
             r += 1
-        row = f.normal + <ssize_t>f.local[cols[a]] * size
+        row = f.normal + <ssize_t>local[cols[a]] * size
         for b in range(end):
-            row[f.local[cols[b]]] += line[b]
+            at = local[cols[b]]
+            row[at] += line[b]
 
 
 cdef inline bint is_other(const flow_t* f, int32_t i) noexcept nogil:
@@ -300,50 +387,68 @@ cdef inline bint has_any(const flow_t* f, int32_t i) noexcept nogil:
     return False
 
 
+cdef inline void changed(const flow_t* f, int32_t island, double* other, double* all_) noexcept nogil:
+    """What it costs to form N by the blocks whose V is another than held, and anew."""
+    cdef int32_t a, b, i, nc, last, end
+    cdef double cost
+    other[0] = 0.0
+    all_[0] = 0.0
+    for a in range(f.iptr[island], f.iptr[island + 1]):
+        end = f.run[2 * a + 1]
+        for b in range(f.run[2 * a], end):
+            nc = f.g.pcol[b + 1] - f.g.pcol[b]
+            last = f.pblock[b + 1]
+            for i in range(f.pblock[b], last):
+                cost = <double>nc * nc * (f.p.ptr[i + 1] - f.p.ptr[i])
+                if has_any(f, i):
+                    all_[0] += cost
+                if is_other(f, i):
+                    other[0] += cost
+
+
 cdef inline int32_t form(flow_t* f, int32_t island, bint anew, bint square) noexcept nogil:
     """N of the present V, by what changed where that is less; 0 where nothing changed, 1 where it did."""
-    cdef int32_t a, b, i, n, nc, size = f.cptr[island + 1] - f.cptr[island]
-    cdef double other = 0.0, all_ = 0.0, cost
-    for a in range(f.iptr[island], f.iptr[island + 1]):
-        b = f.ipanel[a]
-        nc = f.g.pcol[b + 1] - f.g.pcol[b]
-        for i in range(f.pblock[b], f.pblock[b + 1]):
-            cost = <double>nc * nc * (f.p.ptr[i + 1] - f.p.ptr[i])
-            if has_any(f, i):
-                all_ += cost
-            if not anew and is_other(f, i):
-                other += cost
-    if not anew and other == 0.0:
-        return 0
-    if not anew and other >= all_:
-        anew = True
+    cdef int32_t a, b, i, n, nc, size = f.cptr[island + 1] - f.cptr[island], end, last
+    cdef double other, all_
+    cdef double* normal = f.normal
+    cdef const double* y
+    if not anew:
+        changed(f, island, &other, &all_)
+        if other == 0.0:
+            return 0
+        anew = other >= all_
     if anew:
         for a in range(size):
             for b in range(size if square else a + 1):
-                f.normal[<ssize_t>a * size + b] = 0.0
-            f.normal[<ssize_t>a * size + a] = 1.0
+                normal[b] = 0.0
+            normal[a] = 1.0
+            normal += size
     else:
         f.updates += 1
     for a in range(f.iptr[island], f.iptr[island + 1]):
-        b = f.ipanel[a]
-        nc = f.g.pcol[b + 1] - f.g.pcol[b]
-        n = 0
-        for i in range(f.pblock[b], f.pblock[b + 1]):
-            if anew or is_other(f, i):
-                n = turn_block(f, i, f.p.ptr[i] - f.g.prow[b], nc, f.g.y + f.g.pval[b], anew, n)
-        if n > 0:
-            add_panel(f, b, n, size, square)
+        end = f.run[2 * a + 1]
+        for b in range(f.run[2 * a], end):
+            nc = f.g.pcol[b + 1] - f.g.pcol[b]
+            y = f.g.y + f.g.pval[b]
+            n = 0
+            last = f.pblock[b + 1]
+            for i in range(f.pblock[b], last):
+                if anew or is_other(f, i):
+                    n = turn_block(f, i, f.p.ptr[i] - f.g.prow[b], nc, y, anew, n)
+            if n > 0:
+                add_panel(f, b, n, size, square)
     return 1
 
 
 cdef inline int32_t factor(flow_t* f, int32_t island, bint square) noexcept nogil:
-    cdef int32_t a, b, size = f.cptr[island + 1] - f.cptr[island]
-    cdef ssize_t at
+    cdef int32_t a, size = f.cptr[island + 1] - f.cptr[island]
+    cdef double* to = f.factor
+    cdef const double* normal = f.normal
     f.factorisations += 1
     for a in range(size):
-        at = <ssize_t>a * size
-        for b in range(size if square else a + 1):
-            f.factor[at + b] = f.normal[at + b]
+        memcpy(to, normal, (size if square else a + 1) * sizeof(double))
+        to += size
+        normal += size
     return lu_factor(size, f.factor, f.swap) if square else ltdl_factor(size, f.factor, f.inv, f.swap)
 
 
@@ -364,21 +469,37 @@ cdef inline void newton_step(const flow_t* f, int32_t island, bint square) noexc
 # -- along a line ----------------------------------------------------------------------------------------------
 
 
+cdef inline void along(const flow_t* f, int32_t island, double t) noexcept nogil:
+    """w = s + t q, with lambda there in `trial`, and V."""
+    cdef int32_t a, k
+    cdef double* w = f.w
+    cdef const double* s = f.s
+    cdef const double* q = f.q
+    for a in range(f.iptr[island], f.iptr[island + 1]):
+        for k in range(row_from(f, a), row_end(f, a)):
+            w[k] = s[k] + t * q[k]
+    respond_all(f, island, w, f.trial)
+
+
+cdef inline void arrive(flow_t* f) noexcept nogil:
+    """What `along` found at its last t is where the iterate is."""
+    cdef double* x = f.s
+    f.s = f.w
+    f.w = x
+    x = f.lam
+    f.lam = f.trial
+    f.trial = x
+
+
 cdef inline double slope(flow_t* f, int32_t island, double py, double pp, double t) noexcept nogil:
     """Derivative along p of the convex function, at y + t p; lambda there in `trial`."""
-    cdef int32_t a, b, i, k
-    cdef double out = py + t * pp, part
+    cdef int32_t a, k
+    cdef double out = py + t * pp
     f.evaluations += 1
+    along(f, island, t)
     for a in range(f.iptr[island], f.iptr[island + 1]):
-        b = f.ipanel[a]
-        for k in range(f.g.prow[b], f.g.prow[b + 1]):
-            f.w[k] = f.s[k] + t * f.q[k]
-        part = 0.0
-        for i in range(f.pblock[b], f.pblock[b + 1]):
-            respond(f, i, f.w, f.trial, NULL)
-        for k in range(f.g.prow[b], f.g.prow[b + 1]):
-            part += f.q[k] * f.trial[k]
-        out -= part
+        k = row_from(f, a)
+        out -= dot(f.q + k, f.trial + k, row_end(f, a) - k)
     return out
 
 
@@ -433,15 +554,11 @@ cdef inline double search(flow_t* f, int32_t island) noexcept nogil:
 
 cdef inline double backtrack(flow_t* f, int32_t island, double bound) noexcept nogil:
     """t where |G| falls below the bound (Coulomb); 0 where no step tried does it."""
-    cdef int32_t a, b, k, c, _n
+    cdef int32_t a, c, _n
     cdef double t = 1.0, size
     for _n in range(8):
         f.evaluations += 1
-        for a in range(f.iptr[island], f.iptr[island + 1]):
-            b = f.ipanel[a]
-            for k in range(f.g.prow[b], f.g.prow[b + 1]):
-                f.w[k] = f.s[k] + t * f.q[k]
-        respond_all(f, island, f.w, f.trial, NULL)
+        along(f, island, t)
         gather(f, island, f.trial, f.u)
         size = 0.0
         for a in range(f.cptr[island], f.cptr[island + 1]):
@@ -458,41 +575,46 @@ cdef inline double backtrack(flow_t* f, int32_t island, double bound) noexcept n
 
 cdef inline void follow(const flow_t* f, int32_t island) noexcept nogil:
     """The centre of the proximal terms moves to lambda."""
-    cdef int32_t a, k
-    for a in range(f.iptr[island], f.iptr[island + 1]):
-        for k in range(f.g.prow[f.ipanel[a]], f.g.prow[f.ipanel[a] + 1]):
-            f.center[k] = f.lam[k]
+    keep(f, island, f.lam, f.center)
 
 
 cdef inline void soften(const flow_t* f, int32_t island, double share) noexcept nogil:
     """theta' of (2): rho is `share` d on rows with less than 1e-6 d of their own; a disk's tangents get the largest."""
-    cdef int32_t a, b, i, j, k, nt
-    cdef double big, low = share if share < 1e-6 else 1e-6
+    cdef int32_t a, i, j, k, nt, end, last
+    cdef const double* compliance = f.g.compliance
+    cdef const double* d = f.p.d
+    cdef double* theta = f.theta
+    cdef double* rho = f.rho
+    cdef double* soft = f.soft
+    cdef double big, x, low = share if share < 1e-6 else 1e-6
     for a in range(f.iptr[island], f.iptr[island + 1]):
-        b = f.ipanel[a]
-        for i in range(f.pblock[b], f.pblock[b + 1]):
+        last = block_end(f, a)
+        for i in range(block_from(f, a), last):
             j = f.p.ptr[i]
-            for k in range(j, f.p.ptr[i + 1]):
-                f.theta[k] = f.g.compliance[k]
-                if not f.theta[k] >= low * f.p.d[k]:
-                    f.theta[k] += share * f.p.d[k]
-            nt = 0 if f.p.kind[i] == ROW else n_tangents(f.p.kind[i], f.p.ptr[i + 1] - j)
+            end = f.p.ptr[i + 1]
+            for k in range(j, end):
+                x = compliance[k]
+                if not x >= low * d[k]:
+                    x += share * d[k]
+                theta[k] = x
+            nt = 0 if f.p.kind[i] == ROW else n_tangents(f.p.kind[i], end - j)
             if nt > 1:
                 big = 0.0
                 for k in range(j + 1, j + 1 + nt):
-                    if f.theta[k] > big:
-                        big = f.theta[k]
+                    if theta[k] > big:
+                        big = theta[k]
                 for k in range(j + 1, j + 1 + nt):
-                    f.theta[k] = big
-            for k in range(j, f.p.ptr[i + 1]):
-                f.rho[k] = f.theta[k] - f.g.compliance[k]
+                    theta[k] = big
+            for k in range(j, end):
+                rho[k] = theta[k] - compliance[k]
+                soft[k] = 1.0 / theta[k]
 
 
 cdef inline bint is_rigid(const flow_t* f, int32_t island) noexcept nogil:
     """Is there any proximal term that matters?"""
     cdef int32_t a, k
     for a in range(f.iptr[island], f.iptr[island + 1]):
-        for k in range(f.g.prow[f.ipanel[a]], f.g.prow[f.ipanel[a] + 1]):
+        for k in range(row_from(f, a), row_end(f, a)):
             if f.rho[k] > 1e-13 * f.theta[k]:
                 return True
     return False
@@ -501,7 +623,7 @@ cdef inline bint is_rigid(const flow_t* f, int32_t island) noexcept nogil:
 cdef inline void keep(const flow_t* f, int32_t island, const double* lam, double* to) noexcept nogil:
     cdef int32_t a, k
     for a in range(f.iptr[island], f.iptr[island + 1]):
-        for k in range(f.g.prow[f.ipanel[a]], f.g.prow[f.ipanel[a] + 1]):
+        for k in range(row_from(f, a), row_end(f, a)):
             to[k] = lam[k]
 
 
@@ -524,7 +646,7 @@ cdef inline int32_t descend(flow_t* f, int32_t island, double goal, double* shar
     without one, lowered where the centre's progress is slow.
     """
     cdef int32_t a, c, idle = 0, n = 0
-    cdef bint square = f.p.law == COULOMB, rigid, stale = True, fresh = True
+    cdef bint square = f.p.law == COULOMB, rigid, stale = True, fresh = True, known = False, moves
     cdef double energy, velocity, over, t, size, last_center = -1.0, bound
     cdef double sizes[3]
     sizes[0] = sizes[1] = sizes[2] = -1.0
@@ -532,9 +654,11 @@ cdef inline int32_t descend(flow_t* f, int32_t island, double goal, double* shar
     rigid = is_rigid(f, island)
     renew(f, island)
     while True:
-        respond_all(f, island, f.s, f.lam, f.v)
-        gather(f, island, f.lam, f.u)
-        energy = measure(f, island, f.lam, &velocity)
+        if not known:
+            respond_all(f, island, f.s, f.lam)
+        known = False
+        moves = gather(f, island, f.lam, f.u)
+        energy = measure(f, island, f.lam, moves, &velocity)
         over = excess(f, energy, velocity)
         if over != over:
             return LOST
@@ -597,13 +721,13 @@ cdef inline int32_t descend(flow_t* f, int32_t island, double goal, double* shar
         for a in range(f.cptr[island], f.cptr[island + 1]):
             c = f.icols[a]
             f.y[c] += t * f.step[c]
+        f.still = False
         if n % RENEW == 0:
             renew(f, island)
             fresh = True
         else:
-            for a in range(f.iptr[island], f.iptr[island + 1]):
-                for c in range(f.g.prow[f.ipanel[a]], f.g.prow[f.ipanel[a] + 1]):
-                    f.s[c] += t * f.q[c]
+            arrive(f)                                   # both ended where they looked last
+            known = True
             fresh = False
 
 
@@ -618,31 +742,26 @@ cdef inline double slip(const flow_t* f, int32_t i) noexcept nogil:
 
 cdef inline void lower_normals(const flow_t* f, int32_t island, const double* lam) noexcept nogil:
     """phi of what lam leaves; it must be 0 before."""
-    cdef int32_t a, b, i
+    cdef int32_t a, i
     cdef double velocity
-    gather(f, island, lam, f.u)
-    measure(f, island, lam, &velocity)
+    measure(f, island, lam, gather(f, island, lam, f.u), &velocity)
     for a in range(f.iptr[island], f.iptr[island + 1]):
-        b = f.ipanel[a]
-        for i in range(f.pblock[b], f.pblock[b + 1]):
+        for i in range(block_from(f, a), block_end(f, a)):
             if f.p.kind[i] != ROW and f.p.ptr[i + 1] - f.p.ptr[i] > 1:
                 f.phi[f.p.ptr[i]] = slip(f, i)
 
 
 cdef inline void level(const flow_t* f, int32_t island) noexcept nogil:
     """phi = 0."""
-    cdef int32_t a, k
-    for a in range(f.iptr[island], f.iptr[island + 1]):
-        for k in range(f.g.prow[f.ipanel[a]], f.g.prow[f.ipanel[a] + 1]):
-            f.phi[k] = 0.0
+    blank(f, island, f.phi)
 
 
-cdef inline void restart(const flow_t* f, int32_t island, const double* lam) noexcept nogil:
+cdef inline void restart(flow_t* f, int32_t island, const double* lam) noexcept nogil:
     """y = Y^T lam and the centre at lam."""
     cdef int32_t a, c
     keep(f, island, lam, f.lam)
     follow(f, island)
-    gather(f, island, lam, f.u)
+    f.still = not gather(f, island, lam, f.u)
     for a in range(f.cptr[island], f.cptr[island + 1]):
         c = f.icols[a]
         f.y[c] = f.u[c]
@@ -652,8 +771,7 @@ cdef inline bint offer(flow_t* f, int32_t island, const double* lam, double* lea
     """Keep lam in `first_best` where its error under the problem's own law is the least; phi must be 0."""
     cdef double energy, velocity, over
     f.p.law = f.law
-    gather(f, island, lam, f.u)
-    energy = measure(f, island, lam, &velocity)
+    energy = measure(f, island, lam, gather(f, island, lam, f.u), &velocity)
     over = excess(f, energy, velocity)
     if over < least[0]:
         least[0] = over

@@ -11,10 +11,10 @@ ENDS = {"done": DONE, "spent": SPENT, "stuck": STUCK, "failed": FAILED, "lost": 
 
 
 cdef public int32_t lav_general_islands(const blocks_t* p, const generalized_t* g, int32_t* up, int32_t* label,
-                                        int32_t* iptr, int32_t* ipanel, int32_t* cptr, int32_t* icols, int32_t* local,
+                                        int32_t* iptr, int32_t* run, int32_t* cptr, int32_t* icols, int32_t* local,
                                         int32_t* pblock, int32_t* vptr, int32_t* most) noexcept nogil:
     """`find_islands`."""
-    return find_islands(p, g, up, label, iptr, ipanel, cptr, icols, local, pblock, vptr, most)
+    return find_islands(p, g, up, label, iptr, run, cptr, icols, local, pblock, vptr, most)
 
 
 cdef int32_t descend_all(flow_t* f, double* impulse, int32_t cold, double soft) noexcept nogil:
