@@ -37,6 +37,7 @@ class Derived:
         "lock",
         "motion",
         "nothing",
+        "seen",
         "spread",
         "tried",
         "view",
@@ -49,6 +50,7 @@ class Derived:
         self.view: Data | None = None  # in generalised coordinates: what kernels read, from the beginning
         self.tried: Tried | None = None
         self.spread: int | None = None  # how far apart blocks that share a body stand
+        self.seen = False  # whether `solve` has had it, once: repeated ones are spared more
         self.chain: Any = None  # of a problem of few rows, False where it has none
         self.factor: Any = None  # the factorisation that suits A: its name, half bandwidth, order
         self.motion: Kept | None = None  # the reference that motion errors are told from, and its operator

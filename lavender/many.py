@@ -19,7 +19,7 @@ from lavender.problem import Problem
 from lavender.registry import SolverSpec, get
 from lavender.solution import Solution
 from lavender.solve import of_batch, solve, solve_few
-from lavender.solvers._costs import GENERAL_GATE as GATE
+from lavender.solvers._few import ANY, GATE
 from lavender.solvers._newton import general
 from lavender_ext.few.many import Batch
 
@@ -75,8 +75,7 @@ def solve_many(
     at = [i for i, p in enumerate(given) if type(p) is Problem and p.generalized is not None]
 
     def batch(part: list[int]) -> None:
-        for i, solution in _batch(given, starts, part, tol, spec):
-            made[i] = solution
+        _batch(given, starts, part, tol, spec, made)
 
     short = spec.few is not None and plain
 
@@ -100,20 +99,21 @@ def solve_many(
 
 
 def _batch(
-    problems: list[Problem], starts: list[Any], at: list[int], tol: float, spec: SolverSpec
-) -> list[tuple[int, Solution]]:
-    """Solutions of those of the problems `at` that the compiled loop ends, each with its share of the time."""
+    problems: list[Problem],
+    starts: list[Any],
+    at: list[int],
+    tol: float,
+    spec: SolverSpec,
+    made: list[Solution | None],
+) -> None:
+    """Into `made` the solutions of those of the problems `at` that the compiled loop ends, with their share of time."""
     begin = perf_counter()
     views, given = [], []
     for i in at:
         p, start = problems[i], starts[i]
         views.append(p.derived.view)
         given.append(p.guess if start is None else p.impulse_array(start))
-    work = Batch(views, given, tol, GATE if spec.name == "auto" else None, general.LIMIT)
+    work = Batch(views, given, tol, GATE if spec.name == "auto" else ANY, general.ROOM)
     work.run()
     seconds = (perf_counter() - begin) / max(1, len(at))
-    return [
-        (i, Solution.later((of_batch, (work, k, problems[i], spec, tol, seconds))))
-        for k, i in enumerate(at)
-        if work.is_solved(k)
-    ]
+    work.hand_out(Solution, of_batch, (work, [problems[i] for i in at], spec, tol, seconds), at, made)

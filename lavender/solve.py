@@ -454,10 +454,10 @@ def late(
     return Solution.late(impulse, CONVERGED, tol, seconds, (_rest, (problem, spec, judged, counts)))
 
 
-def of_batch(
-    batch: Any, i: int, problem: Problem, spec: SolverSpec, tol: float, seconds: float
-) -> dict[str, Any]:
+def of_batch(common: tuple[Any, list[Problem], SolverSpec, float, float], i: int) -> dict[str, Any]:
     """All fields of the solution of a `Batch`'s problem i, which converged."""
+    batch, problems, spec, tol, seconds = common
+    problem = problems[i]
     judged, counts = batch.judged(i)
     made = {"impulse": judged.impulse, "status": CONVERGED, "tol": tol, "setup_time": 0.0}
     return made | {"solve_time": seconds} | _rest(problem, spec, judged, counts)

@@ -15,11 +15,13 @@ from lavender.problem import Problem
 from lavender.registry import FEW
 from lavender.residuals import reference
 from lavender.solution import Claim, Status
-from lavender.solvers._costs import first_look, general_first, sweep_cost
+from lavender.solvers._costs import GENERAL_GATE, first_look, general_first, sweep_cost
 from lavender.solvers._newton import general
 from lavender_ext.few.chain import PIVOTS, SWEEPS, VELOCITIES, Chain
+from lavender_ext.few.many import Gate, solve_first
 
 FEW_GENERAL = 1000  # rows in generalised coordinates, where nothing of Python's grows with them
+GATE, ANY = Gate(GENERAL_GATE), Gate(None)
 WARM = 1e-3  # relative residual from which an iterate is worth starting from
 
 
@@ -68,7 +70,19 @@ class Few:
 
     def solve(self, problem: Problem, impulse: FloatArray | None, tol: float) -> Any:
         """(what the judge finds, counts) from an impulse (m,) or from doing nothing; None where it is left."""
-        chain = prepared(problem)
+        kept = problem.derived
+        if kept.chain is None and kept.view is not None and VELOCITIES in self.kinds:
+            # Its first solve: what repeated ones are spared, room and islands, is not kept yet.
+            if kept.seen or not 0 < problem.m <= FEW_GENERAL:
+                chain = prepared(problem)
+            else:
+                kept.seen = True
+                found = solve_first(kept.view, impulse, tol, GATE, general.ROOM) if tol > 0.0 else None
+                if found is not None:
+                    return found
+                chain = prepared(problem)
+        else:
+            chain = prepared(problem)
         if chain is None or chain.kind not in self.kinds or not tol > 0.0:
             return None
         return chain.run(impulse, tol, self.looks, WARM)

@@ -92,13 +92,14 @@ class Newton:
                 return NewtonState(problem, None, kernel)
             if self.form == "velocity":
                 raise CapabilityError(
-                    f"form='velocity' keeps a dense matrix for each island of at most {general.LIMIT} velocities; "
-                    "this problem has a larger one: use form='impulse' or sweeps"
+                    f"form='velocity' has room for a matrix of {general.ROOM:.1e} values over the velocities of an "
+                    "island (dense or with the factor's own fill); this problem has a larger one: use form='impulse' "
+                    "or sweeps"
                 )
         if problem.cones.has_round:
             raise CapabilityError(
                 "round cones of more than two tangents are solved over velocities alone: form='impulse' does not take "
-                f"them, and form='velocity' has room for islands of at most {general.LIMIT} velocities"
+                f"them, and form='velocity' has room for {general.ROOM:.1e} values of an island's matrix"
             )
         form = self.form
         if form == "auto":

@@ -358,7 +358,7 @@ cdef inline int32_t panel_pattern(const generalized_t* g, int32_t n_blocks, cons
 cdef inline void panel_whiten(const generalized_t* g, int32_t panel, int32_t* place, double* y) noexcept nogil:
     """Rows of Y of one panel: L^T y = J^T on its columns, then D^-1/2. place (n) is scratch."""
     cdef int32_t first = g.prow[panel], rows = g.prow[panel + 1] - first, c0 = g.pcol[panel]
-    cdef int32_t nc = g.pcol[panel + 1] - c0, a, k, q, i, p, count, end, before
+    cdef int32_t nc = g.pcol[panel + 1] - c0, a, k, q, i, _i, p, count, end, before
     cdef const int32_t* cols = g.cols + c0
     cdef const int32_t* jptr = g.jptr + first
     cdef const int32_t* jidx = g.jidx
@@ -386,14 +386,14 @@ cdef inline void panel_whiten(const generalized_t* g, int32_t panel, int32_t* pl
         z = root[k]
         if count == a:                                      # every column before it
             x = y
-            for i in range(rows):
+            for _i in range(rows):
                 take_from(x, l, x[a], a)
                 x[a] *= z
                 x += nc
         else:
             lidx = g.lidx + before
             x = y
-            for i in range(rows):
+            for _i in range(rows):
                 if x[a] != 0.0:
                     for p in range(count):
                         x[place[lidx[p]]] -= l[p] * x[a]

@@ -15,7 +15,7 @@ import numpy as np
 from lavender_ext.core.block cimport COULOMB, ROW, blocks_t
 from lavender_ext.core.generalized cimport generalized_t
 from lavender_ext.core.problem cimport MADE, Data, made_t, make_numbers
-from lavender_ext.generalized.islands cimport aim_at, furnish, marks_of, numbers_of, settle
+from lavender_ext.generalized.islands cimport aim_at, furnish, marks_of, need_t, numbers_of, settle
 from lavender_ext.generalized.newton cimport DONE, descend_all, flow_t
 from lavender_ext.judge.measure cimport do_nothing, general_judge, judged_from, reference_of, relative_of
 from lavender_ext.judge.score cimport are_numbers, relative, score_rows, score_t
@@ -111,11 +111,11 @@ cdef inline bint is_first(const job_t* j, const gate_t* gate, int32_t largest) n
     return cost <= gate.form * entries * entries / <double>(j.g.n if j.g.n > 1 else 1)
 
 
-cdef void solve_job(job_t* j, space_t* space, const gate_t* gate, double tol, int32_t limit) noexcept nogil:
+cdef void solve_job(job_t* j, space_t* space, const gate_t* gate, double tol, double most) noexcept nogil:
     cdef bint known = j.made.marks != NULL
     if not known and make_numbers(&j.p, &j.g, &j.made) != MADE:
         return
-    solve_made(j, space, gate, tol, limit)
+    solve_made(j, space, gate, tol, most)
     if not known:
         free(j.made.marks)
         free(j.made.numbers)
@@ -123,9 +123,9 @@ cdef void solve_job(job_t* j, space_t* space, const gate_t* gate, double tol, in
     j.made.numbers = NULL
 
 
-cdef void solve_made(job_t* j, space_t* space, const gate_t* gate, double tol, int32_t limit) noexcept nogil:
+cdef void solve_made(job_t* j, space_t* space, const gate_t* gate, double tol, double most) noexcept nogil:
     cdef flow_t f
-    cdef int32_t most[4]
+    cdef need_t need
     cdef int32_t m = j.p.n_rows, end, i
     cdef bint cold = j.cold
     if j.made.n_empty:
@@ -136,12 +136,12 @@ cdef void solve_made(job_t* j, space_t* space, const gate_t* gate, double tol, i
         begin(j, space.numbers)
     if not with_marks(space, marks_of(&j.p, &j.g)):
         return
-    settle(&f, &j.p, &j.g, space.marks, most)
-    if most[0] > limit or not is_first(j, gate, most[0]):
+    settle(&f, &j.p, &j.g, space.marks, &need)
+    if need.values > most or not is_first(j, gate, need.wide):
         return
-    if not with_numbers(space, numbers_of(&f, most)):
+    if not with_numbers(space, numbers_of(&f, &need)):
         return
-    furnish(&f, most, space.numbers)
+    furnish(&f, &need, space.numbers)
     if cold:
         do_nothing(&j.p, j.lam, j.both)
     else:                                               # doing nothing, given as a start, is cold as well
@@ -193,6 +193,83 @@ cdef int32_t law_of(const blocks_t* p) noexcept nogil:
     return law
 
 
+cdef class Gate:
+    """What Newton's method may cost to be asked first, in the words of `general_first`.
+
+    Parameters
+    ----------
+    gate : tuple (start, row, factor, most, form, counts) or None
+        None: whatever it costs.
+    """
+
+    cdef gate_t at
+
+    def __init__(self, gate):
+        self.at.is_open = gate is None
+        if gate is not None:
+            (self.at.start, self.at.row, self.at.factor, self.at.most, self.at.form, counts) = gate
+            for i in range(4):
+                self.at.count[i] = counts[i]
+
+
+def solve_first(Data p, start, double tol, Gate gate, double most):
+    """A problem of at least one row that nobody has looked at: what is worked out of its data, solved, judged, at once.
+
+    From `start` (m,) [N s], or from doing nothing where it is None. What the judge finds and the counts, as
+    `Batch.judged`; None where it does not end below tol, has empty rows or costs more than the gate lets in. d, Y and the
+    error of doing nothing stay with the data.
+    """
+    cdef job_t j
+    cdef space_t space
+    cdef Py_ssize_t m = p.blocks.n_rows
+    cdef double[::1] lam, both
+    cdef const double[::1] given
+    cdef made_t made
+    cdef bint known = p.ready
+    impulse = np.empty(m)
+    results = np.empty(2 * m + 1)
+    lam = impulse
+    both = results
+    j.p = p.blocks
+    j.g = p.general
+    j.begin[0] = p.start_energy
+    j.begin[1] = p.start_velocity
+    j.begin[2] = p.start_relative
+    j.law = law_of(&j.p)
+    j.cold = start is None
+    if not j.cold:
+        given = start
+        memcpy(&lam[0], &given[0], m * sizeof(double))
+    j.lam = &lam[0]
+    j.both = &both[0]
+    j.end = LEFT
+    space.marks = NULL
+    space.numbers = NULL
+    space.n_marks = space.n_numbers = 0
+    with nogil:
+        if known or make_numbers(&j.p, &j.g, &made) == MADE:
+            if not known:
+                j.made = made
+            else:
+                j.made = p.made
+            solve_made(&j, &space, &gate.at, tol, most)
+        else:
+            j.end = -1
+    free(space.marks)
+    free(space.numbers)
+    if j.end < 0:
+        return None                                     # which `prepare` puts in words
+    if not known:
+        p.adopt(&made)
+    if p.start_energy < 0.0 and j.begin[0] >= 0.0:
+        p.set_start(j.begin[0], j.begin[1])
+        p.start_relative = j.begin[2]
+    if j.end != SOLVED:
+        return None
+    return judged_from(p, impulse, results, &j.score, j.relative, j.floor), (
+        j.counts[0], j.counts[1], j.counts[2], j.counts[3], j.counts[4])
+
+
 cdef class Batch:
     """Problems and what came of them; `run` once.
 
@@ -202,10 +279,9 @@ cdef class Batch:
         In generalised coordinates, each of a problem of at least one row.
     starts : list of (m,) N s or None
         None: from doing nothing.
-    gate : tuple (start, row, factor, most, form, counts) or None
-        What Newton's method may cost, in the words of `general_first`; None: whatever it does.
-    limit : int
-        Velocities of one island up to which N is kept dense.
+    gate : Gate
+    most : float
+        Values of one island's N, as of `Newton`.
     """
 
     cdef job_t* jobs
@@ -214,22 +290,16 @@ cdef class Batch:
     cdef list data
     cdef object impulses, both
     cdef gate_t gate
-    cdef int32_t limit
-    cdef double tol
+    cdef double tol, most
 
-    def __init__(self, list data, list starts, double tol, gate, int limit):
+    def __init__(self, list data, list starts, double tol, Gate gate, double most):
         cdef Py_ssize_t i, at = 0, n = len(data)
         cdef Data p
         cdef job_t* j
         cdef double[::1] whole, measured
         cdef const double[::1] given
-        self.data, self.tol, self.limit = data, tol, limit
-        self.gate.is_open = gate is None
-        if gate is not None:
-            (self.gate.start, self.gate.row, self.gate.factor, self.gate.most, self.gate.form,
-             counts) = gate
-            for i in range(4):
-                self.gate.count[i] = counts[i]
+        self.data, self.tol, self.most = data, tol, most
+        self.gate = gate.at
         for i in range(n):
             p = data[i]
             at += p.blocks.n_rows
@@ -276,7 +346,7 @@ cdef class Batch:
             with nogil:
                 while i < end:
                     if self.jobs[i].p.n_rows > 0:
-                        solve_job(&self.jobs[i], &self.space, &self.gate, self.tol, self.limit)
+                        solve_job(&self.jobs[i], &self.space, &self.gate, self.tol, self.most)
                     i += 1
             PyErr_CheckSignals()
         for i in range(self.n):
@@ -290,9 +360,17 @@ cdef class Batch:
                 p.start_relative = j.begin[2]
         return solved
 
-    def is_solved(self, Py_ssize_t i):
-        """Whether the judge found problem i below tol."""
-        return self.jobs[i].end == SOLVED
+    def hand_out(self, type kind, function, common, list at, list made):
+        """Into `made`, at the places `at`, an empty `kind` for each problem solved, which knows how to fill itself.
+
+        Its `_rest` is (function, (common, i)).
+        """
+        cdef Py_ssize_t i
+        for i in range(self.n):
+            if self.jobs[i].end == SOLVED:
+                x = object.__new__(kind)
+                x.__dict__["_rest"] = (function, (common, i))
+                made[at[i]] = x
 
     def judged(self, Py_ssize_t i):
         """What the judge found of problem i, solved, with its impulse (m,) [N s]; and its counts, as `Newton.run`."""

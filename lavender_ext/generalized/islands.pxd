@@ -2,12 +2,13 @@
 
 Panels that share a column, directly or through others, are an island: its velocities move no row of another.
 """
-from libc.math cimport sqrt
+from libc.math cimport ceil, sqrt
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.block cimport ROW, blocks_t
+from lavender_ext.core.block cimport COULOMB, ROW, blocks_t
 from lavender_ext.core.generalized cimport generalized_t
 from lavender_ext.generalized.newton cimport flow_t
+from lavender_ext.generalized.sparse cimport SMALL, factor_work, find_pattern, is_worth, pattern_marks
 
 
 cdef inline int32_t root_of(int32_t* up, int32_t i) noexcept nogil:
@@ -158,15 +159,24 @@ cdef inline int32_t find_islands(const blocks_t* p, const generalized_t* g, int3
     return n
 
 
+cdef struct need_t:             # what the islands of a problem ask for
+    int32_t most[4]             # as `find_islands` tells
+    int32_t wide                # columns of a dense island of the same work as the costliest, at most most[0]
+    double values               # of N, of the island that has most; its factor has as many
+
+
 cdef inline ssize_t marks_of(const blocks_t* p, const generalized_t* g) noexcept nogil:
     """int32 that `settle` needs."""
     cdef ssize_t n = g.n, panels = g.n_panels
-    return 3 * n + (n if n > panels else panels) + 5 * panels + p.n_blocks + 8
+    return (3 * n + (n if n > panels else panels) + 5 * panels + p.n_blocks + 8
+            + pattern_marks(n, g.pcol[panels]))
 
 
-cdef inline void settle(flow_t* f, const blocks_t* p, const generalized_t* g, int32_t* w, int32_t* most) noexcept nogil:
-    """Islands of a problem, in w (`marks_of`); most (4) as `find_islands` tells."""
+cdef inline void settle(flow_t* f, const blocks_t* p, const generalized_t* g, int32_t* w, need_t* need) noexcept nogil:
+    """Islands of a problem, in w (`marks_of`), and how N is kept in each."""
     cdef ssize_t n = g.n, panels = g.n_panels, at = n + (n if n > panels else panels)
+    cdef int32_t i, size, wide
+    cdef double values
     f.p = p[0]
     f.law = p.law
     f.g = g
@@ -178,21 +188,43 @@ cdef inline void settle(flow_t* f, const blocks_t* p, const generalized_t* g, in
     f.icols = w + at
     f.local = w + at + n
     f.vptr = w + at + 2 * n
+    at += 2 * n + p.n_blocks + 1
     f.n_islands = find_islands(p, g, w, w + n, <int32_t*>f.iptr, <int32_t*>f.run, <int32_t*>f.cptr,
-                               <int32_t*>f.icols, <int32_t*>f.local, <int32_t*>f.pblock, <int32_t*>f.vptr, most)
+                               <int32_t*>f.icols, <int32_t*>f.local, <int32_t*>f.pblock, <int32_t*>f.vptr, need.most)
     f.swap = w                                          # scratch of before
+    f.lptr = NULL
+    f.lidx = NULL
+    if need.most[0] > SMALL and find_pattern(g, f.n_islands, f.iptr, f.run, f.cptr, f.local, w + at) >= 0:
+        f.lptr = w + at
+        f.lidx = w + at + f.cptr[f.n_islands] + 1
+    need.wide = 0
+    need.values = 0.0
+    for i in range(f.n_islands):
+        size = f.cptr[i + 1] - f.cptr[i]
+        values = <double>size * size
+        wide = size
+        if p.law != COULOMB and f.lptr != NULL and is_worth(size, f.lptr + f.cptr[i]):
+            values = f.lptr[f.cptr[i + 1]] - f.lptr[f.cptr[i]] + size
+            wide = <int32_t>ceil(sqrt(6.0 * factor_work(size, f.lptr + f.cptr[i]) / size))
+        if values > need.values:
+            need.values = values
+        if wide > need.wide:
+            need.wide = wide
 
 
-cdef inline ssize_t numbers_of(const flow_t* f, const int32_t* most) noexcept nogil:
+cdef inline ssize_t numbers_of(const flow_t* f, const need_t* need) noexcept nogil:
     """float64 that `furnish` needs."""
-    cdef ssize_t size = most[0]
-    return (4 * <ssize_t>f.g.n + 13 * <ssize_t>f.p.n_rows + 2 * <ssize_t>f.vptr[f.p.n_blocks] + 2 * size * size
+    cdef ssize_t size = need.most[0], values = <ssize_t>need.values
+    cdef const int32_t* most = need.most
+    return (4 * <ssize_t>f.g.n + 13 * <ssize_t>f.p.n_rows + 2 * <ssize_t>f.vptr[f.p.n_blocks] + 2 * values
             + 2 * size + most[2] + most[1] + most[3] + 1)
 
 
-cdef inline void furnish(flow_t* f, const int32_t* most, double* x) noexcept nogil:
+cdef inline void furnish(flow_t* f, const need_t* need, double* x) noexcept nogil:
     """Arrays of the iterate, of V and of N in x (`numbers_of`)."""
-    cdef ssize_t n = f.g.n, m = f.p.n_rows, nv = f.vptr[f.p.n_blocks], size = most[0]
+    cdef ssize_t n = f.g.n, m = f.p.n_rows, nv = f.vptr[f.p.n_blocks]
+    cdef ssize_t size = need.most[0], values = <ssize_t>need.values
+    cdef const int32_t* most = need.most
     f.y = x
     f.u = x + n
     f.grad = x + 2 * n
@@ -216,8 +248,8 @@ cdef inline void furnish(flow_t* f, const int32_t* most, double* x) noexcept nog
     f.held = x + nv
     x += 2 * nv
     f.normal = x
-    f.factor = x + size * size
-    x += 2 * size * size
+    f.factor = x + values
+    x += 2 * values
     f.inv = x
     f.local_rhs = x + size
     f.turned = x + 2 * size

@@ -27,6 +27,7 @@ from lavender_ext.core.block cimport (CONE, COULOMB, CONTACT_SPIN, ROW, block_er
 from lavender_ext.core.generalized cimport dot, generalized_t, panel_push, panel_times
 from lavender_ext.core.problem cimport Data
 from lavender_ext.generalized.dense cimport ltdl_factor, ltdl_solve, lu_factor, lu_solve
+from lavender_ext.generalized.sparse cimport is_worth, sparse_factor, sparse_solve
 from lavender_ext.generalized.soft cimport INSIDE, OFF, SLIDES, cone_map, coulomb_map, size_of
 from lavender_ext.judge.score cimport nothing, tally_block, tally_row, tally_t
 
@@ -55,9 +56,13 @@ cdef struct flow_t:
     const int32_t* cptr         # (n_islands + 1) columns of each island in `icols`
     const int32_t* icols        # (<= n) ascending in each
     const int32_t* local        # (n) number of a column in its island
+    const int32_t* lptr         # (n + 1) rows of the islands' L, one after the other; NULL: all dense
+    const int32_t* lidx         # columns in their island, ascending
+    int32_t thin                # the present island's N and L are kept where L has entries (`sparse.pxd`)
     const int32_t* pblock       # (n_panels + 1) first block of each panel
     const int32_t* vptr         # (k + 1) V of each block: its diagonal for ROW, else square
-    int32_t still               # y of the present island is 0
+    int32_t island              # the present one
+    int32_t still               # its y is 0
     double* theta               # (m) theta', > 0
     double* soft                # (m) 1 / theta'
     double* rho                 # (m) >= 0
@@ -77,7 +82,7 @@ cdef struct flow_t:
     double* e                   # (m)
     double* v                   # V at s
     double* held                # V inside `normal`
-    double* normal              # N of the present island, lower triangle by rows; whole where it lacks symmetry
+    double* normal              # N of the present island, lower triangle by rows; or L's entries; or whole: Coulomb
     double* factor              # its factor
     double* inv                 # (s) 1 / D
     double* turned              # (rows of a panel, columns) changes of V times Y
@@ -318,6 +323,43 @@ cdef inline int32_t turn_block(const flow_t* f, int32_t i, int32_t row, int32_t 
     return n
 
 
+cdef inline void add_thin(const flow_t* f, int32_t panel, int32_t n, int32_t size) noexcept nogil:
+    """N += Y^T turned of one panel, into the pattern of L."""
+    cdef int32_t nc = f.g.pcol[panel + 1] - f.g.pcol[panel], a, b, r, at, i, k, count
+    cdef int32_t c0 = f.cptr[f.island]
+    cdef const int32_t* cols = f.g.cols + f.g.pcol[panel]
+    cdef const int32_t* local = f.local
+    cdef const int32_t* lptr = f.lptr + c0
+    cdef const int32_t* theirs
+    cdef const double* y = f.g.y + f.g.pval[panel]
+    cdef const double* t = f.turned
+    cdef double* line = f.line
+    cdef double* val = f.normal - lptr[0]
+    cdef double* diag = f.normal + (lptr[size] - lptr[0])
+    cdef double* to
+    for a in range(nc):
+        k = local[cols[a]]
+        to = val + lptr[k]
+        count = lptr[k + 1] - lptr[k]
+        if count == a:                                  # the same columns: into their place at once
+            for r in range(n):
+                at = <int32_t>line[nc + r] * nc + a
+                add_row(to, t + r * nc, y[at], a)
+                diag[k] += y[at] * t[r * nc + a]
+            continue
+        scale_row(line, t, y[<int32_t>line[nc] * nc + a], a + 1)
+        for r in range(1, n):
+            add_row(line, t + r * nc, y[<int32_t>line[nc + r] * nc + a], a + 1)
+        diag[k] += line[a]
+        theirs = f.lidx + lptr[k]
+        at = 0
+        for b in range(a):
+            i = local[cols[b]]
+            while theirs[at] != i:
+                at += 1
+            to[at] += line[b]
+
+
 cdef inline void add_panel(const flow_t* f, int32_t panel, int32_t n, int32_t size, bint square) noexcept nogil:
     """N += Y^T turned of one panel: its lower triangle, or all of it."""
     cdef int32_t nc = f.g.pcol[panel + 1] - f.g.pcol[panel], a, b, r, end
@@ -330,6 +372,9 @@ cdef inline void add_panel(const flow_t* f, int32_t panel, int32_t n, int32_t si
     cdef double f0, f1, f2
     cdef const int32_t* local = f.local
     cdef int32_t at
+    if f.thin and not square:
+        add_thin(f, panel, n, size)
+        return
     if n == 1:
         y0 = y + <int32_t>line[nc] * nc
         for a in range(nc):
@@ -417,13 +462,19 @@ cdef inline int32_t form(flow_t* f, int32_t island, bint anew, bint square) noex
         if other == 0.0:
             return 0
         anew = other >= all_
-    if anew:
+    if anew and f.thin and not square:
+        n = f.lptr[f.cptr[island + 1]] - f.lptr[f.cptr[island]]
+        for a in range(n):
+            normal[a] = 0.0
+        for a in range(n, n + size):
+            normal[a] = 1.0
+    elif anew:
         for a in range(size):
             for b in range(size if square else a + 1):
                 normal[b] = 0.0
             normal[a] = 1.0
             normal += size
-    else:
+    if not anew:
         f.updates += 1
     for a in range(f.iptr[island], f.iptr[island + 1]):
         end = f.run[2 * a + 1]
@@ -444,7 +495,11 @@ cdef inline int32_t factor(flow_t* f, int32_t island, bint square) noexcept nogi
     cdef int32_t a, size = f.cptr[island + 1] - f.cptr[island]
     cdef double* to = f.factor
     cdef const double* normal = f.normal
+    cdef const int32_t* lptr = f.lptr + f.cptr[island]
     f.factorisations += 1
+    if f.thin and not square:
+        memcpy(to, normal, (lptr[size] - lptr[0] + size) * sizeof(double))
+        return sparse_factor(size, lptr, f.lidx, to, f.inv)
     for a in range(size):
         memcpy(to, normal, (size if square else a + 1) * sizeof(double))
         to += size
@@ -459,6 +514,8 @@ cdef inline void newton_step(const flow_t* f, int32_t island, bint square) noexc
         f.local_rhs[a] = -f.grad[f.icols[c0 + a]]
     if square:
         lu_solve(size, f.factor, f.swap, f.local_rhs)
+    elif f.thin:
+        sparse_solve(size, f.lptr + c0, f.lidx, f.factor, f.inv, f.local_rhs)
     else:
         ltdl_solve(size, f.factor, f.inv, f.local_rhs)
     for a in range(size):
@@ -821,6 +878,8 @@ cdef inline int32_t solve_island(flow_t* f, int32_t island, double* impulse, bin
     """One island from `impulse`, into it; how it ended."""
     cdef int32_t end
     cdef double least = 1.0 / 0.0, share = soft
+    f.island = island
+    f.thin = f.lptr != NULL and is_worth(f.cptr[island + 1] - f.cptr[island], f.lptr + f.cptr[island])
     restart(f, island, impulse)
     level(f, island)
     if not offer(f, island, impulse, &least):
@@ -844,7 +903,8 @@ cdef class Newton:
     cdef flow_t f
     cdef Data data
     cdef list keep
-    cdef readonly int largest           # columns of the largest island
+    cdef readonly int largest
+    cdef readonly bint fits
 
     cdef void aim(self, double tol, int32_t steps) noexcept
     cdef int32_t go(self, double* impulse, bint cold) noexcept nogil

@@ -4,7 +4,7 @@ from libc.stdint cimport int32_t
 from lavender_ext.core.block cimport blocks_t
 from lavender_ext.core.generalized cimport generalized_t
 from lavender_ext.core.problem cimport Data, Room, room_for
-from lavender_ext.generalized.islands cimport aim_at, find_islands, furnish, marks_of, numbers_of, settle
+from lavender_ext.generalized.islands cimport aim_at, find_islands, furnish, marks_of, need_t, numbers_of, settle
 from lavender_ext.generalized.newton cimport DONE, FAILED, LOST, SPENT, STUCK, flow_t, solve_island
 
 ENDS = {"done": DONE, "spent": SPENT, "stuck": STUCK, "failed": FAILED, "lost": LOST}
@@ -34,19 +34,21 @@ cdef public int32_t lav_general_newton(flow_t* f, double* impulse, int32_t cold,
 cdef class Newton:
     """Room for Newton's method on a problem in generalised coordinates; `run` as often as wanted.
 
-    Where an island has more than `limit` velocities (`largest`) there is no room, and no `run`.
+    `largest`: velocities of the island whose factor costs most, or of a dense one of the same work. Where N of an
+    island has more than `most` values (`fits`) there is no room, and no `run`.
     """
 
-    def __init__(self, Data p, int limit):
-        cdef int32_t most[4]
+    def __init__(self, Data p, double most):
+        cdef need_t need
         cdef Room marks = room_for(marks_of(&p.blocks, &p.general) * sizeof(int32_t)), numbers
         self.data = p
-        settle(&self.f, &p.blocks, &p.general, <int32_t*>marks.at, most)
-        self.largest = most[0]
-        if most[0] > limit:
+        settle(&self.f, &p.blocks, &p.general, <int32_t*>marks.at, &need)
+        self.largest = need.wide
+        self.fits = need.values <= most
+        if not self.fits:
             return
-        numbers = room_for(numbers_of(&self.f, most) * sizeof(double))
-        furnish(&self.f, most, <double*>numbers.at)
+        numbers = room_for(numbers_of(&self.f, &need) * sizeof(double))
+        furnish(&self.f, &need, <double*>numbers.at)
         self.keep = [marks, numbers]
 
     cdef void aim(self, double tol, int32_t steps) noexcept:

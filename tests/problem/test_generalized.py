@@ -15,6 +15,7 @@ import lavender as lv
 from lavender import registry
 from lavender.solvers._costs import Costs
 from lavender.solvers._islands import islands, restrict, rows_of
+from lavender.solvers._newton import general
 from lavender.solvers._sweeping import reads_whitened
 
 
@@ -536,15 +537,50 @@ def test_nothing_of_the_judge_forms_a():
     assert "_compressed" not in problem.__dict__
 
 
-def test_an_island_too_large_for_a_dense_matrix_goes_over_the_rows(monkeypatch):
-    from lavender.solvers._newton import general
+@given(seed=seeds)
+@pytest.mark.parametrize("friction", ["coulomb", "cone", "lcp"])
+@settings(max_examples=15)
+def test_branches_are_factored_in_their_own_pattern(friction, seed):
+    """Sixty velocities in trees, some contacts between branches: few entries in a row of N, the solution of A."""
+    contacts = 0 if friction == "lcp" else 6
+    problem = random_general(seed, "cone" if friction == "lcp" else friction, n=60, contacts=contacts)
+    kernel = general.prepare(problem)
+    trees = np.bincount(problem.generalized.trees)
+    if friction != "coulomb":  # whose matrix lacks symmetry and is kept whole
+        assert kernel.largest <= max(8, trees.max() // 2)
+    solution = lv.solve(problem, "newton", form="velocity", tol=1e-11)
+    assert solution.residual.relative <= 1e-11 or solution.residual.at_floor
+    other = lv.solve(as_matrix(problem), "newton", tol=1e-11)
+    # Every row is soft by 0.01 / kg or more, so residuals of 1e-11 are impulses of 1e-8 of their size.
+    if friction != "coulomb":
+        np.testing.assert_allclose(
+            solution.impulse, other.impulse, atol=1e-7 * (1 + np.abs(other.impulse).max())
+        )
 
-    monkeypatch.setattr(general, "LIMIT", 5)
+
+@given(seed=seeds, friction=st.sampled_from(["cone", "coulomb"]), warm=st.booleans())
+@settings(max_examples=10)
+def test_the_first_solve_has_the_bits_of_the_next(seed, friction, warm):
+    """In one call the first time, from what is kept the second."""
+    problem = random_general(seed, friction)
+    start = np.random.default_rng(seed).uniform(0.0, 0.1, problem.m) if warm else None
+    first, second = (lv.solve(problem, impulse=start, tol=1e-8) for _ in range(2))
+    assert first.success
+    assert first.impulse.tobytes() == second.impulse.tobytes()
+    assert (first.work, first.message, first.residual.relative) == (
+        second.work,
+        second.message,
+        second.residual.relative,
+    )
+
+
+def test_an_island_too_large_for_a_dense_matrix_goes_over_the_rows(monkeypatch):
+    monkeypatch.setattr(general, "ROOM", 30.0)  # five velocities, dense
     problem = random_general(6, "cone")
     solution = lv.solve(problem, "newton", tol=1e-8)
     assert solution.success
     assert solution.solver.form == "impulse"
-    with pytest.raises(lv.CapabilityError, match="at most 5 velocities"):
+    with pytest.raises(lv.CapabilityError, match="room for a matrix of"):
         lv.solve(random_general(6, "cone"), "newton", form="velocity")
     small = lv.Problem.from_jacobian([[1.0]], [[2.0]], [-1.0], cones=lv.Cones.contacts(0.0, 0))
     assert [s.success for s in lv.solve_many([random_general(6, "cone"), small])] == [True, True]

@@ -24,7 +24,7 @@ FIRST_SHARE = (
 LATE = 0.05  # s that a step may end after the limit
 FLOP = 1e-10  # s for each multiply-add of a dense factor
 CLOSEST = 1e-2  # of tol, up to which the kernel is asked again where the judge does not find what it found
-LIMIT = 3000  # velocities of one island up to which N is kept dense: 144 MB with its factor
+ROOM = 9e6  # values of one island's N: 3,000 velocities dense, 144 MB with its factor
 _STATUS = {
     ENDS["done"]: Status.CONVERGED,
     ENDS["spent"]: Status.MAX_ITERATIONS,
@@ -36,14 +36,14 @@ _WORDS = ("factorisations", "updates", "Coulomb rounds", "line evaluations")
 
 
 def prepare(problem: Problem) -> Newton | None:
-    """Islands and room for them; None where one has more velocities than N is kept for."""
+    """Islands and room for them; None where N of one is too large to be kept."""
     reference(problem)
-    kernel = Newton(problem.metric, LIMIT)
-    return None if kernel.largest > LIMIT else kernel
+    kernel = Newton(problem.metric, ROOM)
+    return kernel if kernel.fits else None
 
 
 def factor_flops(problem: Problem, largest: int) -> float:
-    """Multiply-adds of the dense factors of all islands at most, `largest` velocities in one of them."""
+    """Multiply-adds of the factors of all islands at most, the costliest as of `largest` velocities."""
     assert problem.generalized is not None
     flops = float(problem.generalized.nv) * float(largest) ** 2 / 6.0
     return 2.0 * flops if problem.law == "coulomb" else flops

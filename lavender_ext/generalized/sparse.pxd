@@ -1,0 +1,159 @@
+"""N = L^T D L of an island whose branches hardly meet, kept where L has entries: rows from the last to the first, as M.
+
+A row of Y has entries in a few chains of a tree, so N = I + Y^T V Y couples columns of one panel alone, and
+eliminating row k couples those that it has an entry in (`tree_pattern`): without contacts between branches the pattern
+is that of M's factor, 6 to 12 entries in a row of a hand or of an insect.
+
+    val     entries left of the diagonal, row by row, then the diagonal
+"""
+from libc.stdint cimport int32_t
+
+from lavender_ext.core.generalized cimport generalized_t, tree_pattern
+
+
+cdef enum:
+    PER_COLUMN = 24             # entries in a row of L for which there is room
+    SMALL = 8                   # columns up to which a dense factor costs less than to look for a pattern
+
+
+cdef inline ssize_t pattern_marks(ssize_t n, ssize_t reached) noexcept nogil:
+    """int32 that `find_pattern` needs for n columns, of which panels reach so many in all."""
+    return (PER_COLUMN + 7) * n + reached + 2
+
+
+cdef inline int32_t find_pattern(const generalized_t* g, int32_t n_islands, const int32_t* iptr, const int32_t* run,
+                                 const int32_t* cptr, const int32_t* local, int32_t* w) noexcept nogil:
+    """Rows of L of all islands, one after the other, columns as in their island: how many entries, -1 without room.
+
+    w (`pattern_marks`) begins with the pointers (n + 1) and the columns; the rest is scratch.
+    """
+    cdef int32_t n = cptr[n_islands], room = PER_COLUMN * g.n, i, a, b, q, k, base, first, end, most, count
+    cdef int32_t* lptr = w
+    cdef int32_t* lidx = w + n + 1
+    cdef int32_t* mptr = lidx + room
+    cdef int32_t* parent = mptr + n + 1
+    cdef int32_t* mark = parent + n
+    cdef int32_t* sibling = mark + n
+    cdef int32_t* child = sibling + n
+    cdef int32_t* midx = child + n
+    cdef const int32_t* cols
+    for k in range(n + 1):
+        mptr[k] = 0
+    # The last column of a panel has the others in its row; elimination leaves them to those before it.
+    for i in range(n_islands):
+        base = cptr[i]
+        for a in range(iptr[i], iptr[i + 1]):
+            for b in range(run[2 * a], run[2 * a + 1]):
+                first = g.pcol[b]
+                end = g.pcol[b + 1]
+                if end > first + 1:
+                    mptr[base + local[g.cols[end - 1]] + 1] += end - first - 1
+    for k in range(n):
+        mptr[k + 1] += mptr[k]
+        mark[k] = mptr[k]
+    for i in range(n_islands):
+        base = cptr[i]
+        for a in range(iptr[i], iptr[i + 1]):
+            for b in range(run[2 * a], run[2 * a + 1]):
+                first = g.pcol[b]
+                end = g.pcol[b + 1] - 1
+                if end <= first:
+                    continue
+                cols = g.cols
+                most = base + local[cols[end]]
+                count = mark[most]
+                for q in range(first, end):
+                    midx[count] = base + local[cols[q]]
+                    count += 1
+                mark[most] = count
+    count = tree_pattern(n, mptr, midx, room, lptr, lidx, parent, mark, sibling, child)
+    if count < 0:
+        return -1
+    for i in range(1, n_islands):
+        for q in range(lptr[cptr[i]], lptr[cptr[i + 1]]):
+            lidx[q] -= cptr[i]
+    return count
+
+
+cdef inline double factor_work(int32_t n, const int32_t* lptr) noexcept nogil:
+    """Multiply-adds of one factor."""
+    cdef int32_t k
+    cdef double c, s = 0.0
+    for k in range(n):
+        c = lptr[k + 1] - lptr[k]
+        s += 0.5 * c * (c + 1.0)
+    return s
+
+
+cdef inline bint is_worth(int32_t n, const int32_t* lptr) noexcept nogil:
+    """Whether the rows' own entries cost less: multiply-adds, 12 instructions of each entry, 5 of each of a square."""
+    cdef double size = n
+    return (n > SMALL and factor_work(n, lptr) + 12.0 * (lptr[n] - lptr[0])
+            < size * size * size / 6.0 + 5.0 * size * size)
+
+
+cdef inline void take_row(double* x, const double* y, double f, int32_t n) noexcept nogil:
+    cdef int32_t i
+    for i in range(n):
+        x[i] -= f * y[i]
+
+
+cdef inline int32_t sparse_factor(int32_t n, const int32_t* lptr, const int32_t* lidx, double* val,
+                                  double* inv) noexcept nogil:
+    """L in place, inv = 1 / D (n); 0 where a pivot is not positive. lptr may begin anywhere in lidx."""
+    cdef int32_t k, a, b, j, count, at, i, base = lptr[0]
+    cdef double* diag = val + (lptr[n] - base)
+    cdef double* row
+    cdef double* to
+    cdef const int32_t* cols
+    cdef const int32_t* theirs
+    cdef double x, f, r
+    for k in range(n - 1, -1, -1):
+        if not diag[k] > 0.0:
+            return 0
+        r = 1.0 / diag[k]
+        inv[k] = r
+        row = val + (lptr[k] - base)
+        cols = lidx + lptr[k]
+        count = lptr[k + 1] - lptr[k]
+        for a in range(count - 1, -1, -1):
+            x = row[a]
+            if x == 0.0:
+                continue
+            f = x * r
+            j = cols[a]
+            diag[j] -= f * x
+            to = val + (lptr[j] - base)
+            if lptr[j + 1] - lptr[j] == a:                  # the same columns
+                take_row(to, row, f, a)
+            else:
+                theirs = lidx + lptr[j]
+                at = 0
+                for b in range(a):
+                    i = cols[b]
+                    while theirs[at] != i:
+                        at += 1
+                    to[at] -= f * row[b]
+            row[a] = f
+    return 1
+
+
+cdef inline void sparse_solve(int32_t n, const int32_t* lptr, const int32_t* lidx, const double* val,
+                              const double* inv, double* x) noexcept nogil:
+    cdef int32_t k, q, first, end
+    cdef const double* l = val - lptr[0]
+    cdef double z
+    for k in range(n - 1, -1, -1):                          # L^T z = x
+        z = x[k]
+        if z != 0.0:
+            first = lptr[k]
+            end = lptr[k + 1]
+            for q in range(first, end):
+                x[lidx[q]] -= l[q] * z
+    for k in range(n):                                      # D, then L x = z
+        z = x[k] * inv[k]
+        first = lptr[k]
+        end = lptr[k + 1]
+        for q in range(first, end):
+            z -= l[q] * x[lidx[q]]
+        x[k] = z
