@@ -1,1 +1,1 @@
-"""Newton's method and sweeps over generalised velocities: softened blocks, dense and sparse factors, islands of trees."""
+"""Newton's method and sweeps over generalised velocities: soft blocks, dense and sparse factors, islands of trees."""
