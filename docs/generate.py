@@ -32,11 +32,14 @@ from lavender.bench import level_name, motions
 from lavender.bench.cases import structure_of
 from lavender.ordering import ORDERS
 from lavender.problem import LAWS
-from lavender.report import advice_by_level, advice_by_time, claims, geometric_means, reaches
+from lavender.report import advice, claims, geometric_means, reaches
 from lavender.report import motions as motion_tables
+from lavender.report.curves import figures as report_figures
+from lavender.report.page import page as report_page
 from lavender.report.style import looks
-from lavender.report.tables import SHIFT, time_budgets
-from lavender.report.text import residual, seconds
+from lavender.report.tables import SHIFT
+from lavender.report.tables.advice import NOISE, RESIDUAL_NOISE
+from lavender.report.text import count, residual, seconds, share
 from lavender.scene.gallery import SCENES
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -62,8 +65,10 @@ PLAN = bench.Plan(LEVELS, budgets=(4, 16, 64), repeats=2, time_limit=0.1, warm=F
 BACKENDS = ("osqp", "scs", "piqp", "clarabel", "clarabel_cone")
 NEAR = 1.25  # times the fastest: differences below say nothing on a machine that does other work
 ADVICE = (
-    "Who brings most cases of a structure to a level, and of those the fastest by shifted geometric mean of time: the\n"
-    "number shown; and on how many cases. In a time: the mean residual reached."
+    "Who brings most cases of a structure to a level, and of those the fastest by shifted geometric mean of time:\n"
+    "the number shown; in brackets on how many cases, where not on all. In a time: the mean residual reached.\n"
+    f"≈ are as good within noise ({NOISE:g} times in time, {RESIDUAL_NOISE:g} in residual). The same records as\n"
+    "[a report's page](REPORT)."
 )
 LAW_NAMES = {
     "linear": "linear systems",
@@ -409,31 +414,47 @@ def solver_pages(site, records, figures):
 # -- measured ---------------------------------------------------------------------------------------
 
 
+def by_structure(records):
+    """The table of the report's page as markdown: what to take for each structure, to a level and in a time."""
+
+    def cell(found, said):
+        best = found.best
+        if best is None:
+            return "nobody"
+        more = (
+            [", ".join(found.ties[:2]) + (f" +{len(found.ties) - 2}" if len(found.ties) > 2 else "")]
+            if found.ties
+            else []
+        )
+        lines = [
+            f"**{best.solver}** {said(best.score)}{share(best.solved, best.cases)}",
+            *(f"≈ {t}" for t in more),
+        ]
+        return "<br>".join([*lines, *([best.how] if best.how else [])])
+
+    lines = advice(records)
+    names = [f"{line.name.replace(' / ', '<br>')}<br>{count(line.size, 'case')}" for line in lines]
+    to_level = table(
+        ("structure", *(f"to {level_name(x)}" for x in lines[0].by_level)),
+        [(n, *(cell(a, seconds) for a in x.by_level.values())) for n, x in zip(names, lines, strict=True)],
+    )
+    in_time = table(
+        ("structure", *(f"in {seconds(t)}" for t in lines[0].by_time)),
+        [(n, *(cell(a, residual) for a in x.by_time.values())) for n, x in zip(names, lines, strict=True)],
+    )
+    return f"{ADVICE}\n\n:::{{container}} wide\n{to_level}\n\n{in_time}\n:::"
+
+
 def measured_page(site, records, figures):
     """Advice by structure from the records of this build, and the curves behind it."""
     run = next(iter(records.runs.values()))
-    families = {}
-    for a in advice_by_level(records):
-        families.setdefault(a.family, {})[a.target] = a
-    timed = {}
-    for a in advice_by_time(records):
-        timed.setdefault(a.family, {})[a.target] = a
-    times = time_budgets(records)
-    rows = []
-    for family, by_level in families.items():
-        cells = [family]
-        for level in LEVELS:
-            best = by_level[level].best
-            cells.append(
-                f"**{best.solver}** {seconds(best.score)} ({best.solved}/{best.cases})" if best else "nobody"
-            )
-        for t in times:
-            best = timed[family][t].best
-            cells.append(f"**{best.solver}** to {residual(best.score)}" if best else "nobody")
-        rows.append(cells)
-    head = ("structure", *(f"to {level_name(x)}" for x in LEVELS), *(f"in {seconds(t)}" for t in times))
+    structures = by_structure(records)
+    site.write(
+        "report.html",
+        report_page(records, report_figures(records), "lavender report of these pages", saved=False),
+    )
     shown = ", ".join(f"{n} {v}" for n, v in run.versions.items())
-    site.write("parts/advice.md", f"{ADVICE}\n\n{table(head, rows)}")
+    site.write("parts/advice.md", structures.replace("REPORT", "generated/report.html"))
     parts = [
         "# Measured in this build",
         (
@@ -443,8 +464,7 @@ def measured_page(site, records, figures):
             "a solve. It is a glance, not a benchmark: `lavender report` on your own problems says more."
         ),
         "## By structure",
-        ADVICE,
-        table(head, rows),
+        structures.replace("REPORT", "report.html"),
         "## By law",
     ]
     first = []
@@ -453,7 +473,9 @@ def measured_page(site, records, figures):
         for level in LEVELS:
             most = max(solved for _, solved, _ in by_level[level].values())
             names = sorted((t, name) for name, (t, solved, _) in by_level[level].items() if solved == most)
-            cells.append(", ".join(f"**{name}** {seconds(t)}" for t, name in names[:3]) if most else "nobody")
+            cells.append(
+                "<br>".join(f"**{name}** {seconds(t)}" for t, name in names[:3]) if most else "nobody"
+            )
         first.append((LAW_NAMES.get(law, law), *cells))
         rows = [
             (
