@@ -60,9 +60,9 @@ GENERAL_FIRST = 0.4e6  # ns of it up to which nothing else is looked at first
 FORM = 1.0  # of each multiply-add of Y Y^T
 FORMED_START, FORMED = 280e3, 6.0  # of A formed of J and M, and of each of its entries
 ADMM_START, ADMM_ROW, ADMM_ENTRY = (
-    300e3,
-    60.0,
-    2.0,
+    500e3,
+    40.0,
+    0.15,
 )  # a call; of each iteration for each row and each entry of L
 
 FIRST_LOOK, LAST_LOOK = 16, 64  # sweeps before the first look at the residual: so many at least and at most,
@@ -80,10 +80,14 @@ PER_ROW = {
     "cone": 0.0,
     "coulomb": 1.0 / 40.0,
 }  # more of them: contacts change their side
-TAIL = {"linear": 2, "lcp": 10, "cone": 40, "coulomb": 24}  # more that are granted before another is asked
+BUDGET = {"linear": 2.0, "lcp": 2.0, "cone": 2.0, "coulomb": 1.2}  # times as many that its first turn has
+TAIL = {"linear": 2, "lcp": 10, "cone": 40, "coulomb": 6}  # more that are granted before another is asked
 MOST = 30.0  # of what rows add
 GENERAL_COUNT = {"linear": 2.0, "lcp": 10.0, "cone": 12.0, "coulomb": 20.0}  # over generalised velocities
-ADMM_COUNT, ADMM_FACTORS = 240.0, 3.0  # iterations to six decades, and how often rho moves on the way
+ADMM_COUNT, ADMM_FACTORS = 80.0, 2.0  # iterations to six decades where it gets there, and how often rho moves
+# Share of problems on which it does, over bodies and over rows of A: of candidates that may fail, those of least cost
+# for each chance come first.
+ADMM_LUCK_BODIES, ADMM_LUCK = 0.15, 0.4
 ADMM_FILL = 6.0  # entries of L for each of A
 DIRECT_ROUNDS = 40  # of `direct` on bounded rows that are granted before another is asked
 AT_REST = 8.0  # of faces on faces, most of whose rows hold
@@ -301,7 +305,7 @@ class Costs:
         cost = self._newton_guess if self._others_win else self._newton(self._newton_factor)
         p = self.problem
         form = () if p.generalized is None else (("form", "impulse"),)
-        limit = int(2.0 * self._newton_count) + TAIL[p.law]
+        limit = int(BUDGET[p.law] * self._newton_count) + TAIL[p.law]
         start = newton_rates(p)[0]
         once = start + (cost - start) / self._newton_count
         newton = Exact("newton", self.formed + cost, limit, form, self.formed + once)
@@ -340,13 +344,9 @@ class Costs:
 
     @property
     def _admm(self) -> tuple[float, float]:
-        # To the end, and with the first factor alone.
         p = self.problem
-        entries = float(sweep_work(p))
-        lu = 1.0 if p.is_symmetric else UNSYMMETRIC
-        each = ADMM_ROW * p.m + ADMM_ENTRY * lu * ADMM_FILL * entries
-        factor = lu * self._sparse(int(entries), p.m)
-        return ADMM_START + ADMM_FACTORS * factor + self._admm_count * each, ADMM_START + factor
+        whole, once = admm_cost(p, p.m, float(sweep_work(p)), self._admm_count)
+        return float(whole), float(once)
 
     def _direct(self, factor: float, times: float = 1.0) -> float:
         p = self.problem
@@ -451,15 +451,28 @@ class Costs:
         return SPARSE * nnz * (1.0 + m / SPARSE_ROWS)
 
 
+def admm_cost(problem: Problem, m: Any, entries: Any, count: float) -> tuple[Any, Any]:
+    """`admm` on m rows of a problem: to the end, for each chance to get there, and with the first factor alone [ns]."""
+    lu = 1.0 if problem.is_symmetric else UNSYMMETRIC
+    factor = lu * SPARSE * entries * (1.0 + m / SPARSE_ROWS)
+    each = ADMM_ROW * m + ADMM_ENTRY * lu * ADMM_FILL * entries
+    whole = ADMM_START + ADMM_FACTORS * factor + count * each
+    return whole / (ADMM_LUCK if problem.rows is None else ADMM_LUCK_BODIES), ADMM_START + factor
+
+
 def islands_cost(problem: Problem, sizes: Any) -> float:
-    """Islands of so many rows, solved apart by Newton's method, by their sizes alone [ns]."""
+    """Islands of so many rows, solved apart by Newton's method or `admm`, by their sizes alone [ns]."""
     m = np.asarray(sizes, float)
     count = NEWTON[problem.law] + np.minimum(MOST, PER_ROW[problem.law] * m)
     start, step, row = newton_rates(problem)
     factor = np.minimum(
         DENSE * m**3 / 3.0, SPARSE * problem.metric.work / max(problem.m, 1) * m * (1.0 + m / SPARSE_ROWS)
     )
-    each = ISLAND + start + count * (step + row * m + UNSYMMETRIC * factor)
+    each = start + count * (step + row * m + UNSYMMETRIC * factor)
+    if problem.law in ("cone", "coulomb"):
+        entries = sweep_work(problem) / max(problem.m, 1) * m
+        each = np.minimum(each, admm_cost(problem, m, entries, ADMM_COUNT)[0])
+    each += ISLAND
     return float(each.sum())
 
 

@@ -122,7 +122,7 @@ class Turns:
         trail, costs, k = self.trail, self.trail.costs, self.taken
         before, spent = trail.best, trail.iterations
         # Friction that Newton's method needs so long for is as often ended by admm.
-        longer = 2 if self.inside is not None and trail.problem.law == "coulomb" else 0
+        longer = 1 if self.inside is not None and trail.problem.law == "coulomb" else 0
         for candidate in costs.exact:
             if trail.best <= trail.tol or self.budget <= trail.iterations:
                 return True
