@@ -244,13 +244,14 @@ class Generalized:
 
 
 def _rows(jac: Any, n: int) -> Compressed:
-    if sp.issparse(jac):
-        if jac.shape[1] != n:
-            raise InputError(f"J has shape {jac.shape}; (any, {n}) is needed, as M has {n} velocities")
-        data = _compressed("J", jac)
+    sparse = sp.issparse(jac)
+    given = jac if sparse else as_array("J", jac, (None, None), copy=False)
+    if given.shape[1] != n:
+        raise InputError(f"J has shape {given.shape}; (any, {n}) is needed, as M has {n} velocities")
+    if sparse:
+        data = _compressed("J", given)
         return data.indptr, data.indices, data.data
-    dense = as_array("J", jac, (None, n), copy=False)
-    return dense_to_csr(dense)
+    return dense_to_csr(given)
 
 
 def _lower(mass: Any, names: Sequence[str] | None) -> tuple[Compressed, int]:
