@@ -20,11 +20,15 @@ from lavender._arrays import FloatArray, IntArray, as_array, equal, read_only
 from lavender.errors import InputError
 from lavender_ext.core import generalized as kernels
 from lavender_ext.core.problem import dense_to_csr
+from lavender_ext.factor.dissection import dissection
 from lavender_ext.judge.measure import all_finite
 
 __all__ = ["Generalized"]
 
 ASYMMETRY = 1e-12  # -, of sqrt(M_ii M_jj): above any rounding of sums over bodies, below anything meant
+MESH = 400  # velocities from which on the order of trees is looked for: below, a factor costs less than the search
+LEAF = 8  # trees that are not taken apart any more
+MET = 100  # trees that meet a tree, in the mean, beyond which no order keeps J^T J sparse
 Compressed = tuple[IntArray, IntArray, FloatArray]
 
 
@@ -111,6 +115,11 @@ class Generalized:
             other = kernels.Operator(*_permuted_columns(jac, order), *_permuted_lower(mass, order))
             if other.fill < operator.fill:
                 put["order"], operator = read_only(order), other
+        if n >= MESH and put["order"] is None and operator.failed < 0:
+            order = _apart(jac, operator.parents)
+            if order is not None:
+                put["order"] = read_only(order)
+                operator = kernels.Operator(*_permuted_columns(jac, order), *_permuted_lower(mass, order))
         if operator.failed >= 0:
             at = operator.failed if put["order"] is None else int(put["order"][operator.failed])
             raise InputError(
@@ -148,7 +157,8 @@ class Generalized:
     def _columns(self, jac: Compressed) -> tuple[FloatArray, IntArray, IntArray]:
         indptr, indices, data = jac
         if self.order is not None:
-            back = sp.csr_array((data, self.order[indices], indptr), shape=(self.m, self.nv))
+            # Sorted in place: of a copy, for kernels read these arrays.
+            back = sp.csr_array((data.copy(), self.order[indices], indptr), shape=(self.m, self.nv))
             back.sort_indices()
             indices, data = back.indices, back.data
         return read_only(data), read_only(indices), read_only(indptr)
@@ -351,6 +361,46 @@ def _order(mass: Compressed, n: int) -> IntArray:
     found = [_cardinality(whole, n), reverse_cuthill_mckee(whole, symmetric_mode=True).astype(np.int32)]
     fills = [kernels.pattern_fill(*_permuted_lower(mass, order)[:2]) for order in found]
     return found[int(np.argmin(fills))]
+
+
+def _apart(jac: Compressed, parent: IntArray) -> IntArray | None:
+    """Velocity at each place where many trees may stand in any order, as vertices of a flex do; None: as they are.
+
+    M does not fill in whatever the order of its trees, but N = M + J^T V J of Newton couples those that share a row:
+    nested dissection of that graph, separators first, since elimination begins at the last.
+    """
+    n = len(parent)
+    roots = np.flatnonzero(parent < 0)
+    tree = np.empty(n, np.int32)
+    tree[roots] = np.arange(len(roots))
+    for i, p in enumerate(parent.tolist()):
+        if p >= 0:
+            tree[i] = tree[p]
+    indptr, indices, _ = jac
+    on = sp.csr_array(
+        (np.ones(len(indices), np.int32), tree[indices], indptr), shape=(len(indptr) - 1, len(roots))
+    )
+    on.sum_duplicates()
+    if np.sum(np.diff(on.indptr).astype(float) ** 2) > MET * len(roots):
+        return None
+    met = sp.csr_array(on.T @ on)
+    met.setdiag(0)
+    met.eliminate_zeros()
+    met.sort_indices()
+    first = dissection(met.indptr.astype(np.int32), met.indices.astype(np.int32), LEAF)[::-1]
+    place = np.empty(len(roots), np.int64)
+    place[first] = np.arange(len(roots))
+    order = np.argsort(place[tree], kind="stable").astype(np.int32)
+    fills = [kernels.pattern_fill(*_lower_of(met, way)) for way in (np.arange(len(roots)), first)]
+    return order if fills[1] < fills[0] else None
+
+
+def _lower_of(graph: sp.csr_array, order: IntArray) -> tuple[IntArray, IntArray]:
+    """Lower triangle with its diagonal of a graph's pattern in this order: pointers and columns."""
+    n = len(order)
+    lower = sp.csr_array(sp.tril(graph[order][:, order], -1) + sp.eye_array(n, dtype=graph.dtype))
+    lower.sort_indices()
+    return lower.indptr.astype(np.int32), lower.indices.astype(np.int32)
 
 
 def _cardinality(whole: sp.csr_array, n: int) -> IntArray:

@@ -18,7 +18,7 @@ becomes what:
 
 | MuJoCo | here |
 |---|---|
-| equality | one ROW block of its 1 to 6 rows, unbounded |
+| equality | one ROW block of its 1 to 6 rows, unbounded; a flex: a block for each edge |
 | friction loss of a joint or tendon | ROW, abs(lambda) <= dt frictionloss |
 | limit of a joint or tendon; `condim="1"` | ROW, or a contact of a normal alone: lambda >= 0 |
 | elliptic cone, `condim="3"` | CONTACT: normal (from geom 1 to geom 2), two tangents, mu = friction[0] |
@@ -362,7 +362,8 @@ def _words(mj: Any, model: Any, held: _Held) -> list[str]:
         if of == kinds.mjCNSTR_EQUALITY:
             while i + size < len(types) and types[i + size] == of and ids[i + size] == which:
                 size += 1
-            names.append(_name(mj, model, "EQUALITY", which, "equality"))
+            name = _name(mj, model, "EQUALITY", which, "equality")
+            names += [name] if size <= export.JOINED else [f"{name}, edge {edge}" for edge in range(size)]
         elif of == kinds.mjCNSTR_FRICTION_DOF:
             joint = int(model.dof_jntid[which])
             axis = which - int(model.jnt_dofadr[joint])

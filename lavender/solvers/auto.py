@@ -31,7 +31,7 @@ import numpy as np
 from lavender._arrays import FloatArray, IntArray
 from lavender.certificates import check_certificate
 from lavender.problem import OPERATORS, Problem
-from lavender.registry import FEW, SolverSpec, get
+from lavender.registry import FEW, SolverSpec
 from lavender.residuals import reference
 from lavender.solution import Claim, Status
 from lavender.solvers._costs import (
@@ -58,6 +58,7 @@ FEW_JOINTS = 300  # rows up to which a linear system is not looked at more close
 RELAXED = 1e6  # ns that sweeps usually take from which Coulomb's law is relaxed first: a problem of its own
 GLANCE = 0.35  # share of a finite solver's cost for which a first look at sweeps is always worth it
 GENERAL_STEPS = 256  # that it then has
+ROUND_SWEEPS = 1000  # of nncg on round cones given by A, before admm is asked
 CERTIFICATE_ROWS = 3000  # rows up to which a linear program is asked for a certificate
 CERTIFICATE_STEPS = 100  # of the simplex method for each row at most
 
@@ -150,9 +151,12 @@ def _solve(trail: Trail, budget: int, glance: Glance | None = None) -> None:
             _certify(trail)
         return
     if problem.cones.has_round:
-        # Nothing else takes them; what it began with may have been cut short.
-        if trail.largest:
-            whole(trail, Exact("newton", 0.0, 0, (("form", "velocity"),)), budget)
+        # What it began with may have been cut short. Few others take them, over the rows of A.
+        if trail.largest and whole(trail, Exact("newton", 0.0, 0, (("form", "velocity"),)), budget):
+            return
+        for name, limit in (("nncg", ROUND_SWEEPS), ("admm", 0), ("nncg", 0)):
+            if whole(trail, Exact(name, 0.0, 0), budget, limit) or trail.late:
+                return
         return
     sweeps = None
     if glance is None and factors_at_once(problem):
@@ -315,17 +319,12 @@ def begins(problem: Problem, tol: float) -> tuple[str, str]:
 # -- what a problem looks like ------------------------------------------------------------------------
 
 
-def _refusal(problem: Problem) -> str | None:
-    return get("newton").refuses(problem) if problem.cones.has_round else None
-
-
 SPEC = SolverSpec(
     name="auto",
     factory=Auto,
     laws=frozenset({"linear", "lcp", "coulomb", "cone"}),
     operators=frozenset(OPERATORS),
     round_cones=True,
-    refusal=_refusal,
     few=AUTO,
     resumable=False,
     delegates=True,

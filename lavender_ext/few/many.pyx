@@ -17,6 +17,7 @@ from lavender_ext.core.generalized cimport generalized_t
 from lavender_ext.core.problem cimport MADE, Data, made_t, make_numbers
 from lavender_ext.generalized.islands cimport aim_at, furnish, marks_of, need_t, numbers_of, settle
 from lavender_ext.generalized.newton cimport DONE, descend_all, flow_t
+from lavender_ext.generalized.sparse cimport PER_COLUMN
 from lavender_ext.judge.measure cimport do_nothing, general_judge, judged_from, reference_of, relative_of
 from lavender_ext.judge.score cimport are_numbers, relative, score_rows, score_t
 
@@ -134,10 +135,10 @@ cdef void solve_made(job_t* j, space_t* space, const gate_t* gate, double tol, d
         if not with_numbers(space, 3 * <ssize_t>m + j.g.n):
             return
         begin(j, space.numbers)
-    if not with_marks(space, marks_of(&j.p, &j.g)):
+    if not with_marks(space, marks_of(&j.p, &j.g, PER_COLUMN)):
         return
-    settle(&f, &j.p, &j.g, space.marks, &need)
-    if need.values > most or not is_first(j, gate, need.wide):
+    settle(&f, &j.p, &j.g, PER_COLUMN, space.marks, &need)
+    if need.crowded or need.values > most or not is_first(j, gate, need.wide):
         return
     if not with_numbers(space, numbers_of(&f, &need)):
         return

@@ -13,6 +13,10 @@ import numpy as np
 from lavender_ext.core.block cimport CONTACT, ROUND, ROW
 
 
+cpdef enum:
+    JOINED = 6                  # rows of an equality that are one block; a flex has one for each edge
+
+
 cdef public int32_t lav_export_blocks(int32_t m, const int32_t* type_, const int32_t* id_, const int32_t* codes,
                                       const int32_t* dim, const double* friction, const int32_t* geom,
                                       const double* loss, double dt, int32_t* ptr, int32_t* kind, double* lower,
@@ -35,13 +39,20 @@ cdef public int32_t lav_export_blocks(int32_t m, const int32_t* type_, const int
         lower[i] = -inf
         upper[i] = inf
         scale[i] = 1.0
-        key[k] = (<uint64_t>(t + 1) << 56) | (<uint64_t>of << 16)
+        key[k] = (<uint64_t>(t + 1) << 56) | (<uint64_t>of << 32)
         if t == codes[0]:
             while i + size < m and type_[i + size] == t and id_[i + size] == of:
                 lower[i + size] = -inf
                 upper[i + size] = inf
                 scale[i + size] = 1.0
                 size += 1
+            if size > JOINED:                           # rows of their own: together they would reach every vertex
+                count = size
+                size = 1
+                for j in range(1, count):
+                    mu[k + j] = 0.0
+                    kind[k + j] = ROW
+                    key[k + j] = key[k] + j
         elif t == codes[1] or t == codes[2]:
             lower[i] = -dt * loss[i]
             upper[i] = dt * loss[i]

@@ -8,7 +8,7 @@ from libc.stdint cimport int32_t
 from lavender_ext.core.block cimport COULOMB, ROW, blocks_t
 from lavender_ext.core.generalized cimport generalized_t
 from lavender_ext.generalized.newton cimport flow_t
-from lavender_ext.generalized.sparse cimport SMALL, factor_work, find_pattern, is_worth, pattern_marks
+from lavender_ext.generalized.sparse cimport MANY, SMALL, factor_work, find_pattern, is_worth, pattern_marks
 
 
 cdef inline int32_t root_of(int32_t* up, int32_t i) noexcept nogil:
@@ -162,17 +162,19 @@ cdef inline int32_t find_islands(const blocks_t* p, const generalized_t* g, int3
 cdef struct need_t:             # what the islands of a problem ask for
     int32_t most[4]             # as `find_islands` tells
     int32_t wide                # columns of a dense island of the same work as the costliest, at most most[0]
+    int32_t crowded             # L of a large problem has more than `per` entries in a row: settle again, with more
     double values               # of N, of the island that has most; its factor has as many
 
 
-cdef inline ssize_t marks_of(const blocks_t* p, const generalized_t* g) noexcept nogil:
-    """int32 that `settle` needs."""
+cdef inline ssize_t marks_of(const blocks_t* p, const generalized_t* g, int32_t per) noexcept nogil:
+    """int32 that `settle` needs, with room for `per` entries in a row of L."""
     cdef ssize_t n = g.n, panels = g.n_panels
     return (3 * n + (n if n > panels else panels) + 5 * panels + p.n_blocks + 8
-            + pattern_marks(n, g.pcol[panels]))
+            + pattern_marks(n, g.pcol[panels], per))
 
 
-cdef inline void settle(flow_t* f, const blocks_t* p, const generalized_t* g, int32_t* w, need_t* need) noexcept nogil:
+cdef inline void settle(flow_t* f, const blocks_t* p, const generalized_t* g, int32_t per, int32_t* w,
+                        need_t* need) noexcept nogil:
     """Islands of a problem, in w (`marks_of`), and how N is kept in each."""
     cdef ssize_t n = g.n, panels = g.n_panels, at = n + (n if n > panels else panels)
     cdef int32_t i, size, wide
@@ -194,9 +196,13 @@ cdef inline void settle(flow_t* f, const blocks_t* p, const generalized_t* g, in
     f.swap = w                                          # scratch of before
     f.lptr = NULL
     f.lidx = NULL
-    if need.most[0] > SMALL and find_pattern(g, f.n_islands, f.iptr, f.run, f.cptr, f.local, w + at) >= 0:
-        f.lptr = w + at
-        f.lidx = w + at + f.cptr[f.n_islands] + 1
+    need.crowded = False
+    if need.most[0] > SMALL:
+        if find_pattern(g, f.n_islands, f.iptr, f.run, f.cptr, f.local, per, w + at) >= 0:
+            f.lptr = w + at
+            f.lidx = w + at + f.cptr[f.n_islands] + 1
+        else:
+            need.crowded = need.most[0] > MANY and p.law != COULOMB
     need.wide = 0
     need.values = 0.0
     for i in range(f.n_islands):

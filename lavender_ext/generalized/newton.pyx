@@ -5,6 +5,7 @@ from lavender_ext.core.block cimport blocks_t
 from lavender_ext.core.generalized cimport generalized_t
 from lavender_ext.core.problem cimport Data, Room, room_for
 from lavender_ext.generalized.islands cimport aim_at, find_islands, furnish, marks_of, need_t, numbers_of, settle
+from lavender_ext.generalized.sparse cimport PER_COLUMN
 from lavender_ext.generalized.newton cimport DONE, FAILED, LOST, SPENT, STUCK, flow_t, solve_island
 
 ENDS = {"done": DONE, "spent": SPENT, "stuck": STUCK, "failed": FAILED, "lost": LOST}
@@ -40,9 +41,15 @@ cdef class Newton:
 
     def __init__(self, Data p, double most):
         cdef need_t need
-        cdef Room marks = room_for(marks_of(&p.blocks, &p.general) * sizeof(int32_t)), numbers
+        cdef int32_t per = PER_COLUMN
+        cdef Room marks, numbers
         self.data = p
-        settle(&self.f, &p.blocks, &p.general, <int32_t*>marks.at, &need)
+        while True:
+            marks = room_for(marks_of(&p.blocks, &p.general, per) * sizeof(int32_t))
+            settle(&self.f, &p.blocks, &p.general, per, <int32_t*>marks.at, &need)
+            if not need.crowded or 2.0 * per * p.general.n > most or 4 * per > p.general.n:
+                break                                   # beyond a quarter of its columns a row is best kept dense
+            per *= 2
         self.largest = need.wide
         self.fits = need.values <= most
         if not self.fits:

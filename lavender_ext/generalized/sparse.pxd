@@ -12,22 +12,23 @@ from lavender_ext.core.generalized cimport generalized_t, tree_pattern
 
 
 cdef enum:
-    PER_COLUMN = 24             # entries in a row of L for which there is room
+    PER_COLUMN = 24             # entries in a row of L for which there is room at first
+    MANY = 200                  # columns from which on more room is made where that does not hold a pattern
     SMALL = 8                   # columns up to which a dense factor costs less than to look for a pattern
 
 
-cdef inline ssize_t pattern_marks(ssize_t n, ssize_t reached) noexcept nogil:
-    """int32 that `find_pattern` needs for n columns, of which panels reach so many in all."""
-    return (PER_COLUMN + 7) * n + reached + 2
+cdef inline ssize_t pattern_marks(ssize_t n, ssize_t reached, ssize_t per) noexcept nogil:
+    """int32 that `find_pattern` needs for n columns with `per` entries each, of which panels reach so many in all."""
+    return (per + 7) * n + reached + 2
 
 
 cdef inline int32_t find_pattern(const generalized_t* g, int32_t n_islands, const int32_t* iptr, const int32_t* run,
-                                 const int32_t* cptr, const int32_t* local, int32_t* w) noexcept nogil:
+                                 const int32_t* cptr, const int32_t* local, int32_t per, int32_t* w) noexcept nogil:
     """Rows of L of all islands, one after the other, columns as in their island: how many entries, -1 without room.
 
     w (`pattern_marks`) begins with the pointers (n + 1) and the columns; the rest is scratch.
     """
-    cdef int32_t n = cptr[n_islands], room = PER_COLUMN * g.n, i, a, b, q, k, base, first, end, most, count
+    cdef int32_t n = cptr[n_islands], room = per * g.n, i, a, b, q, k, base, first, end, most, count
     cdef int32_t* lptr = w
     cdef int32_t* lidx = w + n + 1
     cdef int32_t* mptr = lidx + room
@@ -124,11 +125,14 @@ cdef inline int32_t sparse_factor(int32_t n, const int32_t* lptr, const int32_t*
             j = cols[a]
             diag[j] -= f * x
             to = val + (lptr[j] - base)
-            if lptr[j + 1] - lptr[j] == a:                  # the same columns
-                take_row(to, row, f, a)
+            theirs = lidx + lptr[j]
+            at = 0
+            if a > 0:
+                while theirs[at] != cols[0]:
+                    at += 1
+            if lptr[j + 1] - lptr[j] == at + a:             # the same columns from there on
+                take_row(to + at, row, f, a)
             else:
-                theirs = lidx + lptr[j]
-                at = 0
                 for b in range(a):
                     i = cols[b]
                     while theirs[at] != i:

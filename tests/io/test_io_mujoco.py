@@ -357,3 +357,23 @@ def test_record_then_report_from_the_command_line(tmp_path):
     missing = CliRunner().invoke(cli, ["report", str(tmp_path / "none.xml"), "--out", str(page)])
     assert isinstance(missing.exception, lv.errors.InputError)
     assert wrong.exit_code != 0
+
+
+def test_every_edge_of_a_flex_is_a_block_of_its_own():
+    """Together its rows would reach every vertex, and each row of M^-1/2 J^T would be as long as the flex is large."""
+    model = mj.MjModel.from_xml_string("""<mujoco><worldbody><geom type="plane" size="1 1 .1"/>
+        <flexcomp name="cloth" type="grid" dim="2" count="5 5 1" spacing=".05 .05 .05" pos="0 0 .02" radius=".01"
+        mass="1"><edge equality="true"/></flexcomp></worldbody></mujoco>""")
+    data = mj.MjData(model)
+    for _ in range(20):
+        mj.mj_step(model, data)
+    mj.mj_forward(model, data)
+    problem = lv.io.from_mujoco(model, data)
+    edges = int(np.count_nonzero(data.efc_type[: data.nefc] == mj.mjtConstraint.mjCNSTR_EQUALITY))
+    assert edges > 6
+    assert np.array_equal(problem.cones.ptr[: edges + 1], np.arange(edges + 1))
+    assert len(np.unique(problem.key)) == problem.n_blocks
+    assert problem.names[edges - 1].endswith(f"edge {edges - 1}")
+    assert problem.whitened.nnz <= 9 * problem.m  # three vertices at most
+    solution = lv.solve(problem, "newton", tol=1e-9)
+    assert solution.success or solution.residual.at_floor

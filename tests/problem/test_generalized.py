@@ -558,6 +558,77 @@ def test_branches_are_factored_in_their_own_pattern(friction, seed):
         )
 
 
+def test_a_look_at_j_changes_nothing_that_kernels_read():
+    """Velocities in an order of the factor's own: J is given back in the order given, of a copy."""
+    rng = np.random.default_rng(0)
+    mass = np.diag(np.full(6, 3.0))
+    mass[-1, :-1] = mass[:-1, -1] = rng.uniform(0.2, 0.5, 5)  # a star whose centre comes last fills in
+    jac = rng.normal(size=(4, 6))
+    problem = lv.Problem.from_jacobian(jac, mass, rng.normal(size=6), cones=lv.Cones.free(4), compliance=0.1)
+    assert problem.generalized.order is not None
+    lam = rng.normal(size=4)
+    before = problem.slack(lam)
+    np.testing.assert_array_equal(problem.jacobian.toarray(), jac)
+    np.testing.assert_array_equal(problem.slack(lam), before)
+
+
+def cloth(side, seed, friction="cone"):
+    """Masses on a square grid, each of one velocity, stiff rows between neighbours, contacts of three rows."""
+    rng = np.random.default_rng(seed)
+    n = side * side
+    number = rng.permutation(n).reshape(side, side)  # in no order that anybody meant
+    pairs = np.concatenate([np.stack([number[1:], number[:-1]], -1).reshape(-1, 2),
+                            np.stack([number[:, 1:], number[:, :-1]], -1).reshape(-1, 2)])  # fmt: skip
+    jac = sp.lil_array((len(pairs) + 3 * side, n))
+    for i, (a, b) in enumerate(pairs):
+        jac[i, a], jac[i, b] = 1.0, -1.0
+    for i in range(3 * side):
+        jac[len(pairs) + i, number[i // 3, i % 3]] = 1.0
+    cones = lv.Cones.bounded(np.full(len(pairs), -np.inf), np.full(len(pairs), np.inf))
+    return lv.Problem.from_jacobian(
+        jac.tocsr(), sp.diags_array(rng.uniform(0.5, 2.0, n)), rng.normal(size=n),
+        cones=cones + lv.Cones.contacts(0.5, 2, count=side), compliance=0.2, friction=friction,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_many_small_trees_are_put_in_an_order_that_fills_in_little(seed):
+    problem = cloth(24, seed)
+    assert problem.generalized.order is not None
+    # Natural order of a band: rows of 24 entries; a random one: a hundred and more.
+    assert general.prepare(problem).largest <= 40
+    solution = lv.solve(problem, "newton", form="velocity", tol=1e-10)
+    assert solution.success
+    other = lv.solve(problem, "newton", form="impulse", tol=1e-10)
+    np.testing.assert_allclose(solution.impulse, other.impulse, atol=1e-7)
+    v = problem.velocity(solution.impulse)
+    given = problem.generalized
+    np.testing.assert_allclose(
+        given.mass @ (v - given.v_free), problem.jacobian.T @ solution.impulse, atol=1e-11
+    )
+
+
+def test_room_for_a_pattern_grows():
+    """More entries in a row than there is room for at first, of more columns than are kept dense for that."""
+    problem = cloth(50, 0)
+    kernel = general.prepare(problem)
+    assert kernel.fits and kernel.largest < 150
+    assert lv.solve(problem, "newton", form="velocity", tol=1e-9).success
+    assert lv.solve_many([problem], tol=1e-6)[0].success
+
+
+@pytest.mark.parametrize("tangents", [3, 4, 5])
+@pytest.mark.parametrize("seed", range(3))
+def test_auto_solves_round_cones_given_by_a_matrix(tangents, seed):
+    problem = random_general(seed, "cone", contacts=4, tangents=tangents)
+    matrix = as_matrix(problem)
+    solution = lv.solve(matrix, tol=1e-9)
+    assert solution.success
+    # Soft by 0.01 / kg or more: residuals of 1e-9 are impulses of 1e-6 of their size.
+    own = lv.solve(problem, tol=1e-9).impulse
+    np.testing.assert_allclose(solution.impulse, own, atol=1e-5 * (1 + np.abs(own).max()))
+
+
 @given(seed=seeds, friction=st.sampled_from(["cone", "coulomb"]), warm=st.booleans())
 @settings(max_examples=10)
 def test_the_first_solve_has_the_bits_of_the_next(seed, friction, warm):
