@@ -116,10 +116,10 @@ class Generalized:
             if other.fill < operator.fill:
                 put["order"], operator = read_only(order), other
         if n >= MESH and put["order"] is None and operator.failed < 0:
-            order = _apart(jac, operator.parents)
-            if order is not None:
-                put["order"] = read_only(order)
-                operator = kernels.Operator(*_permuted_columns(jac, order), *_permuted_lower(mass, order))
+            apart = _apart(jac, operator.parents)
+            if apart is not None:
+                put["order"] = read_only(apart)
+                operator = kernels.Operator(*_permuted_columns(jac, apart), *_permuted_lower(mass, apart))
         if operator.failed >= 0:
             at = operator.failed if put["order"] is None else int(put["order"][operator.failed])
             raise InputError(
@@ -391,7 +391,7 @@ def _apart(jac: Compressed, parent: IntArray) -> IntArray | None:
     place = np.empty(len(roots), np.int64)
     place[first] = np.arange(len(roots))
     order = np.argsort(place[tree], kind="stable").astype(np.int32)
-    fills = [kernels.pattern_fill(*_lower_of(met, way)) for way in (np.arange(len(roots)), first)]
+    fills = [kernels.pattern_fill(*_lower_of(met, way)) for way in (np.arange(len(roots), dtype=np.int32), first)]
     return order if fills[1] < fills[0] else None
 
 
