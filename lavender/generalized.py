@@ -391,7 +391,9 @@ def _apart(jac: Compressed, parent: IntArray) -> IntArray | None:
     place = np.empty(len(roots), np.int64)
     place[first] = np.arange(len(roots))
     order = np.argsort(place[tree], kind="stable").astype(np.int32)
-    fills = [kernels.pattern_fill(*_lower_of(met, way)) for way in (np.arange(len(roots), dtype=np.int32), first)]
+    fills = [
+        kernels.pattern_fill(*_lower_of(met, way)) for way in (np.arange(len(roots), dtype=np.int32), first)
+    ]
     return order if fills[1] < fills[0] else None
 
 
