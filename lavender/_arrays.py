@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lavender.errors import InputError
+from lavender_ext.core import gate
 from lavender_ext.judge.measure import all_finite
 
 FloatArray = npt.NDArray[np.float64]
@@ -55,6 +56,10 @@ def as_array(
         Not numeric, complex, of another shape, or not finite where it must be.
     """
     # What most callers give: nothing to convert, and no word to be made.
+    if dtype is np.float64:
+        made = gate.plain(value, shape, finite, copy)
+        if made is not None:
+            return made
     if type(value) is np.ndarray:
         if value.dtype is _PLAIN.get(dtype) and (value.shape == shape or _fits(value.shape, shape)):
             plain: np.ndarray = value.copy() if copy or not value.flags.c_contiguous else value

@@ -209,15 +209,17 @@ class Cones:
             isinstance(count, bool) or not isinstance(count, (int, np.integer)) or count < 0
         ):
             raise InputError(f"count is {count!r}; a whole number of contacts is needed")
-        mu = np.asarray(mu, float)
-        k = count if count is not None else len(mu) if mu.ndim else 1
+        if type(mu) is not float:
+            mu = np.asarray(mu, float)
+        k = count if count is not None else len(mu) if isinstance(mu, np.ndarray) and mu.ndim else 1
         mu = as_array("mu", mu, (k,))
         size = 1 + tangents + spin
         radius = (
             np.zeros(k) if patch_radius is None else as_array("patch_radius", patch_radius, (k,), unit="m")
         )
         m = k * size
-        kind = np.full(k, ROUND if tangents > 2 else CONTACT_SPIN if spin else CONTACT, np.int32)
+        kind = np.empty(k, np.int32)
+        kind.fill(ROUND if tangents > 2 else CONTACT_SPIN if spin else CONTACT)
         return cls._trusted(
             np.arange(0, m + 1, size, dtype=np.int32), kind, np.zeros(m), np.zeros(m), mu, radius
         )

@@ -201,6 +201,12 @@ class Generalized:
         self.operator.times(own if self.order is None else own[self.order], out)
         return out
 
+    def bias(self, target: FloatArray) -> FloatArray:
+        """b = target - J v* (m,) [m/s, rad/s] of targets (m,)."""
+        v = self.v_free if self.order is None else self.v_free[self.order]
+        b: FloatArray = self.operator.bias(v, target)
+        return b
+
     def solve(self, x: Any) -> FloatArray:
         """M^-1 x (nv,)."""
         x = as_array("x", x, (self.nv,))

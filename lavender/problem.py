@@ -422,10 +422,8 @@ class Problem:
         target = as_array("target", target, (m,), unit="m/s")
         if compliance is not None:
             compliance = as_array("compliance", compliance, (m,), unit="1/kg")
-        with np.errstate(over="ignore", invalid="ignore"):  # what is not finite, the problem refuses
-            b = target - generalized.velocity_of(generalized.v_free)
         return cls(
-            b,
+            generalized.bias(target),  # what is not finite, the problem refuses
             cones,
             friction=friction,
             compliance=compliance,

@@ -121,6 +121,15 @@ cdef class Operator:
         for i in range(self.g.m):
             out[i] = jac_row(&self.g, i, &x[0]) if self.g.n else 0.0
 
+    def bias(self, const double[::1] v, const double[::1] target):
+        """b = target - J v (m,), a new array; what overflows is left to whoever reads it."""
+        cdef int32_t i
+        made = np.empty(self.g.m)
+        cdef double[::1] out = made
+        for i in range(self.g.m):
+            out[i] = target[i] - (jac_row(&self.g, i, &v[0]) if self.g.n else 0.0)
+        return made
+
 
 def lower_of_dense(const double[:, ::1] a):
     """(indptr, indices, data) of the lower triangle with its diagonal, and the worst asymmetry.

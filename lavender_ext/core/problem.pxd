@@ -19,6 +19,9 @@ cdef class Blocks:
     cdef bint single_rows       # every block is one ROW
     cdef tuple keep
 
+    cdef void point(self, const int32_t[::1] ptr, const int32_t[::1] kind, const double[::1] lower,
+                    const double[::1] upper, const double[::1] mu, const double[::1] radius)
+
 
 cdef enum:                      # how `make_numbers` ended
     MADE = 0

@@ -520,10 +520,12 @@ cdef class Blocks:
     """Pointers to the arrays of a problem's blocks, which stay alive with it."""
 
     def __init__(self, ptr_, kind_, lower_, upper_, mu_, radius_):
-        cdef const int32_t[::1] ptr = ptr_, kind = kind_
-        cdef const double[::1] lower = lower_, upper = upper_, mu = mu_, radius = radius_
-        cdef int32_t i
+        self.point(ptr_, kind_, lower_, upper_, mu_, radius_)
         self.keep = (ptr_, kind_, lower_, upper_, mu_, radius_)
+
+    cdef void point(self, const int32_t[::1] ptr, const int32_t[::1] kind, const double[::1] lower,
+                    const double[::1] upper, const double[::1] mu, const double[::1] radius):
+        cdef int32_t i
         self.at.n_blocks = <int32_t>kind.shape[0]
         self.at.n_rows = <int32_t>lower.shape[0]
         self.at.ptr = &ptr[0]
@@ -567,8 +569,16 @@ def shape_of(ptr_, kind_, lower_, upper_, mu_, radius_):
     With them `Blocks` of these arrays; -1 and None where an array does not fit the others or holds what no block can
     have. Bounds of contacts, which nobody reads, get one spelling: 0 on normals, else none.
     """
-    bits = bits_of(ptr_, kind_, lower_, upper_, mu_, radius_)
-    return bits, None if bits < 0 else Blocks(ptr_, kind_, lower_, upper_, mu_, radius_)
+    cdef const int32_t[::1] ptr = ptr_, kind = kind_
+    cdef double[::1] lower = lower_, upper = upper_
+    cdef const double[::1] mu = mu_, radius = radius_
+    cdef int bits = bits_of(ptr, kind, lower, upper, mu, radius)
+    cdef Blocks made = None
+    if bits >= 0:
+        made = Blocks.__new__(Blocks)
+        made.point(ptr, kind, lower, upper, mu, radius)
+        made.keep = (ptr_, kind_, lower_, upper_, mu_, radius_)
+    return bits, made
 
 
 cdef int bits_of(const int32_t[::1] ptr, const int32_t[::1] kind, double[::1] lower, double[::1] upper,
