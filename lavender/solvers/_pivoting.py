@@ -20,6 +20,7 @@ HALVINGS = 41  # step lengths tried in a line search: 1, 1/2, ... 2^-40
 # s for each multiply-add of a dense factor, and for each nonzero of a sparse one, with as many times more as it has
 # thousands of rows: what a first factor is refused by where the time is short.
 DENSE, SPARSE, SPARSE_ROWS = 1.5e-10, 1e-7, 1000.0
+SWEEP = 4e-9  # s for each nonzero of a sweep both ways and its slack, likewise
 SLOP = 8.0  # roundings of w within which a sign means nothing, as there
 
 
@@ -95,6 +96,9 @@ class PivotState:
         if self.factor is None:
             code, swept = rows.solve(start, sweeps, n)
             return code, rows.n_rounds - before, swept
+        if stop_at is not None and perf_counter() + sweeps * SWEEP * self.problem.csr_data.work > stop_at:
+            self.late = True
+            return ROUNDS, 0, False
         rows.solve(start, sweeps, 0)
         return *self.rounds(n, stop_at), True
 

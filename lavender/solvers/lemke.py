@@ -40,7 +40,9 @@ LIMIT = 2000  # rows: a dictionary of 32 MB
 TINY, FINER = 1e-11, 1e-13
 REGULAR = 1e-13  # -, reciprocal condition above which a block can be eliminated: the result is refined anyway
 STABLE = 1e-2  # -, a diagonal entry of this share of its row and column makes a fair pivot of its own
-BATCH = 200  # pivots between two looks at the clock; then the dictionary is formed anew, which drops what rounding left
+BATCH = 200  # pivots after which the dictionary is formed anew, which drops what rounding left
+CLOCK = 0.01  # s between two looks at the clock, at
+ENTRY, FORMED = 1e-9, 5e-10  # s for each entry of the dictionary in a pivot, and n^3 times to form it anew
 PATHS = 8  # covering vectors tried
 PIVOTS_A_ROW = 20  # on one path, before it counts as lost
 GOOD = 1e-12  # relative residual at which no other path is tried
@@ -272,12 +274,15 @@ class _Run:
         last = self.pivots + PIVOTS_A_ROW * n + BATCH
         self.count("paths")
         while True:
-            code, done = book.pivots(max(0, min(BATCH, self.budget - self.pivots)))
-            self.pivots += done
+            code, left = PIVOTS, max(0, min(BATCH, self.budget - self.pivots))
+            while code == PIVOTS and left and not self.late():
+                code, done = book.pivots(min(left, max(1, int(CLOCK / (ENTRY * n * n)))))
+                self.pivots += done
+                left -= done
             self.work["pivots"] = self.pivots
             if code != PIVOTS:
                 break
-            if self.pivots >= self.budget or (self.stop_at is not None and perf_counter() >= self.stop_at):
+            if self.pivots >= self.budget or self.late(FORMED * float(n) ** 3):
                 self.judge(self.form.impulse(*self.values(t, basic)))
                 return self.claim(Status.MAX_ITERATIONS if self.pivots >= self.budget else Status.TIME_LIMIT)
             entering = int(nonbasic[book.entering])
@@ -292,6 +297,10 @@ class _Run:
         self.message = ""
         self.finish(basic)
         return None
+
+    def late(self, more: float = 0.0) -> bool:
+        """The time is up, or would be `more` [s] from now."""
+        return self.stop_at is not None and perf_counter() + more >= self.stop_at
 
     def values(self, t: FloatArray, basic: IntArray) -> tuple[FloatArray, FloatArray]:
         """s, w (n,) of a dictionary."""
