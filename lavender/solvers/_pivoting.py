@@ -97,6 +97,7 @@ class PivotState:
             code, swept = rows.solve(start, sweeps, n)
             return code, rows.n_rounds - before, swept
         if stop_at is not None and perf_counter() + sweeps * SWEEP * self.problem.csr_data.work > stop_at:
+            rows.solve(start, 0, 0)
             self.late = True
             return ROUNDS, 0, False
         rows.solve(start, sweeps, 0)
