@@ -57,6 +57,7 @@ LAST = 8000  # sweeps that friction is left to where nothing else is left
 FEW_JOINTS = 300  # rows up to which a linear system is not looked at more closely
 RELAXED = 1e6  # ns that sweeps usually take from which Coulomb's law is relaxed first: a problem of its own
 GLANCE = 0.35  # share of a finite solver's cost for which a first look at sweeps is always worth it
+FRICTION_APART = 2.0  # times the cost of the whole that islands with friction may take
 GENERAL_STEPS = 256  # that it then has
 ROUND_SWEEPS = 1000  # of nncg on round cones given by A, before admm is asked
 CERTIFICATE_ROWS = 3000  # rows up to which a linear program is asked for a certificate
@@ -171,9 +172,17 @@ def _solve(trail: Trail, budget: int, glance: Glance | None = None) -> None:
         if sweeps.run(budget):
             return
     least = costs.exact[0].cost
-    if least > 2.0 * ISLAND and trail.apart_cost() < least and _apart(trail, budget):
+    if least > 2.0 * ISLAND and _worth_apart(trail, least) and _apart(trail, budget):
         return
     _finish(trail, sweeps, budget)
+
+
+def _worth_apart(trail: Trail, least: float) -> bool:
+    """Islands apart cost less than the whole; friction's may cost more, since each finds its own solver."""
+    if trail.islands[0] <= 1:
+        return False
+    friction = trail.problem.law in ("cone", "coulomb")
+    return trail.apart_cost() < (FRICTION_APART if friction else 1.0) * least
 
 
 def _at_once(costs: Costs) -> bool:
