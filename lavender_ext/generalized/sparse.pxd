@@ -2,7 +2,7 @@
 
 A row of Y has entries in a few chains of a tree, so N = I + Y^T V Y couples columns of one panel alone, and
 eliminating row k couples those that it has an entry in (`tree_pattern`): without contacts between branches the pattern
-is that of M's factor, 6 to 12 entries in a row of a hand or of an insect.
+is that of M's factor, some 12 entries in a row of an insect.
 
     val     entries left of the diagonal, row by row, then the diagonal
 """
@@ -14,7 +14,7 @@ from lavender_ext.core.generalized cimport generalized_t, tree_pattern
 cdef enum:
     PER_COLUMN = 24             # entries in a row of L for which there is room at first
     MANY = 200                  # columns from which on more room is made where that does not hold a pattern
-    SMALL = 8                   # columns up to which a dense factor costs less than to look for a pattern
+    SMALL = 40                  # columns up to which dense factors cost less than to look for a pattern: a hand's
 
 
 cdef inline ssize_t pattern_marks(ssize_t n, ssize_t reached, ssize_t per) noexcept nogil:

@@ -541,13 +541,13 @@ def test_nothing_of_the_judge_forms_a():
 @pytest.mark.parametrize("friction", ["coulomb", "cone", "lcp"])
 @settings(max_examples=15)
 def test_branches_are_factored_in_their_own_pattern(friction, seed):
-    """Sixty velocities in trees, some contacts between branches: few entries in a row of N, the solution of A."""
+    """Large trees, some contacts between branches: few entries in a row of N, the solution of A."""
     contacts = 0 if friction == "lcp" else 6
-    problem = random_general(seed, "cone" if friction == "lcp" else friction, n=60, contacts=contacts)
+    problem = random_general(seed, "cone" if friction == "lcp" else friction, n=200, contacts=contacts)
     kernel = general.prepare(problem)
     trees = np.bincount(problem.generalized.trees)
     if friction != "coulomb":  # whose matrix lacks symmetry and is kept whole
-        assert kernel.largest <= max(8, trees.max() // 2)
+        assert kernel.largest <= max(40, trees.max() // 2)
     solution = lv.solve(problem, "newton", form="velocity", tol=1e-11)
     assert solution.residual.relative <= 1e-11 or solution.residual.at_floor
     other = lv.solve(as_matrix(problem), "newton", tol=1e-11)
