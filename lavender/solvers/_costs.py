@@ -80,8 +80,9 @@ PER_ROW = {
     "cone": 0.0,
     "coulomb": 1.0 / 40.0,
 }  # more of them: contacts change their side
+TAIL_LEAST, TAIL_TIME = 6, 2e6  # of them at least under Coulomb's law, else as many as take so long [ns]
 BUDGET = {"linear": 2.0, "lcp": 2.0, "cone": 2.0, "coulomb": 1.2}  # times as many that its first turn has
-TAIL = {"linear": 2, "lcp": 10, "cone": 40, "coulomb": 6}  # more that are granted before another is asked
+TAIL = {"linear": 2, "lcp": 10, "cone": 40, "coulomb": 24}  # more that are granted before another is asked
 MOST = 30.0  # of what rows add
 GENERAL_COUNT = {"linear": 2.0, "lcp": 10.0, "cone": 12.0, "coulomb": 20.0}  # over generalised velocities
 ADMM_COUNT, ADMM_FACTORS = 80.0, 2.0  # iterations to six decades where it gets there, and how often rho moves
@@ -305,9 +306,14 @@ class Costs:
         cost = self._newton_guess if self._others_win else self._newton(self._newton_factor)
         p = self.problem
         form = () if p.generalized is None else (("form", "impulse"),)
-        limit = int(BUDGET[p.law] * self._newton_count) + TAIL[p.law]
+        limit = int(BUDGET[p.law] * self._newton_count)
         start = newton_rates(p)[0]
-        once = start + (cost - start) / self._newton_count
+        each = (cost - start) / self._newton_count
+        # To ask another and to come back costs time, too: small problems go on for longer.
+        limit += (
+            TAIL[p.law] if p.law != "coulomb" else int(min(TAIL[p.law], max(TAIL_LEAST, TAIL_TIME / each)))
+        )
+        once = start + each
         newton = Exact("newton", self.formed + cost, limit, form, self.formed + once)
         return sorted([*self._others, newton], key=lambda e: e.cost)
 
