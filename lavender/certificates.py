@@ -88,7 +88,8 @@ def _pull(problem: Problem, z: FloatArray, zero: FloatArray) -> FloatArray:
     contact, first, rim, spin = _rims(problem, z)
     pull[np.repeat(c.kind != ROW, np.diff(c.ptr))] = 0.0
     most = z[first] + c.mu[contact] * (rim + c.patch_radius[contact] * spin)
-    pull[first] = np.where(most > zero[first], np.inf, 0.0)
+    # What pulls along tangents alone is beyond its own zero already; against a normal it may be rounding.
+    pull[first] = np.where(most > np.where(z[first] == 0.0, 0.0, zero[first]), np.inf, 0.0)
     return pull
 
 

@@ -75,11 +75,11 @@ class Residual:
 
 
 def at_floor(relative: float, floor: float) -> bool:
-    """Whether a relative residual is within twice its floor, both finite, and no worse than doing nothing.
+    """Whether a relative residual is within twice its floor, both finite, and better than doing nothing.
 
     Above 1 the floor is that of an impulse that ran away: it says nothing of the problem.
     """
-    return relative <= 2.0 * floor < math.inf and relative <= 1.0
+    return relative <= 2.0 * floor < math.inf and relative < 1.0
 
 
 def relative_of(data: Any, energy: float, velocity: float) -> float:

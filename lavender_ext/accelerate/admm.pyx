@@ -161,7 +161,7 @@ cdef inline void project_round(int32_t n, const double* root, double mu, const d
     """The same of a round cone of n rows; core/block.pxd (8)."""
     cdef double t[3]
     cdef double a[3]
-    cdef double s = 0.0, size = 0.0
+    cdef double r = 0.0, size = 0.0
     cdef int32_t i, g, zone
     t[0] = t[1] = t[2] = 0.0
     a[0] = a[1] = a[2] = 0.0
@@ -169,10 +169,10 @@ cdef inline void project_round(int32_t n, const double* root, double mu, const d
         g = round_group(i)
         t[g] = norm2(t[g], u[i])
         a[g] = mu * root[i] / root[0]
-    zone = round_section(t, a, u[0], &s, &size)
-    z[0] = s if zone == 0 else (u[0] if zone > 0 else 0.0)
+    zone = round_section(t, a, u[0], &r, &size)
+    z[0] = (u[0] if u[0] > 0.0 else 0.0) + r if zone == 0 else (u[0] if zone > 0 else 0.0)
     for i in range(1, n):
-        z[i] = (round_share(a[round_group(i)], s, u[0]) if zone == 0 else (1.0 if zone > 0 else 0.0)) * u[i]
+        z[i] = (round_share(a[round_group(i)], r, u[0]) if zone == 0 else (1.0 if zone > 0 else 0.0)) * u[i]
 
 
 cdef inline void project_block(const blocks_t* p, const double* root, int32_t i, const double* u,

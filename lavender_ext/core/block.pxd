@@ -170,17 +170,37 @@ cdef inline double opening(double mu, double rt, double rn) noexcept nogil:
     return a if a <= 1.7976931348623157e308 else 1.7976931348623157e308
 
 
-cdef inline double wide_part(double yn, double a, double t, double b) noexcept nogil:
-    # b (yn + a t) / (1 + a^2), where a^2 or a t may overflow
-    return (yn / a + t) * (b / a) if a > 1e140 else b * ((yn + a * t) / (1.0 + a * a))
+cdef inline double closing(double a, double mu, double rt, double rn) noexcept nogil:
+    # 1 / a of `opening`, also where a is beyond the largest number
+    if a < 1.7976931348623157e308:
+        return 1.0 / a
+    return rn / rt / mu if mu >= 1.0 else rn / mu / rt
 
 
-cdef inline double wide_cone(double normal, double at, double t, double as_, double ys, double* bound_t,
-                             double* bound_s) noexcept nogil:
-    """s of (7), a_t s and a_s s where a cone is so wide that a^2 overflows: s b is what keeps its digits, b the wider."""
-    cdef double b = at if at > as_ else as_
-    cdef double p = at / b, q = as_ / b, inv = 1.0 / b
-    cdef double sb = 0.0, c, yn, size = fabs(normal)
+cdef inline void wide_part(double yn, double a, double inverse, double t, double inv, double* s, double* sb) noexcept nogil:
+    # (yn + a t) / (1 + a^2), where a^2 or a t may overflow, and its b-fold: taken where it is the larger
+    cdef double x, y
+    if a > 1e140:
+        x = yn * inverse + t
+        y = x * (inverse / inv if inverse > inv else 1.0)
+        x = x * inverse
+    else:
+        x = (yn + a * t) / (1.0 + a * a)
+        y = x / inv
+    if x > s[0] or y > sb[0]:
+        s[0] = x
+        sb[0] = y
+
+
+cdef inline double wide_cone(double normal, double at, double in_t, double t, double as_, double in_s, double ys,
+                             double* bound_t, double* bound_s) noexcept nogil:
+    """s of (7), a_t s and a_s s where a cone is so wide that a^2 overflows: s b is what keeps its digits, b the wider.
+
+    in_t, in_s: 1 / a_t and 1 / a_s, for a itself may be beyond the largest number.
+    """
+    cdef double inv = in_t if in_t < in_s else in_s                     # 1 / b
+    cdef double p = inv / in_t if in_t > inv else 1.0, q = inv / in_s if in_s > inv else 1.0
+    cdef double sb = 0.0, c = 0.0, x, yn, size = fabs(normal)
     size = t if t > size else size
     size = ys if ys > size else size
     if not 0.0 < size <= 1.7976931348623157e308:
@@ -189,17 +209,14 @@ cdef inline double wide_cone(double normal, double at, double t, double as_, dou
     t = t / size
     ys = ys / size
     if yn > 0.0:
-        sb = yn * b
-    c = wide_part(yn, at, t, b)
-    if c > sb:
-        sb = c
-    c = wide_part(yn, as_, ys, b)
-    if c > sb:
-        sb = c
-    c = (yn * inv + p * t + q * ys) / (inv * inv + p * p + q * q)
-    if c > sb:
-        sb = c
-    c = yn if yn > 0.0 and sb == yn * b else sb * inv
+        c = yn
+        sb = yn / inv
+    wide_part(yn, at, in_t, t, inv, &c, &sb)
+    wide_part(yn, as_, in_s, ys, inv, &c, &sb)
+    x = (yn * inv + p * t + q * ys) / (inv * inv + p * p + q * q)
+    if x > sb:
+        sb = x
+        c = x * inv
     bound_t[0] = (p * sb if at > 1e140 else at * c) * size
     bound_s[0] = (q * sb if as_ > 1e140 else as_ * c) * size
     return normal if c == yn else c * size
@@ -234,7 +251,8 @@ cdef inline void project_error(const double* lam, const double* w, const double*
             as_ = opening(mu * (rs / rn), patch_radius, 1.0)
         ys = weighed(lam[js], w[js], d[js], rs)
     if at > 1e140 or as_ > 1e140:
-        s = wide_cone(yn, at, t, as_, fabs(ys), &bound_t, &bound_s)
+        s = wide_cone(yn, at, closing(at, mu, rt, rn), t, as_, closing(as_, mu * patch_radius, rs, rn), fabs(ys),
+                      &bound_t, &bound_s)
     else:
         s = yn if yn > 0.0 else 0.0
         c = (yn + at * t) / (1.0 + at * at)
@@ -273,14 +291,20 @@ cdef inline void project_error(const double* lam, const double* w, const double*
 
 cdef inline void cone_error(const double* lam, const double* w, const double* d, double mu,
                             double patch_radius, int32_t nt, int32_t spin, double* e) noexcept nogil:
-    # (7) is homogeneous: where all of lam and w / d would vanish, 2^600 times both, so that their ratios decide.
-    cdef double up = 4.149515568880993e180          # 2^600
-    cdef double big[8]
+    # (7) is homogeneous: where all of lam and w / d would vanish, 2^600 times both, so that their ratios decide, and
+    # 2^-600 times both where some w / sqrt(d) would overflow.
+    cdef double up = 1.0, big[8]
     cdef int32_t i, n = 1 + nt + spin
+    cdef bint small = True
     for i in range(n):
-        if not (fabs(lam[i]) < 1e-290 and fabs(w[i]) < 1e-290 * d[i]):
-            project_error(lam, w, d, mu, patch_radius, nt, spin, e)
-            return
+        small = small and fabs(lam[i]) < 1e-290 and fabs(w[i]) < 1e-290 * d[i]
+        if fabs(w[i]) > 1e140 and fabs(w[i]) / sqrt(d[i]) > 1.7976931348623157e308:
+            up = 2.409919865102884e-181                 # 2^-600
+    if small:
+        up = 4.149515568880993e180                      # 2^600
+    if up == 1.0:
+        project_error(lam, w, d, mu, patch_radius, nt, spin, e)
+        return
     for i in range(n):
         big[i] = up * lam[i]
         big[4 + i] = up * w[i]
@@ -294,20 +318,28 @@ cdef inline int32_t round_group(int32_t tangent) noexcept nogil:
     return 0 if tangent < 3 else (1 if tangent == 3 else 2)
 
 
-cdef inline int32_t round_section(const double* t, const double* a, double yn, double* section, double* size) noexcept nogil:
-    # Where y lies, by T_g in t (3) and a_g in a (3): -1 in the polar cone, 1 in the cone, else 0 and the s of (8);
+cdef inline double round_rest(double a, double yn) noexcept nogil:
+    # q of (8) without its part of r
+    return a * a * yn if yn > 0.0 else -yn
+
+
+cdef inline int32_t round_section(const double* t, const double* a, double yn, double* rise, double* size) noexcept nogil:
+    # Where y lies, by T_g in t (3) and a_g in a (3): -1 in the polar cone, 1 in the cone, else 0 and the r of (8);
     # size: of the tangents against the cone, NaN where y is.
-    #     sum (a_g T_g)^2 / ((1 + a_g^2) s - y_n)^2 = 1,        Pi_g = y_g a_g^2 s / ((1 + a_g^2) s - y_n)       (8)
-    # by Newton's method from below: the left side falls and is convex.
-    cdef double s = 0.0, f, h, slope, q, inside = 0.0, polar = 0.0
+    #     s = max(0, y_n) + r,     q_g = (1 + a_g^2) s - y_n = (1 + a_g^2) r + (a_g^2 y_n if y_n > 0 else -y_n)
+    #     sum (a_g T_g)^2 / q_g^2 = 1,     Pi_n = s,     Pi_g = y_g a_g^2 s / q_g                            (8)
+    # by Newton's method from below: the left side falls and is convex. In r, since in a narrow cone s - y_n has lost
+    # the digits of q.
+    cdef double r = 0.0, f, h, slope, q, inside = 0.0, polar = 0.0
     cdef int32_t g, _step
     for g in range(3):
         if t[g] > 0.0:
             inside = norm2(inside, t[g] / a[g])         # infinite without friction
             polar = norm2(polar, a[g] * t[g])
-            f = (yn + a[g] * t[g]) / (1.0 + a[g] * a[g])
-            if f > s:
-                s = f
+            f = a[g] * (t[g] - a[g] * yn) if yn > 0.0 else yn + a[g] * t[g]
+            f = f / (1.0 + a[g] * a[g])
+            if f > r:
+                r = f
     size[0] = inside
     if inside <= yn:
         return 1
@@ -319,53 +351,56 @@ cdef inline int32_t round_section(const double* t, const double* a, double yn, d
             slope = 0.0
             for g in range(3):
                 if t[g] > 0.0:
-                    q = (1.0 + a[g] * a[g]) * s - yn
+                    q = (1.0 + a[g] * a[g]) * r + round_rest(a[g], yn)
                     f = a[g] * t[g] / q
                     h += f * f
                     slope += 2.0 * f * f * (1.0 + a[g] * a[g]) / q
             if not h > 0.0:
                 break
-            f = s + h / slope
-            if not f > s:
+            f = r + h / slope
+            if not f > r:
                 break
-            s = f
-    section[0] = s
+            r = f
+    rise[0] = r
     return 0
 
 
-cdef inline double round_share(double a, double s, double yn) noexcept nogil:
+cdef inline double round_share(double a, double rise, double yn) noexcept nogil:
     # Pi_g / y_g of (8)
-    return a * a * s / ((1.0 + a * a) * s - yn) if a > 0.0 else 0.0
+    cdef double q = (1.0 + a * a) * rise + round_rest(a, yn)
+    return a * (a * ((yn if yn > 0.0 else 0.0) + rise) / q) if q > 0.0 else 0.0
+
+
+cdef inline double round_loss(double a, double rise, double yn) noexcept nogil:
+    # 1 - Pi_g / y_g of (8), by its own digits
+    cdef double q = (1.0 + a * a) * rise + round_rest(a, yn)
+    return (rise if yn > 0.0 else rise - yn) / q if q > 0.0 else 1.0
 
 
 cdef inline void round_error(const double* lam, const double* w, const double* d, double mu, int32_t nt,
                              double* e) noexcept nogil:
-    # (7) of ROUND, |lam_T| <= mu lam_n over all tangents together. Groups g (slide, spin, roll) have one d each: with
-    # y = sqrt(d) (lam - w / d), T_g = |y_g|, a_g = mu sqrt(d_g / d_n) the projection's normal part is the s of (8).
+    # (7) of ROUND, |lam_T| <= mu lam_n over all tangents together. Groups g (slide, spin, roll) have one d each: (8)
+    # with y = sqrt(d) (lam - w / d), T_g = |y_g|, a_g = mu sqrt(d_g / d_n).
     cdef double t[3]
     cdef double a[3]
-    cdef double rn = sqrt(d[0]), yn = rn * (lam[0] - w[0] / d[0]), y, s = 0.0, f, inside = 0.0
+    cdef double rn = sqrt(d[0]), yn = weighed(lam[0], w[0], d[0], rn), y, r = 0.0, f, inside = 0.0
     cdef int32_t i, g, zone
     t[0] = t[1] = t[2] = 0.0
     a[0] = a[1] = a[2] = 0.0
     for i in range(1, 1 + nt):
         g = round_group(i)
-        y = sqrt(d[i]) * (lam[i] - w[i] / d[i])
-        t[g] = norm2(t[g], y)
+        t[g] = norm2(t[g], weighed(lam[i], w[i], d[i], sqrt(d[i])))
         a[g] = mu * sqrt(d[i]) / rn
-    zone = round_section(t, a, yn, &s, &inside)
-    if zone > 0:
-        for i in range(1 + nt):
-            e[i] = w[i] / d[i]
-        return
-    if zone < 0:
-        for i in range(1 + nt):
-            e[i] = lam[i]
-        return
-    e[0] = lam[0] - s / rn
-    for i in range(1, 1 + nt):
-        f = round_share(a[round_group(i)], s, yn)
-        e[i] = lam[i] - f * (lam[i] - w[i] / d[i])
+    zone = round_section(t, a, yn, &r, &inside)
+    for i in range(1 + nt):
+        e[i] = lam[i] if zone < 0 else quotient(w[i], d[i])
+    if zone == 0:
+        # lam - Pi as w / d and what the projection adds, where that is the smaller part
+        e[0] = (e[0] if yn > 0.0 else lam[0]) - r / rn
+        for i in range(1, 1 + nt):
+            f = round_share(a[round_group(i)], r, yn)
+            y = lam[i] - e[i]
+            e[i] = e[i] + round_loss(a[round_group(i)], r, yn) * y if f > 0.5 else lam[i] - f * y
     if not (yn == yn and inside == inside):
         e[0] = yn + inside                              # NaN: comparisons above would hide it
 

@@ -814,9 +814,10 @@ cdef inline void level(const flow_t* f, int32_t island) noexcept nogil:
 
 
 cdef inline void restart(flow_t* f, int32_t island, const double* lam) noexcept nogil:
-    """y = Y^T lam and the centre at lam."""
+    """y = Y^T lam and the centre at lam, the best until a descent finds a better."""
     cdef int32_t a, c
     keep(f, island, lam, f.lam)
+    keep(f, island, lam, f.best)                        # errors that overflow are no better than infinity
     follow(f, island)
     f.still = not gather(f, island, lam, f.u)
     for a in range(f.cptr[island], f.cptr[island + 1]):
@@ -890,7 +891,6 @@ cdef inline int32_t solve_island(flow_t* f, int32_t island, double* impulse, bin
         end = with_coulomb(f, island, impulse, cold, soft, &least)
         keep(f, island, f.first_best, impulse)
     else:
-        keep(f, island, impulse, f.best)
         end = descend(f, island, 1.0, &share, &least)
         keep(f, island, f.best, impulse)
     return end

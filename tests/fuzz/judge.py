@@ -258,25 +258,32 @@ class Problem:
             inside = normal >= 0 and ((size / a) ** 2).sum() <= normal * normal
             top, scale = ZERO, np.zeros(len(y), L)
             if not inside and normal + np.sqrt(((a * size) ** 2).sum()) > 0:
+                # top = base + rise: a narrow cone's (1 + a a) top - normal would lose its digits
+                base = max(ZERO, normal)
+                rest = a * a * normal if normal > 0 else np.full(len(y), -normal)
 
-                def excess(s):
-                    return ((a * size / ((1 + a * a) * s - normal)) ** 2).sum() - 1
+                def excess(rise):
+                    return ((a * size / ((1 + a * a) * rise + rest)) ** 2).sum() - 1
 
-                low = max(ZERO, ((normal + a * size) / (1 + a * a)).max())
+                low = max(ZERO, ((a * size - rest) / (1 + a * a)).max())
                 high = low + size.sum() + abs(normal) + NORMAL
                 for _ in range(130):
                     if not excess(high) > 0:
                         break
                     high = 2 * high
-                for _ in range(130):
-                    top = (low + high) / 2
-                    low, high = (top, high) if excess(top) > 0 else (low, top)
-                scale = a * a * top / ((1 + a * a) * top - normal)
+                for _ in range(200):
+                    rise = (low + high) / 2
+                    low, high = (rise, high) if excess(rise) > 0 else (low, rise)
+                top = base + rise
+                scale = a * a * top / ((1 + a * a) * rise + rest)
+                loss = (top - normal if normal <= 0 else rise) / ((1 + a * a) * rise + rest)
         if inside:
             return step.copy()
         e = np.empty(len(lam), L)
-        e[0] = lam[0] - top / root[0]
+        e[0] = step[0] - rise / root[0] if scale.any() and normal > 0 else lam[0] - top / root[0]
         e[1:] = lam[1:] - y * scale / root[1:]
+        if scale.any():
+            e[1:] = np.where(scale > 0.5, step[1:] + loss * (lam[1:] - step[1:]), e[1:])
         return e
 
     def norms(self, e):
@@ -313,6 +320,7 @@ class Problem:
             energy0, velocity0 = rhs_energy, rhs_velocity
         # An error w / d of the start that float64 holds no number for: there is nothing to be better than.
         nothing |= bool(energy0 <= 2 * NORMAL * np.sqrt(self.d.sum()))
+        nothing |= bool(velocity0 <= 2 * NORMAL * np.sqrt(self.nu * self.d).max(initial=ZERO))
         f = L(2.0) ** -53 * size
         rounded = L(2.0) ** -53 * self.d * np.abs(lam)  # of lambda - Pi, where d is not A_ii
         more = self.roundings * (f + rounded + DENORMAL * (1 + np.abs(lam).max(initial=ZERO)))
