@@ -9,6 +9,7 @@ Environment:
                             begin with it, since an index shows the text alone
 """
 
+import gc
 import gzip
 import json
 import logging
@@ -37,16 +38,29 @@ DIRECTIVES = OPTIONS["directives"](debug=DEBUG)
 #: Holds what Cython would otherwise write into every module (memoryviews): half of all that is compiled.
 SHARED = "lavender_ext._utility"
 
-LINK_ARGS, PLAIN = [], []
+#: Modules whose loops take the update of a block whole, however much they have inlined before it: with gcc's own limits
+#: 2 to 12 % more instructions, elsewhere within 0.7 %, in two thirds of the time.
+WHOLE = ("sweep/", "local/", "judge/", "engine/substep", "warm/substep")
+#: Modules without a loop that counts.
+COLD = (
+    "_utility",
+    "host/",
+    "engine/arrays",
+    "generalized/export",
+    "core/order",
+    "factor/graph",
+    "factor/symbolic",
+)
+
+LINK_ARGS, INLINE, LIMITS = [], [], []
 if sys.platform == "win32":
     COMPILE_ARGS = ["/Od", "/fp:precise"] if DEBUG else ["/O2", "/fp:precise"]
 else:
-    # The update of a block goes into the sweep's loop whole, however much a module has inlined before it: 7 to 20 %
-    # of a sweep with gcc, 2 to 4 % of a step of Newton or of the engine, no change of bits.
-    INLINE = ["-finline-limit=2000", "--param=inline-unit-growth=100"]
-    COMPILE_ARGS = ["-O1", "-g"] if DEBUG else ["-O3", "-g0", *INLINE]
-    # What Cython shares has no loop of ours: the compiler's own limits, in under half of the time.
-    PLAIN = [] if DEBUG else ["-O2", "-finline-limit=600", "--param=inline-unit-growth=40"]
+    # -w: .ci/check_kernels.py reads the C for warnings, which cost a twentieth of the time.
+    COMPILE_ARGS = ["-O1", "-g"] if DEBUG else ["-O3", "-g0", "-w"]
+    if not DEBUG:
+        INLINE = ["-finline-limit=2000", "--param=inline-unit-growth=100"]
+        LIMITS = ["-finline-limit=600", "--param=inline-unit-growth=40"]
     COMPILE_ARGS += [*OPTIONS["COMPILE_FLAGS"], "-Wno-unused-function"]
     if MODE == "asan":
         LINK_ARGS = ["-fsanitize=address,undefined", "-fno-sanitize-recover=undefined"]
@@ -60,11 +74,14 @@ class BuildKernels(build_ext):
         """Translate, then compile; everything anew when flags or directives are others than last time."""
         out = Path("build", "cython")
         stamp = out / "how.json"
-        how = json.dumps([Cython.__version__, SHARED, DIRECTIVES, COMPILE_ARGS, LINK_ARGS])
+        how = json.dumps(
+            [Cython.__version__, SHARED, DIRECTIVES, COMPILE_ARGS, LINK_ARGS, INLINE, LIMITS, WHOLE, COLD]
+        )
         if not (stamp.exists() and stamp.read_text() == how):
             self.force = True  # file times do not tell
         workers = os.cpu_count() or 1
         forks = multiprocessing.get_start_method() == "fork"  # elsewhere workers would run this file anew
+        gc.disable()  # trees of nodes that live to the end: looking through them is two fifths of the translation
         translated = cythonize(
             self.extensions,
             build_dir=str(out),
@@ -73,6 +90,7 @@ class BuildKernels(build_ext):
             nthreads=workers if forks else 0,
             shared_utility_qualified_name=SHARED,
         )
+        gc.enable()
         for extension, c_extension in zip(self.extensions, translated, strict=True):
             extension.sources = c_extension.sources
             extension.depends = c_extension.depends
@@ -156,12 +174,15 @@ class ReproducibleArchive(sdist):
 build.sub_commands = [*build.sub_commands, ("build_wasm", None)]
 
 
-def extension(path, *more):
+def extension(path):
     """One module, named after its file."""
+    name = path.relative_to("lavender_ext").as_posix()
+    limits = INLINE if name.startswith(WHOLE) else LIMITS
+    level = ["-O2"] if limits and name.startswith(COLD) else []
     return Extension(
         ".".join(path.with_suffix("").parts),
         [path.as_posix()],
-        extra_compile_args=[*COMPILE_ARGS, *more],
+        extra_compile_args=[*COMPILE_ARGS, *level, *limits],
         extra_link_args=LINK_ARGS,
     )
 
@@ -181,7 +202,7 @@ setup(
     ext_modules=[
         *(extension(path) for path in sorted(Path("lavender_ext").rglob("*.pyx"))),
         # cythonize writes it
-        extension(Path(*SHARED.split(".")).with_suffix(".c"), *PLAIN),
+        extension(Path(*SHARED.split(".")).with_suffix(".c")),
     ],
     cmdclass={"build_ext": BuildKernels, "build_wasm": BuildWasm, "sdist": ReproducibleArchive},
 )
