@@ -152,7 +152,7 @@ def _spec(backend: Backend) -> SolverSpec:
         external=True,
         impulse=backend.warm,
         max_iter=backend.max_iter,
-        options=OPTIONS if backend.stoppable else {**OPTIONS, **ISOLATE},
+        options={**OPTIONS, **ISOLATE},
         requires=backend.modules,
         install=backend.install,
         summary=f"{backend.summary} (QP backend)",

@@ -26,7 +26,9 @@ OPTIONS = {
     "unit_diagonal": "impulse form: scale A to a unit diagonal, default True",
     "settings": "mapping passed to the backend, over those that tol gives",
 }
-ISOLATE = {"isolate": "run in a process of its own where a time_limit is given, which ends it; default True"}
+ISOLATE = {
+    "isolate": "a backend that takes no limit runs in a process of its own where a time_limit is given; default True"
+}
 
 
 @dataclass
