@@ -140,7 +140,8 @@ def check_not_nan(what: str, array: np.ndarray) -> None:
 
 
 def check_not_negative(what: str, array: np.ndarray) -> None:
-    if array.size and array.min() < 0:
+    plain = array.ndim == 1 and array.dtype is _PLAIN[np.float64] and array.flags.c_contiguous
+    if gate.has_negative(array) if plain else array.size and array.min() < 0:
         i = int(np.argmin(array))
         raise InputError(f"{what} must not be negative; entry [{i}] is {array[i]}")
 

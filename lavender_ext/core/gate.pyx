@@ -38,3 +38,12 @@ def plain(value, tuple shape, bint finite, bint copy):
     made = value.copy() if copy else value
     made.setflags(write=False)
     return made
+
+
+def has_negative(const double[::1] x):
+    """Whether any number is below 0."""
+    cdef Py_ssize_t i
+    for i in range(x.shape[0]):
+        if x[i] < 0.0:
+            return True
+    return False
