@@ -22,10 +22,8 @@ from lavender_ext.few.looks import sweeps_left
 __all__ = ["Glance", "Sweeps", "look_first", "race"]
 
 SWEEPER = "anderson"  # whose sweeps come first
-# Share of a finite solver's cost that sweeps may take that promise to need longer: as many times less as they need
-# longer, so many times at most.
-HOPE, MOST_TIMES = 0.5, 5.0
-BELIEVED = 1.0  # times a finite solver's cost that sweeps may take, whatever they promise
+HOPE = 0.25  # share of a finite solver's cost that sweeps may take without promising an end
+BELIEVED = 2.0  # times a finite solver's cost that sweeps may take, whatever they promise
 APART = 10.0  # islands' worth of Python from which a finite solver is compared with islands solved apart
 PORTION = 0.25  # of a time limit that sweeps may take that will not get there within it
 LEAD = 0.5  # of the cost that sweeps promise, that those of the relaxation must promise to go before them
@@ -198,8 +196,7 @@ class Sweeps:
 
         def than(other: float) -> bool:
             # What was promised before and did not come about is not believed for ever.
-            times = min(rest / other, MOST_TIMES)
-            return (times > 1.0 and spent * times > HOPE * other) or spent > BELIEVED * other
+            return (rest > other and spent > HOPE * other) or spent > BELIEVED * other
 
         factored = self.trail.problem.law in ("linear", "lcp")
         if factored and self.done * self.per > PORTION * self.trail.limit and self.too_late:
