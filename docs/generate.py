@@ -517,7 +517,8 @@ def measured_page(site, records, figures):
         ),
     ]
     site.write("measured.md", "\n\n".join(parts))
-    site.write("parts/advice_by_law.md", table(("", *(f"to {level_name(x)}" for x in LEVELS)), first))
+    by_law = table(("", *(f"to {level_name(x)}" for x in LEVELS)), first)
+    site.write("parts/advice_by_law.md", f":::{{container}} wide\n{by_law}\n:::")
 
 
 # -- examples, scenes, cases, parts -----------------------------------------------------------------

@@ -380,6 +380,72 @@ cdef public int32_t lav_pivot_rounds(pivoting_t* s, int32_t rounds) noexcept nog
     return ROUNDS
 
 
+cdef public int32_t lav_pivot_solve(pivoting_t* s, const double* start, int32_t sweeps, int32_t n,
+                                    int32_t* swept) noexcept nogil:
+    """A boxed problem, as `Pivoting.solve` says; the outcome."""
+    cdef int32_t i
+    # Multiply-adds: (band + 1)^2 / 2 a row against two for each nonzero and sweep.
+    cdef bint cheap = s.band >= 0 and n > 0 and s.n > 0 and (
+        (s.band + 1.0) * (s.band + 1) * s.n <= 4.0 * sweeps * s.a.indptr[s.n])
+    swept[0] = not (cheap and lav_pivot_all_free(s))
+    if not swept[0]:
+        s.n_rounds += 1
+        return SOLVED
+    for i in range(s.n):
+        s.x[i] = start[i]
+    lav_pivot_sweep(s, sweeps)
+    lav_pivot_slack(s)
+    lav_pivot_predict(s)
+    return lav_pivot_rounds(s, n)
+
+
+cdef inline void lay_out(pivoting_t* s, const csr_t* a, const blocks_t* p, int32_t band, const int32_t* order, double tiny,
+                         double* real, int32_t* whole) noexcept nogil:
+    # real: 6 m numbers and the factor's; whole: 2 m, zero; order: NULL as they stand
+    cdef int32_t i, m = p.n_rows
+    s.a = a
+    s.p = p
+    s.n = m
+    s.band = band
+    s.tiny = tiny
+    s.order = order
+    s.natural = 1
+    if order != NULL:
+        for i in range(m):
+            s.natural &= order[i] == i
+    s.x = real
+    s.w = real + m
+    s.f = real + 2 * m
+    s.center = real + 3 * m
+    s.y = real + 4 * m
+    s.size = real + 5 * m
+    s.c = real + 6 * m
+    s.at = whole
+    s.place = whole + m
+
+
+cdef inline void begin(pivoting_t* s, double shift) noexcept nogil:
+    s.shift = shift
+    s.is_factored = 0
+    s.best = s.n + 1
+    s.patience = PATIENCE
+
+
+cdef public int32_t lav_pivot_boxed(const blocks_t* p, const csr_t* a, int32_t band, const int32_t* order, double tiny,
+                                    const double* start, int32_t sweeps, int32_t n, double* real,
+                                    int32_t* whole) noexcept nogil:
+    """A whole solve for a host without Python, in room of 6 m + m (band + 1) + 1 and 2 m numbers; x, w come first."""
+    cdef pivoting_t s
+    cdef int32_t swept, code
+    lay_out(&s, a, p, band, order, tiny, real, whole)
+    s.is_half_solved = s.exchanged = s.factorisations = s.n_rounds = 0
+    no_pivots(&s.found)
+    begin(&s, 0.0)
+    code = lav_pivot_solve(&s, start, sweeps, n, &swept)
+    lav_pivot_slack(&s)
+    return code
+
+
 def bandwidth(const int32_t[::1] indptr, const int32_t[::1] indices):
     """(lower, upper) bandwidth of a canonical CSR matrix, from the ends of its rows."""
     cdef Py_ssize_t i, n = indptr.shape[0] - 1
@@ -468,7 +534,7 @@ cdef class Pivoting:
     cdef object reals, ints, order
 
     def __init__(self, Data p, int band, order, double tiny):
-        cdef int32_t m = p.blocks.n_rows, i
+        cdef int32_t m = p.blocks.n_rows
         cdef int64_t room = 1 if band < 0 else <int64_t>m * (band + 1) + 1
         cdef const int32_t[::1] given
         cdef double[::1] reals
@@ -477,35 +543,19 @@ cdef class Pivoting:
         self.reals = np.empty(6 * m + room)
         self.ints = np.zeros(2 * m + 1, np.int32)
         reals, ints = self.reals, self.ints
-        cdef double* base = &reals[0]
+        cdef const int32_t* first = NULL
         if p.factored:
             raise ValueError("Pivoting reads A in compressed rows")
         self.p = p
         self.order = order
-        self.s.a = &p.csr
-        self.s.p = &p.blocks
-        self.s.n = m
-        self.s.band = band
-        self.s.tiny = tiny
-        self.s.natural = 1
         if order is not None:
             given = order
             if given.shape[0] != m:
                 raise ValueError("order must name every row once")
-            for i in range(m):
-                self.s.natural &= given[i] == i
             if m:
-                self.s.order = &given[0]
-        self.s.x = base
-        self.s.w = base + m
-        self.s.f = base + 2 * m
-        self.s.center = base + 3 * m
-        self.s.y = base + 4 * m
-        self.s.size = base + 5 * m
-        self.s.c = base + 6 * m
-        self.s.at = &ints[0]
-        self.s.place = &ints[0] + m
-        self.start(0.0)
+                first = &given[0]
+        lay_out(&self.s, &p.csr, &p.blocks, band, first, tiny, &reals[0], &ints[0])
+        begin(&self.s, 0.0)
 
     @property
     def x(self):
@@ -539,9 +589,7 @@ cdef class Pivoting:
 
     def start(self, double shift):
         """A fresh count of infeasible rows, with this shift; nothing factored."""
-        self.s.shift = shift
-        self.s.is_factored = 0
-        self.restart()
+        begin(&self.s, shift)
 
     def renew(self):
         """As if made anew: no row at a bound, nothing factored, nothing counted."""
@@ -591,21 +639,10 @@ cdef class Pivoting:
         Where that costs less than the sweeps all rows free first, which may be the end of it. Else `sweeps` symmetric
         sweeps from `start` (m,), the rows free that they leave free, and at most n rounds.
         """
-        cdef int32_t i, code = SOLVED, swept
-        # Multiply-adds: (band + 1)^2 / 2 a row against two for each nonzero and sweep.
-        cdef bint cheap = self.s.band >= 0 and n > 0 and self.s.n > 0 and (
-            (self.s.band + 1.0) * (self.s.band + 1) * self.s.n <= 4.0 * sweeps * self.p.csr.indptr[self.s.n])
+        cdef int32_t code, swept
+        cdef const double* first = &start[0] if self.s.n else NULL
         with nogil:
-            swept = not (cheap and lav_pivot_all_free(&self.s))
-            if swept:
-                for i in range(self.s.n):
-                    self.s.x[i] = start[i]
-                lav_pivot_sweep(&self.s, sweeps)
-                lav_pivot_slack(&self.s)
-                lav_pivot_predict(&self.s)
-                code = lav_pivot_rounds(&self.s, n)
-            else:
-                self.s.n_rounds += 1
+            code = lav_pivot_solve(&self.s, first, sweeps, n, &swept)
         return code, bool(swept)
 
     def slack(self):

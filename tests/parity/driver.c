@@ -3,7 +3,8 @@
  *     driver DATA        DATA is written by tests/parity/export.py
  *
  * A line is NAME HASH, then "same" or where the first bit differs from what the installed extension made of it. The hash
- * runs over all arrays of the engine after every step (where Newton's method solves, over its work, too), or over d, nu, step, impulse, slack, error and sums of a problem.
+ * runs over all arrays of the engine after every step (where Newton's method solves, over its work, too), or over d, nu, step, impulse, slack, error and sums of
+ * a problem; of one that `direct` pivots with its own factorisation over outcome, impulse and slack.
  * Only kernels are called: no libm, no Python, and nothing is computed here.
  */
 #include <stdint.h>
@@ -47,6 +48,9 @@ void lav_pgs_sweeps(const blocks_t *p, const csr_t *a, double *lam, int32_t *ord
 void lav_judge_rows(const blocks_t *p, const rows_t *r, const double *lam, double *w, double *e, double *v, int32_t floor,
                     score_t *out);
 void lav_judge_csr(const blocks_t *p, const csr_t *a, const double *lam, double *w, double *e, int32_t floor, score_t *out);
+
+int32_t lav_pivot_boxed(const blocks_t *p, const csr_t *a, int32_t band, const int32_t *order, double tiny, const double *start,
+                        int32_t sweeps, int32_t n, double *real, int32_t *whole);
 
 static FILE *file;
 
@@ -215,6 +219,27 @@ static int problem(uint64_t *hash) {
   return wrong;
 }
 
+/* A boxed problem by pivoting; 1 where outcome, x or w are not those of the extension. */
+static int pivoted(uint64_t *hash) {
+  int64_t blocks = number(), rows = number(), band = number(), sweeps = number(), rounds = number(), code;
+  double *tiny = array(0);
+  int32_t *ptr = array(0), *kind = array(0), *order = array(0);
+  double *lower = array(0), *upper = array(0), *mu = array(0), *patch = array(0), *b = array(0), *d = array(0);
+  double *nu = array(0), *step = array(0);
+  double *start = array(0), *real = room(8 * (size_t)(6 * rows + rows * (band + 1) + 1));
+  int32_t *whole = room(4 * (size_t)(2 * rows + 1));
+  csr_t a;
+  a.indptr = array(0), a.indices = array(0), a.data = array(0);
+  blocks_t p = {(int32_t)blocks, (int32_t)rows, 0, ptr, kind, lower, upper, mu, patch, b, d, nu, step};
+  code = lav_pivot_boxed(&p, &a, (int32_t)band, order, *tiny, start, (int32_t)sweeps, (int32_t)rounds, real, whole);
+  int wrong = code != number();
+  wrong |= memcmp(real, array(0), 8 * (size_t)rows) != 0;
+  wrong |= memcmp(real + rows, array(0), 8 * (size_t)rows) != 0;
+  *hash = mix(*hash, &code, 8);
+  *hash = mix(*hash, real, 16 * (size_t)rows);
+  return wrong;
+}
+
 int main(int argc, char **argv) {
   int64_t n, i, differs = -1;
   int32_t layout[256];
@@ -234,6 +259,11 @@ int main(int argc, char **argv) {
   for (i = 0; i < n; i++)
     if (problem(&hash) && differs < 0) differs = i + 1;
   snprintf(told, sizeof told, "%lld problems", (long long)n);
+  say(told, hash, differs, "problem");
+  n = number(), hash = 1, differs = -1;
+  for (i = 0; i < n; i++)
+    if (pivoted(&hash) && differs < 0) differs = i + 1;
+  snprintf(told, sizeof told, "%lld pivoted problems", (long long)n);
   say(told, hash, differs, "problem");
   return 0;
 }

@@ -22,11 +22,15 @@ from record import NEWTON_SCENES, NEWTON_STEPS, SCENES, STEPS, problems  # noqa:
 
 import lavender as lv  # noqa: E402
 from lavender.ordering import block_order  # noqa: E402
+from lavender.solvers._factor import TINY, choose  # noqa: E402
+from lavender.solvers.direct import SWEEPS as GUESSES  # noqa: E402
 from lavender_ext.host import memory  # noqa: E402
+from lavender_ext.pivot.principal import Pivoting, scan  # noqa: E402
 
 MAGIC = b"LAOVPAR1"
 ROWS = ("jac", "normal", "tangent", "arm_a", "arm_b", "inv_mass", "inv_inertia")
 SWEEPS = ((1, "given"), (7, None), (40, "given"))
+ROUNDS = 40  # of pivoting
 
 
 def numbers(*values):
@@ -113,8 +117,43 @@ def problem(given, sweeps, order, seed):
     return out, out + b"".join(array(x) for x in made)
 
 
+def pivoted(given):
+    """A boxed problem and what `direct`'s pivoting with its own LDL^T made of it; None where it has no part in that."""
+    if (
+        given.law not in ("linear", "lcp") or given.rows is not None
+    ):  # d of rows is not that of their matrix to the bit
+        return None
+    a, (form, band, order) = given.csr, choose(given)
+    *_, gap, size = scan(a.indptr, a.indices, a.data)
+    if form != "band" or gap > 1e-12 * size:  # larger ones are LAPACK's or QDLDL's, asymmetric ones LAPACK's
+        return None
+    start, c = given.start(), given.cones
+    rows = Pivoting(given.csr_data, band, order, TINY)
+    code, _ = rows.solve(start, GUESSES, ROUNDS)
+    rows.slack()
+    order = np.arange(given.m) if order is None else order
+    out = numbers(given.n_blocks, given.m, band, GUESSES, ROUNDS) + array([TINY])
+    out += array(c.ptr, "<i4") + array(c.kind, "<i4") + array(order, "<i4")
+    out += b"".join(
+        array(x)
+        for x in (
+            c.lower,
+            c.upper,
+            c.mu,
+            c.patch_radius,
+            given.b,
+            given.d,
+            given.data.nu,
+            given.data.step,
+            start,
+        )
+    )
+    out += array(a.indptr, "<i4") + array(a.indices, "<i4") + array(a.data)
+    return out, out + numbers(code) + array(rows.x) + array(rows.w)
+
+
 def record(path, steps=STEPS, scenes=SCENES):
-    """Write the file; (number of scenes, of problems, inputs of scenes, of problems), the last two as bytes."""
+    """Write the file; (number of scenes, of problems swept, pivoted, inputs of scenes, of problems), those as bytes."""
     flat = [(name, field) for name, fields in memory.STRUCTS.items() for field in (None, *fields)]
     out = [MAGIC, numbers(*(flat.index((name, None)) for name in ("blocks_t", "csr_t", "rows_t", "score_t")))]
     made = [scene(*given, steps) for given in scenes]
@@ -124,12 +163,18 @@ def record(path, steps=STEPS, scenes=SCENES):
         for i, given in enumerate(problems())
         for sweeps, order in SWEEPS
     ]
-    for group in (made, solved):
+    exact = [found for found in map(pivoted, problems()) if found]
+    for group in (made, solved, exact):
         out.append(numbers(len(group)))
         out += [whole for _, whole in group]
     Path(path).write_bytes(b"".join(out))
-    return len(made), len(solved), *(b"".join(part for part, _ in group) for group in (made, solved))
+    return (
+        len(made),
+        len(solved),
+        len(exact),
+        *(b"".join(part for part, _ in group) for group in (made, solved + exact)),
+    )
 
 
 if __name__ == "__main__":
-    print(*record(sys.argv[1], *map(int, sys.argv[2:]))[:2])
+    print(*record(sys.argv[1], *map(int, sys.argv[2:]))[:3])
