@@ -59,7 +59,7 @@ else:
     # -w: .ci/check_kernels.py reads the C for warnings, which cost a twentieth of the time.
     COMPILE_ARGS = ["-O1", "-g"] if DEBUG else ["-O3", "-g0", "-w"]
     if not DEBUG:
-        INLINE = ["-finline-limit=2000", "--param=inline-unit-growth=100"]
+        INLINE = ["-finline-limit=2000", "--param=inline-unit-growth=70"]
         LIMITS = ["-finline-limit=600", "--param=inline-unit-growth=40"]
     COMPILE_ARGS += [*OPTIONS["COMPILE_FLAGS"], "-Wno-unused-function"]
     if MODE == "asan":
