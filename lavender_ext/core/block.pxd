@@ -293,7 +293,8 @@ cdef inline void cone_error(const double* lam, const double* w, const double* d,
                             double patch_radius, int32_t nt, int32_t spin, double* e) noexcept nogil:
     # (7) is homogeneous: where all of lam and w / d would vanish, 2^600 times both, so that their ratios decide, and
     # 2^-600 times both where some w / sqrt(d) would overflow.
-    cdef double up = 1.0, big[8]
+    cdef double up = 1.0
+    cdef double big[8]
     cdef int32_t i, n = 1 + nt + spin
     cdef bint small = True
     for i in range(n):
