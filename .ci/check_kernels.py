@@ -47,11 +47,14 @@ PLAIN = ["-DLAVENDER_ONE_LANE"]
 CYTHONS_OWN = "ISO C forbids conversion of function pointer to object pointer type"
 
 #: Modules of these names are exempt from the check of what a core reaches, with the reason. `threaded` yields and
-#: sleeps by the system's calls; `chain` calls the Python faces of kernels one after the other, `many` the kernels
-#: themselves, and allocates what they need. The arithmetic of all is that of other modules, which this check sees.
+#: sleeps by the system's calls; `chain` and `looks` call the Python faces of kernels one after the other, `many` the
+#: kernels themselves, and allocates what they need; `gate` looks at arrays of Python. The arithmetic of all is that of
+#: other modules, which this check sees, but for the logarithms by which `looks` guesses how long sweeps will take.
 EXEMPT = {
     "threaded": "threads",
     "chain": "calls kernels, computes nothing",
+    "looks": "calls kernels, guesses how long they will take",
+    "gate": "reads arrays of Python, computes nothing",
     "many": "allocates and calls kernels, computes nothing",
 }
 

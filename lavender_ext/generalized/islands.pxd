@@ -221,16 +221,14 @@ cdef inline void settle(flow_t* f, const blocks_t* p, const generalized_t* g, in
 cdef inline ssize_t numbers_of(const flow_t* f, const need_t* need) noexcept nogil:
     """float64 that `furnish` needs."""
     cdef ssize_t size = need.most[0], values = <ssize_t>need.values
-    cdef const int32_t* most = need.most
     return (4 * <ssize_t>f.g.n + 13 * <ssize_t>f.p.n_rows + 2 * <ssize_t>f.vptr[f.p.n_blocks] + 2 * values
-            + 2 * size + most[2] + most[1] + most[3] + 1)
+            + 2 * size + need.most[2] + need.most[1] + need.most[3] + 1)
 
 
 cdef inline void furnish(flow_t* f, const need_t* need, double* x) noexcept nogil:
     """Arrays of the iterate, of V and of N in x (`numbers_of`)."""
     cdef ssize_t n = f.g.n, m = f.p.n_rows, nv = f.vptr[f.p.n_blocks]
     cdef ssize_t size = need.most[0], values = <ssize_t>need.values
-    cdef const int32_t* most = need.most
     f.y = x
     f.u = x + n
     f.grad = x + 2 * n
@@ -259,7 +257,7 @@ cdef inline void furnish(flow_t* f, const need_t* need, double* x) noexcept nogi
     f.inv = x
     f.local_rhs = x + size
     f.turned = x + 2 * size
-    f.line = x + 2 * size + most[2]
+    f.line = x + 2 * size + need.most[2]
 
 
 cdef inline void aim_at(flow_t* f, double tol, int32_t steps, double start_energy, double start_velocity) noexcept nogil:
