@@ -47,6 +47,8 @@ COLD = (
     "host/",
     "engine/arrays",
     "generalized/export",
+    "core/blocks",
+    "core/gate",
     "core/order",
     "factor/graph",
     "factor/symbolic",

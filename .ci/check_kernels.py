@@ -48,13 +48,15 @@ CYTHONS_OWN = "ISO C forbids conversion of function pointer to object pointer ty
 
 #: Modules of these names are exempt from the check of what a core reaches, with the reason. `threaded` yields and
 #: sleeps by the system's calls; `chain` and `looks` call the Python faces of kernels one after the other, `many` the
-#: kernels themselves, and allocates what they need; `gate` looks at arrays of Python. The arithmetic of all is that of
-#: other modules, which this check sees, but for the logarithms by which `looks` guesses how long sweeps will take.
+#: kernels themselves, and allocates what they need; `gate` and `blocks` look at arrays of Python. The arithmetic
+#: of all is that of other modules, which this check sees, but for the logarithms by which `looks` guesses how long
+#: sweeps will take.
 EXEMPT = {
     "threaded": "threads",
     "chain": "calls kernels, computes nothing",
     "looks": "calls kernels, guesses how long they will take",
     "gate": "reads arrays of Python, computes nothing",
+    "blocks": "reads and fills arrays of Python, computes nothing",
     "many": "allocates and calls kernels, computes nothing",
 }
 

@@ -12,25 +12,18 @@ perhaps one spin row. With lambda [N s] the bounds are
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
-from functools import cached_property
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import numpy as np
 
 from lavender._arrays import FloatArray, IntArray, as_array, check_not_nan, check_not_negative, equal
 from lavender.errors import InputError
-from lavender_ext.core.problem import BOUNDED, FREE, KINDS, ROUND_CONES, Blocks, shape_of
+from lavender_ext.core import blocks as kernels
 
 __all__ = ["CONTACT", "CONTACT_SPIN", "ROUND", "ROW", "Cones", "project"]
 
-ROW, CONTACT, CONTACT_SPIN, ROUND = KINDS
-
-
-_FIELDS = tuple(
-    (name, np.dtype(np.int32 if name in ("ptr", "kind") else np.float64))
-    for name in ("ptr", "kind", "lower", "upper", "mu", "patch_radius")
-)
+ROW, CONTACT, CONTACT_SPIN, ROUND = kernels.KINDS
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,40 +43,27 @@ class Cones:
     upper: FloatArray  # (m,) N s, read on ROW blocks, +inf allowed
     mu: FloatArray  # (k,) -, read on contacts
     patch_radius: FloatArray  # (k,) m, read on CONTACT_SPIN
+    _blocks: ClassVar[kernels.Blocks]  # of an instance: the same arrays, as kernels read them
 
     def __post_init__(self) -> None:
-        if not self._adopt():
-            self._check()
+        made = kernels.private(self.ptr, self.kind, self.lower, self.upper, self.mu, self.patch_radius)
+        if made is None:
+            made = self._checked()
+        self._take(made)
 
-    def _adopt(self) -> bool:
-        # Arrays as they should be, copied, in one pass; where anything is amiss `_check` finds the words.
-        own = []
-        for name, dtype in _FIELDS:
-            given = getattr(self, name)
-            if type(given) is not np.ndarray or given.dtype is not dtype or given.ndim != 1:
-                return False
-            own.append(given.copy())
-        bits, blocks = shape_of(*own)
-        if bits < 0:
-            return False
-        for (name, _), value in zip(_FIELDS, own, strict=True):
-            value.flags.writeable = False
-            object.__setattr__(self, name, value)
-        self._remember(bits, blocks)
-        return True
-
-    def _remember(self, bits: int, blocks: Blocks) -> None:
+    def _take(self, made: kernels.Blocks) -> None:
         put = self.__dict__
-        put["_blocks"] = blocks
-        for name, bit in (("is_free", FREE), ("is_bounded_rows", BOUNDED), ("has_round", ROUND_CONES)):
-            put[name] = bool(bits & bit)
+        put["_blocks"] = made
+        put["ptr"], put["kind"], put["lower"], put["upper"], put["mu"], put["patch_radius"] = made.arrays
 
-    @cached_property
-    def _blocks(self) -> Blocks:
-        # what kernels read
-        return Blocks(*(getattr(self, name) for name, _ in _FIELDS))
+    @classmethod
+    def _of(cls, made: kernels.Blocks) -> Cones:
+        cones = object.__new__(cls)
+        cones._take(made)
+        return cones
 
-    def _check(self) -> None:
+    def _checked(self) -> kernels.Blocks:
+        # The long way: what can be made to fit, and words for what cannot.
         ptr = as_array("cones.ptr", self.ptr, (None,), dtype=np.int32)
         if len(ptr) == 0 or ptr[0] != 0 or np.any(np.diff(ptr) <= 0):
             raise InputError(
@@ -138,30 +118,21 @@ class Cones:
         check_not_negative("mu", mu)
         radius = as_array("patch_radius", self.patch_radius, (k,), unit="m")
         check_not_negative("patch_radius", radius)
-        for name, value in zip(
-            ("ptr", "kind", "lower", "upper", "mu", "patch_radius"),
-            (ptr, kind, lower, upper, mu, radius),
-            strict=True,
-        ):
-            object.__setattr__(self, name, value)
+        return kernels.Blocks(ptr, kind, lower, upper, mu, radius)
 
     @classmethod
     def _trusted(cls, *values: np.ndarray) -> Cones:
-        # For arrays this module has just made; nothing is checked again.
-        cones = object.__new__(cls)
-        bits, blocks = shape_of(*values)
-        if bits < 0:  # numbers that another engine should not have held
-            return cls(*values)
-        cones._remember(bits, blocks)
-        put = cones.__dict__
-        for (name, _), value in zip(_FIELDS, values, strict=True):
-            value.flags.writeable = False
-            put[name] = value
-        return cones
+        # For arrays this package has just made, which are adopted.
+        made = kernels.adopted(*values)
+        # Numbers that another engine should not have held take the long way.
+        return cls(*values) if made is None else cls._of(made)
 
     @classmethod
     def bounded(cls, lower: FloatArray, upper: FloatArray) -> Cones:
         """One ROW block for each pair of bounds; arrays (m,) [N s]."""
+        made = kernels.bounded_rows(lower, upper)
+        if made is not None:
+            return cls._of(made)
         m = len(lower)
         return cls(
             np.arange(m + 1, dtype=np.int32), np.zeros(m, np.int32), lower, upper, np.zeros(m), np.zeros(m)
@@ -170,14 +141,10 @@ class Cones:
     @classmethod
     def free(cls, m: int) -> Cones:
         """m unbounded rows, each its own block: a linear system."""
-        return cls._trusted(
-            np.arange(m + 1, dtype=np.int32),
-            np.zeros(m, np.int32),
-            np.full(m, -np.inf),
-            np.full(m, np.inf),
-            np.zeros(m),
-            np.zeros(m),
-        )
+        made = kernels.free_rows(m)
+        if made is None:
+            raise InputError(f"m is {m}; a number of rows from 0 to 2^31 - 2 is needed")
+        return cls._of(made)
 
     @classmethod
     def contacts(
@@ -212,17 +179,16 @@ class Cones:
         if type(mu) is not float:
             mu = np.asarray(mu, float)
         k = count if count is not None else len(mu) if isinstance(mu, np.ndarray) and mu.ndim else 1
-        mu = as_array("mu", mu, (k,))
-        size = 1 + tangents + spin
-        radius = (
-            np.zeros(k) if patch_radius is None else as_array("patch_radius", patch_radius, (k,), unit="m")
-        )
-        m = k * size
-        kind = np.empty(k, np.int32)
-        kind.fill(ROUND if tangents > 2 else CONTACT_SPIN if spin else CONTACT)
-        return cls._trusted(
-            np.arange(0, m + 1, size, dtype=np.int32), kind, np.zeros(m), np.zeros(m), mu, radius
-        )
+        if type(mu) is not float or not 0.0 <= mu < np.inf:
+            mu = as_array("mu", mu, (k,))
+            check_not_negative("mu", mu)
+        if patch_radius is not None:
+            patch_radius = as_array("patch_radius", patch_radius, (k,), unit="m")
+            check_not_negative("patch_radius", patch_radius)
+        made = kernels.contacts(k, tangents, mu, patch_radius)
+        if made is None:
+            raise InputError(f"{k} contacts have more rows than 32-bit numbers count")
+        return cls._of(made)
 
     @property
     def n_blocks(self) -> int:
@@ -234,22 +200,20 @@ class Cones:
         """Number of rows, m."""
         return int(self.ptr[-1])
 
-    @cached_property
+    @property
     def is_free(self) -> bool:
         """Every row is unbounded."""
-        return bool(
-            np.all(self.kind == ROW) and np.all(np.isneginf(self.lower)) and np.all(np.isposinf(self.upper))
-        )
+        return bool(self._blocks.is_free)
 
-    @cached_property
+    @property
     def is_bounded_rows(self) -> bool:
         """Every row has constant bounds: ROW blocks and contacts of a normal alone."""
-        return bool(np.all((self.kind == ROW) | (np.diff(self.ptr) == 1)))
+        return bool(self._blocks.is_bounded_rows)
 
-    @cached_property
+    @property
     def has_round(self) -> bool:
         """Some contact has more than two tangents in one cone."""
-        return bool(np.any(self.kind == ROUND))
+        return bool(self._blocks.has_round)
 
     @property
     def n_tangents(self) -> IntArray:
@@ -261,20 +225,21 @@ class Cones:
         """These blocks, then those of `other`."""
         if not isinstance(other, Cones):
             return NotImplemented
-        pairs = [(getattr(self, f.name), getattr(other, f.name)) for f in fields(self)]
-        ptr = np.concatenate([self.ptr, self.n_rows + other.ptr[1:]])
-        return Cones._trusted(ptr.astype(np.int32), *(np.concatenate(pair) for pair in pairs[1:]))
+        made = kernels.joined(self._blocks, other._blocks)
+        if made is None:
+            raise InputError("together these have more rows than 32-bit numbers count")
+        return Cones._of(made)
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Cones):
             return NotImplemented
-        return all(equal(getattr(self, f.name), getattr(other, f.name)) for f in fields(self))
+        return all(map(equal, self._blocks.arrays, other._blocks.arrays))
 
     __hash__ = None  # type: ignore[assignment]
 
     def __reduce__(self) -> tuple[Any, ...]:
         # Arrays stay read-only in copies and pickles.
-        return type(self), tuple(getattr(self, f.name) for f in fields(self))
+        return type(self), self._blocks.arrays
 
 
 def project(cones: Cones, impulse: FloatArray) -> FloatArray:

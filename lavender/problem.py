@@ -577,18 +577,7 @@ class Problem:
         return view
 
     def _data(self, **operator: Any) -> Data:
-        c = self.cones
-        return Data(
-            c.ptr,
-            c.kind,
-            c.lower,
-            c.upper,
-            c.mu,
-            c.patch_radius,
-            self.b,
-            FRICTION_NUMBER[self.friction],
-            **operator,
-        )
+        return Data(self.cones._blocks, self.b, FRICTION_NUMBER[self.friction], **operator)
 
     @once
     def csr(self) -> sp.csr_array:

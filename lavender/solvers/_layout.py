@@ -14,6 +14,7 @@ import numpy as np
 from lavender._arrays import FloatArray, IntArray
 from lavender.ordering import Order, body_ranks
 from lavender.problem import FRICTION, Problem
+from lavender_ext.core.blocks import Blocks
 from lavender_ext.core.problem import Data
 
 __all__ = ["Layout", "lay_out"]
@@ -77,7 +78,7 @@ def lay_out(problem: Problem, blocks: IntArray, before: Layout | None = None) ->
         r.arm_b[contact], rank[r.contact_body[contact]], r.inv_mass[body], r.inv_inertia[body],
         problem.compliance[rows],
     )  # fmt: skip
-    data = Data(*given[:7], FRICTION.index(problem.friction), rows=tuple(given[7:]))
+    data = Data(Blocks(*given[:6]), given[6], FRICTION.index(problem.friction), rows=tuple(given[7:]))
     return Layout(data, rows, place, ranks)
 
 

@@ -148,13 +148,10 @@ cdef inline int32_t tree_factor(int32_t n, const int32_t* mptr, const int32_t* m
     return -1
 
 
-cdef inline void tree_solve(const generalized_t* g, double* x) noexcept nogil:
-    """x <- M^-1 x."""
-    cdef int32_t k, q, first, end, n = g.n
-    cdef const int32_t* lptr = g.lptr                       # what is stored to might be g, for all a compiler knows
-    cdef const int32_t* lidx = g.lidx
-    cdef const double* lval = g.lval
-    cdef const double* inv_pivot = g.inv_pivot
+cdef inline void ldl_solve(int32_t n, const int32_t* lptr, const int32_t* lidx, const double* lval,
+                           const double* inv_pivot, double* x) noexcept nogil:
+    """x <- (L^T D L)^-1 x (n); lval is counted as lidx is, from wherever lptr begins."""
+    cdef int32_t k, q, first, end
     cdef double z
     for k in range(n - 1, -1, -1):                          # L^T z = x
         z = x[k]
@@ -170,6 +167,11 @@ cdef inline void tree_solve(const generalized_t* g, double* x) noexcept nogil:
         for q in range(first, end):
             z -= lval[q] * x[lidx[q]]
         x[k] = z
+
+
+cdef inline void tree_solve(const generalized_t* g, double* x) noexcept nogil:
+    """x <- M^-1 x."""
+    ldl_solve(g.n, g.lptr, g.lidx, g.lval, g.inv_pivot, x)
 
 
 cdef inline void tree_unwhiten(const generalized_t* g, double* x) noexcept nogil:

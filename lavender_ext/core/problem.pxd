@@ -14,15 +14,6 @@ cdef class Room:
 cdef Room room_for(Py_ssize_t bytes)
 
 
-cdef class Blocks:
-    cdef blocks_t at            # without law, b, d, nu and step
-    cdef bint single_rows       # every block is one ROW
-    cdef tuple keep
-
-    cdef void point(self, const int32_t[::1] ptr, const int32_t[::1] kind, const double[::1] lower,
-                    const double[::1] upper, const double[::1] mu, const double[::1] radius)
-
-
 cdef enum:                      # how `make_numbers` ended
     MADE = 0
     NO_MEMORY = 1

@@ -15,8 +15,8 @@ cimport cython
 
 import numpy as np
 
-from lavender_ext.core.block cimport (CONE, CONTACT, CONTACT_SPIN, COULOMB, ROUND, ROW, blocks_t, is_pair,
-                                      n_tangents)
+from lavender_ext.core.block cimport CONE, CONTACT_SPIN, COULOMB, ROUND, ROW, blocks_t, is_pair, n_tangents
+from lavender_ext.core.blocks cimport Blocks
 from lavender_ext.core.csr cimport csr_t
 from lavender_ext.core.generalized cimport Operator, dot, generalized_t, panel_pattern, panel_whiten
 from lavender_ext.core.rows cimport (contact_diagonal, dot12, largest_eigenvalue, minv_times, reciprocal,
@@ -24,8 +24,7 @@ from lavender_ext.core.rows cimport (contact_diagonal, dot12, largest_eigenvalue
 from lavender_ext.core.weights cimport block_weights, joint_weights
 
 
-#: Kinds of blocks and friction laws by the kernels' numbers.
-KINDS = (ROW, CONTACT, CONTACT_SPIN, ROUND)
+#: Friction laws by the kernels' numbers.
 LAWS = {"coulomb": COULOMB, "cone": CONE}
 
 
@@ -282,11 +281,10 @@ cdef class Data:
     contact_body, inv_mass, inv_inertia, compliance). In generalised coordinates: `general_data`.
     """
 
-    def __init__(self, ptr_, kind_, lower_, upper_, mu_, patch_radius_, b_, int law, csr=None, rows=None):
+    def __init__(self, Blocks blocks, b_, int law, csr=None, rows=None):
         # Kept as they came: a view made an object again costs more than the view.
-        cdef const int32_t[::1] ptr = ptr_, kind = kind_
-        cdef const double[::1] lower = lower_, upper = upper_, mu = mu_, patch_radius = patch_radius_, b = b_
-        cdef int32_t m = <int32_t>b.shape[0], k = <int32_t>kind.shape[0], n_empty, i
+        cdef const double[::1] b = b_
+        cdef int32_t m = blocks.at.n_rows, n_empty, i
         numbers_ = np.empty(3 * m + 3)
         cdef double[::1] numbers = numbers_
         cdef double* d = &numbers[0]
@@ -296,28 +294,18 @@ cdef class Data:
         cdef int32_t* empty = <int32_t*>marks.at
         cdef const int32_t[::1] indptr, indices
         cdef const double[::1] data
-        self.keep = [ptr_, kind_, lower_, upper_, mu_, patch_radius_, b_, numbers_, csr, rows]
-        self.blocks.n_blocks = k
-        self.blocks.n_rows = m
+        self.keep = [blocks, b_, numbers_, csr, rows]
+        self.blocks = blocks.at
         self.blocks.law = law
-        self.blocks.ptr = &ptr[0]
         self.blocks.d = d
         self.blocks.nu = nu
         self.blocks.step = step
         if m > 0:
-            self.blocks.kind = &kind[0]
-            self.blocks.lower = &lower[0]
-            self.blocks.upper = &upper[0]
-            self.blocks.mu = &mu[0]
-            self.blocks.patch_radius = &patch_radius[0]
             self.blocks.b = &b[0]
         self.start_energy = self.start_velocity = self.start_relative = -1.0
         self.ready = True
         self.factored = rows is not None
-        self.single_rows = k == m
-        for i in range(k):
-            if kind[i] != ROW:
-                self.single_rows = False
+        self.single_rows = blocks.single_rows
         if self.factored:
             self._set_rows(rows)
             n_empty = lav_rows_diagonal(&self.blocks, &self.rows, d, nu, step, empty,
@@ -516,32 +504,6 @@ cdef class Data:
         self.start_velocity = velocity
 
 
-cdef class Blocks:
-    """Pointers to the arrays of a problem's blocks, which stay alive with it."""
-
-    def __init__(self, ptr_, kind_, lower_, upper_, mu_, radius_):
-        self.point(ptr_, kind_, lower_, upper_, mu_, radius_)
-        self.keep = (ptr_, kind_, lower_, upper_, mu_, radius_)
-
-    cdef void point(self, const int32_t[::1] ptr, const int32_t[::1] kind, const double[::1] lower,
-                    const double[::1] upper, const double[::1] mu, const double[::1] radius):
-        cdef int32_t i
-        self.at.n_blocks = <int32_t>kind.shape[0]
-        self.at.n_rows = <int32_t>lower.shape[0]
-        self.at.ptr = &ptr[0]
-        if self.at.n_rows:
-            self.at.kind = &kind[0]
-            self.at.lower = &lower[0]
-            self.at.upper = &upper[0]
-            self.at.mu = &mu[0]
-            self.at.patch_radius = &radius[0]
-        self.single_rows = self.at.n_blocks == self.at.n_rows
-        for i in range(self.at.n_blocks):
-            if self.at.kind[i] != ROW:
-                self.single_rows = False
-                break
-
-
 def general_data(Blocks blocks, b_, Operator operator, compliance_, int law):
     """Data of a problem in generalised coordinates, whose own numbers wait until `prepare`; law: COULOMB or CONE."""
     cdef const double[::1] b = b_, compliance = compliance_
@@ -558,65 +520,6 @@ def general_data(Blocks blocks, b_, Operator operator, compliance_, int law):
         made.blocks.b = &b[0]
         made.general.compliance = &compliance[0]
     return made
-
-
-FREE, BOUNDED, ROUND_CONES = 1, 2, 4
-
-
-def shape_of(ptr_, kind_, lower_, upper_, mu_, radius_):
-    """What the blocks of a problem are: FREE (every row unbounded), BOUNDED (by constants), ROUND_CONES; as bits.
-
-    With them `Blocks` of these arrays; -1 and None where an array does not fit the others or holds what no block can
-    have. Bounds of contacts, which nobody reads, get one spelling: 0 on normals, else none.
-    """
-    cdef const int32_t[::1] ptr = ptr_, kind = kind_
-    cdef double[::1] lower = lower_, upper = upper_
-    cdef const double[::1] mu = mu_, radius = radius_
-    cdef int bits = bits_of(ptr, kind, lower, upper, mu, radius)
-    cdef Blocks made = None
-    if bits >= 0:
-        made = Blocks.__new__(Blocks)
-        made.point(ptr, kind, lower, upper, mu, radius)
-        made.keep = (ptr_, kind_, lower_, upper_, mu_, radius_)
-    return bits, made
-
-
-cdef int bits_of(const int32_t[::1] ptr, const int32_t[::1] kind, double[::1] lower, double[::1] upper,
-                 const double[::1] mu, const double[::1] radius) except -2:
-    cdef Py_ssize_t i, j, k = kind.shape[0], m = lower.shape[0], size
-    cdef double inf = 1.0 / 0.0
-    cdef bint is_free = True, is_bounded = True, is_round = False
-    if ptr.shape[0] != k + 1 or ptr[0] != 0 or mu.shape[0] != k or radius.shape[0] != k or upper.shape[0] != m:
-        return -1
-    for i in range(k):
-        size = ptr[i + 1] - ptr[i]
-        if size <= 0 or not 0.0 <= mu[i] < inf or not 0.0 <= radius[i] < inf:
-            return -1
-        if kind[i] == ROUND:
-            is_round = True
-            if not 3 < size <= 6:
-                return -1
-        elif kind[i] != ROW and (not 0 < kind[i] < ROUND or size < kind[i] or size > kind[i] + 2):
-            return -1
-    if ptr[k] != m:
-        return -1
-    for i in range(k):
-        if kind[i] == ROW:
-            for j in range(ptr[i], ptr[i + 1]):
-                if not (lower[j] <= upper[j] and lower[j] < inf and upper[j] > -inf):
-                    return -1
-                if lower[j] != -inf or upper[j] != inf:
-                    is_free = False
-        else:
-            is_free = False
-            if ptr[i + 1] - ptr[i] > 1:
-                is_bounded = False
-            for j in range(ptr[i], ptr[i + 1]):
-                if lower[j] != lower[j] or upper[j] != upper[j]:
-                    return -1
-                lower[j] = 0.0 if j == ptr[i] else -inf
-                upper[j] = inf
-    return is_free * FREE + is_bounded * BOUNDED + is_round * ROUND_CONES
 
 
 def nothing_done(const double[::1] lower, const double[::1] upper):
@@ -647,9 +550,11 @@ def dense_to_csr(const double[:, ::1] a):
     for i in range(n):
         for j in range(m):
             nnz += a[i, j] != 0.0
-    cdef int32_t[::1] indptr = np.zeros(n + 1, np.int32)
-    cdef int32_t[::1] indices = np.empty(max(nnz, 1), np.int32)
-    cdef double[::1] data = np.empty(max(nnz, 1))
+    whole, numbers = np.empty(n + 1 + nnz, np.int32), np.empty(nnz)
+    cdef int32_t[::1] indptr = whole
+    cdef double[::1] data = numbers
+    cdef int32_t* indices = &indptr[n + 1]
+    indptr[0] = 0
     for i in range(n):
         for j in range(m):
             if a[i, j] != 0.0:
@@ -657,7 +562,9 @@ def dense_to_csr(const double[:, ::1] a):
                 data[q] = a[i, j]
                 q += 1
         indptr[i + 1] = <int32_t>q
-    return _read_only(np.asarray(indptr)), _read_only(np.asarray(indices)[:nnz]), _read_only(np.asarray(data)[:nnz])
+    whole.setflags(False)
+    numbers.setflags(False)
+    return whole[:n + 1], whole[n + 1:], numbers
 
 
 def rows_velocity(Data p, const double[:, ::1] v, double[::1] out):

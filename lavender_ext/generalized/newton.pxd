@@ -24,10 +24,10 @@ from libc.string cimport memcpy
 
 from lavender_ext.core.block cimport (CONE, COULOMB, CONTACT_SPIN, ROW, block_error, blocks_t, n_tangents,
                                       row_error)
-from lavender_ext.core.generalized cimport dot, generalized_t, panel_push, panel_times
+from lavender_ext.core.generalized cimport dot, generalized_t, ldl_solve, panel_push, panel_times
 from lavender_ext.core.problem cimport Data
 from lavender_ext.generalized.dense cimport ltdl_factor, ltdl_solve, lu_factor, lu_solve
-from lavender_ext.generalized.sparse cimport is_worth, sparse_factor, sparse_solve
+from lavender_ext.generalized.sparse cimport is_worth, sparse_factor
 from lavender_ext.generalized.soft cimport INSIDE, OFF, SLIDES, cone_map, coulomb_map, size_of
 from lavender_ext.judge.score cimport nothing, tally_block, tally_row, tally_t
 
@@ -515,7 +515,7 @@ cdef inline void newton_step(const flow_t* f, int32_t island, bint square) noexc
     if square:
         lu_solve(size, f.factor, f.swap, f.local_rhs)
     elif f.thin:
-        sparse_solve(size, f.lptr + c0, f.lidx, f.factor, f.inv, f.local_rhs)
+        ldl_solve(size, f.lptr + c0, f.lidx, f.factor - f.lptr[c0], f.inv, f.local_rhs)
     else:
         ltdl_solve(size, f.factor, f.inv, f.local_rhs)
     for a in range(size):

@@ -140,24 +140,3 @@ cdef inline int32_t sparse_factor(int32_t n, const int32_t* lptr, const int32_t*
                     to[at] -= f * row[b]
             row[a] = f
     return 1
-
-
-cdef inline void sparse_solve(int32_t n, const int32_t* lptr, const int32_t* lidx, const double* val,
-                              const double* inv, double* x) noexcept nogil:
-    cdef int32_t k, q, first, end
-    cdef const double* l = val - lptr[0]
-    cdef double z
-    for k in range(n - 1, -1, -1):                          # L^T z = x
-        z = x[k]
-        if z != 0.0:
-            first = lptr[k]
-            end = lptr[k + 1]
-            for q in range(first, end):
-                x[lidx[q]] -= l[q] * z
-    for k in range(n):                                      # D, then L x = z
-        z = x[k] * inv[k]
-        first = lptr[k]
-        end = lptr[k + 1]
-        for q in range(first, end):
-            z -= l[q] * x[lidx[q]]
-        x[k] = z

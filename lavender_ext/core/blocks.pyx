@@ -1,0 +1,240 @@
+"""Blocks of a problem, made, joined and checked: one pass over few numbers, in a few arrays.
+
+What Python would do in ten calls of NumPy takes longer than a solve of eight rows. Nothing is said here of what is wrong:
+`lavender.cones` finds the words where these functions return None.
+"""
+from libc.stdint cimport int32_t
+
+import numpy as np
+
+from lavender_ext.core.block cimport CONTACT, CONTACT_SPIN, ROUND, ROW
+
+#: Kinds of blocks by the kernels' numbers.
+KINDS = (ROW, CONTACT, CONTACT_SPIN, ROUND)
+
+cdef double INF = 1.0 / 0.0
+cdef object ndarray = np.ndarray, empty = np.empty, F8 = np.dtype(np.float64), I4 = np.dtype(np.int32)
+
+
+cdef class Blocks:
+    """Pointers to the arrays of a problem's blocks, which are kept; ValueError where they are no blocks."""
+
+    def __init__(self, ptr, kind, lower, upper, mu, patch_radius):
+        if not self.point(ptr, kind, lower, upper, mu, patch_radius) or not self.look():
+            raise ValueError("arrays that do not fit each other, or hold what no block can have")
+        self.arrays = (ptr, kind, lower, upper, mu, patch_radius)
+
+    cdef bint point(self, const int32_t[::1] ptr, const int32_t[::1] kind, const double[::1] lower,
+                    const double[::1] upper, const double[::1] mu, const double[::1] radius):
+        cdef Py_ssize_t k = kind.shape[0], m = lower.shape[0]
+        if ptr.shape[0] != k + 1 or mu.shape[0] != k or radius.shape[0] != k or upper.shape[0] != m:
+            return False
+        if ptr[0] != 0 or ptr[k] != m:
+            return False
+        self.at.n_blocks = <int32_t>k
+        self.at.n_rows = <int32_t>m
+        self.at.ptr = &ptr[0]
+        if m:
+            self.at.kind = &kind[0]
+            self.at.lower = &lower[0]
+            self.at.upper = &upper[0]
+            self.at.mu = &mu[0]
+            self.at.patch_radius = &radius[0]
+        return m > 0 or k == 0
+
+    cdef bint look(self) noexcept:
+        # What the blocks are; False where one is none.
+        cdef blocks_t* p = &self.at
+        cdef int32_t i, j, size, kind
+        self.is_free = self.is_bounded_rows = self.single_rows = True
+        self.has_round = False
+        for i in range(p.n_blocks):
+            size = p.ptr[i + 1] - p.ptr[i]
+            kind = p.kind[i]
+            if size <= 0 or not 0.0 <= p.mu[i] < INF or not 0.0 <= p.patch_radius[i] < INF:
+                return False
+            if kind == ROUND:
+                self.has_round = True
+                if not 3 < size <= 6:
+                    return False
+            elif kind != ROW and (not 0 < kind < ROUND or size < kind or size > kind + 2):
+                return False
+            if kind != ROW or size > 1:
+                self.single_rows = False
+            if kind != ROW:
+                self.is_free = False
+                if size > 1:
+                    self.is_bounded_rows = False
+        for i in range(p.n_blocks):
+            for j in range(p.ptr[i], p.ptr[i + 1]):
+                if p.kind[i] != ROW:
+                    if p.lower[j] != p.lower[j] or p.upper[j] != p.upper[j]:
+                        return False
+                elif not (p.lower[j] <= p.upper[j] and p.lower[j] < INF and p.upper[j] > -INF):
+                    return False
+                elif p.lower[j] != -INF or p.upper[j] != INF:
+                    self.is_free = False
+        return True
+
+    cdef void spell(self) noexcept:
+        # One spelling for bounds of contacts, which nobody reads, so that equal problems compare equal.
+        cdef int32_t i, j
+        cdef double* lower = <double*>self.at.lower
+        cdef double* upper = <double*>self.at.upper
+        for i in range(self.at.n_blocks):
+            if self.at.kind[i] != ROW:
+                for j in range(self.at.ptr[i], self.at.ptr[i + 1]):
+                    lower[j] = 0.0 if j == self.at.ptr[i] else -INF
+                    upper[j] = INF
+
+
+cdef Blocks room_of(Py_ssize_t k, Py_ssize_t m):
+    """Blocks over new arrays, read-only for everybody else, whose numbers are still to be written."""
+    cdef Blocks made = Blocks.__new__(Blocks)
+    whole, numbers = empty(2 * k + 1, I4), empty(2 * (m + k))
+    cdef int32_t[::1] i = whole
+    cdef double[::1] x = numbers
+    made.at.n_blocks = <int32_t>k
+    made.at.n_rows = <int32_t>m
+    made.at.ptr = &i[0]
+    if m:
+        made.at.kind = &i[k + 1]
+        made.at.lower = &x[0]
+        made.at.upper = &x[m]
+        made.at.mu = &x[2 * m]
+        made.at.patch_radius = &x[2 * m + k]
+    whole.setflags(False)
+    numbers.setflags(False)
+    made.arrays = (whole[:k + 1], whole[k + 1:], numbers[:m], numbers[m:2 * m], numbers[2 * m:2 * m + k],
+                   numbers[2 * m + k:])
+    return made
+
+
+cdef void put(Blocks to, Py_ssize_t block, Py_ssize_t row, const blocks_t* p) noexcept:
+    # The blocks of p, from block and row on.
+    cdef Py_ssize_t i
+    for i in range(p.n_blocks):
+        (<int32_t*>to.at.ptr)[block + i] = p.ptr[i] + <int32_t>row
+        (<int32_t*>to.at.kind)[block + i] = p.kind[i]
+        (<double*>to.at.mu)[block + i] = p.mu[i]
+        (<double*>to.at.patch_radius)[block + i] = p.patch_radius[i]
+    for i in range(p.n_rows):
+        (<double*>to.at.lower)[row + i] = p.lower[i]
+        (<double*>to.at.upper)[row + i] = p.upper[i]
+    (<int32_t*>to.at.ptr)[block + p.n_blocks] = <int32_t>row + p.n_rows
+
+
+def joined(Blocks a, Blocks b):
+    """The blocks of a, then those of b."""
+    cdef Py_ssize_t k = a.at.n_blocks, m = a.at.n_rows
+    if k + b.at.n_blocks >= 2147483647 or m + b.at.n_rows >= 2147483647:
+        return None
+    cdef Blocks made = room_of(k + b.at.n_blocks, m + b.at.n_rows)
+    put(made, 0, 0, &a.at)
+    put(made, k, m, &b.at)
+    made.is_free = a.is_free and b.is_free
+    made.is_bounded_rows = a.is_bounded_rows and b.is_bounded_rows
+    made.has_round = a.has_round or b.has_round
+    made.single_rows = a.single_rows and b.single_rows
+    return made
+
+
+def private(ptr, kind, lower, upper, mu, patch_radius):
+    """Blocks over a copy of these arrays; None where anything is amiss."""
+    cdef Blocks given = Blocks.__new__(Blocks), made
+    for x, dtype in ((ptr, I4), (kind, I4), (lower, F8), (upper, F8), (mu, F8), (patch_radius, F8)):
+        if type(x) is not ndarray or x.dtype is not dtype or x.ndim != 1 or not x.flags.c_contiguous:
+            return None
+    try:
+        if not given.point(ptr, kind, lower, upper, mu, patch_radius):
+            return None
+    except ValueError:                                  # not aligned
+        return None
+    made = room_of(given.at.n_blocks, given.at.n_rows)
+    put(made, 0, 0, &given.at)
+    if not made.look():
+        return None
+    made.spell()
+    return made
+
+
+def adopted(ptr, kind, lower, upper, mu, patch_radius):
+    """Blocks over these arrays themselves, read-only from now on; None where anything is amiss."""
+    cdef Blocks made = Blocks.__new__(Blocks)
+    if not made.point(ptr, kind, lower, upper, mu, patch_radius) or not made.look():
+        return None
+    made.spell()
+    for x in (ptr, kind, lower, upper, mu, patch_radius):
+        x.setflags(False)
+    made.arrays = (ptr, kind, lower, upper, mu, patch_radius)
+    return made
+
+
+def free_rows(Py_ssize_t m):
+    """m unbounded rows, each its own block; None below 0 and beyond 32 bits."""
+    if not 0 <= m < 2147483647:
+        return None
+    return rows_between(m, NULL, NULL)
+
+
+def bounded_rows(lower, upper):
+    """One row for each pair of bounds; None where anything is amiss."""
+    cdef const double[::1] low, high
+    cdef Py_ssize_t m
+    for x in (lower, upper):
+        if type(x) is not ndarray or x.dtype is not F8 or x.ndim != 1 or not x.flags.c_contiguous:
+            return None
+    low, high = lower, upper
+    m = low.shape[0]
+    if high.shape[0] != m or m >= 2147483647:
+        return None
+    return rows_between(m, &low[0] if m else NULL, &high[0] if m else NULL)
+
+
+cdef Blocks rows_between(Py_ssize_t m, const double* lower, const double* upper):
+    cdef Blocks made = room_of(m, m)
+    cdef Py_ssize_t i
+    (<int32_t*>made.at.ptr)[0] = 0
+    for i in range(m):
+        (<int32_t*>made.at.ptr)[i + 1] = <int32_t>i + 1
+        (<int32_t*>made.at.kind)[i] = ROW
+        (<double*>made.at.mu)[i] = (<double*>made.at.patch_radius)[i] = 0.0
+        (<double*>made.at.lower)[i] = -INF if lower == NULL else lower[i]
+        (<double*>made.at.upper)[i] = INF if upper == NULL else upper[i]
+    return made if made.look() else None
+
+
+def contacts(Py_ssize_t k, int32_t tangents, mu, radius):
+    """k contacts of so many tangents, with a spin row where there is a radius (k,); mu a float or (k,) array.
+
+    None where anything is amiss.
+    """
+    cdef bint spin = radius is not None
+    cdef int32_t size = 1 + tangents + spin, kind
+    cdef const double[::1] each = None, patch = None
+    cdef double one = 0.0
+    cdef Py_ssize_t i, j
+    kind = ROUND if tangents > 2 else CONTACT_SPIN if spin else CONTACT
+    if not 0 <= k < 2147483647 // size:
+        return None
+    if type(mu) is float:
+        one = mu
+    else:
+        each = mu
+        if each.shape[0] != k:
+            return None
+    if spin:
+        patch = radius
+        if patch.shape[0] != k:
+            return None
+    cdef Blocks made = room_of(k, k * size)
+    (<int32_t*>made.at.ptr)[0] = 0
+    for i in range(k):
+        (<int32_t*>made.at.ptr)[i + 1] = <int32_t>(i + 1) * size
+        (<int32_t*>made.at.kind)[i] = kind
+        (<double*>made.at.mu)[i] = one if each is None else each[i]
+        (<double*>made.at.patch_radius)[i] = patch[i] if spin else 0.0
+        for j in range(i * size, (i + 1) * size):
+            (<double*>made.at.lower)[j] = 0.0 if j == i * size else -INF
+            (<double*>made.at.upper)[j] = INF
+    return made if made.look() else None
