@@ -198,7 +198,7 @@ class Cones:
     @property
     def n_rows(self) -> int:
         """Number of rows, m."""
-        return int(self.ptr[-1])
+        return len(self.lower)
 
     @property
     def is_free(self) -> bool:

@@ -221,9 +221,11 @@ class Problem:
 
     def _check_compliance(self, m: int) -> None:
         put = object.__setattr__
-        compliance = np.zeros(m) if self.compliance is None else self.compliance
-        put(self, "compliance", as_array("compliance", compliance, (m,), unit="1/kg", copy=self.copy))
-        check_not_negative("compliance", self.compliance)  # type: ignore[arg-type]
+        if self.compliance is None:
+            put(self, "compliance", read_only(np.zeros(m)))
+            return
+        put(self, "compliance", as_array("compliance", self.compliance, (m,), unit="1/kg", copy=self.copy))
+        check_not_negative("compliance", self.compliance)
 
     # -- constructors ---------------------------------------------------------------------------
 

@@ -13,7 +13,7 @@ from lavender_ext.core.block cimport CONTACT, CONTACT_SPIN, ROUND, ROW
 KINDS = (ROW, CONTACT, CONTACT_SPIN, ROUND)
 
 cdef double INF = 1.0 / 0.0
-cdef object ndarray = np.ndarray, empty = np.empty, F8 = np.dtype(np.float64), I4 = np.dtype(np.int32)
+cdef object ndarray = np.ndarray, new = np.empty, F8 = np.dtype(np.float64), I4 = np.dtype(np.int32)
 
 
 cdef class Blocks:
@@ -91,7 +91,7 @@ cdef class Blocks:
 cdef Blocks room_of(Py_ssize_t k, Py_ssize_t m):
     """Blocks over new arrays, read-only for everybody else, whose numbers are still to be written."""
     cdef Blocks made = Blocks.__new__(Blocks)
-    whole, numbers = empty(2 * k + 1, I4), empty(2 * (m + k))
+    whole, numbers = new(2 * k + 1, I4), new(2 * (m + k))
     cdef int32_t[::1] i = whole
     cdef double[::1] x = numbers
     made.at.n_blocks = <int32_t>k

@@ -7,6 +7,8 @@ import numpy as np
 from lavender_ext.core.generalized cimport (generalized_t, jac_push, jac_row, tree_factor, tree_pattern, tree_solve,
                                             tree_unwhiten)
 
+cdef object new = np.empty, I4 = np.dtype(np.int32)
+
 
 cdef public int32_t lav_tree_pattern(int32_t n, const int32_t* mptr, const int32_t* midx, int32_t room, int32_t* lptr,
                                      int32_t* lidx, int32_t* parent, int32_t* scratch) noexcept nogil:
@@ -33,13 +35,15 @@ cdef class Operator:
     is the row of M whose pivot is not positive, -1 where M is positive definite.
     """
 
-    def __init__(self, const int32_t[::1] jptr, const int32_t[::1] jidx, const double[::1] jval,
-                 const int32_t[::1] mptr, const int32_t[::1] midx, const double[::1] mval):
+    def __init__(self, jptr_, jidx_, jval_, mptr_, midx_, mval_):
+        # Kept as they came: a view made an object again costs more than the view.
+        cdef const int32_t[::1] jptr = jptr_, jidx = jidx_, mptr = mptr_, midx = midx_
+        cdef const double[::1] jval = jval_, mval = mval_
         cdef int32_t m = <int32_t>jptr.shape[0] - 1, n = <int32_t>mptr.shape[0] - 1, count, room, i
         cdef int32_t[::1] whole, indices
         cdef double[::1] numbers
-        self.jac = (jptr.base, jidx.base, jval.base)
-        self.mass = (mptr.base, midx.base, mval.base)
+        self.jac = (jptr_, jidx_, jval_)
+        self.mass = (mptr_, midx_, mval_)
         self.g.n = n
         self.g.m = m
         self.g.jptr = &jptr[0]
@@ -47,27 +51,31 @@ cdef class Operator:
             self.g.jidx = &jidx[0]
             self.g.jval = &jval[0]
         room = <int32_t>midx.shape[0] + 1
-        whole = np.empty(5 * n + 2 + room, np.int32)
+        marks = new(5 * n + 2 + room, I4)
+        whole = marks
         # lptr, parent, scratch, then the columns of L
         count = tree_pattern(n, &mptr[0], &midx[0] if n else NULL, room, &whole[0], &whole[5 * n + 1], &whole[n + 1],
                              &whole[2 * n + 1], &whole[3 * n + 1], &whole[4 * n + 1])
-        indices = whole[5 * n + 1:]
+        entries = marks
+        self.g.lidx = &whole[5 * n + 1]
         while count < 0:                                # M's pattern is no tree's: L has more entries
             room = min(2 * room, n * n // 2 + 1)
-            indices = np.empty(room, np.int32)
+            entries = new(room, I4)
+            indices = entries
+            self.g.lidx = &indices[0]
             count = tree_pattern(n, &mptr[0], &midx[0], room, &whole[0], &indices[0], &whole[n + 1],
                                  &whole[2 * n + 1], &whole[3 * n + 1], &whole[4 * n + 1])
-        numbers = np.empty(2 * n + count + 1)
-        self.keep = [jptr, jidx, jval, mptr, midx, mval, whole, indices, numbers]
+        factor = new(2 * n + count + 1)
+        numbers = factor
+        self.keep = [marks, entries, factor]
         self.g.lptr = &whole[0]
         self.g.parent = &whole[n + 1]
-        self.g.lidx = &indices[0]
         self.g.lval = &numbers[2 * n]
         self.g.inv_pivot = &numbers[0]
         self.g.root = &numbers[n]                       # the factor's pivots, until it is there
         self.failed = -1
         if n:
-            self.failed = tree_factor(n, &mptr[0], &midx[0], &mval[0], &whole[0], &indices[0], &numbers[2 * n],
+            self.failed = tree_factor(n, &mptr[0], &midx[0], &mval[0], &whole[0], self.g.lidx, &numbers[2 * n],
                                       &numbers[n], &numbers[0])
         for i in range(n):
             numbers[n + i] = sqrt(numbers[i])
@@ -124,7 +132,7 @@ cdef class Operator:
     def bias(self, const double[::1] v, const double[::1] target):
         """b = target - J v (m,), a new array; what overflows is left to whoever reads it."""
         cdef int32_t i
-        made = np.empty(self.g.m)
+        made = new(self.g.m)
         cdef double[::1] out = made
         for i in range(self.g.m):
             out[i] = target[i] - (jac_row(&self.g, i, &v[0]) if self.g.n else 0.0)
@@ -142,8 +150,8 @@ def lower_of_dense(const double[:, ::1] a):
     for i in range(n):
         for j in range(i):
             nnz += a[i, j] != 0.0 or a[j, i] != 0.0
-    whole = np.empty(n + 1 + nnz + n, np.int32)
-    values = np.empty(nnz + n)
+    whole = new(n + 1 + nnz + n, I4)
+    values = new(nnz + n)
     cdef int32_t[::1] k = whole
     cdef double[::1] v = values
     nnz = 0

@@ -24,6 +24,8 @@ from lavender_ext.core.rows cimport (contact_diagonal, dot12, largest_eigenvalue
 from lavender_ext.core.weights cimport block_weights, joint_weights
 
 
+cdef object new = np.empty, I4 = np.dtype(np.int32)
+
 #: Friction laws by the kernels' numbers.
 LAWS = {"coulomb": COULOMB, "cone": CONE}
 
@@ -285,7 +287,7 @@ cdef class Data:
         # Kept as they came: a view made an object again costs more than the view.
         cdef const double[::1] b = b_
         cdef int32_t m = blocks.at.n_rows, n_empty, i
-        numbers_ = np.empty(3 * m + 3)
+        numbers_ = new(3 * m + 3)
         cdef double[::1] numbers = numbers_
         cdef double* d = &numbers[0]
         cdef double* nu = d + m + 1
@@ -550,7 +552,7 @@ def dense_to_csr(const double[:, ::1] a):
     for i in range(n):
         for j in range(m):
             nnz += a[i, j] != 0.0
-    whole, numbers = np.empty(n + 1 + nnz, np.int32), np.empty(nnz)
+    whole, numbers = new(n + 1 + nnz, I4), new(nnz)
     cdef int32_t[::1] indptr = whole
     cdef double[::1] data = numbers
     cdef int32_t* indices = &indptr[n + 1]
