@@ -5,6 +5,7 @@ rest = n log(now / tol) / log(before / now)         sweeps left, by the contract
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass
 from typing import Any
 
@@ -26,8 +27,9 @@ HOPE = 0.25  # share of a finite solver's cost that sweeps may take without prom
 BELIEVED = 2.0  # times a finite solver's cost that sweeps may take, whatever they promise
 APART = 10.0  # islands' worth of Python from which a finite solver is compared with islands solved apart
 PORTION = 0.25  # of a time limit that sweeps may take that will not get there within it
-LEAD = 0.5  # of the cost that sweeps promise, that those of the relaxation must promise to go before them
-FOLLOWS = 100.0  # times the tolerance that Coulomb's residual may be where the relaxation is at it
+SLOW = (
+    2.0  # times the cost that the relaxation promises by all that it did, at which its last look slows down
+)
 
 
 @dataclass
@@ -220,7 +222,14 @@ class Relaxed(Sweeps):
         super().__init__(convex)
         self.outer = trail
         self.last = trail.best
-        self.followed = np.inf  # Coulomb's residual where the relaxation was last solved
+
+    def look(self, step: int) -> float:
+        """As of all sweeps; one that finds the relaxation solved before the first of them promises what was."""
+        before, rest, at = self.done, self.rest, self.at
+        now = super().look(step)
+        if self.done == before:
+            self.rest, self.at = rest, at
+        return now
 
     def judge(self, status: Status) -> float:
         now = self.outer.offer(self.impulse)
@@ -229,9 +238,7 @@ class Relaxed(Sweeps):
         return now
 
     def stopped(self, status: Status) -> bool:
-        before, self.followed = self.followed, self.last
-        now = self.outer.best
-        return status is not Status.CONVERGED or not now <= FOLLOWS * self.outer.tol or now > 0.5 * before
+        return status is not Status.CONVERGED
 
     def note(self, prefix: str = "relaxation: ") -> None:
         trail, self.trail = self.trail, self.outer
@@ -239,28 +246,69 @@ class Relaxed(Sweeps):
         self.trail = trail
 
 
+class Racer:
+    """One of those that race; `before` [ns] was spent, and `best` reached, on what it goes on from."""
+
+    def __init__(self, sweeps: Sweeps, start: float, before: float = 0.0, best: float = np.inf) -> None:
+        self.sweeps, self.start, self.before, self.best = sweeps, start, before, best
+        self.tol = sweeps.tol
+        self.looks = 0
+
+    @property
+    def spent(self) -> float:
+        """Cost of what it did itself [ns]."""
+        return self.looks * LOOK + self.sweeps.done * self.sweeps.per
+
+    @property
+    def promised(self) -> float:
+        """Cost of what is left, by the mean contraction since the start (1) [ns]; nothing is known before a look."""
+        if self.sweeps.ended:
+            return np.inf
+        if self.best == np.inf:
+            return 0.0
+        return sweeps_left(self.before + self.spent, self.start, self.best, self.tol)
+
+    def look(self, budget: int) -> float:
+        self.looks += 1
+        now = self.sweeps.look(min(self.sweeps.next_look(), budget))
+        self.best = min(self.best, now)
+        return now
+
+
 def race(trail: Trail, own: Sweeps, budget: int) -> bool:
-    """Sweeps under Coulomb's law and under its relaxation, look by look whichever promises to cost less from there."""
+    """Sweeps under Coulomb's law, those of its relaxation, and the former from where the latter slow down.
+
+    Look by look whichever promises to cost less from there, so that none is dropped while it moves.
+    """
     relaxed = Relaxed(trail)
+    start = trail.best
     relaxed.impulse[:] = trail.problem.start()
-    looks, before = 0, np.inf
-    while not trail.late and not own.ended:
-        left = budget - trail.iterations - own.done - relaxed.done
-        first = own if not own.done else relaxed if not relaxed.done and not relaxed.ended else None
-        # Where a look finds a rise, what was promised before still holds.
-        promised = min(own.cost, before)
-        racer = first or (relaxed if relaxed.cost < LEAD * promised else own)
-        before = own.cost if racer is own else before
-        step = min(racer.next_look(), left)
-        if step <= 0:
+    slow = Racer(relaxed, 1.0)
+    racers = [Racer(own, start), slow]
+    while not trail.late:
+        racer = min(racers, key=lambda r: (r.promised, r.spent))
+        left = budget - trail.iterations - sum(r.sweeps.done for r in racers)
+        if left <= 0 or racer.sweeps.ended or racer.look(left) <= trail.tol:
             break
-        now = racer.look(step)
-        looks += 1
-        if now <= trail.tol:
-            break
-        spent = looks * LOOK + own.done * own.per + relaxed.done * relaxed.per
-        if relaxed.done and own.dearer(min(own.cost, relaxed.cost), spent, None):
+        spent = sum(r.spent for r in racers)
+        if len(racers) == 2 and slow.looks > 1 and SLOW * slow.promised < relaxed.cost:
+            racers.insert(0, Racer(_follower(own, relaxed.impulse, relaxed.last), 1.0, slow.spent, slow.best))
+        if slow.looks and own.dearer(min(r.sweeps.cost for r in racers), spent, None):
             break
     relaxed.note()
+    if len(racers) > 2:
+        racers[0].sweeps.note("from there: ")
     own.note()
     return trail.done
+
+
+def _follower(own: Sweeps, impulse: FloatArray, last: float) -> Sweeps:
+    """The same sweeps from another impulse (m,), of residual `last`."""
+    other = copy(own)
+    other.state = own.solver.prepare(own.trail.problem)
+    other.impulse = impulse.copy()
+    other.done = other.begun = other.at = 0
+    other.total = {}
+    other.last, other.rest = last, np.inf
+    other.ended = False
+    return other

@@ -254,3 +254,14 @@ def test_ctrl_c_inside_a_solver_ends_the_chain(interrupted_newton):
     assert len(looks) == 5
     assert solution.status is lv.Status.INTERRUPTED
     assert solution.residual.relative <= min(looks)
+
+
+@pytest.mark.parametrize("seed", [8, 9])
+def test_a_looser_tolerance_costs_no_more(seed):
+    # Whether the relaxation was left for good hung on where a check of its own fell: 50 times the sweeps.
+    problem = suite.granular(n=7, friction="coulomb", seed=seed).problem
+    found = [lv.solve(problem, tol=tol) for tol in (1e-3, 1e-4, 1e-6)]
+    assert all(solution.success for solution in found), found
+    sweeps = [solution.work["sweeps"] for solution in found]
+    assert sweeps[0] <= 1.1 * sweeps[1], sweeps
+    assert sweeps[1] <= 1.1 * sweeps[2], sweeps
