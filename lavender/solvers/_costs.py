@@ -54,9 +54,11 @@ SPARSE = 100.0  # for each nonzero of a sparse factor's matrix,
 SPARSE_ROWS = 1000.0  # as many times more as it has thousands of rows: fill grows with the size
 PIVOT, PIVOT_ENTRY = 60e3, 0.5  # of each pivot of lemke, and for each entry of its tableau
 # Newton over generalised velocities: a call, for each row beside each factor, and each multiply-add of the dense
-# factor of an island.
-GENERAL_START, GENERAL_ROW, GENERAL = 60e3, 40.0, 0.06
-GENERAL_FIRST = 0.4e6  # ns of it up to which nothing else is looked at first
+# factor of an island, most of whose entries are nought unless every contact is inside its cone.
+GENERAL_START = 60e3
+GENERAL_ROW = {"linear": 40.0, "lcp": 40.0, "cone": 140.0, "coulomb": 400.0}
+GENERAL = {"linear": 0.03, "lcp": 0.03, "cone": 0.06, "coulomb": 0.02}
+GENERAL_FIRST = 0.6e6  # ns of it up to which nothing else is looked at first
 FORM = 1.0  # of each multiply-add of Y Y^T
 FORMED_START, FORMED = 280e3, 6.0  # of A formed of J and M, and of each of its entries
 ADMM_START, ADMM_ROW, ADMM_ENTRY = (
@@ -84,7 +86,7 @@ TAIL_LEAST, TAIL_TIME = 6, 2e6  # of them at least under Coulomb's law, else as 
 BUDGET = {"linear": 2.0, "lcp": 2.0, "cone": 2.0, "coulomb": 1.2}  # times as many that its first turn has
 TAIL = {"linear": 2, "lcp": 10, "cone": 40, "coulomb": 24}  # more that are granted before another is asked
 MOST = 30.0  # of what rows add
-GENERAL_COUNT = {"linear": 2.0, "lcp": 10.0, "cone": 12.0, "coulomb": 20.0}  # over generalised velocities
+GENERAL_COUNT = {"linear": 2.0, "lcp": 10.0, "cone": 12.0, "coulomb": 30.0}  # over generalised velocities
 ADMM_COUNT, ADMM_FACTORS = 80.0, 2.0  # iterations to six decades where it gets there, and how often rho moves
 # Share of problems on which it does, over bodies and over rows of A: of candidates that may fail, those of least cost
 # for each chance come first.
@@ -111,8 +113,8 @@ LOOKS = 4  # at so many sweeps
 # All that `general_first` reads, for a compiled loop over many problems.
 GENERAL_GATE = (
     GENERAL_START,
-    GENERAL_ROW,
-    GENERAL,
+    tuple(GENERAL_ROW[law] for law in LAWS),
+    tuple(GENERAL[law] for law in LAWS),
     GENERAL_FIRST,
     FORM,
     tuple(GENERAL_COUNT[law] for law in LAWS),
@@ -140,8 +142,8 @@ class Exact:
 
 def general_cost(problem: Problem, largest: int) -> float:
     """Newton over generalised velocities, `largest` of them in one island [ns]."""
-    factor = GENERAL * factor_flops(problem, largest)
-    return GENERAL_START + GENERAL_COUNT[problem.law] * (GENERAL_ROW * problem.m + factor)
+    factor = GENERAL[problem.law] * factor_flops(problem, largest)
+    return GENERAL_START + GENERAL_COUNT[problem.law] * (GENERAL_ROW[problem.law] * problem.m + factor)
 
 
 def sweep_cost(problem: Problem) -> float:
@@ -244,6 +246,19 @@ class Costs:
         self.problem, self.largest = problem, largest
         self.decades = float(-np.log10(min(max(tol, 1e-16), 0.1)))
         self.sweep = sweep_cost(problem)
+        self.ended = set[str]()  # keys of finite solvers that gave up
+
+    def gave_up(self, key: str) -> None:
+        """A finite solver gave up: what was guessed of the others beside it is looked at closely when it is asked."""
+        self.ended.add(key)
+        if self.__dict__.get("_others_win"):
+            del self._others_win
+            self.__dict__.pop("exact", None)
+
+    @property
+    def cheapest(self) -> float:
+        """Of the finite solvers that did not give up [ns]."""
+        return next((e.cost for e in self.exact if e.key not in self.ended), self.exact[0].cost)
 
     def glance(self, sweeps: int) -> float:
         """A first look at so many sweeps [ns]."""
@@ -270,7 +285,7 @@ class Costs:
     @cached_property
     def least(self) -> float:
         """What no finite solver costs less than [ns]."""
-        return min(self.formed + finite_least(self.problem), self._general)
+        return min(self.formed + finite_least(self.problem), self.over_velocities)
 
     @property
     def guess(self) -> float:
@@ -285,7 +300,7 @@ class Costs:
             width = self._width(m) if p.rows is not None else 0.5 * p.metric.work / max(m, 1)
             times = SINGULAR if p.law == "lcp" and self.redundant else 1.0
             found = min(self._newton_guess, self._direct(BAND * m * max(3.0, width) ** 2, times))
-        return min(self.formed + found, self._general)
+        return min(self.formed + found, self.over_velocities)
 
     @cached_property
     def formed(self) -> float:
@@ -293,7 +308,7 @@ class Costs:
         return formed_cost(self.problem)
 
     @cached_property
-    def _general(self) -> float:
+    def over_velocities(self) -> float:
         """Newton over generalised velocities [ns]; inf where it has no room, or none are given."""
         return general_cost(self.problem, self.largest) if self.largest else np.inf
 
@@ -336,7 +351,7 @@ class Costs:
             found.append(Exact("lemke", START["lemke"] + p.m * (PIVOT + PIVOT_ENTRY * float(p.m) ** 2), 0))
         if self.largest:
             count = 2 * int(GENERAL_COUNT[p.law]) + GENERAL_TAIL
-            cost = self._general
+            cost = self.over_velocities
             once = GENERAL_START + (cost - GENERAL_START) / GENERAL_COUNT[p.law]
             found.append(Exact("newton", cost, count, (("form", "velocity"),), once))
         if p.law in ("cone", "coulomb") and (p.generalized is None or p.m <= ADMM_GENERAL):
@@ -362,7 +377,8 @@ class Costs:
 
     @cached_property
     def _others_win(self) -> bool:
-        return min([e.cost for e in self._others], default=np.inf) <= self._newton_guess
+        left = [e.cost for e in self._others if e.key not in self.ended]
+        return min(left, default=np.inf) <= self._newton_guess
 
     @cached_property
     def _newton_guess(self) -> float:

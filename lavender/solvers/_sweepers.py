@@ -211,7 +211,7 @@ class Sweeps:
             return True
         costs = self.trail.costs
         # To ask closely of J and M forms A: not before that much was swept.
-        return than(costs.least) and than(costs.guess) and spent > costs.formed and than(costs.exact[0].cost)
+        return than(costs.least) and than(costs.guess) and spent > costs.formed and than(costs.cheapest)
 
 
 class Relaxed(Sweeps):

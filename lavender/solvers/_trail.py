@@ -54,6 +54,11 @@ class Trail:
         self.impulse = self.problem.start()
         self.w, self.e = np.empty(m), np.empty(m)
 
+    def gave_up(self, key: str, before: float) -> None:
+        """A finite solver ended, from the residual `before`, without being asked to."""
+        self.ended[key] = before
+        self.costs.gave_up(key)
+
     def offer(self, impulse: FloatArray) -> float:
         """Judge an impulse and keep it if it is the best."""
         found = known(self.problem, impulse)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from time import perf_counter
 from typing import Any
@@ -23,6 +23,7 @@ __all__ = ["VELOCITY", "Turns", "whole"]
 
 CHUNK_WORK = 8  # sweeps' work that an iteration of admm is
 ROUNDS = 8  # times that sweeps and finite solvers take turns, the allowance doubled each time
+ALIKE = ("direct", "lemke")  # do the same wherever they start
 VELOCITY = "newton velocity"  # key of newton over generalised velocities
 
 
@@ -75,7 +76,7 @@ def whole(
     if claim.status is Status.INTERRUPTED:
         raise KeyboardInterrupt
     if claim.status is not Status.MAX_ITERATIONS:
-        trail.ended[chosen.key] = before
+        trail.gave_up(chosen.key, before)
     if claim.certificate is not None and check_certificate(trail.problem, claim.certificate) is None:
         trail.certificate = claim.certificate
     return trail.done
@@ -117,19 +118,26 @@ class Turns:
     def left(self) -> bool:
         return self.taken < ROUNDS and not self.over
 
+    def candidates(self) -> Iterator[Exact]:
+        """Each finite solver once, the cheapest first, by what is known of them when it is asked for."""
+        asked = set[str]()
+        while left := [e for e in self.trail.costs.exact if e.key not in asked]:
+            asked.add(left[0].key)
+            yield left[0]
+
     def take(self) -> bool:
         """One turn; True when nothing is left to do."""
         trail, costs, k = self.trail, self.trail.costs, self.taken
         before, spent = trail.best, trail.iterations
         # Friction that Newton's method needs so long for is as often ended by admm.
         longer = 1 if self.inside is not None and trail.problem.law == "coulomb" else 0
-        for candidate in costs.exact:
+        for candidate in self.candidates():
             if trail.best <= trail.tol or self.budget <= trail.iterations:
                 return True
             if candidate is self.inside:
                 continue
             started = trail.ended.get(candidate.key)
-            if started is not None and not trail.best <= 0.1 * started:
+            if started is not None and (candidate.name in ALIKE or not trail.best <= 0.1 * started):
                 continue  # it gave up, and would do so again
             if np.isfinite(candidate.once) and perf_counter() + 1e-9 * candidate.once > trail.deadline:
                 continue  # its first factor would come too late
@@ -150,7 +158,7 @@ class Turns:
                 break  # turns were taken meanwhile
         else:
             self.taken += 1
-            self.allowance = max(2.0 * self.allowance, 2.0 * costs.exact[0].cost)
+            self.allowance = max(2.0 * self.allowance, 2.0 * costs.cheapest)
             self.sweeps = self.sweeps or Sweeps(trail)
             if self.sweeps.run(self.budget, self.allowance):
                 return True

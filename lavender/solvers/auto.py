@@ -35,6 +35,7 @@ from lavender.registry import FEW, SolverSpec
 from lavender.residuals import reference
 from lavender.solution import Claim, Status
 from lavender.solvers._costs import (
+    DIRECT_ROUNDS,
     FIRST_LOOK,
     ISLAND,
     Costs,
@@ -58,7 +59,9 @@ FEW_JOINTS = 300  # rows up to which a linear system is not looked at more close
 RELAXED = 1e6  # ns that sweeps usually take from which Coulomb's law is relaxed first: a problem of its own
 GLANCE = 0.35  # share of a finite solver's cost for which a first look at sweeps is always worth it
 FRICTION_APART = 2.0  # times the cost of the whole that islands with friction may take
-GENERAL_STEPS = 256  # that it then has
+# Steps that newton over the velocities then has; under Coulomb's law, where it ends soon or late, as many as in one
+# compiled call.
+GENERAL_STEPS = {"linear": 256, "lcp": 256, "cone": 256, "coulomb": 64}
 ROUND_SWEEPS = 1000  # of nncg on round cones given by A, before admm is asked
 CERTIFICATE_ROWS = 3000  # rows up to which a linear program is asked for a certificate
 CERTIFICATE_STEPS = 100  # of the simplex method for each row at most
@@ -92,7 +95,7 @@ class Auto:
             kernel = general.prepare(problem)
             largest = 0 if kernel is None else kernel.largest
             if kernel is not None and general_first(problem, largest):
-                claim = general.run(problem, kernel, lam, min(n, GENERAL_STEPS), tol, time_limit)
+                claim = general.run(problem, kernel, lam, min(n, GENERAL_STEPS[problem.law]), tol, time_limit)
                 if claim.status is Status.CONVERGED:
                     impulse[:] = lam
                     return general.named(claim, "auto")
@@ -109,7 +112,7 @@ class Auto:
             trail.add("newton", claim)
             trail.begun = True
             if claim.status is not Status.MAX_ITERATIONS:
-                trail.ended[VELOCITY] = trail.best
+                trail.gave_up(VELOCITY, trail.best)
             if np.isfinite(lam).all():
                 trail.offer(lam)
         interrupted = False
@@ -160,18 +163,18 @@ def _solve(trail: Trail, budget: int, glance: Glance | None = None) -> None:
                 return
         return
     sweeps = None
-    if glance is None and factors_at_once(problem):
-        # START of sweeps alone costs more than this factor.
-        if whole(trail, Exact("direct", 0.0, 0), budget):
-            return
-    elif glance is not None or not _at_once(costs):
+    # START of sweeps alone costs more than this factor; where it is singular, sweeps are asked before it is shifted.
+    hasty = Exact("direct", 0.0, DIRECT_ROUNDS, (("patience", False),))
+    if glance is None and factors_at_once(problem) and whole(trail, hasty, budget):
+        return
+    if glance is not None or not _at_once(costs):
         large = problem.law == "coulomb" and problem.m >= LARGE and problem.rows is not None
         sweeps = Sweeps(trail, "nncg", order="symmetric") if large else Sweeps(trail, glance=glance)
         if problem.m > FEW and _may_relax(trail) and race(trail, sweeps, budget):
             return
         if sweeps.run(budget):
             return
-    least = costs.exact[0].cost
+    least = costs.cheapest
     if least > 2.0 * ISLAND and _worth_apart(trail, least) and _apart(trail, budget):
         return
     _finish(trail, sweeps, budget)
@@ -190,9 +193,10 @@ def _at_once(costs: Costs) -> bool:
     glance = costs.glance(FIRST_LOOK)
 
     def dear(cost: float) -> bool:
-        return cost > costs.sweeping or (glance < costs.formed + GLANCE * cost and not costs.redundant)
+        formed = 0.0 if cost >= costs.over_velocities else costs.formed
+        return cost > costs.sweeping or (glance < formed + GLANCE * cost and not costs.redundant)
 
-    return not dear(costs.guess) and not dear(costs.exact[0].cost)
+    return not dear(costs.guess) and not dear(costs.cheapest)
 
 
 def _may_relax(trail: Trail) -> bool:

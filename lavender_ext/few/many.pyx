@@ -33,10 +33,12 @@ cdef enum:
 
 cdef struct gate_t:             # what Newton's method may cost [ns] to be asked first; see `general_first`
     int32_t is_open             # whatever it costs
-    double start, row, factor
+    double start
+    double row[4]               # by law: linear, lcp, coulomb, cone
+    double factor[4]
     double most
     double form                 # of a multiply-add of A
-    double count[4]             # factorisations by law: linear, lcp, coulomb, cone
+    double count[4]             # factorisations by law
 
 
 cdef struct job_t:
@@ -105,7 +107,7 @@ cdef inline bint is_first(const job_t* j, const gate_t* gate, int32_t largest) n
     flops = <double>j.g.n * (<double>largest * <double>largest) / 6.0
     if j.law == 2:
         flops = 2.0 * flops
-    cost = gate.start + gate.count[j.law] * (gate.row * j.p.n_rows + gate.factor * flops)
+    cost = gate.start + gate.count[j.law] * (gate.row[j.law] * j.p.n_rows + gate.factor[j.law] * flops)
     if cost <= gate.most:
         return True
     entries = 0.5 * (<double>(2 * <ssize_t>j.g.pval[j.g.n_panels] + 4 * <ssize_t>j.p.n_rows) - 4.0 * j.p.n_rows)
@@ -199,7 +201,7 @@ cdef class Gate:
 
     Parameters
     ----------
-    gate : tuple (start, row, factor, most, form, counts) or None
+    gate : tuple (start, rows, factors, most, form, counts) or None
         None: whatever it costs.
     """
 
@@ -208,8 +210,9 @@ cdef class Gate:
     def __init__(self, gate):
         self.at.is_open = gate is None
         if gate is not None:
-            (self.at.start, self.at.row, self.at.factor, self.at.most, self.at.form, counts) = gate
+            (self.at.start, rows, factors, self.at.most, self.at.form, counts) = gate
             for i in range(4):
+                self.at.row[i], self.at.factor[i] = rows[i], factors[i]
                 self.at.count[i] = counts[i]
 
 

@@ -161,7 +161,7 @@ cdef inline int32_t find_islands(const blocks_t* p, const generalized_t* g, int3
 
 cdef struct need_t:             # what the islands of a problem ask for
     int32_t most[4]             # as `find_islands` tells
-    int32_t wide                # columns of a dense island of the same work as the costliest, at most most[0]
+    int32_t wide                # columns of a dense island that costs what the costliest does, at most most[0]
     int32_t crowded             # L of a large problem has more than `per` entries in a row: settle again, with more
     double values               # of N, of the island that has most; its factor has as many
 
@@ -209,9 +209,9 @@ cdef inline void settle(flow_t* f, const blocks_t* p, const generalized_t* g, in
         size = f.cptr[i + 1] - f.cptr[i]
         values = <double>size * size
         wide = size
-        if p.law != COULOMB and f.lptr != NULL and is_worth(size, f.lptr + f.cptr[i]):
+        if p.law != COULOMB and f.lptr != NULL and is_worth(size, f.lptr + f.cptr[i], f.lidx):
             values = f.lptr[f.cptr[i + 1]] - f.lptr[f.cptr[i]] + size
-            wide = <int32_t>ceil(sqrt(6.0 * factor_work(size, f.lptr + f.cptr[i]) / size))
+            wide = <int32_t>ceil(sqrt(6.0 * factor_work(size, f.lptr + f.cptr[i], f.lidx) / size))
         if values > need.values:
             need.values = values
         if wide > need.wide:

@@ -880,7 +880,7 @@ cdef inline int32_t solve_island(flow_t* f, int32_t island, double* impulse, bin
     cdef int32_t end
     cdef double least = 1.0 / 0.0, share = soft
     f.island = island
-    f.thin = f.lptr != NULL and is_worth(f.cptr[island + 1] - f.cptr[island], f.lptr + f.cptr[island])
+    f.thin = f.lptr != NULL and is_worth(f.cptr[island + 1] - f.cptr[island], f.lptr + f.cptr[island], f.lidx)
     restart(f, island, impulse)
     level(f, island)
     if not offer(f, island, impulse, &least):

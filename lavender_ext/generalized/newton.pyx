@@ -35,7 +35,7 @@ cdef public int32_t lav_general_newton(flow_t* f, double* impulse, int32_t cold,
 cdef class Newton:
     """Room for Newton's method on a problem in generalised coordinates; `run` as often as wanted.
 
-    `largest`: velocities of the island whose factor costs most, or of a dense one of the same work. Where N of an
+    `largest`: velocities of the island whose factor costs most, or of a dense one that costs the same. Where N of an
     island has more than `most` values (`fits`) there is no room, and no `run`.
     """
 

@@ -14,6 +14,7 @@ from lavender_ext.core.generalized cimport generalized_t, tree_pattern
 cdef enum:
     PER_COLUMN = 24             # entries in a row of L for which there is room at first
     MANY = 200                  # columns from which on more room is made where that does not hold a pattern
+    PASSED = 8                  # multiply-adds of a dense factor that it costs to pass over a column
     SMALL = 40                  # columns up to which dense factors cost less than to look for a pattern: a hand's
 
 
@@ -76,20 +77,26 @@ cdef inline int32_t find_pattern(const generalized_t* g, int32_t n_islands, cons
     return count
 
 
-cdef inline double factor_work(int32_t n, const int32_t* lptr) noexcept nogil:
-    """Multiply-adds of one factor."""
-    cdef int32_t k
-    cdef double c, s = 0.0
+cdef inline double factor_work(int32_t n, const int32_t* lptr, const int32_t* lidx) noexcept nogil:
+    """Multiply-adds of one factor, and PASSED for each column passed over to find those of a row."""
+    cdef int32_t k, q, first, end, theirs
+    cdef double c, s = 0.0, passed = 0.0
     for k in range(n):
-        c = lptr[k + 1] - lptr[k]
+        first = lptr[k]
+        end = lptr[k + 1]
+        c = end - first
         s += 0.5 * c * (c + 1.0)
-    return s
+        for q in range(first, end):
+            theirs = lptr[lidx[q] + 1] - lptr[lidx[q]]
+            if theirs != q - first:
+                passed += theirs
+    return s + PASSED * passed
 
 
-cdef inline bint is_worth(int32_t n, const int32_t* lptr) noexcept nogil:
+cdef inline bint is_worth(int32_t n, const int32_t* lptr, const int32_t* lidx) noexcept nogil:
     """Whether the rows' own entries cost less: multiply-adds, 12 instructions of each entry, 5 of each of a square."""
     cdef double size = n
-    return (n > SMALL and factor_work(n, lptr) + 12.0 * (lptr[n] - lptr[0])
+    return (n > SMALL and factor_work(n, lptr, lidx) + 12.0 * (lptr[n] - lptr[0])
             < size * size * size / 6.0 + 5.0 * size * size)
 
 

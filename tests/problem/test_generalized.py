@@ -595,8 +595,8 @@ def cloth(side, seed, friction="cone"):
 def test_many_small_trees_are_put_in_an_order_that_fills_in_little(seed):
     problem = cloth(24, seed)
     assert problem.generalized.order is not None
-    # Natural order of a band: rows of 24 entries; a random one: a hundred and more.
-    assert general.prepare(problem).largest <= 40
+    # Its factor costs what a dense one of 96 velocities costs; in the order that was drawn, one of 430.
+    assert general.prepare(problem).largest <= 120
     solution = lv.solve(problem, "newton", form="velocity", tol=1e-10)
     assert solution.success
     other = lv.solve(problem, "newton", form="impulse", tol=1e-10)
@@ -612,7 +612,7 @@ def test_room_for_a_pattern_grows():
     """More entries in a row than there is room for at first, of more columns than are kept dense for that."""
     problem = cloth(50, 0)
     kernel = general.prepare(problem)
-    assert kernel.fits and kernel.largest < 150
+    assert kernel.fits and kernel.largest < 200
     assert lv.solve(problem, "newton", form="velocity", tol=1e-9).success
     assert lv.solve_many([problem], tol=1e-6)[0].success
 

@@ -265,3 +265,32 @@ def test_a_looser_tolerance_costs_no_more(seed):
     sweeps = [solution.work["sweeps"] for solution in found]
     assert sweeps[0] <= 1.1 * sweeps[1], sweeps
     assert sweeps[1] <= 1.1 * sweeps[2], sweeps
+
+
+def twice_touching(n):
+    """n masses in a line, each in contact with the next at two points: A is singular, of half bandwidth 3."""
+    jac = sp.lil_array((2 * n, n))
+    for i in range(2 * n):
+        jac[i, i // 2] = 1.0
+        if i >= 2:
+            jac[i, i // 2 - 1] = -1.0
+    return lv.Problem.lcp((jac @ jac.T).tocsr(), np.repeat(np.random.default_rng(0).uniform(0.5, 2.0, n), 2))
+
+
+def test_what_gave_up_is_not_what_others_are_compared_with():
+    costs = Costs(twice_touching(60), 1e-6)
+    first = costs.exact[0]
+    assert costs.cheapest == first.cost
+    costs.gave_up(first.key)
+    assert costs.cheapest == min(e.cost for e in costs.exact if e.key != first.key) > first.cost
+
+
+def test_a_singular_band_is_factored_once_before_sweeps():
+    """Every contact given twice: `direct` would shift and refine, and sweeps hardly notice."""
+    problem = twice_touching(60)
+    solution = lv.solve(problem, tol=1e-6)
+    assert solution.success
+    assert solution.message.startswith("direct")
+    assert solution.message.count("direct") == 1
+    assert "shifts" not in solution.work
+    assert lv.solve(problem, "direct", tol=1e-6).work["shifts"] > 0
