@@ -96,6 +96,16 @@ cdef class Operator:
         return self.g.lptr[self.g.n] - (len(self.mass[1]) - self.g.n)
 
     @property
+    def work(self):
+        """Multiply-adds of the factor: of a row with c entries left of the diagonal c (c + 1) / 2."""
+        cdef int32_t i, c
+        cdef double out = 0.0
+        for i in range(self.g.n):
+            c = self.g.lptr[i + 1] - self.g.lptr[i]
+            out += 0.5 * c * (c + 1.0)
+        return out
+
+    @property
     def parents(self):
         """Parent of each velocity in the tree of M's factor (n,), -1 at a root; a new array."""
         cdef int32_t i

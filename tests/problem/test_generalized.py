@@ -12,6 +12,7 @@ from random_problems import seeds
 from random_trees import chain, random_general, random_tree, tree_mass
 
 import lavender as lv
+from lavender import generalized as coordinates
 from lavender import registry
 from lavender.solvers._costs import Costs
 from lavender.solvers._islands import islands, restrict, rows_of
@@ -73,7 +74,8 @@ def test_the_judge_says_of_j_and_m_what_it_says_of_a(friction, spin, seed):
     assert other.floor * (1 - 1e-9) <= own.floor <= 30 * other.floor
 
 
-def test_the_factor_of_a_tree_has_no_fill_whatever_the_order_of_its_velocities():
+def test_the_factor_of_a_tree_has_no_fill_whatever_the_order_of_its_velocities(monkeypatch):
+    monkeypatch.setattr(coordinates, "FACTORS", np.inf)  # whatever the search costs
     rng = np.random.default_rng(5)
     parent = random_tree(rng, 30)
     mass = tree_mass(rng, parent)
@@ -90,6 +92,18 @@ def test_the_factor_of_a_tree_has_no_fill_whatever_the_order_of_its_velocities()
     x = rng.normal(size=30)
     np.testing.assert_allclose(mixed.solve(x[shuffle]), np.linalg.solve(mass, x)[shuffle], rtol=1e-10)
     assert len(np.unique(mixed.trees)) == sum(p < 0 for p in parent)
+
+
+def test_few_velocities_keep_the_order_given():
+    """A search for another order costs more than all the factors of a robot whose root slides in two directions."""
+    rng = np.random.default_rng(5)
+    mass = np.diag(np.full(9, 3.0))
+    mass[-1, :-1] = mass[:-1, -1] = rng.uniform(0.2, 0.5, 8)  # a star whose centre comes last fills in
+    general = lv.Generalized(np.eye(9)[:2], mass, np.zeros(9))
+    assert general.operator.fill > 0
+    assert general.order is None
+    x = rng.normal(size=9)
+    np.testing.assert_allclose(general.solve(x), np.linalg.solve(mass, x), rtol=1e-12)
 
 
 def test_a_mesh_fills_in_but_less_than_as_given():
@@ -561,10 +575,12 @@ def test_branches_are_factored_in_their_own_pattern(friction, seed):
 def test_a_look_at_j_changes_nothing_that_kernels_read():
     """Velocities in an order of the factor's own: J is given back in the order given, of a copy."""
     rng = np.random.default_rng(0)
-    mass = np.diag(np.full(6, 3.0))
-    mass[-1, :-1] = mass[:-1, -1] = rng.uniform(0.2, 0.5, 5)  # a star whose centre comes last fills in
-    jac = rng.normal(size=(4, 6))
-    problem = lv.Problem.from_jacobian(jac, mass, rng.normal(size=6), cones=lv.Cones.free(4), compliance=0.1)
+    mass = np.diag(np.full(120, 30.0))
+    mass[-1, :-1] = mass[:-1, -1] = rng.uniform(0.2, 0.5, 119)  # a star whose centre comes last fills in
+    jac = rng.normal(size=(4, 120))
+    problem = lv.Problem.from_jacobian(
+        jac, mass, rng.normal(size=120), cones=lv.Cones.free(4), compliance=0.1
+    )
     assert problem.generalized.order is not None
     lam = rng.normal(size=4)
     before = problem.slack(lam)
