@@ -358,7 +358,8 @@ def _worth_ordering(work: float, n: int) -> bool:
     """Whether factors of so many multiply-adds cost more than a better order takes to be found, ns.
 
     Measured on trees given in the wrong order, 9, 27, 60, 100, 200 and 400 velocities: a search 0.24, 0.4, 0.9, 2.1, 7
-    and 31 ms; a multiply-add 2 ns. A robot of 9 velocities whose root slides in two directions fills in by a single entry.
+    and 31 ms; a multiply-add 2 ns. A robot of 9 velocities whose root slides in two directions fills in by one
+    entry.
     """
     return 2.0 * FACTORS * work > 2e5 + 7e3 * n + 170.0 * n * n
 
