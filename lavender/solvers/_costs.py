@@ -47,7 +47,7 @@ STEP = {"direct": 10e3, "newton": 35e3}  # beside each factor
 ROW = 30.0  # for each row beside each factor of `direct`,
 NEWTON_ROW = {"linear": 150.0, "lcp": 150.0, "cone": 300.0, "coulomb": 300.0}  # and of `newton`
 BODIES_START, BODIES_STEP, BODIES_ROW = 150e3, 8e3, 190.0  # of `newton` over bodies under a convex law
-DENSE = 0.1  # for each multiply-add of a dense factor
+DENSE, DENSE_ENTRY = 0.03, 3.0  # for each multiply-add of a dense factor, and for each entry of its matrix
 BAND = 0.4  # of a band's
 BLOCK, PANEL = 0.35, 0.2  # of one over bodies, by block rows and by panels
 SPARSE = 100.0  # for each nonzero of a sparse factor's matrix,
@@ -119,7 +119,8 @@ GENERAL_GATE = (
     FORM,
     tuple(GENERAL_COUNT[law] for law in LAWS),
 )
-GENERAL_TAIL = 60  # more steps over generalised velocities than expected that are granted
+# Steps over generalised velocities that are granted beside twice those expected.
+GENERAL_TAIL = {"linear": 60, "lcp": 60, "cone": 60, "coulomb": 0}
 ADMM_GENERAL = 1500  # rows up to which A of J and M, whose entries are not known, is formed for `admm`
 LEMKE_ROWS = 1000  # beyond, a dense tableau of 8 MB and more
 
@@ -350,7 +351,7 @@ class Costs:
         if p.law == "lcp" and p.m <= LEMKE_ROWS:
             found.append(Exact("lemke", START["lemke"] + p.m * (PIVOT + PIVOT_ENTRY * float(p.m) ** 2), 0))
         if self.largest:
-            count = 2 * int(GENERAL_COUNT[p.law]) + GENERAL_TAIL
+            count = 2 * int(GENERAL_COUNT[p.law]) + GENERAL_TAIL[p.law]
             cost = self.over_velocities
             once = GENERAL_START + (cost - GENERAL_START) / GENERAL_COUNT[p.law]
             found.append(Exact("newton", cost, count, (("form", "velocity"),), once))
@@ -393,9 +394,9 @@ class Costs:
         m, nnz = float(p.m), float(len(p._compressed[1])) if p.generalized is None else float(p.m)
         share = nnz / (m * m)
         return self._newton(
-            min(BAND * m * max(1.0, 0.5 * nnz / m) ** 2, self._sparse(int(nnz), p.m), DENSE * m**3 / 3.0)
+            min(BAND * m * max(1.0, 0.5 * nnz / m) ** 2, self._sparse(int(nnz), p.m), dense_factor(m))
             if share < DENSE_FILL
-            else DENSE * m**3 / 3.0
+            else dense_factor(m)
         )
 
     def _width(self, n: int) -> float:
@@ -440,8 +441,8 @@ class Costs:
         if not isinstance(system, MatrixSystem):
             return (BLOCK if system.cost < PANELS else PANEL) * system.cost
         if system.dense:
-            return DENSE * system.cost
-        if system.band is not None:
+            return float(dense_factor(system.sc.m))
+        if system.band is not None and self.problem.law != "coulomb":
             return BAND * system.sc.m * float(system.band.h.shape[1]) ** 2
         return self._sparse(system.h.nnz, system.sc.m)
 
@@ -449,7 +450,7 @@ class Costs:
     def _matrix(self) -> float:
         """One factor of A as `direct` makes it [ns]; of a factored problem without forming A."""
         p, m = self.problem, self.problem.m
-        dense = DENSE * float(m) ** 3 / 3.0
+        dense = float(dense_factor(m))
         if p.rows is not None and p.rows.n_bodies:
             bodies, n = block_bodies(p), p.rows.n_bodies
             width = graph.body_spread(p.cones.ptr, bodies, n) + 1
@@ -461,7 +462,7 @@ class Costs:
             if width > NARROW and found > TINY_FACTOR and isinstance(self.system, VelocitySystem):
                 share = m / n / self.system.s  # rows for each unknown of a body
                 over_bodies = FILL * BAND * self.system.cost * share**3
-                found = min(found, max(over_bodies, DENSE * float(clique) ** 3 / 3.0))
+                found = min(found, max(over_bodies, float(dense_factor(clique))))
             return found
         form, band, _ = choose(p) if p.is_symmetric else ("general", max(p.bandwidth), None)
         if form == "band":
@@ -473,11 +474,19 @@ class Costs:
         return SPARSE * nnz * (1.0 + m / SPARSE_ROWS)
 
 
+def dense_factor(m: Any) -> Any:
+    """Of m rows [ns]."""
+    m = np.asarray(m, float)
+    return DENSE * m**3 / 3.0 + DENSE_ENTRY * m**2
+
+
 def admm_cost(problem: Problem, m: Any, entries: Any, count: float) -> tuple[Any, Any]:
     """`admm` on m rows of a problem: to the end, for each chance to get there, and with the first factor alone [ns]."""
     lu = 1.0 if problem.is_symmetric else UNSYMMETRIC
     factor = lu * SPARSE * entries * (1.0 + m / SPARSE_ROWS)
-    each = ADMM_ROW * m + ADMM_ENTRY * lu * ADMM_FILL * entries
+    if problem.is_symmetric:
+        factor = np.minimum(factor, dense_factor(m))
+    each = ADMM_ROW * m + ADMM_ENTRY * lu * np.minimum(ADMM_FILL * entries, 0.5 * m * m)
     whole = ADMM_START + ADMM_FACTORS * factor + count * each
     return whole / (ADMM_LUCK if problem.rows is None else ADMM_LUCK_BODIES), ADMM_START + factor
 
@@ -488,7 +497,7 @@ def islands_cost(problem: Problem, sizes: Any) -> float:
     count = NEWTON[problem.law] + np.minimum(MOST, PER_ROW[problem.law] * m)
     start, step, row = newton_rates(problem)
     factor = np.minimum(
-        DENSE * m**3 / 3.0, SPARSE * problem.metric.work / max(problem.m, 1) * m * (1.0 + m / SPARSE_ROWS)
+        dense_factor(m), SPARSE * problem.metric.work / max(problem.m, 1) * m * (1.0 + m / SPARSE_ROWS)
     )
     each = start + count * (step + row * m + UNSYMMETRIC * factor)
     if problem.law in ("cone", "coulomb"):
