@@ -103,6 +103,9 @@ SWEEPS, SWEEPS_REDUNDANT = 60.0, 400.0
 
 FILL = 5.0  # of a factor over rows against one over bodies, for the same unknowns: rows of one body are all neighbours
 ISLAND = 400e3  # what Python takes for an island of its own
+# Islands in compiled code: a call, for each beside its solve, and for each of its rows (`python
+# benchmarks/bench_islands.py`).
+TOGETHER, TOGETHER_ISLAND, TOGETHER_ROW = 200e3, 1e3, 60.0
 BAND_AT_ONCE = 1e6  # ns of `direct` on a narrow band up to which nothing else is looked at
 LU_ROWS = 300  # of a linear system that is not symmetric, up to which sweeps are looked at before its factor
 NARROW_ENTRIES = 12  # of A in a row up to which a narrow band is looked for
@@ -505,6 +508,18 @@ def islands_cost(problem: Problem, sizes: Any) -> float:
         each = np.minimum(each, admm_cost(problem, m, entries, ADMM_COUNT)[0])
     each += ISLAND
     return float(each.sum())
+
+
+def together_cost(problem: Problem, count: int, largest: int) -> float:
+    """What it takes to solve so many islands in compiled code, beside sweeps over each [ns].
+
+    Under a convex law that of J and M is mostly Newton's method, `largest` velocities in an island, which hardly
+    ever fails: half of it counts.
+    """
+    found = TOGETHER + TOGETHER_ISLAND * count + TOGETHER_ROW * problem.m
+    if problem.generalized is not None and problem.law != "coulomb":
+        found += 0.5 * general_cost(problem, largest) if largest else np.inf
+    return found
 
 
 def is_loose(problem: Problem) -> bool:

@@ -21,27 +21,11 @@ def islands(problem: Problem) -> tuple[int, IntArray]:
     cones = problem.cones
     if problem.rows is not None:
         return graph.body_components(block_bodies(problem), problem.rows.n_bodies)
-    block = np.repeat(np.arange(cones.n_blocks, dtype=np.int32), np.diff(cones.ptr))
     if problem.generalized is not None:
-        return _tree_islands(problem, block)
+        return graph.tree_components(problem.derived.view)
+    block = np.repeat(np.arange(cones.n_blocks, dtype=np.int32), np.diff(cones.ptr))
     a = problem.csr
     return graph.matrix_components(cones.ptr, block, a.indptr, a.indices)
-
-
-def _tree_islands(problem: Problem, block: IntArray) -> tuple[int, IntArray]:
-    from scipy.sparse import coo_array, csgraph
-
-    assert problem.generalized is not None
-    jac, k = problem.generalized.jac, problem.n_blocks
-    trees = problem.generalized.trees
-    row = np.repeat(block, np.diff(jac.indptr))
-    n = k + int(trees.max(initial=-1)) + 1
-    graph = coo_array((np.ones(len(row), np.int8), (row, k + trees[jac.indices])), shape=(n, n))
-    label = csgraph.connected_components(graph, directed=False)[1][:k]
-    first, which = np.unique(label, return_index=True)[1], np.unique(label, return_inverse=True)[1]
-    number = np.empty(len(first), np.int32)
-    number[np.argsort(first)] = np.arange(len(first), dtype=np.int32)
-    return len(first), np.ascontiguousarray(number[which], np.int32)
 
 
 def block_bodies(problem: Problem) -> IntArray:

@@ -21,6 +21,7 @@ from lavender.solvers._islands import islands
 
 __all__ = ["CLOCK", "Trail", "usable"]
 
+CAUTION = 0.999  # of what is left of the tolerance: sums are rounded
 CLOCK = 0.01  # s between two looks at the clock, at a nanosecond for each unit of work
 
 
@@ -72,28 +73,41 @@ class Trail:
         """How many, and the island of each block."""
         return islands(self.problem)
 
-    def wrong_islands(self) -> tuple[IntArray, IntArray]:
-        """Which islands (count,) miss their share of the whole tolerance, and the island of each row (m,)."""
+    def wrong_islands(self) -> tuple[IntArray, IntArray, float]:
+        """Which islands miss their share of the whole tolerance, the island of each row (m,), and the share [sqrt J].
+
+        Of the energy error each may have as much as makes the tolerance with those that have less,
+        sum min(e_i, share)^2 = (tol E0)^2. A pair of tangents counts by its norm, at most sqrt(2) times its
+        larger entry.
+        """
         count, label = self.islands
         problem = self.problem
         energy, velocity = reference(problem)
         quick(problem, self.impulse, self.w, self.e)
         of_row = np.repeat(label, np.diff(problem.cones.ptr))
-        own_energy = np.sqrt(np.bincount(of_row, problem.d * self.e**2, minlength=count))
-        own_velocity = np.zeros(count)
-        np.maximum.at(own_velocity, of_row, problem.metric.weight * np.abs(self.e))
-        # A pair of tangents counts by its norm, at most sqrt(2) times its larger entry.
-        wrong = (own_energy > self.tol * energy / np.sqrt(count)) | (
-            np.sqrt(2.0) * own_velocity > self.tol * velocity
+        own = np.bincount(of_row, problem.d * self.e**2, minlength=count)
+        own[np.isnan(own)] = np.inf
+        least = np.sort(own)
+        below = np.concatenate([[0.0], np.cumsum(least[:-1])])
+        level = ((self.tol * energy) ** 2 - below) / np.arange(count, 0, -1)
+        above = np.flatnonzero(least > level)
+        share = max(0.0, float(level[above[0]])) if len(above) else np.inf
+        fast = np.zeros(count)
+        np.maximum.at(fast, of_row, problem.metric.weight * np.abs(self.e))
+        wrong = (own > share) | ~(np.sqrt(2.0) * fast <= self.tol * velocity)
+        return (
+            np.flatnonzero(wrong).astype(np.int32),
+            of_row.astype(np.int32),
+            CAUTION * float(np.sqrt(share)),
         )
-        return np.flatnonzero(wrong).astype(np.int32), of_row.astype(np.int32)
 
-    def apart_cost(self) -> float:
-        """Of the islands that are wrong, each solved apart [ns]; inf where there is one island."""
+    def apart_cost(self, those: IntArray | None = None) -> float:
+        """Of the islands that are wrong, or of those given, each solved apart [ns]; inf where there is one island."""
         if self.islands[0] <= 1:
             return np.inf
-        wrong, of_row = self.wrong_islands()
-        return islands_cost(self.problem, np.bincount(of_row, minlength=self.islands[0])[wrong])
+        wrong, of_row, _ = self.wrong_islands()
+        sizes = np.bincount(of_row, minlength=self.islands[0])
+        return islands_cost(self.problem, sizes[wrong if those is None else those])
 
     @property
     def done(self) -> bool:

@@ -15,9 +15,10 @@
                       convex relaxation, whose answer is the Coulomb answer wherever contacts stick
 
 Costs are counted from the structure (`_costs.py`) and from the contraction of sweeps that were done, never timed:
-the same problem is solved the same way everywhere. Islands are solved apart, each to its share of the
-whole error, where that costs less than the whole. What is left unsolved is asked for a certificate that it
-has no solution. The message and `work` say what ran.
+the same problem is solved the same way everywhere. Islands are solved apart, each to its share of the whole error,
+where that costs less than the whole: small ones in one compiled call (`_split.py`), before sweeps over all of them;
+those that it leaves, and large ones, each as a problem of its own. What is left unsolved is asked for a
+certificate that it has no solution. The message and `work` say what ran.
 """
 
 from __future__ import annotations
@@ -43,13 +44,16 @@ from lavender.solvers._costs import (
     factors_at_once,
     general_first,
     is_loose,
+    together_cost,
 )
 from lavender.solvers._few import AUTO
 from lavender.solvers._islands import restrict, rows_of
 from lavender.solvers._newton import general
+from lavender.solvers._split import solve_together, takes
 from lavender.solvers._sweepers import Glance, Sweeps, look_first, race
 from lavender.solvers._trail import Trail
 from lavender.solvers._turns import VELOCITY, Turns, whole
+from lavender_ext.few.looks import sweeps_left
 
 LARGE = 4000  # rows of J from which friction is swept both ways, and beside its relaxation
 HUGE = 40_000  # rows from which friction is left to sweeps before any factorisation
@@ -63,6 +67,10 @@ FRICTION_APART = 2.0  # times the cost of the whole that islands with friction m
 # compiled call.
 GENERAL_STEPS = {"linear": 256, "lcp": 256, "cone": 256, "coulomb": 64}
 ROUND_SWEEPS = 1000  # of nncg on round cones given by A, before admm is asked
+ONCE_MORE = (
+    2.0  # times what a finite solver was guessed to cost for each row, from which sweeps of islands go on
+)
+SAVED = 0.5  # share of all sweeps that islands spare which are not the largest
 CERTIFICATE_ROWS = 3000  # rows up to which a linear program is asked for a certificate
 CERTIFICATE_STEPS = 100  # of the simplex method for each row at most
 
@@ -167,25 +175,84 @@ def _solve(trail: Trail, budget: int, glance: Glance | None = None) -> None:
     hasty = Exact("direct", 0.0, DIRECT_ROUNDS, (("patience", False),))
     if glance is None and factors_at_once(problem) and whole(trail, hasty, budget):
         return
-    if glance is not None or not _at_once(costs):
+    swept = glance is not None or not _at_once(costs)
+    together = (
+        (swept or costs.exact[0].key == VELOCITY)
+        and problem.m > FEW
+        and budget - trail.iterations >= ONE_CALL
+        and _worth_together(trail, glance)
+    )
+    if together:
+        if glance is not None:
+            Sweeps(trail, glance=glance).note()
+            trail.offer(glance.impulse)
+        if _together(trail, budget):
+            return
+    relax = swept and problem.m > FEW and _may_relax(trail)
+    if relax or (swept and not together):
+        # What sweeps have not ended island by island, they hardly end together.
         large = problem.law == "coulomb" and problem.m >= LARGE and problem.rows is not None
+        glance = None if together else glance
         sweeps = Sweeps(trail, "nncg", order="symmetric") if large else Sweeps(trail, glance=glance)
-        if problem.m > FEW and _may_relax(trail) and race(trail, sweeps, budget):
+        if relax and race(trail, sweeps, budget):
             return
         if sweeps.run(budget):
             return
     least = costs.cheapest
-    if least > 2.0 * ISLAND and _worth_apart(trail, least) and _apart(trail, budget):
+    if least > 2.0 * ISLAND and _worth_apart(trail, least, together) and _apart(trail, budget):
         return
     _finish(trail, sweeps, budget)
 
 
-def _worth_apart(trail: Trail, least: float) -> bool:
-    """Islands apart cost less than the whole; friction's may cost more, since each finds its own solver."""
+def _worth_apart(trail: Trail, least: float, left: bool) -> bool:
+    """Islands apart cost less than the whole; friction's may cost more, since each finds its own solver.
+
+    `left`: compiled code has solved those that are easy.
+    """
     if trail.islands[0] <= 1:
         return False
-    friction = trail.problem.law in ("cone", "coulomb")
+    friction = trail.problem.law in ("cone", "coulomb") and not left
     return trail.apart_cost() < (FRICTION_APART if friction else 1.0) * least
+
+
+def _worth_together(trail: Trail, glance: Glance | None) -> bool:
+    """What it costs to take islands apart is less than what they save of sweeps over all of them.
+
+    Those cost no more than a finite solver, which comes next. They all go on until the island that needs most of
+    them is there. A glance tells how many are left.
+    """
+    if not takes(trail) or (trail.problem.law == "lcp" and trail.ended):
+        return False  # where direct gave up, A is singular: so it is in islands, and sweeps are slow
+    problem, costs = trail.problem, trail.costs
+    expected = min(costs.sweeping, max(costs.least, costs.guess))
+    cost = together_cost(problem, trail.islands[0], trail.largest)
+    if problem.generalized is not None and problem.law != "coulomb":
+        return cost < costs.sweeping
+    if problem.law == "cone" and trail.islands[0] == problem.n_blocks:
+        return False  # a sweep solves each block exactly
+    if glance is not None:
+        rest = sweeps_left(glance.last, glance.before, glance.best, trail.tol)
+        expected = min(expected, rest * costs.sweep)
+    if not cost < SAVED * expected:
+        return False
+    rows = np.bincount(trail.islands[1], weights=np.diff(problem.cones.ptr))
+    return bool(cost < SAVED * (1.0 - rows.max() / problem.m) * expected)
+
+
+def _together(trail: Trail, budget: int) -> bool:
+    """Islands in compiled code, given up by a guess of what else there is; those left once more where it is worth it.
+
+    What else there is for the whole is then there for them alone.
+    """
+    costs, m = trail.costs, trail.problem.m
+    each = max(costs.least, costs.guess) / m
+    left = solve_together(trail, budget, each)
+    if not trail.done and len(left) and trail.problem.generalized is None:
+        rows = np.bincount(trail.islands[1], weights=np.diff(trail.problem.cones.ptr))
+        known = costs.cheapest / float(rows[left].sum())
+        if known > ONCE_MORE * each:
+            solve_together(trail, budget, known)
+    return trail.done
 
 
 def _at_once(costs: Costs) -> bool:
@@ -227,9 +294,8 @@ def _apart(trail: Trail, budget: int) -> bool:
     """Solve every island that misses its share of the whole tolerance."""
     problem = trail.problem
     count, label = trail.islands
-    energy, velocity = reference(problem)
-    share = trail.tol * energy / np.sqrt(count)
-    wrong, _ = trail.wrong_islands()
+    velocity = reference(problem)[1]
+    wrong, _, share = trail.wrong_islands()
     order = np.argsort(label, kind="stable")
     ends = np.searchsorted(label[order], np.arange(count + 1))
     kinds: dict[str, int] = {}

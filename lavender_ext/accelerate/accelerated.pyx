@@ -18,13 +18,13 @@ from libc.stdint cimport int32_t, uint64_t
 
 import numpy as np
 
+from lavender_ext.accelerate.accelerated cimport sweep_data_t
 from lavender_ext.accelerate.mixing cimport CONTROL, MAX_MEMORY, UNDONE, forget, mix, mixing_t, take
 from lavender_ext.core.block cimport CONE, CONTACT_SPIN, ROW, blocks_t, clip, n_tangents, norm2
-from lavender_ext.core.csr cimport csr_t
-from lavender_ext.core.generalized cimport generalized_t, whitened_gather
+from lavender_ext.core.generalized cimport whitened_gather
 from lavender_ext.core.order cimport SYMMETRIC, advance_order
 from lavender_ext.core.problem cimport Data
-from lavender_ext.core.rows cimport relax_rows_block, rows_t
+from lavender_ext.core.rows cimport relax_rows_block
 from lavender_ext.core.velocity cimport rows_velocity
 from lavender_ext.judge.watch cimport CONVERGED, RUNNING, Watch
 from lavender_ext.local.gauss_seidel cimport solve_csr_block, solve_general_block, solve_rows_block
@@ -36,29 +36,6 @@ cdef enum:
 cdef enum:                      # places in control of nncg
     NORM = 0                    # g.Dg of the last sweep
     RESTARTS = 1                # beta > 1
-
-
-cdef struct sweep_data_t:
-    const blocks_t* blocks
-    const csr_t* csr            # NULL where factored
-    const rows_t* rows
-    const generalized_t* general        # NULL but for J and M
-    const int32_t* start        # prepared blocks, read where `exact` or under the cone law
-    const double* g
-    int32_t exact               # sweeps over exact blocks, else pgs
-    int32_t convex              # iterations under the cone law first
-    int32_t turn                # iterations done
-    blocks_t cone               # the blocks under the cone law
-    int32_t* order
-    int32_t split
-    int32_t mode
-    int32_t memory
-    uint64_t* rng
-    double* v                   # (nv): of bodies (n_bodies, 6), of J and M; nv = 0 where A is swept
-    int32_t nv
-    double* control             # (CONTROL) of accelerate/mixing.pxd
-    double* gram                # (MAX_MEMORY, MAX_MEMORY)
-    double* work                # nncg 3 (m + nv); anderson (4 + 2 memory) m
 
 
 cdef inline void sweep(const sweep_data_t* c, double* lam, int32_t first) noexcept nogil:

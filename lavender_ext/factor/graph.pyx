@@ -1,6 +1,6 @@
 """What a problem's structure alone tells: components of its blocks, spread of its rows, an elimination order.
 
-Two blocks are connected where they share a moving body, or where A has an entry between them. Union-find
+Two blocks are connected where they share a moving body, a tree of M, or where A has an entry between them. Union-find
 with path halving; labels are numbered in the order of the first block of each component. The order of the bodies is in
 graph.pxd.
 """
@@ -8,6 +8,8 @@ from libc.stdint cimport int32_t, uint64_t
 
 import numpy as np
 
+from lavender_ext.core.generalized cimport generalized_t
+from lavender_ext.core.problem cimport Data
 from lavender_ext.factor.graph cimport body_order, lower_pattern
 
 
@@ -71,6 +73,27 @@ cdef public int32_t lav_matrix_components(int32_t k, const int32_t* ptr, const i
             for q in range(indptr[j], indptr[j + 1]):
                 if block[indices[q]] != i:
                     join(parent, i, block[indices[q]])
+    return number(k, parent, label)
+
+
+cdef public int32_t lav_tree_components(int32_t k, const int32_t* ptr, const generalized_t* g, int32_t* parent,
+                                        int32_t* first, int32_t* label) noexcept nogil:
+    """The same by the trees of M that J's rows touch; parent (k), first (2 n) are scratch."""
+    cdef int32_t i, j, q, t
+    cdef int32_t* tree = first + g.n
+    for i in range(k):
+        parent[i] = i
+    for i in range(g.n):
+        tree[i] = i if g.parent[i] < 0 else tree[g.parent[i]]
+        first[i] = -1
+    for i in range(k):
+        for j in range(ptr[i], ptr[i + 1]):
+            for q in range(g.jptr[j], g.jptr[j + 1]):
+                t = tree[g.jidx[q]]
+                if first[t] < 0:
+                    first[t] = i
+                else:
+                    join(parent, first[t], i)
     return number(k, parent, label)
 
 
@@ -151,6 +174,18 @@ def matrix_components(const int32_t[::1] ptr, const int32_t[::1] block, const in
     if k:
         with nogil:
             count = lav_matrix_components(k, &ptr[0], &block[0], &indptr[0], entries, &parent[0], &label[0])
+    return count, label_array
+
+
+def tree_components(Data p):
+    """(number of components, label (k,)) of the blocks of a problem in generalised coordinates."""
+    cdef int32_t k = p.blocks.n_blocks, count = 0
+    label_array = np.zeros(k, np.int32)
+    cdef int32_t[::1] label = label_array, parent = np.empty(k + 1, np.int32)
+    cdef int32_t[::1] first = np.empty(2 * p.general.n + 1, np.int32)
+    if k:
+        with nogil:
+            count = lav_tree_components(k, p.blocks.ptr, &p.general, &parent[0], &first[0], &label[0])
     return count, label_array
 
 

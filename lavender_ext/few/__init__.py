@@ -1,1 +1,1 @@
-"""Problems of few rows: look, solve and judge in one call, over the kernels of other rooms."""
+"""Problems of few rows: look, solve and judge in one call, over kernels of other rooms; islands as such problems."""

@@ -14,7 +14,7 @@ from lavender_ext.judge.measure cimport Judged
 from lavender_ext.judge.watch cimport RUNNING
 
 
-cpdef double sweeps_left(double done, double before, double now, double tol) noexcept:
+cpdef double sweeps_left(double done, double before, double now, double tol) noexcept nogil:
     """(1); inf where the residual does not fall."""
     cdef double gain = log(before / now) if 0.0 < now < before < INFINITY else 0.0
     return done * log(now / (tol if tol > 1e-16 else 1e-16)) / gain if gain > 0.0 else INFINITY

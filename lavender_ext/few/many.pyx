@@ -7,14 +7,14 @@ has empty rows or is more than what Newton's method is asked for first, is left 
 """
 from cpython.exc cimport PyErr_CheckSignals
 from libc.stdint cimport int32_t
-from libc.stdlib cimport calloc, free, malloc
+from libc.stdlib cimport calloc, free
 from libc.string cimport memcpy
 
 import numpy as np
 
 from lavender_ext.core.block cimport COULOMB, ROW, blocks_t
-from lavender_ext.core.generalized cimport generalized_t
 from lavender_ext.core.problem cimport MADE, Data, made_t, make_numbers
+from lavender_ext.few.many cimport LEFT, SOLVED, Gate, gate_t, job_t, space_t, with_marks, with_numbers
 from lavender_ext.generalized.islands cimport aim_at, furnish, marks_of, need_t, numbers_of, settle
 from lavender_ext.generalized.newton cimport DONE, descend_all, flow_t
 from lavender_ext.generalized.sparse cimport PER_COLUMN
@@ -23,69 +23,11 @@ from lavender_ext.judge.score cimport are_numbers, relative, score_rows, score_t
 
 
 cdef enum:
-    LEFT = 0                    # to the caller
-    SOLVED = 1
-
-cdef enum:
     STEPS = 64                  # of newton
     AT_A_TIME = 256             # problems between two looks for Ctrl-C
 
 
-cdef struct gate_t:             # what Newton's method may cost [ns] to be asked first; see `general_first`
-    int32_t is_open             # whatever it costs
-    double start
-    double row[4]               # by law: linear, lcp, coulomb, cone
-    double factor[4]
-    double most
-    double form                 # of a multiply-add of A
-    double count[4]             # factorisations by law
-
-
-cdef struct job_t:
-    blocks_t p
-    generalized_t g
-    made_t made                 # of the data, or in this call; NULL between
-    double begin[3]             # E0, V0, relative residual of doing nothing; E0 < 0 where not known
-    int32_t law                 # as `gate_t.count`
-    int32_t cold                # 1: from doing nothing, else from lam as it is
-    int32_t end
-    int32_t counts[5]           # steps, factorisations, updates, rounds, evaluations
-    double* lam                 # (m)
-    double* both                # (2 m + 1) w, e
-    score_t score
-    double relative, floor
-
-
-cdef struct space_t:            # one after the other in the same room
-    int32_t* marks
-    ssize_t n_marks
-    double* numbers
-    ssize_t n_numbers
-
-
-cdef inline int32_t with_numbers(space_t* s, ssize_t n) noexcept nogil:
-    if n > s.n_numbers:
-        free(s.numbers)
-        s.n_numbers = 2 * n
-        s.numbers = <double*>malloc(s.n_numbers * sizeof(double))
-        if s.numbers == NULL:
-            s.n_numbers = 0
-            return 0
-    return 1
-
-
-cdef inline int32_t with_marks(space_t* s, ssize_t n) noexcept nogil:
-    if n > s.n_marks:
-        free(s.marks)
-        s.n_marks = 2 * n
-        s.marks = <int32_t*>malloc(s.n_marks * sizeof(int32_t))
-        if s.marks == NULL:
-            s.n_marks = 0
-            return 0
-    return 1
-
-
-cdef inline void begin(job_t* j, double* w) noexcept nogil:
+cdef void begin(job_t* j, double* w) noexcept nogil:
     """E0, V0 and the relative residual of doing nothing; w (3 m + n) is scratch."""
     cdef score_t s = score_t(0.0, 0.0, 0.0, 0.0, -1, 1)
     cdef int32_t m = j.p.n_rows
@@ -204,8 +146,6 @@ cdef class Gate:
     gate : tuple (start, rows, factors, most, form, counts) or None
         None: whatever it costs.
     """
-
-    cdef gate_t at
 
     def __init__(self, gate):
         self.at.is_open = gate is None

@@ -18,8 +18,9 @@ import numpy as np
 from lavender_ext.core.block cimport blocks_t, relax_row
 from lavender_ext.core.csr cimport csr_dot, csr_t
 from lavender_ext.core.problem cimport Data
-from lavender_ext.factor.band cimport ldl_back_all, ldl_factor, ldl_factor_2, ldl_solve, no_pivots, pivots_t
+from lavender_ext.factor.band cimport ldl_back_all, ldl_factor, ldl_factor_2, ldl_solve, no_pivots
 from lavender_ext.judge.score cimport unit_roundoff
+from lavender_ext.pivot.principal cimport INDEFINITE, ROUNDS, SMALL, SOLVED, STUCK, pivoting_t
 
 
 cdef enum:
@@ -27,45 +28,8 @@ cdef enum:
     AT_LOWER = -1
     AT_UPPER = 1
 
-cpdef enum:                     # outcomes
-    SOLVED = 0
-    ROUNDS = 1                  # all rounds used
-    SMALL = 2                   # a pivot too small for s = 0
-    INDEFINITE = 3              # a negative pivot
-    STUCK = 4                   # patience used up
-
 cdef enum:
     PATIENCE = 8                # exchanges without a new least number of infeasible rows
-
-
-cdef struct pivoting_t:
-    const csr_t* a
-    const blocks_t* p           # b, d, lower, upper
-    int32_t n
-    int32_t band                # half bandwidth in order of elimination
-    const int32_t* order        # (n) row eliminated first, second, ...; not read where natural
-    int32_t natural             # order is 0, 1, ...
-    int32_t* at                 # (n) FREE | AT_LOWER | AT_UPPER
-    int32_t* place              # (n) place among the free rows, -1
-    double* x                   # (n) N s
-    double* w                   # (n) m/s, (2)
-    double* f                   # (n) m/s, 2^-53 (|A| |x| + |b|): rounding of w
-    double* center              # (n) N s
-    double* y                   # (n) scratch
-    double* size                # (n) d of the free rows, by place
-    double* c                   # (n (band + 1)) factor
-    double shift                # s
-    double tiny                 # pivots below tiny d are small
-    int32_t n_free
-    int32_t width
-    int32_t is_factored         # of the present set and shift
-    int32_t is_half_solved      # x holds what the factorisation made of b on its way
-    pivots_t found
-    int32_t best                # least number of infeasible rows so far
-    int32_t patience
-    int32_t exchanged           # rows that changed sides so far
-    int32_t factorisations
-    int32_t n_rounds
 
 
 cdef public void lav_csr_scan(const csr_t* a, int32_t n, int32_t* cursor, int32_t* band,
@@ -444,6 +408,45 @@ cdef public int32_t lav_pivot_boxed(const blocks_t* p, const csr_t* a, int32_t b
     code = lav_pivot_solve(&s, start, sweeps, n, &swept)
     lav_pivot_slack(&s)
     return code
+
+
+cdef void pivots_on(pivoting_t* s, const csr_t* a, const blocks_t* p, int32_t band, double tiny, double* real,
+                    int32_t* whole) noexcept nogil:
+    cdef int32_t i
+    lay_out(s, a, p, band, NULL, tiny, real, whole)
+    for i in range(p.n_rows):
+        s.at[i] = FREE
+    s.is_half_solved = s.exchanged = s.factorisations = s.n_rounds = 0
+    no_pivots(&s.found)
+    begin(s, 0.0)
+
+
+cdef void pivots_factor_all(pivoting_t* s) noexcept nogil:
+    lav_pivot_factor_all(s)
+
+
+cdef void pivots_solve_free(pivoting_t* s) noexcept nogil:
+    lav_pivot_solve_free(s)
+
+
+cdef int32_t pivots_solve(pivoting_t* s, const double* start, int32_t sweeps, int32_t n, int32_t* swept) noexcept nogil:
+    return lav_pivot_solve(s, start, sweeps, n, swept)
+
+
+cdef void pivots_slack(pivoting_t* s) noexcept nogil:
+    lav_pivot_slack(s)
+
+
+cdef void pivots_correct(pivoting_t* s) noexcept nogil:
+    lav_pivot_correct(s)
+
+
+cdef int32_t pivots_exchange(pivoting_t* s) noexcept nogil:
+    return lav_pivot_exchange(s)
+
+
+cdef void scan_entries(const csr_t* a, int32_t n, int32_t* cursor, int32_t* band, double* size) noexcept nogil:
+    lav_csr_scan(a, n, cursor, band, size)
 
 
 def bandwidth(const int32_t[::1] indptr, const int32_t[::1] indices):
