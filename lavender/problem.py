@@ -33,6 +33,7 @@ from lavender.errors import CapabilityError, InputError
 from lavender.generalized import Generalized
 from lavender.rows import Rows
 from lavender_ext.core import assemble
+from lavender_ext.core.blocks import are_joints_then_contacts
 from lavender_ext.core.problem import LAWS as FRICTION_NUMBER
 from lavender_ext.core.problem import Data, dense_to_csr, general_data, nothing_done, rows_velocity
 from lavender_ext.judge import measure
@@ -193,7 +194,10 @@ class Problem:
     def _check_rows(self, rows: Rows, m: int, k: int) -> None:
         if not isinstance(rows, Rows):
             raise InputError(f"rows is a {type(rows).__name__}; a Rows is needed")
+        self._check_compliance(m)
         kj = rows.n_joints
+        if kj + rows.n_contacts == k and are_joints_then_contacts(self.cones._blocks, rows.joint_ptr):
+            return
         kind = self.cones.kind
         if (
             kj + rows.n_contacts != k
@@ -207,7 +211,6 @@ class Problem:
             )
         if not np.array_equal(self.cones.ptr[: kj + 1], rows.joint_ptr):
             raise InputError("cones.ptr and rows.joint_ptr disagree about the rows of the joints")
-        self._check_compliance(m)
 
     def _check_generalized(self, generalized: Generalized, m: int) -> None:
         if not isinstance(generalized, Generalized):

@@ -11,6 +11,7 @@ import scipy.sparse as sp
 from lavender._arrays import FloatArray, IntArray, as_array, check_not_negative, equal
 from lavender.cones import CONTACT_SPIN, Cones
 from lavender.errors import InputError
+from lavender_ext.core import gate
 
 __all__ = ["Rows"]
 
@@ -104,7 +105,7 @@ class Rows:
         n = np.shape(self.inv_mass)[0] if np.ndim(self.inv_mass) == 1 else None
         c = np.shape(self.normal)[0] if np.ndim(self.normal) == 2 else None
         ptr = as_array("joint_ptr", self.joint_ptr, (None,), dtype=np.int32, copy=self.copy)
-        if len(ptr) == 0 or ptr[0] != 0 or np.any(np.diff(ptr) <= 0):
+        if not gate.counts_up(ptr):
             raise InputError(
                 "joint_ptr must start with 0 and increase: the first row of each joint, then the "
                 "number of joint rows"
@@ -119,6 +120,8 @@ class Rows:
         for name, shape in (("joint_body", (len(ptr) - 1, 2)), ("contact_body", (c, 2))):
             body = as_array(name, getattr(self, name), shape, dtype=np.int32, copy=self.copy)
             object.__setattr__(self, name, body)
+            if gate.are_pairs(body, len(self.inv_mass), name == "contact_body"):
+                continue
             if body.size and (body.min() < -1 or body.max() >= len(self.inv_mass)):
                 stray = body.max() if body.max() >= len(self.inv_mass) else body.min()
                 raise InputError(
@@ -127,15 +130,14 @@ class Rows:
             same = np.flatnonzero((body[:, 0] == body[:, 1]) & (body[:, 0] >= 0))
             if len(same):
                 raise InputError(f"{name}[{same[0]}] joins body {body[same[0], 0]} to itself")
-        nobody = np.flatnonzero((self.contact_body < 0).all(axis=1))
-        if len(nobody):
+            nobody = np.flatnonzero((body < 0).all(axis=1))
             raise InputError(
-                f"contact_body[{nobody[0]}] = [-1, -1]: both are static, and no impulse moves them; leave it out"
+                f"{name}[{nobody[0]}] = [-1, -1]: both are static, and no impulse moves them; leave it out"
             )
         check_not_negative("inv_mass", self.inv_mass)
         if self.copy:
             check_inertia("inv_inertia", self.inv_inertia)
-        if self.n_contacts:
+        if not gate.are_frames(self.normal, self.tangent):
             # 1e-9: far above rounding of a normalised vector, far below anything meant otherwise.
             off = np.abs(np.stack([
                 np.einsum("ij,ij->i", self.normal, self.normal) - 1.0,
@@ -223,7 +225,7 @@ def check_inertia(name: str, tensors: FloatArray) -> None:
     InputError
         Names the first body.
     """
-    if not len(tensors):
+    if gate.are_definite(tensors):
         return
     size = np.abs(tensors).max(axis=(1, 2))
     skew = np.abs(tensors - tensors.transpose(0, 2, 1)).max(axis=(1, 2))

@@ -204,27 +204,30 @@ cdef public void lav_assemble(const blocks_t* p, const rows_t* r, const double* 
 
 def bound(Data p):
     """(most entries A can have, start, blocks): how large A gets before it is formed."""
-    cdef int32_t[::1] start = np.empty(p.rows.n_bodies + 1, np.int32)
-    cdef int32_t[::1] blocks = np.empty(2 * p.blocks.n_blocks + 1, np.int32)
+    start_ = np.empty(p.rows.n_bodies + 1, np.int32)    # a view made an array again costs more than the view
+    blocks_ = np.empty(2 * p.blocks.n_blocks + 1, np.int32)
+    cdef int32_t[::1] start = start_, blocks = blocks_
     cdef int64_t most
     lav_body_blocks(&p.blocks, &p.rows, &start[0], &blocks[0], &most)
-    return most, np.asarray(start), np.asarray(blocks)
+    return most, start_, blocks_
 
 
 def delassus(Data p, Py_ssize_t most, int32_t[::1] start, int32_t[::1] blocks):
     """A as (indptr, indices, data) of compressed rows with sorted columns; arguments are `bound(p)`, most < 2^31."""
     cdef Py_ssize_t m = p.blocks.n_rows
     cdef int32_t nnz
-    cdef double[::1] jac = np.empty(12 * m + 1), minv_jac = np.empty(12 * m + 1), data = np.empty(most + 1)
-    cdef int32_t[::1] indices = np.empty(most + 1, np.int32), indptr = np.zeros(m + 1, np.int32)
+    data_, indices_, indptr_ = np.empty(most + 1), np.empty(most + 1, np.int32), np.zeros(m + 1, np.int32)
+    cdef double[::1] jac = np.empty(24 * m + 1), data = data_
+    cdef double* minv_jac = &jac[12 * m]
+    cdef int32_t[::1] indices = indices_, indptr = indptr_
     cdef int32_t[::1] near = np.empty(4 * p.blocks.n_blocks + 2 + m, np.int32)
     with nogil:
-        lav_expand_rows(&p.blocks, &p.rows, &jac[0], &minv_jac[0])
-        lav_assemble(&p.blocks, &p.rows, &jac[0], &minv_jac[0], &start[0], &blocks[0], &near[0],
+        lav_expand_rows(&p.blocks, &p.rows, &jac[0], minv_jac)
+        lav_assemble(&p.blocks, &p.rows, &jac[0], minv_jac, &start[0], &blocks[0], &near[0],
                      &near[2 * p.blocks.n_blocks + 1], &near[0] + 4 * p.blocks.n_blocks + 2, &indptr[0], &indices[0],
                      &data[0])
     nnz = indptr[m]
-    found = np.asarray(indices)[:nnz], np.asarray(data)[:nnz]
+    found = indices_[:nnz], data_[:nnz]
     if nnz < 0.75 * most:                               # a copy costs more than a quarter of unused room
         found = found[0].copy(), found[1].copy()
-    return (np.asarray(indptr), *found)
+    return (indptr_, *found)

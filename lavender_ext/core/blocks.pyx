@@ -139,6 +139,20 @@ def joined(Blocks a, Blocks b):
     return made
 
 
+def are_joints_then_contacts(Blocks blocks, const int32_t[::1] joint_ptr):
+    """Whether blocks begin with ROW blocks of these rows, and all others are contacts of up to two tangents and spin."""
+    cdef int32_t i, kj = <int32_t>joint_ptr.shape[0] - 1
+    if kj > blocks.at.n_blocks or blocks.has_round:
+        return False
+    for i in range(blocks.at.n_blocks):
+        if (blocks.at.kind[i] == ROW) != (i < kj):
+            return False
+    for i in range(kj + 1):
+        if blocks.at.ptr[i] != joint_ptr[i]:
+            return False
+    return True
+
+
 def private(ptr, kind, lower, upper, mu, patch_radius):
     """Blocks over a copy of these arrays; None where anything is amiss."""
     cdef Blocks given = Blocks.__new__(Blocks), made

@@ -1,5 +1,10 @@
-"""The gate of arrays for what most callers give: float64 that lies together, of the shape asked for."""
+"""The gate of arrays for what most callers give: float64 that lies together, of the shape asked for.
+
+Nothing is said here of what is wrong: where a function says no, the long way looks again, decides, and finds the words.
+"""
 from cpython.buffer cimport PyBUF_C_CONTIGUOUS, PyBUF_FORMAT, PyBuffer_Release, PyObject_GetBuffer
+from libc.math cimport fabs
+from libc.stdint cimport int32_t
 
 import numpy as np
 
@@ -47,3 +52,74 @@ def has_negative(const double[::1] x):
         if x[i] < 0.0:
             return True
     return False
+
+
+def counts_up(const int32_t[::1] ptr):
+    """Whether pointers begin with 0 and increase."""
+    cdef Py_ssize_t i
+    if ptr.shape[0] == 0 or ptr[0] != 0:
+        return False
+    for i in range(1, ptr.shape[0]):
+        if ptr[i] <= ptr[i - 1]:
+            return False
+    return True
+
+
+def are_pairs(const int32_t[:, ::1] pair, int32_t n, bint moves):
+    """Whether (k, 2) names bodies from -1, static, to n - 1, none twice in a pair; `moves`: nor two static ones."""
+    cdef Py_ssize_t i
+    cdef int32_t a, b
+    for i in range(pair.shape[0]):
+        a = pair[i, 0]
+        b = pair[i, 1]
+        if not -1 <= a < n or not -1 <= b < n or a == b and (moves or a >= 0):
+            return False
+    return True
+
+
+def are_frames(const double[:, ::1] normal, const double[:, ::1] tangent):
+    """Whether normals and tangents (c, 3) are orthogonal unit vectors, to half of what is allowed."""
+    cdef Py_ssize_t i, k
+    cdef double nn, tt, nt
+    for i in range(normal.shape[0]):
+        nn = tt = -1.0
+        nt = 0.0
+        for k in range(3):
+            nn += normal[i, k] * normal[i, k]
+            tt += tangent[i, k] * tangent[i, k]
+            nt += normal[i, k] * tangent[i, k]
+        if not (fabs(nn) <= 5e-10 and fabs(tt) <= 5e-10 and fabs(nt) <= 5e-10):
+            return False
+    return True
+
+
+def are_definite(const double[:, :, ::1] tensor):
+    """Whether every tensor (n, 3, 3) is zero, or symmetric to half of what is allowed with pivots well above 0."""
+    cdef Py_ssize_t i, j, k
+    cdef double size, skew, p, q, r, s, t, a
+    for i in range(tensor.shape[0]):
+        size = 0.0
+        skew = 0.0
+        for j in range(3):
+            for k in range(3):
+                if fabs(tensor[i, j, k]) > size:
+                    size = fabs(tensor[i, j, k])
+                if fabs(tensor[i, j, k] - tensor[i, k, j]) > skew:
+                    skew = fabs(tensor[i, j, k] - tensor[i, k, j])
+        if size == 0.0:
+            continue
+        a = 1.0 / size
+        if not (size >= 1e-300 and a > 0.0 and skew <= 5e-10 * size):
+            return False
+        p = tensor[i, 0, 0] * a
+        if not p > 1e-6:
+            return False
+        q = tensor[i, 1, 0] * a
+        r = tensor[i, 2, 0] * a
+        s = tensor[i, 1, 1] * a - q * (q / p)
+        if not s > 1e-6:
+            return False
+        t = tensor[i, 2, 1] * a - q * (r / p)
+        if not tensor[i, 2, 2] * a - r * (r / p) - t * (t / s) > 1e-6:
+            return False
+    return True

@@ -1,0 +1,98 @@
+"""Rows at the door: the quick looks refuse and accept what the long way does."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import lavender as lv
+from lavender_ext.core import gate
+
+
+def fields(seed, bodies=3, contacts=4, joints=2):
+    """Arrays of legal rows: joints of 1 to 5 rows, contacts between random bodies or a body and the ground."""
+    rng = np.random.default_rng(seed)
+    ptr = np.concatenate([[0], np.cumsum(rng.integers(1, 6, joints))]).astype(np.int32)
+    turn = np.linalg.qr(rng.normal(size=(contacts, 3, 3)))[0]
+    root = rng.normal(size=(bodies, 3, 3))
+    pairs = [rng.permutation(np.arange(-1, bodies))[:2] for _ in range(contacts + joints)]
+    pairs = np.array(pairs, np.int32).reshape(-1, 2)
+    return {
+        "inv_mass": rng.uniform(0.1, 2.0, bodies),
+        "inv_inertia": root @ root.transpose(0, 2, 1) + 0.01 * np.eye(3),
+        "v_free": rng.normal(size=(bodies, 6)),
+        "jac": rng.normal(size=(ptr[-1], 12)),
+        "joint_ptr": ptr,
+        "joint_body": pairs[contacts:],
+        "normal": np.ascontiguousarray(turn[:, 0]),
+        "tangent": np.ascontiguousarray(turn[:, 1]),
+        "arm_a": rng.normal(size=(contacts, 3)),
+        "arm_b": rng.normal(size=(contacts, 3)),
+        "contact_body": pairs[:contacts],
+    }
+
+
+SPOILT = {
+    "nothing": None,
+    "a body that is not there": ("contact_body", (0, 1), 3),
+    "below static": ("joint_body", (1, 0), -2),
+    "a joint of one body": ("joint_body", (0, slice(None)), 1),
+    "a contact of one body": ("contact_body", (2, slice(None)), 0),
+    "a joint of nobody": ("joint_body", (0, slice(None)), -1),
+    "a contact of nobody": ("contact_body", (1, slice(None)), -1),
+    "a normal too long by 2e-9": ("normal", (0,), 1.0 + 2e-9),
+    "a normal too long by 1e-11": ("normal", (0,), 1.0 + 1e-11),
+    "a tangent along the normal": ("tangent", (0,), None),
+    "an inertia with a twist": ("inv_inertia", (0, 0, 1), 5.0),
+    "an inertia below zero": ("inv_inertia", (0,), -1.0),
+    "an inertia about one axis": ("inv_inertia", (0,), np.diag([1.0, 0.0, 0.0])),
+    "an inertia of a point": ("inv_inertia", (0,), np.zeros((3, 3))),
+    "an inertia near the edge": ("inv_inertia", (0,), np.diag([1.0, 1.0, -0.9e-9])),
+    "an inertia at the edge of float64": ("inv_inertia", (0,), 1e-310 * np.eye(3)),
+    "pointers that stand still": ("joint_ptr", (1,), 0),
+    "pointers from one on": ("joint_ptr", (0,), 1),
+}
+
+
+def spoilt(seed, how):
+    given = fields(seed)
+    if how is not None:
+        name, at, value = how
+        if name in ("normal", "tangent"):
+            given[name][0] = given["normal"][0] * (1.0 if value is None else value)
+        elif np.ndim(value) == 0 and name == "inv_inertia" and len(at) == 1:
+            given[name][at] *= value
+        else:
+            given[name][at] = value
+    return given
+
+
+def outcome(given):
+    try:
+        lv.Rows(**given)
+    except lv.InputError as error:
+        return str(error)
+    return "taken"
+
+
+@pytest.mark.parametrize("what", SPOILT)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_quick_looks_end_as_the_long_way(what, seed):
+    given = spoilt(seed, SPOILT[what])
+    quick = outcome(given)
+    with pytest.MonkeyPatch.context() as patch:
+        for look in ("are_frames", "are_definite"):
+            patch.setattr(gate, look, lambda *_: False)
+        patch.setattr(gate, "are_pairs", _pairs_by_numpy)
+        slow = outcome(given)
+    assert quick == slow
+    legal = ("nothing", "a joint of nobody", "a normal too long by 1e-11", "an inertia about one axis")
+    also = ("an inertia of a point", "an inertia near the edge", "an inertia at the edge of float64")
+    assert (quick == "taken") == (what in legal + also)
+
+
+def _pairs_by_numpy(pair, n, moves):
+    same = pair[:, 0] == pair[:, 1]
+    if not moves:
+        same &= pair[:, 0] >= 0
+    return not (same.any() or (pair < -1).any() or (pair >= n).any())
