@@ -1,9 +1,11 @@
-"""Coulomb friction by Newton's method: from the start on the Alart-Curnier map, then De Saxce's interior point.
+"""Coulomb friction by Newton's method: after sweeps on the Alart-Curnier map, then De Saxce's interior point.
 
-1. Proximal Newton on the Alart-Curnier map, from the start and from the solution of H z = g.
-2. Interior points on De Saxce's form of the law (`_newton/desaxce.py`), each ended by the proximal Newton; first
+1. Rounds of accelerated sweeps, each ended by a few Newton steps on the Alart-Curnier map (`_newton/sweeping.py`);
+   another between any two of the following, which costs as much as all factorisations so far.
+2. Proximal Newton on that map, from the start and from the solution of H z = g.
+3. Interior points on De Saxce's form of the law (`_newton/desaxce.py`), each ended by the proximal Newton; first
    where the bodies are known, after it where only a matrix is, whose factors cost more.
-3. Longer proximal walks from where the interior points ended, with smaller and smaller weights.
+4. Longer proximal walks from where the interior points ended, with smaller and smaller weights.
 """
 
 from __future__ import annotations
@@ -16,12 +18,15 @@ from lavender.solvers._newton.desaxce import SHARES, apart, solve_desaxce, solve
 from lavender.solvers._newton.interior_point import InteriorPoint
 from lavender.solvers._newton.proximal import Proximal
 from lavender.solvers._newton.run import Run
+from lavender.solvers._newton.sweeping import Sweeping
 from lavender.solvers._newton.systems import AUGMENTED, CONVEX
 
-FIRST, SECOND = 20, 30  # factorisations of the first two walks
+ROUNDS = 2  # of sweeps before anything else: one of each kind
+FEW = 20  # rows up to which a few factorisations cost less than to prepare sweeps
+FIRST, SECOND = 6, 6  # factorisations of the first two walks
 CONVEX_TOL = 1e-4  # of the convex answer that a walk starts from, in energy
 CONVEX_STEPS = 30  # that it may cost
-STRETCH = 60  # factorisations between two looks at whether a walk gets anywhere
+STRETCH = 12  # factorisations between two looks at whether a walk gets anywhere
 STRETCHES = 1000  # of one walk at most, whatever its budget
 SMALL, LARGE = 64, 1000  # rows up to which the first proximal weight is smaller, from which it is larger
 HEAVY = 1e3  # mass ratio from which the walks are not tried from a cold start
@@ -31,23 +36,34 @@ LONG = 50  # Newton steps of one of their rounds: sticking changes to sliding co
 
 
 def solve_coulomb(run: Run, z: FloatArray, cold: bool) -> None:
-    """Walks from the start, interior points, walks from where they ended; until the judge is content."""
+    """Sweeps, walks from the start, interior points, walks from where they ended; until the judge is content."""
     system = run.system
     m = system.sc.m
     plain = Proximal(z, AUGMENTED, 1e-5 if m <= SMALL else 1e-3 if m < LARGE else 1e-2)
     walks = not (cold and _is_heavy(run))
-    if walks:
+    sweeping = Sweeping(run, z)
+    few = m <= FEW
+    if few and walks:
         plain.advance(run, FIRST)
         if run.done() or run.at_floor():
+            return
+    if any(sweeping.round() for _ in range(ROUNDS)):
+        return
+    if walks and not few:
+        plain.advance(run, FIRST)
+        if run.done() or run.at_floor() or sweeping.round():
             return
     ends: list[tuple[float, FloatArray]] = []
     stages = [_interior, _walk] if system.form == "velocity" else [_walk, _interior]
     for stage in stages:
         if stage is _interior or walks:
-            stage(run, plain, ends)
-            if run.done() or run.at_floor():
+            stage(run, plain, ends, sweeping)
+            if run.done() or run.at_floor() or sweeping.round():
                 return
-    ends += solve_desaxce(run, SHARES[2:])
+    for share in SHARES[2:]:
+        ends += solve_desaxce(run, (share,))
+        if run.done() or run.at_floor() or sweeping.round():
+            return
     ends.sort(key=lambda end: end[0])
     for _, start in ends[:CANDIDATES]:
         for alpha in LAST:
@@ -61,7 +77,7 @@ def solve_coulomb(run: Run, z: FloatArray, cold: bool) -> None:
         plain.advance(run)
 
 
-def _interior(run: Run, plain: Proximal, ends: list[tuple[float, FloatArray]]) -> None:
+def _interior(run: Run, plain: Proximal, ends: list[tuple[float, FloatArray]], sweeping: Sweeping) -> None:
     ends += solve_desaxce(run, SHARES[:1])
     if run.done() or run.at_floor():
         return
@@ -70,6 +86,8 @@ def _interior(run: Run, plain: Proximal, ends: list[tuple[float, FloatArray]]) -
         solve_desaxce_augmented(run)
         if run.done() or run.at_floor():
             return
+    if sweeping.round():
+        return
     _from_convex(run)
     if run.done() or run.at_floor():
         return
@@ -91,11 +109,11 @@ def _from_convex(run: Run) -> None:
         _pursue(run, Proximal(ip.z.copy(), AUGMENTED, 1e-3))
 
 
-def _walk(run: Run, plain: Proximal, ends: list[tuple[float, FloatArray]]) -> None:
+def _walk(run: Run, plain: Proximal, ends: list[tuple[float, FloatArray]], sweeping: Sweeping) -> None:
     near = Proximal(InteriorPoint(run.system).everything, AUGMENTED, 1e-4)
     near.advance(run, SECOND)
     for method in (plain, near):
-        if run.done() or run.at_floor():
+        if run.done() or run.at_floor() or sweeping.round():
             return
         _pursue(run, method)
 

@@ -39,9 +39,9 @@ from lavender.solvers._newton.run import Run
 from lavender.solvers._newton.scaled import Scaled
 from lavender.solvers._newton.systems import AUGMENTED, VelocitySystem
 
-SHARES = (0.95, 1.0, 0.85, 0.98, 0.7, 0.9)  # of phi's derivative, tried in turn
+SHARES = (0.7, 0.95, 1.0, 0.85, 0.98, 0.9)  # of phi's derivative, tried in turn
 # First weight, steps of a round and factorisations of the proximal Newton methods after each interior point.
-FINISH = ((1e-3, 20, 30), (1e-7, 50, 40))
+FINISH = ((1e-3, 10, 15), (1e-7, 12, 12))
 
 
 class _Slip:

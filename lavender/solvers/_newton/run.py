@@ -26,6 +26,7 @@ class Run:
     more: Callable[[FloatArray], int] | None = (
         None  # asked for more factorisations, with the best (m,) N s so far
     )
+    sweeps: int = 0  # between Newton's walks
     best: float = np.inf
     best_z: FloatArray = field(init=False)
     floor: float = 0.0
