@@ -34,7 +34,8 @@ class Trail:
     deadline: float
     limit: float = np.inf  # ns that the whole solve may take, as it was asked
     largest: int = 0  # velocities of the largest island, 0 where newton has no room for them
-    best: float = np.inf
+    given: float = np.inf  # relative residual of the first impulse that was offered,
+    best: float = np.inf  # and of the best
     impulse: FloatArray = field(init=False)
     steps: list[str] = field(default_factory=list)
     work: dict[str, int] = field(default_factory=dict)
@@ -64,6 +65,8 @@ class Trail:
         """Judge an impulse and keep it if it is the best."""
         found = known(self.problem, impulse)
         relative = quick(self.problem, impulse, self.w, self.e)[0] if found is None else found
+        if self.given == np.inf:
+            self.given = relative
         if relative < self.best:
             self.best, self.impulse = relative, impulse.copy()
         return relative

@@ -53,9 +53,11 @@ def whole(
         if own and more is not None:
             solver = asking(solver, more)
         state = _newton_state(trail) if own else solver.prepare(trail.problem)
-    # Half-finished sweeps mislead a Newton method; Pi(0) does not.
+    # Half-finished sweeps mislead a Newton method; Pi(0) does not. Under a convex law a step is lost on them even
+    # where they came close; not on a start that was.
     before = trail.best
-    warm = before <= WARM and (own or chosen.key != VELOCITY or trail.begun)
+    close = before if trail.problem.law == "coulomb" or not own else trail.given
+    warm = close <= WARM and (own or chosen.key != VELOCITY or trail.begun)
     impulse = trail.impulse.copy() if warm else trail.problem.start()
     if kept is not None:
         impulse = trail.left[chosen.key]
