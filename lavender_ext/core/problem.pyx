@@ -555,7 +555,7 @@ def dense_to_csr(const double[:, ::1] a):
     whole, numbers = new(n + 1 + nnz, I4), new(nnz)
     cdef int32_t[::1] indptr = whole
     cdef double[::1] data = numbers
-    cdef int32_t* indices = &indptr[n + 1]
+    cdef int32_t* indices = &indptr[0] + n + 1
     indptr[0] = 0
     for i in range(n):
         for j in range(m):
