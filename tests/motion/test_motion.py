@@ -376,9 +376,9 @@ def test_choices_have_names_and_are_motions():
     assert found.select("compliant") in found
     with pytest.raises(lv.InputError, match="select is"):
         found.select("best")
-    picks = found.picks(["anderson", "newton", "jacobi"], max_iter=1000)
+    picks = found.picks(["anderson", "admm", "jacobi"], max_iter=1000)
     assert picks["jacobi"] is None  # 1000 sweeps end before it gets there
-    assert picks["anderson"].motion != picks["newton"].motion
+    assert picks["anderson"].motion != picks["admm"].motion
 
 
 def test_the_cone_law_has_one_motion_and_shows_its_lift():
