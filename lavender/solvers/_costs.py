@@ -58,6 +58,10 @@ PIVOT, PIVOT_ENTRY = 60e3, 0.5  # of each pivot of lemke, and for each entry of 
 GENERAL_START = 60e3
 GENERAL_ROW = {"linear": 40.0, "lcp": 40.0, "cone": 140.0, "coulomb": 400.0}
 GENERAL = {"linear": 0.03, "lcp": 0.03, "cone": 0.06, "coulomb": 0.02}
+# The same under Coulomb's law where soft rows are many: a step, for each row in it, and steps as they usually are (8 to
+# 33 on flexes of 1,800 to 10,200 rows; what few rows cost above holds their tails, too).
+MANY_STEP, MANY_ROW, MANY_COUNT = 15e3, 110.0, 10.0
+MANY_ROWS = 1000  # rows beyond which that is counted
 GENERAL_FIRST = 0.6e6  # ns of it up to which nothing else is looked at first
 FORM = 1.0  # of each multiply-add of Y Y^T
 FORMED_START, FORMED = 280e3, 6.0  # of A formed of J and M, and of each of its entries
@@ -163,14 +167,24 @@ def first_look(per: float) -> int:
 def general_first(problem: Problem, largest: int) -> bool:
     """Newton over generalised velocities costs next to nothing, or less than only to form A = Y Y^T for the others.
 
-    The columns of Y have n_c entries: sum n_c^2 >= (sum n_c)^2 / nv multiply-adds.
+    The columns of Y have n_c entries: sum n_c^2 >= (sum n_c)^2 / nv multiply-adds. Or, of many soft rows under
+    Coulomb's law, more than velocities, less than sweeps usually do where rows depend on each other.
     """
     assert problem.generalized is not None
     cost = general_cost(problem, largest)
     if cost <= GENERAL_FIRST:
         return True
     entries = 0.5 * (problem.metric.work - 4.0 * problem.m)
-    return cost <= FORM * entries * entries / max(1, problem.generalized.nv)
+    if cost <= FORM * entries * entries / max(1, problem.generalized.nv):
+        return True
+    if (
+        problem.law != "coulomb"
+        or problem.m <= max(MANY_ROWS, problem.generalized.nv)
+        or not np.all(problem.compliance)
+    ):
+        return False
+    step = MANY_STEP + MANY_ROW * problem.m + GENERAL["coulomb"] * factor_flops(problem, largest)
+    return GENERAL_START + MANY_COUNT * step <= SWEEPS_REDUNDANT * sweep_cost(problem)
 
 
 def is_glanced(problem: Problem, per: float) -> bool:

@@ -294,3 +294,29 @@ def test_a_singular_band_is_factored_once_before_sweeps():
     assert solution.message.count("direct") == 1
     assert "shifts" not in solution.work
     assert lv.solve(problem, "direct", tol=1e-6).work["shifts"] > 0
+
+
+@pytest.mark.parametrize("soft", [True, False])
+def test_newton_comes_first_on_many_soft_rows_of_few_velocities(soft):
+    """A soft body under Coulomb's law: a few factorisations of 99 velocities end what sweeps need hundreds for."""
+    rng = np.random.default_rng(2)
+    velocities, contacts = 99, 700
+    jac = np.zeros((3 * contacts, velocities))
+    for i in range(contacts):
+        one, other = rng.integers(0, velocities // 3, 2)
+        for k in range(3):
+            jac[3 * i + k, 3 * one + k] += 1.0
+            jac[3 * i + k, 3 * other + k] -= 1.0
+            jac[3 * i + k, 3 * one : 3 * one + 3] += 0.1 * rng.normal(size=3)
+    problem = lv.Problem.from_jacobian(
+        sp.csr_array(jac), sp.diags_array(rng.uniform(0.5, 2.0, velocities)), rng.normal(size=velocities),
+        cones=lv.Cones.contacts(0.7, count=contacts), compliance=0.8 if soft else 0.0,
+    )  # fmt: skip
+    solution = lv.solve(problem, tol=1e-6, max_iter=2000)
+    assert (
+        solution.message.startswith("newton") == soft
+    )  # rows that are not soft depend on each other: sweeps first
+    if soft:
+        assert solution.success
+        assert solution.work["factorisations"] <= 20
+        assert "sweeps" not in solution.work
