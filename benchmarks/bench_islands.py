@@ -9,11 +9,10 @@ its solve: laid out, compared with those before, its start judged to be a soluti
 from __future__ import annotations
 
 import argparse
-from time import process_time
-from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
+from clock import cpu
 
 import lavender as lv
 from lavender.problem import Problem
@@ -66,16 +65,6 @@ def forms(problem: Problem) -> dict[str, Problem]:
             friction=problem.friction,
         ),
     }
-
-
-def cpu(call: Any, repeats: int) -> float:
-    """Least CPU time of a call [s]."""
-    times = []
-    for _ in range(repeats):
-        start = process_time()
-        call()
-        times.append(process_time() - start)
-    return min(times)
 
 
 def fresh(problem: Problem) -> Problem:

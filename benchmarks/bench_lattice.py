@@ -9,10 +9,10 @@ side^3 spheres, each touching its neighbours and the floor, positions 0.02 off t
 from __future__ import annotations
 
 import argparse
-from time import process_time
 from typing import Any
 
 import numpy as np
+from clock import cpu
 from scipy.spatial import cKDTree
 
 import lavender as lv
@@ -51,16 +51,6 @@ def lattice(side: int, ratio: float, mu: float | None, seed: int = 0) -> Problem
     return Problem.from_rows(rows, mu=np.full(len(contacts.body), mu), tangents=2, friction="coulomb")
 
 
-def cpu(call: Any, repeats: int = 5) -> float:
-    """Least CPU time of a call [s]."""
-    times = []
-    for _ in range(repeats):
-        start = process_time()
-        call()
-        times.append(process_time() - start)
-    return min(times)
-
-
 def factors(problem: Problem) -> None:
     """One factor of newton's matrix over bodies: by block rows, by panels with four lanes and with two."""
     given = systems.PANELS, systems.WIDE
@@ -74,7 +64,7 @@ def factors(problem: Problem) -> None:
         system = systems.make_system(problem, "velocity")
         rng = np.random.default_rng(0)
         system.v[:] = 10.0 ** rng.uniform(-2.0, 2.0, len(system.v))
-        time = cpu(system.factor_barrier)
+        time = cpu(system.factor_barrier, 5)
         bits.append(system.solve_barrier(rng.normal(size=system.sc.m)).tobytes())
         print(
             f"  {label:<18}{1e3 * time:8.2f} ms, {system.cost / time / 1e9:5.2f} G multiply-adds/s of {system.cost:.3g}"

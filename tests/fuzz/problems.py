@@ -2,6 +2,7 @@
 
 import numpy as np
 import scipy.sparse as sp
+from crowds import joined
 from draw import numbers, positive
 
 import lavender as lv
@@ -9,8 +10,30 @@ import lavender as lv
 ORDERS = ("given", "reverse", "symmetric", "random", "bottom_up", "top_down", "colored", "local")
 
 
+CROWDS = 0.08  # of problems, many small ones side by side
+
+
 def problem_spec(draw, largest=12):
     """A problem of any law and operator."""
+    if draw.chance(CROWDS):
+        return crowd_spec(draw)
+    return one_spec(draw, largest)
+
+
+def crowd_spec(draw):
+    """Up to 40 of them side by side, most of them alike or of one operator and law, more than `auto` takes whole."""
+    first = one_spec(draw, 8)
+    specs = [first]
+    for _ in range(draw.whole(1, 40)):
+        other = first if draw.chance(0.2) else one_spec(draw, 8)
+        same = all(other[key] == first[key] for key in ("operator", "friction"))
+        alike = (lv.ROUND in other["cones"]["kind"]) == (lv.ROUND in first["cones"]["kind"])
+        specs.append(other if same and alike else first)
+    return joined(draw, specs)
+
+
+def one_spec(draw, largest=12):
+    """A problem whose rows mostly hang together."""
     if draw.chance(0.35):
         return rows_spec(draw)
     if draw.chance(0.25):
@@ -310,6 +333,7 @@ def own_solvers():
 
 
 _OWN = []
+MANY = 20  # blocks, from which a problem is one of several side by side
 
 
 def solve_spec(draw):
@@ -331,7 +355,8 @@ def solve_spec(draw):
         if law in lv.get(name).laws
         and (name != "sequential_impulses" or spec["problem"]["operator"] == "rows")
     ]
-    solver = draw.pick(names)
+    many = len(c["kind"]) > MANY
+    solver = "auto" if many and draw.chance(0.7) else draw.pick(names)  # it takes them apart
     s = lv.get(solver)
     options = {"tol": draw.pick((1e-6, 1e-6, 1e-9, 1e-12, 1e-3, 0.0, 1e-300, 2.0))}
     if draw.chance(0.7):
