@@ -11,15 +11,17 @@ from hypothesis import HealthCheck, given, settings
 from random_problems import random_contact_problem, random_lcp
 
 import lavender as lv
+from lavender.solvers._islands import islands
 
 FUZZ = Path(__file__).resolve().parent.parent / "fuzz"
 sys.path.insert(0, str(FUZZ))
 
 import checks
+import crowds
 import fuzz
 import judge
 import problems
-from draw import strategy
+from draw import Seeded, strategy
 
 
 def spec_of(problem):
@@ -34,6 +36,26 @@ def spec_of(problem):
     keys = (*problems.SHAPES, "inv_mass", "joint_ptr")
     spec["rows"] = {key: getattr(problem.rows, key).tolist() for key in keys}
     return spec | {"compliance": problem.compliance.tolist()}
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_a_crowd_is_its_parts_side_by_side(seed):
+    parts = [problems.one_spec(Seeded(7, seed, i), 8) for i in range(30)]
+    first = parts[0]
+    alike = [p for p in parts if all(p[key] == first[key] for key in ("operator", "friction"))]
+    alike = [p for p in alike if (lv.ROUND in p["cones"]["kind"]) == (lv.ROUND in first["cones"]["kind"])]
+    try:
+        built = [problems.build(p) for p in alike]
+        crowd = problems.build(crowds.joined(Seeded(8, seed), alike))
+    except lv.LavenderError:
+        return  # one of them is refused
+    assert crowd.m == sum(p.m for p in built)
+    assert sorted(crowd.b) == sorted(np.concatenate([p.b for p in built]))
+    if crowd.generalized is None:  # of J and M, sums in another order
+        diagonal = np.concatenate([p.csr.diagonal() for p in built])  # a body of infinite numbers has NaN
+        np.testing.assert_array_equal(np.sort(crowd.csr.diagonal()), np.sort(diagonal))
+    blocks = sum(p.n_blocks for p in built)
+    assert crowd.n_blocks == blocks and islands(crowd)[0] >= sum(p.n_blocks > 0 for p in built)
 
 
 # -- the judge in long double ------------------------------------------------------------------------------------

@@ -448,10 +448,12 @@ class MatrixSystem(System):
         return self._cholesky_band(band)
 
     def _cholesky_band(self, band: _Band) -> bool:
-        self.factorisations += 1
         c, info = pbtrf(band.work.T, lower=1, overwrite_ab=True)
+        if info != 0:
+            return False  # another comes in its place
+        self.factorisations += 1
         self.solver = lambda r: pbtrs(c, r[band.order], lower=1, overwrite_b=True)[0][band.place]
-        return info == 0
+        return True
 
     def _cholesky(self, matrix: FloatArray) -> bool:
         start = perf_counter()
