@@ -336,7 +336,7 @@ class Costs:
         if self.problem.cones.has_round:
             return [e for e in self._others if e.name == "newton"] or [Exact("newton", np.inf, 0)]
         # Newton's system is made only where it may be the cheapest: it costs as much as a small solve.
-        cost = self._newton_guess if self._others_win else self._newton(self._newton_factor)
+        cost = self._newton_guess if self._others_win else self._newton(newton_factor(self.system))
         p = self.problem
         form = () if p.generalized is None else (("form", "impulse"),)
         limit = int(BUDGET[p.law] * self._newton_count)
@@ -411,7 +411,7 @@ class Costs:
         m, nnz = float(p.m), float(len(p._compressed[1])) if p.generalized is None else float(p.m)
         share = nnz / (m * m)
         return self._newton(
-            min(BAND * m * max(1.0, 0.5 * nnz / m) ** 2, self._sparse(int(nnz), p.m), dense_factor(m))
+            min(BAND * m * max(1.0, 0.5 * nnz / m) ** 2, sparse_factor(int(nnz), p.m), dense_factor(m))
             if share < DENSE_FILL
             else dense_factor(m)
         )
@@ -453,17 +453,6 @@ class Costs:
         return NEWTON[p.law] + NEWTON_DECADE[p.law] * decades + min(MOST, PER_ROW[p.law] * p.m)
 
     @property
-    def _newton_factor(self) -> float:
-        system = self.system
-        if not isinstance(system, MatrixSystem):
-            return (BLOCK if system.cost < PANELS else PANEL) * system.cost
-        if system.dense:
-            return float(dense_factor(system.sc.m))
-        if system.band is not None and self.problem.law != "coulomb":
-            return BAND * system.sc.m * float(system.band.h.shape[1]) ** 2
-        return self._sparse(system.h.nnz, system.sc.m)
-
-    @property
     def _matrix(self) -> float:
         """One factor of A as `direct` makes it [ns]; of a factored problem without forming A."""
         p, m = self.problem, self.problem.m
@@ -484,17 +473,29 @@ class Costs:
         form, band, _ = choose(p) if p.is_symmetric else ("general", max(p.bandwidth), None)
         if form == "band":
             return BAND * m * float(min(band, m) + 1) ** 2
-        return min(dense, self._sparse(p.csr.nnz, m))
-
-    @staticmethod
-    def _sparse(nnz: int, m: int) -> float:
-        return SPARSE * nnz * (1.0 + m / SPARSE_ROWS)
+        return min(dense, sparse_factor(p.csr.nnz, m))
 
 
 def dense_factor(m: Any) -> Any:
     """Of m rows [ns]."""
     m = np.asarray(m, float)
     return DENSE * m**3 / 3.0 + DENSE_ENTRY * m**2
+
+
+def sparse_factor(nnz: int, m: int) -> float:
+    """Of a matrix of m rows and nnz entries [ns]."""
+    return SPARSE * nnz * (1.0 + m / SPARSE_ROWS)
+
+
+def newton_factor(system: System) -> float:
+    """One symmetric factor of Newton's matrix [ns]."""
+    if not isinstance(system, MatrixSystem):
+        return (BLOCK if system.cost < PANELS else PANEL) * system.cost
+    if system.dense:
+        return float(dense_factor(system.sc.m))
+    if system.band is not None and system.sc.problem.law != "coulomb":
+        return BAND * system.sc.m * float(system.band.h.shape[1]) ** 2
+    return sparse_factor(system.h.nnz, system.sc.m)
 
 
 def admm_cost(problem: Problem, m: Any, entries: Any, count: float) -> tuple[Any, Any]:

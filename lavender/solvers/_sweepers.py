@@ -157,6 +157,7 @@ class Sweeps:
             self.trail.add(
                 prefix + self.name, Claim(Status.MAX_ITERATIONS, self.done - self.begun, self.total)
             )
+            self.trail.swept = self.impulse
         self.begun, self.total = self.done, {}
 
     def run(self, budget: int, worth: float | None = None, cap: int | None = None) -> bool:

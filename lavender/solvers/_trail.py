@@ -40,6 +40,7 @@ class Trail:
     steps: list[str] = field(default_factory=list)
     work: dict[str, int] = field(default_factory=dict)
     iterations: int = 0
+    swept: FloatArray | None = None  # (m,) N s, where sweeps stopped
     certificate: FloatArray | None = None
     begun: bool = False  # newton over generalised velocities was
     ended: dict[str, float] = field(

@@ -11,13 +11,14 @@ import numpy as np
 
 from lavender._arrays import FloatArray
 from lavender.certificates import check_certificate
+from lavender.registry import FEW
 from lavender.solution import Claim, Status
 from lavender.solvers._costs import Exact
 from lavender.solvers._few import WARM
 from lavender.solvers._sweepers import Sweeps
 from lavender.solvers._trail import CLOCK, Trail, usable
 from lavender.solvers.direct import Impatient
-from lavender.solvers.newton import NewtonState, asking
+from lavender.solvers.newton import NewtonState, after_sweeps, asking
 
 __all__ = ["VELOCITY", "Turns", "whole"]
 
@@ -59,6 +60,14 @@ def whole(
     close = before if trail.problem.law == "coulomb" or not own else trail.given
     warm = close <= WARM and (own or chosen.key != VELOCITY or trail.begun)
     impulse = trail.impulse.copy() if warm else trail.problem.start()
+    if own and trail.problem.law == "lcp":
+        singular = any(key.startswith("direct") for key in trail.ended)
+        if singular or trail.swept is not None:
+            solver = after_sweeps(solver)
+        if trail.swept is not None and not singular and trail.problem.m > FEW:
+            # Which rows are free is known from sweeps, however far they are. Where A is singular on them exchanges,
+            # which is what direct does, go round in circles.
+            impulse = trail.swept.copy()
     if kept is not None:
         impulse = trail.left[chosen.key]
     trail.begun = trail.begun or chosen.key == VELOCITY

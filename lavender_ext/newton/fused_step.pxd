@@ -135,6 +135,7 @@ cdef inline int32_t interior_newton(const elements_t* e, const factor_t* f, inte
     cdef double x, left, last = 1.7976931348623157e308, size = 0.0
     for j in range(e.m):
         x = z_end(e, j, p.z[j] - p.hz[j] + e.g[j])
+        p.side[j] = <int32_t>x
         p.v[j] = 0.0 if x != 0.0 else 1.0 / (e.theta[j] + eps)
         p.r[j] = -(p.hz[j] - e.g[j]) if x == 0.0 else -(p.z[j] - (e.lower[j] if x < 0.0 else e.upper[j]))
         size = fabs(p.r[j]) if fabs(p.r[j]) > size else size
@@ -162,6 +163,9 @@ cdef inline int32_t interior_newton(const elements_t* e, const factor_t* f, inte
             p.z[j] += p.dz[j]
     times_h(e, f.n, p.z, p.y, p.hz)
     convex_error(e, p.z, p.hz, p.speed, &p.energy, &p.velocity)
+    p.changed = 0
+    for j in range(e.m):
+        p.changed += <int32_t>z_end(e, j, p.z[j] - p.hz[j] + e.g[j]) != p.side[j]
     return x == 0.0
 
 

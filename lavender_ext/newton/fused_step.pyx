@@ -84,6 +84,11 @@ cdef class Interior:
         lav_convex_error(&self.e.e, self.p.z, self.p.hz, self.p.speed, &self.p.energy, &self.p.velocity)
         return self.p.energy, self.p.velocity
 
+    @property
+    def changed(self):
+        """Rows that took another side in the last step."""
+        return self.p.changed
+
     def newton(self, double eps, int rounds):
         """One Newton step of bounded rows: (whether it is finite, |F|, velocity error)."""
         cdef int32_t ok

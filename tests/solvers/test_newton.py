@@ -14,7 +14,7 @@ from lavender import suite
 from lavender.solvers._newton import pattern, systems
 from lavender.solvers._newton import scaled as scaling
 from lavender.solvers._newton.interior_point import InteriorPoint
-from lavender.solvers._newton.polish import refined
+from lavender.solvers._newton.row_steps import refined
 from lavender.solvers._newton.systems import AUGMENTED, CONVEX, make_system
 from lavender_ext.factor import symbolic
 from lavender_ext.newton.elements import Elements
@@ -200,6 +200,49 @@ def test_a_newton_step_in_one_call_is_the_same_step(seed):
     # Nine bodies: H has a condition number of some hundreds, the normal matrix 1e9 times that before refinement.
     expected = z + refined(system, -f)
     np.testing.assert_allclose(steps.z, expected, rtol=0, atol=1e-10 * np.abs(z).max())
+
+
+@given(seed=seeds)
+@settings(max_examples=20)
+def test_exchanges_over_bodies_and_over_a_matrix_are_the_same(seed):
+    problem = suite.wild(seed=239).problem  # 160 regular rows over bodies
+    z = np.random.default_rng(seed).normal(size=problem.m)
+    found = []
+    for form in ("velocity", "impulse"):
+        steps = make_system(problem, form).newton
+        steps.place(z)
+        finite, energy, velocity = steps.newton(1e-9, 2)
+        assert finite
+        found.append((steps.z.copy(), energy, velocity, steps.changed))
+    (one, *errors, changed), (other, *twins, count) = found
+    np.testing.assert_allclose(one, other, rtol=0, atol=1e-7 * np.abs(one).max())
+    assert errors == pytest.approx(twins, rel=1e-6)
+    before = z - (dense_h(problem) @ z - problem.b / np.sqrt(problem.d)) > 0.0
+    after = one - (dense_h(problem) @ one - problem.b / np.sqrt(problem.d)) > 0.0
+    assert changed == count == np.count_nonzero(before != after)
+
+
+@pytest.mark.parametrize("seed, most", [(6, 5), (70, 6), (239, 7), (3146, 4)])
+def test_exchanges_from_sweeps_take_few_factorisations(seed, most):
+    solution = lv.solve(suite.wild(seed=seed).problem, "newton", tol=1e-6)
+    assert good(solution, 1e-6)
+    assert solution.work["factorisations"] <= most  # interior points: 11 to 28
+    assert solution.work["sweeps"] > 0
+
+
+def test_exchanges_that_go_in_circles_are_given_up():
+    problem = suite.wild(seed=3).problem  # rows depend on each other
+    solution = lv.solve(problem, "newton", tol=1e-6)
+    assert good(solution, 1e-6)
+    assert "2 exchanges" in solution.message and "interior point steps" in solution.message
+
+
+def test_no_row_free_is_no_factor():
+    problem = lv.Problem.lcp(np.eye(3), -np.ones(3))
+    system = make_system(problem, "impulse")
+    system.newton.place(-np.ones(3))
+    finite, energy, _ = system.newton.newton(1e-9, 2)
+    assert finite and energy == 0.0 and not system.newton.z.any()
 
 
 def test_a_narrow_matrix_is_factored_as_a_band():

@@ -23,7 +23,8 @@ import scipy.sparse.linalg as ssl
 
 from lavender._arrays import FloatArray
 from lavender.solvers._newton.interior_point import InteriorPoint
-from lavender.solvers._newton.polish import polish, refined
+from lavender.solvers._newton.polish import polish
+from lavender.solvers._newton.row_steps import refined
 from lavender.solvers._newton.run import Run
 from lavender.solvers._newton.systems import CONVEX, System, VelocitySystem
 from lavender_ext.newton.panel import scaled_jacobian

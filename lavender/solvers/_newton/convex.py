@@ -9,7 +9,9 @@ from __future__ import annotations
 import numpy as np
 
 from lavender._arrays import FloatArray
+from lavender.solvers._costs import is_redundant
 from lavender.solvers._newton.augmented import WORTH, solve_augmented
+from lavender.solvers._newton.exchange import exchange, sweep
 from lavender.solvers._newton.interior_point import InteriorPoint
 from lavender.solvers._newton.polish import polish
 from lavender.solvers._newton.proximal import Proximal
@@ -32,31 +34,70 @@ STILL = 3  # where so many steps do not halve it
 CONE_DELTA = 1e-8
 
 
-def solve_convex(run: Run, z: FloatArray, cold: bool) -> None:
-    """Warm start, then H z = g on every row, then an interior point and its polish."""
+def solve_convex(run: Run, z: FloatArray, cold: bool, swept: bool = False) -> None:
+    """Rows: exchanges from the warm start or from sweeps. Cones, and what that leaves: interior points.
+
+    `swept`: sweeps are not worth it again.
+    """
     system = run.system
-    sc = system.sc
-    rows = len(sc.kind) == sc.m
+    if len(system.sc.kind) < system.sc.m:
+        if not cold:
+            polish(run, z, patience=1)
+        if not run.done():
+            _solve_cones(run)
+        return
     if not cold:
-        polish(run, z, patience=1)
-        if run.done():
-            return
-    ip = InteriorPoint(system, DELTA if rows else CONE_DELTA, apart=sc.problem.is_symmetric)
-    tried = not rows or _everything(run, ip)
+        _exchange(run, z)
+    if not run.done() and not run.at_floor():
+        _solve_rows(run, z if cold and not swept else None)
+    run.take_back()
+
+
+def _solve_rows(run: Run, start: FloatArray | None) -> None:
+    """H z = g on every row; where many of them do not hold exchanges after sweeps from `start`; an interior point."""
+    system, sc = run.system, run.system.sc
+    ip = InteriorPoint(system, apart=sc.problem.is_symmetric)
+    wrong = _everything(run, ip)
     if not run.done():
-        _interior(run, ip, rows)
+        if wrong <= HOLD * sc.m:
+            _exchange(run, ip.everything)
+        elif sc.m <= FEW:
+            polish(run, ip.everything, patience=1, limit=3)
+        elif start is not None and not is_redundant(sc.problem):
+            _exchange(run, sweep(run, sc.impulse(start)))
+    if not run.done():
+        _interior(run, ip, True)
     if run.done() or run.at_floor():
         return
-    if not tried:
+    if sc.m > FEW and wrong > HOLD * sc.m:
         # An asymmetric A may hold an interior point up at once where exchanging rows ends it.
         polish(run, ip.everything, patience=1, limit=3)
         if run.done() or run.at_floor():
             return
-    if not rows:
+    _proximal(run)
+
+
+def _exchange(run: Run, z: FloatArray) -> None:
+    """Exchanges from z; what these leave unfinished is no start for what follows."""
+    before = run.best, run.best_z
+    exchange(run, z)
+    if not run.done():
+        run.set_aside(*before)
+
+
+def _solve_cones(run: Run) -> None:
+    """An interior point and its polish."""
+    system = run.system
+    symmetric = system.sc.problem.is_symmetric
+    for delta in (CONE_DELTA, DELTA):
         # Where the weight itself is what is in the way (large faces, most of whose points carry nothing).
-        _interior(run, InteriorPoint(system, DELTA, sc.problem.is_symmetric), rows)
+        _interior(run, InteriorPoint(system, delta, apart=symmetric), False)
         if run.done() or run.at_floor():
             return
+    _proximal(run)
+
+
+def _proximal(run: Run) -> None:
     if run.best < WORTH:
         solve_augmented(run)
         if run.at_floor():
@@ -65,11 +106,11 @@ def solve_convex(run: Run, z: FloatArray, cold: bool) -> None:
         Proximal(run.best_z.copy(), alpha=1e-3).advance(run)
 
 
-def _everything(run: Run, ip: InteriorPoint) -> bool:
-    """H z = g where nearly every row holds; whether it was pursued."""
+def _everything(run: Run, ip: InteriorPoint) -> int:
+    """H z = g on every row, refined where all of them hold: how many do not."""
     system, sc = run.system, run.system.sc
     z = ip.everything
-    wrong = np.count_nonzero((z < sc.lower) | (z > sc.upper))
+    wrong = int(np.count_nonzero((z < sc.lower) | (z > sc.upper)))
     if wrong == 0 and system.form == "impulse":
         # The weight of the first point goes away with the factor that is there; another costs more.
         left = sc.g - system.times(z)
@@ -81,12 +122,9 @@ def _everything(run: Run, ip: InteriorPoint) -> bool:
             before, size = size, float(np.sqrt(left @ left))  # |F| where every row still holds
             if not size < 0.1 * before or run.relative(size, 0.0) <= 1e-3 * run.tol:
                 break
-        if run.relative(size, 0.0) <= run.tol and run.score(z) <= run.tol:
-            return True
-    worth = bool(sc.m <= FEW or wrong <= HOLD * sc.m)
-    if worth and not run.done():
-        polish(run, z, patience=1, limit=3)
-    return worth
+        if run.relative(size, 0.0) <= run.tol:
+            run.score(z)
+    return wrong
 
 
 def _interior(run: Run, ip: InteriorPoint, rows: bool) -> None:

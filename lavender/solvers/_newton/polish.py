@@ -13,25 +13,11 @@ from typing import Any
 import numpy as np
 
 from lavender._arrays import FloatArray
+from lavender.solvers._newton.row_steps import refined
 from lavender.solvers._newton.run import Run
-from lavender.solvers._newton.systems import CONVEX, System
+from lavender.solvers._newton.systems import CONVEX
 
 EPS = 1e-9  # proximal weight of the polish, relative to d; refinement takes it away again
-
-
-def refined(system: System, rhs: FloatArray, rounds: int = 2) -> FloatArray:
-    """Solve the Newton system with its proximal weight mostly refined away; the next Newton step does the rest."""
-    x = system.solve_natural(rhs)
-    size = float(np.abs(rhs).max(initial=0.0))
-    last = np.inf
-    for _ in range(rounds):
-        r = rhs - system.natural_times(x)
-        left = float(np.abs(r).max(initial=0.0))
-        if not left < 0.5 * last or left <= 1e-16 * size:
-            break
-        last = left
-        x = x + system.solve_natural(r)
-    return x
 
 
 def polish(run: Run, z: FloatArray, law: int = CONVEX, *, patience: int = 2, limit: int = 12) -> None:

@@ -29,6 +29,7 @@ class Run:
     sweeps: int = 0  # between Newton's walks
     best: float = np.inf
     best_z: FloatArray = field(init=False)
+    aside: tuple[float, FloatArray] | None = None  # a best point that is no start for what comes
     floor: float = 0.0
     stages: dict[str, int] = field(default_factory=dict)  # what ran, for the message
     certificate: FloatArray | None = None  # (m,) N s: no solution exists
@@ -52,6 +53,17 @@ class Run:
         if relative < self.best:
             self.best, self.best_z = relative, z.copy()
         return relative
+
+    def set_aside(self, best: float, best_z: FloatArray) -> None:
+        """Go on with an earlier best point; the one of now counts again in the end."""
+        if self.best < best:
+            self.aside = self.best, self.best_z
+            self.best, self.best_z = best, best_z
+
+    def take_back(self) -> None:
+        """The best of all."""
+        if self.aside is not None and self.aside[0] < self.best:
+            self.best, self.best_z = self.aside
 
     def error(self, ip: InteriorPoint) -> float:
         """Relative residual of an interior point of the convex law; the judge's where a step does not know it."""

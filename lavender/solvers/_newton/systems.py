@@ -26,6 +26,7 @@ from scipy.linalg.lapack import dpotrs as potrs
 from lavender._arrays import FloatArray, IntArray
 from lavender.problem import Problem
 from lavender.solvers._newton.pattern import block_pattern, dissected, postordered
+from lavender.solvers._newton.row_steps import RowSteps
 from lavender.solvers._newton.scaled import Scaled, scaled
 from lavender_ext.factor import symbolic
 from lavender_ext.newton.band import (
@@ -78,7 +79,7 @@ class System:
 
     form = ""
     factorisations = 0
-    newton: Any = None  # Newton steps of bounded rows in compiled code, where there are such
+    newton: Any = None  # Newton steps of bounded rows, where there are such
     law = CONVEX  # of the last natural map
     cost = 0.0  # multiply-adds of one factorisation, roughly
     pace = 1e-9  # s for each of them at most, on any machine of the last ten years
@@ -369,6 +370,11 @@ class MatrixSystem(System):
         self.free: FloatArray | None = None  # rows that the band of the last `factor_natural` holds
 
     @cached_property
+    def newton(self) -> Any:
+        """Newton steps of bounded rows; None where there are cones."""
+        return None if len(self.sc.kind) < self.sc.m else RowSteps(self, CONVEX)
+
+    @cached_property
     def places(self) -> tuple[IntArray, IntArray]:
         """Rows and columns of the elements' small matrices, row by row of each."""
         sc, size = self.sc, np.diff(self.sc.ptr)
@@ -496,10 +502,35 @@ class MatrixSystem(System):
             if self._cholesky_band(self.band):
                 self.free = self.p
                 return True
+        if self.bt is None:
+            return self._factor_free(eps)
         if self.dense:
             return self._dense_lu(self._product(self.p, self.h, eps, 1.0, 1.0))
         p = self.small(self.p)
         return self._sparse_lu(p @ self.h + (eps - 1.0) * p + sp.eye_array(self.sc.m))
+
+    def _factor_free(self, eps: float) -> bool:
+        """H_FF + eps of bounded rows, the rows that the last `natural` found inside their bounds."""
+        self.free = self.p
+        free = np.flatnonzero(self.p)
+        if len(free) == 0:
+            self.solver = np.copy
+            return True
+        if self.dense:
+            matrix = self.h[np.ix_(free, free)]
+            matrix.flat[:: len(free) + 1] += eps
+            done = (self.symmetric and self._cholesky(matrix.copy())) or self._dense_lu(matrix)
+        else:
+            done = self._sparse_lu(self.h[free][:, free] + eps * sp.eye_array(len(free)))
+        inside = self.solver
+
+        def solve(r: FloatArray) -> FloatArray:
+            out = r.copy()
+            out[free] = inside(r[free])
+            return out
+
+        self.solver = solve
+        return done
 
     def solve_natural(self, r: FloatArray) -> FloatArray:
         if self.free is not None:
