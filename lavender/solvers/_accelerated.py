@@ -54,6 +54,10 @@ class Accelerated(Sweeping):
     def _memory(self) -> int:
         return 0
 
+    @property
+    def _keeps(self) -> bool:
+        return False
+
     def prepare(self, problem: Problem) -> AcceleratedState:
         """Order, memory, and each block's own part of A where blocks are solved exactly."""
         self._check(problem)
@@ -87,7 +91,7 @@ class Accelerated(Sweeping):
             measure.velocity_change(data, impulse, state.space[-1])
         status, done, sweeps, restarts = accelerated.run(
             data, state.watch, impulse, n, tol, state.memory, state.prepared, state.exact, state.convex,
-            state.space, o.blocks, o.split, o.mode, o.rng,
+            state.space, o.blocks, o.split, o.mode, o.rng, self._keeps,
         )  # fmt: skip
         work = {"sweeps": sweeps, "restarts": restarts - state.restarts}
         state.restarts = restarts
@@ -115,7 +119,7 @@ class Accelerated(Sweeping):
             measure.velocity_change(data, impulse, state.space[-1])
         sweeper = (
             data, state.watch, state.memory, state.prepared, state.exact, state.convex, state.space, o.blocks,
-            o.split, o.mode, o.rng,
+            o.split, o.mode, o.rng, self._keeps,
         )  # fmt: skip
         now, before, last, done, status, sweeps, state.restarts = look(
             state.problem.metric, impulse, before, steps[0], n, tol, sweeper, steps[1], *costs

@@ -5,7 +5,6 @@ rest = n log(now / tol) / log(before / now)         sweeps left, by the contract
 
 from __future__ import annotations
 
-from copy import copy
 from dataclasses import dataclass
 from typing import Any
 
@@ -30,6 +29,7 @@ PORTION = 0.25  # of a time limit that sweeps may take that will not get there w
 SLOW = (
     2.0  # times the cost that the relaxation promises by all that it did, at which its last look slows down
 )
+FOLLOWING = ("given", "symmetric")  # orders of sweeps that begin where the relaxation slows down, in turn
 
 
 @dataclass
@@ -279,37 +279,33 @@ class Racer:
 def race(trail: Trail, own: Sweeps, budget: int) -> bool:
     """Sweeps under Coulomb's law, those of its relaxation, and the former from where the latter slow down.
 
-    Look by look whichever promises to cost less from there, so that none is dropped while it moves.
+    Look by look whichever promises to cost less from there, so that none is dropped while it moves. From where the
+    relaxation stands others begin whenever it did twice as much: which of them end soon is a matter of luck.
     """
     relaxed = Relaxed(trail)
     start = trail.best
     relaxed.impulse[:] = trail.problem.start()
     slow = Racer(relaxed, 1.0)
-    racers = [Racer(own, start), slow]
+    racers, followers, last = [Racer(own, start), slow], list[Sweeps](), 0
     while not trail.late:
         racer = min(racers, key=lambda r: (r.promised, r.spent))
         left = budget - trail.iterations - sum(r.sweeps.done for r in racers)
         if left <= 0 or racer.sweeps.ended or racer.look(left) <= trail.tol:
             break
         spent = sum(r.spent for r in racers)
-        if len(racers) == 2 and slow.looks > 1 and SLOW * slow.promised < relaxed.cost:
-            racers.insert(0, Racer(_follower(own, relaxed.impulse, relaxed.last), 1.0, slow.spent, slow.best))
+        slows = racer is slow and slow.looks > 1 and SLOW * slow.promised < relaxed.cost
+        if slows and relaxed.done >= 2 * last:
+            last = relaxed.done
+            order = FOLLOWING[len(followers) % len(FOLLOWING)]
+            follower = Sweeps(trail, "nncg", order=order, restart="against")
+            follower.impulse[:] = relaxed.impulse
+            follower.last = relaxed.last
+            followers.append(follower)
+            racers.insert(0, Racer(follower, 1.0, slow.spent, slow.best))
         if slow.looks and own.dearer(min(r.sweeps.cost for r in racers), spent, None):
             break
     relaxed.note()
-    if len(racers) > 2:
-        racers[0].sweeps.note("from there: ")
+    for follower in followers:
+        follower.note("from there: ")
     own.note()
     return trail.done
-
-
-def _follower(own: Sweeps, impulse: FloatArray, last: float) -> Sweeps:
-    """The same sweeps from another impulse (m,), of residual `last`."""
-    other = copy(own)
-    other.state = own.solver.prepare(own.trail.problem)
-    other.impulse = impulse.copy()
-    other.done = other.begun = other.at = 0
-    other.total = {}
-    other.last, other.rest = last, np.inf
-    other.ended = False
-    return other

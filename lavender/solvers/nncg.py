@@ -7,19 +7,36 @@ A sweep S stands in for a gradient step, Fletcher and Reeves' beta for the line 
 One sweep and three passes over vectors an iteration; on piles a third of the sweeps of `pgs` to 1e-9.
 With order="symmetric" an iteration is a sweep and the same sweep backwards, near to a preconditioned
 conjugate gradient: slower where `pgs` is fast, much faster on tall stacks and mass ratios.
+
+Where contacts slide, g is no gradient: sweeps then creep along one direction, g hardly changing, until a contact
+sticks, lifts or slips. There beta > 1 says nothing, and with restart="against" p is dropped only where it points
+against the sweep as well, p.D g > 0, else kept whole, beta = 1: creeping becomes running.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
+from lavender.errors import UnknownName
 from lavender.registry import SolverSpec
 from lavender.solvers._accelerated import CONVEX_OPTION, SWEEP_OPTION, Accelerated
+
+RESTARTS = ("growth", "against")
 
 
 @dataclass(frozen=True)
 class NNCG(Accelerated):
     """Nonsmooth nonlinear conjugate gradients; `order`, `ground`, `seed` as in `lavender.ordering`."""
+
+    restart: str = "growth"
+
+    def __post_init__(self) -> None:
+        if self.restart not in RESTARTS:
+            raise UnknownName("restart", self.restart, RESTARTS)
+
+    @property
+    def _keeps(self) -> bool:
+        return self.restart == "against"
 
 
 SPEC = SolverSpec(
@@ -31,7 +48,12 @@ SPEC = SolverSpec(
     seed=True,
     round_cones=True,
     max_iter=1000,
-    options={"sweep": SWEEP_OPTION, "convex": CONVEX_OPTION},
+    options={
+        "sweep": SWEEP_OPTION,
+        "convex": CONVEX_OPTION,
+        "restart": "growth (beta > 1) or against (beta > 1 and the direction points against the sweep: much faster on "
+        "piles under Coulomb's law); default growth",
+    },
     summary="nonlinear conjugate gradients over Gauss-Seidel sweeps",
     reference="Silcowitz-Hansen, Niebe, Erleben 2010, A nonsmooth nonlinear conjugate gradient method",
 )

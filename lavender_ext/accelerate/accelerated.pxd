@@ -22,6 +22,7 @@ cdef struct sweep_data_t:
     int32_t split
     int32_t mode
     int32_t memory
+    int32_t keeps               # nncg: beta > 1 drops p only where it points against the sweep
     uint64_t* rng
     double* v                   # (nv): of bodies (n_bodies, 6), of J and M; nv = 0 where A is swept
     int32_t nv

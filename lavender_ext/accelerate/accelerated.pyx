@@ -2,6 +2,7 @@
 
     nncg      x_k = y_{k-1} + beta_{k-1} p_{k-2},  y_k = S(x_k),  g_k = x_k - y_k,                    (1)
               beta_k = g_k.D g_k / g_{k-1}.D g_{k-1},  p_k = beta_k p_{k-1} - g_k  (p_k = -g_k where beta_k > 1)
+              or, where it keeps p, beta_k = 1 there while p_{k-1}.D g_k <= 0                         (3)
     anderson  x_k = Pi(y - sum_i gamma_i (y_i+1 - y_i)),  gamma least squares of f = sum_i gamma_i (f_i+1 - f_i),
               f = D^1/2 (y - x), over the last `memory` sweeps                                        (2)
 
@@ -35,7 +36,7 @@ cdef enum:
 
 cdef enum:                      # places in control of nncg
     NORM = 0                    # g.Dg of the last sweep
-    RESTARTS = 1                # beta > 1
+    RESTARTS = 1                # p dropped
 
 
 cdef inline void sweep(const sweep_data_t* c, double* lam, int32_t first) noexcept nogil:
@@ -101,6 +102,22 @@ cdef inline void project_block(const blocks_t* p, int32_t i, double* lam) noexce
         lam[j + n - 1] = clip(lam[j + n - 1], -bound, bound)
 
 
+cdef inline double energy(const double* d, const double* x, const double* y, int32_t m) noexcept nogil:
+    """x.D y."""
+    cdef double s0 = 0.0, s1 = 0.0, s2 = 0.0, s3 = 0.0
+    cdef int32_t i = 0
+    while i + 4 <= m:
+        s0 += d[i] * x[i] * y[i]
+        s1 += d[i + 1] * x[i + 1] * y[i + 1]
+        s2 += d[i + 2] * x[i + 2] * y[i + 2]
+        s3 += d[i + 3] * x[i + 3] * y[i + 3]
+        i += 4
+    while i < m:
+        s0 += d[i] * x[i] * y[i]
+        i += 1
+    return (s0 + s1) + (s2 + s3)
+
+
 cdef public void lav_nncg(sweep_data_t* c, double* lam, int32_t first_sweep, int32_t n) noexcept nogil:
     """n iterations of (1)."""
     cdef int32_t m = c.blocks.n_rows, i, s
@@ -109,7 +126,7 @@ cdef public void lav_nncg(sweep_data_t* c, double* lam, int32_t first_sweep, int
     cdef double* p = q + m + c.nv
     cdef double* control = c.control
     cdef const double* d = c.blocks.d
-    cdef double s0, s1, s2, s3, beta
+    cdef double norm, beta
     for s in range(n):
         if c.turn > 0 and c.turn % REFRESH == 0:
             form_velocity(c, lam)
@@ -120,29 +137,19 @@ cdef public void lav_nncg(sweep_data_t* c, double* lam, int32_t first_sweep, int
             c.v[i] += q[m + i]
             x[m + i] = c.v[i]
         sweep(c, lam, first_sweep and s == 0)
-        s0 = s1 = s2 = s3 = 0.0
-        i = 0
-        while i < m:
+        for i in range(m):
             x[i] -= lam[i]
-            i += 1
-        i = 0
-        while i + 4 <= m:
-            s0 += d[i] * x[i] * x[i]
-            s1 += d[i + 1] * x[i + 1] * x[i + 1]
-            s2 += d[i + 2] * x[i + 2] * x[i + 2]
-            s3 += d[i + 3] * x[i + 3] * x[i + 3]
-            i += 4
-        while i < m:
-            s0 += d[i] * x[i] * x[i]
-            i += 1
-        s0 = (s0 + s1) + (s2 + s3)
+        norm = energy(d, x, x, m)
         for i in range(c.nv):
             x[m + i] -= c.v[i]
-        beta = s0 / control[NORM] if control[NORM] > 0.0 else 0.0
+        beta = norm / control[NORM] if control[NORM] > 0.0 else 0.0
         if not beta <= 1.0:
-            beta = 0.0
-            control[RESTARTS] += 1.0
-        control[NORM] = s0
+            if c.keeps and beta > 1.0 and energy(d, x, p, m) <= 0.0:
+                beta = 1.0                              # (3)
+            else:
+                beta = 0.0
+                control[RESTARTS] += 1.0
+        control[NORM] = norm
         c.turn += 1
         if c.turn == c.convex:
             control[NORM] = 0.0                         # another map: start anew
@@ -206,7 +213,7 @@ def allocate(Data p, int memory):
 
 
 def run(Data p, Watch watch, double[::1] lam, int n, double tol, int memory, prepared, bint exact, int convex, space,
-        int32_t[::1] order, int split, int mode, uint64_t[::1] rng):
+        int32_t[::1] order, int split, int mode, uint64_t[::1] rng, bint keeps=False):
     """`n` iterations in place under `watch`, GIL released: (status, iterations, sweeps, restarts so far).
 
     prepared is (start, numbers) of gauss_seidel.prepare, or None where neither `exact` nor `convex` asks for it;
@@ -240,6 +247,7 @@ def run(Data p, Watch watch, double[::1] lam, int n, double tol, int memory, pre
     c.split = split
     c.mode = mode
     c.memory = memory
+    c.keeps = keeps
     c.rng = &rng[0]
     c.v = &v[0, 0]
     c.nv = p.general.n if p.is_general else 6 * p.rows.n_bodies if p.factored else 0

@@ -24,16 +24,16 @@ def look(Data metric, lam, double before, int32_t sweeps, int32_t n, double tol,
          double per, double least, double most):
     """From `lam` (m,) [N s] in place, at `before`, at most `n`, `sweeps` before the first look.
 
-    sweeper is (data, watch, memory, prepared, exact, convex, space, order, split, mode, rng) of `accelerated.run`, per
-    what a sweep costs, as `least` and `most`. (what the judge finds last, the residual before the last run, its
-    iterations, all iterations, status, sweeps, restarts so far)
+    sweeper is (data, watch, memory, prepared, exact, convex, space, order, split, mode, rng, keeps) of
+    `accelerated.run`, per what a sweep costs, as `least` and `most`. (what the judge finds last, the residual before
+    the last run, its iterations, all iterations, status, sweeps, restarts so far)
     """
     cdef Judged now
     cdef int32_t status, last, total = 0, backwards, swept = 0, restarts
-    data, watch, memory, prepared, exact, convex, space, order, split, mode, rng = sweeper
+    data, watch, memory, prepared, exact, convex, space, order, split, mode, rng, keeps = sweeper
     while True:
         status, last, backwards, restarts = run(
-            data, watch, lam, sweeps, tol, memory, prepared, exact, convex, space, order, split, mode, rng)
+            data, watch, lam, sweeps, tol, memory, prepared, exact, convex, space, order, split, mode, rng, keeps)
         total += last
         swept += backwards
         now = Judged(metric, lam.copy())

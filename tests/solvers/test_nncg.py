@@ -5,6 +5,7 @@ import pytest
 from random_problems import as_matrix, random_contact_problem, random_lcp
 
 import lavender as lv
+from lavender.suite.families import granular
 
 
 def stack(n, ratio=1.0):
@@ -85,32 +86,51 @@ def test_symmetric_order_is_two_sweeps_an_iteration(name):
     assert (solution.iterations, solution.work["sweeps"]) == (7, 14)
 
 
-def test_first_iterations_by_hand():
-    """Two iterations of nncg against the formulas written in NumPy over single sweeps of pgs."""
-    problem = random_lcp(5, m=9)
-    d = problem.d
+def sliding_pile():
+    base = random_contact_problem(77, tangents=2, spin=False, contacts=20, bodies=8, joints=0)
+    return lv.Problem(base.b, base.cones, rows=base.rows, compliance=base.compliance + 0.05)
+
+
+@pytest.mark.parametrize(("restart", "kept"), [("growth", 0), ("against", 2)])
+def test_first_iterations_by_hand(restart, kept):
+    """Iterations of nncg against the formulas written in NumPy over single sweeps of pgs."""
+    problem = random_lcp(5, m=9) if restart == "growth" else sliding_pile()
+    d, count = problem.d, 0
 
     def sweep(x):
         return np.array(lv.solve(problem, "pgs", impulse=x, tol=0.0, max_iter=1).impulse)
 
     x = problem.start()
     p = norm = None
-    for k in range(4):
+    for k in range(4 if restart == "growth" else 40):
         y = sweep(x)
         g = x - y
         beta = 0.0 if p is None else g @ (d * g) / norm
         if beta > 1.0:
-            beta = 0.0
+            keeps = restart == "against" and p @ (d * g) <= 0.0
+            beta, count = (1.0, count + 1) if keeps else (0.0, count)
         norm = g @ (d * g)
         q = np.zeros_like(g) if p is None else beta * p
         p = q - g
-        got = lv.solve(problem, "nncg", tol=0.0, max_iter=k + 1).impulse
-        np.testing.assert_allclose(got, y, rtol=1e-12, atol=1e-14)  # sums in another order
+        got = lv.solve(problem, "nncg", tol=0.0, max_iter=k + 1, restart=restart).impulse
+        np.testing.assert_allclose(got, y, rtol=1e-9, atol=1e-12 * np.abs(y).max())  # sums in another order
         x = y + q
+    assert count >= kept
+
+
+def test_a_sliding_pile_is_found_sooner_where_the_direction_is_kept():
+    problem = granular(n=7, friction="coulomb", seed=8).problem
+    sweeps = [
+        lv.solve(problem, "nncg", convex=60, tol=1e-6, max_iter=10_000, restart=restart).work["sweeps"]
+        for restart in ("growth", "against")
+    ]
+    assert sweeps[1] < 0.7 * sweeps[0]
 
 
 def test_wrong_options_are_refused():
     problem, _ = stack(3)
+    with pytest.raises(lv.UnknownName, match="against"):
+        lv.solve(problem, "nncg", restart="never")
     for name in ("nncg", "anderson"):
         with pytest.raises(lv.UnknownName, match="blocks"):
             lv.solve(problem, name, sweep="block")
@@ -125,8 +145,7 @@ def test_wrong_options_are_refused():
 @pytest.mark.parametrize("name", ["nncg", "anderson"])
 def test_a_sliding_pile_is_solved(name):
     # Contacts that slide: the map is not a gradient, and is accelerated all the same.
-    base = random_contact_problem(77, tangents=2, spin=False, contacts=20, bodies=8, joints=0)
-    problem = lv.Problem(base.b, base.cones, rows=base.rows, compliance=base.compliance + 0.05)
+    problem = sliding_pile()
     plain = lv.solve(problem, "sequential_impulses", tol=1e-9, max_iter=50_000)
     solution = lv.solve(problem, name, tol=1e-9, max_iter=50_000)
     assert plain.success
