@@ -43,7 +43,7 @@ def _choose(problem: Problem) -> tuple[str, int, IntArray | None]:
     band = max(problem.bandwidth)
     if m <= SMALL_SIZE or band <= SMALL_BAND:
         return "band", band, None
-    nnz = problem.csr.nnz
+    nnz = len(problem._compressed[1])
     if nnz >= DENSE_SHARE * m * m and m <= DENSE_LIMIT:
         return "dense", m - 1, None
     # A band needs 2 band + 1 places a row: a mean row of more nonzeros than that has none so narrow.

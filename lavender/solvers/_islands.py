@@ -24,8 +24,8 @@ def islands(problem: Problem) -> tuple[int, IntArray]:
     if problem.generalized is not None:
         return graph.tree_components(problem.derived.view)
     block = np.repeat(np.arange(cones.n_blocks, dtype=np.int32), np.diff(cones.ptr))
-    a = problem.csr
-    return graph.matrix_components(cones.ptr, block, a.indptr, a.indices)
+    indptr, indices, _ = problem._compressed
+    return graph.matrix_components(cones.ptr, block, indptr, indices)
 
 
 def block_bodies(problem: Problem) -> IntArray:

@@ -43,7 +43,9 @@ class PivotState:
         # Of the next factor [s]: the first by structure, then as long as the last took.
         self.seconds = DENSE * problem.m**3 / 3.0
         if self.form == "sparse":
-            self.seconds = min(self.seconds, SPARSE * problem.csr.nnz * (1.0 + problem.m / SPARSE_ROWS))
+            self.seconds = min(
+                self.seconds, SPARSE * len(problem._compressed[1]) * (1.0 + problem.m / SPARSE_ROWS)
+            )
         self.factorisations = self.exchanged = self.searches = 0  # by Python
 
     def start(self, shift: float) -> None:

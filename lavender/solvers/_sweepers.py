@@ -14,7 +14,16 @@ from lavender._arrays import FloatArray
 from lavender.problem import Problem
 from lavender.residuals import judged, known, remember
 from lavender.solution import Claim, Status
-from lavender.solvers._costs import FIRST_LOOK, ISLAND, LOOK, finite_least, first_look, is_glanced, sweep_cost
+from lavender.solvers._costs import (
+    FIRST_LOOK,
+    ISLAND,
+    LOOK,
+    finite_least,
+    first_look,
+    general_cost,
+    is_glanced,
+    sweep_cost,
+)
 from lavender.solvers._few import said
 from lavender.solvers._trail import CLOCK, Trail, usable
 from lavender_ext.few.looks import sweeps_left
@@ -56,7 +65,7 @@ def look_first(problem: Problem, impulse: FloatArray, n: int, tol: float, failed
 
     `failed`: few rows whose factor did not end it at once.
     """
-    if problem.generalized is not None or problem.cones.has_round:
+    if problem.cones.has_round:
         return None
     per = sweep_cost(problem)
     sweeps = first_look(per)
@@ -76,8 +85,12 @@ def look_first(problem: Problem, impulse: FloatArray, n: int, tol: float, failed
     solver: Any = spec.load()()
     state = solver.prepare(problem)
     least = finite_least(problem)
+    most = BELIEVED * least
+    if problem.generalized is not None:
+        # Newton over the velocities mostly ends sooner than it is counted for: no more than hope is worth.
+        least = most = HOPE * general_cost(problem, 0)
     now, before, last, done, status, work = solver.look(
-        state, lam, min(n, 2**31 - 1), tol, before, (sweeps, FIRST_LOOK), (per, least, BELIEVED * least)
+        state, lam, min(n, 2**31 - 1), tol, before, (sweeps, FIRST_LOOK), (per, least, most)
     )
     if now.relative <= tol:
         remember(problem, now)

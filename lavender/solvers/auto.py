@@ -4,8 +4,9 @@
     few rows          a symmetric linear system or LCP, or one of a narrow band: direct, in one call (`_few.py`) where
                       that is the end; else a glance at sweeps (`_sweepers.py`) before anything is counted, and on
                       as below
-    J and M           newton over the velocities at once where that costs next to nothing; else it is one of the
-                      finite solvers below, beside those that form A
+    J and M           newton over the velocities at once where that costs next to nothing (with a time limit, few
+                      rows under Coulomb's law: after a first look at sweeps); else it is one of the finite solvers
+                      below, beside those that form A
     others            a finite solver at once where its factor costs less than sweeps usually do; else anderson
                       as long as what it still needs, by its contraction so far, costs less than the cheapest
                       finite solver (direct, newton, lemke, admm, as the law allows); then that one, with twice the
@@ -23,7 +24,7 @@ certificate that it has no solution. The message and `work` say what ran.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from time import perf_counter
 from typing import Any
 
@@ -44,6 +45,7 @@ from lavender.solvers._costs import (
     factors_at_once,
     general_first,
     is_loose,
+    sweeps_before,
     together_cost,
 )
 from lavender.solvers._few import AUTO
@@ -98,25 +100,35 @@ class Auto:
         deadline = np.inf if time_limit is None else perf_counter() + time_limit
         lam, claim = impulse.copy(), None
         largest = 0
-        if problem.generalized is not None and problem.m and n > 0:
-            # Newton over the velocities ends nearly all robots: nothing is looked at, and nothing noted, before.
+        if problem.m == 0:
+            return Claim(Status.CONVERGED, 0, {}, "nothing to solve")
+        glance = None
+        # Without a limit Newton over few velocities is one compiled call, which costs less than to look at sweeps here.
+        if problem.generalized is None or (time_limit is not None and sweeps_before(problem)):
+            glance = look_first(problem, impulse, n, tol, few)
+            if glance is not None and glance.best <= tol:
+                impulse[:] = glance.impulse
+                return Claim(Status.CONVERGED, glance.done, glance.work, glance.message)
+        done = 0 if glance is None else glance.done
+        if problem.generalized is not None and n > done:
+            # Newton over the velocities ends nearly all robots: nothing else is found out, and nothing noted, before.
             kernel = general.prepare(problem)
             largest = 0 if kernel is None else kernel.largest
             if kernel is not None and general_first(problem, largest):
-                claim = general.run(problem, kernel, lam, min(n, GENERAL_STEPS[problem.law]), tol, time_limit)
+                steps = min(n - done, GENERAL_STEPS[problem.law])
+                claim = general.run(problem, kernel, lam, steps, tol, time_limit)
                 if claim.status is Status.CONVERGED:
                     impulse[:] = lam
-                    return general.named(claim, "auto")
-        if problem.m == 0:
-            return Claim(Status.CONVERGED, 0, {}, "nothing to solve")
-        glance = look_first(problem, impulse, n, tol, few)
-        if glance is not None and glance.best <= tol:
-            impulse[:] = glance.impulse
-            return Claim(Status.CONVERGED, glance.done, glance.work, glance.message)
+                    claim = general.named(claim, "auto")
+                    return claim if glance is None else _after(glance, claim)
         limit = np.inf if time_limit is None else 1e9 * time_limit
         trail = Trail(problem, tol, deadline, limit, largest)
         trail.offer(impulse)
         if claim is not None:
+            if glance is not None:
+                Sweeps(trail, glance=glance).note()
+                trail.offer(glance.impulse)
+                glance = None  # they go on from where newton left it
             trail.add("newton", claim)
             trail.begun = True
             if claim.status is not Status.MAX_ITERATIONS:
@@ -145,6 +157,14 @@ class Auto:
         nothing = "the start is a solution" if trail.best <= tol else "no time for anything"
         message = " -> ".join(trail.steps) or nothing
         return Claim(status, trail.iterations, trail.work, message, certificate=trail.certificate)
+
+
+def _after(glance: Glance, claim: Claim) -> Claim:
+    """A claim of what came after a first look at sweeps, with what these did."""
+    return replace(
+        claim, iterations=glance.done + claim.iterations, work={**glance.work, **claim.work},
+        message=f"{glance.message} -> {claim.message}",
+    )  # fmt: skip
 
 
 # -- the plan ---------------------------------------------------------------------------------------

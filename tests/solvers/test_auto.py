@@ -5,6 +5,7 @@ import pytest
 import scipy.sparse as sp
 from hypothesis import given, settings
 from random_problems import as_matrix, random_contact_problem, random_lcp, seeds
+from random_trees import random_general
 
 import lavender as lv
 from lavender import registry, suite
@@ -320,3 +321,14 @@ def test_newton_comes_first_on_many_soft_rows_of_few_velocities(soft):
         assert solution.success
         assert solution.work["factorisations"] <= 20
         assert "sweeps" not in solution.work
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_few_rows_of_generalized_velocities_have_a_look_at_sweeps_first_under_a_time_limit(seed):
+    problem = random_general(seed, "coulomb", n=20, contacts=8, compliance=seed % 2 == 0)
+    with_limit = lv.solve(problem, tol=1e-6, time_limit=60.0)
+    assert good(with_limit, 1e-6)
+    assert with_limit.message.startswith("anderson")
+    assert with_limit.work["sweeps"] > 0
+    for most in (20, 70, 90):  # a look, newton's steps and what comes after share the budget
+        assert lv.solve(problem, tol=1e-12, time_limit=60.0, max_iter=most).iterations <= most
