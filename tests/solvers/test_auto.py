@@ -332,3 +332,13 @@ def test_few_rows_of_generalized_velocities_have_a_look_at_sweeps_first_under_a_
     assert with_limit.work["sweeps"] > 0
     for most in (20, 70, 90):  # a look, newton's steps and what comes after share the budget
         assert lv.solve(problem, tol=1e-12, time_limit=60.0, max_iter=most).iterations <= most
+
+
+def test_newton_gives_way_before_factors_that_are_dearer_than_it_was_counted_with():
+    """Nearly dependent rows over bodies: its velocity form comes to 2e-6, its augmented system costs 20 times that."""
+    solution = lv.solve(suite.case("wild(seed=2004)").problem, tol=1e-6)
+    assert solution.success
+    before, after = solution.message.split("admm")
+    assert "newton" not in before  # it is still inside, and goes on where the other does not end it
+    assert "newton" in after
+    assert solution.work["factorisations"] < 40

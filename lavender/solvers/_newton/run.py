@@ -92,6 +92,12 @@ class Run:
             self.deadline < np.inf and perf_counter() + self.system.pace * self.system.cost >= self.deadline
         )
 
+    def gives_way(self) -> bool:
+        """Before factors dearer than those counted on: a turn of others, where there are any; whether it is the end."""
+        if self.more is not None:
+            self.budget = min(self.budget, self.system.factorisations)
+        return self.done()
+
     def at_floor(self) -> bool:
         """The best point is within twice the floor."""
         if self.best > 1e-5:
