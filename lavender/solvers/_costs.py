@@ -380,7 +380,11 @@ class Costs:
             count = SINGULAR if p.law == "lcp" and p.generalized is None else 1.0
             found.append(Exact("direct", self.formed + self._direct(factor, count), rounds, once=once))
         if p.law == "lcp" and p.m <= LEMKE_ROWS:
-            found.append(Exact("lemke", START["lemke"] + p.m * (PIVOT + PIVOT_ENTRY * float(p.m) ** 2), 0))
+            capped = int(np.count_nonzero(np.isfinite(p.cones.lower) & np.isfinite(p.cones.upper)))
+            entries = PIVOT_ENTRY * float(p.m + capped) ** 2
+            # It goes on where it stood: twice the pivots expected, and small problems for longer.
+            limit = 2 * p.m + int(TAIL_TIME / entries)
+            found.append(Exact("lemke", START["lemke"] + p.m * (PIVOT + entries), limit))
         if self.largest:
             count = 2 * int(GENERAL_COUNT[p.law]) + GENERAL_TAIL[p.law]
             cost = self.over_velocities

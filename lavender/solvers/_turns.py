@@ -80,7 +80,10 @@ def whole(
         claim = _in_chunks(trail, solver, state, impulse, most)
         trail.kept[chosen.key], trail.left[chosen.key] = (solver, state), impulse
     else:
-        claim = solver.run(state, impulse, most, trail.tol, left)
+        resumes = hasattr(solver, "resume")
+        claim = (solver.resume if resumes else solver.run)(state, impulse, most, trail.tol, left)
+        if resumes:
+            trail.kept[chosen.key], trail.left[chosen.key] = (solver, state), impulse
     trail.add(name, claim)
     if np.isfinite(impulse).all():
         trail.offer(impulse)

@@ -18,6 +18,7 @@ does not reach the result. Ties are broken lexicographically: no cycles, in exac
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from time import perf_counter
 
@@ -180,86 +181,129 @@ def _principal_pivot(m: FloatArray, q: FloatArray, rows: Places) -> tuple[FloatA
     return new, q
 
 
+@dataclass
+class LemkeState:
+    """A problem in standard form, and the paths followed on it so far."""
+
+    form: Standard
+    walk: Walk | None = None
+
+
 @dataclass(frozen=True)
 class Lemke:
     """Lemke's complementary pivoting; one path, no options."""
 
     @np.errstate(all="ignore")  # what overflows is judged
-    def prepare(self, problem: Problem) -> Standard:
-        return standard_form(problem)
+    def prepare(self, problem: Problem) -> LemkeState:
+        return LemkeState(standard_form(problem))
 
-    def update(self, state: Standard, problem: Problem) -> Standard:
+    def update(self, state: LemkeState, problem: Problem) -> LemkeState:
         return self.prepare(problem)
 
-    @np.errstate(all="ignore")  # what overflows is judged
     def run(
-        self, state: Standard, impulse: FloatArray, n: int, tol: float, time_limit: float | None = None
+        self, state: LemkeState, impulse: FloatArray, n: int, tol: float, time_limit: float | None = None
     ) -> Claim:
-        run = _Run(state, impulse, n, tol, time_limit)
-        return run.solve() if n > 0 else run.claim(Status.MAX_ITERATIONS)
+        state.walk = None
+        return self.resume(state, impulse, n, tol, time_limit)
+
+    @np.errstate(all="ignore")  # what overflows is judged
+    def resume(
+        self, state: LemkeState, impulse: FloatArray, n: int, tol: float, time_limit: float | None = None
+    ) -> Claim:
+        """At most n more pivots from where the last call stopped: n, then n, end where 2 n do."""
+        if state.walk is None:
+            state.walk = Walk(state.form, impulse)
+        return state.walk.go(impulse, n, tol, time_limit)
 
 
-class _Run:
-    def __init__(
-        self, form: Standard, impulse: FloatArray, n: int, tol: float, time_limit: float | None
-    ) -> None:
-        self.form, self.problem, self.impulse, self.budget, self.tol = form, form.problem, impulse, n, tol
-        self.stop_at = None if time_limit is None else perf_counter() + time_limit
+class Walk:
+    """Paths of one problem from where they stand; the best judged iterate so far, and what was spent."""
+
+    def __init__(self, form: Standard, impulse: FloatArray) -> None:
+        self.form, self.problem, self.impulse = form, form.problem, impulse.copy()
         m = form.problem.m
         self.w, self.e = np.empty(m), np.empty(m)
         self.best, self.floor = np.inf, 0.0
         self.pivots, self.work = 0, {"pivots": 0}
         self.message = ""
+        self.certificate: FloatArray | None = None
+        self.budget, self.stop_at, self.tol = 0, None, 0.0
+        self.ended = Status.INTERRUPTED  # where Ctrl-C ended the steps; else their last word
+        self.steps = self.solve()
 
-    def judge(self, x: FloatArray) -> float:
-        """Relative residual of x within its bounds; the best becomes the result."""
+    stop_at: float | None  # of perf_counter
+
+    def go(self, impulse: FloatArray, n: int, tol: float, time_limit: float | None) -> Claim:
+        """At most n more pivots; the best impulse (m,) so far in place."""
+        self.budget, self.tol = self.pivots + n, tol
+        self.stop_at = None if time_limit is None else perf_counter() + time_limit
+        work = dict(self.work)
+        self.ahead: FloatArray | None = None
+        status = Status.MAX_ITERATIONS if n <= 0 else next(self.steps, self.ended)
+        impulse[:] = self.impulse if self.ahead is None else self.ahead
+        self.work["pivots"] = self.pivots
+        spent = {what: count - work.get(what, 0) for what, count in self.work.items()}
+        spent = {what: count for what, count in spent.items() if count or what == "pivots"}
+        return Claim(status, spent["pivots"], spent, self.message, form="dense", certificate=self.certificate)
+
+    def judge(self, x: FloatArray, result: bool = True) -> float:
+        """Relative residual of x within its bounds; the best becomes the result.
+
+        With `result` False only that of this call: what comes later must not know where a call ended.
+        """
         c = self.problem.cones
         x = np.clip(x, c.lower, c.upper)
         if not np.isfinite(x).all():
             return np.inf
         relative, floor = quick(self.problem, x, self.w, self.e, floor=True)
         if relative < self.best:
-            self.best, self.floor = relative, floor
-            self.impulse[:] = x
+            if result:
+                self.best, self.floor, self.impulse = relative, floor, x
+            else:
+                self.ahead = x
         return relative
 
-    def claim(self, status: Status, certificate: FloatArray | None = None) -> Claim:
-        self.work["pivots"] = self.pivots
-        return Claim(status, self.pivots, self.work, self.message, form="dense", certificate=certificate)
+    def end(self, status: Status) -> Status:
+        """The last word: further calls say the same."""
+        self.ended = status
+        return status
 
-    def verdict(self) -> Claim:
+    def verdict(self) -> Status:
         if self.best <= self.tol:
             self.message = ""
-            return self.claim(Status.CONVERGED)
-        return self.claim(Status.FLOOR if at_floor(self.best, self.floor) else Status.STALLED)
+            return self.end(Status.CONVERGED)
+        return self.end(Status.FLOOR if at_floor(self.best, self.floor) else Status.STALLED)
 
     def count(self, what: str) -> None:
         self.work[what] = self.work.get(what, 0) + 1
 
     # -- the path ----------------------------------------------------------------------------------
 
-    def solve(self) -> Claim:
+    def solve(self) -> Iterator[Status]:
+        """All paths; how each call ends where it is cut, and in the end."""
         q = self.form.q
         n = len(q)
-        self.judge(self.impulse.copy())
+        self.judge(self.impulse)
         if n == 0 or q.min() >= 0.0:
             self.finish(np.arange(n, dtype=np.int32))
-            return self.verdict()
+            yield self.verdict()
+            return
         covers = np.random.default_rng(0)
         for path in range(PATHS):
             # Another covering vector is another path: past rays that prove nothing, and past lost ones.
             cover = np.ones(n) if path < 2 else covers.uniform(0.2, 1.8, n)
-            claim = self.follow(cover, FINER if path == 1 else TINY)
-            if claim is not None:
-                return claim
+            yield from self.follow(cover, FINER if path == 1 else TINY)
+            if self.certificate is not None:
+                yield self.end(Status.INFEASIBLE)
+                return
             if self.best <= max(GOOD, 2.0 * self.floor):
                 break
             if self.pivots >= self.budget:
-                return self.claim(Status.MAX_ITERATIONS)
-        return self.verdict()
+                yield Status.MAX_ITERATIONS
+        yield self.verdict()
 
-    def follow(self, cover: FloatArray, tiny: float) -> Claim | None:
-        """One path from q + M s + cover z; None where its end proves nothing or is judged elsewhere."""
+    def follow(self, cover: FloatArray, tiny: float) -> Iterator[Status]:
+        """One path from q + M s + cover z; a certificate where its end proves that there is no solution."""
         q = self.form.q
         n = len(q)
         basic = np.arange(n, dtype=np.int32)
@@ -273,30 +317,36 @@ class _Run:
         self.pivots += 1
         last = self.pivots + PIVOTS_A_ROW * n + BATCH
         self.count("paths")
+        chunk = max(1, int(CLOCK / (ENTRY * n * n)))
         while True:
-            code, left = PIVOTS, max(0, min(BATCH, self.budget - self.pivots))
-            while code == PIVOTS and left and not self.late():
-                code, done = book.pivots(min(left, max(1, int(CLOCK / (ENTRY * n * n)))))
+            code, left = PIVOTS, BATCH
+            while code == PIVOTS and left:
+                while self.pivots >= self.budget or self.late():
+                    yield self.cut(t, basic)
+                code, done = book.pivots(min(left, chunk, self.budget - self.pivots))
                 self.pivots += done
                 left -= done
-            self.work["pivots"] = self.pivots
             if code != PIVOTS:
                 break
-            if self.pivots >= self.budget or self.late(FORMED * float(n) ** 3):
-                self.judge(self.form.impulse(*self.values(t, basic)))
-                return self.claim(Status.MAX_ITERATIONS if self.pivots >= self.budget else Status.TIME_LIMIT)
+            while self.late(FORMED * float(n) ** 3):
+                yield self.cut(t, basic)
             entering = int(nonbasic[book.entering])
             if self.pivots >= last or not self.form_anew(t, basic, nonbasic, cover):
                 self.message = "lost its path to rounding"
-                return None
+                return
             book = Dictionary(t, basic, nonbasic, np.empty(2 * n + 1, np.int32), tiny)
             book.enter(entering)
         self.judge(self.form.impulse(*self.values(t, basic)))
         if code == RAY:
-            return self.ray(t, basic, nonbasic, book.entering)
+            self.ray(t, basic, nonbasic, book.entering)
+            return
         self.message = ""
         self.finish(basic)
-        return None
+
+    def cut(self, t: FloatArray, basic: IntArray) -> Status:
+        """A call ends in the middle of a path."""
+        self.judge(self.form.impulse(*self.values(t, basic)), result=False)
+        return Status.MAX_ITERATIONS if self.pivots >= self.budget else Status.TIME_LIMIT
 
     def late(self, more: float = 0.0) -> bool:
         """The time is up, or would be `more` [s] from now."""
@@ -327,7 +377,7 @@ class _Run:
         self.count("factorisations")
         return True
 
-    def ray(self, t: FloatArray, basic: IntArray, nonbasic: IntArray, entering: int) -> Claim | None:
+    def ray(self, t: FloatArray, basic: IntArray, nonbasic: IntArray, entering: int) -> None:
         """On a secondary ray: its direction may prove that there is no solution."""
         n = len(basic)
         s, w = self.column(t[:, entering], basic)
@@ -345,8 +395,7 @@ class _Run:
         size = np.abs(y).max(initial=0.0)
         if size > 0.0 and check_certificate(self.problem, y / size) is None:
             self.message += ": no impulse meets every row"
-            return self.claim(Status.INFEASIBLE, y / size)
-        return None
+            self.certificate = y / size
 
     # -- the result --------------------------------------------------------------------------------
 

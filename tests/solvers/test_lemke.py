@@ -9,6 +9,7 @@ from hypothesis import given
 from random_problems import random_lcp, seeds
 
 import lavender as lv
+from lavender import registry, suite
 from lavender.certificates import check_certificate
 
 
@@ -174,3 +175,37 @@ def test_reference_problems(problem_dir):
         else:
             assert accurate(solution), (path.stem, solution)
     assert seen > 20
+
+
+@given(
+    seed=seeds, m=st.integers(1, 30), cuts=st.lists(st.integers(0, 40), max_size=8), singular=st.booleans()
+)
+def test_pivots_in_parts_are_those_of_one_call_to_the_bit(seed, m, cuts, singular):
+    rng = np.random.default_rng(seed)
+    g, skew = rng.normal(size=(2, m, m))
+    if singular:
+        g[:, : m // 2] = 0.0
+    low, high = random_bounds(rng, m)
+    problem = lv.Problem.lcp(g @ g.T + skew - skew.T, 2.0 * rng.normal(size=m), low, high)
+    solver = registry.get("lemke").load()()
+    state, whole = solver.prepare(problem), problem.start()
+    one = solver.resume(state, whole, 10_000, 1e-9)
+    state, parts = solver.prepare(problem), problem.start()
+    claims = [solver.resume(state, parts, n, 1e-9) for n in [*cuts, 10_000]]
+    assert claims[-1].status is one.status
+    assert sum(c.iterations for c in claims) == one.iterations
+    for kind in one.work:
+        assert sum(c.work.get(kind, 0) for c in claims) == one.work[kind]
+    assert parts.tobytes() == whole.tobytes()
+    assert solver.resume(state, parts, 5, 1e-9).iterations == 0  # the last word is the last
+    again = problem.start()
+    assert solver.run(state, again, 10_000, 1e-9).iterations == one.iterations  # `run` begins anew
+    assert again.tobytes() == whole.tobytes()
+
+
+def test_auto_gives_lemke_turns_that_go_on():
+    solution = lv.solve(suite.wild(seed=5124).problem, "auto", tol=1e-6)
+    assert solution.success, solution
+    assert solution.work["pivots"] < 3000
+    assert "paths" in solution.message and solution.message.count("lemke") > 1
+    assert solution.work["paths"] == 1
