@@ -1,4 +1,4 @@
-"""Accelerated sweeps as `auto` runs them: a glance, looks at what they promise, and a race with the relaxation's.
+"""Accelerated sweeps as `auto` runs them: a glance, and looks at what they promise.
 
 rest = n log(now / tol) / log(before / now)         sweeps left, by the contraction of the last n    (1)
 """
@@ -28,17 +28,13 @@ from lavender.solvers._few import said
 from lavender.solvers._trail import CLOCK, Trail, usable
 from lavender_ext.few.looks import sweeps_left
 
-__all__ = ["Glance", "Sweeps", "look_first", "race"]
+__all__ = ["Glance", "Sweeps", "look_first"]
 
 SWEEPER = "anderson"  # whose sweeps come first
 HOPE = 0.25  # share of a finite solver's cost that sweeps may take without promising an end
 BELIEVED = 2.0  # times a finite solver's cost that sweeps may take, whatever they promise
 APART = 10.0  # islands' worth of Python from which a finite solver is compared with islands solved apart
 PORTION = 0.25  # of a time limit that sweeps may take that will not get there within it
-SLOW = (
-    2.0  # times the cost that the relaxation promises by all that it did, at which its last look slows down
-)
-FOLLOWING = ("given", "symmetric")  # orders of sweeps that begin where the relaxation slows down, in turn
 
 
 @dataclass
@@ -122,6 +118,7 @@ class Sweeps:
         self.total = {} if glance is None else dict(glance.work)  # their work that is not in the trail yet,
         self.begun = 0  # and how many were
         self.last, self.at = trail.best, 0  # residual of the last look, and when it was
+        self.aside = 0.0  # ns that were spent beside them
         self.rest = np.inf  # sweeps that were then expected to be left
         self.ended = False  # by a claim of its own, or because the residual does not fall
 
@@ -226,99 +223,3 @@ class Sweeps:
         costs = self.trail.costs
         # To ask closely of J and M forms A: not before that much was swept.
         return than(costs.least) and than(costs.guess) and spent > costs.formed and than(costs.cheapest)
-
-
-class Relaxed(Sweeps):
-    """Sweeps of the convex relaxation, judged by Coulomb's law, whose answer it has wherever contacts stick."""
-
-    def __init__(self, trail: Trail) -> None:
-        convex = Trail(trail.problem.relaxed("cone"), trail.tol, trail.deadline, trail.limit)
-        super().__init__(convex)
-        self.outer = trail
-        self.last = trail.best
-
-    def look(self, step: int) -> float:
-        """As of all sweeps; one that finds the relaxation solved before the first of them promises what was."""
-        before, rest, at = self.done, self.rest, self.at
-        now = super().look(step)
-        if self.done == before:
-            self.rest, self.at = rest, at
-        return now
-
-    def judge(self, status: Status) -> float:
-        now = self.outer.offer(self.impulse)
-        if status is Status.CONVERGED:
-            self.tol *= 0.1  # solved; Coulomb's residual may follow to a closer one
-        return now
-
-    def stopped(self, status: Status) -> bool:
-        return status is not Status.CONVERGED
-
-    def note(self, prefix: str = "relaxation: ") -> None:
-        trail, self.trail = self.trail, self.outer
-        super().note(prefix)
-        self.trail = trail
-
-
-class Racer:
-    """One of those that race; `before` [ns] was spent, and `best` reached, on what it goes on from."""
-
-    def __init__(self, sweeps: Sweeps, start: float, before: float = 0.0, best: float = np.inf) -> None:
-        self.sweeps, self.start, self.before, self.best = sweeps, start, before, best
-        self.tol = sweeps.tol
-        self.looks = 0
-
-    @property
-    def spent(self) -> float:
-        """Cost of what it did itself [ns]."""
-        return self.looks * LOOK + self.sweeps.done * self.sweeps.per
-
-    @property
-    def promised(self) -> float:
-        """Cost of what is left, by the mean contraction since the start (1) [ns]; nothing is known before a look."""
-        if self.sweeps.ended:
-            return np.inf
-        if self.best == np.inf:
-            return 0.0
-        return sweeps_left(self.before + self.spent, self.start, self.best, self.tol)
-
-    def look(self, budget: int) -> float:
-        self.looks += 1
-        now = self.sweeps.look(min(self.sweeps.next_look(), budget))
-        self.best = min(self.best, now)
-        return now
-
-
-def race(trail: Trail, own: Sweeps, budget: int) -> bool:
-    """Sweeps under Coulomb's law, those of its relaxation, and the former from where the latter slow down.
-
-    Look by look whichever promises to cost less from there, so that none is dropped while it moves. From where the
-    relaxation stands others begin whenever it did twice as much: which of them end soon is a matter of luck.
-    """
-    relaxed = Relaxed(trail)
-    start = trail.best
-    relaxed.impulse[:] = trail.problem.start()
-    slow = Racer(relaxed, 1.0)
-    racers, followers, last = [Racer(own, start), slow], list[Sweeps](), 0
-    while not trail.late:
-        racer = min(racers, key=lambda r: (r.promised, r.spent))
-        left = budget - trail.iterations - sum(r.sweeps.done for r in racers)
-        if left <= 0 or racer.sweeps.ended or racer.look(left) <= trail.tol:
-            break
-        spent = sum(r.spent for r in racers)
-        slows = racer is slow and slow.looks > 1 and SLOW * slow.promised < relaxed.cost
-        if slows and relaxed.done >= 2 * last:
-            last = relaxed.done
-            order = FOLLOWING[len(followers) % len(FOLLOWING)]
-            follower = Sweeps(trail, "nncg", order=order, restart="against")
-            follower.impulse[:] = relaxed.impulse
-            follower.last = relaxed.last
-            followers.append(follower)
-            racers.insert(0, Racer(follower, 1.0, slow.spent, slow.best))
-        if slow.looks and own.dearer(min(r.sweeps.cost for r in racers), spent, None):
-            break
-    relaxed.note()
-    for follower in followers:
-        follower.note("from there: ")
-    own.note()
-    return trail.done

@@ -13,7 +13,8 @@
                       factorisations that it is expected to need; then anderson again, from where it stood, with
                       twice the allowance; and so on (`_turns.py`), newton from where it stood too
     coulomb           loose and large piles: sweeps (nncg in both directions from LARGE rows on) race those of the
-                      convex relaxation, whose answer is the Coulomb answer wherever contacts stick
+                      convex relaxation, whose answer is the Coulomb answer wherever contacts stick; where they stall,
+                      what is wrong is solved in patches between sweeps (`_race.py`, `_patches.py`)
 
 Costs are counted from the structure (`_costs.py`) and from the contraction of sweeps that were done, never timed:
 the same problem is solved the same way everywhere. Islands are solved apart, each to its share of the whole error,
@@ -51,8 +52,9 @@ from lavender.solvers._costs import (
 from lavender.solvers._few import AUTO
 from lavender.solvers._islands import restrict, rows_of
 from lavender.solvers._newton import general
+from lavender.solvers._race import race
 from lavender.solvers._split import solve_together, takes
-from lavender.solvers._sweepers import Glance, Sweeps, look_first, race
+from lavender.solvers._sweepers import Glance, Sweeps, look_first
 from lavender.solvers._trail import Trail
 from lavender.solvers._turns import VELOCITY, Turns, whole
 from lavender_ext.few.looks import sweeps_left

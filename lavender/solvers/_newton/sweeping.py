@@ -21,7 +21,7 @@ from lavender.solvers._newton.proximal import Proximal
 from lavender.solvers._newton.run import Run
 from lavender.solvers._newton.systems import AUGMENTED, PANELS, MatrixSystem, System
 
-__all__ = ["Sweeping"]
+__all__ = ["Sweeping", "step_cost"]
 
 # Solver, options, sweeps of one iteration, and iterations of a round at least.
 METHODS: tuple[tuple[str, dict[str, Any], float, int], ...] = (
@@ -56,7 +56,7 @@ class Sweeping:
         self.run, self.start = run, z.copy()
         self.methods = [_Method(*m) for m in METHODS]
         self.rounds, self.spent = 0, 0.0  # ns
-        self.factor_cost = _step_cost(run.system)
+        self.factor_cost = step_cost(run.system)
 
     @cached_property
     def sweep_cost(self) -> float:
@@ -103,7 +103,7 @@ class Sweeping:
         return z
 
 
-def _step_cost(system: System) -> float:
+def step_cost(system: System) -> float:
     """One step of Newton's method [ns], by the rates of `_costs.py`."""
     if isinstance(system, MatrixSystem):
         rate = DENSE if system.dense else 1.0

@@ -1,0 +1,137 @@
+"""Where sweeps under Coulomb's law stall: patches of blocks around what is wrong, each solved apart.
+
+    A_pp lam_p - b_p' complementary to lam_p,    b_p' = b_p - A_pr lam_r       p a patch, r all other blocks      (1)
+
+On piles that stall two thirds of the squared error sit in ten contacts: there the impulse creeps along one line, step
+after step, until a contact far along it changes side. Sweeps over the patch alone cost a hundredth, and Newton's
+method goes there at once; sweeps over all of them spread what it did. Patches that bring nothing give way to wider
+ones, and all plans to the first one once more.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from lavender._arrays import FloatArray, IntArray
+from lavender.registry import get
+from lavender.residuals import judged, quick
+from lavender.solution import Status
+from lavender.solvers._costs import LOOK, sweep_cost
+from lavender.solvers._islands import block_bodies, restrict, rows_of
+from lavender.solvers._newton.sweeping import step_cost
+from lavender.solvers._sweepers import Sweeps
+from lavender.solvers._trail import Trail
+from lavender_ext.factor import graph
+
+ROUND = 100  # sweeps of all blocks between two rounds of patches
+BAD = 0.3  # share of the largest block's error from which a block is the core of a patch
+IDLE = 4  # times that all plans may gain nothing
+GAIN = 0.8  # of the residual that a plan has to leave
+CLOSER = 1e-3  # of a patch's own residual, to which it is solved
+BLOCKS = 400  # of a patch that Newton's method is asked for
+# What is asked, with how many bodies around the core, in turn while nothing is gained.
+PLANS = (("newton", 1), ("nncg", 1), ("newton", 2), ("nncg", 2), ("nncg", 3))
+SHARE = 2.0  # of what a round's sweeps of all cost, that those of a patch may
+STEPS = {"newton": 60, "nncg": 3000}  # of it at most
+OPTIONS: dict[str, dict[str, Any]] = {"newton": {}, "nncg": {"restart": "against"}}
+
+
+class Patches(Sweeps):
+    """Sweeps of `anderson`, and between two looks patches; begins where the trail is best."""
+
+    def __init__(self, trail: Trail) -> None:
+        super().__init__(trail)
+        self.bodies = block_bodies(trail.problem)
+        self.block = np.repeat(np.arange(len(self.bodies)), np.diff(trail.problem.cones.ptr))
+        self.reached, self.plan = np.inf, 0
+        self.least = trail.best
+        self.idle = 0  # times that all plans were through and nothing was gained
+
+    @property
+    def spent(self) -> float:
+        """Cost of what it did [ns]."""
+        return self.done * (self.per + LOOK / ROUND) + self.aside
+
+    def mend(self, worth: float, budget: int) -> bool:
+        """As long as it gains and costs no more than `worth` [ns] in all; whether the trail is done."""
+        trail = self.trail
+        while not trail.late and self.idle < IDLE and self.done < budget and self.spent < worth:
+            if self.look(min(ROUND, budget - self.done)) <= trail.tol:
+                break
+        return trail.done
+
+    def look(self, step: int) -> float:
+        """So many sweeps of all; then patches, to be swept over by the next."""
+        self.state = self.solver.prepare(self.trail.problem)  # forgets what patches moved
+        now = super().look(step)
+        self.ended = False
+        if now > self.trail.tol and not self.trail.late:
+            if now < GAIN * self.least:
+                self.least, self.idle = now, 0
+            if now < GAIN * self.reached:
+                self.reached, self.plan = now, 0
+            else:
+                self.plan += 1
+                if self.plan == len(PLANS):
+                    self.reached, self.plan = np.inf, 0
+                    self.idle += 1
+            self._mend(*PLANS[self.plan])
+        return now
+
+    def _mend(self, name: str, width: int) -> None:
+        problem = self.trail.problem
+        error = np.bincount(self.block, problem.d * self._error() ** 2)
+        label = self._labels(error >= BAD * BAD * error.max(initial=0.0), width)
+        rest = self.impulse.copy()
+        rest[label[self.block] >= 0] = 0.0
+        shifted = -problem.slack(rest)
+        for i in range(label.max(initial=-1) + 1):
+            blocks = np.flatnonzero(label == i).astype(np.int32)
+            if self.trail.late:
+                break
+            if name == "nncg" or len(blocks) <= BLOCKS:
+                self._solve(blocks, shifted, name)
+
+    def _error(self) -> FloatArray:
+        """What the judge finds wrong in every row (m,) [N s]."""
+        quick(self.trail.problem, self.impulse, self.trail.w, self.trail.e)
+        return self.trail.e
+
+    def _labels(self, core: Any, width: int) -> IntArray:
+        """The patch of each block (k,), -1 of none: of blocks on bodies of the core, `width` times over."""
+        n = self.trail.problem.rows.n_bodies  # type: ignore[union-attr]
+        chosen = core
+        for _ in range(width):
+            touched = np.zeros(n + 1, bool)  # the last entry is body -1
+            touched[self.bodies[chosen]] = True
+            touched[-1] = False
+            chosen = touched[self.bodies].any(axis=1) | chosen
+        label = np.full(len(core), -1, np.int32)
+        label[chosen] = graph.body_components(np.ascontiguousarray(self.bodies[chosen]), n)[1]
+        return label
+
+    def _solve(self, blocks: IntArray, shifted: FloatArray, name: str) -> None:
+        """(1) by one solver, from where the patch stands; what it ends with is kept, whatever it is."""
+        problem = self.trail.problem
+        rows = rows_of(problem, blocks)
+        part = replace(restrict(problem, blocks, rows), b=shifted[rows])
+        impulse, deadline = self.impulse[rows], self.trail.deadline
+        tol = CLOSER * judged(part, impulse.copy()).relative
+        solver: Any = get(name).load()(**OPTIONS[name])
+        state = solver.prepare(part)
+        limit = None if deadline == np.inf else max(deadline - perf_counter(), 1e-3)
+        steps = STEPS[name]
+        if name == "nncg":
+            steps = min(steps, int(SHARE * ROUND * len(self.bodies) / len(blocks)))
+        claim = solver.run(state, impulse, steps, tol, limit)
+        for kind, count in claim.work.items():
+            self.total[kind] = self.total.get(kind, 0) + count
+        if claim.status is not Status.DIVERGED and np.isfinite(impulse).all():
+            self.impulse[rows] = impulse
+        self.aside += LOOK + claim.work.get("sweeps", 0) * sweep_cost(part)
+        if name == "newton" and state.system is not None:
+            self.aside += claim.work["factorisations"] * step_cost(state.system)

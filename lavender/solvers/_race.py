@@ -1,0 +1,140 @@
+"""Sweeps under Coulomb's law race those of the convex relaxation, and others that begin where these stand.
+
+rest = n log(now / tol) / log(before / now)         sweeps left, by the contraction of all n    (1)
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lavender.solution import Status
+from lavender.solvers._costs import LOOK
+from lavender.solvers._patches import Patches
+from lavender.solvers._sweepers import Sweeps
+from lavender.solvers._trail import Trail
+from lavender_ext.few.looks import sweeps_left
+
+__all__ = ["race"]
+
+SLOW = (
+    2.0  # times the cost that the relaxation promises by all that it did, at which its last look slows down
+)
+STALLED = 0.8  # share of its residual that the later half of a racer's work has to leave
+FOLLOWING = ("given", "symmetric")  # orders of sweeps that begin where the relaxation slows down, in turn
+
+
+class Relaxed(Sweeps):
+    """Sweeps of the convex relaxation, judged by Coulomb's law, whose answer it has wherever contacts stick."""
+
+    def __init__(self, trail: Trail) -> None:
+        convex = Trail(trail.problem.relaxed("cone"), trail.tol, trail.deadline, trail.limit)
+        super().__init__(convex)
+        self.outer = trail
+        self.last = trail.best
+
+    def look(self, step: int) -> float:
+        """As of all sweeps; one that finds the relaxation solved before the first of them promises what was."""
+        before, rest, at = self.done, self.rest, self.at
+        now = super().look(step)
+        if self.done == before:
+            self.rest, self.at = rest, at
+        return now
+
+    def judge(self, status: Status) -> float:
+        now = self.outer.offer(self.impulse)
+        if status is Status.CONVERGED:
+            self.tol *= 0.1  # solved; Coulomb's residual may follow to a closer one
+        return now
+
+    def stopped(self, status: Status) -> bool:
+        return status is not Status.CONVERGED
+
+    def note(self, prefix: str = "relaxation: ") -> None:
+        trail, self.trail = self.trail, self.outer
+        super().note(prefix)
+        self.trail = trail
+
+
+class Racer:
+    """One of those that race; `before` [ns] was spent, and `best` reached, on what it goes on from."""
+
+    def __init__(self, sweeps: Sweeps, start: float, before: float = 0.0, best: float = np.inf) -> None:
+        self.sweeps, self.start, self.before, self.best = sweeps, start, before, best
+        self.tol = sweeps.tol
+        self.looks = 0
+        self.past: list[tuple[float, float]] = []  # (spent, best) of each look
+
+    @property
+    def spent(self) -> float:
+        """Cost of what it did itself [ns]."""
+        return self.looks * LOOK + self.sweeps.done * self.sweeps.per + self.sweeps.aside
+
+    @property
+    def promised(self) -> float:
+        """Cost of what is left, by the mean contraction since the start (1) [ns]; nothing is known before a look."""
+        if self.sweeps.ended:
+            return np.inf
+        if self.best == np.inf:
+            return 0.0
+        return sweeps_left(self.before + self.spent, self.start, self.best, self.tol)
+
+    @property
+    def stalls(self) -> bool:
+        """The half of what it did last brought the residual down by less than STALLED."""
+        before = [best for spent, best in self.past if spent <= 0.5 * self.spent]
+        return bool(before) and self.best > STALLED * before[-1]
+
+    def look(self, budget: int) -> float:
+        self.looks += 1
+        now = self.sweeps.look(min(self.sweeps.next_look(), budget))
+        self.best = min(self.best, now)
+        self.past.append((self.spent, self.best))
+        return now
+
+
+def race(trail: Trail, own: Sweeps, budget: int) -> bool:
+    """Sweeps under Coulomb's law, those of its relaxation, and the former from where the latter slow down.
+
+    Look by look whichever promises to cost less from there, so that none is dropped while it moves. From where the
+    relaxation stands others begin whenever it did twice as much: which of them end soon is a matter of luck. Where
+    even the most promising stalls, patches take turns with all of them, at the same cost.
+    """
+    relaxed = Relaxed(trail)
+    start = trail.best
+    relaxed.impulse[:] = trail.problem.start()
+    slow = Racer(relaxed, 1.0)
+    racers, followers, last = [Racer(own, start), slow], list[Sweeps](), 0
+    mended: Patches | None = None
+    while not trail.late:
+        racer = min(racers, key=lambda r: (r.promised, r.spent))
+        left = budget - trail.iterations - sum(r.sweeps.done for r in racers)
+        if left <= 0 or racer.sweeps.ended or racer.look(left) <= trail.tol:
+            break
+        spent = sum(r.spent for r in racers)
+        slows = racer is slow and slow.looks > 1 and SLOW * slow.promised < relaxed.cost
+        if slows and relaxed.done >= 2 * last:
+            last = relaxed.done
+            order = FOLLOWING[len(followers) % len(FOLLOWING)]
+            racers.insert(0, Racer(_from(relaxed, order), 1.0, slow.spent, slow.best))
+            followers.append(racers[0].sweeps)
+        if len(followers) >= len(FOLLOWING) and racer.stalls:
+            mended = mended or Patches(trail)
+            if mended.mend(spent, left):
+                break
+        if slow.looks and own.dearer(min(r.sweeps.cost for r in racers), spent, None):
+            break
+    relaxed.note()
+    for follower in followers:
+        follower.note("from there: ")
+    if mended is not None:
+        mended.note("patches, ")
+    own.note()
+    return trail.done
+
+
+def _from(relaxed: Relaxed, order: str) -> Sweeps:
+    """Sweeps under Coulomb's law from where the relaxation stands."""
+    follower = Sweeps(relaxed.outer, "nncg", order=order, restart="against")
+    follower.impulse[:] = relaxed.impulse
+    follower.last = relaxed.last
+    return follower

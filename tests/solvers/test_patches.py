@@ -1,0 +1,65 @@
+"""Patches of blocks solved apart where sweeps under Coulomb's law stall."""
+
+import numpy as np
+import pytest
+
+import lavender as lv
+from lavender.residuals import judged, residual
+from lavender.solvers._islands import block_bodies, rows_of
+from lavender.solvers._patches import CLOSER, Patches
+from lavender.solvers._trail import Trail
+from lavender.suite.families import granular
+
+
+def stalled(sweeps=60):
+    """A loose pile, and a trail that so many sweeps reached."""
+    problem = granular(n=5, friction="coulomb").problem
+    trail = Trail(problem, 1e-9, np.inf)
+    trail.offer(lv.solve(problem, "nncg", tol=0.0, max_iter=sweeps).impulse)
+    return problem, trail
+
+
+def test_patches_share_no_body_and_hold_the_core():
+    problem, trail = stalled()
+    patches = Patches(trail)
+    core = np.zeros(problem.n_blocks, bool)
+    core[[0, problem.n_blocks - 1]] = True
+    bodies = block_bodies(problem)
+    for width in (1, 2):
+        label = patches._labels(core, width)
+        assert np.all(label[core] >= 0)
+        owner = {}
+        for i in np.flatnonzero(label >= 0):
+            for body in bodies[i][bodies[i] >= 0]:
+                assert owner.setdefault(int(body), label[i]) == label[i]
+    # One more body around it: all blocks of the core's bodies belong to it.
+    near = np.isin(bodies, bodies[core][bodies[core] >= 0]).any(axis=1)
+    assert np.array_equal(patches._labels(core, 1) >= 0, near)
+
+
+@pytest.mark.parametrize("name", ["newton", "nncg"])
+def test_a_patch_is_solved_as_part_of_the_whole(name):
+    problem, trail = stalled()
+    patches = Patches(trail)
+    before = residual(problem, patches.impulse).error.reshape(-1, 3)
+    worst = np.argmax((problem.d.reshape(-1, 3) * before**2).sum(axis=1))
+    core = np.arange(problem.n_blocks) == worst
+    blocks = np.flatnonzero(patches._labels(core, 1) >= 0).astype(np.int32)
+    rows = rows_of(problem, blocks)
+    start, rest = patches.impulse.copy(), patches.impulse.copy()
+    rest[rows] = 0.0
+    patches._solve(blocks, -problem.slack(rest), name)
+    # What the judge of the whole finds wrong in it is what its own found; nothing else moved.
+    after = residual(problem, patches.impulse).error.reshape(-1, 3)
+    assert np.abs(after[blocks]).max() < 10.0 * CLOSER * np.abs(before[blocks]).max()
+    assert np.array_equal(np.delete(patches.impulse, rows), np.delete(start, rows))
+    assert patches.aside > 0.0
+
+
+def test_a_pile_that_stalls_is_mended():
+    problem, trail = stalled()
+    given = trail.best
+    patches = Patches(trail)
+    patches.mend(np.inf, 2000)
+    assert trail.best < 1e-3 * given
+    assert judged(problem, trail.impulse.copy()).relative == trail.best
