@@ -243,18 +243,25 @@ def _worth_together(trail: Trail, glance: Glance | None) -> bool:
     Those cost no more than a finite solver, which comes next. They all go on until the island that needs most of
     them is there. A glance tells how many are left.
     """
-    if not takes(trail) or (trail.problem.law == "lcp" and trail.ended):
-        return False  # where direct gave up, A is singular: so it is in islands, and sweeps are slow
     problem, costs = trail.problem, trail.costs
-    expected = min(costs.sweeping, max(costs.least, costs.guess))
-    cost = together_cost(problem, trail.islands[0], trail.largest)
-    if problem.generalized is not None and problem.law != "coulomb":
-        return cost < costs.sweeping
-    if problem.law == "cone" and trail.islands[0] == problem.n_blocks:
-        return False  # a sweep solves each block exactly
+    if problem.law == "lcp" and trail.ended:
+        return False  # where direct gave up, A is singular: so it is in islands, and sweeps are slow
+    over_velocities = problem.generalized is not None and problem.law != "coulomb"
+    expected = costs.sweeping
     if glance is not None:
         rest = sweeps_left(glance.last, glance.before, glance.best, trail.tol)
         expected = min(expected, rest * costs.sweep)
+    # Islands are not looked for where even one would cost too much.
+    if not over_velocities and not together_cost(problem, 1, trail.largest) < SAVED * expected:
+        return False
+    if not takes(trail):
+        return False
+    cost = together_cost(problem, trail.islands[0], trail.largest)
+    if over_velocities:
+        return cost < costs.sweeping
+    if problem.law == "cone" and trail.islands[0] == problem.n_blocks:
+        return False  # a sweep solves each block exactly
+    expected = min(expected, max(costs.least, costs.guess))
     if not cost < SAVED * expected:
         return False
     rows = np.bincount(trail.islands[1], weights=np.diff(problem.cones.ptr))
