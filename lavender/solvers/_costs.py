@@ -57,7 +57,7 @@ PIVOT, PIVOT_ENTRY = 60e3, 0.5  # of each pivot of lemke, and for each entry of 
 # factor of an island, most of whose entries are nought unless every contact is inside its cone.
 GENERAL_START = 60e3
 GENERAL_ROW = {"linear": 40.0, "lcp": 40.0, "cone": 140.0, "coulomb": 400.0}
-GENERAL = {"linear": 0.03, "lcp": 0.03, "cone": 0.06, "coulomb": 0.02}
+GENERAL = {"linear": 0.07, "lcp": 0.03, "cone": 0.06, "coulomb": 0.02}
 # The same under Coulomb's law where soft rows are many: a step, for each row in it, and steps as they usually are (8 to
 # 33 on flexes of 1,800 to 10,200 rows; what few rows cost above holds their tails, too).
 MANY_STEP, MANY_ROW, MANY_COUNT = 15e3, 110.0, 10.0
@@ -90,7 +90,7 @@ TAIL_LEAST, TAIL_TIME = 6, 2e6  # of them at least under Coulomb's law, else as 
 BUDGET = {"linear": 2.0, "lcp": 2.0, "cone": 2.0, "coulomb": 1.2}  # times as many that its first turn has
 TAIL = {"linear": 2, "lcp": 10, "cone": 40, "coulomb": 24}  # more that are granted before another is asked
 MOST = 30.0  # of what rows add
-GENERAL_COUNT = {"linear": 2.0, "lcp": 10.0, "cone": 12.0, "coulomb": 30.0}  # over generalised velocities
+GENERAL_COUNT = {"linear": 5.0, "lcp": 10.0, "cone": 12.0, "coulomb": 30.0}  # over generalised velocities
 ADMM_COUNT, ADMM_FACTORS = 80.0, 2.0  # iterations to six decades where it gets there, and how often rho moves
 # Share of problems on which it does, over bodies and over rows of A: of candidates that may fail, those of least cost
 # for each chance come first.

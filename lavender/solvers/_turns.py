@@ -20,7 +20,7 @@ from lavender.solvers._trail import CLOCK, Trail, usable
 from lavender.solvers.direct import Impatient
 from lavender.solvers.newton import NewtonState, after_sweeps, asking
 
-__all__ = ["VELOCITY", "Turns", "whole"]
+__all__ = ["VELOCITY", "Turns", "note", "whole"]
 
 CHUNK_WORK = 8  # sweeps' work that an iteration of admm is
 ROUNDS = 8  # times that sweeps and finite solvers take turns, the allowance doubled each time
@@ -84,7 +84,13 @@ def whole(
         claim = (solver.resume if resumes else solver.run)(state, impulse, most, trail.tol, left)
         if resumes:
             trail.kept[chosen.key], trail.left[chosen.key] = (solver, state), impulse
-    trail.add(name, claim)
+    note(trail, chosen, claim, impulse, before)
+    return trail.done
+
+
+def note(trail: Trail, chosen: Exact, claim: Claim, impulse: FloatArray, before: float) -> None:
+    """Tell the trail what a finite solver did, from the residual `before` to an impulse (m,)."""
+    trail.add(chosen.name, claim)
     if np.isfinite(impulse).all():
         trail.offer(impulse)
     if claim.status is Status.INTERRUPTED:
@@ -93,7 +99,6 @@ def whole(
         trail.gave_up(chosen.key, before)
     if claim.certificate is not None and check_certificate(trail.problem, claim.certificate) is None:
         trail.certificate = claim.certificate
-    return trail.done
 
 
 def _in_chunks(trail: Trail, solver: Any, state: Any, impulse: FloatArray, n: int) -> Claim:

@@ -37,8 +37,8 @@ from lavender.problem import OPERATORS, Problem
 from lavender.registry import FEW, SolverSpec
 from lavender.residuals import reference
 from lavender.solution import Claim, Status
+from lavender.solvers._at_once import FEW_JOINTS, HASTY, JOINTS, factor_first
 from lavender.solvers._costs import (
-    DIRECT_ROUNDS,
     FIRST_LOOK,
     ISLAND,
     Costs,
@@ -49,21 +49,20 @@ from lavender.solvers._costs import (
     sweeps_before,
     together_cost,
 )
-from lavender.solvers._few import AUTO
+from lavender.solvers._few import AUTO, said
 from lavender.solvers._islands import restrict, rows_of
 from lavender.solvers._newton import general
 from lavender.solvers._race import race
 from lavender.solvers._split import solve_together, takes
 from lavender.solvers._sweepers import Glance, Sweeps, look_first
 from lavender.solvers._trail import Trail
-from lavender.solvers._turns import VELOCITY, Turns, whole
+from lavender.solvers._turns import VELOCITY, Turns, note, whole
 from lavender_ext.few.looks import sweeps_left
 
 LARGE = 4000  # rows of J from which friction is swept both ways, and beside its relaxation
 HUGE = 40_000  # rows from which friction is left to sweeps before any factorisation
 ONE_CALL = 200  # iterations that a problem of few rows, solved in one call, takes at most
 LAST = 8000  # sweeps that friction is left to where nothing else is left
-FEW_JOINTS = 300  # rows up to which a linear system is not looked at more closely
 RELAXED = 1e6  # ns that sweeps usually take from which Coulomb's law is relaxed first: a problem of its own
 GLANCE = 0.35  # share of a finite solver's cost for which a first look at sweeps is always worth it
 FRICTION_APART = 2.0  # times the cost of the whole that islands with friction may take
@@ -104,9 +103,17 @@ class Auto:
         largest = 0
         if problem.m == 0:
             return Claim(Status.CONVERGED, 0, {}, "nothing to solve")
+        first = factor_first(problem, impulse, n, tol, time_limit)
+        if first is not None and first.relative <= tol:
+            impulse[:] = first.impulse
+            return Claim(
+                Status.CONVERGED, first.claim.iterations, first.claim.work, said("direct", first.claim.work)
+            )
         glance = None
         # Without a limit Newton over few velocities is one compiled call, which costs less than to look at sweeps here.
-        if problem.generalized is None or (time_limit is not None and sweeps_before(problem)):
+        if first is None and (
+            problem.generalized is None or (time_limit is not None and sweeps_before(problem))
+        ):
             glance = look_first(problem, impulse, n, tol, few)
             if glance is not None and glance.best <= tol:
                 impulse[:] = glance.impulse
@@ -126,6 +133,8 @@ class Auto:
         limit = np.inf if time_limit is None else 1e9 * time_limit
         trail = Trail(problem, tol, deadline, limit, largest)
         trail.offer(impulse)
+        if first is not None:
+            note(trail, first.chosen, first.claim, first.impulse, first.before)
         if claim is not None:
             if glance is not None:
                 Sweeps(trail, glance=glance).note()
@@ -139,7 +148,7 @@ class Auto:
                 trail.offer(lam)
         interrupted = False
         try:
-            if n > 0 and not trail.best <= tol:
+            if n > 0 and not (trail.best <= tol if first is None else trail.done):
                 _solve(trail, n, glance)
         except KeyboardInterrupt:
             interrupted = True  # the best impulse goes back all the same
@@ -180,7 +189,9 @@ def _solve(trail: Trail, budget: int, glance: Glance | None = None) -> None:
         # A sparse factorisation takes islands apart by itself; newton where that stops early.
         if glance is not None:
             Sweeps(trail, glance=glance).note()
-        exact = costs.exact if problem.m > FEW_JOINTS else [Exact("direct", 0.0, 0), Exact("newton", 0.0, 0)]
+        # Of a matrix newton makes the same factor as direct.
+        look = problem.m > FEW_JOINTS and problem.matrix is None
+        exact = costs.exact if look else [JOINTS, Exact("newton", 0.0, 0)]
         if not any(whole(trail, e, budget) for e in exact if e.key not in trail.ended):
             _certify(trail)
         return
@@ -194,8 +205,8 @@ def _solve(trail: Trail, budget: int, glance: Glance | None = None) -> None:
         return
     sweeps = None
     # START of sweeps alone costs more than this factor; where it is singular, sweeps are asked before it is shifted.
-    hasty = Exact("direct", 0.0, DIRECT_ROUNDS, (("patience", False),))
-    if glance is None and factors_at_once(problem) and whole(trail, hasty, budget):
+    at_once = glance is None and HASTY.key not in trail.ended and factors_at_once(problem)
+    if at_once and whole(trail, HASTY, budget):
         return
     swept = glance is not None or not _at_once(costs)
     together = (

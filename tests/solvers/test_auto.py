@@ -342,3 +342,21 @@ def test_newton_gives_way_before_factors_that_are_dearer_than_it_was_counted_wit
     assert "newton" not in before  # it is still inside, and goes on where the other does not end it
     assert "newton" in after
     assert solution.work["factorisations"] < 40
+
+
+@pytest.mark.parametrize("seed", [3131, 177])  # bounded rows of a narrow band, joints as a matrix
+def test_direct_that_is_the_end_comes_before_anything_is_noted(seed, monkeypatch):
+    problem = suite.wild(seed=seed).problem
+    kept = lv.solve(problem, "direct", tol=1e-6)
+    monkeypatch.setattr("lavender.solvers.auto.Trail", None)
+    solution = lv.solve(suite.wild(seed=seed).problem, "auto", tol=1e-6)
+    assert solution.success and solution.message.startswith("direct")
+    assert solution.impulse.tobytes() == kept.impulse.tobytes()
+    assert solution.work == kept.work
+
+
+def test_direct_that_came_first_is_not_asked_again():
+    problem = suite.hang(n=100, tip_mass=1e8).problem
+    solution = lv.solve(problem, "auto", tol=1e-14)
+    assert solution.message.count("direct") == 1
+    assert not solution.contradicted

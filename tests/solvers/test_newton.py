@@ -230,6 +230,13 @@ def test_exchanges_from_sweeps_take_few_factorisations(seed, most):
     assert solution.work["sweeps"] > 0
 
 
+@pytest.mark.parametrize("seed, most", [(5080, 2), (5229, 2), (177, 2), (5122, 2), (242, 1)])
+def test_joints_that_nearly_depend_on_each_other_take_two_factorisations(seed, most):
+    solution = lv.solve(suite.wild(seed=seed).problem, "newton", tol=1e-6)
+    assert good(solution, 1e-6)
+    assert solution.work["factorisations"] <= most  # interior points: 23 to 35
+
+
 def test_exchanges_that_go_in_circles_are_given_up():
     problem = suite.wild(seed=3).problem  # rows depend on each other
     solution = lv.solve(problem, "newton", tol=1e-6)

@@ -1,0 +1,64 @@
+"""A factor that costs less than to find out what else there is: `direct`, before anything is looked at or noted."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lavender._arrays import FloatArray
+from lavender.problem import Problem
+from lavender.registry import FEW
+from lavender.residuals import judged, known
+from lavender.solution import Claim
+from lavender.solvers._costs import DIRECT_ROUNDS, Exact, factors_at_once
+from lavender.solvers._few import WARM
+from lavender.solvers._trail import usable
+from lavender.solvers.direct import Direct, Impatient
+
+__all__ = ["FEW_JOINTS", "HASTY", "JOINTS", "Factored", "factor_first"]
+
+FEW_JOINTS = 300  # rows up to which a linear system is not looked at more closely
+JOINTS = Exact("direct", 0.0, 0)
+HASTY = Exact("direct", 0.0, DIRECT_ROUNDS, (("patience", False),))
+
+
+@dataclass
+class Factored:
+    """What `direct` did, for the trail where it is not the end."""
+
+    chosen: Exact
+    claim: Claim
+    impulse: FloatArray  # (m,) N s
+    before: float  # relative residual that it began with
+    relative: float  # and ended with
+
+
+@np.errstate(all="ignore")  # what overflows is judged
+def factor_first(
+    problem: Problem, impulse: FloatArray, n: int, tol: float, time_limit: float | None
+) -> Factored | None:
+    """`direct` from an impulse (m,), or None where something else comes first.
+
+    Bounded rows of a narrow band; and a linear system that is symmetric, of few rows, or given as a matrix, of which
+    `newton` makes the same factor.
+    """
+    if problem.m <= FEW or n <= 0 or problem.generalized is not None:
+        return None
+    if problem.law == "linear":
+        if not problem.is_symmetric or (problem.matrix is None and problem.m > FEW_JOINTS):
+            return None
+        chosen, solver = JOINTS, Direct()
+    elif factors_at_once(problem):
+        chosen, solver = HASTY, Impatient()
+    else:
+        return None
+    spec = usable("direct", problem)
+    found = known(problem, impulse)
+    before = judged(problem, impulse.copy()).relative if found is None else found
+    if spec is None or before <= tol:
+        return None
+    lam = impulse.copy() if before <= WARM else problem.start()
+    claim = solver.run(solver.prepare(problem), lam, min(spec.max_iter, n), tol, time_limit)
+    after = known(problem, lam)
+    return Factored(chosen, claim, lam, before, np.inf if after is None else after)
