@@ -13,6 +13,7 @@ from scipy.linalg import lapack
 
 from lavender._arrays import FloatArray, IntArray
 from lavender.problem import Problem
+from lavender.solvers._costs import dense_factor, sparse_factor
 from lavender.solvers._factor import TINY, DenseFactor, Factor, SparseFactor, choose
 from lavender_ext.pivot.principal import INDEFINITE, ROUNDS, SMALL, SOLVED, STUCK, Pivoting
 
@@ -21,6 +22,8 @@ HALVINGS = 41  # step lengths tried in a line search: 1, 1/2, ... 2^-40
 # thousands of rows: what a first factor is refused by where the time is short.
 DENSE, SPARSE, SPARSE_ROWS = 1.5e-10, 1e-7, 1000.0
 SWEEP = 4e-9  # s for each nonzero of a sweep both ways and its slack, likewise
+SWEEPS, MOST_SWEEPS = 2, 24  # symmetric sweeps of Gauss-Seidel that guess the free rows, at least and at most
+SHARE = 0.5  # of what a factor costs, that they may; a multiply-add of theirs takes a nanosecond
 SLOP = 8.0  # roundings of w within which a sign means nothing, as there
 
 
@@ -52,6 +55,17 @@ class PivotState:
         """Proximal shift s; nothing is factored."""
         self.rows.start(shift)
         self.is_factored = False
+
+    @property
+    def sweeps(self) -> int:
+        """Symmetric sweeps that guess the free rows: few before a compiled factor, else as cost a share of one."""
+        if self.factor is None:
+            return SWEEPS
+        m, data = self.problem.m, self.problem.csr_data
+        factor = dense_factor(m)
+        if self.form == "sparse":
+            factor = min(factor, sparse_factor(self.problem.csr.nnz, m))
+        return int(min(max(SWEEPS, SHARE * factor / (2.0 * data.work)), MOST_SWEEPS))
 
     @property
     def work(self) -> dict[str, int]:

@@ -60,6 +60,8 @@ def whole(
     close = before if trail.problem.law == "coulomb" or not own else trail.given
     warm = close <= WARM and (own or chosen.key != VELOCITY or trail.begun)
     impulse = trail.impulse.copy() if warm else trail.problem.start()
+    if name == "direct" and trail.problem.law == "lcp" and trail.swept is not None:
+        impulse = trail.swept.copy()
     if own and trail.problem.law == "lcp":
         singular = any(key.startswith("direct") for key in trail.ended)
         if singular or trail.swept is not None:

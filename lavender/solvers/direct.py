@@ -41,7 +41,6 @@ GOOD = 1e-13  # relative residual at which refinement ends, where the floor allo
 RUNAWAY = 1e-6
 PASSES = 100  # proximal passes at most
 PATIENCE = 6  # passes without halving the best residual
-SWEEPS = 2  # symmetric sweeps of Gauss-Seidel that guess the free rows
 CORRECTIONS = 100  # refinements at a time at most; each halves the residual
 BATCH = 32  # rounds between two looks at the clock and the judge
 
@@ -225,11 +224,12 @@ class _Run:
                     self.refine(pivot, relative)
         else:
             # Which rows will be free? All, or where a few sweeps put them.
+            sweeps = pivot.sweeps
             code, self.iterations, swept = pivot.solve(
-                self.impulse, SWEEPS, min(BATCH, self.budget), self.stop_at
+                self.impulse, sweeps, min(BATCH, self.budget), self.stop_at
             )
             if swept:
-                self.work["sweeps"] = 2 * SWEEPS
+                self.work["sweeps"] = 2 * sweeps
             code = self.after_rounds(pivot, code)
             if code == ROUNDS and not self.spent:
                 code = self.rounds(pivot)
