@@ -811,6 +811,8 @@ class Problem:
         ------
         CapabilityError
             The problem was given as a matrix.
+        InputError
+            An inverse inertia is so large that its principal values overflow.
         """
         jac = self.jacobian
         scale = 1.0 / np.sqrt(self.d)
@@ -823,6 +825,12 @@ class Problem:
         # M^-1 = L L^T by blocks; a singular inverse inertia (a pinned axis) has a root but no Cholesky factor.
         value, vector = np.linalg.eigh(rows.inv_inertia) if n else (np.zeros((0, 3)), np.zeros((0, 3, 3)))
         root = vector * np.sqrt(np.maximum(value, 0.0))[:, None, :]
+        beyond = np.flatnonzero(~np.isfinite(root).all(axis=(1, 2)))
+        if len(beyond):
+            raise InputError(
+                f"inv_inertia [1/(kg m2)] of body {beyond[0]} has principal values beyond float64; {len(beyond)} "
+                "bodies in all: give it in other units, or take a solver that needs no velocity form"
+            )
         half = replace(
             rows, inv_mass=np.sqrt(rows.inv_mass), inv_inertia=root, copy=False
         ).inverse_mass_matrix()

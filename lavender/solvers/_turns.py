@@ -24,6 +24,8 @@ __all__ = ["VELOCITY", "Turns", "note", "whole"]
 
 CHUNK_WORK = 8  # sweeps' work that an iteration of admm is
 ROUNDS = 8  # times that sweeps and finite solvers take turns, the allowance doubled each time
+STILL = 4  # turns in a row, each twice as long, that gain next to nothing: then nobody gets anywhere
+GAIN = 0.99  # of the residual before a turn, below which it gained something
 ALIKE = ("direct", "lemke")  # do the same wherever they start
 VELOCITY = "newton velocity"  # key of newton over generalised velocities
 
@@ -133,6 +135,7 @@ class Turns:
         self.trail, self.sweeps, self.budget = trail, sweeps, budget
         self.taken = 0
         self.allowance = 0.0  # of sweeps [ns]
+        self.still = 0  # turns in a row that gained nothing
         self.over = False  # nothing gets anywhere
         self.inside: Exact | None = None  # Newton's method, where it waits for a turn to end
 
@@ -183,7 +186,8 @@ class Turns:
             self.sweeps = self.sweeps or Sweeps(trail)
             if self.sweeps.run(self.budget, self.allowance):
                 return True
-            self.over = trail.late or (spent == trail.iterations and trail.best >= before)
+            self.still = 0 if trail.best < GAIN * before else self.still + 1
+            self.over = trail.late or spent == trail.iterations or self.still >= STILL
         return False
 
     def more(self, newton: Exact, limit: int) -> Callable[[FloatArray], int] | None:

@@ -73,7 +73,10 @@ class AdmmState:
         rows = problem.rows
         self.matrix: Any = None
         if rows is not None and 0 < 6 * rows.n_bodies < problem.m:
-            form = problem.velocity_form()
+            try:
+                form = problem.velocity_form()
+            except InputError as error:
+                raise _Failed(str(error)) from None
             k = form.jacobian
             # In the metric of D = diag d of the judge, which is the scale of the form.
             self.kind = _BODIES
