@@ -197,20 +197,6 @@ def is_glanced(problem: Problem, per: float) -> bool:
     return FIRST_LOOK * per <= GLANCED and not is_redundant(problem) and not factors_at_once(problem)
 
 
-def sweeps_before(problem: Problem) -> bool:
-    """A first look at sweeps of few rows of J and M comes before Newton over their velocities.
-
-    Under Coulomb's law alone, where that takes many steps, and where sweeps need not form A.
-    """
-    return (
-        problem.generalized is not None
-        and 0 < problem.m <= FEW
-        and problem.law == "coulomb"
-        and not problem.cones.has_round
-        and reads_whitened(problem)
-    )
-
-
 def factors_at_once(problem: Problem) -> bool:
     """A bounded symmetric A of few rows, or of a narrow band that is found in no time: `direct`, without a look."""
     if problem.law != "lcp" or not problem.is_symmetric:

@@ -20,7 +20,6 @@ from lavender.solvers._costs import (
     LOOK,
     finite_least,
     first_look,
-    general_cost,
     is_glanced,
     sweep_cost,
 )
@@ -61,7 +60,7 @@ def look_first(problem: Problem, impulse: FloatArray, n: int, tol: float, failed
 
     `failed`: few rows whose factor did not end it at once.
     """
-    if problem.cones.has_round:
+    if problem.generalized is not None or problem.cones.has_round:
         return None
     per = sweep_cost(problem)
     sweeps = first_look(per)
@@ -81,12 +80,8 @@ def look_first(problem: Problem, impulse: FloatArray, n: int, tol: float, failed
     solver: Any = spec.load()()
     state = solver.prepare(problem)
     least = finite_least(problem)
-    most = BELIEVED * least
-    if problem.generalized is not None:
-        # Newton over the velocities mostly ends sooner than it is counted for: no more than hope is worth.
-        least = most = HOPE * general_cost(problem, 0)
     now, before, last, done, status, work = solver.look(
-        state, lam, min(n, 2**31 - 1), tol, before, (sweeps, FIRST_LOOK), (per, least, most)
+        state, lam, min(n, 2**31 - 1), tol, before, (sweeps, FIRST_LOOK), (per, least, BELIEVED * least)
     )
     if now.relative <= tol:
         remember(problem, now)

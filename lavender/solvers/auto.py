@@ -4,9 +4,8 @@
     few rows          a symmetric linear system or LCP, or one of a narrow band: direct, in one call (`_few.py`) where
                       that is the end; else a glance at sweeps (`_sweepers.py`) before anything is counted, and on
                       as below
-    J and M           newton over the velocities at once where that costs next to nothing (with a time limit, few
-                      rows under Coulomb's law: after a first look at sweeps); else it is one of the finite solvers
-                      below, beside those that form A
+    J and M           newton over the velocities at once where that costs next to nothing; else it is one of the
+                      finite solvers below, beside those that form A
     others            a finite solver at once where its factor costs less than sweeps usually do; else anderson
                       as long as what it still needs, by its contraction so far, costs less than the cheapest
                       finite solver (direct, newton, lemke, admm, as the law allows); then that one, with twice the
@@ -25,7 +24,7 @@ certificate that it has no solution. The message and `work` say what ran.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from time import perf_counter
 from typing import Any
 
@@ -46,7 +45,6 @@ from lavender.solvers._costs import (
     factors_at_once,
     general_first,
     is_loose,
-    sweeps_before,
     together_cost,
 )
 from lavender.solvers._few import AUTO, said
@@ -109,37 +107,25 @@ class Auto:
             return Claim(
                 Status.CONVERGED, first.claim.iterations, first.claim.work, said("direct", first.claim.work)
             )
-        glance = None
-        # Without a limit Newton over few velocities is one compiled call, which costs less than to look at sweeps here.
-        if first is None and (
-            problem.generalized is None or (time_limit is not None and sweeps_before(problem))
-        ):
-            glance = look_first(problem, impulse, n, tol, few)
-            if glance is not None and glance.best <= tol:
-                impulse[:] = glance.impulse
-                return Claim(Status.CONVERGED, glance.done, glance.work, glance.message)
-        done = 0 if glance is None else glance.done
-        if problem.generalized is not None and n > done:
-            # Newton over the velocities ends nearly all robots: nothing else is found out, and nothing noted, before.
+        if problem.generalized is not None and n > 0:
+            # Newton over the velocities ends nearly all robots: nothing is looked at, and nothing noted, before.
             kernel = general.prepare(problem)
             largest = 0 if kernel is None else kernel.largest
             if kernel is not None and general_first(problem, largest):
-                steps = min(n - done, GENERAL_STEPS[problem.law])
-                claim = general.run(problem, kernel, lam, steps, tol, time_limit)
+                claim = general.run(problem, kernel, lam, min(n, GENERAL_STEPS[problem.law]), tol, time_limit)
                 if claim.status is Status.CONVERGED:
                     impulse[:] = lam
-                    claim = general.named(claim, "auto")
-                    return claim if glance is None else _after(glance, claim)
+                    return general.named(claim, "auto")
+        glance = None if first is not None else look_first(problem, impulse, n, tol, few)
+        if glance is not None and glance.best <= tol:
+            impulse[:] = glance.impulse
+            return Claim(Status.CONVERGED, glance.done, glance.work, glance.message)
         limit = np.inf if time_limit is None else 1e9 * time_limit
         trail = Trail(problem, tol, deadline, limit, largest)
         trail.offer(impulse)
         if first is not None:
             note(trail, first.chosen, first.claim, first.impulse, first.before)
         if claim is not None:
-            if glance is not None:
-                Sweeps(trail, glance=glance).note()
-                trail.offer(glance.impulse)
-                glance = None  # they go on from where newton left it
             trail.add("newton", claim)
             trail.begun = True
             if claim.status is not Status.MAX_ITERATIONS:
@@ -168,14 +154,6 @@ class Auto:
         nothing = "the start is a solution" if trail.best <= tol else "no time for anything"
         message = " -> ".join(trail.steps) or nothing
         return Claim(status, trail.iterations, trail.work, message, certificate=trail.certificate)
-
-
-def _after(glance: Glance, claim: Claim) -> Claim:
-    """A claim of what came after a first look at sweeps, with what these did."""
-    return replace(
-        claim, iterations=glance.done + claim.iterations, work={**glance.work, **claim.work},
-        message=f"{glance.message} -> {claim.message}",
-    )  # fmt: skip
 
 
 # -- the plan ---------------------------------------------------------------------------------------

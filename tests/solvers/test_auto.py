@@ -5,7 +5,6 @@ import pytest
 import scipy.sparse as sp
 from hypothesis import given, settings
 from random_problems import as_matrix, random_contact_problem, random_lcp, seeds
-from random_trees import random_general
 
 import lavender as lv
 from lavender import registry, suite
