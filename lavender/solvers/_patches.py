@@ -29,6 +29,7 @@ from lavender_ext.factor import graph
 
 ROUND = 100  # sweeps of all blocks between two rounds of patches
 BAD = 0.3  # share of the largest block's error from which a block is the core of a patch
+HELD = 0.5  # share of the squared error that the cores have to hold for patches to be worth a beginning
 IDLE = 4  # times that all plans may gain nothing
 GAIN = 0.8  # of the residual that a plan has to leave
 CLOSER = 1e-3  # of a patch's own residual, to which it is solved
@@ -56,6 +57,14 @@ class Patches(Sweeps):
         """Cost of what it did [ns]."""
         return self.done * (self.per + LOOK / ROUND) + self.aside
 
+    @property
+    def is_concentrated(self) -> bool:
+        """What is wrong where the trail is best sits in few blocks; where it is spread patches bring little."""
+        self.impulse[:] = self.trail.impulse
+        self.aside += LOOK
+        error, core = self._core()
+        return bool(error[core].sum() >= HELD * error.sum())
+
     def mend(self, worth: float, budget: int) -> bool:
         """As long as it gains and costs no more than `worth` [ns] in all; whether the trail is done."""
         trail = self.trail
@@ -82,10 +91,14 @@ class Patches(Sweeps):
             self._mend(*PLANS[self.plan])
         return now
 
+    def _core(self) -> tuple[Any, Any]:
+        """Squared error of each block (k,), and which of them are cores."""
+        error = np.bincount(self.block, self.trail.problem.d * self._error() ** 2)
+        return error, error >= BAD * BAD * error.max(initial=0.0)
+
     def _mend(self, name: str, width: int) -> None:
         problem = self.trail.problem
-        error = np.bincount(self.block, problem.d * self._error() ** 2)
-        label = self._labels(error >= BAD * BAD * error.max(initial=0.0), width)
+        label = self._labels(self._core()[1], width)
         rest = self.impulse.copy()
         rest[label[self.block] >= 0] = 0.0
         shifted = -problem.slack(rest)

@@ -97,7 +97,7 @@ def race(trail: Trail, own: Sweeps, budget: int) -> bool:
 
     Look by look whichever promises to cost less from there, so that none is dropped while it moves. From where the
     relaxation stands others begin whenever it did twice as much: which of them end soon is a matter of luck. Where
-    even the most promising stalls, patches take turns with all of them, at the same cost.
+    even the most promising stalls on few blocks, patches take turns with all of them, at the same cost.
     """
     relaxed = Relaxed(trail)
     start = trail.best
@@ -119,14 +119,14 @@ def race(trail: Trail, own: Sweeps, budget: int) -> bool:
             followers.append(racers[0].sweeps)
         if len(followers) >= len(FOLLOWING) and racer.stalls:
             mended = mended or Patches(trail)
-            if mended.mend(spent, left):
+            if (mended.done or mended.is_concentrated) and mended.mend(spent, left):
                 break
         if slow.looks and own.dearer(min(r.sweeps.cost for r in racers), spent, None):
             break
     relaxed.note()
     for follower in followers:
         follower.note("from there: ")
-    if mended is not None:
+    if mended is not None and mended.done:
         mended.note("patches, ")
     own.note()
     return trail.done

@@ -68,9 +68,9 @@ def whole(
         singular = any(key.startswith("direct") for key in trail.ended)
         if singular or trail.swept is not None:
             solver = after_sweeps(solver)
-        if trail.swept is not None and not singular and trail.problem.m > FEW:
+        if trail.swept is not None and not singular and trail.problem.m > FEW and trail.problem.is_symmetric:
             # Which rows are free is known from sweeps, however far they are. Where A is singular on them exchanges,
-            # which is what direct does, go round in circles.
+            # which is what direct does, go round in circles; so they do where A is asymmetric and sweeps got nowhere.
             impulse = trail.swept.copy()
     if kept is not None:
         impulse = trail.left[chosen.key]
