@@ -66,10 +66,10 @@ class Patches(Sweeps):
         return bool(error[core].sum() >= HELD * error.sum())
 
     def mend(self, worth: float, budget: int) -> bool:
-        """As long as it gains and costs no more than `worth` [ns] in all; whether the trail is done."""
-        trail = self.trail
-        while not trail.late and self.idle < IDLE and self.done < budget and self.spent < worth:
-            if self.look(min(ROUND, budget - self.done)) <= trail.tol:
+        """At most `budget` more sweeps, while that gains and costs at most `worth` [ns] in all; is the trail done."""
+        trail, last = self.trail, self.done + budget
+        while not trail.late and self.idle < IDLE and self.done < last and self.spent < worth:
+            if self.look(min(ROUND, last - self.done)) <= trail.tol:
                 break
         return trail.done
 

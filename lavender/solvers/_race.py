@@ -105,10 +105,14 @@ def race(trail: Trail, own: Sweeps, budget: int) -> bool:
     slow = Racer(relaxed, 1.0)
     racers, followers, last = [Racer(own, start), slow], list[Sweeps](), 0
     mended: Patches | None = None
-    while not trail.late:
+
+    def left() -> int:
+        done = sum(r.sweeps.done for r in racers) + (0 if mended is None else mended.done)
+        return budget - trail.iterations - done
+
+    while not trail.late and left() > 0:
         racer = min(racers, key=lambda r: (r.promised, r.spent))
-        left = budget - trail.iterations - sum(r.sweeps.done for r in racers)
-        if left <= 0 or racer.sweeps.ended or racer.look(left) <= trail.tol:
+        if racer.sweeps.ended or racer.look(left()) <= trail.tol:
             break
         spent = sum(r.spent for r in racers)
         slows = racer is slow and slow.looks > 1 and SLOW * slow.promised < relaxed.cost
@@ -119,7 +123,7 @@ def race(trail: Trail, own: Sweeps, budget: int) -> bool:
             followers.append(racers[0].sweeps)
         if len(followers) >= len(FOLLOWING) and racer.stalls:
             mended = mended or Patches(trail)
-            if (mended.done or mended.is_concentrated) and mended.mend(spent, left):
+            if (mended.done or mended.is_concentrated) and mended.mend(spent, left()):
                 break
         if slow.looks and own.dearer(min(r.sweeps.cost for r in racers), spent, None):
             break

@@ -5,6 +5,7 @@ import pytest
 
 import lavender as lv
 from lavender.residuals import judged, residual
+from lavender.solvers import _race
 from lavender.solvers._islands import block_bodies, rows_of
 from lavender.solvers._patches import CLOSER, Patches
 from lavender.solvers._trail import Trail
@@ -63,3 +64,14 @@ def test_a_pile_that_stalls_is_mended():
     patches.mend(np.inf, 2000)
     assert trail.best < 1e-3 * given
     assert judged(problem, trail.impulse.copy()).relative == trail.best
+
+
+@pytest.mark.parametrize("most", [280, 300, 350])
+def test_patches_and_those_that_race_share_one_budget(monkeypatch, most):
+    monkeypatch.setattr(Patches, "is_concentrated", True)
+    monkeypatch.setattr(_race.Racer, "stalls", True)
+    monkeypatch.setattr(_race, "FOLLOWING", ("given",))
+    problem = granular(n=7, friction="coulomb", seed=8).problem
+    solution = lv.solve(problem, "auto", tol=1e-13, max_iter=most)
+    assert "patches" in solution.message
+    assert solution.iterations <= most
