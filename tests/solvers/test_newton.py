@@ -13,8 +13,10 @@ import lavender as lv
 from lavender import suite
 from lavender.solvers._newton import pattern, systems
 from lavender.solvers._newton import scaled as scaling
+from lavender.solvers._newton.exchange import STILL, exchange
 from lavender.solvers._newton.interior_point import InteriorPoint
 from lavender.solvers._newton.row_steps import refined
+from lavender.solvers._newton.run import Run
 from lavender.solvers._newton.systems import AUGMENTED, CONVEX, make_system
 from lavender_ext.factor import symbolic
 from lavender_ext.newton.elements import Elements
@@ -235,6 +237,28 @@ def test_joints_that_nearly_depend_on_each_other_take_two_factorisations(seed, m
     solution = lv.solve(suite.wild(seed=seed).problem, "newton", tol=1e-6)
     assert good(solution, 1e-6)
     assert solution.work["factorisations"] <= most  # interior points: 23 to 35
+
+
+@pytest.mark.parametrize("circle", [(1,), (0, 1), (9, 8), (3, 1, 2)])
+def test_a_circle_of_exchanges_ends_by_count(circle):
+    system = make_system(random_lcp(3, 8), "impulse")
+    run = Run(system, 1e-12, 1500, np.inf)
+
+    class Steps:  # rows that change their side, round and round, and an error that stays
+        z = np.zeros(system.sc.m)
+        taken = changed = 0
+
+        def place(self, z):
+            return 1.0, 1.0
+
+        def newton(self, eps, rounds):
+            self.changed = circle[self.taken % len(circle)]
+            self.taken += 1
+            return True, 1.0, 1.0
+
+    system.newton = steps = Steps()
+    exchange(run, steps.z)
+    assert system.factorisations == steps.taken <= 2 * STILL
 
 
 def test_exchanges_that_go_in_circles_are_given_up():

@@ -5,7 +5,7 @@
 Each exchange is a Newton step on the natural map and costs one factor: the primal-dual active set method
 (Hintermueller, Ito, Kunisch 2002). From a few sweeps it takes one to seven where an interior point takes ten to twenty.
 Where rows depend on each other it may go round in circles: it is given up where the contraction of the number of rows
-c_k that change their side promises more steps than an interior point takes,
+c_k that change their side promises more steps than an interior point takes, or c_k stands still,
 
     k log(c_k) / log(c_0 / c_k)         exchanges left after the k-th                                   (1)
 """
@@ -30,6 +30,7 @@ SWEEPER = "anderson"
 SHARE = 1.0  # of what a step costs, that sweeps may,
 LEAST, MOST = 8, 1000  # and so many at least and at most
 STEPS = 12  # factorisations of an interior point, as it usually takes
+STILL = 4  # exchanges in a row after which no fewer rows change than before
 CLOCK = 0.01  # s between two looks at the clock
 
 
@@ -64,7 +65,7 @@ def exchange(run: Run, z: FloatArray) -> None:
     steps = run.system.newton
     best = run.relative(*steps.place(z))
     kept, judged = z, False
-    first, done = 0, 0
+    first, done, fewest, still = 0, 0, inf, 0
     try:
         while True:
             if best <= run.tol:
@@ -82,7 +83,10 @@ def exchange(run: Run, z: FloatArray) -> None:
             if relative < best:
                 best, kept, judged = relative, steps.z.copy(), False
             changed = steps.changed
-            if best > run.tol and (changed == 0 or _left(first, changed, done) > STEPS):
+            still = 0 if changed < fewest else still + 1
+            fewest = min(fewest, changed)
+            ended = changed == 0 or still >= STILL or _left(first, changed, done) > STEPS
+            if best > run.tol and ended:
                 return
             first, done = first or changed, done + 1
     finally:
