@@ -10,7 +10,7 @@ import numpy as np
 from lavender.solution import Status
 from lavender.solvers._costs import LOOK
 from lavender.solvers._patches import Patches
-from lavender.solvers._sweepers import Sweeps
+from lavender.solvers._sweepers import SWEEPER, Sweeps
 from lavender.solvers._trail import Trail
 from lavender_ext.few.looks import sweeps_left
 
@@ -118,8 +118,7 @@ def race(trail: Trail, own: Sweeps, budget: int) -> bool:
         slows = racer is slow and slow.looks > 1 and SLOW * slow.promised < relaxed.cost
         if slows and relaxed.done >= 2 * last:
             last = relaxed.done
-            order = FOLLOWING[len(followers) % len(FOLLOWING)]
-            racers.insert(0, Racer(_from(relaxed, order), 1.0, slow.spent, slow.best))
+            racers.insert(0, Racer(_from(relaxed, own, len(followers)), 1.0, slow.spent, slow.best))
             followers.append(racers[0].sweeps)
         if len(followers) >= len(FOLLOWING) and racer.stalls:
             mended = mended or Patches(trail)
@@ -136,9 +135,15 @@ def race(trail: Trail, own: Sweeps, budget: int) -> bool:
     return trail.done
 
 
-def _from(relaxed: Relaxed, order: str) -> Sweeps:
-    """Sweeps under Coulomb's law from where the relaxation stands."""
-    follower = Sweeps(relaxed.outer, "nncg", order=order, restart="against")
+def _from(relaxed: Relaxed, own: Sweeps, count: int) -> Sweeps:
+    """Sweeps under Coulomb's law from where the relaxation stands, `count` of which there are.
+
+    On few rows the first of them are those that race from the start; else directions are kept.
+    """
+    if count == 0 and own.name == SWEEPER:
+        follower = Sweeps(relaxed.outer)
+    else:
+        follower = Sweeps(relaxed.outer, "nncg", order=FOLLOWING[count % len(FOLLOWING)], restart="against")
     follower.impulse[:] = relaxed.impulse
     follower.last = relaxed.last
     return follower
