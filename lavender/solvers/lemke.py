@@ -203,8 +203,7 @@ class Lemke:
     def run(
         self, state: LemkeState, impulse: FloatArray, n: int, tol: float, time_limit: float | None = None
     ) -> Claim:
-        state.walk = None
-        return self.resume(state, impulse, n, tol, time_limit)
+        return Walk(state.form, impulse).go(impulse, n, tol, time_limit)
 
     @np.errstate(all="ignore")  # what overflows is judged
     def resume(

@@ -234,6 +234,7 @@ cdef inline double sweep(const view_t* t, int32_t kind, const asked_t* k, const 
     c.g = prepared
     c.exact = k.exact
     c.convex = 0
+    c.keeps = 0
     c.turn = 0
     c.cone = t.p
     c.cone.law = CONE

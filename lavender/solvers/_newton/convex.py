@@ -47,11 +47,13 @@ def solve_convex(run: Run, z: FloatArray, cold: bool, swept: bool = False) -> No
         if not run.done():
             _solve_cones(run)
         return
-    if not cold:
-        _exchange(run, z)
-    if not run.done() and not run.at_floor():
-        _solve_rows(run, z if cold and not swept else None)
-    run.take_back()
+    try:
+        if not cold:
+            _exchange(run, z)
+        if not run.done() and not run.at_floor():
+            _solve_rows(run, z if cold and not swept else None)
+    finally:
+        run.take_back()
 
 
 def _solve_rows(run: Run, start: FloatArray | None) -> None:
