@@ -200,6 +200,7 @@ class Lemke:
     def update(self, state: LemkeState, problem: Problem) -> LemkeState:
         return self.prepare(problem)
 
+    @np.errstate(all="ignore")  # what overflows is judged
     def run(
         self, state: LemkeState, impulse: FloatArray, n: int, tol: float, time_limit: float | None = None
     ) -> Claim:
