@@ -9,11 +9,12 @@ from lavender._arrays import FloatArray
 from lavender.errors import InputError, UnknownName
 from lavender.ordering import Order
 from lavender.problem import Problem
-from lavender.solution import Claim, Status
-from lavender.solvers._sweeping import STATUS, Sweeping, SweepState, claim, over, swept
+from lavender.solution import Claim
+from lavender.solvers._sweeping import Sweeping, SweepState, claim, over, swept
 from lavender_ext.accelerate import accelerated
 from lavender_ext.core import assemble
-from lavender_ext.few.looks import look
+from lavender_ext.core.order import GIVEN
+from lavender_ext.few.looks import Looks
 from lavender_ext.judge import measure
 from lavender_ext.local import gauss_seidel
 
@@ -41,6 +42,16 @@ class AcceleratedState(SweepState):
         self.memory = memory
         self.space = accelerated.allocate(data, memory)
         self.restarts = 0
+
+    @classmethod
+    def after(cls, problem: Problem, looks: Looks) -> AcceleratedState:
+        """Where a first look at sweeps of a problem left them, to go on from."""
+        state = cls.__new__(cls)
+        state.problem, state.data, state.watch = problem, looks.data, looks.watch
+        state.order = state.plan = Order(looks.order, looks.split, GIVEN, looks.rng, is_given=True)
+        state.exact, state.convex, state.prepared = looks.exact, 0, looks.prepared
+        state.memory, state.space, state.restarts = looks.memory, looks.space, looks.restarts
+        return state
 
 
 @dataclass(frozen=True)
@@ -75,7 +86,7 @@ class Accelerated(Sweeping):
     def _state(self, problem: Problem, order: Order, before: AcceleratedState | None) -> AcceleratedState:
         exact = self.sweep == "blocks" or (self.sweep is None and problem.law == "cone")
         convex = self.convex if problem.law == "coulomb" else 0
-        return AcceleratedState(problem, _operator(problem), order, exact, convex, self._memory)
+        return AcceleratedState(problem, operator(problem), order, exact, convex, self._memory)
 
     def run(
         self,
@@ -99,35 +110,8 @@ class Accelerated(Sweeping):
         form = f"{sweep} on {over(data)}"
         return replace(claim(status, done), work=work, form=form)
 
-    def look(
-        self,
-        state: AcceleratedState,
-        impulse: FloatArray,
-        n: int,
-        tol: float,
-        before: float,
-        steps: tuple[int, int],
-        costs: tuple[float, float, float],
-    ) -> tuple[Any, float, int, int, Status, dict[str, int]]:
-        """As `run` from the first sweep on, with looks at the judge's residual (`lavender_ext/few/looks.pyx`).
 
-        `steps` before the first look and at least before another; `costs` of a sweep, of what is left and of all.
-        (what the judge finds last, the residual before the last look, iterations since, all iterations, status, work)
-        """
-        o, data = state.order, state.data
-        if data.factored or data.is_general:
-            measure.velocity_change(data, impulse, state.space[-1])
-        sweeper = (
-            data, state.watch, state.memory, state.prepared, state.exact, state.convex, state.space, o.blocks,
-            o.split, o.mode, o.rng, self._keeps,
-        )  # fmt: skip
-        now, before, last, done, status, sweeps, state.restarts = look(
-            state.problem.metric, impulse, before, steps[0], n, tol, sweeper, steps[1], *costs
-        )
-        return now, before, last, done, STATUS[status], {"sweeps": sweeps, "restarts": state.restarts}
-
-
-def _operator(problem: Problem) -> Any:
+def operator(problem: Problem) -> Any:
     """What the sweeps run over: rows of A where a contact has one row and few neighbours, else as it was given.
 
     Of one row the rows of A cost what body velocities cost, and mixing then need not form the velocities anew.

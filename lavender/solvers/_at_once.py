@@ -34,7 +34,6 @@ class Factored:
     relative: float  # and ended with
 
 
-@np.errstate(all="ignore")  # what overflows is judged
 def factor_first(
     problem: Problem, impulse: FloatArray, n: int, tol: float, time_limit: float | None
 ) -> Factored | None:
@@ -53,6 +52,19 @@ def factor_first(
         chosen, solver = HASTY, Impatient()
     else:
         return None
+    return _factored(problem, impulse, n, tol, time_limit, chosen, solver)
+
+
+@np.errstate(all="ignore")  # what overflows is judged
+def _factored(
+    problem: Problem,
+    impulse: FloatArray,
+    n: int,
+    tol: float,
+    time_limit: float | None,
+    chosen: Exact,
+    solver: Direct,
+) -> Factored | None:
     spec = usable("direct", problem)
     found = known(problem, impulse)
     before = judged(problem, impulse.copy()).relative if found is None else found

@@ -113,8 +113,12 @@ class Few:
 
 def said(name: str, work: Mapping[str, int]) -> str:
     """What a solver did, in words."""
-    done = ", ".join(f"{count} {kind}" for kind, count in work.items() if count)
-    return f"{name} {done}".strip()
+    between = " "
+    for kind, count in work.items():
+        if count:
+            name += f"{between}{count} {kind}"
+            between = ", "
+    return name
 
 
 AUTO = Few("auto", (VELOCITIES, PIVOTS, SWEEPS), looks=True)

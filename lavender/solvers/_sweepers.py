@@ -5,7 +5,6 @@ rest = n log(now / tol) / log(before / now)         sweeps left, by the contract
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -14,6 +13,7 @@ from lavender._arrays import FloatArray
 from lavender.problem import Problem
 from lavender.residuals import judged, known, remember
 from lavender.solution import Claim, Status
+from lavender.solvers._accelerated import AcceleratedState, operator
 from lavender.solvers._costs import (
     FIRST_LOOK,
     ISLAND,
@@ -24,11 +24,14 @@ from lavender.solvers._costs import (
     sweep_cost,
 )
 from lavender.solvers._few import said
+from lavender.solvers._sweeping import STATUS
 from lavender.solvers._trail import CLOCK, Trail, usable
-from lavender_ext.few.looks import sweeps_left
+from lavender.solvers.anderson import Anderson
+from lavender_ext.few.looks import Looks, sweeps_left
 
 __all__ = ["Glance", "Sweeps", "look_first"]
 
+CONVERGED = Status.CONVERGED  # looked up once
 SWEEPER = "anderson"  # whose sweeps come first
 HOPE = 0.25  # share of a finite solver's cost that sweeps may take without promising an end
 BELIEVED = 2.0  # times a finite solver's cost that sweeps may take, whatever they promise
@@ -36,23 +39,51 @@ APART = 10.0  # islands' worth of Python from which a finite solver is compared 
 PORTION = 0.25  # of a time limit that sweeps may take that will not get there within it
 
 
-@dataclass
 class Glance:
     """A first look at sweeps of `anderson`, before anything else is looked at; they go on from here."""
 
-    solver: Any
-    state: Any
-    impulse: FloatArray  # (m,) N s
-    before: float  # relative residual before its last sweeps,
-    last: int  # so many,
-    best: float  # and after them
-    status: Status
-    done: int  # sweeps
-    work: dict[str, int]
+    __slots__ = ("before", "impulse", "looks", "problem")
+
+    def __init__(self, problem: Problem, looks: Looks | None, impulse: FloatArray, before: float) -> None:
+        self.problem = problem
+        self.looks = looks  # None where the start is a solution
+        self.impulse = impulse  # (m,) N s
+        self.before = before  # relative residual before its last sweeps
 
     @property
-    def message(self) -> str:
-        return said(SWEEPER, self.work) if self.done else "the start is a solution"
+    def best(self) -> float:
+        """The relative residual now."""
+        return self.before if self.looks is None else float(self.looks.now.relative)
+
+    @property
+    def last(self) -> int:
+        """Sweeps since `before`."""
+        return 0 if self.looks is None else int(self.looks.last)
+
+    @property
+    def done(self) -> int:
+        """All sweeps."""
+        return 0 if self.looks is None else int(self.looks.done)
+
+    @property
+    def status(self) -> Status:
+        return Status.CONVERGED if self.looks is None else STATUS[self.looks.status]
+
+    @property
+    def work(self) -> dict[str, int]:
+        return {} if self.looks is None else {"sweeps": self.looks.sweeps, "restarts": self.looks.restarts}
+
+    def sweeper(self) -> tuple[Any, Any]:
+        """The solver and its state, to go on with."""
+        return Anderson(), AcceleratedState.after(self.problem, self.looks)
+
+    def claim(self) -> Claim:
+        """Of the end, where `best` meets the tolerance."""
+        looks = self.looks
+        if looks is None:
+            return Claim(CONVERGED, 0, {}, "the start is a solution")
+        work = self.work
+        return Claim(CONVERGED, looks.done, work, said(SWEEPER, work))
 
 
 def look_first(problem: Problem, impulse: FloatArray, n: int, tol: float, failed: bool) -> Glance | None:
@@ -66,29 +97,19 @@ def look_first(problem: Problem, impulse: FloatArray, n: int, tol: float, failed
     sweeps = first_look(per)
     if n < sweeps or not (failed or is_glanced(problem, per)):
         return None
-    spec = usable(SWEEPER, problem)
-    if spec is None:
-        return None
     lam = impulse.copy()
-    found = known(problem, impulse)
-    before = judged(problem, impulse.copy()).relative if found is None else found
+    before = known(problem, impulse)
+    if before is None:
+        before = judged(problem, impulse.copy()).relative
     if before <= tol:
-        return Glance(
-            solver=None, state=None, impulse=lam, before=before, last=0, best=before,
-            status=Status.CONVERGED, done=0, work={},
-        )  # fmt: skip
-    solver: Any = spec.load()()
-    state = solver.prepare(problem)
+        return Glance(problem, None, lam, before)
+    split = 0 if problem.rows is None else problem.rows.n_joints
+    looks = Looks(problem.metric, operator(problem), problem.law == "cone", split)
     least = finite_least(problem)
-    now, before, last, done, status, work = solver.look(
-        state, lam, min(n, 2**31 - 1), tol, before, (sweeps, FIRST_LOOK), (per, least, BELIEVED * least)
-    )
-    if now.relative <= tol:
-        remember(problem, now)
-    return Glance(
-        solver=solver, state=state, impulse=lam, before=before, last=last, best=now.relative, status=status,
-        done=done, work=work,
-    )  # fmt: skip
+    looks.run(lam, before, min(n, 2**31 - 1), tol, sweeps, FIRST_LOOK, per, least, BELIEVED * least)
+    if looks.now.relative <= tol:
+        remember(problem, looks.now)
+    return Glance(problem, looks, lam, looks.before)
 
 
 class Sweeps:
@@ -101,7 +122,7 @@ class Sweeps:
         spec = usable(name, trail.problem)
         self.usable = spec is not None
         if glance is not None:
-            self.solver, self.state, self.impulse = glance.solver, glance.state, glance.impulse
+            (self.solver, self.state), self.impulse = glance.sweeper(), glance.impulse
         elif spec is not None:
             self.solver = spec.load()(**options)
             self.state = self.solver.prepare(trail.problem)

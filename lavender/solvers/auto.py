@@ -119,7 +119,7 @@ class Auto:
         glance = None if first is not None else look_first(problem, impulse, n, tol, few)
         if glance is not None and glance.best <= tol:
             impulse[:] = glance.impulse
-            return Claim(Status.CONVERGED, glance.done, glance.work, glance.message)
+            return glance.claim()
         limit = np.inf if time_limit is None else 1e9 * time_limit
         trail = Trail(problem, tol, deadline, limit, largest)
         trail.offer(impulse)
