@@ -56,8 +56,11 @@ PIVOT, PIVOT_ENTRY = 60e3, 0.5  # of each pivot of lemke, and for each entry of 
 # Newton over generalised velocities: a call, for each row beside each factor, and each multiply-add of the dense
 # factor of an island, most of whose entries are nought unless every contact is inside its cone.
 GENERAL_START = 60e3
-GENERAL_ROW = {"linear": 40.0, "lcp": 40.0, "cone": 140.0, "coulomb": 400.0}
-GENERAL = {"linear": 0.07, "lcp": 0.03, "cone": 0.06, "coulomb": 0.02}
+GENERAL_ROW = {"linear": 40.0, "lcp": 100.0, "cone": 140.0, "coulomb": 400.0}
+GENERAL = {"linear": 0.1, "lcp": 0.06, "cone": 0.06, "coulomb": 0.02}
+GENERAL_SOFT = (
+    1e-6  # of d: the least softness of a row without a proximal term; where all are soft, one factor ends it
+)
 # The same under Coulomb's law where soft rows are many: a step, for each row in it, and steps as they usually are (8 to
 # 33 on flexes of 1,800 to 10,200 rows; what few rows cost above holds their tails, too).
 MANY_STEP, MANY_ROW, MANY_COUNT = 15e3, 110.0, 10.0
@@ -90,7 +93,7 @@ TAIL_LEAST, TAIL_TIME = 6, 2e6  # of them at least under Coulomb's law, else as 
 BUDGET = {"linear": 2.0, "lcp": 2.0, "cone": 2.0, "coulomb": 1.2}  # times as many that its first turn has
 TAIL = {"linear": 2, "lcp": 10, "cone": 40, "coulomb": 24}  # more that are granted before another is asked
 MOST = 30.0  # of what rows add
-GENERAL_COUNT = {"linear": 5.0, "lcp": 10.0, "cone": 12.0, "coulomb": 30.0}  # over generalised velocities
+GENERAL_COUNT = {"linear": 5.0, "lcp": 5.0, "cone": 12.0, "coulomb": 30.0}  # over generalised velocities
 ADMM_COUNT, ADMM_FACTORS = 80.0, 2.0  # iterations to six decades where it gets there, and how often rho moves
 # Share of problems on which it does, over bodies and over rows of A: of candidates that may fail, those of least cost
 # for each chance come first.
@@ -151,7 +154,16 @@ class Exact:
 def general_cost(problem: Problem, largest: int) -> float:
     """Newton over generalised velocities, `largest` of them in one island [ns]."""
     factor = GENERAL[problem.law] * factor_flops(problem, largest)
-    return GENERAL_START + GENERAL_COUNT[problem.law] * (GENERAL_ROW[problem.law] * problem.m + factor)
+    return GENERAL_START + general_count(problem) * (GENERAL_ROW[problem.law] * problem.m + factor)
+
+
+def general_count(problem: Problem) -> float:
+    """Its steps, as expected: one where rows are free and soft, since then it has no proximal term."""
+    if problem.law == "linear" and problem.m:
+        assert problem.compliance is not None
+        if np.all(problem.compliance >= GENERAL_SOFT * problem.d):
+            return 1.0
+    return GENERAL_COUNT[problem.law]
 
 
 def sweep_cost(problem: Problem) -> float:
@@ -167,8 +179,10 @@ def first_look(per: float) -> int:
 def general_first(problem: Problem, largest: int) -> bool:
     """Newton over generalised velocities costs next to nothing, or less than only to form A = Y Y^T for the others.
 
-    The columns of Y have n_c entries: sum n_c^2 >= (sum n_c)^2 / nv multiply-adds. Or, of many soft rows under
-    Coulomb's law, more than velocities, less than sweeps usually do where rows depend on each other.
+    The columns of Y have n_c entries: sum n_c^2 >= (sum n_c)^2 / nv multiply-adds. Without friction, whose steps are
+    less certain, what Python needs for it and each of its entries counts, of a linear system what no finite solver
+    costs less than as well. Or, of many soft rows under Coulomb's law, more than velocities, less than sweeps usually
+    do where rows depend on each other.
     """
     assert problem.generalized is not None
     cost = general_cost(problem, largest)
@@ -176,6 +190,10 @@ def general_first(problem: Problem, largest: int) -> bool:
         return True
     entries = 0.5 * (problem.metric.work - 4.0 * problem.m)
     if cost <= FORM * entries * entries / max(1, problem.generalized.nv):
+        return True
+    if problem.law == "linear" and cost <= formed_cost(problem) + finite_least(problem):
+        return True
+    if problem.law == "lcp" and cost <= formed_cost(problem):
         return True
     if (
         problem.law != "coulomb"
@@ -374,7 +392,7 @@ class Costs:
         if self.largest:
             count = 2 * int(GENERAL_COUNT[p.law]) + GENERAL_TAIL[p.law]
             cost = self.over_velocities
-            once = GENERAL_START + (cost - GENERAL_START) / GENERAL_COUNT[p.law]
+            once = GENERAL_START + (cost - GENERAL_START) / general_count(p)
             found.append(Exact("newton", cost, count, (("form", "velocity"),), once))
         if p.law in ("cone", "coulomb") and (p.generalized is None or p.m <= ADMM_GENERAL):
             cost, once = (self.formed + x for x in self._admm)

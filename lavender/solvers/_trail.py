@@ -34,6 +34,7 @@ class Trail:
     deadline: float
     limit: float = np.inf  # ns that the whole solve may take, as it was asked
     largest: int = 0  # velocities of the largest island, 0 where newton has no room for them
+    kernel: Any = None  # newton over generalised velocities, prepared
     given: float = np.inf  # relative residual of the first impulse that was offered,
     best: float = np.inf  # and of the best
     impulse: FloatArray = field(init=False)

@@ -55,7 +55,12 @@ def whole(
         solver = Impatient() if hasty else spec.load()(**options)
         if own and more is not None:
             solver = asking(solver, more)
-        state = _newton_state(trail) if own else solver.prepare(trail.problem)
+        if own:
+            state = _newton_state(trail)
+        elif chosen.key == VELOCITY and trail.kernel is not None:
+            state = NewtonState(trail.problem, None, trail.kernel)
+        else:
+            state = solver.prepare(trail.problem)
     # Half-finished sweeps mislead a Newton method; Pi(0) does not. Under a convex law a step is lost on them even
     # where they came close; not on a start that was.
     before = trail.best

@@ -39,6 +39,7 @@ from lavender.solution import Claim, Status
 from lavender.solvers._at_once import FEW_JOINTS, HASTY, JOINTS, factor_first
 from lavender.solvers._costs import (
     FIRST_LOOK,
+    GENERAL_COUNT,
     ISLAND,
     Costs,
     Exact,
@@ -64,8 +65,8 @@ LAST = 8000  # sweeps that friction is left to where nothing else is left
 RELAXED = 1e6  # ns that sweeps usually take from which Coulomb's law is relaxed first: a problem of its own
 GLANCE = 0.35  # share of a finite solver's cost for which a first look at sweeps is always worth it
 FRICTION_APART = 2.0  # times the cost of the whole that islands with friction may take
-# Steps that newton over the velocities then has; under Coulomb's law, where it ends soon or late, as many as in one
-# compiled call.
+# Steps that newton over the velocities then has, beside those that are expected of each island but one; under
+# Coulomb's law, where it ends soon or late, as many as in one compiled call.
 GENERAL_STEPS = {"linear": 256, "lcp": 256, "cone": 256, "coulomb": 64}
 ROUND_SWEEPS = 1000  # of nncg on round cones given by A, before admm is asked
 ONCE_MORE = (
@@ -97,7 +98,7 @@ class Auto:
                 impulse[:] = made[0].impulse
                 return AUTO.claim(problem, made[1])
         deadline = np.inf if time_limit is None else perf_counter() + time_limit
-        lam, claim = impulse.copy(), None
+        lam, claim, kernel = impulse.copy(), None, None
         largest = 0
         if problem.m == 0:
             return Claim(Status.CONVERGED, 0, {}, "nothing to solve")
@@ -112,7 +113,10 @@ class Auto:
             kernel = general.prepare(problem)
             largest = 0 if kernel is None else kernel.largest
             if kernel is not None and general_first(problem, largest):
-                claim = general.run(problem, kernel, lam, min(n, GENERAL_STEPS[problem.law]), tol, time_limit)
+                most = GENERAL_STEPS[problem.law]
+                if problem.law != "coulomb":
+                    most += int(GENERAL_COUNT[problem.law]) * (kernel.islands - 1)
+                claim = general.run(problem, kernel, lam, min(n, most), tol, time_limit)
                 if claim.status is Status.CONVERGED:
                     impulse[:] = lam
                     return general.named(claim, "auto")
@@ -121,7 +125,9 @@ class Auto:
             impulse[:] = glance.impulse
             return glance.claim()
         limit = np.inf if time_limit is None else 1e9 * time_limit
-        trail = Trail(problem, tol, deadline, limit, largest)
+        trail = Trail(
+            problem=problem, tol=tol, deadline=deadline, limit=limit, largest=largest, kernel=kernel
+        )
         trail.offer(impulse)
         if first is not None:
             note(trail, first.chosen, first.claim, first.impulse, first.before)

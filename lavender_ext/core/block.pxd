@@ -70,6 +70,15 @@ cdef inline double norm2(double x, double y) noexcept nogil:
     return big * sqrt(1.0 + small * small)
 
 
+cdef inline bint has_friction(const blocks_t* p) noexcept nogil:
+    """A block whose bounds depend on its own normal: else both laws are the same."""
+    cdef int32_t i
+    for i in range(p.n_blocks):
+        if p.kind[i] != ROW and p.ptr[i + 1] - p.ptr[i] > 1:
+            return True
+    return False
+
+
 cdef inline int32_t n_tangents(int32_t kind, int32_t size) noexcept nogil:
     return size - 2 + (kind & 1)                        # CONTACT and ROUND are odd; a spin row is no tangent
 

@@ -5,7 +5,7 @@ Panels that share a column, directly or through others, are an island: its veloc
 from libc.math cimport ceil, sqrt
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.block cimport COULOMB, ROW, blocks_t
+from lavender_ext.core.block cimport CONE, COULOMB, ROW, blocks_t, has_friction
 from lavender_ext.core.generalized cimport generalized_t
 from lavender_ext.generalized.newton cimport flow_t
 from lavender_ext.generalized.sparse cimport MANY, SMALL, factor_work, find_pattern, is_worth, pattern_marks
@@ -180,7 +180,8 @@ cdef inline void settle(flow_t* f, const blocks_t* p, const generalized_t* g, in
     cdef int32_t i, size, wide
     cdef double values
     f.p = p[0]
-    f.law = p.law
+    f.law = p.law if has_friction(p) else CONE          # where nothing rubs, the convex problem is the whole
+    f.p.law = f.law
     f.g = g
     f.iptr = w + at
     f.cptr = w + at + panels + 1
@@ -202,14 +203,14 @@ cdef inline void settle(flow_t* f, const blocks_t* p, const generalized_t* g, in
             f.lptr = w + at
             f.lidx = w + at + f.cptr[f.n_islands] + 1
         else:
-            need.crowded = need.most[0] > MANY and p.law != COULOMB
+            need.crowded = need.most[0] > MANY and f.law != COULOMB
     need.wide = 0
     need.values = 0.0
     for i in range(f.n_islands):
         size = f.cptr[i + 1] - f.cptr[i]
         values = <double>size * size
         wide = size
-        if p.law != COULOMB and f.lptr != NULL and is_worth(size, f.lptr + f.cptr[i], f.lidx):
+        if f.law != COULOMB and f.lptr != NULL and is_worth(size, f.lptr + f.cptr[i], f.lidx):
             values = f.lptr[f.cptr[i + 1]] - f.lptr[f.cptr[i]] + size
             wide = <int32_t>ceil(sqrt(6.0 * factor_work(size, f.lptr + f.cptr[i], f.lidx) / size))
         if values > need.values:

@@ -654,3 +654,21 @@ def test_the_order_of_elimination_stays_between_the_same_bodies(panels, monkeypa
     assert solution.impulse.tobytes() == lv.solve(again, "newton").impulse.tobytes()
     assert prepared.solve(other).impulse.tobytes() == lv.solve(other, "newton").impulse.tobytes()
     assert prepared._state.system.structure is not structure
+
+
+@pytest.mark.parametrize("upper", [np.inf, 0.3])
+def test_where_nothing_rubs_no_law_of_friction_is_asked_for(upper):
+    # A chain on J and M, rows free or bounded: under either law the same convex problem.
+    n = 80
+    jac = np.eye(n)[:-1] - np.eye(n)[1:]
+    mass = np.diag(np.random.default_rng(5).uniform(0.5, 2.0, n))
+    cones = (
+        lv.Cones.free(n - 1) if np.isinf(upper) else lv.Cones.bounded([-upper] * (n - 1), [upper] * (n - 1))
+    )
+    solutions = []
+    for law in ("coulomb", "cone"):
+        problem = lv.Problem.from_jacobian(jac, mass, np.sin(np.arange(n)), cones=cones, friction=law)
+        solutions.append(lv.solve(problem, "newton", tol=1e-9, time_limit=10.0))
+    assert all(good(s, 1e-9) for s in solutions)
+    assert all("Coulomb rounds" not in s.work for s in solutions)
+    assert solutions[0].impulse.tobytes() == solutions[1].impulse.tobytes()
