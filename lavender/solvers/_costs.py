@@ -216,12 +216,14 @@ def is_glanced(problem: Problem, per: float) -> bool:
 
 
 def factors_at_once(problem: Problem) -> bool:
-    """A bounded symmetric A of few rows, or of a narrow band that is found in no time: `direct`, without a look."""
-    if problem.law != "lcp" or not problem.is_symmetric:
+    """Bounded rows, few or of a symmetric narrow band that is found in no time: `direct`, without a look."""
+    if problem.law != "lcp":
         return False
     m = problem.m
     if m <= FEW:
         return True
+    if not problem.is_symmetric:
+        return False
     if problem.rows is not None:
         width = graph.body_spread(problem.cones.ptr, block_bodies(problem), problem.rows.n_bodies) + 1
         return (
@@ -249,7 +251,7 @@ def is_redundant(problem: Problem) -> bool:
 
 def finite_least(problem: Problem) -> float:
     """What no finite solver costs less than [ns]."""
-    if problem.law == "linear" or (problem.law == "lcp" and problem.is_symmetric):
+    if problem.law == "linear" or (problem.law == "lcp" and (problem.m <= FEW or problem.is_symmetric)):
         m = problem.m
         width = 3.0 if problem.matrix is None else max(3.0, 0.5 * len(problem._compressed[1]) / m)
         return START["direct"] + DIRECT[problem.law] * (STEP["direct"] + ROW * m + BAND * m * width * width)
@@ -455,7 +457,9 @@ class Costs:
 
     @property
     def _direct_takes(self) -> bool:
-        return self.problem.law == "linear" or (self.problem.law == "lcp" and self.problem.is_symmetric)
+        # Exchanges of many rows of an asymmetric A as often go round in circles.
+        p = self.problem
+        return p.law == "linear" or (p.law == "lcp" and (p.m <= FEW or p.is_symmetric))
 
     def _finite(self, name: str, count: float, factor: float) -> float:
         start, step, row = newton_rates(self.problem) if name == "newton" else (START[name], STEP[name], ROW)

@@ -3,7 +3,7 @@
     band     LDL^T by diagonals in compiled code (small matrices, and any of small bandwidth)
     dense    Cholesky (LAPACK potrf)
     sparse   LDL^T of a permuted matrix (QDLDL with its minimum degree ordering)
-    general  LU with pivoting (LAPACK getrf, or SuperLU), linear systems that are not symmetric definite
+    general  LU with pivoting (LAPACK getrf, or SuperLU; compiled for few rows), where A is not symmetric definite
 
 A pivot of at most 1e-13 d_i counts as zero: some hundred roundings of A_ii, and below what a mass ratio of
 1e8 leaves.
@@ -131,6 +131,54 @@ class SparseFactor:
 
     def solve(self, rhs: FloatArray) -> FloatArray:
         return self.ldl.solve(rhs) if self.n else rhs
+
+
+class LUFactor:
+    """LU of D^-1/2 A_FF D^-1/2, of an A that is not symmetric."""
+
+    def __init__(self, problem: Problem) -> None:
+        m, a = problem.m, problem.csr
+        self.scale = 1.0 / np.sqrt(problem.csr_data.d)
+        scaled = sp.csr_array(sp.diags_array(self.scale) @ a @ sp.diags_array(self.scale))
+        self.sparse = a.nnz < DENSE_SHARE * m * m or m > DENSE_LIMIT
+        self.a: Any = scaled if self.sparse else scaled.toarray()
+
+    def factor(self, place: IntArray, n_free: int, shift: float, tiny: float = TINY) -> int:
+        self.free = np.flatnonzero(place >= 0)
+        if n_free == 0:
+            return 0
+        if self.sparse:
+            return self._factor_sparse(shift, tiny)
+        a = self.a[np.ix_(self.free, self.free)]
+        if shift > 0.0:
+            a.flat[:: n_free + 1] += shift
+        lu, pivot, info = lapack.dgetrf(a, overwrite_a=1)
+        self.lu: Any = (lu, pivot)
+        if info != 0:
+            return n_free
+        return int(np.count_nonzero(np.abs(np.diagonal(lu)) <= tiny))
+
+    def _factor_sparse(self, shift: float, tiny: float) -> int:
+        from scipy.sparse.linalg import splu
+
+        a = sp.csc_array(self.a[self.free][:, self.free])
+        if shift > 0.0:
+            a = sp.csc_array(a + shift * sp.eye_array(len(self.free)))
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                self.lu = splu(a)
+        except RuntimeError:  # exactly singular
+            return len(self.free)
+        return int(np.count_nonzero(np.abs(self.lu.U.diagonal()) <= tiny))
+
+    def solve(self, rhs: FloatArray) -> FloatArray:
+        if len(rhs) == 0:
+            return rhs
+        scale = self.scale[self.free]
+        y = scale * rhs
+        y = self.lu.solve(y) if self.sparse else lapack.dgetrs(*self.lu, y)[0]
+        return scale * y
 
 
 class GeneralFactor:

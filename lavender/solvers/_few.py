@@ -49,11 +49,13 @@ def _make(problem: Problem) -> Chain | None:
     if problem.cones.has_round:
         return None
     law = problem.law
-    if law in ("linear", "lcp") and problem.is_symmetric:
-        band = max(problem.bandwidth)
-        return Chain(data, start, relative, matrix=problem.csr_data, band=band, linear=law == "linear")
-    if law == "linear":
-        return None
+    if law in ("linear", "lcp"):
+        symmetric = problem.is_symmetric
+        band = max(problem.bandwidth) if symmetric else problem.m - 1
+        linear = law == "linear"
+        return Chain(
+            data, start, relative, matrix=problem.csr_data, band=band, linear=linear, symmetric=symmetric
+        )
     split = 0 if problem.rows is None else problem.rows.n_joints
     return Chain(
         data, start, relative, split=split, exact=law == "cone", first_look=first_look(sweep_cost(problem))
@@ -104,7 +106,9 @@ class Few:
             }
             work = {what: count for what, count in named.items() if count}
             if self.name == "direct":
-                return Claim(Status.CONVERGED, done, work, form="band")
+                symmetric = problem.is_symmetric
+                note = "A is not symmetric" if problem.law == "linear" and not symmetric else ""
+                return Claim(Status.CONVERGED, done, work, note, form="band" if symmetric else "LU")
             return Claim(Status.CONVERGED, done, work, said("direct", work))
         done, sweeps, restarts = counts
         work = {"sweeps": sweeps, "restarts": restarts}

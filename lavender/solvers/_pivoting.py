@@ -1,6 +1,6 @@
 """Principal pivoting with any factorisation: the loop of `lavender_ext/pivot/principal.pyx`, step by step in Python.
 
-Where the compiled factorisation serves, the whole loop runs there; with LAPACK or QDLDL each step is one
+Where the compiled factorisation serves, the whole loop runs there; with LAPACK, QDLDL or SuperLU each step is one
 call into the same compiled code.
 """
 
@@ -14,7 +14,7 @@ from scipy.linalg import lapack
 from lavender._arrays import FloatArray, IntArray
 from lavender.problem import Problem
 from lavender.solvers._costs import dense_factor, sparse_factor
-from lavender.solvers._factor import TINY, DenseFactor, Factor, SparseFactor, choose
+from lavender.solvers._factor import SMALL_SIZE, TINY, DenseFactor, Factor, LUFactor, SparseFactor, choose
 from lavender_ext.pivot.principal import INDEFINITE, ROUNDS, SMALL, SOLVED, STUCK, Pivoting
 
 HALVINGS = 41  # step lengths tried in a line search: 1, 1/2, ... 2^-40
@@ -34,22 +34,38 @@ class PivotState:
 
     def __init__(self, problem: Problem, like: PivotState | None = None) -> None:
         self.problem = problem
-        known = like.chosen if like is not None and _same_pattern(like.problem, problem) else None
-        self.chosen = choose(problem) if known is None else known
-        self.form, band, order = self.chosen
-        self.rows = Pivoting(problem.csr_data, band if self.form == "band" else -1, order, TINY)
+        self.symmetric = problem.is_symmetric
         self.factor: Factor | None = None
-        if self.form != "band":
-            self.factor = DenseFactor(problem) if self.form == "dense" else SparseFactor(problem)
+        if self.symmetric:
+            known = like.chosen if like is not None and _same_pattern(like.problem, problem) else None
+            self.chosen = choose(problem) if known is None else known
+            self.form, band, order = self.chosen
+            if self.form != "band":
+                band = -1
+                self.factor = DenseFactor(problem) if self.form == "dense" else SparseFactor(problem)
+        else:
+            self.chosen = self.form, band, order = "LU", problem.m - 1, None
+            if problem.m > SMALL_SIZE:
+                band, self.factor = -1, LUFactor(problem)
+        self.rows = Pivoting(
+            problem.csr_data, band, order, TINY, symmetric=self.symmetric or self.factor is not None
+        )
         self.is_factored = False
         self.late = False  # a factor was not begun that would have ended after the deadline
         # Of the next factor [s]: the first by structure, then as long as the last took.
         self.seconds = DENSE * problem.m**3 / 3.0
-        if self.form == "sparse":
+        if self.is_sparse:
             self.seconds = min(
                 self.seconds, SPARSE * len(problem._compressed[1]) * (1.0 + problem.m / SPARSE_ROWS)
             )
+        if not self.symmetric:
+            self.seconds *= 2.0
         self.factorisations = self.exchanged = self.searches = 0  # by Python
+
+    @property
+    def is_sparse(self) -> bool:
+        """The factor takes a matrix of few entries."""
+        return self.form == "sparse" or (isinstance(self.factor, LUFactor) and self.factor.sparse)
 
     def start(self, shift: float) -> None:
         """Proximal shift s; nothing is factored."""
@@ -63,7 +79,7 @@ class PivotState:
             return SWEEPS
         m, data = self.problem.m, self.problem.csr_data
         factor = dense_factor(m)
-        if self.form == "sparse":
+        if self.is_sparse:
             factor = min(factor, sparse_factor(self.problem.csr.nnz, m))
         return int(min(max(SWEEPS, SHARE * factor / (2.0 * data.work)), MOST_SWEEPS))
 

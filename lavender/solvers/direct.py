@@ -12,6 +12,8 @@
 Positive definite A: finite and exact to rounding, whatever `tol`. Singular positive semidefinite A: the
 message says so, and what cannot be refined to rounding is STALLED with the best iterate. Linear systems
 that are asymmetric or indefinite get LU with pivoting, and where that is singular its rank from an SVD.
+Bounded rows whose A is asymmetric are exchanged by LU: finite where exchanges do not go round in circles, which no
+energy then ends.
 """
 
 from __future__ import annotations
@@ -28,7 +30,7 @@ from lavender.problem import Problem
 from lavender.registry import SolverSpec
 from lavender.residuals import at_floor, judged, remember
 from lavender.solution import Claim, Status
-from lavender.solvers._factor import GeneralFactor
+from lavender.solvers._factor import SMALL_SIZE, GeneralFactor
 from lavender.solvers._few import DIRECT
 from lavender.solvers._pivoting import PivotState
 from lavender_ext.judge import measure
@@ -58,18 +60,23 @@ class DirectState:
 
 @dataclass(frozen=True)
 class Direct:
-    """Direct solution of linear systems and of symmetric positive semidefinite boxed LCPs."""
+    """Direct solution of linear systems and of boxed LCPs, positive semidefinite or asymmetric."""
 
     patience: ClassVar[bool] = True  # to shift and refine what is singular
 
     def prepare(self, problem: Problem, like: PivotState | None = None) -> DirectState:
-        if not problem.is_symmetric:
+        linear = problem.law == "linear"
+        if linear and not problem.is_symmetric and problem.m > SMALL_SIZE:
             return _general(problem, "A is not symmetric")
         state = DirectState(problem, PivotState(problem, like))
-        if problem.law == "linear" and state.pivot is not None:
+        if linear and state.pivot is not None:
             state.outcome = state.pivot.factorise(whole=True)
             if state.outcome == INDEFINITE:
                 return _general(problem, "A is indefinite")
+            if not problem.is_symmetric:
+                state.note = "A is not symmetric"
+                if state.outcome != SOLVED:
+                    return _general(problem, state.note)
         return state
 
     def update(self, state: DirectState, problem: Problem) -> DirectState:
@@ -222,6 +229,8 @@ class _Run:
                 if not self.good():
                     rows.slack()
                     self.refine(pivot, relative)
+                    if not pivot.symmetric and not self.good():
+                        return self.general("A is not symmetric")
         else:
             # Which rows will be free? All, or where a few sweeps put them.
             sweeps = pivot.sweeps
@@ -241,9 +250,19 @@ class _Run:
             return self.indefinite()
         if code == SMALL:
             self.note_singular(pivot, self.patient or self.problem.law == "linear")
+        if code == STUCK and not pivot.symmetric:
+            return self.circling()
         if not self.patient and self.problem.law != "linear":
             return self.verdict()
         return self.proximal(pivot, code == STUCK)
+
+    def circling(self) -> Claim:
+        self.notes.append(
+            "exchanges go round in circles, and A is not symmetric: no energy to descend on; see lemke"
+        )
+        if not self.best <= 1.0:
+            self.judge(self.problem.start())
+        return self.verdict()
 
     def rounds(self, pivot: PivotState) -> int:
         """Rounds to the end of this pass, refined and judged, within the budget and the time."""
@@ -317,13 +336,16 @@ class _Run:
                 break
             if code == ROUNDS:
                 return self.out_of_budget()
+            if code == STUCK and not pivot.symmetric:
+                return self.circling()
             if code == STUCK:
                 stuck, path = True, list(PATH)
                 np.clip(rows.center, problem.cones.lower, problem.cones.upper, out=rows.x)
                 continue
             if code in (SMALL, INDEFINITE):
                 if shift >= PATH[0]:
-                    return self.indefinite_linear() if problem.law == "linear" else self.indefinite()
+                    linear = problem.law == "linear"
+                    return self.general("A is indefinite") if linear else self.indefinite()
                 path = [shift * SHIFT_STEP]
                 rows.x[:] = rows.center
                 continue
@@ -341,7 +363,7 @@ class _Run:
             if waited >= PATIENCE or self.out_of_time:
                 break
         if problem.law == "linear" and self.best > max(self.tol, 2.0 * self.floor) and not self.out_of_time:
-            return self.indefinite_linear()
+            return self.general("A is indefinite")
         return self.verdict()
 
     def descend(self, pivot: PivotState) -> int:
@@ -369,9 +391,10 @@ class _Run:
             if not relative < previous:
                 rows.x[:] = kept
 
-    def indefinite_linear(self) -> Claim:
+    def general(self, why: str) -> Claim:
+        """A linear system by LU that tells the rank."""
         before = self.state.pivot.work if self.state.pivot is not None else {}
-        self.state = _general(self.problem, "A is indefinite")
+        self.state = _general(self.problem, why)
         self.notes = [self.state.note]
         assert self.state.general is not None
         claim = self.linear_general(self.state.general)
@@ -393,12 +416,6 @@ class _Run:
         return self.claim(Status.INFEASIBLE, certificate=y)
 
 
-def _refusal(problem: Problem) -> str | None:
-    if problem.law == "lcp" and not problem.is_symmetric:
-        return f"needs symmetric A where rows are bounded; asymmetry is {problem.asymmetry:.1e}: use lemke or pgs"
-    return None
-
-
 SPEC = SolverSpec(
     name="direct",
     factory=Direct,
@@ -407,8 +424,7 @@ SPEC = SolverSpec(
     exact=True,
     resumable=False,
     max_iter=1000,
-    refusal=_refusal,
     few=DIRECT,
-    summary="factorisation; symmetric boxed LCP by block principal pivoting",
+    summary="factorisation; boxed LCP by block principal pivoting",
     reference="Golub, Van Loan 2013, chapter 4; Judice, Pires 1994, Computers and Operations Research 21",
 )

@@ -50,8 +50,8 @@ cdef class Chain:
     newton : Newton, with VELOCITIES
     matrix : Data, with PIVOTS
         Of A in compressed rows.
-    band, linear : int, bool, with PIVOTS
-        Half bandwidth of A; whether every row is free.
+    band, linear, symmetric : int, bool, bool, with PIVOTS
+        Half bandwidth of A, m - 1 where it is not symmetric; whether every row is free.
     split, exact, first_look : int, bool, int, with SWEEPS
         Blocks before it are swept before the others: joints, contacts; whether each is solved exactly; sweeps before
         the residual is looked at.
@@ -69,15 +69,14 @@ cdef class Chain:
     cdef int split, first_look
 
     def __init__(self, Data data, start, double start_relative, Newton newton=None, Data matrix=None, int band=0,
-                 bint linear=False, int split=0, bint exact=False,
-                 int first_look=0):
+                 bint linear=False, bint symmetric=True, int split=0, bint exact=False, int first_look=0):
         self.data, self.start, self.start_relative = data, start, start_relative
         self.newton, self.linear, self.split, self.first_look = newton, linear, split, first_look
         if newton is not None:
             self.kind = VELOCITIES
         elif matrix is not None:
             self.kind = PIVOTS
-            self.pivoting = Pivoting(matrix, band, None, 1e-13)
+            self.pivoting = Pivoting(matrix, band, None, 1e-13, symmetric)
         else:
             self.kind = SWEEPS
             self.order = np.arange(data.blocks.n_blocks, dtype=np.int32)

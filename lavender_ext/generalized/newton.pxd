@@ -26,7 +26,8 @@ from lavender_ext.core.block cimport (CONE, COULOMB, CONTACT_SPIN, ROW, block_er
                                       row_error)
 from lavender_ext.core.generalized cimport dot, generalized_t, ldl_solve, panel_push, panel_times
 from lavender_ext.core.problem cimport Data
-from lavender_ext.generalized.dense cimport ltdl_factor, ltdl_solve, lu_factor, lu_solve
+from lavender_ext.factor.dense_lu cimport lu_factor, lu_solve
+from lavender_ext.generalized.dense cimport ltdl_factor, ltdl_solve
 from lavender_ext.generalized.sparse cimport is_worth, sparse_factor
 from lavender_ext.generalized.soft cimport INSIDE, OFF, SLIDES, cone_map, coulomb_map, size_of
 from lavender_ext.judge.score cimport nothing, tally_block, tally_row, tally_t

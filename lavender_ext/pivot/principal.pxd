@@ -21,6 +21,7 @@ cdef struct pivoting_t:
     int32_t band                # half bandwidth in order of elimination
     const int32_t* order        # (n) row eliminated first, second, ...; not read where natural
     int32_t natural             # order is 0, 1, ...
+    int32_t* swap               # (n) rows exchanged by LU; NULL: LDL^T, of a symmetric A
     int32_t* at                 # (n) FREE | AT_LOWER | AT_UPPER
     int32_t* place              # (n) place among the free rows, -1
     double* x                   # (n) N s
@@ -28,8 +29,8 @@ cdef struct pivoting_t:
     double* f                   # (n) m/s, 2^-53 (|A| |x| + |b|): rounding of w
     double* center              # (n) N s
     double* y                   # (n) scratch
-    double* size                # (n) d of the free rows, by place
-    double* c                   # (n (band + 1)) factor
+    double* size                # (n) d of the free rows, by place; of LU d^-1/2
+    double* c                   # (n (band + 1)) factor; of LU (n_free, n_free)
     double shift                # s
     double tiny                 # pivots below tiny d are small
     int32_t n_free

@@ -1,4 +1,4 @@
-"""Principal pivoting on a symmetric boxed LCP, and the symmetric factorisations under it.
+"""Principal pivoting on a boxed LCP, and the factorisations under it: LDL^T, or LU of few rows where A is not symmetric.
 
     free rows F: (A_FF + s D_FF) x_F = b_F - A_FB x_B + s D_FF center_F,  bound rows B: x = its bound    (1)
     w = A x - b + s D (x - center),   D = diag(d)                                                       (2)
@@ -8,9 +8,9 @@
 Judice, Pires 1994 (block principal pivoting; when (4) is stuck the caller descends on the energy instead).
 s > 0 is the proximal shift of a singular matrix. Free rows are numbered compactly in a fixed order of
 elimination, so the bandwidth of A never grows; a dense matrix is a band of full width. A linear system is
-the case of all rows free.
+the case of all rows free. LU is of D^-1/2 (A_FF + s D_FF) D^-1/2, dense, with rows exchanged for the largest pivot.
 """
-from libc.math cimport fabs
+from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t, int64_t
 
 import numpy as np
@@ -19,6 +19,7 @@ from lavender_ext.core.block cimport blocks_t, relax_row
 from lavender_ext.core.csr cimport csr_dot, csr_t
 from lavender_ext.core.problem cimport Data
 from lavender_ext.factor.band cimport ldl_back_all, ldl_factor, ldl_factor_2, ldl_solve, no_pivots
+from lavender_ext.factor.dense_lu cimport lu_factor, lu_solve
 from lavender_ext.judge.score cimport unit_roundoff
 from lavender_ext.pivot.principal cimport INDEFINITE, ROUNDS, SMALL, SOLVED, STUCK, pivoting_t
 
@@ -76,6 +77,34 @@ cdef public void lav_csr_scan(const csr_t* a, int32_t n, int32_t* cursor, int32_
     size[1] = big
 
 
+cdef inline void factor_lu(pivoting_t* s) noexcept nogil:
+    cdef int32_t i, j, k = s.n_free, q, at, to
+    cdef const csr_t* a = s.a
+    cdef double* row
+    no_pivots(&s.found)
+    for j in range(k):
+        s.size[j] = 1.0 / sqrt(s.size[j])
+    for i in range(s.n):
+        at = s.place[i]
+        if at < 0:
+            continue
+        row = s.c + <int64_t>at * k
+        for j in range(k):
+            row[j] = 0.0
+        for q in range(a.indptr[i], a.indptr[i + 1]):
+            to = s.place[a.indices[q]]
+            if to >= 0:
+                row[to] = s.size[at] * a.data[q] * s.size[to]
+        row[at] += s.shift
+    if not lu_factor(k, s.c, s.swap):
+        s.found.small = 1
+    else:
+        for j in range(k):
+            s.found.small += not fabs(s.c[<int64_t>j * k + j]) > s.tiny
+    s.factorisations += 1
+    s.is_factored = 1
+
+
 cdef inline void factor_free(pivoting_t* s, double* x) noexcept nogil:
     # x: what ldl_factor takes along, or NULL
     cdef int32_t i, j, k = 0, q, r, at, to, in_place
@@ -90,6 +119,9 @@ cdef inline void factor_free(pivoting_t* s, double* x) noexcept nogil:
             s.size[k] = s.p.d[i]
             k += 1
     s.n_free = k
+    if s.swap != NULL:
+        factor_lu(s)
+        return
     s.width = s.band + 1 if s.band < k else k
     in_place = s.natural and k == s.n
     for i in range(s.n):
@@ -117,21 +149,34 @@ cdef inline void factor_free(pivoting_t* s, double* x) noexcept nogil:
     s.is_factored = 1
 
 
+cdef inline void solve_factored(const pivoting_t* s, double* y) noexcept nogil:
+    # y (n_free) <- (A_FF + s D_FF)^-1 y
+    cdef int32_t j
+    if s.swap == NULL:
+        ldl_solve(s.n_free, s.width, s.c, y)
+        return
+    for j in range(s.n_free):
+        y[j] *= s.size[j]
+    lu_solve(s.n_free, s.c, s.swap, y)
+    for j in range(s.n_free):
+        y[j] *= s.size[j]
+
+
 cdef public void lav_pivot_factor(pivoting_t* s) noexcept nogil:
-    """LDL^T of A_FF + s D_FF, (1)."""
+    """A factor of A_FF + s D_FF, (1)."""
     factor_free(s, NULL)
 
 
 cdef public void lav_pivot_factor_all(pivoting_t* s) noexcept nogil:
-    """LDL^T of A, all rows free and no shift, with the first half of x = A^-1 b on the way."""
+    """A factor of A, all rows free and no shift; of LDL^T with the first half of x = A^-1 b on the way."""
     cdef int32_t i, q, end
     cdef const csr_t* a = s.a
-    if not (s.natural and s.band == 1 and s.n > 1):
+    if s.swap != NULL or not (s.natural and s.band == 1 and s.n > 1):
         for i in range(s.n):
             s.at[i] = FREE
             s.x[i] = s.p.b[i]
-        factor_free(s, s.x if s.natural else NULL)
-        s.is_half_solved = s.natural
+        factor_free(s, s.x if s.natural and s.swap == NULL else NULL)
+        s.is_half_solved = s.natural and s.swap == NULL
         return
     s.is_half_solved = 1
     s.n_free = s.n
@@ -161,14 +206,14 @@ cdef public void lav_pivot_correct(pivoting_t* s) noexcept nogil:
     if s.natural and s.n_free == s.n:
         for i in range(s.n):
             s.y[i] = s.w[i]
-        ldl_solve(s.n, s.width, s.c, s.y)
+        solve_factored(s, s.y)
         for i in range(s.n):
             s.x[i] -= s.y[i]
         return
     for i in range(s.n):
         if s.place[i] >= 0:
             s.y[s.place[i]] = s.w[i]
-    ldl_solve(s.n_free, s.width, s.c, s.y)
+    solve_factored(s, s.y)
     for i in range(s.n):
         if s.place[i] >= 0:
             s.x[i] -= s.y[s.place[i]]
@@ -297,7 +342,7 @@ cdef public void lav_pivot_solve_free(pivoting_t* s) noexcept nogil:
         return
     for i in range(s.n):
         y[i if s.natural else s.place[i]] = s.p.b[i]
-    ldl_solve(s.n, s.width, s.c, y)
+    solve_factored(s, y)
     if not s.natural:
         for i in range(s.n):
             s.x[i] = y[s.place[i]]
@@ -386,6 +431,7 @@ cdef inline void lay_out(pivoting_t* s, const csr_t* a, const blocks_t* p, int32
     s.c = real + 6 * m
     s.at = whole
     s.place = whole + m
+    s.swap = NULL
 
 
 cdef inline void begin(pivoting_t* s, double shift) noexcept nogil:
@@ -530,13 +576,15 @@ cdef class Pivoting:
         Half bandwidth of A in order of elimination, at most m - 1; -1: no room for a factor.
     order : (m,) int32 or None
         Row eliminated first, second, ...; None: as they stand.
+    symmetric : bool
+        False: LU, in room for a band of m - 1, as they stand.
     """
 
     cdef pivoting_t s
     cdef Data p
     cdef object reals, ints, order
 
-    def __init__(self, Data p, int band, order, double tiny):
+    def __init__(self, Data p, int band, order, double tiny, bint symmetric=True):
         cdef int32_t m = p.blocks.n_rows
         cdef int64_t room = 1 if band < 0 else <int64_t>m * (band + 1) + 1
         cdef const int32_t[::1] given
@@ -544,11 +592,13 @@ cdef class Pivoting:
         cdef int32_t[::1] ints
         # One block for the vectors and the factor: two allocations in all.
         self.reals = np.empty(6 * m + room)
-        self.ints = np.zeros(2 * m + 1, np.int32)
+        self.ints = np.zeros(3 * m + 1, np.int32)
         reals, ints = self.reals, self.ints
         cdef const int32_t* first = NULL
         if p.factored:
             raise ValueError("Pivoting reads A in compressed rows")
+        if not symmetric and (band != m - 1 or order is not None):
+            raise ValueError("LU has room where the band is whole, and takes rows as they stand")
         self.p = p
         self.order = order
         if order is not None:
@@ -558,6 +608,8 @@ cdef class Pivoting:
             if m:
                 first = &given[0]
         lay_out(&self.s, &p.csr, &p.blocks, band, first, tiny, &reals[0], &ints[0])
+        if not symmetric:
+            self.s.swap = &ints[2 * m]
         begin(&self.s, 0.0)
 
     @property
