@@ -11,14 +11,13 @@ from lavender.problem import Problem
 from lavender.registry import FEW
 from lavender.residuals import judged, known
 from lavender.solution import Claim
-from lavender.solvers._costs import DIRECT_ROUNDS, Exact, factors_at_once
+from lavender.solvers._costs import DIRECT_ROUNDS, Exact, factors_at_once, joints_at_once
 from lavender.solvers._few import WARM
 from lavender.solvers._trail import usable
 from lavender.solvers.direct import Direct, Impatient
 
-__all__ = ["FEW_JOINTS", "HASTY", "JOINTS", "Factored", "factor_first"]
+__all__ = ["HASTY", "JOINTS", "Factored", "factor_first"]
 
-FEW_JOINTS = 300  # rows up to which a linear system is not looked at more closely
 JOINTS = Exact("direct", 0.0, 0)
 HASTY = Exact("direct", 0.0, DIRECT_ROUNDS, (("patience", False),))
 
@@ -39,13 +38,12 @@ def factor_first(
 ) -> Factored | None:
     """`direct` from an impulse (m,), or None where something else comes first.
 
-    Bounded rows of a narrow band; and a linear system that is symmetric, of few rows, or given as a matrix, of which
-    `newton` makes the same factor.
+    Bounded rows of a narrow band; and a symmetric linear system that costs least so (`joints_at_once`).
     """
     if problem.m <= FEW or n <= 0 or problem.generalized is not None:
         return None
     if problem.law == "linear":
-        if not problem.is_symmetric or (problem.matrix is None and problem.m > FEW_JOINTS):
+        if not (problem.is_symmetric and joints_at_once(problem)):
             return None
         chosen, solver = JOINTS, Direct()
     elif factors_at_once(problem):

@@ -102,7 +102,7 @@ ADMM_FILL = 6.0  # entries of L for each of A
 DIRECT_ROUNDS = 40  # of `direct` on bounded rows that are granted before another is asked
 AT_REST = 8.0  # of faces on faces, most of whose rows hold
 UNSYMMETRIC = 2.0  # LU against Cholesky, where friction or A asks for it
-SINGULAR = 6.0  # factorisations of `direct` where A is singular: it shifts and refines
+SINGULAR = 6.0  # times as many of `direct` where A is singular and one shift does not end it
 
 # Sweeps to expect before anything was swept, to six decades: median over drawn problems, and where the same weight
 # rests on more points than are needed.
@@ -115,6 +115,7 @@ ISLAND = 400e3  # what Python takes for an island of its own
 TOGETHER, TOGETHER_ISLAND, TOGETHER_ROW = 200e3, 1e3, 60.0
 BAND_AT_ONCE = 1e6  # ns of `direct` on a narrow band up to which nothing else is looked at
 LU_ROWS = 300  # of a linear system that is not symmetric, up to which sweeps are looked at before its factor
+FEW_JOINTS = 300  # rows up to which a linear system is not looked at more closely
 NARROW_ENTRIES = 12  # of A in a row up to which a narrow band is looked for
 NARROW = 40  # half bandwidth up to which a band is what `direct` takes
 TREE = 1.05  # neighbours of a body, in the mean, up to which bodies form trees
@@ -237,6 +238,23 @@ def factors_at_once(problem: Problem) -> bool:
     return form == "band" and DIRECT["lcp"] * BAND * m * float(band + 1) ** 2 <= BAND_AT_ONCE
 
 
+def joints_at_once(problem: Problem) -> bool:
+    """A symmetric linear system for `direct`, without a look at what else there is.
+
+    Of few rows; a matrix, of which `newton` makes the same factor; bodies whose band costs less than `newton` without
+    its factor.
+    """
+    if problem.m <= FEW_JOINTS or problem.matrix is not None:
+        return True
+    if problem.rows is None or problem.rows.n_bodies == 0:
+        return False
+    width = graph.body_spread(problem.cones.ptr, block_bodies(problem), problem.rows.n_bodies) + 1
+    band = BAND * problem.m * float(width) ** 2
+    direct = START["direct"] + DIRECT["linear"] * (STEP["direct"] + ROW * problem.m + band)
+    start, step, row = newton_rates(problem)
+    return width <= NARROW and direct <= start + NEWTON["linear"] * (step + row * problem.m)
+
+
 def is_redundant(problem: Problem) -> bool:
     """The same weight rests on more points than the bodies can tell apart, and none of them is soft.
 
@@ -336,7 +354,8 @@ class Costs:
         else:
             m = p.m
             width = self._width(m) if p.rows is not None else 0.5 * p.metric.work / max(m, 1)
-            times = SINGULAR if p.law == "lcp" and self.redundant else 1.0
+            stuck = self.redundant or any(key.startswith("direct") for key in self.ended)
+            times = SINGULAR if p.law == "lcp" and stuck else 1.0
             found = min(self._newton_guess, self._direct(BAND * m * max(3.0, width) ** 2, times))
         return min(self.formed + found, self.over_velocities)
 

@@ -36,8 +36,9 @@ from lavender.problem import OPERATORS, Problem
 from lavender.registry import FEW, SolverSpec
 from lavender.residuals import reference
 from lavender.solution import Claim, Status
-from lavender.solvers._at_once import FEW_JOINTS, HASTY, JOINTS, factor_first
+from lavender.solvers._at_once import HASTY, JOINTS, factor_first
 from lavender.solvers._costs import (
+    FEW_JOINTS,
     FIRST_LOOK,
     GENERAL_COUNT,
     ISLAND,
@@ -188,7 +189,7 @@ def _solve(trail: Trail, budget: int, glance: Glance | None = None) -> None:
                 return
         return
     sweeps = None
-    # START of sweeps alone costs more than this factor; where it is singular, sweeps are asked before it is shifted.
+    # START of sweeps alone costs more than this factor; where one shift is stuck, sweeps are asked before others.
     at_once = glance is None and HASTY.key not in trail.ended and factors_at_once(problem)
     if at_once and whole(trail, HASTY, budget):
         return

@@ -62,7 +62,7 @@ class DirectState:
 class Direct:
     """Direct solution of linear systems and of boxed LCPs, positive semidefinite or asymmetric."""
 
-    patience: ClassVar[bool] = True  # to shift and refine what is singular
+    patience: ClassVar[bool] = True  # to go on where pivoting on one shift is stuck
 
     def prepare(self, problem: Problem, like: PivotState | None = None) -> DirectState:
         linear = problem.law == "linear"
@@ -97,7 +97,7 @@ class Direct:
 
 
 class Impatient(Direct):
-    """As `auto` asks first: bounded rows whose A is singular where they are free end it at once, as STALLED."""
+    """As `auto` asks first: bounded rows on which pivoting is stuck, or one shift singular, end it at once, STALLED."""
 
     patience: ClassVar[bool] = False
 
@@ -249,10 +249,10 @@ class _Run:
         if code == INDEFINITE:
             return self.indefinite()
         if code == SMALL:
-            self.note_singular(pivot, self.patient or self.problem.law == "linear")
+            self.note_singular(pivot, self.patient or pivot.symmetric)
         if code == STUCK and not pivot.symmetric:
             return self.circling()
-        if not self.patient and self.problem.law != "linear":
+        if not self.patient and not (code == SMALL and pivot.symmetric):
             return self.verdict()
         return self.proximal(pivot, code == STUCK)
 
@@ -338,6 +338,8 @@ class _Run:
                 return self.out_of_budget()
             if code == STUCK and not pivot.symmetric:
                 return self.circling()
+            if code != SOLVED and not self.patient:
+                break
             if code == STUCK:
                 stuck, path = True, list(PATH)
                 np.clip(rows.center, problem.cones.lower, problem.cones.upper, out=rows.x)

@@ -287,15 +287,26 @@ def test_what_gave_up_is_not_what_others_are_compared_with():
     assert costs.cheapest == min(e.cost for e in costs.exact if e.key != first.key) > first.cost
 
 
-def test_a_singular_band_is_factored_once_before_sweeps():
-    """Every contact given twice: `direct` would shift and refine, and sweeps hardly notice."""
+def test_a_singular_band_is_shifted_once_where_it_stands():
+    """Every contact given twice, which sweeps hardly notice: what `direct` does with one shift, once."""
     problem = twice_touching(60)
     solution = lv.solve(problem, tol=1e-6)
     assert solution.success
     assert solution.message.startswith("direct")
     assert solution.message.count("direct") == 1
-    assert "shifts" not in solution.work
-    assert lv.solve(problem, "direct", tol=1e-6).work["shifts"] > 0
+    assert solution.work["shifts"] == 1
+    assert solution.work == lv.solve(problem, "direct", tol=1e-6).work
+
+
+def test_a_shift_that_is_stuck_is_not_followed_by_others_at_once():
+    problem = suite.wild(seed=2044).problem
+    alone = lv.solve(problem, "direct", tol=1e-6)
+    assert alone.success
+    solution = lv.solve(problem, tol=1e-6)
+    assert solution.success
+    assert solution.message.startswith("direct")
+    assert solution.work["shifts"] == 1 < alone.work["shifts"]
+    assert solution.work["factorisations"] < alone.work["factorisations"]
 
 
 @pytest.mark.parametrize("soft", [True, False])
