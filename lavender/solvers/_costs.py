@@ -307,6 +307,7 @@ class Costs:
     def gave_up(self, key: str) -> None:
         """A finite solver gave up: what was guessed of the others beside it is looked at closely when it is asked."""
         self.ended.add(key)
+        self.__dict__.pop("guess", None)
         if self.__dict__.get("_others_win"):
             del self._others_win
             self.__dict__.pop("exact", None)
@@ -343,7 +344,7 @@ class Costs:
         """What no finite solver costs less than [ns]."""
         return min(self.formed + finite_least(self.problem), self.over_velocities)
 
-    @property
+    @cached_property
     def guess(self) -> float:
         """What the cheapest finite solver hardly costs less than [ns], without looking closer."""
         p = self.problem
@@ -469,9 +470,7 @@ class Costs:
         p = self.problem
         if p.rows is None or p.rows.n_bodies == 0:
             return 1.0
-        bodies = block_bodies(p)
-        both = np.sort(bodies[(bodies >= 0).all(axis=1)], axis=1).astype(np.int64)
-        pairs = len(np.unique(both[:, 0] * p.rows.n_bodies + both[:, 1]))
+        pairs = graph.body_pairs(block_bodies(p), p.rows.n_bodies, False)
         return max(1.0, pairs / p.rows.n_bodies)
 
     @property
@@ -585,6 +584,5 @@ def together_cost(problem: Problem, count: int, largest: int) -> float:
 def is_loose(problem: Problem) -> bool:
     """Nearly every contact between two bodies of its own, not one of a face: sweeps then settle which ones stick."""
     assert problem.rows is not None
-    bodies = np.sort(block_bodies(problem), axis=1)
-    pairs = bodies[:, 0].astype(np.int64) * problem.rows.n_bodies + bodies[:, 1]
-    return 4 * len(np.unique(pairs)) > 3 * len(pairs)
+    pairs = graph.body_pairs(block_bodies(problem), problem.rows.n_bodies, True)
+    return bool(4 * pairs > 3 * problem.n_blocks)
