@@ -31,6 +31,7 @@ from lavender.solvers._newton.systems import (
     make_system,
 )
 from lavender.solvers._sweeping import reads_whitened
+from lavender_ext.core import assemble
 from lavender_ext.factor import graph
 
 __all__ = ["Costs", "Exact", "general_cost", "is_loose", "islands_cost"]
@@ -145,6 +146,7 @@ class Exact:
     limit: int
     options: tuple[tuple[str, Any], ...] = ()  # that the solver is made with
     once: float = np.inf  # ns, with the first factorisation alone
+    each: float = 0.0  # ns of one more iteration, 0 where nobody asks
 
     @property
     def key(self) -> str:
@@ -386,8 +388,8 @@ class Costs:
         limit += (
             TAIL[p.law] if p.law != "coulomb" else int(min(TAIL[p.law], max(TAIL_LEAST, TAIL_TIME / each)))
         )
-        once = start + each
-        newton = Exact("newton", self.formed + cost, limit, form, self.formed + once)
+        once = self.formed + start + each
+        newton = Exact("newton", self.formed + cost, limit, options=form, once=once, each=each)
         return sorted([*self._others, newton], key=lambda e: e.cost)
 
     @cached_property
@@ -417,8 +419,9 @@ class Costs:
             once = GENERAL_START + (cost - GENERAL_START) / general_count(p)
             found.append(Exact("newton", cost, count, (("form", "velocity"),), once))
         if p.law in ("cone", "coulomb") and (p.generalized is None or p.m <= ADMM_GENERAL):
-            cost, once = (self.formed + x for x in self._admm)
-            found.append(Exact("admm", cost, int(2.0 * self._admm_count), once=once))
+            cost, once, each = self._admm
+            limit = int(2.0 * self._admm_count)
+            found.append(Exact("admm", self.formed + cost, limit, once=self.formed + once, each=each))
         return found
 
     @property
@@ -426,10 +429,14 @@ class Costs:
         return ADMM_COUNT * max(1.0, self.decades / 6.0)
 
     @property
-    def _admm(self) -> tuple[float, float]:
+    def _admm(self) -> tuple[float, float, float]:
         p = self.problem
-        whole, once = admm_cost(p, p.m, float(sweep_work(p)), self._admm_count)
-        return float(whole), float(once)
+        entries = float(sweep_work(p))
+        if p.rows is not None and 6 * p.rows.n_bodies >= p.m:
+            # It takes the rows of A then: of one heavy body all of them.
+            entries = max(entries, min(float(assemble.bound(p.data)[0]), float(p.m) ** 2))
+        whole, once, each = admm_cost(p, p.m, entries, self._admm_count)
+        return float(whole), float(once), float(each)
 
     def _direct(self, factor: float, times: float = 1.0) -> float:
         p = self.problem
@@ -542,15 +549,15 @@ def newton_factor(system: System) -> float:
     return sparse_factor(system.h.nnz, system.sc.m)
 
 
-def admm_cost(problem: Problem, m: Any, entries: Any, count: float) -> tuple[Any, Any]:
-    """`admm` on m rows of a problem: to the end, for each chance to get there, and with the first factor alone [ns]."""
+def admm_cost(problem: Problem, m: Any, entries: Any, count: float) -> tuple[Any, Any, Any]:
+    """`admm` on m rows [ns]: to the end, for each chance to get there; with the first factor alone; an iteration."""
     lu = 1.0 if problem.is_symmetric else UNSYMMETRIC
     factor = lu * SPARSE * entries * (1.0 + m / SPARSE_ROWS)
     if problem.is_symmetric:
         factor = np.minimum(factor, dense_factor(m))
     each = ADMM_ROW * m + ADMM_ENTRY * lu * np.minimum(ADMM_FILL * entries, 0.5 * m * m)
     whole = ADMM_START + ADMM_FACTORS * factor + count * each
-    return whole / (ADMM_LUCK if problem.rows is None else ADMM_LUCK_BODIES), ADMM_START + factor
+    return whole / (ADMM_LUCK if problem.rows is None else ADMM_LUCK_BODIES), ADMM_START + factor, each
 
 
 def islands_cost(problem: Problem, sizes: Any) -> float:

@@ -17,6 +17,7 @@ from lavender.solvers._costs import Exact
 from lavender.solvers._few import WARM
 from lavender.solvers._sweepers import Sweeps
 from lavender.solvers._trail import CLOCK, Trail, usable
+from lavender.solvers._walks import sweeps_of
 from lavender.solvers.direct import Impatient
 from lavender.solvers.newton import NewtonState, after_sweeps, asking
 
@@ -142,7 +143,8 @@ class Turns:
         self.allowance = 0.0  # of sweeps [ns]
         self.still = 0  # turns in a row that gained nothing
         self.over = False  # nothing gets anywhere
-        self.inside: Exact | None = None  # Newton's method, where it waits for a turn to end
+        self.inside: Exact | None = None  # Newton's method, where it waits for a turn to end,
+        self.waiting = 0.0  # and what it has cost [ns]
 
     def left(self) -> bool:
         return self.taken < ROUNDS and not self.over
@@ -160,6 +162,7 @@ class Turns:
         before, spent = trail.best, trail.iterations
         # Friction that Newton's method needs so long for is as often ended by admm.
         longer = 1 if self.inside is not None and trail.problem.law == "coulomb" else 0
+        postponed = False
         for candidate in self.candidates():
             if trail.best <= trail.tol or self.budget <= trail.iterations:
                 return True
@@ -181,6 +184,12 @@ class Turns:
             ):
                 return True
             limit = candidate.limit << (k + longer)
+            if longer and candidate.each > 0.0:
+                # Not more than twice of what Newton's method, which waits, has cost.
+                limit = min(limit, int((2.0 * self.waiting - candidate.once) / candidate.each))
+                if limit <= 0:
+                    postponed = True
+                    continue
             if whole(trail, candidate, self.budget, limit, self.more(candidate, limit)):
                 return True
             if self.taken > k:
@@ -188,11 +197,12 @@ class Turns:
         else:
             self.taken += 1
             self.allowance = max(2.0 * self.allowance, 2.0 * costs.cheapest)
-            self.sweeps = self.sweeps or Sweeps(trail)
+            self.sweeps = self.sweeps or sweeps_of(trail, self.budget)
             if self.sweeps.run(self.budget, self.allowance):
                 return True
             self.still = 0 if trail.best < GAIN * before else self.still + 1
-            self.over = trail.late or spent == trail.iterations or self.still >= STILL
+            nothing = spent == trail.iterations and not postponed
+            self.over = trail.late or nothing or self.still >= STILL
         return False
 
     def more(self, newton: Exact, limit: int) -> Callable[[FloatArray], int] | None:
@@ -204,14 +214,15 @@ class Turns:
         def ask(impulse: FloatArray) -> int:
             nonlocal granted
             self.trail.offer(impulse)
-            self.inside = newton
+            self.inside, self.trail.waits = newton, True
+            self.waiting = granted * newton.each
             self.trail.iterations += granted  # until Newton's method returns and tells them itself
             try:
                 done = self.trail.done or not self.left() or self.take()
                 left = self.budget - self.trail.iterations
             finally:
                 self.trail.iterations -= granted
-                self.inside = None
+                self.inside, self.trail.waits = None, False
             if done or self.trail.late:
                 return 0
             now = max(0, min(newton.limit << min(self.taken, ROUNDS), left))

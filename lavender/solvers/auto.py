@@ -13,7 +13,8 @@
                       twice the allowance; and so on (`_turns.py`), newton from where it stood too
     coulomb           loose and large piles: sweeps (nncg in both directions from LARGE rows on) race those of the
                       convex relaxation, whose answer is the Coulomb answer wherever contacts stick; where they stall,
-                      what is wrong is solved in patches between sweeps (`_race.py`, `_patches.py`)
+                      what is wrong is solved in patches between sweeps (`_race.py`, `_patches.py`); between sweeps of
+                      rows or of a matrix Newton's method walks a few steps (`_walks.py`)
 
 Costs are counted from the structure (`_costs.py`) and from the contraction of sweeps that were done, never timed:
 the same problem is solved the same way everywhere. Islands are solved apart, each to its share of the whole error,
@@ -57,6 +58,7 @@ from lavender.solvers._split import solve_together, takes
 from lavender.solvers._sweepers import Glance, Sweeps, look_first
 from lavender.solvers._trail import Trail
 from lavender.solvers._turns import VELOCITY, Turns, note, whole
+from lavender.solvers._walks import Walks, sweeps_of
 from lavender_ext.few.looks import sweeps_left
 
 LARGE = 4000  # rows of J from which friction is swept both ways, and beside its relaxation
@@ -211,7 +213,8 @@ def _solve(trail: Trail, budget: int, glance: Glance | None = None) -> None:
         # What sweeps have not ended island by island, they hardly end together.
         large = problem.law == "coulomb" and problem.m >= LARGE and problem.rows is not None
         glance = None if together else glance
-        sweeps = Sweeps(trail, "nncg", order="symmetric") if large else Sweeps(trail, glance=glance)
+        options = {"name": "nncg", "order": "symmetric"} if large else {"glance": glance}
+        sweeps = sweeps_of(trail, budget, **options)
         if relax and race(trail, sweeps, budget):
             return
         if sweeps.run(budget):
@@ -301,6 +304,8 @@ def _may_relax(trail: Trail) -> bool:
 def _finish(trail: Trail, sweeps: Sweeps | None, budget: int) -> None:
     """Finite solvers and sweeps in turn, the allowance doubled each time, until one is there or all have given up."""
     problem = trail.problem
+    if isinstance(sweeps, Walks) and sweeps.give_way():
+        return
     if problem.law == "coulomb" and problem.m >= HUGE and problem.rows is not None:
         # A factorisation is out of reach: sweeps, however many they take.
         last = Sweeps(trail, "nncg", order="symmetric")
@@ -361,7 +366,7 @@ def _apart(trail: Trail, budget: int) -> bool:
 def _solve_island(trail: Trail, budget: int) -> None:
     sweeps = None
     if not _at_once(trail.costs):
-        sweeps = Sweeps(trail)
+        sweeps = sweeps_of(trail, budget)
         if sweeps.run(budget):
             return
     _finish(trail, sweeps, budget)

@@ -349,6 +349,7 @@ class MatrixSystem(System):
         # Of a sparse factor by its fill, which grows with the size: nanoseconds, as `_costs.py` has them.
         self.cost = m**3 / 3.0 if self.dense else 100.0 * a.nnz * (1.0 + m / 1000.0)
         self.pace = 0.15e-9 if self.dense else 1e-9
+        self.fill = 0  # entries of the last sparse factor, 0 before the first
         self.h: Any
         if self.dense:
             self.h = a.toarray()
@@ -415,6 +416,7 @@ class MatrixSystem(System):
         except RuntimeError:
             return False
         self.took(start)
+        self.fill = factor.nnz
         self.solver = factor.solve
         return True
 

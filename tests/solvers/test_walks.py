@@ -1,0 +1,75 @@
+"""Short walks of Newton's method between sweeps under Coulomb's law."""
+
+import numpy as np
+import pytest
+
+import lavender as lv
+from lavender.residuals import judged
+from lavender.solvers._sweepers import Sweeps
+from lavender.solvers._trail import Trail
+from lavender.solvers._walks import WALK, Walks, sweeps_of, walk_step
+from lavender.suite.wild import wild
+
+STALLS = 6140  # of 114 rows, that sweeps take 1,500 for
+
+
+def trail_of(seed, tol=1e-9):
+    problem = wild(seed=seed).problem
+    trail = Trail(problem, tol, np.inf)
+    trail.offer(problem.start())
+    return problem, trail
+
+
+def test_a_walk_ends_what_sweeps_have_begun():
+    problem, trail = trail_of(STALLS)
+    sweeps = sweeps_of(trail, 1000)
+    assert isinstance(sweeps, Walks)
+    sweeps.look(64)
+    assert trail.best > 1e-3
+    assert sweeps._walk() <= 1e-9
+    assert judged(problem, trail.impulse.copy()).relative == trail.best
+    assert trail.work["factorisations"] <= WALK
+    assert trail.iterations == 64 + trail.work["factorisations"]
+
+
+def test_the_next_walk_is_due_when_sweeps_have_cost_as_much():
+    _, trail = trail_of(6042)
+    sweeps = sweeps_of(trail, 100_000)
+    cost = WALK * walk_step(trail.costs.system)
+    walks = 0
+    for _ in range(80):
+        before = sweeps.walked
+        sweeps.look(32)
+        if sweeps.walked != before:
+            assert (sweeps.walked - before) * sweeps.per >= cost
+            walks += 1
+    assert walks > 0
+
+
+def test_sweeps_stay_where_they_are():
+    _, trail = trail_of(6042)
+    walking, plain = sweeps_of(trail, 100_000), Sweeps(trail)
+    for _ in range(50):
+        walking.look(32)
+        plain.look(32)
+    if not walking.walked:
+        walking._walk()
+    assert np.array_equal(walking.impulse, plain.impulse)
+
+
+def test_no_walk_under_another_law_or_while_newton_waits():
+    problem = wild(seed=6017).problem
+    assert problem.law == "cone"
+    assert type(sweeps_of(Trail(problem, 1e-6, np.inf), 1000)) is Sweeps
+    _, trail = trail_of(STALLS)
+    sweeps = sweeps_of(trail, 1000)
+    trail.waits = True
+    sweeps.done = 10**9
+    assert not sweeps._due(0.0)
+
+
+@pytest.mark.parametrize("most", [60, 170, 180, 181, 500, 900])
+def test_walks_and_other_sweeps_keep_to_the_budget(most):
+    for seed in (STALLS, 6042):
+        solution = lv.solve(wild(seed=seed).problem, "auto", tol=1e-13, max_iter=most)
+        assert solution.iterations <= most
