@@ -122,7 +122,12 @@ NARROW = 40  # half bandwidth up to which a band is what `direct` takes
 TREE = 1.05  # neighbours of a body, in the mean, up to which bodies form trees
 TINY_FACTOR = 20e3  # ns, below which a factor is not looked at more closely
 LOOKS = 4  # at so many sweeps
-# All that `general_first` reads, for a compiled loop over many problems.
+# Steps that it then has, beside those that are expected of each island but one; under Coulomb's law, where it ends soon
+# or late, as many as in one compiled call. Of few rows
+# it ends within fewer, or takes twice as many and more where sweeps cost little.
+GENERAL_STEPS = {"linear": 256, "lcp": 256, "cone": 256, "coulomb": 64}
+FEW_STEPS = 16
+# All that `general_first` and `general_steps` read, for a compiled loop over many problems.
 GENERAL_GATE = (
     GENERAL_START,
     tuple(GENERAL_ROW[law] for law in LAWS),
@@ -130,6 +135,8 @@ GENERAL_GATE = (
     GENERAL_FIRST,
     FORM,
     tuple(GENERAL_COUNT[law] for law in LAWS),
+    FEW,
+    FEW_STEPS,
 )
 # Steps over generalised velocities that are granted beside twice those expected.
 GENERAL_TAIL = {"linear": 60, "lcp": 60, "cone": 60, "coulomb": 0}
@@ -206,6 +213,14 @@ def general_first(problem: Problem, largest: int) -> bool:
         return False
     step = MANY_STEP + MANY_ROW * problem.m + GENERAL["coulomb"] * factor_flops(problem, largest)
     return GENERAL_START + MANY_COUNT * step <= SWEEPS_REDUNDANT * sweep_cost(problem)
+
+
+def general_steps(problem: Problem, islands: int) -> int:
+    """Steps that Newton's method over generalised velocities has before another solver is asked."""
+    law = problem.law
+    if law == "coulomb":
+        return FEW_STEPS if problem.m <= FEW else GENERAL_STEPS[law]
+    return GENERAL_STEPS[law] + int(GENERAL_COUNT[law]) * (islands - 1)
 
 
 def is_glanced(problem: Problem, per: float) -> bool:

@@ -11,6 +11,7 @@ import numpy as np
 
 from lavender._arrays import FloatArray
 from lavender.problem import Problem
+from lavender.registry import FEW
 from lavender.residuals import judged, known, remember
 from lavender.solution import Claim, Status
 from lavender.solvers._accelerated import AcceleratedState, operator
@@ -91,7 +92,8 @@ def look_first(problem: Problem, impulse: FloatArray, n: int, tol: float, failed
 
     `failed`: few rows whose factor did not end it at once.
     """
-    if problem.generalized is not None or problem.cones.has_round:
+    general = problem.generalized is not None
+    if problem.cones.has_round or (general and (problem.law != "coulomb" or problem.m > FEW)):
         return None
     per = sweep_cost(problem)
     sweeps = first_look(per)
@@ -104,7 +106,9 @@ def look_first(problem: Problem, impulse: FloatArray, n: int, tol: float, failed
     if before <= tol:
         return Glance(problem, None, lam, before)
     split = 0 if problem.rows is None else problem.rows.n_joints
-    looks = Looks(problem.metric, operator(problem), problem.law == "cone", split)
+    # Of few rows over J and M A is not formed: that costs more than to sweep over them.
+    data = problem.metric if general else operator(problem)
+    looks = Looks(problem.metric, data, problem.law == "cone", split)
     least = finite_least(problem)
     looks.run(lam, before, min(n, 2**31 - 1), tol, sweeps, FIRST_LOOK, per, least, BELIEVED * least)
     if looks.now.relative <= tol:

@@ -41,12 +41,12 @@ from lavender.solvers._at_once import HASTY, JOINTS, factor_first
 from lavender.solvers._costs import (
     FEW_JOINTS,
     FIRST_LOOK,
-    GENERAL_COUNT,
     ISLAND,
     Costs,
     Exact,
     factors_at_once,
     general_first,
+    general_steps,
     is_loose,
     together_cost,
 )
@@ -68,9 +68,6 @@ LAST = 8000  # sweeps that friction is left to where nothing else is left
 RELAXED = 1e6  # ns that sweeps usually take from which Coulomb's law is relaxed first: a problem of its own
 GLANCE = 0.35  # share of a finite solver's cost for which a first look at sweeps is always worth it
 FRICTION_APART = 2.0  # times the cost of the whole that islands with friction may take
-# Steps that newton over the velocities then has, beside those that are expected of each island but one; under
-# Coulomb's law, where it ends soon or late, as many as in one compiled call.
-GENERAL_STEPS = {"linear": 256, "lcp": 256, "cone": 256, "coulomb": 64}
 ROUND_SWEEPS = 1000  # of nncg on round cones given by A, before admm is asked
 ONCE_MORE = (
     2.0  # times what a finite solver was guessed to cost for each row, from which sweeps of islands go on
@@ -116,17 +113,16 @@ class Auto:
             kernel = general.prepare(problem)
             largest = 0 if kernel is None else kernel.largest
             if kernel is not None and general_first(problem, largest):
-                most = GENERAL_STEPS[problem.law]
-                if problem.law != "coulomb":
-                    most += int(GENERAL_COUNT[problem.law]) * (kernel.islands - 1)
-                claim = general.run(problem, kernel, lam, min(n, most), tol, time_limit)
+                steps = general_steps(problem, kernel.islands)
+                claim = general.run(problem, kernel, lam, min(n, steps), tol, time_limit)
                 if claim.status is Status.CONVERGED:
                     impulse[:] = lam
                     return general.named(claim, "auto")
-        glance = None if first is not None else look_first(problem, impulse, n, tol, few)
+        left = n if claim is None else n - claim.iterations
+        glance = None if first is not None else look_first(problem, impulse, left, tol, few)
         if glance is not None and glance.best <= tol:
             impulse[:] = glance.impulse
-            return glance.claim()
+            return glance.claim() if claim is None else _then(general.named(claim, "auto"), glance.claim())
         limit = np.inf if time_limit is None else 1e9 * time_limit
         trail = Trail(
             problem=problem, tol=tol, deadline=deadline, limit=limit, largest=largest, kernel=kernel
@@ -163,6 +159,15 @@ class Auto:
         nothing = "the start is a solution" if trail.best <= tol else "no time for anything"
         message = " -> ".join(trail.steps) or nothing
         return Claim(status, trail.iterations, trail.work, message, certificate=trail.certificate)
+
+
+def _then(first: Claim, second: Claim) -> Claim:
+    """Of two solvers, one after the other."""
+    work = dict(first.work)
+    for kind, count in second.work.items():
+        work[kind] = work.get(kind, 0) + count
+    message = f"{first.message} -> {second.message}"
+    return Claim(second.status, first.iterations + second.iterations, work, message)
 
 
 # -- the plan ---------------------------------------------------------------------------------------

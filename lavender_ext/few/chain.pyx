@@ -28,7 +28,7 @@ cpdef enum:                     # kinds
     SWEEPS = 2
 
 cdef enum:
-    STEPS = 64                  # of newton
+    STEPS = 64                  # of newton; fewer where sweeps come next
     PIVOT_SWEEPS = 2            # that guess the free rows
     PIVOT_ROUNDS = 32
     CORRECTIONS = 100           # refinements
@@ -47,7 +47,8 @@ cdef class Chain:
         Pi(0), read-only.
     start_relative : float
         Relative residual of `start`.
-    newton : Newton, with VELOCITIES
+    newton, steps : Newton, int, with VELOCITIES
+        Steps that it has where something else comes next.
     matrix : Data, with PIVOTS
         Of A in compressed rows.
     band, linear, symmetric : int, bool, bool, with PIVOTS
@@ -63,15 +64,17 @@ cdef class Chain:
     cdef double start_relative
     cdef bint busy
     cdef Newton newton
+    cdef int steps
     cdef object pivoting                                # Pivoting
     cdef bint linear
     cdef object order, rng, prepared
     cdef int split, first_look
 
-    def __init__(self, Data data, start, double start_relative, Newton newton=None, Data matrix=None, int band=0,
-                 bint linear=False, bint symmetric=True, int split=0, bint exact=False, int first_look=0):
+    def __init__(self, Data data, start, double start_relative, Newton newton=None, int steps=STEPS,
+                 Data matrix=None, int band=0, bint linear=False, bint symmetric=True, int split=0, bint exact=False, int first_look=0):
         self.data, self.start, self.start_relative = data, start, start_relative
         self.newton, self.linear, self.split, self.first_look = newton, linear, split, first_look
+        self.steps = steps if steps < STEPS else STEPS
         if newton is not None:
             self.kind = VELOCITIES
         elif matrix is not None:
@@ -86,7 +89,7 @@ cdef class Chain:
     def run(self, impulse, double tol, bint look, double warm):
         """From `impulse` (m,) [N s], or from `start` where it is None: (what the judge finds, what was done).
 
-        look: is `impulse` a solution? And where its residual is above `warm`, pivots start from `start`. None where it
+        look: something else comes next. Is `impulse` a solution? And where its residual is above `warm`, pivots start from `start`. None where it
         does not end below tol, or another thread is here.
 
         What was done is None where `impulse` is the solution, else counts: of newton (steps, factorisations, updates,
@@ -98,12 +101,12 @@ cdef class Chain:
         self.busy = True
         try:
             if self.kind == VELOCITIES:
-                return self.descend(impulse, tol)
+                return self.descend(impulse, tol, self.steps if look else STEPS)
             return self.look_and_solve(impulse, tol, look, warm)
         finally:
             self.busy = False
 
-    cdef descend(self, impulse, double tol):
+    cdef descend(self, impulse, double tol, int steps):
         cdef double[::1] lam
         cdef int32_t i, end, m = self.data.blocks.n_rows
         cdef bint cold = True
@@ -115,7 +118,7 @@ cdef class Chain:
                 if lam[i] != 0.0:
                     cold = bool(np.array_equal(own, self.start))
                     break
-        newton.aim(tol, STEPS)
+        newton.aim(tol, steps)
         with nogil:
             end = newton.go(&lam[0], cold)
         if end != DONE:
@@ -123,7 +126,7 @@ cdef class Chain:
         found = Judged(self.data, own)
         if not found.relative <= tol:
             return None
-        return found, (STEPS - newton.f.steps, newton.f.factorisations, newton.f.updates, newton.f.rounds,
+        return found, (steps - newton.f.steps, newton.f.factorisations, newton.f.updates, newton.f.rounds,
                        newton.f.evaluations)
 
     cdef look_and_solve(self, impulse, double tol, bint look, double warm):
