@@ -50,6 +50,11 @@ NEWTON_ROW = {"linear": 150.0, "lcp": 150.0, "cone": 300.0, "coulomb": 300.0}  #
 BODIES_START, BODIES_STEP, BODIES_ROW = 150e3, 8e3, 190.0  # of `newton` over bodies under a convex law
 DENSE, DENSE_ENTRY = 0.03, 3.0  # for each multiply-add of a dense factor, and for each entry of its matrix
 BAND = 0.4  # of a band's
+# `direct` on few bounded rows, in compiled code, shifted and refined where A is singular: a call and its rounds, each a
+# row and a factor.
+FEW_START, FEW_ROUNDS = 45e3, 9.0
+FEW_PIVOT = 2e3  # of `lemke`, of whose time a call is most there
+DIRECT_KEY = "direct"  # of that, in `Exact.key`
 BLOCK, PANEL = 0.35, 0.2  # of one over bodies, by block rows and by panels
 SPARSE = 100.0  # for each nonzero of a sparse factor's matrix,
 SPARSE_ROWS = 1000.0  # as many times more as it has thousands of rows: fill grows with the size
@@ -288,10 +293,17 @@ def finite_least(problem: Problem) -> float:
     """What no finite solver costs less than [ns]."""
     if problem.law == "linear" or (problem.law == "lcp" and (problem.m <= FEW or problem.is_symmetric)):
         m = problem.m
+        if m <= FEW and problem.law == "lcp":
+            return few_direct(m)
         width = 3.0 if problem.matrix is None else max(3.0, 0.5 * len(problem._compressed[1]) / m)
         return START["direct"] + DIRECT[problem.law] * (STEP["direct"] + ROW * m + BAND * m * width * width)
     start, step, row = newton_rates(problem)
     return start + NEWTON[problem.law] * (step + row * problem.m)
+
+
+def few_direct(m: int) -> float:
+    """`direct` on so many bounded rows, up to FEW [ns]."""
+    return FEW_START + FEW_ROUNDS * (ROW * m + BAND * m**3 / 6.0)
 
 
 def newton_rates(problem: Problem) -> tuple[float, float, float]:
@@ -332,7 +344,15 @@ class Costs:
     @property
     def cheapest(self) -> float:
         """Of the finite solvers that did not give up [ns]."""
+        if self.few_bounded:
+            return few_direct(self.problem.m)
         return next((e.cost for e in self.exact if e.key not in self.ended), self.exact[0].cost)
+
+    @property
+    def few_bounded(self) -> bool:
+        """Few bounded rows: nothing costs less than `direct`, and it did not give up."""
+        p = self.problem
+        return p.law == "lcp" and p.m <= FEW and p.generalized is None and DIRECT_KEY not in self.ended
 
     def glance(self, sweeps: int) -> float:
         """A first look at so many sweeps [ns]."""
@@ -365,6 +385,8 @@ class Costs:
     def guess(self) -> float:
         """What the cheapest finite solver hardly costs less than [ns], without looking closer."""
         p = self.problem
+        if self.few_bounded:
+            return few_direct(p.m)
         if not self._direct_takes:
             start, step, row = newton_rates(p)
             most = start + self._newton_count * (step + row * p.m)  # whatever the factor costs
@@ -427,7 +449,8 @@ class Costs:
             entries = PIVOT_ENTRY * float(p.m + capped) ** 2
             # It goes on where it stood: twice the pivots expected, and small problems for longer.
             limit = 2 * p.m + int(TAIL_TIME / entries)
-            found.append(Exact("lemke", START["lemke"] + p.m * (PIVOT + entries), limit))
+            pivot = PIVOT if p.m > FEW else FEW_PIVOT
+            found.append(Exact("lemke", START["lemke"] + p.m * (pivot + entries), limit))
         if self.largest:
             count = 2 * int(GENERAL_COUNT[p.law]) + GENERAL_TAIL[p.law]
             cost = self.over_velocities
@@ -455,6 +478,8 @@ class Costs:
 
     def _direct(self, factor: float, times: float = 1.0) -> float:
         p = self.problem
+        if p.law == "lcp" and p.m <= FEW:
+            return few_direct(p.m)
         return self._finite(
             "direct", times * DIRECT[p.law], factor * (1.0 if p.is_symmetric else UNSYMMETRIC)
         )

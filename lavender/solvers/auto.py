@@ -39,6 +39,7 @@ from lavender.residuals import reference
 from lavender.solution import Claim, Status
 from lavender.solvers._at_once import HASTY, JOINTS, factor_first
 from lavender.solvers._costs import (
+    DIRECT_ROUNDS,
     FEW_JOINTS,
     FIRST_LOOK,
     ISLAND,
@@ -130,6 +131,8 @@ class Auto:
         trail.offer(impulse)
         if first is not None:
             note(trail, first.chosen, first.claim, first.impulse, first.before)
+        if few and problem.law == "lcp":
+            trail.gave_up(HASTY.key, trail.best)  # that was it
         if claim is not None:
             trail.add("newton", claim)
             trail.begun = True
@@ -224,6 +227,8 @@ def _solve(trail: Trail, budget: int, glance: Glance | None = None) -> None:
             return
         if sweeps.run(budget):
             return
+    if costs.few_bounded and whole(trail, Exact("direct", 0.0, DIRECT_ROUNDS), budget):
+        return
     least = costs.cheapest
     if least > 2.0 * ISLAND and _worth_apart(trail, least, together) and _apart(trail, budget):
         return

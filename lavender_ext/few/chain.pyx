@@ -71,7 +71,8 @@ cdef class Chain:
     cdef int split, first_look
 
     def __init__(self, Data data, start, double start_relative, Newton newton=None, int steps=STEPS,
-                 Data matrix=None, int band=0, bint linear=False, bint symmetric=True, int split=0, bint exact=False, int first_look=0):
+                 Data matrix=None, int band=0, bint linear=False, bint symmetric=True, int split=0,
+                 bint exact=False, int first_look=0):
         self.data, self.start, self.start_relative = data, start, start_relative
         self.newton, self.linear, self.split, self.first_look = newton, linear, split, first_look
         self.steps = steps if steps < STEPS else STEPS
@@ -89,8 +90,8 @@ cdef class Chain:
     def run(self, impulse, double tol, bint look, double warm):
         """From `impulse` (m,) [N s], or from `start` where it is None: (what the judge finds, what was done).
 
-        look: something else comes next. Is `impulse` a solution? And where its residual is above `warm`, pivots start from `start`. None where it
-        does not end below tol, or another thread is here.
+        look: something else comes next. Is `impulse` a solution? And where its residual is above `warm`, pivots start
+        from `start`. None where it does not end below tol, or another thread is here.
 
         What was done is None where `impulse` is the solution, else counts: of newton (steps, factorisations, updates,
         rounds, evaluations); of pivots (rounds, whether swept, refinements, factorisations, pivots); of sweeps

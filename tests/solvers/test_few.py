@@ -161,3 +161,19 @@ def test_round_cones_are_never_solved_over_rows_of_a():
     # What it cannot take further ends as a result, not in a solver that reads past such a block.
     hard = lv.prepare(problem, "auto").solve(tol=1e-15)
     assert np.isfinite(hard.residual.relative) and not hard.contradicted
+
+
+@pytest.mark.parametrize("seed", [40, 97, 6044, 6081])
+def test_newton_over_few_velocities_makes_way_for_sweeps(seed):
+    """Forests under Coulomb's law on which newton takes more steps than it has: every way to a solution is one."""
+    problem = suite.wild(seed=seed).problem
+    assert problem.generalized is not None
+    short = check(problem, "auto", tol=1e-6)
+    assert short.success
+    assert short.message.startswith("newton ")
+    assert " -> anderson " in short.message
+    assert set(short.work) >= {"factorisations", "sweeps"}
+    (together,) = lv.solve_many([replace(problem, copy=False)])
+    assert facts(together) == facts(short)
+    limited = lv.solve(replace(problem, copy=False), time_limit=10.0)
+    assert facts(limited) == facts(short), "a limit chooses nothing"

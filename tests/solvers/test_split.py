@@ -196,7 +196,7 @@ def alone(part, law, start, tol, options):
     if part.generalized is not None:
         if law in ("lcp", "coulomb"):
             nv = part.generalized.nv
-            _, row, factor, _, _, counts = GENERAL_GATE
+            _, row, factor, _, _, counts, *_ = GENERAL_GATE
             at = lv.problem.LAWS.index(part.law)
             one = row[at] * part.m + factor[at] * nv * float(nv * nv) / (
                 3.0 if part.law == "coulomb" else 6.0
