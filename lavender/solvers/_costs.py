@@ -50,11 +50,11 @@ NEWTON_ROW = {"linear": 150.0, "lcp": 150.0, "cone": 300.0, "coulomb": 300.0}  #
 BODIES_START, BODIES_STEP, BODIES_ROW = 150e3, 8e3, 190.0  # of `newton` over bodies under a convex law
 DENSE, DENSE_ENTRY = 0.03, 3.0  # for each multiply-add of a dense factor, and for each entry of its matrix
 BAND = 0.4  # of a band's
-# `direct` on few bounded rows, in compiled code, shifted and refined where A is singular: a call and its rounds, each a
-# row and a factor.
+# `direct` on few bounded rows, in compiled code, with one shift where A is singular: a call and its rounds, each a row
+# and a factor.
 FEW_START, FEW_ROUNDS = 45e3, 9.0
 FEW_PIVOT = 2e3  # of `lemke`, of whose time a call is most there
-DIRECT_KEY = "direct"  # of that, in `Exact.key`
+HASTY_KEY = "direct False"  # of that, in `Exact.key`: it gives up where one shift is stuck
 BLOCK, PANEL = 0.35, 0.2  # of one over bodies, by block rows and by panels
 SPARSE = 100.0  # for each nonzero of a sparse factor's matrix,
 SPARSE_ROWS = 1000.0  # as many times more as it has thousands of rows: fill grows with the size
@@ -352,7 +352,7 @@ class Costs:
     def few_bounded(self) -> bool:
         """Few bounded rows: nothing costs less than `direct`, and it did not give up."""
         p = self.problem
-        return p.law == "lcp" and p.m <= FEW and p.generalized is None and DIRECT_KEY not in self.ended
+        return p.law == "lcp" and p.m <= FEW and p.generalized is None and HASTY_KEY not in self.ended
 
     def glance(self, sweeps: int) -> float:
         """A first look at so many sweeps [ns]."""
@@ -478,7 +478,7 @@ class Costs:
 
     def _direct(self, factor: float, times: float = 1.0) -> float:
         p = self.problem
-        if p.law == "lcp" and p.m <= FEW:
+        if self.few_bounded:
             return few_direct(p.m)
         return self._finite(
             "direct", times * DIRECT[p.law], factor * (1.0 if p.is_symmetric else UNSYMMETRIC)

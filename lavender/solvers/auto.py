@@ -1,11 +1,12 @@
 """The only solver that hands over to others: each in its turn, by what it would cost from here on.
 
     linear            direct, newton
-    few rows          a symmetric linear system or LCP, or one of a narrow band: direct, in one call (`_few.py`) where
-                      that is the end; else a glance at sweeps (`_sweepers.py`) before anything is counted, and on
+    few rows          linear or bounded: direct, in one call (`_few.py`), as more of a narrow band (`_at_once.py`),
+                      where that is the end; else a glance at sweeps (`_sweepers.py`) before anything is counted, and on
                       as below
-    J and M           newton over the velocities at once where that costs next to nothing; else it is one of the
-                      finite solvers below, beside those that form A
+    J and M           newton over the velocities at once where that costs next to nothing, few rows under Coulomb's law
+                      in some steps, then with a glance at sweeps; else it is one of the finite solvers below, beside
+                      those that form A
     others            a finite solver at once where its factor costs less than sweeps usually do; else anderson
                       as long as what it still needs, by its contraction so far, costs less than the cheapest
                       finite solver (direct, newton, lemke, admm, as the law allows); then that one, with twice the
@@ -25,7 +26,7 @@ certificate that it has no solution. The message and `work` say what ran.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from time import perf_counter
 from typing import Any
 
@@ -35,13 +36,13 @@ from lavender._arrays import FloatArray, IntArray
 from lavender.certificates import check_certificate
 from lavender.problem import OPERATORS, Problem
 from lavender.registry import FEW, SolverSpec
-from lavender.residuals import reference
+from lavender.residuals import judged, reference
 from lavender.solution import Claim, Status
 from lavender.solvers._at_once import HASTY, JOINTS, factor_first
 from lavender.solvers._costs import (
-    DIRECT_ROUNDS,
     FEW_JOINTS,
     FIRST_LOOK,
+    GENERAL_STEPS,
     ISLAND,
     Costs,
     Exact,
@@ -51,7 +52,7 @@ from lavender.solvers._costs import (
     is_loose,
     together_cost,
 )
-from lavender.solvers._few import AUTO, said
+from lavender.solvers._few import AUTO, WARM, said
 from lavender.solvers._islands import restrict, rows_of
 from lavender.solvers._newton import general
 from lavender.solvers._race import race
@@ -114,8 +115,7 @@ class Auto:
             kernel = general.prepare(problem)
             largest = 0 if kernel is None else kernel.largest
             if kernel is not None and general_first(problem, largest):
-                steps = general_steps(problem, kernel.islands)
-                claim = general.run(problem, kernel, lam, min(n, steps), tol, time_limit)
+                claim = _over_velocities(problem, kernel, lam, n, tol, deadline)
                 if claim.status is Status.CONVERGED:
                     impulse[:] = lam
                     return general.named(claim, "auto")
@@ -131,8 +131,6 @@ class Auto:
         trail.offer(impulse)
         if first is not None:
             note(trail, first.chosen, first.claim, first.impulse, first.before)
-        if few and problem.law == "lcp":
-            trail.gave_up(HASTY.key, trail.best)  # that was it
         if claim is not None:
             trail.add("newton", claim)
             trail.begun = True
@@ -164,13 +162,37 @@ class Auto:
         return Claim(status, trail.iterations, trail.work, message, certificate=trail.certificate)
 
 
+def _over_velocities(
+    problem: Problem, kernel: Any, impulse: FloatArray, n: int, tol: float, deadline: float
+) -> Claim:
+    """Newton's method as it comes first, from an impulse (m,) in place; few rows go on where few steps came close."""
+
+    def run(steps: int) -> Claim:
+        left = None if np.isinf(deadline) else max(deadline - perf_counter(), 1e-3)
+        return general.run(problem, kernel, impulse, steps, tol, left)
+
+    claim = run(min(n, general_steps(problem, kernel.islands)))
+    more = min(n, GENERAL_STEPS[problem.law]) - claim.iterations
+    if claim.status is not Status.MAX_ITERATIONS or more <= 0:
+        return claim
+    if not judged(problem, impulse.copy()).relative <= WARM:
+        return claim
+    again = run(more)
+    work = _sum_of(claim, again)
+    return replace(again, iterations=claim.iterations + again.iterations, work=work)
+
+
 def _then(first: Claim, second: Claim) -> Claim:
     """Of two solvers, one after the other."""
+    message = f"{first.message} -> {second.message}"
+    return Claim(second.status, first.iterations + second.iterations, _sum_of(first, second), message)
+
+
+def _sum_of(first: Claim, second: Claim) -> dict[str, int]:
     work = dict(first.work)
     for kind, count in second.work.items():
         work[kind] = work.get(kind, 0) + count
-    message = f"{first.message} -> {second.message}"
-    return Claim(second.status, first.iterations + second.iterations, work, message)
+    return work
 
 
 # -- the plan ---------------------------------------------------------------------------------------
@@ -227,7 +249,7 @@ def _solve(trail: Trail, budget: int, glance: Glance | None = None) -> None:
             return
         if sweeps.run(budget):
             return
-    if costs.few_bounded and whole(trail, Exact("direct", 0.0, DIRECT_ROUNDS), budget):
+    if costs.few_bounded and whole(trail, HASTY, budget):
         return
     least = costs.cheapest
     if least > 2.0 * ISLAND and _worth_apart(trail, least, together) and _apart(trail, budget):
