@@ -19,10 +19,10 @@ from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
-import scipy.sparse.linalg as spla
 from scipy.sparse import csgraph
 
 from lavender._arrays import FloatArray, as_array
+from lavender._lu import sparse_lu
 from lavender.cones import CONTACT, ROW, Cones
 from lavender.errors import CapabilityError, InputError
 from lavender.io.npz import compressed
@@ -158,13 +158,13 @@ def _factor(matrix: sp.csr_array, label: np.ndarray, budget: Budget) -> Callable
     dense = ENTRY * int(size @ size)
     try:
         if dense <= budget.left:
-            return spla.splu(sp.csc_matrix(matrix)).solve
+            return sparse_lu(matrix).solve
         order = csgraph.reverse_cuthill_mckee(sp.csr_array(matrix), symmetric_mode=False)
         permuted = sp.coo_array(matrix[order][:, order])
         off = permuted.row.astype(np.int64) - permuted.col
         width = 2 * int(off.max(initial=0)) - int(off.min(initial=0)) + 1
         budget.spend(ENTRY * n * min(width, n), "the factors of M")
-        factor = spla.splu(sp.csc_matrix(permuted), permc_spec="NATURAL")
+        factor = sparse_lu(permuted, permc_spec="NATURAL")
     except RuntimeError as error:
         raise InputError(f"M cannot be factorised ({error}); an invertible M is needed") from None
     back = np.argsort(order)

@@ -19,6 +19,7 @@ import scipy.sparse as sp
 from scipy.linalg import lapack
 
 from lavender._arrays import FloatArray, IntArray
+from lavender._lu import sparse_lu
 from lavender.problem import Problem
 from lavender_ext.pivot import principal
 
@@ -156,21 +157,19 @@ class LUFactor:
         self.lu: Any = (lu, pivot)
         if info != 0:
             return n_free
-        return int(np.count_nonzero(np.abs(np.diagonal(lu)) <= tiny))
+        return int(np.count_nonzero(~(np.abs(np.diagonal(lu)) > tiny)))
 
     def _factor_sparse(self, shift: float, tiny: float) -> int:
-        from scipy.sparse.linalg import splu
-
         a = sp.csc_array(self.a[self.free][:, self.free])
         if shift > 0.0:
             a = sp.csc_array(a + shift * sp.eye_array(len(self.free)))
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
-                self.lu = splu(a)
+                self.lu = sparse_lu(a)
         except RuntimeError:  # exactly singular
             return len(self.free)
-        return int(np.count_nonzero(np.abs(self.lu.U.diagonal()) <= tiny))
+        return int(np.count_nonzero(~(np.abs(self.lu.U.diagonal()) > tiny)))
 
     def solve(self, rhs: FloatArray) -> FloatArray:
         if len(rhs) == 0:
@@ -212,12 +211,10 @@ class GeneralFactor:
             self.lu = (lu, pivot)
 
     def _factor_sparse(self, a: sp.csc_array) -> None:
-        from scipy.sparse.linalg import splu
-
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
-                self.lu = splu(a)
+                self.lu = sparse_lu(a)
             pivot = np.abs(self.lu.U.diagonal())
         except RuntimeError:  # exactly singular
             pivot = np.zeros(1)

@@ -14,7 +14,16 @@ from scipy.linalg import lapack
 from lavender._arrays import FloatArray, IntArray
 from lavender.problem import Problem
 from lavender.solvers._costs import dense_factor, sparse_factor
-from lavender.solvers._factor import SMALL_SIZE, TINY, DenseFactor, Factor, LUFactor, SparseFactor, choose
+from lavender.solvers._factor import (
+    SMALL_SIZE,
+    TINY,
+    DenseFactor,
+    Factor,
+    LUFactor,
+    SparseFactor,
+    choose,
+    permuted_band,
+)
 from lavender_ext.pivot.principal import INDEFINITE, ROUNDS, SMALL, SOLVED, STUCK, Pivoting
 
 HALVINGS = 41  # step lengths tried in a line search: 1, 1/2, ... 2^-40
@@ -37,7 +46,8 @@ class PivotState:
         self.symmetric = problem.is_symmetric
         self.factor: Factor | None = None
         if self.symmetric:
-            known = like.chosen if like is not None and _same_pattern(like.problem, problem) else None
+            kept = like is not None and like.symmetric and _same_pattern(like.problem, problem)
+            known = like.chosen if kept and like is not None else None
             self.chosen = choose(problem) if known is None else known
             self.form, band, order = self.chosen
             if self.form != "band":
@@ -59,7 +69,7 @@ class PivotState:
                 self.seconds, SPARSE * len(problem._compressed[1]) * (1.0 + problem.m / SPARSE_ROWS)
             )
         if not self.symmetric:
-            self.seconds *= 2.0
+            self.seconds = 2.0 * (max(self.seconds, _filled(problem)) if self.is_sparse else self.seconds)
         self.factorisations = self.exchanged = self.searches = 0  # by Python
 
     @property
@@ -244,6 +254,16 @@ class PivotState:
             scale = 1.0 / np.sqrt(d)
             return int(lapack.dpstrf(scale[:, None] * self.problem.dense() * scale, tol=TINY)[2])
         return m - self.factor.factor(np.arange(m, dtype=np.int32), m, 1e-10, 1e-8)
+
+
+def _filled(problem: Problem) -> float:
+    """Of LU [s] as wide as an order of small bandwidth leaves it: what entries alone do not tell, fill is."""
+    from scipy.sparse.csgraph import reverse_cuthill_mckee
+
+    a = problem.csr
+    order = reverse_cuthill_mckee(a, symmetric_mode=False).astype(np.int32)
+    width = float(permuted_band(problem, order) + 1)
+    return DENSE * problem.m * min(width * width, problem.m**2 / 3.0)
 
 
 def _same_pattern(p: Problem, q: Problem) -> bool:

@@ -18,9 +18,9 @@ from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
-from scipy.sparse.linalg import splu
 
 from lavender._arrays import FloatArray
+from lavender._lu import sparse_lu
 from lavender.errors import InputError
 from lavender.problem import Problem
 from lavender.registry import SolverSpec
@@ -136,7 +136,7 @@ class AdmmState:
                 ) from None
         if self.kind == _GENERAL:
             try:
-                lu = splu(sp.csc_array(self.matrix + self.rho * sp.eye_array(m)))
+                lu = sparse_lu(self.matrix + self.rho * sp.eye_array(m))
             except RuntimeError as error:
                 raise _Failed(f"A + rho D has no LU factors at rho = {self.rho:.1e}: {error}") from None
             lower, upper = _columns(lu.L), _columns(lu.U)

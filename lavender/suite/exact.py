@@ -16,9 +16,9 @@ from math import fsum
 
 import numpy as np
 import scipy.sparse as sp
-import scipy.sparse.linalg as spla
 
 from lavender._arrays import FloatArray, IntArray
+from lavender._lu import sparse_lu
 from lavender.cones import ROW
 from lavender.errors import InputError
 from lavender.problem import Problem
@@ -256,6 +256,6 @@ def _solvers(a: sp.csc_matrix) -> Iterator[Callable[[FloatArray], FloatArray]]:
             yield lambda r, inverse=inverse: d * (inverse @ (d * r))  # type: ignore[misc]
         return
     try:
-        yield spla.splu(a).solve
+        yield sparse_lu(a).solve
     except RuntimeError as error:
         raise InputError(f"the rows cannot be factorised ({error})") from None

@@ -377,7 +377,7 @@ cdef public int32_t lav_pivot_rounds(pivoting_t* s, int32_t rounds) noexcept nog
             lav_pivot_factor(s)
         if s.found.negative > 0:
             return INDEFINITE
-        if s.found.small > 0 and s.shift == 0.0:
+        if s.found.small > 0 and (s.shift == 0.0 or s.swap != NULL):
             return SMALL
         lav_pivot_correct(s)
         lav_pivot_slack(s)

@@ -15,7 +15,7 @@ ROOT = Path(__file__).resolve().parent.parent.parent
 LEVELS = [
     {"_version", "_built"},
     {"errors"},
-    {"_arrays", "_derived", "apart"},
+    {"_arrays", "_derived", "_lu", "apart"},
     {"cones"},
     {"generalized", "rows"},
     {"problem"},

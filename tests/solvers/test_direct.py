@@ -10,8 +10,11 @@ from random_problems import as_matrix, random_contact_problem, random_lcp, seeds
 
 import lavender as lv
 from lavender import suite
+from lavender._lu import sparse_lu
 from lavender.certificates import check_certificate
+from lavender.solvers._pivoting import PivotState
 from lavender_ext.pivot import principal
+from lavender_ext.pivot.principal import SMALL
 
 
 def accurate(solution):
@@ -266,6 +269,67 @@ def test_asymmetric_rows_whose_exchanges_go_round_in_circles_are_stalled():
     solution = lv.solve(circle, "direct")
     assert solution.success or "circles" in solution.message
     assert not solution.contradicted
+
+
+def skew(seed, m=120, density=2.0):
+    """A sparse A = -A^T: a zero diagonal, and principal submatrices that are singular whatever their entries are."""
+    rng = np.random.default_rng(seed)
+    k = sp.random_array((m, m), density=density / m, rng=rng, data_sampler=rng.standard_normal)
+    return sp.csr_array(k - k.T), rng.standard_normal(m)
+
+
+def test_superlu_is_not_asked_where_no_entries_would_do():
+    """It writes outside its arrays there: a process that had 442 of these ended in a segmentation fault."""
+    a = sp.csr_array(([1.0, 1.0, 1.0], ([0, 1, 2], [0, 0, 0])), (3, 3))
+    with pytest.raises(RuntimeError, match="singular"):
+        sparse_lu(a)
+    assert sparse_lu(sp.csr_array([[0.0, 2.0], [4.0, 0.0]])).solve(np.array([2.0, 4.0])).tolist() == [
+        1.0,
+        1.0,
+    ]
+    for seed in range(20):
+        a, b = skew(seed)
+        solution = lv.solve(lv.Problem.lcp(a, b, -1.0, 1.0), "direct")
+        assert not solution.contradicted
+        assert solution.residual.relative <= 1.0
+        full = sp.csr_array(
+            a + sp.coo_array((np.ones(120), (np.arange(120), np.zeros(120, int))), (120, 120))
+        )
+        for solver in ("direct", "auto"):
+            assert not lv.solve(lv.Problem.linear(full, b), solver).contradicted
+
+
+@pytest.mark.parametrize("m", [2, 70])
+@pytest.mark.parametrize("make", [lv.Problem.lcp, lv.Problem.linear])
+def test_a_prepared_factorisation_follows_symmetry(make, m):
+    a = np.eye(m) + np.full((m, m), 0.5)
+    turned = a.copy()
+    turned[0, 1] = 0.25
+    for first, then in ((turned, a), (a, turned)):
+        prepared = lv.prepare(make(first, np.ones(m)), "direct")
+        prepared.solve()
+        after = prepared.solve(make(then, np.ones(m)))
+        fresh = lv.prepare(make(then, np.ones(m)), "direct").solve()
+        assert (after.solver.form, dict(after.work)) == (fresh.solver.form, dict(fresh.work))
+        assert after.impulse.tobytes() == fresh.impulse.tobytes()
+
+
+@pytest.mark.parametrize("m", [3, 70])
+def test_a_shifted_matrix_that_is_singular_is_found_to_be(m):
+    a = np.eye(m)
+    a[:2, :2] = [[-1e-10, 1.0], [0.0, -1e-10]]  # singular with a shift of 1e-10
+    state = PivotState(lv.Problem.lcp(a, np.ones(m), -np.inf, 1e9))
+    state.rows.start(1e-10)
+    assert state.rounds(4) == (SMALL, 1)
+    assert np.isfinite(state.rows.x).all()
+
+
+def test_the_first_lu_of_what_fills_is_expected_to_take_long():
+    a, b = skew(1, 3000, 3.0)
+    scattered = PivotState(lv.Problem.lcp(sp.csr_array(a + sp.eye_array(3000)), b))
+    band = sp.diags_array([np.ones(2999), np.full(3000, 3.0), np.full(2999, 0.5)], offsets=[-1, 0, 1])
+    narrow = PivotState(lv.Problem.lcp(sp.csr_array(band), b))
+    assert scattered.seconds > 20.0 * narrow.seconds
 
 
 def test_refusals_and_indefinite_matrices():

@@ -19,9 +19,9 @@ from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
-import scipy.sparse.linalg as ssl
 
 from lavender._arrays import FloatArray
+from lavender._lu import sparse_lu
 from lavender.solvers._newton.interior_point import InteriorPoint
 from lavender.solvers._newton.polish import polish
 from lavender.solvers._newton.row_steps import refined
@@ -110,7 +110,7 @@ class AugmentedSystem(System):
         if not np.isfinite(matrix.data).all():
             return False
         try:
-            self.lu = ssl.splu(sp.csc_array(matrix))
+            self.lu = sparse_lu(matrix)
         except RuntimeError:
             return False
         self.matrix = sp.csr_array(matrix)

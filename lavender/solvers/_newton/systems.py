@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
-import scipy.sparse.linalg as ssl
 from scipy.linalg.lapack import dgetrf as getrf
 from scipy.linalg.lapack import dgetrs as getrs
 from scipy.linalg.lapack import dpbtrf as pbtrf
@@ -24,6 +23,7 @@ from scipy.linalg.lapack import dpotrf as potrf
 from scipy.linalg.lapack import dpotrs as potrs
 
 from lavender._arrays import FloatArray, IntArray
+from lavender._lu import sparse_lu
 from lavender.problem import Problem
 from lavender.solvers._newton.pattern import block_pattern, dissected, postordered
 from lavender.solvers._newton.row_steps import RowSteps
@@ -412,7 +412,7 @@ class MatrixSystem(System):
             return False
         start = perf_counter()
         try:
-            factor = ssl.splu(sp.csc_array(matrix), permc_spec="COLAMD")
+            factor = sparse_lu(matrix, permc_spec="COLAMD")
         except RuntimeError:
             return False
         self.took(start)
