@@ -54,7 +54,9 @@ BAND = 0.4  # of a band's
 # and a factor.
 FEW_START, FEW_ROUNDS = 45e3, 9.0
 FEW_PIVOT = 2e3  # of `lemke`, of whose time a call is most there
-HASTY_KEY = "direct False"  # of that, in `Exact.key`: it gives up where one shift is stuck
+HASTY_KEY = (
+    "direct False"  # `Exact.key` of that (HASTY of `_at_once.py`): it gives up where one shift is stuck
+)
 BLOCK, PANEL = 0.35, 0.2  # of one over bodies, by block rows and by panels
 SPARSE = 100.0  # for each nonzero of a sparse factor's matrix,
 SPARSE_ROWS = 1000.0  # as many times more as it has thousands of rows: fill grows with the size
@@ -128,8 +130,8 @@ TREE = 1.05  # neighbours of a body, in the mean, up to which bodies form trees
 TINY_FACTOR = 20e3  # ns, below which a factor is not looked at more closely
 LOOKS = 4  # at so many sweeps
 # Steps that it then has, beside those that are expected of each island but one; under Coulomb's law, where it ends soon
-# or late, as many as in one compiled call. Of few rows
-# it ends within fewer, or takes twice as many and more where sweeps cost little.
+# or late, as many as in one compiled call. Of few rows it ends within fewer, or takes twice as many and more where
+# sweeps cost little.
 GENERAL_STEPS = {"linear": 256, "lcp": 256, "cone": 256, "coulomb": 64}
 FEW_STEPS = 16
 # All that `general_first` and `general_steps` read, for a compiled loop over many problems.

@@ -46,9 +46,8 @@ class PivotState:
         self.symmetric = problem.is_symmetric
         self.factor: Factor | None = None
         if self.symmetric:
-            kept = like is not None and like.symmetric and _same_pattern(like.problem, problem)
-            known = like.chosen if kept and like is not None else None
-            self.chosen = choose(problem) if known is None else known
+            same = like is not None and like.symmetric and _same_pattern(like.problem, problem)
+            self.chosen = like.chosen if like is not None and same else choose(problem)
             self.form, band, order = self.chosen
             if self.form != "band":
                 band = -1

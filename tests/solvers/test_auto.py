@@ -9,7 +9,8 @@ from random_problems import as_matrix, random_contact_problem, random_lcp, seeds
 import lavender as lv
 from lavender import registry, suite
 from lavender.solvers import _turns
-from lavender.solvers._costs import Costs
+from lavender.solvers._at_once import HASTY
+from lavender.solvers._costs import HASTY_KEY, Costs
 from lavender.solvers._islands import islands, restrict, rows_of
 from lavender.solvers._trail import Trail
 
@@ -396,3 +397,7 @@ def test_a_body_of_huge_inverse_inertia_is_refused_by_no_solver():
     solution = lv.solve(problem, "admm")
     assert solution.status in (lv.Status.NUMERICAL_ERROR, lv.Status.CONVERGED)
     lv.solve(problem, "auto")
+
+
+def test_costs_know_the_hasty_factor_by_its_key():
+    assert HASTY.key == HASTY_KEY
