@@ -97,9 +97,11 @@ class Few:
         if kind == VELOCITIES:
             return general.named(general.claim(Status.CONVERGED, counts), self.name)
         if kind == PIVOTS:
-            done, swept, refined, factored, exchanged = counts
+            done, swept, refined, factored, exchanged, shifts, rank = counts
             named = {
                 "sweeps": 4 * swept,
+                "rank": rank,
+                "shifts": shifts,
                 "refinements": refined,
                 "factorisations": factored,
                 "pivots": exchanged,
@@ -108,6 +110,8 @@ class Few:
             if self.name == "direct":
                 symmetric = problem.is_symmetric
                 note = "A is not symmetric" if problem.law == "linear" and not symmetric else ""
+                if rank:
+                    note = f"A is singular, rank {rank} of {problem.m}"
                 return Claim(Status.CONVERGED, done, work, note, form="band" if symmetric else "LU")
             return Claim(Status.CONVERGED, done, work, said("direct", work))
         done, sweeps, restarts = counts

@@ -1,7 +1,8 @@
 """Problems of few rows: look, solve and judge in one call, with what is prepared kept from one call to the next.
 
     velocities   newton on J and M, from the impulse given                              (generalized/newton.pxd)
-    pivots       the factor of a symmetric A, linear or boxed, and its refinement       (pivot/principal.pyx)
+    pivots       the factor of A, linear or boxed, with a shift where a linear one is singular, and its refinement
+                                                                                        (pivot/principal.pyx)
     sweeps       the first look of accelerated sweeps                                   (accelerate/accelerated.pyx)
 
 The same kernels in the same order as the solvers call them on any problem, so the same bits and counts. What does not
@@ -21,6 +22,8 @@ from lavender_ext.judge.watch import Watch
 from lavender_ext.local import gauss_seidel
 from lavender_ext.pivot.principal import SOLVED, Pivoting
 
+SHIFT = 1e-10                   # of d, as `direct` has it
+
 
 cpdef enum:                     # kinds
     VELOCITIES = 0
@@ -32,6 +35,7 @@ cdef enum:
     PIVOT_SWEEPS = 2            # that guess the free rows
     PIVOT_ROUNDS = 32
     CORRECTIONS = 100           # refinements
+    PASSES = 100                # around the last answer, where A is singular
     MEMORY = 5                  # sweeps that are combined
     PATIENCE = 500              # of their watch
 
@@ -66,7 +70,7 @@ cdef class Chain:
     cdef Newton newton
     cdef int steps
     cdef object pivoting                                # Pivoting
-    cdef bint linear
+    cdef bint linear, symmetric
     cdef object order, rng, prepared
     cdef int split, first_look
 
@@ -75,6 +79,7 @@ cdef class Chain:
                  bint exact=False, int first_look=0):
         self.data, self.start, self.start_relative = data, start, start_relative
         self.newton, self.linear, self.split, self.first_look = newton, linear, split, first_look
+        self.symmetric = symmetric
         self.steps = steps if steps < STEPS else STEPS
         if newton is not None:
             self.kind = VELOCITIES
@@ -94,8 +99,8 @@ cdef class Chain:
         from `start`. None where it does not end below tol, or another thread is here.
 
         What was done is None where `impulse` is the solution, else counts: of newton (steps, factorisations, updates,
-        rounds, evaluations); of pivots (rounds, whether swept, refinements, factorisations, pivots); of sweeps
-        (iterations, sweeps, restarts).
+        rounds, evaluations); of pivots (rounds, whether swept, refinements, factorisations, pivots, shifts, rank of a
+        singular linear system or 0); of sweeps (iterations, sweeps, restarts).
         """
         if self.busy:
             return None
@@ -155,8 +160,10 @@ cdef class Chain:
         code, swept = SOLVED, False
         if self.linear:
             small, negative = rows.factor_all()
-            if small or negative:
+            if negative or (small and not self.symmetric):
                 return None
+            if small:
+                return self.shifted(own, tol, None, 0, 0, self.data.blocks.n_rows - small)
             rows.solve_free()
         else:
             code, swept = rows.solve(own, PIVOT_SWEEPS, PIVOT_ROUNDS)
@@ -176,9 +183,53 @@ cdef class Chain:
                 found = self.judged(rows)
                 if found.relative < best.relative:
                     best = found
+        if self.linear and self.symmetric and not is_good(best):
+            return self.shifted(own, tol, best, done, k, 0)
         if not is_good(best) or not best.relative <= tol:
             return None
-        return best, (done, bool(swept), k, rows.factorisations, rows.exchanged)
+        return best, (done, bool(swept), k, rows.factorisations, rows.exchanged, 0, 0)
+
+    cdef shifted(self, own, double tol, Judged best, int done, int k, int rank):
+        """Passes on A + s D around the last answer, which `best` or `own` is, all rows free; `rank`: 0, or what it is.
+
+        As `direct` does where A is singular; given up where a pass does not halve the residual.
+        """
+        cdef Judged found
+        cdef double previous, reference = 1.0 / 0.0, least = 1.0 / 0.0
+        rows = self.pivoting
+        rows.x[:] = own if best is None or best.floor > 1e-6 else best.impulse
+        if best is not None:
+            least = best.relative
+        for _ in range(PASSES):
+            rows.recenter()
+            if not rows.shift:
+                rows.start(SHIFT)
+            rows.restart()
+            before = rows.n_rounds
+            if rows.rounds(1) != SOLVED:
+                return None
+            done += rows.n_rounds - before
+            found = self.judged(rows)
+            previous = 1.0 / 0.0
+            while True:
+                if found.relative < least:
+                    best, least = found, found.relative
+                if best is None:
+                    return None                         # not a number
+                if is_good(best) or k == CORRECTIONS or not found.relative < 0.5 * previous:
+                    break
+                previous = found.relative
+                rows.recenter()
+                rows.slack()
+                rows.correct()
+                k += 1
+                found = self.judged(rows)
+            if is_good(best) or not least <= 0.5 * reference:
+                break
+            reference = least
+        if not is_good(best) or not least <= tol:
+            return None
+        return best, (done, False, k, rows.factorisations, rows.exchanged, 1, rank)
 
     cdef judged(self, rows):
         x = np.empty(self.data.blocks.n_rows)

@@ -48,6 +48,10 @@ def draw(kind, seed):
         g = rng.normal(size=(9, 9))
         a = g @ g.T if rng.random() < 0.6 else g
         return lv.Problem.linear(a, rng.normal(size=9))
+    if kind == "singular":
+        g = rng.normal(size=(9, 9 - seed % 4)) * 10.0 ** rng.uniform(0.0, seed % 3, (9, 1))
+        a = g @ g.T
+        return lv.Problem.linear(0.5 * (a + a.T), a @ rng.normal(size=9) if seed % 5 else rng.normal(size=9))
     if kind == "one-sided":  # unsymmetric
         return lv.Problem.lcp(
             rng.normal(size=(6, 6)) + 6.0 * np.eye(6),
@@ -68,8 +72,8 @@ def draw(kind, seed):
 
 
 KINDS = (
-    "lcp", "linear", "one-sided", "rows coulomb", "rows cone", "matrix coulomb", "matrix cone", "general coulomb",
-    "general cone",
+    "lcp", "linear", "singular", "one-sided", "rows coulomb", "rows cone", "matrix coulomb", "matrix cone",
+    "general coulomb", "general cone",
 )  # fmt: skip
 
 
@@ -105,6 +109,18 @@ def test_most_of_them_do_take_the_short_way():
         for seed in range(6):
             took += registry.get("auto").few.solve(draw(kind, seed), None, 1e-6) is not None
     assert took >= 0.6 * 6 * len(KINDS)  # a chain that gives everything up would pass the tests above
+
+
+@pytest.mark.parametrize("solver", ["auto", "direct"])
+def test_few_joints_that_depend_on_each_other_are_one_shifted_factor_more(solver):
+    g = np.random.default_rng(4).normal(size=(12, 7))
+    a = g @ g.T
+    problem = lv.Problem.linear(0.5 * (a + a.T), a @ np.ones(12))
+    assert registry.get(solver).few.solve(problem, None, 1e-9) is not None
+    found = check(problem, solver, tol=1e-9)
+    assert found.success
+    assert found.work["rank"] == 7
+    assert (found.work["factorisations"], found.work["shifts"]) == (2, 1)
 
 
 def test_a_late_solution_is_a_solution():
