@@ -99,7 +99,7 @@ class Accelerated(Sweeping):
         """n iterations, or fewer where a check ends them."""
         o, data = state.order, state.data
         if state.first and (data.factored or data.is_general):
-            measure.velocity_change(data, impulse, state.space[-1])
+            measure.velocity_change(data, impulse, state.space[3])
         status, done, sweeps, restarts = accelerated.run(
             data, state.watch, impulse, n, tol, state.memory, state.prepared, state.exact, state.convex,
             state.space, o.blocks, o.split, o.mode, o.rng, self._keeps,

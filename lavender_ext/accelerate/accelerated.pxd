@@ -5,6 +5,7 @@ from lavender_ext.core.block cimport blocks_t
 from lavender_ext.core.csr cimport csr_t
 from lavender_ext.core.generalized cimport generalized_t
 from lavender_ext.core.rows cimport rows_t
+from lavender_ext.sweep.packed cimport packed_t
 
 
 cdef struct sweep_data_t:
@@ -29,6 +30,9 @@ cdef struct sweep_data_t:
     double* control             # (CONTROL) of accelerate/mixing.pxd
     double* gram                # (MAX_MEMORY, MAX_MEMORY)
     double* work                # nncg 3 (m + nv); anderson (4 + 2 memory) m
+    const packed_t* packed      # contacts of rows in pairs, level by level, where not exact; else NULL
+    int32_t backwards           # the order is turned round since they were packed
+    double* padded              # (m + BEHIND) with them
 
 
 cdef void anderson_step(void* context, double* lam, int32_t first_sweep, int32_t n) noexcept nogil

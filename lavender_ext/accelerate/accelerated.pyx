@@ -15,7 +15,7 @@ order.
 where contacts stick, its answer is Coulomb's.
 """
 from libc.math cimport fabs, sqrt
-from libc.stdint cimport int32_t, uint64_t
+from libc.stdint cimport int32_t, int64_t, uint64_t
 
 import numpy as np
 
@@ -23,12 +23,14 @@ from lavender_ext.accelerate.accelerated cimport sweep_data_t
 from lavender_ext.accelerate.mixing cimport CONTROL, MAX_MEMORY, UNDONE, forget, mix, mixing_t, take
 from lavender_ext.core.block cimport CONE, CONTACT_SPIN, ROW, blocks_t, clip, n_tangents, norm2
 from lavender_ext.core.generalized cimport whitened_gather
-from lavender_ext.core.order cimport SYMMETRIC, advance_order
+from lavender_ext.core.order cimport RANDOM, SYMMETRIC, advance_order
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.rows cimport relax_rows_block
 from lavender_ext.core.velocity cimport rows_velocity
 from lavender_ext.judge.watch cimport CONVERGED, RUNNING, Watch
 from lavender_ext.local.gauss_seidel cimport solve_csr_block, solve_general_block, solve_rows_block
+from lavender_ext.sweep.levels cimport BEHIND, pack_levels, set_behind, sweep_levels
+from lavender_ext.sweep.packed cimport ROOM_BODY, ROOM_CONTACT, ROOM_MORE, packed_t, packs
 from lavender_ext.sweep.pgs cimport relax_csr_block, relax_general_block
 
 cdef enum:
@@ -39,12 +41,16 @@ cdef enum:                      # places in control of nncg
     RESTARTS = 1                # p dropped
 
 
-cdef inline void sweep(const sweep_data_t* c, double* lam, int32_t first) noexcept nogil:
-    cdef const blocks_t* p = &c.cone if c.turn < c.convex else c.blocks
+cdef inline void sweep(sweep_data_t* c, double* lam, int32_t first) noexcept nogil:
+    cdef const blocks_t* p = c.blocks
     cdef int32_t i, q, k, exact = c.exact or c.turn < c.convex
+    if c.turn < c.convex:
+        p = &c.cone
     for k in range(2 if c.mode == SYMMETRIC else 1):
         advance_order(c.mode, first and k == 0, c.order, 0, c.split, c.rng)
         advance_order(c.mode, first and k == 0, c.order, c.split, p.n_blocks, c.rng)
+        if c.mode == SYMMETRIC and not (first and k == 0):
+            c.backwards = 1 - c.backwards
         if c.general != NULL:
             for q in range(p.n_blocks):
                 i = c.order[q]
@@ -60,6 +66,8 @@ cdef inline void sweep(const sweep_data_t* c, double* lam, int32_t first) noexce
                 for q in range(p.n_blocks):
                     i = c.order[q]
                     solve_csr_block(p, c.csr, i, c.g + c.start[i], lam)
+        elif c.packed != NULL and not exact:
+            sweep_levels(p, c.rows, c.order, c.packed, c.backwards, lam, c.v)
         elif not exact:
             for q in range(p.n_blocks):
                 relax_rows_block(p, c.rows, c.order[q], lam, c.v)
@@ -67,6 +75,24 @@ cdef inline void sweep(const sweep_data_t* c, double* lam, int32_t first) noexce
             for q in range(p.n_blocks):
                 i = c.order[q]
                 solve_rows_block(p, c.rows, i, c.g + c.start[i], lam, c.v)
+
+
+cdef inline double* swept(const sweep_data_t* c, double* lam) noexcept nogil:
+    """Where sweeps have their impulse: lam (m), or a copy of it with those of nobody behind."""
+    cdef int32_t i
+    if c.packed == NULL:
+        return lam
+    for i in range(c.blocks.n_rows):
+        c.padded[i] = lam[i]
+    set_behind(c.padded, c.blocks.n_rows)
+    return c.padded
+
+
+cdef inline void show(const sweep_data_t* c, const double* y, double* lam) noexcept nogil:
+    cdef int32_t i
+    if y != lam:
+        for i in range(c.blocks.n_rows):
+            lam[i] = y[i]
 
 
 cdef inline void form_velocity(const sweep_data_t* c, const double* lam) noexcept nogil:
@@ -118,28 +144,64 @@ cdef inline double energy(const double* d, const double* x, const double* y, int
     return (s0 + s1) + (s2 + s3)
 
 
+cdef inline double step_energy(const double* d, double* x, const double* y, int32_t m) noexcept nogil:
+    """x <- x - y; x.D x of that, summed as `energy`."""
+    cdef double s0 = 0.0, s1 = 0.0, s2 = 0.0, s3 = 0.0
+    cdef int32_t i = 0
+    while i + 4 <= m:
+        x[i] -= y[i]
+        x[i + 1] -= y[i + 1]
+        x[i + 2] -= y[i + 2]
+        x[i + 3] -= y[i + 3]
+        s0 += d[i] * x[i] * x[i]
+        s1 += d[i + 1] * x[i + 1] * x[i + 1]
+        s2 += d[i + 2] * x[i + 2] * x[i + 2]
+        s3 += d[i + 3] * x[i + 3] * x[i + 3]
+        i += 4
+    while i < m:
+        x[i] -= y[i]
+        s0 += d[i] * x[i] * x[i]
+        i += 1
+    return (s0 + s1) + (s2 + s3)
+
+
+cdef inline void follow(double* y, double* x, double* p, double beta, int32_t n) noexcept nogil:
+    """p <- beta p - x, then y <- y + beta p of before and x <- y, in one pass."""
+    cdef int32_t i
+    cdef double q
+    for i in range(n):
+        q = beta * p[i]
+        p[i] = q - x[i]
+        q = y[i] + q
+        y[i] = q
+        x[i] = q
+
+
 cdef public void lav_nncg(sweep_data_t* c, double* lam, int32_t first_sweep, int32_t n) noexcept nogil:
     """n iterations of (1)."""
     cdef int32_t m = c.blocks.n_rows, i, s
     cdef double* x = c.work                             # x, then g; behind lam's part that of v
     cdef double* q = c.work + m + c.nv                  # beta p, to be added
     cdef double* p = q + m + c.nv
+    cdef double* y = swept(c, lam)
     cdef double* control = c.control
     cdef const double* d = c.blocks.d
-    cdef double norm, beta
+    cdef double norm, beta = 0.0
     for s in range(n):
         if c.turn > 0 and c.turn % REFRESH == 0:
-            form_velocity(c, lam)
-        for i in range(m):
-            lam[i] += q[i]
-            x[i] = lam[i]
-        for i in range(c.nv):
-            c.v[i] += q[m + i]
-            x[m + i] = c.v[i]
-        sweep(c, lam, first_sweep and s == 0)
-        for i in range(m):
-            x[i] -= lam[i]
-        norm = energy(d, x, x, m)
+            form_velocity(c, y)
+        if s > 0:
+            follow(y, x, p, beta, m)
+            follow(c.v, x + m, p + m, beta, c.nv)
+        else:
+            for i in range(m):
+                y[i] += q[i]
+                x[i] = y[i]
+            for i in range(c.nv):
+                c.v[i] += q[m + i]
+                x[m + i] = c.v[i]
+        sweep(c, y, first_sweep and s == 0)
+        norm = step_energy(d, x, y, m)
         for i in range(c.nv):
             x[m + i] -= c.v[i]
         beta = norm / control[NORM] if control[NORM] > 0.0 else 0.0
@@ -153,9 +215,11 @@ cdef public void lav_nncg(sweep_data_t* c, double* lam, int32_t first_sweep, int
         c.turn += 1
         if c.turn == c.convex:
             control[NORM] = 0.0                         # another map: start anew
+    if n > 0:
         for i in range(m + c.nv):
             q[i] = beta * p[i]
             p[i] = q[i] - x[i]
+    show(c, y, lam)
 
 
 cdef public void lav_anderson(sweep_data_t* c, double* lam, int32_t first_sweep, int32_t n) noexcept nogil:
@@ -163,6 +227,7 @@ cdef public void lav_anderson(sweep_data_t* c, double* lam, int32_t first_sweep,
     cdef int32_t m = c.blocks.n_rows, i, s, mixed
     cdef double* x = c.work                             # x, later f
     cdef const double* d = c.blocks.d
+    cdef double* y = swept(c, lam)
     cdef double* root                                   # (m) square roots of d
     cdef mixing_t mixing
     mixing.m = m
@@ -178,21 +243,22 @@ cdef public void lav_anderson(sweep_data_t* c, double* lam, int32_t first_sweep,
         for i in range(m):
             root[i] = sqrt(d[i])
     for s in range(n):
-        mixed = mix(&mixing, lam)
+        mixed = mix(&mixing, y)
         if mixed:
             for i in range(c.blocks.n_blocks):
-                project_block(c.blocks, i, lam)
-            form_velocity(c, lam)
+                project_block(c.blocks, i, y)
+            form_velocity(c, y)
         for i in range(m):
-            x[i] = lam[i]
-        sweep(c, lam, first_sweep and s == 0)
+            x[i] = y[i]
+        sweep(c, y, first_sweep and s == 0)
         for i in range(m):
-            x[i] = root[i] * (lam[i] - x[i])
-        if not take(&mixing, mixed, lam, x):
-            form_velocity(c, lam)
+            x[i] = root[i] * (y[i] - x[i])
+        if not take(&mixing, mixed, y, x):
+            form_velocity(c, y)
         c.turn += 1
         if c.turn == c.convex:
             forget(&mixing)                             # another map
+    show(c, y, lam)
 
 
 cdef void nncg_step(void* context, double* lam, int32_t first_sweep, int32_t n) noexcept nogil:
@@ -203,13 +269,48 @@ cdef void anderson_step(void* context, double* lam, int32_t first_sweep, int32_t
     lav_anderson(<sweep_data_t*>context, lam, first_sweep, n)
 
 
+cdef enum:
+    FEWEST = 24                 # contacts: below, a sweep costs less than to look for pairs
+    FIRST = 16                  # sweeps of a run that packs, with all before: packing costs two to four
+    LEAST_WIDTH = 2             # contacts of a level on average: fewer, and pairs would stand half empty
+
+
+cdef class Pairs:
+    """Contacts of rows in pairs, level by level, for accelerated sweeps in a fixed order; made once these are many.
+
+    wanted : without it none are made, and the bits are the same.
+    """
+    cdef packed_t packed
+    cdef object keep
+    cdef bint asked, ready
+    cdef int32_t backwards
+
+    def __init__(self, bint wanted=True):
+        self.asked = not wanted
+
+    cdef void make(self, Data p, const int32_t[::1] order, int split, int mode, const double* lam):
+        cdef Py_ssize_t c = p.rows.n_contacts
+        cdef double[::1] room
+        self.asked = True
+        self.backwards = 0
+        if mode == RANDOM or not p.factored or c < FEWEST or split != p.rows.n_joints or not packs(&p.blocks, &p.rows):
+            return
+        self.keep = room = np.empty(ROOM_CONTACT * c + ROOM_BODY * p.rows.n_bodies + ROOM_MORE + p.blocks.n_rows + BEHIND)
+        self.ready = pack_levels(&p.blocks, &p.rows, &order[0], LEAST_WIDTH, &room[0], lam, &self.packed)
+
+    @property
+    def count(self):
+        """Pairs; 0 where contacts are swept one after the other."""
+        return self.packed.pairs if self.ready else 0
+
+
 def allocate(Data p, int memory):
-    """Zeroed (control, gram, work, v) for a run; memory 0 is nncg."""
+    """Zeroed (control, gram, work, v) for a run, and its pairs; memory 0 is nncg."""
     cdef Py_ssize_t m = p.blocks.n_rows, nv = p.general.n if p.is_general else 6 * p.rows.n_bodies if p.factored else 0
     if not 0 <= memory <= MAX_MEMORY:
         raise ValueError(f"memory is {memory}; 0 to {MAX_MEMORY} is needed")
     return (np.zeros(CONTROL), np.zeros(MAX_MEMORY * MAX_MEMORY), np.zeros(3 * (m + nv) + (1 + 2 * memory) * m + 1),
-            np.zeros((nv // 6 + 1, 6)))
+            np.zeros((nv // 6 + 2, 6)), Pairs())
 
 
 def run(Data p, Watch watch, double[::1] lam, int n, double tol, int memory, prepared, bint exact, int convex, space,
@@ -224,6 +325,7 @@ def run(Data p, Watch watch, double[::1] lam, int n, double tol, int memory, pre
     cdef double[::1] control = space[0], gram = space[1], work = space[2], g
     cdef double[:, ::1] v = space[3]
     cdef int32_t[::1] start
+    cdef Pairs pairs = space[4]
     if lam.shape[0] == 0:
         if tol > 0.0:
             return CONVERGED, 0, 0, 0
@@ -251,9 +353,18 @@ def run(Data p, Watch watch, double[::1] lam, int n, double tol, int memory, pre
     c.rng = &rng[0]
     c.v = &v[0, 0]
     c.nv = p.general.n if p.is_general else 6 * p.rows.n_bodies if p.factored else 0
+    c.packed = NULL
+    c.padded = NULL
+    if not exact and not pairs.asked and c.turn + <int64_t>n >= FIRST:
+        pairs.make(p, order, split, mode, &lam[0])
+    if pairs.ready:
+        c.packed = &pairs.packed
+        c.padded = pairs.packed.behind
+    c.backwards = pairs.backwards
     c.control = &control[0]
     c.gram = &gram[0]
     c.work = &work[0]
     with nogil:
         status = watch.run(nncg_step if memory == 0 else anderson_step, &c, &lam[0], n, tol, &done)
+    pairs.backwards = c.backwards
     return status, done, done * (2 if mode == SYMMETRIC else 1), int(control[RESTARTS if memory == 0 else UNDONE])

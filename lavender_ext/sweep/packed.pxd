@@ -41,7 +41,7 @@ cdef enum:                      # one record, in pairs
     ROOM_BODY = 7
     ROOM_MORE = 16
     SLOTS = 32768               # more than there are slots: level // SLOTS is the stage, the rest the slot
-    MOST = 20000                # contacts; more records than a second-level cache holds gain nothing
+    MOST = 32767                # contacts, below SLOTS; with twice as many records in memory little is gained
 
 
 cdef inline int32_t packs(const blocks_t* p, const rows_t* r) noexcept nogil:
@@ -138,14 +138,14 @@ cdef inline void pack_contacts(const blocks_t* p, const rows_t* r, int32_t c, in
             place[2 * k + 1] = 6 * <int64_t>(r.n_bodies if k < 2 else r.n_bodies + 1)
 
 
-cdef inline void relax_pair(pair_t* c, double* v, const int64_t* to_a, const int64_t* to_b) noexcept nogil:
-    """relax_contact of core/rows.pxd for two tangents without spin, operation by operation in each lane."""
+cdef inline void relax_pair(const pair_t* c, pair_t* lam, double* v, const int64_t* to_a,
+                            const int64_t* to_b) noexcept nogil:
+    """relax_contact of core/rows.pxd for two tangents without spin, operation by operation in each lane; lam (3)."""
     cdef const int64_t* place = <const int64_t*>(c + R_PLACE)
     cdef const double* v0 = v + place[0]
     cdef const double* v1 = v + place[LANES - 1]
     cdef double* x0
     cdef double* x1
-    cdef pair_t* lam = c + R_IMPULSE
     cdef const pair_t* n = c + R_NORMAL
     cdef const pair_t* t1 = c + R_TANGENT
     cdef const pair_t* t2 = c + R_TANGENT_2
@@ -235,7 +235,7 @@ cdef inline void relax_due(pair_t* c, double* v, int32_t pass_, int32_t sweeps, 
             kept[3 * l + k] = lam[LANES * k + l]
     if n == 0:
         return
-    relax_pair(c, v, to, to + LANES)
+    relax_pair(c, c + R_IMPULSE, v, to, to + LANES)
     for l in range(LANES):
         if not live[l]:
             for k in range(3):
@@ -380,7 +380,7 @@ cdef inline void sweep_records(const blocks_t* p, const rows_t* r, const int32_t
                 x += RECORD
         else:
             for _i in range(packed.pairs):
-                relax_pair(x, body, <const int64_t*>(x + R_PLACE) + 2 * LANES,
+                relax_pair(x, x + R_IMPULSE, body, <const int64_t*>(x + R_PLACE) + 2 * LANES,
                            <const int64_t*>(x + R_PLACE) + 3 * LANES)
                 x += RECORD
 

@@ -174,7 +174,7 @@ def swept(part, law, start, before, tol, options, least, hope):
     lam = start.copy()
     given, o, step, total = before, state.order, first, 0
     if data.factored or data.is_general:
-        velocity_change(data, lam, state.space[-1])
+        velocity_change(data, lam, state.space[3])
     while True:
         status, last, *_ = accelerated.run(
             data, state.watch, lam, step, tol, 5, state.prepared, state.exact, 0, state.space, o.blocks, o.split,
