@@ -130,11 +130,9 @@ TREE = 1.05  # neighbours of a body, in the mean, up to which bodies form trees
 TINY_FACTOR = 20e3  # ns, below which a factor is not looked at more closely
 LOOKS = 4  # at so many sweeps
 # Steps that it then has, beside those that are expected of each island but one; under Coulomb's law, where it ends soon
-# or late, as many as in one compiled call. Of few rows it ends within fewer, or takes twice as many and more where
-# sweeps cost little.
+# or late, as many as in one compiled call.
 GENERAL_STEPS = {"linear": 256, "lcp": 256, "cone": 256, "coulomb": 64}
-FEW_STEPS = 16
-# All that `general_first` and `general_steps` read, for a compiled loop over many problems.
+# All that `general_first` reads, for a compiled loop over many problems.
 GENERAL_GATE = (
     GENERAL_START,
     tuple(GENERAL_ROW[law] for law in LAWS),
@@ -142,8 +140,6 @@ GENERAL_GATE = (
     GENERAL_FIRST,
     FORM,
     tuple(GENERAL_COUNT[law] for law in LAWS),
-    FEW,
-    FEW_STEPS,
 )
 # Steps over generalised velocities that are granted beside twice those expected.
 GENERAL_TAIL = {"linear": 60, "lcp": 60, "cone": 60, "coulomb": 0}
@@ -226,7 +222,7 @@ def general_steps(problem: Problem, islands: int) -> int:
     """Steps that Newton's method over generalised velocities has before another solver is asked."""
     law = problem.law
     if law == "coulomb":
-        return FEW_STEPS if problem.m <= FEW else GENERAL_STEPS[law]
+        return GENERAL_STEPS[law]
     return GENERAL_STEPS[law] + int(GENERAL_COUNT[law]) * (islands - 1)
 
 

@@ -15,7 +15,7 @@ from lavender.problem import Problem
 from lavender.registry import FEW
 from lavender.residuals import reference
 from lavender.solution import Claim, Status
-from lavender.solvers._costs import GENERAL_GATE, first_look, general_first, general_steps, sweep_cost
+from lavender.solvers._costs import GENERAL_GATE, first_look, general_first, sweep_cost
 from lavender.solvers._newton import general
 from lavender_ext.few.chain import PIVOTS, SWEEPS, VELOCITIES, Chain
 from lavender_ext.few.many import Gate, solve_first
@@ -45,7 +45,7 @@ def _make(problem: Problem) -> Chain | None:
         kernel = general.prepare(problem)
         if kernel is None or not general_first(problem, kernel.largest):
             return None
-        return Chain(data, start, relative, newton=kernel, steps=general_steps(problem, kernel.islands))
+        return Chain(data, start, relative, newton=kernel)
     if problem.cones.has_round:
         return None
     law = problem.law

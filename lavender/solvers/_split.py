@@ -35,7 +35,7 @@ __all__ = ["solve_together"]
 
 LARGEST = 2000  # rows of an island that is solved so
 # What Newton's method may cost in an island of J and M [ns]: there is no other there.
-GATE = Gate((*GENERAL_GATE[:3], 1e7, 0.0, GENERAL_GATE[5], 0, 0))
+GATE = Gate((*GENERAL_GATE[:3], 1e7, 0.0, GENERAL_GATE[5]))
 ENTRIES = 100  # of A for each row, up to which it is formed for pivots where bodies are given
 COUNTS: dict[
     int, tuple[str, tuple[tuple[str, int, int], ...]]

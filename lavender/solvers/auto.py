@@ -26,7 +26,7 @@ certificate that it has no solution. The message and `work` say what ran.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from time import perf_counter
 from typing import Any
 
@@ -36,13 +36,12 @@ from lavender._arrays import FloatArray, IntArray
 from lavender.certificates import check_certificate
 from lavender.problem import OPERATORS, Problem
 from lavender.registry import FEW, SolverSpec
-from lavender.residuals import judged, reference
+from lavender.residuals import reference
 from lavender.solution import Claim, Status
 from lavender.solvers._at_once import HASTY, JOINTS, factor_first
 from lavender.solvers._costs import (
     FEW_JOINTS,
     FIRST_LOOK,
-    GENERAL_STEPS,
     ISLAND,
     Costs,
     Exact,
@@ -52,7 +51,7 @@ from lavender.solvers._costs import (
     is_loose,
     together_cost,
 )
-from lavender.solvers._few import AUTO, WARM, said
+from lavender.solvers._few import AUTO, said
 from lavender.solvers._islands import restrict, rows_of
 from lavender.solvers._newton import general
 from lavender.solvers._race import race
@@ -165,21 +164,10 @@ class Auto:
 def _over_velocities(
     problem: Problem, kernel: Any, impulse: FloatArray, n: int, tol: float, deadline: float
 ) -> Claim:
-    """Newton's method as it comes first, from an impulse (m,) in place; few rows go on where few steps came close."""
-
-    def run(steps: int) -> Claim:
-        left = None if np.isinf(deadline) else max(deadline - perf_counter(), 1e-3)
-        return general.run(problem, kernel, impulse, steps, tol, left)
-
-    claim = run(min(n, general_steps(problem, kernel.islands)))
-    more = min(n, GENERAL_STEPS[problem.law]) - claim.iterations
-    if claim.status is not Status.MAX_ITERATIONS or more <= 0:
-        return claim
-    if not judged(problem, impulse.copy()).relative <= WARM:
-        return claim
-    again = run(more)
-    work = _sum_of(claim, again)
-    return replace(again, iterations=claim.iterations + again.iterations, work=work)
+    """Newton's method as it comes first, from an impulse (m,) in place."""
+    left = None if np.isinf(deadline) else max(deadline - perf_counter(), 1e-3)
+    steps = min(n, general_steps(problem, kernel.islands))
+    return general.run(problem, kernel, impulse, steps, tol, left)
 
 
 def _then(first: Claim, second: Claim) -> Claim:

@@ -31,7 +31,7 @@ cpdef enum:                     # kinds
     SWEEPS = 2
 
 cdef enum:
-    STEPS = 64                  # of newton; fewer where sweeps come next
+    STEPS = 64                  # of newton
     PIVOT_SWEEPS = 2            # that guess the free rows
     PIVOT_ROUNDS = 32
     CORRECTIONS = 100           # refinements
@@ -51,8 +51,8 @@ cdef class Chain:
         Pi(0), read-only.
     start_relative : float
         Relative residual of `start`.
-    newton, steps : Newton, int, with VELOCITIES
-        Steps that it has where something else comes next.
+    newton : Newton, with VELOCITIES
+        Over generalised velocities.
     matrix : Data, with PIVOTS
         Of A in compressed rows.
     band, linear, symmetric : int, bool, bool, with PIVOTS
@@ -68,19 +68,17 @@ cdef class Chain:
     cdef double start_relative
     cdef bint busy
     cdef Newton newton
-    cdef int steps
     cdef object pivoting                                # Pivoting
     cdef bint linear, symmetric
     cdef object order, rng, prepared
     cdef int split, first_look
 
-    def __init__(self, Data data, start, double start_relative, Newton newton=None, int steps=STEPS,
-                 Data matrix=None, int band=0, bint linear=False, bint symmetric=True, int split=0,
-                 bint exact=False, int first_look=0):
+    def __init__(self, Data data, start, double start_relative, Newton newton=None, Data matrix=None,
+                 int band=0, bint linear=False, bint symmetric=True, int split=0, bint exact=False,
+                 int first_look=0):
         self.data, self.start, self.start_relative = data, start, start_relative
         self.newton, self.linear, self.split, self.first_look = newton, linear, split, first_look
         self.symmetric = symmetric
-        self.steps = steps if steps < STEPS else STEPS
         if newton is not None:
             self.kind = VELOCITIES
         elif matrix is not None:
@@ -107,12 +105,12 @@ cdef class Chain:
         self.busy = True
         try:
             if self.kind == VELOCITIES:
-                return self.descend(impulse, tol, self.steps if look else STEPS)
+                return self.descend(impulse, tol)
             return self.look_and_solve(impulse, tol, look, warm)
         finally:
             self.busy = False
 
-    cdef descend(self, impulse, double tol, int steps):
+    cdef descend(self, impulse, double tol):
         cdef double[::1] lam
         cdef int32_t i, end, m = self.data.blocks.n_rows
         cdef bint cold = True
@@ -124,7 +122,7 @@ cdef class Chain:
                 if lam[i] != 0.0:
                     cold = bool(np.array_equal(own, self.start))
                     break
-        newton.aim(tol, steps)
+        newton.aim(tol, STEPS)
         with nogil:
             end = newton.go(&lam[0], cold)
         if end != DONE:
@@ -132,7 +130,7 @@ cdef class Chain:
         found = Judged(self.data, own)
         if not found.relative <= tol:
             return None
-        return found, (steps - newton.f.steps, newton.f.factorisations, newton.f.updates, newton.f.rounds,
+        return found, (STEPS - newton.f.steps, newton.f.factorisations, newton.f.updates, newton.f.rounds,
                        newton.f.evaluations)
 
     cdef look_and_solve(self, impulse, double tol, bint look, double warm):

@@ -21,8 +21,6 @@ cdef struct gate_t:             # what Newton's method may cost [ns] to be asked
     double most
     double form                 # of a multiply-add of A
     double count[4]             # factorisations by law
-    int32_t few                 # rows up to which Coulomb's law has
-    int32_t steps               # no more steps than so many
 
 
 cdef struct job_t:

@@ -23,7 +23,7 @@ from lavender_ext.judge.score cimport are_numbers, relative, score_rows, score_t
 
 
 cdef enum:
-    STEPS = 64                  # of newton; of few rows under Coulomb's law what the gate says
+    STEPS = 64                  # of newton
     AT_A_TIME = 256             # problems between two looks for Ctrl-C
 
 
@@ -71,7 +71,7 @@ cdef void solve_job(job_t* j, space_t* space, const gate_t* gate, double tol, do
 cdef void solve_made(job_t* j, space_t* space, const gate_t* gate, double tol, double most) noexcept nogil:
     cdef flow_t f
     cdef need_t need
-    cdef int32_t m = j.p.n_rows, end, i, steps = STEPS
+    cdef int32_t m = j.p.n_rows, end, i
     cdef bint cold = j.cold
     if j.made.n_empty:
         return
@@ -102,13 +102,11 @@ cdef void solve_made(job_t* j, space_t* space, const gate_t* gate, double tol, d
                 if j.lam[i] != j.both[i]:
                     cold = False
                     break
-    if j.law == 2 and m <= gate.few and gate.steps < steps:
-        steps = gate.steps
-    aim_at(&f, tol, steps, j.begin[0], j.begin[1])
-    end = descend_all(&f, j.lam, cold, 1e-4)
+    aim_at(&f, tol, STEPS, j.begin[0], j.begin[1])
+    end = descend_all(&f, j.lam, cold)
     if end != DONE:
         return
-    j.counts[0] = steps - f.steps
+    j.counts[0] = STEPS - f.steps
     j.counts[1] = f.factorisations
     j.counts[2] = f.updates
     j.counts[3] = f.rounds
@@ -145,15 +143,14 @@ cdef class Gate:
 
     Parameters
     ----------
-    gate : tuple (start, rows, factors, most, form, counts, few, steps) or None
+    gate : tuple (start, rows, factors, most, form, counts) or None
         None: whatever it costs.
     """
 
     def __init__(self, gate):
         self.at.is_open = gate is None
-        self.at.few = 0
         if gate is not None:
-            (self.at.start, rows, factors, self.at.most, self.at.form, counts, self.at.few, self.at.steps) = gate
+            (self.at.start, rows, factors, self.at.most, self.at.form, counts) = gate
             for i in range(4):
                 self.at.row[i], self.at.factor[i] = rows[i], factors[i]
                 self.at.count[i] = counts[i]

@@ -8,8 +8,10 @@ With y = D^1/2 L (v - v*), whitened, s = Y y - b, and the answer lambda(s) of so
 
 Without Coulomb friction G is the gradient of a convex function with kinks in its second derivative, N is symmetric,
 and t is where the derivative along p vanishes (Todorov 2014; Castro et al. 2022): it ends in a few steps. rho (2)
-is nothing where the problem's own theta is no less than 1e-6 d; below, and between tangents that differ, it is a
-proximal term about the centre c, which follows lambda (Rockafellar 1976), and the limit is the problem given.
+is nothing where the problem's own theta is no less than 1e-6 d, 1e-3 d on contacts, where kinks are sharp; below, and
+between tangents that differ, it is a proximal term about the centre c, which follows lambda (Rockafellar 1976), and the
+limit is the problem given. It begins the larger the further steps lead astray: 1e-4 d where nothing rubs, 1e-3 d
+under the cone law, 3e-2 d under Coulomb's (docs/auto.md).
 
 Coulomb's law has no such function. Newton's method goes on from the convex relaxation's answer with the derivative
 that lacks symmetry, as long as |G| falls; where it does not, normals are lowered by phi = mu |w_t| + mu r |w_s| (3)
@@ -51,6 +53,7 @@ cdef struct flow_t:
     blocks_t p                  # a copy: its law is that of the convex problem while one is solved
     const generalized_t* g
     int32_t law                 # of the problem
+    double share                # of d, that rho is at first
     int32_t n_islands
     const int32_t* iptr         # (n_islands + 1) runs of panels of each island in `run`
     const int32_t* run          # (2 runs) first panel and the one past the last; runs <= n_panels
@@ -637,19 +640,25 @@ cdef inline void follow(const flow_t* f, int32_t island) noexcept nogil:
 
 
 cdef inline void soften(const flow_t* f, int32_t island, double share) noexcept nogil:
-    """theta' of (2): rho is `share` d on rows with less than 1e-6 d of their own; a disk's tangents get the largest."""
+    """theta' of (2): rho is `share` d on rows with less than 1e-6 d of their own, 1e-3 d in contacts.
+
+    A disk's tangents get the largest.
+    """
     cdef int32_t a, i, j, k, nt, end, last
     cdef const double* compliance = f.g.compliance
     cdef const double* d = f.p.d
     cdef double* theta = f.theta
     cdef double* rho = f.rho
     cdef double* soft = f.soft
-    cdef double big, x, low = share if share < 1e-6 else 1e-6
+    cdef double big, x, low
     for a in range(f.iptr[island], f.iptr[island + 1]):
         last = block_end(f, a)
         for i in range(block_from(f, a), last):
             j = f.p.ptr[i]
             end = f.p.ptr[i + 1]
+            low = 1e-6 if f.p.kind[i] == ROW else 1e-3
+            if share < low:
+                low = share
             for k in range(j, end):
                 x = compliance[k]
                 if not x >= low * d[k]:
@@ -701,11 +710,12 @@ cdef inline int32_t descend(flow_t* f, int32_t island, double goal, double* shar
     """Newton steps under the law of f.p until the error is `goal` times its limits, or nothing moves.
 
     The iterate with the least error stands in `best`, that error in least[0]; `share` of d is the softness of rows
-    without one, lowered where the centre's progress is slow.
+    without one, lowered where the centre's progress is slow. Idle is what does not lower the least error of this
+    descent: the first step of one often leaves a larger one than it began with.
     """
     cdef int32_t a, c, idle = 0, n = 0
     cdef bint square = f.p.law == COULOMB, rigid, stale = True, fresh = True, known = False, moves
-    cdef double energy, velocity, over, t, size, last_center = -1.0, bound
+    cdef double energy, velocity, over, t, size, last_center = -1.0, bound, lowest = 1.0 / 0.0
     cdef double sizes[3]
     sizes[0] = sizes[1] = sizes[2] = -1.0
     soften(f, island, share[0])
@@ -720,8 +730,10 @@ cdef inline int32_t descend(flow_t* f, int32_t island, double goal, double* shar
         over = excess(f, energy, velocity)
         if over != over:
             return LOST
+        if over < lowest:
+            idle = idle if over > 0.9 * lowest else 0
+            lowest = over
         if over < least[0]:
-            idle = idle if over > 0.9 * least[0] else 0
             least[0] = over
             keep(f, island, f.lam, f.best)
         if over <= goal:
@@ -839,8 +851,7 @@ cdef inline bint offer(flow_t* f, int32_t island, const double* lam, double* lea
     return False
 
 
-cdef inline int32_t with_coulomb(flow_t* f, int32_t island, double* impulse, bint cold, double soft,
-                                 double* least) noexcept nogil:
+cdef inline int32_t with_coulomb(flow_t* f, int32_t island, double* impulse, bint cold, double* least) noexcept nogil:
     """Rounds of Newton's method on Coulomb's law, each from the answer of a convex problem."""
     cdef int32_t n, rounds
     cdef double found, share
@@ -849,7 +860,7 @@ cdef inline int32_t with_coulomb(flow_t* f, int32_t island, double* impulse, bin
         if rounds > 0 or cold:
             f.p.law = CONE
             found = 1.0 / 0.0
-            share = soft
+            share = f.share
             n = descend(f, island, 1e-2 * least[0] if least[0] > 1e2 else 1.0, &share, &found)
             if n == LOST or n == FAILED:
                 return n
@@ -863,7 +874,7 @@ cdef inline int32_t with_coulomb(flow_t* f, int32_t island, double* impulse, bin
         restart(f, island, impulse)
         f.p.law = COULOMB
         found = 1.0 / 0.0
-        share = soft
+        share = f.share
         n = descend(f, island, 1.0, &share, &found)
         if n != LOST and offer(f, island, f.best, least):
             keep(f, island, f.best, impulse)
@@ -876,10 +887,10 @@ cdef inline int32_t with_coulomb(flow_t* f, int32_t island, double* impulse, bin
     return STUCK
 
 
-cdef inline int32_t solve_island(flow_t* f, int32_t island, double* impulse, bint cold, double soft) noexcept nogil:
+cdef inline int32_t solve_island(flow_t* f, int32_t island, double* impulse, bint cold) noexcept nogil:
     """One island from `impulse`, into it; how it ended."""
     cdef int32_t end
-    cdef double least = 1.0 / 0.0, share = soft
+    cdef double least = 1.0 / 0.0, share = f.share
     f.island = island
     f.thin = f.lptr != NULL and is_worth(f.cptr[island + 1] - f.cptr[island], f.lptr + f.cptr[island], f.lidx)
     restart(f, island, impulse)
@@ -889,7 +900,7 @@ cdef inline int32_t solve_island(flow_t* f, int32_t island, double* impulse, bin
     if least <= 1.0:
         return DONE
     if f.law == COULOMB:
-        end = with_coulomb(f, island, impulse, cold, soft, &least)
+        end = with_coulomb(f, island, impulse, cold, &least)
         keep(f, island, f.first_best, impulse)
     else:
         end = descend(f, island, 1.0, &share, &least)
@@ -897,7 +908,7 @@ cdef inline int32_t solve_island(flow_t* f, int32_t island, double* impulse, bin
     return end
 
 
-cdef int32_t descend_all(flow_t* f, double* impulse, int32_t cold, double soft) noexcept nogil
+cdef int32_t descend_all(flow_t* f, double* impulse, int32_t cold) noexcept nogil
 
 
 cdef class Newton:

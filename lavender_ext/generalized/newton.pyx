@@ -18,18 +18,18 @@ cdef public int32_t lav_general_islands(const blocks_t* p, const generalized_t* 
     return find_islands(p, g, up, label, iptr, run, cptr, icols, local, pblock, vptr, most)
 
 
-cdef int32_t descend_all(flow_t* f, double* impulse, int32_t cold, double soft) noexcept nogil:
+cdef int32_t descend_all(flow_t* f, double* impulse, int32_t cold) noexcept nogil:
     cdef int32_t i, end, worst = DONE
     for i in range(f.n_islands):
-        end = solve_island(f, i, impulse, cold, soft)
+        end = solve_island(f, i, impulse, cold)
         if end > worst:
             worst = end
     return worst
 
 
-cdef public int32_t lav_general_newton(flow_t* f, double* impulse, int32_t cold, double soft) noexcept nogil:
+cdef public int32_t lav_general_newton(flow_t* f, double* impulse, int32_t cold) noexcept nogil:
     """All islands from `impulse` (m), into it: DONE, or how the worst of them ended."""
-    return descend_all(f, impulse, cold, soft)
+    return descend_all(f, impulse, cold)
 
 
 cdef class Newton:
@@ -62,14 +62,14 @@ cdef class Newton:
         aim_at(&self.f, tol, steps, self.data.start_energy, self.data.start_velocity)
 
     cdef int32_t go(self, double* impulse, bint cold) noexcept nogil:
-        return lav_general_newton(&self.f, impulse, cold, 1e-4)
+        return lav_general_newton(&self.f, impulse, cold)
 
     @property
     def islands(self):
         """Problems that share no velocity."""
         return self.f.n_islands
 
-    def run(self, double[::1] impulse, double tol, int steps, bint cold, double soft=1e-4):
+    def run(self, double[::1] impulse, double tol, int steps, bint cold):
         """At most `steps` Newton steps on impulse (m,), in place; the judge's start must be known to the data.
 
         Returns how it ended (`ENDS`) and (steps, factorisations, updates of N, rounds, evaluations of a line).
@@ -78,5 +78,5 @@ cdef class Newton:
         if self.f.p.n_rows > 0:
             self.aim(tol, steps)
             with nogil:
-                end = lav_general_newton(&self.f, &impulse[0], cold, soft)
+                end = lav_general_newton(&self.f, &impulse[0], cold)
         return end, (steps - self.f.steps, self.f.factorisations, self.f.updates, self.f.rounds, self.f.evaluations)

@@ -179,7 +179,7 @@ def test_round_cones_are_never_solved_over_rows_of_a():
     assert np.isfinite(hard.residual.relative) and not hard.contradicted
 
 
-@pytest.mark.parametrize("seed", [40, 97, 6044, 6081])
+@pytest.mark.parametrize("seed", [246, 6662])
 def test_newton_over_few_velocities_makes_way_for_sweeps(seed):
     """Forests under Coulomb's law on which newton takes more steps than it has: every way to a solution is one."""
     problem = suite.wild(seed=seed).problem
