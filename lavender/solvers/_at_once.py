@@ -12,9 +12,10 @@ from lavender.registry import FEW
 from lavender.residuals import judged, known
 from lavender.solution import Claim
 from lavender.solvers._costs import DIRECT_ROUNDS, Exact, factors_at_once, joints_at_once
+from lavender.solvers._factor import PanelsLU
 from lavender.solvers._few import WARM
 from lavender.solvers._trail import usable
-from lavender.solvers.direct import Direct, Impatient
+from lavender.solvers.direct import Direct, Enough, Impatient
 
 __all__ = ["HASTY", "JOINTS", "Factored", "factor_first"]
 
@@ -38,14 +39,16 @@ def factor_first(
 ) -> Factored | None:
     """`direct` from an impulse (m,), or None where something else comes first.
 
-    Bounded rows of a narrow band; and a symmetric linear system that costs least so (`joints_at_once`).
+    Bounded rows of a narrow band; a symmetric linear system that costs least so (`joints_at_once`), and one that is not
+    and has few entries.
     """
     if problem.m <= FEW or n <= 0 or problem.generalized is not None:
         return None
+    solver: Direct
     if problem.law == "linear":
-        if not (problem.is_symmetric and joints_at_once(problem)):
+        if not (joints_at_once(problem) if problem.is_symmetric else PanelsLU.takes(problem)):
             return None
-        chosen, solver = JOINTS, Direct()
+        chosen, solver = JOINTS, Enough()
     elif factors_at_once(problem):
         chosen, solver = HASTY, Impatient()
     else:

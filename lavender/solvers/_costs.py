@@ -19,7 +19,7 @@ import numpy as np
 from lavender.problem import LAWS, Problem
 from lavender.registry import FEW
 from lavender.solvers._accelerated import sweep_work
-from lavender.solvers._factor import choose
+from lavender.solvers._factor import PanelsLU, choose, panels_cost
 from lavender.solvers._islands import block_bodies
 from lavender.solvers._newton.general import factor_flops
 from lavender.solvers._newton.systems import (
@@ -27,7 +27,6 @@ from lavender.solvers._newton.systems import (
     PANELS,
     MatrixSystem,
     System,
-    VelocitySystem,
     make_system,
 )
 from lavender.solvers._sweeping import reads_whitened
@@ -75,6 +74,7 @@ MANY_STEP, MANY_ROW, MANY_COUNT = 15e3, 110.0, 10.0
 MANY_ROWS = 1000  # rows beyond which that is counted
 GENERAL_FIRST = 0.6e6  # ns of it up to which nothing else is looked at first
 FORM = 1.0  # of each multiply-add of Y Y^T
+FORMED_ROWS = 6.0  # of each entry of A over bodies
 FORMED_START, FORMED = 280e3, 6.0  # of A formed of J and M, and of each of its entries
 ADMM_START, ADMM_ROW, ADMM_ENTRY = (
     500e3,
@@ -116,7 +116,6 @@ SINGULAR = 6.0  # times as many of `direct` where A is singular and one shift do
 # rests on more points than are needed.
 SWEEPS, SWEEPS_REDUNDANT = 60.0, 400.0
 
-FILL = 5.0  # of a factor over rows against one over bodies, for the same unknowns: rows of one body are all neighbours
 ISLAND = 400e3  # what Python takes for an island of its own
 # Islands in compiled code: a call, as it showed in `wild` with them and without; for each island beside its solve, and
 # for each of its rows (`python benchmarks/bench_islands.py`).
@@ -127,7 +126,6 @@ FEW_JOINTS = 300  # rows up to which a linear system is not looked at more close
 NARROW_ENTRIES = 12  # of A in a row up to which a narrow band is looked for
 NARROW = 40  # half bandwidth up to which a band is what `direct` takes
 TREE = 1.05  # neighbours of a body, in the mean, up to which bodies form trees
-TINY_FACTOR = 20e3  # ns, below which a factor is not looked at more closely
 LOOKS = 4  # at so many sweeps
 # Steps that it then has, beside those that are expected of each island but one; under Coulomb's law, where it ends soon
 # or late, as many as in one compiled call.
@@ -261,18 +259,14 @@ def factors_at_once(problem: Problem) -> bool:
 def joints_at_once(problem: Problem) -> bool:
     """A symmetric linear system for `direct`, without a look at what else there is.
 
-    Of few rows; a matrix, of which `newton` makes the same factor; bodies whose band costs less than `newton` without
-    its factor.
+    Of few rows; a matrix, whose factor costs less than the one of `newton`; bodies, by the entries that A can have.
     """
     if problem.m <= FEW_JOINTS or problem.matrix is not None:
         return True
     if problem.rows is None or problem.rows.n_bodies == 0:
         return False
-    width = graph.body_spread(problem.cones.ptr, block_bodies(problem), problem.rows.n_bodies) + 1
-    band = BAND * problem.m * float(width) ** 2
-    direct = START["direct"] + DIRECT["linear"] * (STEP["direct"] + ROW * problem.m + band)
-    start, step, row = newton_rates(problem)
-    return width <= NARROW and direct <= start + NEWTON["linear"] * (step + row * problem.m)
+    costs = Costs(problem, 1e-6)
+    return costs.rows_direct <= costs.newton_guess
 
 
 def is_redundant(problem: Problem) -> bool:
@@ -388,13 +382,13 @@ class Costs:
         if not self._direct_takes:
             start, step, row = newton_rates(p)
             most = start + self._newton_count * (step + row * p.m)  # whatever the factor costs
-            found = most if most > self.sweeping else self._newton_guess
+            found = most if most > self.sweeping else self.newton_guess
         else:
             m = p.m
             width = self._width(m) if p.rows is not None else 0.5 * p.metric.work / max(m, 1)
             stuck = self.redundant or any(key.startswith("direct") for key in self.ended)
             times = SINGULAR if p.law == "lcp" and stuck else 1.0
-            found = min(self._newton_guess, self._direct(BAND * m * max(3.0, width) ** 2, times))
+            found = min(self.newton_guess, self._direct(BAND * m * max(3.0, width) ** 2, times))
         return min(self.formed + found, self.over_velocities)
 
     @cached_property
@@ -413,7 +407,7 @@ class Costs:
         if self.problem.cones.has_round:
             return [e for e in self._others if e.name == "newton"] or [Exact("newton", np.inf, 0)]
         # Newton's system is made only where it may be the cheapest: it costs as much as a small solve.
-        cost = self._newton_guess if self._others_win else self._newton(newton_factor(self.system))
+        cost = self.newton_guess if self._others_win else self._newton(newton_factor(self.system))
         p = self.problem
         form = () if p.generalized is None else (("form", "impulse"),)
         limit = int(BUDGET[p.law] * self._newton_count)
@@ -485,11 +479,11 @@ class Costs:
     @cached_property
     def _others_win(self) -> bool:
         left = [e.cost for e in self._others if e.key not in self.ended]
-        return min(left, default=np.inf) <= self._newton_guess
+        return min(left, default=np.inf) <= self.newton_guess
 
     @cached_property
-    def _newton_guess(self) -> float:
-        """Its factor is at least that of a tree of bodies, or of a diagonal; loops fill it."""
+    def newton_guess(self) -> float:
+        """Of `newton` [ns]: its factor is at least that of a tree of bodies, or of a diagonal; loops fill it."""
         p = self.problem
         if p.rows is not None and p.rows.n_bodies:
             # One row each, and no joint: most likely spheres, which no contact turns.
@@ -517,6 +511,13 @@ class Costs:
             return 1.0
         pairs = graph.body_pairs(block_bodies(p), p.rows.n_bodies, False)
         return max(1.0, pairs / p.rows.n_bodies)
+
+    @property
+    def rows_direct(self) -> float:
+        """`direct` over bodies, A formed, by panels [ns]."""
+        p = self.problem
+        entries = int(assemble.bound(p.data)[0])
+        return FORMED_ROWS * entries + self._finite("direct", DIRECT[p.law], panels_cost(entries, p.m))
 
     @property
     def _direct_takes(self) -> bool:
@@ -553,16 +554,15 @@ class Costs:
             clique = int(np.bincount(of[of >= 0], minlength=1).max())  # rows of one body are all neighbours
             if self._loops <= TREE:
                 width = min(width, 2 * clique)
-            found = min(dense, BAND * m * float(width) ** 2)
-            if width > NARROW and found > TINY_FACTOR and isinstance(self.system, VelocitySystem):
-                share = m / n / self.system.s  # rows for each unknown of a body
-                over_bodies = FILL * BAND * self.system.cost * share**3
-                found = min(found, max(over_bodies, float(dense_factor(clique))))
-            return found
+            entries = int(assemble.bound(p.data)[0])
+            return min(dense, BAND * m * float(width) ** 2, panels_cost(entries, m))
         form, band, _ = choose(p) if p.is_symmetric else ("general", max(p.bandwidth), None)
         if form == "band":
             return BAND * m * float(min(band, m) + 1) ** 2
-        return min(dense, sparse_factor(len(p._compressed[1]), m))
+        nnz = len(p._compressed[1])
+        if form == "sparse" or (form == "general" and p.law == "linear" and PanelsLU.takes(p)):
+            return min(dense, panels_cost(nnz, m))
+        return min(dense, sparse_factor(nnz, m))
 
 
 def dense_factor(m: Any) -> Any:

@@ -2,8 +2,9 @@
 
     band     LDL^T by diagonals in compiled code (small matrices, and any of small bandwidth)
     dense    Cholesky (LAPACK potrf)
-    sparse   LDL^T of a permuted matrix (QDLDL with its minimum degree ordering)
-    general  LU with pivoting (LAPACK getrf, or SuperLU; compiled for few rows), where A is not symmetric definite
+    sparse   Cholesky by dense panels of a permuted matrix, in compiled code (`lavender_ext/factor/sparse.pyx`)
+    general  LU where A is not symmetric definite: with pivoting (LAPACK getrf, or SuperLU; compiled for few rows), or
+             first by such panels, rows exchanged inside each, where A has few entries and theirs a symmetric pattern
 
 A pivot of at most 1e-13 d_i counts as zero: some hundred roundings of A_ii, and below what a mass ratio of
 1e8 leaves.
@@ -11,6 +12,7 @@ A pivot of at most 1e-13 d_i counts as zero: some hundred roundings of A_ii, and
 
 from __future__ import annotations
 
+import os
 import warnings
 from typing import Any, Protocol
 
@@ -21,13 +23,20 @@ from scipy.linalg import lapack
 from lavender._arrays import FloatArray, IntArray
 from lavender._lu import sparse_lu
 from lavender.problem import Problem
-from lavender_ext.pivot import principal
+from lavender_ext.factor.sparse import SparsePanels, free_part, is_mirrored
 
 TINY = 1e-13  # -, of d
 SMALL_SIZE = 64  # rows up to which the compiled factorisation beats LAPACK behind SciPy
 SMALL_BAND = 40  # half bandwidth up to which it beats the others
 DENSE_SHARE = 0.1  # of nonzeros, from which dense Cholesky beats sparse
+PANELS_SHARE = 0.25  # of nonzeros, up to which panels are looked at for a linear system
+# ns: of a compiled band for each row and square of its width; of LAPACK's Cholesky a call, and for each multiply-add
+# and entry; of panels, their analysis included, a call, and for each nonzero of A, as many times more as it has some
+# thousand rows.
+BAND, LAPACK, DENSE, DENSE_ENTRY = 0.4, 20e3, 0.03, 3.0
+PANELS, PANELS_ENTRY, PANELS_ROWS = 20e3, 17.0, 8000.0
 DENSE_LIMIT = 6000  # rows, 288 MB
+WIDE = os.environ.get("LAVENDER_BASELINE", "0") in ("", "0")  # four lanes where there are: the same bits
 GENERAL_LIMIT = 2000  # rows up to which a singular matrix that is not symmetric is decomposed as a dense one
 
 
@@ -42,9 +51,18 @@ def choose(problem: Problem) -> tuple[str, int, IntArray | None]:
 def _choose(problem: Problem) -> tuple[str, int, IntArray | None]:
     m = problem.m
     band = max(problem.bandwidth)
-    if m <= SMALL_SIZE or band <= SMALL_BAND:
+    if m <= SMALL_SIZE:
         return "band", band, None
     nnz = len(problem._compressed[1])
+    if problem.law == "linear" and nnz <= PANELS_SHARE * m * m:
+        # One factor: by what it costs.
+        narrow = BAND * m * float(band + 1) ** 2
+        full = LAPACK + DENSE * m**3 / 3.0 + DENSE_ENTRY * float(m) ** 2
+        if panels_cost(nnz, m) < min(narrow, full if m <= DENSE_LIMIT else np.inf):
+            return "sparse", m - 1, None
+        return ("band", band, None) if narrow <= full else ("dense", m - 1, None)
+    if band <= SMALL_BAND:
+        return "band", band, None
     if nnz >= DENSE_SHARE * m * m and m <= DENSE_LIMIT:
         return "dense", m - 1, None
     # A band needs 2 band + 1 places a row: a mean row of more nonzeros than that has none so narrow.
@@ -56,6 +74,11 @@ def _choose(problem: Problem) -> tuple[str, int, IntArray | None]:
         if band <= SMALL_BAND:
             return "band", band, order
     return "sparse", m - 1, None
+
+
+def panels_cost(nnz: int, m: int) -> float:
+    """Of one factor by panels [ns], of a symmetric matrix of m rows and nnz entries."""
+    return PANELS + PANELS_ENTRY * nnz * (1.0 + m / PANELS_ROWS)
 
 
 def permuted_band(problem: Problem, order: IntArray) -> int:
@@ -109,29 +132,41 @@ class DenseFactor:
 
 
 class SparseFactor:
-    """LDL^T with minimum degree ordering."""
+    """Cholesky by panels, in an order of least degree."""
 
     def __init__(self, problem: Problem) -> None:
-        self.csr = problem.csr
         self.d = problem.csr_data.d
+        self.m = problem.m
+        self.pattern = _mirrored(problem)
+        self.whole: SparsePanels | None = None  # of all rows, kept
 
     def factor(self, place: IntArray, n_free: int, shift: float, tiny: float = TINY) -> int:
-        import qdldl
-
-        a = self.csr
-        upper = principal.free_block(a.indptr, a.indices, a.data, place, self.d, shift, n_free)
         self.n = n_free
         if n_free == 0:
             return 0
-        try:
-            self.ldl = qdldl.Solver(sp.csc_matrix(upper, shape=(n_free, n_free)), upper=True)
-        except RuntimeError:  # an exact zero on the diagonal of D
-            return n_free
-        _, pivot, order = self.ldl.factors()
-        return int(np.count_nonzero(pivot <= tiny * self.d[np.flatnonzero(place >= 0)][order]))
+        indptr, indices, data = self.pattern
+        if n_free == self.m:
+            if self.whole is None:
+                self.whole = SparsePanels(indptr, indices, False, WIDE)
+            self.panels, d = self.whole, self.d
+        else:
+            indptr, indices, data = free_part(indptr, indices, data, place, n_free)
+            self.panels, d = SparsePanels(indptr, indices, False, WIDE), self.d[place >= 0]
+        return self.panels.factor(data, d, shift, tiny)
 
     def solve(self, rhs: FloatArray) -> FloatArray:
-        return self.ldl.solve(rhs) if self.n else rhs
+        return self.panels.solve(rhs) if self.n else rhs
+
+
+def _mirrored(problem: Problem) -> tuple[IntArray, IntArray, FloatArray]:
+    """A in compressed rows whose pattern is symmetric, as a symmetric A has it but for zeros that are stored."""
+    compressed = problem._compressed
+    if is_mirrored(*compressed[:2]):
+        return compressed
+    lower = sp.tril(problem.csr, -1)
+    a = sp.csr_array(lower + lower.T + sp.diags_array(problem.csr.diagonal()))
+    a.sort_indices()
+    return a.indptr.astype(np.int32), a.indices.astype(np.int32), a.data
 
 
 class LUFactor:
@@ -178,6 +213,31 @@ class LUFactor:
         y = scale * rhs
         y = self.lu.solve(y) if self.sparse else lapack.dgetrs(*self.lu, y)[0]
         return scale * y
+
+
+class PanelsLU:
+    """LU of D^-1/2 A D^-1/2 by panels: what pivoting across them would have saved, refinement has to end.
+
+    Attributes
+    ----------
+    usable : bool
+        No pivot is lost to rounding.
+    """
+
+    def __init__(self, problem: Problem) -> None:
+        indptr, indices, data = problem._compressed
+        self.panels = SparsePanels(indptr, indices, True, WIDE)
+        self.rank = problem.m
+        self.usable = self.panels.factor(data, problem.csr_data.d, 0.0, TINY) == 0
+
+    @staticmethod
+    def takes(problem: Problem) -> bool:
+        """Few entries, and (i, j) is one wherever (j, i) is."""
+        indptr, indices, _ = problem._compressed
+        return len(indices) <= PANELS_SHARE * problem.m**2 and is_mirrored(indptr, indices)
+
+    def solve(self, rhs: FloatArray) -> FloatArray:
+        return self.panels.solve(rhs)
 
 
 class GeneralFactor:

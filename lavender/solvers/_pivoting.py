@@ -1,6 +1,6 @@
 """Principal pivoting with any factorisation: the loop of `lavender_ext/pivot/principal.pyx`, step by step in Python.
 
-Where the compiled factorisation serves, the whole loop runs there; with LAPACK, QDLDL or SuperLU each step is one
+Where the compiled factorisation serves, the whole loop runs there; with LAPACK, panels or SuperLU each step is one
 call into the same compiled code.
 """
 
@@ -60,6 +60,7 @@ class PivotState:
             problem.csr_data, band, order, TINY, symmetric=self.symmetric or self.factor is not None
         )
         self.is_factored = False
+        self.small = 0  # pivots that the last factor by Python found at rounding
         self.late = False  # a factor was not begun that would have ended after the deadline
         # Of the next factor [s]: the first by structure, then as long as the last took.
         self.seconds = DENSE * problem.m**3 / 3.0
@@ -113,7 +114,7 @@ class PivotState:
         self.factorisations += 1
         self.is_factored = True
         start = perf_counter()
-        small = self.factor.factor(self.rows.place, n_free, self.rows.shift)
+        small = self.small = self.factor.factor(self.rows.place, n_free, self.rows.shift)
         self.seconds = perf_counter() - start
         return SMALL if small else SOLVED
 
@@ -243,8 +244,8 @@ class PivotState:
     def rank(self) -> int:
         """Rank of a positive semidefinite A with all rows free, pivots of 1e-13 d counting as zero.
 
-        Band: the pivots just found (a zero pivot of a semidefinite matrix has a zero column, so leaving it
-        out is exact). Dense: Cholesky with pivoting. Sparse: pivots of A + 1e-10 D below 1e-8 D.
+        Band and sparse: the pivots just found (a zero pivot of a semidefinite matrix has a zero column, so
+        leaving it out is exact). Dense: Cholesky with pivoting.
         """
         m, d = self.problem.m, self.problem.csr_data.d
         if self.factor is None:
@@ -252,7 +253,7 @@ class PivotState:
         if self.form == "dense":
             scale = 1.0 / np.sqrt(d)
             return int(lapack.dpstrf(scale[:, None] * self.problem.dense() * scale, tol=TINY)[2])
-        return m - self.factor.factor(np.arange(m, dtype=np.int32), m, 1e-10, 1e-8)
+        return m - self.small
 
 
 def _filled(problem: Problem) -> float:

@@ -30,7 +30,7 @@ from lavender.problem import Problem
 from lavender.registry import SolverSpec
 from lavender.residuals import at_floor, judged, remember
 from lavender.solution import Claim, Status
-from lavender.solvers._factor import SMALL_SIZE, GeneralFactor
+from lavender.solvers._factor import SMALL_SIZE, GeneralFactor, PanelsLU
 from lavender.solvers._few import DIRECT
 from lavender.solvers._pivoting import PivotState
 from lavender_ext.judge import measure
@@ -53,7 +53,7 @@ class DirectState:
 
     problem: Problem
     pivot: PivotState | None = None
-    general: GeneralFactor | None = None
+    general: GeneralFactor | PanelsLU | None = None
     outcome: int = SOLVED  # of the factorisation of a linear system
     note: str = ""
 
@@ -63,11 +63,12 @@ class Direct:
     """Direct solution of linear systems and of boxed LCPs, positive semidefinite or asymmetric."""
 
     patience: ClassVar[bool] = True  # to go on where pivoting on one shift is stuck
+    exact: ClassVar[bool] = True  # to rounding, whatever the tolerance
 
     def prepare(self, problem: Problem, like: PivotState | None = None) -> DirectState:
         linear = problem.law == "linear"
         if linear and not problem.is_symmetric and problem.m > SMALL_SIZE:
-            return _general(problem, "A is not symmetric")
+            return _unsymmetric(problem)
         state = DirectState(problem, PivotState(problem, like))
         if linear and state.pivot is not None:
             state.outcome = state.pivot.factorise(whole=True)
@@ -85,7 +86,7 @@ class Direct:
     def run(
         self, state: DirectState, impulse: FloatArray, n: int, tol: float, time_limit: float | None = None
     ) -> Claim:
-        run = _Run(state, impulse, n, tol, time_limit, self.patience)
+        run = _Run(state, impulse, n, tol, time_limit, self.patience, self.exact)
         if state.problem.m == 0:
             return run.claim(Status.CONVERGED)
         if n == 0:
@@ -100,6 +101,23 @@ class Impatient(Direct):
     """As `auto` asks first: bounded rows on which pivoting is stuck, or one shift singular, end it at once, STALLED."""
 
     patience: ClassVar[bool] = False
+
+
+class Enough(Direct):
+    """As `auto` asks where every row is free: what meets the tolerance is not refined."""
+
+    exact: ClassVar[bool] = False
+
+
+@np.errstate(all="ignore")  # what overflows is judged
+def _unsymmetric(problem: Problem) -> DirectState:
+    """LU by panels where A has few entries, else with pivoting."""
+    why = "A is not symmetric"
+    if PanelsLU.takes(problem):
+        factor = PanelsLU(problem)
+        if factor.usable:
+            return DirectState(problem, general=factor, note=why)
+    return _general(problem, why)
 
 
 @np.errstate(all="ignore")  # what overflows is judged
@@ -123,8 +141,10 @@ class _Run:
         tol: float,
         time_limit: float | None,
         patient: bool,
+        exact: bool,
     ) -> None:
         self.patient = patient
+        self.least = GOOD if exact else max(GOOD, tol)  # relative residual that is good whatever the floor
         self.state, self.problem, self.impulse, self.budget, self.tol = state, state.problem, impulse, n, tol
         self.stop_at = None if time_limit is None else perf_counter() + time_limit
         self.kept: measure.Judged | None = None
@@ -156,7 +176,11 @@ class _Run:
 
     def good(self) -> bool:
         # A floor above 1e-6 belongs to an impulse that ran away, not to the problem.
-        return self.best <= max(GOOD, min(self.floor, RUNAWAY))
+        return self.best <= max(self.least, min(self.floor, RUNAWAY))
+
+    def rounded(self) -> bool:
+        """Good, or where refinement ends: at what counts as the floor."""
+        return self.good() or at_floor(self.best, min(self.floor, RUNAWAY))
 
     @property
     def spent(self) -> bool:
@@ -188,7 +212,7 @@ class _Run:
     # -- linear systems that are not symmetric definite -------------------------------------------
 
     @np.errstate(all="ignore")  # what overflows is judged
-    def linear_general(self, factor: GeneralFactor) -> Claim:
+    def linear_general(self, factor: GeneralFactor | PanelsLU) -> Claim:
         problem = self.problem
         self.iterations = 1
         self.work = {"factorisations": 1}
@@ -206,7 +230,10 @@ class _Run:
             if self.good() or not relative < 0.5 * previous:
                 break
             previous = relative
-        if not self.good() and singular:
+        if isinstance(factor, PanelsLU):
+            if not self.rounded():
+                return self.general(self.notes[0])
+        elif not self.good() and singular:
             # What least squares in the metric of D leaves of b is orthogonal to the range of A.
             measure.slack(problem.csr_data, x, w)
             proof = self.certificate(-w / problem.csr_data.d) or self.certificate(factor.outside(problem.b))
@@ -229,7 +256,9 @@ class _Run:
                 if not self.good():
                     rows.slack()
                     self.refine(pivot, relative)
-                    if not pivot.symmetric and not self.good():
+                    if self.rounded():
+                        return self.verdict()
+                    if not pivot.symmetric:
                         return self.general("A is not symmetric")
         else:
             # Which rows will be free? All, or where a few sweeps put them.
@@ -303,8 +332,9 @@ class _Run:
             self.judge(self.problem.start())
         return self.claim(Status.TIME_LIMIT if self.iterations < self.budget else Status.MAX_ITERATIONS)
 
-    def indefinite(self) -> Claim:
-        self.notes.append("A is indefinite on the free rows: no solution by this method, see lemke")
+    def indefinite(self, symmetric: bool = True) -> Claim:
+        why = "A is indefinite" if symmetric else "A is not symmetric, and singular under every shift,"
+        self.notes.append(f"{why} on the free rows: no solution by this method, see lemke")
         return self.claim(Status.NUMERICAL_ERROR)
 
     def note_singular(self, pivot: PivotState, shifted: bool) -> None:
@@ -319,6 +349,7 @@ class _Run:
     def proximal(self, pivot: PivotState, stuck: bool) -> Claim:
         """Passes on A + s D around the last answer; where pivoting is stuck, descent along falling s."""
         problem, rows = self.problem, pivot.rows
+        ended = self.rounded if problem.law == "linear" else self.good
         path = list(PATH if stuck else PATH[-1:])
         reference, waited = np.inf, 0
         rows.x[:] = self.impulse_now if self.floor <= RUNAWAY else self.impulse
@@ -332,7 +363,7 @@ class _Run:
                 self.work["shifts"] += 1
             rows.restart()
             code = self.descend(pivot) if stuck else self.rounds(pivot)
-            if self.good():
+            if ended():
                 break
             if code == ROUNDS:
                 return self.out_of_budget()
@@ -347,13 +378,13 @@ class _Run:
             if code in (SMALL, INDEFINITE):
                 if shift >= PATH[0]:
                     linear = problem.law == "linear"
-                    return self.general("A is indefinite") if linear else self.indefinite()
+                    return self.general("A is indefinite") if linear else self.indefinite(pivot.symmetric)
                 path = [shift * SHIFT_STEP]
                 rows.x[:] = rows.center
                 continue
             step = rows.x - rows.center
             self.settle(pivot)
-            if self.good():
+            if ended():
                 break
             if path or self.best <= 0.5 * reference:
                 reference, waited = self.best, 0
@@ -395,12 +426,15 @@ class _Run:
 
     def general(self, why: str) -> Claim:
         """A linear system by LU that tells the rank."""
-        before = self.state.pivot.work if self.state.pivot is not None else {}
+        before = dict(self.work)
+        if self.state.pivot is not None:
+            before.update(self.state.pivot.work)
         self.state = _general(self.problem, why)
         self.notes = [self.state.note]
-        assert self.state.general is not None
+        assert isinstance(self.state.general, GeneralFactor)
         claim = self.linear_general(self.state.general)
-        return replace(claim, work={**claim.work, "factorisations": 1 + before.get("factorisations", 0)})
+        work = {kind: before.get(kind, 0) + claim.work.get(kind, 0) for kind in {**claim.work, **before}}
+        return replace(claim, work=work)
 
     def certificate(self, step: FloatArray) -> Claim | None:
         """INFEASIBLE where `step`, cut to the directions the bounds allow, proves it."""

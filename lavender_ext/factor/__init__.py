@@ -1,1 +1,1 @@
-"""Factorisations in the order of a structure: bands, dense panels, components and elimination orders of graphs."""
+"""Factorisations in the order of a structure: bands, dense panels, sparse matrices, components and orders of graphs."""

@@ -19,8 +19,12 @@ cdef enum:
     TOGETHER = 3                # columns of a panel that are finished together
 
 
-cdef inline int32_t dense_panel(int32_t wide, int32_t width, int32_t rows, double* a) noexcept nogil:
-    """Columns of a panel (rows, width) from what is left of N there; how many pivots were lost to rounding."""
+cdef inline int32_t dense_panel(int32_t wide, int32_t width, int32_t rows, double* a,
+                                const double* least) noexcept nogil:
+    """Columns of a panel (rows, width) from what is left of N there; how many pivots were lost to rounding.
+
+    least (width): what a pivot must be above, or NULL: 1e-15 of what stood there before the last columns.
+    """
     cdef int32_t j, j0 = 0, t, n, lost = 0
     cdef double x
     cdef double top[3]
@@ -35,7 +39,7 @@ cdef inline int32_t dense_panel(int32_t wide, int32_t width, int32_t rows, doubl
             for t in range(j0, j):
                 take(j0 + n - j, a[j + <int64_t>t * rows], a + j + <int64_t>t * rows, y + j)
             x = y[j]
-            if not x > 1e-15 * top[j - j0]:
+            if not x > (1e-15 * top[j - j0] if least == NULL else least[j]):
                 lost += 1
                 x = 0.0
             else:
@@ -138,7 +142,7 @@ cdef inline int32_t super_cholesky(const factor_t* f) noexcept nogil:
                 p.link[j] = p.head[k]
                 p.head[k] = j
             j = after
-        lost += dense_panel(p.wide, s * (p.first[i + 1] - p.first[i]), p.height[i], p.val + p.at[i])
+        lost += dense_panel(p.wide, s * (p.first[i + 1] - p.first[i]), p.height[i], p.val + p.at[i], NULL)
         if p.rptr[i] < p.rptr[i + 1]:
             k = p.of[p.rows[p.rptr[i]]]
             p.link[i] = p.head[k]

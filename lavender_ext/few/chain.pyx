@@ -181,9 +181,9 @@ cdef class Chain:
                 found = self.judged(rows)
                 if found.relative < best.relative:
                     best = found
-        if self.linear and self.symmetric and not is_good(best):
-            return self.shifted(own, tol, best, done, k, 0)
-        if not is_good(best) or not best.relative <= tol:
+        if not (is_good(best) or (self.linear and is_rounded(best))):
+            return self.shifted(own, tol, best, done, k, 0) if self.linear and self.symmetric else None
+        if not best.relative <= tol:
             return None
         return best, (done, bool(swept), k, rows.factorisations, rows.exchanged, 0, 0)
 
@@ -209,23 +209,27 @@ cdef class Chain:
             done += rows.n_rounds - before
             found = self.judged(rows)
             previous = 1.0 / 0.0
+            whole = True                                # just after a solve
             while True:
                 if found.relative < least:
                     best, least = found, found.relative
                 if best is None:
                     return None                         # not a number
-                if is_good(best) or k == CORRECTIONS or not found.relative < 0.5 * previous:
+                if is_good(best) or (whole and is_rounded(best)) or k == CORRECTIONS:
                     break
+                if not found.relative < 0.5 * previous:
+                    break
+                whole = False
                 previous = found.relative
                 rows.recenter()
                 rows.slack()
                 rows.correct()
                 k += 1
                 found = self.judged(rows)
-            if is_good(best) or not least <= 0.5 * reference:
+            if is_good(best) or is_rounded(best) or not least <= 0.5 * reference:
                 break
             reference = least
-        if not is_good(best) or not least <= tol:
+        if not (is_good(best) or is_rounded(best)) or not least <= tol:
             return None
         return best, (done, False, k, rows.factorisations, rows.exchanged, 1, rank)
 
@@ -252,3 +256,9 @@ cdef inline bint is_good(Judged x) noexcept:
     # As `direct`: to rounding, or to the floor where that is not of an impulse that ran away.
     cdef double floor = x.floor if x.floor < 1e-6 else 1e-6
     return x.relative <= (floor if floor > 1e-13 else 1e-13)
+
+
+cdef inline bint is_rounded(Judged x) noexcept:
+    # As `direct` where refinement has ended.
+    cdef double floor = x.floor if x.floor < 1e-6 else 1e-6
+    return x.relative <= 2.0 * floor

@@ -53,7 +53,7 @@ RNG = np.random.default_rng(5)
 LINEAR = {
     "tridiagonal": (tridiagonal(500), "band"),
     "pentadiagonal": (sp.csr_array(tridiagonal(300) @ tridiagonal(300)), "band"),
-    "shuffled tridiagonal": (shuffled(RNG, tridiagonal(500)), "band"),
+    "shuffled tridiagonal": (shuffled(RNG, tridiagonal(500)), "sparse"),
     "diagonal": (sp.csr_array(sp.diags_array(np.arange(1.0, 100.0))), "band"),
     "small": (symmetric(spd(RNG, 20)), "band"),
     "dense": (symmetric(spd(RNG, 150)), "dense"),
@@ -467,3 +467,39 @@ def test_more_sweeps_guess_the_free_rows_where_a_factor_costs_as_much():
     sparse = lv.solve(suite.wild(seed=3170).problem, "direct", tol=1e-6)  # 480 rows
     assert sparse.solver.form == "sparse" and sparse.work["sweeps"] == 48
     assert sparse.work["factorisations"] <= 3  # 6 after 4 sweeps
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_many_asymmetric_joints_take_one_factor_by_panels(seed):
+    rng = np.random.default_rng(seed)
+    n = 150
+    a = sp.csr_array(
+        laplacian(30) if seed % 2 else spd(rng, n) * (rng.random((n, n)) < 0.03) + 9.0 * np.eye(n)
+    )
+    a = sp.csr_array(a + a.T)
+    a.data *= 1.0 + 10.0 ** rng.uniform(-5.0, -0.5) * rng.normal(size=a.nnz)
+    x = rng.normal(size=a.shape[0])
+    problem = lv.Problem.linear(a, a @ x)
+    solution = lv.solve(problem, "direct", tol=1e-9)
+    assert solution.success and accurate(solution)
+    assert (solution.solver.form, solution.message) == ("LU", "A is not symmetric")
+    assert solution.work["factorisations"] == 1
+    assert lv.solve(problem, "auto").message.startswith("direct 1 factorisations")
+
+
+def test_pivots_that_panels_cannot_exchange_are_left_to_superlu_and_counted():
+    """Without a diagonal rows must change places across panels."""
+    rng = np.random.default_rng(5)
+    n = 80
+    turn = sp.block_diag([np.array([[0.0, 1.0 + i], [-1.0 - i, 0.0]]) for i in range(n)])
+    lone = sp.csr_array(turn)[rng.permutation(2 * n)]
+    problem = lv.Problem.linear(lone, rng.normal(size=2 * n))
+    assert lv.solve(problem, "direct", tol=1e-9).success
+    far = np.r_[np.arange(n, 2 * n), np.arange(n)]
+    ring = sp.csr_array((np.ones(2 * n), (np.arange(2 * n), far)), shape=(2 * n, 2 * n))
+    near = sp.csr_array(ring + 1e-20 * sp.diags_array(rng.normal(size=2 * n)))
+    near.data[near.data == 1.0] += 1e-3 * rng.normal(size=2 * n)
+    problem = lv.Problem.linear(near, rng.normal(size=2 * n))
+    solution = lv.solve(problem, "direct", tol=1e-9)
+    assert solution.success, solution
+    assert solution.work["factorisations"] <= 2

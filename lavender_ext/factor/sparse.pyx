@@ -1,0 +1,637 @@
+"""A sparse matrix of any pattern and its factor by dense panels: L L^T, or L U with rows exchanged inside a panel.
+
+    A_JJ' = A_JJ - sum over K below J of L_K U_K,   P A_JJ' = L_JJ U_JJ                                    (1)
+    L_J = (A_J - sum L_K U_KJ) U_JJ^-1 below,   U_J = L_JJ^-1 P (A_J - sum L_JK U_K) beside                (2)
+
+Both on the pattern of the symmetric factor, in an order of least degree, rows of one pattern taken as one vertex. A
+panel is held column by column, its own columns' rows first, then the rows below; of L U what is beside it transposed,
+so that every update is C - A B^T (`tiles.pxd`). 1 / L_jj or 1 / U_jj stands on the diagonal. L U is of
+D^-1/2 A D^-1/2: what rows a panel exchanges are of one size, and how small a pivot is shows.
+"""
+from libc.math cimport fabs, sqrt
+from libc.stdint cimport int32_t, int64_t
+from libc.string cimport memset
+
+import numpy as np
+
+from lavender_ext.factor.minimum_degree import minimum_degree
+from lavender_ext.factor.supernodal cimport dense_panel, less_lower
+from lavender_ext.factor.symbolic import factor_pattern, postorder
+from lavender_ext.factor.tiles cimport add, has_wide, less, take
+
+
+cdef enum:
+    STRIP = 12                  # columns of a panel of L U that are finished together
+    FEW = 6                     # columns of a panel up to which zeros are held for four times the share
+
+
+ZEROS = 0.1                     # share of a panel that zeros held as numbers may be
+
+
+cdef struct sparse_t:
+    int32_t n                   # rows
+    int32_t panels
+    int32_t wide                # 1 where four lanes are one instruction
+    int32_t lu
+    const int32_t* order        # (n) row at each place
+    const int32_t* place        # (n) place of each row
+    const int32_t* first        # (panels + 1) places
+    const int32_t* of           # (n) panel of a place
+    const int32_t* rptr         # (panels + 1) places below a panel, ascending
+    const int32_t* rows
+    const int64_t* at           # (panels + 1) of a panel in `val`,
+    const int64_t* beside       # (panels + 1) and of what is beside it in `up`
+    double* val
+    double* up                  # L U only
+    double* temp                # what one panel takes from another, at most, or STRIP rows of one
+    double* scale               # (n) L U: of each place; else the least pivot of each
+    double* y                   # (n)
+    int32_t* swap               # (n) L U: the place within the panel that came here
+    int32_t* rel                # (n) row of a place in the present panel
+    int32_t* head               # (panels) panels that take from a panel next
+    int32_t* link               # (panels)
+    int32_t* next               # (panels) first row not yet taken
+
+
+cdef public int32_t lav_same_rows(int32_t n, const int32_t* indptr, const int32_t* indices, int32_t* node,
+                                  int32_t* first) noexcept nogil:
+    """Runs of rows with the same columns: their number, the run of each row, the first row of each."""
+    cdef int32_t i, q, count = 0, length
+    cdef bint same
+    for i in range(n):
+        length = indptr[i + 1] - indptr[i]
+        same = i > 0 and length == indptr[i] - indptr[i - 1]
+        if same:
+            for q in range(length):
+                if indices[indptr[i] + q] != indices[indptr[i - 1] + q]:
+                    same = False
+                    break
+        if not same:
+            first[count] = i
+            count += 1
+        node[i] = count - 1
+    first[count] = n
+    return count
+
+
+cdef public int32_t lav_node_graph(int32_t count, const int32_t* indptr, const int32_t* indices, const int32_t* node,
+                                   const int32_t* first, int32_t* ptr, int32_t* near) noexcept nogil:
+    """Neighbours of each run of rows, without itself; how many there are in all. Columns ascend."""
+    cdef int32_t k, q, j, last, total = 0
+    for k in range(count):
+        ptr[k] = total
+        last = k
+        for q in range(indptr[first[k]], indptr[first[k] + 1]):
+            j = node[indices[q]]
+            if j != last and j != k:
+                near[total] = j
+                total += 1
+                last = j
+    ptr[count] = total
+    return total
+
+
+cdef public int32_t lav_is_mirrored(int32_t n, const int32_t* indptr, const int32_t* indices,
+                                    int32_t* cursor) noexcept nogil:
+    """1 where (i, j) is an entry wherever (j, i) is; columns ascend, cursor (n) is scratch."""
+    cdef int32_t i, j, q
+    for i in range(n):
+        cursor[i] = indptr[i]
+    for i in range(n):
+        for q in range(indptr[i], indptr[i + 1]):
+            j = indices[q]
+            if cursor[j] == indptr[j + 1] or indices[cursor[j]] != i:
+                return 0                                # rows are gone through in order: entry i of row j is next
+            cursor[j] += 1
+    return 1
+
+
+cdef public void lav_lower(int32_t n, const int32_t* ptr, const int32_t* near, const int32_t* rank, const int32_t* order,
+                           int32_t* nptr, int32_t* nind) noexcept nogil:
+    """Lower pattern of a graph in an order, the diagonal last in each row."""
+    cdef int32_t k, i, q, to = 0
+    for k in range(n):
+        nptr[k] = to
+        i = order[k]
+        for q in range(ptr[i], ptr[i + 1]):
+            if rank[near[q]] < k:
+                nind[to] = rank[near[q]]
+                to += 1
+        nind[to] = k
+        to += 1
+    nptr[n] = to
+
+
+cdef public int32_t lav_panels(int32_t n, const int32_t* lptr, const int32_t* lind, const int32_t* size, double share,
+                               int32_t* first) noexcept nogil:
+    """As `lav_supernodes`, of vertices of weights size (n): the number of panels, the first vertex of each."""
+    cdef int32_t j, k = 0, q
+    cdef double width = 0.0, below, before = 0.0, held = 0.0, more, all_
+    for j in range(n):
+        below = 0.0
+        for q in range(lptr[j], lptr[j + 1]):
+            below += size[lind[q]]
+        if j > 0 and lptr[j] > lptr[j - 1] and lind[lptr[j - 1]] == j:
+            # Every column before gets the rows below j; it has those of its own already.
+            more = held + width * (below + size[j] - before)
+            all_ = 0.5 * (width + size[j]) * (width + size[j] + 1.0) + (width + size[j]) * below
+            if more <= (4.0 * share if width < FEW else share) * all_:
+                held = more
+                width += size[j]
+                before = below
+                continue
+        first[k] = j
+        k += 1
+        held = 0.0
+        width = size[j]
+        before = below
+    first[k] = n
+    return k
+
+
+cdef public void lav_transpose(int32_t n, const int32_t* indptr, const int32_t* indices, const double* data, int32_t* tptr,
+                               int32_t* tind, double* tdata) noexcept nogil:
+    """A^T in compressed rows; tptr (n + 2)."""
+    cdef int32_t i, q, j
+    for i in range(n + 2):
+        tptr[i] = 0
+    for q in range(indptr[n]):
+        tptr[indices[q] + 2] += 1
+    for i in range(2, n + 2):
+        tptr[i] += tptr[i - 1]
+    for i in range(n):
+        for q in range(indptr[i], indptr[i + 1]):
+            j = indices[q] + 1
+            tind[tptr[j]] = i
+            tdata[tptr[j]] = data[q]
+            tptr[j] += 1
+
+
+cdef inline int32_t lu_panel(const sparse_t* f, int32_t width, int32_t rows, double* a, double* u, int32_t* swap,
+                             double tiny) noexcept nogil:
+    """(1), (2) of one panel: columns a (rows, width) with L below, u (rows - width, width) beside; small pivots."""
+    cdef int32_t j, j0 = 0, t, n, i, best, lost = 0, below = rows - width
+    cdef double x, top
+    cdef double* y
+    cdef double* z
+    while j0 < width:
+        n = STRIP if j0 + STRIP <= width else width - j0
+        for j in range(j0, j0 + n):
+            y = a + <int64_t>j * rows
+            for t in range(j0):
+                if swap[t] != t:
+                    x = y[t]
+                    y[t] = y[swap[t]]
+                    y[swap[t]] = x
+            for t in range(j0):
+                take(j0 - t - 1, y[t], a + (t + 1) + <int64_t>t * rows, y + t + 1)
+            for t in range(j0):
+                f.temp[t * n + j - j0] = y[t]
+        less(f.wide, rows - j0, n, j0, a + j0, rows, f.temp, n, a + j0 + <int64_t>j0 * rows, rows)
+        for j in range(j0, j0 + n):
+            y = a + <int64_t>j * rows
+            best = j
+            top = fabs(y[j])
+            for i in range(j + 1, width):
+                if fabs(y[i]) > top:
+                    top = fabs(y[i])
+                    best = i
+            swap[j] = best
+            if best != j:
+                for t in range(j0 + n):
+                    z = a + <int64_t>t * rows
+                    x = z[j]
+                    z[j] = z[best]
+                    z[best] = x
+            if top > tiny:
+                x = 1.0 / y[j]
+            else:
+                lost += 1
+                x = 0.0
+            y[j] = x
+            for i in range(j + 1, rows):
+                y[i] *= x
+            for t in range(j + 1, j0 + n):
+                z = a + <int64_t>t * rows
+                take(rows - j - 1, z[j], y + j + 1, z + j + 1)
+        j0 += n
+    if below == 0:
+        return lost
+    for j in range(width):
+        if swap[j] != j:
+            y = u + <int64_t>j * below
+            z = u + <int64_t>swap[j] * below
+            for i in range(below):
+                x = y[i]
+                y[i] = z[i]
+                z[i] = x
+    j0 = 0
+    while j0 < width:
+        n = STRIP if j0 + STRIP <= width else width - j0
+        less(f.wide, below, n, j0, u, below, a + j0, rows, u + <int64_t>j0 * below, below)
+        for j in range(j0 + 1, j0 + n):
+            for t in range(j0, j):
+                take(below, a[j + <int64_t>t * rows], u + <int64_t>t * below, u + <int64_t>j * below)
+        j0 += n
+    return lost
+
+
+cdef inline void spread(const sparse_t* f, int32_t from_, int32_t end, int32_t skip, int32_t n, const int32_t* columns,
+                        int32_t base, int64_t ld, double* to) noexcept nogil:
+    """temp (end - from, n) added to a panel's rows rel - skip and the columns at those places."""
+    cdef int32_t row = from_, high, j, m = end - from_
+    while row < end:
+        high = row + 1
+        while high < end and f.rel[f.rows[high]] - f.rel[f.rows[row]] == high - row:
+            high += 1
+        for j in range(n):
+            add(high - row, f.temp + <int64_t>j * m + row - from_,
+                to + ld * (columns[j] - base) + f.rel[f.rows[row]] - skip)
+        row = high
+
+
+cdef inline void strip_by_strip(const sparse_t* f, int32_t m, int32_t n, int32_t k, const double* u, int32_t below,
+                                const double* a, int32_t rows, const int32_t* columns, int32_t base, double* v,
+                                int32_t beside) noexcept nogil:
+    # Rows in one run, columns not: each run of columns by itself.
+    cdef int32_t j = 0, high
+    while j < n:
+        high = j + 1
+        while high < n and columns[high] - columns[j] == high - j:
+            high += 1
+        less(f.wide, m, high - j, k, u, below, a + j, rows, v + <int64_t>beside * (columns[j] - base), beside)
+        j = high
+
+
+cdef inline void take_panel(const sparse_t* f, int32_t to, int32_t of) noexcept nogil:
+    """What the panel `to` is owed by an earlier one, from row `next` of that on."""
+    cdef int32_t q = f.next[of], end = f.rptr[of + 1], n = 0, base = f.first[to], after = f.first[to + 1]
+    cdef int32_t width = f.first[of + 1] - f.first[of], below = end - f.rptr[of], rows = width + below, m = end - q
+    cdef int32_t own = after - base, beside = f.rptr[to + 1] - f.rptr[to], low, r = q - f.rptr[of]
+    cdef int64_t ld = own + beside
+    cdef double* a = f.val + f.at[of] + width + r
+    cdef double* u
+    cdef double* v = f.val + f.at[to]
+    cdef const int32_t* columns = f.rows + q
+    cdef bint run
+    while q + n < end and f.rows[q + n] < after:
+        n += 1
+    low = f.rel[f.rows[q]]
+    run = f.rel[f.rows[end - 1]] - low == m - 1         # into the panel as it stands
+    if not f.lu:
+        if run:
+            less_lower(f.wide, m, n, width, a, rows, v + ld * low + low, ld)
+        else:
+            memset(f.temp, 0, sizeof(double) * m * n)
+            less_lower(f.wide, m, n, width, a, rows, f.temp, m)
+            spread(f, q, end, 0, n, columns, base, ld, v)
+        f.next[of] = q + n
+        return
+    u = f.up + f.beside[of] + r
+    if run:
+        less(f.wide, m, n, width, a, rows, u, below, v + ld * low + low, ld)
+    else:
+        memset(f.temp, 0, sizeof(double) * m * n)
+        less(f.wide, m, n, width, a, rows, u, below, f.temp, m)
+        spread(f, q, end, 0, n, columns, base, ld, v)
+    if m > n:
+        v = f.up + f.beside[to]
+        low = f.rel[f.rows[q + n]]
+        if f.rel[f.rows[end - 1]] - low == m - n - 1:
+            strip_by_strip(f, m - n, n, width, u + n, below, a, rows, columns, base, v + low - own, beside)
+        else:
+            memset(f.temp, 0, sizeof(double) * (m - n) * n)
+            less(f.wide, m - n, n, width, u + n, below, a, rows, f.temp, m - n)
+            spread(f, q + n, end, own, n, columns, base, beside, v)
+    f.next[of] = q + n
+
+
+cdef inline void fill(const sparse_t* f, int32_t i, const int32_t* indptr, const int32_t* indices, const double* data,
+                      const int32_t* tptr, const int32_t* tind, const double* tdata, const double* d,
+                      double shift) noexcept nogil:
+    """Entries of A + shift D in the columns of panel i and, of L U, beside them."""
+    cdef int32_t base = f.first[i], after = f.first[i + 1], c, q, p, row
+    cdef int64_t own = after - base, beside = f.rptr[i + 1] - f.rptr[i], ld = own + beside
+    cdef double* v = f.val + f.at[i]
+    cdef double* u = f.up + f.beside[i]
+    cdef double s
+    memset(v, 0, sizeof(double) * ld * own)
+    if not f.lu:
+        for c in range(base, after):
+            row = f.order[c]
+            for q in range(indptr[row], indptr[row + 1]):
+                p = f.place[indices[q]]
+                if p >= c:
+                    v[f.rel[p]] = data[q]
+            v[c - base] += shift * d[row]
+            v += ld
+        return
+    memset(u, 0, sizeof(double) * beside * own)
+    for c in range(base, after):
+        row = f.order[c]
+        s = f.scale[c]
+        for q in range(indptr[row], indptr[row + 1]):
+            p = f.place[indices[q]]
+            if p >= after:
+                u[f.rel[p] - own] = s * data[q] * f.scale[p]
+        for q in range(tptr[row], tptr[row + 1]):
+            p = f.place[tind[q]]
+            if p >= base:
+                v[f.rel[p]] = f.scale[p] * tdata[q] * s
+        v[c - base] += shift
+        v += ld
+        u += beside
+
+
+cdef public int32_t lav_sparse_factor(const sparse_t* f, const int32_t* indptr, const int32_t* indices,
+                                      const double* data, const int32_t* tptr, const int32_t* tind, const double* tdata,
+                                      const double* d, double shift, double tiny) noexcept nogil:
+    """Factor A + shift D, D = diag(d) > 0; of L U with A^T beside. How many pivots were at most tiny of d."""
+    cdef int32_t i, j, k, q, after, lost = 0
+    for k in range(f.n):
+        f.scale[k] = 1.0 / sqrt(d[f.order[k]]) if f.lu else tiny * d[f.order[k]]
+    for i in range(f.panels):
+        f.head[i] = -1
+        f.next[i] = f.rptr[i]
+    for i in range(f.panels):
+        for k in range(f.first[i], f.first[i + 1]):
+            f.rel[k] = k - f.first[i]
+        for q in range(f.rptr[i], f.rptr[i + 1]):
+            f.rel[f.rows[q]] = f.first[i + 1] - f.first[i] + q - f.rptr[i]
+        fill(f, i, indptr, indices, data, tptr, tind, tdata, d, shift)
+        j = f.head[i]
+        while j >= 0:
+            after = f.link[j]
+            take_panel(f, i, j)
+            if f.next[j] < f.rptr[j + 1]:
+                k = f.of[f.rows[f.next[j]]]
+                f.link[j] = f.head[k]
+                f.head[k] = j
+            j = after
+        k = f.first[i + 1] - f.first[i]
+        q = k + f.rptr[i + 1] - f.rptr[i]
+        if f.lu:
+            lost += lu_panel(f, k, q, f.val + f.at[i], f.up + f.beside[i], f.swap + f.first[i], tiny)
+        else:
+            lost += dense_panel(f.wide, k, q, f.val + f.at[i], f.scale + f.first[i])
+        if f.rptr[i] < f.rptr[i + 1]:
+            k = f.of[f.rows[f.rptr[i]]]
+            f.link[i] = f.head[k]
+            f.head[k] = i
+    return lost
+
+
+cdef public void lav_sparse_solve(const sparse_t* f, const double* b, double* x) noexcept nogil:
+    """x <- (A + shift D)^-1 b after `lav_sparse_factor`; they may be one array."""
+    cdef int32_t i, j, q, width, below, rows, k
+    cdef double t
+    cdef double* own
+    cdef const double* a
+    cdef const double* u
+    for k in range(f.n):
+        f.y[k] = b[f.order[k]]
+        if f.lu:
+            f.y[k] *= f.scale[k]
+    for i in range(f.panels):
+        width = f.first[i + 1] - f.first[i]
+        below = f.rptr[i + 1] - f.rptr[i]
+        rows = width + below
+        own = f.y + f.first[i]
+        a = f.val + f.at[i]
+        if f.lu:
+            for j in range(width):
+                k = f.swap[f.first[i] + j]
+                t = own[k]
+                own[k] = own[j]
+                own[j] = t
+        memset(f.temp, 0, sizeof(double) * below)
+        for j in range(width):
+            t = own[j]
+            if not f.lu:
+                t = t * a[j]
+                own[j] = t
+            take(width - j - 1, t, a + j + 1, own + j + 1)
+            take(below, t, a + width, f.temp)
+            a += rows
+        for q in range(below):
+            f.y[f.rows[f.rptr[i] + q]] += f.temp[q]
+    for i in range(f.panels - 1, -1, -1):
+        width = f.first[i + 1] - f.first[i]
+        below = f.rptr[i + 1] - f.rptr[i]
+        rows = width + below
+        own = f.y + f.first[i]
+        a = f.val + f.at[i]
+        for q in range(below):
+            f.temp[q] = f.y[f.rows[f.rptr[i] + q]]
+        u = a + width
+        if f.lu:
+            u = f.up + f.beside[i]
+        for j in range(width):
+            t = own[j]
+            for q in range(below):
+                t -= u[q] * f.temp[q]
+            own[j] = t
+            u += below if f.lu else rows
+        for j in range(width - 1, -1, -1):
+            if f.lu:
+                t = own[j] * a[j + <int64_t>j * rows]
+                own[j] = t
+                take(j, t, a + <int64_t>j * rows, own)
+            else:
+                t = own[j]
+                for q in range(j + 1, width):
+                    t -= a[q + <int64_t>j * rows] * own[q]
+                own[j] = t * a[j + <int64_t>j * rows]
+    for k in range(f.n):
+        x[f.order[k]] = f.y[k] * f.scale[k] if f.lu else f.y[k]
+
+
+def is_mirrored(const int32_t[::1] indptr, const int32_t[::1] indices):
+    """Whether the pattern of a canonical CSR matrix is symmetric."""
+    cdef int32_t n = <int32_t>indptr.shape[0] - 1
+    cdef int32_t[::1] cursor = np.empty(n + 1, np.int32)
+    if n == 0 or indices.shape[0] == 0:
+        return True
+    return bool(lav_is_mirrored(n, &indptr[0], &indices[0], &cursor[0]))
+
+
+def free_part(const int32_t[::1] indptr, const int32_t[::1] indices, const double[::1] data,
+              const int32_t[::1] place, int n_free):
+    """(indptr, indices, data) of the rows and columns with place >= 0, numbered in order of rows."""
+    cdef int32_t i, q, k = 0, n = <int32_t>indptr.shape[0] - 1
+    ptr_array = np.zeros(n_free + 1, np.int32)
+    cdef int32_t[::1] ptr = ptr_array, idx
+    cdef double[::1] val
+    for i in range(n):
+        if place[i] >= 0:
+            for q in range(indptr[i], indptr[i + 1]):
+                k += place[indices[q]] >= 0
+            ptr[place[i] + 1] = k
+    idx_array, val_array = np.empty(k, np.int32), np.empty(k)
+    idx, val = idx_array, val_array
+    k = 0
+    for i in range(n):
+        if place[i] >= 0:
+            for q in range(indptr[i], indptr[i + 1]):
+                if place[indices[q]] >= 0:
+                    idx[k] = place[indices[q]]
+                    val[k] = data[q]
+                    k += 1
+    return ptr_array, idx_array, val_array
+
+
+cdef class SparsePanels:
+    """The factor of a matrix in canonical compressed rows (n, n), whose pattern is symmetric; n > 0.
+
+    Parameters
+    ----------
+    indptr, indices : (n + 1,), (nnz,) int32
+    lu : bool
+        L U; else L L^T of a symmetric matrix, of which the entries at and after the diagonal in the order are read.
+    wide : bool
+        Four lanes where the machine has them: the same bits.
+    """
+
+    cdef sparse_t f
+    cdef object keep, indptr, indices, turned
+    cdef readonly double work                           # multiply-adds of a factor, roughly
+    cdef readonly int64_t entries                       # numbers it holds
+
+    def __init__(self, indptr, indices, bint lu, bint wide=True):
+        cdef int32_t n = <int32_t>len(indptr) - 1, k, i, j, count, width, below, run, c
+        cdef const int32_t[::1] ptr = indptr, ind = indices
+        cdef int32_t[::1] node = np.empty(n, np.int32), begin = np.empty(n + 1, np.int32), gptr, near, size, rank, order
+        cdef int32_t[::1] nptr, nind, first, lptr, lind, rows_, starts, of, rptr, by_place, place, columns, weight
+        cdef int64_t[::1] at, beside
+        cdef int64_t most = 0, room, total
+        if n < 1 or n != len(indptr) - 1:
+            raise ValueError("a matrix of one row or more")
+        count = lav_same_rows(n, &ptr[0], &ind[0] if ind.shape[0] else NULL, &node[0], &begin[0])
+        gptr, near = np.empty(count + 1, np.int32), np.empty(max(1, len(indices)), np.int32)
+        k = lav_node_graph(count, &ptr[0], &ind[0] if ind.shape[0] else NULL, &node[0], &begin[0], &gptr[0], &near[0])
+        near = near[:k]
+        size = np.diff(np.asarray(begin[:count + 1])).astype(np.int32)
+        order = minimum_degree(gptr, near, size)
+        rank = np.empty(count, np.int32)
+        nptr, nind = np.empty(count + 1, np.int32), np.empty(k // 2 + count + 1, np.int32)
+        for i in range(count):
+            rank[order[i]] = i
+        lav_lower(count, &gptr[0], &near[0] if k else NULL, &rank[0], &order[0], &nptr[0], &nind[0])
+        after = postorder(nptr, nind)
+        columns = after
+        for i in range(count):
+            rank[i] = columns[rank[i]]
+        for i in range(count):
+            order[rank[i]] = i
+        lav_lower(count, &gptr[0], &near[0] if k else NULL, &rank[0], &order[0], &nptr[0], &nind[0])
+        found = factor_pattern(nptr, nind)
+        lptr, lind = found[0], found[1]
+        # From vertices to rows.
+        starts, first, weight = np.empty(count + 1, np.int32), np.empty(count + 1, np.int32), np.empty(count, np.int32)
+        starts[0] = 0
+        for i in range(count):
+            weight[i] = size[order[i]]
+            starts[i + 1] = starts[i] + weight[i]
+        k = lav_panels(count, &lptr[0], &lind[0], &weight[0], ZEROS, &first[0])
+        order_array, place_array = np.empty(n, np.int32), np.empty(n, np.int32)
+        by_place, place = order_array, place_array
+        c = 0
+        for i in range(count):
+            for j in range(begin[order[i]], begin[order[i] + 1]):
+                by_place[c] = j
+                place[j] = c
+                c += 1
+        first_array, rptr_array = np.empty(k + 1, np.int32), np.zeros(k + 1, np.int32)
+        at_array, beside_array = np.zeros(k + 1, np.int64), np.zeros(k + 1, np.int64)
+        of_array = np.empty(n + 1, np.int32)
+        rptr, at, beside, of = rptr_array, at_array, beside_array, of_array
+        columns = first_array
+        total = 0
+        for i in range(k):
+            columns[i] = starts[first[i]]
+            c = first[i + 1] - 1
+            for j in range(lptr[c], lptr[c + 1]):
+                total += weight[lind[j]]
+            if total >= 2**31:
+                raise OverflowError("the factor has 2^31 rows of panels or more")
+            rptr[i + 1] = <int32_t>total
+        columns[k] = n
+        rows_array = np.empty(total + 1, np.int32)
+        rows_ = rows_array
+        self.work = 0.0
+        for i in range(k):
+            c = rptr[i]
+            for j in range(lptr[first[i + 1] - 1], lptr[first[i + 1]]):
+                for run in range(starts[lind[j]], starts[lind[j] + 1]):
+                    rows_[c] = run
+                    c += 1
+            width = columns[i + 1] - columns[i]
+            below = rptr[i + 1] - rptr[i]
+            at[i + 1] = at[i] + <int64_t>width * (width + below)
+            beside[i + 1] = beside[i] + <int64_t>width * below
+            for j in range(columns[i], columns[i + 1]):
+                of[j] = i
+            # 1/2 of the sum of the squares of its columns' heights
+            self.work += width * (0.5 * (<double>below * below + <double>below * width) + <double>width * width / 6.0)
+            if lu and <int64_t>width * STRIP > most:
+                most = <int64_t>width * STRIP
+            if below > most:
+                most = below
+        for i in range(k):
+            run = 0
+            for j in range(rptr[i], rptr[i + 1]):
+                run = run + 1 if j > rptr[i] and of[rows_[j]] == of[rows_[j - 1]] else 1
+                room = <int64_t>run * (rptr[i + 1] - j + run - 1)
+                if room > most:
+                    most = room
+        if lu:
+            self.work *= 2.0
+        self.entries = at[k] + (beside[k] if lu else 0)
+        val, up, temp = np.empty(at[k] + 1), np.empty((beside[k] if lu else 0) + 1), np.empty(most + 1)
+        scale, y, swap, rel = np.empty(n), np.empty(n), np.empty(n, np.int32), np.empty(n, np.int32)
+        head, link, nxt = np.empty(k, np.int32), np.empty(k, np.int32), np.empty(k, np.int32)
+        cdef double[::1] val_ = val, up_ = up, temp_ = temp, scale_ = scale, y_ = y
+        cdef int32_t[::1] swap_ = swap, rel_ = rel, head_ = head, link_ = link, next_ = nxt
+        self.keep = [val, up, temp, scale, y, swap, rel, head, link, nxt, order_array, place_array, first_array, of_array,
+                     rptr_array, rows_array, at_array, beside_array]
+        self.indptr, self.indices = indptr, indices
+        self.turned = None
+        self.f = sparse_t(
+            n, k, wide and has_wide(), lu, &by_place[0], &place[0], &columns[0], &of[0], &rptr[0], &rows_[0], &at[0],
+            &beside[0], &val_[0], &up_[0], &temp_[0], &scale_[0], &y_[0], &swap_[0], &rel_[0], &head_[0], &link_[0],
+            &next_[0])
+
+    def factor(self, const double[::1] data, const double[::1] d, double shift, double tiny):
+        """Factor the matrix of these entries with shift D, d (n,) > 0; how many pivots are not above tiny d."""
+        cdef const int32_t[::1] ptr = self.indptr, ind = self.indices
+        cdef int32_t[::1] tptr, tind
+        cdef double[::1] tdata
+        cdef int32_t lost
+        if data.shape[0] != ind.shape[0] or d.shape[0] != self.f.n:
+            raise ValueError("entries of another matrix")
+        if data.shape[0] == 0:
+            return self.f.n
+        tptr, tind, tdata = np.empty(1, np.int32), np.empty(1, np.int32), np.empty(1)
+        if self.f.lu:
+            tptr = np.empty(self.f.n + 2, np.int32)
+            tind, tdata = np.empty(data.shape[0], np.int32), np.empty(data.shape[0])
+        with nogil:
+            if self.f.lu:
+                lav_transpose(self.f.n, &ptr[0], &ind[0], &data[0], &tptr[0], &tind[0], &tdata[0])
+            lost = lav_sparse_factor(&self.f, &ptr[0], &ind[0], &data[0], &tptr[0], &tind[0], &tdata[0], &d[0], shift, tiny)
+        return lost
+
+    def solve(self, const double[::1] b):
+        """(n,) of the last factor; a new array."""
+        out = np.empty(self.f.n)
+        cdef double[::1] x = out
+        if b.shape[0] != self.f.n:
+            raise ValueError("of another size")
+        with nogil:
+            lav_sparse_solve(&self.f, &b[0], &x[0])
+        return out
+
+    @property
+    def order(self):
+        """(n,) row eliminated first, second, ..."""
+        return self.keep[10]

@@ -1,0 +1,135 @@
+"""Sparse factors by panels: an order of all vertices in any graph, and factors that solve, to the same bits."""
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from lavender_ext.factor.minimum_degree import minimum_degree
+from lavender_ext.factor.sparse import SparsePanels, free_part, is_mirrored
+
+
+def mirrored(rng, n, block, density):
+    """A random matrix (n, n) with a symmetric pattern and a diagonal, of blocks of equal patterns."""
+    k = -(-n // block)
+    pattern = sp.random_array((k, k), density=density, rng=rng, format="csr")
+    pattern = sp.kron(pattern + pattern.T + sp.eye_array(k), np.ones((block, block)))
+    a = sp.csr_array(sp.csr_array(pattern)[:n, :n])
+    a.sort_indices()
+    a.data = rng.normal(size=a.nnz)
+    return a
+
+
+def raw(a):
+    return a.indptr.astype(np.int32), a.indices.astype(np.int32)
+
+
+def definite(a):
+    lower = sp.tril(a, -1)
+    a = lower + lower.T
+    a = sp.csr_array(a + sp.diags_array(abs(a).sum(axis=1) + 0.1))
+    a.sort_indices()
+    return a
+
+
+@given(
+    n=st.integers(1, 60),
+    pairs=st.lists(st.tuples(st.integers(0, 59), st.integers(0, 59)), max_size=250),
+    heavy=st.integers(1, 9),
+)
+@settings(max_examples=200, deadline=None)
+def test_every_vertex_has_one_place_in_any_graph(n, pairs, heavy):
+    near = [set() for _ in range(n)]
+    for i, j in pairs:
+        if i < n and j < n and i != j:
+            near[i].add(j)
+            near[j].add(i)
+    ptr = np.cumsum([0, *map(len, near)]).astype(np.int32)
+    ind = np.array([j for s in near for j in sorted(s)], np.int32)
+    size = (1 + np.arange(n) % heavy).astype(np.int32)
+    assert np.array_equal(np.sort(minimum_degree(ptr, ind, size)), np.arange(n))
+
+
+def test_trees_and_stars_fill_nothing():
+    rng = np.random.default_rng(0)
+    for n in (2, 50, 3000):
+        parent = np.array([rng.integers(0, i) if n < 3000 else 0 for i in range(1, n)])  # the last: a star
+        a = sp.csr_array((np.ones(n - 1), (parent, np.arange(1, n))), shape=(n, n))
+        a = definite(sp.csr_array(a + a.T + sp.eye_array(n)))
+        f = SparsePanels(*raw(a), False)
+        assert f.factor(a.data, a.diagonal(), 0.0, 1e-13) == 0
+        b = rng.normal(size=n)
+        np.testing.assert_allclose(a @ f.solve(b), b, atol=1e-9)
+        assert f.entries <= 8 * n  # 2 n - 1, and zeros that are held as numbers
+
+
+def test_a_grid_fills_less_than_its_band():
+    side = 40
+    line = sp.diags_array([-np.ones(side - 1), -np.ones(side - 1)], offsets=[-1, 1])
+    a = definite(
+        sp.csr_array(
+            sp.kron(line, sp.eye_array(side)) + sp.kron(sp.eye_array(side), line) + sp.eye_array(side**2)
+        )
+    )
+    assert SparsePanels(*raw(a), False).work < 0.3 * 0.5 * side**4
+
+
+@given(seed=st.integers(0, 10**6), n=st.integers(1, 150), block=st.integers(1, 6), lu=st.booleans())
+@settings(max_examples=150, deadline=None)
+def test_factors_solve_and_lanes_do_not_show(seed, n, block, lu):
+    rng = np.random.default_rng(seed)
+    a = mirrored(rng, n, block, rng.choice([0.005, 0.03, 0.2]))
+    if lu:
+        a = sp.csr_array(a + sp.diags_array(3.0 * np.sqrt(np.diff(a.indptr))))
+    else:
+        a = definite(a)
+    scale = sp.diags_array(10.0 ** rng.uniform(-4.0, 4.0, n))
+    a = sp.csr_array(scale @ a @ scale)
+    a.sort_indices()
+    assert is_mirrored(*raw(a))
+    d, b = a.diagonal(), rng.normal(size=n)
+    found = []
+    for wide in (True, False):
+        f = SparsePanels(*raw(a), lu, wide)
+        assert np.array_equal(np.sort(f.order), np.arange(n))
+        assert f.factor(a.data, abs(d), 0.0, 1e-13) == 0
+        found.append(f.solve(b))
+    assert found[0].tobytes() == found[1].tobytes()
+    s = 1.0 / np.sqrt(abs(d))
+    error = s * (a @ found[0] - b)
+    assert np.abs(error).max() <= 1e-9 * np.abs(s * b).max()
+
+
+def test_shifts_parts_and_lost_pivots():
+    rng = np.random.default_rng(3)
+    n = 90
+    edge = np.flatnonzero(np.arange(n - 1) % 18 != 17)  # five paths: Laplacians of rank 17
+    path = sp.csr_array((np.ones(len(edge)), (edge, edge + 1)), shape=(n, n))
+    a = path + path.T
+    a = sp.csr_array(sp.diags_array(a.sum(axis=1)) - a)
+    a.sort_indices()
+    d = a.diagonal()
+    f = SparsePanels(*raw(a), False)
+    assert f.factor(a.data, d, 0.0, 1e-12) == 5
+    assert f.factor(a.data, d, 1e-3, 1e-12) == 0
+    b = rng.normal(size=n)
+    np.testing.assert_allclose((a + 1e-3 * sp.diags_array(d)) @ f.solve(b), b, atol=1e-9)
+    free = rng.random(n) < 0.5
+    place = np.where(free, np.cumsum(free) - 1, -1).astype(np.int32)
+    ptr, ind, val = free_part(*raw(a), a.data, place, int(free.sum()))
+    np.testing.assert_array_equal(sp.csr_array((val, ind, ptr)).toarray(), a.toarray()[np.ix_(free, free)])
+    lost = SparsePanels(*raw(a), True).factor(np.full(a.nnz, np.nan), d, 0.0, 1e-13)
+    assert lost > 0
+    with pytest.raises(ValueError, match="entries of another matrix"):
+        f.factor(a.data[1:], d, 0.0, 0.0)
+    with pytest.raises(ValueError, match="of another size"):
+        f.solve(b[1:])
+
+
+def test_what_is_no_mirror_is_seen():
+    a = sp.csr_array(np.array([[1.0, 2.0, 0.0], [0.0, 1.0, 0.0], [0.0, 1.0, 1.0]]))
+    assert not is_mirrored(*raw(a))
+    assert not is_mirrored(*raw(sp.csr_array(a.T)))
+    assert is_mirrored(*raw(sp.csr_array(a + a.T)))
+    assert is_mirrored(*raw(sp.csr_array((4, 4))))
