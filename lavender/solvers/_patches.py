@@ -4,41 +4,43 @@
 
 On piles that stall two thirds of the squared error sit in ten contacts: there the impulse creeps along one line, step
 after step, until a contact far along it changes side. Sweeps over the patch alone cost a hundredth, and Newton's
-method goes there at once; sweeps over all of them spread what it did. Patches that bring nothing give way to wider
-ones, and all plans to the first one once more.
+method on the Alart-Curnier map goes there at once, since all else is at rest; sweeps over all of them spread what it
+did. Patches that bring nothing give way to wider ones, and all plans to the same around more bodies.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
-from time import perf_counter
 from typing import Any
 
 import numpy as np
 
 from lavender._arrays import FloatArray, IntArray
-from lavender.registry import get
+from lavender.problem import Problem
 from lavender.residuals import judged, quick
-from lavender.solution import Status
 from lavender.solvers._costs import LOOK, sweep_cost
 from lavender.solvers._islands import block_bodies, restrict, rows_of
+from lavender.solvers._newton.proximal import Proximal
+from lavender.solvers._newton.run import Run
 from lavender.solvers._newton.sweeping import step_cost
+from lavender.solvers._newton.systems import AUGMENTED, make_system
 from lavender.solvers._sweepers import Sweeps
 from lavender.solvers._trail import Trail
+from lavender.solvers.nncg import NNCG
 from lavender_ext.factor import graph
 
-ROUND = 100  # sweeps of all blocks between two rounds of patches
+ROUND = 50  # sweeps of all blocks between two rounds of patches
 BAD = 0.3  # share of the largest block's error from which a block is the core of a patch
 HELD = 0.5  # share of the squared error that the cores have to hold for patches to be worth a beginning
-IDLE = 4  # times that all plans may gain nothing
+IDLE = 5  # times that all plans may gain nothing
 GAIN = 0.8  # of the residual that a plan has to leave
 CLOSER = 1e-3  # of a patch's own residual, to which it is solved
 BLOCKS = 400  # of a patch that Newton's method is asked for
-# What is asked, with how many bodies around the core, in turn while nothing is gained.
+# What is asked, with how many bodies around the core, in turn while nothing is gained; then with one more each.
 PLANS = (("newton", 1), ("nncg", 1), ("newton", 2), ("nncg", 2), ("nncg", 3))
 SHARE = 2.0  # of what a round's sweeps of all cost, that those of a patch may
-STEPS = {"newton": 60, "nncg": 3000}  # of it at most
-OPTIONS: dict[str, dict[str, Any]] = {"newton": {}, "nncg": {"restart": "against"}}
+SWEEPS, FACTORS = 3000, 25  # of one patch at most
+WEIGHT = 1e-6  # proximal weight that Newton's method begins with
 
 
 class Patches(Sweeps):
@@ -56,6 +58,11 @@ class Patches(Sweeps):
     def spent(self) -> float:
         """Cost of what it did [ns]."""
         return self.done * (self.per + LOOK / ROUND) + self.aside
+
+    @property
+    def gains(self) -> bool:
+        """Some plan gained lately."""
+        return self.done > 0 and self.idle <= 1
 
     @property
     def is_concentrated(self) -> bool:
@@ -88,7 +95,8 @@ class Patches(Sweeps):
                 if self.plan == len(PLANS):
                     self.reached, self.plan = np.inf, 0
                     self.idle += 1
-            self._mend(*PLANS[self.plan])
+            name, width = PLANS[self.plan]
+            self._mend(name, width + self.idle)  # the same patches would end where they did
         return now
 
     def _core(self) -> tuple[Any, Any]:
@@ -128,23 +136,38 @@ class Patches(Sweeps):
         return label
 
     def _solve(self, blocks: IntArray, shifted: FloatArray, name: str) -> None:
-        """(1) by one solver, from where the patch stands; what it ends with is kept, whatever it is."""
+        """(1) by one method, from where the patch stands; what it ends with is kept, whatever it is."""
         problem = self.trail.problem
         rows = rows_of(problem, blocks)
         part = replace(restrict(problem, blocks, rows), b=shifted[rows])
-        impulse, deadline = self.impulse[rows], self.trail.deadline
+        impulse = self.impulse[rows]
         tol = CLOSER * judged(part, impulse.copy()).relative
-        solver: Any = get(name).load()(**OPTIONS[name])
-        state = solver.prepare(part)
-        limit = None if deadline == np.inf else max(deadline - perf_counter(), 1e-3)
-        steps = STEPS[name]
-        if name == "nncg":
-            steps = min(steps, int(SHARE * ROUND * len(self.bodies) / len(blocks)))
-        claim = solver.run(state, impulse, steps, tol, limit)
+        if name == "newton":
+            impulse = self._walk(part, impulse, tol)
+        else:
+            self._sweep(part, impulse, tol)
+        if np.isfinite(impulse).all():
+            self.impulse[rows] = impulse
+        self.aside += LOOK
+
+    def _walk(self, part: Problem, impulse: FloatArray, tol: float) -> FloatArray:
+        """Newton's method on the Alart-Curnier map, from an impulse: the best that it met."""
+        system = make_system(part, "velocity")
+        if not (system.sc.m and system.sc.has_friction):
+            return impulse
+        system.factorisations = 0
+        run = Run(system, tol, FACTORS, self.trail.deadline)
+        Proximal(system.sc.unknown(impulse), AUGMENTED, WEIGHT).advance(run, FACTORS)
+        count = system.factorisations
+        self.total["factorisations"] = self.total.get("factorisations", 0) + count
+        self.aside += count * step_cost(system)
+        return system.sc.impulse(run.best_z)
+
+    def _sweep(self, part: Problem, impulse: FloatArray, tol: float) -> None:
+        """Sweeps that keep their direction, on an impulse in place."""
+        solver = NNCG(restart="against")
+        steps = min(SWEEPS, int(SHARE * ROUND * self.trail.problem.n_blocks / part.n_blocks))
+        claim = solver.run(solver.prepare(part), impulse, steps, tol)
         for kind, count in claim.work.items():
             self.total[kind] = self.total.get(kind, 0) + count
-        if claim.status is not Status.DIVERGED and np.isfinite(impulse).all():
-            self.impulse[rows] = impulse
-        self.aside += LOOK + claim.work.get("sweeps", 0) * sweep_cost(part)
-        if name == "newton" and state.system is not None:
-            self.aside += claim.work["factorisations"] * step_cost(state.system)
+        self.aside += claim.work["sweeps"] * sweep_cost(part)

@@ -97,7 +97,8 @@ def race(trail: Trail, own: Sweeps, budget: int) -> bool:
 
     Look by look whichever promises to cost less from there, so that none is dropped while it moves. From where the
     relaxation stands others begin whenever it did twice as much: which of them end soon is a matter of luck. Where
-    even the most promising stalls on few blocks, patches take turns with all of them, at the same cost.
+    even the most promising stalls on few blocks, patches take turns with all of them, at the same cost, and so they do
+    before others than sweeps are asked, which they are not while patches gain.
     """
     relaxed = Relaxed(trail)
     start = trail.best
@@ -120,12 +121,14 @@ def race(trail: Trail, own: Sweeps, budget: int) -> bool:
             last = relaxed.done
             racers.insert(0, Racer(_from(relaxed, own, len(followers)), 1.0, slow.spent, slow.best))
             followers.append(racers[0].sweeps)
-        if len(followers) >= len(FOLLOWING) and racer.stalls:
+        leaves = slow.looks > 0 and own.dearer(min(r.sweeps.cost for r in racers), spent, None)
+        stalls = racer.stalls and (mended is not None or len(followers) >= len(FOLLOWING))
+        if stalls or leaves:
             mended = mended or Patches(trail)
             if (mended.done or mended.is_concentrated) and mended.mend(spent, left()):
                 break
-        if slow.looks and own.dearer(min(r.sweeps.cost for r in racers), spent, None):
-            break
+            if leaves and not mended.gains:
+                break
     relaxed.note()
     for follower in followers:
         follower.note("from there: ")

@@ -7,14 +7,15 @@ import lavender as lv
 from lavender.residuals import judged, residual
 from lavender.solvers import _race
 from lavender.solvers._islands import block_bodies, rows_of
-from lavender.solvers._patches import CLOSER, Patches
+from lavender.solvers._patches import CLOSER, IDLE, PLANS, Patches
 from lavender.solvers._trail import Trail
 from lavender.suite.families import granular
+from lavender.suite.wild import wild
 
 
-def stalled(sweeps=60):
+def stalled(sweeps=60, seed=7):
     """A loose pile, and a trail that so many sweeps reached."""
-    problem = granular(n=5, friction="coulomb").problem
+    problem = granular(n=5, friction="coulomb", seed=seed).problem
     trail = Trail(problem, 1e-9, np.inf)
     trail.offer(lv.solve(problem, "nncg", tol=0.0, max_iter=sweeps).impulse)
     return problem, trail
@@ -57,8 +58,9 @@ def test_a_patch_is_solved_as_part_of_the_whole(name):
     assert patches.aside > 0.0
 
 
-def test_a_pile_that_stalls_is_mended():
-    problem, trail = stalled()
+@pytest.mark.parametrize("seed", [2, 5, 6])
+def test_a_pile_that_stalls_is_mended(seed):
+    problem, trail = stalled(seed=seed)
     given = trail.best
     patches = Patches(trail)
     patches.mend(np.inf, 2000)
@@ -75,3 +77,25 @@ def test_patches_and_those_that_race_share_one_budget(monkeypatch, most):
     solution = lv.solve(problem, "auto", tol=1e-13, max_iter=most)
     assert "patches" in solution.message
     assert solution.iterations <= most
+
+
+def test_patches_come_before_solvers_that_factor():
+    solution = lv.solve(wild(6074).problem, "auto", tol=1e-3)
+    assert solution.status is lv.Status.CONVERGED
+    assert "patches" in solution.message
+    assert "newton 1" not in solution.message
+    assert "admm" not in solution.message
+
+
+def test_patches_that_gain_nothing_grow_and_end():
+    _, trail = stalled()
+    patches = Patches(trail)
+    asked = []
+    patches._mend = lambda name, width: asked.append((name, width))
+    patches.least = patches.reached = 0.0
+    patches.trail.tol = 0.0
+    patches.mend(np.inf, 10_000)
+    assert patches.idle == IDLE
+    assert asked[: len(PLANS)] == [*PLANS[1:], (PLANS[0][0], PLANS[0][1] + 1)]
+    assert max(width for _, width in asked) == max(width for _, width in PLANS) + IDLE - 1
+    assert not patches.gains
