@@ -33,6 +33,7 @@ class Derived:
     __slots__ = (
         "chain",
         "factor",
+        "first",
         "judged",
         "lock",
         "motion",
@@ -53,6 +54,7 @@ class Derived:
         self.seen = False  # whether `solve` has had it, once: repeated ones are spared more
         self.chain: Any = None  # of a problem of few rows, False where it has none
         self.factor: Any = None  # the factorisation that suits A: its name, half bandwidth, order
+        self.first: bool | None = None  # in generalised coordinates: newton over velocities before all else
         self.motion: Kept | None = None  # the reference that motion errors are told from, and its operator
 
 

@@ -612,7 +612,7 @@ class Problem:
         return self.matrix.indptr, self.matrix.indices, self.matrix.data
 
     def _product(self) -> tuple[IntArray, IntArray, FloatArray]:
-        # A = Y Y^T + diag(compliance): symmetric to the bit, as SciPy adds both triangles in the same order.
+        # A = Y Y^T + diag(compliance): symmetric to the bit, as both triangles are summed in the same order.
         y = self.whitened
         most = float(np.sum(np.bincount(y.indices, minlength=1).astype(float) ** 2))
         if most >= 2**31:
@@ -620,8 +620,8 @@ class Problem:
                 f"A would have up to {most:.3g} entries, more than 32-bit indices reach: use a solver that takes "
                 "J and M as they are (operator 'generalized')"
             )
-        a = _canonical(sp.csr_array(y @ y.T + sp.diags_array(np.asarray(self.compliance))), self.m)
-        return a.indptr, a.indices, a.data
+        indptr, indices, data = assemble.gram(y.data, y.indices, y.indptr, y.shape[1], self.compliance)
+        return read_only(indptr), read_only(indices), read_only(data)
 
     @once
     def whitened(self) -> sp.csr_array:

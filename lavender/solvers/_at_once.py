@@ -10,14 +10,14 @@ from lavender._arrays import FloatArray
 from lavender.problem import Problem
 from lavender.registry import FEW
 from lavender.residuals import judged, known
-from lavender.solution import Claim
+from lavender.solution import Claim, Status
 from lavender.solvers._costs import DIRECT_ROUNDS, Exact, factors_at_once, joints_at_once
 from lavender.solvers._factor import PanelsLU
-from lavender.solvers._few import WARM
+from lavender.solvers._few import WARM, said
 from lavender.solvers._trail import usable
 from lavender.solvers.direct import Direct, Enough, Impatient
 
-__all__ = ["HASTY", "JOINTS", "Factored", "factor_first"]
+__all__ = ["HASTY", "JOINTS", "Factored", "factor_first", "joints_over_velocities"]
 
 JOINTS = Exact("direct", 0.0, 0)
 HASTY = Exact("direct", 0.0, DIRECT_ROUNDS, (("patience", False),))
@@ -32,6 +32,11 @@ class Factored:
     impulse: FloatArray  # (m,) N s
     before: float  # relative residual that it began with
     relative: float  # and ended with
+
+    def ended(self) -> Claim:
+        """Where that meets the tolerance."""
+        work = self.claim.work
+        return Claim(Status.CONVERGED, self.claim.iterations, work, said("direct", work))
 
 
 def factor_first(
@@ -54,6 +59,15 @@ def factor_first(
     else:
         return None
     return _factored(problem, impulse, n, tol, time_limit, chosen, solver)
+
+
+def joints_over_velocities(
+    problem: Problem, impulse: FloatArray, n: int, tol: float, time_limit: float | None
+) -> Factored | None:
+    """The same of a linear system in generalised coordinates on which Newton's method over velocities costs more."""
+    if problem.law != "linear" or problem.m <= FEW or n <= 0:
+        return None
+    return _factored(problem, impulse, n, tol, time_limit, JOINTS, Enough())
 
 
 @np.errstate(all="ignore")  # what overflows is judged

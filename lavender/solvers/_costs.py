@@ -75,7 +75,7 @@ MANY_ROWS = 1000  # rows beyond which that is counted
 GENERAL_FIRST = 0.6e6  # ns of it up to which nothing else is looked at first
 FORM = 1.0  # of each multiply-add of Y Y^T
 FORMED_ROWS = 6.0  # of each entry of A over bodies
-FORMED_START, FORMED = 280e3, 6.0  # of A formed of J and M, and of each of its entries
+FORMED_START, FORMED = 60e3, 2.0  # of A formed of J and M, and of each of its entries
 ADMM_START, ADMM_ROW, ADMM_ENTRY = (
     500e3,
     40.0,
@@ -191,8 +191,8 @@ def general_first(problem: Problem, largest: int) -> bool:
     """Newton over generalised velocities costs next to nothing, or less than only to form A = Y Y^T for the others.
 
     The columns of Y have n_c entries: sum n_c^2 >= (sum n_c)^2 / nv multiply-adds. Without friction, whose steps are
-    less certain, what Python needs for it and each of its entries counts, of a linear system what no finite solver
-    costs less than as well. Or, of many soft rows under Coulomb's law, more than velocities, less than sweeps usually
+    less certain, what Python needs for it and each of its entries counts, of a linear system what `direct` then costs
+    as well. Or, of many soft rows under Coulomb's law, more than velocities, less than sweeps usually
     do where rows depend on each other.
     """
     assert problem.generalized is not None
@@ -202,7 +202,7 @@ def general_first(problem: Problem, largest: int) -> bool:
     entries = 0.5 * (problem.metric.work - 4.0 * problem.m)
     if cost <= FORM * entries * entries / max(1, problem.generalized.nv):
         return True
-    if problem.law == "linear" and cost <= formed_cost(problem) + finite_least(problem):
+    if problem.law == "linear" and cost <= joints_formed(problem):
         return True
     if problem.law == "lcp" and cost <= formed_cost(problem):
         return True
@@ -265,8 +265,11 @@ def joints_at_once(problem: Problem) -> bool:
         return True
     if problem.rows is None or problem.rows.n_bodies == 0:
         return False
-    costs = Costs(problem, 1e-6)
-    return costs.rows_direct <= costs.newton_guess
+    direct = rows_direct(problem)
+    start, step, row = newton_rates(problem)
+    if direct <= start + NEWTON["linear"] * (step + row * problem.m):
+        return True  # whatever the factor of newton costs
+    return direct <= Costs(problem, 1e-6).newton_guess
 
 
 def is_redundant(problem: Problem) -> bool:
@@ -296,6 +299,25 @@ def finite_least(problem: Problem) -> float:
 def few_direct(m: int) -> float:
     """`direct` on so many bounded rows, up to FEW [ns]."""
     return FEW_START + FEW_ROUNDS * (ROW * m + BAND * m**3 / 6.0)
+
+
+def rows_direct(problem: Problem) -> float:
+    """`direct` on joints between bodies, A formed, by panels [ns]."""
+    m, entries = problem.m, int(assemble.bound(problem.data)[0])
+    factor = panels_cost(entries, m)
+    return START["direct"] + FORMED_ROWS * entries + DIRECT["linear"] * (STEP["direct"] + ROW * m + factor)
+
+
+def joints_formed(problem: Problem) -> float:
+    """`direct` on linear rows in generalised coordinates, A formed [ns]; its entries at a guess.
+
+    Rows of A meet in the columns of Y that they share: half of a row's, in the mean.
+    """
+    m = problem.m
+    in_row = 0.5 * (problem.metric.work - 4.0 * m) / max(m, 1)
+    entries = int(problem.metric.entries_of_a / max(1.0, 0.5 * in_row))
+    factor = min(panels_cost(entries, m), float(dense_factor(m)))
+    return formed_cost(problem) + START["direct"] + DIRECT["linear"] * (STEP["direct"] + ROW * m + factor)
 
 
 def newton_rates(problem: Problem) -> tuple[float, float, float]:
@@ -511,13 +533,6 @@ class Costs:
             return 1.0
         pairs = graph.body_pairs(block_bodies(p), p.rows.n_bodies, False)
         return max(1.0, pairs / p.rows.n_bodies)
-
-    @property
-    def rows_direct(self) -> float:
-        """`direct` over bodies, A formed, by panels [ns]."""
-        p = self.problem
-        entries = int(assemble.bound(p.data)[0])
-        return FORMED_ROWS * entries + self._finite("direct", DIRECT[p.law], panels_cost(entries, p.m))
 
     @property
     def _direct_takes(self) -> bool:

@@ -43,7 +43,8 @@ def _make(problem: Problem) -> Chain | None:
         return None
     if problem.generalized is not None:
         kernel = general.prepare(problem)
-        if kernel is None or not general_first(problem, kernel.largest):
+        problem.derived.first = kernel is not None and general_first(problem, kernel.largest)
+        if kernel is None or not problem.derived.first:
             return None
         return Chain(data, start, relative, newton=kernel)
     if problem.cones.has_round:
@@ -73,6 +74,8 @@ class Few:
     def solve(self, problem: Problem, impulse: FloatArray | None, tol: float) -> Any:
         """(what the judge finds, counts) from an impulse (m,) or from doing nothing; None where it is left."""
         kept = problem.derived
+        if problem.generalized is not None and VELOCITIES not in self.kinds:
+            return None
         if kept.chain is None and kept.view is not None and VELOCITIES in self.kinds:
             # Its first solve: what repeated ones are spared, room and islands, is not kept yet.
             if kept.seen or not 0 < problem.m <= FEW_GENERAL:

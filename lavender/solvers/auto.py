@@ -38,7 +38,7 @@ from lavender.problem import OPERATORS, Problem
 from lavender.registry import FEW, SolverSpec
 from lavender.residuals import reference
 from lavender.solution import Claim, Status
-from lavender.solvers._at_once import HASTY, JOINTS, factor_first
+from lavender.solvers._at_once import HASTY, JOINTS, factor_first, joints_over_velocities
 from lavender.solvers._costs import (
     FEW_JOINTS,
     FIRST_LOOK,
@@ -51,7 +51,7 @@ from lavender.solvers._costs import (
     is_loose,
     together_cost,
 )
-from lavender.solvers._few import AUTO, said
+from lavender.solvers._few import AUTO
 from lavender.solvers._islands import restrict, rows_of
 from lavender.solvers._newton import general
 from lavender.solvers._race import race
@@ -106,18 +106,27 @@ class Auto:
         first = factor_first(problem, impulse, n, tol, time_limit)
         if first is not None and first.relative <= tol:
             impulse[:] = first.impulse
-            return Claim(
-                Status.CONVERGED, first.claim.iterations, first.claim.work, said("direct", first.claim.work)
-            )
+            return first.ended()
+        if problem.generalized is not None and n > 0 and problem.derived.first is False:
+            first = joints_over_velocities(problem, impulse, n, tol, time_limit)
+            if first is not None and first.relative <= tol:
+                impulse[:] = first.impulse
+                return first.ended()
         if problem.generalized is not None and n > 0:
             # Newton over the velocities ends nearly all robots: nothing is looked at, and nothing noted, before.
             kernel = general.prepare(problem)
             largest = 0 if kernel is None else kernel.largest
-            if kernel is not None and general_first(problem, largest):
+            known = problem.derived.first
+            if kernel is not None and (general_first(problem, largest) if known is None else known):
                 claim = _over_velocities(problem, kernel, lam, n, tol, deadline)
                 if claim.status is Status.CONVERGED:
                     impulse[:] = lam
                     return general.named(claim, "auto")
+            elif known is None:
+                first = joints_over_velocities(problem, impulse, n, tol, time_limit)
+                if first is not None and first.relative <= tol:
+                    impulse[:] = first.impulse
+                    return first.ended()
         left = n if claim is None else n - claim.iterations
         glance = None if first is not None else look_first(problem, impulse, left, tol, few)
         if glance is not None and glance.best <= tol:

@@ -231,3 +231,115 @@ def delassus(Data p, Py_ssize_t most, int32_t[::1] start, int32_t[::1] blocks):
     if nnz < 0.75 * most:                               # a copy costs more than a quarter of unused room
         found = found[0].copy(), found[1].copy()
     return (indptr_, *found)
+
+
+cdef public void lav_by_columns(int32_t m, int32_t n, const int32_t* indptr, const int32_t* indices, const double* data,
+                                int32_t* ptr, int32_t* row, double* value) noexcept nogil:
+    """A matrix (m, n) in compressed rows by its columns, rows ascending; ptr (n + 2)."""
+    cdef int32_t i, j, q
+    for j in range(n + 2):
+        ptr[j] = 0
+    for q in range(indptr[m]):
+        ptr[indices[q] + 2] += 1
+    for j in range(2, n + 2):
+        ptr[j] += ptr[j - 1]
+    for i in range(m):
+        for q in range(indptr[i], indptr[i + 1]):
+            j = indices[q] + 1
+            row[ptr[j]] = i
+            value[ptr[j]] = data[q]
+            ptr[j] += 1
+
+
+cdef public void lav_gram_pattern(int32_t m, const int32_t* indptr, const int32_t* indices, const int32_t* ptr,
+                                  const int32_t* row, int32_t* mark, int32_t* count) noexcept nogil:
+    """count (m + 1): where each row of Y Y^T + D begins, its diagonal always there; mark (m) is scratch."""
+    cdef int32_t i, q, p, k
+    for i in range(m):
+        mark[i] = -1
+    count[0] = 0
+    for i in range(m):
+        mark[i] = i
+        k = 1
+        for q in range(indptr[i], indptr[i + 1]):
+            for p in range(ptr[indices[q]], ptr[indices[q] + 1]):
+                if mark[row[p]] != i:
+                    mark[row[p]] = i
+                    k += 1
+        count[i + 1] = count[i] + k
+
+
+cdef public int32_t lav_gram(int32_t m, const int32_t* indptr, const int32_t* indices, const double* data,
+                             const int32_t* ptr, const int32_t* row, const double* value, const double* diagonal,
+                             int32_t* next, double* sum_, int32_t* count, int32_t* out, double* entry) noexcept nogil:
+    """Y Y^T + D by columns, which are its rows; entries in all, those that are zero left out.
+
+    Each is a sum over the columns of Y in their order, the same for (i, j) and (j, i). count is from
+    `lav_gram_pattern`; next (2 m) is scratch, sum_ (m).
+    """
+    cdef int32_t i, j, q, p, k, to = 0, begin
+    cdef int32_t* list_ = next + m
+    cdef double y
+    # Row i adds itself to every column it meets: rows of each column ascend.
+    for i in range(m):
+        next[i] = count[i]
+        sum_[i] = 0.0
+        list_[i] = -1
+    for i in range(m):
+        # Entries of row i, linked through `list_` from the last to the first: no order is needed.
+        k = i
+        list_[i] = i
+        for q in range(indptr[i], indptr[i + 1]):
+            y = data[q]
+            for p in range(ptr[indices[q]], ptr[indices[q] + 1]):
+                j = row[p]
+                if list_[j] < 0:
+                    list_[j] = k
+                    k = j
+                sum_[j] += y * value[p]
+        sum_[i] += diagonal[i]
+        while True:
+            j = list_[k]
+            list_[k] = -1
+            if sum_[k] != 0.0:
+                out[next[k]] = i
+                entry[next[k]] = sum_[k]
+                next[k] += 1
+            sum_[k] = 0.0
+            if k == i:
+                break
+            k = j
+    for i in range(m):
+        begin = count[i]
+        count[i] = to
+        for q in range(begin, next[i]):
+            out[to] = out[q]
+            entry[to] = entry[q]
+            to += 1
+    count[m] = to
+    return to
+
+
+def gram(const double[::1] data, const int32_t[::1] indices, const int32_t[::1] indptr, int n, const double[::1] diagonal):
+    """(indptr, indices, data) of Y Y^T + D, columns sorted, of Y (m, n) in compressed rows; D = diag(diagonal)."""
+    cdef int32_t m = <int32_t>indptr.shape[0] - 1, nnz = <int32_t>indices.shape[0], total
+    cdef int32_t[::1] whole = np.empty(n + 2 + nnz + 2 * m + 1, np.int32), count, out
+    cdef double[::1] value = np.empty(nnz + m + 1), entry
+    cdef const int32_t* columns = &indices[0] if nnz else NULL
+    cdef const double* numbers = &data[0] if nnz else NULL
+    cdef int32_t* ptr = &whole[0]
+    cdef int32_t* row = ptr + n + 2
+    cdef int32_t* scratch = row + nnz
+    count_array = np.zeros(m + 1, np.int32)
+    if m == 0:
+        return count_array, np.empty(0, np.int32), np.empty(0)
+    count = count_array
+    with nogil:
+        lav_by_columns(m, n, &indptr[0], columns, numbers, ptr, row, &value[0])
+        lav_gram_pattern(m, &indptr[0], columns, ptr, row, scratch, &count[0])
+    out_array, entry_array = np.empty(count[m], np.int32), np.empty(count[m])
+    out, entry = out_array, entry_array
+    with nogil:
+        total = lav_gram(m, &indptr[0], columns, numbers, ptr, row, &value[0], &diagonal[0], scratch, &value[nnz], &count[0],
+                         &out[0], &entry[0])
+    return count_array, out_array[:total], entry_array[:total]

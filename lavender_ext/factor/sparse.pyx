@@ -14,9 +14,8 @@ from libc.string cimport memset
 
 import numpy as np
 
-from lavender_ext.factor.minimum_degree import minimum_degree
+from lavender_ext.factor.minimum_degree cimport degree_order
 from lavender_ext.factor.supernodal cimport dense_panel, less_lower
-from lavender_ext.factor.symbolic import factor_pattern, postorder
 from lavender_ext.factor.tiles cimport add, has_wide, less, take
 
 
@@ -122,6 +121,144 @@ cdef public void lav_lower(int32_t n, const int32_t* ptr, const int32_t* near, c
     nptr[n] = to
 
 
+cdef inline void tree_of(int32_t n, const int32_t* nptr, const int32_t* nind, int32_t* parent,
+                         int32_t* above) noexcept nogil:
+    # Elimination tree of a lower pattern, ancestors remembered (Liu 1986); above (n) is scratch.
+    cdef int32_t k, q, j, after
+    for k in range(n):
+        parent[k] = -1
+        above[k] = -1
+        for q in range(nptr[k], nptr[k + 1]):
+            j = nind[q]
+            while j >= 0 and j < k:
+                after = above[j]
+                above[j] = k
+                if after < 0:
+                    parent[j] = k
+                j = after
+
+
+cdef inline void postorder_of(int32_t n, const int32_t* parent, int32_t* child, int32_t* sibling, int32_t* stack,
+                              int32_t* rank) noexcept nogil:
+    # rank (n): place of each vertex after its children and beside them
+    cdef int32_t i, top, k = 0, root
+    for i in range(n):
+        child[i] = -1
+    for i in range(n - 1, -1, -1):
+        if parent[i] >= 0:
+            sibling[i] = child[parent[i]]
+            child[parent[i]] = i
+    for root in range(n):
+        if parent[root] >= 0:
+            continue
+        top = 0
+        stack[0] = root
+        while top >= 0:
+            i = stack[top]
+            if child[i] >= 0:
+                top += 1
+                stack[top] = child[i]
+                child[i] = sibling[child[i]]
+            else:
+                rank[i] = k
+                k += 1
+                top -= 1
+
+
+cdef public int32_t lav_sparse_order(int32_t n, const int32_t* indptr, const int32_t* indices, int32_t room,
+                                     int32_t* scratch, int64_t* left, int32_t* begin, int32_t* order, int32_t* size,
+                                     int32_t* nptr, int32_t* nind, int32_t* parent, int32_t* lptr) noexcept nogil:
+    """Runs of rows with the same columns, in their order of elimination, and how many vertices are below each.
+
+    begin (n + 1): the first row of each run as they stand; order, size (n), nptr (n + 1), nind (nnz / 2 + n + 1),
+    parent (n) and lptr (n + 1) belong to the order. scratch has 11 n + 2 + room numbers, room is nnz and n or more; left
+    (n). The number of runs, or -1 where the factor has 2^31 entries or more.
+    """
+    cdef int32_t* node = scratch
+    cdef int32_t* gptr = scratch + n                    # n + 1
+    cdef int32_t* head = scratch + 2 * n + 1            # n + 1
+    cdef int32_t* whole = scratch + 3 * n + 2           # 8 n + 1
+    cdef int32_t* near = scratch + 11 * n + 3
+    cdef int32_t* rank = node
+    cdef int32_t count, i, j, k, q, total
+    cdef int64_t below = 0
+    count = lav_same_rows(n, indptr, indices, node, begin)
+    total = lav_node_graph(count, indptr, indices, node, begin, gptr, near)
+    for i in range(count):
+        whole[i] = gptr[i]
+        size[i] = begin[i + 1] - begin[i]
+    whole[count] = total
+    degree_order(count, size, room, near, whole, left, head, order)
+    # The quotient graph has used up its lists: once more.
+    total = lav_node_graph(count, indptr, indices, node, begin, gptr, near)
+    for i in range(count):
+        rank[order[i]] = i
+    lav_lower(count, gptr, near, rank, order, nptr, nind)
+    tree_of(count, nptr, nind, parent, whole)
+    postorder_of(count, parent, whole, whole + n, whole + 2 * n, whole + 3 * n)
+    for i in range(count):
+        rank[i] = whole[3 * n + rank[i]]
+    for i in range(count):
+        order[rank[i]] = i
+    lav_lower(count, gptr, near, rank, order, nptr, nind)
+    for i in range(count):
+        size[i] = begin[order[i] + 1] - begin[order[i]]
+    # How many are below each: along the tree from every entry.
+    for k in range(count):
+        parent[k] = -1
+        whole[k] = k
+        lptr[k + 1] = 0
+        for q in range(nptr[k], nptr[k + 1]):
+            j = nind[q]
+            while j < k and whole[j] != k:
+                if parent[j] < 0:
+                    parent[j] = k
+                whole[j] = k
+                lptr[j + 1] += 1
+                j = parent[j]
+    lptr[0] = 0
+    for k in range(count):
+        below += lptr[k + 1]
+        if below >= 2147483647:
+            return -1
+        lptr[k + 1] += lptr[k]
+    return count
+
+
+cdef inline void pattern_of(int32_t n, const int32_t* nptr, const int32_t* nind, const int32_t* parent, int32_t* mark,
+                            const int32_t* lptr, int32_t* next, int32_t* lind) noexcept nogil:
+    # What is below each vertex, ascending; mark, next (n) are scratch.
+    cdef int32_t k, q, j
+    for k in range(n):
+        mark[k] = k
+        next[k] = lptr[k]
+        for q in range(nptr[k], nptr[k + 1]):
+            j = nind[q]
+            while j < k and mark[j] != k:
+                mark[j] = k
+                lind[next[j]] = k
+                next[j] += 1
+                j = parent[j]
+
+
+cdef public int32_t lav_sparse_pattern(int32_t count, const int32_t* nptr, const int32_t* nind, const int32_t* parent,
+                                       const int32_t* size, const int32_t* lptr, int32_t* lind, int32_t* scratch,
+                                       double share, int32_t* group, int64_t* below) noexcept nogil:
+    """Panels of vertices: their number, the first vertex of each in group (count + 1), rows below all of them.
+
+    lind (lptr[count]) gets the vertices below each; scratch (2 count).
+    """
+    cdef int32_t i, c, q, k
+    pattern_of(count, nptr, nind, parent, scratch, lptr, scratch + count, lind)
+    k = lav_panels(count, lptr, lind, size, share, group)
+    below[0] = 0
+    for i in range(k):
+        c = group[i + 1] - 1
+        for q in range(lptr[c], lptr[c + 1]):
+            below[0] += size[lind[q]]
+    return k
+
+
 cdef public int32_t lav_panels(int32_t n, const int32_t* lptr, const int32_t* lind, const int32_t* size, double share,
                                int32_t* first) noexcept nogil:
     """As `lav_supernodes`, of vertices of weights size (n): the number of panels, the first vertex of each."""
@@ -147,6 +284,58 @@ cdef public int32_t lav_panels(int32_t n, const int32_t* lptr, const int32_t* li
         before = below
     first[k] = n
     return k
+
+
+cdef public void lav_sparse_rows(int32_t n, int32_t count, int32_t panels, const int32_t* begin, const int32_t* order,
+                                 const int32_t* size, const int32_t* lptr, const int32_t* lind, const int32_t* group,
+                                 int32_t lu, int32_t* starts, int32_t* by_place, int32_t* place, int32_t* first,
+                                 int32_t* of, int32_t* rptr, int32_t* rows, int64_t* at, int64_t* beside, int64_t* room,
+                                 double* work) noexcept nogil:
+    """From vertices to rows, as `sparse_t` has them; room for what one panel takes; starts (count + 1) is scratch."""
+    cdef int32_t i, j, c = 0, q, k, width, below, run
+    cdef int64_t most = 0, needed
+    for i in range(count):
+        starts[i] = c
+        for j in range(begin[order[i]], begin[order[i] + 1]):
+            by_place[c] = j
+            place[j] = c
+            c += 1
+    starts[count] = n
+    rptr[0] = 0
+    at[0] = 0
+    beside[0] = 0
+    work[0] = 0.0
+    for i in range(panels):
+        first[i] = starts[group[i]]
+        c = rptr[i]
+        for q in range(lptr[group[i + 1] - 1], lptr[group[i + 1]]):
+            for k in range(starts[lind[q]], starts[lind[q] + 1]):
+                rows[c] = k
+                c += 1
+        rptr[i + 1] = c
+        width = starts[group[i + 1]] - first[i]
+        below = c - rptr[i]
+        at[i + 1] = at[i] + <int64_t>width * (width + below)
+        beside[i + 1] = beside[i] + <int64_t>width * below
+        for j in range(first[i], first[i] + width):
+            of[j] = i
+        # Half of the sum of the squares of its columns' heights.
+        work[0] += width * (0.5 * (<double>below * below + <double>below * width) + <double>width * width / 6.0)
+        if lu and <int64_t>width * STRIP > most:
+            most = <int64_t>width * STRIP
+        if below > most:
+            most = below
+    first[panels] = n
+    for i in range(panels):
+        run = 0
+        for j in range(rptr[i], rptr[i + 1]):
+            run = run + 1 if j > rptr[i] and of[rows[j]] == of[rows[j - 1]] else 1
+            needed = <int64_t>run * (rptr[i + 1] - j + run - 1)
+            if needed > most:
+                most = needed
+    if lu:
+        work[0] *= 2.0
+    room[0] = most
 
 
 cdef public void lav_transpose(int32_t n, const int32_t* indptr, const int32_t* indices, const double* data, int32_t* tptr,
@@ -493,113 +682,81 @@ cdef class SparsePanels:
     """
 
     cdef sparse_t f
-    cdef object keep, indptr, indices, turned
+    cdef object keep, indptr, indices
     cdef readonly double work                           # multiply-adds of a factor, roughly
     cdef readonly int64_t entries                       # numbers it holds
 
     def __init__(self, indptr, indices, bint lu, bint wide=True):
-        cdef int32_t n = <int32_t>len(indptr) - 1, k, i, j, count, width, below, run, c
+        cdef int32_t n = <int32_t>len(indptr) - 1, nnz = <int32_t>len(indices), count, k, room = nnz + nnz // 4 + n + 1
         cdef const int32_t[::1] ptr = indptr, ind = indices
-        cdef int32_t[::1] node = np.empty(n, np.int32), begin = np.empty(n + 1, np.int32), gptr, near, size, rank, order
-        cdef int32_t[::1] nptr, nind, first, lptr, lind, rows_, starts, of, rptr, by_place, place, columns, weight
-        cdef int64_t[::1] at, beside
-        cdef int64_t most = 0, room, total
-        if n < 1 or n != len(indptr) - 1:
+        cdef const int32_t* entries = &ind[0] if nnz else NULL
+        cdef int64_t below, most, held
+        cdef double share = ZEROS
+        cdef int32_t[::1] scratch, lind_
+        cdef int64_t[::1] left
+        cdef double[::1] numbers
+        cdef int32_t* begin
+        cdef int32_t* order
+        cdef int32_t* size
+        cdef int32_t* parent
+        cdef int32_t* nptr
+        cdef int32_t* lptr
+        cdef int32_t* group
+        cdef int32_t* nind
+        cdef int32_t* s
+        if n < 1:
             raise ValueError("a matrix of one row or more")
-        count = lav_same_rows(n, &ptr[0], &ind[0] if ind.shape[0] else NULL, &node[0], &begin[0])
-        gptr, near = np.empty(count + 1, np.int32), np.empty(max(1, len(indices)), np.int32)
-        k = lav_node_graph(count, &ptr[0], &ind[0] if ind.shape[0] else NULL, &node[0], &begin[0], &gptr[0], &near[0])
-        near = near[:k]
-        size = np.diff(np.asarray(begin[:count + 1])).astype(np.int32)
-        order = minimum_degree(gptr, near, size)
-        rank = np.empty(count, np.int32)
-        nptr, nind = np.empty(count + 1, np.int32), np.empty(k // 2 + count + 1, np.int32)
-        for i in range(count):
-            rank[order[i]] = i
-        lav_lower(count, &gptr[0], &near[0] if k else NULL, &rank[0], &order[0], &nptr[0], &nind[0])
-        after = postorder(nptr, nind)
-        columns = after
-        for i in range(count):
-            rank[i] = columns[rank[i]]
-        for i in range(count):
-            order[rank[i]] = i
-        lav_lower(count, &gptr[0], &near[0] if k else NULL, &rank[0], &order[0], &nptr[0], &nind[0])
-        found = factor_pattern(nptr, nind)
-        lptr, lind = found[0], found[1]
-        # From vertices to rows.
-        starts, first, weight = np.empty(count + 1, np.int32), np.empty(count + 1, np.int32), np.empty(count, np.int32)
-        starts[0] = 0
-        for i in range(count):
-            weight[i] = size[order[i]]
-            starts[i + 1] = starts[i] + weight[i]
-        k = lav_panels(count, &lptr[0], &lind[0], &weight[0], ZEROS, &first[0])
-        order_array, place_array = np.empty(n, np.int32), np.empty(n, np.int32)
-        by_place, place = order_array, place_array
-        c = 0
-        for i in range(count):
-            for j in range(begin[order[i]], begin[order[i] + 1]):
-                by_place[c] = j
-                place[j] = c
-                c += 1
-        first_array, rptr_array = np.empty(k + 1, np.int32), np.zeros(k + 1, np.int32)
-        at_array, beside_array = np.zeros(k + 1, np.int64), np.zeros(k + 1, np.int64)
-        of_array = np.empty(n + 1, np.int32)
-        rptr, at, beside, of = rptr_array, at_array, beside_array, of_array
-        columns = first_array
-        total = 0
-        for i in range(k):
-            columns[i] = starts[first[i]]
-            c = first[i + 1] - 1
-            for j in range(lptr[c], lptr[c + 1]):
-                total += weight[lind[j]]
-            if total >= 2**31:
-                raise OverflowError("the factor has 2^31 rows of panels or more")
-            rptr[i + 1] = <int32_t>total
-        columns[k] = n
-        rows_array = np.empty(total + 1, np.int32)
-        rows_ = rows_array
-        self.work = 0.0
-        for i in range(k):
-            c = rptr[i]
-            for j in range(lptr[first[i + 1] - 1], lptr[first[i + 1]]):
-                for run in range(starts[lind[j]], starts[lind[j] + 1]):
-                    rows_[c] = run
-                    c += 1
-            width = columns[i + 1] - columns[i]
-            below = rptr[i + 1] - rptr[i]
-            at[i + 1] = at[i] + <int64_t>width * (width + below)
-            beside[i + 1] = beside[i] + <int64_t>width * below
-            for j in range(columns[i], columns[i + 1]):
-                of[j] = i
-            # 1/2 of the sum of the squares of its columns' heights
-            self.work += width * (0.5 * (<double>below * below + <double>below * width) + <double>width * width / 6.0)
-            if lu and <int64_t>width * STRIP > most:
-                most = <int64_t>width * STRIP
-            if below > most:
-                most = below
-        for i in range(k):
-            run = 0
-            for j in range(rptr[i], rptr[i + 1]):
-                run = run + 1 if j > rptr[i] and of[rows_[j]] == of[rows_[j - 1]] else 1
-                room = <int64_t>run * (rptr[i + 1] - j + run - 1)
-                if room > most:
-                    most = room
-        if lu:
-            self.work *= 2.0
-        self.entries = at[k] + (beside[k] if lu else 0)
-        val, up, temp = np.empty(at[k] + 1), np.empty((beside[k] if lu else 0) + 1), np.empty(most + 1)
-        scale, y, swap, rel = np.empty(n), np.empty(n), np.empty(n, np.int32), np.empty(n, np.int32)
-        head, link, nxt = np.empty(k, np.int32), np.empty(k, np.int32), np.empty(k, np.int32)
-        cdef double[::1] val_ = val, up_ = up, temp_ = temp, scale_ = scale, y_ = y
-        cdef int32_t[::1] swap_ = swap, rel_ = rel, head_ = head, link_ = link, next_ = nxt
-        self.keep = [val, up, temp, scale, y, swap, rel, head, link, nxt, order_array, place_array, first_array, of_array,
-                     rptr_array, rows_array, at_array, beside_array]
+        scratch = np.empty(19 * n + nnz // 2 + room + 9, np.int32)
+        left = np.empty(2 * n + 2, np.int64)
+        begin = &scratch[0]                             # n + 1
+        order = begin + n + 1
+        size = order + n
+        parent = size + n
+        nptr = parent + n                               # n + 1
+        lptr = nptr + n + 1                             # n + 1
+        group = lptr + n + 1                            # n + 1
+        nind = group + n + 1                            # nnz / 2 + n + 1
+        s = nind + nnz // 2 + n + 1                     # 11 n + 3 + room
+        with nogil:
+            count = lav_sparse_order(n, &ptr[0], entries, room, s, &left[0], begin, order, size, nptr, nind, parent, lptr)
+        if count < 0:
+            raise OverflowError("the factor has 2^31 entries or more")
+        lind_ = np.empty(lptr[count] + 1, np.int32)
+        with nogil:
+            k = lav_sparse_pattern(count, nptr, nind, parent, size, lptr, &lind_[0], s, share, group, &below)
+        if below >= 2**31:
+            raise OverflowError("the factor has 2^31 rows of panels or more")
+        whole_array = np.empty(5 * n + 5 * k + 2 + below, np.int32)
+        cdef int32_t[::1] whole = whole_array
+        cdef int32_t* order_ = &whole[0]
+        cdef int32_t* place = order_ + n
+        cdef int32_t* of = place + n
+        cdef int32_t* swap = of + n
+        cdef int32_t* rel = swap + n
+        cdef int32_t* first = rel + n                   # k + 1
+        cdef int32_t* rptr = first + k + 1              # k + 1
+        cdef int32_t* head = rptr + k + 1
+        cdef int32_t* link = head + k
+        cdef int32_t* next_ = link + k
+        cdef int32_t* rows = next_ + k                  # below
+        cdef int64_t* at
+        cdef int64_t* beside
+        places = np.empty(2 * k + 2, np.int64)
+        cdef int64_t[::1] places_ = places
+        at = &places_[0]
+        beside = at + k + 1
+        with nogil:
+            lav_sparse_rows(n, count, k, begin, order, size, lptr, &lind_[0], group, lu, s, order_, place, first, of,
+                            rptr, rows, at, beside, &most, &self.work)
+        held = beside[k] if lu else 0
+        self.entries = at[k] + held
+        numbers = np.empty(self.entries + most + 2 * n + 1)
+        self.keep = whole_array, places, np.asarray(numbers)
         self.indptr, self.indices = indptr, indices
-        self.turned = None
         self.f = sparse_t(
-            n, k, wide and has_wide(), lu, &by_place[0], &place[0], &columns[0], &of[0], &rptr[0], &rows_[0], &at[0],
-            &beside[0], &val_[0], &up_[0], &temp_[0], &scale_[0], &y_[0], &swap_[0], &rel_[0], &head_[0], &link_[0],
-            &next_[0])
+            n, k, wide and has_wide(), lu, order_, place, first, of, rptr, rows, at, beside, &numbers[0],
+            &numbers[0] + at[k], &numbers[0] + self.entries, &numbers[0] + self.entries + most,
+            &numbers[0] + self.entries + most + n, swap, rel, head, link, next_)
 
     def factor(self, const double[::1] data, const double[::1] d, double shift, double tiny):
         """Factor the matrix of these entries with shift D, d (n,) > 0; how many pivots are not above tiny d."""
@@ -634,4 +791,4 @@ cdef class SparsePanels:
     @property
     def order(self):
         """(n,) row eliminated first, second, ..."""
-        return self.keep[10]
+        return self.keep[0][:self.f.n]

@@ -351,6 +351,15 @@ def test_direct_that_is_the_end_comes_before_anything_is_noted(seed, monkeypatch
         assert kept.work == {"factorisations": 1, "refinements": 1}
 
 
+def test_a_net_in_generalised_coordinates_goes_to_direct_where_newton_costs_more():
+    problem = suite.wild(seed=7029).problem
+    assert problem.generalized is not None and problem.law == "linear"
+    solution = lv.solve(problem, tol=1e-6)
+    assert solution.success and solution.message == "direct 1 factorisations"
+    tree = suite.wild(seed=7049).problem  # without loops its velocities fill little
+    assert lv.solve(tree, tol=1e-6).message.startswith("newton")
+
+
 def test_direct_that_came_first_is_not_asked_again():
     problem = suite.hang(n=100, tip_mass=1e8).problem
     solution = lv.solve(problem, "auto", tol=1e-14)
