@@ -52,6 +52,7 @@ COLD = (
     "core/gate",
     "core/order",
     "factor/graph",
+    "factor/narrow",
     "factor/symbolic",
 )
 

@@ -19,7 +19,7 @@ import numpy as np
 from lavender.problem import LAWS, Problem
 from lavender.registry import FEW
 from lavender.solvers._accelerated import sweep_work
-from lavender.solvers._factor import PanelsLU, choose, panels_cost
+from lavender.solvers._factor import DENSE_SHARE, SMALL_BAND, PanelsLU, choose, panels_cost
 from lavender.solvers._islands import block_bodies
 from lavender.solvers._newton.general import factor_flops
 from lavender.solvers._newton.systems import (
@@ -32,6 +32,7 @@ from lavender.solvers._newton.systems import (
 from lavender.solvers._sweeping import reads_whitened
 from lavender_ext.core import assemble
 from lavender_ext.factor import graph
+from lavender_ext.pivot.principal import bandwidth
 
 __all__ = ["Costs", "Exact", "general_cost", "is_loose", "islands_cost"]
 
@@ -86,6 +87,7 @@ FIRST_LOOK, LAST_LOOK = 16, 64  # sweeps before the first look at the residual: 
 LOOKED = 60e3  # ns, or as cost so much: a look and a cut in the sweeps are not free
 
 GLANCED = 200e3  # ns of a first look at sweeps that may come before anything else is found out
+GLANCE = 0.35  # share of a finite solver's cost for which a first look at sweeps is always worth it
 
 # Factorisations to expect, by law: medians over drawn problems. Friction has a long tail.
 DIRECT = {"linear": 1.5, "lcp": 6.0}
@@ -110,7 +112,8 @@ ADMM_FILL = 6.0  # entries of L for each of A
 DIRECT_ROUNDS = 40  # of `direct` on bounded rows that are granted before another is asked
 AT_REST = 8.0  # of faces on faces, most of whose rows hold
 UNSYMMETRIC = 2.0  # LU against Cholesky, where friction or A asks for it
-SINGULAR = 6.0  # times as many of `direct` where A is singular and one shift does not end it
+SINGULAR = 6.0  # times as many of `direct` where A is singular and one shift does not end it,
+STUCK = 10.0  # and where exchanges were stuck
 
 # Sweeps to expect before anything was swept, to six decades: median over drawn problems, and where the same weight
 # rests on more points than are needed.
@@ -120,7 +123,7 @@ ISLAND = 400e3  # what Python takes for an island of its own
 # Islands in compiled code: a call, as it showed in `wild` with them and without; for each island beside its solve, and
 # for each of its rows (`python benchmarks/bench_islands.py`).
 TOGETHER, TOGETHER_ISLAND, TOGETHER_ROW = 200e3, 1e3, 60.0
-BAND_AT_ONCE = 1e6  # ns of `direct` on a narrow band up to which nothing else is looked at
+BAND_AT_ONCE = 4e6  # ns of `direct` on a narrow band up to which nothing else is looked at
 LU_ROWS = 300  # of a linear system that is not symmetric, up to which sweeps are looked at before its factor
 FEW_JOINTS = 300  # rows up to which a linear system is not looked at more closely
 NARROW_ENTRIES = 12  # of A in a row up to which a narrow band is looked for
@@ -231,7 +234,26 @@ def is_glanced(problem: Problem, per: float) -> bool:
         return not problem.is_symmetric and problem.m <= LU_ROWS
     if problem.m <= FEW:
         return not factors_at_once(problem)
-    return FIRST_LOOK * per <= GLANCED and not is_redundant(problem) and not factors_at_once(problem)
+    if is_redundant(problem) or factors_at_once(problem):
+        return False
+    look, most = FIRST_LOOK * per, GLANCED
+    if look > most and problem.law == "lcp" and not _may_be_narrow(problem):
+        # Whether A is symmetric, and what a factor of it takes, is not asked for before.
+        most += GLANCE * finite_least(problem, True)
+    return look <= most
+
+
+def _may_be_narrow(problem: Problem) -> bool:
+    """Its A is a narrow band in the order of elimination, or has no more entries than one where nobody has looked."""
+    kept = problem.derived.factor
+    if kept is not None:
+        return bool(kept[0] == "band")
+    if problem.rows is not None:
+        return True
+    m, entries = problem.m, len(problem._compressed[1])
+    return entries <= (2 * NARROW + 1) * m and (
+        entries < DENSE_SHARE * m * m or max(bandwidth(*problem._compressed[:2])) <= SMALL_BAND
+    )
 
 
 def factors_at_once(problem: Problem) -> bool:
@@ -241,19 +263,25 @@ def factors_at_once(problem: Problem) -> bool:
     m = problem.m
     if m <= FEW:
         return True
-    if not problem.is_symmetric:
+    if problem.generalized is not None or is_redundant(problem):
         return False
-    if problem.rows is not None:
+    if problem.rows is not None and problem.rows.n_bodies:
         width = graph.body_spread(problem.cones.ptr, block_bodies(problem), problem.rows.n_bodies) + 1
-        return (
-            width <= NARROW
-            and DIRECT["lcp"] * BAND * m * float(width) ** 2 <= BAND_AT_ONCE
-            and not is_redundant(problem)
-        )
-    if problem.matrix is None or len(problem._compressed[1]) > NARROW_ENTRIES * m:
+        if width <= NARROW:
+            return _is_hasty(m, width)
+    # Rows of bodies may be narrow in another order, which that of A tells.
+    entries = (
+        int(assemble.bound(problem.data)[0]) if problem.rows is not None else len(problem._compressed[1])
+    )
+    if entries > NARROW_ENTRIES * m or not problem.is_symmetric:
         return False
     form, band, _ = choose(problem)
-    return form == "band" and DIRECT["lcp"] * BAND * m * float(band + 1) ** 2 <= BAND_AT_ONCE
+    return form == "band" and _is_hasty(m, band + 1)
+
+
+def _is_hasty(m: int, width: int) -> bool:
+    """A band of m bounded rows so narrow that nothing else is looked at before `direct`."""
+    return DIRECT["lcp"] * BAND * m * float(width) ** 2 <= BAND_AT_ONCE
 
 
 def joints_at_once(problem: Problem) -> bool:
@@ -284,16 +312,19 @@ def is_redundant(problem: Problem) -> bool:
     return not p.compliance.any() and (p.law != "cone" or not is_loose(p))
 
 
-def finite_least(problem: Problem) -> float:
-    """What no finite solver costs less than [ns]."""
-    if problem.law == "linear" or (problem.law == "lcp" and (problem.m <= FEW or problem.is_symmetric)):
-        m = problem.m
+def finite_least(problem: Problem, symmetric: bool | None = None) -> float:
+    """What no finite solver costs less than [ns]; `symmetric`: as if A were, or were not."""
+    m = problem.m
+    if problem.law == "linear" or (
+        problem.law == "lcp" and (m <= FEW or (problem.is_symmetric if symmetric is None else symmetric))
+    ):
         if m <= FEW and problem.law == "lcp":
             return few_direct(m)
         width = 3.0 if problem.matrix is None else max(3.0, 0.5 * len(problem._compressed[1]) / m)
-        return START["direct"] + DIRECT[problem.law] * (STEP["direct"] + ROW * m + BAND * m * width * width)
+        factor = min(BAND * m * width * width, float(dense_factor(m)))
+        return START["direct"] + DIRECT[problem.law] * (STEP["direct"] + ROW * m + factor)
     start, step, row = newton_rates(problem)
-    return start + NEWTON[problem.law] * (step + row * problem.m)
+    return start + NEWTON[problem.law] * (step + row * m)
 
 
 def few_direct(m: int) -> float:
@@ -456,7 +487,9 @@ class Costs:
                 # Most are regular where they are free; where not, it says so and is asked again last. Not so over J and
                 # M: what comes between is a method that the same redundancy holds up.
                 found.append(Exact("direct", self._direct(factor), rounds, (("patience", False),), once))
-            count = SINGULAR if p.law == "lcp" and p.generalized is None else 1.0
+            count = 1.0
+            if p.law == "lcp" and p.generalized is None:
+                count = SINGULAR if singular else STUCK
             found.append(Exact("direct", self.formed + self._direct(factor, count), rounds, once=once))
         if p.law == "lcp" and p.m <= LEMKE_ROWS:
             capped = int(np.count_nonzero(np.isfinite(p.cones.lower) & np.isfinite(p.cones.upper)))

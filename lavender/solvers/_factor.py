@@ -23,6 +23,7 @@ from scipy.linalg import lapack
 from lavender._arrays import FloatArray, IntArray
 from lavender._lu import sparse_lu
 from lavender.problem import Problem
+from lavender_ext.factor.narrow import narrow_order
 from lavender_ext.factor.sparse import SparsePanels, free_part, is_mirrored
 
 TINY = 1e-13  # -, of d
@@ -67,10 +68,7 @@ def _choose(problem: Problem) -> tuple[str, int, IntArray | None]:
         return "dense", m - 1, None
     # A band needs 2 band + 1 places a row: a mean row of more nonzeros than that has none so narrow.
     if nnz <= (2 * SMALL_BAND + 1) * m:
-        from scipy.sparse.csgraph import reverse_cuthill_mckee
-
-        order = reverse_cuthill_mckee(problem.csr, symmetric_mode=True).astype(np.int32)
-        band = permuted_band(problem, order)
+        order, band = narrow_order(*problem._compressed[:2])
         if band <= SMALL_BAND:
             return "band", band, order
     return "sparse", m - 1, None

@@ -14,7 +14,6 @@ from lavender.registry import FEW
 from lavender.residuals import reference
 from lavender.solvers._costs import (
     BAND,
-    BAND_AT_ONCE,
     DIRECT,
     FIRST_LOOK,
     GENERAL_GATE,
@@ -33,6 +32,7 @@ from lavender_ext.local import gauss_seidel
 
 __all__ = ["solve_together"]
 
+BAND_APART = 1e6  # ns of `direct` on a narrow band of an island, up to which it comes before sweeps
 LARGEST = 2000  # rows of an island that is solved so
 # What Newton's method may cost in an island of J and M [ns]: there is no other there.
 GATE = Gate((*GENERAL_GATE[:3], 1e7, 0.0, GENERAL_GATE[5]))
@@ -61,7 +61,7 @@ def asked(trail: Trail, share: float, n: int, each: float) -> tuple[Any, ...]:
     return (
         trail.tol, share, trail.tol * velocity, WARM, min(n, 2**31 - 1),
         pivots and _entries_fit(trail), law == "linear", problem.rows is not None,
-        law != "linear", law == "cone", FEW, NARROW, DIRECT.get(law, 0.0) * BAND, BAND_AT_ONCE,
+        law != "linear", law == "cone", FEW, NARROW, DIRECT.get(law, 0.0) * BAND, BAND_APART,
         SWEEP[law], SWEEP_ROW, FIRST_LOOK, each, HOPE, BELIEVED,
     )  # fmt: skip
 

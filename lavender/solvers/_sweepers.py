@@ -17,6 +17,7 @@ from lavender.solution import Claim, Status
 from lavender.solvers._accelerated import AcceleratedState, operator
 from lavender.solvers._costs import (
     FIRST_LOOK,
+    GLANCED,
     ISLAND,
     LOOK,
     finite_least,
@@ -29,6 +30,7 @@ from lavender.solvers._sweeping import STATUS
 from lavender.solvers._trail import CLOCK, Trail, usable
 from lavender.solvers.anderson import Anderson
 from lavender_ext.few.looks import Looks, sweeps_left
+from lavender_ext.judge.watch import RUNNING
 
 __all__ = ["Glance", "Sweeps", "look_first"]
 
@@ -109,8 +111,15 @@ def look_first(problem: Problem, impulse: FloatArray, n: int, tol: float, failed
     # Of few rows over J and M A is not formed: that costs more than to sweep over them.
     data = problem.metric if general else operator(problem)
     looks = Looks(problem.metric, data, problem.law == "cone", split)
-    least = finite_least(problem)
-    looks.run(lam, before, min(n, 2**31 - 1), tol, sweeps, FIRST_LOOK, per, least, BELIEVED * least)
+    most = min(n, 2**31 - 1)
+    # What else there is is asked for where the first look is not the end: of a matrix that takes reading it.
+    looks.run(lam, before, most, tol, sweeps, FIRST_LOOK, per, 0.0, 0.0)
+    now = looks.now.relative
+    if now > tol and looks.status == RUNNING and looks.done < most:
+        least = finite_least(problem)
+        if sweeps_left(looks.last, before, now, tol) * per <= least and looks.done * per <= BELIEVED * least:
+            more = min(max(looks.done // 2, FIRST_LOOK), most - looks.done)
+            looks.run(lam, now, most, tol, more, FIRST_LOOK, per, least, BELIEVED * least)
     if looks.now.relative <= tol:
         remember(problem, looks.now)
     return Glance(problem, looks, lam, looks.before)
@@ -199,6 +208,8 @@ class Sweeps:
         if not self.usable or self.ended:
             return trail.done
         begun, looks = self.done, 0
+        # A glance is for nothing as far as it may come before anything else is found out.
+        glanced = 0.0 if self.glance is None else max(0.0, self.done * self.per - GLANCED)
         while not trail.late and not self.ended:
             step = min(self.next_look(), budget - trail.iterations - (self.done - self.begun))
             if cap is not None:
@@ -209,7 +220,9 @@ class Sweeps:
             looks += 1
             if now <= trail.tol:
                 break
-            if cap is None and self.dearer(self.cost, looks * LOOK + (self.done - begun) * self.per, worth):
+            if cap is None and self.dearer(
+                self.cost, glanced + looks * LOOK + (self.done - begun) * self.per, worth
+            ):
                 break
         self.note()
         return trail.done

@@ -42,6 +42,7 @@ from lavender.solvers._at_once import HASTY, JOINTS, factor_first, joints_over_v
 from lavender.solvers._costs import (
     FEW_JOINTS,
     FIRST_LOOK,
+    GLANCE,
     ISLAND,
     Costs,
     Exact,
@@ -67,7 +68,6 @@ HUGE = 40_000  # rows from which friction is left to sweeps before any factorisa
 ONE_CALL = 200  # iterations that a problem of few rows, solved in one call, takes at most
 LAST = 8000  # sweeps that friction is left to where nothing else is left
 RELAXED = 1e6  # ns that sweeps usually take from which Coulomb's law is relaxed first: a problem of its own
-GLANCE = 0.35  # share of a finite solver's cost for which a first look at sweeps is always worth it
 FRICTION_APART = 2.0  # times the cost of the whole that islands with friction may take
 ROUND_SWEEPS = 1000  # of nncg on round cones given by A, before admm is asked
 ONCE_MORE = (

@@ -414,3 +414,17 @@ def test_a_body_of_huge_inverse_inertia_is_refused_by_no_solver():
 
 def test_costs_know_the_hasty_factor_by_its_key():
     assert HASTY.key == HASTY_KEY
+
+
+def test_few_sweeps_that_end_it_come_before_a_matrix_is_scanned():
+    problem = suite.wild(seed=7065).problem  # dense, 262 rows
+    solution = lv.solve(problem, "auto", tol=1e-6)
+    assert solution.success and solution.message == "anderson 5 sweeps"
+    assert "_scan" not in problem.__dict__
+
+
+def test_rows_of_a_chain_in_any_order_are_factored_at_once(monkeypatch):
+    problem = suite.wild(seed=7202).problem  # 780 rows of bodies in an order of large bandwidth
+    monkeypatch.setattr("lavender.solvers.auto.Trail", None)
+    solution = lv.solve(problem, "auto", tol=1e-6)
+    assert solution.success and solution.work == {"factorisations": 1}
