@@ -57,6 +57,7 @@ FEW_PIVOT = 2e3  # of `lemke`, of whose time a call is most there
 HASTY_KEY = (
     "direct False"  # `Exact.key` of that (HASTY of `_at_once.py`): it gives up where one shift is stuck
 )
+VELOCITY_KEY = "newton velocity"  # `Exact.key` of newton over generalised velocities
 BLOCK, PANEL = 0.35, 0.2  # of one over bodies, by block rows and by panels
 SPARSE = 100.0  # for each nonzero of a sparse factor's matrix,
 SPARSE_ROWS = 1000.0  # as many times more as it has thousands of rows: fill grows with the size
@@ -239,12 +240,14 @@ def is_glanced(problem: Problem, per: float) -> bool:
     look, most = FIRST_LOOK * per, GLANCED
     if look > most and problem.law == "lcp" and not _may_be_narrow(problem):
         # Whether A is symmetric, and what a factor of it takes, is not asked for before.
-        most += GLANCE * finite_least(problem, True)
+        most += GLANCE * (formed_cost(problem) + finite_least(problem, True))
     return look <= most
 
 
 def _may_be_narrow(problem: Problem) -> bool:
     """Its A is a narrow band in the order of elimination, or has no more entries than one where nobody has looked."""
+    if problem.generalized is not None:
+        return False
     kept = problem.derived.factor
     if kept is not None:
         return bool(kept[0] == "band")
@@ -382,6 +385,9 @@ class Costs:
         """A finite solver gave up: what was guessed of the others beside it is looked at closely when it is asked."""
         self.ended.add(key)
         self.__dict__.pop("guess", None)
+        if key == VELOCITY_KEY:
+            self.over_velocities = np.inf
+            self.__dict__.pop("least", None)
         if self.__dict__.get("_others_win"):
             del self._others_win
             self.__dict__.pop("exact", None)
@@ -500,7 +506,7 @@ class Costs:
             found.append(Exact("lemke", START["lemke"] + p.m * (pivot + entries), limit))
         if self.largest:
             count = 2 * int(GENERAL_COUNT[p.law]) + GENERAL_TAIL[p.law]
-            cost = self.over_velocities
+            cost = general_cost(p, self.largest)
             once = GENERAL_START + (cost - GENERAL_START) / general_count(p)
             found.append(Exact("newton", cost, count, (("form", "velocity"),), once))
         if p.law in ("cone", "coulomb") and (p.generalized is None or p.m <= ADMM_GENERAL):

@@ -42,7 +42,10 @@ def _make(problem: Problem) -> Chain | None:
     if len(data.empty) or relative < 0.0:
         return None
     if problem.generalized is not None:
-        kernel = general.prepare(problem)
+        looked = general.looked_at(problem)
+        if looked.crowded and problem.law == "lcp" and problem.m > FEW:
+            return None  # sweeps may be the end before what fills is counted
+        kernel = general.prepare(problem) if looked.crowded else looked if looked.fits else None
         problem.derived.first = kernel is not None and general_first(problem, kernel.largest)
         if kernel is None or not problem.derived.first:
             return None

@@ -22,6 +22,7 @@ from lavender.solvers._costs import (
     LOOK,
     finite_least,
     first_look,
+    formed_cost,
     is_glanced,
     sweep_cost,
 )
@@ -89,13 +90,17 @@ class Glance:
         return Claim(CONVERGED, looks.done, work, said(SWEEPER, work))
 
 
-def look_first(problem: Problem, impulse: FloatArray, n: int, tol: float, failed: bool) -> Glance | None:
+def look_first(
+    problem: Problem, impulse: FloatArray, n: int, tol: float, failed: bool, crowded: bool = False
+) -> Glance | None:
     """Sweeps from an impulse (m,) where a first look at them costs no more than to find out what else there is.
 
-    `failed`: few rows whose factor did not end it at once.
+    `failed`: few rows whose factor did not end it at once. `crowded`: bounded rows of J and M whose factors over the
+    velocities fill so much that to count them costs more than a look.
     """
     general = problem.generalized is not None
-    if problem.cones.has_round or (general and (problem.law != "coulomb" or problem.m > FEW)):
+    few = problem.m <= FEW
+    if problem.cones.has_round or (general and not crowded and (problem.law != "coulomb" or not few)):
         return None
     per = sweep_cost(problem)
     sweeps = first_look(per)
@@ -109,14 +114,14 @@ def look_first(problem: Problem, impulse: FloatArray, n: int, tol: float, failed
         return Glance(problem, None, lam, before)
     split = 0 if problem.rows is None else problem.rows.n_joints
     # Of few rows over J and M A is not formed: that costs more than to sweep over them.
-    data = problem.metric if general else operator(problem)
+    data = problem.metric if general and few else operator(problem)
     looks = Looks(problem.metric, data, problem.law == "cone", split)
     most = min(n, 2**31 - 1)
     # What else there is is asked for where the first look is not the end: of a matrix that takes reading it.
     looks.run(lam, before, most, tol, sweeps, FIRST_LOOK, per, 0.0, 0.0)
     now = looks.now.relative
     if now > tol and looks.status == RUNNING and looks.done < most:
-        least = finite_least(problem)
+        least = formed_cost(problem) + finite_least(problem, True if general else None)
         if sweeps_left(looks.last, before, now, tol) * per <= least and looks.done * per <= BELIEVED * least:
             more = min(max(looks.done // 2, FIRST_LOOK), most - looks.done)
             looks.run(lam, now, most, tol, more, FIRST_LOOK, per, least, BELIEVED * least)

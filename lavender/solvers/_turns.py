@@ -13,7 +13,7 @@ from lavender._arrays import FloatArray
 from lavender.certificates import check_certificate
 from lavender.registry import FEW
 from lavender.solution import Claim, Status
-from lavender.solvers._costs import Exact
+from lavender.solvers._costs import VELOCITY_KEY, Exact
 from lavender.solvers._few import WARM
 from lavender.solvers._sweepers import Sweeps
 from lavender.solvers._trail import CLOCK, Trail, usable
@@ -28,7 +28,7 @@ ROUNDS = 8  # times that sweeps and finite solvers take turns, the allowance dou
 STILL = 4  # turns in a row, each twice as long, that gain next to nothing: then nobody gets anywhere
 GAIN = 0.99  # of the residual before a turn, below which it gained something
 ALIKE = ("direct", "lemke")  # do the same wherever they start
-VELOCITY = "newton velocity"  # key of newton over generalised velocities
+VELOCITY = VELOCITY_KEY
 
 
 def whole(

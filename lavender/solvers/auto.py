@@ -100,6 +100,7 @@ class Auto:
                 return AUTO.claim(problem, made[1])
         deadline = np.inf if time_limit is None else perf_counter() + time_limit
         lam, claim, kernel = impulse.copy(), None, None
+        glance: Glance | None = None
         largest = 0
         if problem.m == 0:
             return Claim(Status.CONVERGED, 0, {}, "nothing to solve")
@@ -114,7 +115,17 @@ class Auto:
                 return first.ended()
         if problem.generalized is not None and n > 0:
             # Newton over the velocities ends nearly all robots: nothing is looked at, and nothing noted, before.
-            kernel = general.prepare(problem)
+            # Unless its factors fill so much that to count them takes longer than some sweeps.
+            kernel = general.looked_at(problem)
+            if kernel.crowded:
+                if problem.law == "lcp" and problem.m > FEW:
+                    glance = look_first(problem, impulse, n, tol, few, True)
+                    if glance is not None and glance.best <= tol:
+                        impulse[:] = glance.impulse
+                        return glance.claim()
+                kernel = general.prepare(problem)
+            elif not kernel.fits:
+                kernel = None
             largest = 0 if kernel is None else kernel.largest
             known = problem.derived.first
             if kernel is not None and (general_first(problem, largest) if known is None else known):
@@ -128,7 +139,8 @@ class Auto:
                     impulse[:] = first.impulse
                     return first.ended()
         left = n if claim is None else n - claim.iterations
-        glance = None if first is not None else look_first(problem, impulse, left, tol, few)
+        if glance is None and first is None:
+            glance = look_first(problem, impulse, left, tol, few)
         if glance is not None and glance.best <= tol:
             impulse[:] = glance.impulse
             return glance.claim() if claim is None else _then(general.named(claim, "auto"), glance.claim())

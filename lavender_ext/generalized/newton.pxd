@@ -916,7 +916,7 @@ cdef class Newton:
     cdef Data data
     cdef list keep
     cdef readonly int largest
-    cdef readonly bint fits
+    cdef readonly bint fits, crowded
 
     cdef void aim(self, double tol, int32_t steps) noexcept
     cdef int32_t go(self, double* impulse, bint cold) noexcept nogil

@@ -36,10 +36,11 @@ cdef class Newton:
     """Room for Newton's method on a problem in generalised coordinates; `run` as often as wanted.
 
     `largest`: velocities of the island whose factor costs most, or of a dense one that costs the same. Where N of an
-    island has more than `most` values (`fits`) there is no room, and no `run`.
+    island has more than `most` values (`fits`) there is no room, and no `run`; nor where L fills so much that its rows
+    must be counted anew (`crowded`), unless that is `wanted`: it takes many sweeps' time.
     """
 
-    def __init__(self, Data p, double most):
+    def __init__(self, Data p, double most, bint wanted=True):
         cdef need_t need
         cdef int32_t per = PER_COLUMN
         cdef Room marks, numbers
@@ -49,6 +50,9 @@ cdef class Newton:
             settle(&self.f, &p.blocks, &p.general, per, <int32_t*>marks.at, &need)
             if not need.crowded or 2.0 * per * p.general.n > most or 4 * per > p.general.n:
                 break                                   # beyond a quarter of its columns a row is best kept dense
+            if not wanted:
+                self.crowded = True
+                return
             per *= 2
         self.largest = need.wide
         self.fits = need.values <= most

@@ -12,6 +12,7 @@ from lavender.solvers import _turns
 from lavender.solvers._at_once import HASTY
 from lavender.solvers._costs import HASTY_KEY, Costs
 from lavender.solvers._islands import islands, restrict, rows_of
+from lavender.solvers._newton import general
 from lavender.solvers._trail import Trail
 
 
@@ -428,3 +429,11 @@ def test_rows_of_a_chain_in_any_order_are_factored_at_once(monkeypatch):
     monkeypatch.setattr("lavender.solvers.auto.Trail", None)
     solution = lv.solve(problem, "auto", tol=1e-6)
     assert solution.success and solution.work == {"factorisations": 1}
+
+
+def test_sweeps_come_before_a_factor_over_velocities_that_fills_much_is_counted(monkeypatch):
+    problem = suite.wild(seed=7094).problem  # 294 bounded rows on 1,032 velocities
+    assert general.looked_at(problem).crowded
+    monkeypatch.setattr("lavender.solvers._newton.general.prepare", None)
+    solution = lv.solve(problem, "auto", tol=1e-3)
+    assert solution.success and solution.message == "anderson 32 sweeps"
