@@ -144,7 +144,7 @@ GENERAL_GATE = (
     tuple(GENERAL_COUNT[law] for law in LAWS),
 )
 # Steps over generalised velocities that are granted beside twice those expected.
-GENERAL_TAIL = {"linear": 60, "lcp": 60, "cone": 60, "coulomb": 0}
+GENERAL_TAIL = 60
 ADMM_GENERAL = 1500  # rows up to which A of J and M, whose entries are not known, is formed for `admm`
 LEMKE_ROWS = 1000  # beyond, a dense tableau of 8 MB and more
 
@@ -505,7 +505,7 @@ class Costs:
             pivot = PIVOT if p.m > FEW else FEW_PIVOT
             found.append(Exact("lemke", START["lemke"] + p.m * (pivot + entries), limit))
         if self.largest:
-            count = 2 * int(GENERAL_COUNT[p.law]) + GENERAL_TAIL[p.law]
+            count = 2 * int(GENERAL_COUNT[p.law]) + GENERAL_TAIL
             cost = general_cost(p, self.largest)
             once = GENERAL_START + (cost - GENERAL_START) / general_count(p)
             found.append(Exact("newton", cost, count, (("form", "velocity"),), once))
