@@ -76,6 +76,7 @@ MANY_STEP, MANY_ROW, MANY_COUNT = 15e3, 110.0, 10.0
 MANY_ROWS = 1000  # rows beyond which that is counted
 GENERAL_FIRST = 0.6e6  # ns of it up to which nothing else is looked at first
 FORM = 1.0  # of each multiply-add of Y Y^T
+WITH_A = 2.0  # times what A costs to form, that others cost with their first factor of it
 FORMED_ROWS = 6.0  # of each entry of A over bodies
 FORMED_START, FORMED = 60e3, 2.0  # of A formed of J and M, and of each of its entries
 ADMM_START, ADMM_ROW, ADMM_ENTRY = (
@@ -196,8 +197,8 @@ def general_first(problem: Problem, largest: int) -> bool:
 
     The columns of Y have n_c entries: sum n_c^2 >= (sum n_c)^2 / nv multiply-adds. Without friction, whose steps are
     less certain, what Python needs for it and each of its entries counts, of a linear system what `direct` then costs
-    as well. Or, of many soft rows under Coulomb's law, more than velocities, less than sweeps usually
-    do where rows depend on each other.
+    as well, under the cone law what sweeps usually cost. Or, of many soft rows under Coulomb's law, more than
+    velocities, less than sweeps usually do where rows depend on each other.
     """
     assert problem.generalized is not None
     cost = general_cost(problem, largest)
@@ -209,6 +210,9 @@ def general_first(problem: Problem, largest: int) -> bool:
     if problem.law == "linear" and cost <= joints_formed(problem):
         return True
     if problem.law == "lcp" and cost <= formed_cost(problem):
+        return True
+    # Under the cone law sweeps end few problems that it does not, and those late.
+    if problem.law == "cone" and cost <= WITH_A * formed_cost(problem) + SWEEPS * sweep_cost(problem):
         return True
     if (
         problem.law != "coulomb"
