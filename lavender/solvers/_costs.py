@@ -79,6 +79,8 @@ FORM = 1.0  # of each multiply-add of Y Y^T
 WITH_A = 2.0  # times what A costs to form, that others cost with their first factor of it
 FORMED_ROWS = 6.0  # of each entry of A over bodies
 FORMED_START, FORMED = 60e3, 2.0  # of A formed of J and M, and of each of its entries
+# The same under friction, before which sweeps that end there are not given up.
+RUBBED_START, RUBBED = 280e3, 6.0
 ADMM_START, ADMM_ROW, ADMM_ENTRY = (
     500e3,
     40.0,
@@ -369,6 +371,8 @@ def formed_cost(problem: Problem) -> float:
     """What A costs before a solver that needs it begins, of J and M that sweeps take as they are [ns]."""
     if problem.generalized is None or not reads_whitened(problem):
         return 0.0
+    if problem.law in ("cone", "coulomb"):
+        return RUBBED_START + RUBBED * float(problem.metric.entries_of_a)
     return FORMED_START + FORMED * float(problem.metric.entries_of_a)
 
 
