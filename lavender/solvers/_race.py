@@ -98,7 +98,7 @@ def race(trail: Trail, own: Sweeps, budget: int) -> bool:
     Look by look whichever promises to cost less from there, so that none is dropped while it moves. From where the
     relaxation stands others begin whenever it did twice as much: which of them end soon is a matter of luck. Where
     even the most promising stalls on few blocks, patches take turns with all of them, at the same cost, and so they do
-    before others than sweeps are asked, which they are not while patches gain.
+    on however many before others than sweeps are asked, which they are not while patches gain.
     """
     relaxed = Relaxed(trail)
     start = trail.best
@@ -125,7 +125,7 @@ def race(trail: Trail, own: Sweeps, budget: int) -> bool:
         stalls = racer.stalls and (mended is not None or len(followers) >= len(FOLLOWING))
         if stalls or leaves:
             mended = mended or Patches(trail)
-            if (mended.done or mended.is_concentrated) and mended.mend(spent, left()):
+            if (mended.done or leaves or mended.is_concentrated) and mended.mend(spent, left()):
                 break
             if leaves and not mended.gains:
                 break
