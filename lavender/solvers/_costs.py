@@ -617,14 +617,19 @@ class Costs:
             if self._loops <= TREE:
                 width = min(width, 2 * clique)
             entries = int(assemble.bound(p.data)[0])
-            return min(dense, BAND * m * float(width) ** 2, panels_cost(entries, m))
+            return min(dense, BAND * m * float(width) ** 2, self._sparse(entries))
         form, band, _ = choose(p) if p.is_symmetric else ("general", max(p.bandwidth), None)
         if form == "band":
             return BAND * m * float(min(band, m) + 1) ** 2
         nnz = len(p._compressed[1])
         if form == "sparse" or (form == "general" and p.law == "linear" and PanelsLU.takes(p)):
-            return min(dense, panels_cost(nnz, m))
+            return min(dense, self._sparse(nnz))
         return min(dense, sparse_factor(nnz, m))
+
+    def _sparse(self, entries: int) -> float:
+        """One sparse factor of so many entries [ns]; with bounds rows are analysed anew for each free set."""
+        m = self.problem.m
+        return panels_cost(entries, m) if self.problem.law == "linear" else sparse_factor(entries, m)
 
 
 def dense_factor(m: Any) -> Any:
