@@ -11,7 +11,14 @@ from lavender.problem import Problem
 from lavender.registry import FEW
 from lavender.residuals import judged, known
 from lavender.solution import Claim, Status
-from lavender.solvers._costs import DIRECT_ROUNDS, Exact, factors_at_once, joints_at_once
+from lavender.solvers._costs import (
+    DIRECT_ROUNDS,
+    SWEEPS_REDUNDANT,
+    Exact,
+    factors_at_once,
+    joints_at_once,
+    sweep_cost,
+)
 from lavender.solvers._factor import PanelsLU
 from lavender.solvers._few import WARM, said
 from lavender.solvers._trail import usable
@@ -45,7 +52,7 @@ def factor_first(
     """`direct` from an impulse (m,), or None where something else comes first.
 
     Bounded rows of a narrow band; a symmetric linear system that costs least so (`joints_at_once`), and one that is not
-    and has few entries.
+    and has few entries: `TooDear` where its factor fills so much that slow sweeps cost less, or time runs out.
     """
     if problem.m <= FEW or n <= 0 or problem.generalized is not None:
         return None
@@ -53,7 +60,9 @@ def factor_first(
     if problem.law == "linear":
         if not (joints_at_once(problem) if problem.is_symmetric else PanelsLU.takes(problem)):
             return None
-        chosen, solver = JOINTS, Enough()
+        # Fill is counted before the first number.
+        limit = np.inf if time_limit is None else 1e9 * time_limit
+        chosen, solver = JOINTS, Enough(most=min(SWEEPS_REDUNDANT * sweep_cost(problem), limit))
     elif factors_at_once(problem):
         chosen, solver = HASTY, Impatient()
     else:

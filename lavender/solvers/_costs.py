@@ -19,7 +19,7 @@ import numpy as np
 from lavender.problem import LAWS, Problem
 from lavender.registry import FEW
 from lavender.solvers._accelerated import sweep_work
-from lavender.solvers._factor import DENSE_SHARE, SMALL_BAND, PanelsLU, choose, panels_cost
+from lavender.solvers._factor import DENSE_SHARE, SMALL_BAND, PanelsLU, choose, filled_cost, panels_cost
 from lavender.solvers._islands import block_bodies
 from lavender.solvers._newton.general import factor_flops
 from lavender.solvers._newton.systems import (
@@ -495,7 +495,7 @@ class Costs:
         if self._direct_takes:
             rounds = 0 if p.law == "linear" else DIRECT_ROUNDS
             singular = p.law == "lcp" and self.redundant
-            factor = self._matrix
+            factor = self.whole_factor
             once = self.formed + self._direct(factor, 1.0 / DIRECT[p.law])
             if p.law == "lcp" and not singular and p.generalized is None:
                 # Most are regular where they are free; where not, it says so and is asked again last. Not so over J and
@@ -604,8 +604,8 @@ class Costs:
         decades = max(self.decades - 6.0, -3.0)
         return NEWTON[p.law] + NEWTON_DECADE[p.law] * decades + min(MOST, PER_ROW[p.law] * p.m)
 
-    @property
-    def _matrix(self) -> float:
+    @cached_property
+    def whole_factor(self) -> float:
         """One factor of A as `direct` makes it [ns]; of a factored problem without forming A."""
         p, m = self.problem, self.problem.m
         dense = float(dense_factor(m))
@@ -628,8 +628,10 @@ class Costs:
 
     def _sparse(self, entries: int) -> float:
         """One sparse factor of so many entries [ns]; with bounds rows are analysed anew for each free set."""
-        m = self.problem.m
-        return panels_cost(entries, m) if self.problem.law == "linear" else sparse_factor(entries, m)
+        p = self.problem
+        if p.law != "linear":
+            return sparse_factor(entries, p.m)
+        return panels_cost(entries, p.m) if p.matrix is None else filled_cost(p)
 
 
 def dense_factor(m: Any) -> Any:

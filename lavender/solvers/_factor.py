@@ -36,6 +36,7 @@ PANELS_SHARE = 0.25  # of nonzeros, up to which panels are looked at for a linea
 # thousand rows.
 BAND, LAPACK, DENSE, DENSE_ENTRY = 0.4, 20e3, 0.03, 3.0
 PANELS, PANELS_ENTRY, PANELS_ROWS = 20e3, 17.0, 8000.0
+PANELS_WORK = 0.2  # ns a multiply-add of panels, once these are counted
 DENSE_LIMIT = 6000  # rows, 288 MB
 WIDE = os.environ.get("LAVENDER_BASELINE", "0") in ("", "0")  # four lanes where there are: the same bits
 GENERAL_LIMIT = 2000  # rows up to which a singular matrix that is not symmetric is decomposed as a dense one
@@ -88,6 +89,24 @@ def permuted_band(problem: Problem, order: IntArray) -> int:
     return int(np.abs(row - place[a.indices]).max(initial=0))
 
 
+class TooDear(Exception):
+    """A sparse factor, counted before its first number, takes more than it may."""
+
+
+def counted(panels: SparsePanels, most: float) -> SparsePanels:
+    """The same, where a factor takes `most` nanoseconds at most."""
+    if PANELS_WORK * panels.work > most:
+        raise TooDear
+    return panels
+
+
+def filled_cost(problem: Problem) -> float:
+    """Of one factor of A by panels [ns], by its fill, which is counted anew."""
+    indptr, indices, _ = _mirrored(problem)
+    panels = SparsePanels(indptr, indices, not problem.is_symmetric, WIDE)
+    return PANELS + PANELS_ENTRY * len(indices) + PANELS_WORK * panels.work
+
+
 class Factor(Protocol):
     """Factorisation of A_FF + shift D_FF for changing free sets."""
 
@@ -132,9 +151,10 @@ class DenseFactor:
 class SparseFactor:
     """Cholesky by panels, in an order of least degree."""
 
-    def __init__(self, problem: Problem) -> None:
+    def __init__(self, problem: Problem, most: float = np.inf) -> None:
         self.d = problem.csr_data.d
         self.m = problem.m
+        self.most = most  # ns that a factor of all rows may take
         self.pattern = _mirrored(problem)
         self.whole: SparsePanels | None = None  # of all rows, kept
 
@@ -145,7 +165,7 @@ class SparseFactor:
         indptr, indices, data = self.pattern
         if n_free == self.m:
             if self.whole is None:
-                self.whole = SparsePanels(indptr, indices, False, WIDE)
+                self.whole = counted(SparsePanels(indptr, indices, False, WIDE), self.most)
             self.panels, d = self.whole, self.d
         else:
             indptr, indices, data = free_part(indptr, indices, data, place, n_free)
@@ -222,9 +242,9 @@ class PanelsLU:
         No pivot is lost to rounding.
     """
 
-    def __init__(self, problem: Problem) -> None:
+    def __init__(self, problem: Problem, most: float = np.inf) -> None:
         indptr, indices, data = problem._compressed
-        self.panels = SparsePanels(indptr, indices, True, WIDE)
+        self.panels = counted(SparsePanels(indptr, indices, True, WIDE), most)
         self.rank = problem.m
         self.usable = self.panels.factor(data, problem.csr_data.d, 0.0, TINY) == 0
 

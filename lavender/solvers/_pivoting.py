@@ -41,7 +41,7 @@ class PivotState:
 
     chosen: tuple[str, int, IntArray | None]
 
-    def __init__(self, problem: Problem, like: PivotState | None = None) -> None:
+    def __init__(self, problem: Problem, like: PivotState | None = None, most: float = np.inf) -> None:
         self.problem = problem
         self.symmetric = problem.is_symmetric
         self.factor: Factor | None = None
@@ -51,7 +51,7 @@ class PivotState:
             self.form, band, order = self.chosen
             if self.form != "band":
                 band = -1
-                self.factor = DenseFactor(problem) if self.form == "dense" else SparseFactor(problem)
+                self.factor = DenseFactor(problem) if self.form == "dense" else SparseFactor(problem, most)
         else:
             self.chosen = self.form, band, order = "LU", problem.m - 1, None
             if problem.m > SMALL_SIZE:

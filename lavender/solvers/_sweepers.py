@@ -91,12 +91,19 @@ class Glance:
 
 
 def look_first(
-    problem: Problem, impulse: FloatArray, n: int, tol: float, failed: bool, crowded: bool = False
+    problem: Problem,
+    impulse: FloatArray,
+    n: int,
+    tol: float,
+    failed: bool,
+    time_limit: float | None,
+    crowded: bool = False,
 ) -> Glance | None:
     """Sweeps from an impulse (m,) where a first look at them costs no more than to find out what else there is.
 
     `failed`: few rows whose factor did not end it at once. `crowded`: bounded rows of J and M whose factors over the
-    velocities fill so much that to count them costs more than a look.
+    velocities fill so much that to count them costs more than a look. No look is begun, or gone on with, that is
+    counted for longer than `time_limit` [s].
     """
     general = problem.generalized is not None
     few = problem.m <= FEW
@@ -104,7 +111,8 @@ def look_first(
         return None
     per = sweep_cost(problem)
     sweeps = first_look(per)
-    if n < sweeps or not (failed or is_glanced(problem, per)):
+    limit = np.inf if time_limit is None else 1e9 * time_limit
+    if n < sweeps or sweeps * per > limit or not (failed or is_glanced(problem, per)):
         return None
     lam = impulse.copy()
     before = known(problem, impulse)
@@ -122,6 +130,7 @@ def look_first(
     now = looks.now.relative
     if now > tol and looks.status == RUNNING and looks.done < most:
         least = formed_cost(problem) + finite_least(problem, True if general else None)
+        least = min(least, (limit - looks.done * per) / BELIEVED)
         if sweeps_left(looks.last, before, now, tol) * per <= least and looks.done * per <= BELIEVED * least:
             more = min(max(looks.done // 2, FIRST_LOOK), most - looks.done)
             looks.run(lam, now, most, tol, more, FIRST_LOOK, per, least, BELIEVED * least)

@@ -52,6 +52,7 @@ from lavender.solvers._costs import (
     is_loose,
     together_cost,
 )
+from lavender.solvers._factor import TooDear
 from lavender.solvers._few import AUTO
 from lavender.solvers._islands import restrict, rows_of
 from lavender.solvers._newton import general
@@ -104,7 +105,11 @@ class Auto:
         largest = 0
         if problem.m == 0:
             return Claim(Status.CONVERGED, 0, {}, "nothing to solve")
-        first = factor_first(problem, impulse, n, tol, time_limit)
+        first, fills = None, False
+        try:
+            first = factor_first(problem, impulse, n, tol, time_limit)
+        except TooDear:
+            fills = True
         if first is not None and first.relative <= tol:
             impulse[:] = first.impulse
             return first.ended()
@@ -119,7 +124,7 @@ class Auto:
             kernel = general.looked_at(problem)
             if kernel.crowded:
                 if problem.law == "lcp" and problem.m > FEW:
-                    glance = look_first(problem, impulse, n, tol, few, True)
+                    glance = look_first(problem, impulse, n, tol, few, time_limit, True)
                     if glance is not None and glance.best <= tol:
                         impulse[:] = glance.impulse
                         return glance.claim()
@@ -140,7 +145,7 @@ class Auto:
                     return first.ended()
         left = n if claim is None else n - claim.iterations
         if glance is None and first is None:
-            glance = look_first(problem, impulse, left, tol, few)
+            glance = look_first(problem, impulse, left, tol, few, time_limit)
         if glance is not None and glance.best <= tol:
             impulse[:] = glance.impulse
             return glance.claim() if claim is None else _then(general.named(claim, "auto"), glance.claim())
@@ -161,7 +166,7 @@ class Auto:
         interrupted = False
         try:
             if n > 0 and not (trail.best <= tol if first is None else trail.done):
-                _solve(trail, n, glance)
+                _solve(trail, n, glance, fills)
         except KeyboardInterrupt:
             interrupted = True  # the best impulse goes back all the same
         impulse[:] = trail.impulse
@@ -208,13 +213,19 @@ def _sum_of(first: Claim, second: Claim) -> dict[str, int]:
 
 
 @np.errstate(all="ignore")  # what overflows is judged
-def _solve(trail: Trail, budget: int, glance: Glance | None = None) -> None:
+def _solve(trail: Trail, budget: int, glance: Glance | None = None, fills: bool = False) -> None:
+    """To the end; `fills`: the factor of a linear system was counted, and slow sweeps cost less."""
     problem = trail.problem
     costs = trail.costs
     if problem.law == "linear":
         # A sparse factorisation takes islands apart by itself; newton where that stops early.
         if glance is not None:
             Sweeps(trail, glance=glance).note()
+        elif fills:
+            # What would end after the time limit is no alternative.
+            worth = costs.cheapest if costs.whole_factor <= trail.limit else np.inf
+            if Sweeps(trail).run(budget, worth=worth):
+                return
         # Of a matrix newton makes the same factor as direct.
         look = problem.m > FEW_JOINTS and problem.matrix is None
         exact = costs.exact if look else [JOINTS, Exact("newton", 0.0, 0)]

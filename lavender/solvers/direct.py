@@ -55,6 +55,7 @@ class DirectState:
     pivot: PivotState | None = None
     general: GeneralFactor | PanelsLU | None = None
     outcome: int = SOLVED  # of the factorisation of a linear system
+    begun: int = 0  # factorisations before `general` that came to nothing
     note: str = ""
 
 
@@ -65,11 +66,15 @@ class Direct:
     patience: ClassVar[bool] = True  # to go on where pivoting on one shift is stuck
     exact: ClassVar[bool] = True  # to rounding, whatever the tolerance
 
+    def allowed(self) -> float:
+        """What a sparse factor of a linear system may be counted for [ns], else `TooDear`."""
+        return np.inf
+
     def prepare(self, problem: Problem, like: PivotState | None = None) -> DirectState:
         linear = problem.law == "linear"
         if linear and not problem.is_symmetric and problem.m > SMALL_SIZE:
-            return _unsymmetric(problem)
-        state = DirectState(problem, PivotState(problem, like))
+            return _unsymmetric(problem, self.allowed())
+        state = DirectState(problem, PivotState(problem, like, self.allowed()))
         if linear and state.pivot is not None:
             state.outcome = state.pivot.factorise(whole=True)
             if state.outcome == INDEFINITE:
@@ -103,21 +108,27 @@ class Impatient(Direct):
     patience: ClassVar[bool] = False
 
 
+@dataclass(frozen=True)
 class Enough(Direct):
     """As `auto` asks where every row is free: what meets the tolerance is not refined."""
 
     exact: ClassVar[bool] = False
+    most: float = np.inf  # `allowed`
+
+    def allowed(self) -> float:
+        return self.most
 
 
 @np.errstate(all="ignore")  # what overflows is judged
-def _unsymmetric(problem: Problem) -> DirectState:
+def _unsymmetric(problem: Problem, most: float) -> DirectState:
     """LU by panels where A has few entries, else with pivoting."""
     why = "A is not symmetric"
-    if PanelsLU.takes(problem):
-        factor = PanelsLU(problem)
-        if factor.usable:
-            return DirectState(problem, general=factor, note=why)
-    return _general(problem, why)
+    if not PanelsLU.takes(problem):
+        return _general(problem, why)
+    factor = PanelsLU(problem, most)
+    if factor.usable:
+        return DirectState(problem, general=factor, note=why)
+    return replace(_general(problem, f"{why}; LU by panels lost a pivot"), begun=1)
 
 
 @np.errstate(all="ignore")  # what overflows is judged
@@ -215,7 +226,7 @@ class _Run:
     def linear_general(self, factor: GeneralFactor | PanelsLU) -> Claim:
         problem = self.problem
         self.iterations = 1
-        self.work = {"factorisations": 1}
+        self.work = {"factorisations": 1 + self.state.begun}
         if not factor.usable:
             return self.claim(Status.NUMERICAL_ERROR)
         singular = factor.rank < problem.m
@@ -231,8 +242,8 @@ class _Run:
                 break
             previous = relative
         if isinstance(factor, PanelsLU):
-            if not self.rounded():
-                return self.general(self.notes[0])
+            if not self.rounded() and not self.out_of_time:
+                return self.general(f"{self.notes[0]}; LU by panels did not refine")
         elif not self.good() and singular:
             # What least squares in the metric of D leaves of b is orthogonal to the range of A.
             measure.slack(problem.csr_data, x, w)
@@ -427,6 +438,7 @@ class _Run:
     def general(self, why: str) -> Claim:
         """A linear system by LU that tells the rank."""
         before = dict(self.work)
+        before.pop("rank", None)  # not a count: the claim's is of a decomposition
         if self.state.pivot is not None:
             before.update(self.state.pivot.work)
         self.state = _general(self.problem, why)

@@ -10,9 +10,10 @@ import lavender as lv
 from lavender import registry, suite
 from lavender.solvers import _turns
 from lavender.solvers._at_once import HASTY
-from lavender.solvers._costs import HASTY_KEY, Costs
+from lavender.solvers._costs import FIRST_LOOK, HASTY_KEY, Costs, sweep_cost
 from lavender.solvers._islands import islands, restrict, rows_of
 from lavender.solvers._newton import general
+from lavender.solvers._sweepers import look_first
 from lavender.solvers._trail import Trail
 
 
@@ -248,6 +249,19 @@ def test_budget_clock_and_warm_start():
     again = lv.solve(problem, "auto", tol=1e-7, impulse=full.impulse)
     assert again.message == "the start is a solution"
     assert again.iterations == 0
+
+
+def test_a_first_look_is_not_begun_that_is_counted_for_longer_than_the_time_limit():
+    rng = np.random.default_rng(0)
+    m = 500
+    jacobian = rng.normal(size=(m, m // 2))
+    problem = lv.Problem.lcp(jacobian @ jacobian.T / m + np.eye(m), rng.normal(size=m))
+    counted = 1e-9 * FIRST_LOOK * sweep_cost(problem)
+    start = problem.start()
+    assert look_first(problem, start, 1000, 1e-12, False, 0.5 * counted) is None
+    first = look_first(problem, start, 1000, 1e-12, False, 1.5 * counted)
+    assert first is not None
+    assert first.done == FIRST_LOOK
 
 
 def test_ctrl_c_inside_a_solver_ends_the_chain(interrupted_newton):

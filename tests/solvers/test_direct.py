@@ -12,7 +12,10 @@ import lavender as lv
 from lavender import suite
 from lavender._lu import sparse_lu
 from lavender.certificates import check_certificate
+from lavender.solvers._factor import TooDear
 from lavender.solvers._pivoting import PivotState
+from lavender.solvers.direct import Enough
+from lavender_ext.factor.sparse import SparsePanels
 from lavender_ext.pivot import principal
 from lavender_ext.pivot.principal import SMALL
 
@@ -503,3 +506,43 @@ def test_pivots_that_panels_cannot_exchange_are_left_to_superlu_and_counted():
     solution = lv.solve(problem, "direct", tol=1e-9)
     assert solution.success, solution
     assert solution.work["factorisations"] <= 2
+
+
+def test_a_panel_that_lost_a_pivot_is_counted_and_named():
+    m = 100
+    a = 2.0 * np.eye(m)
+    a[:2, :2] = [[1.0, 1.0], [2.0, 2.0]]
+    solution = lv.solve(lv.Problem.linear(sp.csr_array(a), a @ np.ones(m)), "direct", tol=1e-9)
+    assert solution.success
+    assert solution.work["factorisations"] == 2  # panels and the LU that tells the rank
+    words = "A is not symmetric; LU by panels lost a pivot; A is singular, rank 99 of 100"
+    assert solution.message == words
+
+
+@pytest.mark.parametrize("m", [41, 71])
+def test_the_rank_in_work_is_that_of_the_message(m):
+    """A Cholesky factor of an indefinite A loses pivots that say nothing of its rank."""
+    a = np.zeros((m, m))
+    i = np.arange(0, m - 1, 2)
+    a[i, i + 1] = a[i + 1, i] = 1.0
+    solution = lv.solve(lv.Problem.linear(sp.csr_array(a), np.r_[np.ones(m - 1), 0.0]), "direct")
+    assert f"rank {m - 1} of {m}" in solution.message
+    assert solution.work.get("rank", m - 1) == m - 1
+
+
+@pytest.mark.parametrize("even", [False, True])
+def test_auto_does_not_begin_a_factor_that_fills(even):
+    """A graph without short separators: nearly all of its factor fills, while a few sweeps end it."""
+    rng = np.random.default_rng(0)
+    m = 3000
+    i, j = rng.integers(0, m, (2, 4 * m))
+    x, y = rng.normal(size=(2, 4 * m))
+    a = sp.coo_array((np.r_[x, x if even else y], (np.r_[i, j], np.r_[j, i])), shape=(m, m)).tocsr()
+    a = sp.csr_array(a + sp.diags_array(2.0 * np.abs(a).sum(axis=1) + 1.0))
+    problem = lv.Problem.linear(0.5 * (a + a.T) if even else a, rng.normal(size=m))
+    factor = SparsePanels(*problem._compressed[:2], not even)
+    assert factor.work > 1e8
+    solution = lv.solve(problem, "auto", tol=1e-6)
+    assert solution.success and "factorisations" not in solution.work, solution
+    with pytest.raises(TooDear):
+        Enough(most=1e6).prepare(problem)
