@@ -1,7 +1,8 @@
 """How far each rate of `auto` can move before it chooses another solver.
 
 A choice is what `auto` would do first on a problem at a level, sweeps or a finite solver, and which finite solver
-it takes for the cheapest. Nothing is solved: choices are comparisons of counted costs (`lavender/solvers/_costs.py`).
+it takes for the cheapest. Nothing is solved: choices are comparisons of costs, counted by the
+rates of `lavender/solvers/_rates.py`.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from lavender.problem import Problem
-from lavender.solvers import _costs as costs
+from lavender.solvers import _rates as rates
 from lavender.solvers.auto import begins
 
 __all__ = ["RATES", "Moved", "moved"]
@@ -59,12 +60,12 @@ def moved(problems: Iterable[Problem], levels: Sequence[float]) -> list[Moved]:
 
 @contextmanager
 def _scaled(rate: str, factor: float) -> Iterator[None]:
-    given: Any = getattr(costs, rate)
+    given: Any = getattr(rates, rate)
     if isinstance(given, dict):
-        setattr(costs, rate, {key: factor * value for key, value in given.items()})
+        setattr(rates, rate, {key: factor * value for key, value in given.items()})
     else:
-        setattr(costs, rate, factor * given)
+        setattr(rates, rate, factor * given)
     try:
         yield
     finally:
-        setattr(costs, rate, given)
+        setattr(rates, rate, given)

@@ -11,23 +11,19 @@ from lavender.problem import Problem
 from lavender.registry import FEW
 from lavender.residuals import judged, known
 from lavender.solution import Claim, Status
-from lavender.solvers._costs import (
-    DIRECT_ROUNDS,
-    SWEEPS_REDUNDANT,
-    Exact,
-    factors_at_once,
-    joints_at_once,
-    sweep_cost,
-)
+from lavender.solvers import _rates as rates
+from lavender.solvers._costs import Exact
+from lavender.solvers._counts import sweep_cost
 from lavender.solvers._factor import PanelsLU
 from lavender.solvers._few import WARM, said
+from lavender.solvers._first import factors_at_once, joints_at_once
 from lavender.solvers._trail import usable
 from lavender.solvers.direct import Direct, Enough, Impatient
 
 __all__ = ["HASTY", "JOINTS", "Factored", "factor_first", "joints_over_velocities"]
 
 JOINTS = Exact("direct", 0.0, 0)
-HASTY = Exact("direct", 0.0, DIRECT_ROUNDS, (("patience", False),))
+HASTY = Exact("direct", 0.0, rates.DIRECT_ROUNDS, (("patience", False),))
 
 
 @dataclass
@@ -62,7 +58,7 @@ def factor_first(
             return None
         # Fill is counted before the first number.
         limit = np.inf if time_limit is None else 1e9 * time_limit
-        chosen, solver = JOINTS, Enough(most=min(SWEEPS_REDUNDANT * sweep_cost(problem), limit))
+        chosen, solver = JOINTS, Enough(most=min(rates.SWEEPS_REDUNDANT * sweep_cost(problem), limit))
     elif factors_at_once(problem):
         chosen, solver = HASTY, Impatient()
     else:

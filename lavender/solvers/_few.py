@@ -15,7 +15,8 @@ from lavender.problem import Problem
 from lavender.registry import FEW
 from lavender.residuals import reference
 from lavender.solution import Claim, Status
-from lavender.solvers._costs import GENERAL_GATE, first_look, general_first, sweep_cost
+from lavender.solvers._counts import sweep_cost
+from lavender.solvers._first import GENERAL_GATE, first_look, general_first
 from lavender.solvers._newton import general
 from lavender_ext.few.chain import PIVOTS, SWEEPS, VELOCITIES, Chain
 from lavender_ext.few.many import Gate, solve_first

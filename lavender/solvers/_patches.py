@@ -18,7 +18,8 @@ import numpy as np
 from lavender._arrays import FloatArray, IntArray
 from lavender.problem import Problem
 from lavender.residuals import judged, quick
-from lavender.solvers._costs import LOOK, sweep_cost
+from lavender.solvers import _rates as rates
+from lavender.solvers._counts import sweep_cost
 from lavender.solvers._islands import block_bodies, restrict, rows_of
 from lavender.solvers._newton.proximal import Proximal
 from lavender.solvers._newton.run import Run
@@ -57,7 +58,7 @@ class Patches(Sweeps):
     @property
     def spent(self) -> float:
         """Cost of what it did [ns]."""
-        return self.done * (self.per + LOOK / ROUND) + self.aside
+        return self.done * (self.per + rates.LOOK / ROUND) + self.aside
 
     @property
     def gains(self) -> bool:
@@ -68,7 +69,7 @@ class Patches(Sweeps):
     def is_concentrated(self) -> bool:
         """What is wrong where the trail is best sits in few blocks; where it is spread patches bring little."""
         self.impulse[:] = self.trail.impulse
-        self.aside += LOOK
+        self.aside += rates.LOOK
         error, core = self._core()
         return bool(error[core].sum() >= HELD * error.sum())
 
@@ -148,7 +149,7 @@ class Patches(Sweeps):
             self._sweep(part, impulse, tol)
         if np.isfinite(impulse).all():
             self.impulse[rows] = impulse
-        self.aside += LOOK
+        self.aside += rates.LOOK
 
     def _walk(self, part: Problem, impulse: FloatArray, tol: float) -> FloatArray:
         """Newton's method on the Alart-Curnier map, from an impulse: the best that it met."""

@@ -13,7 +13,7 @@ from scipy.linalg import lapack
 
 from lavender._arrays import FloatArray, IntArray
 from lavender.problem import Problem
-from lavender.solvers._costs import dense_factor, sparse_factor
+from lavender.solvers._counts import dense_factor, sparse_factor
 from lavender.solvers._factor import (
     SMALL_SIZE,
     TINY,

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from lavender.solution import Status
-from lavender.solvers._costs import LOOK
+from lavender.solvers import _rates as rates
 from lavender.solvers._patches import Patches
 from lavender.solvers._sweepers import SWEEPER, Sweeps
 from lavender.solvers._trail import Trail
@@ -67,7 +67,7 @@ class Racer:
     @property
     def spent(self) -> float:
         """Cost of what it did itself [ns]."""
-        return self.looks * LOOK + self.sweeps.done * self.sweeps.per + self.sweeps.aside
+        return self.looks * rates.LOOK + self.sweeps.done * self.sweeps.per + self.sweeps.aside
 
     @property
     def promised(self) -> float:

@@ -12,16 +12,9 @@ import numpy as np
 from lavender._arrays import IntArray
 from lavender.registry import FEW
 from lavender.residuals import reference
-from lavender.solvers._costs import (
-    BAND,
-    DIRECT,
-    FIRST_LOOK,
-    GENERAL_GATE,
-    NARROW,
-    SWEEP,
-    SWEEP_ROW,
-)
+from lavender.solvers import _rates as rates
 from lavender.solvers._few import WARM
+from lavender.solvers._first import GENERAL_GATE
 from lavender.solvers._newton import general
 from lavender.solvers._sweepers import BELIEVED, HOPE
 from lavender.solvers._trail import CLOCK, Trail
@@ -61,8 +54,8 @@ def asked(trail: Trail, share: float, n: int, each: float) -> tuple[Any, ...]:
     return (
         trail.tol, share, trail.tol * velocity, WARM, min(n, 2**31 - 1),
         pivots and _entries_fit(trail), law == "linear", problem.rows is not None,
-        law != "linear", law == "cone", FEW, NARROW, DIRECT.get(law, 0.0) * BAND, BAND_APART,
-        SWEEP[law], SWEEP_ROW, FIRST_LOOK, each, HOPE, BELIEVED,
+        law != "linear", law == "cone", FEW, rates.NARROW, rates.DIRECT.get(law, 0.0) * rates.BAND, BAND_APART,
+        rates.SWEEP[law], rates.SWEEP_ROW, rates.FIRST_LOOK, each, HOPE, BELIEVED,
     )  # fmt: skip
 
 

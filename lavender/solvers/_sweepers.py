@@ -14,19 +14,11 @@ from lavender.problem import Problem
 from lavender.registry import FEW
 from lavender.residuals import judged, known, remember
 from lavender.solution import Claim, Status
+from lavender.solvers import _rates as rates
 from lavender.solvers._accelerated import AcceleratedState, operator
-from lavender.solvers._costs import (
-    FIRST_LOOK,
-    GLANCED,
-    ISLAND,
-    LOOK,
-    finite_least,
-    first_look,
-    formed_cost,
-    is_glanced,
-    sweep_cost,
-)
+from lavender.solvers._counts import finite_least, formed_cost, sweep_cost
 from lavender.solvers._few import said
+from lavender.solvers._first import first_look, is_glanced
 from lavender.solvers._sweeping import STATUS
 from lavender.solvers._trail import CLOCK, Trail, usable
 from lavender.solvers.anderson import Anderson
@@ -126,14 +118,14 @@ def look_first(
     looks = Looks(problem.metric, data, problem.law == "cone", split)
     most = min(n, 2**31 - 1)
     # What else there is is asked for where the first look is not the end: of a matrix that takes reading it.
-    looks.run(lam, before, most, tol, sweeps, FIRST_LOOK, per, 0.0, 0.0)
+    looks.run(lam, before, most, tol, sweeps, rates.FIRST_LOOK, per, 0.0, 0.0)
     now = looks.now.relative
     if now > tol and looks.status == RUNNING and looks.done < most:
         least = formed_cost(problem) + finite_least(problem, True if general else None)
         least = min(least, (limit - looks.done * per) / BELIEVED)
         if sweeps_left(looks.last, before, now, tol) * per <= least and looks.done * per <= BELIEVED * least:
-            more = min(max(looks.done // 2, FIRST_LOOK), most - looks.done)
-            looks.run(lam, now, most, tol, more, FIRST_LOOK, per, least, BELIEVED * least)
+            more = min(max(looks.done // 2, rates.FIRST_LOOK), most - looks.done)
+            looks.run(lam, now, most, tol, more, rates.FIRST_LOOK, per, least, BELIEVED * least)
     if looks.now.relative <= tol:
         remember(problem, looks.now)
     return Glance(problem, looks, lam, looks.before)
@@ -202,7 +194,7 @@ class Sweeps:
 
     def next_look(self) -> int:
         """Iterations until the next one: half as many as were done."""
-        return first_look(self.per) if not self.done else max(FIRST_LOOK, self.done // 2)
+        return first_look(self.per) if not self.done else max(rates.FIRST_LOOK, self.done // 2)
 
     def note(self, prefix: str = "") -> None:
         """Tell the trail what was done since the last time."""
@@ -223,7 +215,7 @@ class Sweeps:
             return trail.done
         begun, looks = self.done, 0
         # A glance is for nothing as far as it may come before anything else is found out.
-        glanced = 0.0 if self.glance is None else max(0.0, self.done * self.per - GLANCED)
+        glanced = 0.0 if self.glance is None else max(0.0, self.done * self.per - rates.GLANCED)
         while not trail.late and not self.ended:
             step = min(self.next_look(), budget - trail.iterations - (self.done - self.begun))
             if cap is not None:
@@ -235,7 +227,7 @@ class Sweeps:
             if now <= trail.tol:
                 break
             if cap is None and self.dearer(
-                self.cost, glanced + looks * LOOK + (self.done - begun) * self.per, worth
+                self.cost, glanced + looks * rates.LOOK + (self.done - begun) * self.per, worth
             ):
                 break
         self.note()
@@ -265,7 +257,7 @@ class Sweeps:
             return costs.formed < left and any(other.once < left for other in costs.exact)
         if worth is not None:
             return than(worth)
-        if min(rest, spent) > APART * ISLAND and than(self.trail.apart_cost()):
+        if min(rest, spent) > APART * rates.ISLAND and than(self.trail.apart_cost()):
             return True
         costs = self.trail.costs
         # To ask closely of J and M forms A: not before that much was swept.

@@ -15,7 +15,8 @@ from lavender.problem import Problem
 from lavender.registry import SolverSpec, get
 from lavender.residuals import at_floor, known, quick, reference
 from lavender.solution import Claim
-from lavender.solvers._costs import Costs, islands_cost
+from lavender.solvers._costs import Costs
+from lavender.solvers._counts import islands_cost
 from lavender.solvers._few import said
 from lavender.solvers._islands import islands
 

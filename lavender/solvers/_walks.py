@@ -16,7 +16,8 @@ import numpy as np
 from lavender.problem import Problem
 from lavender.registry import FEW
 from lavender.solution import Claim, Status
-from lavender.solvers._costs import NEWTON_ROW, STEP, UNSYMMETRIC, dense_factor, newton_factor
+from lavender.solvers import _rates as rates
+from lavender.solvers._counts import dense_factor, newton_factor
 from lavender.solvers._newton.desaxce import apart
 from lavender.solvers._newton.proximal import Proximal
 from lavender.solvers._newton.run import Run
@@ -118,17 +119,21 @@ def walk_step(system: System) -> float:
     """One step of a walk [ns]; with a sparse factor by its fill."""
     if isinstance(system, MatrixSystem) and not system.dense:
         return SPARSE_STEP + SPARSE_FILL * (system.fill or FILL * system.h.nnz)
-    return STEP["newton"] + NEWTON_ROW["coulomb"] * system.sc.m + UNSYMMETRIC * newton_factor(system)
+    return (
+        rates.STEP["newton"]
+        + rates.NEWTON_ROW["coulomb"] * system.sc.m
+        + rates.UNSYMMETRIC * newton_factor(system)
+    )
 
 
 def least_step(problem: Problem) -> float:
     """What a step of a walk costs at least [ns], before its system is made."""
     m = problem.m
-    found = STEP["newton"] + NEWTON_ROW["coulomb"] * m
+    found = rates.STEP["newton"] + rates.NEWTON_ROW["coulomb"] * m
     if problem.matrix is not None and m > DENSE_ROWS:
         nnz = len(problem._compressed[1])
         if nnz > DENSE_FILL * m * m:
-            return found + UNSYMMETRIC * float(dense_factor(m))
+            return found + rates.UNSYMMETRIC * float(dense_factor(m))
         return SPARSE_STEP + SPARSE_FILL * FILL * nnz
     return found
 

@@ -44,7 +44,7 @@ _PATIENCE = 5000  # iterations: on mass ratios the residual rises while rho find
 _LATE = "the next factorisation would end after the time limit"
 _AT_ONCE = 0.02  # s, that a factor may be expected to take for `prepare` to make it
 # s for each multiply-add of a factor over bodies by QDLDL, and of a dense one; for each nonzero of a sparse one, with
-# as many times more as it has thousands of rows (`_costs.py`).
+# as many times more as it has thousands of rows (`_rates.py`).
 _BODY, _FULL, _SPARSE, _SPARSE_ROWS = 3.5e-9, 1.5e-10, 1e-7, 1000.0
 
 

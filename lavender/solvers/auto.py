@@ -33,36 +33,26 @@ from typing import Any
 import numpy as np
 
 from lavender._arrays import FloatArray, IntArray
-from lavender.certificates import check_certificate
 from lavender.problem import OPERATORS, Problem
 from lavender.registry import FEW, SolverSpec
 from lavender.residuals import reference
 from lavender.solution import Claim, Status
+from lavender.solvers import _rates as rates
 from lavender.solvers._at_once import HASTY, JOINTS, factor_first, joints_over_velocities
-from lavender.solvers._costs import (
-    FEW_JOINTS,
-    FIRST_LOOK,
-    GLANCE,
-    ISLAND,
-    Costs,
-    Exact,
-    factors_at_once,
-    general_first,
-    general_steps,
-    is_loose,
-    together_cost,
-)
+from lavender.solvers._certify import certify
+from lavender.solvers._costs import Costs, Exact
+from lavender.solvers._counts import is_loose
 from lavender.solvers._factor import TooDear
 from lavender.solvers._few import AUTO
+from lavender.solvers._first import factors_at_once, general_first, general_steps
 from lavender.solvers._islands import restrict, rows_of
 from lavender.solvers._newton import general
 from lavender.solvers._race import race
-from lavender.solvers._split import solve_together, takes
 from lavender.solvers._sweepers import Glance, Sweeps, look_first
+from lavender.solvers._together import solve_islands, worth_together
 from lavender.solvers._trail import Trail
 from lavender.solvers._turns import VELOCITY, Turns, note, whole
 from lavender.solvers._walks import Walks, sweeps_of
-from lavender_ext.few.looks import sweeps_left
 
 LARGE = 4000  # rows of J from which friction is swept both ways, and beside its relaxation
 HUGE = 40_000  # rows from which friction is left to sweeps before any factorisation
@@ -71,12 +61,6 @@ LAST = 8000  # sweeps that friction is left to where nothing else is left
 RELAXED = 1e6  # ns that sweeps usually take from which Coulomb's law is relaxed first: a problem of its own
 FRICTION_APART = 2.0  # times the cost of the whole that islands with friction may take
 ROUND_SWEEPS = 1000  # of nncg on round cones given by A, before admm is asked
-ONCE_MORE = (
-    2.0  # times what a finite solver was guessed to cost for each row, from which sweeps of islands go on
-)
-SAVED = 0.5  # share of all sweeps that islands spare which are not the largest
-CERTIFICATE_ROWS = 3000  # rows up to which a linear program is asked for a certificate
-CERTIFICATE_STEPS = 100  # of the simplex method for each row at most
 
 
 @dataclass(frozen=True)
@@ -227,10 +211,10 @@ def _solve(trail: Trail, budget: int, glance: Glance | None = None, fills: bool 
             if Sweeps(trail).run(budget, worth=worth):
                 return
         # Of a matrix newton makes the same factor as direct.
-        look = problem.m > FEW_JOINTS and problem.matrix is None
+        look = problem.m > rates.FEW_JOINTS and problem.matrix is None
         exact = costs.exact if look else [JOINTS, Exact("newton", 0.0, 0)]
         if not any(whole(trail, e, budget) for e in exact if e.key not in trail.ended):
-            _certify(trail)
+            certify(trail)
         return
     if problem.cones.has_round:
         # What it began with may have been cut short. Few others take them, over the rows of A.
@@ -250,13 +234,13 @@ def _solve(trail: Trail, budget: int, glance: Glance | None = None, fills: bool 
         (swept or costs.exact[0].key == VELOCITY)
         and problem.m > FEW
         and budget - trail.iterations >= ONE_CALL
-        and _worth_together(trail, glance)
+        and worth_together(trail, glance)
     )
     if together:
         if glance is not None:
             Sweeps(trail, glance=glance).note()
             trail.offer(glance.impulse)
-        if _together(trail, budget):
+        if solve_islands(trail, budget):
             return
     relax = swept and problem.m > FEW and _may_relax(trail)
     if relax or (swept and not together):
@@ -272,7 +256,7 @@ def _solve(trail: Trail, budget: int, glance: Glance | None = None, fills: bool 
     if costs.few_bounded and whole(trail, HASTY, budget):
         return
     least = costs.cheapest
-    if least > 2.0 * ISLAND and _worth_apart(trail, least, together) and _apart(trail, budget):
+    if least > 2.0 * rates.ISLAND and _worth_apart(trail, least, together) and _apart(trail, budget):
         return
     _finish(trail, sweeps, budget)
 
@@ -288,60 +272,13 @@ def _worth_apart(trail: Trail, least: float, left: bool) -> bool:
     return trail.apart_cost() < (FRICTION_APART if friction else 1.0) * least
 
 
-def _worth_together(trail: Trail, glance: Glance | None) -> bool:
-    """What it costs to take islands apart is less than what they save of sweeps over all of them.
-
-    Those cost no more than a finite solver, which comes next. They all go on until the island that needs most of
-    them is there. A glance tells how many are left.
-    """
-    problem, costs = trail.problem, trail.costs
-    if problem.law == "lcp" and trail.ended:
-        return False  # where direct gave up, A is singular: so it is in islands, and sweeps are slow
-    over_velocities = problem.generalized is not None and problem.law != "coulomb"
-    expected = costs.sweeping
-    if glance is not None:
-        rest = sweeps_left(glance.last, glance.before, glance.best, trail.tol)
-        expected = min(expected, rest * costs.sweep)
-    # Islands are not looked for where even one would cost too much.
-    if not over_velocities and not together_cost(problem, 1, trail.largest) < SAVED * expected:
-        return False
-    if not takes(trail):
-        return False
-    cost = together_cost(problem, trail.islands[0], trail.largest)
-    if over_velocities:
-        return cost < costs.sweeping
-    if problem.law == "cone" and trail.islands[0] == problem.n_blocks:
-        return False  # a sweep solves each block exactly
-    expected = min(expected, max(costs.least, costs.guess))
-    if not cost < SAVED * expected:
-        return False
-    rows = np.bincount(trail.islands[1], weights=np.diff(problem.cones.ptr))
-    return bool(cost < SAVED * (1.0 - rows.max() / problem.m) * expected)
-
-
-def _together(trail: Trail, budget: int) -> bool:
-    """Islands in compiled code, given up by a guess of what else there is; those left once more where it is worth it.
-
-    What else there is for the whole is then there for them alone.
-    """
-    costs, m = trail.costs, trail.problem.m
-    each = max(costs.least, costs.guess) / m
-    left = solve_together(trail, budget, each)
-    if not trail.done and len(left) and trail.problem.generalized is None:
-        rows = np.bincount(trail.islands[1], weights=np.diff(trail.problem.cones.ptr))
-        known = costs.cheapest / float(rows[left].sum())
-        if known > ONCE_MORE * each:
-            solve_together(trail, budget, known)
-    return trail.done
-
-
 def _at_once(costs: Costs) -> bool:
     """A finite solver costs less than sweeps usually do, and even a first look at them would be dear beside it."""
-    glance = costs.glance(FIRST_LOOK)
+    glance = costs.glance(rates.FIRST_LOOK)
 
     def dear(cost: float) -> bool:
         formed = 0.0 if cost >= costs.over_velocities else costs.formed
-        return cost > costs.sweeping or (glance < formed + GLANCE * cost and not costs.redundant)
+        return cost > costs.sweeping or (glance < formed + rates.GLANCE * cost and not costs.redundant)
 
     return not dear(costs.guess) and not dear(costs.cheapest)
 
@@ -369,7 +306,7 @@ def _finish(trail: Trail, sweeps: Sweeps | None, budget: int) -> None:
             return
     if problem.law == "coulomb" and Sweeps(trail, "block_gauss_seidel").run(budget, np.inf, cap=LAST):
         return
-    _certify(trail)
+    certify(trail)
 
 
 def _apart(trail: Trail, budget: int) -> bool:
@@ -422,46 +359,6 @@ def _solve_island(trail: Trail, budget: int) -> None:
         if sweeps.run(budget):
             return
     _finish(trail, sweeps, budget)
-
-
-@np.errstate(all="ignore")  # what overflows is judged
-def _certify(trail: Trail) -> None:
-    """Look for a proof that an LCP without upper bounds has no solution, whatever its A."""
-    problem = trail.problem
-    cones = problem.cones
-    if (
-        problem.law not in ("linear", "lcp")
-        or problem.m > CERTIFICATE_ROWS
-        or trail.best < 1e-6
-        or trail.late
-    ):
-        return
-    free = np.isneginf(cones.lower) & np.isposinf(cones.upper)
-    if not np.all(free | ((cones.lower == 0.0) & np.isposinf(cones.upper))):
-        return
-    from scipy.optimize import linprog  # 0.1 s to import, needed only here
-
-    # max b.y, A^T y <= 0 (= 0 on free rows), 0 <= y <= 1, in units of d.
-    scale = 1.0 / np.sqrt(problem.d)
-    at = (problem.csr.T.multiply(scale[:, None])).multiply(scale[None, :]).tocsr()
-    if not (np.isfinite(at.data).all() and np.isfinite(scale * problem.b).all()):
-        return
-    bounds = np.stack([np.where(free, -1.0, 0.0), np.ones(problem.m)], 1)
-    options: dict[str, Any] = {"maxiter": CERTIFICATE_STEPS * problem.m}
-    if trail.deadline < np.inf:
-        options["time_limit"] = max(trail.deadline - perf_counter(), 1e-3)
-    found = linprog(
-        -(scale * problem.b),
-        A_ub=at[~free] if (~free).any() else None, b_ub=np.zeros(int((~free).sum())) if (~free).any() else None,
-        A_eq=at[free] if free.any() else None, b_eq=np.zeros(int(free.sum())) if free.any() else None,
-        bounds=bounds, method="highs", options=options,
-    )  # fmt: skip
-    trail.steps.append("linear program for a certificate")
-    trail.work["certificates"] = trail.work.get("certificates", 0) + 1
-    if found.x is not None:
-        y = np.where((found.x > 0.0) | free, found.x, 0.0) * scale
-        if check_certificate(problem, y) is None:
-            trail.certificate = y
 
 
 def begins(problem: Problem, tol: float) -> tuple[str, str]:

@@ -37,7 +37,8 @@ from lavender.problem import OPERATORS, Problem
 from lavender.registry import SolverSpec
 from lavender.residuals import quick
 from lavender.solution import Claim, Status
-from lavender.solvers._costs import FORMED, FORMED_START, GENERAL, newton_factor
+from lavender.solvers import _rates as rates
+from lavender.solvers._counts import newton_factor
 from lavender.solvers._few import FEW_GENERAL, NEWTON
 from lavender.solvers._newton import general
 from lavender.solvers._newton.convex import solve_convex
@@ -223,8 +224,8 @@ def _rows_cost_less(problem: Problem, kernel: Any, like: System | None) -> Syste
     """
     if problem.m <= FEW_GENERAL or problem.law not in ("linear", "lcp"):
         return None
-    factor = GENERAL[problem.law] * general.factor_flops(problem, kernel.largest)
-    if factor <= FORMED_START + FORMED * float(problem.metric.entries_of_a):
+    factor = rates.GENERAL[problem.law] * general.factor_flops(problem, kernel.largest)
+    if factor <= rates.FORMED_START + rates.FORMED * float(problem.metric.entries_of_a):
         return None
     system = make_system(problem, "impulse", like)
     return system if system.sc.m and newton_factor(system) < factor else None

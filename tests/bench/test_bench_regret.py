@@ -11,7 +11,7 @@ from lavender import suite
 from lavender.bench import rates, regret
 from lavender.cli import main
 from lavender.report.regret import table
-from lavender.solvers import _costs
+from lavender.solvers import _rates
 
 ONE = regret.Regret(
     case="x",
@@ -108,10 +108,10 @@ def test_wild_problems_have_names_that_make_them_again():
 
 def test_rates_that_move_far_change_choices_and_are_put_back():
     problems = [suite.case(f"wild(seed={seed})").problem for seed in (3, 5, 21, 24, 30, 55, 61)]
-    before = dict(vars(_costs))
+    before = dict(vars(_rates))
     found = {m.rate: m for m in rates.moved(problems, (1e-6,))}
     assert set(found) == set(rates.RATES)
-    assert all(vars(_costs)[name] is before[name] for name in rates.RATES)
+    assert all(vars(_rates)[name] is before[name] for name in rates.RATES)
     assert max(m.shares[5.0] for m in found.values()) > 0.0
     assert found["PIVOT"].least(1.0) == math.inf
 

@@ -8,9 +8,11 @@ from random_problems import as_matrix, random_contact_problem, random_lcp, seeds
 
 import lavender as lv
 from lavender import registry, suite
+from lavender.solvers import _rates as rates
 from lavender.solvers import _turns
 from lavender.solvers._at_once import HASTY
-from lavender.solvers._costs import FIRST_LOOK, HASTY_KEY, Costs, sweep_cost
+from lavender.solvers._costs import HASTY_KEY, Costs
+from lavender.solvers._counts import sweep_cost
 from lavender.solvers._islands import islands, restrict, rows_of
 from lavender.solvers._newton import general
 from lavender.solvers._sweepers import look_first
@@ -256,12 +258,12 @@ def test_a_first_look_is_not_begun_that_is_counted_for_longer_than_the_time_limi
     m = 500
     jacobian = rng.normal(size=(m, m // 2))
     problem = lv.Problem.lcp(jacobian @ jacobian.T / m + np.eye(m), rng.normal(size=m))
-    counted = 1e-9 * FIRST_LOOK * sweep_cost(problem)
+    counted = 1e-9 * rates.FIRST_LOOK * sweep_cost(problem)
     start = problem.start()
     assert look_first(problem, start, 1000, 1e-12, False, 0.5 * counted) is None
     first = look_first(problem, start, 1000, 1e-12, False, 1.5 * counted)
     assert first is not None
-    assert first.done == FIRST_LOOK
+    assert first.done == rates.FIRST_LOOK
 
 
 def test_ctrl_c_inside_a_solver_ends_the_chain(interrupted_newton):

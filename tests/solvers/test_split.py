@@ -14,8 +14,8 @@ from lavender.registry import FEW
 from lavender.residuals import judged, reference
 from lavender.solvers import _split
 from lavender.solvers._accelerated import AcceleratedState
-from lavender.solvers._costs import GENERAL_GATE
 from lavender.solvers._few import WARM
+from lavender.solvers._first import GENERAL_GATE
 from lavender.solvers._islands import restrict, rows_of
 from lavender.solvers._newton import general
 from lavender.solvers._split import GATE

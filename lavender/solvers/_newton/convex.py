@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from lavender._arrays import FloatArray
-from lavender.solvers._costs import is_redundant
+from lavender.solvers._counts import is_redundant
 from lavender.solvers._newton.augmented import WORTH, solve_augmented
 from lavender.solvers._newton.exchange import exchange, sweep
 from lavender.solvers._newton.interior_point import InteriorPoint

@@ -19,7 +19,7 @@ from typing import Any
 from lavender._arrays import FloatArray
 from lavender.registry import get
 from lavender.solution import Status
-from lavender.solvers._costs import newton_factor, newton_rates, sweep_cost
+from lavender.solvers._counts import newton_factor, newton_rates, sweep_cost
 from lavender.solvers._newton.polish import EPS
 from lavender.solvers._newton.run import Run
 from lavender.solvers._newton.systems import System

@@ -15,7 +15,8 @@ import numpy as np
 from lavender._arrays import FloatArray
 from lavender.registry import get
 from lavender.solution import Status
-from lavender.solvers._costs import BLOCK, DENSE, NEWTON_ROW, PANEL, STEP, UNSYMMETRIC, sweep_cost
+from lavender.solvers import _rates as rates
+from lavender.solvers._counts import sweep_cost
 from lavender.solvers._newton.desaxce import apart
 from lavender.solvers._newton.proximal import Proximal
 from lavender.solvers._newton.run import Run
@@ -104,9 +105,13 @@ class Sweeping:
 
 
 def step_cost(system: System) -> float:
-    """One step of Newton's method [ns], by the rates of `_costs.py`."""
+    """One step of Newton's method [ns], by the rates of `_rates.py`."""
     if isinstance(system, MatrixSystem):
-        rate = DENSE if system.dense else 1.0
+        rate = rates.DENSE if system.dense else 1.0
     else:
-        rate = BLOCK if system.cost < PANELS else PANEL
-    return STEP["newton"] + NEWTON_ROW["coulomb"] * system.sc.m + UNSYMMETRIC * rate * system.cost
+        rate = rates.BLOCK if system.cost < PANELS else rates.PANEL
+    return (
+        rates.STEP["newton"]
+        + rates.NEWTON_ROW["coulomb"] * system.sc.m
+        + rates.UNSYMMETRIC * rate * system.cost
+    )

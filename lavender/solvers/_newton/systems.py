@@ -346,7 +346,7 @@ class MatrixSystem(System):
         self.dense = self.band is None and (
             m <= DENSE_ROWS or (a.nnz > DENSE_FILL * m * m and m <= DENSE_LIMIT)
         )
-        # Of a sparse factor by its fill, which grows with the size: nanoseconds, as `_costs.py` has them.
+        # Of a sparse factor by its fill, which grows with the size: nanoseconds, as `_rates.py` has them.
         self.cost = m**3 / 3.0 if self.dense else 100.0 * a.nnz * (1.0 + m / 1000.0)
         self.pace = 0.15e-9 if self.dense else 1e-9
         self.fill = 0  # entries of the last sparse factor, 0 before the first

@@ -1,0 +1,162 @@
+"""What comes before anything is swept, factored or counted closely."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lavender.problem import LAWS, Problem
+from lavender.registry import FEW
+from lavender.solvers import _rates as rates
+from lavender.solvers._costs import Costs
+from lavender.solvers._counts import (
+    finite_least,
+    formed_cost,
+    general_cost,
+    is_redundant,
+    joints_formed,
+    newton_rates,
+    rows_direct,
+    sweep_cost,
+)
+from lavender.solvers._factor import DENSE_SHARE, SMALL_BAND, choose
+from lavender.solvers._islands import block_bodies
+from lavender.solvers._newton.general import factor_flops
+from lavender_ext.core import assemble
+from lavender_ext.factor import graph
+from lavender_ext.pivot.principal import bandwidth
+
+# All that `general_first` reads, for a compiled loop over many problems.
+GENERAL_GATE = (
+    rates.GENERAL_START,
+    tuple(rates.GENERAL_ROW[law] for law in LAWS),
+    tuple(rates.GENERAL[law] for law in LAWS),
+    rates.GENERAL_FIRST,
+    rates.FORM,
+    tuple(rates.GENERAL_COUNT[law] for law in LAWS),
+)
+
+
+def first_look(per: float) -> int:
+    """Sweeps, each of cost `per` [ns], before their residual is looked at."""
+    return int(min(max(rates.FIRST_LOOK, rates.LOOKED / per), rates.LAST_LOOK))
+
+
+def general_first(problem: Problem, largest: int) -> bool:
+    """Newton over generalised velocities costs next to nothing, or less than only to form A = Y Y^T for the others.
+
+    The columns of Y have n_c entries: sum n_c^2 >= (sum n_c)^2 / nv multiply-adds. Without friction, whose steps are
+    less certain, what Python needs for it and each of its entries counts, of a linear system what `direct` then costs
+    as well, under the cone law what sweeps usually cost. Or, of many soft rows under Coulomb's law, more than
+    velocities, less than sweeps usually do where rows depend on each other.
+    """
+    assert problem.generalized is not None
+    cost = general_cost(problem, largest)
+    if cost <= rates.GENERAL_FIRST:
+        return True
+    entries = 0.5 * (problem.metric.work - 4.0 * problem.m)
+    if cost <= rates.FORM * entries * entries / max(1, problem.generalized.nv):
+        return True
+    if problem.law == "linear" and cost <= joints_formed(problem):
+        return True
+    if problem.law == "lcp" and cost <= formed_cost(problem):
+        return True
+    # Under the cone law sweeps end few problems that it does not, and those late.
+    if problem.law == "cone" and cost <= rates.WITH_A * formed_cost(problem) + rates.SWEEPS * sweep_cost(
+        problem
+    ):
+        return True
+    if (
+        problem.law != "coulomb"
+        or problem.m <= max(rates.MANY_ROWS, problem.generalized.nv)
+        or not np.all(problem.compliance)
+    ):
+        return False
+    step = (
+        rates.MANY_STEP
+        + rates.MANY_ROW * problem.m
+        + rates.GENERAL["coulomb"] * factor_flops(problem, largest)
+    )
+    return rates.GENERAL_START + rates.MANY_COUNT * step <= rates.SWEEPS_REDUNDANT * sweep_cost(problem)
+
+
+def general_steps(problem: Problem, islands: int) -> int:
+    """Steps that Newton's method over generalised velocities has before another solver is asked."""
+    law = problem.law
+    if law == "coulomb":
+        return rates.GENERAL_STEPS[law]
+    return rates.GENERAL_STEPS[law] + int(rates.GENERAL_COUNT[law]) * (islands - 1)
+
+
+def is_glanced(problem: Problem, per: float) -> bool:
+    """A first look at sweeps, each of cost `per` [ns], comes before anything else is found out."""
+    if problem.law == "linear":
+        # LU of few rows costs as much as hundreds of sweeps, and more where they depend on each other.
+        return not problem.is_symmetric and problem.m <= rates.LU_ROWS
+    if problem.m <= FEW:
+        return not factors_at_once(problem)
+    if is_redundant(problem) or factors_at_once(problem):
+        return False
+    look, most = rates.FIRST_LOOK * per, rates.GLANCED
+    if look > most and problem.law == "lcp" and not _may_be_narrow(problem):
+        # Whether A is symmetric, and what a factor of it takes, is not asked for before.
+        most += rates.GLANCE * (formed_cost(problem) + finite_least(problem, True))
+    return look <= most
+
+
+def _may_be_narrow(problem: Problem) -> bool:
+    """Its A is a narrow band in the order of elimination, or has no more entries than one where nobody has looked."""
+    if problem.generalized is not None:
+        return False
+    kept = problem.derived.factor
+    if kept is not None:
+        return bool(kept[0] == "band")
+    if problem.rows is not None:
+        return True
+    m, entries = problem.m, len(problem._compressed[1])
+    return entries <= (2 * rates.NARROW + 1) * m and (
+        entries < DENSE_SHARE * m * m or max(bandwidth(*problem._compressed[:2])) <= SMALL_BAND
+    )
+
+
+def factors_at_once(problem: Problem) -> bool:
+    """Bounded rows, few or of a symmetric narrow band that is found in no time: `direct`, without a look."""
+    if problem.law != "lcp":
+        return False
+    m = problem.m
+    if m <= FEW:
+        return True
+    if problem.generalized is not None or is_redundant(problem):
+        return False
+    if problem.rows is not None and problem.rows.n_bodies:
+        width = graph.body_spread(problem.cones.ptr, block_bodies(problem), problem.rows.n_bodies) + 1
+        if width <= rates.NARROW:
+            return _is_hasty(m, width)
+    # Rows of bodies may be narrow in another order, which that of A tells.
+    entries = (
+        int(assemble.bound(problem.data)[0]) if problem.rows is not None else len(problem._compressed[1])
+    )
+    if entries > rates.NARROW_ENTRIES * m or not problem.is_symmetric:
+        return False
+    form, band, _ = choose(problem)
+    return form == "band" and _is_hasty(m, band + 1)
+
+
+def _is_hasty(m: int, width: int) -> bool:
+    """A band of m bounded rows so narrow that nothing else is looked at before `direct`."""
+    return rates.DIRECT["lcp"] * rates.BAND * m * float(width) ** 2 <= rates.BAND_AT_ONCE
+
+
+def joints_at_once(problem: Problem) -> bool:
+    """A symmetric linear system for `direct`, without a look at what else there is.
+
+    Of few rows; a matrix, whose factor costs less than the one of `newton`; bodies, by the entries that A can have.
+    """
+    if problem.m <= rates.FEW_JOINTS or problem.matrix is not None:
+        return True
+    if problem.rows is None or problem.rows.n_bodies == 0:
+        return False
+    direct = rows_direct(problem)
+    start, step, row = newton_rates(problem)
+    if direct <= start + rates.NEWTON["linear"] * (step + row * problem.m):
+        return True  # whatever the factor of newton costs
+    return direct <= Costs(problem, 1e-6).newton_guess
