@@ -25,13 +25,13 @@ from lavender.solvers._counts import (
     few_direct,
     finite_least,
     formed_cost,
-    general_cost,
     general_count,
     is_redundant,
     newton_factor,
     newton_rates,
     sparse_factor,
     sweep_cost,
+    velocities_cost,
 )
 from lavender.solvers._factor import PanelsLU, choose, filled_cost, panels_cost
 from lavender.solvers._islands import block_bodies
@@ -156,7 +156,7 @@ class Costs:
     @cached_property
     def over_velocities(self) -> float:
         """Newton over generalised velocities [ns]; inf where it has no room, or none are given."""
-        return general_cost(self.problem, self.largest) if self.largest else np.inf
+        return velocities_cost(self.problem, self.largest) if self.largest else np.inf
 
     @cached_property
     def exact(self) -> list[Exact]:
@@ -206,7 +206,7 @@ class Costs:
             found.append(Exact("lemke", rates.START["lemke"] + p.m * (pivot + entries), limit))
         if self.largest:
             count = 2 * int(rates.GENERAL_COUNT[p.law]) + rates.GENERAL_TAIL
-            cost = general_cost(p, self.largest)
+            cost = velocities_cost(p, self.largest)
             once = rates.GENERAL_START + (cost - rates.GENERAL_START) / general_count(p)
             found.append(Exact("newton", cost, count, (("form", "velocity"),), once))
         if p.law in ("cone", "coulomb") and (p.generalized is None or p.m <= rates.ADMM_GENERAL):

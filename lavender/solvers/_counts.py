@@ -31,6 +31,14 @@ def general_cost(problem: Problem, largest: int) -> float:
     )
 
 
+def velocities_cost(problem: Problem, largest: int) -> float:
+    """The same as others are compared with: of few rows under Coulomb's law as it usually is, without the tail."""
+    if problem.law == "coulomb" and problem.m <= FEW:
+        step = rates.FEW_STEP_ROW * problem.m + rates.FEW_STEP_FLOP * factor_flops(problem, largest)
+        return rates.FEW_CALL + rates.FEW_STEPS * step
+    return general_cost(problem, largest)
+
+
 def general_count(problem: Problem) -> float:
     """Its steps, as expected: one where rows are free and soft, since then it has no proximal term."""
     if problem.law == "linear" and problem.m:

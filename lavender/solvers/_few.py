@@ -15,14 +15,16 @@ from lavender.problem import Problem
 from lavender.registry import FEW
 from lavender.residuals import reference
 from lavender.solution import Claim, Status
-from lavender.solvers._counts import sweep_cost
-from lavender.solvers._first import GENERAL_GATE, first_look, general_first
+from lavender.solvers import _rates as rates
+from lavender.solvers._counts import general_cost, sweep_cost
+from lavender.solvers._first import GENERAL_GATE, NO_GATE, first_look, general_first
 from lavender.solvers._newton import general
 from lavender_ext.few.chain import PIVOTS, SWEEPS, VELOCITIES, Chain
 from lavender_ext.few.many import Gate, solve_first
 
 FEW_GENERAL = 1000  # rows in generalised coordinates, where nothing of Python's grows with them
 GATE, ANY = Gate(GENERAL_GATE), Gate(None)
+LOOSE = Gate((*GENERAL_GATE[:6], NO_GATE))  # of `newton`, before which no sweeps come
 WARM = 1e-3  # relative residual from which an iterate is worth starting from
 
 
@@ -47,8 +49,11 @@ def _make(problem: Problem) -> Chain | None:
         if looked.crowded and problem.law == "lcp" and problem.m > FEW:
             return None  # sweeps may be the end before what fills is counted
         kernel = general.prepare(problem) if looked.crowded else looked if looked.fits else None
-        problem.derived.first = kernel is not None and general_first(problem, kernel.largest)
-        if kernel is None or not problem.derived.first:
+        if kernel is None:
+            problem.derived.first = False
+            return None
+        problem.derived.first = general_first(problem, kernel.largest)
+        if not problem.derived.first and general_cost(problem, kernel.largest) > rates.GENERAL_FIRST:
             return None
         return Chain(data, start, relative, newton=kernel)
     if problem.cones.has_round:
@@ -86,7 +91,8 @@ class Few:
                 chain = prepared(problem)
             else:
                 kept.seen = True
-                found = solve_first(kept.view, impulse, tol, GATE, general.ROOM) if tol > 0.0 else None
+                gate = GATE if self.looks else LOOSE
+                found = solve_first(kept.view, impulse, tol, gate, general.ROOM) if tol > 0.0 else None
                 if found is not None:
                     return found
                 chain = prepared(problem)
@@ -94,6 +100,8 @@ class Few:
             chain = prepared(problem)
         if chain is None or chain.kind not in self.kinds or not tol > 0.0:
             return None
+        if self.looks and kept.first is False:
+            return None  # sweeps come before
         return chain.run(impulse, tol, self.looks, WARM)
 
     def claim(self, problem: Problem, counts: tuple[int, ...] | None) -> Claim:

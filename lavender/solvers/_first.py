@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from lavender.cones import ROW
 from lavender.problem import LAWS, Problem
 from lavender.registry import FEW
 from lavender.solvers import _rates as rates
@@ -25,6 +26,16 @@ from lavender_ext.core import assemble
 from lavender_ext.factor import graph
 from lavender_ext.pivot.principal import bandwidth
 
+# Of few rows under Coulomb's law, up to so many: Newton's method over velocities costs less than sweeps where so much
+# for a row and a multiply-add of its factor comes to no more than that; and of d, what rows of soft contacts have.
+FEW_GATE = (
+    float(FEW),
+    rates.FEW_STEPS * rates.FEW_STEP_ROW - rates.FEW_SWEEPS * rates.FEW_SWEEP_ROW,
+    rates.FEW_STEPS * rates.FEW_STEP_FLOP,
+    rates.FEW_LOOK - rates.FEW_CALL,
+    rates.SOFT,
+)
+NO_GATE = (0.0,) * 5  # in place of these where nothing else would come first
 # All that `general_first` reads, for a compiled loop over many problems.
 GENERAL_GATE = (
     rates.GENERAL_START,
@@ -33,6 +44,7 @@ GENERAL_GATE = (
     rates.GENERAL_FIRST,
     rates.FORM,
     tuple(rates.GENERAL_COUNT[law] for law in LAWS),
+    FEW_GATE,
 )
 
 
@@ -46,11 +58,18 @@ def general_first(problem: Problem, largest: int) -> bool:
 
     The columns of Y have n_c entries: sum n_c^2 >= (sum n_c)^2 / nv multiply-adds. Without friction, whose steps are
     less certain, what Python needs for it and each of its entries counts, of a linear system what `direct` then costs
-    as well, under the cone law what sweeps usually cost. Or, of many soft rows under Coulomb's law, more than
-    velocities, less than sweeps usually do where rows depend on each other.
+    as well, under the cone law what sweeps usually cost. Under Coulomb's law few rows have sweeps first where these
+    usually cost less, unless contacts are soft, on which it takes few steps. Or, of many soft rows there, more than
+    velocities, less than sweeps usually cost where rows depend on each other.
     """
     assert problem.generalized is not None
     cost = general_cost(problem, largest)
+    if problem.law == "coulomb" and problem.m <= FEW:
+        _, row, flop, most, _ = FEW_GATE
+        if row * problem.m + flop * factor_flops(problem, largest) <= most:
+            return True
+        if not contacts_are_soft(problem):
+            return False
     if cost <= rates.GENERAL_FIRST:
         return True
     entries = 0.5 * (problem.metric.work - 4.0 * problem.m)
@@ -77,6 +96,18 @@ def general_first(problem: Problem, largest: int) -> bool:
         + rates.GENERAL["coulomb"] * factor_flops(problem, largest)
     )
     return rates.GENERAL_START + rates.MANY_COUNT * step <= rates.SWEEPS_REDUNDANT * sweep_cost(problem)
+
+
+def general_second(problem: Problem) -> bool:
+    """The same right after a first look at sweeps: of few rows Python takes longer to compare costs."""
+    return problem.law == "coulomb" and problem.m <= FEW
+
+
+def contacts_are_soft(problem: Problem) -> bool:
+    """Every row of every contact has SOFT d of its own, so that Newton's method over velocities adds nothing to it."""
+    assert problem.compliance is not None
+    of_contact = np.repeat(problem.cones.kind != ROW, np.diff(problem.cones.ptr))
+    return bool(np.all(problem.compliance[of_contact] >= rates.SOFT * problem.d[of_contact]))
 
 
 def general_steps(problem: Problem, islands: int) -> int:

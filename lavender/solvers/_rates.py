@@ -36,6 +36,11 @@ GENERAL = {"linear": 0.1, "lcp": 0.06, "cone": 0.06, "coulomb": 0.02}
 GENERAL_SOFT = (
     1e-6  # of d: the least softness of a row without a proximal term; where all are soft, one factor ends it
 )
+# The same under Coulomb's law on few rows as it usually is: a call, steps, each row and multiply-add in one of them;
+# and sweeps: all that Python does for them, so many as end half of these, and each row in one of them.
+FEW_CALL, FEW_STEPS, FEW_STEP_ROW, FEW_STEP_FLOP = 30e3, 22.0, 60.0, 0.09
+FEW_LOOK, FEW_SWEEPS, FEW_SWEEP_ROW = 40e3, 25.0, 40.0
+SOFT = 1e-3  # of d, that rows of soft contacts have of their own (`soften` in lavender_ext/generalized/newton.pxd)
 # The same under Coulomb's law where soft rows are many: a step, for each row in it, and steps as they usually are (8 to
 # 33 on flexes of 1,800 to 10,200 rows; what few rows cost above holds their tails, too).
 MANY_STEP, MANY_ROW, MANY_COUNT = 15e3, 110.0, 10.0

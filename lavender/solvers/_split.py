@@ -14,7 +14,7 @@ from lavender.registry import FEW
 from lavender.residuals import reference
 from lavender.solvers import _rates as rates
 from lavender.solvers._few import WARM
-from lavender.solvers._first import GENERAL_GATE
+from lavender.solvers._first import GENERAL_GATE, NO_GATE
 from lavender.solvers._newton import general
 from lavender.solvers._sweepers import BELIEVED, HOPE
 from lavender.solvers._trail import CLOCK, Trail
@@ -28,7 +28,7 @@ __all__ = ["solve_together"]
 BAND_APART = 1e6  # ns of `direct` on a narrow band of an island, up to which it comes before sweeps
 LARGEST = 2000  # rows of an island that is solved so
 # What Newton's method may cost in an island of J and M [ns]: there is no other there.
-GATE = Gate((*GENERAL_GATE[:3], 1e7, 0.0, GENERAL_GATE[5]))
+GATE = Gate((*GENERAL_GATE[:3], 1e7, 0.0, GENERAL_GATE[5], NO_GATE))
 ENTRIES = 100  # of A for each row, up to which it is formed for pivots where bodies are given
 COUNTS: dict[
     int, tuple[str, tuple[tuple[str, int, int], ...]]

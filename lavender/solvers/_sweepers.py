@@ -16,7 +16,7 @@ from lavender.residuals import judged, known, remember
 from lavender.solution import Claim, Status
 from lavender.solvers import _rates as rates
 from lavender.solvers._accelerated import AcceleratedState, operator
-from lavender.solvers._counts import finite_least, formed_cost, sweep_cost
+from lavender.solvers._counts import finite_least, formed_cost, sweep_cost, velocities_cost
 from lavender.solvers._few import said
 from lavender.solvers._first import first_look, is_glanced
 from lavender.solvers._sweeping import STATUS
@@ -25,7 +25,7 @@ from lavender.solvers.anderson import Anderson
 from lavender_ext.few.looks import Looks, sweeps_left
 from lavender_ext.judge.watch import RUNNING
 
-__all__ = ["Glance", "Sweeps", "look_first"]
+__all__ = ["SWEEPER", "Glance", "Sweeps", "look_first"]
 
 CONVERGED = Status.CONVERGED  # looked up once
 SWEEPER = "anderson"  # whose sweeps come first
@@ -38,13 +38,14 @@ PORTION = 0.25  # of a time limit that sweeps may take that will not get there w
 class Glance:
     """A first look at sweeps of `anderson`, before anything else is looked at; they go on from here."""
 
-    __slots__ = ("before", "impulse", "looks", "problem")
+    __slots__ = ("before", "impulse", "looks", "problem", "told")
 
     def __init__(self, problem: Problem, looks: Looks | None, impulse: FloatArray, before: float) -> None:
         self.problem = problem
         self.looks = looks  # None where the start is a solution
         self.impulse = impulse  # (m,) N s
         self.before = before  # relative residual before its last sweeps
+        self.told = 0  # sweeps that the trail knows of
 
     @property
     def best(self) -> float:
@@ -90,11 +91,13 @@ def look_first(
     failed: bool,
     time_limit: float | None,
     crowded: bool = False,
+    largest: int = 0,
 ) -> Glance | None:
     """Sweeps from an impulse (m,) where a first look at them costs no more than to find out what else there is.
 
     `failed`: few rows whose factor did not end it at once. `crowded`: bounded rows of J and M whose factors over the
-    velocities fill so much that to count them costs more than a look. No look is begun, or gone on with, that is
+    velocities fill so much that to count them costs more than a look. `largest`: velocities of the largest island, 0
+    where newton has no room for them. No look is begun, or gone on with, that is
     counted for longer than `time_limit` [s].
     """
     general = problem.generalized is not None
@@ -122,10 +125,14 @@ def look_first(
     now = looks.now.relative
     if now > tol and looks.status == RUNNING and looks.done < most:
         least = formed_cost(problem) + finite_least(problem, True if general else None)
+        believed = BELIEVED
+        if general and few and largest:
+            # Which mostly takes what it is counted for: no more than that is believed of sweeps.
+            least, believed = min(least, velocities_cost(problem, largest)), 1.0
         least = min(least, (limit - looks.done * per) / BELIEVED)
-        if sweeps_left(looks.last, before, now, tol) * per <= least and looks.done * per <= BELIEVED * least:
+        if sweeps_left(looks.last, before, now, tol) * per <= least and looks.done * per <= believed * least:
             more = min(max(looks.done // 2, rates.FIRST_LOOK), most - looks.done)
-            looks.run(lam, now, most, tol, more, rates.FIRST_LOOK, per, least, BELIEVED * least)
+            looks.run(lam, now, most, tol, more, rates.FIRST_LOOK, per, least, believed * least)
     if looks.now.relative <= tol:
         remember(problem, looks.now)
     return Glance(problem, looks, lam, looks.before)
@@ -150,8 +157,8 @@ class Sweeps:
         self.per = trail.costs.sweep * (2.0 if options.get("order") == "symmetric" else 1.0)
         self.tol = trail.tol
         self.done = 0 if glance is None else glance.done  # iterations
-        self.total = {} if glance is None else dict(glance.work)  # their work that is not in the trail yet,
-        self.begun = 0  # and how many were
+        self.begun = 0 if glance is None else glance.told  # those that the trail knows of,
+        self.total = {} if glance is None or glance.told else dict(glance.work)  # and the work of the others
         self.last, self.at = trail.best, 0  # residual of the last look, and when it was
         self.aside = 0.0  # ns that were spent beside them
         self.rest = np.inf  # sweeps that were then expected to be left
@@ -215,7 +222,8 @@ class Sweeps:
             return trail.done
         begun, looks = self.done, 0
         # A glance is for nothing as far as it may come before anything else is found out.
-        glanced = 0.0 if self.glance is None else max(0.0, self.done * self.per - rates.GLANCED)
+        free = rates.GLANCED if trail.costs.over_velocities == np.inf else 0.0
+        glanced = 0.0 if self.glance is None else max(0.0, self.done * self.per - free)
         while not trail.late and not self.ended:
             step = min(self.next_look(), budget - trail.iterations - (self.done - self.begun))
             if cap is not None:
@@ -260,5 +268,6 @@ class Sweeps:
         if min(rest, spent) > APART * rates.ISLAND and than(self.trail.apart_cost()):
             return True
         costs = self.trail.costs
-        # To ask closely of J and M forms A: not before that much was swept.
-        return than(costs.least) and than(costs.guess) and spent > costs.formed and than(costs.cheapest)
+        # To ask closely of J and M forms A, unless what needs none costs less: not before that much was swept.
+        asked = spent > min(costs.formed, costs.over_velocities)
+        return than(costs.least) and than(costs.guess) and asked and than(costs.cheapest)

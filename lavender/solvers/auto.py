@@ -44,11 +44,11 @@ from lavender.solvers._costs import Costs, Exact
 from lavender.solvers._counts import is_loose
 from lavender.solvers._factor import TooDear
 from lavender.solvers._few import AUTO
-from lavender.solvers._first import factors_at_once, general_first, general_steps
+from lavender.solvers._first import factors_at_once, general_first, general_second, general_steps
 from lavender.solvers._islands import restrict, rows_of
 from lavender.solvers._newton import general
 from lavender.solvers._race import race
-from lavender.solvers._sweepers import Glance, Sweeps, look_first
+from lavender.solvers._sweepers import SWEEPER, Glance, Sweeps, look_first
 from lavender.solvers._together import solve_islands, worth_together
 from lavender.solvers._trail import Trail
 from lavender.solvers._turns import VELOCITY, Turns, note, whole
@@ -129,10 +129,17 @@ class Auto:
                     return first.ended()
         left = n if claim is None else n - claim.iterations
         if glance is None and first is None:
-            glance = look_first(problem, impulse, left, tol, few, time_limit)
+            glance = look_first(problem, impulse, left, tol, few, time_limit, largest=largest)
         if glance is not None and glance.best <= tol:
             impulse[:] = glance.impulse
             return glance.claim() if claim is None else _then(general.named(claim, "auto"), glance.claim())
+        second = claim is None and kernel is not None and general_second(problem)
+        if second:
+            claim = _over_velocities(problem, kernel, lam, left, tol, deadline)
+            if claim.status is Status.CONVERGED:
+                impulse[:] = lam
+                claim = general.named(claim, "auto")
+                return claim if glance is None else _then(glance.claim(), claim)
         limit = np.inf if time_limit is None else 1e9 * time_limit
         trail = Trail(
             problem=problem, tol=tol, deadline=deadline, limit=limit, largest=largest, kernel=kernel
@@ -140,6 +147,9 @@ class Auto:
         trail.offer(impulse)
         if first is not None:
             note(trail, first.chosen, first.claim, first.impulse, first.before)
+        if second and glance is not None:
+            trail.add(SWEEPER, glance.claim())
+            glance.told = glance.done
         if claim is not None:
             trail.add("newton", claim)
             trail.begun = True

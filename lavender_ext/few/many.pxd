@@ -19,6 +19,8 @@ cdef struct gate_t:             # what Newton's method may cost [ns] to be asked
     double row[4]               # by law: linear, lcp, coulomb, cone
     double factor[4]
     double most
+    double few[5]               # of few rows under Coulomb's law that are not soft: rows, a row, a multiply-add, most;
+                                # of d, from which they are
     double form                 # of a multiply-add of A
     double count[4]             # factorisations by law
 

@@ -41,8 +41,19 @@ cdef void begin(job_t* j, double* w) noexcept nogil:
     reference_of(&j.p, &s, moves, False, j.begin)
 
 
+cdef inline bint are_soft(const blocks_t* p, const generalized_t* g, double share) noexcept nogil:
+    """Has every row of every contact `share` d of its own?"""
+    cdef int32_t i, k
+    for i in range(p.n_blocks):
+        if p.kind[i] != ROW:
+            for k in range(p.ptr[i], p.ptr[i + 1]):
+                if not g.compliance[k] >= share * p.d[k]:
+                    return False
+    return True
+
+
 cdef inline bint is_first(const job_t* j, const gate_t* gate, int32_t largest) noexcept nogil:
-    """`general_first` of lavender/solvers/_costs.py, in the same order of operations."""
+    """`general_first` of lavender/solvers/_first.py, in the same order of operations."""
     cdef double flops, cost, entries
     if gate.is_open:
         return True
@@ -50,6 +61,11 @@ cdef inline bint is_first(const job_t* j, const gate_t* gate, int32_t largest) n
     if j.law == 2:
         flops = 2.0 * flops
     cost = gate.start + gate.count[j.law] * (gate.row[j.law] * j.p.n_rows + gate.factor[j.law] * flops)
+    if j.law == 2 and j.p.n_rows <= gate.few[0]:
+        if gate.few[1] * j.p.n_rows + gate.few[2] * flops <= gate.few[3]:
+            return True
+        if not are_soft(&j.p, &j.g, gate.few[4]):
+            return False
     if cost <= gate.most:
         return True
     entries = 0.5 * (<double>(2 * <ssize_t>j.g.pval[j.g.n_panels] + 4 * <ssize_t>j.p.n_rows) - 4.0 * j.p.n_rows)
@@ -143,14 +159,16 @@ cdef class Gate:
 
     Parameters
     ----------
-    gate : tuple (start, rows, factors, most, form, counts) or None
+    gate : tuple (start, rows, factors, most, form, counts, few) or None
         None: whatever it costs.
     """
 
     def __init__(self, gate):
         self.at.is_open = gate is None
         if gate is not None:
-            (self.at.start, rows, factors, self.at.most, self.at.form, counts) = gate
+            (self.at.start, rows, factors, self.at.most, self.at.form, counts, few) = gate
+            for i in range(5):
+                self.at.few[i] = few[i]
             for i in range(4):
                 self.at.row[i], self.at.factor[i] = rows[i], factors[i]
                 self.at.count[i] = counts[i]

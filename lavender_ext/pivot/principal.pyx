@@ -591,7 +591,7 @@ cdef class Pivoting:
         cdef double[::1] reals
         cdef int32_t[::1] ints
         # One block for the vectors and the factor: two allocations in all.
-        self.reals = np.empty(6 * m + room)
+        self.reals = np.zeros(6 * m + room)
         self.ints = np.zeros(3 * m + 1, np.int32)
         reals, ints = self.reals, self.ints
         cdef const int32_t* first = NULL

@@ -1,5 +1,7 @@
 """auto: what it chooses, that it says so, islands, certificates, and that it gets there."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import scipy.sparse as sp
@@ -168,11 +170,19 @@ def test_large_islands_of_generalized_velocities_are_left_to_sweeps_first():
 
 
 def test_small_islands_of_generalized_velocities_go_to_newton_at_once():
-    problem = suite.case("wild(seed=57)").problem
+    problem = suite.case("wild(seed=57)").problem  # 36 rows on 60 velocities
     assert problem.generalized is not None
-    solution = lv.solve(problem, tol=1e-6)
+    solution = lv.solve(problem.relaxed("cone"), tol=1e-6)
     assert good(solution, 1e-6)
     assert solution.message.startswith("newton")
+    rigid = lv.solve(problem, tol=1e-6)
+    assert good(rigid, 1e-6)
+    assert rigid.message.startswith("anderson"), (
+        "under Coulomb's law sweeps cost less, of which half end in 25"
+    )
+    soft = lv.solve(replace(problem, compliance=1e-2 * problem.d, copy=False), tol=1e-6)
+    assert good(soft, 1e-6)
+    assert soft.message.startswith("newton"), "to soft contacts it adds nothing of its own"
 
 
 def test_newton_over_velocities_is_not_asked_twice_where_it_gave_up():
