@@ -16,6 +16,7 @@ import numpy as np
 
 from lavender_ext.factor.minimum_degree cimport degree_order
 from lavender_ext.factor.supernodal cimport dense_panel, less_lower
+from lavender_ext.factor.symbolic cimport postorder_of
 from lavender_ext.factor.tiles cimport add, has_wide, less, take
 
 
@@ -136,33 +137,6 @@ cdef inline void tree_of(int32_t n, const int32_t* nptr, const int32_t* nind, in
                 if after < 0:
                     parent[j] = k
                 j = after
-
-
-cdef inline void postorder_of(int32_t n, const int32_t* parent, int32_t* child, int32_t* sibling, int32_t* stack,
-                              int32_t* rank) noexcept nogil:
-    # rank (n): place of each vertex after its children and beside them
-    cdef int32_t i, top, k = 0, root
-    for i in range(n):
-        child[i] = -1
-    for i in range(n - 1, -1, -1):
-        if parent[i] >= 0:
-            sibling[i] = child[parent[i]]
-            child[parent[i]] = i
-    for root in range(n):
-        if parent[root] >= 0:
-            continue
-        top = 0
-        stack[0] = root
-        while top >= 0:
-            i = stack[top]
-            if child[i] >= 0:
-                top += 1
-                stack[top] = child[i]
-                child[i] = sibling[child[i]]
-            else:
-                rank[i] = k
-                k += 1
-                top -= 1
 
 
 cdef public int32_t lav_sparse_order(int32_t n, const int32_t* indptr, const int32_t* indices, int32_t room,

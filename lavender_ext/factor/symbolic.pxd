@@ -1,4 +1,4 @@
-"""The elimination tree of a lower block pattern, and the pattern of its factor."""
+"""The elimination tree of a lower block pattern, its postorder, and the pattern of its factor."""
 from libc.stdint cimport int32_t
 
 
@@ -44,3 +44,30 @@ cdef inline void block_pattern(int32_t n, const int32_t* nptr, const int32_t* ni
             k = lind[p]
             rind[next[k]] = j
             next[k] += 1
+
+
+cdef inline void postorder_of(int32_t n, const int32_t* parent, int32_t* child, int32_t* sibling, int32_t* stack,
+                              int32_t* rank) noexcept nogil:
+    """rank (n): place of each column after its children and beside them; roots, and siblings, in their order."""
+    cdef int32_t i, top, k = 0, root
+    for i in range(n):
+        child[i] = -1
+    for i in range(n - 1, -1, -1):
+        if parent[i] >= 0:
+            sibling[i] = child[parent[i]]
+            child[parent[i]] = i
+    for root in range(n):
+        if parent[root] >= 0:
+            continue
+        top = 0
+        stack[0] = root
+        while top >= 0:
+            i = stack[top]
+            if child[i] >= 0:
+                top += 1
+                stack[top] = child[i]
+                child[i] = sibling[child[i]]
+            else:
+                rank[i] = k
+                k += 1
+                top -= 1

@@ -3,7 +3,7 @@ from libc.stdint cimport int32_t, int64_t
 
 import numpy as np
 
-from lavender_ext.factor.symbolic cimport block_pattern, block_tree
+from lavender_ext.factor.symbolic cimport block_pattern, block_tree, postorder_of
 
 
 cdef public void lav_block_tree(int32_t n, const int32_t* nptr, const int32_t* nind, int32_t* parent,
@@ -83,28 +83,7 @@ def chain_pattern(const int32_t[:, ::1] body, int n):
 cdef public void lav_postorder(int32_t n, const int32_t* parent, int32_t* child, int32_t* sibling, int32_t* stack,
                                int32_t* rank) noexcept nogil:
     """rank (n): place of each column after its children and beside them; roots, and siblings, in their order."""
-    cdef int32_t i, top, k = 0, root
-    for i in range(n):
-        child[i] = -1
-    for i in range(n - 1, -1, -1):
-        if parent[i] >= 0:
-            sibling[i] = child[parent[i]]
-            child[parent[i]] = i
-    for root in range(n):
-        if parent[root] >= 0:
-            continue
-        top = 0
-        stack[0] = root
-        while top >= 0:
-            i = stack[top]
-            if child[i] >= 0:
-                top += 1
-                stack[top] = child[i]
-                child[i] = sibling[child[i]]
-            else:
-                rank[i] = k
-                k += 1
-                top -= 1
+    postorder_of(n, parent, child, sibling, stack, rank)
 
 
 def postorder(const int32_t[::1] nptr, const int32_t[::1] nind):
