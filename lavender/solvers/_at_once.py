@@ -14,7 +14,7 @@ from lavender.solution import Claim, Status
 from lavender.solvers import _rates as rates
 from lavender.solvers._costs import Exact
 from lavender.solvers._counts import sweep_cost
-from lavender.solvers._factor import PanelsLU
+from lavender.solvers._factor import PanelsLU, TooDear
 from lavender.solvers._few import WARM, said
 from lavender.solvers._first import factors_at_once, joints_at_once
 from lavender.solvers._trail import usable
@@ -44,35 +44,39 @@ class Factored:
 
 def factor_first(
     problem: Problem, impulse: FloatArray, n: int, tol: float, time_limit: float | None
-) -> Factored | None:
-    """`direct` from an impulse (m,), or None where something else comes first.
+) -> tuple[Factored | None, bool]:
+    """`direct` from an impulse (m,), or None where something else comes first; whether that is since its factor fills.
 
     Bounded rows of a narrow band; a symmetric linear system that costs least so (`joints_at_once`), and one that is not
-    and has few entries: `TooDear` where its factor fills so much that slow sweeps cost less, or time runs out.
+    and has few entries, unless the factor fills so much that slow sweeps cost less, or time runs out.
     """
     if problem.m <= FEW or n <= 0 or problem.generalized is not None:
-        return None
+        return None, False
     solver: Direct
     if problem.law == "linear":
         if not (joints_at_once(problem) if problem.is_symmetric else PanelsLU.takes(problem)):
-            return None
-        # Fill is counted before the first number.
-        limit = np.inf if time_limit is None else 1e9 * time_limit
-        chosen, solver = JOINTS, Enough(most=min(rates.SWEEPS_REDUNDANT * sweep_cost(problem), limit))
+            return None, False
+        chosen, solver = JOINTS, _enough(problem, time_limit)
     elif factors_at_once(problem):
         chosen, solver = HASTY, Impatient()
     else:
-        return None
+        return None, False
     return _factored(problem, impulse, n, tol, time_limit, chosen, solver)
 
 
 def joints_over_velocities(
     problem: Problem, impulse: FloatArray, n: int, tol: float, time_limit: float | None
-) -> Factored | None:
+) -> tuple[Factored | None, bool]:
     """The same of a linear system in generalised coordinates on which Newton's method over velocities costs more."""
     if problem.law != "linear" or problem.m <= FEW or n <= 0:
-        return None
-    return _factored(problem, impulse, n, tol, time_limit, JOINTS, Enough())
+        return None, False
+    return _factored(problem, impulse, n, tol, time_limit, JOINTS, _enough(problem, time_limit))
+
+
+def _enough(problem: Problem, time_limit: float | None) -> Enough:
+    """`direct` whose fill is counted before the first number."""
+    limit = np.inf if time_limit is None else 1e9 * time_limit
+    return Enough(most=min(rates.SWEEPS_REDUNDANT * sweep_cost(problem), limit))
 
 
 @np.errstate(all="ignore")  # what overflows is judged
@@ -84,13 +88,17 @@ def _factored(
     time_limit: float | None,
     chosen: Exact,
     solver: Direct,
-) -> Factored | None:
+) -> tuple[Factored | None, bool]:
     spec = usable("direct", problem)
     found = known(problem, impulse)
     before = judged(problem, impulse.copy()).relative if found is None else found
     if spec is None or before <= tol:
-        return None
+        return None, False
     lam = impulse.copy() if before <= WARM else problem.start()
-    claim = solver.run(solver.prepare(problem), lam, min(spec.max_iter, n), tol, time_limit)
+    try:
+        state = solver.prepare(problem)
+        claim = solver.run(state, lam, min(spec.max_iter, n), tol, time_limit)
+    except TooDear:
+        return None, True
     after = known(problem, lam)
-    return Factored(chosen, claim, lam, before, np.inf if after is None else after)
+    return Factored(chosen, claim, lam, before, np.inf if after is None else after), False

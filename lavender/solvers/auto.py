@@ -42,7 +42,6 @@ from lavender.solvers._at_once import HASTY, JOINTS, factor_first, joints_over_v
 from lavender.solvers._certify import certify
 from lavender.solvers._costs import Costs, Exact
 from lavender.solvers._counts import is_loose
-from lavender.solvers._factor import TooDear
 from lavender.solvers._few import AUTO
 from lavender.solvers._first import factors_at_once, general_first, general_second, general_steps
 from lavender.solvers._islands import restrict, rows_of
@@ -89,16 +88,12 @@ class Auto:
         largest = 0
         if problem.m == 0:
             return Claim(Status.CONVERGED, 0, {}, "nothing to solve")
-        first, fills = None, False
-        try:
-            first = factor_first(problem, impulse, n, tol, time_limit)
-        except TooDear:
-            fills = True
+        first, fills = factor_first(problem, impulse, n, tol, time_limit)
         if first is not None and first.relative <= tol:
             impulse[:] = first.impulse
             return first.ended()
         if problem.generalized is not None and n > 0 and problem.derived.first is False:
-            first = joints_over_velocities(problem, impulse, n, tol, time_limit)
+            first, fills = joints_over_velocities(problem, impulse, n, tol, time_limit)
             if first is not None and first.relative <= tol:
                 impulse[:] = first.impulse
                 return first.ended()
@@ -123,7 +118,7 @@ class Auto:
                     impulse[:] = lam
                     return general.named(claim, "auto")
             elif known is None:
-                first = joints_over_velocities(problem, impulse, n, tol, time_limit)
+                first, fills = joints_over_velocities(problem, impulse, n, tol, time_limit)
                 if first is not None and first.relative <= tol:
                     impulse[:] = first.impulse
                     return first.ended()

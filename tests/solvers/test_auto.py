@@ -387,6 +387,19 @@ def test_a_net_in_generalised_coordinates_goes_to_direct_where_newton_costs_more
     assert lv.solve(tree, tol=1e-6).message.startswith("newton")
 
 
+def test_a_net_in_generalised_coordinates_whose_factor_fills_is_left_to_sweeps():
+    """Without short separators neither the rows of A nor the velocities have a sparse factor; they are soft, though."""
+    rng = np.random.default_rng(0)
+    m, nv = 3000, 4000
+    columns = rng.integers(0, nv, (m, 4))
+    jac = sp.csr_array((rng.normal(size=4 * m), (np.repeat(np.arange(m), 4), columns.ravel())), shape=(m, nv))
+    problem = lv.Problem.from_jacobian(
+        jac, sp.eye_array(nv), rng.normal(size=nv), cones=lv.Cones.free(m), compliance=np.full(m, 8.0)
+    )
+    solution = lv.solve(problem, tol=1e-6)
+    assert solution.success and "factorisations" not in solution.work, solution
+
+
 def test_direct_that_came_first_is_not_asked_again():
     problem = suite.hang(n=100, tip_mass=1e8).problem
     solution = lv.solve(problem, "auto", tol=1e-14)
