@@ -13,6 +13,7 @@ from lavender.solvers._counts import (
     finite_least,
     formed_cost,
     general_cost,
+    general_count,
     is_redundant,
     joints_formed,
     newton_rates,
@@ -108,6 +109,14 @@ def contacts_are_soft(problem: Problem) -> bool:
     assert problem.compliance is not None
     of_contact = np.repeat(problem.cones.kind != ROW, np.diff(problem.cones.ptr))
     return bool(np.all(problem.compliance[of_contact] >= rates.SOFT * problem.d[of_contact]))
+
+
+def joints_before_count(problem: Problem) -> bool:
+    """Joints on J and M whose factors over velocities fill so much that to count them takes longer than `direct`.
+
+    Not where rows are free and soft, which one factor ends.
+    """
+    return problem.law == "linear" and general_count(problem) > 1.0
 
 
 def general_steps(problem: Problem, islands: int) -> int:

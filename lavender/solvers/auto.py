@@ -43,7 +43,13 @@ from lavender.solvers._certify import certify
 from lavender.solvers._costs import Costs, Exact
 from lavender.solvers._counts import is_loose
 from lavender.solvers._few import AUTO
-from lavender.solvers._first import factors_at_once, general_first, general_second, general_steps
+from lavender.solvers._first import (
+    factors_at_once,
+    general_first,
+    general_second,
+    general_steps,
+    joints_before_count,
+)
 from lavender.solvers._islands import restrict, rows_of
 from lavender.solvers._newton import general
 from lavender.solvers._race import race
@@ -102,6 +108,12 @@ class Auto:
             # Unless its factors fill so much that to count them takes longer than some sweeps.
             kernel = general.looked_at(problem)
             if kernel.crowded:
+                if problem.derived.first is None and joints_before_count(problem):
+                    first, fills = joints_over_velocities(problem, impulse, n, tol, time_limit)
+                    if first is not None and first.relative <= tol:
+                        impulse[:] = first.impulse
+                        return first.ended()
+                    problem.derived.first = False
                 if problem.law == "lcp" and problem.m > FEW:
                     glance = look_first(problem, impulse, n, tol, few, time_limit, True)
                     if glance is not None and glance.best <= tol:
