@@ -17,7 +17,7 @@ from lavender.residuals import reference
 from lavender.solution import Claim, Status
 from lavender.solvers import _rates as rates
 from lavender.solvers._counts import general_cost, sweep_cost
-from lavender.solvers._first import GENERAL_GATE, NO_GATE, first_look, general_first
+from lavender.solvers._first import GENERAL_GATE, NO_GATE, first_look, general_first, joints_before_count
 from lavender.solvers._newton import general
 from lavender_ext.few.chain import PIVOTS, SWEEPS, VELOCITIES, Chain
 from lavender_ext.few.many import Gate, solve_first
@@ -46,8 +46,8 @@ def _make(problem: Problem) -> Chain | None:
         return None
     if problem.generalized is not None:
         looked = general.looked_at(problem)
-        if looked.crowded and problem.law == "lcp" and problem.m > FEW:
-            return None  # sweeps may be the end before what fills is counted
+        if looked.crowded and problem.m > FEW and (problem.law == "lcp" or joints_before_count(problem)):
+            return None  # sweeps, or `direct`, may be the end before what fills is counted
         kernel = general.prepare(problem) if looked.crowded else looked if looked.fits else None
         if kernel is None:
             problem.derived.first = False

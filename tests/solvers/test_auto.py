@@ -11,7 +11,7 @@ from random_problems import as_matrix, random_contact_problem, random_lcp, seeds
 import lavender as lv
 from lavender import registry, suite
 from lavender.solvers import _rates as rates
-from lavender.solvers import _newton, _turns
+from lavender.solvers import _turns
 from lavender.solvers._at_once import HASTY
 from lavender.solvers._costs import HASTY_KEY, Costs
 from lavender.solvers._counts import sweep_cost
@@ -384,7 +384,7 @@ def test_a_net_in_generalised_coordinates_goes_to_direct_where_newton_costs_more
     solution = lv.solve(problem, tol=1e-6)
     assert solution.success and solution.message == "direct 1 factorisations"
     with monkeypatch.context() as patch:
-        patch.setattr(_newton.general, "prepare", None)  # counts the fill over the velocities, which takes as long
+        patch.setattr(general, "prepare", None)  # which counts the fill over the velocities
         assert lv.solve(replace(problem, copy=False), tol=1e-6).success
     tree = suite.wild(seed=7049).problem  # without loops its velocities fill little
     assert lv.solve(tree, tol=1e-6).message.startswith("newton")
