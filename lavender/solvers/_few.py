@@ -17,14 +17,24 @@ from lavender.residuals import reference
 from lavender.solution import Claim, Status
 from lavender.solvers import _rates as rates
 from lavender.solvers._counts import general_cost, sweep_cost
-from lavender.solvers._first import GENERAL_GATE, NO_GATE, first_look, general_first, joints_before_count
+from lavender.solvers._first import (
+    CARRIED_GATE,
+    GENERAL_GATE,
+    NO_GATE,
+    first_look,
+    general_first,
+    is_carried,
+    joints_before_count,
+)
 from lavender.solvers._newton import general
 from lavender_ext.few.chain import PIVOTS, SWEEPS, VELOCITIES, Chain
 from lavender_ext.few.many import Gate, solve_first
 
 FEW_GENERAL = 1000  # rows in generalised coordinates, where nothing of Python's grows with them
-GATE, ANY = Gate(GENERAL_GATE), Gate(None)
-LOOSE = Gate((*GENERAL_GATE[:6], NO_GATE))  # of `newton`, before which no sweeps come
+GATE, ANY = Gate(GENERAL_GATE, CARRIED_GATE), Gate(None)
+LOOSE = Gate(
+    (*GENERAL_GATE[:6], NO_GATE), CARRIED_GATE
+)  # of `newton`, before which no sweeps come on few rows
 WARM = 1e-3  # relative residual from which an iterate is worth starting from
 
 
@@ -45,6 +55,8 @@ def _make(problem: Problem) -> Chain | None:
     if len(data.empty) or relative < 0.0:
         return None
     if problem.generalized is not None:
+        if is_carried(problem):
+            return None
         looked = general.looked_at(problem)
         if looked.crowded and problem.m > FEW and (problem.law == "lcp" or joints_before_count(problem)):
             return None  # sweeps, or `direct`, may be the end before what fills is counted

@@ -48,6 +48,16 @@ GENERAL_GATE = (
     FEW_GATE,
 )
 
+# And `is_carried`.
+CARRIED_GATE = (
+    FEW,
+    rates.FORMED,
+    rates.SWEEP_START,
+    rates.CARRIED,
+    rates.SWEEP["lcp"],
+    rates.SWEEP_ROW,
+)
+
 
 def first_look(per: float) -> int:
     """Sweeps, each of cost `per` [ns], before their residual is looked at."""
@@ -141,6 +151,23 @@ def is_glanced(problem: Problem, per: float) -> bool:
         # Whether A is symmetric, and what a factor of it takes, is not asked for before.
         most += rates.GLANCE * (formed_cost(problem) + finite_least(problem, True))
     return look <= most
+
+
+def is_carried(problem: Problem) -> bool:
+    """Bounded rows, more than few, that meet on one body: A is full, and to form it costs more than many sweeps do.
+
+    What couples them has few ranks. Combined sweeps end as soon as they have seen these, or they are far from it.
+    """
+    if problem.law != "lcp" or problem.m <= FEW or problem.matrix is not None:
+        return False
+    if problem.generalized is not None:
+        cost = rates.FORMED * problem.metric.entries_of_a
+    else:
+        cost = rates.FORMED_ROWS * int(assemble.bound(problem.data)[0])
+    per = (
+        rates.SWEEP["lcp"] * problem.metric.work + rates.SWEEP_ROW * problem.m
+    )  # A is not what is swept then
+    return bool(cost >= rates.SWEEP_START + rates.CARRIED * per)
 
 
 def _may_be_narrow(problem: Problem) -> bool:

@@ -61,6 +61,8 @@ ADMM_START, ADMM_ROW, ADMM_ENTRY = (
 FIRST_LOOK, LAST_LOOK = 16, 64  # sweeps before the first look at the residual: so many at least and at most,
 LOOKED = 60e3  # ns, or as cost so much: a look and a cut in the sweeps are not free
 
+# Sweeps that A costs at least as much to form as, with their call, where one body carries many; and those tried there.
+CARRIED, TRIED = 12.0, 8
 GLANCED = 200e3  # ns of a first look at sweeps that may come before anything else is found out
 GLANCE = 0.35  # share of a finite solver's cost for which a first look at sweeps is always worth it
 

@@ -18,7 +18,7 @@ from lavender.solvers import _rates as rates
 from lavender.solvers._accelerated import AcceleratedState, operator
 from lavender.solvers._counts import finite_least, formed_cost, sweep_cost, velocities_cost
 from lavender.solvers._few import said
-from lavender.solvers._first import first_look, is_glanced
+from lavender.solvers._first import first_look, is_carried, is_glanced
 from lavender.solvers._sweeping import STATUS
 from lavender.solvers._trail import CLOCK, Trail, usable
 from lavender.solvers.anderson import Anderson
@@ -97,17 +97,25 @@ def look_first(
 
     `failed`: few rows whose factor did not end it at once. `crowded`: bounded rows of J and M whose factors over the
     velocities fill so much that to count them costs more than a look. `largest`: velocities of the largest island, 0
-    where newton has no room for them. No look is begun, or gone on with, that is
+    where newton has no room for them. Where one body carries many rows some sweeps are tried before what would come
+    first. No look is begun, or gone on with, that is
     counted for longer than `time_limit` [s].
     """
     general = problem.generalized is not None
     few = problem.m <= FEW
-    if problem.cones.has_round or (general and not crowded and (problem.law != "coulomb" or not few)):
+    carried = general and is_carried(problem)
+    if problem.cones.has_round or (
+        general and not (crowded or carried) and (problem.law != "coulomb" or not few)
+    ):
         return None
     per = sweep_cost(problem)
-    sweeps = first_look(per)
+    if not (carried or failed or is_glanced(problem, per)):
+        carried = not general and is_carried(problem)
+        if not carried:
+            return None
+    sweeps = rates.TRIED if carried else first_look(per)
     limit = np.inf if time_limit is None else 1e9 * time_limit
-    if n < sweeps or sweeps * per > limit or not (failed or is_glanced(problem, per)):
+    if n < sweeps or sweeps * per > limit:
         return None
     lam = impulse.copy()
     before = known(problem, impulse)
@@ -123,7 +131,7 @@ def look_first(
     # What else there is is asked for where the first look is not the end: of a matrix that takes reading it.
     looks.run(lam, before, most, tol, sweeps, rates.FIRST_LOOK, per, 0.0, 0.0)
     now = looks.now.relative
-    if now > tol and looks.status == RUNNING and looks.done < most:
+    if now > tol and looks.status == RUNNING and looks.done < most and not carried:
         least = formed_cost(problem) + finite_least(problem, True if general else None)
         believed = BELIEVED
         if general and few and largest:

@@ -27,8 +27,6 @@ certificate that it has no solution. The message and `work` say what ran.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from time import perf_counter
-from typing import Any
 
 import numpy as np
 
@@ -38,7 +36,7 @@ from lavender.registry import FEW, SolverSpec
 from lavender.residuals import reference
 from lavender.solution import Claim, Status
 from lavender.solvers import _rates as rates
-from lavender.solvers._at_once import HASTY, JOINTS, factor_first, joints_over_velocities
+from lavender.solvers._at_once import HASTY, JOINTS
 from lavender.solvers._certify import certify
 from lavender.solvers._costs import Costs, Exact
 from lavender.solvers._counts import is_loose
@@ -46,17 +44,15 @@ from lavender.solvers._few import AUTO
 from lavender.solvers._first import (
     factors_at_once,
     general_first,
-    general_second,
-    general_steps,
-    joints_before_count,
 )
 from lavender.solvers._islands import restrict, rows_of
 from lavender.solvers._newton import general
+from lavender.solvers._opening import Opening
 from lavender.solvers._race import race
-from lavender.solvers._sweepers import SWEEPER, Glance, Sweeps, look_first
+from lavender.solvers._sweepers import Glance, Sweeps
 from lavender.solvers._together import solve_islands, worth_together
 from lavender.solvers._trail import Trail
-from lavender.solvers._turns import VELOCITY, Turns, note, whole
+from lavender.solvers._turns import VELOCITY, Turns, whole
 from lavender.solvers._walks import Walks, sweeps_of
 
 LARGE = 4000  # rows of J from which friction is swept both ways, and beside its relaxation
@@ -88,86 +84,17 @@ class Auto:
             if made is not None:
                 impulse[:] = made[0].impulse
                 return AUTO.claim(problem, made[1])
-        deadline = np.inf if time_limit is None else perf_counter() + time_limit
-        lam, claim, kernel = impulse.copy(), None, None
-        glance: Glance | None = None
-        largest = 0
         if problem.m == 0:
             return Claim(Status.CONVERGED, 0, {}, "nothing to solve")
-        first, fills = factor_first(problem, impulse, n, tol, time_limit)
-        if first is not None and first.relative <= tol:
-            impulse[:] = first.impulse
-            return first.ended()
-        if problem.generalized is not None and n > 0 and problem.derived.first is False:
-            first, fills = joints_over_velocities(problem, impulse, n, tol, time_limit)
-            if first is not None and first.relative <= tol:
-                impulse[:] = first.impulse
-                return first.ended()
-        if problem.generalized is not None and n > 0:
-            # Newton over the velocities ends nearly all robots: nothing is looked at, and nothing noted, before.
-            # Unless its factors fill so much that to count them takes longer than some sweeps.
-            kernel = general.looked_at(problem)
-            if kernel.crowded:
-                if problem.derived.first is None and joints_before_count(problem):
-                    first, fills = joints_over_velocities(problem, impulse, n, tol, time_limit)
-                    if first is not None and first.relative <= tol:
-                        impulse[:] = first.impulse
-                        return first.ended()
-                    problem.derived.first = False
-                if problem.law == "lcp" and problem.m > FEW:
-                    glance = look_first(problem, impulse, n, tol, few, time_limit, True)
-                    if glance is not None and glance.best <= tol:
-                        impulse[:] = glance.impulse
-                        return glance.claim()
-                kernel = general.prepare(problem)
-            elif not kernel.fits:
-                kernel = None
-            largest = 0 if kernel is None else kernel.largest
-            known = problem.derived.first
-            if kernel is not None and (general_first(problem, largest) if known is None else known):
-                claim = _over_velocities(problem, kernel, lam, n, tol, deadline)
-                if claim.status is Status.CONVERGED:
-                    impulse[:] = lam
-                    return general.named(claim, "auto")
-            elif known is None:
-                first, fills = joints_over_velocities(problem, impulse, n, tol, time_limit)
-                if first is not None and first.relative <= tol:
-                    impulse[:] = first.impulse
-                    return first.ended()
-        left = n if claim is None else n - claim.iterations
-        if glance is None and first is None:
-            glance = look_first(problem, impulse, left, tol, few, time_limit, largest=largest)
-        if glance is not None and glance.best <= tol:
-            impulse[:] = glance.impulse
-            return glance.claim() if claim is None else _then(general.named(claim, "auto"), glance.claim())
-        second = claim is None and kernel is not None and general_second(problem)
-        if second:
-            claim = _over_velocities(problem, kernel, lam, left, tol, deadline)
-            if claim.status is Status.CONVERGED:
-                impulse[:] = lam
-                claim = general.named(claim, "auto")
-                return claim if glance is None else _then(glance.claim(), claim)
-        limit = np.inf if time_limit is None else 1e9 * time_limit
-        trail = Trail(
-            problem=problem, tol=tol, deadline=deadline, limit=limit, largest=largest, kernel=kernel
-        )
-        trail.offer(impulse)
-        if first is not None:
-            note(trail, first.chosen, first.claim, first.impulse, first.before)
-        if second and glance is not None:
-            trail.add(SWEEPER, glance.claim())
-            glance.told = glance.done
-        if claim is not None:
-            trail.add("newton", claim)
-            trail.begun = True
-            if claim.status is not Status.MAX_ITERATIONS:
-                trail.gave_up(VELOCITY, trail.best)
-            if np.isfinite(lam).all():
-                trail.offer(lam)
+        opening = Opening(problem, impulse, n, tol, time_limit, few)
+        end = opening.run()
+        if end is not None:
+            return end
+        trail = opening.trail()
         interrupted = False
         try:
-            if n > 0 and not (trail.best <= tol if first is None else trail.done):
-                _solve(trail, n, glance, fills)
+            if n > 0 and not (trail.best <= tol if opening.first is None else trail.done):
+                _solve(trail, n, opening.glance, opening.fills)
         except KeyboardInterrupt:
             interrupted = True  # the best impulse goes back all the same
         impulse[:] = trail.impulse
@@ -186,28 +113,6 @@ class Auto:
         nothing = "the start is a solution" if trail.best <= tol else "no time for anything"
         message = " -> ".join(trail.steps) or nothing
         return Claim(status, trail.iterations, trail.work, message, certificate=trail.certificate)
-
-
-def _over_velocities(
-    problem: Problem, kernel: Any, impulse: FloatArray, n: int, tol: float, deadline: float
-) -> Claim:
-    """Newton's method as it comes first, from an impulse (m,) in place."""
-    left = None if np.isinf(deadline) else max(deadline - perf_counter(), 1e-3)
-    steps = min(n, general_steps(problem, kernel.islands))
-    return general.run(problem, kernel, impulse, steps, tol, left)
-
-
-def _then(first: Claim, second: Claim) -> Claim:
-    """Of two solvers, one after the other."""
-    message = f"{first.message} -> {second.message}"
-    return Claim(second.status, first.iterations + second.iterations, _sum_of(first, second), message)
-
-
-def _sum_of(first: Claim, second: Claim) -> dict[str, int]:
-    work = dict(first.work)
-    for kind, count in second.work.items():
-        work[kind] = work.get(kind, 0) + count
-    return work
 
 
 # -- the plan ---------------------------------------------------------------------------------------

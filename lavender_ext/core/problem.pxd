@@ -29,6 +29,7 @@ cdef struct made_t:             # of a problem in generalised coordinates; `free
     double values               # of Y
 
 
+cdef double entries_of(const generalized_t* g, double* on) noexcept nogil
 cdef int32_t make_numbers(blocks_t* p, generalized_t* g, made_t* out) noexcept nogil
 
 

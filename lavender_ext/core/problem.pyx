@@ -220,6 +220,22 @@ cdef void point_at(blocks_t* p, generalized_t* g, const made_t* made) noexcept n
     g.cols = g.home + k
 
 
+cdef double entries_of(const generalized_t* g, double* on) noexcept nogil:
+    """`Data.entries_of_a`; on (n) is scratch: rows of each tree, at its first velocity."""
+    cdef int32_t b, q, rows
+    cdef double out = 0.0
+    for b in range(g.n):
+        on[b] = 0.0
+    for b in range(g.n_panels):
+        rows = g.prow[b + 1] - g.prow[b]
+        for q in range(g.pcol[b], g.pcol[b + 1]):
+            if g.parent[g.cols[q]] < 0:
+                on[g.cols[q]] += rows
+    for b in range(g.n):
+        out += on[b] * on[b]
+    return out
+
+
 cdef int32_t make_numbers(blocks_t* p, generalized_t* g, made_t* out) noexcept nogil:
     """Panels, Y, d, nu and step of a problem in generalised coordinates, which then points at them; how it ended."""
     cdef int32_t n = g.n, k = p.n_blocks, m = p.n_rows, n_cols, i, b = 0
@@ -449,7 +465,8 @@ cdef class Data:
         if self.is_general:
             return 2 * self.general.pval[self.general.n_panels] + 4 * self.blocks.n_rows
         if self.factored:
-            return 24 * self.rows.n_joints + 60 * self.rows.n_contacts + 12 * self.blocks.n_rows
+            of_contacts = self.blocks.n_rows - self.blocks.ptr[self.rows.n_joints]
+            return 24 * self.rows.n_joints + 20 * of_contacts + 12 * self.blocks.n_rows
         return self.csr.indptr[self.blocks.n_rows] + 4 * self.blocks.n_rows
 
     @property
@@ -462,18 +479,8 @@ cdef class Data:
     @property
     def entries_of_a(self):
         """Entries that A would have, of J and M: rows that share a tree meet; rows on several trees may count twice."""
-        cdef const generalized_t* g = &self.general
-        cdef int32_t b, q, rows
-        cdef double out = 0.0
-        cdef double[::1] on = np.zeros(g.n + 1)
-        for b in range(g.n_panels):
-            rows = g.prow[b + 1] - g.prow[b]
-            for q in range(g.pcol[b], g.pcol[b + 1]):
-                if g.parent[g.cols[q]] < 0:
-                    on[g.cols[q]] += rows
-        for b in range(g.n):
-            out += on[b] * on[b]
-        return out
+        cdef double[::1] on = np.empty(self.general.n + 1)
+        return entries_of(&self.general, &on[0])
 
     def whitened(self):
         """(data, indices, indptr) of Y (m, n) in generalised coordinates; entries that are zero are left out."""

@@ -188,7 +188,7 @@ cdef inline double work_of(const view_t* t, int32_t kind) noexcept nogil:
     if kind == GENERAL:
         return 2 * t.g.pval[t.g.n_panels] + 4 * t.p.n_rows
     if kind == BODIES:
-        return 24 * t.r.n_joints + 60 * t.r.n_contacts + 12 * t.p.n_rows
+        return 24 * t.r.n_joints + 20 * (t.p.n_rows - t.p.ptr[t.r.n_joints]) + 12 * t.p.n_rows
     return t.a.indptr[t.p.n_rows] + 4 * t.p.n_rows
 
 

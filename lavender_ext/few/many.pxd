@@ -19,10 +19,16 @@ cdef struct gate_t:             # what Newton's method may cost [ns] to be asked
     double row[4]               # by law: linear, lcp, coulomb, cone
     double factor[4]
     double most
-    double few[5]               # of few rows under Coulomb's law that are not soft: rows, a row, a multiply-add, most;
+    double rigid[5]              # of few rows under Coulomb's law that are not soft: rows, a row, a multiply-add, most;
                                 # of d, from which they are
     double form                 # of a multiply-add of A
     double count[4]             # factorisations by law
+    # Bounded rows, more than few, where A costs at least `carried` sweeps and their call to form; see `is_carried`.
+    int32_t few                 # 2^31 - 1: never
+    double formed               # of an entry of A
+    double call
+    double carried
+    double swept, of_row        # of each multiply-add of a sweep, and for each row
 
 
 cdef struct job_t:

@@ -13,7 +13,7 @@ from libc.string cimport memcpy
 import numpy as np
 
 from lavender_ext.core.block cimport COULOMB, ROW, blocks_t
-from lavender_ext.core.problem cimport MADE, Data, made_t, make_numbers
+from lavender_ext.core.problem cimport MADE, Data, entries_of, made_t, make_numbers
 from lavender_ext.few.many cimport LEFT, SOLVED, Gate, gate_t, job_t, space_t, with_marks, with_numbers
 from lavender_ext.generalized.islands cimport aim_at, furnish, marks_of, need_t, numbers_of, settle
 from lavender_ext.generalized.newton cimport DONE, descend_all, flow_t
@@ -61,15 +61,25 @@ cdef inline bint is_first(const job_t* j, const gate_t* gate, int32_t largest) n
     if j.law == 2:
         flops = 2.0 * flops
     cost = gate.start + gate.count[j.law] * (gate.row[j.law] * j.p.n_rows + gate.factor[j.law] * flops)
-    if j.law == 2 and j.p.n_rows <= gate.few[0]:
-        if gate.few[1] * j.p.n_rows + gate.few[2] * flops <= gate.few[3]:
+    if j.law == 2 and j.p.n_rows <= gate.rigid[0]:
+        if gate.rigid[1] * j.p.n_rows + gate.rigid[2] * flops <= gate.rigid[3]:
             return True
-        if not are_soft(&j.p, &j.g, gate.few[4]):
+        if not are_soft(&j.p, &j.g, gate.rigid[4]):
             return False
     if cost <= gate.most:
         return True
     entries = 0.5 * (<double>(2 * <ssize_t>j.g.pval[j.g.n_panels] + 4 * <ssize_t>j.p.n_rows) - 4.0 * j.p.n_rows)
     return cost <= gate.form * entries * entries / <double>(j.g.n if j.g.n > 1 else 1)
+
+
+cdef inline bint is_swept(const job_t* j, const gate_t* gate, double* w) noexcept nogil:
+    """`is_carried` of lavender/solvers/_first.py; w (n) is scratch."""
+    cdef int32_t m = j.p.n_rows
+    cdef double work
+    if gate.is_open or j.law != 1 or m <= gate.few:
+        return False
+    work = <double>(2 * <ssize_t>j.g.pval[j.g.n_panels] + 4 * <ssize_t>m)
+    return gate.formed * entries_of(&j.g, w) >= gate.call + gate.carried * (gate.swept * work + gate.of_row * m)
 
 
 cdef void solve_job(job_t* j, space_t* space, const gate_t* gate, double tol, double most) noexcept nogil:
@@ -95,6 +105,8 @@ cdef void solve_made(job_t* j, space_t* space, const gate_t* gate, double tol, d
         if not with_numbers(space, 3 * <ssize_t>m + j.g.n):
             return
         begin(j, space.numbers)
+    if not with_numbers(space, j.g.n) or is_swept(j, gate, space.numbers):
+        return
     if not with_marks(space, marks_of(&j.p, &j.g, PER_COLUMN)):
         return
     settle(&f, &j.p, &j.g, PER_COLUMN, space.marks, &need)
@@ -155,20 +167,25 @@ cdef int32_t law_of(const blocks_t* p) noexcept nogil:
 
 
 cdef class Gate:
-    """What Newton's method may cost to be asked first, in the words of `general_first`.
+    """What Newton's method may cost to be asked first, in the words of `general_first`; and where sweeps are, of `is_carried`.
 
     Parameters
     ----------
-    gate : tuple (start, rows, factors, most, form, counts, few) or None
+    gate : tuple (start, rows, factors, most, form, counts, rigid) or None
         None: whatever it costs.
+    sweeps : tuple (few, formed, call, carried, per, row), optional
+        None: nowhere.
     """
 
-    def __init__(self, gate):
+    def __init__(self, gate, sweeps=None):
         self.at.is_open = gate is None
+        self.at.few = 2**31 - 1
+        if sweeps is not None:
+            (self.at.few, self.at.formed, self.at.call, self.at.carried, self.at.swept, self.at.of_row) = sweeps
         if gate is not None:
-            (self.at.start, rows, factors, self.at.most, self.at.form, counts, few) = gate
+            (self.at.start, rows, factors, self.at.most, self.at.form, counts, rigid) = gate
             for i in range(5):
-                self.at.few[i] = few[i]
+                self.at.rigid[i] = rigid[i]
             for i in range(4):
                 self.at.row[i], self.at.factor[i] = rows[i], factors[i]
                 self.at.count[i] = counts[i]

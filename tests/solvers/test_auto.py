@@ -479,3 +479,25 @@ def test_sweeps_come_before_a_factor_over_velocities_that_fills_much_is_counted(
     monkeypatch.setattr("lavender.solvers._newton.general.prepare", None)
     solution = lv.solve(problem, "auto", tol=1e-3)
     assert solution.success and solution.message == "anderson 32 sweeps"
+
+
+@pytest.mark.parametrize("limit", [None, 2.0])
+@pytest.mark.parametrize(("seed", "sweeps"), [(109, 4), (7578, 5)])
+def test_a_body_that_carries_many_is_tried_by_some_sweeps_first(seed, sweeps, limit):
+    problem = suite.wild(seed=seed).problem  # 852 rows of J and M, 1,336 of bodies
+    for _ in range(2):
+        assert lv.solve(problem, "auto", time_limit=limit).message == f"anderson {sweeps} sweeps"
+    assert all(s.message == f"anderson {sweeps} sweeps" for s in lv.solve_many([problem, problem]))
+
+
+def test_sweeps_that_were_tried_in_vain_are_few_and_told(monkeypatch):
+    problem = suite.wild(seed=5051).problem
+    look = look_first(problem, problem.start(), 10**6, 1e-6, False, None)
+    assert look.done == rates.TRIED
+    # 222 rows, whose A costs less to form than a call of sweeps: newton at once.
+    problem = suite.wild(seed=5010).problem
+    assert look_first(problem, problem.start(), 10**6, 1e-6, False, None) is None
+    monkeypatch.setattr(rates, "SWEEP_START", 0.0)
+    solution = lv.solve(problem, "auto", time_limit=2.0)
+    assert solution.success and solution.message.startswith("anderson 8 sweeps -> newton ")
+    assert solution.work["sweeps"] == 8 and solution.work["factorisations"] > 0 and solution.iterations > 8
