@@ -139,6 +139,8 @@ class Few:
                 note = "A is not symmetric" if problem.law == "linear" and not symmetric else ""
                 if rank:
                     note = f"A is singular, rank {rank} of {problem.m}"
+                elif shifts and problem.law != "linear":
+                    note = "A is singular on the free rows: shifted and refined"
                 return Claim(Status.CONVERGED, done, work, note, form="band" if symmetric else "LU")
             return Claim(Status.CONVERGED, done, work, said("direct", work))
         done, sweeps, restarts = counts

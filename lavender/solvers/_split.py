@@ -35,7 +35,13 @@ COUNTS: dict[
 ] = {  # solver; of its work: place and unit of a count
     BY_PIVOTS: (
         "direct",
-        (("sweeps", 1, 4), ("refinements", 2, 1), ("factorisations", 3, 1), ("pivots", 4, 1)),
+        (
+            ("sweeps", 1, 4),
+            ("shifts", 5, 1),
+            ("refinements", 2, 1),
+            ("factorisations", 3, 1),
+            ("pivots", 4, 1),
+        ),
     ),
     BY_SWEEPS: ("anderson", (("sweeps", 1, 1), ("restarts", 2, 1))),
     BY_VELOCITIES: (
@@ -123,7 +129,7 @@ def _tell(trail: Trail, report: Any, count: int) -> None:
         rows = report[report[:, 0] == end]
         if not len(rows):
             continue
-        own = rows[rows[:, 7] == 0]
+        own = rows[rows[:, 8] == 0]
         done = []
         for what, place, unit in counts:
             every = unit * rows[:, 1 + place]

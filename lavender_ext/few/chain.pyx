@@ -1,7 +1,7 @@
 """Problems of few rows: look, solve and judge in one call, with what is prepared kept from one call to the next.
 
     velocities   newton on J and M, from the impulse given                              (generalized/newton.pxd)
-    pivots       the factor of A, linear or boxed, with a shift where a linear one is singular, and its refinement
+    pivots       the factor of A, linear or boxed, with one shift where it is singular, and its refinement
                                                                                         (pivot/principal.pyx)
     sweeps       the first look of accelerated sweeps                                   (accelerate/accelerated.pyx)
 
@@ -20,7 +20,7 @@ from lavender_ext.judge.measure cimport Judged
 from lavender_ext.judge.measure import same_bits, velocity_change
 from lavender_ext.judge.watch import Watch
 from lavender_ext.local import gauss_seidel
-from lavender_ext.pivot.principal import SOLVED, Pivoting
+from lavender_ext.pivot.principal import SMALL, SOLVED, Pivoting
 
 SHIFT = 1e-10                   # of d, as `direct` has it
 
@@ -161,11 +161,13 @@ cdef class Chain:
             if negative or (small and not self.symmetric):
                 return None
             if small:
-                return self.shifted(own, tol, None, 0, 0, self.data.blocks.n_rows - small)
+                return self.shifted(own, tol, None, 0, 0, self.data.blocks.n_rows - small, False)
             rows.solve_free()
         else:
             code, swept = rows.solve(own, PIVOT_SWEEPS, PIVOT_ROUNDS)
             done = rows.n_rounds
+            if code == SMALL and self.symmetric:
+                return self.shifted(own, tol, None, done, 0, 0, bool(swept))
             if code != SOLVED:
                 return None
         found = best = self.judged(rows)
@@ -182,15 +184,15 @@ cdef class Chain:
                 if found.relative < best.relative:
                     best = found
         if not (is_good(best) or (self.linear and is_rounded(best))):
-            return self.shifted(own, tol, best, done, k, 0) if self.linear and self.symmetric else None
+            return self.shifted(own, tol, best, done, k, 0, False) if self.linear and self.symmetric else None
         if not best.relative <= tol:
             return None
         return best, (done, bool(swept), k, rows.factorisations, rows.exchanged, 0, 0)
 
-    cdef shifted(self, own, double tol, Judged best, int done, int k, int rank):
-        """Passes on A + s D around the last answer, which `best` or `own` is, all rows free; `rank`: 0, or what it is.
+    cdef shifted(self, own, double tol, Judged best, int done, int k, int rank, bint swept):
+        """Passes on A + s D around the last answer, which `best` or `own` is; `rank`: 0, or what it is, all rows free.
 
-        As `direct` does where A is singular; given up where a pass does not halve the residual.
+        As `direct` does where A is singular; given up where a pass does not halve the residual, or is stuck.
         """
         cdef Judged found
         cdef double previous, reference = 1.0 / 0.0, least = 1.0 / 0.0
@@ -204,7 +206,7 @@ cdef class Chain:
                 rows.start(SHIFT)
             rows.restart()
             before = rows.n_rounds
-            if rows.rounds(1) != SOLVED:
+            if rows.rounds(1 if self.linear else PIVOT_ROUNDS) != SOLVED:
                 return None
             done += rows.n_rounds - before
             found = self.judged(rows)
@@ -215,7 +217,7 @@ cdef class Chain:
                     best, least = found, found.relative
                 if best is None:
                     return None                         # not a number
-                if is_good(best) or (whole and is_rounded(best)) or k == CORRECTIONS:
+                if is_good(best) or (whole and self.is_end(best)) or k == CORRECTIONS:
                     break
                 if not found.relative < 0.5 * previous:
                     break
@@ -226,12 +228,18 @@ cdef class Chain:
                 rows.correct()
                 k += 1
                 found = self.judged(rows)
-            if is_good(best) or is_rounded(best) or not least <= 0.5 * reference:
+                if not found.relative < previous:
+                    rows.x[:] = rows.center
+            if self.is_end(best) or not least <= 0.5 * reference:
                 break
             reference = least
-        if not (is_good(best) or is_rounded(best)) or not least <= tol:
+        if not self.is_end(best) or not least <= tol:
             return None
-        return best, (done, False, k, rows.factorisations, rows.exchanged, 1, rank)
+        return best, (done, swept, k, rows.factorisations, rows.exchanged, 1, rank)
+
+    cdef bint is_end(self, Judged x):
+        # Where every row is free, rounding is all that can be left.
+        return is_good(x) or (self.linear and is_rounded(x))
 
     cdef judged(self, rows):
         x = np.empty(self.data.blocks.n_rows)

@@ -20,15 +20,18 @@ from lavender_ext.few.many cimport SOLVED, begin, gate_t, job_t, law_of, solve_m
 from lavender_ext.judge.measure cimport do_nothing, general_judge, judge_into, reference_of, relative_of
 from lavender_ext.judge.score cimport are_numbers, relative, score_rows, score_t
 from lavender_ext.judge.watch cimport RUNNING, check, watch_t
+from lavender_ext.pivot.principal cimport SMALL
 from lavender_ext.pivot.principal cimport SOLVED as PIVOTED
 from lavender_ext.pivot.principal cimport (pivoting_t, pivots_correct, pivots_exchange, pivots_factor_all, pivots_on,
-                                           pivots_slack, pivots_solve, pivots_solve_free, scan_entries)
+                                           pivots_restart, pivots_rounds, pivots_slack, pivots_solve, pivots_solve_free,
+                                           pivots_start, scan_entries)
 
 
 cdef enum:                      # as in chain.pyx
     PIVOT_SWEEPS = 2
     PIVOT_ROUNDS = 32
     CORRECTIONS = 100
+    PASSES = 100
     MEMORY = 5
     PATIENCE = 500
 
@@ -117,11 +120,60 @@ cdef inline void clipped(const pivoting_t* s, double* out) noexcept nogil:
         out[i] = s.p.lower[i] if v < s.p.lower[i] else (s.p.upper[i] if v > s.p.upper[i] else v)
 
 
+cdef inline bint shifted(const view_t* t, int32_t kind, const double* begun, const double* start, double tol,
+                  pivoting_t* s, const desk_t* o, int32_t* counts, double* relative_) noexcept nogil:
+    """`Chain.shifted` of bounded rows."""
+    cdef int32_t i = 0, _p
+    cdef size_t size = t.p.n_rows * sizeof(double)
+    cdef double previous, now, floor, best = INFINITY, best_floor = 0.0, reference = INFINITY
+    memcpy(s.x, start, size)
+    for _p in range(PASSES):
+        memcpy(s.center, s.x, size)
+        if s.shift == 0.0:
+            pivots_start(s, 1e-10)          # of d, as in chain.pyx
+        pivots_restart(s)
+        if pivots_rounds(s, PIVOT_ROUNDS) != PIVOTED:
+            return False
+        clipped(s, o.x)
+        now = judged(t, kind, begun, o.x, o, True, &floor)
+        previous = INFINITY
+        while True:
+            if now < best:
+                best = now
+                best_floor = floor
+                memcpy(o.best, o.x, size)
+            if not best < INFINITY:
+                return False
+            if is_good(best, best_floor) or i == CORRECTIONS or not now < 0.5 * previous:
+                break
+            previous = now
+            memcpy(s.center, s.x, size)
+            pivots_slack(s)
+            pivots_correct(s)
+            i += 1
+            clipped(s, o.x)
+            now = judged(t, kind, begun, o.x, o, True, &floor)
+            if not now < previous:
+                memcpy(s.x, s.center, size)
+        if is_good(best, best_floor) or not best <= 0.5 * reference:
+            break
+        reference = best
+    if not is_good(best, best_floor) or not best <= tol:
+        return False
+    relative_[0] = best
+    counts[0] = s.n_rounds
+    counts[2] = i
+    counts[3] = s.factorisations
+    counts[4] = s.exchanged
+    counts[5] = 1
+    return True
+
+
 cdef inline bint pivot(const view_t* t, int32_t kind, const asked_t* k, const double* begun, const double* start, double tol,
                 int32_t band, const desk_t* o, int32_t* counts, double* relative_) noexcept nogil:
     """`Chain.pivot`, into `best`; did it end below tol?"""
     cdef pivoting_t s
-    cdef int32_t i = 0, swept = 0, done = 1
+    cdef int32_t i = 0, swept = 0, done = 1, code
     cdef double previous = INFINITY, now, floor, best, best_floor
     memset(o.marks, 0, 2 * <ssize_t>t.p.n_rows * sizeof(int32_t))
     pivots_on(&s, &t.a, &t.q, band, 1e-13, o.pivots, o.marks)
@@ -131,7 +183,11 @@ cdef inline bint pivot(const view_t* t, int32_t kind, const asked_t* k, const do
             return False
         pivots_solve_free(&s)
     else:
-        if pivots_solve(&s, start, PIVOT_SWEEPS, PIVOT_ROUNDS, &swept) != PIVOTED:
+        code = pivots_solve(&s, start, PIVOT_SWEEPS, PIVOT_ROUNDS, &swept)
+        if code == SMALL:
+            counts[1] = swept
+            return shifted(t, kind, begun, start, tol, &s, o, counts, relative_)
+        if code != PIVOTED:
             return False
         done = s.n_rounds
     clipped(&s, o.best)
@@ -161,6 +217,7 @@ cdef inline bint pivot(const view_t* t, int32_t kind, const asked_t* k, const do
     counts[2] = i
     counts[3] = s.factorisations
     counts[4] = s.exchanged
+    counts[5] = 0
     return True
 
 

@@ -256,14 +256,14 @@ cdef class Islands:
         return self.next < self.count
 
     def report(self):
-        """(count, 8) int32: how each island ended, its counts (5), rows, 1 where it is the copy of another's."""
+        """(count, 9) int32: how each island ended, its counts (6), rows, 1 where it is the copy of another's."""
         cdef int32_t i, j
-        found = np.zeros((self.count, 8), np.int32)
+        found = np.zeros((self.count, 9), np.int32)
         cdef int32_t[:, ::1] out = found
         for i in range(self.count):
             out[i, 0] = self.at[i].end
-            for j in range(5):
+            for j in range(6):
                 out[i, 1 + j] = self.at[i].counts[j]
-            out[i, 6] = self.at[i].n_rows
-            out[i, 7] = self.at[i].twin >= 0
+            out[i, 7] = self.at[i].n_rows
+            out[i, 8] = self.at[i].twin >= 0
         return found

@@ -26,7 +26,7 @@ cdef struct island_t:
     int32_t chosen              # it is to be solved here
     int32_t twin                # the island before that has the same bytes, -1
     int32_t end
-    int32_t counts[5]
+    int32_t counts[6]
     ssize_t numbers             # where its numbers begin, and how many
     ssize_t n_numbers
     ssize_t marks               # and its int32

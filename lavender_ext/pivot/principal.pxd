@@ -50,6 +50,9 @@ cdef void pivots_on(pivoting_t* s, const csr_t* a, const blocks_t* p, int32_t ba
 cdef void pivots_factor_all(pivoting_t* s) noexcept nogil
 cdef void pivots_solve_free(pivoting_t* s) noexcept nogil
 cdef int32_t pivots_solve(pivoting_t* s, const double* start, int32_t sweeps, int32_t n, int32_t* swept) noexcept nogil
+cdef int32_t pivots_rounds(pivoting_t* s, int32_t n) noexcept nogil
+cdef void pivots_start(pivoting_t* s, double shift) noexcept nogil
+cdef void pivots_restart(pivoting_t* s) noexcept nogil
 cdef void pivots_slack(pivoting_t* s) noexcept nogil
 cdef void pivots_correct(pivoting_t* s) noexcept nogil
 cdef int32_t pivots_exchange(pivoting_t* s) noexcept nogil

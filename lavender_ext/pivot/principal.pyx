@@ -434,11 +434,15 @@ cdef inline void lay_out(pivoting_t* s, const csr_t* a, const blocks_t* p, int32
     s.swap = NULL
 
 
+cdef inline void begin_again(pivoting_t* s) noexcept nogil:
+    s.best = s.n + 1
+    s.patience = PATIENCE
+
+
 cdef inline void begin(pivoting_t* s, double shift) noexcept nogil:
     s.shift = shift
     s.is_factored = 0
-    s.best = s.n + 1
-    s.patience = PATIENCE
+    begin_again(s)
 
 
 cdef public int32_t lav_pivot_boxed(const blocks_t* p, const csr_t* a, int32_t band, const int32_t* order, double tiny,
@@ -477,6 +481,18 @@ cdef void pivots_solve_free(pivoting_t* s) noexcept nogil:
 
 cdef int32_t pivots_solve(pivoting_t* s, const double* start, int32_t sweeps, int32_t n, int32_t* swept) noexcept nogil:
     return lav_pivot_solve(s, start, sweeps, n, swept)
+
+
+cdef int32_t pivots_rounds(pivoting_t* s, int32_t n) noexcept nogil:
+    return lav_pivot_rounds(s, n)
+
+
+cdef void pivots_start(pivoting_t* s, double shift) noexcept nogil:
+    begin(s, shift)
+
+
+cdef void pivots_restart(pivoting_t* s) noexcept nogil:
+    begin_again(s)
 
 
 cdef void pivots_slack(pivoting_t* s) noexcept nogil:
@@ -657,8 +673,7 @@ cdef class Pivoting:
 
     def restart(self):
         """A fresh count of infeasible rows; the factor stays."""
-        self.s.best = self.s.n + 1
-        self.s.patience = PATIENCE
+        begin_again(&self.s)
 
     def recenter(self):
         """center <- x."""

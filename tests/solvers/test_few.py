@@ -129,6 +129,16 @@ def test_few_joints_that_depend_on_each_other_are_one_shifted_factor_more(solver
     assert (found.work["factorisations"], found.work["shifts"]) == (2, 1)
 
 
+@pytest.mark.parametrize("solver", ["auto", "direct"])
+@pytest.mark.parametrize("seed", [5793, 6452, 7592])
+def test_few_bounded_rows_that_depend_on_each_other_are_one_shift(solver, seed):
+    problem = suite.wild(seed=seed).problem
+    found = check(problem, solver, tol=1e-9)
+    assert found.success
+    assert found.work["shifts"] == 1 and found.work["factorisations"] <= 6
+    assert registry.get(solver).few.solve(problem, None, 1e-9) is not None
+
+
 def test_a_late_solution_is_a_solution():
     problem = draw("general cone", 3)
     late = lv.solve(problem)

@@ -22,7 +22,7 @@ from lavender.solvers._split import GATE
 from lavender.solvers._trail import Trail
 from lavender_ext.accelerate import accelerated
 from lavender_ext.few.chain import Chain
-from lavender_ext.few.islands import AT_START, LEFT, Islands
+from lavender_ext.few.islands import AT_START, BY_PIVOTS, LEFT, Islands
 from lavender_ext.few.looks import sweeps_left
 from lavender_ext.few.many import solve_first
 from lavender_ext.judge.measure import velocity_change
@@ -242,7 +242,7 @@ def test_an_island_has_the_bits_of_its_own_problem(kind, seed, tol, warm):
     for i in range(count):
         blocks = np.flatnonzero(label == i)
         rows = rows_of(problem, blocks)
-        assert report[i, 6] == len(rows) <= FEW
+        assert report[i, 7] == len(rows) <= FEW
         part = restrict(problem, blocks, rows)
         expected, ended = alone(part, problem.law, start[rows], share(trail, part, options), options)
         assert (report[i, 0] != LEFT) == ended
@@ -290,8 +290,20 @@ def test_equal_islands_are_solved_once(kind, seed):
         return  # joints of all stand first: found by the count alone
     assert np.array_equal(found[: part.m], found[part.m : 2 * part.m])
     assert np.array_equal(found[: part.m], found[2 * part.m :])
-    assert report[len(once) :, 7].all()
+    assert report[len(once) :, 8].all()
     assert len(alone_there) == part.m
+
+
+def test_singular_islands_are_shifted_and_it_is_told():
+    parts = [random_lcp(seed, m=8, rank=3) for seed in range(12)]
+    problem = matrices(np.random.default_rng(0), parts)
+    report, _ = taken_apart(problem)
+    shifted = report[:, 6] == 1
+    assert shifted.any() and (report[shifted, 0] == BY_PIVOTS).all()
+    trail = Trail(problem, 1e-6, np.inf)
+    trail.offer(problem.start())
+    _split.solve_together(trail, 10_000, 1e4)
+    assert trail.work["shifts"] == shifted.sum()
 
 
 def test_an_island_that_is_not_wanted_stays_as_it_is():
