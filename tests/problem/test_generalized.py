@@ -13,7 +13,7 @@ from random_trees import chain, random_general, random_tree, tree_mass
 
 import lavender as lv
 from lavender import generalized as coordinates
-from lavender import registry
+from lavender import registry, suite
 from lavender.solvers._costs import Costs
 from lavender.solvers._islands import islands, restrict, rows_of
 from lavender.solvers._newton import general
@@ -330,6 +330,16 @@ def test_a_warm_start_saves_steps():
     assert cold.success
     assert warm.success
     assert warm.iterations < cold.iterations
+
+
+@pytest.mark.parametrize("limit", [None, 2.0])
+def test_many_islands_are_not_cut_between_two_looks_at_the_clock(limit, monkeypatch):
+    problem = suite.wild(seed=5192).problem  # 152 islands
+    cut = lv.solve(problem, "newton", time_limit=limit, tol=1e-9)
+    assert cut.success and cut.iterations > general.CLOCK
+    monkeypatch.setattr(general, "CLOCK", 10**6)
+    whole = lv.solve(problem, "newton", time_limit=10.0, tol=1e-9)
+    assert whole.work == cut.work and np.array_equal(whole.impulse, cut.impulse)
 
 
 def test_a_budget_of_steps_is_kept_and_the_answer_comes_back():

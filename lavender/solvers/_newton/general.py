@@ -17,7 +17,7 @@ from lavender.solution import Claim, Status
 from lavender_ext.generalized.newton import ENDS, Newton
 
 FORM = "generalized velocities"
-CLOCK = 64  # steps between two looks at the clock and at Ctrl-C; with a time limit at most as many as
+CLOCK = 64  # steps for each island between two looks at the clock and at Ctrl-C; with a time limit at most as many as
 FIRST_SHARE = (
     0.5  # this share of it is for at FLOP, and then as many as what is left is for at the pace so far
 )
@@ -64,10 +64,11 @@ def run(
     counts = np.zeros(5, np.int64)
     status, closer = Status.MAX_ITERATIONS, 1.0
     begun = perf_counter()
-    steps, step = CLOCK, FLOP * factor_flops(problem, kernel.largest)
+    clock = CLOCK * max(1, kernel.islands)  # a step is one of an island
+    steps, step = clock, FLOP * factor_flops(problem, kernel.largest)
     if time_limit is not None:
         # Every cut forgets where rounds of the kernel stood: few of them.
-        steps = max(1, min(CLOCK, int(min(FIRST_SHARE * time_limit / max(step, 1e-9), CLOCK))))
+        steps = max(1, int(min(FIRST_SHARE * time_limit / max(step, 1e-9), clock)))
     while counts[0] < n:
         if perf_counter() + min(step, 1e6) > deadline + LATE:
             status = Status.TIME_LIMIT
@@ -89,7 +90,7 @@ def run(
             break
         if time_limit is not None:
             step = (now - begun) / max(1, int(counts[0]))
-            steps = max(1, int(min(CLOCK, (deadline - now) / max(step, 1e-9))))
+            steps = max(1, int(min(clock, (deadline - now) / max(step, 1e-9))))
         cold = False
     return claim(status, counts)
 
