@@ -1,9 +1,9 @@
 """What `auto` tries before anything is noted or counted closely; most problems end here.
 
-    factor first      bounded rows of a narrow band, joints                         (`_at_once.py`)
-    J and M           joints whose factors over the velocities fill much; sweeps where one body carries many bounded rows
-                      or that fill takes long to count; newton over the velocities where it costs next to nothing; joints
-    a first look      at sweeps                                                     (`_sweepers.py`)
+    factors           bounded rows of a narrow band, joints                                           (`_at_once.py`)
+    J and M           joints, where factors over the velocities fill; sweeps, where one body carries many bounded rows
+                      or fill takes long to count; newton over the velocities where it costs next to nothing
+    a first look      at sweeps                                                                       (`_sweepers.py`)
     few rows          of J and M under Coulomb's law: newton over the velocities
 
 What did not end it is handed on: `Opening.trail`.
@@ -78,7 +78,7 @@ class Opening:
         return 0 if self.kernel is None else int(self.kernel.largest)
 
     def _velocities(self) -> Claim | None:
-        """Newton over them ends nearly all robots: nothing is looked at, and nothing noted, before, unless that costs less."""
+        """Newton over them ends nearly all robots: before it comes only what costs less than to know its own cost."""
         problem = self.problem
         known = problem.derived.first
         if known is False and self._is_factored(joints_over_velocities):
