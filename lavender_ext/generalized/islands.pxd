@@ -196,6 +196,7 @@ cdef inline void settle(flow_t* f, const blocks_t* p, const generalized_t* g, in
     f.n_islands = find_islands(p, g, w, w + n, <int32_t*>f.iptr, <int32_t*>f.run, <int32_t*>f.cptr,
                                <int32_t*>f.icols, <int32_t*>f.local, <int32_t*>f.pblock, <int32_t*>f.vptr, need.most)
     f.swap = w                                          # scratch of before
+    f.wait.island = -1
     f.lptr = NULL
     f.lidx = NULL
     need.crowded = False
@@ -223,7 +224,7 @@ cdef inline void settle(flow_t* f, const blocks_t* p, const generalized_t* g, in
 cdef inline ssize_t numbers_of(const flow_t* f, const need_t* need) noexcept nogil:
     """float64 that `furnish` needs."""
     cdef ssize_t size = need.most[0], values = <ssize_t>need.values
-    return (4 * <ssize_t>f.g.n + 13 * <ssize_t>f.p.n_rows + 2 * <ssize_t>f.vptr[f.p.n_blocks] + 2 * values
+    return (4 * <ssize_t>f.g.n + 14 * <ssize_t>f.p.n_rows + 2 * <ssize_t>f.vptr[f.p.n_blocks] + 2 * values
             + 2 * size + need.most[2] + need.most[1] + need.most[3] + 1)
 
 
@@ -249,7 +250,8 @@ cdef inline void furnish(flow_t* f, const need_t* need, double* x) noexcept nogi
     f.w = x + 10 * m
     f.e = x + 11 * m
     f.soft = x + 12 * m
-    x += 13 * m
+    f.aside = x + 13 * m
+    x += 14 * m
     f.v = x
     f.held = x + nv
     x += 2 * nv
@@ -268,4 +270,5 @@ cdef inline void aim_at(flow_t* f, double tol, int32_t steps, double start_energ
     f.energy_limit = tol * start_energy * share
     f.velocity_limit = tol * start_velocity
     f.steps = steps
+    f.wait.island = -1
     f.factorisations = f.updates = f.rounds = f.evaluations = 0

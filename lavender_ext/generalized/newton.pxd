@@ -49,6 +49,24 @@ cdef enum:
     ROUNDS = 60                 # rounds of Coulomb friction
 
 
+cdef struct wait_t:             # a descent whose steps were used up, to go on with
+    int32_t island              # -1: none waits
+    int32_t worst               # end of the islands before it
+    int32_t cold                # those after it begin from nothing
+    int32_t law                 # that it is under
+    int32_t rounds              # of Coulomb friction before this one
+    int32_t idle
+    int32_t n                   # steps of it
+    int32_t fresh               # s was formed anew, not moved
+    int32_t stale               # N is to be formed anew
+    double share                # of d
+    double least                # error of the island's best,
+    double found                # of the descent's as its caller keeps it,
+    double lowest               # and of its own steps
+    double last_center
+    double sizes[3]             # |G| of the last steps
+
+
 cdef struct flow_t:
     blocks_t p                  # a copy: its law is that of the convex problem while one is solved
     const generalized_t* g
@@ -82,6 +100,7 @@ cdef struct flow_t:
     double* trial               # (m)
     double* best                # (m) of one descent
     double* first_best          # (m) of one island, under the problem's own law
+    double* aside               # (m) what a descent that waits began with: phi, under Coulomb's law the impulse
     double* w                   # (m)
     double* e                   # (m)
     double* v                   # V at s
@@ -100,6 +119,7 @@ cdef struct flow_t:
     int32_t updates             # of N by changed blocks alone
     int32_t rounds              # of Coulomb friction
     int32_t evaluations         # of lambda(s) along a line
+    wait_t wait
 
 
 # -- rows and blocks of a run of panels ------------------------------------------------------------------
@@ -711,16 +731,29 @@ cdef inline int32_t descend(flow_t* f, int32_t island, double goal, double* shar
 
     The iterate with the least error stands in `best`, that error in least[0]; `share` of d is the softness of rows
     without one, lowered where the centre's progress is slow. Idle is what does not lower the least error of this
-    descent: the first step of one often leaves a larger one than it began with.
+    descent: the first step of one often leaves a larger one than it began with. Where the steps are used up it waits,
+    and goes on from there when it is called again.
     """
     cdef int32_t a, c, idle = 0, n = 0
     cdef bint square = f.p.law == COULOMB, rigid, stale = True, fresh = True, known = False, moves
     cdef double energy, velocity, over, t, size, last_center = -1.0, bound, lowest = 1.0 / 0.0
     cdef double sizes[3]
     sizes[0] = sizes[1] = sizes[2] = -1.0
-    soften(f, island, share[0])
+    if f.wait.island == island:                         # its N, s and lambda are as they were
+        idle = f.wait.idle
+        n = f.wait.n
+        fresh = f.wait.fresh
+        lowest = f.wait.lowest
+        last_center = f.wait.last_center
+        for a in range(3):
+            sizes[a] = f.wait.sizes[a]
+        f.wait.island = -1
+        stale = f.wait.stale
+        known = True
+    else:
+        soften(f, island, share[0])
+        renew(f, island)
     rigid = is_rigid(f, island)
-    renew(f, island)
     while True:
         if not known:
             respond_all(f, island, f.s, f.lam)
@@ -739,6 +772,18 @@ cdef inline int32_t descend(flow_t* f, int32_t island, double goal, double* shar
         if over <= goal:
             return DONE
         if f.steps <= 0:
+            f.wait.island = island
+            f.wait.law = f.p.law
+            f.wait.idle = idle
+            f.wait.n = n
+            f.wait.fresh = fresh
+            f.wait.stale = stale
+            f.wait.share = share[0]
+            f.wait.found = least[0]
+            f.wait.lowest = lowest
+            f.wait.last_center = last_center
+            for a in range(3):
+                f.wait.sizes[a] = sizes[a]
             return SPENT
         idle += 1
         n += 1
@@ -853,34 +898,56 @@ cdef inline bint offer(flow_t* f, int32_t island, const double* lam, double* lea
 
 cdef inline int32_t with_coulomb(flow_t* f, int32_t island, double* impulse, bint cold, double* least) noexcept nogil:
     """Rounds of Newton's method on Coulomb's law, each from the answer of a convex problem."""
+    cdef bint waits = f.wait.island == island, convex
     cdef int32_t n, rounds
     cdef double found, share
-    for rounds in range(ROUNDS):
-        f.rounds += 1
-        if rounds > 0 or cold:
+    for rounds in range(f.wait.rounds if waits else 0, ROUNDS):
+        convex = f.wait.law == CONE if waits else rounds > 0 or cold
+        if convex:
             f.p.law = CONE
-            found = 1.0 / 0.0
-            share = f.share
+            found = f.wait.found if waits else 1.0 / 0.0
+            share = f.wait.share if waits else f.share
+            if waits:
+                keep(f, island, f.aside, f.phi)
+            else:
+                f.rounds += 1
+            waits = False
             n = descend(f, island, 1e-2 * least[0] if least[0] > 1e2 else 1.0, &share, &found)
             if n == LOST or n == FAILED:
                 return n
+            if n == SPENT:
+                f.wait.rounds = rounds
+                f.wait.least = least[0]
+                keep(f, island, f.phi, f.aside)
             keep(f, island, f.best, impulse)
             level(f, island)
             offer(f, island, impulse, least)
             if least[0] <= 1.0:
+                f.wait.island = -1
                 return DONE
-            if f.steps <= 0:
+            if n == SPENT:
                 return SPENT
-        restart(f, island, impulse)
+        if waits:
+            keep(f, island, f.aside, impulse)
+        else:
+            if not convex:
+                f.rounds += 1
+            restart(f, island, impulse)
         f.p.law = COULOMB
-        found = 1.0 / 0.0
-        share = f.share
+        found = f.wait.found if waits else 1.0 / 0.0
+        share = f.wait.share if waits else f.share
+        waits = False
         n = descend(f, island, 1.0, &share, &found)
+        if n == SPENT:
+            f.wait.rounds = rounds
+            f.wait.least = least[0]
+            keep(f, island, impulse, f.aside)
         if n != LOST and offer(f, island, f.best, least):
             keep(f, island, f.best, impulse)
         if least[0] <= 1.0:
+            f.wait.island = -1
             return DONE
-        if f.steps <= 0:
+        if n == SPENT:
             return SPENT
         lower_normals(f, island, impulse)
         restart(f, island, impulse)
@@ -888,22 +955,27 @@ cdef inline int32_t with_coulomb(flow_t* f, int32_t island, double* impulse, bin
 
 
 cdef inline int32_t solve_island(flow_t* f, int32_t island, double* impulse, bint cold) noexcept nogil:
-    """One island from `impulse`, into it; how it ended."""
+    """One island from `impulse`, or from where it waits, into it; how it ended."""
     cdef int32_t end
     cdef double least = 1.0 / 0.0, share = f.share
     f.island = island
     f.thin = f.lptr != NULL and is_worth(f.cptr[island + 1] - f.cptr[island], f.lptr + f.cptr[island], f.lidx)
-    restart(f, island, impulse)
-    level(f, island)
-    if not offer(f, island, impulse, &least):
-        return LOST
-    if least <= 1.0:
-        return DONE
+    if f.wait.island == island:
+        least = f.wait.least
+        share = f.wait.share
+    else:
+        restart(f, island, impulse)
+        level(f, island)
+        if not offer(f, island, impulse, &least):
+            return LOST
+        if least <= 1.0:
+            return DONE
     if f.law == COULOMB:
         end = with_coulomb(f, island, impulse, cold, &least)
         keep(f, island, f.first_best, impulse)
     else:
         end = descend(f, island, 1.0, &share, &least)
+        f.wait.least = least
         keep(f, island, f.best, impulse)
     return end
 

@@ -19,16 +19,24 @@ cdef public int32_t lav_general_islands(const blocks_t* p, const generalized_t* 
 
 
 cdef int32_t descend_all(flow_t* f, double* impulse, int32_t cold) noexcept nogil:
-    cdef int32_t i, end, worst = DONE
-    for i in range(f.n_islands):
+    cdef int32_t i, end, first = 0, worst = DONE
+    if f.wait.island >= 0:
+        first = f.wait.island
+        worst = f.wait.worst
+        cold = f.wait.cold
+    for i in range(first, f.n_islands):
         end = solve_island(f, i, impulse, cold)
+        if end == SPENT:                                # N is of this one
+            f.wait.worst = worst
+            f.wait.cold = cold
+            return SPENT
         if end > worst:
             worst = end
     return worst
 
 
 cdef public int32_t lav_general_newton(flow_t* f, double* impulse, int32_t cold) noexcept nogil:
-    """All islands from `impulse` (m), into it: DONE, or how the worst of them ended."""
+    """All islands from `impulse` (m), or from the one that waits on, into it: DONE, or how the worst of them ended."""
     return descend_all(f, impulse, cold)
 
 
@@ -69,18 +77,25 @@ cdef class Newton:
         return lav_general_newton(&self.f, impulse, cold)
 
     @property
+    def waits(self):
+        """A run has used up its steps: `again` goes on from there."""
+        return self.f.wait.island >= 0
+
+    @property
     def islands(self):
         """Problems that share no velocity."""
         return self.f.n_islands
 
-    def run(self, double[::1] impulse, double tol, int steps, bint cold):
+    def run(self, double[::1] impulse, double tol, int steps, bint cold, bint again=False):
         """At most `steps` Newton steps on impulse (m,), in place; the judge's start must be known to the data.
 
+        again: on from where the run before, to the same tol, has used up its steps: with the bits of one run of as many.
         Returns how it ended (`ENDS`) and (steps, factorisations, updates of N, rounds, evaluations of a line).
         """
-        cdef int32_t end = DONE
+        cdef int32_t end = DONE, waits = self.f.wait.island if again else -1
         if self.f.p.n_rows > 0:
             self.aim(tol, steps)
+            self.f.wait.island = waits
             with nogil:
                 end = lav_general_newton(&self.f, &impulse[0], cold)
         return end, (steps - self.f.steps, self.f.factorisations, self.f.updates, self.f.rounds, self.f.evaluations)

@@ -18,6 +18,7 @@ from lavender.solvers._costs import Costs
 from lavender.solvers._islands import islands, restrict, rows_of
 from lavender.solvers._newton import general
 from lavender.solvers._sweeping import reads_whitened
+from lavender_ext.generalized.newton import ENDS
 
 
 def as_matrix(problem):
@@ -580,6 +581,33 @@ def test_branches_are_factored_in_their_own_pattern(friction, seed):
         np.testing.assert_allclose(
             solution.impulse, other.impulse, atol=1e-7 * (1 + np.abs(other.impulse).max())
         )
+
+
+@given(seed=seeds, steps=st.integers(1, 12))
+@pytest.mark.parametrize("friction", ["coulomb", "cone"])
+@settings(max_examples=15)
+def test_newton_whose_steps_are_used_up_goes_on_with_the_bits_of_one_run(friction, seed, steps):
+    """Cut anywhere, in one of several islands: the same impulse and counts."""
+    problem = random_general(seed, friction, n=24, compliance=False)
+    whole, cut = problem.start(), problem.start()
+    end, counts = general.prepare(problem).run(whole, 1e-9, 90, True)
+    kernel, done, now, again = general.prepare(problem), np.zeros(5, int), ENDS["spent"], False
+    while now == ENDS["spent"] and done[0] < 90:
+        now, more = kernel.run(cut, 1e-9, min(steps, 90 - done[0]), True, again)
+        done, again = done + more, kernel.waits
+    assert (now, tuple(done)) == (end, counts)
+    assert kernel.waits == (end == ENDS["spent"])
+    np.testing.assert_array_equal(cut, whole)
+
+
+def test_newton_that_waits_begins_anew_unless_it_is_told_to_go_on():
+    problem = random_general(3, "coulomb", n=24, compliance=False)
+    kernel, fresh = general.prepare(problem), problem.start()
+    end, counts = kernel.run(fresh, 1e-9, 5, True)
+    assert end == ENDS["spent"] and kernel.waits
+    other = problem.start()
+    assert kernel.run(other, 1e-9, 5, True) == (end, counts)
+    np.testing.assert_array_equal(other, fresh)
 
 
 def test_a_look_at_j_changes_nothing_that_kernels_read():

@@ -17,10 +17,8 @@ from lavender.solution import Claim, Status
 from lavender_ext.generalized.newton import ENDS, Newton
 
 FORM = "generalized velocities"
-CLOCK = 64  # steps for each island between two looks at the clock and at Ctrl-C; with a time limit at most as many as
-FIRST_SHARE = (
-    0.5  # this share of it is for at FLOP, and then as many as what is left is for at the pace so far
-)
+CLOCK = 64  # steps for each island between two looks at the clock and at Ctrl-C, which change no bit; with a time limit
+FIRST_SHARE = 0.5  # at most as many as this share of it is for at FLOP, and then as what is left is for at the pace so far
 LATE = 0.05  # s that a step may end after the limit
 FLOP = 1e-10  # s for each multiply-add of a dense factor
 CLOSEST = 1e-2  # of tol, up to which the kernel is asked again where the judge does not find what it found
@@ -56,9 +54,18 @@ def factor_flops(problem: Problem, largest: int) -> float:
 
 
 def run(
-    problem: Problem, kernel: Newton, impulse: FloatArray, n: int, tol: float, time_limit: float | None
+    problem: Problem,
+    kernel: Newton,
+    impulse: FloatArray,
+    n: int,
+    tol: float,
+    time_limit: float | None,
+    again: bool = False,
 ) -> Claim:
-    """At most n Newton steps on `impulse`, in place, until the judge's test at tol is met."""
+    """At most n Newton steps on `impulse`, in place, until the judge's test at tol is met.
+
+    `again`: on from where a run before, to the same tol, has used up its steps.
+    """
     deadline = np.inf if time_limit is None else perf_counter() + time_limit
     cold = _is_cold(problem, impulse)
     counts = np.zeros(5, np.int64)
@@ -67,21 +74,23 @@ def run(
     clock = CLOCK * max(1, kernel.islands)  # a step is one of an island
     steps, step = clock, FLOP * factor_flops(problem, kernel.largest)
     if time_limit is not None:
-        # Every cut forgets where rounds of the kernel stood: few of them.
         steps = max(1, int(min(FIRST_SHARE * time_limit / max(step, 1e-9), clock)))
     while counts[0] < n:
         if perf_counter() + min(step, 1e6) > deadline + LATE:
             status = Status.TIME_LIMIT
             break
-        end, done = kernel.run(impulse, closer * tol, min(steps, n - int(counts[0])), cold)
+        end, done = kernel.run(impulse, closer * tol, min(steps, n - int(counts[0])), cold, again)
         counts += done
         status = _STATUS[end]
         if status is Status.CONVERGED and not confirmed(problem, impulse, tol):
             # Its sums are rounded in another order, and vanish where squares do.
             status = Status.MAX_ITERATIONS if closer > CLOSEST else Status.STALLED
             closer *= 0.25
-        elif status is Status.MAX_ITERATIONS and done[0] <= 0:
-            status = Status.STALLED
+            again = cold = False
+        elif status is Status.MAX_ITERATIONS:
+            again = True
+            if done[0] <= 0:
+                status = Status.STALLED
         if status is not Status.MAX_ITERATIONS:
             break
         now = perf_counter()
@@ -91,7 +100,6 @@ def run(
         if time_limit is not None:
             step = (now - begun) / max(1, int(counts[0]))
             steps = max(1, int(min(clock, (deadline - now) / max(step, 1e-9))))
-        cold = False
     return claim(status, counts)
 
 
