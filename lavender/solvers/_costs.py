@@ -69,12 +69,12 @@ class Exact:
 class Costs:
     """Of one problem; what takes time to find out is found when it is first asked.
 
-    `largest`: velocities of the largest island of a problem in generalised coordinates, 0 where Newton's method has
-    no room for so many.
+    `largest`: velocities of the largest of the `islands` of a problem in generalised coordinates, 0 where Newton's
+    method has no room for so many.
     """
 
-    def __init__(self, problem: Problem, tol: float, largest: int = 0) -> None:
-        self.problem, self.largest = problem, largest
+    def __init__(self, problem: Problem, tol: float, largest: int = 0, islands: int = 1) -> None:
+        self.problem, self.largest, self.islands = problem, largest, islands
         self.decades = float(-np.log10(min(max(tol, 1e-16), 0.1)))
         self.sweep = sweep_cost(problem)
         self.ended = set[str]()  # keys of finite solvers that gave up
@@ -205,7 +205,8 @@ class Costs:
             pivot = rates.PIVOT if p.m > FEW else rates.FEW_PIVOT
             found.append(Exact("lemke", rates.START["lemke"] + p.m * (pivot + entries), limit))
         if self.largest:
-            count = 2 * int(rates.GENERAL_COUNT[p.law]) + rates.GENERAL_TAIL
+            # A step is that of one island.
+            count = (2 * int(rates.GENERAL_COUNT[p.law]) + rates.GENERAL_TAIL) * self.islands
             cost = velocities_cost(p, self.largest)
             once = rates.GENERAL_START + (cost - rates.GENERAL_START) / general_count(p)
             found.append(Exact("newton", cost, count, (("form", "velocity"),), once))

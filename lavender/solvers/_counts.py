@@ -48,6 +48,12 @@ def general_count(problem: Problem) -> float:
     return rates.GENERAL_COUNT[problem.law]
 
 
+def general_step(problem: Problem, largest: int, islands: int) -> float:
+    """One step over generalised velocities, in one of the islands, without what is lost on those that fail [ns]."""
+    factors = rates.GENERAL[problem.law] * factor_flops(problem, largest)
+    return (rates.GENERAL_STEP_ROW * problem.m + factors) / islands
+
+
 def sweep_cost(problem: Problem) -> float:
     """Of one sweep [ns]."""
     return rates.SWEEP[problem.law] * sweep_work(problem) + rates.SWEEP_ROW * problem.m

@@ -25,7 +25,7 @@ from lavender.solvers._first import general_first, general_second, general_steps
 from lavender.solvers._newton import general
 from lavender.solvers._sweepers import SWEEPER, Glance, look_first
 from lavender.solvers._trail import Trail
-from lavender.solvers._turns import VELOCITY, note
+from lavender.solvers._turns import VELOCITY, note, velocities_left
 
 __all__ = ["Opening"]
 
@@ -160,7 +160,7 @@ class Opening:
                 trail.add(SWEEPER, self.glance.claim())
                 self.glance.told = self.glance.done
             trail.add("newton", self.newton)
-            trail.begun = True
+            velocities_left(trail, self.newton, self.lam)
             if self.newton.status is not Status.MAX_ITERATIONS:
                 trail.gave_up(VELOCITY, trail.best)
             if np.isfinite(self.lam).all():

@@ -33,6 +33,7 @@ PIVOT, PIVOT_ENTRY = 60e3, 0.5  # of each pivot of lemke, and for each entry of 
 GENERAL_START = 60e3
 GENERAL_ROW = {"linear": 40.0, "lcp": 100.0, "cone": 140.0, "coulomb": 400.0}
 GENERAL = {"linear": 0.1, "lcp": 0.06, "cone": 0.06, "coulomb": 0.02}
+GENERAL_STEP_ROW = 150.0  # of a step under Coulomb's law, its tail aside
 GENERAL_SOFT = (
     1e-6  # of d: the least softness of a row without a proximal term; where all are soft, one factor ends it
 )
@@ -110,7 +111,7 @@ LOOKS = 4  # at so many sweeps
 # Steps that it then has, beside those that are expected of each island but one; under Coulomb's law, where it ends soon
 # or late, as many as in one compiled call.
 GENERAL_STEPS = {"linear": 256, "lcp": 256, "cone": 256, "coulomb": 64}
-# Steps over generalised velocities that are granted beside twice those expected.
+# Steps over generalised velocities, in each island, that are granted beside twice those expected.
 GENERAL_TAIL = 60
 ADMM_GENERAL = 1500  # rows up to which A of J and M, whose entries are not known, is formed for `admm`
 LEMKE_ROWS = 1000  # beyond, a dense tableau of 8 MB and more

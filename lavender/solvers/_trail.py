@@ -56,7 +56,9 @@ class Trail:
 
     def __post_init__(self) -> None:
         m = self.problem.m
-        self.costs = Costs(self.problem, self.tol, self.largest)
+        self.costs = Costs(
+            self.problem, self.tol, self.largest, 1 if self.kernel is None else self.kernel.islands
+        )
         self.impulse = self.problem.start()
         self.w, self.e = np.empty(m), np.empty(m)
 

@@ -15,13 +15,14 @@ from lavender.registry import FEW
 from lavender.solution import Claim, Status
 from lavender.solvers._costs import VELOCITY_KEY, Exact
 from lavender.solvers._few import WARM
+from lavender.solvers._newton import general
 from lavender.solvers._sweepers import Sweeps
 from lavender.solvers._trail import CLOCK, Trail, usable
 from lavender.solvers._walks import sweeps_of
 from lavender.solvers.direct import Impatient
 from lavender.solvers.newton import NewtonState, after_sweeps, asking
 
-__all__ = ["VELOCITY", "Turns", "note", "whole"]
+__all__ = ["VELOCITY", "Turns", "note", "velocities_left", "whole"]
 
 CHUNK_WORK = 8  # sweeps' work that an iteration of admm is
 ROUNDS = 8  # times that sweeps and finite solvers take turns, the allowance doubled each time
@@ -46,6 +47,8 @@ def whole(
     spec = usable(name, trail.problem)
     if spec is None or budget <= trail.iterations:
         return trail.done
+    if chosen.key == VELOCITY and trail.kernel is not None:
+        return _over_velocities(trail, chosen, budget, limit or spec.max_iter)
     own = name == "newton" and trail.problem.generalized is None
     kept = trail.kept.get(chosen.key)
     if kept is not None:
@@ -58,15 +61,13 @@ def whole(
             solver = asking(solver, more)
         if own:
             state = _newton_state(trail)
-        elif chosen.key == VELOCITY and trail.kernel is not None:
-            state = NewtonState(trail.problem, None, trail.kernel)
         else:
             state = solver.prepare(trail.problem)
     # Half-finished sweeps mislead a Newton method; Pi(0) does not. Under a convex law a step is lost on them even
     # where they came close; not on a start that was.
     before = trail.best
     close = before if trail.problem.law == "coulomb" or not own else trail.given
-    warm = close <= WARM and (own or chosen.key != VELOCITY or trail.begun)
+    warm = close <= WARM
     impulse = trail.impulse.copy() if warm else trail.problem.start()
     if name == "direct" and trail.problem.law == "lcp" and trail.swept is not None:
         impulse = trail.swept.copy()
@@ -80,7 +81,6 @@ def whole(
             impulse = trail.swept.copy()
     if kept is not None:
         impulse = trail.left[chosen.key]
-    trail.begun = trail.begun or chosen.key == VELOCITY
     left = None if np.isinf(trail.deadline) else max(trail.deadline - perf_counter(), 1e-3)
     most = min(limit or spec.max_iter, spec.max_iter, budget - trail.iterations)
     claim: Claim
@@ -96,6 +96,29 @@ def whole(
             trail.kept[chosen.key], trail.left[chosen.key] = (solver, state), impulse
     note(trail, chosen, claim, impulse, before)
     return trail.done
+
+
+def _over_velocities(trail: Trail, chosen: Exact, budget: int, limit: int) -> bool:
+    """Newton's method over generalised velocities, on from where its steps were used up."""
+    before = trail.best
+    impulse = trail.left.get(VELOCITY)
+    again = impulse is not None
+    if impulse is None:
+        impulse = trail.impulse.copy() if trail.begun and before <= WARM else trail.problem.start()
+    left = None if np.isinf(trail.deadline) else max(trail.deadline - perf_counter(), 1e-3)
+    most = min(limit, budget - trail.iterations)
+    claim = general.run(trail.problem, trail.kernel, impulse, most, trail.tol, left, again)
+    velocities_left(trail, claim, impulse)
+    note(trail, chosen, claim, impulse, before)
+    return trail.done
+
+
+def velocities_left(trail: Trail, claim: Claim, impulse: FloatArray) -> None:
+    """Newton's method over generalised velocities has begun, and goes on from here where it only ran out of steps."""
+    trail.begun = True
+    trail.left.pop(VELOCITY, None)
+    if claim.status is Status.MAX_ITERATIONS and trail.kernel.waits:
+        trail.left[VELOCITY] = impulse
 
 
 def note(trail: Trail, chosen: Exact, claim: Claim, impulse: FloatArray, before: float) -> None:

@@ -26,7 +26,7 @@ from lavender.solvers._newton.systems import AUGMENTED, DENSE_FILL, DENSE_ROWS, 
 from lavender.solvers._sweepers import SWEEPER, Glance, Sweeps
 from lavender.solvers._trail import Trail
 
-__all__ = ["Walks", "sweeps_of"]
+__all__ = ["OTHER", "Walks", "sweeps_of"]
 
 WALK = 8  # factorisations of a walk,
 EARLY, GAIN = 3, 0.95  # of which so many have to leave that share of the residual

@@ -15,7 +15,8 @@
     coulomb           loose and large piles: sweeps (nncg in both directions from LARGE rows on) race those of the
                       convex relaxation, whose answer is the Coulomb answer wherever contacts stick; where they stall,
                       what is wrong is solved in patches between sweeps (`_race.py`, `_patches.py`); between sweeps of
-                      rows or of a matrix Newton's method walks a few steps (`_walks.py`)
+                      rows or of a matrix Newton's method walks a few steps (`_walks.py`), over velocities it takes
+                      turns with them (`_velocities.py`)
 
 Costs are counted from the structure (`_costs.py`) and from the contraction of sweeps that were done, never timed:
 the same problem is solved the same way everywhere. Islands are solved apart, each to its share of the whole error,
@@ -53,6 +54,7 @@ from lavender.solvers._sweepers import Glance, Sweeps
 from lavender.solvers._together import solve_islands, worth_together
 from lavender.solvers._trail import Trail
 from lavender.solvers._turns import VELOCITY, Turns, whole
+from lavender.solvers._velocities import alternate
 from lavender.solvers._walks import Walks, sweeps_of
 
 LARGE = 4000  # rows of J from which friction is swept both ways, and beside its relaxation
@@ -176,6 +178,8 @@ def _solve(trail: Trail, budget: int, glance: Glance | None = None, fills: bool 
         if sweeps.run(budget):
             return
     if costs.few_bounded and whole(trail, HASTY, budget):
+        return
+    if trail.largest and problem.law == "coulomb" and alternate(trail, sweeps, budget):
         return
     least = costs.cheapest
     if least > 2.0 * rates.ISLAND and _worth_apart(trail, least, together) and _apart(trail, budget):

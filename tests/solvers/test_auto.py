@@ -190,6 +190,34 @@ def test_newton_over_velocities_is_not_asked_twice_where_it_gave_up():
     assert sorted(names) == ["admm", "newton impulse", "newton velocity"]
 
 
+def test_newton_over_velocities_goes_on_in_its_next_turn(monkeypatch):
+    asked, run = [], general.run
+
+    def recorded(problem, kernel, impulse, n, tol, time_limit, again=False):
+        asked.append((n, again))
+        return run(problem, kernel, impulse, n, tol, time_limit, again)
+
+    monkeypatch.setattr(general, "run", recorded)
+    problem = suite.wild(seed=7597).problem  # 45 rows on which all of them need long
+    solution = lv.solve(problem, "auto", tol=1e-6)
+    assert good(solution, 1e-6)
+    assert [name.split()[0] for name in solution.message.split(" -> ")][:3] == ["anderson", "newton", "nncg"]
+    assert not asked[0][1] and all(again for _, again in asked[1:])
+
+
+def test_each_island_over_velocities_has_its_steps():
+    problem = suite.wild(seed=5884).problem  # 132 rows in five islands, which sweeps do not end
+    kernel = general.prepare(problem)
+    one, all_of_them = (
+        next(e for e in Costs(problem, 1e-6, kernel.largest, n).exact if e.key == _turns.VELOCITY)
+        for n in (1, kernel.islands)
+    )
+    assert all_of_them.limit == 5 * one.limit and all_of_them.cost == one.cost
+    solution = lv.solve(problem, "auto", tol=1e-6)
+    assert good(solution, 1e-6)
+    assert "admm" not in solution.message
+
+
 def test_a_step_that_would_end_after_the_deadline_is_refused(monkeypatch):
     from lavender.solvers._newton import general
 
