@@ -17,8 +17,10 @@ from lavender.solution import Claim, Status
 from lavender_ext.generalized.newton import ENDS, Newton
 
 FORM = "generalized velocities"
-CLOCK = 64  # steps for each island between two looks at the clock and at Ctrl-C, which change no bit; with a time limit
-FIRST_SHARE = 0.5  # at most as many as this share of it is for at FLOP, and then as what is left is for at the pace so far
+# Steps for each island between two looks at the clock and at Ctrl-C, which change no bit; with a time limit at most as
+# many as this share of it is for at FLOP, and then as what is left is for at the pace so far.
+CLOCK = 64
+FIRST_SHARE = 0.5
 LATE = 0.05  # s that a step may end after the limit
 FLOP = 1e-10  # s for each multiply-add of a dense factor
 CLOSEST = 1e-2  # of tol, up to which the kernel is asked again where the judge does not find what it found
