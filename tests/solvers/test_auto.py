@@ -201,7 +201,8 @@ def test_newton_over_velocities_goes_on_in_its_next_turn(monkeypatch):
     problem = suite.wild(seed=7597).problem  # 45 rows on which all of them need long
     solution = lv.solve(problem, "auto", tol=1e-6)
     assert good(solution, 1e-6)
-    assert [name.split()[0] for name in solution.message.split(" -> ")][:3] == ["anderson", "newton", "nncg"]
+    ran = [name.split()[0] for name in solution.message.split(" -> ")]
+    assert ran[:2] == ["anderson", "newton"] and "nncg" in ran
     assert not asked[0][1] and all(again for _, again in asked[1:])
 
 
