@@ -262,12 +262,11 @@ cdef public int32_t lav_panels(int32_t n, const int32_t* lptr, const int32_t* li
 
 cdef public void lav_sparse_rows(int32_t n, int32_t count, int32_t panels, const int32_t* begin, const int32_t* order,
                                  const int32_t* size, const int32_t* lptr, const int32_t* lind, const int32_t* group,
-                                 int32_t lu, int32_t* starts, int32_t* by_place, int32_t* place, int32_t* first,
-                                 int32_t* of, int32_t* rptr, int32_t* rows, int64_t* at, int64_t* beside, int64_t* room,
+                                 int32_t* starts, int32_t* by_place, int32_t* place, int32_t* first, int32_t* of,
+                                 int32_t* rptr, int32_t* rows, int64_t* at, int64_t* beside,
                                  double* work) noexcept nogil:
-    """From vertices to rows, as `sparse_t` has them; room for what one panel takes; starts (count + 1) is scratch."""
-    cdef int32_t i, j, c = 0, q, k, width, below, run
-    cdef int64_t most = 0, needed
+    """From vertices to rows, as `sparse_t` has them; work of L L^T; starts (count + 1) is scratch."""
+    cdef int32_t i, j, c = 0, q, k, width, below
     for i in range(count):
         starts[i] = c
         for j in range(begin[order[i]], begin[order[i] + 1]):
@@ -295,20 +294,26 @@ cdef public void lav_sparse_rows(int32_t n, int32_t count, int32_t panels, const
             of[j] = i
         # Half of the sum of the squares of its columns' heights.
         work[0] += width * (0.5 * (<double>below * below + <double>below * width) + <double>width * width / 6.0)
-        if lu and <int64_t>width * STRIP > most:
-            most = <int64_t>width * STRIP
-        if below > most:
-            most = below
     first[panels] = n
+
+
+cdef public void lav_sparse_room(int32_t panels, const int32_t* first, const int32_t* of, const int32_t* rptr,
+                                 const int32_t* rows, int32_t lu, int64_t* room) noexcept nogil:
+    """Room for what one panel takes from another, for the rows below it, and of L U for the tops of a strip."""
+    cdef int32_t i, j, run
+    cdef int64_t most = 0, needed
     for i in range(panels):
+        needed = <int64_t>(first[i + 1] - first[i]) * STRIP if lu else 0
+        if rptr[i + 1] - rptr[i] > needed:
+            needed = rptr[i + 1] - rptr[i]
+        if needed > most:
+            most = needed
         run = 0
         for j in range(rptr[i], rptr[i + 1]):
             run = run + 1 if j > rptr[i] and of[rows[j]] == of[rows[j - 1]] else 1
             needed = <int64_t>run * (rptr[i + 1] - j + run - 1)
             if needed > most:
                 most = needed
-    if lu:
-        work[0] *= 2.0
     room[0] = most
 
 
@@ -643,6 +648,45 @@ def free_part(const int32_t[::1] indptr, const int32_t[::1] indices, const doubl
     return ptr_array, idx_array, val_array
 
 
+cdef tuple _analysed(indptr, indices):
+    # Numbers of `sparse_t` with room for what a factor notes, places in its values, and the work of L L^T.
+    cdef int32_t n = <int32_t>len(indptr) - 1, nnz = <int32_t>len(indices), count, k, room = nnz + nnz // 4 + n + 1
+    cdef const int32_t[::1] ptr = indptr, ind = indices
+    cdef const int32_t* entries = &ind[0] if nnz else NULL
+    cdef int64_t below
+    cdef double share = ZEROS, work
+    cdef int32_t[::1] scratch = np.empty(19 * n + nnz // 2 + room + 9, np.int32), lind, whole
+    cdef int64_t[::1] left = np.empty(2 * n + 2, np.int64), places
+    cdef int32_t* begin = &scratch[0]                   # n + 1
+    cdef int32_t* order = begin + n + 1
+    cdef int32_t* size = order + n
+    cdef int32_t* parent = size + n
+    cdef int32_t* nptr = parent + n                     # n + 1
+    cdef int32_t* lptr = nptr + n + 1                   # n + 1
+    cdef int32_t* group = lptr + n + 1                  # n + 1
+    cdef int32_t* nind = group + n + 1                  # nnz / 2 + n + 1
+    cdef int32_t* s = nind + nnz // 2 + n + 1           # 11 n + 3 + room
+    cdef int32_t* first
+    cdef int32_t* rptr
+    with nogil:
+        count = lav_sparse_order(n, &ptr[0], entries, room, s, &left[0], begin, order, size, nptr, nind, parent, lptr)
+    if count < 0:
+        raise OverflowError("the factor has 2^31 entries or more")
+    lind = np.empty(lptr[count] + 1, np.int32)
+    with nogil:
+        k = lav_sparse_pattern(count, nptr, nind, parent, size, lptr, &lind[0], s, share, group, &below)
+    if below >= 2**31:
+        raise OverflowError("the factor has 2^31 rows of panels or more")
+    whole_array, places_array = np.empty(5 * n + 5 * k + 2 + below, np.int32), np.empty(2 * k + 2, np.int64)
+    whole, places = whole_array, places_array
+    first = &whole[0] + 5 * n
+    rptr = first + k + 1
+    with nogil:
+        lav_sparse_rows(n, count, k, begin, order, size, lptr, &lind[0], group, s, &whole[0], &whole[0] + n, first,
+                        &whole[0] + 2 * n, rptr, rptr + k + 1 + 3 * k, &places[0], &places[0] + k + 1, &work)
+    return whole_array, places_array, work
+
+
 cdef class SparsePanels:
     """The factor of a matrix in canonical compressed rows (n, n), whose pattern is symmetric; n > 0.
 
@@ -653,57 +697,33 @@ cdef class SparsePanels:
         L U; else L L^T of a symmetric matrix, of which the entries at and after the diagonal in the order are read.
     wide : bool
         Four lanes where the machine has them: the same bits.
+    like : SparsePanels, optional
+        Of the same pattern, whose analysis serves again.
     """
 
     cdef sparse_t f
-    cdef object keep, indptr, indices
-    cdef readonly double work                           # multiply-adds of a factor, roughly
+    cdef object keep, numbers, indptr, indices
+    cdef double half                                    # multiply-adds of L L^T, roughly,
+    cdef readonly double work                           # and of the factor
     cdef readonly int64_t entries                       # numbers it holds
 
-    def __init__(self, indptr, indices, bint lu, bint wide=True):
-        cdef int32_t n = <int32_t>len(indptr) - 1, nnz = <int32_t>len(indices), count, k, room = nnz + nnz // 4 + n + 1
-        cdef const int32_t[::1] ptr = indptr, ind = indices
-        cdef const int32_t* entries = &ind[0] if nnz else NULL
-        cdef int64_t below, most, held
-        cdef double share = ZEROS
-        cdef int32_t[::1] scratch, lind_
-        cdef int64_t[::1] left
-        cdef double[::1] numbers
-        cdef int32_t* begin
-        cdef int32_t* order
-        cdef int32_t* size
-        cdef int32_t* parent
-        cdef int32_t* nptr
-        cdef int32_t* lptr
-        cdef int32_t* group
-        cdef int32_t* nind
-        cdef int32_t* s
+    def __init__(self, indptr, indices, bint lu, bint wide=True, SparsePanels like=None):
+        cdef int32_t n = <int32_t>len(indptr) - 1, k
+        cdef int64_t below
         if n < 1:
             raise ValueError("a matrix of one row or more")
-        scratch = np.empty(19 * n + nnz // 2 + room + 9, np.int32)
-        left = np.empty(2 * n + 2, np.int64)
-        begin = &scratch[0]                             # n + 1
-        order = begin + n + 1
-        size = order + n
-        parent = size + n
-        nptr = parent + n                               # n + 1
-        lptr = nptr + n + 1                             # n + 1
-        group = lptr + n + 1                            # n + 1
-        nind = group + n + 1                            # nnz / 2 + n + 1
-        s = nind + nnz // 2 + n + 1                     # 11 n + 3 + room
-        with nogil:
-            count = lav_sparse_order(n, &ptr[0], entries, room, s, &left[0], begin, order, size, nptr, nind, parent, lptr)
-        if count < 0:
-            raise OverflowError("the factor has 2^31 entries or more")
-        lind_ = np.empty(lptr[count] + 1, np.int32)
-        with nogil:
-            k = lav_sparse_pattern(count, nptr, nind, parent, size, lptr, &lind_[0], s, share, group, &below)
-        if below >= 2**31:
-            raise OverflowError("the factor has 2^31 rows of panels or more")
-        whole_array = np.empty(5 * n + 5 * k + 2 + below, np.int32)
+        if like is None:
+            whole_array, places, self.half = _analysed(indptr, indices)
+        elif like.f.n == n and like.indices.shape[0] == len(indices):
+            whole_array, places, self.half = like.keep[0].copy(), like.keep[1], like.half
+        else:
+            raise ValueError("panels of another matrix")
+        k = <int32_t>(len(places) // 2 - 1)
+        below = len(whole_array) - 5 * n - 5 * k - 2
         cdef int32_t[::1] whole = whole_array
-        cdef int32_t* order_ = &whole[0]
-        cdef int32_t* place = order_ + n
+        cdef int64_t[::1] places_ = places
+        cdef int32_t* order = &whole[0]
+        cdef int32_t* place = order + n
         cdef int32_t* of = place + n
         cdef int32_t* swap = of + n
         cdef int32_t* rel = swap + n
@@ -713,24 +733,27 @@ cdef class SparsePanels:
         cdef int32_t* link = head + k
         cdef int32_t* next_ = link + k
         cdef int32_t* rows = next_ + k                  # below
-        cdef int64_t* at
-        cdef int64_t* beside
-        places = np.empty(2 * k + 2, np.int64)
-        cdef int64_t[::1] places_ = places
-        at = &places_[0]
-        beside = at + k + 1
-        with nogil:
-            lav_sparse_rows(n, count, k, begin, order, size, lptr, &lind_[0], group, lu, s, order_, place, first, of,
-                            rptr, rows, at, beside, &most, &self.work)
-        held = beside[k] if lu else 0
-        self.entries = at[k] + held
-        numbers = np.empty(self.entries + most + 2 * n + 1)
-        self.keep = whole_array, places, np.asarray(numbers)
+        cdef int64_t* at = &places_[0]
+        cdef int64_t* beside = at + k + 1
+        self.work = 2.0 * self.half if lu else self.half
+        self.entries = at[k] + (beside[k] if lu else 0)
+        self.keep, self.numbers = (whole_array, places), None
         self.indptr, self.indices = indptr, indices
         self.f = sparse_t(
-            n, k, wide and has_wide(), lu, order_, place, first, of, rptr, rows, at, beside, &numbers[0],
-            &numbers[0] + at[k], &numbers[0] + self.entries, &numbers[0] + self.entries + most,
-            &numbers[0] + self.entries + most + n, swap, rel, head, link, next_)
+            n, k, wide and has_wide(), lu, order, place, first, of, rptr, rows, at, beside, NULL, NULL, NULL, NULL, NULL,
+            swap, rel, head, link, next_)
+
+    cdef _make_room(self):
+        # What is counted and never factored holds no numbers.
+        cdef int64_t most
+        cdef double[::1] numbers
+        lav_sparse_room(self.f.panels, self.f.first, self.f.of, self.f.rptr, self.f.rows, self.f.lu, &most)
+        numbers = self.numbers = np.empty(self.entries + most + 2 * self.f.n + 1)
+        self.f.val = &numbers[0]
+        self.f.up = self.f.val + self.f.at[self.f.panels]
+        self.f.temp = self.f.val + self.entries
+        self.f.scale = self.f.temp + most
+        self.f.y = self.f.scale + self.f.n
 
     def factor(self, const double[::1] data, const double[::1] d, double shift, double tiny):
         """Factor the matrix of these entries with shift D, d (n,) > 0; how many pivots are not above tiny d."""
@@ -742,6 +765,8 @@ cdef class SparsePanels:
             raise ValueError("entries of another matrix")
         if data.shape[0] == 0:
             return self.f.n
+        if self.numbers is None:
+            self._make_room()
         tptr, tind, tdata = np.empty(1, np.int32), np.empty(1, np.int32), np.empty(1)
         if self.f.lu:
             tptr = np.empty(self.f.n + 2, np.int32)
@@ -756,8 +781,8 @@ cdef class SparsePanels:
         """(n,) of the last factor; a new array."""
         out = np.empty(self.f.n)
         cdef double[::1] x = out
-        if b.shape[0] != self.f.n:
-            raise ValueError("of another size")
+        if b.shape[0] != self.f.n or self.numbers is None:
+            raise ValueError("of another size, or before a factor")
         with nogil:
             lav_sparse_solve(&self.f, &b[0], &x[0])
         return out

@@ -96,6 +96,9 @@ def test_factors_solve_and_lanes_do_not_show(seed, n, block, lu):
         assert f.factor(a.data, abs(d), 0.0, 1e-13) == 0
         found.append(f.solve(b))
     assert found[0].tobytes() == found[1].tobytes()
+    again = SparsePanels(*raw(a), lu, True, SparsePanels(*raw(a), not lu))
+    assert again.work == f.work and again.factor(a.data, abs(d), 0.0, 1e-13) == 0
+    assert again.solve(b).tobytes() == found[0].tobytes()
     s = 1.0 / np.sqrt(abs(d))
     error = s * (a @ found[0] - b)
     assert np.abs(error).max() <= 1e-9 * np.abs(s * b).max()
@@ -125,6 +128,10 @@ def test_shifts_parts_and_lost_pivots():
         f.factor(a.data[1:], d, 0.0, 0.0)
     with pytest.raises(ValueError, match="of another size"):
         f.solve(b[1:])
+    with pytest.raises(ValueError, match="before a factor"):
+        SparsePanels(*raw(a), False).solve(b)
+    with pytest.raises(ValueError, match="of another matrix"):
+        SparsePanels(np.zeros(2, np.int32), np.zeros(0, np.int32), False, True, f)
 
 
 def test_what_is_no_mirror_is_seen():
