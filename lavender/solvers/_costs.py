@@ -23,6 +23,7 @@ from lavender.solvers._counts import (
     admm_cost,
     dense_factor,
     few_direct,
+    filled,
     finite_least,
     formed_cost,
     general_count,
@@ -37,6 +38,7 @@ from lavender.solvers._factor import PanelsLU, choose, filled_cost, panels_cost
 from lavender.solvers._islands import block_bodies
 from lavender.solvers._newton.systems import (
     DENSE_FILL,
+    DENSE_ROWS,
     System,
     make_system,
 )
@@ -256,7 +258,7 @@ class Costs:
         m, nnz = float(p.m), float(len(p._compressed[1])) if p.generalized is None else float(p.m)
         share = nnz / (m * m)
         return self._newton(
-            min(rates.BAND * m * max(1.0, 0.5 * nnz / m) ** 2, sparse_factor(int(nnz), p.m), dense_factor(m))
+            min(rates.BAND * m * max(1.0, 0.5 * nnz / m) ** 2, filled(int(nnz), 0.0), dense_factor(m))
             if share < DENSE_FILL
             else dense_factor(m)
         )
@@ -291,7 +293,10 @@ class Costs:
     def _newton(self, factor: float) -> float:
         p = self.problem
         lu = rates.UNSYMMETRIC if p.law == "coulomb" or not p.is_symmetric else 1.0
-        return self._finite("newton", self._newton_count, lu * factor)
+        found = self._finite("newton", self._newton_count, lu * factor)
+        if p.matrix is None or p.law == "linear" or p.is_symmetric or p.m <= DENSE_ROWS:
+            return found
+        return found * rates.ASYMMETRIC if len(p._compressed[1]) <= DENSE_FILL * p.m**2 else found
 
     @property
     def _newton_count(self) -> float:

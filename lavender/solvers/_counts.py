@@ -147,6 +147,11 @@ def sparse_factor(nnz: int, m: int) -> float:
     return rates.SPARSE * nnz * (1.0 + m / rates.SPARSE_ROWS)
 
 
+def filled(entries: Any, work: float) -> Any:
+    """One factor of Newton's matrix over rows of A by panels [ns]: entries of its pattern, multiply-adds of L L^T."""
+    return rates.FILLED + rates.FILLED_ENTRY * entries + rates.FILLED_WORK * work
+
+
 def newton_factor(system: System) -> float:
     """One symmetric factor of Newton's matrix [ns]."""
     if not isinstance(system, MatrixSystem):
@@ -155,7 +160,7 @@ def newton_factor(system: System) -> float:
         return float(dense_factor(system.sc.m))
     if system.band is not None and system.sc.problem.law != "coulomb":
         return rates.BAND * system.sc.m * float(system.band.h.shape[1]) ** 2
-    return sparse_factor(system.h.nnz, system.sc.m)
+    return float(filled(len(system.sparse.indices), system.sparse.work))
 
 
 def admm_cost(problem: Problem, m: Any, entries: Any, count: float) -> tuple[Any, Any, Any]:
@@ -178,10 +183,7 @@ def islands_cost(problem: Problem, sizes: Any) -> float:
     m = np.asarray(sizes, float)
     count = rates.NEWTON[problem.law] + np.minimum(rates.MOST, rates.PER_ROW[problem.law] * m)
     start, step, row = newton_rates(problem)
-    factor = np.minimum(
-        dense_factor(m),
-        rates.SPARSE * problem.metric.work / max(problem.m, 1) * m * (1.0 + m / rates.SPARSE_ROWS),
-    )
+    factor = np.minimum(dense_factor(m), filled(problem.metric.work / max(problem.m, 1) * m, 0.0))
     each = start + count * (step + row * m + rates.UNSYMMETRIC * factor)
     if problem.law in ("cone", "coulomb"):
         entries = sweep_work(problem) / max(problem.m, 1) * m

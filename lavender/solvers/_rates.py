@@ -27,6 +27,9 @@ FEW_PIVOT = 2e3  # of `lemke`, of whose time a call is most there
 BLOCK, PANEL = 0.35, 0.2  # of one over bodies, by block rows and by panels
 SPARSE = 100.0  # for each nonzero of a sparse factor's matrix,
 SPARSE_ROWS = 1000.0  # as many times more as it has thousands of rows: fill grows with the size
+# Of `newton` over rows of A by panels, whose analysis is kept: a factor with its solutions, for each entry of its
+# pattern, and each multiply-add.
+FILLED, FILLED_ENTRY, FILLED_WORK = 50e3, 6.0, 0.12
 PIVOT, PIVOT_ENTRY = 60e3, 0.5  # of each pivot of lemke, and for each entry of its tableau
 # Newton over generalised velocities: a call, for each row beside each factor, and each multiply-add of the dense
 # factor of an island, most of whose entries are nought unless every contact is inside its cone.
@@ -88,6 +91,9 @@ ADMM_COUNT, ADMM_FACTORS = 80.0, 2.0  # iterations to six decades where it gets 
 ADMM_LUCK_BODIES, ADMM_LUCK = 0.15, 0.4
 ADMM_FILL = 6.0  # entries of L for each of A
 DIRECT_ROUNDS = 40  # of `direct` on bounded rows that are granted before another is asked
+ASYMMETRIC = (
+    3.0  # times what `newton` costs on an asymmetric A with few entries: it often takes many times as many
+)
 AT_REST = 8.0  # of faces on faces, most of whose rows hold
 UNSYMMETRIC = 2.0  # LU against Cholesky, where friction or A asks for it
 SINGULAR = 6.0  # times as many of `direct` where A is singular and one shift does not end it,

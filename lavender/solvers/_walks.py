@@ -17,12 +17,12 @@ from lavender.problem import Problem
 from lavender.registry import FEW
 from lavender.solution import Claim, Status
 from lavender.solvers import _rates as rates
-from lavender.solvers._counts import dense_factor, newton_factor
+from lavender.solvers._counts import dense_factor, filled, newton_factor
 from lavender.solvers._newton.desaxce import apart
 from lavender.solvers._newton.proximal import Proximal
 from lavender.solvers._newton.run import Run
 from lavender.solvers._newton.sweeping import METHODS, STEPS, WEIGHT
-from lavender.solvers._newton.systems import AUGMENTED, DENSE_FILL, DENSE_ROWS, MatrixSystem, System
+from lavender.solvers._newton.systems import AUGMENTED, DENSE_FILL, DENSE_ROWS, System
 from lavender.solvers._sweepers import SWEEPER, Glance, Sweeps
 from lavender.solvers._trail import Trail
 
@@ -33,8 +33,6 @@ EARLY, GAIN = 3, 0.95  # of which so many have to leave that share of the residu
 READY = 0.25  # of a walk's cost, that sweeps have to have cost where they give way to another solver
 OTHER: dict[str, Any] = {"name": "nncg", "order": "symmetric", "restart": "against"}
 OWN = sum(least for _, _, _, least in METHODS)  # sweeps that Newton's method begins with itself
-SPARSE_STEP, SPARSE_FILL = 500e3, 45.0  # ns of a step with a sparse factor, and for each entry of that,
-FILL = 2.0  # of which there are so many for each of A, as long as none was made
 MOST = 40_000  # rows from which friction is left to sweeps
 
 
@@ -116,9 +114,7 @@ class _Walk(Run):
 
 
 def walk_step(system: System) -> float:
-    """One step of a walk [ns]; with a sparse factor by its fill."""
-    if isinstance(system, MatrixSystem) and not system.dense:
-        return SPARSE_STEP + SPARSE_FILL * (system.fill or FILL * system.h.nnz)
+    """One step of a walk [ns]."""
     return (
         rates.STEP["newton"]
         + rates.NEWTON_ROW["coulomb"] * system.sc.m
@@ -134,7 +130,7 @@ def least_step(problem: Problem) -> float:
         nnz = len(problem._compressed[1])
         if nnz > DENSE_FILL * m * m:
             return found + rates.UNSYMMETRIC * float(dense_factor(m))
-        return SPARSE_STEP + SPARSE_FILL * FILL * nnz
+        return found + rates.UNSYMMETRIC * filled(nnz, 0.0)
     return found
 
 

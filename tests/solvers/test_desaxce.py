@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from random_problems import as_matrix, random_contact_problem, seeds
 
 import lavender as lv
 from lavender import suite
+from lavender.solvers._newton import systems
 from lavender.solvers._newton.augmented import AugmentedSystem
 from lavender.solvers._newton.desaxce import DeSaxce, _Slip
 from lavender.solvers._newton.sweeping import Sweeping
@@ -69,12 +71,13 @@ def test_slip_is_de_saxces_term_and_psi_its_derivative(seed):
 
 
 @pytest.mark.parametrize("compliant", [True, False])
-@pytest.mark.parametrize("form", ["velocity", "impulse", "augmented"])
+@pytest.mark.parametrize("form", ["velocity", "impulse", "sparse", "augmented"])
 @given(seed=seeds)
 @settings(max_examples=15)
 def test_the_system_of_a_step_is_solved(form, compliant, seed):
     problem = problem_of(seed, compliant)
-    system = make_system(problem, "impulse" if form == "impulse" else "velocity")
+    with mock.patch.multiple(systems, DENSE_ROWS=0 if form == "sparse" else 150, DENSE_FILL=2.0):
+        system = make_system(problem, "velocity" if form in ("velocity", "augmented") else "impulse")
     if form == "augmented":
         system = AugmentedSystem(system)
     sc = system.sc

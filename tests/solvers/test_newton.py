@@ -1,17 +1,19 @@
 """newton: its linear algebra against dense NumPy, its answers against enumeration and closed forms."""
 
 from dataclasses import replace
+from time import process_time
 from unittest import mock
 
 import numpy as np
 import pytest
+import scipy.sparse as sp
 from enumeration import enumerate_lcp
 from hypothesis import given, settings
 from random_problems import as_matrix, random_contact_problem, random_lcp, seeds
 
 import lavender as lv
 from lavender import suite
-from lavender.solvers._newton import pattern, systems
+from lavender.solvers._newton import pattern, sparse, systems
 from lavender.solvers._newton import scaled as scaling
 from lavender.solvers._newton.exchange import STILL, exchange
 from lavender.solvers._newton.interior_point import InteriorPoint
@@ -19,6 +21,7 @@ from lavender.solvers._newton.row_steps import refined
 from lavender.solvers._newton.run import Run
 from lavender.solvers._newton.systems import AUGMENTED, CONVEX, make_system
 from lavender_ext.factor import symbolic
+from lavender_ext.factor.sparse import SparsePanels
 from lavender_ext.newton.elements import Elements
 from lavender_ext.newton.normal_matrix import Factor
 
@@ -65,7 +68,12 @@ def test_usual_problems_are_scaled_as_any_other(problem, monkeypatch):
 
 
 def system_in(problem, form):
-    """The system of a problem; "band" is the impulse form factored as a band whatever it costs."""
+    """The system of a problem; "band", "sparse": the impulse form factored so whatever it costs."""
+    if form == "sparse":
+        with mock.patch.multiple(systems, DENSE_ROWS=0, DENSE_FILL=2.0, BAND_SHARE=-1.0):
+            system = make_system(problem, "impulse")
+        assert system.band is None and not system.dense
+        return system
     if form != "band":
         return make_system(problem, form)
     with mock.patch.multiple(systems, BAND_ROWS=0, BAND_SHARE=4.0, BAND_FILL=np.inf):
@@ -86,7 +94,7 @@ def test_velocity_form_is_h_without_forming_it(seed):
 
 
 @pytest.mark.parametrize("law", [CONVEX, AUGMENTED])
-@pytest.mark.parametrize("form", ["velocity", "impulse", "band"])
+@pytest.mark.parametrize("form", ["velocity", "impulse", "band", "sparse"])
 @given(seed=seeds)
 @settings(max_examples=20)
 def test_newton_system_is_the_derivative_and_is_solved(form, law, seed):
@@ -122,7 +130,7 @@ def test_newton_system_is_the_derivative_and_is_solved(form, law, seed):
     np.testing.assert_allclose(matrix @ x, r, rtol=0, atol=1e-9 * (1.0 + np.abs(x).max()))
 
 
-@pytest.mark.parametrize("form", ["velocity", "impulse", "band"])
+@pytest.mark.parametrize("form", ["velocity", "impulse", "band", "sparse"])
 @given(seed=seeds)
 @settings(max_examples=20)
 def test_interior_point_system_is_solved_and_its_steps_stay_inside(form, seed):
@@ -560,6 +568,95 @@ def test_budget_and_floor_are_what_they_say():
     floor = lv.solve(problem, "newton", tol=1e-16)
     assert floor.status is lv.Status.FLOOR
     assert not floor.contradicted
+
+
+def sparse_rows(seed, m=500, even=True, near=3):
+    """Bounded rows of a matrix with few entries, some of them in one row alone where it is not even."""
+    rng = np.random.default_rng(seed)
+    i, j = np.arange(m).repeat(near), rng.integers(0, m, near * m)
+    x, y = rng.normal(size=(2, near * m))
+    if even:
+        a = sp.coo_array((np.r_[x, x], (np.r_[i, j], np.r_[j, i])), shape=(m, m))
+    else:
+        kept = rng.random(near * m) < 0.5
+        a = sp.coo_array((np.r_[x, y[kept]], (np.r_[i, j[kept]], np.r_[j, i[kept]])), shape=(m, m))
+    a = sp.csr_array(a)
+    a = sp.csr_array(a + sp.diags_array(np.abs(a).sum(axis=1) + 0.1))
+    return lv.Problem.lcp(a, rng.normal(size=m), upper=np.where(rng.random(m) < 0.5, 0.05, np.inf))
+
+
+@pytest.mark.parametrize("even", [True, False])
+@given(seed=seeds)
+@settings(max_examples=5)
+def test_free_rows_of_few_entries_are_solved_with_all_the_others_and_by_themselves(even, seed):
+    problem = sparse_rows(seed, 200, even)
+    system = system_in(problem, "sparse")
+    h, rng, eps = dense_h(problem), np.random.default_rng(seed), 1e-6
+    for apart in (0.0, np.inf):
+        free = rng.random(200) < 0.6
+        r = rng.normal(size=200)
+        system.free, system.p[:] = None, free
+        with mock.patch.object(sparse, "panels_cost", lambda *_, apart=apart: apart):
+            assert system.factor_natural(eps)
+            made = system.sparse.free(np.flatnonzero(free).astype(np.int32), eps, not even)
+        assert len(made.diagonal) == (200 if apart else np.count_nonzero(free))
+        expected = np.linalg.solve(np.where(free[:, None], h, 0.0) + np.diag(np.where(free, eps, 1.0)), r)
+        np.testing.assert_allclose(
+            system.solve_natural(r), expected, rtol=0, atol=1e-11 * np.abs(expected).max()
+        )
+
+
+@pytest.mark.parametrize("even", [True, False])
+def test_one_analysis_serves_all_factors_of_few_entries(even, monkeypatch):
+    made = []
+
+    class Counted(SparsePanels):
+        def __init__(self, *args):
+            made.append(args[4] if len(args) > 4 else None)
+            super().__init__(*args)
+
+    monkeypatch.setattr(sparse, "SparsePanels", Counted)
+    problem = sparse_rows(1, even=even)
+    cones = lv.Cones.contacts(np.full(166, 0.5), 2) + lv.Cones.bounded(np.zeros(2), np.full(2, np.inf))
+    problem = lv.Problem(problem.b, cones, problem.csr, friction="cone")
+    solution = lv.solve(problem, "newton", tol=1e-8)
+    assert solution.success and solution.work["factorisations"] > 5
+    assert sum(like is None for like in made) == 1
+
+
+def test_where_panels_lose_a_pivot_or_digits_superlu_takes_over(monkeypatch):
+    problem = sparse_rows(2)
+    expected = lv.solve(problem, "newton", tol=1e-10)
+    assert expected.success
+    for name, worse in (("factor", lambda *_: False), ("solve", lambda *_: None)):
+        with monkeypatch.context() as patch:
+            patch.setattr(sparse.Panelled, name, worse)
+            solution = lv.solve(problem, "newton", tol=1e-10)
+        assert solution.success
+        np.testing.assert_allclose(solution.impulse, expected.impulse, rtol=0, atol=1e-8)
+
+
+def test_pivots_inside_panels_are_refined_or_given_up():
+    """[[e, 1], [1, e]] of two panels has no stable LU without an exchange between them."""
+    problem = sparse_rows(3, even=False)
+    system = system_in(problem, "sparse")
+    made = system.sparse.barrier(np.zeros(500), True)
+    assert made.factor()
+    r = np.random.default_rng(0).normal(size=500)
+    x = made.solve(r)
+    np.testing.assert_allclose(dense_h(problem) @ x, r, rtol=0, atol=1e-11)
+    made.values[made.diagonal] = 1e-12
+    assert not made.factor() or made.solve(r) is None
+
+
+def test_a_factor_that_fills_is_not_begun_where_time_is_short():
+    """Its work is counted first: a graph without short separators."""
+    problem = sparse_rows(4, 8000, near=6)
+    assert system_in(problem, "sparse").sparse.work > 1e10
+    start = process_time()
+    solution = lv.solve(problem, "newton", tol=1e-12, time_limit=0.3)
+    assert solution.status is lv.Status.TIME_LIMIT and solution.work.get("factorisations", 0) == 0
+    assert process_time() - start < 1.5  # a factor takes several seconds
 
 
 def test_time_limit_is_kept():

@@ -88,9 +88,7 @@ class Run:
                 self.more = None
                 return True
             self.budget += more
-        return (
-            self.deadline < np.inf and perf_counter() + self.system.pace * self.system.cost >= self.deadline
-        )
+        return self.deadline < np.inf and perf_counter() + self.system.seconds >= self.deadline
 
     def gives_way(self) -> bool:
         """Before factors dearer than those counted on: a turn of others, where there are any; whether it is the end."""

@@ -16,11 +16,11 @@ from lavender._arrays import FloatArray
 from lavender.registry import get
 from lavender.solution import Status
 from lavender.solvers import _rates as rates
-from lavender.solvers._counts import sweep_cost
+from lavender.solvers._counts import newton_factor, sweep_cost
 from lavender.solvers._newton.desaxce import apart
 from lavender.solvers._newton.proximal import Proximal
 from lavender.solvers._newton.run import Run
-from lavender.solvers._newton.systems import AUGMENTED, PANELS, MatrixSystem, System
+from lavender.solvers._newton.systems import AUGMENTED, MatrixSystem, System
 
 __all__ = ["Sweeping", "step_cost"]
 
@@ -106,12 +106,6 @@ class Sweeping:
 
 def step_cost(system: System) -> float:
     """One step of Newton's method [ns], by the rates of `_rates.py`."""
-    if isinstance(system, MatrixSystem):
-        rate = rates.DENSE if system.dense else 1.0
-    else:
-        rate = rates.BLOCK if system.cost < PANELS else rates.PANEL
-    return (
-        rates.STEP["newton"]
-        + rates.NEWTON_ROW["coulomb"] * system.sc.m
-        + rates.UNSYMMETRIC * rate * system.cost
-    )
+    dense = isinstance(system, MatrixSystem) and system.dense
+    factor = rates.DENSE * system.cost if dense else newton_factor(system)
+    return rates.STEP["newton"] + rates.NEWTON_ROW["coulomb"] * system.sc.m + rates.UNSYMMETRIC * factor

@@ -1,7 +1,7 @@
 """H of the scaled problem and its Newton systems, in two forms.
 
 `VelocitySystem` never forms H (K K^T + theta with one small dense block for each body, factored in compiled
-code), `MatrixSystem` holds it (dense LAPACK, LAPACK's band where one is narrow, else sparse LU). The
+code), `MatrixSystem` holds it (dense LAPACK, LAPACK's band where one is narrow, else by sparse panels). The
 equations are in `lavender_ext/newton/`.
 """
 
@@ -28,6 +28,7 @@ from lavender.problem import Problem
 from lavender.solvers._newton.pattern import block_pattern, dissected, postordered
 from lavender.solvers._newton.row_steps import RowSteps
 from lavender.solvers._newton.scaled import Scaled, scaled
+from lavender.solvers._newton.sparse import Coupled, Panelled
 from lavender_ext.factor import symbolic
 from lavender_ext.newton.band import (
     band_free,
@@ -49,12 +50,12 @@ from lavender_ext.newton.normal_matrix import Factor
 from lavender_ext.newton.panel import narrow, scaled_jacobian
 
 CONVEX, COULOMB, AUGMENTED = MAP_CONVEX, MAP_COULOMB, MAP_AUGMENTED
-DENSE_ROWS = 400  # below: dense LAPACK beats sparse bookkeeping
-DENSE_FILL = 0.1  # nonzero share of A above which a sparse factor is full anyway
+DENSE_ROWS = 150  # below: dense LAPACK beats sparse bookkeeping
+DENSE_FILL = 0.25  # nonzero share of A above which a sparse factor is full anyway
 DENSE_LIMIT = 6000  # rows; 288 MB of A
 BAND_ROWS = 100  # below: dense LAPACK
 BAND_SHARE = 0.25  # of rows that the half bandwidth may have
-BAND_FILL = 1000.0  # multiply-adds for each nonzero of A up to which LAPACK's band beats SuperLU
+BAND_FILL = 1000.0  # multiply-adds for each nonzero of A up to which LAPACK's band is made
 # Weight of the proximal term in an interior point system, relative to d: far below any step that
 # matters, far above the rounding of a pivot.
 DELTA = 1e-10
@@ -99,6 +100,11 @@ class System:
         """The pace of a factor that was begun at `start` (of `perf_counter`): the next one is refused by it."""
         if self.cost > 0.0:
             self.pace = (perf_counter() - start) / self.cost
+
+    @property
+    def seconds(self) -> float:
+        """What the next factor takes, at that pace."""
+        return self.pace * self.cost
 
     def interior(self, u1: FloatArray, u2: FloatArray, delta: float) -> Any:
         """Interior point steps in compiled code on the duals u1, u2 (m,), or None where there are none."""
@@ -330,8 +336,13 @@ def _band(sc: Scaled, a: Any) -> _Band | None:
     return _Band(h, order, place, elements, np.empty_like(h))
 
 
+def _nothing(r: FloatArray) -> FloatArray:
+    """The solution of a singular system."""
+    return np.full_like(r, np.nan)
+
+
 class MatrixSystem(System):
-    """H as a matrix: dense LAPACK, or sparse LU."""
+    """H as a matrix: dense LAPACK, its band, or sparse panels."""
 
     form = "impulse"
 
@@ -376,17 +387,18 @@ class MatrixSystem(System):
         return None if len(self.sc.kind) < self.sc.m else RowSteps(self, CONVEX)
 
     @cached_property
-    def places(self) -> tuple[IntArray, IntArray]:
-        """Rows and columns of the elements' small matrices, row by row of each."""
-        sc, size = self.sc, np.diff(self.sc.ptr)
-        nr = np.repeat(size, size**2)
-        inner = np.arange(int(sc.wptr[-1])) - np.repeat(sc.wptr[:-1], size**2)
-        base = np.repeat(sc.ptr[:-1], size**2)
-        return base + inner // nr, base + inner % nr
+    def sparse(self) -> Coupled:
+        """The pattern of its factors, where there is no band and few entries."""
+        sc = self.sc
+        a = sc.problem.csr
+        return Coupled(sc, a if sc.whole else a[sc.keep][:, sc.keep], self.elements)
 
-    def small(self, values: FloatArray) -> sp.csr_array:
-        m = self.sc.m
-        return sp.csr_array((values, self.places), shape=(m, m))
+    @property
+    def seconds(self) -> float:
+        """As of all systems; fill is counted before the first number."""
+        if not self.dense and self.band is None:
+            self.cost = self.sparse.work if self.symmetric else 2.0 * self.sparse.work
+        return self.pace * self.cost
 
     def times(self, z: FloatArray) -> FloatArray:
         return self.h @ z
@@ -405,20 +417,44 @@ class MatrixSystem(System):
         element_product(self.elements, w, h, eps, own, one, out)
         return out
 
-    def _sparse_lu(self, matrix: Any) -> bool:
-        self.factorisations += 1
-        self.solver = lambda r: np.full_like(r, np.nan)
-        if not np.isfinite(matrix.data).all():
+    def _by_panels(self, made: Panelled) -> bool:
+        """SuperLU where a pivot is lost, and where a solution is not exact."""
+        self.solver = _nothing
+        if not np.isfinite(made.values).all():
+            self.factorisations += 1
             return False
         start = perf_counter()
-        try:
-            factor = sparse_lu(matrix, permc_spec="COLAMD")
-        except RuntimeError:
-            return False
+        done = made.factor()
+        self.cost = made.panels.work
         self.took(start)
-        self.fill = factor.nnz
-        self.solver = factor.solve
+        if not done:
+            self.solver = self._superlu(made)
+            return self.solver is not _nothing
+        self.factorisations += 1
+        instead: Any = None
+
+        def solve(r: FloatArray) -> FloatArray:
+            nonlocal instead
+            if instead is None:
+                x = made.solve(r)
+                if x is not None:
+                    return x
+                instead = self._superlu(made)
+            found: FloatArray = instead(r)
+            return found
+
+        self.solver = solve
         return True
+
+    def _superlu(self, made: Panelled) -> Any:
+        self.factorisations += 1
+        start = perf_counter()
+        try:
+            factor = sparse_lu(made.matrix(), permc_spec="COLAMD")
+        except RuntimeError:
+            return _nothing
+        self.took(start)
+        return factor.solve
 
     def factor_barrier(self) -> bool:
         # H + V^-1, or with cones I + B^T H B and dz = B (...): V^-1 would lose the small eigenvalues of V.
@@ -428,7 +464,7 @@ class MatrixSystem(System):
             with np.errstate(divide="ignore", over="ignore"):
                 w = 1.0 / self.v  # inf for a row that no longer moves, and the step fails
             if not self.dense:
-                return self._sparse_lu(self.h + sp.diags_array(w))
+                return self._by_panels(self.sparse.barrier(w, not self.symmetric))
             matrix = self.h.copy()
             matrix.flat[:: len(matrix) + 1] += w
             if self.symmetric and self._cholesky(matrix):
@@ -438,8 +474,7 @@ class MatrixSystem(System):
                 matrix.flat[:: len(matrix) + 1] += w
             return self._dense_lu(matrix)
         if not self.dense:
-            bt = self.small(self.bt)
-            return self._sparse_lu(bt @ self.h @ bt.T + sp.eye_array(self.sc.m))
+            return self._by_panels(self.sparse.small(self.bt, self.bt, 0.0, not self.symmetric))
         left = np.ascontiguousarray(self._product(self.bt, self.h, 0.0, 0.0, 0.0).T)
         matrix = self._product(self.bt, left, 0.0, 0.0, 1.0)
         if self.symmetric and self._cholesky(matrix.copy()):
@@ -488,7 +523,7 @@ class MatrixSystem(System):
         if self.dense:
             product = np.ascontiguousarray(self._product(left, self.h, 0.0, 0.0, 0.0).T)
             return self._dense_lu(np.ascontiguousarray(self._product(right, product, 0.0, 0.0, 1.0).T))
-        return self._sparse_lu(self.small(left) @ self.h @ self.small(right).T + sp.eye_array(self.sc.m))
+        return self._by_panels(self.sparse.small(left, right, 0.0, True))
 
     def solve_pair(self, r: FloatArray) -> FloatArray:
         left, right = self.pair
@@ -508,13 +543,12 @@ class MatrixSystem(System):
             return self._factor_free(eps)
         if self.dense:
             return self._dense_lu(self._product(self.p, self.h, eps, 1.0, 1.0))
-        p = self.small(self.p)
-        return self._sparse_lu(p @ self.h + (eps - 1.0) * p + sp.eye_array(self.sc.m))
+        return self._by_panels(self.sparse.small(self.p, None, eps - 1.0, True))
 
     def _factor_free(self, eps: float) -> bool:
         """H_FF + eps of bounded rows, the rows that the last `natural` found inside their bounds."""
         self.free = self.p
-        free = np.flatnonzero(self.p)
+        free = np.flatnonzero(self.p).astype(np.int32)
         if len(free) == 0:
             self.solver = np.copy
             return True
@@ -523,7 +557,10 @@ class MatrixSystem(System):
             matrix.flat[:: len(free) + 1] += eps
             done = (self.symmetric and self._cholesky(matrix.copy())) or self._dense_lu(matrix)
         else:
-            done = self._sparse_lu(self.h[free][:, free] + eps * sp.eye_array(len(free)))
+            made = self.sparse.free(free, eps, not self.symmetric)
+            done = self._by_panels(made)
+            if len(made.diagonal) == self.sc.m:
+                return done
         inside = self.solver
 
         def solve(r: FloatArray) -> FloatArray:

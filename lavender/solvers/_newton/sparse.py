@@ -1,0 +1,143 @@
+"""Newton's matrices of an A with few entries: one pattern, whose analysis all factors by panels share.
+
+    M = L H R^T + o L + I,   of bounded rows H + W, and H + eps where they are free with I elsewhere
+
+L L^T where M is symmetric; else L U that exchanges rows inside a panel alone. What pivoting across panels would have
+saved shows in what a solution x leaves of its right-hand side r, and is refined away once: it is as exact as
+
+    max |r - M x| <= BACKWARD (max |M_ij| max |x| + max |r|)                                            (1)
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sp
+
+from lavender._arrays import FloatArray, IntArray
+from lavender.solvers._factor import PANELS_WORK, TINY, WIDE, panels_cost
+from lavender.solvers._newton.scaled import Scaled
+from lavender_ext.factor.sparse import SparsePanels, free_part, is_mirrored
+from lavender_ext.newton.band import element_graph, scaled_entries
+from lavender_ext.newton.coupled import coupled, coupled_entries, coupled_rows
+from lavender_ext.newton.elements import Elements
+
+__all__ = ["Coupled", "Panelled"]
+
+BACKWARD = 1e-12  # (1): thousands of roundings
+
+
+@dataclass
+class Panelled:
+    """M in compressed rows, and the panels that factor it."""
+
+    panels: SparsePanels
+    lu: bool
+    rows: sp.csr_array  # shared with the others of its pattern
+    values: FloatArray
+    diagonal: IntArray  # (n,) where its entries are
+
+    def factor(self) -> bool:
+        """Whether no pivot is lost."""
+        d = np.ones(len(self.diagonal)) if self.lu else self.values[self.diagonal]
+        self.size = float(np.abs(self.values).max()) if self.lu else 0.0
+        self.rows.data = self.values
+        return bool((d > 0.0).all()) and self.panels.factor(self.values, d, 0.0, TINY) == 0
+
+    def solve(self, r: FloatArray) -> FloatArray | None:
+        """M^-1 r with the last factor, None where that is not (1)."""
+        x: FloatArray = self.panels.solve(r)
+        if not self.lu:
+            return x
+        most = float(np.abs(r).max())
+        for _ in range(2):
+            left = r - self.rows @ x
+            if float(np.abs(left).max()) <= BACKWARD * (self.size * float(np.abs(x).max()) + most):
+                return x
+            x = x + self.panels.solve(left)
+        return None
+
+    def matrix(self) -> sp.csr_array:
+        """Without entries that are nought."""
+        found = sp.csr_array((self.values, self.rows.indices, self.rows.indptr), copy=True)
+        found.eliminate_zeros()
+        return found
+
+
+class Coupled:
+    """H on the pattern of its elements, and what Newton's method makes of it."""
+
+    def __init__(self, sc: Scaled, a: sp.csr_array, elements: Elements) -> None:
+        n, m = len(sc.kind), sc.m
+        self.elements = elements
+        of = np.repeat(np.arange(n, dtype=np.int32), np.diff(sc.ptr))
+        to, other = element_graph(sc.ptr, of, a.indptr, a.indices)
+        graph = sp.csr_array((np.ones(len(other), bool), other, to), shape=(n, n))
+        graph.sort_indices()
+        if not (is_mirrored(graph.indptr, graph.indices) and graph.diagonal().all()):
+            graph = sp.csr_array(graph + graph.T + sp.eye_array(n, dtype=bool))
+            graph.sort_indices()
+        self.to, self.other = graph.indptr.astype(np.int32), graph.indices.astype(np.int32)
+        self.indptr, self.indices = coupled_rows(sc.ptr, self.to, self.other)
+        values = scaled_entries(a.indptr, a.indices, a.data, sc.scale)
+        self.h: FloatArray = coupled_entries(a.indptr, a.indices, values, self.indptr, self.indices)
+        self.diagonal = _diagonal(self.indptr, self.indices)
+        self.panels: dict[bool, SparsePanels] = {}
+        self.rows = sp.csr_array((self.h, self.indices, self.indptr))
+        self.part: tuple[bytes, SparsePanels] | None = None  # of the rows that were free last
+        self.m = m
+
+    def analysed(self, lu: bool) -> SparsePanels:
+        """The panels of all rows; no number is looked at."""
+        found = self.panels.get(lu)
+        if found is None:
+            found = SparsePanels(self.indptr, self.indices, lu, WIDE, self.panels.get(not lu))
+            self.panels[lu] = found
+        return found
+
+    @property
+    def work(self) -> float:
+        """Multiply-adds of L L^T, inf where it has more entries than can be counted."""
+        try:
+            return float(self.analysed(False).work)
+        except OverflowError:
+            return np.inf
+
+    def _whole(self, values: FloatArray, lu: bool) -> Panelled:
+        return Panelled(self.analysed(lu), lu, self.rows, values, self.diagonal)
+
+    def barrier(self, w: FloatArray, lu: bool) -> Panelled:
+        """H + W of bounded rows."""
+        values = self.h.copy()
+        values[self.diagonal] += w
+        return self._whole(values, lu)
+
+    def small(self, left: FloatArray, right: FloatArray | None, own: float, lu: bool) -> Panelled:
+        """L H R^T + own L + I of small matrices for each element; None is I."""
+        values = np.empty_like(self.h)
+        coupled(self.elements, self.to, self.other, self.indptr, self.h, left, right, own, values)
+        return self._whole(values, lu)
+
+    def free(self, rows: IntArray, eps: float, lu: bool) -> Panelled:
+        """H + eps of the free ones of bounded rows, or of all of them with I elsewhere where that costs less."""
+        n = len(rows)
+        entries = len(self.indices) * (n / self.m) ** 2
+        if PANELS_WORK * self.analysed(lu).work <= panels_cost(int(entries), n):
+            p = np.zeros(self.m)
+            p[rows] = 1.0
+            return self.small(p, p, eps - 1.0, lu)
+        place = np.full(self.m, -1, np.int32)
+        place[rows] = np.arange(n, dtype=np.int32)
+        indptr, indices, values = free_part(self.indptr, self.indices, self.h, place, n)
+        key = place.tobytes()
+        if self.part is None or self.part[0] != key:
+            self.part = key, SparsePanels(indptr, indices, lu, WIDE)
+        diagonal = _diagonal(indptr, indices)
+        values[diagonal] += eps
+        return Panelled(self.part[1], lu, sp.csr_array((values, indices, indptr)), values, diagonal)
+
+
+def _diagonal(indptr: IntArray, indices: IntArray) -> IntArray:
+    row = np.repeat(np.arange(len(indptr) - 1, dtype=np.int32), np.diff(indptr))
+    return np.flatnonzero(row == indices).astype(np.int32)

@@ -1,0 +1,131 @@
+"""H in compressed rows of whole elements, and the matrices of Newton's method on that one pattern.
+
+    M = L H R^T + o L + I         L, R one small matrix for each element, or nothing for the identity             (1)
+
+Rows of an element share their columns, which are those of all elements that H couples it with, either way.
+"""
+from libc.stdint cimport int32_t
+
+import numpy as np
+
+from lavender_ext.newton.elements cimport Elements, elements_t
+
+
+cdef public void lav_coupled_rows(int32_t n, const int32_t* ptr, const int32_t* to, const int32_t* other,
+                                  int32_t* indptr, int32_t* indices) noexcept nogil:
+    """Compressed rows of the graph (to, other) of n elements, each with itself, ascending; indices NULL: indptr alone."""
+    cdef int32_t i, j, q, r, width, at
+    indptr[0] = 0
+    for i in range(n):
+        width = 0
+        for q in range(to[i], to[i + 1]):
+            width += ptr[other[q] + 1] - ptr[other[q]]
+        for r in range(ptr[i], ptr[i + 1]):
+            at = indptr[r]
+            indptr[r + 1] = at + width
+            if indices != NULL:
+                for q in range(to[i], to[i + 1]):
+                    for j in range(ptr[other[q]], ptr[other[q] + 1]):
+                        indices[at] = j
+                        at += 1
+
+
+cdef public void lav_coupled_entries(int32_t m, const int32_t* aptr, const int32_t* aind, const double* a,
+                                     const int32_t* indptr, const int32_t* indices, double* out) noexcept nogil:
+    """A, whose columns ascend, on a pattern of its rows that holds its own."""
+    cdef int32_t i, p, q
+    for i in range(m):
+        q = aptr[i]
+        for p in range(indptr[i], indptr[i + 1]):
+            out[p] = 0.0
+            if q < aptr[i + 1] and aind[q] == indices[p]:
+                out[p] = a[q]
+                q += 1
+
+
+cdef inline void coupled_block(const double* h, double* out, int32_t ld, const double* left, const double* right,
+                               double own, bint diagonal, const int32_t ni, const int32_t nj) noexcept nogil:
+    # (1) of one pair of elements; rows of both are ld apart
+    cdef int32_t k, l, t
+    cdef double x
+    cdef double half[16]
+    for k in range(ni):
+        for l in range(nj):
+            x = h[k * ld + l]
+            if left != NULL:
+                x = 0.0
+                for t in range(ni):
+                    x += left[k * ni + t] * h[t * ld + l]
+            half[k * nj + l] = x
+    for k in range(ni):
+        for l in range(nj):
+            x = half[k * nj + l]
+            if right != NULL:
+                x = 0.0
+                for t in range(nj):
+                    x += half[k * nj + t] * right[l * nj + t]
+            if diagonal:
+                x += own * left[k * ni + l]
+                if k == l:
+                    x += 1.0
+            out[k * ld + l] = x
+
+
+cdef public void lav_coupled(const elements_t* e, const int32_t* to, const int32_t* other, const int32_t* indptr,
+                             const double* h, const double* left, const double* right, double own,
+                             double* out) noexcept nogil:
+    """(1); right may be NULL."""
+    cdef int32_t i, j, q, ni, nj, at, ld
+    cdef const double* r = NULL
+    for i in range(e.n):
+        ni = e.ptr[i + 1] - e.ptr[i]
+        at = indptr[e.ptr[i]]
+        ld = indptr[e.ptr[i] + 1] - at
+        for q in range(to[i], to[i + 1]):
+            j = other[q]
+            nj = e.ptr[j + 1] - e.ptr[j]
+            if right != NULL:
+                r = right + e.wptr[j]
+            if ni == 3 and nj == 3:
+                coupled_block(h + at, out + at, ld, left + e.wptr[i], r, own, i == j, 3, 3)
+            elif ni == 1 and nj == 1:
+                coupled_block(h + at, out + at, ld, left + e.wptr[i], r, own, i == j, 1, 1)
+            else:
+                coupled_block(h + at, out + at, ld, left + e.wptr[i], r, own, i == j, ni, nj)
+            at += nj
+
+
+def coupled_rows(const int32_t[::1] ptr, const int32_t[::1] to, const int32_t[::1] other):
+    """(indptr, indices) of the rows of the graph of elements; n > 0."""
+    cdef int32_t n = <int32_t>ptr.shape[0] - 1
+    indptr_array = np.empty(ptr[n] + 1, np.int32)
+    cdef int32_t[::1] indptr = indptr_array, indices
+    lav_coupled_rows(n, &ptr[0], &to[0], &other[0], &indptr[0], NULL)
+    indices_array = np.empty(indptr[ptr[n]], np.int32)
+    indices = indices_array
+    if indices.shape[0]:
+        with nogil:
+            lav_coupled_rows(n, &ptr[0], &to[0], &other[0], &indptr[0], &indices[0])
+    return indptr_array, indices_array
+
+
+def coupled_entries(const int32_t[::1] aptr, const int32_t[::1] aind, const double[::1] a, const int32_t[::1] indptr,
+                    const int32_t[::1] indices):
+    """A on the pattern of `coupled_rows`; A not empty."""
+    out_array = np.empty(indices.shape[0])
+    cdef double[::1] out = out_array
+    with nogil:
+        lav_coupled_entries(<int32_t>indptr.shape[0] - 1, &aptr[0], &aind[0], &a[0], &indptr[0], &indices[0], &out[0])
+    return out_array
+
+
+def coupled(Elements e, const int32_t[::1] to, const int32_t[::1] other, const int32_t[::1] indptr,
+            const double[::1] h, const double[::1] left, right, double own, double[::1] out):
+    """(1); right may be None."""
+    cdef const double[::1] r
+    cdef const double* second = NULL
+    if right is not None:
+        r = right
+        second = &r[0]
+    with nogil:
+        lav_coupled(&e.e, &to[0], &other[0], &indptr[0], &h[0], &left[0], second, own, &out[0])
