@@ -1,6 +1,9 @@
 """A proof that a problem has no solution, which `auto` looks for where nobody gets there.
 
-A^T y <= 0 (= 0 on free rows),  y >= 0 (any sign there),  b.y > 0
+    A^T y <= 0 (= 0 on free rows),  y >= 0 (any sign there),  b.y > 0
+
+Of islands that proves it for one: those that are wrong are asked one by one, since a bound above in another one is
+in nobody's way.
 """
 
 from __future__ import annotations
@@ -10,12 +13,17 @@ from typing import Any
 
 import numpy as np
 
+from lavender._arrays import FloatArray
 from lavender.certificates import check_certificate
+from lavender.problem import Problem
+from lavender.solvers._islands import blocks_of_each, restrict, rows_of
 from lavender.solvers._trail import Trail
 
 __all__ = ["certify"]
 
-CERTIFICATE_ROWS = 3000  # rows up to which a linear program is asked for a certificate
+CERTIFICATE_ROWS = (
+    3000  # rows up to which a linear program is asked for a certificate, of all islands together
+)
 CERTIFICATE_STEPS = 100  # of the simplex method for each row at most
 
 
@@ -23,37 +31,70 @@ CERTIFICATE_STEPS = 100  # of the simplex method for each row at most
 def certify(trail: Trail) -> None:
     """Look for a proof that an LCP without upper bounds has no solution, whatever its A."""
     problem = trail.problem
+    if problem.law not in ("linear", "lcp") or trail.best < 1e-6 or trail.late:
+        return
+    asked = 0
+    for part, rows in _parts(trail):
+        asked += part.m
+        if asked > CERTIFICATE_ROWS or trail.late:
+            return
+        if not _is_open(part):
+            continue
+        y = _proof(part, trail.deadline)
+        if not trail.steps or trail.steps[-1] != "linear program for a certificate":
+            trail.steps.append("linear program for a certificate")
+        trail.work["certificates"] = trail.work.get("certificates", 0) + 1
+        if y is None:
+            continue
+        whole = np.zeros(problem.m)
+        whole[rows] = y
+        if check_certificate(problem, whole) is None:
+            trail.certificate = whole
+            return
+
+
+def _parts(trail: Trail) -> Any:
+    """Islands that are wrong and their rows, the smallest first; all of it where there is one."""
+    problem = trail.problem
+    if trail.islands[0] <= 1:
+        yield problem, slice(None)
+        return
+    blocks = blocks_of_each(*trail.islands)
+    wrong = trail.wrong_islands()[0]
+    for i in sorted(wrong, key=lambda i: len(blocks[i])):
+        rows = rows_of(problem, blocks[i])
+        yield restrict(problem, blocks[i], rows), rows
+
+
+def _is_open(problem: Problem) -> bool:
+    """Every row is free, or bounded by 0 below alone."""
     cones = problem.cones
-    if (
-        problem.law not in ("linear", "lcp")
-        or problem.m > CERTIFICATE_ROWS
-        or trail.best < 1e-6
-        or trail.late
-    ):
-        return
     free = np.isneginf(cones.lower) & np.isposinf(cones.upper)
-    if not np.all(free | ((cones.lower == 0.0) & np.isposinf(cones.upper))):
-        return
+    return bool(np.all(free | ((cones.lower == 0.0) & np.isposinf(cones.upper))))
+
+
+def _proof(problem: Problem, deadline: float) -> FloatArray | None:
+    """What a linear program finds, y (m,), to be checked."""
     from scipy.optimize import linprog  # 0.1 s to import, needed only here
 
     # max b.y, A^T y <= 0 (= 0 on free rows), 0 <= y <= 1, in units of d.
+    cones = problem.cones
+    free = np.isneginf(cones.lower) & np.isposinf(cones.upper)
     scale = 1.0 / np.sqrt(problem.d)
     at = (problem.csr.T.multiply(scale[:, None])).multiply(scale[None, :]).tocsr()
     if not (np.isfinite(at.data).all() and np.isfinite(scale * problem.b).all()):
-        return
+        return None
     bounds = np.stack([np.where(free, -1.0, 0.0), np.ones(problem.m)], 1)
     options: dict[str, Any] = {"maxiter": CERTIFICATE_STEPS * problem.m}
-    if trail.deadline < np.inf:
-        options["time_limit"] = max(trail.deadline - perf_counter(), 1e-3)
+    if deadline < np.inf:
+        options["time_limit"] = max(deadline - perf_counter(), 1e-3)
     found = linprog(
         -(scale * problem.b),
         A_ub=at[~free] if (~free).any() else None, b_ub=np.zeros(int((~free).sum())) if (~free).any() else None,
         A_eq=at[free] if free.any() else None, b_eq=np.zeros(int(free.sum())) if free.any() else None,
         bounds=bounds, method="highs", options=options,
     )  # fmt: skip
-    trail.steps.append("linear program for a certificate")
-    trail.work["certificates"] = trail.work.get("certificates", 0) + 1
-    if found.x is not None:
-        y = np.where((found.x > 0.0) | free, found.x, 0.0) * scale
-        if check_certificate(problem, y) is None:
-            trail.certificate = y
+    if found.x is None:
+        return None
+    y: FloatArray = np.where((found.x > 0.0) | free, found.x, 0.0) * scale
+    return y

@@ -28,6 +28,12 @@ def islands(problem: Problem) -> tuple[int, IntArray]:
     return graph.matrix_components(cones.ptr, block, indptr, indices)
 
 
+def blocks_of_each(count: int, label: IntArray) -> list[IntArray]:
+    """Blocks of each island, in order, from the island of each block (k,)."""
+    order = np.argsort(label, kind="stable").astype(np.int32)
+    return np.split(order, np.searchsorted(label[order], np.arange(1, count)))
+
+
 def block_bodies(problem: Problem) -> IntArray:
     """Bodies of each block (k, 2), -1 static; only with rows."""
     rows = problem.rows

@@ -31,7 +31,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lavender._arrays import FloatArray, IntArray
+from lavender._arrays import FloatArray
 from lavender.problem import OPERATORS, Problem
 from lavender.registry import FEW, SolverSpec
 from lavender.residuals import reference
@@ -46,7 +46,7 @@ from lavender.solvers._first import (
     factors_at_once,
     general_first,
 )
-from lavender.solvers._islands import restrict, rows_of
+from lavender.solvers._islands import blocks_of_each, restrict, rows_of
 from lavender.solvers._newton import general
 from lavender.solvers._opening import Opening
 from lavender.solvers._race import race
@@ -238,15 +238,14 @@ def _finish(trail: Trail, sweeps: Sweeps | None, budget: int) -> None:
 def _apart(trail: Trail, budget: int) -> bool:
     """Solve every island that misses its share of the whole tolerance."""
     problem = trail.problem
-    count, label = trail.islands
+    count = trail.islands[0]
     velocity = reference(problem)[1]
     wrong, _, share = trail.wrong_islands()
-    order = np.argsort(label, kind="stable")
-    ends = np.searchsorted(label[order], np.arange(count + 1))
+    blocks_of = blocks_of_each(*trail.islands)
     kinds: dict[str, int] = {}
     impulse = trail.impulse.copy()
     for i in wrong:
-        blocks: IntArray = order[ends[i] : ends[i + 1]].astype(np.int32)
+        blocks = blocks_of[i]
         rows = rows_of(problem, blocks)
         part = restrict(problem, blocks, rows)
         e0, v0 = reference(part)

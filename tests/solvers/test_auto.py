@@ -13,6 +13,7 @@ from lavender import registry, suite
 from lavender.solvers import _rates as rates
 from lavender.solvers import _turns
 from lavender.solvers._at_once import HASTY
+from lavender.solvers._certify import certify
 from lavender.solvers._costs import HASTY_KEY, Costs
 from lavender.solvers._counts import sweep_cost
 from lavender.solvers._islands import islands, restrict, rows_of
@@ -263,6 +264,22 @@ def test_every_random_compliant_problem_is_solved(seed):
         for given_as in (problem, as_matrix(problem)):
             solution = lv.solve(given_as, "auto", tol=1e-9)
             assert good(solution, 1e-9), solution
+
+
+def test_an_island_without_a_solution_is_proof_enough():
+    """Bounds above elsewhere are in nobody's way; what the linear program finds is proven for the whole."""
+    a = np.zeros((4, 4))
+    a[:2, :2] = [[1.0, -1.0], [-1.0, 1.0]]  # y = (1, 1): A^T y = 0, b.y = 2
+    a[2:, 2:] = [[2.0, 0.5], [0.1, 2.0]]
+    problem = lv.Problem.lcp(a, [1.0, 1.0, -1.0, 3.0], 0.0, [np.inf, np.inf, 1.0, 1.0])
+    trail = Trail(problem, 1e-6, np.inf)
+    trail.offer(problem.start())
+    certify(trail)
+    assert trail.certificate is not None
+    assert not trail.certificate[2:].any()
+    assert trail.steps == ["linear program for a certificate"] and trail.work == {"certificates": 1}
+    large = lv.solve(suite.wild(seed=141).problem, tol=1e-6)  # 2,133 asymmetric rows in 108 islands
+    assert large.status is lv.Status.INFEASIBLE and not large.contradicted
 
 
 def test_what_has_no_solution_gets_a_certificate():
