@@ -709,7 +709,6 @@ cdef class SparsePanels:
 
     def __init__(self, indptr, indices, bint lu, bint wide=True, SparsePanels like=None):
         cdef int32_t n = <int32_t>len(indptr) - 1, k
-        cdef int64_t below
         if n < 1:
             raise ValueError("a matrix of one row or more")
         if like is None:
@@ -719,7 +718,6 @@ cdef class SparsePanels:
         else:
             raise ValueError("panels of another matrix")
         k = <int32_t>(len(places) // 2 - 1)
-        below = len(whole_array) - 5 * n - 5 * k - 2
         cdef int32_t[::1] whole = whole_array
         cdef int64_t[::1] places_ = places
         cdef int32_t* order = &whole[0]
@@ -732,7 +730,7 @@ cdef class SparsePanels:
         cdef int32_t* head = rptr + k + 1
         cdef int32_t* link = head + k
         cdef int32_t* next_ = link + k
-        cdef int32_t* rows = next_ + k                  # below
+        cdef int32_t* rows = next_ + k                  # the rest
         cdef int64_t* at = &places_[0]
         cdef int64_t* beside = at + k + 1
         self.work = 2.0 * self.half if lu else self.half

@@ -19,8 +19,7 @@ cdef struct gate_t:             # what Newton's method may cost [ns] to be asked
     double row[4]               # by law: linear, lcp, coulomb, cone
     double factor[4]
     double most
-    double rigid[5]              # of few rows under Coulomb's law that are not soft: rows, a row, a multiply-add, most;
-                                # of d, from which they are
+    double rigid[5]             # few rows under Coulomb's law: up to so many, a row, a multiply-add, most; d of soft ones
     double form                 # of a multiply-add of A
     double count[4]             # factorisations by law
     # Bounded rows, more than few, where A costs at least `carried` sweeps and their call to form; see `is_carried`.
