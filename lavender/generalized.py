@@ -395,7 +395,7 @@ def _apart(jac: Compressed, parent: IntArray) -> IntArray | None:
             tree[i] = tree[p]
     indptr, indices, _ = jac
     on = sp.csr_array(
-        (np.ones(len(indices), np.int32), tree[indices], indptr), shape=(len(indptr) - 1, len(roots))
+        (np.ones(len(indices), np.int32), tree[indices], indptr.copy()), shape=(len(indptr) - 1, len(roots))
     )
     on.sum_duplicates()
     if np.sum(np.diff(on.indptr).astype(float) ** 2) > MET * len(roots):

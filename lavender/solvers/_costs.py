@@ -160,6 +160,11 @@ class Costs:
         """Newton over generalised velocities [ns]; inf where it has no room, or none are given."""
         return velocities_cost(self.problem, self.largest) if self.largest else np.inf
 
+    @property
+    def over_velocities_exact(self) -> Exact | None:
+        """The same as a finite solver; A is not formed to tell."""
+        return next((e for e in self._others if e.key == VELOCITY_KEY), None)
+
     @cached_property
     def exact(self) -> list[Exact]:
         """The finite solvers that take this problem, cheapest first."""

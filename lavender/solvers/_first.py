@@ -171,12 +171,12 @@ def is_carried(problem: Problem) -> bool:
 
 
 def _may_be_narrow(problem: Problem) -> bool:
-    """Its A is a narrow band in the order of elimination, or has no more entries than one where nobody has looked."""
+    """Its A is a narrow band in the order of elimination, or has no more entries than one where nobody looks for it."""
     if problem.generalized is not None:
         return False
-    kept = problem.derived.factor
-    if kept is not None:
-        return bool(kept[0] == "band")
+    # What was found out before says nothing: the same problem goes the same way again.
+    if _body_width(problem) > rates.NARROW and _asks_for_order(problem):
+        return bool(choose(problem)[0] == "band")
     if problem.rows is not None:
         return True
     m, entries = problem.m, len(problem._compressed[1])
@@ -194,21 +194,33 @@ def factors_at_once(problem: Problem) -> bool:
         return True
     if problem.generalized is not None or is_redundant(problem):
         return False
-    if problem.rows is not None and problem.rows.n_bodies:
-        width = graph.body_spread(problem.cones.ptr, block_bodies(problem), problem.rows.n_bodies) + 1
-        if width <= rates.NARROW:
-            return _is_hasty(m, width)
-    # Rows of bodies may be narrow in another order, which that of A tells.
-    entries = (
-        int(assemble.bound(problem.data)[0]) if problem.rows is not None else len(problem._compressed[1])
-    )
-    if entries > rates.NARROW_ENTRIES * m or not problem.is_symmetric:
+    width = _body_width(problem)
+    if width <= rates.NARROW:
+        return _is_hasty(m, width)
+    if not _asks_for_order(problem):
         return False
     form, band, _ = choose(problem)
     return form == "band" and _is_hasty(m, band + 1)
 
 
-def _is_hasty(m: int, width: int) -> bool:
+def _body_width(problem: Problem) -> float:
+    """Of A's band in the order of blocks, by the bodies that they share; inf where these are not given."""
+    rows = problem.rows
+    if rows is None or not rows.n_bodies:
+        return np.inf
+    return float(graph.body_spread(problem.cones.ptr, block_bodies(problem), rows.n_bodies) + 1)
+
+
+def _asks_for_order(problem: Problem) -> bool:
+    """A has so few entries, and is symmetric, that an order of a narrow band is looked for; of bodies, too."""
+    if problem.rows is not None:
+        entries = int(assemble.bound(problem.data)[0])
+    else:
+        entries = len(problem._compressed[1])
+    return entries <= rates.NARROW_ENTRIES * problem.m and problem.is_symmetric
+
+
+def _is_hasty(m: int, width: float) -> bool:
     """A band of m bounded rows so narrow that nothing else is looked at before `direct`."""
     return rates.DIRECT["lcp"] * rates.BAND * m * float(width) ** 2 <= rates.BAND_AT_ONCE
 

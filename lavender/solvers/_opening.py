@@ -31,7 +31,7 @@ __all__ = ["Opening"]
 
 
 class Opening:
-    """Of a solve of `problem` from `impulse` (m,) [N s], in which the end is put, in n iterations to `tol`.
+    """What `auto` tries first on `problem` from `impulse` (m,) [N s], in n iterations to `tol`; the end is put there.
 
     `failed`: few rows that the one compiled call did not end.
     """

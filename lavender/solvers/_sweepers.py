@@ -98,8 +98,7 @@ def look_first(
     `failed`: few rows whose factor did not end it at once. `crowded`: bounded rows of J and M whose factors over the
     velocities fill so much that to count them costs more than a look. `largest`: velocities of the largest island, 0
     where newton has no room for them. Where one body carries many rows some sweeps are tried before what would come
-    first. No look is begun, or gone on with, that is
-    counted for longer than `time_limit` [s].
+    first. No look is begun, or gone on with, that is counted for longer than `time_limit` [s].
     """
     general = problem.generalized is not None
     few = problem.m <= FEW
@@ -266,16 +265,19 @@ class Sweeps:
             # What was promised before and did not come about is not believed for ever.
             return (rest > other and spent > HOPE * other) or spent > BELIEVED * other
 
-        factored = self.trail.problem.law in ("linear", "lcp")
-        if factored and self.done * self.per > PORTION * self.trail.limit and self.too_late:
+        trail = self.trail
+        factored = trail.problem.law in ("linear", "lcp")
+        if factored and self.done * self.per > PORTION * trail.limit and self.too_late:
             # Sweeps will not get there in time; a factorisation that is in luck may.
-            costs, left = self.trail.costs, self.trail.limit - spent
+            costs, left = trail.costs, trail.limit - spent
             return costs.formed < left and any(other.once < left for other in costs.exact)
         if worth is not None:
             return than(worth)
-        if min(rest, spent) > APART * rates.ISLAND and than(self.trail.apart_cost()):
+        if min(rest, spent) > APART * rates.ISLAND and than(trail.apart_cost()):
             return True
-        costs = self.trail.costs
+        costs = trail.costs
         # To ask closely of J and M forms A, unless what needs none costs less: not before that much was swept.
+        if trail.late_by(rates.WITH_A * costs.formed):
+            return than(costs.over_velocities)
         asked = spent > min(costs.formed, costs.over_velocities)
         return than(costs.least) and than(costs.guess) and asked and than(costs.cheapest)

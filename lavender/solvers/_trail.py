@@ -126,6 +126,10 @@ class Trail:
     def late(self) -> bool:
         return perf_counter() >= self.deadline
 
+    def late_by(self, cost: float) -> bool:
+        """What is counted for so long [ns] would end after the deadline."""
+        return perf_counter() + 1e-9 * cost > self.deadline
+
     def at_floor(self) -> bool:
         if self.best > 1e-5:
             return False

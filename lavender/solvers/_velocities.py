@@ -9,10 +9,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from lavender.solvers import _rates as rates
 from lavender.solvers._counts import general_step
 from lavender.solvers._sweepers import Sweeps
 from lavender.solvers._trail import Trail
-from lavender.solvers._turns import VELOCITY, whole
+from lavender.solvers._turns import ROUNDS, VELOCITY, whole
 from lavender.solvers._walks import OTHER
 
 __all__ = ["alternate"]
@@ -27,24 +28,30 @@ def alternate(trail: Trail, sweeps: Sweeps | None, budget: int) -> bool:
     A turn is as long as all that `sweeps` did.
     """
     costs = trail.costs
-    newton = next((e for e in costs.exact if e.key == VELOCITY), None)
+    newton = costs.over_velocities_exact
     if newton is None:
         return False
-    others = min((e.cost for e in costs.exact if e.key not in (VELOCITY, *trail.ended)), default=np.inf)
+    others = np.inf
+    if not trail.late_by(rates.WITH_A * costs.formed):  # to ask what they cost may form A
+        others = min((e.cost for e in costs.exact if e.key not in (VELOCITY, *trail.ended)), default=np.inf)
     step = general_step(trail.problem, trail.largest, costs.islands)
     allowed = max(LEAST, min(newton.cost, others) if sweeps is None else sweeps.done * sweeps.per)
     first = FIRST * newton.cost if newton.cost <= others else 0.0
     swept = [] if sweeps is None else [sweeps]
-    while allowed <= others or first > 0.0:
+    other: Sweeps | None = None
+    for _ in range(ROUNDS):
+        if not (allowed <= others or first > 0.0):
+            break
         before = trail.iterations
         steps = int(max(allowed, first) / step)
         if steps > 0 and VELOCITY not in trail.ended and whole(trail, newton, budget, steps):
             return True
         if allowed > others:
             break
-        if len(swept) == (sweeps is not None):
-            swept.insert(0, Sweeps(trail, **OTHER))
-            swept[0].impulse, swept[0].last = trail.problem.start(), 1.0
+        if other is None:
+            other = Sweeps(trail, **OTHER)
+            other.impulse, other.last = trail.problem.start(), 1.0
+            swept.insert(0, other)
         for each in swept:
             if each.run(budget, cap=each.done + int(allowed / each.per)):
                 return True

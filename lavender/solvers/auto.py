@@ -42,10 +42,7 @@ from lavender.solvers._certify import certify
 from lavender.solvers._costs import Costs, Exact
 from lavender.solvers._counts import is_loose
 from lavender.solvers._few import AUTO
-from lavender.solvers._first import (
-    factors_at_once,
-    general_first,
-)
+from lavender.solvers._first import factors_at_once, general_first
 from lavender.solvers._islands import blocks_of_each, restrict, rows_of
 from lavender.solvers._newton import general
 from lavender.solvers._opening import Opening
@@ -297,9 +294,6 @@ def begins(problem: Problem, tol: float) -> tuple[str, str]:
     if problem.law == "linear" or (problem.m > FEW and _at_once(costs)):
         return finite, finite
     return "sweeps", finite
-
-
-# -- what a problem looks like ------------------------------------------------------------------------
 
 
 SPEC = SolverSpec(

@@ -53,7 +53,7 @@ cdef inline bint are_soft(const blocks_t* p, const generalized_t* g, double shar
 
 
 cdef inline bint is_first(const job_t* j, const gate_t* gate, int32_t largest) noexcept nogil:
-    """`general_first` of lavender/solvers/_first.py, in the same order of operations."""
+    """The first tests of `general_first` in lavender/solvers/_first.py, in the same order of operations."""
     cdef double flops, cost, entries
     if gate.is_open:
         return True

@@ -60,7 +60,8 @@ cdef struct wait_t:             # a descent whose steps were used up, to go on w
     int32_t fresh               # s was formed anew, not moved
     int32_t stale               # N is to be formed anew
     double share                # of d
-    double least                # error of the island's best,
+    double kept                 # error of the island's best, which a cut may have found,
+    double least                # of the best that one run knows of,
     double found                # of the descent's as its caller keeps it,
     double lowest               # and of its own steps
     double last_center
@@ -883,20 +884,26 @@ cdef inline void restart(flow_t* f, int32_t island, const double* lam) noexcept 
         f.y[c] = f.u[c]
 
 
-cdef inline bint offer(flow_t* f, int32_t island, const double* lam, double* least) noexcept nogil:
-    """Keep lam in `first_best` where its error under the problem's own law is the least; phi must be 0."""
+cdef inline bint offer(flow_t* f, int32_t island, const double* lam, double* least, double* kept) noexcept nogil:
+    """Keep lam in `first_best` where its error under the problem's own law is less than is kept; phi must be 0.
+
+    Is it less than the least?
+    """
     cdef double energy, velocity, over
     f.p.law = f.law
     energy = measure(f, island, lam, gather(f, island, lam, f.u), &velocity)
     over = excess(f, energy, velocity)
+    if over < kept[0]:
+        kept[0] = over
+        keep(f, island, lam, f.first_best)
     if over < least[0]:
         least[0] = over
-        keep(f, island, lam, f.first_best)
         return True
     return False
 
 
-cdef inline int32_t with_coulomb(flow_t* f, int32_t island, double* impulse, bint cold, double* least) noexcept nogil:
+cdef inline int32_t with_coulomb(flow_t* f, int32_t island, double* impulse, bint cold, double* least,
+                                 double* kept) noexcept nogil:
     """Rounds of Newton's method on Coulomb's law, each from the answer of a convex problem."""
     cdef bint waits = f.wait.island == island, convex
     cdef int32_t n, rounds
@@ -921,7 +928,7 @@ cdef inline int32_t with_coulomb(flow_t* f, int32_t island, double* impulse, bin
                 keep(f, island, f.phi, f.aside)
             keep(f, island, f.best, impulse)
             level(f, island)
-            offer(f, island, impulse, least)
+            offer(f, island, impulse, least, kept)
             if least[0] <= 1.0:
                 f.wait.island = -1
                 return DONE
@@ -942,7 +949,7 @@ cdef inline int32_t with_coulomb(flow_t* f, int32_t island, double* impulse, bin
             f.wait.rounds = rounds
             f.wait.least = least[0]
             keep(f, island, impulse, f.aside)
-        if n != LOST and offer(f, island, f.best, least):
+        if n != LOST and offer(f, island, f.best, least, kept):
             keep(f, island, f.best, impulse)
         if least[0] <= 1.0:
             f.wait.island = -1
@@ -957,21 +964,23 @@ cdef inline int32_t with_coulomb(flow_t* f, int32_t island, double* impulse, bin
 cdef inline int32_t solve_island(flow_t* f, int32_t island, double* impulse, bint cold) noexcept nogil:
     """One island from `impulse`, or from where it waits, into it; how it ended."""
     cdef int32_t end
-    cdef double least = 1.0 / 0.0, share = f.share
+    cdef double least = 1.0 / 0.0, kept = 1.0 / 0.0, share = f.share
     f.island = island
     f.thin = f.lptr != NULL and is_worth(f.cptr[island + 1] - f.cptr[island], f.lptr + f.cptr[island], f.lidx)
     if f.wait.island == island:
         least = f.wait.least
+        kept = f.wait.kept
         share = f.wait.share
     else:
         restart(f, island, impulse)
         level(f, island)
-        if not offer(f, island, impulse, &least):
+        if not offer(f, island, impulse, &least, &kept):
             return LOST
         if least <= 1.0:
             return DONE
     if f.law == COULOMB:
-        end = with_coulomb(f, island, impulse, cold, &least)
+        end = with_coulomb(f, island, impulse, cold, &least, &kept)
+        f.wait.kept = kept
         keep(f, island, f.first_best, impulse)
     else:
         end = descend(f, island, 1.0, &share, &least)

@@ -89,7 +89,8 @@ cdef class Newton:
     def run(self, double[::1] impulse, double tol, int steps, bint cold, bint again=False):
         """At most `steps` Newton steps on impulse (m,), in place; the judge's start must be known to the data.
 
-        again: on from where the run before, to the same tol, has used up its steps: with the bits of one run of as many.
+        again: on from where the run before, to the same tol, has used up its steps. Under Coulomb's law the best at a
+        cut is kept, and may be the end sooner than one run of as many steps finds it; else the bits are those of one.
         Returns how it ended (`ENDS`) and (steps, factorisations, updates of N, rounds, evaluations of a line).
         """
         cdef int32_t end = DONE, waits = self.f.wait.island if again else -1

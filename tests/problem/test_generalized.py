@@ -757,3 +757,30 @@ def test_many_columns_and_few_have_the_same_panels():
     )  # fmt: skip
     np.testing.assert_array_equal(small.d, large.d)
     np.testing.assert_array_equal(small.whitened.toarray(), large.whitened.toarray()[:, :-1])
+
+
+def test_many_rows_on_many_trees_are_ordered_whoever_else_holds_the_pattern():
+    """Several entries of a row on one tree are summed, in a copy: J's own arrays are frozen."""
+    rng = np.random.default_rng(0)
+    nv, contacts = 400, 400
+    parent = np.arange(-1, nv - 1)
+    parent[:: nv // 30] = -1  # chains
+    jac = np.zeros((3 * contacts, nv))
+    for first in range(0, 3 * contacts, 3):
+        for end in rng.integers(0, nv, 2):
+            for i in range(int(end), max(int(end) - 6, -1), -1):
+                jac[first : first + 3, i] = rng.normal(size=3)
+                if parent[i] < 0:
+                    break
+    mass = sp.diags_array(
+        [np.full(nv - 1, 0.1), np.full(nv, 2.0), np.full(nv - 1, 0.1)], offsets=[-1, 0, 1]
+    ).tolil()
+    for i in np.flatnonzero(parent < 0):
+        if i:
+            mass[i, i - 1] = mass[i - 1, i] = 0.0
+    problem = lv.Problem.from_jacobian(
+        jac, sp.csr_array(mass), rng.normal(size=nv), cones=lv.Cones.contacts(np.full(contacts, 0.5), 2),
+        friction="coulomb",
+    )  # fmt: skip
+    assert problem.generalized is not None
+    assert np.isfinite(lv.solve(problem, tol=1e-3, max_iter=50).residual.relative)

@@ -266,6 +266,29 @@ def test_every_random_compliant_problem_is_solved(seed):
             assert good(solution, 1e-9), solution
 
 
+def test_what_gave_up_at_once_is_not_called_solved():
+    cones = lv.Cones.contacts([0.0], 2)
+    jac = np.sqrt(np.arange(1.0, 7.0)).reshape(3, 2)
+    problem = lv.Problem.from_jacobian(jac, np.eye(2), np.full(2, -1e300), cones=cones)
+    assert "the start is a solution ->" not in lv.solve(problem).message
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_the_same_object_goes_the_same_way_again(seed):
+    """What a first solve found out of a problem does not choose for the second."""
+    rng = np.random.default_rng(seed)
+    parts = []
+    for _ in range(30):
+        k = int(rng.integers(2, 7))
+        root = rng.normal(size=(k, max(1, k - 1)))
+        parts.append(root @ root.T)
+    a = sp.block_diag(parts, format="csr")
+    problem = lv.Problem.lcp(a, a @ rng.normal(size=a.shape[0]))
+    first, second = (lv.solve(problem, tol=1e-3) for _ in range(2))
+    assert first.message == second.message
+    assert first.impulse.tobytes() == second.impulse.tobytes()
+
+
 def test_an_island_without_a_solution_is_proof_enough():
     """Bounds above elsewhere are in nobody's way; what the linear program finds is proven for the whole."""
     a = np.zeros((4, 4))

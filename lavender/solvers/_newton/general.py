@@ -17,7 +17,7 @@ from lavender.solution import Claim, Status
 from lavender_ext.generalized.newton import ENDS, Newton
 
 FORM = "generalized velocities"
-# Steps for each island between two looks at the clock and at Ctrl-C, which change no bit; with a time limit at most as
+# Steps for each island between two looks at the clock and at Ctrl-C; with a time limit at most as
 # many as this share of it is for at FLOP, and then as what is left is for at the pace so far.
 CLOCK = 64
 FIRST_SHARE = 0.5
@@ -123,10 +123,10 @@ def named(claim: Claim, solver: str) -> Claim:
     """The claim as `newton` or `auto` makes it."""
     if solver == "newton":
         return claim
-    if claim.iterations == 0:
-        return Claim(claim.status, 0, {}, "the start is a solution")
     done = ", ".join(f"{count} {kind}" for kind, count in claim.work.items() if count)
-    return Claim(claim.status, claim.iterations, claim.work, f"newton {done}")
+    if not done and claim.status is Status.CONVERGED:
+        return Claim(claim.status, claim.iterations, {}, "the start is a solution")
+    return Claim(claim.status, claim.iterations, claim.work, f"newton {done or 'gave up at once'}")
 
 
 def _is_cold(problem: Problem, impulse: FloatArray) -> bool:
