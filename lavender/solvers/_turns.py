@@ -28,6 +28,7 @@ CHUNK_WORK = 8  # sweeps' work that an iteration of admm is
 ROUNDS = 8  # times that sweeps and finite solvers take turns, the allowance doubled each time
 STILL = 4  # turns in a row, each twice as long, that gain next to nothing: then nobody gets anywhere
 GAIN = 0.99  # of the residual before a turn, below which it gained something
+DEARER = 2.0  # times what Newton's method, which waits, has cost, that another's turn may be counted for
 ALIKE = ("direct", "lemke")  # do the same wherever they start
 VELOCITY = VELOCITY_KEY
 
@@ -206,10 +207,13 @@ class Turns:
                 and sweeps.run(self.budget, candidate.cost)
             ):
                 return True
+            dear = DEARER * self.waiting  # what Newton's method has cost, which waits, where it does
+            if self.inside is not None and trail.problem.law == "lcp" and candidate.cost > dear:
+                postponed = True
+                continue
             limit = candidate.limit << (k + longer)
             if longer and candidate.each > 0.0:
-                # Not more than twice of what Newton's method, which waits, has cost.
-                limit = min(limit, int((2.0 * self.waiting - candidate.once) / candidate.each))
+                limit = min(limit, int((dear - candidate.once) / candidate.each))
                 if limit <= 0:
                     postponed = True
                     continue
