@@ -4,9 +4,9 @@
     few rows          linear or bounded: direct, in one call (`_few.py`), as more of a narrow band (`_at_once.py`),
                       where that is the end; else a glance at sweeps (`_sweepers.py`) before anything is counted, and on
                       as below
-    J and M           newton over the velocities at once where that costs next to nothing, few rows under Coulomb's law
-                      in some steps, then with a glance at sweeps; else it is one of the finite solvers below, beside
-                      those that form A
+    J and M           newton over the velocities at once where that costs next to nothing, on few rows under Coulomb's
+                      law after a glance at sweeps, unless contacts are soft (`_opening.py`); else it is one of the
+                      finite solvers below, beside those that form A
     others            a finite solver at once where its factor costs less than sweeps usually do; else anderson
                       as long as what it still needs, by its contraction so far, costs less than the cheapest
                       finite solver (direct, newton, lemke, admm, as the law allows); then that one, with twice the
