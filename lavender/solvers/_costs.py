@@ -141,13 +141,14 @@ class Costs:
         if not self._direct_takes:
             start, step, row = newton_rates(p)
             most = start + self._newton_count * (step + row * p.m)  # whatever the factor costs
-            found = most if most > self.sweeping else self.newton_guess
+            far = p.matrix is None and most > self.sweeping
+            found = most if far else self.newton_guess
+            if p.matrix is not None and p.law in ("cone", "coulomb"):
+                found = min(found, self._admm[0])
         else:
-            m = p.m
-            width = self._width(m) if p.rows is not None else 0.5 * p.metric.work / max(m, 1)
             stuck = self.redundant or any(key.startswith("direct") for key in self.ended)
             times = rates.SINGULAR if p.law == "lcp" and stuck else 1.0
-            found = min(self.newton_guess, self._direct(rates.BAND * m * max(3.0, width) ** 2, times))
+            found = min(self.newton_guess, self._direct(self._factor_guess, times))
         return min(self.formed + found, self.over_velocities)
 
     @cached_property
@@ -164,6 +165,18 @@ class Costs:
     def over_velocities_exact(self) -> Exact | None:
         """The same as a finite solver; A is not formed to tell."""
         return next((e for e in self._others if e.key == VELOCITY_KEY), None)
+
+    @property
+    def asking(self) -> float:
+        """What it takes to find out what the finite solvers cost [ns], A formed, as far as that is not known."""
+        if "system" in self.__dict__ or self._others_win:
+            return 0.0
+        p = self.problem
+        if p.generalized is not None:
+            return rates.ASK
+        if p.rows is not None and p.rows.n_bodies:
+            return rates.ASK_BODIES + rates.ASK_BODIES_ROW * p.m
+        return rates.ASK + rates.ASK_ROW * p.m + rates.ASK_ENTRY * len(p._compressed[1])
 
     @cached_property
     def exact(self) -> list[Exact]:
@@ -260,13 +273,26 @@ class Costs:
             s = 6 if turns else 3
             n = p.rows.n_bodies
             return self._newton(rates.BLOCK * s**3 * (1.0 + 0.5 * max(1.0, self._width(n)) ** 2) * n)
-        m, nnz = float(p.m), float(len(p._compressed[1])) if p.generalized is None else float(p.m)
-        share = nnz / (m * m)
-        return self._newton(
-            min(rates.BAND * m * max(1.0, 0.5 * nnz / m) ** 2, filled(int(nnz), 0.0), dense_factor(m))
-            if share < DENSE_FILL
-            else dense_factor(m)
-        )
+        m = float(p.m)
+        if p.generalized is not None:
+            return self._newton(min(rates.BAND * m, float(dense_factor(m))))
+        nnz = float(len(p._compressed[1]))
+        if nnz >= DENSE_FILL * m * m:
+            return self._newton(float(dense_factor(m)))
+        # Its entries fill; a band is narrower than they are at best, and neither Coulomb's law nor LU asks for one.
+        least = float(filled(nnz, 0.0)) if p.m > DENSE_ROWS else float(dense_factor(m))
+        if p.law != "coulomb" and p.is_symmetric:
+            least = min(least, rates.BAND * m * max(1.0, 0.5 * nnz / m) ** 2)
+        return self._newton(least)
+
+    @property
+    def _factor_guess(self) -> float:
+        """What one factor of A as `direct` makes it hardly costs less than [ns]; of bounded rows given as A, all."""
+        p, m = self.problem, self.problem.m
+        if p.law == "lcp" and p.matrix is not None:
+            return self.whole_factor
+        width = self._width(m) if p.rows is not None else 0.5 * p.metric.work / max(m, 1)
+        return rates.BAND * m * max(3.0, width) ** 2
 
     def _width(self, n: int) -> float:
         """Neighbours that elimination leaves each of n unknowns, at a guess: none in a tree, as in a plane else."""

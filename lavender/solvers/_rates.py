@@ -18,6 +18,9 @@ STEP = {"direct": 10e3, "newton": 35e3}  # beside each factor
 ROW = 30.0  # for each row beside each factor of `direct`,
 NEWTON_ROW = {"linear": 150.0, "lcp": 150.0, "cone": 300.0, "coulomb": 300.0}  # and of `newton`
 BODIES_START, BODIES_STEP, BODIES_ROW = 150e3, 8e3, 190.0  # of `newton` over bodies under a convex law
+# What it takes to find out what one factor of `newton` costs, of its pattern: a call, each row, and each entry of A.
+ASK, ASK_ROW, ASK_ENTRY = 200e3, 400.0, 3.0
+ASK_BODIES, ASK_BODIES_ROW = 150e3, 200.0  # over bodies
 DENSE, DENSE_ENTRY = 0.03, 3.0  # for each multiply-add of a dense factor, and for each entry of its matrix
 BAND = 0.4  # of a band's
 # `direct` on few bounded rows, in compiled code, with one shift where A is singular: a call and its rounds, each a row

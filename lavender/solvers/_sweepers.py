@@ -276,8 +276,10 @@ class Sweeps:
         if min(rest, spent) > APART * rates.ISLAND and than(trail.apart_cost()):
             return True
         costs = trail.costs
-        # To ask closely of J and M forms A, unless what needs none costs less: not before that much was swept.
+        # To ask closely takes time, and of J and M forms A, unless what needs none costs less: not before as much was
+        # swept.
         if trail.late_by(rates.WITH_A * costs.formed):
             return than(costs.over_velocities)
-        asked = spent > min(costs.formed, costs.over_velocities)
-        return than(costs.least) and than(costs.guess) and asked and than(costs.cheapest)
+        if not (than(costs.least) and than(costs.guess)):
+            return False
+        return spent > min(costs.formed + costs.asking, costs.over_velocities) and than(costs.cheapest)
