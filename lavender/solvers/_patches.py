@@ -32,7 +32,7 @@ from lavender_ext.factor import graph
 
 ROUND = 50  # sweeps of all blocks between two rounds of patches
 BAD = 0.3  # share of the largest block's error from which a block is the core of a patch
-HELD = 0.5  # share of the squared error that the cores have to hold for patches to be worth a beginning
+HELD = 0.2  # share of the squared error that the cores have to hold for patches to be worth a beginning
 IDLE = 5  # times that all plans may gain nothing
 GAIN = 0.8  # of the residual that a plan has to leave
 CLOSER = 1e-3  # of a patch's own residual, to which it is solved

@@ -19,7 +19,8 @@ __all__ = ["race"]
 SLOW = (
     2.0  # times the cost that the relaxation promises by all that it did, at which its last look slows down
 )
-STALLED = 0.8  # share of its residual that the later half of a racer's work has to leave
+EARLY = 500  # sweeps of all racers together before patches begin, some rounds of theirs
+STALLED = 0.6  # share of its residual that the later half of a racer's work has to leave
 FOLLOWING = ("given", "symmetric")  # orders of sweeps that begin where the relaxation slows down, in turn
 
 
@@ -97,8 +98,9 @@ def race(trail: Trail, own: Sweeps, budget: int) -> bool:
 
     Look by look whichever promises to cost less from there, so that none is dropped while it moves. From where the
     relaxation stands others begin whenever it did twice as much: which of them end soon is a matter of luck. Where
-    even the most promising stalls on few blocks, patches take turns with all of them, at the same cost, and so they do
-    on however many before others than sweeps are asked, which they are not while patches gain.
+    even the most promising stalls, no sooner than EARLY sweeps, and few blocks hold much of the error, patches take
+    turns with all of them, at the same cost, and so they do on however many before others than sweeps are asked, which
+    they are not while patches gain.
     """
     relaxed = Relaxed(trail)
     start = trail.best
@@ -122,8 +124,8 @@ def race(trail: Trail, own: Sweeps, budget: int) -> bool:
             racers.insert(0, Racer(_from(relaxed, own, len(followers)), 1.0, slow.spent, slow.best))
             followers.append(racers[0].sweeps)
         leaves = slow.looks > 0 and own.dearer(min(r.sweeps.cost for r in racers), spent, None)
-        stalls = racer.stalls and (mended is not None or len(followers) >= len(FOLLOWING))
-        if stalls or leaves:
+        swept = sum(r.sweeps.done for r in racers)
+        if (racer.stalls and swept >= EARLY) or leaves:
             mended = mended or Patches(trail)
             if (mended.done or leaves or mended.is_concentrated) and mended.mend(spent, left()):
                 break

@@ -72,11 +72,23 @@ def test_a_pile_that_stalls_is_mended(seed):
 def test_patches_and_those_that_race_share_one_budget(monkeypatch, most):
     monkeypatch.setattr(Patches, "is_concentrated", True)
     monkeypatch.setattr(_race.Racer, "stalls", True)
-    monkeypatch.setattr(_race, "FOLLOWING", ("given",))
+    monkeypatch.setattr(_race, "EARLY", 100)
     problem = granular(n=7, friction="coulomb", seed=8).problem
     solution = lv.solve(problem, "auto", tol=1e-13, max_iter=most)
     assert "patches" in solution.message
     assert solution.iterations <= most
+
+
+@pytest.mark.parametrize("early", [50, 150])
+def test_patches_begin_where_sweeps_stall_and_no_sooner_than_that(monkeypatch, early):
+    begun, most = [], 2000
+    monkeypatch.setattr(Patches, "is_concentrated", True)
+    monkeypatch.setattr(Patches, "mend", lambda self, worth, budget: begun.append(most - budget))
+    monkeypatch.setattr(_race.Racer, "stalls", True)
+    monkeypatch.setattr(_race, "EARLY", early)
+    problem = granular(n=7, friction="coulomb", seed=8).problem
+    lv.solve(problem, "auto", tol=1e-13, max_iter=most)
+    assert early <= begun[0] <= 2 * early  # at the next look, after half as many more
 
 
 def test_patches_come_before_solvers_that_factor():
