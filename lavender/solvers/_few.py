@@ -114,7 +114,7 @@ class Few:
             return None
         if self.looks and kept.first is False:
             return None  # sweeps come before
-        return chain.run(impulse, tol, self.looks, WARM)
+        return chain.run(impulse, tol, self.looks, WARM, self.looks)
 
     def claim(self, problem: Problem, counts: tuple[int, ...] | None) -> Claim:
         """What the solver says of a chain that did so much, word for word."""
@@ -124,7 +124,7 @@ class Few:
         if kind == VELOCITIES:
             return general.named(general.claim(Status.CONVERGED, counts), self.name)
         if kind == PIVOTS:
-            done, swept, refined, factored, exchanged, shifts, rank = counts
+            done, swept, refined, factored, exchanged, shifts, rank, path = counts
             named = {
                 "sweeps": 4 * swept,
                 "rank": rank,
@@ -142,7 +142,11 @@ class Few:
                 elif shifts and problem.law != "linear":
                     note = "A is singular on the free rows: shifted and refined"
                 return Claim(Status.CONVERGED, done, work, note, form="band" if symmetric else "LU")
-            return Claim(Status.CONVERGED, done, work, said("direct", work))
+            message = said("direct", work)
+            if path:
+                message += " -> " + said("lemke", {"pivots": path})
+                work["pivots"] = exchanged + path
+            return Claim(Status.CONVERGED, done + path, work, message)
         done, sweeps, restarts = counts
         work = {"sweeps": sweeps, "restarts": restarts}
         return Claim(Status.CONVERGED, done, work, said("anderson", work))

@@ -1,9 +1,9 @@
 """The only solver that hands over to others: each in its turn, by what it would cost from here on.
 
     linear            direct, newton
-    few rows          linear or bounded: direct, in one call (`_few.py`), as more of a narrow band (`_at_once.py`),
-                      where that is the end; else a glance at sweeps (`_sweepers.py`) before anything is counted, and on
-                      as below
+    few rows          linear or bounded: direct, in one call (`_few.py`), with Lemke's path where exchanges are stuck,
+                      as more of a narrow band (`_at_once.py`), where that is the end; else a glance at sweeps
+                      (`_sweepers.py`) before anything is counted, and on as below
     J and M           newton over the velocities at once where that costs next to nothing, on few rows under Coulomb's
                       law after a glance at sweeps, unless contacts are soft (`_opening.py`); else it is one of the
                       finite solvers below, beside those that form A

@@ -2,11 +2,13 @@
 
     velocities   newton on J and M, from the impulse given                              (generalized/newton.pxd)
     pivots       the factor of A, linear or boxed, with one shift where it is singular, and its refinement
-                                                                                        (pivot/principal.pyx)
+                                                                                        (pivot/principal.pyx);
+                 where exchanges are stuck Lemke's path, if asked for               (pivot/tableau.pyx)
     sweeps       the first look of accelerated sweeps                                   (accelerate/accelerated.pyx)
 
-The same kernels in the same order as the solvers call them on any problem, so the same bits and counts. What does not
-end as one hopes, below tol on the judge's own measure, is nobody's result: the caller starts again the long way.
+The same kernels in the same order as the solvers call them on any problem, Lemke's path aside, so the same bits and
+counts. What does not end as one hopes, below tol on the judge's own measure, is nobody's result: the caller starts
+again the long way.
 """
 from libc.stdint cimport int32_t
 
@@ -21,8 +23,11 @@ from lavender_ext.judge.measure import same_bits, velocity_change
 from lavender_ext.judge.watch import Watch
 from lavender_ext.local import gauss_seidel
 from lavender_ext.pivot.principal import SMALL, SOLVED, Pivoting
+from lavender_ext.pivot.tableau import DONE as FOLLOWED
+from lavender_ext.pivot.tableau import follow as lemke
 
 SHIFT = 1e-10                   # of d, as `direct` has it
+TINY = 1e-11                    # of the largest entry of a column, as `lemke` has it
 
 
 cpdef enum:                     # kinds
@@ -35,6 +40,7 @@ cdef enum:
     PIVOT_SWEEPS = 2            # that guess the free rows
     PIVOT_ROUNDS = 32
     CORRECTIONS = 100           # refinements
+    PATH = 8                    # pivots of Lemke's for each row
     PASSES = 100                # around the last answer, where A is singular
     MEMORY = 5                  # sweeps that are combined
     PATIENCE = 500              # of their watch
@@ -69,6 +75,7 @@ cdef class Chain:
     cdef bint busy
     cdef Newton newton
     cdef object pivoting                                # Pivoting
+    cdef Data matrix
     cdef bint linear, symmetric
     cdef object order, rng, prepared
     cdef int split, first_look
@@ -83,22 +90,23 @@ cdef class Chain:
             self.kind = VELOCITIES
         elif matrix is not None:
             self.kind = PIVOTS
-            self.pivoting = Pivoting(matrix, band, None, 1e-13, symmetric)
+            self.pivoting, self.matrix = Pivoting(matrix, band, None, 1e-13, symmetric), matrix
         else:
             self.kind = SWEEPS
             self.order = np.arange(data.blocks.n_blocks, dtype=np.int32)
             self.rng = np.zeros(1, np.uint64)
             self.prepared = gauss_seidel.prepare(data) if exact else None
 
-    def run(self, impulse, double tol, bint look, double warm):
+    def run(self, impulse, double tol, bint look, double warm, bint follow=False):
         """From `impulse` (m,) [N s], or from `start` where it is None: (what the judge finds, what was done).
 
         look: something else comes next. Is `impulse` a solution? And where its residual is above `warm`, pivots start
-        from `start`. None where it does not end below tol, or another thread is here.
+        from `start`. follow: Lemke's path where exchanges are stuck; and what pivots find is good where it is below
+        tol, not to rounding alone. None where it does not end below tol, or another thread is here.
 
         What was done is None where `impulse` is the solution, else counts: of newton (steps, factorisations, updates,
         rounds, evaluations); of pivots (rounds, whether swept, refinements, factorisations, pivots, shifts, rank of a
-        singular linear system or 0); of sweeps (iterations, sweeps, restarts).
+        singular linear system or 0, pivots of Lemke's path); of sweeps (iterations, sweeps, restarts).
         """
         if self.busy:
             return None
@@ -106,7 +114,7 @@ cdef class Chain:
         try:
             if self.kind == VELOCITIES:
                 return self.descend(impulse, tol)
-            return self.look_and_solve(impulse, tol, look, warm)
+            return self.look_and_solve(impulse, tol, look, warm, follow)
         finally:
             self.busy = False
 
@@ -133,7 +141,7 @@ cdef class Chain:
         return found, (STEPS - newton.f.steps, newton.f.factorisations, newton.f.updates, newton.f.rounds,
                        newton.f.evaluations)
 
-    cdef look_and_solve(self, impulse, double tol, bint look, double warm):
+    cdef look_and_solve(self, impulse, double tol, bint look, double warm, bint follow):
         cdef Judged found
         cdef double before = self.start_relative
         if look:
@@ -147,12 +155,10 @@ cdef class Chain:
             if self.kind == PIVOTS and not before <= warm:
                 impulse = None
         own = (self.start if impulse is None else impulse).copy()
-        return self.pivot(own, tol) if self.kind == PIVOTS else self.sweep(own, tol)
+        return self.pivot(own, tol, follow) if self.kind == PIVOTS else self.sweep(own, tol)
 
-    cdef pivot(self, own, double tol):
-        cdef Judged best, found
-        cdef double previous = 1.0 / 0.0
-        cdef int k = 0, done = 1
+    cdef pivot(self, own, double tol, bint follow):
+        cdef int done = 1
         rows = self.pivoting
         rows.renew()
         code, swept = SOLVED, False
@@ -167,9 +173,19 @@ cdef class Chain:
             code, swept = rows.solve(own, PIVOT_SWEEPS, PIVOT_ROUNDS)
             done = rows.n_rounds
             if code == SMALL and self.symmetric:
-                return self.shifted(own, tol, None, done, 0, 0, bool(swept))
-            if code != SOLVED:
-                return None
+                made = self.shifted(own, tol, None, done, 0, 0, bool(swept))
+                if made is not None or not follow:
+                    return made
+        if code == SOLVED:
+            return self.refined(own, tol, done, bool(swept), 0, follow and not self.linear)
+        return self.followed(own, tol, bool(swept)) if follow else None
+
+    cdef refined(self, own, double tol, int done, bint swept, int path, bint enough):
+        """Refinements of the rows found free; `enough`: below tol is."""
+        cdef Judged best, found
+        cdef double previous = 1.0 / 0.0
+        cdef int k = 0
+        rows = self.pivoting
         found = best = self.judged(rows)
         if not is_good(best):
             rows.slack()
@@ -179,15 +195,34 @@ cdef class Chain:
                 rows.slack()
                 k += 1
                 if rows.exchange():
+                    if enough:
+                        break
                     return None
                 found = self.judged(rows)
                 if found.relative < best.relative:
                     best = found
-        if not (is_good(best) or (self.linear and is_rounded(best))):
+        if not (enough or self.is_end(best)):
             return self.shifted(own, tol, best, done, k, 0, False) if self.linear and self.symmetric else None
         if not best.relative <= tol:
             return None
-        return best, (done, bool(swept), k, rows.factorisations, rows.exchanged, 0, 0)
+        return best, (done, swept, k, rows.factorisations, rows.exchanged, 0, 0, path)
+
+    cdef followed(self, own, double tol, bint swept):
+        """Where exchanges are stuck: the sides on which Lemke's path leaves the rows, and exchanges from there."""
+        rows = self.pivoting
+        rows.x[:] = own
+        end, path = lemke(self.matrix, TINY, PATH * self.data.blocks.n_rows, rows.at, rows.x)
+        if end != FOLLOWED:
+            return None
+        found = self.judged(rows)
+        rows.start(0.0)
+        if rows.rounds(PIVOT_ROUNDS) == SOLVED:
+            made = self.refined(own, tol, rows.n_rounds, swept, path, True)
+            if made is not None:
+                return made
+        if not found.relative <= tol:
+            return None
+        return found, (rows.n_rounds, swept, 0, rows.factorisations, rows.exchanged, 0, 0, path)
 
     cdef shifted(self, own, double tol, Judged best, int done, int k, int rank, bint swept):
         """Passes on A + s D around the last answer, which `best` or `own` is; `rank`: 0, or what it is, all rows free.
@@ -235,7 +270,7 @@ cdef class Chain:
             reference = least
         if not self.is_end(best) or not least <= tol:
             return None
-        return best, (done, swept, k, rows.factorisations, rows.exchanged, 1, rank)
+        return best, (done, swept, k, rows.factorisations, rows.exchanged, 1, rank, 0)
 
     cdef bint is_end(self, Judged x):
         # Where every row is free, rounding is all that can be left.

@@ -10,15 +10,30 @@ from then on the complement of the variable that left enters, and the row with t
 
 compared lexicographically: what q + (e, e^2, ...) would decide for a small e > 0. beta is read off (2):
 beta_ij = -t[i, column of w_j], or 1 where w_j itself is basic in row i, else 0.
+
+`lavender/solvers/lemke.py` makes (1) of any bounded rows and follows many paths; for few rows `lav_lemke_rows` does so
+on one, where the diagonal is enough to eliminate free ones.
 """
-from libc.math cimport fabs
+from libc.math cimport INFINITY, fabs, sqrt
 from libc.stdint cimport int32_t, int64_t
+
+import numpy as np
+
+from lavender_ext.core.block cimport blocks_t
+from lavender_ext.core.csr cimport csr_t
+from lavender_ext.core.problem cimport Data
 
 
 cpdef enum:                     # how a path ended
     DONE = 0                    # z left: s solves the problem
     PIVOTS = 1                  # all pivots used
     RAY = 2                     # nothing limits the entering variable
+    HELD = 3                    # a free row is not reached by a pivot of its own
+
+cdef enum:                      # as in principal.pyx
+    FREE = 0
+    AT_LOWER = -1
+    AT_UPPER = 1
 
 
 cdef struct dictionary_t:
@@ -126,6 +141,158 @@ cdef public int32_t lav_lemke_pivots(dictionary_t* d, int32_t pivots, int32_t* d
         var = var - d.n if var >= d.n else var + d.n
         d.entering = -1 - d.where[var]
     return PIVOTS
+
+
+cdef inline void begin(dictionary_t* d) noexcept nogil:
+    # Every w basic, in its own row.
+    cdef int32_t i
+    for i in range(d.n):
+        d.basic[i] = d.where[i] = i
+        d.nonbasic[i] = d.n + i
+        d.where[d.n + i] = -1 - i
+    d.nonbasic[d.n] = 2 * d.n
+    d.where[2 * d.n] = -1 - d.n
+
+
+cdef inline int32_t standard_form(dictionary_t* d, const blocks_t* p, const csr_t* a, int32_t* place,
+                                  int32_t* row) noexcept nogil:
+    """(1) of bounded rows, scaled to d = 1: those that are not fixed, then one for each with two bounds.
+
+    lambda_i = lower + s d^-1/2, or upper - s d^-1/2 where there is no other; a cap is (upper - lower) d^1/2 - s >= 0.
+    row: of each place, of a cap the place that it is for; the number of rows that are not fixed.
+    """
+    cdef int32_t i, j, l, q, k = 0, m = p.n_rows, width
+    cdef double w, scale, base
+    for i in range(m):
+        place[i] = -1
+        if p.lower[i] != p.upper[i]:
+            place[i] = k
+            row[k] = i
+            k += 1
+    d.n = k
+    for j in range(k):
+        if p.lower[row[j]] > -INFINITY and p.upper[row[j]] < INFINITY:
+            row[d.n] = j
+            d.n += 1
+    width = d.n + 2
+    for q in range(d.n * width):
+        d.t[q] = 0.0
+    for j in range(k):
+        i = row[j]
+        scale = turn(p, i)
+        w = -p.b[i]
+        for q in range(a.indptr[i], a.indptr[i + 1]):
+            l = a.indices[q]
+            base = p.lower[l] if p.lower[l] > -INFINITY else (p.upper[l] if p.upper[l] < INFINITY else 0.0)
+            w += a.data[q] * base
+            if place[l] >= 0:
+                d.t[<int64_t>j * width + place[l]] = scale * a.data[q] * turn(p, l)
+        d.t[<int64_t>j * width + d.n + 1] = scale * w
+    for l in range(k, d.n):
+        j = row[l]
+        i = row[j]
+        d.t[<int64_t>j * width + l] = 1.0
+        d.t[<int64_t>l * width + j] = -1.0
+        d.t[<int64_t>l * width + d.n + 1] = (p.upper[i] - p.lower[i]) * sqrt(p.d[i])
+    begin(d)
+    return k
+
+
+cdef inline double turn(const blocks_t* p, int32_t i) noexcept nogil:
+    cdef double scale = 1.0 / sqrt(p.d[i])
+    return scale if p.lower[i] > -INFINITY or p.upper[i] == INFINITY else -scale
+
+
+cdef inline int32_t eliminate(dictionary_t* d, const blocks_t* p, int32_t k, int32_t* row,
+                              int32_t* kept) noexcept nogil:
+    """Free rows made basic for good, and left out; how many of k rows stay, or -1. kept: place of each that does."""
+    cdef int32_t i, j, l, n = 0, stay = 0, width = d.n + 2
+    cdef double size
+    for j in range(k):
+        if p.lower[row[j]] > -INFINITY or p.upper[row[j]] < INFINITY:
+            continue
+        size = 0.0
+        for l in range(d.n):
+            if fabs(d.t[<int64_t>j * width + l]) > size:
+                size = fabs(d.t[<int64_t>j * width + l])
+        if not fabs(d.t[<int64_t>j * width + j]) > 1e-10 * size:
+            return -1
+        lav_dictionary_pivot(d, j, j)
+    for j in range(d.n):
+        if d.basic[j] == j:
+            kept[n] = j
+            n += 1
+            stay += j < k
+    for i in range(n):                                  # no place comes after the one that it is read from
+        for j in range(n):
+            d.t[<int64_t>i * (n + 2) + j] = d.t[<int64_t>kept[i] * width + kept[j]]
+        size = d.t[<int64_t>kept[i] * width + d.n + 1]
+        d.t[<int64_t>i * (n + 2) + n] = 1.0             # covers
+        d.t[<int64_t>i * (n + 2) + n + 1] = size
+    d.n = n
+    begin(d)
+    return stay
+
+
+cdef public int32_t lav_lemke_rows(const blocks_t* p, const csr_t* a, double tiny, int32_t pivots, double* t,
+                                   int32_t* whole, int32_t* at, double* x, int32_t* done) noexcept nogil:
+    """One path of at most so many pivots on bounded rows: on which side each of them ends, into at (m), and where.
+
+    x (m): all but free rows. t, whole: room for a dictionary of 2 m rows, and for 13 m + 2 numbers.
+    """
+    cdef dictionary_t d
+    cdef int32_t i, j, k, r = 0, code, m = p.n_rows
+    cdef int32_t* place = whole
+    cdef int32_t* row = whole + m
+    cdef int32_t* kept = whole + 3 * m
+    d.t = t
+    d.basic = whole + 5 * m
+    d.nonbasic = whole + 7 * m
+    d.where = whole + 9 * m + 1
+    d.tiny = tiny
+    done[0] = 0
+    k = standard_form(&d, p, a, place, row)
+    k = eliminate(&d, p, k, row, kept)
+    if k < 0:
+        return HELD
+    for i in range(d.n):
+        if d.t[<int64_t>i * (d.n + 2) + d.n + 1] <= d.t[<int64_t>r * (d.n + 2) + d.n + 1]:
+            r = i
+    if d.n > 0 and d.t[<int64_t>r * (d.n + 2) + d.n + 1] < 0.0:
+        lav_dictionary_pivot(&d, r, d.n)
+        d.entering = -1 - d.where[d.n + r]
+        code = lav_lemke_pivots(&d, pivots - 1, done)
+        done[0] += 1
+        if code != DONE:
+            return code
+    for i in range(m):
+        at[i] = FREE if place[i] >= 0 else AT_LOWER
+        if place[i] < 0:
+            x[i] = p.lower[i]
+    for j in range(k):
+        i = row[kept[j]]
+        r = d.where[d.n + j]
+        x[i] = p.lower[i] if p.lower[i] > -INFINITY else p.upper[i]
+        if r < 0:
+            at[i] = AT_LOWER if p.lower[i] > -INFINITY else AT_UPPER
+        else:
+            x[i] += turn(p, i) * d.t[<int64_t>r * (d.n + 2) + d.n + 1]
+    for j in range(k, d.n):
+        if d.where[d.n + j] >= 0:
+            at[row[row[kept[j]]]] = AT_UPPER
+    return DONE
+
+
+def follow(Data p, double tiny, int pivots, int32_t[::1] at, double[::1] x):
+    """(how the path ended, its pivots) of bounded rows of A in compressed rows, as `lav_lemke_rows`; `at`, `x` (m,)."""
+    cdef int32_t m = p.blocks.n_rows, code, done
+    cdef double[::1] t = np.empty(2 * m * (2 * m + 2))
+    cdef int32_t[::1] whole = np.empty(13 * m + 2, np.int32)
+    if p.factored or at.shape[0] != m or x.shape[0] != m or m == 0:
+        raise ValueError("A in compressed rows, and a side and a number of each, are needed")
+    with nogil:
+        code = lav_lemke_rows(&p.blocks, &p.csr, tiny, pivots, &t[0], &whole[0], &at[0], &x[0], &done)
+    return code, done
 
 
 cdef class Dictionary:

@@ -139,6 +139,28 @@ def test_few_bounded_rows_that_depend_on_each_other_are_one_shift(solver, seed):
     assert registry.get(solver).few.solve(problem, None, 1e-9) is not None
 
 
+@pytest.mark.parametrize("tol", [1e-3, 1e-9])
+@pytest.mark.parametrize("seed", [7530, 7845, 4691, 7514])  # asymmetric, long, with joints, symmetric
+def test_where_exchanges_of_few_rows_are_stuck_auto_follows_lemkes_path(seed, tol):
+    problem = suite.wild(seed=seed).problem
+    found = check(problem, "auto", tol=tol)
+    assert found.success
+    said = re.fullmatch(
+        r"direct 4 sweeps, \d+ factorisations, (\d+) pivots -> lemke (\d+) pivots", found.message
+    )
+    assert said, found.message
+    assert found.work["pivots"] == int(said[1]) + int(said[2])
+    assert found.iterations > int(said[2])
+    assert registry.get("direct").few.solve(problem, None, tol) is None  # which is exchanges alone
+
+
+def test_few_bounded_rows_that_are_nearly_singular_end_where_that_meets_the_tolerance():
+    problem = suite.wild(seed=7375).problem
+    found = check(problem, "auto", tol=1e-6)
+    assert found.success and found.residual.relative > 1e-13
+    assert found.message.startswith("direct") and "->" not in found.message
+
+
 def test_a_late_solution_is_a_solution():
     problem = draw("general cone", 3)
     late = lv.solve(problem)

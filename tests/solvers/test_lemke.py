@@ -11,6 +11,7 @@ from random_problems import random_lcp, seeds
 import lavender as lv
 from lavender import registry, suite
 from lavender.certificates import check_certificate
+from lavender_ext.pivot.tableau import DONE, HELD, PIVOTS, RAY, follow
 
 
 def accurate(solution):
@@ -57,6 +58,36 @@ def test_every_kind_of_row_against_enumeration(seed, m):
     assert truth
     for x, _ in truth:
         np.testing.assert_allclose(solution.impulse, x, atol=1e-7)
+
+
+@given(seed=seeds, m=st.integers(1, 6))
+def test_a_compiled_path_ends_where_enumeration_does(seed, m):
+    rng = np.random.default_rng(seed)
+    g, skew = rng.normal(size=(2, m, m))
+    a = g @ g.T + 0.5 * np.eye(m) + skew - skew.T
+    low, high = random_bounds(rng, m)
+    problem = lv.Problem.lcp(a, 2.0 * rng.normal(size=m), low, high)
+    at, x = np.full(m, 7, np.int32), np.full(m, np.nan)
+    assert follow(problem.csr_data, 1e-11, 20 * m, at, x)[0] == DONE
+    ((truth, _),) = enumerate_lcp(a, problem.b, low, high)
+    bounded = np.isfinite(low) | np.isfinite(high)
+    np.testing.assert_allclose(x[bounded], truth[bounded], atol=1e-7)
+    assert np.isnan(x[~bounded]).all() and not at[~bounded].any()
+    np.testing.assert_array_equal(truth[at == -1], low[at == -1])
+    np.testing.assert_array_equal(truth[at == 1], high[at == 1])
+    assert set(at) <= {-1, 0, 1}
+
+
+def test_a_compiled_path_stops_at_its_pivots_at_a_ray_and_before_free_rows_it_cannot_eliminate():
+    at, x = np.zeros(2, np.int32), np.zeros(2)
+    problem = lv.Problem.lcp(np.eye(2), [1.0, 2.0])
+    assert follow(problem.csr_data, 1e-11, 1, at, x) == (PIVOTS, 1)
+    assert follow(problem.csr_data, 1e-11, 9, at, x)[0] == DONE
+    np.testing.assert_allclose(x, [1.0, 2.0])
+    ray = lv.Problem.lcp([[1.0, -1.0], [-1.0, 1.0]], [1.0, 1.0])
+    assert follow(ray.csr_data, 1e-11, 9, at, x)[0] == RAY
+    saddle = lv.Problem.lcp([[1.0, 1.0], [-1.0, 1e-14]], [1.0, 1.0], [0.0, -np.inf], [np.inf, np.inf])
+    assert follow(saddle.csr_data, 1e-11, 9, at, x)[0] == HELD
 
 
 @given(seed=seeds, m=st.integers(1, 6))
