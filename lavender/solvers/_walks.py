@@ -26,7 +26,7 @@ from lavender.solvers._newton.systems import AUGMENTED, DENSE_FILL, DENSE_ROWS, 
 from lavender.solvers._sweepers import SWEEPER, Glance, Sweeps
 from lavender.solvers._trail import Trail
 
-__all__ = ["OTHER", "Walks", "sweeps_of"]
+__all__ = ["OTHER", "Walks", "in_turns", "sweeps_of"]
 
 WALK = 8  # factorisations of a walk,
 EARLY, GAIN = 3, 0.95  # of which so many have to leave that share of the residual
@@ -140,3 +140,21 @@ def sweeps_of(trail: Trail, budget: int, **options: Any) -> Sweeps:
     if problem.law != "coulomb" or problem.generalized is not None or not FEW < problem.m < MOST:
         return Sweeps(trail, **options)
     return Walks(trail, budget, **options)
+
+
+def in_turns(trail: Trail, sweeps: Sweeps, budget: int) -> bool:
+    """Few rows, where sweeps gave way: others from the beginning and these in turns, each from where it stood.
+
+    Twice as many in each turn as were done, as long as that is counted for less than a finite solver; True when nothing
+    is left to do.
+    """
+    other = Sweeps(trail, **OTHER)
+    other.impulse, other.last = trail.problem.start(), 1.0
+    while sweeps.done * sweeps.per <= trail.costs.cheapest:
+        before = trail.iterations
+        for each in (other, sweeps):
+            if each.run(budget, cap=2 * sweeps.done):
+                return True
+        if trail.iterations == before:
+            break  # nobody is left
+    return trail.done

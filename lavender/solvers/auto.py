@@ -15,8 +15,8 @@
     coulomb           loose and large piles: sweeps (nncg in both directions from LARGE rows on) race those of the
                       convex relaxation, whose answer is the Coulomb answer wherever contacts stick; where they stall,
                       what is wrong is solved in patches between sweeps (`_race.py`, `_patches.py`); between sweeps of
-                      rows or of a matrix Newton's method walks a few steps (`_walks.py`), over velocities it takes
-                      turns with them (`_velocities.py`)
+                      rows or of a matrix Newton's method walks a few steps, few rows have turns of other sweeps
+                      instead (`_walks.py`), over velocities it takes turns with them (`_velocities.py`)
 
 Costs are counted from the structure (`_costs.py`) and from the contraction of sweeps that were done, never timed:
 the same problem is solved the same way everywhere. Islands are solved apart, each to its share of the whole error,
@@ -52,7 +52,7 @@ from lavender.solvers._together import solve_islands, worth_together
 from lavender.solvers._trail import Trail
 from lavender.solvers._turns import VELOCITY, Turns, whole
 from lavender.solvers._velocities import alternate
-from lavender.solvers._walks import Walks, sweeps_of
+from lavender.solvers._walks import Walks, in_turns, sweeps_of
 
 LARGE = 4000  # rows of J from which friction is swept both ways, and beside its relaxation
 HUGE = 40_000  # rows from which friction is left to sweeps before any factorisation
@@ -173,6 +173,9 @@ def _solve(trail: Trail, budget: int, glance: Glance | None = None, fills: bool 
         if relax and race(trail, sweeps, budget):
             return
         if sweeps.run(budget):
+            return
+        few = problem.m <= FEW and problem.law == "coulomb" and problem.generalized is None
+        if few and in_turns(trail, sweeps, budget):
             return
     if costs.few_bounded and whole(trail, HASTY, budget):
         return
