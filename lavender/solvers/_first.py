@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from lavender.cones import ROW
 from lavender.problem import LAWS, Problem
 from lavender.registry import FEW
 from lavender.solvers import _rates as rates
@@ -25,6 +24,7 @@ from lavender.solvers._islands import block_bodies
 from lavender.solvers._newton.general import factor_flops
 from lavender_ext.core import assemble
 from lavender_ext.factor import graph
+from lavender_ext.few.many import contacts_are_soft
 from lavender_ext.pivot.principal import bandwidth
 
 # Of few rows under Coulomb's law, up to so many: Newton's method over velocities costs less than sweeps where so much
@@ -79,7 +79,7 @@ def general_first(problem: Problem, largest: int) -> bool:
         _, row, flop, most, _ = FEW_GATE
         if row * problem.m + flop * factor_flops(problem, largest) <= most:
             return True
-        if not contacts_are_soft(problem):
+        if not contacts_are_soft(problem.metric, rates.SOFT):
             return False
     if cost <= rates.GENERAL_FIRST:
         return True
@@ -112,13 +112,6 @@ def general_first(problem: Problem, largest: int) -> bool:
 def general_second(problem: Problem) -> bool:
     """The same right after a first look at sweeps: of few rows Python takes longer to compare costs."""
     return problem.law == "coulomb" and problem.m <= FEW
-
-
-def contacts_are_soft(problem: Problem) -> bool:
-    """Every row of every contact has SOFT d of its own, so that Newton's method over velocities adds nothing to it."""
-    assert problem.compliance is not None
-    of_contact = np.repeat(problem.cones.kind != ROW, np.diff(problem.cones.ptr))
-    return bool(np.all(problem.compliance[of_contact] >= rates.SOFT * problem.d[of_contact]))
 
 
 def joints_before_count(problem: Problem) -> bool:

@@ -131,15 +131,17 @@ def look_first(
     looks.run(lam, before, most, tol, sweeps, rates.FIRST_LOOK, per, 0.0, 0.0)
     now = looks.now.relative
     if now > tol and looks.status == RUNNING and looks.done < most and not carried:
-        least = formed_cost(problem) + finite_least(problem, True if general else None)
-        believed = BELIEVED
+        left = limit - looks.done * per
         if general and few and largest:
-            # Which mostly takes what it is counted for: no more than that is believed of sweeps.
-            least, believed = min(least, velocities_cost(problem, largest)), 1.0
-        least = min(least, (limit - looks.done * per) / BELIEVED)
-        if sweeps_left(looks.last, before, now, tol) * per <= least and looks.done * per <= believed * least:
+            # Newton over velocities comes next: they have as long as it mostly takes, whatever they promise.
+            least, believed = np.inf, min(velocities_cost(problem, largest), left)
+        else:
+            least = formed_cost(problem) + finite_least(problem, True if general else None)
+            least = min(least, left / BELIEVED)
+            believed = BELIEVED * least
+        if sweeps_left(looks.last, before, now, tol) * per <= least and looks.done * per <= believed:
             more = min(max(looks.done // 2, rates.FIRST_LOOK), most - looks.done)
-            looks.run(lam, now, most, tol, more, rates.FIRST_LOOK, per, least, believed * least)
+            looks.run(lam, now, most, tol, more, rates.FIRST_LOOK, per, least, believed)
     if looks.now.relative <= tol:
         remember(problem, looks.now)
     return Glance(problem, looks, lam, looks.before)

@@ -52,6 +52,13 @@ cdef inline bint are_soft(const blocks_t* p, const generalized_t* g, double shar
     return True
 
 
+def contacts_are_soft(Data p, double share):
+    """Has every row of every contact of J and M `share` d of its own?"""
+    if not (p.is_general and p.ready):
+        raise ValueError("J and M are needed, and d")
+    return bool(are_soft(&p.blocks, &p.general, share))
+
+
 cdef inline bint is_first(const job_t* j, const gate_t* gate, int32_t largest) noexcept nogil:
     """The first tests of `general_first` in lavender/solvers/_first.py, in the same order of operations."""
     cdef double flops, cost, entries

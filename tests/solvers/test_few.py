@@ -14,12 +14,13 @@ from random_trees import random_general
 
 import lavender as lv
 from lavender import registry, suite
+from lavender.cones import ROW
 from lavender.registry import FEW
 from lavender.solvers._few import GATE
 from lavender.solvers._first import general_first
 from lavender.solvers._newton import general
 from lavender.solvers._rates import SOFT
-from lavender_ext.few.many import solve_first
+from lavender_ext.few.many import contacts_are_soft, solve_first
 
 SHORT = ("auto", "direct", "newton")
 TIMES = ("setup_time", "solve_time", "_rest")
@@ -233,6 +234,19 @@ def test_sweeps_over_few_velocities_make_way_for_newton(seed, ran):
     assert facts(together) == facts(short)
     limited = lv.solve(replace(problem, copy=False), time_limit=10.0)
     assert facts(limited) == facts(short), "a limit chooses nothing"
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_contacts_are_soft_where_each_of_their_rows_is(seed):
+    problem = random_general(seed, "coulomb", n=20, compliance=False, contacts=6)
+    rows = np.repeat(problem.cones.kind != ROW, np.diff(problem.cones.ptr))
+    assert rows.any()
+    for share, soft in ((0.5, False), (2.0, True)):
+        compliance = share * SOFT * problem.d * rows  # joints and limits do not count
+        made = replace(problem, compliance=compliance, copy=False)
+        assert contacts_are_soft(made.metric, SOFT) is soft
+    compliance = np.where(np.arange(problem.m) == np.flatnonzero(rows)[-1], 0.1, 1.0) * compliance
+    assert not contacts_are_soft(replace(problem, compliance=compliance, copy=False).metric, SOFT)
 
 
 @pytest.mark.parametrize("seed", range(40))
