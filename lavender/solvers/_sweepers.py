@@ -129,22 +129,35 @@ def look_first(
     most = min(n, 2**31 - 1)
     # What else there is is asked for where the first look is not the end: of a matrix that takes reading it.
     looks.run(lam, before, most, tol, sweeps, rates.FIRST_LOOK, per, 0.0, 0.0)
-    now = looks.now.relative
-    if now > tol and looks.status == RUNNING and looks.done < most and not carried:
+    if looks.now.relative > tol and not carried:
         left = limit - looks.done * per
-        if general and few and largest:
-            # Newton over velocities comes next: they have as long as it mostly takes, whatever they promise.
-            least, believed = np.inf, min(velocities_cost(problem, largest), left)
-        else:
-            least = formed_cost(problem) + finite_least(problem, True if general else None)
-            least = min(least, left / BELIEVED)
-            believed = BELIEVED * least
-        if sweeps_left(looks.last, before, now, tol) * per <= least and looks.done * per <= believed:
-            more = min(max(looks.done // 2, rates.FIRST_LOOK), most - looks.done)
-            looks.run(lam, now, most, tol, more, rates.FIRST_LOOK, per, least, believed)
+        for least, believed in _allowed(problem, few, largest, left):
+            now = looks.now.relative
+            if not now > tol or looks.status != RUNNING or looks.done >= most:
+                break
+            rest = sweeps_left(looks.last, looks.before, now, tol)
+            if rest * per <= least and looks.done * per <= believed:
+                more = min(max(looks.done // 2, rates.FIRST_LOOK), most - looks.done)
+                looks.run(lam, now, most, tol, more, rates.FIRST_LOOK, per, least, believed)
     if looks.now.relative <= tol:
         remember(problem, looks.now)
     return Glance(problem, looks, lam, looks.before)
+
+
+def _allowed(problem: Problem, few: bool, largest: int, left: float) -> list[tuple[float, float]]:
+    """How long a first look goes on [ns], in stages: while the rest is promised for so much, until so much is spent.
+
+    Of `few` rows Python takes as long to compare costs as many sweeps: as much as these then have on hope, they have
+    here. `largest` as of `look_first`, `left`: until the time limit.
+    """
+    general = problem.generalized is not None
+    if general and few and largest:
+        # Newton over velocities comes next: as long as it mostly takes, whatever they promise.
+        return [(np.inf, min(velocities_cost(problem, largest), left))]
+    least = formed_cost(problem) + finite_least(problem, True if general else None)
+    least = min(least, left / BELIEVED)
+    promised = (least, BELIEVED * least)
+    return [(np.inf, HOPE * least), promised] if few else [promised]
 
 
 class Sweeps:

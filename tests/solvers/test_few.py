@@ -20,6 +20,7 @@ from lavender.solvers._few import GATE
 from lavender.solvers._first import general_first
 from lavender.solvers._newton import general
 from lavender.solvers._rates import SOFT
+from lavender.solvers._sweepers import look_first
 from lavender_ext.few.many import contacts_are_soft, solve_first
 
 SHORT = ("auto", "direct", "newton")
@@ -234,6 +235,16 @@ def test_sweeps_over_few_velocities_make_way_for_newton(seed, ran):
     assert facts(together) == facts(short)
     limited = lv.solve(replace(problem, copy=False), time_limit=10.0)
     assert facts(limited) == facts(short), "a limit chooses nothing"
+
+
+@pytest.mark.parametrize("limit", [None, 10.0])
+def test_a_first_look_at_sweeps_of_few_rows_goes_on_where_they_promise_nothing(limit):
+    problem = suite.wild(seed=7734).problem  # of 15 rows: 0.96 after 16 sweeps, 0.96 after 48
+    glance = look_first(problem, problem.start(), 10_000, 1e-6, False, limit)
+    assert glance.best <= 1e-6 and glance.done > 48
+    many = suite.wild(seed=6140).problem  # of 114, whose sweeps stall as well
+    glance = look_first(many, many.start(), 10_000, 1e-6, False, limit)
+    assert glance.done < 32 and glance.best > 0.1
 
 
 @pytest.mark.parametrize("seed", range(8))
