@@ -47,6 +47,7 @@ GENERAL_SOFT = (
 # and sweeps: all that Python does for them, so many as end half of these, and each row in one of them.
 FEW_CALL, FEW_STEPS, FEW_STEP_ROW, FEW_STEP_FLOP = 30e3, 22.0, 60.0, 0.09
 FEW_LOOK, FEW_SWEEPS, FEW_SWEEP_ROW = 40e3, 25.0, 40.0
+FEW_SWEEP = 150.0  # of a sweep of few rows of A beside its multiply-adds: what it takes to mix
 SOFT = 1e-3  # of d, that rows of soft contacts have of their own (`soften` in lavender_ext/generalized/newton.pxd)
 # The same under Coulomb's law where soft rows are many: a step, for each row in it, and steps as they usually are (8 to
 # 33 on flexes of 1,800 to 10,200 rows; what few rows cost above holds their tails, too).

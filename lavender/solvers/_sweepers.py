@@ -131,6 +131,8 @@ def look_first(
     looks.run(lam, before, most, tol, sweeps, rates.FIRST_LOOK, per, 0.0, 0.0)
     if looks.now.relative > tol and not carried:
         left = limit - looks.done * per
+        if few:
+            per = rates.FEW_SWEEP_ROW * problem.m if general else per + rates.FEW_SWEEP
         for least, believed in _allowed(problem, few, largest, left):
             now = looks.now.relative
             if not now > tol or looks.status != RUNNING or looks.done >= most:

@@ -16,10 +16,11 @@ import lavender as lv
 from lavender import registry, suite
 from lavender.cones import ROW
 from lavender.registry import FEW
+from lavender.solvers import _rates as rates
+from lavender.solvers._counts import velocities_cost
 from lavender.solvers._few import GATE
 from lavender.solvers._first import general_first
 from lavender.solvers._newton import general
-from lavender.solvers._rates import SOFT
 from lavender.solvers._sweepers import look_first
 from lavender_ext.few.many import contacts_are_soft, solve_first
 
@@ -247,17 +248,27 @@ def test_a_first_look_at_sweeps_of_few_rows_goes_on_where_they_promise_nothing(l
     assert glance.done < 32 and glance.best > 0.1
 
 
+@pytest.mark.parametrize("seed", [1224, 4967, 7495])  # of 48, 36, 18 rows, which sweeps do not end
+def test_sweeps_over_few_velocities_have_as_long_as_newton_mostly_takes(seed):
+    problem = suite.wild(seed=seed).problem
+    largest = general.prepare(problem).largest
+    glance = look_first(problem, problem.start(), 10_000, 1e-6, False, None, largest=largest)
+    cost = glance.done * rates.FEW_SWEEP_ROW * problem.m
+    assert glance.best > 1e-6
+    assert 1.0 < cost / velocities_cost(problem, largest) < 1.6  # looks come when half as many more were done
+
+
 @pytest.mark.parametrize("seed", range(8))
 def test_contacts_are_soft_where_each_of_their_rows_is(seed):
     problem = random_general(seed, "coulomb", n=20, compliance=False, contacts=6)
     rows = np.repeat(problem.cones.kind != ROW, np.diff(problem.cones.ptr))
     assert rows.any()
     for share, soft in ((0.5, False), (2.0, True)):
-        compliance = share * SOFT * problem.d * rows  # joints and limits do not count
+        compliance = share * rates.SOFT * problem.d * rows  # joints and limits do not count
         made = replace(problem, compliance=compliance, copy=False)
-        assert contacts_are_soft(made.metric, SOFT) is soft
+        assert contacts_are_soft(made.metric, rates.SOFT) is soft
     compliance = np.where(np.arange(problem.m) == np.flatnonzero(rows)[-1], 0.1, 1.0) * compliance
-    assert not contacts_are_soft(replace(problem, compliance=compliance, copy=False).metric, SOFT)
+    assert not contacts_are_soft(replace(problem, compliance=compliance, copy=False).metric, rates.SOFT)
 
 
 @pytest.mark.parametrize("seed", range(40))
@@ -268,7 +279,7 @@ def test_the_compiled_gate_lets_in_what_comes_first(seed):
     contacts = int(rng.integers(0, 30))
     problem = random_general(seed, friction, n=int(rng.integers(6, 40)), compliance=False, contacts=contacts)
     for share in (0.0, 0.5, 2.0):
-        made = replace(problem, compliance=share * SOFT * problem.d, copy=False)
+        made = replace(problem, compliance=share * rates.SOFT * problem.d, copy=False)
         kernel = general.prepare(made)
         found = solve_first(made.metric, None, np.inf, GATE, general.ROOM)
         assert (found is not None) == general_first(made, kernel.largest)
