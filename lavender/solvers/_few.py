@@ -106,7 +106,7 @@ class Few:
                 gate = GATE if self.looks else LOOSE
                 found = solve_first(kept.view, impulse, tol, gate, general.ROOM) if tol > 0.0 else None
                 if found is not None:
-                    return found
+                    return found or None  # the chain would take the same steps in vain
                 chain = prepared(problem)
         else:
             chain = prepared(problem)

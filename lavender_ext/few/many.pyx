@@ -139,9 +139,9 @@ cdef void solve_made(job_t* j, space_t* space, const gate_t* gate, double tol, d
                     break
     aim_at(&f, tol, STEPS, j.begin[0], j.begin[1])
     end = descend_all(&f, j.lam, cold)
+    j.counts[0] = STEPS - f.steps
     if end != DONE:
         return
-    j.counts[0] = STEPS - f.steps
     j.counts[1] = f.factorisations
     j.counts[2] = f.updates
     j.counts[3] = f.rounds
@@ -202,8 +202,8 @@ def solve_first(Data p, start, double tol, Gate gate, double most):
     """A problem of at least one row that nobody has looked at: what is worked out of its data, solved, judged, at once.
 
     From `start` (m,) [N s], or from doing nothing where it is None. What the judge finds and the counts, as
-    `Batch.judged`; None where it does not end below tol, has empty rows or costs more than the gate lets in. d, Y and the
-    error of doing nothing stay with the data.
+    `Batch.judged`; False where it does not end below tol, None where it was not tried: it has empty rows or costs more than
+    the gate lets in. d, Y and the error of doing nothing stay with the data.
     """
     cdef job_t j
     cdef space_t space
@@ -229,6 +229,7 @@ def solve_first(Data p, start, double tol, Gate gate, double most):
     j.lam = &lam[0]
     j.both = &both[0]
     j.end = LEFT
+    j.counts[0] = 0
     space.marks = NULL
     space.numbers = NULL
     space.n_marks = space.n_numbers = 0
@@ -251,7 +252,7 @@ def solve_first(Data p, start, double tol, Gate gate, double most):
         p.set_start(j.begin[0], j.begin[1])
         p.start_relative = j.begin[2]
     if j.end != SOLVED:
-        return None
+        return False if j.counts[0] > 0 else None
     return judged_from(p, impulse, results, &j.score, j.relative, j.floor), (
         j.counts[0], j.counts[1], j.counts[2], j.counts[3], j.counts[4])
 

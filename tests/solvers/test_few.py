@@ -258,6 +258,16 @@ def test_sweeps_over_few_velocities_have_as_long_as_newton_mostly_takes(seed):
     assert 1.0 < cost / velocities_cost(problem, largest) < 1.6  # looks come when half as many more were done
 
 
+@pytest.mark.parametrize("seed", [1076, 3352])  # of 48 rows, for which newton takes more than 64 steps
+def test_steps_over_few_velocities_that_were_in_vain_are_not_taken_twice_in_one_call(seed):
+    problem = suite.wild(seed=seed).problem
+    assert solve_first(replace(problem, copy=False).metric, None, 1e-6, GATE, general.ROOM) is False
+    fresh = replace(problem, copy=False)
+    assert registry.get("auto").few.solve(fresh, None, 1e-6) is None
+    assert fresh.derived.chain is None
+    check(problem, "auto", tol=1e-6)
+
+
 @pytest.mark.parametrize("seed", range(8))
 def test_contacts_are_soft_where_each_of_their_rows_is(seed):
     problem = random_general(seed, "coulomb", n=20, compliance=False, contacts=6)

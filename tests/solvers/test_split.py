@@ -205,7 +205,7 @@ def alone(part, law, start, tol, options):
             if ended:
                 return lam, True
         found = solve_first(part.derived.view, start, tol, GATE, general.ROOM)
-        return (start, False) if found is None else (found[0].impulse, True)
+        return (start, False) if not found else (found[0].impulse, True)
     data = part.metric
     if options[5] and part.is_symmetric:
         band = max(part.bandwidth)
