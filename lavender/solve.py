@@ -330,9 +330,11 @@ class _Loop:
         chunk = min(FIRST_CHUNK, max(1, int(CHUNK_TIME * 1e9) // max(1, self.problem.metric.work)))
         records = self.rows is not None or self.callback is not None
         claim = NOTHING_DONE
-        if self.time_limit is not None and hasattr(self.solver, "until"):
-            # Of what cannot be cut into chunks: a factor that would end too late is not begun.
-            self.solver.until(self.state, perf_counter() + self.time_limit)
+        if self.time_limit is not None:
+            chunk = 1  # what a solver takes need not be what is counted: over J and M some sweep over A
+            if hasattr(self.solver, "until"):
+                # Of what cannot be cut into chunks: a factor that would end too late is not begun.
+                self.solver.until(self.state, perf_counter() + self.time_limit)
         try:
             if records and self._record():
                 return self._total(Claim(INTERRUPTED, 0, {}, "stopped by the callback"))

@@ -44,6 +44,7 @@ STABLE = 1e-2  # -, a diagonal entry of this share of its row and column makes a
 BATCH = 200  # pivots after which the dictionary is formed anew, which drops what rounding left
 CLOCK = 0.01  # s between two looks at the clock, at
 ENTRY, FORMED = 1e-9, 5e-10  # s for each entry of the dictionary in a pivot, and n^3 times to form it anew
+LAID_OUT = 5e-8  # s for each entry of the first dictionary; FORMED for each that a free row's pivot touches
 PATHS = 8  # covering vectors tried
 PIVOTS_A_ROW = 20  # on one path, before it counts as lost
 GOOD = 1e-12  # relative residual at which no other path is tried
@@ -183,19 +184,37 @@ def _principal_pivot(m: FloatArray, q: FloatArray, rows: Places) -> tuple[FloatA
 
 @dataclass
 class LemkeState:
-    """A problem in standard form, and the paths followed on it so far."""
+    """A problem, in standard form from the first run on, and the paths followed on it so far."""
 
-    form: Standard
+    problem: Problem
+    form: Standard | None = None
     walk: Walk | None = None
+
+    def ready(self, impulse: FloatArray, anew: bool, time_limit: float | None) -> Walk | None:
+        """Paths from an impulse (m,), or those that were begun; None where the standard form would take longer."""
+        if self.form is None:
+            if time_limit is not None and _counted(self.problem) > time_limit:
+                return None
+            self.form = standard_form(self.problem)
+        if self.walk is None or anew:
+            self.walk = Walk(self.form, impulse)
+        return self.walk
+
+
+def _counted(problem: Problem) -> float:
+    """What the standard form takes [s]."""
+    c = problem.cones
+    low, high = np.isfinite(c.lower), np.isfinite(c.upper)
+    n = problem.m + np.count_nonzero(low & high)
+    return float(LAID_OUT * n**2 + FORMED * n**2 * np.count_nonzero(~low & ~high))
 
 
 @dataclass(frozen=True)
 class Lemke:
     """Lemke's complementary pivoting; one path, no options."""
 
-    @np.errstate(all="ignore")  # what overflows is judged
     def prepare(self, problem: Problem) -> LemkeState:
-        return LemkeState(standard_form(problem))
+        return LemkeState(problem)
 
     def update(self, state: LemkeState, problem: Problem) -> LemkeState:
         return self.prepare(problem)
@@ -204,16 +223,26 @@ class Lemke:
     def run(
         self, state: LemkeState, impulse: FloatArray, n: int, tol: float, time_limit: float | None = None
     ) -> Claim:
-        return Walk(state.form, impulse).go(impulse, n, tol, time_limit)
+        return self._go(state, impulse, n, tol, time_limit, True)
 
     @np.errstate(all="ignore")  # what overflows is judged
     def resume(
         self, state: LemkeState, impulse: FloatArray, n: int, tol: float, time_limit: float | None = None
     ) -> Claim:
         """At most n more pivots from where the last call stopped: n, then n, end where 2 n do."""
-        if state.walk is None:
-            state.walk = Walk(state.form, impulse)
-        return state.walk.go(impulse, n, tol, time_limit)
+        return self._go(state, impulse, n, tol, time_limit, False)
+
+    def _go(
+        self, state: LemkeState, impulse: FloatArray, n: int, tol: float, time_limit: float | None, anew: bool
+    ) -> Claim:
+        start = perf_counter()
+        walk = state.ready(impulse, anew, time_limit)
+        if walk is None:
+            return Claim(
+                Status.TIME_LIMIT, 0, {"pivots": 0}, "the dictionary alone would take longer", form="dense"
+            )
+        left = None if time_limit is None else max(time_limit - (perf_counter() - start), 1e-3)
+        return walk.go(impulse, n, tol, left)
 
 
 class Walk:
@@ -341,6 +370,8 @@ class Walk:
             self.ray(t, basic, nonbasic, book.entering)
             return
         self.message = ""
+        while self.late(FORMED * float(n) ** 3):
+            yield self.cut(t, basic)
         self.finish(basic)
 
     def cut(self, t: FloatArray, basic: IntArray) -> Status:

@@ -1,6 +1,7 @@
 """The front door: what it refuses before anything runs, budgets, clocks, history, callbacks, Ctrl-C."""
 
 import dataclasses
+import itertools
 
 import numpy as np
 import pytest
@@ -144,3 +145,20 @@ def test_zero_iterations_judge_the_start():
     solution = lv.solve(TINY, "pgs", max_iter=0)
     assert solution.iterations == 0
     assert solution.residual.relative == lv.residual(TINY, TINY.start()).relative == 1.0
+
+
+@pytest.mark.parametrize("limit", [None, 10.0])
+def test_with_a_time_limit_the_first_look_at_the_clock_is_after_one_iteration(monkeypatch, limit):
+    from lavender.solvers.jacobi import Jacobi
+
+    asked, own = [], Jacobi.run
+
+    def run(self, state, impulse, n, tol, time_limit=None):
+        asked.append(n)
+        return own(self, state, impulse, n, tol, time_limit)
+
+    monkeypatch.setattr(Jacobi, "run", run)
+    problem = suite.stack(8).problem
+    lv.solve(problem, "jacobi", tol=1e-12, max_iter=500, time_limit=limit)
+    assert (asked[0] == 1) == (limit is not None)
+    assert all(later <= 8 * one for one, later in itertools.pairwise(asked))

@@ -17,10 +17,12 @@ from lavender.solution import Claim, Status
 from lavender_ext.generalized.newton import ENDS, Newton
 
 FORM = "generalized velocities"
-# Steps for each island between two looks at the clock and at Ctrl-C; with a time limit at most as
-# many as this share of it is for at FLOP, and then as what is left is for at the pace so far.
+# Steps for each island between two looks at the clock and at Ctrl-C. With a time limit at most as many as a share of
+# what is left is for: at FLOP, LOOKED_UP times as much where a sparse factor looks for its entries, then at the pace
+# so far.
 CLOCK = 64
-FIRST_SHARE = 0.5
+TIME_SHARE = 0.5
+LOOKED_UP = 20.0
 LATE = 0.05  # s that a step may end after the limit
 FLOP = 1e-10  # s for each multiply-add of a dense factor
 CLOSEST = 1e-2  # of tol, up to which the kernel is asked again where the judge does not find what it found
@@ -72,11 +74,11 @@ def run(
     cold = _is_cold(problem, impulse)
     counts = np.zeros(5, np.int64)
     status, closer = Status.MAX_ITERATIONS, 1.0
-    begun = perf_counter()
+    begun = now = perf_counter()
     clock = CLOCK * max(1, kernel.islands)  # a step is one of an island
     steps, step = clock, FLOP * factor_flops(problem, kernel.largest)
     if time_limit is not None:
-        steps = max(1, int(min(FIRST_SHARE * time_limit / max(step, 1e-9), clock)))
+        steps = max(1, int(min(TIME_SHARE * time_limit / max(LOOKED_UP * step, 1e-9), clock)))
     while counts[0] < n:
         if perf_counter() + min(step, 1e6) > deadline + LATE:
             status = Status.TIME_LIMIT
@@ -95,13 +97,13 @@ def run(
                 status = Status.STALLED
         if status is not Status.MAX_ITERATIONS:
             break
-        now = perf_counter()
+        last, now = now, perf_counter()
         if now > deadline:
             status = Status.TIME_LIMIT
             break
         if time_limit is not None:
-            step = (now - begun) / max(1, int(counts[0]))
-            steps = max(1, int(min(clock, (deadline - now) / max(step, 1e-9))))
+            step = max((now - begun) / max(1, int(counts[0])), (now - last) / max(1, int(done[0])))
+            steps = max(1, int(min(clock, TIME_SHARE * (deadline - now) / max(step, 1e-9))))
     return claim(status, counts)
 
 
