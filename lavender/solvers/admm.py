@@ -6,8 +6,8 @@ in the metric of d: B = D^-1/2 A D^-1/2, c = D^-1/2 b, K the bounds and cones of
 Saxce's shift of Coulomb's law (`lavender_ext/accelerate/admm.pyx`). One triangular solve an iteration instead of a
 sweep, so mass ratios and long chains cost factorisations (rho is weighed ever more rarely), not sweeps.
 Friction starts from the convex answer.
-Cholesky of a dense A, L D L^T of a sparse one or, where rows have fewer body unknowns than rows, of the
-body form; L U where A is not symmetric.
+Cholesky of a dense A, L L^T by panels of a sparse one or, where rows have fewer body unknowns than rows, of the
+body form; L U by panels where A is not symmetric.
 """
 
 from __future__ import annotations
@@ -20,32 +20,33 @@ import numpy as np
 import scipy.sparse as sp
 
 from lavender._arrays import FloatArray
-from lavender._lu import sparse_lu
 from lavender.errors import InputError
 from lavender.problem import Problem
 from lavender.registry import SolverSpec
 from lavender.residuals import reference
 from lavender.solution import Claim, Status
 from lavender.solvers._accelerated import LARGEST_MEMORY
+from lavender.solvers._factor import GENERAL_LIMIT, PANELS_WORK, TINY, WIDE
 from lavender.solvers._islands import block_bodies
 from lavender.solvers._newton.pattern import block_pattern
-from lavender.solvers._newton.systems import factor_cost
+from lavender.solvers._newton.sparse import BACKWARD
+from lavender.solvers._newton.systems import DENSE_FILL, factor_cost
 from lavender.solvers._sweeping import claim
 from lavender_ext.accelerate import admm
 from lavender_ext.factor import symbolic
+from lavender_ext.factor.sparse import SparsePanels, is_mirrored
 from lavender_ext.judge import watch
+from lavender_ext.newton.band import scaled_entries
 
-_DENSE, _SYMMETRIC, _GENERAL, _BODIES = 0, 1, 2, 3
-_DENSE_ABOVE = 0.15  # share of nonzeros from which LAPACK on the full matrix is the faster factorisation
+_DENSE, _PANELS, _BODIES = 0, 1, 2  # as the kernel names them
 _START_RHO = 0.1  # B has unit diagonal, so 1 is its scale; measured
 _PATIENCE = 5000  # iterations: on mass ratios the residual rises while rho finds its place
 
 
 _LATE = "the next factorisation would end after the time limit"
 _AT_ONCE = 0.02  # s, that a factor may be expected to take for `prepare` to make it
-# s for each multiply-add of a factor over bodies by QDLDL, and of a dense one; for each nonzero of a sparse one, with
-# as many times more as it has thousands of rows (`_rates.py`).
-_BODY, _FULL, _SPARSE, _SPARSE_ROWS = 3.5e-9, 1.5e-10, 1e-7, 1000.0
+# s for each multiply-add of a factor by panels, and of a dense one.
+_PANELS_WORK, _FULL = 1e-9 * PANELS_WORK, 1.5e-10
 
 
 class _Failed(Exception):
@@ -72,6 +73,8 @@ class AdmmState:
         self.factorisations = self.reported = 0  # all, and those that an earlier run has told
         rows = problem.rows
         self.matrix: Any = None
+        self.panels: Any = None  # analysed, of the matrix
+        self.lu = self.full = False  # L U, and of a matrix with an entry everywhere
         if rows is not None and 0 < 6 * rows.n_bodies < problem.m:
             try:
                 form = problem.velocity_form()
@@ -84,14 +87,16 @@ class AdmmState:
             self.jacobian = k
         else:
             a = problem.csr
-            scale = sp.diags_array(1.0 / self.root)
-            self.matrix = sp.csr_array(scale @ a @ scale)
-            if not problem.is_symmetric:
-                self.kind = _GENERAL
-            elif self.matrix.nnz > _DENSE_ABOVE * problem.m**2 and problem.m > 1:
+            values = scaled_entries(a.indptr, a.indices, a.data, 1.0 / self.root)
+            self.matrix = sp.csr_array((values, a.indices, a.indptr), shape=a.shape)
+            self.lu = not problem.is_symmetric
+            if not self.lu and self.matrix.nnz > DENSE_FILL * problem.m**2 and problem.m > 1:
                 self.kind, self.matrix = _DENSE, self.matrix.toarray()
             else:
-                self.kind = _SYMMETRIC
+                self.kind = _PANELS
+                if problem.m:
+                    self.matrix = _mirrored(self.matrix)
+                    self.panels = SparsePanels(*_arrays(self.matrix)[:2], self.lu, WIDE)
         self.stop_at = np.inf  # of perf_counter: no factor is begun that is expected to end later
         self.seconds = self._expected()  # of the next factor
         self.factor: Any = self._factor() if self.seconds <= _AT_ONCE else None
@@ -104,8 +109,8 @@ class AdmmState:
         if self.kind == _BODIES:
             assert problem.rows is not None
             nptr, nind = block_pattern(problem.rows.n_bodies, block_bodies(problem))[:2]
-            return _BODY * factor_cost(symbolic.factor_pattern(nptr, nind)[0], 6)
-        return _SPARSE * self.matrix.nnz * (1.0 + m / _SPARSE_ROWS) * (2.0 if self.kind == _GENERAL else 1.0)
+            return _PANELS_WORK * factor_cost(symbolic.factor_pattern(nptr, nind)[0], 6)
+        return _PANELS_WORK * self.panels.work if m else 0.0
 
     @property
     def best(self) -> tuple[float, FloatArray | None]:
@@ -134,43 +139,60 @@ class AdmmState:
                 raise _Failed(
                     f"A + rho D is not positive definite at rho = {self.rho:.1e}: {error}"
                 ) from None
-        if self.kind == _GENERAL:
-            try:
-                lu = sparse_lu(self.matrix + self.rho * sp.eye_array(m))
-            except RuntimeError as error:
-                raise _Failed(f"A + rho D has no LU factors at rho = {self.rho:.1e}: {error}") from None
-            lower, upper = _columns(lu.L), _columns(lu.U)
-            place = np.empty(m, np.int32)
-            place[lu.perm_r] = np.arange(m, dtype=np.int32)
-            # Row perm_r^-1[i] stands at place i; the solution's entry c stands at place perm_c[c].
-            column = np.empty(m, np.int32)
-            column[lu.perm_c] = np.arange(m, dtype=np.int32)
-            return _GENERAL, m, (*lower, place, column, *upper)
+        panels, matrix, shift = self.panels, self.matrix, self.rho
+        extra: tuple[Any, ...] = ()
         if self.kind == _BODIES:
             k = self.jacobian
             e = 1.0 / (self.theta + self.rho)
-            n = k.shape[1]
-            normal = sp.csc_array(k.T @ sp.diags_array(e) @ k + sp.eye_array(n))
-            extra: tuple[Any, ...] = (*_columns(k, convert=False), e)
-        else:
-            n, extra = m, ()
-            normal = sp.csc_array(self.matrix + self.rho * sp.eye_array(m))
-        import qdldl  # 60 ms, at first use
-
-        try:
-            lower, diag, order = qdldl.Solver(sp.csc_matrix(normal)).factors()
-        except (RuntimeError, ValueError) as error:  # a zero pivot, or nothing stored at all
-            raise _Failed(f"A + rho D has no L D L^T at rho = {self.rho:.1e}: {error}") from None
-        if not (np.isfinite(diag).all() and np.all(diag != 0.0)):
-            raise _Failed(f"L D L^T broke down at rho = {self.rho:.1e}")
-        order = np.ascontiguousarray(order, np.int32)
-        return self.kind, n, (*_columns(lower), order, order, np.ascontiguousarray(diag), *extra)
+            matrix, shift = _mirrored(sp.csr_array(k.T @ sp.diags_array(e) @ k)), 1.0
+            # Analysed each time: an entry may cancel at one rho and not at another, or alone of a pair.
+            panels = SparsePanels(*_arrays(matrix)[:2], False, WIDE)
+            extra = (*_arrays(k), e)
+        done = _factored(panels, matrix, shift, self.lu)
+        if not done and self.lu and not self.full and m <= GENERAL_LIMIT:
+            # It needs pivots across panels: of a full matrix there is one panel.
+            self.full = True
+            self.matrix = matrix = _full(matrix)
+            self.panels = panels = SparsePanels(*_arrays(matrix)[:2], True, WIDE)
+            done = _factored(panels, matrix, shift, True)
+        if not done:
+            raise _Failed(f"the factor of A + rho D broke down at rho = {self.rho:.1e}")
+        return self.kind, matrix.shape[0], (panels, *extra)
 
 
-def _columns(matrix: Any, convert: bool = True) -> tuple[Any, Any, Any]:
-    # (ptr, index, value) with sorted indices, as the kernel reads them.
-    if convert:
-        matrix = sp.csc_array(matrix)
+def _factored(panels: SparsePanels, matrix: sp.csr_array, shift: float, lu: bool) -> bool:
+    # Whether M = matrix + shift has its factor; of L U also whether what it solves is exact:
+    # max |r - M x| <= BACKWARD (max |M_ij| max |x| + max |r|).
+    values, n = _arrays(matrix)[2], matrix.shape[0]
+    if not np.isfinite(values).all() or panels.factor(values, np.ones(n), shift, TINY):
+        return False
+    if not lu:
+        return True
+    r = np.linspace(1.0, 2.0, n)
+    x = panels.solve(r)
+    left = np.abs(r - matrix @ x - shift * x).max()
+    return bool(left <= BACKWARD * ((np.abs(values).max() + shift) * np.abs(x).max() + 2.0))
+
+
+def _full(matrix: sp.csr_array) -> sp.csr_array:
+    # The same with an entry everywhere.
+    n = matrix.shape[0]
+    indptr, indices = np.arange(n + 1, dtype=np.int32) * n, np.tile(np.arange(n, dtype=np.int32), n)
+    return sp.csr_array((matrix.toarray().ravel(), indices, indptr), shape=matrix.shape)
+
+
+def _mirrored(matrix: sp.csr_array) -> sp.csr_array:
+    # The same in sorted rows, with an entry, if only 0, at (j, i) wherever there is one at (i, j).
+    matrix.sort_indices()
+    if is_mirrored(*_arrays(matrix)[:2]):
+        return matrix
+    a = sp.coo_array(matrix)
+    where = (np.concatenate([a.row, a.col]), np.concatenate([a.col, a.row]))
+    return sp.csr_array((np.concatenate([a.data, np.zeros(a.nnz)]), where), shape=a.shape)
+
+
+def _arrays(matrix: Any) -> tuple[Any, Any, Any]:
+    # (ptr, index, value) of sorted rows, as the kernels read them.
     matrix.sort_indices()
     value = np.ascontiguousarray(matrix.data if matrix.nnz else np.zeros(1), np.float64)
     index = np.ascontiguousarray(matrix.indices if matrix.nnz else np.zeros(1), np.int32)
@@ -252,7 +274,8 @@ class ADMM:
             "undone": state.undone - undone,
         }
         state.reported = state.factorisations
-        form = ("dense Cholesky", "sparse LDLT", "sparse LU", "LDLT over bodies")[state.kind]
+        sparse = "sparse LU" if state.lu else "sparse Cholesky"
+        form = ("dense Cholesky", sparse, "Cholesky over bodies")[state.kind]
         return replace(result, work=work, form=form, message=message)
 
 

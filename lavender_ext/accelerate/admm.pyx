@@ -9,8 +9,8 @@ With x = D^1/2 lam, B = D^-1/2 A D^-1/2, c = D^-1/2 b, cones K in the same scale
 
 At rest x = z: B z - c + s + y = 0. The shift comes in once both imbalances below are at most 1e-3 (or
 after 200 iterations), that is from the convex answer: where contacts stick that is the answer, elsewhere a
-start. (1) is solved with a factorisation made by the caller: Cholesky of a dense matrix, L D L^T or L U of
-a sparse one, or L D L^T of I + K^T diag(1 / (theta + rho)) K over bodies where B = K K^T + diag(theta):
+start. (1) is solved with a factorisation made by the caller: Cholesky of a dense matrix, L L^T or L U by panels
+(`factor/sparse.pyx`), or those of I + K^T diag(1 / (theta + rho)) K over bodies where B = K K^T + diag(theta):
 
     x = E (r - K t),  (I + K^T E K) t = K^T E r,  E = diag(1 / (theta + rho))                     (2)
 
@@ -30,13 +30,13 @@ from lavender_ext.accelerate.mixing cimport CONTROL, MAX_MEMORY, UNDONE, forget,
 from lavender_ext.core.block cimport (CONE, CONTACT_SPIN, ROUND, ROW, blocks_t, clip, n_tangents, norm2, round_group,
                                       round_section, round_share)
 from lavender_ext.core.problem cimport Data
+from lavender_ext.factor.sparse cimport SparsePanels, sparse_solve, sparse_t
 
 
 cdef enum:
     DENSE = 0
-    SYMMETRIC = 1
-    GENERAL = 2
-    BODIES = 3
+    PANELS = 1
+    BODIES = 2
 
 cdef enum:
     RHO_EVERY = 20              # iterations between weighings of rho at first, later a quarter of those done
@@ -47,15 +47,7 @@ cdef struct factor_t:           # of B + rho, or of the body form
     int32_t kind
     int32_t n                   # its order
     const double* dense         # (n, n) Cholesky, row by row, lower
-    const int32_t* l_ptr        # L by columns: strictly lower (SYMMETRIC, BODIES), with unit diagonal (GENERAL)
-    const int32_t* l_row
-    const double* l_val
-    const double* diag          # (n) D
-    const int32_t* u_ptr        # U by columns (GENERAL), the diagonal last in each
-    const int32_t* u_row
-    const double* u_val
-    const int32_t* p            # (n) row of the matrix that stands at place i
-    const int32_t* q            # (n) column of the matrix at place i; = p where symmetric
+    const sparse_t* panels
     const int32_t* k_ptr        # K by rows (BODIES)
     const int32_t* k_col
     const double* k_val
@@ -74,74 +66,37 @@ cdef struct admm_t:
     double* x                   # (m)
     double* g                   # (m)
     double* before              # (m) z of the iteration before
-    double* work                # (m + n)
+    double* work                # (n) of BODIES
     double* turn                # (4) iterations done; u was mixed; iterations at the next weighing; the shift is on
 
 
-cdef inline void solve_factor(const factor_t* f, double* x, double* work) noexcept nogil:
+cdef inline void solve_dense(const factor_t* f, double* x) noexcept nogil:
     # x (n) <- matrix^-1 x
-    cdef int32_t i, j, k, n = f.n
-    cdef double s, s0, s1, s2, s3
+    cdef int32_t i, j, n = f.n
+    cdef double s
     cdef const double* row
-    if f.kind == DENSE:
-        for i in range(n):
-            row = f.dense + <int64_t>n * i
-            x[i] = (x[i] - product(row, x, i)) / row[i]
-        i = n - 1
-        while i >= 0:
-            row = f.dense + <int64_t>n * i
-            s = x[i] / row[i]
-            x[i] = s
-            for j in range(i):
-                x[j] -= row[j] * s
-            i -= 1
-        return
     for i in range(n):
-        work[i] = x[f.p[i]]
-    for j in range(n):
-        s = work[j]
-        if s != 0.0:
-            for k in range(f.l_ptr[j], f.l_ptr[j + 1]):
-                if f.l_row[k] != j:
-                    work[f.l_row[k]] -= f.l_val[k] * s
-    if f.kind == GENERAL:
-        j = n - 1
-        while j >= 0:
-            s = work[j] / f.u_val[f.u_ptr[j + 1] - 1]
-            work[j] = s
-            if s != 0.0:
-                for k in range(f.u_ptr[j], f.u_ptr[j + 1] - 1):
-                    work[f.u_row[k]] -= f.u_val[k] * s
-            j -= 1
-    else:
-        for i in range(n):
-            work[i] /= f.diag[i]
-        j = n - 1
-        while j >= 0:
-            s0 = s1 = s2 = s3 = 0.0
-            k = f.l_ptr[j]
-            while k + 4 <= f.l_ptr[j + 1]:
-                s0 += f.l_val[k] * work[f.l_row[k]]
-                s1 += f.l_val[k + 1] * work[f.l_row[k + 1]]
-                s2 += f.l_val[k + 2] * work[f.l_row[k + 2]]
-                s3 += f.l_val[k + 3] * work[f.l_row[k + 3]]
-                k += 4
-            while k < f.l_ptr[j + 1]:
-                s0 += f.l_val[k] * work[f.l_row[k]]
-                k += 1
-            work[j] -= (s0 + s1) + (s2 + s3)
-            j -= 1
-    for i in range(n):
-        x[f.q[i]] = work[i]
+        row = f.dense + <int64_t>n * i
+        x[i] = (x[i] - product(row, x, i)) / row[i]
+    i = n - 1
+    while i >= 0:
+        row = f.dense + <int64_t>n * i
+        s = x[i] / row[i]
+        x[i] = s
+        for j in range(i):
+            x[j] -= row[j] * s
+        i -= 1
 
 
-cdef inline void solve_shifted(const factor_t* f, int32_t m, double* x, double* work) noexcept nogil:
-    # (1): x (m) <- (B + rho)^-1 x; work (m + n)
+cdef inline void solve_shifted(const factor_t* f, int32_t m, double* x, double* t) noexcept nogil:
+    # (1): x (m) <- (B + rho)^-1 x; t (n) is scratch of BODIES
     cdef int32_t i, k
     cdef double s
-    cdef double* t = work + m
-    if f.kind != BODIES:
-        solve_factor(f, x, work)
+    if f.kind == DENSE:
+        solve_dense(f, x)
+        return
+    if f.kind == PANELS:
+        sparse_solve(f.panels, x, x)
         return
     for i in range(f.n):
         t[i] = 0.0
@@ -149,7 +104,7 @@ cdef inline void solve_shifted(const factor_t* f, int32_t m, double* x, double* 
         s = f.e[i] * x[i]
         for k in range(f.k_ptr[i], f.k_ptr[i + 1]):
             t[f.k_col[k]] += f.k_val[k] * s
-    solve_factor(f, t, work)
+    sparse_solve(f.panels, t, t)
     for i in range(m):
         s = x[i]
         for k in range(f.k_ptr[i], f.k_ptr[i + 1]):
@@ -342,26 +297,21 @@ def run(Data p, double[::1] lam, int n, double rho, double alpha, int memory, sp
     cdef double[::1] control = space[0], gram = space[1], turn = space[2], v = space[3]
     cdef double[::1] work
     cdef const double[:, ::1] dense
-    cdef const double[::1] l_val, diag, u_val, k_val, e
-    cdef const int32_t[::1] l_ptr, l_row, u_ptr, u_row, pp, qq, k_ptr, k_col
+    cdef const double[::1] k_val, e
+    cdef const int32_t[::1] k_ptr, k_col
+    cdef SparsePanels panels
     f.kind = factor[0]
     f.n = factor[1]
     if f.kind == DENSE:
         dense = factor[2][0]
         f.dense = &dense[0, 0]
     else:
-        l_ptr, l_row, l_val, pp, qq = factor[2][:5]
-        f.l_ptr, f.l_row, f.l_val, f.p, f.q = &l_ptr[0], &l_row[0], &l_val[0], &pp[0], &qq[0]
-        if f.kind == GENERAL:
-            u_ptr, u_row, u_val = factor[2][5:]
-            f.u_ptr, f.u_row, f.u_val = &u_ptr[0], &u_row[0], &u_val[0]
-        else:
-            diag = factor[2][5]
-            f.diag = &diag[0]
+        panels = factor[2][0]
+        f.panels = &panels.f
         if f.kind == BODIES:
-            k_ptr, k_col, k_val, e = factor[2][6:]
+            k_ptr, k_col, k_val, e = factor[2][1:]
             f.k_ptr, f.k_col, f.k_val, f.e = &k_ptr[0], &k_col[0], &k_val[0], &e[0]
-    work = np.empty(m + f.n + 1)
+    work = np.empty(f.n + 1)
     run.blocks = &p.blocks
     run.root = &root[0]
     run.c = &c[0]

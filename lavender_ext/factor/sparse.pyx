@@ -28,31 +28,6 @@ cdef enum:
 ZEROS = 0.1                     # share of a panel that zeros held as numbers may be
 
 
-cdef struct sparse_t:
-    int32_t n                   # rows
-    int32_t panels
-    int32_t wide                # 1 where four lanes are one instruction
-    int32_t lu
-    const int32_t* order        # (n) row at each place
-    const int32_t* place        # (n) place of each row
-    const int32_t* first        # (panels + 1) places
-    const int32_t* of           # (n) panel of a place
-    const int32_t* rptr         # (panels + 1) places below a panel, ascending
-    const int32_t* rows
-    const int64_t* at           # (panels + 1) of a panel in `val`,
-    const int64_t* beside       # (panels + 1) and of what is beside it in `up`
-    double* val
-    double* up                  # L U only
-    double* temp                # what one panel takes from another, at most, or STRIP rows of one
-    double* scale               # (n) L U: of each place; else the least pivot of each
-    double* y                   # (n)
-    int32_t* swap               # (n) L U: the place within the panel that came here
-    int32_t* rel                # (n) row of a place in the present panel
-    int32_t* head               # (panels) panels that take from a panel next
-    int32_t* link               # (panels)
-    int32_t* next               # (panels) first row not yet taken
-
-
 cdef public int32_t lav_same_rows(int32_t n, const int32_t* indptr, const int32_t* indices, int32_t* node,
                                   int32_t* first) noexcept nogil:
     """Runs of rows with the same columns: their number, the run of each row, the first row of each."""
@@ -551,67 +526,7 @@ cdef public int32_t lav_sparse_factor(const sparse_t* f, const int32_t* indptr, 
 
 cdef public void lav_sparse_solve(const sparse_t* f, const double* b, double* x) noexcept nogil:
     """x <- (A + shift D)^-1 b after `lav_sparse_factor`; they may be one array."""
-    cdef int32_t i, j, q, width, below, rows, k
-    cdef double t
-    cdef double* own
-    cdef const double* a
-    cdef const double* u
-    for k in range(f.n):
-        f.y[k] = b[f.order[k]]
-        if f.lu:
-            f.y[k] *= f.scale[k]
-    for i in range(f.panels):
-        width = f.first[i + 1] - f.first[i]
-        below = f.rptr[i + 1] - f.rptr[i]
-        rows = width + below
-        own = f.y + f.first[i]
-        a = f.val + f.at[i]
-        if f.lu:
-            for j in range(width):
-                k = f.swap[f.first[i] + j]
-                t = own[k]
-                own[k] = own[j]
-                own[j] = t
-        memset(f.temp, 0, sizeof(double) * below)
-        for j in range(width):
-            t = own[j]
-            if not f.lu:
-                t = t * a[j]
-                own[j] = t
-            take(width - j - 1, t, a + j + 1, own + j + 1)
-            take(below, t, a + width, f.temp)
-            a += rows
-        for q in range(below):
-            f.y[f.rows[f.rptr[i] + q]] += f.temp[q]
-    for i in range(f.panels - 1, -1, -1):
-        width = f.first[i + 1] - f.first[i]
-        below = f.rptr[i + 1] - f.rptr[i]
-        rows = width + below
-        own = f.y + f.first[i]
-        a = f.val + f.at[i]
-        for q in range(below):
-            f.temp[q] = f.y[f.rows[f.rptr[i] + q]]
-        u = a + width
-        if f.lu:
-            u = f.up + f.beside[i]
-        for j in range(width):
-            t = own[j]
-            for q in range(below):
-                t -= u[q] * f.temp[q]
-            own[j] = t
-            u += below if f.lu else rows
-        for j in range(width - 1, -1, -1):
-            if f.lu:
-                t = own[j] * a[j + <int64_t>j * rows]
-                own[j] = t
-                take(j, t, a + <int64_t>j * rows, own)
-            else:
-                t = own[j]
-                for q in range(j + 1, width):
-                    t -= a[q + <int64_t>j * rows] * own[q]
-                own[j] = t * a[j + <int64_t>j * rows]
-    for k in range(f.n):
-        x[f.order[k]] = f.y[k] * f.scale[k] if f.lu else f.y[k]
+    sparse_solve(f, b, x)
 
 
 def is_mirrored(const int32_t[::1] indptr, const int32_t[::1] indices):
@@ -700,12 +615,6 @@ cdef class SparsePanels:
     like : SparsePanels, optional
         Of the same pattern, whose analysis serves again.
     """
-
-    cdef sparse_t f
-    cdef object keep, numbers, indptr, indices
-    cdef double half                                    # multiply-adds of L L^T, roughly,
-    cdef readonly double work                           # and of the factor
-    cdef readonly int64_t entries                       # numbers it holds
 
     def __init__(self, indptr, indices, bint lu, bint wide=True, SparsePanels like=None):
         cdef int32_t n = <int32_t>len(indptr) - 1, k

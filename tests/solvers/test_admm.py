@@ -80,7 +80,7 @@ def test_every_factorisation_gives_the_same(law):
     eight = lv.solve(
         lv.Problem(np.tile(base.b, 8), many, big, friction=base.friction), "admm", tol=1e-10, max_iter=20_000
     )
-    assert eight.solver.form == "sparse LDLT"
+    assert eight.solver.form == "sparse Cholesky"
     for solution in results:
         assert solution.success
         # Eigenvalues of A from 0.3 to about 30.
@@ -97,7 +97,7 @@ def test_the_body_form_solves_the_same_problem():
     assert problem.m > 18
     bodies = lv.solve(problem, "admm", tol=1e-10, max_iter=20_000)
     matrix = lv.solve(as_matrix(problem), "admm", tol=1e-10, max_iter=20_000)
-    assert bodies.solver.form == "LDLT over bodies"
+    assert bodies.solver.form == "Cholesky over bodies"
     assert bodies.success
     assert matrix.success
     # Eigenvalues of A from 0.2 to about 30.
@@ -119,6 +119,33 @@ def test_far_from_symmetric():
         problem = lv.Problem.lcp(g @ g.T + 0.5 * np.eye(8) + k - k.T, rng.standard_normal(8))
         # Monotone: the symmetric part is definite, so the splitting converges.
         assert lv.solve(problem, "admm", tol=1e-9, max_iter=20_000).success
+
+
+def test_a_pattern_that_is_not_symmetric():
+    # Entries above the diagonal alone, in the last column: LU by panels wants their mirrors, if only as zeros.
+    a = 2.0 * np.eye(80)
+    a[np.arange(79), np.arange(1, 80)] = -0.5
+    a[:79, 79] += 0.25
+    problem = lv.Problem.lcp(sp.csr_array(a), np.linspace(0.5, 1.5, 80))
+    solution = lv.solve(problem, "admm", tol=1e-12)
+    assert solution.success
+    assert solution.solver.form == "sparse LU"
+    np.testing.assert_allclose(a @ solution.impulse, problem.b, rtol=1e-10)
+
+
+def test_pivots_across_panels():
+    # A chain of whose diagonal rho = 0.1 leaves nothing: every pivot is a neighbour's.
+    m = 60
+    i = np.arange(m - 1)
+    a = np.diag(np.full(m, -0.1))
+    a[i, i + 1], a[i + 1, i] = 1.0, -0.999
+    problem = lv.Problem(np.linspace(0.5, 1.5, m), lv.Cones.free(m), sp.csr_array(a))
+    state = lv.prepare(problem, "admm")._state
+    assert not isinstance(state, str), state
+    assert state.full
+    r = np.linspace(-1.0, 1.0, m)
+    x = state.factor[2][0].solve(r)
+    np.testing.assert_allclose(state.matrix @ x + state.rho * x, r, atol=1e-12)
 
 
 def test_without_memory_it_is_plain_admm_by_hand():
