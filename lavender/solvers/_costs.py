@@ -37,9 +37,9 @@ from lavender.solvers._counts import (
 from lavender.solvers._factor import PanelsLU, choose, filled_cost, panels_cost
 from lavender.solvers._islands import block_bodies
 from lavender.solvers._newton.systems import (
-    DENSE_FILL,
     DENSE_ROWS,
     System,
+    is_full,
     make_system,
 )
 from lavender_ext.core import assemble
@@ -277,7 +277,7 @@ class Costs:
         if p.generalized is not None:
             return self._newton(min(rates.BAND * m, float(dense_factor(m))))
         nnz = float(len(p._compressed[1]))
-        if nnz >= DENSE_FILL * m * m:
+        if is_full(int(nnz), p.m, self._bounded):
             return self._newton(float(dense_factor(m)))
         # Its entries fill; a band is narrower than they are at best, and neither Coulomb's law nor LU asks for one.
         least = float(filled(nnz, 0.0)) if p.m > DENSE_ROWS else float(dense_factor(m))
@@ -327,7 +327,11 @@ class Costs:
         found = self._finite("newton", self._newton_count, lu * factor)
         if p.matrix is None or p.law == "linear" or p.is_symmetric or p.m <= DENSE_ROWS:
             return found
-        return found * rates.ASYMMETRIC if len(p._compressed[1]) <= DENSE_FILL * p.m**2 else found
+        return found if is_full(len(p._compressed[1]), p.m, self._bounded) else found * rates.ASYMMETRIC
+
+    @property
+    def _bounded(self) -> bool:
+        return self.problem.law in ("linear", "lcp")
 
     @property
     def _newton_count(self) -> float:

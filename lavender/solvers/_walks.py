@@ -22,7 +22,7 @@ from lavender.solvers._newton.desaxce import apart
 from lavender.solvers._newton.proximal import Proximal
 from lavender.solvers._newton.run import Run
 from lavender.solvers._newton.sweeping import METHODS, STEPS, WEIGHT
-from lavender.solvers._newton.systems import AUGMENTED, DENSE_FILL, DENSE_ROWS, System
+from lavender.solvers._newton.systems import AUGMENTED, DENSE_ROWS, System, is_full
 from lavender.solvers._sweepers import SWEEPER, Glance, Sweeps
 from lavender.solvers._trail import Trail
 
@@ -128,7 +128,7 @@ def least_step(problem: Problem) -> float:
     found = rates.STEP["newton"] + rates.NEWTON_ROW["coulomb"] * m
     if problem.matrix is not None and m > DENSE_ROWS:
         nnz = len(problem._compressed[1])
-        if nnz > DENSE_FILL * m * m:
+        if is_full(nnz, m, False):
             return found + rates.UNSYMMETRIC * float(dense_factor(m))
         return found + rates.UNSYMMETRIC * filled(nnz, 0.0)
     return found

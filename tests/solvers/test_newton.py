@@ -13,6 +13,7 @@ from random_problems import as_matrix, random_contact_problem, random_lcp, seeds
 
 import lavender as lv
 from lavender import suite
+from lavender.bench.cases import resolve
 from lavender.solvers._newton import pattern, sparse, systems
 from lavender.solvers._newton import scaled as scaling
 from lavender.solvers._newton.exchange import STILL, exchange
@@ -67,10 +68,39 @@ def test_usual_problems_are_scaled_as_any_other(problem, monkeypatch):
 # -- linear algebra ---------------------------------------------------------------------------------
 
 
+def test_many_bodies_on_one_leave_half_of_the_rows():
+    # 26 % of A is nonzero; of 228 rows, half of them of bodies that touch nothing else, elimination leaves a quarter of
+    # the entries of a full factor and an eighth of its work.
+    (item,) = resolve(["wild(seed=7012)"])
+    problem = item.problem
+    assert problem.matrix is not None
+    assert systems.BOUNDED_FILL < problem.csr.nnz / problem.m**2 < systems.DENSE_FILL
+    system = make_system(problem, "impulse")
+    assert not system.dense
+    assert system.sparse.work < 0.2 * problem.m**3 / 3.0
+    sparse_one = lv.solve(problem, "newton", tol=1e-9)
+    with mock.patch.multiple(systems, DENSE_FILL=0.25):
+        assert make_system(problem, "impulse").dense
+        full = lv.solve(problem, "newton", tol=1e-9)
+    assert sparse_one.success
+    assert full.success
+    np.testing.assert_allclose(
+        problem.csr @ sparse_one.impulse, problem.csr @ full.impulse, atol=1e-6 * np.abs(problem.b).max()
+    )
+
+
+def test_bounded_rows_as_full_as_that_stay_full():
+    (item,) = resolve(["wild(seed=7566)"])
+    problem = item.problem
+    assert problem.law == "lcp"
+    assert problem.csr.nnz / problem.m**2 < systems.DENSE_FILL
+    assert make_system(problem, "impulse").dense
+
+
 def system_in(problem, form):
     """The system of a problem; "band", "sparse": the impulse form factored so whatever it costs."""
     if form == "sparse":
-        with mock.patch.multiple(systems, DENSE_ROWS=0, DENSE_FILL=2.0, BAND_SHARE=-1.0):
+        with mock.patch.multiple(systems, DENSE_ROWS=0, DENSE_FILL=2.0, BOUNDED_FILL=2.0, BAND_SHARE=-1.0):
             system = make_system(problem, "impulse")
         assert system.band is None and not system.dense
         return system

@@ -51,7 +51,9 @@ from lavender_ext.newton.panel import narrow, scaled_jacobian
 
 CONVEX, COULOMB, AUGMENTED = MAP_CONVEX, MAP_COULOMB, MAP_AUGMENTED
 DENSE_ROWS = 150  # below: dense LAPACK beats sparse bookkeeping
-DENSE_FILL = 0.25  # nonzero share of A above which a sparse factor is full anyway
+# Nonzero share s of A above which LAPACK has its factor sooner: of one full block of s^1/2 m rows, whose multiply-adds
+# cost a quarter there; and of bounded rows alone, whose free ones panels analyse anew whenever they change.
+DENSE_FILL, BOUNDED_FILL = 0.4, 0.25
 DENSE_LIMIT = 6000  # rows; 288 MB of A
 BAND_ROWS = 100  # below: dense LAPACK
 BAND_SHARE = 0.25  # of rows that the half bandwidth may have
@@ -67,6 +69,11 @@ WIDE = os.environ.get("LAVENDER_BASELINE", "0") in (
     "0",
 )  # four lanes where the machine has them: the same bits
 DAMPING = 0.995  # share of the way to the boundary that a step takes
+
+
+def is_full(nnz: int, m: int, bounded: bool) -> bool:
+    """Whether LAPACK factors Newton's matrix of m rows and nnz entries sooner than panels; `bounded`: no cones."""
+    return nnz > (BOUNDED_FILL if bounded else DENSE_FILL) * m * m
 
 
 def factor_cost(lptr: IntArray, s: int) -> float:
@@ -355,7 +362,7 @@ class MatrixSystem(System):
         self.symmetric = sc.problem.is_symmetric
         self.band: _Band | None = _band(sc, a) if self.symmetric else None
         self.dense = self.band is None and (
-            m <= DENSE_ROWS or (a.nnz > DENSE_FILL * m * m and m <= DENSE_LIMIT)
+            m <= DENSE_ROWS or (is_full(a.nnz, m, len(sc.kind) == m) and m <= DENSE_LIMIT)
         )
         # Of a sparse factor by its fill, which grows with the size: nanoseconds, as `_rates.py` has them.
         self.cost = m**3 / 3.0 if self.dense else 100.0 * a.nnz * (1.0 + m / 1000.0)
