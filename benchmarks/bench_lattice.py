@@ -1,15 +1,17 @@
 """Newton's factor on lattices of spheres, by block rows and by panels, and whole solves beside it.
 
-    python benchmarks/bench_lattice.py [--sides 6 10 14] [--ratio 1e4] [--mu 0.5]
+    python benchmarks/bench_lattice.py [--sides 6 10 14] [--ratio 1e4] [--mu 0.5] [--off 0.02] [--keep 1] [--seed 0]
+                                       [--solvers auto]
 
-side^3 spheres, each touching its neighbours and the floor, positions 0.02 off the lattice, masses log-uniform over
-`ratio`. Times are CPU time of one thread. With `--mu` equal spheres with friction instead, and sweeps beside `newton`.
+side^3 spheres, each touching its neighbours and the floor, positions `off` the lattice, masses log-uniform over
+`ratio`, each contact kept with probability `keep`. Times are CPU time of one thread. With `--mu` equal spheres with
+friction instead, and sweeps beside `newton`.
 """
 
 from __future__ import annotations
 
 import argparse
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
 from clock import cpu
@@ -22,22 +24,24 @@ from lavender.suite.build import Bodies, Contacts
 from lavender.suite.families import SPHERE
 
 
-def lattice(side: int, ratio: float, mu: float | None, seed: int = 0) -> Problem:
+def lattice(
+    side: int, ratio: float, mu: float | None, seed: int = 0, off: float = 0.02, keep: float = 1.0
+) -> Problem:
     """side^3 spheres at rest under gravity."""
     rng = np.random.default_rng(seed)
     grid = np.stack(np.meshgrid(*[np.arange(side)] * 3, indexing="ij"), -1).reshape(-1, 3)
-    position = grid + np.array([0.0, 0.0, 0.5]) + 0.02 * rng.standard_normal(grid.shape)
+    position = grid + np.array([0.0, 0.0, 0.5]) + off * rng.standard_normal(grid.shape)
     a, b = cKDTree(grid).query_pairs(1.01, output_type="ndarray").T
     a, b = np.where(position[a, 2] > position[b, 2], b, a), np.where(position[a, 2] > position[b, 2], a, b)
     away = position[b] - position[a]
     low = np.flatnonzero(grid[:, 2] == 0)
-    contacts = Contacts(
-        np.concatenate([np.stack([a, b], 1), np.stack([np.full(len(low), -1), low], 1)]),
-        np.concatenate([0.5 * (position[a] + position[b]), position[low] - [0.0, 0.0, 0.5]]),
-        np.concatenate(
-            [away / np.linalg.norm(away, axis=1, keepdims=True), np.tile([0.0, 0.0, 1.0], (len(low), 1))]
-        ),
+    body = np.concatenate([np.stack([a, b], 1), np.stack([np.full(len(low), -1), low], 1)])
+    point = np.concatenate([0.5 * (position[a] + position[b]), position[low] - [0.0, 0.0, 0.5]])
+    normal = np.concatenate(
+        [away / np.linalg.norm(away, axis=1, keepdims=True), np.tile([0.0, 0.0, 1.0], (len(low), 1))]
     )
+    kept = rng.random(len(body)) < keep if keep < 1.0 else np.ones(len(body), bool)
+    contacts = Contacts(body[kept], point[kept], normal[kept])
     half = 0.5 * np.log10(ratio)
     mass = np.ones(len(grid)) if mu is not None else 10.0 ** rng.uniform(-half, half, len(grid))
     bodies = Bodies(position, mass, SPHERE)
@@ -73,7 +77,7 @@ def factors(problem: Problem) -> None:
     print(f"  widths give {'the same bits' if bits[1] == bits[2] else 'OTHER BITS'}")
 
 
-def solves(make: Any, names: tuple[str, ...]) -> None:
+def solves(problem: Problem, names: list[str]) -> None:
     """Whole solves, cold."""
     for tol in (1e-3, 1e-6):
         for name in names:
@@ -81,7 +85,7 @@ def solves(make: Any, names: tuple[str, ...]) -> None:
 
             def run(name: str = name, tol: float = tol) -> None:
                 nonlocal solution
-                solution = lv.solve(make(), name, tol=tol, time_limit=60.0)
+                solution = lv.solve(replace(problem, copy=False), name, tol=tol, time_limit=60.0)
 
             time = cpu(run, 2)
             assert solution is not None
@@ -96,14 +100,17 @@ def main() -> None:
     parser.add_argument("--sides", type=int, nargs="+", default=[6, 10, 14])
     parser.add_argument("--ratio", type=float, default=1e4)
     parser.add_argument("--mu", type=float, default=None)
+    parser.add_argument("--off", type=float, default=0.02)
+    parser.add_argument("--keep", type=float, default=1.0)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--solvers", nargs="+", default=None)
     args = parser.parse_args()
     for side in args.sides:
-        problem = lattice(side, args.ratio, args.mu)
+        problem = lattice(side, args.ratio, args.mu, args.seed, args.off, args.keep)
         print(f"side {side}, {problem.m} rows, {problem.law}")
         if args.mu is None:
             factors(problem)
-        names = ("newton", "direct", "auto") if args.mu is None else ("newton", "anderson", "auto")
-        solves(lambda side=side: lattice(side, args.ratio, args.mu), names)
+        solves(problem, args.solvers or ["newton", "direct" if args.mu is None else "anderson", "auto"])
 
 
 if __name__ == "__main__":
