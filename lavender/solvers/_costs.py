@@ -327,7 +327,9 @@ class Costs:
         found = self._finite("newton", self._newton_count, lu * factor)
         if p.matrix is None or p.law == "linear" or p.is_symmetric or p.m <= DENSE_ROWS:
             return found
-        return found if is_full(len(p._compressed[1]), p.m, self._bounded) else found * rates.ASYMMETRIC
+        return (
+            found if is_full(len(p._compressed[1]), p.m, self._bounded) else found * rates.ASYMMETRIC[p.law]
+        )
 
     @property
     def _bounded(self) -> bool:

@@ -95,9 +95,8 @@ ADMM_COUNT, ADMM_FACTORS = 80.0, 2.0  # iterations to six decades where it gets 
 ADMM_LUCK_BODIES, ADMM_LUCK = 0.15, 0.4
 ADMM_FILL = 6.0  # entries of L for each of A
 DIRECT_ROUNDS = 40  # of `direct` on bounded rows that are granted before another is asked
-ASYMMETRIC = (
-    3.0  # times what `newton` costs on an asymmetric A with few entries: it often takes many times as many
-)
+# Times what `newton` costs on an asymmetric A with few entries: it often takes many times as many factorisations.
+ASYMMETRIC = {"linear": 1.0, "lcp": 3.0, "cone": 1.5, "coulomb": 3.0}
 AT_REST = 8.0  # of faces on faces, most of whose rows hold
 UNSYMMETRIC = 2.0  # LU against Cholesky, where friction or A asks for it
 SINGULAR = 6.0  # times as many of `direct` where A is singular and one shift does not end it,
