@@ -56,7 +56,7 @@ from lavender.solvers._walks import Walks, in_turns, sweeps_of
 
 LARGE = 4000  # rows of J from which friction is swept both ways, and beside its relaxation
 HUGE = 40_000  # rows from which friction is left to sweeps before any factorisation
-ONE_CALL = 200  # iterations that a problem of few rows, solved in one call, takes at most
+ONE_CALL = 200  # iterations that a problem of few rows, solved in one call, takes, unless its path is long
 LAST = 8000  # sweeps that friction is left to where nothing else is left
 RELAXED = 1e6  # ns that sweeps usually take from which Coulomb's law is relaxed first: a problem of its own
 FRICTION_APART = 2.0  # times the cost of the whole that islands with friction may take
@@ -80,9 +80,10 @@ class Auto:
         few = problem.m <= FEW and n >= ONE_CALL and (problem.law == "linear" or factors_at_once(problem))
         if few:
             made = AUTO.solve(problem, impulse, tol)
-            if made is not None:
+            claim = None if made is None else AUTO.claim(problem, made[1])
+            if made is not None and claim is not None and claim.iterations <= n:
                 impulse[:] = made[0].impulse
-                return AUTO.claim(problem, made[1])
+                return claim
         if problem.m == 0:
             return Claim(Status.CONVERGED, 0, {}, "nothing to solve")
         opening = Opening(problem, impulse, n, tol, time_limit, few)

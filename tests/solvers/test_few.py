@@ -157,6 +157,19 @@ def test_where_exchanges_of_few_rows_are_stuck_auto_follows_lemkes_path(seed, to
     assert registry.get("direct").few.solve(problem, None, tol) is None  # which is exchanges alone
 
 
+@pytest.mark.parametrize("most", [200, 293, 294])
+def test_a_path_that_is_longer_than_the_budget_is_not_the_end(most):
+    rng = np.random.default_rng(9)
+    _, skew = rng.normal(size=(2, 60, 60))
+    a = 0.01 * np.eye(60) + 3.0 * (skew - skew.T)
+    high = np.where(np.arange(60) % 2, np.inf, 1.0)
+    problem = lv.Problem.lcp(a, 3.0 * rng.normal(size=60), np.zeros(60), high)
+    assert lv.solve(problem).iterations == 294
+    solution = lv.solve(problem, max_iter=most)
+    assert solution.iterations <= most
+    assert solution.success or most < 294
+
+
 def test_few_bounded_rows_that_are_nearly_singular_end_where_that_meets_the_tolerance():
     problem = suite.wild(seed=7375).problem
     found = check(problem, "auto", tol=1e-6)
