@@ -666,6 +666,16 @@ def test_where_panels_lose_a_pivot_or_digits_superlu_takes_over(monkeypatch):
         np.testing.assert_allclose(solution.impulse, expected.impulse, rtol=0, atol=1e-8)
 
 
+@pytest.mark.parametrize("most", [1, 3])
+def test_where_superlu_takes_over_that_is_one_factorisation(monkeypatch, most):
+    problem = sparse_rows(1)
+    cones = lv.Cones.contacts(np.full(166, 0.5), 2) + lv.Cones.bounded(np.zeros(2), np.full(2, np.inf))
+    problem = lv.Problem(problem.b, cones, problem.csr, friction="cone")
+    monkeypatch.setattr(sparse.Panelled, "solve", lambda *_: None)
+    solution = lv.solve(problem, "newton", tol=1e-12, max_iter=most)
+    assert solution.iterations <= most
+
+
 def test_pivots_inside_panels_are_refined_or_given_up():
     """[[e, 1], [1, e]] of two panels has no stable LU without an exchange between them."""
     problem = sparse_rows(3, even=False)

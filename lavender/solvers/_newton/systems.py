@@ -427,8 +427,8 @@ class MatrixSystem(System):
     def _by_panels(self, made: Panelled) -> bool:
         """SuperLU where a pivot is lost, and where a solution is not exact."""
         self.solver = _nothing
+        self.factorisations += 1  # one, by whichever: it is a step of the budget
         if not np.isfinite(made.values).all():
-            self.factorisations += 1
             return False
         start = perf_counter()
         done = made.factor()
@@ -437,7 +437,6 @@ class MatrixSystem(System):
         if not done:
             self.solver = self._superlu(made)
             return self.solver is not _nothing
-        self.factorisations += 1
         instead: Any = None
 
         def solve(r: FloatArray) -> FloatArray:
@@ -454,7 +453,6 @@ class MatrixSystem(System):
         return True
 
     def _superlu(self, made: Panelled) -> Any:
-        self.factorisations += 1
         start = perf_counter()
         try:
             factor = sparse_lu(made.matrix(), permc_spec="COLAMD")
