@@ -12,6 +12,7 @@ body form; L U by panels where A is not symmetric.
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from time import perf_counter
 from typing import Any
@@ -45,8 +46,8 @@ _PATIENCE = 5000  # iterations: on mass ratios the residual rises while rho find
 
 _LATE = "the next factorisation would end after the time limit"
 _AT_ONCE = 0.02  # s, that a factor may be expected to take for `prepare` to make it
-# s for each multiply-add of a factor by panels, and of a dense one.
-_PANELS_WORK, _FULL = 1e-9 * PANELS_WORK, 1.5e-10
+# s for each multiply-add of a factor by panels, of L U in one panel, and of a dense one.
+_PANELS_WORK, _ONE_PANEL, _FULL = 1e-9 * PANELS_WORK, 4e-10, 1.5e-10
 
 
 class _Failed(Exception):
@@ -99,7 +100,9 @@ class AdmmState:
                     self.panels = SparsePanels(*_arrays(self.matrix)[:2], self.lu, WIDE)
         self.stop_at = np.inf  # of perf_counter: no factor is begun that is expected to end later
         self.seconds = self._expected()  # of the next factor
-        self.factor: Any = self._factor() if self.seconds <= _AT_ONCE else None
+        self.factor: Any = None
+        with suppress(_TooLate):
+            self.factor = self._factor(_AT_ONCE)
 
     def _expected(self) -> float:
         # What the first factor takes, from structure; the next ones take as long as it did.
@@ -117,16 +120,18 @@ class AdmmState:
         """(relative residual, impulse) of the best check."""
         return self.watch.best
 
-    def _factor(self) -> tuple[int, int, tuple[Any, ...]]:
+    def _factor(self, most: float = np.inf) -> tuple[int, int, tuple[Any, ...]]:
+        # Within `most` [s], as far as that can be told.
         start = perf_counter()
-        if start + self.seconds > self.stop_at:
+        most = min(most, self.stop_at - start)
+        if self.seconds > most:
             raise _TooLate
-        made = self._make_factor()
+        made = self._make_factor(most)
+        self.factorisations += 1
         self.seconds = perf_counter() - start
         return made
 
-    def _make_factor(self) -> tuple[int, int, tuple[Any, ...]]:
-        self.factorisations += 1
+    def _make_factor(self, most: float) -> tuple[int, int, tuple[Any, ...]]:
         m = self.problem.m
         if m == 0:
             return self.kind, 0, ()
@@ -151,6 +156,8 @@ class AdmmState:
         done = _factored(panels, matrix, shift, self.lu)
         if not done and self.lu and not self.full and m <= GENERAL_LIMIT:
             # It needs pivots across panels: of a full matrix there is one panel.
+            if _ONE_PANEL * m**3 / 3.0 > most:
+                raise _TooLate
             self.full = True
             self.matrix = matrix = _full(matrix)
             self.panels = panels = SparsePanels(*_arrays(matrix)[:2], True, WIDE)

@@ -148,6 +148,19 @@ def test_pivots_across_panels():
     np.testing.assert_allclose(state.matrix @ x + state.rho * x, r, atol=1e-12)
 
 
+@pytest.mark.parametrize("m", [60, 1200])
+def test_pivots_across_panels_take_no_longer_than_the_time_limit(m):
+    a = sp.diags_array([np.full(m, -0.1), np.ones(m - 1), np.full(m - 1, -0.999)], offsets=[0, 1, -1])
+    problem = lv.Problem(np.linspace(0.5, 1.5, m), lv.Cones.free(m), sp.csr_array(a))
+    prepared = lv.prepare(problem, "admm")
+    assert (prepared._state.factor is None) == (m > 1000), "of 60 rows at once"
+    solution = prepared.solve(time_limit=0.05, max_iter=30)
+    assert (solution.status is lv.Status.TIME_LIMIT and solution.iterations == 0) == (m > 1000)
+    if m == 60:
+        assert solution.work["factorisations"] >= 1
+    assert lv.solve(problem, "admm", max_iter=3).work["factorisations"] == 1
+
+
 def test_without_memory_it_is_plain_admm_by_hand():
     """Five iterations against the formulas in NumPy with a dense inverse."""
     problem = random_lcp(4, m=7)
