@@ -7,7 +7,7 @@ Saxce's shift of Coulomb's law (`lavender_ext/accelerate/admm.pyx`). One triangu
 sweep, so mass ratios and long chains cost factorisations (rho is weighed ever more rarely), not sweeps.
 Friction starts from the convex answer.
 Cholesky of a dense A, L L^T by panels of a sparse one or, where rows have fewer body unknowns than rows, of the
-body form; L U by panels where A is not symmetric.
+body form; L U by panels where A is not symmetric, or belongs to a linear system and is not definite.
 """
 
 from __future__ import annotations
@@ -154,6 +154,11 @@ class AdmmState:
             panels = SparsePanels(*_arrays(matrix)[:2], False, WIDE)
             extra = (*_arrays(k), e)
         done = _factored(panels, matrix, shift, self.lu)
+        if not done and self.kind == _PANELS and not self.lu and self.problem.law == "linear":
+            # A linear system need not be definite, which L L^T is for.
+            self.lu = True
+            self.panels = panels = SparsePanels(*_arrays(matrix)[:2], True, WIDE, panels)
+            done = _factored(panels, matrix, shift, True)
         if not done and self.lu and not self.full and m <= GENERAL_LIMIT:
             # It needs pivots across panels: of a full matrix there is one panel.
             if _ONE_PANEL * m**3 / 3.0 > most:

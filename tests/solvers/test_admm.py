@@ -161,6 +161,19 @@ def test_pivots_across_panels_take_no_longer_than_the_time_limit(m):
     assert lv.solve(problem, "admm", max_iter=3).work["factorisations"] == 1
 
 
+def test_a_linear_system_that_is_not_definite():
+    # A saddle: masses, joints, and a little give in each of these.
+    h = sp.random_array((60, 200), density=0.05, rng=np.random.default_rng(0))
+    a = sp.csr_array(sp.block_array([[2.0 * sp.eye_array(200), h.T], [h, -1e-3 * sp.eye_array(60)]]))
+    problem = lv.Problem(np.linspace(-1.0, 1.0, 260), lv.Cones.free(260), a)
+    solution = lv.solve(problem, "admm", tol=1e-9)
+    assert solution.success
+    assert solution.solver.form == "sparse LU"
+    np.testing.assert_allclose(a @ solution.impulse, problem.b, atol=1e-7)
+    bounded = lv.solve(lv.Problem.lcp(a, problem.b), "admm")
+    assert bounded.status is lv.Status.NUMERICAL_ERROR
+
+
 def test_without_memory_it_is_plain_admm_by_hand():
     """Five iterations against the formulas in NumPy with a dense inverse."""
     problem = random_lcp(4, m=7)
