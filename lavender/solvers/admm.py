@@ -97,7 +97,7 @@ class AdmmState:
                 self.kind = _PANELS
                 if problem.m:
                     self.matrix = _mirrored(self.matrix)
-                    self.panels = SparsePanels(*_arrays(self.matrix)[:2], self.lu, WIDE)
+                    self.panels = _analysed(self.matrix, self.lu)
         self.stop_at = np.inf  # of perf_counter: no factor is begun that is expected to end later
         self.seconds = self._expected()  # of the next factor
         self.factor: Any = None
@@ -151,13 +151,13 @@ class AdmmState:
             e = 1.0 / (self.theta + self.rho)
             matrix, shift = _mirrored(sp.csr_array(k.T @ sp.diags_array(e) @ k)), 1.0
             # Analysed each time: an entry may cancel at one rho and not at another, or alone of a pair.
-            panels = SparsePanels(*_arrays(matrix)[:2], False, WIDE)
+            panels = _analysed(matrix, False)
             extra = (*_arrays(k), e)
         done = _factored(panels, matrix, shift, self.lu)
         if not done and self.kind == _PANELS and not self.lu and self.problem.law == "linear":
             # A linear system need not be definite, which L L^T is for.
             self.lu = True
-            self.panels = panels = SparsePanels(*_arrays(matrix)[:2], True, WIDE, panels)
+            self.panels = panels = _analysed(matrix, True, panels)
             done = _factored(panels, matrix, shift, True)
         if not done and self.lu and not self.full and m <= GENERAL_LIMIT:
             # It needs pivots across panels: of a full matrix there is one panel.
@@ -165,11 +165,18 @@ class AdmmState:
                 raise _TooLate
             self.full = True
             self.matrix = matrix = _full(matrix)
-            self.panels = panels = SparsePanels(*_arrays(matrix)[:2], True, WIDE)
+            self.panels = panels = _analysed(matrix, True)
             done = _factored(panels, matrix, shift, True)
         if not done:
             raise _Failed(f"the factor of A + rho D broke down at rho = {self.rho:.1e}")
         return self.kind, matrix.shape[0], (panels, *extra)
+
+
+def _analysed(matrix: sp.csr_array, lu: bool, like: SparsePanels | None = None) -> SparsePanels:
+    try:
+        return SparsePanels(*_arrays(matrix)[:2], lu, WIDE, like)
+    except OverflowError as error:
+        raise _Failed(str(error)) from None
 
 
 def _factored(panels: SparsePanels, matrix: sp.csr_array, shift: float, lu: bool) -> bool:

@@ -6,6 +6,7 @@ import scipy.sparse as sp
 from random_problems import as_matrix, random_contact_problem, random_lcp
 
 import lavender as lv
+from lavender.solvers import admm
 
 
 def box_stack(n, ratio, friction=None, speed=0.0):
@@ -172,6 +173,18 @@ def test_a_linear_system_that_is_not_definite():
     np.testing.assert_allclose(a @ solution.impulse, problem.b, atol=1e-7)
     bounded = lv.solve(lv.Problem.lcp(a, problem.b), "admm")
     assert bounded.status is lv.Status.NUMERICAL_ERROR
+
+
+def test_a_factor_of_more_entries_than_can_be_counted_is_said(monkeypatch):
+    class Large:
+        def __init__(self, *_):
+            raise OverflowError("the factor has 2^31 entries or more")
+
+    monkeypatch.setattr(admm, "SparsePanels", Large)
+    a = sp.diags_array([np.full(89, -1.0), np.full(90, 2.0), np.full(89, -1.0)], offsets=[-1, 0, 1])
+    problem = lv.Problem.lcp(sp.csr_array(a), np.ones(90))
+    assert "entries" in admm.ADMM().prepare(problem)  # which auto calls, and goes on to another
+    assert lv.solve(problem, "admm").status is lv.Status.NUMERICAL_ERROR
 
 
 def test_without_memory_it_is_plain_admm_by_hand():
