@@ -231,6 +231,25 @@ def test_a_step_that_would_end_after_the_deadline_is_refused(monkeypatch):
     assert claim.iterations == 0
 
 
+def test_cheap_first_steps_promise_nothing_of_those_that_follow(monkeypatch):
+    problem = suite.case("wild(seed=7)").problem  # a step of it: 0.4 s at 1e-8 s a multiply-add
+    clock, asked = [0.0], []
+
+    class Kernel:
+        islands, largest, ends = 1, general.prepare(problem).largest, general.ENDS["spent"]
+
+        def run(self, impulse, tol, steps, cold, again):
+            asked.append(steps)
+            clock[0] += 1e-3 if len(asked) == 1 else 0.4 * steps
+            return self.ends, np.array([steps, 0, 0, 0, 0])
+
+    monkeypatch.setattr(general, "FLOP", 1e-8)
+    monkeypatch.setattr(general, "perf_counter", lambda: clock[0])
+    claim = general.run(problem, Kernel(), problem.start(), 1000, 1e-9, 1.0)
+    assert claim.status is lv.Status.TIME_LIMIT
+    assert set(asked) == {1} and clock[0] <= 1.0 + 0.4
+
+
 def test_costs_are_counted_and_not_timed():
     # The same numbers whenever they are asked for: a choice depends on the problem alone.
     for seed in range(20):

@@ -19,7 +19,7 @@ from lavender_ext.generalized.newton import ENDS, Newton
 FORM = "generalized velocities"
 # Steps for each island between two looks at the clock and at Ctrl-C. With a time limit at most as many as a share of
 # what is left is for: at FLOP, LOOKED_UP times as much where a sparse factor looks for its entries, then at the pace
-# so far.
+# so far, and at FLOP at least: the first steps may be the cheap ones.
 CLOCK = 64
 TIME_SHARE = 0.5
 LOOKED_UP = 20.0
@@ -76,7 +76,8 @@ def run(
     status, closer = Status.MAX_ITERATIONS, 1.0
     begun = now = perf_counter()
     clock = CLOCK * max(1, kernel.islands)  # a step is one of an island
-    steps, step = clock, FLOP * factor_flops(problem, kernel.largest)
+    step = counted = FLOP * factor_flops(problem, kernel.largest)
+    steps = clock
     if time_limit is not None:
         steps = max(1, int(min(TIME_SHARE * time_limit / max(LOOKED_UP * step, 1e-9), clock)))
     while counts[0] < n:
@@ -103,7 +104,7 @@ def run(
             break
         if time_limit is not None:
             step = max((now - begun) / max(1, int(counts[0])), (now - last) / max(1, int(done[0])))
-            steps = max(1, int(min(clock, TIME_SHARE * (deadline - now) / max(step, 1e-9))))
+            steps = max(1, int(min(clock, TIME_SHARE * (deadline - now) / max(step, counted, 1e-9))))
     return claim(status, counts)
 
 
