@@ -370,7 +370,7 @@ class Walk:
             self.ray(t, basic, nonbasic, book.entering)
             return
         self.message = ""
-        while self.late(FORMED * float(n) ** 3):
+        while self.late(FORMED * float(self.about_free(basic)) ** 3):
             yield self.cut(t, basic)
         self.finish(basic)
 
@@ -429,6 +429,14 @@ class Walk:
             self.certificate = y / size
 
     # -- the result --------------------------------------------------------------------------------
+
+    def about_free(self, basic: IntArray) -> int:
+        """How many rows `finish` solves anew, or a few more."""
+        form, n = self.form, len(basic)
+        k, whole = n + len(form.kept), n + len(form.exchanged)
+        inside = int(np.count_nonzero((basic >= n) & (basic < k)))
+        pulls = int(np.count_nonzero((basic >= k) & (basic < whole)))  # caps: at the upper bound
+        return max(inside - pulls, 0) + int(form.exchanged.sum()) + len(form.split) + len(form.out)
 
     def finish(self, basic: IntArray) -> None:
         """Solve the rows found free anew, on A itself, and refine while that halves the residual."""

@@ -11,6 +11,7 @@ from random_problems import random_lcp, seeds
 import lavender as lv
 from lavender import registry, suite
 from lavender.certificates import check_certificate
+from lavender.solvers import lemke
 from lavender_ext.pivot.tableau import DONE, HELD, PIVOTS, RAY, follow
 
 
@@ -240,6 +241,15 @@ def test_auto_gives_lemke_turns_that_go_on():
     assert solution.work["pivots"] < 3000
     assert "paths" in solution.message and solution.message.count("lemke") > 1
     assert solution.work["paths"] == 1
+
+
+def test_the_end_of_a_path_is_counted_by_the_rows_found_free(monkeypatch):
+    monkeypatch.setattr(lemke, "FORMED", 1e-4)
+    m = 60
+    problem = lv.Problem.lcp(2.0 * np.eye(m), np.where(np.arange(m) < 6, 1.0, 3.0), np.zeros(m), np.ones(m))
+    solution = lv.solve(problem, "lemke", time_limit=10.0)  # 6 free: 0.02 s; all of the dictionary: 173 s
+    assert solution.success
+    assert solution.work["factorisations"] == 1
 
 
 def test_a_dictionary_that_takes_longer_than_the_time_limit_is_not_formed():
