@@ -343,6 +343,28 @@ def test_many_islands_are_not_cut_between_two_looks_at_the_clock(limit, monkeypa
     assert whole.work == cut.work and np.array_equal(whole.impulse, cut.impulse)
 
 
+def test_slow_steps_are_few_between_two_looks_and_end_where_many_do(monkeypatch):
+    """Ctrl-C is seen between two calls of the kernel: a call is counted for WATCHED at most, by structure alone."""
+    problem = random_general(21, "cone", n=30, contacts=12)
+    whole = lv.solve(problem, "newton", tol=1e-10, form="velocity")
+    asked = []
+
+    class Spy:
+        def __init__(self, kernel):
+            self.kernel, self.islands, self.largest = kernel, kernel.islands, kernel.largest
+
+        def run(self, impulse, tol, steps, *rest):
+            asked.append(steps)
+            return self.kernel.run(impulse, tol, steps, *rest)
+
+    monkeypatch.setattr(general, "WATCHED", 0.0)
+    impulse = problem.start()
+    claim = general.run(problem, Spy(general.prepare(problem)), impulse, 100, 1e-10, None)
+    assert set(asked) == {1} and len(asked) == claim.iterations
+    assert claim.status is lv.Status.CONVERGED
+    assert claim.work == whole.work and np.array_equal(impulse, whole.impulse)
+
+
 def test_a_budget_of_steps_is_kept_and_the_answer_comes_back():
     problem = random_general(21, "cone", n=30, contacts=12)
     one = lv.solve(problem, "newton", form="velocity", tol=1e-13, max_iter=2)

@@ -17,10 +17,11 @@ from lavender.solution import Claim, Status
 from lavender_ext.generalized.newton import ENDS, Newton
 
 FORM = "generalized velocities"
-# Steps for each island between two looks at the clock and at Ctrl-C. With a time limit at most as many as a share of
-# what is left is for: at FLOP, LOOKED_UP times as much where a sparse factor looks for its entries, then at the pace
-# so far, and at FLOP at least: the first steps may be the cheap ones.
+# Steps for each island between two looks at the clock and at Ctrl-C, at most as many as are counted for WATCHED [s]: at
+# FLOP, LOOKED_UP times as much where a sparse factor looks for its entries. With a time limit at most as many as a
+# share of what is left is for: counted so, then at the pace so far, and at FLOP at least: the first may be cheap ones.
 CLOCK = 64
+WATCHED = 4.0
 TIME_SHARE = 0.5
 LOOKED_UP = 20.0
 LATE = 0.05  # s that a step may end after the limit
@@ -75,11 +76,12 @@ def run(
     counts = np.zeros(5, np.int64)
     status, closer = Status.MAX_ITERATIONS, 1.0
     begun = now = perf_counter()
-    clock = CLOCK * max(1, kernel.islands)  # a step is one of an island
+    islands = max(1, kernel.islands)
     step = counted = FLOP * factor_flops(problem, kernel.largest)
-    steps = clock
+    slow = max(LOOKED_UP * step, 1e-9)
+    steps = clock = max(1, int(islands * min(CLOCK, WATCHED / slow)))  # a step is one of an island
     if time_limit is not None:
-        steps = max(1, int(min(TIME_SHARE * time_limit / max(LOOKED_UP * step, 1e-9), clock)))
+        steps = max(1, int(min(TIME_SHARE * time_limit / slow, clock)))
     while counts[0] < n:
         if perf_counter() + min(step, 1e6) > deadline + LATE:
             status = Status.TIME_LIMIT
