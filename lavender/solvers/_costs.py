@@ -276,8 +276,8 @@ class Costs:
         m = float(p.m)
         if p.generalized is not None:
             return self._newton(min(rates.BAND * m, float(dense_factor(m))))
-        nnz = float(len(p._compressed[1]))
-        if is_full(int(nnz), p.m, self._bounded):
+        nnz = len(p._compressed[1])
+        if is_full(nnz, p.m, self._bounded):
             return self._newton(float(dense_factor(m)))
         # Its entries fill; a band is narrower than they are at best, and neither Coulomb's law nor LU asks for one.
         least = float(filled(nnz, 0.0)) if p.m > DENSE_ROWS else float(dense_factor(m))

@@ -190,15 +190,13 @@ class LemkeState:
     form: Standard | None = None
     walk: Walk | None = None
 
-    def ready(self, impulse: FloatArray, anew: bool, time_limit: float | None) -> Walk | None:
-        """Paths from an impulse (m,), or those that were begun; None where the standard form would take longer."""
+    def formed(self, time_limit: float | None) -> Standard | None:
+        """The standard form; None where it would take longer than that [s]."""
         if self.form is None:
             if time_limit is not None and _counted(self.problem) > time_limit:
                 return None
             self.form = standard_form(self.problem)
-        if self.walk is None or anew:
-            self.walk = Walk(self.form, impulse)
-        return self.walk
+        return self.form
 
 
 def _counted(problem: Problem) -> float:
@@ -223,26 +221,33 @@ class Lemke:
     def run(
         self, state: LemkeState, impulse: FloatArray, n: int, tol: float, time_limit: float | None = None
     ) -> Claim:
-        return self._go(state, impulse, n, tol, time_limit, True)
+        start = perf_counter()
+        form = state.formed(time_limit)
+        if form is None:
+            return _too_late()
+        return Walk(form, impulse).go(impulse, n, tol, _left(time_limit, start))
 
     @np.errstate(all="ignore")  # what overflows is judged
     def resume(
         self, state: LemkeState, impulse: FloatArray, n: int, tol: float, time_limit: float | None = None
     ) -> Claim:
         """At most n more pivots from where the last call stopped: n, then n, end where 2 n do."""
-        return self._go(state, impulse, n, tol, time_limit, False)
-
-    def _go(
-        self, state: LemkeState, impulse: FloatArray, n: int, tol: float, time_limit: float | None, anew: bool
-    ) -> Claim:
         start = perf_counter()
-        walk = state.ready(impulse, anew, time_limit)
-        if walk is None:
-            return Claim(
-                Status.TIME_LIMIT, 0, {"pivots": 0}, "the dictionary alone would take longer", form="dense"
-            )
-        left = None if time_limit is None else max(time_limit - (perf_counter() - start), 1e-3)
-        return walk.go(impulse, n, tol, left)
+        form = state.formed(time_limit)
+        if form is None:
+            return _too_late()
+        if state.walk is None:
+            state.walk = Walk(form, impulse)
+        return state.walk.go(impulse, n, tol, _left(time_limit, start))
+
+
+def _too_late() -> Claim:
+    return Claim(Status.TIME_LIMIT, 0, {"pivots": 0}, "the dictionary alone would take longer", form="dense")
+
+
+def _left(time_limit: float | None, start: float) -> float | None:
+    """Of the limit [s] since `start`, of perf_counter; a step at least."""
+    return None if time_limit is None else max(time_limit - (perf_counter() - start), 1e-3)
 
 
 class Walk:

@@ -46,13 +46,17 @@ def test_p_matrices_have_the_one_solution_of_enumeration(seed, m, whole):
         np.testing.assert_allclose(solution.impulse, x, atol=1e-7)
 
 
-@given(seed=seeds, m=st.integers(1, 6))
-def test_every_kind_of_row_against_enumeration(seed, m):
+def random_mix(seed, m):
+    """(A, b, lower, upper): A asymmetric and positive definite, every kind of row."""
     rng = np.random.default_rng(seed)
     g, skew = rng.normal(size=(2, m, m))
-    a = g @ g.T + 0.5 * np.eye(m) + skew - skew.T
     low, high = random_bounds(rng, m)
-    b = 2.0 * rng.normal(size=m)
+    return g @ g.T + 0.5 * np.eye(m) + skew - skew.T, 2.0 * rng.normal(size=m), low, high
+
+
+@given(seed=seeds, m=st.integers(1, 6))
+def test_every_kind_of_row_against_enumeration(seed, m):
+    a, b, low, high = random_mix(seed, m)
     solution = lv.solve(lv.Problem.lcp(a, b, low, high), "lemke", tol=1e-9)
     assert accurate(solution), solution
     truth = enumerate_lcp(a, b, low, high)
@@ -63,14 +67,11 @@ def test_every_kind_of_row_against_enumeration(seed, m):
 
 @given(seed=seeds, m=st.integers(1, 6))
 def test_a_compiled_path_ends_where_enumeration_does(seed, m):
-    rng = np.random.default_rng(seed)
-    g, skew = rng.normal(size=(2, m, m))
-    a = g @ g.T + 0.5 * np.eye(m) + skew - skew.T
-    low, high = random_bounds(rng, m)
-    problem = lv.Problem.lcp(a, 2.0 * rng.normal(size=m), low, high)
+    a, b, low, high = random_mix(seed, m)
+    problem = lv.Problem.lcp(a, b, low, high)
     at, x = np.full(m, 7, np.int32), np.full(m, np.nan)
     assert follow(problem.csr_data, 1e-11, 20 * m, at, x)[0] == DONE
-    ((truth, _),) = enumerate_lcp(a, problem.b, low, high)
+    ((truth, _),) = enumerate_lcp(a, b, low, high)
     bounded = np.isfinite(low) | np.isfinite(high)
     np.testing.assert_allclose(x[bounded], truth[bounded], atol=1e-7)
     assert np.isnan(x[~bounded]).all() and not at[~bounded].any()
@@ -259,3 +260,11 @@ def test_a_dictionary_that_takes_longer_than_the_time_limit_is_not_formed():
     assert "dictionary" in solution.message
     assert solution.work == {"pivots": 0}
     assert lv.solve(problem, "lemke", time_limit=60.0).status is lv.Status.CONVERGED
+
+
+def test_a_prepared_solve_that_is_cut_keeps_no_path():
+    prepared = lv.prepare(random_lcp(3, 60), "lemke")
+    cut = prepared.solve(max_iter=2)
+    assert cut.status is lv.Status.MAX_ITERATIONS
+    assert prepared._state.walk is None  # a dictionary of every row
+    assert prepared.solve().iterations == lv.solve(random_lcp(3, 60), "lemke").iterations

@@ -9,6 +9,7 @@ import pytest
 import lavender as lv
 from lavender import registry, suite
 from lavender.solution import Claim, Status
+from lavender.solvers.jacobi import Jacobi
 
 TINY = lv.Problem.lcp([[2.0, 1.0], [1.0, 2.0]], [1.0, -1.0])
 
@@ -149,8 +150,6 @@ def test_zero_iterations_judge_the_start():
 
 @pytest.mark.parametrize("limit", [None, 10.0])
 def test_with_a_time_limit_the_first_look_at_the_clock_is_after_one_iteration(monkeypatch, limit):
-    from lavender.solvers.jacobi import Jacobi
-
     asked, own = [], Jacobi.run
 
     def run(self, state, impulse, n, tol, time_limit=None):
