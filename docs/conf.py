@@ -7,7 +7,7 @@ solver, the examples' output and figures, scenes, cases, measured curves.
 import sys
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).parent))
+sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parent.parent)]  # generate.py, benchmarks
 
 import docstrings
 import generate

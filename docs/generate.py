@@ -27,13 +27,12 @@ import tried
 
 import lavender as lv
 import lavender_ext
+from benchmarks import motions, stability
 from lavender import bench, registry, suite
-from lavender.bench import level_name, motions
-from lavender.bench.cases import structure_of
+from lavender.bench import level_name, structure_of
 from lavender.ordering import ORDERS
 from lavender.problem import LAWS
 from lavender.report import advice, claims, geometric_means, reaches
-from lavender.report import motions as motion_tables
 from lavender.report.curves import figures as report_figures
 from lavender.report.page import page as report_page
 from lavender.report.style import looks
@@ -626,11 +625,16 @@ def calibration_part(site):
     for name in CASES:
         case = suite.case(name)
         seen += motions.samples(name, case.problem, " + ".join(structure_of(case.problem)))
-    motion_tables.figure(seen, site.path("figures/calibration.svg"))
+    motions.figure(seen, site.path("figures/calibration.svg"))
     site.write(
         "parts/calibration.md",
-        f"{motion_tables.table(seen)}\n\n{image('generated/figures/calibration.svg', 'Motion error over residual')}",
+        f"{motions.table(seen)}\n\n{image('generated/figures/calibration.svg', 'Motion error over residual')}",
     )
+
+
+def stability_part(site):
+    """Eigenvalues of a substep, for the page on towers."""
+    stability.figure(site.path("figures/stability.svg"))
 
 
 def api_page(site):
@@ -716,6 +720,7 @@ def write(source, cache):
     solver_pages(site, records, figures)
     measured_page(site, records, figures)
     example_page(site, cache)
+    stability_part(site)
     scene_page(site)
     suite_page(site)
     part_pages(site)

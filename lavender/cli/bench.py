@@ -23,17 +23,12 @@ __all__ = ["bench"]
 
 
 class Suites(ManyValues):
-    """`lavender bench auto`, `kernels`, `peers`, `stand` are commands; other first words are files (or ./peers)."""
+    """`lavender bench auto`, `mujoco`, `peers` are commands; other first words are files (or ./peers)."""
 
     OWN = {  # noqa: RUF012 - a constant of the class
-        "gallery": "lavender.cli.bench_gallery:gallery",
         "auto": "lavender.cli.bench_auto:auto",
-        "branches": "lavender.cli.bench_branches:branches",
-        "motions": "lavender.cli.bench_motions:motions",
         "mujoco": "lavender.cli.bench_mujoco:mujoco",
-        "kernels": "lavender.cli.bench_kernels:kernels",
         "peers": "lavender.cli.bench_peers:peers",
-        "stand": "lavender.cli.bench_stand:stand",
     }
 
     def make_context(
@@ -74,9 +69,8 @@ def bench(
 ) -> None:
     """As `report`, but only the records: a .jsonl file that `lavender report` shows later.
 
-    `lavender bench peers` compares with other engines and solvers instead, `lavender bench stand` says how long towers
-    stand in each, `lavender bench auto` measures what auto loses against the best of our own solvers; see their own
-    --help.
+    `lavender bench peers` compares with other engines and solvers instead, `lavender bench auto` measures what auto
+    loses against the best of our own solvers; see their own --help.
     """
     plan = make_plan(files, levels, budgets, orders, repeats, time_limit, motion, speed_levels)
     done = measure(files, solvers, plan, out, memory, in_process)

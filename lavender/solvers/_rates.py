@@ -108,7 +108,7 @@ SWEEPS, SWEEPS_REDUNDANT = 60.0, 400.0
 
 ISLAND = 400e3  # what Python takes for an island of its own
 # Islands in compiled code: a call, as it showed in `wild` with them and without; for each island beside its solve, and
-# for each of its rows (`python benchmarks/bench_islands.py`).
+# for each of its rows (`python -m benchmarks islands`).
 TOGETHER, TOGETHER_ISLAND, TOGETHER_ROW = 200e3, 1e3, 60.0
 BAND_AT_ONCE = 4e6  # ns of `direct` on a narrow band up to which nothing else is looked at
 LU_ROWS = 300  # of a linear system that is not symmetric, up to which sweeps are looked at before its factor

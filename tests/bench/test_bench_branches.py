@@ -1,12 +1,12 @@
-"""`lavender bench branches`: which motion a warm-started engine is on."""
+"""`python -m benchmarks branches`: which motion a warm-started engine is on."""
 
 import math
 from dataclasses import replace
 
 import numpy as np
 
-from lavender.bench import branches
-from lavender.report.branches import table
+from benchmarks import branches
+from benchmarks.branches import table
 
 
 def crossing(run="a", motions=2, **words):

@@ -1,4 +1,4 @@
-"""`lavender bench stand`: towers in ours and in others' engines."""
+"""`python -m benchmarks stand`: towers in ours and in others' engines."""
 
 import json
 
@@ -7,9 +7,7 @@ import pytest
 from click.testing import CliRunner
 
 import lavender as lv
-from lavender.bench.stand import ENGINES, Line, Tower, installed, lines, measure, missing
-from lavender.cli.bench_stand import stand
-from lavender.report.stand import table
+from benchmarks.stand import ENGINES, Line, Tower, command, installed, lines, measure, missing, table
 
 
 def line(engine="x", boxes=6, sweeps=4, substeps=4):
@@ -73,7 +71,7 @@ def test_the_command_prints_the_map_and_writes_the_lines(tmp_path):
     out = tmp_path / "stand.json"
     words = ["--engines", "lavender,newton", "--boxes", "2", "--sweeps", "4", "--rates", "60", "--substeps", "0",
              "--seconds", "3", "--out", str(out)]  # fmt: skip
-    result = CliRunner().invoke(stand, words, catch_exceptions=False)
+    result = CliRunner().invoke(command, words, catch_exceptions=False)
     assert result.exit_code == 0 and "| 2 | 1/60 | lavender | 4 | 4 | 960 | 3 |" in result.output
     kept = json.loads(out.read_text())
     assert [x["engine"] for x in kept["lines"]] == ["lavender", "lavender newton"]
@@ -91,7 +89,7 @@ def test_the_command_prints_the_map_and_writes_the_lines(tmp_path):
     ],
 )
 def test_what_makes_no_sense_is_refused_before_anything_is_measured(words, error):
-    result = CliRunner().invoke(stand, words)
+    result = CliRunner().invoke(command, words)
     assert isinstance(result.exception, lv.LavenderError) and error in str(result.exception)
 
 

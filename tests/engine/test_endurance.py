@@ -1,16 +1,17 @@
 """Scenes of the gallery over some seconds: nothing is lost, nothing gains energy, what stands stands still.
 
-The short form of `lavender bench gallery`, which runs ten minutes.
+The short form of `python -m benchmarks gallery`, which runs ten minutes.
 """
 
 import json
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
 import lavender as lv
-from lavender.bench import endurance
-from lavender.report.endurance import table
+from benchmarks import gallery
+from benchmarks.gallery import table
 from lavender.scene import SCENES
 
 SECONDS = 5.0
@@ -18,10 +19,10 @@ STANDING = {"stack", "card_house", "heavy_on_light", "table", "ramp", "pyramid"}
 SMALLER = {"pyramid": {"base": 5}, "pile": {"n": 30, "kind": "mixed"}}  # the same with less to compute
 
 
-@pytest.mark.parametrize("rate", endurance.STEPS_PER_SECOND)
+@pytest.mark.parametrize("rate", gallery.STEPS_PER_SECOND)
 @pytest.mark.parametrize("name", SCENES)
 def test_a_scene_of_the_gallery_keeps_its_energy_and_its_place(name, rate):
-    found = endurance.stay(name, 1.0 / rate, SECONDS, **SMALLER.get(name, {}))
+    found = gallery.stay(name, 1.0 / rate, SECONDS, **SMALLER.get(name, {}))
     assert (found.lost, found.failed, found.seconds) == ("", 0, pytest.approx(SECONDS))
     # What the projection lifts: a slop for each body's weight, and a thousandth of what moves in impacts.
     weight = sum(b.mass for b in lv.Scene(name, **SMALLER.get(name, {})).bodies) * 9.81
@@ -34,7 +35,7 @@ def test_a_scene_of_the_gallery_keeps_its_energy_and_its_place(name, rate):
 
 @pytest.mark.parametrize("name", ["bridge", "four_bar", "stack", "heavy_on_light"])
 def test_newton_keeps_them_too(name):
-    found = endurance.stay(name, 1 / 60, 2.5, solver="newton")
+    found = gallery.stay(name, 1 / 60, 2.5, solver="newton")
     assert (found.lost, found.failed) == ("", 0)
     assert found.gain <= 1e-2 * abs(found.start)
 
@@ -54,35 +55,29 @@ def test_energy_is_that_of_the_textbook():
     )
     observation = lv.Simulation(scene).reset()[0]
     expected = 0.5 * 12 * 25 + 0.5 * (4 + 9) * 4 + 12 * 10 * 5
-    assert endurance.energy(scene, observation) == pytest.approx(expected, rel=1e-14)
+    assert gallery.energy(scene, observation) == pytest.approx(expected, rel=1e-14)
 
 
-def test_a_lost_scene_says_so_and_the_command_writes_its_table(tmp_path, capsys):
-    from lavender.cli import main
-
-    with pytest.raises(SystemExit) as code:
-        main(
-            ["bench", "gallery", "spinner", "ramp", "--seconds", "0.5", "--out", str(tmp_path / "found.json")]
-        )
-    assert not code.value.code
-    printed = capsys.readouterr().out.splitlines()
-    assert len(printed) == 5 and printed[0].startswith("scene") and printed[-1].startswith("ramp")
-    found = json.loads((tmp_path / "found.json").read_text())
+def test_a_lost_scene_says_so_and_the_command_writes_its_table(tmp_path):
+    words = ["spinner", "ramp", "--seconds", "0.5", "--out", str(tmp_path / "found.json")]
+    done = CliRunner().invoke(gallery.command, words, catch_exceptions=False)
+    assert done.exit_code == 0
+    printed = done.output.splitlines()
+    assert len(printed) == 6 and printed[0].startswith("| scene") and printed[-1].startswith("| ramp")
+    found = json.loads((tmp_path / "found.json").read_text())["lines"]
     assert [(f["scene"], round(1 / f["dt"])) for f in found] == [
         ("spinner", 60),
         ("spinner", 120),
         ("ramp", 60),
         ("ramp", 120),
     ]
-    fast = endurance.stay("ramp", 1 / 60, 1.0, gravity=1e307)
-    assert fast.lost == "box 1" and "lost: box 1" in table([fast])
+    fast = gallery.stay("ramp", 1 / 60, 1.0, gravity=1e307)
+    assert fast.lost == "box 1" and "| box 1 |" in table([fast])
     for words in (["--seconds", "0"], ["no_such_scene"], ["--solvers", "nwton", "ramp"]):
-        with pytest.raises(SystemExit) as code:
-            main(["bench", "gallery", *words])
-        assert code.value.code == 2
+        assert isinstance(CliRunner().invoke(gallery.command, words).exception, lv.LavenderError)
 
 
 def test_newton_swings_the_redundant_loop_where_no_projection_moves_its_rows_apart():
-    found = endurance.stay("four_bar", 1 / 120, 3.0, solver="newton", position_iterations=0)
+    found = gallery.stay("four_bar", 1 / 120, 3.0, solver="newton", position_iterations=0)
     assert (found.lost, found.failed) == ("", 0)
     assert found.drift > 0.1  # m

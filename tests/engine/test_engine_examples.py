@@ -26,9 +26,7 @@ def sweeps():
     return module, module.numbers()
 
 
-@pytest.mark.parametrize(
-    "name", ["engine_sweeps", "engine_warm_start", "standing_towers", "two_particles", "all_rows"]
-)
+@pytest.mark.parametrize("name", ["engine_sweeps", "engine_warm_start", "two_particles", "all_rows"])
 def test_prints_its_numbers_and_saves_its_figure(name, tmp_path, capsys):
     path = tmp_path / "figure.png"
     example(name).main(str(path))

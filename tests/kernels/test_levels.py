@@ -5,7 +5,7 @@ import pytest
 from random_problems import random_contact_problem
 
 import lavender as lv
-from lavender.bench.kernels import lattice_pile
+from benchmarks.kernels import lattice_pile
 from lavender_ext.accelerate.accelerated import Pairs
 
 

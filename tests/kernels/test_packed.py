@@ -7,7 +7,7 @@ import pytest
 from random_problems import random_contact_problem
 
 import lavender as lv
-from lavender.bench.kernels import lattice_pile
+from benchmarks.kernels import lattice_pile
 from lavender.engine.layout import HEAD
 from lavender.solvers import _layout
 from lavender.solvers.sequential_impulses import SequentialImpulses

@@ -7,7 +7,7 @@ import pytest
 from random_problems import random_contact_problem
 
 import lavender as lv
-from lavender.bench.kernels import lattice_pile
+from benchmarks.kernels import lattice_pile
 from lavender.ordering import block_order, body_ranks
 from lavender.solvers import _layout, _sweeping
 from lavender_ext.sweep.threaded import Team

@@ -1,4 +1,4 @@
-"""Whether a warm-started engine stays on one branch of motions: what `lavender bench branches` measures.
+"""Whether a warm-started engine stays on one branch of motions: `python -m benchmarks branches`.
 
 A run of LavenderSim is searched every few steps. Where Coulomb's law leaves several motions, the impulses of the
 step before, which the engine starts from, lie nearest to one of them. Sweeps from there, as many as the engine has,
@@ -9,20 +9,25 @@ are on their way to a motion: it is the nearest one, or another. The same number
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
+import click
 import numpy as np
 
+from benchmarks.output import markdown, write_csv
 from lavender import motion
 from lavender._arrays import FloatArray
 from lavender.engine import Simulation
+from lavender.errors import InputError
 from lavender.motion.error import SAME
 from lavender.problem import Problem
 from lavender.registry import available
 from lavender.scene import Scene
 from lavender.solve import solve
 
-__all__ = ["RUNS", "WAYS", "Crossing", "follow", "pushed"]
+__all__ = ["RUNS", "WAYS", "Crossing", "command", "follow", "pushed", "table"]
 
 # Scene, its parameters, and the speed [m/s] that every body is pushed at, each in a direction of its own.
 RUNS: tuple[tuple[str, dict[str, object], float], ...] = (
@@ -138,3 +143,71 @@ def _crossing(run: str, step: int, problem: Problem, sweeps: int) -> Crossing:
         nearest=nearest,
         **values,  # type: ignore[arg-type]
     )
+
+
+HEAD = (
+    *("run", "steps searched", "proved unique", "several motions", "median, largest spread"),
+    *("warm", "cold", "`newton`", "by chance"),
+)
+
+
+def table(found: Sequence[Crossing]) -> str:
+    """For each run, as markdown: steps with several motions, and how often each way ends at the nearest one.
+
+    By chance: how many of them would, if each way ended at any motion of a step alike.
+    """
+    rows = []
+    groups: dict[str, list[Crossing]] = {}
+    for one in found:
+        groups.setdefault(one.run, []).append(one)
+        groups.setdefault("all", []).append(one)
+    for run, group in sorted(groups.items(), key=lambda item: item[0] == "all"):
+        several = [one for one in group if one.motions > 1]
+        spread = [one.spread for one in several]
+        text = f"{np.median(spread):.2g}, {max(spread):.2g} m/s" if spread else ""
+        ways = []
+        for way in WAYS:
+            told = [getattr(one, way) for one in several if getattr(one, way)]
+            ways.append(f"{sum(word == 'nearest' for word in told)} of {len(told)}" if told else "")
+        proved = sum(bool(one.unique) for one in group)
+        chance = f"{sum(1.0 / one.motions for one in several):.0f}" if several else ""
+        rows.append((run, len(group), proved, len(several), text, *ways, chance))
+    lines = [markdown(HEAD, rows)]
+    several = [one for one in found if one.motions > 1]
+    if several:
+        lines += [
+            "",
+            "Distance from where the step comes from, median over steps with several motions [m/s]:",
+            "",
+        ]
+        columns = ("nearest", *(f"{way}_distance" for way in WAYS))
+        middles: list[str] = []
+        for column in columns:
+            told = [x for one in several if not math.isnan(x := getattr(one, column))]
+            middles.append(f"{np.median(told):.2g}" if told else "")
+        lines.append(markdown(("to the nearest motion", "warm", "cold", "`newton`"), [middles]))
+    return "\n".join(lines)
+
+
+@click.command("branches")
+@click.option("--steps", type=click.IntRange(1), default=120, show_default=True, help="Of each run.")
+@click.option(
+    "--every", type=click.IntRange(1), default=3, show_default=True, help="Search one step of these."
+)
+@click.option("--sweeps", type=click.IntRange(4, 64), default=16, show_default=True, help="Of the engine.")
+@click.option("--out", type=click.Path(path_type=Path), help="Folder for branches.csv.")
+def command(steps: int, every: int, sweeps: int, out: Path | None) -> None:
+    """Whether a warm-started engine stays on one branch where a step has several motions.
+
+    Six scenes whose bodies are pushed in directions of their own.
+    """
+    if out is not None and not out.is_dir():
+        raise InputError(f"--out {out}: there is no such folder")
+    found: list[Crossing] = []
+    for name, parameters, speed in RUNS:
+        own = follow(name, speed, steps=steps, every=every, sweeps=sweeps, **parameters)
+        found += own
+        click.echo(f"{own[0].run if own else name}: {len(own)} steps", err=True)
+    click.echo(table(found))
+    if out is not None:
+        write_csv(out / "branches.csv", found)

@@ -1,6 +1,6 @@
-// The WebAssembly side of bench_wasm.py: seconds for one substep and one sweep, as JSON.
+// The WebAssembly side of wasm.py: seconds for one substep and one sweep, as JSON.
 //
-//     node benchmarks/bench_wasm.mjs FOLDER REPEATS
+//     node benchmarks/wasm.mjs FOLDER REPEATS
 
 import { readFileSync } from "node:fs";
 import { join } from "node:path";

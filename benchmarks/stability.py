@@ -1,4 +1,9 @@
-"""Eigenvalues of a substep about rest: which mode of a tower grows, and what makes it.
+"""Why a tower falls that should stand: eigenvalues of one substep of the engine about rest.
+
+With few warm-started sweeps a substep takes only the share kappa of what is left of a tower's slow sway. The sway
+then rings like a spring with little damping, |z| = sqrt(1 - kappa). A contact that asks for its whole gap to be closed
+within one substep feeds the gap back with gain 1; all gains above about kappa drive the sway. The engine lets a
+bearing contact be where it is within the slop: gain 0.
 
 State of a tower of n boxes: places, turns and velocities of the boxes, and the impulses in the cache, 24 n numbers.
 About rest (every face at one gap, the weight spread evenly over the four corners, no friction, all contacts bearing
@@ -19,11 +24,14 @@ g > 0 it leaves the unit circle where g is larger than about kappa.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from os import PathLike
 
+import click
 import numpy as np
 
+from benchmarks.output import markdown, save
 from lavender._arrays import FloatArray
 from lavender.engine import Simulation
 from lavender.engine.layout import HEAD, SETTING
@@ -31,8 +39,10 @@ from lavender.engine.state import State
 from lavender.errors import InputError
 from lavender.scene import Scene
 
-__all__ = ["Modes", "critical_gain", "figure", "model", "modes", "slowest"]
+__all__ = ["Modes", "command", "critical_gain", "figure", "model", "modes", "numbers", "slowest"]
 
+TOWERS = ((2, 4), (4, 4), (6, 4))  # boxes, sweeps
+ORDERS = ("given", "symmetric", "alternating")
 PLAY = 2e-5  # m, gap of a face where feedback acts: more than the differences move it
 STEP = 1e-7  # m, rad, m/s, N s of the differences
 NEUTRAL = 1e-6  # |z| within this of 1 counts as 1: the differences see no more
@@ -219,7 +229,40 @@ def figure(path: str | PathLike[str]) -> None:
     right.set_title("g = 0: gravity is quicker than the sweeps", fontsize=10)
     for panel in (left, middle, right):
         panel.legend(fontsize=8, loc="lower right" if panel is left else "upper left")
-    try:
-        canvas.savefig(path)
-    except (OSError, ValueError) as error:
-        raise InputError(f"cannot write the figure {str(path)!r}: {error}") from None
+    save(canvas, path)
+
+
+def numbers(
+    towers: Sequence[tuple[int, int]] = TOWERS,
+) -> list[tuple[int, int, str, float, float, float, float, float]]:
+    """Per tower and order: kappa, frequency [Hz] at 1/60 and 1/240 s, largest |z| of a substep with gains 0 and 1."""
+    found = []
+    for n, sweeps in towers:
+        for order in ORDERS:
+            still = modes(n, sweeps, 1 / 60, order=order)
+            fine = modes(n, sweeps, 1 / 240, order=order)
+            whole = modes(n, sweeps, 1 / 60, order=order, gain=1.0)
+            most = [np.abs(m.z[0]) ** (1 / m.substeps) for m in (still, whole)]
+            kappa, hertz = slowest(still)
+            found.append((n, sweeps, order, kappa, hertz, slowest(fine)[1], *most))
+    return found
+
+
+@click.command("stability")
+@click.option("--figure", "picture", type=click.Path(), help="Eigenvalues and growth, drawn.")
+def command(picture: str | None) -> None:
+    """Why towers fall on few sweeps: eigenvalues of one substep about rest."""
+    head = ("boxes", "sweeps", "order", "kappa", "Hz, 1/60 s", "Hz, 1/240 s", "|z|, g = 0", "|z|, g = 1")
+    forms = ("{:.2e}", "{:.2f}", "{:.2f}", "{:.6f}", "{:.4f}")
+    cells = [
+        (n, sweeps, order, *(form.format(x) for form, x in zip(forms, values, strict=True)))
+        for n, sweeps, order, *values in numbers()
+    ]
+    click.echo(markdown(head, cells))
+    for n, sweeps in TOWERS[1:]:
+        gain, (kappa, _) = critical_gain(n, sweeps, 1 / 60, digits=1), slowest(modes(n, sweeps, 1 / 60))
+        click.echo(
+            f"{n} boxes, {sweeps} sweeps: the first mode leaves the unit circle at g = {gain:.1e} (kappa {kappa:.1e})"
+        )
+    if picture is not None:
+        figure(picture)

@@ -1,7 +1,7 @@
 """Cost of an engine's step at steady contact, with what the step leaves behind: LavenderSim, MuJoCo, PyBullet.
 
-    python benchmarks/bench_engine.py [--sweeps 16] [--scenes stack6 pyramid55 ...] [--json FILE]
-    python benchmarks/bench_engine.py --detail        what each level of detail of one scene costs
+    python -m benchmarks engine [--sweeps 16] [--scenes stack6,pyramid55] [--out FILE]
+    python -m benchmarks engine --detail        what each level of detail of one scene costs
 
 Every engine steps the same bodies (unit boxes, 1 kg; spheres of 0.5 m) with dt = 1/240 s, the same number of
 solver iterations at tolerance 0, warm-started, friction 0.5. After a settling time, the time is the least
@@ -14,23 +14,20 @@ boxes and spheres. What is not installed is left out and said.
 
 from __future__ import annotations
 
-import argparse
-import importlib.metadata
-import json
-import os
-import platform
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
+from importlib.util import find_spec
+from pathlib import Path
 from time import perf_counter
 from typing import Any
 
-for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-    os.environ.setdefault(variable, "1")
+import click
+import numpy as np
 
-import numpy as np  # noqa: E402
-
-import lavender as lv  # noqa: E402
-from lavender.scene import Box, Plane, Sphere  # noqa: E402
+import lavender as lv
+from benchmarks.output import folder_of, markdown, write_json
+from lavender.errors import UnknownName
+from lavender.scene import Box, Plane, Sphere
 
 DT = 1.0 / 240.0
 SCENES: dict[str, tuple[str, dict[str, Any], int]] = {  # name, parameters, steps to settle
@@ -274,10 +271,7 @@ def detail() -> None:
         ("boxes with friction disk", {"kind": "boxes"}),
         ("and patch friction", {"kind": "boxes", "patch_radius": 0.05}),
     )
-    print(
-        f"{'pile of 200':<26}{'rows/contact':>13}{'bytes/body':>12}{'bytes/contact':>14}{'contacts':>9}"
-        f"{'us/step':>9}{'ns/contact':>11}"
-    )
+    rows: list[tuple[Any, ...]] = []
     for label, more in levels:
         sim = lv.Simulation(lv.Scene("pile", n=200, dt=DT, **more))
         for _ in range(960):
@@ -290,70 +284,85 @@ def detail() -> None:
             size[6] += bodies if size[6] else 0
             sizes.append(State(size).nbytes)
         c = int(sim._state.head[0])
-        print(
-            f"{label:<26}{int(sim._state.size[7]):>13}{(sizes[2] - sizes[0]) // 1000:>12}"
-            f"{(sizes[1] - sizes[0]) // 1000:>14}{c:>9}{1e6 * seconds:>9.0f}{1e9 * seconds / c:>11.0f}"
-        )
+        rows.append(
+            (
+                label, int(sim._state.size[7]), (sizes[2] - sizes[0]) // 1000, (sizes[1] - sizes[0]) // 1000, c,
+                f"{1e6 * seconds:.0f}", f"{1e9 * seconds / c:.0f}",
+            )
+        )  # fmt: skip
+    head = ("pile of 200", "rows/contact", "bytes/body", "bytes/contact", "contacts", "µs/step", "ns/contact")
+    click.echo(markdown(head, rows))
 
 
-ENGINES: dict[str, tuple[str, Callable[[str, int], Row]]] = {
-    "lavender": ("lavender", lavender_row),
-    "mujoco": ("mujoco", mujoco_row),
-    "pybullet": ("pybullet", pybullet_row),
+ENGINES: dict[str, Callable[[str, int], Row]] = {
+    "lavender": lavender_row,
+    "mujoco": mujoco_row,
+    "pybullet": pybullet_row,
 }
 
 
-def available(package: str) -> str | None:
-    """Version of a package, or None."""
-    try:
-        return importlib.metadata.version(package)
-    except importlib.metadata.PackageNotFoundError:
-        return None
-
-
-def main() -> None:
-    """Run and print."""
-    parse = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parse.add_argument("--sweeps", type=int, nargs="+", default=[16])
-    parse.add_argument("--scenes", nargs="+", default=list(SCENES), choices=list(SCENES))
-    parse.add_argument("--engines", nargs="+", default=list(ENGINES), choices=list(ENGINES))
-    parse.add_argument("--json", default=None, help="write the rows here too")
-    parse.add_argument(
-        "--detail", action="store_true", help="levels of detail of one scene, LavenderSim alone"
+def table(rows: list[Row]) -> str:
+    """A line for each engine and scene, markdown."""
+    head = (
+        "scene",
+        "engine",
+        "sweeps",
+        "ms a step",
+        "contacts",
+        "depth [mm]",
+        "speed [m/s]",
+        "residual",
+        "phases [µs]",
     )
-    given = parse.parse_args()
-    if given.detail:
+    return markdown(
+        head,
+        [
+            (
+                r.scene, r.engine, r.sweeps, f"{1e3 * r.step:.4f}", r.contacts, f"{1e3 * r.depth:.3f}",
+                f"{r.speed:.1e}", f"{r.residual:.1e}", ", ".join(f"{k} {1e6 * v:.1f}" for k, v in r.phases.items()),
+            )
+            for r in rows
+        ],
+    )  # fmt: skip
+
+
+def _words(text: str, known: Any, what: str) -> list[str]:
+    found = text.replace(",", " ").split()
+    for word in found:
+        if word not in known:
+            raise UnknownName(what, word, known)
+    return found
+
+
+@click.command("engine")
+@click.option("--sweeps", type=click.IntRange(4, 64), multiple=True, default=(16,), show_default=True)
+@click.option("--scenes", default=",".join(SCENES), show_default=True, help="Names with commas.")
+@click.option("--engines", default=",".join(ENGINES), show_default=True, help="Names with commas.")
+@click.option(
+    "--detail",
+    "levels",
+    is_flag=True,
+    help="What each level of detail of one scene costs; LavenderSim alone.",
+)
+@click.option("--out", type=click.Path(path_type=Path), default=None, help="JSON of the lines.")
+def command(sweeps: tuple[int, ...], scenes: str, engines: str, levels: bool, out: Path | None) -> None:
+    """Cost of an engine's step at steady contact, with what the step leaves behind."""
+    folder_of(out)
+    if levels:
         return detail()
-    versions = {}
-    for name in given.engines:
-        versions[name] = lv.__version__ if name == "lavender" else available(ENGINES[name][0])
-        if versions[name] is None:
-            print(f"{name} is not installed: left out (pip install {name})")
-    print(
-        f"{platform.processor() or platform.machine()}, Python {platform.python_version()}, "
-        + ", ".join(f"{k} {v}" for k, v in versions.items() if v)
-    )
-    print(
-        f"{'scene':<12}{'engine':<12}{'sweeps':>7}{'ms/step':>10}{'contacts':>9}{'depth mm':>10}"
-        f"{'speed m/s':>11}{'residual':>10}  phases [us]"
-    )
+    names = _words(engines, ENGINES, "engine")
     rows = []
-    for scene in given.scenes:
-        for sweeps in given.sweeps:
-            for name in given.engines:
-                if versions[name] is None:
+    for scene in _words(scenes, SCENES, "scene"):
+        for budget in sweeps:
+            for name in names:
+                if find_spec(name) is None:
                     continue
-                row = ENGINES[name][1](scene, sweeps)
-                rows.append(row)
-                shares = ", ".join(f"{k} {1e6 * v:.1f}" for k, v in row.phases.items())
-                print(
-                    f"{row.scene:<12}{row.engine:<12}{row.sweeps:>7}{1e3 * row.step:>10.4f}{row.contacts:>9}"
-                    f"{1e3 * row.depth:>10.3f}{row.speed:>11.1e}{row.residual:>10.1e}  {shares}"
-                )
-    if given.json:
-        with open(given.json, "w") as stream:
-            json.dump({"versions": versions, "rows": [asdict(r) for r in rows]}, stream, indent=1)
-
-
-if __name__ == "__main__":
-    main()
+                rows.append(ENGINES[name](scene, budget))
+                click.echo(f"{scene}, {name}: {1e3 * rows[-1].step:.4f} ms", err=True)
+    click.echo(table(rows))
+    left = [name for name in names if find_spec(name) is None]
+    if left:
+        click.echo(f"\nNot installed: {', '.join(left)}.")
+    if out is not None:
+        write_json(out, rows)
+    return None

@@ -21,20 +21,35 @@ import shutil
 import subprocess
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
+from importlib import metadata
 from importlib.util import find_spec
 from pathlib import Path
 from time import process_time
 from typing import Any
 
+import click
 import numpy as np
 
+from benchmarks.output import folder_of, markdown, write_json
 from lavender._arrays import FloatArray
 from lavender.engine import Simulation
 from lavender.errors import InputError, UnknownName
 from lavender.external._running import quiet
 from lavender.scene import Scene
+from lavender.scene.scene import SCENE_ORDERS
 
-__all__ = ["ENGINES", "Engine", "Line", "Tower", "installed", "lines", "measure", "missing"]
+__all__ = [
+    "ENGINES",
+    "Engine",
+    "Line",
+    "Tower",
+    "command",
+    "installed",
+    "lines",
+    "measure",
+    "missing",
+    "table",
+]
 
 FRICTION = 0.5
 SETTLE = 2.0  # s
@@ -429,3 +444,127 @@ def lines(
                             if key not in seen:
                                 seen.add(key)
                                 yield line
+
+
+def _letters(found: Sequence[Line]) -> dict[tuple[int, float], str]:
+    # towers and sweeps a second that more than one line has
+    count: dict[tuple[int, float], int] = {}
+    for line in found:
+        if line.sweeps:
+            key = (line.boxes, round(line.work, 6))
+            count[key] = count.get(key, 0) + 1
+    out: dict[tuple[int, float], str] = {}
+    for n in {key[0] for key in count}:
+        shared = sorted(key for key, times in count.items() if key[0] == n and times > 1)
+        out |= {key: chr(ord("a") + i) if i < 26 else f"a{i}" for i, key in enumerate(shared)}
+    return out
+
+
+def table(found: Sequence[Line]) -> str:
+    """The map as a markdown table, by tower and step; lines of one tower and letter spend equally many sweeps."""
+    letters = _letters(found)
+    head = (
+        "boxes",
+        "dt [s]",
+        "engine",
+        "sweeps",
+        "substeps",
+        "sweeps a second",
+        "stood [s]",
+        "drift [mm]",
+        "µs a step",
+    )
+    rows = []
+    for line in sorted(found, key=lambda x: (x.boxes, -x.dt)):
+        sweeps = str(line.sweeps) if line.sweeps else "to a tolerance"
+        work = (
+            f"{line.work:,.0f} {letters.get((line.boxes, round(line.work, 6)), '')}".strip()
+            if line.sweeps
+            else "–"
+        )
+        stood = f"{line.seconds:g}" if line.stands else f"**fell at {line.stood:.1f}**"
+        drift = f"{1e3 * line.drift:.2g}" if line.stands else "–"
+        rows.append(
+            (
+                line.boxes, f"1/{round(1 / line.dt)}", line.engine, sweeps, line.substeps, work, stood, drift,
+                f"{1e6 * line.cost:,.3g}",
+            )
+        )  # fmt: skip
+    return markdown(head, rows)
+
+
+def _numbers(text: str, what: str, low: int) -> list[int]:
+    words = text.replace(",", " ").split()
+    if not words or not all(w.isdecimal() and int(w) >= low for w in words):
+        raise InputError(f"{what} {text!r}: whole numbers of at least {low} are needed, with commas between")
+    return [int(w) for w in words]
+
+
+@click.command("stand")
+@click.option("--engines", default=None, help="Names with commas; default: all that are installed.")
+@click.option("--boxes", default="6,10,20", show_default=True, help="Heights of the towers.")
+@click.option(
+    "--sweeps", default="4,8,16", show_default=True, help="Sweeps of a substep, for whoever takes a number."
+)
+@click.option("--rates", default="60,120", show_default=True, help="Steps a second.")
+@click.option(
+    "--substeps", default="0,1,2,4", show_default=True, help="Substeps of a step; 0: the engine's own number."
+)
+@click.option("--orders", default=None, help="Sweep orders of LavenderSim; default: that of the scene.")
+@click.option(
+    "--seconds", type=click.FloatRange(min=3.0), default=60.0, show_default=True, help="Simulated at most."
+)
+@click.option("--out", type=click.Path(path_type=Path), help="JSON of the lines.")
+def command(
+    engines: str | None,
+    boxes: str,
+    sweeps: str,
+    rates: str,
+    substeps: str,
+    orders: str | None,
+    seconds: float,
+    out: Path | None,
+) -> None:
+    """How long towers of boxes stand, how far they move and what a step costs, in every engine that is installed.
+
+    Rapier and Jolt take part where npm has installed them in this folder: npm install @dimforge/rapier3d-compat
+    jolt-physics.
+    """
+    names = installed() if engines is None else engines.replace(",", " ").split()
+    for name in names:
+        if name not in ENGINES:
+            raise UnknownName("engine", name, ENGINES)
+        if missing(name):
+            raise InputError(f"{name} cannot run here: {missing(name)}")
+    asked: list[str | None] = [None] if orders is None else [*orders.replace(",", " ").split()]
+    for order in asked:
+        if order is not None and order not in SCENE_ORDERS:
+            raise UnknownName("order", order, SCENE_ORDERS)
+    folder_of(out)
+    plan = (
+        _numbers(boxes, "--boxes", 1), _numbers(sweeps, "--sweeps", 4), _numbers(rates, "--rates", 1),
+        _numbers(substeps, "--substeps", 0),
+    )  # fmt: skip
+    found = []
+    for line in lines(names, *plan, seconds=seconds, orders=asked):
+        found.append(line)
+        how = (
+            f"stood {line.seconds:g} s, {1e3 * line.drift:.3g} mm"
+            if line.stands
+            else f"fell at {line.stood:.1f} s"
+        )
+        click.echo(
+            f"{line.boxes} boxes, 1/{round(1 / line.dt)} s, {line.engine}, {line.sweeps} x {line.substeps}: {how}",
+            err=True,
+        )
+        if out is not None:
+            write_json(out, found, engines=_versions(names))
+    click.echo(table(found))
+    left = [f"{name} ({missing(name)})" for name in ENGINES if missing(name)] if engines is None else []
+    if left:
+        click.echo(f"\nNot installed: {', '.join(left)}.")
+
+
+def _versions(names: Sequence[str]) -> dict[str, str]:
+    packages = {p for n in names if (p := ENGINES[n].needs) and not isinstance(ENGINES[n].make, str)}
+    return {p: metadata.version(p) for p in sorted(packages)}

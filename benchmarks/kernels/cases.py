@@ -11,9 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from lavender._arrays import FloatArray
-from lavender.bench.kernels.limits import least, stream_time
-from lavender.bench.kernels.problems import (
+from benchmarks.kernels.limits import least, stream_time
+from benchmarks.kernels.problems import (
     bare_contacts,
     contact_bytes,
     csr_bytes,
@@ -21,6 +20,7 @@ from lavender.bench.kernels.problems import (
     raw_bytes,
     tridiagonal,
 )
+from lavender._arrays import FloatArray
 from lavender.engine.simulation import Simulation
 from lavender.errors import InputError
 from lavender.problem import Problem

@@ -1,6 +1,6 @@
 """Cost of the kernels in WebAssembly (Node) beside the native ones, on the same numbers.
 
-    python benchmarks/bench_wasm.py [--rounds 5] [--json FILE]
+    python -m benchmarks wasm [--rounds 5] [--out FILE]
 
 Both sides start from the same bytes and do the same arithmetic to the last bit (tests/web/test_wasm.py), so a
 ratio compares code, never work. A substep is timed as a run of substeps from a settled state, restored before
@@ -13,9 +13,7 @@ two calls.
 
 from __future__ import annotations
 
-import argparse
 import json
-import os
 import platform
 import subprocess
 import sys
@@ -24,19 +22,18 @@ from tempfile import TemporaryDirectory
 from time import perf_counter
 from typing import Any
 
-for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-    os.environ.setdefault(variable, "1")
+import click
+import numpy as np
+import scipy.sparse as sp
 
-import numpy as np  # noqa: E402
-import scipy.sparse as sp  # noqa: E402
-
-import lavender as lv  # noqa: E402
-from lavender import registry  # noqa: E402
-from lavender.engine import Snapshot  # noqa: E402
-from lavender.engine.state import State  # noqa: E402
-from lavender.web import pages  # noqa: E402
-from lavender.web.scenes import layout  # noqa: E402
-from lavender_ext.host import memory  # noqa: E402
+import lavender as lv
+from benchmarks.output import folder_of, markdown, write_json
+from lavender import registry
+from lavender.engine import Snapshot
+from lavender.engine.state import State
+from lavender.web import pages
+from lavender.web.scenes import layout
+from lavender_ext.host import memory
 
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT / "tests" / "wasm"))
@@ -51,7 +48,7 @@ SCENES: dict[str, tuple[str, dict[str, Any], int, int]] = {
     "pile of 300": ("pile", {"n": 300}, 240, 4),
 }
 TARGET = 1.3  # times native
-LEAST = 0.5  # s, of repetitions in a turn, here and in bench_wasm.mjs
+LEAST = 0.5  # s, of repetitions in a turn, here and in wasm.mjs
 
 
 def problems() -> dict[str, tuple[lv.Problem, int]]:
@@ -120,13 +117,13 @@ def native_sweeps(problem: lv.Problem, sweeps: int, repeats: int) -> float:
     return float(best)
 
 
-def main() -> None:
-    """Print the table; write it as JSON on request."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--rounds", type=int, default=5, help="turns of native and Node")
-    parser.add_argument("--repeats", type=int, default=4, help="repetitions within a turn")
-    parser.add_argument("--json", type=Path, help="file for the numbers")
-    arguments = parser.parse_args()
+@click.command("wasm")
+@click.option("--rounds", default=5, show_default=True, help="Turns of native and Node.")
+@click.option("--repeats", default=4, show_default=True, help="Repetitions within a turn.")
+@click.option("--out", type=click.Path(path_type=Path), default=None, help="JSON of the numbers.")
+def command(rounds: int, repeats: int, out: Path | None) -> None:
+    """Cost of the kernels in WebAssembly (Node) beside the native ones, on the same numbers."""
+    folder_of(out)
     node = subprocess.run(["node", "--version"], capture_output=True, text=True, check=True).stdout.strip()
     best: dict[str, dict[str, float]] = {}
     with TemporaryDirectory() as folder:
@@ -148,18 +145,18 @@ def main() -> None:
             json.dumps({"layout": layout(), "scenes": scenes, "problems": recorded}, allow_nan=False)
         )
         (work / "bench.bin").write_bytes(b"".join(writer.parts))
-        script = ROOT / "benchmarks" / "bench_wasm.mjs"
-        for _ in range(arguments.rounds):
+        script = ROOT / "benchmarks" / "wasm.mjs"
+        for _ in range(rounds):
             times: dict[str, dict[str, float]] = {"native": {}, "wasm": {}}
             for name, (simulation, snapshot, substeps) in starts.items():
                 begun, found = perf_counter(), []
-                while len(found) < arguments.repeats or perf_counter() - begun < LEAST:
+                while len(found) < repeats or perf_counter() - begun < LEAST:
                     simulation.restore(snapshot)
                     found.append(native_substeps(simulation, substeps))
                 times["native"][name] = min(found)
             for name, (problem, sweeps) in cases.items():
-                times["native"][name] = native_sweeps(problem, sweeps, arguments.repeats)
-            command = ["node", str(script), folder, str(arguments.repeats)]
+                times["native"][name] = native_sweeps(problem, sweeps, repeats)
+            command = ["node", str(script), folder, str(repeats)]
             done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
             times["wasm"] = json.loads(done.stdout)
             for side, found_times in times.items():
@@ -167,17 +164,17 @@ def main() -> None:
                     entry = best.setdefault(name, {})
                     entry[side] = min(time, entry.get(side, np.inf))
     where = f"{platform.machine()}, CPython {platform.python_version()}, Node {node}"
-    print(f"{where}, {arguments.rounds} turns, least times\n")
-    print(f"{'':44}{'native':>12}{'wasm':>12}{'ratio':>8}")
+    click.echo(f"{where}, {rounds} turns, least times\n")
+    rows = []
     for name, entry in best.items():
         entry["ratio"] = entry["wasm"] / entry["native"]
         unit = "sweep" if name in cases else "substep"
-        late = "" if entry["ratio"] <= TARGET else f"   above {TARGET}"
-        times_shown = "".join(f"{1e6 * entry[side]:9.2f} us" for side in ("native", "wasm"))
-        print(f"{name:44}{times_shown}{entry['ratio']:8.2f}  per {unit}{late}")
-    if arguments.json:
-        arguments.json.write_text(json.dumps({"node": node, "cases": best}, indent=1))
-
-
-if __name__ == "__main__":
-    main()
+        late = "" if entry["ratio"] <= TARGET else f" (above {TARGET})"
+        rows.append(
+            (
+                name, unit, *(f"{1e6 * entry[side]:.2f}" for side in ("native", "wasm")), f"{entry['ratio']:.2f}{late}",
+            )
+        )  # fmt: skip
+    click.echo(markdown(("case", "unit", "native [µs]", "wasm [µs]", "ratio"), rows))
+    if out is not None:
+        write_json(out, [{"case": name, **entry} for name, entry in best.items()], node=node)

@@ -10,18 +10,23 @@ solver left behind; for one that swings or rolls, its motion.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
+from pathlib import Path
 from time import process_time
 from typing import Any
 
+import click
 import numpy as np
 
+from benchmarks.output import folder_of, markdown, write_json
 from lavender._arrays import FloatArray
 from lavender.engine import Simulation
-from lavender.scene import Scene
+from lavender.errors import InputError
+from lavender.scene import SCENES, Scene
 from lavender.scene.parts import rotation
 
-__all__ = ["STEPS_PER_SECOND", "Stay", "energy", "stay"]
+__all__ = ["STEPS_PER_SECOND", "Stay", "command", "energy", "stay", "table"]
 
 STEPS_PER_SECOND = (60, 120)
 SETTLED = 2.0  # s
@@ -117,3 +122,53 @@ def stay(
         failed=info["failed_solves"],
         cost=cost / max(done, 1),
     )
+
+
+HEAD = (
+    *("scene", "solver", "1/dt", "s", "E start [J]", "E end [J]", "gain [J]", "drift [mm]", "speed [m/s]"),
+    *("depth [mm]", "failed", "µs a step", "lost"),
+)
+
+
+def table(found: Iterable[Stay]) -> str:
+    """A line a run, markdown."""
+    return markdown(
+        HEAD,
+        [
+            (
+                f.scene, f.solver, round(1 / f.dt), f"{f.seconds:.0f}", f"{f.start:.4g}", f"{f.end:.4g}",
+                f"{f.gain:.2g}", f"{1e3 * f.drift:.3g}", f"{f.speed:.2g}", f"{1e3 * f.depth:.3g}", f.failed,
+                f"{1e6 * f.cost:.0f}", f.lost,
+            )
+            for f in found
+        ],
+    )  # fmt: skip
+
+
+@click.command("gallery")
+@click.argument("scenes", nargs=-1, metavar="[SCENES]...")
+@click.option("--seconds", type=float, default=600.0, show_default=True, help="Simulated, of each run.")
+@click.option(
+    "--solvers",
+    default="sequential_impulses",
+    show_default=True,
+    help="Solvers of the substeps, commas between them.",
+)
+@click.option("--out", type=click.Path(path_type=Path), default=None, help="Also write the numbers as JSON.")
+def command(scenes: tuple[str, ...], seconds: float, solvers: str, out: Path | None) -> None:
+    """Run scenes of the gallery for ten minutes, at 60 and at 120 steps a second: energies, drifts, times.
+
+    SCENES: names; without any, the whole gallery.
+    """
+    if not seconds > 0.0:
+        raise InputError(f"seconds is {seconds:g}; more than 0 is needed")
+    folder_of(out)
+    found: list[Stay] = []
+    for name in scenes or tuple(SCENES):
+        for solver in solvers.split(","):
+            for rate in STEPS_PER_SECOND:
+                found.append(stay(name, 1.0 / rate, seconds, solver=solver))
+                lines = table(found[-1:]).splitlines()
+                click.echo("\n".join(lines if len(found) == 1 else lines[2:]))
+    if out is not None:
+        write_json(out, found)

@@ -1,6 +1,6 @@
 """Frames a second of the page that runs the kernels, and what one frame costs, in Chromium without a window.
 
-    python benchmarks/bench_page.py [ADDRESS ...] [--seconds 8]
+    python -m benchmarks page [ADDRESS ...] [--seconds 8]
 
 ADDRESS is what stands behind # in the page's address; by default the pyramid with sweeps on both sides, the pyramid
 with `newton` beside sweeps, and the pile. Frames are those that the page asked for (requestAnimationFrame);
@@ -9,16 +9,17 @@ that the thread did for a frame (layout, painting of canvases, hand-over to the 
 steps of those, too).
 """
 
-import argparse
 import os
 import shutil
-import sys
 import tempfile
 import threading
 from pathlib import Path
 
+import click
 from playwright.sync_api import sync_playwright
 
+from benchmarks.output import markdown
+from lavender.errors import SolverUnavailable
 from lavender.web import pages
 
 ADDRESSES = (
@@ -61,28 +62,22 @@ def cpu(page, session, code, times):
     return (spent(session) - before) / times
 
 
-def main():
-    """A line for each address."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("addresses", nargs="*", default=ADDRESSES)
-    parser.add_argument("--seconds", type=float, default=8.0)
-    given = parser.parse_args()
+@click.command("page")
+@click.argument("addresses", nargs=-1, metavar="[ADDRESS]...")
+@click.option("--seconds", default=8.0, show_default=True)
+def command(addresses, seconds):
+    """Frames a second of the page that runs the kernels, and what one frame costs, in Chromium."""
     names = ("chromium", "chromium-browser", "google-chrome")
     browser_path = os.environ.get("CHROMIUM") or next(filter(None, map(shutil.which, names)), None)
     if browser_path is None:
-        sys.exit(f"none of {', '.join(names)} is installed, and CHROMIUM names no browser")
-    print(
-        "| address | frames/s | simulated s/s | "
-        + " | ".join(f"{name} [ms]" for name in (*PARTS, "script", "main thread"))
-        + " |"
-    )
-    print("|---" * (len(PARTS) + 5) + "|")
+        raise SolverUnavailable(f"none of {', '.join(names)} is installed, and CHROMIUM names no browser")
+    rows = []
     with tempfile.TemporaryDirectory() as folder, sync_playwright() as p:
         pages.write_page(Path(folder), print)
         server = pages.server(Path(folder))
         threading.Thread(target=server.serve_forever, daemon=True).start()
         browser = p.chromium.launch(executable_path=browser_path, args=["--no-sandbox"])
-        for address in given.addresses:
+        for address in addresses or ADDRESSES:
             page = browser.new_page(viewport={"width": 1280, "height": 1000})
             page.goto(f"http://127.0.0.1:{server.server_address[1]}/#{address}")
             page.wait_for_selector("html[data-ready=true]")
@@ -91,7 +86,7 @@ def main():
             session.send("Performance.enable", {"timeDomain": "threadTicks"})
             before = spent(session)
             page.evaluate(COUNT)
-            page.wait_for_timeout(1000 * given.seconds)
+            page.wait_for_timeout(1000 * seconds)
             found = page.evaluate(
                 "() => ({...found, to: lavender.steps, passed: performance.now() - found.begun})"
             )
@@ -103,18 +98,22 @@ def main():
             parts["the rest"] /= 8
             parts["script"] = sum(parts.values())
             parts["main thread"] = thread / found["frames"]
-            seconds = found["passed"] / 1000
-            cells = [
-                address.split("&speed")[0],
-                f"{found['frames'] / seconds:.1f}",
-                f"{(found['to'] - found['from']) * dt / seconds:.2f}",
-                *(f"{ms:.2f}" for ms in parts.values()),
-            ]
-            print("| " + " | ".join(cells) + " |", flush=True)
+            passed = found["passed"] / 1000
+            rows.append(
+                [
+                    address.split("&speed")[0],
+                    f"{found['frames'] / passed:.1f}",
+                    f"{(found['to'] - found['from']) * dt / passed:.2f}",
+                    *(f"{ms:.2f}" for ms in parts.values()),
+                ]
+            )
             page.close()
         browser.close()
         server.shutdown()
-
-
-if __name__ == "__main__":
-    main()
+    head = (
+        "address",
+        "frames/s",
+        "simulated s/s",
+        *(f"{name} [ms]" for name in (*PARTS, "script", "main thread")),
+    )
+    click.echo(markdown(head, rows))

@@ -9,10 +9,11 @@ add time). The limit is measured in the same run (`lavender_ext/bench/`, compile
 Instructions are counted by valgrind's callgrind where it is asked for and installed.
 """
 
-from lavender.bench.kernels.cases import CASES, Row, run, scaling
-from lavender.bench.kernels.instructions import COUNTED, counted, instructions
-from lavender.bench.kernels.limits import FOOTPRINTS, Limit, least, measure_limits, stream_time
-from lavender.bench.kernels.problems import bare_contacts, contact_bytes, csr_bytes, lattice_pile, tridiagonal
+from benchmarks.kernels.cases import CASES, Row, run, scaling
+from benchmarks.kernels.command import command, limits_table, scaling_table, table
+from benchmarks.kernels.instructions import COUNTED, counted, instructions
+from benchmarks.kernels.limits import FOOTPRINTS, Limit, least, measure_limits, stream_time
+from benchmarks.kernels.problems import bare_contacts, contact_bytes, csr_bytes, lattice_pile, tridiagonal
 
 __all__ = [
     "CASES",
@@ -21,15 +22,19 @@ __all__ = [
     "Limit",
     "Row",
     "bare_contacts",
+    "command",
     "contact_bytes",
     "counted",
     "csr_bytes",
     "instructions",
     "lattice_pile",
     "least",
+    "limits_table",
     "measure_limits",
     "run",
     "scaling",
+    "scaling_table",
     "stream_time",
+    "table",
     "tridiagonal",
 ]

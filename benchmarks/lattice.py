@@ -1,7 +1,7 @@
 """Newton's factor on lattices of spheres, by block rows and by panels, and whole solves beside it.
 
-    python benchmarks/bench_lattice.py [--sides 6 10 14] [--ratio 1e4] [--mu 0.5] [--off 0.02] [--keep 1] [--seed 0]
-                                       [--solvers auto]
+    python -m benchmarks lattice [--side 6 --side 10] [--ratio 1e4] [--mu 0.5] [--off 0.02] [--keep 1] [--seed 0]
+                                 [--solvers auto]
 
 side^3 spheres, each touching its neighbours and the floor, positions `off` the lattice, masses log-uniform over
 `ratio`, each contact kept with probability `keep`. Times are CPU time of one thread. With `--mu` equal spheres with
@@ -10,14 +10,14 @@ friction instead, and sweeps beside `newton`.
 
 from __future__ import annotations
 
-import argparse
 from dataclasses import replace
 
+import click
 import numpy as np
-from clock import cpu
 from scipy.spatial import cKDTree
 
 import lavender as lv
+from benchmarks.clock import cpu
 from lavender.problem import Problem
 from lavender.solvers._newton import systems
 from lavender.suite.build import Bodies, Contacts
@@ -92,26 +92,22 @@ def solves(problem: Problem, names: list[str]) -> None:
             print(f"  {name:<10} to {tol:.0e}: {1e3 * time:8.1f} ms {solution.status.name} {solution.work}")
 
 
-def main() -> None:
-    """Print every figure."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--sides", type=int, nargs="+", default=[6, 10, 14])
-    parser.add_argument("--ratio", type=float, default=1e4)
-    parser.add_argument("--mu", type=float, default=None)
-    parser.add_argument("--off", type=float, default=0.02)
-    parser.add_argument("--keep", type=float, default=1.0)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--solvers", nargs="+", default=None)
-    args = parser.parse_args()
-    for side in args.sides:
-        problem = lattice(side, args.ratio, args.mu, args.seed, args.off, args.keep)
-        print(f"side {side}, {problem.m} rows, {problem.law}")
-        if args.mu is None:
+@click.command("lattice")
+@click.option("--side", "sides", type=int, multiple=True, default=(6, 10, 14), show_default=True)
+@click.option("--ratio", default=1e4, show_default=True, help="Of masses.")
+@click.option("--mu", type=float, default=None, help="Friction; equal masses then.")
+@click.option("--off", default=0.02, show_default=True, help="The lattice, in diameters.")
+@click.option("--keep", default=1.0, show_default=True, help="Probability of each contact.")
+@click.option("--seed", default=0, show_default=True)
+@click.option("--solvers", default="", help="Names with commas; default: newton, direct or anderson, auto.")
+def command(
+    sides: tuple[int, ...], ratio: float, mu: float | None, off: float, keep: float, seed: int, solvers: str
+) -> None:
+    """Newton's factor on lattices of spheres, and whole solves beside it."""
+    names = solvers.replace(",", " ").split()
+    for side in sides:
+        problem = lattice(side, ratio, mu, seed, off, keep)
+        click.echo(f"side {side}, {problem.m} rows, {problem.law}")
+        if mu is None:
             factors(problem)
-        solves(problem, args.solvers or ["newton", "direct" if args.mu is None else "anderson", "auto"])
-
-
-if __name__ == "__main__":
-    main()
+        solves(problem, names or ["newton", "direct" if mu is None else "anderson", "auto"])

@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from lavender.bench.kernels.cases import frictionless, sweeps
-from lavender.bench.kernels.problems import lattice_pile, tridiagonal
+from benchmarks.kernels.cases import frictionless, sweeps
+from benchmarks.kernels.problems import lattice_pile, tridiagonal
 from lavender.errors import InputError, SolverUnavailable
 from lavender.problem import Problem
 from lavender.solve import solve
@@ -23,9 +23,10 @@ from lavender_ext.judge import measure
 
 __all__ = ["COUNTED", "counted", "instructions"]
 
+ROOT = Path(__file__).parents[2]  # of the checkout
 _COUNT = """
 import sys
-from lavender.bench import kernels
+from benchmarks import kernels
 name, n = sys.argv[1], int(sys.argv[2])
 call, work = kernels.counted(name)
 call()
@@ -81,6 +82,7 @@ def instructions(name: str, calls: int = 50) -> float:
                 capture_output=True,
                 text=True,
                 check=False,
+                cwd=ROOT,
                 env={**_environment(), "PYTHONHASHSEED": "0"},
             )  # fmt: skip
             found = re.search(

@@ -1,0 +1,60 @@
+"""`python -m benchmarks NAME [OPTIONS]`, in the folder of the checkout."""
+
+from __future__ import annotations
+
+import importlib
+import os
+
+import click
+
+for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(variable, "1")  # before NumPy is imported
+
+NAMES = (
+    "branches",
+    "engine",
+    "gallery",
+    "islands",
+    "kernels",
+    "lattice",
+    "motions",
+    "page",
+    "stability",
+    "stand",
+    "wasm",
+)
+
+
+class Benchmarks(click.Group):
+    """Commands by name, each imported when it is asked for."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """Every name."""
+        return list(NAMES)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        """The command of `benchmarks.NAME`."""
+        if cmd_name not in NAMES:
+            return None
+        command: click.Command = importlib.import_module(f"benchmarks.{cmd_name}").command
+        return command
+
+
+@click.group(cls=Benchmarks)
+def cli() -> None:
+    """What measures lavender itself."""
+
+
+def main() -> None:
+    """The command line; what lavender says is an error line, as in its own commands."""
+    from lavender.errors import LavenderError
+
+    try:
+        cli(prog_name="python -m benchmarks")
+    except LavenderError as error:
+        click.echo(f"benchmarks: {error}", err=True)
+        raise SystemExit(2) from None
+
+
+if __name__ == "__main__":
+    main()

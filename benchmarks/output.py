@@ -1,0 +1,66 @@
+"""Tables as markdown, lines as JSON or CSV, figures as files: for every benchmark."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, fields
+from pathlib import Path
+from typing import Any
+
+from lavender.bench import machine
+from lavender.errors import InputError
+
+__all__ = ["folder_of", "markdown", "save", "write_csv", "write_json"]
+
+
+def markdown(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
+    """A table; columns whose cells are all numbers are ruled like the others, for a diff that stays small."""
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join("| " + " | ".join(str(cell) for cell in line) + " |" for line in lines)
+
+
+def folder_of(out: Path | None) -> Path | None:
+    """`--out FILE`, refused before anything is measured where its folder does not exist."""
+    if out is not None and not out.parent.is_dir():
+        raise InputError(f"--out {out}: there is no such folder")
+    return out
+
+
+def write_json(path: Path, lines: Iterable[Any], **more: Any) -> None:
+    """Lines (dataclasses or dictionaries) with the machine and versions of packages; the file is whole or absent."""
+    rows = [line if isinstance(line, dict) else asdict(line) for line in lines]
+    text = json.dumps(
+        {"cpu": machine.cpu_name(), "versions": machine.versions(), **more, "lines": rows}, indent=1
+    )
+    part = path.with_name(path.name + ".part")
+    try:
+        part.write_text(text + "\n", encoding="utf-8")
+        part.replace(path)
+    except OSError as error:
+        raise InputError(f"cannot write {str(path)!r}: {error.strerror}") from None
+
+
+def write_csv(path: Path, lines: Iterable[Any]) -> None:
+    """One line for each dataclass, floats to their last digit."""
+    entries = list(lines)
+    with open(path, "w", newline="", encoding="utf-8") as stream:
+        write = csv.writer(stream)
+        if entries:
+            write.writerow([f.name for f in fields(entries[0])])
+        write.writerows([*asdict(entry).values()] for entry in entries)
+
+
+def save(canvas: Any, path: str | Path, **options: Any) -> None:
+    """A matplotlib figure as a file.
+
+    Raises
+    ------
+    InputError
+        A path that cannot be written, or a suffix that matplotlib does not know.
+    """
+    try:
+        canvas.savefig(path, **options)
+    except (OSError, ValueError) as error:
+        raise InputError(f"cannot write the figure {str(path)!r}: {error}") from None
