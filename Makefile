@@ -22,8 +22,9 @@ test: kernels  ## every test
 quick: kernels  ## tests but for the slow ones, first failure stops
 	$(PYTHON) -m pytest -q -x -m "not slow"
 
-lint:  ## ruff and cython-lint
+lint:  ## ruff, import-linter, cython-lint
 	$(BIN)ruff check .
+	$(BIN)lint-imports
 	PATH="$(abspath $(BIN)):$$PATH" cython-lint $$(git ls-files 'lavender_ext/*.pyx' 'lavender_ext/*.pxd')
 
 format:  ## rewrite Python files in the format that CI expects

@@ -1,51 +1,20 @@
-"""Every room imports only rooms below it (the order is the flow of a problem from scene to report)."""
+"""Rooms of the kernels cimport only from below; those of Python are held by import-linter (pyproject.toml)."""
 
 import ast
 import re
+import sys
 from pathlib import Path
 
 import pytest
 
-import lavender
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    tomllib = pytest.importorskip("tomli")
 
-PACKAGE = Path(lavender.__file__).resolve().parent
 ROOT = Path(__file__).resolve().parent.parent.parent
 
-#: Bottom to top; names on one line are of one level and do not import each other.
-LEVELS = [
-    {"_version", "_built"},
-    {"errors"},
-    {"_arrays", "_derived", "_lu", "apart"},
-    {"cones"},
-    {"generalized", "rows"},
-    {"problem"},
-    {"residuals", "measures", "certificates"},
-    {"solution"},
-    {"io", "ordering"},
-    {"registry"},
-    {"external", "solvers"},
-    {"solve"},
-    {"check", "many", "motion", "redundancy"},
-    {"scene"},
-    {"engine"},
-    {"suite"},
-    {"bench"},
-    {"report"},
-    {"web"},
-    {"cli"},
-    {"__main__"},
-]
-#: Imports upwards that happen inside a function, when it is first called, or for a type checker alone.
-LATE = {
-    ("_derived", "motion"),  # a problem keeps its reference, whose type is known above
-    ("problem", "io"),  # Problem.save
-    ("bench", "report"),  # Records.plot
-    ("engine", "web"),  # Simulation.view shows itself in the page
-    ("solution", "motion"),  # Solution.motion_error is a short way to lavender.motion_error
-}
-HEIGHT = {name: height for height, level in enumerate(LEVELS) for name in level}
-
-#: The same for the rooms of lavender_ext, whose modules share inline headers by cimport.
+#: Bottom to top, the rooms of lavender_ext, whose modules share inline headers by cimport.
 KERNEL_LEVELS = [
     {"core"},
     {"factor", "judge"},
@@ -55,60 +24,6 @@ KERNEL_LEVELS = [
     {"bench", "few", "host"},
 ]
 KERNEL_HEIGHT = {name: height for height, level in enumerate(KERNEL_LEVELS) for name in level}
-
-
-def room_of(path: Path, package: Path) -> str:
-    """`solvers` for lavender/solvers/pgs.py, `cones` for lavender/cones.py, `` for lavender/__init__.py."""
-    first = path.relative_to(package).parts[0].removesuffix(".py")
-    return "" if first == "__init__" else first
-
-
-def _is_type_checking(test: ast.expr) -> bool:
-    return isinstance(test, ast.Name) and test.id == "TYPE_CHECKING"
-
-
-def imports(path: Path, package: Path) -> list[tuple[int, str, bool]]:
-    """Line, dotted name, and whether inside a function, of everything that a file imports from lavender."""
-    found = []
-    inside = ["lavender", *path.relative_to(package).parent.parts]
-    tree = ast.parse(path.read_text(encoding="utf-8"))
-    functions = (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda)
-    late = {id(node) for f in ast.walk(tree) if isinstance(f, functions) for node in ast.walk(f)}
-    # What only a type checker reads counts as late too: nothing is imported.
-    checked = [node for node in ast.walk(tree) if isinstance(node, ast.If) and _is_type_checking(node.test)]
-    late |= {id(node) for branch in checked for part in branch.body for node in ast.walk(part)}
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Import):
-            found += [(node.lineno, alias.name, id(node) in late) for alias in node.names]
-        elif isinstance(node, ast.ImportFrom):
-            base = inside[: len(inside) - node.level + 1] if node.level else []
-            module = ".".join([*base, *([node.module] if node.module else [])])
-            # In `from lavender import x` each x may be a module.
-            names = [f"lavender.{alias.name}" for alias in node.names] if module == "lavender" else [module]
-            found += [(node.lineno, name, id(node) in late) for name in names]
-    return [entry for entry in found if entry[1] == "lavender" or entry[1].startswith("lavender.")]
-
-
-def breaches(package: Path) -> list[str]:
-    """Every import that goes up, sideways within a level, or round by `import lavender`."""
-    found = []
-    for path in sorted(package.rglob("*.py")):
-        room = room_of(path, package)
-        where = path.relative_to(package.parent).as_posix()
-        if room == "":
-            continue  # lavender/__init__.py holds the public names: it may import every room
-        if room not in HEIGHT:
-            found.append(f"{where}: the room {room!r} has no place in LEVELS of tests/project/test_layers.py")
-            continue
-        for line, name, late in imports(path, package):
-            other = name.split(".")[1] if "." in name else ""
-            if other == room or (late and (room, other) in LATE):
-                continue
-            if other not in HEIGHT:
-                found.append(f"{where}:{line}: imports {name}: name the module it comes from")
-            elif HEIGHT[other] >= HEIGHT[room]:
-                found.append(f"{where}:{line}: {room} imports {name}, which stands above or beside it")
-    return found
 
 
 def kernel_breaches(package: Path) -> list[str]:
@@ -132,10 +47,6 @@ def kernel_breaches(package: Path) -> list[str]:
             elif other != room and KERNEL_HEIGHT[other] >= KERNEL_HEIGHT[room]:
                 found.append(f"{where}: {room} cimports lavender_ext{name}, which stands above or beside it")
     return found
-
-
-def test_every_import_goes_down():
-    assert breaches(PACKAGE) == []
 
 
 def test_kernels_import_nothing_of_lavender():
@@ -205,56 +116,18 @@ def test_a_cimport_downwards_passes(tmp_path, file, line):
     assert kernel_breaches(tmp_path / "lavender_ext") == []
 
 
-@pytest.mark.parametrize(
-    ("file", "line", "sign"),
-    [
-        ("cones.py", "from lavender.problem import Problem", "cones imports lavender.problem"),
-        ("cones.py", "from .problem import Problem", "cones imports lavender.problem"),
-        ("solvers/pgs.py", "from ..report import tables", "solvers imports lavender.report"),
-        ("external/qp.py", "from lavender.solvers.pgs import f", "external imports lavender.solvers"),
-        ("problem.py", "def f():\n    import lavender.solve", "problem imports lavender.solve"),
-        ("registry.py", "from lavender.solvers import SPECS", "registry imports lavender.solvers"),
-        ("engine/step.py", "import lavender as lv", "name the module"),
-        ("engine/step.py", "from lavender import Problem", "name the module"),
-        ("attic.py", "import os", "has no place"),
-    ],
-)
-def test_a_breach_is_named(tmp_path, file, line, sign):
-    path = tmp_path / "lavender" / file
-    path.parent.mkdir(parents=True)
-    path.write_text(line)
-    assert len(breaches(tmp_path / "lavender")) == 1
-    assert sign in breaches(tmp_path / "lavender")[0]
-
-
-@pytest.mark.parametrize(
-    ("file", "line"),
-    [
-        ("problem.py", "from lavender import cones"),
-        (
-            "solvers/pgs.py",
-            "from .jacobi import f\nfrom lavender.solvers import gauss\nfrom ..problem import Problem",
-        ),
-        ("cli.py", "from lavender import bench, report"),
-        ("__init__.py", "from lavender.solve import solve"),
-        ("cones.py", "import lavender_ext.judge.measure"),
-        ("solution.py", "def motion_error():\n    from lavender.motion import motion_error"),
-    ],
-)
-def test_an_import_downwards_passes(tmp_path, file, line):
-    path = tmp_path / "lavender" / file
-    path.parent.mkdir(parents=True)
-    path.write_text(line)
-    assert breaches(tmp_path / "lavender") == []
-
-
-def test_the_page_on_architecture_names_every_room():
+def test_the_page_on_architecture_lists_the_rooms_in_the_order_of_their_contract():
+    settings = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["importlinter"]
+    layers = [layer.split(" | ") for layer in settings["contracts"][0]["layers"]]
+    height = {room: i for i, layer in enumerate(reversed(layers)) for room in layer if room[0] != "_"}
     page = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
-    rooms = {room for room in HEIGHT if not room.startswith("_")}
-    named = set(re.findall(r"`(\w+)`", page[page.index("## The rooms of `lavender`") :]))
-    assert rooms - named == set()
-    kernels = (ROOT / "lavender_ext" / "README.md").read_text(encoding="utf-8")
-    assert set(KERNEL_HEIGHT) == set(re.findall(r"^\| `(\w+)/`", kernels, re.MULTILINE))
+    table = page[page.index("## The rooms of `lavender`") : page.index("## The rooms of `lavender_ext`")]
+    listed = [
+        re.findall(r"`(\w+)`", line.split("|")[1]) for line in table.splitlines() if line.startswith("| `")
+    ]
+    assert {room for rooms in listed for room in rooms} == set(height)
+    lowest = [min(height[room] for room in rooms) for rooms in listed]
+    assert lowest == sorted(lowest)
 
 
 def test_files_that_the_page_on_architecture_names_are_there():
