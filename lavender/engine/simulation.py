@@ -15,9 +15,10 @@ import numpy as np
 
 from lavender import io
 from lavender._arrays import FloatArray, read_only
-from lavender.cones import CONTACT_SPIN, Cones
 from lavender.engine.check import same_scene, well_formed, whole_state
+from lavender.engine.export import problem_of
 from lavender.engine.film import Film, header_of
+from lavender.engine.judge import judged, moved
 from lavender.engine.layout import HEAD, NEED_ROOM, OK, SIZE
 from lavender.engine.picture import save_picture
 from lavender.engine.snapshot import Snapshot
@@ -25,10 +26,7 @@ from lavender.engine.state import State
 from lavender.errors import InputError, LavenderError, SolveFailed, UnknownName
 from lavender.problem import Problem
 from lavender.registry import get
-from lavender.residuals import Residual, residual
-from lavender.rows import Rows
 from lavender.scene import Scene
-from lavender.scene.arithmetic import norm
 from lavender.scene.parts import whole
 from lavender.scene.scene import SWEEPS
 from lavender.solution import Solution, Status
@@ -55,7 +53,6 @@ SOLVER_FIELDS = (
     "violation_initial",
     "violation_final",
 )
-PARTS = ("joint", "normal", "disk", "spin")
 NEWTON = NEWTON_SPEC.factory
 TOL = 1e-6  # of lavender.solve
 INSIDE = "this simulation is inside a step; a solver or callback may not use it until the step has ended"
@@ -470,67 +467,8 @@ class Simulation:
         return (int(head[HEAD["seed"]]) << 32) ^ int(head[HEAD["step"]])
 
     def _problem(self, state: State, steps: int | None = None) -> Problem:
-        a = state.a
-        kj, mj = int(state.size[SIZE["joints"]]), int(state.size[SIZE["joint_rows"]])
-        c = int(state.head[HEAD["contacts"]])
-        k, m = kj + c, mj + int(state.head[HEAD["contact_rows"]])
-        normal = a["normal"][:c].copy()
-        tangent = a["tangent"][:c].copy() if len(a["tangent"]) else np.zeros((c, 3))
-        # contacts without friction have no tangent; any unit vector normal to the normal stands in
-        bare = np.flatnonzero(a["mu"][kj:k] == 0.0)
-        tangent[bare] = _any_tangent(normal[bare])
-        rows = Rows(
-            inv_mass=a["inv_mass"].copy(),
-            inv_inertia=a["inv_inertia"].copy(),
-            v_free=a["v_free"].copy(),
-            jac=a["jac"].copy(),
-            joint_ptr=a["ptr"][: kj + 1].copy(),
-            joint_body=a["joint_body"].copy(),
-            normal=normal,
-            tangent=tangent,
-            arm_a=a["arm_a"][:c].copy(),
-            arm_b=a["arm_b"][:c].copy(),
-            contact_body=a["contact_body"][:c].copy(),
-            copy=False,
-        )
-        lower, upper = np.full(m, -np.inf), np.full(m, np.inf)
-        lower[:mj], upper[:mj] = a["lower"][:mj], a["upper"][:mj]
-        cones = Cones(
-            ptr=a["ptr"][: k + 1].copy(),
-            kind=a["kind"][:k].copy(),
-            lower=lower,
-            upper=upper,
-            mu=a["mu"][:k].copy(),
-            patch_radius=a["patch_radius"][:k].copy(),
-        )
-        guess = a["impulse"][:m].copy() if state.head[HEAD["warm_start"]] else None
-        return Problem(
-            a["b"][:m].copy(),
-            cones,
-            rows=rows,
-            compliance=a["compliance"][:m].copy(),
-            guess=guess,
-            key=self._block_keys(state, kj, c),
-            names=self._block_names(a["contact_pair"][:c], a["key"][:c]),
-            name=f"{self.scene.name or 'scene'}, step {self._steps + 1 if steps is None else steps}",
-            copy=False,
-        )
-
-    def _block_keys(self, state: State, kj: int, c: int) -> np.ndarray:
-        # joints above all contacts: 24 bits for each body leave the pair (2^24 - 1, ...) free
-        joints = np.uint64(0xFFFFFF << 40) + np.arange(kj, dtype=np.uint64)
-        return np.concatenate([joints, state.a["key"][:c]])
-
-    def _block_names(self, pair: np.ndarray, key: np.ndarray) -> list[str]:
-        names = self._names
-        points = (key & np.uint64(0xFFFF)).tolist()
-        return [
-            *self._joint_names,
-            *(
-                f"{names[i]} on {names[j]}, point {f}"
-                for (i, j), f in zip(pair.tolist(), points, strict=True)
-            ),
-        ]
+        step = self._steps + 1 if steps is None else steps
+        return problem_of(state, self._names, self._joint_names, f"{self.scene.name or 'scene'}, step {step}")
 
     @_alone
     def residual(self) -> dict[str, Any]:
@@ -551,18 +489,7 @@ class Simulation:
         return self._judged()
 
     def _judged(self) -> dict[str, Any]:
-        if not self._state.head[HEAD["solved"]]:
-            raise InputError("no step has been done yet, or the last was stopped; call step() and ask again")
-        problem = self._problem(self._state)
-        judged = residual(problem, self._state.a["impulse"][: problem.m].copy())
-        return {
-            "relative": judged.relative,
-            "energy": judged.energy,
-            "velocity": judged.velocity,
-            "floor": judged.floor,
-            "worst": judged.worst_name,
-            "share": _shares(problem, judged),
-        }
+        return judged(*self._solved())
 
     @_alone
     def motion(self) -> dict[str, Any]:
@@ -586,24 +513,15 @@ class Simulation:
         return self._moved()
 
     def _moved(self) -> dict[str, Any]:
+        problem, impulse = self._solved()
+        return moved(problem, impulse, [b.name for b in self.scene.bodies if not b.is_static])
+
+    def _solved(self) -> tuple[Problem, FloatArray]:
+        # the problem of the last substep, and its impulses (m,) [N s]
         if not self._state.head[HEAD["solved"]]:
             raise InputError("no step has been done yet, or the last was stopped; call step() and ask again")
         problem = self._problem(self._state)
-        impulse = self._state.a["impulse"][: problem.m].copy()
-        from lavender import motion
-
-        error, apart = motion.measure(problem, impulse, motion.reference(problem)), 0.0
-        if problem.law == "coulomb":
-            own = motion.branch(problem, impulse)
-            near = motion.measure(problem, impulse, own)
-            if own.accepted and error.reference.accepted:
-                apart = motion.measure(problem, own.impulse, error.reference).speed or 0.0
-            if near.kinetic is not None and (error.kinetic is None or near.kinetic < error.kinetic):
-                error = near
-        names = ("relative", "kinetic", "speed", "spin", "bound", "bound_speed")
-        moving = [b.name for b in self.scene.bodies if not b.is_static]
-        body = moving[error.body] if error.body >= 0 else ""
-        return {**{name: getattr(error, name) for name in names}, "body": body, "open": apart}
+        return problem, self._state.a["impulse"][: problem.m].copy()
 
     def record(self, folder: str | PathLike[str], steps: int, *, form: str = "npz") -> list[Path]:
         """Step `steps` times and write the problem of each (of its first substep), with its warm start.
@@ -830,32 +748,3 @@ def _make_pairs_anew(state: State) -> None:
     # a list that lacks a pair cannot be told from one that is right; contacts do not depend on its age
     for name in ("pairs_valid", "need_pairs", "need_contacts"):
         state.head[HEAD[name]] = 0
-
-
-def _any_tangent(normal: FloatArray) -> FloatArray:
-    out = np.zeros_like(normal)
-    for i, n in enumerate(normal):
-        t = np.cross(n, np.eye(3)[np.argmin(np.abs(n))])
-        size = norm(t)
-        if size > 0.0:  # a body so far off that its contact has no direction: Rows says so
-            out[i] = t / size
-    return out
-
-
-def _shares(problem: Problem, judged: Residual) -> dict[str, float]:
-    c = problem.cones
-    part = np.zeros(problem.m, np.int32)
-    contact = np.flatnonzero(c.kind > 0)
-    part[c.ptr[0] :] = 2
-    joints = len(c.kind) - len(contact)
-    part[: c.ptr[joints]] = 0
-    part[c.ptr[:-1][contact]] = 1
-    part[c.ptr[1:][c.kind == CONTACT_SPIN] - 1] = 3
-    with np.errstate(invalid="ignore"):
-        size = np.sqrt(problem.d) * np.abs(judged.error)
-    top = float(size.max(initial=0.0))
-    # Over the largest, so that squares neither overflow nor vanish; what is infinite has no shares.
-    energy = (size / top) ** 2 if 0.0 < top < np.inf else np.zeros(problem.m)
-    total = float(energy.sum())
-    sums = np.bincount(part, weights=energy, minlength=4) if problem.m else np.zeros(4)
-    return {name: float(x / total) if total > 0.0 else 0.0 for name, x in zip(PARTS, sums, strict=True)}
