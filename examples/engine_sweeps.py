@@ -19,10 +19,9 @@ the error matrix of a sweep and l the impulses that hold the stack,
 taken without friction, since the friction disks do not sweep like a matrix. Cold stacks then fall over, so the
 run is not averaged over its fall: how long it stands is a number of its own. Warm ones stand on every budget.
 
-Order, with nothing else changed: a cold run swept always the same way keeps a slow sway that 64 sweeps with friction do
-not see. Turned round in every other substep (`alternating`, the default) the sweeps are as many and as long, and what
-is left after 64 of them is an order of magnitude less. How much depends on when one looks, so that each figure has
-its window; late in the run the stack on 4 sweeps leans.
+Order: with friction a cold run swept always the same way keeps a slow sway that 64 sweeps do not see. Turned round in
+every other substep (`alternating`, the default), they leave an order of magnitude less. How much depends on when one
+looks, so that each figure has its window: late in the run the stack on 4 sweeps leans.
 
     python examples/engine_sweeps.py [FIGURE.png]
 """
@@ -69,10 +68,8 @@ def run(sweeps, order="alternating", warm=False):
 def trail(sweeps, order, warm=False):
     """Of TRAIL steps: residual before the first sweep and after the last [N s], and how far a box has moved [m]."""
     sim = lv.Simulation(lv.Scene("stack", solver_iterations=sweeps, order=order, warm_start=warm))
-    start, fields = (
-        sim.reset()[0]["positions"],
-        [lv.SOLVER_FIELDS.index(f"residual_{k}") for k in ("initial", "final")],
-    )
+    start = sim.reset()[0]["positions"]
+    fields = [lv.SOLVER_FIELDS.index(f"residual_{k}") for k in ("initial", "final")]
     seen = (sim.step()[0] for _ in range(TRAIL))
     return np.array([(*o["solver"][fields], np.abs(o["positions"] - start).max()) for o in seen])
 

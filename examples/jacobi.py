@@ -10,7 +10,6 @@ does not end at all (k equal rows: it is k - 1 times too strong); the damping th
 problem costs more sweeps again.
 
 This counts; it measures no time, for `jacobi` itself runs on one thread: sweep by sweep, and by how many rows wait.
-How the load of equal rows is shared is nobody's to know: each way that ends has other impulses, and the same slack.
 
 Rows done one after the other, with T threads: sweeps x the sum over the colours of ceil(rows of it / T).
 

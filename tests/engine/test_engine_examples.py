@@ -38,9 +38,7 @@ def test_more_sweeps_help_in_the_first_solve_and_in_the_run(sweeps):
     for by in (*found["first"].values(), *found["cold"].values()):
         for column in by.T:
             assert all(b < a for a, b in pairwise(column))
-    # Six boxes, friction 0.5, from rest: the first solve leaves 45 times less after 64 sweeps than after 4.
     bottom_up = found["first"]["bottom_up"]
-    assert bottom_up[0, 0] / bottom_up[-1, 0] == pytest.approx(45.4, abs=0.1)
     # Cold, each solve carries the weight from zero: the run is further off than the first solve.
     cold = found["cold"]
     assert cold["bottom_up"][0, 0] > 3 * bottom_up[0, 0]
@@ -60,14 +58,6 @@ def test_turning_the_sweeps_round_is_worth_a_factor(sweeps):
     # The slow sway that 64 sweeps always the same way leave: an order of magnitude, from step 20 on.
     one_way, turned = (by["trails"][module.ENDS[1]][20:] for by in (one_way, turned))
     assert np.all(5.0 * turned[:, 1] < one_way[:, 1]) and np.all(3.0 * turned[:, 2] < one_way[:, 2])
-    # At no cost: as many visits, for each substep visits each contact once a sweep, in either direction.
-    scene = lv.Scene("stack", order="alternating")
-    sim, orders = lv.Simulation(scene), []
-    for _ in range(2):
-        problem = sim.constraint_problem()
-        orders.append([problem.row_name(i) for i in problem.cones.ptr[:-1]])
-        sim._state.kernel.substeps(1)
-    assert sorted(orders[0]) == sorted(orders[1]) and orders[0] == orders[1][::-1]
 
 
 def test_the_published_residual_misleads_across_orders_and_the_judge_does_not(sweeps):

@@ -97,23 +97,16 @@ def test_sweeps_solve_the_toy_stack_and_clamping_once_does_not():
     assert found["r_p"][1] < found["clamped_r_p"]  # one sweep is better already
     # Clamped after each sweep: rows read impulses that pull, and the end is another point.
     assert found["lowest"] < -0.1 and found["late_r_p"] > 1e6 * found["r_p"][-1]
-    # A zero on the diagonal: finite impulses; no solution where things approach that cannot move.
-    rests, approaches = found["zero"].values()
-    assert rests.success and rests.impulse[-1] == 0.0
-    np.testing.assert_allclose(
-        rests.impulse[:-1], exact, rtol=0.0, atol=1e-7
-    )  # tol 1e-9, slowest mode 0.94 a sweep
-    assert approaches.status is lv.Status.INFEASIBLE and np.isfinite(approaches.impulse).all()
+    # A zero on the diagonal: no solution, and no number that is not finite.
+    zero = found["immovable"]
+    assert zero.dense()[-1, -1] == 0.0 < zero.d[-1]
+    assert found["zero"].status is lv.Status.INFEASIBLE and np.isfinite(found["zero"].impulse).all()
     np.testing.assert_allclose(found["slack"][-1], toy.dense() @ found["impulse"][-1] - toy.b, atol=1e-14)
     # Where the contact opens each residual is 0 at the other's wrong point.
-    assert found["points"]["A^-1 b"][4] == pytest.approx(-0.346, abs=5e-4)  # it pulls
-    assert found["ordinary"]["A^-1 b"] < 1e-12 and found["projected"]["A^-1 b"] == pytest.approx(
-        0.346, abs=5e-4
-    )
-    assert (
-        found["ordinary"]["solution"] == pytest.approx(0.0865, abs=5e-5)
-        and found["projected"]["solution"] == 0.0
-    )
+    ordinary, projected = found["ordinary"], found["projected"]
+    assert found["points"]["A^-1 b"][4] < -0.1  # it pulls
+    assert ordinary["A^-1 b"] < 1e-12 and projected["A^-1 b"] > 0.1
+    assert ordinary["solution"] > 0.05 and projected["solution"] == 0.0
     # Complementarity says nothing of depth: solved in every step, and 50 mm deep in the first.
     residual, depth = found["deep"].T
     assert residual.max() <= 1e-6
