@@ -149,8 +149,8 @@ class LavenderNewton(Lavender):
     solver = "newton"
 
 
-class LavenderSim(Engine):
-    """The C++ engine of the package lavendersim; it divides a step into substeps of 1/240 s by itself. y is up."""
+class Lavendersim(Engine):
+    """The C++ engine of PyPI's lavendersim; it divides a step into substeps of 1/240 s by itself. y is up."""
 
     name = "lavendersim"
     up = 1
@@ -286,7 +286,7 @@ class Contestant:
 ENGINES: dict[str, Contestant] = {
     "lavender": Contestant(Lavender, substeps=True),
     "newton": Contestant(LavenderNewton, sweeps=False),
-    "lavendersim": Contestant(LavenderSim, "lavendersim"),
+    "lavendersim": Contestant(Lavendersim, "lavendersim"),
     "mujoco_newton": Contestant(MuJoCoNewton, "mujoco", sweeps=False),
     "mujoco_pgs": Contestant(MuJoCoPGS, "mujoco"),
     "pybullet": Contestant(PyBullet, "pybullet", substeps=True),

@@ -1,4 +1,4 @@
-"""Exercise: stop at a tolerance, or after a fixed number of sweeps? Cost and error over a sequence of steps.
+"""Exercise 5: stop at a tolerance, or after a fixed number of sweeps? Cost and error over a sequence of steps.
 
 A scene of the gallery is recorded step by step; each step is solved by projected Gauss-Seidel from the
 impulses of the step before, twice: until the relative residual is at most TOL, and with the same number of sweeps

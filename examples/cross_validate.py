@@ -1,4 +1,4 @@
-"""Exercise: do the solvers agree? Each one beside an optimum that OSQP found and the judge has accepted.
+"""Do the solvers agree? Each one beside an optimum that OSQP found and the judge has accepted.
 
 On the optimum of a symmetric positive semidefinite problem the slack w = A l - b is unique, the impulses
 need not be: four corners of a box share its weight in many ways. So solvers are compared in the energy norm

@@ -136,12 +136,13 @@ def figure(found, path):
 def main(path="direct_or_iterate.png"):
     """Print the tables, save the figure."""
     found = numbers()
-    print(f"{'condition':>10} {'direct':>9} {'Gauss-Seidel':>14} {'Jacobi':>10}")
+    print(f"{'condition':>10} {'direct':>9} {'Gauss-Seidel':>14} {'Jacobi':>10} {'ratio':>7}")
     print(f"{'':>10} {'residual':>9} {'sweeps':>14} {'sweeps':>10}   (to a relative residual of {TOL:g})")
     for row in found["systems"].values():
         sweeps = [row[s].work["sweeps"] for s in SOLVERS]
         print(
-            f"{row['condition']:>10.1e} {row['direct'].residual.relative:>9.1e} {sweeps[0]:>14} {sweeps[1]:>10}"
+            f"{row['condition']:>10.1e} {row['direct'].residual.relative:>9.1e} {sweeps[0]:>14} {sweeps[1]:>10} "
+            f"{sweeps[1] / sweeps[0]:>7.1f}"
         )
     exact = found["systems"][SHOWN]["direct"].impulse
     for n, x in found["after"].items():
@@ -153,6 +154,8 @@ def main(path="direct_or_iterate.png"):
     print(f"{'rows':>6}" + "".join(f"{name:>14}" for name in names))
     for n, by in found["cost"].items():
         print(f"{n:>6}" + "".join(f"{by[name]:>14.2e}" for name in names))
+    most = found["cost"][max(found["cost"])]
+    print(f"on the largest lattice sweeps cost {most['gauss_seidel'] / most['banded']:.1f} times the band")
     figure(found, path)
     print(f"figure: {path}")
 

@@ -87,6 +87,14 @@ def main(path="engine_warm_start.png"):
             )
     initial = {k: np.median(column(v[0], "residual_initial")[20:SWITCH]) for k, v in found.items()}
     print(f"before the switch warm begins {initial['cold'] / initial['warm']:.0f} times closer than cold")
+    solver = found["switched off"][0]
+    begins, matches = (
+        column(solver, k)[SWITCH - 1 : SWITCH + 1] for k in ("residual_initial", "cache_matches")
+    )
+    print(
+        f"at the switch the start goes from {begins[0]:.1e} to {begins[1]:.1e} N s, {begins[1] / begins[0]:.0f} times, "
+        f"and matches from {matches[0]:.0f} to {matches[1]:.0f}"
+    )
     figure(found, path)
     print(f"figure: {path}")
 

@@ -1,4 +1,4 @@
-"""Exercise: friction bounds added to the toy QP: fixed boxes on the tangents, filled in by the normals.
+"""Exercise 4: friction bounds added to the toy QP: fixed boxes on the tangents, filled in by the normals.
 
 Six unit boxes stand on each other, a contact each with a normal and one tangent (no rotation, so the
 two directions do not couple). The top box is hit sideways. As a QP the tangents are bounded by
@@ -103,6 +103,10 @@ def main(path="friction_bounds.png"):
         ("tangent, Coulomb", found["coulomb"].impulse),
     ]:
         print(f"{name:<22}" + "".join(f"{x + 0.0:>9.5f}" for x in impulse[1::2]))
+    print(
+        f"the top box slides: its tangent takes {abs(found['rounds'][-1][-1]):.5f} N s, {MU:g} of its normal; "
+        f"glued it would take {abs(found['glued'][-1]):.2f}"
+    )
     gap = max(np.abs(found["rounds"][-1] - found[name]).max() for name in ("osqp", "pgs"))
     print(f"direct, OSQP and projected Gauss-Seidel agree on the bounded QP within {gap:.1e} N s")
     figure(found, path)

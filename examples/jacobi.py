@@ -9,6 +9,8 @@ what undamped Jacobi's does: twice the sweeps. Where rows of one contact repeat 
 does not end at all (k equal rows: it is k - 1 times too strong); the damping that makes it safe for every
 problem costs more sweeps again.
 
+This counts; it measures no time, for `jacobi` itself runs on one thread: sweep by sweep, and by how many rows wait.
+
 Rows done one after the other, with T threads: sweeps x the sum over the colours of ceil(rows of it / T).
 
     python examples/jacobi.py [FIGURE.png]
@@ -106,6 +108,11 @@ def main(path="jacobi.png"):
             f"{name:<24}{solution.work['sweeps']:>8}"
             + "".join(f"{x:>9}" for x in found["waiting"][name])
             + f"   {found['repeated'][name].status.name.lower().replace('_', ' ')}"
+        )
+    for name in ("Gauss-Seidel", "Jacobi, safe damping"):
+        impulse = found["repeated"][name].impulse
+        print(
+            f"three equal rows, {name}: impulses {' '.join(f'{x + 0.0:.3f}' for x in impulse)}, sum {impulse.sum():.3f}"
         )
     figure(found, path)
     print(f"figure: {path}")

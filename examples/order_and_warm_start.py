@@ -91,6 +91,7 @@ def numbers():
             name: histories(cases()[name]) for name in ("falling, lighter above", "falling, equal")
         },
         **{name: np.array([error(changed, start, n) for n in SWEEPS]) for name, start in starts.items()},
+        "behind": np.array([[error(changed, starts[k], n) for n in range(16)] for k in ("cold", "stale")]),
     }
 
 
@@ -164,13 +165,20 @@ def main(path="order_and_warm_start.png"):
             f"{name:<23} bottom up {by['bottom up']:.2e}   top down {by['top down']:.2e}   "
             f"random {min(random):.2e} to {max(random):.2e} ({max(random) / min(random):.1f} times)"
         )
+    falling, equal, struck = found["orders"].values()
+    print(
+        f"after {BUDGET} sweeps bottom up is {falling['top down'] / falling['bottom up']:.1f} times closer where boxes "
+        f"fall, lighter above,\n{100 * (equal['top down'] / equal['bottom up'] - 1):.1f} % among equal ones; "
+        f"struck from above, top down is {struck['bottom up'] / struck['top down']:.1f} times closer"
+    )
     print(f"\n{'sweeps':>6}{'cold':>12}{'warm':>12}{'stale':>12}")
     for i, n in enumerate(SWEEPS):
         print(f"{n:>6}" + "".join(f"{found[k][i]:>12.2e}" for k in ("cold", "warm", "stale")))
-    behind = SWEEPS[int(np.argmax(found["stale"] <= found["cold"]))]
+    cold, stale = found["behind"]
+    behind = np.argmax(stale <= cold) - 1
     print(
         f"before the first sweep: warm {found['cold'][0] / found['warm'][0]:.0f} times closer than cold, "
-        f"stale {found['stale'][0] / found['cold'][0]:.0f} times further, for fewer than {behind} sweeps"
+        f"stale {found['stale'][0] / found['cold'][0]:.0f} times further, and behind for {behind} sweeps"
     )
     figure(found, path)
     print(f"figure: {path}")

@@ -10,7 +10,11 @@ At contact 5 the ordinary residual |w| is 0 for A^-1 b, which pulls there, and i
 the contact opens; r_p = |l - max(0, l - w)| is the other way round. That is why projections are measured by r_p.
 
 Wrong: solve A l = b, then clamp the negative impulses to zero, once. The clamped contacts no longer pull, but
-their neighbours were computed as if they did.
+their neighbours were computed as if they did. Not much better: sweep as if nothing were bounded, and clamp after
+each sweep. In mid-sweep impulses are negative, the rows that come after read them, and the end is not the solution.
+
+A zero on the diagonal: a contact between two things that cannot move has an empty row, and w/A_ii is no number.
+`d` falls back to the mean of the others; what approaches there has no solution, and the status says INFEASIBLE.
 
 Wrong too: a residual of 0 means no penetration. The conditions are on velocities; a box that lies 50 mm
 deep and does not approach is a solution. Depth is removed by the position projection, step by step.
@@ -34,12 +38,29 @@ DEEP = 0.05  # m, penetration of the box at the start
 STEPS = 40
 
 
-def problem():
-    """The toy stack: A (8, 8) [1/kg], b (8,) [m/s]."""
+def problem(kick=KICK):
+    """The toy stack: A (8, 8) [1/kg], b (8,) [m/s]; at rest without the kick."""
     jacobian = np.eye(N) - np.eye(N, k=-1)  # velocity of a box minus that of the one below
     velocity = np.full(N, -GRAVITY_STEP)
-    velocity[OPEN] += KICK
+    velocity[OPEN] += kick
     return lv.Problem.lcp(jacobian @ jacobian.T, -jacobian @ velocity, name="toy stack")
+
+
+def clamped_after_each_sweep(toy):
+    """Sweeps without bounds, each clamped at its end: impulse (8,), most negative impulse in mid-sweep, [N s]."""
+    free = lv.Problem.linear(toy.dense(), toy.b)
+    impulse, lowest = np.zeros(N), 0.0
+    for _ in range(SWEEPS):
+        swept = lv.solve(free, "gauss_seidel", impulse=impulse, tol=0.0, max_iter=1).impulse
+        impulse, lowest = np.maximum(swept, 0.0), min(lowest, swept.min())
+    return impulse, lowest
+
+
+def immovable(toy):
+    """The toy stack and a ninth contact, between things that cannot move and approach at 0.1 m/s."""
+    a = np.zeros((N + 1, N + 1))
+    a[:N, :N] = toy.dense()
+    return lv.Problem.lcp(a, np.append(toy.b, 0.1), name="a zero on the diagonal")
 
 
 def deep_box():
@@ -64,9 +85,16 @@ def numbers():
     equations = np.linalg.solve(toy.dense(), toy.b)
     clamped = np.maximum(equations, 0.0)
     exact = lv.solve(toy, "direct", tol=1e-12).impulse
+    late, lowest = clamped_after_each_sweep(toy)
     points = {"A^-1 b": equations, "clamped": clamped, "solution": exact}
     return {
         "problem": toy,
+        "resting": lv.solve(problem(0.0), "direct", tol=1e-12).impulse,
+        "late": late,
+        "late_r_p": natural_map(toy, late),
+        "lowest": lowest,
+        "immovable": immovable(toy),
+        "zero": lv.solve(immovable(toy), "pgs"),
         "impulse": impulse,  # (SWEEPS + 1, N) N s
         "slack": np.array([toy.slack(x) for x in impulse]),  # (SWEEPS + 1, N) m/s
         "r_p": np.array([natural_map(toy, x) for x in impulse]),
@@ -126,7 +154,7 @@ def main(path="toy_stack.png"):
     """Print the tables, save the figure."""
     found = numbers()
     print(f"{'contact':<14}" + "".join(f"{i + 1:>9}" for i in range(N)))
-    for name in ("exact", "clamped", "clamped_slack"):
+    for name in ("resting", "exact", "clamped", "clamped_slack"):
         print(f"{name:<14}" + "".join(f"{x + 0.0:>9.4f}" for x in found[name]))
     for sweep in (0, 1, 4, 16, 64, SWEEPS):
         print(f"after {sweep:>3} sweeps  r_p {found['r_p'][sweep]:.2e}")
@@ -134,6 +162,16 @@ def main(path="toy_stack.png"):
         f"solved, then clamped once  r_p {found['clamped_r_p']:.2e}: "
         f"boxes still approach at {-found['clamped_slack'].min():.3f} m/s"
     )
+    print(
+        f"clamped after each of {SWEEPS} sweeps  r_p {found['late_r_p']:.2e}: down to {found['lowest']:.3f} N s "
+        f"in mid-sweep"
+    )
+    ninth = found["immovable"]
+    with np.errstate(divide="ignore"):
+        print(
+            f"a zero on the diagonal: w/A_ii is {-ninth.b[-1] / ninth.dense()[-1, -1]}; "
+            f"with d = {ninth.d[-1]:.3f} the status is {found['zero'].status.name}"
+        )
     print(f"\n{'contact 5':<12}{'impulse':>10}{'|A l - b|':>12}{'r_p':>10}")
     for name, x in found["points"].items():
         print(

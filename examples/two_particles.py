@@ -87,6 +87,7 @@ def figure(found, path):
 def main(path="two_particles.png"):
     """Print impulse, velocities and drift, save the figure."""
     found = numbers()
+    print(f"A = {found['problem'].dense()[0, 0]:.4f} 1/kg, b = {found['problem'].b[0]:g} m/s")
     print(f"impulse by hand {found['impulse']:.6f} N s, in the engine {found['engine']:.6f} N s")
     for i in range(2):
         print(f"particle {i + 1}: velocity {SPEED[i]} -> {np.round(found['after'][i], 6)} m/s")

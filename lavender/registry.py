@@ -106,6 +106,7 @@ class SolverSpec:
     options: Mapping[str, str] = field(default_factory=dict)  # own options: name -> one line
     requires: tuple[str, ...] = ()  # modules that must be importable
     install: str = ""  # what to install where they are not
+    bounded: str = ""  # of a method for free rows: what to take where rows are bounded
     refusal: Callable[[Problem], str | None] | None = None  # more reasons against a problem
     few: Few | None = None  # problems of few rows with default options, in one compiled call
 
@@ -148,7 +149,9 @@ class SolverSpec:
         """None when the solver takes this problem, else the reason."""
         if problem.law not in self.laws:
             takes = ", ".join(law for law in LAWS if law in self.laws)
-            return f"takes laws {takes}, not {problem.law!r}{_way_round(problem.law, self.laws)}"
+            return (
+                f"takes laws {takes}, not {problem.law!r}{self.bounded or _way_round(problem.law, self.laws)}"
+            )
         if "matrix" not in self.operators and problem.operator not in self.operators:
             makers = {"rows": "Problem.from_rows", "generalized": "Problem.from_jacobian"}
             needs = " or ".join(f"{o} ({makers[o]})" for o in OPERATORS if o in self.operators)

@@ -92,7 +92,9 @@ def run(
     if live:
         click.echo()
     best = 1e3 * found.cost.min()
-    click.echo(f"{found.scene}: {len(found)} steps, {found.time[-1]:.3f} s, {best:.3g} ms a step at best")
+    click.echo(
+        f"{found.scene}: {len(found)} steps, {found.time[-1]:.3f} s, order {found.order}, {best:.3g} ms a step at best"
+    )
     for name, path in (("trace", trace), ("figure", plot), ("film", film)):
         if path is not None:
             click.echo(f"{name}: {path}")

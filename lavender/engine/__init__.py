@@ -1,4 +1,4 @@
-"""LavenderSim: the step loop over the compiled substep, and the problems inside it."""
+"""LavenderSim (not PyPI's `lavendersim`): the step loop over the compiled substep, and the problems inside it."""
 
 from lavender.engine.film import Film
 from lavender.engine.run import Trace, run, run_scene

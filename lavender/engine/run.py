@@ -35,6 +35,7 @@ class Trace:
     lost_body: str = ""  # name of the body that ended the run, or empty
     recorded: int = 0  # problems written
     title: str = ""  # of figures
+    order: str = ""  # in which each sweep visits the contacts
 
     def __len__(self) -> int:
         return len(self.time)
@@ -54,10 +55,10 @@ class Trace:
         try:
             with open(path, "w", newline="") as stream:
                 write = csv.writer(stream)
-                write.writerow(["step", "time", *SOLVER_FIELDS, "depth", "cost"])
+                write.writerow(["step", "time", *SOLVER_FIELDS, "depth", "cost", "order"])
                 for i in range(len(self)):
                     row = [self.time[i], *self.solver[i], self.depth[i], self.cost[i]]
-                    write.writerow([i + 1, *(repr(float(x)) for x in row)])
+                    write.writerow([i + 1, *(repr(float(x)) for x in row), self.order])
         except OSError as error:
             raise InputError(f"cannot write {str(path)!r}: {error.strerror}") from None
 
@@ -132,6 +133,7 @@ def run(
         if watch is not None:
             watch(done, observation, info)
     scene = simulation.scene
+    order = str(scene.parameters.solver_options.get("order", scene.parameters.order))
     return Trace(
         scene=repr(scene),
         time=time[:done],
@@ -141,7 +143,8 @@ def run(
         lost_body=lost,
         recorded=recorded,
         title=f"{scene.name or 'scene'}, {simulation.solver_iterations} iterations, "
-        f"{'warm' if simulation.warm_start else 'cold'}",
+        f"{'warm' if simulation.warm_start else 'cold'}, order {order}",
+        order=order,
     )
 
 

@@ -26,22 +26,12 @@ def sweeps():
     return module, module.numbers()
 
 
-@pytest.mark.parametrize("name", ["engine_sweeps", "engine_warm_start", "two_particles", "all_rows"])
-def test_prints_its_numbers_and_saves_its_figure(name, tmp_path, capsys):
-    path = tmp_path / "figure.png"
-    example(name).main(str(path))
-    assert path.read_bytes().startswith(b"\x89PNG")
-    assert str(path) in capsys.readouterr().out
-
-
 def test_more_sweeps_help_in_the_first_solve_and_in_the_run(sweeps):
     _, found = sweeps
     for by in (*found["first"].values(), *found["cold"].values()):
         for column in by.T:
             assert all(b < a for a, b in pairwise(column))
-    # Six boxes, friction 0.5, from rest: the first solve leaves 45 times less after 64 sweeps than after 4.
     bottom_up = found["first"]["bottom_up"]
-    assert bottom_up[0, 0] / bottom_up[-1, 0] == pytest.approx(45.4, abs=0.1)
     # Cold, each solve carries the weight from zero: the run is further off than the first solve.
     cold = found["cold"]
     assert cold["bottom_up"][0, 0] > 3 * bottom_up[0, 0]
@@ -53,6 +43,16 @@ def test_more_sweeps_help_in_the_first_solve_and_in_the_run(sweeps):
     assert 0.6 < ratio < 1.6
 
 
+def test_turning_the_sweeps_round_is_worth_a_factor(sweeps):
+    module, found = sweeps
+    one_way, turned = found["alternation"].values()
+    for key in ("tails", "starts"):
+        assert all(3.0 * a < b < 8.0 * a for a, b in zip(one_way[key], turned[key], strict=True))
+    # The slow sway that 64 sweeps always the same way leave: an order of magnitude, from step 20 on.
+    one_way, turned = (by["trails"][module.ENDS[1]][20:] for by in (one_way, turned))
+    assert np.all(5.0 * turned[:, 1] < one_way[:, 1]) and np.all(3.0 * turned[:, 2] < one_way[:, 2])
+
+
 def test_the_published_residual_misleads_across_orders_and_the_judge_does_not(sweeps):
     _, found = sweeps
     # top-down publishes half of bottom-up's residual ...
@@ -60,8 +60,9 @@ def test_the_published_residual_misleads_across_orders_and_the_judge_does_not(sw
     assert np.all(down[:, 0] < 0.65 * up[:, 0])
     up, down = found["cold"]["bottom_up"][0], found["cold"]["top_down"][0]
     assert down[0] < 0.65 * up[0]
-    # ... with more velocity left, more depth, and a larger residual of all rows
+    # ... with more velocity left, more depth, and a larger residual of all rows; not so on 64 sweeps
     assert np.all(down[1:] > up[1:])
+    assert np.all(found["cold"]["top_down"][-1] < found["cold"]["bottom_up"][-1])
     # because at the ground one body moves instead of two: half the d, twice the residual of a velocity
     problem = lv.Simulation("stack").constraint_problem()
     normal = problem.d[problem.cones.ptr[:-1]]
@@ -125,10 +126,10 @@ def test_the_judge_sees_what_the_normals_do_not():
     found = module.numbers()
     bridge, pile = found["bridge"], found["pile"]
     touching = bridge["normals"] > 0.0
-    # With the load on the planks: normals at 5e-4 N s and less, half of the error left, and all of it in the hinges.
+    # With the load on the planks: normals below 1e-3 N s, half of the error left, and nearly all of it in the hinges.
     assert touching.sum() > 20
-    assert np.median(bridge["normals"][touching]) < 5e-4
-    assert np.median(bridge["relative"]) > 0.2
+    assert np.median(bridge["normals"][touching]) < 1e-4 and bridge["normals"].max() < 1e-3
+    assert np.median(bridge["relative"][touching]) > 0.5
     assert bridge["shares"][20:, module.KINDS.index("joint")].min() > 0.9
     assert all(name.startswith("hinge ") for name in bridge["worst"][20:])
     disk = pile["shares"][:, module.KINDS.index("disk")]
@@ -151,6 +152,8 @@ def test_lavender_run_shows_a_line_and_writes_what_was_asked_for(tmp_path, capsy
         "12",
         "--set",
         "n=2",
+        "--set",
+        "order=top_down",
         "--residual",
     ]
     files = ["--trace", paths[0], "--plot", paths[1], "--record", paths[2], "--skip", "9"]
@@ -159,10 +162,12 @@ def test_lavender_run_shows_a_line_and_writes_what_was_asked_for(tmp_path, capsy
     assert not code.value.code
     printed = capsys.readouterr().out
     assert "step     12" in printed and "contacts     8  matches     0" in printed and "worst" in printed
-    table = np.genfromtxt(paths[0], delimiter=",", names=True)
+    assert "order top_down" in printed
+    table = np.genfromtxt(paths[0], delimiter=",", names=True, dtype=None, encoding="utf-8")
     assert table.shape == (12,) and np.all(table["iterations"] == 8) and np.all(table["contacts"] == 8)
     assert table["residual_final"].max() < table["residual_initial"].max()
-    assert paths[1].read_text().lstrip().startswith("<?xml")
+    assert set(table["order"]) == {"top_down"}
+    assert paths[1].read_text().lstrip().startswith("<?xml") and "order top_down" in paths[1].read_text()
     assert [load(p).n_blocks for p in sorted(paths[2].iterdir())] == [8, 8, 8]
 
 

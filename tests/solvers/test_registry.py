@@ -70,6 +70,8 @@ def test_a_refusal_names_the_way_round():
     assert "problem.boxed" in lcp_only.refuses(contact)
     assert "problem.relaxed('cone')" in cone_only.refuses(contact)
     assert "from_rows" in rows_only.refuses(contact)
+    for name in ("gauss_seidel", "sor"):
+        assert "not 'lcp': 'pgs' is this method with bounds" in registry.get(name).refuses(TINY)
     assert (
         dataclasses.replace(SPEC, refusal=lambda p: f"{p.m} rows are unlucky").refuses(TINY)
         == "2 rows are unlucky"

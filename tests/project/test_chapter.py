@@ -1,0 +1,129 @@
+"""Every number of the chapter's page is what the command beside it prints.
+
+Comments in the page hold the claims, section by section: a command in the first line, then `numbers | line`, the line
+as it is printed with `{}` for a number, `_` for a word, `…` for anything and blanks of any width. A number is held to
+half a unit of its last digit, or to a tolerance after `±` where libraries of other machines may round otherwise.
+`given:` lists settings and numbers of theory, `measured once:` those of another project's engine; a section has no
+further numbers but those claimed elsewhere on the page.
+"""
+
+import contextlib
+import importlib.util
+import io
+import re
+import shlex
+from functools import cache
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+import benchmarks.__main__ as benchmarks
+from lavender.cli import cli
+
+ROOT = Path(__file__).resolve().parent.parent.parent
+PAGE = (ROOT / "docs" / "chapter.md").read_text(encoding="utf-8")
+COMMENT = re.compile(r"<!-- (.*?) ?-->", re.DOTALL)
+CODE = re.compile(r"^```.*?^```$|`[^`\n]*`|\]\([^)]*\)", re.DOTALL | re.MULTILINE)
+NUMBER = re.compile(r"(?<![\w.])(?:\d{1,3}(?:,\d{3})+|\d+)(?:\.\d+)?(?:e-?\d+)?(?!\w|\.\d)")
+NUMERAL = r"(?<![\w.])([-+\d.e]*\d)(?!\d)"
+SECTIONS = re.split(r"^#+ .*\n", PAGE, flags=re.MULTILINE)
+
+
+def value(text):
+    return float(text.replace(",", ""))
+
+
+def claims(text):
+    """Command -> [(numbers as they stand, tolerance [%] or "", printed line)], and the set of other numbers."""
+    by, others = {}, set()
+    for comment in COMMENT.findall(text):
+        first, *lines = comment.strip().splitlines()
+        kind, colon, listed = first.partition(": ")
+        if colon and kind in ("given", "measured once"):
+            others |= set(listed.split())
+            continue
+        for line in lines:
+            numbers, _, printed = line.partition(" | ")
+            numbers, _, tolerance = numbers.partition(" ± ")
+            by.setdefault(first, []).append((numbers.split(), tolerance.rstrip("%"), printed))
+    return by, others
+
+
+@cache
+def printed(command):
+    """What a command of the page prints."""
+    words = shlex.split(command)
+    if words[:3] == ["python", "-m", "benchmarks"]:
+        result = CliRunner().invoke(benchmarks.cli, words[3:])
+        assert result.exit_code == 0, result.output
+        return result.output
+    if words[0] == "python":
+        spec = importlib.util.spec_from_file_location(Path(words[1]).stem, ROOT / words[1])
+        module = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(module)
+        out, figure = io.StringIO(), io.BytesIO()
+        with contextlib.redirect_stdout(out):
+            module.main(figure)
+        assert figure.getvalue().startswith(b"\x89PNG")
+        return out.getvalue()
+    assert words[0] == "lavender"
+    result = CliRunner().invoke(cli, words[1:])
+    assert result.exit_code == 0, result.output
+    return result.output
+
+
+def check(numbers, tolerance, line, text):
+    """The numbers are what the first such line says."""
+    places = {"_": r"\S+", "…": ".*?"}
+    pattern = " ".join(places.get(w) or re.escape(w).replace(r"\{\}", NUMERAL) for w in line.split())
+    found = next(filter(None, (re.fullmatch(pattern, " ".join(x.split())) for x in text.splitlines())), None)
+    assert found, f"no line {line!r} in\n{text}"
+    for number, shown in zip(numbers, found.groups(), strict=True):
+        mantissa, _, exponent = number.replace(",", "").partition("e")
+        unit = 10.0 ** (int(exponent or 0) - len(mantissa.partition(".")[2]))
+        allowed = float(tolerance) / 100.0 * value(number) if tolerance else 0.5 * unit
+        # what is printed is decimal, too
+        assert abs(value(shown) - value(number)) <= allowed * (1.0 + 1e-9), (
+            f"{number}, but {found[0]!r} is printed"
+        )
+
+
+def claimed(by):
+    """The numbers of all claims of some commands."""
+    return {number for found in by.values() for numbers, *_ in found for number in numbers}
+
+
+CLAIMS = claims(PAGE)[0]
+
+
+@pytest.mark.parametrize("command", sorted(CLAIMS))
+def test_numbers_are_what_the_command_prints(command):
+    assert f"`{command}`" in PAGE
+    for numbers, tolerance, line in CLAIMS[command]:
+        check(numbers, tolerance, line, printed(command))
+
+
+@pytest.mark.parametrize("section", SECTIONS[1:], ids=re.findall(r"^#+ (.*)\n", PAGE, re.MULTILINE))
+def test_no_number_stands_unclaimed_and_no_claim_without_its_number(section):
+    by, others = claims(section)
+    stand = set(NUMBER.findall(CODE.sub(" ", COMMENT.sub("", section))))
+    assert claimed(by) | others <= stand <= claimed(CLAIMS) | others
+
+
+def test_every_failure_has_a_command_that_shows_it():
+    section = PAGE.partition("## Failure modes")[2].partition("\n## ")[0]
+    rows = [row.strip("|").split(" | ") for row in re.findall(r"^\| .*", section, re.MULTILINE)[1:]]
+    assert len(rows) > 14
+    for row in rows:
+        command = row[-1].strip().strip("`")
+        numbers = set(NUMBER.findall(CODE.sub(" ", row[1])))
+        assert numbers & claimed({command: CLAIMS[command]}), row
+
+
+@pytest.mark.parametrize(
+    ("number", "shown"), [("5e-4", "8.0e-04"), ("15", "7.4"), ("45.4", "45.6"), ("0.40", "0.4060")]
+)
+def test_the_comparison_sees_a_wrong_number(number, shown):
+    with pytest.raises(AssertionError, match="is printed"):
+        check([number], "", "at most {} N s", f"first line\nat  most {shown} N s")
