@@ -42,8 +42,8 @@ cdef inline double normal_error(const engine_t* e, int32_t c) noexcept nogil:
     return e.gap[c] if e.gap[c] > 0.0 else (1.0 - e.setting[S_HERTZ]) * e.gap[c]
 
 
-cdef inline void contact_impulse(const engine_t* e, int32_t c, const double* z, double* p) noexcept nogil:
-    """(1) of a contact: p (1 or 3)."""
+cdef inline int32_t contact_impulse(const engine_t* e, int32_t c, const double* z, double* p) noexcept nogil:
+    """(1) of a contact: p (1 or 3); 1 where it bears and does not slide."""
     cdef int32_t block = e.size[N_JOINT] + c, row = e.ptr[block]
     cdef const double* n = e.normal + 3 * c
     cdef double kappa = e.push[e.size[N_JOINT_ROW] + c], r, s
@@ -52,7 +52,7 @@ cdef inline void contact_impulse(const engine_t* e, int32_t c, const double* z, 
     if p[0] < 0.0:
         p[0] = 0.0
     if e.mu[block] == 0.0:
-        return
+        return p[0] > 0.0
     cross(n, e.tangent + 3 * c, t2)
     p[1] = e.impulse[row + 1] - kappa * tangent_speed(e, z, c, e.tangent + 3 * c)
     p[2] = e.impulse[row + 2] - kappa * tangent_speed(e, z, c, t2)
@@ -61,6 +61,8 @@ cdef inline void contact_impulse(const engine_t* e, int32_t c, const double* z, 
     if s > r:
         p[1] *= r / s
         p[2] *= r / s
+        return 0
+    return p[0] > 0.0
 
 
 cdef inline double joint_impulse(const engine_t* e, int32_t i, int32_t row, const double* z) noexcept nogil:
@@ -195,8 +197,8 @@ cdef inline void stiffen(double* kappa, double least, double error, double beta,
 
 
 cdef inline void take_multipliers(engine_t* e) noexcept nogil:
-    cdef int32_t i, c, row, k
-    cdef double h = e.setting[S_H], beta = e.setting[S_RATIO], slop = e.setting[S_SLOP], x, r
+    cdef int32_t i, c, row, k, sticks
+    cdef double h = e.setting[S_H], beta = e.setting[S_RATIO], slop = e.setting[S_SLOP], x
     cdef double p[3]
     cdef const double* z = e.shift
     if slop < 1e-6:
@@ -211,14 +213,12 @@ cdef inline void take_multipliers(engine_t* e) noexcept nogil:
                 stiffen(e.push + row, 1.0 / (h * e.d[row]), x, beta, slop)
     for c in range(e.head[H_CONTACTS]):
         row = e.ptr[e.size[N_JOINT] + c]
-        contact_impulse(e, c, z, p)
+        sticks = contact_impulse(e, c, z, p)
         for k in range(e.ptr[e.size[N_JOINT] + c + 1] - row):
             e.impulse[row + k] = p[k]
-        if p[0] > 0.0:
+        if sticks:
             x = normal_error(e, c) + tangent_speed(e, z, c, e.normal + 3 * c)
-            r = e.mu[e.size[N_JOINT] + c] * p[0]
-            if r == 0.0 or p[1] * p[1] + p[2] * p[2] < r * r:
-                stiffen(e.push + e.size[N_JOINT_ROW] + c, 1.0 / (h * e.d[row]), x, beta, slop)
+            stiffen(e.push + e.size[N_JOINT_ROW] + c, 1.0 / (h * e.d[row]), x, beta, slop)
 
 
 cdef inline void start_stiffness(engine_t* e, double gamma) noexcept nogil:

@@ -298,42 +298,52 @@ cdef inline void push_contact(engine_t* e, int32_t c, const double* impulse) noe
                 e.arm_b + 3 * c, impulse, NULL)
 
 
-cdef inline void brake_contact(engine_t* e, int32_t c) noexcept nogil:
-    """Stage 4; the multipliers become impulses [N s]."""
+cdef inline void bounce_contact(engine_t* e, int32_t c) noexcept nogil:
+    """Stage 4 of the normal; the multipliers of the contact become impulses [N s]."""
     cdef int32_t row = e.ptr[e.size[N_JOINT] + c], a = e.contact_pair[2 * c], b = e.contact_pair[2 * c + 1], k
-    cdef double mu = e.mu[e.size[N_JOINT] + c], h = e.setting[S_H], s, t, x, left, before, goal, e_ab
+    cdef double before, goal, x, e_ab = e.restitution[a] if e.restitution[a] > e.restitution[b] else e.restitution[b]
+    cdef double p[3]
+    for k in range(row, e.ptr[e.size[N_JOINT] + c + 1]):
+        e.impulse[k] = e.impulse[k] / e.setting[S_H]
+    if e.impulse[row] <= 0.0:
+        return
+    before = normal_velocity(e, a, b, c)
+    goal = -e_ab * before if before < -e.setting[S_BOUNCE] else 0.0
+    x = e.impulse[row] + (goal - normal_speed(e, e.v_free, c) - normal_speed(e, e.dv, c)) / e.d[row]
+    x = x if x > 0.0 else 0.0
+    for k in range(3):
+        p[k] = (x - e.impulse[row]) * e.normal[3 * c + k]
+    e.impulse[row] = x
+    push_contact(e, c, p)
+
+
+cdef inline void brake_contact(engine_t* e, int32_t c) noexcept nogil:
+    """Stage 4 of the tangents."""
+    cdef int32_t row = e.ptr[e.size[N_JOINT] + c], k
+    cdef double s, t, x, left
     cdef double t2[3]
     cdef double p[3]
     cdef const double* t1 = e.tangent + 3 * c
     cdef double* lam = e.impulse + row
-    for k in range(e.ptr[e.size[N_JOINT] + c + 1] - row):
-        lam[k] = lam[k] / h
-    if lam[0] <= 0.0:
+    if e.mu[e.size[N_JOINT] + c] == 0.0:
         return
-    if mu > 0.0:
-        cross(e.normal + 3 * c, t1, t2)
-        s = tangent_speed(e, e.v_free, c, t1) + tangent_speed(e, e.dv, c, t1)
-        t = tangent_speed(e, e.v_free, c, t2) + tangent_speed(e, e.dv, c, t2)
-        x = sqrt(s * s + t * t)
-        left = mu * lam[0] - sqrt(lam[1] * lam[1] + lam[2] * lam[2])
-        if x > 0.0 and left > 0.0:
-            for k in range(3):
-                p[k] = (s * t1[k] + t * t2[k]) / x
-            goal = x / weight_of(e, c, e.arm_a + 3 * c, e.arm_b + 3 * c, p)
-            goal = goal if goal < left else left
-            for k in range(3):
-                p[k] = -goal * p[k]
-            lam[1] -= goal * s / x
-            lam[2] -= goal * t / x
-            push_contact(e, c, p)
-    e_ab = e.restitution[a] if e.restitution[a] > e.restitution[b] else e.restitution[b]
-    before = normal_velocity(e, a, b, c)
-    goal = -e_ab * before if before < -e.setting[S_BOUNCE] else 0.0
-    x = lam[0] + (goal - normal_speed(e, e.v_free, c) - normal_speed(e, e.dv, c)) / e.d[row]
-    x = x if x > 0.0 else 0.0
+    left = e.mu[e.size[N_JOINT] + c] * lam[0] - sqrt(lam[1] * lam[1] + lam[2] * lam[2])
+    if left <= 0.0:
+        return
+    cross(e.normal + 3 * c, t1, t2)
+    s = tangent_speed(e, e.v_free, c, t1) + tangent_speed(e, e.dv, c, t1)
+    t = tangent_speed(e, e.v_free, c, t2) + tangent_speed(e, e.dv, c, t2)
+    x = sqrt(s * s + t * t)
+    if x == 0.0:
+        return
     for k in range(3):
-        p[k] = (x - lam[0]) * e.normal[3 * c + k]
-    lam[0] = x
+        p[k] = (s * t1[k] + t * t2[k]) / x
+    x = x / weight_of(e, c, e.arm_a + 3 * c, e.arm_b + 3 * c, p)
+    left = x if x < left else left
+    for k in range(3):
+        p[k] = -left * p[k]
+    lam[1] += dot3(p, t1)
+    lam[2] += dot3(p, t2)
     push_contact(e, c, p)
 
 
@@ -360,6 +370,8 @@ cdef inline void correct_all(engine_t* e) noexcept nogil:
             x = e.b[row] - joint_velocity(e.jac + 12 * row, e.dv, e.joint_body[2 * i], e.joint_body[2 * i + 1])
             e.impulse[row] = clip(x / e.d[row], e.lower[row], e.upper[row])
             joint_push(e.minv_jac + 12 * row, e.impulse[row], e.dv, e.joint_body[2 * i], e.joint_body[2 * i + 1])
+    for i in range(kj, n):
+        bounce_contact(e, e.order[i] - kj)
     for i in range(kj, n):
         brake_contact(e, e.order[i] - kj)
 
