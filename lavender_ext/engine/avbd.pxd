@@ -24,8 +24,8 @@ from libc.stdint cimport int32_t
 
 from lavender_ext.core.block cimport clip
 from lavender_ext.core.rows cimport cross, joint_velocity
-from lavender_ext.engine.arrays cimport (H_CONTACTS, H_ITERATIONS, H_WARM_START, N_DYNAMIC, N_FRAME, N_JOINT, N_JOINT_REAL, N_JOINT_ROW, S_H, S_HERTZ, S_RATIO, S_SLOP,
-                                         engine_t)
+from lavender_ext.engine.arrays cimport (H_CONTACTS, H_ITERATIONS, H_WARM_START, N_DYNAMIC, N_FRAME, N_JOINT,
+                                         N_JOINT_ROW, S_H, S_HERTZ, S_RATIO, S_SLOP, engine_t)
 from lavender_ext.engine.bodies cimport world_tensor
 from lavender_ext.engine.projection cimport rigid_row
 from lavender_ext.engine.xpbd cimport tangent_speed
@@ -245,7 +245,7 @@ cdef inline void start_stiffness(engine_t* e, double gamma) noexcept nogil:
 
 cdef inline void descend_all(engine_t* e) noexcept nogil:
     """The whole substep on the prepared rows; dv = z/h - v*."""
-    cdef int32_t nd = e.size[N_DYNAMIC], n = e.size[N_JOINT] + e.head[H_CONTACTS], i, k, s
+    cdef int32_t nd = e.size[N_DYNAMIC], n = e.size[N_JOINT] + e.head[H_CONTACTS], i, k, _pass
     cdef int32_t* first = e.order_scratch               # (nd + 1), then two entries a block
     cdef int32_t* rows = first + nd + 1
     for i in range(nd + 1):
@@ -265,7 +265,7 @@ cdef inline void descend_all(engine_t* e) noexcept nogil:
     start_stiffness(e, fading())
     for i in range(6 * nd):
         e.shift[i] = e.setting[S_H] * e.v_free[i]
-    for s in range(e.head[H_ITERATIONS]):
+    for _pass in range(e.head[H_ITERATIONS]):
         for i in range(nd):
             descend(e, i, first, rows)
         take_multipliers(e)

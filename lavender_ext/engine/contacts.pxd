@@ -32,7 +32,8 @@ from lavender_ext.core.block cimport CONTACT, CONTACT_SPIN
 from lavender_ext.core.rows cimport (contact_diagonal, contact_slack, cross, dot3, largest_eigenvalue,
                                      reciprocal, relative_velocity, rows_t)
 from lavender_ext.engine.arrays cimport (ALTERNATING, AVBD, BOX, CAP_CONTACT, H_CACHED, H_CONTACTS, H_CONTACT_ROWS,
-                                         H_MATCHES, H_ORDER, H_PAIRS, H_STEP, H_STEPPER, H_WARM_START, N_CACHE_IMPULSE, N_JOINT, N_JOINT_ROW,
+                                         H_MATCHES, H_ORDER, H_PAIRS, H_STEP, H_STEPPER, H_WARM_START,
+                                         N_CACHE_IMPULSE, N_JOINT, N_JOINT_ROW,
                                          S_BETA, S_BOUNCE, S_H, S_MARGIN, S_MATCH, S_SLOP, engine_t)
 from lavender_ext.engine.bodies cimport to_body
 from lavender_ext.engine.narrow_phase cimport collide, manifold_t

@@ -11,6 +11,7 @@ needed. Between `prepare` and `finish` any solver may take the place of `solve`:
 lies in the arrays, the impulses go back into them.
 """
 from libc.stdint cimport int32_t, int64_t, uint64_t
+from libc.string cimport memcpy
 
 import numpy as np
 
@@ -174,14 +175,14 @@ cdef inline void sweep(engine_t* e, const blocks_t* p, const rows_t* r, int32_t 
 cdef inline void move(engine_t* e) noexcept nogil:
     # steppers over positions: residuals of a velocity problem have no meaning there
     cdef int32_t k
-    cdef double zero = 0.0
+    cdef uint64_t nan = 0x7FF8000000000000              # by its bits: processors choose the sign of 0/0
     if e.head[H_STEPPER] == XPBD:
         order_blocks(e)
         correct_all(e)
     else:
         descend_all(e)
     for k in range(4, 8):
-        e.setting[S_OUT + k] = zero / zero
+        memcpy(e.setting + S_OUT + k, &nan, sizeof(nan))
 
 
 cdef inline void solve(engine_t* e, int32_t sweeps, double* room, double* curve, double* scratch) noexcept nogil:

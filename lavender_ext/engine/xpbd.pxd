@@ -349,12 +349,12 @@ cdef inline void brake_contact(engine_t* e, int32_t c) noexcept nogil:
 
 cdef inline void correct_all(engine_t* e) noexcept nogil:
     """Stages 1 to 4 on the prepared rows, in the order of e.order; motors after the positions."""
-    cdef int32_t i, s, row, kj = e.size[N_JOINT], n = kj + e.head[H_CONTACTS]
+    cdef int32_t i, _sweep, row, kj = e.size[N_JOINT], n = kj + e.head[H_CONTACTS]
     cdef double x, h = e.setting[S_H]
     for i in range(e.ptr[n]):
         e.impulse[i] = 0.0
     fly(e)
-    for s in range(e.head[H_ITERATIONS]):
+    for _sweep in range(e.head[H_ITERATIONS]):
         for i in range(kj):
             correct_joint(e, e.order[i])
         for i in range(kj, n):
