@@ -16,10 +16,16 @@ __all__ = ["run"]
 @click.command()
 @click.argument("scene")
 @click.option("--steps", type=int, default=240, show_default=True, help="Steps to run.")
-@click.option("--iterations", type=int, default=None, help="Budget of the velocity solve; 4 to 64 sweeps.")
+@click.option(
+    "--iterations",
+    type=int,
+    default=None,
+    help="Sweeps of a solve; 4 to 64 (1 to 64 of other steppers).",
+)
 @click.option(
     "--warm-start/--no-warm-start", default=True, show_default=True, help="Carry impulses from step to step."
 )
+@click.option("--stepper", default=None, help="impulses (default), soft_step, xpbd or avbd.")
 @click.option(
     "--set",
     "parameters",
@@ -51,6 +57,7 @@ def run(
     steps: int,
     iterations: int | None,
     warm_start: bool,
+    stepper: str | None,
     parameters: tuple[str, ...],
     residual: bool,
     plot: Path | None,
@@ -78,7 +85,7 @@ def run(
         steps=steps,
         iterations=iterations,
         warm_start=warm_start,
-        parameters=_parameters(parameters),
+        parameters={**_parameters(parameters), **({} if stepper is None else {"stepper": stepper})},
         residual=residual,
         trace=trace,
         plot=plot,

@@ -25,7 +25,7 @@ __all__ = ["same_scene", "whole_state"]
 
 CARRIED = ("x", "q", "v", "fat", "joint_impulse", "inv_inertia", "cache_impulse", "cache_local", "cache_key")
 GIVEN = tuple(name for name in KEPT if name not in (*CARRIED, "head", "setting", "ptr"))
-FIXED_HEAD = ("position_iterations", "order", "seed")
+FIXED_HEAD = ("position_iterations", "order", "seed", "stepper", "relaxing")
 WRITTEN = {"out": 8, "depth": 1, "joint_error": 1}  # entries of `setting` that the engine writes
 UNIT = 1e-9  # -, quaternions are normalised in every substep
 

@@ -28,7 +28,7 @@ from lavender.problem import Problem
 from lavender.registry import get
 from lavender.scene import Scene
 from lavender.scene.parts import whole
-from lavender.scene.scene import SWEEPS
+from lavender.scene.steppers import get_stepper
 from lavender.solution import Solution, Status
 from lavender.solve import finish, solve
 from lavender.solvers.newton import SPEC as NEWTON_SPEC
@@ -98,6 +98,8 @@ class Simulation:
     ----------
     scene : Scene or str
         A scene, or the name of one of the gallery.
+    stepper : str, optional
+        Of `lavender.scene.steppers`, with its default options, in the place of the scene's.
     report_residual : bool, default False
         Put the judge's residual over all rows of the final substep into `info["residual"]`; costs about as
         much as a step.
@@ -112,7 +114,12 @@ class Simulation:
     """
 
     def __init__(
-        self, scene: Scene | str, *, report_residual: bool = False, report_motion: bool = False
+        self,
+        scene: Scene | str,
+        *,
+        stepper: str | None = None,
+        report_residual: bool = False,
+        report_motion: bool = False,
     ) -> None:
         if isinstance(scene, str):
             scene = Scene(scene)
@@ -120,6 +127,8 @@ class Simulation:
             raise InputError(f"scene is a {type(scene).__name__}; a lavender.Scene is needed, or a name")
         if not scene.bodies:
             raise InputError("the scene has no bodies; add some (add_box, add_sphere, add_plane)")
+        if stepper is not None and stepper != scene.parameters.stepper:
+            scene = scene.with_parameters(stepper=stepper, stepper_options={})
         self.scene = scene
         self.report_residual = report_residual
         self.report_motion = report_motion
@@ -134,6 +143,7 @@ class Simulation:
         self._state = State.of_scene(scene)
         self._fingerprint = scene.fingerprint()
         self._own_sweeps = p.solver == "sequential_impulses"
+        self._sweeps = get_stepper(p.stepper).sweeps if self._own_sweeps else (1, 2**31 - 1)
         # `newton` with nothing but a tolerance asked for: its first phase runs on the engine's own arrays
         tol = p.solver_options.get("tol", TOL)
         self._warm_tol = 0.0
@@ -190,10 +200,10 @@ class Simulation:
         Raises
         ------
         InputError
-            Not a whole number of 4 to 64 for sequential_impulses, of at least 1 for other solvers.
+            Not a whole number of 4 to 64 for sequential_impulses (1 to 64 under other steppers than "impulses"), of at
+            least 1 for other solvers.
         """
-        low, high = SWEEPS if self._own_sweeps else (1, 2**31 - 1)
-        self._state.head[HEAD["iterations"]] = whole("solver_iterations", n, low, high)
+        self._state.head[HEAD["iterations"]] = whole("solver_iterations", n, *self._sweeps)
 
     @_alone
     def set_warm_start(self, flag: bool) -> None:
@@ -716,7 +726,7 @@ class Simulation:
         state = State(size)
         state.real[:], state.index[:], state.keys[:] = snapshot.real, snapshot.index, snapshot.keys
         lost = snapshot.lost
-        whole_state(self._state, state, SWEEPS if self._own_sweeps else (1, 2**31 - 1), bool(lost))
+        whole_state(self._state, state, self._sweeps, bool(lost))
         if lost != (self._names[state.head[HEAD["lost"]]] if lost else ""):
             raise InputError(
                 f"the snapshot is damaged: {lost[:40]!r} is not the body whose state it says is lost"

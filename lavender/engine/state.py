@@ -25,6 +25,7 @@ from lavender.engine.layout import (
 from lavender.errors import InputError
 from lavender.scene import Box, Plane, Scene, Sphere, arithmetic
 from lavender.scene.scene import SCENE_ORDERS
+from lavender.scene.steppers import get_stepper
 from lavender_ext.engine import substep
 from lavender_ext.engine.arrays import lengths
 from lavender_ext.warm.start import Warm
@@ -168,6 +169,7 @@ class State:
         frames = any(uneven) or bool(joints) or any(isinstance(b.shape, Box) for b in bodies)
         mu = np.array([p.friction if b.friction is None else b.friction for b in bodies])
         patch = np.array([p.patch_radius if b.patch_radius is None else b.patch_radius for b in bodies])
+        restitution = np.array([p.restitution if b.restitution is None else b.restitution for b in bodies])
         shaped = np.array([b.shape is not None for b in bodies], bool)
         per = (
             1
@@ -204,6 +206,15 @@ class State:
         head[HEAD["order"]] = ORDER_NUMBER[p.order]
         head[HEAD["seed"]] = p.seed
         head[HEAD["lost"]] = -1
+        stepper = get_stepper(p.stepper)
+        stepper.check(per == 4, bool((restitution > 0.0).any()))
+        head[HEAD["stepper"]] = stepper.number
+        for name, value in p.stepper_options.items():
+            option = stepper.options[name]
+            if option.is_whole:
+                head[HEAD[option.place]] = value
+            else:
+                setting[SETTING[option.place]] = value
         setting[SETTING["out"] : SETTING["out"] + 2] = p.solver_iterations, p.warm_start
         dynamic = 0
         for i, b in enumerate(bodies):
@@ -219,7 +230,7 @@ class State:
                 a["inv_inertia_body"][i] = a["inv_inertia"][dynamic] = inverse
                 a["uneven"][i] = uneven[i]
                 dynamic += 1
-            a["restitution"][i] = p.restitution if b.restitution is None else b.restitution
+            a["restitution"][i] = restitution[i]
             a["kind_of_shape"][i], a["shape"][i] = _shape(b.shape)
         a["friction"][:], a["patch"][:] = mu, patch
         row = 0

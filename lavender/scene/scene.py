@@ -32,12 +32,12 @@ from lavender.scene.parts import (
     unit,
     whole,
 )
+from lavender.scene.steppers import get_stepper
 
 __all__ = ["ON_FAILURE", "SCENES", "Parameters", "Scene", "named_scene"]
 
 SCENE_ORDERS = (*ENGINE_ORDERS, "alternating")  # alternating: contacts turned round every substep
 ON_FAILURE = ("use", "keep", "damp", "raise")
-SWEEPS = (4, 64)  # sweep budget of sequential impulses
 MOST = {"restitution": 1.0, "friction": 1e100}  # the product of two coefficients of friction is finite
 MOST_SUBSTEPS = 10_000  # of a step where their number is not given; more are asked for by name
 MAX_SUBSTEP = 1.0 / 240.0  # s, within which four warm sweeps hold a stack
@@ -58,12 +58,15 @@ class Parameters:
     solver_options: Mapping[str, Any] = field(default_factory=dict)
     solver_iterations: int | None = None  # None: 16 sweeps, or the solver's own default
     warm_start: bool = True
-    # None: alternating for sequential impulses, given for other solvers
+    stepper: str = "impulses"  # of lavender.scene.steppers
+    stepper_options: Mapping[str, Any] = field(default_factory=dict)  # its own numbers; here all of them
+    # None: the stepper's for sequential impulses (alternating for "impulses"), given for other solvers
     order: str = None  # type: ignore[assignment]
     friction: float = 0.5  # -, of bodies that say nothing else
     restitution: float = 0.0  # -, of bodies that say nothing else
     patch_radius: float = 0.0  # m, of bodies that say nothing else; 0: no spin friction
-    position_iterations: int = 2
+    # None: 2 for "impulses", 0 for the others, which have no position projection
+    position_iterations: int = None  # type: ignore[assignment]
     seed: int = 0
     on_failure: str = "use"
     slop: float = 1e-3  # m, penetration left alone
@@ -82,6 +85,14 @@ class Parameters:
             raise InputError(f"solver_options is {self.solver_options!r}; a mapping is needed")
         put(self, "solver_options", dict(self.solver_options))
         sweeps, own = self.solver_iterations, self.solver == "sequential_impulses"
+        stepper = get_stepper(self.stepper)
+        if not own and not stepper.solvers:
+            raise InputError(
+                f"stepper {stepper.name!r} takes no solver {self.solver!r}; leave solver= out, or take 'impulses'"
+            )
+        if not isinstance(self.stepper_options, Mapping):
+            raise InputError(f"stepper_options is {self.stepper_options!r}; a mapping is needed")
+        put(self, "stepper_options", stepper.values(self.stepper_options))
         longest: Any = self.max_substep
         if longest is None:
             longest = MAX_SUBSTEP if own else self.dt
@@ -102,7 +113,7 @@ class Parameters:
                     f"solver_options {sorted(self.solver_options)} are for other solvers; sequential_impulses "
                     "takes order= and seed= of the scene"
                 )
-            sweeps = 16 if sweeps is None else whole("solver_iterations", sweeps, *SWEEPS)
+            sweeps = 16 if sweeps is None else whole("solver_iterations", sweeps, *stepper.sweeps)
         elif sweeps is None:
             sweeps = spec.max_iter
         put(self, "solver_iterations", whole("solver_iterations", sweeps, 1))
@@ -111,7 +122,7 @@ class Parameters:
         put(self, "warm_start", bool(self.warm_start))
         order: Any = self.order
         if order is None:
-            put(self, "order", "alternating" if own else "given")
+            put(self, "order", stepper.order if own else "given")
         if self.order not in SCENE_ORDERS:
             raise UnknownName("order", self.order, SCENE_ORDERS)
         if self.order != "given" and not own:
@@ -125,7 +136,14 @@ class Parameters:
                 number(name, getattr(self, name), low=0.0, high=MOST.get(name, np.inf)),
             )
         put(self, "margin", number("margin", self.margin, low=0.0))
-        put(self, "position_iterations", whole("position_iterations", self.position_iterations, 0, 1000))
+        projections: Any = self.position_iterations
+        if projections is None:
+            projections = stepper.position_iterations
+        put(self, "position_iterations", whole("position_iterations", projections, 0, 1000))
+        if self.position_iterations and not stepper.position_iterations:
+            raise InputError(
+                f"position_iterations is {projections}; stepper {stepper.name!r} has no position projection"
+            )
         put(self, "seed", whole("seed", self.seed))
         if self.on_failure not in ON_FAILURE:
             raise UnknownName("on_failure", self.on_failure, ON_FAILURE)
@@ -497,7 +515,9 @@ class Scene:
         """Hash of what cannot change while the scene runs: bodies, joints and parameters, without the start state
         and without the sweep budget and warm-start mode.
         """
-        free = ("solver_iterations", "warm_start")
+        free: tuple[str, ...] = ("solver_iterations", "warm_start")
+        if self.parameters.stepper == "impulses":
+            free += ("stepper", "stepper_options")  # as it was before there were others: old snapshots fit
         head = {f.name: getattr(self.parameters, f.name) for f in fields(Parameters) if f.name not in free}
         parts: list[Any] = [head]
         for b in self.bodies:

@@ -150,7 +150,7 @@ def layout() -> dict[str, Any]:
     dict
         structs: name -> field -> type ("i4", "f8", "3f8", "p" for a pointer); native: name -> size and offsets
         [bytes]; arrays: buffer -> names in order; size, head, setting,
-        joint, joint_kinds: name -> place, number; orders: name -> number.
+        joint, joint_kinds: name -> place, number; orders: name -> number; steppers: name -> what it writes.
     """
     native = {name: {"size": size, "offsets": offsets} for name, (size, offsets) in memory.layout().items()}
     return {
@@ -163,7 +163,17 @@ def layout() -> dict[str, Any]:
         "joint": JOINT,
         "joint_kinds": JOINT_KINDS,
         "orders": ORDER_NUMBER,
+        "steppers": {name: _stepper(name) for name in ("impulses", "soft_step")},
     }
+
+
+def _stepper(name: str) -> dict[str, dict[str, float]]:
+    """What a stepper writes into `head` and `setting`."""
+    state = Simulation(Scene("stack", stepper=name)).snapshot()
+    first = offsets(state.size)
+    head, setting = state.index[first["head"] :], state.real[first["setting"] :]
+    numbers = {place: int(head[HEAD[place]]) for place in ("stepper", "relaxing", "position_iterations")}
+    return {"head": numbers, "setting": {p: float(setting[SETTING[p]]) for p in ("hertz", "ratio", "push")}}
 
 
 def describe(start: Snapshot) -> dict[str, Any]:

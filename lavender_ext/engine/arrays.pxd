@@ -45,6 +45,8 @@ cpdef enum:
     H_PROJECTED = 15        # position sweeps done in the last substep
     H_LOST = 16             # first body whose state is not finite, or -1
     H_SOLVED = 17           # 1: the arrays hold the last substep's problem and its impulses
+    H_STEPPER = 18          # what happens between collision and integration, see below
+    H_RELAXING = 19         # sweeps without bias after the others, of SOFT_STEP
     N_HEAD = 24
 
 # H_ORDER: how the blocks of a sweep are ordered, joints and contacts each among themselves
@@ -58,6 +60,13 @@ cpdef enum:
     COLORED = 6
     ALTERNATING = 7         # as given, and contacts are made from the last pair to the first in odd substeps
 
+# H_STEPPER
+cpdef enum:
+    IMPULSES = 0            # speculative contacts, sweeps over velocities, position projection
+    SOFT_STEP = 1           # soft contacts and joints, then relaxing sweeps: engine/soft_step.pxd
+    XPBD = 2                # position corrections, velocities from positions: engine/xpbd.pxd
+    AVBD = 3                # block descent over bodies, augmented Lagrangian: engine/avbd.pxd
+
 # setting[]: real numbers; those from S_OUT on are written by the engine
 cpdef enum:
     S_H = 0                 # s, substep
@@ -69,9 +78,12 @@ cpdef enum:
     S_MAX_PUSH = 8          # m, largest error corrected per substep
     S_BOUNCE = 9            # m/s, closing speed below which restitution is 0
     S_MATCH = 10            # m, a cached contact further away than this is stale
+    S_PUSH = 11             # m/s, largest speed at which SOFT_STEP pushes bodies apart
     S_OUT = 12              # the eight solver values
     S_DEPTH = 20            # m, deepest penetration
     S_JOINT_ERROR = 21      # m or rad, largest joint error
+    S_HERTZ = 22            # 1/s, of the contacts of SOFT_STEP; stabilisation [-] of AVBD
+    S_RATIO = 23            # -, their damping ratio
     N_SETTINGS = 24
 
 # the pair list: what stops the broad phase, and what it then says is needed, which no capacity meets

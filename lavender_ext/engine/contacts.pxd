@@ -31,8 +31,9 @@ from libc.stdint cimport int32_t, uint64_t
 from lavender_ext.core.block cimport CONTACT, CONTACT_SPIN
 from lavender_ext.core.rows cimport (contact_diagonal, contact_slack, cross, dot3, largest_eigenvalue,
                                      reciprocal, relative_velocity, rows_t)
-from lavender_ext.engine.arrays cimport (ALTERNATING, BOX, CAP_CONTACT, H_CACHED, H_CONTACTS, H_CONTACT_ROWS,
-                                         H_MATCHES, H_ORDER, H_PAIRS, H_STEP, H_WARM_START, N_CACHE_IMPULSE, N_JOINT, N_JOINT_ROW,
+from lavender_ext.engine.arrays cimport (ALTERNATING, AVBD, BOX, CAP_CONTACT, H_CACHED, H_CONTACTS, H_CONTACT_ROWS,
+                                         H_MATCHES, H_ORDER, H_PAIRS, H_STEP, H_STEPPER, H_WARM_START,
+                                         N_CACHE_IMPULSE, N_JOINT, N_JOINT_ROW,
                                          S_BETA, S_BOUNCE, S_H, S_MARGIN, S_MATCH, S_SLOP, engine_t)
 from lavender_ext.engine.bodies cimport to_body
 from lavender_ext.engine.narrow_phase cimport collide, manifold_t
@@ -123,6 +124,8 @@ cdef inline void guess_contact(engine_t* e, int32_t c, int32_t entry, int32_t nt
         lam[2] = dot3(p + 1, t2)
     if spin:
         lam[1 + nt] = p[4]
+    if e.head[H_STEPPER] == AVBD:
+        e.push[e.size[N_JOINT_ROW] + c] = p[4]
 
 
 cdef inline double normal_velocity(const engine_t* e, int32_t a, int32_t b, int32_t c) noexcept nogil:
@@ -256,6 +259,7 @@ cdef inline int32_t make_contacts(engine_t* e, const rows_t* r) noexcept nogil:
             e.patch_radius[block] = patch if spin else 0.0
             for k in range(1 + nt + spin):
                 e.impulse[row + k] = 0.0
+            e.push[e.size[N_JOINT_ROW] + c] = 0.0
             row += 1 + nt + spin
             c += 1
             e.ptr[block + 1] = row
@@ -295,6 +299,8 @@ cdef inline void store_contacts(engine_t* e) noexcept nogil:
             for k in range(3):
                 p[1 + k] = 0.0
         p[4] = e.impulse[row + 3] if e.kind[e.size[N_JOINT] + c] == CONTACT_SPIN else 0.0
+        if e.head[H_STEPPER] == AVBD:                   # which has no spin: the stiffness of the contact
+            p[4] = e.push[e.size[N_JOINT_ROW] + c]
         for k in range(6):
             e.cache_local[6 * at + k] = e.local[6 * c + k]
     e.head[H_CACHED] = n

@@ -11,6 +11,7 @@ needed. Between `prepare` and `finish` any solver may take the place of `solve`:
 lies in the arrays, the impulses go back into them.
 """
 from libc.stdint cimport int32_t, int64_t, uint64_t
+from libc.string cimport memcpy
 
 import numpy as np
 
@@ -21,28 +22,35 @@ from lavender_ext.core.order cimport (RANDOM, SYMMETRIC, advance_order, block_le
                                       color_by_bodies, reverse, sort_by_level)
 from lavender_ext.core.rows cimport relax_contact_block, relax_joint, rows_t
 from lavender_ext.core.velocity cimport rows_velocity
-from lavender_ext.engine.arrays cimport (AT_RANDOM, BOTTOM_UP, CAP_CONTACT, CAP_PAIR, COLORED, H_CACHED,
-                                         H_CONTACTS, H_CONTACT_ROWS, H_ITERATIONS, H_LOST, H_MATCHES,
+from lavender_ext.engine.arrays cimport (AT_RANDOM, AVBD, BOTTOM_UP, CAP_CONTACT, CAP_PAIR, COLORED, H_CACHED,
+                                         H_CONTACTS, H_CONTACT_ROWS, H_ITERATIONS, H_LOST, H_MATCHES, H_RELAXING, H_STEPPER,
                                          H_NEED_CONTACTS, H_NEED_PAIRS, H_ORDER, H_SEED, H_SOLVED, H_STEP,
                                          H_WARM_START, NEED_ROOM, NOT_FINITE, N_DYNAMIC, N_HEAD, N_JOINT,
-                                         N_JOINT_ROW, OK, REVERSED, ROWS_PER_CONTACT, SYMMETRICALLY, S_OUT,
-                                         TOP_DOWN, bind, engine_t)
+                                         N_JOINT_ROW, OK, REVERSED, ROWS_PER_CONTACT, SOFT_STEP, SYMMETRICALLY, S_OUT,
+                                         TOP_DOWN, XPBD, bind, engine_t)
+from lavender_ext.engine.avbd cimport descend_all
 from lavender_ext.engine.bodies cimport drift_bodies, start_bodies
 from lavender_ext.engine.broad_phase cimport update_pairs
 from lavender_ext.engine.contacts cimport make_contacts, store_contacts
 from lavender_ext.engine.joints cimport make_joints
 from lavender_ext.engine.kept cimport keep, kept_reals, put_back
 from lavender_ext.engine.projection cimport normal_speed, project_positions
+from lavender_ext.engine.soft_step cimport drift_relaxed, relax, restitute, soften
 from lavender_ext.engine.view cimport view
+from lavender_ext.engine.xpbd cimport correct_all, keep_velocities
 from lavender_ext.judge.measure cimport rows_slack
 from lavender_ext.judge.score cimport score_rows, score_t
-from lavender_ext.sweep.packed cimport MOST, ROOM_BODY, ROOM_CONTACT, ROOM_MORE, packs, sweep_packed
+from lavender_ext.sweep.packed cimport MOST, room_for, sweep_packed
+
+
+cdef enum:
+    SWEEPS_PACKED = 4
 
 
 cdef int32_t prepare(engine_t* e) noexcept nogil:
     cdef blocks_t p
     cdef rows_t r
-    cdef int32_t pairs, contacts
+    cdef int32_t pairs, contacts, i
     e.head[H_SOLVED] = 0
     start_bodies(e)
     pairs = update_pairs(e)
@@ -52,9 +60,16 @@ cdef int32_t prepare(engine_t* e) noexcept nogil:
     view(e, &p, &r)
     if e.size[N_JOINT] > 0:
         make_joints(e)
+    if e.head[H_STEPPER] == SOFT_STEP:
+        for i in range(e.size[CAP_CONTACT] * e.size[ROWS_PER_CONTACT]):
+            e.compliance[e.size[N_JOINT_ROW] + i] = 0.0     # where a substep stopped between prepare and solve
     contacts = make_contacts(e, &r)
     e.head[H_NEED_CONTACTS] = contacts
-    return NEED_ROOM if contacts > e.size[CAP_CONTACT] else OK
+    if contacts > e.size[CAP_CONTACT]:
+        return NEED_ROOM
+    if e.head[H_STEPPER] == SOFT_STEP:
+        soften(e)
+    return OK
 
 
 cdef inline void measure(const engine_t* e, double* residual, double* violation) noexcept nogil:
@@ -122,16 +137,15 @@ cdef inline void note_sweep(const engine_t* e, const blocks_t* p, const rows_t* 
     out[1] = s.energy
 
 
-cdef void sweep_all(engine_t* e, const blocks_t* p, const rows_t* r, double* curve,
+cdef void sweep_all(engine_t* e, const blocks_t* p, const rows_t* r, int32_t sweeps, double* curve,
                     double* scratch) noexcept nogil:
-    """The budgeted sweeps: joints, then contacts; curve (sweeps + 1, 2) or NULL."""
+    """Sweeps one after another: joints, then contacts; curve (sweeps + 1, 2) or NULL."""
     cdef int32_t s, i, kj = r.n_joints, k = p.n_blocks, mode
     cdef uint64_t rng
-    order_blocks(e)
     mode = SYMMETRIC if e.head[H_ORDER] == SYMMETRICALLY else (RANDOM if e.head[H_ORDER] == AT_RANDOM else 0)
     # every substep has its own stream, a function of seed and substep alone
     rng = ((<uint64_t>(<int64_t>e.head[H_SEED])) << 32) ^ (<uint64_t>(<int64_t>e.head[H_STEP]))
-    for s in range(e.head[H_ITERATIONS]):
+    for s in range(sweeps):
         advance_order(mode, s == 0, e.order, 0, kj, &rng)
         advance_order(mode, s == 0, e.order, kj, k, &rng)
         for i in range(kj):
@@ -142,28 +156,56 @@ cdef void sweep_all(engine_t* e, const blocks_t* p, const rows_t* r, double* cur
             note_sweep(e, p, r, curve + 2 * (s + 1), scratch)
 
 
-cdef inline int32_t sweep_fast(engine_t* e, const blocks_t* p, const rows_t* r, double* room) noexcept nogil:
-    # the same bits by packed contacts; 0 where the scene has other blocks, or an order that changes
-    if e.head[H_ORDER] == SYMMETRICALLY or e.head[H_ORDER] == AT_RANDOM or not packs(p, r):
+cdef inline int32_t sweep_fast(engine_t* e, const blocks_t* p, const rows_t* r, int32_t sweeps,
+                               double* room) noexcept nogil:
+    # the same bits by packed blocks; 0 where these are few, or the order changes
+    if e.head[H_ORDER] == SYMMETRICALLY or e.head[H_ORDER] == AT_RANDOM:
         return 0
+    return sweep_packed(p, r, e.order, sweeps, room, e.impulse, e.dv)
+
+
+cdef inline void sweep(engine_t* e, const blocks_t* p, const rows_t* r, int32_t sweeps, double* room, double* curve,
+                       double* scratch) noexcept nogil:
     order_blocks(e)
-    sweep_packed(p, r, e.order, e.head[H_ITERATIONS], room, e.impulse, e.dv)
-    return 1
+    # to pack costs what some sweeps do
+    if room == NULL or sweeps < SWEEPS_PACKED or not sweep_fast(e, p, r, sweeps, room):
+        sweep_all(e, p, r, sweeps, curve, scratch)
+
+
+cdef inline void move(engine_t* e) noexcept nogil:
+    # steppers over positions: residuals of a velocity problem have no meaning there
+    cdef int32_t k
+    cdef uint64_t nan = 0x7FF8000000000000              # by its bits: processors choose the sign of 0/0
+    if e.head[H_STEPPER] == XPBD:
+        order_blocks(e)
+        correct_all(e)
+    else:
+        descend_all(e)
+    for k in range(4, 8):
+        memcpy(e.setting + S_OUT + k, &nan, sizeof(nan))
 
 
 cdef inline void solve(engine_t* e, int32_t sweeps, double* room, double* curve, double* scratch) noexcept nogil:
+    """What the stepper does before positions move for good; sweeps = 0: guesses and first measures alone."""
     cdef blocks_t p
     cdef rows_t r
     cdef double* out = e.setting + S_OUT
     view(e, &p, &r)
+    if sweeps and (e.head[H_STEPPER] == XPBD or e.head[H_STEPPER] == AVBD):
+        move(e)
+        return
     warm(e, &p, &r)
     measure(e, out + 4, out + 6)
     if curve != NULL:
         note_sweep(e, &p, &r, curve, scratch)
-    if sweeps:
-        if room == NULL or not sweep_fast(e, &p, &r, room):
-            sweep_all(e, &p, &r, curve, scratch)
-        measure(e, out + 5, out + 7)
+    if not sweeps:
+        return
+    sweep(e, &p, &r, e.head[H_ITERATIONS], room, curve, scratch)
+    if e.head[H_STEPPER] == SOFT_STEP:
+        relax(e)
+        sweep(e, &p, &r, e.head[H_RELAXING], room, NULL, NULL)
+        restitute(e)
+    measure(e, out + 5, out + 7)
 
 
 cdef inline int32_t finite(const double* x, int32_t n) noexcept nogil:
@@ -181,8 +223,9 @@ cdef inline int32_t moving_body(const engine_t* e, const int32_t* pair) noexcept
 cdef inline int32_t unsolved_body(const engine_t* e) noexcept nogil:
     """A moving body of the first block whose impulses are not finite, or the solver's measures; -1 if all are."""
     cdef int32_t i, kj = e.size[N_JOINT], c = e.head[H_CONTACTS]
+    cdef int32_t known = 4 if e.head[H_STEPPER] == XPBD or e.head[H_STEPPER] == AVBD else 8
     if (finite(e.impulse, e.size[N_JOINT_ROW] + e.head[H_CONTACT_ROWS]) and finite(e.gap, c)
-            and finite(e.setting + S_OUT, 8)):
+            and finite(e.setting + S_OUT, known)):
         return -1
     for i in range(kj):
         if not finite(e.impulse + e.ptr[i], e.ptr[i + 1] - e.ptr[i]):
@@ -206,7 +249,12 @@ cdef int32_t finish(engine_t* e) noexcept nogil:
     unsolved = unsolved_body(e)
     store_contacts(e)
     shifted = project_positions(e)
-    e.head[H_LOST] = drift_bodies(e, shifted)
+    if e.head[H_STEPPER] == SOFT_STEP:
+        e.head[H_LOST] = drift_relaxed(e)
+    elif e.head[H_STEPPER] == XPBD:
+        e.head[H_LOST] = keep_velocities(e)
+    else:
+        e.head[H_LOST] = drift_bodies(e, shifted)
     if e.head[H_LOST] < 0:
         e.head[H_LOST] = unsolved
     e.head[H_SOLVED] = 1
@@ -301,7 +349,7 @@ cdef public int32_t lav_engine_substeps(const int32_t* size, double* real, int32
 
 cdef public int32_t lav_engine_substeps_packed(const int32_t* size, double* real, int32_t* index, uint64_t* keys,
                                                int32_t n_substeps, double* room, int32_t* done) noexcept nogil:
-    """The same bits in less time, with room for packed contacts, as sweep_packed asks."""
+    """The same bits in less time, with room for packed blocks, `room_for` the capacities."""
     return substeps(size, real, index, keys, n_substeps, room, done)
 
 
@@ -324,8 +372,9 @@ cdef class Buffers:
         self.real = real
         self.index = index
         self.keys = keys
-        self.room = np.empty(ROOM_CONTACT * min(<int64_t>size[CAP_CONTACT], MOST)
-                             + ROOM_BODY * <int64_t>size[N_DYNAMIC] + ROOM_MORE)
+        cdef int64_t contacts = min(<int64_t>size[CAP_CONTACT], MOST), joints = size[N_JOINT]
+        self.room = np.empty(room_for(joints, size[N_JOINT_ROW], contacts, contacts * size[ROWS_PER_CONTACT],
+                                      size[N_DYNAMIC]) if joints <= MOST else 1)
         self.kept_real, self.kept_index, self.kept_keys = np.empty(1), np.empty(N_HEAD, np.int32), np.empty(1, np.uint64)
 
     def pairs(self):

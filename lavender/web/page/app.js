@@ -196,7 +196,7 @@ class Side {
   choose(solver) {
     this.wanted = solver;
     if (solver !== "newton") {
-      this.simulation.use(null);
+      this.simulation.use(null, solver === "soft_step" ? solver : "impulses");
     } else if (this.app.newton instanceof WebAssembly.Module) {
       this.simulation.use(new Newton(this.app.newton, this.simulation.k));
     } else {
@@ -291,7 +291,7 @@ class Side {
   restore() {
     const { state, history, curve, fresh } = this.kept;
     this.simulation.restore(state);
-    this.wanted = state.newton ? "newton" : "sweeps";
+    this.wanted = state.newton ? "newton" : state.stepper === "soft_step" ? "soft_step" : "sweeps";
     this.history = { time: [...history.time], values: [...history.values] };
     this.curve = curve;
     this.fresh = fresh;
@@ -318,6 +318,9 @@ class Side {
   work() {
     const { newton, substeps, short, solved, settings } = this.simulation;
     const parts = substeps === 1 ? "in one step" : `in each of ${substeps} substeps`;
+    if (this.wanted === "soft_step") {
+      return `soft step: ${settings.iterations} sweeps and one that relaxes ${parts}`;
+    }
     if (!newton) {
       return `sweeps: ${settings.iterations} ${parts}`;
     }
@@ -468,7 +471,7 @@ class App {
     this.choose(scenes.includes(name) ? name : scenes[0]);
     ["a", "b"].forEach((key, i) => {
       const [sweeps, warm, order, solver] = (given.get(key) ?? "").split(",");
-      const changes = { solver: solver === "newton" ? "newton" : "sweeps" };
+      const changes = { solver: ["newton", "soft_step"].includes(solver) ? solver : "sweeps" };
       if (Number(sweeps) >= 4 && Number(sweeps) <= 64) {
         changes.iterations = Math.round(Number(sweeps));
       }
@@ -492,7 +495,7 @@ class App {
       return;
     }
     const said = this.sides.map(({ settings: s }) =>
-      [s.iterations, s.warm_start ? "warm" : "cold", ORDERS[s.order], ...(s.solver === "newton" ? ["newton"] : [])].join(","));
+      [s.iterations, s.warm_start ? "warm" : "cold", ORDERS[s.order], ...(s.solver === "sweeps" ? [] : [s.solver])].join(","));
     const values = [this.scene.name, ...said, find("speed").value, this.playing ? 1 : 0];
     this.written = "#" + PLAIN.map((name, i) => `${name}=${values[i]}`).join("&");
     if (location.hash !== this.written) {

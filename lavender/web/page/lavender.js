@@ -220,6 +220,7 @@ export class Simulation {
     this.scene = scene;
     this.substeps = scene.substeps;
     this.newton = null;
+    this.stepper = "impulses";
     this.short = 0; // substeps that Newton's method left short of TOL
     this.solved = 0; // all that it solved
     this.steps = 0;
@@ -324,10 +325,16 @@ export class Simulation {
     this.k.functions.lav_engine_move(...old, ...this.buffers);
   }
 
-  // From the next step on: a Newton of the same kernels, or null for sweeps. Each takes as many substeps as it does
-  // natively.
-  use(newton) {
+  // From the next step on: a Newton of the same kernels, or null for what the stepper of that name does. Each takes as
+  // many substeps as it does natively.
+  use(newton, stepper = "impulses") {
     this.newton = newton;
+    this.stepper = stepper;
+    for (const [name, numbers] of Object.entries(this.k.layout.steppers[stepper])) {
+      for (const [place, value] of Object.entries(numbers)) {
+        this.array(name)[this.k.layout[name][place]] = value;
+      }
+    }
     this.substeps = newton ? this.scene.newton_substeps : this.scene.substeps;
     this.set({ h: this.scene.dt / this.substeps });
   }
@@ -411,6 +418,7 @@ export class Simulation {
       steps: this.steps,
       lost: this.lost,
       newton: this.newton,
+      stepper: this.stepper,
       counts: [this.short, this.solved],
       real: this.k.f64(copy[0], this.lengths[0]).slice(),
       index: this.k.i32(copy[1], this.lengths[1]).slice(),
@@ -430,6 +438,7 @@ export class Simulation {
     this.steps = snapshot.steps;
     this.lost = snapshot.lost;
     this.newton = snapshot.newton;
+    this.stepper = snapshot.stepper;
     this.substeps = this.newton ? this.scene.newton_substeps : this.scene.substeps;
     [this.short, this.solved] = snapshot.counts;
   }

@@ -1,0 +1,167 @@
+"""Soft contacts and joints, then a relaxation without their bias (Catto, "Solver2D", 2024).
+
+A constraint C, J v its rate and m = 1/A_ii its effective mass, is a damped spring of frequency f and damping ratio
+zeta on that mass. Over a substep h, implicitly, with omega = 2 pi f (the derivation is that of engine/joints.pxd):
+
+    m omega^2 = k,  2 m zeta omega = c:    lambda = -h (k (C + h J v) + c J v)                           (1)
+    a1 = 2 zeta + h omega,  a2 = h omega a1
+    J v + (omega / a1) C + (A_ii / a2) lambda = 0                                                        (2)
+
+so it is a row with target -(omega / a1) C and compliance A_ii / a2, and a sweep of it is the update with mass scale
+a2 / (1 + a2) and impulse scale 1 / (1 + a2). The substep:
+
+    1   contacts that penetrate and rigid joints get (2), the first at most the push speed; gaps may close, not more
+    2   warm start and sweeps; positions move by these velocities
+    3   sweeps without bias: target 0, no compliance; open gaps as they are by then
+    4   restitution: v_n = -e v_n(before) where the contact bears and closed faster than the threshold
+
+(3) takes away the velocity that pushed bodies apart, so that it adds no energy.
+"""
+from libc.stdint cimport int32_t
+
+from lavender_ext.core.rows cimport joint_velocity, push_bodies, reciprocal
+from lavender_ext.engine.arrays cimport (H_CONTACTS, N_DYNAMIC, N_JOINT, S_BOUNCE, S_H, S_HERTZ, S_PUSH, S_RATIO,
+                                         engine_t)
+from lavender_ext.engine.bodies cimport drift_rotation, rotation, turn, world_times
+from lavender_ext.engine.contacts cimport normal_velocity
+from lavender_ext.engine.projection cimport normal_speed, rigid_row
+
+
+cdef inline void soft(double hertz, double ratio, double h, double* rate, double* a2) noexcept nogil:
+    # omega / a1 [1/s] and a2 [-] of (2)
+    cdef double omega, a1
+    omega = 6.283185307179586 * hertz
+    a1 = 2.0 * ratio + h * omega
+    rate[0] = omega / a1
+    a2[0] = h * omega * a1
+
+
+cdef inline void soften(engine_t* e) noexcept nogil:
+    """(2) on the prepared rows: contacts that penetrate, rigid joint rows."""
+    cdef int32_t i, c, j, a, b
+    cdef double h = e.setting[S_H], rate, a2, stiff, stiff_a2, x
+    cdef double hertz = e.setting[S_HERTZ]
+    if hertz * h > 0.25:                                # a swing of four substeps is what they can follow
+        hertz = 0.25 / h
+    soft(2.0 * hertz, 2.0, h, &stiff, &stiff_a2)   # joints, and contacts with what never moves
+    for i in range(e.size[N_JOINT]):
+        a = e.joint_body[2 * i]
+        b = e.joint_body[2 * i + 1]
+        for j in range(e.ptr[i], e.ptr[i + 1]):
+            if rigid_row(e, i, j):
+                e.compliance[j] = e.d[j] / stiff_a2
+                e.target[j] = -stiff * e.joint_error[j]
+                e.d[j] += e.compliance[j]
+                e.step[j] = reciprocal(e.d[j])
+                e.b[j] = e.target[j] - joint_velocity(e.jac + 12 * j, e.v_free, a, b)
+    soft(hertz, e.setting[S_RATIO], h, &rate, &a2)
+    soft(2.0 * hertz, e.setting[S_RATIO], h, &stiff, &stiff_a2)
+    for c in range(e.head[H_CONTACTS]):
+        j = e.ptr[e.size[N_JOINT] + c]
+        i = e.contact_body[2 * c] < 0 or e.contact_body[2 * c + 1] < 0
+        e.compliance[j] = 0.0
+        if e.gap[c] > 0.0:
+            e.target[j] = -e.gap[c] / h
+        else:
+            x = -(stiff if i else rate) * e.gap[c]
+            e.target[j] = x if x < e.setting[S_PUSH] else e.setting[S_PUSH]
+            e.compliance[j] = e.d[j] / (stiff_a2 if i else a2)
+            e.d[j] += e.compliance[j]
+            e.step[j] = reciprocal(e.d[j])
+        e.b[j] = e.target[j] - normal_speed(e, e.v_free, c)
+
+
+cdef inline void relax(engine_t* e) noexcept nogil:
+    """Keep dv, which moves the bodies, in `shift`; then the rows of stage 3, gaps as they end."""
+    cdef int32_t i, c, j, a, b
+    cdef double h = e.setting[S_H], gap
+    for i in range(6 * e.size[N_DYNAMIC]):
+        e.shift[i] = e.dv[i]
+    for i in range(e.size[N_JOINT]):
+        a = e.joint_body[2 * i]
+        b = e.joint_body[2 * i + 1]
+        for j in range(e.ptr[i], e.ptr[i + 1]):
+            if rigid_row(e, i, j):
+                e.d[j] -= e.compliance[j]
+                e.compliance[j] = 0.0
+                e.step[j] = reciprocal(e.d[j])
+                e.target[j] = 0.0
+                e.b[j] = 0.0 - joint_velocity(e.jac + 12 * j, e.v_free, a, b)
+    for c in range(e.head[H_CONTACTS]):
+        j = e.ptr[e.size[N_JOINT] + c]
+        gap = normal_speed(e, e.v_free, c)
+        e.b[j] = 0.0 - gap
+        gap = e.gap[c] + h * (gap + normal_speed(e, e.dv, c))
+        e.d[j] -= e.compliance[j]
+        e.compliance[j] = 0.0
+        e.step[j] = reciprocal(e.d[j])
+        e.target[j] = -gap / h if gap > 0.0 else 0.0
+        e.b[j] = e.target[j] + e.b[j]
+
+
+cdef inline void restitute(engine_t* e) noexcept nogil:
+    """Stage 4, contact by contact; e.v are the velocities before the substep."""
+    cdef int32_t c, j, k, a, b
+    cdef double e_ab, before, y
+    cdef double impulse[3]
+    for c in range(e.head[H_CONTACTS]):
+        a = e.contact_pair[2 * c]
+        b = e.contact_pair[2 * c + 1]
+        e_ab = e.restitution[a] if e.restitution[a] > e.restitution[b] else e.restitution[b]
+        j = e.ptr[e.size[N_JOINT] + c]
+        if e_ab == 0.0 or e.impulse[j] <= 0.0:
+            continue
+        before = normal_velocity(e, a, b, c)
+        if before > -e.setting[S_BOUNCE]:
+            continue
+        y = normal_speed(e, e.v_free, c) + normal_speed(e, e.dv, c) + e_ab * before
+        y = e.impulse[j] - y * e.step[j]
+        y = y if y > 0.0 else 0.0
+        for k in range(3):
+            impulse[k] = (y - e.impulse[j]) * e.normal[3 * c + k]
+        e.impulse[j] = y
+        push_bodies(e.dv, e.contact_body[2 * c], e.contact_body[2 * c + 1], e.inv_mass, e.inv_inertia,
+                    e.arm_a + 3 * c, e.arm_b + 3 * c, impulse, NULL)
+
+
+cdef inline int32_t drift_relaxed(engine_t* e) noexcept nogil:
+    """Poses over h by v* + shift, velocities v* + dv; a turning body keeps the momentum of the latter.
+
+    Returns the first body whose state is not finite, or -1.
+    """
+    cdef int32_t i, k, b, lost = -1
+    cdef double h = e.setting[S_H], total
+    cdef double r[9]
+    cdef double moving[6]
+    cdef double momentum[3]
+    cdef double* v
+    cdef double* x
+    cdef double* q
+    for i in range(e.size[N_DYNAMIC]):
+        b = e.body_of[i]
+        v = e.v + 6 * b
+        x = e.x + 3 * b
+        q = e.q + 4 * b
+        for k in range(6):
+            moving[k] = e.v_free[6 * i + k] + e.shift[6 * i + k]
+            v[k] = e.v_free[6 * i + k] + e.dv[6 * i + k]
+        for k in range(3):
+            x[k] += h * moving[k]
+        if e.uneven[b]:
+            rotation(q, r)
+            world_times(r, e.inertia + 9 * b, v + 3, momentum)
+            drift_rotation(q, moving + 3, e.inertia + 9 * b, e.inv_inertia_body + 9 * b, h)
+            rotation(q, r)
+            world_times(r, e.inv_inertia_body + 9 * b, momentum, v + 3)
+        elif moving[3] != 0.0 or moving[4] != 0.0 or moving[5] != 0.0:
+            turn(q, moving + 3, h)
+        total = 0.0
+        for k in range(6):
+            total += v[k] - v[k]
+        for k in range(3):
+            total += x[k] - x[k]
+        for k in range(4):
+            total += q[k] - q[k]
+        if total != 0.0 and lost < 0:
+            lost = b
+    return lost
