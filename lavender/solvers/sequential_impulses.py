@@ -48,7 +48,7 @@ class ImpulseState(SweepState):
             laid = replace(order, blocks=np.arange(problem.n_blocks, dtype=np.int32))
             super().__init__(problem, self.layout.data, laid)
             self.plan = order
-        packs = order.is_fixed and serial.may_pack(self.data, self.order.blocks)
+        packs = order.is_fixed and serial.may_pack(self.data)
         self.packing = serial.Packing(self.data, packing) if packs else None
 
     @property

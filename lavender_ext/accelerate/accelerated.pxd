@@ -30,9 +30,8 @@ cdef struct sweep_data_t:
     double* control             # (CONTROL) of accelerate/mixing.pxd
     double* gram                # (MAX_MEMORY, MAX_MEMORY)
     double* work                # nncg 3 (m + nv); anderson (4 + 2 memory) m
-    const packed_t* packed      # contacts of rows in pairs, level by level, where not exact; else NULL
+    const packed_t* packed      # blocks of rows in pairs, level by level, where not exact; else NULL
     int32_t backwards           # the order is turned round since they were packed
-    double* padded              # (m + BEHIND) with them
 
 
 cdef void anderson_step(void* context, double* lam, int32_t first_sweep, int32_t n) noexcept nogil

@@ -29,8 +29,8 @@ from lavender_ext.core.rows cimport relax_rows_block
 from lavender_ext.core.velocity cimport rows_velocity
 from lavender_ext.judge.watch cimport CONVERGED, RUNNING, Watch
 from lavender_ext.local.gauss_seidel cimport solve_csr_block, solve_general_block, solve_rows_block
-from lavender_ext.sweep.levels cimport BEHIND, pack_levels, set_behind, sweep_levels
-from lavender_ext.sweep.packed cimport ROOM_BODY, ROOM_CONTACT, ROOM_MORE, packed_t, packs
+from lavender_ext.sweep.levels cimport sweep_levels
+from lavender_ext.sweep.packed cimport pack_order, packed_t, room_of
 from lavender_ext.sweep.pgs cimport relax_csr_block, relax_general_block
 
 cdef enum:
@@ -67,7 +67,7 @@ cdef inline void sweep(sweep_data_t* c, double* lam, int32_t first) noexcept nog
                     i = c.order[q]
                     solve_csr_block(p, c.csr, i, c.g + c.start[i], lam)
         elif c.packed != NULL and not exact:
-            sweep_levels(p, c.rows, c.order, c.packed, c.backwards, lam, c.v)
+            sweep_levels(p, c.rows, c.packed, c.backwards, lam, c.v)
         elif not exact:
             for q in range(p.n_blocks):
                 relax_rows_block(p, c.rows, c.order[q], lam, c.v)
@@ -75,24 +75,6 @@ cdef inline void sweep(sweep_data_t* c, double* lam, int32_t first) noexcept nog
             for q in range(p.n_blocks):
                 i = c.order[q]
                 solve_rows_block(p, c.rows, i, c.g + c.start[i], lam, c.v)
-
-
-cdef inline double* swept(const sweep_data_t* c, double* lam) noexcept nogil:
-    """Where sweeps have their impulse: lam (m), or a copy of it with those of nobody behind."""
-    cdef int32_t i
-    if c.packed == NULL:
-        return lam
-    for i in range(c.blocks.n_rows):
-        c.padded[i] = lam[i]
-    set_behind(c.padded, c.blocks.n_rows)
-    return c.padded
-
-
-cdef inline void show(const sweep_data_t* c, const double* y, double* lam) noexcept nogil:
-    cdef int32_t i
-    if y != lam:
-        for i in range(c.blocks.n_rows):
-            lam[i] = y[i]
 
 
 cdef inline void form_velocity(const sweep_data_t* c, const double* lam) noexcept nogil:
@@ -183,25 +165,24 @@ cdef public void lav_nncg(sweep_data_t* c, double* lam, int32_t first_sweep, int
     cdef double* x = c.work                             # x, then g; behind lam's part that of v
     cdef double* q = c.work + m + c.nv                  # beta p, to be added
     cdef double* p = q + m + c.nv
-    cdef double* y = swept(c, lam)
     cdef double* control = c.control
     cdef const double* d = c.blocks.d
     cdef double norm, beta = 0.0
     for s in range(n):
         if c.turn > 0 and c.turn % REFRESH == 0:
-            form_velocity(c, y)
+            form_velocity(c, lam)
         if s > 0:
-            follow(y, x, p, beta, m)
+            follow(lam, x, p, beta, m)
             follow(c.v, x + m, p + m, beta, c.nv)
         else:
             for i in range(m):
-                y[i] += q[i]
-                x[i] = y[i]
+                lam[i] += q[i]
+                x[i] = lam[i]
             for i in range(c.nv):
                 c.v[i] += q[m + i]
                 x[m + i] = c.v[i]
-        sweep(c, y, first_sweep and s == 0)
-        norm = step_energy(d, x, y, m)
+        sweep(c, lam, first_sweep and s == 0)
+        norm = step_energy(d, x, lam, m)
         for i in range(c.nv):
             x[m + i] -= c.v[i]
         beta = norm / control[NORM] if control[NORM] > 0.0 else 0.0
@@ -219,7 +200,6 @@ cdef public void lav_nncg(sweep_data_t* c, double* lam, int32_t first_sweep, int
         for i in range(m + c.nv):
             q[i] = beta * p[i]
             p[i] = q[i] - x[i]
-    show(c, y, lam)
 
 
 cdef public void lav_anderson(sweep_data_t* c, double* lam, int32_t first_sweep, int32_t n) noexcept nogil:
@@ -227,7 +207,6 @@ cdef public void lav_anderson(sweep_data_t* c, double* lam, int32_t first_sweep,
     cdef int32_t m = c.blocks.n_rows, i, s, mixed
     cdef double* x = c.work                             # x, later f
     cdef const double* d = c.blocks.d
-    cdef double* y = swept(c, lam)
     cdef double* root                                   # (m) square roots of d
     cdef mixing_t mixing
     mixing.m = m
@@ -243,22 +222,21 @@ cdef public void lav_anderson(sweep_data_t* c, double* lam, int32_t first_sweep,
         for i in range(m):
             root[i] = sqrt(d[i])
     for s in range(n):
-        mixed = mix(&mixing, y)
+        mixed = mix(&mixing, lam)
         if mixed:
             for i in range(c.blocks.n_blocks):
-                project_block(c.blocks, i, y)
-            form_velocity(c, y)
+                project_block(c.blocks, i, lam)
+            form_velocity(c, lam)
         for i in range(m):
-            x[i] = y[i]
-        sweep(c, y, first_sweep and s == 0)
+            x[i] = lam[i]
+        sweep(c, lam, first_sweep and s == 0)
         for i in range(m):
-            x[i] = root[i] * (y[i] - x[i])
-        if not take(&mixing, mixed, y, x):
-            form_velocity(c, y)
+            x[i] = root[i] * (lam[i] - x[i])
+        if not take(&mixing, mixed, lam, x):
+            form_velocity(c, lam)
         c.turn += 1
         if c.turn == c.convex:
             forget(&mixing)                             # another map
-    show(c, y, lam)
 
 
 cdef void nncg_step(void* context, double* lam, int32_t first_sweep, int32_t n) noexcept nogil:
@@ -270,13 +248,12 @@ cdef void anderson_step(void* context, double* lam, int32_t first_sweep, int32_t
 
 
 cdef enum:
-    FEWEST = 24                 # contacts: below, a sweep costs less than to look for pairs
+    FEWEST = 24                 # blocks: below, a sweep costs less than to look for pairs
     FIRST = 16                  # sweeps of a run that packs, with all before: packing costs two to four
-    LEAST_WIDTH = 2             # contacts of a level on average: fewer, and pairs would stand half empty
 
 
 cdef class Pairs:
-    """Contacts of rows in pairs, level by level, for accelerated sweeps in a fixed order; made once these are many.
+    """Blocks of rows in pairs, level by level, for accelerated sweeps in a fixed order; made once these are many.
 
     wanted : without it none are made, and the bits are the same.
     """
@@ -289,18 +266,17 @@ cdef class Pairs:
         self.asked = not wanted
 
     cdef void make(self, Data p, const int32_t[::1] order, int split, int mode, const double* lam):
-        cdef Py_ssize_t c = p.rows.n_contacts
         cdef double[::1] room
         self.asked = True
         self.backwards = 0
-        if mode == RANDOM or not p.factored or c < FEWEST or split != p.rows.n_joints or not packs(&p.blocks, &p.rows):
+        if mode == RANDOM or not p.factored or p.blocks.n_blocks < FEWEST or split != p.rows.n_joints:
             return
-        self.keep = room = np.empty(ROOM_CONTACT * c + ROOM_BODY * p.rows.n_bodies + ROOM_MORE + p.blocks.n_rows + BEHIND)
-        self.ready = pack_levels(&p.blocks, &p.rows, &order[0], LEAST_WIDTH, &room[0], lam, &self.packed)
+        self.keep = room = np.empty(room_of(&p.blocks, &p.rows))
+        self.ready = pack_order(&p.blocks, &p.rows, &order[0], 1, &room[0], lam, &self.packed)
 
     @property
     def count(self):
-        """Pairs; 0 where contacts are swept one after the other."""
+        """Pairs; 0 where blocks are swept one after the other."""
         return self.packed.pairs if self.ready else 0
 
 
@@ -354,12 +330,10 @@ def run(Data p, Watch watch, double[::1] lam, int n, double tol, int memory, pre
     c.v = &v[0, 0]
     c.nv = p.general.n if p.is_general else 6 * p.rows.n_bodies if p.factored else 0
     c.packed = NULL
-    c.padded = NULL
     if not exact and not pairs.asked and c.turn + <int64_t>n >= FIRST:
         pairs.make(p, order, split, mode, &lam[0])
     if pairs.ready:
         c.packed = &pairs.packed
-        c.padded = pairs.packed.behind
     c.backwards = pairs.backwards
     c.control = &control[0]
     c.gram = &gram[0]

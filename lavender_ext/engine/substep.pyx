@@ -36,7 +36,7 @@ from lavender_ext.engine.projection cimport normal_speed, project_positions
 from lavender_ext.engine.view cimport view
 from lavender_ext.judge.measure cimport rows_slack
 from lavender_ext.judge.score cimport score_rows, score_t
-from lavender_ext.sweep.packed cimport MOST, ROOM_BODY, ROOM_CONTACT, ROOM_MORE, packs, sweep_packed
+from lavender_ext.sweep.packed cimport MOST, room_for, sweep_packed
 
 
 cdef int32_t prepare(engine_t* e) noexcept nogil:
@@ -127,7 +127,6 @@ cdef void sweep_all(engine_t* e, const blocks_t* p, const rows_t* r, double* cur
     """The budgeted sweeps: joints, then contacts; curve (sweeps + 1, 2) or NULL."""
     cdef int32_t s, i, kj = r.n_joints, k = p.n_blocks, mode
     cdef uint64_t rng
-    order_blocks(e)
     mode = SYMMETRIC if e.head[H_ORDER] == SYMMETRICALLY else (RANDOM if e.head[H_ORDER] == AT_RANDOM else 0)
     # every substep has its own stream, a function of seed and substep alone
     rng = ((<uint64_t>(<int64_t>e.head[H_SEED])) << 32) ^ (<uint64_t>(<int64_t>e.head[H_STEP]))
@@ -143,12 +142,10 @@ cdef void sweep_all(engine_t* e, const blocks_t* p, const rows_t* r, double* cur
 
 
 cdef inline int32_t sweep_fast(engine_t* e, const blocks_t* p, const rows_t* r, double* room) noexcept nogil:
-    # the same bits by packed contacts; 0 where the scene has other blocks, or an order that changes
-    if e.head[H_ORDER] == SYMMETRICALLY or e.head[H_ORDER] == AT_RANDOM or not packs(p, r):
+    # the same bits by packed blocks; 0 where these are few, or the order changes
+    if e.head[H_ORDER] == SYMMETRICALLY or e.head[H_ORDER] == AT_RANDOM:
         return 0
-    order_blocks(e)
-    sweep_packed(p, r, e.order, e.head[H_ITERATIONS], room, e.impulse, e.dv)
-    return 1
+    return sweep_packed(p, r, e.order, e.head[H_ITERATIONS], room, e.impulse, e.dv)
 
 
 cdef inline void solve(engine_t* e, int32_t sweeps, double* room, double* curve, double* scratch) noexcept nogil:
@@ -161,6 +158,7 @@ cdef inline void solve(engine_t* e, int32_t sweeps, double* room, double* curve,
     if curve != NULL:
         note_sweep(e, &p, &r, curve, scratch)
     if sweeps:
+        order_blocks(e)
         if room == NULL or not sweep_fast(e, &p, &r, room):
             sweep_all(e, &p, &r, curve, scratch)
         measure(e, out + 5, out + 7)
@@ -301,7 +299,7 @@ cdef public int32_t lav_engine_substeps(const int32_t* size, double* real, int32
 
 cdef public int32_t lav_engine_substeps_packed(const int32_t* size, double* real, int32_t* index, uint64_t* keys,
                                                int32_t n_substeps, double* room, int32_t* done) noexcept nogil:
-    """The same bits in less time, with room for packed contacts, as sweep_packed asks."""
+    """The same bits in less time, with room for packed blocks, `room_for` the capacities."""
     return substeps(size, real, index, keys, n_substeps, room, done)
 
 
@@ -324,8 +322,9 @@ cdef class Buffers:
         self.real = real
         self.index = index
         self.keys = keys
-        self.room = np.empty(ROOM_CONTACT * min(<int64_t>size[CAP_CONTACT], MOST)
-                             + ROOM_BODY * <int64_t>size[N_DYNAMIC] + ROOM_MORE)
+        cdef int64_t contacts = min(<int64_t>size[CAP_CONTACT], MOST), joints = size[N_JOINT]
+        self.room = np.empty(room_for(joints, size[N_JOINT_ROW], contacts, contacts * size[ROWS_PER_CONTACT],
+                                      size[N_DYNAMIC]) if joints <= MOST else 1)
         self.kept_real, self.kept_index, self.kept_keys = np.empty(1), np.empty(N_HEAD, np.int32), np.empty(1, np.uint64)
 
     def pairs(self):

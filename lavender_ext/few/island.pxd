@@ -293,7 +293,6 @@ cdef inline double sweep(const view_t* t, int32_t kind, const asked_t* k, const 
     c.convex = 0
     c.keeps = 0
     c.packed = NULL
-    c.padded = NULL
     c.backwards = 0
     c.turn = 0
     c.cone = t.p

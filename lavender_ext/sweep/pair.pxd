@@ -10,17 +10,35 @@ cdef extern from *:
     #define LAVENDER_PAIR
     #if defined(__GNUC__) && !defined(LAVENDER_ONE_LANE)
     #define LAVENDER_LANES 2
+    #define lavender_both(x) ((lavender_pair){(x), (x)})
     typedef double lavender_pair __attribute__((vector_size(16)));
     typedef long long lavender_pair_bits __attribute__((vector_size(16)));
     static inline lavender_pair lavender_gather(const double* x, const double* y) {
         return (lavender_pair){*x, *y};
     }
+    typedef double lavender_two __attribute__((vector_size(16), aligned(8)));
+    static inline void lavender_gather_two(const double* x, const double* y, lavender_pair* z) {
+        const lavender_two a = *(const lavender_two*)x, b = *(const lavender_two*)y;
+        z[0] = (lavender_pair){a[0], b[0]};
+        z[1] = (lavender_pair){a[1], b[1]};
+    }
     static inline void lavender_scatter(double* x, double* y, lavender_pair z) {
         *x = z[0];
         *y = z[1];
     }
+    static inline void lavender_scatter_two(double* x, double* y, lavender_pair z0, lavender_pair z1) {
+        *(lavender_two*)x = (lavender_two){z0[0], z1[0]};
+        *(lavender_two*)y = (lavender_two){z0[1], z1[1]};
+    }
     static inline lavender_pair lavender_not_below_zero(lavender_pair y) {
         return (lavender_pair)(~(lavender_pair_bits)(y < (lavender_pair){0.0, 0.0}) & (lavender_pair_bits)y);
+    }
+    static inline lavender_pair lavender_select(lavender_pair_bits m, lavender_pair x, lavender_pair y) {
+        return (lavender_pair)((m & (lavender_pair_bits)x) | (~m & (lavender_pair_bits)y));
+    }
+    static inline lavender_pair lavender_clip(lavender_pair x, lavender_pair low, lavender_pair high) {
+        return lavender_select((lavender_pair_bits)(x < low), low,
+                               lavender_select((lavender_pair_bits)(x > high), high, x));
     }
     static inline int lavender_all_within(lavender_pair s, lavender_pair bound) {
         lavender_pair low = {1e-280, 1e-280}, high = {1e280, 1e280};
@@ -30,10 +48,24 @@ cdef extern from *:
     }
     #else
     #define LAVENDER_LANES 1
+    #define lavender_both(x) (x)
     typedef double lavender_pair;
     static inline lavender_pair lavender_gather(const double* x, const double* y) { (void)y; return *x; }
+    static inline void lavender_gather_two(const double* x, const double* y, lavender_pair* z) {
+        (void)y;
+        z[0] = x[0];
+        z[1] = x[1];
+    }
     static inline void lavender_scatter(double* x, double* y, lavender_pair z) { (void)y; *x = z; }
+    static inline void lavender_scatter_two(double* x, double* y, lavender_pair z0, lavender_pair z1) {
+        (void)y;
+        x[0] = z0;
+        x[1] = z1;
+    }
     static inline lavender_pair lavender_not_below_zero(lavender_pair y) { return y < 0.0 ? 0.0 : y; }
+    static inline lavender_pair lavender_clip(lavender_pair x, lavender_pair low, lavender_pair high) {
+        return x < low ? low : x > high ? high : x;
+    }
     static inline int lavender_all_within(lavender_pair s, lavender_pair bound) {
         return s > 1e-280 && s < 1e280 && !(s > bound);
     }
@@ -42,9 +74,15 @@ cdef extern from *:
     """
     int LANES "LAVENDER_LANES"
     ctypedef double pair_t "lavender_pair"
+    pair_t both "lavender_both"(double x) noexcept nogil
     # (x, y), and back; the first alone where there is one lane
     pair_t gather "lavender_gather"(const double* x, const double* y) noexcept nogil
     void scatter "lavender_scatter"(double* x, double* y, pair_t z) noexcept nogil
+    # (x[0], y[0]) and (x[1], y[1]) into z (2), and back
+    void gather_two "lavender_gather_two"(const double* x, const double* y, pair_t* z) noexcept nogil
+    void scatter_two "lavender_scatter_two"(double* x, double* y, pair_t z0, pair_t z1) noexcept nogil
+    # `clip` of core/block.pxd in each lane
+    pair_t clip_pair "lavender_clip"(pair_t x, pair_t low, pair_t high) noexcept nogil
     # y, or 0 where y < 0
     pair_t not_below_zero "lavender_not_below_zero"(pair_t y) noexcept nogil
     # 1 where both lanes of s are in (1e-280, 1e280) and not above those of bound

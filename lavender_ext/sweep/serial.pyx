@@ -20,8 +20,7 @@ from lavender_ext.core.order cimport advance_order
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.rows cimport relax_rows_block, rows_t
 from lavender_ext.judge.watch cimport CONVERGED, RUNNING, Watch, sweep_t
-from lavender_ext.sweep.packed cimport (ROOM_BODY, ROOM_CONTACT, ROOM_MORE, pack_order, packed_t, packs,
-                                        put_impulses, sweep_records, take_impulses)
+from lavender_ext.sweep.packed cimport MOST, move_impulses, pack_order, packed_t, room_of, sweep_records
 from lavender_ext.sweep.pgs cimport relax_csr_block, relax_general_block
 
 
@@ -106,12 +105,10 @@ cdef public void lav_impulse_sweeps(const blocks_t* p, const rows_t* r, double* 
 
 
 cdef enum:
-    WIDTH = 6                   # contacts of a slot: pairs enough to hide how long one takes
-    FEWEST = 24                 # contacts: below, calls cost more than sweeps
+    FEWEST = 24                 # blocks: below, calls cost more than sweeps
     FIRST = 8                   # sweeps of the run that packs: packing costs two to four
-    FIRST_FAR = 16              # from FAR contacts, whose records leave the second-level cache
+    FIRST_FAR = 16              # from FAR blocks, whose records leave the second-level cache
     FAR = 4000
-    LEAST_WIDTH = 2             # fewer on average, and pairs would stand half empty
 
 
 cdef enum:                      # of a packing
@@ -120,7 +117,7 @@ cdef enum:                      # of a packing
     USELESS = 2
 
 
-cdef struct packing_t:          # contacts in pairs, made at the first run of sweeps that is long enough
+cdef struct packing_t:          # blocks in pairs, made at the first run of sweeps that is long enough
     packed_t packed
     double* room
     int32_t status
@@ -129,15 +126,15 @@ cdef struct packing_t:          # contacts in pairs, made at the first run of sw
 
 cdef inline int32_t impulse_sweeps_packed(const blocks_t* p, const rows_t* r, double* lam, double* v, const int32_t* order,
                                           packing_t* x, int32_t n) noexcept nogil:
-    """n sweeps of (2) with the same bits, or 0 and none where one contact after the other is faster; order (k) has
-    joints first; v (n_bodies + 2, 6), behind the last body zeros."""
+    """n sweeps of (2) with the same bits, or 0 and none where one block after the other is faster; v (n_bodies + 2, 6),
+    behind the last body zeros."""
     if x.status == NOT_YET and n >= x.first:
-        x.status = READY if pack_order(p, r, order, WIDTH, LEAST_WIDTH, x.room, lam, &x.packed) else USELESS
+        x.status = READY if pack_order(p, r, order, 0, x.room, lam, &x.packed) else USELESS
     if x.status != READY or n < x.packed.stages:
         return 0
-    put_impulses(p, r, order, &x.packed, lam)
-    sweep_records(p, r, order, &x.packed, n, lam, v)
-    take_impulses(p, r, order, &x.packed, lam)
+    move_impulses(p, order, &x.packed, 0, lam)
+    sweep_records(p, r, &x.packed, n, lam, v)
+    move_impulses(p, order, &x.packed, 1, lam)
     return 1
 
 
@@ -152,7 +149,7 @@ cdef struct context_t:          # what a sweep needs besides lam
     int32_t split
     int32_t mode
     uint64_t* rng
-    packing_t* packing          # NULL: one contact after the other
+    packing_t* packing          # NULL: one block after the other
 
 
 cdef void pgs_step(void* context, double* lam, int32_t first_sweep, int32_t n) noexcept nogil:
@@ -186,7 +183,7 @@ PGS, SOR, JACOBI, IMPULSES = range(4)
 
 
 cdef class Packing:
-    """Contacts of `p` in pairs, for sequential impulses in one fixed order with joints first.
+    """Blocks of `p` in pairs, for sequential impulses in one fixed order.
 
     Made at the first run of sweeps that is long enough; `before`, of another problem, hands over its room.
     """
@@ -194,8 +191,7 @@ cdef class Packing:
     cdef object keep
 
     def __init__(self, Data p, Packing before=None):
-        cdef int64_t size = (ROOM_CONTACT * <int64_t>p.rows.n_contacts + ROOM_BODY * <int64_t>p.rows.n_bodies
-                             + ROOM_MORE)
+        cdef int64_t size = room_of(&p.blocks, &p.rows)
         cdef double[::1] room
         self.keep = None
         if before is not None:
@@ -205,7 +201,7 @@ cdef class Packing:
             self.keep = np.empty(size)
         room = self.keep
         self.state.room = &room[0]
-        self.state.first = FIRST if p.rows.n_contacts < FAR else FIRST_FAR
+        self.state.first = FIRST if p.blocks.n_blocks < FAR else FIRST_FAR
         self.state.status = NOT_YET
 
     @property
@@ -216,15 +212,9 @@ cdef class Packing:
         return self.state.packed.pairs, self.state.packed.stages
 
 
-def may_pack(Data p, const int32_t[::1] order):
-    """Whether contacts have two tangents and no spin alone, behind the joints, and are as many as gain by packing."""
-    cdef int32_t i
-    if not p.factored or p.rows.n_contacts < FEWEST:
-        return False
-    for i in range(p.rows.n_joints):
-        if order[i] >= p.rows.n_joints:
-            return False
-    return packs(&p.blocks, &p.rows) != 0
+def may_pack(Data p):
+    """Whether there are as many blocks over bodies as gain by packing."""
+    return bool(p.factored and FEWEST <= p.blocks.n_blocks <= MOST)
 
 
 def run(int kind, Data p, Watch watch, double[::1] lam, int n, double tol, int32_t[::1] order, int split, int mode,

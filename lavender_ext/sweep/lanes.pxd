@@ -1,0 +1,313 @@
+"""Two blocks of one kind at once, one in each lane: the update of core/rows.pxd, operation by operation.
+
+A kind is what a compiler or a branch must know: a contact's rows (a normal; with two tangents; and spin), or a joint's
+number of rows and which of its bodies move. The scalar update stays the truth; a block of another kind, or of more
+rows, has the kind ALONE and is updated by it.
+
+A record holds what an update reads, in pairs, one entry for each lane:
+
+    header      places of both bodies in v, where read, where written; a number of its owner's; kind and size
+    impulses    n
+    contact     normal 3, arms 3 and 3, inverse masses 2; of each row compliance, b, step, swing 6;
+                with tangents t1 3, t2 3, mu, A_t1n, A_t2n; with spin mu r, A_sn, A_st1, A_st2
+    joint       of each row compliance, b, step, lower, upper, J 12, M^-1 J^T 12
+
+Where a block has no partner both lanes hold it, and what the second computes is written where nobody reads.
+"""
+from libc.stdint cimport int32_t, int64_t
+
+from lavender_ext.core.block cimport CONTACT, CONTACT_SPIN, blocks_t, relax_tangents
+from lavender_ext.core.rows cimport cross, relax_rows_block, rows_t
+from lavender_ext.sweep.pair cimport (LANES, all_within, both, clip_pair, gather, gather_two, not_below_zero, pair_t,
+                                      scatter_two)
+
+
+cdef enum:                      # kinds
+    ALONE = 0
+    NORMAL = 1
+    DISK = 3
+    SPIN = 4
+    JOINT = 5                   # + 4 (rows - 1) + 2 where a moves + 1 where b does
+    MOST_ROWS = 6
+    KINDS = 29
+
+cdef enum:                      # int64 in the header, one of each lane
+    P_READ = 0                  # a, b; of a block alone its number
+    P_WRITE = 2                 # a, b
+    P_OWN = 4
+    P_CODE = 5                  # kind + 2^8 size + 2^32 size of the record before, in pairs
+
+cdef enum:                      # pairs
+    HEADER = 6
+    C_NORMAL = 0                # behind the impulses of a contact
+    C_ARM_A = 3
+    C_ARM_B = 6
+    C_MASS = 9
+    C_ROW = 11                  # compliance, b, step, swing
+    C_ROW_SIZE = 9
+    T_MU = 6                    # behind the rows
+    T_COUPLING = 7
+    T_SIZE = 9
+    S_SIZE = 4
+    J_ROW_SIZE = 29
+
+
+cdef inline int32_t kind_of(const blocks_t* p, const rows_t* r, int32_t i) noexcept nogil:
+    cdef int32_t n = p.ptr[i + 1] - p.ptr[i]
+    if i < r.n_joints:
+        if n > MOST_ROWS:
+            return ALONE
+        return JOINT + 4 * (n - 1) + 2 * (r.joint_body[2 * i] >= 0) + (r.joint_body[2 * i + 1] >= 0)
+    if p.kind[i] == CONTACT and (n == NORMAL or n == DISK) or p.kind[i] == CONTACT_SPIN and n == SPIN:
+        return n
+    return ALONE
+
+
+cdef inline int32_t rows_of(int32_t kind) noexcept nogil:
+    # impulses in a record; a block alone has its own where they were
+    return kind if kind < JOINT else 1 + (kind - JOINT) // 4
+
+
+cdef inline int32_t record_size(int32_t kind) noexcept nogil:
+    cdef int32_t n = rows_of(kind)
+    if kind >= JOINT:
+        return HEADER + (1 + J_ROW_SIZE) * n
+    return HEADER + (0 if kind == ALONE else n + C_ROW + C_ROW_SIZE * n
+                     + (T_SIZE if n > 1 else 0) + (S_SIZE if n == SPIN else 0))
+
+
+cdef inline const int32_t* bodies_of(const rows_t* r, int32_t i) noexcept nogil:
+    return r.joint_body + 2 * i if i < r.n_joints else r.contact_body + 2 * (i - r.n_joints)
+
+
+cdef inline void put(pair_t* out, int32_t n, const double* x, const double* y) noexcept nogil:
+    cdef int32_t k
+    for k in range(n):
+        out[k] = gather(x + k, y + k)
+
+
+cdef inline void pack_contact(const blocks_t* p, const rows_t* r, int32_t i, int32_t j, int32_t n,
+                              pair_t* out) noexcept nogil:
+    # out is behind the impulses
+    cdef int32_t c = i - r.n_joints, d = j - r.n_joints, e = p.ptr[i], f = p.ptr[j], first = p.ptr[r.n_joints], k
+    cdef const int32_t* x = r.contact_body + 2 * c
+    cdef const int32_t* y = r.contact_body + 2 * d
+    cdef double t2[6]
+    cdef double m[2]
+    put(out + C_NORMAL, 3, r.normal + 3 * c, r.normal + 3 * d)
+    put(out + C_ARM_A, 3, r.arm_a + 3 * c, r.arm_a + 3 * d)
+    put(out + C_ARM_B, 3, r.arm_b + 3 * c, r.arm_b + 3 * d)
+    for k in range(2):
+        m[0] = r.inv_mass[x[k]] if x[k] >= 0 else 0.0
+        m[1] = r.inv_mass[y[k]] if y[k] >= 0 else 0.0
+        out[C_MASS + k] = gather(m, m + 1)
+    out += C_ROW
+    for k in range(n):
+        out[0] = gather(r.compliance + e + k, r.compliance + f + k)
+        out[1] = gather(p.b + e + k, p.b + f + k)
+        out[2] = gather(p.step + e + k, p.step + f + k)
+        put(out + 3, 6, r.swing + 6 * (e - first + k), r.swing + 6 * (f - first + k))
+        out += C_ROW_SIZE
+    if n == NORMAL:
+        return
+    put(out, 3, r.tangent + 3 * c, r.tangent + 3 * d)
+    cross(r.normal + 3 * c, r.tangent + 3 * c, t2)
+    cross(r.normal + 3 * d, r.tangent + 3 * d, t2 + 3)
+    put(out + 3, 3, t2, t2 + 3)
+    out[T_MU] = gather(p.mu + i, p.mu + j)
+    put(out + T_COUPLING, 2, r.coupling + 5 * c, r.coupling + 5 * d)
+    if n == SPIN:
+        m[0] = p.mu[i] * p.patch_radius[i]
+        m[1] = p.mu[j] * p.patch_radius[j]
+        out[T_SIZE] = gather(m, m + 1)
+        put(out + T_SIZE + 1, 3, r.coupling + 5 * c + 2, r.coupling + 5 * d + 2)
+
+
+cdef inline void pack_joint(const blocks_t* p, const rows_t* r, int32_t i, int32_t j, int32_t n,
+                            pair_t* out) noexcept nogil:
+    cdef int32_t k, e = p.ptr[i], f = p.ptr[j]
+    for k in range(n):
+        out[0] = gather(r.compliance + e, r.compliance + f)
+        out[1] = gather(p.b + e, p.b + f)
+        out[2] = gather(p.step + e, p.step + f)
+        out[3] = gather(p.lower + e, p.lower + f)
+        out[4] = gather(p.upper + e, p.upper + f)
+        put(out + 5, 12, r.jac + 12 * e, r.jac + 12 * f)
+        put(out + 17, 12, r.minv_jac + 12 * e, r.minv_jac + 12 * f)
+        out += J_ROW_SIZE
+        e += 1
+        f += 1
+
+
+cdef inline void pack_blocks(const blocks_t* p, const rows_t* r, int32_t kind, int32_t i, int32_t j, int64_t own_i,
+                             int64_t own_j, const double* lam, pair_t* out) noexcept nogil:
+    """The record of blocks i and j of one kind but for its code; j = i where it stands without a partner."""
+    cdef int64_t* place = <int64_t*>out
+    cdef const int32_t* x
+    cdef int32_t k, l, n = rows_of(kind)
+    place[P_OWN * LANES] = own_i
+    place[P_OWN * LANES + LANES - 1] = own_j if LANES > 1 else own_i
+    if kind == ALONE:
+        place[P_READ] = i
+        return
+    for l in range(LANES):
+        x = bodies_of(r, i if l == 0 else j)
+        for k in range(2):
+            # behind the last body: zeros that are read for a static one, and a place that nobody reads
+            place[(P_READ + k) * LANES + l] = 6 * <int64_t>(x[k] if x[k] >= 0 else r.n_bodies)
+            place[(P_WRITE + k) * LANES + l] = 6 * <int64_t>(x[k] if x[k] >= 0 and (l == 0 or i != j) else r.n_bodies + 1)
+    put(out + HEADER, n, lam + p.ptr[i], lam + p.ptr[j])
+    if kind >= JOINT:
+        pack_joint(p, r, i, j, n, out + HEADER + n)
+    else:
+        pack_contact(p, r, i, j, n, out + HEADER + n)
+
+
+cdef inline void gather_six(const double* v, const int64_t* place, pair_t* out) noexcept nogil:
+    gather_two(v + place[0], v + place[LANES - 1], out)
+    gather_two(v + place[0] + 2, v + place[LANES - 1] + 2, out + 2)
+    gather_two(v + place[0] + 4, v + place[LANES - 1] + 4, out + 4)
+
+
+cdef inline void scatter_six(double* v, const int64_t* place, const pair_t* x) noexcept nogil:
+    scatter_two(v + place[0], v + place[LANES - 1], x[0], x[1])
+    scatter_two(v + place[0] + 2, v + place[LANES - 1] + 2, x[2], x[3])
+    scatter_two(v + place[0] + 4, v + place[LANES - 1] + 4, x[4], x[5])
+
+
+cdef inline pair_t dot_pair(const pair_t* x, const pair_t* y) noexcept nogil:
+    return x[0] * y[0] + x[1] * y[1] + x[2] * y[2]
+
+
+cdef inline void project_tangents(pair_t* x, pair_t radius) noexcept nogil:
+    """(3) of core/block.pxd, the step being taken; lane by lane where one slides."""
+    cdef pair_t square = x[0] * x[0] + x[1] * x[1]
+    cdef double* lane = <double*>x
+    cdef double two[2]
+    cdef double none[2]
+    cdef int32_t l
+    if all_within(square, radius * radius):
+        return
+    for l in range(LANES):
+        two[0] = lane[l]
+        two[1] = lane[LANES + l]
+        none[0] = 0.0
+        none[1] = 0.0
+        relax_tangents(two, none, 0.0, (<double*>&radius)[l], 2)
+        lane[l] = two[0]
+        lane[LANES + l] = two[1]
+
+
+cdef inline void relax_contact_lanes(const pair_t* c, pair_t* lam, double* v, const int64_t* to, int32_t nt,
+                                     int32_t spin) noexcept nogil:
+    """relax_contact of core/rows.pxd for no tangents or two; lam (1 + nt + spin), to: where a and b are written."""
+    cdef const int64_t* place = <const int64_t*>c
+    cdef const pair_t* n = c + HEADER + 1 + nt + spin
+    cdef const pair_t* q = n + C_ARM_A
+    cdef const pair_t* row = n + C_ROW
+    cdef const pair_t* t = row + C_ROW_SIZE * (1 + nt + spin)
+    cdef pair_t a[6]
+    cdef pair_t b[6]
+    cdef pair_t u[3]
+    cdef pair_t turn[3]
+    cdef pair_t x[2]
+    cdef pair_t d0 = both(0.0), d1 = d0, ds = d0, y, z, dn, impulse, swing_a, swing_b
+    cdef int32_t k
+    gather_six(v, place + P_READ * LANES, a)
+    gather_six(v, place + (P_READ + 1) * LANES, b)
+    u[0] = (b[0] + (b[4] * q[5] - b[5] * q[4])) - (a[0] + (a[4] * q[2] - a[5] * q[1]))
+    u[1] = (b[1] + (b[5] * q[3] - b[3] * q[5])) - (a[1] + (a[5] * q[0] - a[3] * q[2]))
+    u[2] = (b[2] + (b[3] * q[4] - b[4] * q[3])) - (a[2] + (a[3] * q[1] - a[4] * q[0]))
+    y = not_below_zero(lam[0] - (dot_pair(n, u) + (row[0] * lam[0] - row[1])) * row[2])
+    dn = y - lam[0]
+    lam[0] = y
+    if nt > 0:
+        row += C_ROW_SIZE
+        d0 = lam[1]
+        x[0] = d0 - ((dot_pair(t, u) + (row[0] * d0 - row[1])) + t[T_COUPLING] * dn) * row[2]
+        z = row[2]                                      # one step for both
+        row += C_ROW_SIZE
+        d1 = lam[2]
+        x[1] = d1 - ((dot_pair(t + 3, u) + (row[0] * d1 - row[1])) + t[T_COUPLING + 1] * dn) * z
+        project_tangents(x, t[T_MU] * y)
+        lam[1] = x[0]
+        lam[2] = x[1]
+        d0 = x[0] - d0
+        d1 = x[1] - d1
+    if spin:
+        row += C_ROW_SIZE
+        for k in range(3):
+            turn[k] = b[3 + k] - a[3 + k]
+        ds = lam[3]
+        z = dot_pair(n, turn) + (row[0] * ds - row[1])
+        z = z + t[T_SIZE + 1] * dn + t[T_SIZE + 2] * d0 + t[T_SIZE + 3] * d1
+        y = t[T_SIZE] * y
+        y = clip_pair(ds - z * row[2], -y, y)
+        lam[3] = y
+        ds = y - ds
+    row = n + C_ROW + 3                                 # swing
+    for k in range(3):
+        impulse = dn * n[k]
+        swing_a = dn * row[k]
+        swing_b = dn * row[3 + k]
+        if nt > 0:
+            impulse = impulse + d0 * t[k] + d1 * t[3 + k]
+            swing_a = swing_a + d0 * row[C_ROW_SIZE + k] + d1 * row[2 * C_ROW_SIZE + k]
+            swing_b = swing_b + d0 * row[C_ROW_SIZE + 3 + k] + d1 * row[2 * C_ROW_SIZE + 3 + k]
+        if spin:
+            swing_a = swing_a + ds * row[3 * C_ROW_SIZE + k]
+            swing_b = swing_b + ds * row[3 * C_ROW_SIZE + 3 + k]
+        a[k] = a[k] - n[C_MASS] * impulse
+        a[3 + k] = a[3 + k] - swing_a
+        b[k] = b[k] + n[C_MASS + 1] * impulse
+        b[3 + k] = b[3 + k] + swing_b
+    scatter_six(v, to, a)
+    scatter_six(v, to + LANES, b)
+
+
+cdef inline void relax_joint_lanes(const pair_t* c, int32_t kind, pair_t* lam, double* v, const int64_t* to) noexcept nogil:
+    """relax_joint of core/rows.pxd."""
+    cdef const int64_t* place = <const int64_t*>c
+    cdef int32_t i, k, n = rows_of(kind), moves_a = (kind - JOINT) & 2, moves_b = (kind - JOINT) & 1
+    cdef const pair_t* row = c + HEADER + n
+    cdef pair_t a[6]
+    cdef pair_t b[6]
+    cdef pair_t s, t, y
+    gather_six(v, place + P_READ * LANES, a)
+    gather_six(v, place + (P_READ + 1) * LANES, b)
+    for i in range(n):
+        s = both(0.0)
+        t = both(0.0)
+        if moves_a:
+            for k in range(6):
+                s = s + row[5 + k] * a[k]
+        if moves_b:
+            for k in range(6):
+                t = t + row[11 + k] * b[k]
+        y = clip_pair(lam[i] - (((s + t) + row[0] * lam[i]) - row[1]) * row[2], row[3], row[4])
+        s = y - lam[i]
+        lam[i] = y
+        if moves_a:
+            for k in range(6):
+                a[k] = a[k] + s * row[17 + k]
+        if moves_b:
+            for k in range(6):
+                b[k] = b[k] + s * row[23 + k]
+        row += J_ROW_SIZE
+    scatter_six(v, to, a)
+    scatter_six(v, to + LANES, b)
+
+
+cdef inline void relax_record(const blocks_t* p, const rows_t* r, const pair_t* c, int32_t kind, pair_t* lam, double* v,
+                              const int64_t* to, double* all_lam) noexcept nogil:
+    """The blocks of a record; lam its impulses, all_lam (m) those of blocks alone, v (n_bodies + 2, 6)."""
+    if kind == DISK:
+        relax_contact_lanes(c, lam, v, to, 2, 0)
+    elif kind == NORMAL:
+        relax_contact_lanes(c, lam, v, to, 0, 0)
+    elif kind == SPIN:
+        relax_contact_lanes(c, lam, v, to, 2, 1)
+    elif kind >= JOINT:
+        relax_joint_lanes(c, kind, lam, v, to)
+    else:
+        relax_rows_block(p, r, <int32_t>(<const int64_t*>c)[P_READ], all_lam, v)
