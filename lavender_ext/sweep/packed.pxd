@@ -34,7 +34,7 @@ cdef enum:                      # doubles of room: records, as every block may s
     SLOTS = 32768               # more than there are slots: level // SLOTS is the stage, the rest the slot
     MOST = 32767                # blocks, below SLOTS; with twice as many records in memory little is gained
     LEAST = 2                   # blocks of a slot: fewer, and pairs would stand half empty
-    WIDTH = 10                  # blocks of a slot: pairs enough to hide how long one takes
+    WIDTH = 6                   # blocks of a slot: pairs enough to hide how long one takes
     ROUNDS = 3                  # of moving late what begins too early
 
 
