@@ -33,7 +33,12 @@ SOLVERS = [("nncg", {}), ("nncg", {"restart": "against"}), ("nncg", {"convex": 2
 )
 def test_pairs_change_no_bit(order, name, options, contacts, joints, tangents, spin):
     problem = random_contact_problem(
-        contacts, tangents=tangents, spin=spin, bodies=(contacts + joints) // 2, joints=joints, contacts=contacts
+        contacts,
+        tangents=tangents,
+        spin=spin,
+        bodies=(contacts + joints) // 2,
+        joints=joints,
+        contacts=contacts,
     )
     if order == "array":
         rng = np.random.default_rng(contacts)

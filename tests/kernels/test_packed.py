@@ -165,7 +165,9 @@ def in_chunks(problem, order, counts, start, *, packs=True):
 
 @pytest.mark.parametrize("order", FIXED)
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize(("contacts", "joints"), [(1, 0), (19, 4), (24, 0), (25, 3), (0, 60), (300, 0), (301, 40), (30, 200)])
+@pytest.mark.parametrize(
+    ("contacts", "joints"), [(1, 0), (19, 4), (24, 0), (25, 3), (0, 60), (300, 0), (301, 40), (30, 200)]
+)
 def test_packed_runs_of_any_length_are_the_plain_ones(order, kind, contacts, joints):
     problem = tangled(contacts, contacts, joints, kind=kind)
     rng = np.random.default_rng(contacts)
@@ -179,7 +181,7 @@ def test_packed_runs_of_any_length_are_the_plain_ones(order, kind, contacts, joi
             assert (packing is not None) == (problem.n_blocks >= 24)
             if packing is not None:
                 pairs, _ = packing.shape
-                if max(counts) < 8 or kind == "one tangent" and contacts > joints:
+                if max(counts) < 8 or (kind == "one tangent" and contacts > joints):
                     assert pairs == 0
                 elif problem.n_blocks > 100:  # else too few may be free of each other
                     assert pairs > 0
