@@ -12,8 +12,8 @@ each lane of a vector, the last of a slot beside one of the next. Pass k visits 
 whose sweep k - floor(level / T) is due. Every block still sees its bodies as in one sweep after another.
 
 Levels may begin anywhere. A body whose first block is early and whose others are late (a joint, swept first, on top of
-a tower) begins later, so that T is near the number of blocks of one body; and parts without a body in common begin one
-behind the other, so that a long one and many short ones fill the same slots.
+a tower) begins later, so that T is near the largest number of blocks of one body. Parts of a scene that share no body
+fill the same slots: none waits for another.
 """
 from libc.stdint cimport int32_t, int64_t, uintptr_t
 
