@@ -2,6 +2,7 @@
 
     python -m benchmarks engine [--sweeps 16] [--scenes stack6,pyramid55] [--out FILE]
     python -m benchmarks engine --detail        what each level of detail of one scene costs
+    python -m benchmarks engine --model         what friction, spin and a joint far away cost, by sweeps
 
 Every engine steps the same bodies (unit boxes, 1 kg; spheres of 0.5 m) with dt = 1/240 s, the same number of
 solver iterations at tolerance 0, warm-started, friction 0.5. After a settling time, the time is the least
@@ -294,6 +295,47 @@ def detail() -> None:
     click.echo(markdown(head, rows))
 
 
+MODELS: dict[str, tuple[dict[str, Any], bool]] = {  # what is declared, and whether a joint hangs far away
+    "no friction": ({"friction": 0.0}, False),
+    "friction": ({}, False),
+    "and spin": ({"patch_radius": 0.05}, False),
+    "and a joint": ({}, True),
+}
+MODEL_SCENES: dict[str, tuple[str, dict[str, Any]]] = {
+    "tower of 6": ("stack", {"n": 6}),
+    "tower of 20": ("stack", {"n": 20}),
+    "pyramid of 55": ("pyramid", {"base": 10}),
+    "pyramid of 210": ("pyramid", {"base": 20}),
+    "pile of 200 spheres": ("pile", {"n": 200}),
+    "pile of 60 boxes": ("pile", {"n": 60, "kind": "boxes"}),
+}
+
+
+def models() -> None:
+    """Towers, pyramids and piles by what they declare: least times of a step, the variants in turns."""
+    rows: list[tuple[Any, ...]] = []
+    chains = {f"chain of {n}": ("chain", {"n": n}) for n in (6, 50)}
+    for label, (name, parameters) in (MODEL_SCENES | chains).items():
+        for sweeps in (4, 16, 64):
+            sims = []
+            for more, joint in MODELS.values() if name != "chain" else [({}, False)]:
+                scene = lv.Scene(name, dt=DT, solver_iterations=sweeps, **parameters, **more)
+                if joint:
+                    far = scene.add_sphere(position=(90.0, 0.0, 5.0))
+                    scene.add_joint("ball", -1, far, anchor=(90.0, 0.0, 7.0))
+                sims.append(lv.Simulation(scene))
+            for sim in sims:
+                for _ in range(240):
+                    sim.step()
+            best = np.full(len(sims), np.inf)
+            for _ in range(20):
+                for i, sim in enumerate(sims):
+                    best[i] = min(best[i], least(sim.step, batches=10))
+            cells = (f"{1e6 * t:.1f} ({int(s._state.head[0])})" for t, s in zip(best, sims, strict=True))
+            rows.append((label, sweeps, *cells, *[""] * (len(MODELS) - len(sims))))
+    click.echo(markdown(("µs a step (contacts)", "sweeps", *MODELS), rows))
+
+
 ENGINES: dict[str, Callable[[str, int], Row]] = {
     "lavender": lavender_row,
     "mujoco": mujoco_row,
@@ -344,10 +386,17 @@ def _words(text: str, known: Any, what: str) -> list[str]:
     is_flag=True,
     help="What each level of detail of one scene costs; LavenderSim alone.",
 )
+@click.option(
+    "--model", is_flag=True, help="What friction, spin and a joint far away cost; LavenderSim alone."
+)
 @click.option("--out", type=click.Path(path_type=Path), default=None, help="JSON of the lines.")
-def command(sweeps: tuple[int, ...], scenes: str, engines: str, levels: bool, out: Path | None) -> None:
+def command(
+    sweeps: tuple[int, ...], scenes: str, engines: str, levels: bool, model: bool, out: Path | None
+) -> None:
     """Cost of an engine's step at steady contact, with what the step leaves behind."""
     folder_of(out)
+    if model:
+        return models()
     if levels:
         return detail()
     names = _words(engines, ENGINES, "engine")

@@ -108,6 +108,10 @@ class Simulation:
         number = k.layout["size"]
         rows = size[number["joint_rows"]] + size[number["rows_per_contact"]] * size[number["cap_contact"]]
         self.scratch = k.alloc(16 * (int(rows) + 1))
+        # for packed blocks, more than is asked for
+        self.room = k.alloc(
+            8 * (64 * (int(rows) + int(size[number["cap_contact"]])) + 32 * int(size.sum()) + 64)
+        )
         lists = list(k.layout["arrays"].values())
         place = k.alloc(4 * sum(map(len, lists)))
         k.call("lav_engine_offsets", *self.buffers, place)
@@ -145,10 +149,13 @@ class Simulation:
         self.allocate(self.k.view(room, SIZES, np.int32).copy())
         self.k.call("lav_engine_move", *old, *self.buffers)
 
-    def step(self):
+    def step(self, packed=False):
         left, status = self.substeps, NEED_ROOM
         while status == NEED_ROOM:
-            status = self.k.call("lav_engine_substeps", *self.buffers, left, self.done)
+            if packed:
+                status = self.k.call("lav_engine_substeps_packed", *self.buffers, left, self.room, self.done)
+            else:
+                status = self.k.call("lav_engine_substeps", *self.buffers, left, self.done)
             left -= int(self.k.view(self.done, 1, np.int32)[0])
             if status == NEED_ROOM:
                 self.grow()

@@ -6,7 +6,7 @@ rows, has the kind ALONE and is updated by it.
 
 A record holds what an update reads, in pairs, one entry for each lane:
 
-    header      places of both bodies in v, where read, where written; a number of its owner's; kind and size
+    header      places of both bodies in v [bytes], where read, where written; a number of its owner's; kind and size
     impulses    n
     contact     normal 3, arms 3 and 3, inverse masses 2; of each row compliance, b, step, swing 6;
                 with tangents t1 3, t2 3, mu, A_t1n, A_t2n; with spin mu r, A_sn, A_st1, A_st2
@@ -18,8 +18,8 @@ from libc.stdint cimport int32_t, int64_t
 
 from lavender_ext.core.block cimport CONTACT, CONTACT_SPIN, blocks_t, relax_tangents
 from lavender_ext.core.rows cimport cross, relax_rows_block, rows_t
-from lavender_ext.sweep.pair cimport (LANES, all_within, both, clip_pair, gather, gather_two, not_below_zero, pair_t,
-                                      scatter_two)
+from lavender_ext.sweep.pair cimport (LANES, all_within, at, both, clip_pair, gather, gather_six, not_below_zero, pair_t,
+                                      scatter_six)
 
 
 cdef enum:                      # kinds
@@ -38,6 +38,7 @@ cdef enum:                      # int64 in the header, one of each lane
     P_CODE = 5                  # kind + 2^8 size + 2^32 size of the record before, in pairs
 
 cdef enum:                      # pairs
+    BODY = 48                   # bytes of a velocity
     HEADER = 6
     C_NORMAL = 0                # behind the impulses of a contact
     C_ARM_A = 3
@@ -50,6 +51,19 @@ cdef enum:                      # pairs
     T_SIZE = 9
     S_SIZE = 4
     J_ROW_SIZE = 29
+
+
+cdef struct normal_t:           # records of contacts: the type says how many rows, so that a compiler knows
+    pair_t header
+cdef struct disk_t:
+    pair_t header
+cdef struct spin_t:
+    pair_t header
+
+ctypedef fused contact_t:
+    normal_t
+    disk_t
+    spin_t
 
 
 cdef inline int32_t kind_of(const blocks_t* p, const rows_t* r, int32_t i) noexcept nogil:
@@ -154,25 +168,13 @@ cdef inline void pack_blocks(const blocks_t* p, const rows_t* r, int32_t kind, i
         x = bodies_of(r, i if l == 0 else j)
         for k in range(2):
             # behind the last body: zeros that are read for a static one, and a place that nobody reads
-            place[(P_READ + k) * LANES + l] = 6 * <int64_t>(x[k] if x[k] >= 0 else r.n_bodies)
-            place[(P_WRITE + k) * LANES + l] = 6 * <int64_t>(x[k] if x[k] >= 0 and (l == 0 or i != j) else r.n_bodies + 1)
+            place[(P_READ + k) * LANES + l] = BODY * <int64_t>(x[k] if x[k] >= 0 else r.n_bodies)
+            place[(P_WRITE + k) * LANES + l] = BODY * <int64_t>(x[k] if x[k] >= 0 and (l == 0 or i != j) else r.n_bodies + 1)
     put(out + HEADER, n, lam + p.ptr[i], lam + p.ptr[j])
     if kind >= JOINT:
         pack_joint(p, r, i, j, n, out + HEADER + n)
     else:
         pack_contact(p, r, i, j, n, out + HEADER + n)
-
-
-cdef inline void gather_six(const double* v, const int64_t* place, pair_t* out) noexcept nogil:
-    gather_two(v + place[0], v + place[LANES - 1], out)
-    gather_two(v + place[0] + 2, v + place[LANES - 1] + 2, out + 2)
-    gather_two(v + place[0] + 4, v + place[LANES - 1] + 4, out + 4)
-
-
-cdef inline void scatter_six(double* v, const int64_t* place, const pair_t* x) noexcept nogil:
-    scatter_two(v + place[0], v + place[LANES - 1], x[0], x[1])
-    scatter_two(v + place[0] + 2, v + place[LANES - 1] + 2, x[2], x[3])
-    scatter_two(v + place[0] + 4, v + place[LANES - 1] + 4, x[4], x[5])
 
 
 cdef inline pair_t dot_pair(const pair_t* x, const pair_t* y) noexcept nogil:
@@ -198,11 +200,11 @@ cdef inline void project_tangents(pair_t* x, pair_t radius) noexcept nogil:
         lane[LANES + l] = two[1]
 
 
-cdef inline void relax_contact_lanes(const pair_t* c, pair_t* lam, double* v, const int64_t* to, int32_t nt,
-                                     int32_t spin) noexcept nogil:
+cdef inline void relax_contact_lanes(const contact_t* c, pair_t* lam, double* v, const int64_t* to) noexcept nogil:
     """relax_contact of core/rows.pxd for no tangents or two; lam (1 + nt + spin), to: where a and b are written."""
+    cdef int32_t nt = 0 if contact_t is normal_t else 2, spin = 1 if contact_t is spin_t else 0
     cdef const int64_t* place = <const int64_t*>c
-    cdef const pair_t* n = c + HEADER + 1 + nt + spin
+    cdef const pair_t* n = <const pair_t*>c + HEADER + 1 + nt + spin
     cdef const pair_t* q = n + C_ARM_A
     cdef const pair_t* row = n + C_ROW
     cdef const pair_t* t = row + C_ROW_SIZE * (1 + nt + spin)
@@ -213,8 +215,8 @@ cdef inline void relax_contact_lanes(const pair_t* c, pair_t* lam, double* v, co
     cdef pair_t x[2]
     cdef pair_t d0 = both(0.0), d1 = d0, ds = d0, y, z, dn, impulse, swing_a, swing_b
     cdef int32_t k
-    gather_six(v, place + P_READ * LANES, a)
-    gather_six(v, place + (P_READ + 1) * LANES, b)
+    gather_six(at(v, place[0]), at(v, place[LANES - 1]), a)
+    gather_six(at(v, place[LANES]), at(v, place[2 * LANES - 1]), b)
     u[0] = (b[0] + (b[4] * q[5] - b[5] * q[4])) - (a[0] + (a[4] * q[2] - a[5] * q[1]))
     u[1] = (b[1] + (b[5] * q[3] - b[3] * q[5])) - (a[1] + (a[5] * q[0] - a[3] * q[2]))
     u[2] = (b[2] + (b[3] * q[4] - b[4] * q[3])) - (a[2] + (a[3] * q[1] - a[4] * q[0]))
@@ -261,8 +263,8 @@ cdef inline void relax_contact_lanes(const pair_t* c, pair_t* lam, double* v, co
         a[3 + k] = a[3 + k] - swing_a
         b[k] = b[k] + n[C_MASS + 1] * impulse
         b[3 + k] = b[3 + k] + swing_b
-    scatter_six(v, to, a)
-    scatter_six(v, to + LANES, b)
+    scatter_six(at(v, to[0]), at(v, to[LANES - 1]), a)
+    scatter_six(at(v, to[LANES]), at(v, to[2 * LANES - 1]), b)
 
 
 cdef inline void relax_joint_lanes(const pair_t* c, int32_t kind, pair_t* lam, double* v, const int64_t* to) noexcept nogil:
@@ -273,8 +275,8 @@ cdef inline void relax_joint_lanes(const pair_t* c, int32_t kind, pair_t* lam, d
     cdef pair_t a[6]
     cdef pair_t b[6]
     cdef pair_t s, t, y
-    gather_six(v, place + P_READ * LANES, a)
-    gather_six(v, place + (P_READ + 1) * LANES, b)
+    gather_six(at(v, place[0]), at(v, place[LANES - 1]), a)
+    gather_six(at(v, place[LANES]), at(v, place[2 * LANES - 1]), b)
     for i in range(n):
         s = both(0.0)
         t = both(0.0)
@@ -294,19 +296,19 @@ cdef inline void relax_joint_lanes(const pair_t* c, int32_t kind, pair_t* lam, d
             for k in range(6):
                 b[k] = b[k] + s * row[23 + k]
         row += J_ROW_SIZE
-    scatter_six(v, to, a)
-    scatter_six(v, to + LANES, b)
+    scatter_six(at(v, to[0]), at(v, to[LANES - 1]), a)
+    scatter_six(at(v, to[LANES]), at(v, to[2 * LANES - 1]), b)
 
 
 cdef inline void relax_record(const blocks_t* p, const rows_t* r, const pair_t* c, int32_t kind, pair_t* lam, double* v,
                               const int64_t* to, double* all_lam) noexcept nogil:
     """The blocks of a record; lam its impulses, all_lam (m) those of blocks alone, v (n_bodies + 2, 6)."""
     if kind == DISK:
-        relax_contact_lanes(c, lam, v, to, 2, 0)
+        relax_contact_lanes(<const disk_t*>c, lam, v, to)
     elif kind == NORMAL:
-        relax_contact_lanes(c, lam, v, to, 0, 0)
+        relax_contact_lanes(<const normal_t*>c, lam, v, to)
     elif kind == SPIN:
-        relax_contact_lanes(c, lam, v, to, 2, 1)
+        relax_contact_lanes(<const spin_t*>c, lam, v, to)
     elif kind >= JOINT:
         relax_joint_lanes(c, kind, lam, v, to)
     else:

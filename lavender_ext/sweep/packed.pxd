@@ -12,14 +12,14 @@ each lane of a vector, the last of a slot beside one of the next. Pass k visits 
 whose sweep k - floor(level / T) is due. Every block still sees its bodies as in one sweep after another.
 
 Levels may begin anywhere. A body whose first block is early and whose others are late (a joint, swept first, on top of
-a tower) begins later, so that T is near the number of blocks of one body; and parts without a body in common begin one
-behind the other, so that a long one and many short ones fill the same slots.
+a tower) begins later, so that T is near the largest number of blocks of one body. Parts of a scene that share no body
+fill the same slots: none waits for another.
 """
 from libc.stdint cimport int32_t, int64_t, uintptr_t
 
 from lavender_ext.core.block cimport blocks_t
 from lavender_ext.core.rows cimport rows_t
-from lavender_ext.sweep.lanes cimport (ALONE, HEADER, KINDS, MOST_ROWS, P_CODE, P_OWN, P_WRITE, bodies_of, kind_of,
+from lavender_ext.sweep.lanes cimport (ALONE, BODY, HEADER, KINDS, MOST_ROWS, P_CODE, P_OWN, P_WRITE, bodies_of, kind_of,
                                        pack_blocks, record_size, relax_record, rows_of)
 from lavender_ext.sweep.pair cimport LANES, pair_t
 
@@ -307,31 +307,37 @@ cdef inline void move_impulses(const blocks_t* p, const int32_t* order, const pa
                 x[LANES * k] = lam[j + k]
 
 
-cdef inline int32_t hold(const pair_t* x, int32_t kind, int32_t pass_, int32_t sweeps, int64_t nowhere, int64_t* to,
-                         double* kept) noexcept nogil:
-    """Which lanes are due, a bit each. For the others: nowhere to write (to), their impulses as they are (kept)."""
-    cdef const int64_t* place = <const int64_t*>x
-    cdef const double* lam = <const double*>(x + HEADER)
-    cdef int32_t k, l, live = 0
+cdef inline int32_t due(const int64_t* place, int32_t pass_, int32_t sweeps) noexcept nogil:
+    # lanes that are, a bit each
+    cdef int32_t l, live = 0
     for l in range(LANES):
-        if 0 <= pass_ - place[P_OWN * LANES + l] < sweeps:
-            live |= 1 << l
-            to[l] = place[P_WRITE * LANES + l]
-            to[LANES + l] = place[(P_WRITE + 1) * LANES + l]
-        else:
-            to[l] = nowhere
-            to[LANES + l] = nowhere
-    for k in range(LANES * rows_of(kind)):
-        kept[k] = lam[k]
+        live |= (0 <= pass_ - place[P_OWN * LANES + l] < sweeps) << l
     return live
+
+
+cdef inline void hold(const pair_t* x, int32_t n, int32_t live, int64_t nowhere, int64_t* to, double* kept) noexcept nogil:
+    """For lanes that are not live: nowhere to write (to), and their impulses as they are (kept)."""
+    cdef const int64_t* place = <const int64_t*>x + P_WRITE * LANES
+    cdef int32_t k
+    for k in range(2 * LANES):
+        to[k] = place[k] if live >> (k % LANES) & 1 else nowhere
+    for k in range(LANES * n):
+        kept[k] = (<const double*>(x + HEADER))[k]
+
+
+cdef inline void let_go(pair_t* x, int32_t n, int32_t live, const double* kept) noexcept nogil:
+    cdef int32_t k
+    for k in range(LANES * n):
+        if not live >> (k % LANES) & 1:
+            (<double*>(x + HEADER))[k] = kept[k]
 
 
 cdef inline void sweep_records(const blocks_t* p, const rows_t* r, const packed_t* packed, int32_t sweeps, double* lam,
                                double* body) noexcept nogil:
     """`sweeps` sweeps over the records, drained at the end; body (n_bodies + 2, 6), behind the last body zeros.
     Impulses stay in the records, but for those of blocks alone."""
-    cdef int32_t k, l, _i, kind, live, draining, stages = packed.stages
-    cdef int64_t code, nowhere = 6 * <int64_t>(r.n_bodies + 1)
+    cdef int32_t k, _i, kind, live, draining, every = (1 << LANES) - 1, stages = packed.stages
+    cdef int64_t code, nowhere = BODY * <int64_t>(r.n_bodies + 1)
     cdef int64_t held[4]
     cdef double kept[2 * MOST_ROWS]
     cdef const int64_t* to
@@ -343,16 +349,13 @@ cdef inline void sweep_records(const blocks_t* p, const rows_t* r, const packed_
             code = (<int64_t*>x)[P_CODE * LANES]
             kind = code & 255
             to = <int64_t*>x + P_WRITE * LANES
-            live = (1 << LANES) - 1
-            if draining:
-                live = hold(x, kind, k, sweeps, nowhere, held, kept)
-                to = held
-            if live != 0:
+            live = due(<int64_t*>x, k, sweeps) if draining else every
+            if live == every:
                 relax_record(p, r, x, kind, x + HEADER, body, to, lam)
-            if live != (1 << LANES) - 1 and kind != ALONE:
-                for l in range(LANES * rows_of(kind)):
-                    if not live >> (l % LANES) & 1:
-                        (<double*>(x + HEADER))[l] = kept[l]
+            elif live:
+                hold(x, rows_of(kind), live, nowhere, held, kept)
+                relax_record(p, r, x, kind, x + HEADER, body, held, lam)
+                let_go(x, rows_of(kind), live, kept)
             x += (code >> 8) & 0xffffff
 
 

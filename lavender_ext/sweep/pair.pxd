@@ -4,10 +4,14 @@ The vector types of gcc and clang; elsewhere (or with LAVENDER_ONE_LANE) a pair 
 Arithmetic is written as on a double.
 """
 
+from libc.stdint cimport int64_t
+
+
 cdef extern from *:
     """
     #ifndef LAVENDER_PAIR
     #define LAVENDER_PAIR
+    #define lavender_at(x, offset) ((double*)((char*)(x) + (offset)))
     #if defined(__GNUC__) && !defined(LAVENDER_ONE_LANE)
     #define LAVENDER_LANES 2
     #define lavender_both(x) ((lavender_pair){(x), (x)})
@@ -17,18 +21,23 @@ cdef extern from *:
         return (lavender_pair){*x, *y};
     }
     typedef double lavender_two __attribute__((vector_size(16), aligned(8)));
-    static inline void lavender_gather_two(const double* x, const double* y, lavender_pair* z) {
-        const lavender_two a = *(const lavender_two*)x, b = *(const lavender_two*)y;
-        z[0] = (lavender_pair){a[0], b[0]};
-        z[1] = (lavender_pair){a[1], b[1]};
+    #define LAVENDER_INLINE static inline __attribute__((always_inline))
+    LAVENDER_INLINE void lavender_gather_six(const double* x, const double* y, lavender_pair* z) {
+        for (int k = 0; k < 6; k += 2) {
+            const lavender_two a = *(const lavender_two*)(x + k), b = *(const lavender_two*)(y + k);
+            z[k] = (lavender_pair){a[0], b[0]};
+            z[k + 1] = (lavender_pair){a[1], b[1]};
+        }
     }
     static inline void lavender_scatter(double* x, double* y, lavender_pair z) {
         *x = z[0];
         *y = z[1];
     }
-    static inline void lavender_scatter_two(double* x, double* y, lavender_pair z0, lavender_pair z1) {
-        *(lavender_two*)x = (lavender_two){z0[0], z1[0]};
-        *(lavender_two*)y = (lavender_two){z0[1], z1[1]};
+    LAVENDER_INLINE void lavender_scatter_six(double* x, double* y, const lavender_pair* z) {
+        for (int k = 0; k < 6; k += 2) {
+            *(lavender_two*)(x + k) = (lavender_two){z[k][0], z[k + 1][0]};
+            *(lavender_two*)(y + k) = (lavender_two){z[k][1], z[k + 1][1]};
+        }
     }
     static inline lavender_pair lavender_not_below_zero(lavender_pair y) {
         return (lavender_pair)(~(lavender_pair_bits)(y < (lavender_pair){0.0, 0.0}) & (lavender_pair_bits)y);
@@ -44,23 +53,21 @@ cdef extern from *:
         lavender_pair low = {1e-280, 1e-280}, high = {1e280, 1e280};
         lavender_pair_bits m = (lavender_pair_bits)(s > low) & (lavender_pair_bits)(s < high)
                                & ~(lavender_pair_bits)(s > bound);
-        return (m[0] & m[1]) != 0;
+        return (m[0] & m[1]) < 0;
     }
     #else
     #define LAVENDER_LANES 1
     #define lavender_both(x) (x)
     typedef double lavender_pair;
     static inline lavender_pair lavender_gather(const double* x, const double* y) { (void)y; return *x; }
-    static inline void lavender_gather_two(const double* x, const double* y, lavender_pair* z) {
+    static inline void lavender_gather_six(const double* x, const double* y, lavender_pair* z) {
         (void)y;
-        z[0] = x[0];
-        z[1] = x[1];
+        for (int k = 0; k < 6; k++) z[k] = x[k];
     }
     static inline void lavender_scatter(double* x, double* y, lavender_pair z) { (void)y; *x = z; }
-    static inline void lavender_scatter_two(double* x, double* y, lavender_pair z0, lavender_pair z1) {
+    static inline void lavender_scatter_six(double* x, double* y, const lavender_pair* z) {
         (void)y;
-        x[0] = z0;
-        x[1] = z1;
+        for (int k = 0; k < 6; k++) x[k] = z[k];
     }
     static inline lavender_pair lavender_not_below_zero(lavender_pair y) { return y < 0.0 ? 0.0 : y; }
     static inline lavender_pair lavender_clip(lavender_pair x, lavender_pair low, lavender_pair high) {
@@ -78,9 +85,10 @@ cdef extern from *:
     # (x, y), and back; the first alone where there is one lane
     pair_t gather "lavender_gather"(const double* x, const double* y) noexcept nogil
     void scatter "lavender_scatter"(double* x, double* y, pair_t z) noexcept nogil
-    # (x[0], y[0]) and (x[1], y[1]) into z (2), and back
-    void gather_two "lavender_gather_two"(const double* x, const double* y, pair_t* z) noexcept nogil
-    void scatter_two "lavender_scatter_two"(double* x, double* y, pair_t z0, pair_t z1) noexcept nogil
+    double* at "lavender_at"(double* x, int64_t bytes) noexcept nogil
+    # (x[k], y[k]) into z (6), and back
+    void gather_six "lavender_gather_six"(const double* x, const double* y, pair_t* z) noexcept nogil
+    void scatter_six "lavender_scatter_six"(double* x, double* y, const pair_t* z) noexcept nogil
     # `clip` of core/block.pxd in each lane
     pair_t clip_pair "lavender_clip"(pair_t x, pair_t low, pair_t high) noexcept nogil
     # y, or 0 where y < 0

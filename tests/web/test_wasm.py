@@ -386,6 +386,14 @@ def test_wasmtime_errors_along_the_sweeps_are_the_native_ones(module, host):
             assert curve[0, 0] == observation["solver"][4] and curve[-1, 0] == observation["solver"][5]
 
 
+def test_wasmtime_packed_sweeps_are_the_plain_ones(module, host):
+    for scene in page_scenes()["scenes"]:
+        plain, packed = (host.Simulation(host.Kernels(module, layout()), scene) for _ in range(2))
+        for _ in range(60):
+            assert plain.step() == packed.step(packed=True) == 0
+        assert plain.everything() == packed.everything(), scene["name"]
+
+
 def test_wasmtime_snapshot_leads_back(module, host):
     (scene,) = (s for s in page_scenes()["scenes"] if s["name"] == "pyramid")
     simulation = host.Simulation(host.Kernels(module, layout()), scene)
