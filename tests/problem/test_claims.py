@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import scipy.sparse as sp
-from random_problems import as_matrix, random_contact_problem, random_lcp
+from random_problems import arrays_of, as_matrix, random_contact_problem, random_lcp
 
 import lavender as lv
 from lavender import registry
@@ -155,30 +155,6 @@ def problems():
             compliance=rows.compliance,
         ),
     }
-
-
-def arrays_of(thing, name, seen, depth=0):
-    """(name, array) of every array that can be reached from a thing's public attributes."""
-    if isinstance(thing, np.ndarray):
-        yield name, thing
-    elif sp.issparse(thing):
-        for part in ("data", "indices", "indptr"):
-            yield f"{name}.{part}", getattr(thing, part)
-    elif type(thing).__module__.startswith("lavender") and id(thing) not in seen and depth < 4:
-        seen.add(id(thing))
-        for attribute in dir(type(thing)):
-            if attribute.startswith("__"):
-                continue
-            kind = getattr(type(thing), attribute)
-            if callable(kind) and not isinstance(kind, type):
-                continue
-            try:
-                value = getattr(thing, attribute)
-            except lv.LavenderError:
-                continue
-            yield from arrays_of(value, f"{name}.{attribute}", seen, depth + 1)
-        for attribute, value in getattr(thing, "__dict__", {}).items():
-            yield from arrays_of(value, f"{name}.{attribute}", seen, depth + 1)
 
 
 @pytest.mark.parametrize("form", ["rows", "csr", "dense", "generalized"])
