@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from lavender._arrays import FloatArray
-from lavender.errors import CapabilityError, InputError
+from lavender.errors import InputError, LavenderError
 from lavender.io import mujoco as adapter
 from lavender.io import npz
 from lavender.residuals import residual
@@ -108,7 +108,7 @@ def record(
             continue
         try:
             problem = adapter.from_mujoco(model, data, name=f"step {step + 1}")
-        except CapabilityError as error:
+        except LavenderError as error:
             left_out.append(f"step {step + 1}: {error}")
             continue
         own = adapter.impulse(model, data)
