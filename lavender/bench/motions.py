@@ -19,6 +19,7 @@ import numpy as np
 from lavender import motion
 from lavender.cones import ROW
 from lavender.errors import CapabilityError, InputError
+from lavender.io.stored import write_atomically
 from lavender.measures import natural_map, siconos_error
 from lavender.problem import Problem
 from lavender.registry import available, get
@@ -165,11 +166,15 @@ def _warm(problem: Problem, found: motion.Motions) -> str:
 def write_csv(found: Iterable[Any], path: Path) -> None:
     """One line for each entry, floats to their last digit."""
     entries = list(found)
-    with open(path, "w", newline="", encoding="utf-8") as stream:
-        write = csv.writer(stream)
-        if entries:
-            write.writerow([f.name for f in fields(entries[0])])
-        write.writerows([*asdict(entry).values()] for entry in entries)
+
+    def write(part: Path) -> None:
+        with part.open("w", newline="", encoding="utf-8") as stream:
+            lines = csv.writer(stream)
+            if entries:
+                lines.writerow([f.name for f in fields(entries[0])])
+            lines.writerows([*asdict(entry).values()] for entry in entries)
+
+    write_atomically(path, write)
 
 
 def is_searched(problem: Problem, rows: int) -> bool:

@@ -29,6 +29,7 @@ from lavender.engine import Simulation
 from lavender.engine.layout import HEAD, SETTING
 from lavender.engine.state import State
 from lavender.errors import InputError
+from lavender.io.stored import write_figure
 from lavender.scene import Scene
 
 __all__ = ["Modes", "critical_gain", "figure", "model", "modes", "slowest"]
@@ -219,7 +220,4 @@ def figure(path: str | PathLike[str]) -> None:
     right.set_title("g = 0: gravity is quicker than the sweeps", fontsize=10)
     for panel in (left, middle, right):
         panel.legend(fontsize=8, loc="lower right" if panel is left else "upper left")
-    try:
-        canvas.savefig(path)
-    except (OSError, ValueError) as error:
-        raise InputError(f"cannot write the figure {str(path)!r}: {error}") from None
+    write_figure(canvas, path)

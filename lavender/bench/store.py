@@ -20,6 +20,7 @@ from lavender._arrays import table_of
 from lavender.bench.lock import Lock
 from lavender.bench.record import CaseInfo, Done, Entry, Record, Run, Skip, from_json, to_json
 from lavender.errors import InputError, UnknownName
+from lavender.io.stored import destination, write_atomically, write_text
 
 __all__ = ["Records", "Store", "read", "write_csv", "write_json"]
 
@@ -160,10 +161,10 @@ class Store:
     """
 
     def __init__(self, path: str | Path) -> None:
-        self.path = Path(path)
+        self.path, real = Path(path), destination(path)
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            self._lock = Lock(self.path)
+            self._lock = Lock(real)  # one for all names of a file
             try:
                 self.records = read(self.path) if self.path.exists() else Records()
                 _cut_torn_line(self.path)
@@ -267,13 +268,17 @@ def write_csv(records: Records, path: str | Path) -> None:
     """One row for each record; `work`, `options` and `versions` are JSON in their cells."""
     rows = records.rows()
     columns = list(rows[0]) if rows else [f.name for f in fields(Record)]
-    with Path(path).open("w", newline="", encoding="utf-8") as f:
-        writer = csv.DictWriter(f, columns)
-        writer.writeheader()
-        for row in rows:
-            writer.writerow(
-                {k: json.dumps(v, default=str) if isinstance(v, dict) else v for k, v in row.items()}
-            )
+
+    def write(part: Path) -> None:
+        with part.open("w", newline="", encoding="utf-8") as f:
+            writer = csv.DictWriter(f, columns)
+            writer.writeheader()
+            for row in rows:
+                writer.writerow(
+                    {k: json.dumps(v, default=str) if isinstance(v, dict) else v for k, v in row.items()}
+                )
+
+    write_atomically(path, write)
 
 
 def write_json(records: Records, path: str | Path) -> None:
@@ -291,4 +296,4 @@ def write_json(records: Records, path: str | Path) -> None:
             for entry, r in zip(plain(records.records), records.records, strict=True)
         ],
     }
-    Path(path).write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    write_text(path, json.dumps(content, indent=1, allow_nan=False) + "\n")

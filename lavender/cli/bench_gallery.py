@@ -11,6 +11,7 @@ import click
 
 from lavender.bench.endurance import STEPS_PER_SECOND, Stay, stay
 from lavender.errors import InputError
+from lavender.io.stored import write_text
 from lavender.report.endurance import table
 from lavender.scene import SCENES
 
@@ -43,8 +44,4 @@ def gallery(scenes: tuple[str, ...], seconds: float, solvers: str, out: str | No
                 lines = table(found[-1:]).splitlines()
                 say("\n".join(lines if len(found) == 1 else lines[1:]))
     if out is not None:
-        try:
-            with open(out, "w", encoding="utf-8") as stream:
-                json.dump([asdict(f) for f in found], stream, indent=1)
-        except OSError as error:
-            raise InputError(f"cannot write {out!r}: {error.strerror}") from None
+        write_text(out, json.dumps([asdict(f) for f in found], indent=1))

@@ -10,6 +10,7 @@ import click
 
 from lavender.bench import machine
 from lavender.bench.kernels import CASES, COUNTED, Row, instructions, measure_limits, run, scaling
+from lavender.io.stored import write_text
 from lavender.report.kernels import limits_table, scaling_table, table
 
 __all__ = ["kernels"]
@@ -56,4 +57,4 @@ def kernels(cases: tuple[str, ...], seconds: float, largest: int, count: bool, o
             "cpu": machine.cpu_name(), "versions": machine.versions(), "limits": [asdict(x) for x in bounds],
             "rows": [asdict(r) | {"ns_per_unit": r.per_unit, "share": r.share} for r in found], "scaling": growth,
         }  # fmt: skip
-        out.write_text(json.dumps(record, indent=1))
+        write_text(out, json.dumps(record, indent=1))

@@ -13,6 +13,7 @@ import click
 from lavender.bench import machine
 from lavender.bench.stand import ENGINES, Line, installed, lines, missing
 from lavender.errors import InputError, UnknownName
+from lavender.io.stored import write_text
 from lavender.report.stand import table
 from lavender.scene.scene import SCENE_ORDERS
 
@@ -98,6 +99,4 @@ def _write(found: Sequence[Line], names: Sequence[str], out: Path) -> None:
     text = json.dumps(
         {"cpu": machine.cpu_name(), "versions": versions, "lines": [asdict(line) for line in found]}, indent=1
     )
-    part = out.with_name(out.name + ".part")
-    part.write_text(text + "\n")
-    part.replace(out)
+    write_text(out, text + "\n")

@@ -19,7 +19,7 @@ from lavender._arrays import FloatArray
 from lavender.engine.layout import HEAD, JOINT
 from lavender.engine.state import State
 from lavender.errors import InputError
-from lavender.io.stored import write_atomically
+from lavender.io.stored import write_bytes
 from lavender.scene import Scene
 
 __all__ = ["Film"]
@@ -110,12 +110,7 @@ class Film:
         InputError
             A path that cannot be written.
         """
-        data = self.to_bytes()
-
-        def write(part: Path) -> None:
-            part.write_bytes(data)
-
-        write_atomically(path, write)
+        write_bytes(path, self.to_bytes())
 
     def to_bytes(self) -> bytes:
         """The bytes of a file."""

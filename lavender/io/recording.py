@@ -16,6 +16,7 @@ from lavender._arrays import FloatArray
 from lavender.errors import InputError, LavenderError
 from lavender.io import mujoco as adapter
 from lavender.io import npz
+from lavender.io.stored import write_text
 from lavender.residuals import residual
 
 __all__ = ["Recording", "record", "record_file"]
@@ -120,7 +121,7 @@ def record(
             "seconds": seconds, "relative": residual(problem, own).relative,
             "solver": mj.mjtSolver(int(model.opt.solver)).name.removeprefix("mjSOL_"),
         }))  # fmt: skip
-    (folder / ENGINE).write_text("".join(f"{line}\n" for line in lines), encoding="utf-8")
+    write_text(folder / ENGINE, "".join(f"{line}\n" for line in lines))
     return Recording(folder, tuple(files), without, tuple(left_out))
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from lavender.bench.motions import LARGEST, SMALLEST, Branches, Sample
-from lavender.errors import InputError
+from lavender.io.stored import write_figure
 
 __all__ = ["calibration", "figure", "predictors", "several_table", "table"]
 
@@ -153,7 +153,4 @@ def figure(found: Sequence[Sample], path: str | Path) -> None:
         ylim=(1e-12, 10),
     )
     ax.legend(fontsize=8)
-    try:
-        canvas.savefig(path, dpi=150)
-    except (OSError, ValueError) as error:
-        raise InputError(f"cannot write the figure {str(path)!r}: {error}") from None
+    write_figure(canvas, path, dpi=150)

@@ -12,6 +12,7 @@ from typing import Any
 
 import lavender_ext
 from lavender.errors import InputError, LavenderError
+from lavender.io.stored import write_bytes, write_text
 from lavender.web import compile as wasm
 from lavender.web.scenes import page_scenes
 
@@ -120,9 +121,9 @@ def write_page(folder: Path, say: Callable[[str], Any] = lambda text: None) -> P
     try:
         shutil.copytree(HERE / "page", folder, dirs_exist_ok=True)
         for name, data in modules.items():
-            (folder / f"{name}.wasm").write_bytes(data)
+            write_bytes(folder / f"{name}.wasm", data)
         text = json.dumps(page_scenes(), allow_nan=False, separators=(",", ":"))
-        (folder / "scenes.json").write_text(text, encoding="utf-8")
+        write_text(folder / "scenes.json", text)
     except (OSError, shutil.Error) as error:
         raise InputError(f"cannot write the page into {folder}: {error}") from None
     return folder / "index.html"

@@ -23,7 +23,7 @@ LEVELS = [
     {"solution"},
     {"io", "ordering"},
     {"registry"},
-    {"external", "solvers"},
+    {"external", "foreign", "solvers"},
     {"solve"},
     {"check", "many", "motion", "redundancy"},
     {"scene"},
