@@ -83,13 +83,13 @@ class Foreign:
         if wrong:
             return Claim(Status.NUMERICAL_ERROR, iterations, {}, f"solver {self.name!r} {wrong}")
         return Claim(
-            claim.status,
-            iterations,
-            {k: int(n) for k, n in work.items()},
-            claim.message,
-            claim.form,
-            read_only(dual.copy()) if isinstance(dual, np.ndarray) else dual,
-            certificate,
+            status=claim.status,
+            iterations=iterations,
+            work={k: int(n) for k, n in work.items()},
+            message=claim.message,
+            form=claim.form,
+            dual=read_only(dual.copy()) if isinstance(dual, np.ndarray) else dual,
+            certificate=certificate,
         )
 
 

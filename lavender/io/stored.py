@@ -165,6 +165,31 @@ def first_bytes(path: Path, count: int = 8) -> bytes:
         raise InputError(f"cannot read {path}: {getattr(error, 'strerror', None) or error}") from None
 
 
+def whole_file(path: str | os.PathLike[str], what: str, max_bytes: int = MAX_BYTES) -> bytes:
+    """All bytes of a regular file of at most so many.
+
+    Raises
+    ------
+    InputError
+        The file does not exist, is no regular file, is larger, or cannot be read.
+    """
+    try:
+        found = os.stat(path)
+        if not stat.S_ISREG(found.st_mode):  # a pipe or a device has no end
+            raise InputError(f"cannot read {what} {str(path)!r}: it is no file")
+        if found.st_size > max_bytes:
+            raise InputError(
+                f"cannot read {what} {str(path)!r}: it holds {found.st_size} bytes, more than {max_bytes}"
+            )
+        return Path(path).read_bytes()
+    except (OSError, ValueError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(
+            f"cannot read {what} {str(path)!r}: {getattr(error, 'strerror', None) or error}"
+        ) from None
+
+
 class Budget:
     """Bytes that a file may still make; spent before anything is allocated."""
 

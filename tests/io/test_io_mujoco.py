@@ -7,6 +7,7 @@ import pytest
 
 import lavender as lv
 from lavender.io import mujoco as adapter
+from lavender.io import recording
 
 mj = pytest.importorskip("mujoco", reason="needs MuJoCo: pip install 'lavender-contact[peers]'")
 
@@ -519,3 +520,32 @@ def test_data_of_a_second_model_are_refused():
     assert other.nv == model.nv
     with pytest.raises(lv.LavenderError):
         lv.io.from_mujoco(other, data)
+
+
+@pytest.mark.parametrize(
+    "kind", ["archive", "words", "objects", "one row", "short", "huge", "folder", "nothing"]
+)
+def test_controls_of_another_thing_are_refused_by_name(tmp_path, kind):
+    (tmp_path / "model.xml").write_text(
+        SCENE.format(cone="elliptic", solver="Newton", condim=3, jacobian="dense")
+    )
+    path = tmp_path / "controls.npy"
+    if kind == "archive":
+        np.savez(tmp_path / "controls.npz", a=np.zeros((3, 1)), b=np.zeros(2))
+        path = tmp_path / "controls.npz"
+    elif kind == "words":
+        np.save(path, np.array([["a"]]))
+    elif kind == "objects":
+        np.save(path, np.array([[None]]), allow_pickle=True)
+    elif kind == "one row":
+        np.save(path, np.zeros(3))
+    elif kind == "folder":
+        path.mkdir()
+    elif kind == "huge":
+        path.write_bytes(b"\x93NUMPY\x01\x00\x76\x00" + (
+            b"{'descr': '<f8', 'fortran_order': False, 'shape': (1000000000000, 1), }".ljust(117) + b"\n"
+        ))  # fmt: skip
+    elif kind == "short":
+        path.write_bytes(b"\x93NUMPY")
+    with pytest.raises(lv.InputError, match="control"):
+        recording.record_file(tmp_path / "model.xml", tmp_path / "out", 3, control=str(path))

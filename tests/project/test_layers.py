@@ -13,7 +13,7 @@ ROOT = Path(__file__).resolve().parent.parent.parent
 
 #: Bottom to top; names on one line are of one level and do not import each other.
 LEVELS = [
-    {"_version", "_built"},
+    {"_version", "_built", "_starting"},
     {"errors"},
     {"_arrays", "_derived", "_lu", "apart"},
     {"cones"},
