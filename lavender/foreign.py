@@ -57,12 +57,13 @@ class Foreign:
 
     def _checked(self, claim: Any, wrong: str, m: int) -> Claim:
         """The claim with what belongs into each of its fields, or one that says what is wrong."""
-        if not isinstance(claim, Claim):
+        if type(claim) is not Claim:
             wrong = wrong or f"returned a {type(claim).__name__} ({claim!r:.60}); a lavender.Claim is needed"
             return Claim(Status.NUMERICAL_ERROR, 0, {}, f"solver {self.name!r} {wrong}")
-        iterations = int(claim.iterations) if _counts(claim.iterations) else 0
-        work, certificate, dual = claim.work, claim.certificate, claim.dual
-        if not isinstance(claim.status, Status):
+        said: Any = claim  # whose fields may hold anything
+        iterations = int(said.iterations) if _counts(said.iterations) else 0
+        work, certificate, dual = said.work, said.certificate, said.dual
+        if not isinstance(said.status, Status):
             wrong = wrong or f"claims the status {claim.status!r:.60}; a lavender.Status is needed"
         elif not _counts(claim.iterations):
             wrong = wrong or f"claims {claim.iterations!r:.60} iterations; a whole number from 0 is needed"
@@ -70,7 +71,7 @@ class Foreign:
             isinstance(k, str) and _counts(n) for k, n in work.items()
         ):
             wrong = wrong or f"claims the work {work!r:.60}; counts by name are needed"
-        elif not isinstance(claim.message, str) or not isinstance(claim.form, str):
+        elif not isinstance(said.message, str) or not isinstance(said.form, str):
             wrong = (
                 wrong
                 or f"claims the message {claim.message!r:.60} and form {claim.form!r:.60}; texts are needed"
@@ -112,12 +113,17 @@ class Held:
 
 
 def _counts(n: Any) -> bool:
-    return isinstance(n, (int, np.integer)) and not isinstance(n, bool) and 0 <= n < 2**63
+    return isinstance(n, (int, np.integer)) and not isinstance(n, bool) and bool(0 <= n < 2**63)
 
 
 def _private(problem: Problem) -> Problem:
     """The same problem in arrays that nobody else reads."""
-    cones, rows, generalized = (deepcopy(x) for x in (problem.cones, problem.rows, problem.generalized))
-    made = replace(problem, cones=cones, rows=rows, generalized=generalized, copy=True)
+    made = replace(
+        problem,
+        cones=deepcopy(problem.cones),
+        rows=deepcopy(problem.rows),
+        generalized=deepcopy(problem.generalized),
+        copy=True,
+    )
     reference(made)  # of the judge, which nobody can set any more
     return made

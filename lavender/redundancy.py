@@ -165,7 +165,7 @@ def redundancy(problem: Problem, *, tol: float = 1e-12) -> Redundancy:
     InputError
         `tol` is not between 0 and 1.
     CapabilityError
-        Asymmetric A with an island of more than 1,200 rows.
+        Asymmetric A with an island of more than 1,200 rows; numbers whose products are beyond float64.
     """
     if not isinstance(problem, Problem):
         raise InputError(f"problem is a {type(problem).__name__}; a lavender.Problem is needed")
@@ -175,16 +175,22 @@ def redundancy(problem: Problem, *, tol: float = 1e-12) -> Redundancy:
     unique = np.ones(m, bool)
     dependent: list[int] = []
     used, methods = tol, set()
-    scale = 1.0 / np.sqrt(problem.csr_data.d)
-    unit = _unit(problem, scale)
+    with np.errstate(all="ignore"):  # what is not finite is told below
+        scale = 1.0 / np.sqrt(problem.csr_data.d)
+        unit = _unit(problem, scale)
     null: list[tuple[Places, FloatArray]] = []
     if m:
-        scaled = sp.csr_array(sp.diags_array(unit) @ problem.csr @ sp.diags_array(unit))
         from scipy.sparse import csgraph
 
         roots: tuple[Any, ...] = ()
-        if problem.matrix is None and not np.any(problem.compliance):
-            roots = _roots(problem)
+        with np.errstate(all="ignore"):
+            scaled = sp.csr_array(sp.diags_array(unit) @ problem.csr @ sp.diags_array(unit))
+            if problem.matrix is None and not np.any(problem.compliance):
+                roots = _roots(problem)
+        if not all(np.isfinite(part.data).all() for part in (scaled, *roots)):
+            raise CapabilityError(
+                "the rank cannot be told: rows of unit size are beyond float64 (give the problem in other units)"
+            )
         count, label = csgraph.connected_components(scaled, directed=False)
         by_island = np.split(
             np.argsort(label, kind="stable"), np.cumsum(np.bincount(label, minlength=count))[:-1]
@@ -282,8 +288,8 @@ def _roots(problem: Problem) -> tuple[sp.csr_array, sp.csr_array]:
             copy=False,
         )
         bare = Problem(problem.b, problem.cones, rows=plain, copy=False).velocity_form().jacobian
-    for measure in (lambda a: abs(a).max(axis=1).toarray().ravel(), lambda a: np.sqrt((a * a).sum(axis=1))):
-        size = measure(bare)  # the largest entry first: squares of large ones overflow
+    for squared in (False, True):  # the largest entry first: squares of large ones overflow
+        size = np.sqrt((bare * bare).sum(axis=1)) if squared else abs(bare).max(axis=1).toarray().ravel()
         bare = sp.csr_array(sp.diags_array(1.0 / np.where(size > 0.0, size, 1.0)) @ bare)
     return whole, bare
 

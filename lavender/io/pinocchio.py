@@ -90,7 +90,7 @@ def from_pinocchio(
             f"got a {type(model).__name__} and a {type(data).__name__}; a pinocchio.Model and its Data are needed"
         )
     for word, given in (("models", constraint_models), ("data", constraint_datas)):
-        if not isinstance(given, Sequence) and not (hasattr(given, "__len__") and hasattr(given, "__iter__")):
+        if not (hasattr(given, "__len__") and hasattr(given, "__iter__")):
             raise InputError(f"constraint {word}: got a {type(given).__name__}; a sequence is needed")
     if len(constraint_models) != len(constraint_datas):
         raise InputError(

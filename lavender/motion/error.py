@@ -85,9 +85,8 @@ class MotionError:
             parts.append(f"{self.row_name or 'rows'} {self.rows:.2g} m/s")
         if self.bound is not None:
             speed = "" if self.bound_speed is None else f" ({self.bound_speed:.2g} m/s)"
-            parts.append(
-                f"at most {self.bound:.2e} sqrt(J){speed} with targets moved by {self.moved:.1e} m/s"
-            )
+            moved = "" if self.moved is None else f" with targets moved by {self.moved:.1e} m/s"
+            parts.append(f"at most {self.bound:.2e} sqrt(J){speed}{moved}")
         if self.spread_speed is not None and self.count > 1:
             parts.append(f"nearest of {self.count} motions {self.spread_speed:.2g} m/s apart")
         if self.unique:
