@@ -15,11 +15,12 @@ from pathlib import Path
 import click
 import numpy as np
 
-from benchmarks.output import markdown, save, write_csv
+from benchmarks.output import markdown, write_csv
 from lavender import motion
 from lavender.bench import resolve, structure_of
 from lavender.cones import ROW
 from lavender.errors import CapabilityError, InputError
+from lavender.io.stored import write_figure
 from lavender.measures import natural_map, siconos_error
 from lavender.problem import Problem
 from lavender.registry import available, get
@@ -325,7 +326,7 @@ def figure(found: Sequence[Sample], path: str | Path) -> None:
         ylim=(1e-12, 10),
     )
     ax.legend(fontsize=8)
-    save(canvas, path, dpi=150)
+    write_figure(canvas, path, dpi=150)
 
 
 @click.command("motions")

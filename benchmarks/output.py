@@ -1,4 +1,4 @@
-"""Tables as markdown, lines as JSON or CSV, figures as files: for every benchmark."""
+"""Tables as markdown, lines as JSON or CSV: for every benchmark."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ from typing import Any
 
 from lavender.bench import machine
 from lavender.errors import InputError
+from lavender.io.stored import write_atomically, write_text
 
-__all__ = ["folder_of", "markdown", "save", "write_csv", "write_json"]
+__all__ = ["folder_of", "markdown", "write_csv", "write_json"]
 
 
 def markdown(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
@@ -31,36 +32,19 @@ def folder_of(out: Path | None) -> Path | None:
 def write_json(path: Path, lines: Iterable[Any], **more: Any) -> None:
     """Lines (dataclasses or dictionaries) with the machine and versions of packages; the file is whole or absent."""
     rows = [line if isinstance(line, dict) else asdict(line) for line in lines]
-    text = json.dumps(
-        {"cpu": machine.cpu_name(), "versions": machine.versions(), **more, "lines": rows}, indent=1
-    )
-    part = path.with_name(path.name + ".part")
-    try:
-        part.write_text(text + "\n", encoding="utf-8")
-        part.replace(path)
-    except OSError as error:
-        raise InputError(f"cannot write {str(path)!r}: {error.strerror}") from None
+    more = {"cpu": machine.cpu_name(), "versions": machine.versions(), **more, "lines": rows}
+    write_text(path, json.dumps(more, indent=1) + "\n")
 
 
 def write_csv(path: Path, lines: Iterable[Any]) -> None:
     """One line for each dataclass, floats to their last digit."""
     entries = list(lines)
-    with open(path, "w", newline="", encoding="utf-8") as stream:
-        write = csv.writer(stream)
-        if entries:
-            write.writerow([f.name for f in fields(entries[0])])
-        write.writerows([*asdict(entry).values()] for entry in entries)
 
+    def write(part: Path) -> None:
+        with part.open("w", newline="", encoding="utf-8") as stream:
+            to = csv.writer(stream)
+            if entries:
+                to.writerow([f.name for f in fields(entries[0])])
+            to.writerows([*asdict(entry).values()] for entry in entries)
 
-def save(canvas: Any, path: str | Path, **options: Any) -> None:
-    """A matplotlib figure as a file.
-
-    Raises
-    ------
-    InputError
-        A path that cannot be written, or a suffix that matplotlib does not know.
-    """
-    try:
-        canvas.savefig(path, **options)
-    except (OSError, ValueError) as error:
-        raise InputError(f"cannot write the figure {str(path)!r}: {error}") from None
+    write_atomically(path, write)

@@ -31,12 +31,13 @@ from os import PathLike
 import click
 import numpy as np
 
-from benchmarks.output import markdown, save
+from benchmarks.output import markdown
 from lavender._arrays import FloatArray
 from lavender.engine import Simulation
 from lavender.engine.layout import HEAD, SETTING
 from lavender.engine.state import State
 from lavender.errors import InputError
+from lavender.io.stored import write_figure
 from lavender.scene import Scene
 
 __all__ = ["Modes", "command", "critical_gain", "figure", "model", "modes", "numbers", "slowest"]
@@ -229,7 +230,7 @@ def figure(path: str | PathLike[str]) -> None:
     right.set_title("g = 0: gravity is quicker than the sweeps", fontsize=10)
     for panel in (left, middle, right):
         panel.legend(fontsize=8, loc="lower right" if panel is left else "upper left")
-    save(canvas, path)
+    write_figure(canvas, path)
 
 
 def numbers(

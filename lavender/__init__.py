@@ -4,10 +4,12 @@ Scenes, the engine, files, cases and reports are imported at their first use: `l
 `lavender.io`, `lavender.suite`, `lavender.bench`, `lavender.report`.
 """
 
+import lavender._starting  # noqa: I001 - first: Ctrl-C from here on
+
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-import lavender._built  # noqa: F401 - first: says what to do where nothing is built
+import lavender._built
 from lavender._version import __version__
 from lavender.cones import CONTACT, CONTACT_SPIN, ROUND, ROW, Cones
 from lavender.errors import (
@@ -124,3 +126,6 @@ def __getattr__(name: str) -> Any:
 
 def __dir__() -> list[str]:
     return sorted(__all__)
+
+
+lavender._starting.end()

@@ -118,6 +118,11 @@ def as_array(
     return read_only(array)
 
 
+def borrowed(name: str, value: Any, shape: tuple[int | None, ...]) -> np.ndarray:
+    """`value` as `as_array` would adopt it, to be read at once and not kept: the array given stays writable."""
+    return as_array(name, value.view() if type(value) is np.ndarray else value, shape, copy=False)
+
+
 def _narrowed(wide: np.ndarray) -> np.ndarray:
     # Long double as float64, rounded; what does not fit becomes infinite without a warning, and is told by its place.
     with np.errstate(over="ignore", under="ignore"):

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from lavender._arrays import FloatArray, IntArray, as_array, equal, read_only
+from lavender._arrays import FloatArray, IntArray, as_array, borrowed, equal, read_only
 from lavender.errors import InputError
 from lavender_ext.core import generalized as kernels
 from lavender_ext.core.problem import dense_to_csr
@@ -46,6 +46,8 @@ class Generalized:
         v*, the velocity without constraint impulses.
     names : sequence of str (nv,), optional
         Names of the velocities, for messages.
+
+    J and M are copied into compressed rows; the arrays given are not kept, and stay as they are.
 
     Raises
     ------
@@ -262,7 +264,7 @@ class Generalized:
 
 def _rows(jac: Any, n: int) -> Compressed:
     sparse = sp.issparse(jac)
-    given = jac if sparse else as_array("J", jac, (None, None), copy=False)
+    given = jac if sparse else borrowed("J", jac, (None, None))
     if given.shape[1] != n:
         raise InputError(f"J has shape {given.shape}; (any, {n}) is needed, as M has {n} velocities")
     if sparse:
@@ -276,7 +278,7 @@ def _lower(mass: Any, names: Sequence[str] | None) -> tuple[Compressed, int]:
         given = [as_array(f"block {i} of M", block, (None, None)) for i, block in enumerate(mass)]
         mass = sp.block_diag(given, format="csr")
     if not sp.issparse(mass):
-        dense = as_array("M", mass, (None, None), copy=False)
+        dense = borrowed("M", mass, (None, None))
         n = len(dense)
         if dense.shape != (n, n):
             raise InputError(f"M has shape {dense.shape}; a square matrix is needed")

@@ -71,13 +71,15 @@ def solve_many(
     spec = get(solver)
     more = {"tol": tol, "max_iter": max_iter, **options}
     plain = not options and max_iter is None
-    together = plain and solver in ("auto", "newton") and isinstance(tol, float) and 0.0 < tol < np.inf
+    together = (
+        plain and spec.own and solver in ("auto", "newton") and isinstance(tol, float) and 0.0 < tol < np.inf
+    )
     at = [i for i, p in enumerate(given) if type(p) is Problem and p.generalized is not None]
 
     def batch(part: list[int]) -> None:
         _batch(given, starts, part, tol, spec, made)
 
-    short = spec.few is not None and plain
+    short = spec.few is not None and spec.own and plain
 
     def alone(i: int) -> None:
         made[i] = solve_few(given[i], spec, starts[i], tol) if short else None

@@ -124,7 +124,8 @@ class Problem:
         Names of blocks, e.g. "hinge 7"; see `row_name`.
     name : str
     copy : bool
-        False adopts arrays that already fit, marking them read-only.
+        True leaves the arrays given as they are. False adopts those that already fit (b, matrix, compliance, guess):
+        they are shared, and marked read-only for the giver, too.
 
     Raises
     ------
@@ -169,6 +170,8 @@ class Problem:
             self._check_generalized(self.generalized, m)
         else:
             put(self, "matrix", _checked_matrix(self.matrix, m, self.copy))
+            if sp.issparse(self.matrix):  # checked arrays; those of the object anybody may exchange
+                put(self, "_compressed", (self.matrix.indptr, self.matrix.indices, self.matrix.data))
             if self.compliance is not None:
                 raise InputError("compliance goes with rows; in a matrix it is already on the diagonal of A")
         if self.guess is not None:
@@ -190,6 +193,7 @@ class Problem:
                 raise InputError(f"{len(names)} names for {k} blocks; one for each block is needed")
             put(self, "names", names)
         put(self, "name", str(self.name))
+        put(self, "copy", True)  # of what was given here: another problem made of this one says so itself
 
     def _check_rows(self, rows: Rows, m: int, k: int) -> None:
         if not isinstance(rows, Rows):
@@ -386,7 +390,7 @@ class Problem:
             Rows in the order of `cones`, e.g. `Cones.free(6) + Cones.contacts(0.5, count=8)`; of a contact its normal,
             then its two tangents.
         M : (nv, nv) array or sparse, or a sequence of square blocks, one for each kinematic tree
-            Mass matrix, symmetric positive definite.
+            Mass matrix, symmetric positive definite. J and M are copied, whatever `copy` says.
         v_free : (nv,) m/s, rad/s
             v*, the velocity after the step without constraint impulses.
         target : scalar or (m,) m/s
@@ -452,7 +456,7 @@ class Problem:
         Parameters
         ----------
         J, M, v_free : as in `from_jacobian`
-            Only in generalised coordinates.
+            Only in generalised coordinates; copied, so that a loop may fill the same arrays again.
         b : (m,) m/s, optional
             The right-hand side itself; or
         target : scalar or (m,) m/s, optional
@@ -487,8 +491,10 @@ class Problem:
         if target is not None and general is not None:
             with np.errstate(over="ignore", invalid="ignore"):  # what is not finite, the problem refuses
                 b = as_array("target", target, (self.m,), unit="m/s") - general.velocity_of(general.v_free)
-        given: dict[str, Any] = {"b": self.b if b is None else b, "guess": guess}  # checked by `Problem`
-        return replace(self, generalized=general, **given)
+        # Private here, so that nothing else is copied a second time.
+        given = self.b if b is None else as_array("b", b, (self.m,), unit="m/s")
+        warm = None if guess is None else as_array("guess", guess, (self.m,), unit="N s")
+        return replace(self, generalized=general, b=given, guess=warm, copy=False)
 
     # -- size and kind --------------------------------------------------------------------------
 
@@ -607,9 +613,7 @@ class Problem:
                 )
             indptr, indices, data = assemble.delassus(self.data, most, start, blocks)
             return read_only(indptr), read_only(indices), read_only(data)
-        if isinstance(self.matrix, np.ndarray):
-            return dense_to_csr(self.matrix)
-        return self.matrix.indptr, self.matrix.indices, self.matrix.data
+        return dense_to_csr(self.matrix)
 
     def _product(self) -> tuple[IntArray, IntArray, FloatArray]:
         # A = Y Y^T + diag(compliance): symmetric to the bit, as both triangles are summed in the same order.

@@ -6,12 +6,13 @@ what is left of it after all rows before it are taken out,
 
     p_i = A_ii - A_iB A_BB^-1 A_Bi   (B: rows before i that are not redundant)   [1/kg]
 
-is at most `tol` A_ii: the squared share of its direction that is new, in the metric of the masses.
+is at most `tol` A_ii: the squared share of its direction that is new, in the metric of the masses. Where J is
+known, what is new in J alone counts, too: beside a body that is 1e13 times heavier the masses hide it.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -33,6 +34,8 @@ DENSE = 1200  # rows of an island up to which it is decomposed as a dense matrix
 # Larger islands: LDL^T of A + SHIFT D. A zero pivot becomes at most rows SHIFT d: ten times that counts as zero.
 SHIFT = 1e-13
 TIKHONOV = 1e-7  # -, weight of the distance to the wanted impulse while its rows are found
+FALLS_BACK = 1e-10  # A_ii over the largest entry of its row, up to which d is that entry
+SOUND = 1e-8  # -, above 1, up to which |A_ij| / sqrt(A_ii A_jj) is that of a semidefinite A
 UNMOVED = 1e-9  # -, entries of all unit null vectors up to which a row counts as not moved
 ACCEPTED = 1e-9  # relative residual of a representative, or twice its floor
 
@@ -148,7 +151,7 @@ def redundancy(problem: Problem, *, tol: float = 1e-12) -> Redundancy:
     """Rank of A, the rows that repeat others, and what is unique.
 
     Islands (rows that share no body, directly or through others) are decomposed apart: up to 1,200 rows by
-    QR of J M^-1/2 with column pivoting where rows are given (nothing is squared), else by Cholesky with
+    QR of J M^-1/2, and of J, with column pivoting where J is given (nothing is squared), else by Cholesky with
     pivoting, or QR for asymmetric A; larger ones by LDL^T of A + 1e-13 D, where pivots up to 1e-12 d times
     the number of rows count as zero.
 
@@ -162,7 +165,7 @@ def redundancy(problem: Problem, *, tol: float = 1e-12) -> Redundancy:
     InputError
         `tol` is not between 0 and 1.
     CapabilityError
-        Asymmetric A with an island of more than 1,200 rows.
+        Asymmetric A with an island of more than 1,200 rows; numbers whose products are beyond float64.
     """
     if not isinstance(problem, Problem):
         raise InputError(f"problem is a {type(problem).__name__}; a lavender.Problem is needed")
@@ -172,15 +175,22 @@ def redundancy(problem: Problem, *, tol: float = 1e-12) -> Redundancy:
     unique = np.ones(m, bool)
     dependent: list[int] = []
     used, methods = tol, set()
-    scale = 1.0 / np.sqrt(problem.csr_data.d)
+    with np.errstate(all="ignore"):  # what is not finite is told below
+        scale = 1.0 / np.sqrt(problem.csr_data.d)
+        unit = _unit(problem, scale)
     null: list[tuple[Places, FloatArray]] = []
     if m:
-        scaled = sp.csr_array(sp.diags_array(scale) @ problem.csr @ sp.diags_array(scale))
         from scipy.sparse import csgraph
 
-        root = None
-        if problem.matrix is None and not np.any(problem.compliance):
-            root = problem.velocity_form().jacobian
+        roots: tuple[Any, ...] = ()
+        with np.errstate(all="ignore"):
+            scaled = sp.csr_array(sp.diags_array(unit) @ problem.csr @ sp.diags_array(unit))
+            if problem.matrix is None and not np.any(problem.compliance):
+                roots = _roots(problem)
+        if not all(np.isfinite(part.data).all() for part in (scaled, *roots)):
+            raise CapabilityError(
+                "the rank cannot be told: rows of unit size are beyond float64 (give the problem in other units)"
+            )
         count, label = csgraph.connected_components(scaled, directed=False)
         by_island = np.split(
             np.argsort(label, kind="stable"), np.cumsum(np.bincount(label, minlength=count))[:-1]
@@ -203,15 +213,23 @@ def redundancy(problem: Problem, *, tol: float = 1e-12) -> Redundancy:
                 unique[island] = len(found) == 0
             else:
                 dense = part.toarray()
-                if root is not None:
-                    tail = _by_qr(root[island].toarray().T, tol)
+                if roots:
+                    tails = [_by_qr(root[island].toarray().T, tol) for root in roots]
+                    tail = min(tails, key=len)
                     methods.add(f"QR of J M^-1/2 with pivoting, {tol:.0e}")
+                    if len({len(t) for t in tails}) > 1:
+                        methods.add(
+                            f"of {len(island)} rows {len(island) - len(tails[0])} by the masses and "
+                            f"{len(island) - len(tails[1])} without them: the larger number counts"
+                        )
                 else:
                     tail = _by_cholesky(dense, tol)
                     methods.add(f"Cholesky with pivoting, {tol:.0e}")
                 found = _in_order(dense, tail, tol)
                 if len(found):
                     basis = _null_basis(dense, found)
+                    if unit is not scale:  # to the metric of d
+                        basis = np.linalg.qr(basis * (unit[island] / scale[island])[:, None])[0]
                     null.append((island, basis))
                     unique[island] = np.abs(basis).max(axis=1) <= UNMOVED
             dependent += island[found].tolist()
@@ -226,6 +244,54 @@ def redundancy(problem: Problem, *, tol: float = 1e-12) -> Redundancy:
         _scale=scale,
         _null=tuple(null),
     )
+
+
+def _unit(problem: Problem, scale: FloatArray) -> FloatArray:
+    """Factors (m,) that make the diagonal of A one: those of d, but where d is another number than a sound A_ii.
+
+    Beside rows of very much heavier bodies (1e20 and more) d falls back to what stands beside A_ii. Where no entry of
+    the row is above sqrt(A_ii A_jj), as in every semidefinite A, A_ii is no rounding, and the row is scaled by it.
+    """
+    if problem.matrix is None:
+        return scale
+    a = problem.csr
+    own = a.diagonal()
+    beside = abs(a).max(axis=1).toarray().ravel() if problem.m else own
+    fallen = (own > 0.0) & (own <= FALLS_BACK * beside)
+    if not fallen.any():
+        return scale
+    with np.errstate(all="ignore"):
+        tried = np.where(fallen, 1.0 / np.sqrt(np.where(fallen, own, 1.0)), scale)
+        share = (
+            abs(sp.csr_array(sp.diags_array(tried) @ a @ sp.diags_array(tried))).max(axis=1).toarray().ravel()
+        )
+    return np.where(fallen & (share <= 1.0 + SOUND), tried, scale)
+
+
+def _roots(problem: Problem) -> tuple[sp.csr_array, sp.csr_array]:
+    """Two matrices of unit rows whose rank is A's: J M^-1/2, and J with the same root of a unit mass in its place.
+
+    Each hides what is small in it: the first what heavy bodies alone would feel, the second what is small in J.
+    """
+    whole = problem.velocity_form().jacobian
+    if problem.generalized is not None:
+        bare = problem.generalized.jac
+    else:
+        rows = problem.rows
+        assert rows is not None
+        heavy = np.abs(rows.inv_inertia).max(axis=(1, 2)) if rows.n_bodies else np.zeros(0)
+        light = np.where(heavy > 0.0, heavy, 1.0)[:, None, None]
+        plain = replace(
+            rows,
+            inv_mass=(rows.inv_mass > 0.0).astype(float),
+            inv_inertia=rows.inv_inertia / light,
+            copy=False,
+        )
+        bare = Problem(problem.b, problem.cones, rows=plain, copy=False).velocity_form().jacobian
+    for squared in (False, True):  # the largest entry first: squares of large ones overflow
+        size = np.sqrt((bare * bare).sum(axis=1)) if squared else abs(bare).max(axis=1).toarray().ravel()
+        bare = sp.csr_array(sp.diags_array(1.0 / np.where(size > 0.0, size, 1.0)) @ bare)
+    return whole, bare
 
 
 def _by_qr(a: FloatArray, tol: float) -> Places:

@@ -108,7 +108,10 @@ class SolverSpec:
     install: str = ""  # what to install where they are not
     bounded: str = ""  # of a method for free rows: what to take where rows are bounded
     refusal: Callable[[Problem], str | None] | None = None  # more reasons against a problem
-    few: Few | None = None  # problems of few rows with default options, in one compiled call
+    few: Few | None = (
+        None  # problems of few rows with default options, in one compiled call; asked of our own alone
+    )
+    own = False  # of this package: others are handed copies, and what they return is checked (`lavender/foreign.py`)
 
     def __post_init__(self) -> None:
         if (
@@ -197,6 +200,7 @@ _registered: dict[str, SolverSpec] = {}
 def _load_builtin_and_plugins() -> None:
     for table in TABLES:
         for spec in importlib.import_module(table).SPECS:
+            object.__setattr__(spec, "own", True)
             _registered.setdefault(spec.name, spec)
     for entry in entry_points(group="lavender.solvers"):
         try:

@@ -48,7 +48,8 @@ class Rows:
     contact_body : array-like (c, 2) of int, optional
         Bodies a and b of each contact.
     copy : bool, default True
-        False: adopt arrays that fit, and mark them read-only.
+        True leaves the arrays given as they are. False adopts those that fit: they are shared, and marked read-only for
+        the giver, too; inertias are then taken as they are.
 
     Raises
     ------
@@ -150,6 +151,7 @@ class Rows:
                     f"contact {i}: normal {self.normal[i]} and tangent {self.tangent[i]} must be "
                     "orthogonal unit vectors"
                 )
+        object.__setattr__(self, "copy", True)  # of what was given here
 
     @property
     def n_bodies(self) -> int:

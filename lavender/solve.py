@@ -20,6 +20,7 @@ from lavender._arrays import ArrayLike, FloatArray, equal
 from lavender.certificates import check_certificate
 from lavender.cones import ROW
 from lavender.errors import CapabilityError, InputError, InUse, UnknownName
+from lavender.foreign import Foreign
 from lavender.problem import Problem
 from lavender.registry import SolverSpec, State, get
 from lavender.residuals import Residual, reference, residual, told
@@ -100,7 +101,7 @@ def solve(
     """
     spec = get(solver)
     plain = max_iter is None and time_limit is None and callback is None
-    if plain and spec.few is not None and not (options or history):
+    if plain and spec.few is not None and spec.own and not (options or history):
         made = solve_few(problem, spec, impulse, tol)
         if made is not None:
             return made
@@ -249,11 +250,12 @@ def _last_words(error: BaseException) -> str:
 def _make(spec: SolverSpec, options: dict[str, Any]) -> Any:
     factory = spec.load()
     try:
-        return factory(**options)
+        made = factory(**options)
     except (TypeError, ValueError) as error:
         if isinstance(error, InputError):
             raise
         raise InputError(f"solver {spec.name!r} cannot take the options {options}: {error}") from error
+    return made if spec.own else Foreign(spec.name, made)
 
 
 def same_structure(p: Problem, q: Problem) -> bool:

@@ -2,6 +2,7 @@
 
 import hypothesis.strategies as st
 import numpy as np
+import scipy.sparse as sp
 
 import lavender as lv
 
@@ -130,3 +131,27 @@ def box_stack(n, mass_ratio=1.0):
 def spd(n, seed=0):
     a = np.random.default_rng(seed).normal(size=(n, n))
     return a @ a.T / n + np.eye(n), np.random.default_rng(seed + 1).normal(size=n)
+
+
+def arrays_of(thing, name, seen, depth=0):
+    """(name, array) of every array that can be reached from a thing's public attributes."""
+    if isinstance(thing, np.ndarray):
+        yield name, thing
+    elif sp.issparse(thing):
+        for part in ("data", "indices", "indptr"):
+            yield f"{name}.{part}", getattr(thing, part)
+    elif type(thing).__module__.startswith("lavender") and id(thing) not in seen and depth < 4:
+        seen.add(id(thing))
+        for attribute in dir(type(thing)):
+            if attribute.startswith("__"):
+                continue
+            kind = getattr(type(thing), attribute)
+            if callable(kind) and not isinstance(kind, type):
+                continue
+            try:
+                value = getattr(thing, attribute)
+            except lv.LavenderError:
+                continue
+            yield from arrays_of(value, f"{name}.{attribute}", seen, depth + 1)
+        for attribute, value in getattr(thing, "__dict__", {}).items():
+            yield from arrays_of(value, f"{name}.{attribute}", seen, depth + 1)

@@ -20,9 +20,12 @@ from lavender._arrays import table_of
 from lavender.bench.lock import Lock
 from lavender.bench.record import CaseInfo, Done, Entry, Record, Run, Skip, from_json, to_json
 from lavender.errors import InputError, UnknownName
+from lavender.io.stored import MAX_BYTES, destination, write_atomically, write_text
 
 __all__ = ["Records", "Store", "read", "write_csv", "write_json"]
 
+MOST_LINE = 2**26  # bytes of a record; the longest of ours hold a few thousand
+BLOCK = 2**16  # bytes that are looked through at once for the end of a line
 SYNC = 1.0  # s, at most, of records that a power cut could take; a killed process takes none
 
 
@@ -160,10 +163,10 @@ class Store:
     """
 
     def __init__(self, path: str | Path) -> None:
-        self.path = Path(path)
+        self.path, real = Path(path), destination(path)
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            self._lock = Lock(self.path)
+            self._lock = Lock(real)  # one for all names of a file
             try:
                 self.records = read(self.path) if self.path.exists() else Records()
                 _cut_torn_line(self.path)
@@ -216,10 +219,16 @@ def _cut_torn_line(path: Path) -> None:
     if not path.exists():
         return
     with path.open("rb+") as f:
-        data = f.read()
-        end = data.rfind(b"\n") + 1
-        if end != len(data):
-            f.truncate(end)
+        size = end = f.seek(0, os.SEEK_END)
+        found = 0
+        while end > 0 and not found:  # from behind: a torn line is the last one
+            start = max(0, end - BLOCK)
+            f.seek(start)
+            at = f.read(end - start).rfind(b"\n")
+            found = start + at + 1 if at >= 0 else 0
+            end = start
+        if found != size:
+            f.truncate(found)
 
 
 def read(path: str | Path) -> Records:
@@ -235,15 +244,8 @@ def read(path: str | Path) -> Records:
         path = path / "records.jsonl"
     if path.exists() and not path.is_file():
         raise InputError(f"{path} is no file; a records.jsonl is needed")
-    try:
-        lines = path.read_text(encoding="utf-8", errors="replace").split("\n")
-    except OSError as error:
-        raise InputError(
-            f"cannot read {path} ({error.strerror or error}); a records.jsonl is needed"
-        ) from None
     found = Records(source=str(path))
-    lines.pop()  # without a newline: empty, or torn
-    for number, line in enumerate(lines, 1):
+    for number, line in enumerate(_lines(path), 1):
         if not line.strip():
             continue
         try:
@@ -263,17 +265,44 @@ def read(path: str | Path) -> Records:
     return found
 
 
+def _lines(path: Path) -> Iterator[str]:
+    """Lines of a file, one after the other; the last one without a newline, which is torn, is left out."""
+    try:
+        size = path.stat().st_size
+        if size > MAX_BYTES:
+            raise InputError(
+                f"{path} holds {size} bytes, more than {MAX_BYTES}; a records.jsonl is needed, of fewer cases"
+            )
+        with path.open("rb") as f:
+            while line := f.readline(MOST_LINE):
+                if not line.endswith(b"\n"):
+                    if len(line) == MOST_LINE:
+                        raise InputError(
+                            f"{path} has a line of more than {MOST_LINE} bytes; a records.jsonl is needed"
+                        )
+                    return
+                yield line[:-1].decode("utf-8", errors="replace")
+    except OSError as error:
+        raise InputError(
+            f"cannot read {path} ({error.strerror or error}); a records.jsonl is needed"
+        ) from None
+
+
 def write_csv(records: Records, path: str | Path) -> None:
     """One row for each record; `work`, `options` and `versions` are JSON in their cells."""
     rows = records.rows()
     columns = list(rows[0]) if rows else [f.name for f in fields(Record)]
-    with Path(path).open("w", newline="", encoding="utf-8") as f:
-        writer = csv.DictWriter(f, columns)
-        writer.writeheader()
-        for row in rows:
-            writer.writerow(
-                {k: json.dumps(v, default=str) if isinstance(v, dict) else v for k, v in row.items()}
-            )
+
+    def write(part: Path) -> None:
+        with part.open("w", newline="", encoding="utf-8") as f:
+            writer = csv.DictWriter(f, columns)
+            writer.writeheader()
+            for row in rows:
+                writer.writerow(
+                    {k: json.dumps(v, default=str) if isinstance(v, dict) else v for k, v in row.items()}
+                )
+
+    write_atomically(path, write)
 
 
 def write_json(records: Records, path: str | Path) -> None:
@@ -291,4 +320,4 @@ def write_json(records: Records, path: str | Path) -> None:
             for entry, r in zip(plain(records.records), records.records, strict=True)
         ],
     }
-    Path(path).write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    write_text(path, json.dumps(content, indent=1, allow_nan=False) + "\n")

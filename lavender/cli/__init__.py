@@ -3,7 +3,11 @@
 What a command needs is imported when it runs, so that --help is quick.
 """
 
-from lavender.cli.entry import cli, main
-from lavender.cli.options import EXIT_BAD_INPUT, EXIT_INFEASIBLE, EXIT_INTERRUPTED, EXIT_UNMET
+from lavender import _starting
+
+_starting.begin()  # until `main` takes over
+
+from lavender.cli.entry import cli, main  # noqa: E402
+from lavender.cli.options import EXIT_BAD_INPUT, EXIT_INFEASIBLE, EXIT_INTERRUPTED, EXIT_UNMET  # noqa: E402
 
 __all__ = ["EXIT_BAD_INPUT", "EXIT_INFEASIBLE", "EXIT_INTERRUPTED", "EXIT_UNMET", "cli", "main"]

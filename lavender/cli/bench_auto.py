@@ -15,6 +15,7 @@ from lavender.bench.rates import moved
 from lavender.bench.regret import Regret, regrets, summary
 from lavender.bench.running.campaign import seeds as from_seeds
 from lavender.errors import InputError
+from lavender.io.stored import write_text
 from lavender.problem import Problem
 from lavender.report.regret import rates, table
 
@@ -93,4 +94,4 @@ def auto(
         if found:
             click.echo(table(found, worst))
             if out is not None:
-                out.write_text(json.dumps([asdict(r) for r in found], indent=1) + "\n", encoding="utf-8")
+                write_text(out, json.dumps([asdict(r) for r in found], indent=1) + "\n")

@@ -11,6 +11,7 @@ import click
 from lavender.bench.machine import cpu_name, versions
 from lavender.bench.simulators import Step, WarmStep, measure, measure_warm
 from lavender.errors import LavenderError
+from lavender.io.stored import write_text
 from lavender.report.simulators import table, warm_table
 
 __all__ = ["mujoco"]
@@ -46,7 +47,7 @@ def mujoco(models: tuple[Path, ...], steps: int, every: int, warm: int, out: Pat
         lines = [json.dumps({"cpu": cpu_name(), **versions(("mujoco", "numpy"))})]
         lines += [json.dumps(asdict(s)) for s in found]
         lines += [json.dumps(asdict(w)) for w in consecutive]
-        out.write_text("\n".join(lines) + "\n", encoding="utf-8")
+        write_text(out, "\n".join(lines) + "\n")
     click.echo(table(found))
     if consecutive:
         click.echo(f"\n{warm_table(consecutive)}")

@@ -13,6 +13,7 @@ from lavender.bench import peers as bench_peers
 from lavender.bench.peers import adapters, race
 from lavender.bench.peers import engines as peer_engines
 from lavender.bench.peers.contest import Result
+from lavender.io.stored import write_text
 from lavender.report.compared import engines_table, solvers_tables
 
 __all__ = ["peers"]
@@ -100,4 +101,4 @@ def peers(
 
 def _write(out: Path | None, record: dict[str, Any]) -> None:
     if out is not None:
-        out.write_text(json.dumps(record, indent=1))
+        write_text(out, json.dumps(record, indent=1))

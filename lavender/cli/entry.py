@@ -9,6 +9,7 @@ from collections.abc import Sequence
 
 import click
 
+from lavender import _starting
 from lavender._version import __version__
 from lavender.cli.bench import bench
 from lavender.cli.cases import cases
@@ -39,6 +40,7 @@ for _command in (report, bench, check, solve, reference, solvers, cases, run, re
 
 def main(args: Sequence[str] | None = None) -> None:
     """Entry point: what lavender raises on purpose becomes one line and status 2."""
+    _starting.end()
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # names of files may be of bytes that are no text
@@ -59,6 +61,9 @@ def main(args: Sequence[str] | None = None) -> None:
         # `lavender solvers | head`: nobody reads any more.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         code = 0
+    except MemoryError as error:
+        click.echo(f"lavender: not enough memory ({error or 'none left'}): give a smaller problem", err=True)
+        code = EXIT_BAD_INPUT
     except OSError as error:  # a full disk behind stdout, for one
         click.echo(f"lavender: {error}", err=True)
         code = EXIT_BAD_INPUT

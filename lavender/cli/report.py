@@ -20,6 +20,7 @@ from lavender.cli.options import (
     plan_options,
 )
 from lavender.errors import InputError
+from lavender.io.stored import write_text
 
 __all__ = ["report"]
 
@@ -200,7 +201,7 @@ def _recorded(word: str, out: Path, steps: int, every: int, controls: str, fresh
             highlight=False,
             markup=False,
         )
-        how.write_text(asked, encoding="utf-8")
+        write_text(how, asked)
     return str(folder)
 
 

@@ -10,6 +10,7 @@ import click
 
 from lavender.cli.options import EXIT_INFEASIBLE, EXIT_INTERRUPTED, EXIT_UNMET, one_thread
 from lavender.errors import InputError
+from lavender.io.stored import destination, write_atomically
 
 __all__ = ["solve"]
 
@@ -75,8 +76,8 @@ def solve(
     if output is not None:
         import numpy as np
 
-        try:
-            with output.open("wb") as f:
+        def write(part: Path) -> None:
+            with part.open("wb") as f:
                 np.savez(
                     f,
                     impulse=solution.impulse,
@@ -92,8 +93,8 @@ def solve(
                     setup_time=solution.setup_time,
                     solve_time=solution.solve_time,
                 )
-        except OSError as error:
-            raise _unwritable(output, error) from None
+
+        write_atomically(output, write)
         click.echo(f"written: {output}")
     if solution.status.name == "INTERRUPTED":
         raise click.exceptions.Exit(EXIT_INTERRUPTED)
@@ -108,17 +109,16 @@ def solve(
         raise click.exceptions.Exit(EXIT_UNMET)
 
 
-def _unwritable(path: Path, error: OSError) -> InputError:
-    return InputError(f"cannot write {path} ({error.strerror or error}): give a path that you may write to")
-
-
 def _check_writable(path: Path) -> None:
     # Opened for appending: what is there stays, and nothing is left where nothing was.
-    existed = path.exists()
+    target = destination(path)
+    existed = target.exists()
     try:
-        with path.open("ab"):
+        with target.open("ab"):
             pass
     except OSError as error:
-        raise _unwritable(path, error) from None
+        raise InputError(
+            f"cannot write {path} ({error.strerror or error}): give a path that you may write to"
+        ) from None
     if not existed:
-        path.unlink()
+        target.unlink()

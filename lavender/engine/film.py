@@ -10,7 +10,6 @@ from __future__ import annotations
 import json
 import threading
 from os import PathLike
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,7 +18,7 @@ from lavender._arrays import FloatArray
 from lavender.engine.layout import HEAD, JOINT
 from lavender.engine.state import State
 from lavender.errors import InputError
-from lavender.io.stored import write_atomically
+from lavender.io.stored import whole_file, write_bytes
 from lavender.scene import Scene
 
 __all__ = ["Film"]
@@ -110,12 +109,7 @@ class Film:
         InputError
             A path that cannot be written.
         """
-        data = self.to_bytes()
-
-        def write(part: Path) -> None:
-            part.write_bytes(data)
-
-        write_atomically(path, write)
+        write_bytes(path, self.to_bytes())
 
     def to_bytes(self) -> bytes:
         """The bytes of a file."""
@@ -131,12 +125,7 @@ class Film:
         InputError
             No such file, or no film.
         """
-        try:
-            if not Path(path).is_file():
-                raise InputError(f"{str(path)!r} is no file")
-            data = Path(path).read_bytes()
-        except OSError as error:
-            raise InputError(f"cannot read the film {str(path)!r}: {error.strerror or error}") from None
+        data = whole_file(path, "the film")
         start = len(MAGIC) + 8
         end = start + int.from_bytes(data[len(MAGIC) : start], "little")
         try:

@@ -16,7 +16,7 @@ from lavender._arrays import FloatArray
 from lavender.engine.film import Film
 from lavender.engine.layout import BOX, PLANE, SPHERE
 from lavender.errors import InputError
-from lavender.io.stored import write_atomically
+from lavender.io.stored import write_atomically, write_figure
 from lavender.scene.parts import rotation
 
 __all__ = ["PICTURES", "save_picture"]
@@ -172,7 +172,7 @@ def _strip(stage: _Stage, path: Path, count: int, size: float) -> None:
     canvas = Figure(figsize=(size * len(chosen), height), layout="constrained")
     for axes, frame in zip(np.atleast_1d(canvas.subplots(1, len(chosen))), chosen, strict=True):
         stage.paint(axes, int(frame))
-    write_atomically(path, lambda part: canvas.savefig(part, format=path.suffix[1:].lower(), dpi=150))
+    write_figure(canvas, path, dpi=150)
 
 
 def _animate(stage: _Stage, path: Path, size: float, rate: int) -> None:
@@ -188,10 +188,14 @@ def _animate(stage: _Stage, path: Path, size: float, rate: int) -> None:
     writer = PillowWriter(fps=rate)
 
     def write(part: Path) -> None:
-        with writer.saving(canvas, str(part) + ".gif", dpi=80):
-            for frame in chosen:
-                stage.paint(axes, int(frame))
-                writer.grab_frame()
-        Path(str(part) + ".gif").replace(part)
+        made = Path(f"{part}.gif")  # whose suffix tells the format
+        try:
+            with writer.saving(canvas, str(made), dpi=80):
+                for frame in chosen:
+                    stage.paint(axes, int(frame))
+                    writer.grab_frame()
+            made.replace(part)
+        finally:
+            made.unlink(missing_ok=True)
 
     write_atomically(path, write)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from os import PathLike
@@ -17,6 +16,7 @@ from lavender._arrays import FloatArray
 from lavender.engine.picture import PICTURES, save_picture
 from lavender.engine.simulation import SOLVER_FIELDS, Simulation
 from lavender.errors import InputError
+from lavender.io.stored import write_figure, write_text
 from lavender.scene import Scene
 from lavender.scene.parts import whole
 
@@ -52,15 +52,11 @@ class Trace:
         InputError
             A path that cannot be written.
         """
-        try:
-            with open(path, "w", newline="") as stream:
-                write = csv.writer(stream)
-                write.writerow(["step", "time", *SOLVER_FIELDS, "depth", "cost", "order"])
-                for i in range(len(self)):
-                    row = [self.time[i], *self.solver[i], self.depth[i], self.cost[i]]
-                    write.writerow([i + 1, *(repr(float(x)) for x in row), self.order])
-        except OSError as error:
-            raise InputError(f"cannot write {str(path)!r}: {error.strerror}") from None
+        lines = [["step", "time", *SOLVER_FIELDS, "depth", "cost", "order"]]
+        for i in range(len(self)):
+            row = [self.time[i], *self.solver[i], self.depth[i], self.cost[i]]
+            lines.append([str(i + 1), *(repr(float(x)) for x in row), self.order])
+        write_text(path, "".join(",".join(line) + "\r\n" for line in lines))
 
     def plot(self, path: str | PathLike[str]) -> None:
         """Residuals, contacts with matches, and depth over time, as a figure.
@@ -88,10 +84,7 @@ class Trace:
             axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8, frameon=False)
         bottom.plot(self.time, 1e3 * self.depth)
         bottom.set(title="deepest penetration", xlabel="time [s]", ylabel="[mm]", ylim=(0, None))
-        try:
-            canvas.savefig(path)
-        except (OSError, ValueError) as error:
-            raise InputError(f"cannot write the figure {str(path)!r}: {error}") from None
+        write_figure(canvas, path)
 
 
 def run(

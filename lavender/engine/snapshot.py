@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import stat
 from dataclasses import dataclass, field
 from os import PathLike, fsync
 from pathlib import Path
@@ -20,7 +19,7 @@ import numpy as np
 from lavender.engine.check import well_formed
 from lavender.engine.layout import N_SIZES
 from lavender.errors import InputError
-from lavender.io.stored import write_atomically
+from lavender.io.stored import whole_file, write_atomically
 from lavender_ext.engine.arrays import lengths
 
 __all__ = ["Snapshot"]
@@ -128,13 +127,7 @@ def _path(path: str | PathLike[str]) -> Path:
 
 
 def _read(path: str | PathLike[str]) -> bytes:
-    found = _path(path)
-    try:
-        if not stat.S_ISREG(found.stat().st_mode):  # a pipe or a device has no end
-            raise InputError(f"cannot read the snapshot {str(path)!r}: it is no file")
-        return found.read_bytes()
-    except OSError as error:
-        raise InputError(f"cannot read the snapshot {str(path)!r}: {error.strerror or error}") from None
+    return whole_file(_path(path), "the snapshot")
 
 
 def _write(part: Path, data: bytes) -> None:

@@ -27,7 +27,7 @@ import numpy as np
 from lavender._arrays import FloatArray
 from lavender.cones import Cones
 from lavender.errors import CapabilityError, InputError
-from lavender.io.pinocchio import closing_speed
+from lavender.io.pinocchio import closing_speed, told
 from lavender.problem import Problem
 
 __all__ = ["from_drake"]
@@ -83,6 +83,16 @@ def from_drake(
         raise InputError(
             f"got a {type(plant).__name__} and a {type(context).__name__}; a MultibodyPlant and its Context are needed"
         )
+    with told(
+        "Drake",
+        "Give a finalised plant with its scene graph connected, and its own context of finite numbers",
+    ):
+        return _problem(plant, context, dt, friction, compliance, correction, name)
+
+
+def _problem(
+    plant: Any, context: Any, dt: Any, friction: str, compliance: Any, correction: Any, name: str
+) -> Problem:
     step = float(plant.time_step())
     if not step > 0.0:
         raise InputError(

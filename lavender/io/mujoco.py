@@ -36,16 +36,15 @@ Differences to know:
 - It evaluates accelerations at the start of the step: v + dt a is the velocity after the step only for the Euler
   integrator without implicit damping. The pass of `noslip_iterations` comes after the problem and is not in it.
 
-What MuJoCo holds is checked against itself: M a0 must be its smooth force, 1 / R its efc_D, and J (a - a0) must be
-J M^-1 J^T f as far as its solver has come. Data of another problem than M's are refused, with the option that makes
-them.
+What MuJoCo holds is checked against itself: every index before it is followed; M a0 must be its smooth force, 1 / R its
+efc_D; J must be the matrix that made its efc_vel, efc_b and qfrc_constraint; and J (a - a0) must be J M^-1 J^T f as far
+as its solver has come. Data of another problem than M's are refused, with the option that makes them.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
@@ -66,6 +65,13 @@ UNSOLVED = (
 )
 SAME = 1e-9  # -, R D - 1
 UNSEEN = 1e-8  # m/s: what differs by less is nothing that happens (six boxes at rest: about 1e-9)
+SUMMED = (
+    2.0**-40
+)  # of the terms' size: sums of 1,000 of them in another order; what was changed is off by far more
+# Bytes of MuJoCo's memory that a row (12 numbers and more), a contact and an entry of efc_J with its column take.
+ROW_BYTES, CONTACT_BYTES, ENTRY_BYTES = 128, 512, 12
+CHANGED = "MjData was changed since its forward pass, or is of another model: run mj_forward"
+OTHER_MODEL = "The model was changed, or MjData is of another one: give a model and data made from it"
 _CODES = (
     "mjCNSTR_EQUALITY",
     "mjCNSTR_FRICTION_DOF",
@@ -78,6 +84,7 @@ _CODES = (
 )
 
 
+@np.errstate(over="ignore", invalid="ignore")  # what is not finite is refused
 def from_mujoco(model: Any, data: Any, *, name: str = "mujoco") -> Problem:
     """The constraint problem that MuJoCo solved last, in impulses and velocities; see the module.
 
@@ -99,32 +106,35 @@ def from_mujoco(model: Any, data: Any, *, name: str = "mujoco") -> Problem:
     Raises
     ------
     InputError
-        Not a model and its data, or before `mj_forward`.
+        Not a model and its data, or before `mj_forward`; a step that is no time; numbers that are not finite; indices
+        (`efc_id`, `contact.dim`, `efc_J_colind`, ...) that name what is not there.
     CapabilityError
         The data belong to another problem than J, M and R: an integrator that treats damping inside M
-        (`integrator="discrete"`), or a copy that lacks what the problem needs.
+        (`integrator="discrete"`), a Jacobian that is not the one of the forward pass (`opt.jacobian` changed since),
+        or a copy that lacks what the problem needs.
     """
     mj = _mujoco(model, data)
-    m, n, dt = int(data.nefc), int(model.nv), float(model.opt.timestep)
-    smooth, force = data.qacc_smooth, data.efc_force[:m]
+    opt = model.opt
+    m, n, dt = int(data.nefc), int(model.nv), _timestep(opt)
+    smooth, force = data.qacc_smooth, data.efc_force
     mass = _mass(mj, model, data)
-    held = _Held.of(data, m)
-    cones, scale, key = _blocks(mj, data, held, m, dt)
+    held = _Held.of(data)
+    cones, scale, key = _blocks(mj, model, data, held, dt)
     jac = _rows(mj, model, data, m, n, scale)
     _check_smooth(model, data, mass, smooth)
     free = dt * smooth
     general = Generalized.compressed(jac, mass, data.qvel + free)
-    own, target, softness, gap = export.numbers(
-        force, data.efc_aref[:m], data.efc_R[:m], data.efc_D[:m], scale, dt
-    )
-    noslip = int(model.opt.noslip_iterations) > 0
-    if m and not noslip:
-        _check_forces(model, data, general, jac, own, smooth, dt)
+    own, target, softness, gap = export.numbers(force, data.efc_aref, data.efc_R, data.efc_D, scale, dt)
+    rhs = general.operator.bias(free if general.order is None else free[general.order], target)
+    noslip = opt.noslip_iterations > 0
+    # After a step v is that of the step's end; only Euler's tells by how much it has moved since.
+    euler = opt.integrator == _euler(mj)
+    _check_jacobian(model, data, general, jac, scale, rhs, own, smooth, free, dt, euler, noslip)
     return Problem(
-        target - general.velocity_of(free),
+        rhs,
         cones,
         generalized=general,
-        compliance=softness if gap <= SAME else _compliance(data, m) * scale * scale,
+        compliance=softness if gap <= SAME else _compliance(data) * scale * scale,
         friction="cone",
         guess=None if noslip else own,
         key=key,
@@ -134,6 +144,7 @@ def from_mujoco(model: Any, data: Any, *, name: str = "mujoco") -> Problem:
     )
 
 
+@np.errstate(over="ignore", invalid="ignore")
 def impulse(model: Any, data: Any) -> FloatArray:
     """MuJoCo's own answer as impulses of the problem's rows (m,) [N s]: dt efc_force over `scaling`.
 
@@ -145,9 +156,9 @@ def impulse(model: Any, data: Any) -> FloatArray:
         Not a model and its data.
     """
     mj = _mujoco(model, data)
-    m, dt = int(data.nefc), float(model.opt.timestep)
-    scale = _blocks(mj, data, _Held.of(data, m), m, dt)[1]
-    return np.divide(dt * data.efc_force[:m], scale, out=np.zeros(m), where=scale != 0.0)
+    dt = _timestep(model.opt)
+    scale = _blocks(mj, model, data, _Held.of(data), dt)[1]
+    return np.divide(dt * data.efc_force, scale, out=np.zeros(len(scale)), where=scale != 0.0)
 
 
 def scaling(model: Any, data: Any) -> FloatArray:
@@ -161,8 +172,7 @@ def scaling(model: Any, data: Any) -> FloatArray:
         Not a model and its data.
     """
     mj = _mujoco(model, data)
-    m = int(data.nefc)
-    return _blocks(mj, data, _Held.of(data, m), m, float(model.opt.timestep))[1]
+    return _blocks(mj, model, data, _Held.of(data), _timestep(model.opt))[1]
 
 
 def acceleration(model: Any, data: Any, impulse: Any) -> FloatArray:
@@ -175,11 +185,10 @@ def acceleration(model: Any, data: Any, impulse: Any) -> FloatArray:
     """
     mj = _mujoco(model, data)
     lam = np.asarray(impulse, float)
-    if lam.shape != (int(data.nefc),):
-        raise InputError(
-            f"impulse has shape {lam.shape}; ({int(data.nefc)},) is needed, one for each row of efc_J"
-        )
-    push = (jacobian(model, data).T @ (scaling(model, data) * lam))[None, :] / float(model.opt.timestep)
+    m = int(data.nefc)
+    if lam.shape != (m,):
+        raise InputError(f"impulse has shape {lam.shape}; ({m},) is needed, one for each row of efc_J")
+    push = (jacobian(model, data).T @ (scaling(model, data) * lam))[None, :] / _timestep(model.opt)
     change = np.zeros_like(push)
     mj.mj_solveM(model, data, change, np.ascontiguousarray(push))
     return np.array(data.qacc_smooth, float) + change[0]
@@ -194,18 +203,9 @@ def jacobian(model: Any, data: Any) -> sp.csr_array:
         Not a model and its data.
     """
     mj = _mujoco(model, data)
-    m, nv = int(data.nefc), int(model.nv)
-    values = np.array(data.efc_J, float).ravel()
-    if not mj.mj_isSparse(model):
-        return sp.csr_array(values[: m * nv].reshape(m, nv))
-    count = np.array(data.efc_J_rownnz[:m], np.int64)
-    first = np.array(data.efc_J_rowadr[:m], np.int64)
-    indptr = np.concatenate([[0], np.cumsum(count)])
-    at = np.arange(indptr[-1]) + np.repeat(first - indptr[:-1], count)
-    columns = np.array(data.efc_J_colind, np.int64).ravel()[at]
-    jac = sp.csr_array((values[at], columns, indptr), shape=(m, nv))
-    jac.sort_indices()
-    return jac
+    m, n = int(data.nefc), int(model.nv)
+    indptr, indices, values = _rows(mj, model, data, m, n, np.ones(m))
+    return sp.csr_array((values, indices, indptr), shape=(m, n))
 
 
 def _mujoco(model: Any, data: Any) -> Any:
@@ -223,6 +223,13 @@ def _mujoco(model: Any, data: Any) -> Any:
         )
     if len(data.qacc_smooth) != model.nv:
         raise InputError(f"the data has {len(data.qacc_smooth)} degrees of freedom, the model {model.nv}")
+    m, contacts, entries = data.nefc, data.ncon, getattr(data, "nJ", 0)
+    needed = m * ROW_BYTES + contacts * CONTACT_BYTES + entries * ENTRY_BYTES
+    if min(m, contacts, entries) < 0 or needed > data.parena:  # where its arrays end, for whoever reads them
+        raise InputError(
+            f"nefc = {m}, ncon = {contacts}, nJ = {entries}: what this MjData has allocated ({data.parena} bytes) does "
+            f"not hold as many. {CHANGED}"
+        )
     return mj
 
 
@@ -231,38 +238,72 @@ def _codes(mj: Any) -> Any:
     return read_only(np.array([int(getattr(mj.mjtConstraint, name)) for name in _CODES], np.int32))
 
 
+def _timestep(opt: Any) -> float:
+    dt = float(opt.timestep)
+    if not 0.0 < dt < np.inf:
+        raise InputError(f"opt.timestep is {dt} s; a step above 0 is needed")
+    return dt
+
+
+@cache
+def _euler(mj: Any) -> int:
+    return int(mj.mjtIntegrator.mjINT_EULER)
+
+
 def _mass(mj: Any, model: Any, data: Any) -> Any:
     """(indptr, indices, data) of M's lower triangle."""
     if hasattr(data, "M") and hasattr(model, "M_rownnz"):
-        indptr = export.row_pointers(model.M_rowadr, model.M_rownnz)
-        if indptr is not None:
-            return indptr, np.array(model.M_colind, np.int32), np.array(data.M, float)
-    whole = np.zeros((int(model.nv), int(model.nv)))
-    if hasattr(data, "qM"):
-        mj.mj_fullM(model, whole, data.qM)
-    else:
-        mj.mj_fullM(model, data, whole)
+        columns, values = np.array(model.M_colind, np.int32), np.array(data.M, float)
+        indptr = export.lower_pointers(model.M_rowadr, model.M_rownnz, columns, len(values))
+        if indptr is None:
+            raise InputError(f"M_rowadr, M_rownnz and M_colind are no lower triangle of M. {OTHER_MODEL}")
+        return indptr, columns, values
+    n = int(model.nv)
+    parent = np.asarray(model.dof_parentid)
+    if (
+        np.any((parent < -1) | (parent >= np.arange(n)))
+        or not 0 <= np.min(model.dof_Madr, initial=0) <= len(data.qM) - n
+    ):
+        raise InputError(f"dof_parentid and dof_Madr are no tree of velocities. {OTHER_MODEL}")
+    whole = np.zeros((n, n))
+    mj.mj_fullM(model, whole, data.qM)
     return lower_of_dense(whole)[0]
 
 
 def _rows(mj: Any, model: Any, data: Any, m: int, n: int, scale: FloatArray) -> Any:
     """(indptr, indices, data) of J, scaled by row."""
+    values = np.ravel(data.efc_J)
     if not mj.mj_isSparse(model):
-        return export.rows_of_dense(np.ravel(data.efc_J), m, n, scale)
-    count = np.ascontiguousarray(data.efc_J_rownnz[:m], np.int32)
-    first = np.ascontiguousarray(data.efc_J_rowadr[:m], np.int32)
+        if len(values) < m * n:
+            raise InputError(
+                f"efc_J holds {len(values)} numbers; {m} x {n} are needed where opt.jacobian says dense. {CHANGED}"
+            )
+        return export.rows_of_dense(values, m, n, scale)
+    count = np.ascontiguousarray(data.efc_J_rownnz, np.int32)
+    first = np.ascontiguousarray(data.efc_J_rowadr, np.int32)
     columns = np.ascontiguousarray(np.ravel(data.efc_J_colind), np.int32)
-    found = export.rows_of_sparse(np.ravel(data.efc_J), count, first, columns, scale)
+    if not len(count) == len(first) == m:
+        raise InputError(
+            f"efc_J_rownnz and efc_J_rowadr hold {len(count)} and {len(first)} of {m} rows. {CHANGED}"
+        )
+    found = export.rows_of_sparse(values, count, first, columns, scale, n)
+    if isinstance(found, int):
+        raise InputError(
+            f"row {found} of efc_J has {count[found]} entries from place {first[found]} of {len(columns)}, in columns "
+            f"of {n}: it names what is not there. {CHANGED}"
+        )
     if found is None:
-        whole = sp.csr_array(sp.diags_array(scale) @ jacobian(model, data))
-        whole.sort_indices()
+        indptr = np.concatenate([[0], np.cumsum(count, dtype=np.int64)])
+        at = np.arange(indptr[-1]) + np.repeat(first - indptr[:-1], count)
+        whole = sp.csr_array((values[at] * np.repeat(scale, count), columns[at], indptr), shape=(m, n))
+        whole.sum_duplicates()
         found = (whole.indptr.astype(np.int32), whole.indices.astype(np.int32), whole.data)
     return found
 
 
-def _compliance(data: Any, m: int) -> FloatArray:
+def _compliance(data: Any) -> FloatArray:
     """R (m,) [1/kg] where efc_R and 1 / efc_D are not the same: the latter where a copy did not fill the former."""
-    r, inverse = data.efc_R[:m], data.efc_D[:m]
+    r, inverse = data.efc_R, data.efc_D
     empty = r == 0.0
     if np.any(inverse <= 0.0) or np.any(np.abs(r * inverse - 1.0)[~empty] > SAME):
         raise CapabilityError(
@@ -282,18 +323,41 @@ def _check_smooth(model: Any, data: Any, mass: Any, smooth: Any) -> None:
         )
 
 
-def _check_forces(
-    model: Any, data: Any, general: Generalized, jac: Any, own: FloatArray, smooth: Any, dt: float
-) -> None:
-    """J a must be J (a0 + M^-1 J^T f), as far as MuJoCo's solver has come, measured by |J| |a|."""
-    gap = export.row_mismatch(*jac, np.ascontiguousarray(data.qacc), smooth + general.change(own) / dt)
-    if not gap <= UNSOLVED:
-        moved = dt * (
-            general.velocity_of(np.array(data.qacc, float) - smooth)
-            - general.velocity_of(general.change(own) / dt)
+def _check_jacobian(
+    model: Any, data: Any, general: Generalized, jac: Any, scale: Any, rhs: Any, own: Any, smooth: Any,
+    free: Any, dt: float, euler: bool, noslip: bool,
+) -> None:  # fmt: skip
+    """J must be the matrix that made what MuJoCo made by it, and accelerations those of its forces.
+
+    efc_vel, efc_b and qfrc_constraint as far as rounding lets them; J a as J (a0 + M^-1 J^T f), as far as MuJoCo's
+    solver has come, measured by |J| |a|.
+    """
+    acceleration = data.qacc
+    reached = smooth + general.change(own) / dt
+    velocity, row, push, gap = export.row_gaps(
+        *jac, scale, rhs, own, dt, euler, data.qvel, data.efc_vel, free, data.efc_b, data.qfrc_constraint,
+        acceleration, reached,
+    )  # fmt: skip
+    for found, words in (
+        (velocity, "J qvel and efc_vel"),
+        (row, "J qacc_smooth - efc_aref and efc_b"),
+        (push, "efc_force . J qacc and qacc . qfrc_constraint"),
+    ):
+        if not found <= SUMMED:
+            raise CapabilityError(
+                f"{words} differ by {found:.1e} of their size: efc_J is not the Jacobian of this forward pass. "
+                f"{CHANGED} (also where opt.jacobian, which says how efc_J is laid out, was changed)"
+            )
+    if not np.isfinite(gap):
+        raise InputError(
+            "qacc holds numbers that are not finite: the simulation has diverged, or was changed"
         )
-        if np.abs(moved).max() <= UNSEEN:
-            return
+    if noslip or gap <= UNSOLVED:
+        return
+    moved = dt * (
+        general.velocity_of(np.array(acceleration) - smooth) - general.velocity_of(reached - smooth)
+    )
+    if np.abs(moved).max() > UNSEEN:
         raise CapabilityError(
             f"J (qacc - qacc_smooth) differs from J M^-1 J^T efc_force by {gap:.1e} of their size: the accelerations "
             f"are not those of these forces. {_reason(model)}"
@@ -311,8 +375,7 @@ def _reason(model: Any) -> str:
     )
 
 
-@dataclass(frozen=True)
-class _Held:
+class _Held(NamedTuple):
     """What blocks and their names depend on, copied, for the data go on."""
 
     types: IntArray  # (m,)
@@ -321,31 +384,40 @@ class _Held:
     geom: IntArray  # (c, 2)
 
     @classmethod
-    def of(cls, data: Any, m: int) -> _Held:
+    def of(cls, data: Any) -> _Held:
         contact = data.contact
         return cls(
-            np.array(data.efc_type[:m], np.int32),
-            np.array(data.efc_id[:m], np.int32),
+            np.array(data.efc_type, np.int32),
+            np.array(data.efc_id, np.int32),
             np.array(contact.dim, np.int32),
             np.array(contact.geom, np.int32).reshape(-1, 2),
         )
 
 
-def _blocks(mj: Any, data: Any, held: _Held, m: int, dt: float) -> tuple[Cones, FloatArray, Any]:
+def _blocks(mj: Any, model: Any, data: Any, held: _Held, dt: float) -> tuple[Cones, FloatArray, Any]:
     """Cones, factor of each row, key of each block."""
+    contacts, tendons = len(held.dim), model.ntendon
+    most = (model.neq, model.nv, tendons, model.njnt, tendons, contacts, contacts, contacts)
     found = export.blocks(
         held.types,
         held.ids,
         _codes(mj),
+        most,
         held.dim,
         np.ascontiguousarray(data.contact.friction, float).reshape(-1, 5),
         held.geom,
-        np.ascontiguousarray(data.efc_frictionloss[:m], float),
+        np.ascontiguousarray(data.efc_frictionloss, float),
         dt,
     )
     if isinstance(found, int):
-        raise CapabilityError(
-            f"constraint row {found} is of type {held.types[found]}, which is not known here"
+        of, which, known = int(held.types[found]), int(held.ids[found]), _codes(mj).tolist()
+        if of not in known:
+            raise CapabilityError(f"constraint row {found} is of type {of}, which is not known here")
+        there = most[known.index(of)]
+        dim = f", of condim {held.dim[which]}" if known.index(of) > 4 and 0 <= which < there else ""
+        raise InputError(
+            f"constraint row {found} of {len(held.types)} is of type {of} and names number {which} of {there}{dim}: "
+            f"that is not there, or has not so many rows. {CHANGED}"
         )
     ptr, kind, lower, upper, mu, scale, key = found
     return Cones._trusted(ptr, kind, lower, upper, mu, np.zeros(len(mu))), scale, key

@@ -15,18 +15,21 @@ A contact's z axis points from the first joint's side to the second's: w > 0 alo
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
 
 from lavender._arrays import as_array
 from lavender.cones import Cones
-from lavender.errors import CapabilityError, InputError
+from lavender.errors import CapabilityError, InputError, LavenderError
 from lavender.problem import Problem
 
 __all__ = ["from_pinocchio"]
 
+OTHER_MODEL = "A model was changed, or the data are of another one: give data made from this model"
+UNIT = 1e-6  # -, by which quaternions may be off: J of another is no velocity's
 UNSEEN = 1e-9  # -, of |M| |a| + |tau - h|: M a must be what aba solved for
 
 
@@ -53,7 +56,8 @@ def from_pinocchio(
     data : pinocchio.Data
         Computed anew at q and v.
     constraint_models, constraint_datas : sequence
-        Of Pinocchio 4: anchors, contacts, joint limits, joint friction, plain or as `ConstraintModel`; calculated anew.
+        Of Pinocchio 4: anchors, contacts, joint limits, joint friction, plain or as `ConstraintModel`; calculated anew,
+        in data of their own.
     dt : float, s
     q : (nq,)
     v : (nv,) m/s, rad/s
@@ -85,22 +89,34 @@ def from_pinocchio(
         raise InputError(
             f"got a {type(model).__name__} and a {type(data).__name__}; a pinocchio.Model and its Data are needed"
         )
+    for word, given in (("models", constraint_models), ("data", constraint_datas)):
+        if not (hasattr(given, "__len__") and hasattr(given, "__iter__")):
+            raise InputError(f"constraint {word}: got a {type(given).__name__}; a sequence is needed")
     if len(constraint_models) != len(constraint_datas):
         raise InputError(
             f"{len(constraint_datas)} constraint data for {len(constraint_models)} models; one for each is needed"
         )
-    dt, correction = float(dt), float(correction)
+    try:
+        dt, correction = float(dt), float(correction)
+    except (TypeError, ValueError):
+        raise InputError(f"dt is {dt!r}, correction {correction!r}; numbers are needed") from None
     if not 0.0 < dt < math.inf or not 0.0 <= correction <= 1.0:
         raise InputError(
             f"dt is {dt:g} s, correction {correction:g}; a time above 0 and a share in [0, 1] are needed"
         )
+    _check_model(model, data)
     nv = int(model.nv)
     q = np.array(as_array("q", q, (int(model.nq),)))
     v = np.array(as_array("v", v, (nv,), unit="m/s, rad/s"))
     tau = np.array(as_array("tau", 0.0 if tau is None else tau, (nv,), unit="N, N m"))
-    a = np.array(pin.aba(model, data, q, v, tau))
-    force = tau - np.array(pin.nle(model, data, q, v))
-    upper = np.triu(np.array(pin.crba(model, data, q)))
+    if not pin.isNormalized(model, q, UNIT):
+        raise InputError(
+            "q holds a rotation that is none: pinocchio.normalize(model, q) makes quaternions unit ones"
+        )
+    with told("Pinocchio", OTHER_MODEL):
+        a = np.array(pin.aba(model, data, q, v, tau))
+        force = tau - np.array(pin.nle(model, data, q, v))
+        upper = np.triu(np.array(pin.crba(model, data, q)))
     mass = upper + np.triu(upper, 1).T
     if np.abs(mass @ a - force).max(initial=0.0) > UNSEEN * float(
         (np.abs(mass) @ np.abs(a) + np.abs(force)).max()
@@ -108,15 +124,19 @@ def from_pinocchio(
         raise CapabilityError(
             "M aba(q, v, tau) differs from tau - nle(q, v): these are not accelerations of this M"
         )
-    pin.forwardKinematics(model, data, q, v)
-    pin.computeJointJacobians(model, data, q)
+    with told("Pinocchio", OTHER_MODEL):
+        pin.forwardKinematics(model, data, q, v)
+        pin.computeJointJacobians(model, data, q)
     rows: list[Any] = [np.zeros((0, nv))]
     targets: list[Any] = [np.zeros(0)]
     cones, names = Cones.free(0), []
     for i, (wrapped, kept) in enumerate(zip(constraint_models, constraint_datas, strict=True)):
-        model_of, data_of = _plain(wrapped), _plain(kept)
-        model_of.calc(model, data, data_of)
-        jac = np.array(model_of.jacobian(model, data, data_of)).reshape(-1, nv)
+        model_of = _plain(wrapped)
+        _check_constraint(i, model, model_of, _plain(kept))
+        with told("Pinocchio", OTHER_MODEL):
+            data_of = model_of.createData()  # of this model's sizes, whatever came with it
+            model_of.calc(model, data, data_of)
+            jac = np.array(model_of.jacobian(model, data, data_of)).reshape(-1, nv)
         more, target, order = _constraint(model_of, data_of, len(jac), dt, correction)
         rows.append(jac[order])
         targets.append(target)
@@ -134,6 +154,70 @@ def from_pinocchio(
         names=names,
         name=name,
     )
+
+
+@contextmanager
+def told(engine: str, advice: str) -> Iterator[None]:
+    """What an engine raises about data that do not fit, as an error of ours."""
+    try:
+        yield
+    except LavenderError:
+        raise
+    except (RuntimeError, ValueError, TypeError, IndexError) as error:
+        words = " ".join(str(error).split())
+        raise InputError(f"{engine} cannot take these: {words:.300}. {advice}") from None
+
+
+def _check_model(model: Any, data: Any) -> None:
+    """Every joint's place before Pinocchio follows it: its library checks nothing."""
+    n, nv, nq = int(model.njoints), int(model.nv), int(model.nq)
+    lists = ("joints", "parents", "idx_vs", "nvs", "idx_qs", "nqs", "inertias", "jointPlacements")
+    short = [name for name in lists if len(getattr(model, name)) != n]
+    if short or n < 1:
+        raise InputError(f"{n} joints, and another number of {', '.join(short)}. {OTHER_MODEL}")
+    at_v = at_q = 0
+    for i in range(1, n):
+        joint = model.joints[i]
+        places = (model.idx_vs[i], model.nvs[i], model.idx_qs[i], model.nqs[i])
+        if (
+            not 0 <= model.parents[i] < i
+            or places != (at_v, joint.nv, at_q, joint.nq)
+            or (joint.idx_v, joint.idx_q) != (at_v, at_q)
+        ):
+            raise InputError(
+                f"joint {i} has parent {model.parents[i]} and (idx_v, nv, idx_q, nq) = {places}; a parent before it "
+                f"and ({at_v}, {joint.nv}, {at_q}, {joint.nq}) are needed. {OTHER_MODEL}"
+            )
+        at_v, at_q = at_v + joint.nv, at_q + joint.nq
+    sizes = {len(data.oMi), len(data.v), len(data.f)}
+    if (at_v, at_q) != (nv, nq) or sizes != {n} or np.shape(data.M) != (nv, nv) or not model.check(data):
+        raise InputError(
+            f"the data hold {len(data.oMi)} joints, the model {n} of {nv} velocities. {OTHER_MODEL}"
+        )
+
+
+def _check_constraint(i: int, model: Any, constraint: Any, data: Any) -> None:
+    """A constraint's joints are those of this model, and its data of its kind."""
+    kind = type(constraint).__name__
+    if not hasattr(constraint, "createData") or not hasattr(constraint, "calc"):
+        raise InputError(f"constraint model {i} is a {kind}; one of Pinocchio's is needed")
+    if type(data).__name__ != kind.replace("Model", "Data"):
+        raise InputError(f"constraint data {i} are {type(data).__name__}; those of a {kind} are needed")
+    joints = [getattr(constraint, name) for name in ("joint1_id", "joint2_id") if hasattr(constraint, name)]
+    for name in ("getSelectedJoints", "getActiveJoints"):
+        if hasattr(constraint, name):
+            joints += list(getattr(constraint, name)())
+    velocities = list(constraint.getActiveDofs()) if hasattr(constraint, "getActiveDofs") else []
+    of = int(getattr(constraint, "nv", model.nv))
+    if (
+        any(not 0 <= j < model.njoints for j in joints)
+        or any(not 0 <= k < model.nv for k in velocities)
+        or of != model.nv
+    ):
+        raise InputError(
+            f"constraint {i}, a {kind}, is of joints {joints} and {of} velocities; the model has {model.njoints} and "
+            f"{model.nv}. {OTHER_MODEL}"
+        )
 
 
 def _plain(given: Any) -> Any:

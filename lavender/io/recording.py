@@ -9,13 +9,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from time import perf_counter
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 
-from lavender._arrays import FloatArray
-from lavender.errors import CapabilityError, InputError
+from lavender._arrays import FloatArray, as_array
+from lavender.errors import InputError, LavenderError
 from lavender.io import mujoco as adapter
 from lavender.io import npz
+from lavender.io.stored import first_bytes, write_text
 from lavender.residuals import residual
 
 __all__ = ["Recording", "record", "record_file"]
@@ -108,7 +110,7 @@ def record(
             continue
         try:
             problem = adapter.from_mujoco(model, data, name=f"step {step + 1}")
-        except CapabilityError as error:
+        except LavenderError as error:
             left_out.append(f"step {step + 1}: {error}")
             continue
         own = adapter.impulse(model, data)
@@ -120,7 +122,7 @@ def record(
             "seconds": seconds, "relative": residual(problem, own).relative,
             "solver": mj.mjtSolver(int(model.opt.solver)).name.removeprefix("mjSOL_"),
         }))  # fmt: skip
-    (folder / ENGINE).write_text("".join(f"{line}\n" for line in lines), encoding="utf-8")
+    write_text(folder / ENGINE, "".join(f"{line}\n" for line in lines))
     return Recording(folder, tuple(files), without, tuple(left_out))
 
 
@@ -149,15 +151,26 @@ def record_file(
     except ValueError as error:  # MuJoCo's word about a file that it cannot read
         raise InputError(f"{os.fspath(path)}: {error}") from None
     if isinstance(control, str) and control not in CONTROLS:
-        try:
-            control = np.load(control, allow_pickle=False)
-        except (OSError, ValueError) as error:
-            raise InputError(f"controls {control}: {error}; {', '.join(CONTROLS)}, or a .npy file") from None
+        control = _controls(control)
     found = record(made, mj.MjData(made), folder, steps, every=every, control=control, seed=seed)
     if not found.files:
         raise InputError(
             f"{os.fspath(path)}: no step had a constraint that could be kept: more steps, or other controls"
         )
+    return found
+
+
+def _controls(path: str) -> Any:
+    try:
+        first_bytes(Path(path))  # of a regular file
+        found = np.load(
+            path, mmap_mode="r", allow_pickle=False
+        )  # as long as the file is, whatever its head says
+    except (OSError, ValueError, EOFError, BadZipFile) as error:
+        raise InputError(f"controls {path}: {error}; {', '.join(CONTROLS)}, or a .npy file") from None
+    if not isinstance(found, np.ndarray):
+        found.close()
+        raise InputError(f"controls {path}: an archive of several arrays; a .npy file of one is needed")
     return found
 
 
@@ -177,7 +190,7 @@ def _drive(model: Any, control: Control, seed: int) -> Callable[[Any, int], Floa
         limited = np.array(model.actuator_ctrllimited, bool)[:, None]
         low, high = np.where(limited, np.array(model.actuator_ctrlrange), [-1.0, 1.0]).T
         return lambda data, step: rng.uniform(low, high)
-    rows = np.asarray(control, float)
-    if rows.ndim != 2 or rows.shape[1] != n or len(rows) == 0 or not np.isfinite(rows).all():
-        raise InputError(f"control has shape {rows.shape}; (any, {n}) finite numbers are needed")
+    rows = as_array("control", control, (None, n))
+    if len(rows) == 0:
+        raise InputError(f"control has shape {rows.shape}; (any, {n}) with a row at least is needed")
     return lambda data, step: rows[step % len(rows)]

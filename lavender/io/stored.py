@@ -8,8 +8,9 @@ import stat
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from threading import get_native_id
 from types import MappingProxyType
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 from lavender._arrays import FloatArray
 from lavender.errors import InputError
@@ -37,27 +38,95 @@ class Stored:
         object.__setattr__(self, "info", MappingProxyType(dict(self.info)))
 
 
-def write_atomically(path: str | os.PathLike[str], write: Callable[[Path], None]) -> None:
-    """Call `write` with a path beside `path`, then rename: readers see the old file or the new one.
+def destination(path: str | os.PathLike[str]) -> Path:
+    """Where a file of that path is written: behind its symbolic links, a regular file or a new one.
 
     Raises
     ------
     InputError
-        The folder does not exist or cannot be written, the path is a folder, the disk is full.
+        A folder, a pipe, a socket or a device, which is never replaced; links without end.
     """
-    target = Path(path)
-    temporary = target.with_name(f".{target.name}.{os.getpid()}.part")
     try:
-        if target.is_dir():
-            raise IsADirectoryError("it is a folder")
+        target = Path(os.path.realpath(path))
+        found = os.stat(path)
+    except FileNotFoundError:
+        return target
+    except (OSError, ValueError) as error:
+        what = f"{getattr(error, 'strerror', None) or error}"
+        raise InputError(f"cannot write {path}: {what}; give a path that can be written") from None
+    if not stat.S_ISREG(found.st_mode):
+        what = "a folder" if stat.S_ISDIR(found.st_mode) else "a pipe, a socket or a device"
+    elif target.exists() and os.path.samestat(found, target.stat()):
+        return target
+    else:
+        what = "a file that has lost its name"  # of an open descriptor
+    raise InputError(f"cannot write {path}: it is {what}, which is not replaced; give the name of a file")
+
+
+def write_atomically(path: str | os.PathLike[str], write: Callable[[Path], Any]) -> None:
+    """Call `write` with a path beside `path`, then rename: readers see the old file or the new one.
+
+    Symbolic links are followed: the file behind them is replaced, they stay.
+
+    Raises
+    ------
+    InputError
+        The folder does not exist or cannot be written, the path is a folder, a pipe or a device (see `destination`),
+        the disk is full.
+    """
+    target = destination(path)
+    temporary = target.with_name(f".{target.name}.{os.getpid()}.{get_native_id()}.part")
+    try:
         write(temporary)
         os.replace(temporary, target)
     except OSError as error:
         reason = error.strerror or error
-        raise InputError(f"cannot write {target}: {reason}; give a path that can be written") from None
+        raise InputError(
+            f"cannot write {path}: {reason}; make room, or give a path that can be written"
+        ) from None
     finally:
         with contextlib.suppress(OSError):
             temporary.unlink(missing_ok=True)
+
+
+def write_bytes(path: str | os.PathLike[str], data: bytes) -> None:
+    """`write_atomically` of bytes.
+
+    Raises
+    ------
+    InputError
+        As `write_atomically`.
+    """
+    write_atomically(path, lambda part: part.write_bytes(data))
+
+
+def write_text(path: str | os.PathLike[str], text: str) -> None:
+    """`write_atomically` of a text.
+
+    Raises
+    ------
+    InputError
+        As `write_atomically`.
+    """
+    write_bytes(path, text.encode())
+
+
+def write_figure(canvas: Any, path: str | os.PathLike[str], **how: Any) -> None:
+    """`write_atomically` of a figure of matplotlib, whose format the suffix says; png without one.
+
+    Raises
+    ------
+    InputError
+        As `write_atomically`; a suffix that matplotlib does not know.
+    """
+    path = Path(path)
+    path = path if path.suffix else path.with_name(path.name + ".png")
+    try:
+        write_atomically(path, lambda part: canvas.savefig(part, format=path.suffix[1:].lower(), **how))
+    except (ValueError, OverflowError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"cannot write the figure {str(path)!r}: {error}") from None
 
 
 def as_path(path: str | os.PathLike[str]) -> Path:
@@ -94,6 +163,31 @@ def first_bytes(path: Path, count: int = 8) -> bytes:
         if isinstance(error, InputError):
             raise
         raise InputError(f"cannot read {path}: {getattr(error, 'strerror', None) or error}") from None
+
+
+def whole_file(path: str | os.PathLike[str], what: str, max_bytes: int = MAX_BYTES) -> bytes:
+    """All bytes of a regular file of at most so many.
+
+    Raises
+    ------
+    InputError
+        The file does not exist, is no regular file, is larger, or cannot be read.
+    """
+    try:
+        found = os.stat(path)
+        if not stat.S_ISREG(found.st_mode):  # a pipe or a device has no end
+            raise InputError(f"cannot read {what} {str(path)!r}: it is no file")
+        if found.st_size > max_bytes:
+            raise InputError(
+                f"cannot read {what} {str(path)!r}: it holds {found.st_size} bytes, more than {max_bytes}"
+            )
+        return Path(path).read_bytes()
+    except (OSError, ValueError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(
+            f"cannot read {what} {str(path)!r}: {getattr(error, 'strerror', None) or error}"
+        ) from None
 
 
 class Budget:

@@ -38,7 +38,7 @@ import numpy as np
 
 from lavender._arrays import FloatArray
 from lavender.cones import ROW
-from lavender.motion.operator import Operator, Size, U
+from lavender.motion.operator import LEAST, Operator, Size, U
 from lavender.problem import Problem
 from lavender_ext.judge import measure
 
@@ -84,6 +84,12 @@ def _rounding_of_projection(problem: Problem, y: FloatArray, w: FloatArray) -> F
     together = np.repeat((c.kind != ROW) & (count > 1), count)
     if together.any():
         block = np.repeat(np.arange(len(count)), count)
-        energy = np.bincount(block, d * size * size, minlength=len(count))
-        fuzz[together] = (64.0 * U * np.sqrt(energy[block] / d))[together]
+        with np.errstate(over="ignore", invalid="ignore"):
+            energy = np.bincount(block, d * size * size, minlength=len(count))
+            whole = np.sqrt(energy[block] / d)
+            top = float(size.max(initial=0.0))
+            if not np.isfinite(whole).all() and np.isfinite(top):
+                energy = np.bincount(block, d * (size / top) ** 2, minlength=len(count))
+                whole = top * np.sqrt(energy[block] / d) + LEAST
+        fuzz[together] = (64.0 * U * whole)[together]
     return fuzz

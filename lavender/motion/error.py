@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
@@ -22,6 +23,10 @@ if TYPE_CHECKING:
 # Motions nearer than this are one, as a share of the constraints' own motion: a residual of 1e-10 moves by up to
 # 1e-7 of it on the worst conditioned piles of the suite.
 SAME = 1e-6
+
+NUMBERS = (
+    "kinetic", "energy", "speed", "spin", "rows", "bound", "bound_speed", "bound_spin", "moved",
+)  # fmt: skip
 
 __all__ = ["MotionError", "motion_error"]
 
@@ -80,9 +85,8 @@ class MotionError:
             parts.append(f"{self.row_name or 'rows'} {self.rows:.2g} m/s")
         if self.bound is not None:
             speed = "" if self.bound_speed is None else f" ({self.bound_speed:.2g} m/s)"
-            parts.append(
-                f"at most {self.bound:.2e} sqrt(J){speed} with targets moved by {self.moved:.1e} m/s"
-            )
+            moved = "" if self.moved is None else f" with targets moved by {self.moved:.1e} m/s"
+            parts.append(f"at most {self.bound:.2e} sqrt(J){speed}{moved}")
         if self.spread_speed is not None and self.count > 1:
             parts.append(f"nearest of {self.count} motions {self.spread_speed:.2g} m/s apart")
         if self.unique:
@@ -129,13 +133,14 @@ def motion_error(problem: Problem, impulse: Any, reference: Any = None) -> Motio
     if not isinstance(problem, Problem):
         raise InputError(f"problem is a {type(problem).__name__}; a lavender.Problem is needed")
     x = problem.impulse_array(impulse)
-    if reference is not None:
-        return measure(problem, x, as_reference(problem, reference))
-    if problem.law != "coulomb":
-        return measure(problem, x, reference_of(problem))
-    from lavender.motion.several import motions_of
+    with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is told in `note`
+        if reference is not None:
+            return measure(problem, x, as_reference(problem, reference))
+        if problem.law != "coulomb":
+            return measure(problem, x, reference_of(problem))
+        from lavender.motion.several import motions_of
 
-    return nearest(problem, x, motions_of(problem))
+        return nearest(problem, x, motions_of(problem))
 
 
 def nearest(problem: Problem, x: FloatArray, found: Motions) -> MotionError:
@@ -154,7 +159,8 @@ def nearest(problem: Problem, x: FloatArray, found: Motions) -> MotionError:
     if not references:
         return measure(problem, x, reference_of(problem))
     best = min((measure(problem, x, reference) for reference in references), key=_distance)
-    return replace(best, spread=energy, spread_speed=spread, count=len(references), unique=found.unique)
+    made = replace(best, spread=energy, spread_speed=spread, count=len(references), unique=found.unique)
+    return _told(made, ("spread", "spread_speed"))
 
 
 def _distance(error: MotionError) -> float:
@@ -163,27 +169,32 @@ def _distance(error: MotionError) -> float:
 
 
 def measure(problem: Problem, x: FloatArray, reference: Reference) -> MotionError:
-    """The distance of an impulse x (m,) [N s] to one reference."""
+    """The distance of an impulse x (m,) [N s] to one reference; None for what float64 cannot hold, as `note` says."""
+    found = _told(_measured(problem, x, reference), NUMBERS)
+    if found.relative == math.inf:
+        words = "relative to next to nothing, as the solution moves no more"
+        return replace(found, note="; ".join(n for n in (found.note, words) if n))
+    return found
+
+
+def _told(found: MotionError, names: Sequence[str]) -> MotionError:
+    """None in the place of numbers that float64 cannot hold, which `note` names."""
+    beyond = [n for n in names if (value := getattr(found, n)) is not None and not math.isfinite(value)]
+    if not beyond:
+        return found
+    note = "; ".join(n for n in (found.note, f"beyond float64: {', '.join(beyond)}") if n)
+    gone: dict[str, Any] = dict.fromkeys(beyond)
+    return replace(found, note=note, **gone)
+
+
+def _measured(problem: Problem, x: FloatArray, reference: Reference) -> MotionError:
     operator = kept(problem).operator
     delta, size = difference(operator, x, reference.impulse)
     notes = [reference.refusal and f"{reference.refusal}: no energies"]
     energies = reference.accepted and not reference.refusal
     if not reference.accepted:
         notes.append("nothing reached the floor: no estimate")
-    values: dict[str, Any] = dict.fromkeys(
-        (
-            "kinetic",
-            "energy",
-            "relative",
-            "speed",
-            "spin",
-            "rows",
-            "bound",
-            "bound_speed",
-            "bound_spin",
-            "moved",
-        )
-    )
+    values: dict[str, Any] = dict.fromkeys((*NUMBERS, "relative"))
     values |= {"body": -1, "spin_body": -1, "row": -1}
     velocity = operator.velocity(delta, U * np.abs(delta))
     speed = fast = np.zeros(0)
@@ -220,7 +231,7 @@ def measure(problem: Problem, x: FloatArray, reference: Reference) -> MotionErro
 
 
 def _ratio(x: float, reference: float) -> float:
-    return 0.0 if x == 0.0 else x / reference if reference > 0.0 else math.inf
+    return 0.0 if x == 0.0 else x / reference if reference > 0.0 and x < math.inf else math.inf
 
 
 def _largest(x: FloatArray) -> tuple[int, float]:

@@ -11,6 +11,7 @@ count as exact as they are stored (`Problem.jacobian`, `Rows.inv_mass`, `Rows.in
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -27,6 +28,8 @@ U = 2.0**-53
 # A matrix counts as positive semidefinite where A + SHIFT D has a Cholesky factor, D = diag(d): entries that were
 # rounded leave negative eigenvalues of about m 2^-53.
 SHIFT = 1e-12
+SQUARED = 1e-140  # sqrt J: squares of less begin to lose digits, or vanish
+LEAST = 2.0**-1022  # the smallest number of float64 with all its digits
 LARGEST_TREE = 2000  # generalised velocities of one tree, whose M is inverted, dense
 
 
@@ -106,6 +109,9 @@ class _Factored:
         return w, off
 
     def size(self, x: FloatArray, fuzz: FloatArray) -> Size:
+        return _in_range(self._size, x, fuzz)
+
+    def _size(self, x: FloatArray, fuzz: FloatArray) -> Size:
         g = self.jac_t @ x
         h = np.abs(g)
         off = self.size_of_jac_t @ (self.of_wrench * np.abs(x) + 1.01 * fuzz)  # of g
@@ -153,7 +159,7 @@ class _Bodies(_Factored):
         return v.reshape(-1, 6)
 
     def lengths(self, velocity: FloatArray) -> tuple[FloatArray, FloatArray | None]:
-        return np.linalg.norm(velocity[:, :3], axis=1), np.linalg.norm(velocity[:, 3:], axis=1)
+        return _norms(velocity[:, :3]), _norms(velocity[:, 3:])
 
     def name(self, i: int) -> str:
         return f"body {i}"
@@ -229,6 +235,9 @@ class _Matrix:
         return self.a @ x - self.b, self.of_slack * (self.size_of_a @ np.abs(x) + np.abs(self.b))
 
     def size(self, x: FloatArray, fuzz: FloatArray) -> Size:
+        return _in_range(self._size, x, fuzz)
+
+    def _size(self, x: FloatArray, fuzz: FloatArray) -> Size:
         y = np.abs(x)
         square = max(float(x @ (self.a @ x)), 0.0)
         rounding = (self.of_slack + _gamma(len(x) + 1)) * float(y @ (self.size_of_a @ y))
@@ -247,6 +256,31 @@ class _Matrix:
 
     def reach(self, energy: float) -> tuple[float, float | None] | None:
         return None
+
+
+def _in_range(size: Callable[[FloatArray, FloatArray], Size], x: FloatArray, fuzz: FloatArray) -> Size:
+    """A size [sqrt J] whose squares neither overflow nor vanish: of x over a power of two where they would."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        found = size(x, fuzz)
+        top = max(float(np.abs(x).max(initial=0.0)), float(fuzz.max(initial=0.0)))
+        if top == 0.0 or np.isinf(top) or (found.most < np.inf and found.most > SQUARED):
+            return found
+        scale = 2.0 ** (np.frexp(top)[1] - 1)
+        made = size(x / scale, fuzz / scale + LEAST)  # what vanishes beside the largest is within LEAST
+        kinetic = None if made.kinetic is None else made.kinetic * scale
+        return Size(kinetic, made.energy * scale, made.most * scale)
+
+
+def _norms(v: FloatArray) -> FloatArray:
+    """Length of each row; over its largest entry where the square of that overflows."""
+    with np.errstate(over="ignore"):
+        found: FloatArray = np.linalg.norm(v, axis=1)
+    far = np.flatnonzero(np.isinf(found) & np.isfinite(v).all(axis=1))
+    if len(far):
+        top = np.abs(v[far]).max(axis=1)
+        with np.errstate(over="ignore"):
+            found[far] = top * np.linalg.norm(v[far] / top[:, None], axis=1)
+    return found
 
 
 def _gamma(n: int) -> float:

@@ -137,12 +137,18 @@ def _island(problem: Problem, rows: np.ndarray, friction: np.ndarray) -> tuple[s
     scale = 1.0 / np.sqrt(problem.csr_data.d[rows])
     a = problem.csr[rows][:, rows].toarray() * scale[:, None] * scale
     a = 0.5 * (a + a.T)
+    if not np.isfinite(a).all() or not scale.all():
+        return None, np.inf
     others = a[np.ix_(~friction, ~friction)]
     if np.all(np.abs(a[np.ix_(friction, ~friction)]) <= UNCOUPLED) and _definite(others):
         return "normals feel no friction", 0.0
     if not _definite(a):
         return None, np.inf
-    kappa, lifting = _kappa(problem, rows, friction, a, scale)
+    try:
+        with np.errstate(all="ignore"):
+            kappa, lifting = _kappa(problem, rows, friction, a, scale)
+    except np.linalg.LinAlgError:  # of numbers whose products overflow
+        return None, np.inf
     if kappa < 1.0 - MARGIN:
         return "friction is small", kappa
     return ("nothing slides" if _sticks(problem, rows, friction, kappa, lifting) else None), kappa

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from lavender.bench.record import file_name, level_name
+from lavender.io.stored import write_figure
 from lavender.report.curves import Figure
 from lavender.report.style import Look
 
@@ -105,5 +106,5 @@ def save(figure: Figure, look: dict[str, Look], folder: Path) -> None:
     """NAME.svg and NAME.png in `folder`."""
     canvas = matplotlib_figure(figure, look)
     path = folder / file_name(figure.name)
-    canvas.savefig(path.with_name(path.name + ".svg"), metadata={"Date": None})
-    canvas.savefig(path.with_name(path.name + ".png"), dpi=110, metadata={"Software": None})
+    write_figure(canvas, path.with_name(path.name + ".svg"), metadata={"Date": None})
+    write_figure(canvas, path.with_name(path.name + ".png"), dpi=110, metadata={"Software": None})

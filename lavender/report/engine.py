@@ -16,6 +16,7 @@ import numpy as np
 
 from lavender.bench.store import Records
 from lavender.io.recording import ENGINE
+from lavender.io.stored import whole_file
 
 __all__ = ["ENGINES", "Contestant", "contestants", "lines"]
 
@@ -50,7 +51,7 @@ def contestants(words: Sequence[str], records: Records) -> list[Contestant]:
         if not path.is_file():
             continue
         found = []
-        for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
+        for line in whole_file(path, "the engine's answers").decode(errors="replace").splitlines():
             try:
                 entry = json.loads(line)
                 numbers = [float(entry[name]) for name in _NUMBERS]

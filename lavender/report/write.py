@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from lavender.bench.store import Records, write_csv, write_json
 from lavender.errors import InputError
+from lavender.io.stored import write_text
 
 if TYPE_CHECKING:
     from lavender.bench.peers import Peers
@@ -77,13 +78,10 @@ def write(
         index = folder / "index.html"
         before = None if old is None else old.latest()
         # Whole or not at all: on a full disk the page of the last time stays.
-        unfinished = index.with_suffix(".html.part")
-        unfinished.write_text(
-            page(shown, drawn, old=before, budgets=times, saved=figures, peers=peers, engines=engines),
-            encoding="utf-8",
+        write_text(
+            index, page(shown, drawn, old=before, budgets=times, saved=figures, peers=peers, engines=engines)
         )
-        unfinished.replace(index)
-        (folder / "summary.md").write_text(summary(busy, times, engines), encoding="utf-8")
+        write_text(folder / "summary.md", summary(busy, times, engines))
         if figures and list(drawn):
             (folder / "figures").mkdir(exist_ok=True)
             look = looks({r.solver for r in shown} | {c.solver for figure in drawn for c in figure.curves})

@@ -97,6 +97,7 @@ def restrict(problem: Problem, blocks: IntArray, rows: IntArray) -> Problem:
         arm_a=given.arm_a[contacts],
         arm_b=given.arm_b[contacts],
         contact_body=number[given.contact_body[contacts]],
+        copy=False,
     )
     assert problem.compliance is not None
     return Problem(b, cones, rows=part, compliance=problem.compliance[rows], **more)

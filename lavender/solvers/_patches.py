@@ -140,7 +140,7 @@ class Patches(Sweeps):
         """(1) by one method, from where the patch stands; what it ends with is kept, whatever it is."""
         problem = self.trail.problem
         rows = rows_of(problem, blocks)
-        part = replace(restrict(problem, blocks, rows), b=shifted[rows])
+        part = replace(restrict(problem, blocks, rows), b=shifted[rows], copy=False)
         impulse = self.impulse[rows]
         tol = CLOSER * judged(part, impulse.copy()).relative
         if name == "newton":

@@ -96,8 +96,13 @@ def family(**twins: Mapping[str, Any]) -> Callable[[Callable[P, Draft]], Callabl
             given = frozenset(bound.arguments)
             bound.apply_defaults()
             values = {n: _check(name, signature.parameters[n], v) for n, v in bound.arguments.items()}
-            draft = function(**values)  # type: ignore[call-arg]
             text = _text(name, values, given)
+            try:
+                draft = function(**values)  # type: ignore[call-arg]
+            except MemoryError as error:
+                raise InputError(
+                    f"{text}: there is not enough memory ({error or 'none left'}); give smaller parameters"
+                ) from None
             return Case(
                 name=text,
                 problem=replace(draft.problem, name=text, copy=False),

@@ -270,7 +270,12 @@ def build(
         _check(found, names, len(data), LARGEST if largest is None else largest, (MEMORY,) if beside else ())
         data += _section(SECTION, source_hash(root, paths).encode())
         # Moved into place in one step: whoever reads `out` at the same time sees the old file or the new one.
+        out = out.resolve()  # a link stays, what is behind it is replaced
         part = out.with_name(out.name + f".{os.getpid()}")
+        if out.exists() and not out.is_file():
+            raise BuildFailed(
+                f"cannot write {out}: it is no file, and is not replaced; give the name of a file"
+            )
         try:
             part.write_bytes(data)
             part.replace(out)

@@ -6,12 +6,14 @@ import json
 import shutil
 from collections.abc import Callable
 from functools import partial
+from http import HTTPStatus
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
 import lavender_ext
 from lavender.errors import InputError, LavenderError
+from lavender.io.stored import write_bytes, write_text
 from lavender.web import compile as wasm
 from lavender.web.scenes import page_scenes
 
@@ -120,9 +122,9 @@ def write_page(folder: Path, say: Callable[[str], Any] = lambda text: None) -> P
     try:
         shutil.copytree(HERE / "page", folder, dirs_exist_ok=True)
         for name, data in modules.items():
-            (folder / f"{name}.wasm").write_bytes(data)
+            write_bytes(folder / f"{name}.wasm", data)
         text = json.dumps(page_scenes(), allow_nan=False, separators=(",", ":"))
-        (folder / "scenes.json").write_text(text, encoding="utf-8")
+        write_text(folder / "scenes.json", text)
     except (OSError, shutil.Error) as error:
         raise InputError(f"cannot write the page into {folder}: {error}") from None
     return folder / "index.html"
@@ -143,6 +145,14 @@ class Handler(SimpleHTTPRequestHandler):
     def end_headers(self) -> None:
         self.send_header("Cache-Control", "no-cache")
         super().end_headers()
+
+    def send_head(self) -> Any:
+        """What is no path of a file, such as one with a NUL character, is not found."""
+        try:
+            return super().send_head()
+        except (OSError, ValueError):
+            self.send_error(HTTPStatus.NOT_FOUND)
+            return None
 
     def log_message(self, format: str, *arguments: Any) -> None:  # noqa: A002 - the base class names it so
         """Say nothing about single requests."""

@@ -156,7 +156,6 @@ cdef void sweep_all(engine_t* e, const blocks_t* p, const rows_t* r, int32_t swe
             note_sweep(e, p, r, curve + 2 * (s + 1), scratch)
 
 
-<<<<<<< HEAD
 cdef inline int32_t sweep_fast(engine_t* e, const blocks_t* p, const rows_t* r, int32_t sweeps,
                                double* room) noexcept nogil:
     # the same bits by packed blocks; 0 where these are few, or the order changes
@@ -184,13 +183,6 @@ cdef inline void move(engine_t* e) noexcept nogil:
         descend_all(e)
     for k in range(4, 8):
         memcpy(e.setting + S_OUT + k, &nan, sizeof(nan))
-=======
-cdef inline int32_t sweep_fast(engine_t* e, const blocks_t* p, const rows_t* r, double* room) noexcept nogil:
-    # the same bits by packed blocks; 0 where these are few, or the order changes
-    if e.head[H_ORDER] == SYMMETRICALLY or e.head[H_ORDER] == AT_RANDOM:
-        return 0
-    return sweep_packed(p, r, e.order, e.head[H_ITERATIONS], room, e.impulse, e.dv)
->>>>>>> 7203becdcb2965624c66a35c751557e886c23743
 
 
 cdef inline void solve(engine_t* e, int32_t sweeps, double* room, double* curve, double* scratch) noexcept nogil:
@@ -206,7 +198,6 @@ cdef inline void solve(engine_t* e, int32_t sweeps, double* room, double* curve,
     measure(e, out + 4, out + 6)
     if curve != NULL:
         note_sweep(e, &p, &r, curve, scratch)
-<<<<<<< HEAD
     if not sweeps:
         return
     sweep(e, &p, &r, e.head[H_ITERATIONS], room, curve, scratch)
@@ -215,13 +206,6 @@ cdef inline void solve(engine_t* e, int32_t sweeps, double* room, double* curve,
         sweep(e, &p, &r, e.head[H_RELAXING], room, NULL, NULL)
         restitute(e)
     measure(e, out + 5, out + 7)
-=======
-    if sweeps:
-        order_blocks(e)
-        if room == NULL or not sweep_fast(e, &p, &r, room):
-            sweep_all(e, &p, &r, curve, scratch)
-        measure(e, out + 5, out + 7)
->>>>>>> 7203becdcb2965624c66a35c751557e886c23743
 
 
 cdef inline int32_t finite(const double* x, int32_t n) noexcept nogil:

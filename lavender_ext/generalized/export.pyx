@@ -15,18 +15,20 @@ from lavender_ext.core.block cimport CONTACT, ROUND, ROW
 
 cpdef enum:
     JOINED = 6                  # rows of an equality that are one block; a flex has one for each edge
+    CODES = 8                   # kinds of constraints
 
 
 cdef public int32_t lav_export_blocks(int32_t m, const int32_t* type_, const int32_t* id_, const int32_t* codes,
-                                      const int32_t* dim, const double* friction, const int32_t* geom,
-                                      const double* loss, double dt, int32_t* ptr, int32_t* kind, double* lower,
+                                      const int32_t* most, const int32_t* dim, const double* friction,
+                                      const int32_t* geom, const double* loss, double dt, int32_t* ptr, int32_t* kind, double* lower,
                                       double* upper, double* mu, double* scale, uint64_t* key) noexcept nogil:
-    """Blocks of m rows, how many; -1 - i where row i is of a type that `codes` does not hold.
+    """Blocks of m rows, how many; -1 - i where row i is of a type that `codes` does not hold, or names what is not there.
 
     codes (8): equality, friction of a joint, of a tendon, limit of a joint, of a tendon, contact without friction,
-    pyramidal, elliptic. Of ptr room for m + 1.
+    pyramidal, elliptic; most (8): how many there are of what rows of each code name. A contact's dim is from 1 to 6, and
+    its rows end with the m. Of ptr room for m + 1.
     """
-    cdef int32_t i = 0, j, _j, k = 0, t, of, size, count, nth
+    cdef int32_t i = 0, j, _j, k = 0, t, of, size, count, nth, code
     cdef double inf = 1.0 / 0.0
     ptr[0] = 0
     while i < m:
@@ -34,13 +36,18 @@ cdef public int32_t lav_export_blocks(int32_t m, const int32_t* type_, const int
         of = id_[i]
         size = 1
         count = 1
+        code = 0
+        while code < CODES and t != codes[code]:
+            code += 1
+        if code == CODES or not 0 <= of < most[code]:
+            return -1 - i
         mu[k] = 0.0
         kind[k] = ROW
         lower[i] = -inf
         upper[i] = inf
         scale[i] = 1.0
         key[k] = (<uint64_t>(t + 1) << 56) | (<uint64_t>of << 32)
-        if t == codes[0]:
+        if code == 0:
             while i + size < m and type_[i + size] == t and id_[i + size] == of:
                 lower[i + size] = -inf
                 upper[i + size] = inf
@@ -53,14 +60,14 @@ cdef public int32_t lav_export_blocks(int32_t m, const int32_t* type_, const int
                     mu[k + j] = 0.0
                     kind[k + j] = ROW
                     key[k + j] = key[k] + j
-        elif t == codes[1] or t == codes[2]:
+        elif code <= 2:
             lower[i] = -dt * loss[i]
             upper[i] = dt * loss[i]
-        elif t == codes[3] or t == codes[4]:
+        elif code <= 4:
             lower[i] = 0.0
             if k > 0 and (key[k - 1] | 0xFFFF) == (key[k] | 0xFFFF):
                 key[k] = key[k - 1] + 1                 # the other limit of the same joint
-        elif t == codes[5] or t == codes[6] or t == codes[7]:
+        else:
             nth = 0
             j = of - 1
             while j >= 0 and geom[2 * j] == geom[2 * of] and geom[2 * j + 1] == geom[2 * of + 1]:
@@ -69,10 +76,14 @@ cdef public int32_t lav_export_blocks(int32_t m, const int32_t* type_, const int
             key[k] = ((<uint64_t>1 << 63) | (<uint64_t>((geom[2 * of] + 1) & 0xFFFFF) << 40)
                       | (<uint64_t>((geom[2 * of + 1] + 1) & 0xFFFFF) << 20) | (<uint64_t>(nth & 0xFFFF) << 4))
             lower[i] = 0.0
-            if t == codes[5]:
+            if code == 5:
                 kind[k] = CONTACT
-            elif t == codes[6]:
+            elif not 1 < dim[of] <= JOINED:
+                return -1 - i
+            elif code == 6:
                 count = 2 * (dim[of] - 1)               # an edge each
+                if i + count > m:
+                    return -1 - i
                 for j in range(1, count):
                     lower[i + j] = 0.0
                     upper[i + j] = inf
@@ -82,14 +93,14 @@ cdef public int32_t lav_export_blocks(int32_t m, const int32_t* type_, const int
                     key[k + j] = key[k] + j
             else:
                 size = dim[of]
+                if i + size > m:
+                    return -1 - i
                 kind[k] = ROUND if size > 3 else CONTACT
                 mu[k] = friction[5 * of]
                 for j in range(1, size):
                     lower[i + j] = -inf
                     upper[i + j] = inf
                     scale[i + j] = friction[5 * of + j - 1] / mu[k] if mu[k] > 0.0 else 0.0
-        else:
-            return -1 - i
         for _j in range(count):
             i += size
             k += 1
@@ -97,10 +108,14 @@ cdef public int32_t lav_export_blocks(int32_t m, const int32_t* type_, const int
     return k
 
 
-def blocks(const int32_t[::1] type_, const int32_t[::1] id_, const int32_t[::1] codes, const int32_t[::1] dim,
-           const double[:, ::1] friction, const int32_t[:, ::1] geom, const double[::1] loss, double dt):
-    """(ptr, kind, lower, upper, mu, scale, key), or the number of a row of unknown type."""
+def blocks(const int32_t[::1] type_, const int32_t[::1] id_, const int32_t[::1] codes, tuple most,
+           const int32_t[::1] dim, const double[:, ::1] friction, const int32_t[:, ::1] geom, const double[::1] loss,
+           double dt):
+    """(ptr, kind, lower, upper, mu, scale, key), or the number of a row that is unknown, or names what is not there."""
     cdef int32_t m = <int32_t>type_.shape[0], k
+    cdef int32_t limits[CODES]
+    for k in range(CODES):
+        limits[k] = most[k]
     whole = np.empty(2 * m + 1, np.int32)
     numbers = np.empty(4 * m)
     keys = np.empty(m, np.uint64)
@@ -110,7 +125,7 @@ def blocks(const int32_t[::1] type_, const int32_t[::1] id_, const int32_t[::1] 
     if m == 0:
         whole[0] = 0
         return whole, whole[:0], numbers, numbers, numbers, numbers, keys
-    k = lav_export_blocks(m, &type_[0], &id_[0], &codes[0], &dim[0] if dim.shape[0] else NULL,
+    k = lav_export_blocks(m, &type_[0], &id_[0], &codes[0], limits, &dim[0] if dim.shape[0] else NULL,
                           &friction[0, 0] if friction.shape[0] else NULL, &geom[0, 0] if geom.shape[0] else NULL,
                           &loss[0], dt, &w[0], &w[m + 1], &x[0], &x[m], &x[2 * m], &x[3 * m], &key[0])
     if k < 0:
@@ -120,7 +135,7 @@ def blocks(const int32_t[::1] type_, const int32_t[::1] id_, const int32_t[::1] 
 
 
 def rows_of_dense(const double[::1] values, int32_t m, int32_t n, const double[::1] scale):
-    """(indptr, indices, data) of J scaled by row, from its numbers row by row."""
+    """(indptr, indices, data) of J scaled by row, from its numbers row by row; there are m n of them."""
     cdef int32_t i, j
     cdef Py_ssize_t at = 0
     cdef double x
@@ -142,12 +157,19 @@ def rows_of_dense(const double[::1] values, int32_t m, int32_t n, const double[:
 
 
 def rows_of_sparse(const double[::1] values, const int32_t[::1] count, const int32_t[::1] first,
-                   const int32_t[::1] columns, const double[::1] scale):
-    """The same of compressed rows that may have room between them; None where columns do not ascend."""
+                   const int32_t[::1] columns, const double[::1] scale, int32_t n):
+    """The same of compressed rows of n columns that may have room between them; None where columns do not ascend.
+
+    Of rows that cannot be followed, the first one's number.
+    """
     cdef int32_t i, q, m = <int32_t>count.shape[0]
-    cdef Py_ssize_t at = 0, total = 0
+    cdef Py_ssize_t at = 0, total = 0, room = min(values.shape[0], columns.shape[0])
     cdef double x
+    cdef int32_t last, end
+    cdef bint ascend = True
     for i in range(m):
+        if not 0 <= count[i] <= room or not 0 <= first[i] <= room - count[i]:
+            return i
         total += count[i]
     indptr_ = np.empty(m + 1, np.int32)
     indices_ = np.empty(total, np.int32)
@@ -156,16 +178,25 @@ def rows_of_sparse(const double[::1] values, const int32_t[::1] count, const int
     cdef double[::1] data = data_
     indptr[0] = 0
     for i in range(m):
-        for q in range(first[i], first[i] + count[i]):
-            if q > first[i] and columns[q] <= columns[q - 1]:
-                return None
+        end = first[i] + count[i]
+        last = -1
+        for q in range(first[i], end):
+            if columns[q] <= last:
+                ascend = False
+                if columns[q] < 0:
+                    return i
+            last = max(last, columns[q])
             x = values[q] * scale[i]
             if x != 0.0:
                 indices[at] = columns[q]
                 data[at] = x
                 at += 1
+        if last >= n:
+            return i
         indptr[i + 1] = <int32_t>at
-    return indptr_, indices_[:at].copy(), data_[:at].copy()
+    if not ascend:
+        return None
+    return (indptr_, indices_, data_) if at == total else (indptr_, indices_[:at].copy(), data_[:at].copy())
 
 
 def numbers(const double[:] force, const double[:] aref, const double[:] r, const double[:] inverse,
@@ -188,17 +219,30 @@ def numbers(const double[:] force, const double[:] aref, const double[:] r, cons
     return impulse_, target_, compliance_, gap
 
 
-def row_pointers(const int32_t[::1] first, const int32_t[::1] count):
-    """Pointers (n + 1) of rows by first place and length; None where there is room between them."""
-    cdef Py_ssize_t i, n = first.shape[0]
+def lower_pointers(const int32_t[::1] first, const int32_t[::1] count, const int32_t[::1] columns, Py_ssize_t entries):
+    """Pointers (n + 1) of M's rows by first place and length; None where they are no lower triangle, row behind row.
+
+    Columns ascend to the diagonal entry, and as many numbers go with them.
+    """
+    cdef Py_ssize_t i, q, n = first.shape[0], nnz = columns.shape[0]
     out = np.empty(n + 1, np.int32)
     cdef int32_t[::1] at = out
+    cdef int32_t last
     at[0] = 0
+    if entries != nnz or count.shape[0] != n:
+        return None
     for i in range(n):
-        if first[i] != at[i]:
+        if first[i] != at[i] or not 0 < count[i] <= nnz - at[i]:
             return None
         at[i + 1] = at[i] + count[i]
-    return out
+        last = -1
+        for q in range(at[i], at[i + 1]):
+            if columns[q] <= last:
+                return None
+            last = columns[q]
+        if last != i:
+            return None
+    return out if at[n] == nnz else None
 
 
 def mass_mismatch(const int32_t[::1] mptr, const int32_t[::1] midx, const double[::1] mval, const double[::1] x,
@@ -223,19 +267,75 @@ def mass_mismatch(const int32_t[::1] mptr, const int32_t[::1] midx, const double
     return gap / big if big > 0.0 else 0.0
 
 
-def row_mismatch(const int32_t[::1] jptr, const int32_t[::1] jidx, const double[::1] jval, const double[::1] x,
-                 const double[::1] y):
-    """max |J x - J y| over max |J| (|x| + |y|); 0 where both vanish."""
-    cdef int32_t i, q, m = <int32_t>jptr.shape[0] - 1
-    cdef double gap = 0.0, big = 0.0, s, t
+def row_gaps(const int32_t[::1] jptr, const int32_t[::1] jidx, const double[::1] jval, const double[::1] scale,
+             const double[::1] rhs, const double[::1] impulse, double dt, bint euler, const double[:] v,
+             const double[:] vel, const double[:] free, const double[:] b, const double[:] push, const double[:] a,
+             const double[:] reached):
+    """How far J, scaled by row, is from vectors that were made by it, each by the size of its terms.
+
+        J v = efc_vel   (1)      J a0 - aref = efc_b   (2)      f.(J a) = a.qfrc_constraint   (3)      J a = J a1   (4)
+
+    with rhs = dt (aref - J a0), free = dt a0, impulse = dt f, reached = a1 = a0 + M^-1 J^T f. 0 where such a vector is
+    all zeros: one that a copy did not fill. (1) only of the integrator `euler`, after whose step v has changed by
+    dt a: what 2 dt |J| (|a| + |a1|) explains is 0. (4) is NaN where a is not finite. The size of terms is
+    |J_i|_1 |x|_max for (1) to (3), |J| (|a| + |a1|) for (4).
+    """
+    cdef int32_t i, j, k, m = <int32_t>jptr.shape[0] - 1, n = <int32_t>a.shape[0]
+    cdef Py_ssize_t q
+    cdef double c, size, terms, finite = 0.0, moved = 0.0, gap_1 = 0.0, gap_2 = 0.0, gap_3 = 0.0, gap_4 = 0.0
+    cdef double big_1 = 0.0, big_2 = 0.0, big_3 = 0.0, said_1 = 0.0, said_2 = 0.0, said_3 = 0.0
+    cdef double top_v = 0.0, top_free = 0.0, top_a = 0.0
+    cdef double s[4]
+    scratch = np.empty(6 * n + 1)
+    cdef double[::1] held = scratch
+    cdef double* w = &held[0]                           # of each velocity v, free, a, a - a1, |a| + |a1|
+    cdef const double* at
+    for j in range(n):
+        w[6 * j] = v[j]
+        w[6 * j + 1] = free[j]
+        w[6 * j + 2] = a[j]
+        w[6 * j + 3] = a[j] - reached[j]
+        w[6 * j + 4] = fabs(a[j]) + fabs(reached[j])
+        top_v = widest(top_v, v[j])
+        top_free = widest(top_free, free[j])
+        top_a = widest(top_a, a[j])
+        c = dt * push[j] * a[j]
+        gap_3 -= c
+        big_3 += fabs(c)
+        said_3 = widest(said_3, push[j])
+        finite += 0.0 * a[j]
     for i in range(m):
-        s = 0.0
-        t = 0.0
+        size = terms = 0.0
+        for k in range(4):
+            s[k] = 0.0
         for q in range(jptr[i], jptr[i + 1]):
-            s += jval[q] * (x[jidx[q]] - y[jidx[q]])
-            t += fabs(jval[q]) * (fabs(x[jidx[q]]) + fabs(y[jidx[q]]))
-        if fabs(s) > gap or s != s:
-            gap = fabs(s)
-        if t > big:
-            big = t
-    return gap / big if big > 0.0 else 0.0
+            at = w + 6 * jidx[q]
+            c = jval[q]
+            for k in range(4):
+                s[k] += c * at[k]
+            size += fabs(c)
+            terms += fabs(c) * at[4]
+        c = scale[i] * vel[i]
+        gap_1 = widest(gap_1, s[0] - c)
+        big_1 = widest(big_1, size * top_v + fabs(c))
+        said_1 = widest(said_1, vel[i])
+        c = scale[i] * dt * b[i]
+        gap_2 = widest(gap_2, rhs[i] + c)
+        big_2 = widest(big_2, size * top_free + fabs(rhs[i]) + fabs(c))
+        said_2 = widest(said_2, b[i])
+        gap_3 += impulse[i] * s[2]
+        big_3 += fabs(impulse[i]) * size * top_a
+        gap_4 = widest(gap_4, s[3])
+        moved = widest(moved, terms)
+    if not euler or gap_1 <= 2.0 * dt * moved:
+        gap_1 = 0.0
+    return (gap_1 / big_1 if said_1 != 0.0 and big_1 != 0.0 else 0.0,
+            gap_2 / big_2 if said_2 != 0.0 and big_2 != 0.0 else 0.0,
+            fabs(gap_3) / big_3 if said_3 != 0.0 and big_3 != 0.0 else 0.0,
+            (gap_4 / moved if moved > 0.0 else 0.0) + finite)
+
+
+cdef inline double widest(double so_far, double x) noexcept nogil:
+    """The larger of |x| and what was largest so far; NaN stays."""
+    x = fabs(x)
+    return so_far if x <= so_far or so_far != so_far else x

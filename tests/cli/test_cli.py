@@ -405,3 +405,102 @@ def test_solvers_that_are_here_come_first(lavender):
     here = [place[n] for n, reason in reasons.items() if reason is None]
     away = [place[n] for n, reason in reasons.items() if reason is not None]
     assert max(here) < min(away, default=len(lines))
+
+
+# -- what nobody should ask for ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("workers", [0, -2, 1_000_000_000])
+def test_a_number_of_workers_that_means_nothing_is_refused(lavender, path, tmp_path, workers):
+    code, _, err = lavender("report", path, "--campaign", "--workers", workers, "--out", tmp_path / "out")
+    assert code == 2
+    assert f"workers is {workers}" in err
+
+
+@pytest.mark.parametrize("words", [("report", "wild", "--campaign", "--out", "out"), ("bench", "auto")])
+def test_seeds_without_end_are_refused_at_once(lavender, words):
+    code, _, err = lavender(*words, "--seeds", "0:1000000000000")
+    assert code == 2
+    assert "1000000000000 seeds" in err
+
+
+def test_a_case_that_no_memory_holds_is_refused(lavender):
+    code, _, err = lavender("solve", "random_spd(n=10000000)")  # 8e14 bytes
+    assert code == 2
+    assert "not enough memory" in err and "smaller" in err
+
+
+def test_memory_that_ends_elsewhere_is_told_in_a_line(lavender, path, monkeypatch):
+    def none(*_, **__):
+        raise MemoryError
+
+    monkeypatch.setattr(bench, "resolve", none)
+    code, _, err = lavender("solve", path)
+    assert code == 2
+    assert "not enough memory" in err
+
+
+def long_file(path, start=b""):
+    """A file of ten gigabytes that takes no room."""
+    with path.open("wb") as stream:
+        stream.write(start)
+        stream.truncate(10**10)
+    return path
+
+
+def test_files_of_ten_gigabytes_are_refused_by_their_size(lavender, tmp_path):
+    for words in (
+        ("report", long_file(tmp_path / "records.jsonl")),
+        ("report", tmp_path / "records.jsonl", "--out", tmp_path / "out"),
+        ("view", long_file(tmp_path / "a.film", b"LAVENDERFILM"), "--no-browser"),
+        ("bench", "two_particles", "--solvers", "pgs", "--out", tmp_path / "records.jsonl"),
+    ):
+        code, out, err = lavender(*words)
+        assert code == 2
+        assert "10000000000 bytes" in out + err
+    with pytest.raises(lv.InputError, match="10000000000 bytes"):
+        lv.Snapshot.load(tmp_path / "a.film")
+
+
+def test_a_line_without_end_is_refused(tmp_path):
+    path = tmp_path / "records.jsonl"
+    with path.open("wb") as stream:
+        stream.truncate(2**27)
+    with pytest.raises(lv.InputError, match="has a line of more than"):
+        bench.read(path)
+
+
+@pytest.mark.parametrize("tail", [b"", b"torn", b"x" * 70_000, b"x" * 65_536])
+@pytest.mark.parametrize("head", [b"", b"\n", b"a line\n" * 3, b"y" * 65_535 + b"\n"])
+def test_a_torn_line_is_cut_wherever_it_begins(tmp_path, head, tail):
+    from lavender.bench.store import _cut_torn_line
+
+    (tmp_path / "a").write_bytes(head + tail)
+    _cut_torn_line(tmp_path / "a")
+    assert (tmp_path / "a").read_bytes() == head
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="signals of POSIX")
+@pytest.mark.parametrize("way", [("-m", "lavender"), ("-m", "lavender.cli")])
+@pytest.mark.parametrize(
+    "module", ["numpy", "lavender.problem", "lavender.cli.options", "lavender.cli.solve"]
+)
+def test_ctrl_c_while_the_command_is_imported_ends_with_130(way, module):
+    """-X importtime writes a line when a module is there: so far the command has come."""
+    command = [sys.executable, "-X", "importtime", *way, "solvers"]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True) as started:
+        text = ""
+        for line in started.stderr:
+            text += line
+            if line.rpartition("|")[2].strip() == module:
+                started.send_signal(signal.SIGINT)
+                break
+        text += started.stderr.read()
+        assert started.wait(timeout=60) == 130
+    assert "lavender: stopped" in text
+    assert "Traceback" not in text
+
+
+def test_another_program_keeps_its_own_ctrl_c():
+    words = "import signal, lavender, lavender.cli; assert signal.getsignal(2) is signal.default_int_handler"
+    subprocess.run([sys.executable, "-c", words, "lavender"], check=True, timeout=120)

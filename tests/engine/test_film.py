@@ -97,7 +97,16 @@ def test_the_page_gets_the_frames_as_they_come():
             np.testing.assert_array_equal(
                 row[9:].reshape(-1, 7)[:, :3], observation["positions"].astype("f4")
             )
-        for path in ("frames?from=-1", "frames?from=x", "../film.py", "none"):
+        for path in (
+            "frames?from=-1",
+            "frames?from=x",
+            "../film.py",
+            "none",
+            "%00",
+            "a%00b/",
+            "%ff",
+            "x" * 5000,
+        ):
             with pytest.raises(urllib.error.HTTPError):
                 get(viewer, path)
         with pytest.raises(urllib.error.HTTPError, match="403"):

@@ -13,6 +13,7 @@ import traceback
 import warnings
 from pathlib import Path
 
+import doors
 import files
 import folders
 import judge
@@ -24,7 +25,7 @@ import lavender as lv
 
 REFUSED = (lv.LavenderError,)
 COUNTS = {"solves": 0, "refused": 0, "files": 0, "loaded": 0, "steps": 0, "scenes": 0, "snapshots": 0, "restored": 0,
-          "folders": 0, "judged": 0, "repeated": 0, "lost": 0}  # fmt: skip
+          "folders": 0, "doors": 0, "judged": 0, "repeated": 0, "lost": 0}  # fmt: skip
 # Below this, numbers on the way are far from the edges of float64, and both judges must say the same.
 MODERATE = 90.0
 
@@ -369,12 +370,18 @@ def check_folder(spec):
     yield from folders.check(spec)
 
 
+def check_door(spec):
+    COUNTS["doors"] += 1
+    yield from doors.check(spec)
+
+
 CHECKS = {
     "solve": check_solve,
     "file": check_file,
     "steps": check_steps,
     "snapshot": check_snapshot,
     "folder": check_folder,
+    "door": check_door,
 }
 MAKE = {
     "solve": problems.solve_spec,
@@ -382,4 +389,5 @@ MAKE = {
     "steps": scenes.scene_spec,
     "snapshot": scenes.snapshot_spec,
     "folder": folders.folder_spec,
+    "door": doors.door_spec,
 }

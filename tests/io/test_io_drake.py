@@ -144,3 +144,25 @@ def test_velocities_that_do_not_add_up_are_refused(monkeypatch):
     monkeypatch.setattr(drake, "_free_motion", lambda *a: (honest(*a)[0], honest(*a)[1] + 1e-3))
     with pytest.raises(lv.CapabilityError, match=r"not J\^T times its impulses"):
         lv.io.from_drake(plant, context)
+
+
+@pytest.mark.parametrize(
+    "what", ["another context", "root", "unconnected", "rotation", "huge", "dt", "correction"]
+)
+def test_what_drake_cannot_take_is_an_input_error(what):
+    _, whole, plant, context = robot()
+    more = {}
+    if what == "another context":
+        context = robot()[3]
+    elif what == "root":
+        context = whole
+    elif what == "unconnected":
+        context = plant.CreateDefaultContext()
+    elif what == "rotation":
+        plant.SetPositions(context, np.zeros(plant.num_positions()))
+    elif what == "huge":
+        plant.SetVelocities(context, np.full(plant.num_velocities(), 1e200))
+    else:
+        more = {what: "a"}
+    with pytest.raises(lv.LavenderError):
+        lv.io.from_drake(plant, context, **more)

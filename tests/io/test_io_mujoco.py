@@ -7,6 +7,7 @@ import pytest
 
 import lavender as lv
 from lavender.io import mujoco as adapter
+from lavender.io import recording
 
 mj = pytest.importorskip("mujoco", reason="needs MuJoCo: pip install 'lavender-contact[peers]'")
 
@@ -377,3 +378,174 @@ def test_every_edge_of_a_flex_is_a_block_of_its_own():
     assert problem.whitened.nnz <= 9 * problem.m  # three vertices at most
     solution = lv.solve(problem, "newton", tol=1e-9)
     assert solution.success or solution.residual.at_floor
+
+
+# -- data that were changed -----------------------------------------------------------------------------
+
+WRONG = (-1, -(2**31), 2**31 - 1, 2**20, 1000)
+INDICES = (
+    "efc_id",
+    "efc_J_colind",
+    "efc_J_rowadr",
+    "efc_J_rownnz",
+    "contact.dim",
+    "M_colind",
+    "M_rowadr",
+    "M_rownnz",
+)
+
+
+def entry(model, data, name):
+    """An array of the data or the model by its name."""
+    if name == "contact.dim":
+        return data.contact.dim
+    return getattr(model if name.startswith("M_") else data, name)
+
+
+@pytest.mark.parametrize("value", WRONG)
+@pytest.mark.parametrize("name", INDICES)
+@pytest.mark.parametrize("cone", ["elliptic", "pyramidal"])
+def test_an_index_that_names_what_is_not_there_is_refused_before_it_is_followed(cone, name, value):
+    model, data = state(cone, condim=4, jacobian="sparse")
+    array = np.array(entry(model, data, name))
+    places = np.arange(len(array))
+    if name == "efc_id":  # of the rows of a contact the first one's is read
+        places = places[np.diff(array, prepend=-1) != 0]
+    for at in (places[0], places[len(places) // 2], places[-1]):
+        changed = array.copy()
+        changed[at] = value
+        entry(model, data, name)[:] = changed
+        with pytest.raises(lv.InputError, match=r"M_rowadr|names what is not there|names number"):
+            lv.io.from_mujoco(model, data)
+        if name.startswith("efc_J"):
+            with pytest.raises(lv.InputError, match="names what is not there"):
+                adapter.jacobian(model, data)
+
+
+@pytest.mark.parametrize("name", ["nefc", "ncon", "nJ"])
+@pytest.mark.parametrize("value", [-1, 2**30])
+def test_counts_beyond_the_memory_of_the_data_are_refused(name, value):
+    model, data = state(jacobian="sparse")
+    if not hasattr(data, name):
+        pytest.skip("this MuJoCo does not count so")
+    setattr(data, name, value)
+    for read in (lv.io.from_mujoco, adapter.impulse, adapter.scaling, adapter.jacobian):
+        with pytest.raises(lv.InputError, match="does not hold as many"):
+            read(model, data)
+
+
+@pytest.mark.parametrize("before", ["dense", "sparse"])
+def test_another_choice_of_layout_after_the_forward_pass_is_refused(before):
+    model, data = state(jacobian=before)
+    other = {"dense": mj.mjtJacobian.mjJAC_SPARSE, "sparse": mj.mjtJacobian.mjJAC_DENSE}[before]
+    model.opt.jacobian = other
+    with pytest.raises(lv.LavenderError, match=r"opt\.jacobian"):
+        lv.io.from_mujoco(model, data)
+
+
+@pytest.mark.parametrize("gravity", [(0.0, 0.0, 0.0), (0.0, 0.0, -9.81)])
+@pytest.mark.parametrize("moving", [False, True])
+@pytest.mark.parametrize("stepped", [False, True])
+@pytest.mark.parametrize("factor", [0.0, -1.0, 1.0 + 1e-6])
+def test_a_jacobian_that_did_not_make_the_data_is_refused(factor, stepped, moving, gravity):
+    model, data = state()
+    model.opt.gravity[:] = gravity
+    if not moving:
+        data.qvel[:] = 0.0
+    (mj.mj_step if stepped else mj.mj_forward)(model, data)
+    assert lv.io.from_mujoco(model, data).m > 0
+    data.efc_J[:] = factor * data.efc_J
+    # Nothing moves, pushes or falls: what J is nobody can tell.
+    if moving or any(gravity) or np.abs(data.efc_force).max() > 0.0:
+        with pytest.raises(lv.CapabilityError, match="not the Jacobian of this forward pass"):
+            lv.io.from_mujoco(model, data)
+
+
+def test_vectors_that_a_copy_did_not_fill_tell_nothing_of_the_jacobian():
+    model, data = state()
+    right = lv.io.from_mujoco(model, data)
+    data.efc_vel[:] = data.efc_b[:] = 0.0
+    data.qfrc_constraint[:] = 0.0
+    assert lv.io.from_mujoco(model, data) == right
+
+
+@pytest.mark.parametrize("integrator", ["EULER", "RK4", "IMPLICIT", "IMPLICITFAST"])
+@pytest.mark.parametrize("jacobian", ["dense", "sparse"])
+def test_data_of_a_step_and_of_a_forward_pass_agree_with_themselves(jacobian, integrator):
+    model, data = state(jacobian=jacobian)
+    model.opt.integrator = getattr(mj.mjtIntegrator, f"mjINT_{integrator}")
+    for _ in range(20):
+        mj.mj_step(model, data)
+        if integrator != "RK4":  # whose qacc is that of no single pass
+            assert lv.io.from_mujoco(model, data).m > 0
+        mj.mj_forward(model, data)
+        assert lv.io.from_mujoco(model, data).m > 0
+
+
+@pytest.mark.parametrize("step", [0.0, -0.004, np.nan, np.inf])
+def test_a_step_that_is_no_time_is_refused(step):
+    model, data = state()
+    model.opt.timestep = step
+    with pytest.raises(lv.InputError, match="timestep"):
+        lv.io.from_mujoco(model, data)
+
+
+@pytest.mark.parametrize(
+    "name", ["qacc", "qvel", "qacc_smooth", "efc_aref", "efc_force", "efc_J", "efc_R", "M"]
+)
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+@pytest.mark.parametrize("noslip", [0, 3])
+def test_numbers_that_are_not_finite_are_refused(name, value, noslip):
+    model, data = state()
+    model.opt.noslip_iterations = noslip
+    mj.mj_forward(model, data)
+    if not hasattr(data, name):
+        pytest.skip("this MuJoCo has no such array")
+    getattr(data, name)[-1] = value  # of a body that nothing touches, where there is one
+    with pytest.raises(lv.LavenderError):
+        lv.io.from_mujoco(model, data)
+
+
+def test_data_of_a_second_model_are_refused():
+    model, data = state()
+    text = SCENE.format(cone="elliptic", solver="Newton", condim=3, jacobian="dense")
+    # As many velocities, of six joints where one was.
+    ways = "".join(
+        f'<joint type="{kind}" axis="{axis}"/>'
+        for kind in ("slide", "hinge")
+        for axis in ("1 0 0", "0 1 0", "0 0 1")
+    )
+    bob = '<body name="bob" pos="0 2 1">'
+    other = mj.MjModel.from_xml_string(text.replace(f"{bob}<freejoint/>", bob + ways))
+    assert other.nv == model.nv
+    with pytest.raises(lv.LavenderError):
+        lv.io.from_mujoco(other, data)
+
+
+@pytest.mark.parametrize(
+    "kind", ["archive", "words", "objects", "one row", "short", "huge", "folder", "nothing"]
+)
+def test_controls_of_another_thing_are_refused_by_name(tmp_path, kind):
+    (tmp_path / "model.xml").write_text(
+        SCENE.format(cone="elliptic", solver="Newton", condim=3, jacobian="dense")
+    )
+    path = tmp_path / "controls.npy"
+    if kind == "archive":
+        np.savez(tmp_path / "controls.npz", a=np.zeros((3, 1)), b=np.zeros(2))
+        path = tmp_path / "controls.npz"
+    elif kind == "words":
+        np.save(path, np.array([["a"]]))
+    elif kind == "objects":
+        np.save(path, np.array([[None]]), allow_pickle=True)
+    elif kind == "one row":
+        np.save(path, np.zeros(3))
+    elif kind == "folder":
+        path.mkdir()
+    elif kind == "huge":
+        path.write_bytes(b"\x93NUMPY\x01\x00\x76\x00" + (
+            b"{'descr': '<f8', 'fortran_order': False, 'shape': (1000000000000, 1), }".ljust(117) + b"\n"
+        ))  # fmt: skip
+    elif kind == "short":
+        path.write_bytes(b"\x93NUMPY")
+    with pytest.raises(lv.InputError, match="control"):
+        recording.record_file(tmp_path / "model.xml", tmp_path / "out", 3, control=str(path))

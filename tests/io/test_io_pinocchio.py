@@ -97,3 +97,77 @@ def test_what_does_not_fit_is_said():
     with pytest.raises(lv.errors.InputError, match=r"pinocchio\.Model"):
         lv.io.from_pinocchio(3, model.createData(), [], [], 0.01, q=q, v=v)
     assert problem_of(model, [], q, v).m == 0
+
+
+# -- data that were changed -----------------------------------------------------------------------------
+
+
+def chain(n):
+    """Another model, of n hinges in a row."""
+    model, last = pin.Model(), 0
+    for i in range(n):
+        last = model.addJoint(last, pin.JointModelRX(), pin.SE3.Identity(), f"joint {i}")
+        model.appendBodyToJoint(last, pin.Inertia.Random(), pin.SE3.Identity())
+    model.lowerPositionLimit[:], model.upperPositionLimit[:] = -0.5, 0.5
+    return model
+
+
+def changed(what):
+    """Model, data, constraints and their data, q, v, of which one does not fit."""
+    model, models, q, v = robot()
+    data, datas, other = model.createData(), [m.createData() for m in models], chain(12)
+    if what.startswith("data of"):
+        data = chain(int(what.split()[-1])).createData()
+    elif what.startswith("constraint"):
+        make = {
+            "contact": lambda: pin.PointContactConstraintModel(other, 0, pin.SE3.Identity(), 12, pin.SE3.Identity()),
+            "friction": lambda: pin.JointFrictionConstraintModel(other, [12]),
+            "limit": lambda: pin.JointLimitConstraintModel(other, [12]),
+        }  # fmt: skip
+        models = [make[what.split()[-1]]()]
+        datas = [models[0].createData()]
+    elif what == "order of data":
+        datas = datas[::-1]
+    elif what == "no constraints":
+        models = [3, "a", None, {}]
+    elif what == "no data":
+        datas = [3, "a", None, {}]
+    elif what == "none":
+        models = None
+    elif what.startswith("joint"):
+        setattr(models[1], f"{what.replace(' ', '')}_id", 99)
+    elif what == "parent":
+        model.parents[2] = 7
+    elif what == "parent of itself":
+        model.parents[2] = 2
+    elif what in ("idx_vs", "nvs", "idx_qs", "nqs"):
+        getattr(model, what)[2] = 50
+    elif what == "rotation":
+        q[3:7] = 0.0
+    else:
+        model.addJoint(2, pin.JointModelRX(), pin.SE3.Identity(), "later")
+        q, v = np.append(q, 0.0), np.append(v, 0.0)
+    return model, data, models, datas, q, v
+
+
+@pytest.mark.parametrize(
+    "what",
+    [
+        "data of 1", "data of 3", "data of 12", "constraint contact", "constraint friction", "constraint limit",
+        "order of data", "no constraints", "no data", "none", "joint 1", "joint 2", "parent", "parent of itself",
+        "idx_vs", "nvs", "idx_qs", "nqs", "rotation", "another joint",
+    ],
+)  # fmt: skip
+def test_what_does_not_fit_is_refused_before_it_is_followed(what):
+    model, data, models, datas, q, v = changed(what)
+    with pytest.raises(lv.InputError):
+        lv.io.from_pinocchio(model, data, models, datas, 0.01, q=q, v=v)
+
+
+def test_data_of_another_constraint_are_not_written():
+    model, models, q, v = robot()
+    datas = [m.createData() for m in models]
+    right = lv.io.from_pinocchio(model, model.createData(), models, datas, 0.01, q=q, v=v)
+    big = chain(12)
+    datas[2] = pin.JointLimitConstraintModel(big, list(range(1, 13))).createData()
+    assert lv.io.from_pinocchio(model, model.createData(), models, datas, 0.01, q=q, v=v) == right

@@ -1,5 +1,6 @@
 """Motion errors: the bound against a truth in long double, distances that mean what they say, several motions."""
 
+import warnings
 from importlib import import_module
 
 import numpy as np
@@ -474,3 +475,78 @@ def test_no_search_finds_several_motions_where_one_is_proved():
         assert len(found) <= 1, name
         proved += found.runs > 1
     assert proved >= 5
+
+
+# -- numbers at the end of float64 ---------------------------------------------------------------------
+
+NUMBERS = (
+    "kinetic", "energy", "speed", "spin", "rows", "bound", "bound_speed", "bound_spin", "moved", "spread",
+    "spread_speed",
+)  # fmt: skip
+
+
+def forms(seed):
+    rows = random_contact_problem(seed)
+    return {
+        "lcp": random_lcp(seed),
+        "cone": rows.relaxed("cone"),
+        "cone, matrix": as_matrix(rows.relaxed("cone")),
+        "coulomb": rows,
+    }
+
+
+@pytest.mark.parametrize("form", forms(0))
+@pytest.mark.parametrize("exponent", [500, 530, 700, 1000, -500, -530, -700])
+def test_motion_errors_of_impulses_scale_with_them(form, exponent):
+    """Powers of two scale every number but rounding of the target: x is far above all else, or it is nothing."""
+    problem = forms(1)[form]
+    scale = 2.0**exponent
+    reference = lv.motion.reference(problem)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        far = lv.motion_error(problem, scale * np.ones(problem.m), reference)
+        near = lv.motion_error(problem, 2.0**400 * np.ones(problem.m), reference)
+        still = lv.motion_error(problem, np.zeros(problem.m), reference)
+    assert far.relative is None or np.isfinite(far.relative)
+    for name in NUMBERS:
+        value = getattr(far, name)
+        if value is None:
+            assert name in far.note or getattr(near, name) is None
+        elif exponent > 0:
+            assert (
+                value == pytest.approx(getattr(near, name) * 2.0 ** (exponent - 400), rel=1e-9)
+                or name == "moved"
+            )
+        else:
+            assert value == pytest.approx(getattr(still, name), rel=1e-9)
+
+
+def test_what_float64_cannot_hold_is_told():
+    problem = lv.Problem.lcp([[1e300]], [1.0])
+    error = lv.motion_error(problem, [1e300])
+    assert error.rows is None
+    assert "beyond float64" in error.note
+    assert str(error)
+
+
+def test_bounds_of_tiny_impulses_do_not_vanish():
+    problem = lv.Problem.lcp(np.eye(2), [1e-170, 1e-170])
+    error = lv.motion_error(problem, [2e-170, 1e-170])
+    assert error.energy == pytest.approx(np.sqrt(0.5) * 1e-170, rel=1e-12)
+    assert error.bound >= error.energy
+
+
+@pytest.mark.parametrize("d", [1e-160, 1e160, 1e200])
+def test_motion_errors_at_the_answer_of_problems_in_far_units(d):
+    for problem in (
+        lv.Problem.lcp(d * np.array([[2.0, 1.0], [1.0, 2.0]]), [1.0, -1.0]),
+        lv.Problem.contact(d * np.eye(3), [1.0, 0.2, 0.1], 0.5),
+        lv.Problem.contact(d * np.eye(3), [1.0, 0.2, 0.1], 0.5, friction="cone"),
+    ):
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            error = lv.motion_error(problem, lv.solve(problem).impulse)
+        for name in NUMBERS:
+            value = getattr(error, name)
+            assert value is None or np.isfinite(value)
+        assert error.bound is not None or error.note

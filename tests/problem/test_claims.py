@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import scipy.sparse as sp
-from random_problems import as_matrix, random_contact_problem, random_lcp
+from random_problems import arrays_of, as_matrix, random_contact_problem, random_lcp
 
 import lavender as lv
 from lavender import registry
@@ -157,30 +157,6 @@ def problems():
     }
 
 
-def arrays_of(thing, name, seen, depth=0):
-    """(name, array) of every array that can be reached from a thing's public attributes."""
-    if isinstance(thing, np.ndarray):
-        yield name, thing
-    elif sp.issparse(thing):
-        for part in ("data", "indices", "indptr"):
-            yield f"{name}.{part}", getattr(thing, part)
-    elif type(thing).__module__.startswith("lavender") and id(thing) not in seen and depth < 4:
-        seen.add(id(thing))
-        for attribute in dir(type(thing)):
-            if attribute.startswith("__"):
-                continue
-            kind = getattr(type(thing), attribute)
-            if callable(kind) and not isinstance(kind, type):
-                continue
-            try:
-                value = getattr(thing, attribute)
-            except lv.LavenderError:
-                continue
-            yield from arrays_of(value, f"{name}.{attribute}", seen, depth + 1)
-        for attribute, value in getattr(thing, "__dict__", {}).items():
-            yield from arrays_of(value, f"{name}.{attribute}", seen, depth + 1)
-
-
 @pytest.mark.parametrize("form", ["rows", "csr", "dense", "generalized"])
 def test_every_array_of_a_problem_is_read_only(form):
     problem = problems()[form]
@@ -241,3 +217,166 @@ def test_a_verdict_on_another_problem_is_not_taken(plug_in):
     solution = lv.solve(problem, plug_in(run))
     assert solution.contradicted
     np.testing.assert_array_equal(solution.residual.slack, -problem.b)
+
+
+# -- plug-ins that lie --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("resumable", [False, True])
+def test_an_impulse_kept_by_a_solver_and_changed_later_changes_no_solution(plug_in, resumable):
+    kept = []
+    problem = random_lcp(10)
+    answer = lv.solve(problem, "pgs", tol=1e-9).impulse
+
+    def run(problem, impulse):
+        for old in kept:
+            old.flags.writeable = True
+            old[:] = 7.0
+        impulse[:] = answer
+        kept.append(impulse[:])
+        return says(lv.Status.CONVERGED)
+
+    name = plug_in(run, resumable=resumable)
+    first = lv.solve(problem, name)
+    before = first.impulse.copy()
+    second = lv.solve(problem, name)
+    for solution in (first, second):
+        assert solution.success
+        assert solution.impulse.tobytes() == before.tobytes()
+        assert lv.residual(problem, solution.impulse).relative == solution.residual.relative
+
+
+@pytest.mark.parametrize("form", ["rows", "csr", "dense", "generalized"])
+def test_arrays_made_writable_by_a_solver_change_no_problem(form, plug_in):
+    problem, twin = problems()[form], problems()[form]
+
+    def run(problem, impulse):
+        for _, array in arrays_of(problem, "problem", set()):
+            base = array
+            while base is not None:
+                if isinstance(base, np.ndarray) and base.dtype == float and base.flags.owndata:
+                    base.flags.writeable = True
+                    base[...] = 0.0
+                base = base.base
+        return says(lv.Status.CONVERGED)
+
+    name = plug_in(run)
+    honest = lv.solve(twin, "pgs")
+    for start in (None, honest.impulse):
+        lv.solve(problem, name, impulse=start)
+        assert problem == twin
+        assert lv.solve(problem, "pgs").impulse.tobytes() == honest.impulse.tobytes()
+        np.testing.assert_array_equal(problem.d, twin.d)
+
+
+@pytest.mark.parametrize(
+    "claim",
+    [
+        None,
+        "CONVERGED",
+        (lv.Status.CONVERGED, 3),
+        lv.Claim(None, 1),
+        lv.Claim("CONVERGED", 1),
+        lv.Claim(lv.Status.CONVERGED, None),
+        lv.Claim(lv.Status.CONVERGED, "3"),
+        lv.Claim(lv.Status.CONVERGED, 1.5),
+        lv.Claim(lv.Status.CONVERGED, -1),
+        lv.Claim(lv.Status.CONVERGED, 1, ["sweeps"]),
+        lv.Claim(lv.Status.CONVERGED, 1, {"sweeps": None}),
+        lv.Claim(lv.Status.CONVERGED, 1, {"sweeps": 1.5}),
+        lv.Claim(lv.Status.CONVERGED, 1, {1: 1}),
+        lv.Claim(lv.Status.CONVERGED, 1, message=None),
+        lv.Claim(lv.Status.CONVERGED, 1, form=3),
+        lv.Claim(lv.Status.INFEASIBLE, 1, certificate="none"),
+        lv.Claim(lv.Status.INFEASIBLE, 1, certificate=[[1.0], [1.0, 2.0]]),
+    ],
+    ids=repr,
+)
+@pytest.mark.parametrize("resumable", [False, True])
+def test_what_is_no_claim_is_a_numerical_error_that_names_the_solver(plug_in, claim, resumable):
+    problem = random_lcp(11)
+    answer = lv.solve(problem, "pgs", tol=1e-9).impulse
+
+    def run(problem, impulse):
+        impulse[:] = answer
+        return claim
+
+    name = plug_in(run, resumable=resumable)
+    solution = lv.solve(problem, name)
+    assert solution.status is lv.Status.NUMERICAL_ERROR
+    assert f"solver {name!r}" in solution.message
+    assert solution.success  # the judge reads the impulse, whatever was said of it
+    assert str(solution)
+    assert lv.solve_many([problem], name)[0].status is lv.Status.NUMERICAL_ERROR
+
+
+@pytest.mark.parametrize("change", ["shape", "dtype"])
+def test_an_impulse_made_another_array_is_not_taken_over(plug_in, change):
+    def run(problem, impulse):
+        if change == "shape":
+            impulse.shape = (problem.m, 1)
+        else:
+            impulse.dtype = np.int64
+        return says(lv.Status.CONVERGED)
+
+    problem = random_lcp(12)
+    name = plug_in(run)
+    solution = lv.solve(problem, name)
+    assert solution.status is lv.Status.NUMERICAL_ERROR
+    assert f"solver {name!r} made of the impulse" in solution.message
+    np.testing.assert_array_equal(solution.impulse, problem.start())
+
+
+@pytest.mark.parametrize("relative", [0.0, np.nan, None])
+@pytest.mark.parametrize("value", [np.nan, np.inf, 1e9, "words", (3,)])
+def test_the_best_iterate_of_a_solver_is_judged_before_it_is_taken(relative, value):
+    problem = random_lcp(13)
+    answer = lv.solve(problem, "pgs", tol=1e-9).impulse
+    best = np.full(problem.m, value) if isinstance(value, float) else value
+    best = np.zeros(best) if isinstance(best, tuple) else best
+
+    class Boasts:
+        def prepare(self, problem):
+            self.best = relative, best
+            return self
+
+        def update(self, state, problem):
+            return self.prepare(problem)
+
+        def run(self, state, impulse, n, tol, time_limit=None):
+            impulse[:] = answer
+            return says(lv.Status.CONVERGED)
+
+    registry.register(lv.SolverSpec(name="boasts", factory=Boasts, laws={"lcp"}, summary=""))
+    try:
+        solution = lv.solve(problem, "boasts")
+        assert solution.status is lv.Status.CONVERGED
+        assert solution.impulse.tobytes() == answer.tobytes()
+    finally:
+        del registry._registered["boasts"]
+
+
+def test_ctrl_c_leaves_what_a_plug_in_has_come_to(plug_in):
+    def run(problem, impulse):
+        impulse[:] = 3.0
+        raise KeyboardInterrupt
+
+    solution = lv.solve(random_lcp(14), plug_in(run))
+    assert solution.status is lv.Status.INTERRUPTED
+    np.testing.assert_array_equal(solution.impulse, 3.0)
+
+
+def test_the_short_way_of_few_rows_is_for_solvers_of_this_package_alone():
+    class Few:
+        def solve(self, problem, impulse, tol):
+            raise AssertionError("asked")
+
+    registry.register(
+        lv.SolverSpec(name="few", factory="lavender.solvers.pgs:PGS", laws={"lcp"}, summary="", few=Few())
+    )
+    try:
+        assert lv.solve(random_lcp(15), "few", max_iter=2000).success
+        assert lv.solve_many([random_lcp(15)], "few")[0].iterations > 0
+        assert lv.solve(random_lcp(15), "few").iterations > 0
+    finally:
+        del registry._registered["few"]

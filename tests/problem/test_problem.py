@@ -5,12 +5,13 @@ import pickle
 import subprocess
 import sys
 import warnings
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
 import scipy.sparse as sp
 from hypothesis import given
-from random_problems import as_matrix, random_contact_problem, random_lcp, random_rows, seeds
+from random_problems import arrays_of, as_matrix, random_contact_problem, random_lcp, random_rows, seeds
 
 import lavender as lv
 
@@ -451,3 +452,95 @@ def test_ctrl_c_from_a_real_signal(tmp_path):
         "assert solution.iterations > 1000 and solution.residual.relative < 1e-9, solution\n"
     )
     subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
+
+
+# -- what is given stays the giver's ---------------------------------------------------------------------
+
+
+def given_arrays():
+    """Arrays as callers hold them, float64 and int32, writable and contiguous: what could be taken as it is."""
+    general = random_contact_problem(3)
+    rows = general.rows
+    jac = general.jacobian.toarray()
+    given = {
+        "A": random_lcp(3).dense(), "b": np.array(random_lcp(3).b), "lower": np.zeros(12), "upper": np.full(12, 2.0),
+        "mu": np.full(4, 0.5), "patch": np.full(4, 0.1), "guess": np.zeros(12),
+        "J": jac, "M": 2.0 * np.eye(jac.shape[1]),
+        "v": np.ones(jac.shape[1]), "target": np.array(general.b), "soft": np.full(general.m, 1e-3),
+        "warm": np.zeros(general.m), "key": np.arange(12, dtype=np.uint64),
+    }  # fmt: skip
+    return given | {f.name: np.array(getattr(rows, f.name)) for f in fields(rows) if f.name != "copy"}
+
+
+def makers(sparse):
+    """A problem of each constructor; `sparse`, where it is not None, is the format of A, J and M."""
+    form = sparse or (lambda a: a)
+    cones = random_contact_problem(3).cones
+
+    def of_rows(g):
+        return lv.Rows(**{f.name: g[f.name] for f in fields(lv.Rows) if f.name != "copy"})
+
+    def of_jacobian(g):
+        return lv.Problem.from_jacobian(
+            form(g["J"]), form(g["M"]), g["v"], target=g["target"], cones=cones, compliance=g["soft"], guess=g["warm"]
+        )  # fmt: skip
+
+    def blocks_of_mass(g):
+        half = g["M"].shape[0] // 2
+        blocks = [np.ascontiguousarray(g["M"][:half, :half]), np.ascontiguousarray(g["M"][half:, half:])]
+        made = lv.Problem.from_jacobian(g["J"], blocks, g["v"], target=g["target"], cones=cones)
+        assert all(block.flags.writeable for block in blocks)
+        return made
+
+    return {
+        "linear": lambda g: lv.Problem.linear(form(g["A"]), g["b"], guess=g["guess"]),
+        "lcp": lambda g: lv.Problem.lcp(form(g["A"]), g["b"], g["lower"], g["upper"], key=g["key"]),
+        "contact": lambda g: lv.Problem.contact(form(g["A"]), g["b"], g["mu"]),
+        "spin": lambda g: lv.Problem.contact(form(g["A"]), g["b"], g["mu"], patch_radius=g["patch"]),
+        "from_rows": lambda g: lv.Problem.from_rows(of_rows(g), g["target"][: len(g["jac"]) + len(g["normal"])]),
+        "from_jacobian": of_jacobian,
+        "blocks of M": blocks_of_mass,
+        "updated": lambda g: of_jacobian(given_arrays()).updated(
+            J=form(g["J"]), M=form(g["M"]), v_free=g["v"], target=g["target"], guess=g["warm"]
+        ),
+        "with a new J": lambda g: of_jacobian(given_arrays()).updated(J=form(g["J"]), b=g["target"]),
+        "of an adopted one": lambda g: (
+            lv.Problem.lcp(given_arrays()["A"], given_arrays()["b"], copy=False).updated(b=g["b"], guess=g["guess"])
+        ),
+        "of another law": lambda g: random_contact_problem(3).relaxed().updated(b=g["target"], guess=g["warm"]),
+        "replaced": lambda g: replace(random_contact_problem(3), b=g["target"], guess=g["warm"]),
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("sparse", [None, sp.csr_array, sp.csc_array, sp.coo_array])
+@pytest.mark.parametrize("maker", makers(None))
+def test_arrays_that_are_copied_stay_writable_and_unshared(maker, sparse):
+    given = given_arrays()
+    problem = makers(sparse)[maker](given)
+    before = pickle.dumps(problem)
+    assert [name for name, array in given.items() if not array.flags.writeable] == []
+    kept = arrays_of(problem, "problem", set())
+    assert [k for k, x in kept for y in given.values() if x.size and np.shares_memory(x, y)] == []
+    for array in given.values():
+        array[...] = array + 1  # a loop fills its arrays anew
+    assert pickle.dumps(problem) == before
+
+
+@pytest.mark.parametrize("sparse", [sp.csr_array, sp.csc_array, sp.coo_array, sp.bsr_array])
+def test_sparse_matrices_that_are_copied_stay_writable_and_unshared(sparse):
+    given = given_arrays()
+    a, jac, mass = (sparse(given[name]) for name in "AJM")
+    problem = lv.Problem.lcp(a, given["b"])
+    general = lv.Problem.from_jacobian(jac, mass, given["v"], cones=lv.Cones.free(len(given["J"])))
+    before = pickle.dumps((problem, general))
+    for matrix in (a, jac, mass):
+        matrix.data += 1.0
+    assert pickle.dumps((problem, general)) == before
+
+
+def test_arrays_that_are_adopted_are_shared_and_read_only():
+    given = given_arrays()
+    problem = lv.Problem(given["b"], random_lcp(3).cones, given["A"], guess=given["guess"], copy=False)
+    for name, kept in (("b", problem.b), ("A", problem.matrix), ("guess", problem.guess)):
+        assert kept is given[name]
+        assert not kept.flags.writeable

@@ -1,5 +1,7 @@
 """`redundancy`: ranks known by hand, names, uniqueness, and representatives against other optimisers."""
 
+from fractions import Fraction
+
 import numpy as np
 import pytest
 import scipy.sparse as sp
@@ -182,3 +184,74 @@ def test_what_has_no_representative_is_refused():
 
 def test_no_rows():
     assert redundancy(lv.Problem.linear(np.zeros((0, 0)), [])).rank == 0
+
+
+# -- rows and bodies of very different size -------------------------------------------------------------
+
+
+def exact_rank(matrix):
+    """Rank of a small matrix in rational numbers."""
+    rows, rank = [[Fraction(float(x)) for x in row] for row in matrix], 0
+    for column in range(len(rows[0])):
+        pivot = next((i for i in range(rank, len(rows)) if rows[i][column]), None)
+        if pivot is None:
+            continue
+        rows[rank], rows[pivot] = rows[pivot], rows[rank]
+        for i in range(rank + 1, len(rows)):
+            share = rows[i][column] / rows[rank][column]
+            rows[i] = [x - share * y for x, y in zip(rows[i], rows[rank], strict=True)]
+        rank += 1
+    return rank
+
+
+@pytest.mark.parametrize("form", ["masses", "rows of J", "matrix"])
+@pytest.mark.parametrize("spread", [0, 30, 44, 50, 66, 88, 140])
+def test_the_rank_is_that_of_exact_numbers_whatever_the_sizes(form, spread):
+    """Powers of two, so that nothing is rounded: the rank of J is the rank of J M^-1 J^T, and of its rows scaled."""
+    rng = np.random.default_rng(spread)
+    seen = set()
+    for _ in range(25):
+        m, n = rng.integers(2, 6, 2)
+        jac = rng.integers(-2, 3, (m, n)).astype(float)
+        if m > 2 and rng.random() < 0.5:
+            jac[-1] = jac[0] + jac[1]
+        if not jac.any(axis=1).all():
+            continue
+        truth = exact_rank(jac)
+        size = 2.0 ** (spread * rng.integers(0, 2, n if form == "masses" else m))
+        if form == "matrix":
+            jac = np.sqrt(2.0 ** (2 * (np.log2(size) // 2)))[:, None] * jac
+            problem = lv.Problem.linear(jac @ jac.T, np.zeros(m))
+        else:
+            mass = np.diag(size) if form == "masses" else np.eye(n)
+            jac = jac if form == "masses" else size[:, None] * jac
+            problem = lv.Problem.from_jacobian(jac, mass, np.zeros(n), cones=lv.Cones.free(m))
+        found = lv.redundancy(problem)
+        assert found.rank == truth, (jac, size, str(found))
+        assert len(found.rows) == m - truth
+        seen.add(m - truth)
+    assert len(seen) > 1
+
+
+def test_a_rank_that_masses_hide_is_told():
+    jac = np.array([[1.0, 1.0], [1.0, -1.0]])
+    found = lv.redundancy(
+        lv.Problem.from_jacobian(jac, np.diag([1.0, 1e14]), np.zeros(2), cones=lv.Cones.free(2))
+    )
+    assert found.rank == 2
+    assert "1 by the masses and 2 without them" in str(found)
+
+
+def test_beside_a_diagonal_1e26_times_larger_a_row_is_still_a_row():
+    found = lv.redundancy(lv.Problem.linear([[1.0, 1e12], [1e12, 1e26]], [1.0, 1.0]))
+    assert found.rank == 2
+    problem = lv.Problem.linear([[1.0, 2.0**43], [2.0**43, 2.0**86]], [1.0, 2.0**43])
+    repeated = lv.redundancy(problem)
+    assert repeated.rank == 1
+    assert lv.residual(problem, repeated.least_norm()).relative <= 1e-9
+
+
+def test_a_diagonal_that_is_rounding_is_not_scaled_by():
+    # 1e-17 beside 1e-3: no semidefinite matrix, and so no size of the row.
+    found = lv.redundancy(lv.Problem.linear([[1e-17, 1e-3], [1e-3, 1.0]], [0.0, 0.0]))
+    assert found.rank == 1

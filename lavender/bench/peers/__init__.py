@@ -17,6 +17,7 @@ from lavender.bench.peers import engines, race
 from lavender.bench.peers.contest import Result
 from lavender.engine import Simulation
 from lavender.errors import InputError, UnknownName
+from lavender.io.stored import whole_file
 from lavender.problem import Problem
 from lavender.scene import Scene
 
@@ -81,11 +82,9 @@ def read(path: str | Path) -> Peers:
     """
     path = Path(path)
     try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(
-            f"cannot read {path} ({error}); a file of `lavender bench peers --out` is needed"
-        ) from None
+        text = whole_file(path, "the measurements").decode()
+    except (InputError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: {error}; a file of `lavender bench peers --out` is needed") from None
     try:
         found = json.loads(text)
         return Peers(

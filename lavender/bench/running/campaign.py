@@ -34,6 +34,8 @@ from lavender.problem import Problem
 
 __all__ = ["CampaignPlan", "campaign", "seeds"]
 
+MOST_SEEDS = 1_000_000  # of a family in one run: a case's name and place take a kilobyte
+MOST_WORKERS = 4096  # processes: more than any machine has cores for
 ATTEMPTS = 5  # times that the remaining pairs are handed out again after workers were lost
 ROUND = 256  # pairs handed out together to a backend that cannot give results one by one
 CONNECT = 10.0  # s, for a scheduler to answer
@@ -78,10 +80,14 @@ def seeds(words: Iterable[str], n: int, first: int = 0) -> list[str]:
     Raises
     ------
     UnknownName, InputError
-        A name that the suite does not have.
+        A name that the suite does not have; more than a million seeds, each of which is a case with a name.
     """
     from lavender.suite.case import FAMILIES, parse
 
+    if not 0 <= n <= MOST_SEEDS:
+        raise InputError(
+            f"{n} seeds are asked for; at most {MOST_SEEDS} in one run: give A:B, part after part"
+        )
     out = []
     for word in words:
         if is_path(word):
@@ -129,8 +135,17 @@ def campaign(
     Raises
     ------
     InputError
-        A backend that joblib does not have here, or workers that were lost again and again.
+        A backend that joblib does not have here, another number of workers than -1 or 1 to 4096, or workers that were
+        lost again and again.
     """
+    if (
+        isinstance(workers, bool)
+        or not isinstance(workers, int)
+        or not (workers == -1 or 1 <= workers <= MOST_WORKERS)
+    ):
+        raise InputError(
+            f"workers is {workers!r}; -1 (one for each core) or a whole number from 1 to {MOST_WORKERS} is needed"
+        )
     plan = plan or CampaignPlan()
     items = resolve(cases)
     names = solver_names(solvers)

@@ -1,0 +1,129 @@
+"""Solvers of others: what they are handed is a copy, and what comes back is checked whole before anybody reads it.
+
+A plug-in may keep the arrays that it was given, change them later, or claim what is no claim. Its problem, its impulse
+and its answer are its own: none of them is the caller's, and none is what the judge reads.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from copy import deepcopy
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from lavender._arrays import FloatArray, read_only
+from lavender.problem import Problem
+from lavender.residuals import reference, residual
+from lavender.solution import Claim, Status
+from lavender_ext.judge.measure import all_finite
+
+__all__ = ["Foreign"]
+
+
+class Foreign:
+    """A solver of the name, as `lavender.registry` describes one, behind this door."""
+
+    def __init__(self, name: str, solver: Any) -> None:
+        self.name, self.solver = name, solver
+        if hasattr(solver, "ready"):
+            self.ready = solver.ready
+        if hasattr(solver, "until"):
+            self.until = lambda held, deadline: solver.until(held.state, deadline)
+
+    def prepare(self, problem: Problem) -> Held:
+        """Factor, colour, allocate, of a problem of its own."""
+        return Held(problem, self.solver.prepare(_private(problem)))
+
+    def update(self, held: Held, problem: Problem) -> Held:
+        """The same structure with new numbers."""
+        return Held(problem, self.solver.update(held.state, _private(problem)))
+
+    def run(self, held: Held, impulse: FloatArray, n: int, tol: float, time_limit: float | None) -> Claim:
+        """n more iterations on an impulse of its own; what it ends with is copied."""
+        handed = impulse.copy()
+        kept = False
+        try:
+            claim = self.solver.run(held.state, handed, n, tol, time_limit)
+        finally:  # Ctrl-C: what it has come to is the result
+            kept = handed.shape == impulse.shape and handed.dtype == impulse.dtype
+            if kept:
+                impulse[:] = handed
+        wrong = (
+            "" if kept else f"made of the impulse an array of shape {handed.shape} and dtype {handed.dtype}"
+        )
+        return self._checked(claim, wrong, len(impulse))
+
+    def _checked(self, claim: Any, wrong: str, m: int) -> Claim:
+        """The claim with what belongs into each of its fields, or one that says what is wrong."""
+        if type(claim) is not Claim:
+            wrong = wrong or f"returned a {type(claim).__name__} ({claim!r:.60}); a lavender.Claim is needed"
+            return Claim(Status.NUMERICAL_ERROR, 0, {}, f"solver {self.name!r} {wrong}")
+        said: Any = claim  # whose fields may hold anything
+        iterations = int(said.iterations) if _counts(said.iterations) else 0
+        work, certificate, dual = said.work, said.certificate, said.dual
+        if not isinstance(said.status, Status):
+            wrong = wrong or f"claims the status {claim.status!r:.60}; a lavender.Status is needed"
+        elif not _counts(claim.iterations):
+            wrong = wrong or f"claims {claim.iterations!r:.60} iterations; a whole number from 0 is needed"
+        elif not isinstance(work, Mapping) or not all(
+            isinstance(k, str) and _counts(n) for k, n in work.items()
+        ):
+            wrong = wrong or f"claims the work {work!r:.60}; counts by name are needed"
+        elif not isinstance(said.message, str) or not isinstance(said.form, str):
+            wrong = (
+                wrong
+                or f"claims the message {claim.message!r:.60} and form {claim.form!r:.60}; texts are needed"
+            )
+        if certificate is not None:
+            try:
+                certificate = read_only(np.array(certificate, np.float64))
+            except (TypeError, ValueError):
+                wrong = wrong or f"gives a certificate that is no array of {m} numbers ({certificate!r:.60})"
+        if wrong:
+            return Claim(Status.NUMERICAL_ERROR, iterations, {}, f"solver {self.name!r} {wrong}")
+        return Claim(
+            status=claim.status,
+            iterations=iterations,
+            work={k: int(n) for k, n in work.items()},
+            message=claim.message,
+            form=claim.form,
+            dual=read_only(dual.copy()) if isinstance(dual, np.ndarray) else dual,
+            certificate=certificate,
+        )
+
+
+class Held:
+    """What `prepare` of a foreign solver returned, with the problem that its answers are judged on."""
+
+    def __init__(self, problem: Problem, state: Any) -> None:
+        self.problem, self.state = problem, state
+
+    @property
+    def best(self) -> tuple[float, FloatArray] | None:
+        """The iterate that it takes for its best, judged here; None where it has none, or none of finite numbers."""
+        found = getattr(self.state, "best", None)
+        if not isinstance(found, tuple) or len(found) != 2 or not isinstance(found[1], np.ndarray):
+            return None
+        if found[1].shape != (self.problem.m,) or found[1].dtype != np.float64:
+            return None
+        impulse = found[1].copy()
+        return (residual(self.problem, impulse).relative, impulse) if all_finite(impulse) else None
+
+
+def _counts(n: Any) -> bool:
+    return isinstance(n, (int, np.integer)) and not isinstance(n, bool) and bool(0 <= n < 2**63)
+
+
+def _private(problem: Problem) -> Problem:
+    """The same problem in arrays that nobody else reads."""
+    made = replace(
+        problem,
+        cones=deepcopy(problem.cones),
+        rows=deepcopy(problem.rows),
+        generalized=deepcopy(problem.generalized),
+        copy=True,
+    )
+    reference(made)  # of the judge, which nobody can set any more
+    return made

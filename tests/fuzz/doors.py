@@ -1,0 +1,414 @@
+"""Doors: arrays of callers, another engine's memory, paths that are no files, plug-ins that lie, numbers at the end of
+float64 and words of the command line; as plain data."""
+
+import functools
+import os
+import tempfile
+from fractions import Fraction
+from pathlib import Path
+
+import folders
+import numpy as np
+import problems
+
+import lavender as lv
+from lavender import io, registry
+from lavender.io.stored import write_bytes
+
+WHAT = ("arrays", "memory", "path", "plug-in", "plug-in", "far", "far", "rank", "command")
+INDICES = ("efc_id", "efc_type", "efc_J_colind", "efc_J_rowadr", "efc_J_rownnz", "dim", "geom", "M_colind", "M_rowadr",
+           "M_rownnz")  # fmt: skip
+NUMBERS = ("efc_J", "efc_R", "efc_D", "efc_aref", "efc_force", "efc_frictionloss", "efc_vel", "efc_b", "qacc",
+           "qacc_smooth", "qfrc_smooth", "qfrc_constraint", "qvel", "M")  # fmt: skip
+OPTIONS = ("jacobian", "cone", "timestep", "integrator", "noslip_iterations", "nefc", "ncon", "nJ")
+WHOLE = (-1, -2, 0, 1, 2, 3, 5, 7, 100, 2**15, 2**20, 2**30, 2**31 - 1, -(2**31))
+REAL = (0.0, -0.0, 1.0, -1.0, 1e300, -1e300, 1e-300, "nan", "inf", "-inf")
+LIES = ("keep", "write", "nan", "shape", "dtype", "best", "raise", "honest")
+CLAIMED = ("status", "iterations", "work", "message", "form", "certificate", "dual", "claim", "nothing")
+WILD = (
+    None, "CONVERGED", -1, 1.5, 10**30, True, [], {}, {"sweeps": None}, {"sweeps": 1e400}, [1.0, 2.0], "a", [[1], 2],
+)  # fmt: skip
+TARGETS = ("pipe", "folder", "link", "dangling", "loop", "file", "new", "below a file", "long")
+WORDS = (
+    ("report", "two_particles", "--campaign", "--workers", "{}"), ("report", "wild", "--campaign", "--seeds", "0:{}"),
+    ("bench", "auto", "--seeds", "{}:0"), ("solve", "random_spd(n={})"), ("solve", "two_particles", "--tol", "{}"),
+    ("solve", "two_particles", "--max-iter", "{}"), ("solve", "two_particles", "--time-limit", "{}"),
+    ("check", "two_particles", "--tol", "{}", "--solvers", "pgs"), ("view", "{}"), ("record", "{}", "--out", "{}"),
+)  # fmt: skip
+ASKED = (
+    "0",
+    "-1",
+    "-2",
+    "1000000000",
+    "1000000000000",
+    "1e400",
+    "nan",
+    "",
+    "a",
+    "10000000",
+    "\x00",
+    "1:",
+    "0x10",
+)
+TOLD = ("kinetic", "energy", "speed", "spin", "rows", "bound", "bound_speed", "bound_spin", "moved", "spread",
+        "spread_speed")  # fmt: skip
+
+
+def door_spec(draw):
+    """What is done at which door."""
+    spec = {"kind": "door", "what": draw.pick(WHAT), "seed": draw.whole(0, 10**6)}
+    if spec["what"] == "memory":
+        spec["model"] = draw.whole(0, 11)
+        spec["edits"] = [memory_edit(draw) for _ in range(draw.pick((1, 1, 2, 3)))]
+    elif spec["what"] == "path":
+        spec["target"] = draw.pick(TARGETS)
+    elif spec["what"] == "plug-in":
+        spec |= {"lie": draw.pick(LIES), "field": draw.pick(CLAIMED), "value": draw.whole(0, len(WILD) - 1)}
+        spec["resumable"] = draw.chance(0.5)
+    elif spec["what"] == "far":
+        spec |= {"problem": problems.one_spec(draw, 8), "exponent": draw.whole(-1070, 1020)}
+    elif spec["what"] == "rank":
+        spec |= {"form": draw.pick(("masses", "rows", "matrix")), "spread": 2 * draw.whole(0, 60)}
+    elif spec["what"] == "command":
+        spec["words"] = [word.format(draw.pick(ASKED)) for word in draw.pick(WORDS)]
+    return spec
+
+
+def memory_edit(draw):
+    """Name, places (shares of the length) and value of a change."""
+    kind = draw.pick((INDICES, INDICES, INDICES, NUMBERS, OPTIONS))
+    values = WHOLE if kind is INDICES else REAL if kind is NUMBERS else (*WHOLE, *REAL)
+    return [draw.pick(kind), [draw.whole(0, 999) for _ in range(draw.pick((1, 1, 2, 20)))], draw.pick(values)]
+
+
+def check(spec):
+    """What was broken."""
+    yield from {
+        "arrays": arrays, "memory": memory, "path": path, "plug-in": plug_in, "far": far, "rank": rank,
+        "command": command,
+    }[spec["what"]](spec)  # fmt: skip
+
+
+# -- arrays of the caller -----------------------------------------------------------------------------------------
+
+
+def arrays(spec):
+    """A loop that fills its own arrays, step after step."""
+    rng = np.random.default_rng(spec["seed"])
+    m, n = (int(x) for x in rng.integers(1, 12, 2))
+    jac, mass, v, target, guess = np.zeros((m, n)), np.zeros((n, n)), np.zeros(n), np.zeros(m), np.zeros(m)
+    cones = lv.Cones.bounded(np.zeros(m), np.full(m, np.inf))
+    problem, kept = None, []
+    for step in range(3):
+        if not all(x.flags.writeable for x in (jac, mass, v, target, guess)):
+            yield "changed caller", "an array of the caller is read-only"
+            return
+        jac[:], v[:], target[:], guess[:] = (
+            rng.normal(size=(m, n)),
+            rng.normal(size=n),
+            rng.normal(size=m),
+            0.0,
+        )
+        root = rng.normal(size=(n, n))
+        mass[:] = root @ root.T + n * np.eye(n)
+        mass[:] = 0.5 * (mass + mass.T)
+        given = {"J": jac, "M": mass, "v_free": v, "target": target}
+        if problem is None or step == 2:
+            problem = lv.Problem.from_jacobian(**given, cones=cones, guess=guess)
+        else:
+            problem = problem.updated(**given, guess=guess)
+        fresh = lv.Problem.from_jacobian(
+            **{k: x.copy() for k, x in given.items()}, cones=cones, guess=guess.copy()
+        )
+        kept.append((problem, fresh))
+    if not all(problem == fresh for problem, fresh in kept):
+        yield "changed problem", "a problem follows the caller's arrays"
+
+
+# -- another engine's memory ------------------------------------------------------------------------------------
+
+
+@functools.cache
+def model(number):
+    """A small MuJoCo model by number."""
+    import mujoco as mj
+
+    rng = np.random.default_rng(number)
+    cone, jacobian = ("elliptic", "pyramidal")[number % 2], ("dense", "sparse")[number // 2 % 2]
+    condim = (3, 4, 6, 1)[number % 4]
+    links = "".join(
+        f'<body pos="0.2 0 0"><joint type="{rng.choice(["hinge", "slide"])}" axis="{rng.normal()} 1 0.3"'
+        ' frictionloss="0.1" limited="true" range="-0.2 0.2"/><geom type="capsule" fromto="0 0 0 .2 0 0" size=".04"/>'
+        for _ in range(3)
+    )
+    boxes = "".join(
+        f'<body name="b{k}" pos="{0.15 * k} 3 {0.1 + 0.15 * k}"><freejoint/><geom type="box" size=".1 .1 .1"/></body>'
+        for k in range(3)
+    )
+    made = mj.MjModel.from_xml_string(
+        f'<mujoco><option cone="{cone}" jacobian="{jacobian}"/>'
+        f'<default><geom condim="{condim}" friction="0.7 0.01 0.001"/></default>'
+        f'<worldbody><geom type="plane" size="0 0 1"/>{boxes}<body pos="0 0 1">{links}{"</body>" * 3}</body>'
+        '</worldbody><equality><connect body1="b2" anchor="0 0 .2"/></equality></mujoco>'
+    )
+    data = mj.MjData(made)
+    data.qvel[:] = 0.3 * rng.normal(size=made.nv)
+    for _ in range(20):
+        mj.mj_step(made, data)
+    return mj, made, data.qpos.copy(), data.qvel.copy()
+
+
+def memory(spec):
+    """Changed data are refused, or are a problem of finite numbers; the process lives."""
+    try:
+        mj, made, qpos, qvel = model(spec["model"])
+    except ImportError:
+        return
+    data = mj.MjData(made)
+    data.qpos[:], data.qvel[:] = qpos, qvel
+    mj.mj_forward(made, data)
+    before = {name: np.array(getattr(made, name)) for name in INDICES if name.startswith("M_")}
+    options = {name: getattr(made.opt, name) for name in OPTIONS if hasattr(made.opt, name)}
+    try:
+        for edit in sorted(
+            spec["edits"], key=lambda e: e[0] in ("nefc", "ncon", "nJ")
+        ):  # nobody writes behind those
+            change(made, data, *edit)
+        for read in (io.from_mujoco, io.mujoco.jacobian, io.mujoco.scaling, io.mujoco.impulse, named):
+            try:
+                found = read(made, data)
+            except lv.LavenderError:
+                continue
+            if isinstance(found, lv.Problem) and not np.isfinite(found.b).all():
+                yield "wrong number", "a problem from changed memory is not finite"
+    finally:
+        for name, values in before.items():
+            getattr(made, name)[:] = values
+        for name, value in options.items():
+            setattr(made.opt, name, value)
+
+
+def named(made, data):
+    """The names of the blocks, which are made late."""
+    return list(io.from_mujoco(made, data).names)
+
+
+def change(made, data, name, places, value):
+    """Write a value; what the engine does not let be written stays."""
+    value = float(value) if isinstance(value, str) else value
+    try:
+        if name in OPTIONS:
+            holder = data if name in ("nefc", "ncon", "nJ") else made.opt
+            setattr(holder, name, type(getattr(holder, name))(value))
+            return
+        holder = made if name.startswith("M_") else data.contact if name in ("dim", "geom") else data
+        array = np.asarray(getattr(holder, name)).reshape(-1)
+        for place in places if array.size else ():
+            array[place * array.size // 1000] = value
+    except (TypeError, ValueError, OverflowError, AttributeError):
+        return
+
+
+# -- paths --------------------------------------------------------------------------------------------------------
+
+
+def path(spec):
+    """A file is written behind its links or not at all; what is no file stays."""
+    if not hasattr(os, "mkfifo"):
+        return
+    with tempfile.TemporaryDirectory() as root:
+        target, real = Path(root, "a"), Path(root, "real")
+        kind = spec["target"]
+        if kind == "pipe":
+            os.mkfifo(target)
+        elif kind == "folder":
+            target.mkdir()
+        elif kind in ("link", "dangling", "loop"):
+            target.symlink_to({"link": real, "dangling": real, "loop": target}[kind])
+            if kind == "link":
+                real.write_bytes(b"old")
+        elif kind == "file":
+            target.write_bytes(b"old")
+        elif kind == "below a file":
+            target.write_bytes(b"old")
+            target = target / "b"
+        elif kind == "long":
+            target = Path(root, "x" * 300)
+        before = os.lstat(target) if os.path.lexists(target) else None
+        written = True
+        try:
+            write_bytes(target, b"new")
+        except lv.InputError:
+            written = False
+        if written != (kind in ("link", "dangling", "file", "new")):
+            yield "false claim", f"{kind}: written {written}"
+        if written and target.read_bytes() != b"new":
+            yield "wrong number", f"{kind}: what was written is not there"
+        if before is not None and kind != "file" and os.lstat(target).st_ino != before.st_ino:
+            yield "changed target", f"{kind} is another thing now"
+        if any(name.endswith(".part") for name in os.listdir(root)):
+            yield "changed folder", "a part was left"
+
+
+# -- plug-ins -----------------------------------------------------------------------------------------------------
+
+
+class Liar:
+    """Solves with pgs, and then does or says something else."""
+
+    def __init__(self, spec):
+        self.spec, self.kept, self.best = spec, [], None
+
+    def prepare(self, problem):
+        self.problem = problem
+        if self.spec["lie"] == "best":
+            self.best = (float("nan"), np.full(problem.m, np.nan))
+        return self
+
+    def update(self, state, problem):
+        return self.prepare(problem)
+
+    def run(self, state, impulse, n, tol, time_limit=None):
+        found = lv.solve(self.problem, "pgs", tol=1e-9, max_iter=300)
+        lie = self.spec["lie"]
+        for old in self.kept:
+            old.flags.writeable = True
+            old[:] = 3e5
+        impulse[:] = found.impulse
+        self.kept.append(impulse[:])
+        if lie == "write":
+            for array in (self.problem.b, self.problem.d, self.problem.csr.data, self.problem.cones.lower):
+                if array.flags.owndata:
+                    array.flags.writeable = True
+                    array[...] = -7.0
+        elif lie == "nan":
+            impulse[-1:] = np.nan
+        elif lie == "shape":
+            impulse.shape = (1, -1)
+        elif lie == "dtype":
+            impulse.dtype = np.int64
+        elif lie == "raise":
+            raise FloatingPointError("breaks")
+        field, value = self.spec["field"], WILD[self.spec["value"]]
+        if field == "claim":
+            return value
+        fields = {"status": lv.Status.CONVERGED, "iterations": 1}
+        return lv.Claim(**fields if field == "nothing" else fields | {field: value})
+
+
+def plug_in(spec):
+    """Nothing that a plug-in keeps, writes or says changes a problem or an earlier solution."""
+    rng = np.random.default_rng(spec["seed"])
+    m = int(rng.integers(1, 9))
+    root = rng.normal(size=(m, m))
+    a, b = root @ root.T + np.eye(m), rng.normal(size=m)
+    problem, twin = lv.Problem.lcp(a, b), lv.Problem.lcp(a, b)
+    liar = Liar(spec)
+    registry.register(
+        lv.SolverSpec("liar", lambda: liar, laws={"lcp"}, summary="", resumable=spec["resumable"]),
+        replace=True,
+    )
+    try:
+        first = lv.solve(problem, "liar")
+        before, word = first.impulse.tobytes(), str(first).rpartition(",")[0]
+        second = lv.solve(
+            problem, "liar", impulse=first.impulse if np.isfinite(first.impulse).all() else None
+        )
+    finally:
+        del registry._registered["liar"]
+    for solution in (first, second):
+        judged = lv.residual(twin, solution.impulse).relative
+        if not (judged == solution.residual.relative or judged != judged):
+            yield "false claim", f"judged {judged}, told {solution.residual.relative}"
+        if not isinstance(solution.status, lv.Status) or not isinstance(solution.message, str):
+            yield "raw claim", f"{solution.status!r}, {solution.message!r}"
+        str(solution)
+    if first.impulse.tobytes() != before or str(first).rpartition(",")[0] != word:
+        yield "changed solution", "an earlier solution is another one now"
+    if (
+        problem != twin
+        or lv.solve(problem, "pgs").impulse.tobytes() != lv.solve(twin, "pgs").impulse.tobytes()
+    ):
+        yield "changed problem", "a plug-in has changed it"
+
+
+# -- the end of float64 --------------------------------------------------------------------------------------------
+
+
+def far(spec):
+    """Motion errors are finite, or `note` says why there is none; at any impulse, and at the answer of auto."""
+    problem = problems.build(spec["problem"])
+    answer = lv.solve(problem).impulse
+    for x in (np.full(problem.m, 2.0 ** spec["exponent"]), answer):
+        if not np.isfinite(x).all():
+            continue
+        error = lv.motion_error(problem, x)
+        values = {name: getattr(error, name) for name in TOLD}
+        beyond = [name for name, value in values.items() if value is not None and not np.isfinite(value)]
+        if beyond or (error.relative is not None and not np.isfinite(error.relative) and not error.note):
+            yield "wrong number", f"not finite and not told: {beyond}"
+        str(error)
+    if problem.m and problem.is_symmetric:
+        found = lv.redundancy(problem)
+        if not 0 <= found.rank == problem.m - len(found.rows):
+            yield "wrong number", f"rank {found.rank}"
+
+
+def rank(spec):
+    """The rank of small whole numbers, whatever the sizes of rows and masses."""
+    rng = np.random.default_rng(spec["seed"])
+    m, n = (int(x) for x in rng.integers(1, 7, 2))
+    jac = rng.integers(-2, 3, (m, n)).astype(float)
+    if m > 2 and rng.random() < 0.5:
+        jac[-1] = jac[0] - jac[1]
+    jac = jac[jac.any(axis=1)]
+    m = len(jac)
+    if m == 0:
+        return
+    truth = exact_rank(jac)
+    size = 2.0 ** (spec["spread"] * rng.integers(0, 2, n if spec["form"] == "masses" else m))
+    if spec["form"] == "matrix":
+        jac = 2.0 ** (np.log2(size)[:, None] // 2) * jac
+        problem = lv.Problem.linear(jac @ jac.T, np.zeros(m))
+    else:
+        mass = np.diag(size) if spec["form"] == "masses" else np.eye(n)
+        jac = jac if spec["form"] == "masses" else size[:, None] * jac
+        problem = lv.Problem.from_jacobian(jac, mass, np.zeros(n), cones=lv.Cones.free(m))
+    found = lv.redundancy(problem)
+    if found.rank != truth:
+        yield "wrong number", f"rank {found.rank} of {truth}"
+
+
+def exact_rank(matrix):
+    """Rank in rational numbers."""
+    rows, found = [[Fraction(float(x)) for x in row] for row in matrix], 0
+    for column in range(len(rows[0])):
+        pivot = next((i for i in range(found, len(rows)) if rows[i][column]), None)
+        if pivot is None:
+            continue
+        rows[found], rows[pivot] = rows[pivot], rows[found]
+        for i in range(found + 1, len(rows)):
+            share = rows[i][column] / rows[found][column]
+            rows[i] = [x - share * y for x, y in zip(rows[i], rows[found], strict=True)]
+        found += 1
+    return found
+
+
+# -- the command line ----------------------------------------------------------------------------------------------
+
+
+def command(spec):
+    """A documented status and no traceback, whatever number is asked for."""
+    if (
+        spec["words"][:2] in (["report", "two_particles"], ["report", "wild"])
+        and spec["words"][-1].strip("0:-") == "1"
+    ):
+        return  # which starts processes
+    with tempfile.TemporaryDirectory() as root:
+        here = os.getcwd()
+        os.chdir(root)
+        try:
+            code, text = folders.quiet(spec["words"])
+        finally:
+            os.chdir(here)
+    yield from folders.told(code, text, " ".join(spec["words"][:2]))

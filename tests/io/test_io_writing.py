@@ -1,0 +1,173 @@
+"""Whoever writes a file writes a regular one, whole, behind its links; what is no file is left as it is."""
+
+import errno
+import os
+import stat
+
+import numpy as np
+import pytest
+
+import lavender as lv
+import lavender.cli
+from lavender import bench, io
+from lavender.bench.motions import write_csv
+from lavender.bench.store import Records, Store
+from lavender.engine import run
+from lavender.engine.picture import save_picture
+from lavender.io.stored import write_atomically, write_text
+
+pytestmark = pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="pipes and devices with names are of POSIX")
+
+
+@pytest.fixture(scope="module")
+def made():
+    """What is written: a problem, a film, a trace and a snapshot."""
+    simulation = lv.Simulation("stack")
+    return {
+        "problem": lv.Problem.contact(np.eye(3), [1.0, 0.0, 0.0], 0.5),
+        "film": lv.Simulation("stack").film(3),
+        "trace": run(simulation, 3),
+        "state": simulation.snapshot(),
+    }
+
+
+def store(made, path):
+    Store(path).close()
+
+
+WRITERS = {
+    "npz": (".npz", lambda made, path: io.save(made["problem"], path)),
+    "hdf5": (".hdf5", lambda made, path: io.save(made["problem"], path)),
+    "film": (".film", lambda made, path: made["film"].save(path)),
+    "strip": (".png", lambda made, path: save_picture(made["film"], path)),
+    "animation": (".gif", lambda made, path: save_picture(made["film"], path)),
+    "trace": (".csv", lambda made, path: made["trace"].save(path)),
+    "figure": (".svg", lambda made, path: made["trace"].plot(path)),
+    "snapshot": (".snap", lambda made, path: made["state"].save(path)),
+    "records": (".jsonl", store),
+    "records as CSV": (".csv", lambda made, path: bench.write_csv(Records(), path)),
+    "records as JSON": (".json", lambda made, path: bench.write_json(Records(), path)),
+    "samples": (".csv", lambda made, path: write_csv([lv.Cones.free(1)], path)),
+    "text": (".txt", lambda made, path: write_text(path, "a")),
+}
+everybody = pytest.mark.parametrize(("suffix", "write"), WRITERS.values(), ids=WRITERS)
+
+BEFORE = b"what stood there"
+
+
+@everybody
+def test_a_link_stays_and_the_file_behind_it_is_replaced(suffix, write, made, tmp_path):
+    (tmp_path / "far").mkdir()
+    target, link, second = (
+        tmp_path / name for name in (f"far/target{suffix}", f"link{suffix}", f"second{suffix}")
+    )
+    link.symlink_to(target)
+    second.symlink_to(f"link{suffix}")
+    for _ in range(2):  # first where the links lead to nothing yet
+        write(made, second)
+        assert link.is_symlink() and second.is_symlink()
+        assert target.is_file() and not target.is_symlink()
+        if suffix != ".jsonl":  # which is added to
+            assert target.stat().st_size
+            target.write_bytes(BEFORE)
+    assert [p.name for p in (tmp_path / "far").iterdir()] == [target.name]  # nothing left lying
+
+
+def special(kind, path):
+    """Something that is no file, at `path`; its mode."""
+    if kind == "pipe":
+        os.mkfifo(path)
+    elif kind == "folder":
+        path.mkdir()
+    elif kind == "link to a pipe":
+        os.mkfifo(path.with_name("pipe"))
+        path.symlink_to("pipe")
+    elif kind == "link to itself":
+        path.symlink_to(path.name)
+    else:
+        try:
+            os.mknod(path, 0o666 | stat.S_IFCHR, os.makedev(1, 7))  # as /dev/full
+        except PermissionError:
+            pytest.skip("a device needs its privileges")
+    return os.lstat(path)
+
+
+@pytest.mark.parametrize("kind", ["pipe", "folder", "device", "link to a pipe", "link to itself"])
+@everybody
+def test_what_is_no_file_is_refused_and_left_as_it_is(kind, suffix, write, made, tmp_path):
+    path = tmp_path / f"there{suffix}"
+    before = special(kind, path)
+    with pytest.raises(lv.InputError, match="cannot write"):
+        write(made, path)
+    after = os.lstat(path)
+    assert (after.st_mode, after.st_ino, after.st_rdev) == (before.st_mode, before.st_ino, before.st_rdev)
+    assert {p.name for p in tmp_path.iterdir()} <= {path.name, "pipe"}
+
+
+@everybody
+def test_a_full_disk_leaves_the_file_of_before(suffix, write, made, tmp_path, monkeypatch):
+    """A disk that is full where the new file would be renamed, for everybody the last moment."""
+    path = tmp_path / f"there{suffix}"
+    if suffix == ".jsonl":
+        pytest.skip("records are added to")
+    path.write_bytes(BEFORE)
+
+    def full(*_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "replace", full)
+    with pytest.raises(lv.InputError, match="No space left"):
+        write(made, path)
+    assert path.read_bytes() == BEFORE
+    assert [p.name for p in tmp_path.iterdir()] == [path.name]
+
+
+def test_the_path_of_an_open_descriptor_is_no_name(tmp_path):
+    with open(tmp_path / "gone", "wb") as stream:
+        path = f"/proc/self/fd/{stream.fileno()}"
+        if not os.path.exists(path):
+            pytest.skip("descriptors have no paths here")
+        os.unlink(tmp_path / "gone")
+        with pytest.raises(lv.InputError, match="cannot write"):
+            write_text(path, "a")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("run", "stack", "--steps", "2", "--film"),
+        ("run", "stack", "--steps", "2", "--trace"),
+        ("run", "stack", "--steps", "2", "--plot"),
+        ("solve", "stack(n=2)", "--output"),
+        ("bench", "two_particles", "--solvers", "pgs", "--out"),
+    ],
+)
+def test_a_command_that_is_to_write_a_device_ends_with_2(words, tmp_path, capsys):
+    path = tmp_path / "device.npz"
+    before = special("device", path)
+    with pytest.raises(SystemExit) as end:
+        lv.cli.main([*words, str(path)])
+    assert end.value.code == 2
+    assert "cannot write" in capsys.readouterr().err
+    assert os.lstat(path).st_rdev == before.st_rdev
+
+
+def test_threads_that_write_one_path_do_not_share_their_parts(tmp_path):
+    from threading import Barrier, Thread
+
+    both, parts = Barrier(2), []
+
+    def write(part):
+        parts.append(part)
+        both.wait(timeout=30.0)
+        part.write_text(str(part))
+        both.wait(timeout=30.0)
+
+    threads = [Thread(target=write_atomically, args=(tmp_path / "a", write)) for _ in range(2)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(set(parts)) == 2
+    assert (tmp_path / "a").read_text() in map(str, parts)
