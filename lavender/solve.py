@@ -21,7 +21,7 @@ from lavender.certificates import check_certificate
 from lavender.cones import ROW
 from lavender.errors import CapabilityError, InputError, InUse, UnknownName
 from lavender.problem import Problem
-from lavender.registry import SolverSpec, State, get
+from lavender.registry import SolverSpec, State, get, in_one_call
 from lavender.residuals import Residual, reference, residual, told
 from lavender.solution import Claim, History, Solution, SolverRun, Status
 from lavender_ext.judge.measure import all_finite
@@ -211,8 +211,9 @@ class Prepared:
         else:
             claim = loop.run(max_iter) if spec.resumable else loop.run_once(max_iter)
         return finish(
-            problem, spec, self.options, loop.impulse, claim, tol, setup_time, loop.time, loop.recorded()
-        )
+            problem, spec, self.options, loop.impulse, claim, tol, setup_time, loop.time, loop.recorded(),
+            float(getattr(self._state, "sweeps_per_decade", math.nan)),
+        )  # fmt: skip
 
     def _refresh(self, problem: Problem | None) -> None:
         if problem is None or problem is self.problem:
@@ -478,6 +479,7 @@ def _rest(problem: Problem, spec: SolverSpec, judged: Any, counts: Any) -> dict[
         "dual": None,
         "certificate": None,
         "contradicted": "",
+        "sweeps_per_decade": math.nan,
     }
 
 
@@ -491,6 +493,7 @@ def finish(
     setup_time: float,
     solve_time: float,
     history: History | None,
+    sweeps_per_decade: float = math.nan,
 ) -> Solution:
     judged = residual(problem, impulse)
     status, message = claim.status, claim.message
@@ -519,6 +522,9 @@ def finish(
             "no certificate was given" if certificate is None else check_certificate(problem, certificate)
         )
         contradicted = f"says INFEASIBLE, {reason}" if reason else ""
+    if status is MAX_ITERATIONS:
+        way = _way_left(problem, relative, tol, claim.iterations, sweeps_per_decade)
+        message = "; ".join(filter(None, (message, way)))
     impulse.setflags(write=False)
     return Solution.of(
         {
@@ -536,7 +542,19 @@ def finish(
             "dual": claim.dual,
             "certificate": certificate,
             "contradicted": contradicted,
+            "sweeps_per_decade": sweeps_per_decade,
         }
+    )
+
+
+def _way_left(problem: Problem, relative: float, tol: float, done: int, per_decade: float) -> str:
+    """What a budget that was used up tells, where tol is further away than was done."""
+    left = per_decade * math.log10(relative / tol) if tol > 0.0 and 0.0 < relative < math.inf else math.nan
+    if not done < left < math.inf:
+        return ""
+    return (
+        f"the residual falls tenfold in {per_decade:.3g} iterations, so tol is some {left:.2g} more away; "
+        f"solvers of another kind end sooner: {', '.join(in_one_call(problem))}"
     )
 
 

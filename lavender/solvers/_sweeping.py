@@ -63,6 +63,11 @@ class SweepState:
         """(relative residual, impulse) of the best check."""
         return self.watch.best
 
+    @property
+    def sweeps_per_decade(self) -> float:
+        """Sweeps in which the residual falls tenfold; NaN where it does not."""
+        return float(self.watch.sweeps_per_decade)
+
 
 def claim(status: int, done: int) -> Claim:
     return Claim(STATUS[status], done, {"sweeps": done})

@@ -120,6 +120,11 @@ class AdmmState:
         """(relative residual, impulse) of the best check."""
         return self.watch.best
 
+    @property
+    def sweeps_per_decade(self) -> float:
+        """Iterations in which the residual falls tenfold; NaN where it does not."""
+        return float(self.watch.sweeps_per_decade)
+
     def _factor(self, most: float = np.inf) -> tuple[int, int, tuple[Any, ...]]:
         # Within `most` [s], as far as that can be told.
         start = perf_counter()
