@@ -502,7 +502,9 @@ def finish(
         status = DIVERGED
     elif tol > 0.0 and relative <= tol and status in (MAX_ITERATIONS, TIME_LIMIT, STALLED):
         status = CONVERGED
-    elif status is CONVERGED and relative > tol and problem.operator not in spec.operators:
+    elif problem.operator not in spec.operators and (
+        (status is CONVERGED and relative > tol) or (status is FLOOR and not judged.at_floor)
+    ):
         status = STALLED
         message = f"{message}; its test was met on A, as it was formed, alone".removeprefix("; ")
     if status in (CONVERGED, STALLED) and tol < relative and judged.at_floor:

@@ -32,11 +32,10 @@ from lavender.solvers._islands import block_bodies
 from lavender.solvers._newton.pattern import block_pattern
 from lavender.solvers._newton.sparse import BACKWARD
 from lavender.solvers._newton.systems import DENSE_FILL, factor_cost
-from lavender.solvers._sweeping import claim
+from lavender.solvers._sweeping import claim, watch_over
 from lavender_ext.accelerate import admm
 from lavender_ext.factor import symbolic
 from lavender_ext.factor.sparse import SparsePanels, is_mirrored
-from lavender_ext.judge import watch
 from lavender_ext.newton.band import scaled_entries
 
 _DENSE, _PANELS, _BODIES = 0, 1, 2  # as the kernel names them
@@ -65,7 +64,7 @@ class AdmmState:
         reference(problem)
         self.problem = problem
         self.data = problem.data
-        self.watch = watch.Watch(problem.data, _PATIENCE)
+        self.watch = watch_over(problem, problem.data, _PATIENCE)
         self.root = np.sqrt(problem.d)
         self.c = problem.b / self.root
         self.space = admm.allocate(self.data, memory)

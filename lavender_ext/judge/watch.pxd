@@ -40,6 +40,7 @@ cdef struct watch_t:
     int32_t last_at             # sweeps at the last check
     int32_t best_at             # sweeps at the best check, -1 before any
     int32_t patience            # sweeps that may always pass without a better check
+    int32_t again_at            # best_at of the iterate that was begun anew from, 0 before any
     double start                # relative residual at the first check
     double last                 # at the last one
     double best_relative        # of the best check
@@ -62,6 +63,7 @@ cdef inline void begin_watch(watch_t* s, double start_energy, double start_veloc
     s.start = 0.0
     s.last = s.best_relative = 1.0 / 0.0
     s.best_at = -1
+    s.again_at = 0
     s.patience = patience
     s.start_energy = start_energy
     s.start_velocity = start_velocity
@@ -143,6 +145,18 @@ cdef inline int32_t check(watch_t* s, const blocks_t* p, const csr_t* a, const r
         return STALLED
     keep(&s.progress, s.total, lam, p.n_rows)
     return RUNNING
+
+
+cdef inline bint begins_again(watch_t* s, int32_t patience) noexcept nogil:
+    """Whether a run that STALLED, its best put back, may go on from there with nothing remembered: once for each best.
+
+    For maps with a memory, which may have lost the way; `patience` sweeps are theirs to find a better one.
+    """
+    if s.best_at <= s.again_at:
+        return False
+    s.again_at = s.best_at
+    s.patience = s.total - 32 * s.best_at + patience
+    return True
 
 
 cdef inline int32_t confirmed(const watch_t* s, const blocks_t* p, const csr_t* a, const rows_t* r,
