@@ -73,8 +73,8 @@ def solve(
     max_iter : int, optional
         Budget in the solver's own iterations (sweeps, steps, pivots); default: the spec's.
     time_limit : float, optional, s
-        Of solving; checked between chunks. A backend of another package that takes none itself runs in a process
-        of its own, which is kept, and ended at the limit; `isolate=False` runs it here, to its end.
+        Of solving; checked between chunks. A backend of another package runs in a process of its own, which is kept,
+        and ended at the limit (at twice it where it takes one itself); `isolate=False` runs it here.
     history : bool
         Record iterations, time and residual at fixed counts.
     callback : callable (iterations, impulse, residual), optional
