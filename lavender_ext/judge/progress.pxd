@@ -1,6 +1,6 @@
 """Whether a run of sweeps still gets anywhere: by the residuals r of its checks, and by where its impulses go.
 
-A run of t sweeps rests where neither of these comes within 64 t more:
+A run of t sweeps rests where its residual has not leapt up (f > 3/2) and neither of these comes within 64 t more:
 
     half of the best, by the lower envelope: f = least r in (t/2, t] / least r in (t/4, t/2], k sweeps apart,
     r f^(n/k) <= best / 2 after n                                                               (1)
@@ -77,12 +77,12 @@ cdef inline int32_t envelope(const progress_t* s, double* fall, double* low) noe
     return late_at - early_at if late < 1.0 / 0.0 and early < 1.0 / 0.0 else 0
 
 
-cdef inline bint falls_to(const progress_t* s, double aim, double most) noexcept nogil:
-    """(1): whether the envelope meets `aim` within `most` sweeps."""
+cdef inline bint moves(const progress_t* s, double aim, double most) noexcept nogil:
+    """(1): whether the envelope meets `aim` within `most` sweeps, or has leapt up: then it has not come to rest yet."""
     cdef double fall, r, n = 0.0
     cdef int32_t k = envelope(s, &fall, &r)
     if k == 0 or not fall < 1.0:
-        return False
+        return k > 0 and fall > 1.5
     while r > aim and n <= most:
         r *= fall
         n += k
@@ -142,4 +142,4 @@ cdef inline bint rests(const progress_t* s, const blocks_t* p, const double* lam
                        double best) noexcept nogil:
     """Nothing is in sight of what was last seen, at sweep `now` with the impulse lam (m)."""
     cdef double most = HORIZON * <double>now
-    return not (falls_to(s, 0.5 * best, most) or meets_bound(s, p, lam, now, most))
+    return not (moves(s, 0.5 * best, most) or meets_bound(s, p, lam, now, most))

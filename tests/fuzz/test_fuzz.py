@@ -167,7 +167,14 @@ def test_the_same_seed_gives_the_same_inputs():
 # -- the same generators under hypothesis, which makes what fails small ------------------------------------------
 
 
-EXAMPLES = {"solve": 60, "file": 40, "steps": 30, "snapshot": 30, "folder": 2}  # some seconds each
+EXAMPLES = {
+    "solve": 60,
+    "file": 40,
+    "steps": 30,
+    "snapshot": 30,
+    "folder": 2,
+    "promise": 60,
+}  # some seconds each
 
 
 @pytest.mark.parametrize("kind", fuzz.KINDS)

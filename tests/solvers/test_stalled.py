@@ -102,6 +102,16 @@ def test_what_rests_is_told_within_twice_the_sweeps(text, options, sweeps):
         assert solution.iterations <= 2 * before, name
 
 
+def test_checks_over_a_weigh_rows_as_the_judge_does():
+    """In A nothing tells a hinge's angular rows from linear ones: the body's masses must come along."""
+    simulation = lv.Simulation(lv.Scene("four_bar"))
+    for _ in range(20):
+        simulation.step()
+    problem = simulation.constraint_problem()
+    assert np.any(problem.metric.nu != problem.metric.d)
+    np.testing.assert_array_equal(problem.csr_data.nu, problem.metric.nu)
+
+
 def warm_stack():
     simulation = lv.Simulation(lv.Scene("stack"))
     for _ in range(15):
