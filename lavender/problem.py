@@ -571,6 +571,8 @@ class Problem:
     def csr_data(self) -> Data:
         """The same over A in compressed rows; forms A where J and M are given."""
         data = self._data(csr=self._compressed)
+        if self.rows is not None:
+            data.weigh_as(self.metric)
         if self.generalized is not None and self.metric.start_energy >= 0.0:
             data.set_start(self.metric.start_energy, self.metric.start_velocity)
         return data

@@ -56,6 +56,13 @@ class State(Protocol):
         Optional, for residuals that rise on the way: where a solve ends at something worse, this is the result.
         """
 
+    @property
+    def sweeps_per_decade(self) -> float:
+        """Iterations in which the relative residual falls tenfold, by the last checks; NaN where it does not.
+
+        Optional, for iterations of equal work.
+        """
+
 
 class Solver(Protocol):
     """What a factory returns; see the module.
@@ -303,3 +310,9 @@ def available(problem: Problem | None = None, *, law: str | None = None, **capab
         and (law is None or law in table[name].laws)
         and all(bool(getattr(table[name], c)) == bool(v) for c, v in capabilities.items())
     ]
+
+
+def in_one_call(problem: Problem) -> list[str]:
+    """Names of this project's solvers that take `problem` and do not go on iteration by iteration to a budget."""
+    kind = (s for s in specs().values() if not (s.resumable or s.external))
+    return [s.name for s in kind if not s.missing() and not s.refuses(problem)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
 from enum import Enum
@@ -151,6 +152,8 @@ class Solution:
     dual: Any
     certificate: FloatArray | None  # (m,), with INFEASIBLE
     contradicted: str  # why the judge disagrees with `status`; empty where it does not
+    # of the last checks, in which the residual falls tenfold; NaN where it did not fall, or no sweeps were checked
+    sweeps_per_decade: float
 
     def __init__(
         self,
@@ -168,6 +171,7 @@ class Solution:
         dual: Any = None,
         certificate: FloatArray | None = None,
         contradicted: str = "",
+        sweeps_per_decade: float = math.nan,
     ) -> None:
         _fill(
             self,
@@ -186,6 +190,7 @@ class Solution:
                 "dual": dual,
                 "certificate": certificate,
                 "contradicted": contradicted,
+                "sweeps_per_decade": sweeps_per_decade,
             },
         )
 

@@ -22,7 +22,7 @@ from lavender.cones import ROW
 from lavender.errors import CapabilityError, InputError, InUse, UnknownName
 from lavender.foreign import Foreign
 from lavender.problem import Problem
-from lavender.registry import SolverSpec, State, get
+from lavender.registry import SolverSpec, State, get, in_one_call
 from lavender.residuals import Residual, reference, residual, told
 from lavender.solution import Claim, History, Solution, SolverRun, Status
 from lavender_ext.judge.measure import all_finite
@@ -74,8 +74,8 @@ def solve(
     max_iter : int, optional
         Budget in the solver's own iterations (sweeps, steps, pivots); default: the spec's.
     time_limit : float, optional, s
-        Of solving; checked between chunks. A backend of another package that takes none itself runs in a process
-        of its own, which is kept, and ended at the limit; `isolate=False` runs it here, to its end.
+        Of solving; checked between chunks. A backend of another package runs in a process of its own, which is kept,
+        and ended at the limit (at twice it where it takes one itself); `isolate=False` runs it here.
     history : bool
         Record iterations, time and residual at fixed counts.
     callback : callable (iterations, impulse, residual), optional
@@ -212,8 +212,9 @@ class Prepared:
         else:
             claim = loop.run(max_iter) if spec.resumable else loop.run_once(max_iter)
         return finish(
-            problem, spec, self.options, loop.impulse, claim, tol, setup_time, loop.time, loop.recorded()
-        )
+            problem, spec, self.options, loop.impulse, claim, tol, setup_time, loop.time, loop.recorded(),
+            float(getattr(self._state, "sweeps_per_decade", math.nan)),
+        )  # fmt: skip
 
     def _refresh(self, problem: Problem | None) -> None:
         if problem is None or problem is self.problem:
@@ -480,6 +481,7 @@ def _rest(problem: Problem, spec: SolverSpec, judged: Any, counts: Any) -> dict[
         "dual": None,
         "certificate": None,
         "contradicted": "",
+        "sweeps_per_decade": math.nan,
     }
 
 
@@ -493,6 +495,7 @@ def finish(
     setup_time: float,
     solve_time: float,
     history: History | None,
+    sweeps_per_decade: float = math.nan,
 ) -> Solution:
     judged = residual(problem, impulse)
     status, message = claim.status, claim.message
@@ -501,7 +504,9 @@ def finish(
         status = DIVERGED
     elif tol > 0.0 and relative <= tol and status in (MAX_ITERATIONS, TIME_LIMIT, STALLED):
         status = CONVERGED
-    elif status is CONVERGED and relative > tol and problem.operator not in spec.operators:
+    elif problem.operator not in spec.operators and (
+        (status is CONVERGED and relative > tol) or (status is FLOOR and not judged.at_floor)
+    ):
         status = STALLED
         message = f"{message}; its test was met on A, as it was formed, alone".removeprefix("; ")
     if status in (CONVERGED, STALLED) and tol < relative and judged.at_floor:
@@ -521,6 +526,9 @@ def finish(
             "no certificate was given" if certificate is None else check_certificate(problem, certificate)
         )
         contradicted = f"says INFEASIBLE, {reason}" if reason else ""
+    if status is MAX_ITERATIONS:
+        way = _way_left(problem, relative, tol, claim.iterations, sweeps_per_decade)
+        message = "; ".join(filter(None, (message, way)))
     impulse.setflags(write=False)
     return Solution.of(
         {
@@ -538,7 +546,19 @@ def finish(
             "dual": claim.dual,
             "certificate": certificate,
             "contradicted": contradicted,
+            "sweeps_per_decade": sweeps_per_decade,
         }
+    )
+
+
+def _way_left(problem: Problem, relative: float, tol: float, done: int, per_decade: float) -> str:
+    """What a budget that was used up tells, where tol is further away than was done."""
+    left = per_decade * math.log10(relative / tol) if tol > 0.0 and 0.0 < relative < math.inf else math.nan
+    if not done < left < math.inf:
+        return ""
+    return (
+        f"the residual falls tenfold in {per_decade:.3g} iterations, so tol is some {left:.2g} more away; "
+        f"solvers of another kind end sooner: {', '.join(in_one_call(problem))}"
     )
 
 

@@ -155,3 +155,25 @@ def arrays_of(thing, name, seen, depth=0):
             yield from arrays_of(value, f"{name}.{attribute}", seen, depth + 1)
         for attribute, value in getattr(thing, "__dict__", {}).items():
             yield from arrays_of(value, f"{name}.{attribute}", seen, depth + 1)
+
+
+def nearly_singular(seed):
+    """J and M of a few velocities, M of a condition number up to 1e17 and of any size."""
+    rng = np.random.default_rng(seed)
+    nv = int(rng.integers(1, 13))
+    law = str(rng.choice(["linear", "lcp", "coulomb", "cone"]))
+    q = np.linalg.qr(rng.normal(size=(nv, nv)))[0]
+    mass = (q * 10.0 ** -rng.uniform(0.0, rng.uniform(6.0, 17.0), nv)) @ q.T
+    mass = 0.5 * (mass + mass.T) * 10.0 ** rng.uniform(-6.0, 6.0)
+    if law in ("coulomb", "cone"):
+        cones = lv.Cones.contacts(rng.uniform(0.0, 1.2, int(rng.integers(1, 6))))
+    else:
+        m = int(rng.integers(1, nv + 3))
+        cones = lv.Cones.bounded(
+            np.where((law == "lcp") & (rng.random(m) < 0.5), 0.0, -np.inf), np.full(m, np.inf)
+        )
+    jac = rng.normal(size=(cones.n_rows, nv))
+    if rng.random() < 0.3:
+        jac[rng.random(jac.shape) < 0.5] = 0.0
+    friction = "cone" if law == "cone" else "coulomb"
+    return lv.Problem.from_jacobian(jac, mass, rng.normal(size=nv), cones=cones, friction=friction)

@@ -1,7 +1,8 @@
-"""Backends that take no time limit, in processes of their own that are kept from call to call.
+"""Backends under a time limit, in processes of their own that are kept from call to call.
 
-A process that has not answered when the time is up is ended, and the next call finds another. Answers are data
-(`lavender.apart`): nothing that a backend sends is unpickled here.
+A process that has not answered when the time is up is ended, and the next call finds another. Backends that take a
+limit are told it and have as long again to answer with what they have; some look at the clock seconds apart. Answers
+are data (`lavender.apart`): nothing that a backend sends is unpickled here.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ import atexit
 import json
 import os
 import pickle
+from functools import partial
 from threading import Lock
 from time import monotonic
 from typing import Any
@@ -19,15 +21,17 @@ import numpy as np
 from lavender._arrays import FloatArray
 from lavender.apart.process import Process
 from lavender.errors import InputError
-from lavender.external._running import Answer, Failed, Limits
+from lavender.external._running import Answer, Elsewhere, Failed, Limits
 from lavender.external.as_qp import QP
 from lavender.solution import Status
 
-__all__ = ["ARRAYS", "call", "ready"]
+__all__ = ["ARRAYS", "call", "elsewhere", "ready"]
 
 SERVED = "lavender.external._served"
 ARRAYS = ("x", "zeta", "xi", "direction", "contradiction")  # of an answer, in the order they are sent
 WORDS = 500  # characters of what a backend said
+GRACE = 2.0  # limits after which a backend that was told its own is ended
+HAND_OVER = 3e8  # bytes in a second that go to another process: pickled, through a pipe, and back into arrays
 
 _lock = Lock()
 _idle: list[Process] = []  # started, and not asked anything
@@ -47,8 +51,15 @@ def ready() -> None:
     _keep(process)
 
 
-def call(name: str, qp: QP, impulse: FloatArray, limit: Limits, settings: dict[str, Any]) -> Answer | None:
-    """One run of the backend of that name within `limit.time_limit`; None where no process is ready.
+def elsewhere(name: str, stoppable: bool) -> Elsewhere:
+    """How the backend of that name is run within a limit; `stoppable`: it takes one itself."""
+    return partial(call, name, GRACE if stoppable else 1.0)
+
+
+def call(
+    name: str, patience: float, qp: QP, impulse: FloatArray, limit: Limits, settings: dict[str, Any]
+) -> Answer | None:
+    """One run of the backend of that name, ended after `patience` times `limit.time_limit`; None without a process.
 
     Raises
     ------
@@ -58,7 +69,11 @@ def call(name: str, qp: QP, impulse: FloatArray, limit: Limits, settings: dict[s
         The backend raised something, or its process died.
     """
     assert limit.time_limit is not None
-    process, until = _take(), monotonic() + limit.time_limit
+    if qp.nbytes > HAND_OVER * limit.time_limit:
+        return Answer(
+            Status.TIME_LIMIT, "ended at the time limit: to hand the program over would take longer"
+        )
+    process, until = _take(), monotonic() + patience * limit.time_limit
     if process is None:
         return None
     process.room = 8 * (4 * qp.n + 2 * len(qp.b))

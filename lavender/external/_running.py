@@ -24,11 +24,12 @@ from lavender.solution import Claim, Status
 
 __all__ = [
     "Answer",
+    "Elsewhere",
     "Failed",
     "Limits",
     "ask",
     "at_least",
-    "check_settings",
+    "check_options",
     "definite_refusal",
     "proof",
     "quiet",
@@ -52,10 +53,12 @@ class Limits:
     time_limit: float | None  # s
 
 
-def check_settings(settings: Any) -> None:
-    """An option `settings` maps the backend's own names to values."""
+def check_options(settings: Any, isolate: Any) -> None:
+    """`settings` maps the backend's own names to values, `isolate` is true or false."""
     if not isinstance(settings, Mapping):
         raise InputError(f"settings is a {type(settings).__name__}; a mapping of names to values is needed")
+    if not isinstance(isolate, bool):
+        raise InputError(f"isolate is {isolate!r}; True or False is needed")
 
 
 @dataclass(frozen=True)

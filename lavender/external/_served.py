@@ -19,18 +19,22 @@ def serve(lifeline: int) -> None:
     """Read tasks from standard input, answer on standard output, until the input ends."""
     requests, answers = begin(lifeline)
     from lavender.external.backends import BACKENDS
+    from lavender.external.clarabel_cone import NAME
+    from lavender.external.native import clarabel
 
-    backends = {backend.name: backend for backend in BACKENDS}
+    runs = {backend.name: (backend.run, backend.noisy) for backend in BACKENDS} | {
+        NAME: (clarabel.call, False)
+    }
     answer(answers, "{}", b"")  # ready
     while True:
         try:
             name, qp, impulse, limit, settings = receive(requests)
         except EOFError:
             return
-        backend = backends[name]
+        run, noisy = runs[name]
         try:
-            with quiet(backend.noisy) as said:
-                found = backend.run(qp, impulse, limit, settings)
+            with quiet(noisy) as said:
+                found = run(qp, impulse, limit, settings)
             answer(answers, *_as_data(found, "; ".join(said)))
         except InputError as error:
             answer(answers, json.dumps({"error": str(error)[:WORDS], "kind": InputError.__name__}), b"")

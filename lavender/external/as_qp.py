@@ -80,6 +80,13 @@ class QP:
         return len(self.q)
 
     @property
+    def nbytes(self) -> int:
+        """Bytes of its matrices, and of the problem's."""
+        own = sum(x.data.nbytes + x.indices.nbytes for x in (self.P, self.A, self.back, self.lift))
+        matrix = self.problem.matrix
+        return own + (0 if matrix is None else getattr(matrix, "data", matrix).nbytes)
+
+    @property
     def is_bounds_only(self) -> bool:
         """No rows, and no bound that is finite: a backend may call it unconstrained."""
         no_bound = self.lb is None or self.ub is None or not np.isfinite([self.lb, self.ub]).any()

@@ -14,7 +14,7 @@ from typing import Any
 from lavender.external._running import Limits, at_least
 from lavender.external.backend import Backend
 from lavender.external.native import clarabel, daqp, highs, osqp, qpalm
-from lavender.external.qp_solver import ISOLATE, OPTIONS, QPSolver, refusal
+from lavender.external.qp_solver import OPTIONS, QPSolver, refusal
 from lavender.registry import SolverSpec
 
 __all__ = ["BACKENDS", "SPECS"]
@@ -152,7 +152,7 @@ def _spec(backend: Backend) -> SolverSpec:
         external=True,
         impulse=backend.warm,
         max_iter=backend.max_iter,
-        options={**OPTIONS, **ISOLATE},
+        options=OPTIONS,
         requires=backend.modules,
         install=backend.install,
         summary=f"{backend.summary} (QP backend)",

@@ -15,13 +15,16 @@ from typing import Any
 import numpy as np
 
 from lavender._arrays import FloatArray
-from lavender.external._running import ask, check_settings, definite_refusal, symmetric_refusal
+from lavender.external import _apart
+from lavender.external._running import ask, check_options, definite_refusal, symmetric_refusal
 from lavender.external.as_qp import QP, impulse_form, pick_form, velocity_form
 from lavender.external.native import clarabel
 from lavender.external.qp_solver import OPTIONS
 from lavender.problem import Problem
 from lavender.registry import SolverSpec
 from lavender.solution import Claim
+
+NAME = "clarabel_cone"
 
 
 @dataclass(frozen=True)
@@ -31,9 +34,10 @@ class ClarabelCone:
     form: str = "auto"
     unit_diagonal: bool = True
     settings: Mapping[str, Any] = field(default_factory=dict)
+    isolate: bool = True
 
     def __post_init__(self) -> None:
-        check_settings(self.settings)
+        check_options(self.settings, self.isolate)
 
     @np.errstate(all="ignore")  # what overflows is judged
     def prepare(self, problem: Problem) -> tuple[Problem, QP]:
@@ -54,7 +58,24 @@ class ClarabelCone:
         time_limit: float | None = None,
     ) -> Claim:
         problem, qp = state
-        return ask(problem, qp, impulse, clarabel.call, n, tol, time_limit, self.settings, stoppable=True)
+        apart = _apart.elsewhere(NAME, True) if self.isolate and time_limit is not None else None
+        return ask(
+            problem,
+            qp,
+            impulse,
+            clarabel.call,
+            n,
+            tol,
+            time_limit,
+            self.settings,
+            stoppable=True,
+            apart=apart,
+        )
+
+    def ready(self) -> None:
+        """As that of `QPSolver`."""
+        if self.isolate:
+            _apart.ready()
 
 
 def refusal(problem: Problem) -> str | None:
@@ -63,7 +84,7 @@ def refusal(problem: Problem) -> str | None:
 
 
 SPEC = SolverSpec(
-    name="clarabel_cone",
+    name=NAME,
     factory=ClarabelCone,
     laws=frozenset({"linear", "lcp", "cone"}),
     resumable=False,

@@ -4,30 +4,27 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import partial
 from typing import Any
 
 import numpy as np
 
 from lavender._arrays import FloatArray
-from lavender.errors import CapabilityError, InputError
+from lavender.errors import CapabilityError
 from lavender.external import _apart
-from lavender.external._running import ask, check_settings, definite_refusal, symmetric_refusal
+from lavender.external._running import ask, check_options, definite_refusal, symmetric_refusal
 from lavender.external.as_qp import QP, impulse_form, pick_form, velocity_form
 from lavender.external.backend import Backend
 from lavender.problem import Problem
 from lavender.solution import Claim
 
-__all__ = ["ISOLATE", "OPTIONS", "QPSolver", "refusal"]
+__all__ = ["OPTIONS", "QPSolver", "refusal"]
 
 DENSE_LIMIT = 2**30  # bytes of one dense matrix; beyond, a dense backend is refused
 OPTIONS = {
+    "isolate": "where a time_limit is given, the backend runs in a process of its own, which is ended; default True",
     "form": "'impulse', 'velocity' (needs rows) or 'auto' (default): by size, mass ratio and backend",
     "unit_diagonal": "impulse form: scale A to a unit diagonal, default True",
     "settings": "mapping passed to the backend, over those that tol gives",
-}
-ISOLATE = {
-    "isolate": "a backend that takes no limit runs in a process of its own where a time_limit is given; default True"
 }
 
 
@@ -52,7 +49,7 @@ class QPSolver:
     settings : mapping
         Passed to the backend as they are, over those that `tol` gives.
     isolate : bool
-        Run a backend that takes no time limit in a process of its own where one is given.
+        Under a time limit, run the backend in a process of its own, which is ended where it does not end itself.
     """
 
     backend: Backend
@@ -62,9 +59,7 @@ class QPSolver:
     isolate: bool = True
 
     def __post_init__(self) -> None:
-        check_settings(self.settings)
-        if not isinstance(self.isolate, bool):
-            raise InputError(f"isolate is {self.isolate!r}; True or False is needed")
+        check_options(self.settings, self.isolate)
 
     @np.errstate(all="ignore")  # what overflows is judged
     def prepare(self, problem: Problem) -> State:
@@ -98,20 +93,15 @@ class QPSolver:
         self, state: State, impulse: FloatArray, n: int, tol: float, time_limit: float | None = None
     ) -> Claim:
         b = self.backend
-        apart = None if time_limit is None or not self.runs_apart else partial(_apart.call, b.name)
+        apart = _apart.elsewhere(b.name, b.stoppable) if self.isolate and time_limit is not None else None
         return ask(
             state.problem, state.qp, impulse, b.run, n, tol, time_limit, self.settings,
             stoppable=b.stoppable, noisy=b.noisy, apart=apart,
         )  # fmt: skip
 
-    @property
-    def runs_apart(self) -> bool:
-        """With a time limit it runs in a process of its own, which can be ended."""
-        return self.isolate and not self.backend.stoppable
-
     def ready(self) -> None:
         """A time limit was given, and its clock has not begun: have that process ready."""
-        if self.runs_apart:
+        if self.isolate:
             _apart.ready()
 
 

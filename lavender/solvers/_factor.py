@@ -90,7 +90,7 @@ def permuted_band(problem: Problem, order: IntArray) -> int:
 
 
 class TooDear(Exception):
-    """A sparse factor, counted before its first number, takes more than it may."""
+    """A factor, counted before its first number, takes more than it may."""
 
 
 def counted(panels: SparsePanels, most: float) -> SparsePanels:

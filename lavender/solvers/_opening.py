@@ -20,6 +20,7 @@ from lavender._arrays import FloatArray
 from lavender.problem import Problem
 from lavender.registry import FEW
 from lavender.solution import Claim, Status
+from lavender.solvers import _rates as rates
 from lavender.solvers._at_once import Factored, factor_first, joints_over_velocities
 from lavender.solvers._first import general_first, general_second, general_steps, joints_before_count
 from lavender.solvers._newton import general
@@ -99,7 +100,9 @@ class Opening:
                 self._look(self.n, crowded=True)
                 if (end := self._swept()) is not None:
                     return end
-            kernel = general.prepare(problem)
+            assert problem.generalized is not None
+            room = 1e-9 * rates.CROWDED * float(problem.generalized.nv) ** 2
+            kernel = None if perf_counter() + room > self.deadline else general.prepare(problem)
         self.kernel = kernel if kernel is not None and kernel.fits else None
         if self.kernel is not None and (general_first(problem, self.largest) if known is None else known):
             return self._by_newton()

@@ -21,6 +21,7 @@ from lavender.solvers._factor import (
     Factor,
     LUFactor,
     SparseFactor,
+    TooDear,
     choose,
     permuted_band,
 )
@@ -70,6 +71,8 @@ class PivotState:
             )
         if not self.symmetric:
             self.seconds = 2.0 * (max(self.seconds, _filled(problem)) if self.is_sparse else self.seconds)
+        if self.form == "dense" and 1e9 * self.seconds > most:
+            raise TooDear
         self.factorisations = self.exchanged = self.searches = 0  # by Python
 
     @property

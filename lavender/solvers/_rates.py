@@ -39,6 +39,7 @@ PIVOT, PIVOT_ENTRY = 60e3, 0.5  # of each pivot of lemke, and for each entry of 
 GENERAL_START = 60e3
 GENERAL_ROW = {"linear": 40.0, "lcp": 100.0, "cone": 140.0, "coulomb": 400.0}
 GENERAL = {"linear": 0.1, "lcp": 0.06, "cone": 0.06, "coulomb": 0.02}
+CROWDED = 6.0  # to count factors that fill much, and for their room, for each square of the velocities
 GENERAL_STEP_ROW = 150.0  # of a step under Coulomb's law, its tail aside
 GENERAL_SOFT = (
     1e-6  # of d: the least softness of a row without a proximal term; where all are soft, one factor ends it

@@ -36,6 +36,12 @@ PATIENCE = 64  # sweeps that may always pass without a better check
 _ROW_BY_ROW = np.empty(0, np.int32)
 
 
+def watch_over(problem: Problem, data: Any, patience: int) -> Watch:
+    """The watch of a run over `data`; of A that was formed of J and M, the form that was given has the last word."""
+    formed = problem.matrix is None and not (data.factored or data.is_general)
+    return Watch(data, patience, problem.metric if formed else None)
+
+
 class SweepState:
     """Where a run stands; the watch counts sweeps and keeps the best checked iterate."""
 
@@ -48,10 +54,7 @@ class SweepState:
         start = reference(problem)
         if data is not problem.metric:
             data.set_start(*start)  # the error of doing nothing is the judge's, in whatever form
-        # Rows of A that were formed of J and M: the form that was given has the last word.
-        formed = problem.matrix is None and not (data.factored or data.is_general)
-        other = problem.metric if formed else None
-        self.watch = Watch(data, patience, other)
+        self.watch = watch_over(problem, data, patience)
 
     @property
     def first(self) -> bool:
@@ -62,6 +65,11 @@ class SweepState:
     def best(self) -> tuple[float, FloatArray | None]:
         """(relative residual, impulse) of the best check."""
         return self.watch.best
+
+    @property
+    def sweeps_per_decade(self) -> float:
+        """Sweeps in which the residual falls tenfold; NaN where it does not."""
+        return float(self.watch.sweeps_per_decade)
 
 
 def claim(status: int, done: int) -> Claim:

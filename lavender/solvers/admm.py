@@ -27,16 +27,17 @@ from lavender.registry import SolverSpec
 from lavender.residuals import reference
 from lavender.solution import Claim, Status
 from lavender.solvers._accelerated import LARGEST_MEMORY
+from lavender.solvers._counts import formed_cost
 from lavender.solvers._factor import GENERAL_LIMIT, PANELS_WORK, TINY, WIDE
 from lavender.solvers._islands import block_bodies
 from lavender.solvers._newton.pattern import block_pattern
 from lavender.solvers._newton.sparse import BACKWARD
 from lavender.solvers._newton.systems import DENSE_FILL, factor_cost
-from lavender.solvers._sweeping import claim
+from lavender.solvers._sweeping import claim, watch_over
 from lavender_ext.accelerate import admm
+from lavender_ext.core import assemble
 from lavender_ext.factor import symbolic
 from lavender_ext.factor.sparse import SparsePanels, is_mirrored
-from lavender_ext.judge import watch
 from lavender_ext.newton.band import scaled_entries
 
 _DENSE, _PANELS, _BODIES = 0, 1, 2  # as the kernel names them
@@ -44,8 +45,11 @@ _START_RHO = 0.1  # B has unit diagonal, so 1 is its scale; measured
 _PATIENCE = 5000  # iterations: on mass ratios the residual rises while rho finds its place
 
 
-_LATE = "the next factorisation would end after the time limit"
-_AT_ONCE = 0.02  # s, that a factor may be expected to take for `prepare` to make it
+_LATE = "the next factorisation, or the analysis before it, would end after the time limit"
+_AT_ONCE = (
+    5e-3  # s, that scaling, analysis and the first factor may be expected to take for `prepare` to do them
+)
+_ENTRY = 2e-8  # s, of the first two, for each entry of A
 # s for each multiply-add of a factor by panels, of L U in one panel, and of a dense one.
 _PANELS_WORK, _ONE_PANEL, _FULL = 1e-9 * PANELS_WORK, 4e-10, 1.5e-10
 
@@ -59,50 +63,64 @@ class _TooLate(Exception):
 
 
 class AdmmState:
-    """Scaled problem, factorisation for the present rho, and the vectors of the run."""
+    """Scaled problem, factorisation for the present rho, and the vectors of the run, which `open` makes."""
 
     def __init__(self, problem: Problem, memory: int) -> None:
         reference(problem)
-        self.problem = problem
+        self.problem, self.memory = problem, memory
+        self.stop_at = np.inf  # of perf_counter: nothing is begun that is expected to end later
+        self.factorisations = self.reported = self.undone = (
+            0  # factors: all, and those that an earlier run has told
+        )
+        self.watch: Any = None
+        self.factor: Any = None
+        self.is_scaled = False
+        self.seconds = _opening(problem)  # of what comes next: to open it, then of the next factor
+        with suppress(_TooLate):
+            self.open(_AT_ONCE)
+
+    def open(self, most: float = np.inf) -> None:
+        """Scale, analyse and factor within `most` [s], as far as that can be told; what is left, the next call does."""
+        start = perf_counter()
+        if not self.is_scaled:
+            if self.seconds > min(most, self.stop_at - start):
+                raise _TooLate
+            self._scale()
+            self.is_scaled = True
+            self.seconds = self._expected()
+        if self.factor is None:
+            self.factor = self._factor(most - (perf_counter() - start))
+
+    def _scale(self) -> None:
+        problem = self.problem
         self.data = problem.data
-        self.watch = watch.Watch(problem.data, _PATIENCE)
+        self.watch = watch_over(problem, problem.data, _PATIENCE)
         self.root = np.sqrt(problem.d)
         self.c = problem.b / self.root
-        self.space = admm.allocate(self.data, memory)
+        self.space = admm.allocate(self.data, self.memory)
         self.rho = _START_RHO
-        self.undone = 0
-        self.factorisations = self.reported = 0  # all, and those that an earlier run has told
-        rows = problem.rows
         self.matrix: Any = None
         self.panels: Any = None  # analysed, of the matrix
         self.lu = self.full = False  # L U, and of a matrix with an entry everywhere
-        if rows is not None and 0 < 6 * rows.n_bodies < problem.m:
+        if _is_over_bodies(problem):
             try:
                 form = problem.velocity_form()
             except InputError as error:
                 raise _Failed(str(error)) from None
-            k = form.jacobian
             # In the metric of D = diag d of the judge, which is the scale of the form.
-            self.kind = _BODIES
-            self.theta = form.theta
-            self.jacobian = k
-        else:
-            a = problem.csr
-            values = scaled_entries(a.indptr, a.indices, a.data, 1.0 / self.root)
-            self.matrix = sp.csr_array((values, a.indices, a.indptr), shape=a.shape)
-            self.lu = not problem.is_symmetric
-            if not self.lu and self.matrix.nnz > DENSE_FILL * problem.m**2 and problem.m > 1:
-                self.kind, self.matrix = _DENSE, self.matrix.toarray()
-            else:
-                self.kind = _PANELS
-                if problem.m:
-                    self.matrix = _mirrored(self.matrix)
-                    self.panels = _analysed(self.matrix, self.lu)
-        self.stop_at = np.inf  # of perf_counter: no factor is begun that is expected to end later
-        self.seconds = self._expected()  # of the next factor
-        self.factor: Any = None
-        with suppress(_TooLate):
-            self.factor = self._factor(_AT_ONCE)
+            self.kind, self.theta, self.jacobian = _BODIES, form.theta, form.jacobian
+            return
+        a = problem.csr
+        values = scaled_entries(a.indptr, a.indices, a.data, 1.0 / self.root)
+        self.matrix = sp.csr_array((values, a.indices, a.indptr), shape=a.shape)
+        self.lu = not problem.is_symmetric
+        if not self.lu and self.matrix.nnz > DENSE_FILL * problem.m**2 and problem.m > 1:
+            self.kind, self.matrix = _DENSE, self.matrix.toarray()
+            return
+        self.kind = _PANELS
+        if problem.m:
+            self.matrix = _mirrored(self.matrix)
+            self.panels = _analysed(self.matrix, self.lu)
 
     def _expected(self) -> float:
         # What the first factor takes, from structure; the next ones take as long as it did.
@@ -118,7 +136,12 @@ class AdmmState:
     @property
     def best(self) -> tuple[float, FloatArray | None]:
         """(relative residual, impulse) of the best check."""
-        return self.watch.best
+        return (np.inf, None) if self.watch is None else self.watch.best
+
+    @property
+    def sweeps_per_decade(self) -> float:
+        """Iterations in which the residual falls tenfold; NaN where it does not."""
+        return np.nan if self.watch is None else float(self.watch.sweeps_per_decade)
 
     def _factor(self, most: float = np.inf) -> tuple[int, int, tuple[Any, ...]]:
         # Within `most` [s], as far as that can be told.
@@ -170,6 +193,22 @@ class AdmmState:
         if not done:
             raise _Failed(f"the factor of A + rho D broke down at rho = {self.rho:.1e}")
         return self.kind, matrix.shape[0], (panels, *extra)
+
+
+def _is_over_bodies(problem: Problem) -> bool:
+    rows = problem.rows
+    return rows is not None and 0 < 6 * rows.n_bodies < problem.m
+
+
+def _opening(problem: Problem) -> float:
+    """What scaling and analysis are expected to take [s], by the entries that they pass over."""
+    if problem.matrix is not None:
+        entries = problem.matrix.size if isinstance(problem.matrix, np.ndarray) else problem.matrix.nnz
+    elif problem.rows is None:
+        entries = problem.metric.entries_of_a
+    else:
+        entries = 24 * problem.m if _is_over_bodies(problem) else int(assemble.bound(problem.data)[0])
+    return _ENTRY * entries + 1e-9 * formed_cost(problem)
 
 
 def _analysed(matrix: sp.csr_array, lu: bool, like: SparsePanels | None = None) -> SparsePanels:
@@ -257,14 +296,13 @@ class ADMM:
         """n iterations, or fewer where a check ends them."""
         if isinstance(state, str):
             return Claim(Status.NUMERICAL_ERROR, 0, {}, state)
+        try:
+            state.open()
+        except _Failed as failure:
+            return Claim(Status.NUMERICAL_ERROR, 0, {}, str(failure))
+        except _TooLate:
+            return Claim(Status.TIME_LIMIT, 0, {}, _LATE)
         data = state.data
-        if state.factor is None:
-            try:
-                state.factor = state._factor()
-            except _Failed as failure:
-                return Claim(Status.NUMERICAL_ERROR, 0, {}, str(failure))
-            except _TooLate:
-                return Claim(Status.TIME_LIMIT, 0, {}, _LATE)
         if state.watch.total == 0 and len(impulse):
             # y of the start: minus its slack, shifted; at a solution the first iteration stays there.
             admm.start(data, impulse, state.problem.slack(impulse), state.root, state.rho, state.space)

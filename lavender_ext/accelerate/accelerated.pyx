@@ -27,7 +27,7 @@ from lavender_ext.core.order cimport RANDOM, SYMMETRIC, advance_order
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.rows cimport relax_rows_block
 from lavender_ext.core.velocity cimport rows_velocity
-from lavender_ext.judge.watch cimport CONVERGED, RUNNING, Watch
+from lavender_ext.judge.watch cimport CONVERGED, RUNNING, STALLED, Watch, begins_again
 from lavender_ext.local.gauss_seidel cimport solve_csr_block, solve_general_block, solve_rows_block
 from lavender_ext.sweep.levels cimport sweep_levels
 from lavender_ext.sweep.packed cimport pack_order, packed_t, room_of
@@ -35,6 +35,9 @@ from lavender_ext.sweep.pgs cimport relax_csr_block, relax_general_block
 
 cdef enum:
     REFRESH = 64                # iterations of nncg after which v is formed anew: rounding adds up in it
+
+cdef enum:
+    AGAIN = 64                  # sweeps that a stalled run has from its best, begun anew
 
 cdef enum:                      # places in control of nncg
     NORM = 0                    # g.Dg of the last sweep
@@ -239,6 +242,20 @@ cdef public void lav_anderson(sweep_data_t* c, double* lam, int32_t first_sweep,
             forget(&mixing)                             # another map
 
 
+cdef inline void forget_all(sweep_data_t* c, const double* lam) noexcept nogil:
+    """As before the first iteration, from lam (m), but for the counts."""
+    cdef int32_t i, m = c.blocks.n_rows
+    if c.memory == 0:
+        c.control[NORM] = 0.0
+        for i in range(2 * (m + c.nv)):
+            c.work[m + c.nv + i] = 0.0
+    else:
+        for i in range(CONTROL):
+            if i != UNDONE:
+                c.control[i] = 0.0
+    form_velocity(c, lam)
+
+
 cdef void nncg_step(void* context, double* lam, int32_t first_sweep, int32_t n) noexcept nogil:
     lav_nncg(<sweep_data_t*>context, lam, first_sweep, n)
 
@@ -297,7 +314,7 @@ def run(Data p, Watch watch, double[::1] lam, int n, double tol, int memory, pre
     space comes from `allocate`, v in it holding M^-1 J^T lam.
     """
     cdef sweep_data_t c
-    cdef int32_t status, done = 0
+    cdef int32_t status, done = 0, more = 0
     cdef double[::1] control = space[0], gram = space[1], work = space[2], g
     cdef double[:, ::1] v = space[3]
     cdef int32_t[::1] start
@@ -340,5 +357,9 @@ def run(Data p, Watch watch, double[::1] lam, int n, double tol, int memory, pre
     c.work = &work[0]
     with nogil:
         status = watch.run(nncg_step if memory == 0 else anderson_step, &c, &lam[0], n, tol, &done)
+        while status == STALLED and begins_again(&watch.state, AGAIN):
+            forget_all(&c, &lam[0])
+            status = watch.run(nncg_step if memory == 0 else anderson_step, &c, &lam[0], n - done, tol, &more)
+            done += more
     pairs.backwards = c.backwards
     return status, done, done * (2 if mode == SYMMETRIC else 1), int(control[RESTARTS if memory == 0 else UNDONE])

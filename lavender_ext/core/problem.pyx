@@ -428,6 +428,11 @@ cdef class Data:
             self._d = _read_only(self.part(0))
         return self._d
 
+    def weigh_as(self, Data other):
+        """Take nu of the same problem given by rows: in A alone nothing tells an angular row from a linear one."""
+        memcpy(<double*>self.blocks.nu, other.blocks.nu, self.blocks.n_rows * sizeof(double))
+        self._nu = self._weight = None
+
     @property
     def nu(self):
         """(m,) 1/kg: velocity error = sqrt(nu d) |e|."""

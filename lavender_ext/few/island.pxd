@@ -19,7 +19,7 @@ from lavender_ext.few.looks cimport sweeps_left
 from lavender_ext.few.many cimport SOLVED, begin, gate_t, job_t, law_of, solve_made, space_t, with_marks, with_numbers
 from lavender_ext.judge.measure cimport do_nothing, general_judge, judge_into, reference_of, relative_of
 from lavender_ext.judge.score cimport are_numbers, relative, score_rows, score_t
-from lavender_ext.judge.watch cimport RUNNING, check, watch_t
+from lavender_ext.judge.watch cimport RUNNING, begin_watch, check, watch_t
 from lavender_ext.pivot.principal cimport SMALL
 from lavender_ext.pivot.principal cimport SOLVED as PIVOTED
 from lavender_ext.pivot.principal cimport (pivoting_t, pivots_correct, pivots_exchange, pivots_factor_all, pivots_on,
@@ -66,7 +66,7 @@ cdef struct desk_t:             # scratch of one island
     double* w                   # (m)
     double* e                   # (m)
     double* v                   # (12 n)
-    double* kept                # (m) of a watch
+    double* kept                # (3 m) of a watch
     double* mixed               # of Anderson's
     double* velocity            # (6 n)
     double* pivots
@@ -267,15 +267,7 @@ cdef inline double sweep(const view_t* t, int32_t kind, const asked_t* k, const 
     cdef int32_t nv = 6 * t.r.n_bodies if kind == BODIES else t.g.n if kind == GENERAL else 0
     cdef double per = k.work * work_of(t, kind) + k.row * m, now, floor
     memset(o.mixed, 0, mixed_room(m, nv) * sizeof(double))
-    s.total = s.check_at = s.last_at = 0
-    s.last = INFINITY
-    s.best_at = -1
-    s.patience = PATIENCE
-    s.best_relative = INFINITY
-    s.start = 0.0
-    s.start_energy = begun[0]
-    s.start_velocity = begun[1]
-    s.best = o.kept
+    begin_watch(&s, begun[0], begun[1], PATIENCE, o.kept, m)
     s.w = o.w
     s.e = o.e
     s.v = o.v
@@ -332,7 +324,7 @@ cdef inline double sweep(const view_t* t, int32_t kind, const asked_t* k, const 
 
 
 cdef inline ssize_t numbers_for(ssize_t m, ssize_t nv, ssize_t band) noexcept nogil:
-    return 13 * m + 3 * nv + 2 + mixed_room(m, nv) + m * (band + 1) + 1
+    return 15 * m + 3 * nv + 2 + mixed_room(m, nv) + m * (band + 1) + 1
 
 
 cdef inline void furnish_desk(desk_t* o, ssize_t m, ssize_t nv, double* x) noexcept nogil:
@@ -343,7 +335,7 @@ cdef inline void furnish_desk(desk_t* o, ssize_t m, ssize_t nv, double* x) noexc
     o.w = x + 3 * m
     o.e = x + 4 * m
     o.kept = x + 5 * m
-    o.v = x + 6 * m
+    o.v = x + 8 * m
     o.mixed = o.v + 2 * nv + m + 1
     o.velocity = o.mixed + mixed_room(m, nv)
     o.pivots = o.velocity + nv + 1

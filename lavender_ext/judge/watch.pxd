@@ -9,7 +9,8 @@ that eighth. The relative residual r decides:
     r not finite, or > 1e6 max(1, r at the start)   DIVERGED
     no better than the best so far, and
         best <= 1e-6 and best <= 2 floor            AT_FLOOR
-        sweeps > 32 * sweeps of the best + patience STALLED
+        sweeps > 32 * sweeps of the best + patience, and nothing
+        better in sight (judge/progress.pxd)        STALLED
 
 On the last three the best iterate is put back. A check costs about one sweep.
 """
@@ -21,6 +22,7 @@ from lavender_ext.core.generalized cimport generalized_t
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.rows cimport rows_t
 from lavender_ext.judge.measure cimport general_judge, judge_into
+from lavender_ext.judge.progress cimport keep, open_progress, progress_t, rests, see
 from lavender_ext.judge.score cimport are_numbers, relative, score_t
 
 
@@ -38,6 +40,7 @@ cdef struct watch_t:
     int32_t last_at             # sweeps at the last check
     int32_t best_at             # sweeps at the best check, -1 before any
     int32_t patience            # sweeps that may always pass without a better check
+    int32_t again_at            # best_at of the iterate that was begun anew from, 0 before any
     double start                # relative residual at the first check
     double last                 # at the last one
     double best_relative        # of the best check
@@ -47,9 +50,25 @@ cdef struct watch_t:
     double* w                   # (m) scratch
     double* e                   # (m) scratch
     double* v                   # (n_bodies, 12) scratch, of J and M (nv + m)
+    progress_t progress
 
 
 ctypedef void (*sweep_t)(void* context, double* lam, int32_t first_sweep, int32_t n) noexcept nogil
+
+
+cdef inline void begin_watch(watch_t* s, double start_energy, double start_velocity, int32_t patience, double* room,
+                       int32_t m) noexcept nogil:
+    """Before the first sweep; room (3 m) is for iterates."""
+    s.total = s.check_at = s.last_at = 0
+    s.start = 0.0
+    s.last = s.best_relative = 1.0 / 0.0
+    s.best_at = -1
+    s.again_at = 0
+    s.patience = patience
+    s.start_energy = start_energy
+    s.start_velocity = start_velocity
+    s.best = room
+    open_progress(&s.progress, room + m, m)
 
 
 cdef inline double against_start(const watch_t* s, double energy, double velocity) noexcept nogil:
@@ -99,6 +118,7 @@ cdef inline int32_t check(watch_t* s, const blocks_t* p, const csr_t* a, const r
         now = inf
     if s.total == 0:
         s.start = now
+    see(&s.progress, s.total, now)
     s.check_at = s.total + until_next(s, now, tol)
     s.last = now
     s.last_at = s.total
@@ -108,6 +128,7 @@ cdef inline int32_t check(watch_t* s, const blocks_t* p, const csr_t* a, const r
         s.best_relative = now
         s.best_at = s.total
         copy(lam, s.best, p.n_rows)
+        keep(&s.progress, s.total, lam, p.n_rows)
         return RUNNING
     if not now < inf or now > 1e6 * (s.start if s.start > 1.0 else 1.0):
         if s.best_at >= 0:
@@ -119,10 +140,23 @@ cdef inline int32_t check(watch_t* s, const blocks_t* p, const csr_t* a, const r
         if s.best_relative <= 2.0 * floor and floor < inf:
             copy(s.best, lam, p.n_rows)
             return AT_FLOOR
-    if s.total > 32 * <double>s.best_at + s.patience:
+    if s.total > 32 * <double>s.best_at + s.patience and rests(&s.progress, p, lam, s.total, s.best_relative):
         copy(s.best, lam, p.n_rows)
         return STALLED
+    keep(&s.progress, s.total, lam, p.n_rows)
     return RUNNING
+
+
+cdef inline bint begins_again(watch_t* s, int32_t patience) noexcept nogil:
+    """Whether a run that STALLED, its best put back, may go on from there with nothing remembered: once for each best.
+
+    For maps with a memory, which may have lost the way; `patience` sweeps are theirs to find a better one.
+    """
+    if s.best_at <= s.again_at:
+        return False
+    s.again_at = s.best_at
+    s.patience = s.total - 32 * s.best_at + patience
+    return True
 
 
 cdef inline int32_t confirmed(const watch_t* s, const blocks_t* p, const csr_t* a, const rows_t* r,

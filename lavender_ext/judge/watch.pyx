@@ -1,4 +1,5 @@
 """The watch of judge/watch.pxd for Python: where a run of sweeps stands, and the loop of sweeps and checks."""
+from libc.math cimport NAN, log10
 from libc.stdint cimport int32_t
 
 import numpy as np
@@ -7,7 +8,8 @@ from lavender_ext.core.block cimport blocks_t
 from lavender_ext.core.csr cimport csr_t
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.rows cimport rows_t
-from lavender_ext.judge.watch cimport AT_FLOOR, CONVERGED, RUNNING, check, confirmed, sweep_t, watch_t
+from lavender_ext.judge.progress cimport envelope
+from lavender_ext.judge.watch cimport AT_FLOOR, CONVERGED, RUNNING, begin_watch, check, confirmed, sweep_t, watch_t
 
 
 cdef public int32_t lav_watch_check(watch_t* s, const blocks_t* p, const csr_t* a, const rows_t* r, int32_t factored,
@@ -26,21 +28,14 @@ cdef class Watch:
         cdef Py_ssize_t m = data.blocks.n_rows
         cdef Data last = data if confirm is None else confirm
         cdef Py_ssize_t n = last.general.n + m if last.is_general else 12 * <Py_ssize_t>last.rows.n_bodies
-        cdef double[::1] scratch = np.empty(3 * m + n + 4)
+        cdef double[::1] scratch = np.empty(5 * m + n + 4)
         self.data = data
         self.confirm = confirm
         self.keep = scratch
-        self.state.best = &scratch[0]
-        self.state.w = &scratch[m]
-        self.state.e = &scratch[2 * m]
-        self.state.v = &scratch[3 * m]
-        self.state.total = self.state.check_at = self.state.last_at = 0
-        self.state.last = 1.0 / 0.0
-        self.state.best_at = -1
-        self.state.patience = patience
-        self.state.best_relative = 1.0 / 0.0
-        self.state.start_energy = data.start_energy
-        self.state.start_velocity = data.start_velocity
+        begin_watch(&self.state, data.start_energy, data.start_velocity, patience, &scratch[0], <int32_t>m)
+        self.state.w = &scratch[3 * m]
+        self.state.e = &scratch[4 * m]
+        self.state.v = &scratch[5 * m]
 
     @property
     def total(self):
@@ -53,6 +48,13 @@ cdef class Watch:
         if self.state.best_at < 0:
             return self.state.best_relative, None
         return self.state.best_relative, np.array(self.keep)[:self.data.blocks.n_rows]
+
+    @property
+    def sweeps_per_decade(self):
+        """Sweeps in which the residual falls tenfold, by its lower envelope at the last check; NaN where it does not."""
+        cdef double fall = 0.0, low = 0.0
+        cdef int32_t k = envelope(&self.state.progress, &fall, &low)
+        return -k / log10(fall) if k > 0 and 0.0 < fall < 1.0 else NAN
 
     cdef int32_t check_now(self, double* lam, double tol) noexcept nogil:
         cdef int32_t status = check(&self.state, &self.data.blocks, &self.data.csr, &self.data.rows,

@@ -9,7 +9,7 @@ import pytest
 from random_problems import as_matrix, box_stack, random_contact_problem, random_rows, spd
 
 import lavender as lv
-from lavender import registry
+from lavender import registry, suite
 from lavender.certificates import check_certificate
 from lavender.external import backends, qp_solver
 from lavender.external._running import Answer
@@ -260,19 +260,43 @@ def test_no_time_limit_is_said(name):
 APART = [b.name for b in backends.BACKENDS if not b.stoppable and b.name in BACKENDS]
 
 
-@pytest.mark.parametrize("name", APART)
-def test_a_backend_without_a_time_limit_runs_in_a_process_of_its_own(name):
+@pytest.mark.parametrize("name", BACKENDS)
+def test_under_a_time_limit_a_backend_runs_in_a_process_of_its_own(name, monkeypatch):
+    from lavender.external import _apart
+
     problem = lv.Problem.lcp(*spd(12, seed=3))
     plain = lv.solve(problem, name)
+    calls, call = [], _apart.call
+    monkeypatch.setattr(_apart, "call", lambda *a: calls.append(call(*a)) or calls[-1])
     apart = lv.solve(problem, name, time_limit=60.0)
+    assert calls and all(answer is not None for answer in calls)
+    calls.clear()
     here = lv.solve(problem, name, time_limit=60.0, isolate=False)
-    assert "ran in a process of its own" in apart.message
-    assert "ran to its end" in here.message
+    assert not calls
+    if name in APART:
+        assert "ran in a process of its own" in apart.message and "ran to its end" in here.message
     assert plain.success and "time limit" not in plain.message
     for other in (apart, here):
         assert other.status is plain.status
         assert other.work == plain.work
         assert other.impulse.tobytes() == plain.impulse.tobytes()
+
+
+@pytest.mark.parametrize("name", BACKENDS)
+def test_no_backend_begins_what_it_could_not_even_be_handed_in_time(name):
+    problem = lv.Problem.lcp(*spd(60, seed=3))
+    late = lv.solve(problem, name, time_limit=1e-7)
+    assert late.status is lv.Status.TIME_LIMIT and "ended at the time limit" in late.message
+    assert late.impulse.tobytes() == problem.start().tobytes()
+
+
+def test_a_backend_that_looks_at_the_clock_too_late_is_ended():
+    """DAQP looks at it rarely: on these rows it took seconds under a limit of a millisecond."""
+    if "daqp" not in BACKENDS:
+        pytest.skip("daqp is not installed")
+    problem = suite.case("granular(n=7)").problem
+    late = lv.solve(problem, "daqp", form="impulse", time_limit=0.02)
+    assert late.status is lv.Status.TIME_LIMIT and "ended at the time limit" in late.message
 
 
 def test_a_backend_that_does_not_end_is_ended_and_the_next_call_finds_another():

@@ -19,13 +19,15 @@ import folders
 import judge
 import numpy as np
 import problems
+import promises
 import scenes
 
 import lavender as lv
 
 REFUSED = (lv.LavenderError,)
 COUNTS = {"solves": 0, "refused": 0, "files": 0, "loaded": 0, "steps": 0, "scenes": 0, "snapshots": 0, "restored": 0,
-          "folders": 0, "doors": 0, "judged": 0, "repeated": 0, "lost": 0}  # fmt: skip
+          "folders": 0, "doors": 0, "judged": 0, "repeated": 0, "lost": 0, "promises": 0, "stalled": 0,
+          "stalled_wrongly": 0, "lost_its_way": 0}  # fmt: skip
 # Below this, numbers on the way are far from the edges of float64, and both judges must say the same.
 MODERATE = 90.0
 
@@ -164,6 +166,8 @@ def claims(spec, problem, solution):
         and lv.get(name).resumable
     ):
         yield "overrun", f"{name}: {solution.iterations} iterations where {budget} were asked for"
+    if solution.contradicted:
+        yield "contradicted", f"{name}: {solution.contradicted}"
     finite = bool(np.isfinite(solution.impulse).all())
     if not finite and status not in ("DIVERGED", "NUMERICAL_ERROR"):
         yield "false claim", f"{name}: {status} with an impulse that is not finite"
@@ -375,6 +379,13 @@ def check_door(spec):
     yield from doors.check(spec)
 
 
+# -- promises --------------------------------------------------------------------------------------------------
+
+
+def check_promise(spec):
+    yield from promises.check(spec, COUNTS)
+
+
 CHECKS = {
     "solve": check_solve,
     "file": check_file,
@@ -382,6 +393,7 @@ CHECKS = {
     "snapshot": check_snapshot,
     "folder": check_folder,
     "door": check_door,
+    "promise": check_promise,
 }
 MAKE = {
     "solve": problems.solve_spec,
@@ -390,4 +402,5 @@ MAKE = {
     "snapshot": scenes.snapshot_spec,
     "folder": folders.folder_spec,
     "door": doors.door_spec,
+    "promise": promises.promise_spec,
 }

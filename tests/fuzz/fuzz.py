@@ -28,15 +28,9 @@ from pathlib import Path
 
 HERE = Path(__file__).resolve().parent
 FOUND = Path(os.environ.get("LAVENDER_FUZZ_FOUND", HERE / "found"))
-KINDS = ("solve", "file", "steps", "snapshot", "folder", "door")
-SHARE = {
-    "solve": 0.4,
-    "file": 0.15,
-    "steps": 0.25,
-    "snapshot": 0.1,
-    "folder": 0.1,
-    "door": 0.2,
-}  # of the time
+KINDS = ("solve", "file", "steps", "snapshot", "folder", "door", "promise")
+# of the time
+SHARE = {"solve": 0.3, "file": 0.1, "steps": 0.2, "snapshot": 0.1, "folder": 0.1, "door": 0.1, "promise": 0.1}
 LIMIT = 20.0  # s of processor time on one input
 ROOM = 3 * 2**30  # bytes of memory of a worker, beyond what it starts with
 FIELDS = struct.Struct("<qqd")  # input, inputs done, processor time at its start

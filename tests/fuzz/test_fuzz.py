@@ -174,6 +174,7 @@ EXAMPLES = {
     "snapshot": 30,
     "folder": 2,
     "door": 40,
+    "promise": 60,
 }  # some seconds each
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import scipy.sparse as sp
-from random_problems import arrays_of, as_matrix, random_contact_problem, random_lcp
+from random_problems import arrays_of, as_matrix, nearly_singular, random_contact_problem, random_lcp
 
 import lavender as lv
 from lavender import registry
@@ -78,6 +78,40 @@ def test_values_that_are_not_finite_are_divergence(plug_in, value):
     assert solution.status is lv.Status.DIVERGED
     assert solution.residual.relative == np.inf
     assert not solution.success
+
+
+@pytest.mark.parametrize("name", lv.available(external=False))
+def test_no_claim_is_contradicted_where_m_is_nearly_singular(name):
+    """A formed of J and M has lost what J and M still tell: claims hold in the form that was given."""
+    count, wrong = 0, []
+    for seed in range(80):
+        problem = nearly_singular(seed)
+        if registry.get(name).refuses(problem):
+            continue
+        for tol in (1e-6, 1e-10, 1e-14):
+            solution = lv.solve(problem, name, tol=tol)
+            count += 1
+            if solution.contradicted:
+                wrong.append((seed, tol, str(solution)))
+    assert not wrong, wrong[:3]
+    assert count >= 30 or "matrix" not in registry.get(name).operators, "nearly all were refused"
+
+
+@pytest.mark.parametrize("name", lv.available(external=False, resumable=True))
+def test_what_stalled_does_not_get_on_when_it_is_started_again(name):
+    """From what it returned, with nothing remembered: what had only lost its way would end below half."""
+    for seed in range(260):
+        problem = nearly_singular(seed)
+        if registry.get(name).refuses(problem):
+            continue
+        solution = lv.solve(problem, name)
+        if solution.status is lv.Status.STALLED:
+            again = lv.solve(problem, name, impulse=solution.impulse)
+            assert again.residual.relative >= 0.5 * solution.residual.relative, (
+                seed,
+                str(solution),
+                str(again),
+            )
 
 
 def test_infeasible_and_a_success_exclude_each_other():

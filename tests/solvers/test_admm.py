@@ -6,6 +6,7 @@ import scipy.sparse as sp
 from random_problems import as_matrix, random_contact_problem, random_lcp
 
 import lavender as lv
+from lavender import suite
 from lavender.solvers import admm
 
 
@@ -276,3 +277,17 @@ def test_a_large_factor_is_left_to_run_with_the_same_bits(monkeypatch):
     after = prepared.solve(max_iter=200, tol=1e-8)
     assert after.impulse.tobytes() == before.impulse.tobytes()
     assert after.work == before.work
+
+
+def test_under_a_limit_nothing_long_is_begun_in_setting_up():
+    """A of J and M is not formed, and a matrix of many entries not analysed, where that would end too late."""
+    problem = suite.case("wild(seed=109, rows=3000)").problem
+    assert problem.operator == "generalized"
+    late = lv.solve(problem, "admm", time_limit=1e-4)
+    assert late.status is lv.Status.TIME_LIMIT and late.iterations == 0 and not late.work
+    assert not {"csr", "csr_data"} & set(problem.__dict__)
+    assert late.impulse.tobytes() == problem.start().tobytes()
+    prepared = lv.prepare(problem, "admm")
+    assert prepared.solve(time_limit=1e-4).status is lv.Status.TIME_LIMIT
+    after, whole = prepared.solve(max_iter=5), lv.solve(problem, "admm", max_iter=5)
+    assert after.work == whole.work and after.impulse.tobytes() == whole.impulse.tobytes()

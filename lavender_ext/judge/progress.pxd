@@ -1,0 +1,145 @@
+"""Whether a run of sweeps still gets anywhere: by the residuals r of its checks, and by where its impulses go.
+
+A run of t sweeps rests where its residual has not leapt up (f > 3/2) and neither of these comes within 64 t more:
+
+    half of the best, by the lower envelope: f = least r in (t/2, t] / least r in (t/4, t/2], k sweeps apart,
+    r f^(n/k) <= best / 2 after n                                                               (1)
+    the end of a plateau: a row that moved one way from check to check, by the last three, at the slower of both
+    speeds, meets a bound or leaves its cone                                                    (2)
+
+A residual that swings as it falls has a falling envelope. On a plateau it stands still while some impulse is carried
+to its bound, and falls behind that. In a cycle no row keeps its way, and infeasible rows have no bound in sight.
+"""
+from libc.math cimport fabs
+from libc.stdint cimport int32_t
+
+from lavender_ext.core.block cimport CONTACT_SPIN, ROW, blocks_t, n_tangents, norm2
+
+
+cdef enum:
+    CHECKS = 32                 # kept: eight to sixteen lie in (t/4, t]
+    HORIZON = 64                # sweeps that are looked ahead, for each one done
+
+
+cdef struct progress_t:
+    int32_t n                   # checks so far; check k stands in place k % CHECKS
+    int32_t at[CHECKS]          # sweeps
+    double r[CHECKS]            # relative residual
+    int32_t last_at             # sweeps at which `last`
+    int32_t before_at           # and `before` were kept; -1: they were not
+    double* last                # (m) N s, of the last check
+    double* before              # (m) N s, of the one before
+
+
+cdef inline void open_progress(progress_t* s, double* room, int32_t m) noexcept nogil:
+    """Before the first check; room (2 m)."""
+    s.n = 0
+    s.last_at = s.before_at = -1
+    s.last = room
+    s.before = room + m
+
+
+cdef inline void see(progress_t* s, int32_t at, double r) noexcept nogil:
+    s.at[s.n % CHECKS] = at
+    s.r[s.n % CHECKS] = r
+    s.n += 1
+
+
+cdef inline void keep(progress_t* s, int32_t at, const double* lam, int32_t m) noexcept nogil:
+    cdef double* x = s.before
+    cdef int32_t i
+    s.before = s.last
+    s.before_at = s.last_at
+    s.last = x
+    s.last_at = at
+    for i in range(m):
+        x[i] = lam[i]
+
+
+cdef inline int32_t envelope(const progress_t* s, double* fall, double* low) noexcept nogil:
+    """k, f and the later of the two minima, at the last check; k = 0 where there are too few checks."""
+    cdef int32_t i = s.n - 1, first = s.n - CHECKS if s.n > CHECKS else 0, t, at, late_at = 0, early_at = 0
+    cdef double late = 1.0 / 0.0, early = 1.0 / 0.0, r
+    t = s.at[i % CHECKS] if i >= 0 else 0
+    while i >= first and s.at[i % CHECKS] > t // 4:
+        at = s.at[i % CHECKS]
+        r = s.r[i % CHECKS]
+        if at > t // 2:
+            if r < late:
+                late = r
+                late_at = at
+        elif r < early:
+            early = r
+            early_at = at
+        i -= 1
+    low[0] = late
+    fall[0] = late / early
+    return late_at - early_at if late < 1.0 / 0.0 and early < 1.0 / 0.0 else 0
+
+
+cdef inline bint moves(const progress_t* s, double aim, double most) noexcept nogil:
+    """(1): whether the envelope meets `aim` within `most` sweeps, or has leapt up: then it has not come to rest yet."""
+    cdef double fall, r, n = 0.0
+    cdef int32_t k = envelope(s, &fall, &r)
+    if k == 0 or not fall < 1.0:
+        return k > 0 and fall > 1.5
+    while r > aim and n <= most:
+        r *= fall
+        n += k
+    return n <= most
+
+
+cdef inline double speed(const progress_t* s, const double* lam, int32_t now, int32_t i) noexcept nogil:
+    """N s a sweep of row i, the slower of its last two; 0 where it turned."""
+    cdef double x = (lam[i] - s.last[i]) / (now - s.last_at), y = (s.last[i] - s.before[i]) / (s.last_at - s.before_at)
+    if not x * y > 0.0:
+        return 0.0
+    return x if fabs(x) < fabs(y) else y
+
+
+cdef inline bint meets(double gap, double closing, double most) noexcept nogil:
+    return gap > 0.0 and closing > 0.0 and gap <= most * closing
+
+
+cdef inline bint meets_bound(const progress_t* s, const blocks_t* p, const double* lam, int32_t now,
+                             double most) noexcept nogil:
+    """(2): whether a row does within `most` sweeps."""
+    cdef int32_t i, j, k, nt
+    cdef double v, rate, size, along
+    if not now > s.last_at > s.before_at >= 0:
+        return False
+    for i in range(p.n_blocks):
+        j = p.ptr[i]
+        if p.kind[i] == ROW:
+            for k in range(j, p.ptr[i + 1]):
+                v = speed(s, lam, now, k)
+                if meets(lam[k] - p.lower[k], -v, most) or meets(p.upper[k] - lam[k], v, most):
+                    return True
+            continue
+        if not lam[j] > 0.0:
+            continue
+        rate = speed(s, lam, now, j)
+        if meets(lam[j], -rate, most):
+            return True
+        nt = n_tangents(p.kind[i], p.ptr[i + 1] - j)
+        size = along = v = 0.0
+        for k in range(j + 1, j + 1 + nt):
+            size = norm2(size, lam[k])
+            along += lam[k] * speed(s, lam, now, k)
+            v = norm2(v, speed(s, lam, now, k))
+        if meets(p.mu[i] * lam[j] - size, (along / size if size > 0.0 else v) - p.mu[i] * rate, most):
+            return True
+        if p.kind[i] == CONTACT_SPIN:
+            k = j + 1 + nt
+            v = speed(s, lam, now, k)
+            along = p.mu[i] * p.patch_radius[i]
+            if meets(along * lam[j] - fabs(lam[k]), (v if lam[k] >= 0.0 else -v) - along * rate, most):
+                return True
+    return False
+
+
+cdef inline bint rests(const progress_t* s, const blocks_t* p, const double* lam, int32_t now,
+                       double best) noexcept nogil:
+    """Nothing is in sight of what was last seen, at sweep `now` with the impulse lam (m)."""
+    cdef double most = HORIZON * <double>now
+    return not (moves(s, 0.5 * best, most) or meets_bound(s, p, lam, now, most))

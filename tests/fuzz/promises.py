@@ -1,0 +1,111 @@
+"""Claims of solvers that go on iteration by iteration: problems on which sweeps creep, rest or lose their way.
+
+A spec names where its problem comes from (a seed says the rest), so that it stays small.
+"""
+
+import numpy as np
+from draw import numbers, positive
+
+import lavender as lv
+from lavender import suite
+from lavender.suite import hard
+
+SCENES = (
+    ("stack", {"n": (3, 6, 10)}),
+    ("pyramid", {"base": (3, 4)}),
+    ("card_house", {"levels": (2, 3)}),
+    ("chain", {"n": (5, 20)}),
+    ("bridge", {"n": (6, 12)}),
+    ("heavy_on_light", {"ratio": (1.0, 10.0, 1e3)}),
+    ("table", {"legs": (3, 4, 9)}),
+    ("four_bar", {}),
+    ("ramp", {"angle": (0.1, 0.35, 0.6)}),
+    ("pile", {"n": (8, 16)}),
+)
+
+
+def promise_spec(draw):
+    """A problem, an iterative solver and a budget."""
+    source = draw.pick(("scene", "scene", "wild", "warm", "singular", "singular", "hard"))
+    spec = {"kind": "promise", "source": source, "seed": draw.whole(0, 10**6)}
+    if source == "scene":
+        name, choices = draw.pick(SCENES)
+        parameters = {key: draw.pick(values) for key, values in choices.items()}
+        spec |= {"scene": name, "parameters": parameters | {"solver_iterations": draw.pick((4, 8, 16, 32))}}
+        spec["steps"] = draw.whole(1, 120)
+    elif source == "hard":
+        spec["text"] = draw.pick(hard.SET)
+    elif source == "singular":
+        spec |= general(draw)
+    spec["solver"] = draw.pick(lv.available(external=False, resumable=True))
+    spec["tol"] = draw.pick((1e-6, 1e-6, 1e-9, 1e-12))
+    spec["max_iter"] = draw.pick((None, None, None, 200, 3000))
+    return spec
+
+
+def general(draw):
+    """J of a few velocities, and M whose eigenvalues lie up to 1e17 apart."""
+    nv, rows = draw.whole(1, 10), draw.whole(1, 12)
+    q = np.linalg.qr(numbers(draw, nv * nv, "tame").reshape(nv, nv) + 3.0 * np.eye(nv))[0]
+    mass = (
+        q * positive(draw, nv, "tame") * 10.0 ** -np.array([draw.whole(0, 17) for _ in range(nv)], float)
+    ) @ q.T
+    mass = 0.5 * (mass + mass.T) * 10.0 ** draw.whole(-6, 6)
+    law = draw.pick(("linear", "lcp", "coulomb", "cone"))
+    rows = 3 * (1 + rows // 3) if law in ("coulomb", "cone") else rows
+    jac = numbers(draw, rows * nv, draw.pick(("tame", "tame", "whole"))).reshape(rows, nv)
+    return {"law": law, "J": jac.tolist(), "M": mass.tolist(), "v_free": numbers(draw, nv, "tame").tolist()}
+
+
+def build(spec):
+    """The problem of a spec, with its warm start."""
+    source = spec["source"]
+    if source == "scene":
+        simulation = lv.Simulation(lv.Scene(spec["scene"], **spec["parameters"]))
+        for _ in range(spec["steps"]):
+            simulation.step()
+        return simulation.constraint_problem()
+    if source == "hard":
+        return suite.case(spec["text"]).problem
+    if source == "singular":
+        jac = np.array(spec["J"], float).reshape(-1, len(spec["v_free"]))
+        m, law = len(jac), spec["law"]
+        if law in ("coulomb", "cone"):
+            cones = lv.Cones.contacts(0.5, count=m // 3)
+        else:
+            cones = lv.Cones.bounded(np.full(m, 0.0 if law == "lcp" else -np.inf), np.full(m, np.inf))
+        friction = "cone" if law == "cone" else "coulomb"
+        return lv.Problem.from_jacobian(
+            jac, np.array(spec["M"]), spec["v_free"], cones=cones, friction=friction
+        )
+    problem = suite.case(f"wild(seed={spec['seed']}, rows=200)").problem
+    if source == "wild":
+        return problem
+    rng = np.random.default_rng(spec["seed"])
+    b = problem.b * (1.0 + rng.choice([1e-3, 1e-2, 0.1]) * rng.standard_normal(problem.m))
+    return problem.updated(b=b, guess=lv.solve(problem, tol=1e-9).impulse)
+
+
+def check(spec, counts):
+    """No claim is contradicted; STALLED is counted, and counted as wrong where the budget ends below half of it."""
+    problem, name = build(spec), spec["solver"]
+    if problem.m == 0 or problem.m > 700 or lv.get(name).refuses(problem):
+        counts["refused"] += 1
+        return
+    more = {} if spec["max_iter"] is None else {"max_iter": spec["max_iter"]}
+    solution = lv.solve(problem, name, tol=spec["tol"], **more)
+    counts["promises"] += 1
+    counts["solves"] += 1
+    if solution.contradicted:
+        yield "contradicted", f"{name}: {solution.contradicted}"
+    slope = solution.sweeps_per_decade
+    if not (np.isnan(slope) or 0.0 < slope < np.inf):
+        yield "wrong number", f"{name}: sweeps_per_decade is {slope}"
+    if solution.status is not lv.Status.STALLED:
+        return
+    counts["stalled"] += 1
+    whole = lv.solve(problem, name, tol=0.0, **more).residual.relative
+    again = lv.solve(problem, name, tol=spec["tol"], impulse=solution.impulse, **more).residual.relative
+    counts["solves"] += 2
+    counts["stalled_wrongly"] += whole < 0.5 * solution.residual.relative
+    counts["lost_its_way"] += again < 0.5 * solution.residual.relative
