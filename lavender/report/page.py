@@ -41,6 +41,7 @@ def page(
     *,
     old: Records | None = None,
     budgets: Sequence[float] = (),
+    sweeps: Sequence[int] = (),
     saved: bool = True,
     peers: Peers | None = None,
     engines: Sequence[Contestant] = (),
@@ -56,6 +57,8 @@ def page(
         An earlier run to compare with.
     budgets : s, optional
         Time budgets of the recommendation.
+    sweeps : int, optional
+        Budgets of sweeps of the recommendation.
     saved : bool
         The figures are beside the page as SVG and PNG.
     peers : Peers, optional
@@ -75,7 +78,7 @@ def page(
     environment.filters.update(
         seconds=seconds, residual=residual, level=level_name, anchor=file_name, times=times, speed=speed_name
     )
-    content = _content(records, figures, old, tuple(budgets) or tables.time_budgets(records), peers)
+    content = _content(records, figures, old, tuple(budgets), tuple(sweeps), peers)
     return environment.get_template("index.html.j2").render(
         title=title,
         saved=saved,
@@ -88,11 +91,17 @@ def page(
 
 
 def _content(
-    records: Records, figures: Figures, old: Records | None, budgets: Sequence[float], peers: Peers | None
+    records: Records,
+    figures: Figures,
+    old: Records | None,
+    budgets: Sequence[float],
+    sweeps: Sequence[int],
+    peers: Peers | None,
 ) -> dict[str, Any]:
     still = idle(records)
     records = working(records)
-    found = verdict(records, budgets)
+    found = verdict(records, budgets, sweeps)
+    budgets = budgets or tables.time_budgets(records)
     names = sorted({r.solver for r in records} | {c.solver for f in figures for c in f.curves})
     number = {name: i for i, name in enumerate(names)}
     # Under the heading of a case or a family its name says nothing new.

@@ -24,6 +24,7 @@ def write(
     figures: bool = True,
     old: Records | None = None,
     times: Sequence[float] = (),
+    sweeps: Sequence[int] = (),
     peers: Peers | None = None,
     engines: Sequence[Contestant] = (),
 ) -> Path:
@@ -39,7 +40,9 @@ def write(
     old : Records, optional
         An earlier run to compare with.
     times : s, optional
-        Time budgets of the recommendation; `tables.time_budgets` if none are given.
+        Time budgets of the recommendation; those of the plan, or `tables.time_budgets`, if none are given.
+    sweeps : int, optional
+        Budgets of sweeps with which a solver is to be named; those of the plan if none are given.
     peers : Peers, optional
         A run of `lavender bench peers` (`lavender.bench.peers.read`) to show beside them.
     engines : sequence of Contestant
@@ -79,11 +82,20 @@ def write(
         # Whole or not at all: on a full disk the page of the last time stays.
         unfinished = index.with_suffix(".html.part")
         unfinished.write_text(
-            page(shown, drawn, old=before, budgets=times, saved=figures, peers=peers, engines=engines),
+            page(
+                shown,
+                drawn,
+                old=before,
+                budgets=times,
+                sweeps=sweeps,
+                saved=figures,
+                peers=peers,
+                engines=engines,
+            ),
             encoding="utf-8",
         )
         unfinished.replace(index)
-        (folder / "summary.md").write_text(summary(busy, times, engines), encoding="utf-8")
+        (folder / "summary.md").write_text(summary(busy, times, engines, sweeps), encoding="utf-8")
         if figures and list(drawn):
             (folder / "figures").mkdir(exist_ok=True)
             look = looks({r.solver for r in shown} | {c.solver for figure in drawn for c in figure.curves})

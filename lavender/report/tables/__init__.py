@@ -7,7 +7,9 @@ from lavender.report.tables.advice import (
     advice,
     advice_by_level,
     advice_by_sequence,
+    advice_by_sweeps,
     advice_by_time,
+    over_steps,
     quantile,
     time_budgets,
     to_level,
@@ -26,6 +28,7 @@ from lavender.report.tables.cases import (
     spreads,
 )
 from lavender.report.tables.changes import NOISE, Change, changes
+from lavender.report.tables.finals import Final, Race
 from lavender.report.tables.groups import families, is_campaign, levels_of, pairs
 from lavender.report.tables.means import (
     SHIFT,
@@ -46,8 +49,10 @@ __all__ = [
     "Choice",
     "Claims",
     "Failure",
+    "Final",
     "Line",
     "Profile",
+    "Race",
     "Reach",
     "Robustness",
     "Spread",
@@ -55,6 +60,7 @@ __all__ = [
     "advice",
     "advice_by_level",
     "advice_by_sequence",
+    "advice_by_sweeps",
     "advice_by_time",
     "budgets",
     "by_sequence",
@@ -67,6 +73,7 @@ __all__ = [
     "is_campaign",
     "levels_of",
     "limit_of",
+    "over_steps",
     "pairs",
     "profiles",
     "quantile",
