@@ -110,7 +110,9 @@ class Run(_Texts):
     threads: int  # of BLAS and OpenMP while timing
     versions: Mapping[str, str]
     plan: Mapping[str, Any]
-    build: Mapping[str, str] = field(default_factory=dict)  # commit or hash, compiler, flags, BLAS, clock
+    build: Mapping[str, str] = field(
+        default_factory=dict
+    )  # commit, hash of the kernels, compiler, BLAS, clock
     load: float | None = None  # processes that wanted the processor, mean of the minute before
 
 

@@ -21,6 +21,7 @@ from lavender.report.moved import (
 )
 from lavender.report.svg import svg
 from lavender.report.tables.advice import NOISE, RESIDUAL_NOISE
+from lavender.report.tables.finals import WAYS, line_table
 from lavender.report.text import count, residual, seconds, times
 from lavender.report.verdict import verdict
 
@@ -152,6 +153,8 @@ def _content(
         "levels": levels,
         "budgets_of_time": budgets,
         "advice": [] if campaign else tables.advice(records, budgets),
+        "lines": line_table(records),
+        "ways": {way: head for way, head in WAYS.items() if any(r.turns and r.way == way for r in records)},
         "families": tables.families(records),
         "family_figures": {f: file_name(figure.name) for f, figure in figures.families.items()},
         "claims": tables.claims(records),
@@ -177,6 +180,7 @@ def _content(
         "sequences": tables.by_sequence(records),
         "sequence_figures": {name: _keys(some) for name, some in figures.sequences.items()},
         "compared": old is not None,
+        "drift": 1.0 if old is None else tables.drift(old, records),
         "changes": [c for c in changes if c.kind != "same"],
         "n_changes": len(changes),
         "n_records": len(records),

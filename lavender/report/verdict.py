@@ -12,7 +12,7 @@ from lavender.report import tables
 from lavender.report.contenders import QUICKER, Subject, subjects
 from lavender.report.moved import by_speed, speed_levels, speed_name
 from lavender.report.tables import Advice, Choice
-from lavender.report.tables.finals import Final, Race, in_time, lines
+from lavender.report.tables.finals import WAYS, Final, Race, in_time, lines
 from lavender.report.tables.finals import to_level as race_to_level
 from lavender.report.text import count, residual, seconds
 from lavender.report.text import times as times_of
@@ -97,13 +97,13 @@ def _of(records: Records, subject: Subject, times: Sequence[float], sweeps: Sequ
         return Verdict((f"Nobody brings any of {what} {BY_RESIDUAL.reached(level)}.",), (), leaders)
     final, first = race.ranking[0]
     said = [_head(first, level, what, BY_RESIDUAL), *_sure(race)]
-    code = _told(final, first.score, "one call" if subject.way == "call" else "a step")
+    code = _told(final, first.score, WAYS[subject.way])
     leaders = [c.solver for _, c in race.ranking[:3] if c.solved]
     some = [
         f for f in lines(records, "batch") if f.line.solver == first.solver and set(f.runs) <= set(final.runs)
     ]
     for batch in some[:1] if len(final.runs) > 1 else ():
-        code += _told(batch, batch.time, "a problem of a batch")
+        code += _told(batch, batch.time, WAYS["batch"])
     plain = lines(records, subject.way, rounds=False)
     for t in times or [a.target for a in subject.quick if a.target <= QUICKER * first.score][-1:]:
         if first.worst <= t and first.solved == first.cases:

@@ -101,7 +101,9 @@ def finals(
             )
     names = list(dict.fromkeys(ask.solver for ask in asks))
     with Worker(memory) as worker, one_thread():
-        runner = _Runner(list(known.runs.values())[-1], plan, names, store, watch, worker if isolate else None)
+        runner = _Runner(
+            list(known.runs.values())[-1], plan, names, store, watch, worker if isolate else None
+        )
         runner.out = known
         described = [(i, known.cases[i.name]) for i in resolve(cases) if i.name in known.cases]
         what = repr([asks, [info.sha for _, info in described]])

@@ -27,7 +27,7 @@ from lavender.report.tables.cases import (
     reaches,
     spreads,
 )
-from lavender.report.tables.changes import NOISE, Change, changes
+from lavender.report.tables.changes import NOISE, Change, changes, drift
 from lavender.report.tables.finals import Final, Race
 from lavender.report.tables.groups import families, is_campaign, levels_of, pairs
 from lavender.report.tables.means import (
@@ -66,6 +66,7 @@ __all__ = [
     "by_sequence",
     "changes",
     "claims",
+    "drift",
     "failures",
     "families",
     "geometric_mean",

@@ -20,7 +20,7 @@ from lavender.bench.store import Records
 from lavender.report.tables.advice import FIRST, HALF, QUANTILE, Choice, counts_sweeps, quantile
 from lavender.report.tables.means import SHIFT, limit_of
 
-__all__ = ["Final", "Race", "in_time", "lines", "to_level"]
+__all__ = ["WAYS", "Final", "Race", "in_time", "line_table", "lines", "to_level"]
 
 SAMPLES = 500
 SURE = 0.8  # share of resamplings below which a second name is told
@@ -91,6 +91,19 @@ def lines(records: Records, way: str, rounds: bool = True) -> list[Final]:
             groups.setdefault(key, {})[r.case] = r
     most = max((len(runs) for runs in groups.values()), default=0)
     return [Final(runs) for runs in groups.values() if len(runs) == most]
+
+
+WAYS = {"call": "one call", "steps": "a step, impulses carried on", "batch": "a problem of a batch"}
+
+
+def line_table(records: Records) -> dict[str, dict[str, Final]]:
+    """Solver -> way -> the line to the middle level, for the ways that were timed."""
+    found: dict[str, dict[str, Final]] = {}
+    for way in WAYS:
+        for final in lines(records, way):
+            if final.line.mode == "tol":
+                found.setdefault(final.line.solver, {})[way] = final
+    return found
 
 
 def to_level(records: Records, some: Sequence[Final], level: float, cases: int = 0) -> Race | None:
