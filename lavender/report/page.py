@@ -168,6 +168,7 @@ def _content(
         "moved_profiles": {law: _keys(some) for law, some in other.profiles.items()},
         "moved_sequences": {name: _keys(some) for name, some in other.sequences.items()},
         "means": tables.geometric_means(records),
+        "backends": tables.backends(records),
         "shift": tables.SHIFT,
         "limit": tables.limit_of(records),
         "spreads": sorted(tables.spreads(records), key=lambda s: -s.factor),

@@ -122,6 +122,11 @@ def _of(records: Records, subject: Subject, times: Sequence[float], sweeps: Sequ
         if swept is not None:
             said.append(_serves(f"With {count(budget, 'sweep')}", *swept.ranking[0], math.inf))
             code += _told(swept.ranking[0][0], swept.ranking[0][0].time, count(budget, "sweep"))
+    foreign = [f"{b.solver} on {b.wins} of {b.solved} cases" for b in tables.backends(records) if b.wins]
+    if foreign and subject.way == "call":
+        said.append(
+            f"By their own interface, on data given before, some are faster than all of ours: {', '.join(foreign)}."
+        )
     if first.score < PYTHON_SHARE:
         said.append(f"Below {seconds(PYTHON_SHARE)} Python's share of a call decides as much as the solver.")
     return Verdict(tuple(said), tuple(dict.fromkeys(code)), tuple(dict.fromkeys(leaders))[:3])

@@ -393,5 +393,5 @@ def _without_times(record: Record) -> Record:
     nan = math.nan
     return replace(
         record, setup_min=nan, setup_median=nan, solve_min=nan, solve_median=nan, time_min=nan, time_median=nan,
-        pace=None,
+        pace=None, own_min=None,
     )  # fmt: skip

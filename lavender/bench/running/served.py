@@ -59,6 +59,7 @@ def _as_data(found: Any) -> tuple[str, bytes]:
         "solves": found.solves,
         "times": found.times,
         "pace": found.pace,
+        "own": found.own,
         "certificate": certificate is not None,
     }
     more = b"" if certificate is None else certificate.tobytes()

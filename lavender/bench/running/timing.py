@@ -24,6 +24,7 @@ from lavender import registry
 from lavender._arrays import FloatArray
 from lavender.bench.line import needs_more
 from lavender.bench.record import ERROR, Record, measurement_key
+from lavender.external.stopwatch import own_time
 from lavender.problem import Problem
 from lavender.residuals import reference
 from lavender.solution import Claim, Solution, Status
@@ -143,6 +144,7 @@ class Outcome:
     times: list[float]  # s, of the line of each repeat; none where the guard did not end
     reached: list[float]  # relative residual of each repeat, in mode "time"
     pace: float | None  # s
+    own: float | None = None  # s, in the backend's own solve
 
 
 def measure(problem: Problem, task: Task) -> Record:
@@ -171,6 +173,7 @@ def attempt(problem: Problem, task: Task, impulse: Any = None) -> Outcome | str:
     """Run the solver as the task asks, in this process; what it raised, as text."""
     runs: list[tuple[Solution, float]] = []  # with the time of the line
     paces: list[float] = []
+    owns: list[float] = []
     guard: Solution | None = None
     try:
         _warm_up(task.solver)
@@ -185,7 +188,9 @@ def attempt(problem: Problem, task: Task, impulse: Any = None) -> Outcome | str:
                     solution = _parts(problem, task, impulse)
                     runs.append((_uninterrupted(solution), solution.setup_time + solution.solve_time))
                 else:
-                    runs.append(_line(problem, task, impulse, guard))
+                    with own_time(task.solver) as spent:
+                        runs.append(_line(problem, task, impulse, guard))
+                    owns += [sum(spent)] if spent else []
                 if task.turns:  # in turns with others: as a simulator that calls the same line at every step
                     left, runs = left if perf_counter() - begun < SHORT else 1, runs[-1:]
                 left -= 1
@@ -200,8 +205,8 @@ def attempt(problem: Problem, task: Task, impulse: Any = None) -> Outcome | str:
         return f"{type(error).__name__}: {error}".strip()
     assert solution is not None  # there is at least one repeat
     made = [s for s, _ in runs] or [solution]
-    paced = min(paces, default=None)
-    return outcome_of(solution, made, [t for _, t in runs], paced, task.mode == "time")
+    found = outcome_of(solution, made, [t for _, t in runs], min(paces, default=None), task.mode == "time")
+    return replace(found, own=min(owns, default=None))
 
 
 def outcome_of(
@@ -353,4 +358,5 @@ def record_of(task: Task, s: Solution, found: Outcome) -> Record:
         times=tuple(found.times) if task.way else (),
         reached=tuple(found.reached),
         pace=found.pace,
+        own_min=found.own,
     )

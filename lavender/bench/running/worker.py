@@ -151,11 +151,11 @@ def _outcome(answer: tuple[bytes, bytes], m: int, took: float) -> Outcome | str:
     if not all(isinstance(said.get(name), str) for name in ("message", "form")):
         raise ValueError("no message")
     setups, solves = _times(said.get("setups")), _times(said.get("solves"))
-    times, pace = _times(said.get("times"), some=False), said.get("pace")
+    times, pace, own = _times(said.get("times"), some=False), said.get("pace"), said.get("own")
     if len(setups) != len(solves) or not max(math.fsum(setups + solves), math.fsum(times)) <= took:
         raise ValueError("times that did not pass")
-    if pace is not None and not (isinstance(pace, float) and pace >= 0.0):
-        raise ValueError("no pace")
+    if any(t is not None and not (isinstance(t, float) and 0.0 <= t <= took) for t in (pace, own)):
+        raise ValueError("no pace, or times that did not pass")
     return Outcome(
         impulse=numbers[:m],
         status=Status[status],
@@ -169,6 +169,7 @@ def _outcome(answer: tuple[bytes, bytes], m: int, took: float) -> Outcome | str:
         times=times,
         reached=[],  # of runs to a time, which no worker is asked for
         pace=pace,
+        own=own,
     )
 
 

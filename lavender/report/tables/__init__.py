@@ -32,7 +32,9 @@ from lavender.report.tables.finals import Final, Race
 from lavender.report.tables.groups import families, is_campaign, levels_of, pairs
 from lavender.report.tables.means import (
     SHIFT,
+    Backend,
     Profile,
+    backends,
     geometric_mean,
     geometric_means,
     limit_of,
@@ -45,6 +47,7 @@ __all__ = [
     "NOISE",
     "SHIFT",
     "Advice",
+    "Backend",
     "Change",
     "Choice",
     "Claims",
@@ -62,6 +65,7 @@ __all__ = [
     "advice_by_sequence",
     "advice_by_sweeps",
     "advice_by_time",
+    "backends",
     "budgets",
     "by_sequence",
     "changes",
