@@ -90,7 +90,7 @@ def _in_time(
         c.solver for c in advice.ranking if not (s := specs().get(c.solver)) or not (s.external or s.requires)
     ]
     asks = [
-        Ask(solver, "time", level, 0, share * advice.target, subject.way, start)
+        Ask(solver, "time", level, time_limit=share * advice.target, way=subject.way, start=start)
         for solver in dict.fromkeys([*own[: MOST - 1], *(s for s in own if s == "auto")])
         for share in SHARES
     ]

@@ -662,7 +662,7 @@ def test_lines_are_timed_in_turns_and_kept(tmp_path):
     made = bench.finals(problems, asks, known, plan, path).records[before:]
     assert len(made) == len(problems) * len(asks)
     for r in made:
-        assert len(r.times) == r.repeats == 7
+        assert len(r.times) == r.repeats >= 3
         assert r.time_min == min(r.times)
         assert r.success == (r.mode == "tol")
         assert len(r.reached) == (r.repeats if r.mode == "time" else 0)

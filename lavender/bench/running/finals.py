@@ -24,7 +24,8 @@ from lavender.many import solve_many
 
 __all__ = ["ROUNDS", "Ask", "finals"]
 
-ROUNDS, LEAST_ROUNDS = 7, 3
+ROUNDS, LEAST_ROUNDS, MOST_ROUNDS = 7, 3, 41
+SPARE = 3.0  # s, for more repetitions than usual where they are cheap
 STAGE = 20.0  # time limits, that all repetitions may take together once there were the least
 TOGETHER = 32  # cases that are held in memory at a time
 ALIKE = 10  # rows of the largest over the smallest problem, up to which they are a batch
@@ -117,7 +118,8 @@ def finals(
             if item.sequence:
                 sequences.setdefault(item.sequence, []).append((item, info))
         for part in (*parts, *sequences.values()):
-            stage.run(part, STAGE * plan.time_limit * len(part) / len(described))
+            share = len(part) / len(described)
+            stage.run(part, share * STAGE * plan.time_limit, share * SPARE)
             for item, _ in part:
                 item.forget()
     return known
@@ -132,15 +134,16 @@ class _Stage:
                 runner.out.add(record)
                 runner.tell(record.case, record.solver, record, True)
 
-    def run(self, part: Cases, limit: float) -> None:
-        """All repetitions over a part of the cases, or over one sequence."""
+    def run(self, part: Cases, limit: float, spare: float) -> None:
+        """All repetitions over a part of the cases, or over one sequence, in a time [s] and one for more than usual."""
         steps = bool(part[0][0].sequence)
         mine = [a for a in self.asks if a.way == "batch" or (a.way == "steps") == steps]
         taken = {ask: [(i, info) for i, info in part if self.takes(ask, i)] for ask in mine}
         made: Made = {}
         begun = perf_counter()
-        for turn in range(ROUNDS):
-            if turn >= LEAST_ROUNDS and perf_counter() - begun > limit:
+        for turn in range(MOST_ROUNDS):
+            spent = perf_counter() - begun
+            if turn >= LEAST_ROUNDS and spent > (limit if turn < ROUNDS else min(limit, spare)):
                 break
             order = mine[turn % len(mine) :] + mine[: turn % len(mine)] if mine else []
             if steps:

@@ -358,7 +358,17 @@ def over_steps(
                 solved = sum(r <= target for r in left)
                 score = geometric_mean(taken, SHIFT)
                 slow = f"step {taken.index(max(taken))}"
-                choice = Choice(solver, solved, whole, score, quantile(taken, 0.95), max(taken), slow, how, n)
+                choice = Choice(
+                    solver=solver,
+                    solved=solved,
+                    cases=whole,
+                    score=score,
+                    p95=quantile(taken, 0.95),
+                    worst=max(taken),
+                    hardest=slow,
+                    how=how,
+                    iterations=n,
+                )
             places.append(((wrong, -choice.solved), choice))
         found = ranked(name, target, _best_of_each(places), RESIDUAL_NOISE if timed else NOISE)
         (by_time if timed else by_level).append(found)

@@ -2,7 +2,7 @@
 
 A resampling draws the cases and the repetitions of the whole with replacement (a sequence's steps in blocks of
 consecutive ones, since neighbours are alike). In each the lines are ranked as the tables rank; who is within noise of
-the best wins. Noise is what a score differs by between repetitions of the whole, not between repeats in one loop.
+the best wins. Noise is of what a score differs by between repetitions of the whole, not between repeats in one loop.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ SURE = 0.8  # share of resamplings below which a second name is told
 SOMETIMES = 0.2  # share from which another is as good a choice
 NOISE = 1.05  # at least: what nobody notices
 BLOCKS = 10  # that the steps of a sequence are cut into
+QUIET = 0.25  # quantile of the repetitions that is a line's time: what else the machine does only ever adds
 LATE = 0.95  # of the repeats, that have to be in time
 
 
@@ -48,9 +49,9 @@ class Final:
 
     @property
     def time(self) -> float:
-        """Geometric mean over the cases of the median repetition [s], with the shift of the tables."""
-        medians = [float(np.median(r.times or (r.time_min,))) for r in self.runs.values()]
-        return float(np.exp(np.mean(np.log(np.array(medians) + SHIFT))) - SHIFT)
+        """Geometric mean over the cases of the lower quartile of the repetitions [s], with the shift of the tables."""
+        each = [float(np.quantile(r.times or (r.time_min,), QUIET)) for r in self.runs.values()]
+        return float(np.exp(np.mean(np.log(np.array(each) + SHIFT))) - SHIFT)
 
 
 @dataclass(frozen=True)
@@ -60,7 +61,7 @@ class Race:
     ranking: tuple[tuple[Final, Choice], ...]  # the recommended one first
     shares: tuple[float, ...]  # of the resamplings that each wins, in this order
     loss: float  # score of the recommended over the best's where it does not win, median; 1 where it always wins
-    noise: float  # factor between repetitions
+    noise: float  # factor within which two scores are the same
 
     @property
     def named(self) -> tuple[str, ...]:
@@ -120,19 +121,19 @@ def to_level(records: Records, some: Sequence[Final], level: float, cases: int =
     charged = np.where(missed[:, :, None] | ~np.isfinite(times), limit, times)
 
     def score(values: FloatArray) -> FloatArray:
-        return np.asarray(np.exp(np.log(np.median(values, axis=2) + SHIFT).mean(axis=1)) - SHIFT)
+        return np.asarray(np.exp(np.log(np.quantile(values, QUIET, axis=2) + SHIFT).mean(axis=1)) - SHIFT)
 
     def choice(i: int, value: float) -> Choice:
-        names, medians = list(some[i].runs), np.median(times[i], axis=1)
-        medians = np.where(missed[i], math.inf, medians)
+        names, each = list(some[i].runs), np.quantile(times[i], QUIET, axis=1)
+        each = np.where(missed[i], math.inf, each)
         return Choice(
             solver=some[i].line.solver,
             solved=int((~missed[i]).sum()),
             cases=max(cases, len(names)),
             score=value,
-            p95=quantile(medians.tolist(), 0.95),
-            worst=float(medians.max()),
-            hardest=names[int(medians.argmax())],
+            p95=quantile(each.tolist(), 0.95),
+            worst=float(each.max()),
+            hardest=names[int(each.argmax())],
         )
 
     return _race(records, some, charged, missed, score, choice)
@@ -206,7 +207,9 @@ def _race(
     blocks = _blocks(records, list(some[0].runs))
     draw = np.random.default_rng(0)
     single = np.array([score(values[:, :, k : k + 1]) for k in range(repeats)])  # (repetitions, lines)
-    noise = max(NOISE, float(np.exp(np.median(np.log(single).std(axis=0)))) if repeats > 1 else NOISE)
+    # Two standard errors of the difference of two scores; that of a quartile is 1.36 times a mean's.
+    spread = float(np.median(np.log(single).std(axis=0)))
+    noise = max(NOISE, math.exp(2.0 * math.sqrt(2.0) * 1.36 * spread / math.sqrt(repeats)))
     whole = score(values)
     wins, losses = np.zeros(n), [[] for _ in range(n)]  # type: ignore[var-annotated]
     lying = np.array([any(r.contradicted for r in f.runs.values()) for f in some])
