@@ -118,7 +118,7 @@ def load() -> float | None:
 
 def clock() -> dict[str, str]:
     """Frequency of the processor now, and what governs it, as far as the system says."""
-    found = {}
+    found: dict[str, str] = {}
     with contextlib.suppress(OSError):
         mhz = re.search(
             r"^cpu MHz\s*:\s*([\d.]+)", Path("/proc/cpuinfo").read_text(errors="replace"), re.MULTILINE

@@ -48,7 +48,9 @@ def summary(
         lines.append("")
         budgets = sorted({n for line in advice for n in line.by_sweeps})
         rows = [[line.name, *map(in_time, line.by_sweeps.values())] for line in advice if line.by_sweeps]
-        lines += [*_table(["structure", *(count(n, "sweep") for n in budgets)], rows), ""] if rows else []
+        lines += (
+            [*_table(["structure", *(count(int(n), "sweep") for n in budgets)], rows), ""] if rows else []
+        )
     if tables.is_campaign(records):
         lines += _campaign(tables.robustness(records), [f"to {level_name(x)}" for x in levels])
         if by_speed := robustness_by_speed(records):

@@ -99,7 +99,7 @@ def sweeps_table(advice: Sequence[tables.Line]) -> Any:
     table = _table()
     table.add_column("structure")
     for n in budgets:
-        table.add_column(count(n, "sweep"), overflow="fold")
+        table.add_column(count(int(n), "sweep"), overflow="fold")
     for line in advice:
         table.add_row(
             line.name, *(in_time(line.by_sweeps[n]) if n in line.by_sweeps else "–" for n in budgets)

@@ -93,8 +93,8 @@ def _of(records: Records, subject: Subject, times: Sequence[float], sweeps: Sequ
     race = race_to_level(records, in_turns or lines(records, subject.way, rounds=False), level, n)
     what = _what(records, subject)
     if race is None or not race.ranking[0][1].solved:
-        leaders = tuple(c.solver for c in subject.best.ranking[:3] if c.solved)
-        return Verdict((f"Nobody brings any of {what} {BY_RESIDUAL.reached(level)}.",), (), leaders)
+        near = tuple(c.solver for c in subject.best.ranking[:3] if c.solved)
+        return Verdict((f"Nobody brings any of {what} {BY_RESIDUAL.reached(level)}.",), (), near)
     final, first = race.ranking[0]
     said = [_head(first, level, what, BY_RESIDUAL), *_sure(race)]
     code = _told(final, first.score, WAYS[subject.way])

@@ -194,11 +194,11 @@ class _Stage:
         if all(task.key in self.known for task in tasks):
             return
         fresh = [just_written(item.problem) for item, _ in some]
-        more = {"max_iter": ask.max_iter} if ask.max_iter else {}
+        asked = ask.max_iter or None
         beside = pace()
         begun = perf_counter()
         try:
-            found = solve_many(fresh, ask.solver, tol=ask.tol, **more)
+            found = solve_many(fresh, ask.solver, tol=ask.tol, max_iter=asked)
         except Exception as error:  # as in `attempt`: it costs its own records
             for task in tasks:
                 self.keep(made, task.record(status="ERROR", message=f"{type(error).__name__}: {error}"[:500]))

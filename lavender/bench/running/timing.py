@@ -185,8 +185,8 @@ def attempt(problem: Problem, task: Task, impulse: Any = None) -> Outcome | str:
             while left and (guard is None or guard.status is not Status.TIME_LIMIT):
                 paces.append(pace())
                 if not task.way:
-                    solution = _parts(problem, task, impulse)
-                    runs.append((_uninterrupted(solution), solution.setup_time + solution.solve_time))
+                    parts = _uninterrupted(_parts(problem, task, impulse))
+                    runs.append((parts, parts.setup_time + parts.solve_time))
                 else:
                     with own_time(task.solver) as spent:
                         runs.append(_line(problem, task, impulse, guard))

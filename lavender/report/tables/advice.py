@@ -108,7 +108,7 @@ class Line:
     sequence: bool
     by_level: Mapping[float, Advice]
     by_time: Mapping[float, Advice]
-    by_sweeps: Mapping[int, Advice]
+    by_sweeps: Mapping[float, Advice]
 
 
 def advice(records: Records, times: Sequence[float] = ()) -> list[Line]:
@@ -116,17 +116,16 @@ def advice(records: Records, times: Sequence[float] = ()) -> list[Line]:
     times = tuple(times) or time_budgets(records)
     steps = {name: walks[0].steps for name, walks in by_sequence(records).items()}
     sizes = {name: len(cases) for name, cases in families(records).items()}
-    lines = []
-    by_sequence_level, by_sequence_time = advice_by_sequence(records, times)
-    for sizes_of, sequence, by_level, by_time in (
-        (sizes, False, advice_by_level(records), advice_by_time(records, times)),
-        (steps, True, by_sequence_level, by_sequence_time),
-    ):
-        for name, size in sizes_of.items():
-            found = ({a.target: a for a in some if a.family == name} for some in (by_level, by_time))
-            by_sweeps = {int(a.target): a for a in advice_by_sweeps(records) if a.family == name}
-            lines.append(Line(name, size, sequence, *found, by_sweeps))
-    return lines
+    steps_level, steps_time = advice_by_sequence(records, times)
+    found: dict[str, list[dict[float, Advice]]] = defaultdict(lambda: [{}, {}, {}])
+    by_level, by_time = (
+        [*advice_by_level(records), *steps_level],
+        [*advice_by_time(records, times), *steps_time],
+    )
+    for i, some in enumerate((by_level, by_time, advice_by_sweeps(records))):
+        for a in some:
+            found[a.family][i][a.target] = a
+    return [Line(name, size, of is steps, *found[name]) for of in (sizes, steps) for name, size in of.items()]
 
 
 def advice_by_level(records: Records) -> list[Advice]:
@@ -340,7 +339,8 @@ def over_steps(
     for w in walks:
         for start in w.residuals:
             ways[w.solver, w.asked, start].append(w)
-    by_level, by_time = [], []
+    by_level: list[Advice] = []
+    by_time: list[Advice] = []
     for target, timed in [*((x, False) for x in levels), *((t, True) for t in times)]:
         places: list[tuple[tuple[float, ...], Choice]] = []
         for (solver, asked, start), some in ways.items():
