@@ -11,7 +11,7 @@ from lavender.bench.store import Records
 from lavender.report import tables
 from lavender.report.contenders import QUICKER, Subject, subjects
 from lavender.report.moved import by_speed, speed_levels, speed_name
-from lavender.report.tables import Advice, Choice
+from lavender.report.tables import Choice
 from lavender.report.tables.finals import WAYS, Final, Race, in_time, lines
 from lavender.report.tables.finals import to_level as race_to_level
 from lavender.report.text import count, residual, seconds
@@ -42,12 +42,10 @@ class _Scale:
     """What a level is of: a residual, or metres per second of motion error."""
 
     reached: Callable[[float], str]  # "to 1e-6"
-    short: Callable[[float], str]  # how far one came in a time
     tol: Callable[[str, float], float]  # to ask a solver for, so that it reaches a level
-    useless: float  # how far is too far to be worth a sentence
 
 
-BY_RESIDUAL = _Scale(lambda x: f"to {level_name(x)}", residual, lambda solver, x: x, 1.0)
+BY_RESIDUAL = _Scale(lambda x: f"to {level_name(x)}", lambda solver, x: x)
 
 
 def verdict(records: Records, times: Sequence[float] = (), sweeps: Sequence[int] = ()) -> Verdict:
@@ -66,12 +64,10 @@ def verdict(records: Records, times: Sequence[float] = (), sweeps: Sequence[int]
         moving = by_speed(records)
         scale = _Scale(
             lambda x: f"until no body is wrong by more than {speed_name(x)}",
-            lambda x: f"wrong by {residual(x)} m/s",
             lambda solver, x: _tolerance(moving, solver, x),
-            math.inf,
         )
         if newest is not None and newest.plan.get("speed_levels"):
-            return _by_advice(moving, times or tables.time_budgets(moving), scale)
+            return _by_advice(moving, scale)
     plan = {} if newest is None else newest.plan
     times = tuple(times) or tuple(plan.get("times", ()))
     sweeps = tuple(sweeps) or tuple(plan.get("sweeps", ()))
@@ -181,10 +177,19 @@ def _told(final: Final, time: float, what: str) -> list[str]:
     return [*before, f"{last}  # {timed}"]
 
 
-def _by_advice(records: Records, times: Sequence[float], scale: _Scale) -> Verdict:
-    """By motion error: no line was timed for it."""
-    subject = subjects(records, times)[0]
-    return _verdict(_what(records, subject), subject.best, subject.quick, scale)
+def _by_advice(records: Records, scale: _Scale) -> Verdict:
+    """By motion error: lines are not timed for it."""
+    subject = subjects(records)[0]
+    best, what = subject.best, _what(records, subject)
+    leaders = tuple(c.solver for c in best.ranking[:3] if c.solved)
+    first = best.best
+    if first is None:
+        return Verdict((f"Nobody brings any of {what} {scale.reached(best.target)}.",), (), leaders)
+    ties = (f"As good within noise: {', '.join(best.ties)}.",) if best.ties else ()
+    tol = scale.tol(first.solver, best.target)
+    asked = f"tol={level_name(tol)}" if math.isfinite(tol) else f"tol=0, max_iter={first.iterations}"
+    code = f'lv.solve(problem, "{first.solver}", {asked})'
+    return Verdict((_head(first, best.target, what, scale), *ties), (code,), leaders)
 
 
 def _tolerance(records: Records, solver: str, level: float) -> float:
@@ -200,42 +205,6 @@ def _tolerance(records: Records, solver: str, level: float) -> float:
         return math.nan
     power = math.floor(math.log10(tightest))
     return float(f"{math.floor(tightest / 10.0**power + 1e-9)}e{power}")  # rounded down: it still gets there
-
-
-def _verdict(what: str, best: Advice, quick: Sequence[Advice], scale: _Scale) -> Verdict:
-    first, level = best.best, best.target
-    leaders = [c.solver for c in best.ranking[:3] if c.solved]
-    if first is None:
-        return Verdict((f"Nobody brings any of {what} {scale.reached(level)}.",), (), tuple(leaders))
-    sentences = [_head(first, level, what, scale)]
-    if best.ties:
-        sentences.append(f"As good within noise: {', '.join(best.ties)}.")
-    tol = scale.tol(first.solver, level)
-    by_budget = bool(first.iterations) and first.how.startswith(f"{first.iterations} iterations")
-    if by_budget or not math.isfinite(tol):
-        code = [_budget(first.solver, first.iterations)]
-    else:
-        code = [f'lv.solve(problem, "{first.solver}", tol={level_name(tol)})']
-    shorter = [
-        a for a in quick if a.target <= QUICKER * first.score and a.best and a.best.score < scale.useless
-    ]
-    if shorter:
-        other = shorter[-1].best
-        assert other is not None
-        how = f", {other.how}" if other.how else ""
-        sentences.append(
-            f"If you have only {seconds(shorter[-1].target)}, take {other.solver}{how}: {scale.short(other.score)}."
-        )
-        leaders.insert(1, other.solver)
-    if first.score < PYTHON_SHARE:
-        sentences.append(
-            f"Below {seconds(PYTHON_SHARE)} Python's share of a call decides as much as the solver."
-        )
-    return Verdict(tuple(sentences), tuple(code), tuple(dict.fromkeys(leaders))[:3])
-
-
-def _budget(solver: str, iterations: int) -> str:
-    return f'lv.solve(problem, "{solver}", tol=0, max_iter={iterations})'
 
 
 def _name(records: Records, cases: Sequence[str]) -> str:

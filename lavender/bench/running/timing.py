@@ -273,7 +273,10 @@ def _line(problem: Problem, task: Task, impulse: Any, guard: Solution | None) ->
         more["max_iter"] = task.max_iter
     if task.mode == "time":
         more["time_limit"] = task.time_limit
-    if task.start == "carried" or (task.start == "cold" and problem.guess is not None):
+    guessed = (
+        problem.guess is not None and not task.turns
+    )  # in turns: what the line says, from the guess if there is one
+    if task.start == "carried" or (task.start == "cold" and guessed):
         more["impulse"] = problem.start() if impulse is None else impulse
     fresh = just_written(problem)
     begun = perf_counter()
