@@ -106,11 +106,11 @@ def finals(
             list(known.runs.values())[-1], plan, names, store, watch, worker if isolate else None
         )
         runner.out = known
+        if fresh:
+            runner.known = {}
         described = [(i, known.cases[i.name]) for i in resolve(cases) if i.name in known.cases]
         what = repr([asks, [info.sha for _, info in described]])
         stage = _Stage(runner, asks, hashlib.sha256(what.encode()).hexdigest()[:12])
-        if fresh:
-            runner.known = {}
         single = [(i, info) for i, info in described if not i.sequence]
         parts = [single[k : k + TOGETHER] for k in range(0, len(single), TOGETHER)]
         sequences: dict[str, list[tuple[Item, CaseInfo]]] = {}
