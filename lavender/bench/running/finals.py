@@ -155,7 +155,7 @@ class _Stage:
                         if ask.way != "batch" and any(info is other for _, other in taken[ask]):
                             self.keep(made, self.one(ask, item, info, None)[0])
             for ask in order:
-                if ask.way == "batch" and _is_batch(taken[ask]):
+                if ask.way == "batch" and _is_batch(taken[ask], steps):
                     self.batch(ask, taken[ask], made)
         for records in made.values():
             self.runner.keep(_together(records))
@@ -208,9 +208,9 @@ class _Stage:
             self.keep(made, record_of(task, s, outcome_of(s, [s], [share], beside)))
 
 
-def _is_batch(some: Cases) -> bool:
+def _is_batch(some: Cases, steps: bool) -> bool:
     rows = [info.rows for _, info in some]
-    return len(rows) > 1 and max(rows) <= ALIKE * min(rows)
+    return len(rows) > 1 and (steps or max(rows) <= ALIKE * min(rows))
 
 
 def _together(records: Sequence[Record]) -> Record:

@@ -94,7 +94,7 @@ def lines(records: Records, way: str, rounds: bool = True) -> list[Final]:
     return [Final(runs) for runs in groups.values() if len(runs) == most]
 
 
-WAYS = {"call": "one call", "steps": "a step, impulses carried on", "batch": "a problem of a batch"}
+WAYS = {"call": "one call", "steps": "a step in its loop", "batch": "a problem of a batch"}
 
 
 def line_table(records: Records) -> dict[str, dict[str, Final]]:
