@@ -65,7 +65,8 @@ BACKENDS = ("osqp", "scs", "piqp", "clarabel", "clarabel_cone")
 NEAR = 1.25  # times the fastest: differences below say nothing on a machine that does other work
 ADVICE = (
     "Who brings most cases of a structure to a level, and of those the fastest by shifted geometric mean of time:\n"
-    "the number shown; in brackets on how many cases, where not on all. In a time: the mean residual reached.\n"
+    "the number shown; in brackets on how many cases, where not on all. In a time: who serves most (half of\n"
+    "the start's residual is left at most), of those the residual at the 90th percentile.\n"
     f"≈ are as good within noise ({NOISE:g} times in time, {RESIDUAL_NOISE:g} in residual). The same records as\n"
     "[a report's page](REPORT)."
 )

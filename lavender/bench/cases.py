@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import math
 import os
 import re
@@ -20,13 +21,14 @@ from lavender._arrays import FloatArray
 from lavender.bench.record import CaseInfo, file_name, printable
 from lavender.cones import ROW
 from lavender.errors import InputError
+from lavender.io.recording import ENGINE
+from lavender.io.stored import SUFFIXES
 from lavender.problem import Problem
 from lavender.residuals import nothing_to_do, residual
 from lavender.suite import Case
 
-__all__ = ["SUFFIXES", "Item", "describe", "is_path", "resolve", "sequence", "steps_in", "structure_of"]
+__all__ = ["Item", "describe", "is_path", "resolve", "sequence", "steps_in", "structure_of"]
 
-SUFFIXES = (".npz", ".hdf5", ".h5", ".hdf")
 RANK_ROWS = 300  # rows up to which the rank of A is computed, a fraction of a second
 MANIFOLD = 8  # blocks between one pair of bodies, at most
 LARGE_RATIO = 1e3  # mass ratio from which the velocity form changes everything
@@ -153,10 +155,39 @@ def steps_in(folder: str | Path) -> list[Item]:
         raise InputError(
             f"{folder} holds {len(paths)} problem files ({', '.join(SUFFIXES)}); a sequence needs two"
         )
+    _check_one_recording(folder, paths)
     name = folder.resolve().name
     return [
         replace(_from_file(path), name=f"{name}[{i}]", sequence=name, step=i) for i, path in enumerate(paths)
     ]
+
+
+def _check_one_recording(folder: Path, paths: list[Path]) -> None:
+    # Two files of one number, two rows of numbers, or files that the engine's own list does not name.
+    numbered = [(m[1], int(m[2])) for p in paths if (m := re.fullmatch(r"(.*?)(\d+)", p.stem))]
+    series = [prefix for prefix, n in Counter(prefix for prefix, _ in numbered).items() if n > 1]
+    twice = len(numbered) > len(set(numbered))
+    listed = _listed(folder / ENGINE)
+    strange = [p.name for p in paths if listed and p.name not in listed]
+    if twice or len(series) > 1 or strange:
+        why = (
+            f"{strange[0]} is not in its {ENGINE}"
+            if strange
+            else "two files have one number"
+            if twice
+            else f"files are named {series[0]}N and {series[1]}N"
+        )
+        raise InputError(
+            f"{folder} holds steps of more than one recording ({why}): move each into a folder of its own"
+        )
+
+
+def _listed(path: Path) -> set[str]:
+    try:
+        lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+        return {str(json.loads(line)["file"]) for line in lines}
+    except (OSError, ValueError, KeyError, TypeError):
+        return set()
 
 
 def _problem_files(folder: Path) -> list[Path]:
@@ -183,9 +214,12 @@ def _holds_steps(folder: Path) -> bool:
 
 
 def _another(steps: list[Item], items: list[Item]) -> list[Item]:
-    # Two folders of one name are two sequences.
+    # Two folders of one name are two sequences, told apart by the folder around them where that is another.
     names = {item.sequence for item in items}
     name, n = steps[0].sequence, 1
+    if name in names:
+        around = f"{Path(steps[0].source).resolve().parent.parent.name}/{name}"
+        name = name if around in names else around
     while (unique := f"{name} #{n}" if n > 1 else name) in names:
         n += 1
     return [replace(item, name=f"{unique}[{item.step}]", sequence=unique) for item in steps]
@@ -294,8 +328,8 @@ def structure_of(problem: Problem) -> tuple[str, ...]:
 
     - The largest part of the graph that hangs together. One moving body (in a matrix: a few blocks that all
       couple with each other, as its contacts do): "separate". At most two neighbours on average: "chain"
-      (bilateral) or "stack" (contacts). More: "mesh" of joints or "pile". A matrix that couples more than
-      half of all pairs: "dense".
+      (most couplings are joints) or "stack" (contacts). More: "mesh" of joints or "pile". A matrix that couples
+      more than half of all pairs: "dense".
     - "redundant": fewer independent rows than rows, where the rank is cheap to know or the counts alone
       prove it.
     - "friction": the law. "large mass ratio": from 1000 on.
@@ -337,7 +371,7 @@ def _shape(problem: Problem) -> str:
     largest = np.bincount(part).argmax()
     size = np.count_nonzero(part == largest)
     neighbours = 2.0 * np.count_nonzero(part[i] == largest) / size
-    bilateral = problem.law == "linear"
+    bilateral = _is_bilateral(problem)
     if size == 1:
         return "separate"
     if neighbours <= 2.0:
@@ -345,6 +379,21 @@ def _shape(problem: Problem) -> str:
     if problem.rows is None and size > MANIFOLD and neighbours > 0.5 * (size - 1):
         return "dense"
     return "mesh" if bilateral else "pile"
+
+
+def _is_bilateral(problem: Problem) -> bool:
+    # Joints couple most of what is coupled; of a matrix, rows without bounds.
+    if problem.law == "linear":
+        return True
+    r, c = problem.rows, problem.cones
+    if r is not None:
+        joints, contacts = (
+            len(np.unique(np.sort(x, axis=1), axis=0)) for x in (r.joint_body, r.contact_body)
+        )
+        return joints > contacts
+    first = c.ptr[:-1][c.kind == ROW]
+    free = np.count_nonzero(np.isinf(c.lower[first]) & np.isinf(c.upper[first]))
+    return bool(2 * free > c.n_blocks)
 
 
 Edges = tuple[int, NDArray[np.int64], NDArray[np.int64]]  # nodes, and the ends of each edge, once

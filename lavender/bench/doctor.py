@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import os
 import platform
-import re
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -13,10 +12,10 @@ from typing import Any
 import numpy as np
 
 from lavender._version import __version__
-from lavender.bench.machine import cpu_name, memory, versions
+from lavender.bench.machine import build_facts, clock, cpu_name, load, memory, versions
 from lavender.engine import Simulation
 from lavender.problem import Problem
-from lavender.registry import known, specs
+from lavender.registry import get, known, specs
 from lavender.rows import Rows
 from lavender.scene.gallery import SCENES
 from lavender.solve import solve
@@ -69,7 +68,6 @@ def examine() -> dict[str, Any]:
         n: "same" if h == HASHES.get(n) else f"{HASHES.get(n)} expected, {h} came"
         for n, h in self_test().items()
     }
-    library = Path(str(serial.__file__))
     affinity = getattr(os, "sched_getaffinity", None)
     return {
         "lavender": __version__,
@@ -82,13 +80,20 @@ def examine() -> dict[str, Any]:
         "memory_bytes": memory(),
         "threads_set": {k: v for k, v in sorted(os.environ.items()) if k.endswith("_NUM_THREADS")},
         "versions": versions(["cython", "matplotlib", "h5py", "mujoco"]),
-        "build": build_of(library.read_bytes()),
-        "extension": library.name,
-        "backends": {name: reason or "installed" for name, reason in backends.items()},
+        "build": build_facts() | clock(),
+        "load": load(),
+        "extension": Path(str(serial.__file__)).name,
+        "backends": {name: reason or version_of(name) for name, reason in backends.items()},
         "self_test": parts,
         "same_bits": all(x == "same" for x in parts.values()),
         "seconds": round(perf_counter() - begun, 2),
     }
+
+
+def version_of(solver: str) -> str:
+    """Versions of the packages that a backend runs on."""
+    found = versions(get(solver).requires, base=())
+    return ", ".join(f"{name} {v}" for name, v in found.items()) or "installed"
 
 
 def _steps(scene: str, n: int) -> Any:
@@ -96,18 +101,6 @@ def _steps(scene: str, n: int) -> Any:
     for _ in range(n):
         positions = simulation.step()[0]["positions"]
     return positions.ravel()
-
-
-def build_of(library: bytes) -> dict[str, str]:
-    """Compiler and Cython that a compiled module names; what it does not name is left out."""
-    found = {}
-    compiler = re.search(rb"GCC: \([^)\x00]*\) [\d.]+|clang version [\d.]+|MSVC [\d.]+", library)
-    if compiler:
-        found["compiler"] = compiler[0].decode()
-    cython = re.search(rb"_cython_(\d+)_(\d+)_(\d+)", library)
-    if cython:
-        found["cython"] = ".".join(part.decode() for part in cython.groups())
-    return found
 
 
 def _contacts(law: str) -> Problem:

@@ -8,8 +8,11 @@ import json
 import os
 import platform
 import re
+import subprocess
+import sysconfig
 from collections.abc import Iterable, Mapping
 from datetime import datetime, timezone
+from functools import cache
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -17,7 +20,17 @@ from typing import Any
 from lavender._version import __version__
 from lavender.bench.record import Run
 
-__all__ = ["cpu_name", "describe", "memory", "memory_share", "versions"]
+__all__ = [
+    "build_facts",
+    "build_of",
+    "clock",
+    "cpu_name",
+    "describe",
+    "load",
+    "memory",
+    "memory_share",
+    "versions",
+]
 
 SHARE = 0.5  # of the machine's memory, which the processes of backends may take together
 LEAST = 2 * 2**30  # bytes: below that, packages of compiled code do not start
@@ -53,15 +66,20 @@ def memory_share(processes: int = 1) -> int:
     return max(LEAST, int(SHARE * memory() / max(1, processes))) if memory() else 0
 
 
-def versions(packages: Iterable[str] = ()) -> dict[str, str]:
-    """Version of each installed distribution; those that are not installed are left out."""
+def versions(packages: Iterable[str] = (), base: Iterable[str] = BASE) -> dict[str, str]:
+    """Version of each installed distribution, or of that of a module; those that are not installed are left out."""
     found = {}
-    for name in sorted({*BASE, *packages}):
+    for name in sorted({*base, *packages}):
         try:
             found[name] = metadata.version(name)
         except metadata.PackageNotFoundError:
-            continue
+            found |= {dist: metadata.version(dist) for dist in _distributions().get(name, ())[:1]}
     return found
+
+
+@cache
+def _distributions() -> Mapping[str, list[str]]:
+    return metadata.packages_distributions()  # by module; reads the lists of all that is installed
 
 
 def describe(plan: Mapping[str, Any], packages: Iterable[str] = (), threads: int = 1) -> Run:
@@ -76,7 +94,81 @@ def describe(plan: Mapping[str, Any], packages: Iterable[str] = (), threads: int
         "versions": versions(packages),
     }
     # What decides how a single measurement comes out; which cases and solvers are asked for does not.
-    same = {**facts, "plan": {k: plan[k] for k in ("repeats", "campaign") if k in plan}}
+    same: dict[str, Any] = {**facts, "plan": {k: plan[k] for k in ("repeats", "campaign") if k in plan}}
+    build = build_facts()
+    same["build"] = build
     digest = hashlib.sha256(json.dumps(same, sort_keys=True, default=str).encode()).hexdigest()[:12]
     started = datetime.now(timezone.utc).isoformat(timespec="seconds")
-    return Run(run=digest, started=started, plan=dict(plan), **facts)  # type: ignore[arg-type]
+    return Run(
+        run=digest,
+        started=started,
+        plan=dict(plan),
+        build=build | clock(),
+        load=load(),
+        **facts,  # type: ignore[arg-type]
+    )
+
+
+def load() -> float | None:
+    """Processes that wanted a processor, mean of the last minute; None where the system does not say."""
+    with contextlib.suppress(AttributeError, OSError):
+        return float(os.getloadavg()[0])
+    return None
+
+
+def clock() -> dict[str, str]:
+    """Frequency of the processor now, and what governs it, as far as the system says."""
+    found: dict[str, str] = {}
+    with contextlib.suppress(OSError):
+        mhz = re.search(
+            r"^cpu MHz\s*:\s*([\d.]+)", Path("/proc/cpuinfo").read_text(errors="replace"), re.MULTILINE
+        )
+        found |= {"clock": f"{float(mhz[1]):.0f} MHz"} if mhz else {}
+        found["governor"] = Path("/sys/devices/system/cpu/cpu0/cpufreq/scaling_governor").read_text().strip()
+    return found
+
+
+@cache
+def build_facts() -> dict[str, str]:
+    """What was built, and of what: commit of a checkout or hash of a wheel's kernels, compiler, flags, BLAS."""
+    from lavender_ext.sweep import serial
+
+    package = Path(__file__).resolve().parents[1]
+    library = Path(str(serial.__file__))
+    found = {"commit": commit} if (commit := _commit(package.parent)) else {}
+    kernels = hashlib.sha256()
+    for path in sorted(library.parents[1].rglob(f"*{library.suffix}")):
+        kernels.update(path.read_bytes())
+    found["kernels"] = kernels.hexdigest()[:12]
+    found |= build_of(library.read_bytes())
+    flags = sysconfig.get_config_var("CFLAGS")
+    found |= {"python_flags": " ".join(str(flags).split())} if flags else {}
+    from threadpoolctl import threadpool_info
+
+    blas = [f"{i['internal_api']} {i['version']}" for i in threadpool_info() if i.get("user_api") == "blas"]
+    return found | {"blas": ", ".join(sorted(set(blas)))}
+
+
+def _commit(root: Path) -> str:
+    """Of a checkout, with a mark where files differ from it; empty elsewhere."""
+    if not (root / ".git").exists():
+        return ""
+    with contextlib.suppress(OSError, subprocess.SubprocessError):
+        said = subprocess.run(
+            ["git", "-C", str(root), "describe", "--always", "--dirty", "--abbrev=12", "--exclude=*"],
+            capture_output=True, text=True, timeout=10, check=True,
+        )  # fmt: skip
+        return said.stdout.strip()
+    return ""
+
+
+def build_of(library: bytes) -> dict[str, str]:
+    """Compiler and Cython that a compiled module names; what it does not name is left out."""
+    found = {}
+    compiler = re.search(rb"GCC: \([^)\x00]*\) [\d.]+|clang version [\d.]+|MSVC [\d.]+", library)
+    if compiler:
+        found["compiler"] = compiler[0].decode()
+    cython = re.search(rb"_cython_(\d+)_(\d+)_(\d+)", library)
+    if cython:
+        found["cython"] = ".".join(part.decode() for part in cython.groups())
+    return found

@@ -110,6 +110,10 @@ class Run(_Texts):
     threads: int  # of BLAS and OpenMP while timing
     versions: Mapping[str, str]
     plan: Mapping[str, Any]
+    build: Mapping[str, str] = field(
+        default_factory=dict
+    )  # commit, hash of the kernels, compiler, BLAS, clock
+    load: float | None = None  # processes that wanted the processor, mean of the minute before
 
 
 @dataclass(frozen=True)
@@ -134,6 +138,7 @@ class CaseInfo(_Texts):
     sequence: str = ""  # name of the sequence that this is a step of
     step: int = -1
     nothing_to_do: bool = False  # doing nothing is right: nobody solves it, nobody fails
+    identity: str = ""  # of the sequence, from the numbers of all its steps: steps of two are never one
 
 
 @dataclass(frozen=True)
@@ -167,7 +172,8 @@ class Record(_Texts):
     start: (
         str  # "cold" from doing nothing, "warm" from the guess of the problem, "carried" from the step before
     )
-    mode: str  # "tol": to that residual; "budget": exactly max_iter iterations
+    # "tol": to that residual; "budget": exactly max_iter iterations; "time": to tol, but stopped at time_limit
+    mode: str
     tol: float
     max_iter: int
     time_limit: float  # s
@@ -195,10 +201,24 @@ class Record(_Texts):
     setup_median: float = math.nan
     solve_min: float = math.nan
     solve_median: float = math.nan
-    time_min: float = math.nan  # set-up and solve of one repeat together
+    time_min: float = (
+        math.nan
+    )  # of one repeat: of the line where `way` says one, else set-up and solve together
     time_median: float = math.nan
     threads: int = 1
     step: int = -1  # of a sequence
+    # What was timed: "call", one `lv.solve` on a problem just made; "steps", the same in a loop that carries impulses;
+    # "batch", a problem's share of one `lv.solve_many`; "" prepare and solve, without judge and front door.
+    way: str = ""
+    turns: str = (
+        ""  # which lines on which cases took turns with this one; "": repeats came one after the other
+    )
+    times: tuple[float, ...] = ()  # s, of each repeat
+    reached: tuple[float, ...] = ()  # relative residual of each repeat, where they differ (mode "time")
+    pace: float | None = None  # s, of a loop of fixed work beside the repeats: what the machine was worth
+    own_min: float | None = (
+        None  # s, of a backend of others on data that it was given before, by its own interface
+    )
 
     @property
     def key(self) -> tuple[Any, ...]:
@@ -214,7 +234,7 @@ class Record(_Texts):
 def measurement_key(what: Any) -> tuple[Any, ...]:
     """The identity of a measurement, of its `Task` as of its `Record`."""
     options = repr(sorted(_plain(what.options).items()))
-    asked = (what.start, what.mode, what.tol, what.max_iter, what.time_limit)
+    asked = (what.start, what.mode, what.tol, what.max_iter, what.time_limit, what.way, what.turns)
     return (what.case, what.sha, what.solver, options, *asked)
 
 
@@ -250,7 +270,7 @@ def from_json(line: Any) -> Entry:
         ):
             value = float(value)
         elif kind.startswith("tuple") and isinstance(value, list):
-            value = tuple(value)
+            value = tuple(map(_number, value) if "float" in kind else value)
         wanted, holds = _TYPES[kind]
         if not holds(value):
             raise ValueError(f"not an entry of a records file ({f.name} is not {wanted})")
@@ -262,6 +282,10 @@ def from_json(line: Any) -> Entry:
         return cls(**values)
     except TypeError as error:
         raise ValueError(f"not an entry of a records file ({error})") from None
+
+
+def _number(value: Any) -> Any:
+    return float(value) if _is_whole(value) or value in ("inf", "nan") else value
 
 
 def _is_whole(value: Any) -> bool:
@@ -303,6 +327,10 @@ _TYPES: dict[str, _Rule] = {
         lambda v: v is None or (isinstance(v, float) and not v < 0.0),
     ),
     "bool": ("true or false", lambda v: isinstance(v, bool)),
+    "tuple[float, ...]": (
+        "a list of numbers of 0 or more",
+        lambda v: isinstance(v, tuple) and all(isinstance(x, float) and not x < 0.0 for x in v),
+    ),
     "tuple[str, ...]": ("a list of words", lambda v: isinstance(v, tuple) and all(map(_is_word, v))),
     "Mapping[str, Any]": (
         "a table of numbers and words",
@@ -316,7 +344,8 @@ _RANGES: dict[Any, _Rule] = {
     "": ("0 or more", lambda v: not v < 0.0),
     ("run", "plan"): ("a plan with positive levels", _is_plan),
     ("record", "start"): ("cold, warm or carried", lambda v: v in ("cold", "warm", "carried")),
-    ("record", "mode"): ("tol or budget", lambda v: v in ("tol", "budget")),
+    ("record", "mode"): ("tol, budget or time", lambda v: v in ("tol", "budget", "time")),
+    ("record", "way"): ("call, steps, batch or nothing", lambda v: v in ("", "call", "steps", "batch")),
     ("record", "tol"): ("a finite number of 0 or more", lambda v: 0.0 <= v < math.inf),
     ("record", "time_limit"): ("a positive number of seconds", _is_positive),
     ("record", "max_iter"): ("0 or more", lambda v: v >= 0),

@@ -39,6 +39,9 @@ class Records:
     source: str = ""
     done: dict[tuple[str, str, str], Done] = field(default_factory=dict)  # pairs of a campaign, complete
     _skips: dict[tuple[str, str, str], Skip] = field(default_factory=dict, repr=False)
+    _sequences: dict[str, str] = field(
+        default_factory=dict, repr=False
+    )  # the identity of each, as described last
 
     @property
     def skips(self) -> list[Skip]:
@@ -51,6 +54,13 @@ class Records:
             self.runs.pop(entry.run, None)  # the newest stands last
             self.runs[entry.run] = entry
         elif isinstance(entry, CaseInfo):
+            if (
+                entry.sequence
+                and self._sequences.setdefault(entry.sequence, entry.identity) != entry.identity
+            ):
+                # Another sequence under a name that was used: the steps of the earlier one are none of it.
+                self.cases = {n: i for n, i in self.cases.items() if i.sequence != entry.sequence}
+                self._sequences[entry.sequence] = entry.identity
             self.cases[entry.case] = entry
         elif isinstance(entry, Skip):
             self._skips[entry.run, entry.case, entry.solver] = entry
@@ -76,7 +86,13 @@ class Records:
         found = Records(source=self.source)
         found.add(self.runs[run])
         now = {name: info.sha for name, info in self.cases.items()}
-        mine = [r for r in self.records if r.run == run and r.sha == now.get(r.case, r.sha)]
+        mine = [
+            r for r in self.records if r.run == run and r.sha == now.get(r.case, "" if r.step >= 0 else r.sha)
+        ]
+        newest = next(
+            (r.turns for r in reversed(mine) if r.turns), ""
+        )  # lines that took turns with each other
+        mine = [r for r in mine if r.turns in ("", newest)]
         cases = {r.case for r in mine}
         described = [info for info in self.cases.values() if info.run == run or info.case in cases]
         entries: list[Entry] = [*self.skips, *self.done.values()]

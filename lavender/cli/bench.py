@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,8 @@ from lavender.cli.options import (
     make_plan,
     one_thread,
     plan_options,
+    refuse_idle,
+    was_given,
 )
 
 __all__ = ["bench"]
@@ -53,7 +56,9 @@ class Suites(ManyValues):
     show_default=True,
     help="File of the records.",
 )
+@click.pass_context
 def bench(
+    context: click.Context,
     files: tuple[str, ...],
     solvers: tuple[str, ...] | None,
     levels: tuple[float, ...],
@@ -63,6 +68,7 @@ def bench(
     orders: tuple[str, ...] | None,
     repeats: int,
     time_limit: float | None,
+    pass_limit: float | None,
     memory: float | None,
     in_process: bool,
     out: Path,
@@ -72,8 +78,9 @@ def bench(
     `lavender bench peers` compares with other engines and solvers instead, `lavender bench auto` measures what auto
     loses against the best of our own solvers; see their own --help.
     """
-    plan = make_plan(files, levels, budgets, orders, repeats, time_limit, motion, speed_levels)
-    done = measure(files, solvers, plan, out, memory, in_process)
+    refuse_idle(context, solvers)
+    plan = make_plan(files, levels, budgets, orders, repeats, time_limit, pass_limit, motion, speed_levels)
+    done = measure(files, solvers, plan, out, memory, in_process, given=partial(was_given, context))
     shown_on = console()
     shown_on.print(f"{len(done.records)} runs in {out}", highlight=False, markup=False, soft_wrap=True)
     if done.note:

@@ -66,8 +66,18 @@ def measure(
     in_process: bool,
     sequence: bool | None = None,
     fresh: bool = False,
+    *,
+    given: Callable[[str], bool] = lambda name: False,
+    lines: bool = False,
 ) -> Measured:
     """Run with a progress bar.
+
+    Parameters
+    ----------
+    given : callable (name)
+        Whether an option stands on the command line.
+    lines : bool
+        Time the lines that a report would print, too, in turns.
 
     Raises
     ------
@@ -75,6 +85,7 @@ def measure(
         A file that was named and does not load; a folder that cannot be written or that another process writes.
     """
     from lavender import bench
+    from lavender.report.contenders import time_lines
 
     one_thread()
     bench.solver_names(solvers)  # before anything is loaded: names first
@@ -83,6 +94,8 @@ def measure(
     reused = 0
     with bench.Store(path) as store:
         items = bench.resolve(files, sequence)
+        if given("pass_limit") and not any(item.sequence for item in items):
+            raise InputError("--pass-limit has no effect without a sequence: leave it out")
         check_named(items)
         before = {name: run.started for name, run in store.records.runs.items()}
         found: list[Records] = []
@@ -95,17 +108,10 @@ def measure(
 
             stopped = False
             try:
-                bench.run(
-                    items,
-                    solvers,
-                    plan,
-                    store,
-                    watch=watch,
-                    isolate=not in_process,
-                    memory=bytes_of(memory),
-                    into=found,
-                    fresh=fresh,
-                )
+                more: dict[str, Any] = {"isolate": not in_process, "memory": bytes_of(memory)}
+                bench.run(items, solvers, plan, store, watch=watch, into=found, fresh=fresh, **more)
+                if lines:
+                    time_lines(items, found[0], plan, store, watch=watch, fresh=fresh, **more)
             except KeyboardInterrupt:
                 stopped = True
     since = before.get(next(iter(found[0].runs)), "") if reused else ""

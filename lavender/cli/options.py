@@ -35,6 +35,7 @@ __all__ = [
     "one_thread",
     "plain",
     "plan_options",
+    "refuse_unused",
 ]
 
 EXIT_UNMET = 1  # a claim not met: unsolved, a failed check, an unreadable file met in a folder
@@ -165,6 +166,46 @@ def console(stderr: bool = False) -> Console:
     return made
 
 
+def was_given(context: click.Context, name: str) -> bool:
+    """An option stands on the command line (or in the environment), whatever its value."""
+    return context.get_parameter_source(name) not in (None, click.core.ParameterSource.DEFAULT)
+
+
+def refuse_unused(context: click.Context, names: Sequence[str], where: str) -> None:
+    """Refuse options that would be ignored.
+
+    Raises
+    ------
+    InputError
+        One of them was given.
+    """
+    options = {p.name: p.opts[0] for p in context.command.params}
+    for name in names:
+        if was_given(context, name):
+            raise InputError(f"{options[name]} has no effect {where}: leave it out")
+
+
+def refuse_idle(context: click.Context, solvers: Sequence[str] | None) -> None:
+    """Refuse options of a plan that none of the named solvers heeds.
+
+    Raises
+    ------
+    InputError, UnknownName
+    """
+    from lavender import registry
+    from lavender.bench.running.runner import is_foreign
+
+    if not solvers:
+        return
+    specs = [registry.get(name) for name in solvers]
+    if not any(s.resumable and not s.exact for s in specs):
+        refuse_unused(context, ["budgets"], "on solvers that cannot stop anywhere")
+    if not any(s.order and not s.exact for s in specs):
+        refuse_unused(context, ["orders"], "on solvers that take no order")
+    if not any(map(is_foreign, specs)):
+        refuse_unused(context, ["memory", "in_process"], "where no solver of another package runs")
+
+
 def plan_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """The options of what is measured."""
     options = (
@@ -216,6 +257,13 @@ def plan_options(command: Callable[..., Any]) -> Callable[..., Any]:
             help="Of one solve; 1 s, or 0.25 s for the built-in suite.",
         ),
         click.option(
+            "--pass-limit",
+            type=float,
+            default=None,
+            metavar="S",
+            help="Of one solver over all steps of a sequence, at one budget or level; 5 s.",
+        ),
+        click.option(
             "--memory",
             type=float,
             default=None,
@@ -241,8 +289,11 @@ def make_plan(
     orders: Sequence[str] | None,
     repeats: int,
     time_limit: float | None,
+    pass_limit: float | None = None,
     motion: bool = False,
     speed_levels: Sequence[float] = (),
+    times: Sequence[float] = (),
+    sweeps: Sequence[int] = (),
 ) -> Plan:
     """The plan that those options mean.
 
@@ -256,6 +307,8 @@ def make_plan(
     if time_limit is None:
         time_limit = 1.0 if files else 0.25  # all of the suite in a minute
     more: dict[str, Any] = {} if orders is None else {"orders": orders}
+    if pass_limit is not None:
+        more["pass_limit"] = pass_limit
     return Plan(
         levels=levels,
         budgets=budgets,
@@ -263,6 +316,8 @@ def make_plan(
         time_limit=time_limit,
         motion=motion,
         speed_levels=speed_levels,
+        times=times,
+        sweeps=sweeps,
         **more,
     )
 

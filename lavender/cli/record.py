@@ -6,6 +6,8 @@ from pathlib import Path
 
 import click
 
+from lavender.cli.options import refuse_unused
+
 __all__ = ["record"]
 
 
@@ -20,9 +22,24 @@ __all__ = ["record"]
 @click.option(
     "--out", required=True, type=click.Path(file_okay=False, path_type=Path), help="Folder of the problems."
 )
-def record(model: Path, steps: int, every: int, controls: str, seed: int, out: Path) -> None:
+@click.option(
+    "--replace", is_flag=True, help="Take the problems of another recording out of the folder first."
+)
+@click.pass_context
+def record(
+    context: click.Context,
+    model: Path,
+    steps: int,
+    every: int,
+    controls: str,
+    seed: int,
+    out: Path,
+    replace: bool,
+) -> None:
     """Run a MuJoCo model (MJCF) and keep its constraint problems, for `lavender report OUT`."""
     from lavender.io.recording import record_file
 
-    found = record_file(model, out, steps, every=every, control=controls, seed=seed)
+    if controls != "random":
+        refuse_unused(context, ["seed"], "without --controls random")
+    found = record_file(model, out, steps, every=every, control=controls, seed=seed, replace=replace)
     click.echo(str(found))

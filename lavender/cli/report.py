@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 import math
+from functools import partial
 from pathlib import Path
 
 import click
 
+from lavender.bench.record import file_name
 from lavender.cli.measuring import Measured, measure, run_campaign
 from lavender.cli.options import (
     EXIT_INTERRUPTED,
@@ -18,6 +20,9 @@ from lavender.cli.options import (
     console,
     make_plan,
     plan_options,
+    refuse_idle,
+    refuse_unused,
+    was_given,
 )
 from lavender.errors import InputError
 from lavender.io.stored import write_text
@@ -79,7 +84,9 @@ __all__ = ["report"]
 @click.option("--tables", is_flag=True, help="Print every case and sequence too.")
 @click.option("--fresh", is_flag=True, help="Measure again what the folder holds already.")
 @click.option("--no-figures", is_flag=True, help="Leave out the SVG and PNG files.")
+@click.pass_context
 def report(
+    context: click.Context,
     files: tuple[str, ...],
     solvers: tuple[str, ...] | None,
     levels: tuple[float, ...],
@@ -89,6 +96,7 @@ def report(
     orders: tuple[str, ...] | None,
     repeats: int,
     time_limit: float | None,
+    pass_limit: float | None,
     memory: float | None,
     in_process: bool,
     out: Path,
@@ -128,8 +136,10 @@ def report(
     for limit in time_budgets:
         if not (math.isfinite(limit) and limit > 0.0):
             raise InputError(f"time budget {limit} must be a positive number of seconds")
+    _refuse_unused(context, files, solvers)
     shown_on = console()
-    files = tuple(_recorded(f, out, steps, every, controls, fresh) for f in files)
+    taken: set[Path] = set()
+    files = tuple(_recorded(f, out, steps, every, controls, fresh, taken) for f in files)
     old = None if compare is None else bench.read(compare)
     rivals = None if peers is None else read_peers(peers)
     shown = [Path(f) for f in files if f.endswith(".jsonl")]
@@ -146,17 +156,41 @@ def report(
             words, solvers, many, out / "records.jsonl", workers=workers, backend=backend, memory=memory
         )
     else:
-        plan = make_plan(files, levels, budgets, orders, repeats, time_limit, motion, speed_levels)
-        done = measure(files, solvers, plan, out / "records.jsonl", memory, in_process, sequence, fresh)
+        named = partial(was_given, context)
+        plan = make_plan(
+            files,
+            levels,
+            budgets,
+            orders,
+            repeats,
+            time_limit,
+            pass_limit,
+            motion,
+            speed_levels,
+            times=time_budgets,
+            sweeps=budgets if named("budgets") else (),
+        )
+        path = out / "records.jsonl"
+        done = measure(
+            files, solvers, plan, path, memory, in_process, sequence, fresh, given=named, lines=True
+        )
     records = done.records
     engines = [] if campaign else contestants(files, records.latest())
-    print_report(records, shown_on, old=old, times=time_budgets, whole=tables)
+    sweeps = budgets if was_given(context, "budgets") else ()
+    print_report(records, shown_on, old=old, times=time_budgets, sweeps=sweeps, whole=tables)
     if engines:
         shown_on.print(f"\n{ENGINES}", highlight=False, markup=False, soft_wrap=True)
         for line in engine_lines(engines):
             shown_on.print(line, highlight=False, markup=False, soft_wrap=True)
     index = write(
-        records, out, figures=not no_figures, old=old, times=time_budgets, peers=rivals, engines=engines
+        records,
+        out,
+        figures=not no_figures,
+        old=old,
+        times=time_budgets,
+        sweeps=sweeps,
+        peers=rivals,
+        engines=engines,
     )
     shown_on.print(
         f"\n{len(records)} runs in {out / 'records.csv'}, page: {index}",
@@ -175,18 +209,58 @@ def report(
         raise click.exceptions.Exit(EXIT_UNMET)
 
 
-def _recorded(word: str, out: Path, steps: int, every: int, controls: str, fresh: bool) -> str:
-    """A model's file as the folder of its recorded steps, recorded now unless that was done in the same way."""
+def _refuse_unused(context: click.Context, files: tuple[str, ...], solvers: tuple[str, ...] | None) -> None:
+    """Every option that would be ignored is an error."""
+    campaign = context.params["campaign"]
+    if any(f.endswith(".jsonl") for f in files):
+        kept = {"files", "out", "compare", "time_budgets", "budgets", "peers", "tables", "no_figures"}
+        rest = [p.name for p in context.command.params if p.name and p.name not in kept]
+        refuse_unused(context, rest, "where records are shown again and nothing is solved")
+    elif campaign:
+        of_times = [
+            "repeats",
+            "time_limit",
+            "pass_limit",
+            "time_budgets",
+            "in_process",
+            "sequence",
+            "tables",
+            "fresh",
+        ]
+        refuse_unused(
+            context, of_times, "with --campaign, which ends by iterations and goes on where it stopped"
+        )
+    else:
+        refuse_unused(context, ["seeds", "workers", "backend"], "without --campaign")
+    if not any(Path(f).suffix.lower() == ".xml" for f in files):
+        refuse_unused(context, ["steps", "every", "controls"], "without a MODEL.xml")
+    refuse_idle(context, solvers)
+
+
+def _recorded(
+    word: str, out: Path, steps: int, every: int, controls: str, fresh: bool, taken: set[Path]
+) -> str:
+    """A model's file as the folder of its recorded steps, recorded now unless that was done in the same way.
+
+    The folder is named by the model's own folder and file: many are called scene.xml. `taken` are those of the models
+    before it.
+    """
     path = Path(word)
     if path.suffix.lower() != ".xml":
         return word
     from lavender.io.recording import record_file
 
-    folder = out / "recorded" / path.stem
+    model, n = str(path.resolve()), 1
+    first = out / "recorded" / file_name(f"{path.resolve().parent.name}-{path.stem}")
+    folder = first
+    while folder in taken or _model_of(folder) not in ("", model):
+        n += 1
+        folder = first.with_name(f"{first.name}-{n}")
+    taken.add(folder)
     how = folder / "how.json"
     asked = json.dumps(
         {
-            "model": str(path.resolve()),
+            "model": model,
             "changed": _age(path),
             "steps": steps,
             "every": every,
@@ -194,15 +268,21 @@ def _recorded(word: str, out: Path, steps: int, every: int, controls: str, fresh
         }
     )
     if fresh or not how.is_file() or how.read_text(encoding="utf-8") != asked:
-        for old in folder.glob("step_*.npz"):
-            old.unlink()
         console().print(
-            str(record_file(path, folder, steps, every=every, control=controls)),
+            str(record_file(path, folder, steps, every=every, control=controls, replace=True)),
             highlight=False,
             markup=False,
         )
         write_text(how, asked)
     return str(folder)
+
+
+def _model_of(folder: Path) -> str:
+    """The model whose steps a folder holds; empty where there are none."""
+    try:
+        return str(json.loads((folder / "how.json").read_text(encoding="utf-8"))["model"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return ""
 
 
 def _age(path: Path) -> float:

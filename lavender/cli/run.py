@@ -8,6 +8,7 @@ from typing import Any
 
 import click
 
+from lavender.cli.options import refuse_unused
 from lavender.errors import InputError
 
 __all__ = ["run"]
@@ -45,6 +46,9 @@ __all__ = ["run"]
 @click.option(
     "--skip", type=int, default=0, show_default=True, help="Steps before the first that is recorded."
 )
+@click.option(
+    "--replace", is_flag=True, help="With --record: take the problems of another recording out first."
+)
 @click.option("--view", is_flag=True, help="Show the run in a page on this machine, live, then until Ctrl-C.")
 @click.option(
     "--film",
@@ -52,7 +56,9 @@ __all__ = ["run"]
     default=None,
     help="Film of the run: .gif or .png pictures, or a file for `lavender view`.",
 )
+@click.pass_context
 def run(
+    context: click.Context,
     scene: str,
     steps: int,
     iterations: int | None,
@@ -66,6 +72,7 @@ def run(
     skip: int,
     view: bool,
     film: Path | None,
+    replace: bool,
 ) -> None:
     """Run a LavenderSim scene of the gallery; record its steps as a sequence for `report`.
 
@@ -73,6 +80,9 @@ def run(
     newtons_cradle or four_bar.
     """
     from lavender.engine import run_scene
+
+    if record is None:
+        refuse_unused(context, ["skip", "replace"], "without --record")
 
     live = sys.stdout.isatty()
 
@@ -91,6 +101,7 @@ def run(
         plot=plot,
         record=record,
         skip=skip,
+        replace=replace,
         view=view,
         film=film,
         every=1 if live else max(1, steps // 20),

@@ -15,8 +15,7 @@ from lavender import io
 from lavender._arrays import FloatArray
 from lavender.engine.picture import PICTURES, save_picture
 from lavender.engine.simulation import SOLVER_FIELDS, Simulation
-from lavender.errors import InputError
-from lavender.io.stored import write_figure, write_text
+from lavender.io.stored import folder_for_steps, write_figure, write_text
 from lavender.scene import Scene
 from lavender.scene.parts import whole
 
@@ -93,6 +92,7 @@ def run(
     *,
     record: str | PathLike[str] | None = None,
     skip: int = 0,
+    replace: bool = False,
     watch: Callable[[int, dict[str, Any], dict[str, Any]], Any] | None = None,
 ) -> Trace:
     """Step a simulation and keep its trace; stops where the state is no longer finite.
@@ -105,16 +105,19 @@ def run(
         Folder for the problem of every step, one file each; made if it does not exist.
     skip : int
         Steps before the first that is recorded.
+    replace : bool
+        Take the problem files of another recording out of that folder, which is refused otherwise.
     watch : callable (step, observation, info), optional
         Called after every step.
     """
     steps, skip = whole("steps", steps, 1), whole("skip", skip)
     recorded = 0
+    folder = None if record is None else folder_for_steps(record, replace)
     solver, depth, cost, time = np.zeros((steps, 8)), np.zeros(steps), np.zeros(steps), np.zeros(steps)
     lost, done = "", 0
     while done < steps and not lost:
-        if record is not None and done >= skip:
-            recorded += _write_problem(simulation, Path(record))
+        if folder is not None and done >= skip:
+            recorded += _write_problem(simulation, folder)
         start = perf_counter()
         observation, _, _, _, info = simulation.step()
         cost[done] = perf_counter() - start
@@ -144,10 +147,6 @@ def run(
 def _write_problem(simulation: Simulation, folder: Path) -> bool:
     problem = simulation.constraint_problem()
     if problem.m:
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise InputError(f"cannot make the folder {str(folder)!r}: {error.strerror}") from None
         io.save(problem, folder / f"{simulation.scene.name or 'scene'}-{simulation.steps + 1:06d}.npz")
     return problem.m > 0
 
@@ -181,6 +180,7 @@ def run_scene(
     plot: str | PathLike[str] | None = None,
     record: str | PathLike[str] | None = None,
     skip: int = 0,
+    replace: bool = False,
     film: str | PathLike[str] | None = None,
     view: bool = False,
     every: int = 1,
@@ -202,6 +202,8 @@ def run_scene(
         CSV of the trace, figure, folder of the problems.
     skip : int
         Steps before the first that is recorded.
+    replace : bool
+        Take the problem files of another recording out of the folder, which is refused otherwise.
     film : path, optional
         Film of the run: `.gif`, `.png`, `.svg` or `.pdf` are pictures, anything else a file for `lavender view`.
     view : bool
@@ -235,7 +237,7 @@ def run_scene(
             sleep(max(0.0, info["time"] - (perf_counter() - begun)))
 
     try:
-        found = run(simulation, steps, record=record, skip=skip, watch=watch)
+        found = run(simulation, steps, record=record, skip=skip, replace=replace, watch=watch)
         if found.lost_body:
             show(f"stopped: the state of {found.lost_body!r} is not finite")
         if trace is not None:

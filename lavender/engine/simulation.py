@@ -24,6 +24,7 @@ from lavender.engine.picture import save_picture
 from lavender.engine.snapshot import Snapshot
 from lavender.engine.state import State
 from lavender.errors import InputError, LavenderError, SolveFailed, UnknownName
+from lavender.io.stored import folder_for_steps
 from lavender.problem import Problem
 from lavender.registry import get
 from lavender.scene import Scene
@@ -152,6 +153,7 @@ class Simulation:
         self._steps = 0
         self._failed = 0
         self._over = ""  # why no step can follow
+        self._recorded: Path | None = None  # where its steps were written last
         self._restored = False  # the list of pairs is somebody else's
         self._last: Solution | _Pending | None = None
 
@@ -552,7 +554,7 @@ class Simulation:
         Raises
         ------
         InputError
-            A folder that cannot be written, another form.
+            A folder that cannot be written or that holds problems which this simulation did not write, another form.
         CapabilityError
             FCLIB cannot hold these rows; nothing is stepped.
         """
@@ -560,10 +562,8 @@ class Simulation:
             raise UnknownName("form", form, ("npz", "fclib"))
         steps = whole("steps", steps, 1)
         folder = Path(folder)
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise InputError(f"cannot make the folder {str(folder)!r}: {error.strerror}") from None
+        if folder.resolve() != self._recorded:
+            self._recorded = folder_for_steps(folder).resolve()
         more: dict[str, Any] = {} if form == "npz" else {"drop": ("names", "key")}
         suffix = ".npz" if form == "npz" else ".hdf5"
         name, digits = self.scene.name or "scene", len(str(self._steps + steps))

@@ -17,7 +17,7 @@ from lavender._arrays import FloatArray, as_array
 from lavender.errors import InputError, LavenderError
 from lavender.io import mujoco as adapter
 from lavender.io import npz
-from lavender.io.stored import first_bytes, write_text
+from lavender.io.stored import first_bytes, folder_for_steps, write_text
 from lavender.residuals import residual
 
 __all__ = ["Recording", "record", "record_file"]
@@ -51,6 +51,7 @@ def record(
     every: int = 1,
     control: Control = "zero",
     seed: int = 0,
+    replace: bool = False,
 ) -> Recording:
     """Step a MuJoCo simulation and keep the problem of every `every`-th step.
 
@@ -63,7 +64,7 @@ def record(
     data : mujoco.MjData
         Stepped on, from where it stands.
     folder : path
-        Made where it is not; files of these names are replaced.
+        Made where it is not.
     steps : int
         Steps of the simulation.
     every : int
@@ -72,6 +73,8 @@ def record(
         start where it ends. What a callable returns is written to `data.ctrl`, unless it is None.
     seed : int
         Of "random".
+    replace : bool
+        Take the problem files of another recording out of the folder, which is refused otherwise.
 
     Returns
     -------
@@ -80,15 +83,14 @@ def record(
     Raises
     ------
     InputError
-        Not a model and its data, `steps` or `every` below 1, another control.
+        Not a model and its data, `steps` or `every` below 1, another control, a folder that holds a recording.
     """
     mj = adapter._mujoco(model, data)
     for word, value in (("steps", steps), ("every", every)):
         if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
             raise InputError(f"{word} is {value!r}; a whole number from 1 is needed")
     drive = _drive(model, control, seed)
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
+    folder = folder_for_steps(folder, replace)
     files: list[str] = []
     left_out: list[str] = []
     lines: list[str] = []
@@ -134,6 +136,7 @@ def record_file(
     every: int = 1,
     control: Control = "zero",
     seed: int = 0,
+    replace: bool = False,
 ) -> Recording:
     """`record` of a model by its file (MJCF); an array of controls may be given by its file (.npy), too.
 
@@ -152,7 +155,9 @@ def record_file(
         raise InputError(f"{os.fspath(path)}: {error}") from None
     if isinstance(control, str) and control not in CONTROLS:
         control = _controls(control)
-    found = record(made, mj.MjData(made), folder, steps, every=every, control=control, seed=seed)
+    found = record(
+        made, mj.MjData(made), folder, steps, every=every, control=control, seed=seed, replace=replace
+    )
     if not found.files:
         raise InputError(
             f"{os.fspath(path)}: no step had a constraint that could be kept: more steps, or other controls"

@@ -16,7 +16,9 @@ from lavender._arrays import FloatArray
 from lavender.errors import InputError
 from lavender.problem import Problem
 
-__all__ = ["MAX_BYTES", "Stored"]
+__all__ = ["MAX_BYTES", "SUFFIXES", "Stored", "folder_for_steps"]
+
+SUFFIXES = (".npz", ".hdf5", ".h5", ".hdf")  # of problem files
 
 MAX_BYTES = 2**31  # of what a file makes in memory; a megabyte can declare a terabyte
 NUMBER = 8  # bytes of a number once it is read: float64, or an index before it is checked
@@ -36,6 +38,36 @@ class Stored:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "info", MappingProxyType(dict(self.info)))
+
+
+def folder_for_steps(path: str | os.PathLike[str], replace: bool = False) -> Path:
+    """A folder, made where it is not, that holds no problem file: steps of two recordings are no sequence.
+
+    Parameters
+    ----------
+    path : path
+    replace : bool
+        Take the problem files out that it holds.
+
+    Raises
+    ------
+    InputError
+        It holds problem files and `replace` is False, or it cannot be made or written.
+    """
+    folder = Path(path)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        old = [p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES and p.is_file()]
+        if old and not replace:
+            raise InputError(
+                f"{folder} holds {len(old)} problem files, and steps of two recordings would be read as one sequence: "
+                "give another folder, or have them replaced (replace=True, --replace)"
+            )
+        for file in old:
+            file.unlink()
+    except OSError as error:
+        raise InputError(f"cannot make or clear the folder {str(folder)!r}: {error.strerror}") from None
+    return folder
 
 
 def destination(path: str | os.PathLike[str]) -> Path:

@@ -84,7 +84,12 @@ def _fastest(sequence: str, records: Records) -> tuple[str, float, float]:
     # Steps of a folder are cases named "folder[step]".
     by_solver: dict[tuple[str, str], list[tuple[float, float, bool]]] = {}
     for r in records:
-        if r.mode == "tol" and r.case.partition("[")[0] == sequence and records.success(r) is not None:
+        if (
+            r.mode == "tol"
+            and not r.turns
+            and r.case.partition("[")[0] == sequence
+            and records.success(r) is not None
+        ):
             by_solver.setdefault((r.solver, r.start), []).append((r.time_min, r.relative, r.success))
     most = max((len(runs) for runs in by_solver.values()), default=0)
     best = ("", math.nan, math.nan)

@@ -12,7 +12,7 @@ from lavender.report import tables
 from lavender.report.engine import ENGINES, Contestant
 from lavender.report.engine import lines as engine_lines
 from lavender.report.moved import advice_by_speed, moved, robustness_by_speed, speed_levels, speed_name
-from lavender.report.text import in_time, residual, seconds, to_level
+from lavender.report.text import count, in_time, residual, seconds, to_level
 from lavender.report.verdict import verdict
 
 __all__ = ["summary"]
@@ -20,16 +20,22 @@ __all__ = ["summary"]
 MOTION = "**By motion error** (how wrong the body moves that is furthest off)"
 
 
-def summary(records: Records, times: Sequence[float] = (), engines: Sequence[Contestant] = ()) -> str:
+def summary(
+    records: Records,
+    times: Sequence[float] = (),
+    engines: Sequence[Contestant] = (),
+    sweeps: Sequence[int] = (),
+) -> str:
     """Markdown: recommendations, then every case and solver, then what failed."""
     levels = tables.levels_of(records)
-    times = tuple(times) or tables.time_budgets(records)
+    asked = tuple(times)
+    times = asked or tables.time_budgets(records)
     speeds = speed_levels(records)
     lines = ["## lavender report", ""]
     for run in records.runs.values():
         machine = f"{run.cpu}, {run.threads} thread; lavender {run.lavender}, Python {run.python}"
         lines += [_cell(f"{machine}; run {run.run}, {run.started}"), ""]
-    found = verdict(records, times)
+    found = verdict(records, asked, sweeps)
     if found.sentences:
         lines += [_cell(found.text), "", "```python", *found.code, "```", ""]
     advice = [] if tables.is_campaign(records) else tables.advice(records, times)
@@ -40,6 +46,11 @@ def summary(records: Records, times: Sequence[float] = (), engines: Sequence[Con
             cells = [line.name, *map(to_level, line.by_level.values()), *map(in_time, line.by_time.values())]
             lines.append("| " + " | ".join(map(_cell, cells)) + " |")
         lines.append("")
+        budgets = sorted({n for line in advice for n in line.by_sweeps})
+        rows = [[line.name, *map(in_time, line.by_sweeps.values())] for line in advice if line.by_sweeps]
+        lines += (
+            [*_table(["structure", *(count(int(n), "sweep") for n in budgets)], rows), ""] if rows else []
+        )
     if tables.is_campaign(records):
         lines += _campaign(tables.robustness(records), [f"to {level_name(x)}" for x in levels])
         if by_speed := robustness_by_speed(records):

@@ -76,7 +76,7 @@ def by_speed(records: Records) -> Records:
     others: list[Entry] = [*records.cases.values(), *records.skips, *records.done.values()]
     for entry in others:
         out.add(entry)
-    for r in records:
+    for r in (r for r in records if not r.turns):
         out.add(replace(r, relative=math.inf if r.motion_speed is None else r.motion_speed, floor=0.0))
     return out
 

@@ -21,6 +21,7 @@ from lavender.report.moved import (
 )
 from lavender.report.svg import svg
 from lavender.report.tables.advice import NOISE, RESIDUAL_NOISE
+from lavender.report.tables.finals import WAYS, line_table
 from lavender.report.text import count, residual, seconds, times
 from lavender.report.verdict import verdict
 
@@ -41,6 +42,7 @@ def page(
     *,
     old: Records | None = None,
     budgets: Sequence[float] = (),
+    sweeps: Sequence[int] = (),
     saved: bool = True,
     peers: Peers | None = None,
     engines: Sequence[Contestant] = (),
@@ -56,6 +58,8 @@ def page(
         An earlier run to compare with.
     budgets : s, optional
         Time budgets of the recommendation.
+    sweeps : int, optional
+        Budgets of sweeps of the recommendation.
     saved : bool
         The figures are beside the page as SVG and PNG.
     peers : Peers, optional
@@ -75,7 +79,7 @@ def page(
     environment.filters.update(
         seconds=seconds, residual=residual, level=level_name, anchor=file_name, times=times, speed=speed_name
     )
-    content = _content(records, figures, old, tuple(budgets) or tables.time_budgets(records), peers)
+    content = _content(records, figures, old, tuple(budgets), tuple(sweeps), peers)
     return environment.get_template("index.html.j2").render(
         title=title,
         saved=saved,
@@ -88,11 +92,17 @@ def page(
 
 
 def _content(
-    records: Records, figures: Figures, old: Records | None, budgets: Sequence[float], peers: Peers | None
+    records: Records,
+    figures: Figures,
+    old: Records | None,
+    budgets: Sequence[float],
+    sweeps: Sequence[int],
+    peers: Peers | None,
 ) -> dict[str, Any]:
     still = idle(records)
     records = working(records)
-    found = verdict(records, budgets)
+    found = verdict(records, budgets, sweeps)
+    budgets = budgets or tables.time_budgets(records)
     names = sorted({r.solver for r in records} | {c.solver for f in figures for c in f.curves})
     number = {name: i for i, name in enumerate(names)}
     # Under the heading of a case or a family its name says nothing new.
@@ -143,6 +153,8 @@ def _content(
         "levels": levels,
         "budgets_of_time": budgets,
         "advice": [] if campaign else tables.advice(records, budgets),
+        "lines": line_table(records),
+        "ways": {way: head for way, head in WAYS.items() if any(r.turns and r.way == way for r in records)},
         "families": tables.families(records),
         "family_figures": {f: file_name(figure.name) for f, figure in figures.families.items()},
         "claims": tables.claims(records),
@@ -156,6 +168,7 @@ def _content(
         "moved_profiles": {law: _keys(some) for law, some in other.profiles.items()},
         "moved_sequences": {name: _keys(some) for name, some in other.sequences.items()},
         "means": tables.geometric_means(records),
+        "backends": tables.backends(records),
         "shift": tables.SHIFT,
         "limit": tables.limit_of(records),
         "spreads": sorted(tables.spreads(records), key=lambda s: -s.factor),
@@ -168,6 +181,7 @@ def _content(
         "sequences": tables.by_sequence(records),
         "sequence_figures": {name: _keys(some) for name, some in figures.sequences.items()},
         "compared": old is not None,
+        "drift": 1.0 if old is None else tables.drift(old, records),
         "changes": [c for c in changes if c.kind != "same"],
         "n_changes": len(changes),
         "n_records": len(records),

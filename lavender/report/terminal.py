@@ -80,16 +80,30 @@ def reach_table(records: Records, levels: Sequence[float]) -> Any:
     return table
 
 
-def advice_table(records: Records, times: Sequence[float] = ()) -> Any:
+def advice_table(records: Records, advice: Sequence[tables.Line], times: Sequence[float] = ()) -> Any:
     """Per structure or sequence, at each level and in each time: the recommended solver and how it does."""
     levels, times = tables.levels_of(records), tuple(times) or tables.time_budgets(records)
     table = _table()
     table.add_column("structure")
     for head in (*(f"to {level_name(x)}" for x in levels), *(f"in {seconds(t)}" for t in times)):
         table.add_column(head, overflow="fold")
-    for line in tables.advice(records, times):
+    for line in advice:
         cells = [*map(to_level, line.by_level.values()), *map(in_time, line.by_time.values())]
         table.add_row(line.name, *cells)
+    return table
+
+
+def sweeps_table(advice: Sequence[tables.Line]) -> Any:
+    """Per structure and sequence, with each budget of sweeps: the recommended solver and how it does."""
+    budgets = sorted({n for line in advice for n in line.by_sweeps})
+    table = _table()
+    table.add_column("structure")
+    for n in budgets:
+        table.add_column(count(int(n), "sweep"), overflow="fold")
+    for line in advice:
+        table.add_row(
+            line.name, *(in_time(line.by_sweeps[n]) if n in line.by_sweeps else "–" for n in budgets)
+        )
     return table
 
 
@@ -153,6 +167,7 @@ def print_report(
     console: Console,
     old: Records | None = None,
     times: Sequence[float] = (),
+    sweeps: Sequence[int] = (),
     whole: bool = False,
 ) -> None:
     """What the terminal shows after a run: the recommendation first; every case and sequence where `whole`.
@@ -172,17 +187,21 @@ def print_report(
             console.print(BY_MOTION, highlight=False)
             console.print(robustness_table(by_speed, speed_levels(records), " m/s"), highlight=False)
     elif len(records):
-        found = verdict(records, times)
+        found = verdict(records, times, sweeps)
         console.print(found.text, style="bold", highlight=False, markup=False, soft_wrap=True)
         for line in found.code:
             console.print(f"    {line}", highlight=False, markup=False, soft_wrap=True)
         console.print(
-            "\n[bold]By structure[/] (to a level: mean time, share of cases that get there, budget; in a time: mean "
-            "residual; ≈ as good within noise)",
+            "\n[bold]By structure[/] (to a level: mean time, share of cases that get there, budget; in a time or with "
+            "sweeps: share of cases served, residual at the 90th percentile; ≈ as good within noise)",
             highlight=False,
             soft_wrap=True,
         )
-        console.print(advice_table(records, times), highlight=False)
+        advice = tables.advice(records, times)
+        console.print(advice_table(records, advice, times), highlight=False)
+        if any(line.by_sweeps for line in advice):
+            console.print("\n[bold]By sweeps[/]", highlight=False)
+            console.print(sweeps_table(advice), highlight=False)
         _print_motion(records, console, whole)
     for case in still[:FEW]:
         console.print(

@@ -59,11 +59,11 @@ def to_level(advice: Advice) -> str:
 
 
 def in_time(advice: Advice) -> str:
-    """Who comes closest within a time, and how close, in one line."""
+    """Who serves most cases within a time or a budget, and how close it comes, in one line."""
     best = advice.best
     if best is None:
         return "nobody"
-    return f"{best.solver} to {residual(best.score)}{_how(best.how)}{_ties(advice)}"
+    return f"{best.solver} to {residual(best.score)}{share(best.solved, best.cases)}{_how(best.how)}{_ties(advice)}"
 
 
 def _how(how: str) -> str:

@@ -4,19 +4,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from lavender.bench.record import Record, level_name
 from lavender.bench.store import Records
 from lavender.report import tables
+from lavender.report.contenders import QUICKER, Subject, subjects
 from lavender.report.moved import by_speed, speed_levels, speed_name
-from lavender.report.tables import Advice
+from lavender.report.tables import Choice
+from lavender.report.tables.finals import WAYS, Final, Race, in_time, lines
+from lavender.report.tables.finals import to_level as race_to_level
 from lavender.report.text import count, residual, seconds
+from lavender.report.text import times as times_of
 
 __all__ = ["Verdict", "verdict"]
 
 PYTHON_SHARE = 2e-4  # s: below it what is measured is largely the way through Python, some 50 µs of it
-QUICKER = 0.5  # of the time to the level: a time budget below that is worth another sentence
 SHAPES = ("separate", "chain", "mesh", "stack", "pile", "dense")
 
 
@@ -39,64 +42,154 @@ class _Scale:
     """What a level is of: a residual, or metres per second of motion error."""
 
     reached: Callable[[float], str]  # "to 1e-6"
-    short: Callable[[float], str]  # how far one came in a time
     tol: Callable[[str, float], float]  # to ask a solver for, so that it reaches a level
-    useless: float  # how far is too far to be worth a sentence
 
 
-BY_RESIDUAL = _Scale(lambda x: f"to {level_name(x)}", residual, lambda solver, x: x, 1.0)
+BY_RESIDUAL = _Scale(lambda x: f"to {level_name(x)}", lambda solver, x: x)
 
 
-def verdict(records: Records, times: Sequence[float] = ()) -> Verdict:
-    """The recommendation for everything that was measured together.
+def verdict(records: Records, times: Sequence[float] = (), sweeps: Sequence[int] = ()) -> Verdict:
+    """The recommendation for everything that was measured together: single cases, then sequences.
 
     By motion error where the plan names speed levels; where motion errors were measured beside residuals, a sentence
-    says who is first by them.
+    says who is first by them. `times` [s] and `sweeps` that are asked for each get a sentence; those of the newest plan
+    if none are given.
     """
     if tables.is_campaign(records) or not len(records):
         return Verdict((), (), ())
     newest = next(reversed(list(records.runs.values())), None)
     speeds = speed_levels(records)
-    if not speeds:
-        return _of(records, times, BY_RESIDUAL)
-    moving = by_speed(records)
-    scale = _Scale(
-        lambda x: f"until no body is wrong by more than {speed_name(x)}",
-        lambda x: f"wrong by {residual(x)} m/s",
-        lambda solver, x: _tolerance(moving, solver, x),
-        math.inf,
+    scale = BY_RESIDUAL
+    if speeds:
+        moving = by_speed(records)
+        scale = _Scale(
+            lambda x: f"until no body is wrong by more than {speed_name(x)}",
+            lambda solver, x: _tolerance(moving, solver, x),
+        )
+        if newest is not None and newest.plan.get("speed_levels"):
+            return _by_advice(moving, scale)
+    plan = {} if newest is None else newest.plan
+    times = tuple(times) or tuple(plan.get("times", ()))
+    sweeps = tuple(sweeps) or tuple(plan.get("sweeps", ()))
+    parts = [_of(records, subject, times, sweeps) for subject in subjects(records, times)]
+    sentences = [s for part in parts for s in part.sentences]
+    if speeds and parts:
+        best = subjects(by_speed(records))[0].best.best
+        if best is not None:
+            reached = scale.reached(speeds[len(speeds) // 2])
+            sentences.append(f"By motion error {best.solver}: {seconds(best.score)} {reached}.")
+    leaders = dict.fromkeys(name for part in parts for name in part.leaders)
+    return Verdict(tuple(sentences), tuple(c for part in parts for c in part.code), tuple(leaders)[:3])
+
+
+def _of(records: Records, subject: Subject, times: Sequence[float], sweeps: Sequence[int]) -> Verdict:
+    """The recommendation for one subject, by the lines that were timed in turns or, without any, by those measured."""
+    level, n = subject.best.target, subject.best.ranking[0].cases if subject.best.ranking else 0
+    in_turns = lines(records, subject.way)
+    race = race_to_level(records, in_turns or lines(records, subject.way, rounds=False), level, n)
+    what = _what(records, subject)
+    if race is None or not race.ranking[0][1].solved:
+        near = tuple(c.solver for c in subject.best.ranking[:3] if c.solved)
+        return Verdict((f"Nobody brings any of {what} {BY_RESIDUAL.reached(level)}.",), (), near)
+    final, first = race.ranking[0]
+    said = [_head(first, level, what, BY_RESIDUAL), *_sure(race)]
+    code = _told(final, first.score, WAYS[subject.way])
+    leaders = [c.solver for _, c in race.ranking[:3] if c.solved]
+    some = [
+        f for f in lines(records, "batch") if f.line.solver == first.solver and set(f.runs) <= set(final.runs)
+    ]
+    for batch in some[:1] if len(final.runs) > 1 else ():
+        code += _told(batch, batch.time, WAYS["batch"])
+    plain = lines(records, subject.way, rounds=False)
+    for t in times or [a.target for a in subject.quick if a.target <= QUICKER * first.score][-1:]:
+        if first.worst <= t and first.solved == first.cases:
+            continue  # there is time for the whole
+        quick = in_time(records, [f for f in in_turns if f.line.mode != "tol"] or plain, t, n)
+        asked = f"If you have only {seconds(t)}"
+        if quick is None or not quick.ranking[0][1].solved:
+            said += [f"{asked}, nobody gets any of {what} to half of the start's residual."] if times else []
+            continue
+        said.append(_serves(asked, *quick.ranking[0], t))
+        code += _told(quick.ranking[0][0], quick.ranking[0][0].time, f"for {seconds(t)}")
+        leaders.insert(1, quick.ranking[0][1].solver)
+    for budget in sweeps:
+        same = [f for f in plain if f.line.mode == "budget" and f.line.max_iter == budget]
+        swept = in_time(records, same, math.inf, n)
+        if swept is not None:
+            said.append(_serves(f"With {count(budget, 'sweep')}", *swept.ranking[0], math.inf))
+            code += _told(swept.ranking[0][0], swept.ranking[0][0].time, count(budget, "sweep"))
+    foreign = [f"{b.solver} on {b.wins} of {b.solved} cases" for b in tables.backends(records) if b.wins]
+    if foreign and subject.way == "call":
+        said.append(
+            f"By their own interface, on data given before, some are faster than all of ours: {', '.join(foreign)}."
+        )
+    if first.score < PYTHON_SHARE:
+        said.append(f"Below {seconds(PYTHON_SHARE)} Python's share of a call decides as much as the solver.")
+    return Verdict(tuple(said), tuple(dict.fromkeys(code)), tuple(dict.fromkeys(leaders))[:3])
+
+
+def _what(records: Records, subject: Subject) -> str:
+    if subject.way == "call":
+        return _name(records, subject.names)
+    names = subject.names
+    return f"a step of {names[0]}" if len(names) == 1 else f"a step of your {count(len(names), 'sequence')}"
+
+
+def _head(first: Choice, level: float, what: str, scale: _Scale) -> str:
+    said = f"Use {first.solver}: {seconds(first.score)} {scale.reached(level)} on {what}"
+    if first.solved < first.cases:
+        said += f", of which it brings {first.solved} of {first.cases} there"
+    elif math.isfinite(first.worst) and first.worst > 3.0 * first.score:
+        said += f" (at worst {seconds(first.worst)}: {first.hardest})"
+    return f"{said}."
+
+
+def _sure(race: Race) -> list[str]:
+    """How often the choice wins, and who is as good."""
+    if len(race.ranking) < 2:
+        return []
+    share = f"It wins in {100 * race.shares[0]:.0f} % of resamplings"
+    if race.loss > 1.0:
+        share += f" and takes {times_of(race.loss)} the best's time in the others"
+    others = [f"{name} ({100 * s:.0f} %)" for (_, c), s in zip(race.ranking, race.shares, strict=True)
+              if (name := c.solver) in race.named[1:]]  # fmt: skip
+    return [f"{share}; as good: {', '.join(others)}." if others else f"{share}."]
+
+
+def _serves(asked: str, final: Final, choice: Choice, limit: float) -> str:
+    how = f", {choice.how}" if choice.how and math.isfinite(limit) else ""
+    said = (
+        f"{asked}, take {choice.solver}{how}: it serves {choice.solved} of {choice.cases} (at most half of the start's "
+        f"residual), at the 90th percentile {residual(choice.score)}"
     )
-    if newest is not None and newest.plan.get("speed_levels"):
-        return _of(moving, times, scale)
-    found = _of(records, times, BY_RESIDUAL)
-    best = _best(moving, "all")[0].best
-    if best is None:
-        return found
-    level = speeds[len(speeds) // 2]
-    more = f"By motion error {best.solver}: {seconds(best.score)} {scale.reached(level)}."
-    return replace(found, sentences=(*found.sentences, more))
+    if math.isfinite(limit) and choice.overrun > 1.0:
+        said += f", and takes up to {times_of(choice.overrun)} that time on the others"
+    return f"{said}."
 
 
-def _best(records: Records, what: str) -> tuple[Advice, str]:
-    # of the middle level, and what it is of
-    levels = tables.levels_of(records)
-    level = levels[len(levels) // 2]
-    cases = list(dict.fromkeys(r.case for r in records if r.step < 0))
-    if cases:
-        return tables.to_level(records, what, cases, level), _name(records, cases)
-    best = next(a for a in tables.advice_by_sequence(records, ())[0] if a.target == level)
-    return best, f"a step of {best.family}"
+def _told(final: Final, time: float, what: str) -> list[str]:
+    """Lines to copy, with what they were timed at."""
+    *before, last = final.code
+    timed = f"{seconds(time)}, {what}"
+    timed = timed if final.line.times else f"not timed as a line: {timed}"
+    if final.line.start == "carried":
+        return [f"{before[0]}  # {timed}", *before[1:], last]
+    return [*before, f"{last}  # {timed}"]
 
 
-def _of(records: Records, times: Sequence[float], scale: _Scale) -> Verdict:
-    cases = list(dict.fromkeys(r.case for r in records if r.step < 0))
-    times = tuple(times) or tables.time_budgets(records)
-    best, what = _best(records, "all")
-    if cases:
-        quick = [tables.within(records, "all", cases, t) for t in times]
-    else:
-        quick = [a for a in tables.advice_by_sequence(records, times)[1] if a.family == best.family]
-    return _verdict(what, best, quick, scale)
+def _by_advice(records: Records, scale: _Scale) -> Verdict:
+    """By motion error: lines are not timed for it."""
+    subject = subjects(records)[0]
+    best, what = subject.best, _what(records, subject)
+    leaders = tuple(c.solver for c in best.ranking[:3] if c.solved)
+    first = best.best
+    if first is None:
+        return Verdict((f"Nobody brings any of {what} {scale.reached(best.target)}.",), (), leaders)
+    ties = (f"As good within noise: {', '.join(best.ties)}.",) if best.ties else ()
+    tol = scale.tol(first.solver, best.target)
+    asked = f"tol={level_name(tol)}" if math.isfinite(tol) else f"tol=0, max_iter={first.iterations}"
+    code = f'lv.solve(problem, "{first.solver}", {asked})'
+    return Verdict((_head(first, best.target, what, scale), *ties), (code,), leaders)
 
 
 def _tolerance(records: Records, solver: str, level: float) -> float:
@@ -112,50 +205,6 @@ def _tolerance(records: Records, solver: str, level: float) -> float:
         return math.nan
     power = math.floor(math.log10(tightest))
     return float(f"{math.floor(tightest / 10.0**power + 1e-9)}e{power}")  # rounded down: it still gets there
-
-
-def _verdict(what: str, best: Advice, quick: Sequence[Advice], scale: _Scale) -> Verdict:
-    first, level = best.best, best.target
-    leaders = [c.solver for c in best.ranking[:3] if c.solved]
-    if first is None:
-        return Verdict((f"Nobody brings any of {what} {scale.reached(level)}.",), (), tuple(leaders))
-    said = f"Use {first.solver}: {seconds(first.score)} {scale.reached(level)} on {what}"
-    if first.solved < first.cases:
-        said += f", of which it brings {first.solved} there"
-    elif math.isfinite(first.worst) and first.worst > 3.0 * first.score:
-        said += f" (at worst {seconds(first.worst)}: {first.hardest})"
-    said += "."
-    sentences = [said]
-    if best.ties:
-        sentences.append(f"As good within noise: {', '.join(best.ties)}.")
-    tol = scale.tol(first.solver, level)
-    by_budget = bool(first.iterations) and first.how.startswith(f"{first.iterations} iterations")
-    if by_budget or not math.isfinite(tol):
-        code = [_budget(first.solver, first.iterations)]
-    else:
-        code = [f'lv.solve(problem, "{first.solver}", tol={level_name(tol)})']
-    shorter = [
-        a for a in quick if a.target <= QUICKER * first.score and a.best and a.best.score < scale.useless
-    ]
-    if shorter:
-        other = shorter[-1].best
-        assert other is not None
-        how = f", {other.how}" if other.how else ""
-        sentences.append(
-            f"If you have only {seconds(shorter[-1].target)}, take {other.solver}{how}: {scale.short(other.score)}."
-        )
-        if other.iterations:
-            code.append(_budget(other.solver, other.iterations))
-        leaders.insert(1, other.solver)
-    if first.score < PYTHON_SHARE:
-        sentences.append(
-            f"Below {seconds(PYTHON_SHARE)} Python's share of a call decides as much as the solver."
-        )
-    return Verdict(tuple(sentences), tuple(code), tuple(dict.fromkeys(leaders))[:3])
-
-
-def _budget(solver: str, iterations: int) -> str:
-    return f'lv.solve(problem, "{solver}", tol=0, max_iter={iterations})'
 
 
 def _name(records: Records, cases: Sequence[str]) -> str:

@@ -25,6 +25,7 @@ def write(
     figures: bool = True,
     old: Records | None = None,
     times: Sequence[float] = (),
+    sweeps: Sequence[int] = (),
     peers: Peers | None = None,
     engines: Sequence[Contestant] = (),
 ) -> Path:
@@ -40,7 +41,9 @@ def write(
     old : Records, optional
         An earlier run to compare with.
     times : s, optional
-        Time budgets of the recommendation; `tables.time_budgets` if none are given.
+        Time budgets of the recommendation; those of the plan, or `tables.time_budgets`, if none are given.
+    sweeps : int, optional
+        Budgets of sweeps with which a solver is to be named; those of the plan if none are given.
     peers : Peers, optional
         A run of `lavender bench peers` (`lavender.bench.peers.read`) to show beside them.
     engines : sequence of Contestant
@@ -79,9 +82,19 @@ def write(
         before = None if old is None else old.latest()
         # Whole or not at all: on a full disk the page of the last time stays.
         write_text(
-            index, page(shown, drawn, old=before, budgets=times, saved=figures, peers=peers, engines=engines)
+            index,
+            page(
+                shown,
+                drawn,
+                old=before,
+                budgets=times,
+                sweeps=sweeps,
+                saved=figures,
+                peers=peers,
+                engines=engines,
+            ),
         )
-        write_text(folder / "summary.md", summary(busy, times, engines))
+        write_text(folder / "summary.md", summary(busy, times, engines, sweeps))
         if figures and list(drawn):
             (folder / "figures").mkdir(exist_ok=True)
             look = looks({r.solver for r in shown} | {c.solver for figure in drawn for c in figure.curves})

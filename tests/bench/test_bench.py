@@ -568,7 +568,7 @@ def test_recorded_steps_are_known_by_themselves_and_kept_apart(tmp_path):
     io.save(p, tmp_path / "mixed" / "other.npz")
     items = bench.resolve([tmp_path / "a" / "steps", tmp_path / "b" / "steps", tmp_path / "mixed"])
     assert [(i.sequence, i.step) for i in items] == [
-        ("steps", 0), ("steps", 1), ("steps #2", 0), ("steps #2", 1), ("", -1), ("", -1), ("", -1),
+        ("steps", 0), ("steps", 1), ("b/steps", 0), ("b/steps", 1), ("", -1), ("", -1), ("", -1),
     ]  # fmt: skip
     assert len({i.name for i in items}) == len(items)
     assert all(i.sequence == "" for i in bench.resolve([tmp_path / "a" / "steps"], sequences=False))
@@ -593,3 +593,79 @@ def test_a_folder_is_a_sequence_in_numeric_order(tmp_path):
     empty.mkdir()
     with pytest.raises(lv.InputError, match="needs two"):
         bench.steps_in(empty)
+
+
+def test_steps_of_two_sequences_are_never_one(tmp_path):
+    path, plan = tmp_path / "records.jsonl", bench.Plan(levels=(), budgets=(6,), repeats=1)
+    bench.run(bench.sequence(moving_stack(5), "load"), ["pgs"], plan, path)
+    bench.run(bench.sequence(moving_stack(2, n=11), "load"), ["pgs"], plan, path)
+    (walk,) = lv.report.tables.walks(bench.read(path).latest())
+    assert (walk.steps, len(walk.times["cold"])) == (2, 2)
+
+
+@pytest.mark.parametrize("names", [("s_1", "s_2", "s_02"), ("a_1", "a_2", "b_1", "b_2")])
+def test_a_folder_with_two_recordings_is_refused(tmp_path, names):
+    for name in names:
+        lv.io.save(stack(4), tmp_path / f"{name}.npz")
+    with pytest.raises(lv.InputError, match="more than one recording"):
+        bench.steps_in(tmp_path)
+
+
+def test_a_level_of_a_sequence_is_solved_to_that_level():
+    plan = bench.Plan(levels=(1e-3, 1e-6, 1e-9), budgets=(), repeats=1)
+    records = bench.run(bench.sequence(moving_stack(3), "load"), ["pgs", "direct"], plan)
+    assert {r.tol for r in records if r.solver == "pgs"} == set(plan.levels)
+    for advice in lv.report.tables.advice_by_sequence(records)[0]:
+        assert all(
+            float(c.how.removeprefix("tol ").partition(",")[0]) <= advice.target for c in advice.ranking
+        )
+
+
+def test_what_is_timed_is_the_line_that_is_printed(monkeypatch):
+    """Whatever the front door of `lv.solve` costs is in the time, once for each repeat."""
+    calls = []
+    true = timing.solve
+
+    def slow(problem, solver, **asked):
+        calls.append((solver, asked))
+        time.sleep(0.02)
+        return true(problem, solver, **asked)
+
+    monkeypatch.setattr(timing, "solve", slow)
+    records = bench.run([stack(6)], ["pgs"], bench.Plan(levels=(1e-6,), budgets=(4,), repeats=2, orders=()))
+    assert calls == [("pgs", {"tol": 1e-6}), ("pgs", {"tol": 0.0, "max_iter": 4})]
+    for r in records:
+        assert r.way == "call"
+        assert len(r.times) == 1
+        assert r.time_min >= 0.02 > r.setup_min + r.solve_min
+    calls.clear()
+    bench.run(
+        bench.sequence(moving_stack(2), "load"), ["pgs"], bench.Plan(levels=(1e-6,), budgets=(), repeats=1)
+    )
+    assert ["impulse" in asked for _, asked in calls] == [False, False, True, True]
+
+
+def test_lines_are_timed_in_turns_and_kept(tmp_path):
+    asks = [
+        bench.Ask("pgs", "tol", 1e-6),
+        bench.Ask("pgs", "budget", 0.0, 4),
+        bench.Ask("pgs", "time", 1e-6, time_limit=1e-3),
+        bench.Ask("pgs", "tol", 1e-6, way="batch"),
+    ]
+    problems, plan = (
+        [stack(6), stack(8, "other")],
+        bench.Plan(levels=(1e-6,), budgets=(), repeats=1, orders=()),
+    )
+    path = tmp_path / "records.jsonl"
+    known = bench.run(problems, ["pgs"], plan, path)
+    before = len(known)
+    made = bench.finals(problems, asks, known, plan, path).records[before:]
+    assert len(made) == len(problems) * len(asks)
+    for r in made:
+        assert len(r.times) == r.repeats >= 3
+        assert r.time_min == min(r.times)
+        assert r.success == (r.mode == "tol")
+        assert len(r.reached) == (r.repeats if r.mode == "time" else 0)
+    assert bench.read(path).records == known.records
+    again = bench.finals(problems, asks, bench.run(problems, ["pgs"], plan, path), plan, path)
+    assert again.records == known.records

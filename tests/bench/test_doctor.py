@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from lavender.bench import doctor
+from lavender.bench import doctor, machine
 from lavender.cli.entry import cli
 
 NEEDED = {
@@ -30,7 +30,12 @@ def test_it_says_what_a_report_of_a_bug_needs_and_finds_every_bit():
     assert set(found) >= NEEDED
     assert found["self_test"] == dict.fromkeys(doctor.HASHES, "same")
     assert found["versions"]["numpy"] == np.__version__
-    assert "osqp" in found["backends"]
+    assert found["backends"]["osqp"] == f"osqp {found['versions']['osqp']}"
+    facts = machine.describe({}).build
+    assert {"kernels", "compiler", "python_flags", "blas"} <= set(facts)
+    assert {k: found["build"][k] for k in facts if k != "clock"} == {
+        k: facts[k] for k in facts if k != "clock"
+    }
 
 
 def test_another_bit_is_told_and_is_status_1(monkeypatch):
@@ -67,4 +72,4 @@ def test_one_sweep_less_is_seen_in_every_part(monkeypatch):
     ],
 )  # fmt: skip
 def test_the_compiler_is_read_from_the_module(library, found):
-    assert doctor.build_of(library) == found
+    assert machine.build_of(library) == found

@@ -572,7 +572,7 @@ def test_what_a_worker_says_is_what_this_process_says():
             far, there = worker.measure_impulse(p, asked, start)
             near, here = timing.measure_impulse(p, asked, start)
             np.testing.assert_array_equal(here, there)
-            times = {n: 0.0 for n in vars(near) if n.startswith(("time_m", "setup_", "solve_"))}
+            times = {n: 0.0 for n in vars(near) if n.startswith(("time_m", "setup_", "solve_", "pace"))}
             assert dataclasses.replace(far, **times) == dataclasses.replace(near, **times)
 
 
@@ -589,6 +589,9 @@ def test_what_a_worker_says_is_what_this_process_says():
         {"setups": [0.0, 0.0]},
         {"solves": [1e9]},
         {"solves": [float("nan")]},
+        {"times": [1e9]},
+        {"times": None},
+        {"pace": "fast"},
         {"certificate": True},
     ],
 )
@@ -597,7 +600,7 @@ def test_an_answer_that_is_none_is_refused(said):
 
     good = {
         "status": "CONVERGED", "iterations": 3, "work": {"sweeps": 3}, "message": "", "form": "",
-        "setups": [0.01], "solves": [0.02], "certificate": False,
+        "setups": [0.01], "solves": [0.02], "times": [0.04], "pace": 1e-4, "certificate": False,
     }  # fmt: skip
     numbers = np.ones(4).tobytes()
     assert _outcome((json.dumps(good).encode(), numbers), 4, 1.0).iterations == 3

@@ -83,7 +83,7 @@ def test_a_contradicted_claim_is_marked(lavender, path, monkeypatch):
             return lv.Claim(lv.Status.CONVERGED, 1)
 
     registry.register(lv.SolverSpec("liar", Liar, laws={"lcp"}, summary="says it did", resumable=False))
-    code, out, _ = lavender("report", path, "--solvers", "liar", *QUICK)
+    code, out, _ = lavender("report", path, "--solvers", "liar", *QUICK[:3], *QUICK[-3:])
     assert code == 0
     assert "✗ contradicted" in out
     assert "2 claims are contradicted" in out
@@ -187,6 +187,17 @@ def test_solvers_lists_all_with_reasons(lavender):
         (("report", "--levels", "many"), "not a list of numbers"),
         (("report", "--campaign", "--seeds", "9:3"), "whole numbers with A < B"),
         (("report", "--time-budgets", "0"), "time budget 0.0 must be"),
+        (("report", "stack(n=4)", "--seeds", "3"), "--seeds has no effect without --campaign"),
+        (("report", "stack(n=4)", "--steps", "3"), "--steps has no effect without a MODEL.xml"),
+        (("report", "stack(n=4)", "--pass-limit", "3"), "--pass-limit has no effect without a sequence"),
+        (("report", "stack(n=4)", "--solvers", "direct", "--budgets", "3"), "--budgets has no effect"),
+        (("report", "stack(n=4)", "--solvers", "direct", "--orders", "reverse"), "--orders has no effect"),
+        (("report", "stack(n=4)", "--solvers", "pgs", "--in-process"), "--in-process has no effect"),
+        (("report", "--campaign", "--time-limit", "3"), "--time-limit has no effect with --campaign"),
+        (("report", "a.jsonl", "--levels", "1e-3"), "--levels has no effect where records are shown again"),
+        (("bench", "stack(n=4)", "--solvers", "pgs", "--memory", "3"), "--memory has no effect"),
+        (("run", "stack", "--skip", "3"), "--skip has no effect without --record"),
+        (("record", "a.xml", "--out", "o", "--seed", "3"), "--seed has no effect without --controls random"),
         (("nonsense",), "No such command"),
     ],
 )
@@ -296,6 +307,10 @@ def test_a_recorded_scene_is_reported_as_a_sequence(lavender, tmp_path):
     code, out, _ = lavender(*words, "--no-figures", "--repeats", 1, "--compare", "lavender-report")
     assert code == 0
     assert "nothing beyond noise" in out
+    code, _, err = lavender("run", "stack", "--steps", 5, "--record", folder)
+    assert (code, "steps of two recordings" in err) == (2, True)
+    assert lavender("run", "stack", "--steps", 3, "--record", folder, "--replace")[0] == 0
+    assert len(list(folder.glob("*.npz"))) == 3  # none of the four is left
     assert lavender("run", "no such scene")[0] == 2
     assert lavender("report", "--sequence")[0] == 2
     assert lavender("report", "--sequence", folder, "--compare", "nowhere")[0] == 2
@@ -313,10 +328,12 @@ def test_the_recommendation_comes_first_and_tables_on_request(lavender, path, tm
     code, out, _ = lavender(*words, "--tables")
     assert "CONVERGED" in out
     n = len(bench.read(tmp_path / "out"))
+    plain = len([r for r in bench.read(tmp_path / "out") if not r.turns])
     assert f"{n} of {n} runs reused of 20" in out
     code, out, _ = lavender(*words, "--fresh")
     assert "reused" not in out
-    assert len(bench.read(tmp_path / "out")) == n  # made again, they stand for the earlier ones
+    again = [r for r in bench.read(tmp_path / "out") if not r.turns]
+    assert len(again) == plain  # made again, they stand for the earlier ones
 
 
 def test_nothing_is_cut_off_in_a_pipe(path, tmp_path):
@@ -504,3 +521,36 @@ def test_ctrl_c_while_the_command_is_imported_ends_with_130(way, module):
 def test_another_program_keeps_its_own_ctrl_c():
     words = "import signal, lavender, lavender.cli; assert signal.getsignal(2) is signal.default_int_handler"
     subprocess.run([sys.executable, "-c", words, "lavender"], check=True, timeout=120)
+
+
+MODEL = """<mujoco><option timestep="0.01"/><worldbody><geom type="plane" size="1 1 1"/>
+<body pos="0 0 {height}"><freejoint/><geom type="{kind}" size=".1 .1 .1"/></body></worldbody></mujoco>"""
+
+
+def test_models_of_one_file_name_are_kept_apart(lavender, tmp_path):
+    pytest.importorskip("mujoco")
+    for name, kind in (("h1", "box"), ("g1", "sphere")):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "scene.xml").write_text(MODEL.format(height=0.1, kind=kind))
+    words = (
+        "--steps",
+        20,
+        "--every",
+        5,
+        "--solvers",
+        "auto",
+        "--repeats",
+        1,
+        "--no-figures",
+        "--out",
+        tmp_path / "o",
+    )
+    models = [tmp_path / name / "scene.xml" for name in ("h1", "g1")]
+    assert lavender("report", *models, *words)[0] == 0
+    found = bench.read(tmp_path / "o")
+    rows = {info.sequence: info.rows for info in found.cases.values()}
+    assert set(rows) == {"h1-scene", "g1-scene"}
+    assert rows["h1-scene"] > rows["g1-scene"]  # a box has more contacts than a sphere
+    folders = {p.name for p in (tmp_path / "o" / "recorded").iterdir()}
+    assert lavender("report", *models, *words)[0] == 0
+    assert {p.name for p in (tmp_path / "o" / "recorded").iterdir()} == folders

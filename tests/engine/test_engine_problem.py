@@ -386,7 +386,7 @@ def test_recorded_problems_are_the_problems_of_the_steps(tmp_path):
     pytest.importorskip("h5py")
     assert sim.record(tmp_path / "fclib", 1, form="fclib")[0].suffix == ".hdf5"
     with pytest.raises(lv.CapabilityError):  # joints
-        chain.record(tmp_path / "fclib", 1, form="fclib")
+        chain.record(tmp_path / "joints", 1, form="fclib")
     assert chain.steps == 0
     (tmp_path / "file").write_text("")
     with pytest.raises(lv.InputError, match="cannot make the folder"):

@@ -51,6 +51,7 @@ class CampaignPlan(Plan):
     time_limit: float = HANG
     cap: int = 20_000
     campaign: bool = True
+    way = ""  # nothing is timed
 
 
 @dataclass(frozen=True)
@@ -406,5 +407,6 @@ def _by_iterations(task: Task, cap: int) -> Task:
 def _without_times(record: Record) -> Record:
     nan = math.nan
     return replace(
-        record, setup_min=nan, setup_median=nan, solve_min=nan, solve_median=nan, time_min=nan, time_median=nan
+        record, setup_min=nan, setup_median=nan, solve_min=nan, solve_median=nan, time_min=nan, time_median=nan,
+        pace=None, own_min=None,
     )  # fmt: skip

@@ -18,6 +18,7 @@ __all__ = ["Plan"]
 
 # A speed level: the residual that is asked for first, the tightest, and how often a tighter one is tried.
 FIRST_TOL, LAST_TOL, SPEED_TRIES = 1e-2, 1e-13, 6
+PASS_LIMIT = 5.0  # s, of one pass over a sequence
 UNLIMITED = 10_000_000  # iterations of a run to a tolerance: the time limit ends it first
 
 
@@ -32,14 +33,16 @@ class Plan:
     repeats : solves of each kind; minimum and median are recorded. Repeats end early once they have
         taken `time_limit` together. Steps of a sequence of more than twenty are solved once.
     time_limit : s, of one solve
-    pass_limit : s, of one solver over a sequence at one budget or level; five solves if None. The steps
-        that are left over are not solved, and a note says so.
+    pass_limit : s, of one solver over all steps of a sequence at one budget or level. The steps that are left over are
+        not solved, and a note says so.
     warm : also start from the problem's guess, where it has one
     orders : sweep orders beside "given", each at the middle budget, for solvers that take an order;
         "random:3" is random with seed 3
     motion : tell how wrong the bodies move, by a reference that is solved for once a case
     speed_levels : m/s, motion errors to reach; implies `motion`. Each solver is asked for the residual that takes it
         there: again and tighter while it misses, at most `SPEED_TRIES` times a level
+    times : s, in which the report is asked to name a solver
+    sweeps : of `budgets`, those with which the report is asked to name one
 
     Raises
     ------
@@ -53,18 +56,22 @@ class Plan:
     budgets: Sequence[int] = (4, 8, 16, 32, 64)
     repeats: int = 3
     time_limit: float = 1.0
-    pass_limit: float | None = None
+    pass_limit: float = PASS_LIMIT
     warm: bool = True
     orders: Sequence[str] = ("reverse", "symmetric", "random:0", "random:1", "random:2")
     campaign: bool = False
     motion: bool = False
     speed_levels: Sequence[float] = ()
+    times: Sequence[float] = ()
+    sweeps: Sequence[int] = ()
 
     def __post_init__(self) -> None:
         for name, values in (
             ("level", self.levels),
             ("budget", self.budgets),
             ("speed level", self.speed_levels),
+            ("time budget", self.times),
+            ("budget", self.sweeps),
         ):
             for value in values:
                 if not (math.isfinite(value) and value > 0):
@@ -75,9 +82,7 @@ class Plan:
             raise InputError(f"repeats is {self.repeats}; at least 1 is needed")
         if not (math.isfinite(self.time_limit) and self.time_limit > 0.0):
             raise InputError(f"time limit is {self.time_limit}; a positive number of seconds is needed")
-        if self.pass_limit is None:
-            object.__setattr__(self, "pass_limit", 5.0 * self.time_limit)
-        elif not self.pass_limit > 0.0:
+        if not self.pass_limit > 0.0:
             raise InputError(f"pass limit is {self.pass_limit}; a positive number of seconds is needed")
         for word in self.orders:
             name, _, seed = word.partition(":")
@@ -89,7 +94,11 @@ class Plan:
         object.__setattr__(self, "budgets", tuple(sorted(map(int, self.budgets))))
         object.__setattr__(self, "orders", tuple(self.orders))
         object.__setattr__(self, "speed_levels", tuple(sorted(map(float, self.speed_levels), reverse=True)))
+        object.__setattr__(self, "times", tuple(sorted(map(float, self.times))))
+        object.__setattr__(self, "sweeps", tuple(sorted(map(int, self.sweeps))))
         object.__setattr__(self, "motion", self.motion or bool(self.speed_levels))
+
+    way = "call"  # what of a single problem is timed, as `Record.way`
 
     def as_dict(self) -> dict[str, Any]:
         """For the description of a run."""
@@ -120,6 +129,7 @@ class Plan:
                 options=options,
                 repeats=self.repeats,
                 step=info.step,
+                way="" if options else self.way,
             )
 
         for start in starts:

@@ -38,12 +38,9 @@ def carry(before: Problem, impulse: FloatArray, problem: Problem) -> FloatArray:
 
 
 def passes(plan: Plan, spec: SolverSpec) -> list[tuple[str, str, float, int]]:
-    """What is run over a sequence: (start, mode, tol, max_iter), each budget and the middle level."""
+    """What is run over a sequence: (start, mode, tol, max_iter), each budget and level."""
     starts = ["cold", "carried"] if spec.impulse and not spec.exact else ["cold"]
-    level = (
-        ("tol", plan.levels[len(plan.levels) // 2], UNLIMITED if spec.resumable else 0)
-        if plan.levels
-        else None
-    )
+    asked = plan.levels[-1:] if spec.exact else plan.levels
+    levels = [("tol", level, UNLIMITED if spec.resumable else 0) for level in asked]
     budgets = [("budget", 0.0, n) for n in plan.budgets] if spec.resumable and not spec.exact else []
-    return [(start, *what) for start in starts for what in [*budgets, *([level] if level else [])]]
+    return [(start, *what) for start in starts for what in [*budgets, *levels]]

@@ -57,6 +57,9 @@ def _as_data(found: Any) -> tuple[str, bytes]:
         "form": str(found.form)[:500],
         "setups": found.setups,
         "solves": found.solves,
+        "times": found.times,
+        "pace": found.pace,
+        "own": found.own,
         "certificate": certificate is not None,
     }
     more = b"" if certificate is None else certificate.tobytes()

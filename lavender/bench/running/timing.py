@@ -1,8 +1,10 @@
 """The one place that times a solve.
 
-A measurement takes a fresh problem (nothing computed yet) for every repeat, prepares the solver
-(set-up: form A, factor, colour, allocate) and solves (solve). Judging is outside both clocks. BLAS and
-OpenMP have one thread and the garbage collector waits.
+What is timed is the line that a report prints: `lv.solve(problem, "name", tol=...)`, judge and all, on a problem whose
+numbers were written just before, as a simulator leaves them, after other work that takes its part of the caches. A
+guarded solve comes first, prepared and under the time limit; what it does not end is timed as far as it went. Where no
+line is asked for (`Task.way` is empty) preparing and solving are timed, on a problem of which nothing is computed yet,
+without the judge. BLAS and OpenMP have one thread and the garbage collector waits.
 """
 
 from __future__ import annotations
@@ -20,14 +22,17 @@ import numpy as np
 
 from lavender import registry
 from lavender._arrays import FloatArray
+from lavender.bench.line import needs_more
 from lavender.bench.record import ERROR, Record, measurement_key
+from lavender.external.stopwatch import own_time
 from lavender.problem import Problem
 from lavender.residuals import reference
 from lavender.solution import Claim, Solution, Status
-from lavender.solve import finish, prepare
+from lavender.solve import finish, prepare, solve
 
-__all__ = ["Outcome", "Task", "attempt", "judged", "measure", "one_thread"]
+__all__ = ["Outcome", "Task", "attempt", "judged", "just_written", "measure", "one_thread", "pace"]
 
+SHORT = 5e-3  # s: what took longer is not called once more for warmth
 CLAIMS = (Status.CONVERGED, Status.FLOOR, Status.INFEASIBLE)
 
 
@@ -39,7 +44,7 @@ class Task:
     case: str
     sha: str
     solver: str
-    mode: str  # "tol" | "budget"
+    mode: str  # "tol" | "budget" | "time"
     tol: float
     max_iter: int  # 0: the solver's own default
     time_limit: float  # s, of one solve
@@ -47,6 +52,10 @@ class Task:
     options: Mapping[str, Any] = field(default_factory=dict)
     repeats: int = 1
     step: int = -1
+    way: str = ""  # as `Record.way`
+    turns: str = ""
+    guarded: bool = True  # a solve under the time limit comes first
+    lead: float = 0.0  # s, that the line takes before its call: carrying impulses
 
     @property
     def key(self) -> tuple[Any, ...]:
@@ -69,6 +78,8 @@ class Task:
             order=str(self.options.get("order", "given")),
             seed=int(self.options.get("seed", 0)),
             step=self.step,
+            way=self.way,
+            turns=self.turns,
             **what,
         )
 
@@ -130,6 +141,10 @@ class Outcome:
     certificate: FloatArray | None  # (m,), with INFEASIBLE
     setups: list[float]  # s, of each repeat
     solves: list[float]  # s
+    times: list[float]  # s, of the line of each repeat; none where the guard did not end
+    reached: list[float]  # relative residual of each repeat, in mode "time"
+    pace: float | None  # s
+    own: float | None = None  # s, in the backend's own solve
 
 
 def measure(problem: Problem, task: Task) -> Record:
@@ -156,25 +171,48 @@ def measure_impulse(problem: Problem, task: Task, impulse: Any = None) -> tuple[
 
 def attempt(problem: Problem, task: Task, impulse: Any = None) -> Outcome | str:
     """Run the solver as the task asks, in this process; what it raised, as text."""
-    setups: list[float] = []
-    solves: list[float] = []
-    solution = None
+    runs: list[tuple[Solution, float]] = []  # with the time of the line
+    paces: list[float] = []
+    owns: list[float] = []
+    guard: Solution | None = None
     try:
         _warm_up(task.solver)
         with _undisturbed(task.solver):
             begun = perf_counter()
-            for _ in range(max(1, task.repeats)):
-                solution = _once(problem, task, impulse)
-                setups.append(solution.setup_time)
-                solves.append(solution.solve_time)
-                if solution.status is Status.INTERRUPTED:
-                    raise KeyboardInterrupt
-                if solution.status is Status.TIME_LIMIT or perf_counter() - begun > task.time_limit:
-                    break
+            if task.way and task.guarded:
+                guard = _uninterrupted(_parts(problem, task, impulse))
+            left = max(1, task.repeats - (guard is not None))
+            while left and (guard is None or guard.status is not Status.TIME_LIMIT):
+                paces.append(pace())
+                if not task.way:
+                    parts = _uninterrupted(_parts(problem, task, impulse))
+                    runs.append((parts, parts.setup_time + parts.solve_time))
+                else:
+                    with own_time(task.solver) as spent:
+                        runs.append(_line(problem, task, impulse, guard))
+                    owns += [sum(spent)] if spent else []
+                if task.turns:  # in turns with others: as a simulator that calls the same line at every step
+                    left, runs = left if perf_counter() - begun < SHORT else 1, runs[-1:]
+                left -= 1
+                if runs[-1][0].status is Status.TIME_LIMIT or perf_counter() - begun > task.time_limit:
+                    left = 0 if task.mode != "time" else left
+            solution = runs[-1][0] if runs else guard
+            if guard is None and task.way and _cut_short(solution, task):
+                # More iterations than the solver's own limit: they are asked for, under the guard.
+                return attempt(problem, replace(task, guarded=True), impulse)
     except Exception as error:
         # A backend may raise anything; it costs its own record, never the run.
         return f"{type(error).__name__}: {error}".strip()
     assert solution is not None  # there is at least one repeat
+    made = [s for s, _ in runs] or [solution]
+    found = outcome_of(solution, made, [t for _, t in runs], min(paces, default=None), task.mode == "time")
+    return replace(found, own=min(owns, default=None))
+
+
+def outcome_of(
+    solution: Solution, made: list[Solution], times: list[float], paced: float | None, reached: bool = False
+) -> Outcome:
+    """What the repeats `made` brought, the last of them `solution`."""
     return Outcome(
         impulse=solution.impulse,
         status=solution.status,
@@ -183,9 +221,67 @@ def attempt(problem: Problem, task: Task, impulse: Any = None) -> Outcome | str:
         message=solution.message,
         form=solution.solver.form,
         certificate=solution.certificate,
-        setups=setups,
-        solves=solves,
+        setups=[s.setup_time for s in made],
+        solves=[s.solve_time for s in made],
+        times=times,
+        reached=[float(s.residual.relative) for s in made] if reached else [],
+        pace=paced,
     )
+
+
+def _uninterrupted(solution: Solution) -> Solution:
+    if solution.status is Status.INTERRUPTED:
+        raise KeyboardInterrupt
+    return solution
+
+
+def _cut_short(solution: Solution | None, task: Task) -> bool:
+    assert solution is not None
+    return (
+        task.mode == "tol"
+        and not task.turns
+        and task.max_iter > 0
+        and solution.status is Status.MAX_ITERATIONS
+    )
+
+
+_NUMBERS = np.arange(2.0**15)  # 256 KiB: more than a first cache holds
+
+
+def pace() -> float:
+    """Time [s] of a loop of fixed work: what the machine is worth now. It takes its part of the caches, too."""
+    begun = perf_counter()
+    total = 0.0
+    for i in range(500):
+        total += 0.5 * i
+    for _ in range(4):
+        total += float(_NUMBERS.sum())
+    return perf_counter() - begun
+
+
+def just_written(problem: Problem) -> Problem:
+    """The problem in arrays of its own, written now, nothing derived from them: what a simulator hands over."""
+    rows = None if problem.rows is None else replace(problem.rows, copy=True)
+    return replace(problem, rows=rows, copy=True)
+
+
+def _line(problem: Problem, task: Task, impulse: Any, guard: Solution | None) -> tuple[Solution, float]:
+    """One call of the line, and its time."""
+    more: dict[str, Any] = dict(task.options)
+    needs = guard is not None and needs_more(task.solver, guard.iterations)
+    if task.mode == "budget" or needs or (task.turns and task.max_iter):
+        more["max_iter"] = task.max_iter
+    if task.mode == "time":
+        more["time_limit"] = task.time_limit
+    guessed = (
+        problem.guess is not None and not task.turns
+    )  # in turns: what the line says, from the guess if there is one
+    if task.start == "carried" or (task.start == "cold" and guessed):
+        more["impulse"] = problem.start() if impulse is None else impulse
+    fresh = just_written(problem)
+    begun = perf_counter()
+    solution = solve(fresh, task.solver, tol=task.tol, **more)
+    return _uninterrupted(solution), perf_counter() - begun + task.lead
 
 
 def judged(problem: Problem, task: Task, found: Outcome | str) -> tuple[Record, FloatArray | None]:
@@ -212,10 +308,11 @@ def judged(problem: Problem, task: Task, found: Outcome | str) -> tuple[Record, 
         None,
     )
     impulse = solution.impulse if np.isfinite(solution.impulse).all() else None
-    return record_of(task, solution, found.setups, found.solves), impulse
+    return record_of(task, solution, found), impulse
 
 
-def _once(problem: Problem, task: Task, impulse: Any) -> Solution:
+def _parts(problem: Problem, task: Task, impulse: Any) -> Solution:
+    """Prepare and solve under the time limit."""
     fresh = replace(problem, copy=False)  # nothing derived yet: forming A is set-up
     more = {"isolate": False} if "isolate" in registry.get(task.solver).accepts else {}
     prepared = prepare(
@@ -234,9 +331,10 @@ def _once(problem: Problem, task: Task, impulse: Any) -> Solution:
     )
 
 
-def record_of(task: Task, s: Solution, setups: list[float], solves: list[float]) -> Record:
+def record_of(task: Task, s: Solution, found: Outcome) -> Record:
     """The record of repeats that ended in the solution `s`."""
-    both = [a + b for a, b in zip(setups, solves, strict=True)]
+    setups, solves = found.setups, found.solves
+    both = found.times or [a + b for a, b in zip(setups, solves, strict=True)]
     r = s.residual
     return task.record(
         status=s.status.name,
@@ -260,4 +358,8 @@ def record_of(task: Task, s: Solution, setups: list[float], solves: list[float])
         solve_median=statistics.median(solves),
         time_min=min(both),
         time_median=statistics.median(both),
+        times=tuple(found.times) if task.way else (),
+        reached=tuple(found.reached),
+        pace=found.pace,
+        own_min=found.own,
     )

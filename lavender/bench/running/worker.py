@@ -151,8 +151,11 @@ def _outcome(answer: tuple[bytes, bytes], m: int, took: float) -> Outcome | str:
     if not all(isinstance(said.get(name), str) for name in ("message", "form")):
         raise ValueError("no message")
     setups, solves = _times(said.get("setups")), _times(said.get("solves"))
-    if len(setups) != len(solves) or not math.fsum(setups + solves) <= took:
+    times, pace, own = _times(said.get("times"), some=False), said.get("pace"), said.get("own")
+    if len(setups) != len(solves) or not max(math.fsum(setups + solves), math.fsum(times)) <= took:
         raise ValueError("times that did not pass")
+    if any(t is not None and not (isinstance(t, float) and 0.0 <= t <= took) for t in (pace, own)):
+        raise ValueError("no pace, or times that did not pass")
     return Outcome(
         impulse=numbers[:m],
         status=Status[status],
@@ -163,13 +166,21 @@ def _outcome(answer: tuple[bytes, bytes], m: int, took: float) -> Outcome | str:
         certificate=numbers[m:] if len(numbers) > m else None,
         setups=setups,
         solves=solves,
+        times=times,
+        reached=[],  # of runs to a time, which no worker is asked for
+        pace=pace,
+        own=own,
     )
 
 
-def _times(some: Any) -> list[float]:
-    if not isinstance(some, list) or not some or not all(isinstance(t, float) and t >= 0.0 for t in some):
+def _times(said: Any, some: bool = True) -> list[float]:
+    if (
+        not isinstance(said, list)
+        or (some and not said)
+        or not all(isinstance(t, float) and t >= 0.0 for t in said)
+    ):
         raise ValueError("no times")
-    return some
+    return said
 
 
 def _is_count(n: Any) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from statistics import median
@@ -11,7 +12,7 @@ from lavender.bench.record import Record
 from lavender.bench.store import Records
 from lavender.report.tables.groups import families, levels_of, pairs
 from lavender.report.tables.means import SHIFT, geometric_mean, limit_of, times_to
-from lavender.report.tables.sequences import by_sequence
+from lavender.report.tables.sequences import Walk, by_sequence
 
 __all__ = [
     "Advice",
@@ -20,7 +21,10 @@ __all__ = [
     "advice",
     "advice_by_level",
     "advice_by_sequence",
+    "advice_by_sweeps",
     "advice_by_time",
+    "counts_sweeps",
+    "over_steps",
     "quantile",
     "time_budgets",
     "to_level",
@@ -31,6 +35,8 @@ __all__ = [
 #: Factors within which two scores are the same: what a busy machine does to the minimum of a few repeats, and what
 #: one run more or less within a time does to a mean residual.
 NOISE, RESIDUAL_NOISE = 1.25, 2.0
+HALF = 0.5  # of the start's residual: a case is served where at most that is left
+QUANTILE = 0.9  # of the residuals in a time or with sweeps, over the cases: misses cannot be averaged away
 Groups = Mapping[tuple[str, str], Sequence[Record]]  # usable runs by (case, solver)
 FIRST = "auto"  # among equals: the only name that needs no choice
 
@@ -42,12 +48,14 @@ class Choice:
     solver: str
     solved: int
     cases: int
-    score: float  # what ranks, and what is shown: shifted geometric mean of times [s], or of residuals [-]
-    p95: float = math.nan  # 95th percentile over the cases, of what `score` is the mean of; inf: not reached
+    # What ranks, and what is shown: shifted geometric mean of times [s], or the 90th percentile of residuals [-]
+    score: float
+    p95: float = math.nan  # 95th percentile over the cases, of what `score` is of; inf: not reached
     worst: float = math.nan
     hardest: str = ""  # the case of `worst`
     how: str = ""  # the budget that does it, and for a sequence whether impulses are carried
     iterations: int = 0  # of that budget, 0 where there is none
+    overrun: float = math.nan  # 95th percentile of the line's time over what it was to take
 
 
 @dataclass(frozen=True)
@@ -100,23 +108,24 @@ class Line:
     sequence: bool
     by_level: Mapping[float, Advice]
     by_time: Mapping[float, Advice]
+    by_sweeps: Mapping[float, Advice]
 
 
 def advice(records: Records, times: Sequence[float] = ()) -> list[Line]:
-    """Every recommendation: structures, then sequences; at each level and within each time [s]."""
+    """Every recommendation: structures, then sequences; at each level, within each time [s], with each budget."""
     times = tuple(times) or time_budgets(records)
     steps = {name: walks[0].steps for name, walks in by_sequence(records).items()}
     sizes = {name: len(cases) for name, cases in families(records).items()}
-    lines = []
-    by_sequence_level, by_sequence_time = advice_by_sequence(records, times)
-    for sizes_of, sequence, by_level, by_time in (
-        (sizes, False, advice_by_level(records), advice_by_time(records, times)),
-        (steps, True, by_sequence_level, by_sequence_time),
-    ):
-        for name, size in sizes_of.items():
-            found = ({a.target: a for a in some if a.family == name} for some in (by_level, by_time))
-            lines.append(Line(name, size, sequence, *found))
-    return lines
+    steps_level, steps_time = advice_by_sequence(records, times)
+    found: dict[str, list[dict[float, Advice]]] = defaultdict(lambda: [{}, {}, {}])
+    by_level, by_time = (
+        [*advice_by_level(records), *steps_level],
+        [*advice_by_time(records, times), *steps_time],
+    )
+    for i, some in enumerate((by_level, by_time, advice_by_sweeps(records))):
+        for a in some:
+            found[a.family][i][a.target] = a
+    return [Line(name, size, of is steps, *found[name]) for of in (sizes, steps) for name, size in of.items()]
 
 
 def advice_by_level(records: Records) -> list[Advice]:
@@ -192,10 +201,10 @@ def time_budgets(records: Records) -> tuple[float, ...]:
 
 
 def advice_by_time(records: Records, times: Sequence[float] = ()) -> list[Advice]:
-    """For each structure and time budget: the smallest geometric mean of residuals reached in that time.
+    """For each structure and time budget: who serves most cases in that time, then the residual at the 90th percentile.
 
-    A solver with nothing to show in the time scores 1 on that case: doing nothing. "Solved" counts the
-    cases on which it brought anything back. `times` [s]; `time_budgets` if none are given.
+    A case is served where at most half of the start's residual is left. A solver with nothing to show in the time
+    scores 1 on that case: doing nothing. `times` [s]; `time_budgets` if none are given.
     """
     times, groups = tuple(times) or time_budgets(records), _cold(records)
     return [
@@ -216,39 +225,86 @@ def within(
     groups = groups or _cold(records)
     liars = {(r.case, r.solver) for r in records if r.contradicted}
     places: list[tuple[tuple[float, ...], Choice]] = []
-    hopes: dict[str, float] = {}
+    hopes: dict[str, tuple[tuple[float, ...], float]] = {}
     for solver in sorted({s for c, s in groups if c in cases}):
+        lies = any((c, solver) in liars for c in cases)
         got = {c: _closest(groups.get((c, solver), ()), limit) for c in cases}
-        hoped = (_closest(groups.get((c, solver), ()), NOISE * limit) for c in cases)
-        hopes[solver] = geometric_mean([1.0 if r is None else _score(r.relative) for r in hoped])
-        residuals = {c: 1.0 if r is None else _score(r.relative) for c, r in got.items()}
+        hoped = _residuals({c: _closest(groups.get((c, solver), ()), NOISE * limit) for c in cases})
+        hopes[solver] = ((lies, -_served(hoped)), quantile(list(hoped.values()), QUANTILE))
         done = [r for r in got.values() if r is not None]
         budgets = [r.work["sweeps"] for r in done if "sweeps" in r.work]
         middle = round(median(budgets)) if done and len(budgets) == len(done) else 0
-        choice = Choice(
-            solver=solver,
-            solved=len(done),
-            cases=len(cases),
-            score=geometric_mean(list(residuals.values())),
-            p95=quantile(list(residuals.values()), 0.95),
-            worst=max(residuals.values()),
-            hardest=max(residuals, key=lambda c: residuals[c]),
-            how=f"{middle} sweeps" if middle else "",
-            iterations=middle,
-        )
-        places.append(((any((c, solver) in liars for c in cases),), choice))
+        choice = _by_residual(solver, _residuals(got), f"{middle} sweeps" if middle else "", middle)
+        places.append(((lies, -choice.solved), choice))
     found = ranked(family, limit, places, RESIDUAL_NOISE)
     if found.best is None:
         return found
     best = min(c.score for c in found.ranking[: found.equal])
-    honest = {c.solver for key, c in places if not key[0]}
+    first = min(key for key, _ in places)
     near = [
         c
         for c in found.ranking[found.equal :]
-        if c.solver in honest and hopes[c.solver] <= RESIDUAL_NOISE * best
+        if hopes[c.solver][0] <= first and hopes[c.solver][1] <= RESIDUAL_NOISE * best
     ]
     rest = [c for c in found.ranking[found.equal :] if all(c is not n for n in near)]
     return Advice(family, limit, (*found.ranking[: found.equal], *near, *rest), found.equal + len(near))
+
+
+def _residuals(runs: Mapping[str, Record | None]) -> dict[str, float]:
+    return {c: 1.0 if r is None else _score(r.relative) for c, r in runs.items()}
+
+
+def _served(residuals: Mapping[str, float]) -> int:
+    return sum(r <= HALF for r in residuals.values())
+
+
+def _by_residual(solver: str, residuals: Mapping[str, float], how: str, iterations: int) -> Choice:
+    """A standing by what is left on each case."""
+    values = list(residuals.values())
+    return Choice(
+        solver=solver,
+        solved=_served(residuals),
+        cases=len(values),
+        score=quantile(values, QUANTILE),
+        p95=quantile(values, 0.95),
+        worst=max(values),
+        hardest=max(residuals, key=lambda c: residuals[c]),
+        how=how,
+        iterations=iterations,
+    )
+
+
+def counts_sweeps(r: Record) -> bool:
+    """A budget whose iterations are sweeps, so that it bounds what a solve takes."""
+    return 0 < r.work.get("sweeps", 0) <= r.max_iter
+
+
+def advice_by_sweeps(records: Records) -> list[Advice]:
+    """For each structure and sequence and each budget: who serves most cases with so many sweeps, ranked as in a time.
+
+    Solvers whose iterations are sweeps: the others' cost nobody can compare by number.
+    """
+    liars = {(r.case, r.solver) for r in records if r.contradicted}
+    runs: dict[tuple[str, int, str], dict[str, Record]] = {}
+    for r in records:
+        plain = r.order == "given" and not r.turns and r.start in ("cold", "carried") and r.usable
+        if plain and r.mode == "budget" and counts_sweeps(r):
+            runs.setdefault((r.solver, r.max_iter, "" if r.step < 0 else r.start), {})[r.case] = r
+    steps: dict[str, list[str]] = {}
+    for name, info in records.cases.items():
+        if info.sequence:
+            steps.setdefault(info.sequence, []).append(name)
+    out = []
+    for family, cases in [*families(records).items(), *steps.items()]:
+        for n in sorted({n for _, n, _ in runs}):
+            places: list[tuple[tuple[float, ...], Choice]] = []
+            for (solver, budget, start), by_case in runs.items():
+                if budget != n or not any(c in by_case for c in cases):
+                    continue
+                choice = _by_residual(solver, _residuals({c: by_case.get(c) for c in cases}), start, n)
+                places.append(((any((c, solver) in liars for c in cases), -choice.solved), choice))
+            out.append(ranked(family, float(n), _best_of_each(places), RESIDUAL_NOISE))
+    return out
 
 
 def _closest(runs: Iterable[Record], limit: float) -> Record | None:
@@ -261,53 +317,61 @@ def _score(residual: float) -> float:
 
 
 def advice_by_sequence(records: Records, times: Sequence[float] = ()) -> tuple[list[Advice], list[Advice]]:
-    """For each sequence, by level and by time of a step: which solver, which budget, carried or cold.
-
-    To a level: who brings most steps there, then who takes least time for a step (the mean). In a time (the median
-    step keeps to it): the smallest geometric mean of the residuals; a step that was not solved counts 1. A
-    false claim on any step comes last.
-    """
+    """For each sequence, by level and by time of a step: which solver and budget, carried or cold; see `over_steps`."""
     times = tuple(times) or time_budgets(records)
-    by_level, by_time = [], []
-    for name, walks in by_sequence(records).items():
-        runs = [(w, start, f"{w.asked}, {start}") for w in walks for start in w.residuals]
-        for level in levels_of(records):
-            places: list[tuple[tuple[float, ...], Choice]] = []
-            for w, start, how in runs:
-                solved = sum(r <= level for r in w.residuals[start])
-                steps = list(w.times[start])
+    found = [
+        over_steps(name, walks, levels_of(records), times) for name, walks in by_sequence(records).items()
+    ]
+    return [a for some, _ in found for a in some], [a for _, some in found for a in some]
+
+
+def over_steps(
+    name: str, walks: Sequence[Walk], levels: Sequence[float], times: Sequence[float]
+) -> tuple[list[Advice], list[Advice]]:
+    """Who brings the steps of these walks to each level, and who comes closest in each time [s] of a step.
+
+    To a level, by those that were asked for it or have a budget: who brings most steps there, then the geometric mean
+    of their times. In a time: who serves most steps, then the residual at the 90th percentile; a step that was not
+    solved or took longer counts 1. A false claim on any step comes last. Steps of several sequences count together.
+    """
+    whole = sum({w.sequence: w.steps for w in walks}.values())
+    ways: dict[tuple[str, str, str], list[Walk]] = defaultdict(list)
+    for w in walks:
+        for start in w.residuals:
+            ways[w.solver, w.asked, start].append(w)
+    by_level: list[Advice] = []
+    by_time: list[Advice] = []
+    for target, timed in [*((x, False) for x in levels), *((t, True) for t in times)]:
+        places: list[tuple[tuple[float, ...], Choice]] = []
+        for (solver, asked, start), some in ways.items():
+            taken = [t for w in some for t in w.times[start]]
+            left = [r for w in some for r in w.residuals[start]]
+            first, wrong = some[0], any(w.wrong[start] for w in some)
+            n, how = first.max_iter if first.mode == "budget" else 0, f"{asked}, {start}"
+            if timed:
+                got = [_score(r) if t <= target else 1.0 for t, r in zip(taken, left, strict=True)]
+                got += [1.0] * (whole - len(got))
+                choice = _by_residual(solver, {f"step {i}": r for i, r in enumerate(got)}, how, n)
+            elif first.mode == "tol" and first.tol > target:
+                continue
+            else:
+                solved = sum(r <= target for r in left)
+                score = geometric_mean(taken, SHIFT)
+                slow = f"step {taken.index(max(taken))}"
                 choice = Choice(
-                    solver=w.solver,
+                    solver=solver,
                     solved=solved,
-                    cases=w.steps,
-                    score=sum(steps) / len(steps),
-                    p95=quantile(steps, 0.95),
-                    worst=max(steps),
-                    hardest=f"step {steps.index(max(steps))}",
+                    cases=whole,
+                    score=score,
+                    p95=quantile(taken, 0.95),
+                    worst=max(taken),
+                    hardest=slow,
                     how=how,
-                    iterations=w.max_iter if w.mode == "budget" else 0,
+                    iterations=n,
                 )
-                places.append(((bool(w.wrong[start]), -solved), choice))
-            by_level.append(ranked(name, level, _best_of_each(places), NOISE))
-        for limit in times:
-            places = []
-            for w, start, how in runs:
-                if median(w.times[start]) <= limit:
-                    done = [_score(r) for r in w.residuals[start]]
-                    done += [1.0] * (w.steps - len(done))
-                    choice = Choice(
-                        solver=w.solver,
-                        solved=len(w.residuals[start]),
-                        cases=w.steps,
-                        score=geometric_mean(done),
-                        p95=quantile(done, 0.95),
-                        worst=max(done),
-                        hardest=f"step {done.index(max(done))}",
-                        how=how,
-                        iterations=w.max_iter if w.mode == "budget" else 0,
-                    )
-                    places.append(((bool(w.wrong[start]),), choice))
-            by_time.append(ranked(name, limit, _best_of_each(places), RESIDUAL_NOISE))
+            places.append(((wrong, -choice.solved), choice))
+        found = ranked(name, target, _best_of_each(places), RESIDUAL_NOISE if timed else NOISE)
+        (by_time if timed else by_level).append(found)
     return by_level, by_time
 
 

@@ -127,6 +127,8 @@ def failures(records: Records) -> list[Failure]:
     """Runs to a level that the judge does not confirm (nor the floor excuses), crashes, and false claims."""
     out = []
     for r in records:
+        if r.turns:
+            continue  # the same runs again, in turns
         missed = r.mode == "tol" and not r.success and not r.relative <= 2.0 * r.floor
         proven = r.status == "INFEASIBLE" and not r.contradicted
         lost = not math.isfinite(r.relative) or r.status.startswith(DIED)
@@ -157,7 +159,7 @@ def claims(records: Records) -> list[Claims]:
     """By solver: how often its claim holds."""
     out = []
     for solver in sorted({r.solver for r in records}):
-        mine = [r for r in records if r.solver == solver]
+        mine = [r for r in records if r.solver == solver and not r.turns]
         asked = [r for r in mine if r.mode == "tol"]
         out.append(
             Claims(
@@ -177,7 +179,7 @@ def spreads(records: Records) -> list[Spread]:
     """Where one budget was run in several sweep orders, the residual of each."""
     groups: dict[tuple[str, str, int], dict[str, Record]] = defaultdict(dict)
     for r in records:
-        if r.mode == "budget" and r.start == "cold" and r.step < 0:
+        if r.mode == "budget" and r.start == "cold" and r.step < 0 and not r.turns:
             name = f"{r.order} {r.seed}" if r.order == "random" else r.order
             groups[r.case, r.solver, r.max_iter][name] = r
     return [
@@ -191,6 +193,8 @@ def budgets(records: Records) -> dict[tuple[str, str, str], list[tuple[int, floa
     """(case, solver, start) -> (iterations, residual) of the exact budgets, given order."""
     groups: dict[tuple[str, str, str], list[tuple[int, float]]] = defaultdict(list)
     for r in records:
-        if r.mode == "budget" and r.order == "given" and r.step < 0 and r.status == "MAX_ITERATIONS":
+        if r.mode != "budget" or r.turns:
+            continue
+        if r.order == "given" and r.step < 0 and r.status == "MAX_ITERATIONS":
             groups[r.case, r.solver, r.start].append((r.iterations, r.relative))
     return {key: sorted(points) for key, points in groups.items()}

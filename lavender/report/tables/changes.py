@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 from collections import defaultdict
 from dataclasses import dataclass
+from statistics import median
 
 from lavender.bench.store import Records
 from lavender.report.tables.cases import reaches
 from lavender.report.tables.groups import levels_of, pairs
 
-__all__ = ["NOISE", "Change", "changes"]
+__all__ = ["NOISE", "Change", "changes", "drift"]
 
 
 @dataclass(frozen=True)
@@ -41,7 +42,8 @@ NOISE = 1.25  # a factor of time below which nothing is said: what a busy machin
 def changes(old: Records, new: Records) -> list[Change]:
     """Time to each level in two runs, on the cases whose numbers are the same in both.
 
-    Noise is at least `NOISE`, and at least twice the spread between minimum and median of either run.
+    Noise is at least `NOISE`, and at least twice the spread between minimum and median of either run. Earlier times are
+    in what the machine is worth now: multiplied by the drift of the case, where both runs know it.
     """
     levels = levels_of(new)
     same = {name for name, info in new.cases.items() if name in old.cases and old.cases[name].sha == info.sha}
@@ -57,6 +59,16 @@ def changes(old: Records, new: Records) -> list[Change]:
         key = (row.case, row.solver, row.start)
         if row.case not in same or key not in before:
             continue
+        worth = drift(old, new, row.case)
         noise = max(NOISE, 1.0 + 2.0 * (spread[key] - 1.0))
-        out += [Change(*key, x, before[key].times[x], row.times[x], noise) for x in levels]
+        out += [Change(*key, x, worth * before[key].times[x], row.times[x], noise) for x in levels]
     return out
+
+
+def drift(old: Records, new: Records, case: str = "") -> float:
+    """Time of the loop of fixed work now over then, medians beside the runs of a case, or of all; 1 where not known."""
+    found = []
+    for records in (old, new):
+        some = [r.pace for r in records if r.pace and (not case or r.case == case)]
+        found.append(median(some) if some else math.nan)
+    return found[1] / found[0] if all(map(math.isfinite, found)) else 1.0

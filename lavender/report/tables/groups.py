@@ -23,7 +23,7 @@ def pairs(records: Iterable[Record]) -> dict[tuple[str, str, str], list[Record]]
     """Runs in the given order of blocks, by (case, solver, start)."""
     groups: dict[tuple[str, str, str], list[Record]] = defaultdict(list)
     for r in records:
-        if r.order == "given" and r.step < 0:
+        if r.order == "given" and r.step < 0 and not r.turns:
             groups[r.case, r.solver, r.start].append(r)
     return dict(groups)
 

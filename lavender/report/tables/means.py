@@ -7,11 +7,22 @@ from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+from lavender.bench.record import Record
 from lavender.bench.store import Records
 from lavender.report.tables.cases import reaches
 from lavender.report.tables.groups import levels_of
 
-__all__ = ["SHIFT", "Profile", "geometric_mean", "geometric_means", "limit_of", "profiles", "times_to"]
+__all__ = [
+    "SHIFT",
+    "Backend",
+    "Profile",
+    "backends",
+    "geometric_mean",
+    "geometric_means",
+    "limit_of",
+    "profiles",
+    "times_to",
+]
 
 
 #: s, of the geometric means, whoever takes part: what is quicker than that differs by Python's share of a call.
@@ -71,6 +82,41 @@ def geometric_means(records: Records) -> dict[str, dict[float, dict[str, tuple[f
                 )
             out[law][level] = dict(sorted(by.items(), key=lambda kv: kv[1][0]))
     return out
+
+
+@dataclass(frozen=True)
+class Backend:
+    """A solver of another package to the middle level, on the cases that it brings there."""
+
+    solver: str
+    solved: int
+    whole: float  # s, geometric mean of the whole way from a problem
+    own: float  # s, of its own solve, on data that it was given before
+    wins: int  # cases on which that is less than the fastest of ours takes
+
+
+def backends(records: Records) -> list[Backend]:
+    """Those of which both times are known; by their own interface first the fastest."""
+    levels = levels_of(records)
+    level = levels[len(levels) // 2]
+    best: dict[tuple[str, str], Record] = {}
+    for r in records:
+        key = (r.solver, r.case)
+        reached = r.usable and r.relative <= level and r.start == "cold" and not r.turns
+        if reached and (key not in best or r.time_min < best[key].time_min):
+            best[key] = r
+    ours: dict[str, float] = {}
+    for (_, case), r in best.items():
+        if r.own_min is None:
+            ours[case] = min(r.time_min, ours.get(case, math.inf))
+    out = []
+    for solver in sorted({r.solver for r in best.values() if r.own_min is not None}):
+        mine = {c: r for (s, c), r in best.items() if s == solver and r.own_min is not None}
+        owns = {c: r.own_min or 0.0 for c, r in mine.items()}
+        whole = geometric_mean([r.time_min for r in mine.values()], SHIFT)
+        wins = sum(t < ours.get(c, math.inf) for c, t in owns.items())
+        out.append(Backend(solver, len(mine), whole, geometric_mean(list(owns.values()), SHIFT), wins))
+    return sorted(out, key=lambda b: b.own)
 
 
 def _laws(records: Records) -> dict[str, list[str]]:

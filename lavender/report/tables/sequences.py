@@ -60,7 +60,7 @@ def walks(records: Records) -> list[Walk]:
         lambda: defaultdict(list)
     )
     for r in records:
-        if r.step >= 0 and r.case in records.cases:
+        if r.step >= 0 and not r.turns and r.case in records.cases:
             name = records.cases[r.case].sequence
             groups[name, r.solver, r.mode, r.tol, r.max_iter][r.start].append(r)
     steps = Counter(info.sequence for info in records.cases.values())

@@ -1,0 +1,73 @@
+"""Time that a backend spends in its own solve, within a call through the front door: the rest is conversion and ours.
+
+The object or function of its own interface is wrapped while the call runs. Backends that set up within their one
+function (daqp, quadprog, scs) have that in it, too.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from time import perf_counter
+from typing import Any
+from unittest.mock import patch
+
+__all__ = ["OWN", "own_time"]
+
+#: module:class.method or module:function, as the calls in this package and in qpsolvers look them up.
+OWN = {
+    "clarabel": ("clarabel:DefaultSolver.solve",),
+    "clarabel_cone": ("clarabel:DefaultSolver.solve",),
+    "daqp": ("daqp:solve",),
+    "highs": ("highspy:Highs.run",),
+    "osqp": ("osqp:OSQP.solve",),
+    "piqp": ("piqp:DenseSolver.solve", "piqp:SparseSolver.solve"),
+    "proxqp": ("proxsuite.proxqp.dense:QP.solve", "proxsuite.proxqp.sparse:QP.solve"),
+    "qpalm": ("qpalm:Solver.solve",),
+    "quadprog": ("qpsolvers.solvers.quadprog_:solve_qp",),
+    "scs": ("qpsolvers.solvers.scs_:solve",),
+}
+
+
+class _Watched:
+    """An object of a backend, one of whose methods is timed."""
+
+    def __init__(self, inner: Any, method: str, timed: Callable[..., Any]) -> None:
+        object.__setattr__(self, "_inner", inner)
+        object.__setattr__(self, method, timed(getattr(inner, method)))
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._inner, name)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        setattr(self._inner, name, value)
+
+
+@contextmanager
+def own_time(solver: str) -> Iterator[list[float]]:
+    """A list that receives the time [s] of each call into the backend; it stays empty where that is not known."""
+    spent: list[float] = []
+
+    def timed(function: Callable[..., Any]) -> Callable[..., Any]:
+        def call(*args: Any, **kwargs: Any) -> Any:
+            begun = perf_counter()
+            try:
+                return function(*args, **kwargs)
+            finally:
+                spent.append(perf_counter() - begun)
+
+        return call
+
+    with ExitStack() as stack:
+        for place in OWN.get(solver, ()):
+            path, _, name = place.partition(":")
+            name, _, method = name.partition(".")
+            module = importlib.import_module(path)
+            true = getattr(module, name)
+
+            def watched(*args: Any, true: Any = true, method: str = method, **kwargs: Any) -> Any:
+                return _Watched(true(*args, **kwargs), method, timed)
+
+            stack.enter_context(patch.object(module, name, watched if method else timed(true)))
+        yield spent

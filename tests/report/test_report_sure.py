@@ -1,0 +1,156 @@
+"""How sure a recommendation is: resamplings, misses that count, drift, and what others take by their own interface."""
+
+import random
+
+import pytest
+
+from lavender import bench, report
+from lavender.report import tables
+from lavender.report.tables.finals import in_time, lines, to_level
+from lavender.report.verdict import verdict
+from tests.report.test_report import record, records_of
+
+CASES = [f"case {i}" for i in range(6)]
+ROBOTS = {"ant": 1.0, "cheetah": 3.0, "hopper": 0.7, "humanoid": 5.0, "walker": 1.5, "reacher": 0.4}
+
+
+def in_turns(speeds, seed, cases=CASES, noise=1.04, rerun=1.0, sizes=None, repeats=7):
+    """Records of lines that took turns: each case has its size, each repetition its noise, a rerun its own machine."""
+    rng = random.Random(seed)
+    machine = rerun ** rng.uniform(-1.0, 1.0)
+    made = []
+    for i, case in enumerate(cases):
+        size = machine * 1e-3 * (1.0 + i if sizes is None else sizes[case])
+        for solver, of_case in speeds.items():
+            factor = of_case if isinstance(of_case, float) else of_case(i)
+            times = tuple(size * factor * noise ** rng.gauss(0.0, 1.0) for _ in range(repeats))
+            more = {"way": "call", "times": times, "pace": 1e-4 * machine}
+            made.append(record(case, solver, min(times), 1e-7, turns="one", **more))
+            made.append(record(case, solver, min(times), 1e-7, **more))
+    return records_of(*made)
+
+
+def race(records, level=1e-6):
+    return to_level(records, lines(records, "call"), level)
+
+
+def test_a_clear_winner_is_named_alone_and_wins_every_resampling():
+    found = race(in_turns({"auto": 1.5, "fast": 1.0, "slow": 2.0}, 0))
+    assert found.named == ("fast",)
+    assert found.shares[0] == 1.0
+    assert found.loss == 1.0
+    (said,) = (s for s in verdict(in_turns({"auto": 1.5, "fast": 1.0}, 0)).sentences if "resamplings" in s)
+    assert said == "It wins in 100 % of resamplings."
+
+
+def test_cases_that_disagree_make_it_unsure_and_both_are_named():
+    speeds = {"even": 1.0, "odd": lambda i: (0.5, 2.0)[i % 2]}
+    found = race(in_turns(speeds, 0))
+    assert set(found.named) == {"even", "odd"}
+    assert found.shares[0] < 0.9
+    assert found.loss > 1.05
+    text = verdict(in_turns(speeds, 0)).text
+    assert "as good: " in text
+
+
+@pytest.mark.parametrize(
+    ("speeds", "noise"),
+    [({"auto": 1.02, "newton": 1.0, "nncg": 1.6}, 1.04), ({"a": 1.0, "b": 1.0, "c": 1.01, "d": 1.4}, 1.1)],
+)
+def test_three_reports_of_a_near_tie_name_the_same_set(speeds, noise):
+    """Each report is of another hour, on a machine up to 1.6 times as fast; the truly fastest is among the named."""
+    fastest = min(speeds, key=speeds.get)
+    agreed = []
+    for first in range(0, 60, 3):
+        found = [
+            race(in_turns(speeds, seed, tuple(ROBOTS), noise, rerun=1.6, sizes=ROBOTS, repeats=21))
+            for seed in range(first, first + 3)
+        ]
+        assert all(fastest in f.named for f in found)
+        agreed.append(len({frozenset(f.named) for f in found}) == 1)
+    assert sum(agreed) >= 19  # of 20: two standard errors are no certainty
+
+
+def test_who_misses_a_case_is_never_the_first_whatever_the_mean_says():
+    made = []
+    for case in CASES:
+        sure, quick = (1e-3, 1e-7), (1e-6, 1.0 if case == CASES[0] else 1e-12)
+        for solver, (t, left) in (("sure", sure), ("quick", quick)):
+            made.append(record(case, solver, t, left, way="call", turns="one", times=(t,) * 3))
+    found = race(records_of(*made))
+    assert found.ranking[0][1].solver == "sure"
+    assert [c.solved for _, c in found.ranking] == [6, 5]
+
+
+def test_in_a_time_misses_count_and_the_sentence_says_how_many():
+    """Nearly exact on seven cases of ten and nothing on three ranks behind a little on all of them."""
+    cases = [f"c{i}" for i in range(10)]
+    made = []
+    for i, case in enumerate(cases):
+        made.append(record(case, "whole", 1.0, 1e-7))
+        for solver, left in (("deep", 1e-15 if i < 7 else 1.0), ("wide", 1e-1)):
+            budget = {"mode": "budget", "tol": 0.0, "max_iter": 8, "work": {"sweeps": 8}, "claims": False}
+            made.append(record(case, solver, 1e-4, left, **budget))
+    found = records_of(*made)
+    (advice,) = report.advice_by_time(found, [1e-3])
+    assert [(c.solver, c.solved, c.score) for c in advice.ranking][:2] == [
+        ("wide", 10, 0.1),
+        ("deep", 7, 1.0),
+    ]
+    said = verdict(found, [1e-3]).sentences
+    assert any("take wide, 8 sweeps: it serves 10 of 10" in s for s in said)
+    alone = verdict(records_of(*(r for r in made if r.solver != "wide")), [1e-3]).sentences
+    assert any("take deep, 8 sweeps: it serves 7 of 10" in s for s in alone)
+    (swept,) = report.tables.advice_by_sweeps(found)
+    assert (swept.target, swept.best.solver) == (8.0, "wide")
+    assert any(s.startswith("With 8 sweeps, take wide") for s in verdict(found, sweeps=[8]).sentences)
+
+
+def test_what_comes_too_late_in_more_than_one_repetition_of_twenty_is_not_served():
+    def line(solver, late):
+        times = (2e-3,) * late + (0.5e-3,) * (20 - late)
+        more = {"mode": "time", "time_limit": 0.5e-3, "way": "call", "turns": "one", "times": times}
+        return record("a", solver, min(times), 1e-2, reached=(1e-2,) * 20, **more)
+
+    found = records_of(line("punctual", 1), line("late", 2))
+    served = {c.solver: c.solved for _, c in in_time(found, lines(found, "call"), 1e-3).ranking}
+    assert served == {"punctual": 1, "late": 0}
+
+
+def test_no_iteration_limit_of_a_factorising_solver_is_offered_for_a_time():
+    newton = {"mode": "budget", "tol": 0.0, "max_iter": 8, "work": {"factorisations": 8}, "claims": False}
+    found = records_of(record("a", "newton", 1.0, 1e-7), record("a", "newton", 1e-4, 1e-3, **newton))
+    assert verdict(found, [1e-3]).code == (
+        'lv.solve(problem, "newton", tol=1e-6)  # not timed as a line: 1.00 s, one call',
+    )
+
+
+def test_a_slower_machine_is_no_slower_code():
+    old = in_turns({"pgs": 1.0, "auto": 1.0}, 0, noise=1.0)
+    by = [bench.Record(**{**vars(r), "time_min": 1.6 * r.time_min, "pace": 1.6 * r.pace}) for r in old]
+    slower = [bench.Record(**{**vars(r), "time_min": 1.6 * r.time_min}) for r in old]
+    assert {c.kind for c in tables.changes(old, records_of(*by))} == {"same"}
+    assert {c.kind for c in tables.changes(old, records_of(*slower))} == {"slower"}
+    assert tables.drift(old, records_of(*by)) == pytest.approx(1.6)
+
+
+def test_backends_are_told_by_their_own_interface_too():
+    found = bench.run(["stack(n=6)"], ["auto", "osqp"], bench.Plan(levels=(1e-6,), budgets=(), repeats=2))
+    (osqp,) = tables.backends(found)
+    (r,) = (r for r in found if r.solver == "osqp")
+    assert 0.0 < r.own_min < r.time_min
+    assert (osqp.solver, osqp.solved) == ("osqp", 1)
+    assert osqp.own == pytest.approx(r.own_min)
+    assert osqp.whole == pytest.approx(r.time_min)
+
+
+def test_the_headline_is_of_all_sequences():
+    made = []
+    for name in ("a", "b", "c"):
+        for step in range(4):
+            for solver, t in (("auto", 1e-3), ("pgs", {"a": 1e-4}.get(name, 1e-2))):
+                made.append(record(f"{name}[{step}]", solver, t, 1e-7, start="carried", step=step))
+    found = records_of(*made)
+    for case, info in list(found.cases.items()):
+        found.add(bench.CaseInfo(**{**vars(info), "sequence": case[0], "step": int(case[2])}))
+    assert verdict(found).sentences[0].startswith("Use auto: 1.00 ms to 1e-6 on a step of your 3 sequences")
