@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from lavender.many import solve_many
     from lavender.motion import MotionError, Motions, motion_error, motions
     from lavender.scene import Scene
+    from lavender.suspicions import Suspicion, diagnose
 
 # Public name -> module that holds it; the module itself where both are the same.
 _LATER = {
@@ -46,8 +47,10 @@ _LATER = {
     "Scene": "lavender.scene",
     "Simulation": "lavender.engine",
     "Snapshot": "lavender.engine",
+    "Suspicion": "lavender.suspicions",
     "bench": "lavender.bench",
     "cross_check": "lavender.check",
+    "diagnose": "lavender.suspicions",
     "engine": "lavender.engine",
     "io": "lavender.io",
     "load": "lavender.io",
@@ -88,11 +91,13 @@ __all__ = [
     "SolverSpec",
     "SolverUnavailable",
     "Status",
+    "Suspicion",
     "UnknownName",
     "__version__",
     "available",
     "bench",
     "cross_check",
+    "diagnose",
     "engine",
     "get",
     "io",

@@ -315,7 +315,8 @@ class Problem:
         ----------
         rows : Rows
         target : scalar or (m,) m/s
-            Wanted relative velocity after the step: 0 holds, -depth/dt pushes out, -e v_n bounces.
+            Wanted relative velocity after the step: 0 holds, +depth/dt pushes out (depth positive inside), -e v_n
+            bounces off an approach v_n < 0. A gap is a negative depth.
         lower, upper : scalar or (mj,) N s
             Bounds of the joint rows.
         mu : scalar or (c,)
@@ -330,6 +331,28 @@ class Problem:
         ------
         InputError
             mu > 0 at a contact without tangents and spin, which no row could feel.
+
+        Examples
+        --------
+        A ball of 2 kg and 0.1 m, 0.01 m deep in the ground, is out of it after the step:
+
+        >>> import numpy as np
+        >>> import lavender as lv
+        >>> dt, depth = 1 / 60, 0.01
+        >>> ball = lv.Rows(
+        ...     inv_mass=[0.5],
+        ...     inv_inertia=[np.eye(3) / (0.4 * 2 * 0.1**2)],
+        ...     v_free=[[0.0, 0.0, -9.81 * dt, 0.0, 0.0, 0.0]],
+        ...     contact_body=[(-1, 0)],
+        ...     normal=[(0.0, 0.0, 1.0)],
+        ...     tangent=[(1.0, 0.0, 0.0)],
+        ...     arm_a=[(0.0, 0.0, 0.0)],
+        ...     arm_b=[(0.0, 0.0, -0.09)],
+        ... )
+        >>> impulse = lv.solve(lv.Problem.from_rows(ball, target=depth / dt), tol=1e-9).impulse
+        >>> v = ball.v_free[0, 2] + 0.5 * impulse[0]  # m/s
+        >>> round(float(v * dt), 6)  # m: it rises by its depth
+        0.01
         """
         if not isinstance(rows, Rows):
             raise InputError(f"rows is a {type(rows).__name__}; a Rows is needed")
@@ -390,7 +413,8 @@ class Problem:
         v_free : (nv,) m/s, rad/s
             v*, the velocity after the step without constraint impulses.
         target : scalar or (m,) m/s
-            Wanted relative velocity after the step: 0 holds, -depth/dt pushes out, -e v_n bounces.
+            Wanted relative velocity after the step: 0 holds, +depth/dt pushes out (depth positive inside), -e v_n
+            bounces off an approach v_n < 0. A gap is a negative depth.
         cones : Cones
         compliance : scalar or (m,) 1/kg, optional
         friction : {"coulomb", "cone"}
@@ -416,6 +440,13 @@ class Problem:
         >>> solution = lv.solve(problem, tol=1e-9)
         >>> solution.impulse.round(3).tolist()  # N s: it slides, 0.579 = 0.5 x 1.158
         [1.158, -0.579]
+
+        The same with the tip 0.01 m inside the wall, and a step of 1/60 s:
+
+        >>> inside = problem.updated(target=[0.01 * 60, 0.0])
+        >>> pushed = lv.solve(inside, tol=1e-9)
+        >>> round(float((inside.generalized.velocity_of(inside.velocity(pushed.impulse)))[0] / 60), 6)  # m
+        0.01
         """
         generalized = J if isinstance(J, Generalized) else Generalized(J, M, v_free, dof_names)
         m = generalized.m

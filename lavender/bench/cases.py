@@ -23,6 +23,7 @@ from lavender.errors import InputError
 from lavender.problem import Problem
 from lavender.residuals import nothing_to_do, residual
 from lavender.suite import Case
+from lavender.suspicions import diagnose
 
 __all__ = ["SUFFIXES", "Item", "describe", "is_path", "resolve", "sequence", "steps_in", "structure_of"]
 
@@ -252,6 +253,7 @@ def describe(item: Item, run: str) -> CaseInfo:
         step=item.step,
         stored=_stored(item, p),
         nothing_to_do=nothing_to_do(p),
+        suspicions=tuple(map(str, diagnose(p))),
     )
 
 

@@ -134,6 +134,7 @@ class CaseInfo(_Texts):
     sequence: str = ""  # name of the sequence that this is a step of
     step: int = -1
     nothing_to_do: bool = False  # doing nothing is right: nobody solves it, nobody fails
+    suspicions: tuple[str, ...] = ()  # what looks like a mistake in its data
 
 
 @dataclass(frozen=True)

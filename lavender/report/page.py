@@ -21,7 +21,7 @@ from lavender.report.moved import (
 )
 from lavender.report.svg import svg
 from lavender.report.tables.advice import NOISE, RESIDUAL_NOISE
-from lavender.report.text import count, residual, seconds, times
+from lavender.report.text import count, residual, seconds, suspicions, times
 from lavender.report.verdict import verdict
 
 if TYPE_CHECKING:
@@ -130,6 +130,7 @@ def _content(
         },
         "verdict": found,
         "idle": still,
+        "suspicions": suspicions(records),
         "moved": [] if campaign else moved(records),
         "speeds": speed_levels(records),
         "speed_advice": {} if campaign else _by_family(advice_by_speed(records)),

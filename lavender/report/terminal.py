@@ -18,7 +18,7 @@ from lavender.report.moved import (
     speed_name,
     working,
 )
-from lavender.report.text import count, in_time, residual, seconds, to_level
+from lavender.report.text import count, in_time, residual, seconds, suspicions, to_level
 from lavender.report.verdict import verdict
 
 if TYPE_CHECKING:
@@ -194,6 +194,7 @@ def print_report(
     if len(still) > FEW:
         console.print(f"and {len(still) - FEW} more with nothing to do", highlight=False, style="dim")
     _print_lost(records, console)
+    _print_suspicions(records, console)
     if not campaign:
         _print_tables(records, console, levels, whole)
     if old is not None:
@@ -263,6 +264,15 @@ def _print_lost(records: Records, console: Console) -> None:
             markup=False,
             style="dim",
         )
+
+
+def _print_suspicions(records: Records, console: Console) -> None:
+    found = suspicions(records)
+    for case, told in found[:FEW]:
+        console.print("[yellow]suspicious:[/]", end=" ")
+        console.print(f"{case}: {told}", highlight=False, markup=False)
+    if len(found) > FEW:
+        console.print(f"and {len(found) - FEW} more, on the page", highlight=False, style="dim")
 
 
 def _print_tables(records: Records, console: Console, levels: Sequence[float], whole: bool) -> None:

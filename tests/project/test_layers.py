@@ -25,7 +25,7 @@ LEVELS = [
     {"registry"},
     {"external", "solvers"},
     {"solve"},
-    {"check", "many", "motion", "redundancy"},
+    {"check", "many", "motion", "redundancy", "suspicions"},
     {"scene"},
     {"engine"},
     {"suite"},
