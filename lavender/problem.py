@@ -742,6 +742,65 @@ class Problem:
         measure.velocity_change(self.data, self.impulse_array(impulse), v)
         return self.rows.v_free + v
 
+    def carry(self, previous: Any, keys: Any = None) -> FloatArray:
+        """Start (m,) [N s] from the impulses of the step before: each block's by its key, the others Pi(0).
+
+        A block that has changed its kind or its number of rows starts anew. Where a problem has no keys,
+        impulses stay if both have the same blocks. Impulses of tangents are taken as they are: keep the directions of a
+        contact's tangents from step to step.
+
+        Parameters
+        ----------
+        previous : Solution, or (Problem, impulse)
+            Of the step before; its problem has keys.
+        keys : (k,) unsigned int, optional
+            Of this problem's blocks; default: `key`.
+
+        Raises
+        ------
+        InputError
+            No solution, keys of another length, or keys here and none before.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> import lavender as lv
+        >>> first = lv.Problem.lcp(np.eye(3), [1.0, 2.0, 3.0], key=np.array([7, 8, 9]))
+        >>> solution = lv.solve(first)
+        >>> second = lv.Problem.lcp(np.eye(2), [3.1, 5.0], key=np.array([9, 4]))  # one stays, one is new
+        >>> second.carry(solution).tolist()
+        [3.0, 0.0]
+        >>> lv.solve(second, impulse=second.carry(solution)).success
+        True
+        """
+        if isinstance(previous, tuple) and len(previous) == 2 and isinstance(previous[0], Problem):
+            before, impulse = previous[0], previous[0].impulse_array(previous[1])
+        elif hasattr(previous, "residual") and hasattr(previous, "impulse"):
+            before, impulse = previous.residual._problem, previous.impulse
+        else:
+            raise InputError(
+                f"previous is a {type(previous).__name__}; a Solution, or (problem, impulse), is needed"
+            )
+        if keys is not None:
+            if before.key is None:
+                raise InputError("the problem of the step before has no keys: make it with key=")
+            return replace(self, key=keys, copy=False).carry((before, impulse))
+        start = self.start()
+        old, new = before.cones, self.cones
+        if self.key is None or before.key is None:
+            if np.array_equal(old.ptr, new.ptr) and np.array_equal(old.kind, new.kind):
+                start[:] = impulse
+            return start
+        place = {key: i for i, key in enumerate(before.key.tolist())}
+        for block, key in enumerate(self.key.tolist()):
+            i = place.get(key)
+            if i is None or old.kind[i] != new.kind[block]:
+                continue
+            here, there = slice(new.ptr[block], new.ptr[block + 1]), slice(old.ptr[i], old.ptr[i + 1])
+            if here.stop - here.start == there.stop - there.start:
+                start[here] = impulse[there]
+        return start
+
     def start(self) -> FloatArray:
         """Pi(0) (m,) [N s]: doing nothing, clipped to the bounds; a new array."""
         return self._start.copy()
