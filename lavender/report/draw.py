@@ -48,6 +48,8 @@ def matplotlib_figure(figure: Figure, look: dict[str, Look]) -> Any:
         }
         if c.points:
             style["linestyle"] = "none"
+        if c.low:
+            axes.fill_between(c.x, c.low, c.high, color=k.color, alpha=0.15, linewidth=0.0)
         if c.steps:
             last = max(x for d in figure.curves for x in d.x) * 1.3
             axes.step([*c.x, last], [*c.y, c.y[-1]], where="post", **style)
@@ -55,7 +57,7 @@ def matplotlib_figure(figure: Figure, look: dict[str, Look]) -> Any:
             axes.plot(
                 c.x,
                 c.y,
-                marker=k.marker if len(c.x) <= MANY else "",
+                marker=k.marker if len(c.x) <= MANY and not c.low else "",
                 markersize=4,
                 markerfacecolor="none" if c.thin else k.color,
                 **style,

@@ -6,12 +6,14 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
+from lavender.bench.cases import SUFFIXES
 from lavender.bench.record import Record, level_name
 from lavender.bench.store import Records
 from lavender.report import tables
 from lavender.report.moved import by_speed, speed_levels, speed_name
 from lavender.report.tables import Advice
 from lavender.report.text import count, residual, seconds
+from lavender.suite import FAMILIES
 
 __all__ = ["Verdict", "verdict"]
 
@@ -161,6 +163,8 @@ def _budget(solver: str, iterations: int) -> str:
 def _name(records: Records, cases: Sequence[str]) -> str:
     words = [set(records.cases[c].structure) for c in cases]
     shape = next((s for s in SHAPES if all(s in w for w in words)), "")
+    if all(c.partition("(")[0] in FAMILIES and not records.cases[c].source.endswith(SUFFIXES) for c in cases):
+        return f"the {count(len(cases), 'built-in problem')}" if len(cases) > 1 else cases[0]
     if shape in ("", "separate", "dense"):
         return f"your {count(len(cases), 'problem')}" if len(cases) > 1 else "your problem"
     plural = {"mesh": "meshes"}.get(shape, shape + "s")
