@@ -55,7 +55,7 @@ def test_the_first_sentence_is_by_motion_error_where_that_was_asked_for(records)
     assert solution.motion_error().speed <= 1e-4
     plain = records_without(records, "speed_levels")
     found = verdict(moved.working(plain))
-    assert found.sentences[0].startswith("Use ") and " to 1e-3 on your stack" in found.sentences[0]
+    assert found.sentences[0].startswith("Use ") and " to 1e-3 on stack(n=16)" in found.sentences[0]
     assert found.sentences[-1].startswith("By motion error ") and "1e-3 m/s" in found.sentences[-1]
 
 
