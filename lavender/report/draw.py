@@ -29,15 +29,16 @@ def power_on_axis(x: float, _position: object = None) -> str:
     return f"{x:.3g}" if 0.09 < x < 1e4 else level_name(x)
 
 
-def matplotlib_figure(figure: Figure, look: dict[str, Look]) -> Any:
-    """The figure drawn, without pyplot and its global state."""
+def matplotlib_figure(figure: Figure, look: dict[str, Look], size: tuple[float, float] = (7.6, 4.6)) -> Any:
+    """The figure drawn, `size` in inches, without pyplot and its global state."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure as Canvas
 
-    canvas = Canvas(figsize=(7.6, 4.6))
+    canvas = Canvas(figsize=size)
     FigureCanvasAgg(canvas)
     # A fixed place for the axes: fitting it to the labels would take most of the time of a figure.
-    axes = canvas.add_axes((0.1, 0.13, 0.63, 0.78))
+    axes = canvas.add_axes((0.76 / size[0], 0.6 / size[1], 1.0 - 2.81 / size[0], 1.0 - 1.01 / size[1]))
+    banded = any(c.low for c in figure.curves)  # over all cases: points are no runs
     for c in figure.curves:
         k = look[c.solver]
         style: dict[str, Any] = {
@@ -57,7 +58,7 @@ def matplotlib_figure(figure: Figure, look: dict[str, Look]) -> Any:
             axes.plot(
                 c.x,
                 c.y,
-                marker=k.marker if len(c.x) <= MANY and not c.low else "",
+                marker="" if len(c.x) > MANY or banded else k.marker,
                 markersize=4,
                 markerfacecolor="none" if c.thin else k.color,
                 **style,

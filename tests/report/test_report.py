@@ -18,6 +18,7 @@ from lavender import bench, report
 from lavender.bench.record import CaseInfo, Record, Run, file_name
 from lavender.report import curves, tables
 from lavender.report.curves import overall_figure
+from lavender.report.paper import write_paper
 from lavender.report.style import looks
 from lavender.report.svg import svg
 from lavender.report.terminal import print_report
@@ -386,6 +387,36 @@ def test_the_first_screen_has_the_choice_and_the_picture(real, tmp_path):
     assert first.count("<svg") == 1
     assert 'class="b"' in first
     assert "built-in" not in first
+
+
+def test_a_paper_is_written_from_records_alone(real, tmp_path):
+    records = real[0]
+    folder = write_paper(records, tmp_path / "paper")
+    pdf = {p.name for p in folder.glob("*.pdf")}
+    assert "over-all.pdf" in pdf
+    assert any(name.startswith("profile-") for name in pdf)
+    assert all(p.read_bytes().startswith(b"%PDF") for p in folder.glob("*.pdf"))
+    before = {p.name: p.read_bytes() for p in folder.iterdir()}
+    write_paper(records, folder)
+    assert {p.name: p.read_bytes() for p in folder.iterdir()} == before  # no clock in it
+    text, method = ((folder / name).read_text(encoding="utf-8") for name in ("tables.tex", "method.tex"))
+    assert (
+        text.count(r"\begin{tabular}")
+        == text.count(r"\end{tabular}")
+        == 2 + len(tables.geometric_means(records))
+    )
+    for line in text.splitlines():
+        if line.endswith(r" \\"):  # as many cells as the head has
+            head = next(
+                h for h in text[: text.index(line) + len(line)].splitlines()[::-1] if "tabular}{" in h
+            )
+            assert len(re.findall(r"(?<!\\)&", line)) == len(head.split("{")[-1].rstrip("}")) - 1
+    unescaped = re.findall(r"(?<!\\)[_#%]", (text + method).replace("% \\usepackage", ""))
+    assert unescaped == []
+    for number in (len(records), len({r.solver for r in records}), len({r.case for r in records})):
+        assert re.search(rf"\b{number} ", method)
+    with pytest.raises(lv.InputError, match="runs with times"):
+        write_paper(records_of(), tmp_path / "none")
 
 
 def test_built_in_problems_are_not_called_yours():
