@@ -207,7 +207,7 @@ def run_scene(
     skip : int
         Steps before the first that is recorded.
     film : path, optional
-        Film of the run: `.gif`, `.png`, `.svg` or `.pdf` are pictures, anything else a file for `lavender view`.
+        Film of the run: `.gif`, `.mp4`, `.png`, `.svg` or `.pdf` are pictures, anything else is for `lavender view`.
     view : bool
         Show the run in a page while it goes on, no faster than it would, and after it until Ctrl-C.
     every : int
