@@ -83,9 +83,10 @@ def diagnose(problem: Problem, impulse: Any = None) -> tuple[Suspicion, ...]:
     if not isinstance(problem, Problem):
         raise InputError(f"problem is a {type(problem).__name__}; a lavender.Problem is needed")
     given = problem.guess if impulse is None else problem.impulse_array(impulse)
-    found = [s for check in _CHECKS for s in check(problem)]
-    if given is not None:
-        found += _impulses(problem, given)
+    with np.errstate(all="ignore"):  # what is beyond float64 is no larger and no smaller than anything
+        found = [s for check in _CHECKS for s in check(problem)]
+        if given is not None:
+            found += _impulses(problem, given)
     return tuple(found)
 
 
@@ -154,7 +155,7 @@ def _twins(p: Problem) -> Iterator[Suspicion]:
     a = p.csr if p.generalized is None else p.generalized.jac
     seen: dict[bytes, int] = {}
     again, opposed = [], []
-    for i in contacts:
+    for i in contacts.tolist():
         j, end = c.ptr[i], c.ptr[i + 1]
         part = slice(a.indptr[j], a.indptr[end])
         index, x = a.indices[part].tobytes() + np.diff(a.indptr[j : end + 1]).tobytes(), a.data[part]
@@ -330,16 +331,18 @@ def _loops(pair: Any, between: FloatArray, n: int) -> FloatArray:
         (np.r_[-np.ones(len(pair)), np.ones(len(pair))], (np.r_[at, at], pair.T.ravel())),
         shape=(len(pair), n),
     )
-    scale = np.abs(between).max() or 1.0
+    scale = np.abs(between).max()
+    if not 0.0 < scale < np.inf:
+        return np.zeros(len(pair))
     weight = np.ones(len(pair))
     for _ in range(8):
-        normal = incidence.T @ sp.diags_array(weight) @ incidence + sp.diags_array(
-            np.full(n, 1e-12 * weight.max())
+        normal = incidence.T @ sp.diags_array(weight) @ incidence + 1e-9 * sp.eye_array(n)
+        centre = sp.linalg.splu(sp.csc_array(normal)).solve(
+            incidence.T @ (weight[:, None] * (between / scale))
         )
-        centre = sp.linalg.splu(sp.csc_array(normal)).solve(incidence.T @ (weight[:, None] * between))
-        off = np.linalg.norm(incidence @ centre - between, axis=1)
-        weight = 1.0 / (off + 1e-4 * scale)
-    return off
+        off = np.linalg.norm(incidence @ centre - between / scale, axis=1)
+        weight = 1.0 / (off + 1e-4)
+    return scale * off
 
 
 # -- masses --------------------------------------------------------------------------------------------------

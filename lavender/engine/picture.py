@@ -193,7 +193,8 @@ def _animate(stage: _Stage, path: Path, size: float, rate: float) -> None:
     canvas = Figure(figsize=(size, size * stage.height + 0.3), layout="constrained")
     axes = canvas.subplots()
     # a shade slower: the milliseconds of a frame, rounded down, are those meant
-    writer = PillowWriter(fps=rate * (1.0 - 1e-9)) if suffix == ".gif" else FFMpegWriter(fps=rate)
+    kind, own = (PillowWriter, rate * (1.0 - 1e-9)) if suffix == ".gif" else (FFMpegWriter, rate)
+    writer: Any = kind(fps=own)  # type: ignore[arg-type]
 
     def write(part: Path) -> None:
         with writer.saving(canvas, str(part) + suffix, dpi=DPI):

@@ -13,7 +13,7 @@ inequalities. Two tangents have a circle of directions to slide in, which no lis
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -131,7 +131,7 @@ def _ways(problem: Problem, block: int, a: FloatArray, b: FloatArray, scale: Flo
     yield _packed([opened, stuck, *slide], problem.m)
 
 
-def _packed(some: list, m: int) -> _Ways:
+def _packed(some: list[Any], m: int) -> _Ways:
     r = len(some[0][0])
     out = _Ways(
         np.zeros((len(some), r, m)),

@@ -220,15 +220,17 @@ def motions(problem: Problem, n: int = RUNS, seed: int = 0, *, always: bool = Fa
     whole = bool(proof)
     if (always or not proof) and (modes := enumerated(problem)) is not None:
         best_last = sorted(modes[0], key=lambda x: -residual(problem, x).relative)
-        apart = {tuple(np.round(problem.slack(x), 9)): x for x in best_last}  # m/s: modes that share a motion
-        ends = [judged(problem, x, "every mode") for x in list(apart.values())[:MANY]]
+        single = {
+            tuple(np.round(problem.slack(x), 9)): x for x in best_last
+        }  # m/s: modes that share a motion
+        ends = [judged(problem, x, "every mode") for x in list(single.values())[:MANY]]
         solved = [end for end in ends if end.accepted]
         found += [(end, "every mode") for end in solved]
         # what rounding lets pass an inequality lies beside a motion that it would otherwise have missed
         beside = (
             min((distance(problem, e.impulse, s.impulse).share for s in solved), default=1.0) for e in ends
         )
-        whole |= modes[1] and len(apart) <= MANY and max(beside, default=1.0) < BESIDE
+        whole |= modes[1] and len(single) <= MANY and max(beside, default=1.0) < BESIDE
     if always or not whole:
         for label, impulse in _runs(problem, own, int(n), int(seed)):
             candidate = judged(problem, impulse, label)

@@ -188,6 +188,18 @@ def test_a_matrix_with_opposed_rows_is_told():
     assert kinds(lv.Problem.contact(a, [0.3, 0.0, 0.0, -0.4, 0.0, 0.0], mu=[0.5, 0.5])) == set()
 
 
+@pytest.mark.parametrize("size", [0.0, 1e-320, 1e-160, 1e160, 1e300])
+@pytest.mark.parametrize("what", ["arm_a", "arm_b", "inv_mass", "inv_inertia", "v_free"])
+def test_numbers_at_the_edge_of_float64_are_looked_at(what, size):
+    for name in SCENES:
+        rows, target = given(SCENES[name])
+        try:
+            problem = made(SCENES[name], rows | {what: size * rows[what]}, target)
+        except lv.InputError:  # b is not finite
+            continue
+        assert all(isinstance(s.reason, str) for s in lv.diagnose(problem, np.full(problem.m, 1e300)))
+
+
 def test_what_is_no_problem_is_refused():
     with pytest.raises(lv.InputError, match=r"lavender\.Problem is needed"):
         lv.diagnose(np.eye(3))
