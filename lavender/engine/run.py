@@ -30,7 +30,7 @@ class Trace:
     scene: str
     time: FloatArray  # (steps,) s, simulated
     solver: FloatArray  # (steps, 8) see SOLVER_FIELDS
-    depth: FloatArray  # (steps,) m, deepest penetration
+    depth: FloatArray  # (steps,) m, largest depth
     cost: FloatArray  # (steps,) s, wall time of the step
     lost_body: str = ""  # name of the body that ended the run, or empty
     recorded: int = 0  # problems written
@@ -86,7 +86,7 @@ class Trace:
         for axes in (top, middle):
             axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8, frameon=False)
         bottom.plot(self.time, 1e3 * self.depth)
-        bottom.set(title="deepest penetration", xlabel="time [s]", ylabel="[mm]", ylim=(0, None))
+        bottom.set(title="largest depth", xlabel="time [s]", ylabel="[mm]", ylim=(0, None))
         try:
             canvas.savefig(path)
         except (OSError, ValueError) as error:
