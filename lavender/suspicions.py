@@ -166,7 +166,7 @@ def _twins(p: Problem) -> Iterator[Suspicion]:
         seen.setdefault(b"-" + a.indices[row].tobytes() + a.data[row].tobytes(), i)
         if other is not None and len(a.data[row]) and p.b[j] + p.b[c.ptr[other]] > 1e-9 * np.abs(p.b).max():
             opposed += [other, i]
-    if len(again) > 0.3 * len(contacts):  # collision detection repeats a point now and then
+    if len(again) > max(2, 0.3 * len(contacts)):  # collision detection repeats a point now and then
         yield _of(p, "duplicate rows", f"{len(again)} contacts have the rows of an earlier one", again)
     if opposed:
         yield _of(p, "opposed normals", "normals that ask the same row to go both ways at once", opposed)
