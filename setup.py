@@ -208,5 +208,8 @@ setup(
         # cythonize writes it
         extension(Path(*SHARED.split(".")).with_suffix(".c")),
     ],
+    # An editable install is a line of a .pth file: the finder of setuptools comes after the folders of sys.path, and a
+    # clone named lavender in one of them, as in its parent, would be imported as an empty package.
+    options={"editable_wheel": {"mode": "compat"}},
     cmdclass={"build_ext": BuildKernels, "build_wasm": BuildWasm, "sdist": ReproducibleArchive},
 )

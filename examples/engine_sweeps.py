@@ -53,7 +53,7 @@ def first_solve(sweeps, order):
 
 
 def run(sweeps, order="alternating", warm=False):
-    """Medians of residual [N s], violation [m/s] and relative residual of all rows [-]; deepest penetration [m]."""
+    """Medians of residual [N s], violation [m/s] and relative residual of all rows [-]; largest depth [m]."""
     scene = lv.Scene("stack", solver_iterations=sweeps, order=order, warm_start=warm)
     sim = lv.Simulation(scene, report_residual=True)
     rows, depth = [], []
@@ -167,7 +167,7 @@ def figure(found, path):
     residual.set(title=f"the run, steps {FIRST} to {LAST}: residual", ylabel="max $|e_n|$ [N s]")
     rows.set(title="judged: all rows", ylabel="relative residual")
     violation.set(title="approach velocity left", ylabel="[m/s]")
-    depth.set(title="deepest penetration", ylabel="[mm]")
+    depth.set(title="largest depth", ylabel="[mm]")
     for warm, style in ((False, "o--"), (True, "s-")):
         stand.plot(BUDGETS, found["standing"][warm], style, markersize=4, label="warm" if warm else "cold")
     stand.set(title=f"how long the stack stands (looked at for {LONG:.0f} s)", xlabel="sweeps", ylabel="[s]")

@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from lavender.many import solve_many
     from lavender.motion import MotionError, Motions, motion_error, motions
     from lavender.scene import Scene
+    from lavender.suspicions import Suspicion, diagnose
 
 # Public name -> module that holds it; the module itself where both are the same.
 _LATER = {
@@ -48,8 +49,10 @@ _LATER = {
     "Scene": "lavender.scene",
     "Simulation": "lavender.engine",
     "Snapshot": "lavender.engine",
+    "Suspicion": "lavender.suspicions",
     "bench": "lavender.bench",
     "cross_check": "lavender.check",
+    "diagnose": "lavender.suspicions",
     "engine": "lavender.engine",
     "io": "lavender.io",
     "load": "lavender.io",
@@ -90,11 +93,13 @@ __all__ = [
     "SolverSpec",
     "SolverUnavailable",
     "Status",
+    "Suspicion",
     "UnknownName",
     "__version__",
     "available",
     "bench",
     "cross_check",
+    "diagnose",
     "engine",
     "get",
     "io",

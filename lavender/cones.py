@@ -28,13 +28,39 @@ ROW, CONTACT, CONTACT_SPIN, ROUND = kernels.KINDS
 
 @dataclass(frozen=True, eq=False)
 class Cones:
-    """Bounds of every block; use the class methods unless blocks are mixed.
+    """Bounds of every block (k of them, m rows): `bounded`, `free`, `contacts`, and sums of these.
+
+    Parameters
+    ----------
+    ptr : (k + 1,) int
+        First row of each block, then m.
+    kind : (k,) int
+        ROW, CONTACT, CONTACT_SPIN or ROUND of each block.
+    lower, upper : (m,) N s
+        Bounds of rows on ROW blocks; infinite ones are allowed, those of contacts are not read.
+    mu : (k,) -
+        Coefficient of friction of each contact.
+    patch_radius : (k,) m
+        Of CONTACT_SPIN: its spin row is bounded by mu r lambda_n [N m s].
 
     Raises
     ------
     InputError
         Shapes that do not fit, lower > upper, NaN bounds, negative mu or patch radius, a contact with
         more rows than normal, two tangents and spin, a round cone of more than five tangents.
+
+    Examples
+    --------
+    A hinge of five rows, a motor that gives at most 2 N s, two contacts of a normal and two tangents:
+
+    >>> import lavender as lv
+    >>> cones = lv.Cones.free(5) + lv.Cones.bounded([-2.0], [2.0]) + lv.Cones.contacts(0.5, count=2)
+    >>> cones.n_blocks, cones.n_rows
+    (8, 12)
+    >>> cones.ptr.tolist()  # each free row is a block of its own
+    [0, 1, 2, 3, 4, 5, 6, 9, 12]
+    >>> cones.mu[-2:].tolist(), cones.upper[5].item()
+    ([0.5, 0.5], 2.0)
     """
 
     ptr: IntArray  # (k + 1,) first row of each block, then m
@@ -129,7 +155,7 @@ class Cones:
 
     @classmethod
     def bounded(cls, lower: FloatArray, upper: FloatArray) -> Cones:
-        """One ROW block for each pair of bounds; arrays (m,) [N s]."""
+        """One ROW block for each pair of bounds: lower <= lambda <= upper, arrays (m,) [N s], infinite ones allowed."""
         made = kernels.bounded_rows(lower, upper)
         if made is not None:
             return cls._of(made)

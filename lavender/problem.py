@@ -319,7 +319,8 @@ class Problem:
         ----------
         rows : Rows
         target : scalar or (m,) m/s
-            Wanted relative velocity after the step: 0 holds, -depth/dt pushes out, -e v_n bounces.
+            Wanted relative velocity after the step: 0 holds, +depth/dt pushes out (depth positive inside), -e v_n
+            bounces off an approach v_n < 0. A gap is a negative depth.
         lower, upper : scalar or (mj,) N s
             Bounds of the joint rows.
         mu : scalar or (c,)
@@ -334,6 +335,28 @@ class Problem:
         ------
         InputError
             mu > 0 at a contact without tangents and spin, which no row could feel.
+
+        Examples
+        --------
+        A ball of 2 kg and 0.1 m, 0.01 m deep in the ground, is out of it after the step:
+
+        >>> import numpy as np
+        >>> import lavender as lv
+        >>> dt, depth = 1 / 60, 0.01
+        >>> ball = lv.Rows(
+        ...     inv_mass=[0.5],
+        ...     inv_inertia=[np.eye(3) / (0.4 * 2 * 0.1**2)],
+        ...     v_free=[[0.0, 0.0, -9.81 * dt, 0.0, 0.0, 0.0]],
+        ...     contact_body=[(-1, 0)],
+        ...     normal=[(0.0, 0.0, 1.0)],
+        ...     tangent=[(1.0, 0.0, 0.0)],
+        ...     arm_a=[(0.0, 0.0, 0.0)],
+        ...     arm_b=[(0.0, 0.0, -0.09)],
+        ... )
+        >>> impulse = lv.solve(lv.Problem.from_rows(ball, target=depth / dt), tol=1e-9).impulse
+        >>> v = ball.v_free[0, 2] + 0.5 * impulse[0]  # m/s
+        >>> round(float(v * dt), 6)  # m: it rises by its depth
+        0.01
         """
         if not isinstance(rows, Rows):
             raise InputError(f"rows is a {type(rows).__name__}; a Rows is needed")
@@ -394,7 +417,8 @@ class Problem:
         v_free : (nv,) m/s, rad/s
             v*, the velocity after the step without constraint impulses.
         target : scalar or (m,) m/s
-            Wanted relative velocity after the step: 0 holds, -depth/dt pushes out, -e v_n bounces.
+            Wanted relative velocity after the step: 0 holds, +depth/dt pushes out (depth positive inside), -e v_n
+            bounces off an approach v_n < 0. A gap is a negative depth.
         cones : Cones
         compliance : scalar or (m,) 1/kg, optional
         friction : {"coulomb", "cone"}
@@ -420,6 +444,13 @@ class Problem:
         >>> solution = lv.solve(problem, tol=1e-9)
         >>> solution.impulse.round(3).tolist()  # N s: it slides, 0.579 = 0.5 x 1.158
         [1.158, -0.579]
+
+        The same with the tip 0.01 m inside the wall, and a step of 1/60 s:
+
+        >>> inside = problem.updated(target=[0.01 * 60, 0.0])
+        >>> pushed = lv.solve(inside, tol=1e-9)
+        >>> round(float((inside.generalized.velocity_of(inside.velocity(pushed.impulse)))[0] / 60), 6)  # m
+        0.01
         """
         generalized = J if isinstance(J, Generalized) else Generalized(J, M, v_free, dof_names)
         m = generalized.m
@@ -716,6 +747,65 @@ class Problem:
         v = np.zeros((self.rows.n_bodies, 6))
         measure.velocity_change(self.data, self.impulse_array(impulse), v)
         return self.rows.v_free + v
+
+    def carry(self, previous: Any, keys: Any = None) -> FloatArray:
+        """Start (m,) [N s] from the impulses of the step before: each block's by its key, the others Pi(0).
+
+        A block that has changed its kind or its number of rows starts anew. Where a problem has no keys,
+        impulses stay if both have the same blocks. Impulses of tangents are taken as they are: keep the directions of a
+        contact's tangents from step to step.
+
+        Parameters
+        ----------
+        previous : Solution, or (Problem, impulse)
+            Of the step before; its problem has keys.
+        keys : (k,) unsigned int, optional
+            Of this problem's blocks; default: `key`.
+
+        Raises
+        ------
+        InputError
+            No solution, keys of another length, or keys here and none before.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> import lavender as lv
+        >>> first = lv.Problem.lcp(np.eye(3), [1.0, 2.0, 3.0], key=np.array([7, 8, 9]))
+        >>> solution = lv.solve(first)
+        >>> second = lv.Problem.lcp(np.eye(2), [3.1, 5.0], key=np.array([9, 4]))  # one stays, one is new
+        >>> second.carry(solution).tolist()
+        [3.0, 0.0]
+        >>> lv.solve(second, impulse=second.carry(solution)).success
+        True
+        """
+        if isinstance(previous, tuple) and len(previous) == 2 and isinstance(previous[0], Problem):
+            before, impulse = previous[0], previous[0].impulse_array(previous[1])
+        elif hasattr(previous, "residual") and hasattr(previous, "impulse"):
+            before, impulse = previous.residual._problem, previous.impulse
+        else:
+            raise InputError(
+                f"previous is a {type(previous).__name__}; a Solution, or (problem, impulse), is needed"
+            )
+        if keys is not None:
+            if before.key is None:
+                raise InputError("the problem of the step before has no keys: make it with key=")
+            return replace(self, key=keys, copy=False).carry((before, impulse))
+        start = self.start()
+        old, new = before.cones, self.cones
+        if self.key is None or before.key is None:
+            if np.array_equal(old.ptr, new.ptr) and np.array_equal(old.kind, new.kind):
+                start[:] = impulse
+            return start
+        place = {key: i for i, key in enumerate(before.key.tolist())}
+        for block, key in enumerate(self.key.tolist()):
+            i = place.get(key)
+            if i is None or old.kind[i] != new.kind[block]:
+                continue
+            here, there = slice(new.ptr[block], new.ptr[block + 1]), slice(old.ptr[i], old.ptr[i + 1])
+            if here.stop - here.start == there.stop - there.start:
+                start[here] = impulse[there]
+        return start
 
     def start(self) -> FloatArray:
         """Pi(0) (m,) [N s]: doing nothing, clipped to the bounds; a new array."""

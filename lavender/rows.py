@@ -8,12 +8,15 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from lavender._arrays import FloatArray, IntArray, as_array, check_not_negative, equal
+from lavender._arrays import FloatArray, IntArray, as_array, check_not_negative, equal, read_only
 from lavender.cones import CONTACT_SPIN, Cones
 from lavender.errors import InputError
 from lavender_ext.core import gate
 
 __all__ = ["Rows"]
+
+EXACT = 1e-9  # above rounding of what was normalised in float64
+ROUNDED = 1e-5  # above what float32 leaves after some turns, below anything meant otherwise
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,6 +53,9 @@ class Rows:
     copy : bool, default True
         True leaves the arrays given as they are. False adopts those that fit: they are shared, and marked read-only for
         the giver, too; inertias are then taken as they are.
+
+    Numbers of float32 are taken as what they stand for: normals and tangents off orthogonal unit vectors by up to 1e-5,
+    and inertias off symmetry by as much, are made whole.
 
     Raises
     ------
@@ -137,21 +143,32 @@ class Rows:
             )
         check_not_negative("inv_mass", self.inv_mass)
         if self.copy:
-            check_inertia("inv_inertia", self.inv_inertia)
+            object.__setattr__(self, "inv_inertia", check_inertia("inv_inertia", self.inv_inertia))
         if not gate.are_frames(self.normal, self.tangent):
-            # 1e-9: far above rounding of a normalised vector, far below anything meant otherwise.
-            off = np.abs(np.stack([
-                np.einsum("ij,ij->i", self.normal, self.normal) - 1.0,
-                np.einsum("ij,ij->i", self.tangent, self.tangent) - 1.0,
-                np.einsum("ij,ij->i", self.normal, self.tangent),
-            ])).max(axis=0)  # fmt: skip
-            if off.max() > 1e-9:
-                i = int(np.argmax(off))
-                raise InputError(
-                    f"contact {i}: normal {self.normal[i]} and tangent {self.tangent[i]} must be "
-                    "orthogonal unit vectors"
-                )
+            self._take_frames()
         object.__setattr__(self, "copy", True)  # of what was given here
+
+    def _take_frames(self) -> None:
+        # What float32 leaves of unit vectors is made whole; what is meant otherwise is told.
+        n, t = self.normal, self.tangent
+        along = np.einsum("ij,ij->i", n, t)
+        off = np.abs(np.stack([np.linalg.norm(n, axis=1) - 1.0, np.linalg.norm(t, axis=1) - 1.0, along])).max(
+            axis=0
+        )
+        if off.max() > ROUNDED:
+            i = int(np.argmax(off))
+            raise InputError(
+                f"contact {i}: normal {n[i]} and tangent {t[i]} must be orthogonal unit vectors; they are off by "
+                f"{off[i]:.2g}, and up to {ROUNDED:g} (float32 leaves 1e-7) is made whole"
+            )
+        if off.max() <= EXACT:
+            return
+        n = n / np.linalg.norm(n, axis=1)[:, None]
+        t = t - np.einsum("ij,ij->i", n, t)[:, None] * n
+        t /= np.linalg.norm(t, axis=1)[:, None]
+        rough = (off > EXACT)[:, None]
+        object.__setattr__(self, "normal", read_only(np.where(rough, n, self.normal)))
+        object.__setattr__(self, "tangent", read_only(np.where(rough, t, self.tangent)))
 
     @property
     def n_bodies(self) -> int:
@@ -219,25 +236,30 @@ class Rows:
         return type(self), tuple(f.name != "copy" and getattr(self, f.name) for f in fields(self))
 
 
-def check_inertia(name: str, tensors: FloatArray) -> None:
-    """Refuse tensors (n, 3, 3) that no body has: not symmetric, or not positive semidefinite, beyond rounding.
+def check_inertia(name: str, tensors: FloatArray) -> FloatArray:
+    """Tensors (n, 3, 3) that bodies have; what float32 leaves of symmetry and of eigenvalues that are 0 is made whole.
 
     Raises
     ------
     InputError
-        Names the first body.
+        Not symmetric, or not positive semidefinite, beyond such rounding: names the first body.
     """
     if gate.are_definite(tensors):
-        return
+        return tensors
     size = np.abs(tensors).max(axis=(1, 2))
     skew = np.abs(tensors - tensors.transpose(0, 2, 1)).max(axis=(1, 2))
     with np.errstate(divide="ignore", invalid="ignore"):
         scaled = np.where(size[:, None, None] > 0.0, tensors / size[:, None, None], 0.0)
     least = np.linalg.eigvalsh(scaled)[:, 0]
-    # 1e-9 of the largest entry: far above rounding of a rotated tensor, far below anything meant otherwise.
-    for wrong, what in ((skew > 1e-9 * size, "symmetric"), (least < -1e-9, "positive semidefinite")):
+    for wrong, what in ((skew > ROUNDED * size, "symmetric"), (least < -ROUNDED, "positive semidefinite")):
         if wrong.any():
             i = int(np.argmax(wrong))
             raise InputError(
                 f"{name}[{i}] is not {what}: {tensors[i].tolist()}; an inverse inertia, world axes, is needed"
             )
+    rough = (skew > EXACT * size) | (least < -EXACT)
+    if not rough.any():
+        return tensors
+    value, axes = np.linalg.eigh(0.5 * (scaled + scaled.transpose(0, 2, 1)))
+    whole = size[:, None, None] * ((axes * np.maximum(value, 0.0)[:, None, :]) @ axes.transpose(0, 2, 1))
+    return read_only(np.where(rough[:, None, None], 0.5 * (whole + whole.transpose(0, 2, 1)), tensors))

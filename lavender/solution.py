@@ -136,7 +136,44 @@ class SolverRun:
 
 @dataclass(frozen=True, init=False, repr=False)
 class Solution:
-    """Result of `solve`; returned for every status, with the iterate. `str()` is one line."""
+    """Result of `solve`; returned for every status, with the iterate. `str()` is one line.
+
+    Parameters
+    ----------
+    impulse : (m,) N s
+        The answer, in the order of the problem's rows.
+    residual : Residual
+        How wrong it is, by the judge: `relative` [-], `energy` [sqrt J], `velocity` [m/s], the worst row.
+    status : Status
+        What the solver claims; `success` and `contradicted` are what the judge says of it.
+    tol : float, -
+        Relative residual asked for.
+    iterations : int
+    work : mapping
+        Sweeps, products, factorisations, pivots: what ran.
+    setup_time, solve_time : float, s
+    solver : SolverRun
+        Name, options, and the form that was solved.
+    message : str
+    history : History or None
+        With `history=True`.
+    dual : object
+        A backend's own multipliers.
+    certificate : (m,), or None
+        With INFEASIBLE: why there is no solution.
+    contradicted : str
+        Why the judge disagrees with `status`; empty where it does not.
+
+    Examples
+    --------
+    >>> import lavender as lv
+    >>> problem = lv.Problem.lcp([[2.0, 1.0], [1.0, 2.0]], [1.0, -1.0])  # 1/kg, m/s
+    >>> solution = lv.solve(problem, "pgs", tol=1e-9)
+    >>> solution.impulse.tolist(), solution.slack.tolist()  # N s, m/s
+    ([0.5, 0.0], [0.0, 1.5])
+    >>> solution.success, solution.status.name, solution.residual.relative <= 1e-9
+    (True, 'CONVERGED', True)
+    """
 
     impulse: FloatArray  # (m,) N s
     residual: Residual

@@ -113,8 +113,40 @@ def solve(
 def prepare(problem: Problem, solver: str, **options: Any) -> Prepared:
     """Do the part of a solve that does not depend on the iterate: factor, colour, allocate.
 
-    The result solves this problem, or another of the same structure, as often as wanted. Raises as
-    `solve`.
+    Parameters
+    ----------
+    problem : Problem
+    solver : str
+        Name, as in `solve`.
+    **options
+        Of the solver; those of a single call (`tol`, `max_iter`, `impulse`, `time_limit`) belong to `Prepared.solve`.
+
+    Returns
+    -------
+    Prepared
+        Its `solve(problem2, impulse=..., tol=...)` gives a `Solution` of this problem, or of another with the same
+        structure (blocks, pattern of A or J), as often as wanted; `setup_time` [s] is what preparing took.
+
+    Raises
+    ------
+    LavenderError
+        As `solve`.
+
+    Examples
+    --------
+    Ten steps of one structure, each from the impulses (m,) [N s] of the last:
+
+    >>> import numpy as np
+    >>> import lavender as lv
+    >>> A = np.array([[2.0, 1.0], [1.0, 2.0]])  # 1/kg
+    >>> prepared = lv.prepare(lv.Problem.lcp(A, [1.0, 0.5]), "pgs")
+    >>> impulse = None
+    >>> for step in range(10):
+    ...     problem = lv.Problem.lcp(A, [1.0 + 0.01 * step, 0.5])  # m/s
+    ...     solution = prepared.solve(problem, impulse=impulse, tol=1e-9)
+    ...     impulse = solution.impulse
+    >>> solution.success
+    True
     """
     return Prepared(problem, get(solver), options)
 

@@ -26,6 +26,7 @@ from lavender.io.stored import SUFFIXES
 from lavender.problem import Problem
 from lavender.residuals import nothing_to_do, residual
 from lavender.suite import Case
+from lavender.suspicions import diagnose
 
 __all__ = ["Item", "describe", "is_path", "resolve", "sequence", "steps_in", "structure_of"]
 
@@ -286,6 +287,7 @@ def describe(item: Item, run: str) -> CaseInfo:
         step=item.step,
         stored=_stored(item, p),
         nothing_to_do=nothing_to_do(p),
+        suspicions=tuple(map(str, diagnose(p))),
     )
 
 

@@ -139,6 +139,7 @@ class CaseInfo(_Texts):
     step: int = -1
     nothing_to_do: bool = False  # doing nothing is right: nobody solves it, nobody fails
     identity: str = ""  # of the sequence, from the numbers of all its steps: steps of two are never one
+    suspicions: tuple[str, ...] = ()  # what looks like a mistake in its data
 
 
 @dataclass(frozen=True)

@@ -3,18 +3,29 @@
 from __future__ import annotations
 
 import json
+from dataclasses import asdict
 
 import click
 
 from lavender.bench import doctor as bench_doctor
+from lavender.cli.options import EXIT_BAD_INPUT, EXIT_UNMET
+from lavender.errors import InputError, LavenderError
 
 __all__ = ["doctor"]
 
 
 @click.command()
+@click.argument("files", nargs=-1, metavar="[FILES | FOLDERS | NAMES]...")
 @click.option("--json", "as_json", is_flag=True, help="Everything as JSON, for a report of a bug.")
-def doctor(as_json: bool) -> None:
-    """Versions, processor, compiler, backends, and a self-test of bits. Status 1 where bits differ."""
+def doctor(files: tuple[str, ...], as_json: bool) -> None:
+    """Versions, processor, compiler, backends, and a self-test of bits. Status 1 where bits differ.
+
+    With problems: what in their data looks like a mistake of whoever made it (flipped normals, masses for their
+    inverses, rows out of order, ...). Status 1 where anything does.
+    """
+    if files:
+        _suspect(files, as_json)
+        return
     found = bench_doctor.examine()
     if as_json:
         click.echo(json.dumps(found, indent=2, ensure_ascii=True))
@@ -31,3 +42,27 @@ def doctor(as_json: bool) -> None:
             click.echo(f"{'':<14}{name}: {said}")
     if not found["same_bits"]:
         raise SystemExit(1)
+
+
+def _suspect(files: tuple[str, ...], as_json: bool) -> None:
+    from lavender import bench
+    from lavender.suspicions import diagnose
+
+    found, missing = {}, False
+    for item in bench.resolve(files):
+        try:
+            found[item.name] = diagnose(item.problem)
+        except LavenderError as error:
+            click.echo(f"{item.name}: {error}", err=True)
+            missing |= isinstance(error, InputError)
+        finally:
+            item.forget()
+        for suspicion in () if as_json else found.get(item.name, ()):
+            click.echo(f"{item.name}: {suspicion}")
+    suspect = sum(map(bool, found.values()))
+    if as_json:
+        click.echo(json.dumps({name: list(map(asdict, told)) for name, told in found.items()}, indent=2))
+    else:
+        click.echo(f"{len(found)} looked at, {suspect or 'none'} suspicious")
+    if missing or suspect:
+        raise SystemExit(EXIT_BAD_INPUT if missing else EXIT_UNMET)

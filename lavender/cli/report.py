@@ -83,6 +83,7 @@ __all__ = ["report"]
 )
 @click.option("--tables", is_flag=True, help="Print every case and sequence too.")
 @click.option("--fresh", is_flag=True, help="Measure again what the folder holds already.")
+@click.option("--paper", is_flag=True, help="Also PDF figures, LaTeX tables and the method, in OUT/paper.")
 @click.option("--no-figures", is_flag=True, help="Leave out the SVG and PNG files.")
 @click.pass_context
 def report(
@@ -113,6 +114,7 @@ def report(
     controls: str,
     tables: bool,
     fresh: bool,
+    paper: bool,
     no_figures: bool,
 ) -> None:
     """Speed against error: every solver on every case, to each level and at each budget.
@@ -192,6 +194,12 @@ def report(
         peers=rivals,
         engines=engines,
     )
+    if paper:
+        from lavender.report.paper import write_paper
+
+        shown_on.print(
+            f"figures, tables and method of a paper: {write_paper(records, out / 'paper', time_budgets)}"
+        )
     shown_on.print(
         f"\n{len(records)} runs in {out / 'records.csv'}, page: {index}",
         highlight=False,

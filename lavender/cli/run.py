@@ -54,7 +54,7 @@ __all__ = ["run"]
     "--film",
     type=click.Path(path_type=Path),
     default=None,
-    help="Film of the run: .gif or .png pictures, or a file for `lavender view`.",
+    help="Film of the run: .gif, .mp4 or .png pictures, or a file for `lavender view`.",
 )
 @click.pass_context
 def run(

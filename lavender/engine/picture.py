@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from os import PathLike
 from pathlib import Path
+from shutil import which
 from typing import Any
 
 import numpy as np
@@ -21,7 +22,8 @@ from lavender.scene.parts import rotation
 
 __all__ = ["PICTURES", "save_picture"]
 
-PICTURES = (".gif", ".png", ".svg", ".pdf")
+PICTURES = (".gif", ".mp4", ".png", ".svg", ".pdf")
+DPI = 160  # of an animation: 480 pixels at the width that is the default
 
 CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
 FACES = (
@@ -52,31 +54,34 @@ def save_picture(
     ----------
     film : Film
     path : path
-        `.gif`: an animation at `rate`; `.png`, `.svg`, `.pdf`: `frames` of them side by side, evenly spaced.
+        `.gif`, or `.mp4` where ffmpeg is: an animation in the time of the film; `.png`, `.svg`, `.pdf`: `frames` of
+        them side by side, evenly spaced.
     frames : int
         In a strip.
     turn, tilt : float, rad
         Where the eye is.
     size : float, inch
-        Width of one frame; its height is that of what is seen.
+        Width of one frame, 160 pixels an inch in an animation; its height is that of what is seen.
     rate : int, 1/s
-        Frames of an animation in a second of simulated time.
+        Frames of an animation in a second; of a GIF the nearest that whole hundredths of a second allow.
 
     Raises
     ------
     InputError
-        An empty film, a path that cannot be written, another suffix.
+        An empty film, a path that cannot be written, another suffix, `.mp4` without ffmpeg.
     """
     path = Path(path)
     suffix = path.suffix.lower()
     if suffix not in PICTURES:
-        raise InputError(f"{str(path)!r} ends in {path.suffix!r}; .gif, .png, .svg or .pdf is needed")
+        raise InputError(f"{str(path)!r} ends in {path.suffix!r}; .gif, .mp4, .png, .svg or .pdf is needed")
     if not len(film):
         raise InputError("the film has no frames; step first")
     if not (isinstance(frames, int) and frames >= 1 and rate > 0.0 and 0.5 <= size <= 50.0):
         raise InputError("frames must be at least 1, rate positive and size 0.5 to 50 inch")
+    if suffix == ".mp4" and which("ffmpeg") is None:
+        raise InputError("an .mp4 needs ffmpeg, which is not here; a .gif needs nothing")
     stage = _Stage(film, turn, tilt)
-    if suffix == ".gif":
+    if suffix in (".gif", ".mp4"):
         _animate(stage, path, size, rate)
     else:
         _strip(stage, path, frames, size)
@@ -175,24 +180,29 @@ def _strip(stage: _Stage, path: Path, count: int, size: float) -> None:
     write_figure(canvas, path, dpi=150)
 
 
-def _animate(stage: _Stage, path: Path, size: float, rate: int) -> None:
-    from matplotlib.animation import PillowWriter
+def _animate(stage: _Stage, path: Path, size: float, rate: float) -> None:
+    from matplotlib.animation import FFMpegWriter, PillowWriter
     from matplotlib.figure import Figure
 
-    time = stage.time
-    # evenly in simulated time, each step at most once
+    suffix, time = path.suffix.lower(), stage.time
+    if suffix == ".gif":
+        rate = 100.0 / max(2, round(100.0 / rate))  # a frame of a GIF stands for whole hundredths of a second
+    # evenly in simulated time: a film of fewer steps shows one for longer
     wanted = np.arange(time[0], time[-1] + 0.5 / rate, 1.0 / rate)
-    chosen = np.unique(np.searchsorted(time, wanted - 1e-9).clip(0, len(time) - 1))
+    chosen = np.searchsorted(time, wanted - 1e-9).clip(0, len(time) - 1)
     canvas = Figure(figsize=(size, size * stage.height + 0.3), layout="constrained")
     axes = canvas.subplots()
-    writer = PillowWriter(fps=rate)
+    # a shade slower: the milliseconds of a frame, rounded down, are those meant
+    kind, own = (PillowWriter, rate * (1.0 - 1e-9)) if suffix == ".gif" else (FFMpegWriter, rate)
+    writer: Any = kind(fps=own)  # type: ignore[arg-type]
 
     def write(part: Path) -> None:
-        made = Path(f"{part}.gif")  # whose suffix tells the format
+        made = Path(f"{part}{suffix}")  # whose suffix tells the format
         try:
-            with writer.saving(canvas, str(made), dpi=80):
-                for frame in chosen:
-                    stage.paint(axes, int(frame))
+            with writer.saving(canvas, str(made), dpi=DPI):
+                for before, frame in zip((-1, *chosen), chosen, strict=False):
+                    if frame != before:
+                        stage.paint(axes, int(frame))
                     writer.grab_frame()
             made.replace(part)
         finally:

@@ -29,7 +29,7 @@ class Trace:
     scene: str
     time: FloatArray  # (steps,) s, simulated
     solver: FloatArray  # (steps, 8) see SOLVER_FIELDS
-    depth: FloatArray  # (steps,) m, deepest penetration
+    depth: FloatArray  # (steps,) m, largest depth
     cost: FloatArray  # (steps,) s, wall time of the step
     lost_body: str = ""  # name of the body that ended the run, or empty
     recorded: int = 0  # problems written
@@ -82,7 +82,7 @@ class Trace:
         for axes in (top, middle):
             axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8, frameon=False)
         bottom.plot(self.time, 1e3 * self.depth)
-        bottom.set(title="deepest penetration", xlabel="time [s]", ylabel="[mm]", ylim=(0, None))
+        bottom.set(title="largest depth", xlabel="time [s]", ylabel="[mm]", ylim=(0, None))
         write_figure(canvas, path)
 
 
@@ -205,7 +205,7 @@ def run_scene(
     replace : bool
         Take the problem files of another recording out of the folder, which is refused otherwise.
     film : path, optional
-        Film of the run: `.gif`, `.png`, `.svg` or `.pdf` are pictures, anything else a file for `lavender view`.
+        Film of the run: `.gif`, `.mp4`, `.png`, `.svg` or `.pdf` are pictures, anything else is for `lavender view`.
     view : bool
         Show the run in a page while it goes on, no faster than it would, and after it until Ctrl-C.
     every : int

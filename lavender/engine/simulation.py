@@ -617,7 +617,7 @@ class Simulation:
         self._films = [other for other in self._films if other is not film]
 
     def frames(self, path: str | PathLike[str], steps: int = 120, **more: Any) -> Path:
-        """Step `steps` times and write pictures by matplotlib: `.gif` an animation, `.png`, `.svg`, `.pdf` a strip.
+        """Step `steps` times and write pictures: `.gif`, `.mp4` an animation, `.png`, `.svg`, `.pdf` a strip.
 
         Parameters
         ----------

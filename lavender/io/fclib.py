@@ -25,6 +25,7 @@ from lavender._arrays import FloatArray, as_array
 from lavender._lu import sparse_lu
 from lavender.cones import CONTACT, ROW, Cones
 from lavender.errors import CapabilityError, InputError
+from lavender.generalized import Generalized
 from lavender.io.npz import compressed
 from lavender.io.stored import MAX_BYTES, NUMBER, Budget, Stored, write_atomically
 from lavender.problem import Problem
@@ -70,14 +71,18 @@ class Contents:
         return "local" if self.W is not None else "global"
 
     def problem(self, name: str = "", *, max_bytes: int = MAX_BYTES) -> Problem:
-        """The problem, condensed to a matrix where it is global.
+        """The problem: a global one in generalised coordinates (J = H^T), condensed where M is no mass matrix.
 
         Raises
         ------
         InputError
             M is singular, parts do not fit each other, or A may take more than `max_bytes`.
         """
-        a, b = self._local() if self.form == "local" else self._condensed(Budget(max_bytes))
+        general = self._general(max_bytes) if self.form == "global" else None
+        if general is not None:
+            a, b = None, general.bias(-self._offset())
+        else:
+            a, b = self._local() if self.form == "local" else self._condensed(Budget(max_bytes))
         c, d = len(self.mu), self.spacedim
         p = len(b) - c * d
         ptr = np.concatenate([np.arange(0, c * d + 1, d), c * d + 1 + np.arange(p)])
@@ -86,7 +91,8 @@ class Contents:
         free = np.full(len(b), np.inf)
         cones = Cones(ptr=ptr, kind=kind, lower=-free, upper=free, mu=mu, patch_radius=np.zeros(c + p))
         guess = self._impulse(self.guesses[0]) if self.guesses else None
-        return Problem(b, cones, a, guess=guess, name=self.info.get("title", "") or name)
+        name = self.info.get("title", "") or name
+        return Problem(b, cones, a, guess=guess, name=name, generalized=general)
 
     def _local(self) -> tuple[sp.csr_array, FloatArray]:
         assert self.q is not None
@@ -95,14 +101,33 @@ class Contents:
         a = sp.block_array([[self.W, self.V], [self.V.T, self.R]])
         return sp.csr_array(a), -np.concatenate([self.q, self.s])
 
+    def _columns(self) -> sp.csr_array:
+        assert self.H is not None
+        return self.H if self.G is None else sp.csr_array(sp.hstack([self.H, self.G]))
+
+    def _offset(self) -> FloatArray:
+        assert self.w is not None
+        return self.w if self.b is None else np.concatenate([self.w, self.b])
+
+    def _general(self, max_bytes: int) -> Generalized | None:
+        # None where M is no mass matrix of bodies: asymmetric, not definite, or of a size that is no part's.
+        assert self.M is not None
+        n = self.M.shape[0]
+        if n == 0:
+            return None
+        size = np.bincount(csgraph.connected_components(self.M, directed=False)[1]).astype(float)
+        if 4 * ENTRY * float(size @ size) > max_bytes:
+            return None
+        try:
+            made = Generalized(self._columns().T.tocsr(), self.M, np.zeros(n))
+            return made.with_jacobian(v_free=made.solve(self.f))
+        except InputError:
+            return None
+
     def _condensed(self, budget: Budget) -> tuple[sp.csr_array, FloatArray]:
         # J = [H G]^T: contact rows and equations alike.
         assert self.M is not None
-        assert self.H is not None
-        assert self.w is not None
-        jt, offset = self.H, self.w
-        if self.G is not None and self.b is not None:
-            jt, offset = sp.csr_array(sp.hstack([self.H, self.G])), np.concatenate([self.w, self.b])
+        jt, offset = self._columns(), self._offset()
         if self.M.shape[0] == 0:
             return sp.csr_array((len(offset), len(offset))), -offset
         label = csgraph.connected_components(self.M, directed=False)[1]
@@ -429,7 +454,8 @@ def contents(
     if not isinstance(problem, Problem):
         raise InputError(f"problem is a {type(problem).__name__}; a lavender.Problem is needed")
     if form is None:
-        form = "local" if problem.rows is None else "global"
+        soft = problem.generalized is not None and np.any(problem.compliance)
+        form = "local" if problem.matrix is not None or soft else "global"
     if form not in ("local", "global"):
         raise InputError(f"form is {form!r}; 'local' or 'global' is needed")
     unknown = sorted(set(drop) - {"names", "key"})
@@ -457,16 +483,8 @@ def contents(
         return Contents(
             spacedim, mu, W=problem.csr, q=-problem.b, solution=solution, guesses=guesses, info=info
         )
-    rows = problem.rows
-    assert rows is not None
-    inertia = np.linalg.inv(rows.inv_inertia)
-    blocks = np.zeros((rows.n_bodies, 6, 6))
-    blocks[:, :3, :3] = np.eye(3) / rows.inv_mass[:, None, None]
-    blocks[:, 3:, 3:] = 0.5 * (inertia + inertia.transpose(0, 2, 1))
-    mass = sp.csr_array(sp.block_diag(list(blocks), format="csr"))
-    mass.eliminate_zeros()
+    mass, v = _mass(problem)
     jac = problem.jacobian
-    v = rows.v_free.ravel()
     return Contents(
         spacedim,
         mu,
@@ -478,6 +496,21 @@ def contents(
         guesses=guesses,
         info=info,
     )
+
+
+def _mass(problem: Problem) -> tuple[sp.csr_array, FloatArray]:
+    """M (n, n) and v* (n,) of a problem that has them."""
+    if problem.generalized is not None:
+        return problem.generalized.mass, problem.generalized.v_free
+    rows = problem.rows
+    assert rows is not None
+    inertia = np.linalg.inv(rows.inv_inertia)
+    blocks = np.zeros((rows.n_bodies, 6, 6))
+    blocks[:, :3, :3] = np.eye(3) / rows.inv_mass[:, None, None]
+    blocks[:, 3:, 3:] = 0.5 * (inertia + inertia.transpose(0, 2, 1))
+    mass = sp.csr_array(sp.block_diag(list(blocks), format="csr"))
+    mass.eliminate_zeros()
+    return mass, rows.v_free.ravel()
 
 
 def _cannot_hold(problem: Problem, form: str, drop: Collection[str]) -> list[str]:
@@ -508,12 +541,14 @@ def _cannot_hold(problem: Problem, form: str, drop: Collection[str]) -> list[str
 
 
 def _no_global_form(problem: Problem) -> list[str]:
-    rows = problem.rows
-    if rows is None:
+    if problem.matrix is not None:
         return ["a problem given as a matrix (form='local' holds it)"]
     reasons = []
     if problem.compliance is not None and np.any(problem.compliance):
         reasons.append("compliance (form='local' holds it, added to the diagonal of W)")
+    rows = problem.rows
+    if rows is None:
+        return reasons
     heavy = np.flatnonzero(rows.inv_mass == 0.0)
     if len(heavy):
         reasons.append(f"an infinite mass (body {heavy[0]}; form='local' holds it)")

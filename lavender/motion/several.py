@@ -1,7 +1,8 @@
 """The motions that solve one problem: Coulomb's law may leave several, and no accuracy of a solver chooses.
 
 Runs from different starts, in different orders, by different solvers end at solutions; those whose motions
-agree are one. A search finds motions, it does not prove that there are no more: only `uniqueness` can.
+agree are one. A search finds motions, it does not prove that there are no more: `uniqueness` can, and up to eight
+contacts with one tangent are enumerated whole (`lavender/motion/modes.py`).
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from lavender.cones import ROW, project
 from lavender.errors import CapabilityError, InputError, LavenderError
 from lavender.motion.bound import difference
 from lavender.motion.error import SAME
+from lavender.motion.modes import enumerated
 from lavender.motion.reference import Reference, judged, kept
 from lavender.motion.reference import reference as reference_of
 from lavender.motion.unique import uniqueness
@@ -37,6 +39,8 @@ SWEEPS = (400, 20_000)  # least and most of one run
 CHOICES = ("nearest", "dissipation", "compliant")
 SOFTEST, STEP = 1.0, 0.1  # softness of "compliant" as a share of d, and what each round leaves of it
 HARDEST = 1e-12
+BESIDE = 1e-6  # -, of `Distance.share`: an enumerated end that rounding alone keeps from being a solution
+MANY = 100  # motions of an enumeration that are compared with each other
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,6 +92,7 @@ class Motions:
     unique: str  # the criterion that proves there is one; empty where none does
     runs: int  # that ended at a solution
     failed: int  # runs that did not
+    all: bool = False  # there are no others: proved, or every mode of the contacts was looked at
 
     def __iter__(self) -> Iterator[Motion]:
         return iter(self.motions)
@@ -168,7 +173,9 @@ class Motions:
         if not self.motions:
             return f"{name}: none of {self.failed} runs ended at a solution"
         energy = "" if self.spread_energy is None else f", {self.spread_energy:.2e} sqrt(J)"
-        kind = f"one motion, unique: {self.unique}" if self.unique else f"{len(self)} motions found"
+        many = "one motion" if len(self) == 1 else f"{len(self)} motions"
+        kind = f"one motion, unique: {self.unique}" if self.unique else f"{many}, all that there are"
+        kind = kind if self.all else f"at least {many}"
         spread = f", up to {self.spread:.2g} m/s{energy} apart" if len(self) > 1 else ""
         failed = f", {self.failed} did not end at one" if self.failed else ""
         head = f"{name} ({self.problem.law}): {kind}{spread}; {self.runs} runs{failed}"
@@ -176,13 +183,16 @@ class Motions:
 
 
 def motions(problem: Problem, n: int = RUNS, seed: int = 0, *, always: bool = False) -> Motions:
-    """Search the motions that solve a problem, from several starts, in several orders, by several solvers.
+    """The motions that solve a problem: from several starts, in several orders, by several solvers, or all of them.
+
+    Up to eight contacts with at most one tangent each are enumerated: `Motions.all` is then true, and no run is
+    needed. Otherwise there are at least those that are found.
 
     Parameters
     ----------
     problem : Problem
     n : int, default 12
-        Runs, after the one of `auto`; none where the motion is proved to be unique.
+        Runs, after the one of `auto`; none where the motion is proved to be unique, or all are enumerated.
     seed : int, default 0
         Of starts and random orders: equal seeds give equal results.
     always : bool, default False
@@ -207,7 +217,21 @@ def motions(problem: Problem, n: int = RUNS, seed: int = 0, *, always: bool = Fa
     own = reference_of(problem)
     found = [(own, "auto")] if own.accepted else []
     failed = 0 if own.accepted else 1
-    if always or not proof:
+    whole = bool(proof)
+    if (always or not proof) and (modes := enumerated(problem)) is not None:
+        best_last = sorted(modes[0], key=lambda x: -residual(problem, x).relative)
+        single = {
+            tuple(np.round(problem.slack(x), 9)): x for x in best_last
+        }  # m/s: modes that share a motion
+        ends = [judged(problem, x, "every mode") for x in list(single.values())[:MANY]]
+        solved = [end for end in ends if end.accepted]
+        found += [(end, "every mode") for end in solved]
+        # what rounding lets pass an inequality lies beside a motion that it would otherwise have missed
+        beside = (
+            min((distance(problem, e.impulse, s.impulse).share for s in solved), default=1.0) for e in ends
+        )
+        whole |= modes[1] and len(single) <= MANY and max(beside, default=1.0) < BESIDE
+    if always or not whole:
         for label, impulse in _runs(problem, own, int(n), int(seed)):
             candidate = judged(problem, impulse, label)
             if candidate.accepted:
@@ -228,6 +252,7 @@ def motions(problem: Problem, n: int = RUNS, seed: int = 0, *, always: bool = Fa
         unique=proof.reason if proof else "",
         runs=len(found),
         failed=failed,
+        all=whole,
     )
     kept(problem).motions = result
     return result

@@ -20,6 +20,7 @@ __all__ = [
     "budget_figure",
     "family_figure",
     "figures",
+    "overall_figure",
     "profile_figure",
     "walk_figure",
     "work_precision",
@@ -40,6 +41,8 @@ class Curve:
     thin: bool = False  # warm starts
     steps: bool = False
     points: bool = False  # without a line between them
+    low: tuple[float, ...] = ()  # of a band about the line, as `y`
+    high: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -96,6 +99,47 @@ def work_precision(records: Records, case: str) -> Figure:
     return Figure(
         "work-precision " + case, case, "time: set-up and solve [s]", "relative residual [-]", tuple(curves),
         levels=tables.levels_of(records), floor=floor,
+    )  # fmt: skip
+
+
+GRID = 49  # times of a figure over all cases
+
+
+def overall_figure(records: Records) -> Figure:
+    """Residual that a solver has reached by a time, over all cases: median, and a band of the middle half.
+
+    A case on which nothing has been reached by then stands at 1, doing nothing. Cases are single problems from a cold
+    start; of sequences alone each step is one, from the impulses of the step before where they are carried.
+    """
+    single = any(r.step < 0 for r in records)
+    start = "cold" if single or all(r.start == "cold" for r in records) else "carried"
+    runs = [r for r in records if (r.step < 0) == single and r.start == start and r.order == "given"]
+    cases = sorted({r.case for r in runs})
+    by: dict[str, dict[str, list[tuple[float, float]]]] = {}
+    for r in runs:
+        if r.usable and r.time_min > 0.0:
+            by.setdefault(r.solver, {}).setdefault(r.case, []).append((r.time_min, max(r.relative, TINY)))
+    times = [t for own in by.values() for some in own.values() for t, _ in some]
+    if not times:
+        return Figure("over all", "", "", "", ())
+    low, high = math.log10(min(times)), math.log10(max(times))
+    grid = [10.0 ** (low + (high - low) * i / (GRID - 1)) for i in range(GRID)]
+    curves = []
+    for solver, own in sorted(by.items()):
+        bands = []
+        for t in grid:
+            reached = [
+                min((x for s, x in own.get(c, ()) if s <= t * (1.0 + 1e-9)), default=1.0) for c in cases
+            ]
+            bands.append([min(tables.quantile(reached, q), 1.0) for q in (0.25, 0.5, 0.75)])
+        # from the last time at which half of the cases have nothing
+        first = max((i for i, b in enumerate(bands) if b[0] == 1.0), default=0)
+        lower, middle, upper = (tuple(column) for column in zip(*bands[first:], strict=True))
+        curves.append(Curve(solver, solver, tuple(grid[first:]), middle, low=lower, high=upper))
+    over = count(len(cases), "case" if single else "step")
+    return Figure(
+        "over all", f"Error against time over all {over}: median, middle half",
+        "time: set-up and solve [s]", "relative residual [-]", tuple(curves), levels=tables.levels_of(records),
     )  # fmt: skip
 
 
@@ -221,12 +265,14 @@ class Figures:
     families: Mapping[str, Figure]
     profiles: Mapping[str, tuple[Figure, ...]]  # by problem class, one for each level
     sequences: Mapping[str, tuple[Figure, ...]]
+    over: tuple[Figure, ...] = ()  # the one over all cases
     peers: Mapping[str, tuple[Figure, ...]] = field(default_factory=dict)  # `lavender.report.rivals`
     moved: Figures | None = (
         None  # the same with motion errors [m/s] in place of residuals, where they are known
     )
 
     def __iter__(self) -> Iterator[Figure]:
+        yield from self.over
         yield from self.families.values()
         for group in (self.profiles, self.sequences, self.cases, self.peers):
             for some in group.values():
@@ -258,7 +304,8 @@ def _by_motion(found: Figures) -> Figures:
         return {name: tuple(map(told, own)) for name, own in some.items()}
 
     families = {name: told(figure) for name, figure in found.families.items()}
-    return Figures(group(found.cases), families, group(found.profiles), group(found.sequences))
+    over = tuple(map(told, found.over))
+    return Figures(group(found.cases), families, group(found.profiles), group(found.sequences), over)
 
 
 def _figures(records: Records) -> Figures:
@@ -273,6 +320,7 @@ def _figures(records: Records) -> Figures:
         {f: figure for f, figure in families.items() if figure.curves},
         {law: _drawn(*some) for law, some in profiles.items()},
         {name: _walk_figures(name, walks) for name, walks in tables.by_sequence(records).items()},
+        _drawn(overall_figure(records)),
     )
 
 

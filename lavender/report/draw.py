@@ -30,15 +30,16 @@ def power_on_axis(x: float, _position: object = None) -> str:
     return f"{x:.3g}" if 0.09 < x < 1e4 else level_name(x)
 
 
-def matplotlib_figure(figure: Figure, look: dict[str, Look]) -> Any:
-    """The figure drawn, without pyplot and its global state."""
+def matplotlib_figure(figure: Figure, look: dict[str, Look], size: tuple[float, float] = (7.6, 4.6)) -> Any:
+    """The figure drawn, `size` in inches, without pyplot and its global state."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure as Canvas
 
-    canvas = Canvas(figsize=(7.6, 4.6))
+    canvas = Canvas(figsize=size)
     FigureCanvasAgg(canvas)
     # A fixed place for the axes: fitting it to the labels would take most of the time of a figure.
-    axes = canvas.add_axes((0.1, 0.13, 0.63, 0.78))
+    axes = canvas.add_axes((0.76 / size[0], 0.6 / size[1], 1.0 - 2.81 / size[0], 1.0 - 1.01 / size[1]))
+    banded = any(c.low for c in figure.curves)  # over all cases: points are no runs
     for c in figure.curves:
         k = look[c.solver]
         style: dict[str, Any] = {
@@ -49,6 +50,8 @@ def matplotlib_figure(figure: Figure, look: dict[str, Look]) -> Any:
         }
         if c.points:
             style["linestyle"] = "none"
+        if c.low:
+            axes.fill_between(c.x, c.low, c.high, color=k.color, alpha=0.15, linewidth=0.0)
         if c.steps:
             last = max(x for d in figure.curves for x in d.x) * 1.3
             axes.step([*c.x, last], [*c.y, c.y[-1]], where="post", **style)
@@ -56,7 +59,7 @@ def matplotlib_figure(figure: Figure, look: dict[str, Look]) -> Any:
             axes.plot(
                 c.x,
                 c.y,
-                marker=k.marker if len(c.x) <= MANY else "",
+                marker="" if len(c.x) > MANY or banded else k.marker,
                 markersize=4,
                 markerfacecolor="none" if c.thin else k.color,
                 **style,

@@ -22,8 +22,8 @@ from lavender.report.moved import (
 from lavender.report.svg import svg
 from lavender.report.tables.advice import NOISE, RESIDUAL_NOISE
 from lavender.report.tables.finals import WAYS, line_table
-from lavender.report.text import count, residual, seconds, times
-from lavender.report.verdict import verdict
+from lavender.report.text import count, residual, seconds, suspicions, times
+from lavender.report.verdict import Verdict, verdict
 
 if TYPE_CHECKING:
     from lavender.bench.peers import Peers
@@ -128,6 +128,7 @@ def _content(
         for name, rows in by_case.items()
     ]
     changes = tables.changes(old, records) if old is not None else []
+    lines = [] if campaign else tables.advice(records, budgets)
     rivals = None
     if peers is not None:
         from lavender.report.rivals import content  # with the engine behind it
@@ -139,7 +140,11 @@ def _content(
             for figure in figures
         },
         "verdict": found,
+        "over": _keys(figures.over),
+        "moved_over": _keys(other.over),
+        "others": [] if campaign else _others(records, lines, found, levels, budgets),
         "idle": still,
+        "suspicions": suspicions(records),
         "moved": [] if campaign else moved(records),
         "speeds": speed_levels(records),
         "speed_advice": {} if campaign else _by_family(advice_by_speed(records)),
@@ -152,7 +157,7 @@ def _content(
         "runs": list(records.runs.values()),
         "levels": levels,
         "budgets_of_time": budgets,
-        "advice": [] if campaign else tables.advice(records, budgets),
+        "advice": lines,
         "lines": line_table(records),
         "ways": {way: head for way, head in WAYS.items() if any(r.turns and r.way == way for r in records)},
         "families": tables.families(records),
@@ -189,6 +194,40 @@ def _content(
         "peers": rivals,
         "peer_figures": {place: _keys(some) for place, some in figures.peers.items()},
     }
+
+
+MOST_OTHERS = 6
+
+
+def _others(
+    records: Records,
+    lines: Sequence[tables.Line],
+    found: Verdict,
+    levels: Sequence[float],
+    budgets: Sequence[float],
+) -> list[str]:
+    """What would change the choice: other levels and times, single structures, each with who is first there."""
+    if not found.leaders or not lines:
+        return []
+    cases = list(dict.fromkeys(r.case for r in records if r.step < 0))
+    middle = levels[len(levels) // 2]
+    asked: dict[str, tables.Advice] = {}
+    if cases:
+        asked |= {
+            f"to {level_name(x)}": tables.to_level(records, "all", cases, x) for x in levels if x != middle
+        }
+        asked |= {f"in {seconds(t)}": tables.within(records, "all", cases, t) for t in budgets}
+    asked |= {f"on {line.name}": line.by_level[middle] for line in lines if len(lines) > 1}
+    by_solver: dict[str, list[str]] = {}
+    for where, advice in asked.items():
+        if advice.best and found.leaders[0] not in (advice.best.solver, *advice.ties):
+            by_solver.setdefault(advice.best.solver, []).append(where)
+    most = 3  # places of one solver
+    told = [
+        f"{name} {'; '.join(some[:most])}{f'; and {len(some) - most} more' if len(some) > most else ''}"
+        for name, some in sorted(by_solver.items(), key=lambda pair: -len(pair[1]))
+    ]
+    return told[:MOST_OTHERS]
 
 
 def _by_family(found: Iterable[tables.Advice]) -> dict[str, dict[float, tables.Advice]]:

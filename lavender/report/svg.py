@@ -78,7 +78,7 @@ def svg(
     curves = [(c, *_finite(c, figure)) for c in figure.curves]
     curves = [(c, x, y) for c, x, y in curves if any(not math.isnan(v) for v in y)]
     xs = [v for _, x, y in curves for v, w in zip(x, y, strict=True) if not math.isnan(w)]
-    ys = [v for _, _, y in curves for v in y if not math.isnan(v)]
+    ys = [v for c, _, y in curves for v in (*y, *c.low, *c.high) if not math.isnan(v)]
     across = _Axis(xs, figure.x_log, LEFT, WIDTH - RIGHT)
     up = _Axis(ys, figure.y_log, HEIGHT - BOTTOM, TOP)
     said = f"{int('[s]' in figure.x_title)}{int('[s]' in figure.y_title)}"
@@ -215,7 +215,11 @@ def _curve(
     said = "|".join(note.removesuffix(" iterations") for note in c.notes)
     asked = f' data-n="{escape(said)}"' if c.notes else ""
     body = "" if c.points else f'<path d="{"".join(line)}"/>'
-    if not c.steps:
+    if c.low:
+        edge = [f"{across(a)} {up(b)}" for a, b in zip(c.x, c.high, strict=True)]
+        edge += [f"{across(a)} {up(b)}" for a, b in reversed([*zip(c.x, c.low, strict=True)])]
+        body = f'<path class="b" d="M{"L".join(edge)}Z"/>{body}'
+    if not c.steps and not c.low:
         body += f'<path class="d" d="{"".join(dots)}"/>'
     if c.label in names and not c.thin:
         place = names[c.label]

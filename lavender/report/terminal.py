@@ -18,7 +18,7 @@ from lavender.report.moved import (
     speed_name,
     working,
 )
-from lavender.report.text import count, in_time, residual, seconds, to_level
+from lavender.report.text import count, in_time, residual, seconds, suspicions, to_level
 from lavender.report.verdict import verdict
 
 if TYPE_CHECKING:
@@ -43,6 +43,20 @@ class _Plain:
 
     def __rich__(self) -> Any:
         return self.table
+
+
+def _width(console: Console, table: Any) -> int:
+    """Characters that a table takes where there is room."""
+    return console.measure(table, options=console.options.update(width=100_000)).maximum
+
+
+def _show(console: Console, table: Any) -> None:
+    """A table within the terminal: where it is wider, its cells fold; nothing is cut."""
+    inner = table.__rich__()
+    if _width(console, inner) > console.width:
+        for column in inner.columns:
+            column.no_wrap, column.overflow = False, "fold"
+    console.print(inner, highlight=False)
 
 
 def _table() -> _Plain:
@@ -105,6 +119,21 @@ def sweeps_table(advice: Sequence[tables.Line]) -> Any:
             line.name, *(in_time(line.by_sweeps[n]) if n in line.by_sweeps else "–" for n in budgets)
         )
     return table
+
+
+def _show_advice(console: Console, table: Any) -> None:
+    """The table of recommendations; in a narrow terminal a line for each level and time under each structure."""
+    inner = table.__rich__()
+    if _width(console, inner) <= console.width:
+        console.print(inner, highlight=False)
+        return
+    heads, *columns = inner.columns
+    room = max(len(str(column.header)) for column in columns)
+    for i, name in enumerate(heads.cells):
+        console.print(name, highlight=False)
+        for column in columns:
+            line = f"  {column.header!s:<{room}}  {list(column.cells)[i]}"
+            console.print(line, highlight=False, markup=False)
 
 
 def walk_table(records: Records) -> Any:
@@ -182,26 +211,25 @@ def print_report(
         console.print(
             "[bold]Campaign[/] (no times; share of cases brought to a level, residual at each budget)"
         )
-        console.print(robustness_table(tables.robustness(records), levels), highlight=False)
+        _show(console, robustness_table(tables.robustness(records), levels))
         if by_speed := robustness_by_speed(records):
             console.print(BY_MOTION, highlight=False)
-            console.print(robustness_table(by_speed, speed_levels(records), " m/s"), highlight=False)
+            _show(console, robustness_table(by_speed, speed_levels(records), " m/s"))
     elif len(records):
         found = verdict(records, times, sweeps)
-        console.print(found.text, style="bold", highlight=False, markup=False, soft_wrap=True)
+        console.print(found.text, style="bold", highlight=False, markup=False)
         for line in found.code:
             console.print(f"    {line}", highlight=False, markup=False, soft_wrap=True)
         console.print(
             "\n[bold]By structure[/] (to a level: mean time, share of cases that get there, budget; in a time or with "
             "sweeps: share of cases served, residual at the 90th percentile; ≈ as good within noise)",
             highlight=False,
-            soft_wrap=True,
         )
         advice = tables.advice(records, times)
-        console.print(advice_table(records, advice, times), highlight=False)
+        _show_advice(console, advice_table(records, advice, times))
         if any(line.by_sweeps for line in advice):
             console.print("\n[bold]By sweeps[/]", highlight=False)
-            console.print(sweeps_table(advice), highlight=False)
+            _show_advice(console, sweeps_table(advice))
         _print_motion(records, console, whole)
     for case in still[:FEW]:
         console.print(
@@ -213,6 +241,7 @@ def print_report(
     if len(still) > FEW:
         console.print(f"and {len(still) - FEW} more with nothing to do", highlight=False, style="dim")
     _print_lost(records, console)
+    _print_suspicions(records, console)
     if not campaign:
         _print_tables(records, console, levels, whole)
     if old is not None:
@@ -220,7 +249,7 @@ def print_report(
         said = f"\nAgainst {printable(old.source)}{'' if table else ': nothing beyond noise'}"
         console.print(said, highlight=False, markup=False, style="bold")
         if table:
-            console.print(table, highlight=False)
+            _show(console, table)
     wrong = [r for r in records if r.contradicted]
     if wrong:
         console.print(f"\n[bold red]{len(wrong)} claims are contradicted by the judge:[/]")
@@ -263,10 +292,10 @@ def _print_motion(records: Records, console: Console, whole: bool) -> None:
     for name in dict.fromkeys(a.family for a in found):
         table.add_row(name, *(to_level(a) for a in found if a.family == name))
     console.print(BY_MOTION, highlight=False)
-    console.print(table, highlight=False)
+    _show_advice(console, table)
     if whole or len(moved(records, levels)) <= FEW:
         console.print()
-        console.print(motion_table(records), highlight=False)
+        _show(console, motion_table(records))
 
 
 def _print_lost(records: Records, console: Console) -> None:
@@ -284,6 +313,15 @@ def _print_lost(records: Records, console: Console) -> None:
         )
 
 
+def _print_suspicions(records: Records, console: Console) -> None:
+    found = suspicions(records)
+    for case, told in found[:FEW]:
+        console.print("[yellow]suspicious:[/]", end=" ")
+        console.print(f"{case}: {told}", highlight=False, markup=False)
+    if len(found) > FEW:
+        console.print(f"and {len(found) - FEW} more, on the page", highlight=False, style="dim")
+
+
 def _print_tables(records: Records, console: Console, levels: Sequence[float], whole: bool) -> None:
     lines = len(tables.reaches(records, levels)) + len(tables.walks(records))
     if not whole and lines > FEW:
@@ -295,10 +333,10 @@ def _print_tables(records: Records, console: Console, levels: Sequence[float], w
         return
     if any(r.step < 0 for r in records):
         console.print()
-        console.print(reach_table(records, levels))
+        _show(console, reach_table(records, levels))
         console.print("* at the floor: rounding to float64 allows no better", style="dim", highlight=False)
     if any(r.step >= 0 for r in records):
         console.print(
             "\n[bold]Sequences[/] (median residual, time of all steps; carried from step to step, or cold)"
         )
-        console.print(walk_table(records), highlight=False)
+        _show(console, walk_table(records))

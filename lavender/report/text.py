@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 
+from lavender.bench.store import Records
 from lavender.report.tables import Advice
 
-__all__ = ["count", "in_time", "residual", "seconds", "share", "times", "to_level"]
+__all__ = ["count", "in_time", "residual", "seconds", "share", "suspicions", "times", "to_level"]
 
 
 def seconds(t: float, missing: str = "–") -> str:
@@ -41,6 +42,19 @@ def times(x: float) -> str:
 def count(n: int, what: str, plural: str = "") -> str:
     """1 contact, 2 contacts."""
     return f"{n} {what if n == 1 else plural or what + 's'}"
+
+
+def suspicions(records: Records) -> list[tuple[str, str]]:
+    """(case, what looks like a mistake in its data); of a sequence the first step, and how many more."""
+    seen: dict[tuple[str, str], list[tuple[str, str]]] = {}
+    for name, info in records.cases.items():
+        for told in info.suspicions:
+            kind = told.partition(":")[0]
+            seen.setdefault((info.sequence or name, kind), []).append((name, told))
+    return [
+        (f"{some[0][0]} and {count(len(some) - 1, 'more step')}" if len(some) > 1 else some[0][0], some[0][1])
+        for some in seen.values()
+    ]
 
 
 def share(solved: int, cases: int) -> str:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 from lavender.bench.record import Record, level_name
 from lavender.bench.store import Records
+from lavender.io.stored import SUFFIXES
 from lavender.report import tables
 from lavender.report.contenders import QUICKER, Subject, subjects
 from lavender.report.moved import by_speed, speed_levels, speed_name
@@ -16,6 +17,7 @@ from lavender.report.tables.finals import WAYS, Final, Race, in_time, lines
 from lavender.report.tables.finals import to_level as race_to_level
 from lavender.report.text import count, residual, seconds
 from lavender.report.text import times as times_of
+from lavender.suite import FAMILIES
 
 __all__ = ["Verdict", "verdict"]
 
@@ -210,6 +212,8 @@ def _tolerance(records: Records, solver: str, level: float) -> float:
 def _name(records: Records, cases: Sequence[str]) -> str:
     words = [set(records.cases[c].structure) for c in cases]
     shape = next((s for s in SHAPES if all(s in w for w in words)), "")
+    if all(c.partition("(")[0] in FAMILIES and not records.cases[c].source.endswith(SUFFIXES) for c in cases):
+        return f"the {count(len(cases), 'built-in problem')}" if len(cases) > 1 else cases[0]
     if shape in ("", "separate", "dense"):
         return f"your {count(len(cases), 'problem')}" if len(cases) > 1 else "your problem"
     plural = {"mesh": "meshes"}.get(shape, shape + "s")

@@ -69,7 +69,7 @@ class Parameters:
     position_iterations: int = None  # type: ignore[assignment]
     seed: int = 0
     on_failure: str = "use"
-    slop: float = 1e-3  # m, penetration left alone
+    slop: float = 1e-3  # m, depth left alone
     margin: float = 1e-2  # m, gap below which contacts are made
     restitution_threshold: float = 0.5  # m/s, slower closing speeds do not bounce
 

@@ -167,7 +167,7 @@ def layout() -> dict[str, Any]:
     }
 
 
-def _stepper(name: str) -> dict[str, dict[str, float]]:
+def _stepper(name: str) -> dict[str, dict[str, Any]]:
     """What a stepper writes into `head` and `setting`."""
     state = Simulation(Scene("stack", stepper=name)).snapshot()
     first = offsets(state.size)

@@ -554,3 +554,26 @@ def test_models_of_one_file_name_are_kept_apart(lavender, tmp_path):
     folders = {p.name for p in (tmp_path / "o" / "recorded").iterdir()}
     assert lavender("report", *models, *words)[0] == 0
     assert {p.name for p in (tmp_path / "o" / "recorded").iterdir()} == folders
+
+
+def test_doctor_tells_what_looks_wrong_in_a_problem(lavender, path, tmp_path):
+    assert lavender("doctor", path)[:2] == (0, "1 looked at, none suspicious\n")
+    code, out, _ = lavender("doctor", path, "duplicated(k=3)")
+    assert (code, out.splitlines()[-1]) == (1, "2 looked at, 1 suspicious")
+    assert out.startswith("duplicated(k=3): duplicate rows: 2 contacts")
+    assert json.loads(lavender("doctor", "duplicated(k=3)", "--json")[1])["duplicated(k=3)"][0]["blocks"] == [
+        1,
+        2,
+    ]
+    assert lavender("doctor", tmp_path / "none.npz")[0] == 2
+
+
+def test_a_report_tells_what_looks_wrong(lavender, tmp_path):
+    code, out, _ = lavender(
+        "report", "duplicated(k=3)", "--solvers", "pgs", *QUICK, "--out", tmp_path / "out"
+    )
+    assert code == 0
+    told = "duplicate rows: 2 contacts stand where another of the pair does"
+    assert told in out
+    assert told in (tmp_path / "out" / "index.html").read_text(encoding="utf-8")
+    assert bench.read(tmp_path / "out").cases["duplicated(k=3)"].suspicions[0].startswith(told)

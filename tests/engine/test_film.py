@@ -1,6 +1,7 @@
 """Films of a run: what was stepped is what is kept, served and painted."""
 
 import json
+import shutil
 import threading
 import urllib.error
 import urllib.request
@@ -127,6 +128,29 @@ def test_a_port_that_is_taken_is_refused_and_nothing_is_filmed():
             sim.view(port=port, browser=False)
         assert len(sim._films) == 1
     assert sim._films == []
+
+
+@pytest.mark.parametrize(("dt", "rate"), [(1 / 60, 30), (1 / 7, 30), (1 / 240, 24)])
+def test_a_gif_takes_the_time_of_its_film_and_is_480_pixels_wide(dt, rate, tmp_path):
+    image = pytest.importorskip("PIL.Image")
+    film = lv.Simulation(lv.Scene("stack", n=1, dt=dt)).film(round(1.0 / dt))
+    shown = 0.0
+    with image.open(save_picture(film, tmp_path / "a.gif", rate=rate)) as found:
+        assert found.size[0] >= 480
+        for i in range(found.n_frames):
+            found.seek(i)
+            shown += 1e-3 * found.info["duration"]
+    # the last frame stands for one more, and the grid of frames ends within one of the film's end
+    assert shown == pytest.approx(film.time[-1] - film.time[0], abs=2.0 / rate)
+
+
+def test_an_mp4_needs_ffmpeg(tmp_path, monkeypatch):
+    film = lv.Simulation(lv.Scene("stack", n=1)).film(3)
+    if shutil.which("ffmpeg"):
+        assert save_picture(film, tmp_path / "a.mp4").read_bytes()[4:8] == b"ftyp"
+    monkeypatch.setenv("PATH", "")
+    with pytest.raises(lv.InputError, match="needs ffmpeg"):
+        save_picture(film, tmp_path / "b.mp4")
 
 
 @pytest.mark.parametrize("suffix", [".png", ".svg", ".gif"])

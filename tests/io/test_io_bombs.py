@@ -112,13 +112,13 @@ GLOBAL = {"fclib_global/spacedim": np.array([3], np.int32)}
 
 def one_wide_body(path):
     m = 36_000
-    h = sp.csr_array(np.ones((1, m)))
+    h = sp.csr_array(np.ones((2, m)))  # M is no mass matrix, so A is formed
     return hdf5(
         path,
         GLOBAL
-        | matrix("fclib_global/H", 1, m, -2, h.indptr, h.indices, h.data)
-        | matrix("fclib_global/M", 1, 1, -2, np.array([0, 1]), np.array([0]), np.array([1.0]))
-        | {"fclib_global/vectors/f": np.zeros(1), "fclib_global/vectors/w": np.zeros(m)}
+        | matrix("fclib_global/H", 2, m, -2, h.indptr, h.indices, h.data)
+        | matrix("fclib_global/M", 2, 2, -2, np.array([0, 2, 3]), np.array([0, 1, 1]), np.ones(3))
+        | {"fclib_global/vectors/f": np.zeros(2), "fclib_global/vectors/w": np.zeros(m)}
         | {"fclib_global/vectors/mu": np.full(m // 3, 0.5)},
     )
 

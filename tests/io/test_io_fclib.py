@@ -190,8 +190,12 @@ def test_every_storage_is_read(tmp_path, nz, spare):
     m, h = np.diag([2.0, 4.0, 0.5, 1.0]), np.vstack([W, np.ones(3)])
     parts = {"M": encoded(m, nz, spare), "H": encoded(h, nz, spare)}
     problem = lavender.io.load(make(tmp_path / "g.h5", f=np.arange(4.0), w=np.ones(3), mu=[0.5], **parts))
-    assert np.array_equal(problem.dense(), h.T @ np.linalg.inv(m) @ h)  # powers of two: exact
-    assert np.array_equal(problem.b, -(np.ones(3) + h.T @ np.linalg.inv(m) @ np.arange(4.0)))
+    assert np.array_equal(problem.generalized.jac.toarray(), h.T)
+    assert np.array_equal(problem.generalized.mass.toarray(), m)
+    np.testing.assert_allclose(problem.dense(), h.T @ np.linalg.inv(m) @ h, rtol=1e-15)
+    assert np.array_equal(
+        problem.b, -(np.ones(3) + h.T @ np.linalg.inv(m) @ np.arange(4.0))
+    )  # powers of two: exact
 
 
 def test_repeated_triplets_are_summed(tmp_path):
@@ -199,6 +203,38 @@ def test_repeated_triplets_are_summed(tmp_path):
     parts |= {"p": np.array([0, 1, 2, 1]), "i": np.array([0, 1, 2, 1]), "x": np.array([1.0, 2.0, 3.0, 4.0])}
     problem = lavender.io.load(make(tmp_path / "p.h5", W=parts, q=np.zeros(3), mu=[0.0]))
     assert np.array_equal(problem.dense(), np.diag([1.0, 6.0, 3.0]))
+
+
+def test_j_and_m_are_written_and_read_as_they_are(tmp_path):
+    rng = np.random.default_rng(2)
+    half = rng.normal(size=(5, 5))
+    jac, mass, v = rng.normal(size=(6, 5)), half @ half.T + np.eye(5), rng.normal(size=5)
+    cones = lv.Cones.contacts(0.5, count=2)
+    problem = lv.Problem.from_jacobian(jac, mass, v, cones=cones, target=rng.normal(size=6))
+    lavender.io.save(problem, tmp_path / "p.hdf5")
+    again = lavender.io.load(tmp_path / "p.hdf5")
+    assert lavender.io.read(tmp_path / "p.hdf5").format == "fclib_global"
+    assert again.operator == "generalized"
+    for one, two in ((again.generalized.jac, jac), (again.generalized.mass, mass)):
+        assert np.array_equal(one.toarray(), two)
+    # v* = M^-1 f with f = M v*: rounding times the condition number of M, 50
+    np.testing.assert_allclose(again.generalized.v_free, v, rtol=0.0, atol=1e-13)
+    np.testing.assert_allclose(again.b, problem.b, rtol=0.0, atol=1e-13)
+    lavender.io.save(again, tmp_path / "q.hdf5")
+    first, second = (lavender.io.fclib.read_contents(tmp_path / name) for name in ("p.hdf5", "q.hdf5"))
+    np.testing.assert_allclose(second.f, first.f, rtol=0.0, atol=1e-12)
+    soft = lv.Problem.from_jacobian(jac, mass, v, cones=cones, compliance=0.5)
+    lavender.io.save(soft, tmp_path / "s.hdf5")  # which the global form cannot hold
+    assert lavender.io.read(tmp_path / "s.hdf5").format == "fclib_local"
+
+
+def test_a_global_file_whose_m_is_no_mass_matrix_is_condensed(tmp_path):
+    m, h = np.diag([2.0, 4.0, 0.5]), W.T
+    m[0, 1] = 1.0
+    parts = {"M": encoded(m, -2), "H": encoded(h, -2)}
+    problem = lavender.io.load(make(tmp_path / "g.h5", f=np.arange(3.0), w=np.ones(3), mu=[0.5], **parts))
+    assert problem.operator == "matrix"
+    np.testing.assert_allclose(problem.dense(), h.T @ np.linalg.inv(m) @ h, rtol=1e-14, atol=1e-15)
 
 
 def test_equations_become_free_rows(tmp_path):
@@ -219,7 +255,7 @@ def test_equations_become_free_rows(tmp_path):
         make(tmp_path / "l.h5", q=w + h.T @ inv @ f, s=b + g.T @ inv @ f, mu=[0.5], **parts)
     )
     assert glob.cones.kind.tolist() == [lv.CONTACT, lv.ROW]
-    assert np.array_equal(glob.dense(), loc.dense())
+    np.testing.assert_allclose(glob.dense(), loc.dense(), rtol=1e-15, atol=1e-15)
     assert np.array_equal(glob.b, loc.b)
     assert glob.cones == loc.cones
     assert np.all(np.isinf([glob.cones.lower[3], glob.cones.upper[3]]))

@@ -13,6 +13,8 @@ from random_trees import random_general
 
 import lavender as lv
 from lavender import suite
+from lavender.motion.modes import enumerated
+from lavender.motion.several import _runs, distance
 
 LAWS = ("linear", "lcp", "cone")
 
@@ -358,6 +360,54 @@ def test_coulombs_law_leaves_several_motions():
     assert e.count == len(found)
     assert e.spread_speed == found.spread
     assert "no bound" in e.note
+
+
+def test_a_rod_that_can_stay_slide_or_leave_has_its_three_motions_by_default():
+    """A_nn < mu A_nt: with b = (-1, c), lambda = 0, (1, 1) and A^-1 b all solve where c >= 3, worked out by hand."""
+    rod = np.array([[1.0, -2.0], [-2.0, 5.0]])
+    for c in np.linspace(3.5, 9.0, 18):
+        found = lv.motions(lv.Problem.contact(rod, [-1.0, c], mu=[1.0]))
+        exact = [np.zeros(2), np.ones(2), np.linalg.solve(rod, [-1.0, c])]
+        assert found.all
+        assert "3 motions, all that there are" in str(found)
+        for x in exact:
+            assert min(np.abs(one.impulse - x).max() for one in found) < 1e-12
+    three = lv.motions(lv.Problem.contact(np.kron(np.eye(3), rod), [-1.0, 4.0] * 3, mu=[1.0] * 3))
+    assert (len(three), three.all) == (27, True)
+
+
+def test_every_mode_holds_what_a_search_finds_and_beyond_them_there_are_at_least_so_many():
+    rng = np.random.default_rng(4)
+    several = 0
+    for _ in range(20):
+        k = int(rng.integers(1, 3))
+        x = 0.3 * rng.normal(size=(2 * k, 2 * k))
+        a = np.kron(np.eye(k), [[1.0, -2.0], [-2.0, 5.0]]) + x @ x.T
+        problem = lv.Problem.contact(a, [-1.0, 4.0] * k + rng.normal(size=2 * k), mu=rng.uniform(0.5, 1.5, k))
+        found = lv.motions(problem)
+        assert found.all
+        several += len(found) > 1
+        for label, end in _runs(problem, found[0].reference, 6, 1):
+            if lv.residual(problem, end).relative < 1e-9:
+                assert min(distance(problem, end, one.impulse).share for one in found) < 1e-6, label
+    assert several > 3  # else the draw asks for nothing
+    rods = np.kron(np.eye(9), [[1.0, -2.0], [-2.0, 5.0]])
+    nine = lv.motions(lv.Problem.contact(rods, [-1.0, 4.0] * 9, mu=[1.0] * 9))
+    assert not nine.all
+    assert "at least" in str(nine)
+
+
+def test_a_box_without_a_unique_impulse_has_its_motion_by_all_modes():
+    # a plane box on two corners: four rows, three velocities
+    jac = [[0, 1, x] if normal else [1, 0, 0.5] for x in (-0.5, 0.5) for normal in (True, False)]
+    cones = lv.Cones.contacts([0.5, 0.5], tangents=1)
+    problem = lv.Problem.from_jacobian(
+        np.array(jac, float), np.diag([1, 1, 1 / 6]), [0.3, -0.16, 0.0], cones=cones
+    )
+    impulses, whole = enumerated(problem)
+    assert whole
+    assert impulses
+    assert all(lv.residual(problem, x).relative < 1e-7 for x in impulses)
 
 
 def test_equal_seeds_find_equal_motions():

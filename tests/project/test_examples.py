@@ -225,3 +225,25 @@ def test_drift_follows_the_motion_error_over_runs(tmp_path):
     assert all(value > 0.8 for value in module.ranks(found).values())
     by = {(run["sweeps"], run["order"], run["warm"]): run for run in found}
     assert by[4, "bottom_up", False]["drift"][-1] > 10 * by[64, "bottom_up", True]["drift"][-1]
+
+
+def test_a_box_of_pinocchio_comes_to_rest_on_its_corners():
+    pytest.importorskip("pinocchio", reason="needs Pinocchio 4: pip install 'lavender-contact[pinocchio]'")
+    module = example("pinocchio_box")
+    heights, speeds, force, worst = module.run()
+    assert worst <= 1e-8  # what was asked for
+    assert heights.min() > 0.5 * module.SIZE - 1e-4  # it never sinks in
+    assert heights[-1] == pytest.approx(0.5 * module.SIZE, abs=1e-4)
+    assert speeds.max() > 1.0 > 1e-6 > speeds[-1]  # it fell, and rests
+    assert force == pytest.approx(9.81 * module.MASS, rel=1e-6)
+
+
+def test_saps_impulses_on_a_box_of_drake_are_near_the_rigid_ones():
+    pytest.importorskip("pydrake", reason="needs Drake: pip install 'lavender-contact[drake]'")
+    module = example("drake_box")
+    found, force = module.run()
+    assert len(found) > 0.9 * module.STEPS
+    theirs, apart = np.median(found[:, [0, 2]], axis=0)
+    assert found[:, 1].max() <= 1e-9 < theirs < 1e-3  # asked for; SAP's contacts are soft, and little
+    assert apart < 1e-5
+    assert force == pytest.approx(9.81 * module.MASS, rel=1e-3)

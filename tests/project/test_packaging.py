@@ -50,6 +50,18 @@ def test_what_is_not_built_says_what_to_do(tmp_path):
     assert "pip install -e ." in last
 
 
+def test_a_folder_of_the_same_name_beside_does_not_hide_the_package(tmp_path):
+    # As Python started in the parent of a clone: an empty package comes before what only a finder knows.
+    if "__editable___lavender" in "".join(getattr(f, "__module__", "") for f in sys.meta_path):
+        pytest.skip("installed before setup.py asked for a .pth file: pip install -e . again")
+    (tmp_path / "lavender").mkdir()
+    done = subprocess.run(
+        [sys.executable, "-c", "import lavender; print(lavender.__version__)"],
+        capture_output=True, text=True, check=False, cwd=tmp_path,
+    )  # fmt: skip
+    assert done.stdout.strip() == lavender.__version__, done.stderr
+
+
 def test_no_text_offers_the_package_of_someone_else():
     # `lavender` on PyPI is another project; ours is installed as lavender-contact.
     offers = re.compile(r"pip install[^\n`&|;]*?[ '\"]lavender(?![\w-])|\blavender\[\w")

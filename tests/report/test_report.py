@@ -3,6 +3,7 @@
 import dataclasses
 import html
 import html.parser
+import io
 import math
 import random
 import re
@@ -10,13 +11,17 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 import lavender as lv
 from lavender import bench, report
 from lavender.bench.record import CaseInfo, Record, Run, file_name
 from lavender.report import curves, tables
+from lavender.report.curves import overall_figure
+from lavender.report.paper import write_paper
 from lavender.report.style import looks
 from lavender.report.svg import svg
+from lavender.report.terminal import print_report
 from lavender.report.text import residual, seconds, times
 from lavender.report.verdict import verdict
 
@@ -341,6 +346,91 @@ def test_residuals_have_two_digits():
     assert [residual(x) for x in (3.44e-7, 0.0, math.inf, 1.0)] == ["3.4e-7", "0", "inf", "1.0e0"]
 
 
+def test_the_picture_of_all_cases_is_the_median_of_what_was_reached_by_each_time():
+    rng = np.random.default_rng(5)
+    made = [
+        record(case, solver, 10.0 ** rng.uniform(-5, -2), 10.0 ** rng.uniform(-9, -1))
+        for case in "abcdefg"
+        for solver in ("pgs", "newton")
+        for _ in range(6)
+    ]
+    found = overall_figure(records_of(*made))
+    assert [c.solver for c in found.curves] == ["newton", "pgs"]
+    for curve in found.curves:
+        for t, low, middle, high in zip(curve.x, curve.low, curve.y, curve.high, strict=True):
+            reached = []
+            for case in "abcdefg":
+                own = [r for r in made if r.case == case and r.solver == curve.solver]
+                reached.append(min((r.relative for r in own if r.time_min <= t * (1 + 1e-9)), default=1.0))
+            assert middle == sorted(reached)[3]
+            assert (low, high) == (sorted(reached)[1], sorted(reached)[5])
+        assert list(curve.y) == sorted(curve.y, reverse=True)
+
+
+@pytest.mark.parametrize("width", [60, 80, 120])
+def test_tables_stay_within_the_terminal_and_nothing_is_cut(real, width):
+    out = io.StringIO()
+    print_report(real[0], Console(width=width, file=out), whole=True)
+    lines = [line for line in out.getvalue().splitlines() if not line.startswith("    lv.")]  # to copy
+    assert max(map(len, lines)) <= width
+    assert "…" not in out.getvalue()
+    found = tables.advice(real[0])
+    for name in {line.name for line in found}:
+        assert name in out.getvalue()
+    for best in (a.best for line in found for a in (*line.by_level.values(), *line.by_time.values())):
+        assert best is None or best.solver in out.getvalue()
+
+
+def test_the_first_screen_has_the_choice_and_the_picture(real, tmp_path):
+    page = report.write(real[0], tmp_path, figures=False).read_text(encoding="utf-8")
+    first = page[page.index('class="first"') : page.index("<nav>")]
+    found = verdict(real[0])
+    for text in (*found.sentences, *found.code):
+        assert text in html.unescape(first)
+    assert first.count("<svg") == 1
+    assert 'class="b"' in first
+    assert "built-in" not in first
+
+
+def test_a_paper_is_written_from_records_alone(real, tmp_path):
+    records = real[0]
+    folder = write_paper(records, tmp_path / "paper")
+    pdf = {p.name for p in folder.glob("*.pdf")}
+    assert "over-all.pdf" in pdf
+    assert any(name.startswith("profile-") for name in pdf)
+    assert all(p.read_bytes().startswith(b"%PDF") for p in folder.glob("*.pdf"))
+    before = {p.name: p.read_bytes() for p in folder.iterdir()}
+    write_paper(records, folder)
+    assert {p.name: p.read_bytes() for p in folder.iterdir()} == before  # no clock in it
+    text, method = ((folder / name).read_text(encoding="utf-8") for name in ("tables.tex", "method.tex"))
+    assert (
+        text.count(r"\begin{tabular}")
+        == text.count(r"\end{tabular}")
+        == 2 + len(tables.geometric_means(records))
+    )
+    for line in text.splitlines():
+        if line.endswith(r" \\"):  # as many cells as the head has
+            head = next(
+                h for h in text[: text.index(line) + len(line)].splitlines()[::-1] if "tabular}{" in h
+            )
+            assert len(re.findall(r"(?<!\\)&", line)) == len(head.split("{")[-1].rstrip("}")) - 1
+    unescaped = re.findall(r"(?<!\\)[_#%]", (text + method).replace("% \\usepackage", ""))
+    assert unescaped == []
+    for number in (len(records), len({r.solver for r in records}), len({r.case for r in records})):
+        assert re.search(rf"\b{number} ", method)
+    with pytest.raises(lv.InputError, match="runs with times"):
+        write_paper(records_of(), tmp_path / "none")
+
+
+def test_built_in_problems_are_not_called_yours():
+    runs = [record(name, "pgs", 1e-3, 1e-7) for name in ("stack(n=8)", "chain(n=4)")]
+    assert "the 2 built-in problems" in verdict(records_of(*runs)).text
+    named = records_of(*runs)
+    for name, known in list(named.cases.items()):
+        named.add(dataclasses.replace(known, source=f"{name}.npz"))
+    assert "your 2 stacks" in verdict(named).text
+
+
 def test_looks_tell_solvers_apart():
     names = [f"s{i}" for i in range(24)] + ["pgs", "direct"]
     found = looks(names)
@@ -563,7 +653,9 @@ def test_sequences_are_compared_carried_against_cold(tmp_path):
     assert [(c.label, c.y) for c in to_level.curves if c.solver == "direct"] == [
         ("direct", exact.times["cold"])
     ]
-    assert len(list(drawn)) == len(drawn.sequences["load"]) == 2  # the budget, and to the level
+    assert (
+        len(list(drawn)) - len(drawn.over) == len(drawn.sequences["load"]) == 2
+    )  # the budget, and to the level
     assert report.reaches(records) == []  # steps are no cases of their own
 
 

@@ -48,14 +48,14 @@ def test_the_first_sentence_is_by_motion_error_where_that_was_asked_for(records)
     said = verdict(working)
     best = next(a for a in moved.advice_by_speed(working) if a.target == 1e-4).best
     assert said.sentences[0].startswith(f"Use {best.solver}: ")
-    assert "until no body is wrong by more than 1e-4 m/s on your stack" in said.sentences[0]
+    assert "until no body is wrong by more than 1e-4 m/s on stack(n=16)" in said.sentences[0]
     # the line to copy does what the sentence says
     problem = lv.suite.case("stack(n=16)").problem
     solution = eval(said.code[0], {"lv": lv, "problem": problem})
     assert solution.motion_error().speed <= 1e-4
     plain = records_without(records, "speed_levels")
     found = verdict(moved.working(plain))
-    assert found.sentences[0].startswith("Use ") and " to 1e-3 on your stack" in found.sentences[0]
+    assert found.sentences[0].startswith("Use ") and " to 1e-3 on stack(n=16)" in found.sentences[0]
     assert found.sentences[-1].startswith("By motion error ") and "1e-3 m/s" in found.sentences[-1]
 
 

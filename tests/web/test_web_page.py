@@ -346,6 +346,23 @@ def test_it_opens_moving_with_two_settings_that_make_the_point(visit):
     assert caption == "A's joints are open by {}, B's by {}".format(*(said(v, x) for x in gaps))
 
 
+def test_joints_have_values_too(visit):
+    v = visit("#chain")
+    v.page.click("#second")
+    for i, warm in enumerate((True, False)):
+        simulation = lv.Simulation(lv.Scene("chain", warm_start=warm))
+        for _ in range(120):
+            observation = simulation.step()[0]
+        impulse, opened = (
+            float(v.side(i).locator(f"td[data-field='{name}']").get_attribute("data-value"))
+            for name in ("joint impulse", "joints open")
+        )
+        assert impulse == np.abs(observation["joint_impulses"]).max() > 0.0
+        assert opened == pytest.approx(native_gap("chain", 120, simulation.solver_iterations, warm), rel=1e-9)
+    v.page.select_option("#scene", "stack")
+    assert v.side(0).locator("td[data-field='joints open']").is_hidden()
+
+
 def said(v, x):
     return v.js(f"import('./app.js').then((module) => module.length({x!r}))")
 

@@ -7,9 +7,14 @@
   const theme = document.getElementById("theme");
   const dark = matchMedia("(prefers-color-scheme: dark)");
   theme.hidden = false;
+  const kept = (word) => {  // pages opened as files may have no storage
+    try { return word ? localStorage.setItem("lavender-theme", word) : localStorage.getItem("lavender-theme"); } catch { return null; }
+  };
+  if (["dark", "light"].includes(kept())) root.dataset.theme = kept();
   theme.addEventListener("click", () => {
     const isDark = root.dataset.theme ? root.dataset.theme === "dark" : dark.matches;
     root.dataset.theme = isDark ? "light" : "dark";
+    kept(root.dataset.theme);
   });
   const copy = document.getElementById("copy");
   if (copy && navigator.clipboard) {
@@ -35,10 +40,15 @@
     const paint = () => {
       const rules = chosen.map((n, i) => `.s${n} { --c: var(--c${i % COLOURS + 1}); }
         .c.s${n} { stroke-width: 5; opacity: 1; visibility: visible; } .c.s${n} text { display: block; }`);
+      if (chosen.length) rules.push(`.c.s${chosen[0]} .b { fill: var(--c); fill-opacity: 0.16; }`);
       if (alone.checked) rules.unshift(".c { visibility: hidden; }");
       style.textContent = rules.join("\n");
     };
     filter.hidden = filter.parentElement.hidden = false;
+    // What a link leads to stands below the bar, whatever its height is.
+    const below = () => { root.style.scrollPaddingTop = `${filter.parentElement.offsetHeight + 8}px`; };
+    addEventListener("resize", below);
+    below();
     filter.addEventListener("change", (event) => {
       const box = event.target;
       if (box !== alone) {
@@ -68,8 +78,8 @@
     return `${+(t / scale).toPrecision(3)} ${unit}`;
   };
   const points = (curve) => {
-    const path = curve.querySelector(".d") || curve.querySelector("path");
-    return (path.getAttribute("d").match(/M\d+ \d+/g) || []).map((p) => p.slice(1).split(" ").map(Number));
+    const path = curve.querySelector(".d") || curve.querySelector("path:not(.b)");
+    return (path.getAttribute("d").match(/[ML]\d+ \d+/g) || []).map((p) => p.slice(1).split(" ").map(Number));
   };
   function show(event) {
     const chart = event.target.closest && event.target.closest("svg.chart");
@@ -89,9 +99,15 @@
     const [xs, ys] = chart.dataset.t;
     const note = (best.curve.dataset.n || "").split("|")[best.i];
     const asked = /^\d+$/.test(note) ? `${note} iterations` : note;
+    const limit = /^\d+$/.test(note) ? `tol=0, max_iter=${note}` : /^to /.test(note) ? `tol=${note.slice(3)}` : "";
     const x = value(chart.dataset.x, best.x), y = value(chart.dataset.y, best.y);
-    tip.textContent = [best.curve.dataset.l, asked, xs === "1" ? seconds(x) : number(x), ys === "1" ? seconds(y) : number(y)]
-      .filter(Boolean).join(", ");
+    const said = [best.curve.dataset.l, asked, xs === "1" ? seconds(x) : number(x), ys === "1" ? seconds(y) : number(y)];
+    const run = every(".run").map((r) => r.textContent);
+    const [name, start] = best.curve.dataset.l.split(" ");
+    const from = start === "(warm)" ? "impulse=problem.guess, " : "";
+    const line = limit && `lv.solve(problem, "${name}", ${from}${limit})`;
+    tip.textContent = [said.filter(Boolean).join(", "), line, run.length === 1 ? `run ${run[0]}` : ""]
+      .filter(Boolean).join("\n");
     tip.hidden = false;
     tip.style.left = Math.min(event.pageX + 12, root.clientWidth + scrollX - tip.offsetWidth - 6) + "px";
     tip.style.top = event.pageY + 14 + "px";

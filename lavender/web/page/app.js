@@ -11,7 +11,9 @@ const DEFAULTS = [{ warm_start: 1 }, { warm_start: 0 }];
 const WHOLE = new Set(["iterations", "warm_start", "contacts", "cache_matches"]);
 const PULL = 200; // 1/s^2 and, as 2 sqrt of it, 1/s: the spring a held body hangs on, critically damped
 const PLAIN = ["scene", "a", "b", "speed", "play"];
-const UNITS = { residual_initial: "N s", residual_final: "N s", violation_initial: "m/s", violation_final: "m/s" };
+// Of joints, which the eight values of a step say nothing of: how far the worst is open, and its largest impulse.
+const OF_JOINTS = ["joints open", "joint impulse"];
+const UNITS = { "joints open": "m", "joint impulse": "N s", residual_initial: "N s", residual_final: "N s", violation_initial: "m/s", violation_final: "m/s" };
 
 const find = (id) => document.getElementById(id);
 
@@ -136,7 +138,7 @@ class Side {
     this.canvas = pick("canvas");
     this.order.append(...ORDERS.map((name, i) => new Option(name.replace("_", " "), i)));
     this.cells = {};
-    for (const field of SOLVER_FIELDS) {
+    for (const field of [...OF_JOINTS, ...SOLVER_FIELDS]) {
       const row = pick("tbody").insertRow();
       const head = document.createElement("th");
       head.scope = "row";
@@ -334,9 +336,18 @@ class Side {
 
   show() {
     const values = this.simulation.values;
+    const stepped = this.simulation.steps > 0;
+    const joints = this.simulation.joints > 0;
+    const impulses = joints ? this.simulation.array("joint_impulse") : [];
+    const most = [joints && stepped ? this.gap() : 0, impulses.reduce((x, y) => Math.max(x, Math.abs(y)), 0)];
+    OF_JOINTS.forEach((field, i) => {
+      const cell = this.cells[field];
+      cell.parentElement.hidden = !joints;
+      cell.textContent = stepped ? shown(field, most[i]) : "–";
+      cell.dataset.value = stepped ? String(most[i]) : "";
+    });
     SOLVER_FIELDS.forEach((field, i) => {
       const cell = this.cells[field];
-      const stepped = this.simulation.steps > 0;
       const asked = this.simulation.newton && field === "iterations" ? `to ${TOL.toExponential(0)}` : shown(field, values[i]);
       cell.textContent = stepped ? asked : "–";
       cell.dataset.value = stepped ? String(values[i]) : "";

@@ -1,0 +1,185 @@
+"""What a paper takes from a report: PDF figures, LaTeX tables, the paragraph on the method. From records alone.
+
+paper/over-all.pdf          error against time over all cases: medians, and bands of the middle half
+paper/profile-LAW-X.pdf     performance profiles, for each problem class and level
+paper/sequence-....pdf      of sequences, each step
+paper/tables.tex            recommendations, mean times by law, claims against the judge (booktabs)
+paper/method.tex            what was measured, how, on which machine, with its numbers
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from lavender.bench.record import file_name, level_name
+from lavender.bench.store import Records
+from lavender.errors import InputError
+from lavender.report import tables
+from lavender.report.curves import LINES, Figure, figures
+from lavender.report.draw import matplotlib_figure
+from lavender.report.moved import working
+from lavender.report.style import looks
+from lavender.report.tables.advice import NOISE
+from lavender.report.text import count, seconds, share
+from lavender.report.verdict import verdict
+
+__all__ = ["write_paper"]
+
+INCH = (5.5, 3.4)  # of a figure: a page's width of text
+
+
+def write_paper(records: Records, folder: str | Path, times: Sequence[float] = ()) -> Path:
+    """Write the figures, tables and the method of a paper.
+
+    Parameters
+    ----------
+    records : Records
+        Of the newest run; nothing is solved.
+    folder : path
+        Made if it does not exist.
+    times : s, optional
+        Time budgets of the recommendations; `tables.time_budgets` if none are given.
+
+    Returns
+    -------
+    Path
+        The folder.
+
+    Raises
+    ------
+    InputError
+        No runs with times (a campaign), or the folder cannot be written.
+    """
+    found = working(records.latest())
+    if not len(found) or tables.is_campaign(found):
+        raise InputError("a paper's figures need runs with times; these records have none")
+    times = tuple(times) or tables.time_budgets(found)
+    folder = Path(folder)
+    drawn = figures(found)
+    some = [_leading(figure, found, times) for figure in drawn.over]
+    some += [
+        figure for group in (drawn.profiles, drawn.sequences) for own in group.values() for figure in own
+    ]
+    look = looks({c.solver for figure in some for c in figure.curves})
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for figure in some:
+            canvas = matplotlib_figure(replace(figure, title=""), look, INCH)
+            path = folder / (file_name(figure.name.replace(" ", "-")) + ".pdf")
+            canvas.savefig(path, metadata={"CreationDate": None, "Producer": None})
+        (folder / "tables.tex").write_text(_tables(found, times), encoding="utf-8")
+        (folder / "method.tex").write_text(_method(found), encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"cannot write {error.filename or folder} ({error.strerror or error})") from None
+    return folder
+
+
+def _leading(figure: Figure, records: Records, times: Sequence[float]) -> Figure:
+    """The five curves to tell apart: the leaders of the verdict, then whoever ends lowest; bands of the first two."""
+    leaders = [
+        *verdict(records, times).leaders,
+        *(c.solver for c in sorted(figure.curves, key=lambda c: c.y[-1])),
+    ]
+    order = sorted(figure.curves, key=lambda c: leaders.index(c.solver))[:LINES]
+    return replace(figure, curves=(*order[:2], *(replace(c, low=(), high=()) for c in order[2:])))
+
+
+# -- LaTeX ------------------------------------------------------------------------------------------------
+
+
+_SPECIAL = {
+    "\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "µ": r"$\mu$", "≈": r"$\approx$",
+    "–": "--", **{c: "\\" + c for c in "&%$#_{}"},
+}  # fmt: skip
+
+
+def _tex(text: str) -> str:
+    """Text as LaTeX prints it, with no meaning of its own."""
+    return re.sub(r"[\\~^&%$#_{}µ≈–]", lambda found: _SPECIAL[found[0]], " ".join(text.split()))
+
+
+def _table(caption: str, label: str, heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    line = " & ".join
+    body = "".join(f"{line(map(_tex, row))} \\\\\n" for row in rows)
+    return (
+        f"\\begin{{table}}\n\\centering\n\\caption{{{_tex(caption)}}}\n\\label{{tab:{label}}}\n"
+        f"\\begin{{tabular}}{{l{'r' * (len(heads) - 1)}}}\n\\toprule\n{line(map(_tex, heads))} \\\\\n\\midrule\n"
+        f"{body}\\bottomrule\n\\end{{tabular}}\n\\end{{table}}\n"
+    )
+
+
+def _tables(records: Records, times: Sequence[float]) -> str:
+    levels = tables.levels_of(records)
+    heads = [f"to {level_name(x)}" for x in levels]
+    rows = []
+    for found in tables.advice(records, times):
+        best = [found.by_level[x].best for x in levels]
+        told = [f"{b.solver} {seconds(b.score)}{share(b.solved, b.cases)}" if b else "nobody" for b in best]
+        rows.append([found.name, str(found.size), *told])
+    caption = (
+        "Recommended solver, its mean time, and the cases that it brings to the level where that is not all. Within "
+        f"{NOISE:g} times of each other solvers count as equal."
+    )
+    made = [_table(caption, "recommended", ["structure", "cases", *heads], rows)]
+    shift = seconds(tables.SHIFT)
+    for law, by_level in tables.geometric_means(records).items():
+        names = by_level[levels[0]]
+        rows = [
+            [
+                name,
+                *(
+                    f"{seconds(by_level[x][name][0])} {by_level[x][name][1]}/{by_level[x][name][2]}"
+                    for x in levels
+                ),
+            ]
+            for name in names
+        ]
+        caption = (
+            f"Law {law}: geometric mean of times with {shift} added, and cases brought to the level; a miss costs "
+            f"{seconds(tables.limit_of(records))}. Solvers that take every case."
+        )
+        made.append(_table(caption, f"means-{law}", ["solver", *heads], rows))
+    rows = [
+        [c.solver, str(c.runs), str(c.claims), str(c.wrong), f"{c.reached}/{c.asked}", str(c.crashed)]
+        for c in tables.claims(records)
+    ]
+    caption = "Claims of solvers against the judge, who recomputes every residual from the problem's data."
+    made.append(
+        _table(caption, "claims", ["solver", "runs", "claims", "wrong", "levels reached", "died"], rows)
+    )
+    return "% \\usepackage{booktabs}\n" + "\n".join(made)
+
+
+def _method(records: Records) -> str:
+    """The paragraph on the method, each number of it read off the records."""
+    run = next(reversed(list(records.runs.values())))
+    own = [r for r in records if r.run == run.run]
+    ran = {r.case for r in own}
+    infos = [info for name, info in records.cases.items() if name in ran]
+    rows = sorted(info.rows for info in infos)
+    laws = [
+        f"{count(sum(i.law == law for i in infos), 'problem')} of law {law}"
+        for law in sorted({i.law for i in infos})
+    ]
+    repeats = sorted({r.repeats for r in own if r.usable})
+    levels = ", ".join(map(level_name, tables.levels_of(records)))
+    budgets = sorted({r.max_iter for r in own if r.mode == "budget"})
+    swept = f" and with exact budgets of {', '.join(map(str, budgets))} iterations" if budgets else ""
+    versions = ", ".join(f"{name} {version}" for name, version in run.versions.items())
+    least = f"the least of {repeats[0]}{f' to {repeats[-1]}' if len(repeats) > 1 else ''} repeats"
+    limit, threads = seconds(tables.limit_of(records)), count(run.threads, "thread")
+    solvers = count(len({r.solver for r in own}), "solver")
+    parts = (
+        f"We ran {solvers} on {count(len(infos), 'problem')} ({', '.join(laws)}; {rows[0]} to {rows[-1]} rows),",
+        f"{count(len(own), 'run')} in all, to relative residuals of {levels}{swept}. The residual of an impulse is",
+        "computed from the problem's data, whatever the solver reports: the larger of its errors in energy norm and",
+        "in velocity, each over that of doing nothing, so that 1 is doing nothing and 0 a solution. Times are those",
+        f"of set-up and solve, {least}, within a limit of {limit}; BLAS and OpenMP had {threads}. Means of times are",
+        f"geometric, with {seconds(tables.SHIFT)} added to each and a miss charged the limit. Profiles follow Dolan",
+        f"and Moré (2002). Machine: {run.cpu}, {run.cores} cores, {run.platform}; lavender {run.lavender}, Python",
+        f"{run.python}, {versions}; run {run.run}, {run.started}.",
+    )
+    return _tex(" ".join(parts)) + "\n"

@@ -1,0 +1,462 @@
+"""What in a problem looks like a mistake of whoever made it: suspicions, never a refusal.
+
+A solver takes a normal that points the wrong way as it takes any other, and converges. `diagnose` reads the data
+with the eyes of somebody who knows where such numbers come from:
+
+    centres     c_b - c_a = arm_a - arm_b, whatever contact of the pair says so; n points from a to b:
+                n.(c_b - c_a) > 0 between bodies without hollows                                        (1)
+    size        k^2 = tr(I) / 2m, the radius of gyration, is of the size of the arms                    (2)
+    targets     target = b + J v*: zero on tangents, not negative where bodies overlap                  (3)
+
+Every threshold stands off what the built-in suite, the scenes of the gallery, robots and recorded problems hold;
+where another reading of the same numbers would be ordinary (M^-1 read as M), that is part of the suspicion.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import scipy.sparse as sp
+
+from lavender._arrays import FloatArray
+from lavender.cones import CONTACT_SPIN, ROW
+from lavender.errors import InputError
+from lavender.problem import Problem
+from lavender.residuals import residual
+
+__all__ = ["Suspicion", "diagnose"]
+
+MU = 10.0  # -, beyond any pair of materials
+LARGE = 600  # velocities up to which an inverse of M is looked at
+FAR = 0.25  # -, of the arms: bodies further off each other than another contact of the pair says
+
+
+@dataclass(frozen=True)
+class Suspicion:
+    """One thing that looks wrong; `str()` is a line."""
+
+    kind: str  # in a few words, the same for the same mistake
+    reason: str  # what was found, and what to look at
+    blocks: tuple[int, ...] = ()  # blocks concerned; empty: the whole
+    names: tuple[str, ...] = ()  # of these blocks
+    data: dict[str, Any] = field(default_factory=dict)  # the numbers behind it
+
+    def __str__(self) -> str:
+        where = ", ".join(self.names[:3]) + (f", {len(self.names) - 3} more" if len(self.names) > 3 else "")
+        return f"{self.kind}: {self.reason}" + (f" ({where})" if where else "")
+
+
+def diagnose(problem: Problem, impulse: Any = None) -> tuple[Suspicion, ...]:
+    """What looks like a mistake in a problem's data, or in impulses that a solver found for it.
+
+    Looks at signs and order of normals, bodies and their sizes, masses, order of rows, targets, coefficients, keys
+    and the guess; solves nothing. A suspicion is no error: hooks have normals against their arms, conveyors targets on
+    tangents. None is no proof either.
+
+    Parameters
+    ----------
+    problem : Problem
+    impulse : (m,) N s, optional
+        A solution to look at; default: the problem's guess.
+
+    Returns
+    -------
+    tuple of Suspicion
+        Empty where nothing stands out.
+
+    Raises
+    ------
+    InputError
+        Not a problem, or impulses of another shape.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import lavender as lv
+    >>> problem = lv.Problem.contact(np.eye(6), [0.0, 0.0, 0.2, 0.0, 0.0, 0.2], mu=[0.5, 12.0])
+    >>> [s.kind for s in lv.diagnose(problem)]
+    ['friction', 'tangents first']
+    """
+    if not isinstance(problem, Problem):
+        raise InputError(f"problem is a {type(problem).__name__}; a lavender.Problem is needed")
+    given = problem.guess if impulse is None else problem.impulse_array(impulse)
+    with np.errstate(all="ignore"):  # what is beyond float64 is no larger and no smaller than anything
+        found = [s for check in _CHECKS for s in check(problem)]
+        if given is not None:
+            found += _impulses(problem, given)
+    return tuple(found)
+
+
+def _of(problem: Problem, kind: str, reason: str, blocks: Any = (), **data: Any) -> Suspicion:
+    at = tuple(int(i) for i in np.unique(np.asarray(blocks, int)))
+    names = tuple(problem.row_name(int(problem.cones.ptr[i])).rsplit(", ", 1)[0] for i in at[:100])
+    return Suspicion(kind, reason, at, names, data)
+
+
+# -- any problem ------------------------------------------------------------------------------------------
+
+
+def _friction(p: Problem) -> Iterator[Suspicion]:
+    c = p.cones
+    wild = np.flatnonzero((c.kind != ROW) & (c.mu > MU))
+    if len(wild):
+        most = float(c.mu[wild].max())
+        yield _of(p, "friction", f"mu up to {most:g}; dry materials have 0.1 to 2", wild, mu=most)
+
+
+def _keys(p: Problem) -> Iterator[Suspicion]:
+    if p.key is None:
+        return
+    values, first, count = np.unique(p.key, return_index=True, return_counts=True)
+    if len(values) < len(p.key):
+        worst = int(np.argmax(count))
+        blocks = np.flatnonzero(np.isin(p.key, values[count > 1]))
+        reason = f"{len(p.key) - len(values)} of {len(p.key)} keys stand elsewhere already: block {first[worst]}'s "
+        yield _of(p, "duplicate keys", reason + f"is that of {count[worst]} blocks", blocks)
+
+
+def _order(p: Problem) -> Iterator[Suspicion]:
+    # By b alone, which in the direction of a normal is an approach: gravity, a bounce, a depth.
+    c = p.cones
+    full = np.flatnonzero((c.kind != ROW) & (np.diff(c.ptr) - (c.kind == CONTACT_SPIN) == 3))
+    if p.rows is not None or len(full) < 2:
+        return
+    b = p.b[c.ptr[full][:, None] + np.arange(3)]
+    whole, toward = np.abs(b).sum(axis=0), b.sum(axis=0)
+    size = whole.sum()
+    if size == 0.0:
+        return
+    for row, place in ((1, "second"), (2, "third")):
+        if (
+            toward[row] > 0.98 * whole[row]
+            and whole[row] > 0.8 * size
+            and toward[0] < 0.1 * whole[0] + 1e-9 * size
+        ):
+            reason = f"bodies approach along the {place} row of contacts and not along the first; a contact's rows are "
+            yield _of(p, "tangents first", reason + "normal, tangent, tangent", full, b=b[0].tolist())
+            return
+    flat = b.ravel()
+    k = len(full)
+    late = np.count_nonzero(np.abs(flat[k:]) > 1e-6 * np.abs(flat).max())
+    if np.abs(flat[:k]).sum() > 0.9 * size and (flat[:k] > 0.0).mean() > 0.9 and 2 * late <= k:
+        reason = f"the first {k} contact rows approach and the other {2 * k} hardly do; rows stand by contact: normal, "
+        yield _of(p, "all normals first", reason + "tangent, tangent, then those of the next", full)
+
+
+def _twins(p: Problem) -> Iterator[Suspicion]:
+    # Blocks of the same rows, or of opposed ones that cannot both hold.
+    c = p.cones
+    contacts = np.flatnonzero(c.kind != ROW)
+    if p.rows is not None or len(contacts) < 2:
+        return
+    a = p.csr if p.generalized is None else p.generalized.jac
+    seen: dict[bytes, int] = {}
+    again, opposed = [], []
+    for i in contacts.tolist():
+        j, end = c.ptr[i], c.ptr[i + 1]
+        part = slice(a.indptr[j], a.indptr[end])
+        index, x = a.indices[part].tobytes() + np.diff(a.indptr[j : end + 1]).tobytes(), a.data[part]
+        if len(x) and seen.setdefault(index + x.tobytes(), i) != i:
+            again.append(i)
+        row = slice(a.indptr[j], a.indptr[j + 1])
+        other = seen.get(b"-" + a.indices[row].tobytes() + (0.0 - a.data[row]).tobytes())
+        seen.setdefault(b"-" + a.indices[row].tobytes() + a.data[row].tobytes(), i)
+        if other is not None and len(a.data[row]) and p.b[j] + p.b[c.ptr[other]] > 1e-9 * np.abs(p.b).max():
+            opposed += [other, i]
+    if len(again) > max(2, 0.3 * len(contacts)):  # collision detection repeats a point now and then
+        yield _of(p, "duplicate rows", f"{len(again)} contacts have the rows of an earlier one", again)
+    if opposed:
+        yield _of(p, "opposed normals", "normals that ask the same row to go both ways at once", opposed)
+
+
+def _impulses(p: Problem, impulse: FloatArray) -> Iterator[Suspicion]:
+    r = residual(p, impulse)
+    b = float(np.max(np.abs(p.b), initial=0.0))
+    if r.nothing_to_do or b == 0.0:
+        return
+    if r.relative > 50.0:  # dt = 1/60 s and less; what a step before left is worse than nothing a few times
+        reason = f"they are {r.relative:.2g} times as wrong as doing nothing; are they forces [N], for impulses [N s]?"
+        yield _of(p, "impulses", reason, [p.block_of(r.worst_row)], relative=r.relative)
+        return
+    own = np.abs(impulse) * np.where(p.d > 0.0, p.d, 0.0)  # the velocity that each gives its own row
+    i = int(np.argmax(own))
+    if own[i] > 1e4 * b * max(1.0, p.m / 100):  # a stack of n bodies multiplies its own momentum n times
+        reason = f"an impulse of {impulse[i]:.3g} N s turns its row by {own[i]:.3g} m/s, where b is {b:.3g} m/s at most"
+        yield _of(
+            p,
+            "impulses",
+            reason + ": far beyond the momentum at hand",
+            [p.block_of(i)],
+            velocity=float(own[i]),
+        )
+
+
+# -- J and v*: targets -------------------------------------------------------------------------------------
+
+
+def _motion(p: Problem) -> tuple[FloatArray, FloatArray] | None:
+    """J v* and target (m,) [m/s]; None for a matrix."""
+    if p.rows is not None:
+        u = p.jacobian @ p.rows.v_free.ravel()
+    elif p.generalized is not None:
+        u = p.generalized.velocity_of(p.generalized.v_free)
+    else:
+        return None
+    target = p.b + u
+    target[np.abs(target) <= 1e-12 * np.abs(u).max(initial=0.0)] = 0.0  # rounding of both
+    return u, target
+
+
+def _targets(p: Problem) -> Iterator[Suspicion]:
+    c = p.cones
+    motion = _motion(p)
+    contact = c.kind != ROW
+    if motion is None or not contact.any():
+        return
+    u, target = motion
+    normal = c.ptr[:-1][contact]
+    tangent = np.repeat(contact, np.diff(c.ptr))
+    tangent[normal] = False
+    joints = int(np.count_nonzero(np.repeat(~contact, np.diff(c.ptr))))
+    if joints and np.any(target[tangent]) and not np.any(np.roll(target, joints)[tangent]):
+        reason = f"tangents have targets up to {np.abs(target[tangent]).max():.3g} m/s, and none with the {joints} "
+        yield _of(p, "targets", reason + "targets of joints put first, where their rows stand")
+        return
+    un, tn = u[normal], target[normal]
+    if p.rows is None or not _at_rest(p):
+        return
+    if np.all(p.b[normal] <= 0.0) and np.all(tn < 0.0) and np.any(un < 0.0):
+        reason = f"every contact has a negative target (to {tn.min():.3g} m/s), which lets its bodies approach as over "
+        reason += "a gap, and nothing holds them; of a depth that is positive inside the target is +depth/dt"
+        yield _of(p, "targets", reason, np.flatnonzero(contact), target=float(tn.min()))
+
+
+def _above(p: Problem) -> Iterator[Suspicion]:
+    # Most bodies have one velocity v*, that of a step of gravity; what stands still holds some of them from below.
+    if p.rows is None or np.count_nonzero(p.rows.inv_mass) < 2:
+        return
+    r = p.rows
+    still = np.flatnonzero((r.contact_body < 0).any(axis=1))
+    v = r.v_free[r.inv_mass > 0.0, :3]
+    fall = np.median(v, axis=0)
+    size = float(np.linalg.norm(fall))
+    if len(still) < 4 or size == 0.0 or np.median(np.abs(v @ fall / size - size)) > 0.6 * size:
+        return
+    toward = np.where(r.contact_body[still, 1:] < 0, -1.0, 1.0) * r.normal[still] @ fall[:, None] / size
+    if toward.mean() > 0.3 and (toward > -0.1).mean() > 0.9:
+        reason = "what stands still pushes bodies the way they fall: are normals flipped, or bodies swapped?"
+        yield _of(p, "normals", reason, r.n_joints + still, along=float(toward.mean()))
+
+
+def _at_rest(p: Problem) -> bool:
+    """Bodies have about one velocity v*, and each touches another: what one step of gravity makes of rest."""
+    assert p.rows is not None
+    moving = p.rows.inv_mass > 0.0
+    if not np.isin(np.flatnonzero(moving), p.rows.contact_body).all() or not moving.any():
+        return False
+    v = p.rows.v_free[moving, :3]
+    fall = np.median(v, axis=0)
+    return bool(np.linalg.norm(v - fall, axis=1).max() <= 0.1 * np.linalg.norm(fall))
+
+
+# -- contacts of bodies --------------------------------------------------------------------------------------
+
+
+def _geometry(p: Problem) -> Iterator[Suspicion]:
+    if p.rows is None or not p.rows.n_contacts:
+        return
+    r = p.rows
+    first = r.n_joints
+    a, b = r.contact_body.T
+    reach = np.linalg.norm(np.stack([r.arm_a, r.arm_b]), axis=2) * np.stack([a >= 0, b >= 0])
+    size = reach.sum(axis=0)
+    along = np.einsum("ij,ij->i", r.normal, r.arm_a * (a >= 0)[:, None] - r.arm_b * (b >= 0)[:, None])
+    against = np.flatnonzero(along < -0.1 * size)  # (1)
+    if len(against):
+        i = int(against[np.argmin(along[against] / size[against])])
+        reason = f"{len(against)} of {len(along)} normals point from body b to body a by their arms: body {a[i]} to "
+        reason += f"{b[i]}, {along[i]:.3g} m; a normal points from a to b, arms from the centres to the point"
+        yield _of(p, "normals", reason, first + against, along=float(along[i]))
+    again, opposed = _same_place(r, size)
+    if len(again):
+        yield _of(
+            p, "duplicate rows", f"{len(again)} contacts stand where another of the pair does", first + again
+        )
+    if len(opposed):
+        reason = "two contacts of a pair in one place push opposite ways"
+        yield _of(p, "opposed normals", reason, first + opposed)
+    moving = np.flatnonzero((a >= 0) & (b >= 0))
+    off = _loops(np.stack([a, b], axis=1)[moving], (r.arm_a - r.arm_b)[moving], r.n_bodies)
+    wrong = moving[off > FAR * size[moving]]
+    if len(wrong) and len(wrong) <= 0.2 * len(moving):
+        i = int(wrong[0])
+        reason = (
+            f"by its arms contact {i} has the centres of bodies {a[i]} and {b[i]} elsewhere than the others "
+        )
+        yield _of(
+            p, "bodies", reason + "have them: does it name another body?", first + wrong, off=float(off.max())
+        )
+
+
+def _same_place(r: Any, size: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Contacts that repeat another of their pair to rounding, and those that oppose one within a hundredth."""
+    pair = np.sort(r.contact_body, axis=1)
+    turned = np.where(r.contact_body[:, 0] > r.contact_body[:, 1], -1.0, 1.0)[:, None]
+    arm = np.where(
+        (r.contact_body[:, 1] == pair[:, 1])[:, None], r.arm_b, r.arm_a
+    )  # of the later, a moving body
+    n = turned * r.normal
+    order = np.lexsort((arm[:, 2], arm[:, 1], arm[:, 0], pair[:, 1], pair[:, 0]))
+    again, opposed = [], []
+    for step in (1, 2, 3):
+        i, j = order[:-step], order[step:]
+        near = np.linalg.norm(arm[i] - arm[j], axis=1)
+        same = np.all(pair[i] == pair[j], axis=1)
+        dot = np.einsum("ij,ij->i", n[i], n[j])
+        again.append(j[same & (near <= 1e-12 * size[i]) & (dot > 1.0 - 1e-12)])
+        clash = same & (near <= 1e-2 * size[i]) & (dot < -0.9)
+        opposed += [i[clash], j[clash]]
+    return np.unique(np.concatenate(again)), np.unique(np.concatenate(opposed))
+
+
+def _loops(pair: Any, between: FloatArray, n: int) -> FloatArray:
+    """|c_b - c_a - between| (e,) [m] with centres c of least sum of such distances: few that err stand out."""
+    if not len(pair):
+        return np.zeros(0)
+    at = np.arange(len(pair))
+    incidence = sp.csr_array(
+        (np.r_[-np.ones(len(pair)), np.ones(len(pair))], (np.r_[at, at], pair.T.ravel())),
+        shape=(len(pair), n),
+    )
+    scale = np.abs(between).max()
+    if not 0.0 < scale < np.inf:
+        return np.zeros(len(pair))
+    weight = np.ones(len(pair))
+    for _ in range(8):
+        normal = incidence.T @ sp.diags_array(weight) @ incidence + 1e-9 * sp.eye_array(n)
+        centre = sp.linalg.splu(sp.csc_array(normal)).solve(
+            incidence.T @ (weight[:, None] * (between / scale))
+        )
+        off = np.linalg.norm(incidence @ centre - between / scale, axis=1)
+        weight = 1.0 / (off + 1e-4)
+    return scale * off
+
+
+# -- masses --------------------------------------------------------------------------------------------------
+
+
+def _masses(p: Problem) -> Iterator[Suspicion]:
+    if p.rows is None or not p.rows.n_bodies:
+        return
+    r = p.rows
+    turning = np.abs(r.inv_inertia).max(axis=(1, 2)) > 0.0
+    still = np.flatnonzero((r.inv_mass == 0.0) & turning)
+    if len(still):
+        reason = f"body {still[0]} has a finite inertia and an infinite mass (inv_mass 0): it turns and never moves"
+        yield _of(p, "masses", reason, bodies=still.tolist())
+    eigen = np.linalg.eigvalsh(r.inv_inertia)
+    size = _sizes(r)
+    known = np.flatnonzero((r.inv_mass > 0.0) & (eigen[:, 0] > 1e-9 * eigen[:, -1]) & (size > 0.0))
+    if not len(known):
+        return
+    m, e, s2 = r.inv_mass[known], eigen[known], size[known] ** 2
+    readings = {  # (2), with each number read as given, or as its inverse
+        "": (1.0 / e).sum(axis=1) * m,
+        "mass for inverse mass": (1.0 / e).sum(axis=1) / m,
+        "inertia for inverse inertia": e.sum(axis=1) * m,
+        "mass and inertia for their inverses": e.sum(axis=1) / m,
+    }
+    share = {name: float(np.median(np.log10(0.5 * k2 / s2))) for name, k2 in readings.items()}
+    own = share.pop("")
+    best = min(share, key=lambda name: abs(share[name] + 0.4))
+    if abs(own + 0.4) > 1.6 and abs(share[best] + 0.4) < 0.5:
+        reason = (
+            f"radii of gyration are {10 ** (0.5 * own):.2g} times the arms of contacts and joints; ordinary "
+        )
+        yield _of(
+            p,
+            "masses",
+            reason + f"({10 ** (0.5 * share[best]):.2g}) if {best} was given",
+            ratio=10 ** (0.5 * own),
+        )
+        return
+    density = np.median(1.0 / m / s2**1.5)
+    if density < 0.05 and 10.0 < np.median(m / s2**1.5) < 3e4:
+        reason = f"bodies are lighter than air ({density:.2g} kg/m^3 by the arms), ordinary with mass for inverse mass"
+        yield _of(p, "masses", reason, density=float(density))
+
+
+def _sizes(r: Any) -> FloatArray:
+    """Longest arm of each body (n,) [m], of contacts and of joint rows that push."""
+    size = np.zeros(r.n_bodies)
+    joint = np.repeat(r.joint_body, np.diff(r.joint_ptr), axis=0)
+    for side in (0, 1):
+        body = r.contact_body[:, side]
+        arm = np.linalg.norm(r.arm_b if side else r.arm_a, axis=1)
+        np.maximum.at(size, body[body >= 0], arm[body >= 0])
+        push, turn = (np.linalg.norm(r.jac[:, 6 * side + k : 6 * side + k + 3], axis=1) for k in (0, 3))
+        has = (joint[:, side] >= 0) & (push > 0.0)
+        np.maximum.at(size, joint[has, side], turn[has] / push[has])
+    return size
+
+
+def _inverse(p: Problem) -> Iterator[Suspicion]:
+    g = p.generalized
+    if g is None or not 3 <= g.nv <= LARGE:
+        return
+    mass = g.mass.toarray()
+    inverse = np.linalg.inv(mass)
+    given, other = _free(mass), _free(inverse)
+    if len(other) and not len(given):
+        reason = "three velocities have one mass, uncoupled, in the inverse of M and not in M: was M^-1 given for M?"
+        yield _of(p, "masses", reason, velocities=other)
+    elif (
+        p.m == g.nv
+        and len(given)
+        and not _orthogonal(p, g.jac, given)
+        and _orthogonal(p, g.jac.T.tocsr(), given)
+    ):
+        reason = (
+            "contacts' rows are orthogonal unit vectors of a free body in J^T and not in J: is J transposed?"
+        )
+        yield _of(p, "J transposed", reason)
+    weight = np.abs(g.jac).max(axis=0).toarray().ravel() if p.m else np.zeros(g.nv)
+    seen = weight > 0.0
+    if len(other) > len(given) or np.count_nonzero(seen) < 3:
+        return
+    spread = [np.ptp(np.log10(d[seen] / weight[seen] ** 2)) for d in (mass.diagonal(), inverse.diagonal())]
+    if spread[0] > 2.0 and spread[1] < 0.25 * spread[0]:
+        reason = f"effective masses of the velocities span 10^{spread[0]:.1f}, with the inverse of M 10^{spread[1]:.1f}"
+        yield _of(p, "masses", reason + ": was M^-1 given for M?", spread=spread)
+
+
+def _free(mass: FloatArray) -> list[int]:
+    """First of each three velocities with equal mass and nothing between them: those of a body that flies."""
+    n = len(mass)
+    d = mass.diagonal()
+    at = np.arange(n - 2)
+    size = 1e-9 * d[:-2]
+    equal = (np.abs(d[1:-1] - d[:-2]) <= size) & (np.abs(d[2:] - d[:-2]) <= size)
+    off = sum(np.abs(mass[at + i, at + j]) for i, j in ((0, 1), (0, 2), (1, 2)))
+    return [int(i) for i in np.flatnonzero(equal & (off <= size))]
+
+
+def _orthogonal(p: Problem, jac: Any, free: list[int]) -> bool:
+    """Most contacts that move a free body do so by three orthogonal unit vectors."""
+    c = p.cones
+    first = c.ptr[:-1][(c.kind != ROW) & (np.diff(c.ptr) == 3)]
+    eye = np.eye(3)
+    for j in free:
+        parts = [jac[i : i + 3][:, j : j + 3].toarray() for i in first]
+        unit = [np.allclose(x @ x.T, eye, atol=1e-6) for x in parts if x.any()]
+        if unit and np.mean(unit) > 0.5:
+            return True
+    return False
+
+
+_CHECKS: tuple[Callable[[Problem], Iterator[Suspicion]], ...] = (
+    _friction, _keys, _order, _twins, _targets, _above, _geometry, _masses, _inverse,
+)  # fmt: skip

@@ -1,0 +1,207 @@
+"""Absurd input is told, and what is meant so is not."""
+
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+
+import lavender as lv
+from lavender import suite
+
+
+def step(name, steps, **parameters):
+    simulation = lv.Simulation(lv.Scene(name, **parameters))
+    for _ in range(steps):
+        simulation.step()
+    return simulation.constraint_problem()
+
+
+SCENES = {
+    "stack": step("stack", 2, n=12, size=0.5, mass=60.0),
+    "bridge": step("bridge", 40),
+    "pit": step("pile", 60, n=60, size=0.3),
+}
+
+
+def given(problem):
+    """Rows as somebody would give them, and b's target."""
+    rows = {f.name: np.array(getattr(problem.rows, f.name)) for f in fields(problem.rows) if f.name != "copy"}
+    return rows, problem.b + problem.jacobian @ problem.rows.v_free.ravel()
+
+
+def made(problem, rows, target):
+    c, kj = problem.cones, problem.rows.n_joints
+    mj = len(rows["jac"])
+    return lv.Problem.from_rows(
+        lv.Rows(**rows),
+        target,
+        lower=c.lower[:mj],
+        upper=c.upper[:mj],
+        mu=c.mu[kj:],
+        tangents=c.n_tangents[kj:],
+    )
+
+
+def kinds(problem, impulse=None):
+    return {s.kind for s in lv.diagnose(problem, impulse)}
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_a_sound_step_is_silent(name):
+    problem = SCENES[name]
+    assert lv.diagnose(problem) == ()
+    assert lv.diagnose(made(problem, *given(problem))) == ()
+
+
+def test_the_built_in_suite_is_silent():
+    assert [c.name for c in suite.cases("default") if lv.diagnose(c.problem)] == []
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_flipped_normals_are_told(name):
+    rows, target = given(SCENES[name])
+    rows["normal"] *= -1.0
+    assert "normals" in kinds(made(SCENES[name], rows, target))
+    rows["normal"][1:] *= -1.0  # one alone, which opposes the others of its pair
+    found = lv.diagnose(made(SCENES[name], rows, target))
+    assert ("normals", (SCENES[name].rows.n_joints,)) in [(s.kind, s.blocks) for s in found]
+
+
+@pytest.mark.parametrize("name", ["stack", "pit"])
+def test_swapped_bodies_are_told(name):
+    rows, target = given(SCENES[name])
+    rows["contact_body"] = rows["contact_body"][:, ::-1]
+    assert "normals" in kinds(made(SCENES[name], rows, target))
+
+
+@pytest.mark.parametrize("name", ["stack", "pit"])
+def test_opposed_and_repeated_contacts_are_told(name):
+    problem = SCENES[name]
+    rows, _ = given(problem)
+    for sign, kind in ((1.0, "duplicate rows"), (-1.0, "opposed normals")):
+        twice = dict(rows)
+        for key in ("contact_body", "tangent", "arm_a", "arm_b"):
+            twice[key] = np.concatenate([rows[key], rows[key][-1:]])
+        twice["normal"] = np.concatenate([rows["normal"], sign * rows["normal"][-1:]])
+        assert kind in kinds(lv.Problem.from_rows(lv.Rows(**twice), mu=0.5))
+
+
+@pytest.mark.parametrize("name", ["stack", "pit"])
+def test_a_contact_of_another_body_is_told(name):
+    problem = SCENES[name]
+    rows, target = given(problem)
+    pair = rows["contact_body"]
+    count = np.bincount(pair[pair.min(axis=1) >= 0].ravel(), minlength=problem.rows.n_bodies)
+    # a contact whose bodies, and the one beside, are held by others
+    i = next(
+        i for i, (a, b) in enumerate(pair)
+        if a >= 0 and 0 <= b < len(count) - 1 and b + 1 != a and min(count[[a, b, b + 1]]) > 3
+    )  # fmt: skip
+    rows["contact_body"][i, 1] += 1
+    found = {s.kind: s for s in lv.diagnose(made(problem, rows, target))}
+    assert found["bodies"].blocks == (problem.rows.n_joints + i,)
+
+
+def test_joint_targets_behind_those_of_contacts_are_told():
+    problem = SCENES["bridge"]
+    rows, target = given(problem)
+    mj = len(rows["jac"])
+    target[np.abs(target) < 1e-12] = 0.0
+    target[:mj:3] = 0.6  # m/s: they close gaps of a centimetre
+    assert kinds(made(problem, rows, target)) == set()
+    assert kinds(made(problem, rows, np.roll(target, -mj))) == {"targets"}
+
+
+def test_masses_for_their_inverses_are_told():
+    for name in ("stack", "pit"):  # the bridge's planks have 1 kg and 1 m, where both readings are ordinary
+        rows, target = given(SCENES[name])
+        rows["inv_mass"], rows["inv_inertia"] = 1.0 / rows["inv_mass"], np.linalg.inv(rows["inv_inertia"])
+        assert "masses" in kinds(made(SCENES[name], rows, target)), name
+    rows, target = given(SCENES["stack"])
+    assert "masses" in kinds(made(SCENES["stack"], rows | {"inv_mass": 1.0 / rows["inv_mass"]}, target))
+    still = rows["inv_mass"].copy()
+    still[3] = 0.0
+    found = lv.diagnose(made(SCENES["stack"], rows | {"inv_mass": still}, target))
+    assert "finite inertia" in found[0].reason
+    assert found[0].data["bodies"] == [3]
+
+
+def test_a_depth_with_the_wrong_sign_is_told():
+    rows, _ = given(SCENES["stack"])
+    rows["v_free"][:] = (0.0, 0.0, -9.81 / 60, 0.0, 0.0, 0.0)
+    target = np.zeros(SCENES["stack"].m)
+    for depth, wanted in ((0.01, set()), (-0.01, {"targets"})):
+        target[::3] = depth * 60
+        assert kinds(made(SCENES["stack"], rows, target)) == wanted
+
+
+def test_friction_keys_and_forces_are_told():
+    problem = SCENES["stack"]
+    doubled = np.array(problem.key)
+    doubled[5] = doubled[7]
+    assert kinds(replace(problem, key=doubled)) == {"duplicate keys"}
+    assert lv.diagnose(replace(problem, key=doubled))[0].blocks == (5, 7)
+    solved = lv.solve(problem, tol=1e-9).impulse
+    assert kinds(problem, solved) == set()
+    assert kinds(problem, 240.0 * solved) == {"impulses"}
+    assert kinds(replace(problem, guess=240.0 * solved)) == {"impulses"}
+    wild = replace(problem, cones=lv.Cones.contacts(12.0, count=problem.n_blocks))
+    assert kinds(wild) == {"friction"}
+
+
+def boxes(n=3):
+    """Boxes side by side on the ground in generalised coordinates: J (12 n, 6 n), M, v*."""
+    problem = step("stack", 1, n=1, size=0.5, mass=60.0)
+    j = problem.jacobian.toarray()
+    mass = np.linalg.inv(problem.rows.inverse_mass_matrix().toarray())
+    return np.kron(np.eye(n), j), np.kron(np.eye(n), mass), np.tile(problem.rows.v_free.ravel(), n)
+
+
+def test_generalised_coordinates_out_of_order_are_told():
+    j, mass, v = boxes()
+    cones = lv.Cones.contacts(0.5, count=12)
+
+    def problem(j, mass=mass):
+        return lv.Problem.from_jacobian(j, mass, v, cones=cones)
+
+    assert kinds(problem(j)) == set()
+    last = np.arange(36).reshape(-1, 3)[:, [1, 2, 0]].ravel()
+    assert kinds(problem(j[last])) == {"tangents first"}
+    grouped = np.arange(36).reshape(-1, 3).T.ravel()
+    assert kinds(problem(j[grouped])) == {"all normals first"}
+    assert kinds(problem(j, np.linalg.inv(mass))) == {"masses"}
+    assert (
+        kinds(problem(np.concatenate([j[:-3], j[:3]]))) == set()
+    )  # one of twelve: collision detection does that
+    assert kinds(problem(np.concatenate([j[:18], j[:18]]))) == {"duplicate rows"}
+    flat = j[:6, :6]  # two contacts of one box: as many rows as velocities
+    pair = lv.Cones.contacts(0.5, count=2)
+    assert kinds(lv.Problem.from_jacobian(flat, mass[:6, :6], v[:6], cones=pair)) == set()
+    assert "J transposed" in kinds(lv.Problem.from_jacobian(flat.T, mass[:6, :6], v[:6], cones=pair))
+
+
+def test_a_matrix_with_opposed_rows_is_told():
+    a = np.eye(6)
+    a[3:, :3] = a[:3, 3:] = np.diag([-1.0, 1.0, 1.0])
+    problem = lv.Problem.contact(a, [0.3, 0.0, 0.0, 0.1, 0.0, 0.0], mu=[0.5, 0.5])
+    assert "opposed normals" in kinds(problem)
+    assert kinds(lv.Problem.contact(a, [0.3, 0.0, 0.0, -0.4, 0.0, 0.0], mu=[0.5, 0.5])) == set()
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-320, 1e-160, 1e160, 1e300])
+@pytest.mark.parametrize("what", ["arm_a", "arm_b", "inv_mass", "inv_inertia", "v_free"])
+def test_numbers_at_the_edge_of_float64_are_looked_at(what, size):
+    for name in SCENES:
+        rows, target = given(SCENES[name])
+        try:
+            problem = made(SCENES[name], rows | {what: size * rows[what]}, target)
+        except lv.InputError:  # b is not finite
+            continue
+        assert all(isinstance(s.reason, str) for s in lv.diagnose(problem, np.full(problem.m, 1e300)))
+
+
+def test_what_is_no_problem_is_refused():
+    with pytest.raises(lv.InputError, match=r"lavender\.Problem is needed"):
+        lv.diagnose(np.eye(3))
+    with pytest.raises(lv.InputError, match="shape"):
+        lv.diagnose(SCENES["stack"], np.zeros(3))
