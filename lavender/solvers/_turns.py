@@ -20,7 +20,7 @@ from lavender.solvers._sweepers import Sweeps
 from lavender.solvers._trail import CLOCK, Trail, usable
 from lavender.solvers._walks import sweeps_of
 from lavender.solvers.direct import Impatient
-from lavender.solvers.newton import NewtonState, after_sweeps, asking
+from lavender.solvers.newton import NewtonState, asking
 
 __all__ = ["VELOCITY", "Turns", "note", "velocities_left", "whole"]
 
@@ -74,8 +74,6 @@ def whole(
         impulse = trail.swept.copy()
     if own and trail.problem.law == "lcp":
         singular = any(key.startswith("direct") for key in trail.ended)
-        if singular or trail.swept is not None:
-            solver = after_sweeps(solver)
         if trail.swept is not None and not singular and trail.problem.m > FEW and trail.problem.is_symmetric:
             # Which rows are free is known from sweeps, however far they are. Where A is singular on them exchanges,
             # which is what direct does, go round in circles; so they do where A is asymmetric and sweeps got nowhere.

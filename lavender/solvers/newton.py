@@ -5,8 +5,8 @@
 0. A warm start over bodies is judged first; then at most 64 sweeps (counted in `work`) and, for contacts, at most
    six Newton steps over the bodies, or one banded factorisation of joints alone, where these will do
    (`warm_start.py`).
-1. Bounded rows by exchanges (Newton's method on the natural map) from the warm start, from sweeps that cost as much
-   as a factorisation, and from the solution of H z = g (`_newton/exchange.py`).
+1. Bounded rows by exchanges (Newton's method on the natural map) from the warm start and from the solution of H z = g
+   (`_newton/polish.py`).
 2. A cold Mehrotra interior point, polished on the identified rows as soon as it has found them, to the floor of
    float64.
 3. Where that stops short on rows that nearly depend on each other: both again through the augmented
@@ -74,7 +74,6 @@ class Newton:
 
     form: str = "auto"
     more: ClassVar[Any] = None  # see `asking`
-    swept: ClassVar[bool] = False  # see `after_sweeps`
 
     def prepare(self, problem: Problem) -> NewtonState:
         """The system of a problem."""
@@ -171,7 +170,7 @@ class Newton:
             return Claim(Status.STALLED, 0, {"factorisations": 0}, "no row can move")
         cold = bool(np.array_equal(impulse, problem.start()))
         sweeps = system.factorisations = 0
-        if not cold and not self.swept and self.form == "auto" and problem.rows is not None:
+        if not cold and self.form == "auto" and problem.rows is not None:
             tried = warm_start(problem, impulse, tol, n, time_limit)
             claim, sweeps, system.factorisations = claim_of(tried), tried.sweeps, tried.factorisations
             if claim is not None and general.confirmed(problem, impulse, tol):
@@ -179,15 +178,14 @@ class Newton:
         deadline = np.inf if time_limit is None else perf_counter() + time_limit
         run = Run(system, tol, n, deadline, self.more)
         z = system.sc.unknown(impulse)
-        # What sweeps left says which rows are free; where that fails, it is no start.
-        run.score(system.sc.unknown(problem.start()) if self.swept else z)
+        run.score(z)
         interrupted = False
         try:
             if not run.done():
                 if problem.law == "coulomb" and system.sc.has_friction:
                     solve_coulomb(run, z, cold)
                 else:
-                    solve_convex(run, z, cold, self.swept)
+                    solve_convex(run, z, cold)
         except KeyboardInterrupt:
             interrupted = True  # the best iterate goes back all the same
         impulse[:] = system.sc.impulse(run.best_z)
@@ -235,14 +233,6 @@ def asking(solver: Any, more: Callable[[FloatArray], int]) -> Newton:
     """The same solver, which asks for more factorisations where its budget is used up (`_newton/run.py`)."""
     made: Newton = replace(solver)
     object.__setattr__(made, "more", more)
-    return made
-
-
-def after_sweeps(solver: Newton) -> Newton:
-    """The same solver, for a start that sweeps have left or where they are in vain: it does not sweep again."""
-    made = replace(solver)
-    object.__setattr__(made, "more", solver.more)
-    object.__setattr__(made, "swept", True)
     return made
 
 
