@@ -34,7 +34,7 @@ from lavender.problem import Problem
 from lavender.residuals import nothing_to_do
 from lavender.scene.gallery import SCENES
 from lavender.solvers import newton
-from lavender.solvers._newton import convex, coulomb, desaxce, interior_point, proximal, sparse, sweeping, systems
+from lavender.solvers._newton import convex, coulomb, interior_point, proximal, sparse, systems
 
 Part = tuple[Callable[[Problem], bool], list[tuple[Any, str, Any]], dict[str, Any]]
 
@@ -140,33 +140,12 @@ PARTS: dict[str, Part] = {
     "first weight of cones": (cones, [(convex, "CONE_DELTA", convex.DELTA)], {}),
     "proximal end of cones": (cones, [(convex, "Proximal", _Still)], {}),
     # phases, Coulomb's law
-    "sweeps": (coulombs, [(sweeping.Sweeping, "round", lambda _s: False)], {}),
-    "first walk": (coulombs, [(coulomb, "FIRST", 0)], {}),
-    "walks": (coulombs, [(coulomb, "_walk", nothing)], {}),
-    "De Saxce": (coulombs, [(coulomb, "_interior", nothing), (coulomb, "solve_desaxce", lambda *_: [])], {}),
+    "walks": (coulombs, [(coulomb, "_pursue", nothing), (coulomb.Proximal, "advance", _not_last)], {}),
+    "De Saxce": (coulombs, [(coulomb, "solve_desaxce", nothing), (coulomb, "_loops", nothing)], {}),
     "walk from the cone law": (coulombs, [(coulomb, "_from_convex", nothing)], {}),
-    "further shares": (coulombs, [(coulomb, "SHARES", desaxce.SHARES[:2])], {}),
-    "last walks": (coulombs, [(coulomb, "LAST", ()), (coulomb.Proximal, "advance", _not_last)], {}),
+    "further shares": (coulombs, [(coulomb, "SHARES", coulomb.SHARES[:2])], {}),
+    "last rounds": (coulombs, [(coulomb.Proximal, "advance", _not_last)], {}),
     "augmented De Saxce": (coulombs, [(coulomb, "solve_desaxce_augmented", nothing)], {}),
-    "all but sweeps and De Saxce": (
-        coulombs,
-        [(coulomb, "_walk", nothing), (coulomb, "_from_convex", nothing), (coulomb, "FIRST", 0),
-         (coulomb, "LAST", ()), (coulomb.Proximal, "advance", _not_last)],
-        {},
-    ),
-    "all but De Saxce": (
-        coulombs,
-        [(sweeping.Sweeping, "round", lambda _s: False), (coulomb, "_walk", nothing),
-         (coulomb, "_from_convex", nothing), (coulomb, "FIRST", 0),
-         (coulomb, "LAST", ()), (coulomb.Proximal, "advance", _not_last)],
-        {},
-    ),
-    "all but walks": (
-        coulombs,
-        [(sweeping.Sweeping, "round", lambda _s: False), (coulomb, "_interior", nothing),
-         (coulomb, "solve_desaxce", lambda *_: [])],
-        {},
-    ),
     # factorisations
     "band": (matrix, [(systems, "_band", lambda _sc, _a: None)], {}),
     "dense": (matrix, [(systems, "DENSE_ROWS", -1), (systems, "is_full", lambda *_: False)], {}),
@@ -235,7 +214,12 @@ def run(p: Problem, part: Part | None, args: argparse.Namespace) -> tuple[bool, 
         took = process_time() - begun
     r = found.residual
     good = found.success or r.relative <= 2.0 * r.floor or found.status.name == "INFEASIBLE"
-    return good, found.work.get("factorisations", 0), took, found.impulse.tobytes() + repr(dict(found.work)).encode()
+    return (
+        good,
+        found.work.get("factorisations", 0),
+        took,
+        found.impulse.tobytes() + repr(dict(found.work)).encode(),
+    )
 
 
 def compare(p: Problem, parts: dict[str, Part], args: argparse.Namespace) -> Iterator[dict[str, Any]]:
@@ -270,11 +254,14 @@ def table(records: list[dict[str, Any]]) -> Iterator[str]:
     order = {name: i for i, name in enumerate(PARTS)}
     for (part, of), rs in sorted(grouped.items(), key=lambda item: (order[item[0][0]], item[0][1])):
         both = [r for r in rs if r["with"] and r["without"]]
-        mean = [math.exp(np.mean(np.log([r[k] for r in both]))) if both else math.nan for k in ("factors", "time")]
+        mean = [
+            math.exp(np.mean(np.log([r[k] for r in both]))) if both else math.nan for k in ("factors", "time")
+        ]
         worst = max((r["time"] for r in both), default=math.nan)
         lost = sum(r["with"] and not r["without"] for r in rs)
         won = sum(r["without"] and not r["with"] for r in rs)
-        yield f"{'' if of else part:<30}{of or 'all':<24}{len(rs):>5}{lost:>6}{won:>5}{mean[0]:>9.2f}{mean[1]:>7.2f}{worst:>7.1f}"
+        counts = f"{len(rs):>5}{lost:>6}{won:>5}{mean[0]:>9.2f}{mean[1]:>7.2f}{worst:>7.1f}"
+        yield f"{'' if of else part:<30}{of or 'all':<24}{counts}"
 
 
 def main() -> None:

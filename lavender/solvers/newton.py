@@ -11,8 +11,8 @@
    float64.
 3. Where that stops short on rows that nearly depend on each other: both again through the augmented
    system of the bodies.
-4. Coulomb friction by rounds of accelerated sweeps (counted in `work`), a proximal Newton method on the
-   Alart-Curnier map, and interior points on De Saxce's form of the law, whose convex problem moves with every step.
+4. Coulomb friction by a proximal Newton method on the Alart-Curnier map, and interior points on De Saxce's form of the
+   law, whose convex problem moves with every step.
 
 Problems in generalised coordinates go over their velocities first (`_newton/general.py`), where A is never formed; what
 that leaves goes on as above, over the rows of A, unless form="velocity". Many rows without friction go over A at once
@@ -183,7 +183,7 @@ class Newton:
         try:
             if not run.done():
                 if problem.law == "coulomb" and system.sc.has_friction:
-                    solve_coulomb(run, z, cold)
+                    solve_coulomb(run, z)
                 else:
                     solve_convex(run, z, cold)
         except KeyboardInterrupt:
@@ -203,7 +203,6 @@ class Newton:
             status = Status.TIME_LIMIT
         else:
             status = Status.STALLED
-        sweeps += run.sweeps
         work = {"factorisations": system.factorisations} | ({"sweeps": sweeps} if sweeps else {})
         return Claim(
             status,

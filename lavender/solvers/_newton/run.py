@@ -26,7 +26,6 @@ class Run:
     more: Callable[[FloatArray], int] | None = (
         None  # asked for more factorisations, with the best (m,) N s so far
     )
-    sweeps: int = 0  # between Newton's walks
     best: float = np.inf
     best_z: FloatArray = field(init=False)
     aside: tuple[float, FloatArray] | None = None  # a best point that is no start for what comes
