@@ -124,7 +124,6 @@ PARTS: dict[str, Part] = {
     "bodies apart from J and M": (bodies, [], {"as": "J and M"}),
     "velocities of J and M": (general, [], FORM_ROWS),
     "rows after velocities": (general, [], {"form": "velocity"}),
-    "rows where they cost less": (general, [(newton, "_rows_cost_less", nothing)], {}),
     # starts
     "warm start": (bodies, [(newton, "warm_start", _left)], {}),
     "exchanges": (bounded, [(convex, "_exchange", nothing)], {}),

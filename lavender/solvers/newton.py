@@ -15,8 +15,7 @@
    law, whose convex problem moves with every step.
 
 Problems in generalised coordinates go over their velocities first (`_newton/general.py`), where A is never formed; what
-that leaves goes on as above, over the rows of A, unless form="velocity". Many rows without friction go over A at once
-where its factor costs less.
+that leaves goes on as above, over the rows of A, unless form="velocity".
 
 The parts stand in `_newton/`. Form "velocity" factors I + K^T V K over the bodies and never squares J; "impulse"
 factors over the rows.
@@ -37,9 +36,7 @@ from lavender.problem import OPERATORS, Problem
 from lavender.registry import SolverSpec
 from lavender.residuals import quick
 from lavender.solution import Claim, Status
-from lavender.solvers import _rates as rates
-from lavender.solvers._counts import newton_factor
-from lavender.solvers._few import FEW_GENERAL, NEWTON
+from lavender.solvers._few import NEWTON
 from lavender.solvers._newton import general
 from lavender.solvers._newton.convex import solve_convex
 from lavender.solvers._newton.coulomb import solve_coulomb
@@ -93,8 +90,7 @@ class Newton:
         if problem.generalized is not None and self.form != "impulse":
             kernel = general.prepare(problem)
             if kernel is not None:
-                rows = _rows_cost_less(problem, kernel, like) if self.form == "auto" else None
-                return NewtonState(problem, rows, None if rows is not None else kernel)
+                return NewtonState(problem, None, kernel)
             if self.form == "velocity":
                 raise CapabilityError(
                     f"form='velocity' has room for a matrix of {general.ROOM:.1e} values over the velocities of an "
@@ -212,20 +208,6 @@ class Newton:
             form=system.form,
             certificate=run.certificate,
         )
-
-
-def _rows_cost_less(problem: Problem, kernel: Any, like: System | None) -> System | None:
-    """The system over the rows of A where its factor costs less than one over velocities that fills.
-
-    Looked at where no row rubs, and such a factor costs more than to form A; few rows go in one compiled call.
-    """
-    if problem.m <= FEW_GENERAL or problem.law not in ("linear", "lcp"):
-        return None
-    factor = rates.GENERAL[problem.law] * general.factor_flops(problem, kernel.largest)
-    if factor <= rates.FORMED_START + rates.FORMED * float(problem.metric.entries_of_a):
-        return None
-    system = make_system(problem, "impulse", like)
-    return system if system.sc.m and newton_factor(system) < factor else None
 
 
 def asking(solver: Any, more: Callable[[FloatArray], int]) -> Newton:
