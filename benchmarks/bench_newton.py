@@ -29,12 +29,12 @@ from bench_islands import forms
 
 import lavender as lv
 from lavender import suite
-from lavender._derived import Tried
 from lavender.problem import Problem
 from lavender.residuals import nothing_to_do
 from lavender.scene.gallery import SCENES
 from lavender.solvers import newton
 from lavender.solvers._newton import convex, coulomb, interior_point, proximal, sparse, systems
+from lavender.solvers.warm_start import Tried
 
 Part = tuple[Callable[[Problem], bool], list[tuple[Any, str, Any]], dict[str, Any]]
 
@@ -113,8 +113,8 @@ def _apart(*args: Any, apart: bool = True, **kwargs: Any) -> Any:
     return interior_point.InteriorPoint(*args, apart=True, **kwargs)
 
 
-def _left(_problem: Problem, _impulse: Any, tol: float, *_: Any) -> Tried:
-    return Tried(tol, 0, 0, 0)
+def _left(*_: Any) -> Tried:
+    return Tried(0)
 
 
 FORM_ROWS = {"form": "impulse"}

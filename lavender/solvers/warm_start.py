@@ -6,10 +6,9 @@ equations; what is not within tol after it goes on from the start it came with.
 
 from __future__ import annotations
 
-import numpy as np
+from typing import NamedTuple
 
 from lavender._arrays import FloatArray
-from lavender._derived import Tried
 from lavender.problem import Problem
 from lavender.solution import Claim, Status
 from lavender_ext.warm.start import (
@@ -35,6 +34,14 @@ ENDED = {
 }
 
 
+class Tried(NamedTuple):
+    """What the first phase made of a start."""
+
+    how: int  # how it ended, a number of the kernel; 0 where it decided nothing
+    sweeps: int = 0
+    factorisations: int = 0
+
+
 def claim_of(tried: Tried) -> Claim | None:
     """What `newton` says of a warm start that ended in its first phase; None where it did not."""
     message = ENDED[tried.how]
@@ -50,21 +57,9 @@ def claim_of(tried: Tried) -> Claim | None:
 def warm_start(
     problem: Problem, impulse: FloatArray, tol: float, budget: int, time_limit: float | None = None
 ) -> Tried:
-    """Carry `impulse` (m,) to tol in place where the first phase can; else nothing is changed.
-
-    Where `problem.derived.tried` says that this was tried on the guess before, as a simulation does on its own
-    arrays, it is not tried again.
-    """
+    """Carry `impulse` (m,) to tol in place where the first phase can; else nothing is changed."""
     if problem.rows is None or problem.friction != "coulomb" or tol <= 0.0 or budget < MOST_STEPS:
-        return Tried(tol, 0, 0, 0)
+        return Tried(0)
     if time_limit is not None and MOST_SWEEPS * 1e-9 * problem.data.work > time_limit:
-        return Tried(tol, 0, 0, 0)
-    tried = problem.derived.tried
-    if (
-        tried is None
-        or tried.tol != tol
-        or problem.guess is None
-        or not np.array_equal(impulse, problem.guess)
-    ):
-        tried = Tried(tol, *from_guess(problem.data, impulse, tol))
-    return tried
+        return Tried(0)
+    return Tried(*from_guess(problem.data, impulse, tol))
