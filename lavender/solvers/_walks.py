@@ -75,7 +75,7 @@ class Walks(Sweeps):
     def _due(self, share: float) -> bool:
         """Sweeps since the last walk cost that share of one, and promise no end within its cost."""
         trail = self.trail
-        if trail.late or trail.waits or self.since < share * WALK * least_step(trail.problem):
+        if trail.late or self.since < share * WALK * least_step(trail.problem):
             return False
         cost = WALK * walk_step(trail.costs.system)
         return self.since >= share * cost and self.cost > cost

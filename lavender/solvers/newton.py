@@ -23,10 +23,9 @@ factors over the rows.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from time import perf_counter
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -70,7 +69,6 @@ class Newton:
     """
 
     form: str = "auto"
-    more: ClassVar[Any] = None  # see `asking`
 
     def prepare(self, problem: Problem) -> NewtonState:
         """The system of a problem."""
@@ -172,7 +170,7 @@ class Newton:
             if claim is not None and general.confirmed(problem, impulse, tol):
                 return claim
         deadline = np.inf if time_limit is None else perf_counter() + time_limit
-        run = Run(system, tol, n, deadline, self.more)
+        run = Run(system, tol, n, deadline)
         z = system.sc.unknown(impulse)
         run.score(z)
         interrupted = False
@@ -208,13 +206,6 @@ class Newton:
             form=system.form,
             certificate=run.certificate,
         )
-
-
-def asking(solver: Any, more: Callable[[FloatArray], int]) -> Newton:
-    """The same solver, which asks for more factorisations where its budget is used up (`_newton/run.py`)."""
-    made: Newton = replace(solver)
-    object.__setattr__(made, "more", more)
-    return made
 
 
 def _refusal(problem: Problem) -> str | None:

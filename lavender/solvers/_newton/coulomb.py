@@ -9,6 +9,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from lavender._arrays import FloatArray
@@ -29,14 +31,15 @@ WEIGHT = 1e-5  # proximal weight that the first walk begins with (measured: 1e-4
 def solve_coulomb(run: Run, z: FloatArray) -> None:
     """1 to 4, until the judge is content."""
     walk = Proximal(z, AUGMENTED, WEIGHT)
-    for stage in (
+    stages: list[Callable[[], None]] = [
         lambda: _pursue(run, walk),
         lambda: solve_desaxce(run, SHARES[:1]),
         lambda: _loops(run),
         lambda: _from_convex(run),
         lambda: solve_desaxce(run, SHARES[1:]),
         lambda: walk.advance(run),
-    ):
+    ]
+    for stage in stages:
         stage()
         if run.done() or run.at_floor():
             return
