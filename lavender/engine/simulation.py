@@ -34,7 +34,7 @@ from lavender.scene.scene import SWEEPS
 from lavender.solution import Solution, Status
 from lavender.solve import finish, solve
 from lavender.solvers.newton import SPEC as NEWTON_SPEC
-from lavender.solvers.warm_start import MOST_STEPS, Tried, claim_of
+from lavender.solvers.warm_start import Tried, claim_of
 from lavender_ext.engine.arrays import lengths
 
 if TYPE_CHECKING:
@@ -333,9 +333,7 @@ class Simulation:
             self._state = self._state.grown()
 
     def _solve_substeps(self) -> None:
-        warm = (
-            self._warm_tol > 0.0 and self.solver_iterations >= MOST_STEPS and get("newton").factory == NEWTON
-        )
+        warm = self._warm_tol > 0.0 and get("newton").factory == NEWTON
         for _ in range(self._parameters.substeps):
             self._last = None
             self._prepare()

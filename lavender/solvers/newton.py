@@ -2,9 +2,8 @@
 
     z = D^1/2 lambda,   H = D^-1/2 A D^-1/2,   s = H z - g complementary to z on every block
 
-0. A warm start over bodies is judged first; then at most 64 sweeps (counted in `work`) and, for contacts, at most
-   six Newton steps over the bodies, or one banded factorisation of joints alone, where these will do
-   (`warm_start.py`).
+0. A warm start over bodies is judged first; then at most 64 sweeps (counted in `work`), or one banded factorisation of
+   joints alone, where these will do (`warm_start.py`).
 1. Bounded rows by exchanges (Newton's method on the natural map) from the warm start and from the solution of H z = g
    (`_newton/polish.py`).
 2. A cold Mehrotra interior point, polished on the identified rows as soon as it has found them, to the floor of

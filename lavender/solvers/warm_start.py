@@ -1,7 +1,7 @@
-"""The first phase of `newton` from a warm start: judge it, a few sweeps, few Newton steps; or free joints at once.
+"""The first phase of `newton` from a warm start: judge it, a few sweeps; or free joints at once.
 
-The step of a simulation at rest, or of a chain, ends here. `lavender_ext/warm/start.pxd` and `active_set.pxd` have the
-equations; what is not within tol after it goes on from the start it came with.
+The step of a simulation at rest, or of a chain, ends here. `lavender_ext/warm/start.pxd` has the equations; what is not
+within tol after it goes on from the start it came with.
 """
 
 from __future__ import annotations
@@ -13,16 +13,14 @@ from lavender.problem import Problem
 from lavender.solution import Claim, Status
 from lavender_ext.warm.start import (
     JUDGED,
-    MOST_STEPS,
     MOST_SWEEPS,
     SOLVED,
-    STEPPED,
     SWEPT,
     UNDECIDED,
     from_guess,
 )
 
-__all__ = ["MOST_STEPS", "Tried", "claim_of", "warm_start"]
+__all__ = ["Tried", "claim_of", "warm_start"]
 
 #: How the kernel says that it ended; None where nothing was decided.
 ENDED = {
@@ -30,7 +28,6 @@ ENDED = {
     JUDGED: "as it came",
     SWEPT: "warm sweeps",
     SOLVED: "joints solved directly",
-    STEPPED: "warm sweeps, Newton steps over bodies",
 }
 
 
@@ -58,7 +55,7 @@ def warm_start(
     problem: Problem, impulse: FloatArray, tol: float, budget: int, time_limit: float | None = None
 ) -> Tried:
     """Carry `impulse` (m,) to tol in place where the first phase can; else nothing is changed."""
-    if problem.rows is None or problem.friction != "coulomb" or tol <= 0.0 or budget < MOST_STEPS:
+    if problem.rows is None or problem.friction != "coulomb" or tol <= 0.0 or budget < 1:
         return Tried(0)
     if time_limit is not None and MOST_SWEEPS * 1e-9 * problem.data.work > time_limit:
         return Tried(0)

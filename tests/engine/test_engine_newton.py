@@ -75,16 +75,6 @@ def test_the_first_phase_ends_in_each_of_its_ways():
     assert all(s.residual.relative <= 1e-10 for s in chain[1:])
     swept = [s for s in messages("pyramid", base=6, dt=1 / 240) if s.message == "warm sweeps"]
     assert all(s.work["sweeps"] in (4, 8, 16, 32, 64) and s.success for s in swept)
-    sim = lv.Simulation(lv.Scene("pyramid", base=8, friction=0.15))
-    for _ in range(50):
-        sim.step()
-    problem = sim.constraint_problem()
-    exact = lv.solve(problem, "newton", tol=1e-13).impulse
-    noise = np.random.default_rng(0).normal(size=problem.m)
-    stepped = lv.solve(problem, "newton", tol=1e-9, impulse=exact * (1.0 + 1e-4 * noise))
-    assert stepped.message == "warm sweeps, Newton steps over bodies" and stepped.success
-    assert 1 <= stepped.work["factorisations"] <= 6
-    assert stepped.work["sweeps"] in (4, 8, 16)
     problem = lv.Simulation("table").constraint_problem()
     exact = lv.solve(problem, "newton", tol=1e-12).impulse
     near = lv.solve(problem, "newton", impulse=exact * (1.0 + 1e-5))
