@@ -33,7 +33,7 @@ from lavender.problem import Problem
 from lavender.residuals import nothing_to_do
 from lavender.scene.gallery import SCENES
 from lavender.solvers import newton
-from lavender.solvers._newton import convex, coulomb, interior_point, proximal, sparse, systems
+from lavender.solvers._newton import convex, coulomb, interior_point, proximal, systems
 from lavender.solvers.warm_start import Tried
 
 Part = tuple[Callable[[Problem], bool], list[tuple[Any, str, Any]], dict[str, Any]]
@@ -86,21 +86,9 @@ def anything(_p: Problem) -> bool:
 _ADVANCE = proximal.Proximal.advance
 
 
-def _not_last(self: Any, run: Any, limit: int = 10_000) -> None:
-    if limit != 10_000:
+def _no_end(self: Any, run: Any, limit: int = 10_000) -> None:
+    if limit != 12:
         _ADVANCE(self, run, limit)
-
-
-class _Still(proximal.Proximal):
-    def advance(self, run: Any, limit: int = 10_000) -> None:
-        if limit != 12:
-            super().advance(run, limit)
-
-
-def _whole(self: Any, rows: Any, eps: float, lu: bool) -> Any:
-    p = np.zeros(self.m)
-    p[rows] = 1.0
-    return self.small(p, p, eps - 1.0, lu)
 
 
 def _together(*args: Any, apart: bool = False, **kwargs: Any) -> Any:
@@ -137,29 +125,17 @@ PARTS: dict[str, Part] = {
     "proximal rounds, convex": (convexs, [(convex, "_proximal", nothing)], {}),
     "second weight of cones": (cones, [(convex, "DELTA", convex.CONE_DELTA)], {}),
     "first weight of cones": (cones, [(convex, "CONE_DELTA", convex.DELTA)], {}),
-    "proximal end of cones": (cones, [(convex, "Proximal", _Still)], {}),
+    "proximal end of cones": (cones, [(convex.Proximal, "advance", _no_end)], {}),
     # phases, Coulomb's law
-    "walks": (coulombs, [(coulomb, "_pursue", nothing), (coulomb.Proximal, "advance", _not_last)], {}),
+    "walks": (coulombs, [(coulomb, "_pursue", nothing)], {}),
     "De Saxce": (coulombs, [(coulomb, "solve_desaxce", nothing), (coulomb, "_loops", nothing)], {}),
     "walk from the cone law": (coulombs, [(coulomb, "_from_convex", nothing)], {}),
     "further shares": (coulombs, [(coulomb, "SHARES", coulomb.SHARES[:2])], {}),
-    "last rounds": (coulombs, [(coulomb.Proximal, "advance", _not_last)], {}),
     "augmented De Saxce": (coulombs, [(coulomb, "solve_desaxce_augmented", nothing)], {}),
     # factorisations
-    "band": (matrix, [(systems, "_band", lambda _sc, _a: None)], {}),
     "dense": (matrix, [(systems, "DENSE_ROWS", -1), (systems, "is_full", lambda *_: False)], {}),
     "sparse panels of A": (matrix, [(systems, "is_full", lambda *_: True)], {}),
-    "band and panels of A": (
-        matrix, [(systems, "_band", lambda _sc, _a: None), (systems, "is_full", lambda *_: True)], {}
-    ),
-    "band and dense": (
-        matrix,
-        [(systems, "_band", lambda _sc, _a: None), (systems, "DENSE_ROWS", -1),
-         (systems, "is_full", lambda *_: False)],
-        {},
-    ),
     "SuperLU after panels": (matrix, [(systems.MatrixSystem, "_superlu", lambda _s, _m: systems._nothing)], {}),
-    "factor of free rows alone": (matrix, [(sparse.Coupled, "free", _whole)], {}),
     "panels over bodies": (bodies, [(systems, "PANELS", math.inf)], {}),
     "block rows over bodies": (bodies, [(systems, "PANELS", 0.0)], {}),
     "dissection": (bodies, [(systems, "dissected", lambda n, a, p, i: (p, i, None, None, None))], {}),

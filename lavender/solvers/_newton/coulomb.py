@@ -4,7 +4,6 @@
 2. De Saxce's form of the law (`_newton/desaxce.py`), ended by the proximal Newton; closed loops of joints through the
    augmented system, too.
 3. The same walk from the answer of the convex relaxation; then the other shares of phi's derivative.
-4. Proximal rounds from the first walk on, to the end of the budget.
 """
 
 from __future__ import annotations
@@ -29,15 +28,13 @@ WEIGHT = 1e-5  # proximal weight that the first walk begins with (measured: 1e-4
 
 
 def solve_coulomb(run: Run, z: FloatArray) -> None:
-    """1 to 4, until the judge is content."""
-    walk = Proximal(z, AUGMENTED, WEIGHT)
+    """1 to 3, until the judge is content."""
     stages: list[Callable[[], None]] = [
-        lambda: _pursue(run, walk),
+        lambda: _pursue(run, Proximal(z, AUGMENTED, WEIGHT)),
         lambda: solve_desaxce(run, SHARES[:1]),
         lambda: _loops(run),
         lambda: _from_convex(run),
         lambda: solve_desaxce(run, SHARES[1:]),
-        lambda: walk.advance(run),
     ]
     for stage in stages:
         stage()
