@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from threading import RLock
-from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TypeVar, overload
+from typing import TYPE_CHECKING, Any, Generic, TypeVar, overload
 
 if TYPE_CHECKING:
     from lavender.motion.reference import Kept
@@ -12,15 +12,6 @@ if TYPE_CHECKING:
     from lavender_ext.judge.measure import Judged
 
 T = TypeVar("T")
-
-
-class Tried(NamedTuple):
-    """What the first phase of `newton` made of a problem's guess."""
-
-    tol: float
-    how: int  # how it ended, a number of the kernel; 0 where it decided nothing
-    sweeps: int
-    factorisations: int
 
 
 class Derived:
@@ -40,7 +31,6 @@ class Derived:
         "nothing",
         "seen",
         "spread",
-        "tried",
         "view",
     )
 
@@ -49,7 +39,6 @@ class Derived:
         self.nothing: bool | None = None  # whether doing nothing is right
         self.judged: Judged | None = None  # the judge's pass over a result that is about to be returned
         self.view: Data | None = None  # in generalised coordinates: what kernels read, from the beginning
-        self.tried: Tried | None = None
         self.spread: int | None = None  # how far apart blocks that share a body stand
         self.seen = False  # whether `solve` has had it, once: repeated ones are spared more
         self.chain: Any = None  # of a problem of few rows, False where it has none

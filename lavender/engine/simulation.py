@@ -33,7 +33,7 @@ from lavender.scene.steppers import get_stepper
 from lavender.solution import Solution, Status
 from lavender.solve import finish, solve
 from lavender.solvers.newton import SPEC as NEWTON_SPEC
-from lavender.solvers.warm_start import MOST_STEPS, Tried, claim_of
+from lavender.solvers.warm_start import Tried, claim_of
 from lavender_ext.engine.arrays import lengths
 
 if TYPE_CHECKING:
@@ -342,23 +342,18 @@ class Simulation:
             self._state = self._state.grown()
 
     def _solve_substeps(self) -> None:
-        warm = (
-            self._warm_tol > 0.0 and self.solver_iterations >= MOST_STEPS and get("newton").factory == NEWTON
-        )
+        warm = self._warm_tol > 0.0 and get("newton").factory == NEWTON
         for _ in range(self._parameters.substeps):
             self._last = None
             self._prepare()
             kernel, a = self._state.kernel, self._state.a
             kernel.solve(False)
-            spent = self._solve_in_place() if warm else (0, 0)
-            if spent is not None:
+            if not (warm and self._solve_in_place()):
                 try:
                     problem = self._problem(self._state)
                 except InputError:  # its numbers are not finite
                     self._lose()
                     return
-                if warm:
-                    problem.derived.tried = Tried(self._warm_tol, 0, *spent)
                 if problem.m:
                     a["impulse"][: problem.m] = self._solve(problem)
                 kernel.apply()
@@ -372,20 +367,18 @@ class Simulation:
             bodies = [*self._state.a["contact_pair"][:1].ravel().tolist(), int(self._state.a["body_of"][0])]
             self._state.head[HEAD["lost"]] = next(i for i in bodies if self._state.a["dyn"][i] >= 0)
 
-    def _solve_in_place(self) -> tuple[int, int] | None:
+    def _solve_in_place(self) -> bool:
         # The bits of lavender.solve(problem, "newton"), whose first phase this is, without making the problem.
-        # None, or sweeps and factorisations done in vain.
         start = perf_counter()
         how, sweeps, factorisations = self._state.warm.solve(self._warm_tol)
         if how:
             self._last = _Pending(how, sweeps, factorisations, perf_counter() - start)
-            return None
-        return sweeps, factorisations
+        return bool(how)
 
     def _told(self, pending: _Pending) -> Solution:
         # The arrays of the last substep's problem stay as they were until the next one.
         problem = self._problem(self._state, steps=self._steps)
-        claim = claim_of(Tried(self._warm_tol, pending.how, pending.sweeps, pending.factorisations))
+        claim = claim_of(Tried(pending.how, pending.sweeps, pending.factorisations))
         assert claim is not None
         impulse = self._state.a["impulse"][: problem.m].copy()
         options = dict(self._parameters.solver_options)

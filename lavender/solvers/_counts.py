@@ -158,8 +158,6 @@ def newton_factor(system: System) -> float:
         return (rates.BLOCK if system.cost < PANELS else rates.PANEL) * system.cost
     if system.dense:
         return float(dense_factor(system.sc.m))
-    if system.band is not None and system.sc.problem.law != "coulomb":
-        return rates.BAND * system.sc.m * float(system.band.h.shape[1]) ** 2
     return float(filled(len(system.sparse.indices), system.sparse.work))
 
 

@@ -23,10 +23,10 @@ from lavender.solvers._counts import sweep_cost
 from lavender.solvers._islands import block_bodies, restrict, rows_of
 from lavender.solvers._newton.proximal import Proximal
 from lavender.solvers._newton.run import Run
-from lavender.solvers._newton.sweeping import step_cost
 from lavender.solvers._newton.systems import AUGMENTED, make_system
 from lavender.solvers._sweepers import Sweeps
 from lavender.solvers._trail import Trail
+from lavender.solvers._walks import walk_step
 from lavender.solvers.nncg import NNCG
 from lavender_ext.factor import graph
 
@@ -161,7 +161,7 @@ class Patches(Sweeps):
         Proximal(system.sc.unknown(impulse), AUGMENTED, WEIGHT).advance(run, FACTORS)
         count = system.factorisations
         self.total["factorisations"] = self.total.get("factorisations", 0) + count
-        self.aside += count * step_cost(system)
+        self.aside += count * walk_step(system)
         return system.sc.impulse(run.best_z)
 
     def _sweep(self, part: Problem, impulse: FloatArray, tol: float) -> None:

@@ -45,7 +45,6 @@ class Trail:
     swept: FloatArray | None = None  # (m,) N s, where sweeps stopped
     certificate: FloatArray | None = None
     begun: bool = False  # newton over generalised velocities was
-    waits: bool = False  # newton does, with its system, for a turn of others to end
     ended: dict[str, float] = field(
         default_factory=dict
     )  # finite solvers that gave up: residual they started from

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from time import perf_counter
 from typing import Any
@@ -20,7 +20,7 @@ from lavender.solvers._sweepers import Sweeps
 from lavender.solvers._trail import CLOCK, Trail, usable
 from lavender.solvers._walks import sweeps_of
 from lavender.solvers.direct import Impatient
-from lavender.solvers.newton import NewtonState, after_sweeps, asking
+from lavender.solvers.newton import NewtonState
 
 __all__ = ["VELOCITY", "Turns", "note", "velocities_left", "whole"]
 
@@ -28,7 +28,6 @@ CHUNK_WORK = 8  # sweeps' work that an iteration of admm is
 ROUNDS = 8  # times that sweeps and finite solvers take turns, the allowance doubled each time
 STILL = 4  # turns in a row, each twice as long, that gain next to nothing: then nobody gets anywhere
 GAIN = 0.99  # of the residual before a turn, below which it gained something
-DEARER = 2.0  # times what Newton's method, which waits, has cost, that another's turn may be counted for
 ALIKE = ("direct", "lemke")  # do the same wherever they start
 VELOCITY = VELOCITY_KEY
 
@@ -38,12 +37,8 @@ def whole(
     chosen: Exact,
     budget: int,
     limit: int = 0,
-    more: Callable[[FloatArray], int] | None = None,
 ) -> bool:
-    """Run a finite solver from the best impulse, to its end or `limit` iterations; True when nothing is left to do.
-
-    `more`: where Newton's method comes to that limit, it is asked for more iterations, 0 to stop.
-    """
+    """Run a finite solver from the best impulse, to its end or `limit` iterations; True when nothing is left to do."""
     name = chosen.name
     spec = usable(name, trail.problem)
     if spec is None or budget <= trail.iterations:
@@ -58,8 +53,6 @@ def whole(
         options = dict(chosen.options)
         hasty = not options.pop("patience", True)
         solver = Impatient() if hasty else spec.load()(**options)
-        if own and more is not None:
-            solver = asking(solver, more)
         if own:
             state = _newton_state(trail)
         else:
@@ -74,8 +67,6 @@ def whole(
         impulse = trail.swept.copy()
     if own and trail.problem.law == "lcp":
         singular = any(key.startswith("direct") for key in trail.ended)
-        if singular or trail.swept is not None:
-            solver = after_sweeps(solver)
         if trail.swept is not None and not singular and trail.problem.m > FEW and trail.problem.is_symmetric:
             # Which rows are free is known from sweeps, however far they are. Where A is singular on them exchanges,
             # which is what direct does, go round in circles; so they do where A is asymmetric and sweeps got nowhere.
@@ -155,11 +146,7 @@ def _newton_state(trail: Trail) -> NewtonState:
 
 
 class Turns:
-    """Turns of what there is: every finite solver with its allowance, then sweeps; twice as much in the next turn.
-
-    Newton's method, which cannot go on where it stood once it has returned, takes the turns of the others from
-    within: where its allowance is used up, they have theirs.
-    """
+    """Turns of what there is: every finite solver with its allowance, then sweeps; twice as much in the next turn."""
 
     def __init__(self, trail: Trail, sweeps: Sweeps | None, budget: int) -> None:
         self.trail, self.sweeps, self.budget = trail, sweeps, budget
@@ -167,8 +154,6 @@ class Turns:
         self.allowance = 0.0  # of sweeps [ns]
         self.still = 0  # turns in a row that gained nothing
         self.over = False  # nothing gets anywhere
-        self.inside: Exact | None = None  # Newton's method, where it waits for a turn to end,
-        self.waiting = 0.0  # and what it has cost [ns]
 
     def left(self) -> bool:
         return self.taken < ROUNDS and not self.over
@@ -184,14 +169,9 @@ class Turns:
         """One turn; True when nothing is left to do."""
         trail, costs, k = self.trail, self.trail.costs, self.taken
         before, spent = trail.best, trail.iterations
-        # Friction that Newton's method needs so long for is as often ended by admm.
-        longer = 1 if self.inside is not None and trail.problem.law == "coulomb" else 0
-        postponed = False
         for candidate in self.candidates():
             if trail.best <= trail.tol or self.budget <= trail.iterations:
                 return True
-            if candidate is self.inside:
-                continue
             started = trail.ended.get(candidate.key)
             if started is not None and (candidate.name in ALIKE or not trail.best <= 0.1 * started):
                 continue  # it gave up, and would do so again
@@ -207,53 +187,13 @@ class Turns:
                 and sweeps.run(self.budget, candidate.cost)
             ):
                 return True
-            dear = DEARER * self.waiting  # what Newton's method has cost, which waits, where it does
-            if self.inside is not None and trail.problem.law == "lcp" and candidate.cost > dear:
-                postponed = True
-                continue
-            limit = candidate.limit << (k + longer)
-            if longer and candidate.each > 0.0:
-                limit = min(limit, int((dear - candidate.once) / candidate.each))
-                if limit <= 0:
-                    postponed = True
-                    continue
-            if whole(trail, candidate, self.budget, limit, self.more(candidate, limit)):
+            if whole(trail, candidate, self.budget, candidate.limit << k):
                 return True
-            if self.taken > k:
-                break  # turns were taken meanwhile
-        else:
-            self.taken += 1
-            self.allowance = max(2.0 * self.allowance, 2.0 * costs.cheapest)
-            self.sweeps = self.sweeps or sweeps_of(trail, self.budget)
-            if self.sweeps.run(self.budget, self.allowance):
-                return True
-            self.still = 0 if trail.best < GAIN * before else self.still + 1
-            nothing = spent == trail.iterations and not postponed
-            self.over = trail.late or nothing or self.still >= STILL
+        self.taken += 1
+        self.allowance = max(2.0 * self.allowance, 2.0 * costs.cheapest)
+        self.sweeps = self.sweeps or sweeps_of(trail, self.budget)
+        if self.sweeps.run(self.budget, self.allowance):
+            return True
+        self.still = 0 if trail.best < GAIN * before else self.still + 1
+        self.over = trail.late or spent == trail.iterations or self.still >= STILL
         return False
-
-    def more(self, newton: Exact, limit: int) -> Callable[[FloatArray], int] | None:
-        """What Newton's method asks where its first `limit` iterations are used up."""
-        if self.inside is not None:
-            return None
-        granted = min(limit, self.budget - self.trail.iterations)
-
-        def ask(impulse: FloatArray) -> int:
-            nonlocal granted
-            self.trail.offer(impulse)
-            self.inside, self.trail.waits = newton, True
-            self.waiting = granted * newton.each
-            self.trail.iterations += granted  # until Newton's method returns and tells them itself
-            try:
-                done = self.trail.done or not self.left() or self.take()
-                left = self.budget - self.trail.iterations
-            finally:
-                self.trail.iterations -= granted
-                self.inside, self.trail.waits = None, False
-            if done or self.trail.late:
-                return 0
-            now = max(0, min(newton.limit << min(self.taken, ROUNDS), left))
-            granted += now
-            return now
-
-        return ask

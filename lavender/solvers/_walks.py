@@ -21,7 +21,6 @@ from lavender.solvers._counts import dense_factor, filled, newton_factor
 from lavender.solvers._newton.desaxce import apart
 from lavender.solvers._newton.proximal import Proximal
 from lavender.solvers._newton.run import Run
-from lavender.solvers._newton.sweeping import METHODS, STEPS, WEIGHT
 from lavender.solvers._newton.systems import AUGMENTED, DENSE_ROWS, System, is_full
 from lavender.solvers._sweepers import SWEEPER, Glance, Sweeps
 from lavender.solvers._trail import Trail
@@ -32,7 +31,9 @@ WALK = 8  # factorisations of a walk,
 EARLY, GAIN = 3, 0.95  # of which so many have to leave that share of the residual
 READY = 0.25  # of a walk's cost, that sweeps have to have cost where they give way to another solver
 OTHER: dict[str, Any] = {"name": "nncg", "order": "symmetric", "restart": "against"}
-OWN = sum(least for _, _, _, least in METHODS)  # sweeps that Newton's method begins with itself
+STEPS = 6  # Newton steps of one of a walk's proximal rounds
+WEIGHT = 1e-6  # proximal weight there at most
+OWN = 400  # sweeps from which others begin anew
 MOST = 40_000  # rows from which friction is left to sweeps
 
 
@@ -74,7 +75,7 @@ class Walks(Sweeps):
     def _due(self, share: float) -> bool:
         """Sweeps since the last walk cost that share of one, and promise no end within its cost."""
         trail = self.trail
-        if trail.late or trail.waits or self.since < share * WALK * least_step(trail.problem):
+        if trail.late or self.since < share * WALK * least_step(trail.problem):
             return False
         cost = WALK * walk_step(trail.costs.system)
         return self.since >= share * cost and self.cost > cost

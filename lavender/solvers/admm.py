@@ -38,7 +38,7 @@ from lavender_ext.accelerate import admm
 from lavender_ext.core import assemble
 from lavender_ext.factor import symbolic
 from lavender_ext.factor.sparse import SparsePanels, is_mirrored
-from lavender_ext.newton.band import scaled_entries
+from lavender_ext.newton.coupled import scaled_entries
 
 _DENSE, _PANELS, _BODIES = 0, 1, 2  # as the kernel names them
 _START_RHO = 0.1  # B has unit diagonal, so 1 is its scale; measured

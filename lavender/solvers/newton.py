@@ -2,21 +2,19 @@
 
     z = D^1/2 lambda,   H = D^-1/2 A D^-1/2,   s = H z - g complementary to z on every block
 
-0. A warm start over bodies is judged first; then at most 64 sweeps (counted in `work`) and, for contacts, at most
-   six Newton steps over the bodies, or one banded factorisation of joints alone, where these will do
-   (`warm_start.py`).
-1. Bounded rows by exchanges (Newton's method on the natural map) from the warm start, from sweeps that cost as much
-   as a factorisation, and from the solution of H z = g (`_newton/exchange.py`).
+0. A warm start over bodies is judged first; then at most 64 sweeps (counted in `work`), or one banded factorisation of
+   joints alone, where these will do (`warm_start.py`).
+1. Bounded rows by exchanges (Newton's method on the natural map) from the warm start and from the solution of H z = g
+   (`_newton/polish.py`).
 2. A cold Mehrotra interior point, polished on the identified rows as soon as it has found them, to the floor of
    float64.
 3. Where that stops short on rows that nearly depend on each other: both again through the augmented
    system of the bodies.
-4. Coulomb friction by rounds of accelerated sweeps (counted in `work`), a proximal Newton method on the
-   Alart-Curnier map, and interior points on De Saxce's form of the law, whose convex problem moves with every step.
+4. Coulomb friction by a proximal Newton method on the Alart-Curnier map, and interior points on De Saxce's form of the
+   law, whose convex problem moves with every step.
 
 Problems in generalised coordinates go over their velocities first (`_newton/general.py`), where A is never formed; what
-that leaves goes on as above, over the rows of A, unless form="velocity". Many rows without friction go over A at once
-where its factor costs less.
+that leaves goes on as above, over the rows of A, unless form="velocity".
 
 The parts stand in `_newton/`. Form "velocity" factors I + K^T V K over the bodies and never squares J; "impulse"
 factors over the rows.
@@ -24,10 +22,9 @@ factors over the rows.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from time import perf_counter
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -37,9 +34,7 @@ from lavender.problem import OPERATORS, Problem
 from lavender.registry import SolverSpec
 from lavender.residuals import quick
 from lavender.solution import Claim, Status
-from lavender.solvers import _rates as rates
-from lavender.solvers._counts import newton_factor
-from lavender.solvers._few import FEW_GENERAL, NEWTON
+from lavender.solvers._few import NEWTON
 from lavender.solvers._newton import general
 from lavender.solvers._newton.convex import solve_convex
 from lavender.solvers._newton.coulomb import solve_coulomb
@@ -73,8 +68,6 @@ class Newton:
     """
 
     form: str = "auto"
-    more: ClassVar[Any] = None  # see `asking`
-    swept: ClassVar[bool] = False  # see `after_sweeps`
 
     def prepare(self, problem: Problem) -> NewtonState:
         """The system of a problem."""
@@ -94,8 +87,7 @@ class Newton:
         if problem.generalized is not None and self.form != "impulse":
             kernel = general.prepare(problem)
             if kernel is not None:
-                rows = _rows_cost_less(problem, kernel, like) if self.form == "auto" else None
-                return NewtonState(problem, rows, None if rows is not None else kernel)
+                return NewtonState(problem, None, kernel)
             if self.form == "velocity":
                 raise CapabilityError(
                     f"form='velocity' has room for a matrix of {general.ROOM:.1e} values over the velocities of an "
@@ -171,23 +163,22 @@ class Newton:
             return Claim(Status.STALLED, 0, {"factorisations": 0}, "no row can move")
         cold = bool(np.array_equal(impulse, problem.start()))
         sweeps = system.factorisations = 0
-        if not cold and not self.swept and self.form == "auto" and problem.rows is not None:
+        if not cold and self.form == "auto" and problem.rows is not None:
             tried = warm_start(problem, impulse, tol, n, time_limit)
             claim, sweeps, system.factorisations = claim_of(tried), tried.sweeps, tried.factorisations
             if claim is not None and general.confirmed(problem, impulse, tol):
                 return claim
         deadline = np.inf if time_limit is None else perf_counter() + time_limit
-        run = Run(system, tol, n, deadline, self.more)
+        run = Run(system, tol, n, deadline)
         z = system.sc.unknown(impulse)
-        # What sweeps left says which rows are free; where that fails, it is no start.
-        run.score(system.sc.unknown(problem.start()) if self.swept else z)
+        run.score(z)
         interrupted = False
         try:
             if not run.done():
                 if problem.law == "coulomb" and system.sc.has_friction:
-                    solve_coulomb(run, z, cold)
+                    solve_coulomb(run, z)
                 else:
-                    solve_convex(run, z, cold, self.swept)
+                    solve_convex(run, z, cold)
         except KeyboardInterrupt:
             interrupted = True  # the best iterate goes back all the same
         impulse[:] = system.sc.impulse(run.best_z)
@@ -205,7 +196,6 @@ class Newton:
             status = Status.TIME_LIMIT
         else:
             status = Status.STALLED
-        sweeps += run.sweeps
         work = {"factorisations": system.factorisations} | ({"sweeps": sweeps} if sweeps else {})
         return Claim(
             status,
@@ -215,35 +205,6 @@ class Newton:
             form=system.form,
             certificate=run.certificate,
         )
-
-
-def _rows_cost_less(problem: Problem, kernel: Any, like: System | None) -> System | None:
-    """The system over the rows of A where its factor costs less than one over velocities that fills.
-
-    Looked at where no row rubs, and such a factor costs more than to form A; few rows go in one compiled call.
-    """
-    if problem.m <= FEW_GENERAL or problem.law not in ("linear", "lcp"):
-        return None
-    factor = rates.GENERAL[problem.law] * general.factor_flops(problem, kernel.largest)
-    if factor <= rates.FORMED_START + rates.FORMED * float(problem.metric.entries_of_a):
-        return None
-    system = make_system(problem, "impulse", like)
-    return system if system.sc.m and newton_factor(system) < factor else None
-
-
-def asking(solver: Any, more: Callable[[FloatArray], int]) -> Newton:
-    """The same solver, which asks for more factorisations where its budget is used up (`_newton/run.py`)."""
-    made: Newton = replace(solver)
-    object.__setattr__(made, "more", more)
-    return made
-
-
-def after_sweeps(solver: Newton) -> Newton:
-    """The same solver, for a start that sweeps have left or where they are in vain: it does not sweep again."""
-    made = replace(solver)
-    object.__setattr__(made, "more", solver.more)
-    object.__setattr__(made, "swept", True)
-    return made
 
 
 def _refusal(problem: Problem) -> str | None:

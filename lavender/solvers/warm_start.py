@@ -1,29 +1,26 @@
-"""The first phase of `newton` from a warm start: judge it, a few sweeps, few Newton steps; or free joints at once.
+"""The first phase of `newton` from a warm start: judge it, a few sweeps; or free joints at once.
 
-The step of a simulation at rest, or of a chain, ends here. `lavender_ext/warm/start.pxd` and `active_set.pxd` have the
-equations; what is not within tol after it goes on from the start it came with.
+The step of a simulation at rest, or of a chain, ends here. `lavender_ext/warm/start.pxd` has the equations; what is not
+within tol after it goes on from the start it came with.
 """
 
 from __future__ import annotations
 
-import numpy as np
+from typing import NamedTuple
 
 from lavender._arrays import FloatArray
-from lavender._derived import Tried
 from lavender.problem import Problem
 from lavender.solution import Claim, Status
 from lavender_ext.warm.start import (
     JUDGED,
-    MOST_STEPS,
     MOST_SWEEPS,
     SOLVED,
-    STEPPED,
     SWEPT,
     UNDECIDED,
     from_guess,
 )
 
-__all__ = ["MOST_STEPS", "Tried", "claim_of", "warm_start"]
+__all__ = ["Tried", "claim_of", "warm_start"]
 
 #: How the kernel says that it ended; None where nothing was decided.
 ENDED = {
@@ -31,8 +28,15 @@ ENDED = {
     JUDGED: "as it came",
     SWEPT: "warm sweeps",
     SOLVED: "joints solved directly",
-    STEPPED: "warm sweeps, Newton steps over bodies",
 }
+
+
+class Tried(NamedTuple):
+    """What the first phase made of a start."""
+
+    how: int  # how it ended, a number of the kernel; 0 where it decided nothing
+    sweeps: int = 0
+    factorisations: int = 0
 
 
 def claim_of(tried: Tried) -> Claim | None:
@@ -50,21 +54,9 @@ def claim_of(tried: Tried) -> Claim | None:
 def warm_start(
     problem: Problem, impulse: FloatArray, tol: float, budget: int, time_limit: float | None = None
 ) -> Tried:
-    """Carry `impulse` (m,) to tol in place where the first phase can; else nothing is changed.
-
-    Where `problem.derived.tried` says that this was tried on the guess before, as a simulation does on its own
-    arrays, it is not tried again.
-    """
-    if problem.rows is None or problem.friction != "coulomb" or tol <= 0.0 or budget < MOST_STEPS:
-        return Tried(tol, 0, 0, 0)
+    """Carry `impulse` (m,) to tol in place where the first phase can; else nothing is changed."""
+    if problem.rows is None or problem.friction != "coulomb" or tol <= 0.0 or budget < 1:
+        return Tried(0)
     if time_limit is not None and MOST_SWEEPS * 1e-9 * problem.data.work > time_limit:
-        return Tried(tol, 0, 0, 0)
-    tried = problem.derived.tried
-    if (
-        tried is None
-        or tried.tol != tol
-        or problem.guess is None
-        or not np.array_equal(impulse, problem.guess)
-    ):
-        tried = Tried(tol, *from_guess(problem.data, impulse, tol))
-    return tried
+        return Tried(0)
+    return Tried(*from_guess(problem.data, impulse, tol))

@@ -16,7 +16,8 @@ from lavender_ext.core.block cimport COULOMB, ROW, blocks_t
 from lavender_ext.core.problem cimport MADE, Data, entries_of, made_t, make_numbers
 from lavender_ext.few.many cimport LEFT, SOLVED, Gate, gate_t, job_t, space_t, with_marks, with_numbers
 from lavender_ext.generalized.islands cimport aim_at, furnish, marks_of, need_t, numbers_of, settle
-from lavender_ext.generalized.newton cimport DONE, descend_all, flow_t
+from lavender_ext.generalized.flow cimport flow_t
+from lavender_ext.generalized.newton cimport DONE, descend_all
 from lavender_ext.generalized.sparse cimport PER_COLUMN
 from lavender_ext.judge.measure cimport do_nothing, general_judge, judged_from, reference_of, relative_of
 from lavender_ext.judge.score cimport are_numbers, relative, score_rows, score_t

@@ -7,7 +7,7 @@ from libc.stdint cimport int32_t
 
 from lavender_ext.core.block cimport CONE, COULOMB, ROW, blocks_t, has_friction
 from lavender_ext.core.generalized cimport generalized_t
-from lavender_ext.generalized.newton cimport flow_t
+from lavender_ext.generalized.flow cimport flow_t
 from lavender_ext.generalized.sparse cimport MANY, SMALL, factor_work, find_pattern, is_worth, pattern_marks
 
 

@@ -4,9 +4,10 @@ from libc.stdint cimport int32_t
 from lavender_ext.core.block cimport blocks_t
 from lavender_ext.core.generalized cimport generalized_t
 from lavender_ext.core.problem cimport Data, Room, room_for
+from lavender_ext.generalized.flow cimport flow_t
 from lavender_ext.generalized.islands cimport aim_at, find_islands, furnish, marks_of, need_t, numbers_of, settle
 from lavender_ext.generalized.sparse cimport PER_COLUMN
-from lavender_ext.generalized.newton cimport DONE, FAILED, LOST, SPENT, STUCK, flow_t, solve_island
+from lavender_ext.generalized.newton cimport DONE, FAILED, LOST, SPENT, STUCK, solve_island
 
 ENDS = {"done": DONE, "spent": SPENT, "stuck": STUCK, "failed": FAILED, "lost": LOST}
 

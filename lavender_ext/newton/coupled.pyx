@@ -11,6 +11,25 @@ import numpy as np
 from lavender_ext.newton.elements cimport Elements, elements_t
 
 
+cdef public int32_t lav_element_graph(int32_t n, const int32_t* ptr, const int32_t* element, const int32_t* indptr,
+                                      const int32_t* indices, int32_t* mark, int32_t* to, int32_t* other) noexcept nogil:
+    """Which elements an element's rows of A reach: (to, other) as compressed rows, other as long as A's indices."""
+    cdef int32_t i, j, q, k, count = 0
+    for i in range(n):
+        mark[i] = -1
+    for i in range(n):
+        to[i] = count
+        for j in range(ptr[i], ptr[i + 1]):
+            for q in range(indptr[j], indptr[j + 1]):
+                k = element[indices[q]]
+                if mark[k] != i:
+                    mark[k] = i
+                    other[count] = k
+                    count += 1
+    to[n] = count
+    return count
+
+
 cdef public void lav_coupled_rows(int32_t n, const int32_t* ptr, const int32_t* to, const int32_t* other,
                                   int32_t* indptr, int32_t* indices) noexcept nogil:
     """Compressed rows of the graph (to, other) of n elements, each with itself, ascending; indices NULL: indptr alone."""
@@ -93,6 +112,29 @@ cdef public void lav_coupled(const elements_t* e, const int32_t* to, const int32
             else:
                 coupled_block(h + at, out + at, ld, left + e.wptr[i], r, own, i == j, ni, nj)
             at += nj
+
+
+def element_graph(const int32_t[::1] ptr, const int32_t[::1] element, const int32_t[::1] indptr,
+                  const int32_t[::1] indices):
+    """(indptr, indices) of the graph of elements that A couples; A not empty."""
+    cdef int32_t n = <int32_t>ptr.shape[0] - 1, count
+    to_array, other_array = np.empty(n + 1, np.int32), np.empty(indices.shape[0] + 1, np.int32)
+    cdef int32_t[::1] mark = np.empty(n + 1, np.int32), to = to_array, other = other_array
+    with nogil:
+        count = lav_element_graph(n, &ptr[0], &element[0], &indptr[0], &indices[0], &mark[0], &to[0], &other[0])
+    return to_array, other_array[:count].copy()
+
+
+def scaled_entries(const int32_t[::1] indptr, const int32_t[::1] indices, const double[::1] a, const double[::1] scale):
+    """Entries of diag(scale) A diag(scale)."""
+    out_array = np.empty(a.shape[0])
+    cdef double[::1] out = out_array
+    cdef int32_t i, q
+    with nogil:
+        for i in range(indptr.shape[0] - 1):
+            for q in range(indptr[i], indptr[i + 1]):
+                out[q] = scale[i] * a[q] * scale[indices[q]]
+    return out_array
 
 
 def coupled_rows(const int32_t[::1] ptr, const int32_t[::1] to, const int32_t[::1] other):

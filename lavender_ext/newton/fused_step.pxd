@@ -35,7 +35,7 @@ cdef struct interior_t:         # an interior point of the velocity form and its
     double* q                   # (m)
     double* y                   # (n s)
     const double* speed         # (m) velocity error per unit of f
-    int32_t* side               # (n) bound that a row rests on by its natural map, after the last step
+    int32_t* side               # (m) bound that a row rests on by its natural map, before the last Newton step
     int32_t changed             # rows that took another side in it
     double length               # of the last step
     double gap                  # G z . u / degree before it
@@ -101,17 +101,6 @@ cdef inline void interior_first(const elements_t* e, const factor_t* f, interior
     times_h(e, f.n, p.z, p.y, p.hz)
 
 
-cdef inline void interior_refine(const elements_t* e, const factor_t* f, interior_t* p) noexcept nogil:
-    """z <- z + (H + W)^-1 (g - H z) with the factor of the last W: the weight of the first point goes away."""
-    cdef int32_t j
-    for j in range(e.m):
-        p.r[j] = e.g[j] - p.hz[j]
-    solve_barrier(e, f, p, p.r, p.dz)
-    for j in range(e.m):
-        p.z[j] += p.dz[j]
-    times_h(e, f.n, p.z, p.y, p.hz)
-
-
 cdef inline void solve_free(const elements_t* e, const factor_t* f, const interior_t* p, const double* r,
                             double* out) noexcept nogil:
     # (5) on bounded rows, V = 0 where a row rests on its bound
@@ -174,7 +163,7 @@ cdef inline int32_t interior_step(const elements_t* e, const factor_t* f, interi
 
     The elements' bounds are read at every step, so e may not change between steps.
     """
-    cdef int32_t i, j, lost, side
+    cdef int32_t j, lost
     cdef double gap, after, sigma = 0.0, x
     ipm_scale(e, p.z, p.u1, p.u2, p.delta, p.v, p.bt, &gap)
     normal_matrix(e, p.v, f, 0)
@@ -201,11 +190,4 @@ cdef inline int32_t interior_step(const elements_t* e, const factor_t* f, interi
     p.gap = gap / (p.degree if p.degree > 1.0 else 1.0)
     times_h(e, f.n, p.z, p.y, p.hz)
     convex_error(e, p.z, p.hz, p.speed, &p.energy, &p.velocity)
-    p.changed = 0
-    for i in range(e.n):
-        if e.kind[i] == ROW:
-            j = e.ptr[i]
-            side = <int32_t>z_end(e, j, p.z[j] - p.hz[j] + e.g[j])
-            p.changed += side != p.side[i]
-            p.side[i] = side
     return p.length > 0.0

@@ -6,10 +6,10 @@ import numpy as np
 from lavender_ext.core.arrays cimport address
 from lavender_ext.factor.blocks cimport factor_t
 from lavender_ext.newton.elements cimport Elements, elements_t
-from lavender_ext.newton.fused_step cimport (interior_first, interior_newton, interior_refine, interior_step,
-                                             interior_t, times_h)
+from lavender_ext.newton.fused_step cimport (interior_first, interior_newton, interior_step, interior_t,
+                                             times_h)
 from lavender_ext.newton.interior cimport ipm_start, ipm_start_apart
-from lavender_ext.newton.natural_map cimport convex_error, z_end
+from lavender_ext.newton.natural_map cimport convex_error
 from lavender_ext.newton.normal_matrix cimport Factor
 
 
@@ -21,10 +21,6 @@ cdef public void lav_convex_error(const elements_t* e, const double* z, const do
 cdef public void lav_interior_first(const elements_t* e, const factor_t* f, interior_t* p, double weight,
                                     double free_weight) noexcept nogil:
     interior_first(e, f, p, weight, free_weight)
-
-
-cdef public void lav_interior_refine(const elements_t* e, const factor_t* f, interior_t* p) noexcept nogil:
-    interior_refine(e, f, p)
 
 
 cdef public int32_t lav_interior_newton(const elements_t* e, const factor_t* f, interior_t* p, double eps,
@@ -40,7 +36,7 @@ cdef class Interior:
     """An interior point of the velocity form: `first`, then `step` after `step`."""
     def __init__(self, Elements e, Factor f, v, bt, u1, u2, speed, double delta, double damping):
         buffer = np.empty((8, e.m + 1))
-        y, side = np.empty(f.n * f.s + 1), np.full(e.n + 1, 2, np.int32)
+        y, side = np.empty(f.n * f.s + 1), np.zeros(e.m + 1, np.int32)
         self.e, self.f = e, f
         self.keep = [v, bt, u1, u2, speed, buffer, y, side]
         self.z, self.hz = buffer[0, : e.m], buffer[1, : e.m]
@@ -58,18 +54,6 @@ cdef class Interior:
         self.f.lu = False
         with nogil:
             lav_interior_first(&self.e.e, &self.f.f, &self.p, weight, free_weight)
-
-    def refine(self):
-        """One refinement of the first point, with the factor of `first`."""
-        with nogil:
-            lav_interior_refine(&self.e.e, &self.f.f, &self.p)
-
-    def outside(self):
-        """How many rows z puts beyond their bounds."""
-        cdef int32_t j, count = 0
-        for j in range(self.e.m):
-            count += z_end(&self.e.e, j, self.p.z[j]) != 0.0
-        return count
 
     def place(self, const double[::1] z):
         """z as the point of `newton`: (|F|, velocity error)."""
@@ -109,11 +93,10 @@ cdef class Interior:
     def step(self):
         """One predictor-corrector step.
 
-        Returns whether it went, its length, gap / degree before it, |F|, velocity error, and how many rows changed
-        their side.
+        Returns whether it went, its length, gap / degree before it, |F| and velocity error.
         """
         cdef int32_t ok
         self.f.lu = False
         with nogil:
             ok = lav_interior_step(&self.e.e, &self.f.f, &self.p)
-        return bool(ok), self.p.length, self.p.gap, self.p.energy, self.p.velocity, self.p.changed
+        return bool(ok), self.p.length, self.p.gap, self.p.energy, self.p.velocity

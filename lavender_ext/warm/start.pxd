@@ -4,7 +4,6 @@
     contacts     sequential impulses, judged after 4, 8, 16, 32 and 64 sweeps; from 16 on given up
                  where r_s (r_s / r_s/2)^(2 (64 - s)/s), what 64 would leave, is above tol       (2)
     free joints  A lam = b by LDL^T on the band of A, one round of refinement                   (3)
-    contacts     after the sweeps, Newton steps of warm/active_set.pxd                                (4)
 
 An impulse is scored by the judge's own lines (judge/measure.pxd, judge/score.pxd): the residual found here is the
 judge's. What is not decided here (dependent joints, numbers near the ends of the range, a residual that stays above
@@ -13,20 +12,18 @@ tol) is left to the caller, with lam as it came.
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t, int64_t
 
-from lavender_ext.core.block cimport COULOMB, ROW, blocks_t, clip, row_error
+from lavender_ext.core.block cimport COULOMB, ROW, blocks_t, row_error
 from lavender_ext.core.rows cimport relax_rows_block, rows_t
 from lavender_ext.core.velocity cimport rows_velocity
 from lavender_ext.factor.band cimport ldl_factor, ldl_solve, pivots_t
 from lavender_ext.judge.measure cimport rows_slack
 from lavender_ext.judge.score cimport is_plain, nothing, relative, score_rows, score_t, tally_row, tally_t
-from lavender_ext.warm.active_set cimport body_band, newton_step
 
 
 cpdef enum:
     FIRST_SWEEPS = 4            # of (2); fewer leave a residual just below tol, and the next step begins above it
     PATIENT_SWEEPS = 16         # from here on (2) is given up where it will not do
     MOST_SWEEPS = 64
-    MOST_STEPS = 6              # of (4)
     MOST_ROWS = 200000          # so that all of it takes a fraction of a second
     MOST_BAND = 48              # rows between the first and the last of one body's joints, for (3)
     MOST_TRACED = 256           # scores of one solve that are noted
@@ -36,20 +33,17 @@ cpdef enum:                     # how it ended
     JUDGED = 1                  # met tol as it came
     SWEPT = 2                   # met it after some sweeps
     SOLVED = 3                  # met it after one factorisation
-    STEPPED = 4                 # met it after sweeps and Newton steps
     WALKED = 5                  # met it after the proximal Newton walks of walk.pxd
 
 
 cdef struct warm_t:
     double* kept                # (m) lam as it came
     double* band                # (m, width) of (3)
-    double* change              # (n_bodies, 6) of Newton steps
     double* slack               # (m) w of the impulse that was scored last
     double* error               # (m) e of it
-    int32_t* state              # (c)
     int32_t* last               # (n_bodies) last joint seen on a body
     int32_t* before             # (2 kj) the one before on the same body: 2 joint + side, or -1
-    int32_t width               # of the band, 0 where neither (3) nor (4) applies
+    int32_t width               # of the band, 0 where (3) does not apply
     int32_t sweeps              # done
     int32_t factorisations      # done
     double relative             # of lam as it is left
@@ -99,20 +93,17 @@ cdef inline void observe(const blocks_t* p, const rows_t* r, const warm_t* s, do
 
 cdef inline int64_t room_of(const blocks_t* p, const rows_t* r, int32_t width) noexcept nogil:
     # doubles that `lay_out` hands out
-    cdef int64_t m = p.n_rows, n = 6 * <int64_t>r.n_bodies
-    return 3 * m + n + width * (n if r.n_contacts > 0 else m)
+    return (3 + <int64_t>width) * p.n_rows
 
 
 cdef inline void lay_out(warm_t* s, double* real, int32_t* index, const blocks_t* p, const rows_t* r) noexcept nogil:
-    # index (n_bodies + 2 joints + contacts)
+    # index (n_bodies + 2 joints)
     s.kept = real
     s.slack = real + p.n_rows
     s.error = s.slack + p.n_rows
-    s.change = s.error + p.n_rows
-    s.band = s.change + 6 * <int64_t>r.n_bodies
+    s.band = s.error + p.n_rows
     s.last = index
     s.before = index + r.n_bodies
-    s.state = s.before + 2 * r.n_joints
 
 
 cdef inline void note_score(const blocks_t* p, const rows_t* r, warm_t* s, double energy) noexcept nogil:
@@ -146,11 +137,9 @@ cdef inline double scored(const blocks_t* p, const rows_t* r, warm_t* s, const d
 
 
 cdef inline int32_t band_width(const blocks_t* p, const rows_t* r, int32_t* last) noexcept nogil:
-    """Width of the band of A in the given order, joints alone and all free, or of N; 0 where none applies."""
+    """Width of the band of A in the given order, joints alone and all free; 0 where there are others."""
     cdef int32_t i, j, h, b, width = 1
-    if r.n_contacts > 0:
-        return body_band(p, r)
-    if r.n_joints == 0:
+    if r.n_contacts > 0 or r.n_joints == 0:
         return 0
     for b in range(r.n_bodies):
         last[b] = -1
@@ -237,12 +226,9 @@ cdef inline int32_t solve_joints(const blocks_t* p, const rows_t* r, warm_t* s, 
 cdef inline int32_t sweep_contacts(const blocks_t* p, const rows_t* r, warm_t* s, double tol, double e0, double v0,
                                    double* lam, double* v) noexcept nogil:
     """(2)"""
-    cdef int32_t i, n = 0, last = 0, next_ = FIRST_SWEEPS, most = MOST_SWEEPS, patient = PATIENT_SWEEPS
+    cdef int32_t i, n = 0, last = 0, next_ = FIRST_SWEEPS
     cdef double before, now = s.relative, ahead
-    if s.width > 0:                                     # (4) costs less than many sweeps
-        most = PATIENT_SWEEPS
-        patient = FIRST_SWEEPS
-    while n < most:
+    while n < MOST_SWEEPS:
         while n < next_:
             for i in range(p.n_blocks):
                 relax_rows_block(p, r, i, lam, v)
@@ -254,35 +240,16 @@ cdef inline int32_t sweep_contacts(const blocks_t* p, const rows_t* r, warm_t* s
             s.relative = judged(p, r, s, lam, v, e0, v0)
             if s.relative <= tol:
                 return SWEPT
-        if n >= patient:
+        if n >= PATIENT_SWEEPS:
             ahead = now
             i = n
-            while i < most:
+            while i < MOST_SWEEPS:
                 ahead = ahead * (now / before)
                 i += n - last
             if not ahead <= tol:
                 return UNDECIDED
         last = n
         next_ = 2 * n
-    return UNDECIDED
-
-
-cdef inline int32_t step_contacts(const blocks_t* p, const rows_t* r, warm_t* s, double tol, double e0, double v0,
-                                  double* lam, double* v) noexcept nogil:
-    """(4)"""
-    cdef double before = s.relative, eps
-    while s.factorisations < MOST_STEPS:
-        s.factorisations += 1
-        # what no impulse of the set can meet moves lam by w / (eps d): a tenth of b / d
-        eps = clip(10.0 * s.relative, 1e-8, 1e-4)
-        if not newton_step(p, r, s.state, s.width, s.band, eps, 0.3 * tol * e0 / sqrt(p.n_rows), 0.3 * tol * v0, lam, v,
-                           s.change, s.slack):
-            return UNDECIDED
-        s.relative = judged(p, r, s, lam, v, e0, v0)
-        if s.relative <= tol:
-            return STEPPED
-        if not s.relative < 1e3 * before:
-            return UNDECIDED
     return UNDECIDED
 
 
@@ -310,9 +277,6 @@ cdef inline int32_t warm_solve(const blocks_t* p, const rows_t* r, warm_t* s, do
     found = UNDECIDED
     if r.n_contacts > 0:
         found = sweep_contacts(p, r, s, tol, e0, v0, lam, v)
-        if found == UNDECIDED and s.width > 0:
-            rows_velocity(p, r, lam, v)
-            found = step_contacts(p, r, s, tol, e0, v0, lam, v)
     elif s.width > 0:
         found = solve_joints(p, r, s, tol, e0, v0, lam, v)
     if found == UNDECIDED:

@@ -7,7 +7,7 @@ from lavender_ext.core.block cimport blocks_t
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.rows cimport rows_t
 from lavender_ext.core.weights cimport block_weights, joint_weights
-from lavender_ext.engine.arrays cimport CAP_CONTACT, N_DYNAMIC, N_JOINT, S_OUT, bind, engine_t
+from lavender_ext.engine.arrays cimport N_DYNAMIC, N_JOINT, S_OUT, bind, engine_t
 from lavender_ext.engine.view cimport view
 from lavender_ext.warm.start cimport band_width, lay_out, observe, room_of, warm_solve, warm_t
 
@@ -29,8 +29,7 @@ def from_guess(Data data, double[::1] impulse, double tol):
     cdef warm_t s
     if m == 0 or not data.factored:
         return 0, 0, 0
-    cdef int32_t[::1] index = np.empty(data.rows.n_bodies + 2 * data.rows.n_joints + data.rows.n_contacts + 1,
-                                       np.int32)
+    cdef int32_t[::1] index = np.empty(data.rows.n_bodies + 2 * data.rows.n_joints + 1, np.int32)
     s.width = lav_warm_band(&data.blocks, &data.rows, &index[0])
     cdef double[::1] real = np.empty(6 * data.rows.n_bodies + room_of(&data.blocks, &data.rows, s.width))
     s.trace = NULL
@@ -55,7 +54,7 @@ cdef class Warm:
         self.index = index
         self.keys = keys
         self.scratch = np.empty(1)
-        self.scratch_index = np.empty(size[N_DYNAMIC] + 2 * size[N_JOINT] + size[CAP_CONTACT] + 1, np.int32)
+        self.scratch_index = np.empty(size[N_DYNAMIC] + 2 * size[N_JOINT] + 1, np.int32)
 
     def solve(self, double tol):
         """After `prepare` and `solve(False)`: (how it ended, sweeps, factorisations); 0: nothing has changed.

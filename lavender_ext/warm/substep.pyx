@@ -30,7 +30,7 @@ cdef enum:
 
 
 cdef inline int64_t warm_indices(const rows_t* r) noexcept nogil:
-    return <int64_t>r.n_bodies + 2 * r.n_joints + r.n_contacts
+    return <int64_t>r.n_bodies + 2 * r.n_joints
 
 
 cdef public int32_t lav_newton_index_room(const int32_t* size, double* real, int32_t* index,

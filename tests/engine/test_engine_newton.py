@@ -75,16 +75,6 @@ def test_the_first_phase_ends_in_each_of_its_ways():
     assert all(s.residual.relative <= 1e-10 for s in chain[1:])
     swept = [s for s in messages("pyramid", base=6, dt=1 / 240) if s.message == "warm sweeps"]
     assert all(s.work["sweeps"] in (4, 8, 16, 32, 64) and s.success for s in swept)
-    sim = lv.Simulation(lv.Scene("pyramid", base=8, friction=0.15))
-    for _ in range(50):
-        sim.step()
-    problem = sim.constraint_problem()
-    exact = lv.solve(problem, "newton", tol=1e-13).impulse
-    noise = np.random.default_rng(0).normal(size=problem.m)
-    stepped = lv.solve(problem, "newton", tol=1e-9, impulse=exact * (1.0 + 1e-4 * noise))
-    assert stepped.message == "warm sweeps, Newton steps over bodies" and stepped.success
-    assert 1 <= stepped.work["factorisations"] <= 6
-    assert stepped.work["sweeps"] in (4, 8, 16)
     problem = lv.Simulation("table").constraint_problem()
     exact = lv.solve(problem, "newton", tol=1e-12).impulse
     near = lv.solve(problem, "newton", impulse=exact * (1.0 + 1e-5))
@@ -102,8 +92,7 @@ def test_a_warm_start_within_tol_comes_back_as_it_is():
     assert dict(again.work) == {"factorisations": 0} and again.message == "as it came"
 
 
-def test_what_the_first_phase_does_not_reach_is_left_as_it_came(monkeypatch):
-    from lavender.solvers._newton.sweeping import Sweeping
+def test_what_the_first_phase_does_not_reach_is_left_as_it_came():
     from lavender_ext.warm import start
 
     sim = lv.Simulation(lv.Scene("four_bar", solver="newton"))  # a closed loop: its rows depend on each other
@@ -122,10 +111,7 @@ def test_what_the_first_phase_does_not_reach_is_left_as_it_came(monkeypatch):
     np.testing.assert_array_equal(lam, before)
     found = lv.solve(problem, "newton", impulse=before, tol=1e-22)
     assert found.status.name == "FLOOR"
-    # what the first phase did in vain is counted, beside the sweeps between phases
-    assert found.work["sweeps"] > sweeps
-    monkeypatch.setattr(Sweeping, "round", lambda self: False)
-    found = lv.solve(problem, "newton", impulse=before, tol=1e-22)
+    # what the first phase did in vain is counted; there are no other sweeps
     assert found.work["sweeps"] == sweeps and found.work["factorisations"] > factorisations
 
 

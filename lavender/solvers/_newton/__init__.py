@@ -9,7 +9,6 @@ proximal         proximal point rounds around Newton steps
 augmented        the same where rows nearly depend on each other
 convex, coulomb  what is tried when, for bounded rows and cones, for Coulomb friction
 desaxce          interior points of Coulomb's law
-sweeping         sweeps between the walks of that
 general          over the velocities of generalised coordinates
 warm             the first phase from a warm start
 """

@@ -154,7 +154,7 @@ def polish_augmented(
 
 def solve_augmented(run: Run) -> None:
     """A cold interior point of the convex law through (2), polished through (1)."""
-    if isinstance(run.system, VelocitySystem) and run.system.sc.m <= ROWS and not run.gives_way():
+    if isinstance(run.system, VelocitySystem) and run.system.sc.m <= ROWS:
         advance(
             run, InteriorPoint(AugmentedSystem(run.system), SHIFT), CONVEX, "augmented interior point steps"
         )

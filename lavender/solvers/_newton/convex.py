@@ -9,25 +9,18 @@ from __future__ import annotations
 import numpy as np
 
 from lavender._arrays import FloatArray
-from lavender.solvers._counts import is_redundant
 from lavender.solvers._newton.augmented import WORTH, solve_augmented
-from lavender.solvers._newton.exchange import exchange, sweep
 from lavender.solvers._newton.interior_point import InteriorPoint
-from lavender.solvers._newton.polish import polish
+from lavender.solvers._newton.polish import exchange, polish
 from lavender.solvers._newton.proximal import Proximal
 from lavender.solvers._newton.run import Run
 from lavender.solvers._newton.systems import DELTA
 
 IPM_STEPS = 1000  # of one interior point at most, whatever the budget
 IPM_PATIENCE = 15  # interior point steps that halve neither residual nor gap
-HOLD = 0.1  # share of rows beyond their bounds up to which exchanging those is worth a try,
-FEW = 64  # or rows up to which it always is
 REFINEMENTS, CLEAR = 3, 1e-3  # of a first point, and share of the tolerance at which they end
 FINER, MORE = 1e-12, 20  # weight of another factor of rows that all hold, and refinements with it
 FIRST = 1e-2  # relative residual of the first polish of an interior point; the next at each decade
-SETTLED = (
-    0.0025  # share of rows that may change their side in the step after which one polish is tried sooner
-)
 CLOSE = 1e-6  # relative residual from which rounding is what holds an interior point up,
 STILL = 3  # where so many steps do not halve it
 # Proximal weight on cones: their scaling spans more than that of rows, and what N loses to rounding is 2^-53 over
@@ -35,11 +28,8 @@ STILL = 3  # where so many steps do not halve it
 CONE_DELTA = 1e-8
 
 
-def solve_convex(run: Run, z: FloatArray, cold: bool, swept: bool = False) -> None:
-    """Rows: exchanges from the warm start or from sweeps. Cones, and what that leaves: interior points.
-
-    `swept`: sweeps are not worth it again.
-    """
+def solve_convex(run: Run, z: FloatArray, cold: bool) -> None:
+    """Rows: exchanges from the warm start and from H z = g. Cones, and what that leaves: interior points."""
     system = run.system
     if len(system.sc.kind) < system.sc.m:
         if not cold:
@@ -51,33 +41,22 @@ def solve_convex(run: Run, z: FloatArray, cold: bool, swept: bool = False) -> No
         if not cold:
             _exchange(run, z)
         if not run.done() and not run.at_floor():
-            _solve_rows(run, z if cold and not swept else None)
+            _solve_rows(run)
     finally:
         run.take_back()
 
 
-def _solve_rows(run: Run, start: FloatArray | None) -> None:
-    """H z = g on every row; where many of them do not hold exchanges after sweeps from `start`; an interior point."""
-    system, sc = run.system, run.system.sc
-    ip = InteriorPoint(system, apart=sc.problem.is_symmetric)
-    wrong = _everything(run, ip)
+def _solve_rows(run: Run) -> None:
+    """Exchanges from H z = g on every row; an interior point."""
+    ip = InteriorPoint(run.system, apart=run.system.sc.problem.is_symmetric)
+    _everything(run, ip)
     if not run.done():
-        if wrong <= HOLD * sc.m:
-            _exchange(run, ip.everything)
-        elif sc.m <= FEW:
-            polish(run, ip.everything, patience=1, limit=3)
-        elif start is not None and not is_redundant(sc.problem):
-            _exchange(run, sweep(run, sc.impulse(start)))
+        _exchange(run, ip.everything)
     if not run.done():
         _interior(run, ip, True)
-    if run.done() or run.at_floor():
-        return
-    if sc.m > FEW and wrong > HOLD * sc.m:
-        # An asymmetric A may hold an interior point up at once where exchanging rows ends it.
-        polish(run, ip.everything, patience=1, limit=3)
-        if run.done() or run.at_floor():
-            return
-    _proximal(run)
+    if not run.done() and not run.at_floor():
+        run.take_back()
+        _proximal(run)
 
 
 def _exchange(run: Run, z: FloatArray) -> None:
@@ -109,22 +88,21 @@ def _proximal(run: Run) -> None:
         Proximal(run.best_z.copy(), alpha=1e-3).advance(run)
 
 
-def _everything(run: Run, ip: InteriorPoint) -> int:
-    """H z = g on every row, refined where all of them hold: how many do not."""
+def _everything(run: Run, ip: InteriorPoint) -> None:
+    """H z = g on every row, refined where all of them hold."""
     system, sc = run.system, run.system.sc
     z = ip.everything
-    wrong = int(np.count_nonzero((z < sc.lower) | (z > sc.upper)))
     linear = sc.problem.law == "linear"
-    if wrong == 0 and (linear or system.form == "impulse"):
-        # The weight of the first point goes away with the factor that is there; another costs more.
-        _refine(run, z, REFINEMENTS, 0.1)
-        if linear and not run.done():
-            # Rows that nearly depend on each other feel that weight: with next to none a factor is less exact, and
-            # refinement mends that.
-            system.v[:] = 1.0 / (sc.theta + FINER)
-            system.factor_barrier()
-            _refine(run, system.solve_barrier(sc.g), MORE, 1.0)
-    return wrong
+    if not (linear or (system.form == "impulse" and np.all((z >= sc.lower) & (z <= sc.upper)))):
+        return
+    # The weight of the first point goes away with the factor that is there; another costs more.
+    _refine(run, z, REFINEMENTS, 0.1)
+    if linear and not run.done():
+        # Rows that nearly depend on each other feel that weight: with next to none a factor is less exact, and
+        # refinement mends that.
+        system.v[:] = 1.0 / (sc.theta + FINER)
+        system.factor_barrier()
+        _refine(run, system.solve_barrier(sc.g), MORE, 1.0)
 
 
 def _refine(run: Run, z: FloatArray, most: int, contraction: float) -> None:
@@ -146,7 +124,7 @@ def _refine(run: Run, z: FloatArray, most: int, contraction: float) -> None:
 
 def _interior(run: Run, ip: InteriorPoint, rows: bool) -> None:
     """Steps until the judge is content or they get nowhere; rows are polished at each new decade, cones at the end."""
-    trigger, untried = FIRST, True
+    trigger = FIRST
     lowest, idle, still, kept = np.inf, 0, 0, ip.z.copy()
     try:
         for _ in range(IPM_STEPS):
@@ -162,10 +140,9 @@ def _interior(run: Run, ip: InteriorPoint, rows: bool) -> None:
                 kept[:] = ip.z
             if relative <= run.tol and run.score(ip.z) <= run.tol:
                 return
-            settled = untried and ip.changed is not None and ip.changed <= SETTLED * len(kept)
-            if rows and (relative < trigger or settled):
-                untried, trigger = False, min(FIRST, 0.1 * relative)
-                polish(run, ip.z.copy())
+            if rows and relative < trigger:
+                trigger = 0.1 * relative
+                exchange(run, ip.z.copy())
                 trigger = min(trigger, 0.1 * run.best) if run.best < 1e-6 else trigger
                 if run.done() or run.at_floor():
                     return

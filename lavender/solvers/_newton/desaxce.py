@@ -39,7 +39,7 @@ from lavender.solvers._newton.run import Run
 from lavender.solvers._newton.scaled import Scaled
 from lavender.solvers._newton.systems import AUGMENTED, VelocitySystem
 
-SHARES = (0.7, 0.95, 1.0, 0.85, 0.98, 0.9)  # of phi's derivative, tried in turn
+SHARES = (0.7, 0.95, 1.0, 0.85, 0.5)  # of phi's derivative, tried in turn
 # First weight, steps of a round and factorisations of the proximal Newton methods after each interior point.
 FINISH = ((1e-3, 10, 15), (1e-7, 12, 12))
 
@@ -159,22 +159,16 @@ class DeSaxce(InteriorPoint):
         sy.v[:] = v + normal * wide - normal * ((across + own * psi) / (1.0 + own))[of.column]
 
 
-def solve_desaxce(run: Run, shares: tuple[float, ...] = SHARES) -> list[tuple[float, FloatArray]]:
-    """Interior points, each ended by Newton's method on the Alart-Curnier map, until the judge is content.
-
-    Returns where each of them ended: relative residual and z.
-    """
-    ends: list[tuple[float, FloatArray]] = []
+def solve_desaxce(run: Run, shares: tuple[float, ...] = SHARES) -> None:
+    """Interior points, each ended by Newton's method on the Alart-Curnier map, until the judge is content."""
     for share in shares:
         best, z = advance(run, DeSaxce(run.system, share=share), AUGMENTED, "De Saxce steps")
         if run.done() or run.at_floor():
-            break
+            return
         for alpha, inner, limit in FINISH:
             best, z = apart(run, Proximal(z, AUGMENTED, min(alpha, best), inner), limit)
             if run.done() or run.at_floor():
-                return ends
-        ends.append((best, z))
-    return ends
+                return
 
 
 def solve_desaxce_augmented(run: Run, shares: tuple[float, ...] = SHARES[:2]) -> None:

@@ -32,7 +32,6 @@ class InteriorPoint:
     first_gap: float = field(init=False, default=0.0)
     length: float = field(init=False, default=1.0)
     error: tuple[float, float] | None = field(init=False, default=None)  # of z, where a step has it anyway
-    changed: int | None = field(init=False, default=None)  # rows that changed their side, likewise
 
     def __post_init__(self) -> None:
         sy, sc = self.system, self.system.sc
@@ -71,7 +70,7 @@ class InteriorPoint:
         sy, sc, e = self.system, self.system.sc, self.system.elements
         if self.inner is not None:
             sy.factorisations += 1
-            went, self.length, mu, energy, velocity, self.changed = self.inner.step()
+            went, self.length, mu, energy, velocity = self.inner.step()
             self.error = energy, velocity
             self.lowest_gap = min(self.lowest_gap, self.gap)
             self.gap = mu

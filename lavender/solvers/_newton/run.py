@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from time import perf_counter
 
@@ -23,10 +22,6 @@ class Run:
     tol: float
     budget: int  # factorisations
     deadline: float  # of perf_counter
-    more: Callable[[FloatArray], int] | None = (
-        None  # asked for more factorisations, with the best (m,) N s so far
-    )
-    sweeps: int = 0  # between Newton's walks
     best: float = np.inf
     best_z: FloatArray = field(init=False)
     aside: tuple[float, FloatArray] | None = None  # a best point that is no start for what comes
@@ -81,20 +76,8 @@ class Run:
     def spent(self) -> bool:
         """No budget or time for another factorisation, at the system's pace."""
         if self.system.factorisations >= self.budget:
-            if self.more is None:
-                return True
-            more = self.more(self.system.sc.impulse(self.best_z))
-            if more <= 0:
-                self.more = None
-                return True
-            self.budget += more
+            return True
         return self.deadline < np.inf and perf_counter() + self.system.seconds >= self.deadline
-
-    def gives_way(self) -> bool:
-        """Before factors dearer than those counted on: a turn of others, where there are any; whether it is the end."""
-        if self.more is not None:
-            self.budget = min(self.budget, self.system.factorisations)
-        return self.done()
 
     def at_floor(self) -> bool:
         """The best point is within twice the floor."""

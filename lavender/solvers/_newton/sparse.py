@@ -16,11 +16,10 @@ import numpy as np
 import scipy.sparse as sp
 
 from lavender._arrays import FloatArray, IntArray
-from lavender.solvers._factor import PANELS_WORK, TINY, WIDE, panels_cost
+from lavender.solvers._factor import TINY, WIDE
 from lavender.solvers._newton.scaled import Scaled
-from lavender_ext.factor.sparse import SparsePanels, free_part, is_mirrored
-from lavender_ext.newton.band import element_graph, scaled_entries
-from lavender_ext.newton.coupled import coupled, coupled_entries, coupled_rows
+from lavender_ext.factor.sparse import SparsePanels, is_mirrored
+from lavender_ext.newton.coupled import coupled, coupled_entries, coupled_rows, element_graph
 from lavender_ext.newton.elements import Elements
 
 __all__ = ["Coupled", "Panelled"]
@@ -68,25 +67,21 @@ class Panelled:
 class Coupled:
     """H on the pattern of its elements, and what Newton's method makes of it."""
 
-    def __init__(self, sc: Scaled, a: sp.csr_array, elements: Elements) -> None:
-        n, m = len(sc.kind), sc.m
+    def __init__(self, sc: Scaled, h: sp.csr_array, elements: Elements) -> None:
         self.elements = elements
-        of = np.repeat(np.arange(n, dtype=np.int32), np.diff(sc.ptr))
-        to, other = element_graph(sc.ptr, of, a.indptr, a.indices)
-        graph = sp.csr_array((np.ones(len(other), bool), other, to), shape=(n, n))
-        graph.sort_indices()
-        if not (is_mirrored(graph.indptr, graph.indices) and graph.diagonal().all()):
-            graph = sp.csr_array(graph + graph.T + sp.eye_array(n, dtype=bool))
-            graph.sort_indices()
-        self.to, self.other = graph.indptr.astype(np.int32), graph.indices.astype(np.int32)
-        self.indptr, self.indices = coupled_rows(sc.ptr, self.to, self.other)
-        values = scaled_entries(a.indptr, a.indices, a.data, sc.scale)
-        self.h: FloatArray = coupled_entries(a.indptr, a.indices, values, self.indptr, self.indices)
+        self.h: FloatArray = h.data
+        if len(sc.kind) == sc.m and is_mirrored(h.indptr, h.indices) and h.diagonal().all():
+            self.to, self.other = self.indptr, self.indices = (
+                h.indptr,
+                h.indices,
+            )  # a pattern is its own graph
+        else:
+            self.to, self.other = _graph(sc, h)
+            self.indptr, self.indices = coupled_rows(sc.ptr, self.to, self.other)
+            self.h = coupled_entries(h.indptr, h.indices, h.data, self.indptr, self.indices)
         self.diagonal = _diagonal(self.indptr, self.indices)
         self.panels: dict[bool, SparsePanels] = {}
         self.rows = sp.csr_array((self.h, self.indices, self.indptr))
-        self.part: tuple[bytes, SparsePanels] | None = None  # of the rows that were free last
-        self.m = m
 
     def analysed(self, lu: bool) -> SparsePanels:
         """The panels of all rows; no number is looked at."""
@@ -119,23 +114,18 @@ class Coupled:
         coupled(self.elements, self.to, self.other, self.indptr, self.h, left, right, own, values)
         return self._whole(values, lu)
 
-    def free(self, rows: IntArray, eps: float, lu: bool) -> Panelled:
-        """H + eps of the free ones of bounded rows, or of all of them with I elsewhere where that costs less."""
-        n = len(rows)
-        entries = len(self.indices) * (n / self.m) ** 2
-        if PANELS_WORK * self.analysed(lu).work <= panels_cost(int(entries), n):
-            p = np.zeros(self.m)
-            p[rows] = 1.0
-            return self.small(p, p, eps - 1.0, lu)
-        place = np.full(self.m, -1, np.int32)
-        place[rows] = np.arange(n, dtype=np.int32)
-        indptr, indices, values = free_part(self.indptr, self.indices, self.h, place, n)
-        key = place.tobytes()
-        if self.part is None or self.part[0] != key:
-            self.part = key, SparsePanels(indptr, indices, lu, WIDE)
-        diagonal = _diagonal(indptr, indices)
-        values[diagonal] += eps
-        return Panelled(self.part[1], lu, sp.csr_array((values, indices, indptr)), values, diagonal)
+
+def _graph(sc: Scaled, a: sp.csr_array) -> tuple[IntArray, IntArray]:
+    """(indptr, indices) of the elements that A couples, either way, each with itself."""
+    n = len(sc.kind)
+    of = np.repeat(np.arange(n, dtype=np.int32), np.diff(sc.ptr))
+    to, other = element_graph(sc.ptr, of, a.indptr, a.indices)
+    graph = sp.csr_array((np.ones(len(other), bool), other, to), shape=(n, n))
+    graph.sort_indices()
+    if not (is_mirrored(graph.indptr, graph.indices) and graph.diagonal().all()):
+        graph = sp.csr_array(graph + graph.T + sp.eye_array(n, dtype=bool))
+        graph.sort_indices()
+    return graph.indptr.astype(np.int32), graph.indices.astype(np.int32)
 
 
 def _diagonal(indptr: IntArray, indices: IntArray) -> IntArray:

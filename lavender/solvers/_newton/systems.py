@@ -1,14 +1,13 @@
 """H of the scaled problem and its Newton systems, in two forms.
 
 `VelocitySystem` never forms H (K K^T + theta with one small dense block for each body, factored in compiled
-code), `MatrixSystem` holds it (dense LAPACK, LAPACK's band where one is narrow, else by sparse panels). The
+code), `MatrixSystem` holds it (dense LAPACK, or sparse panels). The
 equations are in `lavender_ext/newton/`.
 """
 
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
 from functools import cached_property
 from time import perf_counter
 from typing import Any
@@ -17,8 +16,6 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.linalg.lapack import dgetrf as getrf
 from scipy.linalg.lapack import dgetrs as getrs
-from scipy.linalg.lapack import dpbtrf as pbtrf
-from scipy.linalg.lapack import dpbtrs as pbtrs
 from scipy.linalg.lapack import dpotrf as potrf
 from scipy.linalg.lapack import dpotrs as potrs
 
@@ -30,14 +27,7 @@ from lavender.solvers._newton.row_steps import RowSteps
 from lavender.solvers._newton.scaled import Scaled, scaled
 from lavender.solvers._newton.sparse import Coupled, Panelled
 from lavender_ext.factor import symbolic
-from lavender_ext.newton.band import (
-    band_free,
-    band_scaled,
-    band_width,
-    element_graph,
-    scaled_band,
-    scaled_entries,
-)
+from lavender_ext.newton.coupled import scaled_entries
 from lavender_ext.newton.elements import (
     MAP_AUGMENTED,
     MAP_CONVEX,
@@ -55,9 +45,6 @@ DENSE_ROWS = 150  # below: dense LAPACK beats sparse bookkeeping
 # cost a quarter there; and of bounded rows alone, whose free ones panels analyse anew whenever they change.
 DENSE_FILL, BOUNDED_FILL = 0.4, 0.25
 DENSE_LIMIT = 6000  # rows; 288 MB of A
-BAND_ROWS = 100  # below: dense LAPACK
-BAND_SHARE = 0.25  # of rows that the half bandwidth may have
-BAND_FILL = 1000.0  # multiply-adds for each nonzero of A up to which LAPACK's band is made
 # Weight of the proximal term in an interior point system, relative to d: far below any step that
 # matters, far above the rounding of a pivot.
 DELTA = 1e-10
@@ -305,51 +292,13 @@ class VelocitySystem(System):
         return out
 
 
-@dataclass
-class _Band:
-    """H in an order of its elements that makes it narrow."""
-
-    h: FloatArray  # (m, width), h[j, t] = H[j + t, j]
-    order: IntArray  # (m,) row at each place
-    place: IntArray  # (m,) place of each row
-    elements: IntArray  # (n,) element at each place
-    work: FloatArray  # (m, width) the last factor
-
-
-def _band(sc: Scaled, a: Any) -> _Band | None:
-    """Where a band costs less than a sparse factor, and far less than a dense one."""
-    m, n = sc.m, len(sc.kind)
-    if m < BAND_ROWS or a.nnz == 0 or a.nnz > 0.5 * BAND_SHARE * m * m:
-        return None  # a mean row of more nonzeros than that has no narrow band
-    from scipy.sparse.csgraph import reverse_cuthill_mckee
-
-    if n == m:
-        elements = order = reverse_cuthill_mckee(a, symmetric_mode=True).astype(np.int32)
-    else:
-        of = np.repeat(np.arange(n, dtype=np.int32), np.diff(sc.ptr))
-        to, other = element_graph(sc.ptr, of, a.indptr, a.indices)
-        graph = sp.csr_array((np.ones(len(other), np.int8), other, to), shape=(n, n))
-        elements = reverse_cuthill_mckee(graph, symmetric_mode=True).astype(np.int32)
-        size = np.diff(sc.ptr)[elements]
-        ends = np.cumsum(size)
-        order = (np.arange(m) + np.repeat(sc.ptr[:-1][elements] - (ends - size), size)).astype(np.int32)
-    place = np.empty(m, np.int32)
-    place[order] = np.arange(m, dtype=np.int32)
-    width = band_width(a.indptr, a.indices, place) + 1
-    if width > BAND_SHARE * m or m * width**2 > BAND_FILL * a.nnz:
-        return None
-    h = np.empty((m, width))
-    scaled_band(a.indptr, a.indices, a.data, place, sc.scale, h)
-    return _Band(h, order, place, elements, np.empty_like(h))
-
-
 def _nothing(r: FloatArray) -> FloatArray:
     """The solution of a singular system."""
     return np.full_like(r, np.nan)
 
 
 class MatrixSystem(System):
-    """H as a matrix: dense LAPACK, its band, or sparse panels."""
+    """H as a matrix: dense LAPACK, or sparse panels."""
 
     form = "impulse"
 
@@ -360,10 +309,7 @@ class MatrixSystem(System):
         if not sc.whole:
             a = a[sc.keep][:, sc.keep]
         self.symmetric = sc.problem.is_symmetric
-        self.band: _Band | None = _band(sc, a) if self.symmetric else None
-        self.dense = self.band is None and (
-            m <= DENSE_ROWS or (is_full(a.nnz, m, len(sc.kind) == m) and m <= DENSE_LIMIT)
-        )
+        self.dense = m <= DENSE_ROWS or (is_full(a.nnz, m, len(sc.kind) == m) and m <= DENSE_LIMIT)
         # Of a sparse factor by its fill, which grows with the size: nanoseconds, as `_rates.py` has them.
         self.cost = m**3 / 3.0 if self.dense else 100.0 * a.nnz * (1.0 + m / 1000.0)
         self.pace = 0.15e-9 if self.dense else 1e-9
@@ -386,7 +332,7 @@ class MatrixSystem(System):
         )
         self.solver: Any = None
         self.pair: tuple[FloatArray, FloatArray]
-        self.free: FloatArray | None = None  # rows that the band of the last `factor_natural` holds
+        self.free: FloatArray | None = None  # 1 on the bounded rows that the last `factor_natural` solves for
 
     @cached_property
     def newton(self) -> Any:
@@ -395,15 +341,13 @@ class MatrixSystem(System):
 
     @cached_property
     def sparse(self) -> Coupled:
-        """The pattern of its factors, where there is no band and few entries."""
-        sc = self.sc
-        a = sc.problem.csr
-        return Coupled(sc, a if sc.whole else a[sc.keep][:, sc.keep], self.elements)
+        """The pattern of its factors, where there are few entries."""
+        return Coupled(self.sc, self.h, self.elements)
 
     @property
     def seconds(self) -> float:
         """As of all systems; fill is counted before the first number."""
-        if not self.dense and self.band is None:
+        if not self.dense:
             self.cost = self.sparse.work if self.symmetric else 2.0 * self.sparse.work
         return self.pace * self.cost
 
@@ -463,8 +407,6 @@ class MatrixSystem(System):
 
     def factor_barrier(self) -> bool:
         # H + V^-1, or with cones I + B^T H B and dz = B (...): V^-1 would lose the small eigenvalues of V.
-        if self.band is not None and self._factor_band(self.band):
-            return True
         if self.bt is None:
             with np.errstate(divide="ignore", over="ignore"):
                 w = 1.0 / self.v  # inf for a row that no longer moves, and the step fails
@@ -485,23 +427,6 @@ class MatrixSystem(System):
         if self.symmetric and self._cholesky(matrix.copy()):
             return True
         return self._dense_lu(np.ascontiguousarray(matrix.T))
-
-    def _factor_band(self, band: _Band) -> bool:
-        if self.bt is None:
-            matrix = band.work
-            matrix[:] = band.h
-            matrix[:, 0] += (1.0 / self.v)[band.order]
-        else:
-            band_scaled(self.elements, band.elements, band.place, band.h, self.bt, band.work)
-        return self._cholesky_band(band)
-
-    def _cholesky_band(self, band: _Band) -> bool:
-        c, info = pbtrf(band.work.T, lower=1, overwrite_ab=True)
-        if info != 0:
-            return False  # another comes in its place
-        self.factorisations += 1
-        self.solver = lambda r: pbtrs(c, r[band.order], lower=1, overwrite_b=True)[0][band.place]
-        return True
 
     def _cholesky(self, matrix: FloatArray) -> bool:
         start = perf_counter()
@@ -539,11 +464,6 @@ class MatrixSystem(System):
 
     def factor_natural(self, eps: float) -> bool:
         self.free = None
-        if self.band is not None and self.bt is None:
-            band_free(self.band.h, self.p[self.band.order], eps, self.band.work)
-            if self._cholesky_band(self.band):
-                self.free = self.p
-                return True
         if self.bt is None:
             return self._factor_free(eps)
         if self.dense:
@@ -557,15 +477,11 @@ class MatrixSystem(System):
         if len(free) == 0:
             self.solver = np.copy
             return True
-        if self.dense:
-            matrix = self.h[np.ix_(free, free)]
-            matrix.flat[:: len(free) + 1] += eps
-            done = (self.symmetric and self._cholesky(matrix.copy())) or self._dense_lu(matrix)
-        else:
-            made = self.sparse.free(free, eps, not self.symmetric)
-            done = self._by_panels(made)
-            if len(made.diagonal) == self.sc.m:
-                return done
+        if not self.dense:
+            return self._by_panels(self.sparse.small(self.p, self.p, eps - 1.0, not self.symmetric))
+        matrix = self.h[np.ix_(free, free)]
+        matrix.flat[:: len(free) + 1] += eps
+        done = (self.symmetric and self._cholesky(matrix.copy())) or self._dense_lu(matrix)
         inside = self.solver
 
         def solve(r: FloatArray) -> FloatArray:

@@ -1,0 +1,269 @@
+"""What every form, start, phase and factorisation of `newton` is worth: each taken out alone.
+
+    python benchmarks/bench_newton.py [--sets hard default wild scenes] [--seeds 9000:9060] [--rows 1000]
+                                      [--files 'robots/*.npz'] [--tol 1e-6] [--limit 2] [--only NAME ...] [--save FILE]
+
+A part is taken out by putting something in its place while a problem is solved; nothing of the product knows of it. A
+line for each part and class (law, operator, size) on which its absence changes the result's bits or work: problems,
+those then unsolved and those that only then are solved, factorisations and CPU time without over with, geometric means
+(time of problems solved both ways, the two solved in turn).
+"""
+
+from __future__ import annotations
+
+import argparse
+import glob
+import json
+import math
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+from time import process_time
+from typing import Any
+from unittest.mock import patch
+
+import numpy as np
+from bench_islands import forms
+
+import lavender as lv
+from lavender import suite
+from lavender.problem import Problem
+from lavender.residuals import nothing_to_do
+from lavender.scene.gallery import SCENES
+from lavender.solvers import newton
+from lavender.solvers._newton import convex, coulomb, interior_point, proximal, systems
+from lavender.solvers.warm_start import Tried
+
+Part = tuple[Callable[[Problem], bool], list[tuple[Any, str, Any]], dict[str, Any]]
+
+
+def nothing(*_args: Any, **_kwargs: Any) -> None:
+    """In the place of what is taken out."""
+
+
+def bounded(p: Problem) -> bool:
+    """Bounded rows alone."""
+    return p.law in ("linear", "lcp")
+
+
+def coulombs(p: Problem) -> bool:
+    """Coulomb's law."""
+    return p.law == "coulomb"
+
+
+def convexs(p: Problem) -> bool:
+    """Any other."""
+    return p.law != "coulomb"
+
+
+def cones(p: Problem) -> bool:
+    """The convex law of contacts."""
+    return p.law == "cone"
+
+
+def matrix(p: Problem) -> bool:
+    """Given as A."""
+    return p.matrix is not None
+
+
+def bodies(p: Problem) -> bool:
+    """Given by bodies."""
+    return p.rows is not None
+
+
+def general(p: Problem) -> bool:
+    """Given by J and M."""
+    return p.generalized is not None and not p.cones.has_round
+
+
+def anything(_p: Problem) -> bool:
+    """Every problem."""
+    return True
+
+
+_ADVANCE = proximal.Proximal.advance
+
+
+def _no_end(self: Any, run: Any, limit: int = 10_000) -> None:
+    if limit != 12:
+        _ADVANCE(self, run, limit)
+
+
+def _together(*args: Any, apart: bool = False, **kwargs: Any) -> Any:
+    del apart
+    return interior_point.InteriorPoint(*args, **kwargs)
+
+
+def _apart(*args: Any, apart: bool = True, **kwargs: Any) -> Any:
+    del apart
+    return interior_point.InteriorPoint(*args, apart=True, **kwargs)
+
+
+def _left(*_: Any) -> Tried:
+    return Tried(0)
+
+
+FORM_ROWS = {"form": "impulse"}
+PARTS: dict[str, Part] = {
+    # forms
+    "velocities of bodies": (bodies, [], FORM_ROWS),
+    "bodies apart from J and M": (bodies, [], {"as": "J and M"}),
+    "velocities of J and M": (general, [], FORM_ROWS),
+    "rows after velocities": (general, [], {"form": "velocity"}),
+    # starts
+    "warm start": (bodies, [(newton, "warm_start", _left)], {}),
+    "exchanges": (bounded, [(convex, "_exchange", nothing)], {}),
+    "refinement of all rows": (bounded, [(convex, "_refine", nothing)], {}),
+    "shift for each row apart": (convexs, [(convex, "InteriorPoint", _together)], {}),
+    "one shift for all rows": (convexs, [(convex, "InteriorPoint", _apart)], {}),
+    # phases, convex
+    "interior point": (bounded, [(convex, "_interior", nothing)], {}),
+    "polish of bounded rows": (bounded, [(convex, "exchange", nothing)], {}),
+    "augmented interior point": (convexs, [(convex, "solve_augmented", nothing)], {}),
+    "proximal rounds, convex": (convexs, [(convex, "_proximal", nothing)], {}),
+    "second weight of cones": (cones, [(convex, "DELTA", convex.CONE_DELTA)], {}),
+    "first weight of cones": (cones, [(convex, "CONE_DELTA", convex.DELTA)], {}),
+    "proximal end of cones": (cones, [(convex.Proximal, "advance", _no_end)], {}),
+    # phases, Coulomb's law
+    "walks": (coulombs, [(coulomb, "_pursue", nothing)], {}),
+    "De Saxce": (coulombs, [(coulomb, "solve_desaxce", nothing), (coulomb, "_loops", nothing)], {}),
+    "walk from the cone law": (coulombs, [(coulomb, "_from_convex", nothing)], {}),
+    "further shares": (coulombs, [(coulomb, "SHARES", coulomb.SHARES[:2])], {}),
+    "augmented De Saxce": (coulombs, [(coulomb, "solve_desaxce_augmented", nothing)], {}),
+    # factorisations
+    "dense": (matrix, [(systems, "DENSE_ROWS", -1), (systems, "is_full", lambda *_: False)], {}),
+    "sparse panels of A": (matrix, [(systems, "is_full", lambda *_: True)], {}),
+    "SuperLU after panels": (matrix, [(systems.MatrixSystem, "_superlu", lambda _s, _m: systems._nothing)], {}),
+    "panels over bodies": (bodies, [(systems, "PANELS", math.inf)], {}),
+    "block rows over bodies": (bodies, [(systems, "PANELS", 0.0)], {}),
+    "dissection": (bodies, [(systems, "dissected", lambda n, a, p, i: (p, i, None, None, None))], {}),
+}  # fmt: skip
+
+
+def problems(args: argparse.Namespace) -> Iterator[tuple[str, Problem]]:
+    """Name and problem of all that is asked for."""
+    for name in args.sets:
+        if name == "wild":
+            first, last = map(int, args.seeds.split(":"))
+            for seed in range(first, last):
+                yield f"wild({seed})", suite.wild(seed=seed, rows=args.rows).problem
+        elif name == "scenes":
+            for scene in SCENES:
+                simulation = lv.Simulation(lv.Scene(scene, solver="newton"))
+                for step in range(1, 121):
+                    simulation.step()
+                    if step in (5, 30, 60, 119, 120):
+                        yield f"{scene} {step}", simulation.constraint_problem()
+        else:
+            for case in suite.cases(name):
+                yield case.name, case.problem
+    for path in sorted(glob.glob(args.files)) if args.files else ():
+        yield Path(path).stem, lv.io.load(path)
+
+
+def kind(p: Problem) -> str:
+    """Class of a problem: law, operator, size."""
+    operator = "J and M" if p.generalized is not None else "bodies" if p.rows is not None else "A"
+    size = "64" if p.m <= 64 else "300" if p.m <= 300 else "more"
+    return f"{p.law}, {operator}, {size}"
+
+
+def run(p: Problem, part: Part | None, args: argparse.Namespace) -> tuple[bool, int, float, bytes]:
+    """(solved or proven infeasible, factorisations, CPU time [s], impulse and work)."""
+    with ExitStack() as stack:
+        options: dict[str, Any] = {}
+        if part is not None:
+            for where, name, instead in part[1]:
+                stack.enter_context(patch.object(where, name, instead))
+            options = dict(part[2])
+        begun = process_time()
+        try:
+            guess = p.guess
+            made = forms(p)["J and M"] if options.pop("as", None) else replace(p, copy=False)
+            begun = process_time()
+            found = lv.solve(made, "newton", impulse=guess, tol=args.tol, time_limit=args.limit, **options)
+        except (lv.LavenderError, ValueError, MemoryError):  # what is left has no room for it
+            return False, 0, process_time() - begun, b""
+        took = process_time() - begun
+    r = found.residual
+    good = found.success or r.relative <= 2.0 * r.floor or found.status.name == "INFEASIBLE"
+    return (
+        good,
+        found.work.get("factorisations", 0),
+        took,
+        found.impulse.tobytes() + repr(dict(found.work)).encode(),
+    )
+
+
+def compare(p: Problem, parts: dict[str, Part], args: argparse.Namespace) -> Iterator[dict[str, Any]]:
+    """A record for every part whose absence changes anything."""
+    run(p, None, args)
+    first = run(p, None, args)
+    for name, part in parts.items():
+        if not part[0](p):
+            continue
+        without = run(p, part, args)
+        if without[3] == first[3]:
+            continue
+        times, least = [without[2]], [first[2]]
+        if without[0] and first[0]:
+            for _ in range(2 if without[2] + first[2] < 0.3 else 0):
+                least.append(run(p, None, args)[2])
+                times.append(run(p, part, args)[2])
+        yield {
+            "part": name, "kind": kind(p), "rows": p.m, "with": first[0], "without": without[0],
+            "factors": (without[1] + 1) / (first[1] + 1), "time": min(times) / min(least),
+            "ms": 1e3 * min(least),
+        }  # fmt: skip
+
+
+def table(records: list[dict[str, Any]]) -> Iterator[str]:
+    """A line for each part, and for each of its classes."""
+    yield f"{'without':<30}{'class':<24}{'n':>5}{'lost':>6}{'won':>5}{'factors':>9}{'time':>7}{'worst':>7}"
+    grouped = defaultdict(list)
+    for r in records:
+        grouped[r["part"], ""].append(r)
+        grouped[r["part"], r["kind"]].append(r)
+    order = {name: i for i, name in enumerate(PARTS)}
+    for (part, of), rs in sorted(grouped.items(), key=lambda item: (order[item[0][0]], item[0][1])):
+        both = [r for r in rs if r["with"] and r["without"]]
+        mean = [
+            math.exp(np.mean(np.log([r[k] for r in both]))) if both else math.nan for k in ("factors", "time")
+        ]
+        worst = max((r["time"] for r in both), default=math.nan)
+        lost = sum(r["with"] and not r["without"] for r in rs)
+        won = sum(r["without"] and not r["with"] for r in rs)
+        counts = f"{len(rs):>5}{lost:>6}{won:>5}{mean[0]:>9.2f}{mean[1]:>7.2f}{worst:>7.1f}"
+        yield f"{'' if of else part:<30}{of or 'all':<24}{counts}"
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--sets", nargs="*", default=["hard", "default", "wild", "scenes"])
+    parser.add_argument("--seeds", default="9000:9060")
+    parser.add_argument("--rows", type=int, default=1000)
+    parser.add_argument("--files", default="")
+    parser.add_argument("--tol", type=float, default=1e-6)
+    parser.add_argument("--limit", type=float, default=2.0)
+    parser.add_argument("--only", nargs="*", default=list(PARTS))
+    parser.add_argument("--save", default="")
+    args = parser.parse_args()
+    parts, records = {name: PARTS[name] for name in args.only}, []
+    for name, problem in problems(args):
+        if problem.m == 0 or nothing_to_do(problem):
+            continue
+        for record in compare(problem, parts, args):
+            records.append({"name": name} | record)
+            if args.save:
+                with Path(args.save).open("a") as stream:
+                    stream.write(json.dumps(records[-1]) + "\n")
+    print("\n".join(table(records)))
+
+
+if __name__ == "__main__":
+    main()

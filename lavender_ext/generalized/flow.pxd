@@ -1,0 +1,235 @@
+"""The iterate of Newton's method over generalised velocities: what is kept of it, and what a point answers (`newton.pxd`).
+
+Rows and blocks of an island stand in runs of panels. lambda(s) and V are those of softened blocks (`soft.pxd`), errors
+those of the judge.
+"""
+from libc.math cimport sqrt
+from libc.stdint cimport int32_t
+
+from lavender_ext.core.block cimport CONE, CONTACT_SPIN, ROW, block_error, blocks_t, n_tangents, row_error
+from lavender_ext.core.generalized cimport generalized_t, panel_push, panel_times
+from lavender_ext.generalized.soft cimport cone_map, coulomb_map
+from lavender_ext.judge.score cimport nothing, tally_block, tally_row, tally_t
+
+
+cdef struct wait_t:             # a descent whose steps were used up, to go on with
+    int32_t island              # -1: none waits
+    int32_t worst               # end of the islands before it
+    int32_t cold                # those after it begin from nothing
+    int32_t law                 # that it is under
+    int32_t rounds              # of Coulomb friction before this one
+    int32_t idle
+    int32_t n                   # steps of it
+    int32_t fresh               # s was formed anew, not moved
+    int32_t stale               # N is to be formed anew
+    double share                # of d
+    double kept                 # error of the island's best, which a cut may have found,
+    double least                # of the best that one run knows of,
+    double found                # of the descent's as its caller keeps it,
+    double lowest               # and of its own steps
+    double last_center
+    double sizes[3]             # |G| of the last steps
+
+
+cdef struct flow_t:
+    blocks_t p                  # a copy: its law is that of the convex problem while one is solved
+    const generalized_t* g
+    int32_t law                 # of the problem
+    double share                # of d, that rho is at first
+    int32_t n_islands
+    const int32_t* iptr         # (n_islands + 1) runs of panels of each island in `run`
+    const int32_t* run          # (2 runs) first panel and the one past the last; runs <= n_panels
+    const int32_t* cptr         # (n_islands + 1) columns of each island in `icols`
+    const int32_t* icols        # (<= n) ascending in each
+    const int32_t* local        # (n) number of a column in its island
+    const int32_t* lptr         # (n + 1) rows of the islands' L, one after the other; NULL: all dense
+    const int32_t* lidx         # columns in their island, ascending
+    int32_t thin                # the present island's N and L are kept where L has entries (`sparse.pxd`)
+    const int32_t* pblock       # (n_panels + 1) first block of each panel
+    const int32_t* vptr         # (k + 1) V of each block: its diagonal for ROW, else square
+    int32_t island              # the present one
+    int32_t still               # its y is 0
+    double* theta               # (m) theta', > 0
+    double* soft                # (m) 1 / theta'
+    double* rho                 # (m) >= 0
+    double* y                   # (n)
+    double* u                   # (n) Y^T lambda
+    double* grad                # (n) G
+    double* step                # (n) p
+    double* s                   # (m) Y y - b + phi
+    double* q                   # (m) Y p
+    double* phi                 # (m)
+    double* center              # (m)
+    double* lam                 # (m)
+    double* trial               # (m)
+    double* best                # (m) of one descent
+    double* first_best          # (m) of one island, under the problem's own law
+    double* aside               # (m) what a descent that waits began with: phi, under Coulomb's law the impulse
+    double* w                   # (m)
+    double* e                   # (m)
+    double* v                   # V at s
+    double* held                # V inside `normal`
+    double* normal              # N of the present island, lower triangle by rows; or L's entries; or whole: Coulomb
+    double* factor              # its factor
+    double* inv                 # (s) 1 / D
+    double* turned              # (rows of a panel, columns) changes of V times Y
+    double* line                # (columns)
+    double* local_rhs           # (s)
+    int32_t* swap               # (s)
+    double energy_limit         # sqrt J of one island
+    double velocity_limit       # m/s
+    int32_t steps               # Newton steps left
+    int32_t factorisations
+    int32_t updates             # of N by changed blocks alone
+    int32_t rounds              # of Coulomb friction
+    int32_t evaluations         # of lambda(s) along a line
+    wait_t wait
+
+
+# -- rows and blocks of a run of panels ------------------------------------------------------------------
+
+
+cdef inline int32_t row_from(const flow_t* f, int32_t a) noexcept nogil:
+    return f.g.prow[f.run[2 * a]]
+
+
+cdef inline int32_t row_end(const flow_t* f, int32_t a) noexcept nogil:
+    return f.g.prow[f.run[2 * a + 1]]
+
+
+cdef inline int32_t block_from(const flow_t* f, int32_t a) noexcept nogil:
+    return f.pblock[f.run[2 * a]]
+
+
+cdef inline int32_t block_end(const flow_t* f, int32_t a) noexcept nogil:
+    return f.pblock[f.run[2 * a + 1]]
+
+
+# -- lambda(s) and V -------------------------------------------------------------------------------------
+
+
+cdef inline void respond(const flow_t* f, int32_t first, int32_t last, const double* s, double* lam,
+                         double* v) noexcept nogil:
+    """lambda and V of blocks [first, last)."""
+    cdef int32_t i, j, end, k, nt, spin, at
+    # Hoisted: what is stored to might be any of them, for all a compiler knows.
+    cdef const int32_t* ptr = f.p.ptr
+    cdef const int32_t* kind = f.p.kind
+    cdef const int32_t* vptr = f.vptr
+    cdef const double* lower = f.p.lower
+    cdef const double* upper = f.p.upper
+    cdef const double* rho = f.rho
+    cdef const double* center = f.center
+    cdef const double* soft = f.soft
+    cdef double z, low, high
+    cdef bint cone = f.p.law == CONE
+    for i in range(first, last):
+        j = ptr[i]
+        end = ptr[i + 1]
+        at = vptr[i]
+        if kind[i] == ROW:
+            at -= j
+            for k in range(j, end):
+                z = (rho[k] * center[k] - s[k]) * soft[k]
+                low = lower[k]
+                high = upper[k]
+                v[at + k] = soft[k] if low < z < high else 0.0
+                lam[k] = low if z < low else (high if z > high else z)
+            continue
+        for k in range(j, end):
+            lam[k] = (rho[k] * center[k] - s[k]) * soft[k]
+        nt = n_tangents(kind[i], end - j)
+        spin = kind[i] == CONTACT_SPIN
+        if cone:
+            cone_map(nt, spin, f.theta + j, f.p.mu[i], f.p.patch_radius[i], lam + j, v + at)
+        else:
+            coulomb_map(nt, spin, f.theta + j, f.p.mu[i], f.p.patch_radius[i], lam + j, v + at)
+
+
+cdef inline void respond_all(const flow_t* f, int32_t island, const double* s, double* lam) noexcept nogil:
+    cdef int32_t a
+    for a in range(f.iptr[island], f.iptr[island + 1]):
+        respond(f, block_from(f, a), block_end(f, a), s, lam, f.v)
+
+
+cdef inline bint gather(const flow_t* f, int32_t island, const double* lam, double* x) noexcept nogil:
+    """x = Y^T lam on the island's columns; whether any lam is other than 0."""
+    cdef int32_t a, b, k
+    cdef bint moves = False
+    for a in range(f.cptr[island], f.cptr[island + 1]):
+        x[f.icols[a]] = 0.0
+    for a in range(f.iptr[island], f.iptr[island + 1]):
+        for k in range(row_from(f, a), row_end(f, a)):
+            if lam[k] != 0.0:
+                moves = True
+                break
+        if moves:
+            for b in range(f.run[2 * a], f.run[2 * a + 1]):
+                panel_push(f.g, b, lam, x)
+    return moves
+
+
+cdef inline void spread(const flow_t* f, int32_t island, const double* x, double* out) noexcept nogil:
+    """out = Y x on the island's rows."""
+    cdef int32_t a, b, end
+    for a in range(f.iptr[island], f.iptr[island + 1]):
+        end = f.run[2 * a + 1]
+        for b in range(f.run[2 * a], end):
+            panel_times(f.g, b, x, out)
+
+
+cdef inline void blank(const flow_t* f, int32_t island, double* out) noexcept nogil:
+    """out = 0 on the island's rows."""
+    cdef int32_t a, k
+    for a in range(f.iptr[island], f.iptr[island + 1]):
+        for k in range(row_from(f, a), row_end(f, a)):
+            out[k] = 0.0
+
+
+cdef inline void renew(const flow_t* f, int32_t island) noexcept nogil:
+    """s = Y y - b + phi."""
+    cdef int32_t a, k
+    cdef double* s = f.s
+    cdef const double* phi = f.phi
+    cdef const double* b = f.p.b
+    if f.still:
+        blank(f, island, s)
+    else:
+        spread(f, island, f.y, s)
+    for a in range(f.iptr[island], f.iptr[island + 1]):
+        for k in range(row_from(f, a), row_end(f, a)):
+            s[k] += phi[k] - b[k]
+
+
+cdef inline double measure(const flow_t* f, int32_t island, const double* lam, bint moves,
+                           double* velocity) noexcept nogil:
+    """Energy [sqrt J] and velocity [m/s] of the errors of lam, with u = Y^T lam, 0 unless it `moves`; NaN: not finite."""
+    cdef int32_t a, i, k, end, last
+    cdef const int32_t* ptr = f.p.ptr
+    cdef const int32_t* kind = f.p.kind
+    cdef const double* lower = f.p.lower
+    cdef const double* upper = f.p.upper
+    cdef const double* d = f.p.d
+    cdef const double* b = f.p.b
+    cdef const double* phi = f.phi
+    cdef const double* compliance = f.g.compliance
+    cdef double* w = f.w
+    cdef tally_t t = nothing()
+    if moves:
+        spread(f, island, f.u, w)
+    else:
+        blank(f, island, w)
+    for a in range(f.iptr[island], f.iptr[island + 1]):
+        for k in range(row_from(f, a), row_end(f, a)):
+            w[k] += compliance[k] * lam[k] - b[k] + phi[k]
+        last = block_end(f, a)
+        for i in range(block_from(f, a), last):
+            if kind[i] == ROW:
+                end = ptr[i + 1]
+                for k in range(ptr[i], end):
+                    tally_row(&f.p, k, row_error(lam[k], w[k], d[k], lower[k], upper[k]), &t)
+            else:
+                block_error(&f.p, i, lam, w, f.e)
+                tally_block(&f.p, i, f.e, &t)
+    velocity[0] = sqrt(t.fast) if t.fast > 0.0 else 0.0
+    return sqrt(t.energy)
