@@ -50,6 +50,8 @@ class PivotState:
             same = like is not None and like.symmetric and _same_pattern(like.problem, problem)
             self.chosen = like.chosen if like is not None and same else choose(problem)
             self.form, band, order = self.chosen
+            if self.form == "dense" and 1e9 * DENSE * problem.m**3 / 3.0 > most:
+                raise TooDear
             if self.form != "band":
                 band = -1
                 self.factor = DenseFactor(problem) if self.form == "dense" else SparseFactor(problem, most)
@@ -71,8 +73,6 @@ class PivotState:
             )
         if not self.symmetric:
             self.seconds = 2.0 * (max(self.seconds, _filled(problem)) if self.is_sparse else self.seconds)
-        if self.form == "dense" and 1e9 * self.seconds > most:
-            raise TooDear
         self.factorisations = self.exchanged = self.searches = 0  # by Python
 
     @property

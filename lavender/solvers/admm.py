@@ -49,7 +49,7 @@ _LATE = "the next factorisation, or the analysis before it, would end after the 
 _AT_ONCE = (
     5e-3  # s, that scaling, analysis and the first factor may be expected to take for `prepare` to do them
 )
-_ENTRY = 2e-8  # s, of the first two, for each entry of A
+_ENTRY = 4e-8  # s, of the first two, for each entry of A
 # s for each multiply-add of a factor by panels, of L U in one panel, and of a dense one.
 _PANELS_WORK, _ONE_PANEL, _FULL = 1e-9 * PANELS_WORK, 4e-10, 1.5e-10
 
