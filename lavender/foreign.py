@@ -6,6 +6,7 @@ and its answer are its own: none of them is the caller's, and none is what the j
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from copy import deepcopy
 from dataclasses import replace
@@ -110,6 +111,12 @@ class Held:
             return None
         impulse = found[1].copy()
         return (residual(self.problem, impulse).relative, impulse) if all_finite(impulse) else None
+
+    @property
+    def sweeps_per_decade(self) -> float:
+        """What it says of its pace; NaN where that is no number."""
+        found = getattr(self.state, "sweeps_per_decade", math.nan)
+        return float(found) if isinstance(found, (int, float, np.number)) and found > 0.0 else math.nan
 
 
 def _counts(n: Any) -> bool:
