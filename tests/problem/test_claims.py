@@ -371,7 +371,7 @@ def test_the_best_iterate_of_a_solver_is_judged_before_it_is_taken(relative, val
 
     class Boasts:
         def prepare(self, problem):
-            self.best = relative, best
+            self.best, self.sweeps_per_decade = (relative, best), value
             return self
 
         def update(self, state, problem):
@@ -386,6 +386,8 @@ def test_the_best_iterate_of_a_solver_is_judged_before_it_is_taken(relative, val
         solution = lv.solve(problem, "boasts")
         assert solution.status is lv.Status.CONVERGED
         assert solution.impulse.tobytes() == answer.tobytes()
+        numbers = isinstance(value, float)  # NaN is what has no pace
+        np.testing.assert_equal(solution.sweeps_per_decade, value if numbers else np.nan)
     finally:
         del registry._registered["boasts"]
 
