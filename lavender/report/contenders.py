@@ -61,13 +61,12 @@ def contenders(records: Records, times: Sequence[float] = ()) -> list[Ask]:
             continue
         equal = [c for c in subject.best.ranking if c.solved == best.solved]
         near = [c for i, c in enumerate(equal) if i < 2 or c.score <= NEAR * best.score]
-        starts = {
-            c.solver: c.how.rpartition(", ")[2] if subject.way == "steps" else "cold" for c in near[:MOST]
-        }
-        for solver, start in starts.items():
-            line = Ask(solver, "tol", level, _needed(records, solver, level), way=subject.way, start=start)
-            asks.append(line)
-            asks.append(Ask(solver, "tol", level, line.max_iter, way="batch"))
+        for solver in [c.solver for c in near[:MOST]]:
+            needed = _needed(records, solver, level)
+            # Carrying impulses has its price: where steps are quick, a cold start may be the quicker line.
+            for start in ("cold", "carried") if subject.way == "steps" else ("cold",):
+                asks.append(Ask(solver, "tol", level, needed, way=subject.way, start=start))
+            asks.append(Ask(solver, "tol", level, needed, way="batch"))
         plain = lines(records, subject.way, rounds=False)
         for advice in subject.quick:
             if times or advice.target <= QUICKER * best.score:

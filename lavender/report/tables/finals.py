@@ -101,10 +101,18 @@ def line_table(records: Records) -> dict[str, dict[str, Final]]:
     """Solver -> way -> the line to the middle level, for the ways that were timed."""
     found: dict[str, dict[str, Final]] = {}
     for way in WAYS:
-        for final in lines(records, way):
-            if final.line.mode == "tol":
-                found.setdefault(final.line.solver, {})[way] = final
+        some = [f for f in lines(records, way) if f.line.mode == "tol"]
+        for final in _best_of_each(some, max((f.line.tol for f in some), default=0.0)):
+            found.setdefault(final.line.solver, {})[way] = final
     return found
+
+
+def _best_of_each(some: Sequence[Final], level: float) -> list[Final]:
+    """One line of each solver: cold or carried, whichever brings more cases to the level, then the quicker."""
+    best: dict[str, Final] = {}
+    for final in sorted(some, key=lambda f: (sum(not r.relative <= level for r in f.runs.values()), f.time)):
+        best.setdefault(final.line.solver, final)
+    return list(best.values())
 
 
 def to_level(records: Records, some: Sequence[Final], level: float, cases: int = 0) -> Race | None:
@@ -112,7 +120,7 @@ def to_level(records: Records, some: Sequence[Final], level: float, cases: int =
 
     `cases` there are, where lines were timed on fewer.
     """
-    some = [f for f in some if f.line.mode == "tol" and f.line.tol <= level]
+    some = _best_of_each([f for f in some if f.line.mode == "tol" and f.line.tol <= level], level)
     if not some:
         return None
     limit = limit_of(records)
