@@ -14,7 +14,7 @@ pytest.importorskip("h5py", reason="most reference problems are HDF5")
 FOLDER = Path(os.environ.get("LAVENDER_PROBLEMS", "") or "nowhere")
 FILES = sorted(p.name for s in ("*.npz", "*.hdf5") for p in FOLDER.glob(s))
 #: Solutions rounded to float64 that cannot score 1e-11: the entries of A and of lambda are too far apart.
-AT_FLOOR = {"fc3d_2cubes_t0.hdf5", "gmp_GMP6.npz"}
+AT_FLOOR = {"fc3d_2cubes_t0.hdf5", "gfc3d_TwoRods1.hdf5", "gmp_GMP6.npz"}
 
 
 def test_the_folder_is_the_one_meant(problem_dir):
@@ -37,7 +37,9 @@ def test_a_reference_problem_loads_and_its_solution_is_one(problem_dir, name, tm
         assert name == "lcpgen_psd-300.npz"
         return
     judged = lv.residual(problem, stored.impulse)
-    assert judged.relative <= max(1e-11, 2.0 * judged.floor), str(judged)
+    # Of a global form b = -(w + J M^-1 f) has roundings of its own, in another order than the file's solver added them.
+    floors = 4.0 if stored.format == "fclib_global" else 2.0
+    assert judged.relative <= max(1e-11, floors * judged.floor), str(judged)
     assert (judged.relative > 1e-11) == (name in AT_FLOOR)
     # Their u is that of the same r, formed by another code: rounding of the largest sums, and where M had to
     # be inverted its condition number on top.
