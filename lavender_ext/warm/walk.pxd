@@ -4,10 +4,9 @@
 
 z = D^1/2 lam; a round takes Newton steps on (1), Pi that of Alart and Curnier, until |F_c| is a tenth of what it was,
 each passed by a non-monotone line search (Grippo, Lampariello, Lucidi 1986). alpha falls the faster the shorter the
-rounds are, and rises where one fails. Near the end plain Newton steps are tried on the natural map itself, their small
-weight refined away. A point counts by the judge's residual alone.
+rounds are, and rises where one fails. A point counts by the judge's residual alone.
 """
-from libc.math cimport fabs, sqrt
+from libc.math cimport sqrt
 from libc.stdint cimport int32_t, int64_t, uint64_t
 
 from lavender_ext.core.block cimport CONTACT, CONTACT_SPIN as SPIN, ROW, blocks_t
@@ -30,7 +29,6 @@ cdef enum:
     MEMORY = 6                  # steps that the line search looks back
     HALVINGS = 7                # of one step
     FREE = 20                   # rounds in a row without a factorisation
-    POLISH_STEPS = 4
     FIRST_STEPS = 20            # factorisations of the first walk
     NEXT_STEPS = 40             # of each that follows
     WALKS = 4
@@ -348,60 +346,6 @@ cdef inline int32_t done(const walk_t* w, const warm_t* s) noexcept nogil:
     return w.best <= w.tol or s.factorisations >= w.last
 
 
-cdef inline void refined(walk_t* w, const double* rhs, double* x, double* r, double* dx) noexcept nogil:
-    """x of the Newton system, its weight mostly refined away; r, dx (m) are scratch."""
-    cdef int32_t j, _
-    cdef double left, size = 0.0, last = 1.7976931348623157e308
-    for j in range(w.e.m):
-        size = fabs(rhs[j]) if fabs(rhs[j]) > size else size
-    solve_natural(w, rhs, x)
-    for _ in range(2):
-        times(w, x, dx)
-        for j in range(w.e.m):
-            dx[j] -= x[j]
-        element_times(&w.e, w.p, dx, r)
-        left = 0.0
-        for j in range(w.e.m):
-            r[j] = rhs[j] - (r[j] + x[j])
-            left = fabs(r[j]) if fabs(r[j]) > left else left
-        if not left < 0.5 * last or left <= 1e-16 * size:
-            return
-        last = left
-        solve_natural(w, r, dx)
-        for j in range(w.e.m):
-            x[j] += dx[j]
-
-
-cdef inline void polish(const blocks_t* p, const rows_t* r, warm_t* s, walk_t* w, double* lam, double* v) noexcept nogil:
-    """Plain Newton steps from the best point, while they gain; z of the walk stays."""
-    cdef int32_t j, _, worse = 0
-    cdef double now, best = w.best
-    for j in range(w.e.m):
-        w.trial[j] = w.best_z[j]
-    for _ in range(POLISH_STEPS):
-        if done(w, s):
-            return
-        times(w, w.trial, w.hz)
-        for j in range(w.e.m):
-            w.s[j] = w.hz[j] - w.e.g[j]
-        natural(&w.e, w.trial, w.s, MAP_AUGMENTED, 1e-9, w.map, w.p, w.einv, w.v)
-        factor(w, s)
-        for j in range(w.e.m):
-            w.map[j] = -w.map[j]
-        refined(w, w.map, w.dz, w.s, w.hdz)
-        for j in range(w.e.m):
-            w.trial[j] += w.dz[j]
-        if not all_finite(w.trial, w.e.m):
-            return
-        now = score(p, r, s, w, w.trial, lam, v)
-        if now > 1e3 * best:
-            return
-        worse = 0 if now < 0.5 * best else worse + 1
-        best = now if now < best else best
-        if worse >= 2:
-            return
-
-
 cdef inline double size_at(walk_t* w, double t, double alpha) noexcept nogil:
     """|F_c| at trial = z + t dz."""
     cdef int32_t j
@@ -467,16 +411,10 @@ cdef inline void walk(const blocks_t* p, const rows_t* r, warm_t* s, walk_t* w, 
                       double* v) noexcept nogil:
     """Rounds from z until the judge is content, `limit` factorisations are spent, or nothing moves."""
     cdef int32_t begun, used, solved, failures = 0, idle = 0, free = 0
-    cdef double before, slowest = 0.1, probed = 1e-2, fall
+    cdef double before, slowest = 0.1, fall
     w.last = s.factorisations + limit
     score(p, r, s, w, w.z, lam, v)
     while not done(w, s):
-        if w.best < probed and alpha > 1e-7:
-            # Near enough, plain Newton steps may end it: asked once for each decade.
-            polish(p, r, s, w, lam, v)
-            probed = 0.1 * w.best
-            if done(w, s):
-                return
         before = w.best
         begun = s.factorisations
         solved = walk_round(p, r, s, w, alpha, lam, v)

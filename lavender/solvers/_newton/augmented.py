@@ -23,7 +23,6 @@ import scipy.sparse as sp
 from lavender._arrays import FloatArray
 from lavender._lu import sparse_lu
 from lavender.solvers._newton.interior_point import InteriorPoint
-from lavender.solvers._newton.polish import polish
 from lavender.solvers._newton.row_steps import refined
 from lavender.solvers._newton.run import Run
 from lavender.solvers._newton.systems import CONVEX, System, VelocitySystem
@@ -161,7 +160,7 @@ def solve_augmented(run: Run) -> None:
 
 
 def advance(run: Run, ip: InteriorPoint, law: int, name: str) -> tuple[float, FloatArray]:
-    """Steps and Newton steps of `law` until the judge is content or they get nowhere.
+    """Steps, and Newton steps of `law` through (1), until the judge is content or they get nowhere.
 
     Returns the lowest relative residual of the steps, and its z.
     """
@@ -178,8 +177,6 @@ def advance(run: Run, ip: InteriorPoint, law: int, name: str) -> tuple[float, Fl
             near = 0.1 * relative
             if isinstance(ip.system, AugmentedSystem):
                 polish_augmented(run, ip.z.copy(), law, patience=2, limit=4)
-            else:
-                polish(run, ip.z.copy(), law, patience=1, limit=4)
             if run.at_floor():
                 break
         short = short + 1 if ip.length < SHORT else 0

@@ -1,4 +1,4 @@
-"""Bounded rows and the convex cone law: interior point and polish, and what follows where those stop short.
+"""Bounded rows and the convex cone law: exchanges, interior points, and what follows where those stop short.
 
 Rows that nearly depend on each other are asked through the augmented system (`_newton/augmented.py`); proximal
 rounds end it, or find the certificate that there is no solution.
@@ -11,7 +11,7 @@ import numpy as np
 from lavender._arrays import FloatArray
 from lavender.solvers._newton.augmented import WORTH, solve_augmented
 from lavender.solvers._newton.interior_point import InteriorPoint
-from lavender.solvers._newton.polish import exchange, polish
+from lavender.solvers._newton.polish import exchange
 from lavender.solvers._newton.proximal import Proximal
 from lavender.solvers._newton.run import Run
 from lavender.solvers._newton.systems import DELTA
@@ -32,10 +32,7 @@ def solve_convex(run: Run, z: FloatArray, cold: bool) -> None:
     """Rows: exchanges from the warm start and from H z = g. Cones, and what that leaves: interior points."""
     system = run.system
     if len(system.sc.kind) < system.sc.m:
-        if not cold:
-            polish(run, z, patience=1)
-        if not run.done():
-            _solve_cones(run)
+        _solve_cones(run)
         return
     try:
         if not cold:
@@ -68,7 +65,7 @@ def _exchange(run: Run, z: FloatArray) -> None:
 
 
 def _solve_cones(run: Run) -> None:
-    """An interior point and its polish."""
+    """Interior points."""
     system = run.system
     symmetric = system.sc.problem.is_symmetric
     for delta in (CONE_DELTA, DELTA):
@@ -157,4 +154,4 @@ def _interior(run: Run, ip: InteriorPoint, rows: bool) -> None:
         if lowest < run.best:
             run.score(kept)
     if not rows and lowest < CLOSE and not run.done() and not run.at_floor():
-        Proximal(kept.copy(), alpha=min(1e-4, lowest), probed=0.0).advance(run, 12)
+        Proximal(kept.copy(), alpha=min(1e-4, lowest)).advance(run, 12)

@@ -1,8 +1,8 @@
 """Newton's method on the natural map: the active-set polish.
 
-    F(z) = z - Pi(z - (H z - g)) = 0,    (I - P + P H) dz = -F,    P in the derivative of Pi
+    F(z) = z - Pi(z - (H z - g)) = 0,    (I - P + P H) dz = -F,    P = 1 on rows inside their bounds, else 0
 
-For bounded rows P is 0 or 1: the identified rows are solved exactly, rows with the wrong sign change
+The identified rows are solved exactly, rows with the wrong sign change
 sides, and so on: the primal-dual active set method (Qi, Sun 1993; Hintermueller, Ito, Kunisch 2002), whose steps are
 exchanges here. Where rows depend on each other it may go round in circles: it is given up where the contraction of the
 number of rows c_k that change their side promises more steps than an interior point takes, or c_k stands still,
@@ -14,46 +14,15 @@ from __future__ import annotations
 
 from math import inf, log
 
-import numpy as np
-
 from lavender._arrays import FloatArray
-from lavender.solvers._newton.row_steps import refined
 from lavender.solvers._newton.run import Run
-from lavender.solvers._newton.systems import CONVEX
 
-__all__ = ["EPS", "exchange", "polish"]
+__all__ = ["STILL", "exchange"]
 
 EPS = 1e-9  # proximal weight of the polish, relative to d; refinement takes it away again
 STEPS = 12  # factorisations of an interior point, as it usually takes
 NEAR = 1e-5  # relative residual from which a step that gains nothing may be at the floor
 STILL = 4  # exchanges in a row after which no fewer rows change than before
-
-
-def polish(run: Run, z: FloatArray, law: int = CONVEX, *, patience: int = 2, limit: int = 12) -> None:
-    """Newton steps from z until the judge is content or `patience` of them gain nothing; rows are exchanged."""
-    system = run.system
-    if law == CONVEX and system.newton is not None:
-        exchange(run, z)
-        return
-    f = np.empty_like(z)
-    worse = 0
-    best = run.score(z)
-    for _ in range(limit):
-        if run.done():
-            return
-        system.natural(z, system.times(z) - system.sc.g, law, EPS, f)
-        system.factor_natural(EPS)
-        run.count("polish steps")
-        z = z + refined(system, -f)
-        if not np.isfinite(z).all():
-            return
-        relative = run.score(z)
-        if relative > 1e3 * best:
-            return
-        worse = 0 if relative < 0.5 * best else worse + 1
-        best = min(best, relative)
-        if worse >= patience or (worse and run.at_floor()):
-            return
 
 
 def exchange(run: Run, z: FloatArray) -> None:

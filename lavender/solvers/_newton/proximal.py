@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from lavender._arrays import FloatArray
-from lavender.solvers._newton.polish import polish
 from lavender.solvers._newton.run import Run
 from lavender.solvers._newton.systems import CONVEX
 
@@ -15,7 +14,6 @@ INNER_STEPS = 20  # Newton steps of one proximal round at most
 INNER_TOL = 0.1  # |F_c| at which a round ends, relative to its start
 MEMORY = 6  # steps that the non-monotone line search looks back
 CERTIFY = 1e-8  # relative residual below which there is a solution
-PROBE = 1e-7  # proximal weight below which a round is as good as a plain Newton step
 FREE = 20  # rounds in a row that cost no factorisation, and so change nothing but the weight
 ALPHA_LOW = 1e-12  # proximal weight below which a factorisation sees none
 
@@ -39,7 +37,6 @@ class Proximal:
     slowest: float = 0.1  # alpha falls at most by this factor; closer to 1 after a failure
     failures: int = 0
     idle: int = 0
-    probed: float = 1e-2
     stuck: bool = False
 
     def advance(self, run: Run, limit: int = 10_000) -> None:
@@ -48,12 +45,6 @@ class Proximal:
         last, free = system.factorisations + limit, 0
         run.score(self.z)
         while not run.done() and not self.stuck and system.factorisations < last:
-            if run.best < self.probed and self.alpha > PROBE:
-                # Near enough, plain Newton steps may end it: asked once for each decade.
-                polish(run, run.best_z.copy(), self.law, limit=4)
-                self.probed = 0.1 * run.best
-                if run.done():
-                    break
             before, start, centre = run.best, system.factorisations, self.z
             solved = self._round(run)
             if self.law == CONVEX and solved and run.best > 0.5 * before and run.best > CERTIFY:
