@@ -333,7 +333,9 @@ def models() -> None:
             for _ in range(20):
                 for i, sim in enumerate(sims):
                     best[i] = min(best[i], least(sim.step, batches=10))
-            cells = (f"{f'{1e6 * t:.1f} ({int(s._state.head[0])})':>16}" for t, s in zip(best, sims, strict=True))
+            cells = (
+                f"{f'{1e6 * t:.1f} ({int(s._state.head[0])})':>16}" for t, s in zip(best, sims, strict=True)
+            )
             print(f"{label:<22}{sweeps:>7}" + "".join(cells))
 
 
