@@ -4,8 +4,8 @@
     v <- v + M^-1 J_i^T (change of lambda_i)
 
 with v = M^-1 J^T lambda, the change of velocity. Equal to `pgs` on the same order, sweep by sweep, to
-rounding; a contact costs the same whatever the number of its neighbours. In a fixed order contacts of two
-tangents are swept in pairs, with the same bits (`lavender_ext/sweep/packed.pxd`).
+rounding; a contact costs the same whatever the number of its neighbours. In a fixed order contacts
+and joints are swept in pairs, with the same bits (`lavender_ext/sweep/packed.pxd`).
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from lavender_ext.sweep import serial
 class ImpulseState(SweepState):
     """A sweep state with v = M^-1 J^T lambda (n + 2, 6), formed once and kept by the sweeps.
 
-    Behind the bodies stand zeros, and what packed contacts write for a static one. A large problem that is swept
+    Behind the bodies stand zeros, and what packed blocks write for a static one. A large problem that is swept
     in an order of its own is written out in that order; the impulse of the sweeps is then `laid`.
     """
 
