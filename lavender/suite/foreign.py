@@ -2,7 +2,7 @@
 
     worlds     table (one body under everything), dome, packing (crowded), scattered (nearly empty), loops (closed
                chains on the floor), cloth (point masses), jelly (soft rows), gripper (many contacts on few bodies)
-    matrices   obstacle (an M-matrix), network (flow with capacities), lowrank (dense), boxed (dense), skew (asymmetric),
+    matrices   obstacle (an M-matrix), network (flow with capacities), lowrank and boxed (dense), skew (asymmetric),
                hand (many contacts on few velocities)
 
 Which structures are for judging was drawn by lot, below, before anything was measured on them: rates and rules are
