@@ -25,7 +25,7 @@ from lavender.redundancy import Redundancy, redundancy
 from lavender.registry import SolverSpec, available, get, known, register
 from lavender.residuals import Residual, residual
 from lavender.rows import Rows
-from lavender.solution import Claim, Solution, Status
+from lavender.solution import Claim, Solution, Status, Turn
 from lavender.solve import prepare, solve
 
 if TYPE_CHECKING:
@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from lavender.io import load
     from lavender.many import solve_many
     from lavender.motion import MotionError, Motions, motion_error, motions
+    from lavender.plan import Plan, explain
     from lavender.scene import Scene
 
 # Public name -> module that holds it; the module itself where both are the same.
@@ -42,6 +43,7 @@ _LATER = {
     "CrossCheck": "lavender.check",
     "MotionError": "lavender.motion",
     "Motions": "lavender.motion",
+    "Plan": "lavender.plan",
     "SOLVER_FIELDS": "lavender.engine",
     "Scene": "lavender.scene",
     "Simulation": "lavender.engine",
@@ -49,6 +51,7 @@ _LATER = {
     "bench": "lavender.bench",
     "cross_check": "lavender.check",
     "engine": "lavender.engine",
+    "explain": "lavender.plan",
     "io": "lavender.io",
     "load": "lavender.io",
     "motion": "lavender.motion",
@@ -76,6 +79,7 @@ __all__ = [
     "LavenderError",
     "MotionError",
     "Motions",
+    "Plan",
     "Problem",
     "Redundancy",
     "Residual",
@@ -88,12 +92,14 @@ __all__ = [
     "SolverSpec",
     "SolverUnavailable",
     "Status",
+    "Turn",
     "UnknownName",
     "__version__",
     "available",
     "bench",
     "cross_check",
     "engine",
+    "explain",
     "get",
     "io",
     "known",

@@ -17,7 +17,7 @@ from lavender.residuals import Residual
 if TYPE_CHECKING:
     from lavender.motion import MotionError
 
-__all__ = ["Claim", "History", "Solution", "SolverRun", "Status"]
+__all__ = ["Claim", "History", "Solution", "SolverRun", "Status", "Turn"]
 
 
 def _fill(made: object, values: dict[str, Any]) -> None:
@@ -43,6 +43,16 @@ class Status(str, Enum):
         return self.name
 
 
+@dataclass(frozen=True)
+class Turn:
+    """What one solver did in one turn of `auto`."""
+
+    solver: str
+    work: Mapping[str, int]  # sweeps, factorisations, pivots, ...
+    before: float  # - least relative residual so far, nan where nobody looked
+    after: float
+
+
 @dataclass(frozen=True, init=False)
 class Claim:
     """What one call of a solver's `run` says of itself."""
@@ -54,6 +64,7 @@ class Claim:
     form: str = ""  # which formulation ran, where there is a choice
     dual: Any = None  # the backend's own multipliers, as it returned them
     certificate: FloatArray | None = None  # (m,), with INFEASIBLE
+    turns: tuple[Turn, ...] = ()  # of a solver that hands over to others
 
     def __init__(
         self,
@@ -64,6 +75,7 @@ class Claim:
         form: str = "",
         dual: Any = None,
         certificate: FloatArray | None = None,
+        turns: tuple[Turn, ...] = (),
     ) -> None:
         _fill(
             self,
@@ -75,6 +87,7 @@ class Claim:
                 "form": form,
                 "dual": dual,
                 "certificate": certificate,
+                "turns": turns,
             },
         )
 
@@ -151,6 +164,7 @@ class Solution:
     dual: Any
     certificate: FloatArray | None  # (m,), with INFEASIBLE
     contradicted: str  # why the judge disagrees with `status`; empty where it does not
+    turns: tuple[Turn, ...]  # of `auto`: who ran, in order, and what came of it; () of other solvers
 
     def __init__(
         self,
@@ -168,6 +182,7 @@ class Solution:
         dual: Any = None,
         certificate: FloatArray | None = None,
         contradicted: str = "",
+        turns: tuple[Turn, ...] = (),
     ) -> None:
         _fill(
             self,
@@ -186,6 +201,7 @@ class Solution:
                 "dual": dual,
                 "certificate": certificate,
                 "contradicted": contradicted,
+                "turns": turns,
             },
         )
 

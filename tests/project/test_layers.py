@@ -25,7 +25,7 @@ LEVELS = [
     {"registry"},
     {"external", "solvers"},
     {"solve"},
-    {"check", "many", "motion", "redundancy"},
+    {"check", "many", "motion", "plan", "redundancy"},
     {"scene"},
     {"engine"},
     {"suite"},
