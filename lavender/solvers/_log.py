@@ -29,11 +29,13 @@ class SolveLog:
 
     def __init__(self, problem: Problem, tol: float, budget: int, deadline: float = np.inf) -> None:
         self.problem, self.tol, self.budget, self.deadline = problem, tol, budget, deadline
+        self.limit = deadline - perf_counter()  # s
         self.best, self.impulse = np.inf, problem.start()  # least relative residual, (m,) N s
         self.turns: list[Turn] = []
         self.work: dict[str, int] = {}
         self.iterations = 0
         self.certificate: FloatArray | None = None  # (m,)
+        self.relaxed: FloatArray | None = None  # (m,) N s, where the relaxation of friction stands
         self.pace = 1.0  # s for each counted ns, times 1e9, as far as a time limit asks for it
         self._w, self._e = np.empty(problem.m), np.empty(problem.m)
 

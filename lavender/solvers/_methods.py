@@ -33,8 +33,11 @@ FIRST, MOST = 16, 64  # sweeps of the first turn at least and at most,
 HOPE = 0.15  # of what the cheapest other costs: so long sweeps go on whatever they promise; and the first turn lasts,
 CHEAP = 0.05  # where FIRST of them cost no more than that share of it: else they have their turn by what they cost
 CLOCK = 0.01  # s between two looks at the clock, as counted
+CLOSEST = 1e-2  # of tol, to which the relaxation is solved where Coulomb's residual has not followed
+SHORT = 2e7  # ns of time left, below which sweeps come before anything is counted,
+LEAST = 1e6  # ns of them at most
 SURE = 4.0  # times its cost, that has to be left for a finite solver to come before any sweep
-SHARE = 0.25  # of the time that is left, between two looks at the clock
+SHARE = 0.7  # of the time that is left, between two looks at the clock
 
 
 class Candidate:
@@ -68,8 +71,8 @@ class Candidate:
         begun = self.spent > 0.0 and not self.again
         setup = 0.0 if begun else self.cost.setup
         n = max(1, int((work - setup) / self.cost.each))
-        if self.log.ends_late(setup + self.cost.each):
-            return 0
+        if self.is_finite and self.log.ends_late(SURE * max(self.cost.total - self.spent * begun, 0.0)):
+            return 0  # what comes of it before its end is seldom worth its time
         return min(n, self.log.left, self.spec.max_iter if self.again else n)
 
     def run(self, work: float, others: float) -> bool:
@@ -111,7 +114,8 @@ class Resumed(Candidate):
     def begin(self) -> None:
         self.solver = self.spec.load()(**METHODS[self.name][1])
         self.state = self.solver.prepare(self.log.problem)
-        self.impulse = self.log.impulse.copy()
+        relaxed = self.log.relaxed if self.name == "nncg" else None
+        self.impulse = (self.log.impulse if relaxed is None else relaxed).copy()
         if hasattr(self.solver, "until"):
             self.solver.until(self.state, self.log.deadline)
 
@@ -125,8 +129,9 @@ class Resumed(Candidate):
             step = min(chunk, n - done)
             began = perf_counter()
             if log.deadline < np.inf:
-                left = 1e9 * (log.deadline - began) / (log.pace * self.cost.each)
-                step = max(1, min(step, int(SHARE * left)))
+                # The first share is one of the whole limit: what Python took before was not for nothing.
+                left = log.limit if log.iterations + done == 0 else log.deadline - began
+                step = max(1, min(step, int(SHARE * 1e9 * left / (log.pace * self.cost.each))))
             last = self.iterate(step)
             done += last.iterations
             for kind, count in last.work.items():
@@ -134,7 +139,10 @@ class Resumed(Candidate):
             if last.status is not Status.MAX_ITERATIONS or last.iterations < step:
                 break
             if log.deadline < np.inf:
-                log.pace = 1e9 * (perf_counter() - began) / (step * self.cost.each)
+                pace = 1e9 * (perf_counter() - began) / (step * self.cost.each)
+                log.pace = (
+                    pace if log.pace == 1.0 else min(pace, log.pace)
+                )  # a pause of the machine tells nothing
         self.close()
         return Claim(last.status, done, work)
 
@@ -194,6 +202,53 @@ class Sweeps(Resumed):
     def promise(self) -> float:
         looks = self.state
         return sweeps_left(looks.last, looks.before, self.relative, self.log.tol) * self.cost.each
+
+
+class Relaxation(Resumed):
+    """Sweeps of the convex relaxation from doing nothing, judged by Coulomb's law."""
+
+    relative = 1.0  # by Coulomb's law, at the last look
+    left = np.inf  # sweeps, by (1)
+
+    def begin(self) -> None:
+        self.solver = self.spec.load()()
+        self.state = self.solver.prepare(self.log.problem.relaxed("cone"))
+        self.impulse = self.log.problem.start()
+        self.tol = self.log.tol
+
+    def iterate(self, n: int) -> Claim:
+        """With looks at Coulomb's residual, which goes on falling with the relaxation's where contacts stick."""
+        log, done, work = self.log, 0, dict[str, int]()
+        while done < n:
+            step = min(max((self.done + done) // 2, FIRST), n - done)
+            claim = self.solver.run(self.state, self.impulse, step, self.tol, None)
+            done += claim.iterations
+            for kind, count in claim.work.items():
+                work[kind] = work.get(kind, 0) + count
+            before, self.relative = self.relative, log.offer(self.impulse)
+            self.left = sweeps_left(claim.iterations, before, self.relative, log.tol)
+            if self.relative <= log.tol or log.late:
+                break
+            if claim.status is Status.CONVERGED and self.tol > CLOSEST * log.tol:
+                self.tol *= 0.1  # solved; Coulomb's residual may follow to a closer one
+            elif claim.status is not Status.MAX_ITERATIONS:
+                return Claim(Status.STALLED, done, work)
+            spent = (self.done + done) * self.cost.each
+            if self.left * self.cost.each > self.others and spent > HOPE * self.others:
+                break
+        self.done += done
+        return Claim(Status.MAX_ITERATIONS, done, work)
+
+    def close(self) -> None:
+        """Offered at each look; `nncg` begins from here."""
+        self.log.relaxed = self.impulse
+
+    def promise(self) -> float:
+        return self.left * self.cost.each
+
+    @property
+    def shown(self) -> str:
+        return "relaxation: anderson"
 
 
 class Velocities(Candidate):
@@ -285,7 +340,9 @@ def _offer(log: SolveLog, impulse: FloatArray) -> None:
         log.offer(impulse)
 
 
-KINDS: dict[str, type[Candidate]] = {"newton": Newton, "direct": Direct, "anderson": Sweeps}
+KINDS: dict[str, type[Candidate]] = {
+    "newton": Newton, "direct": Direct, "anderson": Sweeps, "islands": Islands, "relaxation": Relaxation,
+}  # fmt: skip
 
 
 def make(
@@ -293,9 +350,18 @@ def make(
 ) -> list[Candidate]:
     """The candidates of these names that can run here, in this order; the first turn is set where sweeps have it."""
     found: list[Candidate] = []
+    if log.deadline < np.inf and "anderson" in names and log.ends_late(SHORT):
+        # So that something is there when time is up: to count what the others cost takes as long as many sweeps.
+        sweeps = Sweeps("anderson", log, costs, get("anderson"))
+        sweeps.count()
+        names = tuple(name for name in names if name != "anderson")
+        if sweeps.run(sweeps.cost.setup + min(LEAST, SHARE * 1e9 * log.limit), np.inf):
+            found.append(sweeps)
+        if log.done():
+            return found
     for name in names:
         spec = get(METHODS[name][0])
-        kind = Islands if name == "islands" else KINDS.get(spec.name, Resumed)
+        kind = KINDS.get(name, KINDS.get(spec.name, Resumed))
         if name == "newton" and log.problem.generalized is not None:
             kind = Velocities
         made = kind(name, log, costs, spec)

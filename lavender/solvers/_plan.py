@@ -35,10 +35,10 @@ METHODS: dict[str, tuple[str, dict[str, Any]]] = {
     "newton": ("newton", {}),
     "newton over rows": ("newton", {"form": "impulse"}),
     "admm": ("admm", {}),
-    "islands": (
-        "anderson",
-        {},
-    ),  # each island by itself, in compiled code (`_split.py`): sweeps, pivots or velocities
+    # Of Coulomb's law: its answer is the law's own wherever contacts stick.
+    "relaxation": ("anderson", {}),
+    # Each island by itself, in compiled code (`_split.py`): sweeps, pivots or velocities.
+    "islands": ("anderson", {}),
 }
 _GIVEN = {
     "linear": ("direct", "anderson", "newton"),
@@ -48,7 +48,7 @@ _GIVEN = {
 }
 #: At most four for each law and operator; "round": cones of more than two tangents.
 TABLE: dict[str, dict[str, tuple[str, ...]]] = {
-    "rows": _GIVEN,
+    "rows": _GIVEN | {"coulomb": ("anderson", "newton", "nncg", "relaxation")},
     "matrix": _GIVEN,
     "generalized": {
         "linear": ("newton", "direct", "anderson", "newton over rows"),
@@ -213,6 +213,8 @@ class Costs:
             return self._finite("newton", s.newton_least)
         if name == "newton over rows":
             return self._finite("newton", s.newton_least)
+        if name == "relaxation":
+            return self._relaxation()
         if name == "islands":
             whole = self.of("anderson")
             return Cost(whole.setup, whole.each, 0.5 * whole.count)
@@ -230,6 +232,8 @@ class Costs:
             return Cost(a["start"], each * (1.0 if name == "anderson" else BOTH_WAYS), count)
         if name == "direct":
             return self._finite("direct", s.direct)
+        if name == "relaxation":
+            return self._relaxation() if s.is_loose else Cost(inf, 1.0, 1.0)
         if name == "islands":
             # The others have ended while sweeps of the whole go on for the one that needs most of them.
             if not s.divides:
@@ -248,6 +252,10 @@ class Costs:
                 v["start"], v["entry"] * s.sweep + v["work"] * s.velocities, _of(v["count"], law) * s.steps
             )
         return self._finite("newton", s.newton)
+
+    def _relaxation(self) -> Cost:
+        a, s = self.rates["anderson"], self.structure
+        return Cost(a["start"], a["row"] * s.m + a["work"]["cone"] * s.sweep, self.decades * a["count"])
 
     def _finite(self, name: str, factor: float) -> Cost:
         r, s = self.rates[name], self.structure

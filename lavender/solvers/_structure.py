@@ -78,6 +78,14 @@ class Structure:
         rows = np.bincount(self.islands[1], weights=np.diff(self.problem.cones.ptr))
         return float(rows.max() / self.m)
 
+    @cached_property
+    def is_loose(self) -> bool:
+        """Nearly every contact between two bodies of its own, not one of a face: sweeps then settle which stick."""
+        p = self.problem
+        if p.rows is None or not p.rows.n_bodies:
+            return False
+        return 4 * graph.body_pairs(block_bodies(p), p.rows.n_bodies, True) > 3 * p.n_blocks
+
     @property
     def divides(self) -> bool:
         """No island has more than half of the rows, and some have more than a block, which a sweep solves."""

@@ -332,7 +332,7 @@ def test_a_crowd_goes_island_by_island_and_says_so(form, law):
     problem = problem if form == "rows" else as_matrix(problem)
     solution = lv.solve(problem, "auto", tol=1e-7)
     assert solution.success
-    if form == "rows":
+    if (form, law) == ("rows", "cone"):
         assert " islands " in solution.message and "anderson" in solution.message, solution.message
     again = lv.solve(problem, "auto", tol=1e-7)
     assert again.impulse.tobytes() == solution.impulse.tobytes()
@@ -340,7 +340,7 @@ def test_a_crowd_goes_island_by_island_and_says_so(form, law):
 
 
 def test_an_interrupt_and_a_deadline_keep_what_is_solved(monkeypatch):
-    problem = crowd(400)
+    problem = crowd(400, "cone")
     calls = []
 
     class Slow:
