@@ -19,7 +19,7 @@ from lavender.problem import Problem
 from lavender.residuals import judged
 from lavender.solvers import _split
 from lavender.solvers._islands import islands
-from lavender.solvers._trail import Trail
+from lavender.solvers._log import SolveLog
 
 
 def stacks(
@@ -78,10 +78,10 @@ def fresh(problem: Problem) -> Problem:
 def beyond(problem: Problem, repeats: int) -> float:
     """Of one island [s]: laid out, compared, its start judged to be a solution, and put back."""
     answer = lv.solve(problem, tol=1e-9).impulse
-    trail = Trail(problem, 1e-3, np.inf)
-    trail.offer(answer)
+    log = SolveLog(problem, 1e-3, 10**6)
+    log.offer(answer)
     count, label = islands(problem)
-    options = _split.asked(trail, np.inf, 10_000, 1e3)
+    options = _split.asked(log, np.inf, 10_000, 1e3)
     wanted = np.ones(count, np.int32)
     matrix = problem.csr_data if options[5] and problem.rows is not None else None
     prepared = _split.gauss_seidel.prepare(problem.metric) if problem.law == "cone" else None

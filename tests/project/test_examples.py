@@ -30,6 +30,7 @@ def example(name):
         "jacobi",
         "residual_or_motion",
         "two_motions",
+        "turns_of_auto",
     ],
 )
 def test_prints_its_numbers_and_saves_its_figure(name, tmp_path, capsys):
@@ -229,3 +230,12 @@ def test_drift_follows_the_motion_error_over_runs(tmp_path):
     assert all(value > 0.8 for value in module.ranks(found).values())
     by = {(run["sweeps"], run["order"], run["warm"]): run for run in found}
     assert by[4, "bottom_up", False]["drift"][-1] > 10 * by[64, "bottom_up", True]["drift"][-1]
+
+
+def test_turns_of_auto_meet_and_the_last_one_ends_it(tmp_path):
+    shown = example("turns_of_auto")
+    solution = shown.main(str(tmp_path / "figure.png"))
+    assert solution.success and len(solution.turns) > 1
+    for one, other in itertools.pairwise(solution.turns):
+        assert one.after == other.before  # the least so far
+    assert solution.turns[-1].after <= shown.TOL < solution.turns[-1].before
