@@ -21,6 +21,7 @@ from lavender.bench.curves import LEVELS, Curve
 from lavender.bench.regret import SHIFT
 from lavender.bench.replay import replayed
 from lavender.problem import Problem
+from lavender.registry import FEW
 from lavender.solvers._structure import Structure
 
 __all__ = ["LEAST", "count_rates", "fit", "regret"]
@@ -29,7 +30,7 @@ LEAST = 30  # problems that a rate stands on at least
 LEVEL = 1e-6  # that counts are for
 POINTS = 5  # of a curve, that are fitted at most
 ROUNDS, FACTORS = 2, (0.4, 0.6, 0.8, 1.25, 1.6, 2.5, 4.0)  # of the search for counts
-KEPT = 0.01  # of the square of a count's distance from the median, in the logarithm
+KEPT = 0.1  # of the square of a count's distance from the median, in the logarithm
 LOST = 100.0  # times the best, that a solve which does not end counts for
 KINDS = {
     "rows": ("linear", "lcp"),
@@ -49,7 +50,8 @@ def fit(curves: Iterable[Curve], problem_of: Callable[[str], Problem]) -> dict[s
     """
     found: dict[str, dict[str, Curve]] = {}
     for curve in curves:
-        found.setdefault(curve.case, {})[curve.candidate] = curve
+        if curve.rows > FEW:  # others are mostly solved in one compiled call
+            found.setdefault(curve.case, {})[curve.candidate] = curve
     structures = {case: Structure(problem_of(case)) for case in found}
 
     def of(*names: str) -> list[tuple[Structure, Curve]]:
@@ -74,10 +76,10 @@ def fit(curves: Iterable[Curve], problem_of: Callable[[str], Problem]) -> dict[s
     rates["direct"] = {"start": start, "row": row, "work": one}
     rates["formed"] = formed
     newton = [(s, c) for s, c in of("newton", "newton over rows") if _is_over_rows(s, c)]
-    start, row, *work = _least_squares(
-        newton, lambda s, n: [1.0, n * s.m, *given(s, n * s.newton)], lambda s: formed * s.formed
+    start, one, *row = _least_squares(
+        newton, lambda s, n: [1.0, n * s.newton, *given(s, n * s.m)], lambda s: formed * s.formed
     )
-    rates["newton"] = {"start": start, "row": row, "work": dict(zip(KINDS, work, strict=True))}
+    rates["newton"] = {"start": start, "row": dict(zip(KINDS, row, strict=True)), "work": one}
     steps = [(s, c) for s, c in of("newton over velocities") if s.kernel is not None]
     start, entry, one = _least_squares(steps, lambda s, n: [1.0, n * s.sweep, n * s.velocities])
     rates["velocities"] = {"start": start, "entry": entry, "work": one}
@@ -93,11 +95,17 @@ def fit(curves: Iterable[Curve], problem_of: Callable[[str], Problem]) -> dict[s
         "admm": split,
     }
     for name, part in chosen.items():
-        ended = [n for n in (c.iterations(LEVEL) for _, c in part) if math.isfinite(n)]
-        middle = max(1.0, float(np.median(ended)))
-        split_up = name in ("newton", "velocities")
-        rates[name] = rates[name] | {"count": dict.fromkeys(KINDS, middle) if split_up else middle}
+        kinds = {kind: [x for x in part if x[0].problem.law in laws] for kind, laws in KINDS.items()}
+        whole = _middle(part)
+        by_kind = {kind: _middle(those) if len(those) >= LEAST else whole for kind, those in kinds.items()}
+        rates[name] = rates[name] | {"count": by_kind if name in ("newton", "velocities") else whole}
     return _counted(rates, [(structures[case], made) for case, made in found.items()])
+
+
+def _middle(part: list[tuple[Structure, Curve]]) -> float:
+    """Iterations to LEVEL, the median of those that end."""
+    ended = [n for n in (curve.iterations(LEVEL) for _, curve in part) if math.isfinite(n)]
+    return max(1.0, float(np.median(ended)))
 
 
 def _is_over_rows(s: Structure, curve: Curve) -> bool:

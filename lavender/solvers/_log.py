@@ -18,10 +18,8 @@ from lavender.solvers._islands import islands
 __all__ = ["SolveLog"]
 
 CAUTION = 0.999  # of what is left of the tolerance: sums are rounded
-STILL, GAIN = (
-    8,
-    0.99,
-)  # turns in a row, most twice as long as the one before, that leave such a share: nobody gets anywhere
+STILL = 24  # turns in a row, most of them longer than those before, that leave
+GAIN = 0.99  # of the residual: then nobody gets anywhere
 
 
 class SolveLog:
@@ -35,7 +33,6 @@ class SolveLog:
         self.work: dict[str, int] = {}
         self.iterations = 0
         self.certificate: FloatArray | None = None  # (m,)
-        self.relaxed: FloatArray | None = None  # (m,) N s, where the relaxation of friction stands
         self.pace = 1.0  # s for each counted ns, times 1e9, as far as a time limit asks for it
         self._w, self._e = np.empty(problem.m), np.empty(problem.m)
 

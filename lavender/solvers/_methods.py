@@ -5,6 +5,7 @@ rest = n log(now / tol) / log(before / now)         sweeps left, by the contract
 
 from __future__ import annotations
 
+from dataclasses import replace
 from time import perf_counter
 from typing import Any
 
@@ -18,7 +19,7 @@ from lavender.solvers._accelerated import operator
 from lavender.solvers._few import WARM
 from lavender.solvers._log import SolveLog
 from lavender.solvers._newton import general
-from lavender.solvers._plan import METHODS, Cost, Costs
+from lavender.solvers._plan import BOTH_WAYS, METHODS, Cost, Costs
 from lavender.solvers._schedule import AGAIN, GIVEN_UP, remainder
 from lavender.solvers._split import solve_together
 from lavender.solvers._sweeping import STATUS
@@ -114,8 +115,7 @@ class Resumed(Candidate):
     def begin(self) -> None:
         self.solver = self.spec.load()(**METHODS[self.name][1])
         self.state = self.solver.prepare(self.log.problem)
-        relaxed = self.log.relaxed if self.name == "nncg" else None
-        self.impulse = (self.log.impulse if relaxed is None else relaxed).copy()
+        self.impulse = self.log.impulse.copy()
         if hasattr(self.solver, "until"):
             self.solver.until(self.state, self.log.deadline)
 
@@ -205,10 +205,11 @@ class Sweeps(Resumed):
 
 
 class Relaxation(Resumed):
-    """Sweeps of the convex relaxation from doing nothing, judged by Coulomb's law."""
+    """Sweeps of the convex relaxation from doing nothing, judged by Coulomb's law; from where these stand `nncg`."""
 
     relative = 1.0  # by Coulomb's law, at the last look
     left = np.inf  # sweeps, by (1)
+    slow = False  # the relaxation is not the answer, or not soon
 
     def begin(self) -> None:
         self.solver = self.spec.load()()
@@ -216,12 +217,25 @@ class Relaxation(Resumed):
         self.impulse = self.log.problem.start()
         self.tol = self.log.tol
 
+    def turn(self, n: int) -> Claim:
+        if self.slow and self.name == self.shown_by:
+            self.shown_by = "nncg"
+            self.solver = get("nncg").load()(**METHODS["nncg"][1])
+            self.state = self.solver.prepare(self.log.problem)
+        if self.slow:
+            n = max(1, n // int(BOTH_WAYS))
+        claim = super().turn(n)
+        return replace(claim, iterations=int(BOTH_WAYS) * claim.iterations) if self.slow else claim
+
+    shown_by = "relaxation"
+
     def iterate(self, n: int) -> Claim:
         """With looks at Coulomb's residual, which goes on falling with the relaxation's where contacts stick."""
         log, done, work = self.log, 0, dict[str, int]()
+        follows = self.shown_by == "nncg"
         while done < n:
             step = min(max((self.done + done) // 2, FIRST), n - done)
-            claim = self.solver.run(self.state, self.impulse, step, self.tol, None)
+            claim = self.solver.run(self.state, self.impulse, step, log.tol if follows else self.tol, None)
             done += claim.iterations
             for kind, count in claim.work.items():
                 work[kind] = work.get(kind, 0) + count
@@ -229,10 +243,12 @@ class Relaxation(Resumed):
             self.left = sweeps_left(claim.iterations, before, self.relative, log.tol)
             if self.relative <= log.tol or log.late:
                 break
-            if claim.status is Status.CONVERGED and self.tol > CLOSEST * log.tol:
+            if claim.status is Status.CONVERGED and not follows and self.tol > CLOSEST * log.tol:
                 self.tol *= 0.1  # solved; Coulomb's residual may follow to a closer one
             elif claim.status is not Status.MAX_ITERATIONS:
-                return Claim(Status.STALLED, done, work)
+                if follows:
+                    return Claim(Status.STALLED, done, work)
+                break
             spent = (self.done + done) * self.cost.each
             if self.left * self.cost.each > self.others and spent > HOPE * self.others:
                 break
@@ -240,15 +256,15 @@ class Relaxation(Resumed):
         return Claim(Status.MAX_ITERATIONS, done, work)
 
     def close(self) -> None:
-        """Offered at each look; `nncg` begins from here."""
-        self.log.relaxed = self.impulse
+        """Offered at each look; where the relaxation brought no end, the next turn is of another kind."""
+        self.slow = True
 
     def promise(self) -> float:
-        return self.left * self.cost.each
+        return self.left * self.cost.each if self.shown_by == "nncg" else 0.0
 
     @property
     def shown(self) -> str:
-        return "relaxation: anderson"
+        return "relaxation: anderson" if self.shown_by == "relaxation" else "nncg"
 
 
 class Velocities(Candidate):

@@ -48,7 +48,7 @@ _GIVEN = {
 }
 #: At most four for each law and operator; "round": cones of more than two tangents.
 TABLE: dict[str, dict[str, tuple[str, ...]]] = {
-    "rows": _GIVEN | {"coulomb": ("anderson", "newton", "nncg", "relaxation")},
+    "rows": _GIVEN | {"coulomb": ("anderson", "newton", "islands", "relaxation")},
     "matrix": _GIVEN,
     "generalized": {
         "linear": ("newton", "direct", "anderson", "newton over rows"),
@@ -59,6 +59,7 @@ TABLE: dict[str, dict[str, tuple[str, ...]]] = {
     },
 }
 BOTH_WAYS = 2.0  # sweeps of an iteration in the symmetric order
+SPARED = 0.25  # of the sweeps of the whole, that small islands take when each goes on for itself
 SIXTH = 6.0  # decades that counts of sweeps are fitted for
 
 
@@ -217,7 +218,7 @@ class Costs:
             return self._relaxation()
         if name == "islands":
             whole = self.of("anderson")
-            return Cost(whole.setup, whole.each, 0.5 * whole.count)
+            return Cost(whole.setup, whole.each, SPARED * whole.count)
         return self.of(name)
 
     def of(self, name: str) -> Cost:
@@ -238,7 +239,7 @@ class Costs:
             # The others have ended while sweeps of the whole go on for the one that needs most of them.
             if not s.divides:
                 return Cost(inf, 1.0, 1.0)
-            whole, share = self.of("anderson"), 0.5 * (1.0 + s.largest)
+            whole, share = self.of("anderson"), SPARED + (1.0 - SPARED) * s.largest
             return Cost(whole.setup, whole.each, share * whole.count)
         if name == "admm":
             a, (factored, fill) = r["admm"], s.admm(1.0)
@@ -263,7 +264,7 @@ class Costs:
         count = (
             1.0 if name == "direct" and self.problem.law == "linear" else _of(r["count"], self.problem.law)
         )
-        return Cost(setup, r["row"] * s.m + _of(r["work"], self.problem.law) * factor, count)
+        return Cost(setup, _of(r["row"], self.problem.law) * s.m + r["work"] * factor, count)
 
 
 def _of(rate: Any, law: str) -> float:
@@ -282,6 +283,8 @@ def candidates(structure: Structure) -> tuple[str, ...]:
 
 def made(problem: Problem, tol: float) -> Plan:
     """The plan of a problem to `tol`, counted in full; nothing is run."""
+    from lavender.solvers._few import FEW_GENERAL
+    from lavender.solvers._gates import general_first
     from lavender.solvers._log import SolveLog
     from lavender.solvers._methods import make
     from lavender.solvers._schedule import first
@@ -290,8 +293,12 @@ def made(problem: Problem, tol: float) -> Plan:
     methods = make(SolveLog(problem, tol, 2**31 - 1), costs, candidates(costs.structure))
     chosen = first(methods)
     counted = sorted(((m.name, costs.of(m.name)) for m in methods), key=lambda pair: pair[1].total)
+    kernel = costs.structure.kernel
+    over_velocities = (
+        kernel is not None and problem.m <= FEW_GENERAL and general_first(problem, kernel.largest)
+    )
     return Plan(
         rows=problem.m, law=problem.law, operator=problem.operator, structure=structure_of(problem), tol=tol,
-        small=problem.m <= FEW, first=(chosen.name, chosen.steps(chosen.rest)),
+        small=problem.m <= FEW or over_velocities, first=(chosen.name, chosen.steps(chosen.rest)),
         candidates=tuple((name, cost) for name, cost in counted if cost.total < inf),
     )  # fmt: skip

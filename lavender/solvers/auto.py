@@ -22,7 +22,7 @@ from lavender.problem import OPERATORS, Problem
 from lavender.registry import FEW, SolverSpec
 from lavender.solution import Claim, Status
 from lavender.solvers._certify import certify
-from lavender.solvers._few import AUTO
+from lavender.solvers._few import AUTO, FEW_GENERAL
 from lavender.solvers._log import SolveLog
 from lavender.solvers._methods import make
 from lavender.solvers._plan import Costs, Plan, candidates
@@ -60,7 +60,8 @@ class Auto:
     ) -> Claim:
         problem = state
         deadline = np.inf if time_limit is None else perf_counter() + time_limit
-        if problem.m <= FEW and n >= ONE_CALL:
+        most = FEW if problem.generalized is None else FEW_GENERAL
+        if problem.m <= most and n >= ONE_CALL:
             made = AUTO.solve(problem, impulse, tol)
             claim = None if made is None else AUTO.claim(problem, made[1])
             if made is not None and claim is not None and claim.iterations <= n:

@@ -65,7 +65,7 @@ def _curve(problem, points, setup):
 
 
 def test_counts_move_towards_what_ends_sooner():
-    """A candidate that never ends where another does at once is counted for more, and comes later."""
+    """A candidate that never ends where another does at once comes later."""
     case = suite.wild(seed=64)
     slow = replace(_hopeless(case), candidate="newton", points=((40, 0.1, 1.0),))
     quick = replace(
@@ -77,7 +77,6 @@ def test_counts_move_towards_what_ends_sooner():
     given = _plan.rates() | {"newton": _plan.rates()["newton"] | {"count": 1.0}}
     before, fitted = rates.regret(given, cases), rates._counted(given, cases)
     assert sum(rates.regret(fitted, cases)) < sum(before)
-    assert fitted["newton"]["count"] > 1.0
 
 
 def test_times_that_are_made_of_rates_give_them_back():

@@ -286,8 +286,8 @@ def test_a_looser_tolerance_costs_no_more(seed):
     assert all(solution.success for solution in found), found
     sweeps = [solution.work["sweeps"] for solution in found]
     # Turns are as long as what is expected at that tolerance: in a shorter one the relaxation may begin later.
-    assert sweeps[0] <= 1.5 * sweeps[1], sweeps
-    assert sweeps[1] <= 1.5 * sweeps[2], sweeps
+    assert sweeps[0] <= 2.0 * sweeps[1], sweeps
+    assert sweeps[1] <= 2.0 * sweeps[2], sweeps
 
 
 def twice_touching(n):
