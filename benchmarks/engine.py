@@ -331,16 +331,9 @@ def models() -> None:
             for _ in range(20):
                 for i, sim in enumerate(sims):
                     best[i] = min(best[i], least(sim.step, batches=10))
-<<<<<<< HEAD:benchmarks/engine.py
             cells = (f"{1e6 * t:.1f} ({int(s._state.head[0])})" for t, s in zip(best, sims, strict=True))
             rows.append((label, sweeps, *cells, *[""] * (len(MODELS) - len(sims))))
     click.echo(markdown(("µs a step (contacts)", "sweeps", *MODELS), rows))
-=======
-            cells = (
-                f"{f'{1e6 * t:.1f} ({int(s._state.head[0])})':>16}" for t, s in zip(best, sims, strict=True)
-            )
-            print(f"{label:<22}{sweeps:>7}" + "".join(cells))
->>>>>>> c8865ac46e00f85baa44d33828314fb383cef0c8:benchmarks/bench_engine.py
 
 
 ENGINES: dict[str, Callable[[str, int], Row]] = {

@@ -27,7 +27,7 @@ from lavender.redundancy import Redundancy, redundancy
 from lavender.registry import SolverSpec, available, get, known, register
 from lavender.residuals import Residual, residual
 from lavender.rows import Rows
-from lavender.solution import Claim, Solution, Status
+from lavender.solution import Claim, Solution, Status, Turn
 from lavender.solve import prepare, solve
 
 if TYPE_CHECKING:
@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from lavender.io import load
     from lavender.many import solve_many
     from lavender.motion import MotionError, Motions, motion_error, motions
+    from lavender.plan import Plan, explain
     from lavender.scene import Scene
     from lavender.suspicions import Suspicion, diagnose
 
@@ -45,6 +46,7 @@ _LATER = {
     "CrossCheck": "lavender.check",
     "MotionError": "lavender.motion",
     "Motions": "lavender.motion",
+    "Plan": "lavender.plan",
     "SOLVER_FIELDS": "lavender.engine",
     "Scene": "lavender.scene",
     "Simulation": "lavender.engine",
@@ -54,6 +56,7 @@ _LATER = {
     "cross_check": "lavender.check",
     "diagnose": "lavender.suspicions",
     "engine": "lavender.engine",
+    "explain": "lavender.plan",
     "io": "lavender.io",
     "load": "lavender.io",
     "motion": "lavender.motion",
@@ -81,6 +84,7 @@ __all__ = [
     "LavenderError",
     "MotionError",
     "Motions",
+    "Plan",
     "Problem",
     "Redundancy",
     "Residual",
@@ -94,6 +98,7 @@ __all__ = [
     "SolverUnavailable",
     "Status",
     "Suspicion",
+    "Turn",
     "UnknownName",
     "__version__",
     "available",
@@ -101,6 +106,7 @@ __all__ = [
     "cross_check",
     "diagnose",
     "engine",
+    "explain",
     "get",
     "io",
     "known",

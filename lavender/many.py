@@ -118,4 +118,4 @@ def _batch(
     work = Batch(views, given, tol, GATE if spec.name == "auto" else ANY, general.ROOM)
     work.run()
     seconds = (perf_counter() - begin) / max(1, len(at))
-    work.hand_out(Solution, of_batch, (work, [problems[i] for i in at], spec, tol, seconds), at, made)
+    work.hand_out(Solution, of_batch, (work, [problems[i] for i in at], spec, tol, seconds, given), at, made)

@@ -26,7 +26,7 @@ from typing import Any, Protocol
 from lavender._arrays import FloatArray
 from lavender.errors import InputError, SolverUnavailable, UnknownName
 from lavender.problem import LAWS, OPERATORS, Problem
-from lavender.solution import Claim
+from lavender.solution import Claim, Turn
 
 __all__ = ["Solver", "SolverSpec", "State", "available", "get", "known", "register"]
 
@@ -44,6 +44,11 @@ class Few(Protocol):
 
     def claim(self, problem: Problem, counts: Any) -> Claim:
         """What counts come to."""
+
+    def turns(
+        self, problem: Problem, claim: Claim, start: FloatArray | None, after: float
+    ) -> tuple[Turn, ...]:
+        """Who ran, from a start (m,) or from none, to the residual `after`; () where one solver did."""
 
 
 class State(Protocol):

@@ -18,7 +18,7 @@ from lavender.residuals import Residual
 if TYPE_CHECKING:
     from lavender.motion import MotionError
 
-__all__ = ["Claim", "History", "Solution", "SolverRun", "Status"]
+__all__ = ["Claim", "History", "Solution", "SolverRun", "Status", "Turn"]
 
 
 def _fill(made: object, values: dict[str, Any]) -> None:
@@ -44,6 +44,16 @@ class Status(str, Enum):
         return self.name
 
 
+@dataclass(frozen=True)
+class Turn:
+    """What one solver did in one turn of `auto`."""
+
+    solver: str
+    work: Mapping[str, int]  # sweeps, factorisations, pivots, ...
+    before: float  # - least relative residual so far, nan where nobody looked
+    after: float
+
+
 @dataclass(frozen=True, init=False)
 class Claim:
     """What one call of a solver's `run` says of itself."""
@@ -55,6 +65,7 @@ class Claim:
     form: str = ""  # which formulation ran, where there is a choice
     dual: Any = None  # the backend's own multipliers, as it returned them
     certificate: FloatArray | None = None  # (m,), with INFEASIBLE
+    turns: tuple[Turn, ...] = ()  # of a solver that hands over to others
 
     def __init__(
         self,
@@ -65,6 +76,7 @@ class Claim:
         form: str = "",
         dual: Any = None,
         certificate: FloatArray | None = None,
+        turns: tuple[Turn, ...] = (),
     ) -> None:
         _fill(
             self,
@@ -76,6 +88,7 @@ class Claim:
                 "form": form,
                 "dual": dual,
                 "certificate": certificate,
+                "turns": turns,
             },
         )
 
@@ -191,6 +204,7 @@ class Solution:
     contradicted: str  # why the judge disagrees with `status`; empty where it does not
     # of the last checks, in which the residual falls tenfold; NaN where it did not fall, or no sweeps were checked
     sweeps_per_decade: float
+    turns: tuple[Turn, ...]  # of `auto`: who ran, in order, and what came of it; () of other solvers
 
     def __init__(
         self,
@@ -209,6 +223,7 @@ class Solution:
         certificate: FloatArray | None = None,
         contradicted: str = "",
         sweeps_per_decade: float = math.nan,
+        turns: tuple[Turn, ...] = (),
     ) -> None:
         _fill(
             self,
@@ -228,6 +243,7 @@ class Solution:
                 "certificate": certificate,
                 "contradicted": contradicted,
                 "sweeps_per_decade": sweeps_per_decade,
+                "turns": turns,
             },
         )
 

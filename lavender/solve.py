@@ -479,28 +479,42 @@ def solve_few(problem: Problem, spec: SolverSpec, impulse: Any, tol: float) -> S
     if found is None:
         return None
     judged, counts = found
-    return late(problem, spec, judged, counts, tol, perf_counter() - start)
+    kept = given if given is None or impulse is None else given.copy()  # the caller may write into his own
+    return late(problem, spec, judged, counts, tol, perf_counter() - start, kept)
 
 
 def late(
-    problem: Problem, spec: SolverSpec, judged: Any, counts: Any, tol: float, seconds: float
+    problem: Problem,
+    spec: SolverSpec,
+    judged: Any,
+    counts: Any,
+    tol: float,
+    seconds: float,
+    given: FloatArray | None,
 ) -> Solution:
-    """A solution that the judge found below tol, in words when somebody asks; `counts` as `spec.few` tells them."""
+    """A solution that the judge found below tol, in words when somebody asks; `counts` as `spec.few` tells them.
+
+    `given`: where it began (m,) [N s], None where from doing nothing.
+    """
     impulse = judged.impulse
     impulse.setflags(write=False)
-    return Solution.late(impulse, CONVERGED, tol, seconds, (_rest, (problem, spec, judged, counts)))
+    return Solution.late(impulse, CONVERGED, tol, seconds, (_rest, (problem, spec, judged, counts, given)))
 
 
-def of_batch(common: tuple[Any, list[Problem], SolverSpec, float, float], i: int) -> dict[str, Any]:
+def of_batch(
+    common: tuple[Any, list[Problem], SolverSpec, float, float, list[Any]], i: int
+) -> dict[str, Any]:
     """All fields of the solution of a `Batch`'s problem i, which converged."""
-    batch, problems, spec, tol, seconds = common
+    batch, problems, spec, tol, seconds, given = common
     problem = problems[i]
     judged, counts = batch.judged(i)
     made = {"impulse": judged.impulse, "status": CONVERGED, "tol": tol, "setup_time": 0.0}
-    return made | {"solve_time": seconds} | _rest(problem, spec, judged, counts)
+    return made | {"solve_time": seconds} | _rest(problem, spec, judged, counts, given[i])
 
 
-def _rest(problem: Problem, spec: SolverSpec, judged: Any, counts: Any) -> dict[str, Any]:
+def _rest(
+    problem: Problem, spec: SolverSpec, judged: Any, counts: Any, given: FloatArray | None
+) -> dict[str, Any]:
     assert spec.few is not None
     claim = spec.few.claim(problem, counts)
     return {
@@ -514,6 +528,7 @@ def _rest(problem: Problem, spec: SolverSpec, judged: Any, counts: Any) -> dict[
         "certificate": None,
         "contradicted": "",
         "sweeps_per_decade": math.nan,
+        "turns": spec.few.turns(problem, claim, given, judged.relative),
     }
 
 
@@ -579,6 +594,7 @@ def finish(
             "certificate": certificate,
             "contradicted": contradicted,
             "sweeps_per_decade": sweeps_per_decade,
+            "turns": claim.turns,
         }
     )
 

@@ -1,71 +1,192 @@
-"""How far each rate of `auto` can move before it chooses another solver.
+"""The rates of `auto` from recorded curves of its candidates: least squares in the logarithm of the time.
 
-A choice is what `auto` would do first on a problem at a level, sweeps or a finite solver, and which finite solver
-it takes for the cheapest. Nothing is solved: choices are comparisons of costs, counted by the
-rates of `lavender/solvers/_rates.py`.
+    log t = log(start + formed E + n (row m + work w))         at points of a curve, n iterations after t        (1)
+    minimise sum log(t_auto / t_best)^2                        over counts, the schedule replayed               (2)
+
+What a call, a row and a multiply-add cost is told by (1). How many iterations to count on, of a candidate that ends
+soon, late or not at all, is told by what the schedule makes of it (2), beginning from medians. No rate stands on fewer
+than LEAST problems.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
+import math
+from collections.abc import Callable, Iterable, Mapping
+from itertools import product
 from typing import Any
 
+import numpy as np
+
+from lavender.bench.curves import LEVELS, Curve
+from lavender.bench.regret import SHIFT
+from lavender.bench.replay import replayed
 from lavender.problem import Problem
-from lavender.solvers import _rates as rates
-from lavender.solvers.auto import begins
+from lavender.registry import FEW
+from lavender.solvers._structure import Structure
 
-__all__ = ["RATES", "Moved", "moved"]
+__all__ = ["LEAST", "count_rates", "fit", "regret"]
 
-RATES = (
-    "SWEEP", "SWEEP_ROW", "SWEEP_START", "LOOK", "ROWS_OF_A", "START", "STEP", "ROW", "NEWTON_ROW", "DENSE",
-    "DENSE_ENTRY", "BAND", "BLOCK", "PANEL", "SPARSE", "SPARSE_ROWS", "FILLED", "FILLED_ENTRY", "FILLED_WORK",
-    "PIVOT", "PIVOT_ENTRY", "GENERAL_START", "GENERAL_ROW", "GENERAL", "ADMM_START", "ADMM_ROW", "ADMM_ENTRY",
-    "ADMM_COUNT", "ADMM_FACTORS", "ADMM_FILL", "DIRECT", "NEWTON", "GENERAL_COUNT", "UNSYMMETRIC", "ASYMMETRIC",
-    "SINGULAR", "SWEEPS", "SWEEPS_REDUNDANT", "FORMED_START", "FORMED", "RUBBED", "FORMED_ROWS",
-)  # fmt: skip
-FACTORS = (1.1, 1.25, 1.5, 2.0, 3.0, 5.0)
-
-
-@dataclass(frozen=True)
-class Moved:
-    """One rate over all problems and levels."""
-
-    rate: str
-    shares: dict[float, float]  # factor, up or down: share of the choices that change with it
-
-    def least(self, share: float = 0.05) -> float:
-        """The least factor, up or down, with which more than `share` of the choices change; inf where none does."""
-        return min((factor for factor, found in self.shares.items() if found > share), default=float("inf"))
+LEAST = 30  # problems that a rate stands on at least
+LEVEL = 1e-6  # that counts are for
+POINTS = 5  # of a curve, that are fitted at most
+ROUNDS, FACTORS = 2, (0.4, 0.6, 0.8, 1.25, 1.6, 2.5, 4.0)  # of the search for counts
+KEPT = 0.1  # of the square of a count's distance from the median, in the logarithm
+LOST = 100.0  # times the best, that a solve which does not end counts for
+KINDS = {
+    "rows": ("linear", "lcp"),
+    "cone": ("cone",),
+    "coulomb": ("coulomb",),
+}  # of laws, as rates tell them apart
+Terms = list[float]
 
 
-def moved(problems: Iterable[Problem], levels: Sequence[float]) -> list[Moved]:
-    """Each rate alone, up and down by each of `FACTORS`; the ones that move choices most, first."""
-    cases = [(problem, level) for problem in problems if problem.m for level in levels]
-    before = [begins(problem, level) for problem, level in cases]
+def fit(curves: Iterable[Curve], problem_of: Callable[[str], Problem]) -> dict[str, Any]:
+    """All rates, as `rates.json` has them.
+
+    Parameters
+    ----------
+    curves : iterable of Curve
+    problem_of : callable (name) -> Problem
+    """
+    found: dict[str, dict[str, Curve]] = {}
+    for curve in curves:
+        if curve.rows > FEW:  # others are mostly solved in one compiled call
+            found.setdefault(curve.case, {})[curve.candidate] = curve
+    structures = {case: Structure(problem_of(case)) for case in found}
+
+    def of(*names: str) -> list[tuple[Structure, Curve]]:
+        return [
+            (structures[case], c)
+            for case, made in found.items()
+            for n, c in made.items()
+            if n in names and c.points
+        ]
+
+    def given(s: Structure, value: float) -> Terms:
+        """The value at the place of the problem's law."""
+        return [value * (s.problem.law in of_laws) for of_laws in KINDS.values()]
+
+    rates: dict[str, Any] = {}
+    sweeps, back = of("anderson"), of("nncg")
+    start, row, *work = _least_squares(sweeps, lambda s, n: [1.0, n * s.m, *given(s, n * s.sweep)])
+    rates["anderson"] = {"start": start, "row": row, "work": dict(zip(KINDS, work, strict=True))}
+    rates["nncg"] = {}
+    finite = of("direct")
+    start, row, one, formed = _least_squares(finite, lambda s, n: [1.0, n * s.m, n * s.direct, s.formed])
+    rates["direct"] = {"start": start, "row": row, "work": one}
+    rates["formed"] = formed
+    newton = [(s, c) for s, c in of("newton", "newton over rows") if _is_over_rows(s, c)]
+    start, one, *row = _least_squares(
+        newton, lambda s, n: [1.0, n * s.newton, *given(s, n * s.m)], lambda s: formed * s.formed
+    )
+    rates["newton"] = {"start": start, "row": dict(zip(KINDS, row, strict=True)), "work": one}
+    steps = [(s, c) for s, c in of("newton over velocities") if s.kernel is not None]
+    start, entry, one = _least_squares(steps, lambda s, n: [1.0, n * s.sweep, n * s.velocities])
+    rates["velocities"] = {"start": start, "entry": entry, "work": one}
+    split = of("admm")
+    start, factor, one = _least_squares(split, lambda s, n: [1.0, *s.admm(n)], lambda s: formed * s.formed)
+    rates["admm"] = {"start": start, "factor": factor, "work": one}
+    chosen = {
+        "anderson": sweeps,
+        "nncg": back,
+        "direct": finite,
+        "newton": newton,
+        "velocities": steps,
+        "admm": split,
+    }
+    for name, part in chosen.items():
+        kinds = {kind: [x for x in part if x[0].problem.law in laws] for kind, laws in KINDS.items()}
+        whole = _middle(part)
+        by_kind = {kind: _middle(those) if len(those) >= LEAST else whole for kind, those in kinds.items()}
+        rates[name] = rates[name] | {"count": by_kind if name in ("newton", "velocities") else whole}
+    return _counted(rates, [(structures[case], made) for case, made in found.items()])
+
+
+def _middle(part: list[tuple[Structure, Curve]]) -> float:
+    """Iterations to LEVEL, the median of those that end."""
+    ended = [n for n in (curve.iterations(LEVEL) for _, curve in part) if math.isfinite(n)]
+    return max(1.0, float(np.median(ended)))
+
+
+def _is_over_rows(s: Structure, curve: Curve) -> bool:
+    return (curve.candidate == "newton") == (s.problem.generalized is None)
+
+
+def _points(curve: Curve) -> list[tuple[int, float, float]]:
+    """Some of a curve, evenly spread."""
+    at = np.unique(np.linspace(0, len(curve.points) - 1, POINTS).round().astype(int))
+    return [curve.points[i] for i in at]
+
+
+def _least_squares(
+    chosen: list[tuple[Structure, Curve]],
+    terms: Callable[[Structure, float], Terms],
+    known: Callable[[Structure], float] = lambda s: 0.0,
+) -> list[float]:
+    """Positive rates by (1), robust: a curve that is far off counts by its distance, not by its square."""
+    from scipy.optimize import least_squares
+
+    if len(chosen) < LEAST:
+        raise ValueError(
+            f"{len(chosen)} curves of {chosen[0][1].candidate if chosen else 'nobody'}: {LEAST} are needed"
+        )
+    x, y, z = [], [], []
+    for s, curve in chosen:
+        for n, t, _ in _points(curve):
+            x.append(terms(s, float(max(n, 1))))
+            y.append(1e9 * t)
+            z.append(known(s))
+    a, time, rest = np.array(x), np.array(y), np.array(z)
+    scale = np.array([np.median(column[column > 0.0]) if (column > 0.0).any() else 1.0 for column in a.T])
+    start = np.log(np.median(time) / scale / a.shape[1])
+    found = least_squares(lambda q: np.log(a @ np.exp(q) + rest + 1.0) - np.log(time), start, loss="soft_l1")
+    return [_round(rate) for rate in np.exp(found.x)]
+
+
+def regret(rates: Mapping[str, Any], cases: list[tuple[Structure, dict[str, Curve]]]) -> list[float]:
+    """log (t + SHIFT) / (t_best + SHIFT) of each case and level that somebody ended, the schedule replayed."""
     found = []
-    for rate in RATES:
-        shares = {}
-        for factor in FACTORS:
-            changed = [False] * len(cases)
-            for by in (factor, 1.0 / factor):
-                with _scaled(rate, by):
-                    for i, (problem, level) in enumerate(cases):
-                        changed[i] = changed[i] or begins(problem, level) != before[i]
-            shares[factor] = sum(changed) / max(1, len(cases))
-        found.append(Moved(rate, shares))
-    return sorted(found, key=lambda m: (-max(m.shares.values()), m.rate))
+    for structure, curves in cases:
+        for level in LEVELS:
+            best = min(curve.time(level) for curve in curves.values())
+            if math.isfinite(best):
+                t = min(replayed(structure, curves, level, rates), LOST * best)
+                found.append(math.log((t + SHIFT) / (best + SHIFT)))
+    return found
 
 
-@contextmanager
-def _scaled(rate: str, factor: float) -> Iterator[None]:
-    given: Any = getattr(rates, rate)
-    if isinstance(given, dict):
-        setattr(rates, rate, {key: factor * value for key, value in given.items()})
-    else:
-        setattr(rates, rate, factor * given)
-    try:
-        yield
-    finally:
-        setattr(rates, rate, given)
+def _counted(rates: dict[str, Any], cases: list[tuple[Structure, dict[str, Curve]]]) -> dict[str, Any]:
+    """(2), one count after the other."""
+
+    def loss(tried: Mapping[str, Any]) -> float:
+        far = [math.log(a / b) for a, b in zip(_all_counts(tried), start, strict=True)]
+        return float(np.mean(np.square(regret(tried, cases))) + KEPT * np.sum(np.square(far)))
+
+    start = _all_counts(rates)
+
+    least = loss(rates)
+    for _ in range(ROUNDS):
+        for name in [name for name in rates if isinstance(rates[name], dict)]:
+            kinds = list(KINDS) if isinstance(rates[name]["count"], dict) else [""]
+            for kind, factor in product(kinds, FACTORS):
+                count = rates[name]["count"]
+                moved = count | {kind: _round(count[kind] * factor)} if kind else _round(count * factor)
+                tried = rates | {name: rates[name] | {"count": moved}}
+                if (now := loss(tried)) < least:
+                    least, rates = now, tried
+    return rates
+
+
+def _all_counts(rates: Mapping[str, Any]) -> list[float]:
+    """Every count, in order."""
+    counts = [part["count"] for part in rates.values() if isinstance(part, Mapping)]
+    return [x for count in counts for x in (count.values() if isinstance(count, Mapping) else [count])]
+
+
+def _round(value: float) -> float:
+    return float(f"{value:.3g}")
+
+
+def count_rates(rates: Mapping[str, Any]) -> int:
+    """How many numbers there are."""
+    return sum(count_rates(value) if isinstance(value, Mapping) else 1 for value in rates.values())

@@ -11,13 +11,14 @@ import click
 
 from lavender.bench import machine
 from lavender.bench.cases import resolve
-from lavender.bench.rates import moved
+from lavender.bench.curves import curves, read, write
+from lavender.bench.rates import count_rates, fit
 from lavender.bench.regret import Regret, regrets, summary
 from lavender.bench.running.campaign import seeds as from_seeds
 from lavender.errors import InputError
 from lavender.io.stored import write_text
 from lavender.problem import Problem
-from lavender.report.regret import rates, table
+from lavender.report.regret import table
 
 __all__ = ["auto"]
 
@@ -44,10 +45,18 @@ __all__ = ["auto"]
     "--out", type=click.Path(path_type=Path), default=None, help="Write every measurement here too, JSON."
 )
 @click.option(
-    "--rates",
-    "only_rates",
-    is_flag=True,
-    help="Time nothing: tell how far each rate can move before choices change.",
+    "--record",
+    "record",
+    type=click.Path(path_type=Path),
+    default=None,
+    help="Record what each candidate does alone, turn by turn, into this file, one curve a line; compare nothing.",
+)
+@click.option(
+    "--fit",
+    "recorded",
+    type=click.Path(path_type=Path, exists=True),
+    multiple=True,
+    help="Fit the rates of auto to recorded curves and print them, or write them to --out; several are read as one.",
 )
 def auto(
     files: tuple[str, ...],
@@ -58,12 +67,23 @@ def auto(
     repeats: int,
     worst: int,
     out: Path | None,
-    only_rates: bool,
+    record: Path | None,
+    recorded: tuple[Path, ...],
 ) -> None:
     """How much slower auto is than the best of our own solvers.
 
     On FILES, or on families of the suite with seeds. Published seeds should be others than those tuned on.
     """
+    for path in (out, record):
+        if path is not None and not path.parent.is_dir():
+            raise InputError(f"{path}: there is no folder {path.parent}")
+    if recorded:
+        found_rates = fit(read(recorded), lambda name: resolve([name])[0].problem)
+        text = json.dumps(found_rates, indent=1) + "\n"
+        click.echo(text if out is None else f"{count_rates(found_rates)} rates written to {out}")
+        if out is not None:
+            out.write_text(text, encoding="utf-8")
+        return
     first, colon, last = seeds.partition(":")
     if not (colon and first.isdecimal() and last.isdecimal() and int(first) < int(last)):
         raise InputError(f"--seeds {seeds!r}: A:B is needed, whole numbers with A < B")
@@ -72,16 +92,15 @@ def auto(
     except ValueError:
         raise InputError(f"--levels {levels!r}: numbers with commas between them are needed") from None
     names = list(files) or from_seeds(families.replace(",", " ").split(), int(last) - int(first), int(first))
-    if out is not None and not out.parent.is_dir():
-        raise InputError(f"--out {out}: there is no folder {out.parent}")
 
     def cases() -> Iterator[tuple[str, str, Problem]]:
         for item in resolve(names):
             yield item.name, item.reason, item.problem
             item.forget()
 
-    if only_rates:
-        click.echo(rates(moved([problem for _, _, problem in cases()], wanted)))
+    if record is not None:
+        count = write(record, curves(cases(), time_limit=limit))
+        click.echo(f"{count} curves of {len(names)} problems written to {record}")
         return
     found: list[Regret] = []
     click.echo(f"{machine.cpu_name()}; {len(names)} problems, {len(wanted)} levels", err=True)

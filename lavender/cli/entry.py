@@ -15,6 +15,7 @@ from lavender.cli.bench import bench
 from lavender.cli.cases import cases
 from lavender.cli.check import check
 from lavender.cli.doctor import doctor
+from lavender.cli.explain import explain
 from lavender.cli.options import EXIT_BAD_INPUT, EXIT_INTERRUPTED
 from lavender.cli.record import record
 from lavender.cli.reference import reference
@@ -34,7 +35,21 @@ def cli() -> None:
     """Constraint solvers of rigid-body simulation: any solver by name, its error in units, its cost."""
 
 
-for _command in (report, bench, check, solve, reference, solvers, cases, run, record, web, view, doctor):
+for _command in (
+    report,
+    bench,
+    check,
+    solve,
+    explain,
+    reference,
+    solvers,
+    cases,
+    run,
+    record,
+    web,
+    view,
+    doctor,
+):
     cli.add_command(_command)
 
 

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from lavender.bench.rates import FACTORS, Moved
 from lavender.bench.regret import SHIFT, Regret, summary
 
-__all__ = ["rates", "table"]
+__all__ = ["table"]
 
 
 def table(found: Sequence[Regret], rows: int = 12) -> str:
@@ -33,11 +32,4 @@ def table(found: Sequence[Regret], rows: int = 12) -> str:
                 f"         {r.reason}",
                 f"         {r.auto_ran[:160]}",
             ]
-    return "\n".join(lines)
-
-
-def rates(found: Sequence[Moved]) -> str:
-    """Share of the choices that each rate changes, by the factor it moves."""
-    lines = ["rate, of the choices that change (%), times" + "".join(f"{f:>7g}" for f in FACTORS)]
-    lines += [f"{m.rate:<43}" + "".join(f"{100.0 * m.shares[f]:>7.1f}" for f in FACTORS) for m in found]
     return "\n".join(lines)

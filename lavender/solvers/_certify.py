@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 
 from lavender._arrays import FloatArray
-from lavender.certificates import check_certificate
 from lavender.problem import Problem
+from lavender.solution import Claim, Status
 from lavender.solvers._islands import blocks_of_each, restrict, rows_of
-from lavender.solvers._trail import Trail
+from lavender.solvers._log import SolveLog
 
 __all__ = ["certify"]
 
@@ -28,39 +28,37 @@ CERTIFICATE_STEPS = 100  # of the simplex method for each row at most
 
 
 @np.errstate(all="ignore")  # what overflows is judged
-def certify(trail: Trail) -> None:
+def certify(log: SolveLog) -> None:
     """Look for a proof that an LCP without upper bounds has no solution, whatever its A."""
-    problem = trail.problem
-    if problem.law not in ("linear", "lcp") or trail.best < 1e-6 or trail.late:
+    problem = log.problem
+    if problem.law not in ("linear", "lcp") or log.best < 1e-6 or log.late:
         return
     asked = 0
-    for part, rows in _parts(trail):
+    for part, rows in _parts(log):
         asked += part.m
-        if asked > CERTIFICATE_ROWS or trail.late:
+        if asked > CERTIFICATE_ROWS or log.late:
             return
         if not _is_open(part):
             continue
-        y = _proof(part, trail.deadline)
-        if not trail.steps or trail.steps[-1] != "linear program for a certificate":
-            trail.steps.append("linear program for a certificate")
-        trail.work["certificates"] = trail.work.get("certificates", 0) + 1
-        if y is None:
-            continue
-        whole = np.zeros(problem.m)
-        whole[rows] = y
-        if check_certificate(problem, whole) is None:
-            trail.certificate = whole
+        y = _proof(part, log.deadline)
+        proof = None
+        if y is not None:
+            proof = np.zeros(problem.m)
+            proof[rows] = y
+        claim = Claim(Status.STALLED, 0, {"certificates": 1}, certificate=proof)
+        log.note("linear program", claim, log.best)
+        if log.certificate is not None:
             return
 
 
-def _parts(trail: Trail) -> Any:
+def _parts(log: SolveLog) -> Any:
     """Islands that are wrong and their rows, the smallest first; all of it where there is one."""
-    problem = trail.problem
-    if trail.islands[0] <= 1:
+    problem = log.problem
+    if log.islands[0] <= 1:
         yield problem, slice(None)
         return
-    blocks = blocks_of_each(*trail.islands)
-    wrong = trail.wrong_islands()[0]
+    blocks = blocks_of_each(*log.islands)
+    wrong = log.wrong_islands()[0]
     for i in sorted(wrong, key=lambda i: len(blocks[i])):
         rows = rows_of(problem, blocks[i])
         yield restrict(problem, blocks[i], rows), rows

@@ -8,23 +8,26 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from math import nan
 from typing import Any
+
+import numpy as np
 
 from lavender._arrays import FloatArray
 from lavender.problem import Problem
 from lavender.registry import FEW
-from lavender.residuals import reference
-from lavender.solution import Claim, Status
+from lavender.residuals import judged, reference
+from lavender.solution import Claim, Status, Turn
 from lavender.solvers import _rates as rates
-from lavender.solvers._counts import general_cost, sweep_cost
-from lavender.solvers._first import (
+from lavender.solvers._counts import sweep_cost
+from lavender.solvers._gates import (
     CARRIED_GATE,
     GENERAL_GATE,
     NO_GATE,
     first_look,
+    general_cost,
     general_first,
     is_carried,
-    joints_before_count,
 )
 from lavender.solvers._newton import general
 from lavender_ext.few.chain import PIVOTS, SWEEPS, VELOCITIES, Chain
@@ -58,7 +61,7 @@ def _make(problem: Problem) -> Chain | None:
         if is_carried(problem):
             return None
         looked = general.looked_at(problem)
-        if looked.crowded and problem.m > FEW and (problem.law == "lcp" or joints_before_count(problem)):
+        if looked.crowded and problem.m > FEW and problem.law in ("linear", "lcp"):
             return None  # sweeps, or `direct`, may be the end before what fills is counted
         kernel = general.prepare(problem) if looked.crowded else looked if looked.fits else None
         if kernel is None:
@@ -116,6 +119,12 @@ class Few:
             return None  # sweeps come before
         return chain.run(impulse, tol, self.looks, WARM, self.looks)
 
+    def turns(
+        self, problem: Problem, claim: Claim, start: FloatArray | None, after: float
+    ) -> tuple[Turn, ...]:
+        """Of `auto`, which hands over."""
+        return turns_of(problem, claim, start, after) if self.looks else ()
+
     def claim(self, problem: Problem, counts: tuple[int, ...] | None) -> Claim:
         """What the solver says of a chain that did so much, word for word."""
         if counts is None:
@@ -150,6 +159,23 @@ class Few:
         done, sweeps, restarts = counts
         work = {"sweeps": sweeps, "restarts": restarts}
         return Claim(Status.CONVERGED, done, work, said("anderson", work))
+
+
+def turns_of(problem: Problem, claim: Claim, start: FloatArray | None, after: float) -> tuple[Turn, ...]:
+    """The turns of `auto` in one compiled call from a start (m,) [N s], or from none, to the residual `after`."""
+    if not claim.work:
+        return ()
+    cold = start is None or np.array_equal(start, problem._start)
+    assert start is not None or cold
+    before = float(problem.metric.start_relative) if cold else judged(problem, start.copy()).relative  # type: ignore
+    names = [part.split()[0] for part in claim.message.split(" -> ")]
+    if len(names) == 1:
+        return (Turn(names[0], dict(claim.work), before, after),)
+    path = int(
+        claim.message.split()[-2]
+    )  # of `lemke`, after exchanges that were stuck; nobody looked between them
+    work = dict(claim.work) | {"pivots": claim.work["pivots"] - path}
+    return Turn(names[0], work, before, nan), Turn(names[1], {"pivots": path}, nan, after)
 
 
 def said(name: str, work: Mapping[str, int]) -> str:

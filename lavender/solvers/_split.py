@@ -12,14 +12,14 @@ import numpy as np
 from lavender._arrays import IntArray
 from lavender.registry import FEW
 from lavender.residuals import reference
+from lavender.solution import Claim, Status
 from lavender.solvers import _rates as rates
 from lavender.solvers._few import WARM
-from lavender.solvers._first import GENERAL_GATE, NO_GATE
+from lavender.solvers._gates import FIRST_LOOK, GENERAL_GATE, NO_GATE
+from lavender.solvers._log import SolveLog
 from lavender.solvers._newton import general
-from lavender.solvers._sweepers import BELIEVED, HOPE
-from lavender.solvers._trail import CLOCK, Trail
 from lavender_ext.core import assemble
-from lavender_ext.few.islands import AT_START, BY_PIVOTS, BY_SWEEPS, BY_VELOCITIES, LEFT, Islands
+from lavender_ext.few.islands import BY_PIVOTS, BY_SWEEPS, BY_VELOCITIES, LEFT, Islands
 from lavender_ext.few.many import Gate
 from lavender_ext.local import gauss_seidel
 
@@ -27,6 +27,9 @@ __all__ = ["solve_together"]
 
 BAND_APART = 1e6  # ns of `direct` on a narrow band of an island, up to which it comes before sweeps
 LARGEST = 2000  # rows of an island that is solved so
+CLOCK = 0.01  # s between two looks at the clock, as counted
+# Sweeps of an island go on whatever they promise for such a share of what else there is, and for so many times that.
+HOPE, BELIEVED = 0.25, 2.0
 # What Newton's method may cost in an island of J and M [ns]: there is no other there.
 GATE = Gate((*GENERAL_GATE[:3], 1e7, 0.0, GENERAL_GATE[5], NO_GATE))
 ENTRIES = 100  # of A for each row, up to which it is formed for pivots where bodies are given
@@ -51,43 +54,43 @@ COUNTS: dict[
 }
 
 
-def asked(trail: Trail, share: float, n: int, each: float) -> tuple[Any, ...]:
+def asked(log: SolveLog, share: float, n: int, each: float) -> tuple[Any, ...]:
     """What `Islands.run` is asked for: n sweeps of an island at most, fewer by what else there is for a row [ns]."""
-    problem = trail.problem
+    problem = log.problem
     law = problem.law
     velocity = reference(problem)[1]
     pivots = law in ("linear", "lcp") and problem.generalized is None
     return (
-        trail.tol, share, trail.tol * velocity, WARM, min(n, 2**31 - 1),
-        pivots and _entries_fit(trail), law == "linear", problem.rows is not None,
+        log.tol, share, log.tol * velocity, WARM, min(n, 2**31 - 1),
+        pivots and _entries_fit(log), law == "linear", problem.rows is not None,
         law != "linear", law == "cone", FEW, rates.NARROW, rates.DIRECT.get(law, 0.0) * rates.BAND, BAND_APART,
-        rates.SWEEP[law], rates.SWEEP_ROW, rates.FIRST_LOOK, each, HOPE, BELIEVED,
+        rates.SWEEP[law], rates.SWEEP_ROW, FIRST_LOOK, each, HOPE, BELIEVED,
     )  # fmt: skip
 
 
-def _entries_fit(trail: Trail) -> bool:
-    problem = trail.problem
+def _entries_fit(log: SolveLog) -> bool:
+    problem = log.problem
     return problem.rows is None or int(assemble.bound(problem.data)[0]) <= ENTRIES * problem.m
 
 
-def takes(trail: Trail) -> bool:
+def takes(log: SolveLog) -> bool:
     """Whether there are islands that may be solved so."""
-    problem = trail.problem
-    return (problem.generalized is not None or not problem.cones.has_round) and trail.islands[0] > 1
+    problem = log.problem
+    return (problem.generalized is not None or not problem.cones.has_round) and log.islands[0] > 1
 
 
-def solve_together(trail: Trail, budget: int, each: float) -> IntArray:
+def solve_together(log: SolveLog, budget: int, each: float) -> IntArray:
     """Solve every small island that misses its share of the tolerance; those that are left, in order.
 
     Sweeps of an island are given up where they cost more than `each` [ns] for each of its rows, as what else there is.
 
-    The trail is offered the impulse and told what ran. Iterations are those of the island that took most: they go on
+    The log is offered the impulse and told what ran. Iterations are those of the island that took most: they go on
     side by side.
     """
-    problem = trail.problem
-    count, label = trail.islands
-    wrong, of_row, share = trail.wrong_islands()
-    if not takes(trail):
+    problem = log.problem
+    count, label = log.islands
+    wrong, of_row, share = log.wrong_islands()
+    if not takes(log):
         return wrong
     small = np.bincount(of_row, minlength=count) <= LARGEST
     if len(problem.metric.empty):
@@ -96,52 +99,41 @@ def solve_together(trail: Trail, budget: int, each: float) -> IntArray:
     wanted[wrong] = small[wrong]
     if not wanted.any():
         return wrong
-    options = asked(trail, share, budget - trail.iterations, each)
+    options = asked(log, share, budget - log.iterations, each)
     pivots = options[5]
     matrix = problem.csr_data if pivots and problem.rows is not None else None
     exact = problem.law == "cone" and problem.generalized is None
     prepared = gauss_seidel.prepare(problem.metric) if exact else None
-    impulse = trail.impulse.copy()
+    impulse, before = log.impulse.copy(), log.best
     work = Islands(problem.metric, matrix, label, wanted, impulse, prepared)
     more, late = True, False
     try:
         while more and not late:  # a cut for Ctrl-C and the clock, which changes no bit
             more = work.run(options, GATE, general.ROOM, 1e9 * CLOCK, impulse)
-            late = trail.late
+            late = log.late
     finally:
         report = work.report()
-        found = trail.offer(impulse)
-        if not found <= trail.best:
+        found = log.offer(impulse)
+        if not found <= log.best:
             # An island that came nearer by its own measure may have moved away by the whole's.
             back = (report[:, 0] == LEFT)[of_row]
-            impulse[back] = trail.impulse[back]
-            found = trail.offer(impulse)
-        if found == trail.best:
-            trail.impulse = impulse  # the worst row may be that of another island
-        _tell(trail, report[(wanted != 0) & (report[:, 0] != LEFT)], count)
+            impulse[back] = log.impulse[back]
+            found = log.offer(impulse)
+        if found == log.best:
+            log.impulse = impulse  # the worst row may be that of another island
+        _tell(log, report[(wanted != 0) & (report[:, 0] != LEFT)], before)
     left: IntArray = wrong[report[wrong, 0] == LEFT]
     return left
 
 
-def _tell(trail: Trail, report: Any, count: int) -> None:
-    parts = []
+def _tell(log: SolveLog, report: Any, before: float) -> None:
     for end, (name, counts) in COUNTS.items():
         rows = report[report[:, 0] == end]
-        if not len(rows):
-            continue
-        own = rows[rows[:, 8] == 0]
-        done = []
-        for what, place, unit in counts:
-            every = unit * rows[:, 1 + place]
-            low, high = int(every.min()), int(every.max())
-            if high:
-                done.append(f"{low} to {high} {what}" if low < high else f"{high} {what}")
-                total = int(unit * own[:, 1 + place].sum(dtype=np.int64))
-                trail.work[what] = trail.work.get(what, 0) + total
-        copies = len(rows) - len(own)
-        text = f"{len(rows)} x {name} {', '.join(done)}" + (f" ({copies} alike)" if copies else "")
-        parts.append(text.replace("1 x ", "", 1) if len(rows) == 1 else text)
-        trail.iterations += int(rows[:, 1].max())
-    solved = int((report[:, 0] != AT_START).sum())
-    if parts:
-        trail.steps.append(f"{solved} of {count} islands: {'; '.join(parts)}")
+        if len(rows):
+            own = rows[rows[:, 8] == 0]  # those that are not like another
+            work = {what: int(unit * own[:, 1 + place].sum(dtype=np.int64)) for what, place, unit in counts}
+            work = {what: count for what, count in work.items() if count}
+            islands = "an island" if len(rows) == 1 else f"{len(rows)} islands"
+            log.note(
+                f"{name} on {islands}", Claim(Status.MAX_ITERATIONS, int(rows[:, 1].max()), work), before
+            )

@@ -26,8 +26,8 @@ from lavender.problem import Problem
 from lavender.registry import SolverSpec
 from lavender.residuals import reference
 from lavender.solution import Claim, Status
+from lavender.solvers import _rates as rates
 from lavender.solvers._accelerated import LARGEST_MEMORY
-from lavender.solvers._counts import formed_cost
 from lavender.solvers._factor import GENERAL_LIMIT, PANELS_WORK, TINY, WIDE
 from lavender.solvers._islands import block_bodies
 from lavender.solvers._newton.pattern import block_pattern
@@ -208,7 +208,10 @@ def _opening(problem: Problem) -> float:
         entries = problem.metric.entries_of_a
     else:
         entries = 24 * problem.m if _is_over_bodies(problem) else int(assemble.bound(problem.data)[0])
-    return _ENTRY * entries + 1e-9 * formed_cost(problem)
+    formed = 0.0
+    if problem.generalized is not None:
+        formed = 1e-9 * (rates.FORMED_START + rates.FORMED * float(problem.metric.entries_of_a))
+    return _ENTRY * entries + formed
 
 
 def _analysed(matrix: sp.csr_array, lu: bool, like: SparsePanels | None = None) -> SparsePanels:

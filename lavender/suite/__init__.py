@@ -30,6 +30,7 @@ from lavender.suite.families import (
     toy_stack,
     two_particles,
 )
+from lavender.suite.foreign import foreign
 from lavender.suite.wild import wild
 
 __all__ = [
@@ -44,6 +45,7 @@ __all__ = [
     "chain",
     "default",
     "families",
+    "foreign",
     "granular",
     "hang",
     "hard",

@@ -69,7 +69,7 @@ def lattice(rng: np.random.Generator, rows: int) -> World:
         grid = grid[rng.random(len(grid)) < 0.9]
     position = grid + np.array([0.0, 0.0, 0.5]) + rng.choice([0.0, 0.02]) * rng.standard_normal(grid.shape)
     pairs = cKDTree(grid).query_pairs(1.01, output_type="ndarray")
-    return World(position, SPHERE).add(_between(position, pairs)).add(_on_floor(position, grid[:, 2] == 0))
+    return World(position, SPHERE).add(between(position, pairs)).add(on_floor(position, grid[:, 2] == 0))
 
 
 def heap(rng: np.random.Generator, rows: int) -> World:
@@ -79,11 +79,11 @@ def heap(rng: np.random.Generator, rows: int) -> World:
     position = rng.uniform(0.0, side, (n, 3))
     reach = side * (9.0 / (4.0 * n)) ** (1 / 3)  # some five neighbours
     pairs = cKDTree(position).query_pairs(reach, output_type="ndarray")
-    contacts = _between(position, pairs[np.lexsort(pairs.T[::-1])] if len(pairs) else pairs)
+    contacts = between(position, pairs[np.lexsort(pairs.T[::-1])] if len(pairs) else pairs)
     contacts.normal += 0.2 * rng.standard_normal(contacts.normal.shape)
     contacts.normal /= np.linalg.norm(contacts.normal, axis=1, keepdims=True)
     low = position[:, 2] <= np.partition(position[:, 2], n // 5)[n // 5]
-    return World(position, SPHERE).add(contacts).add(_on_floor(position, low))
+    return World(position, SPHERE).add(contacts).add(on_floor(position, low))
 
 
 def towers(rng: np.random.Generator, rows: int) -> World:
@@ -137,7 +137,7 @@ def tree(rng: np.random.Generator, rows: int) -> World:
     n = max(2, rows // 3)
     parent = np.array([-1, *(int(rng.integers(max(0, i - int(rng.integers(1, 9))), i)) for i in range(1, n))])
     world = _joined(rng, parent, BOX)
-    return world.add(_on_floor(world.position, rng.random(n) < 0.3)) if rng.random() < 0.5 else world
+    return world.add(on_floor(world.position, rng.random(n) < 0.3)) if rng.random() < 0.5 else world
 
 
 def net(rng: np.random.Generator, rows: int) -> World:
@@ -164,11 +164,11 @@ def ragdolls(rng: np.random.Generator, rows: int) -> World:
     world.position[:, 0] += 2.0 * np.repeat(np.arange(count), size)
     world.anchor[:, 0] += 2.0 * (world.joint[:, 1] // size)
     n = len(parent)
-    world.add(_on_floor(world.position, rng.random(n) < 0.4))
+    world.add(on_floor(world.position, rng.random(n) < 0.4))
     if count > 1:
         a = np.arange(count - 1) * size + rng.integers(0, size, count - 1)
         b = np.arange(1, count) * size + rng.integers(0, size, count - 1)
-        world.add(_between(world.position, np.stack([a, b], 1)))
+        world.add(between(world.position, np.stack([a, b], 1)))
     return world
 
 
@@ -181,7 +181,7 @@ def snake(rng: np.random.Generator, rows: int) -> World:
     )
     joint = np.stack([k[:-1], k[1:]], 1)
     world = World(position, ROD, joint=joint, anchor=0.5 * (position[:-1] + position[1:]))
-    return world.add(_on_floor(position, rng.random(n) < 0.8))
+    return world.add(on_floor(position, rng.random(n) < 0.8))
 
 
 def anvil(rng: np.random.Generator, rows: int) -> World:
@@ -191,7 +191,7 @@ def anvil(rng: np.random.Generator, rows: int) -> World:
     position = np.concatenate([foot, [[0.0, 0.0, 2.0]]])
     k = np.arange(n)
     top = Contacts(np.stack([k, np.full(n, n)], 1), foot + np.array([0.0, 0.0, 0.5]), [0.0, 0.0, 1.0])
-    return World(position, SPHERE).add(_on_floor(position, np.arange(n + 1) < n)).add(top)
+    return World(position, SPHERE).add(on_floor(position, np.arange(n + 1) < n)).add(top)
 
 
 STRUCTURES: dict[str, Structure] = {
@@ -208,22 +208,28 @@ def wild(seed: int = 0, rows: int = 3000) -> Draft:
     law, masses, form = (str(rng.choice(words)) for words in (LAWS, MASSES, FORMS))
     wanted = 8.0 * (rows / 8.0) ** rng.random()
     world = STRUCTURES[name](rng, max(2, round(wanted / (1 if law == "none" else 3))))
-    bodies = Bodies(world.position, _masses(rng, masses, len(world.position)), world.inertia)
+    bodies = Bodies(world.position, masses_of(rng, masses, len(world.position)), world.inertia)
     bodies.v_free += rng.choice([0.0, 1e-3, 0.05]) * rng.standard_normal(bodies.v_free.shape)
     sideways(bodies, float(rng.choice([0.0, 0.0, 0.2, 1.0])), seed=seed)
-    problem = _problem(rng, world, bodies, law)
+    problem, form = given_as(rng, problem_of(rng, world, bodies, law), form)
+    return Draft(problem, f"{name}, masses {masses}, friction {law}, given as {form}: drawn, not chosen")
+
+
+def given_as(rng: np.random.Generator, problem: Problem, form: str) -> tuple[Problem, str]:
+    """The problem in that form, or the one nearest to it that it can have; and which that is."""
     if form == "dense" and problem.m > LARGEST_DENSE:
         form = "csr"
     if form == "generalized" and problem.rows is None:
         form = "csr"  # friction in a box was given as a matrix
     if form == "generalized":
-        problem = _as_generalized(problem)
-    elif form != "rows":
-        problem = _as_matrix(rng, problem, form)
-    return Draft(problem, f"{name}, masses {masses}, friction {law}, given as {form}: drawn, not chosen")
+        return _as_generalized(problem), form
+    return (problem if form == "rows" else _as_matrix(rng, problem, form)), form
 
 
-def _problem(rng: np.random.Generator, world: World, bodies: Bodies, law: str) -> Problem:
+def problem_of(
+    rng: np.random.Generator, world: World, bodies: Bodies, law: str, soft: float | None = None
+) -> Problem:
+    """Contacts and joints of a world under a law; `soft`: compliance beside 1/mass, one problem of five has one."""
     contacts = Contacts(world.touch, world.point, world.normal)
     joints = len(world.joint)
     arm_a, arm_b = contacts.arms(bodies.position)
@@ -237,8 +243,8 @@ def _problem(rng: np.random.Generator, world: World, bodies: Bodies, law: str) -
         arm_b=arm_b,
         contact_body=contacts.body,
     )
-    compliance = 0.0
-    if rng.random() < 0.2:
+    compliance = 0.0 if soft is None else soft / float(np.median(bodies.mass))
+    if soft is None and rng.random() < 0.2:
         compliance = 10.0 ** rng.uniform(-6.0, -2.0) / float(np.median(bodies.mass))
     if law == "none":
         m = 3 * joints + len(contacts.body)
@@ -265,23 +271,29 @@ def _as_matrix(rng: np.random.Generator, problem: Problem, form: str) -> Problem
 
 
 def _as_generalized(problem: Problem) -> Problem:
-    """J and M, one block of six velocities for each body."""
+    """J and M, one block of six velocities for each body; of three for point masses, which do not turn."""
     rows = problem.rows
     assert rows is not None
-    mass = np.zeros((rows.n_bodies, 6, 6))
+    size = 6 if rows.inv_inertia.any() else 3
+    mass = np.zeros((rows.n_bodies, size, size))
     mass[:, [0, 1, 2], [0, 1, 2]] = (1.0 / rows.inv_mass)[:, None]
-    mass[:, 3:, 3:] = np.linalg.inv(rows.inv_inertia)
+    jac, v_free = rows.jacobian(problem.cones), rows.v_free
+    if size == 6:
+        mass[:, 3:, 3:] = np.linalg.inv(rows.inv_inertia)
+    else:
+        jac = jac[:, (6 * np.arange(rows.n_bodies)[:, None] + np.arange(3)).ravel()]
+        v_free = np.ascontiguousarray(v_free[:, :3])
     return Problem.from_jacobian(
-        rows.jacobian(problem.cones),
+        jac,
         list(mass),
-        rows.v_free.ravel(),
+        v_free.ravel(),
         cones=problem.cones,
         compliance=problem.compliance,
         friction=problem.friction,
     )
 
 
-def _masses(rng: np.random.Generator, word: str, n: int) -> FloatArray:
+def masses_of(rng: np.random.Generator, word: str, n: int) -> FloatArray:
     if word == "uniform":
         return rng.uniform(0.5, 2.0, n)
     if word == "spectrum":
@@ -294,7 +306,7 @@ def _masses(rng: np.random.Generator, word: str, n: int) -> FloatArray:
     return mass
 
 
-def _between(position: FloatArray, pairs: np.ndarray) -> Contacts:
+def between(position: FloatArray, pairs: np.ndarray) -> Contacts:
     """Contacts half way between bodies, along the line of their centres, upwards where that has a meaning."""
     pairs = np.asarray(pairs, np.int64).reshape(-1, 2)
     a, b = pairs.T
@@ -305,7 +317,7 @@ def _between(position: FloatArray, pairs: np.ndarray) -> Contacts:
     return Contacts(np.stack([a, b], 1), 0.5 * (position[a] + position[b]), away)
 
 
-def _on_floor(position: FloatArray, which: np.ndarray) -> Contacts:
+def on_floor(position: FloatArray, which: np.ndarray) -> Contacts:
     """One contact with the floor right below each of those bodies."""
     k = np.flatnonzero(which)
     return Contacts(np.stack([np.full(len(k), -1), k], 1), position[k] - [0.0, 0.0, 0.5], [0.0, 0.0, 1.0])

@@ -61,7 +61,7 @@ def contacts_are_soft(Data p, double share):
 
 
 cdef inline bint is_first(const job_t* j, const gate_t* gate, int32_t largest) noexcept nogil:
-    """The first tests of `general_first` in lavender/solvers/_first.py, in the same order of operations."""
+    """The first tests of `general_first` in lavender/solvers/_gates.py, in the same order of operations."""
     cdef double flops, cost, entries
     if gate.is_open:
         return True
@@ -81,7 +81,7 @@ cdef inline bint is_first(const job_t* j, const gate_t* gate, int32_t largest) n
 
 
 cdef inline bint is_swept(const job_t* j, const gate_t* gate, double* w) noexcept nogil:
-    """`is_carried` of lavender/solvers/_first.py; w (n) is scratch."""
+    """`is_carried` of lavender/solvers/_gates.py; w (n) is scratch."""
     cdef int32_t m = j.p.n_rows
     cdef double work
     if gate.is_open or j.law != 1 or m <= gate.few:

@@ -8,10 +8,9 @@ import pytest
 
 import lavender as lv
 from lavender import suite
-from lavender.bench import rates, regret
+from lavender.bench import regret
 from lavender.cli import main
 from lavender.report.regret import table
-from lavender.solvers import _rates
 
 ONE = regret.Regret(
     case="x",
@@ -104,20 +103,3 @@ def test_a_senseless_request_is_refused(args, sign, capsys):
 
 def test_wild_problems_have_names_that_make_them_again():
     assert lv.suite.case("wild(seed=3, rows=40)").name == "wild(seed=3, rows=40)"
-
-
-def test_rates_that_move_far_change_choices_and_are_put_back():
-    problems = [suite.case(f"wild(seed={seed})").problem for seed in (3, 5, 21, 24, 30, 55, 61)]
-    before = dict(vars(_rates))
-    found = {m.rate: m for m in rates.moved(problems, (1e-6,))}
-    assert set(found) == set(rates.RATES)
-    assert all(vars(_rates)[name] is before[name] for name in rates.RATES)
-    assert max(m.shares[5.0] for m in found.values()) > 0.0
-    assert found["PIVOT"].least(1.0) == math.inf
-
-
-def test_the_command_tells_of_rates(capsys):
-    with pytest.raises(SystemExit) as end:
-        main(["bench", "auto", "--seeds", "3:5", "--levels", "1e-6", "--rates"])
-    assert end.value.code in (0, None)
-    assert "SWEEPS" in capsys.readouterr().out

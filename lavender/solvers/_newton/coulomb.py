@@ -3,7 +3,8 @@
 1. Proximal Newton on that map from the start, as long as it gets anywhere.
 2. De Saxce's form of the law (`_newton/desaxce.py`), ended by the proximal Newton; closed loops of joints through the
    augmented system, too.
-3. The same walk from the answer of the convex relaxation; then the other shares of phi's derivative.
+3. The same walk from the answer of the convex relaxation; then the other shares of phi's derivative; then the first
+   walk goes on for what is left of the budget.
 """
 
 from __future__ import annotations
@@ -29,12 +30,14 @@ WEIGHT = 1e-5  # proximal weight that the first walk begins with (measured: 1e-4
 
 def solve_coulomb(run: Run, z: FloatArray) -> None:
     """1 to 3, until the judge is content."""
+    walk = Proximal(z, AUGMENTED, WEIGHT)
     stages: list[Callable[[], None]] = [
-        lambda: _pursue(run, Proximal(z, AUGMENTED, WEIGHT)),
+        lambda: _pursue(run, walk),
         lambda: solve_desaxce(run, SHARES[:1]),
         lambda: _loops(run),
         lambda: _from_convex(run),
         lambda: solve_desaxce(run, SHARES[1:]),
+        lambda: walk.advance(run),
     ]
     for stage in stages:
         stage()

@@ -1,0 +1,155 @@
+"""The log of one solve of `auto`: the best impulse, what ran, and when it has to end."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from time import perf_counter
+
+import numpy as np
+
+from lavender._arrays import FloatArray, IntArray
+from lavender.certificates import check_certificate
+from lavender.problem import Problem
+from lavender.residuals import at_floor, known, quick, reference
+from lavender.solution import Claim, Status, Turn
+from lavender.solvers._few import said
+from lavender.solvers._islands import islands
+
+__all__ = ["SolveLog"]
+
+CAUTION = 0.999  # of what is left of the tolerance: sums are rounded
+STILL = 24  # turns in a row, most of them longer than those before, that leave
+GAIN = 0.99  # of the residual: then nobody gets anywhere
+
+
+class SolveLog:
+    """What ran on a (sub)problem, what it cost, and the best impulse."""
+
+    def __init__(self, problem: Problem, tol: float, budget: int, deadline: float = np.inf) -> None:
+        self.problem, self.tol, self.budget, self.deadline = problem, tol, budget, deadline
+        self.limit = deadline - perf_counter()  # s
+        self.best, self.impulse = np.inf, problem.start()  # least relative residual, (m,) N s
+        self.turns: list[Turn] = []
+        self.work: dict[str, int] = {}
+        self.iterations = 0
+        self.certificate: FloatArray | None = None  # (m,)
+        self.pace = 1.0  # s for each counted ns, times 1e9, as far as a time limit asks for it
+        self._w, self._e = np.empty(problem.m), np.empty(problem.m)
+
+    def offer(self, impulse: FloatArray) -> float:
+        """Judge an impulse (m,) and keep it if it is the best."""
+        found = known(self.problem, impulse)
+        relative = quick(self.problem, impulse, self._w, self._e)[0] if found is None else found
+        if relative < self.best:
+            self.best, self.impulse = relative, impulse.copy()
+        return relative
+
+    def note(self, name: str, claim: Claim, before: float) -> None:
+        """A turn has ended: what it did since the residual was `before`."""
+        self.iterations += claim.iterations
+        for kind, count in claim.work.items():
+            self.work[kind] = self.work.get(kind, 0) + count
+        self.turns.append(Turn(name, dict(claim.work), before, self.best))
+        if claim.certificate is not None and check_certificate(self.problem, claim.certificate) is None:
+            self.certificate = claim.certificate
+        if claim.status is Status.INTERRUPTED:
+            raise KeyboardInterrupt
+
+    @property
+    def message(self) -> str:
+        """What ran, in words: turns of one solver in a row are one."""
+        words: list[tuple[str, dict[str, int]]] = []
+        for turn in self.turns:
+            if not words or words[-1][0] != turn.solver:
+                words.append((turn.solver, {}))
+            for kind, count in turn.work.items():
+                words[-1][1][kind] = words[-1][1].get(kind, 0) + count
+        return " -> ".join(said(name, work) for name, work in words)
+
+    # -- the end ---------------------------------------------------------------------------------
+
+    @property
+    def left(self) -> int:
+        """Iterations that may still be done."""
+        return self.budget - self.iterations
+
+    @property
+    def time_left(self) -> float | None:
+        """s until the time limit, as solvers take it."""
+        return None if self.deadline == np.inf else max(self.deadline - perf_counter(), 1e-5)
+
+    @property
+    def late(self) -> bool:
+        return self.deadline < np.inf and perf_counter() >= self.deadline
+
+    def ends_late(self, cost: float) -> bool:
+        """What is counted for so long [ns] would end after the deadline, at the pace so far."""
+        return self.deadline < np.inf and perf_counter() + 1e-9 * self.pace * cost > self.deadline
+
+    @property
+    def still(self) -> bool:
+        """The last turns gained next to nothing."""
+        return len(self.turns) > STILL and self.best > GAIN * self.turns[-STILL].before
+
+    def done(self) -> bool:
+        """Solved, proven to have no solution, or at an end."""
+        return (
+            self.still
+            or self.best <= self.tol
+            or self.certificate is not None
+            or self.left <= 0
+            or self.late
+            or self.at_floor()
+        )
+
+    def at_floor(self) -> bool:
+        if self.best > 1e-5:
+            return False
+        return at_floor(*quick(self.problem, self.impulse, self._w, self._e, True))
+
+    @property
+    def status(self) -> Status:
+        if self.certificate is not None:
+            return Status.INFEASIBLE
+        if self.best <= self.tol:
+            return Status.CONVERGED
+        if self.at_floor():
+            return Status.FLOOR
+        if self.late:
+            return Status.TIME_LIMIT
+        return Status.MAX_ITERATIONS if self.left <= 0 else Status.STALLED
+
+    # -- islands ---------------------------------------------------------------------------------
+
+    @cached_property
+    def islands(self) -> tuple[int, IntArray]:
+        """How many, and the island of each block."""
+        return islands(self.problem)
+
+    def wrong_islands(self) -> tuple[IntArray, IntArray, float]:
+        """Which islands miss their share of the whole tolerance, the island of each row (m,), and the share [sqrt J].
+
+        Of the energy error each may have as much as makes the tolerance with those that have less,
+        sum min(e_i, share)^2 = (tol E0)^2. A pair of tangents counts by its norm, at most sqrt(2) times its
+        larger entry.
+        """
+        count, label = self.islands
+        problem = self.problem
+        energy, velocity = reference(problem)
+        quick(problem, self.impulse, self._w, self._e)
+        of_row = np.repeat(label, np.diff(problem.cones.ptr))
+        own = np.bincount(of_row, problem.d * self._e**2, minlength=count)
+        own[np.isnan(own)] = np.inf
+        least = np.sort(own)
+        below = np.concatenate([[0.0], np.cumsum(least[:-1])])
+        level = ((self.tol * energy) ** 2 - below) / np.arange(count, 0, -1)
+        above = np.flatnonzero(least > level)
+        share = max(0.0, float(level[above[0]])) if len(above) else np.inf
+        fast = np.zeros(count)
+        np.maximum.at(fast, of_row, problem.metric.weight * np.abs(self._e))
+        wrong = (own > share) | ~(np.sqrt(2.0) * fast <= self.tol * velocity)
+        return (
+            np.flatnonzero(wrong).astype(np.int32),
+            of_row.astype(np.int32),
+            CAUTION * float(np.sqrt(share)),
+        )

@@ -1,0 +1,414 @@
+"""The candidates of `auto` as its schedule runs them: turns of counted work, each on from where it stood if it can.
+
+rest = n log(now / tol) / log(before / now)         sweeps left, by the contraction of the last n             (1)
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from lavender._arrays import FloatArray
+from lavender.registry import SolverSpec, get
+from lavender.residuals import remember
+from lavender.solution import Claim, Status
+from lavender.solvers._accelerated import operator
+from lavender.solvers._few import WARM
+from lavender.solvers._log import SolveLog
+from lavender.solvers._newton import general
+from lavender.solvers._plan import BOTH_WAYS, METHODS, Cost, Costs
+from lavender.solvers._schedule import AGAIN, GIVEN_UP, remainder
+from lavender.solvers._split import solve_together
+from lavender.solvers._sweeping import STATUS
+from lavender.solvers.direct import Enough, Impatient
+from lavender.solvers.newton import NewtonState
+from lavender_ext.few.looks import Looks, sweeps_left
+from lavender_ext.judge.watch import RUNNING
+
+__all__ = ["FIRST", "Candidate", "make"]
+
+FIRST, MOST = 16, 64  # sweeps of the first turn at least and at most,
+HOPE = 0.15  # of what the cheapest other costs: so long sweeps go on whatever they promise; and the first turn lasts,
+CHEAP = 0.05  # where FIRST of them cost no more than that share of it: else they have their turn by what they cost
+CLOCK = 0.01  # s between two looks at the clock, as counted
+CLOSEST = 1e-2  # of tol, to which the relaxation is solved where Coulomb's residual has not followed
+SHORT = 2e7  # ns of time left, below which sweeps come before anything is counted,
+LEAST = 1e6  # ns of them at most
+SURE = 4.0  # times its cost, that has to be left for a finite solver to come before any sweep
+SHARE = 0.7  # of the time that is left, between two looks at the clock
+
+
+class Candidate:
+    """One of them on the problem of a log; its cost is a bound from below until it is counted."""
+
+    again = False  # begins anew in each turn
+    is_finite = False  # factors
+    patient = False  # has another turn, though the last ended above the tolerance by itself
+    others = np.inf  # least remainder of the others [ns]
+
+    def __init__(self, name: str, log: SolveLog, costs: Costs, spec: SolverSpec) -> None:
+        self.name, self.log, self.costs, self.spec = name, log, costs, spec
+        self.cost: Cost = costs.least(name)
+        self.rest, self.counted = self.cost.total, False
+        self.expected = self.rest
+        self.spent = 0.0  # ns, as counted
+        self.state: Any = None
+
+    def count(self) -> None:
+        self.cost = self.costs.of(self.name)
+        self.rest, self.counted = self.cost.total, True
+        self.expected = self.rest
+
+    @property
+    def shown(self) -> str:
+        """The solver's name, as it is told."""
+        return self.spec.name
+
+    def steps(self, work: float) -> int:
+        """Iterations of a turn of so much work, 0 where not even the first would end in time."""
+        begun = self.spent > 0.0 and not self.again
+        setup = 0.0 if begun else self.cost.setup
+        n = max(1, int((work - setup) / self.cost.each))
+        if self.is_finite and self.log.ends_late(SURE * max(self.cost.total - self.spent * begun, 0.0)):
+            return 0  # what comes of it before its end is seldom worth its time
+        return min(n, self.log.left, self.spec.max_iter if self.again else n)
+
+    def run(self, work: float, others: float) -> bool:
+        self.others = others
+        n = self.steps(AGAIN * work if self.again else work)
+        if n <= 0:
+            return False
+        begun = self.spent > 0.0
+        setup = self.cost.setup if self.again or not begun else 0.0
+        before = self.log.best
+        claim = self.turn(n)
+        self.log.note(self.shown, claim, before)
+        last = setup + max(claim.iterations, 1) * self.cost.each
+        self.spent += last
+        self.rest = 2.0 * last if self.again else remainder(self.spent, self.promise())
+        more = claim.status is Status.MAX_ITERATIONS or self.patient
+        if self.again and claim.iterations >= self.spec.max_iter:
+            return False  # it would have no more the next time
+        return more and self.spent < GIVEN_UP * self.expected
+
+    def turn(self, n: int) -> Claim:
+        """At most n iterations; what came of them is offered to the log."""
+        raise NotImplementedError
+
+    def promise(self) -> float:
+        """What is left by what was seen so far [ns]."""
+        return 0.0
+
+
+class Resumed(Candidate):
+    """A solver that goes on where it stood, in short runs for the clock and Ctrl-C: cut anywhere, the same bits."""
+
+    def __init__(self, name: str, log: SolveLog, costs: Costs, spec: SolverSpec) -> None:
+        super().__init__(name, log, costs, spec)
+        self.solver: Any = None
+        self.impulse = np.empty(0)  # (m,) N s
+        self.done, self.sweeps = 0, dict[str, int]()  # iterations and work of all turns
+
+    def begin(self) -> None:
+        self.solver = self.spec.load()(**METHODS[self.name][1])
+        self.state = self.solver.prepare(self.log.problem)
+        self.impulse = self.log.impulse.copy()
+        if hasattr(self.solver, "until"):
+            self.solver.until(self.state, self.log.deadline)
+
+    def turn(self, n: int) -> Claim:
+        log = self.log
+        if self.state is None:
+            self.begin()
+        done, work, last = 0, dict[str, int](), Claim(Status.MAX_ITERATIONS, 0)
+        chunk = max(1, int(1e9 * CLOCK / self.cost.each))
+        while done < n and not (done and log.late):
+            step = min(chunk, n - done)
+            began = perf_counter()
+            if log.deadline < np.inf:
+                # The first share is one of the whole limit: what Python took before was not for nothing.
+                left = log.limit if log.iterations + done == 0 else log.deadline - began
+                step = max(1, min(step, int(SHARE * 1e9 * left / (log.pace * self.cost.each))))
+            last = self.iterate(step)
+            done += last.iterations
+            for kind, count in last.work.items():
+                work[kind] = work.get(kind, 0) + count
+            if last.status is not Status.MAX_ITERATIONS or last.iterations < step:
+                break
+            if log.deadline < np.inf:
+                pace = 1e9 * (perf_counter() - began) / (step * self.cost.each)
+                log.pace = (
+                    pace if log.pace == 1.0 else min(pace, log.pace)
+                )  # a pause of the machine tells nothing
+        self.close()
+        return Claim(last.status, done, work)
+
+    def iterate(self, n: int) -> Claim:
+        """At most n iterations."""
+        claim: Claim = self.solver.run(self.state, self.impulse, n, self.log.tol, None)
+        return claim
+
+    def close(self) -> None:
+        """Offer what came of a turn."""
+        self.log.offer(self.impulse)
+        best = self.state.best
+        if best[1] is not None and best[0] < self.log.best:
+            self.log.offer(best[1])
+
+
+class Sweeps(Resumed):
+    """Accelerated sweeps, with looks at what they promise in compiled code (`lavender_ext/few/looks.pyx`)."""
+
+    relative = 1.0  # residual of the last look
+
+    def begin(self) -> None:
+        problem = self.log.problem
+        split = 0 if problem.rows is None else problem.rows.n_joints
+        self.impulse = self.log.impulse.copy()
+        self.relative = self.log.best
+        self.state = Looks(problem.metric, operator(problem), problem.law == "cone", split)
+
+    def iterate(self, n: int) -> Claim:
+        """At most n, given up where they have cost a share of what the others do and promise no end for less."""
+        looks, each = self.state, self.cost.each
+        done, swept, restarts = looks.done, looks.sweeps, looks.restarts
+        hope = HOPE * self.others
+        for least, most in ((np.inf, min(hope, (done + n) * each)), (self.others, (done + n) * each)):
+            if looks.done and (looks.status != RUNNING or self.relative <= self.log.tol):
+                break
+            if (
+                looks.done * each < most
+                and sweeps_left(looks.last, looks.before, self.relative, self.log.tol) * each <= least
+            ):
+                step = min(max(looks.done // 2, FIRST), done + n - looks.done)
+                if step > 0:
+                    looks.run(
+                        self.impulse, self.relative, done + n, self.log.tol, step, FIRST, each, least, most
+                    )
+                    self.relative = looks.now.relative
+        work = {"sweeps": looks.sweeps - swept, "restarts": looks.restarts - restarts}
+        return Claim(STATUS[looks.status], looks.done - done, work)
+
+    def close(self) -> None:
+        remember(self.log.problem, self.state.now)
+        self.log.offer(self.state.now.impulse)
+        best = self.state.watch.best
+        if best[1] is not None and best[0] < self.log.best:
+            self.log.offer(best[1])
+
+    def promise(self) -> float:
+        looks = self.state
+        return sweeps_left(looks.last, looks.before, self.relative, self.log.tol) * self.cost.each
+
+
+class Relaxation(Resumed):
+    """Sweeps of the convex relaxation from doing nothing, judged by Coulomb's law; from where these stand `nncg`."""
+
+    relative = 1.0  # by Coulomb's law, at the last look
+    left = np.inf  # sweeps, by (1)
+    slow = False  # the relaxation is not the answer, or not soon
+
+    def begin(self) -> None:
+        self.solver = self.spec.load()()
+        self.state = self.solver.prepare(self.log.problem.relaxed("cone"))
+        self.impulse = self.log.problem.start()
+        self.tol = self.log.tol
+
+    def turn(self, n: int) -> Claim:
+        if self.slow and self.name == self.shown_by:
+            self.shown_by = "nncg"
+            self.solver = get("nncg").load()(**METHODS["nncg"][1])
+            self.state = self.solver.prepare(self.log.problem)
+        if self.slow:
+            n = max(1, n // int(BOTH_WAYS))
+        claim = super().turn(n)
+        return replace(claim, iterations=int(BOTH_WAYS) * claim.iterations) if self.slow else claim
+
+    shown_by = "relaxation"
+
+    def iterate(self, n: int) -> Claim:
+        """With looks at Coulomb's residual, which goes on falling with the relaxation's where contacts stick."""
+        log, done, work = self.log, 0, dict[str, int]()
+        follows = self.shown_by == "nncg"
+        while done < n:
+            step = min(max((self.done + done) // 2, FIRST), n - done)
+            claim = self.solver.run(self.state, self.impulse, step, log.tol if follows else self.tol, None)
+            done += claim.iterations
+            for kind, count in claim.work.items():
+                work[kind] = work.get(kind, 0) + count
+            before, self.relative = self.relative, log.offer(self.impulse)
+            self.left = sweeps_left(claim.iterations, before, self.relative, log.tol)
+            if self.relative <= log.tol or log.late:
+                break
+            if claim.status is Status.CONVERGED and not follows and self.tol > CLOSEST * log.tol:
+                self.tol *= 0.1  # solved; Coulomb's residual may follow to a closer one
+            elif claim.status is not Status.MAX_ITERATIONS:
+                if follows:
+                    return Claim(Status.STALLED, done, work)
+                break
+            spent = (self.done + done) * self.cost.each
+            if self.left * self.cost.each > self.others and spent > HOPE * self.others:
+                break
+        self.done += done
+        return Claim(Status.MAX_ITERATIONS, done, work)
+
+    def close(self) -> None:
+        """Offered at each look; where the relaxation brought no end, the next turn is of another kind."""
+        self.slow = True
+
+    def promise(self) -> float:
+        return self.left * self.cost.each if self.shown_by == "nncg" else 0.0
+
+    @property
+    def shown(self) -> str:
+        return "relaxation: anderson" if self.shown_by == "relaxation" else "nncg"
+
+
+class Velocities(Candidate):
+    """Newton's method over generalised velocities, on from where its steps were used up."""
+
+    is_finite = True
+    begun = False
+
+    def turn(self, n: int) -> Claim:
+        log = self.log
+        if not self.begun:
+            self.impulse = log.impulse.copy() if log.best <= WARM else log.problem.start()
+        kernel = self.costs.structure.kernel
+        claim = general.run(log.problem, kernel, self.impulse, n, log.tol, log.time_left, self.begun)
+        self.begun = True
+        _offer(log, self.impulse)
+        if claim.status is Status.MAX_ITERATIONS and not kernel.waits:
+            return Claim(Status.STALLED, claim.iterations, claim.work)
+        return claim
+
+
+class Finite(Candidate):
+    """A solver that begins anew in each turn: from the best impulse where that is near, else from doing nothing."""
+
+    again = is_finite = True
+
+    def turn(self, n: int) -> Claim:
+        log = self.log
+        solver = self.make()
+        if self.state is None:
+            self.state = self.prepare(solver)
+        impulse = self.start()
+        claim: Claim = solver.run(self.state, impulse, n, log.tol, log.time_left)
+        _offer(log, impulse)
+        return claim
+
+    def make(self) -> Any:
+        return self.spec.load()(**METHODS[self.name][1])
+
+    def prepare(self, solver: Any) -> Any:
+        return solver.prepare(self.log.problem)
+
+    def start(self) -> FloatArray:
+        return self.log.impulse.copy() if self.log.best <= WARM else self.log.problem.start()
+
+
+class Newton(Finite):
+    """From the system whose factor was counted."""
+
+    def prepare(self, solver: Any) -> Any:
+        system = self.costs.structure.system
+        rows = self.name == "newton over rows" or self.log.problem.rows is None
+        if rows != (system.form == "impulse"):
+            return super().prepare(solver)
+        return NewtonState(self.log.problem, system if system.sc.m else None)
+
+
+class Direct(Finite):
+    """From where sweeps have stopped, since they know which rows are free; a linear system no closer than tol."""
+
+    def make(self) -> Any:
+        if self.log.problem.law == "linear":
+            return Enough()
+        return super().make() if self.spent > 0.0 else Impatient()
+
+    def start(self) -> FloatArray:
+        return self.log.impulse.copy()
+
+    def turn(self, n: int) -> Claim:
+        self.state = None  # after a turn its rows are those of the end; the problem keeps their order
+        first = self.spent == 0.0 and self.log.problem.law == "lcp"
+        claim = super().turn(n)
+        # Stuck, or singular where rows are free: with more shifts and descent it takes far longer.
+        self.patient = first and claim.status is Status.STALLED
+        return claim
+
+
+class Islands(Candidate):
+    """One turn: every small island by itself, to its share of the tolerance; what that leaves is for the others."""
+
+    def run(self, work: float, others: float) -> bool:
+        log = self.log
+        solve_together(log, log.left, min(work, others) / log.problem.m)
+        return False
+
+
+def _offer(log: SolveLog, impulse: FloatArray) -> None:
+    if np.isfinite(impulse).all():
+        log.offer(impulse)
+
+
+KINDS: dict[str, type[Candidate]] = {
+    "newton": Newton, "direct": Direct, "anderson": Sweeps, "islands": Islands, "relaxation": Relaxation,
+}  # fmt: skip
+
+
+def make(
+    log: SolveLog, costs: Costs, names: tuple[str, ...], planned: tuple[str, int] | None = None
+) -> list[Candidate]:
+    """The candidates of these names that can run here, in this order; the first turn is set where sweeps have it."""
+    found: list[Candidate] = []
+    if log.deadline < np.inf and "anderson" in names and log.ends_late(SHORT):
+        # So that something is there when time is up: to count what the others cost takes as long as many sweeps.
+        sweeps = Sweeps("anderson", log, costs, get("anderson"))
+        sweeps.count()
+        names = tuple(name for name in names if name != "anderson")
+        if sweeps.run(sweeps.cost.setup + min(LEAST, SHARE * 1e9 * log.limit), np.inf):
+            found.append(sweeps)
+        if log.done():
+            return found
+    for name in names:
+        spec = get(METHODS[name][0])
+        kind = KINDS.get(name, KINDS.get(spec.name, Resumed))
+        if name == "newton" and log.problem.generalized is not None:
+            kind = Velocities
+        made = kind(name, log, costs, spec)
+        if made.rest < np.inf:
+            found.append(made)
+    first_turn(log, found, planned)
+    return found
+
+
+def first_turn(log: SolveLog, found: list[Candidate], planned: tuple[str, int] | None = None) -> None:
+    """Sweeps come first where some of them cost next to nothing beside the others, or time is limited.
+
+    `planned`: who has the first turn, and for how many iterations.
+    """
+    if planned is not None:
+        for candidate in found:
+            candidate.counted = True
+            if candidate.name == planned[0]:
+                cost = candidate.cost
+                candidate.rest = min(
+                    cost.total, cost.setup + planned[1] * cost.each, *(c.rest for c in found)
+                )
+        found.sort(key=lambda candidate: candidate.name != planned[0])
+        return
+    sweeps = next((c for c in found if c.name == "anderson"), None)
+    least = min((c.rest for c in found if c.is_finite), default=np.inf)
+    if sweeps is None:
+        return
+    sweeps.counted = True
+    each = sweeps.cost.each
+    cheap = log.problem.law != "linear" and FIRST * each <= CHEAP * least
+    if cheap or log.ends_late(SURE * least):
+        n = int(min(max(HOPE * least / each, FIRST), MOST))
+        sweeps.rest = min(sweeps.rest, sweeps.cost.setup + n * each, least)

@@ -1,0 +1,304 @@
+"""Which solvers `auto` asks, and what each is expected to cost: a table, counts of structure, and fitted rates.
+
+    cost = start + formed * entries + count * (row * m + work * w)                                            (1)
+
+m rows; w multiply-adds of one iteration, counted from the structure (`_structure.py`); start, row, work [ns] and count,
+iterations to the end, are rates of `rates.json`, which `lavender bench auto --fit` writes from recorded runs of single
+solvers. No clock is read: the same problem has the same plan everywhere.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from functools import cache
+from hashlib import sha256
+from math import inf, log10
+from pathlib import Path
+from typing import Any
+
+from lavender.errors import InputError
+from lavender.problem import Problem
+from lavender.registry import FEW
+from lavender.solvers._structure import Structure
+
+__all__ = ["METHODS", "TABLE", "Cost", "Costs", "Plan", "candidates", "made", "rates", "structure_of"]
+
+RATES = Path(__file__).with_name("rates.json")
+
+#: Solver and options of each candidate.
+METHODS: dict[str, tuple[str, dict[str, Any]]] = {
+    "anderson": ("anderson", {}),
+    "nncg": ("nncg", {"order": "symmetric", "restart": "against"}),
+    "direct": ("direct", {}),
+    "newton": ("newton", {}),
+    "newton over rows": ("newton", {"form": "impulse"}),
+    "admm": ("admm", {}),
+    # Of Coulomb's law: its answer is the law's own wherever contacts stick.
+    "relaxation": ("anderson", {}),
+    # Each island by itself, in compiled code (`_split.py`): sweeps, pivots or velocities.
+    "islands": ("anderson", {}),
+}
+_GIVEN = {
+    "linear": ("direct", "anderson", "newton"),
+    "lcp": ("anderson", "direct", "newton", "islands"),
+    "cone": ("anderson", "newton", "admm", "islands"),
+    "coulomb": ("anderson", "newton", "nncg", "islands"),
+}
+#: At most four for each law and operator; "round": cones of more than two tangents.
+TABLE: dict[str, dict[str, tuple[str, ...]]] = {
+    "rows": _GIVEN | {"coulomb": ("anderson", "newton", "islands", "relaxation")},
+    "matrix": _GIVEN,
+    "generalized": {
+        "linear": ("newton", "direct", "anderson", "newton over rows"),
+        "lcp": ("newton", "anderson", "direct", "newton over rows"),
+        "cone": ("newton", "anderson", "admm", "newton over rows"),
+        "coulomb": ("newton", "anderson", "nncg", "newton over rows"),
+        "round": ("newton", "nncg", "admm"),
+    },
+}
+BOTH_WAYS = 2.0  # sweeps of an iteration in the symmetric order
+SPARED = 0.25  # of the sweeps of the whole, that small islands take when each goes on for itself
+SIXTH = 6.0  # decades that counts of sweeps are fitted for
+
+
+@cache
+def rates() -> dict[str, Any]:
+    """Of `rates.json`, read once."""
+    found: dict[str, Any] = json.loads(RATES.read_text(encoding="utf-8"))
+    return found
+
+
+@dataclass(frozen=True)
+class Cost:
+    """Of one candidate: before its first iteration, each of them, and how many are expected."""
+
+    setup: float  # ns
+    each: float  # ns
+    count: float
+
+    @property
+    def total(self) -> float:
+        """All of them [ns]."""
+        return self.setup + self.count * self.each
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What `auto` would do with a problem: its candidates and what each is expected to cost, as counted.
+
+    `str()` is one screen; `data()` are plain numbers and words, which `Plan.of` and `lavender.solve(..., plan=)` take.
+    """
+
+    rows: int
+    law: str
+    operator: str  # rows, matrix or generalized
+    structure: str  # of blocks, law and operator: a plan is for problems of the same
+    tol: float  # - relative residual
+    small: bool  # one compiled call is tried before all of them
+    candidates: tuple[tuple[str, Cost], ...]  # by expected cost, the least first
+    first: tuple[str, int]  # who has the first turn, and how many iterations it is for
+
+    def data(self) -> dict[str, Any]:
+        """As JSON has it; costs in nanoseconds."""
+        costs = [{"name": name} | asdict(cost) for name, cost in self.candidates]
+        return asdict(self) | {"candidates": costs, "first": list(self.first)}
+
+    @classmethod
+    def of(cls, given: Any) -> Plan:
+        """A plan, or the data of one.
+
+        Raises
+        ------
+        InputError
+            Neither.
+        """
+        if isinstance(given, Plan):
+            return given
+        try:
+            values = dict(given)
+            costs = [
+                (c["name"], Cost(*(float(c[k]) for k in ("setup", "each", "count"))))
+                for c in values["candidates"]
+            ]
+            found = cls(**(values | {"candidates": tuple(costs), "first": tuple(values["first"])}))
+        except (TypeError, ValueError, KeyError) as error:
+            raise InputError(
+                f"plan is a {type(given).__name__} that is no plan ({error}); what lavender.explain(problem) "
+                "returns, or its .data(), is needed"
+            ) from None
+        for name, cost in found.candidates:
+            if name not in METHODS or not (cost.setup >= 0.0 and cost.each > 0.0 and cost.count > 0.0):
+                raise InputError(
+                    f"plan: candidate {name!r} with {cost}; one of {', '.join(METHODS)} with costs above 0 is needed"
+                )
+        return found
+
+    def check(self, problem: Problem) -> None:
+        """Refuse a problem of another structure.
+
+        Raises
+        ------
+        InputError
+            The plan is of another problem.
+        """
+        if self.structure != structure_of(problem):
+            raise InputError(
+                f"the plan is of a problem of {self.rows} rows under the law {self.law!r} given as {self.operator}, "
+                f"structure {self.structure}; this one has {problem.m}, {problem.law!r}, {problem.operator}, "
+                f"{structure_of(problem)}: make its own with lavender.explain(problem)"
+            )
+
+    def __str__(self) -> str:
+        name, n = self.first
+        lines = [
+            f"{self.rows} rows under the law {self.law!r}, given as {self.operator}; to {self.tol:.0e}",
+            f"{'candidate':<18}{'expected':>12}{'set-up':>12}{'iterations':>12}{'each':>12}",
+        ]
+        for candidate, cost in self.candidates:
+            parts = [_time(cost.total), _time(cost.setup), f"{cost.count:.3g}", _time(cost.each)]
+            lines.append(f"{candidate:<18}" + "".join(f"{part:>12}" for part in parts))
+        if self.small:
+            lines.append("one compiled call for few rows comes before all of them")
+        why = (
+            "it is expected to cost least"
+            if name == self.candidates[0][0]
+            else "so many cost little beside the others"
+        )
+        lines.append(f"first {name}, for {n} iterations: {why}")
+        lines.append("then always the one with the least expected remainder, for as long as that is")
+        return "\n".join(lines)
+
+
+def _time(ns: float) -> str:
+    unit, word = (1e9, "s") if ns >= 1e9 else (1e6, "ms") if ns >= 1e6 else (1e3, "us")
+    return f"{ns / unit:.3g} {word}"
+
+
+def structure_of(problem: Problem) -> str:
+    """Some digits that blocks, law and operator have in common with no other structure."""
+    found = sha256(f"{problem.law} {problem.operator} {problem.m}".encode())
+    found.update(problem.cones.ptr.tobytes() + problem.cones.kind.tobytes())
+    return found.hexdigest()[:12]
+
+
+class Costs:
+    """Costs of the candidates on one problem to `tol`.
+
+    `given`: rates in place of those of the file; `plan`: costs in place of counts.
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        tol: float,
+        given: Mapping[str, Any] | None = None,
+        structure: Structure | None = None,
+        plan: Plan | None = None,
+    ) -> None:
+        self.problem = problem
+        self.structure = Structure(problem) if structure is None else structure
+        self.rates = rates() if given is None else given
+        self.planned = {} if plan is None else dict(plan.candidates)
+        self.decades = -log10(min(max(tol, 1e-16), 0.1)) / SIXTH
+
+    def least(self, name: str) -> Cost:
+        """At least, without the analysis of a factor's pattern."""
+        s = self.structure
+        if name in self.planned:
+            return self.planned[name]
+        if name == "direct":
+            return self._finite("direct", s.direct_least)
+        if name == "newton" and s.problem.generalized is None:
+            return self._finite("newton", s.newton_least)
+        if name == "newton over rows":
+            return self._finite("newton", s.newton_least)
+        if name == "relaxation":
+            return self._relaxation()
+        if name == "islands":
+            whole = self.of("anderson")
+            return Cost(whole.setup, whole.each, SPARED * whole.count)
+        return self.of(name)
+
+    def of(self, name: str) -> Cost:
+        """As counted."""
+        s, r, law = self.structure, self.rates, self.problem.law
+        if name in self.planned:
+            return self.planned[name]
+        if name in ("anderson", "nncg"):
+            a = r["anderson"]
+            each = a["row"] * s.m + _of(a["work"], law) * s.sweep
+            count = self.decades * r[name]["count"]
+            return Cost(a["start"], each * (1.0 if name == "anderson" else BOTH_WAYS), count)
+        if name == "direct":
+            return self._finite("direct", s.direct)
+        if name == "relaxation":
+            return self._relaxation() if s.is_loose else Cost(inf, 1.0, 1.0)
+        if name == "islands":
+            # The others have ended while sweeps of the whole go on for the one that needs most of them.
+            if not s.divides:
+                return Cost(inf, 1.0, 1.0)
+            whole, share = self.of("anderson"), SPARED + (1.0 - SPARED) * s.largest
+            return Cost(whole.setup, whole.each, share * whole.count)
+        if name == "admm":
+            a, (factored, fill) = r["admm"], s.admm(1.0)
+            setup = a["start"] + r["formed"] * s.formed + a["factor"] * factored
+            return Cost(setup, a["work"] * fill, self.decades * a["count"])
+        if name == "newton" and s.problem.generalized is not None:
+            v = r["velocities"]
+            if s.kernel is None:
+                return Cost(float("inf"), 1.0, 1.0)
+            return Cost(
+                v["start"], v["entry"] * s.sweep + v["work"] * s.velocities, _of(v["count"], law) * s.steps
+            )
+        return self._finite("newton", s.newton)
+
+    def _relaxation(self) -> Cost:
+        a, s = self.rates["anderson"], self.structure
+        return Cost(a["start"], a["row"] * s.m + a["work"]["cone"] * s.sweep, self.decades * a["count"])
+
+    def _finite(self, name: str, factor: float) -> Cost:
+        r, s = self.rates[name], self.structure
+        setup = r["start"] + self.rates["formed"] * s.formed
+        count = (
+            1.0 if name == "direct" and self.problem.law == "linear" else _of(r["count"], self.problem.law)
+        )
+        return Cost(setup, _of(r["row"], self.problem.law) * s.m + r["work"] * factor, count)
+
+
+def _of(rate: Any, law: str) -> float:
+    """A rate that depends on the law: bounded rows, whether they have bounds or not, and each law of friction."""
+    return float(rate[law if law in rate else "rows"] if isinstance(rate, Mapping) else rate)
+
+
+def candidates(structure: Structure) -> tuple[str, ...]:
+    """Names of the table that take a problem, in its order."""
+    problem = structure.problem
+    if problem.cones.has_round:
+        return TABLE["generalized"]["round"]
+    names = TABLE[problem.operator][problem.law]
+    return names if structure.is_definite else tuple(name for name in names if name != "direct")
+
+
+def made(problem: Problem, tol: float) -> Plan:
+    """The plan of a problem to `tol`, counted in full; nothing is run."""
+    from lavender.solvers._few import FEW_GENERAL
+    from lavender.solvers._gates import general_first
+    from lavender.solvers._log import SolveLog
+    from lavender.solvers._methods import make
+    from lavender.solvers._schedule import first
+
+    costs = Costs(problem, tol)
+    methods = make(SolveLog(problem, tol, 2**31 - 1), costs, candidates(costs.structure))
+    chosen = first(methods)
+    counted = sorted(((m.name, costs.of(m.name)) for m in methods), key=lambda pair: pair[1].total)
+    kernel = costs.structure.kernel
+    over_velocities = (
+        kernel is not None and problem.m <= FEW_GENERAL and general_first(problem, kernel.largest)
+    )
+    return Plan(
+        rows=problem.m, law=problem.law, operator=problem.operator, structure=structure_of(problem), tol=tol,
+        small=problem.m <= FEW or over_velocities, first=(chosen.name, chosen.steps(chosen.rest)),
+        candidates=tuple((name, cost) for name, cost in counted if cost.total < inf),
+    )  # fmt: skip

@@ -1,0 +1,198 @@
+"""What the structure of a problem says of the work of each method, counted when it is first asked and then kept.
+
+sweep        multiply-adds of one sweep
+factor       weighted multiply-adds of one factorisation: of A (`direct`), of Newton's matrix over rows, bodies or
+             generalised velocities; `_least` are bounds from below that need no analysis of a pattern
+formed       entries of A that a method forms first, of a problem given by J and M
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from lavender._arrays import IntArray
+from lavender.problem import Problem
+from lavender.registry import FEW
+from lavender.solvers import _rates as weights
+from lavender.solvers._accelerated import sweep_work
+from lavender.solvers._counts import dense_factor, newton_factor, sparse_factor
+from lavender.solvers._factor import PanelsLU, choose, filled_cost, panels_cost
+from lavender.solvers._islands import block_bodies, islands
+from lavender.solvers._newton import general
+from lavender.solvers._newton.systems import System, make_system
+from lavender.solvers._sweeping import reads_whitened
+from lavender_ext.core import assemble
+from lavender_ext.factor import graph
+
+__all__ = ["Structure"]
+
+TREE = 1.05  # neighbours of a body, in the mean, up to which bodies form trees
+FILL = 6.0  # entries of a factor for each of A, at most
+SOFT = 1e-6  # of d: where all free rows have so much compliance of their own one step over velocities is the last
+
+
+class Structure:
+    """Counts of one problem."""
+
+    def __init__(self, problem: Problem) -> None:
+        self.problem, self.m = problem, problem.m
+
+    @cached_property
+    def sweep(self) -> float:
+        """Multiply-adds of one sweep."""
+        return float(sweep_work(self.problem))
+
+    @cached_property
+    def entries(self) -> float:
+        """Of A, at most where it is not formed."""
+        p = self.problem
+        if p.generalized is not None:
+            return float(p.metric.entries_of_a)
+        if p.rows is not None:
+            return min(float(assemble.bound(p.data)[0]), float(p.m) ** 2)
+        return float(len(p._compressed[1]))
+
+    @cached_property
+    def formed(self) -> float:
+        """Entries of A that are formed of J and M by who needs it; 0 where A was given, or sweeps form it as well."""
+        return self.entries if reads_whitened(self.problem) else 0.0
+
+    def admm(self, n: float) -> tuple[float, float]:
+        """Of `admm`: nonzeros of the matrix that it factors, and entries that n of its iterations read."""
+        entries = self.entries if self.problem.matrix is not None else self.sweep
+        lu = 1.0 if self.problem.is_symmetric else 2.0
+        fill = min(FILL * entries, 0.5 * float(self.m) ** 2) + 10.0 * self.m
+        return lu * entries * (1.0 + self.m / 1000.0), n * lu * fill
+
+    @cached_property
+    def islands(self) -> tuple[int, IntArray]:
+        """How many, and the island of each block."""
+        return islands(self.problem)
+
+    @cached_property
+    def largest(self) -> float:
+        """Share of the rows that the largest island has."""
+        rows = np.bincount(self.islands[1], weights=np.diff(self.problem.cones.ptr))
+        return float(rows.max() / self.m)
+
+    @cached_property
+    def is_loose(self) -> bool:
+        """Nearly every contact between two bodies of its own, not one of a face: sweeps then settle which stick."""
+        p = self.problem
+        if p.rows is None or not p.rows.n_bodies:
+            return False
+        return 4 * graph.body_pairs(block_bodies(p), p.rows.n_bodies, True) > 3 * p.n_blocks
+
+    @property
+    def divides(self) -> bool:
+        """No island has more than half of the rows, and some have more than a block, which a sweep solves."""
+        count = self.islands[0]
+        return 1 < count < self.problem.n_blocks and self.largest <= 0.5
+
+    # -- factors of A ------------------------------------------------------------------------------
+
+    @property
+    def is_definite(self) -> bool:
+        """`direct` exchanges rows of symmetric matrices, or of few rows."""
+        p = self.problem
+        return p.law == "linear" or (p.law == "lcp" and (p.m <= FEW or p.is_symmetric))
+
+    @property
+    def direct_least(self) -> float:
+        """What one factor of A costs at least."""
+        if self.problem.matrix is not None:
+            return self.direct
+        width = max(3.0, self._width(self.m))
+        return min(weights.BAND * self.m * width**2, dense_factor(self.m))
+
+    @cached_property
+    def direct(self) -> float:
+        """One factor of A as `direct` makes it; of a factored problem without forming A."""
+        p, m = self.problem, self.m
+        dense = dense_factor(m)
+        if p.rows is not None and p.rows.n_bodies:
+            return min(dense, weights.BAND * m * self._body_band() ** 2, self._sparse(self.entries))
+        form, band, _ = choose(p) if p.is_symmetric else ("general", max(p.bandwidth), None)
+        if form == "band":
+            return weights.BAND * m * float(min(band, m) + 1) ** 2
+        nnz = float(len(p._compressed[1]))
+        if form == "sparse" or (form == "general" and p.law == "linear" and PanelsLU.takes(p)):
+            return min(dense, self._sparse(nnz))
+        return min(dense, sparse_factor(int(nnz), m))
+
+    def _body_band(self) -> float:
+        """Of A in the order of blocks, or of a tree."""
+        p = self.problem
+        assert p.rows is not None
+        bodies, n = block_bodies(p), p.rows.n_bodies
+        width = float(graph.body_spread(p.cones.ptr, bodies, n) + 1)
+        if self._loops <= TREE:
+            of = np.repeat(bodies, np.diff(p.cones.ptr), axis=0)
+            width = min(width, 2.0 * float(np.bincount(of[of >= 0], minlength=1).max()))
+        return width
+
+    def _sparse(self, entries: float) -> float:
+        """A sparse factor of so many entries; with bounds rows are analysed anew for each free set."""
+        p = self.problem
+        if p.law != "linear":
+            return sparse_factor(int(entries), p.m)
+        return filled_cost(p) if p.rows is None else panels_cost(int(entries), p.m)
+
+    # -- factors of Newton's matrix ----------------------------------------------------------------
+
+    @cached_property
+    def system(self) -> System:
+        """Newton's system over the bodies, else over the rows of A; who factors later takes it over."""
+        rows = self.problem.rows
+        return make_system(self.problem, "impulse" if rows is None or rows.n_bodies == 0 else "velocity")
+
+    @cached_property
+    def newton(self) -> float:
+        """One factor of it."""
+        return newton_factor(self.system)
+
+    @property
+    def newton_least(self) -> float:
+        """At least that of a tree of bodies, or of a diagonal; loops fill it."""
+        p = self.problem
+        if p.rows is not None and p.rows.n_bodies:
+            turns = p.rows.inv_inertia.any() and (p.rows.n_joints or p.m > p.n_blocks)
+            s, n = 6 if turns else 3, p.rows.n_bodies
+            return weights.BLOCK * s**3 * (1.0 + 0.5 * max(1.0, self._width(n)) ** 2) * n
+        width = max(1.0, 0.5 * self.entries / max(1, self.m)) if p.matrix is not None else 1.0
+        return min(weights.BAND * self.m * width**2, dense_factor(self.m))
+
+    def _width(self, n: int) -> float:
+        """Neighbours that elimination leaves each of n unknowns, at a guess: none in a tree, as in a plane else."""
+        return 0.5 * float(np.sqrt(n)) * self._loops if self._loops > TREE else 0.0
+
+    @cached_property
+    def _loops(self) -> float:
+        """Pairs of bodies with a block between them, for each body: 1 in a chain, 2 or 3 in a lattice; at least 1."""
+        p = self.problem
+        if p.rows is None or p.rows.n_bodies == 0:
+            return 1.0
+        return max(1.0, graph.body_pairs(block_bodies(p), p.rows.n_bodies, False) / p.rows.n_bodies)
+
+    # -- velocities of generalised coordinates -----------------------------------------------------
+
+    @cached_property
+    def kernel(self) -> Any:
+        """Newton's method over them with its room; None where there is none for it."""
+        return None if self.problem.generalized is None else general.prepare(self.problem)
+
+    @cached_property
+    def velocities(self) -> float:
+        """One step over them, in one of the islands."""
+        kernel = self.kernel
+        return general.factor_flops(self.problem, kernel.largest) / max(1, kernel.islands)
+
+    @cached_property
+    def steps(self) -> float:
+        """Steps for each that one island takes; free rows that are all soft need no proximal term, so half."""
+        p, islands = self.problem, float(max(1, self.kernel.islands))
+        assert p.compliance is not None
+        return 0.5 * islands if p.law == "linear" and np.all(p.compliance >= SOFT * p.d) else islands

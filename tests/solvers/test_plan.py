@@ -1,0 +1,113 @@
+"""explain and plan: counted alone, the same everywhere, and a solve goes by them."""
+
+import json
+
+import numpy as np
+import pytest
+from random_trees import random_general
+
+import lavender as lv
+from lavender import suite
+from lavender.cli import main
+from lavender.problem import LAWS, OPERATORS
+from lavender.solvers._plan import METHODS, TABLE
+
+NAMES = (
+    "stack(n=200)",
+    "granularF(n=4)",
+    "pyramid(k=6)",
+    *(f"wild(seed={seed})" for seed in (9, 28, 43, 67)),
+)
+
+
+def test_the_table_has_at_most_four_candidates_for_each_law_and_operator():
+    for operator in OPERATORS:
+        for law in LAWS:
+            names = TABLE[operator][law]
+            assert 1 < len(names) <= 4 and len(set(names)) == len(names)
+            assert set(names) <= set(METHODS)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_plan_is_counted_and_a_solve_goes_by_it(name, monkeypatch):
+    problem = suite.case(name).problem
+    plan = lv.explain(problem, tol=1e-6)
+    assert plan == lv.explain(suite.case(name).problem, tol=1e-6)
+    assert [c.total for _, c in plan.candidates] == sorted(c.total for _, c in plan.candidates)
+    assert len(str(plan).splitlines()) <= 24 and max(map(len, str(plan).splitlines())) <= 100
+    free = lv.solve(problem, tol=1e-6)
+    data = json.loads(json.dumps(plan.data()))
+    for given in (plan, data):
+        planned = lv.solve(suite.case(name).problem, plan=given, tol=1e-6)
+        assert planned.success
+        assert planned.turns[0].solver == free.turns[0].solver
+    assert lv.Plan.of(data) == plan
+
+
+def test_nothing_is_run(monkeypatch):
+    from lavender.solvers._methods import Candidate
+
+    monkeypatch.setattr(Candidate, "run", None)
+    for name in NAMES:
+        lv.explain(suite.case(name).problem)
+
+
+def test_a_frozen_plan_serves_problems_of_the_same_structure_and_no_others():
+    problem = suite.case("granularF(n=4)").problem
+    plan = lv.explain(problem)
+    prepared = lv.prepare(problem, "auto", plan=plan)
+    other = suite.case("granularF(n=4, sliding=0.5)").problem
+    assert prepared.solve(other).success == lv.solve(other).success
+    with pytest.raises(lv.InputError, match=r"lavender\.explain"):
+        lv.solve(suite.case("granularF(n=3)").problem, plan=plan)
+    with pytest.raises(lv.InputError, match="the law 'coulomb'"):
+        lv.solve(problem.relaxed("cone"), plan=plan)
+    with pytest.raises(lv.InputError, match="the plan is of a problem"):
+        prepared.solve(suite.case("granularF(n=3)").problem)
+
+
+@pytest.mark.parametrize("tol", [0.0, -1.0, np.nan, np.inf, True, "small"])
+def test_a_senseless_tolerance_is_refused(tol):
+    with pytest.raises(lv.InputError, match="tol is"):
+        lv.explain(suite.case("stack(n=8)").problem, tol=tol)
+
+
+def test_senseless_requests_are_refused():
+    with pytest.raises(lv.InputError, match="Problem is needed"):
+        lv.explain(3)
+    with pytest.raises(lv.InputError, match="no rows"):
+        lv.explain(lv.Problem.lcp(np.zeros((0, 0)), np.zeros(0)))
+    problem = suite.case("stack(n=8)").problem
+    for plan in (3, "direct", {"rows": 8}, {**lv.explain(problem).data(), "candidates": [{"name": "x"}]}):
+        with pytest.raises(lv.InputError, match="plan"):
+            lv.solve(problem, plan=plan)
+    wrong = lv.explain(problem).data()
+    wrong["candidates"][0]["each"] = -1.0
+    with pytest.raises(lv.InputError, match="above 0"):
+        lv.solve(problem, plan=wrong)
+    for limit in (0.0, -1.0):
+        with pytest.raises(lv.InputError, match="time_limit"):
+            lv.solve(problem, plan=lv.explain(problem), time_limit=limit)
+
+
+def test_cones_that_nobody_of_the_table_takes_are_refused():
+    general = random_general(0, "cone", n=8, compliance=False, contacts=4, tangents=5)
+    assert {name for name, _ in lv.explain(general).candidates} <= {"newton", "nncg", "admm"}
+    matrix = lv.Problem(general.b, general.cones, general.csr, friction="cone")
+    taken = lv.explain(matrix)
+    assert lv.solve(matrix, plan=taken, tol=1e-4).solver.name == "auto"
+
+
+def test_the_command_shows_plans_and_gives_them_as_data(capsys):
+    with pytest.raises(SystemExit) as end:
+        main(["explain", "stack(n=200)", "granularF(n=4)"])
+    assert end.value.code in (0, None)
+    shown = capsys.readouterr().out
+    assert "first direct" in shown and "granularF(n=4)" in shown
+    with pytest.raises(SystemExit):
+        main(["explain", "stack(n=200)", "--json", "--tol", "1e-9"])
+    plan = lv.Plan.of(json.loads(capsys.readouterr().out))
+    assert plan.tol == 1e-9 and plan.rows == 200
+    with pytest.raises(SystemExit) as end:
+        main(["explain", "stack(n=200)", "--tol", "0"])
+    assert end.value.code == 2
