@@ -139,8 +139,8 @@ cdef inline void pack_contact(const blocks_t* p, const rows_t* r, int32_t i, int
 
 cdef inline void pack_joint(const blocks_t* p, const rows_t* r, int32_t i, int32_t j, int32_t n,
                             pair_t* out) noexcept nogil:
-    cdef int32_t k, e = p.ptr[i], f = p.ptr[j]
-    for k in range(n):
+    cdef int32_t _k, e = p.ptr[i], f = p.ptr[j]
+    for _k in range(n):
         out[0] = gather(r.compliance + e, r.compliance + f)
         out[1] = gather(p.b + e, p.b + f)
         out[2] = gather(p.step + e, p.step + f)
