@@ -1,7 +1,13 @@
 """The examples run, and the relations that they show hold."""
 
 import importlib.util
+import itertools
 from pathlib import Path
+
+import numpy as np
+import pytest
+
+import lavender as lv
 
 FOLDER = Path(__file__).resolve().parent.parent.parent / "examples"
 
@@ -11,3 +17,233 @@ def example(name):
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
+
+
+# Those of the chapter are run by test_chapter.py.
+@pytest.mark.parametrize("name", ["residual_or_motion", "two_motions", "turns_of_auto"])
+def test_prints_its_numbers_and_saves_its_figure(name, tmp_path, capsys):
+    path = tmp_path / "figure.png"
+    example(name).main(str(path))
+    assert path.read_bytes().startswith(b"\x89PNG")
+    assert str(path) in capsys.readouterr().out
+
+
+def test_direct_does_not_mind_the_condition_number_and_sweeps_do():
+    module = example("direct_or_iterate")
+    found = module.numbers()
+    rows = list(found["systems"].values())
+    for row in rows:
+        assert row["direct"].work["factorisations"] == 1
+        # Backward stable: the residual stays within a modest factor of rounding, whatever the condition.
+        assert row["direct"].residual.relative <= 100 * row["direct"].residual.floor
+        for solver in module.SOLVERS:
+            assert row[solver].success
+            assert row[solver].history.relative[-1] <= module.TOL
+    for easy, hard in itertools.pairwise(rows):
+        ratio = hard["condition"] / easy["condition"]
+        for solver in module.SOLVERS:
+            # Theory: the rate is 1 - c / condition, so sweeps grow like the condition number; within a factor 3 here.
+            growth = hard[solver].work["sweeps"] / easy[solver].work["sweeps"]
+            assert ratio / 3 < growth < 3 * ratio
+    assert all(row["gauss_seidel"].work["sweeps"] < row["jacobi"].work["sweeps"] for row in rows)
+    exact = found["systems"][module.SHOWN]["direct"].impulse
+    off = [np.abs(x - exact).max() for x in found["after"].values()]
+    assert off[0] > 3 * off[1] > 30 * off[2]
+
+
+def test_what_a_factorisation_costs_is_its_structure():
+    module = example("direct_or_iterate")
+    # the count of a dense factor of the same matrix: n^3/6 to leading order, and a band fills its band
+    k = 6
+    a, n = module.lattice(k).toarray(), k * k
+    factor = np.linalg.cholesky(a)
+    below = np.array([np.count_nonzero(np.abs(factor[i + 1 :, i]) > 1e-14) for i in range(n)])
+    by = module.cost(k)
+    assert below.max() == k
+    assert (below * (below + 3) / 2).sum() == pytest.approx(by["banded"], rel=0.25)  # the band's corners
+    assert by["sparse"] < by["banded"] < by["dense"]
+    costs = {k: module.cost(k) for k in (8, 16, 32)}
+    growth = {name: np.log2(costs[32][name] / costs[16][name]) for name in by}
+    # n^3, n k^2 = n^2, and for sweeps nonzeros times a number of sweeps that grows like the condition number, n
+    assert growth["dense"] == pytest.approx(6.0)
+    assert growth["banded"] == pytest.approx(4.0, abs=0.15)
+    assert growth["sparse"] < growth["banded"]
+    assert growth["gauss_seidel"] == pytest.approx(4.0, abs=0.4)
+    assert costs[32]["banded"] < costs[32]["gauss_seidel"] < costs[32]["dense"]
+    assert costs[8]["dense"] < 1.5 * costs[8]["gauss_seidel"]
+
+
+def test_sweeps_solve_the_toy_stack_and_clamping_once_does_not():
+    found = example("toy_stack").numbers()
+    toy, exact = found["problem"], found["exact"]
+    # At rest every contact bears, and the equations alone give the same.
+    assert np.all(found["resting"] > 0.0)
+    np.testing.assert_allclose(
+        toy.dense() @ found["resting"], example("toy_stack").problem(0.0).b, atol=1e-12
+    )
+    # Contact 5 opens; the boxes below carry their own weight alone.
+    assert exact[4] == 0.0
+    assert np.all(np.delete(exact, 4) > 0.0)
+    np.testing.assert_allclose(
+        exact[:4], example("toy_stack").GRAVITY_STEP * np.array([4, 3, 2, 1]), rtol=1e-12
+    )
+    assert found["r_p"][0] > found["r_p"][16] > 100 * found["r_p"][-1]
+    # 400 sweeps at a rate of cos(pi / 10)^2 or better leave nothing but rounding.
+    np.testing.assert_allclose(found["impulse"][-1], exact, rtol=0.0, atol=1e-12)
+    # Clamped: feasible, and wrong: boxes approach, and impulses act on a contact that opens.
+    assert found["clamped"].min() >= 0.0
+    assert found["clamped_slack"].min() < -0.1
+    assert found["clamped_r_p"] > 0.1 > 1e6 * found["r_p"][-1]
+    assert found["r_p"][1] < found["clamped_r_p"]  # one sweep is better already
+    # Clamped after each sweep: rows read impulses that pull, and the end is another point.
+    assert found["lowest"] < -0.1 and found["late_r_p"] > 1e6 * found["r_p"][-1]
+    # A zero on the diagonal: no solution, and no number that is not finite.
+    zero = found["immovable"]
+    assert zero.dense()[-1, -1] == 0.0 < zero.d[-1]
+    assert found["zero"].status is lv.Status.INFEASIBLE and np.isfinite(found["zero"].impulse).all()
+    np.testing.assert_allclose(found["slack"][-1], toy.dense() @ found["impulse"][-1] - toy.b, atol=1e-14)
+    # Where the contact opens each residual is 0 at the other's wrong point.
+    ordinary, projected = found["ordinary"], found["projected"]
+    assert found["points"]["A^-1 b"][4] < -0.1  # it pulls
+    assert ordinary["A^-1 b"] < 1e-12 and projected["A^-1 b"] > 0.1
+    assert ordinary["solution"] > 0.05 and projected["solution"] == 0.0
+    # Complementarity says nothing of depth: solved in every step, and 50 mm deep in the first.
+    residual, depth = found["deep"].T
+    assert residual.max() <= 1e-6
+    assert depth[0] == pytest.approx(0.05, rel=1e-6) and depth[-1] < 1.1e-3
+    assert np.all(np.diff(depth) < 0.0)
+
+
+def test_friction_bounds_are_met_and_the_right_bounds_give_coulomb():
+    module = example("friction_bounds")
+    found = module.numbers()
+    none, *rounds = found["rounds"]
+    assert np.all(none[1::2] == 0.0)
+    # Two rounds give the same: the tangents do not change the normals.
+    np.testing.assert_allclose(rounds[0], rounds[-1], rtol=0.0, atol=1e-12)
+    normal, tangent = rounds[-1][0::2], rounds[-1][1::2]
+    assert np.all(np.abs(tangent) <= module.MU * normal + 1e-12)
+    assert abs(tangent[-1]) == pytest.approx(module.MU * normal[-1], rel=1e-9)  # the top contact slides
+    assert np.abs(found["glued"][1::2]).max() > 2 * module.MU * normal[-1]
+    # tol 1e-9 relative of impulses below 1 N s, times the conditioning of six boxes (about 50).
+    for name in ("osqp", "pgs"):
+        np.testing.assert_allclose(found[name], rounds[-1], rtol=0.0, atol=1e-7)
+    assert found["coulomb"].success
+    np.testing.assert_allclose(found["coulomb"].impulse, rounds[-1], rtol=0.0, atol=1e-8)
+
+
+def test_the_order_that_follows_the_impulse_wins_and_warm_starts_are_closer():
+    found = example("order_and_warm_start").numbers()
+    falling, equal, struck = found["orders"].values()
+    # Measured: 14 and 3.3 times, and 5 % for equal boxes; half of that is asked for.
+    assert 7 * falling["bottom up"] < falling["top down"]
+    assert 1.6 * struck["top down"] < struck["bottom up"]
+    assert 0.9 < equal["bottom up"] / equal["top down"] < 1.1
+    for by in found["orders"].values():
+        assert len(by["random"]) == 20
+        assert len(set(by["random"])) > 10  # the seed matters
+    # The start is off by CHANGE instead of by everything: 1 / CHANGE = 20 times closer, before any sweep.
+    gains = found["cold"] / found["warm"]
+    assert gains[0] == pytest.approx(20.0)
+    assert np.all((gains > 10) & (gains < 60))
+    # Matched in reverse: the lowest contact, which needs the whole weight, gets the least.
+    assert found["stale"][0] == pytest.approx(9.0 * found["cold"][0], rel=1e-6)
+    behind = np.array(example("order_and_warm_start").SWEEPS)[found["stale"] > found["cold"]]
+    assert behind.max() == 8
+    for by in found["histories"].values():
+        assert by["Jacobi"][-1] > 2 * max(by[k][-1] for k in ("bottom up", "top down", "colored"))
+        for name in ("bottom up", "top down", "colored"):
+            assert by[name][0] == 1.0 and by[name][-1] < 0.06
+    falling_lighter = found["histories"]["falling, lighter above"]
+    assert falling_lighter["bottom up"][-1] < falling_lighter["random"][:, -1].min()
+
+
+def test_jacobi_costs_twice_the_sweeps_and_lets_all_rows_go_at_once():
+    module = example("jacobi")
+    found = module.numbers()
+    sweeps = {name: s.work["sweeps"] for name, s in found["stack"].items()}
+    assert all(s.success for s in found["stack"].values())
+    # Two colours: a coloured sweep is two undamped Jacobi sweeps of every other row.
+    assert sweeps["Jacobi, undamped"] == pytest.approx(2 * sweeps["Gauss-Seidel, coloured"], rel=0.02)
+    assert sweeps["Gauss-Seidel"] < sweeps["Gauss-Seidel, coloured"] < 1.2 * sweeps["Gauss-Seidel"]
+    assert sweeps["Jacobi, safe damping"] > sweeps["Jacobi, undamped"]
+    assert not found["repeated"]["Jacobi, undamped"].success
+    assert all(s.success for name, s in found["repeated"].items() if name != "Jacobi, undamped")
+    waiting = {name: np.array(x) for name, x in found["waiting"].items()}
+    assert len(set(waiting["Gauss-Seidel"])) == 1  # threads are no use to it
+    assert waiting["Jacobi, undamped"][0] > 2 * waiting["Gauss-Seidel"][0]
+    assert waiting["Jacobi, undamped"][-1] < 0.1 * waiting["Gauss-Seidel"][-1]
+
+
+def test_a_tolerance_bounds_the_error_and_a_budget_the_cost():
+    module = example("budget_or_tolerance")
+    found = module.numbers()
+    (sweeps, residuals), (fixed_sweeps, fixed_residuals) = found["tolerance"], found["fixed"]
+    assert np.all(residuals <= module.TOL)
+    assert np.all(fixed_sweeps == found["budget"])
+    assert abs(sweeps.mean() - found["budget"]) <= 0.5  # the same cost
+    assert sweeps.max() > 3 * found["budget"]  # but not every step
+    assert np.any(fixed_residuals > module.TOL)  # nor the same error
+
+
+def test_residual_and_motion_error_part_as_the_theory_says():
+    module = example("residual_or_motion")
+    found = module.numbers()
+    factors = []
+    for n in module.HEIGHTS[:2]:
+        values = found["curves"][f"stack(n={n})"]
+        late = values[values[:, 1] < 5e-2]
+        factors.append(np.median(late[:, 2] / late[:, 1]))
+        # 2 sqrt(2 n) / pi for a stack without end; a finite one stays some percent below.
+        assert 0.85 < factors[-1] / (2.0 * np.sqrt(2.0 * n) / np.pi) < 1.05
+    hang = found["curves"]["hang(n=33, tip_mass=1e4)"]
+    assert hang[-1, 1] < 0.2 and hang[-1, 2] > 0.9  # nearly content, and the weight falls all the same
+    residual, error = found["gram"]
+    assert residual.relative == pytest.approx(1.0)
+    # Its share of the energy: sqrt(1e-3 / (3000 + 1e-3)), at equal speeds.
+    assert error.relative == pytest.approx(np.sqrt(1e-3 / 3000.001), rel=1e-6)
+
+
+def test_every_motion_of_the_example_is_a_solution_and_they_differ():
+    module = example("two_motions")
+    found = module.numbers()
+    motions = found["motions"]
+    i, j = module.furthest(motions)
+    assert len(motions) > 3
+    for k in (i, j):
+        assert lv.residual(found["problem"], motions[k].impulse).relative < 1e-10
+    assert (
+        lv.motion.distance(found["problem"], motions[i].impulse, motions[j].impulse).speed == motions.spread
+    )
+    assert found["cone"].lift > 0.1
+
+
+def test_drift_follows_the_motion_error_over_runs(tmp_path):
+    module = example("motion_over_a_run")
+    module.STEPS, module.SWEEPS = 30, (4, 64)
+    found = module.numbers()
+    assert all(value > 0.8 for value in module.ranks(found).values())
+    by = {(run["sweeps"], run["order"], run["warm"]): run for run in found}
+    assert by[4, "bottom_up", False]["drift"][-1] > 10 * by[64, "bottom_up", True]["drift"][-1]
+
+
+def test_a_box_of_pinocchio_comes_to_rest_on_its_corners():
+    pytest.importorskip("pinocchio", reason="needs Pinocchio 4: pip install 'lavender-contact[pinocchio]'")
+    module = example("pinocchio_box")
+    heights, speeds, force, worst = module.run()
+    assert worst <= 1e-8  # what was asked for
+    assert heights.min() > 0.5 * module.SIZE - 1e-4  # it never sinks in
+    assert heights[-1] == pytest.approx(0.5 * module.SIZE, abs=1e-4)
+    assert speeds.max() > 1.0 > 1e-6 > speeds[-1]  # it fell, and rests
+    assert force == pytest.approx(9.81 * module.MASS, rel=1e-6)
+
+
+def test_saps_impulses_on_a_box_of_drake_are_near_the_rigid_ones():
+    pytest.importorskip("pydrake", reason="needs Drake: pip install 'lavender-contact[drake]'")
+    module = example("drake_box")
+    found, force = module.run()
+    assert len(found) > 0.9 * module.STEPS
+    theirs, apart = np.median(found[:, [0, 2]], axis=0)
+    assert found[:, 1].max() <= 1e-9 < theirs < 1e-3  # asked for; SAP's contacts are soft, and little
+    assert apart < 1e-5
+    assert force == pytest.approx(9.81 * module.MASS, rel=1e-3)
