@@ -18,6 +18,7 @@ NAMES = (
     "kernels",
     "lattice",
     "motions",
+    "newton",
     "page",
     "stability",
     "stand",

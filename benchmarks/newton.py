@@ -1,7 +1,7 @@
 """What every form, start, phase and factorisation of `newton` is worth: each taken out alone.
 
-    python benchmarks/bench_newton.py [--sets hard default wild scenes] [--seeds 9000:9060] [--rows 1000]
-                                      [--files 'robots/*.npz'] [--tol 1e-6] [--limit 2] [--only NAME ...] [--save FILE]
+    python -m benchmarks newton [--sets hard,default,wild,scenes] [--seeds 9000:9060] [--rows 1000]
+                                [--files 'robots/*.npz'] [--tol 1e-6] [--limit 2] [--only NAME] [--out FILE]
 
 A part is taken out by putting something in its place while a problem is solved; nothing of the product knows of it. A
 line for each part and class (law, operator, size) on which its absence changes the result's bits or work: problems,
@@ -11,9 +11,7 @@ those then unsolved and those that only then are solved, factorisations and CPU 
 
 from __future__ import annotations
 
-import argparse
 import glob
-import json
 import math
 from collections import defaultdict
 from collections.abc import Callable, Iterator
@@ -21,13 +19,15 @@ from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from time import process_time
-from typing import Any
+from typing import Any, NamedTuple
 from unittest.mock import patch
 
+import click
 import numpy as np
-from bench_islands import forms
 
 import lavender as lv
+from benchmarks.islands import forms
+from benchmarks.output import folder_of, markdown, write_json
 from lavender import suite
 from lavender.problem import Problem
 from lavender.residuals import nothing_to_do
@@ -35,6 +35,18 @@ from lavender.scene.gallery import SCENES
 from lavender.solvers import newton
 from lavender.solvers._newton import convex, coulomb, interior_point, proximal, systems
 from lavender.solvers.warm_start import Tried
+
+
+class Asked(NamedTuple):
+    """Which problems, and how they are solved."""
+
+    sets: list[str]
+    seeds: str
+    rows: int
+    files: str
+    tol: float
+    limit: float  # s
+
 
 Part = tuple[Callable[[Problem], bool], list[tuple[Any, str, Any]], dict[str, Any]]
 
@@ -142,7 +154,7 @@ PARTS: dict[str, Part] = {
 }  # fmt: skip
 
 
-def problems(args: argparse.Namespace) -> Iterator[tuple[str, Problem]]:
+def problems(args: Asked) -> Iterator[tuple[str, Problem]]:
     """Name and problem of all that is asked for."""
     for name in args.sets:
         if name == "wild":
@@ -170,7 +182,7 @@ def kind(p: Problem) -> str:
     return f"{p.law}, {operator}, {size}"
 
 
-def run(p: Problem, part: Part | None, args: argparse.Namespace) -> tuple[bool, int, float, bytes]:
+def run(p: Problem, part: Part | None, args: Asked) -> tuple[bool, int, float, bytes]:
     """(solved or proven infeasible, factorisations, CPU time [s], impulse and work)."""
     with ExitStack() as stack:
         options: dict[str, Any] = {}
@@ -197,7 +209,7 @@ def run(p: Problem, part: Part | None, args: argparse.Namespace) -> tuple[bool, 
     )
 
 
-def compare(p: Problem, parts: dict[str, Part], args: argparse.Namespace) -> Iterator[dict[str, Any]]:
+def compare(p: Problem, parts: dict[str, Part], args: Asked) -> Iterator[dict[str, Any]]:
     """A record for every part whose absence changes anything."""
     run(p, None, args)
     first = run(p, None, args)
@@ -219,14 +231,14 @@ def compare(p: Problem, parts: dict[str, Part], args: argparse.Namespace) -> Ite
         }  # fmt: skip
 
 
-def table(records: list[dict[str, Any]]) -> Iterator[str]:
-    """A line for each part, and for each of its classes."""
-    yield f"{'without':<30}{'class':<24}{'n':>5}{'lost':>6}{'won':>5}{'factors':>9}{'time':>7}{'worst':>7}"
+def table(records: list[dict[str, Any]]) -> str:
+    """A line for each part, and for each of its classes, markdown."""
     grouped = defaultdict(list)
     for r in records:
         grouped[r["part"], ""].append(r)
         grouped[r["part"], r["kind"]].append(r)
     order = {name: i for i, name in enumerate(PARTS)}
+    lines = []
     for (part, of), rs in sorted(grouped.items(), key=lambda item: (order[item[0][0]], item[0][1])):
         both = [r for r in rs if r["with"] and r["without"]]
         mean = [
@@ -235,35 +247,37 @@ def table(records: list[dict[str, Any]]) -> Iterator[str]:
         worst = max((r["time"] for r in both), default=math.nan)
         lost = sum(r["with"] and not r["without"] for r in rs)
         won = sum(r["without"] and not r["with"] for r in rs)
-        counts = f"{len(rs):>5}{lost:>6}{won:>5}{mean[0]:>9.2f}{mean[1]:>7.2f}{worst:>7.1f}"
-        yield f"{'' if of else part:<30}{of or 'all':<24}{counts}"
+        numbers = (f"{mean[0]:.2f}", f"{mean[1]:.2f}", f"{worst:.1f}")
+        lines.append(("" if of else part, of or "all", len(rs), lost, won, *numbers))
+    return markdown(("without", "class", "n", "lost", "won", "factors", "time", "worst"), lines)
 
 
-def main() -> None:
-    """Print the table."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--sets", nargs="*", default=["hard", "default", "wild", "scenes"])
-    parser.add_argument("--seeds", default="9000:9060")
-    parser.add_argument("--rows", type=int, default=1000)
-    parser.add_argument("--files", default="")
-    parser.add_argument("--tol", type=float, default=1e-6)
-    parser.add_argument("--limit", type=float, default=2.0)
-    parser.add_argument("--only", nargs="*", default=list(PARTS))
-    parser.add_argument("--save", default="")
-    args = parser.parse_args()
-    parts, records = {name: PARTS[name] for name in args.only}, []
+@click.command("newton")
+@click.option("--sets", default="hard,default,wild,scenes", show_default=True, help="Names with commas.")
+@click.option("--seeds", default="9000:9060", show_default=True, help="Of wild.")
+@click.option("--rows", default=1000, show_default=True, help="Of wild, at most.")
+@click.option("--files", default="", help="Problem files besides, a pattern.")
+@click.option("--tol", default=1e-6, show_default=True)
+@click.option("--limit", default=2.0, show_default=True, help="Of one solve [s].")
+@click.option("--only", multiple=True, type=click.Choice(list(PARTS)), help="Parts; default: all.")
+@click.option("--out", type=click.Path(path_type=Path), default=None, help="JSON of the lines.")
+def command(
+    sets: str,
+    seeds: str,
+    rows: int,
+    files: str,
+    tol: float,
+    limit: float,
+    only: tuple[str, ...],
+    out: Path | None,
+) -> None:
+    """What every form, start, phase and factorisation of newton is worth: each taken out alone."""
+    folder_of(out)
+    args = Asked(sets.replace(",", " ").split(), seeds, rows, files, tol, limit)
+    parts, records = {name: PARTS[name] for name in only or PARTS}, []
     for name, problem in problems(args):
-        if problem.m == 0 or nothing_to_do(problem):
-            continue
-        for record in compare(problem, parts, args):
-            records.append({"name": name} | record)
-            if args.save:
-                with Path(args.save).open("a") as stream:
-                    stream.write(json.dumps(records[-1]) + "\n")
-    print("\n".join(table(records)))
-
-
-if __name__ == "__main__":
-    main()
+        if problem.m and not nothing_to_do(problem):
+            records += [{"name": name} | record for record in compare(problem, parts, args)]
+    click.echo(table(records))
+    if out is not None:
+        write_json(out, records)
