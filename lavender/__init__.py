@@ -29,7 +29,7 @@ from lavender.solution import Claim, Solution, Status
 from lavender.solve import prepare, solve
 
 if TYPE_CHECKING:
-    from lavender import bench, engine, io, motion, report, scene, suite
+    from lavender import bench, engine, io, motion, phenomena, report, scene, suite
     from lavender.check import CrossCheck, cross_check
     from lavender.engine import SOLVER_FIELDS, Simulation, Snapshot
     from lavender.io import load
@@ -54,6 +54,7 @@ _LATER = {
     "motion": "lavender.motion",
     "motion_error": "lavender.motion",
     "motions": "lavender.motion",
+    "phenomena": "lavender.phenomena",
     "report": "lavender.report",
     "scene": "lavender.scene",
     "solve_many": "lavender.many",
@@ -101,6 +102,7 @@ __all__ = [
     "motion",
     "motion_error",
     "motions",
+    "phenomena",
     "prepare",
     "redundancy",
     "register",

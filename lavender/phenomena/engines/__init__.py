@@ -1,0 +1,132 @@
+"""One file for each engine: `Engine(scene, **options)` steps a scene of lavender; a way is an engine with its setting."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from time import process_time
+from typing import Any
+
+import numpy as np
+
+from lavender._arrays import FloatArray
+from lavender.phenomena.parts import Track
+from lavender.scene import Scene
+from lavender.scene.steppers import STEPPERS
+
+__all__ = ["WAYS", "Stepping", "Way", "follow", "make"]
+
+POINT = "one point of contact for two bodies: boxes do not rest on each other"
+NO_SPIN = "point contacts carry no torque against spinning"
+
+
+class Stepping:
+    """One engine with one scene."""
+
+    dt = 0.0  # s, of one `step`
+    setting = ""  # step, substeps and sweeps, as run
+
+    def step(self) -> Any:
+        """One step of dt."""
+        raise NotImplementedError
+
+    def state(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Positions (n, 3) [m], quaternions (n, 4) w x y z, velocities (n, 6) [m/s, rad/s] in the world."""
+        raise NotImplementedError
+
+    def force(self) -> float:
+        """Force of the first joint [N]; nan where the engine does not tell it."""
+        return float("nan")
+
+    def close(self) -> None:
+        """Let go of what the engine holds."""
+
+
+@dataclass(frozen=True)
+class Way:
+    """An engine with a setting: its own defaults, or one that is recommended."""
+
+    name: str
+    module: str  # of this folder
+    package: str  # that it needs; empty: none
+    options: Mapping[str, Any]
+    text: str  # the setting, in words
+    scene: Mapping[str, Any] = field(default_factory=dict)  # asked of the scene, of our own steppers
+    cannot: Mapping[str, str] = field(default_factory=dict)  # feature of a scene -> why not
+
+    def missing(self) -> str:
+        """What it lacks here; empty where it can run."""
+        if not self.package or importlib.util.find_spec(self.package):
+            return ""
+        return f"not installed: pip install {self.package}"
+
+
+FINE = {"substeps": 16, "solver_iterations": 4}
+
+
+def _own() -> list[Way]:
+    found = []
+    for name, spec in STEPPERS.items():
+        cannot = {} if spec.spin else {"spin": "the stepper has no spin friction"}
+        for more, words in (({}, "4 substeps of 16 sweeps"), (FINE, "16 substeps of 4 sweeps")):
+            full = f"{name} 16x4" if more else name
+            asked = {"stepper": name, "dt": 1 / 60, **more}
+            found.append(Way(full, "own", "", {}, f"1/60 s, {words}", scene=asked, cannot=cannot))
+    return found
+
+
+def _others() -> list[Way]:
+    found = []
+    for cone in ("pyramidal", "elliptic"):
+        for noslip in (0, 10):
+            more = f", {noslip} iterations of noslip" if noslip else ""
+            found.append(
+                Way(
+                    f"mujoco {cone}{' noslip' if noslip else ''}", "mujoco", "mujoco",
+                    {"cone": cone, "noslip": noslip}, f"2 ms, Newton to 1e-8{more}",
+                )
+            )  # fmt: skip
+    found += [
+        Way("pybullet", "bullet", "pybullet", {"sweeps": 50, "substeps": 1}, "1/240 s, 50 sweeps"),
+        Way(
+            "pybullet 4x100",
+            "bullet",
+            "pybullet",
+            {"sweeps": 100, "substeps": 4},
+            "1/240 s in 4 of 100 sweeps",
+        ),
+    ]
+    return found
+
+
+#: Name -> way; ours first.
+WAYS: dict[str, Way] = {way.name: way for way in (*_own(), *_others())}
+
+
+def make(way: Way, scene: Scene) -> Stepping:
+    """The engine of a way with a scene."""
+    module = importlib.import_module(f"lavender.phenomena.engines.{way.module}")
+    made: Stepping = module.Engine(scene, **way.options)
+    return made
+
+
+def follow(engine: Stepping, seconds: float, look: float) -> Track:
+    """Step for so long, and look every `look` seconds, in whole steps; a state that is not finite is the last."""
+    every = max(1, round(look / engine.dt))
+    looks = max(2, int(np.ceil(seconds / (every * engine.dt) - 1e-9)))
+    states, spent, done = [engine.state()], 0.0, 0
+    step = engine.step
+    for _ in range(looks):
+        begin = process_time()
+        for _ in range(every):
+            step()
+        spent += process_time() - begin
+        done += every
+        states.append(engine.state())
+        if not all(np.isfinite(x).all() for x in states[-1]):
+            break
+    x, q, v = (np.array(part) for part in zip(*states, strict=True))
+    time = np.arange(len(states)) * (every * engine.dt)
+    return Track(time, x, q, v, engine.force(), spent / (done * engine.dt), engine.setting)
