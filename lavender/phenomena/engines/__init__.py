@@ -74,6 +74,9 @@ def _own() -> list[Way]:
             full = f"{name} 16x4" if more else name
             asked = {"stepper": name, "dt": 1 / 60, **more}
             found.append(Way(full, "own", "", {}, f"1/60 s, {words}", scene=asked, cannot=cannot))
+        if spec.solvers:
+            asked = {"stepper": name, "dt": 1 / 60, "solver": "newton"}
+            found.append(Way(f"{name} newton", "own", "", {}, "1/60 s, Newton to 1e-6", scene=asked, cannot=cannot))
     return found
 
 
