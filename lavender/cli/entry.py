@@ -15,6 +15,7 @@ from lavender.cli.cases import cases
 from lavender.cli.check import check
 from lavender.cli.doctor import doctor
 from lavender.cli.options import EXIT_BAD_INPUT, EXIT_INTERRUPTED
+from lavender.cli.phenomena import phenomena
 from lavender.cli.record import record
 from lavender.cli.reference import reference
 from lavender.cli.report import report
@@ -33,7 +34,9 @@ def cli() -> None:
     """Constraint solvers of rigid-body simulation: any solver by name, its error in units, its cost."""
 
 
-for _command in (report, bench, check, solve, reference, solvers, cases, run, record, web, view, doctor):
+for _command in (
+    report, bench, check, solve, reference, solvers, cases, run, record, phenomena, web, view, doctor,
+):  # fmt: skip
     cli.add_command(_command)
 
 

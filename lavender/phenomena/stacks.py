@@ -102,8 +102,8 @@ STACKS = (
         title="a tall box on a slope, rough enough not to slide",
         why="what tips and what slides decides every push of a robot and every loaded lorry",
         truth=(
-            "it tips where tan(theta) > w/h: its weight passes outside its foot; the time to 0.5 rad by the integral of "
-            "energy about the edge"
+            "it tips where tan(theta) > w/h: its weight passes outside its foot; the time to 0.5 rad "
+            "by the integral of energy about the edge"
         ),
         parameters={
             "width": Parameter(0.5, 0.1, 1.0, "over its height of 1 m [-]"),

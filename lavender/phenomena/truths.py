@@ -72,11 +72,11 @@ def tipping_time(width: float, height: float, slope: float, angle: float) -> flo
 
 
 def arch_thrust(stones: int, lean: float, thick: float) -> tuple[float, float]:
-    """Least and largest thrust at the apex of a pointed arch that all its joints can bear, over the weight of a stone.
+    """Least and largest thrust at the apex of a pointed arch that all its joints bear, over the weight of a stone.
 
-    A leg is `stones` blocks of length 1 on a skewback, at `lean` [rad] from upright; both legs meet at their upper inner
-    edges, where by symmetry the thrust H is level. Above the joint at distance D from the top hangs the weight D of D
-    blocks. The resultant must pass the joint within its thickness t; moments about its inner and its outer edge say
+    A leg is `stones` blocks of length 1 on a skewback, at `lean` [rad] from upright; both legs meet at their upper
+    inner edges, where by symmetry the thrust H is level. A joint at distance D from the top bears the weight D of D
+    blocks. The resultant must pass it within its thickness t; moments about its inner and its outer edge say
 
         H >= (D tan a - t)/2,        H (D cos a - t sin a) <= D (D sin a + t cos a)/2
 

@@ -1,4 +1,4 @@
-"""One file for each engine: `Engine(scene, **options)` steps a scene of lavender; a way is an engine with its setting."""
+"""One file for each engine: `Engine(scene, **options)` steps a scene; a way is an engine with its setting."""
 
 from __future__ import annotations
 
@@ -18,8 +18,7 @@ from lavender.scene.steppers import STEPPERS
 
 __all__ = ["WAYS", "Stepping", "Way", "follow", "make"]
 
-POINT = "one point of contact for two bodies: boxes do not rest on each other"
-NO_SPIN = "point contacts carry no torque against spinning"
+NO_SPIN = "its friction against spinning has no radius that could be given"
 
 
 class Stepping:
@@ -50,7 +49,7 @@ class Way:
 
     name: str
     module: str  # of this folder
-    package: str  # that it needs; empty: none
+    package: str  # module that it needs; empty: none
     options: Mapping[str, Any]
     text: str  # the setting, in words
     scene: Mapping[str, Any] = field(default_factory=dict)  # asked of the scene, of our own steppers
@@ -60,7 +59,7 @@ class Way:
         """What it lacks here; empty where it can run."""
         if not self.package or importlib.util.find_spec(self.package):
             return ""
-        return f"not installed: pip install {self.package}"
+        return f"not installed: pip install {self.package.replace('pydrake', 'drake')}"
 
 
 FINE = {"substeps": 16, "solver_iterations": 4}
@@ -76,7 +75,9 @@ def _own() -> list[Way]:
             found.append(Way(full, "own", "", {}, f"1/60 s, {words}", scene=asked, cannot=cannot))
         if spec.solvers:
             asked = {"stepper": name, "dt": 1 / 60, "solver": "newton"}
-            found.append(Way(f"{name} newton", "own", "", {}, "1/60 s, Newton to 1e-6", scene=asked, cannot=cannot))
+            found.append(
+                Way(f"{name} newton", "own", "", {}, "1/60 s, Newton to 1e-6", scene=asked, cannot=cannot)
+            )
     return found
 
 
@@ -101,6 +102,24 @@ def _others() -> list[Way]:
             "1/240 s in 4 of 100 sweeps",
         ),
     ]
+    for name, options, text in (
+        ("drake", {"approximation": "lagged", "hydroelastic": False}, "1 ms, point contacts: its defaults"),
+        (
+            "drake lagged",
+            {"approximation": "lagged", "hydroelastic": True},
+            "1 ms, hydroelastic bodies of 1e8 Pa",
+        ),
+        (
+            "drake sap",
+            {"approximation": "sap", "hydroelastic": True},
+            "1 ms, SAP, hydroelastic bodies of 1e8 Pa",
+        ),
+    ):
+        found.append(Way(name, "drake", "pydrake", options, text, cannot={"spin": NO_SPIN}))
+    for sweeps in (22, 88):
+        more = f" {sweeps}" if sweeps != 22 else ""
+        text = f"1/60 s in 4 of {sweeps} sweeps"
+        found.append(Way(f"lavendersim{more}", "lavender_sim", "lavendersim", {"sweeps": sweeps}, text))
     return found
 
 

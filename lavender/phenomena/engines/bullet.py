@@ -67,7 +67,9 @@ class Engine(Stepping):
             baseOrientation=_xyzw(body.quaternion), **self.at,
         )  # fmt: skip
         if body.mass:
-            pybullet.resetBaseVelocity(made, body.velocity.tolist(), body.angular_velocity.tolist(), **self.at)
+            pybullet.resetBaseVelocity(
+                made, body.velocity.tolist(), body.angular_velocity.tolist(), **self.at
+            )
         self.ids[i] = (made, -1)
 
     def _tree(self) -> None:
@@ -102,7 +104,12 @@ class Engine(Stepping):
                 pybullet.setJointMotorControl2(made, k, pybullet.VELOCITY_CONTROL, force=0, **self.at)
             else:
                 pybullet.setJointMotorControlMultiDof(
-                    made, k, pybullet.POSITION_CONTROL, targetPosition=[0, 0, 0, 1], force=[0, 0, 0], **self.at
+                    made,
+                    k,
+                    pybullet.POSITION_CONTROL,
+                    targetPosition=[0, 0, 0, 1],
+                    force=[0, 0, 0],
+                    **self.at,
                 )
 
     def _material(self, body: int, link: int) -> None:
