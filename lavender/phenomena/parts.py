@@ -138,7 +138,9 @@ def crossing(time: FloatArray, x: FloatArray, level: float) -> float:
     below = np.flatnonzero(x < level)
     if not len(below):
         return float("inf")
-    i = max(int(below[0]), 1)
+    i = int(below[0])
+    if i == 0:
+        return float(time[0])
     part = (x[i - 1] - level) / (x[i - 1] - x[i])
     return float(time[i - 1] + part * (time[i] - time[i - 1]))
 

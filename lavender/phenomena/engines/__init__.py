@@ -74,9 +74,17 @@ def _own() -> list[Way]:
             asked = {"stepper": name, "dt": 1 / 60, **more}
             found.append(Way(full, "own", "", {}, f"1/60 s, {words}", scene=asked, cannot=cannot))
         if spec.solvers:
-            asked = {"stepper": name, "dt": 1 / 60, "solver": "newton"}
+            asked = {"stepper": name, "dt": 1 / 60, "solver": "newton", "substeps": 4}
             found.append(
-                Way(f"{name} newton", "own", "", {}, "1/60 s, Newton to 1e-6", scene=asked, cannot=cannot)
+                Way(
+                    f"{name} newton",
+                    "own",
+                    "",
+                    {},
+                    "1/60 s, 4 substeps, Newton to 1e-6",
+                    scene=asked,
+                    cannot=cannot,
+                )
             )
     return found
 
@@ -116,7 +124,7 @@ def _others() -> list[Way]:
         ),
     ):
         found.append(Way(name, "drake", "pydrake", options, text, cannot={"spin": NO_SPIN}))
-    for sweeps in (22, 88):
+    for sweeps in (22, 64):
         more = f" {sweeps}" if sweeps != 22 else ""
         text = f"1/60 s in 4 of {sweeps} sweeps"
         found.append(Way(f"lavendersim{more}", "lavender_sim", "lavendersim", {"sweeps": sweeps}, text))

@@ -68,8 +68,8 @@ class Engine(Stepping):
             if self.bodies[i] is not None and i not in self.up:
                 plant.SetFreeBodyPose(self.context, self.bodies[i], _pose(body.position, body.quaternion))
                 plant.SetFreeBodySpatialVelocity(
-                    context=self.context, body=self.bodies[i],
-                    V_PB=SpatialVelocity(w=body.angular_velocity, v=body.velocity),
+                    self.context, self.bodies[i],
+                    SpatialVelocity(w=body.angular_velocity, v=body.velocity),
                 )  # fmt: skip
         self.simulator.Initialize()
         self.steps = 0

@@ -20,7 +20,8 @@ class Engine(Stepping):
         p = scene.parameters
         self.dt, self.substep = p.dt, p.dt / p.substeps
         self.seen = self.sim.reset()[0]
-        self.setting = f"{1e3 * p.dt:.3g} ms in {p.substeps} of {self.sim.solver_iterations} sweeps"
+        work = f"{self.sim.solver_iterations} sweeps" if p.solver == "sequential_impulses" else p.solver
+        self.setting = f"{1e3 * p.dt:.3g} ms in {p.substeps} of {work}"
         self.over = False
 
     def step(self) -> None:
