@@ -11,7 +11,9 @@ import click
 from lavender.bench.machine import cpu_name, versions
 from lavender.cli.options import parameters_of
 from lavender.phenomena import WAYS, Record, chosen, run
+from lavender.phenomena import motion as motions
 from lavender.phenomena import table as tables
+from lavender.scene.steppers import STEPPERS
 
 __all__ = ["phenomena"]
 
@@ -39,6 +41,12 @@ def _names(text: str | None) -> list[str] | None:
 )  # fmt: skip
 @click.option("--out", type=click.Path(path_type=Path), default=None, help="Every measurement, JSON.")
 @click.option(
+    "--motion", is_flag=True, help="Steppers' distance from a reference on six scenes, against time."
+)
+@click.option(
+    "--plot", type=click.Path(path_type=Path), default=None, help="Figure of --motion (.svg, .png)."
+)
+@click.option(
     "--list", "listed", is_flag=True, help="Tell what each is, its truth and its bounds; run nothing."
 )
 def phenomena(
@@ -48,6 +56,8 @@ def phenomena(
     parameters: tuple[str, ...],
     limit: float,
     out: Path | None,
+    motion: bool,
+    plot: Path | None,
     listed: bool,
 ) -> None:
     """Scenes whose motion is known, measured in every stepper, and in the engines of others.
@@ -58,8 +68,16 @@ def phenomena(
     if listed:
         click.echo(tables.described(chosen(names)))
         return
-    if out is not None and not out.parent.is_dir():
-        raise click.UsageError(f"--out {out}: there is no folder {out.parent}")
+    for path in (out, plot):
+        if path is not None and not path.parent.is_dir():
+            raise click.UsageError(f"{path}: there is no folder {path.parent}")
+    if motion:
+        if names or parameters or engines != "none":
+            raise click.UsageError("--motion goes with --steppers, --out and --plot; its scenes are its own")
+        _motion(_names(steppers), out, plot)
+        return
+    if plot is not None:
+        raise click.UsageError("--plot goes with --motion")
     some = {"steppers": _names(steppers), "engines": _names(engines)}
     found: list[Record] = []
 
@@ -86,6 +104,20 @@ def phenomena(
     click.echo(tables.table(found))
     ran = {r.engine for r in found}
     click.echo("\n" + "\n".join(f"- {way.name}: {way.text}" for way in WAYS.values() if way.name in ran))
+
+
+def _motion(steppers: list[str] | None, out: Path | None, plot: Path | None) -> None:
+    def show(point: motions.Point) -> None:
+        words = point.note or f"{1e3 * point.distance:.3g} mm, {1e3 * point.cpu:.3g} ms a second"
+        click.echo(f"{point.scene}, {point.stepper} {point.substeps} x {point.sweeps}: {words}", err=True)
+
+    found = motions.measure(steppers=steppers or tuple(STEPPERS), show=show)
+    if out is not None:
+        points = [asdict(p) for p in found]
+        out.write_text(json.dumps({"cpu": cpu_name(), "points": points}, indent=1) + "\n", encoding="utf-8")
+    if plot is not None:
+        motions.plot(found, plot)
+    click.echo(motions.table(found))
 
 
 def _told(found: list[Record]) -> dict[str, object]:

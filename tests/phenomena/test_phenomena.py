@@ -12,7 +12,7 @@ from click.testing import CliRunner
 
 import lavender as lv
 from lavender.cli.entry import cli
-from lavender.phenomena import PHENOMENA, WAYS, Record, Track, run, ways
+from lavender.phenomena import PHENOMENA, WAYS, Record, Track, motion, run, ways
 from lavender.phenomena import table as tables
 from lavender.phenomena.engines import follow, make
 from lavender.phenomena.parts import crossing, judged
@@ -296,3 +296,40 @@ def test_the_list_tells_truths_without_running():
     assert done.exit_code == 0
     for name, p in PHENOMENA.items():
         assert f"{name}: {p.title}" in done.output
+
+
+# -- motion against truth -------------------------------------------------------------------------
+
+
+def test_a_reference_is_known_to_its_floor_and_steppers_come_nearer_with_substeps():
+    # the block on the slope: x = g (sin - mu cos) t^2/2 is the reference's truth
+    truth, floor = motion.reference("ramp")
+    assert floor < motion.AGREE
+    a = 9.81 * (math.sin(0.6) - 0.5 * math.cos(0.6))
+    way = np.linalg.norm(truth[:, 1] - truth[0, 1], axis=1)
+    np.testing.assert_allclose(way, 0.5 * a * (np.arange(len(way)) / 60) ** 2, atol=1e-3)
+    points = motion.measure(["ramp"], ["impulses", "soft_step", "xpbd"], [(1, 4), (16, 4)])
+    for stepper in ("impulses", "soft_step", "xpbd"):
+        far, near = (p.distance for p in points if p.stepper == stepper)
+        assert near < 0.2 * far
+    assert [p.sweeps for p in points if p.stepper == "soft_step"] == [5, 5]  # relaxing sweeps count
+
+
+def test_a_stepper_that_does_not_take_a_scene_of_motion_is_a_note():
+    points = motion.measure(["spinner"], ["xpbd", "avbd"], [(1, 16)])
+    assert [("spin" in p.note, math.isnan(p.distance)) for p in points] == [(True, True)] * 2
+    assert "–" in motion.table(points)
+
+
+def test_chaos_is_no_reference(monkeypatch):
+    monkeypatch.setattr(motion, "MOST_SUBSTEPS", 32)
+    with pytest.raises(lv.InputError, match="differ by"):
+        motion.reference("pile", {"n": 8, "kind": "boxes"})
+
+
+def test_the_figure_of_motion(tmp_path):
+    points = motion.measure(["ramp"], ["impulses", "avbd"], [(1, 4), (4, 4)])
+    motion.plot(points, tmp_path / "motion.svg")
+    text = (tmp_path / "motion.svg").read_text()
+    assert "ramp" in text
+    assert text.count("<path") > 10
