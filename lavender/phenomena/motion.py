@@ -147,7 +147,10 @@ def measure(
                     away, note = distance(x, truth), ""
                 except InputError as error:  # a stepper that does not take the scene
                     away, cpu, note = float("nan"), float("nan"), str(error)
-                point = Point(name, spec.name, substeps, sweeps + int(more), away, cpu, floor, note)
+                point = Point(
+                    scene=name, stepper=spec.name, substeps=substeps, sweeps=sweeps + int(more), distance=away,
+                    cpu=cpu, floor=floor, note=note,
+                )  # fmt: skip
                 found.append(point)
                 show(point)
     return found

@@ -67,8 +67,16 @@ def _track(words: bytes, numbers: bytes) -> Track | str:
         x = np.frombuffer(numbers, float)
         time, place, turn, speed, last = np.split(x, np.cumsum([k, 3 * k * n, 4 * k * n, 6 * k * n]))
         shapes = ((k, n, 3), (k, n, 4), (k, n, 6))
-        parts = [a.reshape(s) for a, s in zip((place, turn, speed), shapes, strict=True)]
-        return Track(time, *parts, float(last[0]), float(last[1]), str(said["setting"]))
+        place, turn, speed = (a.reshape(s) for a, s in zip((place, turn, speed), shapes, strict=True))
+        return Track(
+            time=time,
+            positions=place,
+            quaternions=turn,
+            velocities=speed,
+            force=float(last[0]),
+            cpu=float(last[1]),
+            setting=str(said["setting"]),
+        )
     except (ValueError, KeyError, TypeError, IndexError) as error:
         return f"its answer is no track: {error}"
 

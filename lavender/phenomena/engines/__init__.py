@@ -157,6 +157,13 @@ def follow(engine: Stepping, seconds: float, look: float) -> Track:
         states.append(engine.state())
         if not all(np.isfinite(x).all() for x in states[-1]):
             break
-    x, q, v = (np.array(part) for part in zip(*states, strict=True))
-    time = np.arange(len(states)) * (every * engine.dt)
-    return Track(time, x, q, v, engine.force(), spent / (done * engine.dt), engine.setting)
+    x, q, v = (np.array(part, float) for part in zip(*states, strict=True))
+    return Track(
+        time=np.arange(len(states), dtype=float) * (every * engine.dt),
+        positions=x,
+        quaternions=q,
+        velocities=v,
+        force=engine.force(),
+        cpu=spent / (done * engine.dt),
+        setting=engine.setting,
+    )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from pydrake.common.eigen_geometry import Quaternion
 from pydrake.geometry import (
@@ -57,7 +59,7 @@ class Engine(Stepping):
             getattr(DiscreteContactApproximation, "k" + approximation.capitalize())
         )
         plant.mutable_gravity_field().set_gravity_vector(np.asarray(scene.parameters.gravity))
-        self.bodies = [self._add(i) for i in range(scene.n_bodies)]
+        self.bodies: list[Any] = [self._add(i) for i in range(scene.n_bodies)]
         for i in self.up:
             self._join(i)
         plant.Finalize()
@@ -69,7 +71,7 @@ class Engine(Stepping):
                 plant.SetFreeBodyPose(self.context, self.bodies[i], _pose(body.position, body.quaternion))
                 plant.SetFreeBodySpatialVelocity(
                     self.context, self.bodies[i],
-                    SpatialVelocity(w=body.angular_velocity, v=body.velocity),
+                    SpatialVelocity(w=_any(body.angular_velocity), v=_any(body.velocity)),
                 )  # fmt: skip
         self.simulator.Initialize()
         self.steps = 0
@@ -87,11 +89,11 @@ class Engine(Stepping):
             AddCompliantHydroelasticProperties(0.1, MODULUS, made)
         return made
 
-    def _add(self, i: int) -> object:
+    def _add(self, i: int) -> Any:
         body, shape = self.scene.bodies[i], self.scene.bodies[i].shape
         if isinstance(shape, Plane):
-            normal = np.asarray(shape.normal)
-            pose = HalfSpace.MakePose(normal, shape.offset * normal)
+            normal = _any(shape.normal)
+            pose = HalfSpace.MakePose(normal, _any(shape.offset * normal))
             ground = self.plant.world_body()
             self.plant.RegisterCollisionGeometry(ground, pose, HalfSpace(), f"b{i}", self._material(True))
             return None
@@ -99,7 +101,7 @@ class Engine(Stepping):
             raise CapabilityError(f"{body.name} has no shape that drake could be given")
         about = np.diag(body.inertia) / body.mass
         unit = UnitInertia(*about)
-        made = self.plant.AddRigidBody(f"b{i}", SpatialInertia(body.mass, np.zeros(3), unit))
+        made = self.plant.AddRigidBody(f"b{i}", SpatialInertia(body.mass, _any(np.zeros(3)), unit))
         if not self.up:
             solid = DrakeSphere(shape.radius) if isinstance(shape, Sphere) else DrakeBox(*shape.size)
             self.plant.RegisterCollisionGeometry(
@@ -111,12 +113,12 @@ class Engine(Stepping):
         joint, plant = self.up[i], self.plant
         above: Body | None = None if joint.a < 0 else self.scene.bodies[joint.a]
         _, turn = relative(above, self.scene.bodies[i])
-        base = plant.world_frame() if above is None else self.bodies[joint.a].body_frame()  # type: ignore[attr-defined]
-        own = self.bodies[i].body_frame()  # type: ignore[attr-defined]
+        base = plant.world_frame() if above is None else self.bodies[joint.a].body_frame()
+        own = self.bodies[i].body_frame()
         first = plant.AddFrame(FixedOffsetFrame(f"f{i}", base, _pose(joint.anchor_a, turn)))
-        second = plant.AddFrame(FixedOffsetFrame(f"m{i}", own, RigidTransform(joint.anchor_b)))
+        second = plant.AddFrame(FixedOffsetFrame(f"m{i}", own, RigidTransform(_any(joint.anchor_b))))
         if joint.kind == "hinge":
-            plant.AddJoint(RevoluteJoint(joint.name, first, second, joint.axis_b, 0.0))
+            plant.AddJoint(RevoluteJoint(joint.name, first, second, _any(joint.axis_b), 0.0))
         else:
             plant.AddJoint(BallRpyJoint(joint.name, first, second, 0.0))
 
@@ -140,5 +142,10 @@ class Engine(Stepping):
         return x, q, v
 
 
+def _any(x: Any) -> Any:
+    # its stubs ask for arrays of a type that NumPy has no name for
+    return np.asarray(x, float)
+
+
 def _pose(place: FloatArray, turn: FloatArray) -> RigidTransform:
-    return RigidTransform(RotationMatrix(Quaternion(turn / np.linalg.norm(turn))), place)
+    return RigidTransform(RotationMatrix(Quaternion(_any(turn / np.linalg.norm(turn)))), _any(place))

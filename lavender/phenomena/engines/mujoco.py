@@ -53,9 +53,8 @@ class Engine(Stepping):
         body, joint = self.scene.bodies[i], self.up.get(i)
         shape = body.shape
         if isinstance(shape, Plane):
-            turn = f'zaxis="{_text(shape.normal)}"'
-            place = _text(shape.offset * np.asarray(shape.normal))
-            return f'<body name="b{i}"><geom type="plane" size="0 0 1" pos="{place}" {turn}/></body>'
+            at = f'pos="{_text(shape.offset * np.asarray(shape.normal))}" zaxis="{_text(shape.normal)}"'
+            return f'<body name="b{i}"><geom type="plane" size="0 0 1" {at}/></body>'
         if isinstance(shape, Sphere):
             geom = f'type="sphere" size="{shape.radius!r}"'
         elif isinstance(shape, Box):
