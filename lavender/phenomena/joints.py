@@ -142,9 +142,9 @@ JOINTS = (
         },
         cases=({}, {"spin": 15.0}),
         quantities=(
-            Quantity("period", "", 0.01, "relative, of the flips in three periods"),
-            Quantity("energy", "", 0.01, "relative, largest distance"),
             Quantity("momentum", "", 0.01, "relative, largest distance"),
+            Quantity("energy", "", 0.01, "relative, largest distance"),
+            Quantity("period", "", 0.01, "relative, of the flips in three periods"),
         ),
         needs=frozenset({"box"}),
         build=_free,
