@@ -148,17 +148,20 @@ def run(
     UnknownName
         No such phenomenon, stepper, engine or parameter.
     InputError
-        A parameter outside its range; nothing has run.
+        A parameter outside its range, or neither stepper nor engine; nothing has run.
     """
     plan = [
         (p, case)
         for p in chosen(names)
         for case in map(p.values, p.cases if parameters is None else (parameters,))
     ]
+    chosen_ways = ways(steppers, engines)
+    if not chosen_ways:
+        raise InputError("no stepper and no engine to measure; name one, or leave steppers to its default")
     found = []
     apart = Apart(limit)
     try:
-        for way in ways(steppers, engines):
+        for way in chosen_ways:
             for record in _measure(way, plan, apart):
                 found.append(record)
                 show(record)

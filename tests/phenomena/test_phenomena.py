@@ -194,7 +194,7 @@ def test_mujoco_creeps_and_lifts_as_it_is_known_to():
     ],
 )
 def test_an_engine_that_fails_is_a_note_and_the_next_has_a_process(name, words, monkeypatch):
-    monkeypatch.setattr("lavender.phenomena.running.MODULE", "tests.phenomena.broken_engines")
+    monkeypatch.setattr("lavender.phenomena.running.MODULE", "broken_engines")
     apart = Apart(limit=0.5 if name == "sleeps" else 20.0)
     scene = PHENOMENA["stick"].scene()
     way = dataclasses.replace(OTHERS[0], name=name)
@@ -279,6 +279,9 @@ def test_the_command(tmp_path):
         (["stick", "--set", "slope"], "NAME=VALUE"),
         (["stick", "--steppers", "fast"], "unknown stepper"),
         (["stick", "--engines", "fast"], "unknown engine"),
+        (["stick", "--steppers", "none"], "no stepper and no engine"),
+        (["stick", "--motion"], "scenes are its own"),
+        (["--plot", "x.png"], "goes with --motion"),
         (["stick", "--out", "no/such/folder/x.json"], "no folder"),
     ],
 )
