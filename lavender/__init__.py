@@ -31,7 +31,7 @@ from lavender.solution import Claim, Solution, Status, Turn
 from lavender.solve import prepare, solve
 
 if TYPE_CHECKING:
-    from lavender import bench, engine, io, motion, report, scene, suite
+    from lavender import bench, engine, io, motion, phenomena, report, scene, suite
     from lavender.check import CrossCheck, cross_check
     from lavender.engine import SOLVER_FIELDS, Simulation, Snapshot
     from lavender.io import load
@@ -62,6 +62,7 @@ _LATER = {
     "motion": "lavender.motion",
     "motion_error": "lavender.motion",
     "motions": "lavender.motion",
+    "phenomena": "lavender.phenomena",
     "report": "lavender.report",
     "scene": "lavender.scene",
     "solve_many": "lavender.many",
@@ -114,6 +115,7 @@ __all__ = [
     "motion",
     "motion_error",
     "motions",
+    "phenomena",
     "prepare",
     "redundancy",
     "register",

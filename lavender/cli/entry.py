@@ -17,6 +17,7 @@ from lavender.cli.check import check
 from lavender.cli.doctor import doctor
 from lavender.cli.explain import explain
 from lavender.cli.options import EXIT_BAD_INPUT, EXIT_INTERRUPTED
+from lavender.cli.phenomena import phenomena
 from lavender.cli.record import record
 from lavender.cli.reference import reference
 from lavender.cli.report import report
@@ -36,20 +37,8 @@ def cli() -> None:
 
 
 for _command in (
-    report,
-    bench,
-    check,
-    solve,
-    explain,
-    reference,
-    solvers,
-    cases,
-    run,
-    record,
-    web,
-    view,
-    doctor,
-):
+    report, bench, check, solve, explain, reference, solvers, cases, run, record, phenomena, web, view, doctor,
+):  # fmt: skip
     cli.add_command(_command)
 
 

@@ -33,6 +33,7 @@ __all__ = [
     "console",
     "make_plan",
     "one_thread",
+    "parameters_of",
     "plain",
     "plan_options",
     "refuse_unused",
@@ -342,3 +343,21 @@ def plain(text: str) -> str:
     from rich.markup import escape
 
     return escape(text)
+
+
+def parameters_of(words: tuple[str, ...]) -> dict[str, Any]:
+    """`n=20` as {"n": 20}: numbers, true and false, none; else a word."""
+    found: dict[str, Any] = {}
+    for word in words:
+        name, equals, value = word.partition("=")
+        if not equals or not name:
+            raise InputError(f"--set {word!r}; NAME=VALUE is needed")
+        known = {"true": True, "false": False, "none": None}
+        if value.lower() in known:
+            found[name] = known[value.lower()]
+            continue
+        try:
+            found[name] = float(value) if not value.lstrip("+-").isdigit() else int(value)
+        except ValueError:
+            found[name] = value
+    return found

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Any
 
 import click
 
-from lavender.cli.options import refuse_unused
-from lavender.errors import InputError
+from lavender.cli.options import parameters_of, refuse_unused
 
 __all__ = ["run"]
 
@@ -95,7 +93,7 @@ def run(
         steps=steps,
         iterations=iterations,
         warm_start=warm_start,
-        parameters={**_parameters(parameters), **({} if stepper is None else {"stepper": stepper})},
+        parameters={**parameters_of(parameters), **({} if stepper is None else {"stepper": stepper})},
         residual=residual,
         trace=trace,
         plot=plot,
@@ -118,21 +116,3 @@ def run(
             click.echo(f"{name}: {path}")
     if record is not None:
         click.echo(f"{found.recorded} problems in {record}: lavender report {record}")
-
-
-def _parameters(words: tuple[str, ...]) -> dict[str, Any]:
-    """`n=20` as {"n": 20}: numbers, true and false, none; else a word."""
-    found: dict[str, Any] = {}
-    for word in words:
-        name, equals, value = word.partition("=")
-        if not equals or not name:
-            raise InputError(f"--set {word!r}; NAME=VALUE is needed")
-        known = {"true": True, "false": False, "none": None}
-        if value.lower() in known:
-            found[name] = known[value.lower()]
-            continue
-        try:
-            found[name] = float(value) if not value.lstrip("+-").isdigit() else int(value)
-        except ValueError:
-            found[name] = value
-    return found

@@ -12,7 +12,8 @@ The substep:
     1   x, q at the places of free flight
     2   sweeps of (2): joints; contacts where the bodies overlap; friction as an error of place, where it stays in
         its disk, |lambda_t| <= mu lambda_n
-    3   v = (x - x0)/h, omega = 2 (q q0^-1)_xyz / h
+    3   v = (x - x0)/h, omega = 2 (q q0^-1)_xyz / (h (q q0^-1)_w); of a body whose free spin changes, that of free flight
+        and the turn from where it would have come, over h
     4   contacts that bear: what slides is braked by at most mu lambda_n, what parts or closes goes to -e v_n(before)
 
 Nothing is carried from one substep to the next. A soft joint has alpha = 1/k and a damper, c = 2 m zeta omega on its
@@ -143,9 +144,9 @@ cdef inline void correct_joint(engine_t* e, int32_t i) noexcept nogil:
 
 
 cdef inline void turned_by(const double* q, const double* p, double* out) noexcept nogil:
-    # the small rotation from p to q as a vector [rad]: 2 (q p^-1)_xyz
+    # the rotation from p to q as a vector [rad]: 2 (q p^-1)_xyz / (q p^-1)_w, which `turn` makes of it again
     cdef double s = q[0] * p[0] + q[1] * p[1] + q[2] * p[2] + q[3] * p[3]
-    s = 2.0 if s >= 0.0 else -2.0
+    s = 2.0 / s if s != 0.0 else 2.0                    # half a turn in a substep has no such vector
     out[0] = s * (q[1] * p[0] - q[0] * p[1] - q[2] * p[3] + q[3] * p[2])
     out[1] = s * (q[2] * p[0] - q[0] * p[2] - q[3] * p[1] + q[1] * p[3])
     out[2] = s * (q[3] * p[0] - q[0] * p[3] - q[1] * p[2] + q[2] * p[1])
@@ -264,19 +265,24 @@ cdef inline void fly(engine_t* e) noexcept nogil:
 
 
 cdef inline void take_velocities(engine_t* e) noexcept nogil:
-    """Stage 3, dv = v - v*."""
+    """Stage 3, dv = v - v*; of a body whose free spin changes, from where free flight would have turned it."""
     cdef int32_t i, k, b
     cdef double h = e.setting[S_H]
     cdef double p[4]
     cdef double by[3]
+    cdef double spin[3]
     for i in range(e.size[N_DYNAMIC]):
         b = e.body_of[i]
         for k in range(4):
             p[k] = e.dv[6 * i + k]
+        if e.uneven[b]:
+            for k in range(3):
+                spin[k] = e.v[6 * b + 3 + k]
+            drift_rotation(p, spin, e.inertia + 9 * b, e.inv_inertia_body + 9 * b, h)
         turned_by(e.q + 4 * b, p, by)
         for k in range(3):
             e.dv[6 * i + k] = (e.x[3 * b + k] - e.shift[6 * i + k]) / h - e.v_free[6 * i + k]
-            e.dv[6 * i + 3 + k] = by[k] / h - e.v_free[6 * i + 3 + k]
+            e.dv[6 * i + 3 + k] = by[k] / h - (0.0 if e.uneven[b] else e.v_free[6 * i + 3 + k])
 
 
 cdef inline double tangent_speed(const engine_t* e, const double* v, int32_t c, const double* t) noexcept nogil:

@@ -7,6 +7,7 @@ import pytest
 
 import lavender as lv
 from lavender.engine.layout import HEAD
+from lavender.scene.parts import rotation
 from lavender.scene.steppers import STEPPERS, get_stepper
 
 NAMES = tuple(STEPPERS)
@@ -129,6 +130,19 @@ def test_bodies_that_meet_keep_their_momentum(name):
     v = sim.step()[0]["velocities"][:, :3]
     assert np.abs(v[1] - [-2, 0, 0]).max() > 0.1  # they met
     np.testing.assert_allclose(3 * v[0] + v[1], before, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_free_body_keeps_its_angular_momentum(name):
+    # to rounding, which grows with the substeps
+    for size, tol in (((1, 1, 1), 1e-10), ((0.2, 0.6, 1.0), 1e-9)):
+        scene = lv.Scene(stepper=name, dt=1 / 240, gravity=0.0)
+        scene.add_box(size, angular_velocity=(0.25, 5, 0))
+        start = scene.bodies[0].inertia @ np.array([0.25, 5, 0])
+        _, seen = run(scene, 2400)
+        r = rotation(seen["quaternions"][0])
+        end = r @ scene.bodies[0].inertia @ r.T @ seen["velocities"][0][3:]
+        np.testing.assert_allclose(end, start, atol=tol * np.linalg.norm(start))
 
 
 # -- twins ----------------------------------------------------------------------------------------

@@ -1,0 +1,39 @@
+"""LavenderSim with a stepper; the scene says which."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lavender._arrays import FloatArray
+from lavender.engine import Simulation
+from lavender.phenomena.engines import Stepping
+from lavender.scene import Scene
+
+__all__ = ["Engine"]
+
+
+class Engine(Stepping):
+    """`Simulation.step` with its observation."""
+
+    def __init__(self, scene: Scene) -> None:
+        self.sim = Simulation(scene)
+        p = scene.parameters
+        self.dt, self.substep = p.dt, p.dt / p.substeps
+        self.seen = self.sim.reset()[0]
+        work = f"{self.sim.solver_iterations} sweeps" if p.solver == "sequential_impulses" else p.solver
+        self.setting = f"{1e3 * p.dt:.3g} ms in {p.substeps} of {work}"
+        self.over = False
+
+    def step(self) -> None:
+        """See `Stepping.step`; after a body was lost nothing follows."""
+        if not self.over:
+            self.seen, _, self.over, _, _ = self.sim.step()
+
+    def state(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """See `Stepping.state`."""
+        return self.seen["positions"], self.seen["quaternions"], self.seen["velocities"]
+
+    def force(self) -> float:
+        """See `Stepping.force`; the first joint is a ball's three rows."""
+        rows = self.seen["joint_impulses"][:3]
+        return float(np.linalg.norm(rows)) / self.substep if len(rows) == 3 else float("nan")

@@ -1,0 +1,21 @@
+"""Processes in the place of an engine's: each answers once, that it is there, and then fails in its own way."""
+
+import os
+import sys
+import time
+
+from lavender.apart.served import answer, begin, receive
+
+
+def serve(lifeline):
+    requests, answers = begin(lifeline)
+    answer(answers, "{}", b"")
+    name, _, _, _ = receive(requests)
+    if name == "dies":
+        os.abort()
+    if name == "sleeps":
+        time.sleep(60)
+    if name == "babbles":
+        answer(answers, '{"looks": 3, "bodies": 1, "setting": ""}', b"12345678")
+        time.sleep(60)
+    sys.exit(0)
