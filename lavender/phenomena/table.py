@@ -17,7 +17,7 @@ def _number(x: float, unit: str) -> str:
         return "never"
     text = "0" if x < 1e-12 else f"{x:.1e}" if x < 1e-3 or x >= 1e4 else f"{x:.2g}"
     if not unit and 1e-3 <= x < 1.0:
-        return f"{100 * x:.2g} %"
+        return f"{100 * x:.0f} %" if x >= 0.1 else f"{100 * x:.2g} %"
     return f"{text} {unit}".strip()
 
 
