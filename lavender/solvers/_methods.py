@@ -280,7 +280,7 @@ class Velocities(Candidate):
     def turn(self, n: int) -> Claim:
         log = self.log
         if not self.begun:
-            n = min(max(n, STEPS), log.left) if log.problem.derived.first else n
+            n = min(max(n, STEPS), log.left) if self.costs.structure.goes_first else n
             self.impulse = log.impulse.copy() if log.best <= WARM else log.problem.start()
         kernel = self.costs.structure.kernel
         claim = general.run(log.problem, kernel, self.impulse, n, log.tol, log.time_left, self.begun)
@@ -407,7 +407,7 @@ def first_turn(log: SolveLog, found: list[Candidate], planned: tuple[str, int] |
                 )
         found.sort(key=lambda candidate: candidate.name != planned[0])
         return
-    if log.problem.derived.first and found and isinstance(found[0], Velocities):
+    if found and isinstance(found[0], Velocities) and found[0].costs.structure.goes_first:
         # What the compiled call for few rows does, which is in the hands of another thread or did not end it.
         found[0].count()
         found[0].rest = min(c.rest for c in found)
