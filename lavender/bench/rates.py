@@ -68,12 +68,12 @@ def fit(curves: Iterable[Curve], problem_of: Callable[[str], Problem]) -> dict[s
 
     rates: dict[str, Any] = {}
     sweeps, back = of("anderson"), of("nncg")
-    start, row, *work = _least_squares(sweeps, lambda s, n: [1.0, n * s.m, *given(s, n * s.sweep)])
-    rates["anderson"] = {"start": start, "row": row, "work": dict(zip(KINDS, work, strict=True))}
+    start, each_row, *work = _least_squares(sweeps, lambda s, n: [1.0, n * s.m, *given(s, n * s.sweep)])
+    rates["anderson"] = {"start": start, "row": each_row, "work": dict(zip(KINDS, work, strict=True))}
     rates["nncg"] = {}
     finite = of("direct")
-    start, row, one, formed = _least_squares(finite, lambda s, n: [1.0, n * s.m, n * s.direct, s.formed])
-    rates["direct"] = {"start": start, "row": row, "work": one}
+    start, each_row, one, formed = _least_squares(finite, lambda s, n: [1.0, n * s.m, n * s.direct, s.formed])
+    rates["direct"] = {"start": start, "row": each_row, "work": one}
     rates["formed"] = formed
     newton = [(s, c) for s, c in of("newton", "newton over rows") if _is_over_rows(s, c)]
     start, one, *row = _least_squares(

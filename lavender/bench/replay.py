@@ -30,6 +30,7 @@ class Replayed(Candidate):
 
     def __init__(self, name: str, log: Any, costs: Any, curve: Curve, level: float) -> None:
         super().__init__(name, log, costs, registry.get(METHODS[name][0]))
+        self.tape: Any = log
         self.curve, self.level = curve, level
         self.is_finite = not self.spec.resumable
         self.again = self.is_finite and curve.candidate != "newton over velocities"
@@ -55,15 +56,15 @@ class Replayed(Candidate):
         total, now = begun + n, begun
         while now < total:
             now = min(total, now + max(now // 2, FIRST)) if self.name == "anderson" else total
-            self.log.seconds += TURN
+            self.tape.seconds += TURN
             if now >= end or now > last:
                 break
             if self.name == "anderson" and self._gives_way(now):
                 break
         solved = now >= end
         seconds = self.curve.time(self.level) if solved else self.at(now)[0]
-        self.log.seconds += seconds - spent
-        self.log.solved = self.log.solved or solved
+        self.tape.seconds += seconds - spent
+        self.tape.solved = self.tape.solved or solved
         self.done = now
         stuck = not solved and now > last
         return Claim(Status.STALLED if stuck else Status.MAX_ITERATIONS, now - begun)

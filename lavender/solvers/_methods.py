@@ -33,6 +33,10 @@ __all__ = ["FIRST", "Candidate", "make"]
 FIRST, MOST = 16, 64  # sweeps of the first turn at least and at most,
 HOPE = 0.15  # of what the cheapest other costs: so long sweeps go on whatever they promise; and the first turn lasts,
 CHEAP = 0.05  # where FIRST of them cost no more than that share of it: else they have their turn by what they cost
+STEPS = (
+    64  # over velocities that the compiled call for few rows takes, and so does the first turn in its place
+)
+CALL = 20e3  # ns that Python takes for a turn: under Coulomb's law, where others end late, or where they cost no more
 CLOCK = 0.01  # s between two looks at the clock, as counted
 CLOSEST = 1e-2  # of tol, to which the relaxation is solved where Coulomb's residual has not followed
 SHORT = 2e7  # ns of time left, below which sweeps come before anything is counted,
@@ -276,6 +280,7 @@ class Velocities(Candidate):
     def turn(self, n: int) -> Claim:
         log = self.log
         if not self.begun:
+            n = min(max(n, STEPS), log.left) if self.costs.structure.goes_first else n
             self.impulse = log.impulse.copy() if log.best <= WARM else log.problem.start()
         kernel = self.costs.structure.kernel
         claim = general.run(log.problem, kernel, self.impulse, n, log.tol, log.time_left, self.begun)
@@ -402,6 +407,11 @@ def first_turn(log: SolveLog, found: list[Candidate], planned: tuple[str, int] |
                 )
         found.sort(key=lambda candidate: candidate.name != planned[0])
         return
+    if found and isinstance(found[0], Velocities) and found[0].costs.structure.goes_first:
+        # What the compiled call for few rows does, which is in the hands of another thread or did not end it.
+        found[0].count()
+        found[0].rest = min(c.rest for c in found)
+        return
     sweeps = next((c for c in found if c.name == "anderson"), None)
     least = min((c.rest for c in found if c.is_finite), default=np.inf)
     if sweeps is None:
@@ -409,6 +419,7 @@ def first_turn(log: SolveLog, found: list[Candidate], planned: tuple[str, int] |
     sweeps.counted = True
     each = sweeps.cost.each
     cheap = log.problem.law != "linear" and FIRST * each <= CHEAP * least
+    cheap = cheap or (log.problem.law == "coulomb" and FIRST * each <= CALL)
     if cheap or log.ends_late(SURE * least):
         n = int(min(max(HOPE * least / each, FIRST), MOST))
         sweeps.rest = min(sweeps.rest, sweeps.cost.setup + n * each, least)

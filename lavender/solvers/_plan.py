@@ -43,7 +43,7 @@ METHODS: dict[str, tuple[str, dict[str, Any]]] = {
 _GIVEN = {
     "linear": ("direct", "anderson", "newton"),
     "lcp": ("anderson", "direct", "newton", "islands"),
-    "cone": ("anderson", "newton", "admm", "islands"),
+    "cone": ("anderson", "newton", "islands"),
     "coulomb": ("anderson", "newton", "nncg", "islands"),
 }
 #: At most four for each law and operator; "round": cones of more than two tangents.
@@ -53,7 +53,7 @@ TABLE: dict[str, dict[str, tuple[str, ...]]] = {
     "generalized": {
         "linear": ("newton", "direct", "anderson", "newton over rows"),
         "lcp": ("newton", "anderson", "direct", "newton over rows"),
-        "cone": ("newton", "anderson", "admm", "newton over rows"),
+        "cone": ("newton", "anderson", "newton over rows"),
         "coulomb": ("newton", "anderson", "nncg", "newton over rows"),
         "round": ("newton", "nncg", "admm"),
     },

@@ -20,6 +20,8 @@ from lavender.solvers import _rates as weights
 from lavender.solvers._accelerated import sweep_work
 from lavender.solvers._counts import dense_factor, newton_factor, sparse_factor
 from lavender.solvers._factor import PanelsLU, choose, filled_cost, panels_cost
+from lavender.solvers._few import FEW_GENERAL
+from lavender.solvers._gates import general_first
 from lavender.solvers._islands import block_bodies, islands
 from lavender.solvers._newton import general
 from lavender.solvers._newton.systems import System, make_system
@@ -183,6 +185,12 @@ class Structure:
     def kernel(self) -> Any:
         """Newton's method over them with its room; None where there is none for it."""
         return None if self.problem.generalized is None else general.prepare(self.problem)
+
+    @cached_property
+    def goes_first(self) -> bool:
+        """It is what the compiled call for few rows does."""
+        few = self.m <= FEW_GENERAL and self.kernel is not None
+        return few and general_first(self.problem, self.kernel.largest)
 
     @cached_property
     def velocities(self) -> float:

@@ -17,7 +17,6 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.spatial import cKDTree
 
-from lavender._arrays import FloatArray
 from lavender.cones import Cones
 from lavender.errors import UnknownName
 from lavender.problem import Problem
@@ -290,7 +289,7 @@ def foreign(seed: int = 0, rows: int = 3000, part: str = "all") -> Draft:
     bodies = Bodies(world.position, masses_of(rng, masses, len(world.position)), world.inertia)
     bodies.v_free += rng.choice([0.0, 1e-3, 0.05]) * rng.standard_normal(bodies.v_free.shape)
     sideways(bodies, float(rng.choice([0.0, 0.0, 0.2, 1.0])), seed=seed)
-    soft: float | FloatArray | None = None
+    soft: float | None = None
     if name == "jelly":
         soft = 10.0 ** rng.uniform(-4.0, 1.0)
     problem, form = given_as(rng, problem_of(rng, world, bodies, law, soft), form)
