@@ -528,12 +528,19 @@ def example_page(site, cache):
     """Every example: its docstring, what it prints, its figure, its source."""
     parts = [
         "# Examples",
-        "Each is run, and its figure drawn, when these pages are built; a test checks what it shows.",
+        "Those that need no simulator are run when these pages are built; a test checks what each shows.",
     ]
     for path in sorted((ROOT / "examples").glob("*.py")):
         spec = importlib.util.spec_from_file_location(path.stem, path)
         module = importlib.util.module_from_spec(spec)
         spec.loader.exec_module(module)
+        if not inspect.signature(
+            module.main
+        ).parameters:  # draws nothing, and needs what may not be installed
+            first, _, rest = inspect.cleandoc(module.__doc__).partition("\n")
+            source = f"Source: `examples/{path.name}`."
+            parts += [f"## {path.stem}", f"**{first}**", docstrings.markdown(rest), source]
+            continue
         figure = site.path(f"figures/example-{path.stem}.svg")
         printed = io.StringIO()
         with contextlib.redirect_stdout(printed):

@@ -389,7 +389,7 @@ def test_recorded_problems_are_the_problems_of_the_steps(tmp_path):
         chain.record(tmp_path / "joints", 1, form="fclib")
     assert chain.steps == 0
     (tmp_path / "file").write_text("")
-    with pytest.raises(lv.InputError, match="cannot make the folder"):
+    with pytest.raises(lv.InputError, match="cannot make or clear the folder"):
         sim.record(tmp_path / "file", 1)
 
 
