@@ -20,7 +20,8 @@ cpdef enum:
 
 cdef public int32_t lav_export_blocks(int32_t m, const int32_t* type_, const int32_t* id_, const int32_t* codes,
                                       const int32_t* most, const int32_t* dim, const double* friction,
-                                      const int32_t* geom, const double* loss, double dt, int32_t* ptr, int32_t* kind, double* lower,
+                                      const int32_t* geom, const double* loss, double dt, int32_t* ptr, int32_t* kind,
+                                      double* lower,
                                       double* upper, double* mu, double* scale, uint64_t* key) noexcept nogil:
     """Blocks of m rows, how many; -1 - i where row i is of a type that `codes` does not hold, or names what is not there.
 
