@@ -121,12 +121,13 @@ class Lavender(Engine):
 
     name = "lavender"
     solver = "sequential_impulses"
+    stepper = "impulses"
 
     def __init__(self, tower: Tower) -> None:
         own = self.solver == "sequential_impulses"
         scene = Scene(
             "stack", n=tower.boxes, dt=tower.dt, friction=FRICTION, solver=self.solver, substeps=tower.substeps,
-            solver_iterations=tower.sweeps if own else None, order=tower.order if own else None,
+            solver_iterations=tower.sweeps if own else None, order=tower.order if own else None, stepper=self.stepper,
         )  # fmt: skip
         p = scene.parameters
         self.sim = Simulation(scene)
@@ -134,12 +135,26 @@ class Lavender(Engine):
         self.substeps = p.substeps
         self.sweeps = self.sim.solver_iterations if own else 0
         if own and tower.order is not None:
-            self.name = f"lavender, {p.order}"
+            self.name = f"{self.name}, {p.order}"
 
     def centres(self) -> FloatArray:
         """See `Engine.centres`."""
         x: FloatArray = self.sim._state.a["x"][1:]
         return x.copy()
+
+
+class SoftStep(Lavender):
+    """LavenderSim with `soft_step`: as many sweeps again as there are substeps relax."""
+
+    name = "lavender soft_step"
+    stepper = "soft_step"
+
+
+class BlockDescent(Lavender):
+    """LavenderSim with `avbd`."""
+
+    name = "lavender avbd"
+    stepper = "avbd"
 
 
 class LavenderNewton(Lavender):
@@ -286,6 +301,8 @@ class Contestant:
 ENGINES: dict[str, Contestant] = {
     "lavender": Contestant(Lavender, substeps=True),
     "newton": Contestant(LavenderNewton, sweeps=False),
+    "soft_step": Contestant(SoftStep, substeps=True),
+    "avbd": Contestant(BlockDescent, substeps=True),
     "lavendersim": Contestant(Lavendersim, "lavendersim"),
     "mujoco_newton": Contestant(MuJoCoNewton, "mujoco", sweeps=False),
     "mujoco_pgs": Contestant(MuJoCoPGS, "mujoco"),
@@ -423,7 +440,7 @@ def lines(
         for rate in rates:
             for name in engines:
                 c = ENGINES[name]
-                own = name == "lavender"
+                own = isinstance(c.make, type) and c.make in (Lavender, SoftStep, BlockDescent)
                 budgets: list[int | None] = [*sweeps] if c.sweeps else []
                 if not own:
                     budgets.append(None)
@@ -542,7 +559,7 @@ def command(
             raise UnknownName("order", order, SCENE_ORDERS)
     folder_of(out)
     plan = (
-        _numbers(boxes, "--boxes", 1), _numbers(sweeps, "--sweeps", 4), _numbers(rates, "--rates", 1),
+        _numbers(boxes, "--boxes", 1), _numbers(sweeps, "--sweeps", 1), _numbers(rates, "--rates", 1),
         _numbers(substeps, "--substeps", 0),
     )  # fmt: skip
     found = []

@@ -84,7 +84,8 @@ def test_the_command_prints_the_map_and_writes_the_lines(tmp_path):
         (["--engines", "lavendr"], "lavender"),
         (["--orders", "upwards"], "order"),
         (["--boxes", "x"], "--boxes"),
-        (["--sweeps", "3"], "--sweeps"),
+        (["--sweeps", "0"], "--sweeps"),
+        (["--engines", "lavender", "--sweeps", "3"], "solver_iterations"),
         (["--out", "/no/such/folder/x.json"], "no such folder"),
     ],
 )
