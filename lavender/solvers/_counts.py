@@ -5,9 +5,7 @@ from __future__ import annotations
 from lavender.problem import Problem
 from lavender.solvers import _rates as rates
 from lavender.solvers._accelerated import sweep_work
-from lavender.solvers._islands import block_bodies
 from lavender.solvers._newton.systems import PANELS, MatrixSystem, System
-from lavender_ext.factor import graph
 
 
 def sweep_cost(problem: Problem, work: float | None = None) -> float:
@@ -16,28 +14,6 @@ def sweep_cost(problem: Problem, work: float | None = None) -> float:
         rates.SWEEP[problem.law] * (sweep_work(problem) if work is None else work)
         + rates.SWEEP_ROW * problem.m
     )
-
-
-def is_redundant(problem: Problem) -> bool:
-    """The same weight rests on more points than the bodies can tell apart, and none of them is soft.
-
-    Faces on faces; sweeps then hardly move it. With Coulomb friction a Newton method suffers as much.
-    """
-    p = problem
-    if p.rows is None or p.law == "coulomb" or p.m <= 6 * p.rows.n_bodies:
-        return False
-    assert p.compliance is not None
-    if p.compliance.any():
-        return False
-    # Under the cone law not where nearly every contact is between two bodies of its own: sweeps settle which stick.
-    return p.law != "cone" or 4 * graph.body_pairs(block_bodies(p), p.rows.n_bodies, True) <= 3 * p.n_blocks
-
-
-def newton_rates(problem: Problem) -> tuple[float, float, float]:
-    """Of `newton` [ns]: a call, and beside each factor a step and each row."""
-    if problem.rows is not None and problem.rows.n_bodies and problem.law != "coulomb":
-        return rates.BODIES_START, rates.BODIES_STEP, rates.BODIES_ROW
-    return rates.START["newton"], rates.STEP["newton"], rates.NEWTON_ROW[problem.law]
 
 
 def dense_factor(m: float) -> float:

@@ -16,13 +16,6 @@ SPARSE_ROWS = 1000.0  # as many times more as it has thousands of rows: fill gro
 # Of `newton` over rows of A by panels, whose analysis is kept: a factor with its solutions, for each entry of its
 # pattern, and each multiply-add.
 FILLED, FILLED_ENTRY, FILLED_WORK = 50e3, 6.0, 0.12
-UNSYMMETRIC = 2.0  # LU against Cholesky, where friction or A asks for it
-
-# What `newton` weighs its own sweeps by: a call, beside each factor a step, and each row.
-START = {"newton": 300e3}
-STEP = {"newton": 35e3}
-NEWTON_ROW = {"linear": 150.0, "lcp": 150.0, "cone": 300.0, "coulomb": 300.0}
-BODIES_START, BODIES_STEP, BODIES_ROW = 150e3, 8e3, 190.0  # over bodies under a convex law
 
 # Newton over generalised velocities: a call, for each row beside each factor, each multiply-add of the dense factor of
 # an island, most of whose entries are nought unless every contact is inside its cone, and steps to expect.

@@ -200,6 +200,18 @@ def test_without_relaxation_soft_step_gives_the_bits_of_its_problem():
     assert seen["contacts"]["impulses"].ravel().tobytes() == found.tobytes()
 
 
+@pytest.mark.parametrize("name", NAMES)
+def test_a_spec_says_whether_the_exported_problem_is_the_step(name):
+    sim = lv.Simulation(
+        lv.Scene("pyramid", base=3, stepper=name, substeps=1, solver_iterations=7, order="given")
+    )
+    for _ in range(30):
+        sim.step()
+    found = lv.solve(sim.constraint_problem(), "sequential_impulses", tol=0, max_iter=7).impulse
+    same = sim.step()[0]["contacts"]["impulses"].ravel().tobytes() == found.tobytes()
+    assert same == get_stepper(name).exact_problem
+
+
 def dense_descent(sim, passes, keep, stiffening):
     """One substep of `avbd` in NumPy from the exported rows: displacements (6 n)."""
     p = sim.constraint_problem()
