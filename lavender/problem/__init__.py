@@ -1,0 +1,15 @@
+"""The constraint problem of one step: w = A lambda - b, and what bounds lambda.
+
+    A = J M^-1 J^T + diag(compliance)  [1/kg],   b = target - J v*  [m/s],   w = A lambda - b  [m/s]
+
+`Problem` holds rows (J and M^-1 of bodies, `lavender/rows.py`), J and M in generalised coordinates
+(`lavender/generalized.py`) or a matrix, one of them, and derives the rest on first use.
+
+Four files, each over the one before: `data.py` (fields and their checks), `operators.py` (A, J and the metric),
+`builders.py` (ways to make one), `problem.py` (`Problem` itself and its other forms).
+"""
+
+from lavender.problem.data import FRICTION, LAWS, OPERATORS, Names
+from lavender.problem.problem import Problem, VelocityForm
+
+__all__ = ["FRICTION", "LAWS", "OPERATORS", "Names", "Problem", "VelocityForm"]

@@ -1,0 +1,314 @@
+"""Problems from a matrix, from rows of bodies, from J and M, and from the problem of another step."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, TypeVar
+
+import numpy as np
+
+from lavender._arrays import ArrayLike, as_array
+from lavender.cones import ROW, Cones
+from lavender.errors import InputError
+from lavender.generalized import Generalized
+from lavender.problem.operators import Operators
+from lavender.rows import Rows
+from lavender_ext.core.problem import rows_velocity
+
+P = TypeVar("P", bound="Builders")
+
+
+class Builders(Operators):
+    """Ways to make a problem."""
+
+    @classmethod
+    def linear(cls: type[P], A: Any, b: ArrayLike, **more: Any) -> P:
+        """A lambda = b: every row unbounded. A (m, m) [1/kg], b (m,) [m/s]."""
+        b = as_array("b", b, (None,), unit="m/s")
+        return cls(b, Cones.free(len(b)), A, **more)
+
+    @classmethod
+    def lcp(
+        cls: type[P], A: Any, b: ArrayLike, lower: ArrayLike = 0.0, upper: ArrayLike = np.inf, **more: Any
+    ) -> P:
+        """Boxed LCP: lower <= lambda <= upper complementary to A lambda - b; bounds scalar or (m,) [N s]."""
+        b = as_array("b", b, (None,), unit="m/s")
+        bounds = [
+            as_array(n, x, (len(b),), finite=False, unit="N s")
+            for n, x in (("lower", lower), ("upper", upper))
+        ]
+        return cls(b, Cones.bounded(*bounds), A, **more)
+
+    @classmethod
+    def contact(
+        cls: type[P], A: Any, b: ArrayLike, mu: ArrayLike, patch_radius: ArrayLike | None = None, **more: Any
+    ) -> P:
+        """Contacts only, m / k rows each: normal, up to two tangents, spin with `patch_radius`.
+
+        Parameters
+        ----------
+        A : (m, m) 1/kg, array or sparse
+        b : (m,) m/s
+            Normal first in every contact.
+        mu : scalar or (k,)
+            One for each contact. A scalar stands for all of them, which then have two tangents, or for a single one.
+        patch_radius : scalar or (k,) m, optional
+            Gives each contact a spin row.
+
+        Raises
+        ------
+        InputError
+            The rows do not part among the contacts; mu > 0 where contacts have no row for friction.
+        """
+        b = as_array("b", b, (None,), unit="m/s")
+        if np.ndim(mu) == 0:
+            each = 3 + (patch_radius is not None)
+            mu = np.full(max(1, len(b) // each) if len(b) % each == 0 else 1, mu)
+        mu = as_array("mu", np.asarray(mu), (None,))
+        if (len(mu) == 0) != (len(b) == 0) or (len(mu) and len(b) % len(mu)):
+            raise InputError(
+                f"b has {len(b)} rows for {len(mu)} values of mu; the same number of rows for each "
+                "contact is needed"
+            )
+        tangents = len(b) // len(mu) - 1 - (patch_radius is not None) if len(mu) else 0
+        if not 0 <= tangents <= 2:
+            raise InputError(
+                f"{len(b)} rows for {len(mu)} contacts; a contact has a normal, up to two tangents, "
+                "and spin with patch_radius"
+            )
+        if patch_radius is not None:
+            patch_radius = as_array("patch_radius", patch_radius, (len(mu),), unit="m")
+        elif tangents == 0 and np.any(mu > 0.0):
+            raise InputError(
+                f"mu has {len(mu)} values for {len(b)} rows, so each contact is a normal alone, without a row for "
+                "friction: give one mu for each contact (normal and tangents together), or mu = 0"
+            )
+        return cls(b, Cones.contacts(mu, tangents, patch_radius), A, **more)
+
+    @classmethod
+    def from_rows(
+        cls: type[P],
+        rows: Rows,
+        target: ArrayLike = 0.0,
+        *,
+        lower: ArrayLike = -np.inf,
+        upper: ArrayLike = np.inf,
+        mu: ArrayLike = 0.0,
+        tangents: ArrayLike | None = None,
+        patch_radius: ArrayLike | None = None,
+        **more: Any,
+    ) -> P:
+        """Problem of a step from factored rows: b = target - J v*.
+
+        Parameters
+        ----------
+        rows : Rows
+        target : scalar or (m,) m/s
+            Wanted relative velocity after the step: 0 holds, +depth/dt pushes out (depth positive inside), -e v_n
+            bounces off an approach v_n < 0. A gap is a negative depth.
+        lower, upper : scalar or (mj,) N s
+            Bounds of the joint rows.
+        mu : scalar or (c,)
+        tangents : int or (c,), optional
+            Tangent rows of each contact, 0 to 2. Default: two where mu > 0.
+        patch_radius : scalar or (c,) m, optional
+            Gives each contact a spin row.
+        **more
+            As `Problem`: name, friction, ...; the example of `Rows` is a whole stack.
+
+        Raises
+        ------
+        InputError
+            mu > 0 at a contact without tangents and spin, which no row could feel.
+
+        Examples
+        --------
+        A ball of 2 kg and 0.1 m, 0.01 m deep in the ground, is out of it after the step:
+
+        >>> import numpy as np
+        >>> import lavender as lv
+        >>> dt, depth = 1 / 60, 0.01
+        >>> ball = lv.Rows(
+        ...     inv_mass=[0.5],
+        ...     inv_inertia=[np.eye(3) / (0.4 * 2 * 0.1**2)],
+        ...     v_free=[[0.0, 0.0, -9.81 * dt, 0.0, 0.0, 0.0]],
+        ...     contact_body=[(-1, 0)],
+        ...     normal=[(0.0, 0.0, 1.0)],
+        ...     tangent=[(1.0, 0.0, 0.0)],
+        ...     arm_a=[(0.0, 0.0, 0.0)],
+        ...     arm_b=[(0.0, 0.0, -0.09)],
+        ... )
+        >>> impulse = lv.solve(lv.Problem.from_rows(ball, target=depth / dt), tol=1e-9).impulse
+        >>> v = ball.v_free[0, 2] + 0.5 * impulse[0]  # m/s
+        >>> round(float(v * dt), 6)  # m: it rises by its depth
+        0.01
+        """
+        if not isinstance(rows, Rows):
+            raise InputError(f"rows is a {type(rows).__name__}; a Rows is needed")
+        kj, c, mj = rows.n_joints, rows.n_contacts, len(rows.jac)
+        mu = as_array("mu", mu, (c,))
+        if tangents is None:
+            tangents = np.where(mu > 0.0, 2, 0)
+        tangents = as_array("tangents", tangents, (c,), dtype=np.int32)
+        if c and (tangents.min() < 0 or tangents.max() > 2):
+            raise InputError("tangents must be 0, 1 or 2 for each contact")
+        spin = patch_radius is not None
+        smooth = np.flatnonzero((mu > 0.0) & (tangents == 0))
+        if len(smooth) and not spin:
+            raise InputError(
+                f"contact {smooth[0]} has mu {mu[smooth[0]]:g} and no tangent to feel it: give tangents=2, or mu 0"
+            )
+        ptr = np.concatenate([rows.joint_ptr, mj + np.cumsum(1 + tangents + spin)]).astype(np.int32)
+        kind = np.repeat(np.array([ROW, 1 + spin], np.int32), [kj, c])
+        m = int(ptr[-1])
+        low, high = np.full(m, -np.inf), np.full(m, np.inf)
+        low[:mj] = as_array("lower", lower, (mj,), finite=False, unit="N s")
+        high[:mj] = as_array("upper", upper, (mj,), finite=False, unit="N s")
+        both = np.zeros((2, kj + c))
+        both[0, kj:] = mu
+        both[1, kj:] = 0.0 if patch_radius is None else as_array("patch_radius", patch_radius, (c,), unit="m")
+        cones = Cones(ptr=ptr, kind=kind, lower=low, upper=high, mu=both[0], patch_radius=both[1])
+        target = as_array("target", target, (m,), unit="m/s")
+        jv = np.zeros(m + 1)
+        # b = target - J v*: the slack kernel with lambda = 0 and v = v* gives J v* - 0.
+        blank = cls(np.zeros(m), cones, rows=rows, **more)
+        rows_velocity(blank.data, np.ascontiguousarray(rows.v_free), jv)
+        return replace(blank, b=target - jv[:m], copy=False)
+
+    @classmethod
+    def from_jacobian(
+        cls: type[P],
+        J: Any,
+        M: Any,
+        v_free: ArrayLike,
+        *,
+        target: ArrayLike = 0.0,
+        cones: Cones,
+        compliance: ArrayLike | None = None,
+        friction: str = "coulomb",
+        names: Sequence[str] | None = None,
+        dof_names: Sequence[str] | None = None,
+        **more: Any,
+    ) -> P:
+        """Problem of a step in generalised coordinates: w = J v+ - target + compliance lambda.
+
+        Parameters
+        ----------
+        J : (m, nv) array or sparse
+            Rows in the order of `cones`, e.g. `Cones.free(6) + Cones.contacts(0.5, count=8)`; of a contact its normal,
+            then its two tangents.
+        M : (nv, nv) array or sparse, or a sequence of square blocks, one for each kinematic tree
+            Mass matrix, symmetric positive definite. J and M are copied, whatever `copy` says.
+        v_free : (nv,) m/s, rad/s
+            v*, the velocity after the step without constraint impulses.
+        target : scalar or (m,) m/s
+            Wanted relative velocity after the step: 0 holds, +depth/dt pushes out (depth positive inside), -e v_n
+            bounces off an approach v_n < 0. A gap is a negative depth.
+        cones : Cones
+        compliance : scalar or (m,) 1/kg, optional
+        friction : {"coulomb", "cone"}
+        names, dof_names : sequence of str (k,), (nv,), optional
+            Names of blocks and of velocities.
+
+        Raises
+        ------
+        InputError
+            As `Generalized` and `Problem`.
+
+        Examples
+        --------
+        A cart of 2 kg with a pole of 1 kg and 0.5 m runs with its tip into a wall, friction 0.5 in one tangent:
+
+        >>> import numpy as np
+        >>> import lavender as lv
+        >>> c, s = 0.5 * np.cos(0.3), 0.5 * np.sin(0.3)
+        >>> M = [[3.0, c], [c, 0.25]]  # of cart and hinge
+        >>> J = [[1.0, c], [0.0, s]]  # velocity of the tip off the wall, and along it
+        >>> cones = lv.Cones.contacts(0.5, tangents=1)
+        >>> problem = lv.Problem.from_jacobian(J, M, v_free=[-1.0, 0.2], cones=cones)
+        >>> solution = lv.solve(problem, tol=1e-9)
+        >>> solution.impulse.round(3).tolist()  # N s: it slides, 0.579 = 0.5 x 1.158
+        [1.158, -0.579]
+
+        The same with the tip 0.01 m inside the wall, and a step of 1/60 s:
+
+        >>> inside = problem.updated(target=[0.01 * 60, 0.0])
+        >>> pushed = lv.solve(inside, tol=1e-9)
+        >>> round(float((inside.generalized.velocity_of(inside.velocity(pushed.impulse)))[0] / 60), 6)  # m
+        0.01
+        """
+        generalized = J if isinstance(J, Generalized) else Generalized(J, M, v_free, dof_names)
+        m = generalized.m
+        if isinstance(cones, Cones) and cones.n_rows != m:
+            hint = (
+                " (a contact has a normal and two tangents, or tangents=0, 1)" if np.any(cones.kind) else ""
+            )
+            raise InputError(f"J has {m} rows; {cones.n_rows} are needed, as the cones have{hint}")
+        target = as_array("target", target, (m,), unit="m/s")
+        if compliance is not None:
+            compliance = as_array("compliance", compliance, (m,), unit="1/kg")
+        return cls(
+            generalized.bias(target),  # what is not finite, the problem refuses
+            cones,
+            friction=friction,
+            compliance=compliance,
+            names=names,
+            generalized=generalized,
+            **more,
+        )
+
+    def updated(
+        self: P,
+        *,
+        J: Any = None,
+        M: Any = None,
+        v_free: ArrayLike | None = None,
+        b: ArrayLike | None = None,
+        target: ArrayLike | None = None,
+        guess: ArrayLike | None = None,
+    ) -> P:
+        """The same structure with new numbers: what is not given stays.
+
+        Parameters
+        ----------
+        J, M, v_free : as in `from_jacobian`
+            Only in generalised coordinates; copied, so that a loop may fill the same arrays again.
+        b : (m,) m/s, optional
+            The right-hand side itself; or
+        target : scalar or (m,) m/s, optional
+            b = target - J v*.
+        guess : (m,) N s, optional
+            Default: none, as it belongs to other numbers.
+
+        Raises
+        ------
+        InputError
+            J, M, v_free or target without J and M; both b and target, or neither with a new J or v*.
+        """
+        general = self.generalized
+        new = (J, M, v_free, target)
+        if general is None and any(x is not None for x in new):
+            raise InputError("J, M, v_free and target go with a problem in generalised coordinates; give b")
+        if b is not None and target is not None:
+            raise InputError("give b or target, not both")
+        if b is None and target is None and (J is not None or v_free is not None):
+            raise InputError("with a new J or v_free the right-hand side is another: give target or b")
+        if general is not None and any(x is not None for x in (J, M, v_free)):
+            general = (
+                general.with_jacobian(J, v_free)
+                if M is None
+                else Generalized(
+                    general.jac if J is None else J,
+                    general.mass if M is None else M,
+                    general.v_free if v_free is None else v_free,
+                    general.names,
+                )
+            )
+        if target is not None and general is not None:
+            with np.errstate(over="ignore", invalid="ignore"):  # what is not finite, the problem refuses
+                b = as_array("target", target, (self.m,), unit="m/s") - general.velocity_of(general.v_free)
+        # Private here, so that nothing else is copied a second time.
+        given = self.b if b is None else as_array("b", b, (self.m,), unit="m/s")
+        warm = None if guess is None else as_array("guess", guess, (self.m,), unit="N s")
+        return replace(self, generalized=general, b=given, guess=warm, copy=False)

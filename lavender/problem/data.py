@@ -1,0 +1,314 @@
+"""What a problem is given as: arrays checked once, sizes, names, equality."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, fields
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import scipy.sparse as sp
+
+from lavender._arrays import ArrayLike, FloatArray, as_array, check_not_negative, equal, read_only, table_of
+from lavender._derived import Derived
+from lavender.cones import CONTACT_SPIN, ROUND, ROW, Cones
+from lavender.errors import InputError
+from lavender.generalized import Generalized
+from lavender.rows import Rows
+from lavender_ext.core.blocks import are_joints_then_contacts
+from lavender_ext.core.problem import LAWS as FRICTION_NUMBER
+from lavender_ext.core.problem import general_data
+from lavender_ext.judge import measure
+
+FRICTION = tuple(FRICTION_NUMBER)
+# A solver that takes a law takes every law before it that it contains: linear < lcp < coulomb | cone.
+LAWS = ("linear", "lcp", "coulomb", "cone")
+# How A is given.
+OPERATORS = ("rows", "matrix", "generalized")
+
+
+class Names(Sequence[str]):
+    """Names of blocks that are made when they are first asked for; equal to a tuple of the same words."""
+
+    def __init__(self, count: int, make: Callable[[], Sequence[str]]) -> None:
+        self._count, self._make = count, make
+        self._made: tuple[str, ...] | None = None
+
+    def _words(self) -> tuple[str, ...]:
+        if self._made is None:
+            self._made = tuple(self._make())
+        return self._made
+
+    def __len__(self) -> int:
+        return self._count
+
+    def __getitem__(self, i: Any) -> Any:
+        return self._words()[i]
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, (Names, tuple)) and self._words() == tuple(other)
+
+    def __hash__(self) -> int:
+        return hash(self._words())
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return tuple, (self._words(),)
+
+
+@dataclass(frozen=True, eq=False)
+class ProblemData:
+    """The fields of a `Problem`, checked; what follows from them is worked out by the classes over this one."""
+
+    b: FloatArray
+    cones: Cones
+    matrix: Any = None
+    rows: Rows | None = None
+    friction: str = "coulomb"
+    compliance: FloatArray | None = None
+    guess: FloatArray | None = None
+    key: Any = None
+    names: Sequence[str] | None = None
+    name: str = ""
+    copy: bool = field(default=True, repr=False)
+    generalized: Generalized | None = None
+    derived: Derived = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        put = object.__setattr__
+        if not isinstance(self.cones, Cones):
+            raise InputError(
+                f"cones is a {type(self.cones).__name__}; a Cones is needed (Cones.bounded, Cones.contacts)"
+            )
+        m, k = self.cones.n_rows, self.cones.n_blocks
+        put(self, "derived", Derived())
+        put(self, "b", as_array("b", self.b, (m,), unit="m/s", copy=self.copy))
+        if (self.matrix is None) + (self.rows is None) + (self.generalized is None) != 2:
+            raise InputError("give matrix=, rows= or generalized=, one of them")
+        if self.friction not in FRICTION:
+            raise InputError(f"friction is {self.friction!r}; {' or '.join(map(repr, FRICTION))} is needed")
+        if self.friction != "cone" and self.cones.has_round:
+            raise InputError(
+                "a round cone of more than two tangents has no Coulomb law here: give friction='cone'"
+            )
+        if self.rows is not None:
+            self._check_rows(self.rows, m, k)
+        elif self.generalized is not None:
+            self._check_generalized(self.generalized, m)
+        else:
+            put(self, "matrix", _checked_matrix(self.matrix, m, self.copy))
+            if sp.issparse(self.matrix):  # checked arrays; those of the object anybody may exchange
+                put(self, "_compressed", (self.matrix.indptr, self.matrix.indices, self.matrix.data))
+            if self.compliance is not None:
+                raise InputError("compliance goes with rows; in a matrix it is already on the diagonal of A")
+        if self.guess is not None:
+            put(self, "guess", as_array("guess", self.guess, (m,), unit="N s", copy=self.copy))
+        if self.key is not None:
+            key = np.asarray(self.key)
+            if (
+                key.shape != (k,)
+                or key.dtype.kind not in "ui"
+                or (key.dtype.kind == "i" and key.size and key.min() < 0)
+            ):
+                raise InputError(
+                    f"key has shape {key.shape} and dtype {key.dtype}; ({k},) unsigned 64-bit is needed"
+                )
+            put(self, "key", read_only(key.astype(np.uint64)))
+        if self.names is not None:
+            names = self.names if isinstance(self.names, Names) else tuple(map(str, self.names))
+            if isinstance(self.names, str) or len(names) != k:
+                raise InputError(f"{len(names)} names for {k} blocks; one for each block is needed")
+            put(self, "names", names)
+        put(self, "name", str(self.name))
+        put(self, "copy", True)  # of what was given here: another problem made of this one says so itself
+
+    def _check_rows(self, rows: Rows, m: int, k: int) -> None:
+        if not isinstance(rows, Rows):
+            raise InputError(f"rows is a {type(rows).__name__}; a Rows is needed")
+        self._check_compliance(m)
+        kj = rows.n_joints
+        if kj + rows.n_contacts == k and are_joints_then_contacts(self.cones._blocks, rows.joint_ptr):
+            return
+        kind = self.cones.kind
+        if (
+            kj + rows.n_contacts != k
+            or np.any(kind[:kj] != ROW)
+            or np.any(kind[kj:] == ROW)
+            or self.cones.has_round
+        ):
+            raise InputError(
+                f"rows has {kj} joints and {rows.n_contacts} contacts; cones must have as many ROW "
+                f"blocks, then contacts (it has {k} blocks)"
+            )
+        if not np.array_equal(self.cones.ptr[: kj + 1], rows.joint_ptr):
+            raise InputError("cones.ptr and rows.joint_ptr disagree about the rows of the joints")
+
+    def _check_generalized(self, generalized: Generalized, m: int) -> None:
+        if not isinstance(generalized, Generalized):
+            raise InputError(f"generalized is a {type(generalized).__name__}; a Generalized is needed")
+        if generalized.m != m:
+            raise InputError(f"J has {generalized.m} rows; {m} are needed, as the cones have")
+        self._check_compliance(m)
+        self.derived.view = general_data(
+            self.cones._blocks, self.b, generalized.operator, self.compliance, FRICTION_NUMBER[self.friction]
+        )
+
+    def _check_compliance(self, m: int) -> None:
+        put = object.__setattr__
+        if self.compliance is None:
+            put(self, "compliance", read_only(np.zeros(m)))
+            return
+        put(self, "compliance", as_array("compliance", self.compliance, (m,), unit="1/kg", copy=self.copy))
+        check_not_negative("compliance", self.compliance)
+
+    # -- size and kind --------------------------------------------------------------------------
+
+    @property
+    def m(self) -> int:
+        """Number of rows."""
+        return len(self.b)
+
+    @property
+    def operator(self) -> str:
+        """How A is given, of OPERATORS: "rows", "matrix" or "generalized"."""
+        return "rows" if self.rows is not None else "matrix" if self.generalized is None else "generalized"
+
+    @property
+    def n_blocks(self) -> int:
+        """Number of blocks, k."""
+        return self.cones.n_blocks
+
+    @cached_property
+    def law(self) -> str:
+        """Problem class, from what the blocks hold: "linear", "lcp", "coulomb" or "cone"."""
+        if self.cones.is_free:
+            return "linear"
+        return "lcp" if self.cones.is_bounded_rows else self.friction
+
+    def impulse_array(self, impulse: ArrayLike, name: str = "impulse") -> FloatArray:
+        """A writable private copy of `impulse`, checked: (m,) [N s], finite."""
+        if type(impulse) is np.ndarray and impulse.dtype == np.float64 and impulse.shape == self.b.shape:
+            own = impulse.copy()
+            if measure.all_finite(own):
+                return own
+        return as_array(name, impulse, (self.m,), unit="N s").copy()
+
+    # -- names -----------------------------------------------------------------------------------
+
+    def block_of(self, row: int) -> int:
+        """Block that holds a row."""
+        return int(np.searchsorted(self.cones.ptr, row, side="right")) - 1
+
+    def row_name(self, row: int) -> str:
+        """Name of a row, e.g. "hinge 7, axis 2" or "contact 3, tangent 1".
+
+        Raises
+        ------
+        InputError
+            No such row.
+        """
+        if not 0 <= row < self.m:
+            raise InputError(f"row {row} of a problem of {self.m} rows")
+        i = self.block_of(row)
+        offset, size, kind = row - int(self.cones.ptr[i]), int(np.diff(self.cones.ptr)[i]), self.cones.kind[i]
+        if kind == ROW:
+            name = self.names[i] if self.names else f"row {row}" if size == 1 else f"joint {i}"
+            return name if size == 1 else f"{name}, axis {offset}"
+        first_contact = 0 if self.rows is None else self.rows.n_joints
+        if self.generalized is not None:
+            first_contact = int(np.count_nonzero(self.cones.kind[:i] == ROW))
+        name = self.names[i] if self.names else f"contact {i - first_contact}"
+        if offset == 0:
+            return f"{name}, normal"
+        if kind == ROUND and offset > 2:
+            return f"{name}, spin" if offset == 3 else f"{name}, roll {offset - 3}"
+        return f"{name}, spin" if kind == CONTACT_SPIN and offset == size - 1 else f"{name}, tangent {offset}"
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, ProblemData):
+            return NotImplemented
+        if not all(
+            equal(getattr(self, n), getattr(other, n))
+            for n in (
+                "b",
+                "cones",
+                "rows",
+                "generalized",
+                "friction",
+                "compliance",
+                "guess",
+                "key",
+                "names",
+                "name",
+            )
+        ):
+            return False
+        if sp.issparse(self.matrix) and sp.issparse(other.matrix):
+            return all(
+                equal(getattr(self.matrix, n), getattr(other.matrix, n))
+                for n in ("indptr", "indices", "data")
+            )
+        return type(self.matrix) is type(other.matrix) and equal(self.matrix, other.matrix)
+
+    __hash__ = None  # type: ignore[assignment]
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # Copies and pickles hold what was given; derived numbers are made anew, arrays stay read-only.
+        return type(self), tuple(f.name != "copy" and getattr(self, f.name) for f in fields(self) if f.init)
+
+    def __repr__(self) -> str:
+        kind = self.operator if self.matrix is None else "CSR" if sp.issparse(self.matrix) else "dense"
+        name = f"{self.name!r}, " if self.name else ""
+        return (
+            f"<Problem {name}{self.law}, {_many(self.m, 'row')} in {_many(self.n_blocks, 'block')}, {kind}>"
+        )
+
+    def _repr_html_(self) -> str:
+        """For notebooks: what it is, as a small table."""
+        contacts = int(np.count_nonzero(self.cones.kind != ROW))
+        facts = {
+            "law": self.law,
+            "rows": self.m,
+            "contacts": contacts,
+            "other blocks": self.n_blocks - contacts,
+            "given by": repr(self).rpartition(", ")[2].rstrip(">"),
+        }
+        return table_of(facts, self.name or "Problem")
+
+
+def _many(n: int, what: str) -> str:
+    return f"{n} {what}" if n == 1 else f"{n} {what}s"
+
+
+def _checked_matrix(matrix: Any, m: int, copy: bool) -> Any:
+    if not sp.issparse(matrix):
+        return as_array("A", matrix, (m, m), unit="1/kg", copy=copy)
+    if matrix.shape != (m, m):
+        raise InputError(f"A has shape {matrix.shape}; ({m}, {m}) is needed, as b has {m} rows")
+    if matrix.nnz >= 2**31:
+        raise InputError(
+            f"A has {matrix.nnz} nonzeros, more than 32-bit indices reach; give J and M^-1 instead "
+            "(Problem.from_rows)"
+        )
+    if matrix.dtype.kind not in "buif":
+        raise InputError(f"A has dtype {matrix.dtype}; real numbers are needed")
+    given = sp.csr_array(matrix, copy=copy)
+    try:
+        given.check_format(full_check=True)  # kernels trust every index
+    except ValueError as error:
+        raise InputError(
+            f"A is not a valid compressed matrix ({error}); check its indices and pointers"
+        ) from None
+    as_array("A", given.data, (None,), unit="1/kg", copy=False)
+    return _canonical(given, m)
+
+
+def _canonical(a: sp.csr_array, m: int) -> sp.csr_array:
+    if not a.has_canonical_format:
+        a = a.copy()
+        a.sum_duplicates()
+    parts = [
+        read_only(np.ascontiguousarray(x, t))
+        for x, t in ((a.data, np.float64), (a.indices, np.int32), (a.indptr, np.int32))
+    ]
+    return sp.csr_array(tuple(parts), shape=(m, m))

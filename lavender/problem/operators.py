@@ -1,0 +1,232 @@
+"""What follows from a problem's data, worked out at first use and kept: A, J, the metric, velocities."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import scipy.sparse as sp
+
+from lavender._arrays import ArrayLike, FloatArray, IntArray, read_only
+from lavender._derived import once
+from lavender.errors import CapabilityError, InputError
+from lavender.problem.data import ProblemData
+from lavender_ext.core import assemble
+from lavender_ext.core.problem import LAWS as FRICTION_NUMBER
+from lavender_ext.core.problem import Data, dense_to_csr, nothing_done
+from lavender_ext.judge import measure
+from lavender_ext.pivot import principal
+
+
+class Operators(ProblemData):
+    """A, J and what kernels and the judge read, of the problem's data."""
+
+    @cached_property
+    def asymmetry(self) -> float:
+        """max |A - A^T| / max |A|; exactly 0 with J and M."""
+        if self.matrix is None:
+            return 0.0
+        gap, big = self._scan[2:]
+        return gap / big if big > 0.0 else 0.0
+
+    @cached_property
+    def bandwidth(self) -> tuple[int, int]:
+        """Lower and upper half bandwidth of A: the largest i - j and j - i of a stored entry."""
+        if self.rows is None:
+            return self._scan[:2]
+        return principal.bandwidth(*self._compressed[:2])
+
+    @cached_property
+    def _scan(self) -> tuple[int, int, float, float]:
+        return principal.scan(*self._compressed)
+
+    @property
+    def is_symmetric(self) -> bool:
+        """A = A^T up to rounding of its entries (1e-14 of the largest)."""
+        return self.asymmetry <= 1e-14
+
+    @once
+    def data(self) -> Data:
+        """What kernels that sweep read: pointers, d, nu, steps. Of the rows where there are rows, else of A."""
+        if self.rows is None:
+            return self.csr_data
+        r = self.rows
+        return self._data(
+            rows=(
+                r.jac,
+                r.joint_body,
+                r.normal,
+                r.tangent,
+                r.arm_a,
+                r.arm_b,
+                r.contact_body,
+                r.inv_mass,
+                r.inv_inertia,
+                self.compliance,
+            )
+        )
+
+    @once
+    def csr_data(self) -> Data:
+        """The same over A in compressed rows; forms A where J and M are given."""
+        data = self._data(csr=self._compressed)
+        if self.rows is not None:
+            data.weigh_as(self.metric)
+        if self.generalized is not None and self.metric.start_energy >= 0.0:
+            data.set_start(self.metric.start_energy, self.metric.start_velocity)
+        return data
+
+    @once
+    def metric(self) -> Data:
+        """What the judge reads: `data`, or in generalised coordinates J and M as they are, d, Y = J L^-1 D^-1/2."""
+        view = self.derived.view
+        if view is None:
+            return self.data
+        try:
+            view.prepare()
+        except OverflowError as error:
+            raise InputError(f"the problem is too large: {error}") from None
+        return view
+
+    def _data(self, **operator: Any) -> Data:
+        return Data(self.cones._blocks, self.b, FRICTION_NUMBER[self.friction], **operator)
+
+    @once
+    def csr(self) -> sp.csr_array:
+        """A in compressed rows (m, m), int32 indices, read-only."""
+        if sp.issparse(self.matrix):
+            return self.matrix
+        indptr, indices, data = self._compressed
+        return sp.csr_array((data, indices, indptr), shape=(self.m, self.m))
+
+    @once
+    def _compressed(self) -> tuple[IntArray, IntArray, FloatArray]:
+        # (indptr, indices, data) of A. Kernels and the judge read these: `csr` is an object whose arrays whoever
+        # has it may exchange.
+        if self.generalized is not None:
+            return self._product()
+        if self.rows is not None:
+            most, start, blocks = assemble.bound(self.data)
+            if most >= 2**31:
+                raise InputError(
+                    f"A would have up to {most} entries, more than 32-bit indices reach: "
+                    "use a solver that reads rows"
+                )
+            indptr, indices, data = assemble.delassus(self.data, most, start, blocks)
+            return read_only(indptr), read_only(indices), read_only(data)
+        return dense_to_csr(self.matrix)
+
+    def _product(self) -> tuple[IntArray, IntArray, FloatArray]:
+        # A = Y Y^T + diag(compliance): symmetric to the bit, as both triangles are summed in the same order.
+        y = self.whitened
+        most = float(np.sum(np.bincount(y.indices, minlength=1).astype(float) ** 2))
+        if most >= 2**31:
+            raise InputError(
+                f"A would have up to {most:.3g} entries, more than 32-bit indices reach: use a solver that takes "
+                "J and M as they are (operator 'generalized')"
+            )
+        indptr, indices, data = assemble.gram(y.data, y.indices, y.indptr, y.shape[1], self.compliance)
+        return read_only(indptr), read_only(indices), read_only(data)
+
+    @once
+    def whitened(self) -> sp.csr_array:
+        """Y (m, nv) with J M^-1 J^T = Y Y^T, read-only; only in generalised coordinates.
+
+        Raises
+        ------
+        CapabilityError
+            The problem was given otherwise.
+        """
+        if self.generalized is None:
+            raise CapabilityError(
+                f"this problem was given as {self.operator}; Y is known in generalised coordinates "
+                "(Problem.from_jacobian)"
+            )
+        return _read_only(sp.csr_array(self.metric.whitened(), shape=(self.m, self.generalized.nv)))
+
+    @once
+    def jacobian(self) -> sp.csr_array:
+        """J as CSR, read-only: (m, 6 n) with rows, (m, nv) in generalised coordinates.
+
+        Raises
+        ------
+        CapabilityError
+            The problem was given as a matrix.
+        """
+        if self.generalized is not None:
+            return self.generalized.jac
+        if self.rows is None:
+            raise CapabilityError(
+                "this problem was given as a matrix; its Jacobian is not known (make it with "
+                "Problem.from_rows or Problem.from_jacobian)"
+            )
+        return _read_only(self.rows.jacobian(self.cones))
+
+    @property
+    def d(self) -> FloatArray:
+        """(m,) 1/kg: diagonal of A with fallbacks, the judge's metric."""
+        return self.metric.d
+
+    @property
+    def vanished_rows(self) -> IntArray:
+        """Rows with A_ii = 0 only because products of small numbers vanish: J_i has an entry where M^-1 has one."""
+        empty: IntArray = self.metric.empty
+        if not len(empty):
+            return empty
+        if self.generalized is not None:
+            pattern = self.generalized.jac[empty]  # M is positive definite
+        elif self.rows is not None:
+            inverse = self.rows.inverse_mass_matrix().astype(bool).astype(float)
+            pattern = self.rows.jacobian(self.cones)[empty].astype(bool).astype(float) @ inverse
+        else:
+            return empty[:0]
+        pattern.eliminate_zeros()
+        return empty[np.diff(pattern.indptr) > 0]
+
+    def delassus(self) -> Any:
+        """A (m, m) [1/kg]: the matrix as given, or J M^-1 J^T + diag(compliance) as CSR."""
+        return self.csr if self.matrix is None else self.matrix
+
+    def dense(self) -> FloatArray:
+        """A (m, m) [1/kg] as a new dense array."""
+        return self.matrix.copy() if isinstance(self.matrix, np.ndarray) else self.csr.toarray()
+
+    def slack(self, impulse: ArrayLike) -> FloatArray:
+        """w = A lambda - b (m,) [m/s], recomputed from the problem's data."""
+        w = np.empty(self.m)
+        measure.slack(self.metric, self.impulse_array(impulse), w)
+        return w
+
+    def velocity(self, impulse: ArrayLike) -> FloatArray:
+        """v+ = v* + M^-1 J^T lambda [m/s, rad/s]: (n, 6) with rows, (nv,) in generalised coordinates.
+
+        Raises
+        ------
+        CapabilityError
+            The problem was given as a matrix.
+        """
+        if self.generalized is not None:
+            return self.generalized.v_free + self.generalized.change(self.impulse_array(impulse))
+        if self.rows is None:
+            raise CapabilityError(
+                "this problem was given as a matrix; velocities need J and M (make it with "
+                "Problem.from_rows or Problem.from_jacobian)"
+            )
+        v = np.zeros((self.rows.n_bodies, 6))
+        measure.velocity_change(self.data, self.impulse_array(impulse), v)
+        return self.rows.v_free + v
+
+    def start(self) -> FloatArray:
+        """Pi(0) (m,) [N s]: doing nothing, clipped to the bounds; a new array."""
+        return self._start.copy()
+
+    @once
+    def _start(self) -> FloatArray:
+        return nothing_done(self.cones.lower, self.cones.upper)
+
+
+def _read_only(matrix: sp.csr_array) -> sp.csr_array:
+    for part in (matrix.data, matrix.indices, matrix.indptr):
+        read_only(part)
+    return matrix

@@ -1,0 +1,222 @@
+"""`Problem`: the data, what follows from it, ways to make one, and its other forms."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from os import PathLike
+from typing import Any
+
+import numpy as np
+import scipy.sparse as sp
+
+from lavender._arrays import ArrayLike, FloatArray, as_array, check_not_negative
+from lavender.cones import CONTACT_SPIN, ROW, Cones
+from lavender.errors import InputError
+from lavender.problem.builders import Builders
+
+
+@dataclass(frozen=True)
+class VelocityForm:
+    """min 1/2 |y|^2 + 1/2 z^T diag(theta) z over y [sqrt J], z = scaled impulse, in the metric of d.
+
+        K y + diag(theta) z - g  is complementary to  z,     y = K^T z,
+        K = D^-1/2 J M^-1/2,  theta = compliance / d,  g = D^-1/2 b,  lambda = D^-1/2 z
+
+    so that K K^T + diag(theta) = D^-1/2 A D^-1/2 and y is the mass-scaled change of velocity M^1/2 (v - v*).
+    """
+
+    jacobian: sp.csr_array  # K (m, 6 n), unit rows
+    rhs: FloatArray  # g (m,) sqrt J
+    theta: FloatArray  # (m,) -
+    scale: FloatArray  # D^-1/2 (m,) sqrt kg
+
+    def impulse(self, multiplier: FloatArray) -> FloatArray:
+        """lambda (m,) [N s] of a multiplier z (m,) [sqrt J]."""
+        return self.scale * multiplier
+
+
+class Problem(Builders):
+    """Find lambda (m,) [N s] with w = A lambda - b [m/s] complementary to it on every block.
+
+    Parameters
+    ----------
+    b : (m,) m/s
+        target - J v*: the relative velocity that the impulses must make up for.
+    cones : Cones
+        Blocks and bounds.
+    matrix : (m, m) array or sparse, 1/kg
+        A, kept exactly as given (asymmetric, indefinite and singular are legal); or
+    rows : Rows
+        J and M^-1; A is then J M^-1 J^T + diag(compliance) and is formed only on request; or
+    generalized : Generalized
+        J and M in generalised coordinates; the same.
+    friction : {"coulomb", "cone"}
+        Exact Coulomb friction (non-associated), or its convex relaxation.
+    compliance : (m,) 1/kg, not with a matrix
+        Softness of each row, >= 0.
+    guess : (m,) N s, optional
+        Warm start that travels with the problem.
+    key : (k,) uint64, optional
+        Identity of each block across steps.
+    names : sequence of str (k,), optional
+        Names of blocks, e.g. "hinge 7"; see `row_name`.
+    name : str
+    copy : bool
+        True leaves the arrays given as they are. False adopts those that already fit (b, matrix, compliance, guess):
+        they are shared, and marked read-only for the giver, too.
+
+    Raises
+    ------
+    InputError
+        Wrong shapes, NaN or infinity, none or several of matrix, rows and generalized, nnz >= 2^31.
+    """
+
+    def carry(self, previous: Any, keys: Any = None) -> FloatArray:
+        """Start (m,) [N s] from the impulses of the step before: each block's by its key, the others Pi(0).
+
+        A block that has changed its kind or its number of rows starts anew. Where a problem has no keys,
+        impulses stay if both have the same blocks. Impulses of tangents are taken as they are: keep the directions of a
+        contact's tangents from step to step.
+
+        Parameters
+        ----------
+        previous : Solution, or (Problem, impulse)
+            Of the step before; its problem has keys.
+        keys : (k,) unsigned int, optional
+            Of this problem's blocks; default: `key`.
+
+        Raises
+        ------
+        InputError
+            No solution, keys of another length, or keys here and none before.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> import lavender as lv
+        >>> first = lv.Problem.lcp(np.eye(3), [1.0, 2.0, 3.0], key=np.array([7, 8, 9]))
+        >>> solution = lv.solve(first)
+        >>> second = lv.Problem.lcp(np.eye(2), [3.1, 5.0], key=np.array([9, 4]))  # one stays, one is new
+        >>> second.carry(solution).tolist()
+        [3.0, 0.0]
+        >>> lv.solve(second, impulse=second.carry(solution)).success
+        True
+        """
+        if isinstance(previous, tuple) and len(previous) == 2 and isinstance(previous[0], Problem):
+            before, impulse = previous[0], previous[0].impulse_array(previous[1])
+        elif hasattr(previous, "residual") and hasattr(previous, "impulse"):
+            before, impulse = previous.residual._problem, previous.impulse
+        else:
+            raise InputError(
+                f"previous is a {type(previous).__name__}; a Solution, or (problem, impulse), is needed"
+            )
+        if keys is not None:
+            if before.key is None:
+                raise InputError("the problem of the step before has no keys: make it with key=")
+            return replace(self, key=keys, copy=False).carry((before, impulse))
+        start = self.start()
+        old, new = before.cones, self.cones
+        if self.key is None or before.key is None:
+            if np.array_equal(old.ptr, new.ptr) and np.array_equal(old.kind, new.kind):
+                start[:] = impulse
+            return start
+        place = {key: i for i, key in enumerate(before.key.tolist())}
+        for block, key in enumerate(self.key.tolist()):
+            i = place.get(key)
+            if i is None or old.kind[i] != new.kind[block]:
+                continue
+            here, there = slice(new.ptr[block], new.ptr[block + 1]), slice(old.ptr[i], old.ptr[i + 1])
+            if here.stop - here.start == there.stop - there.start:
+                start[here] = impulse[there]
+        return start
+
+    # -- other forms -----------------------------------------------------------------------------
+
+    def relaxed(self, friction: str = "cone") -> Problem:
+        """The same problem under another friction law: "cone" is the convex relaxation.
+
+        Raises
+        ------
+        InputError
+            "coulomb" for round cones of more than two tangents.
+        """
+        return replace(self, friction=friction, copy=False)
+
+    def boxed(self, normal_impulse: ArrayLike) -> Problem:
+        """Friction bounded by fixed normals: |lambda_t| <= mu N on each tangent alone: a square, not the disk.
+
+        Parameters
+        ----------
+        normal_impulse : scalar or (c,) N s
+            N of each contact, in block order.
+        """
+        c = self.cones
+        contact = np.flatnonzero(c.kind != ROW)
+        n = as_array("normal_impulse", normal_impulse, (len(contact),), unit="N s")
+        check_not_negative("normal_impulse", n)
+        lower, upper = c.lower.copy(), c.upper.copy()
+        for i, load in zip(contact, n, strict=True):
+            j, end = c.ptr[i], c.ptr[i + 1]
+            bound = np.full(end - j, c.mu[i] * load)
+            if c.kind[i] == CONTACT_SPIN:
+                bound[-1] *= c.patch_radius[i]
+            lower[j + 1 : end], upper[j + 1 : end] = -bound[1:], bound[1:]
+            upper[j] = np.inf
+        names = None if self.names is None else [self.row_name(i) for i in range(self.m)]
+        more: dict[str, Any] = {"matrix": self.csr} if self.generalized is None else {
+            "generalized": self.generalized, "compliance": self.compliance
+        }  # fmt: skip
+        return Problem(
+            self.b,
+            Cones.bounded(lower, upper),
+            guess=self.guess,
+            names=names,
+            name=self.name,
+            copy=False,
+            **more,
+        )
+
+    def velocity_form(self) -> VelocityForm:
+        """The mass-scaled velocity form (see `VelocityForm`); not with a matrix.
+
+        Raises
+        ------
+        CapabilityError
+            The problem was given as a matrix.
+        InputError
+            An inverse inertia is so large that its principal values overflow.
+        """
+        jac = self.jacobian
+        scale = 1.0 / np.sqrt(self.d)
+        if self.generalized is not None:
+            k = sp.csr_array(sp.diags_array(scale) @ self.whitened)
+            return VelocityForm(k, scale * self.b, self.compliance * scale**2, scale)  # type: ignore[operator]
+        rows = self.rows
+        assert rows is not None
+        n = rows.n_bodies
+        # M^-1 = L L^T by blocks; a singular inverse inertia (a pinned axis) has a root but no Cholesky factor.
+        value, vector = np.linalg.eigh(rows.inv_inertia) if n else (np.zeros((0, 3)), np.zeros((0, 3, 3)))
+        root = vector * np.sqrt(np.maximum(value, 0.0))[:, None, :]
+        beyond = np.flatnonzero(~np.isfinite(root).all(axis=(1, 2)))
+        if len(beyond):
+            raise InputError(
+                f"inv_inertia [1/(kg m2)] of body {beyond[0]} has principal values beyond float64; {len(beyond)} "
+                "bodies in all: give it in other units, or take a solver that needs no velocity form"
+            )
+        half = replace(
+            rows, inv_mass=np.sqrt(rows.inv_mass), inv_inertia=root, copy=False
+        ).inverse_mass_matrix()
+        k = sp.csr_array(sp.diags_array(scale) @ (jac @ half))
+        return VelocityForm(k, scale * self.b, self.compliance * scale**2, scale)  # type: ignore[operator]
+
+    def save(self, path: str | PathLike[str], **more: Any) -> None:
+        """Write the problem to a file; `lavender.io.save`, whose options `more` are.
+
+        Raises
+        ------
+        InputError
+            The suffix is of no format, or the file cannot be written.
+        """
+        from lavender.io import save
+
+        save(self, path, **more)
