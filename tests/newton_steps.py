@@ -4,7 +4,7 @@ import numpy as np
 
 import lavender as lv
 from lavender.engine.layout import HEAD, SETTING
-from lavender.engine.simulation import TOL
+from lavender.engine.stepping import TOL
 from lavender_ext.warm.substep import Substep
 
 __all__ = ["NewtonSteps"]
