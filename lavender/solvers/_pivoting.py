@@ -6,12 +6,11 @@ call into the same compiled code.
 
 from __future__ import annotations
 
-from time import perf_counter
-
 import numpy as np
 from scipy.linalg import lapack
 
 from lavender._arrays import FloatArray, IntArray
+from lavender.deadline import Deadline, Stopwatch
 from lavender.problem import Problem
 from lavender.solvers._counts import dense_factor, sparse_factor
 from lavender.solvers._factor import (
@@ -34,6 +33,7 @@ DENSE, SPARSE, SPARSE_ROWS = 1.5e-10, 1e-7, 1000.0
 SWEEP = 4e-9  # s for each nonzero of a sweep both ways and its slack, likewise
 SWEEPS, MOST_SWEEPS = 2, 24  # symmetric sweeps of Gauss-Seidel that guess the free rows, at least and at most
 SHARE = 0.5  # of what a factor costs, that they may; a multiply-add of theirs takes a nanosecond
+NEVER = Deadline()
 SLOP = 8.0  # roundings of w within which a sign means nothing, as there
 
 
@@ -116,14 +116,14 @@ class PivotState:
         n_free = self.rows.number()
         self.factorisations += 1
         self.is_factored = True
-        start = perf_counter()
+        watch = Stopwatch()
         small = self.small = self.factor.factor(self.rows.place, n_free, self.rows.shift)
-        self.seconds = perf_counter() - start
+        self.seconds = watch.seconds
         return SMALL if small else SOLVED
 
-    def too_late(self, stop_at: float | None) -> bool:
-        """Whether the next factor would end after `stop_at` (of `perf_counter`), by what the last one took."""
-        if stop_at is None or self.factor is None or perf_counter() + self.seconds <= stop_at:
+    def too_late(self, deadline: Deadline) -> bool:
+        """Whether the next factor would end after it, by what the last one took."""
+        if self.factor is None or not deadline.passed(self.seconds):
             return False
         self.late = True
         return True
@@ -135,18 +135,18 @@ class PivotState:
         else:
             self.rows.x[:] = self.factor.solve(self.problem.b)
 
-    def solve(self, start: FloatArray, sweeps: int, n: int, stop_at: float | None) -> tuple[int, int, bool]:
+    def solve(self, start: FloatArray, sweeps: int, n: int, deadline: Deadline) -> tuple[int, int, bool]:
         """A boxed problem from `start`: (outcome, rounds done, whether it was swept)."""
         rows, before = self.rows, self.rows.n_rounds
         if self.factor is None:
             code, swept = rows.solve(start, sweeps, n)
             return code, rows.n_rounds - before, swept
-        if stop_at is not None and perf_counter() + sweeps * SWEEP * self.problem.csr_data.work > stop_at:
+        if deadline.passed(sweeps * SWEEP * self.problem.csr_data.work):
             rows.solve(start, 0, 0)
             self.late = True
             return ROUNDS, 0, False
         rows.solve(start, sweeps, 0)
-        return *self.rounds(n, stop_at), True
+        return *self.rounds(n, deadline), True
 
     def newton(self) -> None:
         """x_F <- x_F - (A_FF + s D_FF)^-1 w_F."""
@@ -161,7 +161,7 @@ class PivotState:
         self.newton()
         self.rows.slack()
 
-    def rounds(self, n: int, stop_at: float | None = None) -> tuple[int, int]:
+    def rounds(self, n: int, deadline: Deadline = NEVER) -> tuple[int, int]:
         """At most n rounds of factor, solve, exchange: (outcome, rounds done)."""
         rows = self.rows
         if self.factor is None:
@@ -171,7 +171,7 @@ class PivotState:
             rows.put_bounds()
             rows.slack()
             if not self.is_factored:
-                if self.too_late(stop_at):
+                if self.too_late(deadline):
                     return ROUNDS, done - 1
                 code = self.factorise()
                 if code != SOLVED:
@@ -180,7 +180,7 @@ class PivotState:
             bad = self.exchange()
             if bad <= 0:
                 return (STUCK if bad else SOLVED), done
-            if stop_at is not None and perf_counter() >= stop_at:
+            if deadline.passed():
                 return ROUNDS, done
         return ROUNDS, n
 
@@ -191,7 +191,7 @@ class PivotState:
             self.is_factored = False
         return bad
 
-    def descend(self, n: int, stop_at: float | None = None) -> tuple[int, int]:
+    def descend(self, n: int, deadline: Deadline = NEVER) -> tuple[int, int]:
         """At most n steps of projected Newton on the energy: (outcome, steps done). x must be within its bounds.
 
             phi(x) = 1/2 x.A x - b.x + s/2 |x - center|_D^2,  grad phi = w                         (1)
@@ -210,7 +210,7 @@ class PivotState:
             if not (self.is_factored and np.array_equal(at, rows.at)):
                 self.exchanged += int(np.count_nonzero(at != rows.at))
                 rows.at[:] = at
-                if self.too_late(stop_at):
+                if self.too_late(deadline):
                     rows.x[:] = x
                     return ROUNDS, done - 1
                 code = self.factorise()
@@ -234,7 +234,7 @@ class PivotState:
             x, w = rows.x.copy(), rows.w.copy()
             if whole and not np.any(((at < 0) & ~fixed & (w < -slop)) | ((at > 0) & (w > slop))):
                 return SOLVED, done
-            if stop_at is not None and perf_counter() >= stop_at:
+            if deadline.passed():
                 return ROUNDS, done
         return ROUNDS, n
 

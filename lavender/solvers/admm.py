@@ -14,13 +14,13 @@ from __future__ import annotations
 
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from time import perf_counter
 from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
 
 from lavender._arrays import FloatArray
+from lavender.deadline import Deadline, Stopwatch
 from lavender.errors import InputError
 from lavender.problem import Problem
 from lavender.registry import SolverSpec
@@ -68,7 +68,7 @@ class AdmmState:
     def __init__(self, problem: Problem, memory: int) -> None:
         reference(problem)
         self.problem, self.memory = problem, memory
-        self.stop_at = np.inf  # of perf_counter: nothing is begun that is expected to end later
+        self.deadline = Deadline()  # nothing is begun that is expected to end later
         self.factorisations = self.reported = self.undone = (
             0  # factors: all, and those that an earlier run has told
         )
@@ -81,15 +81,15 @@ class AdmmState:
 
     def open(self, most: float = np.inf) -> None:
         """Scale, analyse and factor within `most` [s], as far as that can be told; what is left, the next call does."""
-        start = perf_counter()
+        watch = Stopwatch()
         if not self.is_scaled:
-            if self.seconds > min(most, self.stop_at - start):
+            if self.seconds > most or self.deadline.passed(self.seconds):
                 raise _TooLate
             self._scale()
             self.is_scaled = True
             self.seconds = self._expected()
         if self.factor is None:
-            self.factor = self._factor(most - (perf_counter() - start))
+            self.factor = self._factor(most - watch.seconds)
 
     def _scale(self) -> None:
         problem = self.problem
@@ -145,13 +145,14 @@ class AdmmState:
 
     def _factor(self, most: float = np.inf) -> tuple[int, int, tuple[Any, ...]]:
         # Within `most` [s], as far as that can be told.
-        start = perf_counter()
-        most = min(most, self.stop_at - start)
+        watch = Stopwatch()
+        left = self.deadline.left()
+        most = most if left is None else min(most, left)
         if self.seconds > most:
             raise _TooLate
         made = self._make_factor(most)
         self.factorisations += 1
-        self.seconds = perf_counter() - start
+        self.seconds = watch.seconds
         return made
 
     def _make_factor(self, most: float) -> tuple[int, int, tuple[Any, ...]]:
@@ -288,9 +289,9 @@ class ADMM:
         return self.prepare(problem)
 
     def until(self, state: AdmmState | str, deadline: float) -> None:
-        """Let no factor begin that is expected to end after `deadline` (of `perf_counter`)."""
+        """Let no factor begin that is expected to end after `deadline`, of `time.perf_counter`."""
         if not isinstance(state, str):
-            state.stop_at = deadline
+            state.deadline = Deadline.at(deadline)
 
     @np.errstate(all="ignore")  # what overflows is judged
     def run(

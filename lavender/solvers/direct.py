@@ -19,13 +19,13 @@ energy then ends.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from time import perf_counter
 from typing import Any, ClassVar
 
 import numpy as np
 
 from lavender._arrays import FloatArray
 from lavender.certificates import check_certificate
+from lavender.deadline import Deadline
 from lavender.problem import Problem
 from lavender.registry import SolverSpec
 from lavender.residuals import at_floor, judged, remember
@@ -157,7 +157,7 @@ class _Run:
         self.patient = patient
         self.least = GOOD if exact else max(GOOD, tol)  # relative residual that is good whatever the floor
         self.state, self.problem, self.impulse, self.budget, self.tol = state, state.problem, impulse, n, tol
-        self.stop_at = None if time_limit is None else perf_counter() + time_limit
+        self.deadline = Deadline(time_limit)
         self.kept: measure.Judged | None = None
         self.best, self.floor, self.last = np.inf, 0.0, np.inf
         self.iterations = 0
@@ -201,8 +201,8 @@ class _Run:
     @property
     def out_of_time(self) -> bool:
         pivot = self.state.pivot
-        late = pivot is not None and pivot.late
-        return self.stop_at is not None and (late or perf_counter() >= self.stop_at)
+        late = pivot is not None and pivot.late and self.deadline.is_set
+        return late or self.deadline.passed()
 
     def claim(self, status: Status, **more: Any) -> Claim:
         state = self.state
@@ -275,7 +275,7 @@ class _Run:
             # Which rows will be free? All, or where a few sweeps put them.
             sweeps = pivot.sweeps
             code, self.iterations, swept = pivot.solve(
-                self.impulse, sweeps, min(BATCH, self.budget), self.stop_at
+                self.impulse, sweeps, min(BATCH, self.budget), self.deadline
             )
             if swept:
                 self.work["sweeps"] = 2 * sweeps
@@ -307,7 +307,7 @@ class _Run:
     def rounds(self, pivot: PivotState) -> int:
         """Rounds to the end of this pass, refined and judged, within the budget and the time."""
         while True:
-            code, done = pivot.rounds(min(BATCH, self.budget - self.iterations), self.stop_at)
+            code, done = pivot.rounds(min(BATCH, self.budget - self.iterations), self.deadline)
             self.iterations += done
             code = self.after_rounds(pivot, code)
             # Signs that differ by rounding alone exchange for ever; the judge sees that nothing is wrong.
@@ -413,7 +413,7 @@ class _Run:
     def descend(self, pivot: PivotState) -> int:
         rows, c = pivot.rows, self.problem.cones
         np.clip(rows.x, c.lower, c.upper, out=rows.x)
-        code, done = pivot.descend(self.budget - self.iterations, self.stop_at)
+        code, done = pivot.descend(self.budget - self.iterations, self.deadline)
         self.iterations += done
         if code in (SOLVED, ROUNDS):
             self.judge(pivot.impulse())

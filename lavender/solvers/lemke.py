@@ -20,7 +20,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from time import perf_counter
 
 import numpy as np
 import numpy.typing as npt
@@ -28,6 +27,7 @@ from scipy.linalg import lapack
 
 from lavender._arrays import FloatArray, IntArray
 from lavender.certificates import check_certificate
+from lavender.deadline import Deadline
 from lavender.problem import Problem
 from lavender.registry import SolverSpec
 from lavender.residuals import at_floor, quick
@@ -44,6 +44,7 @@ STABLE = 1e-2  # -, a diagonal entry of this share of its row and column makes a
 BATCH = 200  # pivots after which the dictionary is formed anew, which drops what rounding left
 CLOCK = 0.01  # s between two looks at the clock, at
 ENTRY, FORMED = 1e-9, 5e-10  # s for each entry of the dictionary in a pivot, and n^3 times to form it anew
+STEP = 1e-3  # s that pivots have at least, whatever it took to form their dictionary
 LAID_OUT = 5e-8  # s for each entry of the first dictionary; FORMED for each that a free row's pivot touches
 PATHS = 8  # covering vectors tried
 PIVOTS_A_ROW = 20  # on one path, before it counts as lost
@@ -221,33 +222,28 @@ class Lemke:
     def run(
         self, state: LemkeState, impulse: FloatArray, n: int, tol: float, time_limit: float | None = None
     ) -> Claim:
-        start = perf_counter()
+        deadline = Deadline(time_limit)
         form = state.formed(time_limit)
         if form is None:
             return _too_late()
-        return Walk(form, impulse).go(impulse, n, tol, _left(time_limit, start))
+        return Walk(form, impulse).go(impulse, n, tol, Deadline(deadline.left(STEP)))
 
     @np.errstate(all="ignore")  # what overflows is judged
     def resume(
         self, state: LemkeState, impulse: FloatArray, n: int, tol: float, time_limit: float | None = None
     ) -> Claim:
         """At most n more pivots from where the last call stopped: n, then n, end where 2 n do."""
-        start = perf_counter()
+        deadline = Deadline(time_limit)
         form = state.formed(time_limit)
         if form is None:
             return _too_late()
         if state.walk is None:
             state.walk = Walk(form, impulse)
-        return state.walk.go(impulse, n, tol, _left(time_limit, start))
+        return state.walk.go(impulse, n, tol, Deadline(deadline.left(STEP)))
 
 
 def _too_late() -> Claim:
     return Claim(Status.TIME_LIMIT, 0, {"pivots": 0}, "the dictionary alone would take longer", form="dense")
-
-
-def _left(time_limit: float | None, start: float) -> float | None:
-    """Of the limit [s] since `start`, of perf_counter; a step at least."""
-    return None if time_limit is None else max(time_limit - (perf_counter() - start), 1e-3)
 
 
 class Walk:
@@ -261,16 +257,14 @@ class Walk:
         self.pivots, self.work = 0, {"pivots": 0}
         self.message = ""
         self.certificate: FloatArray | None = None
-        self.budget, self.stop_at, self.tol = 0, None, 0.0
+        self.budget, self.deadline, self.tol = 0, Deadline(), 0.0
         self.ended = Status.INTERRUPTED  # where Ctrl-C ended the steps; else their last word
         self.steps = self.solve()
 
-    stop_at: float | None  # of perf_counter
-
-    def go(self, impulse: FloatArray, n: int, tol: float, time_limit: float | None) -> Claim:
+    def go(self, impulse: FloatArray, n: int, tol: float, deadline: Deadline) -> Claim:
         """At most n more pivots; the best impulse (m,) so far in place."""
         self.budget, self.tol = self.pivots + n, tol
-        self.stop_at = None if time_limit is None else perf_counter() + time_limit
+        self.deadline = deadline
         work = dict(self.work)
         self.ahead: FloatArray | None = None
         status = Status.MAX_ITERATIONS if n <= 0 else next(self.steps, self.ended)
@@ -386,7 +380,7 @@ class Walk:
 
     def late(self, more: float = 0.0) -> bool:
         """The time is up, or would be `more` [s] from now."""
-        return self.stop_at is not None and perf_counter() + more >= self.stop_at
+        return self.deadline.passed(more)
 
     def values(self, t: FloatArray, basic: IntArray) -> tuple[FloatArray, FloatArray]:
         """s, w (n,) of a dictionary."""

@@ -1,0 +1,51 @@
+"""When a run must have ended: the one clock of solvers, asked between their steps."""
+
+from __future__ import annotations
+
+import math
+from time import perf_counter
+
+__all__ = ["Deadline", "Stopwatch"]
+
+
+class Stopwatch:
+    """What a step takes: the seconds since it was made."""
+
+    __slots__ = ("_start",)
+
+    def __init__(self) -> None:
+        self._start = perf_counter()
+
+    @property
+    def seconds(self) -> float:
+        """Seconds since it was made."""
+        return perf_counter() - self._start
+
+
+class Deadline:
+    """`limit` [s] from now, or never."""
+
+    __slots__ = ("_at",)
+
+    def __init__(self, limit: float | None = None) -> None:
+        self._at = math.inf if limit is None else perf_counter() + limit
+
+    @classmethod
+    def at(cls, moment: float) -> Deadline:
+        """At a time of `time.perf_counter`."""
+        made = cls()
+        made._at = moment
+        return made
+
+    @property
+    def is_set(self) -> bool:
+        """Whether there is a limit."""
+        return self._at < math.inf
+
+    def passed(self, step: float = 0.0) -> bool:
+        """Whether a step of so many seconds, begun now, would end after it."""
+        return self._at < math.inf and perf_counter() + step >= self._at
+
+    def left(self, least: float = 0.0) -> float | None:
+        """Seconds until then, at least `least`; None without a limit."""
+        return None if self._at == math.inf else max(self._at - perf_counter(), least)
