@@ -19,13 +19,14 @@ from lavender.engine.judge import judged, moved
 from lavender.engine.layout import HEAD, NEED_ROOM, OK, SIZE
 from lavender.engine.state import State
 from lavender.errors import InputError, LavenderError, SolveFailed
+from lavender.outcome import finish
 from lavender.problem import Problem
 from lavender.registry import get
 from lavender.scene import Scene
 from lavender.scene.parts import whole
 from lavender.scene.steppers import get_stepper
 from lavender.solution import Solution, Status
-from lavender.solve import finish, solve
+from lavender.solve import solve
 from lavender.solvers.newton import SPEC as NEWTON_SPEC
 from lavender.solvers.warm_start import Tried, claim_of
 

@@ -25,10 +25,11 @@ from lavender._arrays import FloatArray
 from lavender.bench.line import needs_more
 from lavender.bench.record import ERROR, Record, measurement_key
 from lavender.external.stopwatch import own_time
+from lavender.outcome import finish
 from lavender.problem import Problem
 from lavender.residuals import reference
 from lavender.solution import Claim, Solution, Status
-from lavender.solve import finish, prepare, solve
+from lavender.solve import prepare, solve
 
 __all__ = ["Outcome", "Task", "attempt", "judged", "just_written", "measure", "one_thread", "pace"]
 

@@ -1,0 +1,129 @@
+"""What became of a run: the claim of a solver held against the judge, and both as a `Solution`."""
+
+from __future__ import annotations
+
+import math
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from lavender._arrays import FloatArray
+from lavender.certificates import check_certificate
+from lavender.cones import ROW
+from lavender.problem import Problem
+from lavender.registry import SolverSpec, in_one_call
+from lavender.residuals import residual
+from lavender.solution import Claim, History, Solution, SolverRun, Status
+from lavender_ext.judge.measure import all_finite
+
+# Looked up once: a member reached through its class costs 600 instructions.
+CONVERGED = Status.CONVERGED
+DIVERGED = Status.DIVERGED
+FLOOR = Status.FLOOR
+INFEASIBLE = Status.INFEASIBLE
+MAX_ITERATIONS = Status.MAX_ITERATIONS
+NUMERICAL_ERROR = Status.NUMERICAL_ERROR
+STALLED = Status.STALLED
+TIME_LIMIT = Status.TIME_LIMIT
+
+
+def finish(
+    problem: Problem,
+    spec: SolverSpec,
+    options: dict[str, Any],
+    impulse: FloatArray,
+    claim: Claim,
+    tol: float,
+    setup_time: float,
+    solve_time: float,
+    history: History | None,
+    sweeps_per_decade: float = math.nan,
+) -> Solution:
+    """The judge's residual, and the status that it bears out; a claim that it contradicts is told."""
+    judged = residual(problem, impulse)
+    status, message = claim.status, claim.message
+    relative = judged.relative
+    if status is not NUMERICAL_ERROR and not all_finite(impulse):
+        status = DIVERGED
+    elif tol > 0.0 and relative <= tol and status in (MAX_ITERATIONS, TIME_LIMIT, STALLED):
+        status = CONVERGED
+    elif problem.operator not in spec.operators and (
+        (status is CONVERGED and relative > tol) or (status is FLOOR and not judged.at_floor)
+    ):
+        status = STALLED
+        message = f"{message}; its test was met on A, as it was formed, alone".removeprefix("; ")
+    if status in (CONVERGED, STALLED) and tol < relative and judged.at_floor:
+        status = FLOOR
+    certificate = claim.certificate
+    if status is INFEASIBLE and relative <= tol:
+        # What meets tol is a solution to tol, whatever can be said of an exact one.
+        status, certificate = CONVERGED, None
+        message = f"{message}; the impulse meets tol all the same".removeprefix("; ")
+    contradicted = ""
+    if status is CONVERGED and not relative <= tol:
+        contradicted = f"says CONVERGED, relative residual {relative:.2e} is above tol {tol:.1e}"
+    elif status is FLOOR and not judged.at_floor:
+        contradicted = f"says FLOOR, relative residual {relative:.2e} is above twice {judged.floor:.2e}"
+    elif status is INFEASIBLE:
+        reason = (
+            "no certificate was given" if certificate is None else check_certificate(problem, certificate)
+        )
+        contradicted = f"says INFEASIBLE, {reason}" if reason else ""
+    if status is MAX_ITERATIONS:
+        way = _way_left(problem, relative, tol, claim.iterations, sweeps_per_decade)
+        message = "; ".join(filter(None, (message, way)))
+    impulse.setflags(write=False)
+    return Solution.of(
+        {
+            "impulse": impulse,
+            "residual": judged,
+            "status": status,
+            "tol": tol,
+            "iterations": claim.iterations,
+            "work": MappingProxyType(dict(claim.work)),
+            "setup_time": setup_time,
+            "solve_time": solve_time,
+            "solver": SolverRun(spec.name, options, claim.form),
+            "message": message,
+            "history": history,
+            "dual": claim.dual,
+            "certificate": certificate,
+            "contradicted": contradicted,
+            "sweeps_per_decade": sweeps_per_decade,
+            "turns": claim.turns,
+        }
+    )
+
+
+def _way_left(problem: Problem, relative: float, tol: float, done: int, per_decade: float) -> str:
+    """What a budget that was used up tells, where tol is further away than was done."""
+    left = per_decade * math.log10(relative / tol) if tol > 0.0 and 0.0 < relative < math.inf else math.nan
+    if not done < left < math.inf:
+        return ""
+    return (
+        f"the residual falls tenfold in {per_decade:.3g} iterations, so tol is some {left:.2g} more away; "
+        f"solvers of another kind end sooner: {', '.join(in_one_call(problem))}"
+    )
+
+
+def decide_empty_rows(problem: Problem, impulse: FloatArray) -> tuple[str, FloatArray] | None:
+    """Rows of A that are all zero: put on the bound that b asks for, or prove that there is none."""
+    cones = problem.cones
+    for i in problem.metric.empty:
+        block = problem.block_of(int(i))
+        if cones.kind[block] != ROW and i != cones.ptr[block]:
+            continue  # tangents and spin: bounded by mu lambda_n
+        b = problem.b[i]
+        bound = cones.upper[i] if b > 0.0 else cones.lower[i]
+        if b == 0.0:
+            continue
+        if np.isfinite(bound):
+            impulse[i] = bound
+            continue
+        y = np.zeros(problem.m)
+        y[i] = math.copysign(1.0, b)
+        if check_certificate(problem, y) is not None:
+            continue  # its products vanish or overflow, but it is not zero
+        return f"{problem.row_name(int(i))}: its row of A is zero, so nothing can meet b = {b:.3g} m/s", y
+    return None
