@@ -40,7 +40,8 @@ def order_of(findex: Any, count: int | None = None) -> IntArray:
             )
         if findex[j] >= 0:
             raise InputError(
-                f"findex[{i}] is {j}, which is no normal: it follows row {findex[j]} itself; a row with findex -1 is needed"
+                f"findex[{i}] is {j}, which is no normal: it follows row {findex[j]} itself; a row with findex -1 is "
+                "needed"
             )
     leader = np.where(findex >= 0, findex, np.arange(m))
     # by the leader, itself first, then in the order given

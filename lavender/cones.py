@@ -265,9 +265,9 @@ class Cones:
                 mu, ratio = _sides(mu)
         elif np.ndim(mu) > 1:
             raise InputError(
-                f"mu has shape {np.shape(mu)}; one for each contact is needed. Two make an ellipse of the disk: give mu_1 "
-                "here, and multiply row and column of the second tangent in A (its row of J), and its b, by mu_2 / mu_1; "
-                "its impulse is mu_2 / mu_1 times the answer's. shape='box' takes two as they are"
+                f"mu has shape {np.shape(mu)}; one for each contact is needed. Two make an ellipse of the disk: give "
+                "mu_1 here, multiply row and column of the second tangent in A (its row of J), and its b, by "
+                "mu_2 / mu_1, and then its impulse; shape='box' takes two as they are"
             )
         spin = patch_radius is not None
         if tangents > 2 and spin:
@@ -405,7 +405,7 @@ class Cones:
 def _sides(mu: Any) -> tuple[Any, FloatArray]:
     """mu_1 (float or (k,)) of boxes and mu_2 / mu_1, (1,) or (k,), from mu: scalar, (k,) or (k, 2)."""
     given = as_array("mu", np.asarray(mu, float), (None,) * np.ndim(mu))
-    check_not_negative("mu", given)
+    check_not_negative("mu", given.ravel())
     if given.ndim < 2:
         return mu, np.ones(1)
     if given.ndim > 2 or given.shape[1] != 2:

@@ -317,13 +317,13 @@ class Problem:
         lower, upper : scalar or (m,) N s
             Where findex < 0; where it is not, upper is mu [-].
         findex : (m,) int
-            Row of the normal whose impulse bounds this one, |lambda_i| <= upper_i lambda_findex; -1: bounds are constant.
+            Row of the normal whose impulse bounds this one, |lambda_i| <= upper_i lambda_findex; -1: constant bounds.
 
         Raises
         ------
         InputError
-            A findex out of range, of its own row, or of a row that is no normal [0, inf]; more than two rows that follow
-            one; mu that is negative or not finite; lower > upper.
+            A findex out of range, of its own row, or of a row that is no normal [0, inf]; more than two rows that
+            follow one; mu that is negative or not finite; lower > upper.
 
         Examples
         --------

@@ -113,8 +113,8 @@ class SolverSpec:
     history: bool = True  # records history; needs resumable
     delegates: bool = False  # may hand over to other solvers: only "auto"
     round_cones: bool = False  # takes contacts of more than two tangents in one cone
-    # Of "coulomb" and "cone", with which it takes boxes: contacts whose tangents are bounded each by itself. A law that is
-    # not of `laws` besides is taken where there is no disk (of our own, as bounded rows: solvers/_polyhedral.py).
+    # Of "coulomb" and "cone", with which it takes boxes: contacts whose tangents are bounded each by itself. A law that
+    # is not of `laws` besides is taken where there is no disk (of our own, as bounded rows: solvers/_polyhedral.py).
     boxes: frozenset[str] = frozenset()
     external: bool = False  # another project's code solves; its claims are its own
     max_iter: int = 1000  # default budget

@@ -116,6 +116,13 @@ def _sparse(entries: list[tuple[int, int, float]], shape: tuple[int, int]) -> sp
     return sp.csr_array((np.array(x, float), (np.array(i, int), np.array(j, int))), shape=shape)
 
 
+def _whole(y: FloatArray) -> FloatArray:
+    """A direction with its largest entry at 1, and without what rounding left of sums that cancel."""
+    size = np.abs(y).max(initial=0.0)
+    y = y / size if size > 0.0 else y
+    return np.where(np.abs(y) < 1e-13, 0.0, y)
+
+
 @dataclass
 class Held:
     """State of the solver inside, and what its rows stand for, where they stand for anything."""
@@ -165,10 +172,8 @@ class ThroughRows:
         elif at_floor(relative, floor):
             status = Status.FLOOR
         elif status is Status.INFEASIBLE and claim.certificate is not None:
-            proof = form.back @ claim.certificate
-            size = np.abs(proof).max(initial=0.0)
-            proof = proof / size if size > 0.0 else None
-            if proof is None or check_certificate(form.problem, proof) is not None:
+            proof = _whole(form.back @ claim.certificate)
+            if check_certificate(form.problem, proof) is not None:
                 status, proof = Status.STALLED, None
                 words += ": of the friction as rows, which proves nothing of the problem itself"
         elif status in (Status.CONVERGED, Status.FLOOR):
