@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from lavender._arrays import FloatArray
-from lavender.cones import CONTACT_SPIN, ROW
+from lavender.cones import ROW
 from lavender.problem import Problem
 
 __all__ = ["check_certificate"]
@@ -70,12 +70,12 @@ def _rims(problem: Problem, x: FloatArray) -> tuple[Any, Any, FloatArray, FloatA
     first = c.ptr[contact]
     block = np.repeat(np.arange(c.n_blocks), np.diff(c.ptr))
     place = np.arange(problem.m) - c.ptr[block]
-    tangent = (place > 0) & (place <= c.n_tangents[block])
+    tangent = (place > 0) & (place <= c.n_together[block])
     big = np.zeros(c.n_blocks)  # over the largest, for squares alone vanish
     np.maximum.at(big, block[tangent], np.abs(x[tangent]))
     part = x[tangent] / np.where(big > 0.0, big, 1.0)[block[tangent]]
     rim = (big * np.sqrt(np.bincount(block[tangent], part**2, minlength=c.n_blocks)))[contact]
-    spin = np.where(c.kind[contact] == CONTACT_SPIN, np.abs(x[c.ptr[contact + 1] - 1]), 0.0)
+    spin = np.where(c.ends_apart[contact], np.abs(x[c.ptr[contact + 1] - 1]), 0.0)
     return contact, first, rim, spin
 
 

@@ -176,6 +176,11 @@ class State:
             + 2 * bool((mu[shaped] > 0.0).any())
             + bool((mu[shaped] > 0.0).any() and (patch[shaped] > 0.0).any())
         )
+        box = p.friction_shape == "box"
+        if box and per == 4:
+            raise InputError(
+                "friction_shape is 'box' and patch_radius > 0: a box has no spin friction; leave one of the two out"
+            )
         excluded = sorted({tuple(sorted((j.a, j.b))) for j in joints if not j.collide and min(j.a, j.b) >= 0})
         n_shapes = int(shaped.sum())
         size = np.zeros(N_SIZES, np.int32)
@@ -205,6 +210,7 @@ class State:
         head[HEAD["position_iterations"]] = p.position_iterations
         head[HEAD["order"]] = ORDER_NUMBER[p.order]
         head[HEAD["seed"]] = p.seed
+        head[HEAD["friction_shape"]] = box
         head[HEAD["lost"]] = -1
         stepper = get_stepper(p.stepper)
         stepper.check(per == 4, bool((restitution > 0.0).any()))

@@ -38,7 +38,7 @@ import numpy.typing as npt
 import scipy.sparse as sp
 
 from lavender._arrays import FloatArray
-from lavender.cones import CONTACT_SPIN, ROW
+from lavender.cones import ROW
 from lavender.errors import CapabilityError, InputError
 from lavender.problem import Problem
 from lavender.residuals import reference
@@ -458,10 +458,10 @@ class _Parts:
                 known[i] = True
                 fixed[i] = np.clip(bound if np.isfinite(bound) else 0.0, c.lower[i], c.upper[i])
         friction = np.flatnonzero((c.kind != ROW) & (size > 1))
-        stays = []
+        stays, apart = [], c.ends_apart
         for i in friction:
             start, end = c.ptr[i] + 1, c.ptr[i + 1]
-            spin = c.kind[i] == CONTACT_SPIN
+            spin = apart[i]
             if c.mu[i] == 0.0:
                 known[start:end] = True
                 continue
@@ -483,7 +483,7 @@ class _Parts:
         disks: list[_Disk] = []
         for i in self.contacts:
             n, end = int(c.ptr[i]), int(c.ptr[i + 1])
-            spin = c.kind[i] == CONTACT_SPIN
+            spin = c.ends_apart[i]
             tangents = list(range(n + 1, end - 1 if spin else end))
             j = int(place[n])
             ratio = [float(c.mu[i] * self.root[j] / self.root[place[t]]) for t in tangents]

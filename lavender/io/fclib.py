@@ -23,7 +23,7 @@ from scipy.sparse import csgraph
 
 from lavender._arrays import FloatArray, as_array
 from lavender._lu import sparse_lu
-from lavender.cones import CONTACT, ROW, Cones
+from lavender.cones import CONTACT, CONTACT_BOX, ROW, Cones
 from lavender.errors import CapabilityError, InputError
 from lavender.generalized import Generalized
 from lavender.io.npz import compressed
@@ -521,7 +521,9 @@ def _cannot_hold(problem: Problem, form: str, drop: Collection[str]) -> list[str
         rows = np.repeat(c.kind == ROW, np.diff(c.ptr))
         what = "free rows" if np.all(free[rows]) else "bounded rows"
         reasons.append(f"ROW blocks ({int(rows.sum())} {what}; contacts only)")
-    if np.any(c.kind > CONTACT):
+    if c.has_box:
+        reasons.append("boxes (its friction is a disk: give cones.shaped('disk'), which is another law)")
+    if np.any((c.kind > CONTACT) & (c.kind != CONTACT_BOX)):
         reasons.append("spin rows")
     contacts = c.n_tangents[c.kind != ROW]
     if problem.n_blocks == 0:

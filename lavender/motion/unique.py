@@ -47,7 +47,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from lavender._arrays import FloatArray
-from lavender.cones import CONTACT_SPIN, ROW
+from lavender.cones import ROW
 from lavender.motion.reference import kept, reference
 from lavender.problem import Problem
 
@@ -96,10 +96,10 @@ def uniqueness(problem: Problem) -> Uniqueness:
         return Uniqueness(True, "the law is convex", 0.0)
     c = problem.cones
     friction = np.zeros(problem.m, bool)
-    count = np.diff(c.ptr)
+    count, apart = np.diff(c.ptr), c.ends_apart
     for i in np.flatnonzero((c.kind != ROW) & (c.mu > 0.0) & (count > 1)):
         friction[c.ptr[i] + 1 : c.ptr[i + 1]] = True
-        if c.kind[i] == CONTACT_SPIN and c.patch_radius[i] == 0.0:
+        if apart[i] and c.patch_radius[i] == 0.0:
             friction[c.ptr[i + 1] - 1] = False
     if not friction.any():
         return Uniqueness(True, "no contact has friction", 0.0)
@@ -174,9 +174,9 @@ def _sticks(
         if i not in touching:
             continue
         normal, mu = x[c.ptr[i]], c.mu[i]
-        tangent = x[c.ptr[i] + 1 : c.ptr[i] + 1 + c.n_tangents[i]]
+        tangent = x[c.ptr[i] + 1 : c.ptr[i] + 1 + c.n_together[i]]
         used = float(np.linalg.norm(tangent))
-        if c.kind[i] == CONTACT_SPIN and c.patch_radius[i] > 0.0:
+        if c.ends_apart[i] and c.patch_radius[i] > 0.0:
             used = max(used, abs(x[c.ptr[i + 1] - 1]) / c.patch_radius[i])
         left.append(normal - used / mu)  # (1 - sigma) lambda_n
     h = float(np.min(np.array(left) / np.sqrt(lifting)))
@@ -191,16 +191,14 @@ def _kappa(
     # In the scaled rows: (A_tt)_ij = a_ij / (scale_i scale_j), Z_ij = (a^-1)_ij scale_i scale_j.
     c = problem.cones
     block = np.searchsorted(c.ptr, rows, side="right") - 1
-    radius = np.where(
-        (c.kind[block] == CONTACT_SPIN) & (rows == c.ptr[block + 1] - 1), c.patch_radius[block], 1.0
-    )
+    radius = np.where(c.ends_apart[block] & (rows == c.ptr[block + 1] - 1), c.patch_radius[block], 1.0)
     tangents = np.flatnonzero(friction)
     contacts, place = np.unique(block[tangents], return_inverse=True)
     normals = np.searchsorted(rows, c.ptr[contacts])
     size = c.mu[block[tangents]] * radius[tangents] / scale[tangents]
     sliding = a[np.ix_(tangents, tangents)] * size[:, None] * size
     lifting = np.linalg.inv(a)[np.ix_(normals, normals)] * scale[normals][:, None] * scale[normals]
-    spin = 2.0 if np.any(c.kind[contacts] == CONTACT_SPIN) and np.any(c.n_tangents[contacts] > 0) else 1.0
+    spin = 2.0 if np.any(c.ends_apart[contacts]) and np.any(c.n_together[contacts] > 0) else 1.0
     strongest = np.zeros(len(contacts))
     np.maximum.at(strongest, place, np.diagonal(sliding))
     best = np.inf

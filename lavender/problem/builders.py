@@ -8,10 +8,12 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from lavender._arrays import ArrayLike, as_array
-from lavender.cones import ROW, Cones
+from lavender._arrays import ArrayLike, FloatArray, IntArray, as_array
+from lavender.cones import ROW, Cones, check_shape
 from lavender.errors import InputError
 from lavender.generalized import Generalized
+from lavender.problem.data import checked_matrix
+from lavender.problem.findex import arrays_of, blocks_of, order_of
 from lavender.problem.operators import Operators
 from lavender.rows import Rows
 from lavender_ext.core.problem import rows_velocity
@@ -87,6 +89,82 @@ class Builders(Operators):
         return cls(b, Cones.contacts(mu, tangents, patch_radius), A, **more)
 
     @classmethod
+    def from_findex(
+        cls: type[P],
+        A: Any,
+        b: ArrayLike,
+        lower: ArrayLike,
+        upper: ArrayLike,
+        findex: ArrayLike,
+        **more: Any,
+    ) -> P:
+        """The arrays of engines (ODE, Bullet, DART), as they are: friction that follows its normal, tangent by tangent.
+
+        Where the normals do not stand right before the rows that follow them, the rows of the problem are those of the
+        arrays in another order, `Problem.findex_order(findex)`.
+
+        Parameters
+        ----------
+        A : (m, m) 1/kg, array or sparse
+        b : (m,) m/s
+        lower, upper : scalar or (m,) N s
+            Where findex < 0; where it is not, upper is mu [-].
+        findex : (m,) int
+            Row of the normal whose impulse bounds this one, |lambda_i| <= upper_i lambda_findex; -1: constant bounds.
+
+        Raises
+        ------
+        InputError
+            A findex out of range, of its own row, or of a row that is no normal [0, inf]; more than two rows that
+            follow one; mu that is negative or not finite; lower > upper.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> import lavender as lv
+        >>> A, b = np.eye(3), [10.0, 9.0, -1.0]  # pressed on, and dragged along both tangents
+        >>> problem = lv.Problem.from_findex(A, b, [0.0, -0.5, -0.5], [np.inf, 0.5, 0.5], [-1, 0, 0])
+        >>> lv.solve(problem, tol=1e-9).impulse.tolist()  # N s: the first slides, the second holds
+        [10.0, 5.0, -1.0]
+        """
+        b = as_array("b", b, (None,), unit="m/s")
+        order, cones = blocks_of(lower, upper, findex, len(b))
+        if (order[1:] < order[:-1]).any():
+            matrix = checked_matrix(A, len(b), True)
+            return cls(b[order], cones, matrix[order][:, order], **more)
+        return cls(b, cones, A, **more)
+
+    @staticmethod
+    def findex_order(findex: ArrayLike) -> IntArray:
+        """(m,) row of the arrays given to `from_findex` for each row of its problem.
+
+        >>> import lavender as lv
+        >>> lv.Problem.findex_order([-1, -1, 0, 0, 1, 1]).tolist()  # all normals first, as Bullet has them
+        [0, 2, 3, 1, 4, 5]
+
+        Raises
+        ------
+        InputError
+            As `from_findex`.
+        """
+        return order_of(findex)
+
+    def to_findex(self) -> tuple[Any, FloatArray, FloatArray, FloatArray, IntArray]:
+        """(A, b, lower, upper, findex) as ODE, Bullet and DART have them, of the rows in this problem's order.
+
+        Raises
+        ------
+        InputError
+            A disk, or the law "cone": findex has neither.
+        """
+        lower, upper, findex = arrays_of(self.cones)
+        if self.law == "cone":
+            raise InputError(
+                "findex means Coulomb friction, not the law 'cone': pass problem.relaxed('coulomb')"
+            )
+        return self.delassus(), self.b, lower, upper, findex
+
+    @classmethod
     def from_rows(
         cls: type[P],
         rows: Rows,
@@ -97,6 +175,7 @@ class Builders(Operators):
         mu: ArrayLike = 0.0,
         tangents: ArrayLike | None = None,
         patch_radius: ArrayLike | None = None,
+        shape: str = "disk",
         **more: Any,
     ) -> P:
         """Problem of a step from factored rows: b = target - J v*.
@@ -114,6 +193,8 @@ class Builders(Operators):
             Tangent rows of each contact, 0 to 2. Default: two where mu > 0.
         patch_radius : scalar or (c,) m, optional
             Gives each contact a spin row.
+        shape : {"disk", "box"}
+            Of friction in two tangents; see `Cones.contacts`. Two coefficients: replace(problem, cones=...).
         **more
             As `Problem`: name, friction, ...; the example of `Rows` is a whole stack.
 
@@ -169,6 +250,8 @@ class Builders(Operators):
         both[0, kj:] = mu
         both[1, kj:] = 0.0 if patch_radius is None else as_array("patch_radius", patch_radius, (c,), unit="m")
         cones = Cones(ptr=ptr, kind=kind, lower=low, upper=high, mu=both[0], patch_radius=both[1])
+        if check_shape("shape", shape) == "box":
+            cones = cones.shaped("box")
         target = as_array("target", target, (m,), unit="m/s")
         jv = np.zeros(m + 1)
         # b = target - J v*: the slack kernel with lambda = 0 and v = v* gives J v* - 0.

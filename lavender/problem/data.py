@@ -96,7 +96,7 @@ class ProblemData:
         elif self.generalized is not None:
             self._check_generalized(self.generalized, m)
         else:
-            put(self, "matrix", _checked_matrix(self.matrix, m, self.copy))
+            put(self, "matrix", checked_matrix(self.matrix, m, self.copy))
             if sp.issparse(self.matrix):  # checked arrays; those of the object anybody may exchange
                 put(self, "_compressed", (self.matrix.indptr, self.matrix.indices, self.matrix.data))
             if self.compliance is not None:
@@ -280,7 +280,8 @@ def _many(n: int, what: str) -> str:
     return f"{n} {what}" if n == 1 else f"{n} {what}s"
 
 
-def _checked_matrix(matrix: Any, m: int, copy: bool) -> Any:
+def checked_matrix(matrix: Any, m: int, copy: bool) -> Any:
+    """A dense (m, m) array or canonical CSR of float64, read-only, every entry finite."""
     if not sp.issparse(matrix):
         return as_array("A", matrix, (m, m), unit="1/kg", copy=copy)
     if matrix.shape != (m, m):

@@ -10,7 +10,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from lavender._arrays import ArrayLike, FloatArray, as_array, check_not_negative
-from lavender.cones import CONTACT_SPIN, ROW, Cones
+from lavender.cones import ROW, Cones
 from lavender.errors import InputError
 from lavender.problem.builders import Builders
 
@@ -154,11 +154,11 @@ class Problem(Builders):
         contact = np.flatnonzero(c.kind != ROW)
         n = as_array("normal_impulse", normal_impulse, (len(contact),), unit="N s")
         check_not_negative("normal_impulse", n)
-        lower, upper = c.lower.copy(), c.upper.copy()
+        lower, upper, apart = c.lower.copy(), c.upper.copy(), c.ends_apart
         for i, load in zip(contact, n, strict=True):
             j, end = c.ptr[i], c.ptr[i + 1]
             bound = np.full(end - j, c.mu[i] * load)
-            if c.kind[i] == CONTACT_SPIN:
+            if apart[i]:
                 bound[-1] *= c.patch_radius[i]
             lower[j + 1 : end], upper[j + 1 : end] = -bound[1:], bound[1:]
             upper[j] = np.inf

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from lavender._arrays import FloatArray
+from lavender.cones import check_shape
 from lavender.errors import InputError, UnknownName
 from lavender.ordering import ENGINE_ORDERS
 from lavender.registry import get
@@ -65,6 +66,8 @@ class Parameters:
     friction: float = 0.5  # -, of bodies that say nothing else
     restitution: float = 0.0  # -, of bodies that say nothing else
     patch_radius: float = 0.0  # m, of bodies that say nothing else; 0: no spin friction
+    # "box": each tangent is bounded by itself, as in most engines; it then has no spin friction
+    friction_shape: str = "disk"
     # None: 2 for "impulses", 0 for the others, which have no position projection
     position_iterations: int = None  # type: ignore[assignment]
     seed: int = 0
@@ -134,6 +137,10 @@ class Parameters:
                 self,
                 name,
                 number(name, getattr(self, name), low=0.0, high=MOST.get(name, np.inf)),
+            )
+        if check_shape("friction_shape", self.friction_shape) == "box" and not stepper.boxes:
+            raise InputError(
+                f"stepper {stepper.name!r} bounds friction by a disk: leave friction_shape out, or take 'impulses'"
             )
         put(self, "margin", number("margin", self.margin, low=0.0))
         projections: Any = self.position_iterations

@@ -468,6 +468,7 @@ SPEC = SolverSpec(
     name="direct",
     factory=Direct,
     laws=frozenset({"linear", "lcp"}),
+    boxes=frozenset({"cone"}),
     operators=frozenset({"matrix"}),
     exact=True,
     resumable=False,

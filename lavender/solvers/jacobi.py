@@ -75,6 +75,7 @@ SPEC = SolverSpec(
     name="jacobi",
     factory=Jacobi,
     laws=frozenset({"linear", "lcp", "coulomb"}),
+    boxes=frozenset({"coulomb"}),
     operators=frozenset({"matrix"}),
     max_iter=1000,
     options={"omega": "damping, default safe for symmetric positive semidefinite A"},

@@ -490,6 +490,7 @@ SPEC = SolverSpec(
     name="lemke",
     factory=Lemke,
     laws=frozenset({"linear", "lcp"}),
+    boxes=frozenset({"coulomb", "cone"}),
     operators=frozenset({"matrix"}),
     exact=True,
     resumable=False,

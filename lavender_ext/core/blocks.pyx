@@ -7,10 +7,10 @@ from libc.stdint cimport int32_t
 
 import numpy as np
 
-from lavender_ext.core.block cimport CONTACT, CONTACT_SPIN, ROUND, ROW
+from lavender_ext.core.block cimport CONTACT, CONTACT_BOX, CONTACT_SPIN, ROUND, ROW
 
 #: Kinds of blocks by the kernels' numbers.
-KINDS = (ROW, CONTACT, CONTACT_SPIN, ROUND)
+KINDS = (ROW, CONTACT, CONTACT_SPIN, ROUND, CONTACT_BOX)
 
 cdef double INF = 1.0 / 0.0
 cdef object ndarray = np.ndarray, new = np.empty, F8 = np.dtype(np.float64), I4 = np.dtype(np.int32)
@@ -56,6 +56,9 @@ cdef class Blocks:
             if kind == ROUND:
                 self.has_round = True
                 if not 3 < size <= 6:
+                    return False
+            elif kind == CONTACT_BOX:
+                if size != 3:
                     return False
             elif kind != ROW and (not 0 < kind < ROUND or size < kind or size > kind + 2):
                 return False
@@ -218,17 +221,19 @@ cdef Blocks rows_between(Py_ssize_t m, const double* lower, const double* upper)
     return made if made.look() else None
 
 
-def contacts(Py_ssize_t k, int32_t tangents, mu, radius):
+def contacts(Py_ssize_t k, int32_t tangents, mu, radius, bint box=False):
     """k contacts of so many tangents, with a spin row where there is a radius (k,); mu a float or (k,) array.
+
+    Boxes have two tangents, and as radius mu_2 / mu_1.
 
     None where anything is amiss.
     """
-    cdef bint spin = radius is not None
+    cdef bint spin = radius is not None and not box
     cdef int32_t size = 1 + tangents + spin, kind
     cdef const double[::1] each = None, patch = None
     cdef double one = 0.0
     cdef Py_ssize_t i, j
-    kind = ROUND if tangents > 2 else CONTACT_SPIN if spin else CONTACT
+    kind = CONTACT_BOX if box else ROUND if tangents > 2 else CONTACT_SPIN if spin else CONTACT
     if not 0 <= k < 2147483647 // size:
         return None
     if type(mu) is float:
@@ -237,7 +242,7 @@ def contacts(Py_ssize_t k, int32_t tangents, mu, radius):
         each = mu
         if each.shape[0] != k:
             return None
-    if spin:
+    if radius is not None:
         patch = radius
         if patch.shape[0] != k:
             return None
@@ -247,7 +252,7 @@ def contacts(Py_ssize_t k, int32_t tangents, mu, radius):
         (<int32_t*>made.at.ptr)[i + 1] = <int32_t>(i + 1) * size
         (<int32_t*>made.at.kind)[i] = kind
         (<double*>made.at.mu)[i] = one if each is None else each[i]
-        (<double*>made.at.patch_radius)[i] = patch[i] if spin else 0.0
+        (<double*>made.at.patch_radius)[i] = 0.0 if patch is None else patch[i]
         for j in range(i * size, (i + 1) * size):
             (<double*>made.at.lower)[j] = 0.0 if j == i * size else -INF
             (<double*>made.at.upper)[j] = INF

@@ -6,7 +6,7 @@ those of the judge.
 from libc.math cimport sqrt
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.block cimport CONE, CONTACT_SPIN, ROW, block_error, blocks_t, n_tangents, row_error
+from lavender_ext.core.block cimport CONE, ROW, block_error, blocks_t, ends_apart, n_tangents, row_error
 from lavender_ext.core.generalized cimport generalized_t, panel_push, panel_times
 from lavender_ext.generalized.soft cimport cone_map, coulomb_map
 from lavender_ext.judge.score cimport nothing, tally_block, tally_row, tally_t
@@ -139,7 +139,7 @@ cdef inline void respond(const flow_t* f, int32_t first, int32_t last, const dou
         for k in range(j, end):
             lam[k] = (rho[k] * center[k] - s[k]) * soft[k]
         nt = n_tangents(kind[i], end - j)
-        spin = kind[i] == CONTACT_SPIN
+        spin = ends_apart(kind[i])
         if cone:
             cone_map(nt, spin, f.theta + j, f.p.mu[i], f.p.patch_radius[i], lam + j, v + at)
         else:

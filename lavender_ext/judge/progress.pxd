@@ -13,7 +13,7 @@ to its bound, and falls behind that. In a cycle no row keeps its way, and infeas
 from libc.math cimport fabs
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.block cimport CONTACT_SPIN, ROW, blocks_t, n_tangents, norm2
+from lavender_ext.core.block cimport ROW, blocks_t, ends_apart, n_tangents, norm2
 
 
 cdef enum:
@@ -129,7 +129,7 @@ cdef inline bint meets_bound(const progress_t* s, const blocks_t* p, const doubl
             v = norm2(v, speed(s, lam, now, k))
         if meets(p.mu[i] * lam[j] - size, (along / size if size > 0.0 else v) - p.mu[i] * rate, most):
             return True
-        if p.kind[i] == CONTACT_SPIN:
+        if ends_apart(p.kind[i]):
             k = j + 1 + nt
             v = speed(s, lam, now, k)
             along = p.mu[i] * p.patch_radius[i]

@@ -10,7 +10,7 @@ from here.
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.block cimport (CONTACT_SPIN, ROUND, ROW, block_error, blocks_t, is_pair, n_tangents,
+from lavender_ext.core.block cimport (ROUND, ROW, block_error, blocks_t, ends_apart, is_pair, n_tangents,
                                       norm2)
 
 
@@ -144,7 +144,7 @@ cdef inline void tally_block(const blocks_t* p, int32_t i, const double* e, tall
     elif p.kind[i] == ROUND:
         tally_round(p, j, n_tangents(p.kind[i], end - j), e, s)
     else:
-        tally_contact(p, j, n_tangents(p.kind[i], end - j), p.kind[i] == CONTACT_SPIN, e, s)
+        tally_contact(p, j, n_tangents(p.kind[i], end - j), ends_apart(p.kind[i]), e, s)
 
 
 cdef inline void tally_floor(const blocks_t* p, int32_t k, double size, tally_t* s) noexcept nogil:

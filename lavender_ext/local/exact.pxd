@@ -11,7 +11,7 @@ Several rows: boxed complementarity by principal pivoting.
 from libc.math cimport fabs
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.block cimport (CONE, CONTACT_SPIN, ROUND, clip, cone_error, relax_normal, relax_row,
+from lavender_ext.core.block cimport (CONE, ROUND, clip, cone_error, ends_apart, relax_normal, relax_row,
                                       relax_tangents, round_error)
 from lavender_ext.local.cone cimport cone2, cone3
 from lavender_ext.local.coulomb cimport PREPARED, coulomb2, coulomb3, prepare3
@@ -103,7 +103,7 @@ cdef inline void project_locally(int32_t law, int32_t nt, int32_t kind, const do
                                  const double* d, const double* step, double mu, double patch_radius,
                                  double* lam) noexcept nogil:
     """Where no exact answer is found: the update of core/block.pxd (cone: projected gradient) on the block alone."""
-    cdef int32_t spin = kind == CONTACT_SPIN, m = 1 + nt + spin, _sweep, i
+    cdef int32_t spin = ends_apart(kind), m = 1 + nt + spin, _sweep, i
     cdef double w[MAX_ROWS]
     cdef double e[MAX_ROWS]
     cdef double high[MAX_ROWS]

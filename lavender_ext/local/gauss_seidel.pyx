@@ -8,7 +8,7 @@ from libc.stdint cimport int32_t, uint64_t
 
 import numpy as np
 
-from lavender_ext.core.block cimport CONTACT_SPIN, blocks_t, n_tangents
+from lavender_ext.core.block cimport CONTACT_SPIN, blocks_t, n_directions
 from lavender_ext.core.csr cimport csr_t
 from lavender_ext.core.generalized cimport dot, generalized_t
 from lavender_ext.core.order cimport advance_order
@@ -69,7 +69,7 @@ cdef public void lav_prepare_rows(const blocks_t* p, const rows_t* r, const int3
         c = i - r.n_joints
         if c >= 0:
             spin = p.kind[i] == CONTACT_SPIN
-            nt = n_tangents(p.kind[i], n)
+            nt = n_directions(p.kind[i], n)
             contact_jacobian(r, c, nt, spin, jac)
             row = jac
         else:

@@ -2,7 +2,7 @@
 from libc.math cimport sqrt
 from libc.stdint cimport int32_t, int64_t
 
-from lavender_ext.core.block cimport CONTACT_SPIN as SPIN, blocks_t, n_tangents
+from lavender_ext.core.block cimport CONTACT_SPIN as SPIN, blocks_t, n_directions
 from lavender_ext.core.rows cimport contact_jacobian, rows_t
 from lavender_ext.newton.elements cimport elements_t
 
@@ -124,7 +124,7 @@ cdef inline void fill_panel(const blocks_t* p, const rows_t* r, const double* ro
         else:
             a = r.contact_body[2 * c]
             b = r.contact_body[2 * c + 1]
-            contact_jacobian(r, c, n_tangents(p.kind[i], p.ptr[i + 1] - j), p.kind[i] == SPIN, jac)
+            contact_jacobian(r, c, n_directions(p.kind[i], p.ptr[i + 1] - j), p.kind[i] == SPIN, jac)
             row = jac
         for q in range(j, p.ptr[i + 1]):
             out = panel + 12 * <int64_t>q

@@ -4,8 +4,7 @@ Over J and M the whitened velocities u = Y^T lam are kept: w = Y u + c lam - b, 
 """
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.block cimport (CONTACT_SPIN, ROW, blocks_t, n_tangents, relax_normal, relax_row,
-                                      relax_tangents)
+from lavender_ext.core.block cimport ROW, blocks_t, ends_apart, n_tangents, relax_normal, relax_row, relax_tangents
 from lavender_ext.core.csr cimport csr_dot, csr_t
 from lavender_ext.core.generalized cimport generalized_t, whitened_dot, whitened_push
 
@@ -25,7 +24,7 @@ cdef inline void relax_csr_block(const blocks_t* p, const csr_t* a, int32_t i, d
         for q in range(nt):
             w[q] = csr_dot(a, j + 1 + q, lam) - p.b[j + 1 + q]
         relax_tangents(lam + j + 1, w, p.step[j + 1], bound, nt)
-    if kind == CONTACT_SPIN:
+    if ends_apart(kind):
         q = end - 1
         bound = p.patch_radius[i] * bound
         lam[q] = relax_row(lam[q], csr_dot(a, q, lam) - p.b[q], p.step[q], -bound, bound)
@@ -63,7 +62,7 @@ cdef inline void relax_general_block(const blocks_t* p, const generalized_t* g, 
         relax_tangents(now, w, p.step[j + 1], bound, nt)
         for q in range(nt):
             take_general(g, b, j + 1 + q, now[q], lam, u)
-    if kind == CONTACT_SPIN:
+    if ends_apart(kind):
         q = end - 1
         bound = p.patch_radius[i] * bound
         x = general_slack_of(p, g, b, q, lam, u)

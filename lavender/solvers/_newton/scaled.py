@@ -150,7 +150,7 @@ def _mixed_elements(problem: Problem) -> _Elements:
     mu, radius = np.repeat(cones.mu, size), np.repeat(cones.patch_radius, size)
     position = np.arange(m) - np.repeat(cones.ptr[:-1], size)
     contact = np.repeat(cones.kind != ROW, size)
-    spin = contact & np.repeat(cones.kind == CONTACT_SPIN, size) & (position == np.repeat(size, size) - 1)
+    spin = contact & np.repeat(cones.ends_apart, size) & (position == np.repeat(size, size) - 1)
     still = np.asarray(cones.lower == cones.upper)
     still |= contact & (position > 0) & ((mu == 0.0) | (spin & (radius == 0.0)))
     fixed = np.zeros(m)
