@@ -1,13 +1,15 @@
 """Blocks of a problem: which rows belong together and what bounds them.
 
 A block is one or more bounded rows (`ROW`), or a contact: normal row, then 0 to 2 tangent rows, then
-perhaps one spin row. With lambda [N s] the bounds are
+perhaps one spin row, perhaps two rows that roll. With lambda [N s] the bounds are
 
     ROW           lower <= lambda_i <= upper on each of its rows
     CONTACT       0 <= lambda_n,  |lambda_t| <= mu lambda_n
     CONTACT_SPIN  the same, and |lambda_s| <= mu r lambda_n, r = patch radius [m]
     ROUND         0 <= lambda_n, |lambda_T| <= mu lambda_n over three to five tangents together: two that slide, one
                   that spins, two that roll; each row scaled by its own coefficient over mu, so that one mu bounds all
+    CONTACT_ROLLING  a contact of two tangents, perhaps with spin, and |lambda_r| <= mu_r lambda_n on the two that roll,
+                  mu_r [m] the arm by which rolling moves the normal force; each part bounded by itself
 """
 
 from __future__ import annotations
@@ -21,9 +23,9 @@ from lavender._arrays import FloatArray, IntArray, as_array, check_not_nan, chec
 from lavender.errors import InputError
 from lavender_ext.core import blocks as kernels
 
-__all__ = ["CONTACT", "CONTACT_SPIN", "ROUND", "ROW", "Cones", "project"]
+__all__ = ["CONTACT", "CONTACT_ROLLING", "CONTACT_SPIN", "ROUND", "ROW", "Cones", "project"]
 
-ROW, CONTACT, CONTACT_SPIN, ROUND = kernels.KINDS
+ROW, CONTACT, CONTACT_SPIN, ROUND, CONTACT_ROLLING = kernels.KINDS
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,18 +37,20 @@ class Cones:
     ptr : (k + 1,) int
         First row of each block, then m.
     kind : (k,) int
-        ROW, CONTACT, CONTACT_SPIN or ROUND of each block.
+        ROW, CONTACT, CONTACT_SPIN, ROUND or CONTACT_ROLLING of each block.
     lower, upper : (m,) N s
         Bounds of rows on ROW blocks; infinite ones are allowed, those of contacts are not read.
     mu : (k,) -
         Coefficient of friction of each contact.
     patch_radius : (k,) m
-        Of CONTACT_SPIN: its spin row is bounded by mu r lambda_n [N m s].
+        Of contacts with spin: their spin row is bounded by mu r lambda_n [N m s].
+    rolling : (k,) m, optional
+        mu_r of CONTACT_ROLLING: what rolls is bounded by mu_r lambda_n [N m s] (Acary, Bourrier, Viano 2023); default 0.
 
     Raises
     ------
     InputError
-        Shapes that do not fit, lower > upper, NaN bounds, negative mu or patch radius, a contact with
+        Shapes that do not fit, lower > upper, NaN bounds, negative mu, patch radius or mu_r, a contact with
         more rows than normal, two tangents and spin, a round cone of more than five tangents.
 
     Examples
@@ -64,15 +68,20 @@ class Cones:
     """
 
     ptr: IntArray  # (k + 1,) first row of each block, then m
-    kind: IntArray  # (k,) ROW | CONTACT | CONTACT_SPIN | ROUND
+    kind: IntArray  # (k,) ROW | CONTACT | CONTACT_SPIN | ROUND | CONTACT_ROLLING
     lower: FloatArray  # (m,) N s, read on ROW blocks, -inf allowed
     upper: FloatArray  # (m,) N s, read on ROW blocks, +inf allowed
     mu: FloatArray  # (k,) -, read on contacts
-    patch_radius: FloatArray  # (k,) m, read on CONTACT_SPIN
+    patch_radius: FloatArray  # (k,) m, read on contacts with spin
+    rolling: FloatArray = None  # type: ignore[assignment]  # (k,) m, read on CONTACT_ROLLING; None: 0
     _blocks: ClassVar[kernels.Blocks]  # of an instance: the same arrays, as kernels read them
 
     def __post_init__(self) -> None:
-        made = kernels.private(self.ptr, self.kind, self.lower, self.upper, self.mu, self.patch_radius)
+        if self.rolling is None:
+            self.__dict__["rolling"] = np.zeros(np.size(self.kind))
+        made = kernels.private(
+            self.ptr, self.kind, self.lower, self.upper, self.mu, self.patch_radius, self.rolling
+        )
         if made is None:
             made = self._checked()
         self._take(made)
@@ -80,7 +89,8 @@ class Cones:
     def _take(self, made: kernels.Blocks) -> None:
         put = self.__dict__
         put["_blocks"] = made
-        put["ptr"], put["kind"], put["lower"], put["upper"], put["mu"], put["patch_radius"] = made.arrays
+        put["ptr"], put["kind"], put["lower"], put["upper"], *coefficients = made.arrays
+        put["mu"], put["patch_radius"], put["rolling"] = coefficients
 
     @classmethod
     def _of(cls, made: kernels.Blocks) -> Cones:
@@ -98,9 +108,10 @@ class Cones:
             )
         k, m = len(ptr) - 1, int(ptr[-1])
         kind = as_array("cones.kind", self.kind, (k,), dtype=np.int32)
-        if k and not np.isin(kind, (ROW, CONTACT, CONTACT_SPIN, ROUND)).all():
+        if k and not np.isin(kind, kernels.KINDS).all():
             raise InputError(
-                f"cones.kind holds {sorted(set(kind.tolist()))}; ROW=0, CONTACT=1, CONTACT_SPIN=2, ROUND=3 are known"
+                f"cones.kind holds {sorted(set(kind.tolist()))}; ROW=0, CONTACT=1, CONTACT_SPIN=2, ROUND=3, "
+                f"CONTACT_ROLLING={CONTACT_ROLLING} are known"
             )
         size = np.diff(ptr)
         if np.any(kind == ROUND):
@@ -114,7 +125,14 @@ class Cones:
                     f"block {bad[0]} is a round cone of {size[bad[0]]} rows; a normal and up to five tangents "
                     "(two slide, one spins, two roll) are known"
                 )
-        bad = np.flatnonzero((kind != ROW) & (kind != ROUND) & ((size < kind) | (size > kind + 2)))
+        bad = np.flatnonzero((kind == CONTACT_ROLLING) & (size != 5) & (size != 6))
+        if len(bad):
+            raise InputError(
+                f"block {bad[0]} is a contact with rolling of {size[bad[0]]} rows; a normal, two tangents, perhaps "
+                "spin, and two that roll are needed: 5 rows or 6"
+            )
+        plain = (kind == CONTACT) | (kind == CONTACT_SPIN)
+        bad = np.flatnonzero(plain & ((size < kind) | (size > kind + 2)))
         if len(bad):
             raise InputError(
                 f"block {bad[0]} is a contact of {size[bad[0]]} rows; a contact has a normal, up to "
@@ -144,7 +162,9 @@ class Cones:
         check_not_negative("mu", mu)
         radius = as_array("patch_radius", self.patch_radius, (k,), unit="m")
         check_not_negative("patch_radius", radius)
-        return kernels.Blocks(ptr, kind, lower, upper, mu, radius)
+        rolling = as_array("rolling", self.rolling, (k,), unit="m")
+        check_not_negative("rolling", rolling)
+        return kernels.Blocks(ptr, kind, lower, upper, mu, radius, rolling)
 
     @classmethod
     def _trusted(cls, *values: np.ndarray) -> Cones:
@@ -174,9 +194,15 @@ class Cones:
 
     @classmethod
     def contacts(
-        cls, mu: Any, tangents: int = 2, patch_radius: Any = None, *, count: int | None = None
+        cls,
+        mu: Any,
+        tangents: int = 2,
+        patch_radius: Any = None,
+        *,
+        rolling: Any = None,
+        count: int | None = None,
     ) -> Cones:
-        """Contacts only, the same rows for each: normal, `tangents`, and with a radius a spin row.
+        """Contacts only, the same rows for each: normal, `tangents`, with a radius a spin row, then what rolls.
 
         Parameters
         ----------
@@ -184,6 +210,8 @@ class Cones:
         tangents : int, 0 to 5
             More than two make one round cone (ROUND) and take no patch radius.
         patch_radius : scalar or (k,) m, optional
+        rolling : scalar or (k,) m, optional
+            mu_r: gives each contact two rows that roll about its two tangents, |lambda_r| <= mu_r lambda_n.
         count : int, optional
             k, where mu is a scalar; default 1.
         """
@@ -198,6 +226,11 @@ class Cones:
             raise InputError(
                 f"{tangents} tangents make a round cone, which bounds spin itself: no patch_radius"
             )
+        if rolling is not None and tangents != 2:
+            raise InputError(
+                f"rolling needs tangents=2, about which it rolls; tangents is {tangents}"
+                + (", a round cone, which bounds rolling itself" if tangents > 2 else "")
+            )
         if count is not None and (
             isinstance(count, bool) or not isinstance(count, (int, np.integer)) or count < 0
         ):
@@ -211,7 +244,10 @@ class Cones:
         if patch_radius is not None:
             patch_radius = as_array("patch_radius", patch_radius, (k,), unit="m")
             check_not_negative("patch_radius", patch_radius)
-        made = kernels.contacts(k, tangents, mu, patch_radius)
+        if rolling is not None:
+            rolling = as_array("rolling", rolling, (k,), unit="m")
+            check_not_negative("rolling", rolling)
+        made = kernels.contacts(k, tangents, mu, patch_radius, rolling)
         if made is None:
             raise InputError(f"{k} contacts have more rows than 32-bit numbers count")
         return cls._of(made)
@@ -242,10 +278,39 @@ class Cones:
         return bool(self._blocks.has_round)
 
     @property
+    def has_rolling(self) -> bool:
+        """Some contact has two rows that roll, bounded by themselves."""
+        return bool(self._blocks.has_rolling)
+
+    @property
     def n_tangents(self) -> IntArray:
-        """(k,) tangent rows of each block, 0 on ROW."""
+        """(k,) tangent rows of each block, 0 on ROW; rows that spin or roll, each with a bound of its own, are none."""
         own = np.diff(self.ptr) - 1 - (self.kind == CONTACT_SPIN)
+        own = np.where(self.kind == CONTACT_ROLLING, 2, own)
         return np.where(self.kind == ROW, 0, own).astype(np.int32)
+
+    @property
+    def reach(self) -> FloatArray:
+        """(m,) largest impulse of each row over lambda_n: mu, mu r of spin, mu_r of rolling; 0 on normals and ROW."""
+        size = np.diff(self.ptr)
+        out = np.repeat(np.where(self.kind == ROW, 0.0, self.mu), size)
+        out[self.ptr[:-1]] = 0.0
+        turning, rolling = self.spin_rows >= 0, self.rolling_rows >= 0
+        out[self.spin_rows[turning]] *= self.patch_radius[turning]
+        for k in (0, 1):
+            out[self.rolling_rows[rolling] + k] = self.rolling[rolling]
+        return np.asarray(out)
+
+    @property
+    def spin_rows(self) -> IntArray:
+        """(k,) the spin row of each block, -1 where it has none."""
+        spins = (self.kind == CONTACT_SPIN) | ((self.kind == CONTACT_ROLLING) & (np.diff(self.ptr) == 6))
+        return np.where(spins, self.ptr[:-1] + 1 + self.n_tangents, -1).astype(np.int32)
+
+    @property
+    def rolling_rows(self) -> IntArray:
+        """(k,) the first of the two rows of each block that roll with a bound of their own, -1 where it has none."""
+        return np.where(self.kind == CONTACT_ROLLING, self.ptr[1:] - 2, -1).astype(np.int32)
 
     def __add__(self, other: object) -> Cones:
         """These blocks, then those of `other`."""
@@ -269,21 +334,26 @@ class Cones:
 
 
 def project(cones: Cones, impulse: FloatArray) -> FloatArray:
-    """Nearest feasible normal and rows, then tangents and spin onto mu lambda_n; (m,) [N s].
+    """Nearest feasible normal and rows, then tangents, spin and rolling onto their bounds times lambda_n; (m,) [N s].
 
     This is the feasibility step of a sweep, not the projection onto the friction cone: the normal is
     clipped first and keeps its value.
     """
     out = np.clip(impulse, cones.lower, cones.upper)
-    tangents = cones.n_tangents
+    tangents, turning, rolling = cones.n_tangents, cones.spin_rows, cones.rolling_rows
     for i in np.flatnonzero((cones.kind != ROW) & (np.diff(cones.ptr) > 1)):
-        j, end, nt = cones.ptr[i], cones.ptr[i + 1], tangents[i]
+        j, nt = cones.ptr[i], tangents[i]
         bound = cones.mu[i] * out[j]
         t = out[j + 1 : j + 1 + nt]
         size = np.hypot.reduce(t) if nt else 0.0
         if size > bound:
             t *= bound / size
-        if cones.kind[i] == CONTACT_SPIN:
+        if turning[i] >= 0:
             spin = bound * cones.patch_radius[i]
-            out[end - 1] = np.clip(out[end - 1], -spin, spin)
+            out[turning[i]] = np.clip(out[turning[i]], -spin, spin)
+        if rolling[i] >= 0:
+            r, bound = out[rolling[i] : rolling[i] + 2], cones.rolling[i] * out[j]
+            size = np.hypot(*r)
+            if size > bound:
+                r *= bound / size
     return out

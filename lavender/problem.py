@@ -28,7 +28,7 @@ from lavender._arrays import (
     table_of,
 )
 from lavender._derived import Derived, once
-from lavender.cones import CONTACT_SPIN, ROUND, ROW, Cones
+from lavender.cones import CONTACT_ROLLING, ROUND, ROW, Cones
 from lavender.errors import CapabilityError, InputError
 from lavender.generalized import Generalized
 from lavender.rows import Rows
@@ -256,9 +256,16 @@ class Problem:
 
     @classmethod
     def contact(
-        cls, A: Any, b: ArrayLike, mu: ArrayLike, patch_radius: ArrayLike | None = None, **more: Any
+        cls,
+        A: Any,
+        b: ArrayLike,
+        mu: ArrayLike,
+        patch_radius: ArrayLike | None = None,
+        *,
+        rolling: ArrayLike | None = None,
+        **more: Any,
     ) -> Problem:
-        """Contacts only, m / k rows each: normal, up to two tangents, spin with `patch_radius`.
+        """Contacts only, m / k rows each: normal, up to two tangents, spin with `patch_radius`, two that roll with `rolling`.
 
         Parameters
         ----------
@@ -269,6 +276,8 @@ class Problem:
             One for each contact. A scalar stands for all of them, which then have two tangents, or for a single one.
         patch_radius : scalar or (k,) m, optional
             Gives each contact a spin row.
+        rolling : scalar or (k,) m, optional
+            mu_r: gives each contact two rows that roll, after the others; two tangents are needed.
 
         Raises
         ------
@@ -276,8 +285,9 @@ class Problem:
             The rows do not part among the contacts; mu > 0 where contacts have no row for friction.
         """
         b = as_array("b", b, (None,), unit="m/s")
+        turns = (patch_radius is not None) + 2 * (rolling is not None)
         if np.ndim(mu) == 0:
-            each = 3 + (patch_radius is not None)
+            each = 3 + turns
             mu = np.full(max(1, len(b) // each) if len(b) % each == 0 else 1, mu)
         mu = as_array("mu", np.asarray(mu), (None,))
         if (len(mu) == 0) != (len(b) == 0) or (len(mu) and len(b) % len(mu)):
@@ -285,11 +295,11 @@ class Problem:
                 f"b has {len(b)} rows for {len(mu)} values of mu; the same number of rows for each "
                 "contact is needed"
             )
-        tangents = len(b) // len(mu) - 1 - (patch_radius is not None) if len(mu) else 0
+        tangents = len(b) // len(mu) - 1 - turns if len(mu) else 2 * (rolling is not None)
         if not 0 <= tangents <= 2:
             raise InputError(
                 f"{len(b)} rows for {len(mu)} contacts; a contact has a normal, up to two tangents, "
-                "and spin with patch_radius"
+                "spin with patch_radius, and two rows that roll with rolling"
             )
         if patch_radius is not None:
             patch_radius = as_array("patch_radius", patch_radius, (len(mu),), unit="m")
@@ -298,7 +308,7 @@ class Problem:
                 f"mu has {len(mu)} values for {len(b)} rows, so each contact is a normal alone, without a row for "
                 "friction: give one mu for each contact (normal and tangents together), or mu = 0"
             )
-        return cls(b, Cones.contacts(mu, tangents, patch_radius), A, **more)
+        return cls(b, Cones.contacts(mu, tangents, patch_radius, rolling=rolling), A, **more)
 
     @classmethod
     def from_rows(
@@ -311,6 +321,7 @@ class Problem:
         mu: ArrayLike = 0.0,
         tangents: ArrayLike | None = None,
         patch_radius: ArrayLike | None = None,
+        rolling: ArrayLike | None = None,
         **more: Any,
     ) -> Problem:
         """Problem of a step from factored rows: b = target - J v*.
@@ -328,6 +339,8 @@ class Problem:
             Tangent rows of each contact, 0 to 2. Default: two where mu > 0.
         patch_radius : scalar or (c,) m, optional
             Gives each contact a spin row.
+        rolling : scalar or (c,) m, optional
+            mu_r: gives each contact two rows that roll about its two tangents; all contacts need two.
         **more
             As `Problem`: name, friction, ...; the example of `Rows` is a whole stack.
 
@@ -367,22 +380,28 @@ class Problem:
         tangents = as_array("tangents", tangents, (c,), dtype=np.int32)
         if c and (tangents.min() < 0 or tangents.max() > 2):
             raise InputError("tangents must be 0, 1 or 2 for each contact")
-        spin = patch_radius is not None
+        spin, rolls = patch_radius is not None, rolling is not None
+        if rolls and c and tangents.min() < 2:
+            raise InputError(
+                f"contact {int(np.argmin(tangents))} has {tangents.min()} tangents; rolling needs two, about which it "
+                "rolls: give tangents=2"
+            )
         smooth = np.flatnonzero((mu > 0.0) & (tangents == 0))
         if len(smooth) and not spin:
             raise InputError(
                 f"contact {smooth[0]} has mu {mu[smooth[0]]:g} and no tangent to feel it: give tangents=2, or mu 0"
             )
-        ptr = np.concatenate([rows.joint_ptr, mj + np.cumsum(1 + tangents + spin)]).astype(np.int32)
-        kind = np.repeat(np.array([ROW, 1 + spin], np.int32), [kj, c])
+        ptr = np.concatenate([rows.joint_ptr, mj + np.cumsum(1 + tangents + spin + 2 * rolls)]).astype(np.int32)
+        kind = np.repeat(np.array([ROW, CONTACT_ROLLING if rolls else 1 + spin], np.int32), [kj, c])
         m = int(ptr[-1])
         low, high = np.full(m, -np.inf), np.full(m, np.inf)
         low[:mj] = as_array("lower", lower, (mj,), finite=False, unit="N s")
         high[:mj] = as_array("upper", upper, (mj,), finite=False, unit="N s")
-        both = np.zeros((2, kj + c))
+        both = np.zeros((3, kj + c))
         both[0, kj:] = mu
         both[1, kj:] = 0.0 if patch_radius is None else as_array("patch_radius", patch_radius, (c,), unit="m")
-        cones = Cones(ptr=ptr, kind=kind, lower=low, upper=high, mu=both[0], patch_radius=both[1])
+        both[2, kj:] = 0.0 if rolling is None else as_array("rolling", rolling, (c,), unit="m")
+        cones = Cones(ptr, kind, low, high, *both)
         target = as_array("target", target, (m,), unit="m/s")
         jv = np.zeros(m + 1)
         # b = target - J v*: the slack kernel with lambda = 0 and v = v* gives J v* - 0.
@@ -841,6 +860,7 @@ class Problem:
             raise InputError(f"row {row} of a problem of {self.m} rows")
         i = self.block_of(row)
         offset, size, kind = row - int(self.cones.ptr[i]), int(np.diff(self.cones.ptr)[i]), self.cones.kind[i]
+        spin, roll = self.cones.spin_rows[i], self.cones.rolling_rows[i]
         if kind == ROW:
             name = self.names[i] if self.names else f"row {row}" if size == 1 else f"joint {i}"
             return name if size == 1 else f"{name}, axis {offset}"
@@ -852,7 +872,9 @@ class Problem:
             return f"{name}, normal"
         if kind == ROUND and offset > 2:
             return f"{name}, spin" if offset == 3 else f"{name}, roll {offset - 3}"
-        return f"{name}, spin" if kind == CONTACT_SPIN and offset == size - 1 else f"{name}, tangent {offset}"
+        if 0 <= roll <= row:
+            return f"{name}, roll {row - roll + 1}"
+        return f"{name}, spin" if row == spin else f"{name}, tangent {offset}"
 
     # -- other forms -----------------------------------------------------------------------------
 
@@ -882,8 +904,10 @@ class Problem:
         for i, load in zip(contact, n, strict=True):
             j, end = c.ptr[i], c.ptr[i + 1]
             bound = np.full(end - j, c.mu[i] * load)
-            if c.kind[i] == CONTACT_SPIN:
-                bound[-1] *= c.patch_radius[i]
+            if c.spin_rows[i] >= 0:
+                bound[c.spin_rows[i] - j] *= c.patch_radius[i]
+            if c.rolling_rows[i] >= 0:
+                bound[-2:] = c.rolling[i] * load
             lower[j + 1 : end], upper[j + 1 : end] = -bound[1:], bound[1:]
             upper[j] = np.inf
         names = None if self.names is None else [self.row_name(i) for i in range(self.m)]

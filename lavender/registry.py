@@ -113,6 +113,7 @@ class SolverSpec:
     history: bool = True  # records history; needs resumable
     delegates: bool = False  # may hand over to other solvers: only "auto"
     round_cones: bool = False  # takes contacts of more than two tangents in one cone
+    rolling: bool = False  # takes contacts that resist rolling, each part with a bound of its own
     external: bool = False  # another project's code solves; its claims are its own
     max_iter: int = 1000  # default budget
     options: Mapping[str, str] = field(default_factory=dict)  # own options: name -> one line
@@ -176,6 +177,11 @@ class SolverSpec:
             return (
                 "takes no round cones (more than two tangents in one): use one of those that do, "
                 "lavender.available(problem) lists them, or give the edges of a pyramid as rows"
+            )
+        if problem.cones.has_rolling and not self.rolling:
+            return (
+                "takes no contacts that resist rolling: use one of those that do, lavender.available(problem) lists "
+                "them, or leave the rows that roll out"
             )
         return self.refusal(problem) if self.refusal is not None else None
 

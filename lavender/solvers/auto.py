@@ -108,6 +108,7 @@ SPEC = SolverSpec(
     laws=frozenset({"linear", "lcp", "coulomb", "cone"}),
     operators=frozenset(OPERATORS),
     round_cones=True,
+    rolling=True,
     few=AUTO,
     resumable=False,
     delegates=True,

@@ -76,6 +76,7 @@ SPEC = SolverSpec(
     factory=Jacobi,
     laws=frozenset({"linear", "lcp", "coulomb"}),
     operators=frozenset({"matrix"}),
+    rolling=True,
     max_iter=1000,
     options={"omega": "damping, default safe for symmetric positive semidefinite A"},
     summary="damped Jacobi, projected",

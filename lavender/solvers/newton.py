@@ -219,6 +219,7 @@ SPEC = SolverSpec(
     laws=frozenset({"linear", "lcp", "coulomb", "cone"}),
     operators=frozenset(OPERATORS),
     round_cones=True,
+    rolling=True,
     refusal=_refusal,
     few=NEWTON,
     resumable=False,

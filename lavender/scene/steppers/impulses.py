@@ -18,5 +18,6 @@ SPEC = StepperSpec(
     position_iterations=2,
     solvers=True,
     spin=True,
+    rolling=True,
     exact_problem=True,
 )
