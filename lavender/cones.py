@@ -1,7 +1,7 @@
 """Blocks of a problem: which rows belong together and what bounds them.
 
 A block is one or more bounded rows (`ROW`), or a contact: normal row, then 0 to 2 tangent rows, then
-perhaps one spin row. With lambda [N s] the bounds are
+perhaps one spin row, perhaps two rows that roll. With lambda [N s] the bounds are
 
     ROW           lower <= lambda_i <= upper on each of its rows
     CONTACT       0 <= lambda_n,  |lambda_t| <= mu lambda_n
@@ -10,6 +10,8 @@ perhaps one spin row. With lambda [N s] the bounds are
                   as most engines have it; q = mu_2 / mu_1 stands in the place of the patch radius
     ROUND         0 <= lambda_n, |lambda_T| <= mu lambda_n over three to five tangents together: two that slide, one
                   that spins, two that roll; each row scaled by its own coefficient over mu, so that one mu bounds all
+    CONTACT_ROLLING  a contact of two tangents, perhaps with spin, and |lambda_r| <= mu_r lambda_n on the two that roll,
+                  mu_r [m] the arm by which rolling moves the normal force; each part bounded by itself
 """
 
 from __future__ import annotations
@@ -26,6 +28,7 @@ from lavender_ext.core import blocks as kernels
 __all__ = [
     "CONTACT",
     "CONTACT_BOX",
+    "CONTACT_ROLLING",
     "CONTACT_SPIN",
     "ROUND",
     "ROW",
@@ -35,7 +38,7 @@ __all__ = [
     "project",
 ]
 
-ROW, CONTACT, CONTACT_SPIN, ROUND, CONTACT_BOX = kernels.KINDS
+ROW, CONTACT, CONTACT_SPIN, ROUND, CONTACT_BOX, CONTACT_ROLLING = kernels.KINDS
 # What bounds two tangents: their norm, or each by itself.
 SHAPES = ("disk", "box")
 # mu_1 = 0 beside mu_2 > 0 stands as this share of mu_2: its impulses vanish in any sum with those of mu_2.
@@ -64,18 +67,20 @@ class Cones:
     ptr : (k + 1,) int
         First row of each block, then m.
     kind : (k,) int
-        ROW, CONTACT, CONTACT_SPIN, ROUND or CONTACT_BOX of each block.
+        ROW, CONTACT, CONTACT_SPIN, ROUND, CONTACT_BOX or CONTACT_ROLLING of each block.
     lower, upper : (m,) N s
         Bounds of rows on ROW blocks; infinite ones are allowed, those of contacts are not read.
     mu : (k,) -
         Coefficient of friction of each contact.
     patch_radius : (k,) m
-        Of CONTACT_SPIN: its spin row is bounded by mu r lambda_n [N m s]. Of CONTACT_BOX mu_2 / mu_1 [-].
+        Of contacts with spin: their spin row is bounded by mu r lambda_n [N m s]. Of CONTACT_BOX mu_2 / mu_1 [-].
+    rolling : (k,) m, optional
+        mu_r of CONTACT_ROLLING: what rolls is bounded by mu_r lambda_n [N m s] (Acary, Bourrier, Viano 2023); default 0.
 
     Raises
     ------
     InputError
-        Shapes that do not fit, lower > upper, NaN bounds, negative mu or patch radius, a contact with
+        Shapes that do not fit, lower > upper, NaN bounds, negative mu, patch radius or mu_r, a contact with
         more rows than normal, two tangents and spin, a round cone of more than five tangents.
 
     Examples
@@ -93,15 +98,20 @@ class Cones:
     """
 
     ptr: IntArray  # (k + 1,) first row of each block, then m
-    kind: IntArray  # (k,) ROW | CONTACT | CONTACT_SPIN | ROUND | CONTACT_BOX
+    kind: IntArray  # (k,) ROW | CONTACT | CONTACT_SPIN | ROUND | CONTACT_BOX | CONTACT_ROLLING
     lower: FloatArray  # (m,) N s, read on ROW blocks, -inf allowed
     upper: FloatArray  # (m,) N s, read on ROW blocks, +inf allowed
     mu: FloatArray  # (k,) -, read on contacts
-    patch_radius: FloatArray  # (k,) m, read on CONTACT_SPIN; on CONTACT_BOX mu_2 / mu_1
+    patch_radius: FloatArray  # (k,) m, read on contacts with spin; on CONTACT_BOX mu_2 / mu_1
+    rolling: FloatArray = None  # type: ignore[assignment]  # (k,) m, read on CONTACT_ROLLING; None: 0
     _blocks: ClassVar[kernels.Blocks]  # of an instance: the same arrays, as kernels read them
 
     def __post_init__(self) -> None:
-        made = kernels.private(self.ptr, self.kind, self.lower, self.upper, self.mu, self.patch_radius)
+        if self.rolling is None:
+            self.__dict__["rolling"] = np.zeros(np.size(self.kind))
+        made = kernels.private(
+            self.ptr, self.kind, self.lower, self.upper, self.mu, self.patch_radius, self.rolling
+        )
         if made is None:
             made = self._checked()
         self._take(made)
@@ -109,7 +119,8 @@ class Cones:
     def _take(self, made: kernels.Blocks) -> None:
         put = self.__dict__
         put["_blocks"] = made
-        put["ptr"], put["kind"], put["lower"], put["upper"], put["mu"], put["patch_radius"] = made.arrays
+        put["ptr"], put["kind"], put["lower"], put["upper"], *coefficients = made.arrays
+        put["mu"], put["patch_radius"], put["rolling"] = coefficients
 
     @classmethod
     def _of(cls, made: kernels.Blocks) -> Cones:
@@ -130,7 +141,7 @@ class Cones:
         if k and not np.isin(kind, kernels.KINDS).all():
             raise InputError(
                 f"cones.kind holds {sorted(set(kind.tolist()))}; ROW=0, CONTACT=1, CONTACT_SPIN=2, ROUND=3, "
-                "CONTACT_BOX=4 are known"
+                f"CONTACT_BOX={CONTACT_BOX}, CONTACT_ROLLING={CONTACT_ROLLING} are known"
             )
         size = np.diff(ptr)
         if np.any(kind == ROUND):
@@ -154,9 +165,14 @@ class Cones:
                 raise InputError(
                     f"block {bad[0]} is a box of {size[bad[0]]} rows; a normal and two tangents are known"
                 )
-        bad = np.flatnonzero(
-            ((kind == CONTACT) | (kind == CONTACT_SPIN)) & ((size < kind) | (size > kind + 2))
-        )
+        bad = np.flatnonzero((kind == CONTACT_ROLLING) & (size != 5) & (size != 6))
+        if len(bad):
+            raise InputError(
+                f"block {bad[0]} is a contact with rolling of {size[bad[0]]} rows; a normal, two tangents, perhaps "
+                "spin, and two that roll are needed: 5 rows or 6"
+            )
+        plain = (kind == CONTACT) | (kind == CONTACT_SPIN)
+        bad = np.flatnonzero(plain & ((size < kind) | (size > kind + 2)))
         if len(bad):
             raise InputError(
                 f"block {bad[0]} is a contact of {size[bad[0]]} rows; a contact has a normal, up to "
@@ -186,7 +202,9 @@ class Cones:
         check_not_negative("mu", mu)
         radius = as_array("patch_radius", self.patch_radius, (k,), unit="m")
         check_not_negative("patch_radius", radius)
-        return kernels.Blocks(ptr, kind, lower, upper, mu, radius)
+        rolling = as_array("rolling", self.rolling, (k,), unit="m")
+        check_not_negative("rolling", rolling)
+        return kernels.Blocks(ptr, kind, lower, upper, mu, radius, rolling)
 
     @classmethod
     def _trusted(cls, *values: np.ndarray) -> Cones:
@@ -221,10 +239,11 @@ class Cones:
         tangents: int = 2,
         patch_radius: Any = None,
         *,
+        rolling: Any = None,
         count: int | None = None,
         shape: str = "disk",
     ) -> Cones:
-        """Contacts only, the same rows for each: normal, `tangents`, and with a radius a spin row.
+        """Contacts only, the same rows for each: normal, `tangents`, with a radius a spin row, then what rolls.
 
         Parameters
         ----------
@@ -233,6 +252,8 @@ class Cones:
         tangents : int, 0 to 5
             More than two make one round cone (ROUND) and take no patch radius.
         patch_radius : scalar or (k,) m, optional
+        rolling : scalar or (k,) m, optional
+            mu_r: gives each contact two rows that roll about its two tangents, |lambda_r| <= mu_r lambda_n.
         count : int, optional
             k, where mu is a scalar; default 1.
         shape : {"disk", "box"}
@@ -274,6 +295,11 @@ class Cones:
             raise InputError(
                 f"{tangents} tangents make a round cone, which bounds spin itself: no patch_radius"
             )
+        if rolling is not None and tangents != 2:
+            raise InputError(
+                f"rolling needs tangents=2, about which it rolls; tangents is {tangents}"
+                + (", a round cone, which bounds rolling itself" if tangents > 2 else "")
+            )
         if count is not None and (
             isinstance(count, bool) or not isinstance(count, (int, np.integer)) or count < 0
         ):
@@ -287,9 +313,12 @@ class Cones:
         if patch_radius is not None:
             patch_radius = as_array("patch_radius", patch_radius, (k,), unit="m")
             check_not_negative("patch_radius", patch_radius)
+        if rolling is not None:
+            rolling = as_array("rolling", rolling, (k,), unit="m")
+            check_not_negative("rolling", rolling)
         if ratio is not None:
             patch_radius = np.ascontiguousarray(np.broadcast_to(ratio, (k,)))
-        made = kernels.contacts(k, tangents, mu, patch_radius, ratio is not None)
+        made = kernels.contacts(k, tangents, mu, patch_radius, rolling, ratio is not None)
         if made is None:
             raise InputError(f"{k} contacts have more rows than 32-bit numbers count")
         return cls._of(made)
@@ -320,6 +349,11 @@ class Cones:
         return bool(self._blocks.has_round)
 
     @property
+    def has_rolling(self) -> bool:
+        """Some contact has two rows that roll, bounded by themselves."""
+        return bool(self._blocks.has_rolling)
+
+    @property
     def has_box(self) -> bool:
         """Some contact bounds each of its two tangents by itself."""
         return bool((self.kind == CONTACT_BOX).any())
@@ -328,11 +362,6 @@ class Cones:
     def is_polyhedral(self) -> bool:
         """No bound is round: every row of friction is bounded by itself, so that Coulomb's law is an LCP."""
         return not bool(np.any(self.n_together > 1))
-
-    @property
-    def ends_apart(self) -> np.ndarray:
-        """(k,) bool: the last row has a bound of its own, mu patch_radius lambda_n (spin, second side of a box)."""
-        return (self.kind == CONTACT_SPIN) | (self.kind == CONTACT_BOX)
 
     @property
     def n_together(self) -> IntArray:
@@ -348,8 +377,9 @@ class Cones:
 
     @property
     def n_tangents(self) -> IntArray:
-        """(k,) tangent rows of each block, 0 on ROW."""
+        """(k,) tangent rows of each block, 0 on ROW; rows that spin or roll, each with a bound of its own, are none."""
         own = np.diff(self.ptr) - 1 - (self.kind == CONTACT_SPIN)
+        own = np.where(self.kind == CONTACT_ROLLING, 2, own)
         return np.where(self.kind == ROW, 0, own).astype(np.int32)
 
     def shaped(self, shape: str) -> Cones:
@@ -364,10 +394,12 @@ class Cones:
         """
         kind, radius, two = self.kind.copy(), self.patch_radius.copy(), self.n_tangents == 2
         if check_shape("shape", shape) == "box":
-            bad = np.flatnonzero((self.n_tangents > 1) & ((self.kind == CONTACT_SPIN) | (self.kind == ROUND)))
+            bad = np.flatnonzero(
+                (self.n_tangents > 1) & (np.isin(self.kind, (CONTACT_SPIN, ROUND, CONTACT_ROLLING)))
+            )
             if len(bad):
                 raise InputError(
-                    f"block {bad[0]} has more rows than a normal and two tangents; no box bounds its spin"
+                    f"block {bad[0]} has more rows than a normal and two tangents; no box bounds its spin or rolling"
                 )
             kind[two], radius[two & (self.kind == CONTACT)] = CONTACT_BOX, 1.0
         else:
@@ -379,7 +411,35 @@ class Cones:
                 )
             radius[self.kind == CONTACT_BOX] = 0.0
             kind[self.kind == CONTACT_BOX] = CONTACT
-        return Cones(self.ptr, kind, self.lower, self.upper, self.mu, radius)
+        return Cones(self.ptr, kind, self.lower, self.upper, self.mu, radius, self.rolling)
+
+    @property
+    def reach(self) -> FloatArray:
+        """(m,) largest impulse of each row over lambda_n: mu, mu r of spin, mu_r of rolling; 0 on normals and ROW."""
+        size = np.diff(self.ptr)
+        out = np.repeat(np.where(self.kind == ROW, 0.0, self.mu), size)
+        out[self.ptr[:-1]] = 0.0
+        apart, rolling = self.apart_rows >= 0, self.rolling_rows >= 0
+        out[self.apart_rows[apart]] *= self.patch_radius[apart]
+        for k in (0, 1):
+            out[self.rolling_rows[rolling] + k] = self.rolling[rolling]
+        return np.asarray(out)
+
+    @property
+    def spin_rows(self) -> IntArray:
+        """(k,) the spin row of each block, -1 where it has none."""
+        spins = (self.kind == CONTACT_SPIN) | ((self.kind == CONTACT_ROLLING) & (np.diff(self.ptr) == 6))
+        return np.where(spins, self.ptr[:-1] + 1 + self.n_tangents, -1).astype(np.int32)
+
+    @property
+    def apart_rows(self) -> IntArray:
+        """(k,) the row of each block that mu patch_radius lambda_n bounds (spin, second side of a box), -1 without."""
+        return np.where(self.kind == CONTACT_BOX, self.ptr[1:] - 1, self.spin_rows).astype(np.int32)
+
+    @property
+    def rolling_rows(self) -> IntArray:
+        """(k,) the first of the two rows of each block that roll with a bound of their own, -1 where it has none."""
+        return np.where(self.kind == CONTACT_ROLLING, self.ptr[1:] - 2, -1).astype(np.int32)
 
     def __add__(self, other: object) -> Cones:
         """These blocks, then those of `other`."""
@@ -417,21 +477,26 @@ def _sides(mu: Any) -> tuple[Any, FloatArray]:
 
 
 def project(cones: Cones, impulse: FloatArray) -> FloatArray:
-    """Nearest feasible normal and rows, then tangents and spin onto mu lambda_n; (m,) [N s].
+    """Nearest feasible normal and rows, then tangents, spin and rolling onto their bounds times lambda_n; (m,) [N s].
 
     This is the feasibility step of a sweep, not the projection onto the friction cone: the normal is
     clipped first and keeps its value.
     """
     out = np.clip(impulse, cones.lower, cones.upper)
-    tangents, apart = cones.n_together, cones.ends_apart
+    tangents, turning, rolling = cones.n_together, cones.apart_rows, cones.rolling_rows
     for i in np.flatnonzero((cones.kind != ROW) & (np.diff(cones.ptr) > 1)):
-        j, end, nt = cones.ptr[i], cones.ptr[i + 1], tangents[i]
+        j, nt = cones.ptr[i], tangents[i]
         bound = cones.mu[i] * out[j]
         t = out[j + 1 : j + 1 + nt]
         size = np.hypot.reduce(t) if nt else 0.0
         if size > bound:
             t *= bound / size
-        if apart[i]:
+        if turning[i] >= 0:
             spin = bound * cones.patch_radius[i]
-            out[end - 1] = np.clip(out[end - 1], -spin, spin)
+            out[turning[i]] = np.clip(out[turning[i]], -spin, spin)
+        if rolling[i] >= 0:
+            r, bound = out[rolling[i] : rolling[i] + 2], cones.rolling[i] * out[j]
+            size = np.hypot(*r)
+            if size > bound:
+                r *= bound / size
     return out

@@ -5,12 +5,13 @@ The chapter's natural map, the errors of FCLIB and Siconos, and the optimality o
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from lavender._arrays import ArrayLike, FloatArray
-from lavender.cones import ROW
+from lavender.cones import ROUND, ROW
 from lavender.errors import InputError
 from lavender.problem import Problem
 
@@ -42,7 +43,7 @@ def natural_map(problem: Problem, impulse: ArrayLike) -> float:
 def siconos_error(problem: Problem, impulse: ArrayLike) -> dict[str, float]:
     """The full Coulomb errors of FCLIB and Siconos (Acary, Bremond, Huber 2018), friction blocks without spin.
 
-        |F|_2,  F_i = r_i - P_K(r_i - (u_i + mu |u_T| n))   on contacts, with unit step
+        |F|_2,  F_i = r_i - P_K(r_i - (u_i + (mu |u_T| + mu_r |u_R|) n))   on contacts, with unit step
 
     Returns
     -------
@@ -59,11 +60,14 @@ def siconos_error(problem: Problem, impulse: ArrayLike) -> dict[str, float]:
         if c.kind[i] == ROW:
             out[s] = lam[s] - np.clip(lam[s] - u[s], c.lower[s], c.upper[s])
             continue
-        if c.kind[i] != 1:
-            raise InputError("siconos_error has no spin rows")
+        if c.apart_rows[i] >= 0 or c.kind[i] == ROUND:
+            raise InputError("siconos_error has neither spin rows nor boxes")
         z = lam[s] - u[s]
-        z[0] -= c.mu[i] * np.linalg.norm(u[s][1:])
-        out[s] = lam[s] - _project_unit_cone(z, float(c.mu[i]))
+        parts = [(slice(1, 1 + int(c.n_tangents[i])), float(c.mu[i]))]
+        if c.rolling_rows[i] >= 0:
+            parts.append((slice(3, 5), float(c.rolling[i])))
+        z[0] -= sum(a * float(np.linalg.norm(u[s][at])) for at, a in parts)
+        out[s] = lam[s] - _project_unit_cone(z, parts)
     total, q, r, v = (float(np.linalg.norm(x)) for x in (out, problem.b, lam, u))
     big = max(q, r, v)
     return {
@@ -74,15 +78,18 @@ def siconos_error(problem: Problem, impulse: ArrayLike) -> dict[str, float]:
     }
 
 
-def _project_unit_cone(z: FloatArray, mu: float) -> FloatArray:
-    # Euclidean projection on {|z_t| <= mu z_n}.
-    t = float(np.linalg.norm(z[1:]))
-    if t <= mu * z[0]:
-        return z
-    if mu * t <= -z[0]:
-        return np.zeros_like(z)
-    n = (z[0] + mu * t) / (1.0 + mu * mu)
-    return np.concatenate([[n], (mu * n / t) * z[1:]])
+def _project_unit_cone(z: FloatArray, parts: Sequence[tuple[slice, float]]) -> FloatArray:
+    # Euclidean projection on {|z_g| <= a_g z_n for every part g}: core/block.pxd (7).
+    out, n = z.copy(), max(0.0, float(z[0]))
+    size = [float(np.linalg.norm(z[at])) for at, _ in parts]
+    for some in range(1, 2 ** len(parts)):
+        took = [(t, a) for g, (t, (_, a)) in enumerate(zip(size, parts, strict=True)) if some >> g & 1]
+        n = max(n, (z[0] + sum(a * t for t, a in took)) / (1.0 + sum(a * a for _, a in took)))
+    out[0] = n
+    for t, (at, a) in zip(size, parts, strict=True):
+        if t > a * n:
+            out[at] *= a * n / t
+    return out
 
 
 @dataclass(frozen=True)

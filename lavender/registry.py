@@ -116,6 +116,7 @@ class SolverSpec:
     # Of "coulomb" and "cone", with which it takes boxes: contacts whose tangents are bounded each by itself. A law that
     # is not of `laws` besides is taken where there is no disk (of our own, as bounded rows: solvers/_polyhedral.py).
     boxes: frozenset[str] = frozenset()
+    rolling: bool = False  # takes contacts that resist rolling, each part with a bound of its own
     external: bool = False  # another project's code solves; its claims are its own
     max_iter: int = 1000  # default budget
     options: Mapping[str, str] = field(default_factory=dict)  # own options: name -> one line
@@ -189,6 +190,11 @@ class SolverSpec:
             return (
                 "takes no round cones (more than two tangents in one): use one of those that do, "
                 "lavender.available(problem) lists them, or give the edges of a pyramid as rows"
+            )
+        if problem.cones.has_rolling and not self.rolling:
+            return (
+                "takes no contacts that resist rolling: use one of those that do, lavender.available(problem) lists "
+                "them, or leave the rows that roll out"
             )
         return self.refusal(problem) if self.refusal is not None else None
 

@@ -9,7 +9,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from lavender._arrays import FloatArray, IntArray, as_array, check_not_negative, equal, read_only
-from lavender.cones import CONTACT_SPIN, Cones
+from lavender.cones import Cones
 from lavender.errors import InputError
 from lavender_ext.core import gate
 
@@ -25,7 +25,7 @@ class Rows:
 
     Bodies are numbered 0 to n - 1; -1 is static and has no number. The blocks of the problem are the kj joints, then
     the c contacts. Row of a contact from body a to body b (n normal, t1, t2 = n x t1 tangents, arms from the centres):
-    n.u, t.u with u = v_b + omega_b x arm_b - v_a - omega_a x arm_a, and n.(omega_b - omega_a) for spin. An impulse
+    n.u, t.u with u = v_b + omega_b x arm_b - v_a - omega_a x arm_a, n.(omega_b - omega_a) for spin, t.(omega_b - omega_a) for rolling. An impulse
     > 0 along n pushes b away from a.
 
     Parameters
@@ -187,7 +187,7 @@ class Rows:
 
     def jacobian(self, cones: Cones) -> sp.csr_array:
         """J as CSR (m, 6 n); the columns of body i are 6 i .. 6 i + 5, linear then angular."""
-        tangents, spin = cones.n_tangents[self.n_joints :], cones.kind[self.n_joints :] == CONTACT_SPIN
+        tangents = cones.n_tangents[self.n_joints :]
         first = cones.ptr[self.n_joints : -1]
         m = cones.n_rows
         dense = np.zeros((m, 12))
@@ -202,9 +202,11 @@ class Rows:
             with np.errstate(over="ignore", invalid="ignore"):  # arms at the edge of float64
                 turn_a, turn_b = np.cross(self.arm_a[has], axis[has]), np.cross(self.arm_b[has], axis[has])
             dense[first[has] + row] = np.hstack([-axis[has], -turn_a, axis[has], turn_b])
-        last = cones.ptr[self.n_joints + 1 :][spin] - 1
-        dense[last] = 0.0
-        dense[last, 3:6], dense[last, 9:12] = -self.normal[spin], self.normal[spin]
+        turning, rolling = cones.spin_rows[self.n_joints :], cones.rolling_rows[self.n_joints :]
+        for axis, row in ((self.normal, turning), (self.tangent, rolling), (t2, rolling + (rolling >= 0))):
+            has = np.flatnonzero(row >= 0)
+            dense[row[has]] = 0.0
+            dense[row[has], 3:6], dense[row[has], 9:12] = -axis[has], axis[has]
         keep = np.repeat(body >= 0, 6, axis=1) & (dense != 0.0)
         columns = (6 * body[:, [0, 1], None] + np.arange(6)).reshape(m, 12)
         indptr = np.concatenate([[0], np.cumsum(keep.sum(axis=1))])

@@ -22,7 +22,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from lavender._arrays import FloatArray
-from lavender.cones import CONTACT_SPIN, ROW
+from lavender.cones import ROUND, ROW
 from lavender.errors import InputError
 from lavender.problem import Problem
 from lavender.residuals import residual
@@ -121,7 +121,7 @@ def _keys(p: Problem) -> Iterator[Suspicion]:
 def _order(p: Problem) -> Iterator[Suspicion]:
     # By b alone, which in the direction of a normal is an approach: gravity, a bounce, a depth.
     c = p.cones
-    full = np.flatnonzero((c.kind != ROW) & (np.diff(c.ptr) - (c.kind == CONTACT_SPIN) == 3))
+    full = np.flatnonzero((c.kind != ROUND) & (c.n_tangents == 2))
     if p.rows is not None or len(full) < 2:
         return
     b = p.b[c.ptr[full][:, None] + np.arange(3)]

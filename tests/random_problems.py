@@ -61,16 +61,17 @@ def random_rows(rng, bodies=5, joints=3, contacts=8):
     )
 
 
-def random_contact_problem(seed, friction="coulomb", tangents=None, spin=True, **sizes):
+def random_contact_problem(seed, friction="coulomb", tangents=None, spin=True, rolling=False, **sizes):
     """A factored problem with free and bounded joint rows and contacts; `tangents` None mixes 0, 1, 2."""
     rng = np.random.default_rng(seed)
     rows = random_rows(rng, **sizes)
+    tangents = 2 if rolling else tangents
     c, mj = rows.n_contacts, len(rows.jac)
     if tangents is None:
         tangents = rng.integers(0, 3, c)
     bounded = rng.random(mj) < 0.4
     high = np.where(bounded, rng.uniform(0.0, 0.5, mj), np.inf)
-    m = mj + int(np.sum(np.broadcast_to(tangents, c))) + c * (1 + spin)
+    m = mj + int(np.sum(np.broadcast_to(tangents, c))) + c * (1 + spin + 2 * rolling)
     return lv.Problem.from_rows(
         rows,
         target=rng.normal(size=m) * 0.1,
@@ -79,6 +80,7 @@ def random_contact_problem(seed, friction="coulomb", tangents=None, spin=True, *
         mu=rng.uniform(0.0, 1.2, c) * (np.broadcast_to(tangents, c) > 0 if not spin else 1.0),
         tangents=tangents,
         patch_radius=rng.uniform(0.0, 0.4, c) if spin else None,
+        rolling=rng.uniform(0.0, 0.3, c) * (rng.random(c) < 0.8) if rolling else None,
         friction=friction,
         compliance=rng.uniform(0.0, 0.2, m) * (rng.random(m) < 0.5),
         name=f"random {seed}",

@@ -303,6 +303,7 @@ def fingerprint(problem: Problem) -> str:
     digest = hashlib.sha256(problem.friction.encode())
     c, r = problem.cones, problem.rows
     arrays: list[Any] = [problem.b, problem.guess, c.ptr, c.kind, c.lower, c.upper, c.mu, c.patch_radius]
+    arrays += [c.rolling] if c.has_rolling else []
     if r is None:
         arrays += [problem.csr.indptr, problem.csr.indices, problem.csr.data]
     else:

@@ -16,14 +16,16 @@ from typing import Any
 
 import numpy as np
 
-from lavender.cones import CONTACT, CONTACT_BOX, CONTACT_SPIN, ROW
+from lavender.cones import CONTACT, CONTACT_BOX, CONTACT_ROLLING, CONTACT_SPIN, ROW
 from lavender.engine.layout import CAP_CONTACT, CAP_PAIR, HEAD, N_SIZES, SETTING, SIZE
 from lavender.engine.state import KEPT, State
 from lavender.errors import InputError
 
 __all__ = ["same_scene", "whole_state"]
 
-CARRIED = ("x", "q", "v", "fat", "joint_impulse", "inv_inertia", "cache_impulse", "cache_local", "cache_key")
+CARRIED = (
+    "x", "q", "v", "fat", "joint_impulse", "inv_inertia", "cache_impulse", "cache_local", "cache_roll", "cache_key"
+)  # fmt: skip
 GIVEN = tuple(name for name in KEPT if name not in (*CARRIED, "head", "setting", "ptr"))
 FIXED_HEAD = ("position_iterations", "order", "seed", "stepper", "relaxing")
 WRITTEN = {"out": 8, "depth": 1, "joint_error": 1}  # entries of `setting` that the engine writes
@@ -122,10 +124,12 @@ def _check_contacts(new: State) -> None:
     blocks = np.diff(ptr)
     friction = b["mu"][kj : kj + c] > 0.0
     kind = b["kind"][: kj + c]
-    expected = np.where(friction, 3, 1) + (kind[kj:] == CONTACT_SPIN)
+    kinds, rolls = kind[kj:], kind[kj:] == CONTACT_ROLLING
+    expected = np.where(friction, 3, 1) + (kinds == CONTACT_SPIN) + rolls * np.where(blocks == 6, 3, 2)
     if ptr[0] != mj or ptr[-1] != mj + rows or (blocks != expected).any() or blocks.max(initial=1) > per:
         raise _damaged("the rows of its contacts do not add up")
-    if c and ((kind[:kj] != ROW).any() or not np.isin(kind[kj:], (CONTACT, CONTACT_SPIN, CONTACT_BOX)).all()):
+    known = (CONTACT, CONTACT_SPIN, CONTACT_BOX, CONTACT_ROLLING)
+    if c and ((kind[:kj] != ROW).any() or not np.isin(kinds, known).all()):
         raise _damaged("kind holds what is no block")
     pair = b["contact_pair"][:c]
     if c and (pair.min() < 0 or pair.max() >= n or not np.array_equal(b["contact_body"][:c], b["dyn"][pair])):
@@ -137,7 +141,7 @@ def _check_numbers(own: State, new: State) -> None:
     for name in ("x", "v", "joint_impulse", "inv_inertia"):
         if not np.isfinite(b[name]).all():
             raise _damaged(f"{name} is not finite")
-    for name in ("cache_impulse", "cache_local"):
+    for name in ("cache_impulse", "cache_local", "cache_roll"):
         if not np.isfinite(b[name][:cached]).all():
             raise _damaged(f"{name} is not finite")
     with np.errstate(over="ignore", invalid="ignore"):

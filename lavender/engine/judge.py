@@ -9,13 +9,12 @@ import numpy as np
 
 from lavender import motion
 from lavender._arrays import FloatArray
-from lavender.cones import CONTACT_SPIN
 from lavender.problem import Problem
 from lavender.residuals import Residual, residual
 
 __all__ = ["judged", "moved"]
 
-PARTS = ("joint", "normal", "disk", "spin")
+PARTS = ("joint", "normal", "disk", "spin", "rolling")
 
 
 def judged(problem: Problem, impulse: FloatArray) -> dict[str, Any]:
@@ -54,12 +53,15 @@ def _shares(problem: Problem, found: Residual) -> dict[str, float]:
     joints = len(c.kind) - len(contact)
     part[: c.ptr[joints]] = 0
     part[c.ptr[:-1][contact]] = 1
-    part[c.ptr[1:][c.kind == CONTACT_SPIN] - 1] = 3
+    part[c.spin_rows[c.spin_rows >= 0]] = 3
+    for k in (0, 1):
+        part[c.rolling_rows[c.rolling_rows >= 0] + k] = 4
     with np.errstate(invalid="ignore"):
         size = np.sqrt(problem.d) * np.abs(found.error)
     top = float(size.max(initial=0.0))
     # Over the largest, so that squares neither overflow nor vanish; what is infinite has no shares.
     energy = (size / top) ** 2 if 0.0 < top < np.inf else np.zeros(problem.m)
     total = float(energy.sum())
-    sums = np.bincount(part, weights=energy, minlength=4) if problem.m else np.zeros(4)
-    return {name: float(x / total) if total > 0.0 else 0.0 for name, x in zip(PARTS, sums, strict=True)}
+    names = PARTS if c.has_rolling else PARTS[:4]
+    sums = np.bincount(part, weights=energy, minlength=len(names)) if problem.m else np.zeros(len(names))
+    return {name: float(x / total) if total > 0.0 else 0.0 for name, x in zip(names, sums, strict=True)}

@@ -43,9 +43,9 @@ MOST_BYTES = 2**32  # of the three buffers
 # What the kernels carry from one substep to the next or a scene gives; the rest is scratch of one substep.
 KEPT = (
     "setting", "x", "q", "v", "inv_mass_body", "inertia", "inv_inertia_body", "shape", "friction", "restitution",
-    "patch", "fat", "joint", "joint_impulse", "inv_mass", "inv_inertia", "cache_impulse", "cache_local", "head",
-    "kind_of_shape", "dyn", "uneven", "body_of", "joint_kind", "joint_motor", "joint_bodies", "joint_body",
-    "excluded", "ptr", "cache_key",
+    "patch", "fat", "joint", "joint_impulse", "inv_mass", "inv_inertia", "cache_impulse", "cache_local",
+    "cache_roll", "head", "kind_of_shape", "dyn", "uneven", "body_of", "joint_kind", "joint_motor", "joint_bodies",
+    "joint_body", "excluded", "ptr", "cache_key",
 )  # fmt: skip
 
 
@@ -171,15 +171,14 @@ class State:
         patch = np.array([p.patch_radius if b.patch_radius is None else b.patch_radius for b in bodies])
         restitution = np.array([p.restitution if b.restitution is None else b.restitution for b in bodies])
         shaped = np.array([b.shape is not None for b in bodies], bool)
-        per = (
-            1
-            + 2 * bool((mu[shaped] > 0.0).any())
-            + bool((mu[shaped] > 0.0).any() and (patch[shaped] > 0.0).any())
-        )
+        rough = bool((mu[shaped] > 0.0).any())
+        spin, rolling = rough and bool((patch[shaped] > 0.0).any()), rough and p.rolling_radius > 0.0
+        per = 1 + 2 * rough + spin + 2 * rolling
         box = p.friction_shape == "box"
-        if box and per == 4:
+        if box and (spin or rolling):
             raise InputError(
-                "friction_shape is 'box' and patch_radius > 0: a box has no spin friction; leave one of the two out"
+                "friction_shape is 'box' beside a patch_radius or rolling_radius > 0: a box has no spin friction and "
+                "resists no rolling; leave one of them out"
             )
         excluded = sorted({tuple(sorted((j.a, j.b))) for j in joints if not j.collide and min(j.a, j.b) >= 0})
         n_shapes = int(shaped.sum())
@@ -205,6 +204,7 @@ class State:
         setting[SETTING["max_push"]] = MAX_PUSH
         setting[SETTING["bounce"]] = p.restitution_threshold
         setting[SETTING["match"]] = 5.0 * p.margin
+        setting[SETTING["rolling"]] = p.rolling_radius
         head[HEAD["iterations"]] = p.solver_iterations
         head[HEAD["warm_start"]] = p.warm_start
         head[HEAD["position_iterations"]] = p.position_iterations
@@ -213,7 +213,7 @@ class State:
         head[HEAD["friction_shape"]] = box
         head[HEAD["lost"]] = -1
         stepper = get_stepper(p.stepper)
-        stepper.check(per == 4, bool((restitution > 0.0).any()))
+        stepper.check(spin, bool((restitution > 0.0).any()), rolling)
         head[HEAD["stepper"]] = stepper.number
         for name, value in p.stepper_options.items():
             option = stepper.options[name]

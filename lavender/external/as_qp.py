@@ -18,7 +18,7 @@ Velocity form, from `Problem.velocity_form` (K, theta, g; y = M^1/2 times the ch
     lower bound alone       w >= 0                         r = l
     both bounds             w + t >= 0, t >= 0             r = l, the multiplier ends at u - l
     upper bound alone       -w >= 0                        r = u
-    disk and spin           w_n - a_s t >= a |w_t|,  t >= |w_s|
+    disk and spin           w_n - a_s t >= a |w_t|,  t >= |w_s|;  a second disk likewise, t >= a_r |w_r|
 
 and z = r + T zeta, lambda = sigma S z, where the rows are A = -T^T K~ (t aside). Its size is that of
 the velocities, and J is never squared.
@@ -332,13 +332,20 @@ def velocity_form(problem: Problem) -> QP:
             put.row([(tangent, sign)])
             slack.row([(n, -1.0)])
         n += 1
+    second: dict[int, int] = {}  # disk -> its t, where its normal has a disk before it
+    for k_disk, disk in enumerate(rows.disks):
+        if any(d.normal == disk.normal for d in rows.disks[:k_disk][-1:]):
+            heads.setdefault(disk.normal, []).append((n, 1.0))
+            second[k_disk] = n
+            n += 1
     alone = [normal for normal in heads if normal not in {d.normal for d in rows.disks}]
     for normal in alone:
         put.row([(normal, 1.0)])
         slack.row(heads[normal])
-    for disk in rows.disks:
-        put.row([(disk.normal, 1.0)])
-        slack.row(heads.get(disk.normal, []))
+    for k_disk, disk in enumerate(rows.disks):
+        own = second.get(k_disk)
+        put.row([(disk.normal, 1.0)] if own is None else [])
+        slack.row(heads.get(disk.normal, []) if own is None else [(own, -1.0)])
         for tangent, ratio in zip(disk.tangents, disk.ratios, strict=True):
             put.row([(tangent, ratio)])
             slack.row([])
@@ -458,15 +465,10 @@ class _Parts:
                 known[i] = True
                 fixed[i] = np.clip(bound if np.isfinite(bound) else 0.0, c.lower[i], c.upper[i])
         friction = np.flatnonzero((c.kind != ROW) & (size > 1))
-        stays, apart = [], c.ends_apart
+        reach, stays = c.reach, []
         for i in friction:
             start, end = c.ptr[i] + 1, c.ptr[i + 1]
-            spin = apart[i]
-            if c.mu[i] == 0.0:
-                known[start:end] = True
-                continue
-            if spin and c.patch_radius[i] == 0.0:
-                known[end - 1] = True
+            known[start:end] = reach[start:end] == 0.0
             if not known[start:end].all():
                 stays.append(i)
         kept = np.flatnonzero(~known)
@@ -477,23 +479,25 @@ class _Parts:
 
     def friction_rows(self) -> _FrictionRows:
         c = self.problem.cones
+        reach = c.reach
         place = np.full(self.problem.m, -1)
         place[self.kept] = np.arange(len(self.kept))
         pairs: list[tuple[int, int, float]] = []
         disks: list[_Disk] = []
         for i in self.contacts:
-            n, end = int(c.ptr[i]), int(c.ptr[i + 1])
-            spin = c.ends_apart[i]
-            tangents = list(range(n + 1, end - 1 if spin else end))
+            n, turning, rolling = int(c.ptr[i]), int(c.apart_rows[i]), int(c.rolling_rows[i])
             j = int(place[n])
-            ratio = [float(c.mu[i] * self.root[j] / self.root[place[t]]) for t in tangents]
-            if len(tangents) == 1:
-                pairs.append((j, int(place[tangents[0]]), ratio[0]))
-            elif tangents:
-                disks.append(_Disk(j, tuple(int(place[t]) for t in tangents), tuple(ratio)))
-            if spin and place[end - 1] >= 0:
-                s = int(place[end - 1])
-                pairs.append((j, s, float(c.mu[i] * c.patch_radius[i] * self.root[j] / self.root[s])))
+            parts = [list(range(n + 1, n + 1 + int(c.n_together[i])))]
+            parts += [[turning]] * (turning >= 0) + [[rolling, rolling + 1]] * (rolling >= 0)
+            for part in parts:
+                if not part or place[part[0]] < 0:
+                    continue
+                at = [int(place[t]) for t in part]
+                ratio = [float(reach[t] * self.root[j] / self.root[s]) for t, s in zip(part, at, strict=True)]
+                if len(part) == 1:
+                    pairs.append((j, at[0], ratio[0]))
+                else:
+                    disks.append(_Disk(j, tuple(at), tuple(ratio)))
         return _FrictionRows(pairs, disks)
 
 

@@ -92,6 +92,7 @@ SPEC = SolverSpec(
     external=True,
     impulse=False,
     round_cones=True,
+    rolling=True,
     max_iter=200,
     options=OPTIONS,
     requires=("clarabel",),

@@ -61,8 +61,6 @@ def read(path: str | os.PathLike[str], *, max_bytes: int = MAX_BYTES) -> Stored:
     ------
     InputError
         Not there, truncated, of another format, inconsistent; or HDF5 without h5py.
-    CapabilityError
-        A problem that has no block here, such as rolling friction.
     """
     path = as_path(path)
     start = first_bytes(path)

@@ -1,8 +1,9 @@
-"""FCLIB files (HDF5): friction contact problems in 2D and 3D, local and global.
+"""FCLIB files (HDF5): friction contact problems in 2D and 3D, in 3D also with rolling friction, local and global.
 
     local     u = W r + q                                         A = W, b = -q, lambda = r, w = u
     global    M v = H r + f,  u = H^T v + w                       A = H^T M^-1 H,  b = -(w + H^T M^-1 f)
     with equations (V, R, s or G, b): free rows after the contacts, w = 0 there
+    rolling   five rows a contact, |r_T| <= mu r_N and |r_R| <= mu_r r_N on the last two: CONTACT_ROLLING
 
 FCLIB's vector `w` is an offset of the velocity, not our slack. Format: Acary, Bremond, Huber et al.,
 "FCLIB: a collection of discrete 3D frictional contact problems", Inria RT-444, 2014.
@@ -23,7 +24,7 @@ from scipy.sparse import csgraph
 
 from lavender._arrays import FloatArray, as_array
 from lavender._lu import sparse_lu
-from lavender.cones import CONTACT, CONTACT_BOX, ROW, Cones
+from lavender.cones import CONTACT, CONTACT_ROLLING, ROW, Cones
 from lavender.errors import CapabilityError, InputError
 from lavender.generalized import Generalized
 from lavender.io.npz import compressed
@@ -33,7 +34,8 @@ from lavender.problem import Problem
 __all__ = ["Contents", "contents", "read", "read_contents", "write", "write_contents"]
 
 LOCAL, GLOBAL = "fclib_local", "fclib_global"
-ROLLING = ("fclib_local_rolling", "fclib_global_rolling")
+ROLLING = "_rolling"  # behind either
+ROLLING_ROWS = 5  # normal, two tangents, two that roll
 CONDENSE_CHUNK = 2**23  # numbers of M^-1 H, or of H^T M^-1 H, held dense at a time: 64 MiB
 ENTRY = 16  # bytes of an entry of a sparse matrix: number and index
 BLOCK = 64  # bytes of the bounds of a row: Cones, b
@@ -47,8 +49,9 @@ class Contents:
     Local: W, q (and V, R, s). Global: M, H, f, w (and G, b). Matrices as (rows, columns) of SciPy, CSR.
     """
 
-    spacedim: int  # 2 or 3 rows of each contact, normal first
+    spacedim: int  # 2 or 3 rows of each contact, normal first; 5 with rolling friction
     mu: FloatArray  # (c,)
+    mu_r: FloatArray | None = None  # (c,) m, with rolling friction
     W: sp.csr_array | None = None  # (m, m)
     q: FloatArray | None = None  # (m,)
     V: sp.csr_array | None = None  # (m, p)
@@ -70,6 +73,11 @@ class Contents:
         """Which form: "local" or "global"."""
         return "local" if self.W is not None else "global"
 
+    @property
+    def group(self) -> str:
+        """Name of its group in the file."""
+        return (LOCAL if self.form == "local" else GLOBAL) + ("" if self.mu_r is None else ROLLING)
+
     def problem(self, name: str = "", *, max_bytes: int = MAX_BYTES) -> Problem:
         """The problem: a global one in generalised coordinates (J = H^T), condensed where M is no mass matrix.
 
@@ -86,10 +94,13 @@ class Contents:
         c, d = len(self.mu), self.spacedim
         p = len(b) - c * d
         ptr = np.concatenate([np.arange(0, c * d + 1, d), c * d + 1 + np.arange(p)])
-        kind = np.repeat(np.array([CONTACT, ROW], np.int32), [c, p])
-        mu = np.concatenate([self.mu, np.zeros(p)])
+        contact = CONTACT if self.mu_r is None else CONTACT_ROLLING
+        kind = np.repeat(np.array([contact, ROW], np.int32), [c, p])
+        mu, mu_r = (
+            np.concatenate([np.zeros(c) if x is None else x, np.zeros(p)]) for x in (self.mu, self.mu_r)
+        )
         free = np.full(len(b), np.inf)
-        cones = Cones(ptr=ptr, kind=kind, lower=-free, upper=free, mu=mu, patch_radius=np.zeros(c + p))
+        cones = Cones(ptr, kind, -free, free, mu, np.zeros(c + p), mu_r)
         guess = self._impulse(self.guesses[0]) if self.guesses else None
         name = self.info.get("title", "") or name
         return Problem(b, cones, a, guess=guess, name=name, generalized=general)
@@ -207,9 +218,7 @@ def read(path: str | os.PathLike[str], *, max_bytes: int = MAX_BYTES) -> Stored:
     Raises
     ------
     InputError
-        Not an FCLIB file, truncated, inconsistent; or h5py is not installed.
-    CapabilityError
-        Rolling friction.
+        Not an FCLIB file, truncated, inconsistent, with and without rolling friction at once; or h5py is not installed.
     """
     file = read_contents(path, max_bytes=max_bytes)
     try:
@@ -219,7 +228,7 @@ def read(path: str | os.PathLike[str], *, max_bytes: int = MAX_BYTES) -> Stored:
         raise InputError(f"{path}: {error}") from None
     return Stored(
         problem,
-        LOCAL if file.form == "local" else GLOBAL,
+        file.group,
         impulse=file.impulse(),
         slack=file.slack(),
         compare=file.compare,
@@ -234,8 +243,8 @@ def read_contents(path: str | os.PathLike[str], *, max_bytes: int = MAX_BYTES) -
     try:
         with h5py.File(path, "r") as file:
             return _read_file(_Reader(h5py, file, max_bytes))
-    except (InputError, CapabilityError) as error:
-        raise type(error)(f"{path}: {error}") from None
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
     except (OSError, KeyError, RuntimeError, ValueError, TypeError, OverflowError, MemoryError) as error:
         raise InputError(
             f"{path} cannot be read as HDF5 ({error}); it is damaged or of another kind"
@@ -353,20 +362,24 @@ def _triplets(p: np.ndarray, i: np.ndarray, x: np.ndarray, nz: int, m: int, n: i
 
 
 def _read_file(r: _Reader) -> Contents:
-    if any(r.has(name) for name in ROLLING):
-        raise CapabilityError(
-            "rolling friction has no block here: a contact is a normal, up to two tangents and a spin row; "
-            "Siconos solves this problem"
-        )
-    group = LOCAL if r.has(LOCAL) else GLOBAL
-    if not r.has(group):
+    there = [name for name in (LOCAL, GLOBAL, LOCAL + ROLLING, GLOBAL + ROLLING) if r.has(name)]
+    if not there:
         found = ", ".join(list(r.file)[:8]) or "nothing"
-        raise InputError(f"holds {found}; an FCLIB file has a group {LOCAL} or {GLOBAL}")
+        raise InputError(
+            f"holds {found}; an FCLIB file has a group {LOCAL} or {GLOBAL}, with {ROLLING} behind it where contacts "
+            "resist rolling"
+        )
+    group, rolling = there[0], there[0].endswith(ROLLING)
+    if there[-1].endswith(ROLLING) != rolling:
+        raise InputError(
+            f"holds {' and '.join(there)}: one problem with rolling friction and one without; keep one of them"
+        )
     spacedim = r.whole(f"{group}/spacedim")
-    if spacedim not in (2, 3):
-        raise InputError(f"{group}/spacedim is {spacedim}; 2 or 3 is needed")
+    if spacedim not in ((ROLLING_ROWS,) if rolling else (2, 3)):
+        needed = f"{ROLLING_ROWS}, as rolling friction has," if rolling else "2 or 3"
+        raise InputError(f"{group}/spacedim is {spacedim}; {needed} is needed")
     vectors = f"{group}/vectors"
-    local = group == LOCAL
+    local = group.startswith(LOCAL)
     first = r.shape(f"{group}/{'W' if local else 'H'}")
     more = f"{group}/{'V' if local else 'G'}"
     has_equations = r.has(more) or (local and r.has(f"{group}/R"))
@@ -375,7 +388,7 @@ def _read_file(r: _Reader) -> Contents:
         raise InputError(f"{group}/W is {first[0]} x {m}; a square matrix is needed")
     if m % spacedim:
         raise InputError(f"{m} rows are not a multiple of spacedim = {spacedim}")
-    length = {"q": m, "s": p, "f": n, "w": m, "b": p, "mu": m // spacedim}
+    length = {"q": m, "s": p, "f": n, "w": m, "b": p, "mu": m // spacedim, "mu_r": m // spacedim}
     wanted: dict[str, tuple[int, int]] = {"W": (m, m)} if local else {"H": (n, m), "M": (n, n)}
     if has_equations:
         wanted |= {"V": (m, p), "R": (p, p)} if local else {"G": (n, p)}
@@ -384,6 +397,7 @@ def _read_file(r: _Reader) -> Contents:
         *([] if local else ["w"]),
         *([("s" if local else "b")] if p else []),
         "mu",
+        *(["mu_r"] if rolling else []),
     ]
     for name in names:  # lengths, then bytes, then numbers
         r.dataset(f"{vectors}/{name}", "iuf", length[name])
@@ -466,6 +480,7 @@ def contents(
         text = "; ".join(reasons)
         raise CapabilityError(f"FCLIB's {form} form cannot hold {text}. An .npz holds everything")
     mu = problem.cones.mu
+    mu_r = problem.cones.rolling if problem.cones.has_rolling else None
     spacedim = int(problem.cones.ptr[1])
     info = {"title": problem.name}
     points = []
@@ -481,13 +496,14 @@ def contents(
     guesses = tuple(points[-1:]) if problem.guess is not None else ()
     if form == "local":
         return Contents(
-            spacedim, mu, W=problem.csr, q=-problem.b, solution=solution, guesses=guesses, info=info
+            spacedim, mu, mu_r, W=problem.csr, q=-problem.b, solution=solution, guesses=guesses, info=info
         )
     mass, v = _mass(problem)
     jac = problem.jacobian
     return Contents(
         spacedim,
         mu,
+        mu_r,
         M=mass,
         H=sp.csr_array(jac.T),
         f=mass @ v,
@@ -523,9 +539,12 @@ def _cannot_hold(problem: Problem, form: str, drop: Collection[str]) -> list[str
         reasons.append(f"ROW blocks ({int(rows.sum())} {what}; contacts only)")
     if c.has_box:
         reasons.append("boxes (its friction is a disk: give cones.shaped('disk'), which is another law)")
-    if np.any((c.kind > CONTACT) & (c.kind != CONTACT_BOX)):
+    if np.any(c.spin_rows >= 0) or c.has_round:
         reasons.append("spin rows")
+    rolls = np.count_nonzero(c.kind == CONTACT_ROLLING)
     contacts = c.n_tangents[c.kind != ROW]
+    if 0 < rolls < len(contacts):
+        reasons.append(f"contacts with rolling beside others ({rolls} of {len(contacts)}; all, or none)")
     if problem.n_blocks == 0:
         reasons.append("a problem without contacts")
     elif len(contacts) and (contacts.min() != contacts.max() or contacts[0] == 0):
@@ -579,13 +598,13 @@ def write_contents(file: Contents, path: str | os.PathLike[str]) -> None:
 
 
 def _write_file(out: Any, file: Contents) -> None:
-    group = out.create_group(LOCAL if file.form == "local" else GLOBAL)
+    group = out.create_group(file.group)
     group["spacedim"] = np.array([file.spacedim], np.int32)
     for name in ("W", "V", "R", "M", "H", "G"):
         if getattr(file, name) is not None:
             _write_matrix(group.create_group(name), getattr(file, name))
     vectors = group.create_group("vectors")
-    for name in ("q", "s", "f", "w", "b", "mu"):
+    for name in ("q", "s", "f", "w", "b", "mu", "mu_r"):
         if getattr(file, name) is not None:
             vectors[name] = getattr(file, name)
     if any(file.info.values()):

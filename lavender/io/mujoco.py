@@ -420,7 +420,7 @@ def _blocks(mj: Any, model: Any, data: Any, held: _Held, dt: float) -> tuple[Con
             f"that is not there, or has not so many rows. {CHANGED}"
         )
     ptr, kind, lower, upper, mu, scale, key = found
-    return Cones._trusted(ptr, kind, lower, upper, mu, np.zeros(len(mu))), scale, key
+    return Cones._trusted(ptr, kind, lower, upper, mu, *np.zeros((2, len(mu)))), scale, key
 
 
 def _words(mj: Any, model: Any, held: _Held) -> list[str]:

@@ -37,14 +37,14 @@ MAX_HEADER = 10_000  # bytes of a .npy header: 100 are usual
 MAX_ENTRIES = 1000  # of an archive: a problem has at most 30
 JSON_GROWTH = 40  # bytes of Python objects that a byte of JSON text can make; nested empty lists make 24
 PACKED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # what NumPy writes; others choose the memory they take
-CONES = tuple(f"cones_{f.name}" for f in fields(Cones))
+CONES = tuple(f"cones_{f.name}" for f in fields(Cones) if f.name != "rolling")
 ROWS = tuple(f"rows_{f.name}" for f in fields(Rows) if f.name != "copy")
 GENERAL = (
     *(f"general_{name}_{part}" for name in ("jac", "mass") for part in ("data", "indices", "indptr")),
     "general_v_free",
 )
 CSR = ("A_data", "A_indices", "A_indptr", "A_shape")
-OPTIONAL = ("guess", "key", "impulse")
+OPTIONAL = ("cones_rolling", "guess", "key", "impulse")
 BROKEN = (
     zipfile.BadZipFile,
     zlib.error,
@@ -224,6 +224,8 @@ def write(problem: Problem, path: str | os.PathLike[str], *, impulse: Any = None
     arrays: dict[str, Any] = {"lavender_format": np.int64(VERSION), "b": problem.b}
     for name in CONES:
         arrays[name] = getattr(problem.cones, name.removeprefix("cones_"))
+    if problem.cones.has_rolling:
+        arrays["cones_rolling"] = problem.cones.rolling
     if problem.rows is not None:
         for name in ROWS:
             arrays[name] = getattr(problem.rows, name.removeprefix("rows_"))
@@ -301,7 +303,8 @@ def _read_own(archive: _Archive) -> Stored:
         more["compliance"] = archive["compliance"]
     else:
         more["matrix"] = _matrix(archive)
-    cones = Cones(**{name.removeprefix("cones_"): archive[name] for name in CONES})
+    given = [*CONES, *(["cones_rolling"] if "cones_rolling" in archive else [])]
+    cones = Cones(**{name.removeprefix("cones_"): archive[name] for name in given})
     problem = Problem(b, cones, friction=meta["friction"], names=meta["names"], name=meta["name"], **more)
     return Stored(problem, "lavender", impulse=_vector(archive, "impulse", problem))
 

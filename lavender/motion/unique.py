@@ -13,10 +13,10 @@ Islands (blocks that no body, directly or through others, connects) are looked a
 De Saxce's change of variable makes a Coulomb solution the solution of a convex cone problem whose normal targets
 are raised by s_i = mu_i (|u_t| + r |u_s|), s being a fixed point of s -> lambda(s) -> s (Acary, Cadoux, Lemarechal,
 Malick 2011, ZAMM 91, 155-175). For two values of s, with Z the block of A^-1 on the normals, S = diag(mu) on the
-friction rows (mu r on spin), and any positive diagonal T (one entry a contact),
+friction rows (mu r on spin, mu_r on rolling), and any positive diagonal T (one entry a contact),
 
     |D lambda|_A^2 <= - D s . D lambda_n <= |D s|_Z |D lambda|_A          the cone is convex, A positive definite
-    |T D s|^2 <= c |T S (A D lambda)_t|^2 <= c max eig(T S A_tt S T) |D lambda|_A^2     c = 2 with spin, else 1
+    |T D s|^2 <= c |T S (A D lambda)_t|^2 <= c max eig(T S A_tt S T) |D lambda|_A^2     c parts of a contact that are bounded apart
 
     kappa^2 = c max eig(T S A_tt S T) max eig(T^-1 Z T^-1)                                               (1)
 
@@ -47,7 +47,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from lavender._arrays import FloatArray
-from lavender.cones import ROW
+from lavender.cones import ROW, Cones
 from lavender.motion.reference import kept, reference
 from lavender.problem import Problem
 
@@ -95,12 +95,8 @@ def uniqueness(problem: Problem) -> Uniqueness:
     if problem.law != "coulomb":
         return Uniqueness(True, "the law is convex", 0.0)
     c = problem.cones
-    friction = np.zeros(problem.m, bool)
-    count, apart = np.diff(c.ptr), c.ends_apart
-    for i in np.flatnonzero((c.kind != ROW) & (c.mu > 0.0) & (count > 1)):
-        friction[c.ptr[i] + 1 : c.ptr[i + 1]] = True
-        if apart[i] and c.patch_radius[i] == 0.0:
-            friction[c.ptr[i + 1] - 1] = False
+    friction = c.reach > 0.0
+    count = np.diff(c.ptr)
     if not friction.any():
         return Uniqueness(True, "no contact has friction", 0.0)
     from scipy.sparse import csgraph
@@ -173,12 +169,8 @@ def _sticks(
     for i in block:
         if i not in touching:
             continue
-        normal, mu = x[c.ptr[i]], c.mu[i]
-        tangent = x[c.ptr[i] + 1 : c.ptr[i] + 1 + c.n_together[i]]
-        used = float(np.linalg.norm(tangent))
-        if c.ends_apart[i] and c.patch_radius[i] > 0.0:
-            used = max(used, abs(x[c.ptr[i + 1] - 1]) / c.patch_radius[i])
-        left.append(normal - used / mu)  # (1 - sigma) lambda_n
+        used = max(float(np.linalg.norm(x[part])) / c.reach[part[0]] for part in _parts(c, i))
+        left.append(x[c.ptr[i]] - used)  # (1 - sigma) lambda_n
     h = float(np.min(np.array(left) / np.sqrt(lifting)))
     size = float(np.sqrt(max(x[rows] @ (w + problem.b[rows]), 0.0)))  # |lambda|_A of the island
     return h > 0.0 and (size <= h * (1.0 - MARGIN) or (kappa - 1.0) * size < kappa * h * (1.0 - MARGIN))
@@ -191,22 +183,29 @@ def _kappa(
     # In the scaled rows: (A_tt)_ij = a_ij / (scale_i scale_j), Z_ij = (a^-1)_ij scale_i scale_j.
     c = problem.cones
     block = np.searchsorted(c.ptr, rows, side="right") - 1
-    radius = np.where(c.ends_apart[block] & (rows == c.ptr[block + 1] - 1), c.patch_radius[block], 1.0)
     tangents = np.flatnonzero(friction)
     contacts, place = np.unique(block[tangents], return_inverse=True)
     normals = np.searchsorted(rows, c.ptr[contacts])
-    size = c.mu[block[tangents]] * radius[tangents] / scale[tangents]
+    size = c.reach[rows[tangents]] / scale[tangents]
     sliding = a[np.ix_(tangents, tangents)] * size[:, None] * size
     lifting = np.linalg.inv(a)[np.ix_(normals, normals)] * scale[normals][:, None] * scale[normals]
-    spin = 2.0 if np.any(c.ends_apart[contacts]) and np.any(c.n_together[contacts] > 0) else 1.0
+    parts = float(max(len(_parts(c, i)) for i in contacts))
     strongest = np.zeros(len(contacts))
     np.maximum.at(strongest, place, np.diagonal(sliding))
     best = np.inf
     for t in (np.sqrt(np.diagonal(lifting)), 1.0 / np.sqrt(strongest)):
         one = np.linalg.eigvalsh(sliding * t[place][:, None] * t[place])[-1]
         two = np.linalg.eigvalsh(lifting / t[:, None] / t)[-1]
-        best = min(best, float(np.sqrt(spin * max(one, 0.0) * max(two, 0.0))))
+        best = min(best, float(np.sqrt(parts * max(one, 0.0) * max(two, 0.0))))
     return best, np.diagonal(lifting)
+
+
+def _parts(c: Cones, i: int) -> list[np.ndarray]:
+    """Rows of contact i that are bounded together: tangents (of a box each by itself), spin, rolling, where the bound is not 0."""
+    first, apart, rolling = int(c.ptr[i]) + 1, int(c.apart_rows[i]), int(c.rolling_rows[i])
+    found = [np.arange(first, first + c.n_together[i])]
+    found += [np.array([apart])] * (apart >= 0) + [np.array([rolling, rolling + 1])] * (rolling >= 0)
+    return [part for part in found if len(part) and c.reach[part[0]] > 0.0]
 
 
 def _definite(a: FloatArray) -> bool:

@@ -1,4 +1,4 @@
-"""Phenomena of friction: stick, slide, stop, lift, roll, spin down."""
+"""Phenomena of friction: stick, slide, stop, lift, roll, roll to rest, spin down."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ SPEED = Parameter(3.0, 0.1, 10.0, "of the start [m/s]")
 SIZE = (1.0, 1.0, 0.2)  # m, of the block: low, so that it cannot tip below friction 5
 RADIUS = 0.5  # m, of the ball
 PATCH = 0.1  # m
+ROLLING = 0.02  # m, mu_r
 
 
 def _slope(p: Values, more: Mapping[str, Any]) -> Scene:
@@ -89,6 +90,29 @@ def _roll(p: Values, track: Track) -> dict[str, float]:
     return {
         "speed": abs(speed[-1] / (5 / 7 * p["speed"]) - 1.0),
         "time": abs(time - 2 * p["speed"] / (7 * p["mu"] * GRAVITY)),
+    }
+
+
+def _rolling(p: Values, more: Mapping[str, Any]) -> Scene:
+    scene = Scene(**{"friction": p["mu"], "rolling_radius": p["rolling"], **more})
+    scene.add_plane()
+    turning = (0.0, p["speed"] / RADIUS, 0.0)
+    scene.add_sphere(
+        RADIUS, position=(0.0, 0.0, RADIUS), velocity=(p["speed"], 0.0, 0.0), angular_velocity=turning
+    )
+    return scene
+
+
+def _rolling_time(p: Values) -> float:
+    # twice the distance over the speed: it slows at a constant rate
+    return 7 * RADIUS * p["speed"] / (5 * p["rolling"] * GRAVITY)
+
+
+def _roll_to_rest(p: Values, track: Track) -> dict[str, float]:
+    truth = 7 * RADIUS * p["speed"] ** 2 / (10 * p["rolling"] * GRAVITY)
+    return {
+        "distance": abs(float(track.moved(1)[-1, 0]) / truth - 1.0),
+        "left": abs(float(track.velocities[-1, 1, 0])),
     }
 
 
@@ -188,6 +212,29 @@ FRICTION = (
         build=_ball,
         seconds=lambda p: 2 * p["speed"] / (7 * p["mu"] * GRAVITY) + 1.0,
         measure=_roll,
+    ),
+    Phenomenon(
+        name="roll_to_rest",
+        title="a rolling ball comes to rest",
+        why="tyres, balls on a lawn, wheels in gravel: without it nothing that rolls comes to rest",
+        truth=(
+            "after 7 R v^2/(10 mu_r g): rolling without slip it has 7/10 m v^2, and the moment mu_r m g takes mu_r m g/R "
+            "of it on each metre; the disk holds as long as mu_r/R <= 7/5 mu"
+        ),
+        parameters={
+            "mu": MU,
+            "rolling": Parameter(ROLLING, 1e-3, 0.03, "mu_r [m]"),
+            "speed": Parameter(2.0, 0.1, 10.0, "of the start [m/s]"),
+        },
+        cases=({}, {"mu": 1.0, "rolling": 0.03, "speed": 3.0}),
+        quantities=(
+            Quantity("distance", "", 0.02, "relative"),
+            Quantity("left", "m/s", 1e-3, "speed half a second after it should have stopped"),
+        ),
+        needs=frozenset({"sphere", "rolling"}),
+        build=_rolling,
+        seconds=lambda p: _rolling_time(p) + 0.5,
+        measure=_roll_to_rest,
     ),
     Phenomenon(
         name="spin_down",

@@ -78,7 +78,7 @@ class Phenomenon:
     parameters: Mapping[str, Parameter]
     cases: tuple[Values, ...]  # that a run measures
     quantities: tuple[Quantity, ...]  # the first stands in the table
-    needs: frozenset[str]  # of an engine: "box", "sphere", "spin", "ball joint", "hinge"
+    needs: frozenset[str]  # of an engine: "box", "sphere", "spin", "rolling", "ball joint", "hinge"
     build: Callable[
         [Values, Mapping[str, Any]], Scene
     ]  # of parameters, and of what an engine asks of the scene

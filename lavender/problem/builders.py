@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from lavender._arrays import ArrayLike, FloatArray, IntArray, as_array
-from lavender.cones import ROW, Cones, check_shape
+from lavender.cones import CONTACT_ROLLING, ROW, Cones, check_shape
 from lavender.errors import InputError
 from lavender.generalized import Generalized
 from lavender.problem.data import checked_matrix
@@ -44,9 +44,16 @@ class Builders(Operators):
 
     @classmethod
     def contact(
-        cls: type[P], A: Any, b: ArrayLike, mu: ArrayLike, patch_radius: ArrayLike | None = None, **more: Any
+        cls: type[P],
+        A: Any,
+        b: ArrayLike,
+        mu: ArrayLike,
+        patch_radius: ArrayLike | None = None,
+        *,
+        rolling: ArrayLike | None = None,
+        **more: Any,
     ) -> P:
-        """Contacts only, m / k rows each: normal, up to two tangents, spin with `patch_radius`.
+        """Contacts only, m / k rows each: normal, up to two tangents, spin with `patch_radius`, two that roll with `rolling`.
 
         Parameters
         ----------
@@ -57,6 +64,8 @@ class Builders(Operators):
             One for each contact. A scalar stands for all of them, which then have two tangents, or for a single one.
         patch_radius : scalar or (k,) m, optional
             Gives each contact a spin row.
+        rolling : scalar or (k,) m, optional
+            mu_r: gives each contact two rows that roll, after the others; two tangents are needed.
 
         Raises
         ------
@@ -64,8 +73,9 @@ class Builders(Operators):
             The rows do not part among the contacts; mu > 0 where contacts have no row for friction.
         """
         b = as_array("b", b, (None,), unit="m/s")
+        turns = (patch_radius is not None) + 2 * (rolling is not None)
         if np.ndim(mu) == 0:
-            each = 3 + (patch_radius is not None)
+            each = 3 + turns
             mu = np.full(max(1, len(b) // each) if len(b) % each == 0 else 1, mu)
         mu = as_array("mu", np.asarray(mu), (None,))
         if (len(mu) == 0) != (len(b) == 0) or (len(mu) and len(b) % len(mu)):
@@ -73,11 +83,11 @@ class Builders(Operators):
                 f"b has {len(b)} rows for {len(mu)} values of mu; the same number of rows for each "
                 "contact is needed"
             )
-        tangents = len(b) // len(mu) - 1 - (patch_radius is not None) if len(mu) else 0
+        tangents = len(b) // len(mu) - 1 - turns if len(mu) else 2 * (rolling is not None)
         if not 0 <= tangents <= 2:
             raise InputError(
                 f"{len(b)} rows for {len(mu)} contacts; a contact has a normal, up to two tangents, "
-                "and spin with patch_radius"
+                "spin with patch_radius, and two rows that roll with rolling"
             )
         if patch_radius is not None:
             patch_radius = as_array("patch_radius", patch_radius, (len(mu),), unit="m")
@@ -86,7 +96,7 @@ class Builders(Operators):
                 f"mu has {len(mu)} values for {len(b)} rows, so each contact is a normal alone, without a row for "
                 "friction: give one mu for each contact (normal and tangents together), or mu = 0"
             )
-        return cls(b, Cones.contacts(mu, tangents, patch_radius), A, **more)
+        return cls(b, Cones.contacts(mu, tangents, patch_radius, rolling=rolling), A, **more)
 
     @classmethod
     def from_findex(
@@ -175,6 +185,7 @@ class Builders(Operators):
         mu: ArrayLike = 0.0,
         tangents: ArrayLike | None = None,
         patch_radius: ArrayLike | None = None,
+        rolling: ArrayLike | None = None,
         shape: str = "disk",
         **more: Any,
     ) -> P:
@@ -195,6 +206,8 @@ class Builders(Operators):
             Gives each contact a spin row.
         shape : {"disk", "box"}
             Of friction in two tangents; see `Cones.contacts`. Two coefficients: replace(problem, cones=...).
+        rolling : scalar or (c,) m, optional
+            mu_r: gives each contact two rows that roll about its two tangents; all contacts need two.
         **more
             As `Problem`: name, friction, ...; the example of `Rows` is a whole stack.
 
@@ -234,22 +247,30 @@ class Builders(Operators):
         tangents = as_array("tangents", tangents, (c,), dtype=np.int32)
         if c and (tangents.min() < 0 or tangents.max() > 2):
             raise InputError("tangents must be 0, 1 or 2 for each contact")
-        spin = patch_radius is not None
+        spin, rolls = patch_radius is not None, rolling is not None
+        if rolls and c and tangents.min() < 2:
+            raise InputError(
+                f"contact {int(np.argmin(tangents))} has {tangents.min()} tangents; rolling needs two, about which it "
+                "rolls: give tangents=2"
+            )
         smooth = np.flatnonzero((mu > 0.0) & (tangents == 0))
         if len(smooth) and not spin:
             raise InputError(
                 f"contact {smooth[0]} has mu {mu[smooth[0]]:g} and no tangent to feel it: give tangents=2, or mu 0"
             )
-        ptr = np.concatenate([rows.joint_ptr, mj + np.cumsum(1 + tangents + spin)]).astype(np.int32)
-        kind = np.repeat(np.array([ROW, 1 + spin], np.int32), [kj, c])
+        ptr = np.concatenate([rows.joint_ptr, mj + np.cumsum(1 + tangents + spin + 2 * rolls)]).astype(
+            np.int32
+        )
+        kind = np.repeat(np.array([ROW, CONTACT_ROLLING if rolls else 1 + spin], np.int32), [kj, c])
         m = int(ptr[-1])
         low, high = np.full(m, -np.inf), np.full(m, np.inf)
         low[:mj] = as_array("lower", lower, (mj,), finite=False, unit="N s")
         high[:mj] = as_array("upper", upper, (mj,), finite=False, unit="N s")
-        both = np.zeros((2, kj + c))
+        both = np.zeros((3, kj + c))
         both[0, kj:] = mu
         both[1, kj:] = 0.0 if patch_radius is None else as_array("patch_radius", patch_radius, (c,), unit="m")
-        cones = Cones(ptr=ptr, kind=kind, lower=low, upper=high, mu=both[0], patch_radius=both[1])
+        both[2, kj:] = 0.0 if rolling is None else as_array("rolling", rolling, (c,), unit="m")
+        cones = Cones(ptr, kind, low, high, *both)
         if check_shape("shape", shape) == "box":
             cones = cones.shaped("box")
         target = as_array("target", target, (m,), unit="m/s")

@@ -12,7 +12,7 @@ import scipy.sparse as sp
 
 from lavender._arrays import ArrayLike, FloatArray, as_array, check_not_negative, equal, read_only, table_of
 from lavender._derived import Derived
-from lavender.cones import CONTACT_SPIN, ROUND, ROW, Cones
+from lavender.cones import ROUND, ROW, Cones
 from lavender.errors import InputError
 from lavender.generalized import Generalized
 from lavender.rows import Rows
@@ -211,6 +211,7 @@ class ProblemData:
             raise InputError(f"row {row} of a problem of {self.m} rows")
         i = self.block_of(row)
         offset, size, kind = row - int(self.cones.ptr[i]), int(np.diff(self.cones.ptr)[i]), self.cones.kind[i]
+        spin, roll = self.cones.spin_rows[i], self.cones.rolling_rows[i]
         if kind == ROW:
             name = self.names[i] if self.names else f"row {row}" if size == 1 else f"joint {i}"
             return name if size == 1 else f"{name}, axis {offset}"
@@ -222,7 +223,9 @@ class ProblemData:
             return f"{name}, normal"
         if kind == ROUND and offset > 2:
             return f"{name}, spin" if offset == 3 else f"{name}, roll {offset - 3}"
-        return f"{name}, spin" if kind == CONTACT_SPIN and offset == size - 1 else f"{name}, tangent {offset}"
+        if 0 <= roll <= row:
+            return f"{name}, roll {row - roll + 1}"
+        return f"{name}, spin" if row == spin else f"{name}, tangent {offset}"
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, ProblemData):

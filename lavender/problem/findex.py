@@ -117,7 +117,7 @@ def arrays_of(cones: Cones) -> tuple[FloatArray, FloatArray, IntArray]:
     for i in np.flatnonzero((cones.kind != ROW) & (np.diff(cones.ptr) > 1)):
         j, end = cones.ptr[i], cones.ptr[i + 1]
         upper[j + 1 : end] = sides[i, 0]
-        if cones.ends_apart[i]:
+        if cones.apart_rows[i] >= 0:
             upper[end - 1] = (
                 sides[i, 1] if cones.kind[i] == CONTACT_BOX else cones.mu[i] * cones.patch_radius[i]
             )

@@ -154,13 +154,11 @@ class Problem(Builders):
         contact = np.flatnonzero(c.kind != ROW)
         n = as_array("normal_impulse", normal_impulse, (len(contact),), unit="N s")
         check_not_negative("normal_impulse", n)
-        lower, upper, apart = c.lower.copy(), c.upper.copy(), c.ends_apart
+        lower, upper, reach = c.lower.copy(), c.upper.copy(), c.reach
         for i, load in zip(contact, n, strict=True):
             j, end = c.ptr[i], c.ptr[i + 1]
-            bound = np.full(end - j, c.mu[i] * load)
-            if apart[i]:
-                bound[-1] *= c.patch_radius[i]
-            lower[j + 1 : end], upper[j + 1 : end] = -bound[1:], bound[1:]
+            bound = reach[j + 1 : end] * load
+            lower[j + 1 : end], upper[j + 1 : end] = -bound, bound
             upper[j] = np.inf
         names = None if self.names is None else [self.row_name(i) for i in range(self.m)]
         more: dict[str, Any] = {"matrix": self.csr} if self.generalized is None else {

@@ -71,7 +71,7 @@ def _make(problem: Problem) -> Chain | None:
         if not problem.derived.first and general_cost(problem, kernel.largest) > rates.GENERAL_FIRST:
             return None
         return Chain(data, start, relative, newton=kernel)
-    if problem.cones.has_round:
+    if problem.cones.has_round or problem.cones.has_rolling:
         return None
     law = problem.law
     if law in ("linear", "lcp"):

@@ -64,6 +64,7 @@ def restrict(problem: Problem, blocks: IntArray, rows: IntArray) -> Problem:
         upper=c.upper[rows],
         mu=c.mu[blocks],
         patch_radius=c.patch_radius[blocks],
+        rolling=c.rolling[blocks],
     )
     names = None if problem.names is None else [problem.names[i] for i in blocks]
     more: dict[str, Any] = {"friction": problem.friction, "names": names, "name": problem.name}

@@ -64,7 +64,7 @@ class AsRows:
 def _blocks(problem: Problem) -> list[tuple[int, list[tuple[int, float]]]]:
     """Blocks, and of each the offset and the c_i of every row that its normal bounds, where c_i > 0."""
     c = problem.cones
-    apart, sides, out = c.ends_apart, c.mu * c.patch_radius, []
+    apart, sides, out = c.apart_rows >= 0, c.mu * c.patch_radius, []
     for i in range(c.n_blocks):
         found = []
         if c.kind[i] != ROW:

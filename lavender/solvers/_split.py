@@ -76,7 +76,9 @@ def _entries_fit(log: SolveLog) -> bool:
 def takes(log: SolveLog) -> bool:
     """Whether there are islands that may be solved so."""
     problem = log.problem
-    return (problem.generalized is not None or not problem.cones.has_round) and log.islands[0] > 1
+    if problem.cones.has_rolling or (problem.generalized is None and problem.cones.has_round):
+        return False
+    return log.islands[0] > 1
 
 
 def solve_together(log: SolveLog, budget: int, each: float) -> IntArray:

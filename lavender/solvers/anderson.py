@@ -42,6 +42,7 @@ SPEC = SolverSpec(
     operators=frozenset({"rows", "matrix", "generalized"}),
     order=True,
     seed=True,
+    rolling=True,
     max_iter=1000,
     options={
         "sweep": SWEEP_OPTION,

@@ -109,6 +109,7 @@ SPEC = SolverSpec(
     boxes=frozenset({"coulomb", "cone"}),
     operators=frozenset(OPERATORS),
     round_cones=True,
+    rolling=True,
     few=AUTO,
     resumable=False,
     delegates=True,

@@ -79,6 +79,7 @@ SPEC = SolverSpec(
     order=True,
     seed=True,
     round_cones=True,
+    rolling=True,
     max_iter=1000,
     summary="Gauss-Seidel over contacts and joints, each solved exactly",
     reference="Jourdan, Alart, Jean 1998; Acary, Bremond, Huber 2018 (NSGS with an exact local solver)",

@@ -77,6 +77,7 @@ SPEC = SolverSpec(
     laws=frozenset({"linear", "lcp", "coulomb"}),
     boxes=frozenset({"coulomb"}),
     operators=frozenset({"matrix"}),
+    rolling=True,
     max_iter=1000,
     options={"omega": "damping, default safe for symmetric positive semidefinite A"},
     summary="damped Jacobi, projected",

@@ -220,6 +220,7 @@ SPEC = SolverSpec(
     boxes=frozenset({"coulomb", "cone"}),
     operators=frozenset(OPERATORS),
     round_cones=True,
+    rolling=True,
     refusal=_refusal,
     few=NEWTON,
     resumable=False,

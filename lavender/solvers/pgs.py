@@ -63,6 +63,7 @@ SPEC = SolverSpec(
     order=True,
     seed=True,
     threads=True,
+    rolling=True,
     max_iter=1000,
     summary="projected Gauss-Seidel on the rows of A, or on J and M",
     reference="Cottle, Pang, Stone 1992, section 5.2; Jourdan, Alart, Jean 1998 for friction",

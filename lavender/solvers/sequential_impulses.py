@@ -100,6 +100,7 @@ SPEC = SolverSpec(
     order=True,
     seed=True,
     threads=True,
+    rolling=True,
     max_iter=1000,
     summary="projected Gauss-Seidel on body velocities, matrix-free",
     reference="Catto 2005, Iterative Dynamics with Temporal Coherence; Guendelman, Bridson, Fedkiw 2003",

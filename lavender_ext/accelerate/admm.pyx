@@ -27,10 +27,11 @@ from libc.stdint cimport int32_t, int64_t
 import numpy as np
 
 from lavender_ext.accelerate.mixing cimport CONTROL, MAX_MEMORY, UNDONE, forget, mix, mixing_t, product, take
-from lavender_ext.core.block cimport (CONE, ROUND, ROW, blocks_t, clip, ends_apart, n_tangents, norm2, round_group,
-                                      round_section, round_share)
+from lavender_ext.core.block cimport (CONE, CONTACT_ROLLING, ROUND, ROW, blocks_t, clip, ends_apart, n_tangents, norm2,
+                                      rolling_section, round_group, round_section, round_share)
 from lavender_ext.core.problem cimport Data
 from lavender_ext.factor.sparse cimport SparsePanels, sparse_solve, sparse_t
+from lavender_ext.local.rolling cimport part_of, part_size
 
 
 cdef enum:
@@ -130,6 +131,33 @@ cdef inline void project_round(int32_t n, const double* root, double mu, const d
         z[i] = (round_share(a[round_group(i)], r, u[0]) if zone == 0 else (1.0 if zone > 0 else 0.0)) * u[i]
 
 
+cdef inline void project_rolling(const blocks_t* p, const double* root, int32_t i, const double* u, double* z) noexcept nogil:
+    # the same of a contact that resists rolling: parts g of one or two rows
+    cdef int32_t j = p.ptr[i], n = p.ptr[i + 1] - j, g, k, q
+    cdef double a[3]
+    cdef double t[3]
+    cdef double bound[3]
+    cdef double f
+    openings(p, root, i, a)
+    for g in range(3):
+        q = part_of(n, g)
+        t[g] = norm2(u[j + q], u[j + q + 1]) if g != 1 else fabs(u[j + q]) if n == 6 else 0.0
+    z[j] = rolling_section(a, t, u[j], bound)
+    for g in range(3):
+        f = bound[g] / t[g] if t[g] > bound[g] else 1.0
+        q = part_of(n, g)
+        for k in range(j + q, j + q + part_size(n, g)):
+            z[k] = f * u[k]
+
+
+cdef inline void openings(const blocks_t* p, const double* root, int32_t i, double* a) noexcept nogil:
+    # a_g of the tangents, of the spin (0 without), of what rolls
+    cdef int32_t j = p.ptr[i], n = p.ptr[i + 1] - j
+    a[0] = p.mu[i] * root[j + 1] / root[j]
+    a[1] = p.mu[i] * p.patch_radius[i] * root[j + 3] / root[j] if n == 6 else 0.0
+    a[2] = p.rolling[i] * root[j + n - 2] / root[j]
+
+
 cdef inline void project_block(const blocks_t* p, const double* root, int32_t i, const double* u,
                                double* z) noexcept nogil:
     """z = Pi_K(u) of one block, u, z whole scaled vectors; core/block.pxd (7)."""
@@ -141,6 +169,9 @@ cdef inline void project_block(const blocks_t* p, const double* root, int32_t i,
         return
     if p.kind[i] == ROUND:
         project_round(n, root + j, p.mu[i], u + j, z + j)
+        return
+    if p.kind[i] == CONTACT_ROLLING:
+        project_rolling(p, root, i, u, z)
         return
     nt = n_tangents(p.kind[i], n)
     at = p.mu[i] * root[j + 1] / root[j] if nt > 0 else 0.0
@@ -166,6 +197,11 @@ cdef inline double shift(const blocks_t* p, const double* root, int32_t i, const
     # s of the normal of contact i
     cdef int32_t j = p.ptr[i], n = p.ptr[i + 1] - j, nt = n_tangents(p.kind[i], n)
     cdef double s = 0.0
+    cdef double a[3]
+    if p.kind[i] == CONTACT_ROLLING:
+        openings(p, root, i, a)
+        s = a[0] * norm2(y[j + 1], y[j + 2]) + a[2] * norm2(y[j + n - 2], y[j + n - 1])
+        return s + a[1] * fabs(y[j + 3]) if n == 6 else s
     if nt > 0:
         s = p.mu[i] * root[j + 1] / root[j] * (norm2(y[j + 1], y[j + 2]) if nt == 2 else fabs(y[j + 1]))
     if ends_apart(p.kind[i]):

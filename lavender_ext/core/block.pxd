@@ -1,17 +1,20 @@
 """The arithmetic of one block: the update of a sweep and the error of the judge.
 
 A block is one or more bounded rows (ROW), or a contact: a normal row, then 0, 1 or 2 tangent rows
-(CONTACT), then one spin row (CONTACT_SPIN); or a normal and two tangents, each bounded by itself (CONTACT_BOX, in
-(1) to (7) a contact of one tangent and, in the place of spin, the other: r is then mu_2 / mu_1); or a contact of three to five tangents in one cone (ROUND:
-two that slide, one that spins, two that roll, scaled to one mu; law CONE only). With w = A lam - b [m/s] and d = diag(A) [1/kg]:
+(CONTACT), then one spin row (CONTACT_SPIN); or a normal, two tangents, perhaps a spin row, and two rows that roll
+(CONTACT_ROLLING); or a normal and two tangents, each bounded by itself (CONTACT_BOX, in (1) to (7) a contact of one
+tangent and, in the place of spin, the other: r is then mu_2 / mu_1); or a contact of three to five tangents in one cone
+(ROUND: two that slide, one that spins, two that roll, scaled to one mu; law CONE only). With w = A lam - b [m/s] and
+d = diag(A) [1/kg]:
 
     update   row      lam  <- clip(lam - w / d, lower, upper)                                  (1)
              normal   lam_n <- max(0, lam_n - w_n / d_n)                                       (2)
              tangents lam_t <- radial projection on mu lam_n of lam_t - w_t / lambda_max(A_tt)  (3)
              spin     lam_s <- clip(lam_s - w_s / d_s, -mu r lam_n, mu r lam_n)                (4)
+             rolling  as (3), on mu_r lam_n
     error    row      e = lam - clip(lam - w / d, lower, upper), w / d where free              (5)
              coulomb  (5) for the normal; e_t = lam_t - Pi_disk(mu lam_n+)(lam_t - w_t / d_t),
-                      e_s likewise on mu r lam_n+, lam_n+ = max(0, lam_n)                       (6)
+                      e_s, e_r likewise on mu r lam_n+, mu_r lam_n+, lam_n+ = max(0, lam_n)     (6)
              cone     e = lam - Pi(lam - w / d) in the metric of d                             (7)
 
 Every function here is inline, allocates nothing, calls sqrt at most, and serves the sweeps, the
@@ -27,6 +30,7 @@ cdef enum:
     CONTACT_SPIN = 2
     ROUND = 3
     CONTACT_BOX = 4
+    CONTACT_ROLLING = 5
 
 cdef enum:
     COULOMB = 0
@@ -38,15 +42,16 @@ cdef struct blocks_t:
     int32_t n_rows              # m
     int32_t law                 # COULOMB | CONE
     const int32_t* ptr          # (k + 1) first row of each block; ptr[0] = 0, increasing
-    const int32_t* kind         # (k) ROW | CONTACT | CONTACT_SPIN | ROUND | CONTACT_BOX
+    const int32_t* kind         # (k) ROW | CONTACT | CONTACT_SPIN | ROUND | CONTACT_BOX | CONTACT_ROLLING
     const double* lower         # (m) N s, read on ROW blocks
     const double* upper         # (m) N s, read on ROW blocks
     const double* mu            # (k) -, >= 0
     const double* patch_radius  # (k) m, of CONTACT_BOX mu_2 / mu_1 [-]; >= 0
     const double* b             # (m) m/s
-    const double* d             # (m) 1/kg, > 0, equal on the two tangents of a contact
+    const double* d             # (m) 1/kg, > 0, equal on the two tangents of a contact, and on the two that roll
     const double* nu            # (m) 1/kg, > 0: velocity error = sqrt(nu d) |e|
-    const double* step          # (m) kg: 1/d, on tangents 1/lambda_max(A_tt)
+    const double* step          # (m) kg: 1/d, on tangents 1/lambda_max(A_tt), likewise on the two that roll
+    const double* rolling       # (k) m, >= 0: mu_r, read on CONTACT_ROLLING alone
 
 
 cdef inline double clip(double x, double low, double high) noexcept nogil:
@@ -87,18 +92,37 @@ cdef inline int32_t ends_apart(int32_t kind) noexcept nogil:
 
 
 cdef inline int32_t n_tangents(int32_t kind, int32_t size) noexcept nogil:
-    # that mu lam_n bounds together: CONTACT and ROUND are odd; the last row of the others ends apart
-    return size - 2 + (kind & 1)
+    # that mu lam_n bounds together: CONTACT and ROUND are odd; rows behind them have a bound each of their own
+    return 2 if kind == CONTACT_ROLLING else size - 2 + (kind & 1)
 
 
 cdef inline int32_t n_directions(int32_t kind, int32_t size) noexcept nogil:
     """Tangent rows, as directions in space."""
-    return size - 1 - (kind == CONTACT_SPIN)
+    return 2 if kind == CONTACT_ROLLING else size - 1 - (kind == CONTACT_SPIN)
 
 
-cdef inline bint is_pair(int32_t nt, int32_t offset) noexcept nogil:
+cdef inline int32_t n_ends(int32_t kind, int32_t size) noexcept nogil:
+    """Rows behind those that mu lam_n bounds together, as bits and as their number: 1 ends apart, 2 roll, 3 is both."""
+    return size - 3 if kind == CONTACT_ROLLING else ends_apart(kind)
+
+
+cdef inline int32_t n_turns(int32_t kind, int32_t size) noexcept nogil:
+    """Rows of a contact behind its tangents, as bits and as their number: 1 spins, 2 roll, 3 is one that spins and two."""
+    return 1 if kind == CONTACT_SPIN else size - 3 if kind == CONTACT_ROLLING else 0
+
+
+cdef inline double mu_r(const blocks_t* p, int32_t i) noexcept nogil:
+    return p.rolling[i] if p.kind[i] == CONTACT_ROLLING else 0.0
+
+
+cdef inline int32_t roll_at(int32_t kind, int32_t size) noexcept nogil:
+    # Offset of the two rows that roll; -2 without them.
+    return size - 2 if kind == CONTACT_ROLLING or kind == ROUND and size == 6 else -2
+
+
+cdef inline bint is_pair(int32_t nt, int32_t roll, int32_t offset) noexcept nogil:
     # Do the rows at this offset in a contact and behind it count by their norm? The two that slide, the two that roll.
-    return offset == 1 and nt >= 2 or offset == 4 and nt == 5
+    return offset == 1 and nt >= 2 or offset == roll
 
 
 cdef inline double relax_row(double lam, double w, double step, double low, double high) noexcept nogil:
@@ -171,16 +195,19 @@ cdef inline void tangent_error(const double* lam, const double* w, double d, dou
 
 
 cdef inline void coulomb_error(const double* lam, const double* w, const double* d, double mu,
-                               double patch_radius, int32_t nt, int32_t spin, double* e) noexcept nogil:
-    # (6): one contact of 1 + nt + spin rows.
-    cdef double bound = mu * (lam[0] if lam[0] > 0.0 else 0.0)
+                               double patch_radius, double rolling, int32_t nt, int32_t turns, double* e) noexcept nogil:
+    # (6): one contact of 1 + nt + turns rows.
+    cdef double normal = lam[0] if lam[0] > 0.0 else 0.0, bound = mu * normal
     cdef double inf = 1.0 / 0.0
+    cdef int32_t k = 1 + nt + (turns & 1)
     e[0] = row_error(lam[0], w[0], d[0], 0.0, inf)
     if nt > 0:
         tangent_error(lam + 1, w + 1, d[1], bound, nt, e + 1)
-    if spin:
+    if turns & 1:
         bound = bound * patch_radius if bound < inf else mu * patch_radius * lam[0]     # inf * 0 would be no bound
         e[1 + nt] = row_error(lam[1 + nt], w[1 + nt], d[1 + nt], -bound, bound)
+    if turns & 2:
+        tangent_error(lam + k, w + k, d[k], rolling * normal, 2, e + k)
 
 
 cdef inline double opening(double mu, double rt, double rn) noexcept nogil:
@@ -250,6 +277,72 @@ cdef inline double weighed(double lam, double w, double d, double r) noexcept no
     return r * (lam - x) if fabs(x) <= 1.7976931348623157e308 else r * lam - w / r
 
 
+cdef inline double rolling_section(const double* a, const double* t, double yn, double* bound) noexcept nogil:
+    """s of (7) and a_g s in bound (3) for three parts, |y_g| = t_g <= a_g s each; a_g = 0 where one is not there.
+
+    The largest of the eight candidates (y_n + sum a_g t_g) / (1 + sum a_g^2) over subsets, as before. b s with b = max(1, a_g)
+    is what keeps its digits where a cone is wide.
+    """
+    cdef double b = 1.0, sb, up, down, f
+    cdef int32_t g, subset
+    for g in range(3):
+        if a[g] > b:
+            b = a[g]
+    sb = b * yn if yn > 0.0 else 0.0
+    for subset in range(1, 8):
+        up = yn / b
+        down = 1.0 / b / b
+        for g in range(3):
+            if subset >> g & 1:
+                f = a[g] / b
+                up += f * t[g]
+                down += f * f
+        if up > sb * down:
+            sb = up / down
+    for g in range(3):
+        bound[g] = a[g] / b * sb
+    return sb / b
+
+
+cdef inline void project_rolling(const double* lam, const double* w, const double* d, double mu, double patch_radius,
+                                 double rolling, int32_t turns, double* e) noexcept nogil:
+    # (7) of a normal, two tangents, perhaps spin, and two that roll: parts g of one or two rows, each with one d
+    cdef double t[3]
+    cdef double a[3]
+    cdef double bound[3]
+    cdef double y[6]
+    cdef double rn = sqrt(d[0]), yn = weighed(lam[0], w[0], d[0], rn), s, r, f
+    cdef int32_t g, i, k = 3 + (turns & 1), j, n
+    t[1] = a[1] = 0.0
+    for g in range(3):
+        if g == 1 and not turns & 1:
+            continue
+        j = 1 if g == 0 else 3 if g == 1 else k
+        n = 1 if g == 1 else 2
+        r = sqrt(d[j])
+        a[g] = opening(rolling if g == 2 else mu, r * (patch_radius if g == 1 else 1.0), rn)
+        t[g] = 0.0
+        for i in range(j, j + n):
+            y[i] = weighed(lam[i], w[i], d[i], r)
+            t[g] = norm2(t[g], y[i])
+    s = rolling_section(a, t, yn, bound)
+    e[0] = quotient(w[0], d[0]) if s == yn else lam[0] - s / rn
+    for g in range(3):
+        if g == 1 and not turns & 1:
+            continue
+        j = 1 if g == 0 else 3 if g == 1 else k
+        n = 1 if g == 1 else 2
+        for i in range(j, j + n):
+            if t[g] > bound[g]:
+                f = t[g] * sqrt(d[i])
+                f = bound[g] / f if 1e-300 < f <= 1.7976931348623157e308 else bound[g] / t[g] / sqrt(d[i])
+                e[i] = lam[i] - f * y[i]
+            else:
+                e[i] = quotient(w[i], d[i])
+    if not (yn == yn and t[0] == t[0] and t[1] == t[1] and t[2] == t[2]):
+        e[0] = yn + t[0] + t[1] + t[2]                  # NaN: comparisons above would hide it
+
+
 cdef inline void project_error(const double* lam, const double* w, const double* d, double mu,
                                double patch_radius, int32_t nt, int32_t spin, double* e) noexcept nogil:
     # (7): the projection on {|y_t| <= a_t y_n, |y_s| <= a_s y_n} after y = sqrt(d) (lam - w / d). The
@@ -311,13 +404,21 @@ cdef inline void project_error(const double* lam, const double* w, const double*
         e[0] = yn + t + ys                              # NaN: comparisons above would hide it
 
 
-cdef inline void cone_error(const double* lam, const double* w, const double* d, double mu,
-                            double patch_radius, int32_t nt, int32_t spin, double* e) noexcept nogil:
+cdef inline void project_parts(const double* lam, const double* w, const double* d, double mu, double patch_radius,
+                               double rolling, int32_t nt, int32_t turns, double* e) noexcept nogil:
+    if turns & 2:
+        project_rolling(lam, w, d, mu, patch_radius, rolling, turns, e)
+    else:
+        project_error(lam, w, d, mu, patch_radius, nt, turns, e)
+
+
+cdef inline void cone_error(const double* lam, const double* w, const double* d, double mu, double patch_radius,
+                            double rolling, int32_t nt, int32_t turns, double* e) noexcept nogil:
     # (7) is homogeneous: where all of lam and w / d would vanish, 2^600 times both, so that their ratios decide, and
     # 2^-600 times both where some w / sqrt(d) would overflow.
     cdef double up = 1.0
-    cdef double big[8]
-    cdef int32_t i, n = 1 + nt + spin
+    cdef double big[12]
+    cdef int32_t i, n = 1 + nt + turns
     cdef bint small = True
     for i in range(n):
         small = small and fabs(lam[i]) < 1e-290 and fabs(w[i]) < 1e-290 * d[i]
@@ -326,12 +427,12 @@ cdef inline void cone_error(const double* lam, const double* w, const double* d,
     if small:
         up = 4.149515568880993e180                      # 2^600
     if up == 1.0:
-        project_error(lam, w, d, mu, patch_radius, nt, spin, e)
+        project_parts(lam, w, d, mu, patch_radius, rolling, nt, turns, e)
         return
     for i in range(n):
         big[i] = up * lam[i]
-        big[4 + i] = up * w[i]
-    project_error(big, big + 4, d, mu, patch_radius, nt, spin, e)
+        big[6 + i] = up * w[i]
+    project_parts(big, big + 6, d, mu, patch_radius, rolling, nt, turns, e)
     for i in range(n):
         e[i] = quotient(e[i], up)
 
@@ -429,12 +530,12 @@ cdef inline void round_error(const double* lam, const double* w, const double* d
 
 
 cdef inline void contact_error(int32_t law, const double* lam, const double* w, const double* d, double mu,
-                               double patch_radius, int32_t nt, int32_t spin, double* e) noexcept nogil:
-    """Error of one contact of 1 + nt + spin rows under its law: where the judge tells laws apart."""
+                               double patch_radius, double rolling, int32_t nt, int32_t turns, double* e) noexcept nogil:
+    """Error of one contact of 1 + nt + turns rows under its law: where the judge tells laws apart."""
     if law == CONE:
-        cone_error(lam, w, d, mu, patch_radius, nt, spin, e)
+        cone_error(lam, w, d, mu, patch_radius, rolling, nt, turns, e)
     else:
-        coulomb_error(lam, w, d, mu, patch_radius, nt, spin, e)
+        coulomb_error(lam, w, d, mu, patch_radius, rolling, nt, turns, e)
 
 
 cdef inline void block_error(const blocks_t* p, int32_t i, const double* lam, const double* w,
@@ -450,4 +551,5 @@ cdef inline void block_error(const blocks_t* p, int32_t i, const double* lam, co
     if kind == ROUND:
         round_error(lam + j, w + j, p.d + j, p.mu[i], nt, e + j)
     else:
-        contact_error(p.law, lam + j, w + j, p.d + j, p.mu[i], p.patch_radius[i], nt, ends_apart(kind), e + j)
+        contact_error(p.law, lam + j, w + j, p.d + j, p.mu[i], p.patch_radius[i], mu_r(p, i), nt,
+                      n_ends(kind, end - j), e + j)

@@ -6,13 +6,15 @@ from lavender_ext.core.block cimport blocks_t
 
 cdef class Blocks:
     cdef blocks_t at                                    # without law, b, d, nu and step
-    cdef readonly tuple arrays                          # ptr, kind, lower, upper, mu, patch_radius
+    cdef readonly tuple arrays                          # ptr, kind, lower, upper, mu, patch_radius, rolling
     cdef readonly bint is_free                          # every row is unbounded
     cdef readonly bint is_bounded_rows                  # every row has constant bounds
     cdef readonly bint has_round                        # some contact has more than two tangents
+    cdef readonly bint has_rolling                      # some contact has rows that roll, bounded by themselves
     cdef readonly bint single_rows                      # every block is one ROW
 
     cdef bint point(self, const int32_t[::1] ptr, const int32_t[::1] kind, const double[::1] lower,
-                    const double[::1] upper, const double[::1] mu, const double[::1] radius)
+                    const double[::1] upper, const double[::1] mu, const double[::1] radius,
+                    const double[::1] rolling)
     cdef bint look(self) noexcept
     cdef void spell(self) noexcept

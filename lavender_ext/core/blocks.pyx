@@ -7,10 +7,10 @@ from libc.stdint cimport int32_t
 
 import numpy as np
 
-from lavender_ext.core.block cimport CONTACT, CONTACT_BOX, CONTACT_SPIN, ROUND, ROW
+from lavender_ext.core.block cimport CONTACT, CONTACT_BOX, CONTACT_ROLLING, CONTACT_SPIN, ROUND, ROW
 
 #: Kinds of blocks by the kernels' numbers.
-KINDS = (ROW, CONTACT, CONTACT_SPIN, ROUND, CONTACT_BOX)
+KINDS = (ROW, CONTACT, CONTACT_SPIN, ROUND, CONTACT_BOX, CONTACT_ROLLING)
 
 cdef double INF = 1.0 / 0.0
 cdef object ndarray = np.ndarray, new = np.empty, F8 = np.dtype(np.float64), I4 = np.dtype(np.int32)
@@ -19,15 +19,16 @@ cdef object ndarray = np.ndarray, new = np.empty, F8 = np.dtype(np.float64), I4 
 cdef class Blocks:
     """Pointers to the arrays of a problem's blocks, which are kept; ValueError where they are no blocks."""
 
-    def __init__(self, ptr, kind, lower, upper, mu, patch_radius):
-        if not self.point(ptr, kind, lower, upper, mu, patch_radius) or not self.look():
+    def __init__(self, ptr, kind, lower, upper, mu, patch_radius, rolling):
+        if not self.point(ptr, kind, lower, upper, mu, patch_radius, rolling) or not self.look():
             raise ValueError("arrays that do not fit each other, or hold what no block can have")
-        self.arrays = (ptr, kind, lower, upper, mu, patch_radius)
+        self.arrays = (ptr, kind, lower, upper, mu, patch_radius, rolling)
 
     cdef bint point(self, const int32_t[::1] ptr, const int32_t[::1] kind, const double[::1] lower,
-                    const double[::1] upper, const double[::1] mu, const double[::1] radius):
+                    const double[::1] upper, const double[::1] mu, const double[::1] radius, const double[::1] rolling):
         cdef Py_ssize_t k = kind.shape[0], m = lower.shape[0]
-        if ptr.shape[0] != k + 1 or mu.shape[0] != k or radius.shape[0] != k or upper.shape[0] != m:
+        if ptr.shape[0] != k + 1 or mu.shape[0] != k or radius.shape[0] != k or upper.shape[0] != m \
+                or rolling.shape[0] != k:
             return False
         if ptr[0] != 0 or ptr[k] != m:
             return False
@@ -40,6 +41,7 @@ cdef class Blocks:
             self.at.upper = &upper[0]
             self.at.mu = &mu[0]
             self.at.patch_radius = &radius[0]
+            self.at.rolling = &rolling[0]
         return m > 0 or k == 0
 
     cdef bint look(self) noexcept:
@@ -47,11 +49,12 @@ cdef class Blocks:
         cdef blocks_t* p = &self.at
         cdef int32_t i, j, size, kind
         self.is_free = self.is_bounded_rows = self.single_rows = True
-        self.has_round = False
+        self.has_round = self.has_rolling = False
         for i in range(p.n_blocks):
             size = p.ptr[i + 1] - p.ptr[i]
             kind = p.kind[i]
-            if size <= 0 or not 0.0 <= p.mu[i] < INF or not 0.0 <= p.patch_radius[i] < INF:
+            if size <= 0 or not 0.0 <= p.mu[i] < INF or not 0.0 <= p.patch_radius[i] < INF \
+                    or not 0.0 <= p.rolling[i] < INF:
                 return False
             if kind == ROUND:
                 self.has_round = True
@@ -59,6 +62,10 @@ cdef class Blocks:
                     return False
             elif kind == CONTACT_BOX:
                 if size != 3:
+                    return False
+            elif kind == CONTACT_ROLLING:
+                self.has_rolling = True
+                if not 5 <= size <= 6:
                     return False
             elif kind != ROW and (not 0 < kind < ROUND or size < kind or size > kind + 2):
                 return False
@@ -94,7 +101,7 @@ cdef class Blocks:
 cdef Blocks room_of(Py_ssize_t k, Py_ssize_t m):
     """Blocks over new arrays, read-only for everybody else, whose numbers are still to be written."""
     cdef Blocks made = Blocks.__new__(Blocks)
-    whole, numbers = new(2 * k + 1, I4), new(2 * (m + k))
+    whole, numbers = new(2 * k + 1, I4), new(2 * m + 3 * k)
     cdef int32_t[::1] i = whole
     cdef double[::1] x = numbers
     made.at.n_blocks = <int32_t>k
@@ -106,10 +113,11 @@ cdef Blocks room_of(Py_ssize_t k, Py_ssize_t m):
         made.at.upper = &x[m]
         made.at.mu = &x[2 * m]
         made.at.patch_radius = &x[2 * m + k]
+        made.at.rolling = &x[2 * m + 2 * k]
     whole.setflags(False)
     numbers.setflags(False)
     made.arrays = (whole[:k + 1], whole[k + 1:], numbers[:m], numbers[m:2 * m], numbers[2 * m:2 * m + k],
-                   numbers[2 * m + k:])
+                   numbers[2 * m + k:2 * m + 2 * k], numbers[2 * m + 2 * k:])
     return made
 
 
@@ -121,6 +129,7 @@ cdef void put(Blocks to, Py_ssize_t block, Py_ssize_t row, const blocks_t* p) no
         (<int32_t*>to.at.kind)[block + i] = p.kind[i]
         (<double*>to.at.mu)[block + i] = p.mu[i]
         (<double*>to.at.patch_radius)[block + i] = p.patch_radius[i]
+        (<double*>to.at.rolling)[block + i] = p.rolling[i]
     for i in range(p.n_rows):
         (<double*>to.at.lower)[row + i] = p.lower[i]
         (<double*>to.at.upper)[row + i] = p.upper[i]
@@ -138,12 +147,13 @@ def joined(Blocks a, Blocks b):
     made.is_free = a.is_free and b.is_free
     made.is_bounded_rows = a.is_bounded_rows and b.is_bounded_rows
     made.has_round = a.has_round or b.has_round
+    made.has_rolling = a.has_rolling or b.has_rolling
     made.single_rows = a.single_rows and b.single_rows
     return made
 
 
 def are_joints_then_contacts(Blocks blocks, const int32_t[::1] joint_ptr):
-    """Whether blocks begin with ROW blocks of these rows, and all others are contacts of up to two tangents and spin."""
+    """Whether blocks begin with ROW blocks of these rows, and all others are contacts of up to two tangents, spin and rolling."""
     cdef int32_t i, kj = <int32_t>joint_ptr.shape[0] - 1
     if kj > blocks.at.n_blocks or blocks.has_round:
         return False
@@ -156,14 +166,15 @@ def are_joints_then_contacts(Blocks blocks, const int32_t[::1] joint_ptr):
     return True
 
 
-def private(ptr, kind, lower, upper, mu, patch_radius):
+def private(ptr, kind, lower, upper, mu, patch_radius, rolling):
     """Blocks over a copy of these arrays; None where anything is amiss."""
     cdef Blocks given = Blocks.__new__(Blocks), made
-    for x, dtype in ((ptr, I4), (kind, I4), (lower, F8), (upper, F8), (mu, F8), (patch_radius, F8)):
+    for x, dtype in ((ptr, I4), (kind, I4), (lower, F8), (upper, F8), (mu, F8), (patch_radius, F8),
+                     (rolling, F8)):
         if type(x) is not ndarray or x.dtype is not dtype or x.ndim != 1 or not x.flags.c_contiguous:
             return None
     try:
-        if not given.point(ptr, kind, lower, upper, mu, patch_radius):
+        if not given.point(ptr, kind, lower, upper, mu, patch_radius, rolling):
             return None
     except ValueError:                                  # not aligned
         return None
@@ -175,15 +186,15 @@ def private(ptr, kind, lower, upper, mu, patch_radius):
     return made
 
 
-def adopted(ptr, kind, lower, upper, mu, patch_radius):
+def adopted(ptr, kind, lower, upper, mu, patch_radius, rolling):
     """Blocks over these arrays themselves, read-only from now on; None where anything is amiss."""
     cdef Blocks made = Blocks.__new__(Blocks)
-    if not made.point(ptr, kind, lower, upper, mu, patch_radius) or not made.look():
+    if not made.point(ptr, kind, lower, upper, mu, patch_radius, rolling) or not made.look():
         return None
     made.spell()
-    for x in (ptr, kind, lower, upper, mu, patch_radius):
+    for x in (ptr, kind, lower, upper, mu, patch_radius, rolling):
         x.setflags(False)
-    made.arrays = (ptr, kind, lower, upper, mu, patch_radius)
+    made.arrays = (ptr, kind, lower, upper, mu, patch_radius, rolling)
     return made
 
 
@@ -215,25 +226,28 @@ cdef Blocks rows_between(Py_ssize_t m, const double* lower, const double* upper)
     for i in range(m):
         (<int32_t*>made.at.ptr)[i + 1] = <int32_t>i + 1
         (<int32_t*>made.at.kind)[i] = ROW
-        (<double*>made.at.mu)[i] = (<double*>made.at.patch_radius)[i] = 0.0
+        (<double*>made.at.mu)[i] = (<double*>made.at.patch_radius)[i] = (<double*>made.at.rolling)[i] = 0.0
         (<double*>made.at.lower)[i] = -INF if lower == NULL else lower[i]
         (<double*>made.at.upper)[i] = INF if upper == NULL else upper[i]
     return made if made.look() else None
 
 
-def contacts(Py_ssize_t k, int32_t tangents, mu, radius, bint box=False):
-    """k contacts of so many tangents, with a spin row where there is a radius (k,); mu a float or (k,) array.
+def contacts(Py_ssize_t k, int32_t tangents, mu, radius, rolling, bint box=False):
+    """k contacts of so many tangents, with a spin row where there is a radius (k,), two that roll where there is mu_r (k,).
+
+    mu is a float or (k,) array.
 
     Boxes have two tangents, and as radius mu_2 / mu_1.
 
     None where anything is amiss.
     """
-    cdef bint spin = radius is not None and not box
-    cdef int32_t size = 1 + tangents + spin, kind
-    cdef const double[::1] each = None, patch = None
+    cdef bint spin = radius is not None and not box, rolls = rolling is not None
+    cdef int32_t size = 1 + tangents + spin + 2 * rolls, kind
+    cdef const double[::1] each = None, patch = None, moment = None
     cdef double one = 0.0
     cdef Py_ssize_t i, j
-    kind = CONTACT_BOX if box else ROUND if tangents > 2 else CONTACT_SPIN if spin else CONTACT
+    kind = (CONTACT_BOX if box else ROUND if tangents > 2 else CONTACT_ROLLING if rolls else CONTACT_SPIN if spin
+            else CONTACT)
     if not 0 <= k < 2147483647 // size:
         return None
     if type(mu) is float:
@@ -246,6 +260,10 @@ def contacts(Py_ssize_t k, int32_t tangents, mu, radius, bint box=False):
         patch = radius
         if patch.shape[0] != k:
             return None
+    if rolls:
+        moment = rolling
+        if moment.shape[0] != k:
+            return None
     cdef Blocks made = room_of(k, k * size)
     (<int32_t*>made.at.ptr)[0] = 0
     for i in range(k):
@@ -253,6 +271,7 @@ def contacts(Py_ssize_t k, int32_t tangents, mu, radius, bint box=False):
         (<int32_t*>made.at.kind)[i] = kind
         (<double*>made.at.mu)[i] = one if each is None else each[i]
         (<double*>made.at.patch_radius)[i] = 0.0 if patch is None else patch[i]
+        (<double*>made.at.rolling)[i] = moment[i] if rolls else 0.0
         for j in range(i * size, (i + 1) * size):
             (<double*>made.at.lower)[j] = 0.0 if j == i * size else -INF
             (<double*>made.at.upper)[j] = INF

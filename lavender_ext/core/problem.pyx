@@ -3,8 +3,9 @@
     d_i     = A_ii; where A_ii <= 1e-10 max_j |A_ij| that maximum; an empty row: the mean of the positive
               d, or 1 (factored: only empty rows fall back); on two tangents the mean of both, and on
               the two that roll                                                                   (1)
-    nu_i    = d_i; on a spin row d of its normal; on an angular joint row 1/m_a + 1/m_b           (2)
-    step_i  = 1/d_i; on tangents 1/lambda_max of the symmetric part of A_tt, d_t where not positive (3)
+    nu_i    = d_i; on a row that spins or rolls d of its normal; on an angular joint row 1/m_a + 1/m_b           (2)
+    step_i  = 1/d_i; on tangents 1/lambda_max of the symmetric part of A_tt, d_t where not positive;
+              likewise on the two that roll                                                       (3)
 """
 from libc.math cimport fabs
 from libc.stdint cimport int32_t
@@ -15,8 +16,8 @@ cimport cython
 
 import numpy as np
 
-from lavender_ext.core.block cimport (CONE, CONTACT_BOX, CONTACT_SPIN, COULOMB, ROUND, ROW, blocks_t, is_pair, n_directions,
-                                      n_tangents)
+from lavender_ext.core.block cimport (CONE, CONTACT_BOX, CONTACT_ROLLING, COULOMB, ROUND, ROW, blocks_t, is_pair,
+                                      n_directions, n_tangents, n_turns, roll_at)
 from lavender_ext.core.blocks cimport Blocks
 from lavender_ext.core.csr cimport csr_t
 from lavender_ext.core.generalized cimport Operator, dot, generalized_t, panel_pattern, panel_whiten
@@ -35,7 +36,7 @@ cdef public int32_t lav_csr_diagonal(const blocks_t* p, const csr_t* a, double* 
                                      int32_t* empty) noexcept nogil:
     """d and step of (1), (3) from the rows of A; marks empty rows, returns how many."""
     cdef int32_t i, j, k, t, q, nt, kind, n_empty = 0, n_positive = 0
-    cdef double diag, big, total = 0.0, mean, x, off, e
+    cdef double diag, big, total = 0.0, mean, x, e, roll
     for i in range(p.n_rows):
         diag = 0.0
         big = 0.0
@@ -60,32 +61,45 @@ cdef public int32_t lav_csr_diagonal(const blocks_t* p, const csr_t* a, double* 
         j = p.ptr[i]
         kind = p.kind[i]
         nt = 0 if kind == ROW else n_tangents(kind, p.ptr[i + 1] - j)
-        pair_means(nt, d + j)
-        if nt > 0 and kind == ROUND:
-            e = 0.0
-        elif nt > 0:
-            big = step[j + 1]
-            if nt == 2 and step[j + 2] > big:
-                big = step[j + 2]
-            e = csr_entry(a, j + 1, j + 1)
-            if nt == 2:
-                off = 0.5 * (csr_entry(a, j + 1, j + 2) + csr_entry(a, j + 2, j + 1))
-                e = largest_eigenvalue(e, off, csr_entry(a, j + 2, j + 2))
-            if not e > 1e-10 * big:
-                e = d[j + 1]
+        q = p.ptr[i + 1] - j
+        pair_means(kind, q, d + j)
+        e = roll = 0.0
+        if nt > 0 and kind != ROUND:
+            e = csr_largest(a, j + 1, nt, d, step)
+        if kind == CONTACT_ROLLING:
+            roll = csr_largest(a, j + q - 2, 2, d, step)
         for k in range(j, p.ptr[i + 1]):
             step[k] = reciprocal(d[k])
         if kind != ROUND:                               # which no sweep relaxes
             for t in range(1, 1 + nt):
                 step[j + t] = reciprocal(e)
+        roll_step(p, i, roll, d, step)
     return n_empty
 
 
-cdef inline void pair_means(int32_t nt, double* d) noexcept nogil:
+cdef inline double csr_largest(const csr_t* a, int32_t j, int32_t n, const double* d, const double* big) noexcept nogil:
+    # lambda_max of (3) on the n rows from j on, with the largest entry of each row in `big`
+    cdef double most = big[j], e = csr_entry(a, j, j), off
+    if n == 2:
+        if big[j + 1] > most:
+            most = big[j + 1]
+        off = 0.5 * (csr_entry(a, j, j + 1) + csr_entry(a, j + 1, j))
+        e = largest_eigenvalue(e, off, csr_entry(a, j + 1, j + 1))
+    return e if e > 1e-10 * most else d[j]
+
+
+cdef inline void roll_step(const blocks_t* p, int32_t i, double e, const double* d, double* step) noexcept nogil:
+    # (3) on the two rows of block i that roll, where it has such
+    cdef int32_t k = p.ptr[i + 1] - 2
+    if p.kind[i] == CONTACT_ROLLING:
+        step[k] = step[k + 1] = reciprocal(e if e > 0.0 else d[k])
+
+
+cdef inline void pair_means(int32_t kind, int32_t size, double* d) noexcept nogil:
     # One d for the two tangents that slide, one for the two that roll; d at the normal.
-    cdef int32_t t
-    for t in range(1, nt):
-        if is_pair(nt, t):
+    cdef int32_t t, nt = 0 if kind == ROW else n_tangents(kind, size), roll = roll_at(kind, size)
+    for t in range(1, size - 1):
+        if is_pair(nt, roll, t):
             d[t] = 0.5 * (d[t] + d[t + 1])
             d[t + 1] = d[t]
 
@@ -108,8 +122,9 @@ cdef public int32_t lav_rows_diagonal(const blocks_t* p, const rows_t* r, double
                                       int32_t* empty, double* minv_jac, double* coupling,
                                       double* swing) noexcept nogil:
     """d, nu, step, M^-1 J^T of joints, coupling and swing of contacts, from the factored form."""
-    cdef int32_t i, j, q, c, t, nt, spin, end, n_empty = 0, n_positive = 0, a, b
-    cdef double total = 0.0, mean, e, off
+    cdef int32_t i, j, q, c, t, nt, end, n_empty = 0, n_positive = 0, a, b
+    cdef double total = 0.0, mean, e, roll
+    cdef double off[2]
     for i in range(r.n_joints):
         a = r.joint_body[2 * i]
         b = r.joint_body[2 * i + 1]
@@ -121,18 +136,20 @@ cdef public int32_t lav_rows_diagonal(const blocks_t* p, const rows_t* r, double
         i = r.n_joints + c
         j = p.ptr[i]
         end = p.ptr[i + 1]
-        spin = p.kind[i] == CONTACT_SPIN
         nt = n_directions(p.kind[i], end - j)
-        contact_diagonal(r.normal + 3 * c, r.tangent + 3 * c, r.arm_a + 3 * c, r.arm_b + 3 * c, nt, spin,
-                         r.contact_body[2 * c], r.contact_body[2 * c + 1], r.inv_mass, r.inv_inertia, d + j, &off,
+        contact_diagonal(r.normal + 3 * c, r.tangent + 3 * c, r.arm_a + 3 * c, r.arm_b + 3 * c, nt,
+                         n_turns(p.kind[i], end - j), r.contact_body[2 * c], r.contact_body[2 * c + 1], r.inv_mass,
+                         r.inv_inertia, d + j, off,
                          coupling + 5 * c, swing + 6 * (j - p.ptr[r.n_joints]))
         for q in range(end - j):
             d[j + q] += r.compliance[j + q]
             step[j + q] = 0.0
         if p.kind[i] == CONTACT_BOX:                    # each tangent has a step of its own, and feels the one before
-            coupling[5 * c + 2] = off
+            coupling[5 * c + 2] = off[0]
         elif nt > 0:
-            step[j + 1] = largest_eigenvalue(d[j + 1], off, d[j + 2]) if nt == 2 else d[j + 1]
+            step[j + 1] = largest_eigenvalue(d[j + 1], off[0], d[j + 2]) if nt == 2 else d[j + 1]
+        if p.kind[i] == CONTACT_ROLLING:
+            step[end - 2] = largest_eigenvalue(d[end - 2], off[1], d[end - 1])
     for j in range(p.n_rows):
         empty[j] = d[j] == 0.0                          # what overflowed is not empty
         n_empty += empty[j]
@@ -149,14 +166,14 @@ cdef public int32_t lav_rows_diagonal(const blocks_t* p, const rows_t* r, double
         j = p.ptr[i]
         end = p.ptr[i + 1]
         nt = 0 if p.kind[i] == ROW else n_tangents(p.kind[i], end - j)
-        if nt == 2:
-            d[j + 1] = 0.5 * (d[j + 1] + d[j + 2])
-            d[j + 2] = d[j + 1]
+        pair_means(p.kind[i], end - j, d + j)
         e = step[j + 1] if nt > 0 and step[j + 1] > 0.0 else (d[j + 1] if nt > 0 else 0.0)
+        roll = step[end - 2] if p.kind[i] == CONTACT_ROLLING else 0.0
         for q in range(j, end):
             step[q] = reciprocal(d[q])
         for t in range(1, 1 + nt):
             step[j + t] = reciprocal(e)
+        roll_step(p, i, roll, d, step)
     block_weights(p, d, nu)
     joint_weights(p, r, nu)
     return n_empty
@@ -166,7 +183,7 @@ cdef public int32_t lav_general_diagonal(const blocks_t* p, const generalized_t*
                                          int32_t* empty, int32_t* place, double* y) noexcept nogil:
     """Y, d, nu and step of a problem in generalised coordinates; place (n) is scratch. Returns how many rows are empty."""
     cdef int32_t i, j, k, b, nc, nt, n_empty = 0, n_positive = 0
-    cdef double total = 0.0, mean, e
+    cdef double total = 0.0, mean, e, roll
     cdef const double* row
     for b in range(g.n_panels):
         panel_whiten(g, b, place, y + g.pval[b])
@@ -193,11 +210,16 @@ cdef public int32_t lav_general_diagonal(const blocks_t* p, const generalized_t*
             b += 1
         nt = 0 if p.kind[i] == ROW else n_tangents(p.kind[i], p.ptr[i + 1] - j)
         e = d[j + 1] if nt > 0 else 0.0
+        roll = 0.0
+        nc = g.pcol[b + 1] - g.pcol[b]
         if nt == 2:
-            nc = g.pcol[b + 1] - g.pcol[b]
             row = y + g.pval[b] + (j + 1 - g.prow[b]) * nc
             e = largest_eigenvalue(d[j + 1], dot(row, row + nc, nc), d[j + 2])
-        pair_means(nt, d + j)
+        if p.kind[i] == CONTACT_ROLLING:
+            k = p.ptr[i + 1] - 2
+            row = y + g.pval[b] + (k - g.prow[b]) * nc
+            roll = largest_eigenvalue(d[k], dot(row, row + nc, nc), d[k + 1])
+        pair_means(p.kind[i], p.ptr[i + 1] - j, d + j)
         for k in range(j, p.ptr[i + 1]):
             step[k] = reciprocal(d[k])
         if nt > 0 and p.kind[i] != ROUND:
@@ -205,6 +227,7 @@ cdef public int32_t lav_general_diagonal(const blocks_t* p, const generalized_t*
                 e = d[j + 1]
             for k in range(1, 1 + nt):
                 step[j + k] = reciprocal(e)
+        roll_step(p, i, roll, d, step)
     block_weights(p, d, nu)
     return n_empty
 

@@ -4,9 +4,9 @@ A body's velocity is six numbers (linear [m/s], angular [rad/s]); body -1 is sta
 never written. Relative velocity at a contact, from body a to body b,
 
     u = (v_b + omega_b x arm_b) - (v_a + omega_a x arm_a)                                      (1)
-    w_n = n.u,  w_t = t.u with t2 = n x t1,  w_s = n.(omega_b - omega_a)                       (2)
+    w_n = n.u,  w_t = t.u with t2 = n x t1,  w_s = n.(omega_b - omega_a),  w_r = t.(omega_b - omega_a)  (2)
 
-and an impulse P [N s] with spin s [N m s] along n changes
+and an impulse P [N s] with spin s [N m s] along n (rolling: along t) changes
 
     v_b += P / m_b,  omega_b += I_b^-1 (arm_b x P + s n),  and the opposite on a.              (3)
 
@@ -20,8 +20,8 @@ from libc.float cimport DBL_MAX
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.block cimport (CONTACT_BOX, CONTACT_SPIN, blocks_t, n_directions, relax_normal, relax_row,
-                                      relax_tangents)
+from lavender_ext.core.block cimport (CONTACT_BOX, CONTACT_ROLLING, CONTACT_SPIN, blocks_t, n_directions, n_turns,
+                                      relax_normal, relax_row, relax_tangents)
 
 
 cdef struct rows_t:
@@ -207,13 +207,49 @@ cdef inline void relax_contact(const double* normal, const double* tangent, cons
         swing_body(v + 6 * b, inv_mass[b], swing + 3, impulse, dn, d0, d1, ds, nt, spin, 1.0)
 
 
+cdef inline void turn_body(double* v, const double* swing, double d0, double d1, double sign) noexcept nogil:
+    cdef int32_t k
+    for k in range(3):
+        v[3 + k] += sign * (d0 * swing[k] + d1 * swing[6 + k])
+
+
+cdef inline void relax_rolling(const double* normal, const double* tangent, const double* swing, const double* compliance,
+                               const double* rhs, const double* step, double radius, int32_t a, int32_t b, double* lam,
+                               double* v) noexcept nogil:
+    """The two rows that roll, after `relax_contact`, on the v of now; all pointers are at the first of them."""
+    cdef double omega[3]
+    cdef double t2[3]
+    cdef double w[2]
+    cdef double x = lam[0], y = lam[1]
+    cdef int32_t k
+    for k in range(3):
+        omega[k] = (v[6 * b + 3 + k] if b >= 0 else 0.0) - (v[6 * a + 3 + k] if a >= 0 else 0.0)
+    cross(normal, tangent, t2)
+    w[0] = dot3(tangent, omega) + (compliance[0] * x - rhs[0])
+    w[1] = dot3(t2, omega) + (compliance[1] * y - rhs[1])
+    relax_tangents(lam, w, step[0], radius, 2)
+    if a >= 0:
+        turn_body(v + 6 * a, swing, lam[0] - x, lam[1] - y, -1.0)
+    if b >= 0:
+        turn_body(v + 6 * b, swing + 3, lam[0] - x, lam[1] - y, 1.0)
+
+
 cdef inline void relax_contact_block(const blocks_t* p, const rows_t* r, int32_t i, double* lam,
                                      double* v) noexcept nogil:
     # The two common kinds with their sizes as constants: a compiler then leaves out the rows that are not
     # there.
-    cdef int32_t c = i - r.n_joints, j = p.ptr[i], kind = p.kind[i], nt = n_directions(kind, p.ptr[i + 1] - j)
+    cdef int32_t c = i - r.n_joints, j = p.ptr[i], kind = p.kind[i], nt = n_directions(kind, p.ptr[i + 1] - j), k
     cdef const double* swing = r.swing + 6 * (j - p.ptr[r.n_joints])
-    if kind == CONTACT_SPIN or nt == 1:
+    if kind == CONTACT_ROLLING:
+        k = p.ptr[i + 1] - j - 2
+        relax_contact(r.normal + 3 * c, r.tangent + 3 * c, r.arm_a + 3 * c, r.arm_b + 3 * c,
+                      r.coupling + 5 * c, swing, r.compliance + j, p.b + j, p.step + j, p.mu[i],
+                      p.patch_radius[i],
+                      2, k > 3, False, r.contact_body[2 * c], r.contact_body[2 * c + 1], r.inv_mass, lam + j, v)
+        relax_rolling(r.normal + 3 * c, r.tangent + 3 * c, swing + 6 * k, r.compliance + j + k, p.b + j + k,
+                      p.step + j + k, p.rolling[i] * lam[j], r.contact_body[2 * c], r.contact_body[2 * c + 1],
+                      lam + j + k, v)
+    elif kind == CONTACT_SPIN or nt == 1:
         relax_contact(r.normal + 3 * c, r.tangent + 3 * c, r.arm_a + 3 * c, r.arm_b + 3 * c,
                       r.coupling + 5 * c, swing, r.compliance + j, p.b + j, p.step + j, p.mu[i],
                       p.patch_radius[i],
@@ -241,7 +277,7 @@ cdef inline void relax_rows_block(const blocks_t* p, const rows_t* r, int32_t i,
         relax_contact_block(p, r, i, lam, v)
 
 
-cdef inline void contact_slack(const rows_t* r, int32_t c, int32_t nt, int32_t spin, const double* v,
+cdef inline void contact_slack(const rows_t* r, int32_t c, int32_t nt, int32_t turns, const double* v,
                                double* w) noexcept nogil:
     # (2): J v of one contact.
     cdef double u[3]
@@ -256,36 +292,44 @@ cdef inline void contact_slack(const rows_t* r, int32_t c, int32_t nt, int32_t s
     if nt == 2:
         cross(n, r.tangent + 3 * c, t2)
         w[2] = dot3(t2, u)
-    if spin:
+    if turns & 1:
         w[1 + nt] = dot3(n, omega)
+    if turns & 2:
+        w[1 + nt + (turns & 1)] = dot3(r.tangent + 3 * c, omega)
+        w[2 + nt + (turns & 1)] = dot3(t2, omega)
 
 
 cdef inline void rows_times(const blocks_t* p, const rows_t* r, const double* v, double* out) noexcept nogil:
     # J v (m) of all rows; v (n, 6).
-    cdef int32_t i, j, c
+    cdef int32_t i, j, c, n
     for i in range(r.n_joints):
         for j in range(p.ptr[i], p.ptr[i + 1]):
             out[j] = joint_velocity(r.jac + 12 * j, v, r.joint_body[2 * i], r.joint_body[2 * i + 1])
     for c in range(r.n_contacts):
         i = r.n_joints + c
         j = p.ptr[i]
-        contact_slack(r, c, n_directions(p.kind[i], p.ptr[i + 1] - j), p.kind[i] == CONTACT_SPIN, v, out + j)
+        n = p.ptr[i + 1] - j
+        contact_slack(r, c, n_directions(p.kind[i], n), n_turns(p.kind[i], n), v, out + j)
 
 
-cdef inline void contact_jacobian(const rows_t* r, int32_t c, int32_t nt, int32_t spin,
+cdef inline void contact_jacobian(const rows_t* r, int32_t c, int32_t nt, int32_t turns,
                                   double* jac) noexcept nogil:
-    # Rows of one contact as (1 + nt + spin, 12), in the layout of joint rows.
+    # Rows of one contact as (1 + nt + turns, 12), in the layout of joint rows.
     cdef double axis[3]
     cdef double arm[3]
     cdef const double* n = r.normal + 3 * c
     cdef int32_t row, k
-    for row in range(1 + nt + spin):
+    for row in range(1 + nt + turns):
         for k in range(12):
             jac[12 * row + k] = 0.0
-        if row > nt:                                    # spin
+        if row > nt:                                    # spins about n, rolls about t1 and t2
             for k in range(3):
-                jac[12 * row + 3 + k] = -n[k]
-                jac[12 * row + 9 + k] = n[k]
+                axis[k] = n[k] if row == nt + (turns & 1) else r.tangent[3 * c + k]
+            if row == nt + (turns & 1) + 2:
+                cross(n, r.tangent + 3 * c, axis)
+            for k in range(3):
+                jac[12 * row + 3 + k] = -axis[k]
+                jac[12 * row + 9 + k] = axis[k]
             continue
         if row == 0:
             for k in range(3):
@@ -304,7 +348,7 @@ cdef inline void contact_jacobian(const rows_t* r, int32_t c, int32_t nt, int32_
         for k in range(3):
             jac[12 * row + 9 + k] = arm[k]
     # A static side has no columns.
-    for row in range(1 + nt + spin):
+    for row in range(1 + nt + turns):
         for k in range(6):
             if r.contact_body[2 * c] < 0:
                 jac[12 * row + k] = 0.0
@@ -330,15 +374,15 @@ cdef inline void minv_times(const double* jac, const double* inv_mass, const dou
 
 cdef inline void contact_diagonal(const double* normal, const double* tangent, const double* arm_a,
                                   const double* arm_b,
-                                  int32_t nt, int32_t spin, int32_t a, int32_t b, const double* inv_mass,
-                                  const double* inv_inertia, double* d, double* t12, double* coupling,
+                                  int32_t nt, int32_t turns, int32_t a, int32_t b, const double* inv_mass,
+                                  const double* inv_inertia, double* d, double* off, double* coupling,
                                   double* swing) noexcept nogil:
-    """A among the rows of one contact, without compliance: diagonal d (1 + nt + spin), t12 = A_t1t2,
-    coupling (5).
+    """A among the rows of one contact, without compliance: diagonal d (1 + nt + turns), off = A_t1t2 and
+    A_r1r2, coupling (5).
 
-    And swing (1 + nt + spin, 6): I_a^-1 (arm_a x axis), I_b^-1 (arm_b x axis) of each row, 0 where static.
+    And swing (1 + nt + turns, 6): I_a^-1 (arm_a x axis), I_b^-1 (arm_b x axis) of each row, 0 where static.
 
-    With l = arm x axis (for spin l = n), A_pq = (sum 1/m) p.q + sum l_p . I^-1 l_q over both bodies.
+    With l = arm x axis (for spin l = n, for rolling l = t), A_pq = (sum 1/m) p.q + sum l_p . I^-1 l_q over both bodies.
     """
     cdef double axis[12]        # n, t1, t2
     cdef double l[9]
@@ -347,7 +391,7 @@ cdef inline void contact_diagonal(const double* normal, const double* tangent, c
     cdef double m = 0.0
     cdef const double* arm
     cdef const double* inv
-    cdef int32_t side, body, i, q
+    cdef int32_t side, body, i, q, roll = 1 + nt + (turns & 1)
     for i in range(3):
         axis[i] = normal[i]
     if nt > 0:
@@ -355,12 +399,12 @@ cdef inline void contact_diagonal(const double* normal, const double* tangent, c
             axis[3 + i] = tangent[i]
     if nt > 1:
         cross(normal, tangent, axis + 6)
-    for i in range(1 + nt + spin):
+    for i in range(1 + nt + turns):
         d[i] = 0.0
-    for i in range(6 * (1 + nt + spin)):
+    for i in range(6 * (1 + nt + turns)):
         swing[i] = 0.0
-    t12[0] = 0.0
-    if nt + spin > 0:
+    off[0] = off[1] = 0.0
+    if nt + turns > 0:
         for i in range(5):
             coupling[i] = 0.0
     for side in range(2):
@@ -380,8 +424,8 @@ cdef inline void contact_diagonal(const double* normal, const double* tangent, c
             coupling[0] += dot3(l + 3, k)
         if nt > 1:
             coupling[1] += dot3(l + 6, k)
-            t12[0] += dot3(l + 3, k + 6)
-        if spin:
+            off[0] += dot3(l + 3, k + 6)
+        if turns & 1:
             for q in range(3):
                 ks[q] = dot3(inv + 3 * q, normal)
                 swing[6 * (1 + nt) + 3 * side + q] = ks[q]
@@ -389,13 +433,20 @@ cdef inline void contact_diagonal(const double* normal, const double* tangent, c
             coupling[2] += dot3(normal, k)
             for i in range(nt):
                 coupling[3 + i] += dot3(normal, k + 3 + 3 * i)
+        if turns & 2:
+            for i in range(2):
+                for q in range(3):
+                    ks[q] = dot3(inv + 3 * q, axis + 3 + 3 * i)
+                    swing[6 * (roll + i) + 3 * side + q] = ks[q]
+                d[roll + i] += dot3(axis + 3 + 3 * i, ks)
+            off[1] += dot3(axis + 3, ks)
     for i in range(1 + nt):
         d[i] += m * dot3(axis + 3 * i, axis + 3 * i)
     if nt > 0:
         coupling[0] += m * dot3(axis + 3, axis)
     if nt > 1:
         coupling[1] += m * dot3(axis + 6, axis)
-        t12[0] += m * dot3(axis + 3, axis + 6)
+        off[0] += m * dot3(axis + 3, axis + 6)
 
 
 cdef inline double reciprocal(double x) noexcept nogil:

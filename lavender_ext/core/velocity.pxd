@@ -5,7 +5,7 @@
 """
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.block cimport CONTACT_SPIN, blocks_t, n_directions
+from lavender_ext.core.block cimport blocks_t, n_directions, n_turns
 from lavender_ext.core.rows cimport cross, dot3, rows_t
 
 
@@ -33,13 +33,15 @@ cdef inline void joint_wrench(const blocks_t* p, const rows_t* r, int32_t i, con
         add6(f + 6 * b, x + 6)
 
 
-cdef inline void contact_wrench(const rows_t* r, int32_t c, int32_t nt, int32_t spin, const double* lam,
+cdef inline void contact_wrench(const rows_t* r, int32_t c, int32_t nt, int32_t turns, const double* lam,
                                 double* f) noexcept nogil:
     """The same of contact c; lam at its normal."""
     cdef double t2[3]
     cdef double x[3]
     cdef double l[3]
+    cdef double twist[3]
     cdef const double* n = r.normal + 3 * c
+    cdef const double* roll = lam + 1 + nt + (turns & 1)
     cdef int32_t k, a = r.contact_body[2 * c], b = r.contact_body[2 * c + 1]
     if nt > 1:
         cross(n, r.tangent + 3 * c, t2)
@@ -49,16 +51,19 @@ cdef inline void contact_wrench(const rows_t* r, int32_t c, int32_t nt, int32_t 
             x[k] += lam[1] * r.tangent[3 * c + k]
         if nt > 1:
             x[k] += lam[2] * t2[k]
+        twist[k] = lam[1 + nt] * n[k] if turns & 1 else 0.0
+        if turns & 2:
+            twist[k] += roll[0] * r.tangent[3 * c + k] + roll[1] * t2[k]
     if a >= 0:
         cross(r.arm_a + 3 * c, x, l)
         for k in range(3):
             f[6 * a + k] -= x[k]
-            f[6 * a + 3 + k] -= l[k] + lam[1 + nt] * n[k] if spin else l[k]
+            f[6 * a + 3 + k] -= l[k] + twist[k] if turns else l[k]
     if b >= 0:
         cross(r.arm_b + 3 * c, x, l)
         for k in range(3):
             f[6 * b + k] += x[k]
-            f[6 * b + 3 + k] += l[k] + lam[1 + nt] * n[k] if spin else l[k]
+            f[6 * b + 3 + k] += l[k] + twist[k] if turns else l[k]
 
 
 cdef inline void wrenches_to_velocity(const rows_t* r, double* v) noexcept nogil:
@@ -79,7 +84,7 @@ cdef inline void wrenches_to_velocity(const rows_t* r, double* v) noexcept nogil
 
 cdef inline void rows_velocity(const blocks_t* p, const rows_t* r, const double* lam, double* v) noexcept nogil:
     """v = M^-1 J^T lam (n, 6) of all blocks, by (1)."""
-    cdef int32_t i, j, c, nt
+    cdef int32_t i, j, c, nt, turns
     for i in range(6 * r.n_bodies):
         v[i] = 0.0
     for i in range(r.n_joints):
@@ -88,8 +93,9 @@ cdef inline void rows_velocity(const blocks_t* p, const rows_t* r, const double*
         i = r.n_joints + c
         j = p.ptr[i]
         nt = n_directions(p.kind[i], p.ptr[i + 1] - j)
-        if p.kind[i] == CONTACT_SPIN or nt == 1:        # the two common kinds with their sizes as constants
-            contact_wrench(r, c, nt, p.kind[i] == CONTACT_SPIN, lam + j, v)
+        turns = n_turns(p.kind[i], p.ptr[i + 1] - j)
+        if turns or nt == 1:                            # the two common kinds with their sizes as constants
+            contact_wrench(r, c, nt, turns, lam + j, v)
         elif nt == 2:
             contact_wrench(r, c, 2, 0, lam + j, v)
         else:

@@ -1,23 +1,24 @@
 """nu, what a velocity error weighs: d, but for rows that turn and have a linear row beside them.
 
-    spin row            nu = d of its normal                                                   (1)
+    spin, rolling rows  nu = d of their normal                                                 (1)
     angular joint row   nu = 1/m_a + 1/m_b                                                     (2)
 """
 from libc.math cimport fabs
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.block cimport CONTACT_SPIN, blocks_t
+from lavender_ext.core.block cimport blocks_t, n_turns
 from lavender_ext.core.rows cimport rows_t
 
 
 cdef inline void block_weights(const blocks_t* p, const double* d, double* nu) noexcept nogil:
     """nu (m) where only a matrix is known: d (m), and (1)."""
-    cdef int32_t i, j
+    cdef int32_t i, j, end
     for j in range(p.n_rows):
         nu[j] = d[j]
     for i in range(p.n_blocks):
-        if p.kind[i] == CONTACT_SPIN:
-            nu[p.ptr[i + 1] - 1] = d[p.ptr[i]]
+        end = p.ptr[i + 1]
+        for j in range(end - n_turns(p.kind[i], end - p.ptr[i]), end):
+            nu[j] = d[p.ptr[i]]
 
 
 cdef inline void joint_weights(const blocks_t* p, const rows_t* r, double* nu) noexcept nogil:

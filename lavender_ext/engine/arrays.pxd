@@ -20,7 +20,7 @@ cpdef enum:
     N_EXCLUDED = 4
     N_BUCKET = 5            # buckets of the hash grid, a power of two; 0: all pairs are tested
     N_FRAME = 6             # rotation matrices: n_bodies where boxes, joints or uneven inertia are, else 0
-    ROWS_PER_CONTACT = 7    # 1 without friction, 3 with, 4 with patch friction
+    ROWS_PER_CONTACT = 7    # 1 without friction, 3 with, 4 with patch friction, 2 more with rolling friction
     CAP_PAIR = 8
     CAP_CONTACT = 9
     N_SIZES = 10
@@ -85,7 +85,8 @@ cpdef enum:
     S_JOINT_ERROR = 21      # m or rad, largest joint error
     S_HERTZ = 22            # 1/s, of the contacts of SOFT_STEP; stabilisation [-] of AVBD
     S_RATIO = 23            # -, their damping ratio
-    N_SETTINGS = 24
+    S_ROLLING = 24          # m, mu_r of every contact with friction
+    N_SETTINGS = 25
 
 # the pair list: what stops the broad phase, and what it then says is needed, which no capacity meets
 cpdef enum:
@@ -127,7 +128,7 @@ cpdef enum:
 
 # arrays in each buffer
 cdef enum:
-    N_REAL_ARRAYS = 45
+    N_REAL_ARRAYS = 47
     N_INDEX_ARRAYS = 22
     N_KEY_ARRAYS = 3
 
@@ -184,6 +185,8 @@ cdef struct engine_t:
     double* impulse         # (m) N s, N m s
     double* mu              # (kj + c)
     double* patch_radius    # (kj + c) m
+    double* rolling         # (kj + c) m, absent without rolling friction
+    double* cache_roll      # (c, 3) N m s, world; absent without rolling friction
     # the buffer of int32, in its order: `lav_engine_offsets` walks over the fields
     int32_t* head           # (N_HEAD)
     int32_t* kind_of_shape  # (n)
@@ -231,6 +234,7 @@ cdef inline void bind(const int32_t* size, double* real, int32_t* index, uint64_
     cdef int64_t n = size[N_BODY], nd = size[N_DYNAMIC], kj = size[N_JOINT], mj = size[N_JOINT_ROW]
     cdef int64_t c = size[CAP_CONTACT], p = size[CAP_PAIR], k = kj + c, m = mj + c * size[ROWS_PER_CONTACT]
     cdef int64_t frames = size[N_FRAME], nt = c if size[ROWS_PER_CONTACT] > 1 else 0
+    cdef int64_t rolls = 1 if size[ROWS_PER_CONTACT] > 4 else 0
     cdef int64_t grid = n if size[N_BUCKET] > 0 else 0
     cdef int64_t i = 0, j = 0
     e.size = size
@@ -279,6 +283,8 @@ cdef inline void bind(const int32_t* size, double* real, int32_t* index, uint64_
     e.impulse = reals(real, &i, m)
     e.mu = reals(real, &i, k)
     e.patch_radius = reals(real, &i, k)
+    e.rolling = reals(real, &i, k * rolls)
+    e.cache_roll = reals(real, &i, 3 * c * rolls)
     e.head = ints(index, &j, N_HEAD)
     e.kind_of_shape = ints(index, &j, n)
     e.dyn = ints(index, &j, n)

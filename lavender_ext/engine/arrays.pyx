@@ -49,7 +49,7 @@ SHAPES = {
         "arm_a": "c 3", "arm_b": "c 3", "coupling": "nt 5", "swing": "contact_rows 6", "local": "c 6",
         "cache_impulse": "c cache_reals", "cache_local": "c 6", "push": "pushes", "target": "m", "lower": "mj",
         "upper": "mj", "b": "m", "d": "m", "step": "m", "compliance": "m", "impulse": "m", "mu": "blocks",
-        "patch_radius": "blocks",
+        "patch_radius": "blocks", "rolling": "rolling_blocks", "cache_roll": "rolling_contacts 3",
     },
     "index": {
         "head": "heads", "kind_of_shape": "n", "dyn": "n", "uneven": "n", "body_of": "nd", "joint_kind": "kj",
@@ -84,12 +84,12 @@ def offsets(const int32_t[::1] size):
 def views(const int32_t[::1] size, real, index, keys):
     """Array -> writable view of one of the buffers, in its shape; without scratch."""
     c, kj, mj = size[CAP_CONTACT], size[N_JOINT], size[N_JOINT_ROW]
-    rows = c * size[ROWS_PER_CONTACT]
+    rows, rolls = c * size[ROWS_PER_CONTACT], size[ROWS_PER_CONTACT] > 4
     known = {
         "n": size[N_BODY], "nd": size[N_DYNAMIC], "kj": kj, "mj": mj, "c": c, "p": size[CAP_PAIR],
         "nt": c if size[ROWS_PER_CONTACT] > 1 else 0, "m": mj + rows, "contact_rows": rows, "blocks": kj + c,
         "settings": N_SETTINGS, "heads": N_HEAD, "joint_reals": N_JOINT_REAL, "cache_reals": N_CACHE_IMPULSE,
-        "block_ends": kj + c + 1, "pushes": mj + c, "frames": size[N_FRAME], "excluded": size[N_EXCLUDED],
+        "block_ends": kj + c + 1, "pushes": mj + c, "rolling_blocks": (kj + c) * rolls, "rolling_contacts": c * rolls, "frames": size[N_FRAME], "excluded": size[N_EXCLUDED],
     }
     first = offsets(size)
     out = {}

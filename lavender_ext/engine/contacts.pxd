@@ -28,13 +28,13 @@ no key has claimed. A stale or false entry is left alone, or corrected by the sw
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t, uint64_t
 
-from lavender_ext.core.block cimport CONTACT, CONTACT_BOX, CONTACT_SPIN
+from lavender_ext.core.block cimport CONTACT, CONTACT_BOX, CONTACT_ROLLING, CONTACT_SPIN
 from lavender_ext.core.rows cimport (contact_diagonal, contact_slack, cross, dot3, largest_eigenvalue,
                                      reciprocal, relative_velocity, rows_t)
 from lavender_ext.engine.arrays cimport (ALTERNATING, AVBD, BOX, CAP_CONTACT, H_CACHED, H_CONTACTS, H_CONTACT_ROWS,
                                          H_FRICTION_SHAPE, H_MATCHES, H_ORDER, H_PAIRS, H_STEP, H_STEPPER, H_WARM_START,
-                                         N_CACHE_IMPULSE, N_JOINT, N_JOINT_ROW,
-                                         S_BETA, S_BOUNCE, S_H, S_MARGIN, S_MATCH, S_SLOP, engine_t)
+                                         N_CACHE_IMPULSE, N_JOINT, N_JOINT_ROW, ROWS_PER_CONTACT,
+                                         S_BETA, S_BOUNCE, S_H, S_MARGIN, S_MATCH, S_ROLLING, S_SLOP, engine_t)
 from lavender_ext.engine.bodies cimport to_body
 from lavender_ext.engine.narrow_phase cimport collide, manifold_t
 
@@ -112,7 +112,7 @@ cdef inline void match_pair(const engine_t* e, int32_t c, int32_t n, int32_t fir
             used |= 1 << (entry[j] - first)
 
 
-cdef inline void guess_contact(engine_t* e, int32_t c, int32_t entry, int32_t nt, int32_t spin,
+cdef inline void guess_contact(engine_t* e, int32_t c, int32_t entry, int32_t nt, int32_t turns,
                                double* lam) noexcept nogil:
     # The cached impulse in this contact's frame: friction is kept as a world vector.
     cdef double t2[3]
@@ -122,8 +122,11 @@ cdef inline void guess_contact(engine_t* e, int32_t c, int32_t entry, int32_t nt
         cross(e.normal + 3 * c, e.tangent + 3 * c, t2)
         lam[1] = dot3(p + 1, e.tangent + 3 * c)
         lam[2] = dot3(p + 1, t2)
-    if spin:
+    if turns & 1:
         lam[1 + nt] = p[4]
+    if turns & 2:
+        lam[nt + turns - 1] = dot3(e.cache_roll + 3 * entry, e.tangent + 3 * c)
+        lam[nt + turns] = dot3(e.cache_roll + 3 * entry, t2)
     if e.head[H_STEPPER] == AVBD:
         e.push[e.size[N_JOINT_ROW] + c] = p[4]
 
@@ -139,11 +142,11 @@ cdef inline double normal_velocity(const engine_t* e, int32_t a, int32_t b, int3
 
 cdef inline void make_contact(engine_t* e, const rows_t* r, int32_t c, int32_t row, int32_t a, int32_t b,
                               const manifold_t* m, int32_t at, const double* tangent, int32_t nt,
-                              int32_t spin) noexcept nogil:
-    """Row data of contact c, rows row .. row + nt + spin, of point `at` of the manifold, but for its target."""
-    cdef double t12
-    cdef double w[4]
-    cdef int32_t k, da = e.dyn[a], db = e.dyn[b]
+                              int32_t turns) noexcept nogil:
+    """Row data of contact c, rows row .. row + nt + turns, of point `at` of the manifold, but for its target."""
+    cdef double off[2]
+    cdef double w[6]
+    cdef int32_t k, roll = row + nt + turns - 1, da = e.dyn[a], db = e.dyn[b]
     cdef double* d = e.d + row
     e.contact_pair[2 * c] = a
     e.contact_pair[2 * c + 1] = b
@@ -171,31 +174,34 @@ cdef inline void make_contact(engine_t* e, const rows_t* r, int32_t c, int32_t r
         for k in range(3):
             e.tangent[3 * c + k] = tangent[k]
     # the common kind with its size as constants, so that a compiler unrolls it
-    if nt == 2 and not spin:
+    if nt == 2 and not turns:
         contact_diagonal(e.normal + 3 * c, e.tangent + 3 * c, e.arm_a + 3 * c, e.arm_b + 3 * c, 2, 0, da, db,
-                         e.inv_mass, e.inv_inertia, d, &t12, e.coupling + 5 * c,
+                         e.inv_mass, e.inv_inertia, d, off, e.coupling + 5 * c,
                          e.swing + 6 * (row - e.size[N_JOINT_ROW]))
         contact_slack(r, c, 2, 0, e.v_free, w)
     else:
-        contact_diagonal(e.normal + 3 * c, e.tangent + 3 * c, e.arm_a + 3 * c, e.arm_b + 3 * c, nt, spin,
-                         da, db, e.inv_mass, e.inv_inertia, d, &t12, e.coupling + 5 * c,
+        contact_diagonal(e.normal + 3 * c, e.tangent + 3 * c, e.arm_a + 3 * c, e.arm_b + 3 * c, nt, turns,
+                         da, db, e.inv_mass, e.inv_inertia, d, off, e.coupling + 5 * c,
                          e.swing + 6 * (row - e.size[N_JOINT_ROW]))
-        contact_slack(r, c, nt, spin, e.v_free, w)
-    for k in range(1 + nt + spin):
+        contact_slack(r, c, nt, turns, e.v_free, w)
+    for k in range(1 + nt + turns):
         d[k] += e.compliance[row + k]
     e.step[row] = reciprocal(d[0])
     if nt > 0 and e.head[H_FRICTION_SHAPE]:
-        e.coupling[5 * c + 2] = t12
+        e.coupling[5 * c + 2] = off[0]
         e.step[row + 1] = reciprocal(d[1])
         e.step[row + 2] = reciprocal(d[2])
     elif nt > 0:
-        e.step[row + 1] = reciprocal(largest_eigenvalue(d[1], t12, d[2]))
+        e.step[row + 1] = reciprocal(largest_eigenvalue(d[1], off[0], d[2]))
         e.step[row + 2] = e.step[row + 1]
         d[1] = 0.5 * (d[1] + d[2])
         d[2] = d[1]
-    if spin:
+    if turns & 1:
         e.step[row + 1 + nt] = reciprocal(d[1 + nt])
-    for k in range(1 + nt + spin):
+    if turns & 2:
+        e.step[roll] = e.step[roll + 1] = reciprocal(largest_eigenvalue(e.d[roll], off[1], e.d[roll + 1]))
+        e.d[roll] = e.d[roll + 1] = 0.5 * (e.d[roll] + e.d[roll + 1])
+    for k in range(1 + nt + turns):
         e.target[row + k] = 0.0
         e.b[row + k] = 0.0 - w[k]
 
@@ -225,7 +231,7 @@ cdef inline int32_t make_contacts(engine_t* e, const rows_t* r) noexcept nogil:
     cdef manifold_t m
     cdef double tangent[3]
     cdef int32_t entry[4]
-    cdef int32_t i, j, k, a, b, nt, spin, box, start, c = 0, row = e.size[N_JOINT_ROW], block
+    cdef int32_t i, j, k, a, b, nt, turns, box, start, c = 0, row = e.size[N_JOINT_ROW], block
     cdef int32_t matches = 0, last_first = backwards(e), cached = e.head[H_CACHED]
     cdef int32_t first = cached if last_first else 0
     cdef double mu, patch, bounce, margin = e.setting[S_MARGIN]
@@ -245,7 +251,7 @@ cdef inline int32_t make_contacts(engine_t* e, const rows_t* r) noexcept nogil:
         bounce = e.restitution[a] if e.restitution[a] > e.restitution[b] else e.restitution[b]
         patch = e.patch[a] if e.patch[a] < e.patch[b] else e.patch[b]
         nt = 2 if mu > 0.0 else 0
-        spin = 1 if mu > 0.0 and patch > 0.0 else 0
+        turns = 0 if not mu > 0.0 else (1 if patch > 0.0 else 0) + (2 if e.setting[S_ROLLING] > 0.0 else 0)
         if nt > 0:
             tangent_of(m.normal, tangent)
         pair = contact_key(a, b, 0)
@@ -256,16 +262,19 @@ cdef inline int32_t make_contacts(engine_t* e, const rows_t* r) noexcept nogil:
             first -= 1
         start = c
         for j in range(m.n):
-            make_contact(e, r, c, row, a, b, &m, m.n - 1 - j if last_first else j, tangent, nt, spin)
+            make_contact(e, r, c, row, a, b, &m, m.n - 1 - j if last_first else j, tangent, nt, turns)
             block = e.size[N_JOINT] + c
             box = nt > 0 and e.head[H_FRICTION_SHAPE]
-            e.kind[block] = CONTACT_BOX if box else CONTACT_SPIN if spin else CONTACT
+            e.kind[block] = (CONTACT_BOX if box else CONTACT_ROLLING if turns & 2 else CONTACT_SPIN if turns
+                             else CONTACT)
             e.mu[block] = mu
-            e.patch_radius[block] = 1.0 if box else patch if spin else 0.0
-            for k in range(1 + nt + spin):
+            e.patch_radius[block] = 1.0 if box else patch if turns & 1 else 0.0
+            if e.size[ROWS_PER_CONTACT] > 4:
+                e.rolling[block] = e.setting[S_ROLLING] if turns & 2 else 0.0
+            for k in range(1 + nt + turns):
                 e.impulse[row + k] = 0.0
             e.push[e.size[N_JOINT_ROW] + c] = 0.0
-            row += 1 + nt + spin
+            row += 1 + nt + turns
             c += 1
             e.ptr[block + 1] = row
         if e.head[H_WARM_START] and first < cached:
@@ -273,7 +282,7 @@ cdef inline int32_t make_contacts(engine_t* e, const rows_t* r) noexcept nogil:
             for j in range(m.n):
                 if entry[j] >= 0:
                     k = e.ptr[e.size[N_JOINT] + start + j]
-                    guess_contact(e, start + j, entry[j], nt, spin, e.impulse + k)
+                    guess_contact(e, start + j, entry[j], nt, turns, e.impulse + k)
                     matches += 1
         for j in range(start, c):
             aim_contact(e, j, e.ptr[e.size[N_JOINT] + j], a, b, bounce)
@@ -286,7 +295,7 @@ cdef inline int32_t make_contacts(engine_t* e, const rows_t* r) noexcept nogil:
 
 cdef inline void store_contacts(engine_t* e) noexcept nogil:
     """The cache of the next substep; kept up to date whether warm starting is on or not."""
-    cdef int32_t c, k, row, nt, at, n = e.head[H_CONTACTS], last_first = backwards(e)
+    cdef int32_t c, k, row, nt, at, size, n = e.head[H_CONTACTS], last_first = backwards(e)
     cdef double t2[3]
     cdef double* p
     for c in range(n):
@@ -303,7 +312,12 @@ cdef inline void store_contacts(engine_t* e) noexcept nogil:
         else:
             for k in range(3):
                 p[1 + k] = 0.0
-        p[4] = e.impulse[row + 3] if e.kind[e.size[N_JOINT] + c] == CONTACT_SPIN else 0.0
+        size = e.ptr[e.size[N_JOINT] + c + 1] - row
+        p[4] = e.impulse[row + 3] if size == 4 or size == 6 else 0.0
+        if e.size[ROWS_PER_CONTACT] > 4:
+            for k in range(3):
+                e.cache_roll[3 * at + k] = (e.impulse[row + size - 2] * e.tangent[3 * c + k]
+                                            + e.impulse[row + size - 1] * t2[k]) if size > 4 else 0.0
         if e.head[H_STEPPER] == AVBD:                   # which has no spin: the stiffness of the contact
             p[4] = e.push[e.size[N_JOINT_ROW] + c]
         for k in range(6):

@@ -20,7 +20,7 @@ from lavender_ext.core.block cimport ROW
 from lavender_ext.core.rows cimport cross, dot3, dot12, joint_velocity, minv_times, reciprocal
 from lavender_ext.engine.arrays cimport (BALL, DISTANCE, HINGE, H_WARM_START, J_ANCHOR_A, J_ANCHOR_B,
                                          J_AXIS_A, J_AXIS_B, J_DAMPING, J_HERTZ, J_LENGTH, J_SIDE_A, J_SPEED,
-                                         J_TORQUE, N_JOINT, N_JOINT_REAL, S_H, engine_t)
+                                         J_TORQUE, N_JOINT, N_JOINT_REAL, ROWS_PER_CONTACT, S_H, engine_t)
 from lavender_ext.engine.bodies cimport to_world
 
 
@@ -136,6 +136,8 @@ cdef inline void make_joints(engine_t* e) noexcept nogil:
         e.kind[i] = ROW
         e.mu[i] = 0.0
         e.patch_radius[i] = 0.0
+        if e.size[ROWS_PER_CONTACT] > 4:
+            e.rolling[i] = 0.0
         for row in range(e.ptr[i], e.ptr[i + 1]):
             minv_times(e.jac + 12 * row, e.inv_mass, e.inv_inertia, a, b, e.minv_jac + 12 * row)
             d = dot12(e.jac + 12 * row, e.minv_jac + 12 * row)

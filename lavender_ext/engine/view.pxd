@@ -15,6 +15,7 @@ cdef inline void view(const engine_t* e, blocks_t* p, rows_t* r) noexcept nogil:
     p.upper = e.upper
     p.mu = e.mu
     p.patch_radius = e.patch_radius
+    p.rolling = e.rolling
     p.b = e.b
     p.d = e.d
     p.nu = e.d

@@ -14,7 +14,7 @@ limit is the problem given. It begins the larger the further steps lead astray: 
 under the cone law, 3e-2 d under Coulomb's (docs/auto.md).
 
 Coulomb's law has no such function. Newton's method goes on from the convex relaxation's answer with the derivative
-that lacks symmetry, as long as |G| falls; where it does not, normals are lowered by phi = mu |w_t| + mu r |w_s| (3)
+that lacks symmetry, as long as |G| falls; where it does not, normals are lowered by phi = mu |w_t| + mu r |w_s| + mu_r |w_r| (3)
 and the convex problem is solved again (De Saxce, Feng 1998; Cadoux 2009).
 
 The test of the end is the judge's, on lambda itself: w = Y (Y^T lambda) - b + theta lambda, error e of every block.
@@ -23,7 +23,7 @@ N is kept between steps; where few blocks have changed their V only those change
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.block cimport CONE, COULOMB, ROW, ends_apart, n_tangents
+from lavender_ext.core.block cimport CONE, CONTACT_ROLLING, COULOMB, ROW, n_tangents, n_ends
 from lavender_ext.core.generalized cimport dot
 from lavender_ext.core.problem cimport Data
 from lavender_ext.generalized.flow cimport (blank, block_end, block_from, flow_t, gather, measure, renew, respond_all,
@@ -159,6 +159,17 @@ cdef inline void follow(const flow_t* f, int32_t island) noexcept nogil:
     keep(f, island, f.lam, f.center)
 
 
+cdef inline void one_theta(double* theta, int32_t first, int32_t end) noexcept nogil:
+    # the largest of rows [first, end) on all of them
+    cdef double big = 0.0
+    cdef int32_t k
+    for k in range(first, end):
+        if theta[k] > big:
+            big = theta[k]
+    for k in range(first, end):
+        theta[k] = big
+
+
 cdef inline void soften(const flow_t* f, int32_t island, double share) noexcept nogil:
     """theta' of (2): rho is `share` d on rows with less than 1e-6 d of their own, 1e-3 d in contacts.
 
@@ -170,7 +181,7 @@ cdef inline void soften(const flow_t* f, int32_t island, double share) noexcept 
     cdef double* theta = f.theta
     cdef double* rho = f.rho
     cdef double* soft = f.soft
-    cdef double big, x, low
+    cdef double x, low
     for a in range(f.iptr[island], f.iptr[island + 1]):
         last = block_end(f, a)
         for i in range(block_from(f, a), last):
@@ -186,12 +197,9 @@ cdef inline void soften(const flow_t* f, int32_t island, double share) noexcept 
                 theta[k] = x
             nt = 0 if f.p.kind[i] == ROW else n_tangents(f.p.kind[i], end - j)
             if nt > 1:
-                big = 0.0
-                for k in range(j + 1, j + 1 + nt):
-                    if theta[k] > big:
-                        big = theta[k]
-                for k in range(j + 1, j + 1 + nt):
-                    theta[k] = big
+                one_theta(theta, j + 1, j + 1 + nt)
+            if f.p.kind[i] == CONTACT_ROLLING:
+                one_theta(theta, end - 2, end)
             for k in range(j, end):
                 rho[k] = theta[k] - compliance[k]
                 soft[k] = 1.0 / theta[k]
@@ -350,8 +358,10 @@ cdef inline double slip(const flow_t* f, int32_t i) noexcept nogil:
     """phi of (3) from w of block i, whose normal it leaves out."""
     cdef int32_t j = f.p.ptr[i], end = f.p.ptr[i + 1], nt = n_tangents(f.p.kind[i], end - j)
     cdef double out = f.p.mu[i] * size_of(f.w + j + 1, nt)
-    if ends_apart(f.p.kind[i]):
-        out += f.p.mu[i] * f.p.patch_radius[i] * fabs(f.w[end - 1])
+    if n_ends(f.p.kind[i], end - j) & 1:
+        out += f.p.mu[i] * f.p.patch_radius[i] * fabs(f.w[j + 1 + nt])
+    if f.p.kind[i] == CONTACT_ROLLING:
+        out += f.p.rolling[i] * size_of(f.w + end - 2, 2)
     return out
 
 

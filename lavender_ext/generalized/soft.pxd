@@ -9,10 +9,13 @@ With theta > 0 [1/kg] on every row and s = J (v - v*) - b [m/s], shifted, a bloc
     V          -d lambda / d s, of the block's rows
 
 theta is equal on all tangents of a disk, which makes (1) a closed form: y = sqrt(theta) z, and s as in
-`core/block.pxd`, (7). Tangents may be one to five (a round cone); a cylinder has a spin row beside its disk.
+`core/block.pxd`, (7). Tangents may be one to five (a round cone); a cylinder has a spin row beside its disk;
+what rolls has a disk of its own (`local/rolling.pxd`).
 """
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t
+
+from lavender_ext.local.rolling cimport rolling_map
 
 
 cdef enum:
@@ -153,3 +156,24 @@ cdef inline int32_t coulomb_map(int32_t nt, int32_t spin, const double* theta, d
         elif v != NULL:
             v[j * n + j] = 1.0 / theta[j]
     return zone
+
+
+cdef inline void rolling_response(int32_t law, int32_t n, const double* theta, double mu, double radius, double rolling,
+                                  double* lam, double* v) noexcept nogil:
+    """(1) or (2) of one contact that resists rolling, n rows."""
+    cdef double a[3]
+    cdef double y[6]
+    cdef double out[6]
+    cdef double root[6]
+    cdef int32_t i, j
+    for i in range(n):
+        root[i] = sqrt(theta[i])
+        y[i] = root[i] * lam[i]
+    a[0] = mu * root[1] / root[0]
+    a[1] = mu * radius * root[3] / root[0] if n == 6 else 0.0
+    a[2] = rolling * root[n - 2] / root[0]
+    rolling_map(law, n, a, y, y[0] if y[0] > 0.0 else 0.0, out, v)
+    for i in range(n):
+        lam[i] = lam[i] if out[i] == y[i] else out[i] / root[i]
+        for j in range(n):
+            v[i * n + j] = v[i * n + j] / (root[i] * root[j])

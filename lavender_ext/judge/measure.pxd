@@ -9,7 +9,7 @@ core/velocity.pxd forms M^-1 J^T lam, and a second loop reads J v.
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.block cimport (CONTACT_BOX, CONTACT_SPIN, ROW, block_error, blocks_t, contact_error, n_directions,
+from lavender_ext.core.block cimport (CONTACT_BOX, ROW, block_error, blocks_t, contact_error, mu_r, n_directions, n_turns,
                                       row_error)
 from lavender_ext.core.csr cimport csr_abs_dot, csr_dot, csr_dot_size, csr_t
 from lavender_ext.core.generalized cimport (generalized_t, jac_push, jac_row, panel_push_size, panel_size,
@@ -116,8 +116,8 @@ cdef inline double abs_cross(const double* x, const double* y, int32_t k) noexce
 
 
 cdef inline void side_wrench_size(const double* n, const double* t1, const double* t2, const double* arm, int32_t nt,
-                                  int32_t spin, double x, double y, double z, double u, double* out) noexcept nogil:
-    # x, y, z, u: |lam| of normal, tangents and spin.
+                                  int32_t turns, double x, double y, double z, const double* turn, double* out) noexcept nogil:
+    # x, y, z: |lam| of normal and tangents; turn (turns): of spin and of what rolls.
     cdef int32_t k
     cdef double s, l
     for k in range(3):
@@ -129,17 +129,19 @@ cdef inline void side_wrench_size(const double* n, const double* t1, const doubl
         if nt > 1:
             s += fabs(t2[k]) * z
             l += abs_cross(arm, t2, k) * z
-        if spin:
-            l += fabs(n[k]) * u
+        if turns & 1:
+            l += fabs(n[k]) * fabs(turn[0])
+        if turns & 2:
+            l += fabs(t1[k]) * fabs(turn[turns & 1]) + fabs(t2[k]) * fabs(turn[1 + (turns & 1)])
         out[k] += s
         out[3 + k] += l
 
 
-cdef inline void contact_wrench_size(const rows_t* r, int32_t c, int32_t nt, int32_t spin, const double* lam,
+cdef inline void contact_wrench_size(const rows_t* r, int32_t c, int32_t nt, int32_t turns, const double* lam,
                                      double* size) noexcept nogil:
     # |J|^T |lam| of one contact.
     cdef double t2[3]
-    cdef double y = 0.0, z = 0.0, u = 0.0
+    cdef double y = 0.0, z = 0.0
     cdef const double* n = r.normal + 3 * c
     cdef const double* t1 = r.tangent + 3 * c
     cdef int32_t a = r.contact_body[2 * c], b = r.contact_body[2 * c + 1]
@@ -148,17 +150,15 @@ cdef inline void contact_wrench_size(const rows_t* r, int32_t c, int32_t nt, int
     if nt > 1:
         z = fabs(lam[2])
         cross(n, t1, t2)
-    if spin:
-        u = fabs(lam[1 + nt])
     if a >= 0:
-        side_wrench_size(n, t1, t2, r.arm_a + 3 * c, nt, spin, fabs(lam[0]), y, z, u, size + 6 * a)
+        side_wrench_size(n, t1, t2, r.arm_a + 3 * c, nt, turns, fabs(lam[0]), y, z, lam + 1 + nt, size + 6 * a)
     if b >= 0:
-        side_wrench_size(n, t1, t2, r.arm_b + 3 * c, nt, spin, fabs(lam[0]), y, z, u, size + 6 * b)
+        side_wrench_size(n, t1, t2, r.arm_b + 3 * c, nt, turns, fabs(lam[0]), y, z, lam + 1 + nt, size + 6 * b)
 
 
 cdef inline void velocity_size(const blocks_t* p, const rows_t* r, const double* lam, double* size) noexcept nogil:
     """|M^-1| |J|^T |lam|, (n, 6)."""
-    cdef int32_t i, j, c, k, nt
+    cdef int32_t i, j, c, k, nt, turns
     cdef double* x
     cdef const double* inv
     cdef double t[3]
@@ -170,8 +170,9 @@ cdef inline void velocity_size(const blocks_t* p, const rows_t* r, const double*
         i = r.n_joints + c
         j = p.ptr[i]
         nt = n_directions(p.kind[i], p.ptr[i + 1] - j)
-        if p.kind[i] == CONTACT_SPIN or nt == 1:        # the two common kinds with their sizes as constants
-            contact_wrench_size(r, c, nt, p.kind[i] == CONTACT_SPIN, lam + j, size)
+        turns = n_turns(p.kind[i], p.ptr[i + 1] - j)
+        if turns or nt == 1:                            # the two common kinds with their sizes as constants
+            contact_wrench_size(r, c, nt, turns, lam + j, size)
         elif nt == 2:
             contact_wrench_size(r, c, 2, 0, lam + j, size)
         else:
@@ -214,7 +215,7 @@ cdef inline double side_size(const double* axis, const double* arm, const double
     return s + t
 
 
-cdef inline void contact_sizes(const rows_t* r, int32_t c, int32_t nt, int32_t spin, const double* size,
+cdef inline void contact_sizes(const rows_t* r, int32_t c, int32_t nt, int32_t turns, const double* size,
                                double* out) noexcept nogil:
     # |J| size of the rows of one contact
     cdef double t2[3]
@@ -222,10 +223,10 @@ cdef inline void contact_sizes(const rows_t* r, int32_t c, int32_t nt, int32_t s
     cdef const double* t1 = r.tangent + 3 * c
     cdef const double* arm
     cdef const double* x
-    cdef int32_t k, side, body
+    cdef int32_t k, side, body, roll = 1 + nt + (turns & 1)
     if nt > 1:
         cross(n, t1, t2)
-    for k in range(1 + nt + spin):
+    for k in range(1 + nt + turns):
         out[k] = 0.0
     for side in range(2):
         body = r.contact_body[2 * c + side]
@@ -238,30 +239,35 @@ cdef inline void contact_sizes(const rows_t* r, int32_t c, int32_t nt, int32_t s
             out[1] += side_size(t1, arm, x)
         if nt > 1:
             out[2] += side_size(t2, arm, x)
-        if spin:
+        if turns & 1:
             for k in range(3):
                 out[1 + nt] += fabs(n[k]) * x[3 + k]
+        if turns & 2:
+            for k in range(3):
+                out[roll] += fabs(t1[k]) * x[3 + k]
+                out[roll + 1] += fabs(t2[k]) * x[3 + k]
 
 
-cdef inline void judge_contact(const blocks_t* p, const rows_t* r, int32_t c, int32_t j, int32_t nt, int32_t spin,
+cdef inline void judge_contact(const blocks_t* p, const rows_t* r, int32_t c, int32_t j, int32_t nt, int32_t turns,
                                bint box, const double* lam, double* w, double* e, const double* v,
                                tally_t* s) noexcept nogil:
-    cdef int32_t k, i = r.n_joints + c, together = 1 if box else nt, apart = 1 if box else spin
-    cdef double size[4]
-    contact_slack(r, c, nt, spin, v, w + j)
-    for k in range(j, j + 1 + nt + spin):
+    cdef int32_t k, i = r.n_joints + c, together = 1 if box else nt, ends = 1 if box else turns
+    cdef double size[6]
+    contact_slack(r, c, nt, turns, v, w + j)
+    for k in range(j, j + 1 + nt + turns):
         w[k] += r.compliance[k] * lam[k] - p.b[k]
-    contact_error(p.law, lam + j, w + j, p.d + j, p.mu[i], p.patch_radius[i], together, apart, e + j)
-    tally_contact(p, j, together, apart, e, s)
-    contact_sizes(r, c, nt, spin, v + 6 * <ssize_t>r.n_bodies, size)
-    for k in range(1 + nt + spin):
+    contact_error(p.law, lam + j, w + j, p.d + j, p.mu[i], p.patch_radius[i], mu_r(p, i), together, ends,
+                  e + j)
+    tally_contact(p, j, together, ends, e, s)
+    contact_sizes(r, c, nt, turns, v + 6 * <ssize_t>r.n_bodies, size)
+    for k in range(1 + nt + turns):
         tally_floor(p, j + k, r.compliance[j + k] * fabs(lam[j + k]) + size[k], s)
 
 
 cdef inline tally_t rows_pass(const blocks_t* p, const rows_t* r, const double* lam, double* w, double* e,
                               const double* v) noexcept nogil:
     # With the floor; without it two loops are the quicker ones.
-    cdef int32_t i, j, c, a, b, nt
+    cdef int32_t i, j, c, a, b, nt, turns
     cdef tally_t s = nothing()
     cdef const double* size = v + 6 * <ssize_t>r.n_bodies
     for i in range(r.n_joints):
@@ -276,8 +282,9 @@ cdef inline tally_t rows_pass(const blocks_t* p, const rows_t* r, const double* 
         i = r.n_joints + c
         j = p.ptr[i]
         nt = n_directions(p.kind[i], p.ptr[i + 1] - j)
-        if p.kind[i] == CONTACT_SPIN or nt == 1:
-            judge_contact(p, r, c, j, nt, p.kind[i] == CONTACT_SPIN, False, lam, w, e, v, &s)
+        turns = n_turns(p.kind[i], p.ptr[i + 1] - j)
+        if turns or nt == 1:
+            judge_contact(p, r, c, j, nt, turns, False, lam, w, e, v, &s)
         elif p.kind[i] == CONTACT_BOX:
             judge_contact(p, r, c, j, 2, 0, True, lam, w, e, v, &s)
         elif nt == 2:
@@ -290,7 +297,7 @@ cdef inline tally_t rows_pass(const blocks_t* p, const rows_t* r, const double* 
 cdef inline void rows_judge(const blocks_t* p, const rows_t* r, const double* lam, double* w, double* e, double* v,
                             bint floor, score_t* out) noexcept nogil:
     cdef int32_t i, j, c, k, nt
-    cdef double size[4]
+    cdef double size[6]
     cdef double* sizes = v + 6 * <ssize_t>r.n_bodies
     cdef tally_t s
     cdef sum_t total = sum_t(0.0, 0.0)
@@ -316,7 +323,7 @@ cdef inline void rows_judge(const blocks_t* p, const rows_t* r, const double* la
                           + joint_size(r.jac + 12 * k, sizes, r.joint_body[2 * i], r.joint_body[2 * i + 1]), &total, &big)
             continue
         nt = n_directions(p.kind[i], p.ptr[i + 1] - j)
-        contact_sizes(r, c, nt, p.kind[i] == CONTACT_SPIN, sizes, size)
+        contact_sizes(r, c, nt, n_turns(p.kind[i], p.ptr[i + 1] - j), sizes, size)
         for k in range(p.ptr[i + 1] - j):
             add_floor(p, j + k, r.compliance[j + k] * fabs(lam[j + k]) + size[k], &total, &big)
     out.floor_energy = root(&total)

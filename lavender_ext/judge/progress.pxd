@@ -13,7 +13,7 @@ to its bound, and falls behind that. In a cycle no row keeps its way, and infeas
 from libc.math cimport fabs
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.block cimport ROW, blocks_t, ends_apart, n_tangents, norm2
+from lavender_ext.core.block cimport CONTACT_ROLLING, ROW, blocks_t, n_tangents, n_ends, norm2
 
 
 cdef enum:
@@ -101,11 +101,23 @@ cdef inline bint meets(double gap, double closing, double most) noexcept nogil:
     return gap > 0.0 and closing > 0.0 and gap <= most * closing
 
 
+cdef inline bint meets_disk(const progress_t* s, const double* lam, int32_t now, int32_t first, int32_t end, double slope,
+                            double normal, double rate, double most) noexcept nogil:
+    # rows first to end, whose norm is at most slope times the normal
+    cdef double size = 0.0, along = 0.0, v = 0.0
+    cdef int32_t k
+    for k in range(first, end):
+        size = norm2(size, lam[k])
+        along += lam[k] * speed(s, lam, now, k)
+        v = norm2(v, speed(s, lam, now, k))
+    return meets(slope * normal - size, (along / size if size > 0.0 else v) - slope * rate, most)
+
+
 cdef inline bint meets_bound(const progress_t* s, const blocks_t* p, const double* lam, int32_t now,
                              double most) noexcept nogil:
     """(2): whether a row does within `most` sweeps."""
-    cdef int32_t i, j, k, nt
-    cdef double v, rate, size, along
+    cdef int32_t i, j, k, nt, end
+    cdef double v, rate, along
     if not now > s.last_at > s.before_at >= 0:
         return False
     for i in range(p.n_blocks):
@@ -121,15 +133,13 @@ cdef inline bint meets_bound(const progress_t* s, const blocks_t* p, const doubl
         rate = speed(s, lam, now, j)
         if meets(lam[j], -rate, most):
             return True
-        nt = n_tangents(p.kind[i], p.ptr[i + 1] - j)
-        size = along = v = 0.0
-        for k in range(j + 1, j + 1 + nt):
-            size = norm2(size, lam[k])
-            along += lam[k] * speed(s, lam, now, k)
-            v = norm2(v, speed(s, lam, now, k))
-        if meets(p.mu[i] * lam[j] - size, (along / size if size > 0.0 else v) - p.mu[i] * rate, most):
+        end = p.ptr[i + 1]
+        nt = n_tangents(p.kind[i], end - j)
+        if meets_disk(s, lam, now, j + 1, j + 1 + nt, p.mu[i], lam[j], rate, most):
             return True
-        if ends_apart(p.kind[i]):
+        if p.kind[i] == CONTACT_ROLLING and meets_disk(s, lam, now, end - 2, end, p.rolling[i], lam[j], rate, most):
+            return True
+        if n_ends(p.kind[i], end - j) & 1:
             k = j + 1 + nt
             v = speed(s, lam, now, k)
             along = p.mu[i] * p.patch_radius[i]

@@ -10,8 +10,8 @@ from here.
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.block cimport (ROUND, ROW, block_error, blocks_t, ends_apart, is_pair, n_tangents,
-                                      norm2)
+from lavender_ext.core.block cimport (ROUND, ROW, block_error, blocks_t, is_pair, n_tangents, n_ends, norm2,
+                                      roll_at)
 
 
 cdef struct score_t:
@@ -97,7 +97,17 @@ cdef inline void tally_row(const blocks_t* p, int32_t k, double e, tally_t* s) n
         s.worst = k
 
 
-cdef inline void tally_contact(const blocks_t* p, int32_t j, int32_t nt, int32_t spin, const double* e,
+cdef inline void tally_pair(const blocks_t* p, int32_t k, const double* e, tally_t* s) noexcept nogil:
+    # Rows k, k + 1, by the norm of the two in the maximum.
+    cdef double x = p.d[k] * e[k], y = p.d[k] * e[k + 1]
+    s.energy += x * e[k] + y * e[k + 1]
+    x = x * (p.nu[k] * e[k]) + y * (p.nu[k] * e[k + 1])
+    if x > s.fast:
+        s.fast = x
+        s.worst = k
+
+
+cdef inline void tally_contact(const blocks_t* p, int32_t j, int32_t nt, int32_t turns, const double* e,
                                tally_t* s) noexcept nogil:
     # A pair of tangents counts once in the maximum, by its norm.
     cdef double x, y
@@ -112,18 +122,10 @@ cdef inline void tally_contact(const blocks_t* p, int32_t j, int32_t nt, int32_t
         if x > s.fast:
             s.fast = x
             s.worst = j + 1
-    if spin:
+    if turns & 1:
         tally_row(p, j + 1 + nt, e[j + 1 + nt], s)
-
-
-cdef inline void tally_pair(const blocks_t* p, int32_t k, const double* e, tally_t* s) noexcept nogil:
-    # Rows k, k + 1, by the norm of the two in the maximum.
-    cdef double x = p.d[k] * e[k], y = p.d[k] * e[k + 1]
-    s.energy += x * e[k] + y * e[k + 1]
-    x = x * (p.nu[k] * e[k]) + y * (p.nu[k] * e[k + 1])
-    if x > s.fast:
-        s.fast = x
-        s.worst = k
+    if turns & 2:
+        tally_pair(p, j + 1 + nt + (turns & 1), e, s)
 
 
 cdef inline void tally_round(const blocks_t* p, int32_t j, int32_t nt, const double* e, tally_t* s) noexcept nogil:
@@ -144,7 +146,7 @@ cdef inline void tally_block(const blocks_t* p, int32_t i, const double* e, tall
     elif p.kind[i] == ROUND:
         tally_round(p, j, n_tangents(p.kind[i], end - j), e, s)
     else:
-        tally_contact(p, j, n_tangents(p.kind[i], end - j), ends_apart(p.kind[i]), e, s)
+        tally_contact(p, j, n_tangents(p.kind[i], end - j), n_ends(p.kind[i], end - j), e, s)
 
 
 cdef inline void tally_floor(const blocks_t* p, int32_t k, double size, tally_t* s) noexcept nogil:
@@ -162,7 +164,7 @@ cdef inline int32_t is_plain(double energy, double fast) noexcept nogil:
 
 cdef inline void score_from(const blocks_t* p, const double* e, const tally_t* s, score_t* out) noexcept nogil:
     """The two sums over e (m); the floor entries are left alone."""
-    cdef int32_t i, j, k, nt
+    cdef int32_t i, j, k, nt, roll
     cdef double v, big = -1.0
     cdef sum_t total = sum_t(0.0, 0.0)
     out.worst = s.worst
@@ -175,11 +177,12 @@ cdef inline void score_from(const blocks_t* p, const double* e, const tally_t* s
     for i in range(p.n_blocks):
         j = p.ptr[i]
         nt = 0 if p.kind[i] == ROW else n_tangents(p.kind[i], p.ptr[i + 1] - j)
+        roll = roll_at(p.kind[i], p.ptr[i + 1] - j)
         for k in range(j, p.ptr[i + 1]):
             add_square(&total, sqrt(p.d[k]) * e[k])
-            if is_pair(nt, k - j - 1):
+            if is_pair(nt, roll, k - j - 1):
                 continue                                # the pair counts once, below
-            v = norm2(e[k], e[k + 1]) if is_pair(nt, k - j) else fabs(e[k])
+            v = norm2(e[k], e[k + 1]) if is_pair(nt, roll, k - j) else fabs(e[k])
             v = sqrt(p.nu[k]) * sqrt(p.d[k]) * v
             if v > big:
                 big = v
@@ -206,16 +209,17 @@ cdef inline void score_rows(const blocks_t* p, const double* lam, const double* 
 
 cdef inline void norms_of_rhs(const blocks_t* p, double* energy, double* velocity) noexcept nogil:
     """sqrt(sum b^2 / d) and max |b| sqrt(nu / d), the pair's norm on tangents."""
-    cdef int32_t i, j, k, nt
+    cdef int32_t i, j, k, nt, roll
     cdef double x, t, sum_ = 0.0, fast = 0.0, big = 0.0
     cdef sum_t total = sum_t(0.0, 0.0)
     for i in range(p.n_blocks):
         j = p.ptr[i]
         nt = 0 if p.kind[i] == ROW else n_tangents(p.kind[i], p.ptr[i + 1] - j)
+        roll = roll_at(p.kind[i], p.ptr[i + 1] - j)
         for k in range(j, p.ptr[i + 1]):
             t = (p.b[k] / p.d[k]) * p.b[k]
             sum_ += t
-            if is_pair(nt, k - j):
+            if is_pair(nt, roll, k - j):
                 t += (p.b[k + 1] / p.d[k + 1]) * p.b[k + 1]
             t = t * p.nu[k]
             if t > fast:
@@ -227,10 +231,11 @@ cdef inline void norms_of_rhs(const blocks_t* p, double* energy, double* velocit
     for i in range(p.n_blocks):                         # scaled: 1e-200 does not vanish
         j = p.ptr[i]
         nt = 0 if p.kind[i] == ROW else n_tangents(p.kind[i], p.ptr[i + 1] - j)
+        roll = roll_at(p.kind[i], p.ptr[i + 1] - j)
         for k in range(j, p.ptr[i + 1]):
             x = p.b[k] / sqrt(p.d[k])
             add_square(&total, x)
-            if is_pair(nt, k - j):
+            if is_pair(nt, roll, k - j):
                 x = norm2(x, p.b[k + 1] / sqrt(p.d[k + 1]))
             x = fabs(x) * sqrt(p.nu[k])
             if x > big:

@@ -5,14 +5,15 @@ local/coulomb.pxd or local/cone.pxd.
 
 Spin: either w_s = 0, and lam_s is eliminated; or lam_s = +-mu r lam_n, and its column (cone: and row) is
 added to the normal's. Three problems without spin; the one whose answer keeps the bound is the answer.
+Rolling: local/rolling.pxd.
 
 Several rows: boxed complementarity by principal pivoting.
 """
 from libc.math cimport fabs
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.block cimport (CONE, ROUND, clip, cone_error, ends_apart, relax_normal, relax_row,
-                                      relax_tangents, round_error)
+from lavender_ext.core.block cimport (CONE, ROUND, clip, cone_error, n_ends, relax_normal, relax_row, relax_tangents,
+                                      round_error)
 from lavender_ext.local.cone cimport cone2, cone3
 from lavender_ext.local.coulomb cimport PREPARED, coulomb2, coulomb3, prepare3
 from lavender_ext.local.small cimport FAILED, MAX_ROWS, OPEN, STICK, eliminate
@@ -99,11 +100,11 @@ cdef inline void local_slack(int32_t m, const double* W, const double* q, const 
             w[i] += W[m * i + j] * lam[j]
 
 
-cdef inline void project_locally(int32_t law, int32_t nt, int32_t kind, const double* W, const double* q,
+cdef inline void project_locally(int32_t law, int32_t nt, int32_t kind, int32_t m, const double* W, const double* q,
                                  const double* d, const double* step, double mu, double patch_radius,
-                                 double* lam) noexcept nogil:
+                                 double rolling, double* lam) noexcept nogil:
     """Where no exact answer is found: the update of core/block.pxd (cone: projected gradient) on the block alone."""
-    cdef int32_t spin = ends_apart(kind), m = 1 + nt + spin, _sweep, i
+    cdef int32_t turns = n_ends(kind, m), roll = m - 2, _sweep, i
     cdef double w[MAX_ROWS]
     cdef double e[MAX_ROWS]
     cdef double high[MAX_ROWS]
@@ -119,7 +120,7 @@ cdef inline void project_locally(int32_t law, int32_t nt, int32_t kind, const do
             if kind == ROUND:
                 round_error(lam, w, high, mu, nt, e)
             else:
-                cone_error(lam, w, high, mu, patch_radius, nt, spin, e)
+                cone_error(lam, w, high, mu, patch_radius, rolling, nt, turns, e)
             for i in range(m):
                 lam[i] -= e[i]
                 change += fabs(e[i])
@@ -130,9 +131,13 @@ cdef inline void project_locally(int32_t law, int32_t nt, int32_t kind, const do
             if nt > 0:
                 local_slack(m, W, q, lam, w)
                 relax_tangents(lam + 1, w + 1, step[1], bound, nt)
-            if spin:
+            if turns & 1:
+                i = 1 + nt
                 local_slack(m, W, q, lam, w)
-                lam[m - 1] = relax_row(lam[m - 1], w[m - 1], step[m - 1], -bound * patch_radius, bound * patch_radius)
+                lam[i] = relax_row(lam[i], w[i], step[i], -bound * patch_radius, bound * patch_radius)
+            if turns & 2:
+                local_slack(m, W, q, lam, w)
+                relax_tangents(lam + roll, w + roll, step[roll], rolling * lam[0], 2)
             for i in range(m):
                 change += fabs(lam[i] - e[i])
         if not change > 1e-12 * fabs(lam[0]):

@@ -11,8 +11,8 @@ Prepared numbers of block i stand from g[start[i]] on:
 """
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.block cimport (CONE, CONTACT, CONTACT_BOX, CONTACT_SPIN, ROUND, ROW, blocks_t, ends_apart,
-                                      n_tangents, relax_normal, relax_row)
+from lavender_ext.core.block cimport (CONE, CONTACT, CONTACT_BOX, CONTACT_ROLLING, CONTACT_SPIN, ROUND, ROW, blocks_t,
+                                      ends_apart, mu_r, n_directions, n_tangents, n_turns, relax_normal, relax_row)
 from lavender_ext.core.csr cimport csr_dot, csr_t
 from lavender_ext.core.generalized cimport generalized_t, whitened_dot, whitened_push
 from lavender_ext.core.rows cimport (cross, dot3, joint_push, joint_velocity, push_bodies, relative_velocity,
@@ -21,6 +21,7 @@ from lavender_ext.local.box cimport box3_from
 from lavender_ext.local.cone cimport cone3
 from lavender_ext.local.coulomb cimport PREPARED, coulomb3_from, prepare3
 from lavender_ext.local.exact cimport boxed_rows, contact_with_spin, contact_without_spin, project_locally
+from lavender_ext.local.rolling cimport rolling_contact
 from lavender_ext.local.round cimport prepare_round, round_contact
 from lavender_ext.local.small cimport FAILED, MAX_ROWS, eliminate
 
@@ -129,6 +130,8 @@ cdef inline int32_t solve_block(const blocks_t* p, int32_t i, const double* g, c
         q[k] = s
     if kind == ROUND:
         found = round_contact(n, g, q, p.d + j, p.mu[i], lam)
+    elif kind == CONTACT_ROLLING:
+        found = rolling_contact(p.law, n, g, q, p.d + j, p.mu[i], p.patch_radius[i], p.rolling[i], lam)
     elif ends_apart(kind):
         found = contact_with_spin(p.law, nt, g, q, p.mu[i], p.patch_radius[i], lam)
     elif n < 3:
@@ -136,7 +139,7 @@ cdef inline int32_t solve_block(const blocks_t* p, int32_t i, const double* g, c
     elif p.law == CONE:
         found = cone3(g, q, p.mu[i], lam) if g[9] > 0.0 or q[0] >= 0.0 else FAILED
     if found == FAILED:
-        project_locally(p.law, nt, kind, g, q, p.d + j, p.step + j, p.mu[i], p.patch_radius[i], lam)
+        project_locally(p.law, nt, kind, n, g, q, p.d + j, p.step + j, p.mu[i], p.patch_radius[i], mu_r(p, i), lam)
         return 1
     return 0
 
@@ -248,7 +251,7 @@ cdef inline int32_t solve_sliding_contact(const blocks_t* p, const rows_t* r, in
 
 cdef inline int32_t solve_rows_block(const blocks_t* p, const rows_t* r, int32_t i, const double* g, double* lam,
                                      double* v) noexcept nogil:
-    cdef int32_t j = p.ptr[i], n = p.ptr[i + 1] - j, c = i - r.n_joints, k, a, b, nt, spin, found
+    cdef int32_t j = p.ptr[i], n = p.ptr[i + 1] - j, c = i - r.n_joints, k, a, b, nt, turns, roll, found
     cdef double w[MAX_ROWS]
     cdef double old[MAX_ROWS]
     cdef double u[3]
@@ -276,8 +279,9 @@ cdef inline int32_t solve_rows_block(const blocks_t* p, const rows_t* r, int32_t
         return found
     a = r.contact_body[2 * c]
     b = r.contact_body[2 * c + 1]
-    spin = p.kind[i] == CONTACT_SPIN
-    nt = n - 1 - spin
+    turns = n_turns(p.kind[i], n)
+    nt = n_directions(p.kind[i], n)
+    roll = 1 + nt + (turns & 1)
     normal = r.normal + 3 * c
     t1 = r.tangent + 3 * c
     relative_velocity(v, a, b, r.arm_a + 3 * c, r.arm_b + 3 * c, u, omega)
@@ -287,8 +291,11 @@ cdef inline int32_t solve_rows_block(const blocks_t* p, const rows_t* r, int32_t
     if nt > 1:
         cross(normal, t1, t2)
         w[2] = dot3(t2, u)
-    if spin:
+    if turns & 1:
         w[1 + nt] = dot3(normal, omega)
+    if turns & 2:
+        w[roll] = dot3(t1, omega)
+        w[roll + 1] = dot3(t2, omega)
     for k in range(n):
         w[k] += r.compliance[j + k] * lam[j + k] - p.b[j + k]
         old[k] = lam[j + k]
@@ -304,8 +311,11 @@ cdef inline int32_t solve_rows_block(const blocks_t* p, const rows_t* r, int32_t
     if nt > 1:
         for k in range(3):
             impulse[k] += w[2] * t2[k]
-    if spin:
+    if turns & 1:
         for k in range(3):
             twist[k] = w[1 + nt] * normal[k]
+    if turns & 2:
+        for k in range(3):
+            twist[k] += w[roll] * t1[k] + w[roll + 1] * t2[k]
     push_bodies(v, a, b, r.inv_mass, r.inv_inertia, r.arm_a + 3 * c, r.arm_b + 3 * c, impulse, twist)
     return found

@@ -8,7 +8,7 @@ from libc.stdint cimport int32_t, uint64_t
 
 import numpy as np
 
-from lavender_ext.core.block cimport CONTACT_SPIN, blocks_t, n_directions
+from lavender_ext.core.block cimport blocks_t, n_directions, n_turns
 from lavender_ext.core.csr cimport csr_t
 from lavender_ext.core.generalized cimport dot, generalized_t
 from lavender_ext.core.order cimport advance_order
@@ -55,9 +55,9 @@ cdef public void lav_prepare_csr(const blocks_t* p, const csr_t* a, const int32_
 
 cdef public void lav_prepare_rows(const blocks_t* p, const rows_t* r, const int32_t* start, double* g) noexcept nogil:
     """The same from J and M^-1: the slack that each row's unit impulse makes on the block."""
-    cdef int32_t i, j, n, k, q, c, nt, spin
+    cdef int32_t i, j, n, k, q, c
     cdef double W[MAX_ROWS * MAX_ROWS]
-    cdef double jac[48]
+    cdef double jac[72]
     cdef double push[12]
     cdef const double* row
     cdef const double* change
@@ -68,9 +68,7 @@ cdef public void lav_prepare_rows(const blocks_t* p, const rows_t* r, const int3
         n = p.ptr[i + 1] - j
         c = i - r.n_joints
         if c >= 0:
-            spin = p.kind[i] == CONTACT_SPIN
-            nt = n_directions(p.kind[i], n)
-            contact_jacobian(r, c, nt, spin, jac)
+            contact_jacobian(r, c, n_directions(p.kind[i], n), n_turns(p.kind[i], n), jac)
             row = jac
         else:
             row = r.jac + 12 * j

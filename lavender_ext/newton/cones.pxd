@@ -2,7 +2,7 @@
 from libc.math cimport sqrt
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.block cimport CONTACT_SPIN as SPIN
+from lavender_ext.core.block cimport CONTACT_ROLLING, CONTACT_SPIN as SPIN
 from lavender_ext.newton.elements cimport elements_t
 
 
@@ -51,12 +51,35 @@ cdef inline double cone_step(const double* x, const double* dx, int32_t n) noexc
     return c / q
 
 
-# One cone of a contact in its own coordinates: x_0 = a z_n, then the tangents (which = 0) or the spin (1).
+cdef enum:
+    PARTS = 3                   # most cones of a contact: tangents, spin, what rolls
+
+
+# One cone of a contact in its own coordinates: x_0 = a z_n, then the tangents (which = 0), the spin (1) or what rolls (2).
 cdef inline int32_t cone_size(const elements_t* e, int32_t i, int32_t which) noexcept nogil:
     cdef int32_t nr = e.ptr[i + 1] - e.ptr[i]
+    if e.kind[i] == CONTACT_ROLLING:
+        return 3 if which != 1 else 2 if nr == 6 else 0
     if which == 0:
         return nr - 1 if e.kind[i] == SPIN else nr
-    return 2 if e.kind[i] == SPIN else 0
+    return 2 if e.kind[i] == SPIN and which == 1 else 0
+
+
+cdef inline int32_t cone_at(const elements_t* e, int32_t i, int32_t which) noexcept nogil:
+    # its first row after the normal
+    if which == 0:
+        return e.ptr[i] + 1
+    if which == 2:
+        return e.ptr[i + 1] - 2
+    return e.ptr[i] + 3 if e.kind[i] == CONTACT_ROLLING else e.ptr[i + 1] - 1
+
+
+cdef inline double ratio(const elements_t* e, int32_t i, int32_t which) noexcept nogil:
+    return e.at[i] if which == 0 else e.as_[i] if which == 1 else e.ar[i]
+
+
+cdef inline double* kept(const elements_t* e, int32_t i, int32_t which) noexcept nogil:
+    return e.scaling + KEPT * (e.parts * i + which)
 
 
 cdef inline double on_normal(double a) noexcept nogil:
@@ -69,57 +92,49 @@ cdef inline double on_tangent(double a) noexcept nogil:
 
 cdef inline void gather(const elements_t* e, int32_t i, int32_t which, const double* z, double* x) noexcept nogil:
     # x = G z, G = diag(1, 1/a) or diag(a, 1): no entry below 1, so that G never blows a proximal term up
-    cdef int32_t j = e.ptr[i], n, k
-    cdef double a = e.at[i] if which == 0 else e.as_[i]
-    x[0] = on_normal(a) * z[j]
-    if which == 0:
-        n = cone_size(e, i, 0)
-        for k in range(1, n):
-            x[k] = on_tangent(a) * z[j + k]
-    else:
-        x[1] = on_tangent(a) * z[e.ptr[i + 1] - 1]
+    cdef int32_t q = cone_at(e, i, which) - 1, k
+    cdef double a = ratio(e, i, which)
+    x[0] = on_normal(a) * z[e.ptr[i]]
+    for k in range(1, cone_size(e, i, which)):
+        x[k] = on_tangent(a) * z[q + k]
 
 
 cdef inline void scatter(const elements_t* e, int32_t i, int32_t which, const double* x, double* z) noexcept nogil:
     # z += G^T x
-    cdef int32_t j = e.ptr[i], n, k
-    cdef double a = e.at[i] if which == 0 else e.as_[i]
-    z[j] += on_normal(a) * x[0]
-    if which == 0:
-        n = cone_size(e, i, 0)
-        for k in range(1, n):
-            z[j + k] += on_tangent(a) * x[k]
-    else:
-        z[e.ptr[i + 1] - 1] += on_tangent(a) * x[1]
+    cdef int32_t q = cone_at(e, i, which) - 1, k
+    cdef double a = ratio(e, i, which)
+    z[e.ptr[i]] += on_normal(a) * x[0]
+    for k in range(1, cone_size(e, i, which)):
+        z[q + k] += on_tangent(a) * x[k]
 
 
-# u1 (m): dual of the lower bound, or of the tangent cone. u2 (m): of the upper bound, or of the spin cone
-# (its two entries on the normal and the spin row).
+# u1 (m): dual of the lower bound, or of the tangent cone. u2 (m): of the upper bound, or of the spin cone (on the normal
+# and the spin row) and of the rolling cone (on the first tangent's row, which the others leave free, and what rolls).
+cdef inline double* dual_head(const elements_t* e, int32_t i, int32_t which, double* u1, double* u2) noexcept nogil:
+    return u1 + e.ptr[i] if which == 0 else u2 + e.ptr[i] + (which == 2)
+
+
 cdef inline void load_dual(const elements_t* e, int32_t i, int32_t which, const double* u1, const double* u2,
                            double* x) noexcept nogil:
-    cdef int32_t j = e.ptr[i], k
-    if which == 0:
-        for k in range(cone_size(e, i, 0)):
-            x[k] = u1[j + k]
-    else:
-        x[0] = u2[j]
-        x[1] = u2[e.ptr[i + 1] - 1]
+    cdef const double* u = u1 if which == 0 else u2
+    cdef int32_t q = cone_at(e, i, which) - 1, k
+    x[0] = dual_head(e, i, which, <double*>u1, <double*>u2)[0]
+    for k in range(1, cone_size(e, i, which)):
+        x[k] = u[q + k]
 
 
 cdef inline void store_dual(const elements_t* e, int32_t i, int32_t which, const double* x, double* u1,
                             double* u2) noexcept nogil:
-    cdef int32_t j = e.ptr[i], k
-    if which == 0:
-        for k in range(cone_size(e, i, 0)):
-            u1[j + k] = x[k]
-    else:
-        u2[j] = x[0]
-        u2[e.ptr[i + 1] - 1] = x[1]
+    cdef double* u = u1 if which == 0 else u2
+    cdef int32_t q = cone_at(e, i, which) - 1, k
+    dual_head(e, i, which, u1, u2)[0] = x[0]
+    for k in range(1, cone_size(e, i, which)):
+        u[q + k] = x[k]
 
 
 cdef inline bint has_cone(const elements_t* e, int32_t i, int32_t which) noexcept nogil:
     # a contact without tangents is a plain normal: its cone is the half-line, a = 1
-    return which == 0 and (cone_size(e, i, 0) > 1 or e.kind[i] != SPIN) or which == 1 and e.kind[i] == SPIN
+    return cone_size(e, i, which) > (1 if which > 0 or e.kind[i] == SPIN else 0)
 
 
 cdef inline void nt_scaling(const double* s, const double* u, int32_t n, double* w, double* eta) noexcept nogil:
@@ -184,15 +199,11 @@ cdef inline bint is_high(const elements_t* e, int32_t j) noexcept nogil:
 
 cdef inline void slack_dual(const elements_t* e, int32_t i, int32_t which, const double* hz, double* c) noexcept nogil:
     # u with G^T u = H z - g where the contact has one cone
-    cdef int32_t j = e.ptr[i], k
-    cdef double a = e.at[i] if which == 0 else e.as_[i]
+    cdef int32_t j = e.ptr[i], q = cone_at(e, i, which) - 1, k
+    cdef double a = ratio(e, i, which)
     c[0] = (hz[j] - e.g[j]) / on_normal(a)
-    if which == 0:
-        for k in range(1, cone_size(e, i, 0)):
-            c[k] = (hz[j + k] - e.g[j + k]) / on_tangent(a)
-    else:
-        k = e.ptr[i + 1] - 1
-        c[1] = (hz[k] - e.g[k]) / on_tangent(a)
+    for k in range(1, cone_size(e, i, which)):
+        c[k] = (hz[q + k] - e.g[q + k]) / on_tangent(a)
 
 
 cdef inline double cone_parts(const double* s, const double* u, int32_t n, double a, double delta, double* w,
@@ -244,7 +255,7 @@ cdef inline double row_limit(double x, double dx, double best) noexcept nogil:
 cdef inline void cone_affine(const elements_t* e, int32_t i, int32_t which, const double* da, const int32_t n,
                              double* y, double* back) noexcept nogil:
     # y = T^-1 G dz_a, back = T du_a
-    cdef const double *w = e.scaling + 2 * KEPT * i + KEPT * which
+    cdef const double *w = kept(e, i, which)
     cdef double x[4]
     cdef int32_t k
     gather(e, i, which, da, x)
@@ -256,7 +267,7 @@ cdef inline void cone_affine(const elements_t* e, int32_t i, int32_t which, cons
 cdef inline void cone_combined(const elements_t* e, int32_t i, int32_t which, const double* da, double sigma_mu,
                                const int32_t n, double* rhs) noexcept nogil:
     # v \\ c of (4) into the cone's store; rhs = T^-1 (v \\ c)
-    cdef double *w = e.scaling + 2 * KEPT * i + KEPT * which
+    cdef double *w = kept(e, i, which)
     cdef const double *v = w + KEPT_V
     cdef double x[4]
     cdef double y[4]
@@ -275,7 +286,7 @@ cdef inline void cone_combined(const elements_t* e, int32_t i, int32_t which, co
 cdef inline double cone_length(const elements_t* e, int32_t i, int32_t which, const double* dz, double best,
                                const int32_t n, double* du) noexcept nogil:
     # the combined step's length, at most `best`; du
-    cdef const double *w = e.scaling + 2 * KEPT * i + KEPT * which
+    cdef const double *w = kept(e, i, which)
     cdef double x[4]
     cdef double y[4]
     cdef double a

@@ -67,7 +67,7 @@ cdef inline void coupled_block(const double* h, double* out, int32_t ld, const d
     # (1) of one pair of elements; rows of both are ld apart
     cdef int32_t k, l, t
     cdef double x
-    cdef double half[16]
+    cdef double half[36]
     for k in range(ni):
         for l in range(nj):
             x = h[k * ld + l]

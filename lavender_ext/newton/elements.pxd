@@ -1,11 +1,11 @@
-"""The scaled problem and its elements: a bounded row or a contact each, with small square matrices, at most 4 x 4.
+"""The scaled problem and its elements: a bounded row or a contact each, with small square matrices, at most 6 x 6.
 
 With d = diag(A): z = D^1/2 lambda [sqrt J], g = D^-1/2 b, s = H z - g,
 
     H = D^-1/2 A D^-1/2 = K K^T + diag(theta),   K = D^-1/2 J M^-1/2                              (1)
 
-An element is a bounded row, or a contact (normal, tangents, spin) whose cones in z are |z_t| <= a_t z_n and
-|z_s| <= a_s z_n. Interior point and natural map both ask for (H + W) dz = r with one small W for each element; in
+An element is a bounded row, or a contact (normal, tangents, spin, rolling) whose cones in z are |z_t| <= a_t z_n,
+|z_s| <= a_s z_n and |z_r| <= a_r z_n. Interior point and natural map both ask for (H + W) dz = r with one small W for each element; in
 the velocity form, with V = (theta + W)^-1 per element,
 
     N = I + K^T V K,   N dy = K^T V r,   dz = V (r - K dy)                                        (2)
@@ -28,7 +28,7 @@ cdef struct elements_t:
     int32_t m                   # rows
     int32_t s                   # columns of a body in the panel
     const int32_t* ptr          # (n + 1) first row
-    const int32_t* kind         # (n) ROW (one row each) | CONTACT | SPIN
+    const int32_t* kind         # (n) ROW (one row each) | CONTACT | SPIN | CONTACT_ROLLING
     const int32_t* wptr         # (n + 1) first entry of the element's small square matrices
     const int32_t* node         # (n, 2) block columns, the first the larger, -1 where static
     const int32_t* slot         # (n, 3) blocks of N: first-first, second-second, first-second
@@ -41,7 +41,9 @@ cdef struct elements_t:
     const double* upper         # (m)
     const double* at            # (n) a_t
     const double* as_           # (n) a_s
-    double* scaling             # (n, 2, KEPT) of the element's cones, once ipm_scale has run
+    double* scaling             # (n, parts, KEPT) of the element's cones, once ipm_scale has run
+    int32_t parts               # cones that an element may have: 2, with rolling 3
+    const double* ar            # (n) a_r, read on CONTACT_ROLLING
 
 
 cdef class Elements:

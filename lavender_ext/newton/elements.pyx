@@ -4,7 +4,7 @@ from libc.stdint cimport int32_t, int64_t
 import numpy as np
 
 from lavender_ext.core.arrays cimport address
-from lavender_ext.newton.cones cimport KEPT
+from lavender_ext.newton.cones cimport KEPT, PARTS
 from lavender_ext.newton.elements cimport element_times, element_times_transposed, elements_t
 from lavender_ext.newton.interior cimport (ipm_affine, ipm_rhs, ipm_scale, ipm_start, ipm_start_apart,
                                            ipm_update)
@@ -77,8 +77,9 @@ cdef class Elements:
     Every array is C-contiguous, float64 or int32, of the length that the structs above give, checked by
     the caller.
     """
-    def __init__(self, ptr, kind, wptr, node, slot, panel, theta, g, lower, upper, at, as_, int s):
-        scaling = np.empty(2 * KEPT * len(kind) if len(kind) < len(g) else 0)
+    def __init__(self, ptr, kind, wptr, node, slot, panel, theta, g, lower, upper, at, as_, int s, ar=None):
+        cdef int32_t parts = 2 if ar is None else PARTS
+        scaling = np.empty(parts * KEPT * len(kind) if len(kind) < len(g) else 0)
         cdef const int32_t[:, ::1] of = node
         cdef int32_t i, k = 0
         group_array = np.empty(len(kind) + 1, np.int32)
@@ -88,7 +89,7 @@ cdef class Elements:
                 group[k] = i
                 k += 1
         group[k] = <int32_t>of.shape[0]
-        self.keep = [ptr, kind, wptr, node, slot, panel, theta, g, lower, upper, at, as_, scaling, group_array]
+        self.keep = [ptr, kind, wptr, node, slot, panel, theta, g, lower, upper, at, as_, scaling, group_array, ar]
         self.n = len(kind)
         self.m = len(g)
         self.n_small = int(wptr[len(kind)])
@@ -96,7 +97,9 @@ cdef class Elements:
             self.n, self.m, s, <int32_t*>address(ptr), <int32_t*>address(kind), <int32_t*>address(wptr),
             <int32_t*>address(node), <int32_t*>address(slot), k, &group[0], <double*>address(panel), <double*>address(theta),
             <double*>address(g), <double*>address(lower), <double*>address(upper), <double*>address(at),
-            <double*>address(as_), <double*>address(scaling))
+            <double*>address(as_), <double*>address(scaling), parts, NULL)
+        if ar is not None:
+            self.e.ar = <double*>address(ar)
 
     def start(self, const double[::1] hz, double size, double[::1] z, double[::1] u1, double[::1] u2, bint apart):
         """z, u inside their cones, one shift for all of them or each `apart`; returns the degree."""

@@ -9,10 +9,10 @@ u dual to G z, G z and u inside every cone, W = G^T T^-2 G with T u = T^-1 G z =
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.block cimport CONTACT, CONTACT_SPIN as SPIN, ROW
-from lavender_ext.newton.cones cimport (KEPT, KEPT_V, cone_affine, cone_combined, cone_gap, cone_length,
-                                        cone_parts, cone_size, cone_step, gather, has_cone, is_high, is_low,
-                                        load_dual, on_normal, row_limit, scatter, slack_dual, store_dual)
+from lavender_ext.core.block cimport ROW
+from lavender_ext.newton.cones cimport (KEPT_V, PARTS, cone_affine, cone_at, cone_combined, cone_gap, cone_length,
+                                        cone_parts, cone_size, cone_step, dual_head, gather, has_cone, is_high, is_low,
+                                        kept, load_dual, on_normal, ratio, row_limit, scatter, slack_dual, store_dual)
 from lavender_ext.newton.elements cimport elements_t, invert_small
 
 
@@ -60,12 +60,12 @@ cdef inline double ipm_start(const elements_t* e, const double* hz, double dual,
                 worst_u = -u2[j] if -u2[j] > worst_u else worst_u
                 degree += 1.0
             continue
-        for which in range(2):
+        for which in range(PARTS):
             if not has_cone(e, i, which):
                 continue
             n = cone_size(e, i, which)
             gather(e, i, which, z, c)
-            x = -cone_gap(c, n) / on_normal(e.at[i] if which == 0 else e.as_[i])
+            x = -cone_gap(c, n) / on_normal(ratio(e, i, which))
             worst_z = x if x > worst_z else worst_z
             slack_dual(e, i, which, hz, c)
             x = -cone_gap(c, n)
@@ -85,12 +85,9 @@ cdef inline double ipm_start(const elements_t* e, const double* hz, double dual,
                 u2[j] += worst_u
             continue
         z[j] += worst_z
-        for which in range(2):
+        for which in range(PARTS):
             if has_cone(e, i, which):
-                if which == 0:
-                    u1[j] += worst_u
-                else:
-                    u2[j] += worst_u
+                dual_head(e, i, which, u1, u2)[0] += worst_u
     return degree
 
 
@@ -139,7 +136,7 @@ cdef inline double ipm_start_apart(const elements_t* e, const double* hz, double
                 u2[j] = -x if -x > size_u else size_u
                 degree += 1.0
             continue
-        for which in range(2):
+        for which in range(PARTS):
             if not has_cone(e, i, which):
                 continue
             n = cone_size(e, i, which)
@@ -149,7 +146,7 @@ cdef inline double ipm_start_apart(const elements_t* e, const double* hz, double
                 c[0] += x
             store_dual(e, i, which, c, u1, u2)
             gather(e, i, which, z, c)
-            x = (size_z - cone_gap(c, n)) / on_normal(e.at[i] if which == 0 else e.as_[i])
+            x = (size_z - cone_gap(c, n)) / on_normal(ratio(e, i, which))
             if x > 0.0:
                 z[j] += x
             degree += 1.0
@@ -162,19 +159,16 @@ cdef inline void ipm_scale(const elements_t* e, const double* z, const double* u
 
     bt may be NULL.
     """
-    cdef int32_t i, j, k, l, n, nr, q, t
+    cdef int32_t i, j, k, l, n, nr, q, t, which, first
+    cdef bint more
     cdef double x, y, r, total = 0.0
     cdef double s[4]
     cdef double u[4]
     cdef double h[4]
     cdef double c[4]
     cdef double root[4]
-    cdef double hs[1]
-    cdef double cs[1]
-    cdef double rs[1]
-    cdef double a[16]
-    cdef double b[16]
-    hs[0] = cs[0] = rs[0] = 0.0
+    cdef double a[36]
+    cdef double b[36]
     for i in range(e.n):
         j = e.ptr[i]
         nr = e.ptr[i + 1] - j
@@ -191,45 +185,42 @@ cdef inline void ipm_scale(const elements_t* e, const double* z, const double* u
             if bt != NULL:
                 bt[q] = sqrt(v[q])
             continue
-        n = nr if e.kind[i] == CONTACT else nr - 1
-        x = 0.0
-        if n > 1:
-            gather(e, i, 0, z, s)
-            load_dual(e, i, 0, u1, u2, u)
-            for k in range(n):
-                total += s[k] * u[k]
-            x = cone_parts(s, u, n, e.at[i], delta, e.scaling + 2 * KEPT * i, h, c, root)
-        if e.kind[i] == SPIN:
-            # Two cones share the normal: their parallel sum there, each of the others follows it.
-            gather(e, i, 1, z, s)
-            load_dual(e, i, 1, u1, u2, u)
-            total += s[0] * u[0] + s[1] * u[1]
-            y = cone_parts(s, u, 2, e.as_[i], delta, e.scaling + 2 * KEPT * i + KEPT, hs, cs, rs)
-            x = x * (y / (x + y)) if n > 1 else y
         for k in range(nr * nr):
             v[q + k] = 0.0
+        if bt != NULL:
+            for k in range(nr * nr):
+                bt[q + k] = 0.0
+        x = 0.0
+        more = False
         a[0] = 1.0
-        for k in range(1, n):
-            a[k] = h[k - 1]
-            for l in range(1, n):
-                v[q + k * nr + l] = c[(k - 1) * (n - 1) + l - 1]
-        if e.kind[i] == SPIN:
-            a[nr - 1] = hs[0]
-            v[q + nr * nr - 1] = cs[0]
+        for which in range(PARTS):
+            n = cone_size(e, i, which)
+            if n <= 1:
+                continue
+            # Cones share the normal: their parallel sum there, each of the others follows it.
+            gather(e, i, which, z, s)
+            load_dual(e, i, which, u1, u2, u)
+            y = total if which == 0 else 0.0
+            for k in range(n):
+                y += s[k] * u[k]
+            total = y if which == 0 else total + y
+            y = cone_parts(s, u, n, ratio(e, i, which), delta, kept(e, i, which), h, c, root)
+            x = x * (y / (x + y)) if more else y
+            more = True
+            first = cone_at(e, i, which) - j
+            for k in range(n - 1):
+                a[first + k] = h[k]
+                for l in range(n - 1):
+                    v[q + (first + k) * nr + first + l] = c[k * (n - 1) + l]
+                    if bt != NULL:
+                        bt[q + (first + k) * nr + first + l] = root[k * (n - 1) + l]
         for k in range(nr):
             for l in range(nr):
                 v[q + k * nr + l] += x * a[k] * a[l]
         if bt != NULL:
             r = sqrt(x)
-            for k in range(nr * nr):
-                bt[q + k] = 0.0
             for k in range(nr):
                 bt[q + k] = r * a[k]
-            for k in range(1, n):
-                for l in range(1, n):
-                    bt[q + k * nr + l] = root[(k - 1) * (n - 1) + l - 1]
-            if e.kind[i] == SPIN:
-                bt[q + nr * nr - 1] = rs[0]
         y = 0.0
         for k in range(nr):
             y += e.theta[j + k]
@@ -276,11 +267,11 @@ cdef inline double ipm_affine(const elements_t* e, const double* z, const double
                 t01 += a * x - u2[j] * dz[j]
                 t11 -= x * dz[j]
             continue
-        for which in range(2):
+        for which in range(PARTS):
             if not has_cone(e, i, which):
                 continue
             n = cone_size(e, i, which)
-            v = e.scaling + 2 * KEPT * i + KEPT * which + KEPT_V
+            v = kept(e, i, which) + KEPT_V
             if n == 3:
                 cone_affine(e, i, which, dz, 3, y, back)
                 a = cone_step(v, y, 3)
@@ -321,7 +312,7 @@ cdef inline void ipm_rhs(const elements_t* e, const double* z, const double* u1,
                 x = -u2[j] + u2[j] / a * da[j]
                 rhs[j] += (-da[j] * x - sigma_mu) / a
             continue
-        for which in range(2):
+        for which in range(PARTS):
             if not has_cone(e, i, which):
                 continue
             n = cone_size(e, i, which)
@@ -341,6 +332,7 @@ cdef inline double ipm_update(const elements_t* e, double* z, double* u1, double
     cdef int32_t i, j, k, which, n
     cdef double best = 1.0 / damping, a, x
     cdef double du[4]
+    cdef double u[4]
     for i in range(e.n):
         j = e.ptr[i]
         if e.kind[i] == ROW:
@@ -359,7 +351,7 @@ cdef inline double ipm_update(const elements_t* e, double* z, double* u1, double
                 best = row_limit(u2[j], x, best)
                 du2[j] = x
             continue
-        for which in range(2):
+        for which in range(PARTS):
             if not has_cone(e, i, which):
                 continue
             n = cone_size(e, i, which)
@@ -379,10 +371,12 @@ cdef inline double ipm_update(const elements_t* e, double* z, double* u1, double
             if is_high(e, j):
                 u2[j] += best * du2[j]
             continue
-        for k in range(j, e.ptr[i + 1]):
-            if has_cone(e, i, 0) and k - j < cone_size(e, i, 0):
-                u1[k] += best * du1[k]
-        if has_cone(e, i, 1):
-            u2[j] += best * du2[j]
-            u2[e.ptr[i + 1] - 1] += best * du2[e.ptr[i + 1] - 1]
+        for which in range(PARTS):
+            if not has_cone(e, i, which):
+                continue
+            load_dual(e, i, which, u1, u2, du)
+            load_dual(e, i, which, du1, du2, u)
+            for k in range(cone_size(e, i, which)):
+                du[k] += best * u[k]
+            store_dual(e, i, which, du, u1, u2)
     return best

@@ -11,8 +11,26 @@ LU.
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.block cimport CONTACT_SPIN as SPIN, ROW
+from lavender_ext.core.block cimport CONE, CONTACT_ROLLING, CONTACT_SPIN as SPIN, COULOMB, ROW
+from lavender_ext.local.rolling cimport rolling_map
 from lavender_ext.newton.elements cimport MAP_AUGMENTED, MAP_CONVEX, elements_t, invert_small
+
+
+cdef inline void natural_rolling(const elements_t* e, int32_t i, const double* z, const double* s, int32_t law,
+                                 int32_t augmented, double* f, double* p) noexcept nogil:
+    # F (nr) and P (nr, nr) of one contact that resists rolling; radii as in `natural_coulomb`
+    cdef int32_t nr = e.ptr[i + 1] - e.ptr[i], k
+    cdef double rn = z[0] - s[0] if augmented else z[0]
+    cdef double y[6]
+    cdef double a[3]
+    a[0] = e.at[i]
+    a[1] = e.as_[i]
+    a[2] = e.ar[i]
+    for k in range(nr):
+        y[k] = z[k] - s[k]
+    rolling_map(law, nr, a, y, rn if rn > 0.0 else 0.0, f, p)
+    for k in range(nr):
+        f[k] = s[k] if f[k] == y[k] else z[k] - f[k]
 
 
 cdef inline void natural_contact(const elements_t* e, int32_t i, const double* z, const double* s, double* f,
@@ -159,7 +177,7 @@ cdef inline double natural(const elements_t* e, const double* z, const double* s
     cdef int32_t i, j, k, l, q, nr, piece
     cdef double total = 0.0
     cdef double y, x
-    cdef double a[16]
+    cdef double a[36]
     for i in range(e.n):
         j = e.ptr[i]
         nr = e.ptr[i + 1] - j
@@ -187,7 +205,9 @@ cdef inline double natural(const elements_t* e, const double* z, const double* s
                     einv[q] = 1.0
                     v[q] = 0.0
             continue
-        if law == MAP_CONVEX:
+        if e.kind[i] == CONTACT_ROLLING:
+            natural_rolling(e, i, z + j, s + j, CONE if law == MAP_CONVEX else COULOMB, law == MAP_AUGMENTED, f + j, p + q)
+        elif law == MAP_CONVEX:
             natural_contact(e, i, z + j, s + j, f + j, p + q)
         else:
             natural_coulomb(e, i, z + j, s + j, law == MAP_AUGMENTED, f + j, p + q)
@@ -214,9 +234,9 @@ cdef inline void convex_error(const elements_t* e, const double* z, const double
     """|F| of the convex natural map, and the largest speed |f|, by norm where a contact has two tangents."""
     cdef int32_t i, j, k, nr
     cdef double total = 0.0, worst = 0.0, x
-    cdef double s[4]
-    cdef double f[4]
-    cdef double p[16]
+    cdef double s[6]
+    cdef double f[6]
+    cdef double p[36]
     for i in range(e.n):
         j = e.ptr[i]
         if e.kind[i] == ROW:
@@ -232,12 +252,17 @@ cdef inline void convex_error(const elements_t* e, const double* z, const double
         nr = e.ptr[i + 1] - j
         for k in range(nr):
             s[k] = hz[j + k] - e.g[j + k]
-        natural_contact(e, i, z + j, s, f, p)
+        if e.kind[i] == CONTACT_ROLLING:
+            natural_rolling(e, i, z + j, s, CONE, 0, f, p)
+        else:
+            natural_contact(e, i, z + j, s, f, p)
         for k in range(nr):
             total += f[k] * f[k]
             x = fabs(f[k]) * speed[j + k]
             if k == 1 and nr - (e.kind[i] == SPIN) == 3:
                 x = sqrt(f[1] * f[1] + f[2] * f[2]) * speed[j + 1]
+            if e.kind[i] == CONTACT_ROLLING and (k == 1 or k == nr - 2):
+                x = sqrt(f[k] * f[k] + f[k + 1] * f[k + 1]) * speed[j + k]
             worst = x if x > worst else worst
     energy[0] = sqrt(total)
     velocity[0] = worst

@@ -50,7 +50,7 @@ cdef inline void weigh(const double* v, const double* rows, double* t, int32_t n
 cdef inline void add_elements(const elements_t* e, const double* v, const factor_t* f, int32_t lu, const int32_t s) noexcept nogil:
     cdef int32_t h, i, j, r, c, nr, first, second, n_blocks = f.nptr[f.n], done
     cdef int64_t b = s * s, q
-    cdef double t[192]                                  # V K of up to 16 rows between two bodies, (16, 2 s)
+    cdef double t[216]                                  # V K of up to 18 rows between two bodies, (18, 2 s)
     cdef const double *pr
     cdef const int32_t *slot
     for q in range(n_blocks * b):

@@ -2,7 +2,7 @@
 from libc.math cimport sqrt
 from libc.stdint cimport int32_t, int64_t
 
-from lavender_ext.core.block cimport CONTACT_SPIN as SPIN, blocks_t, n_directions
+from lavender_ext.core.block cimport blocks_t, n_directions, n_turns
 from lavender_ext.core.rows cimport contact_jacobian, rows_t
 from lavender_ext.newton.elements cimport elements_t
 
@@ -108,8 +108,8 @@ cdef inline void inertia_root(int32_t n, const double* inv_inertia, double* root
 cdef inline void fill_panel(const blocks_t* p, const rows_t* r, const double* root, const double* root_mass,
                             double* panel) noexcept nogil:
     """K (m, 12): D^-1/2 J M^-1/2, columns of body a then b."""
-    cdef int32_t i, j, q, c, k, h, a, b, body
-    cdef double jac[48]
+    cdef int32_t i, j, q, c, k, h, a, b, body, n
+    cdef double jac[72]
     cdef double x
     cdef const double *row
     cdef const double *l
@@ -124,7 +124,8 @@ cdef inline void fill_panel(const blocks_t* p, const rows_t* r, const double* ro
         else:
             a = r.contact_body[2 * c]
             b = r.contact_body[2 * c + 1]
-            contact_jacobian(r, c, n_directions(p.kind[i], p.ptr[i + 1] - j), p.kind[i] == SPIN, jac)
+            n = p.ptr[i + 1] - j
+            contact_jacobian(r, c, n_directions(p.kind[i], n), n_turns(p.kind[i], n), jac)
             row = jac
         for q in range(j, p.ptr[i + 1]):
             out = panel + 12 * <int64_t>q

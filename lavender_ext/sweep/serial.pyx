@@ -12,7 +12,8 @@ from libc.stdint cimport int32_t, int64_t, uint64_t
 
 import numpy as np
 
-from lavender_ext.core.block cimport ROW, blocks_t, ends_apart, n_tangents, relax_normal, relax_row, relax_tangents
+from lavender_ext.core.block cimport (CONTACT_ROLLING, ROW, blocks_t, n_tangents, n_ends, relax_normal,
+                                      relax_row, relax_tangents)
 from lavender_ext.core.csr cimport csr_dot, csr_t
 from lavender_ext.core.generalized cimport generalized_t
 from lavender_ext.core.order cimport advance_order
@@ -86,10 +87,13 @@ cdef public void lav_jacobi_sweeps(const blocks_t* p, const csr_t* a, double ome
             bound = p.mu[i] * lam[j]
             if nt > 0:
                 relax_tangents(lam + j + 1, w + j + 1, omega * p.step[j + 1], bound, nt)
-            if ends_apart(p.kind[i]):
-                q = end - 1
+            if n_ends(p.kind[i], end - j) & 1:
+                q = j + 1 + nt
                 bound = p.patch_radius[i] * bound
                 lam[q] = relax_row(lam[q], w[q], omega * p.step[q], -bound, bound)
+            if p.kind[i] == CONTACT_ROLLING:
+                q = end - 2
+                relax_tangents(lam + q, w + q, omega * p.step[q], p.rolling[i] * lam[j], 2)
 
 
 cdef public void lav_impulse_sweeps(const blocks_t* p, const rows_t* r, double* lam, double* v, int32_t* order,

@@ -9,7 +9,7 @@ rounds are, and rises where one fails. A point counts by the judge's residual al
 from libc.math cimport sqrt
 from libc.stdint cimport int32_t, int64_t, uint64_t
 
-from lavender_ext.core.block cimport CONTACT, CONTACT_SPIN as SPIN, ROW, blocks_t, ends_apart
+from lavender_ext.core.block cimport CONTACT, CONTACT_ROLLING, CONTACT_SPIN as SPIN, ROW, blocks_t, ends_apart
 from lavender_ext.core.rows cimport relax_rows_block, rows_t
 from lavender_ext.core.velocity cimport rows_velocity
 from lavender_ext.factor.blocks cimport factor_t
@@ -85,6 +85,10 @@ cdef inline int64_t index_room(const blocks_t* p, const rows_t* r) noexcept nogi
     """Whole numbers that `lay_pattern` hands out; 0 where a walk does not apply."""
     cdef int32_t small
     cdef int64_t k = count_elements(p, &small), n = r.n_bodies
+    cdef int32_t i
+    for i in range(p.n_blocks):
+        if p.kind[i] == CONTACT_ROLLING:
+            return 0
     if n == 0 or n > MOST_BODIES or k == 0:
         return 0
     # neighbours twice, eight vectors of bodies and their pivots, the pattern of N and of L, elements
@@ -264,7 +268,7 @@ cdef inline void lay_numbers(walk_t* w, const pattern_t* a, double* real, const 
         last = k
     a.group[h] = a.k
     w.e = elements_t(a.k, m, 6, a.ptr, a.kind, a.wptr, a.node, a.slot, h, a.group, panel, theta, g, lower, upper, at, spin,
-                     scaling)
+                     scaling, 2, NULL)
     b = 36 * <int64_t>a.nptr[n]
     w.f.n = n
     w.f.s = 6

@@ -69,6 +69,7 @@ def _own() -> list[Way]:
     found = []
     for name, spec in STEPPERS.items():
         cannot = {} if spec.spin else {"spin": "the stepper has no spin friction"}
+        cannot |= {} if spec.rolling else {"rolling": "the stepper has no rolling friction"}
         for more, words in (({}, "4 substeps of 16 sweeps"), (FINE, "16 substeps of 4 sweeps")):
             full = f"{name} 16x4" if more else name
             asked = {"stepper": name, "dt": 1 / 60, **more}

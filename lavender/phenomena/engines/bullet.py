@@ -113,12 +113,13 @@ class Engine(Stepping):
                 )
 
     def _material(self, body: int, link: int) -> None:
-        # Bullet multiplies the coefficients of two bodies; of the spin it adds spin a x friction b and the reverse
+        # Bullet multiplies the coefficients of two bodies; of spin and rolling it adds spin a x friction b and the reverse
         p = self.scene.parameters
         lateral = p.friction**0.5
         pybullet.changeDynamics(
-            body, link, lateralFriction=lateral, rollingFriction=0, linearDamping=0, angularDamping=0,
-            jointDamping=0, spinningFriction=0.5 * lateral * p.patch_radius, **self.at,
+            body, link, lateralFriction=lateral, linearDamping=0, angularDamping=0, jointDamping=0,
+            spinningFriction=0.5 * lateral * p.patch_radius,
+            rollingFriction=0.5 * p.rolling_radius / lateral if lateral else 0, **self.at,
         )  # fmt: skip
         pybullet.changeDynamics(
             body, link, activationState=pybullet.ACTIVATION_STATE_DISABLE_SLEEPING, **self.at

@@ -27,8 +27,8 @@ class Engine(Stepping):
     def __init__(self, scene: Scene, cone: str, noslip: int) -> None:
         self.scene, self.up = scene, parents(scene, "mujoco")
         p = scene.parameters
-        spin = ' condim="4"' if p.patch_radius else ""
-        friction = f'friction="{p.friction!r} {p.friction * p.patch_radius!r} 0"'
+        spin = ' condim="6"' if p.rolling_radius else ' condim="4"' if p.patch_radius else ""
+        friction = f'friction="{p.friction!r} {p.friction * p.patch_radius!r} {p.rolling_radius!r}"'
         option = f'<option cone="{cone}" noslip_iterations="{noslip}" gravity="{_text(p.gravity)}"/>'
         trees = "".join(self._body(i) for i in range(scene.n_bodies) if i not in self.up or self.up[i].a < 0)
         self.model = mujoco.MjModel.from_xml_string(

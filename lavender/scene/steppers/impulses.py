@@ -19,5 +19,6 @@ SPEC = StepperSpec(
     position_iterations=2,
     solvers=True,
     spin=True,
+    rolling=True,
     exact_problem=True,
 )

@@ -41,6 +41,7 @@ class StepperSpec:
     position_iterations: int  # default; 0: it has no position projection
     solvers: bool = False  # another solver may take the place of its sweeps
     spin: bool = False  # friction of a patch against spinning
+    rolling: bool = False  # friction against rolling
     boxes: bool = False  # friction of each tangent by itself, Scene(friction_shape="box")
     restitution: bool = True
     residuals: bool = True  # `observation["solver"]` holds residuals; else NaN
@@ -70,16 +71,18 @@ class StepperSpec:
                 found[name] = number(label, x, low=option.low, high=option.high)
         return found
 
-    def refuses(self, spin: bool, restitution: bool) -> str | None:
+    def refuses(self, spin: bool, restitution: bool, rolling: bool = False) -> str | None:
         """None where it takes a scene with these, else the reason."""
         if spin and not self.spin:
             return f"stepper {self.name!r} has no spin friction; leave patch_radius at 0, or take 'impulses'"
+        if rolling and not self.rolling:
+            return f"stepper {self.name!r} has no rolling friction; leave rolling_radius at 0, or take 'impulses'"
         if restitution and not self.restitution:
             return f"stepper {self.name!r} has no restitution; leave it at 0, or take another stepper"
         return None
 
-    def check(self, spin: bool, restitution: bool) -> None:
+    def check(self, spin: bool, restitution: bool, rolling: bool) -> None:
         """Raise `InputError` where it does not take a scene with these."""
-        reason = self.refuses(spin, restitution)
+        reason = self.refuses(spin, restitution, rolling)
         if reason:
             raise InputError(reason)

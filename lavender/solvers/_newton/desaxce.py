@@ -1,12 +1,12 @@
 """Coulomb friction by an interior point method on De Saxce's change of variable.
 
-    s = H z - g,   u = s + phi(s_t) e_n,   phi = a_t |s_t| + a_s |s_s|        (De Saxce, Feng 1998)   (1)
+    s = H z - g,   u = s + phi(s_t) e_n,   phi = a_t |s_t| + a_s |s_s| + a_r |s_r|    (De Saxce, Feng 1998)   (1)
     z in K,  u in K*,  z . u = 0     on every contact                                                   (2)
 
 With phi frozen, (1) and (2) are the convex problem of the "cone" law with its normals lowered by phi, and
 phi <- phi(s_t) is Cadoux's fixed point (Cadoux 2009; Acary, Cadoux, Lemarechal, Malick 2011): dozens of
 convex problems. Here phi moves with every step of one interior point, and so does its derivative: with
-psi = phi'(s_t) on the tangents and the spin, 0 on the normal, C = I - e_n psi^T and B = C^-1 = I + e_n psi^T,
+psi = phi'(s_t) on the tangents, the spin and the rolling, 0 on the normal, C = I - e_n psi^T and B = C^-1 = I + e_n psi^T,
 
     du = -q - W dz,    C du = H dz - r_d,    r_d = u - s - phi e_n,                                      (3)
     (H + C W) dz = r_d - C q = r_d - q + (psi . q) e_n,                                                  (4)
@@ -31,7 +31,7 @@ from typing import ClassVar
 import numpy as np
 
 from lavender._arrays import FloatArray
-from lavender.cones import CONTACT_SPIN, ROW
+from lavender.cones import CONTACT_ROLLING, CONTACT_SPIN, ROW
 from lavender.solvers._newton.augmented import ROWS, SHIFT, AugmentedSystem, advance
 from lavender.solvers._newton.interior_point import InteriorPoint
 from lavender.solvers._newton.proximal import Proximal
@@ -45,7 +45,7 @@ FINISH = ((1e-3, 10, 15), (1e-7, 12, 12))
 
 
 class _Slip:
-    """Index arrays of (1): which rows are tangents and spins, and of which contact."""
+    """Index arrays of (1): which rows are tangents, spins and rolling, and of which contact."""
 
     def __init__(self, sc: Scaled) -> None:
         ptr, kind, wptr = sc.ptr, sc.kind, sc.wptr
@@ -55,18 +55,26 @@ class _Slip:
         self.element = np.repeat(np.arange(self.n), size)
         position = np.arange(self.m) - np.repeat(self.first, size)
         contact = (kind != ROW)[self.element]
-        spin = (kind == CONTACT_SPIN)[self.element] & (position == size[self.element] - 1)
-        tangent = contact & (position > 0) & ~spin
+        rolls = kind == CONTACT_ROLLING
+        spins = (kind == CONTACT_SPIN) | (rolls & (size == 6))
+        from_end = size[self.element] - position
+        self.rolling = rolls[self.element] & (from_end <= 2)
+        spin = spins[self.element] & (from_end == np.where(rolls, 3, 1)[self.element])
+        tangent = contact & (position > 0) & ~spin & ~self.rolling
         self.a_t = np.where(np.bincount(self.element, tangent, minlength=self.n) > 0, sc.a_t, 0.0)
-        self.a_s = np.where(kind == CONTACT_SPIN, sc.a_s, 0.0)
+        self.a_s = np.where(spins, sc.a_s, 0.0)
+        self.a_r = np.zeros(self.n) if sc.a_r is None else sc.a_r
         # G^T: the cones' own coordinates are (a z_n, z_t) where a > 1, else (z_n, z_t / a).
         one_t, one_s = np.minimum(self.a_t, 1.0)[self.element], np.minimum(self.a_s, 1.0)[self.element]
         self.from_u1 = np.divide(1.0, one_t, out=np.zeros(self.m), where=tangent)
         self.from_u2 = np.divide(1.0, one_s, out=np.zeros(self.m), where=spin)
         self.normal_u1 = np.where(self.a_t > 0.0, np.maximum(self.a_t, 1.0), np.where(kind == ROW, 1.0, 0.0))
-        self.normal_u2 = np.where(
-            kind == CONTACT_SPIN, np.maximum(self.a_s, 1.0), np.where(kind == ROW, -1.0, 0.0)
-        )
+        self.normal_u2 = np.where(spins, np.maximum(self.a_s, 1.0), np.where(kind == ROW, -1.0, 0.0))
+        # The rolling cone's entry on the normal stands in u2 on the first tangent.
+        one_r = np.minimum(self.a_r, 1.0)[self.element]
+        self.from_u2 += np.divide(1.0, one_r, out=np.zeros(self.m), where=self.rolling)
+        self.turned = np.flatnonzero(rolls)
+        self.normal_u3 = np.maximum(self.a_r, 1.0)[self.turned]
         # Entries (r, c) of every element's small matrix: the row c of the problem, and where (r, 0) is.
         square = np.repeat(size, size**2)
         inner = np.arange(int(wptr[-1])) - np.repeat(wptr[:-1], size**2)
@@ -78,17 +86,25 @@ class _Slip:
         """G^T u (m,): u on every row."""
         out: FloatArray = self.from_u1 * u1 + self.from_u2 * u2
         out[self.first] = self.normal_u1 * u1[self.first] + self.normal_u2 * u2[self.first]
+        if len(self.turned):
+            out[self.first[self.turned]] += self.normal_u3 * u2[self.first[self.turned] + 1]
         return out
 
     def slip(self, s: FloatArray) -> tuple[FloatArray, FloatArray]:
         """phi (n,) of s (m,), and psi (m,)."""
         st = np.where(self.from_u1 > 0.0, s, 0.0)
-        ss = np.where(self.from_u2 > 0.0, s, 0.0)
+        sr = np.where(self.rolling, s, 0.0)
+        ss = np.where((self.from_u2 > 0.0) & ~self.rolling, s, 0.0)
         t = np.sqrt(np.bincount(self.element, st * st, minlength=self.n))
         spin = np.bincount(self.element, np.abs(ss), minlength=self.n)
         along = np.divide(self.a_t, t, out=np.zeros(self.n), where=t > 0.0)
         psi = along[self.element] * st + self.a_s[self.element] * np.sign(ss)
-        return self.a_t * t + self.a_s * spin, psi
+        phi = self.a_t * t + self.a_s * spin
+        if len(self.turned):
+            r = np.sqrt(np.bincount(self.element, sr * sr, minlength=self.n))
+            psi += np.divide(self.a_r, r, out=np.zeros(self.n), where=r > 0.0)[self.element] * sr
+            phi = phi + self.a_r * r
+        return phi, psi
 
     def dot(self, psi: FloatArray, x: FloatArray) -> FloatArray:
         """psi . x (n,) on every element."""

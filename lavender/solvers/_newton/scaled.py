@@ -2,7 +2,7 @@
 
     z = D^1/2 lambda,   H = D^-1/2 A D^-1/2,   g = D^-1/2 b,   H z - g = s,   z, s complementary on every element
 
-An element is a bounded row, or a contact with the tangents and the spin that move.
+An element is a bounded row, or a contact with the tangents, the spin and the rolling that move.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from lavender._arrays import FloatArray, IntArray
-from lavender.cones import CONTACT, CONTACT_SPIN, ROW
+from lavender.cones import CONTACT, CONTACT_ROLLING, CONTACT_SPIN, ROW
 from lavender.problem import Problem
 from lavender.solvers._islands import block_bodies
 
@@ -36,6 +36,7 @@ class Scaled:
     upper: FloatArray  # (mk,)
     a_t: FloatArray  # (n,) mu in the metric of d; 0 on rows
     a_s: FloatArray  # (n,) mu r likewise
+    a_r: FloatArray | None = None  # (n,) mu_r likewise; None without rolling
     bodies: IntArray | None = None  # (n, 2) bodies of each element
     whole: bool = True  # every row moves
 
@@ -97,13 +98,21 @@ def scaled(problem: Problem) -> Scaled:
     if len(e.kind) == mk:
         wptr = e.ptr
         a_t = a_s = np.zeros(mk)
+        a_r = None
     else:
-        wptr = np.concatenate([[0], np.cumsum(np.diff(e.ptr) ** 2)]).astype(np.int32)
-        first, last, root = e.ptr[:-1], e.ptr[1:] - 1, 1.0 / scale
-        second = np.minimum(first + 1, mk - 1)
-        mu, radius = cones.mu[e.block], cones.patch_radius[e.block]
-        a_t = np.where(e.kind != ROW, mu * root[second] / root[first], 0.0)
-        a_s = np.where(e.kind == CONTACT_SPIN, mu * radius * root[last] / root[first], 0.0)
+        size = np.diff(e.ptr)
+        wptr = np.concatenate([[0], np.cumsum(size**2)]).astype(np.int32)
+        root, reach = 1.0 / scale, cones.reach[pick]
+        turning = np.where(e.kind == CONTACT_SPIN, e.ptr[1:] - 1, e.ptr[:-1] + 3)
+
+        def opened(at: IntArray, has: Any) -> FloatArray:
+            at = np.minimum(at, mk - 1)
+            return np.where(has, reach[at] * root[at] / root[e.ptr[:-1]], 0.0)
+
+        rolls = e.kind == CONTACT_ROLLING
+        a_t = opened(e.ptr[:-1] + 1, e.kind != ROW)
+        a_s = opened(turning, (e.kind == CONTACT_SPIN) | (rolls & (size == 6)))
+        a_r = opened(e.ptr[1:] - 2, rolls) if rolls.any() else None
     return Scaled(
         problem=problem,
         keep=keep,
@@ -118,6 +127,7 @@ def scaled(problem: Problem) -> Scaled:
         upper=cones.upper[pick] / scale,
         a_t=a_t,
         a_s=a_s,
+        a_r=a_r,
         bodies=None
         if problem.rows is None
         else np.ascontiguousarray(block_bodies(problem)[e.block], np.int32),
@@ -147,12 +157,13 @@ def _mixed_elements(problem: Problem) -> _Elements:
     cones, m = problem.cones, problem.m
     size: IntArray = np.diff(cones.ptr).astype(np.int32)
     row = np.repeat((cones.kind == ROW) | (size == 1), size)
-    mu, radius = np.repeat(cones.mu, size), np.repeat(cones.patch_radius, size)
     position = np.arange(m) - np.repeat(cones.ptr[:-1], size)
     contact = np.repeat(cones.kind != ROW, size)
-    spin = contact & np.repeat(cones.ends_apart, size) & (position == np.repeat(size, size) - 1)
+    spin, rolling = np.zeros(m, bool), np.zeros(m, bool)
+    spin[cones.apart_rows[cones.apart_rows >= 0]] = True
+    rolling[cones.rolling_rows[cones.rolling_rows >= 0] + 1] = True  # the last of the two
     still = np.asarray(cones.lower == cones.upper)
-    still |= contact & (position > 0) & ((mu == 0.0) | (spin & (radius == 0.0)))
+    still |= contact & (position > 0) & (cones.reach == 0.0)
     fixed = np.zeros(m)
     fixed[still] = np.where(np.isfinite(cones.lower[still]), cones.lower[still], 0.0)
     for i in problem.metric.empty:
@@ -170,4 +181,6 @@ def _mixed_elements(problem: Problem) -> _Elements:
     ptr = np.append(start, mk).astype(np.int32)
     kind = np.where(is_row[start] | (np.diff(ptr) == 1), ROW, CONTACT).astype(np.int32)
     kind[spin[keep][ptr[1:] - 1] & (kind != ROW)] = CONTACT_SPIN
+    # Without tangents that move what rolls takes their place.
+    kind[rolling[keep][ptr[1:] - 1] & (np.diff(ptr) >= 5)] = CONTACT_ROLLING
     return _Elements(ptr, kind, block[start], (keep, fixed) if still.any() else None)

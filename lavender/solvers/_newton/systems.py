@@ -116,7 +116,7 @@ class System:
         sc = self.sc
         return Elements(
             sc.ptr, sc.kind, sc.wptr, node, slot, panel, sc.theta, sc.g, sc.lower, sc.upper,
-            np.ascontiguousarray(sc.a_t, float), np.ascontiguousarray(sc.a_s, float), s,
+            np.ascontiguousarray(sc.a_t, float), np.ascontiguousarray(sc.a_s, float), s, sc.a_r,
         )  # fmt: skip
 
     def times(self, z: FloatArray) -> FloatArray:
