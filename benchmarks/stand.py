@@ -11,30 +11,29 @@ second of simulation: sweeps x substeps / dt.
 
 LavenderSim is stepped as a user steps it, with its observation; the others by their own call for a step. MuJoCo,
 PyBullet and lavendersim are Python packages; Rapier (`@dimforge/rapier3d-compat`) and Jolt (`jolt-physics`) run under
-Node, where npm has installed them in the folder of the command, by `stand.mjs`.
+Node, by the adapters of `lavender phenomena`.
 """
 
 from __future__ import annotations
 
-import json
-import shutil
-import subprocess
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass
-from importlib import metadata
+from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 from time import process_time
-from typing import Any
+from typing import Any, ClassVar
 
 import click
 import numpy as np
 
 from benchmarks.output import folder_of, markdown, write_json
 from lavender._arrays import FloatArray
+from lavender.bench.machine import versions
 from lavender.engine import Simulation
 from lavender.errors import InputError, UnknownName
 from lavender.external._running import quiet
+from lavender.phenomena.engines import PACKAGES_OF_NODE, missing_in_node, versions_of_node
+from lavender.phenomena.engines.node import Engine as Node
 from lavender.scene import Scene
 from lavender.scene.scene import SCENE_ORDERS
 
@@ -55,8 +54,6 @@ FRICTION = 0.5
 SETTLE = 2.0  # s
 LOOK = 0.1  # s
 FELL = 0.5  # m, half an edge
-NODE_LIMIT = 600.0  # s of wall time for one run under Node
-SCRIPT = Path(__file__).with_suffix(".mjs")
 
 
 @dataclass(frozen=True)
@@ -107,6 +104,15 @@ class Engine:
     def step(self) -> Any:
         """One step of dt."""
         raise NotImplementedError
+
+    def advance(self, steps: int) -> None:
+        """So many steps."""
+        for _ in range(steps):
+            self.step()
+
+    def clock(self) -> float:
+        """CPU time that steps took, from any moment on [s]."""
+        return process_time()
 
     def centres(self) -> FloatArray:
         """Centres of the boxes (n, 3) [m]."""
@@ -287,11 +293,40 @@ class PyBullet(Engine):
         self.p.disconnect(self.client)
 
 
+class Rapier(Engine):
+    """`World.step`, iterations of which each is a substep."""
+
+    name = "rapier"
+    default = 4
+    option = "iterations"
+    more: ClassVar[dict[str, float]] = {}
+
+    def __init__(self, tower: Tower) -> None:
+        self.sweeps = self.default if tower.sweeps is None else tower.sweeps
+        scene = Scene("stack", n=tower.boxes, friction=FRICTION)
+        options = {self.option: self.sweeps, **self.more}
+        self.made = made = Node(scene, self.name, dt=tower.dt, **options)
+        self.advance, self.clock, self.close = made.advance, made.clock, made.close  # type: ignore[method-assign]
+
+    def centres(self) -> FloatArray:
+        """See `Engine.centres`."""
+        return self.made.state()[0][1:]
+
+
+class Jolt(Rapier):
+    """`Step` with velocity steps."""
+
+    name = "jolt"
+    default = 10
+    option = "sweeps"
+    more: ClassVar[dict[str, float]] = {"substeps": 1, "gyroscopic": False}
+
+
 @dataclass(frozen=True)
 class Contestant:
     """How an engine is made, what it needs, and what it lets one choose."""
 
-    make: Callable[[Tower], Engine] | str  # str: name in stand.mjs
+    make: Callable[[Tower], Engine]
     needs: str | None = None  # Python package, or npm package
     sweeps: bool = True
     substeps: bool = False
@@ -307,8 +342,8 @@ ENGINES: dict[str, Contestant] = {
     "mujoco_newton": Contestant(MuJoCoNewton, "mujoco", sweeps=False),
     "mujoco_pgs": Contestant(MuJoCoPGS, "mujoco"),
     "pybullet": Contestant(PyBullet, "pybullet", substeps=True),
-    "rapier": Contestant("rapier", "@dimforge/rapier3d-compat"),
-    "jolt": Contestant("jolt", "jolt-physics"),
+    "rapier": Contestant(Rapier, PACKAGES_OF_NODE["rapier"]),
+    "jolt": Contestant(Jolt, PACKAGES_OF_NODE["jolt"]),
 }
 
 
@@ -317,11 +352,9 @@ def missing(name: str) -> str:
     found = ENGINES[name]
     if found.needs is None:
         return ""
-    if not isinstance(found.make, str):
-        return "" if find_spec(found.needs) else f"pip install {found.needs}"
-    if shutil.which("node") is None:
-        return "Node"
-    return "" if Path("node_modules", found.needs).is_dir() else f"npm install {found.needs} in this folder"
+    if found.needs in PACKAGES_OF_NODE.values():
+        return missing_in_node(found.needs)
+    return "" if find_spec(found.needs) else f"pip install {found.needs}"
 
 
 def installed() -> list[str]:
@@ -344,10 +377,7 @@ def measure(engine: str, tower: Tower) -> Line:
     lack = missing(engine)
     if lack:
         raise InputError(f"{engine} cannot run here: {lack}")
-    make = ENGINES[engine].make
-    if isinstance(make, str):
-        return _under_node(make, tower)
-    made = make(tower)
+    made = ENGINES[engine].make(tower)
     try:
         return _watch(made, tower)
     finally:
@@ -358,12 +388,11 @@ def _watch(engine: Engine, tower: Tower) -> Line:
     every = max(1, round(LOOK / tower.dt))
     looks = max(1, round(tower.seconds / (every * tower.dt)))
     spent, drift, start, stood, steps = 0.0, 0.0, None, tower.seconds, 0
-    step, first = engine.step, engine.centres()
+    first = engine.centres()
     for _ in range(looks):
-        begin = process_time()
-        for _ in range(every):
-            step()
-        spent += process_time() - begin
+        begin = engine.clock()
+        engine.advance(every)
+        spent += engine.clock() - begin
         steps += every
         time = steps * tower.dt
         now = engine.centres()
@@ -386,39 +415,6 @@ def _watch(engine: Engine, tower: Tower) -> Line:
         drift=drift,
         cost=spent / steps,
     )
-
-
-def _under_node(name: str, tower: Tower) -> Line:
-    asked = {
-        **asdict(tower),
-        "engine": name,
-        "settle": SETTLE,
-        "look": LOOK,
-        "fell": FELL,
-        "friction": FRICTION,
-    }
-    node = shutil.which("node")
-    assert node is not None
-    try:
-        done = subprocess.run(
-            [node, str(SCRIPT), json.dumps(asked)],
-            capture_output=True,
-            text=True,
-            timeout=NODE_LIMIT,
-            check=True,
-        )
-        return Line(
-            **json.loads(done.stdout.splitlines()[-1]), boxes=tower.boxes, dt=tower.dt, seconds=tower.seconds
-        )
-    except subprocess.TimeoutExpired:
-        raise InputError(f"{name} took more than {NODE_LIMIT:g} s; ask for fewer --seconds") from None
-    except (subprocess.CalledProcessError, IndexError, ValueError, TypeError) as error:
-        said = (
-            error.stderr.strip().splitlines()
-            if isinstance(error, subprocess.CalledProcessError)
-            else [str(error)]
-        )
-        raise InputError(f"{name} did not run under Node: {said[-1] if said else 'no word'}") from None
 
 
 def lines(
@@ -583,5 +579,5 @@ def command(
 
 
 def _versions(names: Sequence[str]) -> dict[str, str]:
-    packages = {p for n in names if (p := ENGINES[n].needs) and not isinstance(ENGINES[n].make, str)}
-    return {p: metadata.version(p) for p in sorted(packages)}
+    needed = {p for n in names if (p := ENGINES[n].needs)}
+    return {p: v for p, v in (versions(needed) | versions_of_node()).items() if p in needed}

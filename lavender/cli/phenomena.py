@@ -10,14 +10,17 @@ import click
 
 from lavender.bench.machine import cpu_name, versions
 from lavender.cli.options import parameters_of
-from lavender.phenomena import WAYS, Record, chosen, run
+from lavender.engine.picture import PICTURES
+from lavender.phenomena import WAYS, Record, Track, chosen, run
 from lavender.phenomena import motion as motions
 from lavender.phenomena import table as tables
+from lavender.phenomena.engines import versions_of_node
+from lavender.phenomena.film import save_film
 from lavender.scene.steppers import STEPPERS
 
 __all__ = ["phenomena"]
 
-PACKAGES = ("mujoco", "pybullet", "drake", "lavendersim", "numpy")
+PACKAGES = ("mujoco", "pybullet", "drake", "lavendersim", "newton", "numpy")
 
 
 def _names(text: str | None) -> list[str] | None:
@@ -47,6 +50,14 @@ def _names(text: str | None) -> list[str] | None:
     "--plot", type=click.Path(path_type=Path), default=None, help="Figure of --motion (.svg, .png)."
 )
 @click.option(
+    "--film", type=click.Path(path_type=Path), default=None,
+    help="One phenomenon as each engine does it, beside each other: .gif, .mp4 (animations), .png, .svg (strips).",
+)  # fmt: skip
+@click.option(
+    "--magnify", type=click.FloatRange(min=1.0), default=1.0, show_default=True,
+    help="Show distances from the first engine of --film so many times as large.",
+)  # fmt: skip
+@click.option(
     "--list", "listed", is_flag=True, help="Tell what each is, its truth and its bounds; run nothing."
 )
 def phenomena(
@@ -58,6 +69,8 @@ def phenomena(
     out: Path | None,
     motion: bool,
     plot: Path | None,
+    film: Path | None,
+    magnify: float,
     listed: bool,
 ) -> None:
     """Scenes whose motion is known, measured in every stepper, and in the engines of others.
@@ -68,18 +81,28 @@ def phenomena(
     if listed:
         click.echo(tables.described(chosen(names)))
         return
-    for path in (out, plot):
+    for path in (out, plot, film):
         if path is not None and not path.parent.is_dir():
             raise click.UsageError(f"{path}: there is no folder {path.parent}")
     if motion:
-        if names or parameters or engines != "none":
+        if names or parameters or engines != "none" or film is not None:
             raise click.UsageError("--motion goes with --steppers, --out and --plot; its scenes are its own")
         _motion(_names(steppers), out, plot)
         return
     if plot is not None:
         raise click.UsageError("--plot goes with --motion")
+    if film is not None and (len(names) != 1 or film.suffix.lower() not in PICTURES):
+        raise click.UsageError(f"--film takes one phenomenon, and a file that ends in {', '.join(PICTURES)}")
+    case = parameters_of(parameters) if parameters else None
+    if film is not None and case is None:
+        case = dict(chosen(names)[0].cases[0])
     some = {"steppers": _names(steppers), "engines": _names(engines)}
     found: list[Record] = []
+    tracks: dict[str, Track] = {}
+
+    def keep(record: Record, track: Track) -> None:
+        if film is not None:
+            tracks[record.engine] = track
 
     def show(record: Record) -> None:
         found.append(record)
@@ -91,10 +114,13 @@ def phenomena(
         names,
         steppers=[] if some["steppers"] == ["none"] else some["steppers"],
         engines=[] if some["engines"] == ["none"] else some["engines"],
-        parameters=parameters_of(parameters) if parameters else None,
+        parameters=case,
         limit=limit,
         show=show,
+        keep=keep,
     )
+    if film is not None:
+        save_film(chosen(names)[0], found[0].case, tracks, film, magnify)
     for heading, lines in (
         ("Ours out of their bounds", tables.losses(found)),
         ("Without values", tables.notes(found)),
@@ -121,4 +147,8 @@ def _motion(steppers: list[str] | None, out: Path | None, plot: Path | None) -> 
 
 
 def _told(found: list[Record]) -> dict[str, object]:
-    return {"cpu": cpu_name(), "versions": versions(PACKAGES), "records": [asdict(r) for r in found]}
+    return {
+        "cpu": cpu_name(),
+        "versions": versions(PACKAGES) | versions_of_node(),
+        "records": [asdict(r) for r in found],
+    }

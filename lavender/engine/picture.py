@@ -6,6 +6,7 @@ right, away from the eye and upwards on the paper, a point p is at (p.r, p.t); f
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from os import PathLike
 from pathlib import Path
 from shutil import which
@@ -39,7 +40,7 @@ COLORS = ("#7a5fb5", "#4f7cac", "#5b9279", "#b5895f", "#a85f7a", "#6b8fb5", "#8a
 
 
 def save_picture(
-    film: Film,
+    film: Film | Mapping[str, Film],
     path: str | PathLike[str],
     *,
     frames: int = 4,
@@ -52,7 +53,8 @@ def save_picture(
 
     Parameters
     ----------
-    film : Film
+    film : Film, or mapping of name to Film
+        Several are seen beside each other, in a strip below each other.
     path : path
         `.gif`, or `.mp4` where ffmpeg is: an animation in the time of the film; `.png`, `.svg`, `.pdf`: `frames` of
         them side by side, evenly spaced.
@@ -74,24 +76,29 @@ def save_picture(
     suffix = path.suffix.lower()
     if suffix not in PICTURES:
         raise InputError(f"{str(path)!r} ends in {path.suffix!r}; .gif, .mp4, .png, .svg or .pdf is needed")
-    if not len(film):
+    films = film if isinstance(film, Mapping) else {"": film}
+    if not films or not all(len(one) for one in films.values()):
         raise InputError("the film has no frames; step first")
     if not (isinstance(frames, int) and frames >= 1 and rate > 0.0 and 0.5 <= size <= 50.0):
         raise InputError("frames must be at least 1, rate positive and size 0.5 to 50 inch")
     if suffix == ".mp4" and which("ffmpeg") is None:
         raise InputError("an .mp4 needs ffmpeg, which is not here; a .gif needs nothing")
-    stage = _Stage(film, turn, tilt)
+    stages = [_Stage(one, turn, tilt, name) for name, one in films.items()]
+    ends = np.array([stage.bounds for stage in stages])
+    for stage in stages:  # one scale for all
+        stage.bounds = tuple(np.where([1, 0, 1, 0], ends.min(axis=0), ends.max(axis=0)))
     if suffix in (".gif", ".mp4"):
-        _animate(stage, path, size, rate)
+        _animate(stages, path, size, rate)
     else:
-        _strip(stage, path, frames, size)
+        _strip(stages, path, frames, size)
     return path
 
 
 class _Stage:
     """One view for all frames: directions, bounds, and bodies as painted shapes."""
 
-    def __init__(self, film: Film, turn: float, tilt: float) -> None:
+    def __init__(self, film: Film, turn: float, tilt: float, name: str = "") -> None:
+        self.name = name
         s, c, up, flat = np.sin(turn), np.cos(turn), np.sin(tilt), np.cos(tilt)
         self.right = np.array([c, s, 0.0])
         self.away = np.array([-s * flat, c * flat, -up])
@@ -103,7 +110,7 @@ class _Stage:
         centre = self.x[:, seen] if seen else np.zeros((1, 1, 3))
         reach = reach if seen else np.ones(1)
         across, tall = centre @ self.right, centre @ self.top
-        self.bounds = (
+        self.bounds: tuple[float, ...] = (
             float((across - reach).min()),
             float((across + reach).max()),
             float((tall - reach).min()),
@@ -152,7 +159,7 @@ class _Stage:
             axes.add_patch(shape)
         self._ground(axes)
         self._joints(axes, frame)
-        axes.set_title(f"{self.time[frame]:.2f} s", fontsize=8)
+        axes.set_title(f"{self.name}  {self.time[frame]:.2f} s".strip(), fontsize=8)
 
     def _ground(self, axes: Any) -> None:
         if any(body["kind"] == PLANE and body["shape"][2] > 0.99 for body in self.bodies):
@@ -169,40 +176,50 @@ class _Stage:
             axes.plot(*self.project(place), "k.", markersize=3, zorder=4)
 
 
-def _strip(stage: _Stage, path: Path, count: int, size: float) -> None:
+def _strip(stages: list[_Stage], path: Path, count: int, size: float) -> None:
     from matplotlib.figure import Figure
 
-    chosen = np.unique(np.linspace(0, len(stage.film) - 1, count).round().astype(int))
-    height = size * stage.height + 0.3
-    canvas = Figure(figsize=(size * len(chosen), height), layout="constrained")
-    for axes, frame in zip(np.atleast_1d(canvas.subplots(1, len(chosen))), chosen, strict=True):
-        stage.paint(axes, int(frame))
+    height = size * sum(stage.height for stage in stages) + 0.3 * len(stages)
+    columns = min(count, max(len(stage.time) for stage in stages))
+    canvas = Figure(figsize=(size * columns, height), layout="constrained")
+    rows = canvas.subplots(len(stages), columns, squeeze=False)
+    for stage, row in zip(stages, rows, strict=True):
+        chosen = np.linspace(0, len(stage.time) - 1, columns).round().astype(int)
+        for axes, frame in zip(row, chosen, strict=True):
+            stage.paint(axes, int(frame))
     write_figure(canvas, path, dpi=150)
 
 
-def _animate(stage: _Stage, path: Path, size: float, rate: float) -> None:
+def _animate(stages: list[_Stage], path: Path, size: float, rate: float) -> None:
     from matplotlib.animation import FFMpegWriter, PillowWriter
     from matplotlib.figure import Figure
 
-    suffix, time = path.suffix.lower(), stage.time
+    suffix = path.suffix.lower()
+    first, last = min(stage.time[0] for stage in stages), max(stage.time[-1] for stage in stages)
     if suffix == ".gif":
         rate = 100.0 / max(2, round(100.0 / rate))  # a frame of a GIF stands for whole hundredths of a second
     # evenly in simulated time: a film of fewer steps shows one for longer
-    wanted = np.arange(time[0], time[-1] + 0.5 / rate, 1.0 / rate)
-    chosen = np.searchsorted(time, wanted - 1e-9).clip(0, len(time) - 1)
-    canvas = Figure(figsize=(size, size * stage.height + 0.3), layout="constrained")
-    axes = canvas.subplots()
+    wanted = np.arange(first, last + 0.5 / rate, 1.0 / rate)
+    chosen = np.stack(
+        [np.searchsorted(s.time, wanted - 1e-9).clip(0, len(s.time) - 1) for s in stages], axis=1
+    )
+    height = size * max(stage.height for stage in stages) + 0.3
+    canvas = Figure(figsize=(size * len(stages), height), layout="constrained")
+    row = canvas.subplots(1, len(stages), squeeze=False)[0]
     # a shade slower: the milliseconds of a frame, rounded down, are those meant
     kind, own = (PillowWriter, rate * (1.0 - 1e-9)) if suffix == ".gif" else (FFMpegWriter, rate)
     writer: Any = kind(fps=own)  # type: ignore[arg-type]
 
     def write(part: Path) -> None:
         made = Path(f"{part}{suffix}")  # whose suffix tells the format
+        before = np.full(len(stages), -1)
         try:
             with writer.saving(canvas, str(made), dpi=DPI):
-                for before, frame in zip((-1, *chosen), chosen, strict=False):
-                    if frame != before:
-                        stage.paint(axes, int(frame))
+                for frames in chosen:
+                    for stage, axes, frame, shown in zip(stages, row, frames, before, strict=True):
+                        if frame != shown:
+                            stage.paint(axes, int(frame))
+                    before = frames
                     writer.grab_frame()
             made.replace(part)
         finally:

@@ -122,6 +122,7 @@ def run(
     parameters: Mapping[str, Any] | None = None,
     limit: float = LIMIT,
     show: Callable[[Record], None] = lambda record: None,
+    keep: Callable[[Record, Track], None] = lambda record, track: None,
 ) -> list[Record]:
     """Measure phenomena.
 
@@ -138,6 +139,8 @@ def run(
         Wall time of one case in an engine of others [s].
     show : callable
         Called with every record as it comes.
+    keep : callable
+        Called with a record and the finite motion that it was measured of.
 
     Returns
     -------
@@ -162,7 +165,7 @@ def run(
     apart = Apart(limit)
     try:
         for way in chosen_ways:
-            for record in _measure(way, plan, apart):
+            for record in _measure(way, plan, apart, keep):
                 found.append(record)
                 show(record)
     finally:
@@ -170,7 +173,12 @@ def run(
     return found
 
 
-def _measure(way: Way, plan: list[tuple[Phenomenon, dict[str, float]]], apart: Apart) -> Iterator[Record]:
+def _measure(
+    way: Way,
+    plan: list[tuple[Phenomenon, dict[str, float]]],
+    apart: Apart,
+    keep: Callable[[Record, Track], None],
+) -> Iterator[Record]:
     lack = way.missing()
     for phenomenon, case in plan:
         note = lack or next((way.cannot[x] for x in sorted(phenomenon.needs) if x in way.cannot), "")
@@ -180,7 +188,10 @@ def _measure(way: Way, plan: list[tuple[Phenomenon, dict[str, float]]], apart: A
         if isinstance(found, str):
             yield Record(phenomenon.name, way.name, case, note=found)
         else:
-            yield judged(phenomenon, way.name, case, found)
+            record = judged(phenomenon, way.name, case, found)
+            if not record.note:
+                keep(record, found)
+            yield record
 
 
 def _one(way: Way, phenomenon: Phenomenon, case: dict[str, float], apart: Apart) -> Track | str:

@@ -4,17 +4,22 @@ import dataclasses
 import importlib.util
 import json
 import math
+import os
 import re
+import sys
 
 import numpy as np
 import pytest
 from click.testing import CliRunner
 
 import lavender as lv
+from lavender.apart.lines import Lines
 from lavender.cli.entry import cli
+from lavender.errors import LavenderError
 from lavender.phenomena import PHENOMENA, WAYS, Record, Track, motion, run, ways
 from lavender.phenomena import table as tables
-from lavender.phenomena.engines import follow, make
+from lavender.phenomena.engines import PACKAGES_OF_NODE, follow, make, versions_of_node
+from lavender.phenomena.film import save_film
 from lavender.phenomena.parts import crossing, judged
 from lavender.phenomena.running import Apart
 from lavender.scene.steppers import STEPPERS
@@ -217,6 +222,95 @@ def test_an_engine_that_is_missing_is_a_note(monkeypatch):
     assert not record.passed
 
 
+def test_an_engine_without_what_a_scene_needs_is_a_note_and_starts_no_process(monkeypatch):
+    bare = dataclasses.replace(OTHERS[0], package="", cannot={"hinge": "it has no hinges"})
+    monkeypatch.setitem(WAYS, bare.name, bare)
+    monkeypatch.setattr("lavender.phenomena.running.Process", None)  # a start would fail
+    (record,) = run(["pendulum"], steppers=[], engines=[bare.name], parameters={})
+    assert (record.note, record.values, record.passed) == ("it has no hinges", {}, False)
+
+
+# -- engines under Node ---------------------------------------------------------------------------
+
+
+class Answers:
+    """In the place of the other process: what it was told to say, one answer after the other."""
+
+    said = ()
+
+    def __init__(self, command):
+        self.command, self.left = command, list(self.said)
+
+    def ask(self, message):
+        assert json.loads(json.dumps(message, allow_nan=False)) == message  # a line of JSON
+        return self.left.pop(0)
+
+    def end(self):
+        self.left = None
+
+
+@pytest.fixture
+def under_node(monkeypatch, tmp_path):
+    from lavender.phenomena.engines import node
+
+    for package in PACKAGES_OF_NODE.values():
+        (tmp_path / package).mkdir(parents=True)
+        (tmp_path / package / "package.json").write_text('{"version": "1.2.3"}')
+    monkeypatch.setenv("NODE_PATH", f"{tmp_path / 'nowhere'}{os.pathsep}{tmp_path}")
+    monkeypatch.setattr(node, "Lines", Answers)
+
+    def made(*said):
+        monkeypatch.setattr(Answers, "said", said)
+        return make(WAYS["rapier"], PHENOMENA["stick"].scene())
+
+    return made
+
+
+def test_poses_that_an_engine_under_node_loses_are_a_note(under_node):
+    p = PHENOMENA["stick"]
+    state = [0.0, 0.0, 0.0, 1.0, *[0.0] * 9] * 2
+    lost = [*state[:13], None, *state[14:]]  # JSON has no nan
+    engine = under_node(*({"cpu": 0.5, "state": x} for x in (state, state, lost)))
+    track = follow(engine, 3 / 60, 1 / 60)
+    assert len(track.time) == 3  # it ends with what is not finite
+    assert track.cpu == pytest.approx(1.0 / (2 / 60))  # of the other process, without what building took
+    assert "not finite from 0.0333 s" in judged(p, "rapier", p.values(), track).note
+
+
+def test_what_an_engine_under_node_says_is_told(under_node):
+    with pytest.raises(lv.CapabilityError, match="no such shape"):
+        under_node({"cannot": "no such shape"})
+    with pytest.raises(LavenderError, match="unreachable"):
+        under_node({"error": "unreachable"})
+
+
+def test_packages_of_node_are_found_or_what_to_install_is_said(under_node, monkeypatch, tmp_path):
+    monkeypatch.setattr("lavender.phenomena.engines.shutil.which", lambda name: name)
+    assert WAYS["rapier"].missing() == ""
+    assert versions_of_node() == dict.fromkeys(PACKAGES_OF_NODE.values(), "1.2.3")
+    monkeypatch.delenv("NODE_PATH")
+    monkeypatch.chdir(tmp_path)
+    assert "not installed: npm install jolt-physics" in WAYS["jolt"].missing()
+    with pytest.raises(LavenderError, match="npm install @dimforge/rapier3d-compat"):
+        under_node()
+    monkeypatch.setattr("lavender.phenomena.engines.shutil.which", lambda name: None)
+    assert "under Node" in WAYS["jolt"].missing()
+
+
+def test_a_program_is_asked_by_lines_and_its_end_is_told():
+    echo = "import sys\nfor line in sys.stdin:\n    if '7' in line: sys.exit(3)\n    print(line, flush=True, end='')"
+    lines = Lines([sys.executable, "-c", echo])
+    try:
+        assert lines.ask({"a": [1.5, "ü"]}) == {"a": [1.5, "ü"]}
+        with pytest.raises(EOFError, match="status 3"):
+            lines.ask(7)
+    finally:
+        lines.end()
+    lines = Lines([sys.executable, "-c", "import time; time.sleep(60)"])
+    lines.end()
+    assert lines._process.returncode is not None
+
+
 def test_a_stepper_that_does_not_take_a_scene_is_a_note_and_the_others_go_on():
     found = run(["spin_down"], steppers=["xpbd", "impulses"], parameters={})
     notes = {r.engine: r.note for r in found}
@@ -270,9 +364,45 @@ def test_the_command(tmp_path):
     assert all(r["setting"] for r in told["records"])
 
 
+@pytest.mark.parametrize("suffix", ["gif", "png"])
+def test_a_film_shows_engines_beside_each_other(suffix, tmp_path):
+    image = pytest.importorskip("PIL.Image")
+    sizes = []
+    for names in ("impulses newton", "impulses newton,soft_step 16x4"):
+        path = tmp_path / f"film.{suffix}"
+        words = ["lift", "--steppers", names, "--set", "speed=1", "--film", str(path), "--magnify", "10"]
+        done = CliRunner().invoke(cli, ["phenomena", *words])
+        assert done.exit_code == 0, done.output
+        with image.open(path) as found:
+            sizes.append(found.size)
+    side = 0 if suffix == "gif" else 1  # a strip has a row for each
+    assert sizes[1][side] > 1.5 * sizes[0][side]
+
+
+def test_a_film_tells_distances_from_its_first_engine_magnified(tmp_path, monkeypatch):
+    p = PHENOMENA["lift"]
+    case = p.values({})
+    scene = p.scene(case)
+    t, x = np.arange(3) / 60, np.array([b.position for b in scene.bodies])
+    still = Track(t, np.tile(x, (3, 1, 1)), np.tile([1.0, 0, 0, 0], (3, 2, 1)), np.zeros((3, 2, 6)))
+    high = dataclasses.replace(still, positions=still.positions + np.array([0.0, 0.0, 0.01]))
+    seen = {}
+    monkeypatch.setattr(
+        "lavender.phenomena.film.save_picture", lambda films, path, **more: seen.update(films)
+    )
+    save_film(p, case, {"a": still, "b": high}, tmp_path / "x.gif", magnify=5.0)
+    np.testing.assert_allclose(seen["a"].positions, still.positions, atol=1e-6)  # a film keeps 32 bits
+    np.testing.assert_allclose(seen["b"].positions[..., 2], still.positions[..., 2] + 0.05, atol=1e-6)
+    with pytest.raises(lv.InputError, match="no engine"):
+        save_film(p, case, {}, tmp_path / "x.gif")
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [
+        (["stick", "lift", "--film", "x.gif"], "takes one phenomenon"),
+        (["stick", "--film", "x.txt", "--steppers", "impulses newton"], ".gif"),
+        (["--motion", "--film", "x.gif"], "scenes are its own"),
         (["nothing"], "unknown phenomenon"),
         (["stick", "--set", "slope=3"], "0 to 0.99 is needed"),
         (["stick", "--set", "speed=3"], "speed"),

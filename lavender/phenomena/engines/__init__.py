@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
+import json
+import os
+import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from time import process_time
 from typing import Any
 
@@ -16,8 +20,20 @@ from lavender.phenomena.parts import Track
 from lavender.scene import Scene
 from lavender.scene.steppers import STEPPERS
 
-__all__ = ["WAYS", "Stepping", "Way", "follow", "make"]
+__all__ = [
+    "PACKAGES_OF_NODE",
+    "WAYS",
+    "Stepping",
+    "Way",
+    "follow",
+    "make",
+    "missing_in_node",
+    "node_folder",
+    "versions_of_node",
+]
 
+PACKAGES_OF_NODE = {"rapier": "@dimforge/rapier3d-compat", "jolt": "jolt-physics"}  # engine -> package of npm
+NO_TORSION = {"spin": "it has no friction against spinning"}
 NO_SPIN = "its friction against spinning has no radius that could be given"
 
 
@@ -30,6 +46,15 @@ class Stepping:
     def step(self) -> Any:
         """One step of dt."""
         raise NotImplementedError
+
+    def advance(self, steps: int) -> None:
+        """So many steps."""
+        for _ in range(steps):
+            self.step()
+
+    def clock(self) -> float:
+        """CPU time that the steps took, from any moment on [s]."""
+        return process_time()
 
     def state(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Positions (n, 3) [m], quaternions (n, 4) w x y z, velocities (n, 6) [m/s, rad/s] in the world."""
@@ -57,9 +82,35 @@ class Way:
 
     def missing(self) -> str:
         """What it lacks here; empty where it can run."""
+        if self.module == "node":
+            lack = missing_in_node(self.package)
+            return f"not installed: {lack}" if lack else ""
         if not self.package or importlib.util.find_spec(self.package):
             return ""
         return f"not installed: pip install {self.package.replace('pydrake', 'drake')}"
+
+
+def node_folder(package: str) -> Path | None:
+    """Where npm has put a package: in node_modules of the current folder, or a folder of NODE_PATH; None: nowhere."""
+    more = filter(None, os.environ.get("NODE_PATH", "").split(os.pathsep))
+    found = (Path(place) / package for place in ("node_modules", *more))
+    return next((p.resolve() for p in found if (p / "package.json").is_file()), None)
+
+
+def versions_of_node() -> dict[str, str]:
+    """Version of each package of npm that is here."""
+    places = {name: place for name in PACKAGES_OF_NODE.values() if (place := node_folder(name))}
+    return {
+        name: str(json.loads((place / "package.json").read_text(encoding="utf-8"))["version"])
+        for name, place in places.items()
+    }
+
+
+def missing_in_node(package: str) -> str:
+    """What a package of npm lacks to run here; empty where it can."""
+    if shutil.which("node") is None:
+        return "it runs under Node, https://nodejs.org"
+    return "" if node_folder(package) else f"npm install {package} in this folder, or its folder in NODE_PATH"
 
 
 FINE = {"substeps": 16, "solver_iterations": 4}
@@ -132,8 +183,40 @@ def _others() -> list[Way]:
     return found
 
 
+def _under_node() -> list[Way]:
+    settings: tuple[tuple[str, dict[str, Any], str], ...] = (
+        ("rapier", {"iterations": 4}, "1/60 s, 4 iterations: its defaults"),
+        ("rapier 16", {"iterations": 16}, "1/60 s, 16 iterations"),
+        ("jolt", {"sweeps": 10, "substeps": 1, "gyroscopic": False}, "1/60 s, 10 sweeps: its defaults"),
+        (
+            "jolt 4",
+            {"sweeps": 10, "substeps": 4, "gyroscopic": True},
+            "1/60 s in 4 of 10 sweeps, gyroscopic torques",
+        ),
+    )
+    found = []
+    for name, options, text in settings:
+        engine = name.split()[0]
+        options["engine"] = engine
+        found.append(Way(name, "node", PACKAGES_OF_NODE[engine], options, text, cannot=NO_TORSION))
+    return found
+
+
+def _newton() -> list[Way]:
+    found = []
+    for name, solver, iterations, text in (
+        ("newton xpbd", "XPBD", 2, "2 iterations, its default"),
+        ("newton xpbd 20", "XPBD", 20, "20 iterations"),
+        ("newton vbd", "VBD", 10, "10 iterations, its default"),
+    ):
+        options = {"solver": solver, "iterations": iterations}
+        cannot = NO_TORSION if solver == "VBD" else {}
+        found.append(Way(name, "newton", "newton", options, f"1/60 s in 4 of {text}", cannot=cannot))
+    return found
+
+
 #: Name -> way; ours first.
-WAYS: dict[str, Way] = {way.name: way for way in (*_own(), *_others())}
+WAYS: dict[str, Way] = {way.name: way for way in (*_own(), *_others(), *_under_node(), *_newton())}
 
 
 def make(way: Way, scene: Scene) -> Stepping:
@@ -148,12 +231,10 @@ def follow(engine: Stepping, seconds: float, look: float) -> Track:
     every = max(1, round(look / engine.dt))
     looks = max(2, int(np.ceil(seconds / (every * engine.dt) - 1e-9)))
     states, spent, done = [engine.state()], 0.0, 0
-    step = engine.step
     for _ in range(looks):
-        begin = process_time()
-        for _ in range(every):
-            step()
-        spent += process_time() - begin
+        begin = engine.clock()
+        engine.advance(every)
+        spent += engine.clock() - begin
         done += every
         states.append(engine.state())
         if not all(np.isfinite(x).all() for x in states[-1]):

@@ -1,0 +1,64 @@
+"""One phenomenon in several engines beside each other, as pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from lavender._arrays import FloatArray
+from lavender.engine import Film, Simulation
+from lavender.engine.picture import save_picture
+from lavender.errors import InputError
+from lavender.phenomena.parts import Phenomenon, Track, Values
+
+__all__ = ["save_film"]
+
+FRAMES = 40  # of an animation, about
+SIZE = 2.0  # inch, of one engine's picture
+TURN, TILT = 0.25, 0.1  # rad, of the eye
+
+
+def save_film(
+    phenomenon: Phenomenon, case: Values, tracks: Mapping[str, Track], path: Path, magnify: float = 1.0
+) -> Path:
+    """Write a picture of what each engine did of one case.
+
+    Parameters
+    ----------
+    phenomenon : Phenomenon
+    case : its parameters
+    tracks : name of an engine -> its track
+    path : path
+        As `lavender.engine.picture.save_picture` takes it.
+    magnify : float
+        Distances from the first track are shown so many times as large.
+
+    Raises
+    ------
+    InputError
+        No track, a path that cannot be written, another suffix.
+    """
+    if not tracks:
+        raise InputError("no engine gave a motion to film")
+    scene = phenomenon.scene(case)
+    header = Simulation(scene).start_film().header
+    films: dict[str, Film] = {}
+    first = next(iter(tracks.values()))
+    for name, track in tracks.items():
+        film = films[name] = Film(header)
+        base = _at(first, track.time)
+        places = base + magnify * (track.positions - base)
+        for time, place, turn in zip(track.time, places, track.quaternions, strict=True):
+            film.add(float(time), {"solver": 0.0, "positions": place, "quaternions": turn})
+    rate = max(1, min(12, int(FRAMES / max(track.time[-1] for track in tracks.values()))))
+    return save_picture(films, path, turn=TURN, tilt=TILT, size=SIZE, rate=rate)
+
+
+def _at(track: Track, time: FloatArray) -> FloatArray:
+    """Positions (len(time), n, 3) [m] at these times, between two looks by a straight line."""
+    k, n = track.positions.shape[:2]
+    flat = track.positions.reshape(k, -1)
+    found = np.stack([np.interp(time, track.time, column) for column in flat.T], axis=1)
+    return found.reshape(len(time), n, 3)
