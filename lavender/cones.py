@@ -379,7 +379,9 @@ class Cones:
                 )
             radius[self.kind == CONTACT_BOX] = 0.0
             kind[self.kind == CONTACT_BOX] = CONTACT
-        return Cones(self.ptr, kind, self.lower, self.upper, self.mu, radius)
+        return Cones(
+            ptr=self.ptr, kind=kind, lower=self.lower, upper=self.upper, mu=self.mu, patch_radius=radius
+        )
 
     def __add__(self, other: object) -> Cones:
         """These blocks, then those of `other`."""
