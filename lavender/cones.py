@@ -266,8 +266,8 @@ class Cones:
         elif np.ndim(mu) > 1:
             raise InputError(
                 f"mu has shape {np.shape(mu)}; one for each contact is needed. Two make an ellipse of the disk: give "
-                "mu_1 here, multiply row and column of the second tangent in A (its row of J), and its b, by "
-                "mu_2 / mu_1, and then its impulse; shape='box' takes two as they are"
+                "mu_1 here and stretch the second tangent by mu_2 / mu_1 (problem.stretched); shape='box' takes two as "
+                "they are"
             )
         spin = patch_radius is not None
         if tangents > 2 and spin:

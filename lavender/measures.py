@@ -60,7 +60,7 @@ def siconos_error(problem: Problem, impulse: ArrayLike) -> dict[str, float]:
             out[s] = lam[s] - np.clip(lam[s] - u[s], c.lower[s], c.upper[s])
             continue
         if c.kind[i] != 1:
-            raise InputError("siconos_error has no spin rows")
+            raise InputError("siconos_error has no spin rows, and no boxes: its friction is a disk")
         z = lam[s] - u[s]
         z[0] -= c.mu[i] * np.linalg.norm(u[s][1:])
         out[s] = lam[s] - _project_unit_cone(z, float(c.mu[i]))

@@ -168,7 +168,7 @@ class ThroughRows:
     ) -> Claim:
         """At most n iterations; the claim is of the problem itself."""
         if not isinstance(held, Held):
-            return self.solver.run(held, impulse, n, tol, time_limit)  # type: ignore[no-any-return]
+            return self.solver.run(held, impulse, n, tol, time_limit)
         form = held.form
         z, start = form.start(impulse), perf_counter()
         claim: Claim = self.solver.run(held.state, z, n, tol, time_limit)

@@ -2,8 +2,9 @@
 
 A block is one or more bounded rows (ROW), or a contact: a normal row, then 0, 1 or 2 tangent rows
 (CONTACT), then one spin row (CONTACT_SPIN); or a normal and two tangents, each bounded by itself (CONTACT_BOX, in
-(1) to (7) a contact of one tangent and, in the place of spin, the other: r is then mu_2 / mu_1); or a contact of three to five tangents in one cone (ROUND:
-two that slide, one that spins, two that roll, scaled to one mu; law CONE only). With w = A lam - b [m/s] and d = diag(A) [1/kg]:
+(1) to (7) a contact of one tangent and, in the place of spin, the other: r is then mu_2 / mu_1); or a contact of
+three to five tangents in one cone (ROUND: two that slide, one that spins, two that roll, scaled to one mu; law CONE
+only). With w = A lam - b [m/s] and d = diag(A) [1/kg]:
 
     update   row      lam  <- clip(lam - w / d, lower, upper)                                  (1)
              normal   lam_n <- max(0, lam_n - w_n / d_n)                                       (2)
