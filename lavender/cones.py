@@ -14,7 +14,7 @@ perhaps one spin row. With lambda [N s] the bounds are
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -362,9 +362,9 @@ class Cones:
         InputError
             A contact of two tangents and spin, or a round cone, as a box; a box of two coefficients as a disk.
         """
-        kind, radius, two = self.kind.copy(), self.patch_radius.copy(), self.n_tangents == 2
+        kind, radius, two = self.kind.copy(), self.patch_radius.copy(), self.n_tangents > 1
         if check_shape("shape", shape) == "box":
-            bad = np.flatnonzero((self.n_tangents > 1) & ((self.kind == CONTACT_SPIN) | (self.kind == ROUND)))
+            bad = np.flatnonzero(two & ~np.isin(self.kind, (CONTACT, CONTACT_BOX)))
             if len(bad):
                 raise InputError(
                     f"block {bad[0]} has more rows than a normal and two tangents; no box bounds its spin"
@@ -379,9 +379,7 @@ class Cones:
                 )
             radius[self.kind == CONTACT_BOX] = 0.0
             kind[self.kind == CONTACT_BOX] = CONTACT
-        return Cones(
-            ptr=self.ptr, kind=kind, lower=self.lower, upper=self.upper, mu=self.mu, patch_radius=radius
-        )
+        return replace(self, kind=kind, patch_radius=radius)
 
     def __add__(self, other: object) -> Cones:
         """These blocks, then those of `other`."""

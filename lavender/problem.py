@@ -982,7 +982,7 @@ class Problem:
             raise InputError(f"scale of {self.row_name(i)} is {s[i]}; {needed} is needed")
         rows = np.repeat(c.kind == ROW, np.diff(c.ptr))
         low, high = (np.where(rows, x / s, x) for x in (c.lower, c.upper))
-        cones = Cones(ptr=c.ptr, kind=c.kind, lower=low, upper=high, mu=c.mu, patch_radius=c.patch_radius)
+        cones = replace(c, lower=low, upper=high)
         guess = None if self.guess is None else self.guess / s
         more: dict[str, Any] = {"guess": guess, "key": self.key, "names": self.names, "name": self.name}
         more["friction"] = self.friction

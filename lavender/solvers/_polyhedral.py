@@ -107,8 +107,12 @@ def as_rows(problem: Problem) -> AsRows:
         high += [np.inf] * count
     n = len(low)
     e = _sparse(entries, (problem.m, n))
-    a = sp.csr_array(e.T @ (problem.csr @ e)) + _sparse(more, (n, n))
-    rows = Problem.lcp(sp.csr_array(a), e.T @ problem.b, np.array(low), np.array(high), copy=False)
+    with np.errstate(all="ignore"):
+        a = sp.csr_array(e.T @ (problem.csr @ e)) + _sparse(more, (n, n))
+        b = e.T @ problem.b
+    if not (np.isfinite(a.data).all() and np.isfinite(b).all()):
+        raise OverflowError("A or b, times coefficients of friction, is beyond float64")
+    rows = Problem.lcp(sp.csr_array(a), b, np.array(low), np.array(high), copy=False)
     return AsRows(problem, rows, e)
 
 
