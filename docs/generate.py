@@ -261,7 +261,10 @@ def abilities(spec):
         "history": "`history=True`",
     }
     rows = [
-        ("laws", join_laws(spec)),
+        (
+            "laws",
+            join_laws(spec) + (f"; boxes under {' and '.join(sorted(spec.boxes))}" if spec.boxes else ""),
+        ),
         ("reads", "; ".join(text for name, text in reads.items() if name in spec.operators)),
         (
             "ends",

@@ -16,7 +16,7 @@ perhaps one spin row, perhaps two rows that roll. With lambda [N s] the bounds a
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -287,8 +287,8 @@ class Cones:
         elif np.ndim(mu) > 1:
             raise InputError(
                 f"mu has shape {np.shape(mu)}; one for each contact is needed. Two make an ellipse of the disk: give "
-                "mu_1 here, multiply row and column of the second tangent in A (its row of J), and its b, by "
-                "mu_2 / mu_1, and then its impulse; shape='box' takes two as they are"
+                "mu_1 here and stretch the second tangent by mu_2 / mu_1 (problem.stretched); shape='box' takes two as "
+                "they are"
             )
         spin = patch_radius is not None
         if tangents > 2 and spin:
@@ -392,11 +392,9 @@ class Cones:
         InputError
             A contact of two tangents and spin, or a round cone, as a box; a box of two coefficients as a disk.
         """
-        kind, radius, two = self.kind.copy(), self.patch_radius.copy(), self.n_tangents == 2
+        kind, radius, two = self.kind.copy(), self.patch_radius.copy(), self.n_tangents > 1
         if check_shape("shape", shape) == "box":
-            bad = np.flatnonzero(
-                (self.n_tangents > 1) & (np.isin(self.kind, (CONTACT_SPIN, ROUND, CONTACT_ROLLING)))
-            )
+            bad = np.flatnonzero(two & ~np.isin(self.kind, (CONTACT, CONTACT_BOX)))
             if len(bad):
                 raise InputError(
                     f"block {bad[0]} has more rows than a normal and two tangents; no box bounds its spin or rolling"
@@ -411,7 +409,7 @@ class Cones:
                 )
             radius[self.kind == CONTACT_BOX] = 0.0
             kind[self.kind == CONTACT_BOX] = CONTACT
-        return Cones(self.ptr, kind, self.lower, self.upper, self.mu, radius, self.rolling)
+        return replace(self, kind=kind, patch_radius=radius)
 
     @property
     def reach(self) -> FloatArray:

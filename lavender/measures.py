@@ -61,7 +61,7 @@ def siconos_error(problem: Problem, impulse: ArrayLike) -> dict[str, float]:
             out[s] = lam[s] - np.clip(lam[s] - u[s], c.lower[s], c.upper[s])
             continue
         if c.apart_rows[i] >= 0 or c.kind[i] == ROUND:
-            raise InputError("siconos_error has neither spin rows nor boxes")
+            raise InputError("siconos_error has no spin rows, and no boxes: its friction is a disk")
         z = lam[s] - u[s]
         parts = [(slice(1, 1 + int(c.n_tangents[i])), float(c.mu[i]))]
         if c.rolling_rows[i] >= 0:

@@ -30,6 +30,7 @@ def solvers(problem: str | None) -> None:
             word
             for word, has in (
                 ("exact", spec.exact),
+                ("boxes", bool(spec.boxes)),
                 ("warm start", spec.impulse),
                 ("budget", spec.resumable),
                 ("order", spec.order),

@@ -93,7 +93,12 @@ def blocks_of(lower: Any, upper: Any, findex: Any, m: int) -> tuple[IntArray, Co
     box = Cones.contacts(mu, shape="box")
     radius = np.where(kind == CONTACT_BOX, box.patch_radius, 0.0)
     return order, Cones(
-        ptr, kind, low[order], high[order], np.where(kind == CONTACT_BOX, box.mu, mu[:, 0]), radius
+        ptr=ptr,
+        kind=kind,
+        lower=low[order],
+        upper=high[order],
+        mu=np.where(kind == CONTACT_BOX, box.mu, mu[:, 0]),
+        patch_radius=radius,
     )
 
 

@@ -12,6 +12,7 @@ import scipy.sparse as sp
 from lavender._arrays import ArrayLike, FloatArray, as_array, check_not_negative
 from lavender.cones import ROW, Cones
 from lavender.errors import InputError
+from lavender.generalized import Generalized
 from lavender.problem.builders import Builders
 
 
@@ -141,6 +142,61 @@ class Problem(Builders):
             "coulomb" for round cones of more than two tangents.
         """
         return replace(self, friction=friction, copy=False)
+
+    def stretched(self, scale: ArrayLike) -> Problem:
+        """The same problem with rows `scale` times as long, whose impulses are those here over `scale`.
+
+            A' = S A S,   b' = S b,   lambda = S lambda',   w' = S w,   S = diag(scale)
+
+        Rows of bodies become a matrix. A disk of stretched tangents is an ellipse of those here.
+
+        Parameters
+        ----------
+        scale : scalar or (m,)
+            Above 0; of a contact's normal 1.
+
+        Raises
+        ------
+        InputError
+            A scale that is not above 0, or not 1 at the normal of a contact.
+
+        Examples
+        --------
+        An ellipse, mu 0.5 along the first tangent and 0.2 along the second:
+
+        >>> import numpy as np
+        >>> import lavender as lv
+        >>> A, b = np.eye(3), np.array([10.0, 9.0, 9.0])
+        >>> scale = np.array([1.0, 1.0, 0.2 / 0.5])
+        >>> ellipse = lv.Problem.contact(A, b, [0.5]).stretched(scale)
+        >>> impulse = scale * lv.solve(ellipse, tol=1e-9).impulse
+        >>> round(float(np.hypot(impulse[1] / 0.5, impulse[2] / 0.2) / impulse[0]), 6)  # it slides: on the rim
+        1.0
+        """
+        s = as_array("scale", scale, (self.m,))
+        c = self.cones
+        normal = c.ptr[:-1][c.kind != ROW]
+        wrong = np.flatnonzero(~(s > 0.0))
+        if len(wrong) or np.any(s[normal] != 1.0):
+            i = int(wrong[0]) if len(wrong) else int(normal[s[normal] != 1.0][0])
+            needed = "a number above 0" if len(wrong) else "1"
+            raise InputError(f"scale of {self.row_name(i)} is {s[i]}; {needed} is needed")
+        rows = np.repeat(c.kind == ROW, np.diff(c.ptr))
+        low, high = (np.where(rows, x / s, x) for x in (c.lower, c.upper))
+        cones = replace(c, lower=low, upper=high)
+        guess = None if self.guess is None else self.guess / s
+        more: dict[str, Any] = {"guess": guess, "key": self.key, "names": self.names, "name": self.name}
+        more["friction"] = self.friction
+        if self.generalized is None:
+            a = sp.csr_array(sp.diags_array(s) @ self.csr @ sp.diags_array(s))
+            return Problem(s * self.b, cones, a, copy=False, **more)
+        g = self.generalized
+        jac = sp.csr_array(sp.diags_array(s) @ g.jac)
+        assert self.compliance is not None
+        made = Generalized(jac, g.mass, g.v_free, g.names)
+        return Problem(
+            s * self.b, cones, generalized=made, compliance=s * s * self.compliance, copy=False, **more
+        )
 
     def boxed(self, normal_impulse: ArrayLike) -> Problem:
         """Friction bounded by fixed normals: |lambda_t| <= mu N on each tangent alone: a square, not the disk.

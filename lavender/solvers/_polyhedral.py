@@ -25,11 +25,12 @@ import scipy.sparse as sp
 from lavender._arrays import FloatArray
 from lavender.certificates import check_certificate
 from lavender.cones import ROW, project
+from lavender.deadline import Deadline
 from lavender.problem import Problem
 from lavender.residuals import at_floor, quick
 from lavender.solution import Claim, Status
 
-__all__ = ["AsRows", "ThroughRows", "as_rows"]
+__all__ = ["AsRows", "ThroughRows", "as_rows", "count_rows"]
 
 
 @dataclass(frozen=True)
@@ -106,9 +107,22 @@ def as_rows(problem: Problem) -> AsRows:
         high += [np.inf] * count
     n = len(low)
     e = _sparse(entries, (problem.m, n))
-    a = sp.csr_array(e.T @ (problem.csr @ e)) + _sparse(more, (n, n))
-    rows = Problem.lcp(sp.csr_array(a), e.T @ problem.b, np.array(low), np.array(high), copy=False)
+    with np.errstate(all="ignore"):
+        a = sp.csr_array(e.T @ (problem.csr @ e)) + _sparse(more, (n, n))
+        b = e.T @ problem.b
+    if not (np.isfinite(a.data).all() and np.isfinite(b).all()):
+        raise OverflowError("A or b, times coefficients of friction, is beyond float64")
+    rows = Problem.lcp(sp.csr_array(a), b, np.array(low), np.array(high), copy=False)
     return AsRows(problem, rows, e)
+
+
+def count_rows(problem: Problem) -> int:
+    """At most so many rows, n: what (1) or (2) of a problem without disks has."""
+    c = problem.cones
+    if problem.law == "cone":
+        sides = np.where(c.kind == ROW, 0, np.diff(c.ptr) - 1)
+        return int(np.where(c.kind == ROW, np.diff(c.ptr), 2**sides).sum())
+    return problem.m + (2 * int((np.diff(c.ptr) - 1)[c.kind != ROW].sum()) if problem.law == "coulomb" else 0)
 
 
 def _sparse(entries: list[tuple[int, int, float]], shape: tuple[int, int]) -> sp.csr_array:
@@ -125,42 +139,58 @@ def _whole(y: FloatArray) -> FloatArray:
 
 @dataclass
 class Held:
-    """State of the solver inside, and what its rows stand for, where they stand for anything."""
+    """State of the solver inside, and what its rows stand for."""
 
-    form: AsRows | None
+    form: AsRows
     state: Any
 
 
 class ThroughRows:
-    """A solver of bounded rows that also takes friction of boxes."""
+    """A solver of bounded rows that also takes friction of boxes.
+
+    Where the solver has `otherwise()`, the one of it follows what did not end at a solution.
+    """
 
     def __init__(self, solver: Any) -> None:
         self.solver = solver
         if hasattr(solver, "ready"):
             self.ready = solver.ready
 
-    def prepare(self, problem: Problem) -> Held:
+    def prepare(self, problem: Problem) -> Any:
         """Its state, of the problem or of (1), (2)."""
         if problem.law in ("linear", "lcp"):
-            return Held(None, self.solver.prepare(problem))
+            return self.solver.prepare(problem)
         form = as_rows(problem)
         return Held(form, self.solver.prepare(form.rows))
 
-    def update(self, held: Held, problem: Problem) -> Held:
+    def update(self, held: Any, problem: Problem) -> Any:
         """The same structure with new numbers; coefficients that became 0 change that of the rows."""
-        if held.form is None:
-            return Held(None, self.solver.update(held.state, problem))
-        return self.prepare(problem)
+        return self.prepare(problem) if isinstance(held, Held) else self.solver.update(held, problem)
 
     def run(
-        self, held: Held, impulse: FloatArray, n: int, tol: float, time_limit: float | None = None
+        self, held: Any, impulse: FloatArray, n: int, tol: float, time_limit: float | None = None
     ) -> Claim:
         """At most n iterations; the claim is of the problem itself."""
+        if not isinstance(held, Held):
+            return self.solver.run(held, impulse, n, tol, time_limit)
         form = held.form
-        if form is None:
-            return self.solver.run(held.state, impulse, n, tol, time_limit)
-        z = form.start(impulse)
+        z, deadline = form.start(impulse), Deadline(time_limit)
         claim: Claim = self.solver.run(held.state, z, n, tol, time_limit)
+        claim = self._judged(form, claim, z, impulse, tol)
+        other = getattr(self.solver, "otherwise", None)
+        if other is None or claim.status not in (Status.STALLED, Status.NUMERICAL_ERROR):
+            return claim
+        z = form.start(impulse)
+        path = other()
+        more = self._judged(
+            form, path.run(path.prepare(form.rows), z, n, tol, deadline.left(1e-3)), z, impulse, tol
+        )
+        work = {k: claim.work.get(k, 0) + more.work.get(k, 0) for k in {**claim.work, **more.work}}
+        words = f"{claim.message or 'no exchange helped'}, then complementary pivots"
+        return replace(more, work=work, message=f"{words}: {more.message}" if more.message else words)
+
+    def _judged(self, form: AsRows, claim: Claim, z: FloatArray, impulse: FloatArray, tol: float) -> Claim:
+        """The claim of z (n,) as one of the problem, lambda (m,) in place."""
         found = project(form.problem.cones, form.back @ z)
         if not np.isfinite(found).all():
             return replace(claim, status=Status.NUMERICAL_ERROR, certificate=None, dual=None)

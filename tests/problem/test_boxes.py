@@ -259,10 +259,11 @@ def test_lemke_finds_one_of_all_solutions(seed):
     assert min(np.abs(x - y).max() for y in truth) < 1e-9 * (1.0 + np.abs(x).max())
 
 
+@pytest.mark.parametrize("name", ["lemke", "direct"])
 @pytest.mark.parametrize("seed", range(60))
-def test_lemke_ends_on_every_problem(seed):
+def test_pivoting_ends_on_every_problem(seed, name):
     problem = free(seed, contacts=2 + seed % 7)
-    solution = lv.solve(problem, "lemke", tol=1e-10)
+    solution = lv.solve(problem, name, tol=1e-10)
     assert solution.status is lv.Status.CONVERGED, solution
     assert not solution.contradicted
 
@@ -369,7 +370,7 @@ def test_no_impulse_meets_every_row():
     g = np.zeros(6)
     g[[0, 3]] = 1.0, -1.0
     a = np.outer(g, g) + np.diag([0, 1.0, 1.0, 0, 1.0, 1.0])
-    for law, name in (("coulomb", "lemke"), ("cone", "lemke"), ("cone", "direct")):
+    for law, name in itertools.product(LAWS, ("lemke", "direct")):
         problem = lv.Problem(
             np.array([1.0, 0, 0, 1.0, 0, 0]), lv.Cones.contacts(0.5, count=2, shape="box"), a, friction=law
         )
@@ -520,3 +521,48 @@ def test_fclib_has_no_boxes(tmp_path):
     pytest.importorskip("h5py")
     with pytest.raises(lv.LavenderError, match="box"):
         as_matrix(free(3)).save(tmp_path / "box.hdf5")
+
+
+# -- an ellipse --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("form", ["matrix", "generalized", "rows"])
+def test_stretched_rows_have_the_same_solution(form):
+    base = boxes(11, "cone") if form == "rows" else free(11, friction="cone")
+    base = replace(
+        base, cones=base.cones.shaped("box") if form == "rows" else lv.Cones.contacts(0.4, count=4)
+    )
+    base = as_matrix(base) if form == "matrix" else base
+    rng = np.random.default_rng(0)
+    s = np.where(base.cones.lower == 0.0, 1.0, rng.uniform(0.3, 3.0, base.m))
+    if form != "rows":  # a disk stays one where both tangents are as long
+        s[2::3] = s[1::3]
+        mu = base.cones.mu / s[1::3]
+    else:
+        mu = base.cones.mu
+    long = base.stretched(s)
+    c = long.cones
+    if form == "rows":  # each side of a box by its own
+        first, second = (s[c.ptr[:-1][c.kind == lv.CONTACT_BOX] + k] for k in (1, 2))
+        box = c.kind == lv.CONTACT_BOX
+        mu, radius = c.mu.copy(), c.patch_radius.copy()
+        mu[box], radius[box] = mu[box] / first, radius[box] * first / second
+    else:
+        radius = c.patch_radius
+    long = replace(long, cones=lv.Cones(c.ptr, c.kind, c.lower, c.upper, mu, radius))
+    x = s * lv.solve(long, "newton", tol=1e-10).raise_for_status().impulse
+    assert lv.residual(base, x).relative < 1e-8
+    with pytest.raises(lv.InputError, match="normal is 2"):
+        free(1).stretched(2.0)
+    with pytest.raises(lv.InputError, match="above 0"):
+        free(1).stretched(np.tile([1.0, 0.0, 1.0], 4))
+
+
+def test_an_ellipse_is_the_disk_of_stretched_tangents():
+    # t = -S^2 w / |S w| n: the point of the rim that dissipates most
+    b, mu = np.array([10.0, 9.0, 5.0]), np.array([0.5, 0.2])
+    s = np.array([1.0, 1.0, mu[1] / mu[0]])
+    x = s * lv.solve(lv.Problem.contact(np.eye(3), b, [mu[0]]).stretched(s), "newton", tol=1e-12).impulse
+    w = x - b
+    rim = -(mu**2) * w[1:] / np.hypot(*(mu * w[1:])) * x[0]
+    np.testing.assert_allclose(x[1:], rim, rtol=1e-9)

@@ -214,7 +214,7 @@ def test_threads_share_a_problem_of_few_rows():
 def test_what_is_refused_is_refused_the_same_way():
     problem = draw("matrix coulomb", 1)
     with pytest.raises(lv.errors.CapabilityError, match="takes laws"):
-        lv.solve(problem, "direct")
+        lv.solve(lv.Problem.contact(np.eye(3), np.ones(3), 0.5), "direct")
     with pytest.raises(lv.errors.InputError, match="impulse"):
         lv.solve(problem, impulse=np.zeros(problem.m + 1))
     with pytest.raises(lv.errors.InputError, match="tol"):
