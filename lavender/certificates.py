@@ -112,9 +112,7 @@ def _recession_violation(problem: Problem, y: FloatArray) -> str | None:
         across = np.flatnonzero((rim > 0.0) | (spin > 0.0) | (roll > 0.0))
         if len(across):
             return f"y is not along the normal of {problem.row_name(int(first[across[0]]))}, as Coulomb friction needs"
-    beyond = (spin > limit * c.patch_radius[contact]) | (
-        roll > c.rolling[contact] * y[first] * (1 + 1e-12)
-    )
+    beyond = (spin > limit * c.patch_radius[contact]) | (roll > c.rolling[contact] * y[first] * (1 + 1e-12))
     out = np.flatnonzero((y[first] < 0.0) | (rim > limit) | beyond)
     if len(out):
         return f"y leaves the cone of {problem.row_name(int(first[out[0]]))}"

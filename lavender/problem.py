@@ -391,7 +391,9 @@ class Problem:
             raise InputError(
                 f"contact {smooth[0]} has mu {mu[smooth[0]]:g} and no tangent to feel it: give tangents=2, or mu 0"
             )
-        ptr = np.concatenate([rows.joint_ptr, mj + np.cumsum(1 + tangents + spin + 2 * rolls)]).astype(np.int32)
+        ptr = np.concatenate([rows.joint_ptr, mj + np.cumsum(1 + tangents + spin + 2 * rolls)]).astype(
+            np.int32
+        )
         kind = np.repeat(np.array([ROW, CONTACT_ROLLING if rolls else 1 + spin], np.int32), [kj, c])
         m = int(ptr[-1])
         low, high = np.full(m, -np.inf), np.full(m, np.inf)

@@ -65,7 +65,9 @@ class Parameters:
     friction: float = 0.5  # -, of bodies that say nothing else
     restitution: float = 0.0  # -, of bodies that say nothing else
     patch_radius: float = 0.0  # m, of bodies that say nothing else; 0: no spin friction
-    rolling_radius: float = 0.0  # m, mu_r of every contact with friction: a moment of at most mu_r lambda_n; 0: none
+    rolling_radius: float = (
+        0.0  # m, mu_r of every contact with friction: a moment of at most mu_r lambda_n; 0: none
+    )
     # None: 2 for "impulses", 0 for the others, which have no position projection
     position_iterations: int = None  # type: ignore[assignment]
     seed: int = 0
@@ -130,7 +132,14 @@ class Parameters:
             raise InputError(
                 f"order={self.order!r} is for sequential_impulses; give {self.solver} its own in solver_options"
             )
-        for name in ("friction", "restitution", "patch_radius", "rolling_radius", "slop", "restitution_threshold"):
+        for name in (
+            "friction",
+            "restitution",
+            "patch_radius",
+            "rolling_radius",
+            "slop",
+            "restitution_threshold",
+        ):
             put(
                 self,
                 name,
