@@ -265,7 +265,7 @@ class Problem:
         rolling: ArrayLike | None = None,
         **more: Any,
     ) -> Problem:
-        """Contacts only, m / k rows each: normal, up to two tangents, spin with `patch_radius`, two that roll with `rolling`.
+        """Contacts only, m / k rows each: normal, up to two tangents, spin with `patch_radius`, two with `rolling`.
 
         Parameters
         ----------

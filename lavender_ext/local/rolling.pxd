@@ -127,7 +127,7 @@ cdef inline int32_t rolling_contact(int32_t law, int32_t n, const double* W, con
     cdef double root[MAX_ROWS]
     cdef double a[3]
     cdef double now, next_, size, x
-    cdef int32_t i, j, k, _step, halving, start
+    cdef int32_t i, j, k, _step, _halving, start
     if not W[0] > 0.0:
         return FAILED
     for i in range(n):
@@ -159,7 +159,7 @@ cdef inline int32_t rolling_contact(int32_t law, int32_t n, const double* W, con
                     A[n * i + j] = x
             eliminate(n, A, f)
             x = 1.0
-            for halving in range(HALVINGS):
+            for _halving in range(HALVINGS):
                 for i in range(n):
                     to[i] = z[i] + x * f[i]
                 next_ = residue(law, n, H, g, a, to, out, P, &size)

@@ -19,6 +19,7 @@ from lavender.scene.steppers import STEPPERS
 __all__ = ["WAYS", "Stepping", "Way", "follow", "make"]
 
 NO_SPIN = "its friction against spinning has no radius that could be given"
+NO_ROLLING = "it has no friction against rolling"
 
 
 class Stepping:
@@ -124,7 +125,9 @@ def _others() -> list[Way]:
             "1 ms, SAP, hydroelastic bodies of 1e8 Pa",
         ),
     ):
-        found.append(Way(name, "drake", "pydrake", options, text, cannot={"spin": NO_SPIN}))
+        found.append(
+            Way(name, "drake", "pydrake", options, text, cannot={"spin": NO_SPIN, "rolling": NO_ROLLING})
+        )
     for sweeps in (22, 64):
         more = f" {sweeps}" if sweeps != 22 else ""
         text = f"1/60 s in 4 of {sweeps} sweeps"
