@@ -64,7 +64,7 @@ def _exponent(x: FloatArray) -> int:
 
 
 def _rims(problem: Problem, x: FloatArray) -> tuple[Any, Any, FloatArray, FloatArray, FloatArray]:
-    """Contact blocks and their normal rows; |x_t| over the tangents of each, |x_s| of its spin row, |x_r| of what rolls."""
+    """Contact blocks and their normal rows; |x_t| over the tangents of each, |x_s| of its spin, |x_r| of what rolls."""
     c = problem.cones
     contact = np.flatnonzero(c.kind != ROW)
     first = c.ptr[contact]

@@ -75,7 +75,7 @@ class Cones:
     patch_radius : (k,) m
         Of contacts with spin: their spin row is bounded by mu r lambda_n [N m s]. Of CONTACT_BOX mu_2 / mu_1 [-].
     rolling : (k,) m, optional
-        mu_r of CONTACT_ROLLING: what rolls is bounded by mu_r lambda_n [N m s] (Acary, Bourrier, Viano 2023); default 0.
+        mu_r of CONTACT_ROLLING: what rolls is bounded by mu_r lambda_n [N m s]; default 0. Acary, Bourrier, Viano 2023.
 
     Raises
     ------

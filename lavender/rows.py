@@ -25,8 +25,8 @@ class Rows:
 
     Bodies are numbered 0 to n - 1; -1 is static and has no number. The blocks of the problem are the kj joints, then
     the c contacts. Row of a contact from body a to body b (n normal, t1, t2 = n x t1 tangents, arms from the centres):
-    n.u, t.u with u = v_b + omega_b x arm_b - v_a - omega_a x arm_a, n.(omega_b - omega_a) for spin, t.(omega_b - omega_a) for rolling. An impulse
-    > 0 along n pushes b away from a.
+    n.u, t.u with u = v_b + omega_b x arm_b - v_a - omega_a x arm_a, n.(omega_b - omega_a) for spin and
+    t.(omega_b - omega_a) for rolling. An impulse > 0 along n pushes b away from a.
 
     Parameters
     ----------

@@ -220,8 +220,8 @@ class Stepping:
             positions (n, 3) [m], quaternions (n, 4) w x y z, velocities (n, 6) [m/s, rad/s],
             joint_impulses (mj,) [N s, N m s], solver (8,) see `SOLVER_FIELDS`, and contacts: pair (c, 2),
             point, normal, tangent (c, 3), depth (c,) [m, positive inside], impulses (c, r) [N s, N m s], the
-            rows that contacts of this scene can have: normal, two tangents, spin. Contacts and impulses are
-            those of the final substep.
+            rows that contacts of this scene can have: normal, two tangents, spin, two that roll. Contacts and
+            impulses are those of the final substep.
         reward : float
             0.0
         terminated : bool
@@ -408,6 +408,9 @@ class Stepping:
         for row in range(per):
             has = first + row < end
             out[has, row] = a["impulse"][first[has] + row]
+        if per == 6:  # what rolls stands last, with or without spin before it
+            bare = end - first == 5
+            out[bare, 3:] = np.roll(out[bare, 3:], 1, axis=1)
         return out
 
     def _info(self, lost: str = "") -> dict[str, Any]:

@@ -100,7 +100,9 @@ class Contents:
             np.concatenate([np.zeros(c) if x is None else x, np.zeros(p)]) for x in (self.mu, self.mu_r)
         )
         free = np.full(len(b), np.inf)
-        cones = Cones(ptr, kind, -free, free, mu, np.zeros(c + p), mu_r)
+        cones = Cones(
+            ptr=ptr, kind=kind, lower=-free, upper=free, mu=mu, patch_radius=np.zeros(c + p), rolling=mu_r
+        )
         guess = self._impulse(self.guesses[0]) if self.guesses else None
         name = self.info.get("title", "") or name
         return Problem(b, cones, a, guess=guess, name=name, generalized=general)

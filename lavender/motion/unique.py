@@ -16,7 +16,7 @@ Malick 2011, ZAMM 91, 155-175). For two values of s, with Z the block of A^-1 on
 friction rows (mu r on spin, mu_r on rolling), and any positive diagonal T (one entry a contact),
 
     |D lambda|_A^2 <= - D s . D lambda_n <= |D s|_Z |D lambda|_A          the cone is convex, A positive definite
-    |T D s|^2 <= c |T S (A D lambda)_t|^2 <= c max eig(T S A_tt S T) |D lambda|_A^2     c parts of a contact that are bounded apart
+    |T D s|^2 <= c |T S (A D lambda)_t|^2 <= c max eig(T S A_tt S T) |D lambda|_A^2   c parts of a contact
 
     kappa^2 = c max eig(T S A_tt S T) max eig(T^-1 Z T^-1)                                               (1)
 

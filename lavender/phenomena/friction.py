@@ -218,8 +218,8 @@ FRICTION = (
         title="a rolling ball comes to rest",
         why="tyres, balls on a lawn, wheels in gravel: without it nothing that rolls comes to rest",
         truth=(
-            "after 7 R v^2/(10 mu_r g): rolling without slip it has 7/10 m v^2, and the moment mu_r m g takes mu_r m g/R "
-            "of it on each metre; the disk holds as long as mu_r/R <= 7/5 mu"
+            "after 7 R v^2/(10 mu_r g): rolling without slip it has 7/10 m v^2, and the moment mu_r m g takes "
+            "mu_r m g/R of it on each metre; the disk holds as long as mu_r/R <= 7/5 mu"
         ),
         parameters={
             "mu": MU,

@@ -53,7 +53,7 @@ class Builders(Operators):
         rolling: ArrayLike | None = None,
         **more: Any,
     ) -> P:
-        """Contacts only, m / k rows each: normal, up to two tangents, spin with `patch_radius`, two that roll with `rolling`.
+        """Contacts only, m / k rows each: normal, up to two tangents, spin with `patch_radius`, two with `rolling`.
 
         Parameters
         ----------

@@ -30,8 +30,8 @@ from lavender_ext.accelerate.mixing cimport CONTROL, MAX_MEMORY, UNDONE, forget,
 from lavender_ext.core.block cimport (CONE, CONTACT_ROLLING, ROUND, ROW, blocks_t, clip, ends_apart, n_tangents, norm2,
                                       rolling_section, round_group, round_section, round_share)
 from lavender_ext.core.problem cimport Data
+from lavender_ext.core.rolling cimport part_of, part_size
 from lavender_ext.factor.sparse cimport SparsePanels, sparse_solve, sparse_t
-from lavender_ext.local.rolling cimport part_of, part_size
 
 
 cdef enum:

@@ -89,7 +89,8 @@ def views(const int32_t[::1] size, real, index, keys):
         "n": size[N_BODY], "nd": size[N_DYNAMIC], "kj": kj, "mj": mj, "c": c, "p": size[CAP_PAIR],
         "nt": c if size[ROWS_PER_CONTACT] > 1 else 0, "m": mj + rows, "contact_rows": rows, "blocks": kj + c,
         "settings": N_SETTINGS, "heads": N_HEAD, "joint_reals": N_JOINT_REAL, "cache_reals": N_CACHE_IMPULSE,
-        "block_ends": kj + c + 1, "pushes": mj + c, "rolling_blocks": (kj + c) * rolls, "rolling_contacts": c * rolls, "frames": size[N_FRAME], "excluded": size[N_EXCLUDED],
+        "block_ends": kj + c + 1, "pushes": mj + c,
+        "rolling_blocks": (kj + c) * rolls, "rolling_contacts": c * rolls, "frames": size[N_FRAME], "excluded": size[N_EXCLUDED],
     }
     first = offsets(size)
     out = {}

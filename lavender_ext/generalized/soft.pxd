@@ -10,12 +10,12 @@ With theta > 0 [1/kg] on every row and s = J (v - v*) - b [m/s], shifted, a bloc
 
 theta is equal on all tangents of a disk, which makes (1) a closed form: y = sqrt(theta) z, and s as in
 `core/block.pxd`, (7). Tangents may be one to five (a round cone); a cylinder has a spin row beside its disk;
-what rolls has a disk of its own (`local/rolling.pxd`).
+what rolls has a disk of its own (`core/rolling.pxd`).
 """
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t
 
-from lavender_ext.local.rolling cimport rolling_map
+from lavender_ext.core.rolling cimport rolling_map
 
 
 cdef enum:

@@ -12,7 +12,7 @@ from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t
 
 from lavender_ext.core.block cimport CONE, CONTACT_ROLLING, CONTACT_SPIN as SPIN, COULOMB, ROW
-from lavender_ext.local.rolling cimport rolling_map
+from lavender_ext.core.rolling cimport rolling_map
 from lavender_ext.newton.elements cimport MAP_AUGMENTED, MAP_CONVEX, elements_t, invert_small
 
 

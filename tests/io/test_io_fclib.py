@@ -323,12 +323,66 @@ def test_what_fclib_cannot_hold_is_named(tmp_path):
         lavender.io.save(None, tmp_path / "p.hdf5")
 
 
-def test_rolling_friction_is_a_capability_error(tmp_path):
-    for name in ("fclib_local_rolling", "fclib_global_rolling"):
-        with h5py.File(tmp_path / "r.h5", "w") as file:
-            file.create_group(name)
-        with pytest.raises(lv.CapabilityError, match="rolling friction has no block here"):
-            lavender.io.load(tmp_path / "r.h5")
+@pytest.mark.parametrize("form", ["local", "global"])
+def test_rolling_friction_is_kept_to_the_bit(tmp_path, form):
+    rows = random_contact_problem(5, rolling=True, spin=False, joints=0)
+    rows = lv.Problem(rows.b, rows.cones, rows=rows.rows, name="rolls")
+    problem = lv.Problem(rows.b, rows.cones, rows.delassus(), name="rolls") if form == "local" else rows
+    impulse = np.linspace(0.0, 1.0, problem.m)
+    path = tmp_path / "r.hdf5"
+    lavender.io.save(problem, path, impulse=impulse, form=form)
+    with h5py.File(path) as file:
+        group = file[f"fclib_{form}_rolling"]
+        assert group["spacedim"][0] == 5
+        np.testing.assert_array_equal(group["vectors/mu_r"][:], problem.cones.rolling)
+    stored = lavender.io.read(path)
+    assert stored.format == f"fclib_{form}_rolling"
+    assert stored.problem.cones == problem.cones
+    assert stored.impulse.tobytes() == impulse.tobytes()
+    if form == "local":
+        assert stored.problem == problem
+    else:  # b = J v* + w is formed again
+        np.testing.assert_allclose(stored.problem.slack(impulse), problem.slack(impulse), atol=1e-12)
+
+
+def test_files_that_mix_kinds_or_miss_a_moment_are_told(tmp_path):
+    path = tmp_path / "r.hdf5"
+    plain, rolls = local_problem(), random_contact_problem(5, rolling=True, spin=False, joints=0)
+    rolls = lv.Problem(rolls.b, rolls.cones, rolls.delassus())
+
+    def changed(change, words):
+        lavender.io.save(rolls, path)
+        with h5py.File(path, "a") as file:
+            change(file)
+        with pytest.raises(lv.InputError, match=words):
+            lavender.io.load(path)
+
+    def put(file, value):
+        del file["fclib_local_rolling/vectors/mu_r"]
+        if value is not None:
+            file["fclib_local_rolling/vectors/mu_r"] = value
+
+    count = rolls.n_blocks
+    changed(
+        lambda file: file.copy("fclib_local_rolling", "fclib_local"),
+        "one problem with rolling.*and one without",
+    )
+    changed(lambda file: put(file, None), "mu_r is missing")
+    changed(lambda file: put(file, np.full(count, -0.1)), "rolling.*-0.1")
+    changed(lambda file: put(file, np.full(count, np.nan)), "mu_r")
+    changed(lambda file: put(file, np.ones(count + 1)), f"{count + 1} entries; {count} are needed")
+    changed(
+        lambda file: file["fclib_local_rolling/spacedim"].write_direct(np.array([3], np.int32)),
+        "spacedim is 3",
+    )
+    both = lv.Problem(
+        np.concatenate([plain.b, rolls.b]), plain.cones + rolls.cones, sp.block_diag([plain.csr, rolls.csr])
+    )
+    with pytest.raises(lv.CapabilityError, match="rolling beside others"):
+        lavender.io.save(both, path)
+    with_spin = random_contact_problem(5, rolling=True, joints=0)
+    with pytest.raises(lv.CapabilityError, match="spin rows"):
+        lavender.io.save(with_spin, path)
 
 
 GOOD = encoded(W, -2)

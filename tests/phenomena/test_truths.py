@@ -138,13 +138,16 @@ def one_body(name, case, wrong=1.0):
     g, down = G * math.cos(angle), G * math.sin(angle)
     x, v, w, s = 0.0, p.get("speed", 0.0), 0.0, p.get("spin", 0.0)
     radius, inertia = 0.5, 0.4 * 0.25
+    w = v / radius if name == "roll_to_rest" else w
+    moment = wrong * p.get("rolling", 0.0) * g
     rows, every = [], round(look / h)
     for i in range(int(PHENOMENA[name].seconds(p) / h) + every):
         if i % every == 0:
             rows.append((i * h, x, v, w, s))
         v += h * down
+        w -= math.copysign(min(h * moment / inertia, abs(w)), w)
         slip = v - radius * w
-        if name == "roll":
+        if name in ("roll", "roll_to_rest"):
             most = abs(slip) / (1 + radius**2 / inertia)
             push = -math.copysign(min(h * mu * g, most), slip)
             v, w = v + push, w - radius * push / inertia
@@ -162,7 +165,15 @@ def one_body(name, case, wrong=1.0):
 
 @pytest.mark.parametrize(
     ("name", "case"),
-    [("stick", {}), ("slide", {}), ("stop", {}), ("roll", {}), ("spin_down", {}), ("lift", {})],
+    [
+        ("stick", {}),
+        ("slide", {}),
+        ("stop", {}),
+        ("roll", {}),
+        ("roll_to_rest", {}),
+        ("spin_down", {}),
+        ("lift", {}),
+    ],
 )
 def test_small_steps_of_coulombs_law_are_within_every_bound(name, case):
     phenomenon = PHENOMENA[name]
@@ -171,7 +182,7 @@ def test_small_steps_of_coulombs_law_are_within_every_bound(name, case):
         assert phenomenon.measure(p, track)[q.name] <= 0.1 * q.bound, q.name
 
 
-@pytest.mark.parametrize("name", ["slide", "stop", "roll", "spin_down"])
+@pytest.mark.parametrize("name", ["slide", "stop", "roll", "roll_to_rest", "spin_down"])
 def test_friction_of_four_fifths_is_out_of_a_bound(name):
     phenomenon = PHENOMENA[name]
     p, track = one_body(name, {}, wrong=0.8)

@@ -30,9 +30,7 @@ def general(problem):
 def soft_problem(seed, law, spin=True, **sizes):
     """With compliance on every row: A is definite, and sweeps converge."""
     base = random_contact_problem(seed, law, spin=spin, rolling=True, **sizes)
-    return lv.Problem(
-        base.b, base.cones, rows=base.rows, compliance=base.compliance + 0.3, friction=law
-    )
+    return lv.Problem(base.b, base.cones, rows=base.rows, compliance=base.compliance + 0.3, friction=law)
 
 
 GIVEN = {"rows": lambda p: p, "matrix": as_matrix, "generalized": general}

@@ -35,6 +35,7 @@ __all__ = [
 PACKAGES_OF_NODE = {"rapier": "@dimforge/rapier3d-compat", "jolt": "jolt-physics"}  # engine -> package of npm
 NO_TORSION = {"spin": "it has no friction against spinning"}
 NO_SPIN = "its friction against spinning has no radius that could be given"
+NO_ROLLING = "it has no friction against rolling"
 
 
 class Stepping:
@@ -175,7 +176,9 @@ def _others() -> list[Way]:
             "1 ms, SAP, hydroelastic bodies of 1e8 Pa",
         ),
     ):
-        found.append(Way(name, "drake", "pydrake", options, text, cannot={"spin": NO_SPIN}))
+        found.append(
+            Way(name, "drake", "pydrake", options, text, cannot={"spin": NO_SPIN, "rolling": NO_ROLLING})
+        )
     for sweeps in (22, 64):
         more = f" {sweeps}" if sweeps != 22 else ""
         text = f"1/60 s in 4 of {sweeps} sweeps"

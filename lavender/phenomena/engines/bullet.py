@@ -113,7 +113,7 @@ class Engine(Stepping):
                 )
 
     def _material(self, body: int, link: int) -> None:
-        # Bullet multiplies the coefficients of two bodies; of spin and rolling it adds spin a x friction b and the reverse
+        # Bullet multiplies the coefficients of two bodies; of spin and rolling it adds a's x friction b and the reverse
         p = self.scene.parameters
         lateral = p.friction**0.5
         pybullet.changeDynamics(

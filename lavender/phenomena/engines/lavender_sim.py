@@ -38,9 +38,9 @@ class Engine(Stepping):
         size = float(np.linalg.norm(g))
         self.frame = _frame(-g / size if size else np.array([0.0, 0.0, 1.0]))
         self.material = {
-            "static_friction": p.friction, "dynamic_friction": p.friction, "rolling_friction": 0.0,
+            "static_friction": p.friction, "dynamic_friction": p.friction, "restitution": 0.0,
             "torsional_friction": p.friction if p.patch_radius else 0.0, "contact_radius": p.patch_radius or 0.02,
-            "restitution": 0.0,
+            "rolling_friction": p.rolling_radius / (p.patch_radius or 0.02),  # it multiplies by the contact radius
         }  # fmt: skip
         made = lavendersim.Scene("phenomenon", gravity=-size, solver_iterations=sweeps, ground=False)
         refs = [self._add(made, i, jointed=i in up or bool(up)) for i in range(scene.n_bodies)]

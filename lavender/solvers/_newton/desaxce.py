@@ -6,7 +6,7 @@
 With phi frozen, (1) and (2) are the convex problem of the "cone" law with its normals lowered by phi, and
 phi <- phi(s_t) is Cadoux's fixed point (Cadoux 2009; Acary, Cadoux, Lemarechal, Malick 2011): dozens of
 convex problems. Here phi moves with every step of one interior point, and so does its derivative: with
-psi = phi'(s_t) on the tangents, the spin and the rolling, 0 on the normal, C = I - e_n psi^T and B = C^-1 = I + e_n psi^T,
+psi = phi'(s_t) on tangents, spin and rolling, 0 on the normal, C = I - e_n psi^T and B = C^-1 = I + e_n psi^T,
 
     du = -q - W dz,    C du = H dz - r_d,    r_d = u - s - phi e_n,                                      (3)
     (H + C W) dz = r_d - C q = r_d - q + (psi . q) e_n,                                                  (4)
