@@ -24,6 +24,7 @@ from lavender._arrays import (
     as_array,
     check_not_negative,
     equal,
+    precision_of,
     read_only,
     table_of,
 )
@@ -46,6 +47,8 @@ FRICTION = tuple(FRICTION_NUMBER)
 LAWS = ("linear", "lcp", "coulomb", "cone")
 # How A is given.
 OPERATORS = ("rows", "matrix", "generalized")
+# In which the numbers of a problem were made, and answers to it are.
+PRECISIONS = ("float64", "float32")
 
 
 class Names(Sequence[str]):
@@ -126,6 +129,9 @@ class Problem:
     copy : bool
         True leaves the arrays given as they are. False adopts those that already fit (b, matrix, compliance, guess):
         they are shared, and marked read-only for the giver, too.
+    precision : {"float64", "float32"}, optional
+        In which an engine made these numbers, and makes its answers: `lavender.residual` then knows what rounding
+        alone explains. Default: that of `rows`. Numbers are widened exactly and solved in float64 in any case.
 
     Raises
     ------
@@ -145,6 +151,7 @@ class Problem:
     name: str = ""
     copy: bool = field(default=True, repr=False)
     generalized: Generalized | None = None
+    precision: str = ""
     derived: Derived = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -160,6 +167,12 @@ class Problem:
             raise InputError("give matrix=, rows= or generalized=, one of them")
         if self.friction not in FRICTION:
             raise InputError(f"friction is {self.friction!r}; {' or '.join(map(repr, FRICTION))} is needed")
+        if not self.precision:
+            put(self, "precision", getattr(self.rows, "precision", "float64"))
+        if self.precision not in PRECISIONS:
+            raise InputError(
+                f"precision is {self.precision!r}; {' or '.join(map(repr, PRECISIONS))} is needed"
+            )
         if self.friction != "cone" and self.cones.has_round:
             raise InputError(
                 "a round cone of more than two tangents has no Coulomb law here: give friction='cone'"
@@ -422,6 +435,8 @@ class Problem:
         cones : Cones
         compliance : scalar or (m,) 1/kg, optional
         friction : {"coulomb", "cone"}
+        precision : {"float64", "float32"}, optional
+            Default: float32 where J, M and v_free are arrays of float32; they are widened exactly.
         names, dof_names : sequence of str (k,), (nv,), optional
             Names of blocks and of velocities.
 
@@ -459,6 +474,7 @@ class Problem:
                 " (a contact has a normal and two tangents, or tangents=0, 1)" if np.any(cones.kind) else ""
             )
             raise InputError(f"J has {m} rows; {cones.n_rows} are needed, as the cones have{hint}")
+        more.setdefault("precision", precision_of(J, *(M if isinstance(M, (list, tuple)) else [M]), v_free))
         target = as_array("target", target, (m,), unit="m/s")
         if compliance is not None:
             compliance = as_array("compliance", compliance, (m,), unit="1/kg")
@@ -897,6 +913,7 @@ class Problem:
             names=names,
             name=self.name,
             copy=False,
+            precision=self.precision,
             **more,
         )
 
@@ -949,6 +966,7 @@ class Problem:
                 "key",
                 "names",
                 "name",
+                "precision",
             )
         ):
             return False
