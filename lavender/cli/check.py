@@ -13,6 +13,7 @@ from lavender.cli.options import (
     one_thread,
     plain,
     precision_option,
+    refuse_unused,
 )
 from lavender.errors import InputError, LavenderError
 
@@ -25,7 +26,9 @@ __all__ = ["check"]
 @click.option("--reference", default="osqp", show_default=True, help="Whose answer to compare with.")
 @click.option("--tol", type=float, default=1e-6, show_default=True)
 @precision_option
+@click.pass_context
 def check(
+    context: click.Context,
     files: tuple[str, ...],
     solvers: tuple[str, ...] | None,
     reference: str,
@@ -35,9 +38,12 @@ def check(
     """Compare solvers with a reference and with the judge.
 
     Of an answer stored in a file it is said whether it stands at the floor of its precision or stopped early.
+    A records.jsonl of somebody's report is verified anew, on the problems that are named after it or else where it
+    says: verdicts must agree, times are shown beside each other.
 
-    Exits with 1 when a claim is contradicted, a file met in a folder cannot be read or, with --precision, a stored
-    answer is not at its floor; with 2 when a file that was named cannot be read, or --precision finds no answer.
+    Exits with 1 when a claim is contradicted, a verdict or problem of a records.jsonl is another one here, a file met
+    in a folder cannot be read or, with --precision, a stored answer is not at its floor; with 2 when a file that was
+    named cannot be read, or --precision finds no answer.
     """
     from lavender import bench
     from lavender.check import cross_check
@@ -45,6 +51,11 @@ def check(
 
     one_thread()
     out = console()
+    if files and files[0].endswith(".jsonl"):
+        refuse_unused(context, ["reference", "tol", "precision"], "with a records.jsonl, which has its own")
+        submission = bench.verify(bench.read(files[0]), files[1:], solvers)
+        out.print(str(submission), highlight=False, markup=False, soft_wrap=True)
+        raise click.exceptions.Exit(0 if submission.ok else EXIT_UNMET)
     contradicted = unread = missing = answers = unmet = 0
     bench.solver_names(solvers)
     for item in bench.resolve(files):

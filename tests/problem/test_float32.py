@@ -296,7 +296,8 @@ def test_a_recording_of_a_float32_engine_counts_its_early_answers(tmp_path):
         """<mujoco><option solver="CG" tolerance="1e-5"/><worldbody>
         <geom type="plane" size="5 5 .1"/>
         <body pos="0 0 .09"><freejoint/><geom type="box" size=".1 .1 .1"/></body>
-        <body pos=".05 0 .28" euler="5 9 20"><freejoint/><geom type="box" size=".1 .1 .1"/></body></worldbody></mujoco>"""
+        <body pos=".05 0 .28" euler="5 9 20"><freejoint/><geom type="box" size=".1 .1 .1"/></body>
+        </worldbody></mujoco>"""
     )
     found = lv.io.record(model, mujoco.MjData(model), tmp_path, 6, precision="float32")
     assert lv.load(tmp_path / found.files[0]).precision == "float32"
