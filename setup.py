@@ -6,7 +6,7 @@ Environment:
     LAVENDER_DEBUG=asan     the same, with the address and undefined-behaviour sanitizers, which also see raw
                             pointers (gcc; run Python with LD_PRELOAD="$(gcc -print-file-name=libasan.so)")
     LAVENDER_FILES_URL=U    where the files of this version can be fetched: links and pictures of the long description
-                            begin with it, since an index shows the text alone
+                            begin with it, since an index shows the text alone, and so do the project's URLs
 """
 
 import gc
@@ -191,18 +191,25 @@ def extension(path):
     )
 
 
+FILES_URL = os.environ.get("LAVENDER_FILES_URL", "").rstrip("/")
+
+
 def long_description():
     """README.md, its links and pictures absolute where it is known what they begin with."""
-    text, base = (
-        Path("README.md").read_text(encoding="utf-8"),
-        os.environ.get("LAVENDER_FILES_URL", "").rstrip("/"),
-    )
-    return re.sub(r"\]\((?![a-z]+:|#)([^)\s]+)\)", rf"]({base}/\1)", text) if base else text
+    text = Path("README.md").read_text(encoding="utf-8")
+    return re.sub(r"\]\((?![a-z]+:|#)([^)\s]+)\)", rf"]({FILES_URL}/\1)", text) if FILES_URL else text
+
+
+def project_urls():
+    """`[project.urls]`: below the address of this version's files, and none where that is not known."""
+    pages = {"Documentation": "docs/index.md", "Changelog": "CHANGELOG.md", "Citation": "CITATION.cff"}
+    return {"Source": FILES_URL} | {k: f"{FILES_URL}/{p}" for k, p in pages.items()} if FILES_URL else {}
 
 
 setup(
     long_description=long_description(),
     long_description_content_type="text/markdown",
+    project_urls=project_urls(),
     ext_modules=[
         *(extension(path) for path in sorted(Path("lavender_ext").rglob("*.pyx"))),
         # cythonize writes it

@@ -118,6 +118,12 @@ def as_array(
     return read_only(array)
 
 
+def precision_of(*given: Any) -> str:
+    """The word float32 where all of these are arrays of it, dense or sparse, or None, not all None; else float64."""
+    types = {getattr(x, "dtype", None) for x in given if x is not None}
+    return "float32" if types == {np.dtype(np.float32)} else "float64"
+
+
 def borrowed(name: str, value: Any, shape: tuple[int | None, ...]) -> np.ndarray:
     """`value` as `as_array` would adopt it, to be read at once and not kept: the array given stays writable."""
     return as_array(name, value.view() if type(value) is np.ndarray else value, shape, copy=False)

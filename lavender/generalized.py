@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from lavender._arrays import FloatArray, IntArray, as_array, borrowed, equal, read_only
+from lavender._arrays import FloatArray, IntArray, as_array, borrowed, equal, precision_of, read_only
 from lavender.errors import InputError
 from lavender_ext.core import generalized as kernels
 from lavender_ext.core.problem import dense_to_csr
@@ -26,6 +26,7 @@ from lavender_ext.judge.measure import all_finite
 __all__ = ["Generalized"]
 
 ASYMMETRY = 1e-12  # -, of sqrt(M_ii M_jj): above any rounding of sums over bodies, below anything meant
+ASYMMETRY32 = 2.0**-16  # the same of an M in float32, of which the lower triangle is taken
 MESH = 400  # velocities from which on the order of trees is looked for: below, a factor costs less than the search
 FACTORS = 20  # of a matrix like M that the solves of a problem take: what an order that fills in costs
 LEAF = 8  # trees that are not taken apart any more
@@ -274,6 +275,8 @@ def _rows(jac: Any, n: int) -> Compressed:
 
 
 def _lower(mass: Any, names: Sequence[str] | None) -> tuple[Compressed, int]:
+    blocks = mass if isinstance(mass, (list, tuple)) else [mass]
+    allowed = ASYMMETRY32 if precision_of(*blocks) == "float32" else ASYMMETRY
     if isinstance(mass, (list, tuple)) and all(np.ndim(block) == 2 for block in mass) and mass:
         given = [as_array(f"block {i} of M", block, (None, None)) for i, block in enumerate(mass)]
         mass = sp.block_diag(given, format="csr")
@@ -283,7 +286,7 @@ def _lower(mass: Any, names: Sequence[str] | None) -> tuple[Compressed, int]:
         if dense.shape != (n, n):
             raise InputError(f"M has shape {dense.shape}; a square matrix is needed")
         lower, (i, j, worst) = kernels.lower_of_dense(dense)
-        if worst > ASYMMETRY:
+        if worst > allowed:
             _refuse(i, j, dense[i, j], dense[j, i], names)
         return lower, n
     n = mass.shape[0]
@@ -294,7 +297,7 @@ def _lower(mass: Any, names: Sequence[str] | None) -> tuple[Compressed, int]:
     scale = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
     off = sp.coo_array(whole - whole.T)
     share = np.abs(off.data) / (scale[off.row] * scale[off.col])
-    if len(share) and share.max() > ASYMMETRY:
+    if len(share) and share.max() > allowed:
         at = int(np.argmax(share))
         i, j = int(off.row[at]), int(off.col[at])
         _refuse(i, j, whole[i, j], whole[j, i], names)

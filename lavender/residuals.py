@@ -12,24 +12,58 @@ block (an inactive row: w / d, the step that is missing; formulas in `lavender_e
 
 Where doing nothing already solves the problem to rounding (E0 <= 2^-48 of the energy norm of b), the
 norms of b stand in for E0 and V0. E sees heavy bodies, V sees light ones.
+
+An answer made in float32 is held to what it could have been. A number is rounded by at most u = 2^-24 of it, each by
+itself, so squares add up; entry by entry (A^2 is A o A), x = M^-1 J^T lambda, w^2 grows with
+
+    lambda rounded         u^2 A^2 lambda^2                                                                        (1)
+    a matrix's A and b     u^2 (A^2 lambda^2 + b^2)                                                                (2)
+    J and M^-1 of bodies   u^2 (J^2 x^2 + (J M^-1)^2 J^T^2 lambda^2 + J^2 M^-1^2 (J^T lambda)^2) + (b)             (3)
+    J and M                u^2 (J^2 x^2 + (J M^-1)^2 (J^T^2 lambda^2 + M^2 x^2)) + (b)                             (4)
+                           (b): u^2 (theta^2 lambda^2 + target^2 + 2 J^2 v*^2), as b = target - J v*
+    lambda read off v+     u^2 A^2 (J^2 x^2 + b^2 + theta^2 lambda^2) / theta^2                                    (5)
+
+(5) where impulses are made by lambda = (target - J v+) / theta, as by engines that minimise over velocities: in
+generalised coordinates, where every row that acts is soft. The floor is the root of (1) + (2, 3 or 4) + (5) in the two
+norms. Numbers that a matrix holds in float32 already cost nothing; forming A and b of J and M in float32 costs about
+what rounding these does.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+import scipy.sparse as sp
 
 from lavender._arrays import ArrayLike, FloatArray, read_only
 from lavender.errors import InputError
-from lavender.problem import Problem
+from lavender.generalized import Generalized
+from lavender.problem import PRECISIONS, Problem
 from lavender_ext.judge import measure
 
-__all__ = ["Residual", "nothing_to_do", "residual"]
+__all__ = ["Residual", "Rounding", "nothing_to_do", "residual"]
 
 AT_REST = 1e-9  # m/s, V0 below which nobody could tell doing nothing from a solution
+UNIT32 = 2.0**-24  # u of float32: half its spacing at 1
+CHUNK = 2**22  # numbers of J M^-1 that are formed at once: 32 MB
+
+AT_FLOOR, EARLY, WRONG = "at its floor", "stopped early", "wrong"
+
+
+@dataclass(frozen=True)
+class Rounding:
+    """What float32 costs an answer, as relative residuals, one by one (module, 1 to 5)."""
+
+    impulse: float  # -, (1): rounding the impulse
+    data: float  # -, (2, 3, 4): rounding what the problem is made of, or forming A and b of it
+    velocities: float  # -, (5): reading impulses off rounded velocities; 0 where a row that acts is rigid
+
+    def __str__(self) -> str:
+        more = f", velocities {self.velocities:.1e}" if self.velocities else ""
+        return f"impulse {self.impulse:.1e}, data {self.data:.1e}{more}"
 
 
 @dataclass(frozen=True)
@@ -39,18 +73,56 @@ class Residual:
     relative: float  # -, max(energy / energy_start, velocity / velocity_start)
     energy: float  # sqrt J
     velocity: float  # m/s, of the worst row
-    floor: float  # -, relative residual that float64 alone costs
+    floor: float  # -, relative residual that rounding to `precision` alone costs
     worst_row: int  # row of the largest velocity error, -1 for an empty problem
     energy_start: float  # sqrt J, E of doing nothing (or the norm of b)
     velocity_start: float  # m/s
     error: FloatArray = field(repr=False)  # (m,) N s, e
     slack: FloatArray = field(repr=False)  # (m,) m/s, w
     _problem: Problem = field(repr=False)
+    precision: str = "float64"  # in which the answer was made
+    rounding: Rounding | None = None  # in float32: the parts of the floor
 
     @property
     def at_floor(self) -> bool:
-        """Within twice what float64 allows, and no worse than doing nothing."""
-        return at_floor(self.relative, self.floor)
+        """No further off than rounding explains, and better than doing nothing.
+
+        In float64 twice the floor, which is a sum of absolute values. In float32 four times: there it is a root of
+        squares that has each number at its worst, sqrt(3) standard deviations, and many rows have a largest one.
+        """
+        return self.rounds and self.relative < 1.0
+
+    @property
+    def rounds(self) -> bool:
+        """Rounding explains the residual, whatever it is beside doing nothing."""
+        factor = 2.0 if self.rounding is None else 4.0
+        return self.relative <= factor * self.floor < math.inf
+
+    @property
+    def verdict(self) -> str:
+        """What to think of the answer: "at its floor", "stopped early" (by `excess`) or "wrong".
+
+        At its floor: within `at_floor`. Wrong: not finite, or as far off as doing
+        nothing. A residual tells no mistake that is smaller from an early stop: another mu, say, leaves the same error.
+        """
+        if self.at_floor:
+            return AT_FLOOR
+        if self.nothing_to_do and self.rounds:
+            # Relative to nothing 1 means nothing: an impulse that ran away has more error than b.
+            return AT_FLOOR if self.energy <= measure.rhs_norms(self._problem.metric)[0] else WRONG
+        return EARLY if self.relative < 1.0 else WRONG
+
+    @property
+    def verdict_in_words(self) -> str:
+        """The verdict, of an early stop with by how much."""
+        return f"{EARLY}, {self.excess:.2g} times its floor" if self.verdict == EARLY else self.verdict
+
+    @property
+    def excess(self) -> float:
+        """The relative residual over its floor [-]: by how much an answer stopped early; 0 of an exact one."""
+        if self.relative == 0.0:
+            return 0.0
+        return self.relative / self.floor if self.floor > 0.0 else math.inf
 
     @property
     def nothing_to_do(self) -> bool:
@@ -69,9 +141,12 @@ class Residual:
 
     def __str__(self) -> str:
         worst = f", worst {self.worst_name} {self.velocity:.2g} m/s" if self.worst_row >= 0 else ""
-        return (
+        text = (
             f"relative {self.relative:.2e}, energy {self.energy:.2e} sqrt(J){worst}, floor {self.floor:.1e}"
         )
+        if self.rounding is None:
+            return text
+        return f"{text} of {self.precision} ({self.rounding}): {self.verdict_in_words}"
 
 
 def at_floor(relative: float, floor: float) -> bool:
@@ -146,16 +221,38 @@ def quick(
     return relative_of(data, energy, velocity), relative_of(data, floor_energy, floor_velocity)
 
 
-def residual(problem: Problem, impulse: ArrayLike) -> Residual:
+def residual(problem: Problem, impulse: ArrayLike, precision: str | None = None) -> Residual:
     """Judge an impulse (m,) [N s].
 
-    Non-finite entries are allowed here and give an infinite relative residual.
+    Parameters
+    ----------
+    problem : Problem
+    impulse : (m,) N s
+        Non-finite entries are allowed here and give an infinite relative residual.
+    precision : {"float64", "float32"}, optional
+        In which the impulse was made: its floor, and with it the verdict. Default: `problem.precision`. The error
+        itself is always measured in float64.
 
     Raises
     ------
     InputError
-        `impulse` has the wrong length or holds no numbers.
+        `impulse` has the wrong length or holds no numbers; another precision.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import lavender as lv
+    >>> problem = lv.Problem.lcp([[2.0, 1.0], [1.0, 2.0]], [1.0, 0.3])
+    >>> exact = np.array([1.7 / 3.0, 0.0])  # of a solver that has missed nothing ...
+    >>> lv.residual(problem, np.float32([0.5, 0.0]), precision="float32").verdict
+    'at its floor'
+    >>> early = lv.residual(problem, np.float32([0.49, 0.0]), precision="float32")
+    >>> early.verdict, early.excess > 1e4
+    ('stopped early', True)
     """
+    precision = problem.precision if precision is None else precision
+    if precision not in PRECISIONS:
+        raise InputError(f"precision is {precision!r}; {' or '.join(map(repr, PRECISIONS))} is needed")
     try:
         if type(impulse) is not np.ndarray or impulse.dtype != float or not impulse.flags.c_contiguous:
             impulse = np.ascontiguousarray(impulse, float)
@@ -166,7 +263,70 @@ def residual(problem: Problem, impulse: ArrayLike) -> Residual:
     last, problem.derived.judged = problem.derived.judged, None
     if last is None or last.data is not problem.metric or not measure.same_bits(last.impulse, impulse):
         last = judged(problem, impulse)
-    return told(problem, last)
+    found = told(problem, last)
+    return found if precision == "float64" else _in_float32(problem, found, impulse)
+
+
+def _in_float32(problem: Problem, found: Residual, impulse: FloatArray) -> Residual:
+    """The same error beside the floor of float32."""
+    with np.errstate(over="ignore", invalid="ignore"):  # an impulse that is not finite has no floor
+        squares = rounded(problem, impulse)
+        parts = [_relative_size(problem, x) for x in squares]
+        floor = _relative_size(problem, sum(squares))
+    return replace(found, precision="float32", floor=floor, rounding=Rounding(*parts))
+
+
+def _relative_size(problem: Problem, square: Any) -> float:
+    """Changes of w in the judge's two norms, relative; their squares (m,) given."""
+    d = problem.d
+    energy = float(np.sqrt(np.sum(square / d)))
+    velocity = float(np.max(problem.metric.weight * np.sqrt(square) / d, initial=0.0))
+    return float(relative_of(problem.metric, energy, velocity))
+
+
+def rounded(problem: Problem, impulse: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """What float32 makes of w (m,), three squares [m2/s2]: by (1), by (2, 3 or 4), by (5) of the module."""
+    unit, none = UNIT32 * UNIT32, np.zeros(problem.m)
+    a, b, lam = _squared(problem.csr), problem.b**2, impulse**2
+    own = a @ lam
+    if problem.matrix is not None:
+        return unit * own, none if problem.precision == "float32" else unit * (own + b), none
+    jac, compliance = problem.jacobian, problem.compliance
+    assert compliance is not None
+    soft, pushed = compliance**2 * lam, _squared(jac.T) @ lam
+    if problem.rows is not None:
+        inverse = problem.rows.inverse_mass_matrix()
+        x, free = inverse @ (jac.T @ impulse), problem.rows.v_free.ravel()
+        through = _squared(jac @ inverse) @ pushed + _squared(jac) @ (
+            _squared(inverse) @ (jac.T @ impulse) ** 2
+        )
+    else:
+        general = problem.generalized
+        assert general is not None
+        x, free = general.change(impulse), general.v_free
+        through = _through(general, _squared(general.mass) @ x**2 + pushed)
+    seen, given = _squared(jac) @ x**2, (problem.b + jac @ free) ** 2 + 2.0 * (_squared(jac) @ free**2)
+    data = seen + through + soft + given
+    acts = (impulse != 0.0) & (impulse != problem.cones.lower) & (impulse != problem.cones.upper)
+    velocities = none
+    if problem.generalized is not None and not np.any(acts & (compliance == 0.0)):
+        off = np.divide(seen + b + soft, compliance**2, out=none.copy(), where=acts)
+        velocities = a @ off
+    return unit * own, unit * data, unit * velocities
+
+
+def _squared(a: Any) -> Any:
+    """Every entry of a sparse matrix squared."""
+    return a.multiply(a).tocsr()
+
+
+def _through(general: Generalized, force: FloatArray) -> FloatArray:
+    """Squares of J M^-1 f (m,) of forces f (nv,) without a correlation, their squares given."""
+    mass, out = sp.linalg.splu(sp.csc_array(general.mass)), np.empty(general.m)
+    step = max(1, CHUNK // max(1, general.nv))
+    for i in range(0, general.m, step):
+        out[i : i + step] = (mass.solve(general.jac[i : i + step].toarray().T) ** 2).T @ force
+    return out
 
 
 def told(problem: Problem, last: measure.Judged) -> Residual:
@@ -183,6 +343,8 @@ def told(problem: Problem, last: measure.Judged) -> Residual:
         "error": read_only(last.error),
         "slack": read_only(last.slack),
         "_problem": problem,
+        "precision": "float64",
+        "rounding": None,
     }
     object.__setattr__(made, "__dict__", state)  # a quarter of the time of a frozen dataclass's __init__
     return made

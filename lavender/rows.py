@@ -8,7 +8,15 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from lavender._arrays import FloatArray, IntArray, as_array, check_not_negative, equal, read_only
+from lavender._arrays import (
+    FloatArray,
+    IntArray,
+    as_array,
+    check_not_negative,
+    equal,
+    precision_of,
+    read_only,
+)
 from lavender.cones import Cones
 from lavender.errors import InputError
 from lavender_ext.core import gate
@@ -54,8 +62,9 @@ class Rows:
         True leaves the arrays given as they are. False adopts those that fit: they are shared, and marked read-only for
         the giver, too; inertias are then taken as they are.
 
-    Numbers of float32 are taken as what they stand for: normals and tangents off orthogonal unit vectors by up to 1e-5,
-    and inertias off symmetry by as much, are made whole.
+    Numbers of float32 are widened exactly and taken as what they stand for: normals and tangents off orthogonal unit
+    vectors by up to 1e-5, and inertias off symmetry by as much, are made whole. Where every array of numbers is of
+    float32, so is `precision`, the rows' and their problems'.
 
     Raises
     ------
@@ -107,6 +116,7 @@ class Rows:
     arm_b: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))  # (c, 3) m
     contact_body: IntArray = field(default_factory=lambda: np.zeros((0, 2), np.int32))  # (c, 2)
     copy: bool = field(default=True, repr=False)  # False: adopt arrays that fit, and mark them read-only
+    precision = "float64"  # of the numbers given, no field; an instance of float32 has its own
 
     def __post_init__(self) -> None:
         n = np.shape(self.inv_mass)[0] if np.ndim(self.inv_mass) == 1 else None
@@ -121,6 +131,9 @@ class Rows:
             "inv_mass": (n,), "inv_inertia": (n, 3, 3), "v_free": (n, 6), "jac": (int(ptr[-1]), 12),
             "normal": (c, 3), "tangent": (c, 3), "arm_a": (c, 3), "arm_b": (c, 3),
         }  # fmt: skip
+        given = [getattr(self, name) for name in shapes]
+        if precision_of(*(x for x in given if np.size(x))) == "float32":
+            object.__setattr__(self, "precision", "float32")
         object.__setattr__(self, "joint_ptr", ptr)
         for name, shape in shapes.items():
             object.__setattr__(self, name, as_array(name, getattr(self, name), shape, copy=self.copy))
@@ -159,7 +172,8 @@ class Rows:
             i = int(np.argmax(off))
             raise InputError(
                 f"contact {i}: normal {n[i]} and tangent {t[i]} must be orthogonal unit vectors; they are off by "
-                f"{off[i]:.2g}, and up to {ROUNDED:g} (float32 leaves 1e-7) is made whole"
+                f"{off[i]:.2g}, and up to {ROUNDED:g} (float32 leaves 1e-7) is made whole: divide each by its length, "
+                "after the part along the normal was taken out of the tangent"
             )
         if off.max() <= EXACT:
             return

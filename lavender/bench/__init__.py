@@ -16,6 +16,7 @@ from lavender.bench.running.runner import Event, run, solver_names
 from lavender.bench.running.sequences import carry
 from lavender.bench.running.timing import Task, measure, one_thread
 from lavender.bench.store import Records, Store, read, write_csv, write_json
+from lavender.bench.submitted import Submission, Verified, verify
 
 __all__ = [
     "Ask",
@@ -29,7 +30,9 @@ __all__ = [
     "Run",
     "Skip",
     "Store",
+    "Submission",
     "Task",
+    "Verified",
     "campaign",
     "carry",
     "cpu_name",
@@ -45,6 +48,7 @@ __all__ = [
     "solver_names",
     "steps_in",
     "structure_of",
+    "verify",
     "write_csv",
     "write_json",
 ]

@@ -24,7 +24,7 @@ from lavender.errors import InputError
 from lavender.io.recording import ENGINE
 from lavender.io.stored import SUFFIXES
 from lavender.problem import Problem
-from lavender.residuals import nothing_to_do, residual
+from lavender.residuals import Residual, nothing_to_do, residual
 from lavender.suite import Case
 from lavender.suspicions import diagnose
 
@@ -59,6 +59,13 @@ class Item:
     def problem(self) -> Problem:
         """The problem; loading errors come from here."""
         return self.load()
+
+    def judged(self, precision: str | None = None) -> Residual | None:
+        """The answer stored beside the problem, judged; None where there is none, or one of another problem."""
+        impulse = self.stored()
+        if impulse is None or impulse.shape != (self.problem.m,):
+            return None
+        return residual(self.problem, impulse, precision)
 
     def forget(self) -> None:
         """Let go of the problem's memory."""
@@ -268,6 +275,7 @@ def describe(item: Item, run: str) -> CaseInfo:
     """What the report says of a case; loads its problem."""
     p = item.problem
     contacts = int(np.count_nonzero(p.cones.kind != ROW))
+    answer = item.judged()
     return CaseInfo(
         run=run,
         case=item.name,
@@ -285,17 +293,11 @@ def describe(item: Item, run: str) -> CaseInfo:
         reason=item.reason,
         sequence=item.sequence,
         step=item.step,
-        stored=_stored(item, p),
+        stored=math.nan if answer is None else answer.relative,
+        stored_verdict=answer.verdict_in_words if answer and answer.rounding else "",
         nothing_to_do=nothing_to_do(p),
         suspicions=tuple(map(str, diagnose(p))),
     )
-
-
-def _stored(item: Item, problem: Problem) -> float:
-    impulse = item.stored()
-    if impulse is None or impulse.shape != (problem.m,):
-        return math.nan
-    return float(residual(problem, impulse).relative)
 
 
 def fingerprint(problem: Problem) -> str:

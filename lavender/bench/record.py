@@ -139,6 +139,9 @@ class CaseInfo(_Texts):
     step: int = -1
     nothing_to_do: bool = False  # doing nothing is right: nobody solves it, nobody fails
     identity: str = ""  # of the sequence, from the numbers of all its steps: steps of two are never one
+    stored_verdict: str = (
+        ""  # of a stored answer in float32: at its floor, stopped early (by how much) or wrong
+    )
     suspicions: tuple[str, ...] = ()  # what looks like a mistake in its data
 
 

@@ -12,6 +12,8 @@ from lavender.cli.options import (
     console,
     one_thread,
     plain,
+    precision_option,
+    refuse_unused,
 )
 from lavender.errors import InputError, LavenderError
 
@@ -23,22 +25,43 @@ __all__ = ["check"]
 @click.option("--solvers", type=Names(), help="Solvers by name; all that take the problem if not given.")
 @click.option("--reference", default="osqp", show_default=True, help="Whose answer to compare with.")
 @click.option("--tol", type=float, default=1e-6, show_default=True)
-def check(files: tuple[str, ...], solvers: tuple[str, ...] | None, reference: str, tol: float) -> None:
+@precision_option
+@click.pass_context
+def check(
+    context: click.Context,
+    files: tuple[str, ...],
+    solvers: tuple[str, ...] | None,
+    reference: str,
+    tol: float,
+    precision: str | None,
+) -> None:
     """Compare solvers with a reference and with the judge.
 
-    Exits with 1 when a claim is contradicted or a file met in a folder cannot be read, with 2 when one that was
-    named cannot.
+    Of an answer stored in a file it is said whether it stands at the floor of its precision or stopped early.
+    A records.jsonl of somebody's report is verified anew, on the problems that are named after it or else where it
+    says: verdicts must agree, times are shown beside each other.
+
+    Exits with 1 when a claim is contradicted, a verdict or problem of a records.jsonl is another one here, a file met
+    in a folder cannot be read or, with --precision, a stored answer is not at its floor; with 2 when a file that was
+    named cannot be read, or --precision finds no answer.
     """
     from lavender import bench
     from lavender.check import cross_check
+    from lavender.residuals import AT_FLOOR
 
     one_thread()
     out = console()
-    contradicted = unread = missing = 0
+    if files and files[0].endswith(".jsonl"):
+        refuse_unused(context, ["reference", "tol", "precision"], "with a records.jsonl, which has its own")
+        submission = bench.verify(bench.read(files[0]), files[1:], solvers)
+        out.print(str(submission), highlight=False, markup=False, soft_wrap=True)
+        raise click.exceptions.Exit(0 if submission.ok else EXIT_UNMET)
+    contradicted = unread = missing = answers = unmet = 0
     bench.solver_names(solvers)
     for item in bench.resolve(files):
         try:
             found = cross_check(item.problem, solvers=solvers, reference=reference, tol=tol)
+            stored = item.judged(precision)
         except LavenderError as error:
             out.print(f"{item.name}: {plain(str(error))}", style="yellow", highlight=False)
             unread += isinstance(error, InputError) and not item.named
@@ -48,10 +71,17 @@ def check(files: tuple[str, ...], solvers: tuple[str, ...] | None, reference: st
             item.forget()
         out.print(f"[bold]{plain(item.name)}[/]", highlight=False)
         out.print(str(found), highlight=False, markup=False)
+        if stored is not None:
+            answers += 1
+            unmet += stored.verdict != AT_FLOOR
+            said = f"stored answer: {stored.verdict_in_words} of {stored.precision}; {stored}"
+            out.print(said, highlight=False, markup=False)
         contradicted += len(found.contradicted)
     if contradicted:
         out.print(f"[bold red]{contradicted} claims are contradicted[/]")
+    if precision is not None and not answers:
+        raise InputError("--precision: no file holds an answer to judge (an entry `impulse`)")
     if missing:
         raise click.exceptions.Exit(EXIT_BAD_INPUT)
-    if contradicted or unread:
+    if contradicted or unread or (precision is not None and unmet):
         raise click.exceptions.Exit(EXIT_UNMET)

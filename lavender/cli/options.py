@@ -36,6 +36,7 @@ __all__ = [
     "parameters_of",
     "plain",
     "plan_options",
+    "precision_option",
     "refuse_unused",
 ]
 
@@ -170,6 +171,12 @@ def console(stderr: bool = False) -> Console:
 def was_given(context: click.Context, name: str) -> bool:
     """An option stands on the command line (or in the environment), whatever its value."""
     return context.get_parameter_source(name) not in (None, click.core.ParameterSource.DEFAULT)
+
+
+def precision_option(command: Callable[..., Any]) -> Callable[..., Any]:
+    """`--precision`, of answers that an engine made."""
+    told = "In which the engine made its answers; default: what the problem says, else float64."
+    return click.option("--precision", type=click.Choice(["float64", "float32"]), help=told)(command)
 
 
 def refuse_unused(context: click.Context, names: Sequence[str], where: str) -> None:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from lavender.cli.options import refuse_unused
+from lavender.cli.options import precision_option, refuse_unused
 
 __all__ = ["record"]
 
@@ -25,6 +25,7 @@ __all__ = ["record"]
 @click.option(
     "--replace", is_flag=True, help="Take the problems of another recording out of the folder first."
 )
+@precision_option
 @click.pass_context
 def record(
     context: click.Context,
@@ -35,11 +36,21 @@ def record(
     seed: int,
     out: Path,
     replace: bool,
+    precision: str | None,
 ) -> None:
     """Run a MuJoCo model (MJCF) and keep its constraint problems, for `lavender report OUT`."""
     from lavender.io.recording import record_file
 
     if controls != "random":
         refuse_unused(context, ["seed"], "without --controls random")
-    found = record_file(model, out, steps, every=every, control=controls, seed=seed, replace=replace)
+    found = record_file(
+        model,
+        out,
+        steps,
+        every=every,
+        control=controls,
+        seed=seed,
+        replace=replace,
+        precision=precision or "float64",
+    )
     click.echo(str(found))

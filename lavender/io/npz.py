@@ -27,7 +27,7 @@ from lavender.cones import CONTACT, ROW, Cones
 from lavender.errors import InputError
 from lavender.generalized import Generalized
 from lavender.io.stored import MAX_BYTES, NUMBER, Budget, Stored, write_atomically
-from lavender.problem import Problem
+from lavender.problem import PRECISIONS, Problem
 from lavender.rows import Rows
 
 __all__ = ["VERSION", "read", "write"]
@@ -259,6 +259,8 @@ def write(problem: Problem, path: str | os.PathLike[str], *, impulse: Any = None
         "name": problem.name,
         "names": names,
     }
+    if problem.precision != "float64":
+        meta["precision"] = problem.precision
     if problem.generalized is not None:
         meta["dof_names"] = problem.generalized.names
     arrays["meta"] = np.frombuffer(json.dumps(meta).encode("ascii"), np.uint8)
@@ -294,6 +296,7 @@ def _read_own(archive: _Archive) -> Stored:
     if ptr.ndim != 1 or len(ptr) == 0 or ptr[-1] != len(b):  # before bounds of as many rows are made
         raise InputError(f"b has shape {b.shape}; cones.ptr must end with the number of its rows")
     more: dict[str, Any] = {name: archive[name] for name in ("guess", "key") if name in archive}
+    more["precision"] = meta.get("precision", "float64")
     if meta["operator"] == "rows":
         parts: dict[str, Any] = {name.removeprefix("rows_"): archive[name] for name in ROWS}
         more["rows"] = Rows(**parts)
@@ -316,16 +319,18 @@ def _meta(archive: _Archive) -> dict[str, Any]:
         raise InputError(f"entry 'meta' is not JSON text in bytes ({error})") from None
     if (
         not isinstance(meta, dict)
-        or set(meta) - {"dof_names"} != {"operator", "friction", "name", "names"}
+        or set(meta) - {"dof_names", "precision"} != {"operator", "friction", "name", "names"}
         or meta["operator"] not in ("dense", "csr", "rows", "generalized")
         or ("dof_names" in meta) != (meta["operator"] == "generalized")
         or not _is_names(meta.get("dof_names"))
         or not isinstance(meta["name"], str)
         or not isinstance(meta["friction"], str)
         or not _is_names(meta["names"])
+        or meta.get("precision", "float64") not in PRECISIONS
     ):
         raise InputError(
-            "entry 'meta' must hold operator (dense, csr, rows or generalized), friction, name and names"
+            "entry 'meta' must hold operator (dense, csr, rows or generalized), friction, name and names; a precision "
+            f"in it is {' or '.join(PRECISIONS)}"
         )
     return meta
 

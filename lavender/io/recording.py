@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 from collections.abc import Callable
@@ -18,6 +19,7 @@ from lavender.errors import InputError, LavenderError
 from lavender.io import mujoco as adapter
 from lavender.io import npz
 from lavender.io.stored import first_bytes, folder_for_steps, write_text
+from lavender.problem import PRECISIONS
 from lavender.residuals import residual
 
 __all__ = ["Recording", "record", "record_file"]
@@ -52,11 +54,13 @@ def record(
     control: Control = "zero",
     seed: int = 0,
     replace: bool = False,
+    precision: str = "float64",
 ) -> Recording:
     """Step a MuJoCo simulation and keep the problem of every `every`-th step.
 
     Each file holds the problem with keys of its blocks and MuJoCo's own impulse. `engine.jsonl` has a line for each:
-    file, step, rows, the engine's iterations, the time of its constraint solver [s] and its residual by our judge.
+    file, step, rows, the engine's iterations, the time of its constraint solver [s] and, by our judge, its
+    residual, the floor of its precision and the verdict.
 
     Parameters
     ----------
@@ -75,6 +79,8 @@ def record(
         Of "random".
     replace : bool
         Take the problem files of another recording out of the folder, which is refused otherwise.
+    precision : {"float64", "float32"}
+        In which this MuJoCo computes (`mjtNum`); written with each problem.
 
     Returns
     -------
@@ -83,12 +89,15 @@ def record(
     Raises
     ------
     InputError
-        Not a model and its data, `steps` or `every` below 1, another control, a folder that holds a recording.
+        Not a model and its data, `steps` or `every` below 1, another control or precision, a folder that holds a
+        recording.
     """
     mj = adapter._mujoco(model, data)
     for word, value in (("steps", steps), ("every", every)):
         if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
             raise InputError(f"{word} is {value!r}; a whole number from 1 is needed")
+    if precision not in PRECISIONS:
+        raise InputError(f"precision is {precision!r}; {' or '.join(map(repr, PRECISIONS))} is needed")
     drive = _drive(model, control, seed)
     folder = folder_for_steps(folder, replace)
     files: list[str] = []
@@ -112,6 +121,7 @@ def record(
             continue
         try:
             problem = adapter.from_mujoco(model, data, name=f"step {step + 1}")
+            problem = dataclasses.replace(problem, precision=precision, copy=False)
         except LavenderError as error:
             left_out.append(f"step {step + 1}: {error}")
             continue
@@ -119,9 +129,11 @@ def record(
         name = f"step_{step + 1:0{width}d}.npz"
         npz.write(problem, folder / name, impulse=own)
         files.append(name)
+        judged = residual(problem, own)
         lines.append(json.dumps({
             "file": name, "step": step + 1, "rows": problem.m, "iterations": int(np.sum(data.solver_niter)),
-            "seconds": seconds, "relative": residual(problem, own).relative,
+            "seconds": seconds, "relative": judged.relative, "floor": judged.floor, "verdict": judged.verdict,
+            "precision": precision,
             "solver": mj.mjtSolver(int(model.opt.solver)).name.removeprefix("mjSOL_"),
         }))  # fmt: skip
     write_text(folder / ENGINE, "".join(f"{line}\n" for line in lines))
@@ -137,6 +149,7 @@ def record_file(
     control: Control = "zero",
     seed: int = 0,
     replace: bool = False,
+    precision: str = "float64",
 ) -> Recording:
     """`record` of a model by its file (MJCF); an array of controls may be given by its file (.npy), too.
 
@@ -156,7 +169,15 @@ def record_file(
     if isinstance(control, str) and control not in CONTROLS:
         control = _controls(control)
     found = record(
-        made, mj.MjData(made), folder, steps, every=every, control=control, seed=seed, replace=replace
+        made,
+        mj.MjData(made),
+        folder,
+        steps,
+        every=every,
+        control=control,
+        seed=seed,
+        replace=replace,
+        precision=precision,
     )
     if not found.files:
         raise InputError(

@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from lavender._arrays import ArrayLike, FloatArray, IntArray, as_array
+from lavender._arrays import ArrayLike, FloatArray, IntArray, as_array, precision_of
 from lavender.cones import CONTACT_ROLLING, ROW, Cones, check_shape
 from lavender.errors import InputError
 from lavender.generalized import Generalized
@@ -312,6 +312,8 @@ class Builders(Operators):
         cones : Cones
         compliance : scalar or (m,) 1/kg, optional
         friction : {"coulomb", "cone"}
+        precision : {"float64", "float32"}, optional
+            Default: float32 where J, M and v_free are arrays of float32; they are widened exactly.
         names, dof_names : sequence of str (k,), (nv,), optional
             Names of blocks and of velocities.
 
@@ -349,6 +351,7 @@ class Builders(Operators):
                 " (a contact has a normal and two tangents, or tangents=0, 1)" if np.any(cones.kind) else ""
             )
             raise InputError(f"J has {m} rows; {cones.n_rows} are needed, as the cones have{hint}")
+        more.setdefault("precision", precision_of(J, *(M if isinstance(M, (list, tuple)) else [M]), v_free))
         target = as_array("target", target, (m,), unit="m/s")
         if compliance is not None:
             compliance = as_array("compliance", compliance, (m,), unit="1/kg")

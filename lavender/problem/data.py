@@ -26,6 +26,8 @@ FRICTION = tuple(FRICTION_NUMBER)
 LAWS = ("linear", "lcp", "coulomb", "cone")
 # How A is given.
 OPERATORS = ("rows", "matrix", "generalized")
+# In which the numbers of a problem were made, and answers to it are.
+PRECISIONS = ("float64", "float32")
 
 
 class Names(Sequence[str]):
@@ -72,6 +74,7 @@ class ProblemData:
     name: str = ""
     copy: bool = field(default=True, repr=False)
     generalized: Generalized | None = None
+    precision: str = ""
     derived: Derived = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -87,6 +90,12 @@ class ProblemData:
             raise InputError("give matrix=, rows= or generalized=, one of them")
         if self.friction not in FRICTION:
             raise InputError(f"friction is {self.friction!r}; {' or '.join(map(repr, FRICTION))} is needed")
+        if not self.precision:
+            put(self, "precision", getattr(self.rows, "precision", "float64"))
+        if self.precision not in PRECISIONS:
+            raise InputError(
+                f"precision is {self.precision!r}; {' or '.join(map(repr, PRECISIONS))} is needed"
+            )
         if self.friction != "cone" and self.cones.has_round:
             raise InputError(
                 "a round cone of more than two tangents has no Coulomb law here: give friction='cone'"
@@ -243,6 +252,7 @@ class ProblemData:
                 "key",
                 "names",
                 "name",
+                "precision",
             )
         ):
             return False

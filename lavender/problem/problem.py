@@ -65,6 +65,9 @@ class Problem(Builders):
     copy : bool
         True leaves the arrays given as they are. False adopts those that already fit (b, matrix, compliance, guess):
         they are shared, and marked read-only for the giver, too.
+    precision : {"float64", "float32"}, optional
+        In which an engine made these numbers, and makes its answers: `lavender.residual` then knows what rounding
+        alone explains. Default: that of `rows`. Numbers are widened exactly and solved in float64 in any case.
 
     Raises
     ------
@@ -186,7 +189,7 @@ class Problem(Builders):
         cones = replace(c, lower=low, upper=high)
         guess = None if self.guess is None else self.guess / s
         more: dict[str, Any] = {"guess": guess, "key": self.key, "names": self.names, "name": self.name}
-        more["friction"] = self.friction
+        more |= {"friction": self.friction, "precision": self.precision}
         if self.generalized is None:
             a = sp.csr_array(sp.diags_array(s) @ self.csr @ sp.diags_array(s))
             return Problem(s * self.b, cones, a, copy=False, **more)
@@ -227,6 +230,7 @@ class Problem(Builders):
             names=names,
             name=self.name,
             copy=False,
+            precision=self.precision,
             **more,
         )
 

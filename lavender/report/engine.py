@@ -17,6 +17,7 @@ import numpy as np
 from lavender.bench.store import Records
 from lavender.io.recording import ENGINE
 from lavender.io.stored import whole_file
+from lavender.residuals import AT_FLOOR
 
 __all__ = ["ENGINES", "Contestant", "contestants", "lines"]
 
@@ -38,6 +39,9 @@ class Contestant:
     seconds: float  # median, inside the engine
     relative: float  # median
     worst: float
+    early: (
+        int | None
+    )  # answers of a float32 engine that stopped early or are wrong; None in float64, where tol ends all
     ours: str  # the fastest solver that reached its tolerance in every step, carrying impulses; empty if none did
     our_seconds: float  # median
     our_worst: float
@@ -55,12 +59,13 @@ def contestants(words: Sequence[str], records: Records) -> list[Contestant]:
             try:
                 entry = json.loads(line)
                 numbers = [float(entry[name]) for name in _NUMBERS]
-                found.append((*numbers, str(entry["solver"])))
+                early = entry["verdict"] != AT_FLOOR if entry.get("precision") == "float32" else None
+                found.append((*numbers, early, str(entry["solver"])))
             except (ValueError, KeyError, TypeError):
                 continue
         if not found:
             continue
-        rows, seconds, relative, iterations, solvers = zip(*found, strict=True)
+        rows, seconds, relative, iterations, early, solvers = zip(*found, strict=True)
         name, ours, worst = _fastest(Path(word).name, records)
         out.append(
             Contestant(
@@ -72,6 +77,7 @@ def contestants(words: Sequence[str], records: Records) -> list[Contestant]:
                 seconds=float(np.median(seconds)),
                 relative=float(np.median(relative)),
                 worst=float(np.max(relative)),
+                early=None if None in early else sum(early),
                 ours=name,
                 our_seconds=ours,
                 our_worst=worst,
@@ -106,10 +112,18 @@ def lines(found: Sequence[Contestant]) -> list[str]:
     """As Markdown."""
     if not found:
         return []
-    out = [
-        "| recorded | steps | rows | engine's own | time | residual, median | worst | fastest here | time | worst |",
-        "|---|---|---|---|---|---|---|---|---|---|",
-    ]
+    head = (
+        "recorded",
+        "steps",
+        "rows",
+        "engine's own",
+        "time",
+        "residual, median",
+        "worst",
+        "early in float32",
+    )
+    head = (*head, "fastest here", "time", "worst")
+    out = [f"| {' | '.join(head)} |", "|---" * len(head) + "|"]
     for c in found:
         here = (
             f"{c.ours} | {1e6 * c.our_seconds:.3g} µs | {c.our_worst:.1e}"
@@ -118,6 +132,6 @@ def lines(found: Sequence[Contestant]) -> list[str]:
         )
         out.append(
             f"| {c.folder} | {c.steps} | {c.rows:g} | {c.solver} | {1e6 * c.seconds:.3g} µs | {c.relative:.1e} "
-            f"| {c.worst:.1e} | {here} |"
+            f"| {c.worst:.1e} | {'–' if c.early is None else c.early} | {here} |"
         )
     return out

@@ -13,6 +13,11 @@ from pathlib import Path
 
 import pytest
 
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    tomllib = pytest.importorskip("tomli")
+
 import lavender
 import lavender_ext
 
@@ -99,6 +104,57 @@ def test_pictures_of_the_long_description_are_absolute_where_an_address_is_known
     links = re.findall(r"\]\(([^)]+)\)", described(LAVENDER_FILES_URL="https://example.org/v1/"))
     assert "https://example.org/v1/docs/static/web.gif" in links
     assert len(links) >= 6 and all(link.startswith("https://") for link in links)
+
+
+def test_urls_stand_below_an_address_that_is_known_and_nowhere_else(tmp_path):
+    def urls(**env):
+        run = [sys.executable, "setup.py", "-q", "egg_info", "--egg-base", str(tmp_path)]
+        subprocess.run(run, capture_output=True, check=True, cwd=ROOT, env={**os.environ, **env})
+        (info,) = tmp_path.glob("*/PKG-INFO")
+        return re.findall(r"^Project-URL: (\w+), (.+)$", info.read_text(encoding="utf-8"), re.MULTILINE)
+
+    assert urls(LAVENDER_FILES_URL="") == []
+    found = dict(urls(LAVENDER_FILES_URL="https://example.org/v1/"))
+    assert found.pop("Source") == "https://example.org/v1"
+    assert found
+    for url in found.values():
+        assert (ROOT / url.removeprefix("https://example.org/v1/")).is_file()
+
+
+def test_the_citation_names_this_version_and_licence():
+    said = dict(re.findall(r"^([\w-]+): (.+)$", (ROOT / "CITATION.cff").read_text("utf-8"), re.MULTILINE))
+    assert said["version"] == lavender.__version__
+    assert (
+        said["license"] == tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]["license"]
+    )
+    assert {"cff-version", "message", "title"} <= set(said)
+
+
+def test_recipe_and_lock_file_name_what_the_package_asks_for():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+    asked = {re.split(r"[<>=]", line)[0]: re.split(r">=", line)[1] for line in project["dependencies"]}
+    recipe = (ROOT / ".ci" / "conda" / "meta.yaml").read_text("utf-8")
+    run = recipe.partition("\n  run:\n")[2].partition("\n\n")[0]
+    bounds = dict(re.findall(r"- ([\w-]+) >=(\S+)", run))
+    other = {"matplotlib": "matplotlib-base", "qdldl": "qdldl-python"}  # names of that channel
+    assert bounds == {other.get(k, k): v for k, v in asked.items()} | {
+        "python": project["requires-python"][2:]
+    }
+    lock = dict(
+        re.findall(r"^([\w-]+)==(\S+)$", (ROOT / ".ci" / "lock.txt").read_text("utf-8"), re.MULTILINE)
+    )
+    extras = project["optional-dependencies"]
+    needed = set(asked) | {
+        re.split(r"[<>=]", x)[0] for name in ("qp", "fclib", "frame", "mujoco") for x in extras[name]
+    }
+    assert needed <= set(lock)
+
+
+def test_workflows_run_what_is_here():
+    said = "".join(path.read_text("utf-8") for path in (ROOT / ".github" / "workflows").glob("*.yml"))
+    named = set(re.findall(r"\.ci/[\w.]+|tests/[\w/.]+", said))
+    assert ".ci/run" in named
+    assert [name for name in named if not (ROOT / name).exists()] == []
 
 
 def test_types_ship():
