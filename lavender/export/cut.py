@@ -125,7 +125,7 @@ def tokens(text: str) -> Iterator[Token]:
 
 
 def read(text: str, origin: str = "") -> list[Item]:
-    """The declarations of a C file one by one, those between `#if` and `#endif` together; a guard of all is no group."""
+    """The declarations of a C file one by one, those between `#if` and `#endif` together."""
     stream = list(tokens(text))
     closing, opened = {}, []
     for at, token in enumerate(stream):

@@ -6,17 +6,20 @@ import contextlib
 import hashlib
 from collections.abc import Iterator
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import lavender_ext
 from lavender.errors import InputError, LavenderError
-from lavender.export import cut
+from lavender.export import bindings, cut
 from lavender.io.stored import write_text
+from lavender.web import compile as wasm
 
 __all__ = ["HEADER", "source", "write"]
 
 HERE = Path(__file__).resolve().parent
 ROOT = Path(lavender_ext.__file__).resolve().parent.parent  # the folder that holds lavender_ext
 HEADER = HERE / "c" / "lavender.h"
+TEXTS = (".h", ".hpp", ".c", ".cpp", ".txt", ".in", ".rs", ".toml", ".mjs", ".mts", ".json")
 #: Folders of what can be written, by name.
 KINDS = {"c": "c", "rust": "rust", "npm": "js"}
 
@@ -78,16 +81,44 @@ def write(kind: str, out: Path, *, replace: bool = False) -> list[Path]:
     LavenderError
         As `source`.
     """
-    folder = HERE / KINDS[kind]
+    folder, header = HERE / KINDS[kind], HEADER.read_text(encoding="utf-8")
     made = {p.relative_to(folder).as_posix(): p.read_text(encoding="utf-8") for p in _files(folder)}
     if kind == "rust":
         made["lavender-sys/c/lavender.c"] = source()
-        made["lavender-sys/c/lavender.h"] = HEADER.read_text(encoding="utf-8")
+        made["lavender-sys/c/lavender.h"] = header
+        made["lavender-sys/src/lib.rs"] = bindings.rust(header)
+    elif kind == "npm":
+        made["header.mjs"], made["header.d.mts"] = bindings.javascript(header)
     elif kind == "c":
         made["lavender.c"] = source()
     sums = "".join(f"{hashlib.sha256(made[name].encode()).hexdigest()}  {name}\n" for name in sorted(made))
     made["SHA256SUMS"] = sums
-    return put(out, made, replace)
+    written = put(out, made, replace)
+    if kind == "npm":
+        written.insert(0, _module(out / "liblavender.wasm", header))
+    return written
+
+
+def _module(out: Path, header: str) -> Path:
+    """The library as a WebAssembly module: the one that came with the package, or a new one."""
+    kept, text = HERE / "js" / out.name, source()
+    stamp = hashlib.sha256(text.encode()).hexdigest()
+    if kept.exists() and kept.with_suffix(".sha256").read_text(encoding="utf-8") == stamp:
+        out.write_bytes(kept.read_bytes())
+        return out
+    with TemporaryDirectory() as folder:
+        work = Path(folder)
+        (work / "lavender.c").write_text(text, encoding="utf-8")
+        (work / "lavender.h").write_text(header, encoding="utf-8")
+        names = [name for _, name, _ in bindings.functions(header)]
+        try:
+            wasm.build_library(out, work / "lavender.c", names)
+        except wasm.BuildFailed as error:
+            raise LavenderError(str(error)) from None
+    with contextlib.suppress(OSError):  # a package that nobody may write into
+        kept.write_bytes(out.read_bytes())
+        kept.with_suffix(".sha256").write_text(stamp, encoding="utf-8")
+    return out
 
 
 def put(out: Path, made: dict[str, str], replace: bool) -> list[Path]:

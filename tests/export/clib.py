@@ -5,7 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
-from lavender.export import HEADER, struct_fields
+from lavender.export import HEADER
+from lavender.export.bindings import struct_fields
 from lavender.export.view import view
 
 COUNTS = (

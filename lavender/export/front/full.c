@@ -317,7 +317,9 @@ int32_t lav_engine_image(lav_engine *engine, void *out, uint64_t out_bytes, uint
     double *real = (double *)(void *)(at + 40);
     int32_t *index = (int32_t *)(void *)(real + count[0]);
     uint64_t *keys = (uint64_t *)(void *)(index + (count[1] + 1) / 2 * 2);
-    if (memcmp(size, e->size, 40) == 0) {
+    int32_t i, same = 1;
+    for (i = 0; i < 10; i++) same = same && size[i] == e->size[i];
+    if (same) {
       memcpy(real, e->real, 8 * (size_t)count[0]);
       memcpy(index, e->index, 4 * (size_t)count[1]);
       memcpy(keys, e->keys, 8 * (size_t)count[2]);
