@@ -30,7 +30,7 @@ def constants(header: str) -> dict[str, int]:
 
 
 def struct_fields(header: str, name: str) -> list[tuple[str, str]]:
-    """Fields of a struct, in order: ("int32_t", "n_rows"), a pointer as ("const double *", "b"), a function as ("(*)", .)."""
+    """Fields of a struct in order: ("int32_t", "n_rows"), a pointer ("const double *", "b"), a function ("(*)", .)."""
     body = re.search(rf"typedef struct {name} \{{(.*?)\}} {name};", header, re.DOTALL)
     if body is None:
         raise ValueError(f"the header has no struct {name}")

@@ -42,7 +42,10 @@ class Library:
     """A shared library that was built from lavender.c."""
 
     def __init__(self, path: Path):
+        self.path = path
         self.c = ct.CDLL(str(path))
+        self.c.lav_velocity.argtypes = [ct.c_void_p, ct.c_void_p, ct.c_int32]
+        self.c.lav_islands.argtypes = [ct.c_void_p, ct.c_void_p, ct.c_int32]
         self.c.lav_text.restype = self.c.lav_name.restype = self.c.lav_outcome.restype = ct.c_char_p
         self.c.lav_hash.restype = self.c.lav_needed.restype = ct.c_uint64
         self.c.lav_needed.argtypes = [ct.c_void_p]

@@ -63,11 +63,11 @@ static int solve_one(int64_t number) {
   result.size = sizeof result;
   CHECK(lav_room(&q, &options, &bytes));
   for (;;) {
-    int32_t code;
+    int32_t set;
     CHECK(lav_open(malloc(bytes), bytes, &q, &options, &solver));
-    code = lav_set(solver, &q);
-    if (code != LAV_ERROR_ROOM) {
-      CHECK(code);
+    set = lav_set(solver, &q);
+    if (set != LAV_ERROR_ROOM) {
+      CHECK(set);
       break;
     }
     bytes = lav_needed(solver);
