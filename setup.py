@@ -34,6 +34,7 @@ MODE = os.environ.get("LAVENDER_DEBUG", "")
 DEBUG = MODE not in ("", "0")
 OPTIONS = runpy.run_path("lavender_ext/build_options.py")
 WASM = runpy.run_path("lavender/web/compile.py")
+CUT = runpy.run_path("lavender/export/cut.py")
 DIRECTIVES = OPTIONS["directives"](debug=DEBUG)
 #: Holds what Cython would otherwise write into every module (memoryviews): half of all that is compiled.
 SHARED = "lavender_ext._utility"
@@ -151,8 +152,60 @@ class BuildWasm(Command):
         return []
 
 
+class BuildLibrary(Command):
+    """Cuts the C library out of the kernels (lavender/export/cut.py); into a wheel with it, its header and bindings."""
+
+    user_options = [("build-lib=", None, "folder of what is installed")]  # noqa: RUF012 - as the base class asks
+
+    def initialize_options(self):
+        """Nothing is known yet."""
+        self.build_lib = None
+        self.editable_mode = False
+        self.written = []
+
+    def finalize_options(self):
+        """As for the other parts of a build."""
+        self.set_undefined_options("build", ("build_lib", "build_lib"))
+
+    def run(self):
+        """One source from the translations of this build, and everything that lies beside it."""
+        if self.editable_mode:
+            return  # `lavender export` makes it when it is first needed
+        for path in [*sorted(Path("lavender/export").rglob("*.*")), make_library()]:
+            if path.is_file() and path.suffix not in (".py", ".pyc") and "target" not in path.parts:
+                out = Path(self.build_lib, path)
+                out.parent.mkdir(parents=True, exist_ok=True)
+                out.write_bytes(path.read_bytes())
+                self.written.append(str(out))
+
+    def get_outputs(self):
+        """Source, header, bindings."""
+        return self.written
+
+    def get_output_mapping(self):
+        """No file is linked to a source."""
+        return {}
+
+    def get_source_files(self):
+        """Nothing beyond what the kernels list."""
+        return []
+
+
+def make_library():
+    """lavender/export/c/lavender.c of the kernels as they are, its path."""
+    out = Path("lavender", "export", "c", "lavender.c")
+    if not (out.exists() and CUT["source_hash"](Path()) in out.read_text(encoding="utf-8")[:1000]):
+        out.write_text(CUT["amalgamate"](Path().resolve(), Path("build", "cython")), encoding="utf-8")
+    return out
+
+
 class ReproducibleArchive(sdist):
     """A source distribution whose bytes follow from its files alone: no clock, owner, umask or order of a folder."""
+
+    def run(self):
+        """The C library is made first, so that whoever unpacks the archive has it without Cython."""
+        make_library()
+        super().run()
 
     def make_archive(self, base_name, format, root_dir=None, base_dir=None, owner=None, group=None):  # noqa: A002
         """The archive's path; only `gztar`, the one that frontends ask for, is made here."""
@@ -175,7 +228,7 @@ class ReproducibleArchive(sdist):
         return str(out)
 
 
-build.sub_commands = [*build.sub_commands, ("build_wasm", None)]
+build.sub_commands = [*build.sub_commands, ("build_wasm", None), ("build_library", None)]
 
 
 def extension(path):
@@ -218,5 +271,10 @@ setup(
     # An editable install is a line of a .pth file: the finder of setuptools comes after the folders of sys.path, and a
     # clone named lavender in one of them, as in its parent, would be imported as an empty package.
     options={"editable_wheel": {"mode": "compat"}},
-    cmdclass={"build_ext": BuildKernels, "build_wasm": BuildWasm, "sdist": ReproducibleArchive},
+    cmdclass={
+        "build_ext": BuildKernels,
+        "build_wasm": BuildWasm,
+        "build_library": BuildLibrary,
+        "sdist": ReproducibleArchive,
+    },
 )

@@ -7,7 +7,19 @@ from typing import Any
 from lavender import registry
 from lavender.bench.record import Record, level_name
 
-__all__ = ["code_of", "needs_more"]
+__all__ = ["C_METHODS", "c_of", "code_of", "needs_more"]
+
+#: Solvers that the C library has (`lavender export c`), by its numbers.
+C_METHODS = {
+    "sequential_impulses": 1, "pgs": 2, "sor": 3, "gauss_seidel": 4, "jacobi": 5, "block_gauss_seidel": 6,
+    "anderson": 7, "nncg": 8, "newton": 9, "direct": 10,
+}  # fmt: skip
+C_OPTIONS = {"memory": "{}", "convex": "{}", "omega": "{!r}"}
+C_WORDS = {
+    ("order", "symmetric"): "order = LAV_SYMMETRIC", ("order", "random"): "order = LAV_RANDOM",
+    ("order", "reverse"): "order = LAV_REVERSE", ("sweep", "pgs"): "sweep = LAV_PGS_SWEEP",
+    ("sweep", "blocks"): "sweep = LAV_BLOCK_SWEEP", ("restart", "against"): "keeps = 1",
+}  # fmt: skip
 
 CARRIED = (
     "before, impulse = problems[0], None",
@@ -40,3 +52,25 @@ def code_of(record: Record) -> tuple[str, ...]:
         f'    solution = lv.solve(problem, "{record.solver}", impulse=start, {words})',
         "    before, impulse = problem, solution.impulse",
     )
+
+
+def c_of(record: Record) -> tuple[str, ...]:
+    """The C calls of a record, on `options` and `budget`; none where the library lacks the solver or an option."""
+    if record.solver not in C_METHODS or record.way == "batch":
+        return ()
+    out = [f"lav_default_options(LAV_{record.solver.upper()}, &options)"]
+    for key, value in {"order": record.order or "given", **record.options}.items():
+        if key in C_OPTIONS:
+            out.append(f"options.{key} = {C_OPTIONS[key].format(value)}")
+        elif (key, value) in C_WORDS:
+            out.append(f"options.{C_WORDS[key, value]}")
+        elif (key, value) != ("order", "given"):
+            return ()
+    if record.seed and record.order == "random":
+        out.append(f"options.seed = {record.seed}")
+    out.append("lav_default_budget(&budget)")
+    out.append(f"budget.tol = {record.tol:g}")
+    out.append(f"budget.iterations = {record.max_iter or registry.specs()[record.solver].max_iter}")
+    if record.mode == "time":
+        out.append(f"budget.seconds = {record.time_limit:g}")
+    return tuple(out)

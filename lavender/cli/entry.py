@@ -16,6 +16,7 @@ from lavender.cli.cases import cases
 from lavender.cli.check import check
 from lavender.cli.doctor import doctor
 from lavender.cli.explain import explain
+from lavender.cli.export import export
 from lavender.cli.options import EXIT_BAD_INPUT, EXIT_INTERRUPTED
 from lavender.cli.phenomena import phenomena
 from lavender.cli.record import record
@@ -37,7 +38,7 @@ def cli() -> None:
 
 
 for _command in (
-    report, bench, check, solve, explain, reference, solvers, cases, run, record, phenomena, web, view, doctor,
+    report, bench, check, solve, explain, reference, solvers, cases, run, record, phenomena, export, web, view, doctor,
 ):  # fmt: skip
     cli.add_command(_command)
 

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+from lavender.bench.line import c_of
 from lavender.bench.record import Record, level_name
 from lavender.bench.store import Records
 from lavender.io.stored import SUFFIXES
@@ -174,9 +175,11 @@ def _told(final: Final, time: float, what: str) -> list[str]:
     *before, last = final.code
     timed = f"{seconds(time)}, {what}"
     timed = timed if final.line.times else f"not timed as a line: {timed}"
+    calls = ", ".join(c_of(final.line))
+    in_c = [f"# in C (lavender export c): {calls}, lav_run(solver, &budget, &result);"] if calls else []
     if final.line.start == "carried":
-        return [f"{before[0]}  # {timed}", *before[1:], last]
-    return [*before, f"{last}  # {timed}"]
+        return [f"{before[0]}  # {timed}", *before[1:], last, *in_c]
+    return [*before, f"{last}  # {timed}", *in_c]
 
 
 def _by_advice(records: Records, scale: _Scale) -> Verdict:

@@ -226,10 +226,7 @@ def build(
         raise BuildFailed(reason)
     paths = _paths(root, modules)
     names = [name for path in paths for name in core_functions(path.read_text(encoding="utf-8"))]
-    zig = [sys.executable, "-m", "ziglang"]
-    named = shlex.split(os.environ.get("LAVENDER_WASM_CC", ""))
-    compiler = named or [*zig, "cc", "-target", "wasm32-wasi"]
-    linker = shlex.split(os.environ.get("LAVENDER_WASM_LD", "")) or [*zig, "wasm-ld"]
+    compiler, linker, named = _tools()
     options = runpy.run_path(str(root / "lavender_ext" / "build_options.py"))
     with tempfile.TemporaryDirectory(prefix="lavender-wasm-") as folder:
         work = Path(folder)
@@ -283,6 +280,42 @@ def build(
             part.unlink(missing_ok=True)
             raise BuildFailed(f"cannot write {out}: {error.strerror or error}") from None
     return Built(len(data), tuple(sorted(names)), found.imports, shlex.join(compiler))
+
+
+def _tools() -> tuple[list[str], list[str], bool]:
+    """Compiler, linker, and whether a variable of the environment names the compiler."""
+    zig = [sys.executable, "-m", "ziglang"]
+    named = shlex.split(os.environ.get("LAVENDER_WASM_CC", ""))
+    linker = shlex.split(os.environ.get("LAVENDER_WASM_LD", "")) or [*zig, "wasm-ld"]
+    return named or [*zig, "cc", "-target", "wasm32-wasi"], linker, bool(named)
+
+
+def build_library(out: Path, source: Path, names: Iterable[str]) -> Module:
+    """One C file that needs no header of Python's, its functions exported with the memory; nothing is imported.
+
+    Raises
+    ------
+    BuildFailed
+        No compiler, or the file needs a function that is not in it.
+    """
+    compiler, linker, named = _tools()
+    if not named and importlib.util.find_spec("ziglang") is None:
+        raise BuildFailed(
+            "no compiler for WebAssembly: pip install 'lavender-contact[wasm]' brings ziglang, or set "
+            "LAVENDER_WASM_CC and LAVENDER_WASM_LD"
+        )
+    with tempfile.TemporaryDirectory(prefix="lavender-wasm-") as folder:
+        compiled, linked = Path(folder, "library.o"), Path(folder, "library.wasm")
+        flags = ["-std=c11", "-O3", "-g0", "-ffp-contract=off", *(["-mbulk-memory"] if named else [])]
+        _run([*compiler, *flags, "-c", str(source), "-o", str(compiled)], source.parent)
+        keep = ["--no-entry", "--gc-sections", "-s", *(f"--export={name}" for name in (*names, *EDGES))]
+        _run([*linker, *keep, str(compiled), "-o", str(linked)], source.parent)
+        data = linked.read_bytes()
+    found = read_module(data)
+    if found.imports:
+        raise BuildFailed(f"the module imports {', '.join(found.imports)}; it must stand alone")
+    out.write_bytes(data)
+    return found
 
 
 def _run(command: list[str], folder: Path) -> None:

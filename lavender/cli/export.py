@@ -1,0 +1,47 @@
+"""`lavender export`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from lavender.cli.options import refuse_unused
+
+__all__ = ["export"]
+
+
+@click.command()
+@click.argument("kind", type=click.Choice(["c", "rust", "npm"]))
+@click.argument("folder", type=click.Path(file_okay=False, path_type=Path))
+@click.option(
+    "--for", "records", type=click.Path(exists=True, dir_okay=False, path_type=Path),
+    help="records.jsonl of a report: with the solver it recommends, its settings and test vectors (c alone).",
+)  # fmt: skip
+@click.option("--solver", help="With --for: this solver of the records, not the recommended one.")
+@click.option("--vectors", default=4, show_default=True, help="With --for: problems at most.")
+@click.option(
+    "--replace", is_flag=True, help="Replace files of ours that are others than what would be written."
+)
+@click.pass_context
+def export(
+    context: click.Context,
+    kind: str,
+    folder: Path,
+    records: Path | None,
+    solver: str | None,
+    vectors: int,
+    replace: bool,
+) -> None:
+    """Write the kernels for an engine outside Python: a C library with one header, Rust crates, an npm package."""
+    from lavender.export import library
+    from lavender.export import vectors as chosen
+
+    if records is None:
+        refuse_unused(context, ["solver", "vectors"], "without --for")
+    elif kind != "c":
+        raise click.UsageError("--for goes with c: test vectors are checked by a C program")
+    written = library.write(kind, folder, replace=replace)
+    if records is not None:
+        written += chosen.write(records, folder, solver, vectors, replace=replace)
+    click.echo(f"{len(written)} files in {folder}: {', '.join(p.name for p in written)}")

@@ -1,0 +1,8 @@
+"""The way out: the kernels as a C library with one header, for engines that are not written in Python.
+
+`lavender export c DIR` writes it, `rust` and `npm` its bindings. From Python `write`, `source`, `HEADER`.
+"""
+
+from lavender.export.library import HEADER, source, write
+
+__all__ = ["HEADER", "source", "write"]

@@ -1,0 +1,128 @@
+"""What other languages need of lavender.h, made of the header itself: constants, structs field by field, functions."""
+
+from __future__ import annotations
+
+import re
+
+__all__ = ["constants", "functions", "javascript", "rust", "struct_fields"]
+
+STRUCTS = ("lav_problem", "lav_options", "lav_budget", "lav_verdict", "lav_result")
+RUST = {
+    "int32_t": "i32",
+    "uint32_t": "u32",
+    "uint64_t": "u64",
+    "double": "f64",
+    "void": "c_void",
+    "char": "c_char",
+}
+
+
+def _bare(header: str) -> str:
+    return re.sub(r"/\*.*?\*/", "", header, flags=re.DOTALL)
+
+
+def constants(header: str) -> dict[str, int]:
+    """Numbers of the enums by name."""
+    found = {}
+    for body in re.findall(r"enum \{(.*?)\};", _bare(header), re.DOTALL):
+        found |= {name: int(value) for name, value in re.findall(r"(\w+)\s*=\s*(-?\d+)", body)}
+    return found
+
+
+def struct_fields(header: str, name: str) -> list[tuple[str, str]]:
+    """Fields of a struct in order: ("int32_t", "n_rows"), a pointer ("const double *", "b"), a function ("(*)", .)."""
+    body = re.search(rf"typedef struct {name} \{{(.*?)\}} {name};", header, re.DOTALL)
+    if body is None:
+        raise ValueError(f"the header has no struct {name}")
+    found = []
+    for line in _bare(body[1]).split(";"):
+        words = " ".join(line.split())
+        pointer = re.match(r"(.*?)\(\*(\w+)\)\(", words)
+        if pointer:
+            found.append(("(*)", pointer[2]))
+            continue
+        match = re.match(r"((?:const )?\w+) (.+)", words)
+        for part in match[2].split(",") if match else ():
+            assert match is not None
+            found.append((match[1] + (" *" if "*" in part else ""), part.replace("*", "").strip()))
+    return found
+
+
+def functions(header: str) -> list[tuple[str, str, list[str]]]:
+    """(what it returns, name, arguments) of every function."""
+    found = re.findall(r"LAV_API ((?:const )?\w+ \*?)(\w+)\((.*?)\);", _bare(header), re.DOTALL)
+    return [
+        (kind.strip(), name, [] if args.strip() == "void" else [" ".join(a.split()) for a in args.split(",")])
+        for kind, name, args in found
+    ]
+
+
+def _rust_type(words: str) -> str:
+    if words.startswith("lav_solver *const *"):
+        return "*const *mut lav_solver"
+    name = words.replace("const", " ").replace("*", " ").split()[0]
+    stars, constant = words.count("*"), words.startswith("const")
+    if not stars:
+        return RUST.get(name, name)
+    return "*mut " * (stars - 1) + ("*const " if constant else "*mut ") + RUST.get(name, name)
+
+
+def rust(header: str) -> str:
+    """lavender-sys: the header in Rust."""
+    out = [
+        "//! The functions and structs of lavender.h, as they are; `lavender` wraps them safely. Made of the header.",
+        "#![no_std]",
+        "#![allow(non_camel_case_types)]",
+        "use core::ffi::{c_char, c_void};",
+        "",
+        *(f"pub const {name}: i32 = {value};" for name, value in constants(header).items()),
+    ]
+    for name in ("lav_solver", "lav_engine"):
+        out += ["", "#[repr(C)]", f"pub struct {name} {{", "    _opaque: [u8; 0],", "}"]
+    for name in STRUCTS:
+        out += ["", "#[repr(C)]", "#[derive(Clone, Copy)]", f"pub struct {name} {{"]
+        for kind, field in struct_fields(header, name):
+            clock = 'Option<unsafe extern "C" fn(*mut c_void) -> f64>'
+            out.append(f"    pub {field}: {clock if kind == '(*)' else _rust_type(kind)},")
+        out.append("}")
+    out += ["", 'extern "C" {']
+    for kind, name, arguments in functions(header):
+        given = []
+        for words in arguments:
+            match = re.fullmatch(r"(.*?)(\w+)", words)
+            assert match is not None
+            given.append(f"{match[2]}: {_rust_type(match[1].strip())}")
+        out.append(f"    pub fn {name}({', '.join(given)}) -> {_rust_type(kind)};")
+    return "\n".join([*out, "}", ""])
+
+
+def javascript(header: str) -> tuple[str, str]:
+    """(module, types) of the constants and of where the fields of structs lie in WebAssembly's 32-bit memory."""
+    numbers = constants(header)
+    sizes = {"double": 8, "uint64_t": 8, "int32_t": 4, "uint32_t": 4}
+    layouts: dict[str, dict[str, tuple[str, int]]] = {}
+    total: dict[str, int] = {}
+    for name in ("lav_verdict", *(s for s in STRUCTS if s != "lav_verdict")):
+        at, layouts[name] = 0, {}
+        for kind, field in struct_fields(header, name):
+            size = 4 if "*" in kind else total.get(kind) or sizes[kind]
+            align = 8 if kind in total else size
+            at = (at + align - 1) // align * align
+            layouts[name][field] = ("pointer" if "*" in kind else kind, at)
+            at += size
+        total[name] = (
+            (at + 7) // 8 * 8
+            if any(k in ("double", "uint64_t", *total) for k, _ in layouts[name].values())
+            else at
+        )
+    module = ["// Made of lavender.h: its constants, and where fields lie in a module of 32-bit pointers."]
+    module += [f"export const {name} = {value};" for name, value in numbers.items()]
+    module.append("export const STRUCTS = {")
+    for name, fields in layouts.items():
+        inside = ", ".join(f"{field}: ['{kind}', {at}]" for field, (kind, at) in fields.items())
+        module.append(f"  {name}: {{ size: {total[name]}, fields: {{ {inside} }} }},")
+    types = [f"export const {name}: {value};" for name, value in numbers.items()]
+    types.append(
+        "export const STRUCTS: Record<string, { size: number; fields: Record<string, [string, number]> }>;"
+    )
+    return "\n".join([*module, "};", ""]), "\n".join([*types, ""])

@@ -1,0 +1,491 @@
+"""C without Python, cut out of the C that Cython writes: what given functions reach, and nothing else.
+
+    cut(translations, front)      one C file of the kernels that `front` (C of ours) uses, `front` at its end
+    amalgamate(root)              the library of lavender.h
+
+Cython writes a module's core (`cdef ... noexcept nogil`) and its Python part into one file, and what several modules
+cimport into each of them. Every file is read token by token into its declarations (structs, enums, typedefs, functions,
+groups under `#if`); a name leads to the declaration that makes it, and what that uses leads on. A function that another
+module imports by pointer is the function itself here. What is reached must not name Python: who uses it is told.
+
+Names lose what Cython puts before them (`__pyx_f_12lavender_ext_4core_5block_clip` is `core_block_clip`), core
+functions `lav_x` become `k_x`, and everything of the kernels is `static`. Uses under `#ifndef LAV_SWEEPS_ONLY` of
+`front` count for the full build alone, and what only they reach stands under the same condition.
+
+Only the standard library is imported, so that setup.py can run this before anything is built.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+import runpy
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import ClassVar
+
+__all__ = ["FRONT", "MODULES", "CutFailed", "Item", "amalgamate", "cut", "read", "source_hash", "translate"]
+
+#: Modules of lavender_ext that the library reaches into, and C of ours: what comes before the kernels, what after them.
+MODULES = (
+    "core.generalized",
+    "core.order",
+    "core.problem",
+    "judge.measure",
+    "judge.watch",
+    "sweep.serial",
+    "local.gauss_seidel",
+    "accelerate.accelerated",
+    "generalized.newton",
+    "pivot.principal",
+    "few.islands",
+    "factor.graph",
+    "engine.arrays",
+    "engine.substep",
+    "host.memory",
+)
+PROLOGUE, FRONT = "prologue.c", ("front.c", "solve.c", "full.c")
+CIMPORT = re.compile(r"^from lavender_ext\.([\w.]+) cimport", re.MULTILINE)
+
+#: The condition of `front` under which the small build leaves things out.
+SMALL = "LAV_SWEEPS_ONLY"
+#: Words of Cython for which `front` has its own.
+PROVIDED = frozenset(
+    {"CYTHON_INLINE", "CYTHON_UNUSED", "__PYX_EXTERN_C", "likely", "unlikely", "NULL", "DL_IMPORT"}
+)
+KEYWORDS = frozenset(
+    """auto break case char const continue default do double else enum extern float for goto if inline int long register
+    return short signed sizeof static struct switch typedef union unsigned void volatile while""".split()  # noqa: SIM905
+)
+
+TOKEN = re.compile(
+    r"""(?P<directive>(?<![^\n])[ \t]*\#(?:\\\n|/\*.*?\*/|[^\n])*)
+      |(?P<skip>\n|[^\S\n]+|/\*.*?\*/|//[^\n]*)
+      |(?P<name>[A-Za-z_]\w*)
+      |(?P<literal>"(?:\\.|[^"\\\n])*"|'(?:\\.|[^'\\\n])*'|\.?\d(?:[eEpP][+-]|[\w.])*)
+      |(?P<mark>[^\s\w])""",
+    re.VERBOSE | re.DOTALL,
+)
+WORD = re.compile(r"[A-Za-z_]\w*")
+MANGLED = re.compile(r"__pyx_(?:f|t|e|fuse_\d+)_(?=\d)")
+
+
+class CutFailed(Exception):
+    """The C of the kernels could not be made, or needs Python; the message says where."""
+
+
+@dataclass
+class Item:
+    """One declaration: the names it makes, those it uses (in the full build, in both), its text."""
+
+    kind: str  # include, macro, type, prototype, variable, function, group
+    text: str
+    makes: set[str] = field(default_factory=set)
+    uses: set[str] = field(default_factory=set)
+    small: set[str] = field(default_factory=set)  # of `uses`, those of the small build
+    origin: str = ""
+    only_full: bool = False
+
+
+@dataclass
+class Token:
+    kind: str
+    text: str
+    before: str  # white space
+    full: bool  # under a condition of the full build
+
+
+def tokens(text: str) -> Iterator[Token]:
+    """Words, literals, marks and lines of the preprocessor; comments are white space."""
+    before, conditions = "", [False]
+    for match in TOKEN.finditer(text):
+        kind, said = match.lastgroup or "", match.group()
+        if kind == "skip":
+            before += said if said.isspace() else " "
+            continue
+        if kind == "directive":
+            said = said.lstrip()
+            words = WORD.findall(said)
+            if words[:1] in (["if"], ["ifdef"], ["ifndef"]):
+                conditions.append(conditions[-1] or words == ["ifndef", SMALL])
+                yield Token(kind, said, before, conditions[-1])
+                before = ""
+                continue
+            if words[:1] == ["endif"] and len(conditions) > 1:
+                yield Token(kind, said, before, conditions.pop())
+                before = ""
+                continue
+        yield Token(kind, said, before, conditions[-1])
+        before = ""
+
+
+def read(text: str, origin: str = "") -> list[Item]:
+    """The declarations of a C file one by one, those between `#if` and `#endif` together."""
+    stream = list(tokens(text))
+    closing, opened = {}, []
+    for at, token in enumerate(stream):
+        if token.kind == "directive":
+            word = WORD.findall(token.text)[:1]
+            if word and word[0] in ("if", "ifdef", "ifndef"):
+                opened.append(at)
+            elif word == ["endif"] and opened:
+                closing[opened.pop()] = at
+    return list(_declarations(stream, closing, 0, len(stream), origin))
+
+
+def _declarations(
+    stream: list[Token], closing: dict[int, int], at: int, end: int, origin: str
+) -> Iterator[Item]:
+    while at < end:
+        token = stream[at]
+        if token.kind == "directive":
+            word = (WORD.findall(token.text) or [""])[0]
+            if at in closing:
+                last = closing[at]
+                if SMALL in token.text:
+                    for item in _declarations(stream, closing, at + 1, last, origin):
+                        item.only_full = True
+                        yield item
+                    at = last + 1
+                elif last >= end - 1 and at < 400:  # the guard of the file: its last branch counts
+                    inner = [
+                        i
+                        for i in range(at + 1, last)
+                        if _level(stream, closing, at, i) and _word(stream[i]) == "else"
+                    ]
+                    yield from _declarations(stream, closing, (inner[-1] if inner else at) + 1, last, origin)
+                    return
+                else:
+                    yield _group(stream[at : last + 1], closing, at, origin)
+                    at = last + 1
+                continue
+            if word == "include":
+                yield Item("include", token.text.strip(), origin=origin)
+            elif word == "define":
+                yield _macro(token, origin)
+            at += 1
+            continue
+        stop = _end_of_declaration(stream, at, end)
+        yield _item(stream[at:stop], origin)
+        at = stop
+
+
+def _word(token: Token) -> str:
+    return (WORD.findall(token.text) or [""])[0] if token.kind == "directive" else ""
+
+
+def _level(stream: list[Token], closing: dict[int, int], outer: int, at: int) -> bool:
+    """Whether the token at `at` is of the conditional that opens at `outer` itself, not of one inside."""
+    return stream[at].kind == "directive" and not any(i < at < j for i, j in closing.items() if outer < i)
+
+
+def _end_of_declaration(stream: list[Token], at: int, end: int) -> int:
+    depth, is_function, i = 0, False, at
+    while i < end:
+        text = stream[i].text if stream[i].kind == "mark" else ""
+        if text in ("(", "[", "{"):
+            if text == "{" and depth == 0:
+                is_function = i > at and stream[i - 1].text == ")"
+            depth += 1
+        elif text in (")", "]", "}"):
+            depth -= 1
+            if text == "}" and depth == 0 and is_function:
+                return i + 1
+        elif text == ";" and depth == 0:
+            return i + 1
+        i += 1
+    return end
+
+
+def _text(part: list[Token]) -> str:
+    out = []
+    for i, token in enumerate(part):
+        before = re.sub(r"\n\s*\n", "\n", token.before) if i else ""
+        if token.kind == "directive" or (i and part[i - 1].kind == "directive"):
+            before = "\n" if i else ""
+        out.append(before + token.text)
+    return re.sub(r"[ \t]+\n", "\n", "".join(out))
+
+
+def _uses(item: Item, part: list[Token]) -> None:
+    last = ""
+    for token in part:
+        words = [token.text] if token.kind == "name" and last not in (".", "->") else []
+        if token.kind == "directive":
+            words = WORD.findall(token.text)
+        last = "->" if last == "-" and token.text == ">" else token.text
+        item.uses.update(words)
+        if not token.full:
+            item.small.update(words)
+
+
+def _macro(token: Token, origin: str) -> Item:
+    words = WORD.findall(token.text)
+    made = Item("macro", token.text.strip(), {words[1]}, origin=origin)
+    _uses(made, [token])
+    return made
+
+
+def _group(part: list[Token], closing: dict[int, int], offset: int, origin: str) -> Item:
+    made = Item("group", _text(part), origin=origin)
+    inside: list[Token] = [token for token in part if token.kind != "directive"]
+    for item in _declarations(inside, {}, 0, len(inside), origin):
+        made.makes |= item.makes
+    for token in part:
+        if _word(token) == "define":
+            made.makes.add(WORD.findall(token.text)[1])
+    _uses(made, part)
+    return made
+
+
+def _item(part: list[Token], origin: str) -> Item:
+    """One declaration from its tokens: what it is, and what it is called."""
+    words = [token.text for token in part]
+    made = Item("variable", _text(part), origin=origin)
+    _uses(made, part)
+    names = [i for i, token in enumerate(part) if token.kind == "name" and token.text not in KEYWORDS]
+    brace = words.index("{") if "{" in words else -1
+    if words[0] == "typedef":
+        made.kind = "type"
+        pointers = [i for i in range(len(words) - 2) if words[i : i + 2] == ["(", "*"]]
+        if pointers and brace < 0:
+            made.makes = {words[pointers[0] + 2]}
+        else:
+            last = len(words) - 1 - words[::-1].index("}") if brace >= 0 else 0
+            made.makes = {words[i] for i in names if i > last and words[i + 1] in (";", "[", "__attribute__")}
+    elif words[0] in ("struct", "union", "enum") and (brace in (1, 2) or words[2:3] == [";"]):
+        made.kind = "type"
+        made.makes = {words[1]} if brace != 1 else set()
+        if words[0] == "enum":
+            depth = 0
+            for i in range(brace, len(words)):
+                depth += words[i] == "("
+                depth -= words[i] == ")"
+                if depth == 0 and words[i] in ("{", ",") and part[i + 1].kind == "name":
+                    made.makes.add(words[i + 1])
+        if words[2:3] == [";"]:
+            made.kind = "prototype"
+    elif "(" in words and "=" not in words[: words.index("(")]:
+        at = words.index("(")
+        if words[at + 1] == "*":  # a pointer to a function
+            made.makes = {words[i] for i in names if i > at and words[i + 1] in (")", "[")} - {"const"}
+            made.makes = {words[min(i for i in names if i > at)]}
+        else:
+            made.makes = {words[at - 1]}
+            made.kind = "function" if brace > at else "prototype"
+    else:
+        first = words.index("=") if "=" in words else len(words) - 1
+        before = [i for i in names if i < first]
+        made.makes = {words[before[-1]]} if before else set()
+    return made
+
+
+# -- what is reached ----------------------------------------------------------------------------------------
+
+
+class _Table:
+    """Declarations of all files by the names they make; a definition goes before a prototype or a pointer."""
+
+    RANK: ClassVar = {"function": 3, "type": 3, "group": 2, "macro": 2, "variable": 1, "prototype": 0}
+
+    def __init__(self) -> None:
+        self.by_name: dict[str, Item] = {}
+        self.twice: dict[str, str] = {}
+
+    def add(self, items: Iterable[Item]) -> None:
+        for item in items:
+            for name in item.makes:
+                held = self.by_name.get(name)
+                if held is None or self.RANK[item.kind] > self.RANK[held.kind]:
+                    self.by_name[name] = item
+                elif held.kind == item.kind == "function" and held.text != item.text:
+                    self.twice[name] = f"{held.origin} and {item.origin}"
+
+    def reach(self, roots: Iterable[str], small: bool, done: dict[int, Item]) -> None:
+        """Adds what the names lead to, in an order in which everything stands before its use."""
+        for name in sorted(roots):
+            self._visit(name, small, done, ())
+
+    def _visit(self, name: str, small: bool, done: dict[int, Item], path: tuple[str, ...]) -> None:
+        item = self.by_name.get(name)
+        if item is None or name in PROVIDED or id(item) in done:
+            return
+        if name in path:
+            raise CutFailed(f"{' > '.join(path)} > {name} comes round")
+        if name in self.twice:
+            raise CutFailed(f"{name} is not the same in {self.twice[name]}")
+        if item.kind in ("variable", "prototype"):
+            if item.kind == "prototype" and item.text.startswith(("struct", "union")):
+                return
+            raise CutFailed(
+                f"{path[-1] if path else 'somebody'} needs {name}, which only Python's side has ({item.origin})"
+            )
+        for other in sorted((item.small if small else item.uses) - item.makes):
+            if other not in KEYWORDS:
+                self._visit(other, small, done, (*path, name))
+        done[id(item)] = item
+
+
+def cut(translations: Iterable[tuple[str, str]], front: str = "", roots: Iterable[str] = ()) -> str:
+    """One C file without Python.
+
+    Parameters
+    ----------
+    translations : iterable of (str, str)
+        Name of each module, as `sweep.serial`, and the C that Cython has made of it.
+    front : str
+        C that uses kernels by their names here; it stands at the end.
+    roots : iterable of str
+        Core functions by their names in the sources, `lav_x`, that keep names and linkage.
+
+    Returns
+    -------
+    str
+    """
+    kept = frozenset(roots)
+    table, includes = _Table(), {}
+    for name, text in translations:
+        items = read(text, name)
+        for item in items:
+            _rename(item, kept)
+        table.add(item for item in items if item.kind != "include")
+    reached: dict[int, Item] = {}
+    small: dict[int, Item] = {}
+    own = read(front, "front")
+    for item in own:
+        if item.kind == "include":
+            includes[item.text] = item
+    made = set().union(*(item.makes for item in own), KEYWORDS)
+    table.reach(set().union(*(item.small for item in own if not item.only_full), kept) - made, True, small)
+    table.reach(set().union(*(item.uses for item in own), kept) - made, False, reached)
+    missing = sorted(kept - set(table.by_name))
+    if missing:
+        raise CutFailed(f"no such core functions: {', '.join(missing)}")
+    parts, hidden = [], False
+    for key, item in reached.items():
+        if (key not in small) != hidden:
+            parts.append("#endif" if hidden else f"#ifndef {SMALL}")
+            hidden = not hidden
+        parts.append(_private(item, kept))
+    if hidden:
+        parts.append("#endif")
+    return "\n\n".join(parts) + "\n\n" + front
+
+
+def _private(item: Item, kept: frozenset[str]) -> str:
+    text = item.text
+    if item.kind == "function":
+        text = re.sub(r"^(?:static\s+)?(?:CYTHON_INLINE\s+)?", "", text)
+        inline = "inline " if "CYTHON_INLINE" in item.uses else ""
+        text = text if item.makes & kept else f"static {inline}{text}"
+    return text
+
+
+def _rename(item: Item, kept: frozenset[str]) -> None:
+    # Words are told from what they stand in: no string of a kernel is one.
+    item.text = WORD.sub(lambda match: _plain(match.group(), kept), item.text)
+    item.makes = {_plain(name, kept) for name in item.makes}
+    item.uses = {_plain(name, kept) for name in item.uses}
+    item.small = {_plain(name, kept) for name in item.small}
+
+
+def _plain(name: str, kept: frozenset[str]) -> str:
+    """A name without what Cython puts before it; one of a variable ends in an underscore, no other one does."""
+    if not name.startswith("__pyx_"):
+        if name == "Py_ssize_t":
+            return "ptrdiff_t"
+        return "k_" + name[4:] if name.startswith("lav_") and name not in kept else name
+    mangled = MANGLED.match(name)
+    if mangled:
+        at, parts = mangled.end(), []
+        while at < len(name) and name[at].isdigit():
+            number = re.match(r"\d+", name[at:])
+            assert number is not None
+            size = int(number.group())
+            start = at + number.end()
+            if not (size and start + size < len(name) and name[start + size] == "_"):
+                break  # a number of Cython's own, as in __pyx_t_1
+            parts.append(name[start : start + size])
+            at = start + size + 1
+        if parts:
+            return "_".join([*parts[1:], name[at:]])
+    for prefix, form in (("__pyx_v_", "{}_"), ("__pyx_t_", "tmp_{}"), ("__pyx_L", "L{}")):
+        if name.startswith(prefix):
+            return form.format(name[len(prefix) :])
+    return "returned" if name == "__pyx_r" else name
+
+
+# -- Cython -------------------------------------------------------------------------------------------------
+
+
+def _sources(root: Path, module: str) -> set[Path]:
+    """Files of lavender_ext that the translation of a module reads."""
+    open_, seen = [root.joinpath("lavender_ext", *module.split(".")).with_suffix(".pyx")], set()
+    while open_:
+        path = open_.pop()
+        if path in seen or not path.exists():
+            continue
+        seen.add(path)
+        names = CIMPORT.findall(path.read_text(encoding="utf-8"))
+        open_ += [path.with_suffix(".pxd")]
+        open_ += [root.joinpath("lavender_ext", *name.split(".")).with_suffix(".pxd") for name in names]
+    return seen
+
+
+def source_hash(root: Path, modules: Iterable[str] = MODULES) -> str:
+    """Hash of everything that the library is made of."""
+    here = Path(__file__).resolve().parent
+    paths = {path for name in modules for path in _sources(root, name)}
+    found = hashlib.sha256()
+    for path in [*sorted(paths), Path(__file__), *(here / "front" / name for name in (PROLOGUE, *FRONT))]:
+        found.update(path.name.encode() + b"\0" + path.read_text(encoding="utf-8").encode() + b"\0")
+    return found.hexdigest()
+
+
+def translate(
+    root: Path, modules: Iterable[str], work: Path, made: Path | None = None
+) -> list[tuple[str, str]]:
+    """The C of modules of lavender_ext below `root`, by Cython.
+
+    made : folder of translations of an ordinary build; one that is newer than all its sources is taken.
+    """
+    directives = runpy.run_path(str(root / "lavender_ext" / "build_options.py"))["directives"]()
+    given = [f"-X{name}={value}" for name, value in directives.items()]
+
+    def one(name: str) -> tuple[str, str]:
+        source = Path("lavender_ext", *name.split(".")).with_suffix(".pyx")
+        there = made / source.with_suffix(".c") if made else None
+        if there and there.exists():
+            newest = max(path.stat().st_mtime for path in _sources(root, name))
+            if there.stat().st_mtime > newest:
+                return name, there.read_text(encoding="utf-8")
+        out = work / f"{name}.c"
+        done = subprocess.run(
+            [sys.executable, "-m", "cython", *given, "--shared=lavender_ext._utility", str(source), "-o", str(out)],
+            cwd=root, capture_output=True, text=True, check=False,
+        )  # fmt: skip
+        if done.returncode:
+            raise CutFailed(f"Cython cannot translate {source}:\n{(done.stdout + done.stderr)[-4000:]}")
+        return name, out.read_text(encoding="utf-8")
+
+    with ThreadPoolExecutor(2) as pool:
+        return list(pool.map(one, modules))
+
+
+def amalgamate(root: Path, made: Path | None = None) -> str:
+    """lavender.c, from the sources of lavender_ext below `root`; `made` as for `translate`."""
+    here = Path(__file__).resolve().parent / "front"
+    front = "".join((here / name).read_text(encoding="utf-8") for name in FRONT)
+    version = runpy.run_path(str(here.parent.parent / "_version.py"))["__version__"]
+    with tempfile.TemporaryDirectory() as work:
+        kernels = cut(translate(root, MODULES, Path(work), made), front)
+    head = (
+        f"/* liblavender of lavender {version}: the kernels without Python, then the functions of lavender.h.\n"
+        f" * Made, not written: changes belong into the kernels. Sources {source_hash(root)}\n */\n"
+    )
+    return head + (here / PROLOGUE).read_text(encoding="utf-8") + kernels

@@ -1,0 +1,348 @@
+/* -- from here on: the functions of lavender.h over the kernels above ------------------------------------------------- */
+
+typedef struct core_block_blocks_t blocks_t;
+typedef struct core_csr_csr_t csr_t;
+typedef struct core_rows_rows_t rows_t;
+typedef struct core_generalized_generalized_t general_t;
+typedef struct judge_score_score_t score_t;
+typedef void (*sweep_t)(void *, double *, int32_t, int32_t);
+
+enum { MAGIC = 0x4C415631, PATIENCE = 64, LONG_PATIENCE = 500, AGAIN = 64, CONTROL = 9, GRAM = 256 };
+enum { PACK_FROM = 24, FAR_FROM = 4000 }; /* blocks from which sweeps run in pairs, and from which they leave the cache */
+
+typedef struct kept_t { /* impulses of the problem before, by key */
+  int32_t n_blocks, n_rows, most_blocks, most_rows;
+  uint64_t *key;
+  int32_t *ptr, *kind;
+  double *impulse;
+} kept_t;
+
+struct lav_solver {
+  uint32_t magic;
+  int32_t busy;
+  int32_t ready;    /* a problem is set */
+  int32_t begun;    /* its method has run */
+  char *base;
+  uint64_t bytes, used, begin, needed; /* of memory: all, taken, taken by `kept`, asked for */
+  lav_options options;
+  kept_t kept;
+  int32_t form, has_keys, is_short, n_v; /* n_v: numbers of v */
+  blocks_t p;
+  csr_t a;
+  rows_t r;
+  general_t g;
+  uint64_t *key;
+  double *impulse, *v_free, *v, *score_room;
+  double start[3]; /* E0 [sqrt J], V0 [m/s], relative residual of doing nothing */
+  int32_t *order, *empty, *marks;
+  int32_t split, mode;
+  uint64_t rng;
+  struct judge_watch_watch_t watch;
+  sweep_t step;
+  void *context;
+  struct sweep_serial_context_t swept;
+#ifndef LAV_SWEEPS_ONLY
+  struct sweep_serial_packing_t packing;
+  struct local_gauss_seidel_context_t local;
+  int32_t *prepared_at;
+  double *prepared;
+  struct accelerate_accelerated_sweep_data_t fast;
+  struct sweep_packed_packed_t pairs;
+  double *pair_room;
+  int32_t pairs_asked;
+  struct generalized_flow_flow_t flow;
+  struct few_island_desk_t desk;
+  int32_t band, is_linear, doubt; /* doubt: Newton's tol is tighter than what was asked */
+#endif
+};
+
+/* -- words ------------------------------------------------------------------------------------------------------------ */
+
+uint32_t lav_version(void) { return (uint32_t)LAV_VERSION_MAJOR << 16 | LAV_VERSION_MINOR; }
+
+const char *lav_text(int32_t code) {
+  switch (code) {
+    case LAV_OK: return "no error";
+    case LAV_ERROR_NULL: return "a pointer that is needed is null";
+    case LAV_ERROR_VERSION: return "size of a struct is not one of this library's: fill it by a lav_default_... function";
+    case LAV_ERROR_COUNT: return "a count is negative, too large, or does not fit another";
+    case LAV_ERROR_NUMBER: return "a number is NaN or infinite where it must not be";
+    case LAV_ERROR_BOUNDS: return "lower is above upper, or an infinite bound stands on the wrong side";
+    case LAV_ERROR_FRICTION: return "mu or patch_radius is negative, or a contact with mu has no row to feel it";
+    case LAV_ERROR_BLOCKS: return "block_ptr or kind describe no blocks: sizes, kinds, or joints behind contacts";
+    case LAV_ERROR_INDEX: return "a column, body or place in the order is out of range, or columns do not ascend";
+    case LAV_ERROR_MASS: return "an inverse mass is negative, or M is not positive definite";
+    case LAV_ERROR_ROOM: return "too little memory: give as many bytes as lav_needed or lav_room says";
+    case LAV_ERROR_UNSUPPORTED: return "this method of this build does not take this form, law or kind of block";
+    case LAV_ERROR_OPTION: return "an option is out of its range";
+    case LAV_ERROR_BUSY: return "another thread is in this solver: one at a time";
+    case LAV_ERROR_NO_PROBLEM: return "no problem is set: lav_set comes first, and must have succeeded";
+    case LAV_ERROR_SOLVER: return "this is no solver: not opened, or its memory was written over";
+    case LAV_ERROR_SELF_TEST: return "this build does not round as it must: compile lavender.c with -ffp-contract=off and "
+                                     "without -march=native or fast math";
+    default: return "no such code";
+  }
+}
+
+const char *lav_name(int32_t method) {
+  switch (method) {
+    case LAV_SEQUENTIAL_IMPULSES: return "sequential_impulses";
+    case LAV_PGS: return "pgs";
+    case LAV_SOR: return "sor";
+    case LAV_GAUSS_SEIDEL: return "gauss_seidel";
+    case LAV_JACOBI: return "jacobi";
+    case LAV_BLOCK_GAUSS_SEIDEL: return "block_gauss_seidel";
+    case LAV_ANDERSON: return "anderson";
+    case LAV_NNCG: return "nncg";
+    case LAV_NEWTON: return "newton";
+    case LAV_DIRECT: return "direct";
+    case LAV_LEMKE: return "lemke";
+    case LAV_ADMM: return "admm";
+    case LAV_AUTO: return "auto";
+    default: return NULL;
+  }
+}
+
+const char *lav_outcome(int32_t outcome) {
+  switch (outcome) {
+    case LAV_MAX_ITERATIONS: return "max_iterations";
+    case LAV_CONVERGED: return "converged";
+    case LAV_DIVERGED: return "diverged";
+    case LAV_STALLED: return "stalled";
+    case LAV_FLOOR: return "floor";
+    case LAV_TIME_LIMIT: return "time_limit";
+    case LAV_FAILED: return "failed";
+    default: return NULL;
+  }
+}
+
+int32_t lav_default_problem(int32_t form, lav_problem *out) {
+  if (!out) return LAV_ERROR_NULL;
+  if (form < LAV_MATRIX || form > LAV_VELOCITIES) return LAV_ERROR_OPTION;
+  memset(out, 0, sizeof *out);
+  out->size = (uint32_t)sizeof *out;
+  out->form = form;
+  return LAV_OK;
+}
+
+int32_t lav_default_options(int32_t method, lav_options *out) {
+  if (!out) return LAV_ERROR_NULL;
+  if (!lav_name(method)) return LAV_ERROR_OPTION;
+  memset(out, 0, sizeof *out);
+  out->size = (uint32_t)sizeof *out;
+  out->method = method;
+  out->memory = 5;
+  out->omega = method == LAV_SOR ? 1.5 : method == LAV_GAUSS_SEIDEL ? 1.0 : 0.0;
+  return LAV_OK;
+}
+
+int32_t lav_default_budget(lav_budget *out) {
+  if (!out) return LAV_ERROR_NULL;
+  memset(out, 0, sizeof *out);
+  out->size = (uint32_t)sizeof *out;
+  out->iterations = 1000;
+  out->tol = 1e-6;
+  return LAV_OK;
+}
+
+uint64_t lav_hash(const double *x, int32_t n, uint64_t seed) {
+  uint64_t h = seed, bits;
+  int32_t i;
+  for (i = 0; x && i < n; i++) {
+    memcpy(&bits, x + i, 8);
+    h = (h ^ bits) * 0x9E3779B97F4A7C15u;
+    h ^= h >> 29;
+  }
+  return h ^ h >> 32;
+}
+
+/* -- what is asked for, looked at ------------------------------------------------------------------------------------- */
+
+static int32_t are_finite(const double *x, int64_t n) {
+  double sum = 0.0; /* stays 0, or becomes NaN */
+  int64_t i;
+  for (i = 0; i < n; i++) sum += 0.0 * x[i];
+  return sum == 0.0;
+}
+
+static int32_t check_counts(const lav_problem *q) {
+  const int64_t m = q->n_rows, n = q->n_velocities;
+  if (q->size != sizeof *q) return LAV_ERROR_VERSION;
+  if (q->form < LAV_MATRIX || q->form > LAV_VELOCITIES) return LAV_ERROR_OPTION;
+  if (q->law != LAV_COULOMB && q->law != LAV_CONE) return LAV_ERROR_OPTION;
+  if (q->n_blocks < 0 || q->n_rows < q->n_blocks || q->n_rows > 100000000 || (q->n_rows > 0 && q->n_blocks == 0))
+    return LAV_ERROR_COUNT;
+  if (q->n_entries < 0 || q->n_bodies < 0 || q->n_joints < 0 || n < 0 || q->n_mass_entries < 0) return LAV_ERROR_COUNT;
+  if (q->n_entries > 1000000000 || q->n_bodies > 100000000 || n > 100000000) return LAV_ERROR_COUNT;
+  if (q->form == LAV_BODIES && q->n_joints > q->n_blocks) return LAV_ERROR_COUNT;
+  if (q->form == LAV_MATRIX && q->value && !q->index_ptr && q->n_entries != m * m) return LAV_ERROR_COUNT;
+  if (q->form == LAV_VELOCITIES && q->value && !q->index_ptr && q->n_entries != m * n) return LAV_ERROR_COUNT;
+  if (q->form == LAV_VELOCITIES && q->mass_value && !q->mass_ptr && q->n_mass_entries != n * n) return LAV_ERROR_COUNT;
+  if (q->form == LAV_VELOCITIES && n == 0 && m > 0) return LAV_ERROR_COUNT;
+  return LAV_OK;
+}
+
+static int32_t check_options(const lav_options *o) {
+  if (o->size != sizeof *o) return LAV_ERROR_VERSION;
+  if (!lav_name(o->method) || o->order < LAV_GIVEN || o->order > LAV_REVERSE) return LAV_ERROR_OPTION;
+  if (o->memory < 1 || o->memory > 16 || o->sweep < LAV_DEFAULT_SWEEP || o->sweep > LAV_BLOCK_SWEEP) return LAV_ERROR_OPTION;
+  if (o->convex < 0 || (o->keeps != 0 && o->keeps != 1)) return LAV_ERROR_OPTION;
+  if (o->method == LAV_SOR && !(o->omega > 0.0 && o->omega < 2.0)) return LAV_ERROR_OPTION;
+  if (o->method == LAV_JACOBI && !(o->omega >= 0.0 && o->omega < 1e300)) return LAV_ERROR_OPTION;
+  if (o->method == LAV_GAUSS_SEIDEL && o->omega != 1.0) return LAV_ERROR_OPTION;
+  return LAV_OK;
+}
+
+/* Does the method take the form, whatever the blocks are? */
+static int32_t takes_form(int32_t method, int32_t form) {
+#ifdef LAV_SWEEPS_ONLY
+  if (form == LAV_VELOCITIES) return 0;
+#endif
+  switch (method) {
+    case LAV_SEQUENTIAL_IMPULSES: return form == LAV_BODIES;
+    case LAV_PGS: return form != LAV_BODIES;
+    case LAV_SOR: case LAV_GAUSS_SEIDEL: case LAV_JACOBI: return form == LAV_MATRIX;
+#ifndef LAV_SWEEPS_ONLY
+    case LAV_BLOCK_GAUSS_SEIDEL: case LAV_ANDERSON: case LAV_NNCG: return 1;
+    case LAV_NEWTON: return form == LAV_VELOCITIES;
+    case LAV_DIRECT: return form == LAV_MATRIX;
+#endif
+    default: return 0;
+  }
+}
+
+static int32_t takes(const lav_problem *q, const lav_options *o) {
+  int32_t i, free_rows = 1, rows_alone = 1;
+  if (!takes_form(o->method, q->form)) return LAV_ERROR_UNSUPPORTED;
+  for (i = 0; q->kind && i < q->n_blocks; i++)
+    if (q->kind[i] != LAV_ROW) {
+      free_rows = 0;
+      if (!q->block_ptr || q->block_ptr[i + 1] - q->block_ptr[i] > 1) rows_alone = 0;
+    }
+  for (i = 0; i < q->n_rows; i++)
+    if ((q->lower && q->lower[i] > -DBL_MAX) || (q->upper && q->upper[i] < DBL_MAX)) free_rows = 0;
+  if ((o->method == LAV_SOR || o->method == LAV_GAUSS_SEIDEL) && !free_rows) return LAV_ERROR_UNSUPPORTED;
+  if (o->method == LAV_DIRECT && !rows_alone) return LAV_ERROR_UNSUPPORTED;
+  if (q->law == LAV_CONE && !rows_alone) {
+    if (o->method <= LAV_JACOBI) return LAV_ERROR_UNSUPPORTED; /* no update for that law */
+    if ((o->method == LAV_ANDERSON || o->method == LAV_NNCG) && o->sweep == LAV_PGS_SWEEP) return LAV_ERROR_UNSUPPORTED;
+  }
+  return LAV_OK;
+}
+
+static int32_t check_blocks(const lav_problem *q) {
+  int32_t i, j;
+  if (q->n_rows > 0 && !q->block_ptr && q->n_blocks != q->n_rows) return LAV_ERROR_BLOCKS;
+  if (q->block_ptr) {
+    if (q->block_ptr[0] != 0 || q->block_ptr[q->n_blocks] != q->n_rows) return LAV_ERROR_BLOCKS;
+    for (i = 0; i < q->n_blocks; i++)
+      if (q->block_ptr[i + 1] <= q->block_ptr[i] || q->block_ptr[i + 1] > q->n_rows) return LAV_ERROR_BLOCKS;
+  }
+  for (i = 0; i < q->n_blocks; i++) {
+    const int32_t first = q->block_ptr ? q->block_ptr[i] : i, end = q->block_ptr ? q->block_ptr[i + 1] : i + 1;
+    const int32_t kind = q->kind ? q->kind[i] : LAV_ROW;
+    const double mu = q->mu ? q->mu[i] : 0.0, radius = q->patch_radius ? q->patch_radius[i] : 0.0;
+    if (kind < LAV_ROW || kind > LAV_CONTACT_SPIN) return LAV_ERROR_BLOCKS;
+    if (kind != LAV_ROW && (end - first < kind || end - first > kind + 2)) return LAV_ERROR_BLOCKS;
+    if (q->form == LAV_BODIES && (kind == LAV_ROW) != (i < q->n_joints)) return LAV_ERROR_BLOCKS;
+    if (!(mu >= 0.0 && mu <= DBL_MAX && radius >= 0.0 && radius <= DBL_MAX)) return LAV_ERROR_FRICTION;
+    if (kind == LAV_CONTACT && end - first == 1 && mu > 0.0 && q->form == LAV_BODIES) return LAV_ERROR_FRICTION;
+    for (j = first; kind == LAV_ROW && j < end; j++) {
+      const double low = q->lower ? q->lower[j] : -INFINITY, high = q->upper ? q->upper[j] : INFINITY;
+      if (!(low <= high && low <= DBL_MAX && high >= -DBL_MAX)) return LAV_ERROR_BOUNDS;
+    }
+  }
+  return LAV_OK;
+}
+
+static int32_t check_columns(const int32_t *ptr, const int32_t *index, int32_t rows, int32_t columns, int32_t entries,
+                             int32_t is_lower) {
+  int32_t i, k;
+  if (!ptr || (entries > 0 && !index)) return LAV_ERROR_NULL;
+  if (ptr[0] != 0 || ptr[rows] != entries) return LAV_ERROR_COUNT;
+  for (i = 0; i < rows; i++)
+    if (ptr[i + 1] < ptr[i] || ptr[i + 1] > entries) return LAV_ERROR_COUNT;
+  for (i = 0; i < rows; i++) {
+    for (k = ptr[i]; k < ptr[i + 1]; k++)
+      if (index[k] < 0 || index[k] >= columns || (k > ptr[i] && index[k] <= index[k - 1])) return LAV_ERROR_INDEX;
+    if (is_lower && (ptr[i] == ptr[i + 1] || index[ptr[i + 1] - 1] != i)) return LAV_ERROR_INDEX;
+  }
+  return LAV_OK;
+}
+
+static int32_t check_pairs(const int32_t *body, int32_t n, int32_t n_bodies) {
+  int32_t i;
+  if (n > 0 && !body) return LAV_ERROR_NULL;
+  for (i = 0; i < 2 * n; i++)
+    if (body[i] < -1 || body[i] >= n_bodies) return LAV_ERROR_INDEX;
+  return LAV_OK;
+}
+
+#define OPTIONAL(x, n)                                              \
+  do {                                                              \
+    if ((x) && !are_finite((x), (n))) return LAV_ERROR_NUMBER;      \
+  } while (0)
+#define NEEDED(x, n)                                                \
+  do {                                                              \
+    if ((n) > 0 && !(x)) return LAV_ERROR_NULL;                     \
+    OPTIONAL(x, n);                                                 \
+  } while (0)
+#define GIVE_BACK(call)                                             \
+  do {                                                              \
+    const int32_t code_ = (call);                                   \
+    if (code_ != LAV_OK) return code_;                              \
+  } while (0)
+
+static int32_t check_bodies(const lav_problem *q) {
+  const int64_t n = q->n_bodies, c = q->n_blocks - q->n_joints, mj = q->block_ptr ? q->block_ptr[q->n_joints] : q->n_joints;
+  int64_t i;
+  NEEDED(q->inv_mass, n);
+  NEEDED(q->inv_inertia, 9 * n);
+  OPTIONAL(q->velocity, 6 * n);
+  NEEDED(q->jac, 12 * mj);
+  NEEDED(q->normal, 3 * c);
+  NEEDED(q->tangent, 3 * c);
+  NEEDED(q->arm_a, 3 * c);
+  NEEDED(q->arm_b, 3 * c);
+  for (i = 0; i < n; i++)
+    if (q->inv_mass[i] < 0.0) return LAV_ERROR_MASS;
+  GIVE_BACK(check_pairs(q->joint_body, q->n_joints, q->n_bodies));
+  return check_pairs(q->contact_body, (int32_t)c, q->n_bodies);
+}
+
+static int32_t check_velocities(const lav_problem *q) {
+  const int32_t n = q->n_velocities;
+  if (q->index_ptr) GIVE_BACK(check_columns(q->index_ptr, q->index, q->n_rows, n, q->n_entries, 0));
+  NEEDED(q->value, q->n_entries);
+  if (q->mass_ptr) GIVE_BACK(check_columns(q->mass_ptr, q->mass_index, n, n, q->n_mass_entries, 1));
+  NEEDED(q->mass_value, q->n_mass_entries);
+  OPTIONAL(q->velocity, n);
+  return q->n_rows > 0 && (q->n_entries == 0 ? !q->index_ptr : 0) ? LAV_ERROR_COUNT : LAV_OK;
+}
+
+static int32_t check_problem(const lav_problem *q) {
+  const int64_t m = q->n_rows;
+  int32_t i;
+  GIVE_BACK(check_counts(q));
+  GIVE_BACK(check_blocks(q));
+  OPTIONAL(q->b, m);
+  OPTIONAL(q->target, m);
+  OPTIONAL(q->compliance, m);
+  OPTIONAL(q->impulse, m);
+  for (i = 0; q->compliance && i < m; i++)
+    if (q->compliance[i] < 0.0) return LAV_ERROR_MASS;
+  if (q->form == LAV_BODIES) return check_bodies(q);
+  if (q->form == LAV_VELOCITIES) return check_velocities(q);
+  if (m > 0 && (!q->b || !q->value)) return LAV_ERROR_NULL;
+  if (q->index_ptr) GIVE_BACK(check_columns(q->index_ptr, q->index, q->n_rows, q->n_rows, q->n_entries, 0));
+  NEEDED(q->value, q->n_entries);
+  return LAV_OK;
+}
+
+int32_t lav_takes(const lav_problem *problem, const lav_options *options) {
+  if (!problem || !options) return LAV_ERROR_NULL;
+  GIVE_BACK(check_options(options));
+  GIVE_BACK(check_counts(problem));
+  GIVE_BACK(check_blocks(problem));
+  return takes(problem, options);
+}

@@ -1,0 +1,752 @@
+
+/* -- memory ----------------------------------------------------------------------------------------------------------- */
+
+static void *take(lav_solver *s, int64_t count, size_t size) {
+  const uint64_t at = (s->used + 15) & ~(uint64_t)15;
+  s->used = at + (uint64_t)(count + 1) * size; /* one more than none, so that every array has an address */
+  if (s->used <= s->bytes) return s->base + at;
+  s->is_short = 1;
+  return NULL;
+}
+
+#define TAKE(s, type, n) ((type *)take((s), (n), sizeof(type)))
+
+static void take_kept(lav_solver *s, const lav_problem *q) {
+  s->kept.most_blocks = q->n_blocks;
+  s->kept.most_rows = q->n_rows;
+  s->kept.key = TAKE(s, uint64_t, q->n_blocks);
+  s->kept.ptr = TAKE(s, int32_t, q->n_blocks + 1);
+  s->kept.kind = TAKE(s, int32_t, q->n_blocks);
+  s->kept.impulse = TAKE(s, double, q->n_rows);
+}
+
+/* What every problem has. */
+static void take_blocks(lav_solver *s, const lav_problem *q) {
+  const int64_t k = q->n_blocks, m = q->n_rows, n = q->n_bodies, nv = q->n_velocities;
+  s->p.n_blocks = q->n_blocks;
+  s->p.n_rows = q->n_rows;
+  s->p.law = q->law;
+  s->p.ptr = TAKE(s, int32_t, k + 1);
+  s->p.kind = TAKE(s, int32_t, k);
+  s->p.lower = TAKE(s, double, m);
+  s->p.upper = TAKE(s, double, m);
+  s->p.mu = TAKE(s, double, k);
+  s->p.patch_radius = TAKE(s, double, k);
+  s->p.b = TAKE(s, double, m);
+  s->p.d = TAKE(s, double, m);
+  s->p.nu = TAKE(s, double, m);
+  s->p.step = TAKE(s, double, m);
+  s->key = TAKE(s, uint64_t, k);
+  s->impulse = TAKE(s, double, m);
+  s->order = TAKE(s, int32_t, k);
+  s->empty = TAKE(s, int32_t, m);
+  s->marks = TAKE(s, int32_t, 4 * ((int64_t)s->kept.most_blocks + k) + m + 2 * (n + nv) + 16); /* scratch */
+  s->score_room = TAKE(s, double, 3 * m);
+  s->watch.w = TAKE(s, double, m);
+  s->watch.e = TAKE(s, double, m);
+  s->form = q->form;
+  s->n_v = q->form == LAV_BODIES ? 6 * q->n_bodies : q->form == LAV_VELOCITIES ? q->n_velocities : 0;
+  s->v_free = TAKE(s, double, s->n_v);
+  s->v = TAKE(s, double, s->n_v + 12);
+  s->watch.v = TAKE(s, double, q->form == LAV_BODIES ? 12 * n : q->form == LAV_VELOCITIES ? nv + m : 0);
+}
+
+static void take_form(lav_solver *s, const lav_problem *q) {
+  const int64_t m = q->n_rows, k = q->n_blocks, n = q->n_bodies, c = k - q->n_joints, nv = q->n_velocities;
+  const int64_t mj = q->block_ptr && q->form == LAV_BODIES ? q->block_ptr[q->n_joints] : m, mc = q->block_ptr ? m - mj : m;
+  s->r.compliance = s->g.compliance = NULL;
+  if (q->form == LAV_MATRIX) {
+    s->a.indptr = TAKE(s, int32_t, m + 1);
+    s->a.indices = TAKE(s, int32_t, q->n_entries);
+    s->a.data = TAKE(s, double, q->n_entries);
+    return;
+  }
+  s->r.compliance = s->g.compliance = TAKE(s, double, m);
+  if (q->form == LAV_VELOCITIES) {
+    s->g.n = q->n_velocities;
+    s->g.m = q->n_rows;
+    s->g.jptr = TAKE(s, int32_t, m + 1);
+    s->g.jidx = TAKE(s, int32_t, q->n_entries);
+    s->g.jval = TAKE(s, double, q->n_entries);
+    s->g.lptr = TAKE(s, int32_t, nv + 1);
+    s->g.parent = TAKE(s, int32_t, nv);
+    s->g.inv_pivot = TAKE(s, double, nv);
+    s->g.root = TAKE(s, double, nv);
+    return;
+  }
+  s->r.n_bodies = q->n_bodies;
+  s->r.n_joints = q->n_joints;
+  s->r.n_contacts = q->n_blocks - q->n_joints;
+  s->r.jac = TAKE(s, double, 12 * mj);
+  s->r.minv_jac = TAKE(s, double, 12 * (mj + 1));
+  s->r.joint_body = TAKE(s, int32_t, 2 * (int64_t)q->n_joints);
+  s->r.normal = TAKE(s, double, 3 * c);
+  s->r.tangent = TAKE(s, double, 3 * c);
+  s->r.arm_a = TAKE(s, double, 3 * c);
+  s->r.arm_b = TAKE(s, double, 3 * c);
+  s->r.contact_body = TAKE(s, int32_t, 2 * c);
+  s->r.coupling = TAKE(s, double, 5 * (c + 1));
+  s->r.swing = TAKE(s, double, 6 * (mc + 1));
+  s->r.inv_mass = TAKE(s, double, n);
+  s->r.inv_inertia = TAKE(s, double, 9 * n);
+  if (s->is_short) return;
+  memset((void *)(uintptr_t)s->r.minv_jac, 0, 12 * (size_t)(mj + 1) * sizeof(double));
+  memset((void *)(uintptr_t)s->r.coupling, 0, 5 * (size_t)(c + 1) * sizeof(double));
+  memset((void *)(uintptr_t)s->r.swing, 0, 6 * (size_t)(mc + 1) * sizeof(double));
+}
+
+/* -- the problem copied ----------------------------------------------------------------------------------------------- */
+
+#define COPY(to, from, n) copy_bytes((to), (from), (size_t)(n) * sizeof *(to))
+
+static void copy_bytes(const void *to, const void *from, size_t bytes) {
+  if (bytes > 0) memcpy((void *)(uintptr_t)to, from, bytes);
+}
+
+static void copy_or(const double *to, const double *from, int64_t n, double otherwise) {
+  double *out = (double *)(uintptr_t)to;
+  int64_t i;
+  for (i = 0; i < n; i++) out[i] = from ? from[i] : otherwise;
+}
+
+static int32_t fill_blocks(lav_solver *s, const lav_problem *q) {
+  int32_t *ptr = (int32_t *)(uintptr_t)s->p.ptr, *kind = (int32_t *)(uintptr_t)s->p.kind, i, j, single = 1;
+  double *lower = (double *)(uintptr_t)s->p.lower, *upper = (double *)(uintptr_t)s->p.upper;
+  const int32_t k = q->n_blocks, m = q->n_rows;
+  for (i = 0; i <= k; i++) ptr[i] = q->block_ptr ? q->block_ptr[i] : i;
+  for (i = 0; i < k; i++) {
+    kind[i] = q->kind ? q->kind[i] : LAV_ROW;
+    if (kind[i] != LAV_ROW || ptr[i + 1] - ptr[i] > 1) single = 0;
+  }
+  copy_or(lower, q->lower, m, -INFINITY);
+  copy_or(upper, q->upper, m, INFINITY);
+  for (i = 0; i < k; i++) /* bounds of contacts, which nobody reads, in one spelling */
+    for (j = ptr[i]; kind[i] != LAV_ROW && j < ptr[i + 1]; j++) {
+      lower[j] = j == ptr[i] ? 0.0 : -INFINITY;
+      upper[j] = INFINITY;
+    }
+  copy_or(s->p.mu, q->mu, k, 0.0);
+  copy_or(s->p.patch_radius, q->patch_radius, k, 0.0);
+  s->has_keys = q->key != NULL;
+  if (q->key) COPY(s->key, q->key, k);
+  s->mode = q->order ? core_order_GIVEN : s->options.order == LAV_REVERSE ? core_order_GIVEN : s->options.order;
+  s->split = q->order ? k : q->form == LAV_BODIES ? q->n_joints : 0;
+  s->rng = s->options.seed;
+  for (i = 0; i < k; i++) s->order[i] = i;
+  if (q->order) {
+    memset(s->marks, 0, (size_t)k * sizeof(int32_t));
+    for (i = 0; i < k; i++) {
+      if (q->order[i] < 0 || q->order[i] >= k || s->marks[q->order[i]]++) return LAV_ERROR_INDEX;
+      s->order[i] = q->order[i];
+    }
+  } else if (s->options.order == LAV_REVERSE) {
+    core_order_reverse(s->order, 0, s->split);
+    core_order_reverse(s->order, s->split, k);
+  }
+  s->swept.order = single && !q->order && s->options.order == LAV_GIVEN && q->form == LAV_MATRIX ? NULL : s->order;
+  return LAV_OK;
+}
+
+/* Rows of a matrix, of a dense one what is not zero; `lower`: up to the diagonal, which is kept. */
+static void fill_matrix(const int32_t *to_ptr, const int32_t *to_index, const double *to_value, const int32_t *ptr,
+                        const int32_t *index, const double *value, int32_t rows, int32_t columns, int32_t entries,
+                        int32_t lower) {
+  int32_t *out = (int32_t *)(uintptr_t)to_ptr, *to = (int32_t *)(uintptr_t)to_index, i, j, at = 0;
+  double *x = (double *)(uintptr_t)to_value;
+  if (ptr) {
+    COPY(out, ptr, rows + 1);
+    COPY(to, index, entries);
+    COPY(x, value, entries);
+    return;
+  }
+  out[0] = 0;
+  for (i = 0; i < rows; i++) {
+    for (j = 0; j < (lower ? i + 1 : columns); j++)
+      if (value[(int64_t)i * columns + j] != 0.0 || (lower && j == i)) {
+        to[at] = j;
+        x[at++] = value[(int64_t)i * columns + j];
+      }
+    out[i + 1] = at;
+  }
+}
+
+static void fill_bodies(lav_solver *s, const lav_problem *q) {
+  const int64_t n = q->n_bodies, c = s->r.n_contacts, mj = s->p.ptr[q->n_joints];
+  double *b = (double *)(uintptr_t)s->p.b;
+  int32_t i;
+  COPY(s->r.inv_mass, q->inv_mass, n);
+  COPY(s->r.inv_inertia, q->inv_inertia, 9 * n);
+  COPY(s->r.joint_body, q->joint_body, 2 * (int64_t)q->n_joints);
+  COPY(s->r.jac, q->jac, 12 * mj);
+  COPY(s->r.contact_body, q->contact_body, 2 * c);
+  COPY(s->r.normal, q->normal, 3 * c);
+  COPY(s->r.tangent, q->tangent, 3 * c);
+  COPY(s->r.arm_a, q->arm_a, 3 * c);
+  COPY(s->r.arm_b, q->arm_b, 3 * c);
+  copy_or(s->r.compliance, q->compliance, q->n_rows, 0.0);
+  copy_or(s->v_free, q->velocity, 6 * n, 0.0);
+  copy_or(b, q->b, q->n_rows, 0.0);
+  if (!q->b) {
+    core_rows_rows_times(&s->p, &s->r, s->v_free, s->watch.w);
+    for (i = 0; i < q->n_rows; i++) b[i] = (q->target ? q->target[i] : 0.0) - s->watch.w[i];
+  }
+  k_rows_diagonal(&s->p, &s->r, (double *)(uintptr_t)s->p.d, (double *)(uintptr_t)s->p.nu, (double *)(uintptr_t)s->p.step,
+                  s->empty, (double *)(uintptr_t)s->r.minv_jac, (double *)(uintptr_t)s->r.coupling,
+                  (double *)(uintptr_t)s->r.swing);
+}
+
+#ifndef LAV_SWEEPS_ONLY
+/* M = L^T D L and Y of J and M. */
+static int32_t fill_velocities(lav_solver *s, const lav_problem *q) {
+  const int32_t n = q->n_velocities, m = q->n_rows, k = q->n_blocks;
+  const int64_t most = (int64_t)n * n / 2 + 1;
+  int32_t *mptr, *midx, *mark, *columns = NULL, *pcol, *pval, *home, count, n_columns = 0, i, j;
+  double *mval, *lval, *b = (double *)(uintptr_t)s->p.b, *pivot = (double *)(uintptr_t)s->g.root, values = 0.0;
+  int64_t room = (int64_t)q->n_mass_entries + 1;
+  uint64_t from;
+  mptr = TAKE(s, int32_t, n + 1);
+  midx = TAKE(s, int32_t, q->n_mass_entries);
+  mval = TAKE(s, double, q->n_mass_entries);
+  mark = TAKE(s, int32_t, 4 * (int64_t)n + 4);
+  if (s->is_short) return LAV_ERROR_ROOM;
+  fill_matrix(s->g.jptr, s->g.jidx, s->g.jval, q->index_ptr, q->index, q->value, m, n, q->n_entries, 0);
+  fill_matrix(mptr, midx, mval, q->mass_ptr, q->mass_index, q->mass_value, n, n, q->n_mass_entries, 1);
+  for (from = s->used;; room = 2 * room < most ? 2 * room : most) {
+    s->used = from;
+    columns = TAKE(s, int32_t, room);
+    if (s->is_short) return LAV_ERROR_ROOM;
+    count = core_generalized_tree_pattern(n, mptr, midx, (int32_t)room, (int32_t *)(uintptr_t)s->g.lptr, columns,
+                                          (int32_t *)(uintptr_t)s->g.parent, mark, mark + n, mark + 2 * n);
+    if (count >= 0) break;
+    if (room >= most) return LAV_ERROR_MASS;
+  }
+  s->g.lidx = columns;
+  s->g.lval = lval = TAKE(s, double, count);
+  if (s->is_short) return LAV_ERROR_ROOM;
+  if (core_generalized_tree_factor(n, mptr, midx, mval, s->g.lptr, columns, lval, pivot,
+                                   (double *)(uintptr_t)s->g.inv_pivot) >= 0)
+    return LAV_ERROR_MASS;
+  for (i = 0; i < n; i++) pivot[i] = sqrt(s->g.inv_pivot[i]);
+  copy_or(s->g.compliance, q->compliance, m, 0.0);
+  copy_or(s->v_free, q->velocity, n, 0.0);
+  for (i = 0; i < m; i++)
+    b[i] = q->b ? q->b[i] : (q->target ? q->target[i] : 0.0) - core_generalized_jac_row(&s->g, i, s->v_free);
+  s->g.prow = TAKE(s, int32_t, k + 1);
+  s->g.pcol = pcol = TAKE(s, int32_t, k + 1);
+  s->g.pval = pval = TAKE(s, int32_t, k + 1);
+  s->g.home = home = TAKE(s, int32_t, k);
+  for (from = s->used, room = 2 * (int64_t)q->n_entries + 64;; room *= 2) {
+    s->used = from;
+    s->g.cols = columns = TAKE(s, int32_t, room);
+    if (s->is_short) return LAV_ERROR_ROOM;
+    s->g.n_panels = core_generalized_panel_pattern(&s->g, k, s->p.ptr, mark, (int32_t *)(uintptr_t)s->g.prow, pcol, pval,
+                                                   columns, room < 2147483647 ? (int32_t)room : 2147483647, &n_columns,
+                                                   &values);
+    if (s->g.n_panels >= 0) break;
+    if (room >= 2147483647) return LAV_ERROR_COUNT;
+  }
+  if (values >= 2147483647.0) return LAV_ERROR_COUNT;
+  s->g.y = TAKE(s, double, (int64_t)values);
+  if (s->is_short) return LAV_ERROR_ROOM;
+  for (i = j = 0; i < k; i++) {
+    while (s->g.prow[j + 1] <= s->p.ptr[i]) j++;
+    home[i] = j;
+  }
+  k_general_diagonal(&s->p, &s->g, (double *)(uintptr_t)s->p.d, (double *)(uintptr_t)s->p.nu,
+                     (double *)(uintptr_t)s->p.step, s->empty, mark, (double *)(uintptr_t)s->g.y);
+  return LAV_OK;
+}
+#endif
+
+/* -- judging ---------------------------------------------------------------------------------------------------------- */
+
+#ifndef LAV_SWEEPS_ONLY
+static const general_t *general_of(const lav_solver *s) { return s->form == LAV_VELOCITIES ? &s->g : NULL; }
+#else
+static const general_t *general_of(const lav_solver *s) { return (void)s, (const general_t *)NULL; }
+#endif
+
+static void judge(lav_solver *s, const double *impulse, int32_t floor, lav_verdict *out) {
+  score_t t = {0.0, 0.0, 0.0, 0.0, -1, 1};
+  if (s->p.n_rows > 0)
+    judge_watch_look(&s->watch, &s->p, &s->a, &s->r, general_of(s), s->form == LAV_BODIES, impulse, floor, &t);
+  out->worst = t.worst;
+  out->energy = t.finite ? t.energy : INFINITY;
+  out->velocity = t.finite ? t.velocity : INFINITY;
+  out->relative = judge_measure_relative_of(&t, s->watch.w, s->p.n_rows, s->start[0], s->start[1]);
+  out->floor = floor ? judge_score_relative(t.floor_energy, t.floor_velocity, s->start[0], s->start[1]) : 0.0;
+}
+
+/* E0, V0 of doing nothing, which is left in x (m). */
+static void do_nothing(lav_solver *s, double *x) {
+  score_t t = {0.0, 0.0, 0.0, 0.0, -1, 1};
+  int32_t moves = 0;
+  if (s->p.n_rows > 0) {
+    moves = judge_measure_do_nothing(&s->p, x, s->watch.w);
+    if (!moves) judge_score_score_rows(&s->p, x, s->watch.w, s->watch.e, &t);
+    else {
+      judge_watch_look(&s->watch, &s->p, &s->a, &s->r, general_of(s), s->form == LAV_BODIES, x, 0, &t);
+      t.finite = t.finite && judge_score_are_numbers(s->watch.w, s->p.n_rows);
+    }
+  }
+  judge_measure_reference_of(&s->p, &t, moves, 0, s->start);
+}
+
+/* -- impulses carried by key ------------------------------------------------------------------------------------------ */
+
+static void keep_impulses(lav_solver *s) {
+  kept_t *kept = &s->kept;
+  if (!s->ready) return;
+  kept->n_blocks = kept->n_rows = 0;
+  if (!s->has_keys || s->p.n_blocks > kept->most_blocks || s->p.n_rows > kept->most_rows) return;
+  COPY(kept->key, s->key, s->p.n_blocks);
+  COPY(kept->ptr, s->p.ptr, s->p.n_blocks + 1);
+  COPY(kept->kind, s->p.kind, s->p.n_blocks);
+  COPY(kept->impulse, s->impulse, s->p.n_rows);
+  kept->n_blocks = s->p.n_blocks;
+  kept->n_rows = s->p.n_rows;
+}
+
+static uint32_t place_of(uint64_t key, uint32_t mask) {
+  key = (key ^ key >> 30) * 0xBF58476D1CE4E5B9u;
+  return (uint32_t)(key ^ key >> 31) & mask;
+}
+
+/* Impulses of blocks of the same key, kind and rows; of equal keys the first. */
+static void carry(lav_solver *s) {
+  const kept_t *kept = &s->kept;
+  uint32_t size = 1, at;
+  int32_t i, j, *table = s->marks; /* twice the number of blocks before, and a power of two */
+  if (!s->has_keys || kept->n_blocks == 0) return;
+  while (size < 2u * (uint32_t)kept->n_blocks) size *= 2;
+  for (at = 0; at < size; at++) table[at] = -1;
+  for (i = 0; i < kept->n_blocks; i++) {
+    for (at = place_of(kept->key[i], size - 1); table[at] >= 0; at = (at + 1) & (size - 1))
+      if (kept->key[table[at]] == kept->key[i]) break;
+    if (table[at] < 0) table[at] = i;
+  }
+  for (i = 0; i < s->p.n_blocks; i++) {
+    const int32_t rows = s->p.ptr[i + 1] - s->p.ptr[i];
+    for (at = place_of(s->key[i], size - 1); table[at] >= 0; at = (at + 1) & (size - 1))
+      if (kept->key[table[at]] == s->key[i]) break;
+    j = table[at];
+    if (j >= 0 && kept->kind[j] == s->p.kind[i] && kept->ptr[j + 1] - kept->ptr[j] == rows)
+      COPY(s->impulse + s->p.ptr[i], kept->impulse + kept->ptr[j], rows);
+  }
+}
+
+/* -- methods ---------------------------------------------------------------------------------------------------------- */
+
+static void pgs_step(void *context, double *lam, int32_t first, int32_t n) {
+  struct sweep_serial_context_t *c = (struct sweep_serial_context_t *)context;
+#ifndef LAV_SWEEPS_ONLY
+  if (c->general) {
+    sweep_serial_pgs_step(context, lam, first, n);
+    return;
+  }
+#endif
+  if (!c->order) k_pgs_rows_in_order(c->blocks, c->csr, lam, n);
+  else k_pgs_sweeps(c->blocks, c->csr, lam, c->order, c->split, c->mode, c->rng, first, n);
+}
+
+static void impulse_step(void *context, double *lam, int32_t first, int32_t n) {
+  struct sweep_serial_context_t *c = (struct sweep_serial_context_t *)context;
+  k_impulse_sweeps(c->blocks, c->rows, lam, c->scratch, c->order, c->split, c->mode, c->rng, first, n);
+}
+
+static int32_t prepare_sweeps(lav_solver *s) {
+  s->swept.blocks = &s->p;
+  s->swept.csr = &s->a;
+  s->swept.rows = &s->r;
+  s->swept.general = general_of(s);
+  s->swept.omega = s->options.omega;
+  s->swept.scratch = s->form == LAV_MATRIX ? s->watch.e : s->v; /* of jacobi, which the watch does not need between sweeps */
+  s->swept.split = s->split;
+  s->swept.mode = s->mode;
+  s->swept.rng = &s->rng;
+  s->swept.packing = NULL;
+  s->context = &s->swept;
+  s->step = s->options.method == LAV_PGS ? pgs_step : sweep_serial_sor_step;
+  if (s->options.method == LAV_SOR || s->options.method == LAV_GAUSS_SEIDEL) s->swept.order = s->order;
+  if (s->options.method == LAV_JACOBI) {
+    double most = 0.0, sum;
+    int32_t i, q;
+    for (i = 0; i < s->p.n_rows; i++) { /* max_i sum_j |A_ij| / d_i */
+      for (sum = 0.0, q = s->a.indptr[i]; q < s->a.indptr[i + 1]; q++) sum += fabs(s->a.data[q]);
+      sum *= s->p.step[i];
+      if (sum > most) most = sum;
+    }
+    if (s->options.omega == 0.0) s->swept.omega = most > 0.0 && 1.6 / most < 1.0 ? 1.6 / most : 1.0;
+    s->step = sweep_serial_jacobi_step;
+  }
+  if (s->options.method != LAV_SEQUENTIAL_IMPULSES) return LAV_OK;
+  s->step = impulse_step;
+#ifndef LAV_SWEEPS_ONLY
+  s->step = sweep_serial_impulse_step; /* in pairs, with the same bits */
+  if (s->mode == core_order_GIVEN && s->p.n_blocks >= PACK_FROM && s->p.n_blocks <= sweep_packed_MOST) {
+    s->packing.room = TAKE(s, double, sweep_packed_room_of(&s->p, &s->r));
+    s->packing.status = 0;
+    s->packing.first = s->p.n_blocks < FAR_FROM ? 8 : 16;
+    s->swept.packing = &s->packing;
+  }
+#endif
+  return s->is_short ? LAV_ERROR_ROOM : LAV_OK;
+}
+
+#ifndef LAV_SWEEPS_ONLY
+static int32_t prepare_blocks(lav_solver *s) {
+  double numbers;
+  s->prepared_at = TAKE(s, int32_t, s->p.n_blocks);
+  if (s->is_short) return LAV_ERROR_ROOM;
+  numbers = k_prepared_sizes(&s->p, s->prepared_at);
+  if (numbers >= 2147483647.0) return LAV_ERROR_COUNT;
+  s->prepared = TAKE(s, double, (int64_t)numbers);
+  if (s->is_short) return LAV_ERROR_ROOM;
+  memset(s->prepared, 0, ((size_t)numbers + 1) * sizeof(double));
+  if (s->form == LAV_VELOCITIES) k_prepare_general(&s->p, &s->g, s->prepared_at, s->prepared);
+  else if (s->form == LAV_BODIES) k_prepare_rows(&s->p, &s->r, s->prepared_at, s->prepared);
+  else k_prepare_csr(&s->p, &s->a, s->prepared_at, s->prepared);
+  s->local.blocks = &s->p;
+  s->local.csr = s->form == LAV_BODIES ? NULL : &s->a;
+  s->local.rows = &s->r;
+  s->local.general = general_of(s);
+  s->local.start = s->prepared_at;
+  s->local.g = s->prepared;
+  s->local.velocity = s->v;
+  s->local.order = s->order;
+  s->local.split = s->split;
+  s->local.mode = s->mode;
+  s->local.rng = &s->rng;
+  s->local.fallbacks = 0.0;
+  s->context = &s->local;
+  s->step = local_gauss_seidel_step;
+  return LAV_OK;
+}
+#endif
+
+/* v = M^-1 J^T lambda, or Y^T lambda of J and M. */
+static void form_velocity(lav_solver *s) {
+  memset(s->v, 0, ((size_t)s->n_v + 12) * sizeof(double));
+  if (s->p.n_rows == 0 || s->n_v == 0) return;
+#ifndef LAV_SWEEPS_ONLY
+  if (s->form == LAV_VELOCITIES) {
+    core_generalized_whitened_gather(&s->g, s->impulse, s->v);
+    return;
+  }
+#endif
+  k_rows_velocity(&s->p, &s->r, s->impulse, s->v);
+}
+
+#ifndef LAV_SWEEPS_ONLY
+static int32_t prepare_full(lav_solver *s);
+static void run_full(lav_solver *s, const lav_budget *budget, lav_result *out);
+static void pack_pairs(lav_solver *s, int32_t n);
+static int32_t restarts_of(const lav_solver *s);
+static int32_t begins_again(lav_solver *s);
+#endif
+
+static int32_t prepare(lav_solver *s) {
+  switch (s->options.method) {
+#ifndef LAV_SWEEPS_ONLY
+    case LAV_BLOCK_GAUSS_SEIDEL: return prepare_blocks(s);
+    case LAV_ANDERSON: case LAV_NNCG: case LAV_NEWTON: case LAV_DIRECT: return prepare_full(s);
+#endif
+    default: return prepare_sweeps(s);
+  }
+}
+
+/* n sweeps, fewer where a check ends them; tol = 0 checks nothing. */
+static int32_t watched(lav_solver *s, int32_t n, double tol, int32_t *done) {
+  struct judge_watch_watch_t *w = &s->watch;
+  int32_t step, status;
+  *done = 0;
+  while (*done < n) {
+    step = n - *done;
+    if (tol > 0.0) {
+      if (w->total == w->check_at) {
+        status = judge_watch_check(w, &s->p, &s->a, &s->r, general_of(s), s->form == LAV_BODIES, s->impulse, tol);
+        if (status != judge_watch_RUNNING) return status;
+      }
+      if (w->check_at - w->total < step) step = w->check_at - w->total;
+    }
+    s->step(s->context, s->impulse, w->total == 0, step);
+    *done += step;
+    w->total += step;
+  }
+  return judge_watch_RUNNING;
+}
+
+/* Sweeps until a check, the budget or the clock ends them. */
+static void run_sweeps(lav_solver *s, const lav_budget *budget, lav_result *out) {
+  const double begin = budget->seconds > 0.0 ? budget->clock(budget->clock_data) : 0.0;
+  double now = begin, left;
+  int32_t status = judge_watch_RUNNING, n = budget->seconds > 0.0 ? 1 : budget->iterations, done;
+#ifndef LAV_SWEEPS_ONLY
+  const int32_t fallbacks = (int32_t)s->local.fallbacks;
+#endif
+  while (out->iterations < budget->iterations && status == judge_watch_RUNNING) {
+    if (n > budget->iterations - out->iterations) n = budget->iterations - out->iterations;
+#ifndef LAV_SWEEPS_ONLY
+    if (s->options.method == LAV_ANDERSON || s->options.method == LAV_NNCG) pack_pairs(s, n);
+#endif
+    status = watched(s, n, budget->tol, &done);
+    out->iterations += done;
+#ifndef LAV_SWEEPS_ONLY
+    if (status == judge_watch_STALLED && begins_again(s)) status = judge_watch_RUNNING;
+#endif
+    if (budget->seconds > 0.0 && status == judge_watch_RUNNING) {
+      now = budget->clock(budget->clock_data);
+      left = begin + budget->seconds - now;
+      if (!(left > 0.0)) {
+        out->outcome = LAV_TIME_LIMIT;
+        break;
+      }
+      left = 0.5 * left * out->iterations / (now > begin ? now - begin : 1e-7); /* iterations that half of it is for */
+      n = left < 1.0 ? 1 : left > 4.0 * n ? (n < 250000000 ? 4 * n : n) : (int32_t)left;
+    }
+  }
+  if (status != judge_watch_RUNNING) out->outcome = status; /* numbered alike */
+  out->sweeps = out->iterations;
+#ifndef LAV_SWEEPS_ONLY
+  if (s->options.method == LAV_BLOCK_GAUSS_SEIDEL) out->restarts = (int32_t)s->local.fallbacks - fallbacks;
+  if (s->options.method == LAV_ANDERSON || s->options.method == LAV_NNCG) {
+    if (s->mode == core_order_SYMMETRIC) out->sweeps *= 2;
+    out->restarts = restarts_of(s);
+  }
+#endif
+}
+
+/* -- the calls -------------------------------------------------------------------------------------------------------- */
+
+static int32_t enter(lav_solver *s) {
+  if (!s) return LAV_ERROR_NULL;
+  if ((uintptr_t)s % 16 != 0 || s->magic != MAGIC) return LAV_ERROR_SOLVER;
+#if defined(__GNUC__)
+  return __atomic_exchange_n(&s->busy, 1, __ATOMIC_ACQUIRE) ? LAV_ERROR_BUSY : LAV_OK;
+#else
+  if (s->busy) return LAV_ERROR_BUSY;
+  s->busy = 1;
+  return LAV_OK;
+#endif
+}
+
+static int32_t leave(lav_solver *s, int32_t code) {
+#if defined(__GNUC__)
+  __atomic_store_n(&s->busy, 0, __ATOMIC_RELEASE);
+#else
+  s->busy = 0;
+#endif
+  return code;
+}
+
+int32_t lav_room(const lav_problem *problem, const lav_options *options, uint64_t *bytes) {
+  lav_solver s; /* of no memory: it only counts */
+  int64_t m, k, n, nv, numbers;
+  if (!problem || !options || !bytes) return LAV_ERROR_NULL;
+  GIVE_BACK(check_counts(problem));
+  GIVE_BACK(check_options(options));
+  if (!takes_form(options->method, problem->form)) return LAV_ERROR_UNSUPPORTED;
+  memset(&s, 0, sizeof s);
+  s.used = sizeof(lav_solver);
+  m = problem->n_rows, k = problem->n_blocks, n = problem->n_bodies, nv = problem->n_velocities;
+  (void)m, (void)k, (void)n, (void)nv;
+  take_kept(&s, problem);
+  take_blocks(&s, problem);
+  take_form(&s, problem);
+  numbers = 0;
+  if (problem->form == LAV_VELOCITIES) { /* M, its factor without fill, Y with what ancestors add */
+    numbers += 6 * nv + 4 * (int64_t)problem->n_mass_entries + 4 * k + 4 * (int64_t)problem->n_entries + 256;
+    numbers += m * nv < 4 * (int64_t)problem->n_entries + 256 ? m * nv : 4 * (int64_t)problem->n_entries + 256;
+  }
+#ifndef LAV_SWEEPS_ONLY
+  if (options->method == LAV_SEQUENTIAL_IMPULSES || options->method == LAV_ANDERSON || options->method == LAV_NNCG)
+    numbers += problem->form == LAV_BODIES ? sweep_packed_room_for(problem->n_joints, m, k - problem->n_joints, m, n) : 0;
+  if (options->method == LAV_BLOCK_GAUSS_SEIDEL || options->method == LAV_ANDERSON || options->method == LAV_NNCG)
+    numbers += 9 * m + 26 * k;
+  if (options->method == LAV_ANDERSON || options->method == LAV_NNCG)
+    numbers += CONTROL + GRAM + 3 * (m + s.n_v) + (1 + 2 * (int64_t)options->memory) * m + 64;
+  if (options->method == LAV_NEWTON) numbers += 60 * m + 48 * nv + 16 * k + 2 * (nv < 64 ? nv * nv : 64 * nv) + 2048;
+  if (options->method == LAV_DIRECT) numbers += 40 * m + CONTROL + GRAM + m * (m < 64 ? m : 64) + 64;
+#endif
+  *bytes = s.used + 8 * (uint64_t)numbers + 4096;
+  return LAV_OK;
+}
+
+int32_t lav_open(void *memory, uint64_t bytes, const lav_problem *largest, const lav_options *options, lav_solver **out) {
+  lav_solver *s;
+  uint64_t skip;
+  if (!memory || !largest || !options || !out) return LAV_ERROR_NULL;
+  GIVE_BACK(check_counts(largest));
+  GIVE_BACK(check_options(options));
+  if (!takes_form(options->method, largest->form)) return LAV_ERROR_UNSUPPORTED;
+  skip = (16 - (uintptr_t)memory % 16) % 16;
+  if (bytes < skip + sizeof(lav_solver)) return LAV_ERROR_ROOM;
+  s = (lav_solver *)(void *)((char *)memory + skip);
+  {
+    lav_solver probe;
+    memset(&probe, 0, sizeof probe);
+    probe.used = sizeof(lav_solver);
+    take_kept(&probe, largest);
+    if (probe.used > bytes - skip) return LAV_ERROR_ROOM;
+  }
+  memset(s, 0, sizeof *s);
+  s->base = (char *)s;
+  s->bytes = bytes - skip;
+  s->used = sizeof(lav_solver);
+  s->options = *options;
+  take_kept(s, largest);
+  s->begin = s->used;
+  s->magic = MAGIC;
+  *out = s;
+  return LAV_OK;
+}
+
+uint64_t lav_needed(const lav_solver *solver) {
+  return solver && (uintptr_t)solver % 16 == 0 && solver->magic == MAGIC ? solver->needed : 0;
+}
+
+static int32_t set_problem(lav_solver *s, const lav_problem *q) {
+  int32_t code = LAV_OK;
+  GIVE_BACK(check_problem(q));
+  GIVE_BACK(takes(q, &s->options));
+  if (q->n_blocks > s->kept.most_blocks || q->n_rows > s->kept.most_rows) return LAV_ERROR_ROOM;
+  keep_impulses(s);
+  s->ready = s->begun = 0;
+  s->used = s->begin;
+  s->is_short = 0;
+  take_blocks(s, q);
+  take_form(s, q);
+  if (s->is_short) return LAV_ERROR_ROOM;
+  GIVE_BACK(fill_blocks(s, q));
+  if (q->form == LAV_MATRIX) {
+    copy_or(s->p.b, q->b, q->n_rows, 0.0);
+    fill_matrix(s->a.indptr, s->a.indices, s->a.data, q->index_ptr, q->index, q->value, q->n_rows, q->n_rows, q->n_entries, 0);
+    if (q->n_rows > 0) k_csr_diagonal(&s->p, &s->a, (double *)(uintptr_t)s->p.d, (double *)(uintptr_t)s->p.step, s->empty);
+    k_matrix_nu(&s->p, (double *)(uintptr_t)s->p.nu);
+  } else if (q->form == LAV_BODIES) fill_bodies(s, q);
+#ifndef LAV_SWEEPS_ONLY
+  else code = fill_velocities(s, q);
+#endif
+  if (code != LAV_OK) return code;
+  do_nothing(s, s->impulse);
+  if (q->impulse) COPY(s->impulse, q->impulse, q->n_rows);
+  else carry(s);
+  GIVE_BACK(prepare(s));
+  s->ready = 1;
+  return LAV_OK;
+}
+
+int32_t lav_set(lav_solver *solver, const lav_problem *problem) {
+  int32_t code;
+  uint64_t wanted = 0;
+  GIVE_BACK(enter(solver));
+  if (!problem) return leave(solver, LAV_ERROR_NULL);
+  code = set_problem(solver, problem);
+  if (code == LAV_ERROR_ROOM) {
+    if (lav_room(problem, &solver->options, &wanted) != LAV_OK) wanted = 0;
+    if (solver->used + solver->used / 2 > wanted) wanted = solver->used + solver->used / 2; /* what comes after is not known yet */
+  }
+  solver->needed = code == LAV_ERROR_ROOM ? wanted + 32 : solver->used + 32;
+  return leave(solver, code);
+}
+
+static int32_t run(lav_solver *s, const lav_budget *budget, lav_result *out) {
+  lav_verdict best;
+  if (!s->ready) return LAV_ERROR_NO_PROBLEM;
+  if (budget->size != sizeof *budget || out->size != sizeof *out) return LAV_ERROR_VERSION;
+  if (budget->iterations < 0 || !(budget->tol >= 0.0 && budget->tol < INFINITY)) return LAV_ERROR_OPTION;
+  if (!(budget->seconds >= 0.0 && budget->seconds < INFINITY)) return LAV_ERROR_OPTION;
+  if (budget->seconds > 0.0 && !budget->clock) return LAV_ERROR_NULL;
+  out->outcome = LAV_MAX_ITERATIONS;
+  out->iterations = out->sweeps = out->restarts = 0;
+  out->method = s->options.method;
+  if (!s->begun) {
+    judge_watch_begin_watch(&s->watch, s->start[0], s->start[1],
+                            s->options.method == LAV_ANDERSON || s->options.method == LAV_NNCG ? LONG_PATIENCE : PATIENCE,
+                            s->score_room, s->p.n_rows);
+    form_velocity(s);
+    s->begun = 1;
+  }
+  if (s->p.n_rows == 0) {
+    if (budget->tol > 0.0) out->outcome = LAV_CONVERGED;
+    else out->iterations = budget->iterations;
+  }
+#ifndef LAV_SWEEPS_ONLY
+  else if (s->options.method == LAV_NEWTON || s->options.method == LAV_DIRECT) run_full(s, budget, out);
+#endif
+  else {
+    run_sweeps(s, budget, out);
+    if (budget->tol > 0.0 && s->watch.best_at >= 0 && out->outcome != LAV_CONVERGED) {
+      judge(s, s->impulse, 0, &best); /* a residual may rise: the best check counts */
+      if (!(best.relative <= s->watch.best_relative)) {
+        COPY(s->impulse, s->watch.best, s->p.n_rows);
+        form_velocity(s);
+      }
+    }
+  }
+  out->verdict.size = (uint32_t)sizeof out->verdict;
+  judge(s, s->impulse, 1, &out->verdict);
+  return LAV_OK;
+}
+
+int32_t lav_run(lav_solver *solver, const lav_budget *budget, lav_result *out) {
+  GIVE_BACK(enter(solver));
+  return leave(solver, budget && out ? run(solver, budget, out) : LAV_ERROR_NULL);
+}
+
+int32_t lav_run_many(lav_solver *const *solvers, int32_t n, int32_t first, int32_t stride, const lav_budget *budget,
+                     lav_result *results) {
+  int32_t i, code, worst = LAV_OK;
+  if (n > 0 && (!solvers || !budget || !results)) return LAV_ERROR_NULL;
+  if (n < 0 || first < 0 || stride < 1) return LAV_ERROR_COUNT;
+  for (i = first; i < n; i += stride) {
+    code = lav_run(solvers[i], budget, results + i);
+    if (code < worst) worst = code;
+    if (stride > n - i) break;
+  }
+  return worst;
+}
+
+int32_t lav_impulse(lav_solver *solver, double *out, int32_t n) {
+  GIVE_BACK(enter(solver));
+  if (!solver->ready) return leave(solver, LAV_ERROR_NO_PROBLEM);
+  if (n != solver->p.n_rows) return leave(solver, LAV_ERROR_COUNT);
+  if (!out && n > 0) return leave(solver, LAV_ERROR_NULL);
+  if (n > 0) COPY(out, solver->impulse, n);
+  return leave(solver, LAV_OK);
+}
+
+int32_t lav_velocity(lav_solver *solver, double *out, int32_t n) {
+  int32_t i;
+  GIVE_BACK(enter(solver));
+  if (!solver->ready) return leave(solver, LAV_ERROR_NO_PROBLEM);
+  if (solver->form == LAV_MATRIX) return leave(solver, LAV_ERROR_UNSUPPORTED);
+  if (n != solver->n_v) return leave(solver, LAV_ERROR_COUNT);
+  if (!out && n > 0) return leave(solver, LAV_ERROR_NULL);
+  if (n == 0) return leave(solver, LAV_OK);
+  memset(out, 0, (size_t)n * sizeof(double));
+#ifndef LAV_SWEEPS_ONLY
+  if (solver->form == LAV_VELOCITIES && solver->p.n_rows > 0) {
+    core_generalized_jac_push(&solver->g, solver->impulse, out);
+    core_generalized_tree_solve(&solver->g, out);
+  } else
+#endif
+      if (solver->p.n_rows > 0) k_rows_velocity(&solver->p, &solver->r, solver->impulse, out);
+  for (i = 0; i < n; i++) out[i] = solver->v_free[i] + out[i];
+  return leave(solver, LAV_OK);
+}
+
+int32_t lav_judge(lav_solver *solver, const double *impulse, int32_t n, double *slack, double *error, lav_verdict *out) {
+  lav_verdict found;
+  GIVE_BACK(enter(solver));
+  if (!solver->ready) return leave(solver, LAV_ERROR_NO_PROBLEM);
+  if (n != solver->p.n_rows) return leave(solver, LAV_ERROR_COUNT);
+  if (!out || (!impulse && n > 0)) return leave(solver, LAV_ERROR_NULL);
+  if (out->size != sizeof *out) return leave(solver, LAV_ERROR_VERSION);
+  found.size = out->size;
+  judge(solver, impulse, 1, &found);
+  *out = found;
+  if (slack && n > 0) COPY(slack, solver->watch.w, n);
+  if (error && n > 0) COPY(error, solver->watch.e, n);
+  return leave(solver, LAV_OK);
+}

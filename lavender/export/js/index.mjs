@@ -1,0 +1,155 @@
+// liblavender in WebAssembly: the functions and names of lavender.h, a solver over typed arrays.
+import { LAV_BODIES, LAV_ERROR_ROOM, STRUCTS } from './header.mjs';
+export * from './header.mjs';
+
+const ARRAYS = { int32_t: Int32Array, double: Float64Array, uint64_t: BigUint64Array };
+const WHOLE = new Set(['block_ptr', 'kind', 'order', 'index_ptr', 'index', 'mass_ptr', 'mass_index', 'joint_body', 'contact_body']);
+
+export class LavenderError extends Error {
+  constructor(code, text) {
+    super(text);
+    this.name = 'LavenderError';
+    this.code = code;
+  }
+}
+
+/** The library of a module: bytes of liblavender.wasm, or a compiled WebAssembly.Module. */
+export async function load(module) {
+  const made = await WebAssembly.instantiate(module, {});
+  const library = new Library((made.instance ?? made).exports);
+  library.check(library.c.lav_self_test());
+  return library;
+}
+
+export class Library {
+  constructor(c) {
+    this.c = c;
+    this.top = c.__heap_base.value;
+  }
+  /** Bytes of the module's memory, which grows and is never given back. */
+  take(bytes) {
+    const at = (this.top + 15) & ~15;
+    this.top = at + bytes;
+    const missing = this.top - this.c.memory.buffer.byteLength;
+    if (missing > 0) this.c.memory.grow(Math.ceil(missing / 65536));
+    return at;
+  }
+  view(kind, at, count) {
+    return new ARRAYS[kind](this.c.memory.buffer, at, count);
+  }
+  text(at) {
+    const bytes = new Uint8Array(this.c.memory.buffer);
+    let end = at;
+    while (bytes[end]) end++;
+    return new TextDecoder().decode(bytes.slice(at, end));
+  }
+  check(code) {
+    if (code < 0) throw new LavenderError(code, this.text(this.c.lav_text(code)));
+    return code;
+  }
+  struct(name) {
+    return new Struct(this, name);
+  }
+  hash(x, seed = 0n) {
+    const at = this.take(8 * x.length + 8);
+    this.view('double', at, x.length).set(x);
+    const out = BigInt.asUintN(64, this.c.lav_hash(at, x.length, seed));
+    this.top = at;
+    return out;
+  }
+  solver(method, options = {}) {
+    return new Solver(this, method, options);
+  }
+}
+
+class Struct {
+  constructor(library, name, at) {
+    const { size, fields } = STRUCTS[name];
+    Object.assign(this, { library, fields, size, at: at ?? library.take(size) });
+  }
+  get(field) {
+    const [kind, offset] = this.fields[field];
+    if (kind === 'lav_verdict') return new Struct(this.library, kind, this.at + offset);
+    const view = new DataView(this.library.c.memory.buffer);
+    if (kind === 'double') return view.getFloat64(this.at + offset, true);
+    return kind === 'uint64_t' ? view.getBigUint64(this.at + offset, true) : view.getInt32(this.at + offset, true);
+  }
+  set(field, value) {
+    if (!(field in this.fields)) throw new TypeError(`there is no ${field}; one of ${Object.keys(this.fields).join(', ')} is needed`);
+    const [kind, offset] = this.fields[field], view = new DataView(this.library.c.memory.buffer);
+    if (kind === 'double') view.setFloat64(this.at + offset, value, true);
+    else if (kind === 'uint64_t') view.setBigUint64(this.at + offset, BigInt(value), true);
+    else view.setInt32(this.at + offset, value, true);
+  }
+  plain() {
+    return Object.fromEntries(Object.keys(this.fields).map((key) => {
+      const value = this.get(key);
+      return [key, value instanceof Struct ? value.plain() : value];
+    }));
+  }
+}
+
+/** One solver; its memory grows where a problem asks for more, and impulses then start anew. */
+export class Solver {
+  constructor(library, method, options) {
+    Object.assign(this, { library, c: library.c, at: 0, bytes: 0, rows: 0, speeds: 0 });
+    for (const name of ['options', 'budget', 'result', 'problem']) this[name] = library.struct(`lav_${name}`);
+    library.check(this.c.lav_default_options(method, this.options.at));
+    for (const [key, value] of Object.entries(options)) this.options.set(key, value);
+    this.pointer = library.take(16);
+    this.arrays = new Map(); // name -> place and room of the copy that the module reads
+  }
+  /** A problem: counts by name, arrays of numbers by name, as in lavender.h. */
+  set(given) {
+    const q = this.problem;
+    this.library.check(this.c.lav_default_problem(given.form ?? LAV_BODIES, q.at));
+    for (const [key, value] of Object.entries(given)) {
+      if (typeof value === 'number') q.set(key, value);
+      else if (value != null) q.set(key, this.copy(key, value));
+    }
+    if (!this.at) this.open(0n);
+    let code = this.c.lav_set(this.at, q.at);
+    for (let turn = 0; code === LAV_ERROR_ROOM && turn < 40; turn++) {
+      this.open(BigInt.asUintN(64, this.c.lav_needed(this.at)));
+      code = this.c.lav_set(this.at, q.at);
+    }
+    this.library.check(code);
+    this.rows = q.get('n_rows');
+    this.speeds = q.get('form') === LAV_BODIES ? 6 * q.get('n_bodies') : q.get('n_velocities');
+  }
+  copy(key, values) {
+    const kind = key === 'key' ? 'uint64_t' : WHOLE.has(key) ? 'int32_t' : 'double', bytes = values.length * ARRAYS[kind].BYTES_PER_ELEMENT;
+    let held = this.arrays.get(key);
+    if (!held || held.bytes < bytes) this.arrays.set(key, (held = { at: this.library.take(2 * bytes + 8), bytes: 2 * bytes }));
+    this.library.view(kind, held.at, values.length).set(values);
+    return held.at;
+  }
+  open(needed) {
+    this.library.check(this.c.lav_room(this.problem.at, this.options.at, this.pointer));
+    const wanted = this.library.view('uint64_t', this.pointer, 1)[0], bytes = wanted > needed ? wanted : needed;
+    const memory = this.library.take(Number(bytes) + 16);
+    this.library.check(this.c.lav_open(memory, bytes + 16n, this.problem.at, this.options.at, this.pointer));
+    this.at = this.library.view('int32_t', this.pointer, 1)[0];
+  }
+  run({ iterations = 1000, tol = 1e-6 } = {}) {
+    this.library.check(this.c.lav_default_budget(this.budget.at));
+    this.budget.set('iterations', iterations);
+    this.budget.set('tol', tol);
+    this.result.set('size', STRUCTS.lav_result.size);
+    this.library.check(this.c.lav_run(this.at, this.budget.at, this.result.at));
+    return this.result.plain();
+  }
+  numbers(call, n) {
+    const at = this.library.take(8 * n + 8);
+    const code = call(this.at, at, n), out = this.library.view('double', at, n).slice();
+    this.library.top = at;
+    this.library.check(code);
+    return out;
+  }
+  impulse() {
+    return this.numbers(this.c.lav_impulse, this.rows);
+  }
+  velocity() {
+    return this.numbers(this.c.lav_velocity, this.speeds);
+  }
+}

@@ -1,0 +1,136 @@
+"""The C library as a folder: its one source, its header, and how it is built; its bindings likewise."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+from collections.abc import Iterator
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import lavender_ext
+from lavender.errors import InputError, LavenderError
+from lavender.export import bindings, cut
+from lavender.io.stored import write_text
+from lavender.web import compile as wasm
+
+__all__ = ["HEADER", "source", "write"]
+
+HERE = Path(__file__).resolve().parent
+ROOT = Path(lavender_ext.__file__).resolve().parent.parent  # the folder that holds lavender_ext
+HEADER = HERE / "c" / "lavender.h"
+TEXTS = (".h", ".hpp", ".c", ".cpp", ".txt", ".in", ".rs", ".toml", ".mjs", ".mts", ".json")
+#: Folders of what can be written, by name.
+KINDS = {"c": "c", "rust": "rust", "npm": "js"}
+
+
+def source() -> str:
+    """lavender.c: the one that came with the package, or one made of the kernels as they lie here, kept beside it.
+
+    Raises
+    ------
+    LavenderError
+        Neither: the kernels were changed, or come without one, and Cython is not installed.
+    """
+    kept = HERE / "c" / "lavender.c"
+    wanted = cut.source_hash(ROOT)
+    if kept.exists():
+        text = kept.read_text(encoding="utf-8")
+        if wanted in text[:1000]:
+            return text
+    try:
+        text = cut.amalgamate(ROOT, ROOT / "build" / "cython")
+    except cut.CutFailed as error:
+        raise LavenderError(
+            f"lavender.c does not lie in {kept.parent} and cannot be made: {str(error)[-500:]}; "
+            "install a wheel, or Cython"
+        ) from None
+    with contextlib.suppress(OSError, LavenderError):  # a package that nobody may write into
+        write_text(kept, text)
+    return text
+
+
+def _files(folder: Path) -> Iterator[Path]:
+    return (
+        p
+        for p in sorted(folder.rglob("*"))
+        if p.is_file() and p.name != "lavender.c" and "target" not in p.parts
+    )
+
+
+def write(kind: str, out: Path, *, replace: bool = False) -> list[Path]:
+    """Write a folder: the C library, the Rust crates, or the npm package.
+
+    Parameters
+    ----------
+    kind : {"c", "rust", "npm"}
+    out : Path
+        A folder; made where it is not there. Files of other names in it stay.
+    replace : bool
+        Replace files of ours that are others than what would be written.
+
+    Returns
+    -------
+    list of Path
+        What was written, SHA256SUMS last.
+
+    Raises
+    ------
+    InputError
+        A file of that name is there and is another.
+    LavenderError
+        As `source`.
+    """
+    folder, header = HERE / KINDS[kind], HEADER.read_text(encoding="utf-8")
+    made = {p.relative_to(folder).as_posix(): p.read_text(encoding="utf-8") for p in _files(folder)}
+    if kind == "rust":
+        made["lavender-sys/c/lavender.c"] = source()
+        made["lavender-sys/c/lavender.h"] = header
+        made["lavender-sys/src/lib.rs"] = bindings.rust(header)
+    elif kind == "npm":
+        made["header.mjs"], made["header.d.mts"] = bindings.javascript(header)
+    elif kind == "c":
+        made["lavender.c"] = source()
+    sums = "".join(f"{hashlib.sha256(made[name].encode()).hexdigest()}  {name}\n" for name in sorted(made))
+    made["SHA256SUMS"] = sums
+    written = put(out, made, replace)
+    if kind == "npm":
+        written.insert(0, _module(out / "liblavender.wasm", header))
+    return written
+
+
+def _module(out: Path, header: str) -> Path:
+    """The library as a WebAssembly module: the one that came with the package, or a new one."""
+    kept, text = HERE / "js" / out.name, source()
+    stamp = hashlib.sha256(text.encode()).hexdigest()
+    if kept.exists() and kept.with_suffix(".sha256").read_text(encoding="utf-8") == stamp:
+        out.write_bytes(kept.read_bytes())
+        return out
+    with TemporaryDirectory() as folder:
+        work = Path(folder)
+        (work / "lavender.c").write_text(text, encoding="utf-8")
+        (work / "lavender.h").write_text(header, encoding="utf-8")
+        names = [name for _, name, _ in bindings.functions(header)]
+        try:
+            wasm.build_library(out, work / "lavender.c", names)
+        except wasm.BuildFailed as error:
+            raise LavenderError(str(error)) from None
+    with contextlib.suppress(OSError):  # a package that nobody may write into
+        kept.write_bytes(out.read_bytes())
+        kept.with_suffix(".sha256").write_text(stamp, encoding="utf-8")
+    return out
+
+
+def put(out: Path, made: dict[str, str], replace: bool) -> list[Path]:
+    """Write texts by their names below a folder; none where one of them is there and is another."""
+    for name, text in made.items():
+        path = out / name
+        if path.exists() and not replace and path.read_text(encoding="utf-8", errors="replace") != text:
+            raise InputError(f"{path} is there and is another: give --replace, or another folder")
+    written = []
+    for name, text in made.items():
+        path = out / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_text(path, text)
+        written.append(path)
+    return written

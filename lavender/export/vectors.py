@@ -1,0 +1,114 @@
+"""Test vectors: problems of a report, the solver it recommends with its settings, and the bits that come of both.
+
+`vectors.bin` is read by `check.c`, which a build runs: 8 bytes of name, the number of vectors, then each as whole
+numbers of 8 bytes and arrays (bytes, data, padded to 8) in the order of `lav_problem`, -1 for null. Little-endian.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import lavender as lv
+from lavender import bench, registry
+from lavender.bench.line import c_of
+from lavender.bench.store import read
+from lavender.errors import InputError
+from lavender.export.library import HERE, put
+from lavender.export.view import METHODS, NotTaken, choices, view
+from lavender.io.stored import write_bytes
+from lavender.report.verdict import verdict
+
+__all__ = ["chosen", "pack", "write"]
+
+MAGIC = b"LAVVEC1\0"
+
+
+def write(path: Path, out: Path, solver: str | None, most: int, *, replace: bool = False) -> list[Path]:
+    """Write `vectors.bin`, `check.c` and `chosen.h`, the settings as C, into a folder of the library.
+
+    Parameters
+    ----------
+    path : Path
+        records.jsonl of a report.
+    solver : str, optional
+        One of its records; default: the one that it recommends.
+    most : int
+        Problems at most.
+
+    Raises
+    ------
+    InputError
+        No such solver, or one that the library does not have, or no problem that can be had again.
+    """
+    records = read(path)
+    record = chosen(records, solver)
+    packed, left = [], []
+    for name in dict.fromkeys(r.case for r in records if r.solver == record.solver and r.success):
+        if len(packed) < most:
+            try:
+                packed.append(
+                    pack(
+                        bench.resolve([name])[0].problem,
+                        record.solver,
+                        record.tol,
+                        record.max_iter,
+                        record.options,
+                    )
+                )
+            except (NotTaken, lv.LavenderError) as error:
+                left.append(f"{name}: {error}")
+    if not packed:
+        raise InputError(
+            f"no problem of {record.solver} in {path} makes a test vector: {'; '.join(left[:3])}"
+        )
+    write_bytes(out / "vectors.bin", MAGIC + struct.pack("<q", len(packed)) + b"".join(packed))
+    text = (
+        f"/* What the report measured: {record.solver}, to a relative residual of {record.tol:g}. */\n"
+        '#include "lavender.h"\n\n'
+        "static inline void lav_chosen(lav_options *options, lav_budget *budget) {\n"
+        + "".join(f"  {_by_pointer(line)};\n" for line in c_of(record))
+        + "}\n"
+    )
+    check = (HERE / "front" / "check.c").read_text(encoding="utf-8")
+    return [out / "vectors.bin", *put(out, {"check.c": check, "chosen.h": text}, replace)]
+
+
+def _by_pointer(line: str) -> str:
+    return line.replace("&", "").replace("options.", "options->").replace("budget.", "budget->")
+
+
+def chosen(records: Any, solver: str | None) -> Any:
+    """The record whose solver and settings are written."""
+    solved = [r for r in records if r.success and r.mode == "tol"]
+    mine = [r for r in solved if r.solver in METHODS]
+    names = sorted({r.solver for r in mine})
+    if solver is None:
+        leaders = verdict(records).leaders
+        solver = next((name for name in leaders if name in names), None)
+    if solver not in names:
+        have = ", ".join(names) or "none"
+        raise InputError(
+            f"{solver or 'what is recommended'} is not in the C library; of these records are: {have} (--solver)"
+        )
+    return min((r for r in mine if r.solver == solver), key=lambda r: r.tol)
+
+
+def pack(problem: Any, solver: str, tol: float, max_iter: int, options: Mapping[str, Any]) -> bytes:
+    """One vector; NotTaken where the library does not do what the package did."""
+    given = view(problem)
+    max_iter = max_iter or registry.specs()[solver].max_iter
+    found = lv.solve(problem, solver, tol=tol, max_iter=max_iter, **options)
+    if problem.matrix is None and "rows of A" in found.solver.form:
+        raise NotTaken(f"{solver} formed A, which the library does not")
+    numbers, doubles = choices(solver, options)
+    out = struct.pack("<6q", METHODS[solver], *numbers) + struct.pack("<Q", 0) + struct.pack("<d", doubles)
+    out += struct.pack("<qd", max_iter, tol) + struct.pack("<9q", *given.counts)
+    for values in given.arrays.values():
+        data = b"" if values is None else np.ascontiguousarray(values).tobytes()
+        out += struct.pack("<q", -1 if values is None else len(data)) + data + bytes(-len(data) % 8)
+    return out + struct.pack("<d", found.residual.relative) + found.impulse.tobytes()

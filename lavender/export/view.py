@@ -1,0 +1,111 @@
+"""A problem of the package as `lav_problem` has it: counts, arrays by name, and settings by number."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from lavender.bench.line import C_METHODS as METHODS
+from lavender.errors import InputError
+from lavender.problem import Problem
+
+__all__ = ["ARRAYS", "METHODS", "NotTaken", "View", "choices", "view"]
+
+#: Arrays in the order of the struct.
+ARRAYS = (
+    "block_ptr", "kind", "lower", "upper", "mu", "patch_radius", "b", "target", "velocity", "compliance", "impulse",
+    "key", "order", "index_ptr", "index", "value", "mass_ptr", "mass_index", "mass_value", "inv_mass", "inv_inertia",
+    "joint_body", "jac", "contact_body", "normal", "tangent", "arm_a", "arm_b",
+)  # fmt: skip
+BODIES = ARRAYS[19:]
+ORDERS = {"given": 0, "symmetric": 1, "random": 2, "reverse": 3}
+SWEEPS = {None: 0, "pgs": 1, "blocks": 2}
+
+
+class NotTaken(InputError):
+    """The library does not take this; the message says what."""
+
+
+@dataclass(frozen=True)
+class View:
+    """form, law, blocks, rows, entries, bodies, joints, velocities, entries of M; arrays, None for null."""
+
+    counts: tuple[int, ...]
+    arrays: dict[str, Any]
+
+
+def view(problem: Problem) -> View:
+    """The problem in the library's words; its start is a guess that came with it, or none.
+
+    Raises
+    ------
+    NotTaken
+        Round cones; generalised velocities in an order of lavender's own.
+    """
+    c = problem.cones
+    if c.has_round:
+        raise NotTaken("round cones of more than two tangents are not in the library")
+    arrays: dict[str, Any] = dict.fromkeys(ARRAYS)
+    arrays |= {"block_ptr": c.ptr, "kind": c.kind, "lower": c.lower, "upper": c.upper, "mu": c.mu}
+    arrays |= {"patch_radius": c.patch_radius, "b": problem.b, "impulse": problem.guess}
+    form, entries, bodies, joints, velocities, mass = 1, 0, 0, 0, 0, 0
+    if problem.rows is not None:
+        r, form = problem.rows, 2
+        bodies, joints = r.n_bodies, r.n_joints
+        for key in BODIES:
+            arrays[key] = getattr(r, key)
+        arrays |= {"velocity": r.v_free, "compliance": problem.compliance}
+    elif problem.generalized is not None:
+        g, form = problem.generalized, 3
+        if g.order is not None:
+            raise NotTaken(
+                "velocities stand in an order of lavender's own: M's pattern is not that of a tree"
+            )
+        arrays |= zip(("index_ptr", "index", "value"), g.operator.jac, strict=True)
+        arrays |= zip(("mass_ptr", "mass_index", "mass_value"), g.operator.mass, strict=True)
+        arrays |= {"velocity": g.v_free, "compliance": problem.compliance}
+        velocities, mass = g.operator.n, len(g.operator.mass[1])
+    else:
+        a = problem.csr
+        arrays |= {"index_ptr": a.indptr, "index": a.indices, "value": a.data}
+    if arrays["value"] is not None:
+        entries = len(arrays["value"])
+    whole = {
+        "block_ptr",
+        "kind",
+        "order",
+        "index_ptr",
+        "index",
+        "mass_ptr",
+        "mass_index",
+        "joint_body",
+        "contact_body",
+    }
+    for key, values in arrays.items():
+        if values is not None:
+            kind = np.uint64 if key == "key" else np.int32 if key in whole else np.float64
+            arrays[key] = np.ascontiguousarray(values, kind)
+    law = int(problem.friction == "cone")
+    return View((form, law, problem.n_blocks, problem.m, entries, bodies, joints, velocities, mass), arrays)
+
+
+def choices(solver: str, options: Mapping[str, Any]) -> tuple[tuple[int, ...], float]:
+    """(order, memory, sweep, convex, keeps) and omega of the options of a solver.
+
+    Raises
+    ------
+    NotTaken
+        An option that the library does not have.
+    """
+    left = dict(options)
+    order = left.pop("order", "given")
+    sweep, restart = left.pop("sweep", None), left.pop("restart", "growth")
+    numbers = left.pop("memory", 5), SWEEPS.get(sweep, -1), left.pop("convex", 0), int(restart == "against")
+    omega = left.pop("omega", {"sor": 1.5, "gauss_seidel": 1.0}.get(solver)) or 0.0
+    if left or order not in ORDERS or solver not in METHODS:
+        what = ", ".join(left) or (f"order={order!r}" if order not in ORDERS else solver)
+        raise NotTaken(f"{what}: not in the library")
+    return (ORDERS[order], *numbers), float(omega)

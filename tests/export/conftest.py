@@ -1,0 +1,47 @@
+"""The library written and compiled once; everything here skips, with the reason, where that cannot be."""
+
+import shutil
+import subprocess
+
+import pytest
+from clib import Library
+
+from lavender import export
+from lavender.errors import LavenderError
+
+
+@pytest.fixture(scope="session")
+def folder(tmp_path_factory):
+    out = tmp_path_factory.mktemp("library")
+    try:
+        export.write("c", out)
+    except LavenderError as error:
+        pytest.skip(str(error))
+    return out
+
+
+@pytest.fixture(scope="session")
+def compiler():
+    for name in ("gcc", "clang", "cc"):
+        if shutil.which(name):
+            return name
+    pytest.skip("no C compiler (gcc, clang, cc)")
+
+
+@pytest.fixture(scope="session")
+def shared(folder, compiler):
+    out = folder / "liblavender.so"
+    run(compiler, "-std=c11", "-O1", "-fPIC", "-shared", "-DLAV_SHARED", "-fvisibility=hidden", "-ffp-contract=off",
+        folder / "lavender.c", "-lm", "-o", out)  # fmt: skip
+    return out
+
+
+@pytest.fixture(scope="session")
+def library(shared):
+    return Library(shared)
+
+
+def run(*command, **more):
+    done = subprocess.run([str(c) for c in command], capture_output=True, text=True, check=False, **more)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout

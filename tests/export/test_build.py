@@ -1,0 +1,239 @@
+"""What is written builds: as C11 and C++17 without a warning, by CMake, in Rust and JavaScript, with one hash."""
+
+import re
+import shutil
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import random_problems as rp
+from conftest import run
+from tower import self_test_problem
+
+import lavender as lv
+from lavender import export
+from lavender.errors import LavenderError
+from lavender.export import cut, vectors
+from lavender.export.bindings import constants, functions, javascript, rust
+
+WARNINGS = ["-Wall", "-Wextra", "-Werror"]
+LANGUAGES = {"C11": ["-std=c11"], "C++17": ["-std=c++17", "-x", "c++"]}
+
+
+@pytest.mark.parametrize("language", LANGUAGES)
+@pytest.mark.parametrize("small", [[], ["-DLAV_SWEEPS_ONLY"]], ids=["full", "sweeps"])
+@pytest.mark.parametrize("name", ["gcc", "clang", "zig"])
+def test_no_warning_in_either_language(folder, name, small, language):
+    command = [sys.executable, "-m", "ziglang", "cc", "-Wno-unused-command-line-argument"] if name == "zig" else [name]
+    if name == "zig":
+        pytest.importorskip("ziglang", reason="ziglang is not installed (extra: wasm)")
+    elif shutil.which(name) is None:
+        pytest.skip(f"{name} is not installed")
+    run(*command, *LANGUAGES[language], *WARNINGS, *small, "-fsyntax-only", folder / "lavender.c")
+    run(*command, *LANGUAGES[language], *WARNINGS, "-fsyntax-only", "-x", "c++" if "C++" in language else "c",
+        folder / "lavender.h")  # fmt: skip
+
+
+def test_no_python_header_and_nothing_but_sqrt_and_moves_of_memory(folder, shared):
+    assert not re.search(r"Python\.h|PyObject|malloc|\bfree\(", (folder / "lavender.c").read_text())
+    if shutil.which("nm") is None:
+        pytest.skip("nm is not installed")
+    wanted = {line.split()[-1].split("@")[0] for line in run("nm", "-D", "-u", shared).splitlines()}
+    ours = {"sqrt", "floor", "ceil", "memcpy", "memset", "memmove"}
+    assert {name for name in wanted if not name.startswith("_")} <= ours
+    given = {line.split()[-1] for line in run("nm", "-D", "--defined-only", shared).splitlines()}
+    assert {name for _, name, _ in functions(export.HEADER.read_text())} == {
+        n for n in given if n.startswith("lav_")
+    }
+
+
+def test_fast_math_does_not_compile(folder, compiler):
+    done = subprocess.run(
+        [compiler, "-ffast-math", "-fsyntax-only", folder / "lavender.c"],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode and "ffast-math" in done.stderr
+
+
+def test_checksums_are_of_the_files(folder):
+    import hashlib
+
+    for line in (folder / "SHA256SUMS").read_text().splitlines():
+        value, name = line.split("  ")
+        assert hashlib.sha256((folder / name).read_bytes()).hexdigest() == value
+
+
+def test_what_is_there_and_is_another_is_not_replaced_unasked(tmp_path, folder):
+    (tmp_path / "lavender.h").write_text("mine")
+    with pytest.raises(LavenderError, match="--replace"):
+        export.write("c", tmp_path)
+    assert [p.name for p in tmp_path.iterdir()] == ["lavender.h"]
+
+
+def tower(*command, **more):
+    return run(*command, **more).split()[-1]
+
+
+def test_the_tower_in_c_and_cpp_has_one_hash(folder, shared, compiler, tmp_path):
+    link = [shared, f"-Wl,-rpath,{shared.parent}", "-ffp-contract=off", *WARNINGS]
+    run(compiler, "-std=c11", folder / "tower.c", *link, "-o", tmp_path / "tower_c")
+    run(compiler, "-std=c++17", folder / "tower.cpp", *link, "-lstdc++", "-o", tmp_path / "tower_cpp")
+    assert tower(tmp_path / "tower_c") == tower(tmp_path / "tower_cpp")
+    lines = {name: len((folder / name).read_text().splitlines()) for name in ("tower.c", "tower.cpp")}
+    assert max(lines.values()) <= 70
+
+
+@pytest.mark.slow
+def test_rust_and_javascript_have_the_hash_of_c(folder, shared, compiler, tmp_path):
+    run(
+        compiler,
+        "-std=c11",
+        folder / "tower.c",
+        shared,
+        f"-Wl,-rpath,{shared.parent}",
+        "-o",
+        tmp_path / "tower_c",
+    )
+    wanted, ran = tower(tmp_path / "tower_c"), 0
+    if shutil.which("node"):
+        try:
+            export.write("npm", tmp_path / "js")
+            assert tower("node", tmp_path / "js" / "tower.mjs") == wanted
+            ran += 1
+        except LavenderError as reason:
+            print(reason)
+    if shutil.which("cargo"):
+        export.write("rust", tmp_path / "rust")
+        where = {"cwd": tmp_path / "rust"}
+        assert tower("cargo", "run", "--offline", "--release", "-q", "--example", "tower", **where) == wanted
+        run("cargo", "test", "--offline", "--release", "-q", "--lib", **where)
+        ran += 1
+    if not ran:
+        pytest.skip("neither cargo, nor node with a compiler for WebAssembly")
+
+
+@pytest.mark.slow
+def test_cmake_builds_installs_and_is_found(folder, tmp_path):
+    if shutil.which("cmake") is None:
+        pytest.skip("cmake is not installed")
+    flags = [
+        "-DCMAKE_BUILD_TYPE=Debug",
+        f"-DCMAKE_C_FLAGS={' '.join(WARNINGS)}",
+        f"-DCMAKE_INSTALL_PREFIX={tmp_path / 'in'}",
+    ]
+    run("cmake", "-S", folder, "-B", tmp_path / "b", "-DBUILD_SHARED_LIBS=ON", *flags)
+    run("cmake", "--build", tmp_path / "b")
+    run("ctest", "--test-dir", tmp_path / "b")
+    run("cmake", "--install", tmp_path / "b")
+    user = tmp_path / "user"
+    user.mkdir()
+    (user / "CMakeLists.txt").write_text(
+        "cmake_minimum_required(VERSION 3.13)\nproject(user C)\nfind_package(lavender 1.0 REQUIRED)\n"
+        f"add_executable(user {folder / 'tower.c'})\ntarget_link_libraries(user lavender::lavender)\n"
+    )
+    run("cmake", "-S", user, "-B", user / "b", f"-DCMAKE_PREFIX_PATH={tmp_path / 'in'}")
+    run("cmake", "--build", user / "b")
+    run(user / "b" / "user")
+    assert "-llavender" in next((tmp_path / "in").rglob("lavender.pc")).read_text()
+
+
+@pytest.mark.slow
+def test_address_and_undefined_sanitizers_have_nothing_to_say(folder, compiler, tmp_path):
+    write_vectors(tmp_path)
+    flags = ["-std=c11", "-O1", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
+    run(
+        compiler,
+        *flags,
+        "-I",
+        folder,
+        folder / "lavender.c",
+        folder / "tower.c",
+        "-lm",
+        "-o",
+        tmp_path / "tower",
+    )
+    run(tmp_path / "tower")
+    check = export.library.HERE / "front" / "check.c"
+    run(compiler, *flags, "-I", folder, folder / "lavender.c", check, "-lm", "-o", tmp_path / "check")
+    run(tmp_path / "check", cwd=tmp_path, env={"ASAN_OPTIONS": "detect_leaks=0"})
+
+
+def write_vectors(out):
+    given = [
+        (self_test_problem(), "sequential_impulses", {}), (self_test_problem(), "anderson", {"memory": 3}),
+        (rp.random_contact_problem(4), "block_gauss_seidel", {"order": "symmetric"}),
+        (rp.random_contact_problem(5, "cone"), "nncg", {"restart": "against"}),
+        (lv.Problem.lcp(np.array([[2.0, 1.0], [1.0, 2.0]]), [1.0, 0.5]), "direct", {}),
+    ]  # fmt: skip
+    packed = [vectors.pack(problem, solver, 1e-6, 500, options) for problem, solver, options in given]
+    (out / "vectors.bin").write_bytes(vectors.MAGIC + len(packed).to_bytes(8, "little") + b"".join(packed))
+    return len(packed)
+
+
+def test_test_vectors_are_met_and_a_changed_bit_is_seen(folder, shared, compiler, tmp_path):
+    count = write_vectors(tmp_path)
+    check = export.library.HERE / "front" / "check.c"
+    link = [check, shared, f"-Wl,-rpath,{shared.parent}"]
+    run(compiler, "-std=c11", *WARNINGS, "-I", folder, *link, "-o", tmp_path / "check")
+    said = run(tmp_path / "check", cwd=tmp_path)
+    assert len(re.findall("^same ", said, re.MULTILINE)) == count
+    data = bytearray((tmp_path / "vectors.bin").read_bytes())
+    data[-8] ^= 1  # the last bit of the last impulse
+    (tmp_path / "vectors.bin").write_bytes(data)
+    done = subprocess.run([tmp_path / "check"], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 1 and "DIFFERS" in done.stdout
+
+
+def test_bindings_have_every_name_of_the_header():
+    header = export.HEADER.read_text()
+    module, types = javascript(header)
+    for name, value in constants(header).items():
+        assert f"pub const {name}: i32 = {value};" in rust(header)
+        assert f"export const {name} = {value};" in module and f"export const {name}: {value};" in types
+    assert all(f"pub fn {name}(" in rust(header) for _, name, _ in functions(header))
+
+
+KERNEL = """
+#ifndef Py_PYTHON_H
+#error no
+#else
+struct __pyx_t_12lavender_ext_1a_point_t { double x; };
+static double __pyx_f_12lavender_ext_1a_norm(struct __pyx_t_12lavender_ext_1a_point_t const *__pyx_v_p) {
+  return __pyx_v_p->x; /* "never ; { " */
+}
+static double (*__pyx_f_12lavender_ext_1b_far)(double) = 0;
+static PyObject *__pyx_d = 0;
+double lav_good(double __pyx_v_x) { struct __pyx_t_12lavender_ext_1a_point_t __pyx_v_p; __pyx_v_p.x = __pyx_v_x;
+  return __pyx_f_12lavender_ext_1a_norm(&__pyx_v_p) + __pyx_f_12lavender_ext_1b_far(__pyx_v_x); }
+void lav_bad(void) { Py_INCREF(__pyx_d); }
+double lav_pong(double x);
+double lav_round(double x) { return lav_pong(x); }
+double lav_pong(double x) { return lav_round(x); }
+#endif
+"""
+OTHER = "static double __pyx_f_12lavender_ext_1b_far(double __pyx_v_x) { return __pyx_v_x; }\n"
+
+
+def test_a_cut_follows_names_through_modules_and_leaves_the_rest():
+    text = cut.cut([("a", KERNEL), ("b", OTHER)], "double lav_use(double x) { return k_good(x); }")
+    assert (
+        "static double b_far(double x_)" in text and "b_far)(double)" not in text
+    )  # the function, not the pointer to it
+    assert (
+        text.index("struct a_point_t {") < text.index("a_norm") < text.index("k_good") < text.index("lav_use")
+    )
+    assert "k_bad" not in text and "Py" not in text
+    small = cut.cut(
+        [("a", KERNEL), ("b", OTHER)],
+        "#ifndef LAV_SWEEPS_ONLY\ndouble u(double x) { return k_good(x); }\n#endif",
+    )
+    assert small.index("#ifndef LAV_SWEEPS_ONLY") < small.index("k_good") < small.index("#endif")
+
+
+@pytest.mark.parametrize("used, sign", [("k_bad()", "Python's side"), ("k_round(1)", "comes round")])
+def test_a_cut_that_needs_python_or_itself_is_refused(used, sign):
+    with pytest.raises(cut.CutFailed, match=sign):
+        cut.cut([("a", KERNEL), ("b", OTHER)], f"double lav_use(double x) {{ {used}; return x; }}")

@@ -1,0 +1,258 @@
+"""What is wrong comes back as a number with a text, and nothing is written where it must not be."""
+
+import ctypes as ct
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from clib import Options, Problem, Result, Verdict
+from hypothesis import given as drawn
+from hypothesis import settings
+from hypothesis import strategies as st
+from tower import self_test_problem
+
+from lavender.export import HEADER
+from lavender.export.bindings import constants
+
+ERRORS = {
+    value: name for name, value in constants(HEADER.read_text()).items() if name.startswith("LAV_ERROR")
+}
+CANARY = 0xA5
+
+
+class Guarded:
+    """A solver in memory of just so many bytes, with marks before and behind."""
+
+    def __init__(self, library, problem, options, bytes_):
+        self.c, self.bytes = library.c, bytes_
+        self.memory = (ct.c_ubyte * (bytes_ + 256))(*([CANARY] * (bytes_ + 256)))
+        self.at = ct.c_void_p()
+        begin = ct.addressof(self.memory) + 128
+        self.code = self.c.lav_open(
+            ct.c_void_p(begin), ct.c_uint64(bytes_), ct.byref(problem), ct.byref(options), ct.byref(self.at)
+        )
+
+    def whole(self):
+        return set(self.memory[:128]) == set(self.memory[128 + self.bytes :]) == {CANARY}
+
+
+def opened(library, method="sequential_impulses"):
+    problem, options = library.problem(self_test_problem()), library.options(method)
+    room = ct.c_uint64()
+    assert library.c.lav_room(ct.byref(problem), ct.byref(options), ct.byref(room)) == 0
+    solver = Guarded(library, problem, options, room.value)
+    assert solver.code == 0
+    return solver, problem
+
+
+def changed(key, at, value):
+    def apply(problem):
+        array = problem.keep[key].copy()
+        array.reshape(-1)[at] = value
+        problem.keep[key] = array
+        setattr(problem, key, array.ctypes.data)
+
+    return apply
+
+
+def put(key, value):
+    return lambda problem: setattr(problem, key, value)
+
+
+MISTAKES = {
+    "struct of another version": (put("size", 8), "VERSION"),
+    "form": (put("form", 9), "OPTION"),
+    "law": (put("law", 5), "OPTION"),
+    "rows below 0": (put("n_rows", -3), "COUNT"),
+    "fewer rows than blocks": (put("n_rows", 3), "COUNT"),
+    "entries below 0": (put("n_entries", -1), "COUNT"),
+    "more joints than blocks": (put("n_joints", 99), "COUNT"),
+    "joints that are contacts": (put("n_joints", 2), "BLOCKS"),
+    "blocks that do not end": (changed("block_ptr", -1, 35), "BLOCKS"),
+    "blocks that go back": (changed("block_ptr", 3, 1), "BLOCKS"),
+    "a block far away": (changed("block_ptr", 4, 2**30), "BLOCKS"),
+    "no such kind": (changed("kind", 2, 7), "BLOCKS"),
+    "friction below 0": (changed("mu", 1, -0.1), "FRICTION"),
+    "friction not a number": (changed("mu", 1, np.nan), "FRICTION"),
+    "a body that is not there": (changed("contact_body", 5, 3), "INDEX"),
+    "a body below the world": (changed("contact_body", 5, -2), "INDEX"),
+    "NaN in b": (changed("b", 0, np.nan), "NUMBER"),
+    "an infinite normal": (changed("normal", 4, np.inf), "NUMBER"),
+    "NaN in an inertia": (changed("inv_inertia", 9, np.nan), "NUMBER"),
+    "a mass below 0": (changed("inv_mass", 1, -1.0), "MASS"),
+    "a compliance below 0": (changed("compliance", 3, -1.0), "MASS"),
+    "no masses": (put("inv_mass", None), "NULL"),
+    "no normals": (put("normal", None), "NULL"),
+    "no bodies of contacts": (put("contact_body", None), "NULL"),
+    "an order with a block twice": (lambda q: changed("order", 1, 0)(q), "INDEX"),
+}
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_a_problem_with_a_mistake_is_refused_and_said(library, mistake):
+    solver, problem = opened(library)
+    assert library.c.lav_set(solver.at, ct.byref(problem)) == 0
+    problem.keep["order"] = np.arange(12, dtype=np.int32)
+    apply, error = MISTAKES[mistake]
+    apply(problem)
+    code = library.c.lav_set(solver.at, ct.byref(problem))
+    assert ERRORS[code] == f"LAV_ERROR_{error}"
+    assert len(library.c.lav_text(code)) > 20
+    assert solver.whole()
+    assert library.c.lav_set(solver.at, ct.byref(library.problem(self_test_problem()))) == 0  # and goes on
+
+
+def test_every_error_has_its_own_text(library):
+    texts = {library.c.lav_text(code) for code in [0, *ERRORS]}
+    assert len(texts) == 1 + len(ERRORS) and all(len(text) > 7 for text in texts)
+
+
+def test_null_and_no_solver_are_told_apart(library):
+    c, q, o, r = library.c, Problem(), Options(), Result()
+    assert c.lav_set(None, ct.byref(q)) == c.lav_run(None, None, None) == c.lav_impulse(None, None, 0) == -1
+    assert c.lav_room(None, None, None) == c.lav_open(None, ct.c_uint64(8), None, None, None) == -1
+    nobody = (ct.c_double * 400)()
+    assert c.lav_set(nobody, ct.byref(q)) == -15
+    assert c.lav_default_options(99, ct.byref(o)) == c.lav_default_problem(0, ct.byref(q)) == -12
+    solver, problem = opened(library)
+    budget = library.budget(5, 0.0)
+    assert c.lav_run(solver.at, ct.byref(budget), ct.byref(r)) == -14  # no problem yet
+    assert c.lav_set(solver.at, ct.byref(problem)) == 0
+    assert c.lav_run(solver.at, ct.byref(budget), ct.byref(r)) == -2  # its size is not filled in
+    r.size = ct.sizeof(Result)
+    budget.tol = np.nan
+    assert c.lav_run(solver.at, ct.byref(budget), ct.byref(r)) == -12
+    budget.tol, budget.seconds = 0.0, 1.0
+    assert c.lav_run(solver.at, ct.byref(budget), ct.byref(r)) == -1  # a limit without a clock
+    out = np.full(35, 7.0)
+    assert c.lav_impulse(solver.at, ct.c_void_p(out.ctypes.data), 35) == -3 and set(out) == {7.0}
+    assert solver.whole()
+
+
+@pytest.mark.parametrize("method", ["sequential_impulses", "block_gauss_seidel", "anderson", "nncg"])
+def test_too_little_room_is_said_and_nothing_is_written_behind_it(library, method):
+    problem, options, room = library.problem(self_test_problem()), library.options(method), ct.c_uint64()
+    assert library.c.lav_room(ct.byref(problem), ct.byref(options), ct.byref(room)) == 0
+    seen = set()
+    for bytes_ in [*range(0, room.value, room.value // 40), room.value]:
+        solver = Guarded(library, problem, options, bytes_)
+        if solver.code == 0:
+            code = library.c.lav_set(solver.at, ct.byref(problem))
+            seen.add(code)
+            if code == -10:
+                assert library.c.lav_needed(solver.at) > bytes_
+        else:
+            assert solver.code == -10
+        assert solver.whole()
+    assert seen == {0, -10}
+
+
+def test_a_second_caller_in_one_solver_is_turned_away(library):
+    # From within the clock, which stands for another thread: the solver is busy until the run returns.
+    solver, problem = opened(library)
+    assert library.c.lav_set(solver.at, ct.byref(problem)) == 0
+    said = []
+    out, inner = Result(), Result()
+    out.size = inner.size = ct.sizeof(Result)
+    budget = library.budget(50, 0.0)
+
+    def clock(_):
+        said.append(library.c.lav_run(solver.at, ct.byref(library.budget(1, 0.0)), ct.byref(inner)))
+        said.append(library.c.lav_set(solver.at, ct.byref(problem)))
+        return float(len(said))
+
+    kind = ct.CFUNCTYPE(ct.c_double, ct.c_void_p)
+    kept = kind(clock)
+    budget.seconds, budget.clock = 1e9, ct.cast(kept, ct.c_void_p).value
+    assert library.c.lav_run(solver.at, ct.byref(budget), ct.byref(out)) == 0
+    assert set(said) == {-13} and out.iterations == 50
+    budget.seconds = 3.0  # the clock goes on by two each time
+    assert library.c.lav_run(solver.at, ct.byref(budget), ct.byref(out)) == 0
+    assert out.outcome == 5 and 0 < out.iterations < 50
+
+
+SMALL = st.integers(-2, 9)
+WHOLE = st.lists(st.integers(-3, 12), min_size=0, max_size=12)
+REAL = st.lists(st.floats(allow_nan=True, allow_infinity=True), min_size=0, max_size=12)
+INTS = (
+    "block_ptr",
+    "kind",
+    "order",
+    "index_ptr",
+    "index",
+    "mass_ptr",
+    "mass_index",
+    "joint_body",
+    "contact_body",
+)
+
+
+@settings(max_examples=150)
+@drawn(st.data())
+def test_no_problem_whatever_makes_the_library_write_beside_its_memory(library, data):
+    problem, keep = Problem(), []
+    form, method = data.draw(st.integers(1, 3)), data.draw(st.integers(1, 13))
+    library.c.lav_default_problem(form, ct.byref(problem))
+    for key in (
+        "law",
+        "n_blocks",
+        "n_rows",
+        "n_entries",
+        "n_bodies",
+        "n_joints",
+        "n_velocities",
+        "n_mass_entries",
+    ):
+        setattr(problem, key, data.draw(SMALL))
+    for key, _ in Problem._fields_[10:]:
+        if data.draw(st.booleans()):
+            whole = key in INTS or key == "key"
+            x = np.zeros(900, np.uint64 if key == "key" else np.int32 if whole else np.float64)
+            if data.draw(st.booleans()) and key in ("block_ptr", "index_ptr", "mass_ptr"):
+                x[:] = np.arange(900)  # what may well be rows of one entry
+            values = data.draw(WHOLE if whole else REAL)
+            with np.errstate(all="ignore"):
+                x[: len(values)] = np.abs(values) if key == "key" else values
+            keep.append(x)
+            setattr(problem, key, x.ctypes.data)
+    options, room = Options(), ct.c_uint64()
+    library.c.lav_default_options(method, ct.byref(options))
+    code = library.c.lav_room(ct.byref(problem), ct.byref(options), ct.byref(room))
+    assert code == 0 or code in ERRORS
+    if code:
+        return
+    assert room.value < 10_000_000
+    solver = Guarded(library, problem, options, room.value)
+    assert solver.code == 0
+    code = library.c.lav_set(solver.at, ct.byref(problem))
+    assert code == 0 or code in ERRORS
+    if code == 0:
+        out, verdict = Result(), Verdict()
+        out.size, verdict.size = ct.sizeof(Result), ct.sizeof(Verdict)
+        budget = library.budget(5, 1e-9)
+        assert library.c.lav_run(solver.at, ct.byref(budget), ct.byref(out)) == 0
+        impulse = (ct.c_double * (problem.n_rows + 2))(*([7.0] * (problem.n_rows + 2)))
+        assert library.c.lav_impulse(solver.at, impulse, problem.n_rows) == 0
+        assert impulse[problem.n_rows] == 7.0
+    assert solver.whole()
+
+
+def test_structs_lie_as_python_reads_them_and_grow_only_at_the_end(library, folder):
+    from lavender.export.bindings import functions, struct_fields
+
+    header = HEADER.read_text()
+    made = [f"{kind} {name}({', '.join(arguments)})" for kind, name, arguments in functions(header)]
+    made += [f"{name} = {value}" for name, value in constants(header).items()]
+    for name in ("lav_problem", "lav_options", "lav_budget", "lav_verdict", "lav_result"):
+        made += [f"{name}[{i}] {kind} {field}" for i, (kind, field) in enumerate(struct_fields(header, name))]
+    kept = (Path(__file__).parent / "abi.txt").read_text().splitlines()
+    lost = [line for line in kept if line not in made]
+    assert not lost, "what a release had is gone or is another"
+    problem, options = Problem(), Options()
+    library.c.lav_default_problem(1, ct.byref(problem))
+    library.c.lav_default_options(1, ct.byref(options))
+    assert (problem.size, options.size) == (ct.sizeof(Problem), ct.sizeof(Options))
+    assert library.budget(1, 0.0).size == ct.sizeof(type(library.budget(1, 0.0)))
+    names = {re.split(r"[ *]", line.split("(")[0])[-1] for line in kept if "(" in line and "[" not in line}
+    assert all(hasattr(library.c, name) for name in names)
