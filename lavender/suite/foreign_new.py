@@ -130,15 +130,15 @@ def halfspace(rng: np.random.Generator, rows: int) -> Problem:
     off = (grid - 0.5 * (side - 1)) / side
     r = np.linalg.norm(grid[:, None] - grid[None], axis=2)
     g = 1.0 / (r + np.eye(len(grid)) / 3.525)  # of a square on itself: 4 ln(1 + sqrt 2)
-    gap = (off**2).sum(axis=1) - rng.uniform(0.02, 0.3)
+    deep = rng.uniform(0.02, 0.3) - (off**2).sum(axis=1)
     if size == 1:
-        return Problem.lcp(g, gap)
+        return Problem.lcp(g, deep)
     a = np.kron(g, np.diag([1.0, 0.9, 0.9]))
     drag = rng.choice([0.0, 0.02, 0.5]) * rng.standard_normal(2)
-    b = np.concatenate([gap[:, None], np.broadcast_to(drag, off.shape) - 0.02 * off], 1).ravel()
+    b = np.concatenate([deep[:, None], np.broadcast_to(drag, off.shape) - 0.02 * off], 1).ravel()
     return Problem(
         b,
-        Cones.contacts(np.full(len(gap), rng.uniform(0.1, 0.9))),
+        Cones.contacts(np.full(len(deep), rng.uniform(0.1, 0.9))),
         a,
         friction=str(rng.choice(["coulomb", "cone"])),
     )
@@ -156,18 +156,18 @@ def option(rng: np.random.Generator, rows: int) -> Problem:
     )
     payoff = np.maximum(0.0, rng.uniform(0.2, 0.8) - k / m)
     held = payoff + 0.1 * np.exp(-(((k / m - 0.5) / 0.2) ** 2))
-    return Problem.lcp(sp.csr_array(a), a @ payoff - held)
+    return Problem.lcp(sp.csr_array(a), held - a @ payoff)
 
 
 def kernel(rng: np.random.Generator, rows: int) -> Problem:
-    """Dual of a classifier of points in a few dimensions: a kernel matrix, nearly singular, 0 <= x <= c."""
+    """Dual of a classifier of points in a few dimensions, each of a weight: nearly singular, 0 <= x <= c."""
     m = min(max(4, rows), LARGEST_DENSE)
     x = rng.standard_normal((m, int(rng.integers(1, 6))))
     label = np.where(x.sum(axis=1) + 0.5 * rng.standard_normal(m) > 0.0, 1.0, -1.0)
     square = ((x[:, None] - x[None]) ** 2).sum(axis=2)
     a = label[:, None] * np.exp(-square * 10.0 ** rng.uniform(-1.0, 1.0)) * label
     a[np.arange(m), np.arange(m)] += 10.0 ** rng.uniform(-6.0, -1.0)
-    return Problem.lcp(a, np.full(m, -1.0), 0.0, 10.0 ** rng.uniform(-1.0, 2.0))
+    return Problem.lcp(a, rng.uniform(0.5, 1.5, m), 0.0, 10.0 ** rng.uniform(-1.0, 2.0))
 
 
 def control(rng: np.random.Generator, rows: int) -> Problem:
