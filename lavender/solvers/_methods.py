@@ -19,24 +19,26 @@ from lavender.solvers._accelerated import operator
 from lavender.solvers._few import WARM
 from lavender.solvers._log import SolveLog
 from lavender.solvers._newton import general
-from lavender.solvers._plan import BOTH_WAYS, METHODS, Cost, Costs
+from lavender.solvers._plan import BOTH_WAYS, METHODS, TABLE, Cost, Costs
 from lavender.solvers._schedule import AGAIN, GIVEN_UP, remainder
 from lavender.solvers._split import solve_together
 from lavender.solvers._sweeping import STATUS
 from lavender.solvers.direct import Enough, Impatient
 from lavender.solvers.newton import NewtonState
 from lavender_ext.few.looks import Looks, sweeps_left
-from lavender_ext.judge.watch import RUNNING
 
-__all__ = ["FIRST", "Candidate", "make"]
+__all__ = ["FIRST", "Candidate", "in_short_time", "make"]
 
 FIRST = 32  # sweeps before the first look at what they promise
-STEPS = 64  # over velocities that the compiled call for few rows takes, and so does the first turn in its place
+STEPS = (
+    64  # over velocities that the compiled call for few rows takes, and so does the first turn in its place
+)
 CLOCK = 0.01  # s between two looks at the clock, as counted
 CLOSEST = 1e-2  # of tol, to which the relaxation is solved where Coulomb's residual has not followed
 SHORT = 2e7  # ns of time left, below which sweeps come before anything is counted,
 LEAST = 1e6  # ns of them at most
 SURE = 4.0  # times its cost, that has to be left for a finite solver to come before any sweep
+ALL = 1e18  # ns: until the time is up
 SHARE = 0.7  # of the time that is left, between two looks at the clock
 
 
@@ -166,7 +168,7 @@ class Sweeps(Resumed):
     def begin(self) -> None:
         problem = self.log.problem
         split = 0 if problem.rows is None else problem.rows.n_joints
-        self.impulse = self.log.impulse.copy()
+        self.impulse = self.log.impulse.copy() if self.log.given is None else self.log.given.copy()
         self.relative = self.log.best
         self.state = Looks(problem.metric, operator(problem), problem.law == "cone", split)
 
@@ -175,7 +177,9 @@ class Sweeps(Resumed):
         looks = self.state
         done, swept, restarts = looks.done, looks.sweeps, looks.restarts
         step = min(max(done // 2, FIRST), n)
-        looks.run(self.impulse, self.relative, done + n, self.log.tol, step, FIRST, self.others / self.cost.each)
+        looks.run(
+            self.impulse, self.relative, done + n, self.log.tol, step, FIRST, self.others / self.cost.each
+        )
         self.relative = looks.now.relative
         work = {"sweeps": looks.sweeps - swept, "restarts": looks.restarts - restarts}
         return Claim(STATUS[looks.status], looks.done - done, work)
@@ -349,20 +353,34 @@ KINDS: dict[str, type[Candidate]] = {
 }  # fmt: skip
 
 
+def in_short_time(log: SolveLog, costs: Costs) -> list[Candidate]:
+    """Sweeps that have had a turn, where time is so short that what the others cost is not worth counting before.
+
+    Nor after it, where not one of those that factor would end in time: then they have all of it.
+    """
+    names = TABLE[log.problem.operator][log.problem.law]
+    if not log.ends_late(SHORT) or log.problem.cones.has_round:
+        return []
+    sweeps = Sweeps("anderson", log, costs, get("anderson"))
+    sweeps.count()
+    if all(log.ends_late(SURE * costs.floor(name)) for name in names):
+        sweeps.run(ALL, np.inf)
+        return [sweeps]
+    more = sweeps.run(sweeps.cost.setup + min(LEAST, SHARE * 1e9 * log.limit), np.inf)
+    return [sweeps] if more else []
+
+
 def make(
-    log: SolveLog, costs: Costs, names: tuple[str, ...], planned: tuple[str, int] | None = None
+    log: SolveLog,
+    costs: Costs,
+    names: tuple[str, ...],
+    planned: tuple[str, int] | None = None,
+    begun: list[Candidate] | None = None,
 ) -> list[Candidate]:
-    """The candidates of these names that can run here, in this order; where time is short sweeps have had a turn."""
-    found: list[Candidate] = []
-    if log.deadline < np.inf and "anderson" in names and log.ends_late(SHORT):
-        # So that something is there when time is up: to count what the others cost takes as long as many sweeps.
-        sweeps = Sweeps("anderson", log, costs, get("anderson"))
-        sweeps.count()
-        names = tuple(name for name in names if name != "anderson")
-        if sweeps.run(sweeps.cost.setup + min(LEAST, SHARE * 1e9 * log.limit), np.inf):
-            found.append(sweeps)
-        if log.done():
-            return found
+    """The candidates of these names that can run here, in this order, after those that have begun."""
+    found = begun or []
+    if found:
+        names = tuple(name for name in names if name != found[0].name)
     for name in names:
         spec = get(METHODS[name][0])
         kind = KINDS.get(name, KINDS.get(spec.name, Resumed))

@@ -49,7 +49,8 @@ _GIVEN = {
 #: At most four for each law and operator, `islands` in place of the last where the problem divides; "round": cones of
 #: more than two tangents.
 TABLE: dict[str, dict[str, tuple[str, ...]]] = {
-    "rows": _GIVEN | {"lcp": ("anderson", "direct", "newton"), "coulomb": ("anderson", "newton", "relaxation")},
+    "rows": _GIVEN
+    | {"lcp": ("anderson", "direct", "newton"), "coulomb": ("anderson", "newton", "relaxation")},
     "matrix": _GIVEN,
     "generalized": {
         "linear": ("newton", "direct", "anderson", "newton over rows"),
@@ -203,6 +204,16 @@ class Costs:
         self.rates = rates() if given is None else given
         self.planned = {} if plan is None else dict(plan.candidates)
         self.decades = -log10(min(max(tol, 1e-16), 0.1)) / SIXTH
+
+    def floor(self, name: str) -> float:
+        """ns that a method which factors takes at least, told by rows alone; inf for sweeps, which take any time."""
+        r, law, m = self.rates, self.problem.law, self.structure.m
+        if name == "newton" and self.problem.generalized is not None:
+            return float(r["velocities"]["start"])
+        if name in ("direct", "newton", "newton over rows"):
+            part = r["direct" if name == "direct" else "newton"]
+            return float(part["start"] + _of(part["count"], law) * _of(part["row"], law) * m)
+        return float(r["admm"]["start"]) if name == "admm" else inf
 
     def least(self, name: str) -> Cost:
         """At least, without the analysis of a factor's pattern."""
