@@ -1,37 +1,29 @@
 """The rates of `auto` from recorded curves of its candidates: least squares in the logarithm of the time.
 
     log t = log(start + formed E + n (row m + work w))         at points of a curve, n iterations after t        (1)
-    minimise sum log(t_auto / t_best)^2                        over counts, the schedule replayed               (2)
 
-What a call, a row and a multiply-add cost is told by (1). How many iterations to count on, of a candidate that ends
-soon, late or not at all, is told by what the schedule makes of it (2), beginning from medians. No rate stands on fewer
-than LEAST problems.
+What a call, a row and a multiply-add cost is told by (1), how many iterations to count on by medians; no rate stands on
+fewer than LEAST problems. Counts that a search over the replayed schedule found gained nothing on other seeds.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping
-from itertools import product
 from typing import Any
 
 import numpy as np
 
-from lavender.bench.curves import LEVELS, Curve
-from lavender.bench.regret import SHIFT
-from lavender.bench.replay import replayed
+from lavender.bench.curves import Curve
 from lavender.problem import Problem
 from lavender.registry import FEW
 from lavender.solvers._structure import Structure
 
-__all__ = ["LEAST", "count_rates", "fit", "regret"]
+__all__ = ["LEAST", "count_rates", "fit"]
 
 LEAST = 30  # problems that a rate stands on at least
 LEVEL = 1e-6  # that counts are for
 POINTS = 5  # of a curve, that are fitted at most
-ROUNDS, FACTORS = 2, (0.4, 0.6, 0.8, 1.25, 1.6, 2.5, 4.0)  # of the search for counts
-KEPT = 0.1  # of the square of a count's distance from the median, in the logarithm
-LOST = 100.0  # times the best, that a solve which does not end counts for
 KINDS = {
     "rows": ("linear", "lcp"),
     "cone": ("cone",),
@@ -71,7 +63,7 @@ def fit(curves: Iterable[Curve], problem_of: Callable[[str], Problem]) -> dict[s
     start, each_row, *work = _least_squares(sweeps, lambda s, n: [1.0, n * s.m, *given(s, n * s.sweep)])
     rates["anderson"] = {"start": start, "row": each_row, "work": dict(zip(KINDS, work, strict=True))}
     rates["nncg"] = {}
-    finite = of("direct")
+    finite = [(s, c) for s, c in of("direct") if s.is_definite]
     start, each_row, one, formed = _least_squares(finite, lambda s, n: [1.0, n * s.m, n * s.direct, s.formed])
     rates["direct"] = {"start": start, "row": each_row, "work": one}
     rates["formed"] = formed
@@ -97,15 +89,17 @@ def fit(curves: Iterable[Curve], problem_of: Callable[[str], Problem]) -> dict[s
     for name, part in chosen.items():
         kinds = {kind: [x for x in part if x[0].problem.law in laws] for kind, laws in KINDS.items()}
         whole = _middle(part)
-        by_kind = {kind: _middle(those) if len(those) >= LEAST else whole for kind, those in kinds.items()}
-        rates[name] = rates[name] | {"count": by_kind if name in ("newton", "velocities") else whole}
-    return _counted(rates, [(structures[case], made) for case, made in found.items()])
+        by_kind = {kind: _round(_middle(those, whole)) for kind, those in kinds.items()}
+        rates[name] = rates[name] | {"count": by_kind if name in ("newton", "velocities") else _round(whole)}
+    return rates
 
 
-def _middle(part: list[tuple[Structure, Curve]]) -> float:
-    """Iterations to LEVEL, the median of those that end."""
+def _middle(part: list[tuple[Structure, Curve]], pooled: float | None = None) -> float:
+    """Iterations to LEVEL, the median of those that end, drawn towards `pooled` as by LEAST more problems."""
     ended = [n for n in (curve.iterations(LEVEL) for _, curve in part) if math.isfinite(n)]
-    return max(1.0, float(np.median(ended)))
+    own = max(1.0, float(np.median(ended))) if ended else 1.0
+    share = 1.0 if pooled is None else len(ended) / (len(ended) + LEAST)
+    return own**share * (1.0 if pooled is None else pooled ** (1.0 - share))
 
 
 def _is_over_rows(s: Structure, curve: Curve) -> bool:
@@ -141,46 +135,6 @@ def _least_squares(
     start = np.log(np.median(time) / scale / a.shape[1])
     found = least_squares(lambda q: np.log(a @ np.exp(q) + rest + 1.0) - np.log(time), start, loss="soft_l1")
     return [_round(rate) for rate in np.exp(found.x)]
-
-
-def regret(rates: Mapping[str, Any], cases: list[tuple[Structure, dict[str, Curve]]]) -> list[float]:
-    """log (t + SHIFT) / (t_best + SHIFT) of each case and level that somebody ended, the schedule replayed."""
-    found = []
-    for structure, curves in cases:
-        for level in LEVELS:
-            best = min(curve.time(level) for curve in curves.values())
-            if math.isfinite(best):
-                t = min(replayed(structure, curves, level, rates), LOST * best)
-                found.append(math.log((t + SHIFT) / (best + SHIFT)))
-    return found
-
-
-def _counted(rates: dict[str, Any], cases: list[tuple[Structure, dict[str, Curve]]]) -> dict[str, Any]:
-    """(2), one count after the other."""
-
-    def loss(tried: Mapping[str, Any]) -> float:
-        far = [math.log(a / b) for a, b in zip(_all_counts(tried), start, strict=True)]
-        return float(np.mean(np.square(regret(tried, cases))) + KEPT * np.sum(np.square(far)))
-
-    start = _all_counts(rates)
-
-    least = loss(rates)
-    for _ in range(ROUNDS):
-        for name in [name for name in rates if isinstance(rates[name], dict)]:
-            kinds = list(KINDS) if isinstance(rates[name]["count"], dict) else [""]
-            for kind, factor in product(kinds, FACTORS):
-                count = rates[name]["count"]
-                moved = count | {kind: _round(count[kind] * factor)} if kind else _round(count * factor)
-                tried = rates | {name: rates[name] | {"count": moved}}
-                if (now := loss(tried)) < least:
-                    least, rates = now, tried
-    return rates
-
-
-def _all_counts(rates: Mapping[str, Any]) -> list[float]:
-    """Every count, in order."""
-    counts = [part["count"] for part in rates.values() if isinstance(part, Mapping)]
-    return [x for count in counts for x in (count.values() if isinstance(count, Mapping) else [count])]
 
 
 def _round(value: float) -> float:

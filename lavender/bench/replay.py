@@ -7,22 +7,25 @@ their order are made by the same code. Beside the curves' own times a call and e
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from types import SimpleNamespace
 from typing import Any
 
 from lavender import registry
-from lavender.bench.curves import Curve
+from lavender.bench.curves import LEVELS, Curve
+from lavender.bench.regret import SHIFT
 from lavender.solution import Claim, Status
-from lavender.solvers._methods import FIRST, HOPE, Candidate, first_turn
+from lavender.solvers._methods import FIRST, Candidate, first_turn
 from lavender.solvers._plan import METHODS, Costs, candidates
 from lavender.solvers._schedule import race
 from lavender.solvers._structure import Structure
 from lavender_ext.few.looks import sweeps_left
 
-__all__ = ["CALL", "TURN", "replayed"]
+__all__ = ["CALL", "TURN", "regret", "replayed"]
 
-CALL, TURN = 80e-6, 20e-6  # s that Python takes for a solve, and for each turn and look
+# s that Python takes for a solve by any of them, for what `auto` counts before, and for each turn and look
+CALL, COUNTED, TURN = 35e-6, 45e-6, 20e-6
+LOST = 100.0  # times the best, that a solve which does not end counts for
 
 
 class Replayed(Candidate):
@@ -74,7 +77,7 @@ class Replayed(Candidate):
         self.relative = self.at(now)[1]
         self.rest_of = sweeps_left(now - at, before, self.relative, self.level) * self.cost.each
         self.done = now
-        return self.rest_of > self.others and now * self.cost.each > HOPE * self.others
+        return self.rest_of > self.others
 
     def promise(self) -> float:
         return self.rest_of if self.name == "anderson" else 0.0
@@ -92,7 +95,7 @@ def replayed(
     rates : as in `rates.json`, which is read if None
     """
     log = SimpleNamespace(
-        problem=structure.problem, deadline=math.inf, left=2**31, best=1.0, seconds=CALL, solved=False,
+        problem=structure.problem, deadline=math.inf, left=2**31, best=1.0, seconds=CALL + COUNTED, solved=False,
         ends_late=lambda cost: False, note=lambda *what: None,
     )  # fmt: skip
     costs = Costs(structure.problem, level, rates, structure)
@@ -102,6 +105,20 @@ def replayed(
         curve = curves.get("newton over velocities" if over else name)
         if curve is not None and curve.points:
             found.append(Replayed(name, log, costs, curve, level))
-    first_turn(log, found)  # type: ignore[arg-type]
+    first_turn(found)  # type: ignore[arg-type]
     race(list(found), lambda: log.solved)
     return log.seconds if log.solved else math.inf
+
+
+def regret(
+    cases: Iterable[tuple[Structure, Mapping[str, Curve]]], rates: Mapping[str, Any] | None = None
+) -> list[float]:
+    """(t + SHIFT) / (t_best + SHIFT) of each case and level that somebody ended, replayed by these rates."""
+    found = []
+    for structure, curves in cases:
+        for level in LEVELS:
+            best = CALL + min(curve.time(level) for curve in curves.values())
+            if math.isfinite(best):
+                t = min(replayed(structure, curves, level, rates), LOST * best)
+                found.append((t + SHIFT) / (best + SHIFT))
+    return found

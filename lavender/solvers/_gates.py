@@ -17,6 +17,7 @@ __all__ = [
     "CARRIED_GATE",
     "GENERAL_GATE",
     "NO_GATE",
+    "call_ends_within",
     "first_look",
     "general_cost",
     "general_first",
@@ -52,6 +53,18 @@ CARRIED_GATE = (FEW, rates.FORMED, rates.SWEEP_START, rates.CARRIED, rates.SWEEP
 def first_look(per: float) -> int:
     """Sweeps, each of cost `per` [ns], before their residual is looked at."""
     return int(min(max(FIRST_LOOK, LOOKED / per), LAST_LOOK))
+
+
+def call_ends_within(problem: Problem, time_limit: float | None) -> bool:
+    """The compiled call for few rows takes a quarter of the limit [s] at most: without an end it leaves nothing."""
+    if time_limit is None or (problem.generalized is None and problem.law in ("linear", "lcp")):
+        return True
+    if problem.generalized is not None:
+        cost = general_cost(problem, problem.generalized.nv)
+    else:
+        per = sweep_cost(problem)
+        cost = first_look(per) * per
+    return 4e-9 * cost <= time_limit
 
 
 def general_cost(problem: Problem, largest: int) -> float:

@@ -29,6 +29,7 @@ class SolveLog:
         self.problem, self.tol, self.budget, self.deadline = problem, tol, budget, deadline
         self.limit = deadline - perf_counter()  # s
         self.best, self.impulse = np.inf, problem.start()  # least relative residual, (m,) N s
+        self.given: FloatArray | None = None  # (m,) N s, a start that doing nothing is better than
         self.turns: list[Turn] = []
         self.work: dict[str, int] = {}
         self.iterations = 0

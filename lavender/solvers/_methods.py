@@ -19,29 +19,26 @@ from lavender.solvers._accelerated import operator
 from lavender.solvers._few import WARM
 from lavender.solvers._log import SolveLog
 from lavender.solvers._newton import general
-from lavender.solvers._plan import BOTH_WAYS, METHODS, Cost, Costs
+from lavender.solvers._plan import BOTH_WAYS, METHODS, TABLE, Cost, Costs
 from lavender.solvers._schedule import AGAIN, GIVEN_UP, remainder
 from lavender.solvers._split import solve_together
 from lavender.solvers._sweeping import STATUS
 from lavender.solvers.direct import Enough, Impatient
 from lavender.solvers.newton import NewtonState
 from lavender_ext.few.looks import Looks, sweeps_left
-from lavender_ext.judge.watch import RUNNING
 
-__all__ = ["FIRST", "Candidate", "make"]
+__all__ = ["FIRST", "Candidate", "in_short_time", "make"]
 
-FIRST, MOST = 16, 64  # sweeps of the first turn at least and at most,
-HOPE = 0.15  # of what the cheapest other costs: so long sweeps go on whatever they promise; and the first turn lasts,
-CHEAP = 0.05  # where FIRST of them cost no more than that share of it: else they have their turn by what they cost
+FIRST = 32  # sweeps before the first look at what they promise
 STEPS = (
     64  # over velocities that the compiled call for few rows takes, and so does the first turn in its place
 )
-CALL = 20e3  # ns that Python takes for a turn: under Coulomb's law, where others end late, or where they cost no more
 CLOCK = 0.01  # s between two looks at the clock, as counted
 CLOSEST = 1e-2  # of tol, to which the relaxation is solved where Coulomb's residual has not followed
 SHORT = 2e7  # ns of time left, below which sweeps come before anything is counted,
 LEAST = 1e6  # ns of them at most
 SURE = 4.0  # times its cost, that has to be left for a finite solver to come before any sweep
+ALL = 1e18  # ns: until the time is up
 SHARE = 0.7  # of the time that is left, between two looks at the clock
 
 
@@ -171,28 +168,19 @@ class Sweeps(Resumed):
     def begin(self) -> None:
         problem = self.log.problem
         split = 0 if problem.rows is None else problem.rows.n_joints
-        self.impulse = self.log.impulse.copy()
+        self.impulse = self.log.impulse.copy() if self.log.given is None else self.log.given.copy()
         self.relative = self.log.best
         self.state = Looks(problem.metric, operator(problem), problem.law == "cone", split)
 
     def iterate(self, n: int) -> Claim:
-        """At most n, given up where they have cost a share of what the others do and promise no end for less."""
-        looks, each = self.state, self.cost.each
+        """At most n, given up where they promise no end for less than the others."""
+        looks = self.state
         done, swept, restarts = looks.done, looks.sweeps, looks.restarts
-        hope = HOPE * self.others
-        for least, most in ((np.inf, min(hope, (done + n) * each)), (self.others, (done + n) * each)):
-            if looks.done and (looks.status != RUNNING or self.relative <= self.log.tol):
-                break
-            if (
-                looks.done * each < most
-                and sweeps_left(looks.last, looks.before, self.relative, self.log.tol) * each <= least
-            ):
-                step = min(max(looks.done // 2, FIRST), done + n - looks.done)
-                if step > 0:
-                    looks.run(
-                        self.impulse, self.relative, done + n, self.log.tol, step, FIRST, each, least, most
-                    )
-                    self.relative = looks.now.relative
+        step = min(max(done // 2, FIRST), n)
+        looks.run(
+            self.impulse, self.relative, done + n, self.log.tol, step, FIRST, self.others / self.cost.each
+        )
+        self.relative = looks.now.relative
         work = {"sweeps": looks.sweeps - swept, "restarts": looks.restarts - restarts}
         return Claim(STATUS[looks.status], looks.done - done, work)
 
@@ -253,8 +241,7 @@ class Relaxation(Resumed):
                 if follows:
                     return Claim(Status.STALLED, done, work)
                 break
-            spent = (self.done + done) * self.cost.each
-            if self.left * self.cost.each > self.others and spent > HOPE * self.others:
+            if self.left * self.cost.each > self.others:
                 break
         self.done += done
         return Claim(Status.MAX_ITERATIONS, done, work)
@@ -366,20 +353,34 @@ KINDS: dict[str, type[Candidate]] = {
 }  # fmt: skip
 
 
+def in_short_time(log: SolveLog, costs: Costs) -> list[Candidate]:
+    """Sweeps that have had a turn, where time is so short that what the others cost is not worth counting before.
+
+    Nor after it, where not one of those that factor would end in time: then they have all of it.
+    """
+    names = TABLE[log.problem.operator][log.problem.law]
+    if not log.ends_late(SHORT) or log.problem.cones.has_round:
+        return []
+    sweeps = Sweeps("anderson", log, costs, get("anderson"))
+    sweeps.count()
+    if all(log.ends_late(SURE * costs.floor(name)) for name in names):
+        sweeps.run(ALL, np.inf)
+        return [sweeps]
+    more = sweeps.run(sweeps.cost.setup + min(LEAST, SHARE * 1e9 * log.limit), np.inf)
+    return [sweeps] if more else []
+
+
 def make(
-    log: SolveLog, costs: Costs, names: tuple[str, ...], planned: tuple[str, int] | None = None
+    log: SolveLog,
+    costs: Costs,
+    names: tuple[str, ...],
+    planned: tuple[str, int] | None = None,
+    begun: list[Candidate] | None = None,
 ) -> list[Candidate]:
-    """The candidates of these names that can run here, in this order; the first turn is set where sweeps have it."""
-    found: list[Candidate] = []
-    if log.deadline < np.inf and "anderson" in names and log.ends_late(SHORT):
-        # So that something is there when time is up: to count what the others cost takes as long as many sweeps.
-        sweeps = Sweeps("anderson", log, costs, get("anderson"))
-        sweeps.count()
-        names = tuple(name for name in names if name != "anderson")
-        if sweeps.run(sweeps.cost.setup + min(LEAST, SHARE * 1e9 * log.limit), np.inf):
-            found.append(sweeps)
-        if log.done():
-            return found
+    """The candidates of these names that can run here, in this order, after those that have begun."""
+    found = begun or []
+    if found:
+        names = tuple(name for name in names if name != found[0].name)
     for name in names:
         spec = get(METHODS[name][0])
         kind = KINDS.get(name, KINDS.get(spec.name, Resumed))
@@ -388,12 +389,12 @@ def make(
         made = kind(name, log, costs, spec)
         if made.rest < np.inf:
             found.append(made)
-    first_turn(log, found, planned)
+    first_turn(found, planned)
     return found
 
 
-def first_turn(log: SolveLog, found: list[Candidate], planned: tuple[str, int] | None = None) -> None:
-    """Sweeps come first where some of them cost next to nothing beside the others, or time is limited.
+def first_turn(found: list[Candidate], planned: tuple[str, int] | None = None) -> None:
+    """What the compiled call for few rows does, which another thread has in hand or did not end it, or what is planned.
 
     `planned`: who has the first turn, and for how many iterations.
     """
@@ -406,20 +407,6 @@ def first_turn(log: SolveLog, found: list[Candidate], planned: tuple[str, int] |
                     cost.total, cost.setup + planned[1] * cost.each, *(c.rest for c in found)
                 )
         found.sort(key=lambda candidate: candidate.name != planned[0])
-        return
-    if found and isinstance(found[0], Velocities) and found[0].costs.structure.goes_first:
-        # What the compiled call for few rows does, which is in the hands of another thread or did not end it.
+    elif found and isinstance(found[0], Velocities) and found[0].costs.structure.goes_first:
         found[0].count()
         found[0].rest = min(c.rest for c in found)
-        return
-    sweeps = next((c for c in found if c.name == "anderson"), None)
-    least = min((c.rest for c in found if c.is_finite), default=np.inf)
-    if sweeps is None:
-        return
-    sweeps.counted = True
-    each = sweeps.cost.each
-    cheap = log.problem.law != "linear" and FIRST * each <= CHEAP * least
-    cheap = cheap or (log.problem.law == "coulomb" and FIRST * each <= CALL)
-    if cheap or log.ends_late(SURE * least):
-        n = int(min(max(HOPE * least / each, FIRST), MOST))
-        sweeps.rest = min(sweeps.rest, sweeps.cost.setup + n * each, least)

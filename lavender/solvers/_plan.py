@@ -42,17 +42,19 @@ METHODS: dict[str, tuple[str, dict[str, Any]]] = {
 }
 _GIVEN = {
     "linear": ("direct", "anderson", "newton"),
-    "lcp": ("anderson", "direct", "newton", "islands"),
-    "cone": ("anderson", "newton", "islands"),
-    "coulomb": ("anderson", "newton", "nncg", "islands"),
+    "lcp": ("anderson", "direct", "newton", "nncg"),
+    "cone": ("anderson", "newton"),
+    "coulomb": ("anderson", "newton", "nncg", "admm"),
 }
-#: At most four for each law and operator; "round": cones of more than two tangents.
+#: At most four for each law and operator, `islands` in place of the last where the problem divides; "round": cones of
+#: more than two tangents.
 TABLE: dict[str, dict[str, tuple[str, ...]]] = {
-    "rows": _GIVEN | {"coulomb": ("anderson", "newton", "islands", "relaxation")},
+    "rows": _GIVEN
+    | {"lcp": ("anderson", "direct", "newton"), "coulomb": ("anderson", "newton", "relaxation")},
     "matrix": _GIVEN,
     "generalized": {
         "linear": ("newton", "direct", "anderson", "newton over rows"),
-        "lcp": ("newton", "anderson", "direct", "newton over rows"),
+        "lcp": ("newton", "anderson", "direct"),
         "cone": ("newton", "anderson", "newton over rows"),
         "coulomb": ("newton", "anderson", "nncg", "newton over rows"),
         "round": ("newton", "nncg", "admm"),
@@ -203,6 +205,16 @@ class Costs:
         self.planned = {} if plan is None else dict(plan.candidates)
         self.decades = -log10(min(max(tol, 1e-16), 0.1)) / SIXTH
 
+    def floor(self, name: str) -> float:
+        """ns that a method which factors takes at least, told by rows alone; inf for sweeps, which take any time."""
+        r, law, m = self.rates, self.problem.law, self.structure.m
+        if name == "newton" and self.problem.generalized is not None:
+            return float(r["velocities"]["start"])
+        if name in ("direct", "newton", "newton over rows"):
+            part = r["direct" if name == "direct" else "newton"]
+            return float(part["start"] + _of(part["count"], law) * _of(part["row"], law) * m)
+        return float(r["admm"]["start"]) if name == "admm" else inf
+
     def least(self, name: str) -> Cost:
         """At least, without the analysis of a factor's pattern."""
         s = self.structure
@@ -216,9 +228,6 @@ class Costs:
             return self._finite("newton", s.newton_least)
         if name == "relaxation":
             return self._relaxation()
-        if name == "islands":
-            whole = self.of("anderson")
-            return Cost(whole.setup, whole.each, SPARED * whole.count)
         return self.of(name)
 
     def of(self, name: str) -> Cost:
@@ -237,8 +246,6 @@ class Costs:
             return self._relaxation() if s.is_loose else Cost(inf, 1.0, 1.0)
         if name == "islands":
             # The others have ended while sweeps of the whole go on for the one that needs most of them.
-            if not s.divides:
-                return Cost(inf, 1.0, 1.0)
             whole, share = self.of("anderson"), SPARED + (1.0 - SPARED) * s.largest
             return Cost(whole.setup, whole.each, share * whole.count)
         if name == "admm":
@@ -278,6 +285,8 @@ def candidates(structure: Structure) -> tuple[str, ...]:
     if problem.cones.has_round:
         return TABLE["generalized"]["round"]
     names = TABLE[problem.operator][problem.law]
+    if problem.law != "linear" and structure.divides:
+        names = (*names[:3], "islands")
     return names if structure.is_definite else tuple(name for name in names if name != "direct")
 
 

@@ -91,8 +91,11 @@ class Structure:
     @property
     def divides(self) -> bool:
         """No island has more than half of the rows, and some have more than a block, which a sweep solves."""
+        p = self.problem
+        if p.generalized is not None or 2.0 * self.entries > float(p.m) ** 2:
+            return False  # islands of half of the rows at most have no more entries than that
         count = self.islands[0]
-        return 1 < count < self.problem.n_blocks and self.largest <= 0.5
+        return 1 < count < p.n_blocks and self.largest <= 0.5
 
     # -- factors of A ------------------------------------------------------------------------------
 

@@ -31,6 +31,7 @@ from lavender.suite.families import (
     two_particles,
 )
 from lavender.suite.foreign import foreign
+from lavender.suite.foreign_new import foreign_new
 from lavender.suite.wild import wild
 
 __all__ = [
@@ -46,6 +47,7 @@ __all__ = [
     "default",
     "families",
     "foreign",
+    "foreign_new",
     "granular",
     "hang",
     "hard",

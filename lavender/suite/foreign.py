@@ -11,7 +11,7 @@ tuned on the others and on `wild`.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import numpy as np
 import scipy.sparse as sp
@@ -37,9 +37,10 @@ from lavender.suite.wild import (
     problem_of,
 )
 
-__all__ = ["JUDGED", "TUNED", "foreign"]
+__all__ = ["JUDGED", "TUNED", "drawn", "foreign"]
 
 PART = ("all", "tuned", "judged")
+Matrix = Callable[[np.random.Generator, int], Problem]  # (generator, rows wanted) -> Problem
 UP = [0.0, 0.0, 1.0]
 
 
@@ -259,9 +260,7 @@ def hand(rng: np.random.Generator, rows: int) -> Problem:
 WORLDS: dict[str, Structure] = {
     f.__name__: f for f in (table, dome, packing, scattered, loops, cloth, jelly, gripper)
 }
-MATRICES: dict[str, Callable[[np.random.Generator, int], Problem]] = {
-    f.__name__: f for f in (obstacle, network, lowrank, boxed, skew, hand)
-}
+MATRICES: dict[str, Matrix] = {f.__name__: f for f in (obstacle, network, lowrank, boxed, skew, hand)}
 STRUCTURES = (*WORLDS, *MATRICES)
 # The lot: half of the worlds and half of the matrices, by a generator whose seed is the day of the drawing.
 _LOT = np.random.default_rng(20261121)
@@ -278,14 +277,27 @@ def foreign(seed: int = 0, rows: int = 3000, part: str = "all") -> Draft:
     if part not in PART:
         raise UnknownName("part", part, PART)
     rng = np.random.default_rng([seed, 0x666F7265])
-    names = [n for n in STRUCTURES if part == "all" or (n in JUDGED) == (part == "judged")]
+    return drawn(
+        rng, seed, rows, [n for n in STRUCTURES if part == "all" or (n in JUDGED) == (part == "judged")]
+    )
+
+
+def drawn(
+    rng: np.random.Generator,
+    seed: int,
+    rows: int,
+    names: list[str],
+    worlds: Mapping[str, Structure] = WORLDS,
+    matrices: Mapping[str, Matrix] = MATRICES,
+) -> Draft:
+    """A problem of one of these structures, of some 8 to `rows` rows, even in the logarithm."""
     name = str(rng.choice(names))
     wanted = 8.0 * (rows / 8.0) ** rng.random()
-    if name in MATRICES:
-        problem = MATRICES[name](rng, max(4, round(wanted)))
+    if name in matrices:
+        problem = matrices[name](rng, max(4, round(wanted)))
         return Draft(problem, f"{name}, {problem.law}, given as {problem.operator}: drawn, not chosen")
     law, masses, form = (str(rng.choice(words)) for words in (LAWS, MASSES, FORMS))
-    world = WORLDS[name](rng, max(2, round(wanted / (1 if law == "none" else 3))))
+    world = worlds[name](rng, max(2, round(wanted / (1 if law == "none" else 3))))
     bodies = Bodies(world.position, masses_of(rng, masses, len(world.position)), world.inertia)
     bodies.v_free += rng.choice([0.0, 1e-3, 0.05]) * rng.standard_normal(bodies.v_free.shape)
     sideways(bodies, float(rng.choice([0.0, 0.0, 0.2, 1.0])), seed=seed)

@@ -2,8 +2,8 @@
 
     rest = n log(now / tol) / log(before / now)         sweeps left, by the contraction of the last n    (1)
 
-They go on while rest costs no more than `least`, and all that were done no more than `most`; each time half as many as
-were done, `first` at least. `now` is the judge's.
+They go on while rest is no more than `least`; each time half as many as were done, `first` at least. `now` is the
+judge's.
 """
 from libc.math cimport INFINITY, log
 from libc.stdint cimport int32_t
@@ -66,10 +66,10 @@ cdef class Looks:
         self.order = np.arange(data.blocks.n_blocks, dtype=np.int32)
         self.rng = np.zeros(1, np.uint64)
 
-    def run(self, lam, double before, int n, double tol, int sweeps, int first, double per, double least, double most):
+    def run(self, lam, double before, int n, double tol, int sweeps, int first, double least):
         """From `lam` (m,) [N s] in place, at the relative residual `before`, at most `n`, `sweeps` before the first look.
 
-        per is what a sweep costs, as `least` and `most`.
+        `least`: sweeps left that they promise at most, to go on.
         """
         cdef Judged now
         cdef int32_t status, last, swept, restarts
@@ -82,8 +82,8 @@ cdef class Looks:
             self.done += last
             self.sweeps += swept
             now = Judged(self.metric, lam.copy())
-            if now.relative <= tol or status != RUNNING or self.done >= n or self.done * per > most or \
-                    sweeps_left(last, before, now.relative, tol) * per > least:
+            if now.relative <= tol or status != RUNNING or self.done >= n or \
+                    sweeps_left(last, before, now.relative, tol) > least:
                 self.now, self.before, self.last, self.status, self.restarts = now, before, last, status, restarts
                 return
             before = now.relative

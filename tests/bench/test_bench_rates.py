@@ -2,7 +2,6 @@
 
 import json
 import math
-from dataclasses import replace
 
 import pytest
 
@@ -64,19 +63,17 @@ def _curve(problem, points, setup):
     )  # fmt: skip
 
 
-def test_counts_move_towards_what_ends_sooner():
-    """A candidate that never ends where another does at once comes later."""
+def test_counts_of_few_problems_stay_near_those_of_all():
     case = suite.wild(seed=64)
-    slow = replace(_hopeless(case), candidate="newton", points=((40, 0.1, 1.0),))
-    quick = replace(
-        _hopeless(case),
-        candidate="anderson",
-        points=tuple((n, 4e-5 * n, 10.0 ** (-n / 20)) for n in range(1, 200)),
-    )
-    cases = [(Structure(case.problem), {"newton": slow, "anderson": quick})]
-    given = _plan.rates() | {"newton": _plan.rates()["newton"] | {"count": 1.0}}
-    before, fitted = rates.regret(given, cases), rates._counted(given, cases)
-    assert sum(rates.regret(fitted, cases)) < sum(before)
+    structure = Structure(case.problem)
+
+    def ended(n):
+        return structure, _curve(case.problem, ((n, 1e-3, 1e-9),), setup=1e-5)
+
+    assert rates._middle([ended(8), ended(32), ended(64)]) == 32
+    assert 9 < rates._middle([ended(80)], 10.0) < 12
+    assert 50 < rates._middle([ended(80)] * 10 * rates.LEAST, 10.0) < 80
+    assert rates._middle([], 10.0) == 10
 
 
 def test_times_that_are_made_of_rates_give_them_back():
