@@ -20,6 +20,7 @@ NAMES = (
     "motions",
     "newton",
     "page",
+    "shapes",
     "stability",
     "stand",
     "wasm",

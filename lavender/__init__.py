@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import lavender._built
 from lavender._version import __version__
-from lavender.cones import CONTACT, CONTACT_ROLLING, CONTACT_SPIN, ROUND, ROW, Cones
+from lavender.cones import CONTACT, CONTACT_BOX, CONTACT_ROLLING, CONTACT_SPIN, ROUND, ROW, Cones
 from lavender.errors import (
     CapabilityError,
     InputError,
@@ -71,6 +71,7 @@ _LATER = {
 
 __all__ = [
     "CONTACT",
+    "CONTACT_BOX",
     "CONTACT_ROLLING",
     "CONTACT_SPIN",
     "ROUND",

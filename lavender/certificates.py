@@ -78,9 +78,9 @@ def _rims(problem: Problem, x: FloatArray) -> tuple[Any, Any, FloatArray, FloatA
         part = x[at] / np.where(big > 0.0, big, 1.0)[block[at]]
         return np.asarray((big * np.sqrt(np.bincount(block[at], part**2, minlength=c.n_blocks)))[contact])
 
-    rim = size((place > 0) & (place <= c.n_tangents[block]))
+    rim = size((place > 0) & (place <= c.n_together[block]))
     roll = size((rolling[block] >= 0) & (place >= rolling[block] - c.ptr[block]))
-    spin = np.where(c.spin_rows[contact] >= 0, np.abs(x[c.spin_rows[contact]]), 0.0)
+    spin = np.where(c.apart_rows[contact] >= 0, np.abs(x[c.apart_rows[contact]]), 0.0)
     return contact, first, rim, spin, roll
 
 

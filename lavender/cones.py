@@ -6,6 +6,8 @@ perhaps one spin row, perhaps two rows that roll. With lambda [N s] the bounds a
     ROW           lower <= lambda_i <= upper on each of its rows
     CONTACT       0 <= lambda_n,  |lambda_t| <= mu lambda_n
     CONTACT_SPIN  the same, and |lambda_s| <= mu r lambda_n, r = patch radius [m]
+    CONTACT_BOX   0 <= lambda_n,  |lambda_1| <= mu lambda_n,  |lambda_2| <= mu q lambda_n: two tangents, each by itself,
+                  as most engines have it; q = mu_2 / mu_1 stands in the place of the patch radius
     ROUND         0 <= lambda_n, |lambda_T| <= mu lambda_n over three to five tangents together: two that slide, one
                   that spins, two that roll; each row scaled by its own coefficient over mu, so that one mu bounds all
     CONTACT_ROLLING  a contact of two tangents, perhaps with spin, and |lambda_r| <= mu_r lambda_n on the two that roll,
@@ -20,12 +22,40 @@ from typing import Any, ClassVar
 import numpy as np
 
 from lavender._arrays import FloatArray, IntArray, as_array, check_not_nan, check_not_negative, equal
-from lavender.errors import InputError
+from lavender.errors import InputError, UnknownName
 from lavender_ext.core import blocks as kernels
 
-__all__ = ["CONTACT", "CONTACT_ROLLING", "CONTACT_SPIN", "ROUND", "ROW", "Cones", "project"]
+__all__ = [
+    "CONTACT",
+    "CONTACT_BOX",
+    "CONTACT_ROLLING",
+    "CONTACT_SPIN",
+    "ROUND",
+    "ROW",
+    "SHAPES",
+    "Cones",
+    "check_shape",
+    "project",
+]
 
-ROW, CONTACT, CONTACT_SPIN, ROUND, CONTACT_ROLLING = kernels.KINDS
+ROW, CONTACT, CONTACT_SPIN, ROUND, CONTACT_BOX, CONTACT_ROLLING = kernels.KINDS
+# What bounds two tangents: their norm, or each by itself.
+SHAPES = ("disk", "box")
+# mu_1 = 0 beside mu_2 > 0 stands as this share of mu_2: its impulses vanish in any sum with those of mu_2.
+LEAST_SHARE = 2.0**-60
+
+
+def check_shape(name: str, shape: Any) -> str:
+    """A shape of friction, one of SHAPES.
+
+    Raises
+    ------
+    UnknownName
+        None of them.
+    """
+    if not isinstance(shape, str) or shape not in SHAPES:
+        raise UnknownName(name, shape, SHAPES)
+    return shape
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,13 +67,13 @@ class Cones:
     ptr : (k + 1,) int
         First row of each block, then m.
     kind : (k,) int
-        ROW, CONTACT, CONTACT_SPIN, ROUND or CONTACT_ROLLING of each block.
+        ROW, CONTACT, CONTACT_SPIN, ROUND, CONTACT_BOX or CONTACT_ROLLING of each block.
     lower, upper : (m,) N s
         Bounds of rows on ROW blocks; infinite ones are allowed, those of contacts are not read.
     mu : (k,) -
         Coefficient of friction of each contact.
     patch_radius : (k,) m
-        Of contacts with spin: their spin row is bounded by mu r lambda_n [N m s].
+        Of contacts with spin: their spin row is bounded by mu r lambda_n [N m s]. Of CONTACT_BOX mu_2 / mu_1 [-].
     rolling : (k,) m, optional
         mu_r of CONTACT_ROLLING: what rolls is bounded by mu_r lambda_n [N m s]; default 0. Acary, Bourrier, Viano 2023.
 
@@ -68,11 +98,11 @@ class Cones:
     """
 
     ptr: IntArray  # (k + 1,) first row of each block, then m
-    kind: IntArray  # (k,) ROW | CONTACT | CONTACT_SPIN | ROUND | CONTACT_ROLLING
+    kind: IntArray  # (k,) ROW | CONTACT | CONTACT_SPIN | ROUND | CONTACT_BOX | CONTACT_ROLLING
     lower: FloatArray  # (m,) N s, read on ROW blocks, -inf allowed
     upper: FloatArray  # (m,) N s, read on ROW blocks, +inf allowed
     mu: FloatArray  # (k,) -, read on contacts
-    patch_radius: FloatArray  # (k,) m, read on contacts with spin
+    patch_radius: FloatArray  # (k,) m, read on contacts with spin; on CONTACT_BOX mu_2 / mu_1
     rolling: FloatArray = None  # type: ignore[assignment]  # (k,) m, read on CONTACT_ROLLING; None: 0
     _blocks: ClassVar[kernels.Blocks]  # of an instance: the same arrays, as kernels read them
 
@@ -111,7 +141,7 @@ class Cones:
         if k and not np.isin(kind, kernels.KINDS).all():
             raise InputError(
                 f"cones.kind holds {sorted(set(kind.tolist()))}; ROW=0, CONTACT=1, CONTACT_SPIN=2, ROUND=3, "
-                f"CONTACT_ROLLING={CONTACT_ROLLING} are known"
+                "CONTACT_BOX=4, CONTACT_ROLLING=5 are known"
             )
         size = np.diff(ptr)
         if np.any(kind == ROUND):
@@ -131,8 +161,19 @@ class Cones:
                 f"block {bad[0]} is a contact with rolling of {size[bad[0]]} rows; a normal, two tangents, perhaps "
                 "spin, and two that roll are needed: 5 rows or 6"
             )
-        plain = (kind == CONTACT) | (kind == CONTACT_SPIN)
-        bad = np.flatnonzero(plain & ((size < kind) | (size > kind + 2)))
+        if np.any(kind == CONTACT_BOX):
+            flat = (kind == CONTACT_BOX) & (size <= 2)
+            if flat.any():  # one tangent is bounded by itself in a contact, too
+                kind = np.where(flat, CONTACT, kind).astype(np.int32)
+                kind.flags.writeable = False
+            bad = np.flatnonzero((kind == CONTACT_BOX) & (size != 3))
+            if len(bad):
+                raise InputError(
+                    f"block {bad[0]} is a box of {size[bad[0]]} rows; a normal and two tangents are known"
+                )
+        bad = np.flatnonzero(
+            ((kind == CONTACT) | (kind == CONTACT_SPIN)) & ((size < kind) | (size > kind + 2))
+        )
         if len(bad):
             raise InputError(
                 f"block {bad[0]} is a contact of {size[bad[0]]} rows; a contact has a normal, up to "
@@ -201,12 +242,14 @@ class Cones:
         *,
         rolling: Any = None,
         count: int | None = None,
+        shape: str = "disk",
     ) -> Cones:
         """Contacts only, the same rows for each: normal, `tangents`, with a radius a spin row, then what rolls.
 
         Parameters
         ----------
-        mu : scalar or (k,)
+        mu : scalar or (k,), of boxes also (k, 2)
+            One for each contact, or one for each tangent of a box.
         tangents : int, 0 to 5
             More than two make one round cone (ROUND) and take no patch radius.
         patch_radius : scalar or (k,) m, optional
@@ -214,6 +257,18 @@ class Cones:
             mu_r: gives each contact two rows that roll about its two tangents, |lambda_r| <= mu_r lambda_n.
         count : int, optional
             k, where mu is a scalar; default 1.
+        shape : {"disk", "box"}
+            What bounds two tangents: |lambda_t| <= mu lambda_n, or each by itself as in most engines,
+            |lambda_i| <= mu_i lambda_n, which grips up to sqrt(2) more on the diagonal.
+
+        Examples
+        --------
+        Four skates that glide along the first tangent and hold across:
+
+        >>> import lavender as lv
+        >>> skates = lv.Cones.contacts([(0.02, 0.8)] * 4, shape="box")
+        >>> skates.n_rows, skates.coefficients[0].tolist()
+        (12, [0.02, 0.8])
         """
         if (
             isinstance(tangents, bool)
@@ -221,6 +276,21 @@ class Cones:
             or not 0 <= tangents <= 5
         ):
             raise InputError(f"tangents is {tangents!r}; a whole number from 0 to 5 is needed")
+        ratio = None
+        if check_shape("shape", shape) == "box":
+            if patch_radius is not None or rolling is not None or tangents > 2:
+                raise InputError(
+                    "a box bounds up to two tangents, no spin and no rolling: leave patch_radius, rolling and tangents "
+                    "out, or give them as a disk's (shape='disk')"
+                )
+            if tangents == 2:
+                mu, ratio = _sides(mu)
+        elif np.ndim(mu) > 1:
+            raise InputError(
+                f"mu has shape {np.shape(mu)}; one for each contact is needed. Two make an ellipse of the disk: give "
+                "mu_1 here and stretch the second tangent by mu_2 / mu_1 (problem.stretched); shape='box' takes two as "
+                "they are"
+            )
         spin = patch_radius is not None
         if tangents > 2 and spin:
             raise InputError(
@@ -244,10 +314,12 @@ class Cones:
         if patch_radius is not None:
             patch_radius = as_array("patch_radius", patch_radius, (k,), unit="m")
             check_not_negative("patch_radius", patch_radius)
+        if ratio is not None:
+            patch_radius = np.ascontiguousarray(np.broadcast_to(ratio, (k,)))
         if rolling is not None:
             rolling = as_array("rolling", rolling, (k,), unit="m")
             check_not_negative("rolling", rolling)
-        made = kernels.contacts(k, tangents, mu, patch_radius, rolling)
+        made = kernels.contacts(k, tangents, mu, patch_radius, rolling, ratio is not None)
         if made is None:
             raise InputError(f"{k} contacts have more rows than 32-bit numbers count")
         return cls._of(made)
@@ -283,6 +355,33 @@ class Cones:
         return bool(self._blocks.has_rolling)
 
     @property
+    def has_box(self) -> bool:
+        """Some contact bounds each of its two tangents by itself."""
+        return bool((self.kind == CONTACT_BOX).any())
+
+    @property
+    def is_polyhedral(self) -> bool:
+        """No bound is round: every row of friction is bounded by itself, so that Coulomb's law is an LCP."""
+        return not bool(np.any(self.n_together > 1))
+
+    @property
+    def ends_apart(self) -> np.ndarray:
+        """(k,) bool: the last row has a bound of its own, mu patch_radius lambda_n (spin, second side of a box)."""
+        return (self.kind == CONTACT_SPIN) | (self.kind == CONTACT_BOX)
+
+    @property
+    def n_together(self) -> IntArray:
+        """(k,) tangent rows of each block that mu lambda_n bounds by their norm, 0 on ROW."""
+        return self.n_tangents - (self.kind == CONTACT_BOX)
+
+    @property
+    def coefficients(self) -> FloatArray:
+        """(k, 2) mu of the first and of the second tangent: mu twice, but of a box; 0 on ROW."""
+        mu = np.where(self.kind == ROW, 0.0, self.mu)
+        second = mu * np.where(self.kind == CONTACT_BOX, self.patch_radius, 1.0)
+        return np.stack([np.where(mu <= LEAST_SHARE * second, 0.0, mu), second], axis=1)
+
+    @property
     def n_tangents(self) -> IntArray:
         """(k,) tangent rows of each block, 0 on ROW; rows that spin or roll, each with a bound of its own, are none."""
         own = np.diff(self.ptr) - 1 - (self.kind == CONTACT_SPIN)
@@ -291,12 +390,12 @@ class Cones:
 
     @property
     def reach(self) -> FloatArray:
-        """(m,) largest impulse of each row over lambda_n: mu, mu r of spin, mu_r of rolling; 0 on normals and ROW."""
+        """(m,) largest impulse of each row over lambda_n: mu, mu r on `apart_rows`, mu_r on rolling; 0 on others."""
         size = np.diff(self.ptr)
         out = np.repeat(np.where(self.kind == ROW, 0.0, self.mu), size)
         out[self.ptr[:-1]] = 0.0
-        turning, rolling = self.spin_rows >= 0, self.rolling_rows >= 0
-        out[self.spin_rows[turning]] *= self.patch_radius[turning]
+        apart, rolling = self.apart_rows >= 0, self.rolling_rows >= 0
+        out[self.apart_rows[apart]] *= self.patch_radius[apart]
         for k in (0, 1):
             out[self.rolling_rows[rolling] + k] = self.rolling[rolling]
         return np.asarray(out)
@@ -311,6 +410,50 @@ class Cones:
     def rolling_rows(self) -> IntArray:
         """(k,) the first of the two rows of each block that roll with a bound of their own, -1 where it has none."""
         return np.where(self.kind == CONTACT_ROLLING, self.ptr[1:] - 2, -1).astype(np.int32)
+
+    @property
+    def apart_rows(self) -> IntArray:
+        """(k,) the row of each block bounded by mu patch_radius lambda_n: spin, second side of a box; else -1."""
+        return np.where(self.kind == CONTACT_BOX, self.ptr[1:] - 1, self.spin_rows).astype(np.int32)
+
+    def shaped(self, shape: str) -> Cones:
+        """The same blocks with contacts of another shape, "disk" or "box"; a box with two coefficients is no disk.
+
+        Raises
+        ------
+        UnknownName
+            No such shape.
+        InputError
+            A contact of two tangents and spin, or a round cone, as a box; a box of two coefficients as a disk.
+        """
+        kind, radius, two = self.kind.copy(), self.patch_radius.copy(), self.n_tangents == 2
+        if check_shape("shape", shape) == "box":
+            bad = np.flatnonzero(
+                (self.n_tangents > 1) & (np.isin(self.kind, (CONTACT_SPIN, ROUND, CONTACT_ROLLING)))
+            )
+            if len(bad):
+                raise InputError(
+                    f"block {bad[0]} has more rows than a normal and two tangents; no box bounds its spin or rolling"
+                )
+            kind[two], radius[two & (self.kind == CONTACT)] = CONTACT_BOX, 1.0
+        else:
+            bad = np.flatnonzero((self.kind == CONTACT_BOX) & (radius != 1.0))
+            if len(bad):
+                c = self.coefficients[bad[0]].tolist()
+                raise InputError(
+                    f"block {bad[0]} has mu {c}; a disk has one: give Cones.contacts a single mu"
+                )
+            radius[self.kind == CONTACT_BOX] = 0.0
+            kind[self.kind == CONTACT_BOX] = CONTACT
+        return Cones(
+            ptr=self.ptr,
+            kind=kind,
+            lower=self.lower,
+            upper=self.upper,
+            mu=self.mu,
+            patch_radius=radius,
+            rolling=self.rolling,
+        )
 
     def __add__(self, other: object) -> Cones:
         """These blocks, then those of `other`."""
@@ -333,6 +476,20 @@ class Cones:
         return type(self), self._blocks.arrays
 
 
+def _sides(mu: Any) -> tuple[Any, FloatArray]:
+    """mu_1 (float or (k,)) of boxes and mu_2 / mu_1, (1,) or (k,), from mu: scalar, (k,) or (k, 2)."""
+    given = as_array("mu", np.asarray(mu, float), (None,) * np.ndim(mu))
+    check_not_negative("mu", given.ravel())
+    if given.ndim < 2:
+        return mu, np.ones(1)
+    if given.ndim > 2 or given.shape[1] != 2:
+        raise InputError(f"mu has shape {given.shape}; (k,) or (k, 2), one for each tangent, is needed")
+    first, second = given[:, 0], given[:, 1]
+    first = np.where((first <= LEAST_SHARE * second) & (second > 0.0), LEAST_SHARE * second, first)
+    some = first > 0.0
+    return first, np.divide(second, first, out=np.zeros(len(first)), where=some)
+
+
 def project(cones: Cones, impulse: FloatArray) -> FloatArray:
     """Nearest feasible normal and rows, then tangents, spin and rolling onto their bounds times lambda_n; (m,) [N s].
 
@@ -340,7 +497,7 @@ def project(cones: Cones, impulse: FloatArray) -> FloatArray:
     clipped first and keeps its value.
     """
     out = np.clip(impulse, cones.lower, cones.upper)
-    tangents, turning, rolling = cones.n_tangents, cones.spin_rows, cones.rolling_rows
+    tangents, turning, rolling = cones.n_together, cones.apart_rows, cones.rolling_rows
     for i in np.flatnonzero((cones.kind != ROW) & (np.diff(cones.ptr) > 1)):
         j, nt = cones.ptr[i], tangents[i]
         bound = cones.mu[i] * out[j]

@@ -28,7 +28,8 @@ from lavender._arrays import (
     table_of,
 )
 from lavender._derived import Derived, once
-from lavender.cones import CONTACT_ROLLING, ROUND, ROW, Cones
+from lavender._findex import arrays_of, blocks_of, order_of
+from lavender.cones import CONTACT_ROLLING, ROUND, ROW, Cones, check_shape
 from lavender.errors import CapabilityError, InputError
 from lavender.generalized import Generalized
 from lavender.rows import Rows
@@ -311,6 +312,76 @@ class Problem:
         return cls(b, Cones.contacts(mu, tangents, patch_radius, rolling=rolling), A, **more)
 
     @classmethod
+    def from_findex(
+        cls, A: Any, b: ArrayLike, lower: ArrayLike, upper: ArrayLike, findex: ArrayLike, **more: Any
+    ) -> Problem:
+        """The arrays of engines (ODE, Bullet, DART), as they are: friction that follows its normal, tangent by tangent.
+
+        Where the normals do not stand right before the rows that follow them, the rows of the problem are those of the
+        arrays in another order, `Problem.findex_order(findex)`.
+
+        Parameters
+        ----------
+        A : (m, m) 1/kg, array or sparse
+        b : (m,) m/s
+        lower, upper : scalar or (m,) N s
+            Where findex < 0; where it is not, upper is mu [-].
+        findex : (m,) int
+            Row of the normal whose impulse bounds this one, |lambda_i| <= upper_i lambda_findex; -1: constant bounds.
+
+        Raises
+        ------
+        InputError
+            A findex out of range, of its own row, or of a row that is no normal [0, inf]; more than two rows that
+            follow one; mu that is negative or not finite; lower > upper.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> import lavender as lv
+        >>> A, b = np.eye(3), [10.0, 9.0, -1.0]  # pressed on, and dragged along both tangents
+        >>> problem = lv.Problem.from_findex(A, b, [0.0, -0.5, -0.5], [np.inf, 0.5, 0.5], [-1, 0, 0])
+        >>> lv.solve(problem, tol=1e-9).impulse.tolist()  # N s: the first slides, the second holds
+        [10.0, 5.0, -1.0]
+        """
+        b = as_array("b", b, (None,), unit="m/s")
+        order, cones = blocks_of(lower, upper, findex, len(b))
+        if (order[1:] < order[:-1]).any():
+            matrix = _checked_matrix(A, len(b), True)
+            return cls(b[order], cones, matrix[order][:, order], **more)
+        return cls(b, cones, A, **more)
+
+    @staticmethod
+    def findex_order(findex: ArrayLike) -> IntArray:
+        """(m,) row of the arrays given to `from_findex` for each row of its problem.
+
+        >>> import lavender as lv
+        >>> lv.Problem.findex_order([-1, -1, 0, 0, 1, 1]).tolist()  # all normals first, as Bullet has them
+        [0, 2, 3, 1, 4, 5]
+
+        Raises
+        ------
+        InputError
+            As `from_findex`.
+        """
+        return order_of(findex)
+
+    def to_findex(self) -> tuple[Any, FloatArray, FloatArray, FloatArray, IntArray]:
+        """(A, b, lower, upper, findex) as ODE, Bullet and DART have them, of the rows in this problem's order.
+
+        Raises
+        ------
+        InputError
+            A disk, or the law "cone": findex has neither.
+        """
+        lower, upper, findex = arrays_of(self.cones)
+        if self.law == "cone":
+            raise InputError(
+                "findex means Coulomb friction, not the law 'cone': pass problem.relaxed('coulomb')"
+            )
+        return self.delassus(), self.b, lower, upper, findex
+
+    @classmethod
     def from_rows(
         cls,
         rows: Rows,
@@ -322,6 +393,7 @@ class Problem:
         tangents: ArrayLike | None = None,
         patch_radius: ArrayLike | None = None,
         rolling: ArrayLike | None = None,
+        shape: str = "disk",
         **more: Any,
     ) -> Problem:
         """Problem of a step from factored rows: b = target - J v*.
@@ -341,6 +413,8 @@ class Problem:
             Gives each contact a spin row.
         rolling : scalar or (c,) m, optional
             mu_r: gives each contact two rows that roll about its two tangents; all contacts need two.
+        shape : {"disk", "box"}
+            Of friction in two tangents; see `Cones.contacts`. Two coefficients: replace(problem, cones=...).
         **more
             As `Problem`: name, friction, ...; the example of `Rows` is a whole stack.
 
@@ -403,7 +477,11 @@ class Problem:
         both[0, kj:] = mu
         both[1, kj:] = 0.0 if patch_radius is None else as_array("patch_radius", patch_radius, (c,), unit="m")
         both[2, kj:] = 0.0 if rolling is None else as_array("rolling", rolling, (c,), unit="m")
-        cones = Cones(ptr, kind, low, high, *both)
+        cones = Cones(
+            ptr=ptr, kind=kind, lower=low, upper=high, mu=both[0], patch_radius=both[1], rolling=both[2]
+        )
+        if check_shape("shape", shape) == "box":
+            cones = cones.shaped("box")
         target = as_array("target", target, (m,), unit="m/s")
         jv = np.zeros(m + 1)
         # b = target - J v*: the slack kernel with lambda = 0 and v = v* gives J v* - 0.
@@ -890,6 +968,61 @@ class Problem:
         """
         return replace(self, friction=friction, copy=False)
 
+    def stretched(self, scale: ArrayLike) -> Problem:
+        """The same problem with rows `scale` times as long, whose impulses are those here over `scale`.
+
+            A' = S A S,   b' = S b,   lambda = S lambda',   w' = S w,   S = diag(scale)
+
+        Rows of bodies become a matrix. A disk of stretched tangents is an ellipse of those here.
+
+        Parameters
+        ----------
+        scale : scalar or (m,)
+            Above 0; of a contact's normal 1.
+
+        Raises
+        ------
+        InputError
+            A scale that is not above 0, or not 1 at the normal of a contact.
+
+        Examples
+        --------
+        An ellipse, mu 0.5 along the first tangent and 0.2 along the second:
+
+        >>> import numpy as np
+        >>> import lavender as lv
+        >>> A, b = np.eye(3), np.array([10.0, 9.0, 9.0])
+        >>> scale = np.array([1.0, 1.0, 0.2 / 0.5])
+        >>> ellipse = lv.Problem.contact(A, b, [0.5]).stretched(scale)
+        >>> impulse = scale * lv.solve(ellipse, tol=1e-9).impulse
+        >>> round(float(np.hypot(impulse[1] / 0.5, impulse[2] / 0.2) / impulse[0]), 6)  # it slides: on the rim
+        1.0
+        """
+        s = as_array("scale", scale, (self.m,))
+        c = self.cones
+        normal = c.ptr[:-1][c.kind != ROW]
+        wrong = np.flatnonzero(~(s > 0.0))
+        if len(wrong) or np.any(s[normal] != 1.0):
+            i = int(wrong[0]) if len(wrong) else int(normal[s[normal] != 1.0][0])
+            needed = "a number above 0" if len(wrong) else "1"
+            raise InputError(f"scale of {self.row_name(i)} is {s[i]}; {needed} is needed")
+        rows = np.repeat(c.kind == ROW, np.diff(c.ptr))
+        low, high = (np.where(rows, x / s, x) for x in (c.lower, c.upper))
+        cones = Cones(ptr=c.ptr, kind=c.kind, lower=low, upper=high, mu=c.mu, patch_radius=c.patch_radius)
+        guess = None if self.guess is None else self.guess / s
+        more: dict[str, Any] = {"guess": guess, "key": self.key, "names": self.names, "name": self.name}
+        more["friction"] = self.friction
+        if self.generalized is None:
+            a = sp.csr_array(sp.diags_array(s) @ self.csr @ sp.diags_array(s))
+            return Problem(s * self.b, cones, a, copy=False, **more)
+        g = self.generalized
+        jac = sp.csr_array(sp.diags_array(s) @ g.jac)
+        assert self.compliance is not None
+        made = Generalized(jac, g.mass, g.v_free, g.names)
+        return Problem(
+            s * self.b, cones, generalized=made, compliance=s * s * self.compliance, copy=False, **more
+        )
+
     def boxed(self, normal_impulse: ArrayLike) -> Problem:
         """Friction bounded by fixed normals: |lambda_t| <= mu N on each tangent alone: a square, not the disk.
 
@@ -906,8 +1039,8 @@ class Problem:
         for i, load in zip(contact, n, strict=True):
             j, end = c.ptr[i], c.ptr[i + 1]
             bound = np.full(end - j, c.mu[i] * load)
-            if c.spin_rows[i] >= 0:
-                bound[c.spin_rows[i] - j] *= c.patch_radius[i]
+            if c.apart_rows[i] >= 0:
+                bound[c.apart_rows[i] - j] *= c.patch_radius[i]
             if c.rolling_rows[i] >= 0:
                 bound[-2:] = c.rolling[i] * load
             lower[j + 1 : end], upper[j + 1 : end] = -bound[1:], bound[1:]

@@ -114,6 +114,9 @@ class SolverSpec:
     delegates: bool = False  # may hand over to other solvers: only "auto"
     round_cones: bool = False  # takes contacts of more than two tangents in one cone
     rolling: bool = False  # takes contacts that resist rolling, each part with a bound of its own
+    # Of "coulomb" and "cone", with which it takes boxes: contacts whose tangents are bounded each by itself. A law that
+    # is not of `laws` besides is taken where there is no disk (of our own, as bounded rows: solvers/_polyhedral.py).
+    boxes: frozenset[str] = frozenset()
     external: bool = False  # another project's code solves; its claims are its own
     max_iter: int = 1000  # default budget
     options: Mapping[str, str] = field(default_factory=dict)  # own options: name -> one line
@@ -132,14 +135,16 @@ class SolverSpec:
             or not set(self.laws) <= set(LAWS)
             or not self.laws
             or not set(self.operators) <= set(OPERATORS)
+            or not set(self.boxes) <= {"coulomb", "cone"}
             or not self.operators
         ):
             raise InputError(
                 f"solver {self.name!r}: laws {sorted(self.laws)} must be of {LAWS}, operators "
-                f"{self.operators!r} a set of {OPERATORS}"
+                f"{self.operators!r} a set of {OPERATORS}, boxes {sorted(self.boxes)} of coulomb and cone"
             )
         object.__setattr__(self, "laws", frozenset(self.laws))
         object.__setattr__(self, "operators", frozenset(self.operators))
+        object.__setattr__(self, "boxes", frozenset(self.boxes))
         if not self.resumable:
             object.__setattr__(self, "callback", False)
             object.__setattr__(self, "history", False)
@@ -163,11 +168,19 @@ class SolverSpec:
 
     def refuses(self, problem: Problem) -> str | None:
         """None when the solver takes this problem, else the reason."""
-        if problem.law not in self.laws:
-            takes = ", ".join(law for law in LAWS if law in self.laws)
+        law = problem.law
+        apart = law in self.boxes and problem.cones.is_polyhedral
+        if law in self.laws and law not in ("linear", "lcp", *self.boxes) and problem.cones.has_box:
             return (
-                f"takes laws {takes}, not {problem.law!r}{self.bounded or _way_round(problem.law, self.laws)}"
+                "takes no boxes, contacts that bound each tangent by itself: use one of those that do, "
+                "lavender.available(problem) lists them, or give the problem cones.shaped('disk')"
             )
+        if law not in self.laws and not apart:
+            takes = ", ".join(law for law in LAWS if law in self.laws)
+            way = _way_round(law, self.laws)
+            if law == "coulomb" and "cone" in self.boxes and problem.cones.is_polyhedral:
+                way = ": pass problem.relaxed('cone'), or use a solver for Coulomb friction"
+            return f"takes laws {takes}, not {law!r}{self.bounded or way}"
         if "matrix" not in self.operators and problem.operator not in self.operators:
             makers = {"rows": "Problem.from_rows", "generalized": "Problem.from_jacobian"}
             needs = " or ".join(f"{o} ({makers[o]})" for o in OPERATORS if o in self.operators)

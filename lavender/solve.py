@@ -25,6 +25,7 @@ from lavender.problem import Problem
 from lavender.registry import SolverSpec, State, get, in_one_call
 from lavender.residuals import Residual, reference, residual, told
 from lavender.solution import Claim, History, Solution, SolverRun, Status
+from lavender.solvers._polyhedral import ThroughRows
 from lavender_ext.judge.measure import all_finite
 
 __all__ = ["Prepared", "prepare", "solve"]
@@ -288,7 +289,9 @@ def _make(spec: SolverSpec, options: dict[str, Any]) -> Any:
         if isinstance(error, InputError):
             raise
         raise InputError(f"solver {spec.name!r} cannot take the options {options}: {error}") from error
-    return made if spec.own else Foreign(spec.name, made)
+    if not spec.own:
+        return Foreign(spec.name, made)
+    return ThroughRows(made) if spec.boxes - spec.laws else made
 
 
 def same_structure(p: Problem, q: Problem) -> bool:

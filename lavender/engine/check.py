@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from lavender.cones import CONTACT, CONTACT_ROLLING, CONTACT_SPIN, ROW
+from lavender.cones import CONTACT, CONTACT_BOX, CONTACT_ROLLING, CONTACT_SPIN, ROW
 from lavender.engine.layout import CAP_CONTACT, CAP_PAIR, HEAD, N_SIZES, SETTING, SIZE
 from lavender.engine.state import KEPT, State
 from lavender.errors import InputError
@@ -128,7 +128,8 @@ def _check_contacts(new: State) -> None:
     expected = np.where(friction, 3, 1) + (kinds == CONTACT_SPIN) + rolls * np.where(blocks == 6, 3, 2)
     if ptr[0] != mj or ptr[-1] != mj + rows or (blocks != expected).any() or blocks.max(initial=1) > per:
         raise _damaged("the rows of its contacts do not add up")
-    if c and ((kind[:kj] != ROW).any() or not np.isin(kinds, (CONTACT, CONTACT_SPIN, CONTACT_ROLLING)).all()):
+    known = (CONTACT, CONTACT_SPIN, CONTACT_BOX, CONTACT_ROLLING)
+    if c and ((kind[:kj] != ROW).any() or not np.isin(kinds, known).all()):
         raise _damaged("kind holds what is no block")
     pair = b["contact_pair"][:c]
     if c and (pair.min() < 0 or pair.max() >= n or not np.array_equal(b["contact_body"][:c], b["dyn"][pair])):

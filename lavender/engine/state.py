@@ -174,6 +174,12 @@ class State:
         rough = bool((mu[shaped] > 0.0).any())
         spin, rolling = rough and bool((patch[shaped] > 0.0).any()), rough and p.rolling_radius > 0.0
         per = 1 + 2 * rough + spin + 2 * rolling
+        box = p.friction_shape == "box"
+        if box and (spin or rolling):
+            raise InputError(
+                "friction_shape is 'box' and patch_radius or rolling_radius > 0: a box has no spin friction, and none "
+                "against rolling; leave one of the two out"
+            )
         excluded = sorted({tuple(sorted((j.a, j.b))) for j in joints if not j.collide and min(j.a, j.b) >= 0})
         n_shapes = int(shaped.sum())
         size = np.zeros(N_SIZES, np.int32)
@@ -204,6 +210,7 @@ class State:
         head[HEAD["position_iterations"]] = p.position_iterations
         head[HEAD["order"]] = ORDER_NUMBER[p.order]
         head[HEAD["seed"]] = p.seed
+        head[HEAD["friction_shape"]] = box
         head[HEAD["lost"]] = -1
         stepper = get_stepper(p.stepper)
         stepper.check(spin, bool((restitution > 0.0).any()), rolling)

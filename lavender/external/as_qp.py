@@ -485,9 +485,9 @@ class _Parts:
         pairs: list[tuple[int, int, float]] = []
         disks: list[_Disk] = []
         for i in self.contacts:
-            n, turning, rolling = int(c.ptr[i]), int(c.spin_rows[i]), int(c.rolling_rows[i])
+            n, turning, rolling = int(c.ptr[i]), int(c.apart_rows[i]), int(c.rolling_rows[i])
             j = int(place[n])
-            parts = [list(range(n + 1, n + 1 + int(c.n_tangents[i])))]
+            parts = [list(range(n + 1, n + 1 + int(c.n_together[i])))]
             parts += [[turning]] * (turning >= 0) + [[rolling, rolling + 1]] * (rolling >= 0)
             for part in parts:
                 if not part or place[part[0]] < 0:

@@ -148,6 +148,7 @@ def _spec(backend: Backend) -> SolverSpec:
         name=backend.name,
         factory=partial(QPSolver, backend),
         laws=frozenset({"linear", "lcp"} if backend.linear else {"lcp"}),
+        boxes=frozenset() if backend.definite else frozenset({"cone"}),  # as edges of cones A is singular
         resumable=False,
         external=True,
         impulse=backend.warm,

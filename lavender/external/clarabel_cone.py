@@ -87,6 +87,7 @@ SPEC = SolverSpec(
     name=NAME,
     factory=ClarabelCone,
     laws=frozenset({"linear", "lcp", "cone"}),
+    boxes=frozenset({"cone"}),
     resumable=False,
     external=True,
     impulse=False,

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from lavender._arrays import FloatArray
+from lavender.cones import check_shape
 from lavender.errors import InputError, UnknownName
 from lavender.ordering import ENGINE_ORDERS
 from lavender.registry import get
@@ -68,6 +69,8 @@ class Parameters:
     rolling_radius: float = (
         0.0  # m, mu_r of every contact with friction: a moment of at most mu_r lambda_n; 0: none
     )
+    # "box": each tangent is bounded by itself, as in most engines; it then has no spin friction
+    friction_shape: str = "disk"
     # None: 2 for "impulses", 0 for the others, which have no position projection
     position_iterations: int = None  # type: ignore[assignment]
     seed: int = 0
@@ -144,6 +147,10 @@ class Parameters:
                 self,
                 name,
                 number(name, getattr(self, name), low=0.0, high=MOST.get(name, np.inf)),
+            )
+        if check_shape("friction_shape", self.friction_shape) == "box" and not stepper.boxes:
+            raise InputError(
+                f"stepper {stepper.name!r} bounds friction by a disk: leave friction_shape out, or take 'impulses'"
             )
         put(self, "margin", number("margin", self.margin, low=0.0))
         projections: Any = self.position_iterations

@@ -343,6 +343,7 @@ SPEC = SolverSpec(
     name="admm",
     factory=ADMM,
     laws=frozenset({"linear", "lcp", "coulomb", "cone"}),
+    boxes=frozenset({"coulomb", "cone"}),
     round_cones=True,
     rolling=True,
     max_iter=2000,

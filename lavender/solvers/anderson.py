@@ -38,6 +38,7 @@ SPEC = SolverSpec(
     name="anderson",
     factory=Anderson,
     laws=frozenset({"linear", "lcp", "coulomb", "cone"}),
+    boxes=frozenset({"coulomb", "cone"}),
     operators=frozenset({"rows", "matrix", "generalized"}),
     order=True,
     seed=True,

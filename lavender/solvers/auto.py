@@ -106,6 +106,7 @@ SPEC = SolverSpec(
     name="auto",
     factory=Auto,
     laws=frozenset({"linear", "lcp", "coulomb", "cone"}),
+    boxes=frozenset({"coulomb", "cone"}),
     operators=frozenset(OPERATORS),
     round_cones=True,
     rolling=True,

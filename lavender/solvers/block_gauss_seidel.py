@@ -74,6 +74,7 @@ SPEC = SolverSpec(
     name="block_gauss_seidel",
     factory=BlockGaussSeidel,
     laws=frozenset({"linear", "lcp", "coulomb", "cone"}),
+    boxes=frozenset({"coulomb", "cone"}),
     operators=frozenset({"rows", "matrix", "generalized"}),
     order=True,
     seed=True,

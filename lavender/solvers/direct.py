@@ -13,7 +13,8 @@ Positive definite A: finite and exact to rounding, whatever `tol`. Singular posi
 message says so, and what cannot be refined to rounding is STALLED with the best iterate. Linear systems
 that are asymmetric or indefinite get LU with pivoting, and where that is singular its rank from an SVD.
 Bounded rows whose A is asymmetric are exchanged by LU: finite where exchanges do not go round in circles, which no
-energy then ends.
+energy then ends. Friction of boxes comes as such rows (`_polyhedral.py`); where its exchanges do, complementary pivots
+follow.
 """
 
 from __future__ import annotations
@@ -69,6 +70,12 @@ class Direct:
     def allowed(self) -> float:
         """What a sparse factor of a linear system may be counted for [ns], else `TooDear`."""
         return np.inf
+
+    def otherwise(self) -> Any:
+        """What follows where exchanges go round in circles on friction as bounded rows: one pivot after the other."""
+        from lavender.solvers.lemke import Lemke
+
+        return Lemke()
 
     def prepare(self, problem: Problem, like: PivotState | None = None) -> DirectState:
         linear = problem.law == "linear"
@@ -468,6 +475,7 @@ SPEC = SolverSpec(
     name="direct",
     factory=Direct,
     laws=frozenset({"linear", "lcp"}),
+    boxes=frozenset({"coulomb", "cone"}),
     operators=frozenset({"matrix"}),
     exact=True,
     resumable=False,

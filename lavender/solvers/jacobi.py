@@ -75,6 +75,7 @@ SPEC = SolverSpec(
     name="jacobi",
     factory=Jacobi,
     laws=frozenset({"linear", "lcp", "coulomb"}),
+    boxes=frozenset({"coulomb"}),
     operators=frozenset({"matrix"}),
     rolling=True,
     max_iter=1000,

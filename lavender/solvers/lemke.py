@@ -32,6 +32,7 @@ from lavender.problem import Problem
 from lavender.registry import SolverSpec
 from lavender.residuals import at_floor, quick
 from lavender.solution import Claim, Status
+from lavender.solvers._polyhedral import count_rows
 from lavender_ext.judge import measure
 from lavender_ext.pivot.tableau import PIVOTS, RAY, Dictionary
 
@@ -484,9 +485,11 @@ class Walk:
 
 
 def _refusal(problem: Problem) -> str | None:
-    if problem.m > LIMIT:
+    rows = count_rows(problem)
+    if rows > LIMIT:
+        means = "" if rows == problem.m else f", its friction as bounded rows {rows}"
         return (
-            f"holds a dense dictionary, for at most {LIMIT} rows; this problem has {problem.m}: "
+            f"holds a dense dictionary, for at most {LIMIT} rows; this problem has {problem.m}{means}: "
             "use direct, newton or pgs"
         )
     return None
@@ -496,6 +499,7 @@ SPEC = SolverSpec(
     name="lemke",
     factory=Lemke,
     laws=frozenset({"linear", "lcp"}),
+    boxes=frozenset({"coulomb", "cone"}),
     operators=frozenset({"matrix"}),
     exact=True,
     resumable=False,

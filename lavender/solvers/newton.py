@@ -217,6 +217,7 @@ SPEC = SolverSpec(
     name="newton",
     factory=Newton,
     laws=frozenset({"linear", "lcp", "coulomb", "cone"}),
+    boxes=frozenset({"coulomb", "cone"}),
     operators=frozenset(OPERATORS),
     round_cones=True,
     rolling=True,

@@ -43,6 +43,7 @@ SPEC = SolverSpec(
     name="nncg",
     factory=NNCG,
     laws=frozenset({"linear", "lcp", "coulomb", "cone"}),
+    boxes=frozenset({"coulomb", "cone"}),
     operators=frozenset({"rows", "matrix", "generalized"}),
     order=True,
     seed=True,

@@ -58,6 +58,7 @@ SPEC = SolverSpec(
     name="pgs",
     factory=PGS,
     laws=frozenset({"linear", "lcp", "coulomb"}),
+    boxes=frozenset({"coulomb"}),
     operators=frozenset({"matrix", "generalized"}),
     order=True,
     seed=True,

@@ -95,6 +95,7 @@ SPEC = SolverSpec(
     name="sequential_impulses",
     factory=SequentialImpulses,
     laws=frozenset({"linear", "lcp", "coulomb"}),
+    boxes=frozenset({"coulomb"}),
     operators=frozenset({"rows"}),
     order=True,
     seed=True,

@@ -230,6 +230,7 @@ def page_scenes() -> dict[str, Any]:
                     "warm_start": int(side["warm_start"]),
                     "order": ORDER_NUMBER[side.get("order", "given")],
                     "solver": side.get("solver", "sweeps"),
+                    "box": int(side.get("friction_shape") == "box"),
                 }
                 for side in (one, two)
             ],

@@ -27,7 +27,7 @@ from libc.stdint cimport int32_t, int64_t
 import numpy as np
 
 from lavender_ext.accelerate.mixing cimport CONTROL, MAX_MEMORY, UNDONE, forget, mix, mixing_t, product, take
-from lavender_ext.core.block cimport (CONE, CONTACT_ROLLING, CONTACT_SPIN, ROUND, ROW, blocks_t, clip, n_tangents, norm2,
+from lavender_ext.core.block cimport (CONE, CONTACT_ROLLING, ROUND, ROW, blocks_t, clip, ends_apart, n_tangents, norm2,
                                       rolling_section, round_group, round_section, round_share)
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.rolling cimport part_of, part_size
@@ -175,13 +175,13 @@ cdef inline void project_block(const blocks_t* p, const double* root, int32_t i,
         return
     nt = n_tangents(p.kind[i], n)
     at = p.mu[i] * root[j + 1] / root[j] if nt > 0 else 0.0
-    as_ = p.mu[i] * p.patch_radius[i] * root[j + n - 1] / root[j] if p.kind[i] == CONTACT_SPIN else 0.0
+    as_ = p.mu[i] * p.patch_radius[i] * root[j + n - 1] / root[j] if ends_apart(p.kind[i]) else 0.0
     t = norm2(u[j + 1], u[j + 2]) if nt == 2 else (fabs(u[j + 1]) if nt == 1 else 0.0)
-    c = fabs(u[j + n - 1]) if p.kind[i] == CONTACT_SPIN else 0.0
+    c = fabs(u[j + n - 1]) if ends_apart(p.kind[i]) else 0.0
     s = u[j] if u[j] > 0.0 else 0.0
     if (u[j] + at * t) / (1.0 + at * at) > s:
         s = (u[j] + at * t) / (1.0 + at * at)
-    if p.kind[i] == CONTACT_SPIN:
+    if ends_apart(p.kind[i]):
         if (u[j] + as_ * c) / (1.0 + as_ * as_) > s:
             s = (u[j] + as_ * c) / (1.0 + as_ * as_)
         if (u[j] + at * t + as_ * c) / (1.0 + at * at + as_ * as_) > s:
@@ -204,7 +204,7 @@ cdef inline double shift(const blocks_t* p, const double* root, int32_t i, const
         return s + a[1] * fabs(y[j + 3]) if n == 6 else s
     if nt > 0:
         s = p.mu[i] * root[j + 1] / root[j] * (norm2(y[j + 1], y[j + 2]) if nt == 2 else fabs(y[j + 1]))
-    if p.kind[i] == CONTACT_SPIN:
+    if ends_apart(p.kind[i]):
         s += p.mu[i] * p.patch_radius[i] * root[j + n - 1] / root[j] * fabs(y[j + n - 1])
     return s
 

@@ -1,9 +1,11 @@
 """The arithmetic of one block: the update of a sweep and the error of the judge.
 
 A block is one or more bounded rows (ROW), or a contact: a normal row, then 0, 1 or 2 tangent rows
-(CONTACT), then one spin row (CONTACT_SPIN); or a normal, two tangents, perhaps a spin row, and two rows that roll
-(CONTACT_ROLLING); or a contact of three to five tangents in one cone (ROUND: two that slide, one that spins, two
-that roll, scaled to one mu; law CONE only). With w = A lam - b [m/s] and d = diag(A) [1/kg]:
+(CONTACT), then one spin row (CONTACT_SPIN); or a normal and two tangents, each bounded by itself (CONTACT_BOX, in
+(1) to (7) a contact of one tangent and, in the place of spin, the other: r is then mu_2 / mu_1); or a normal, two
+tangents, perhaps a spin row, and two rows that roll (CONTACT_ROLLING); or a contact of three to five tangents in one
+cone (ROUND: two that slide, one that spins, two that roll, scaled to one mu; law CONE only). With w = A lam - b [m/s]
+and d = diag(A) [1/kg]:
 
     update   row      lam  <- clip(lam - w / d, lower, upper)                                  (1)
              normal   lam_n <- max(0, lam_n - w_n / d_n)                                       (2)
@@ -27,6 +29,7 @@ cdef enum:
     CONTACT = 1
     CONTACT_SPIN = 2
     ROUND = 3
+    CONTACT_BOX = 4
     CONTACT_ROLLING = 5
 
 cdef enum:
@@ -39,11 +42,11 @@ cdef struct blocks_t:
     int32_t n_rows              # m
     int32_t law                 # COULOMB | CONE
     const int32_t* ptr          # (k + 1) first row of each block; ptr[0] = 0, increasing
-    const int32_t* kind         # (k) ROW | CONTACT | CONTACT_SPIN | ROUND | CONTACT_ROLLING
+    const int32_t* kind         # (k) ROW | CONTACT | CONTACT_SPIN | ROUND | CONTACT_BOX | CONTACT_ROLLING
     const double* lower         # (m) N s, read on ROW blocks
     const double* upper         # (m) N s, read on ROW blocks
     const double* mu            # (k) -, >= 0
-    const double* patch_radius  # (k) m, >= 0
+    const double* patch_radius  # (k) m, of CONTACT_BOX mu_2 / mu_1 [-]; >= 0
     const double* b             # (m) m/s
     const double* d             # (m) 1/kg, > 0, equal on the two tangents of a contact, and on the two that roll
     const double* nu            # (m) 1/kg, > 0: velocity error = sqrt(nu d) |e|
@@ -83,9 +86,24 @@ cdef inline bint has_friction(const blocks_t* p) noexcept nogil:
     return False
 
 
+cdef inline int32_t ends_apart(int32_t kind) noexcept nogil:
+    """Has the last row of a contact a bound of its own, mu r lam_n: the spin, the second side of a box?"""
+    return kind == CONTACT_SPIN or kind == CONTACT_BOX
+
+
 cdef inline int32_t n_tangents(int32_t kind, int32_t size) noexcept nogil:
-    # CONTACT and ROUND are odd; rows that spin or roll, each with a bound of its own, are no tangents
+    # that mu lam_n bounds together: CONTACT and ROUND are odd; rows with a bound of their own are left out
     return 2 if kind == CONTACT_ROLLING else size - 2 + (kind & 1)
+
+
+cdef inline int32_t n_directions(int32_t kind, int32_t size) noexcept nogil:
+    """Tangent rows, as directions in space."""
+    return size - 1 - n_turns(kind, size)
+
+
+cdef inline int32_t n_apart(int32_t kind, int32_t size) noexcept nogil:
+    """Rows behind those that mu lam_n bounds together, as bits: 1 on mu r lam_n (`ends_apart`), 2 for two on mu_r lam_n."""
+    return size - 3 if kind == CONTACT_ROLLING else ends_apart(kind)
 
 
 cdef inline int32_t n_turns(int32_t kind, int32_t size) noexcept nogil:
@@ -534,4 +552,4 @@ cdef inline void block_error(const blocks_t* p, int32_t i, const double* lam, co
         round_error(lam + j, w + j, p.d + j, p.mu[i], nt, e + j)
     else:
         contact_error(p.law, lam + j, w + j, p.d + j, p.mu[i], p.patch_radius[i], mu_r(p, i), nt,
-                      n_turns(kind, end - j), e + j)
+                      n_apart(kind, end - j), e + j)

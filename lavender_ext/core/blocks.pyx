@@ -7,10 +7,10 @@ from libc.stdint cimport int32_t
 
 import numpy as np
 
-from lavender_ext.core.block cimport CONTACT, CONTACT_ROLLING, CONTACT_SPIN, ROUND, ROW
+from lavender_ext.core.block cimport CONTACT, CONTACT_BOX, CONTACT_ROLLING, CONTACT_SPIN, ROUND, ROW
 
 #: Kinds of blocks by the kernels' numbers.
-KINDS = (ROW, CONTACT, CONTACT_SPIN, ROUND, CONTACT_ROLLING)
+KINDS = (ROW, CONTACT, CONTACT_SPIN, ROUND, CONTACT_BOX, CONTACT_ROLLING)
 
 cdef double INF = 1.0 / 0.0
 cdef object ndarray = np.ndarray, new = np.empty, F8 = np.dtype(np.float64), I4 = np.dtype(np.int32)
@@ -59,6 +59,9 @@ cdef class Blocks:
             if kind == ROUND:
                 self.has_round = True
                 if not 3 < size <= 6:
+                    return False
+            elif kind == CONTACT_BOX:
+                if size != 3:
                     return False
             elif kind == CONTACT_ROLLING:
                 self.has_rolling = True
@@ -229,19 +232,21 @@ cdef Blocks rows_between(Py_ssize_t m, const double* lower, const double* upper)
     return made if made.look() else None
 
 
-def contacts(Py_ssize_t k, int32_t tangents, mu, radius, rolling):
+def contacts(Py_ssize_t k, int32_t tangents, mu, radius, rolling, bint box=False):
     """k contacts of so many tangents, with a spin row where there is a radius (k,), two that roll where there is mu_r (k,).
 
     mu is a float or (k,) array.
 
+    Boxes have two tangents, and as radius mu_2 / mu_1.
+
     None where anything is amiss.
     """
-    cdef bint spin = radius is not None, rolls = rolling is not None
+    cdef bint spin = radius is not None and not box, rolls = rolling is not None
     cdef int32_t size = 1 + tangents + spin + 2 * rolls, kind
     cdef const double[::1] each = None, patch = None, moment = None
     cdef double one = 0.0
     cdef Py_ssize_t i, j
-    kind = ROUND if tangents > 2 else CONTACT_ROLLING if rolls else CONTACT_SPIN if spin else CONTACT
+    kind = CONTACT_BOX if box else ROUND if tangents > 2 else CONTACT_ROLLING if rolls else CONTACT_SPIN if spin else CONTACT
     if not 0 <= k < 2147483647 // size:
         return None
     if type(mu) is float:
@@ -250,7 +255,7 @@ def contacts(Py_ssize_t k, int32_t tangents, mu, radius, rolling):
         each = mu
         if each.shape[0] != k:
             return None
-    if spin:
+    if radius is not None:
         patch = radius
         if patch.shape[0] != k:
             return None
@@ -264,7 +269,7 @@ def contacts(Py_ssize_t k, int32_t tangents, mu, radius, rolling):
         (<int32_t*>made.at.ptr)[i + 1] = <int32_t>(i + 1) * size
         (<int32_t*>made.at.kind)[i] = kind
         (<double*>made.at.mu)[i] = one if each is None else each[i]
-        (<double*>made.at.patch_radius)[i] = patch[i] if spin else 0.0
+        (<double*>made.at.patch_radius)[i] = 0.0 if patch is None else patch[i]
         (<double*>made.at.rolling)[i] = moment[i] if rolls else 0.0
         for j in range(i * size, (i + 1) * size):
             (<double*>made.at.lower)[j] = 0.0 if j == i * size else -INF

@@ -16,8 +16,8 @@ cimport cython
 
 import numpy as np
 
-from lavender_ext.core.block cimport (CONE, CONTACT_ROLLING, COULOMB, ROUND, ROW, blocks_t, is_pair, n_tangents,
-                                      n_turns, roll_at)
+from lavender_ext.core.block cimport (CONE, CONTACT_BOX, CONTACT_ROLLING, COULOMB, ROUND, ROW, blocks_t, is_pair,
+                                      n_directions, n_tangents, n_turns, roll_at)
 from lavender_ext.core.blocks cimport Blocks
 from lavender_ext.core.csr cimport csr_t
 from lavender_ext.core.generalized cimport Operator, dot, generalized_t, panel_pattern, panel_whiten
@@ -136,7 +136,7 @@ cdef public int32_t lav_rows_diagonal(const blocks_t* p, const rows_t* r, double
         i = r.n_joints + c
         j = p.ptr[i]
         end = p.ptr[i + 1]
-        nt = n_tangents(p.kind[i], end - j)
+        nt = n_directions(p.kind[i], end - j)
         contact_diagonal(r.normal + 3 * c, r.tangent + 3 * c, r.arm_a + 3 * c, r.arm_b + 3 * c, nt,
                          n_turns(p.kind[i], end - j), r.contact_body[2 * c], r.contact_body[2 * c + 1], r.inv_mass,
                          r.inv_inertia, d + j, off,
@@ -144,7 +144,9 @@ cdef public int32_t lav_rows_diagonal(const blocks_t* p, const rows_t* r, double
         for q in range(end - j):
             d[j + q] += r.compliance[j + q]
             step[j + q] = 0.0
-        if nt > 0:
+        if p.kind[i] == CONTACT_BOX:                    # each tangent has a step of its own, and feels the one before
+            coupling[5 * c + 2] = off[0]
+        elif nt > 0:
             step[j + 1] = largest_eigenvalue(d[j + 1], off[0], d[j + 2]) if nt == 2 else d[j + 1]
         if p.kind[i] == CONTACT_ROLLING:
             step[end - 2] = largest_eigenvalue(d[end - 2], off[1], d[end - 1])

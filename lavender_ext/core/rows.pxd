@@ -20,7 +20,7 @@ from libc.float cimport DBL_MAX
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.block cimport (CONTACT_ROLLING, CONTACT_SPIN, blocks_t, n_tangents, n_turns, relax_normal,
+from lavender_ext.core.block cimport (CONTACT_BOX, CONTACT_ROLLING, CONTACT_SPIN, blocks_t, n_directions, n_turns, relax_normal,
                                       relax_row, relax_tangents)
 
 
@@ -36,7 +36,7 @@ cdef struct rows_t:
     const double* arm_a         # (c, 3) m, contact point minus centre of a
     const double* arm_b         # (c, 3) m
     const int32_t* contact_body  # (c, 2)
-    const double* coupling      # (c, 5) 1/kg: A_t1n, A_t2n, A_sn, A_st1, A_st2 without compliance
+    const double* coupling      # (c, 5) 1/kg: A_t1n, A_t2n, A_sn (of a box A_t2t1), A_st1, A_st2 without compliance
     const double* swing         # (contact rows, 6) 1/(kg m): change of -omega_a and omega_b by a unit impulse
     const double* inv_mass      # (n) 1/kg
     const double* inv_inertia   # (n, 9) 1/(kg m^2), world
@@ -158,9 +158,9 @@ cdef inline void swing_body(double* v, double inv_mass, const double* swing, con
 cdef inline void relax_contact(const double* normal, const double* tangent, const double* arm_a,
                                const double* arm_b, const double* coupling, const double* swing,
                                const double* compliance, const double* rhs, const double* step, double mu,
-                               double patch_radius, int32_t nt, int32_t spin, int32_t a, int32_t b,
+                               double patch_radius, int32_t nt, int32_t spin, bint box, int32_t a, int32_t b,
                                const double* inv_mass, double* lam, double* v) noexcept nogil:
-    """One contact: normal, tangents together, spin; all pointers are at this contact's first entry."""
+    """One contact: normal, tangents together (of a box one after the other), spin; all pointers are at its first entry."""
     cdef double u[3]
     cdef double omega[3]
     cdef double t2[3]
@@ -182,7 +182,12 @@ cdef inline void relax_contact(const double* normal, const double* tangent, cons
             cross(normal, tangent, t2)
             old[1] = lam[2]
             w[1] = (dot3(t2, u) + (compliance[2] * lam[2] - rhs[2])) + coupling[1] * dn
-        relax_tangents(lam + 1, w, step[1], mu * y, nt)
+        if box:
+            lam[1] = relax_row(lam[1], w[0], step[1], -(mu * y), mu * y)
+            w[1] += coupling[2] * (lam[1] - old[0])
+            lam[2] = relax_row(lam[2], w[1], step[2], -(mu * patch_radius * y), mu * patch_radius * y)
+        else:
+            relax_tangents(lam + 1, w, step[1], mu * y, nt)
         d0 = lam[1] - old[0]
         for k in range(3):
             impulse[k] += d0 * tangent[k]
@@ -233,14 +238,14 @@ cdef inline void relax_contact_block(const blocks_t* p, const rows_t* r, int32_t
                                      double* v) noexcept nogil:
     # The two common kinds with their sizes as constants: a compiler then leaves out the rows that are not
     # there.
-    cdef int32_t c = i - r.n_joints, j = p.ptr[i], kind = p.kind[i], nt = n_tangents(kind, p.ptr[i + 1] - j), k
+    cdef int32_t c = i - r.n_joints, j = p.ptr[i], kind = p.kind[i], nt = n_directions(kind, p.ptr[i + 1] - j), k
     cdef const double* swing = r.swing + 6 * (j - p.ptr[r.n_joints])
     if kind == CONTACT_ROLLING:
         k = p.ptr[i + 1] - j - 2
         relax_contact(r.normal + 3 * c, r.tangent + 3 * c, r.arm_a + 3 * c, r.arm_b + 3 * c,
                       r.coupling + 5 * c, swing, r.compliance + j, p.b + j, p.step + j, p.mu[i],
                       p.patch_radius[i],
-                      2, k > 3, r.contact_body[2 * c], r.contact_body[2 * c + 1], r.inv_mass, lam + j, v)
+                      2, k > 3, False, r.contact_body[2 * c], r.contact_body[2 * c + 1], r.inv_mass, lam + j, v)
         relax_rolling(r.normal + 3 * c, r.tangent + 3 * c, swing + 6 * k, r.compliance + j + k, p.b + j + k,
                       p.step + j + k, p.rolling[i] * lam[j], r.contact_body[2 * c], r.contact_body[2 * c + 1],
                       lam + j + k, v)
@@ -248,15 +253,19 @@ cdef inline void relax_contact_block(const blocks_t* p, const rows_t* r, int32_t
         relax_contact(r.normal + 3 * c, r.tangent + 3 * c, r.arm_a + 3 * c, r.arm_b + 3 * c,
                       r.coupling + 5 * c, swing, r.compliance + j, p.b + j, p.step + j, p.mu[i],
                       p.patch_radius[i],
-                      nt, kind == CONTACT_SPIN, r.contact_body[2 * c], r.contact_body[2 * c + 1], r.inv_mass,
+                      nt, kind == CONTACT_SPIN, False, r.contact_body[2 * c], r.contact_body[2 * c + 1], r.inv_mass,
                       lam + j, v)
+    elif kind == CONTACT_BOX:
+        relax_contact(r.normal + 3 * c, r.tangent + 3 * c, r.arm_a + 3 * c, r.arm_b + 3 * c,
+                      r.coupling + 5 * c, swing, r.compliance + j, p.b + j, p.step + j, p.mu[i], p.patch_radius[i], 2, 0,
+                      True, r.contact_body[2 * c], r.contact_body[2 * c + 1], r.inv_mass, lam + j, v)
     elif nt == 2:
         relax_contact(r.normal + 3 * c, r.tangent + 3 * c, r.arm_a + 3 * c, r.arm_b + 3 * c,
-                      r.coupling + 5 * c, swing, r.compliance + j, p.b + j, p.step + j, p.mu[i], 0.0, 2, 0,
+                      r.coupling + 5 * c, swing, r.compliance + j, p.b + j, p.step + j, p.mu[i], 0.0, 2, 0, False,
                       r.contact_body[2 * c], r.contact_body[2 * c + 1], r.inv_mass, lam + j, v)
     else:
         relax_contact(r.normal + 3 * c, NULL, r.arm_a + 3 * c, r.arm_b + 3 * c, NULL, swing, r.compliance + j,
-                      p.b + j, p.step + j, 0.0, 0.0, 0, 0, r.contact_body[2 * c], r.contact_body[2 * c + 1],
+                      p.b + j, p.step + j, 0.0, 0.0, 0, 0, False, r.contact_body[2 * c], r.contact_body[2 * c + 1],
                       r.inv_mass, lam + j, v)
 
 
@@ -300,7 +309,7 @@ cdef inline void rows_times(const blocks_t* p, const rows_t* r, const double* v,
         i = r.n_joints + c
         j = p.ptr[i]
         n = p.ptr[i + 1] - j
-        contact_slack(r, c, n_tangents(p.kind[i], n), n_turns(p.kind[i], n), v, out + j)
+        contact_slack(r, c, n_directions(p.kind[i], n), n_turns(p.kind[i], n), v, out + j)
 
 
 cdef inline void contact_jacobian(const rows_t* r, int32_t c, int32_t nt, int32_t turns,

@@ -28,11 +28,11 @@ no key has claimed. A stale or false entry is left alone, or corrected by the sw
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t, uint64_t
 
-from lavender_ext.core.block cimport CONTACT, CONTACT_ROLLING, CONTACT_SPIN
+from lavender_ext.core.block cimport CONTACT, CONTACT_BOX, CONTACT_ROLLING, CONTACT_SPIN
 from lavender_ext.core.rows cimport (contact_diagonal, contact_slack, cross, dot3, largest_eigenvalue,
                                      reciprocal, relative_velocity, rows_t)
 from lavender_ext.engine.arrays cimport (ALTERNATING, AVBD, BOX, CAP_CONTACT, H_CACHED, H_CONTACTS, H_CONTACT_ROWS,
-                                         H_MATCHES, H_ORDER, H_PAIRS, H_STEP, H_STEPPER, H_WARM_START,
+                                         H_FRICTION_SHAPE, H_MATCHES, H_ORDER, H_PAIRS, H_STEP, H_STEPPER, H_WARM_START,
                                          N_CACHE_IMPULSE, N_JOINT, N_JOINT_ROW, ROWS_PER_CONTACT,
                                          S_BETA, S_BOUNCE, S_H, S_MARGIN, S_MATCH, S_ROLLING, S_SLOP, engine_t)
 from lavender_ext.engine.bodies cimport to_body
@@ -187,7 +187,11 @@ cdef inline void make_contact(engine_t* e, const rows_t* r, int32_t c, int32_t r
     for k in range(1 + nt + turns):
         d[k] += e.compliance[row + k]
     e.step[row] = reciprocal(d[0])
-    if nt > 0:
+    if nt > 0 and e.head[H_FRICTION_SHAPE]:
+        e.coupling[5 * c + 2] = off[0]
+        e.step[row + 1] = reciprocal(d[1])
+        e.step[row + 2] = reciprocal(d[2])
+    elif nt > 0:
         e.step[row + 1] = reciprocal(largest_eigenvalue(d[1], off[0], d[2]))
         e.step[row + 2] = e.step[row + 1]
         d[1] = 0.5 * (d[1] + d[2])
@@ -227,7 +231,7 @@ cdef inline int32_t make_contacts(engine_t* e, const rows_t* r) noexcept nogil:
     cdef manifold_t m
     cdef double tangent[3]
     cdef int32_t entry[4]
-    cdef int32_t i, j, k, a, b, nt, turns, start, c = 0, row = e.size[N_JOINT_ROW], block
+    cdef int32_t i, j, k, a, b, nt, turns, box, start, c = 0, row = e.size[N_JOINT_ROW], block
     cdef int32_t matches = 0, last_first = backwards(e), cached = e.head[H_CACHED]
     cdef int32_t first = cached if last_first else 0
     cdef double mu, patch, bounce, margin = e.setting[S_MARGIN]
@@ -260,9 +264,10 @@ cdef inline int32_t make_contacts(engine_t* e, const rows_t* r) noexcept nogil:
         for j in range(m.n):
             make_contact(e, r, c, row, a, b, &m, m.n - 1 - j if last_first else j, tangent, nt, turns)
             block = e.size[N_JOINT] + c
-            e.kind[block] = CONTACT_ROLLING if turns & 2 else CONTACT_SPIN if turns else CONTACT
+            box = nt > 0 and e.head[H_FRICTION_SHAPE]
+            e.kind[block] = CONTACT_BOX if box else CONTACT_ROLLING if turns & 2 else CONTACT_SPIN if turns else CONTACT
             e.mu[block] = mu
-            e.patch_radius[block] = patch if turns & 1 else 0.0
+            e.patch_radius[block] = 1.0 if box else patch if turns & 1 else 0.0
             if e.size[ROWS_PER_CONTACT] > 4:
                 e.rolling[block] = e.setting[S_ROLLING] if turns & 2 else 0.0
             for k in range(1 + nt + turns):

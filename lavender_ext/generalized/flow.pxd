@@ -6,7 +6,8 @@ those of the judge.
 from libc.math cimport sqrt
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.block cimport CONE, CONTACT_ROLLING, CONTACT_SPIN, ROW, block_error, blocks_t, n_tangents, row_error
+from lavender_ext.core.block cimport (CONE, CONTACT_ROLLING, ROW, block_error, blocks_t, ends_apart, n_tangents,
+                                      row_error)
 from lavender_ext.core.generalized cimport generalized_t, panel_push, panel_times
 from lavender_ext.generalized.soft cimport cone_map, coulomb_map, rolling_response
 from lavender_ext.judge.score cimport nothing, tally_block, tally_row, tally_t
@@ -139,7 +140,7 @@ cdef inline void respond(const flow_t* f, int32_t first, int32_t last, const dou
         for k in range(j, end):
             lam[k] = (rho[k] * center[k] - s[k]) * soft[k]
         nt = n_tangents(kind[i], end - j)
-        spin = kind[i] == CONTACT_SPIN
+        spin = ends_apart(kind[i])
         if kind[i] == CONTACT_ROLLING:
             rolling_response(f.p.law, end - j, f.theta + j, f.p.mu[i], f.p.patch_radius[i], f.p.rolling[i], lam + j, v + at)
         elif cone:

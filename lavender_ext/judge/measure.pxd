@@ -9,7 +9,7 @@ core/velocity.pxd forms M^-1 J^T lam, and a second loop reads J v.
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.block cimport (ROW, block_error, blocks_t, contact_error, mu_r, n_tangents, n_turns,
+from lavender_ext.core.block cimport (CONTACT_BOX, ROW, block_error, blocks_t, contact_error, mu_r, n_directions, n_turns,
                                       row_error)
 from lavender_ext.core.csr cimport csr_abs_dot, csr_dot, csr_dot_size, csr_t
 from lavender_ext.core.generalized cimport (generalized_t, jac_push, jac_row, panel_push_size, panel_size,
@@ -169,7 +169,7 @@ cdef inline void velocity_size(const blocks_t* p, const rows_t* r, const double*
     for c in range(r.n_contacts):
         i = r.n_joints + c
         j = p.ptr[i]
-        nt = n_tangents(p.kind[i], p.ptr[i + 1] - j)
+        nt = n_directions(p.kind[i], p.ptr[i + 1] - j)
         turns = n_turns(p.kind[i], p.ptr[i + 1] - j)
         if turns or nt == 1:                            # the two common kinds with their sizes as constants
             contact_wrench_size(r, c, nt, turns, lam + j, size)
@@ -249,15 +249,15 @@ cdef inline void contact_sizes(const rows_t* r, int32_t c, int32_t nt, int32_t t
 
 
 cdef inline void judge_contact(const blocks_t* p, const rows_t* r, int32_t c, int32_t j, int32_t nt, int32_t turns,
-                               const double* lam, double* w, double* e, const double* v,
+                               bint box, const double* lam, double* w, double* e, const double* v,
                                tally_t* s) noexcept nogil:
-    cdef int32_t k, i = r.n_joints + c
+    cdef int32_t k, i = r.n_joints + c, together = 1 if box else nt, apart = 1 if box else turns
     cdef double size[6]
     contact_slack(r, c, nt, turns, v, w + j)
     for k in range(j, j + 1 + nt + turns):
         w[k] += r.compliance[k] * lam[k] - p.b[k]
-    contact_error(p.law, lam + j, w + j, p.d + j, p.mu[i], p.patch_radius[i], mu_r(p, i), nt, turns, e + j)
-    tally_contact(p, j, nt, turns, e, s)
+    contact_error(p.law, lam + j, w + j, p.d + j, p.mu[i], p.patch_radius[i], mu_r(p, i), together, apart, e + j)
+    tally_contact(p, j, together, apart, e, s)
     contact_sizes(r, c, nt, turns, v + 6 * <ssize_t>r.n_bodies, size)
     for k in range(1 + nt + turns):
         tally_floor(p, j + k, r.compliance[j + k] * fabs(lam[j + k]) + size[k], s)
@@ -280,14 +280,16 @@ cdef inline tally_t rows_pass(const blocks_t* p, const rows_t* r, const double* 
     for c in range(r.n_contacts):
         i = r.n_joints + c
         j = p.ptr[i]
-        nt = n_tangents(p.kind[i], p.ptr[i + 1] - j)
+        nt = n_directions(p.kind[i], p.ptr[i + 1] - j)
         turns = n_turns(p.kind[i], p.ptr[i + 1] - j)
         if turns or nt == 1:
-            judge_contact(p, r, c, j, nt, turns, lam, w, e, v, &s)
+            judge_contact(p, r, c, j, nt, turns, False, lam, w, e, v, &s)
+        elif p.kind[i] == CONTACT_BOX:
+            judge_contact(p, r, c, j, 2, 0, True, lam, w, e, v, &s)
         elif nt == 2:
-            judge_contact(p, r, c, j, 2, 0, lam, w, e, v, &s)
+            judge_contact(p, r, c, j, 2, 0, False, lam, w, e, v, &s)
         else:
-            judge_contact(p, r, c, j, 0, 0, lam, w, e, v, &s)
+            judge_contact(p, r, c, j, 0, 0, False, lam, w, e, v, &s)
     return s
 
 
@@ -319,7 +321,7 @@ cdef inline void rows_judge(const blocks_t* p, const rows_t* r, const double* la
                 add_floor(p, k, r.compliance[k] * fabs(lam[k])
                           + joint_size(r.jac + 12 * k, sizes, r.joint_body[2 * i], r.joint_body[2 * i + 1]), &total, &big)
             continue
-        nt = n_tangents(p.kind[i], p.ptr[i + 1] - j)
+        nt = n_directions(p.kind[i], p.ptr[i + 1] - j)
         contact_sizes(r, c, nt, n_turns(p.kind[i], p.ptr[i + 1] - j), sizes, size)
         for k in range(p.ptr[i + 1] - j):
             add_floor(p, j + k, r.compliance[j + k] * fabs(lam[j + k]) + size[k], &total, &big)

@@ -5,18 +5,19 @@ Prepared numbers of block i stand from g[start[i]] on:
     one row                      nothing: lam <- clip(lam - w / d)
     rows, 2 to 8, all free       W^-1 (n, n), then 1; where W is singular W, then 0
     rows, 2 to 8, bounded        W (n, n), then 0
-    normal, two tangents         prepare3 of local/exact.pxd; g[15] = 1 where the rows of A share one pattern
+    normal, two tangents, disk or box    prepare3 of local/exact.pxd; g[15] = 1 where the rows of A share one pattern
     round cones                  prepare_round of local/round.pxd
     other contacts               W (n, n)
 """
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.block cimport (CONE, CONTACT_ROLLING, CONTACT_SPIN, ROUND, ROW, blocks_t, mu_r, n_tangents,
-                                      n_turns, relax_normal, relax_row)
+from lavender_ext.core.block cimport (CONE, CONTACT, CONTACT_BOX, CONTACT_ROLLING, ROUND, ROW, blocks_t, ends_apart, mu_r,
+                                      n_directions, n_tangents, n_turns, relax_normal, relax_row)
 from lavender_ext.core.csr cimport csr_dot, csr_t
 from lavender_ext.core.generalized cimport generalized_t, whitened_dot, whitened_push
 from lavender_ext.core.rows cimport (cross, dot3, joint_push, joint_velocity, push_bodies, relative_velocity,
                                      relax_joint, rows_t, swing_body)
+from lavender_ext.local.box cimport box3_from
 from lavender_ext.local.cone cimport cone3
 from lavender_ext.local.coulomb cimport PREPARED, coulomb3_from, prepare3
 from lavender_ext.local.exact cimport boxed_rows, contact_with_spin, contact_without_spin, project_locally
@@ -25,11 +26,22 @@ from lavender_ext.local.round cimport prepare_round, round_contact
 from lavender_ext.local.small cimport FAILED, MAX_ROWS, eliminate
 
 
+cdef inline bint is_plain3(int32_t kind, int32_t n) noexcept nogil:
+    # a normal and two tangents, in a disk or a box
+    return n == 3 and (kind == CONTACT or kind == CONTACT_BOX)
+
+
+cdef inline int32_t coulomb_block3(const blocks_t* p, int32_t i, const double* g, const double* w, double* lam) noexcept nogil:
+    if p.kind[i] == CONTACT_BOX:
+        return box3_from(g, w, p.mu[i], p.mu[i] * p.patch_radius[i], lam)
+    return coulomb3_from(g, w, p.mu[i], lam)
+
+
 cdef inline int32_t prepared_size(const blocks_t* p, int32_t i) noexcept nogil:
     cdef int32_t n = p.ptr[i + 1] - p.ptr[i]
     if p.kind[i] == ROW:
         return n * n + 1 if 1 < n <= MAX_ROWS else 0
-    if p.kind[i] != CONTACT_SPIN and n == 3:
+    if is_plain3(p.kind[i], n):
         return PREPARED
     if p.kind[i] == ROUND:
         return n * n + (n - 1) * n
@@ -44,11 +56,13 @@ cdef inline void prepare_block(const blocks_t* p, int32_t i, const double* W, in
     cdef double a[MAX_ROWS * MAX_ROWS]
     cdef double x[MAX_ROWS]
     if p.kind[i] != ROW:
-        if p.kind[i] != CONTACT_SPIN and n == 3:
+        if is_plain3(p.kind[i], n):
             prepare3(W, g)
             # A normal whose d falls back has no trustworthy W_nn to divide by.
             if W[0] != p.d[j]:
                 g[9] = 0.0
+                if p.kind[i] == CONTACT_BOX:
+                    g[0] = 0.0
             g[15] = one_pattern
         elif p.kind[i] == ROUND:
             prepare_round(n, W, g)
@@ -105,8 +119,8 @@ cdef inline int32_t solve_block(const blocks_t* p, int32_t i, const double* g, c
         lam[0] = relax_normal(lam[0], w[0], p.step[j])
         return 0
     nt = n_tangents(kind, n)
-    if n == 3 and kind != CONTACT_SPIN and p.law != CONE:
-        if coulomb3_from(g, w, p.mu[i], lam) != FAILED:
+    if is_plain3(kind, n) and p.law != CONE:
+        if coulomb_block3(p, i, g, w, lam) != FAILED:
             return 0
     # q = w - W lam
     for k in range(n):
@@ -118,7 +132,7 @@ cdef inline int32_t solve_block(const blocks_t* p, int32_t i, const double* g, c
         found = round_contact(n, g, q, p.d + j, p.mu[i], lam)
     elif kind == CONTACT_ROLLING:
         found = rolling_contact(p.law, n, g, q, p.d + j, p.mu[i], p.patch_radius[i], p.rolling[i], lam)
-    elif kind == CONTACT_SPIN:
+    elif ends_apart(kind):
         found = contact_with_spin(p.law, nt, g, q, p.mu[i], p.patch_radius[i], lam)
     elif n < 3:
         found = contact_without_spin(p.law, nt, g, q, p.mu[i], lam)
@@ -167,7 +181,7 @@ cdef inline int32_t solve_csr_block(const blocks_t* p, const csr_t* a, int32_t i
         for k in range(j, j + n):
             lam[k] = relax_row(lam[k], csr_dot(a, k, lam) - p.b[k], p.step[k], p.lower[k], p.upper[k])
         return 1
-    if n == 3 and p.kind[i] != ROW and p.kind[i] != CONTACT_SPIN and g[15] != 0.0:
+    if is_plain3(p.kind[i], n) and g[15] != 0.0:
         csr_dot3(a, j, lam, w)
         w[0] -= p.b[j]
         w[1] -= p.b[j + 1]
@@ -203,7 +217,7 @@ cdef inline int32_t solve_general_block(const blocks_t* p, const generalized_t* 
 
 cdef inline int32_t solve_sliding_contact(const blocks_t* p, const rows_t* r, int32_t i, const double* g, double* lam,
                                           double* v) noexcept nogil:
-    # The common kind, normal and two tangents under Coulomb's law; lam at its normal.
+    # The common kinds, normal and two tangents under Coulomb's law; lam at its normal.
     cdef int32_t j = p.ptr[i], c = i - r.n_joints, a = r.contact_body[2 * c], b = r.contact_body[2 * c + 1], k
     cdef double w[3]
     cdef double u[3]
@@ -220,7 +234,7 @@ cdef inline int32_t solve_sliding_contact(const blocks_t* p, const rows_t* r, in
     w[1] = dot3(t1, u) + (r.compliance[j + 1] * x - p.b[j + 1])
     w[2] = dot3(t2, u) + (r.compliance[j + 2] * y - p.b[j + 2])
     k = 0
-    if coulomb3_from(g, w, p.mu[i], lam) == FAILED:
+    if coulomb_block3(p, i, g, w, lam) == FAILED:
         k = solve_block(p, i, g, w, lam)
     n = lam[0] - n
     x = lam[1] - x
@@ -248,7 +262,7 @@ cdef inline int32_t solve_rows_block(const blocks_t* p, const rows_t* r, int32_t
     cdef const double* normal
     cdef const double* t1
     w[0] = t2[0] = t2[1] = t2[2] = 0.0
-    if c >= 0 and n == 3 and p.kind[i] != CONTACT_SPIN and p.law != CONE:
+    if c >= 0 and is_plain3(p.kind[i], n) and p.law != CONE:
         return solve_sliding_contact(p, r, i, g, lam + j, v)
     if c < 0:
         if n > MAX_ROWS:
@@ -266,7 +280,7 @@ cdef inline int32_t solve_rows_block(const blocks_t* p, const rows_t* r, int32_t
     a = r.contact_body[2 * c]
     b = r.contact_body[2 * c + 1]
     turns = n_turns(p.kind[i], n)
-    nt = n_tangents(p.kind[i], n)
+    nt = n_directions(p.kind[i], n)
     roll = 1 + nt + (turns & 1)
     normal = r.normal + 3 * c
     t1 = r.tangent + 3 * c

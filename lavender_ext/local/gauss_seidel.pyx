@@ -8,7 +8,7 @@ from libc.stdint cimport int32_t, uint64_t
 
 import numpy as np
 
-from lavender_ext.core.block cimport blocks_t, n_tangents, n_turns
+from lavender_ext.core.block cimport blocks_t, n_directions, n_turns
 from lavender_ext.core.csr cimport csr_t
 from lavender_ext.core.generalized cimport dot, generalized_t
 from lavender_ext.core.order cimport advance_order
@@ -68,7 +68,7 @@ cdef public void lav_prepare_rows(const blocks_t* p, const rows_t* r, const int3
         n = p.ptr[i + 1] - j
         c = i - r.n_joints
         if c >= 0:
-            contact_jacobian(r, c, n_tangents(p.kind[i], n), n_turns(p.kind[i], n), jac)
+            contact_jacobian(r, c, n_directions(p.kind[i], n), n_turns(p.kind[i], n), jac)
             row = jac
         else:
             row = r.jac + 12 * j

@@ -1,7 +1,7 @@
 """Two blocks of one kind at once, one in each lane: the update of core/rows.pxd, operation by operation.
 
-A kind is what a compiler or a branch must know: a contact's rows (a normal; with two tangents; and spin), or a joint's
-number of rows and which of its bodies move. The scalar update stays the truth; a block of another kind, or of more
+A kind is what a compiler or a branch must know: a contact's rows (a normal; with two tangents in a disk or a box; and
+spin), or a joint's number of rows and which of its bodies move. The scalar update stays the truth; a block of another kind, or of more
 rows, has the kind ALONE and is updated by it.
 
 A record holds what an update reads, in pairs, one entry for each lane:
@@ -9,14 +9,14 @@ A record holds what an update reads, in pairs, one entry for each lane:
     header      places of both bodies in v [bytes], where read, where written; a number of its owner's; kind and size
     impulses    n
     contact     normal 3, arms 3 and 3, inverse masses 2; of each row compliance, b, step, swing 6;
-                with tangents t1 3, t2 3, mu, A_t1n, A_t2n; with spin mu r, A_sn, A_st1, A_st2
+                with tangents t1 3, t2 3, mu, A_t1n, A_t2n; with spin mu r, A_sn, A_st1, A_st2; of a box mu_2, A_t2t1
     joint       of each row compliance, b, step, lower, upper, J 12, M^-1 J^T 12
 
 Where a block has no partner both lanes hold it, and what the second computes is written where nobody reads.
 """
 from libc.stdint cimport int32_t, int64_t
 
-from lavender_ext.core.block cimport CONTACT, CONTACT_SPIN, blocks_t, relax_tangents
+from lavender_ext.core.block cimport CONTACT, CONTACT_BOX, CONTACT_SPIN, blocks_t, relax_tangents
 from lavender_ext.core.rows cimport cross, relax_rows_block, rows_t
 from lavender_ext.sweep.pair cimport (LANES, all_within, at, both, clip_pair, gather, gather_six, not_below_zero, pair_t,
                                       scatter_six)
@@ -25,6 +25,7 @@ from lavender_ext.sweep.pair cimport (LANES, all_within, at, both, clip_pair, ga
 cdef enum:                      # kinds
     ALONE = 0
     NORMAL = 1
+    SQUARE = 2                  # a box
     DISK = 3
     SPIN = 4
     JOINT = 5                   # + 4 (rows - 1) + 2 where a moves + 1 where b does
@@ -50,6 +51,7 @@ cdef enum:                      # pairs
     T_COUPLING = 7
     T_SIZE = 9
     S_SIZE = 4
+    B_SIZE = 2
     J_ROW_SIZE = 29
 
 
@@ -59,11 +61,14 @@ cdef struct disk_t:
     pair_t header
 cdef struct spin_t:
     pair_t header
+cdef struct square_t:
+    pair_t header
 
 ctypedef fused contact_t:
     normal_t
     disk_t
     spin_t
+    square_t
 
 
 cdef inline int32_t kind_of(const blocks_t* p, const rows_t* r, int32_t i) noexcept nogil:
@@ -72,6 +77,8 @@ cdef inline int32_t kind_of(const blocks_t* p, const rows_t* r, int32_t i) noexc
         if n > MOST_ROWS:
             return ALONE
         return JOINT + 4 * (n - 1) + 2 * (r.joint_body[2 * i] >= 0) + (r.joint_body[2 * i + 1] >= 0)
+    if p.kind[i] == CONTACT_BOX:
+        return SQUARE
     if p.kind[i] == CONTACT and (n == NORMAL or n == DISK) or p.kind[i] == CONTACT_SPIN and n == SPIN:
         return n
     return ALONE
@@ -79,7 +86,7 @@ cdef inline int32_t kind_of(const blocks_t* p, const rows_t* r, int32_t i) noexc
 
 cdef inline int32_t rows_of(int32_t kind) noexcept nogil:
     # impulses in a record; a block alone has its own where they were
-    return kind if kind < JOINT else 1 + (kind - JOINT) // 4
+    return 3 if kind == SQUARE else kind if kind < JOINT else 1 + (kind - JOINT) // 4
 
 
 cdef inline int32_t record_size(int32_t kind) noexcept nogil:
@@ -87,7 +94,7 @@ cdef inline int32_t record_size(int32_t kind) noexcept nogil:
     if kind >= JOINT:
         return HEADER + (1 + J_ROW_SIZE) * n
     return HEADER + (0 if kind == ALONE else n + C_ROW + C_ROW_SIZE * n
-                     + (T_SIZE if n > 1 else 0) + (S_SIZE if n == SPIN else 0))
+                     + (T_SIZE if n > 1 else 0) + (S_SIZE if n == SPIN else 0) + (B_SIZE if kind == SQUARE else 0))
 
 
 cdef inline const int32_t* bodies_of(const rows_t* r, int32_t i) noexcept nogil:
@@ -130,11 +137,11 @@ cdef inline void pack_contact(const blocks_t* p, const rows_t* r, int32_t i, int
     put(out + 3, 3, t2, t2 + 3)
     out[T_MU] = gather(p.mu + i, p.mu + j)
     put(out + T_COUPLING, 2, r.coupling + 5 * c, r.coupling + 5 * d)
-    if n == SPIN:
+    if n == SPIN or p.kind[i] == CONTACT_BOX:
         m[0] = p.mu[i] * p.patch_radius[i]
         m[1] = p.mu[j] * p.patch_radius[j]
         out[T_SIZE] = gather(m, m + 1)
-        put(out + T_SIZE + 1, 3, r.coupling + 5 * c + 2, r.coupling + 5 * d + 2)
+        put(out + T_SIZE + 1, 3 if n == SPIN else 1, r.coupling + 5 * c + 2, r.coupling + 5 * d + 2)
 
 
 cdef inline void pack_joint(const blocks_t* p, const rows_t* r, int32_t i, int32_t j, int32_t n,
@@ -230,8 +237,16 @@ cdef inline void relax_contact_lanes(const contact_t* c, pair_t* lam, double* v,
         z = row[2]                                      # one step for both
         row += C_ROW_SIZE
         d1 = lam[2]
-        x[1] = d1 - ((dot_pair(t + 3, u) + (row[0] * d1 - row[1])) + t[T_COUPLING + 1] * dn) * z
-        project_tangents(x, t[T_MU] * y)
+        x[1] = (dot_pair(t + 3, u) + (row[0] * d1 - row[1])) + t[T_COUPLING + 1] * dn
+        if contact_t is square_t:
+            z = t[T_MU] * y
+            x[0] = clip_pair(x[0], -z, z)
+            x[1] = d1 - (x[1] + t[T_SIZE + 1] * (x[0] - d0)) * row[2]
+            z = t[T_SIZE] * y
+            x[1] = clip_pair(x[1], -z, z)
+        else:
+            x[1] = d1 - x[1] * z
+            project_tangents(x, t[T_MU] * y)
         lam[1] = x[0]
         lam[2] = x[1]
         d0 = x[0] - d0
@@ -307,6 +322,8 @@ cdef inline void relax_record(const blocks_t* p, const rows_t* r, const pair_t* 
         relax_contact_lanes(<const disk_t*>c, lam, v, to)
     elif kind == NORMAL:
         relax_contact_lanes(<const normal_t*>c, lam, v, to)
+    elif kind == SQUARE:
+        relax_contact_lanes(<const square_t*>c, lam, v, to)
     elif kind == SPIN:
         relax_contact_lanes(<const spin_t*>c, lam, v, to)
     elif kind >= JOINT:

@@ -9,7 +9,7 @@ rounds are, and rises where one fails. A point counts by the judge's residual al
 from libc.math cimport sqrt
 from libc.stdint cimport int32_t, int64_t, uint64_t
 
-from lavender_ext.core.block cimport CONTACT, CONTACT_ROLLING, CONTACT_SPIN as SPIN, ROW, blocks_t
+from lavender_ext.core.block cimport CONTACT, CONTACT_ROLLING, CONTACT_SPIN as SPIN, ROW, blocks_t, ends_apart
 from lavender_ext.core.rows cimport relax_rows_block, rows_t
 from lavender_ext.core.velocity cimport rows_velocity
 from lavender_ext.factor.blocks cimport factor_t
@@ -170,7 +170,7 @@ cdef inline void make_pattern(pattern_t* a, const blocks_t* p, const rows_t* r) 
                 a.body[2 * k + 1] = body[1]
                 k += 1
         else:
-            a.kind[k] = SPIN if p.kind[i] == SPIN else CONTACT
+            a.kind[k] = SPIN if ends_apart(p.kind[i]) else CONTACT
             a.ptr[k + 1] = j + nr
             a.wptr[k + 1] = a.wptr[k] + nr * nr
             a.body[2 * k] = body[0]
@@ -249,7 +249,7 @@ cdef inline void lay_numbers(walk_t* w, const pattern_t* a, double* real, const 
             k += p.ptr[i + 1] - j
             continue
         at[k] = p.mu[i] * w.scale[j] / w.scale[j + 1]
-        if p.kind[i] == SPIN:
+        if ends_apart(p.kind[i]):
             h = p.ptr[i + 1] - 1
             spin[k] = p.mu[i] * p.patch_radius[i] * w.scale[j] / w.scale[h]
         k += 1

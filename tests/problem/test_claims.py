@@ -48,6 +48,8 @@ def says(status, **more):
 
 # -- finite numbers -----------------------------------------------------------------------------------
 
+ANEW = ("n_tangents", "n_together", "ends_apart", "coefficients")
+
 
 @pytest.mark.parametrize("name", lv.available(FLOORLESS, external=False))
 def test_a_floor_that_is_not_finite_excuses_nothing(name):
@@ -199,7 +201,15 @@ def test_every_array_of_a_problem_is_read_only(form):
         (name, array)
         for name, array in arrays_of(problem, "problem", set())
         # Worked out anew at each call, and the caller's own.
-        if not name.endswith(("cones.n_tangents", "operator.parents"))
+        if not name.endswith(
+            (
+                "cones.n_tangents",
+                "cones.n_together",
+                "cones.ends_apart",
+                "cones.coefficients",
+                "operator.parents",
+            )
+        )
     ]
     names = {name for name, _ in kept}
     assert {"problem.b", "problem.csr.data", "problem.csr_data.d", "problem.cones.lower"} <= names

@@ -44,6 +44,7 @@ SCENES = [
     ("bridge", {"stepper": "soft_step", "solver_iterations": 2}, {}),
     ("bridge", {"n": 5, "stepper": "xpbd"}, {}),
     ("bridge", {"n": 5, "stepper": "avbd"}, {}),
+    ("pile", {"n": 30, "kind": "mixed", "friction_shape": "box"}, {}),
 ]
 
 
@@ -53,6 +54,7 @@ NEWTON_SCENES = [
     ("stack", {}, {40: {"warm_start": 0}, 80: {"warm_start": 1}}),
     ("pyramid", {"base": 5, "friction": 0.15}, {}),
     ("pile", {"n": 12, "kind": "mixed"}, {}),
+    ("pyramid", {"base": 4, "friction_shape": "box"}, {}),
     ("bridge", {"n": 5}, {}),
     ("chain", {}, {60: {"warm_start": 0}}),
     ("four_bar", {}, {}),

@@ -151,6 +151,8 @@ def test_settings_of_each_side_are_the_native_ones(visit):
     v.side(1).locator(".sweeps input").fill("4")
     v.side(1).locator(".warm input").check()
     v.side(1).locator(".order").select_option(label="random")
+    v.side(1).locator(".box input").check()
+    assert v.js("location.hash").split("&b=")[1].startswith("4,warm,random,box")
     assert v.side(0).locator(".sweeps output").text_content() == "40"
     for _ in range(3):
         v.page.click("#step")
@@ -158,7 +160,7 @@ def test_settings_of_each_side_are_the_native_ones(visit):
     for _ in range(5):
         v.page.click("#step")
     assert v.values(0)[0] == native("pyramid", 5, order="top_down", solver_iterations=40)
-    assert v.values(1)[0] == native("pyramid", 5, order="random", solver_iterations=4)
+    assert v.values(1)[0] == native("pyramid", 5, order="random", solver_iterations=4, friction_shape="box")
 
 
 def test_plots_hold_the_native_errors(visit):

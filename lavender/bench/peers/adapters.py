@@ -120,6 +120,8 @@ def _backend(backend: Backend, form: str) -> Contestant:
     def refuses(problem: Problem) -> str | None:
         if form == "velocity" and problem.rows is None:
             return "no rows"
+        if problem.law not in registry.get(backend.name).laws:
+            return "friction"
         return registry.get(backend.name).refuses(problem)
 
     return Contestant(f"{backend.name} ({form})", True, runs, refuses)

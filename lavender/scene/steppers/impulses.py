@@ -13,6 +13,7 @@ SPEC = StepperSpec(
     number=0,
     summary="speculative contacts, warm-started sweeps over velocities, position projection",
     reference="Catto, Iterative Dynamics with Temporal Coherence, 2005; Guendelman, Bridson, Fedkiw, 2003",
+    boxes=True,
     sweeps=(4, 64),
     order="alternating",
     position_iterations=2,

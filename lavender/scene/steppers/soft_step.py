@@ -16,6 +16,7 @@ SPEC = StepperSpec(
     number=1,
     summary="soft contacts and joints by sweeps with bias, then relaxing sweeps without",
     reference="Catto, Solver2D, 2024",
+    boxes=True,
     sweeps=(1, 64),
     order="given",
     position_iterations=0,

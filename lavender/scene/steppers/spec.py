@@ -42,6 +42,7 @@ class StepperSpec:
     solvers: bool = False  # another solver may take the place of its sweeps
     spin: bool = False  # friction of a patch against spinning
     rolling: bool = False  # friction against rolling
+    boxes: bool = False  # friction of each tangent by itself, Scene(friction_shape="box")
     restitution: bool = True
     residuals: bool = True  # `observation["solver"]` holds residuals; else NaN
     exact_problem: bool = False  # `constraint_problem()` solved by sequential_impulses gives the step's bits

@@ -160,7 +160,7 @@ def _mixed_elements(problem: Problem) -> _Elements:
     position = np.arange(m) - np.repeat(cones.ptr[:-1], size)
     contact = np.repeat(cones.kind != ROW, size)
     spin, rolling = np.zeros(m, bool), np.zeros(m, bool)
-    spin[cones.spin_rows[cones.spin_rows >= 0]] = True
+    spin[cones.apart_rows[cones.apart_rows >= 0]] = True
     rolling[cones.rolling_rows[cones.rolling_rows >= 0] + 1] = True  # the last of the two
     still = np.asarray(cones.lower == cones.upper)
     still |= contact & (position > 0) & (cones.reach == 0.0)

@@ -132,6 +132,7 @@ class Side {
     this.sweeps = pick(".sweeps input");
     this.sweepsShown = pick(".sweeps output");
     this.warm = pick(".warm input");
+    this.box = pick(".box input");
     this.order = pick(".order");
     this.solver = pick(".solver");
     this.told = pick(".told");
@@ -152,6 +153,7 @@ class Side {
     }
     this.sweeps.addEventListener("input", () => this.set({ iterations: Number(this.sweeps.value) }));
     this.warm.addEventListener("change", () => this.set({ warm_start: Number(this.warm.checked) }));
+    this.box.addEventListener("change", () => this.set({ box: Number(this.box.checked) }));
     this.order.addEventListener("change", () => this.set({ order: Number(this.order.value) }));
     this.solver.addEventListener("change", () => this.set({ solver: this.solver.value }));
     this.view = new View(this.canvas);
@@ -166,8 +168,8 @@ class Side {
   load(scene) {
     const before = this.settings;
     this.simulation = new Simulation(new Kernels(this.app.module, this.app.contents.layout), scene);
-    const { iterations, warm_start, order, solver } = before ?? { ...this.settings, ...DEFAULTS[this.index] };
-    this.simulation.set({ iterations, warm_start, order });
+    const { iterations, warm_start, order, solver, box } = before ?? { ...this.settings, ...DEFAULTS[this.index] };
+    this.simulation.set({ iterations, warm_start, order, box });
     this.choose(solver);
     this.start = Float64Array.from(this.simulation.array("x"));
     this.forget();
@@ -250,7 +252,7 @@ class Side {
   }
 
   readSettings() {
-    const { iterations, warm_start, order, solver } = this.settings;
+    const { iterations, warm_start, order, solver, box } = this.settings;
     const newton = solver === "newton";
     this.solver.value = solver;
     this.sweeps.disabled = newton; // it asks for a residual, not for a number of sweeps
@@ -258,6 +260,7 @@ class Side {
     this.sweeps.value = iterations;
     this.sweepsShown.textContent = iterations;
     this.warm.checked = Boolean(warm_start);
+    this.box.checked = Boolean(box);
     this.order.value = order;
   }
 
@@ -481,8 +484,9 @@ class App {
     const name = given.get("scene") ?? words;
     this.choose(scenes.includes(name) ? name : scenes[0]);
     ["a", "b"].forEach((key, i) => {
-      const [sweeps, warm, order, solver] = (given.get(key) ?? "").split(",");
-      const changes = { solver: ["newton", "soft_step"].includes(solver) ? solver : "sweeps" };
+      const [sweeps, warm, order, ...more] = (given.get(key) ?? "").split(",");
+      const solver = more.find((word) => ["newton", "soft_step"].includes(word)) ?? "sweeps";
+      const changes = { solver, box: Number(more.includes("box")) };
       if (Number(sweeps) >= 4 && Number(sweeps) <= 64) {
         changes.iterations = Math.round(Number(sweeps));
       }
@@ -506,7 +510,8 @@ class App {
       return;
     }
     const said = this.sides.map(({ settings: s }) =>
-      [s.iterations, s.warm_start ? "warm" : "cold", ORDERS[s.order], ...(s.solver === "sweeps" ? [] : [s.solver])].join(","));
+      [s.iterations, s.warm_start ? "warm" : "cold", ORDERS[s.order], ...(s.solver === "sweeps" ? [] : [s.solver]),
+        ...(s.box ? ["box"] : [])].join(","));
     const values = [this.scene.name, ...said, find("speed").value, this.playing ? 1 : 0];
     this.written = "#" + PLAIN.map((name, i) => `${name}=${values[i]}`).join("&");
     if (location.hash !== this.written) {

@@ -302,10 +302,18 @@ export class Simulation {
 
   get settings() {
     this.k.functions.lav_engine_read_settings(...this.buffers, this.settingsPlace);
-    return this.k.readStruct("settings_t", this.settingsPlace);
+    return { ...this.k.readStruct("settings_t", this.settingsPlace), box: this.#head[this.k.layout.head.friction_shape] };
   }
 
-  set(changes) {
+  get #head() {
+    return this.array("head");
+  }
+
+  // iterations, warm_start, order; box: 1 where friction bounds each tangent by itself, else 0
+  set({ box, ...changes }) {
+    if (box !== undefined) {
+      this.#head[this.k.layout.head.friction_shape] = box;
+    }
     this.k.functions.lav_engine_read_settings(...this.buffers, this.settingsPlace);
     this.k.writeStruct("settings_t", this.settingsPlace, changes);
     this.k.functions.lav_engine_write_settings(...this.buffers, this.settingsPlace);

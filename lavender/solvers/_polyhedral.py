@@ -1,0 +1,214 @@
+"""Friction whose every row is bounded by itself, as a problem of bounded rows, for solvers that take nothing else.
+
+Of a contact with the normal impulse n and bounds |t_i| <= c_i n, lambda = E z:
+
+    coulomb   t_i = p_i - q_i,  p, q, s >= 0                  (Stewart, Trinkle 1996; Anitescu, Potra 1997)
+              w_i + d_i s_i      complementary to p_i
+             -w_i + d_i s_i      complementary to q_i                                          (1)
+              d_i (c_i n - p_i - q_i)     complementary to s_i [N s], d_i s_i the speed of sliding along i
+    cone      (n, t) = sum over signs z_k (1, +-c_1, +-c_2),  z >= 0: its edges, two for each axis with c_i > 0,
+              E^T w complementary to z                                                         (2)
+
+(1) is the matrix E^T A E and what couples s to the rest, copositive where A is positive semidefinite: Lemke's path ends
+at a solution of every problem that has no joint to hold back. (2) is symmetric where A is.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import product
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+import scipy.sparse as sp
+
+from lavender._arrays import FloatArray
+from lavender.certificates import check_certificate
+from lavender.cones import ROW, project
+from lavender.problem import Problem
+from lavender.residuals import at_floor, quick
+from lavender.solution import Claim, Status
+
+__all__ = ["AsRows", "ThroughRows", "as_rows", "count_rows"]
+
+
+@dataclass(frozen=True)
+class AsRows:
+    """A problem of bounded rows in z (n,), and lambda = E z of the one it stands for."""
+
+    problem: Problem
+    rows: Problem
+    back: sp.csr_array  # E (m, n)
+
+    def start(self, impulse: FloatArray) -> FloatArray:
+        """Some z (n,) of a feasible impulse (m,), the nearest one of what is not."""
+        c, out = self.problem.cones, []
+        x = project(c, impulse)
+        for i, sides in _blocks(self.problem):
+            j = c.ptr[i]
+            if c.kind[i] == ROW or not sides:
+                out += list(x[j : c.ptr[i + 1]] if c.kind[i] == ROW else x[j : j + 1])
+            elif self.problem.law == "cone":
+                share = [np.divide(x[j + t], s * x[j]) if x[j] > 0.0 else 0.0 for t, s in sides]
+                for signs in product((1.0, -1.0), repeat=len(sides)):
+                    out.append(
+                        x[j] * np.prod([0.5 * (1.0 + a * b) for a, b in zip(signs, share, strict=True)])
+                    )
+            else:
+                out.append(x[j])
+                for t, _ in sides:
+                    out += [max(x[j + t], 0.0), max(-x[j + t], 0.0), 0.0]
+        return np.clip(np.array(out, float), self.rows.cones.lower, self.rows.cones.upper)
+
+
+def _blocks(problem: Problem) -> list[tuple[int, list[tuple[int, float]]]]:
+    """Blocks, and of each the offset and the c_i of every row that its normal bounds, where c_i > 0."""
+    c = problem.cones
+    apart, sides, out = c.ends_apart, c.mu * c.patch_radius, []
+    for i in range(c.n_blocks):
+        found = []
+        if c.kind[i] != ROW:
+            last = int(c.ptr[i + 1] - c.ptr[i]) - 1
+            bounds = [(t, float(sides[i] if apart[i] and t == last else c.mu[i])) for t in range(1, last + 1)]
+            found = [(t, s) for t, s in bounds if s > 0.0]
+        out.append((i, found))
+    return out
+
+
+def as_rows(problem: Problem) -> AsRows:
+    """(1) or (2) of a problem without disks."""
+    c, d = problem.cones, problem.d
+    entries: list[tuple[int, int, float]] = []  # of E
+    more: list[tuple[int, int, float]] = []  # couplings of s
+    low: list[float] = []
+    high: list[float] = []
+    for i, sides in _blocks(problem):
+        j, n = int(c.ptr[i]), len(low)
+        if c.kind[i] == ROW:
+            size = int(c.ptr[i + 1]) - j
+            entries += [(j + k, n + k, 1.0) for k in range(size)]
+            low += c.lower[j : j + size].tolist()
+            high += c.upper[j : j + size].tolist()
+            continue
+        if problem.law == "cone":
+            for k, signs in enumerate(product((1.0, -1.0), repeat=len(sides))):
+                entries.append((j, n + k, 1.0))
+                entries += [(j + t, n + k, sign * s) for sign, (t, s) in zip(signs, sides, strict=True)]
+            count = 2 ** len(sides)
+        else:
+            entries.append((j, n, 1.0))
+            for k, (t, s) in enumerate(sides):
+                p, q, slide, x = n + 1 + 3 * k, n + 2 + 3 * k, n + 3 + 3 * k, float(d[j + t])
+                entries += [(j + t, p, 1.0), (j + t, q, -1.0)]
+                more += [(p, slide, x), (q, slide, x), (slide, n, s * x), (slide, p, -x), (slide, q, -x)]
+            count = 1 + 3 * len(sides)
+        low += [0.0] * count
+        high += [np.inf] * count
+    n = len(low)
+    e = _sparse(entries, (problem.m, n))
+    a = sp.csr_array(e.T @ (problem.csr @ e)) + _sparse(more, (n, n))
+    rows = Problem.lcp(sp.csr_array(a), e.T @ problem.b, np.array(low), np.array(high), copy=False)
+    return AsRows(problem, rows, e)
+
+
+def count_rows(problem: Problem) -> int:
+    """At most so many rows, n: what (1) or (2) of a problem without disks has."""
+    c = problem.cones
+    if problem.law == "cone":
+        sides = np.where(c.kind == ROW, 0, np.diff(c.ptr) - 1)
+        return int(np.where(c.kind == ROW, np.diff(c.ptr), 2**sides).sum())
+    return problem.m + (2 * int((np.diff(c.ptr) - 1)[c.kind != ROW].sum()) if problem.law == "coulomb" else 0)
+
+
+def _sparse(entries: list[tuple[int, int, float]], shape: tuple[int, int]) -> sp.csr_array:
+    i, j, x = (list(part) for part in zip(*entries, strict=True)) if entries else ([], [], [])
+    return sp.csr_array((np.array(x, float), (np.array(i, int), np.array(j, int))), shape=shape)
+
+
+def _whole(y: FloatArray) -> FloatArray:
+    """A direction with its largest entry at 1, and without what rounding left of sums that cancel."""
+    size = np.abs(y).max(initial=0.0)
+    y = y / size if size > 0.0 else y
+    return np.where(np.abs(y) < 1e-13, 0.0, y)
+
+
+@dataclass
+class Held:
+    """State of the solver inside, and what its rows stand for."""
+
+    form: AsRows
+    state: Any
+
+
+class ThroughRows:
+    """A solver of bounded rows that also takes friction of boxes.
+
+    Where the solver has `otherwise()`, the one of it follows what did not end at a solution.
+    """
+
+    def __init__(self, solver: Any) -> None:
+        self.solver = solver
+        if hasattr(solver, "ready"):
+            self.ready = solver.ready
+
+    def prepare(self, problem: Problem) -> Any:
+        """Its state, of the problem or of (1), (2)."""
+        if problem.law in ("linear", "lcp"):
+            return self.solver.prepare(problem)
+        form = as_rows(problem)
+        return Held(form, self.solver.prepare(form.rows))
+
+    def update(self, held: Any, problem: Problem) -> Any:
+        """The same structure with new numbers; coefficients that became 0 change that of the rows."""
+        return self.prepare(problem) if isinstance(held, Held) else self.solver.update(held, problem)
+
+    def run(
+        self, held: Any, impulse: FloatArray, n: int, tol: float, time_limit: float | None = None
+    ) -> Claim:
+        """At most n iterations; the claim is of the problem itself."""
+        if not isinstance(held, Held):
+            return self.solver.run(held, impulse, n, tol, time_limit)
+        form = held.form
+        z, start = form.start(impulse), perf_counter()
+        claim: Claim = self.solver.run(held.state, z, n, tol, time_limit)
+        claim = self._judged(form, claim, z, impulse, tol)
+        other = getattr(self.solver, "otherwise", None)
+        if other is None or claim.status not in (Status.STALLED, Status.NUMERICAL_ERROR):
+            return claim
+        left = None if time_limit is None else max(time_limit - (perf_counter() - start), 1e-3)
+        z = form.start(impulse)
+        path = other()
+        more = self._judged(form, path.run(path.prepare(form.rows), z, n, tol, left), z, impulse, tol)
+        work = {k: claim.work.get(k, 0) + more.work.get(k, 0) for k in {**claim.work, **more.work}}
+        words = f"{claim.message or 'no exchange helped'}, then complementary pivots"
+        return replace(more, work=work, message=f"{words}: {more.message}" if more.message else words)
+
+    def _judged(self, form: AsRows, claim: Claim, z: FloatArray, impulse: FloatArray, tol: float) -> Claim:
+        """The claim of z (n,) as one of the problem, lambda (m,) in place."""
+        found = project(form.problem.cones, form.back @ z)
+        if not np.isfinite(found).all():
+            return replace(claim, status=Status.NUMERICAL_ERROR, certificate=None, dual=None)
+        impulse[:] = found
+        relative, floor = quick(form.problem, impulse, np.empty_like(found), np.empty_like(found), floor=True)
+        status, words, proof = claim.status, claim.message, None
+        if relative <= tol:
+            status = Status.CONVERGED
+        elif at_floor(relative, floor):
+            status = Status.FLOOR
+        elif status is Status.INFEASIBLE and claim.certificate is not None:
+            proof = _whole(form.back @ claim.certificate)
+            if check_certificate(form.problem, proof) is not None:
+                status, proof = Status.STALLED, None
+                words += ": of the friction as rows, which proves nothing of the problem itself"
+        elif status in (Status.CONVERGED, Status.FLOOR):
+            status = Status.STALLED
+        name = "edges of the cones" if form.problem.law == "cone" else "rows with slack"
+        return replace(
+            claim,
+            status=status,
+            message=words,
+            form=", ".join(filter(None, (claim.form, name))),
+            certificate=proof,
+            dual=None,
+        )

@@ -1,0 +1,568 @@
+"""Contacts that bound each tangent by itself: blocks, findex, the judge's twin, closed forms, every solver, files."""
+
+import itertools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+from hypothesis import given, settings
+from random_problems import as_matrix, random_contact_problem, seeds
+from scipy.optimize import nnls
+
+import lavender as lv
+from lavender import registry
+from lavender.certificates import check_certificate
+from lavender.solvers._polyhedral import as_rows
+
+HERE = lv.available()
+OURS = {n for n in HERE if registry.specs()[n].own and not registry.specs()[n].external}
+TRUSTED = OURS | {"osqp", "clarabel", "piqp", "daqp", "clarabel_cone"}
+LAWS = ("coulomb", "cone")
+
+
+def boxes(seed, friction="coulomb", ratio=True, soft=0.3, **sizes):
+    """Rows with joints and contacts of a box each, two coefficients on most."""
+    base = random_contact_problem(seed, friction, tangents=2, spin=False, **sizes)
+    rng = np.random.default_rng(seed + 7)
+    c = base.cones.shaped("box")
+    radius = np.where(c.kind == lv.CONTACT_BOX, rng.uniform(0.2, 3.0, c.n_blocks) if ratio else 1.0, 0.0)
+    cones = lv.Cones(c.ptr, c.kind, c.lower, c.upper, c.mu, radius)
+    return replace(base, cones=cones, compliance=base.compliance + soft)
+
+
+def free(seed, contacts=4, friction="coulomb", mu=None):
+    """J and M of contacts alone, pressed on and dragged."""
+    rng = np.random.default_rng(seed)
+    m, nv = 3 * contacts, 3 * contacts + 3
+    mu = rng.uniform(0.1, 1.0, (contacts, 2)) if mu is None else mu
+    target = rng.normal(size=m)
+    target[::3] += 1.0
+    return lv.Problem.from_jacobian(
+        rng.normal(size=(m, nv)),
+        np.eye(nv),
+        rng.normal(size=nv),
+        target=target,
+        cones=lv.Cones.contacts(mu, shape="box", count=contacts if np.ndim(mu) == 0 else None),
+        friction=friction,
+    )
+
+
+# -- blocks ------------------------------------------------------------------------------------------------------------
+
+
+def test_coefficients_come_back_as_they_were_given():
+    mu = np.array([[0.5, 0.5], [0.02, 0.8], [0.0, 0.3], [0.7, 0.0], [0.0, 0.0]])
+    cones = lv.Cones.contacts(mu, shape="box")
+    assert cones.has_box
+    assert cones.is_polyhedral
+    assert cones.n_tangents.tolist() == [2] * 5
+    np.testing.assert_allclose(cones.coefficients, mu, rtol=1e-15)
+    assert not lv.Cones.contacts(0.5).is_polyhedral
+    assert (lv.Cones.contacts(0.5) + lv.Cones.contacts(0.5, shape="box")).has_box
+    assert lv.Cones.contacts(0.5, 1, shape="box") == lv.Cones.contacts(0.5, 1), "one tangent has no shape"
+
+
+def test_one_shape_becomes_the_other_and_back():
+    disk = lv.Cones.free(2) + lv.Cones.contacts([0.5, 0.3]) + lv.Cones.contacts(0.4, 1)
+    assert disk.shaped("box").shaped("disk") == disk
+    assert disk.shaped("box").coefficients.tolist() == [[0, 0], [0, 0], [0.5] * 2, [0.3] * 2, [0.4] * 2]
+    with pytest.raises(lv.InputError, match="a disk has one"):
+        lv.Cones.contacts([(0.1, 0.2)], shape="box").shaped("disk")
+    with pytest.raises(lv.InputError, match="no box bounds its spin"):
+        lv.Cones.contacts(0.5, patch_radius=0.1).shaped("box")
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: lv.Cones.contacts(0.5, shape="square"), "unknown shape 'square'"),
+        (lambda: lv.Cones.contacts([(0.5, 0.2)]), "ellipse"),
+        (lambda: lv.Cones.contacts([(0.5, -0.2)], shape="box"), "mu"),
+        (lambda: lv.Cones.contacts([(0.5, np.nan)], shape="box"), "mu"),
+        (lambda: lv.Cones.contacts([(0.5, 0.1, 0.2)], shape="box"), "one for each tangent"),
+        (lambda: lv.Cones.contacts(0.5, 2, 0.1, shape="box"), "no spin"),
+        (lambda: lv.Cones.contacts(0.5, 3, shape="box"), "up to two tangents"),
+        (lambda: lv.Cones([0, 4], [4], np.zeros(4), np.ones(4), [0.5], [1.0]), "box of 4 rows"),
+    ],
+)
+def test_what_is_no_box_is_told(make, words):
+    with pytest.raises((lv.InputError, lv.UnknownName), match=words):
+        make()
+
+
+# -- findex ------------------------------------------------------------------------------------------------------------
+
+
+@given(seed=seeds)
+@settings(max_examples=40)
+def test_findex_comes_back_in_any_order(seed):
+    rng = np.random.default_rng(seed)
+    bounded, contacts = int(rng.integers(0, 4)), int(rng.integers(0, 4))
+    tangents = rng.integers(0, 3, contacts)
+    low, high, index = list(-rng.uniform(0, 1, bounded)), list(rng.uniform(0, 1, bounded)), [-1] * bounded
+    for t in tangents:
+        normal = len(index)
+        mu = rng.choice([0.0, 0.25, 0.5, 1.0], t)
+        low += [0.0, *-mu]
+        high += [np.inf, *mu]
+        index += [-1] + [normal] * t
+    m = len(index)
+    order = rng.permutation(m) if rng.random() < 0.7 else np.arange(m)
+    back = np.argsort(order)
+    given_ = np.array([-1 if index[i] < 0 else back[index[i]] for i in order], int)
+    low, high = np.array(low)[order], np.array(high)[order]
+    a, b = np.eye(m) * rng.uniform(1, 2, m) + 0.1, rng.normal(size=m)
+    problem = lv.Problem.from_findex(a, b, low, high, given_)
+    rows = lv.Problem.findex_order(given_)
+    a2, b2, low2, high2, findex = problem.to_findex()
+    np.testing.assert_array_equal(a2, a[np.ix_(rows, rows)])
+    np.testing.assert_array_equal(b2, b[rows])
+    np.testing.assert_allclose(high2, high[rows], rtol=1e-15)
+    np.testing.assert_allclose(low2, low[rows], rtol=1e-15)
+    named = np.where(findex < 0, -1, rows[findex]) if m else findex
+    np.testing.assert_array_equal(named, given_[rows])
+    again = lv.Problem.from_findex(a2, b2, low2, high2, findex)
+    assert again == problem
+
+
+@pytest.mark.parametrize(
+    ("lower", "upper", "findex", "words"),
+    [
+        ([0, -1, -1], [np.inf, 1, 1], [-1, 1, 0], "its own row"),
+        ([0, -1, -1], [np.inf, 1, 1], [-1, 0, 1], "no normal: it follows row 0"),
+        ([0, -1, -1], [np.inf, 1, 1], [-1, 0, 3], "a row below 3"),
+        ([0, -1, -1], [np.inf, np.inf, 1], [-1, 0, 0], "it is mu"),
+        ([0, -1, -1], [np.inf, np.nan, 1], [-1, 0, 0], "lower <= upper"),
+        ([0, 2, -1], [np.inf, 1, 1], [-1, 0, 0], "lower <= upper"),
+        ([0, -1, -1], [5, 1, 1], [-1, 0, 0], r"a normal has \[0, inf\]"),
+        ([-1, -1, -1], [np.inf, 1, 1], [-1, 0, 0], r"a normal has \[0, inf\]"),
+        ([0, -1], [np.inf, 1], [-1, 0, 0], "shape"),
+    ],
+)
+def test_a_findex_that_is_none_is_told(lower, upper, findex, words):
+    with pytest.raises(lv.InputError, match=words):
+        lv.Problem.from_findex(np.eye(3), np.ones(3), lower, upper, findex)
+
+
+def test_what_findex_cannot_hold_is_told():
+    with pytest.raises(lv.InputError, match="3 rows follow row 0"):
+        lv.Problem.from_findex(np.eye(4), np.ones(4), [0, -1, -1, -1], [np.inf, 1, 1, 1], [-1, 0, 0, 0])
+    disk = lv.Problem.contact(np.eye(3), np.ones(3), 0.5)
+    with pytest.raises(lv.InputError, match=r"shaped\('box'\)"):
+        disk.to_findex()
+    with pytest.raises(lv.InputError, match=r"relaxed\('coulomb'\)"):
+        free(1, friction="cone").to_findex()
+
+
+# -- the judge ---------------------------------------------------------------------------------------------------------
+
+
+def edges(sides):
+    return np.array([(1.0, x * sides[0], y * sides[1]) for x in (1, -1) for y in (1, -1)]).T
+
+
+def twin(problem, lam):
+    """Errors e (m,), dense and slow: each tangent clipped, or the nearest sum of the cone's edges."""
+    a, c, d = problem.dense(), problem.cones, problem.d
+    w = a @ lam - problem.b
+    e = np.zeros(problem.m)
+    for i in range(c.n_blocks):
+        s = slice(c.ptr[i], c.ptr[i + 1])
+        l, y = lam[s], lam[s] - w[s] / d[s]
+        if c.kind[i] == lv.ROW:
+            e[s] = l - np.clip(y, c.lower[s], c.upper[s])
+        elif problem.friction == "cone":
+            root = np.sqrt(d[s])
+            rays = root[:, None] * edges(c.coefficients[i])
+            e[s] = l - rays @ nnls(rays, root * y)[0] / root
+        else:
+            bound = np.append(np.inf, c.coefficients[i] * max(l[0], 0.0))
+            e[s] = l - np.clip(y, np.append(0.0, -bound[1:]), bound)
+    return e
+
+
+@settings(max_examples=40)
+@given(seed=seeds)
+@pytest.mark.parametrize("friction", LAWS)
+def test_errors_equal_the_twin_in_every_form(friction, seed):
+    problem = boxes(seed, friction)
+    lam = np.random.default_rng(seed + 1).normal(size=problem.m)
+    for p in (problem, as_matrix(problem)):
+        judged, e = lv.residual(p, lam), twin(p, lam)
+        np.testing.assert_allclose(judged.error, e, atol=1e-10 * np.abs(e).max())
+        assert judged.energy == pytest.approx(np.sqrt(p.d @ e**2), rel=1e-9)
+        if p.rows is None:  # each row counts by itself
+            assert judged.velocity == pytest.approx(np.max(p.d * np.abs(e)), rel=1e-9)
+            assert judged.worst_row == int(np.argmax(p.d * np.abs(e)))
+    general = free(seed, friction=friction)
+    lam = np.random.default_rng(seed).normal(size=general.m)
+    np.testing.assert_allclose(lv.residual(general, lam).error, twin(general, lam), atol=1e-9)
+
+
+@pytest.mark.parametrize("friction", LAWS)
+def test_the_diagonal_keeps_the_axes_apart(friction):
+    problem = free(3, friction=friction)
+    np.testing.assert_allclose(problem.d, np.diag(problem.dense()), rtol=1e-13)
+    rows = boxes(3, friction)
+    np.testing.assert_allclose(rows.d, np.diag(rows.dense()), rtol=1e-12)
+
+
+def test_rows_are_named_as_tangents():
+    p = free(1)
+    assert [p.row_name(i) for i in range(3)] == [
+        f"contact 0, {w}" for w in ("normal", "tangent 1", "tangent 2")
+    ]
+
+
+def test_fixed_normals_make_constant_bounds():
+    boxed = free(1, contacts=1, mu=[(0.25, 0.5)]).boxed(2.0)
+    assert boxed.cones.upper.tolist() == [np.inf, 0.5, 1.0]
+
+
+# -- solutions ---------------------------------------------------------------------------------------------------------
+
+
+def enumerated(problem):
+    """Every solution with a regular system: each contact open, each of its tangents sticking or sliding either way."""
+    a, c = problem.dense(), problem.cones
+    n = c.n_blocks
+    ways = [None, *itertools.product((-1, 0, 1), repeat=2)]
+    found = []
+    for choice in itertools.product(ways, repeat=n):
+        equal, rhs = np.zeros((problem.m, problem.m)), np.zeros(problem.m)
+        for i, way in enumerate(choice):
+            j = 3 * i
+            if way is None:
+                equal[j : j + 3, j : j + 3] = np.eye(3)
+                continue
+            equal[j], rhs[j] = a[j], problem.b[j]
+            for k, s in enumerate(way):
+                if s == 0:
+                    equal[j + 1 + k], rhs[j + 1 + k] = a[j + 1 + k], problem.b[j + 1 + k]
+                else:
+                    equal[j + 1 + k, j + 1 + k], equal[j + 1 + k, j] = 1.0, -s * c.coefficients[i, k]
+        if np.linalg.cond(equal) > 1e10:
+            continue
+        x = np.linalg.solve(equal, rhs)
+        if lv.residual(problem, x).relative < 1e-10:
+            found.append(x)
+    return found
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_lemke_finds_one_of_all_solutions(seed):
+    problem = free(seed, contacts=2)
+    truth = enumerated(problem)
+    assert truth
+    x = lv.solve(problem, "lemke", tol=1e-12).raise_for_status().impulse
+    assert min(np.abs(x - y).max() for y in truth) < 1e-9 * (1.0 + np.abs(x).max())
+
+
+@pytest.mark.parametrize("name", ["lemke", "direct"])
+@pytest.mark.parametrize("seed", range(60))
+def test_pivoting_ends_on_every_problem(seed, name):
+    problem = free(seed, contacts=2 + seed % 7)
+    solution = lv.solve(problem, name, tol=1e-10)
+    assert solution.status is lv.Status.CONVERGED, solution
+    assert not solution.contradicted
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_the_relaxation_is_the_quadratic_program(seed):
+    osqp = pytest.importorskip("osqp")
+    problem = free(seed, friction="cone")
+    c, m = problem.cones, problem.m
+    sides = []
+    for i in range(c.n_blocks):
+        for k, s in itertools.product((0, 1), (1.0, -1.0)):
+            row = np.zeros(m)
+            row[3 * i + 1 + k], row[3 * i] = s, -c.coefficients[i, k]
+            sides.append(row)
+    solver = osqp.OSQP()
+    solver.setup(
+        sp.csc_matrix(problem.dense()), -problem.b, sp.csc_matrix(np.array(sides)), np.full(len(sides), -np.inf),
+        np.zeros(len(sides)), eps_abs=1e-10, eps_rel=1e-10, max_iter=100_000, verbose=False,
+    )  # fmt: skip
+    x = solver.solve(raise_error=True).x
+    for name in ("direct", "newton", "lemke"):
+        ours = lv.solve(problem, name, tol=1e-9).raise_for_status().impulse
+        np.testing.assert_allclose(ours, x, atol=1e-6 * np.abs(x).max())
+
+
+@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("name", [n for n in HERE if registry.specs()[n].boxes])
+def test_every_solver_that_lists_boxes_solves_them(name, law):
+    spec = registry.specs()[name]
+    taken = 0
+    for problem in (
+        boxes(23, law),
+        as_matrix(boxes(23, law)),
+        free(5, friction=law),
+        free(6, mu=0.4, friction=law),
+    ):
+        if spec.refuses(problem):
+            assert law not in spec.boxes or spec.operators == {"rows"} or spec.refusal
+            continue
+        taken += 1
+        most = max(spec.max_iter, 20_000) if spec.resumable else None
+        solution = lv.solve(problem, name, tol=1e-7, max_iter=most)
+        if name in TRUSTED:
+            assert solution.status is lv.Status.CONVERGED, (solution, problem)
+            assert solution.success
+        assert not (solution.contradicted and name in TRUSTED)
+        assert sum(solution.work.values()) > 0
+    assert taken or law not in spec.boxes or spec.refusal
+
+
+@pytest.mark.parametrize("name", HERE)
+def test_who_takes_no_boxes_says_so(name):
+    spec = registry.specs()[name]
+    for law in LAWS:
+        if law not in spec.boxes:
+            with pytest.raises(lv.CapabilityError, match=name):
+                lv.solve(free(5, friction=law), name)
+        if law not in spec.laws:
+            mixed = replace(boxes(23, law), cones=random_contact_problem(23, tangents=2, spin=False).cones)
+            with pytest.raises(lv.CapabilityError, match=f"not '{law}'"):
+                lv.solve(mixed, name)
+
+
+def test_a_solver_of_others_is_not_handed_a_box_it_knows_nothing_of():
+    spec = registry.SolverSpec("theirs", lambda: None, frozenset({"coulomb"}), "no boxes")
+    assert "takes no boxes" in spec.refuses(free(1))
+    assert spec.refuses(replace(free(1), cones=lv.Cones.contacts(0.5, count=4))) is None
+    with pytest.raises(lv.InputError, match="boxes"):
+        registry.SolverSpec("theirs", lambda: None, frozenset({"coulomb"}), "", boxes=frozenset({"lcp"}))
+
+
+@pytest.mark.parametrize("name", ["pgs", "newton", "lemke", "nncg", "anderson", "block_gauss_seidel", "auto"])
+def test_an_axis_without_friction_glides(name):
+    # dragged along both axes by more than it could hold
+    mu = [(0.0, 0.5), (0.5, 0.0)]
+    problem = lv.Problem(np.tile([10.0, 8.0, 8.0], 2), lv.Cones.contacts(mu, shape="box"), np.eye(6))
+    x = lv.solve(problem, name, tol=1e-9).raise_for_status().impulse
+    np.testing.assert_allclose(x, [10, 0, 5, 10, 5, 0], atol=1e-7)
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_the_bounded_rows_hold_what_they_stand_for(law):
+    problem = free(4, friction=law)
+    form = as_rows(problem)
+    rng = np.random.default_rng(0)
+    lam = np.abs(rng.normal(size=problem.m))
+    lam[1::3] = lam[::3] * problem.cones.coefficients[:, 0] * rng.uniform(-1, 1, 4)
+    lam[2::3] = lam[::3] * problem.cones.coefficients[:, 1] * rng.uniform(-1, 1, 4)
+    z = form.start(lam)
+    assert z.min() >= 0.0
+    np.testing.assert_allclose(form.back @ z, lam, atol=1e-13)
+    if law == "cone":  # its edges: symmetric, and no more than what the cone's dual asks
+        assert form.rows.asymmetry <= 1e-15
+    else:  # copositive, which ends Lemke's path at a solution
+        a = form.rows.csr
+        for _ in range(200):
+            x = rng.exponential(size=form.rows.m) * (rng.random(form.rows.m) < 0.7)
+            assert x @ (a @ x) >= -1e-12 * (abs(x) @ (abs(a) @ abs(x)))
+
+
+def test_no_impulse_meets_every_row():
+    # two normals that want opposite ends of nothing: A = g g^T, b across it
+    g = np.zeros(6)
+    g[[0, 3]] = 1.0, -1.0
+    a = np.outer(g, g) + np.diag([0, 1.0, 1.0, 0, 1.0, 1.0])
+    for law, name in itertools.product(LAWS, ("lemke", "direct")):
+        problem = lv.Problem(
+            np.array([1.0, 0, 0, 1.0, 0, 0]), lv.Cones.contacts(0.5, count=2, shape="box"), a, friction=law
+        )
+        solution = lv.solve(problem, name)
+        assert solution.status is lv.Status.INFEASIBLE, (law, name, solution)
+        assert check_certificate(problem, solution.certificate) is None
+        assert not solution.contradicted
+
+
+@settings(max_examples=25)
+@given(seed=seeds)
+def test_the_motion_bound_holds(seed):
+    problem = free(seed % 1000, friction="cone")
+    best = lv.solve(problem, "lemke", tol=1e-12).raise_for_status()
+    rough = lv.solve(problem, "anderson", tol=0.0, max_iter=4)
+    error = lv.motion_error(problem, rough.impulse)
+    apart = problem.velocity(rough.impulse) - problem.velocity(best.impulse)
+    size = np.linalg.norm(apart) / np.sqrt(2.0)  # M is the identity
+    if error.kinetic is not None:
+        assert error.kinetic == pytest.approx(size, rel=1e-4, abs=1e-9)
+    if error.bound is not None:
+        assert size <= error.bound * (1.0 + 1e-9) + 1e-12
+
+
+def test_several_motions_of_boxes_are_solutions():
+    found = lv.motions(free(2, contacts=3))
+    assert len(found) >= 1
+
+
+# -- sweeps ------------------------------------------------------------------------------------------------------------
+
+
+def scene_problem(name="pile", steps=30):
+    sim = lv.Simulation(lv.Scene(name, friction_shape="box"))
+    for _ in range(steps):
+        sim.step()
+    return sim.constraint_problem()
+
+
+@pytest.mark.parametrize("sweeps", [1, 7, 40])
+def test_sweeps_over_bodies_are_those_over_a(sweeps):
+    for problem in (boxes(5, soft=0.0), replace(scene_problem(), guess=None)):
+        x = lv.solve(problem, "sequential_impulses", tol=0.0, max_iter=sweeps).impulse
+        y = lv.solve(as_matrix(problem), "pgs", tol=0.0, max_iter=sweeps).impulse
+        np.testing.assert_allclose(x, y, atol=1e-11 * np.abs(x).max())
+
+
+def test_bits_are_those_of_one_block_after_the_other():
+    problem = scene_problem()
+    alone = registry.get("sequential_impulses").load()()
+    x, y = problem.start(), problem.start()
+    state = alone.prepare(problem)
+    for _ in range(60):  # too few at a time to be packed in lanes
+        alone.run(state, x, 1, 0.0, None)
+    alone.run(alone.prepare(problem), y, 60, 0.0, None)
+    np.testing.assert_array_equal(x, y)
+    threads = [
+        lv.solve(problem, "sequential_impulses", tol=0.0, max_iter=30, order="colored", threads=t).impulse
+        for t in (1, 2)
+    ]
+    np.testing.assert_array_equal(*threads)
+
+
+@settings(max_examples=60)
+@given(seed=seeds)
+def test_one_contact_alone_is_solved_at_once(seed):
+    rng = np.random.default_rng(seed)
+    g = rng.normal(size=(3, 5))
+    problem = lv.Problem(
+        rng.normal(size=3) + np.array([1.0, 0, 0]),
+        lv.Cones.contacts([rng.uniform(0, 1.5, 2)], shape="box"),
+        g @ g.T,
+    )
+    start = np.abs(rng.normal(size=3))
+    x = lv.solve(problem, "block_gauss_seidel", tol=0.0, max_iter=1, impulse=start).impulse
+    judged = lv.residual(problem, x)
+    assert judged.relative <= 1e-9 or judged.nothing_to_do
+
+
+# -- the engine --------------------------------------------------------------------------------------------------------
+
+
+def slope(angle, turned, shape, **more):
+    """Speed [m/s] down a slope after a second, the first tangent `turned` from the way down."""
+    g, mu = 9.81, 0.5
+    down = g * np.sin(angle)
+    scene = lv.Scene(
+        gravity=(down * np.cos(turned), down * np.sin(turned), -g * np.cos(angle)), friction=mu,
+        friction_shape=shape, **more,
+    )  # fmt: skip
+    scene.add_plane()
+    scene.add_box((1.0, 1.0, 0.2), position=(0.0, 0.0, 0.1))
+    sim = lv.Simulation(scene)
+    for _ in range(120):
+        observation = sim.step()[0]
+    return float(np.linalg.norm(observation["velocities"][1, :2]))
+
+
+@pytest.mark.parametrize("more", [{}, {"stepper": "soft_step"}, {"solver": "newton"}])
+def test_a_box_grips_more_on_the_diagonal(more):
+    g, mu, root = 9.81, 0.5, np.sqrt(2.0)
+    for turned, grip in ((0.0, mu), (np.pi / 4, root * mu)):
+        below, above = np.arctan(grip) - 0.01, np.arctan(grip) + 0.05
+        assert slope(below, turned, "box", **more) < 1e-3
+        speed = g * (np.sin(above) - grip * np.cos(above)) * 1.0
+        assert slope(above, turned, "box", **more) == pytest.approx(speed, rel=0.02)
+    assert slope(np.arctan(mu) + 0.05, np.pi / 4, "disk", **more) > 0.3
+
+
+def test_a_substep_is_the_solve_of_its_problem_to_the_bit():
+    sim = lv.Simulation(lv.Scene("pyramid", friction_shape="box", substeps=1))
+    for _ in range(10):
+        sim.step()
+    problem = sim.constraint_problem()
+    assert problem.cones.has_box
+    budget = sim.scene.parameters.solver_iterations
+    x = lv.solve(problem, "sequential_impulses", tol=0.0, max_iter=budget).impulse
+    observation = sim.step()[0]
+    impulses = observation["contacts"]["impulses"]
+    np.testing.assert_array_equal(x, impulses.ravel())
+
+
+def test_what_no_scene_of_boxes_has_is_told():
+    with pytest.raises(lv.UnknownName, match="friction_shape"):
+        lv.Scene("stack", friction_shape="square")
+    for stepper in ("xpbd", "avbd"):
+        with pytest.raises(lv.InputError, match="by a disk"):
+            lv.Scene("stack", friction_shape="box", stepper=stepper)
+    with pytest.raises(lv.InputError, match="no spin friction"):
+        lv.Simulation(lv.Scene("spinner", friction_shape="box"))
+
+
+# -- files -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("problem", [boxes(3), as_matrix(boxes(3)), free(3, friction="cone")])
+def test_files_keep_the_shape(problem, tmp_path):
+    path = tmp_path / "box.npz"
+    problem.save(path)
+    back = lv.load(path)
+    back = back if isinstance(back, lv.Problem) else back[0]
+    assert back.cones == problem.cones
+    x = np.ones(problem.m)
+    assert lv.residual(back, x).relative == lv.residual(problem, x).relative
+
+
+def test_fclib_has_no_boxes(tmp_path):
+    pytest.importorskip("h5py")
+    with pytest.raises(lv.LavenderError, match="box"):
+        as_matrix(free(3)).save(tmp_path / "box.hdf5")
+
+
+# -- an ellipse --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("form", ["matrix", "generalized", "rows"])
+def test_stretched_rows_have_the_same_solution(form):
+    base = boxes(11, "cone") if form == "rows" else free(11, friction="cone")
+    base = replace(
+        base, cones=base.cones.shaped("box") if form == "rows" else lv.Cones.contacts(0.4, count=4)
+    )
+    base = as_matrix(base) if form == "matrix" else base
+    rng = np.random.default_rng(0)
+    s = np.where(base.cones.lower == 0.0, 1.0, rng.uniform(0.3, 3.0, base.m))
+    if form != "rows":  # a disk stays one where both tangents are as long
+        s[2::3] = s[1::3]
+        mu = base.cones.mu / s[1::3]
+    else:
+        mu = base.cones.mu
+    long = base.stretched(s)
+    c = long.cones
+    if form == "rows":  # each side of a box by its own
+        first, second = (s[c.ptr[:-1][c.kind == lv.CONTACT_BOX] + k] for k in (1, 2))
+        box = c.kind == lv.CONTACT_BOX
+        mu, radius = c.mu.copy(), c.patch_radius.copy()
+        mu[box], radius[box] = mu[box] / first, radius[box] * first / second
+    else:
+        radius = c.patch_radius
+    long = replace(long, cones=lv.Cones(c.ptr, c.kind, c.lower, c.upper, mu, radius))
+    x = s * lv.solve(long, "newton", tol=1e-10).raise_for_status().impulse
+    assert lv.residual(base, x).relative < 1e-8
+    with pytest.raises(lv.InputError, match="normal is 2"):
+        free(1).stretched(2.0)
+    with pytest.raises(lv.InputError, match="above 0"):
+        free(1).stretched(np.tile([1.0, 0.0, 1.0], 4))
+
+
+def test_an_ellipse_is_the_disk_of_stretched_tangents():
+    # t = -S^2 w / |S w| n: the point of the rim that dissipates most
+    b, mu = np.array([10.0, 9.0, 5.0]), np.array([0.5, 0.2])
+    s = np.array([1.0, 1.0, mu[1] / mu[0]])
+    x = s * lv.solve(lv.Problem.contact(np.eye(3), b, [mu[0]]).stretched(s), "newton", tol=1e-12).impulse
+    w = x - b
+    rim = -(mu**2) * w[1:] / np.hypot(*(mu * w[1:])) * x[0]
+    np.testing.assert_allclose(x[1:], rim, rtol=1e-9)
