@@ -3,10 +3,10 @@
     python -m benchmarks newton [--sets hard,default,wild,scenes] [--seeds 9000:9060] [--rows 1000]
                                 [--files 'robots/*.npz'] [--tol 1e-6] [--limit 2] [--only NAME] [--out FILE]
 
-A part is taken out by putting something in its place while a problem is solved; nothing of the product knows of it. A
-line for each part and class (law, operator, size) on which its absence changes the result's bits or work: problems,
-those then unsolved and those that only then are solved, factorisations and CPU time without over with, geometric means
-(time of problems solved both ways, the two solved in turn).
+A part is taken out by putting something in its place while a problem is solved, a phase by leaving it out. A line for
+each part and class (law, operator, size) on which its absence changes the result's bits or work: problems, those then
+unsolved and those that only then are solved, factorisations and CPU time without over with, geometric means (time of
+problems solved both ways, the two solved in turn).
 """
 
 from __future__ import annotations
@@ -33,8 +33,9 @@ from lavender.problem import Problem
 from lavender.residuals import nothing_to_do
 from lavender.scene.gallery import SCENES
 from lavender.solvers import newton
-from lavender.solvers._newton import convex, coulomb, interior_point, proximal, systems
+from lavender.solvers._newton import sparse, systems
 from lavender.solvers.warm_start import Tried
+from lavender_ext.newton.solve import PHASES
 
 
 class Asked(NamedTuple):
@@ -51,10 +52,6 @@ class Asked(NamedTuple):
 Part = tuple[Callable[[Problem], bool], list[tuple[Any, str, Any]], dict[str, Any]]
 
 
-def nothing(*_args: Any, **_kwargs: Any) -> None:
-    """In the place of what is taken out."""
-
-
 def bounded(p: Problem) -> bool:
     """Bounded rows alone."""
     return p.law in ("linear", "lcp")
@@ -68,11 +65,6 @@ def coulombs(p: Problem) -> bool:
 def convexs(p: Problem) -> bool:
     """Any other."""
     return p.law != "coulomb"
-
-
-def cones(p: Problem) -> bool:
-    """The convex law of contacts."""
-    return p.law == "cone"
 
 
 def matrix(p: Problem) -> bool:
@@ -95,22 +87,22 @@ def anything(_p: Problem) -> bool:
     return True
 
 
-_ADVANCE = proximal.Proximal.advance
+_SOLVE = systems.System._solve
 
 
-def _no_end(self: Any, run: Any, limit: int = 10_000) -> None:
-    if limit != 12:
-        _ADVANCE(self, run, limit)
+def _without(*phases: str) -> tuple[Any, str, Any]:
+    """Newton's method leaves these out."""
+
+    def solve(self: Any, *args: Any) -> Any:
+        made = _SOLVE(self, *args)
+        made.without = sum(PHASES[name] for name in phases)
+        return made
+
+    return systems.System, "_solve", solve
 
 
-def _together(*args: Any, apart: bool = False, **kwargs: Any) -> Any:
-    del apart
-    return interior_point.InteriorPoint(*args, **kwargs)
-
-
-def _apart(*args: Any, apart: bool = True, **kwargs: Any) -> Any:
-    del apart
-    return interior_point.InteriorPoint(*args, apart=True, **kwargs)
+def _singular(*_: Any, **_kwargs: Any) -> Any:
+    raise RuntimeError
 
 
 def _left(*_: Any) -> Tried:
@@ -126,28 +118,19 @@ PARTS: dict[str, Part] = {
     "rows after velocities": (general, [], {"form": "velocity"}),
     # starts
     "warm start": (bodies, [(newton, "warm_start", _left)], {}),
-    "exchanges": (bounded, [(convex, "_exchange", nothing)], {}),
-    "refinement of all rows": (bounded, [(convex, "_refine", nothing)], {}),
-    "shift for each row apart": (convexs, [(convex, "InteriorPoint", _together)], {}),
-    "one shift for all rows": (convexs, [(convex, "InteriorPoint", _apart)], {}),
-    # phases, convex
-    "interior point": (bounded, [(convex, "_interior", nothing)], {}),
-    "polish of bounded rows": (bounded, [(convex, "exchange", nothing)], {}),
-    "augmented interior point": (convexs, [(convex, "solve_augmented", nothing)], {}),
-    "proximal rounds, convex": (convexs, [(convex, "_proximal", nothing)], {}),
-    "second weight of cones": (cones, [(convex, "DELTA", convex.CONE_DELTA)], {}),
-    "first weight of cones": (cones, [(convex, "CONE_DELTA", convex.DELTA)], {}),
-    "proximal end of cones": (cones, [(convex.Proximal, "advance", _no_end)], {}),
-    # phases, Coulomb's law
-    "walks": (coulombs, [(coulomb, "_pursue", nothing)], {}),
-    "De Saxce": (coulombs, [(coulomb, "solve_desaxce", nothing), (coulomb, "_loops", nothing)], {}),
-    "walk from the cone law": (coulombs, [(coulomb, "_from_convex", nothing)], {}),
-    "further shares": (coulombs, [(coulomb, "SHARES", coulomb.SHARES[:2])], {}),
-    "augmented De Saxce": (coulombs, [(coulomb, "solve_desaxce_augmented", nothing)], {}),
+    # phases
+    "exchanges": (bounded, [_without("exchanges")], {}),
+    "interior point": (convexs, [_without("interior point")], {}),
+    "augmented interior point": (convexs, [_without("approach")], {}),
+    "proximal rounds, convex": (convexs, [_without("rounds")], {}),
+    "walks": (coulombs, [_without("pursuit")], {}),
+    "De Saxce": (coulombs, [_without("De Saxce")], {}),
+    "walk from the cone law": (coulombs, [_without("relaxation")], {}),
+    "augmented steps": (bodies, [_without("augmented steps")], {}),
     # factorisations
     "dense": (matrix, [(systems, "DENSE_ROWS", -1), (systems, "is_full", lambda *_: False)], {}),
     "sparse panels of A": (matrix, [(systems, "is_full", lambda *_: True)], {}),
-    "SuperLU after panels": (matrix, [(systems.MatrixSystem, "_superlu", lambda _s, _m: systems._nothing)], {}),
+    "SuperLU after panels": (matrix, [(sparse, "sparse_lu", _singular)], {}),
     "panels over bodies": (bodies, [(systems, "PANELS", math.inf)], {}),
     "block rows over bodies": (bodies, [(systems, "PANELS", 0.0)], {}),
     "dissection": (bodies, [(systems, "dissected", lambda n, a, p, i: (p, i, None, None, None))], {}),

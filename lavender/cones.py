@@ -277,10 +277,10 @@ class Cones:
             raise InputError(f"tangents is {tangents!r}; a whole number from 0 to 5 is needed")
         ratio = None
         if check_shape("shape", shape) == "box":
-            if patch_radius is not None or tangents > 2:
+            if patch_radius is not None or rolling is not None or tangents > 2:
                 raise InputError(
-                    "a box bounds up to two tangents and no spin: leave patch_radius and tangents out, or give the "
-                    "spin as a disk's (shape='disk')"
+                    "a box bounds up to two tangents, no spin and no rolling: leave patch_radius, rolling and tangents "
+                    "out, or give them as a disk's (shape='disk')"
                 )
             if tangents == 2:
                 mu, ratio = _sides(mu)
@@ -413,7 +413,7 @@ class Cones:
 
     @property
     def reach(self) -> FloatArray:
-        """(m,) largest impulse of each row over lambda_n: mu, mu r of spin, mu_r of rolling; 0 on normals and ROW."""
+        """(m,) largest impulse of each row over lambda_n: mu, mu r on `apart_rows`, mu_r on rolling; 0 on others."""
         size = np.diff(self.ptr)
         out = np.repeat(np.where(self.kind == ROW, 0.0, self.mu), size)
         out[self.ptr[:-1]] = 0.0

@@ -36,17 +36,18 @@ def problem_dir() -> Path:
 
 @pytest.fixture
 def interrupted_newton(monkeypatch) -> list[float]:
-    """Ctrl-C at newton's fifth look at the residual; the list fills with what it saw."""
-    from lavender.solvers._newton.run import Run
+    """Ctrl-C after newton's fifth turn of one factorisation; the list fills with the best residual after each."""
+    from lavender.solvers import newton
+    from lavender.solvers._newton.systems import MatrixSystem, VelocitySystem
 
     looks: list[float] = []
-    original = Run.score
 
-    def interrupt(self, z):
-        looks.append(original(self, z))
+    def interrupt(self, seconds):
+        looks.append(self.solve.best)
         if len(looks) == 5:
             raise KeyboardInterrupt
-        return looks[-1]
 
-    monkeypatch.setattr(Run, "score", interrupt)
+    monkeypatch.setattr(newton, "WATCHED", 0.0)
+    for system in (MatrixSystem, VelocitySystem):
+        monkeypatch.setattr(system, "took", interrupt)
     return looks

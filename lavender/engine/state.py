@@ -177,8 +177,8 @@ class State:
         box = p.friction_shape == "box"
         if box and (spin or rolling):
             raise InputError(
-                "friction_shape is 'box' beside a patch_radius or rolling_radius > 0: a box has no spin friction and "
-                "resists no rolling; leave one of them out"
+                "friction_shape is 'box' and patch_radius or rolling_radius > 0: a box has no spin friction, and none "
+                "against rolling; leave one of the two out"
             )
         excluded = sorted({tuple(sorted((j.a, j.b))) for j in joints if not j.collide and min(j.a, j.b) >= 0})
         n_shapes = int(shaped.sum())

@@ -201,10 +201,10 @@ def _kappa(
 
 
 def _parts(c: Cones, i: int) -> list[np.ndarray]:
-    """Rows of contact i that are bounded together: tangents (of a box each), spin, rolling; bounds of 0 left out."""
-    first, apart, rolling = int(c.ptr[i]) + 1, int(c.apart_rows[i]), int(c.rolling_rows[i])
-    found = [np.arange(first, first + c.n_together[i])]
-    found += [np.array([apart])] * (apart >= 0) + [np.array([rolling, rolling + 1])] * (rolling >= 0)
+    """Rows of contact i bounded together: tangents, spin or second side of a box, rolling, where a bound is not 0."""
+    first, turning, rolling = int(c.ptr[i]) + 1, int(c.apart_rows[i]), int(c.rolling_rows[i])
+    found = [np.arange(first, first + int(c.n_together[i]))]
+    found += [np.array([turning])] * (turning >= 0) + [np.array([rolling, rolling + 1])] * (rolling >= 0)
     return [part for part in found if len(part) and c.reach[part[0]] > 0.0]
 
 

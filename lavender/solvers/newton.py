@@ -4,8 +4,7 @@
 
 0. A warm start over bodies is judged first; then at most 64 sweeps (counted in `work`), or one banded factorisation of
    joints alone, where these will do (`warm_start.py`).
-1. Bounded rows by exchanges (Newton's method on the natural map) from the warm start and from the solution of H z = g
-   (`_newton/polish.py`).
+1. Bounded rows by exchanges (Newton's method on the natural map) from the warm start and from the solution of H z = g.
 2. A cold Mehrotra interior point, polished on the identified rows as soon as it has found them, to the floor of
    float64.
 3. Where that stops short on rows that nearly depend on each other: both again through the augmented
@@ -16,7 +15,8 @@
 Problems in generalised coordinates go over their velocities first (`_newton/general.py`), where A is never formed; what
 that leaves goes on as above, over the rows of A, unless form="velocity".
 
-The parts stand in `_newton/`. Form "velocity" factors I + K^T V K over the bodies and never squares J; "impulse"
+1 to 4 are compiled (`lavender_ext/newton/plan.pxd`) and taken in turns; the clock, Ctrl-C and proofs are asked for in
+between. Their systems stand in `_newton/`. Form "velocity" factors I + K^T V K over the bodies and never squares J; "impulse"
 factors over the rows.
 """
 
@@ -29,6 +29,7 @@ from typing import Any
 import numpy as np
 
 from lavender._arrays import FloatArray
+from lavender.certificates import check_certificate
 from lavender.errors import CapabilityError, InputError
 from lavender.problem import OPERATORS, Problem
 from lavender.registry import SolverSpec
@@ -36,14 +37,20 @@ from lavender.residuals import quick
 from lavender.solution import Claim, Status
 from lavender.solvers._few import NEWTON
 from lavender.solvers._newton import general
-from lavender.solvers._newton.convex import solve_convex
-from lavender.solvers._newton.coulomb import solve_coulomb
-from lavender.solvers._newton.run import Run
+from lavender.solvers._newton.scaled import Scaled
 from lavender.solvers._newton.systems import System, make_system
 from lavender.solvers.warm_start import claim_of, warm_start
+from lavender_ext.newton.solve import COUNTED, OUTCOMES
 
 FORMS = ("auto", "velocity", "impulse")
 ROWS = 3000  # up to which A is formed where velocities did not end it
+WATCHED = 0.05  # s between two looks at Ctrl-C, as factors are counted
+TIME_SHARE = 0.5  # of the time left that one turn may take
+_ENDS = {
+    OUTCOMES["reached"]: Status.CONVERGED,
+    OUTCOMES["floor"]: Status.FLOOR,
+    OUTCOMES["stuck"]: Status.STALLED,
+}
 WARM = 1e-3  # relative residual from which rows of A go on from what velocities left
 
 
@@ -162,49 +169,77 @@ class Newton:
             impulse[:] = system.sc.fixed
             return Claim(Status.STALLED, 0, {"factorisations": 0}, "no row can move")
         cold = bool(np.array_equal(impulse, problem.start()))
-        sweeps = system.factorisations = 0
+        sweeps = worked = 0
         if not cold and self.form == "auto" and problem.rows is not None:
             tried = warm_start(problem, impulse, tol, n, time_limit)
-            claim, sweeps, system.factorisations = claim_of(tried), tried.sweeps, tried.factorisations
+            claim, sweeps, worked = claim_of(tried), tried.sweeps, tried.factorisations
             if claim is not None and general.confirmed(problem, impulse, tol):
                 return claim
-        deadline = np.inf if time_limit is None else perf_counter() + time_limit
-        run = Run(system, tol, n, deadline)
-        z = system.sc.unknown(impulse)
-        run.score(z)
-        interrupted = False
-        try:
-            if not run.done():
-                if problem.law == "coulomb" and system.sc.has_friction:
-                    solve_coulomb(run, z)
-                else:
-                    solve_convex(run, z, cold)
-        except KeyboardInterrupt:
-            interrupted = True  # the best iterate goes back all the same
-        impulse[:] = system.sc.impulse(run.best_z)
-        if interrupted:
-            status = Status.INTERRUPTED
-        elif run.certificate is not None:
-            status = Status.INFEASIBLE
-        elif run.reached():
-            status = Status.CONVERGED
-        elif run.at_floor():
-            status = Status.FLOOR
-        elif system.factorisations >= run.budget:
-            status = Status.MAX_ITERATIONS
-        elif run.spent():
-            status = Status.TIME_LIMIT
-        else:
-            status = Status.STALLED
-        work = {"factorisations": system.factorisations} | ({"sweeps": sweeps} if sweeps else {})
-        return Claim(
-            status,
-            system.factorisations,
-            work,
-            run.message,
-            form=system.form,
-            certificate=run.certificate,
+        n -= worked
+        status, certificate = _turns(problem, system, impulse, n, tol, cold, time_limit)
+        solve = system.solve
+        factorisations = worked + solve.factorisations
+        message = ", ".join(
+            f"{count} {what}" for count, what in zip(solve.counts, COUNTED, strict=True) if count
         )
+        work = {"factorisations": factorisations} | ({"sweeps": sweeps} if sweeps else {})
+        return Claim(status, factorisations, work, message, form=system.form, certificate=certificate)
+
+
+def _turns(
+    problem: Problem,
+    system: System,
+    impulse: FloatArray,
+    n: int,
+    tol: float,
+    cold: bool,
+    time_limit: float | None,
+) -> tuple[Status, FloatArray | None]:
+    """Turns of at most n factorisations on `impulse`, in place, with a look at the clock and at Ctrl-C in between."""
+    deadline = np.inf if time_limit is None else perf_counter() + time_limit
+    sc, solve, certificate = system.sc, system.solve, None
+    start = time = perf_counter()
+    late = interrupted = False
+    coulomb = problem.law == "coulomb" and sc.has_friction
+    solve.start(sc.unknown(impulse), tol, n, coulomb, cold)
+    try:
+        while True:
+            before = solve.factorisations
+            most = WATCHED / max(system.seconds, 1e-6)
+            if deadline < np.inf:
+                most = min(most, TIME_SHARE * (deadline - time) / max(system.seconds, 1e-9))
+                if time + system.seconds >= deadline:
+                    late = True
+                    solve.stop()
+            end = solve.step(max(1, int(most)))
+            start, time = time, perf_counter()
+            if solve.factorisations > before:
+                system.took((time - start) / (solve.factorisations - before))
+            if end == OUTCOMES["certificate"]:
+                certificate = _proof(problem, sc, solve.direction)
+                if certificate is not None:
+                    solve.prove()
+            elif end != OUTCOMES["more"]:
+                break
+    except KeyboardInterrupt:
+        interrupted = True  # the best iterate goes back all the same
+        solve.stop()
+        solve.step(1)
+    impulse[:] = sc.impulse(solve.best_z)
+    if interrupted:
+        return Status.INTERRUPTED, None
+    if certificate is not None:
+        return Status.INFEASIBLE, certificate
+    if end == OUTCOMES["spent"]:
+        return (Status.TIME_LIMIT if late and solve.factorisations < n else Status.MAX_ITERATIONS), None
+    return _ENDS[end], None
+
+
+def _proof(problem: Problem, sc: Scaled, y: FloatArray) -> FloatArray | None:
+    """The direction y (scaled) as a certificate (m,), if it proves that there is no solution."""
+    whole = np.zeros(problem.m)
+    whole[sc.keep] = y * sc.scale
+    return whole if check_certificate(problem, whole) is None else None
 
 
 def _refusal(problem: Problem) -> str | None:

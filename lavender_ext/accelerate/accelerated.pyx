@@ -21,7 +21,7 @@ import numpy as np
 
 from lavender_ext.accelerate.accelerated cimport sweep_data_t
 from lavender_ext.accelerate.mixing cimport CONTROL, MAX_MEMORY, UNDONE, forget, mix, mixing_t, take
-from lavender_ext.core.block cimport CONE, CONTACT_ROLLING, ROW, blocks_t, clip, n_tangents, n_ends, norm2
+from lavender_ext.core.block cimport CONE, CONTACT_ROLLING, ROW, blocks_t, clip, n_apart, n_tangents, norm2
 from lavender_ext.core.generalized cimport whitened_gather
 from lavender_ext.core.order cimport RANDOM, SYMMETRIC, advance_order
 from lavender_ext.core.problem cimport Data
@@ -108,7 +108,7 @@ cdef inline void project_block(const blocks_t* p, int32_t i, double* lam) noexce
             size = bound / size
             for k in range(1, 1 + nt):
                 lam[j + k] *= size
-    if n_ends(p.kind[i], n) & 1:
+    if n_apart(p.kind[i], n) & 1:
         bound = bound * p.patch_radius[i]
         lam[j + 1 + nt] = clip(lam[j + 1 + nt], -bound, bound)
     if p.kind[i] == CONTACT_ROLLING:

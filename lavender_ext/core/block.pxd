@@ -1,11 +1,11 @@
 """The arithmetic of one block: the update of a sweep and the error of the judge.
 
 A block is one or more bounded rows (ROW), or a contact: a normal row, then 0, 1 or 2 tangent rows
-(CONTACT), then one spin row (CONTACT_SPIN); or a normal, two tangents, perhaps a spin row, and two rows that roll
-(CONTACT_ROLLING); or a normal and two tangents, each bounded by itself (CONTACT_BOX, in (1) to (7) a contact of one
-tangent and, in the place of spin, the other: r is then mu_2 / mu_1); or a contact of three to five tangents in one cone
-(ROUND: two that slide, one that spins, two that roll, scaled to one mu; law CONE only). With w = A lam - b [m/s] and
-d = diag(A) [1/kg]:
+(CONTACT), then one spin row (CONTACT_SPIN); or a normal and two tangents, each bounded by itself (CONTACT_BOX, in
+(1) to (7) a contact of one tangent and, in the place of spin, the other: r is then mu_2 / mu_1); or a normal, two
+tangents, perhaps a spin row, and two rows that roll (CONTACT_ROLLING); or a contact of three to five tangents in one
+cone (ROUND: two that slide, one that spins, two that roll, scaled to one mu; law CONE only). With w = A lam - b [m/s]
+and d = diag(A) [1/kg]:
 
     update   row      lam  <- clip(lam - w / d, lower, upper)                                  (1)
              normal   lam_n <- max(0, lam_n - w_n / d_n)                                       (2)
@@ -92,17 +92,17 @@ cdef inline int32_t ends_apart(int32_t kind) noexcept nogil:
 
 
 cdef inline int32_t n_tangents(int32_t kind, int32_t size) noexcept nogil:
-    # that mu lam_n bounds together: CONTACT and ROUND are odd; rows behind them have a bound each of their own
+    # that mu lam_n bounds together: CONTACT and ROUND are odd; rows with a bound of their own are left out
     return 2 if kind == CONTACT_ROLLING else size - 2 + (kind & 1)
 
 
 cdef inline int32_t n_directions(int32_t kind, int32_t size) noexcept nogil:
     """Tangent rows, as directions in space."""
-    return 2 if kind == CONTACT_ROLLING else size - 1 - (kind == CONTACT_SPIN)
+    return size - 1 - n_turns(kind, size)
 
 
-cdef inline int32_t n_ends(int32_t kind, int32_t size) noexcept nogil:
-    """Rows behind those that mu lam_n bounds together, as bits and as their number: 1 ends apart, 2 roll, 3 is both."""
+cdef inline int32_t n_apart(int32_t kind, int32_t size) noexcept nogil:
+    """Rows behind those that mu lam_n bounds together, as bits: 1 on mu r lam_n (`ends_apart`), 2 for two on mu_r lam_n."""
     return size - 3 if kind == CONTACT_ROLLING else ends_apart(kind)
 
 
@@ -552,4 +552,4 @@ cdef inline void block_error(const blocks_t* p, int32_t i, const double* lam, co
         round_error(lam + j, w + j, p.d + j, p.mu[i], nt, e + j)
     else:
         contact_error(p.law, lam + j, w + j, p.d + j, p.mu[i], p.patch_radius[i], mu_r(p, i), nt,
-                      n_ends(kind, end - j), e + j)
+                      n_apart(kind, end - j), e + j)

@@ -246,8 +246,7 @@ def contacts(Py_ssize_t k, int32_t tangents, mu, radius, rolling, bint box=False
     cdef const double[::1] each = None, patch = None, moment = None
     cdef double one = 0.0
     cdef Py_ssize_t i, j
-    kind = (CONTACT_BOX if box else ROUND if tangents > 2 else CONTACT_ROLLING if rolls else CONTACT_SPIN if spin
-            else CONTACT)
+    kind = CONTACT_BOX if box else ROUND if tangents > 2 else CONTACT_ROLLING if rolls else CONTACT_SPIN if spin else CONTACT
     if not 0 <= k < 2147483647 // size:
         return None
     if type(mu) is float:

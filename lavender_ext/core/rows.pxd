@@ -20,8 +20,8 @@ from libc.float cimport DBL_MAX
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.block cimport (CONTACT_BOX, CONTACT_ROLLING, CONTACT_SPIN, blocks_t, n_directions, n_turns,
-                                      relax_normal, relax_row, relax_tangents)
+from lavender_ext.core.block cimport (CONTACT_BOX, CONTACT_ROLLING, CONTACT_SPIN, blocks_t, n_directions, n_turns, relax_normal,
+                                      relax_row, relax_tangents)
 
 
 cdef struct rows_t:

@@ -265,8 +265,7 @@ cdef inline int32_t make_contacts(engine_t* e, const rows_t* r) noexcept nogil:
             make_contact(e, r, c, row, a, b, &m, m.n - 1 - j if last_first else j, tangent, nt, turns)
             block = e.size[N_JOINT] + c
             box = nt > 0 and e.head[H_FRICTION_SHAPE]
-            e.kind[block] = (CONTACT_BOX if box else CONTACT_ROLLING if turns & 2 else CONTACT_SPIN if turns
-                             else CONTACT)
+            e.kind[block] = CONTACT_BOX if box else CONTACT_ROLLING if turns & 2 else CONTACT_SPIN if turns else CONTACT
             e.mu[block] = mu
             e.patch_radius[block] = 1.0 if box else patch if turns & 1 else 0.0
             if e.size[ROWS_PER_CONTACT] > 4:

@@ -23,7 +23,7 @@ N is kept between steps; where few blocks have changed their V only those change
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.block cimport CONE, CONTACT_ROLLING, COULOMB, ROW, n_tangents, n_ends
+from lavender_ext.core.block cimport CONE, CONTACT_ROLLING, COULOMB, ROW, n_apart, n_tangents
 from lavender_ext.core.generalized cimport dot
 from lavender_ext.core.problem cimport Data
 from lavender_ext.generalized.flow cimport (blank, block_end, block_from, flow_t, gather, measure, renew, respond_all,
@@ -358,7 +358,7 @@ cdef inline double slip(const flow_t* f, int32_t i) noexcept nogil:
     """phi of (3) from w of block i, whose normal it leaves out."""
     cdef int32_t j = f.p.ptr[i], end = f.p.ptr[i + 1], nt = n_tangents(f.p.kind[i], end - j)
     cdef double out = f.p.mu[i] * size_of(f.w + j + 1, nt)
-    if n_ends(f.p.kind[i], end - j) & 1:
+    if n_apart(f.p.kind[i], end - j) & 1:
         out += f.p.mu[i] * f.p.patch_radius[i] * fabs(f.w[j + 1 + nt])
     if f.p.kind[i] == CONTACT_ROLLING:
         out += f.p.rolling[i] * size_of(f.w + end - 2, 2)

@@ -251,14 +251,13 @@ cdef inline void contact_sizes(const rows_t* r, int32_t c, int32_t nt, int32_t t
 cdef inline void judge_contact(const blocks_t* p, const rows_t* r, int32_t c, int32_t j, int32_t nt, int32_t turns,
                                bint box, const double* lam, double* w, double* e, const double* v,
                                tally_t* s) noexcept nogil:
-    cdef int32_t k, i = r.n_joints + c, together = 1 if box else nt, ends = 1 if box else turns
+    cdef int32_t k, i = r.n_joints + c, together = 1 if box else nt, apart = 1 if box else turns
     cdef double size[6]
     contact_slack(r, c, nt, turns, v, w + j)
     for k in range(j, j + 1 + nt + turns):
         w[k] += r.compliance[k] * lam[k] - p.b[k]
-    contact_error(p.law, lam + j, w + j, p.d + j, p.mu[i], p.patch_radius[i], mu_r(p, i), together, ends,
-                  e + j)
-    tally_contact(p, j, together, ends, e, s)
+    contact_error(p.law, lam + j, w + j, p.d + j, p.mu[i], p.patch_radius[i], mu_r(p, i), together, apart, e + j)
+    tally_contact(p, j, together, apart, e, s)
     contact_sizes(r, c, nt, turns, v + 6 * <ssize_t>r.n_bodies, size)
     for k in range(1 + nt + turns):
         tally_floor(p, j + k, r.compliance[j + k] * fabs(lam[j + k]) + size[k], s)

@@ -13,7 +13,7 @@ to its bound, and falls behind that. In a cycle no row keeps its way, and infeas
 from libc.math cimport fabs
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.block cimport CONTACT_ROLLING, ROW, blocks_t, n_tangents, n_ends, norm2
+from lavender_ext.core.block cimport CONTACT_ROLLING, ROW, blocks_t, n_apart, n_tangents, norm2
 
 
 cdef enum:
@@ -139,7 +139,7 @@ cdef inline bint meets_bound(const progress_t* s, const blocks_t* p, const doubl
             return True
         if p.kind[i] == CONTACT_ROLLING and meets_disk(s, lam, now, end - 2, end, p.rolling[i], lam[j], rate, most):
             return True
-        if n_ends(p.kind[i], end - j) & 1:
+        if n_apart(p.kind[i], end - j) & 1:
             k = j + 1 + nt
             v = speed(s, lam, now, k)
             along = p.mu[i] * p.patch_radius[i]

@@ -10,7 +10,7 @@ from here.
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.block cimport (ROUND, ROW, block_error, blocks_t, is_pair, n_tangents, n_ends, norm2,
+from lavender_ext.core.block cimport (ROUND, ROW, block_error, blocks_t, is_pair, n_apart, n_tangents, norm2,
                                       roll_at)
 
 
@@ -146,7 +146,7 @@ cdef inline void tally_block(const blocks_t* p, int32_t i, const double* e, tall
     elif p.kind[i] == ROUND:
         tally_round(p, j, n_tangents(p.kind[i], end - j), e, s)
     else:
-        tally_contact(p, j, n_tangents(p.kind[i], end - j), n_ends(p.kind[i], end - j), e, s)
+        tally_contact(p, j, n_tangents(p.kind[i], end - j), n_apart(p.kind[i], end - j), e, s)
 
 
 cdef inline void tally_floor(const blocks_t* p, int32_t k, double size, tally_t* s) noexcept nogil:

@@ -12,7 +12,7 @@ Several rows: boxed complementarity by principal pivoting.
 from libc.math cimport fabs
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.block cimport (CONE, ROUND, clip, cone_error, n_ends, relax_normal, relax_row, relax_tangents,
+from lavender_ext.core.block cimport (CONE, ROUND, clip, cone_error, n_apart, relax_normal, relax_row, relax_tangents,
                                       round_error)
 from lavender_ext.local.cone cimport cone2, cone3
 from lavender_ext.local.coulomb cimport PREPARED, coulomb2, coulomb3, prepare3
@@ -104,7 +104,7 @@ cdef inline void project_locally(int32_t law, int32_t nt, int32_t kind, int32_t 
                                  const double* d, const double* step, double mu, double patch_radius,
                                  double rolling, double* lam) noexcept nogil:
     """Where no exact answer is found: the update of core/block.pxd (cone: projected gradient) on the block alone."""
-    cdef int32_t turns = n_ends(kind, m), roll = m - 2, _sweep, i
+    cdef int32_t turns = n_apart(kind, m), roll = m - 2, _sweep, i
     cdef double w[MAX_ROWS]
     cdef double e[MAX_ROWS]
     cdef double high[MAX_ROWS]

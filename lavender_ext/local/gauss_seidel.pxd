@@ -11,8 +11,8 @@ Prepared numbers of block i stand from g[start[i]] on:
 """
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.block cimport (CONE, CONTACT, CONTACT_BOX, CONTACT_ROLLING, CONTACT_SPIN, ROUND, ROW, blocks_t,
-                                      ends_apart, mu_r, n_directions, n_tangents, n_turns, relax_normal, relax_row)
+from lavender_ext.core.block cimport (CONE, CONTACT, CONTACT_BOX, CONTACT_ROLLING, ROUND, ROW, blocks_t, ends_apart, mu_r,
+                                      n_directions, n_tangents, n_turns, relax_normal, relax_row)
 from lavender_ext.core.csr cimport csr_dot, csr_t
 from lavender_ext.core.generalized cimport generalized_t, whitened_dot, whitened_push
 from lavender_ext.core.rows cimport (cross, dot3, joint_push, joint_velocity, push_bodies, relative_velocity,

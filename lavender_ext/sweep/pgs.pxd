@@ -4,7 +4,7 @@ Over J and M the whitened velocities u = Y^T lam are kept: w = Y u + c lam - b, 
 """
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.block cimport (CONTACT_ROLLING, ROW, blocks_t, n_tangents, n_ends, relax_normal, relax_row,
+from lavender_ext.core.block cimport (CONTACT_ROLLING, ROW, blocks_t, n_apart, n_tangents, relax_normal, relax_row,
                                       relax_tangents)
 from lavender_ext.core.csr cimport csr_dot, csr_t
 from lavender_ext.core.generalized cimport generalized_t, whitened_dot, whitened_push
@@ -25,7 +25,7 @@ cdef inline void relax_csr_block(const blocks_t* p, const csr_t* a, int32_t i, d
         for q in range(nt):
             w[q] = csr_dot(a, j + 1 + q, lam) - p.b[j + 1 + q]
         relax_tangents(lam + j + 1, w, p.step[j + 1], bound, nt)
-    if n_ends(kind, end - j) & 1:
+    if n_apart(kind, end - j) & 1:
         q = j + 1 + nt
         bound = p.patch_radius[i] * bound
         lam[q] = relax_row(lam[q], csr_dot(a, q, lam) - p.b[q], p.step[q], -bound, bound)
@@ -74,7 +74,7 @@ cdef inline void relax_general_block(const blocks_t* p, const generalized_t* g, 
     bound = p.mu[i] * lam[j]
     if nt > 0:
         relax_general_disk(p, g, b, j + 1, nt, bound, lam, u)
-    if n_ends(kind, end - j) & 1:
+    if n_apart(kind, end - j) & 1:
         q = j + 1 + nt
         bound = p.patch_radius[i] * bound
         x = general_slack_of(p, g, b, q, lam, u)

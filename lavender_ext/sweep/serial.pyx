@@ -12,7 +12,7 @@ from libc.stdint cimport int32_t, int64_t, uint64_t
 
 import numpy as np
 
-from lavender_ext.core.block cimport (CONTACT_ROLLING, ROW, blocks_t, n_tangents, n_ends, relax_normal,
+from lavender_ext.core.block cimport (CONTACT_ROLLING, ROW, blocks_t, n_apart, n_tangents, relax_normal,
                                       relax_row, relax_tangents)
 from lavender_ext.core.csr cimport csr_dot, csr_t
 from lavender_ext.core.generalized cimport generalized_t
@@ -87,7 +87,7 @@ cdef public void lav_jacobi_sweeps(const blocks_t* p, const csr_t* a, double ome
             bound = p.mu[i] * lam[j]
             if nt > 0:
                 relax_tangents(lam + j + 1, w + j + 1, omega * p.step[j + 1], bound, nt)
-            if n_ends(p.kind[i], end - j) & 1:
+            if n_apart(p.kind[i], end - j) & 1:
                 q = j + 1 + nt
                 bound = p.patch_radius[i] * bound
                 lam[q] = relax_row(lam[q], w[q], omega * p.step[q], -bound, bound)

@@ -25,7 +25,11 @@ LANGUAGES = {"C11": ["-std=c11"], "C++17": ["-std=c++17", "-x", "c++"]}
 @pytest.mark.parametrize("small", [[], ["-DLAV_SWEEPS_ONLY"]], ids=["full", "sweeps"])
 @pytest.mark.parametrize("name", ["gcc", "clang", "zig"])
 def test_no_warning_in_either_language(folder, name, small, language):
-    command = [sys.executable, "-m", "ziglang", "cc", "-Wno-unused-command-line-argument"] if name == "zig" else [name]
+    command = (
+        [sys.executable, "-m", "ziglang", "cc", "-Wno-unused-command-line-argument"]
+        if name == "zig"
+        else [name]
+    )
     if name == "zig":
         pytest.importorskip("ziglang", reason="ziglang is not installed (extra: wasm)")
     elif shutil.which(name) is None:

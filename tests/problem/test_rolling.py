@@ -12,6 +12,7 @@ import lavender as lv
 from lavender import registry
 from lavender.certificates import check_certificate
 from lavender.measures import siconos_error
+from lavender.motion.unique import uniqueness
 
 TAKES = [n for n in lv.available(law="coulomb") if registry.specs()[n].rolling]
 CONVEX = [n for n in lv.available(law="cone") if registry.specs()[n].rolling]
@@ -277,6 +278,19 @@ def test_the_motion_error_of_a_wrong_answer_lies_within_its_bound():
     moved = problem.velocity(rough.impulse) - problem.velocity(exact.impulse)
     np.testing.assert_allclose(error.speed, np.linalg.norm(moved[:, :3], axis=1).max(), rtol=1e-6)
     assert error.bound is None or error.kinetic <= error.bound * (1 + 1e-12)
+
+
+def test_where_one_motion_is_proven_starts_find_no_other():
+    """Small friction and a small moment: one motion by the criterion; with much of both each one found is one."""
+    rng = np.random.default_rng(3)
+    g = rng.normal(size=(10, 12))
+    a, b = g @ g.T + 2.0 * np.eye(10), rng.normal(size=10)
+    few = lv.Problem(b, lv.Cones.contacts(0.01, rolling=0.01, count=2), a)
+    assert uniqueness(few)
+    assert not uniqueness(lv.Problem(b, lv.Cones.contacts(0.01, rolling=5.0, count=2), a))
+    assert len(lv.motions(few)) == 1
+    for motion in lv.motions(lv.Problem(b, lv.Cones.contacts(2.0, rolling=3.0, count=2), a)):
+        assert motion.reference.residual.relative <= 1e-9
 
 
 def test_siconos_error_is_zero_at_the_solution_alone():

@@ -42,13 +42,22 @@ def example(law, rows):
     return problem if rows else as_matrix(problem)
 
 
+@functools.cache
+def rolling_example(law, rows):
+    base = random_contact_problem(23, friction=law, rolling=True)
+    problem = lv.Problem(base.b, base.cones, rows=base.rows, compliance=base.compliance + 0.3, friction=law)
+    return problem if rows else as_matrix(problem)
+
+
 def examples(spec):
     for law in LAWS:
         if law in spec.laws:
-            for rows in (True, False):
-                problem = example(law, rows)
-                if spec.refuses(problem) is None:
-                    yield problem
+            made = [example, rolling_example] if spec.rolling and law in ("coulomb", "cone") else [example]
+            for make in made:
+                for rows in (True, False):
+                    problem = make(law, rows)
+                    if spec.refuses(problem) is None:
+                        yield problem
 
 
 # Backends that must solve the easy examples; the others are judged all the same.
@@ -354,7 +363,8 @@ def test_units_scale_the_result(name):
         c = problem.cones
         scale = speed * kg
         scaled = lv.Problem(
-            problem.b * speed, lv.Cones(c.ptr, c.kind, c.lower * scale, c.upper * scale, c.mu, c.patch_radius),
+            problem.b * speed,
+            lv.Cones(c.ptr, c.kind, c.lower * scale, c.upper * scale, c.mu, c.patch_radius, c.rolling),
             problem.matrix / kg, friction=problem.friction,
         )  # fmt: skip
         x, y = (lv.solve(p, name, tol=1e-9, max_iter=budget(spec)) for p in (problem, scaled))

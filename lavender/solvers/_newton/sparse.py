@@ -11,18 +11,21 @@ saved shows in what a solution x leaves of its right-hand side r, and is refined
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
 
 from lavender._arrays import FloatArray, IntArray
+from lavender._lu import sparse_lu
 from lavender.solvers._factor import TINY, WIDE
 from lavender.solvers._newton.scaled import Scaled
 from lavender_ext.factor.sparse import SparsePanels, is_mirrored
 from lavender_ext.newton.coupled import coupled, coupled_entries, coupled_rows, element_graph
 from lavender_ext.newton.elements import Elements
+from lavender_ext.newton.solve import WHATS
 
-__all__ = ["Coupled", "Panelled"]
+__all__ = ["Coupled", "Panelled", "SparseRows"]
 
 BACKWARD = 1e-12  # (1): thousands of roundings
 
@@ -113,6 +116,57 @@ class Coupled:
         values = np.empty_like(self.h)
         coupled(self.elements, self.to, self.other, self.indptr, self.h, left, right, own, values)
         return self._whole(values, lu)
+
+
+class SparseRows:
+    """Who factors a sparse M for `Solve` and solves with it: panels; SuperLU where these lose a pivot or digits."""
+
+    def __init__(self, coupled: Coupled, symmetric: bool) -> None:
+        self.coupled, self.symmetric = coupled, symmetric
+        self.small: Any  # with the small matrices v, p, pair and bt of every element
+
+    def factor(self, _augmented: int, what: int, eps: float) -> bool:
+        """Whether there is a factor."""
+        s, own = self.small, eps - 1.0
+        lu = not self.symmetric
+        if what == WHATS["natural"]:
+            bounded = s.bt is None
+            made = self.coupled.small(s.p, s.p if bounded else None, own, lu or not bounded)
+        elif s.bt is None:
+            with np.errstate(divide="ignore", over="ignore"):
+                made = self.coupled.barrier(
+                    1.0 / s.v, lu
+                )  # inf for a row that no longer moves: the step fails
+        elif what == WHATS["barrier"]:
+            made = self.coupled.small(s.bt, s.bt, 0.0, lu)
+        else:
+            made = self.coupled.small(s.pair, s.bt, 0.0, True)
+        self.made: Panelled | None = made
+        self.instead: Any = None
+        if not np.isfinite(made.values).all():
+            self.made = None
+        elif not made.factor():
+            self._superlu()
+        return self.made is not None
+
+    def solve(self, _augmented: int, r: FloatArray) -> FloatArray:
+        """M^-1 r; not finite where there is none."""
+        if self.made is not None and self.instead is None:
+            x = self.made.solve(r)
+            if x is not None:
+                return x
+            self._superlu()
+        if self.made is None:
+            return np.full_like(r, np.nan)
+        found: FloatArray = self.instead(r)
+        return found
+
+    def _superlu(self) -> None:
+        assert self.made is not None
+        try:
+            self.instead = sparse_lu(self.made.matrix(), permc_spec="COLAMD").solve
+        except RuntimeError:
+            self.made = None
 
 
 def _graph(sc: Scaled, a: sp.csr_array) -> tuple[IntArray, IntArray]:

@@ -1,0 +1,332 @@
+"""One solve by Newton's method: its vectors, its budget, its best point, where it stands between two steps.
+
+A point counts by the judge's relative residual alone (`score`). Phases stand on a stack and are taken one factorisation
+at a time, so that whoever asked can look at a clock in between.
+"""
+from libc.stdint cimport int32_t, int64_t
+from libc.string cimport memcpy
+
+from lavender_ext.core.block cimport blocks_t
+from lavender_ext.core.csr cimport csr_t
+from lavender_ext.core.generalized cimport generalized_t
+from lavender_ext.core.rows cimport rows_t
+from lavender_ext.judge.measure cimport general_judge, judge_into, relative_of
+from lavender_ext.judge.score cimport relative, score_t
+from lavender_ext.newton.natural_map cimport convex_error
+from lavender_ext.newton.system cimport system_t, system_times
+
+
+cdef enum:                      # phases
+    CONVEX = 0                  # what is tried when (plan.pxd)
+    COULOMB = 1
+    EXCHANGES = 2               # phases.pxd
+    INTERIOR = 3
+    PROXIMAL = 4
+    PURSUIT = 5
+    APPROACH = 6
+    POLISH = 7
+    DE_SAXCE = 8
+    RELAXED = 9
+    WALKS = 16                  # PROXIMAL + WALKS of the second walk
+
+cdef enum:                      # what is counted
+    N_EXCHANGES = 0
+    N_INTERIOR = 1
+    N_REFINED = 2
+    N_ROUNDS = 3
+    N_DE_SAXCE = 4
+    N_RELAXED = 5
+    N_AUGMENTED_INTERIOR = 6
+    N_AUGMENTED_DE_SAXCE = 7
+    N_AUGMENTED = 8
+    N_COUNTED = 9
+
+cdef enum:
+    DEEP = 8                    # of the stack
+    VECTORS = 35                # (m) of `lay_vectors`
+    INNER = 20                  # Newton steps of one proximal round at most
+
+
+cdef struct problem_t:          # as the judge reads it
+    blocks_t p
+    const csr_t* a              # or NULL,
+    const rows_t* r             # or NULL,
+    const generalized_t* g      # or NULL
+    double e0                   # errors of doing nothing
+    double v0
+    double* w                   # (rows)
+    double* error               # (rows)
+    double* x                   # (12 bodies | velocities + rows)
+
+
+cdef struct interior_t:         # an interior point
+    double* z
+    double* u1                  # duals
+    double* u2
+    double* hz                  # H z
+    double* everything          # nearly H z = g on every row
+    double delta                # proximal weight
+    double share                # of phi's derivative; 0: the convex law
+    double degree               # cones
+    double gap                  # G z . u / degree before the last step
+    double lowest_gap           # before that
+    double first_gap
+    double length               # of it
+    double energy               # |F| after it, the judge's energy error (convex law)
+    double velocity             # the judge's velocity error
+
+
+cdef struct exchange_t:
+    double* z
+    double* hz
+    double* kept
+    double best
+    int32_t* side               # bound that a row rests on by its natural map
+    int32_t judged
+    int32_t first               # rows that changed in the first exchange
+    int32_t done
+    int32_t fewest
+    int32_t still
+
+
+cdef struct look_t:             # of the steps of an interior point
+    double* kept                # its best z
+    double lowest
+    double near                 # relative residual from which Newton steps are asked
+    int32_t idle
+    int32_t still
+    int32_t steps
+    int32_t at
+    int32_t rows                # bounded rows alone
+    int32_t law                 # of the Newton steps
+    int32_t augmented
+
+
+cdef struct polish_t:
+    double* z
+    double best
+    int32_t worse
+    int32_t patience
+    int32_t left                # steps
+
+
+cdef struct proximal_t:         # proximal point rounds
+    double* z
+    double history[INNER]
+    double alpha
+    double slowest              # alpha falls at most by this factor; closer to 1 after a failure
+    double before               # best residual when the round began
+    int32_t law
+    int32_t inner
+    int32_t failures
+    int32_t idle
+    int32_t stuck
+    int32_t at
+    int32_t n                   # of history
+    int32_t solved
+    int32_t begun               # factorisations when the round began,
+    int32_t last                # and at which it ends
+    int32_t free                # rounds in a row that cost no factorisation
+
+
+cdef struct pursuit_t:
+    double last
+    int32_t at
+    int32_t which
+    int32_t stretches
+
+
+cdef struct tries_t:            # De Saxce's interior points
+    int32_t at
+    int32_t share
+    int32_t end
+    int32_t augmented
+
+
+cdef struct newton_t:
+    system_t s
+    problem_t problem
+    const double* scale         # (m) D^-1/2
+    const double* fixed         # (rows) impulse of rows that do not move
+    const int32_t* keep         # (m) rows that do, or NULL: all
+    const double* speed         # (m) velocity error per unit of the natural map
+    double tol
+    int32_t budget              # factorisations
+    int32_t most                # of this turn
+    int32_t stop                # the caller has no more time
+    int32_t asked               # whether `direction` proves that there is no solution
+    int32_t proven              # it does
+    int32_t cold                # begun from doing nothing
+    int32_t loops               # the augmented system can be asked for
+    int32_t without             # bits of phases that are left out
+    int32_t at                  # of the plan
+    int32_t relaxed_at
+    int32_t set_aside
+    int32_t counts[N_COUNTED]
+    int32_t stack[DEEP]
+    int32_t depth
+    double best                 # relative residual of best_z
+    double aside                # a best point that is no start for what comes
+    double before               # the best point apart from a walk's own
+    double floor
+    double relaxed              # residual at which the convex problem is given up
+    double* best_z
+    double* aside_z
+    double* before_z
+    double* direction
+    double* lam                 # (rows)
+    double* f
+    double* r
+    double* da
+    double* dz
+    double* t1
+    double* t2
+    double* u
+    double* psi
+    double* c                   # centre of a round
+    double* hz
+    double* hdz
+    double* trial
+    double* rest
+    interior_t ip
+    exchange_t exchange
+    look_t look
+    polish_t polish
+    proximal_t walk[2]          # the first walk, which goes on in the end; any other
+    pursuit_t pursuit
+    tries_t tries
+
+
+cdef inline void lay_vectors(newton_t* n, double* room, int64_t m) noexcept nogil:
+    """Places in room (VECTORS m)."""
+    cdef double** at[VECTORS]
+    cdef int32_t i
+    at[0], at[1], at[2], at[3] = &n.best_z, &n.aside_z, &n.before_z, &n.direction
+    at[4], at[5], at[6], at[7] = &n.f, &n.r, &n.da, &n.dz
+    at[8], at[9], at[10], at[11] = &n.t1, &n.t2, &n.u, &n.psi
+    at[12], at[13], at[14], at[15] = &n.c, &n.hz, &n.hdz, &n.trial
+    at[16], at[17], at[18], at[19] = &n.rest, &n.ip.z, &n.ip.u1, &n.ip.u2
+    at[20], at[21], at[22], at[23] = &n.ip.hz, &n.ip.everything, &n.exchange.z, &n.exchange.hz
+    at[24], at[25], at[26], at[27] = &n.exchange.kept, &n.look.kept, &n.polish.z, &n.walk[0].z
+    at[28], at[29], at[30] = &n.walk[1].z, &n.s.t, &n.s.q
+    for i in range(31):
+        at[i][0] = room + i * m
+
+
+cdef inline void take(newton_t* n, double* to, const double* x) noexcept nogil:
+    memcpy(to, x, n.s.e.m * sizeof(double))
+
+
+cdef inline void enter(newton_t* n, int32_t phase) noexcept nogil:
+    """The phase goes on top; one that is left out has ended."""
+    if n.without >> (phase % WALKS) & 1:
+        return
+    n.stack[n.depth] = phase
+    n.depth += 1
+
+
+cdef inline void leave(newton_t* n) noexcept nogil:
+    n.depth -= 1
+
+
+cdef inline void impulse_of(const newton_t* n, const double* z, double* lam) noexcept nogil:
+    """lambda (rows) of z."""
+    cdef int32_t j
+    if n.keep == NULL:
+        for j in range(n.s.e.m):
+            lam[j] = z[j] * n.scale[j]
+        return
+    memcpy(lam, n.fixed, n.problem.p.n_rows * sizeof(double))
+    for j in range(n.s.e.m):
+        lam[n.keep[j]] = z[j] * n.scale[j]
+
+
+cdef inline double judged(newton_t* n, const double* z, bint floor) noexcept nogil:
+    """The judge's relative residual of z; what rounding leaves into n.floor."""
+    cdef score_t s = score_t(0.0, 0.0, 0.0, 0.0, -1, 1)
+    cdef const problem_t* o = &n.problem
+    cdef double found
+    impulse_of(n, z, n.lam)
+    if o.g != NULL:
+        general_judge(&o.p, o.g, n.lam, o.w, o.error, o.x, floor, &s)
+    else:
+        judge_into(&o.p, o.a, o.r, o.r != NULL, n.lam, o.w, o.error, o.x, floor, &s)
+    found = relative_of(&s, o.w, o.p.n_rows, o.e0, o.v0)
+    n.floor = relative(s.floor_energy, s.floor_velocity, o.e0, o.v0) if floor and s.finite else 0.0
+    return found
+
+
+cdef inline double score(newton_t* n, const double* z) noexcept nogil:
+    """The same; the best point is kept."""
+    cdef double found = judged(n, z, False)
+    if found < n.best:
+        n.best = found
+        take(n, n.best_z, z)
+    return found
+
+
+cdef inline double relative_at(newton_t* n, const double* z, const double* hz) noexcept nogil:
+    """The judge's residual of the convex law from hz = H z."""
+    cdef double energy, velocity
+    convex_error(n.s.e, z, hz, n.speed, &energy, &velocity)
+    return relative(energy, velocity, n.problem.e0, n.problem.v0)
+
+
+cdef inline bint spent(const newton_t* n) noexcept nogil:
+    return n.s.factorisations >= n.budget or n.stop
+
+
+cdef inline bint done(const newton_t* n) noexcept nogil:
+    return n.best <= n.tol or n.proven or spent(n)
+
+
+cdef inline bint at_floor(newton_t* n) noexcept nogil:
+    """The best point is within twice the floor."""
+    cdef double found
+    if n.best > 1e-5:
+        return False
+    found = judged(n, n.best_z, True)
+    return found <= 2.0 * n.floor < 1.0 / 0.0 and found < 1.0
+
+
+cdef inline void put_aside(newton_t* n, double best, const double* z) noexcept nogil:
+    """Go on with an earlier best point; the one of now counts again in the end."""
+    if n.best < best:
+        n.set_aside = 1
+        n.aside = n.best
+        take(n, n.aside_z, n.best_z)
+        n.best = best
+        take(n, n.best_z, z)
+
+
+cdef inline void take_back(newton_t* n) noexcept nogil:
+    """The best of all."""
+    if n.set_aside and n.aside < n.best:
+        n.best = n.aside
+        take(n, n.best_z, n.aside_z)
+
+
+cdef inline void begin_apart(newton_t* n) noexcept nogil:
+    """A walk judged by its own progress begins."""
+    n.before = n.best
+    take(n, n.before_z, n.best_z)
+    n.best = 1.0 / 0.0
+
+
+cdef inline double end_apart(newton_t* n, double* z) noexcept nogil:
+    """Its lowest residual, and its z where z is not NULL; the better point is the best again."""
+    cdef double best = n.best
+    if z != NULL:
+        take(n, z, n.best_z)
+    if n.before <= best:
+        n.best = n.before
+        take(n, n.best_z, n.before_z)
+    return best
+
+
+cdef inline void with_products(newton_t* n, const double* z, double* rest) noexcept nogil:
+    """s = H z - g into rest."""
+    cdef int32_t j
+    system_times(&n.s, z, rest)
+    for j in range(n.s.e.m):
+        rest[j] -= n.s.e.g[j]
