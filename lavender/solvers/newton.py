@@ -16,8 +16,8 @@ Problems in generalised coordinates go over their velocities first (`_newton/gen
 that leaves goes on as above, over the rows of A, unless form="velocity".
 
 1 to 4 are compiled (`lavender_ext/newton/plan.pxd`) and taken in turns; the clock, Ctrl-C and proofs are asked for in
-between. Their systems stand in `_newton/`. Form "velocity" factors I + K^T V K over the bodies and never squares J; "impulse"
-factors over the rows.
+between. Their systems stand in `_newton/`. Form "velocity" factors I + K^T V K over the bodies and never squares J;
+"impulse" factors over the rows.
 """
 
 from __future__ import annotations

@@ -31,8 +31,8 @@ cdef enum:                      # phases
 
 cdef enum:                      # what is counted
     N_EXCHANGES = 0
-    N_INTERIOR = 1
-    N_REFINED = 2
+    N_REFINED = 1
+    N_INTERIOR = 2
     N_ROUNDS = 3
     N_DE_SAXCE = 4
     N_RELAXED = 5

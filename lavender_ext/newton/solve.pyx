@@ -34,8 +34,8 @@ PHASES = {
 #: What `Solve.counts` counts, as the message of a solution names it.
 COUNTED = (
     "exchanges",
-    "interior point steps",
     "refinements",
+    "interior point steps",
     "proximal rounds",
     "De Saxce steps",
     "convex steps",

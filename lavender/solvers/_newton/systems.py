@@ -28,8 +28,8 @@ from lavender_ext.newton.panel import narrow, scaled_jacobian
 from lavender_ext.newton.solve import Solve
 
 DENSE_ROWS = 150  # below: a dense factor beats sparse bookkeeping
-# Nonzero share s of A above which a dense factor is there sooner: of one full block of s^1/2 m rows, whose multiply-adds
-# cost a quarter there; and of bounded rows alone, whose free ones panels analyse anew whenever they change.
+# Nonzero share s of A above which a dense factor is there sooner: of one full block of s^1/2 m rows, whose
+# multiply-adds cost a quarter there; and of bounded rows alone, of which dense factors take the free ones.
 DENSE_FILL, BOUNDED_FILL = 0.4, 0.25
 DENSE_LIMIT = 6000  # rows; 288 MB of A
 # Multiply-adds of a factor over bodies from which dense panels beat block rows; a panel's columns up to which, and
@@ -42,7 +42,7 @@ WIDE = os.environ.get("LAVENDER_BASELINE", "0") in (
 
 
 def is_full(nnz: int, m: int, bounded: bool) -> bool:
-    """Whether a dense factor of Newton's matrix of m rows and nnz entries is there sooner than panels; `bounded`: no cones."""
+    """Whether a dense factor of m rows and nnz entries is there sooner than panels; `bounded`: no cones."""
     return nnz > (BOUNDED_FILL if bounded else DENSE_FILL) * m * m
 
 

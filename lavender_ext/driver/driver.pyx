@@ -1,0 +1,347 @@
+"""Room, start and step of the methods, for any host; the same from Python for tests."""
+from libc.math cimport sqrt
+from libc.stdint cimport int32_t, int64_t
+from libc.string cimport memset
+
+import numpy as np
+
+from lavender_ext.core.arrays cimport address
+from lavender_ext.core.block cimport COULOMB, blocks_t, has_friction
+from lavender_ext.core.problem cimport Data
+from lavender_ext.driver.driver cimport NEWTON, ROOM, UNFIT, asked_t, room_t, said_t, view_t
+from lavender_ext.driver.scaling cimport (dense_matrix, is_known, lay_scaled, make_scaled, scaled_index, scaled_real,
+                                          scaled_t)
+from lavender_ext.factor.tiles cimport has_wide
+from lavender_ext.generalized.flow cimport flow_t
+from lavender_ext.generalized.islands cimport aim_at, furnish, marks_of, need_t, numbers_of, settle
+from lavender_ext.generalized.newton cimport DONE as G_DONE
+from lavender_ext.generalized.newton cimport SPENT as G_SPENT
+from lavender_ext.generalized.newton cimport solve_island
+from lavender_ext.generalized.sparse cimport PER_COLUMN
+from lavender_ext.judge.measure cimport do_nothing, general_judge, judge_into, reference_of
+from lavender_ext.judge.score cimport are_numbers, score_rows, score_t
+from lavender_ext.newton.plan cimport CERTIFICATE, MORE, REACHED, SPENT, STUCK, newton_start, newton_step
+from lavender_ext.newton.run cimport VECTORS, impulse_of, lay_vectors, newton_t
+from lavender_ext.newton.system cimport BODIES, DENSE, dense_room
+from lavender_ext.warm.walk cimport (index_room, lay_numbers, lay_pattern, make_pattern, pattern_t, real_room, walk_t)
+
+
+cdef struct state_t:            # at the beginning of the caller's float64
+    newton_t n
+    scaled_t s
+    walk_t w
+    flow_t f
+    double* rows                # 4 (rows) of the judge, and its scratch
+    double* z                   # (rows)
+    double* proof               # (rows)
+
+
+cdef inline int64_t state_room() noexcept nogil:
+    return sizeof(state_t) // sizeof(double) + 1
+
+
+cdef inline int64_t judge_room(const view_t* v) noexcept nogil:
+    cdef int64_t m = v.p.n_rows
+    if v.r != NULL:
+        return 6 * m + 12 * <int64_t>v.r.n_bodies
+    return 6 * m + (v.g.n + m if v.g != NULL else 0)
+
+
+cdef inline void vanish(double* x, int64_t n) noexcept nogil:
+    memset(x, 0, n * sizeof(double))
+
+
+cdef inline void reference(const view_t* v, state_t* s) noexcept nogil:
+    """Errors of doing nothing, as the judge has them."""
+    cdef score_t found = score_t(0.0, 0.0, 0.0, 0.0, -1, 1)
+    cdef double begun[3]
+    cdef newton_t* n = &s.n
+    cdef int64_t m = v.p.n_rows
+    cdef bint moves
+    n.problem.p, n.problem.a, n.problem.r, n.problem.g = v.p, v.a, v.r, v.g
+    n.lam, n.problem.w, n.problem.error = s.rows, s.rows + m, s.rows + 2 * m
+    s.z, s.proof, n.problem.x = s.rows + 3 * m, s.rows + 4 * m, s.rows + 6 * m
+    moves = do_nothing(&v.p, n.lam, n.problem.w)
+    if not moves:
+        score_rows(&v.p, n.lam, n.problem.w, n.problem.error, &found)
+    elif v.g != NULL:
+        general_judge(&v.p, v.g, n.lam, n.problem.w, n.problem.error, n.problem.x, False, &found)
+    else:
+        judge_into(&v.p, v.a, v.r, v.r != NULL, n.lam, n.problem.w, n.problem.error, n.problem.x, False, &found)
+    found.finite = found.finite and are_numbers(n.problem.w, v.p.n_rows)
+    reference_of(&v.p, &found, moves, False, begun)
+    n.problem.e0, n.problem.v0 = begun[0], begun[1]
+
+
+cdef inline bint grant(room_t* r, int64_t n_index, int64_t n_real) noexcept nogil:
+    """Is there as much? Else that is what is needed."""
+    cdef bint enough = r.n_index >= n_index and r.n_real >= n_real and (r.real != NULL or n_real == 0)
+    if not enough:
+        r.n_index, r.n_real = n_index, n_real
+    return enough
+
+
+cdef inline void begin(state_t* s, const asked_t* o, const double* lam, bint coulomb) noexcept nogil:
+    cdef int32_t j
+    cdef newton_t* n = &s.n
+    n.tol, n.budget, n.cold = o.tol, o.budget, o.cold
+    n.without = 0
+    for j in range(n.s.e.m):
+        s.z[j] = lam[n.keep[j] if n.keep != NULL else j] / n.scale[j]
+    newton_start(n, s.z, coulomb)
+
+
+# -- over the rows of A ----------------------------------------------------------------------------------------
+
+
+cdef inline void rows_need(const view_t* v, room_t* r) noexcept nogil:
+    """More than enough: as if every row moved, in contacts of four rows."""
+    cdef int64_t m = v.p.n_rows
+    cdef bint cones = has_friction(&v.p)
+    r.n_index = scaled_index(m) + 3 * m
+    r.n_real = (state_room() + judge_room(v) + scaled_real(m) + (VECTORS + 5 * 4) * m + 2 * m * m + dense_room(m, cones)
+                + 8)
+
+
+cdef inline int32_t start_rows(const view_t* v, const asked_t* o, room_t* r, const double* lam) noexcept nogil:
+    cdef state_t* s = <state_t*>r.real
+    cdef newton_t* n = &s.n
+    cdef int64_t m = v.p.n_rows
+    cdef int32_t* index = r.index + scaled_index(m)
+    cdef double* x = r.real + state_room()
+    cdef bint cones
+    vanish(r.real, r.n_real)
+    s.rows = x
+    x += judge_room(v)
+    reference(v, s)
+    lay_scaled(&s.s, m, r.index, x)
+    make_scaled(&s.s, &v.p, v.a)
+    x += scaled_real(m)
+    lay_vectors(n, x, m)
+    x += VECTORS * m
+    n.keep, n.fixed, n.scale, n.speed = s.s.keep, s.s.fixed, s.s.scale, s.s.speed
+    cones = s.s.e.n < s.s.e.m
+    n.s.e = &s.s.e
+    n.s.form, n.s.wide = DENSE, has_wide()
+    n.s.others = NULL
+    n.s.v, n.s.einv, n.s.p, n.s.pair = x, x + s.s.small, x + 2 * s.s.small, x + 3 * s.s.small
+    n.s.bt = x + 4 * s.s.small if cones else NULL
+    x += 5 * s.s.small
+    n.s.h, n.s.whole, n.s.lower = x, x + m * m, x + 2 * m * m
+    n.s.swap, n.s.free, n.exchange.side = index, index + m, index + 2 * m
+    n.s.symmetric = dense_matrix(&s.s, v.a, <int32_t>m, n.s.swap, x)
+    begin(s, o, lam, v.p.law == COULOMB and cones)
+    return MORE
+
+
+# -- over bodies -----------------------------------------------------------------------------------------------
+
+
+cdef inline bint all_move(const blocks_t* p) noexcept nogil:
+    cdef int32_t i, j
+    for i in range(p.n_blocks):
+        for j in range(p.ptr[i], p.ptr[i + 1]):
+            if not p.d[j] > 0.0 or (p.kind[i] == 0 and p.lower[j] == p.upper[j]):
+                return False
+        if p.kind[i] != 0 and p.ptr[i + 1] - p.ptr[i] > 1 and (
+                p.mu[i] == 0.0 or (p.kind[i] == 2 and p.patch_radius[i] == 0.0)):
+            return False
+    return True
+
+
+cdef inline int32_t start_bodies(const view_t* v, const asked_t* o, room_t* r, const double* lam) noexcept nogil:
+    cdef state_t* s = <state_t*>r.real
+    cdef newton_t* n = &s.n
+    cdef pattern_t a
+    cdef int64_t m = v.p.n_rows, indices = index_room(&v.p, v.r), most
+    cdef double* x
+    cdef double* weights
+    cdef int32_t j
+    cdef bint cones, soft = False
+    lay_pattern(&a, r.index, &v.p, v.r)
+    make_pattern(&a, &v.p, v.r)
+    most = (state_room() + judge_room(v) + real_room(&a, &v.p, v.r) + (VECTORS + 2) * m + 2 * <int64_t>a.small + 8)
+    if not grant(r, indices + 2 * m + 8, most):
+        return ROOM
+    vanish(r.real, r.n_real)
+    s.rows = r.real + state_room()
+    x = s.rows + judge_room(v)
+    reference(v, s)
+    lay_numbers(&s.w, &a, x, &v.p, v.r)
+    x += real_room(&a, &v.p, v.r)
+    lay_vectors(n, x, m)
+    x += VECTORS * m
+    weights = x
+    for j in range(<int32_t>m):
+        weights[j] = sqrt(v.p.nu[j] * v.p.d[j]) * s.w.scale[j]
+        soft = soft or v.r.compliance[j] != 0.0
+    x += m
+    n.keep, n.fixed, n.scale, n.speed = NULL, NULL, s.w.scale, weights
+    cones = s.w.e.n < s.w.e.m
+    n.s.e, n.s.f = &s.w.e, &s.w.f
+    n.s.form, n.s.symmetric, n.s.others = BODIES, 1, NULL
+    n.s.v, n.s.einv, n.s.p, n.s.pair, n.s.y = s.w.v, s.w.einv, s.w.p, x, s.w.y
+    n.s.bt = x + a.small if cones and not soft else NULL
+    n.exchange.side = r.index + indices
+    begin(s, o, lam, v.p.law == COULOMB and cones)
+    return MORE
+
+
+# -- over J and M ----------------------------------------------------------------------------------------------
+
+
+cdef inline int32_t start_general(const view_t* v, const asked_t* o, room_t* r) noexcept nogil:
+    cdef state_t* s = <state_t*>r.real
+    cdef need_t need
+    cdef flow_t f
+    cdef int32_t per = PER_COLUMN
+    cdef int64_t own
+    while True:
+        if not grant(r, marks_of(&v.p, v.g, per), state_room() + judge_room(v)):
+            return ROOM
+        settle(&f, &v.p, v.g, per, r.index, &need)
+        if not need.crowded or 4 * per > v.g.n:
+            break
+        per *= 2
+    own = state_room() + judge_room(v)
+    if not grant(r, marks_of(&v.p, v.g, per), own + numbers_of(&f, &need)):
+        return ROOM
+    vanish(r.real, own)
+    s.f = f
+    s.rows = r.real + state_room()
+    reference(v, s)
+    furnish(&s.f, &need, r.real + own)
+    aim_at(&s.f, o.tol, o.budget, s.n.problem.e0, s.n.problem.v0)
+    s.n.budget = o.budget
+    return MORE
+
+
+cdef inline int32_t step_general(const asked_t* o, state_t* s, int32_t work, double* lam) noexcept nogil:
+    """All islands, the one that waits first."""
+    cdef int32_t i, end, cold = o.cold, worst = G_DONE, first = 0, left = s.n.budget
+    if o.stop or left <= 0:
+        return SPENT
+    if s.f.wait.island >= 0:
+        first, worst, cold = s.f.wait.island, s.f.wait.worst, s.f.wait.cold
+    s.f.steps = work if work < left else left
+    s.n.budget -= s.f.steps
+    for i in range(first, s.f.n_islands):
+        end = solve_island(&s.f, i, lam, cold)
+        if end == G_SPENT:
+            s.f.wait.worst, s.f.wait.cold = worst, cold
+            return MORE if s.n.budget > 0 else SPENT
+        worst = end if end > worst else worst
+    return REACHED if worst == G_DONE else STUCK
+
+
+# -- the three -------------------------------------------------------------------------------------------------
+
+
+cdef public int32_t lav_room(const view_t* v, const asked_t* o, room_t* r) noexcept nogil:
+    """r.n_index and r.n_real as far as they are known beforehand; 0 where the method does not take the problem."""
+    cdef int64_t most = 0
+    r.n_index = r.n_real = 0
+    r.index = NULL
+    r.real = NULL
+    if o.method != NEWTON or v.p.n_rows == 0:
+        return 0
+    if v.g != NULL:
+        r.n_index, r.n_real = marks_of(&v.p, v.g, PER_COLUMN), state_room() + judge_room(v)
+        return 1
+    if not is_known(&v.p):
+        return 0
+    if v.a != NULL:
+        rows_need(v, r)
+        return 1
+    if v.r != NULL and all_move(&v.p):
+        most = index_room(&v.p, v.r)
+        r.n_index, r.n_real = most + 2 * v.p.n_rows + 8, state_room() + judge_room(v)
+    return most > 0
+
+
+cdef public int32_t lav_start(const view_t* v, const asked_t* o, room_t* r, const double* lam) noexcept nogil:
+    """From lam (m): MORE, or ROOM with how much is needed."""
+    cdef room_t need
+    if not lav_room(v, o, &need):
+        return UNFIT
+    if not grant(r, need.n_index, need.n_real):
+        return ROOM
+    if v.g != NULL:
+        return start_general(v, o, r)
+    if v.r != NULL:
+        return start_bodies(v, o, r, lam)
+    return start_rows(v, o, r, lam)
+
+
+cdef public int32_t lav_step(const view_t* v, const asked_t* o, const room_t* r, int32_t work, double* lam,
+                             said_t* said) noexcept nogil:
+    """`work` factorisations or a few more; lam (m) is the best so far."""
+    cdef state_t* s = <state_t*>r.real
+    cdef newton_t* n = &s.n
+    cdef int32_t how, j
+    said.direction = NULL
+    if v.g != NULL:
+        how = step_general(o, s, work, lam)
+        said.factorisations = s.f.factorisations
+        said.relative = -1.0
+        return how
+    n.proven, n.stop = o.proven, o.stop
+    how = newton_step(n, work)
+    impulse_of(n, n.best_z, lam)
+    said.factorisations, said.relative = n.s.factorisations, n.best
+    if how == CERTIFICATE:
+        vanish(s.proof, v.p.n_rows)
+        for j in range(n.s.e.m):
+            s.proof[n.keep[j] if n.keep != NULL else j] = n.direction[j] * n.scale[j]
+        said.direction = s.proof
+    return how
+
+
+cdef class Driver:
+    """A problem's `view_t` and the arrays of a method on it, for Python."""
+    cdef view_t v
+    cdef asked_t o
+    cdef room_t r
+    cdef object keep
+
+    def __init__(self, Data data, double tol, int budget):
+        self.v.p = data.blocks
+        self.v.a = NULL
+        self.v.r = NULL
+        self.v.g = NULL
+        if data.is_general:
+            self.v.g = &data.general
+        elif data.factored:
+            self.v.r = &data.rows
+        else:
+            self.v.a = &data.csr
+        self.o = asked_t(NEWTON, budget, 0, 0, 0, tol)
+        self.keep = [data]
+
+    def start(self, const double[::1] impulse, bint cold):
+        """Room, as often as it is asked for, and the start; False where the method does not take the problem."""
+        cdef int32_t how = ROOM
+        cdef int64_t n_index, n_real
+        self.o.cold = cold
+        if not lav_room(&self.v, &self.o, &self.r):
+            return False
+        while how == ROOM:
+            n_index, n_real = self.r.n_index, self.r.n_real
+            index, real = np.zeros(n_index // 2 + 1), np.empty(n_real)
+            self.keep = [self.keep[0], index, real]
+            self.r.index, self.r.real = <int32_t*>address(index), <double*>address(real)
+            how = lav_start(&self.v, &self.o, &self.r, &impulse[0])
+        return how == MORE
+
+    def step(self, int work, double[::1] impulse):
+        """How it stands after so many factorisations, how many there were, and the residual; impulse is the best."""
+        cdef said_t said
+        cdef int32_t how
+        with nogil:
+            how = lav_step(&self.v, &self.o, &self.r, work, &impulse[0], &said)
+        proof = np.asarray(<double[:self.v.p.n_rows]><double*>said.direction).copy() if said.direction != NULL else None
+        return how, said.factorisations, said.relative, proof
+
+    def prove(self):
+        """The proof was found to be one."""
+        self.o.proven = 1

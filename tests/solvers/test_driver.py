@@ -1,0 +1,179 @@
+"""Room, start and step: the same method without Python, in any number of turns, and in WebAssembly."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from random_problems import as_matrix, random_contact_problem, random_lcp, seeds
+
+import lavender as lv
+from lavender import suite
+from lavender.bench.cases import resolve
+from lavender.certificates import check_certificate
+from lavender.web import compile as wasm
+from lavender_ext.driver.driver import Driver
+
+MORE, REACHED, STUCK, CERTIFICATE, SPENT = 0, 1, 3, 4, 5
+ROOT = Path(__file__).resolve().parent.parent.parent
+
+
+def driven(problem, tol=1e-9, budget=1500, work=10**6):
+    """(how it ended, factorisations, residual as the driver has it, impulse); None where it is not taken."""
+    lv.residual(problem, problem.start())  # d, nu and J M^-1 J^T of a problem are known once it is judged
+    driver, impulse = Driver(problem.metric, tol, budget), problem.start().copy()
+    if not driver.start(impulse, True):
+        return None
+    how = MORE
+    while how in (MORE, CERTIFICATE):
+        how, done, relative, proof = driver.step(work, impulse)
+        if proof is not None and check_certificate(problem, proof) is None:
+            driver.prove()
+    return how, done, relative, impulse
+
+
+def forms(problem):
+    """A problem of bodies, and the same as a matrix."""
+    return problem, as_matrix(problem)
+
+
+@pytest.mark.parametrize("friction", ["coulomb", "cone"])
+@given(seed=seeds)
+@settings(max_examples=15)
+def test_contacts_are_solved_as_newton_solves_them(friction, seed):
+    base = random_contact_problem(seed, friction=friction, bodies=5, contacts=6, joints=2)
+    for problem in forms(base):
+        expected = lv.solve(problem, "newton", tol=1e-9)
+        found = driven(problem)
+        if found is None:  # rows that cannot move, over bodies
+            assert problem.rows is not None
+            continue
+        how, done, relative, impulse = found
+        truth = lv.residual(problem, impulse).relative
+        assert relative == pytest.approx(truth, rel=1e-9, abs=1e-300)
+        if how == REACHED:
+            assert truth <= 1e-9
+        if (
+            problem.rows is None
+        ):  # one method: over bodies other columns may be left out, over rows nothing differs
+            assert (how == REACHED) == expected.success
+            assert done == pytest.approx(expected.work["factorisations"], abs=2)
+
+
+@given(seed=seeds)
+@settings(max_examples=20)
+def test_turns_of_any_length_give_the_same_bits(seed):
+    for problem in (random_lcp(seed, m=9), *forms(random_contact_problem(seed, bodies=4, contacts=5))):
+        found = driven(problem)
+        if found is not None:
+            short = driven(problem, work=1)
+            assert short[:2] == found[:2]
+            assert short[3].tobytes() == found[3].tobytes()
+
+
+def test_generalised_coordinates_are_driven_by_the_same_names():
+    taken = 0
+    for item in resolve(["wild(seed=44017)", "wild(seed=44027)", "wild(seed=44030)"]):
+        problem = item.problem
+        assert problem.generalized is not None
+        how, done, _, impulse = driven(problem, 1e-8)
+        assert how == REACHED and done > 0
+        assert lv.residual(problem, impulse).relative <= 1e-8
+        taken += 1
+    assert taken == 3
+
+
+def test_rows_that_cannot_move_stay_and_push_the_others():
+    a = np.array([[2.0, 0.5, 0.0], [0.5, 2.0, 0.1], [0.0, 0.1, 3.0]])
+    problem = lv.Problem.lcp(a, [1.0, 1.0, 1.0], lower=[0.5, 0.0, 0.0], upper=[0.5, 0.0, np.inf])
+    how, _, _, impulse = driven(problem, 1e-12)
+    assert how == REACHED
+    np.testing.assert_allclose(impulse, [0.5, 0.0, 1.0 / 3.0], rtol=0, atol=1e-14)
+    base = as_matrix(random_contact_problem(3, friction="cone", bodies=4, contacts=6))
+    still = replace(
+        base, cones=replace(base.cones, mu=np.where(np.arange(base.n_blocks) % 2, base.cones.mu, 0.0))
+    )
+    how, _, _, impulse = driven(still)
+    assert how == REACHED
+    assert lv.residual(still, impulse).relative <= 1e-9
+
+
+def test_a_budget_ends_it_and_a_proof_too():
+    hard = as_matrix(suite.pyramid(k=3, mass_ratio=1e3, friction="coulomb", sliding=0.5).problem)
+    how, done, relative, impulse = driven(hard, 1e-12, budget=3, work=1)
+    assert how == SPENT and done <= 4
+    assert lv.residual(hard, impulse).relative == pytest.approx(relative)
+    squeeze = lv.Problem.lcp(np.array([[1.0, -1.0], [-1.0, 1.0]]), [1.0, 0.5])
+    how, *_ = driven(squeeze)
+    assert how == STUCK
+
+
+def test_what_the_method_does_not_take_is_said_at_once():
+    problem = lv.Problem.contact(np.eye(3), np.ones(3), [0.5])
+    assert driven(problem) is not None
+    (item,) = resolve(["wild(seed=44017)"])
+    still = random_contact_problem(3, friction="cone", bodies=4, contacts=6)
+    assert driven(replace(still, cones=replace(still.cones, mu=np.zeros(still.n_blocks)))) is None
+    assert driven(item.problem) is not None
+
+
+# -- without Python --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(bool(wasm.why_not()), reason=wasm.why_not())
+def test_webassembly_gives_the_same_bits(tmp_path):
+    wasmtime = pytest.importorskip("wasmtime", reason="wasmtime is not installed (extra: wasm)")
+    out = tmp_path / "driver.wasm"
+    built = wasm.build(out, ROOT, ("driver.driver",), largest=250_000)
+    assert built.imports == () and set(built.functions) == {"lav_room", "lav_start", "lav_step"}
+    engine = wasmtime.Engine()
+    store = wasmtime.Store(engine)
+    exports = wasmtime.Instance(store, wasmtime.Module(engine, out.read_bytes()), []).exports(store)
+    memory, top = exports["memory"], exports["__heap_base"].value(store)
+
+    def room(size):
+        nonlocal top
+        place = -(-top // 16) * 16
+        top = place + size
+        if top > memory.data_len(store):
+            memory.grow(store, -(-(top - memory.data_len(store)) // 65536))
+        return place
+
+    def put(values):
+        data = np.ascontiguousarray(values).tobytes()
+        place = room(len(data) + 8)
+        memory.write(store, data, place)
+        return place
+
+    def words(*numbers):
+        return np.array(numbers, np.int32).tobytes()
+
+    for seed in range(3):
+        problem = as_matrix(random_contact_problem(seed, friction="cone", bodies=4, contacts=5))
+        expected = driven(problem)
+        c, a, m = problem.cones, problem.csr, problem.m
+        nu = (problem.metric.weight**2 / problem.d).astype(float)
+        matrix = put(
+            np.frombuffer(
+                words(put(a.indptr.astype(np.int32)), put(a.indices.astype(np.int32)), put(a.data)), np.int32
+            )
+        )
+        law = 1
+        pointers = [put(c.ptr.astype(np.int32)), put(c.kind.astype(np.int32))] + [
+            put(x)
+            for x in (c.lower, c.upper, c.mu, c.patch_radius, problem.b, problem.d, nu, 1.0 / problem.d)
+        ]
+        view = put(np.frombuffer(words(problem.n_blocks, m, law, *pointers, matrix, 0, 0), np.int32))
+        asked = put(np.frombuffer(words(0, 1500, 1, 0, 0, 0) + np.array([1e-9]).tobytes(), np.uint8))
+        given, said, impulse = room(24), room(24), put(problem.start())
+        assert exports["lav_room"](store, view, asked, given) == 1
+        n_index, n_real = np.frombuffer(memory.read(store, given, given + 16), np.int64).tolist()
+        arrays = words(room(4 * n_index), room(8 * n_real))
+        memory.write(store, arrays, given + 16)
+        assert exports["lav_start"](store, view, asked, given, impulse) == MORE
+        assert exports["lav_step"](store, view, asked, given, 10**6, impulse, said) == expected[0]
+        found = np.frombuffer(memory.read(store, impulse, impulse + 8 * m), float)
+        np.testing.assert_allclose(found, expected[3], rtol=1e-12, atol=1e-300)
+        assert found.tobytes() == expected[3].tobytes()
