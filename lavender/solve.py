@@ -24,7 +24,6 @@ from lavender.problem import Problem
 from lavender.registry import SolverSpec, State, get
 from lavender.residuals import Residual, reference, residual, told
 from lavender.solution import Claim, History, Solution, SolverRun, Status
-from lavender.solvers._polyhedral import ThroughRows
 from lavender_ext.judge.measure import all_finite
 
 __all__ = ["Prepared", "prepare", "solve"]
@@ -288,7 +287,13 @@ def _make(spec: SolverSpec, options: dict[str, Any]) -> Any:
         raise InputError(f"solver {spec.name!r} cannot take the options {options}: {error}") from error
     if not spec.own:
         return Foreign(spec.name, made)
-    return ThroughRows(made) if spec.boxes - spec.laws else made
+    if spec.boxes <= spec.laws:
+        return made
+    from lavender.solvers._polyhedral import (
+        ThroughRows,  # with the table of solvers, which is imported by then
+    )
+
+    return ThroughRows(made)
 
 
 def same_structure(p: Problem, q: Problem) -> bool:

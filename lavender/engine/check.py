@@ -27,7 +27,7 @@ CARRIED = (
     "x", "q", "v", "fat", "joint_impulse", "inv_inertia", "cache_impulse", "cache_local", "cache_roll", "cache_key"
 )  # fmt: skip
 GIVEN = tuple(name for name in KEPT if name not in (*CARRIED, "head", "setting", "ptr"))
-FIXED_HEAD = ("position_iterations", "order", "seed", "stepper", "relaxing")
+FIXED_HEAD = ("position_iterations", "order", "seed", "stepper", "relaxing", "friction_shape")
 WRITTEN = {"out": 8, "depth": 1, "joint_error": 1}  # entries of `setting` that the engine writes
 UNIT = 1e-9  # -, quaternions are normalised in every substep
 
@@ -131,6 +131,8 @@ def _check_contacts(new: State) -> None:
     known = (CONTACT, CONTACT_SPIN, CONTACT_BOX, CONTACT_ROLLING)
     if c and ((kind[:kj] != ROW).any() or not np.isin(kinds, known).all()):
         raise _damaged("kind holds what is no block")
+    if ((kind[kj:] == CONTACT_BOX) != (friction & bool(new.head[HEAD["friction_shape"]]))).any():
+        raise _damaged("kind holds contacts of another shape")
     pair = b["contact_pair"][:c]
     if c and (pair.min() < 0 or pair.max() >= n or not np.array_equal(b["contact_body"][:c], b["dyn"][pair])):
         raise _damaged("contact_pair names bodies that the scene does not have")

@@ -566,3 +566,16 @@ def test_an_ellipse_is_the_disk_of_stretched_tangents():
     w = x - b
     rim = -(mu**2) * w[1:] / np.hypot(*(mu * w[1:])) * x[0]
     np.testing.assert_allclose(x[1:], rim, rtol=1e-9)
+
+
+def test_a_snapshot_of_another_shape_is_refused():
+    sims = [lv.Simulation(lv.Scene("stack", friction_shape=shape)) for shape in ("disk", "box")]
+    for sim in sims:
+        for _ in range(20):
+            sim.step()
+    state = sims[1].snapshot()
+    again = lv.Simulation(lv.Scene("stack", friction_shape="box"))
+    again.restore(state)
+    np.testing.assert_array_equal(again.step()[0]["positions"], sims[1].step()[0]["positions"])
+    with pytest.raises(lv.InputError):
+        sims[0].restore(state)

@@ -340,7 +340,7 @@ def test_wasmtime_scenes_are_the_same_to_the_bit(module, host, recorded):
             assert hashlib.sha256(b"".join(simulation.everything())).digest() == hashes[step].tobytes(), where
             steps += 1
         assert same_bits(simulation.array("x"), states[-1][: 3 * scene["size"][0]])
-    assert steps == 10200
+    assert steps == 10800
 
 
 def test_wasmtime_solves_by_newton_are_the_same_to_the_bit(module, newton_module, host, recorded):
