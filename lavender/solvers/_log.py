@@ -18,7 +18,7 @@ from lavender.solvers._islands import islands
 __all__ = ["SolveLog"]
 
 CAUTION = 0.999  # of what is left of the tolerance: sums are rounded
-STILL = 24  # turns in a row, most of them longer than those before, that leave
+STILL = 32  # turns in a row, most of them longer than those before, that leave
 GAIN = 0.99  # of the residual: then nobody gets anywhere
 
 

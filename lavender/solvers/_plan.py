@@ -44,7 +44,7 @@ _GIVEN = {
     "linear": ("direct", "anderson", "newton"),
     "lcp": ("anderson", "direct", "newton", "nncg"),
     "cone": ("anderson", "newton"),
-    "coulomb": ("anderson", "newton", "nncg", "admm"),
+    "coulomb": ("anderson", "newton", "admm"),
 }
 #: At most four for each law and operator, `islands` in place of the last where the problem divides; "round": cones of
 #: more than two tangents.

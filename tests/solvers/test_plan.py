@@ -1,6 +1,7 @@
 """explain and plan: counted alone, the same everywhere, and a solve goes by them."""
 
 import json
+from time import perf_counter
 
 import numpy as np
 import pytest
@@ -10,7 +11,10 @@ import lavender as lv
 from lavender import suite
 from lavender.cli import main
 from lavender.problem import LAWS, OPERATORS
-from lavender.solvers._plan import METHODS, TABLE
+from lavender.solvers._log import SolveLog
+from lavender.solvers._methods import Sweeps, in_short_time
+from lavender.solvers._plan import METHODS, TABLE, Costs, candidates
+from lavender.solvers._structure import Structure
 
 NAMES = (
     "stack(n=200)",
@@ -111,3 +115,64 @@ def test_the_command_shows_plans_and_gives_them_as_data(capsys):
     with pytest.raises(SystemExit) as end:
         main(["explain", "stack(n=200)", "--tol", "0"])
     assert end.value.code == 2
+
+
+@pytest.mark.parametrize("name", [*NAMES, "wild(seed=141)", "wild(seed=24)"])
+def test_no_more_than_four_are_asked_and_islands_where_the_problem_divides(name):
+    structure = Structure(suite.case(name).problem)
+    names = candidates(structure)
+    assert len(names) <= 4
+    assert ("islands" in names) == (structure.divides and structure.problem.law != "linear")
+
+
+def test_a_matrix_of_many_entries_does_not_divide_and_nobody_looks():
+    problem = suite.foreign(seed=6, part="tuned").problem  # 494 dense rows
+    structure = Structure(problem)
+    assert not structure.divides and "islands" not in vars(structure)
+
+
+@pytest.mark.parametrize("name", ["wild(seed=12)", "wild(seed=24)", "wild(seed=3)", "granularF(n=9)"])
+def test_what_would_not_end_in_time_is_neither_counted_nor_begun(name, monkeypatch):
+    """With the least of time sweeps have all of it, though what factors is expected to be cheaper."""
+    problem = suite.case(name).problem
+    log = SolveLog(problem, 1e-12, 10**6, deadline=perf_counter() + 1e-4)
+    log.offer(problem.start())
+    costs = Costs(problem, 1e-12)
+    monkeypatch.setattr(Costs, "least", lambda self, asked: self.of(asked) if asked == "anderson" else 1 / 0)
+    (sweeps,) = in_short_time(log, costs)
+    assert sweeps.name == "anderson" and log.iterations > 0
+    assert [turn.solver for turn in log.turns] == ["anderson"]
+
+
+def test_a_floor_is_below_what_is_counted():
+    for name in NAMES:
+        problem = suite.case(name).problem
+        costs = Costs(problem, 1e-6)
+        for candidate in candidates(costs.structure):
+            if np.isfinite(costs.floor(candidate)):
+                assert costs.floor(candidate) <= costs.of(candidate).total * (1 + 1e-12), (name, candidate)
+
+
+def test_sweeps_go_on_from_a_stale_guess_that_doing_nothing_is_better_than():
+    """Not from one that is lost; the result is never worse than doing nothing."""
+    problem = suite.granular(n=5, friction="coulomb").problem
+    solved = lv.solve(problem, tol=1e-9).impulse
+    rng = np.random.default_rng(1)
+    direction = rng.standard_normal(problem.m) * np.abs(solved).mean()
+    sizes = [
+        s for s in 10.0 ** np.arange(0.0, 9.0) if lv.residual(problem, solved + s * direction).relative > 1
+    ]
+    near, far = solved + sizes[0] * direction, solved + 1e9 * sizes[0] * direction
+    begun = []
+    original = Sweeps.begin
+
+    def begin(self):
+        original(self)
+        begun.append(self.impulse.copy())
+
+    for guess, kept in ((near, True), (far, False)):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(Sweeps, "begin", begin)
+            found = lv.solve(problem, impulse=guess, tol=1e-6, max_iter=20)
+        assert np.array_equal(begun[-1], guess) == kept
+        assert found.residual.relative <= 1.0
