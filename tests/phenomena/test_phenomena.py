@@ -7,6 +7,8 @@ import math
 import os
 import re
 import sys
+import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -210,6 +212,25 @@ def test_an_engine_that_fails_is_a_note_and_the_next_has_a_process(name, words, 
         if name != "babbles":  # it sleeps on
             again = apart.track(dataclasses.replace(way, name="leaves"), scene, 1.0, 0.1)
             assert again == "its process ended: exit status 0"
+    finally:
+        apart.end()
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="reads /proc")
+def test_a_program_that_an_engine_waits_for_ends_with_it(monkeypatch, tmp_path):
+    monkeypatch.setattr("lavender.phenomena.running.MODULE", "broken_engines")
+    apart = Apart(limit=3.0)
+    way = dataclasses.replace(OTHERS[0], name=f"waits {tmp_path / 'number'}")
+    try:
+        assert apart.track(way, PHENOMENA["stick"].scene(), 1.0, 0.1) == "no answer within 3 s"
+        number = int((tmp_path / "number").read_text())
+        state = Path(f"/proc/{number}/stat")
+        for _ in range(100):  # the system takes a moment
+            if not state.exists() or state.read_text().rpartition(")")[2].split()[0] == "Z":
+                break
+            time.sleep(0.05)
+        else:
+            pytest.fail("it runs on")
     finally:
         apart.end()
 
