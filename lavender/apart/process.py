@@ -82,17 +82,14 @@ class Process:
         return self._process is not None and self._process.poll() is None
 
     def start(self) -> str:
-        """Start it where it does not run, and wait until it is ready; why it is not, or nothing.
-
-        Raises
-        ------
-        OSError
-            The system starts no process.
-        """
+        """Start it where it does not run, and wait until it is ready; why it is not, or nothing."""
         if self.alive:
             return ""
         self.end()
-        self._start()
+        try:
+            self._start()
+        except OSError as error:  # the system starts no process
+            return str(error)
         try:
             first = self._answers.get(timeout=START_TIME)
         except queue.Empty:

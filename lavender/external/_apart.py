@@ -8,7 +8,6 @@ are data (`lavender.apart`): nothing that a backend sends is unpickled here.
 from __future__ import annotations
 
 import atexit
-import contextlib
 import json
 import os
 import pickle
@@ -41,9 +40,8 @@ _owner = 0  # id of the process that started them: a fork's copies are not its o
 def ready() -> None:
     """Have a process ready, started outside the clock; where the system starts none, the backend runs here."""
     process = _take() or Process(SERVED)
-    with contextlib.suppress(OSError):
-        if not process.start():
-            _keep(process)
+    if not process.start():
+        _keep(process)
 
 
 def elsewhere(name: str, stoppable: bool) -> Elsewhere:

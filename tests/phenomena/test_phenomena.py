@@ -235,6 +235,15 @@ def test_a_program_that_an_engine_waits_for_ends_with_it(monkeypatch, tmp_path):
         apart.end()
 
 
+def test_a_system_that_starts_no_process_is_a_note(monkeypatch):
+    def refuse(*_, **__):
+        raise OSError(11, "no more processes")
+
+    monkeypatch.setattr("lavender.apart.process.subprocess.Popen", refuse)
+    found = Apart().track(OTHERS[0], PHENOMENA["stick"].scene(), 1.0, 0.1)
+    assert found == "its process does not start: [Errno 11] no more processes"
+
+
 def test_what_an_engine_raises_is_told_and_its_process_stays():
     apart = Apart()
     scene = PHENOMENA["stick"].scene()
