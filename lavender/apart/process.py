@@ -16,10 +16,10 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import IO, Any
 
-__all__ = ["Process"]
+__all__ = ["Ended", "Process"]
 
 START_TIME = 60.0  # s, to import everything on a loaded machine
 WORDS = 2**20  # bytes of the words of one answer
@@ -46,8 +46,14 @@ def _read(stream: IO[bytes], size: int) -> bytes:
     return b"".join(parts)
 
 
+class Ended(Exception):
+    """The process ended before it answered; its text says how."""
+
+
 class Process:
     """A Python that runs `module.serve(*arguments, lifeline)` and answers messages with it (`served.py`).
+
+    It is started by `start`, again after it ended, and kept between questions.
 
     Parameters
     ----------
@@ -55,57 +61,35 @@ class Process:
     arguments : whole numbers
     environment : mapping, optional
         Beside that of this process.
-
-    Raises
-    ------
-    OSError
-        The system starts no process.
     """
 
     def __init__(self, module: str, *arguments: int, environment: Mapping[str, str] | None = None) -> None:
-        self.room = 0  # bytes of numbers that an answer may have
-        paths = os.pathsep.join(p or os.getcwd() for p in sys.path)
-        more: dict[str, Any] = {}
-        alive, self._lifeline = -1, -1  # the writing end of a pipe that ends when this process does
-        if GROUPS:
-            alive, self._lifeline = os.pipe()
-            more = {"start_new_session": True, "pass_fds": (alive,)}
         # Not `-m`: that puts the current folder first, and in a checkout its sources would hide the installed package.
         start = (
             f"import sys; sys.path[:] = filter(None, sys.path); from {module} import serve; "
             "serve(*map(int, sys.argv[1:]))"
         )
-        try:
-            self._process: subprocess.Popen[bytes] | None = subprocess.Popen(
-                [sys.executable, "-c", start, *map(str, arguments), str(alive)],
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.DEVNULL,
-                env={**os.environ, **(environment or {}), "PYTHONPATH": paths},
-                bufsize=0,
-                **more,
-            )
-        except BaseException:
-            if GROUPS:
-                os.close(self._lifeline)
-            raise
-        finally:
-            if alive >= 0:
-                os.close(alive)
+        self._command = [sys.executable, "-c", start, *map(str, arguments)]
+        self._environment = environment or {}
+        self._process: subprocess.Popen[bytes] | None = None
+        self._lifeline = -1  # the writing end of a pipe that ends when this process does
         self._answers: queue.Queue[Any] = queue.Queue()
-        stream = self._process.stdout
-        assert stream is not None
-        # A process of the backend's that left the group may keep the pipe open for ever: this thread then waits
-        # alone, and nobody waits for it.
-        threading.Thread(target=self._listen, args=(stream, self._answers), daemon=True).start()
+        self._room = 0  # bytes of numbers that an answer may have
 
     @property
     def alive(self) -> bool:
-        """It was not ended, and has not ended."""
+        """It was started, not ended, and has not ended."""
         return self._process is not None and self._process.poll() is None
 
-    def ready(self) -> str:
-        """Wait until it answers for the first time; why it does not, or nothing."""
+    def start(self) -> str:
+        """Start it where it does not run, and wait until it is ready; why it is not, or nothing."""
+        if self.alive:
+            return ""
+        self.end()
+        try:
+            self._start()
+        except OSError as error:  # the system starts no process
+            return str(error)
         try:
             first = self._answers.get(timeout=START_TIME)
         except queue.Empty:
@@ -113,35 +97,72 @@ class Process:
         except KeyboardInterrupt:
             self.end()
             raise
-        return "" if first is not None else self.cause()
+        return "" if first is not None else self._cause()
 
-    def answer(self, limit: float) -> tuple[bytes, bytes] | None:
-        """The next answer: words and numbers; None where it ended.
+    def _start(self) -> None:
+        paths = os.pathsep.join(p or os.getcwd() for p in sys.path)
+        more: dict[str, Any] = {}
+        alive = -1
+        if GROUPS:
+            alive, self._lifeline = os.pipe()
+            more = {"start_new_session": True, "pass_fds": (alive,)}
+        try:
+            self._process = subprocess.Popen(
+                [*self._command, str(alive)],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.DEVNULL,
+                env={**os.environ, **self._environment, "PYTHONPATH": paths},
+                bufsize=0,
+                **more,
+            )
+        except BaseException:
+            if GROUPS:
+                os.close(self._lifeline)
+                self._lifeline = -1
+            raise
+        finally:
+            if alive >= 0:
+                os.close(alive)
+        self._answers = queue.Queue()
+        stream = self._process.stdout
+        assert stream is not None
+        # A process of the backend's that left the group may keep the pipe open for ever: this thread then waits
+        # alone, and nobody waits for it.
+        threading.Thread(target=self._listen, args=(stream, self._answers), daemon=True).start()
+
+    def ask(self, messages: Sequence[Any], limit: float, room: int) -> tuple[bytes, bytes]:
+        """The answer to messages: words, and at most `room` bytes of numbers.
 
         Raises
         ------
+        pickle.PicklingError, TypeError, AttributeError
+            A message cannot be sent; the process runs on.
         TimeoutError
-            None came within `limit` [s].
+            It did not read them and answer within `limit` [s], and was ended, as it is after Ctrl-C.
+        Ended
+            It ended by itself.
         """
+        frames = [pickle.dumps(m, pickle.HIGHEST_PROTOCOL) for m in messages]
+        self._room = room
+        until = time.monotonic() + limit
         try:
-            found: tuple[bytes, bytes] | None = self._answers.get(timeout=max(0.0, limit))
+            self._send(b"".join(struct.pack("<Q", len(f)) + f for f in frames), limit)
+            found: tuple[bytes, bytes] | None = self._answers.get(timeout=max(0.0, until - time.monotonic()))
         except queue.Empty:
+            self.end()
             raise TimeoutError from None
+        except BaseException:
+            self.end()
+            raise
+        if found is None:
+            raise Ended(self._cause())
         return found
 
-    def send(self, messages: list[Any], limit: float) -> None:
-        """Write messages; a process that does not read them within `limit` [s] is one that does not answer.
-
-        Raises
-        ------
-        TimeoutError
-            It did not read them.
-        """
+    def _send(self, message: bytes, limit: float) -> None:
         process = self._process
         assert process is not None and process.stdin is not None
-        stream = process.stdin
-        frames = [pickle.dumps(m, pickle.HIGHEST_PROTOCOL) for m in messages]
-        data = memoryview(b"".join(struct.pack("<Q", len(f)) + f for f in frames))
+        stream, data = process.stdin, memoryview(message)
 
         def write() -> None:
             done = 0
@@ -162,13 +183,13 @@ class Process:
         with contextlib.suppress(Exception), stream:
             while True:
                 words, numbers = struct.unpack("<QQ", _read(stream, 16))
-                if words > WORDS or numbers > self.room:
+                if words > WORDS or numbers > self._room:
                     answers.put((b"", b""))  # no answer has such a size: it is not read
                     break
                 answers.put((_read(stream, words), _read(stream, numbers)))
         answers.put(None)  # the end, however it came
 
-    def cause(self) -> str:
+    def _cause(self) -> str:
         """How it ended, after it was ended with all that it started."""
         process = self._process
         assert process is not None

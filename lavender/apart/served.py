@@ -1,16 +1,63 @@
-"""The answering side of `lavender.apart.process`: streams of messages and answers, and an end with the parent."""
+"""The answering side of `lavender.apart.process`: messages in, answers out, limits, and an end with the parent."""
 
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import pickle
 import signal
 import struct
 import threading
+import time
+from collections.abc import Callable
 from typing import IO, Any
 
-__all__ = ["answer", "begin", "receive"]
+__all__ = ["answer", "begin", "limit_cpu", "receive", "serve"]
+
+WORDS = 500  # characters of an error
+Handler = Callable[[Any], tuple[dict[str, Any], bytes] | None]
+
+
+def serve(lifeline: int, make: Callable[[], Handler], memory: int = 0) -> None:
+    """Answer messages until they end.
+
+    Parameters
+    ----------
+    lifeline : reading end of a pipe whose other end the parent alone holds; -1 for none
+    make : callable
+        Imports what is needed, within the limit of memory; what it returns gives words and numbers for a message, or
+        None for one without an answer. What that raises is the answer: `error`, its text, and `kind`, its type.
+    memory : bytes of address space, 0 for no limit
+    """
+    requests, answers = begin(lifeline)
+    if memory:
+        with contextlib.suppress(ImportError, ValueError, OSError):
+            import resource
+
+            resource.setrlimit(resource.RLIMIT_AS, (memory, memory))
+    handle = make()
+    answer(answers, "{}", b"")  # ready
+    while True:
+        try:
+            message = receive(requests)
+        except EOFError:
+            return
+        try:
+            found = handle(message)
+        except BaseException as error:  # code of others may fail in any way; a panic of Rust is no Exception
+            found = {"error": str(error)[:WORDS], "kind": type(error).__name__}, b""
+        if found is not None:
+            answer(answers, json.dumps(found[0]), found[1])
+
+
+def limit_cpu(more: float) -> None:
+    """Have the system end this process after so much more CPU time [s], should nobody be left who could."""
+    with contextlib.suppress(ImportError, ValueError, OSError):
+        import resource
+
+        hard = resource.getrlimit(resource.RLIMIT_CPU)[1]
+        resource.setrlimit(resource.RLIMIT_CPU, (int(time.process_time() + more) + 1, hard))
 
 
 def begin(lifeline: int) -> tuple[IO[bytes], IO[bytes]]:

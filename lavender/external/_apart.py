@@ -13,13 +13,12 @@ import os
 import pickle
 from functools import partial
 from threading import Lock
-from time import monotonic
 from typing import Any
 
 import numpy as np
 
 from lavender._arrays import FloatArray
-from lavender.apart.process import Process
+from lavender.apart.process import Ended, Process
 from lavender.errors import InputError
 from lavender.external._running import Answer, Elsewhere, Failed, Limits
 from lavender.external.as_qp import QP
@@ -40,15 +39,9 @@ _owner = 0  # id of the process that started them: a fork's copies are not its o
 
 def ready() -> None:
     """Have a process ready, started outside the clock; where the system starts none, the backend runs here."""
-    process = _take()
-    if process is None:
-        try:
-            process = Process(SERVED)
-        except OSError:
-            return
-        if process.ready():
-            return
-    _keep(process)
+    process = _take() or Process(SERVED)
+    if not process.start():
+        _keep(process)
 
 
 def elsewhere(name: str, stoppable: bool) -> Elsewhere:
@@ -73,26 +66,24 @@ def call(
         return Answer(
             Status.TIME_LIMIT, "ended at the time limit: to hand the program over would take longer"
         )
-    process, until = _take(), monotonic() + patience * limit.time_limit
+    process = _take()
     if process is None:
         return None
-    process.room = 8 * (4 * qp.n + 2 * len(qp.b))
     try:
-        process.send([(name, qp, impulse, limit, settings)], limit.time_limit)
-        found = process.answer(until - monotonic())
+        found = process.ask(
+            [(name, qp, impulse, limit, settings)],
+            patience * limit.time_limit,
+            8 * (4 * qp.n + 2 * len(qp.b)),
+        )
     except TimeoutError:
-        process.end()
         return Answer(Status.TIME_LIMIT, "ended at the time limit")
     except (pickle.PicklingError, TypeError, AttributeError) as error:
         _keep(process)
         raise InputError(
             f"settings cannot be sent to another process ({error}); isolate=False runs the backend in this one"
         ) from None
-    except BaseException:
-        process.end()
-        raise
-    if found is None:
-        raise Failed(f"the process of the backend died ({process.cause()})")
+    except Ended as end:
+        raise Failed(f"the process of the backend died ({end})") from None
     _keep(process)
     return _answer(found)
 
@@ -102,9 +93,9 @@ def _answer(found: tuple[bytes, bytes]) -> Answer:
     try:
         said = json.loads(found[0])
         if "error" in said:
-            if said.get("kind") == InputError.__name__:
+            if said["kind"] == InputError.__name__:
                 raise InputError(str(said["error"]))
-            raise Failed(str(said["error"]))
+            raise Failed(f"{said['kind']}: {said['error']}")
         numbers, at = np.frombuffer(found[1], float), 0
         arrays: dict[str, FloatArray | None] = {}
         for name, size in zip(ARRAYS, said["sizes"], strict=True):

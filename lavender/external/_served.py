@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from typing import Any
 
 import numpy as np
 
-from lavender.apart.served import answer, begin, receive
-from lavender.errors import InputError
+from lavender.apart import served as apart
 from lavender.external._apart import ARRAYS, WORDS
 from lavender.external._running import Answer, quiet
 
@@ -16,8 +14,11 @@ __all__ = ["serve"]
 
 
 def serve(lifeline: int) -> None:
-    """Read tasks from standard input, answer on standard output, until the input ends."""
-    requests, answers = begin(lifeline)
+    """Answer the calls of `_apart.call`, until they end."""
+    apart.serve(lifeline, _runner)
+
+
+def _runner() -> apart.Handler:
     from lavender.external.backends import BACKENDS
     from lavender.external.clarabel_cone import NAME
     from lavender.external.native import clarabel
@@ -25,24 +26,18 @@ def serve(lifeline: int) -> None:
     runs = {backend.name: (backend.run, backend.noisy) for backend in BACKENDS} | {
         NAME: (clarabel.call, False)
     }
-    answer(answers, "{}", b"")  # ready
-    while True:
-        try:
-            name, qp, impulse, limit, settings = receive(requests)
-        except EOFError:
-            return
-        run, noisy = runs[name]
-        try:
-            with quiet(noisy) as said:
-                found = run(qp, impulse, limit, settings)
-            answer(answers, *_as_data(found, "; ".join(said)))
-        except InputError as error:
-            answer(answers, json.dumps({"error": str(error)[:WORDS], "kind": InputError.__name__}), b"")
-        except BaseException as error:  # a backend may fail in any way; a panic of Rust is no Exception
-            answer(answers, json.dumps({"error": f"{type(error).__name__}: {error}"[:WORDS]}), b"")
+
+    def run(message: Any) -> tuple[dict[str, Any], bytes]:
+        name, qp, impulse, limit, settings = message
+        call, noisy = runs[name]
+        with quiet(noisy) as said:
+            found = call(qp, impulse, limit, settings)
+        return _as_data(found, "; ".join(said))
+
+    return run
 
 
-def _as_data(found: Answer, said: str) -> tuple[str, bytes]:
+def _as_data(found: Answer, said: str) -> tuple[dict[str, Any], bytes]:
     sizes: list[int | None] = []
     numbers = b""
     for name in ARRAYS:
@@ -55,4 +50,4 @@ def _as_data(found: Answer, said: str) -> tuple[str, bytes]:
         "work": {str(kind): int(count) for kind, count in found.work.items()},
         "sizes": sizes,
     }
-    return json.dumps(words), numbers
+    return words, numbers

@@ -11,6 +11,8 @@ with n doubled until two of them agree to `AGREE` by (1); what they then differ 
 
 from __future__ import annotations
 
+import itertools
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,8 +22,11 @@ import numpy as np
 
 from lavender._arrays import FloatArray
 from lavender.errors import InputError
+from lavender.io.stored import write_figure
 from lavender.phenomena.engines import follow
 from lavender.phenomena.engines.own import Engine
+from lavender.report.curves import Curve, Figure
+from lavender.report.draw import matplotlib_panels
 from lavender.report.style import looks
 from lavender.scene import Scene
 from lavender.scene.steppers import STEPPERS, get_stepper
@@ -183,34 +188,35 @@ def plot(points: Sequence[Point], path: Path) -> None:
     Raises
     ------
     InputError
-        matplotlib is not installed.
+        matplotlib is not installed, or the file cannot be written.
     """
+    look = looks({p.stepper for p in points})
+    figures = [_figure(scene, points) for scene in dict.fromkeys(p.scene for p in points)]
     try:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
+        canvas = matplotlib_panels(figures, look)
     except ImportError:
         raise InputError("a figure needs matplotlib: pip install matplotlib") from None
-    scenes = list(dict.fromkeys(p.scene for p in points))
-    look = looks({p.stepper for p in points})
-    canvas = Figure(figsize=(10.0, 3.1 * ((len(scenes) + 2) // 3)), layout="constrained")
-    FigureCanvasAgg(canvas)
-    for axes, scene in zip(
-        canvas.subplots(-(-len(scenes) // 3), 3, squeeze=False).flat, scenes, strict=False
-    ):
-        some = [p for p in points if p.scene == scene and p.distance == p.distance]
-        for stepper, k in look.items():
-            runs = sorted((p for p in some if p.stepper == stepper), key=lambda p: p.cpu)
-            y = [max(p.distance, TINY) for p in runs]
-            axes.plot([p.cpu for p in runs], y, k.marker, color=k.color, markersize=3, alpha=0.5)
-            axes.step(
-                [p.cpu for p in runs], np.minimum.accumulate(y) if y else [], k.line, where="post", color=k.color,
-                label=stepper,
-            )  # fmt: skip
-        if some:
-            axes.axhline(max(some[0].floor, TINY), color="0.35", linestyle=":", linewidth=1.0)
-        axes.set(xscale="log", yscale="log", title=scene)
-    axes = canvas.axes[0]
-    axes.legend(fontsize=7, frameon=False)
-    canvas.supxlabel("CPU time for a second of simulation [s]", fontsize=9)
-    canvas.supylabel("largest distance from the reference in two seconds [m]", fontsize=9)
-    canvas.savefig(path)
+    write_figure(canvas, path)
+
+
+def _figure(scene: str, points: Sequence[Point]) -> Figure:
+    some = sorted(
+        (p for p in points if p.scene == scene and p.distance == p.distance), key=lambda p: (p.stepper, p.cpu)
+    )
+    curves = []
+    for stepper, group in itertools.groupby(some, key=lambda p: p.stepper):
+        runs = list(group)
+        x, y = tuple(p.cpu for p in runs), tuple(max(p.distance, TINY) for p in runs)
+        best = tuple(itertools.accumulate(y, min))
+        curves += [
+            Curve(stepper, "", x, y, thin=True, points=True),
+            Curve(stepper, stepper, x, best, steps=True),
+        ]
+    return Figure(
+        name=scene,
+        title=scene,
+        x_title="CPU time for a second of simulation [s]",
+        y_title="largest distance from the reference in two seconds [m]",
+        curves=tuple(curves),
+        floor=max(some[0].floor, TINY) if some else math.nan,
+    )

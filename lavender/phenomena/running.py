@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from lavender.apart.process import Process
+from lavender.apart.process import Ended, Process
 from lavender.errors import CapabilityError, InputError, UnknownName
 from lavender.phenomena.engines import WAYS, Way, follow, make
 from lavender.phenomena.friction import FRICTION
@@ -31,38 +31,31 @@ class Apart:
 
     def __init__(self, limit: float = LIMIT) -> None:
         self.limit = limit
-        self._process: Process | None = None
+        self._process = Process(MODULE)
 
     def track(self, way: Way, scene: Scene, seconds: float, look: float) -> Track | str:
         """What the engine did, or why there is nothing."""
-        process = self._process
-        if process is None or not process.alive:
-            process = self._process = Process(MODULE)
-            cause = process.ready()
-            if cause:
-                return f"its process does not start: {cause}"
-            process.room = ROOM
+        cause = self._process.start()
+        if cause:
+            return f"its process does not start: {cause}"
         try:
-            process.send([(way.name, scene, seconds, look)], self.limit)
-            found = process.answer(self.limit)
+            return _track(*self._process.ask([(way.name, scene, seconds, look)], self.limit, ROOM))
         except TimeoutError:
-            process.end()
             return f"no answer within {self.limit:g} s"
-        if found is None:
-            return f"its process ended: {process.cause()}"
-        return _track(*found)
+        except Ended as end:
+            return f"its process ended: {end}"
 
     def end(self) -> None:
         """End the process."""
-        if self._process is not None:
-            self._process.end()
+        self._process.end()
 
 
 def _track(words: bytes, numbers: bytes) -> Track | str:
     try:
         said = json.loads(words)
-        if "cannot" in said or "error" in said:
-            return str(said.get("cannot") or f"it failed: {said['error']}")
+        if "error" in said:
+            cannot = said["kind"] == CapabilityError.__name__
+            return str(said["error"]) if cannot else f"it failed: {said['kind']}: {said['error']}"
         k, n = int(said["looks"]), int(said["bodies"])
         x = np.frombuffer(numbers, float)
         time, place, turn, speed, last = np.split(x, np.cumsum([k, 3 * k * n, 4 * k * n, 6 * k * n]))

@@ -3,83 +3,97 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from lavender.bench.record import file_name, level_name
+from lavender.bench.record import file_name
 from lavender.io.stored import write_figure
+from lavender.report.axes import shown
 from lavender.report.curves import Figure
 from lavender.report.style import Look
 
-__all__ = ["matplotlib_figure", "power_on_axis", "save", "seconds_on_axis"]
+__all__ = ["matplotlib_figure", "matplotlib_panels", "save"]
 
 
 MANY = 60  # points of a curve, above which marks would cover it
 
 
-def seconds_on_axis(t: float, _position: object = None) -> str:
-    """1 ms, 20 µs: a tick of an axis of times."""
-    scale, unit = next(
-        ((s, u) for s, u in ((1.0, "s"), (1e-3, "ms"), (1e-6, "µs")) if t >= 0.999 * s), (1e-9, "ns")
-    )
-    return f"{t / scale:.3g} {unit}"
-
-
-def power_on_axis(x: float, _position: object = None) -> str:
-    """1e-3, or 10: a tick of a logarithmic axis."""
-    return f"{x:.3g}" if 0.09 < x < 1e4 else level_name(x)
-
-
-def matplotlib_figure(figure: Figure, look: dict[str, Look], size: tuple[float, float] = (7.6, 4.6)) -> Any:
+def matplotlib_figure(
+    figure: Figure, look: Mapping[str, Look], size: tuple[float, float] = (7.6, 4.6)
+) -> Any:
     """The figure drawn, `size` in inches, without pyplot and its global state."""
+    canvas = _canvas(size)
+    # A fixed place for the axes: fitting it to the labels would take most of the time of a figure.
+    axes = canvas.add_axes((0.76 / size[0], 0.6 / size[1], 1.0 - 2.81 / size[0], 1.0 - 1.01 / size[1]))
+    _draw(axes, figure, look)
+    axes.set_xlabel(_plain(figure.x_title))
+    axes.set_ylabel(_plain(figure.y_title))
+    if axes.get_legend_handles_labels()[0]:
+        axes.legend(fontsize=7, loc="center left", bbox_to_anchor=(1.01, 0.5), frameon=False, handlelength=3)
+    return canvas
+
+
+def matplotlib_panels(figures: Sequence[Figure], look: Mapping[str, Look], columns: int = 3) -> Any:
+    """Figures of the same quantities beside each other, with the names of the axes and a legend once."""
+    rows = -(-len(figures) // columns)
+    canvas = _canvas((10.0, 3.1 * rows), layout="constrained")
+    places = list(canvas.subplots(rows, columns, squeeze=False).flat)
+    for axes in places:
+        axes.set_axis_off()
+    for axes, figure in zip(places, figures, strict=False):
+        axes.set_axis_on()
+        _draw(axes, figure, look)
+        axes.tick_params(labelsize=7)
+    canvas.axes[0].legend(fontsize=7, frameon=False)
+    canvas.supxlabel(_plain(figures[0].x_title), fontsize=9)
+    canvas.supylabel(_plain(figures[0].y_title), fontsize=9)
+    return canvas
+
+
+def _canvas(size: tuple[float, float], **more: Any) -> Any:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure as Canvas
 
-    canvas = Canvas(figsize=size)
+    canvas = Canvas(figsize=size, **more)
     FigureCanvasAgg(canvas)
-    # A fixed place for the axes: fitting it to the labels would take most of the time of a figure.
-    axes = canvas.add_axes((0.76 / size[0], 0.6 / size[1], 1.0 - 2.81 / size[0], 1.0 - 1.01 / size[1]))
+    return canvas
+
+
+def _draw(axes: Any, figure: Figure, look: Mapping[str, Look]) -> None:
+    laid = shown(figure)
     banded = any(c.low for c in figure.curves)  # over all cases: points are no runs
-    for c in figure.curves:
+    for c, x, y in laid.curves:
         k = look[c.solver]
         style: dict[str, Any] = {
             "color": k.color,
-            "linestyle": k.line,
+            "linestyle": "none" if c.points else k.line,
             "label": _plain(c.label),
             "linewidth": 0.8 if c.thin else 1.5,
         }
-        if c.points:
-            style["linestyle"] = "none"
         if c.low:
             axes.fill_between(c.x, c.low, c.high, color=k.color, alpha=0.15, linewidth=0.0)
         if c.steps:
-            last = max(x for d in figure.curves for x in d.x) * 1.3
-            axes.step([*c.x, last], [*c.y, c.y[-1]], where="post", **style)
+            axes.step([*x, laid.across.limits[1]], [*y, y[-1]], where="post", **style)
         else:
             axes.plot(
-                c.x,
-                c.y,
-                marker="" if len(c.x) > MANY or banded else k.marker,
+                x,
+                y,
+                marker="" if len(x) > MANY or banded else k.marker,
                 markersize=4,
                 markerfacecolor="none" if c.thin else k.color,
                 **style,
             )
-    if figure.x_log:
-        axes.set_xscale("log")
-        axes.xaxis.set_major_formatter(seconds_on_axis if "[s]" in figure.x_title else power_on_axis)
-        lowest, highest = axes.get_xlim()
-        if highest < 20.0 * lowest:  # not a decade to see: name the steps between
-            axes.xaxis.set_minor_formatter(seconds_on_axis if "[s]" in figure.x_title else power_on_axis)
-            axes.tick_params(axis="x", which="minor", labelsize=6, labelrotation=45)
-        else:
-            axes.xaxis.set_minor_formatter("")
-    if figure.y_log:
-        axes.set_yscale("log")
-        axes.yaxis.set_major_formatter(seconds_on_axis if "[s]" in figure.y_title else power_on_axis)
-        axes.yaxis.set_minor_formatter("")
+    axes.set_xscale("log" if figure.x_log else "linear")
+    axes.set_yscale("log" if figure.y_log else "linear")
+    for axis, drawn in ((laid.across, axes.xaxis), (laid.up, axes.yaxis)):
+        ticks = axis.ticks()
+        drawn.set_ticks(ticks, labels=[axis.text(tick) for tick in ticks])
+    axes.minorticks_off()
+    axes.set(xlim=laid.across.limits, ylim=laid.up.limits)
     for level in figure.levels:
         axes.axhline(level, color="0.8", linewidth=0.6, zorder=0)
-    if math.isfinite(figure.floor) and figure.floor > 0.0:
+    if math.isfinite(figure.floor) and figure.floor > 0.0 and 0.0 <= laid.up.share(figure.floor) <= 1.0:
         axes.axhline(
             figure.floor,
             color="0.35",
@@ -88,12 +102,7 @@ def matplotlib_figure(figure: Figure, look: dict[str, Look], size: tuple[float, 
             label="floor of float64",
             zorder=0,
         )
-    axes.set_xlabel(_plain(figure.x_title))
-    axes.set_ylabel(_plain(figure.y_title))
     axes.set_title(_plain(figure.title), fontsize=10)
-    if axes.get_legend_handles_labels()[0]:
-        axes.legend(fontsize=7, loc="center left", bbox_to_anchor=(1.01, 0.5), frameon=False, handlelength=3)
-    return canvas
 
 
 LONGEST_TITLE = 80  # characters

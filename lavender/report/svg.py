@@ -11,56 +11,28 @@ import math
 from collections.abc import Mapping, Sequence
 from html import escape
 
+from lavender.report.axes import Axis, shown
 from lavender.report.curves import Curve, Figure
-from lavender.report.draw import power_on_axis, seconds_on_axis
 
 __all__ = ["svg"]
 
 WIDTH, HEIGHT = 1000, 640  # units, twice the pixels of a phone's width
 LEFT, RIGHT, TOP, BOTTOM = 118, 256, 62, 92  # margins: labels of the axis; names at the ends of curves
 GAP = 30  # units between two names, at least
-LEAST_DECADES = 1.0  # a logarithmic axis spans so much, at least
 
 
-class _Axis:
-    """Values to units."""
+class _Scale:
+    """Values to units of the canvas."""
 
-    def __init__(self, values: Sequence[float], log: bool, first: float, last: float) -> None:
-        self.log, self.first, self.last = log, first, last
-        found = [math.log10(v) if log else v for v in values]
-        low, high = (min(found), max(found)) if found else (0.0, 1.0)
-        least = LEAST_DECADES if log else 1e-300
-        if high - low < least:
-            middle = 0.5 * (low + high)
-            low, high = middle - 0.5 * least, middle + 0.5 * least
-        room = 0.03 * (high - low) if high > low else 0.5
-        self.low, self.high = low - room, high + room
+    def __init__(self, axis: Axis, first: float, last: float) -> None:
+        self.axis, self.first, self.last = axis, first, last
 
     def __call__(self, value: float) -> int:
-        x = math.log10(value) if self.log else value
-        return round(self.first + (self.last - self.first) * (x - self.low) / (self.high - self.low))
-
-    def ticks(self) -> list[float]:
-        """Decades, every second or third where there are many; else about five round numbers."""
-        if self.log:
-            decades = list(range(math.ceil(self.low), math.floor(self.high) + 1))
-            ticks = [10.0**k for k in decades[:: max(1, -(-len(decades) // 7))]]
-            if len(decades) < 2:
-                ticks = [
-                    m * 10.0**k
-                    for k in range(math.floor(self.low), math.ceil(self.high) + 1)
-                    for m in (1, 2, 5)
-                    if self.low <= math.log10(m * 10.0**k) <= self.high
-                ]
-            return ticks
-        step = 10.0 ** math.floor(math.log10((self.high - self.low) / 2.0))
-        step *= next((m for m in (1.0, 2.0, 5.0, 10.0) if (self.high - self.low) / (m * step) <= 6.0), 10.0)
-        first = math.ceil(self.low / step)
-        return [step * k for k in range(first, first + 12) if step * k <= self.high]
+        return round(self.first + (self.last - self.first) * self.axis.share(value))
 
     def data(self) -> str:
         """What a script needs to read a value off a place."""
-        return f"{int(self.log)} {self.low:.4f} {self.high:.4f} {self.first} {self.last}"
+        return f"{int(self.axis.log)} {self.axis.low:.4f} {self.axis.high:.4f} {self.first} {self.last}"
 
 
 def svg(
@@ -75,46 +47,31 @@ def svg(
     leaders : solvers in colour, whose names must not cover each other
     title : in place of the figure's own, which may repeat a heading of the page
     """
-    curves = [(c, *_finite(c, figure)) for c in figure.curves]
-    curves = [(c, x, y) for c, x, y in curves if any(not math.isnan(v) for v in y)]
-    xs = [v for _, x, y in curves for v, w in zip(x, y, strict=True) if not math.isnan(w)]
-    ys = [v for c, _, y in curves for v in (*y, *c.low, *c.high) if not math.isnan(v)]
-    across = _Axis(xs, figure.x_log, LEFT, WIDTH - RIGHT)
-    up = _Axis(ys, figure.y_log, HEIGHT - BOTTOM, TOP)
-    said = f"{int('[s]' in figure.x_title)}{int('[s]' in figure.y_title)}"
+    laid = shown(figure)
+    across, up = _Scale(laid.across, LEFT, WIDTH - RIGHT), _Scale(laid.up, HEIGHT - BOTTOM, TOP)
+    said = f"{int(laid.across.is_time)}{int(laid.up.is_time)}"
     parts = [
         f'<svg class="chart" viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{escape(figure.title)}"',
         f' data-x="{across.data()}" data-y="{up.data()}" data-t="{said}">',
         f'<text class="t" x="{LEFT}" y="24">{escape(_short(figure.title if title is None else title))}</text>',
     ]
     parts += _grid(figure, across, up)
-    names = _names(curves, across, up, leaders)
-    for c, x, y in curves:
+    names = _names(laid.curves, across, up, leaders)
+    for c, x, y in laid.curves:
         parts.append(_curve(c, x, y, across, up, number.get(c.solver, 0), names))
     return "".join([*parts, "</svg>"])
-
-
-def _finite(curve: Curve, figure: Figure) -> tuple[list[float], list[float]]:
-    """Points that the axes can show; nan breaks a line."""
-    x, y = [], []
-    for a, b in zip(curve.x, curve.y, strict=True):
-        shown = math.isfinite(a) and (a > 0.0 or not figure.x_log)
-        x.append(a if shown else math.nan)
-        y.append(b if shown and math.isfinite(b) and (b > 0.0 or not figure.y_log) else math.nan)
-    return x, y
 
 
 def _short(text: str, most: int = 76) -> str:
     return text if len(text) <= most else text[: most - 1] + "…"
 
 
-def _grid(figure: Figure, across: _Axis, up: _Axis) -> list[str]:
+def _grid(figure: Figure, across: _Scale, up: _Scale) -> list[str]:
     bottom, right = HEIGHT - BOTTOM, WIDTH - RIGHT
     lines, words = [], []
-    for axis, title, is_x in ((across, figure.x_title, True), (up, figure.y_title, False)):
-        for value in axis.ticks():
-            place = axis(value)
-            said = _tick(value, axis.log, "[s]" in title)
+    for scale, is_x in ((across, True), (up, False)):
+        for value in scale.axis.ticks():
+            place, said = scale(value), scale.axis.text(value)
             if is_x:
                 lines.append(f"M{place} {TOP}V{bottom}")
                 words.append(
@@ -144,16 +101,10 @@ def _grid(figure: Figure, across: _Axis, up: _Axis) -> list[str]:
     return out
 
 
-def _tick(value: float, log: bool, is_time: bool) -> str:
-    if is_time:
-        return seconds_on_axis(value)
-    return power_on_axis(value) if log else f"{value:.6g}"
-
-
 def _names(
     curves: Sequence[tuple[Curve, list[float], list[float]]],
-    across: _Axis,
-    up: _Axis,
+    across: _Scale,
+    up: _Scale,
     leaders: Sequence[str],
 ) -> dict[str, tuple[int, int]]:
     """Where the name of each curve stands: at its end, those of the leaders apart from each other."""
@@ -187,8 +138,8 @@ def _curve(
     c: Curve,
     x: Sequence[float],
     y: Sequence[float],
-    across: _Axis,
-    up: _Axis,
+    across: _Scale,
+    up: _Scale,
     n: int,
     names: Mapping[str, tuple[int, int]],
 ) -> str:

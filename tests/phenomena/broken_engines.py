@@ -3,7 +3,9 @@
 import os
 import sys
 import time
+from pathlib import Path
 
+from lavender.apart.lines import Lines
 from lavender.apart.served import answer, begin, receive
 
 
@@ -15,6 +17,12 @@ def serve(lifeline):
         os.abort()
     if name == "sleeps":
         time.sleep(60)
+    if name.startswith("waits"):  # for a program of its own, whose number it leaves in a file
+        lines = Lines(
+            [sys.executable, "-c", "import os, time; print(os.getpid(), flush=True); time.sleep(60)"]
+        )
+        Path(name.removeprefix("waits ")).write_text(str(lines.ask(None)))
+        lines.ask(None)
     if name == "babbles":
         answer(answers, '{"looks": 3, "bodies": 1, "setting": ""}', b"12345678")
         time.sleep(60)

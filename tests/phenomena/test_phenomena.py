@@ -7,6 +7,8 @@ import math
 import os
 import re
 import sys
+import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -193,23 +195,63 @@ def test_mujoco_creeps_and_lifts_as_it_is_known_to():
     ("name", "words"),
     [
         ("dies", "SIGABRT"),
-        ("sleeps", "no answer within 0.5 s"),
+        ("sleeps", "no answer within 2 s"),
         ("babbles", "no track"),
         ("leaves", "exit status 0"),
     ],
 )
 def test_an_engine_that_fails_is_a_note_and_the_next_has_a_process(name, words, monkeypatch):
     monkeypatch.setattr("lavender.phenomena.running.MODULE", "broken_engines")
-    apart = Apart(limit=0.5 if name == "sleeps" else 20.0)
+    apart = Apart(limit=2.0 if name == "sleeps" else 20.0)
     scene = PHENOMENA["stick"].scene()
     way = dataclasses.replace(OTHERS[0], name=name)
     try:
         found = apart.track(way, scene, 1.0, 0.1)
         assert isinstance(found, str)
         assert words in found
-        if name != "babbles":
-            monkeypatch.undo()
-            assert "it failed: KeyError" in apart.track(way, scene, 1.0, 0.1)  # a way that nobody has
+        if name != "babbles":  # it sleeps on
+            again = apart.track(dataclasses.replace(way, name="leaves"), scene, 1.0, 0.1)
+            assert again == "its process ended: exit status 0"
+    finally:
+        apart.end()
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="reads /proc")
+def test_a_program_that_an_engine_waits_for_ends_with_it(monkeypatch, tmp_path):
+    monkeypatch.setattr("lavender.phenomena.running.MODULE", "broken_engines")
+    apart = Apart(limit=3.0)
+    way = dataclasses.replace(OTHERS[0], name=f"waits {tmp_path / 'number'}")
+    try:
+        assert apart.track(way, PHENOMENA["stick"].scene(), 1.0, 0.1) == "no answer within 3 s"
+        number = int((tmp_path / "number").read_text())
+        state = Path(f"/proc/{number}/stat")
+        for _ in range(100):  # the system takes a moment
+            if not state.exists() or state.read_text().rpartition(")")[2].split()[0] == "Z":
+                break
+            time.sleep(0.05)
+        else:
+            pytest.fail("it runs on")
+    finally:
+        apart.end()
+
+
+def test_a_system_that_starts_no_process_is_a_note(monkeypatch):
+    def refuse(*_, **__):
+        raise OSError(11, "no more processes")
+
+    monkeypatch.setattr("lavender.apart.process.subprocess.Popen", refuse)
+    found = Apart().track(OTHERS[0], PHENOMENA["stick"].scene(), 1.0, 0.1)
+    assert found == "its process does not start: [Errno 11] no more processes"
+
+
+def test_what_an_engine_raises_is_told_and_its_process_stays():
+    apart = Apart()
+    scene = PHENOMENA["stick"].scene()
+    try:
+        for _ in range(2):
+            found = apart.track(dataclasses.replace(OTHERS[0], name="nobody's"), scene, 1.0, 0.1)
+            assert found == 'it failed: KeyError: "nobody\'s"'
+            assert apart._process.alive
     finally:
         apart.end()
 
@@ -225,7 +267,7 @@ def test_an_engine_that_is_missing_is_a_note(monkeypatch):
 def test_an_engine_without_what_a_scene_needs_is_a_note_and_starts_no_process(monkeypatch):
     bare = dataclasses.replace(OTHERS[0], package="", cannot={"hinge": "it has no hinges"})
     monkeypatch.setitem(WAYS, bare.name, bare)
-    monkeypatch.setattr("lavender.phenomena.running.Process", None)  # a start would fail
+    monkeypatch.setattr("lavender.phenomena.running.Process.start", None)  # a start would fail
     (record,) = run(["pendulum"], steppers=[], engines=[bare.name], parameters={})
     assert (record.note, record.values, record.passed) == ("it has no hinges", {}, False)
 

@@ -209,10 +209,12 @@ def test_every_import_is_declared():
     known |= declared("cluster") | declared("peers") | declared("mujoco")
     known |= {
         "lavendersim",
+        "newton",
         "pinocchio",
         "pydrake",
         "qoco",
         "siconos",
+        "warp",
     }  # peers, used where they are installed
     known |= {"ray"}  # a cluster that campaigns can use where it is installed
     known |= set(sys.stdlib_module_names) | {"lavender", "lavender_ext"}

@@ -18,6 +18,7 @@ from lavender import bench, report
 from lavender.bench.record import CaseInfo, Record, Run, file_name
 from lavender.report import curves, tables
 from lavender.report.curves import overall_figure
+from lavender.report.draw import matplotlib_figure
 from lavender.report.paper import write_paper
 from lavender.report.style import looks
 from lavender.report.svg import svg
@@ -587,6 +588,34 @@ def test_a_drawing_survives_what_has_no_place_on_its_axes():
         curves.Figure("f", "t", "x", "y", (curves.Curve("a", "a", (1.0, 1.0), (5.0, 5.0)),), False, False),
     ):
         ElementTree.fromstring(svg(drawn, {}))
+        matplotlib_figure(drawn, looks(["a"])).draw_without_rendering()
+
+
+@pytest.mark.parametrize("name", ["time", "budget", "profile"])
+def test_a_file_and_the_page_have_the_same_axes(name, real):
+    records, _ = real
+    figure = curves.work_precision(records, "chain")
+    if name == "budget":  # less than a decade, and a straight axis
+        made = curves.Curve("pgs", "pgs", (4.0, 8.0, 16.0), (0.1, 0.5, 0.9))
+        figure = curves.Figure("f", "t", "iterations", "share", (made,), y_log=False)
+    if name == "profile":
+        made = curves.Curve("pgs", "pgs", (1e-5, 1e3), (0.3, 0.3), steps=True)
+        figure = curves.Figure("f", "t", "time [s]", "share", (made,), y_log=False)
+    root = ElementTree.fromstring(svg(figure, {}))
+    (axes,) = matplotlib_figure(figure, looks(c.solver for c in figure.curves)).axes
+    words = [t.text for t in root.iter("text") if t.get("class") == "a"]
+    for drawn, data, limits in (
+        (axes.xaxis, "data-x", axes.get_xlim()),
+        (axes.yaxis, "data-y", axes.get_ylim()),
+    ):
+        log, low, high, *_ = map(float, root.get(data).split())
+        ends = np.log10(limits) if log else limits
+        np.testing.assert_allclose(ends, (low, high), atol=1e-4)  # the page has four digits of them
+        ticks = [t.get_text() for t in drawn.get_ticklabels()]
+        assert 2 <= len(ticks) <= 9
+        assert ticks == words[: len(ticks)]
+        del words[: len(ticks)]
+        assert not drawn.get_minorticklocs().size
 
 
 def test_warm_runs_have_their_own_curves(real):

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
-import json
-import time
 from typing import Any
 
-from lavender.apart.served import answer, begin, receive
+from lavender.apart import served as apart
 
 __all__ = ["serve"]
 
@@ -15,39 +12,30 @@ ORPHAN = 60.0  # s of CPU, beyond what any task may take
 
 
 def serve(memory: int, lifeline: int) -> None:
-    """Read problems and tasks from standard input, answer on standard output, until the input ends.
+    """Answer tasks, until they end; `memory`: bytes of address space, 0 for no limit."""
+    apart.serve(lifeline, _runner, memory)
 
-    Parameters
-    ----------
-    memory : bytes of address space, 0 for no limit
-    lifeline : reading end of a pipe whose other end the parent alone holds; -1 for none
-    """
-    requests, answers = begin(lifeline)
-    if memory:
-        with contextlib.suppress(ImportError, ValueError, OSError):
-            import resource
 
-            resource.setrlimit(resource.RLIMIT_AS, (memory, memory))
+def _runner() -> apart.Handler:
     from lavender.bench.running.timing import attempt
 
-    answer(answers, "{}", b"")  # ready
     problem: Any = None
-    while True:
-        try:
-            message = receive(requests)
-        except EOFError:
-            return
+
+    def run(message: Any) -> tuple[dict[str, Any], bytes] | None:
+        nonlocal problem
         if message[0] == "problem":
             problem = message[1]
-        else:
-            _limit_cpu(3.0 * message[1].time_limit + ORPHAN)
-            answer(answers, *_as_data(attempt(problem, message[1], message[2])))
+            return None
+        apart.limit_cpu(3.0 * message[1].time_limit + ORPHAN)
+        return _as_data(attempt(problem, message[1], message[2]))
+
+    return run
 
 
-def _as_data(found: Any) -> tuple[str, bytes]:
+def _as_data(found: Any) -> tuple[dict[str, Any], bytes]:
     """An outcome as words and numbers (`lavender.bench.running.worker` reads them)."""
     if isinstance(found, str):
-        return json.dumps({"error": found[:500]}), b""
+        return {"error": found[:500]}, b""
     certificate = found.certificate
     said = {
         "status": found.status.name,
@@ -63,13 +51,4 @@ def _as_data(found: Any) -> tuple[str, bytes]:
         "certificate": certificate is not None,
     }
     more = b"" if certificate is None else certificate.tobytes()
-    return json.dumps(said), found.impulse.tobytes() + more
-
-
-def _limit_cpu(more: float) -> None:
-    """The system ends this process after so much more CPU time, should nobody be left who could."""
-    with contextlib.suppress(ImportError, ValueError, OSError):
-        import resource
-
-        hard = resource.getrlimit(resource.RLIMIT_CPU)[1]
-        resource.setrlimit(resource.RLIMIT_CPU, (int(time.process_time() + more) + 1, hard))
+    return said, found.impulse.tobytes() + more

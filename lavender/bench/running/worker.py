@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from lavender._arrays import FloatArray
-from lavender.apart.process import Process
+from lavender.apart.process import Ended, Process
 from lavender.bench.machine import memory_share
 from lavender.bench.record import CRASHED, KILLED, Record
 from lavender.bench.running.timing import Outcome, Task, judged
@@ -45,7 +45,7 @@ class Worker:
     def __init__(self, memory: int | None = None, grace: float | None = None) -> None:
         self.memory = memory_share() if memory is None else memory
         self.grace = GRACE if grace is None else grace
-        self._process: Process | None = None
+        self._process = Process(_SERVED, self.memory or 0, environment=_ONE_THREAD)
         self._holds = ""
 
     def measure(self, problem: Problem, task: Task) -> Record:
@@ -56,64 +56,38 @@ class Worker:
         self, problem: Problem, task: Task, impulse: Any = None
     ) -> tuple[Record, FloatArray | None]:
         """As `lavender.bench.running.timing.measure_impulse`, in the worker."""
-        if self._process is None:
-            cause = self._start()
+        process = self._process
+        if not process.alive:
+            self._holds = ""
+            cause = process.start()
             if cause:
                 message = f"the worker process ended: {cause}"
                 return task.record(status=f"{CRASHED} (did not start)", message=message), None
-        process = self._process
-        assert process is not None
         # Repeats end once they took the limit together, so at most two can take it; backends look at the clock
         # now and then.
         limit = 3.0 * task.time_limit + self.grace
         begun = time.monotonic()
+        messages: list[Any] = [("task", task, impulse)]
+        if self._holds != task.sha:
+            messages.insert(0, ("problem", problem))
+        self._holds = task.sha
         try:
-            messages: list[Any] = [("task", task, impulse)]
-            if self._holds != task.sha:
-                messages.insert(0, ("problem", problem))
-            self._holds = task.sha
-            process.room = 16 * problem.m  # impulses and a certificate
-            process.send(messages, limit)
-            answer = process.answer(begun + limit - time.monotonic())
+            answer = process.ask(messages, limit, 16 * problem.m)  # impulses and a certificate
         except TimeoutError:
-            self._end()
             text = f"did not stop; its process was killed after {limit:.3g} s"
             return task.record(status=KILLED, message=text), None
-        except KeyboardInterrupt:
-            self._end()
-            raise
-        if answer is None:
-            text = "the process of the backend died"
-            return task.record(status=f"{CRASHED} ({self._cause()})", message=text), None
+        except Ended as end:
+            return task.record(status=f"{CRASHED} ({end})", message="the process of the backend died"), None
         try:
             return judged(problem, task, _outcome(answer, problem.m, time.monotonic() - begun))
         except ValueError as error:
-            self._end()
+            process.end()
             text = f"the process of the backend sent what is no answer ({error}); it was killed"
             return task.record(status=f"{CRASHED} (no answer)", message=text), None
 
-    def _start(self) -> str:
-        """Start a process and wait until it is ready; why it is not, or nothing."""
-        self._holds = ""
-        process = Process(_SERVED, self.memory or 0, environment=_ONE_THREAD)
-        cause = process.ready()
-        if not cause:
-            self._process = process
-        return cause
-
-    def _cause(self) -> str:
-        process, self._process = self._process, None
-        assert process is not None
-        return process.cause()
-
-    def _end(self) -> None:
-        process, self._process = self._process, None
-        if process is not None:
-            process.end()
-
     def close(self) -> None:
         """End the process and what it started."""
-        self._end()
+        self._process.end()
 
     def __enter__(self) -> Worker:
         return self
