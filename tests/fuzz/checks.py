@@ -395,12 +395,12 @@ CHECKS = {
     "door": check_door,
     "promise": check_promise,
 }
-MAKE = {
-    "solve": problems.solve_spec,
-    "file": files.file_spec,
-    "steps": scenes.scene_spec,
-    "snapshot": scenes.snapshot_spec,
-    "folder": folders.folder_spec,
-    "door": doors.door_spec,
-    "promise": promises.promise_spec,
+INPUTS = {
+    "solve": problems.solve_specs(),
+    "file": files.file_specs(),
+    "steps": scenes.scene_specs(),
+    "snapshot": scenes.snapshot_specs(),
+    "folder": folders.folder_specs(),
+    "door": doors.door_specs(),
+    "promise": promises.promise_specs(),
 }

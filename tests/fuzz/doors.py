@@ -8,6 +8,7 @@ from fractions import Fraction
 from pathlib import Path
 
 import folders
+import hypothesis.strategies as st
 import numpy as np
 import problems
 
@@ -53,31 +54,39 @@ TOLD = ("kinetic", "energy", "speed", "spin", "rows", "bound", "bound_speed", "b
         "spread_speed")  # fmt: skip
 
 
-def door_spec(draw):
+def door_specs():
     """What is done at which door."""
-    spec = {"kind": "door", "what": draw.pick(WHAT), "seed": draw.whole(0, 10**6)}
-    if spec["what"] == "memory":
-        spec["model"] = draw.whole(0, 11)
-        spec["edits"] = [memory_edit(draw) for _ in range(draw.pick((1, 1, 2, 3)))]
-    elif spec["what"] == "path":
-        spec["target"] = draw.pick(TARGETS)
-    elif spec["what"] == "plug-in":
-        spec |= {"lie": draw.pick(LIES), "field": draw.pick(CLAIMED), "value": draw.whole(0, len(WILD) - 1)}
-        spec["resumable"] = draw.chance(0.5)
-    elif spec["what"] == "far":
-        spec |= {"problem": problems.one_spec(draw, 8), "exponent": draw.whole(-1070, 1020)}
-    elif spec["what"] == "rank":
-        spec |= {"form": draw.pick(("masses", "rows", "matrix")), "spread": 2 * draw.whole(0, 60)}
-    elif spec["what"] == "command":
-        spec["words"] = [word.format(draw.pick(ASKED)) for word in draw.pick(WORDS)]
-    return spec
+    pick = st.sampled_from
+    edits = st.one_of(
+        memory_edits(INDICES, WHOLE), memory_edits(NUMBERS, REAL), memory_edits(OPTIONS, WHOLE + REAL)
+    )
+    lie = {
+        "lie": pick(LIES),
+        "field": pick(CLAIMED),
+        "value": pick(range(len(WILD))),
+        "resumable": st.booleans(),
+    }
+    words = st.tuples(pick(WORDS), pick(ASKED)).map(lambda x: [word.format(x[1]) for word in x[0]])
+    fields = {
+        "arrays": {},
+        "memory": {"model": st.integers(0, 11), "edits": st.lists(edits, min_size=1, max_size=3)},
+        "path": {"target": pick(TARGETS)},
+        "plug-in": lie,
+        "far": {"problem": problems.parts(8), "exponent": st.integers(-1070, 1020)},
+        "rank": {
+            "form": pick(("masses", "rows", "matrix")),
+            "spread": st.integers(0, 60).map(lambda x: 2 * x),
+        },
+        "command": {"words": words},
+    }
+    common = {"kind": st.just("door"), "seed": st.integers(0, 10**6)}
+    return st.one_of(*(st.fixed_dictionaries({"what": st.just(w), **common, **fields[w]}) for w in WHAT))
 
 
-def memory_edit(draw):
+def memory_edits(names, values):
     """Name, places (shares of the length) and value of a change."""
-    kind = draw.pick((INDICES, INDICES, INDICES, NUMBERS, OPTIONS))
-    values = WHOLE if kind is INDICES else REAL if kind is NUMBERS else (*WHOLE, *REAL)
-    return [draw.pick(kind), [draw.whole(0, 999) for _ in range(draw.pick((1, 1, 2, 20)))], draw.pick(values)]
+    places = st.lists(st.integers(0, 999), min_size=1, max_size=20)
+    return st.tuples(st.sampled_from(names), places, st.sampled_from(values))
 
 
 def check(spec):

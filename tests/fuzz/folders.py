@@ -9,7 +9,9 @@ import os
 import tempfile
 from pathlib import Path
 
+import hypothesis.strategies as st
 import numpy as np
+from strategies import chance
 
 import lavender as lv
 import lavender.cli
@@ -23,7 +25,7 @@ NAMES = (
     "01.npz",
     "step-1.npz", "step-٣.npz", "😀.npz",
 )  # fmt: skip
-RAW_NAMES = (b"\xff\xfe.npz", b"a\x80.npz")
+RAW_NAMES = tuple(base64.b64encode(name).decode() for name in (b"\xff\xfe.npz", b"a\x80.npz"))
 INSIDE = (
     "names",
     "name",
@@ -58,40 +60,41 @@ WILD = (
 )
 
 
-def folder_spec(draw):
-    """Files by name, or records; and the command."""
-    if draw.chance(0.6):
-        return records_spec(draw)
-    entries = []
-    for _ in range(draw.whole(1, 4)):
-        name = draw.pick(NAMES) if draw.chance(0.9) else None
-        raw = None if name is not None else base64.b64encode(draw.pick(RAW_NAMES)).decode()
-        entries.append({"name": name, "raw": raw, "inside": draw.pick(INSIDE)})
-    if draw.chance(0.1):
-        entries.append({"name": "loop", "raw": None, "inside": "link"})
-    if draw.chance(0.1):
-        entries.append({"name": "pipe.npz", "raw": None, "inside": "pipe"})
-    command = draw.pick(("report", "report", "report", "bench", "check", "files"))
-    return {
-        "kind": "folder",
-        "entries": entries,
-        "command": command,
-        "figures": draw.chance(0.1),
-        "twice": draw.chance(0.3),
-    }
+def folder_specs():
+    """Files by name and the command, or a records.jsonl with some of its lines, fields or bytes changed."""
+    return st.one_of(named_files(), named_files(), changed_records(), changed_records(), changed_records())
 
 
-def records_spec(draw):
-    """A records.jsonl with some of its lines, fields or bytes changed."""
+def named_files():
+    """Entries of a folder."""
+
+    def entry(names, raws, inside):
+        fields = {"name": names, "raw": raws, "inside": inside}
+        return st.fixed_dictionaries({key: st.sampled_from(values) for key, values in fields.items()})
+
+    good, raw = entry(NAMES, (None,), INSIDE), entry((None,), RAW_NAMES, INSIDE)
+    odd = entry(("loop",), (None,), ("link",)) | entry(("pipe.npz",), (None,), ("pipe",))
+    return st.fixed_dictionaries(
+        {
+            "kind": st.just("folder"),
+            "entries": st.lists(st.one_of(*[good] * 8, raw, odd), min_size=1, max_size=5),
+            "command": st.sampled_from(("report", "report", "report", "bench", "check", "files")),
+            "figures": chance(0.1),
+            "twice": chance(0.3),
+        }
+    )
+
+
+@st.composite
+def changed_records(draw):
+    """How, in which line, which field, to what."""
     lines = [json.loads(line) for line in good_records()]
     edits = []
-    for _ in range(draw.pick((1, 1, 2, 4))):
-        at = draw.whole(0, len(lines) - 1)
-        how = draw.pick(("field", "field", "field", "field", "gone", "line", "again", "cut", "bytes"))
-        keys = sorted(lines[at])
-        edit = [how, at, draw.pick(keys), draw.whole(0, len(WILD) - 1)]
-        edits.append(edit)
-    return {"kind": "folder", "records": edits, "show": draw.chance(0.3)}
+    for _ in range(draw(st.sampled_from((1, 1, 2, 4)))):
+        at = draw(st.integers(0, len(lines) - 1))
+        how = draw(st.sampled_from((*["field"] * 4, "gone", "line", "again", "cut", "bytes")))
+        edits.append([how, at, draw(st.sampled_from(sorted(lines[at]))), draw(st.integers(0, len(WILD) - 1))])
+    return {"kind": "folder", "records": edits, "show": draw(chance(0.3))}
 
 
 @functools.cache
