@@ -166,7 +166,7 @@ def claims(spec, problem, solution):
         and lv.get(name).resumable
     ):
         yield "overrun", f"{name}: {solution.iterations} iterations where {budget} were asked for"
-    if solution.contradicted:
+    if solution.contradicted and not lv.get(name).external:
         yield "contradicted", f"{name}: {solution.contradicted}"
     finite = bool(np.isfinite(solution.impulse).all())
     if not finite and status not in ("DIVERGED", "NUMERICAL_ERROR"):

@@ -2,9 +2,7 @@
 
 import base64
 import contextlib
-import functools
 import io
-import json
 import os
 import tempfile
 from pathlib import Path
@@ -38,35 +36,10 @@ INSIDE = (
     "good",
     "good",
 )
-WILD = (
-    None,
-    True,
-    False,
-    -1,
-    0,
-    1e400,
-    float("nan"),
-    10**400,
-    "",
-    "<b>",
-    "[/x]",
-    "\ud800",
-    "\x00",
-    [],
-    [[]],
-    {},
-    {"a": 1},
-    "a" * 1000,
-)
 
 
 def folder_specs():
-    """Files by name and the command, or a records.jsonl with some of its lines, fields or bytes changed."""
-    return st.one_of(named_files(), named_files(), changed_records(), changed_records(), changed_records())
-
-
-def named_files():
-    """Entries of a folder."""
+    """Files by name, and the command."""
 
     def entry(names, raws, inside):
         fields = {"name": names, "raw": raws, "inside": inside}
@@ -83,29 +56,6 @@ def named_files():
             "twice": chance(0.3),
         }
     )
-
-
-@st.composite
-def changed_records(draw):
-    """How, in which line, which field, to what."""
-    lines = [json.loads(line) for line in good_records()]
-    edits = []
-    for _ in range(draw(st.sampled_from((1, 1, 2, 4)))):
-        at = draw(st.integers(0, len(lines) - 1))
-        how = draw(st.sampled_from((*["field"] * 4, "gone", "line", "again", "cut", "bytes")))
-        edits.append([how, at, draw(st.sampled_from(sorted(lines[at]))), draw(st.integers(0, len(WILD) - 1))])
-    return {"kind": "folder", "records": edits, "show": draw(chance(0.3))}
-
-
-@functools.cache
-def good_records():
-    """Lines of a small run."""
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder, "records.jsonl")
-        quiet(["bench", "two_particles", "slider(mu=1)", "--solvers", "pgs,nncg", "--levels", "1e-3",
-               "--budgets", "4", "--repeats", "1",
-               "--out", str(path)])  # fmt: skip
-        return tuple(path.read_text(encoding="utf-8").splitlines())
 
 
 def quiet(arguments):
@@ -167,9 +117,6 @@ def lay_out(spec, folder):
 def check(spec):
     """What was broken."""
     with tempfile.TemporaryDirectory() as root:
-        if "records" in spec:
-            yield from check_records(spec, Path(root))
-            return
         folder, out = Path(root, "problems"), Path(root, "out")
         folder.mkdir()
         lay_out(spec, folder)
@@ -215,31 +162,3 @@ def told(code, text, command):
         yield "raw traceback", f"{command}: {text[-300:]}"
     if code == 2 and not text.strip():
         yield "raw exit", f"{command}: status 2 without a word"
-
-
-def check_records(spec, root):
-    path = root / "records.jsonl"
-    lines = [json.loads(line) for line in good_records()]
-    texts = []
-    for how, at, key, value in spec["records"]:
-        if how == "field":
-            lines[at % len(lines)][key] = WILD[value]
-        elif how == "gone":
-            lines[at % len(lines)].pop(key, None)
-        elif how == "again":
-            lines.append(dict(lines[at % len(lines)]))
-        elif how == "line":
-            lines[at % len(lines)] = {"": WILD[value]}
-    texts = [json.dumps(line, ensure_ascii=value != 1).encode(errors="surrogatepass") for line in lines]
-    for how, at, _, value in spec["records"]:
-        if how == "cut":
-            texts[at % len(texts)] = texts[at % len(texts)][: 3 * value]
-        elif how == "bytes":
-            texts[at % len(texts)] = bytes([255, 0, value]) + texts[at % len(texts)]
-    path.write_bytes(b"\n".join(texts) + b"\n")
-    records = lv.bench.read(path)
-    records.latest()
-    records.rows()
-    if spec["show"]:
-        code, text = quiet(["report", str(path), "--no-figures", "--out", str(root / "out")])
-        yield from told(code, text, "report records.jsonl")

@@ -16,6 +16,7 @@ import faulthandler
 import hashlib
 import json
 import os
+import random
 import re
 import resource
 import signal
@@ -103,11 +104,15 @@ class Worker:
         import atheris
 
         corpus = self.folder / "corpus"
-        corpus.mkdir(exist_ok=True)
+        corpus.mkdir()
+        rng = random.Random(seed)
+        for i in range(64):  # choices to begin with
+            (corpus / str(i)).write_bytes(rng.randbytes(rng.randint(16, 4000)))
+        check = self.property(seed, 1).hypothesis.fuzz_one_input
 
         def one(data):
             with suppress(AssertionError):  # kept already
-                self.property(seed, 1).hypothesis.fuzz_one_input(data)
+                check(data)
 
         atheris.Setup(
             [sys.argv[0], f"-max_total_time={max(1, int(until - time.time()))}", f"-runs={most}", f"-seed={seed}",

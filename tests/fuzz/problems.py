@@ -313,14 +313,15 @@ def law_of(spec):
 
 @st.composite
 def solve_specs(draw):
-    """A problem, a solver of this project and options."""
+    """A problem, a solver (one in ten of another package) and options."""
     problem = draw(problem_specs())
+    ours, others = (lv.available(external=other, law=law_of(problem)) for other in (False, True))
     names = [
         name
-        for name in lv.available(external=False, law=law_of(problem))
+        for name in (others if others and draw(chance(0.1)) else ours)
         if name != "sequential_impulses" or problem["operator"] == "rows"
     ]
-    many = len(problem["cones"]["kind"]) > MANY
+    many = len(problem["cones"]["kind"]) > MANY and names[0] in ours
     solver = "auto" if many and draw(chance(0.7)) else draw(st.sampled_from(names))  # it takes them apart
     s, m = lv.get(solver), problem["cones"]["ptr"][-1]
     options = {"tol": draw(st.sampled_from((1e-6, 1e-6, 1e-9, 1e-12, 1e-3, 0.0, 1e-300, 2.0)))}
@@ -336,6 +337,8 @@ def solve_specs(draw):
         options |= draw(optional(0.05, history=st.just(True)))
     options |= draw(optional(0.02, time_limit=st.sampled_from((0.0, 1e-6, 1e-3, 1.0))))
     spec = {"kind": "solve", "problem": problem, "solver": solver, "options": options}
+    if s.external:  # what it repeats is its own affair
+        return plain(spec | {"again": False, "prepared": False})
     if "time_limit" not in options and draw(chance(0.2)):
         spec["threads"] = draw(st.sampled_from((1, 1, 1, 2)))
         spec["others"] = draw(st.lists(numbers(m), max_size=3))

@@ -144,7 +144,9 @@ def snapshot_specs(draw):
     index = st.tuples(pick(("size", "index", "index", "index")), place, pick(WILD_WHOLE))
     keys = st.tuples(st.just("keys"), place, st.integers(0, 2**62) | pick((0, 1, 2**64 - 1, 2**63)))
     key = pick(("version", "fingerprint", "steps", "failed", "lost", "lengths", "extra", None))
-    value = pick((None, -1, 0, 1, 2, 10**30, 1.5, "x", "1", [], [1, 2, 3, 4], {}, True))
+    value = pick(
+        (None, -1, 0, 1, 2, 10**30, 1.5, "x", "1", [], [[]], [1, 2, 3, 4], {}, True, float("inf"), "\ud800")
+    )
     at = st.integers(0, 4000)
     raw = pick(
         (

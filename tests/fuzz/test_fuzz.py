@@ -140,8 +140,9 @@ def test_crashes_hangs_and_raw_exceptions_are_found_and_kept(tmp_path, monkeypat
     script.write_text(BROKEN.format(fuzz=str(FUZZ), how=how))
     monkeypatch.setenv("LAVENDER_FUZZ_FOUND", str(tmp_path / "found"))
     monkeypatch.setenv("LAVENDER_FUZZ_SCRIPT", str(script))
+    limit = "1" if how == "hang" else "60"
     done = subprocess.run(
-        [sys.executable, str(script), "1", "--seed", "1", "--kinds", "solve", "--most", "30", "--limit", "1" if how == "hang" else "60"],
+        [sys.executable, str(script), "1", "--seed", "1", "--kinds", "solve", "--most", "30", "--limit", limit],
         capture_output=True, text=True, timeout=200, check=False,
     )  # fmt: skip
     assert done.returncode == 1, done.stdout + done.stderr
