@@ -21,8 +21,8 @@ __all__ = [
     "family_figure",
     "figures",
     "overall_figure",
+    "pass_figure",
     "profile_figure",
-    "walk_figure",
     "work_precision",
 ]
 
@@ -195,11 +195,11 @@ def budget_figure(records: Records, case: str) -> Figure:
     )  # fmt: skip
 
 
-def walk_figure(sequence: str, walks: list[tables.Walk]) -> Figure:
+def pass_figure(sequence: str, passes: list[tables.Pass]) -> Figure:
     """Each step of a sequence, carried and cold (thin): its residual at one budget, its time to one level."""
-    timed = walks[0].mode == "tol"
+    timed = passes[0].mode == "tol"
     curves = []
-    for w in walks:
+    for w in passes:
         for start, residuals in sorted(w.residuals.items()):
             values = w.times[start] if timed else residuals
             cold = start == "cold" and len(w.residuals) > 1
@@ -212,7 +212,7 @@ def walk_figure(sequence: str, walks: list[tables.Walk]) -> Figure:
                     thin=cold,
                 )
             )
-    asked = walks[0].asked
+    asked = passes[0].asked
     return Figure(
         f"sequence {sequence} {asked}", f"{sequence}: {asked}", "step",
         "time: set-up and solve [s]" if timed else "relative residual [-]", tuple(curves), x_log=False,
@@ -319,7 +319,7 @@ def _figures(records: Records) -> Figures:
         {c: _drawn(work_precision(part, c), budget_figure(part, c)) for c, part in parts.items()},
         {f: figure for f, figure in families.items() if figure.curves},
         {law: _drawn(*some) for law, some in profiles.items()},
-        {name: _walk_figures(name, walks) for name, walks in tables.by_sequence(records).items()},
+        {name: _pass_figures(name, passes) for name, passes in tables.by_sequence(records).items()},
         _drawn(overall_figure(records)),
     )
 
@@ -328,9 +328,9 @@ def _drawn(*some: Figure) -> tuple[Figure, ...]:
     return tuple(figure for figure in some if figure.curves)
 
 
-def _walk_figures(name: str, walks: list[tables.Walk]) -> tuple[Figure, ...]:
+def _pass_figures(name: str, passes: list[tables.Pass]) -> tuple[Figure, ...]:
     # The middle budget, and the solvers that have none.
-    budgets = sorted({w.max_iter for w in walks if w.mode == "budget"})
-    middle = [w for w in walks if w.mode == "budget" and w.max_iter == budgets[len(budgets) // 2]]
-    levels = [w for w in walks if w.mode == "tol"]
-    return tuple(walk_figure(name, some) for some in (middle, levels) if some)
+    budgets = sorted({w.max_iter for w in passes if w.mode == "budget"})
+    middle = [w for w in passes if w.mode == "budget" and w.max_iter == budgets[len(budgets) // 2]]
+    levels = [w for w in passes if w.mode == "tol"]
+    return tuple(pass_figure(name, some) for some in (middle, levels) if some)

@@ -234,8 +234,8 @@ def _race(
     draw = np.random.default_rng(0)
     single = np.array([score(values[:, :, k : k + 1]) for k in range(repeats)])  # (repetitions, lines)
     # Two standard errors of the difference of two scores; that of a quartile is 1.36 times a mean's.
-    spread = float(np.median(np.log(single).std(axis=0)))
-    noise = max(NOISE, math.exp(2.0 * math.sqrt(2.0) * 1.36 * spread / math.sqrt(repeats)))
+    deviation = float(np.median(np.log(single).std(axis=0)))
+    noise = max(NOISE, math.exp(2.0 * math.sqrt(2.0) * 1.36 * deviation / math.sqrt(repeats)))
     whole = score(values)
     wins, losses = np.zeros(n), [[] for _ in range(n)]  # type: ignore[var-annotated]
     lying = np.array([any(r.contradicted for r in f.runs.values()) for f in some])
