@@ -6,7 +6,7 @@ import hashlib
 import math
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 __all__ = [
@@ -249,7 +249,7 @@ _KINDS: dict[str, type] = {"run": Run, "case": CaseInfo, "skip": Skip, "done": D
 def to_json(entry: Entry) -> dict[str, Any]:
     """A dictionary that JSON can hold: inf and nan become words."""
     kind = next(name for name, cls in _KINDS.items() if isinstance(entry, cls))
-    return {"kind": kind, **{name: _plain(value) for name, value in asdict(entry).items()}}
+    return {"kind": kind, **{f.name: _plain(getattr(entry, f.name)) for f in fields(entry)}}
 
 
 def from_json(line: Any) -> Entry:

@@ -12,7 +12,7 @@ import json
 import os
 import time
 from collections.abc import Iterable, Iterator
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -110,7 +110,7 @@ class Records:
         out = []
         for r in self.records:
             run, info = self.runs.get(r.run), self.cases.get(r.case)
-            row = {k: v for k, v in asdict(r).items() if k != "sha"}
+            row = {f.name: getattr(r, f.name) for f in fields(r) if f.name != "sha"}
             row |= {
                 "success": self.success(r),
                 "nothing_to_do": bool(info and info.nothing_to_do),

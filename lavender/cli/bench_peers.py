@@ -76,7 +76,7 @@ def peers(
         steps: list[peer_engines.Step] = []
         for scene in filter(None, scenes.split(",")):
             note(scene)
-            steps += peer_engines.run(scene, sweeps)
+            steps += peer_engines.measure_scene(scene, sweeps)
         click.echo("\n".join(engines_table(steps)) + "\n")
         record["steps"] = peer_engines.as_records(steps)
     if solvers:

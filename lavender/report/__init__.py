@@ -14,10 +14,10 @@ from lavender.report.tables import (
     failures,
     families,
     geometric_means,
+    passes,
     profiles,
     reaches,
     spreads,
-    walks,
 )
 from lavender.report.write import write
 
@@ -30,9 +30,9 @@ __all__ = [
     "failures",
     "families",
     "geometric_means",
+    "passes",
     "profiles",
     "reaches",
     "spreads",
-    "walks",
     "write",
 ]

@@ -45,10 +45,10 @@ def subjects(records: Records, times: Sequence[float] = ()) -> list[Subject]:
     if cases:
         quick = tuple(tables.within(records, "all", cases, t) for t in times)
         found.append(Subject(cases, "call", tables.to_level(records, "all", cases, level), quick))
-    walks = tables.walks(records)
-    if walks:
-        (best,), by_time = tables.over_steps("all", walks, (level,), times)
-        found.append(Subject(tuple(dict.fromkeys(w.sequence for w in walks)), "steps", best, tuple(by_time)))
+    passes = tables.passes(records)
+    if passes:
+        (best,), by_time = tables.over_steps("all", passes, (level,), times)
+        found.append(Subject(tuple(dict.fromkeys(w.sequence for w in passes)), "steps", best, tuple(by_time)))
     return found
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 
 from lavender.bench.record import Record, level_name
@@ -21,8 +21,8 @@ __all__ = [
     "family_figure",
     "figures",
     "overall_figure",
+    "pass_figure",
     "profile_figure",
-    "walk_figure",
     "work_precision",
 ]
 
@@ -76,12 +76,8 @@ def _in_order_of_work(runs: list[Record]) -> list[Record]:
 def work_precision(records: Records, case: str) -> Figure:
     """Error against time: every run of a case, one curve for each solver and start, along its work."""
     curves = []
-    floors: list[tuple[float, float]] = []
     for (name, solver, start), group in sorted(tables.pairs(records).items()):
-        if name != case:
-            continue
-        runs = _in_order_of_work([r for r in group if r.usable])
-        floors += [(r.relative, r.floor) for r in runs if r.floor > 0.0]
+        runs = _in_order_of_work([r for r in group if r.usable]) if name == case else []
         if runs:
             curves.append(
                 Curve(
@@ -93,13 +89,20 @@ def work_precision(records: Records, case: str) -> Figure:
                     thin=start != "cold",
                 )
             )
-    floors.sort()
-    # The floor depends on the impulses: that of the best run is the one of the solution.
-    floor = floors[0][1] if floors else math.nan
     return Figure(
         "work-precision " + case, case, "time: set-up and solve [s]", "relative residual [-]", tuple(curves),
-        levels=tables.levels_of(records), floor=floor,
+        levels=tables.levels_of(records), floor=_floor(records, [case]),
     )  # fmt: skip
+
+
+def _floor(records: Records, cases: Iterable[str]) -> float:
+    """The largest floor of the cases; each depends on the impulses: that of the best run is the one of the solution."""
+    best: dict[str, tuple[float, float]] = {}
+    for (case, _, _), runs in tables.pairs(records).items():
+        floors = [(r.relative, r.floor) for r in runs if r.usable and r.floor > 0.0]
+        best[case] = min([*floors, best.get(case, (math.inf, math.nan))])
+    found = [best[case][1] for case in cases if case in best]
+    return max((floor for floor in found if math.isfinite(floor)), default=math.nan)
 
 
 GRID = 49  # times of a figure over all cases
@@ -168,14 +171,8 @@ def family_figure(records: Records, family: str, cases: list[str]) -> Figure:
             curves.append(Curve(solver, solver, tuple(x), tuple(y)))
     return Figure(
         "family " + family, f"{family} ({count(len(cases), 'case')})", "mean time [s], where all cases get there",
-        "relative residual [-]", tuple(curves), levels=tables.levels_of(records), floor=_family_floor(records, cases),
+        "relative residual [-]", tuple(curves), levels=tables.levels_of(records), floor=_floor(records, cases),
     )  # fmt: skip
-
-
-def _family_floor(records: Records, cases: list[str]) -> float:
-    floors = [work_precision(records, c).floor for c in cases]
-    floors = [f for f in floors if math.isfinite(f)]
-    return max(floors, default=math.nan)
 
 
 def budget_figure(records: Records, case: str) -> Figure:
@@ -194,15 +191,15 @@ def budget_figure(records: Records, case: str) -> Figure:
             )
     return Figure(
         "budget " + case, case, "iterations (sweeps)", "relative residual [-]", tuple(curves),
-        levels=tables.levels_of(records), floor=work_precision(records, case).floor,
+        levels=tables.levels_of(records), floor=_floor(records, [case]),
     )  # fmt: skip
 
 
-def walk_figure(sequence: str, walks: list[tables.Walk]) -> Figure:
+def pass_figure(sequence: str, passes: list[tables.Pass]) -> Figure:
     """Each step of a sequence, carried and cold (thin): its residual at one budget, its time to one level."""
-    timed = walks[0].mode == "tol"
+    timed = passes[0].mode == "tol"
     curves = []
-    for w in walks:
+    for w in passes:
         for start, residuals in sorted(w.residuals.items()):
             values = w.times[start] if timed else residuals
             cold = start == "cold" and len(w.residuals) > 1
@@ -215,7 +212,7 @@ def walk_figure(sequence: str, walks: list[tables.Walk]) -> Figure:
                     thin=cold,
                 )
             )
-    asked = walks[0].asked
+    asked = passes[0].asked
     return Figure(
         f"sequence {sequence} {asked}", f"{sequence}: {asked}", "step",
         "time: set-up and solve [s]" if timed else "relative residual [-]", tuple(curves), x_log=False,
@@ -309,17 +306,20 @@ def _by_motion(found: Figures) -> Figures:
 
 
 def _figures(records: Records) -> Figures:
-    cases = dict.fromkeys(r.case for r in records if r.step < 0)
+    parts: dict[str, Records] = {}  # of each case: what the figures of all cases look through
+    for r in records:
+        if r.step < 0:
+            parts.setdefault(r.case, Records(records.runs)).add(r)
     families = {f: family_figure(records, f, cs) for f, cs in tables.families(records).items() if len(cs) > 1}
     profiles: dict[str, list[Figure]] = {}
     for profile in tables.profiles(records):
         if profile.cases > 1:
             profiles.setdefault(profile.law, []).append(profile_figure(profile))
     return Figures(
-        {c: _drawn(work_precision(records, c), budget_figure(records, c)) for c in cases},
+        {c: _drawn(work_precision(part, c), budget_figure(part, c)) for c, part in parts.items()},
         {f: figure for f, figure in families.items() if figure.curves},
         {law: _drawn(*some) for law, some in profiles.items()},
-        {name: _walk_figures(name, walks) for name, walks in tables.by_sequence(records).items()},
+        {name: _pass_figures(name, passes) for name, passes in tables.by_sequence(records).items()},
         _drawn(overall_figure(records)),
     )
 
@@ -328,9 +328,9 @@ def _drawn(*some: Figure) -> tuple[Figure, ...]:
     return tuple(figure for figure in some if figure.curves)
 
 
-def _walk_figures(name: str, walks: list[tables.Walk]) -> tuple[Figure, ...]:
+def _pass_figures(name: str, passes: list[tables.Pass]) -> tuple[Figure, ...]:
     # The middle budget, and the solvers that have none.
-    budgets = sorted({w.max_iter for w in walks if w.mode == "budget"})
-    middle = [w for w in walks if w.mode == "budget" and w.max_iter == budgets[len(budgets) // 2]]
-    levels = [w for w in walks if w.mode == "tol"]
-    return tuple(walk_figure(name, some) for some in (middle, levels) if some)
+    budgets = sorted({w.max_iter for w in passes if w.mode == "budget"})
+    middle = [w for w in passes if w.mode == "budget" and w.max_iter == budgets[len(budgets) // 2]]
+    levels = [w for w in passes if w.mode == "tol"]
+    return tuple(pass_figure(name, some) for some in (middle, levels) if some)

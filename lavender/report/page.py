@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
@@ -33,6 +34,24 @@ __all__ = ["page"]
 
 MOST = 500  # failures on a page, for its weight: 200 problems are to fit into 3 MB
 MOST_SPREADS = 100  # widest spreads of sweep orders on a page
+
+
+@functools.cache
+def _environment() -> Any:
+    """The templates, compiled once."""
+    import jinja2
+
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("lavender.report"),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters.update(
+        seconds=seconds, residual=residual, level=level_name, anchor=file_name, times=times, speed=speed_name
+    )
+    return environment
 
 
 def page(
@@ -67,18 +86,7 @@ def page(
     engines : sequence of Contestant
         Answers of the engines that recorded the steps.
     """
-    import jinja2
-
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("lavender.report"),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    environment.filters.update(
-        seconds=seconds, residual=residual, level=level_name, anchor=file_name, times=times, speed=speed_name
-    )
+    environment = _environment()
     content = _content(records, figures, old, tuple(budgets), tuple(sweeps), peers)
     return environment.get_template("index.html.j2").render(
         title=title,

@@ -136,14 +136,14 @@ def _show_advice(console: Console, table: Any) -> None:
             console.print(line, highlight=False, markup=False)
 
 
-def walk_table(records: Records) -> Any:
+def pass_table(records: Records) -> Any:
     """Sequences: residual and time, carried against cold."""
     table = _table()
     for name in ("sequence", "solver", "asked", "steps", "residual carried", "cold", "time carried", "cold"):
         table.add_column(
             name, no_wrap=True, justify="left" if name in ("sequence", "solver", "asked") else "right"
         )
-    for w in tables.walks(records):
+    for w in tables.passes(records):
         cells = [residual(w.middle(s)) if s in w.residuals else "–" for s in ("carried", "cold")]
         cells += [seconds(w.time[s]) if s in w.time else "–" for s in ("carried", "cold")]
         table.add_row(w.sequence, w.solver, w.asked, str(w.steps), *cells)
@@ -323,7 +323,7 @@ def _print_suspicions(records: Records, console: Console) -> None:
 
 
 def _print_tables(records: Records, console: Console, levels: Sequence[float], whole: bool) -> None:
-    lines = len(tables.reaches(records, levels)) + len(tables.walks(records))
+    lines = len(tables.reaches(records, levels)) + len(tables.passes(records))
     if not whole and lines > FEW:
         console.print(
             f"{count(lines, 'line')} of single cases and sequences: --tables prints them",
@@ -339,4 +339,4 @@ def _print_tables(records: Records, console: Console, levels: Sequence[float], w
         console.print(
             "\n[bold]Sequences[/] (median residual, time of all steps; carried from step to step, or cold)"
         )
-        _show(console, walk_table(records))
+        _show(console, pass_table(records))

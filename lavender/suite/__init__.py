@@ -16,7 +16,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from lavender.errors import UnknownName
-from lavender.suite import hard
+from lavender.suite import friction, hard
 from lavender.suite.case import FAMILIES, Case, Reference, parse, spell
 from lavender.suite.families import (
     box_stack,
@@ -48,6 +48,7 @@ __all__ = [
     "families",
     "foreign",
     "foreign_new",
+    "friction",
     "granular",
     "hang",
     "hard",

@@ -599,8 +599,8 @@ def test_steps_of_two_sequences_are_never_one(tmp_path):
     path, plan = tmp_path / "records.jsonl", bench.Plan(levels=(), budgets=(6,), repeats=1)
     bench.run(bench.sequence(moving_stack(5), "load"), ["pgs"], plan, path)
     bench.run(bench.sequence(moving_stack(2, n=11), "load"), ["pgs"], plan, path)
-    (walk,) = lv.report.tables.walks(bench.read(path).latest())
-    assert (walk.steps, len(walk.times["cold"])) == (2, 2)
+    (one,) = lv.report.tables.passes(bench.read(path).latest())
+    assert (one.steps, len(one.times["cold"])) == (2, 2)
 
 
 @pytest.mark.parametrize("names", [("s_1", "s_2", "s_02"), ("a_1", "a_2", "b_1", "b_2")])

@@ -176,7 +176,7 @@ def test_siconos_solves_the_same_problems():
 
 
 def test_engines_step_the_same_scene():
-    steps = engines.run("stack6", settle=200, rounds=1)
+    steps = engines.measure_scene("stack6", settle=200, rounds=1)
     names = [s.engine for s in steps]
     assert names[:2] == ["lavender, 16 sweeps", "lavender newton"]
     for s in steps:
@@ -205,14 +205,14 @@ def test_mujoco_carries_the_same_weight():
 
 def test_unknown_scenes_and_engines_are_named():
     with pytest.raises(lv.UnknownName, match="stack6"):
-        engines.run("stack")
+        engines.measure_scene("stack")
     with pytest.raises(lv.UnknownName, match="mujoco"):
-        engines.run("stack6", engines=["mujoko"])
+        engines.measure_scene("stack6", engines=["mujoko"])
 
 
 def test_an_engine_that_does_not_settle_is_left_out_and_said(monkeypatch):
     monkeypatch.setattr(engines, "SETTLE_LIMIT", 0.0)
-    steps = engines.run("stack6", engines=["lavender"], rounds=1)
+    steps = engines.measure_scene("stack6", engines=["lavender"], rounds=1)
     assert all("did not settle" in s.note and math.isnan(s.time) for s in steps)
     assert "did not settle" in comparison.engines_table(steps)[2]
 

@@ -166,7 +166,7 @@ def claims(spec, problem, solution):
         and lv.get(name).resumable
     ):
         yield "overrun", f"{name}: {solution.iterations} iterations where {budget} were asked for"
-    if solution.contradicted:
+    if solution.contradicted and not lv.get(name).external:
         yield "contradicted", f"{name}: {solution.contradicted}"
     finite = bool(np.isfinite(solution.impulse).all())
     if not finite and status not in ("DIVERGED", "NUMERICAL_ERROR"):
@@ -395,12 +395,12 @@ CHECKS = {
     "door": check_door,
     "promise": check_promise,
 }
-MAKE = {
-    "solve": problems.solve_spec,
-    "file": files.file_spec,
-    "steps": scenes.scene_spec,
-    "snapshot": scenes.snapshot_spec,
-    "folder": folders.folder_spec,
-    "door": doors.door_spec,
-    "promise": promises.promise_spec,
+INPUTS = {
+    "solve": problems.solve_specs(),
+    "file": files.file_specs(),
+    "steps": scenes.scene_specs(),
+    "snapshot": scenes.snapshot_specs(),
+    "folder": folders.folder_specs(),
+    "door": doors.door_specs(),
+    "promise": promises.promise_specs(),
 }

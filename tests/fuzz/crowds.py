@@ -3,24 +3,18 @@
 from itertools import chain
 
 import numpy as np
+from scipy.linalg import block_diag
 
 
-def joined(draw, specs):
-    """One problem of several with the same operator and friction, blocks in any order (joints of bodies stay first)."""
+def joined(specs, rng=None):
+    """One problem of several alike; `rng` mixes their blocks, of which joints of bodies stay first."""
     join = {"rows": rows, "general": general}.get(specs[0]["operator"], matrices)
     spec = join(specs)
     blocks = np.arange(len(spec["cones"]["kind"]))
     joints = len(spec["rows"]["joint_ptr"]) - 1 if spec["operator"] == "rows" else 0
-    if draw.chance(0.7):
-        blocks = np.concatenate([shuffled(draw, blocks[:joints]), shuffled(draw, blocks[joints:])]).astype(
-            int
-        )
+    if rng is not None:
+        blocks = np.concatenate([rng.permutation(blocks[:joints]), rng.permutation(blocks[joints:])])
     return reordered(spec, blocks, joints)
-
-
-def shuffled(draw, x):
-    """By numbers that are drawn."""
-    return x[np.argsort(draw.normals(len(x)), kind="stable")]
 
 
 def one_list(lists):
@@ -52,25 +46,15 @@ def common(specs):
 
 def matrices(specs):
     """A block diagonal."""
-    return common(specs) | {
-        "A": diagonal([np.array(s["A"], float).reshape((len(s["b"]),) * 2) for s in specs])
-    }
+    a = [np.array(s["A"], float).reshape((len(s["b"]),) * 2) for s in specs]
+    return common(specs) | {"A": block_diag(*a).tolist()}
 
 
 def general(specs):
     """J and M block diagonal."""
     j = [np.array(s["J"], float).reshape(-1, len(s["v_free"])) for s in specs]
-    return common(specs) | {"J": diagonal(j), "M": diagonal([np.array(s["M"], float) for s in specs])}
-
-
-def diagonal(blocks):
-    """Of blocks that may be empty."""
-    out = np.zeros(np.sum([b.shape for b in blocks], axis=0))
-    i = j = 0
-    for b in blocks:
-        out[i : i + b.shape[0], j : j + b.shape[1]] = b
-        i, j = i + b.shape[0], j + b.shape[1]
-    return out.tolist()
+    mass = [np.array(s["M"], float) for s in specs]
+    return common(specs) | {"J": block_diag(*j).tolist(), "M": block_diag(*mass).tolist()}
 
 
 def rows(specs):

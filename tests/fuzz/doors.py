@@ -1,21 +1,19 @@
-"""Doors: arrays of callers, another engine's memory, paths that are no files, plug-ins that lie, numbers at the end of
-float64 and words of the command line; as plain data."""
+"""Doors: arrays of callers, another engine's memory, plug-ins that lie, numbers at the end of float64 and words of the
+command line; as plain data."""
 
 import functools
 import os
 import tempfile
-from fractions import Fraction
-from pathlib import Path
 
 import folders
+import hypothesis.strategies as st
 import numpy as np
 import problems
 
 import lavender as lv
 from lavender import io, registry
-from lavender.io.stored import write_bytes
 
-WHAT = ("arrays", "memory", "path", "plug-in", "plug-in", "far", "far", "rank", "command")
+WHAT = ("arrays", "memory", "plug-in", "plug-in", "far", "far", "command")
 INDICES = ("efc_id", "efc_type", "efc_J_colind", "efc_J_rowadr", "efc_J_rownnz", "dim", "geom", "M_colind", "M_rowadr",
            "M_rownnz")  # fmt: skip
 NUMBERS = ("efc_J", "efc_R", "efc_D", "efc_aref", "efc_force", "efc_frictionloss", "efc_vel", "efc_b", "qacc",
@@ -28,7 +26,6 @@ CLAIMED = ("status", "iterations", "work", "message", "form", "certificate", "du
 WILD = (
     None, "CONVERGED", -1, 1.5, 10**30, True, [], {}, {"sweeps": None}, {"sweeps": 1e400}, [1.0, 2.0], "a", [[1], 2],
 )  # fmt: skip
-TARGETS = ("pipe", "folder", "link", "dangling", "loop", "file", "new", "below a file", "long")
 WORDS = (
     ("report", "two_particles", "--campaign", "--workers", "{}"), ("report", "wild", "--campaign", "--seeds", "0:{}"),
     ("bench", "auto", "--seeds", "{}:0"), ("solve", "random_spd(n={})"), ("solve", "two_particles", "--tol", "{}"),
@@ -53,38 +50,44 @@ TOLD = ("kinetic", "energy", "speed", "spin", "rows", "bound", "bound_speed", "b
         "spread_speed")  # fmt: skip
 
 
-def door_spec(draw):
+def door_specs():
     """What is done at which door."""
-    spec = {"kind": "door", "what": draw.pick(WHAT), "seed": draw.whole(0, 10**6)}
-    if spec["what"] == "memory":
-        spec["model"] = draw.whole(0, 11)
-        spec["edits"] = [memory_edit(draw) for _ in range(draw.pick((1, 1, 2, 3)))]
-    elif spec["what"] == "path":
-        spec["target"] = draw.pick(TARGETS)
-    elif spec["what"] == "plug-in":
-        spec |= {"lie": draw.pick(LIES), "field": draw.pick(CLAIMED), "value": draw.whole(0, len(WILD) - 1)}
-        spec["resumable"] = draw.chance(0.5)
-    elif spec["what"] == "far":
-        spec |= {"problem": problems.one_spec(draw, 8), "exponent": draw.whole(-1070, 1020)}
-    elif spec["what"] == "rank":
-        spec |= {"form": draw.pick(("masses", "rows", "matrix")), "spread": 2 * draw.whole(0, 60)}
-    elif spec["what"] == "command":
-        spec["words"] = [word.format(draw.pick(ASKED)) for word in draw.pick(WORDS)]
-    return spec
+    pick = st.sampled_from
+    edits = st.one_of(
+        memory_edits(INDICES, WHOLE), memory_edits(NUMBERS, REAL), memory_edits(OPTIONS, WHOLE + REAL)
+    )
+    lie = {
+        "lie": pick(LIES),
+        "field": pick(CLAIMED),
+        "value": pick(range(len(WILD))),
+        "resumable": st.booleans(),
+    }
+    words = st.tuples(pick(WORDS), pick(ASKED)).map(lambda x: [word.format(x[1]) for word in x[0]])
+    fields = {
+        "arrays": {},
+        "memory": {"model": st.integers(0, 11), "edits": st.lists(edits, min_size=1, max_size=3)},
+        "plug-in": lie,
+        "far": {"problem": problems.parts(8), "exponent": st.integers(-1070, 1020)},
+        "rank": {
+            "form": pick(("masses", "rows", "matrix")),
+            "spread": st.integers(0, 60).map(lambda x: 2 * x),
+        },
+        "command": {"words": words},
+    }
+    common = {"kind": st.just("door"), "seed": st.integers(0, 10**6)}
+    return st.one_of(*(st.fixed_dictionaries({"what": st.just(w), **common, **fields[w]}) for w in WHAT))
 
 
-def memory_edit(draw):
+def memory_edits(names, values):
     """Name, places (shares of the length) and value of a change."""
-    kind = draw.pick((INDICES, INDICES, INDICES, NUMBERS, OPTIONS))
-    values = WHOLE if kind is INDICES else REAL if kind is NUMBERS else (*WHOLE, *REAL)
-    return [draw.pick(kind), [draw.whole(0, 999) for _ in range(draw.pick((1, 1, 2, 20)))], draw.pick(values)]
+    places = st.lists(st.integers(0, 999), min_size=1, max_size=20)
+    return st.tuples(st.sampled_from(names), places, st.sampled_from(values))
 
 
 def check(spec):
     """What was broken."""
     yield from {
-        "arrays": arrays, "memory": memory, "path": path, "plug-in": plug_in, "far": far, "rank": rank,
-        "command": command,
+        "arrays": arrays, "memory": memory, "plug-in": plug_in, "far": far, "command": command,
     }[spec["what"]](spec)  # fmt: skip
 
 
@@ -208,47 +211,6 @@ def change(made, data, name, places, value):
         return
 
 
-# -- paths --------------------------------------------------------------------------------------------------------
-
-
-def path(spec):
-    """A file is written behind its links or not at all; what is no file stays."""
-    if not hasattr(os, "mkfifo"):
-        return
-    with tempfile.TemporaryDirectory() as root:
-        target, real = Path(root, "a"), Path(root, "real")
-        kind = spec["target"]
-        if kind == "pipe":
-            os.mkfifo(target)
-        elif kind == "folder":
-            target.mkdir()
-        elif kind in ("link", "dangling", "loop"):
-            target.symlink_to({"link": real, "dangling": real, "loop": target}[kind])
-            if kind == "link":
-                real.write_bytes(b"old")
-        elif kind == "file":
-            target.write_bytes(b"old")
-        elif kind == "below a file":
-            target.write_bytes(b"old")
-            target = target / "b"
-        elif kind == "long":
-            target = Path(root, "x" * 300)
-        before = os.lstat(target) if os.path.lexists(target) else None
-        written = True
-        try:
-            write_bytes(target, b"new")
-        except lv.InputError:
-            written = False
-        if written != (kind in ("link", "dangling", "file", "new")):
-            yield "false claim", f"{kind}: written {written}"
-        if written and target.read_bytes() != b"new":
-            yield "wrong number", f"{kind}: what was written is not there"
-        if before is not None and kind != "file" and os.lstat(target).st_ino != before.st_ino:
-            yield "changed target", f"{kind} is another thing now"
-        if any(name.endswith(".part") for name in os.listdir(root)):
-            yield "changed folder", "a part was left"
-
-
 # -- plug-ins -----------------------------------------------------------------------------------------------------
 
 
@@ -351,46 +313,6 @@ def far(spec):
         found = lv.redundancy(problem)
         if not 0 <= found.rank == problem.m - len(found.rows):
             yield "wrong number", f"rank {found.rank}"
-
-
-def rank(spec):
-    """The rank of small whole numbers, whatever the sizes of rows and masses."""
-    rng = np.random.default_rng(spec["seed"])
-    m, n = (int(x) for x in rng.integers(1, 7, 2))
-    jac = rng.integers(-2, 3, (m, n)).astype(float)
-    if m > 2 and rng.random() < 0.5:
-        jac[-1] = jac[0] - jac[1]
-    jac = jac[jac.any(axis=1)]
-    m = len(jac)
-    if m == 0:
-        return
-    truth = exact_rank(jac)
-    size = 2.0 ** (spec["spread"] * rng.integers(0, 2, n if spec["form"] == "masses" else m))
-    if spec["form"] == "matrix":
-        jac = 2.0 ** (np.log2(size)[:, None] // 2) * jac
-        problem = lv.Problem.linear(jac @ jac.T, np.zeros(m))
-    else:
-        mass = np.diag(size) if spec["form"] == "masses" else np.eye(n)
-        jac = jac if spec["form"] == "masses" else size[:, None] * jac
-        problem = lv.Problem.from_jacobian(jac, mass, np.zeros(n), cones=lv.Cones.free(m))
-    found = lv.redundancy(problem)
-    if found.rank != truth:
-        yield "wrong number", f"rank {found.rank} of {truth}"
-
-
-def exact_rank(matrix):
-    """Rank in rational numbers."""
-    rows, found = [[Fraction(float(x)) for x in row] for row in matrix], 0
-    for column in range(len(rows[0])):
-        pivot = next((i for i in range(found, len(rows)) if rows[i][column]), None)
-        if pivot is None:
-            continue
-        rows[found], rows[pivot] = rows[pivot], rows[found]
-        for i in range(found + 1, len(rows)):
-            share = rows[i][column] / rows[found][column]
-            rows[i] = [x - share * y for x, y in zip(rows[i], rows[found], strict=True)]
-        found += 1
-    return found
 
 
 # -- the command line ----------------------------------------------------------------------------------------------

@@ -2,14 +2,14 @@
 
 import base64
 import contextlib
-import functools
 import io
-import json
 import os
 import tempfile
 from pathlib import Path
 
+import hypothesis.strategies as st
 import numpy as np
+from strategies import chance
 
 import lavender as lv
 import lavender.cli
@@ -23,7 +23,7 @@ NAMES = (
     "01.npz",
     "step-1.npz", "step-٣.npz", "😀.npz",
 )  # fmt: skip
-RAW_NAMES = (b"\xff\xfe.npz", b"a\x80.npz")
+RAW_NAMES = tuple(base64.b64encode(name).decode() for name in (b"\xff\xfe.npz", b"a\x80.npz"))
 INSIDE = (
     "names",
     "name",
@@ -36,73 +36,26 @@ INSIDE = (
     "good",
     "good",
 )
-WILD = (
-    None,
-    True,
-    False,
-    -1,
-    0,
-    1e400,
-    float("nan"),
-    10**400,
-    "",
-    "<b>",
-    "[/x]",
-    "\ud800",
-    "\x00",
-    [],
-    [[]],
-    {},
-    {"a": 1},
-    "a" * 1000,
-)
 
 
-def folder_spec(draw):
-    """Files by name, or records; and the command."""
-    if draw.chance(0.6):
-        return records_spec(draw)
-    entries = []
-    for _ in range(draw.whole(1, 4)):
-        name = draw.pick(NAMES) if draw.chance(0.9) else None
-        raw = None if name is not None else base64.b64encode(draw.pick(RAW_NAMES)).decode()
-        entries.append({"name": name, "raw": raw, "inside": draw.pick(INSIDE)})
-    if draw.chance(0.1):
-        entries.append({"name": "loop", "raw": None, "inside": "link"})
-    if draw.chance(0.1):
-        entries.append({"name": "pipe.npz", "raw": None, "inside": "pipe"})
-    command = draw.pick(("report", "report", "report", "bench", "check", "files"))
-    return {
-        "kind": "folder",
-        "entries": entries,
-        "command": command,
-        "figures": draw.chance(0.1),
-        "twice": draw.chance(0.3),
-    }
+def folder_specs():
+    """Files by name, and the command."""
 
+    def entry(names, raws, inside):
+        fields = {"name": names, "raw": raws, "inside": inside}
+        return st.fixed_dictionaries({key: st.sampled_from(values) for key, values in fields.items()})
 
-def records_spec(draw):
-    """A records.jsonl with some of its lines, fields or bytes changed."""
-    lines = [json.loads(line) for line in good_records()]
-    edits = []
-    for _ in range(draw.pick((1, 1, 2, 4))):
-        at = draw.whole(0, len(lines) - 1)
-        how = draw.pick(("field", "field", "field", "field", "gone", "line", "again", "cut", "bytes"))
-        keys = sorted(lines[at])
-        edit = [how, at, draw.pick(keys), draw.whole(0, len(WILD) - 1)]
-        edits.append(edit)
-    return {"kind": "folder", "records": edits, "show": draw.chance(0.3)}
-
-
-@functools.cache
-def good_records():
-    """Lines of a small run."""
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder, "records.jsonl")
-        quiet(["bench", "two_particles", "slider(mu=1)", "--solvers", "pgs,nncg", "--levels", "1e-3",
-               "--budgets", "4", "--repeats", "1",
-               "--out", str(path)])  # fmt: skip
-        return tuple(path.read_text(encoding="utf-8").splitlines())
+    good, raw = entry(NAMES, (None,), INSIDE), entry((None,), RAW_NAMES, INSIDE)
+    odd = entry(("loop",), (None,), ("link",)) | entry(("pipe.npz",), (None,), ("pipe",))
+    return st.fixed_dictionaries(
+        {
+            "kind": st.just("folder"),
+            "entries": st.lists(st.one_of(*[good] * 8, raw, odd), min_size=1, max_size=5),
+            "command": st.sampled_from(("report", "report", "report", "bench", "check", "files")),
+            "figures": chance(0.1),
+            "twice": chance(0.3),
+        }
+    )
 
 
 def quiet(arguments):
@@ -164,9 +117,6 @@ def lay_out(spec, folder):
 def check(spec):
     """What was broken."""
     with tempfile.TemporaryDirectory() as root:
-        if "records" in spec:
-            yield from check_records(spec, Path(root))
-            return
         folder, out = Path(root, "problems"), Path(root, "out")
         folder.mkdir()
         lay_out(spec, folder)
@@ -212,31 +162,3 @@ def told(code, text, command):
         yield "raw traceback", f"{command}: {text[-300:]}"
     if code == 2 and not text.strip():
         yield "raw exit", f"{command}: status 2 without a word"
-
-
-def check_records(spec, root):
-    path = root / "records.jsonl"
-    lines = [json.loads(line) for line in good_records()]
-    texts = []
-    for how, at, key, value in spec["records"]:
-        if how == "field":
-            lines[at % len(lines)][key] = WILD[value]
-        elif how == "gone":
-            lines[at % len(lines)].pop(key, None)
-        elif how == "again":
-            lines.append(dict(lines[at % len(lines)]))
-        elif how == "line":
-            lines[at % len(lines)] = {"": WILD[value]}
-    texts = [json.dumps(line, ensure_ascii=value != 1).encode(errors="surrogatepass") for line in lines]
-    for how, at, _, value in spec["records"]:
-        if how == "cut":
-            texts[at % len(texts)] = texts[at % len(texts)][: 3 * value]
-        elif how == "bytes":
-            texts[at % len(texts)] = bytes([255, 0, value]) + texts[at % len(texts)]
-    path.write_bytes(b"\n".join(texts) + b"\n")
-    records = lv.bench.read(path)
-    records.latest()
-    records.rows()
-    if spec["show"]:
-        code, text = quiet(["report", str(path), "--no-figures", "--out", str(root / "out")])
-        yield from told(code, text, "report records.jsonl")

@@ -1,96 +1,152 @@
-"""Draw inputs from seeds, check each in a process of its own that is watched, count, keep what fails.
+"""Hostile inputs for MINUTES: what tests/fuzz/test_fuzz.py draws for some seconds, each kind in a watched process.
 
-    python tests/fuzz/fuzz.py MINUTES [--seed N] [--kinds solve,file,...] [--limit SECONDS] [--count KIND=N ...]
+    python tests/fuzz/fuzz.py MINUTES [--seed N] [--kinds solve,file,...] [--limit SECONDS] [--most N] [--guided]
     python tests/fuzz/fuzz.py --replay [FILE ...]
-    python tests/fuzz/fuzz.py --again SEED KIND NUMBER
 
-A worker writes the number of each input and the time into shared memory before it starts on it. The parent looks
-there: a worker that stays on one input beyond the limit is a hang, one that ends by a signal a crash, and a new one
-goes on behind that input. Failing inputs become files in tests/fuzz/found/, one for each place that fails; --replay
-runs those that are there. The exit status is 1 where anything failed.
+Hypothesis draws the inputs and makes one that fails smaller. A worker writes each into a file before it starts on
+it, and gives itself `limit` seconds of processor time: one that it does not end is a hang, one on which it ends by
+another signal a crash, and the next worker goes on with another seed. For each place that fails, its smallest input
+becomes a file in tests/fuzz/found/; --replay runs those that are there. --guided lets libFuzzer look for inputs that
+reach new lines (needs the package atheris, which no extra installs: there is one for Linux alone). The exit status
+is 1 where anything failed.
 """
 
 import argparse
 import faulthandler
 import hashlib
 import json
-import mmap
 import os
+import random
 import re
 import resource
 import signal
-import struct
 import subprocess
 import sys
 import tempfile
 import time
+from collections import Counter
+from contextlib import nullcontext, suppress
 from pathlib import Path
+
+import hypothesis
 
 HERE = Path(__file__).resolve().parent
 FOUND = Path(os.environ.get("LAVENDER_FUZZ_FOUND", HERE / "found"))
-KINDS = ("solve", "file", "steps", "snapshot", "folder", "door", "promise")
 # of the time
 SHARE = {"solve": 0.3, "file": 0.1, "steps": 0.2, "snapshot": 0.1, "folder": 0.1, "door": 0.1, "promise": 0.1}
-LIMIT = 20.0  # s of processor time on one input
+LIMIT = 20  # s of processor time on one input
 ROOM = 3 * 2**30  # bytes of memory of a worker, beyond what it starts with
-FIELDS = struct.Struct("<qqd")  # input, inputs done, processor time at its start
-
-
-def make(kind, seed, number):
-    """The input of a number."""
-    sys.path.insert(0, str(HERE))
-    import checks
-    from draw import Seeded
-
-    return checks.MAKE[kind](Seeded(seed, KINDS.index(kind), number))
+CHUNK = 200  # inputs, after which Hypothesis starts again with another seed
+FAULTS = ("crash", "hang", "raw", "false claim", "wrong number", "overrun", "changed", "warning")
+#: What --guided is to cover; the rest of the package runs at full speed.
+COVERED = {
+    "file": ["lavender.io", "lavender.problem", "lavender.cones", "lavender.rows", "lavender.generalized"],
+    "snapshot": ["lavender.engine"],
+    "steps": ["lavender.engine", "lavender.scene"],
+    "solve": ["lavender.solve", "lavender.solvers", "lavender.problem", "lavender.residuals"],
+}
 
 
 # -- the worker ------------------------------------------------------------------------------------------------
 
 
-def work(kind, seed, first, until, shared):
-    """Check inputs from `first` on, until a time or a number; findings and counts go to stdout, a line each."""
+class Worker:
+    """Checks inputs of one kind and leaves what it knows in a folder: the input, its counts, its findings."""
+
+    def __init__(self, kind, folder, limit):
+        self.kind, self.folder, self.limit = kind, Path(folder), limit
+        self.inputs, self.known, self.told = 0, set(), 0.0
+
+    def check(self, spec):
+        """One input; a place that is not known yet fails, so that Hypothesis makes its input smaller."""
+        write(self.folder / "input.json", spec)
+        used = time.process_time()
+        resource.setrlimit(resource.RLIMIT_CPU, (int(used + self.limit) + 1, resource.RLIM_INFINITY))
+        found = [{"finding": what, "detail": detail, "spec": spec} for what, detail in checks.run(spec)]
+        self.inputs += 1
+        for finding in found:
+            keep(finding)
+            with (self.folder / "findings").open("a") as file:
+                file.write(json.dumps({**finding, "spec": None, "name": signature(finding)}) + "\n")
+        if found or time.monotonic() - self.told > 0.2:
+            self.tell()
+        assert not {signature(finding) for finding in found} - self.known
+
+    def tell(self):
+        """What was done so far; a worker may end without a last word."""
+        self.told = time.monotonic()
+        write(self.folder / "counts.json", {"inputs": self.inputs, "checks": checks.COUNTS})
+
+    def property(self, seed, most):
+        """What Hypothesis draws and checks."""
+        settings = hypothesis.settings(
+            max_examples=most,
+            deadline=None,
+            database=None,
+            phases=[hypothesis.Phase.generate, hypothesis.Phase.shrink],
+            suppress_health_check=list(hypothesis.HealthCheck),
+        )
+        return hypothesis.seed(seed)(settings(hypothesis.given(spec=checks.INPUTS[self.kind])(self.check)))
+
+    def draw(self, seed, until, most):
+        """Until a time, or a number of inputs."""
+        while time.time() < until and self.inputs < most:
+            try:
+                self.property(seed, min(CHUNK, most - self.inputs))()
+            except AssertionError:
+                findings = (self.folder / "findings").read_text().splitlines()
+                self.known |= {json.loads(line)["name"] for line in findings}
+            seed += 1
+        self.tell()
+
+    def draw_guided(self, seed, until, most):
+        """The same, with the choices of Hypothesis made by libFuzzer."""
+        import atheris
+
+        corpus = self.folder / "corpus"
+        corpus.mkdir()
+        rng = random.Random(seed)
+        for i in range(64):  # choices to begin with
+            (corpus / str(i)).write_bytes(rng.randbytes(rng.randint(16, 4000)))
+        check = self.property(seed, 1).hypothesis.fuzz_one_input
+
+        def one(data):
+            with suppress(AssertionError):  # kept already
+                check(data)
+
+        atheris.Setup(
+            [sys.argv[0], f"-max_total_time={max(1, int(until - time.time()))}", f"-runs={most}", f"-seed={seed}",
+             f"-artifact_prefix={self.folder}/ended-", "-max_len=8000", "-rss_limit_mb=6000", str(corpus)],
+            one,
+        )  # fmt: skip
+        atheris.Fuzz()
+
+
+def work(kind, folder, seed, until, most, limit, guided):
+    """What a process of its own does."""
+    global checks
+    covered = nullcontext()
+    if guided:
+        import atheris
+
+        covered = atheris.instrument_imports(include=COVERED[kind])
+    sys.path[:0] = [str(HERE), str(HERE.parent.parent)]
+    with covered:
+        import checks
     faulthandler.enable()
-    faulthandler.register(signal.SIGUSR1, all_threads=True)
-    sys.path.insert(0, str(HERE))
-    sys.path.insert(0, str(HERE.parent.parent))
-    import checks
-
-    make(kind, seed, 0)  # imports, and the files that others are made of
-    if "libasan" not in os.environ.get("LD_PRELOAD", "") and kind != "folder":
-        with open("/proc/self/statm") as file:
-            used = int(file.read().split()[0]) * resource.getpagesize()
+    faulthandler.register(signal.SIGXCPU, all_threads=True, chain=True)
+    if "libasan" not in os.environ.get("LD_PRELOAD", "") and kind != "folder":  # which starts processes
+        used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
         resource.setrlimit(resource.RLIMIT_AS, (used + ROOM,) * 2)
-    number, last = first, time.monotonic()
-    with open(shared, "r+b") as file:
-        view = mmap.mmap(file.fileno(), FIELDS.size)
-        parent = os.getppid()
-        while time.time() < until["time"] and number < until["number"] and os.getppid() == parent:
-            # At once: pack_into clears the buffer first, and zeros read as an input that has lasted since the start.
-            view[:] = FIELDS.pack(number, number - first, time.process_time())
-            spec = make(kind, seed, number)
-            for what, detail in checks.run(spec):
-                say(
-                    {
-                        "finding": what,
-                        "detail": detail,
-                        "kind": kind,
-                        "seed": seed,
-                        "number": number,
-                        "spec": spec,
-                    }
-                )
-            number += 1
-            if time.monotonic() - last > 1.0:
-                say({"counts": checks.COUNTS})
-                last = time.monotonic()
-        view[:] = FIELDS.pack(number, number - first, -1.0)
-    say({"counts": checks.COUNTS})
+    worker = Worker(kind, folder, limit)
+    (worker.draw_guided if guided else worker.draw)(seed, until, most)
 
 
-def say(message):
-    sys.stdout.write(json.dumps(message) + "\n")
-    sys.stdout.flush()
+def write(path, data):
+    """At once, so that a reader finds the old or the new."""
+    part = path.with_suffix(".part")
+    part.write_text(json.dumps(data), encoding="utf-8")
+    os.replace(part, path)
 
 
 # -- the parent ------------------------------------------------------------------------------------------------
@@ -99,137 +155,80 @@ def say(message):
 class Campaign:
     """Counts and findings of all workers."""
 
-    def __init__(self, keep):
-        self.counts, self.inputs, self.findings, self.keep = {}, {}, {}, keep
+    def __init__(self):
+        self.inputs, self.checks, self.findings = Counter(), Counter(), {}
 
-    def add(self, finding):
-        name = signature(finding)
-        known = self.findings.setdefault(name, {**finding, "times": 0})
+    def add(self, kind, finding):
+        """Count it, and tell it once."""
+        known = self.findings.setdefault(finding["name"], {**finding, "times": 0})
         known["times"] += 1
         if known["times"] == 1:
-            print(
-                f"FOUND {finding['finding']}: {finding['detail']}  "
-                f"[{finding['kind']} {finding['seed']} {finding['number']}]",
-                flush=True,
-            )
-            if self.keep:
-                FOUND.mkdir(exist_ok=True)
-                text = {key: finding[key] for key in ("finding", "detail", "spec")}
-                (FOUND / f"{name}.json").write_text(json.dumps(text) + "\n", encoding="utf-8")
+            print(f"FOUND {finding['finding']}: {finding['detail']}  [{kind}]", flush=True)
 
-    def run(self, kind, seed, seconds, limit, most):
+    def run(self, kind, given, seed, seconds):
         """Workers of one kind, one after the other, for a time or a number of inputs."""
-        deadline = time.time() + seconds
-        number = 0
-        while time.time() < deadline and number < most:
-            number = self.one_worker(kind, seed, number, deadline, limit, most)
-        self.inputs[kind] = self.inputs.get(kind, 0) + number
+        until = time.time() + seconds
+        while time.time() < until and self.inputs[kind] < given.most:
+            with tempfile.TemporaryDirectory(prefix="lavender-fuzz-") as folder:
+                self.run_worker(kind, given, Path(folder), seed, until)
+            seed += 10**6
 
-    def one_worker(self, kind, seed, first, deadline, limit, most):
-        """Until it ends; the number of the input to go on with."""
-        with tempfile.NamedTemporaryFile() as shared, tempfile.TemporaryFile() as errors:
-            shared.write(FIELDS.pack(first, 0, -1.0))
-            shared.flush()
-            script = os.environ.get("LAVENDER_FUZZ_SCRIPT", str(HERE / "fuzz.py"))
-            command = [
-                sys.executable,
-                script,
-                "--work",
-                kind,
-                str(seed),
-                str(first),
-                str(deadline),
-                str(most),
-                shared.name,
-            ]
-            worker = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=errors, start_new_session=True)
-            os.set_blocking(worker.stdout.fileno(), False)
-            text, counts, hung = b"", {}, False
-            number, started = first, -1.0
-            while True:
-                ended = worker.poll() is not None
-                text += worker.stdout.read() or b""
-                *lines, text = text.split(b"\n")
-                for line in lines:
-                    message = json.loads(line)
-                    if "counts" in message:
-                        counts = message["counts"]
-                    else:
-                        self.add(message)
-                before, seen = (number, started), FIELDS.unpack(Path(shared.name).read_bytes())
-                number, started = seen[0], seen[2]
-                if ended:
-                    break
-                # Twice the same: a look in the middle of a write sees zeros.
-                if started >= 0.0 and (number, started) == before and used(worker.pid) - started > limit:
-                    hung = True
-                    os.kill(worker.pid, signal.SIGUSR1)  # where it is
-                    time.sleep(0.5)
-                    os.killpg(worker.pid, signal.SIGKILL)
-                    worker.wait()
-                    break
-                time.sleep(0.05)
-            for key, n in counts.items():
-                self.counts[key] = self.counts.get(key, 0) + n
-            if worker.returncode == 0 and not hung:
-                return number
-            errors.seek(0)
-            told = errors.read().decode(errors="replace")
-            what = "hang" if hung else "crash"
-            where = next(
-                (s for s in re.findall(r'File ".*?(lavender[^"]*)", line \d+ in (\w+)', told)), ("?", "?")
-            )
-            finding = {
-                "finding": what,
-                "detail": f"{where[0]}:{where[1]}, status {worker.returncode}",
-                "kind": kind,
-            }
-            try:
-                spec = make(kind, seed, number)
-            except Exception as error:  # the generator itself
-                spec = {"kind": kind, "not made": repr(error)}
-            self.add({**finding, "seed": seed, "number": number, "spec": spec})
-            print(told[-3000:], file=sys.stderr)
-            return number + 1
+    def run_worker(self, kind, given, folder, seed, until):
+        """Until it ends, by itself or not."""
+        options = [kind, folder, seed, until, given.most - self.inputs[kind], given.limit, int(given.guided)]
+        script = os.environ.get("LAVENDER_FUZZ_SCRIPT", str(HERE / "fuzz.py"))
+        command = [sys.executable, script, "--work", *(str(option) for option in options)]
+        done = subprocess.run(command, stdout=sys.stderr, stderr=subprocess.PIPE, check=False)
+        told = done.stderr.decode(errors="replace")
+        if (folder / "counts.json").exists():
+            counts = json.loads((folder / "counts.json").read_text())
+            self.inputs[kind] += counts["inputs"]
+            self.checks.update(counts["checks"])
+        if (folder / "findings").exists():
+            for line in (folder / "findings").read_text().splitlines():
+                self.add(kind, json.loads(line))
+        if done.returncode == 0:
+            return
+        self.inputs[kind] += 1
+        print(told[-3000:], file=sys.stderr)
+        where = re.search(r'File ".*?(lavender[^"]*)", line \d+ in (\w+)', told)
+        last = folder / "input.json"
+        finding = {
+            "finding": "hang" if done.returncode == -signal.SIGXCPU else "crash",
+            "detail": f"{':'.join(where.groups()) if where else '?'}, status {done.returncode}",
+            "spec": json.loads(last.read_text()) if last.exists() else {"kind": kind},
+        }
+        self.add(kind, {**finding, "name": keep(finding)})
 
     def report(self):
         """Lines of counts."""
-        inputs = ", ".join(f"{n} {kind}" for kind, n in self.inputs.items())
-        lines = [f"inputs: {inputs}", "done: " + ", ".join(f"{n} {key}" for key, n in self.counts.items())]
-        kinds = {
-            "crash": 0,
-            "hang": 0,
-            "raw": 0,
-            "false claim": 0,
-            "wrong number": 0,
-            "overrun": 0,
-            "changed": 0,
-            "warning": 0,
-        }
+        found = Counter(dict.fromkeys(FAULTS, 0))
         for finding in self.findings.values():
             word = finding["finding"]
-            word = next((kind for kind in kinds if word.startswith(kind)), word)
-            kinds[word] = kinds.get(word, 0) + finding["times"]
-        lines.append("found: " + ", ".join(f"{kind} {n}" for kind, n in kinds.items()))
-        return lines
+            found[next((fault for fault in FAULTS if word.startswith(fault)), word)] += finding["times"]
+        titles = {"inputs": self.inputs, "done": self.checks, "found": found}
+        return [
+            f"{title}: " + ", ".join(f"{n} {key}" for key, n in of.items()) for title, of in titles.items()
+        ]
 
 
 def signature(finding):
     """A short name of the place that fails: digits and quoted texts say nothing about it."""
     text = re.sub(r"'[^']*'|\d[\d.e+-]*|inf|nan", "#", finding["detail"])
-    solver = finding["spec"].get("solver", "") if isinstance(finding["spec"], dict) else ""
-    digest = hashlib.sha256(f"{finding['finding']} {solver} {text}".encode()).hexdigest()[:10]
+    spec = finding["spec"]
+    digest = hashlib.sha256(f"{finding['finding']} {spec.get('solver', '')} {text}".encode()).hexdigest()[:10]
     words = re.sub(r"[^a-z]+", "-", finding["finding"].lower()).strip("-")
-    return f"{finding['kind']}-{words}-{digest}"
+    return f"{spec['kind']}-{words}-{digest}"
 
 
-def used(pid):
-    """Processor time of a process, s."""
-    try:
-        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    except OSError:
-        return 0.0
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+def keep(finding):
+    """Its name; its input is kept, if it is the smallest of this name."""
+    FOUND.mkdir(exist_ok=True)
+    name = signature(finding)
+    path, text = FOUND / f"{name}.json", json.dumps(finding) + "\n"
+    if not path.exists() or len(text) < path.stat().st_size:
+        path.write_text(text, encoding="utf-8")
+    return name
 
 
 def replay(paths):
@@ -239,8 +238,7 @@ def replay(paths):
 
     failed = 0
     for path in paths:
-        spec = json.loads(Path(path).read_text(encoding="utf-8"))["spec"]
-        for what, detail in checks.run(spec):
+        for what, detail in checks.run(json.loads(Path(path).read_text(encoding="utf-8"))["spec"]):
             print(f"{path}: {what}: {detail}")
             failed += 1
     print(f"{len(paths)} inputs replayed, {failed} findings")
@@ -250,37 +248,29 @@ def replay(paths):
 def main():
     """Command line."""
     if sys.argv[1:2] == ["--work"]:
-        kind, seed, first, deadline, most, shared = sys.argv[2:]
-        work(kind, int(seed), int(first), {"time": float(deadline), "number": int(most)}, shared)
+        kind, folder, seed, until, most, limit, guided = sys.argv[2:]
+        work(kind, folder, int(seed), float(until), int(most), float(limit), guided == "1")
         return 0
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("minutes", nargs="?", type=float, default=2.0)
     parser.add_argument("--seed", type=int, help="default: drawn, and printed")
-    parser.add_argument("--kinds", default=",".join(KINDS))
+    parser.add_argument(
+        "--kinds", default=None, help=f"default: {','.join(SHARE)}; guided: {','.join(COVERED)}"
+    )
     parser.add_argument("--limit", type=float, default=LIMIT, help="s of processor time on one input")
     parser.add_argument("--most", type=int, default=10**9, help="inputs of each kind")
-    parser.add_argument("--keep", action="store_true", help="leave failing inputs in tests/fuzz/found/")
+    parser.add_argument("--guided", action="store_true", help="led by coverage")
     parser.add_argument("--replay", nargs="*", metavar="FILE")
-    parser.add_argument("--again", nargs=3, metavar=("SEED", "KIND", "NUMBER"))
     given = parser.parse_args()
     if given.replay is not None:
         return 1 if replay(given.replay or sorted(FOUND.glob("*.json"))) else 0
-    if given.again:
-        seed, kind, number = given.again
-        spec = make(kind, int(seed), int(number))
-        import checks
-
-        print(json.dumps(spec))
-        for finding in checks.run(spec):
-            print(*finding, sep=": ")
-        return 0
     seed = given.seed if given.seed is not None else int.from_bytes(os.urandom(6), "little")
-    kinds = given.kinds.split(",")
+    kinds = given.kinds.split(",") if given.kinds else list(COVERED if given.guided else SHARE)
     print(f"seed {seed}", flush=True)
-    campaign = Campaign(given.keep)
+    campaign = Campaign()
     total = sum(SHARE[kind] for kind in kinds)
     for kind in kinds:
-        campaign.run(kind, seed, 60.0 * given.minutes * SHARE[kind] / total, given.limit, given.most)
+        campaign.run(kind, given, seed, 60.0 * given.minutes * SHARE[kind] / total)
     print("\n".join(campaign.report()))
     return 1 if campaign.findings else 0
 

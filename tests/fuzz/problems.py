@@ -1,235 +1,218 @@
-"""Problems and how they are to be solved, as plain data (what JSON can hold): generators and builders."""
+"""Problems and how they are to be solved, as plain data (what JSON can hold): strategies and builders."""
 
+import hypothesis.strategies as st
 import numpy as np
 import scipy.sparse as sp
 from crowds import joined
-from draw import numbers, positive
+from strategies import chance, generators, numbers, optional, plain, positive, some
 
 import lavender as lv
 
 ORDERS = ("given", "reverse", "symmetric", "random", "bottom_up", "top_down", "colored", "local")
+STYLES = ("tame", "tame", "scales", "wild", "special")
+LAWS = st.sampled_from(("coulomb", "cone"))
 
 
-CROWDS = 0.08  # of problems, many small ones side by side
+def problem_specs(largest=12):
+    """Problems of any law and operator; some 8 of 100 are many small ones side by side."""
+    return st.integers(0, 99).flatmap(lambda x: crowds() if x >= 92 else parts(largest))
 
 
-def problem_spec(draw, largest=12):
-    """A problem of any law and operator."""
-    if draw.chance(CROWDS):
-        return crowd_spec(draw)
-    return one_spec(draw, largest)
+@st.composite
+def crowds(draw):
+    """Up to 40 side by side, most of them alike or of one operator and law, more than `auto` takes whole."""
+    first = draw(parts(8))
+    others = draw(st.lists(st.one_of(st.just(first), *[parts(8)] * 4), min_size=1, max_size=40))
+    alike = [other if kind_of(other) == kind_of(first) else first for other in others]
+    return joined([first, *alike], draw(st.none() | generators()))
 
 
-def crowd_spec(draw):
-    """Up to 40 of them side by side, most of them alike or of one operator and law, more than `auto` takes whole."""
-    first = one_spec(draw, 8)
-    specs = [first]
-    for _ in range(draw.whole(1, 40)):
-        other = first if draw.chance(0.2) else one_spec(draw, 8)
-        same = all(other[key] == first[key] for key in ("operator", "friction"))
-        alike = (lv.ROUND in other["cones"]["kind"]) == (lv.ROUND in first["cones"]["kind"])
-        specs.append(other if same and alike else first)
-    return joined(draw, specs)
+def kind_of(spec):
+    """Problems that agree in this can stand side by side in one."""
+    return spec["operator"], spec["friction"], lv.ROUND in spec["cones"]["kind"]
 
 
-def one_spec(draw, largest=12):
-    """A problem whose rows mostly hang together."""
-    if draw.chance(0.35):
-        return rows_spec(draw)
-    if draw.chance(0.25):
-        return general_spec(draw, largest)
-    cones = cones_spec(draw, draw.whole(0, largest))
-    m = cones["ptr"][-1]
-    spec = {"operator": draw.pick(("dense", "csr")), "A": matrix(draw, m), "cones": cones}
-    spec["friction"] = draw.pick(("coulomb", "cone"))
-    spec["b"] = right_side(draw, np.array(spec["A"]).reshape(m, m)).tolist()
-    if draw.chance(0.2):
-        spec["guess"] = numbers(draw, m).tolist()
-    return spec
+def parts(largest=12):
+    """Problems whose rows mostly hang together."""
+    return st.one_of(*[bodies()] * 7, *[generalized(largest)] * 3, *[matrices(largest)] * 10).map(plain)
 
 
-def cones_spec(draw, rows):
+@st.composite
+def matrices(draw, largest):
+    """A of its entries."""
+    blocks = draw(cones(draw(st.integers(0, largest))))
+    m = blocks["ptr"][-1]
+    a = draw(matrix(m))
+    b = draw(st.sampled_from(("zero", "range", "range", "any", "any")))
+    x = draw(numbers(m))
+    with np.errstate(all="ignore"):
+        x = finite(a @ x) if b == "range" else np.zeros(m) if b == "zero" else x
+    spec = {"operator": draw(st.sampled_from(("dense", "csr"))), "A": a, "cones": blocks, "b": x}
+    return spec | {"friction": draw(LAWS)} | draw(optional(guess=numbers(m)))
+
+
+def finite(x):
+    """What overflowed, as numbers."""
+    return np.nan_to_num(x, nan=0.0, posinf=1e300, neginf=-1e300)
+
+
+@st.composite
+def cones(draw, rows):
     """Blocks of about `rows` rows."""
-    law = draw.pick(("linear", "lcp", "lcp", "contacts", "contacts", "mixed"))
+    law = draw(st.sampled_from(("linear", "lcp", "lcp", "contacts", "contacts", "mixed")))
     kind, size = [], []
-    left = rows
-    while left > 0:
-        contact = law == "contacts" or (law == "mixed" and draw.chance(0.5))
+    while sum(size) < rows:
+        contact = law == "contacts" or (law == "mixed" and draw(st.booleans()))
+        spin = contact and draw(chance(0.2))
+        kind.append(contact + spin)
         if contact:
-            spin = draw.chance(0.2)
-            kind.append(1 + spin)
-            size.append(1 + draw.pick((0, 1, 2, 2, 2)) + spin)
+            size.append(1 + draw(st.sampled_from((0, 1, 2, 2, 2))) + spin)
         else:
-            kind.append(0)
-            size.append(draw.whole(1, 3) if law == "mixed" and draw.chance(0.3) else 1)
-        left -= size[-1]
+            size.append(draw(st.sampled_from((1, 1, 1, 2, 3))) if law == "mixed" else 1)
     m, k = sum(size), len(size)
-    lower, upper = np.full(m, -np.inf), np.full(m, np.inf)
-    if law != "linear":
-        style = draw.pick(("zero", "boxed", "any", "any"))
-        if style == "zero":
-            lower[:] = 0.0
-        else:
-            ends = np.sort(np.stack([numbers(draw, m), numbers(draw, m)]), axis=0)
-            open_low, open_high = (np.array([draw.chance(0.3) for _ in range(m)], bool) for _ in range(2))
-            lower, upper = ends
-            if style == "any":
-                lower, upper = np.where(open_low, -np.inf, lower), np.where(open_high, np.inf, upper)
-                same = np.array([draw.chance(0.05) for _ in range(m)], bool) & np.isfinite(lower)
-                upper = np.where(same, lower, upper)
-    mu = np.array([draw.pick((0.0, 0.5, 1.0, 1e-12, 1e-300, 10.0, 1e8, 1e300)) for _ in range(k)], float)
-    if draw.chance(0.7):
-        mu = np.minimum(mu, 1.0)
-    radius = np.array([draw.pick((0.0, 0.1, 1.0, 1e-200, 1e200)) for _ in range(k)], float)
-    if draw.chance(0.7):
-        radius = np.minimum(radius, 1.0)
-    ptr = np.concatenate([[0], np.cumsum(size)]).astype(int)
+    style = "free" if law == "linear" else draw(st.sampled_from(("zero", "boxed", "any", "any")))
+    lower, upper = np.full(m, 0.0 if style == "zero" else -np.inf), np.full(m, np.inf)
+    if style in ("boxed", "any"):
+        lower, upper = np.sort(np.stack([draw(numbers(m)), draw(numbers(m))]), axis=0)
+    if style == "any":
+        lower, upper = (
+            np.where(draw(some(m, 0.3)), -np.inf, lower),
+            np.where(draw(some(m, 0.3)), np.inf, upper),
+        )
+        upper = np.where(draw(some(m, 0.05)) & np.isfinite(lower), lower, upper)
+    mu = draw(choices((0.0, 0.5, 1.0, 1e-12, 1e-300, 10.0, 1e8, 1e300), k))
+    radius = draw(choices((0.0, 0.1, 1.0, 1e-200, 1e200), k))
     return {
-        "ptr": ptr.tolist(),
+        "ptr": np.cumsum([0, *size]).tolist(),
         "kind": [int(x) for x in kind],
-        "lower": lower.tolist(),
-        "upper": upper.tolist(),
-        "mu": mu.tolist(),
-        "patch_radius": radius.tolist(),
+        "lower": lower,
+        "upper": upper,
+        "mu": np.minimum(mu, 1.0) if draw(chance(0.7)) else mu,
+        "patch_radius": np.minimum(radius, 1.0) if draw(chance(0.7)) else radius,
     }
 
 
-KINDS = (
-    "definite", "definite", "definite", "singular", "diagonal", "chain", "asymmetric", "indefinite", "duplicate",
-    "any", "zero",
-)  # fmt: skip
+def choices(options, n):
+    """n of the options (n,)."""
+    return st.lists(st.sampled_from(options), min_size=n, max_size=n).map(np.array)
 
 
+@st.composite
 def matrix(draw, m):
-    """(m, m) as lists."""
-    kind = draw.pick(KINDS)
+    """(m, m)."""
+    kind = draw(st.sampled_from((*["definite"] * 3, "singular", "diagonal", "chain", "asymmetric", "indefinite",
+                                 "duplicate", "any", "zero")))  # fmt: skip
     if m == 0:
-        return []
-    g = numbers(draw, m * m, draw.pick(("tame", "tame", "tame", "whole"))).reshape(m, m)
+        return np.zeros((0, 0))
+    g = draw(numbers(m * m, draw(st.sampled_from(("tame", "tame", "tame", "whole"))))).reshape(m, m)
     with np.errstate(all="ignore"):
         if kind in ("definite", "singular", "asymmetric", "duplicate"):
-            g = g[:, : max(1, draw.whole(1, m))] if kind == "singular" else g
+            g = g[:, : draw(st.integers(1, m))] if kind == "singular" else g
             a = g @ g.T + (0.0 if kind == "singular" else 0.01 * np.eye(m))
             if kind == "asymmetric":
-                a = a + 10.0 ** draw.whole(-6, 1) * numbers(draw, m * m, "tame").reshape(m, m)
+                a = a + 10.0 ** draw(st.integers(-6, 1)) * draw(numbers(m * m, "tame")).reshape(m, m)
             if kind == "duplicate":
-                index = [draw.whole(0, m - 1) for _ in range(m)]
+                index = draw(generators()).integers(0, m, m)
                 a = a[index][:, index]
         elif kind == "diagonal":
-            a = np.diag(numbers(draw, m))
+            a = np.diag(draw(numbers(m)))
         elif kind == "chain":
-            off = -positive(draw, max(m - 1, 0), "tame")
-            a = np.diag(np.abs(numbers(draw, m, "tame")) + 2.0) + np.diag(off, 1) + np.diag(off, -1)
+            off = -draw(positive(m - 1, "tame"))
+            a = np.diag(draw(positive(m, "tame")) + 2.0) + np.diag(off, 1) + np.diag(off, -1)
         elif kind == "indefinite":
             a = 0.5 * (g + g.T)
         elif kind == "zero":
             a = np.zeros((m, m))
         else:
-            a = numbers(draw, m * m).reshape(m, m)
-        if draw.chance(0.25):  # units of the rows
-            scale = positive(draw, m, draw.pick(("scales", "wild", "special")))
+            a = draw(numbers(m * m)).reshape(m, m)
+        if draw(chance(0.25)):  # units of the rows
+            scale = draw(positive(m, draw(st.sampled_from(("scales", "wild", "special")))))
             a = scale[:, None] * a * scale[None, :]
-        elif draw.chance(0.1):
-            a = a * float(positive(draw, 1, "special")[0])
-        if draw.chance(0.1):
-            gone = draw.whole(0, m - 1)
+        elif draw(chance(0.1)):
+            a = a * draw(positive(1, "special"))
+        if draw(chance(0.1)):
+            gone = draw(st.integers(0, m - 1))
             a[gone] = 0.0
-            if draw.chance(0.7):
+            if draw(chance(0.7)):
                 a[:, gone] = 0.0
-    return np.nan_to_num(a, nan=0.0, posinf=1e300, neginf=-1e300).tolist()
+    return finite(a)
 
 
-def right_side(draw, a):
-    """b (m,): zero, in the range of A, or any."""
-    m = len(a)
-    kind = draw.pick(("zero", "range", "range", "any", "any"))
-    if kind == "zero":
-        return np.zeros(m)
-    x = numbers(draw, m)
-    if kind == "range":
-        with np.errstate(all="ignore"):
-            x = np.nan_to_num(a @ x, nan=0.0, posinf=1e300, neginf=-1e300)
-    return x
+# -- bodies, joints and contacts -----------------------------------------------------------------------------------
 
 
-def rows_spec(draw):
-    """A factored problem: bodies, joints, contacts."""
-    n, joints, contacts = draw.whole(1, 4), draw.whole(0, 2), draw.whole(0, 4)
-    mass_style = draw.pick(("tame", "tame", "scales", "wild", "special"))
-    inverse = positive(draw, n, mass_style)
-    heavy = np.array([draw.chance(0.05) for _ in range(n)], bool)
-    inverse = np.where(heavy, 0.0, inverse)
-    inertia = np.zeros((n, 3, 3))
-    for i in range(n):
-        diag = positive(draw, 3, mass_style)
-        if draw.chance(0.5):
-            q = np.linalg.qr(numbers(draw, 9, "tame").reshape(3, 3) + 3.0 * np.eye(3))[0]
-            with np.errstate(all="ignore"):
-                inertia[i] = np.nan_to_num(q * diag @ q.T, posinf=1e300, neginf=-1e300)
-            inertia[i] = 0.5 * inertia[i] + 0.5 * inertia[i].T
-        else:
-            inertia[i] = np.diag(diag)
-
-    def pair():
-        b = draw.whole(0, n - 1)
-        a = draw.whole(-1, n - 2)
-        return [a if a < b else a + 1, b]
-
-    sizes = [draw.whole(1, 4) for _ in range(joints)]
-    joint_ptr = np.concatenate([[0], np.cumsum(sizes)]).astype(int)
+@st.composite
+def bodies(draw):
+    """A factored problem."""
+    n, joints, contacts = draw(st.integers(1, 4)), draw(st.integers(0, 2)), draw(st.integers(0, 4))
+    mass_style = draw(st.sampled_from(STYLES))
+    inverse = np.where(draw(some(n, 0.05)), 0.0, draw(positive(n, mass_style)))
+    joint_ptr = np.cumsum([0, *draw(st.lists(st.integers(1, 4), min_size=joints, max_size=joints))])
     mj = int(joint_ptr[-1])
-    jac = numbers(draw, mj * 12, draw.pick(("tame", "tame", "whole", "scales", "special"))).reshape(mj, 12)
-    if mj and draw.chance(0.5):
-        jac[: draw.whole(1, mj), [0, 1, 2, 6, 7, 8]] = 0.0
-    normal, tangent = np.zeros((contacts, 3)), np.zeros((contacts, 3))
-    for c in range(contacts):
-        x = numbers(draw, 3, "tame") + np.array([0.0, 0.0, 1e-3])
-        x = x / np.linalg.norm(x) if np.linalg.norm(x) > 1e-6 else np.array([0.0, 0.0, 1.0])
-        t = np.cross(x, np.eye(3)[int(np.argmin(np.abs(x)))])
-        normal[c], tangent[c] = x, t / np.linalg.norm(t)
-    arm_style = draw.pick(("tame", "tame", "scales", "special"))
-    tangents = [draw.pick((0, 1, 2, 2)) for _ in range(contacts)]
-    spin = draw.chance(0.3)
-    kind = [0] * joints + [1 + spin] * contacts
-    size = [*sizes, *(1 + t + spin for t in tangents)]
-    ptr = np.concatenate([[0], np.cumsum(size)]).astype(int)
-    m, k = int(ptr[-1]), len(size)
-    high = np.where(np.array([draw.chance(0.4) for _ in range(m)], bool), positive(draw, m), np.inf)
-    mu = np.zeros(k)
-    mu[joints:] = [draw.pick((0.0, 0.3, 0.8, 1.0, 10.0, 1e-12, 1e300)) for _ in range(contacts)]
-    radius = np.zeros(k)
-    radius[joints:] = [draw.pick((0.0, 0.1, 1.0)) for _ in range(contacts)]
+    jac = draw(
+        numbers(mj * 12, draw(st.sampled_from(("tame", "tame", "whole", "scales", "special"))))
+    ).reshape(mj, 12)
+    if mj and draw(st.booleans()):
+        jac[: draw(st.integers(1, mj)), [0, 1, 2, 6, 7, 8]] = 0.0
+    normal, tangent = draw(directions(contacts))
+    spin = draw(chance(0.3))
+    tangents = draw(st.lists(st.sampled_from((0, 1, 2, 2)), min_size=contacts, max_size=contacts))
+    size = [*np.diff(joint_ptr).tolist(), *(1 + t + spin for t in tangents)]
+    m = sum(size)
+    high = np.where(draw(some(m, 0.4)), draw(positive(m)), np.inf)
+    arm_style = draw(st.sampled_from(("tame", "tame", "scales", "special")))
     spec = {
         "operator": "rows",
-        "friction": draw.pick(("coulomb", "cone")),
+        "friction": draw(LAWS),
         "rows": {
-            "inv_mass": inverse.tolist(),
-            "inv_inertia": inertia.tolist(),
-            "v_free": numbers(draw, 6 * n, "tame").reshape(n, 6).tolist(),
-            "jac": jac.tolist(),
-            "joint_ptr": joint_ptr.tolist(),
-            "joint_body": [pair() if n > 1 else [-1, 0] for _ in range(joints)],
-            "normal": normal.tolist(),
-            "tangent": tangent.tolist(),
-            "arm_a": numbers(draw, 3 * contacts, arm_style).reshape(-1, 3).tolist(),
-            "arm_b": numbers(draw, 3 * contacts, arm_style).reshape(-1, 3).tolist(),
-            "contact_body": [pair() if n > 1 else [-1, 0] for _ in range(contacts)],
+            "inv_mass": inverse,
+            "inv_inertia": [draw(inertia(mass_style)) for _ in range(n)],
+            "v_free": draw(numbers(6 * n, "tame")).reshape(n, 6),
+            "jac": jac,
+            "joint_ptr": joint_ptr,
+            "joint_body": draw(st.lists(pairs(n), min_size=joints, max_size=joints)),
+            "normal": normal,
+            "tangent": tangent,
+            "arm_a": draw(numbers(3 * contacts, arm_style)).reshape(-1, 3),
+            "arm_b": draw(numbers(3 * contacts, arm_style)).reshape(-1, 3),
+            "contact_body": draw(st.lists(pairs(n), min_size=contacts, max_size=contacts)),
         },
         "cones": {
-            "ptr": ptr.tolist(),
-            "kind": [int(x) for x in kind],
-            "lower": np.where(np.isinf(high), -np.inf, -high).tolist(),
-            "upper": high.tolist(),
-            "mu": mu.tolist(),
-            "patch_radius": radius.tolist(),
+            "ptr": np.cumsum([0, *size]).tolist(),
+            "kind": [0] * joints + [1 + spin] * contacts,
+            "lower": -high,
+            "upper": high,
+            "mu": [0.0] * joints + draw(choices((0.0, 0.3, 0.8, 1.0, 10.0, 1e-12, 1e300), contacts)).tolist(),
+            "patch_radius": [0.0] * joints + draw(choices((0.0, 0.1, 1.0), contacts)).tolist(),
         },
-        "b": numbers(draw, m).tolist() if draw.chance(0.9) else [0.0] * m,
+        "b": draw(numbers(m)) if draw(chance(0.9)) else np.zeros(m),
     }
-    if draw.chance(0.3):
-        spec["compliance"] = np.abs(numbers(draw, m)).tolist()
-    if draw.chance(0.2):
-        spec["guess"] = numbers(draw, m).tolist()
-    return spec
+    return spec | draw(optional(compliance=numbers(m).map(np.abs), guess=numbers(m)))
+
+
+def pairs(n):
+    """Two of n bodies, the first perhaps the world (-1)."""
+    return st.tuples(st.integers(-1, n - 1), st.integers(0, n - 1)).filter(lambda pair: pair[0] != pair[1])
+
+
+@st.composite
+def inertia(draw, style):
+    """An inverse inertia (3, 3), diagonal or turned."""
+    diag, turned = np.diag(draw(positive(3, style))), draw(st.booleans())
+    q = np.linalg.qr(draw(numbers(9, "tame")).reshape(3, 3) + 3.0 * np.eye(3))[0] if turned else np.eye(3)
+    with np.errstate(all="ignore"):
+        out = finite(q @ diag @ q.T)
+    return 0.5 * out + 0.5 * out.T
+
+
+@st.composite
+def directions(draw, n):
+    """Normals and tangents (n, 3)."""
+    normal = draw(numbers(3 * n, "tame")).reshape(n, 3) + np.array([0.0, 0.0, 1e-3])
+    length = np.linalg.norm(normal, axis=1, keepdims=True)
+    normal = np.where(length > 1e-6, normal / np.maximum(length, 1e-6), np.array([0.0, 0.0, 1.0]))
+    tangent = np.cross(normal, np.eye(3)[np.abs(normal).argmin(axis=1)])
+    return normal, tangent / np.linalg.norm(tangent, axis=1, keepdims=True)
 
 
 SHAPES = {
@@ -242,61 +225,51 @@ WHOLE = ("joint_ptr", "joint_body", "contact_body")
 # -- generalised coordinates ---------------------------------------------------------------------------------------
 
 
-def general_spec(draw, largest):
+@st.composite
+def generalized(draw, largest):
     """J, M of a forest, v*, target: rows on chains of its trees, masses and rows of any size."""
-    cones = cones_spec(draw, draw.whole(0, largest))
-    round_cones = draw.chance(0.15)
-    if round_cones:
-        k = draw.whole(1, 2)
-        tangents = draw.whole(3, 5)
-        cones = {
-            "ptr": [i * (1 + tangents) for i in range(k + 1)],
-            "kind": [lv.ROUND] * k,
-            "lower": [-np.inf] * (k * (1 + tangents)),
-            "upper": [np.inf] * (k * (1 + tangents)),
-            "mu": [draw.pick((0.0, 0.5, 1.0, 1e-3, 10.0)) for _ in range(k)],
-            "patch_radius": [0.0] * k,
-        }
-    m, n = cones["ptr"][-1], draw.whole(1, 9)
-    parent = [draw.whole(-1, i - 1) if i else -1 for i in range(n)]
-    lower = np.eye(n)
-    for i in range(n):
-        j = parent[i]
-        while j >= 0:
-            lower[i, j] = float(numbers(draw, 1, "tame")[0]) * 0.4
-            j = parent[j]
-    mass = lower.T @ np.diag(positive(draw, n, "tame") + 0.1) @ lower
-    style = "scales" if round_cones else draw.pick(("tame", "tame", "scales", "wild", "special"))
+    is_round = draw(chance(0.15))
+    blocks = draw(round_cones() if is_round else cones(draw(st.integers(0, largest))))
+    m, n = blocks["ptr"][-1], draw(st.integers(1, 9))
+    parent = [draw(st.integers(-1, i - 1)) for i in range(n)]
+    chains = np.eye(n, dtype=bool)  # i hangs on j
+    for i, j in enumerate(parent):
+        chains[i] |= chains[j] if j >= 0 else False
+    lower = np.where(np.eye(n), 1.0, 0.4 * chains * draw(numbers(n * n, "tame")).reshape(n, n))
+    mass = lower.T @ np.diag(draw(positive(n, "tame")) + 0.1) @ lower
+    mass = 0.5 * (mass + mass.T)
+    style = "scales" if is_round else draw(st.sampled_from(STYLES))
     with np.errstate(all="ignore"):
-        if draw.chance(0.4):  # units of the velocities
-            scale = positive(draw, n, style)
+        if draw(chance(0.4)):  # units of the velocities
+            scale = draw(positive(n, style))
             mass = scale[:, None] * mass * scale[None, :]
-        jac = numbers(draw, m * n, draw.pick(("tame", "tame", "whole"))).reshape(m, n)
-        if draw.chance(0.3):
-            jac = jac * positive(draw, m, style)[:, None]
-    for i in range(m):
-        on = draw.whole(0, n - 1)
-        keep = {on}
-        while parent[on] >= 0:
-            on = parent[on]
-            keep.add(on)
-        if draw.chance(0.7):
-            jac[i, [j for j in range(n) if j not in keep]] = 0.0
-    numbers_of = "tame" if round_cones else None
+        jac = draw(numbers(m * n, draw(st.sampled_from(("tame", "tame", "whole"))))).reshape(m, n)
+        if draw(chance(0.3)):
+            jac = jac * draw(positive(m, style))[:, None]
+    on = chains[draw(generators()).integers(0, n, m)]
+    jac[~on & draw(some(m, 0.7))[:, None]] = 0.0
+    sizes = "tame" if is_round else None
+    soft = positive(m, sizes).flatmap(lambda x: st.sampled_from((0.0, 1e-6, 1.0)).map(lambda s: s * x))
     spec = {
         "operator": "general",
-        "M": np.nan_to_num(mass, nan=0.0, posinf=1e300, neginf=-1e300).tolist(),
-        "J": np.nan_to_num(jac, nan=0.0, posinf=1e300, neginf=-1e300).tolist(),
-        "v_free": numbers(draw, n, numbers_of).tolist(),
-        "target": (numbers(draw, m, numbers_of) if draw.chance(0.6) else np.zeros(m)).tolist(),
-        "cones": cones,
-        "friction": "cone" if round_cones else draw.pick(("coulomb", "cone")),
+        "M": finite(mass),
+        "J": finite(jac),
+        "v_free": draw(numbers(n, sizes)),
+        "target": draw(numbers(m, sizes)) if draw(chance(0.6)) else np.zeros(m),
+        "cones": blocks,
+        "friction": "cone" if is_round else draw(LAWS),
     }
-    if draw.chance(0.4):
-        spec["compliance"] = (positive(draw, m, numbers_of) * draw.pick((0.0, 1e-6, 1.0))).tolist()
-    if draw.chance(0.2):
-        spec["guess"] = numbers(draw, m, numbers_of).tolist()
-    return spec
+    return spec | draw(optional(compliance=soft, guess=numbers(m, sizes)))
+
+
+@st.composite
+def round_cones(draw):
+    """One or two cones with three to five rows behind the normal."""
+    k, size = draw(st.integers(1, 2)), draw(st.integers(4, 6))
+    bounds = {"lower": [-np.inf] * (k * size), "upper": [np.inf] * (k * size)}
+    mu = draw(choices((0.0, 0.5, 1.0, 1e-3, 10.0), k))
+    kinds = {"ptr": [i * size for i in range(k + 1)], "kind": [lv.ROUND] * k}
+    return kinds | bounds | {"mu": mu, "patch_radius": [0.0] * k}
 
 
 def build(spec):
@@ -326,56 +299,47 @@ def build(spec):
 
 # -- how it is solved ------------------------------------------------------------------------------------------
 
-
-def own_solvers():
-    """This project's solvers."""
-    return [name for name, reason in lv.known().items() if reason is None and not lv.get(name).external]
-
-
-_OWN = []
 MANY = 20  # blocks, from which a problem is one of several side by side
 
 
-def solve_spec(draw):
-    """A problem, a solver and options."""
-    spec = {"kind": "solve", "problem": problem_spec(draw)}
-    if not _OWN:
-        _OWN.extend(own_solvers())
-    c = spec["problem"]["cones"]
-    free = (
-        not any(c["kind"]) and all(x == -np.inf for x in c["lower"]) and all(x == np.inf for x in c["upper"])
-    )
-    plain = all(
-        kind == 0 or b - a == 1 for kind, a, b in zip(c["kind"], c["ptr"], c["ptr"][1:], strict=False)
-    )
-    law = "linear" if free else "lcp" if plain else spec["problem"]["friction"]
+def law_of(spec):
+    """The narrowest law of a problem."""
+    c = spec["cones"]
+    if not any(c["kind"]) and set(c["lower"]) <= {-np.inf} and set(c["upper"]) <= {np.inf}:
+        return "linear"
+    rows_alone = all(kind == 0 or size == 1 for kind, size in zip(c["kind"], np.diff(c["ptr"]), strict=True))
+    return "lcp" if rows_alone else spec["friction"]
+
+
+@st.composite
+def solve_specs(draw):
+    """A problem, a solver (one in ten of another package) and options."""
+    problem = draw(problem_specs())
+    ours, others = (lv.available(external=other, law=law_of(problem)) for other in (False, True))
     names = [
         name
-        for name in _OWN
-        if law in lv.get(name).laws
-        and (name != "sequential_impulses" or spec["problem"]["operator"] == "rows")
+        for name in (others if others and draw(chance(0.1)) else ours)
+        if name != "sequential_impulses" or problem["operator"] == "rows"
     ]
-    many = len(c["kind"]) > MANY
-    solver = "auto" if many and draw.chance(0.7) else draw.pick(names)  # it takes them apart
-    s = lv.get(solver)
-    options = {"tol": draw.pick((1e-6, 1e-6, 1e-9, 1e-12, 1e-3, 0.0, 1e-300, 2.0))}
-    if draw.chance(0.7):
-        options["max_iter"] = draw.pick((1, 2, 20, 50, 200))
-    m = spec["problem"]["cones"]["ptr"][-1]
-    if draw.chance(0.4):
-        options["impulse"] = numbers(draw, m).tolist()
-    if s.order and draw.chance(0.4):
-        options["order"] = draw.pick(ORDERS)
+    many = len(problem["cones"]["kind"]) > MANY and names[0] in ours
+    solver = "auto" if many and draw(chance(0.7)) else draw(st.sampled_from(names))  # it takes them apart
+    s, m = lv.get(solver), problem["cones"]["ptr"][-1]
+    options = {"tol": draw(st.sampled_from((1e-6, 1e-6, 1e-9, 1e-12, 1e-3, 0.0, 1e-300, 2.0)))}
+    options |= draw(optional(0.7, max_iter=st.sampled_from((1, 2, 20, 50, 200))))
+    options |= draw(optional(0.4, impulse=numbers(m)))
+    if s.order and draw(chance(0.4)):
+        options["order"] = draw(st.sampled_from(ORDERS))
         if s.seed and options["order"] == "random":
-            options["seed"] = draw.whole(0, 2**32)
-        if s.threads and options["order"] == "colored" and draw.chance(0.1):
-            options["threads"] = 2
-    if s.history and draw.chance(0.05):
-        options["history"] = True
-    if draw.chance(0.02):
-        options["time_limit"] = draw.pick((0.0, 1e-6, 1e-3, 1.0))
-    if "time_limit" not in options and draw.chance(0.2):
-        spec["threads"] = draw.pick((1, 1, 1, 2))
-        spec["others"] = [numbers(draw, m).tolist() for _ in range(draw.whole(0, 3))]
-    spec |= {"solver": solver, "options": options, "again": draw.chance(0.25), "prepared": draw.chance(0.1)}
-    return spec
+            options["seed"] = draw(st.integers(0, 2**32))
+        if s.threads and options["order"] == "colored":
+            options |= draw(optional(0.1, threads=st.just(2)))
+    if s.history:
+        options |= draw(optional(0.05, history=st.just(True)))
+    options |= draw(optional(0.02, time_limit=st.sampled_from((0.0, 1e-6, 1e-3, 1.0))))
+    spec = {"kind": "solve", "problem": problem, "solver": solver, "options": options}
+    if s.external:  # what it repeats is its own affair
+        return plain(spec | {"again": False, "prepared": False})
+    if "time_limit" not in options and draw(chance(0.2)):
+        spec["threads"] = draw(st.sampled_from((1, 1, 1, 2)))
+        spec["others"] = draw(st.lists(numbers(m), max_size=3))
+    return plain(spec | {"again": draw(chance(0.25)), "prepared": draw(chance(0.1))})

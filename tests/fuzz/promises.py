@@ -3,8 +3,9 @@
 A spec names where its problem comes from (a seed says the rest), so that it stays small.
 """
 
+import hypothesis.strategies as st
 import numpy as np
-from draw import numbers, positive
+from strategies import generators, numbers, plain, positive
 
 import lavender as lv
 from lavender import suite
@@ -24,37 +25,50 @@ SCENES = (
 )
 
 
-def promise_spec(draw):
+def promise_specs():
     """A problem, an iterative solver and a budget."""
-    source = draw.pick(("scene", "scene", "wild", "warm", "singular", "singular", "hard"))
-    spec = {"kind": "promise", "source": source, "seed": draw.whole(0, 10**6)}
-    if source == "scene":
-        name, choices = draw.pick(SCENES)
-        parameters = {key: draw.pick(values) for key, values in choices.items()}
-        spec |= {"scene": name, "parameters": parameters | {"solver_iterations": draw.pick((4, 8, 16, 32))}}
-        spec["steps"] = draw.whole(1, 120)
-    elif source == "hard":
-        spec["text"] = draw.pick(hard.SET)
-    elif source == "singular":
-        spec |= general(draw)
-    spec["solver"] = draw.pick(lv.available(external=False, resumable=True))
-    spec["tol"] = draw.pick((1e-6, 1e-6, 1e-9, 1e-12))
-    spec["max_iter"] = draw.pick((None, None, None, 200, 3000))
-    return spec
+    pick = st.sampled_from
+    common = {
+        "kind": st.just("promise"),
+        "seed": st.integers(0, 10**6),
+        "solver": pick(lv.available(external=False, resumable=True)),
+        "tol": pick((1e-6, 1e-6, 1e-9, 1e-12)),
+        "max_iter": pick((None, None, None, 200, 3000)),
+    }
+
+    def of(source, more):
+        return st.tuples(st.fixed_dictionaries({"source": st.just(source), **common}), more).map(
+            lambda x: x[0] | x[1]
+        )
+
+    nothing, text = st.just({}), st.fixed_dictionaries({"text": pick(hard.SET)})
+    parts = (of("scene", scenes()), of("scene", scenes()), of("wild", nothing), of("warm", nothing))
+    return st.one_of(*parts, of("singular", singular()), of("singular", singular()), of("hard", text)).map(
+        plain
+    )
 
 
-def general(draw):
+@st.composite
+def scenes(draw):
+    """A scene by name, after some steps."""
+    name, choices = draw(st.sampled_from(SCENES))
+    parameters = {key: draw(st.sampled_from(values)) for key, values in choices.items()}
+    parameters["solver_iterations"] = draw(st.sampled_from((4, 8, 16, 32)))
+    return {"scene": name, "parameters": parameters, "steps": draw(st.integers(1, 120))}
+
+
+@st.composite
+def singular(draw):
     """J of a few velocities, and M whose eigenvalues lie up to 1e17 apart."""
-    nv, rows = draw.whole(1, 10), draw.whole(1, 12)
-    q = np.linalg.qr(numbers(draw, nv * nv, "tame").reshape(nv, nv) + 3.0 * np.eye(nv))[0]
-    mass = (
-        q * positive(draw, nv, "tame") * 10.0 ** -np.array([draw.whole(0, 17) for _ in range(nv)], float)
-    ) @ q.T
-    mass = 0.5 * (mass + mass.T) * 10.0 ** draw.whole(-6, 6)
-    law = draw.pick(("linear", "lcp", "coulomb", "cone"))
+    nv, rows = draw(st.integers(1, 10)), draw(st.integers(1, 12))
+    q = np.linalg.qr(draw(numbers(nv * nv, "tame")).reshape(nv, nv) + 3.0 * np.eye(nv))[0]
+    eigenvalues = draw(positive(nv, "tame")) * 10.0 ** -draw(generators()).integers(0, 18, nv).astype(float)
+    mass = (q * eigenvalues) @ q.T
+    mass = 0.5 * (mass + mass.T) * 10.0 ** draw(st.integers(-6, 6))
+    law = draw(st.sampled_from(("linear", "lcp", "coulomb", "cone")))
     rows = 3 * (1 + rows // 3) if law in ("coulomb", "cone") else rows
-    jac = numbers(draw, rows * nv, draw.pick(("tame", "tame", "whole"))).reshape(rows, nv)
-    return {"law": law, "J": jac.tolist(), "M": mass.tolist(), "v_free": numbers(draw, nv, "tame").tolist()}
+    jac = draw(numbers(rows * nv, draw(st.sampled_from(("tame", "tame", "whole"))))).reshape(rows, nv)
+    return {"law": law, "J": jac, "M": mass, "v_free": draw(numbers(nv, "tame"))}
 
 
 def build(spec):

@@ -1,12 +1,12 @@
 """Scenes that no one would build, how they are stepped, and snapshots that were tampered with; as plain data."""
 
-import base64
 import hashlib
 import json
 import struct
 
+import hypothesis.strategies as st
 import numpy as np
-from draw import SPECIAL, numbers, positive
+from strategies import SPECIAL, chance, numbers, optional, plain, positive
 
 import lavender as lv
 
@@ -19,120 +19,89 @@ ENGINE_ORDERS = ("given", "reverse", "symmetric", "random", "colored", "bottom_u
 SIZES = (0.0, 1e-300, 1e-160, 1e-12, 1e-3, 0.1, 0.5, 1.0, 1e3, 1e8, 1e150, 1e300)
 
 
-def scene_spec(draw, steps=40):
+pick = st.sampled_from
+
+
+@st.composite
+def scene_specs(draw, steps=40):
     """A scene and what is done with it."""
-    gallery = draw.chance(0.3)
-    parameters = {}
-    if draw.chance(0.4):
-        parameters["dt"] = draw.pick((1e-300, 1e-9, 1e-3, 1.0 / 240.0, 0.1, 1.0, 1e6, 1e300))
-    if draw.chance(0.2):
-        parameters["substeps"] = draw.pick((1, 2, 4))
-    if draw.chance(0.3):
-        parameters["gravity"] = numbers(draw, 3, draw.pick(("tame", "wild", "special"))).tolist()
-    for name in ("friction", "patch_radius", "slop", "margin", "restitution_threshold"):
-        if draw.chance(0.15):
-            parameters[name] = draw.pick((0.0, 1e-300, 1e-12, 0.1, 0.5, 1.0, 10.0, 1e150, 1e300))
-    if draw.chance(0.2):
-        parameters["restitution"] = draw.pick((0.0, 0.5, 1.0))
-    if draw.chance(0.3):
-        parameters["order"] = draw.pick(ENGINE_ORDERS)
-    if draw.chance(0.3):
-        parameters["position_iterations"] = draw.pick((0, 1, 20))
-    if draw.chance(0.3):
-        parameters["warm_start"] = False
-    parameters["seed"] = draw.whole(0, 3)
-    if "order" not in parameters and draw.chance(0.15):
-        parameters |= {"solver": draw.pick(SOLVERS), "solver_iterations": draw.pick((1, 10, 60))}
-        parameters["on_failure"] = draw.pick(("use", "keep", "damp", "raise"))
+    gravity = pick(("tame", "wild", "special")).flatmap(lambda style: numbers(3, style))
+    parameters = {"seed": draw(st.integers(0, 3))}
+    parameters |= draw(optional(0.4, dt=pick((1e-300, 1e-9, 1e-3, 1.0 / 240.0, 0.1, 1.0, 1e6, 1e300))))
+    parameters |= draw(optional(0.2, substeps=pick((1, 2, 4)), restitution=pick((0.0, 0.5, 1.0))))
+    parameters |= draw(optional(0.3, gravity=gravity, order=pick(ENGINE_ORDERS)))
+    parameters |= draw(optional(0.3, position_iterations=pick((0, 1, 20)), warm_start=st.just(False)))
+    names = ("friction", "patch_radius", "slop", "margin", "restitution_threshold")
+    size = pick((0.0, 1e-300, 1e-12, 0.1, 0.5, 1.0, 10.0, 1e150, 1e300))
+    parameters |= draw(optional(0.15, **dict.fromkeys(names, size)))
+    if "order" not in parameters and draw(chance(0.15)):
+        parameters |= {"solver": draw(pick(SOLVERS)), "solver_iterations": draw(pick((1, 10, 60)))}
+        parameters["on_failure"] = draw(pick(("use", "keep", "damp", "raise")))
         steps = min(steps, 10)
     spec = {"kind": "steps", "parameters": parameters}
-    if gallery:
-        spec["name"] = draw.pick(GALLERY)
+    if draw(chance(0.3)):
+        spec["name"] = draw(pick(GALLERY))
         parameters.update(SMALL.get(spec["name"], {}))
     else:
-        spec["bodies"] = bodies(draw)
-        spec["joints"] = joints(draw, len(spec["bodies"]))
-    spec["actions"] = actions(draw, steps)
-    spec["again"] = draw.chance(0.25)
-    return spec
+        spec["bodies"] = draw(bodies())
+        spec["joints"] = draw(st.lists(joints(len(spec["bodies"])), max_size=3))
+    spec["actions"] = draw(actions(steps))
+    return plain(spec | {"again": draw(chance(0.25))})
 
 
+@st.composite
 def bodies(draw):
     """Up to nine; often on one another's place."""
-    out = []
-    if draw.chance(0.8):
-        out.append(
-            {"shape": "plane"}
-            if draw.chance(0.8)
-            else {"shape": "plane", "normal": numbers(draw, 3).tolist()}
-        )
-    same = numbers(draw, 3, draw.pick(("tame", "special"))).tolist()
-    for _ in range(draw.whole(1, 8)):
-        body = {"shape": draw.pick(("sphere", "sphere", "box", "box", "none"))}
-        style = draw.pick(("tame", "tame", "scales", "special"))
-        if body["shape"] == "sphere":
-            body["radius"] = float(positive(draw, 1, style)[0])
-        elif body["shape"] == "box":
-            body["size"] = positive(draw, 3, style).tolist()
-        body["mass"] = float(positive(draw, 1, draw.pick(("tame", "scales", "wild", "special")))[0])
-        body["position"] = (
-            same
-            if draw.chance(0.3)
-            else numbers(draw, 3, draw.pick(("tame", "tame", "whole", "wild"))).tolist()
-        )
-        if draw.chance(0.5):
-            body["quaternion"] = numbers(draw, 4).tolist()
-        if draw.chance(0.4):
-            body["velocity"] = numbers(draw, 3).tolist()
-            body["angular_velocity"] = numbers(draw, 3).tolist()
-        if draw.chance(0.1):
-            body["inertia"] = positive(draw, 3).tolist()
-        if draw.chance(0.2):
-            body["friction"] = draw.pick(SIZES)
-            body["patch_radius"] = draw.pick(SIZES)
-        if draw.chance(0.05):
-            body = {key: value for key, value in body.items() if "velocity" not in key} | {"static": True}
-        out.append(body)
-    return out
+    planes = draw(pick(([], *[[{"shape": "plane"}]] * 3, [{"shape": "plane", "normal": draw(numbers(3))}])))
+    same = draw(numbers(3, draw(pick(("tame", "special")))))
+    return planes + draw(st.lists(body(same), min_size=1, max_size=8))
 
 
+@st.composite
+def body(draw, same):
+    """One that moves, mostly."""
+    style = draw(pick(("tame", "tame", "scales", "special")))
+    made = {"shape": draw(pick(("sphere", "sphere", "box", "box", "none")))}
+    if made["shape"] == "sphere":
+        made["radius"] = draw(positive(1, style))[0]
+    elif made["shape"] == "box":
+        made["size"] = draw(positive(3, style))
+    made["mass"] = draw(positive(1, draw(pick(("tame", "scales", "wild", "special")))))[0]
+    at = numbers(3, draw(pick(("tame", "tame", "whole", "wild"))))
+    made["position"] = same if draw(chance(0.3)) else draw(at)
+    made |= draw(optional(0.5, quaternion=numbers(4))) | draw(optional(0.1, inertia=positive(3)))
+    made |= draw(optional(0.2, friction=pick(SIZES), patch_radius=pick(SIZES)))
+    if draw(chance(0.05)):
+        return made | {"static": True}
+    return made | draw(optional(0.4, velocity=numbers(3), angular_velocity=numbers(3)))
+
+
+@st.composite
 def joints(draw, n):
-    """Up to three."""
-    out = []
-    for _ in range(draw.pick((0, 0, 1, 2, 3))):
-        a, b = draw.whole(-1, n - 1), draw.whole(-1, n - 1)
-        joint = {"kind": draw.pick(("distance", "ball", "hinge")), "a": a, "b": b}
-        if joint["kind"] == "hinge":
-            joint["axis"] = numbers(draw, 3).tolist()
-        joint["anchor_a" if joint["kind"] == "distance" else "anchor"] = numbers(draw, 3).tolist()
-        if draw.chance(0.3):
-            joint["hertz"], joint["damping"] = (
-                draw.pick((0.0, 1e-9, 1.0, 1e9, 1e300)),
-                draw.pick((0.0, 1.0, 1e300)),
-            )
-        if joint["kind"] == "hinge" and draw.chance(0.4):
-            joint["motor_speed"] = float(numbers(draw, 1)[0])
-            joint["motor_torque"] = draw.pick((0.0, 1.0, 1e9, 1e300))
-        if joint["kind"] == "distance" and draw.chance(0.3):
-            joint["length"] = draw.pick(SPECIAL)
-        if draw.chance(0.3):
-            joint["collide"] = True
-        out.append(joint)
-    return out
+    """One between two of n bodies or the world."""
+    kind, ends = draw(pick(("distance", "ball", "hinge"))), st.integers(-1, n - 1)
+    joint = {"kind": kind, "a": draw(ends), "b": draw(ends)}
+    joint["anchor_a" if kind == "distance" else "anchor"] = draw(numbers(3))
+    soft = {"hertz": pick((0.0, 1e-9, 1.0, 1e9, 1e300)), "damping": pick((0.0, 1.0, 1e300))}
+    motor = {"motor_speed": numbers(1).map(lambda x: x[0]), "motor_torque": pick((0.0, 1.0, 1e9, 1e300))}
+    joint |= draw(optional(0.3, collide=st.just(True)))
+    for p, fields in ((0.3, soft), (0.4, motor if kind == "hinge" else {})):
+        joint |= draw(st.fixed_dictionaries(fields)) if draw(chance(p)) else {}
+    if kind == "hinge":
+        return joint | {"axis": draw(numbers(3))}
+    return joint | (draw(optional(0.3, length=pick(SPECIAL))) if kind == "distance" else {})
 
 
+@st.composite
 def actions(draw, steps):
     """What is done, in turn."""
+    others = pick((["sweeps", 4], ["sweeps", 64], ["warm", 0], ["warm", 1], ["snapshot"], ["restore"], ["file"],
+                   ["problem"], ["residual"], ["reset"], ["reseed", 5]))  # fmt: skip
     out = []
-    left = steps
-    while left > 0:
-        n = draw.whole(1, 20)
-        out.append(["step", n])
-        left -= n
-        if draw.chance(0.4):
-            out.append(draw.pick((["sweeps", 4], ["sweeps", 64], ["warm", 0], ["warm", 1], ["snapshot"],
-                                  ["restore"], ["file"],
-                                  ["problem"], ["residual"], ["reset"], ["reseed", 5])))  # fmt: skip
+    for n in draw(st.lists(st.integers(1, 20), min_size=1, max_size=4)):
+        out.append(["step", min(n, steps)])
+        if draw(chance(0.4)):
+            out.append(draw(others))
     return out
 
 
@@ -161,36 +130,43 @@ MAGIC = b"LAVENDER-SNAPSHOT\n"
 WILD_WHOLE = (-(2**31), -(10**8), -1000, -2, -1, 0, 1, 2, 3, 7, 100, 65536, 10**8, 2**31 - 1)
 
 
-def snapshot_spec(draw):
+@st.composite
+def snapshot_specs(draw):
     """A snapshot file of a scene, some of whose numbers are others, with a checksum that is right (mostly)."""
-    name = draw.pick(GALLERY)
-    parameters = {**SMALL.get(name, {}), "order": draw.pick(("given", "random", "colored"))}
-    if draw.chance(0.2):
-        del parameters["order"]
-        parameters |= {"solver": "newton", "solver_iterations": 60}
-    edits = []
-    for _ in range(draw.pick((0, 1, 1, 1, 2, 5))):
-        array = draw.pick(("size", "real", "index", "index", "index", "keys"))
-        place = draw.whole(0, 10**6)
-        if array == "real":
-            value = draw.pick((*SPECIAL, float("nan"), float("inf"), -1.0, 1e9))
-        elif array == "keys":
-            value = draw.whole(0, 2**62) if draw.chance(0.5) else draw.pick((0, 1, 2**64 - 1, 2**63))
-        else:
-            value = draw.pick(WILD_WHOLE)
-        edits.append([array, place, value])
-    header = []
-    if draw.chance(0.3):
-        key = draw.pick(("version", "fingerprint", "steps", "failed", "lost", "lengths", "extra", None))
-        header.append(
-            [key, draw.pick((None, -1, 0, 1, 2, 10**30, 1.5, "x", "1", [], [1, 2, 3, 4], {}, True))]
+    name = draw(pick(GALLERY))
+    newton, order = (
+        st.just({"solver": "newton", "solver_iterations": 60}),
+        pick(("given", "random", "colored")),
+    )
+    parameters = SMALL.get(name, {}) | draw(st.one_of(newton, *[st.fixed_dictionaries({"order": order})] * 4))
+    place = st.integers(0, 10**6)
+    real = st.tuples(st.just("real"), place, pick((*SPECIAL, float("nan"), float("inf"), -1.0, 1e9)))
+    index = st.tuples(pick(("size", "index", "index", "index")), place, pick(WILD_WHOLE))
+    keys = st.tuples(st.just("keys"), place, st.integers(0, 2**62) | pick((0, 1, 2**64 - 1, 2**63)))
+    key = pick(("version", "fingerprint", "steps", "failed", "lost", "lengths", "extra", None))
+    value = pick(
+        (None, -1, 0, 1, 2, 10**30, 1.5, "x", "1", [], [[]], [1, 2, 3, 4], {}, True, float("inf"), "\ud800")
+    )
+    at = st.integers(0, 4000)
+    raw = pick(
+        (
+            ["deep", 100_000],
+            ["long", 2**62],
+            ["text", "{"],
+            ["checksum"],
+            ["cut", draw(at)],
+            ["flip", draw(at)],
         )
-    raw = []
-    if draw.chance(0.15):
-        raw.append(draw.pick((["cut", draw.whole(0, 4000)], ["flip", draw.whole(0, 4000)], ["deep", 100_000],
-                              ["long", 2**62], ["text", "{"], ["checksum"])))  # fmt: skip
-    return {"kind": "snapshot", "name": name, "parameters": parameters, "steps": draw.whole(0, 6), "edits": edits,
-            "header": header, "raw": raw}  # fmt: skip
+    )
+    return {
+        "kind": "snapshot",
+        "name": name,
+        "parameters": parameters,
+        "steps": draw(st.integers(0, 6)),
+        "edits": draw(st.lists(st.one_of(index, index, index, real, keys), max_size=5)),
+        "header": draw(st.lists(st.tuples(key, value), max_size=1)) if draw(chance(0.3)) else [],
+        "raw": [draw(raw)] if draw(chance(0.15)) else [],
+    }
 
 
 def tampered(data, spec):
@@ -232,8 +208,3 @@ def tampered(data, spec):
             body = body[:place] + bytes([body[place] ^ 255]) + body[place + 1 :]
     digest = hashlib.sha256(body).digest()
     return body + (bytes(32) if ["checksum"] in spec["raw"] else digest)
-
-
-def text_of(data):
-    """Bytes as JSON can hold them."""
-    return base64.b64encode(data).decode()

@@ -650,7 +650,7 @@ def test_sequences_are_compared_carried_against_cold(tmp_path):
     problems = [lv.Problem.lcp(a, np.ones(6) * (1 + 0.001 * i)) for i in range(4)]
     plan = bench.Plan(levels=(1e-6,), budgets=(5,), repeats=1)
     records = bench.run(bench.sequence(problems, "load"), ["pgs", "direct"], plan)
-    budget, level, exact = tables.walks(records)
+    budget, level, exact = tables.passes(records)
     assert (budget.solver, budget.max_iter, budget.steps) == ("pgs", 5, 4)
     cold = [r for r in records if r.solver == "pgs" and r.mode == "budget" and r.start == "cold"]
     assert budget.time["cold"] == sum(r.time_min for r in cold)

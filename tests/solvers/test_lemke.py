@@ -193,23 +193,6 @@ def test_budgets():
         lv.solve(lv.Problem.lcp(sp.eye_array(5000, format="csr"), np.ones(5000)), "lemke")
 
 
-def test_reference_problems(problem_dir):
-    seen = 0
-    for path in sorted(problem_dir.glob("*.npz")):
-        with np.load(path) as data:
-            if "cone_start" in data or "A" not in data:
-                continue
-            problem = lv.Problem.lcp(data["A"], data["b"], data["lo"], data["hi"], name=path.stem)
-        seen += 1
-        solution = lv.solve(problem, "lemke", tol=1e-9)
-        assert not solution.contradicted, (path.stem, solution)
-        if path.stem == "lcpgen_psd-300":
-            assert solution.status is lv.Status.INFEASIBLE, solution
-        else:
-            assert accurate(solution), (path.stem, solution)
-    assert seen > 20
-
-
 @given(
     seed=seeds, m=st.integers(1, 30), cuts=st.lists(st.integers(0, 40), max_size=8), singular=st.booleans()
 )

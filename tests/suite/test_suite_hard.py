@@ -7,6 +7,15 @@ import lavender as lv
 from lavender import suite
 from lavender.certificates import check_certificate
 from lavender.suite import build, hard
+from lavender.suite.friction import (
+    anisotropic,
+    contact_states,
+    painleve,
+    painleve_solutions,
+    ramp,
+    slider,
+    threshold,
+)
 
 LARGE = {"hang(n=10000)"}  # seconds
 NO_REFERENCE = "sliding=0.5", "box_stackF(n=10, mass_ratio=1e6)"
@@ -105,7 +114,7 @@ def test_units_change_no_relative_residual():
 @pytest.mark.parametrize("speed", [0.01, 0.5, 6.0])
 def test_a_slider_obeys_its_law(mu, friction, speed):
     """Coulomb: the normal velocity is exactly 0 and friction opposes sliding; the relaxation lifts by mu |w_t|."""
-    case = hard.slider(mu=mu, speed=speed, friction=friction)
+    case = slider(mu=mu, speed=speed, friction=friction)
     lam = case.reference.impulse
     w = case.problem.slack(lam)
     slip = np.hypot(w[1], w[2])
@@ -116,7 +125,7 @@ def test_a_slider_obeys_its_law(mu, friction, speed):
 
 @pytest.mark.parametrize("angle", [5.0, 20.0, 26.5, 26.6, 30.0, 40.0])
 def test_a_cube_on_a_ramp_slides_with_the_speed_of_the_textbook(angle):
-    case = hard.ramp(angle=angle)
+    case = ramp(angle=angle)
     a = np.deg2rad(angle)
     v = case.problem.velocity(case.reference.impulse)[0]
     expected = build.FALL * max(0.0, np.sin(a) - 0.5 * np.cos(a))
@@ -128,16 +137,16 @@ def test_a_cube_on_a_ramp_slides_with_the_speed_of_the_textbook(angle):
 
 def test_the_threshold_is_between_stick_and_slip():
     for above, state in ((-1e-9, "stick"), (1e-9, "slip")):
-        case = hard.threshold(above=above)
+        case = threshold(above=above)
         w = case.problem.slack(case.reference.impulse)
-        assert hard.contact_states(case.problem, case.reference.impulse, tol=1e-12) == [state]
+        assert contact_states(case.problem, case.reference.impulse, tol=1e-12) == [state]
         assert np.hypot(w[1], w[2]) == pytest.approx(max(0.0, above) * 0.5 * build.FALL, abs=1e-17)
 
 
 @pytest.mark.parametrize("ratio", [0.1, 1.0, 10.0, 100.0, 1e6])
 @pytest.mark.parametrize("speed", [0.1, 0.6, 3.0, 100.0])
 def test_anisotropic_sliding_opposes_the_slip(ratio, speed):
-    case = hard.anisotropic(ratio=ratio, speed=speed)
+    case = anisotropic(ratio=ratio, speed=speed)
     lam = case.reference.impulse
     w = case.problem.slack(lam)
     size = np.hypot(lam[1], lam[2])
@@ -152,29 +161,29 @@ def test_anisotropic_sliding_opposes_the_slip(ratio, speed):
 
 
 def test_painleve_has_three_solutions_and_each_is_named():
-    problem = hard.painleve().problem
+    problem = painleve().problem
     a = problem.dense()
     assert a[0, 0] - 2.0 * a[0, 1] < 0.0  # the condition of the paradox
-    found = hard.painleve_solutions(problem)
+    found = painleve_solutions(problem)
     assert set(found) == {"open", "stick", "slip +"}
     for state, lam in found.items():
         judged = lv.residual(problem, lam)
         assert judged.relative <= max(1e-15, 2.0 * judged.floor), state
-        assert hard.contact_states(problem, lam) == [state.split()[0]]
+        assert contact_states(problem, lam) == [state.split()[0]]
     # And there is no other: on a grid of impulses within the cone, the error vanishes only near those.
     n, t = np.meshgrid(np.linspace(0.0, 1.5, 151), np.linspace(-1.0, 1.0, 81))
     for x, y in zip(n.ravel(), (2.0 * n * t).ravel(), strict=True):
         near = min(np.hypot(x - lam[0], y - lam[1]) for lam in found.values())
         if near > 0.05:
             assert lv.residual(problem, [x, y]).energy > 1e-3
-    assert set(hard.painleve_solutions(hard.painleve(slide=0.5).problem)) == {"open"}
+    assert set(painleve_solutions(painleve(slide=0.5).problem)) == {"open"}
 
 
 def test_states_of_contacts_of_every_size():
     normals = lv.Problem.contact(np.eye(2), [1.0, -1.0], [0.0, 0.0])
-    assert hard.contact_states(normals, [1.0, 0.0]) == ["stick", "open"]
+    assert contact_states(normals, [1.0, 0.0]) == ["stick", "open"]
     mixed = suite.pyramid(2, friction="coulomb").problem
-    assert hard.contact_states(mixed, np.zeros(mixed.m)) == ["open"] * mixed.n_blocks
+    assert contact_states(mixed, np.zeros(mixed.m)) == ["open"] * mixed.n_blocks
 
 
 @pytest.mark.parametrize(

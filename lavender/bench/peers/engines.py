@@ -26,7 +26,7 @@ from lavender.problem import Problem
 from lavender.residuals import residual
 from lavender.scene import Body, Box, Plane, Scene, Sphere
 
-__all__ = ["ENGINES", "SCENES", "Step", "export", "run"]
+__all__ = ["ENGINES", "SCENES", "Step", "export", "measure_scene"]
 
 DT = 1.0 / 240.0
 NAN = float("nan")
@@ -311,7 +311,7 @@ def _engines(scene: str, sweeps: int, names: Sequence[str]) -> Iterator[list[Eng
             engine.close()
 
 
-def run(
+def measure_scene(
     scene: str,
     sweeps: int = 16,
     *,

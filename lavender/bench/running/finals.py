@@ -119,7 +119,7 @@ def finals(
                 sequences.setdefault(item.sequence, []).append((item, info))
         for part in (*parts, *sequences.values()):
             share = len(part) / len(described)
-            stage.run(part, share * STAGE * plan.time_limit, share * SPARE)
+            stage.measure_part(part, share * STAGE * plan.time_limit, share * SPARE)
             for item, _ in part:
                 item.forget()
     return known
@@ -134,7 +134,7 @@ class _Stage:
                 runner.out.add(record)
                 runner.tell(record.case, record.solver, record, True)
 
-    def run(self, part: Cases, limit: float, spare: float) -> None:
+    def measure_part(self, part: Cases, limit: float, spare: float) -> None:
         """All repetitions over a part of the cases, or over one sequence, in a time [s] and one for more than usual."""
         steps = bool(part[0][0].sequence)
         mine = [a for a in self.asks if a.way == "batch" or (a.way == "steps") == steps]
@@ -148,7 +148,7 @@ class _Stage:
             order = mine[turn % len(mine) :] + mine[: turn % len(mine)] if mine else []
             if steps:
                 for ask in order:
-                    self.walk(ask, taken[ask], made)
+                    self.run_pass(ask, taken[ask], made)
             else:
                 for item, info in part:
                     for ask in order:
@@ -178,7 +178,7 @@ class _Stage:
         self.runner.tell(info.case, ask.solver, record)
         return record, after
 
-    def walk(self, ask: Ask, steps: Cases, made: Made) -> None:
+    def run_pass(self, ask: Ask, steps: Cases, made: Made) -> None:
         if ask.way == "batch" or all(
             ask.task(info, self.runner.plan, self.turns).key in self.known for _, info in steps
         ):

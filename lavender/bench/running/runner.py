@@ -229,12 +229,12 @@ class _Runner:
             else:
                 for what in passes(self.plan, spec):
                     self.tell(items[0].sequence, name)
-                    self.walk(steps, spec, *what)
+                    self.run_pass(steps, spec, *what)
             self.done += len(steps)
         for item in items:
             item.forget()
 
-    def walk(
+    def run_pass(
         self,
         steps: list[tuple[Item, CaseInfo]],
         spec: SolverSpec,

@@ -41,7 +41,7 @@ from lavender.report.tables.means import (
     profiles,
     times_to,
 )
-from lavender.report.tables.sequences import Walk, by_sequence, walks
+from lavender.report.tables.sequences import Pass, by_sequence, passes
 
 __all__ = [
     "NOISE",
@@ -54,12 +54,12 @@ __all__ = [
     "Failure",
     "Final",
     "Line",
+    "Pass",
     "Profile",
     "Race",
     "Reach",
     "Robustness",
     "Spread",
-    "Walk",
     "advice",
     "advice_by_level",
     "advice_by_sequence",
@@ -80,6 +80,7 @@ __all__ = [
     "limit_of",
     "over_steps",
     "pairs",
+    "passes",
     "profiles",
     "quantile",
     "reaches",
@@ -88,6 +89,5 @@ __all__ = [
     "time_budgets",
     "times_to",
     "to_level",
-    "walks",
     "within",
 ]

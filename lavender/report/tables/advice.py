@@ -12,7 +12,7 @@ from lavender.bench.record import Record
 from lavender.bench.store import Records
 from lavender.report.tables.groups import families, levels_of, pairs
 from lavender.report.tables.means import SHIFT, geometric_mean, limit_of, times_to
-from lavender.report.tables.sequences import Walk, by_sequence
+from lavender.report.tables.sequences import Pass, by_sequence
 
 __all__ = [
     "Advice",
@@ -114,7 +114,7 @@ class Line:
 def advice(records: Records, times: Sequence[float] = ()) -> list[Line]:
     """Every recommendation: structures, then sequences; at each level, within each time [s], with each budget."""
     times = tuple(times) or time_budgets(records)
-    steps = {name: walks[0].steps for name, walks in by_sequence(records).items()}
+    steps = {name: passes[0].steps for name, passes in by_sequence(records).items()}
     sizes = {name: len(cases) for name, cases in families(records).items()}
     steps_level, steps_time = advice_by_sequence(records, times)
     found: dict[str, list[dict[float, Advice]]] = defaultdict(lambda: [{}, {}, {}])
@@ -187,10 +187,10 @@ def time_budgets(records: Records) -> tuple[float, ...]:
     levels = levels_of(records)
     level = levels[len(levels) // 2]
     fastest = [min(by.values()) for by in times_to(records, level).values() if by]
-    for walks in by_sequence(records).values():
+    for passes in by_sequence(records).values():
         reached = [
             median(w.times[start])
-            for w in walks
+            for w in passes
             for start, residuals in w.residuals.items()
             if len(residuals) == w.steps and max(residuals) <= level
         ]
@@ -320,23 +320,23 @@ def advice_by_sequence(records: Records, times: Sequence[float] = ()) -> tuple[l
     """For each sequence, by level and by time of a step: which solver and budget, carried or cold; see `over_steps`."""
     times = tuple(times) or time_budgets(records)
     found = [
-        over_steps(name, walks, levels_of(records), times) for name, walks in by_sequence(records).items()
+        over_steps(name, passes, levels_of(records), times) for name, passes in by_sequence(records).items()
     ]
     return [a for some, _ in found for a in some], [a for _, some in found for a in some]
 
 
 def over_steps(
-    name: str, walks: Sequence[Walk], levels: Sequence[float], times: Sequence[float]
+    name: str, passes: Sequence[Pass], levels: Sequence[float], times: Sequence[float]
 ) -> tuple[list[Advice], list[Advice]]:
-    """Who brings the steps of these walks to each level, and who comes closest in each time [s] of a step.
+    """Who brings the steps of these passes to each level, and who comes closest in each time [s] of a step.
 
     To a level, by those that were asked for it or have a budget: who brings most steps there, then the geometric mean
     of their times. In a time: who serves most steps, then the residual at the 90th percentile; a step that was not
     solved or took longer counts 1. A false claim on any step comes last. Steps of several sequences count together.
     """
-    whole = sum({w.sequence: w.steps for w in walks}.values())
-    ways: dict[tuple[str, str, str], list[Walk]] = defaultdict(list)
-    for w in walks:
+    whole = sum({w.sequence: w.steps for w in passes}.values())
+    ways: dict[tuple[str, str, str], list[Pass]] = defaultdict(list)
+    for w in passes:
         for start in w.residuals:
             ways[w.solver, w.asked, start].append(w)
     by_level: list[Advice] = []

@@ -42,25 +42,25 @@ NOISE = 1.25  # a factor of time below which nothing is said: what a busy machin
 def changes(old: Records, new: Records) -> list[Change]:
     """Time to each level in two runs, on the cases whose numbers are the same in both.
 
-    Noise is at least `NOISE`, and at least twice the spread between minimum and median of either run. Earlier times are
+    Noise is at least `NOISE`, and at least twice the ratio between minimum and median of either run. Earlier times are
     in what the machine is worth now: multiplied by the drift of the case, where both runs know it.
     """
     levels = levels_of(new)
     same = {name for name, info in new.cases.items() if name in old.cases and old.cases[name].sha == info.sha}
     before = {(r.case, r.solver, r.start): r for r in reaches(old, levels)}
-    spread: dict[tuple[str, str, str], float] = defaultdict(lambda: 1.0)
+    jitter: dict[tuple[str, str, str], float] = defaultdict(lambda: 1.0)
     for records in (old, new):
         for key, group in pairs(records).items():
             for r in group:
                 if r.usable and r.time_min > 0.0:
-                    spread[key] = max(spread[key], r.time_median / r.time_min)
+                    jitter[key] = max(jitter[key], r.time_median / r.time_min)
     out = []
     for row in reaches(new, levels):
         key = (row.case, row.solver, row.start)
         if row.case not in same or key not in before:
             continue
         worth = drift(old, new, row.case)
-        noise = max(NOISE, 1.0 + 2.0 * (spread[key] - 1.0))
+        noise = max(NOISE, 1.0 + 2.0 * (jitter[key] - 1.0))
         out += [Change(*key, x, worth * before[key].times[x], row.times[x], noise) for x in levels]
     return out
 

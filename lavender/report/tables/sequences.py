@@ -11,11 +11,11 @@ from statistics import median
 from lavender.bench.record import Record, level_name
 from lavender.bench.store import Records
 
-__all__ = ["Walk", "by_sequence", "walks"]
+__all__ = ["Pass", "by_sequence", "passes"]
 
 
 @dataclass(frozen=True)
-class Walk:
+class Pass:
     """One solver over one sequence at one budget or level: cold, and with its impulses carried along."""
 
     sequence: str
@@ -54,7 +54,7 @@ class Walk:
         return median(c / w for c, w in pairs) if pairs else math.nan
 
 
-def walks(records: Records) -> list[Walk]:
+def passes(records: Records) -> list[Pass]:
     """Sequences: total time and iterations, residual of each step, carried against cold."""
     groups: dict[tuple[str, str, str, float, int], dict[str, list[Record]]] = defaultdict(
         lambda: defaultdict(list)
@@ -69,7 +69,7 @@ def walks(records: Records) -> list[Walk]:
         for group in by_start.values():
             group.sort(key=lambda r: r.step)
         out.append(
-            Walk(
+            Pass(
                 *key,
                 steps=steps[key[0]],
                 times={s: tuple(_step_time(r) for r in g) for s, g in by_start.items()},
@@ -86,9 +86,9 @@ def _step_time(r: Record) -> float:
     return r.time_min if math.isfinite(r.time_min) else r.time_limit
 
 
-def by_sequence(records: Records) -> dict[str, list[Walk]]:
-    """Walks of each sequence."""
-    out: dict[str, list[Walk]] = defaultdict(list)
-    for walk in walks(records):
-        out[walk.sequence].append(walk)
+def by_sequence(records: Records) -> dict[str, list[Pass]]:
+    """Passes over each sequence."""
+    out: dict[str, list[Pass]] = defaultdict(list)
+    for one in passes(records):
+        out[one.sequence].append(one)
     return dict(out)
