@@ -1,4 +1,4 @@
-"""Every reference problem loads, its stored solution passes the judge; without friction and with rolling it is solved."""
+"""Every reference problem loads and its stored solution passes the judge; those without friction, or rolling, are solved."""
 
 import os
 from pathlib import Path
