@@ -79,7 +79,7 @@ class Process:
     @property
     def alive(self) -> bool:
         """It was started, not ended, and has not ended."""
-        return self._process is not None and self._process.poll() is None
+        return self._process is not None and _ended(self._process, 0.0) is None
 
     def start(self) -> str:
         """Start it where it does not run, and wait until it is ready; why it is not, or nothing."""
@@ -223,6 +223,8 @@ class Process:
 
 def _ended(process: subprocess.Popen[bytes], limit: float) -> int | None:
     """Exit status of a process, -N for signal N; None where it runs on. It is not reaped: its group may live."""
+    if process.returncode is not None:
+        return process.returncode
     if not GROUPS or not hasattr(os, "waitid"):
         with contextlib.suppress(subprocess.TimeoutExpired):
             return process.wait(limit)
@@ -233,6 +235,6 @@ def _ended(process: subprocess.Popen[bytes], limit: float) -> int | None:
             found = os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT | os.WNOHANG)
             if found is not None:
                 return found.si_status if found.si_code == os.CLD_EXITED else -found.si_status
-        if time.monotonic() > until:
+        if time.monotonic() >= until:
             return None
         time.sleep(0.01)
