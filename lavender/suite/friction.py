@@ -7,7 +7,6 @@ from decimal import Decimal, localcontext
 import numpy as np
 
 from lavender._arrays import FloatArray
-from lavender.cones import ROW
 from lavender.errors import InputError
 from lavender.problem import Problem
 from lavender.suite.build import FALL, Bodies, Contacts, contact_problem, manifold
@@ -172,22 +171,6 @@ def painleve_solutions(problem: Problem) -> dict[str, FloatArray]:
     return found
 
 
-def contact_states(problem: Problem, impulse: FloatArray, tol: float = 1e-9) -> list[str]:
-    """Each contact's state at an impulse (m,) [N s]: "open", "stick" or "slip"."""
-    c = problem.cones
-    lam = np.asarray(impulse, float)
-    size = max(float(np.abs(lam).max(initial=0.0)), 1e-300)
-    out = []
-    for i in np.flatnonzero(c.kind != ROW):
-        part = lam[c.ptr[i] : c.ptr[i + 1]][: 1 + int(c.n_tangents[i])]
-        if part[0] <= tol * size:
-            out.append("open")
-        else:
-            edge = np.linalg.norm(part[1:]) >= (1.0 - tol) * c.mu[i] * part[0]
-            out.append("slip" if len(part) > 1 and edge else "stick")
-    return out
-
-
 @family()
 def arch(n: int = 9, mu: float = 0.6) -> Draft:
     """n voussoirs of a half circle (radius 5 m, 1 m thick), four points between neighbours."""
@@ -259,7 +242,6 @@ __all__ = [
     "anisotropic",
     "arch",
     "card_house",
-    "contact_states",
     "painleve",
     "painleve_solutions",
     "ramp",
