@@ -279,7 +279,9 @@ def _lower(mass: Any, names: Sequence[str] | None) -> tuple[Compressed, int]:
     allowed = ASYMMETRY32 if precision_of(*blocks) == "float32" else ASYMMETRY
     if isinstance(mass, (list, tuple)) and all(np.ndim(block) == 2 for block in mass) and mass:
         given = [as_array(f"block {i} of M", block, (None, None)) for i, block in enumerate(mass)]
-        mass = sp.block_diag(given, format="csr")
+        mass = sp.block_diag(
+            [sp.coo_array(block) for block in given], format="csr"
+        )  # dense ones warn from SciPy 1.18 on
     if not sp.issparse(mass):
         dense = borrowed("M", mass, (None, None))
         n = len(dense)

@@ -526,7 +526,7 @@ def _mass(problem: Problem) -> tuple[sp.csr_array, FloatArray]:
     blocks = np.zeros((rows.n_bodies, 6, 6))
     blocks[:, :3, :3] = np.eye(3) / rows.inv_mass[:, None, None]
     blocks[:, 3:, 3:] = 0.5 * (inertia + inertia.transpose(0, 2, 1))
-    mass = sp.csr_array(sp.block_diag(list(blocks), format="csr"))
+    mass = sp.csr_array(sp.block_diag([sp.coo_array(block) for block in blocks], format="csr"))
     mass.eliminate_zeros()
     return mass, rows.v_free.ravel()
 

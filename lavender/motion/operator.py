@@ -196,7 +196,9 @@ class _Velocities(_Factored):
         back = np.argsort(np.concatenate(places)) if places else np.zeros(0, np.intp)
         empty = sp.csr_array((general.nv, general.nv))
         minv, off = (
-            sp.csr_array(sp.csr_array(sp.block_diag(x))[back][:, back]) if x else empty
+            sp.csr_array(sp.csr_array(sp.block_diag(list(map(sp.coo_array, x))))[back][:, back])
+            if x
+            else empty
             for x in (blocks, offs)
         )
         super().__init__(problem, minv, off)

@@ -1,15 +1,21 @@
 """Threads: a problem is shared freely, a prepared solver serves one of them at a time and says so."""
 
+import subprocess
 import sys
+import sysconfig
 import threading
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import numpy as np
 import pytest
 from random_problems import as_matrix, random_contact_problem, random_lcp
 
 import lavender as lv
+import lavender_ext
 from lavender.errors import InUse
+
+KERNELS = Path(lavender_ext.__file__).parent
 
 
 def test_a_prepared_solver_refuses_a_second_thread():
@@ -55,6 +61,41 @@ def at_once(function, n=8):
 
     with ThreadPoolExecutor(n) as pool:
         return [future.result() for future in [pool.submit(run) for _ in range(n)]]
+
+
+@pytest.mark.skipif(not sysconfig.get_config_var("Py_GIL_DISABLED"), reason="this Python has a GIL")
+def test_where_there_is_no_gil_no_kernel_brings_it_back():
+    modules = [".".join(p.relative_to(KERNELS.parent).with_suffix("").parts) for p in KERNELS.rglob("*.pyx")]
+    code = f"""
+import importlib, sys
+import lavender
+for name in {modules}:
+    importlib.import_module(name)
+    assert not sys._is_gil_enabled(), name
+"""
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-c", code], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+
+
+def test_every_solver_in_threads_at_once_has_the_bits_of_one_by_one():
+    """Each thread a problem of its own, of another form and size: nothing is shared but the kernels."""
+    jobs = [
+        (seed, form, name)
+        for seed in range(3)
+        for form in ("rows", "matrix")
+        for name in lv.available(unseen(seed, form), external=False)
+    ]
+
+    def solved(job):
+        seed, form, name = job
+        return lv.solve(unseen(seed, form), name, max_iter=200).impulse.tobytes()
+
+    alone = [solved(job) for job in jobs]
+    with ThreadPoolExecutor(8) as pool:
+        beside = list(pool.map(solved, jobs))
+    assert [job for job, one, other in zip(jobs, alone, beside, strict=True) if one != other] == []
 
 
 @pytest.fixture
