@@ -3,6 +3,7 @@
 import itertools
 from dataclasses import replace
 
+import hostile
 import numpy as np
 import pytest
 import scipy.sparse as sp
@@ -579,3 +580,22 @@ def test_a_snapshot_of_another_shape_is_refused():
     np.testing.assert_array_equal(again.step()[0]["positions"], sims[1].step()[0]["positions"])
     with pytest.raises(lv.InputError):
         sims[0].restore(state)
+
+
+@pytest.mark.parametrize("name", sorted(n for n in OURS if registry.specs()[n].boxes))
+def test_unpleasant_boxes_come_back_with_a_result(name):
+    spec, taken = registry.specs()[name], 0
+    for seed in range(400):
+        problem = hostile.draw(seed)[0]
+        c = problem.cones
+        if problem.law not in LAWS or np.any((c.n_tangents > 1) & (c.kind != lv.CONTACT)):
+            continue
+        c = c.shaped("box")
+        ratio = np.random.default_rng(seed).choice([1.0, 0.0, 0.5, 1e-12, 1e12], c.n_blocks)
+        problem = replace(
+            problem, cones=replace(c, patch_radius=np.where(c.kind == lv.CONTACT_BOX, ratio, c.patch_radius))
+        )
+        if c.has_box and spec.refuses(problem) is None:
+            taken += 1
+            assert not lv.solve(problem, name, tol=1e-8, max_iter=300).contradicted, (seed, problem)
+    assert taken > 10
