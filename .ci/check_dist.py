@@ -51,14 +51,20 @@ def problems(in_sdist: set[str], in_wheel: set[str]) -> list[str]:
         found += [] if name in in_sdist else [f"sdist lacks {name}"]
     found += [f"wheel lacks {name}" for name in sorted(sources - in_wheel)]
     found += [f"wheel lacks the compiled module {name}" for name in sorted(kernels - modules)]
-    for path in (f"lavender/web/{name}.wasm" for name in WASM["PARTS"]):
+    for path in ("lavender/export/c/lavender.c", *(f"lavender/web/{name}.wasm" for name in WASM["PARTS"])):
         found += [] if path in in_sdist else [f"sdist lacks {path}"]
         found += [] if path in in_wheel else [f"wheel lacks {path}"]
     if not any(name.endswith("/licenses/LICENSE") for name in in_wheel):
         found.append("wheel lacks LICENSE")
-    built = in_sdist - {"tests/parity/driver.c"}  # the one file of C that is written by hand
+    ours = (
+        "lavender/export/",
+        "examples/",
+        "tests/parity/driver.c",
+    )  # C that is written by hand, and the library
+    built = {name for name in in_sdist if not name.startswith(ours)}
     left = [f"sdist holds {name}" for name in built if name.endswith((".c", ".h", ".so", ".pyc", ".o"))]
-    left += [f"wheel holds {name}" for name in in_wheel if name.endswith((".c", ".h", ".pyc", ".o"))]
+    kept = {name for name in in_wheel if not name.startswith(ours)}
+    left += [f"wheel holds {name}" for name in kept if name.endswith((".c", ".h", ".pyc", ".o"))]
     left += [f"wheel holds {name}" for name in in_wheel if name.split("/")[0] in {"tests", "build", "docs"}]
     return found + sorted(left)
 

@@ -23,7 +23,7 @@ def _bare(header: str) -> str:
 
 def constants(header: str) -> dict[str, int]:
     """Numbers of the enums by name."""
-    found = {}
+    found: dict[str, int] = {}
     for body in re.findall(r"enum \{(.*?)\};", _bare(header), re.DOTALL):
         found |= {name: int(value) for name, value in re.findall(r"(\w+)\s*=\s*(-?\d+)", body)}
     return found

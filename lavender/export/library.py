@@ -52,9 +52,7 @@ def source() -> str:
 
 def _files(folder: Path) -> Iterator[Path]:
     return (
-        p
-        for p in sorted(folder.rglob("*"))
-        if p.is_file() and p.name != "lavender.c" and "target" not in p.parts
+        p for p in sorted(folder.rglob("*")) if p.suffix in TEXTS and p.name != "lavender.c" and p.is_file()
     )
 
 
@@ -103,7 +101,8 @@ def _module(out: Path, header: str) -> Path:
     """The library as a WebAssembly module: the one that came with the package, or a new one."""
     kept, text = HERE / "js" / out.name, source()
     stamp = hashlib.sha256(text.encode()).hexdigest()
-    if kept.exists() and kept.with_suffix(".sha256").read_text(encoding="utf-8") == stamp:
+    made_of = kept.with_suffix(".sha256")
+    if kept.exists() and made_of.exists() and made_of.read_text(encoding="utf-8") == stamp:
         out.write_bytes(kept.read_bytes())
         return out
     with TemporaryDirectory() as folder:
@@ -117,7 +116,7 @@ def _module(out: Path, header: str) -> Path:
             raise LavenderError(str(error)) from None
     with contextlib.suppress(OSError):  # a package that nobody may write into
         kept.write_bytes(out.read_bytes())
-        kept.with_suffix(".sha256").write_text(stamp, encoding="utf-8")
+        made_of.write_text(stamp, encoding="utf-8")
     return out
 
 

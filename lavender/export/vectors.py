@@ -47,7 +47,8 @@ def write(path: Path, out: Path, solver: str | None, most: int, *, replace: bool
     """
     records = read(path)
     record = chosen(records, solver)
-    packed, left = [], []
+    packed: list[bytes] = []
+    left: list[str] = []
     for name in dict.fromkeys(r.case for r in records if r.solver == record.solver and r.success):
         if len(packed) < most:
             try:

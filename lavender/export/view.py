@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from lavender.bench.line import C_METHODS as METHODS
+from lavender.cones import CONTACT_SPIN
 from lavender.errors import InputError
 from lavender.problem import Problem
 
@@ -46,8 +47,8 @@ def view(problem: Problem) -> View:
         Round cones; generalised velocities in an order of lavender's own.
     """
     c = problem.cones
-    if c.has_round:
-        raise NotTaken("round cones of more than two tangents are not in the library")
+    if max(c.kind, default=0) > CONTACT_SPIN:
+        raise NotTaken("of blocks the library has rows, contacts of up to two tangents, and such with spin")
     arrays: dict[str, Any] = dict.fromkeys(ARRAYS)
     arrays |= {"block_ptr": c.ptr, "kind": c.kind, "lower": c.lower, "upper": c.upper, "mu": c.mu}
     arrays |= {"patch_radius": c.patch_radius, "b": problem.b, "impulse": problem.guess}

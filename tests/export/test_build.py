@@ -1,11 +1,9 @@
 """What is written builds: as C11 and C++17 without a warning, by CMake, in Rust and JavaScript, with one hash."""
 
-import os
 import re
 import shutil
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -164,23 +162,6 @@ def test_address_and_undefined_sanitizers_have_nothing_to_say(folder, compiler, 
     check = export.library.HERE / "front" / "check.c"
     run(compiler, *flags, "-I", folder, folder / "lavender.c", check, "-lm", "-o", tmp_path / "check")
     run(tmp_path / "check", cwd=tmp_path, env={"ASAN_OPTIONS": "detect_leaks=0"})
-
-
-@pytest.mark.slow
-def test_box2d_with_its_solver_replaced(folder, shared, compiler, tmp_path):
-    source = os.environ.get("LAVENDER_BOX2D", "")
-    if not source:
-        pytest.skip("LAVENDER_BOX2D does not name a copy of Box2D's source (v3)")
-    example = export.library.ROOT / "examples" / "box2d_tower.c"
-    parts = sorted(Path(source, "src").glob("*.c"))
-    where = ["-I", folder, "-I", Path(source, "include"), "-I", Path(source, "src")]
-    link = [shared, f"-Wl,-rpath,{shared.parent}", "-lm", "-lpthread"]
-    run(compiler, "-std=gnu17", "-O1", "-w", *where, example, *parts, *link, "-o", tmp_path / "tower")
-    said = run(tmp_path / "tower", "newton", "12", "300").splitlines()
-    theirs, ours = (float(re.search("worst ([^;]+);", line)[1]) for line in said)
-    assert ours <= 1e-6 < theirs
-    top = float(re.search(r"top at \(\S+ (\S+)\)", said[1])[1])
-    assert abs(top - 11.5) < 0.02  # it stands: twelve boxes of 1 m, the last one's centre
 
 
 def write_vectors(out):

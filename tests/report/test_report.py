@@ -226,6 +226,10 @@ def test_one_sentence_and_a_line_to_copy_come_first(tmp_path):
     assert said.code == (  # records of old: of prepare and solve
         'lv.solve(problem, "auto", tol=1e-6)  # not timed as a line: 12.7 ms, one call',
         'lv.solve(problem, "pgs", tol=0, max_iter=8)  # not timed as a line: 100 µs, for 1.00 ms',
+        (
+            "# in C (lavender export c): lav_default_options(LAV_PGS, &options), lav_default_budget(&budget), "
+            "budget.tol = 0, budget.iterations = 8, lav_run(solver, &budget, &result);"
+        ),
     )
     assert said.leaders == ("auto", "pgs")
     text = html.unescape(report.write(found, tmp_path, figures=False, times=[1e-3, 1.0]).read_text())
