@@ -1,1 +1,1 @@
-"""Newton systems of the whole problem: block Cholesky and LU, interior point steps, natural maps."""
+"""Newton's method, turn by turn: systems of bodies or rows, interior points, exchanges, rounds, what is tried when."""
