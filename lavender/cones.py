@@ -103,11 +103,12 @@ class Cones:
     upper: FloatArray  # (m,) N s, read on ROW blocks, +inf allowed
     mu: FloatArray  # (k,) -, read on contacts
     patch_radius: FloatArray  # (k,) m, read on contacts with spin; on CONTACT_BOX mu_2 / mu_1
-    rolling: FloatArray = None  # type: ignore[assignment]  # (k,) m, read on CONTACT_ROLLING; None: 0
+    rolling: FloatArray = ()  # type: ignore[assignment]  # (k,) m, read on CONTACT_ROLLING; (): 0
     _blocks: ClassVar[kernels.Blocks]  # of an instance: the same arrays, as kernels read them
 
     def __post_init__(self) -> None:
-        if self.rolling is None:
+        given: Any = self.rolling
+        if isinstance(given, tuple) and not given:
             self.__dict__["rolling"] = np.zeros(np.size(self.kind))
         made = kernels.private(
             self.ptr, self.kind, self.lower, self.upper, self.mu, self.patch_radius, self.rolling

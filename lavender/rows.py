@@ -217,10 +217,10 @@ class Rows:
                 turn_a, turn_b = np.cross(self.arm_a[has], axis[has]), np.cross(self.arm_b[has], axis[has])
             dense[first[has] + row] = np.hstack([-axis[has], -turn_a, axis[has], turn_b])
         turning, rolling = cones.spin_rows[self.n_joints :], cones.rolling_rows[self.n_joints :]
-        for axis, row in ((self.normal, turning), (self.tangent, rolling), (t2, rolling + (rolling >= 0))):
-            has = np.flatnonzero(row >= 0)
-            dense[row[has]] = 0.0
-            dense[row[has], 3:6], dense[row[has], 9:12] = -axis[has], axis[has]
+        for axis, at in ((self.normal, turning), (self.tangent, rolling), (t2, rolling + (rolling >= 0))):
+            has = np.flatnonzero(at >= 0)
+            dense[at[has]] = 0.0
+            dense[at[has], 3:6], dense[at[has], 9:12] = -axis[has], axis[has]
         keep = np.repeat(body >= 0, 6, axis=1) & (dense != 0.0)
         columns = (6 * body[:, [0, 1], None] + np.arange(6)).reshape(m, 12)
         indptr = np.concatenate([[0], np.cumsum(keep.sum(axis=1))])

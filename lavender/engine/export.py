@@ -66,7 +66,7 @@ def problem_of(state: State, bodies: Sequence[str], joints: Sequence[str], name:
         upper=upper,
         mu=a["mu"][:k].copy(),
         patch_radius=a["patch_radius"][:k].copy(),
-        rolling=a["rolling"][:k].copy() if len(a["rolling"]) else None,
+        rolling=a["rolling"][:k].copy() if len(a["rolling"]) else np.zeros(k),
     )
     guess = a["impulse"][:m].copy() if state.head[HEAD["warm_start"]] else None
     return Problem(

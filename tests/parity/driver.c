@@ -13,7 +13,7 @@
 #include <string.h>
 
 typedef struct { int32_t n_blocks, n_rows, law; const int32_t *ptr, *kind; const double *lower, *upper, *mu, *patch_radius,
-                 *b, *d, *nu, *step; } blocks_t;
+                 *b, *d, *nu, *step, *rolling; } blocks_t;
 typedef struct { const int32_t *indptr, *indices; const double *data; } csr_t;
 typedef struct { int32_t n_bodies, n_joints, n_contacts; const double *jac, *minv_jac; const int32_t *joint_body;
                  const double *normal, *tangent, *arm_a, *arm_b; const int32_t *contact_body;
