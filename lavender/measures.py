@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lavender._arrays import ArrayLike, FloatArray
-from lavender.cones import CONTACT_BOX, ROUND, ROW
+from lavender.cones import ROUND, ROW
 from lavender.errors import InputError
 from lavender.problem import Problem
 

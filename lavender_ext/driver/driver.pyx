@@ -1,5 +1,4 @@
 """Room, start and step of the methods, for any host; the same from Python for tests."""
-from libc.math cimport sqrt
 from libc.stdint cimport int32_t, int64_t
 from libc.string cimport memset
 
@@ -20,16 +19,17 @@ from lavender_ext.generalized.newton cimport solve_island
 from lavender_ext.generalized.sparse cimport PER_COLUMN
 from lavender_ext.judge.measure cimport do_nothing, general_judge, judge_into, reference_of
 from lavender_ext.judge.score cimport are_numbers, score_rows, score_t
+from lavender_ext.newton.bodies cimport (bodies_t, index_room, lay_bodies, lay_pattern, make_pattern, pattern_t,
+                                         real_room)
 from lavender_ext.newton.plan cimport CERTIFICATE, MORE, REACHED, SPENT, STUCK, newton_start, newton_step
 from lavender_ext.newton.run cimport VECTORS, impulse_of, lay_vectors, newton_t
-from lavender_ext.newton.system cimport BODIES, DENSE, dense_room
-from lavender_ext.warm.walk cimport (index_room, lay_numbers, lay_pattern, make_pattern, pattern_t, real_room, walk_t)
+from lavender_ext.newton.system cimport DENSE, dense_room
 
 
 cdef struct state_t:            # at the beginning of the caller's float64
     newton_t n
     scaled_t s
-    walk_t w
+    bodies_t w
     flow_t f
     double* rows                # 4 (rows) of the judge, and its scratch
     double* z                   # (rows)
@@ -151,39 +151,17 @@ cdef inline bint all_move(const blocks_t* p) noexcept nogil:
 
 cdef inline int32_t start_bodies(const view_t* v, const asked_t* o, room_t* r, const double* lam) noexcept nogil:
     cdef state_t* s = <state_t*>r.real
-    cdef newton_t* n = &s.n
     cdef pattern_t a
-    cdef int64_t m = v.p.n_rows, indices = index_room(&v.p, v.r), most
-    cdef double* x
-    cdef double* weights
-    cdef int32_t j
-    cdef bint cones, soft = False
+    cdef int64_t own = state_room() + judge_room(v)
     lay_pattern(&a, r.index, &v.p, v.r)
     make_pattern(&a, &v.p, v.r)
-    most = (state_room() + judge_room(v) + real_room(&a, &v.p, v.r) + (VECTORS + 2) * m + 2 * <int64_t>a.small + 8)
-    if not grant(r, indices + 2 * m + 8, most):
+    if not grant(r, index_room(&v.p, v.r), own + real_room(&a, &v.p, v.r)):
         return ROOM
     vanish(r.real, r.n_real)
     s.rows = r.real + state_room()
-    x = s.rows + judge_room(v)
     reference(v, s)
-    lay_numbers(&s.w, &a, x, &v.p, v.r)
-    x += real_room(&a, &v.p, v.r)
-    lay_vectors(n, x, m)
-    x += VECTORS * m
-    weights = x
-    for j in range(<int32_t>m):
-        weights[j] = sqrt(v.p.nu[j] * v.p.d[j]) * s.w.scale[j]
-        soft = soft or v.r.compliance[j] != 0.0
-    x += m
-    n.keep, n.fixed, n.scale, n.speed = NULL, NULL, s.w.scale, weights
-    cones = s.w.e.n < s.w.e.m
-    n.s.e, n.s.f = &s.w.e, &s.w.f
-    n.s.form, n.s.symmetric, n.s.others = BODIES, 1, NULL
-    n.s.v, n.s.einv, n.s.p, n.s.pair, n.s.y = s.w.v, s.w.einv, s.w.p, x, s.w.y
-    n.s.bt = x + a.small if cones and not soft else NULL
-    n.exchange.side = r.index + indices
-    begin(s, o, lam, v.p.law == COULOMB and cones)
+    lay_bodies(&s.n, &s.w, &a, r.real + own, &v.p, v.r)
+    begin(s, o, lam, v.p.law == COULOMB and s.w.e.n < s.w.e.m)
     return MORE
 
 
@@ -255,7 +233,7 @@ cdef public int32_t lav_room(const view_t* v, const asked_t* o, room_t* r) noexc
         return 1
     if v.r != NULL and all_move(&v.p):
         most = index_room(&v.p, v.r)
-        r.n_index, r.n_real = most + 2 * v.p.n_rows + 8, state_room() + judge_room(v)
+        r.n_index, r.n_real = most, state_room() + judge_room(v)
     return most > 0
 
 

@@ -9,7 +9,7 @@ from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t, int64_t
 from libc.string cimport memset
 
-from lavender_ext.core.block cimport CONTACT, CONTACT_SPIN as SPIN, ROW, blocks_t
+from lavender_ext.core.block cimport CONTACT, CONTACT_SPIN as SPIN, ROW, blocks_t, ends_apart
 from lavender_ext.core.csr cimport csr_t
 from lavender_ext.newton.cones cimport KEPT
 from lavender_ext.newton.elements cimport elements_t
@@ -25,10 +25,10 @@ cdef struct scaled_t:
 
 
 cdef inline bint is_known(const blocks_t* p) noexcept nogil:
-    """Only rows and contacts of up to two tangents, with or without spin."""
+    """Only rows and contacts of up to two tangents, with or without spin, or boxes of them."""
     cdef int32_t i
     for i in range(p.n_blocks):
-        if p.kind[i] != ROW and p.kind[i] != CONTACT and p.kind[i] != SPIN:
+        if p.kind[i] != ROW and p.kind[i] != CONTACT and not ends_apart(p.kind[i]):
             return False
     return True
 
@@ -51,7 +51,7 @@ cdef inline bint stays(const blocks_t* p, const csr_t* a, int32_t i, int32_t j, 
     cdef double x = 0.0, low, high
     at[0] = 0.0
     if not is_row(p, i):
-        return j > p.ptr[i] and (p.mu[i] == 0.0 or (p.kind[i] == SPIN and j == p.ptr[i + 1] - 1
+        return j > p.ptr[i] and (p.mu[i] == 0.0 or (ends_apart(p.kind[i]) and j == p.ptr[i + 1] - 1
                                                     and p.patch_radius[i] == 0.0))
     low, high = low_of(p, i, j), high_of(p, i, j)
     if low == high:
@@ -95,6 +95,8 @@ cdef inline void lay_scaled(scaled_t* s, int64_t m, int32_t* index, double* real
     s.e.as_ = real + 8 * m
     s.e.scaling = real + 9 * m
     s.e.panel = NULL
+    s.e.parts = 2
+    s.e.ar = NULL
     s.e.s = 1
     s.e.n_groups = 0
 
@@ -129,7 +131,7 @@ cdef inline void make_scaled(scaled_t* s, const blocks_t* p, const csr_t* a) noe
                 n += 1
         if m > first + 1 and not is_row(p, i):
             second = s.keep[m - 1]
-            kind[n - 1] = SPIN if p.kind[i] == SPIN and second == p.ptr[i + 1] - 1 else CONTACT
+            kind[n - 1] = SPIN if ends_apart(p.kind[i]) and second == p.ptr[i + 1] - 1 else CONTACT
             at[n - 1] = p.mu[i] * sqrt(p.d[s.keep[first + 1]] / p.d[p.ptr[i]])
             if kind[n - 1] == SPIN:
                 spin[n - 1] = p.mu[i] * p.patch_radius[i] * sqrt(p.d[second] / p.d[p.ptr[i]])

@@ -33,7 +33,7 @@ cpdef enum:                     # how it ended
     JUDGED = 1                  # met tol as it came
     SWEPT = 2                   # met it after some sweeps
     SOLVED = 3                  # met it after one factorisation
-    WALKED = 5                  # met it after the proximal Newton walks of walk.pxd
+    WALKED = 5                  # met it after the proximal Newton walks of substep.pyx
 
 
 cdef struct warm_t:

@@ -4,7 +4,8 @@ After `prepare` and `solve` without sweeps:
 
     index_room      whole numbers that the next call needs
     plan            bands, elements, elimination order; doubles that the next call needs
-    solve           the first phase of `newton` (start.pxd), then walks (walk.pxd); the judge's residual decides
+    solve           the first phase of `newton` (start.pxd), then proximal rounds (newton/phases.pxd) and sweeps; the
+                    judge's residual decides
 
 Natively and in WebAssembly the same lines, the same bits. `newton` itself goes on to interior points where walks end
 short of tol; here the best impulse found stays, and is told as such.
@@ -14,19 +15,28 @@ from libc.stdint cimport int32_t, int64_t, uint64_t
 import numpy as np
 
 from lavender_ext.core.block cimport blocks_t
-from lavender_ext.core.rows cimport rows_t
+from lavender_ext.core.rows cimport relax_rows_block, rows_t
+from lavender_ext.core.velocity cimport rows_velocity
 from lavender_ext.core.weights cimport block_weights, joint_weights
 from lavender_ext.engine.arrays cimport S_OUT, bind, engine_t
 from lavender_ext.engine.view cimport view
-from lavender_ext.warm.start cimport (JUDGED, MOST_TRACED, UNDECIDED, band_width, judged, lay_out, observe, room_of,
-                                      start_errors, warm_solve, warm_t)
-from lavender_ext.warm.walk cimport (index_room, lay_numbers, lay_pattern, make_pattern, pattern_t, real_room,
-                                     solve_with_walks, walk_t)
+from lavender_ext.newton.bodies cimport (bodies_t, index_room, lay_bodies, lay_pattern, make_pattern, pattern_t,
+                                         real_room)
+from lavender_ext.newton.elements cimport MAP_AUGMENTED
+from lavender_ext.newton.phases cimport LIMITLESS, begin_rounds, enter_rounds, go_rounds
+from lavender_ext.newton.run cimport INNER, N_ROUNDS, impulse_of, newton_t
+from lavender_ext.warm.start cimport (JUDGED, MOST_SWEEPS, MOST_TRACED, UNDECIDED, WALKED, band_width, judged, lay_out,
+                                      observe, room_of, scored, start_errors, warm_solve, warm_t)
 
 
 cdef enum:
     HEAD = 4                    # whole numbers before the pattern: width of the band, whether walks apply
     MOST = 2147483647
+    FIRST_STEPS = 20            # factorisations of the first walk
+    NEXT_STEPS = 40             # of each that follows
+    TURNS = 4
+    SMALL = 64                  # rows up to which the first weight is smaller, from `LARGE` on it is larger
+    LARGE = 1000
 
 
 cdef inline int64_t warm_indices(const rows_t* r) noexcept nogil:
@@ -69,11 +79,59 @@ cdef public int32_t lav_newton_plan(const int32_t* size, double* real, int32_t* 
     return <int32_t>room if room < MOST else -1
 
 
+cdef inline void take_best(const rows_t* r, const blocks_t* p, const newton_t* n, double* lam, double* v) noexcept nogil:
+    impulse_of(n, n.best_z, lam)
+    rows_velocity(p, r, lam, v)
+
+
+cdef inline void walk(const blocks_t* p, const rows_t* r, warm_t* s, newton_t* n, double alpha, int32_t limit,
+                      double* lam, double* v) noexcept nogil:
+    """Proximal rounds from lam until the judge is content, `limit` factorisations are spent, or nothing moves."""
+    cdef int32_t j
+    for j in range(p.n_rows):
+        n.trial[j] = lam[j] / n.scale[j]
+    begin_rounds(n, 0, n.trial, MAP_AUGMENTED, alpha, INNER)
+    enter_rounds(n, 0, limit)
+    while n.depth > 0:
+        go_rounds(n, 0)
+        s.factorisations = n.s.factorisations
+        if s.trace != NULL:
+            judged(p, r, s, n.lam, v, n.problem.e0, n.problem.v0)
+
+
+cdef inline int32_t solve_with_walks(const blocks_t* p, const rows_t* r, warm_t* s, newton_t* n, double tol, double* lam,
+                                     double* v) noexcept nogil:
+    """What `warm_solve` has left undecided, also from lam = 0: walks, 64 sweeps from the best between them.
+
+    UNDECIDED where none met tol: lam is then the best that was scored.
+    """
+    cdef int32_t i, k, _
+    cdef double alpha = 1e-5 if p.n_rows <= SMALL else 1e-3 if p.n_rows < LARGE else 1e-2
+    n.tol, n.budget = tol, LIMITLESS
+    n.stop = n.asked = n.proven = n.depth = n.counts[N_ROUNDS] = 0
+    n.best = 1.0 / 0.0
+    for k in range(TURNS):
+        if k > 0:
+            take_best(r, p, n, lam, v)
+            for _ in range(MOST_SWEEPS):
+                for i in range(p.n_blocks):
+                    relax_rows_block(p, r, i, lam, v)
+            s.sweeps += MOST_SWEEPS
+            alpha = 1e-3 if k == 1 else 10.0 * alpha
+        walk(p, r, s, n, alpha, FIRST_STEPS if k == 0 else NEXT_STEPS, lam, v)
+        if n.best <= tol:
+            break
+    take_best(r, p, n, lam, v)
+    s.relative = scored(p, r, s, lam, v, n.problem.e0, n.problem.v0)
+    return WALKED if n.best <= tol else UNDECIDED
+
+
 cdef inline int32_t newton_substep(const blocks_t* p, const rows_t* r, warm_t* s, double tol, int32_t* scratch,
                                    double* room, double* lam, double* v) noexcept nogil:
     cdef int32_t j, how = warm_solve(p, r, s, tol, lam, v, 1)
     cdef double e0 = 1.0, v0 = 1.0
-    cdef walk_t w
+    cdef newton_t n
+    cdef bodies_t w
     cdef pattern_t a
     if how != UNDECIDED or p.n_rows == 0:
         return how
@@ -89,8 +147,9 @@ cdef inline int32_t newton_substep(const blocks_t* p, const rows_t* r, warm_t* s
     if not scratch[1]:
         return UNDECIDED
     lay_pattern(&a, scratch + HEAD, p, r)
-    lay_numbers(&w, &a, room, p, r)
-    return solve_with_walks(p, r, s, &w, tol, lam, v)
+    lay_bodies(&n, &w, &a, room, p, r)
+    n.problem.e0, n.problem.v0 = e0, v0
+    return solve_with_walks(p, r, s, &n, tol, lam, v)
 
 
 cdef public int32_t lav_newton_substep(const int32_t* size, double* real, int32_t* index, uint64_t* keys, double tol,
