@@ -112,7 +112,7 @@ def lines(found: Sequence[Contestant]) -> list[str]:
     """As Markdown."""
     if not found:
         return []
-    head = (
+    first = (
         "recorded",
         "steps",
         "rows",
@@ -122,7 +122,7 @@ def lines(found: Sequence[Contestant]) -> list[str]:
         "worst",
         "early in float32",
     )
-    head = (*head, "fastest here", "time", "worst")
+    head = (*first, "fastest here", "time", "worst")
     out = [f"| {' | '.join(head)} |", "|---" * len(head) + "|"]
     for c in found:
         here = (

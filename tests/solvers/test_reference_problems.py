@@ -1,4 +1,4 @@
-"""Every reference problem loads and its stored solution passes the judge; those without friction, or rolling, are solved."""
+"""Every reference problem loads and its stored solution passes the judge; solvers end on those without friction."""
 
 import os
 from pathlib import Path
