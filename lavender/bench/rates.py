@@ -73,8 +73,8 @@ def fit(curves: Iterable[Curve], problem_of: Callable[[str], Problem]) -> dict[s
     )
     rates["newton"] = {"start": start, "row": dict(zip(KINDS, row, strict=True)), "work": one}
     steps = [(s, c) for s, c in of("newton over velocities") if s.kernel is not None]
-    start, entry, one = _least_squares(steps, lambda s, n: [1.0, n * s.sweep, n * s.velocities])
-    rates["velocities"] = {"start": start, "entry": entry, "work": one}
+    begun, entry, one = _least_squares(steps, lambda s, n: [s.sweep, n * s.read, n * s.velocities])
+    rates["velocities"] = {"start": begun, "entry": entry, "work": one}
     split = of("admm")
     start, factor, one = _least_squares(split, lambda s, n: [1.0, *s.admm(n)], lambda s: formed * s.formed)
     rates["admm"] = {"start": start, "factor": factor, "work": one}
@@ -95,8 +95,11 @@ def fit(curves: Iterable[Curve], problem_of: Callable[[str], Problem]) -> dict[s
 
 
 def _middle(part: list[tuple[Structure, Curve]], pooled: float | None = None) -> float:
-    """Iterations to LEVEL, the median of those that end, drawn towards `pooled` as by LEAST more problems."""
-    ended = [n for n in (curve.iterations(LEVEL) for _, curve in part) if math.isfinite(n)]
+    """Iterations of an island to LEVEL, the median of those that end; `pooled` counts for LEAST problems more."""
+    counts = [
+        (curve.iterations(LEVEL), s.steps if "velocities" in curve.candidate else 1.0) for s, curve in part
+    ]
+    ended = [n / each for n, each in counts if math.isfinite(n)]
     own = max(1.0, float(np.median(ended))) if ended else 1.0
     share = 1.0 if pooled is None else len(ended) / (len(ended) + LEAST)
     return own**share * (1.0 if pooled is None else pooled ** (1.0 - share))

@@ -209,7 +209,7 @@ class Costs:
         """ns that a method which factors takes at least, told by rows alone; inf for sweeps, which take any time."""
         r, law, m = self.rates, self.problem.law, self.structure.m
         if name == "newton" and self.problem.generalized is not None:
-            return float(r["velocities"]["start"])
+            return float(r["velocities"]["start"] * self.structure.sweep)
         if name in ("direct", "newton", "newton over rows"):
             part = r["direct" if name == "direct" else "newton"]
             return float(part["start"] + _of(part["count"], law) * _of(part["row"], law) * m)
@@ -256,9 +256,8 @@ class Costs:
             v = r["velocities"]
             if s.kernel is None:
                 return Cost(float("inf"), 1.0, 1.0)
-            return Cost(
-                v["start"], v["entry"] * s.sweep + v["work"] * s.velocities, _of(v["count"], law) * s.steps
-            )
+            each = v["entry"] * s.read + v["work"] * s.velocities
+            return Cost(v["start"] * s.sweep, each, _of(v["count"], law) * s.steps)
         return self._finite("newton", s.newton)
 
     def _relaxation(self) -> Cost:
