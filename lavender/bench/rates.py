@@ -22,6 +22,7 @@ from lavender.solvers._structure import Structure
 __all__ = ["LEAST", "count_rates", "fit"]
 
 LEAST = 30  # problems that a rate stands on at least
+DRAWN = 10  # problems that the median of all laws counts for beside those of one
 LEVEL = 1e-6  # that counts are for
 POINTS = 5  # of a curve, that are fitted at most
 KINDS = {
@@ -95,13 +96,13 @@ def fit(curves: Iterable[Curve], problem_of: Callable[[str], Problem]) -> dict[s
 
 
 def _middle(part: list[tuple[Structure, Curve]], pooled: float | None = None) -> float:
-    """Iterations of an island to LEVEL, the median of those that end; `pooled` counts for LEAST problems more."""
+    """Iterations of an island to LEVEL, the median of those that end; `pooled` counts for DRAWN problems more."""
     counts = [
         (curve.iterations(LEVEL), s.steps if "velocities" in curve.candidate else 1.0) for s, curve in part
     ]
     ended = [n / each for n, each in counts if math.isfinite(n)]
     own = max(1.0, float(np.median(ended))) if ended else 1.0
-    share = 1.0 if pooled is None else len(ended) / (len(ended) + LEAST)
+    share = 1.0 if pooled is None else len(ended) / (len(ended) + DRAWN)
     return own**share * (1.0 if pooled is None else pooled ** (1.0 - share))
 
 
