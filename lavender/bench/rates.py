@@ -17,6 +17,7 @@ import numpy as np
 from lavender.bench.curves import Curve
 from lavender.problem import Problem
 from lavender.registry import FEW
+from lavender.solvers._plan import READ
 from lavender.solvers._structure import Structure
 
 __all__ = ["LEAST", "count_rates", "fit"]
@@ -74,8 +75,8 @@ def fit(curves: Iterable[Curve], problem_of: Callable[[str], Problem]) -> dict[s
     )
     rates["newton"] = {"start": start, "row": dict(zip(KINDS, row, strict=True)), "work": one}
     steps = [(s, c) for s, c in of("newton over velocities") if s.kernel is not None]
-    begun, entry, one = _least_squares(steps, lambda s, n: [s.sweep, n * s.read, n * s.velocities])
-    rates["velocities"] = {"start": begun, "entry": entry, "work": one}
+    step, entry, one = _least_squares(steps, lambda s, n: [n, READ * s.sweep + n * s.read, n * s.velocities])
+    rates["velocities"] = {"step": step, "entry": entry, "work": one}
     split = of("admm")
     start, factor, one = _least_squares(split, lambda s, n: [1.0, *s.admm(n)], lambda s: formed * s.formed)
     rates["admm"] = {"start": start, "factor": factor, "work": one}
