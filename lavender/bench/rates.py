@@ -17,11 +17,13 @@ import numpy as np
 from lavender.bench.curves import Curve
 from lavender.problem import Problem
 from lavender.registry import FEW
+from lavender.solvers._plan import READ
 from lavender.solvers._structure import Structure
 
 __all__ = ["LEAST", "count_rates", "fit"]
 
 LEAST = 30  # problems that a rate stands on at least
+DRAWN = 10  # problems that the median of all laws counts for beside those of one
 LEVEL = 1e-6  # that counts are for
 POINTS = 5  # of a curve, that are fitted at most
 KINDS = {
@@ -73,8 +75,8 @@ def fit(curves: Iterable[Curve], problem_of: Callable[[str], Problem]) -> dict[s
     )
     rates["newton"] = {"start": start, "row": dict(zip(KINDS, row, strict=True)), "work": one}
     steps = [(s, c) for s, c in of("newton over velocities") if s.kernel is not None]
-    start, entry, one = _least_squares(steps, lambda s, n: [1.0, n * s.sweep, n * s.velocities])
-    rates["velocities"] = {"start": start, "entry": entry, "work": one}
+    step, entry, one = _least_squares(steps, lambda s, n: [n, READ * s.sweep + n * s.read, n * s.velocities])
+    rates["velocities"] = {"step": step, "entry": entry, "work": one}
     split = of("admm")
     start, factor, one = _least_squares(split, lambda s, n: [1.0, *s.admm(n)], lambda s: formed * s.formed)
     rates["admm"] = {"start": start, "factor": factor, "work": one}
@@ -95,10 +97,13 @@ def fit(curves: Iterable[Curve], problem_of: Callable[[str], Problem]) -> dict[s
 
 
 def _middle(part: list[tuple[Structure, Curve]], pooled: float | None = None) -> float:
-    """Iterations to LEVEL, the median of those that end, drawn towards `pooled` as by LEAST more problems."""
-    ended = [n for n in (curve.iterations(LEVEL) for _, curve in part) if math.isfinite(n)]
+    """Iterations of an island to LEVEL, the median of those that end; `pooled` counts for DRAWN problems more."""
+    counts = [
+        (curve.iterations(LEVEL), s.steps if "velocities" in curve.candidate else 1.0) for s, curve in part
+    ]
+    ended = [n / each for n, each in counts if math.isfinite(n)]
     own = max(1.0, float(np.median(ended))) if ended else 1.0
-    share = 1.0 if pooled is None else len(ended) / (len(ended) + LEAST)
+    share = 1.0 if pooled is None else len(ended) / (len(ended) + DRAWN)
     return own**share * (1.0 if pooled is None else pooled ** (1.0 - share))
 
 

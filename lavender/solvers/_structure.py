@@ -201,6 +201,11 @@ class Structure:
         kernel = self.kernel
         return general.factor_flops(self.problem, kernel.largest) / max(1, kernel.islands)
 
+    @property
+    def read(self) -> float:
+        """What it reads beside its factor: a sweep's multiply-adds, of one of the islands."""
+        return self.sweep / max(1, self.kernel.islands)
+
     @cached_property
     def steps(self) -> float:
         """Steps for each that one island takes; free rows that are all soft need no proximal term, so half."""
