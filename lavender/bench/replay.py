@@ -105,7 +105,7 @@ def replayed(
         curve = curves.get("newton over velocities" if over else name)
         if curve is not None and curve.points:
             found.append(Replayed(name, log, costs, curve, level))
-    first_turn(found)  # type: ignore[arg-type]
+    first_turn(found)
     race(list(found), lambda: log.solved)
     return log.seconds if log.solved else math.inf
 
