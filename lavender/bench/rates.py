@@ -20,7 +20,7 @@ from lavender.registry import FEW
 from lavender.solvers._plan import READ
 from lavender.solvers._structure import Structure
 
-__all__ = ["LEAST", "count_rates", "fit"]
+__all__ = ["LEAST", "count_rates", "fit", "gathered"]
 
 LEAST = 30  # problems that a rate stands on at least
 DRAWN = 10  # problems that the median of all laws counts for beside those of one
@@ -32,10 +32,11 @@ KINDS = {
     "coulomb": ("coulomb",),
 }  # of laws, as rates tell them apart
 Terms = list[float]
+Recorded = tuple[Structure, dict[str, Curve]]
 
 
-def fit(curves: Iterable[Curve], problem_of: Callable[[str], Problem]) -> dict[str, Any]:
-    """All rates, as `rates.json` has them.
+def gathered(curves: Iterable[Curve], problem_of: Callable[[str], Problem]) -> list[Recorded]:
+    """Structure and curves, by candidate, of each problem of more than few rows.
 
     Parameters
     ----------
@@ -46,15 +47,15 @@ def fit(curves: Iterable[Curve], problem_of: Callable[[str], Problem]) -> dict[s
     for curve in curves:
         if curve.rows > FEW:  # others are mostly solved in one compiled call
             found.setdefault(curve.case, {})[curve.candidate] = curve
-    structures = {case: Structure(problem_of(case)) for case in found}
+    return [(Structure(problem_of(case)), made) for case, made in found.items()]
+
+
+def fit(cases: Iterable[Recorded]) -> dict[str, Any]:
+    """All rates, as `rates.json` has them, of what `gathered` returned."""
+    cases = list(cases)
 
     def of(*names: str) -> list[tuple[Structure, Curve]]:
-        return [
-            (structures[case], c)
-            for case, made in found.items()
-            for n, c in made.items()
-            if n in names and c.points
-        ]
+        return [(s, c) for s, made in cases for n, c in made.items() if n in names and c.points]
 
     def given(s: Structure, value: float) -> Terms:
         """The value at the place of the problem's law."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import statistics
 from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
@@ -12,8 +13,9 @@ import click
 from lavender.bench import machine
 from lavender.bench.cases import resolve
 from lavender.bench.curves import curves, read, write
-from lavender.bench.rates import count_rates, fit
+from lavender.bench.rates import count_rates, fit, gathered
 from lavender.bench.regret import Regret, regrets, summary
+from lavender.bench.replay import regret
 from lavender.bench.running.campaign import seeds as from_seeds
 from lavender.errors import InputError
 from lavender.io.stored import write_text
@@ -78,7 +80,11 @@ def auto(
         if path is not None and not path.parent.is_dir():
             raise InputError(f"{path}: there is no folder {path.parent}")
     if recorded:
-        found_rates = fit(read(recorded), lambda name: resolve([name])[0].problem)
+        cases_of = gathered(read(recorded), lambda name: resolve([name])[0].problem)
+        found_rates = fit(cases_of)
+        for whose, rates in (("the rates of this version", None), ("the rates fitted now", found_rates)):
+            mean = statistics.geometric_mean(regret(cases_of, rates))
+            click.echo(f"regret on these curves, replayed with {whose}: {mean:.2f} in the mean", err=True)
         text = json.dumps(found_rates, indent=1) + "\n"
         click.echo(text if out is None else f"{count_rates(found_rates)} rates written to {out}")
         if out is not None:

@@ -2,13 +2,14 @@
 
 import json
 import math
+from dataclasses import replace
 
 import pytest
 
 from lavender import suite
 from lavender.bench import rates
 from lavender.bench.curves import Curve, curves, read, write
-from lavender.bench.replay import CALL, replayed
+from lavender.bench.replay import CALL, regret, replayed
 from lavender.cli import main
 from lavender.errors import InputError
 from lavender.solvers import _plan
@@ -49,6 +50,19 @@ def test_a_replay_takes_no_less_than_the_best_and_ends_where_somebody_does(recor
         best = min(curve.time(1e-3) for curve in made.values())
         assert replayed(structure, made, 1e-3) > best + CALL * 0.999
         assert math.isinf(replayed(structure, dict.fromkeys(made, _hopeless(case)), 1e-3))
+
+
+def test_replayed_regret_is_above_one_and_counts_what_does_not_end_for_much(recorded):
+    case = CASES[0]
+    structure = Structure(case.problem)
+    made = {c.candidate: c for c in recorded if c.case == case.name}
+    values = regret([(structure, made)])
+    assert values and min(values) > 1.0
+    # Somebody whom `auto` does not ask ends, nobody else does.
+    hopeless = {name: replace(_hopeless(case), candidate=name) for name in made}
+    ended = replace(_hopeless(case), candidate="lemke", points=((1, 1e-2, 1e-12),))
+    assert max(regret([(structure, hopeless | {"lemke": ended})])) > 50.0
+    assert regret([(structure, hopeless)]) == []
 
 
 def _hopeless(case):
