@@ -53,7 +53,8 @@ static void take_blocks(lav_solver *s, const lav_problem *q) {
 
 static void take_form(lav_solver *s, const lav_problem *q) {
   const int64_t m = q->n_rows, k = q->n_blocks, n = q->n_bodies, c = k - q->n_joints, nv = q->n_velocities;
-  const int64_t mj = q->block_ptr && q->form == LAV_BODIES ? q->block_ptr[q->n_joints] : m, mc = q->block_ptr ? m - mj : m;
+  const int32_t is_known = s->bytes > 0 && q->form == LAV_BODIES; /* who only counts reads no array */
+  const int64_t mj = !is_known ? m : q->block_ptr ? q->block_ptr[q->n_joints] : q->n_joints, mc = is_known ? m - mj : m;
   s->r.compliance = s->g.compliance = NULL;
   if (q->form == LAV_MATRIX) {
     s->a.indptr = TAKE(s, int32_t, m + 1);
