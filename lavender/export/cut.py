@@ -49,7 +49,7 @@ MODULES = (
     "engine.substep",
     "host.memory",
 )
-PROLOGUE, FRONT = "prologue.c", ("front.c", "solve.c", "full.c")
+PROLOGUE, FRONT = "prologue.c", ("front.c", "problem.c", "solve.c", "full.c")
 CIMPORT = re.compile(r"^from lavender_ext\.([\w.]+) cimport", re.MULTILINE)
 
 #: The condition of `front` under which the small build leaves things out.
@@ -59,9 +59,10 @@ PROVIDED = frozenset(
     {"CYTHON_INLINE", "CYTHON_UNUSED", "__PYX_EXTERN_C", "likely", "unlikely", "NULL", "DL_IMPORT"}
 )
 KEYWORDS = frozenset(
-    """auto break case char const continue default do double else enum extern float for goto if inline int long register
-    return short signed sizeof static struct switch typedef union unsigned void volatile while""".split()  # noqa: SIM905
-)
+    ["auto", "break", "case", "char", "const", "continue", "default", "do", "double", "else", "enum", "extern", "float",
+     "for", "goto", "if", "inline", "int", "long", "register", "return", "short", "signed", "sizeof", "static",
+     "struct", "switch", "typedef", "union", "unsigned", "void", "volatile", "while"]
+)  # fmt: skip
 
 TOKEN = re.compile(
     r"""(?P<directive>(?<![^\n])[ \t]*\#(?:\\\n|/\*.*?\*/|[^\n])*)

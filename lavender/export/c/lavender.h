@@ -83,7 +83,7 @@ enum { /* methods; names as in Python, by `lav_name` */
   LAV_DIRECT = 10,             /* A, symmetric, rows alone */
   LAV_LEMKE = 11,              /* not in this library */
   LAV_ADMM = 12,               /* not in this library */
-  LAV_AUTO = 13                /* all forms: sweeps, and what else takes the form, in turns */
+  LAV_AUTO = 13                /* not in this library */
 };
 
 enum { /* how a run ended; a claim, which `relative` beside it may contradict */
