@@ -193,7 +193,7 @@ static void set_problem(b2StepContext *context, int push) {
 
 static void solve(b2StepContext *context, int push) {
   lav_budget budget;
-  lav_result result;
+  lav_result result = {.size = sizeof result};
   set_problem(context, push);
   if (run.n_contacts == 0) return;
   check(lav_default_budget(&budget), "budget");

@@ -163,7 +163,17 @@ def test_webassembly_gives_the_same_bits(tmp_path):
         law = 1
         pointers = [put(c.ptr.astype(np.int32)), put(c.kind.astype(np.int32))] + [
             put(x)
-            for x in (c.lower, c.upper, c.mu, c.patch_radius, problem.b, problem.d, nu, 1.0 / problem.d)
+            for x in (
+                c.lower,
+                c.upper,
+                c.mu,
+                c.patch_radius,
+                problem.b,
+                problem.d,
+                nu,
+                1.0 / problem.d,
+                c.rolling,
+            )
         ]
         view = put(np.frombuffer(words(problem.n_blocks, m, law, *pointers, matrix, 0, 0), np.int32))
         asked = put(np.frombuffer(words(0, 1500, 1, 0, 0, 0) + np.array([1e-9]).tobytes(), np.uint8))
