@@ -667,7 +667,16 @@ def api_page(site):
             "SolveFailed",
         ),
     }
-    constants = {"CONTACT", "CONTACT_BOX", "CONTACT_SPIN", "ROUND", "ROW", "SOLVER_FIELDS", "__version__"}
+    constants = {
+        "CONTACT",
+        "CONTACT_BOX",
+        "CONTACT_ROLLING",
+        "CONTACT_SPIN",
+        "ROUND",
+        "ROW",
+        "SOLVER_FIELDS",
+        "__version__",
+    }
     modules = {"bench", "engine", "io", "motion", "report", "scene", "suite"}
     listed = {name for names in rooms.values() for name in names}
     rest = sorted(set(lv.__all__) - listed - constants - modules)

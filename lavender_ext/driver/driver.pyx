@@ -122,7 +122,7 @@ cdef inline int32_t start_rows(const view_t* v, const asked_t* o, room_t* r, con
     n.keep, n.fixed, n.scale, n.speed = s.s.keep, s.s.fixed, s.s.scale, s.s.speed
     cones = s.s.e.n < s.s.e.m
     n.s.e = &s.s.e
-    n.s.form, n.s.wide = DENSE, has_wide()
+    n.s.form, n.s.wide = DENSE, o.wide
     n.s.others = NULL
     n.s.v, n.s.einv, n.s.p, n.s.pair = x, x + s.s.small, x + 2 * s.s.small, x + 3 * s.s.small
     n.s.bt = x + 4 * s.s.small if cones else NULL
@@ -293,7 +293,7 @@ cdef class Driver:
             self.v.r = &data.rows
         else:
             self.v.a = &data.csr
-        self.o = asked_t(NEWTON, budget, 0, 0, 0, tol)
+        self.o = asked_t(NEWTON, budget, 0, 0, 0, has_wide(), tol)
         self.keep = [data]
 
     def start(self, const double[::1] impulse, bint cold):

@@ -48,7 +48,7 @@ def says(status, **more):
 
 # -- finite numbers -----------------------------------------------------------------------------------
 
-ANEW = ("n_tangents", "n_together", "ends_apart", "coefficients")
+ANEW = ("n_tangents", "n_together", "apart_rows", "spin_rows", "rolling_rows", "reach", "coefficients")
 
 
 @pytest.mark.parametrize("name", lv.available(FLOORLESS, external=False))
