@@ -50,7 +50,7 @@ CYTHONS_OWN = "ISO C forbids conversion of function pointer to object pointer ty
 #: sleeps by the system's calls; `chain` and `looks` call the Python faces of kernels one after the other, `many` the
 #: kernels themselves, and allocates what they need, `islands` copies parts of a problem for them besides; `gate` and
 #: `blocks` look at arrays of Python, `elements` and `solve` are the driver's newton for Python. The arithmetic of all
-#: is that of other modules, which this check sees, but for the logarithms by which `looks` guesses how long sweeps take.
+#: is that of other modules, which this check sees, but for the logarithms by which `looks` guesses about sweeps.
 EXEMPT = {
     "threaded": "threads",
     "chain": "calls kernels, computes nothing",
