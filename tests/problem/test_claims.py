@@ -49,18 +49,21 @@ def says(status, **more):
 # -- finite numbers -----------------------------------------------------------------------------------
 
 # Worked out anew at each call, and the caller's own.
-ANEW = tuple(
-    f"cones.{name}"
-    for name in (
-        "n_tangents",
-        "n_together",
-        "apart_rows",
-        "spin_rows",
-        "rolling_rows",
-        "reach",
-        "coefficients",
-    )
-) + ("operator.parents",)
+ANEW = (
+    *(
+        f"cones.{name}"
+        for name in (
+            "n_tangents",
+            "n_together",
+            "apart_rows",
+            "spin_rows",
+            "rolling_rows",
+            "reach",
+            "coefficients",
+        )
+    ),
+    "operator.parents",
+)
 
 
 @pytest.mark.parametrize("name", lv.available(FLOORLESS, external=False))
