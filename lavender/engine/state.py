@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -24,7 +24,8 @@ from lavender.engine.layout import (
 )
 from lavender.errors import InputError
 from lavender.scene import Box, Plane, Scene, Sphere, arithmetic
-from lavender.scene.scene import SCENE_ORDERS
+from lavender.scene.parts import Body, Joint
+from lavender.scene.scene import SCENE_ORDERS, Parameters
 from lavender.scene.steppers import get_stepper
 from lavender_ext.engine import substep
 from lavender_ext.engine.arrays import lengths
@@ -82,7 +83,7 @@ class State:
         self.index = np.zeros(used[1], np.int32)
         self.keys = np.zeros(max(used[2], 1), np.uint64)
         self.kernel = substep.Buffers(self.size, self.real, self.index, self.keys)
-        self.a: dict[str, np.ndarray] = self.kernel.arrays()
+        self.a: dict[str, Any] = self.kernel.arrays()
         self.head, self.setting = self.a["head"], self.a["setting"]
         self._seen: tuple[int, int, Seen] | None = None
 
@@ -174,8 +175,7 @@ class State:
         rough = bool((mu[shaped] > 0.0).any())
         spin, rolling = rough and bool((patch[shaped] > 0.0).any()), rough and p.rolling_radius > 0.0
         per = 1 + 2 * rough + spin + 2 * rolling
-        box = p.friction_shape == "box"
-        if box and (spin or rolling):
+        if p.friction_shape == "box" and (spin or rolling):
             raise InputError(
                 "friction_shape is 'box' and patch_radius or rolling_radius > 0: a box has no spin friction, and none "
                 "against rolling; leave one of the two out"
@@ -194,77 +194,89 @@ class State:
         size[CAP_PAIR] = 4 * n_shapes if n_shapes > 1 else 0
         size[CAP_CONTACT] = 4 * n_shapes if n_shapes > 1 else 0
         state = cls(size)
-        a, head, setting = state.a, state.head, state.setting
-        setting[SETTING["h"]] = p.dt / p.substeps
-        setting[SETTING["gravity"] : SETTING["gravity"] + 3] = p.gravity
-        setting[SETTING["slop"]] = p.slop
-        setting[SETTING["margin"]] = p.margin
-        setting[SETTING["skin"]] = 5.0 * p.margin
-        setting[SETTING["beta"]] = BETA
-        setting[SETTING["max_push"]] = MAX_PUSH
-        setting[SETTING["bounce"]] = p.restitution_threshold
-        setting[SETTING["match"]] = 5.0 * p.margin
-        setting[SETTING["rolling"]] = p.rolling_radius
-        head[HEAD["iterations"]] = p.solver_iterations
-        head[HEAD["warm_start"]] = p.warm_start
-        head[HEAD["position_iterations"]] = p.position_iterations
-        head[HEAD["order"]] = ORDER_NUMBER[p.order]
-        head[HEAD["seed"]] = p.seed
-        head[HEAD["friction_shape"]] = box
-        head[HEAD["lost"]] = -1
-        stepper = get_stepper(p.stepper)
-        stepper.check(spin, bool((restitution > 0.0).any()), rolling)
-        head[HEAD["stepper"]] = stepper.number
-        for name, value in p.stepper_options.items():
-            option = stepper.options[name]
-            if option.is_whole:
-                head[HEAD[option.place]] = value
-            else:
-                setting[SETTING[option.place]] = value
-        setting[SETTING["out"] : SETTING["out"] + 2] = p.solver_iterations, p.warm_start
-        dynamic = 0
-        for i, b in enumerate(bodies):
-            a["x"][i], a["q"][i] = b.position, b.quaternion
-            a["v"][i, :3], a["v"][i, 3:] = b.velocity, b.angular_velocity
-            a["dyn"][i] = -1
-            if not b.is_static:
-                inverse = arithmetic.inverse(b.inertia)
-                a["dyn"][i] = dynamic
-                a["body_of"][dynamic] = i
-                a["inv_mass_body"][i] = a["inv_mass"][dynamic] = 1.0 / b.mass
-                a["inertia"][i] = b.inertia
-                a["inv_inertia_body"][i] = a["inv_inertia"][dynamic] = inverse
-                a["uneven"][i] = uneven[i]
-                dynamic += 1
-            a["restitution"][i] = restitution[i]
-            a["kind_of_shape"][i], a["shape"][i] = _shape(b.shape)
-        a["friction"][:], a["patch"][:] = mu, patch
-        row = 0
-        for i, j in enumerate(joints):
-            values = a["joint"][i]
-            for name, x in (
-                ("anchor_a", j.anchor_a),
-                ("anchor_b", j.anchor_b),
-                ("axis_a", j.axis_a),
-                ("axis_b", j.axis_b),
-            ):
-                values[JOINT[name] : JOINT[name] + 3] = x
-            side = np.cross(j.axis_a, np.eye(3)[np.argmin(np.abs(j.axis_a))])
-            values[JOINT["side_a"] : JOINT["side_a"] + 3] = side / arithmetic.norm(side)
-            values[JOINT["length"]], values[JOINT["hertz"]], values[JOINT["damping"]] = (
-                j.length,
-                j.hertz,
-                j.damping,
-            )
-            values[JOINT["speed"]], values[JOINT["torque"]] = j.motor_speed or 0.0, j.motor_torque
-            a["joint_kind"][i], a["joint_motor"][i] = JOINT_KINDS[j.kind], j.motor_speed is not None
-            a["joint_bodies"][i] = j.a, j.b
-            a["joint_body"][i] = [a["dyn"][k] if k >= 0 else -1 for k in (j.a, j.b)]
-            row += j.n_rows
-            a["ptr"][i + 1] = row
+        get_stepper(p.stepper).check(spin, bool((restitution > 0.0).any()), rolling)
+        _put_parameters(state, p)
+        a: dict[str, Any] = state.a
+        _put_bodies(a, bodies, uneven)
+        a["restitution"][:], a["friction"][:], a["patch"][:] = restitution, mu, patch
+        _put_joints(a, joints)
         if excluded:
             a["excluded"][:] = excluded
         return state
+
+
+def _put_parameters(state: State, p: Parameters) -> None:
+    head, setting = state.head, state.setting
+    setting[SETTING["h"]] = p.dt / p.substeps
+    setting[SETTING["gravity"] : SETTING["gravity"] + 3] = p.gravity
+    setting[SETTING["slop"]] = p.slop
+    setting[SETTING["margin"]] = p.margin
+    setting[SETTING["skin"]] = 5.0 * p.margin
+    setting[SETTING["beta"]] = BETA
+    setting[SETTING["max_push"]] = MAX_PUSH
+    setting[SETTING["bounce"]] = p.restitution_threshold
+    setting[SETTING["match"]] = 5.0 * p.margin
+    setting[SETTING["rolling"]] = p.rolling_radius
+    head[HEAD["iterations"]] = p.solver_iterations
+    head[HEAD["warm_start"]] = p.warm_start
+    head[HEAD["position_iterations"]] = p.position_iterations
+    head[HEAD["order"]] = ORDER_NUMBER[p.order]
+    head[HEAD["seed"]] = p.seed
+    head[HEAD["friction_shape"]] = p.friction_shape == "box"
+    head[HEAD["lost"]] = -1
+    stepper = get_stepper(p.stepper)
+    head[HEAD["stepper"]] = stepper.number
+    for name, value in p.stepper_options.items():
+        option = stepper.options[name]
+        if option.is_whole:
+            head[HEAD[option.place]] = value
+        else:
+            setting[SETTING[option.place]] = value
+    setting[SETTING["out"] : SETTING["out"] + 2] = p.solver_iterations, p.warm_start
+
+
+def _put_bodies(a: dict[str, Any], bodies: Sequence[Body], uneven: Sequence[bool]) -> None:
+    dynamic = 0
+    for i, b in enumerate(bodies):
+        a["x"][i], a["q"][i] = b.position, b.quaternion
+        a["v"][i, :3], a["v"][i, 3:] = b.velocity, b.angular_velocity
+        a["dyn"][i] = -1
+        if not b.is_static:
+            inverse = arithmetic.inverse(b.inertia)
+            a["dyn"][i] = dynamic
+            a["body_of"][dynamic] = i
+            a["inv_mass_body"][i] = a["inv_mass"][dynamic] = 1.0 / b.mass
+            a["inertia"][i] = b.inertia
+            a["inv_inertia_body"][i] = a["inv_inertia"][dynamic] = inverse
+            a["uneven"][i] = uneven[i]
+            dynamic += 1
+        a["kind_of_shape"][i], a["shape"][i] = _shape(b.shape)
+
+
+def _put_joints(a: dict[str, Any], joints: Sequence[Joint]) -> None:
+    row = 0
+    for i, j in enumerate(joints):
+        values = a["joint"][i]
+        for name, x in (
+            ("anchor_a", j.anchor_a),
+            ("anchor_b", j.anchor_b),
+            ("axis_a", j.axis_a),
+            ("axis_b", j.axis_b),
+        ):
+            values[JOINT[name] : JOINT[name] + 3] = x
+        side = np.cross(j.axis_a, np.eye(3)[np.argmin(np.abs(j.axis_a))])
+        values[JOINT["side_a"] : JOINT["side_a"] + 3] = side / arithmetic.norm(side)
+        values[JOINT["length"]], values[JOINT["hertz"]], values[JOINT["damping"]] = (
+            j.length,
+            j.hertz,
+            j.damping,
+        )
+        values[JOINT["speed"]], values[JOINT["torque"]] = j.motor_speed or 0.0, j.motor_torque
+        a["joint_kind"][i], a["joint_motor"][i] = JOINT_KINDS[j.kind], j.motor_speed is not None
+        a["joint_bodies"][i] = j.a, j.b
+        a["joint_body"][i] = [a["dyn"][k] if k >= 0 else -1 for k in (j.a, j.b)]
+        row += j.n_rows
+        a["ptr"][i + 1] = row
 
 
 def _is_even(inertia: np.ndarray) -> bool:
