@@ -30,13 +30,6 @@ class Deadline:
     def __init__(self, limit: float | None = None) -> None:
         self._at = math.inf if limit is None else perf_counter() + limit
 
-    @classmethod
-    def at(cls, moment: float) -> Deadline:
-        """At a time of `time.perf_counter`."""
-        made = cls()
-        made._at = moment
-        return made
-
     @property
     def is_set(self) -> bool:
         """Whether there is a limit."""

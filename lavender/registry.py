@@ -73,7 +73,7 @@ class Solver(Protocol):
     """What a factory returns; see the module.
 
     A resumable solver whose single steps may be long (factorisations) may have `until(state, deadline)` besides: called
-    before `run` where there is a time limit, a time of `perf_counter` after which no such step should end.
+    before `run` where there is a time limit, a `lavender.deadline.Deadline` after which no such step should end.
     """
 
     def prepare(self, problem: Problem) -> Any:

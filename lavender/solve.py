@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from lavender._arrays import ArrayLike, FloatArray, equal
+from lavender.deadline import Deadline
 from lavender.errors import CapabilityError, InputError, InUse, UnknownName
 from lavender.foreign import Foreign
 from lavender.outcome import decide_empty_rows, finish
@@ -374,7 +375,7 @@ class _Loop:
             chunk = 1  # what a solver takes need not be what is counted: over J and M some sweep over A
             if hasattr(self.solver, "until"):
                 # Of what cannot be cut into chunks: a factor that would end too late is not begun.
-                self.solver.until(self.state, perf_counter() + self.time_limit)
+                self.solver.until(self.state, Deadline(self.time_limit))
         try:
             if records and self._record():
                 return self._total(Claim(INTERRUPTED, 0, {}, "stopped by the callback"))

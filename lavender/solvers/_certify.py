@@ -8,12 +8,12 @@ in nobody's way.
 
 from __future__ import annotations
 
-from time import perf_counter
 from typing import Any
 
 import numpy as np
 
 from lavender._arrays import FloatArray
+from lavender.deadline import Deadline
 from lavender.problem import Problem
 from lavender.solution import Claim, Status
 from lavender.solvers._islands import blocks_of_each, restrict, rows_of
@@ -71,7 +71,7 @@ def _is_open(problem: Problem) -> bool:
     return bool(np.all(free | ((cones.lower == 0.0) & np.isposinf(cones.upper))))
 
 
-def _proof(problem: Problem, deadline: float) -> FloatArray | None:
+def _proof(problem: Problem, deadline: Deadline) -> FloatArray | None:
     """What a linear program finds, y (m,), to be checked."""
     from scipy.optimize import linprog  # 0.1 s to import, needed only here
 
@@ -84,8 +84,8 @@ def _proof(problem: Problem, deadline: float) -> FloatArray | None:
         return None
     bounds = np.stack([np.where(free, -1.0, 0.0), np.ones(problem.m)], 1)
     options: dict[str, Any] = {"maxiter": CERTIFICATE_STEPS * problem.m}
-    if deadline < np.inf:
-        options["time_limit"] = max(deadline - perf_counter(), 1e-3)
+    if deadline.is_set:
+        options["time_limit"] = deadline.left(1e-3)
     found = linprog(
         -(scale * problem.b),
         A_ub=at[~free] if (~free).any() else None, b_ub=np.zeros(int((~free).sum())) if (~free).any() else None,

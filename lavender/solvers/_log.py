@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from functools import cached_property
-from time import perf_counter
 
 import numpy as np
 
 from lavender._arrays import FloatArray, IntArray
 from lavender.certificates import check_certificate
+from lavender.deadline import Deadline
 from lavender.problem import Problem
 from lavender.residuals import at_floor, known, quick, reference
 from lavender.solution import Claim, Status, Turn
@@ -25,9 +25,10 @@ GAIN = 0.99  # of the residual: then nobody gets anywhere
 class SolveLog:
     """What ran on a (sub)problem, what it cost, and the best impulse."""
 
-    def __init__(self, problem: Problem, tol: float, budget: int, deadline: float = np.inf) -> None:
-        self.problem, self.tol, self.budget, self.deadline = problem, tol, budget, deadline
-        self.limit = deadline - perf_counter()  # s
+    def __init__(self, problem: Problem, tol: float, budget: int, deadline: Deadline | None = None) -> None:
+        self.problem, self.tol, self.budget, self.deadline = problem, tol, budget, deadline or Deadline()
+        left = self.deadline.left()
+        self.limit = np.inf if left is None else left  # s
         self.best, self.impulse = np.inf, problem.start()  # least relative residual, (m,) N s
         self.given: FloatArray | None = None  # (m,) N s, a start that doing nothing is better than
         self.turns: list[Turn] = []
@@ -77,15 +78,15 @@ class SolveLog:
     @property
     def time_left(self) -> float | None:
         """s until the time limit, as solvers take it."""
-        return None if self.deadline == np.inf else max(self.deadline - perf_counter(), 1e-5)
+        return self.deadline.left(1e-5)
 
     @property
     def late(self) -> bool:
-        return self.deadline < np.inf and perf_counter() >= self.deadline
+        return self.deadline.passed()
 
     def ends_late(self, cost: float) -> bool:
         """What is counted for so long [ns] would end after the deadline, at the pace so far."""
-        return self.deadline < np.inf and perf_counter() + 1e-9 * self.pace * cost > self.deadline
+        return self.deadline.passed(1e-9 * self.pace * cost)
 
     @property
     def still(self) -> bool:

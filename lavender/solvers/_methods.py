@@ -6,12 +6,12 @@ rest = n log(now / tol) / log(before / now)         sweeps left, by the contract
 from __future__ import annotations
 
 from dataclasses import replace
-from time import perf_counter
 from typing import Any
 
 import numpy as np
 
 from lavender._arrays import FloatArray
+from lavender.deadline import Stopwatch
 from lavender.registry import SolverSpec, get
 from lavender.residuals import remember
 from lavender.solution import Claim, Status
@@ -128,10 +128,10 @@ class Resumed(Candidate):
         chunk = max(1, int(1e9 * CLOCK / self.cost.each))
         while done < n and not (done and log.late):
             step = min(chunk, n - done)
-            began = perf_counter()
-            if log.deadline < np.inf:
+            watch = Stopwatch()
+            if log.deadline.is_set:
                 # The first share is one of the whole limit: what Python took before was not for nothing.
-                left = log.limit if log.iterations + done == 0 else log.deadline - began
+                left = log.limit if log.iterations + done == 0 else log.deadline.left() or 0.0
                 step = max(1, min(step, int(SHARE * 1e9 * left / (log.pace * self.cost.each))))
             last = self.iterate(step)
             done += last.iterations
@@ -139,8 +139,8 @@ class Resumed(Candidate):
                 work[kind] = work.get(kind, 0) + count
             if last.status is not Status.MAX_ITERATIONS or last.iterations < step:
                 break
-            if log.deadline < np.inf:
-                pace = 1e9 * (perf_counter() - began) / (step * self.cost.each)
+            if log.deadline.is_set:
+                pace = 1e9 * watch.seconds / (step * self.cost.each)
                 log.pace = (
                     pace if log.pace == 1.0 else min(pace, log.pace)
                 )  # a pause of the machine tells nothing

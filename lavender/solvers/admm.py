@@ -288,10 +288,10 @@ class ADMM:
         """A fresh state: the penalty starts anew, so that a solve depends on its problem alone."""
         return self.prepare(problem)
 
-    def until(self, state: AdmmState | str, deadline: float) -> None:
-        """Let no factor begin that is expected to end after `deadline`, of `time.perf_counter`."""
+    def until(self, state: AdmmState | str, deadline: Deadline) -> None:
+        """Let no factor begin that is expected to end after `deadline`."""
         if not isinstance(state, str):
-            state.deadline = Deadline.at(deadline)
+            state.deadline = deadline
 
     @np.errstate(all="ignore")  # what overflows is judged
     def run(

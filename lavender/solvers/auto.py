@@ -12,12 +12,12 @@ it has no solution. `turns` says what ran.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from time import perf_counter
 from typing import Any
 
 import numpy as np
 
 from lavender._arrays import FloatArray
+from lavender.deadline import Deadline
 from lavender.problem import OPERATORS, Problem
 from lavender.registry import FEW, SolverSpec
 from lavender.solution import Claim, Status
@@ -63,7 +63,7 @@ class Auto:
         self, state: Problem, impulse: FloatArray, n: int, tol: float, time_limit: float | None = None
     ) -> Claim:
         problem = state
-        deadline = np.inf if time_limit is None else perf_counter() + time_limit
+        deadline = Deadline(time_limit)
         most = FEW if problem.generalized is None else FEW_GENERAL
         if problem.m <= most and n >= ONE_CALL and call_ends_within(problem, time_limit):
             made = AUTO.solve(problem, impulse, tol)
@@ -101,7 +101,7 @@ class Auto:
 def solve(log: SolveLog, plan: Plan | None = None) -> None:
     """To the end, by a plan where one is given."""
     costs = Costs(log.problem, log.tol, plan=plan)
-    begun = in_short_time(log, costs) if log.deadline < np.inf and plan is None else []
+    begun = in_short_time(log, costs) if log.deadline.is_set and plan is None else []
     if not log.done():
         names = candidates(costs.structure) if plan is None else tuple(name for name, _ in plan.candidates)
         race(list(make(log, costs, names, None if plan is None else plan.first, begun)), log.done)

@@ -23,13 +23,13 @@ between. Their systems stand in `_newton/`. Form "velocity" factors I + K^T V K 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from time import perf_counter
 from typing import Any
 
 import numpy as np
 
 from lavender._arrays import FloatArray
 from lavender.certificates import check_certificate
+from lavender.deadline import Deadline, Stopwatch
 from lavender.errors import CapabilityError, InputError
 from lavender.problem import OPERATORS, Problem
 from lavender.registry import SolverSpec
@@ -130,7 +130,7 @@ class Newton:
     def _run_general(
         self, state: NewtonState, impulse: FloatArray, n: int, tol: float, time_limit: float | None
     ) -> Claim:
-        problem, start = state.problem, perf_counter()
+        problem, deadline = state.problem, Deadline(time_limit)
         claim = general.run(problem, state.general, impulse, n, tol, time_limit)
         left = n - claim.iterations
         ended = claim.status not in (Status.STALLED, Status.NUMERICAL_ERROR, Status.DIVERGED)
@@ -144,8 +144,9 @@ class Newton:
         if not best <= WARM:
             impulse[:] = problem.start()
         system = make_system(problem, "impulse")
-        seconds = None if time_limit is None else max(time_limit - (perf_counter() - start), 1e-3)
-        more = self._run_system(problem, system if system.sc.m else None, impulse, left, tol, seconds)
+        more = self._run_system(
+            problem, system if system.sc.m else None, impulse, left, tol, deadline.left(1e-3)
+        )
         if not quick(problem, impulse, w, e)[0] <= best:
             impulse[:] = before
         work = dict(claim.work)
@@ -196,9 +197,8 @@ def _turns(
     time_limit: float | None,
 ) -> tuple[Status, FloatArray | None]:
     """Turns of at most n factorisations on `impulse`, in place, with a look at the clock and at Ctrl-C in between."""
-    deadline = np.inf if time_limit is None else perf_counter() + time_limit
+    deadline = Deadline(time_limit)
     sc, solve, certificate = system.sc, system.solve, None
-    start = time = perf_counter()
     late = interrupted = False
     coulomb = problem.law == "coulomb" and sc.has_friction
     solve.start(sc.unknown(impulse), tol, n, coulomb, cold)
@@ -206,15 +206,15 @@ def _turns(
         while True:
             before = solve.factorisations
             most = WATCHED / max(system.seconds, 1e-6)
-            if deadline < np.inf:
-                most = min(most, TIME_SHARE * (deadline - time) / max(system.seconds, 1e-9))
-                if time + system.seconds >= deadline:
+            left, watch = deadline.left(), Stopwatch()
+            if left is not None:
+                most = min(most, TIME_SHARE * left / max(system.seconds, 1e-9))
+                if left <= system.seconds:
                     late = True
                     solve.stop()
             end = solve.step(max(1, int(most)))
-            start, time = time, perf_counter()
             if solve.factorisations > before:
-                system.took((time - start) / (solve.factorisations - before))
+                system.took(watch.seconds / (solve.factorisations - before))
             if end == OUTCOMES["certificate"]:
                 certificate = _proof(problem, sc, solve.direction)
                 if certificate is not None:

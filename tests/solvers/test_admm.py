@@ -7,6 +7,7 @@ from random_problems import as_matrix, random_contact_problem, random_lcp
 
 import lavender as lv
 from lavender import suite
+from lavender.deadline import Deadline
 from lavender.solvers import admm
 
 
@@ -257,14 +258,14 @@ def test_a_factor_that_would_end_after_the_deadline_is_not_begun():
     solver, state = prepared._solver, prepared._state
     impulse, made = problem.start(), state.factorisations
     state.factor = None  # as of a problem whose first factor is large
-    solver.until(state, -np.inf)
+    solver.until(state, Deadline(-1.0))
     claim = solver.run(state, impulse, 50, 1e-6)
     assert claim.status is lv.Status.TIME_LIMIT
     assert claim.iterations == 0
     assert state.factorisations == made
     assert "factorisation" in claim.message
     # With time it goes on from there.
-    solver.until(state, np.inf)
+    solver.until(state, Deadline())
     assert solver.run(state, impulse, 500, 1e-6).work["factorisations"] > 0
 
 

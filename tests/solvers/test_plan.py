@@ -1,7 +1,6 @@
 """explain and plan: counted alone, the same everywhere, and a solve goes by them."""
 
 import json
-from time import perf_counter
 
 import numpy as np
 import pytest
@@ -10,6 +9,7 @@ from random_trees import random_general
 import lavender as lv
 from lavender import suite
 from lavender.cli import main
+from lavender.deadline import Deadline
 from lavender.problem import LAWS, OPERATORS
 from lavender.solvers._log import SolveLog
 from lavender.solvers._methods import Sweeps, in_short_time
@@ -135,7 +135,7 @@ def test_a_matrix_of_many_entries_does_not_divide_and_nobody_looks():
 def test_what_would_not_end_in_time_is_neither_counted_nor_begun(name, monkeypatch):
     """With the least of time sweeps have all of it, though what factors is expected to be cheaper."""
     problem = suite.case(name).problem
-    log = SolveLog(problem, 1e-12, 10**6, deadline=perf_counter() + 1e-4)
+    log = SolveLog(problem, 1e-12, 10**6, deadline=Deadline(1e-4))
     log.offer(problem.start())
     costs = Costs(problem, 1e-12)
     monkeypatch.setattr(Costs, "least", lambda self, asked: self.of(asked) if asked == "anderson" else 1 / 0)

@@ -5,12 +5,12 @@ One compiled call solves every island of trees; here stand the clock and the wor
 
 from __future__ import annotations
 
-from time import perf_counter
 from typing import Any
 
 import numpy as np
 
 from lavender._arrays import FloatArray
+from lavender.deadline import Deadline, Stopwatch
 from lavender.problem import Problem
 from lavender.residuals import judged, reference, remember
 from lavender.solution import Claim, Status
@@ -71,11 +71,11 @@ def run(
 
     `again`: on from where a run before, to the same tol, has used up its steps.
     """
-    deadline = np.inf if time_limit is None else perf_counter() + time_limit
+    deadline, watch = Deadline(time_limit), Stopwatch()
     cold = _is_cold(problem, impulse)
     counts = np.zeros(5, np.int64)
     status, closer = Status.MAX_ITERATIONS, 1.0
-    begun = now = perf_counter()
+    now = 0.0
     islands = max(1, kernel.islands)
     step = counted = FLOP * factor_flops(problem, kernel.largest)
     slow = max(LOOKED_UP * step, 1e-9)
@@ -83,7 +83,7 @@ def run(
     if time_limit is not None:
         steps = max(1, int(min(TIME_SHARE * time_limit / slow, clock)))
     while counts[0] < n:
-        if perf_counter() + min(step, 1e6) > deadline + LATE:
+        if deadline.passed(min(step, 1e6) - LATE):
             status = Status.TIME_LIMIT
             break
         end, done = kernel.run(impulse, closer * tol, min(steps, n - int(counts[0])), cold, again)
@@ -100,13 +100,14 @@ def run(
                 status = Status.STALLED
         if status is not Status.MAX_ITERATIONS:
             break
-        last, now = now, perf_counter()
-        if now > deadline:
+        last, now = now, watch.seconds
+        left = deadline.left()
+        if left is not None and left <= 0.0:
             status = Status.TIME_LIMIT
             break
-        if time_limit is not None:
-            step = max((now - begun) / max(1, int(counts[0])), (now - last) / max(1, int(done[0])))
-            steps = max(1, int(min(clock, TIME_SHARE * (deadline - now) / max(step, counted, 1e-9))))
+        if left is not None:
+            step = max(now / max(1, int(counts[0])), (now - last) / max(1, int(done[0])))
+            steps = max(1, int(min(clock, TIME_SHARE * left / max(step, counted, 1e-9))))
     return claim(status, counts)
 
 
