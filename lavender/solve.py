@@ -20,7 +20,16 @@ from lavender._arrays import ArrayLike, FloatArray, equal
 from lavender.deadline import Deadline
 from lavender.errors import CapabilityError, InputError, InUse, UnknownName
 from lavender.foreign import Foreign
-from lavender.outcome import decide_empty_rows, finish
+from lavender.outcome import (
+    CONVERGED,
+    INFEASIBLE,
+    MAX_ITERATIONS,
+    NUMERICAL_ERROR,
+    STALLED,
+    TIME_LIMIT,
+    decide_empty_rows,
+    finish,
+)
 from lavender.problem import Problem
 from lavender.registry import SolverSpec, State, get
 from lavender.residuals import Residual, reference, residual, told
@@ -35,14 +44,7 @@ Callback = Callable[[int, FloatArray, Residual], Any]
 NOTHING_DONE = Claim(Status.MAX_ITERATIONS, 0)
 # What arithmetic on legal numbers may end in: a result, with the solver's last word as its message.
 BREAKDOWN = (ArithmeticError, np.linalg.LinAlgError, MemoryError)
-# Looked up once: a member reached through its class costs 600 instructions, a dozen times a solve.
-CONVERGED = Status.CONVERGED
-INFEASIBLE = Status.INFEASIBLE
 INTERRUPTED = Status.INTERRUPTED
-MAX_ITERATIONS = Status.MAX_ITERATIONS
-NUMERICAL_ERROR = Status.NUMERICAL_ERROR
-STALLED = Status.STALLED
-TIME_LIMIT = Status.TIME_LIMIT
 FRONT_DOOR = ("impulse", "tol", "max_iter", "time_limit", "history", "callback")
 
 
