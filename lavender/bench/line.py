@@ -60,9 +60,11 @@ def c_of(record: Record) -> tuple[str, ...]:
         return ()
     out = [f"lav_default_options(LAV_{record.solver.upper()}, &options)"]
     for key, value in {"order": record.order or "given", **record.options}.items():
+        if not isinstance(value, (str, int, float)):
+            return ()  # of a file that somebody else wrote: no option of the library
         if key in C_OPTIONS:
             out.append(f"options.{key} = {C_OPTIONS[key].format(value)}")
-        elif (key, value) in C_WORDS:
+        elif isinstance(value, str) and (key, value) in C_WORDS:
             out.append(f"options.{C_WORDS[key, value]}")
         elif (key, value) != ("order", "given"):
             return ()

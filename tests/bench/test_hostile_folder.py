@@ -19,6 +19,7 @@ import lavender as lv
 from lavender import bench, cli, io, registry, report
 from lavender.bench import cases as bench_cases
 from lavender.bench import machine
+from lavender.bench.line import c_of, code_of
 from lavender.bench.lock import Lock
 from lavender.bench.record import _KINDS, file_name, printable, to_json
 from lavender.bench.running import timing
@@ -206,6 +207,9 @@ def show_all(records, figure=True):
 
     print_report(records, Console(file=text_io.StringIO(), width=140), old=records)
     shown = records.latest()
+    for record in shown.records:  # whichever is the fastest, and so shown, differs from run to run
+        assert code_of(record)
+        c_of(record)
     drawn = figures(shown)
     page(shown, drawn, old=shown).encode("utf-8")
     summary(shown).encode("utf-8")
