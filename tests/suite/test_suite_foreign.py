@@ -10,14 +10,19 @@ from lavender import suite
 from lavender.errors import UnknownName
 from lavender.suite.wild import STRUCTURES as OF_WILD
 
-FAMILIES = ("foreign", "foreign_new")
+FAMILIES = {
+    "foreign": "lavender.suite.foreign",
+    "foreign_new": "lavender.suite.foreign_new",
+    "drawn": "benchmarks.drawn",
+}
 
 SEEDS = range(250)
 
 
 def family(name):
     """Its function, and the module with its structures and lot."""
-    return getattr(suite, name), import_module(f"lavender.suite.{name}")
+    module = import_module(FAMILIES[name])
+    return getattr(module, name), module
 
 
 @pytest.fixture(scope="module", params=FAMILIES)
