@@ -56,4 +56,3 @@ cdef void pivots_restart(pivoting_t* s) noexcept nogil
 cdef void pivots_slack(pivoting_t* s) noexcept nogil
 cdef void pivots_correct(pivoting_t* s) noexcept nogil
 cdef int32_t pivots_exchange(pivoting_t* s) noexcept nogil
-cdef void scan_entries(const csr_t* a, int32_t n, int32_t* cursor, int32_t* band, double* size) noexcept nogil

@@ -507,10 +507,6 @@ cdef int32_t pivots_exchange(pivoting_t* s) noexcept nogil:
     return lav_pivot_exchange(s)
 
 
-cdef void scan_entries(const csr_t* a, int32_t n, int32_t* cursor, int32_t* band, double* size) noexcept nogil:
-    lav_csr_scan(a, n, cursor, band, size)
-
-
 def bandwidth(const int32_t[::1] indptr, const int32_t[::1] indices):
     """(lower, upper) bandwidth of a canonical CSR matrix, from the ends of its rows."""
     cdef Py_ssize_t i, n = indptr.shape[0] - 1
