@@ -179,14 +179,6 @@ def test_a_solver_that_does_nothing_is_stopped(plug_in):
     assert "none of the" in solution.message
 
 
-def test_an_exception_of_a_callback_is_its_callers():
-    def callback(iterations, impulse, residual):
-        raise ZeroDivisionError("mine")
-
-    with pytest.raises(ZeroDivisionError, match="mine"):
-        lv.solve(random_lcp(6), "pgs", tol=1e-12, callback=callback)
-
-
 # -- the problem is out of reach ----------------------------------------------------------------------
 
 

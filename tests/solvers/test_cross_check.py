@@ -61,30 +61,6 @@ def test_iterative_solvers_agree_with_osqp_on_random_problems(seed):
     assert table.ok
 
 
-def structured():
-    a = 2.0 * np.eye(40) - np.eye(40, k=1) - np.eye(40, k=-1)  # a column of equal discs, mass 1
-    b = np.zeros(40)
-    b[0] = 9.81 / 60.0
-    yield lv.Problem.lcp(a, b, name="stack 40")
-    yield lv.Problem.linear(a + 0.1 * np.eye(40), b, name="soft chain 40")
-    yield box_stack(3)
-    yield lv.Problem.lcp(*spd(30), lower=-0.1, upper=0.2, name="boxed 30")
-    friction = random_contact_problem(7, tangents=2, spin=False)
-    boxed = friction.boxed(np.full(friction.rows.n_contacts, 0.2))
-    yield lv.Problem(boxed.b, boxed.cones, boxed.csr + 0.3 * np.eye(boxed.m), name="boxed friction")
-
-
-@pytest.mark.parametrize("problem", list(structured()), ids=lambda p: p.name)
-def test_iterative_solvers_agree_with_osqp_on_structured_problems(problem):
-    names = [n for n in ITERATIVE if registry.get(n).refuses(problem) is None]
-    table = cross_check(problem, names, max_iter=100_000)
-    assert table.reference == "osqp", table.reference_note
-    assert [r.solver for r in table.agreed] == names, str(table)
-    for row in table:
-        # Both slacks are unique; 1e-6 relative, times a condition number below 1e3 (stack 40: 40^2 / 4).
-        assert row.slack <= 1e-3 * np.abs(problem.b).max()
-
-
 @pytest.mark.parametrize("mass_ratio", [1.0, 1e4, 1e6])
 def test_every_solver_on_redundant_contacts(mass_ratio):
     problem = box_stack(10, mass_ratio)
