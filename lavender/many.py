@@ -74,7 +74,11 @@ def solve_many(
     together = (
         plain and spec.own and solver in ("auto", "newton") and isinstance(tol, float) and 0.0 < tol < np.inf
     )
-    at = [i for i, p in enumerate(given) if type(p) is Problem and p.generalized is not None]
+    at = [
+        i
+        for i, p in enumerate(given)
+        if type(p) is Problem and p.generalized is not None and not p.cones.has_ellipse
+    ]
 
     def batch(part: list[int]) -> None:
         _batch(given, starts, part, tol, spec, made)

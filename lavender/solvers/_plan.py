@@ -3,7 +3,7 @@
     cost = start + formed * entries + count * (row * m + work * w)                                            (1)
 
 m rows; w multiply-adds of one iteration, counted from the structure (`_structure.py`); start, row, work [ns] and count,
-iterations to the end, are rates of `rates.json`, which `lavender bench auto --fit` writes from recorded runs of single
+iterations to the end, are rates of `rates.json`, which `python -m benchmarks auto --fit` writes from runs of single
 solvers. No clock is read: the same problem has the same plan everywhere.
 """
 

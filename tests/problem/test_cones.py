@@ -35,7 +35,6 @@ REFUSED = {
     ),
     "spin beside a round cone": (lambda: lv.Cones.contacts(0.5, 3, 0.1), "no patch_radius"),
     "no such shape": (lambda: lv.Cones.contacts(0.5, shape="square"), "unknown shape 'square'"),
-    "an ellipse": (lambda: lv.Cones.contacts([(0.5, 0.2)]), "ellipse"),
     "a side below zero": (lambda: lv.Cones.contacts([(0.5, -0.2)], shape="box"), "mu"),
     "a side that is no number": (lambda: lv.Cones.contacts([(0.5, np.nan)], shape="box"), "mu"),
     "three sides": (lambda: lv.Cones.contacts([(0.5, 0.1, 0.2)], shape="box"), "one for each tangent"),

@@ -21,7 +21,7 @@ KERNEL_LEVELS = [
     {"generalized", "local", "newton", "pivot", "sweep"},
     {"accelerate", "engine"},
     {"warm"},
-    {"bench", "driver", "few", "host"},
+    {"driver", "few", "host"},
 ]
 KERNEL_HEIGHT = {name: height for height, level in enumerate(KERNEL_LEVELS) for name in level}
 

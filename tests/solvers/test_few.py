@@ -12,6 +12,7 @@ from random_problems import as_matrix, random_contact_problem, random_lcp, seeds
 from random_trees import random_general
 
 import lavender as lv
+from benchmarks.drawn import wild
 from lavender import registry, suite
 from lavender.cones import ROW
 from lavender.registry import FEW
@@ -133,7 +134,7 @@ def test_few_joints_that_depend_on_each_other_are_one_shifted_factor_more(solver
 @pytest.mark.parametrize("solver", ["auto", "direct"])
 @pytest.mark.parametrize("seed", [5793, 6452, 7592])
 def test_few_bounded_rows_that_depend_on_each_other_are_one_shift(solver, seed):
-    problem = suite.wild(seed=seed).problem
+    problem = wild(seed=seed).problem
     found = check(problem, solver, tol=1e-9)
     assert found.success
     assert found.work["shifts"] == 1 and found.work["factorisations"] <= 6
@@ -143,7 +144,7 @@ def test_few_bounded_rows_that_depend_on_each_other_are_one_shift(solver, seed):
 @pytest.mark.parametrize("tol", [1e-3, 1e-9])
 @pytest.mark.parametrize("seed", [7530, 7845, 4691, 7514])  # asymmetric, long, with joints, symmetric
 def test_where_exchanges_of_few_rows_are_stuck_auto_follows_lemkes_path(seed, tol):
-    problem = suite.wild(seed=seed).problem
+    problem = wild(seed=seed).problem
     found = check(problem, "auto", tol=tol)
     assert found.success
     said = re.fullmatch(
@@ -169,7 +170,7 @@ def test_a_path_that_is_longer_than_the_budget_is_not_the_end(most):
 
 
 def test_few_bounded_rows_that_are_nearly_singular_end_where_that_meets_the_tolerance():
-    problem = suite.wild(seed=7375).problem
+    problem = wild(seed=7375).problem
     found = check(problem, "auto", tol=1e-6)
     assert found.success and found.residual.relative > 1e-13
     assert found.message.startswith("direct") and "->" not in found.message
@@ -203,7 +204,7 @@ def test_round_cones_are_never_solved_over_rows_of_a():
 )
 def test_sweeps_over_few_velocities_make_way_for_newton(seed, ran):
     """Forests under Coulomb's law that sweeps end at once, that newton does after them, that neither does at first."""
-    problem = suite.wild(seed=seed).problem
+    problem = wild(seed=seed).problem
     assert problem.generalized is not None
     short = check(problem, "auto", tol=1e-6)
     assert short.success
@@ -218,7 +219,7 @@ def test_sweeps_over_few_velocities_make_way_for_newton(seed, ran):
 
 @pytest.mark.parametrize("seed", [1076, 3352])  # of 48 rows, for which newton takes more than 64 steps
 def test_steps_over_few_velocities_that_were_in_vain_are_not_taken_twice_in_one_call(seed):
-    problem = suite.wild(seed=seed).problem
+    problem = wild(seed=seed).problem
     assert solve_first(replace(problem, copy=False).metric, None, 1e-6, GATE, general.ROOM) is False
     fresh = replace(problem, copy=False)
     assert registry.get("auto").few.solve(fresh, None, 1e-6) is None

@@ -7,6 +7,7 @@ import pytest
 from random_trees import random_general
 
 import lavender as lv
+from benchmarks.drawn import foreign
 from lavender import suite
 from lavender.cli import main
 from lavender.deadline import Deadline
@@ -126,7 +127,7 @@ def test_no_more_than_four_are_asked_and_islands_where_the_problem_divides(name)
 
 
 def test_a_matrix_of_many_entries_does_not_divide_and_nobody_looks():
-    problem = suite.foreign(seed=6, part="tuned").problem  # 494 dense rows
+    problem = foreign(seed=6, part="tuned").problem  # 494 dense rows
     structure = Structure(problem)
     assert not structure.divides and "islands" not in vars(structure)
 
