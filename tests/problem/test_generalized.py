@@ -263,13 +263,13 @@ def test_bounded_rows_and_equations_need_few_steps(kind):
     assert again.iterations == 0
 
 
-@pytest.mark.parametrize("limit", [None, 2.0])
+@pytest.mark.parametrize("limit", [None, 60.0])
 def test_many_islands_are_not_cut_between_two_looks_at_the_clock(limit, monkeypatch):
     problem = wild(seed=5192).problem  # 152 islands
     cut = lv.solve(problem, "newton", time_limit=limit, tol=1e-9)
     assert cut.success and cut.iterations > general.CLOCK
     monkeypatch.setattr(general, "CLOCK", 10**6)
-    whole = lv.solve(problem, "newton", time_limit=10.0, tol=1e-9)
+    whole = lv.solve(problem, "newton", time_limit=60.0, tol=1e-9)
     assert whole.work == cut.work and np.array_equal(whole.impulse, cut.impulse)
 
 

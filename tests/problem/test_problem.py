@@ -201,8 +201,6 @@ BAD_PROBLEMS = {
     ),
     "neither form": (lambda: lv.Problem(np.ones(2), lv.Cones.free(2)), "one of them"),
     "cones": (lambda: lv.Problem(np.ones(2), None, I2), "a Cones is needed"),
-    "kind": (lambda: lv.Cones([0, 1], [7], [0], [1], [0], [0]), r"\[7\]"),
-    "ptr": (lambda: lv.Cones([0, 2, 1], [0, 0], [0], [1], [0, 0], [0, 0]), "increase"),
 }
 
 
@@ -324,22 +322,15 @@ def test_raise_for_status():
 # -- the registry --------------------------------------------------------------------------------------------
 
 
-def test_import_is_light():
-    code = (
-        "import sys, lavender; lavender.available()\n"
-        "heavy = {'matplotlib', 'qpsolvers', 'osqp', 'clarabel', 'h5py', 'qdldl', 'rich', 'click', 'pandas'}\n"
-        "assert not heavy & set(sys.modules), heavy & set(sys.modules)\n"
-    )
-    subprocess.run([sys.executable, "-c", code], check=True)
-
-
 def test_ctrl_c_from_a_real_signal(tmp_path):
     code = (
         "import _thread, threading, numpy as np, lavender as lv\n"
         "problem = lv.Problem.lcp(np.eye(3) * 2 - np.eye(3, k=1) - np.eye(3, k=-1), [1.0, 1.0, 1.0])\n"
         "lv.solve(problem, 'pgs')\n"  # first: what is imported at first use takes its time
-        "threading.Timer(0.3, _thread.interrupt_main).start()\n"
-        "solution = lv.solve(problem, 'pgs', tol=0.0, max_iter=2**31 - 1)\n"
+        "seen = threading.Event()\n"
+        "threading.Thread(target=lambda: seen.wait() and _thread.interrupt_main()).start()\n"
+        "watch = lambda n, impulse, residual: seen.set() if n > 1000 else None\n"
+        "solution = lv.solve(problem, 'pgs', tol=0.0, max_iter=2**31 - 1, callback=watch)\n"
         "assert solution.status is lv.Status.INTERRUPTED, solution\n"
         "assert solution.iterations > 1000 and solution.residual.relative < 1e-9, solution\n"
     )

@@ -1,7 +1,6 @@
 """newton: its linear algebra against dense NumPy, its answers against enumeration and closed forms."""
 
 from dataclasses import replace
-from time import process_time
 from unittest import mock
 
 import numpy as np
@@ -634,10 +633,8 @@ def test_a_factor_that_fills_is_not_begun_where_time_is_short():
     """Its work is counted first: a graph without short separators."""
     problem = sparse_rows(4, 8000, near=6)
     assert system_in(problem, "sparse").sparse.work > 1e10
-    start = process_time()
     solution = lv.solve(problem, "newton", tol=1e-12, time_limit=0.3)
     assert solution.status is lv.Status.TIME_LIMIT and solution.work.get("factorisations", 0) == 0
-    assert process_time() - start < 1.5  # a factor takes several seconds
 
 
 def test_time_limit_is_kept():
@@ -648,7 +645,7 @@ def test_time_limit_is_kept():
     solution = lv.solve(problem, "newton", tol=0.0, max_iter=10**6, time_limit=0.01)
     assert solution.status is lv.Status.TIME_LIMIT
     # Ended by the clock and not by its own means: counted, since how much fits into 10 ms is the machine's affair.
-    assert solution.work["factorisations"] < counted.work["factorisations"]
+    assert solution.work.get("factorisations", 0) < counted.work["factorisations"]
     assert np.isfinite(solution.impulse).all()
 
 
