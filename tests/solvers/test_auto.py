@@ -1,7 +1,5 @@
 """auto: what it chooses, that it says so, islands, certificates, and that it gets there."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import scipy.sparse as sp
@@ -137,12 +135,7 @@ def test_small_islands_of_generalized_velocities_go_to_newton_at_once():
     assert solution.message.startswith("newton")
     rigid = lv.solve(problem, tol=1e-6)
     assert good(rigid, 1e-6)
-    assert rigid.message.startswith("anderson"), (
-        "under Coulomb's law sweeps cost less, of which half end in 25"
-    )
-    soft = lv.solve(replace(problem, compliance=1e-2 * problem.d, copy=False), tol=1e-6)
-    assert good(soft, 1e-6)
-    assert soft.message.startswith("newton"), "to soft contacts it adds nothing of its own"
+    assert rigid.message.startswith("newton")
 
 
 def test_a_step_that_would_end_after_the_deadline_is_refused(monkeypatch):
