@@ -7,6 +7,7 @@ import pytest
 from worked import example
 
 import lavender as lv
+from lavender.engine.layout import HEAD
 
 
 @pytest.fixture(scope="module")
@@ -84,6 +85,15 @@ def test_warm_starts_begin_closer_and_are_missed_when_switched_off():
     assert violation["cold"] > 50 * violation["warm"]
     medians = {k: np.median(v[1][20:90]) for k, v in found.items()}
     assert medians["cold"] > 50 * medians["warm"]
+
+
+def test_warm_starts_keep_their_matches_for_ten_minutes():
+    sim = lv.Simulation(lv.Scene("stack", solver_iterations=4))
+    for _ in range(600):
+        status, done = sim._state.kernel.substeps(240)
+        assert (status, done) == (0, 240)
+        head = sim._state.head
+        assert head[HEAD["contacts"]] == head[HEAD["matches"]] == 24
 
 
 def test_two_particles_agree_with_the_closed_form():
