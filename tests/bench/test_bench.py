@@ -6,6 +6,7 @@ import json
 import math
 import os
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ import lavender as lv
 from lavender import bench, registry
 from lavender.bench import cases as bench_cases
 from lavender.bench import machine, store
+from lavender.bench.line import c_of, code_of
 from lavender.bench.record import Record, from_json, to_json
 from lavender.bench.running import runner, timing
 from lavender.bench.running.worker import Worker
@@ -621,28 +623,89 @@ def test_a_level_of_a_sequence_is_solved_to_that_level():
         )
 
 
-def test_what_is_timed_is_the_line_that_is_printed(monkeypatch):
-    """Whatever the front door of `lv.solve` costs is in the time, once for each repeat."""
+@pytest.fixture
+def timed(monkeypatch):
+    """What each call that is timed is given; every one takes 20 ms more."""
     calls = []
     true = timing.solve
 
     def slow(problem, solver, **asked):
-        calls.append((solver, asked))
+        calls.append((solver, asked, problem.guess))
         time.sleep(0.02)
         return true(problem, solver, **asked)
 
     monkeypatch.setattr(timing, "solve", slow)
-    records = bench.run([stack(6)], ["pgs"], bench.Plan(levels=(1e-6,), budgets=(4,), repeats=2, orders=()))
-    assert calls == [("pgs", {"tol": 1e-6}), ("pgs", {"tol": 0.0, "max_iter": 4})]
-    for r in records:
+    return calls
+
+
+def said(record, problem):
+    """What the line that is printed of a record passes to `lv.solve`; of a loop its first pass."""
+    calls = []
+
+    def solve(problem, solver, **asked):
+        calls.append((solver, asked))
+        return SimpleNamespace(impulse=None)
+
+    names = {"lv": SimpleNamespace(solve=solve, bench=bench), "problem": problem, "problems": [problem]}
+    exec("\n".join(code_of(record)), names)
+    return calls[0]
+
+
+def plainly(solver, asked):
+    return solver, {name: x.tolist() if name == "impulse" else x for name, x in asked.items()}
+
+
+LEVEL = 1.23456e-6  # whose short form is another number
+
+
+def test_what_is_timed_is_the_line_that_is_printed(timed):
+    """Whatever the front door of `lv.solve` costs is in the time, and nothing but the line is asked for."""
+    plan = bench.Plan(levels=(LEVEL,), budgets=(4,), repeats=2, orders=())
+    problem = stack(6, guess=np.ones(6))
+    records = bench.run([problem], ["pgs"], plan)
+    assert len(timed) == len(records) == 4
+    for r, (solver, asked, guess) in zip(records, timed, strict=True):
+        assert (solver, asked) == said(r, problem)
+        assert (guess is None) == (r.start == "cold")
         assert r.way == "call"
         assert len(r.times) == 1
         assert r.time_min >= 0.02 > r.setup_min + r.solve_min
-    calls.clear()
-    bench.run(
-        bench.sequence(moving_stack(2), "load"), ["pgs"], bench.Plan(levels=(1e-6,), budgets=(), repeats=1)
+    timed.clear()
+    steps = moving_stack(2)
+    records = bench.run(
+        bench.sequence(steps, "load"), ["pgs"], dataclasses.replace(plan, budgets=(), repeats=1)
     )
-    assert ["impulse" in asked for _, asked in calls] == [False, False, True, True]
+    assert ["impulse" in asked for _, asked, _ in timed] == [r.start == "carried" for r in records]
+    for r, (solver, asked, _) in zip(records, timed, strict=True):
+        if r.step == 0:
+            assert plainly(solver, asked) == plainly(*said(r, steps[0]))
+
+
+def test_lines_in_turns_are_those_that_are_printed_and_c_asks_for_the_same(timed):
+    asks = [
+        bench.Ask("pgs", "tol", LEVEL),
+        bench.Ask("pgs", "tol", LEVEL, 20_000),
+        bench.Ask("pgs", "budget", 0.0, 4),
+        bench.Ask("pgs", "time", LEVEL, time_limit=1.23456e-3),
+    ]
+    problem, plan = stack(6, guess=np.ones(6)), bench.Plan(levels=(1e-3,), budgets=(), repeats=1, orders=())
+    known = bench.run([problem], ["pgs"], plan)
+    n = len(known)
+    timed.clear()
+    made = bench.finals([problem], asks, known, plan).records[n:]
+    for r in made:
+        line = said(r, problem)
+        assert [asked for solver, asked, _ in timed if (solver, asked) == line]
+        in_c = dict(word.split(" = ") for word in c_of(r) if word.startswith("budget."))
+        asked = line[1]
+        assert float(in_c["budget.tol"]) == asked["tol"]
+        assert int(in_c["budget.iterations"]) == asked.get("max_iter", registry.get("pgs").max_iter)
+        assert float(in_c.get("budget.seconds", 0.0)) == asked.get("time_limit", 0.0)
+    assert all(guess is not None for *_, guess in timed)  # as the line says: from the guess
+    (plain,) = (r for r in known if not r.turns and r.start == "cold")
+    assert int(dict(w.split(" = ") for w in c_of(plain) if "iterations" in w)["budget.iterations"]) == (
+        registry.get("pgs").max_iter
+    )
 
 
 def test_lines_are_timed_in_turns_and_kept(tmp_path):
