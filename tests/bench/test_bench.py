@@ -4,7 +4,6 @@ import dataclasses
 import itertools
 import json
 import math
-import os
 import time
 from types import SimpleNamespace
 
@@ -18,7 +17,6 @@ from lavender.bench import machine, store
 from lavender.bench.line import c_of, code_of
 from lavender.bench.record import Record, from_json, to_json
 from lavender.bench.running import runner, timing
-from lavender.bench.running.worker import Worker
 
 
 def chain(n, name="chain", **more):
@@ -255,13 +253,6 @@ def test_an_unwritable_place_is_known_before_anything_runs(tmp_path):
         bench.Store(tmp_path / "file" / "records.jsonl")
 
 
-@pytest.mark.parametrize("text", ['{"kind": "record"}', '{"kind": "other"}', "[1]", "words"])
-def test_a_file_of_something_else_is_refused(tmp_path, text):
-    (tmp_path / "records.jsonl").write_text(text + "\n")
-    with pytest.raises(lv.InputError, match="line 1"):
-        bench.read(tmp_path)
-
-
 def test_json_and_csv_hold_every_number(tmp_path):
     records = bench.run([stack(6), chain(4, guess=np.ones(4))], ["pgs", "direct"], QUICK)
     store.write_json(records, tmp_path / "r.json")
@@ -401,95 +392,6 @@ def test_a_fingerprint_sees_every_number():
     prints = [bench_cases.fingerprint(v) for v in variants]
     assert len(set(prints)) == len(variants)
     assert bench_cases.fingerprint(stack(5, "renamed")) == prints[0]
-
-
-# -- a process of its own ------------------------------------------------------------------------
-
-BACKENDS = """
-import os, signal, sys, time
-import numpy as np
-import lavender as lv
-
-class Backend:
-    def __init__(self, what): self.what = what
-    def prepare(self, problem): return problem
-    def update(self, state, problem): return problem
-    def run(self, state, impulse, n, tol, time_limit=None):
-        if self.what == "hang":
-            while True: time.sleep(1)
-        if self.what == "segfault": os.kill(os.getpid(), signal.SIGSEGV)
-        if self.what == "exit": os._exit(3)
-        if self.what == "eat": self.all = [np.empty(4 * 10**7) for _ in range(1000)]
-        if self.what == "talk":
-            print("noise" * 10000, flush=True); os.write(1, b"more noise"); print("noise", file=sys.stderr)
-            impulse[:] = state.b / state.matrix.diagonal()
-        return lv.Claim(lv.Status.CONVERGED, 1, {"calls": 1}, str(os.getpid()))
-
-def make(what):
-    def factory(): return Backend(what)
-    return factory
-
-hang, segfault, exit_, eat, talk = map(make, ("hang", "segfault", "exit", "eat", "talk"))
-
-def spec(name, factory):
-    return lv.SolverSpec(name, "fake_backends:" + factory, laws={"linear", "lcp"}, summary="test", resumable=False,
-                         requires=("fake_backends",))
-names = {"hang": "hang", "segfault": "segfault", "exit": "exit_", "eat": "eat", "talk": "talk"}
-HANG, SEGFAULT, EXIT, EAT, TALK = (spec(name, factory) for name, factory in names.items())
-"""
-
-
-@pytest.fixture
-def plugin(tmp_path, monkeypatch):
-    """An installed plug-in, as the worker process finds it: through its entry points."""
-    folder = tmp_path / "site"
-    info = folder / "fake_backends-1.0.dist-info"
-    info.mkdir(parents=True)
-    (folder / "fake_backends.py").write_text(BACKENDS)
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: fake-backends\nVersion: 1.0\n")
-    names = ("hang", "segfault", "exit", "eat", "talk")
-    lines = [f"{n} = fake_backends:{n.upper()}" for n in names]
-    (info / "entry_points.txt").write_text("[lavender.solvers]\n" + "\n".join(lines) + "\n")
-    monkeypatch.setattr(registry, "_registered", dict(registry.specs()))
-    monkeypatch.syspath_prepend(str(folder))
-    registry._load_builtin_and_plugins.cache_clear()
-    yield names
-    registry._load_builtin_and_plugins.cache_clear()
-
-
-def task(problem, solver, **more):
-    return bench.Task("run", "case", bench_cases.fingerprint(problem), solver, "tol", 1e-6, 0, 0.05, **more)
-
-
-def test_a_backend_that_hangs_or_dies_costs_its_own_record(plugin):
-    p = lv.Problem.linear(np.diag([1.0, 2.0]), np.ones(2))
-    with Worker(memory=2**31, grace=1.0) as worker:
-        found = {
-            name: worker.measure(p, task(p, name)) for name in ("talk", "hang", "segfault", "exit", "eat")
-        }
-        after = worker.measure(p, task(p, "talk"))
-    assert found["hang"].status == "KILLED"
-    assert found["segfault"].status == "CRASHED (SIGSEGV)"
-    assert found["exit"].status == "CRASHED (exit status 3)"
-    assert found["eat"].status == "NUMERICAL_ERROR"
-    assert "MemoryError" in found["eat"].message
-    for record in (found["talk"], after):
-        assert record.status == "CONVERGED"
-        assert record.relative == 0.0
-        assert int(record.message) != os.getpid()
-
-
-def test_a_whole_run_survives_its_backends(plugin, monkeypatch):
-    from lavender.bench.running import worker
-
-    monkeypatch.setattr(worker, "GRACE", 0.5)
-    plan = bench.Plan(levels=(1e-3,), budgets=(), repeats=1, time_limit=0.05)
-    started = time.monotonic()
-    records = bench.run([stack(4)], ["hang", "segfault", "pgs", "talk"], plan)
-    assert [r.solver for r in records] == ["hang", "segfault", "pgs", "talk"]
-    assert [r.status.split()[0] for r in records] == ["KILLED", "CRASHED", "CONVERGED", "CONVERGED"]
-    assert records.records[3].contradicted  # its diagonal step does not solve a stack, and it says so
-    assert time.monotonic() - started < 60.0  # hangs are cut off
 
 
 # -- sequences ------------------------------------------------------------------------------------
