@@ -10,6 +10,7 @@ from libc.string cimport memcpy, memset
 from lavender_ext.accelerate.accelerated cimport anderson_step, sweep_data_t
 from lavender_ext.accelerate.mixing cimport CONTROL, MAX_MEMORY, UNDONE
 from lavender_ext.core.block cimport CONE
+from lavender_ext.core.csr cimport scan_entries
 from lavender_ext.core.generalized cimport whitened_gather
 from lavender_ext.core.problem cimport MADE, make_numbers
 from lavender_ext.core.velocity cimport rows_velocity
@@ -24,7 +25,7 @@ from lavender_ext.pivot.principal cimport SMALL
 from lavender_ext.pivot.principal cimport SOLVED as PIVOTED
 from lavender_ext.pivot.principal cimport (pivoting_t, pivots_correct, pivots_exchange, pivots_factor_all, pivots_on,
                                            pivots_restart, pivots_rounds, pivots_slack, pivots_solve, pivots_solve_free,
-                                           pivots_start, scan_entries)
+                                           pivots_start)
 
 
 cdef enum:                      # as in chain.pyx
