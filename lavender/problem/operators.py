@@ -13,11 +13,11 @@ from lavender._derived import once
 from lavender.errors import CapabilityError, InputError
 from lavender.problem.data import ProblemData
 from lavender_ext.core import assemble
-from lavender_ext.core.problem import LAWS as FRICTION_NUMBER
 from lavender_ext.core.assemble import dense_to_csr
+from lavender_ext.core.problem import LAWS as FRICTION_NUMBER
 from lavender_ext.core.problem import Data, nothing_done
-from lavender_ext.judge import measure
 from lavender_ext.factor import sparse
+from lavender_ext.judge import measure
 
 
 class Operators(ProblemData):
