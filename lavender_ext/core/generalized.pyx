@@ -4,7 +4,7 @@ from libc.stdint cimport int32_t
 
 import numpy as np
 
-from lavender_ext.core.generalized cimport (generalized_t, jac_push, jac_row, tree_factor, tree_pattern, tree_solve,
+from lavender_ext.core.generalized cimport (jac_push, jac_row, tree_factor, tree_pattern, tree_solve,
                                             tree_unwhiten)
 
 cdef object new = np.empty, I4 = np.dtype(np.int32)
