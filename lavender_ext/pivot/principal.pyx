@@ -595,6 +595,11 @@ cdef class Pivoting:
     def n_rounds(self):
         return self.s.n_rounds
 
+    def skipped(self):
+        """Rows whose pivots were small in the last factorisation, in order of elimination."""
+        rows = self.order if self.order is not None else range(self.s.n)
+        return [i for i in rows if self.s.place[i] >= 0 and self.s.c[<int64_t>self.s.place[i] * self.s.width] == 0.0]
+
     @property
     def pivots(self):
         """(small, negative, least, first small place) of the last factorisation."""
