@@ -342,8 +342,8 @@ def test_panels_solve_what_a_dense_matrix_solves_with_the_same_bits_at_any_width
     nptr, nind, node, _, _ = pattern.block_pattern(n, body)
     nptr, nind, node, slot, _ = pattern.postordered(n, node, nptr, nind)
     structure = symbolic.factor_pattern(nptr, nind)
-    panels = symbolic.supernodes(nptr, nind, *structure[:2], s, few, share)
-    assert panels[0][-1] == n and len(panels[0]) - 1 < n
+    panels = symbolic.block_panels(nptr, nind, *structure[:2], s, few, share)
+    assert len(panels[2]) // 2 - 1 < n
     panel = rng.normal(size=(m, 2, s))
     panel[node[:, 1] < 0, 1] = 0.0
     k = np.zeros((m, n * s))
