@@ -14,6 +14,12 @@ cpdef enum:                     # outcomes
     STUCK = 4                   # patience used up
 
 
+cdef enum:                      # sides of a row
+    FREE = 0
+    AT_LOWER = -1
+    AT_UPPER = 1
+
+
 cdef struct pivoting_t:
     const csr_t* a
     const blocks_t* p           # b, d, lower, upper
