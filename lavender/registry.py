@@ -293,13 +293,7 @@ def get(name: str) -> SolverSpec:
 
 
 def known(problem: Problem | None = None) -> dict[str, str | None]:
-    """Every solver: None where it can be used here (and takes `problem`), else the reason it cannot.
-
-    Raises
-    ------
-    InputError
-        Not a Problem.
-    """
+    """Every solver: None where it can be used here (and takes `problem`), else the reason it cannot."""
     if problem is not None and not isinstance(problem, Problem):
         raise InputError(f"problem is a {type(problem).__name__}; a lavender.Problem is needed")
     return {

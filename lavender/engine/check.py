@@ -33,13 +33,7 @@ UNIT = 1e-9  # -, quaternions are normalised in every substep
 
 
 def same_scene(own: State, size: np.ndarray) -> None:
-    """Raise where sizes other than the capacities differ from the simulation's.
-
-    Raises
-    ------
-    InputError
-        They do, or a capacity is negative.
-    """
+    """Raise where sizes other than the capacities differ from the simulation's."""
     free = (CAP_PAIR, CAP_CONTACT)
     fixed = [k for k in range(N_SIZES) if k not in free]
     if not np.array_equal(size[fixed], own.size[fixed]) or size[list(free)].min() < 0:
@@ -57,11 +51,6 @@ def whole_state(own: State, new: State, sweeps: tuple[int, int], lost: bool) -> 
         Least and largest budget.
     lost : bool
         The state is said to be not finite: numbers may be anything then, for no step follows.
-
-    Raises
-    ------
-    InputError
-        The message names the array.
     """
     a, b = own.a, new.a
     for name in GIVEN:
@@ -162,13 +151,7 @@ def _damaged(what: str) -> InputError:
 
 
 def well_formed(snapshot: Any) -> None:
-    """Raise where the fields of a snapshot are not of their types.
-
-    Raises
-    ------
-    InputError
-        The message names the field.
-    """
+    """Raise where the fields of a snapshot are not of their types."""
     for name in ("steps", "failed"):
         x = getattr(snapshot, name)
         if isinstance(x, bool) or not isinstance(x, int) or not 0 <= x < 2**53:

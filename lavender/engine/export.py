@@ -28,11 +28,6 @@ def problem_of(state: State, bodies: Sequence[str], joints: Sequence[str], name:
         Names, for those of the blocks.
     name : str
         Of the problem.
-
-    Raises
-    ------
-    InputError
-        A number that is not finite.
     """
     a = state.a
     kj, mj = int(state.size[SIZE["joints"]]), int(state.size[SIZE["joint_rows"]])

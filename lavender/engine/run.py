@@ -44,13 +44,7 @@ class Trace:
         return self.solver[:, SOLVER_FIELDS.index(name)]
 
     def save(self, path: str | PathLike[str]) -> None:
-        """Write as CSV, one line for each step.
-
-        Raises
-        ------
-        InputError
-            A path that cannot be written.
-        """
+        """Write as CSV, one line for each step."""
         lines = [["step", "time", *SOLVER_FIELDS, "depth", "cost", "order"]]
         for i in range(len(self)):
             row = [self.time[i], *self.solver[i], self.depth[i], self.cost[i]]
@@ -58,13 +52,7 @@ class Trace:
         write_text(path, "".join(",".join(line) + "\r\n" for line in lines))
 
     def plot(self, path: str | PathLike[str]) -> None:
-        """Residuals, contacts with matches, and depth over time, as a figure.
-
-        Raises
-        ------
-        InputError
-            A path that cannot be written, or a suffix that matplotlib does not know.
-        """
+        """Residuals, contacts with matches, and depth over time, as a figure."""
         from matplotlib.figure import Figure
 
         canvas = Figure(figsize=(8, 7), layout="constrained")
@@ -212,11 +200,6 @@ def run_scene(
         Show one line in so many, and always the last.
     show : callable
         Takes each line; a terminal may overwrite the one before.
-
-    Raises
-    ------
-    UnknownName, InputError, LavenderError
-        As `Scene` and `Simulation`.
     """
     every = whole("every", every, 1)
     given = dict(parameters or {})

@@ -320,11 +320,5 @@ class Simulation(Stepping):
         self.snapshot().save(path)
 
     def load(self, path: str | PathLike[str]) -> None:
-        """Continue from a file written by `save`.
-
-        Raises
-        ------
-        InputError
-            Not such a file, damaged, or of another scene.
-        """
+        """Continue from a file written by `save`."""
         self.restore(Snapshot.load(path))

@@ -135,13 +135,7 @@ class State:
         self.keys[:] = other.keys
 
     def grown(self) -> State:
-        """A copy with room for what the last substep found missing.
-
-        Raises
-        ------
-        InputError
-            More than `MOST_PAIRS` pairs of bodies are close together, or more than `MOST_BYTES` are needed.
-        """
+        """A copy with room for what the last substep found missing."""
         size = self.size.copy()
         if self.head[HEAD["need_pairs"]] == TOO_MANY:
             raise InputError(

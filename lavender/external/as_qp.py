@@ -182,13 +182,6 @@ def pick_form(problem: Problem, form: str, definite: bool = False) -> str:
 
     "auto" takes the velocity form where rows are known and m > 6 n, the mass ratio is 1e3 or more, or
     the backend needs a definite P (`definite`).
-
-    Raises
-    ------
-    InputError
-        No such form.
-    CapabilityError
-        "velocity" for a problem given as a matrix.
     """
     if form not in FORMS:
         raise InputError(f"form is {form!r}; one of {', '.join(map(repr, FORMS))} is needed")
@@ -283,13 +276,7 @@ def impulse_form(problem: Problem, *, unit_diagonal: bool = True, equality: bool
 
 
 def velocity_form(problem: Problem) -> QP:
-    """The mass-scaled velocity form of a problem with rows.
-
-    Raises
-    ------
-    CapabilityError
-        The problem was given as a matrix.
-    """
+    """The mass-scaled velocity form of a problem with rows."""
     form = problem.velocity_form()
     parts = _Parts.of(problem, True)
     c, kept, root, sigma = problem.cones, parts.kept, parts.root, parts.sigma
@@ -312,7 +299,48 @@ def velocity_form(problem: Problem) -> QP:
     upper = np.flatnonzero(plain & ~has_low & has_high)
     shift = np.zeros(k)
     shift[lower], shift[upper] = low[lower], high[upper]
-    # Columns of T, and the entries of the t unknowns in their rows.
+    put, slack, n, n_alone = _velocity_rows(rows, free, lower, both, upper, ny)
+    back = sp.csr_matrix(put.matrix(k).T)
+    velocities = sp.hstack([-(back.T @ lift), sp.csc_matrix((back.shape[1], n - ny))])
+    matrix = sp.csc_matrix(velocities + slack.matrix(n))
+    q = np.zeros(n)
+    known = np.zeros(ny)
+    known[: jac.shape[1]] = jac.T @ (parts.fixed / (form.scale * sigma))
+    q[:ny] = -(lift.T @ shift) - known
+    q[ny : ny + len(both)] = high[both] - low[both]
+    lb = ub = None
+    if n > ny:
+        lb, ub = np.full(n, -np.inf), np.full(n, np.inf)
+        lb[ny:] = 0.0
+    diagonal = np.zeros(n)
+    diagonal[:ny] = 1.0
+    n_nonneg = len(lower) + len(upper) + 2 * len(rows.pairs) + n_alone
+    return QP(
+        form="velocity",
+        P=sp.csc_matrix(sp.diags_array(diagonal)),
+        q=q,
+        A=matrix,
+        b=-(back.T @ g),
+        n_zero=len(free),
+        n_nonneg=n_nonneg,
+        soc=tuple(1 + len(disk.tangents) for disk in rows.disks),
+        lb=lb,
+        ub=ub,
+        problem=problem,
+        kept=kept,
+        fixed=parts.fixed,
+        root=root,
+        sigma=sigma,
+        back=back,
+        shift=shift,
+        lift=lift,
+    )
+
+
+def _velocity_rows(
+    rows: _FrictionRows, free: IntpArray, lower: IntpArray, both: IntpArray, upper: IntpArray, ny: int
+) -> tuple[_Entries, _Entries, int, int]:
+    """Columns of T, entries of the t in their rows, number of unknowns, normals bounded by a sum of t alone."""
     put, slack = _Entries(), _Entries()
     t_of = {int(i): ny + j for j, i in enumerate(both)}
     n = ny + len(both)
@@ -349,41 +377,7 @@ def velocity_form(problem: Problem) -> QP:
         for tangent, ratio in zip(disk.tangents, disk.ratios, strict=True):
             put.row([(tangent, ratio)])
             slack.row([])
-    back = sp.csr_matrix(put.matrix(k).T)
-    velocities = sp.hstack([-(back.T @ lift), sp.csc_matrix((back.shape[1], n - ny))])
-    matrix = sp.csc_matrix(velocities + slack.matrix(n))
-    q = np.zeros(n)
-    known = np.zeros(ny)
-    known[: jac.shape[1]] = jac.T @ (parts.fixed / (form.scale * sigma))
-    q[:ny] = -(lift.T @ shift) - known
-    q[ny : ny + len(both)] = high[both] - low[both]
-    lb = ub = None
-    if n > ny:
-        lb, ub = np.full(n, -np.inf), np.full(n, np.inf)
-        lb[ny:] = 0.0
-    diagonal = np.zeros(n)
-    diagonal[:ny] = 1.0
-    n_nonneg = len(lower) + len(upper) + 2 * len(rows.pairs) + len(alone)
-    return QP(
-        form="velocity",
-        P=sp.csc_matrix(sp.diags_array(diagonal)),
-        q=q,
-        A=matrix,
-        b=-(back.T @ g),
-        n_zero=len(free),
-        n_nonneg=n_nonneg,
-        soc=tuple(1 + len(disk.tangents) for disk in rows.disks),
-        lb=lb,
-        ub=ub,
-        problem=problem,
-        kept=kept,
-        fixed=parts.fixed,
-        root=root,
-        sigma=sigma,
-        back=back,
-        shift=shift,
-        lift=lift,
-    )
+    return put, slack, n, len(alone)
 
 
 def _sigma(problem: Problem) -> float:

@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from lavender._arrays import FloatArray
-from lavender.errors import CapabilityError
+from lavender.errors import CapabilityError, InputError
 from lavender.external import _apart
-from lavender.external._running import ask, check_options, definite_refusal, symmetric_refusal
+from lavender.external._running import ask, definite_refusal, symmetric_refusal
 from lavender.external.as_qp import QP, impulse_form, pick_form, velocity_form
 from lavender.external.backend import Backend
 from lavender.problem import Problem
-from lavender.solution import Claim
+from lavender.solution import Claim, Status
 
 __all__ = ["OPTIONS", "QPSolver", "refusal"]
 
@@ -26,14 +26,6 @@ OPTIONS = {
     "unit_diagonal": "impulse form: scale A to a unit diagonal, default True",
     "settings": "mapping passed to the backend, over those that tol gives",
 }
-
-
-@dataclass
-class State:
-    """A converted problem."""
-
-    problem: Problem
-    qp: QP
 
 
 @dataclass(frozen=True)
@@ -59,10 +51,15 @@ class QPSolver:
     isolate: bool = True
 
     def __post_init__(self) -> None:
-        check_options(self.settings, self.isolate)
+        if not isinstance(self.settings, Mapping):
+            raise InputError(
+                f"settings is a {type(self.settings).__name__}; a mapping of names to values is needed"
+            )
+        if not isinstance(self.isolate, bool):
+            raise InputError(f"isolate is {self.isolate!r}; True or False is needed")
 
     @np.errstate(all="ignore")  # what overflows is judged
-    def prepare(self, problem: Problem) -> State:
+    def prepare(self, problem: Problem) -> QP:
         b = self.backend
         qp = velocity_form(problem) if pick_form(problem, self.form, b.definite) == "velocity" else None
         if qp is not None and b.definite and self.form == "auto" and not qp.is_definite:
@@ -83,21 +80,30 @@ class QPSolver:
                 f"solver {b.name!r} takes dense matrices only: {max(qp.n, len(qp.b))} x {qp.n} would need more "
                 f"than {DENSE_LIMIT >> 20} MiB; use a sparse backend (osqp, piqp, clarabel)"
             )
-        return State(problem, qp)
+        return qp
 
-    def update(self, state: State, problem: Problem) -> State:
+    def update(self, state: QP, problem: Problem) -> QP:
         return self.prepare(problem)
 
     @np.errstate(all="ignore")  # what overflows is judged
     def run(
-        self, state: State, impulse: FloatArray, n: int, tol: float, time_limit: float | None = None
+        self, state: QP, impulse: FloatArray, max_iter: int, tol: float, time_limit: float | None = None
     ) -> Claim:
-        b = self.backend
-        apart = _apart.elsewhere(b.name, b.stoppable) if self.isolate and time_limit is not None else None
-        return ask(
-            state.problem, state.qp, impulse, b.run, n, tol, time_limit, self.settings,
-            stoppable=b.stoppable, noisy=b.noisy, apart=apart,
-        )  # fmt: skip
+        qp, b, none = state, self.backend, {"backend_calls": 0}
+        if not len(qp.kept):
+            impulse[:] = qp.fixed
+            return Claim(Status.CONVERGED, 0, none, "every row was decided by its bounds", qp.form)
+        if max_iter == 0:
+            return Claim(Status.MAX_ITERATIONS, 0, none, "", qp.form)
+        if not qp.fits:
+            words = "as a quadratic program the problem has numbers that overflow; the backend was not called"
+            return Claim(Status.NUMERICAL_ERROR, 0, none, words, qp.form)
+        apart = _apart.Elsewhere(b) if self.isolate and time_limit is not None else None
+        claim = ask(qp, impulse, apart or b.run, max_iter, tol, time_limit, self.settings, b.noisy)
+        if time_limit is None or b.stoppable:
+            return claim
+        where = "to its end" if apart is None else apart.where
+        return replace(claim, message=f"{claim.message}; takes no time limit and ran {where}")
 
     def ready(self) -> None:
         """A time limit was given, and its clock has not begun: have that process ready."""

@@ -185,13 +185,7 @@ def _npy_header(stream: IO[bytes], size: int) -> _Header:
 
 
 def read(path: str | os.PathLike[str], *, max_bytes: int = MAX_BYTES) -> Stored:
-    """A problem from an .npz archive of any layout that `docs/formats.md` lists.
-
-    Raises
-    ------
-    InputError
-        Truncated, foreign or inconsistent; the message names the entry.
-    """
+    """A problem from an .npz archive of any layout that `docs/formats.md` lists."""
     archive = _Archive(path, max_bytes)
     try:
         if "lavender_format" in archive:
@@ -460,13 +454,7 @@ def _matrix(archive: _Archive) -> Any:
 
 
 def compressed(indptr: np.ndarray, indices: np.ndarray, data: np.ndarray, m: int, n: int) -> sp.csr_array:
-    """CSR matrix (m, n) of arrays from a file; `data` may be longer than the pointers say.
-
-    Raises
-    ------
-    InputError
-        Pointers that do not start with 0 or decrease, indices outside the matrix, wrong lengths.
-    """
+    """CSR matrix (m, n) of arrays from a file; `data` may be longer than the pointers say."""
     for what, x, kinds in (("pointers", indptr, "iu"), ("indices", indices, "iu"), ("values", data, "buif")):
         if x.ndim != 1 or x.dtype.kind not in kinds:
             raise InputError(

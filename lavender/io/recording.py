@@ -151,13 +151,7 @@ def record_file(
     replace: bool = False,
     precision: str = "float64",
 ) -> Recording:
-    """`record` of a model by its file (MJCF); an array of controls may be given by its file (.npy), too.
-
-    Raises
-    ------
-    InputError
-        As `record`; MuJoCo cannot be imported, or cannot read the model; the controls cannot be read.
-    """
+    """`record` of a model by its file (MJCF); an array of controls may be given by its file (.npy), too."""
     try:
         import mujoco as mj
     except ImportError:
@@ -188,7 +182,7 @@ def record_file(
 
 def _controls(path: str) -> Any:
     try:
-        first_bytes(Path(path))  # of a regular file
+        first_bytes(path)  # of a regular file
         found = np.load(
             path, mmap_mode="r", allow_pickle=False
         )  # as long as the file is, whatever its head says

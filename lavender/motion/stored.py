@@ -66,11 +66,6 @@ def load_reference(problem: Problem, path: str | PathLike[str]) -> Reference | N
     -------
     Reference or None
         None without a file, and where what it holds solves another problem: then the reference is solved for anew.
-
-    Raises
-    ------
-    InputError
-        A file of that name that holds no reference.
     """
     place = _beside(path)
     if not place.is_file():

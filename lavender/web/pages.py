@@ -110,13 +110,6 @@ def write_page(folder: Path, say: Callable[[str], Any] = lambda text: None) -> P
     -------
     Path
         The page, index.html.
-
-    Raises
-    ------
-    InputError
-        A folder that cannot be written.
-    LavenderError
-        No module; see `module`.
     """
     modules = {name: module(say, name) for name in wasm.PARTS}
     try:
@@ -159,13 +152,7 @@ class Handler(SimpleHTTPRequestHandler):
 
 
 def server(folder: Path, port: int = 0) -> ThreadingHTTPServer:
-    """A server of `folder` on the loopback address, not yet running; port 0 takes a free one.
-
-    Raises
-    ------
-    InputError
-        A port that is taken.
-    """
+    """A server of `folder` on the loopback address, not yet running; port 0 takes a free one."""
     try:
         return ThreadingHTTPServer(("127.0.0.1", port), partial(Handler, directory=str(folder)))
     except OSError as error:

@@ -49,15 +49,7 @@ class StepperSpec:
     options: Mapping[str, Option] = field(default_factory=dict)
 
     def values(self, given: Mapping[str, Any]) -> dict[str, float]:
-        """Every option, as given or by default.
-
-        Raises
-        ------
-        UnknownName
-            An option that it does not have.
-        InputError
-            A value outside its range.
-        """
+        """Every option, as given or by default."""
         for name in given:
             if name not in self.options:
                 raise UnknownName(f"option of stepper {self.name!r}", name, self.options)
