@@ -84,14 +84,13 @@ class Foreign:
                 wrong = wrong or f"gives a certificate that is no array of {m} numbers ({certificate!r:.60})"
         if wrong:
             return Claim(Status.NUMERICAL_ERROR, iterations, {}, f"solver {self.name!r} {wrong}")
-        return Claim(
-            status=claim.status,
+        return replace(
+            claim,
             iterations=iterations,
             work={k: int(n) for k, n in work.items()},
-            message=claim.message,
-            form=claim.form,
             dual=read_only(dual.copy()) if isinstance(dual, np.ndarray) else dual,
             certificate=certificate,
+            turns=(),
         )
 
 

@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from lavender import io
 from lavender._arrays import FloatArray
 from lavender.engine.picture import PICTURES, save_picture
 from lavender.engine.simulation import SOLVER_FIELDS, Simulation
@@ -105,7 +104,7 @@ def run(
     lost, done = "", 0
     while done < steps and not lost:
         if folder is not None and done >= skip:
-            recorded += _write_problem(simulation, folder)
+            recorded += simulation.write_problem(folder, 6) is not None
         start = perf_counter()
         observation, _, _, _, info = simulation.step()
         cost[done] = perf_counter() - start
@@ -130,13 +129,6 @@ def run(
         f"{'warm' if simulation.warm_start else 'cold'}, order {order}",
         order=order,
     )
-
-
-def _write_problem(simulation: Simulation, folder: Path) -> bool:
-    problem = simulation.constraint_problem()
-    if problem.m:
-        io.save(problem, folder / f"{simulation.scene.name or 'scene'}-{simulation.steps + 1:06d}.npz")
-    return problem.m > 0
 
 
 def line(step: int, observation: Mapping[str, Any], info: Mapping[str, Any]) -> str:
@@ -174,32 +166,10 @@ def run_scene(
     every: int = 1,
     show: Callable[[str], Any] = print,
 ) -> Trace:
-    """`lavender run NAME`: a gallery scene, a live line, and files on request.
+    """`lavender run NAME`: a gallery scene, a line of every `every`-th step for `show`, and files on request.
 
-    Parameters
-    ----------
-    name : str
-        Of the gallery.
-    steps, iterations, warm_start
-        Number of steps, sweep budget (None: the scene's), and mode.
-    parameters : mapping, optional
-        Further parameters of the scene.
-    residual : bool
-        Judge all rows of every step.
-    trace, plot, record : path, optional
-        CSV of the trace, figure, folder of the problems.
-    skip : int
-        Steps before the first that is recorded.
-    replace : bool
-        Take the problem files of another recording out of the folder, which is refused otherwise.
-    film : path, optional
-        Film of the run: `.gif`, `.mp4`, `.png`, `.svg` or `.pdf` are pictures, anything else is for `lavender view`.
-    view : bool
-        Show the run in a page while it goes on, no faster than it would, and after it until Ctrl-C.
-    every : int
-        Show one line in so many, and always the last.
-    show : callable
-        Takes each line; a terminal may overwrite the one before.
+    `film`: `.gif`, `.mp4`, `.png`, `.svg` or `.pdf` are pictures, anything else is for `lavender view`. `view` shows
+    the run in a page, no faster than it would go, and after it until Ctrl-C.
     """
     every = whole("every", every, 1)
     given = dict(parameters or {})

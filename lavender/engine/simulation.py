@@ -143,19 +143,22 @@ class Simulation(Stepping):
         folder = Path(folder)
         if folder.resolve() != self._recorded:
             self._recorded = folder_for_steps(folder).resolve()
-        more: dict[str, Any] = {} if form == "npz" else {"drop": ("names", "key")}
-        suffix = ".npz" if form == "npz" else ".hdf5"
-        name, digits = self.scene.name or "scene", len(str(self._steps + steps))
-        written = []
+        digits, written = len(str(self._steps + steps)), []
         for _ in range(steps):
-            problem = self.constraint_problem()
-            if problem.m:
-                path = folder / f"{name}-{self._steps + 1:0{digits}d}{suffix}"
-                io.save(problem, path, **more)
-                written.append(path)
+            written.append(self.write_problem(folder, digits, form))
             if self.step()[2]:
                 break
-        return written
+        return [path for path in written if path is not None]
+
+    def write_problem(self, folder: Path, digits: int, form: str = "npz") -> Path | None:
+        """Write the next substep's problem, where it has rows, under the scene's name and the step's number."""
+        problem = self.constraint_problem()
+        if not problem.m:
+            return None
+        suffix, drop = (".npz", ()) if form == "npz" else (".hdf5", ("names", "key"))
+        path = folder / f"{self.scene.name or 'scene'}-{self._steps + 1:0{digits}d}{suffix}"
+        io.save(problem, path, drop=drop)
+        return path
 
     # -- pictures -------------------------------------------------------------------------------
 

@@ -8,7 +8,7 @@ from functools import wraps
 from pathlib import Path
 from threading import RLock
 from time import perf_counter
-from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, TypeVar
+from typing import Any, Concatenate, ParamSpec, TypeVar
 
 import numpy as np
 
@@ -29,9 +29,6 @@ from lavender.solution import Solution, Status
 from lavender.solve import solve
 from lavender.solvers.newton import SPEC as NEWTON_SPEC
 from lavender.solvers.warm_start import Tried, claim_of
-
-if TYPE_CHECKING:
-    pass
 
 __all__ = ["SOLVER_FIELDS", "Stepping", "alone", "make_pairs_anew"]
 

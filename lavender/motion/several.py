@@ -7,6 +7,7 @@ contacts with one tangent are enumerated whole (`lavender/motion/modes.py`).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
@@ -18,9 +19,9 @@ from lavender._arrays import FloatArray
 from lavender.cones import ROW, project
 from lavender.errors import CapabilityError, InputError, LavenderError
 from lavender.motion.bound import difference
-from lavender.motion.error import SAME
+from lavender.motion.error import SAME, MotionError, measure, told
 from lavender.motion.modes import enumerated
-from lavender.motion.reference import Reference, judged, kept
+from lavender.motion.reference import Reference, as_reference, judged, kept
 from lavender.motion.reference import reference as reference_of
 from lavender.motion.unique import uniqueness
 from lavender.problem import Problem
@@ -28,7 +29,17 @@ from lavender.registry import available, get
 from lavender.residuals import residual
 from lavender.solve import solve
 
-__all__ = ["CHOICES", "Motion", "Motions", "Pick", "branch", "motions", "motions_of"]
+__all__ = [
+    "CHOICES",
+    "Motion",
+    "Motions",
+    "Pick",
+    "branch",
+    "motion_error",
+    "motions",
+    "motions_of",
+    "nearest",
+]
 
 RUNS = 12  # of a search, after `auto` itself
 SOLVERS = ("anderson", "newton", "sequential_impulses", "block_gauss_seidel", "admm", "nncg")
@@ -398,3 +409,70 @@ def distance(problem: Problem, x: FloatArray, y: FloatArray) -> Distance:
         far = size.energy
         whole = max(operator.size(z, np.zeros(problem.m)).energy for z in (x, y))
     return Distance(fastest, far, far / whole if whole > 0.0 else (0.0 if far == 0.0 else np.inf))
+
+
+def motion_error(problem: Problem, impulse: Any, reference: Any = None) -> MotionError:
+    """How wrong the motion of an impulse is: its distance to the solution, with a bound.
+
+    With lambda* the reference and M^-1 J^T (lambda - lambda*) the difference dv of body velocities,
+
+        kinetic = sqrt(1/2 dv.M dv)        energy = sqrt(1/2 (lambda - lambda*).A (lambda - lambda*))
+
+    so that two impulses which differ by what moves nothing (a table on four legs) are at distance 0. The
+    bound needs no trust in the reference: with e the judge's error of lambda* and targets moved by d e,
+    the solution is within sqrt(1/2) |e|_A of it (proof in `lavender.motion.bound`).
+
+    Parameters
+    ----------
+    problem : Problem
+    impulse : (m,) N s
+    reference : (m,) N s, Solution or Reference, optional
+        What stands for the solution. Default: what `auto` finds at the floor, solved for once and kept
+        with the problem; under Coulomb's law the nearest of the motions that `lavender.motions` finds and of the
+        one that the impulse itself leads to.
+
+    Returns
+    -------
+    MotionError
+        No estimate where the reference is no solution (relative above 1e-10 and above twice its floor); no
+        energies where A is asymmetric or indefinite; no bound under Coulomb's law. `note` says so.
+
+    Raises
+    ------
+    InputError
+        An impulse or reference of the wrong length, or one that is not finite.
+    CapabilityError
+        Generalised coordinates in which M couples more than 2000 velocities.
+    """
+    if not isinstance(problem, Problem):
+        raise InputError(f"problem is a {type(problem).__name__}; a lavender.Problem is needed")
+    x = problem.impulse_array(impulse)
+    with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is told in `note`
+        if reference is not None:
+            return measure(problem, x, as_reference(problem, reference))
+        if problem.law != "coulomb":
+            return measure(problem, x, reference_of(problem))
+        return nearest(problem, x, motions_of(problem))
+
+
+def nearest(problem: Problem, x: FloatArray, found: Motions) -> MotionError:
+    """The distance of an impulse x (m,) to the nearest of several motions, and of the one that it leads to."""
+    references = [motion.reference for motion in found]
+    spread, energy = found.spread, found.spread_energy
+    if not found.unique:
+        own = branch(problem, x)
+        far = [distance(problem, own.impulse, motion.impulse) for motion in found]
+        if own.accepted and all(d.share > SAME for d in far):
+            references.append(own)
+            spread = max([spread, *(d.speed for d in far)])
+            energy = None if energy is None else max([energy, *(d.energy for d in far)])
+    if not references:
+        return measure(problem, x, reference_of(problem))
+    best = min((measure(problem, x, reference) for reference in references), key=_distance)
+    made = replace(best, spread=energy, spread_speed=spread, count=len(references), unique=found.unique)
+    return told(made, ("spread", "spread_speed"))
+
+
+def _distance(error: MotionError) -> float:
+    known = error.energy if error.energy is not None else error.rows
+    return math.inf if known is None else known

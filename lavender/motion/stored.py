@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-import zipfile
+from contextlib import closing
+from io import BytesIO
 from os import PathLike
 from pathlib import Path
 
 import numpy as np
 
 from lavender.errors import InputError
+from lavender.io import npz
+from lavender.io.stored import write_bytes
 from lavender.motion.reference import Reference, judged, kept, reference
 from lavender.problem import Problem
 
@@ -45,11 +48,9 @@ def save_reference(problem: Problem, path: str | PathLike[str]) -> Path:
     if not found.accepted:
         raise InputError(f"{path}: nothing reached the floor ({found}); there is no reference to write")
     out = _beside(path)
-    try:
-        with open(out, "wb") as stream:
-            np.savez(stream, impulse=found.impulse, solver=np.array(found.solver))
-    except OSError as error:
-        raise InputError(f"cannot write {str(out)!r}: {error.strerror}") from None
+    buffer = BytesIO()
+    np.savez(buffer, impulse=found.impulse, solver=np.array(found.solver))
+    write_bytes(out, buffer.getvalue())
     return out
 
 
@@ -71,9 +72,9 @@ def load_reference(problem: Problem, path: str | PathLike[str]) -> Reference | N
     if not place.is_file():
         return None
     try:
-        with np.load(place, allow_pickle=False) as data:
-            impulse, solver = np.asarray(data["impulse"], float), str(data["solver"])
-    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
+        with closing(npz.Archive(place)) as data:
+            impulse, solver = np.asarray(data["impulse"], float), str(data.scalar("solver"))
+    except (InputError, ValueError, TypeError) as error:
         raise InputError(
             f"{str(place)!r} holds no reference ({error}); delete it, or write it again with `lavender reference`"
         ) from None

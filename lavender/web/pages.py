@@ -153,9 +153,13 @@ class Handler(SimpleHTTPRequestHandler):
 
 def server(folder: Path, port: int = 0) -> ThreadingHTTPServer:
     """A server of `folder` on the loopback address, not yet running; port 0 takes a free one."""
+    return bound(partial(Handler, directory=str(folder)), port)
+
+
+def bound(handler: Callable[..., Any], port: int) -> ThreadingHTTPServer:
+    """A server on the loopback address that answers by `handler`."""
     try:
-        return ThreadingHTTPServer(("127.0.0.1", port), partial(Handler, directory=str(folder)))
-    except OSError as error:
-        raise InputError(
-            f"port {port} cannot be used ({error.strerror or error}); give another with --port"
-        ) from None
+        return ThreadingHTTPServer(("127.0.0.1", port), handler)
+    except (OSError, OverflowError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise InputError(f"port {port} cannot be used ({reason}); give another") from None
