@@ -107,7 +107,7 @@ class SolverRun:
     form: str = ""
 
 
-@dataclass(frozen=True, init=False, repr=False)
+@dataclass(frozen=True, repr=False)
 class Solution:
     """Result of `solve`; returned for every status, with the iterate. `str()` is one line.
 

@@ -41,16 +41,10 @@ def same_scene(own: State, size: np.ndarray) -> None:
 
 
 def whole_state(own: State, new: State, sweeps: tuple[int, int], lost: bool) -> None:
-    """Raise where `new`, of the sizes that `same_scene` has let pass, is no state of the same scene.
+    """Raise where `new`, of the sizes that `same_scene` has let pass, is no state of the scene of `own`.
 
-    Parameters
-    ----------
-    own, new : State
-        The simulation's, whose `given` arrays are right, and the one to be checked.
-    sweeps : (int, int)
-        Least and largest budget.
-    lost : bool
-        The state is said to be not finite: numbers may be anything then, for no step follows.
+    `sweeps`: least and largest budget. `lost`: the state is said to be not finite; numbers may be anything then, for no
+    step follows.
     """
     a, b = own.a, new.a
     for name in GIVEN:

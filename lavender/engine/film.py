@@ -110,13 +110,7 @@ class Film:
 
     @classmethod
     def load(cls, path: str | PathLike[str]) -> Film:
-        """Read a file written by `save`.
-
-        Raises
-        ------
-        InputError
-            No such file, or no film.
-        """
+        """Read a file written by `save`."""
         data = whole_file(path, "the film")
         try:
             header, end = unframed(data, MAGIC, MOST_HEADER)

@@ -84,18 +84,8 @@ def run(
 ) -> Trace:
     """Step a simulation and keep its trace; stops where the state is no longer finite.
 
-    Parameters
-    ----------
-    simulation : Simulation
-    steps : int
-    record : path, optional
-        Folder for the problem of every step, one file each; made if it does not exist.
-    skip : int
-        Steps before the first that is recorded.
-    replace : bool
-        Take the problem files of another recording out of that folder, which is refused otherwise.
-    watch : callable (step, observation, info), optional
-        Called after every step.
+    `record`: a folder for the problem of every step after the first `skip`; `replace` takes the problems of another
+    recording out of it, which is refused otherwise. `watch(step, observation, info)` is called after every step.
     """
     steps, skip = whole("steps", steps, 1), whole("skip", skip)
     recorded = 0

@@ -44,13 +44,7 @@ class Snapshot:
     keys: np.ndarray = field(repr=False)  # uint64
 
     def save(self, path: str | PathLike[str]) -> None:
-        """Write to a file, versioned and checksummed; a file of that name is replaced when the new one is whole.
-
-        Raises
-        ------
-        InputError
-            The path cannot be written, the disk is full (the old file stays), or a field is of a wrong type.
-        """
+        """Write to a file, versioned and checksummed; a file of that name is replaced when the new one is whole."""
         well_formed(self)
         arrays = [np.ascontiguousarray(getattr(self, name), code).tobytes() for name, code in ARRAYS]
         header = {name: getattr(self, name) for name in WORDS}
@@ -61,13 +55,7 @@ class Snapshot:
 
     @classmethod
     def load(cls, path: str | PathLike[str]) -> Snapshot:
-        """Read a file written by `save`.
-
-        Raises
-        ------
-        InputError
-            No such file, not a snapshot, of another version, or damaged.
-        """
+        """Read a file written by `save`."""
         data = whole_file(as_path(path), "the snapshot")
         if not data.startswith(MAGIC):
             raise InputError(f"{str(path)!r} is not a lavender snapshot")

@@ -220,12 +220,8 @@ def target(problem: Problem, tol: float) -> float:
 def impulse_form(problem: Problem, *, unit_diagonal: bool = True, equality: bool = False) -> QP:
     """min 1/2 l.A l - b.l over the bounds or friction cones of a symmetric problem.
 
-    Parameters
-    ----------
-    unit_diagonal : bool
-        Scale by D^-1/2; otherwise by one number, so that P is A in other units.
-    equality : bool
-        Write a linear system as min 1/2 x.P x subject to P x = -q, for backends that need a row.
+    `unit_diagonal` scales by D^-1/2, otherwise by one number, so that P is A in other units; `equality` writes a linear
+    system as min 1/2 x.P x subject to P x = -q, for backends that need a row.
     """
     parts = _Parts.of(problem, unit_diagonal)
     c, kept, root, sigma = problem.cones, parts.kept, parts.root, parts.sigma

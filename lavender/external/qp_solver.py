@@ -30,19 +30,7 @@ OPTIONS = {
 
 @dataclass(frozen=True)
 class QPSolver:
-    """A backend with its options.
-
-    Parameters
-    ----------
-    backend : Backend
-    form : {"auto", "impulse", "velocity"}
-    unit_diagonal : bool
-        Impulse form: scale P to a unit diagonal.
-    settings : mapping
-        Passed to the backend as they are, over those that `tol` gives.
-    isolate : bool
-        Under a time limit, run the backend in a process of its own, which is ended where it does not end itself.
-    """
+    """A backend with its options, which OPTIONS says in words."""
 
     backend: Backend
     form: str = "auto"

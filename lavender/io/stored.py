@@ -44,16 +44,7 @@ class Stored:
 def folder_for_steps(path: str | os.PathLike[str], replace: bool = False) -> Path:
     """A folder, made where it is not, that holds no problem file: steps of two recordings are no sequence.
 
-    Parameters
-    ----------
-    path : path
-    replace : bool
-        Take the problem files out that it holds.
-
-    Raises
-    ------
-    InputError
-        It holds problem files and `replace` is False, or it cannot be made or written.
+    `replace` takes the problem files out that it holds.
     """
     folder = Path(path)
     try:
@@ -74,10 +65,7 @@ def folder_for_steps(path: str | os.PathLike[str], replace: bool = False) -> Pat
 def destination(path: str | os.PathLike[str]) -> Path:
     """Where a file of that path is written: behind its symbolic links, a regular file or a new one.
 
-    Raises
-    ------
-    InputError
-        A folder, a pipe, a socket or a device, which is never replaced; links without end.
+    InputError for a folder, a pipe, a socket or a device, which is never replaced, and for links without end.
     """
     try:
         target = Path(os.path.realpath(path))
@@ -100,12 +88,6 @@ def write_atomically(path: str | os.PathLike[str], write: Callable[[Path], Any])
     """Call `write` with a path beside `path`, then rename: readers see the old file or the new one.
 
     Symbolic links are followed: the file behind them is replaced, they stay.
-
-    Raises
-    ------
-    InputError
-        The folder does not exist or cannot be written, the path is a folder, a pipe or a device (see `destination`),
-        the disk is full.
     """
     target = destination(path)
     temporary = target.with_name(f".{target.name}.{os.getpid()}.{get_native_id()}.part")

@@ -72,14 +72,7 @@ def kept(problem: Problem) -> Kept:
 def reference(problem: Problem) -> Reference:
     """The problem's reference; solved for by `auto` when first asked, then kept with the problem.
 
-    Parameters
-    ----------
-    problem : Problem
-
-    Returns
-    -------
-    Reference
-        The best that was found, also where it is no solution: ask `accepted`.
+    The best that was found, also where it is no solution: ask `accepted`.
     """
     own = kept(problem)
     if own.reference is None:

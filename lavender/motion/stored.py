@@ -26,23 +26,9 @@ def _beside(path: str | PathLike[str]) -> Path:
 
 
 def save_reference(problem: Problem, path: str | PathLike[str]) -> Path:
-    """Solve for a problem's reference, unless it is kept, and write it beside the problem's file.
+    """Solve for a problem's reference, unless it is kept, and write it beside the problem's file `path`.
 
-    Parameters
-    ----------
-    problem : Problem
-    path : path
-        Of the problem's file; ".reference" is added to its name.
-
-    Returns
-    -------
-    Path
-        Of what was written.
-
-    Raises
-    ------
-    InputError
-        The file cannot be written, or nothing solved the problem: then there is nothing to keep.
+    InputError where nothing solved the problem: then there is nothing to keep.
     """
     found = reference(problem)
     if not found.accepted:
@@ -57,16 +43,7 @@ def save_reference(problem: Problem, path: str | PathLike[str]) -> Path:
 def load_reference(problem: Problem, path: str | PathLike[str]) -> Reference | None:
     """Keep the reference beside a problem's file, if there is one and it solves this problem by the judge.
 
-    Parameters
-    ----------
-    problem : Problem
-    path : path
-        Of the problem's file.
-
-    Returns
-    -------
-    Reference or None
-        None without a file, and where what it holds solves another problem: then the reference is solved for anew.
+    None without a file, and where what it holds solves another problem: then the reference is solved for anew.
     """
     place = _beside(path)
     if not place.is_file():

@@ -179,15 +179,7 @@ def _stepper(name: str) -> dict[str, dict[str, Any]]:
 def describe(start: Snapshot) -> dict[str, Any]:
     """Sizes, and every array that is not all zero as a list of numbers, of a snapshot.
 
-    Parameters
-    ----------
-    start : Snapshot
-
-    Returns
-    -------
-    dict
-        size (10,), arrays: name -> numbers; exact when written as JSON, since the shortest text of a double
-        that reads back as the same double is written.
+    Exact when written as JSON, since the shortest text of a double that reads back as the same double is written.
     """
     first = offsets(start.size)
     arrays = {}
