@@ -118,6 +118,36 @@ def as_array(
     return read_only(array)
 
 
+def number(
+    what: str, value: object, *, low: float = -np.inf, high: float = np.inf, above: float | None = None
+) -> float:
+    """`value` as a finite float in [low, high], or above `above`."""
+    if isinstance(value, bool) or not isinstance(value, (int, float, np.integer, np.floating)):
+        raise InputError(f"{what} is {value!r}; a number is needed")
+    x = float(value)
+    if not np.isfinite(x):
+        raise InputError(f"{what} is {x}; a finite number is needed")
+    if above is not None and not x > above:
+        raise InputError(f"{what} is {x:g}; more than {above:g} is needed")
+    if x < low or x > high:
+        wanted = f"at least {low:g}" if high == np.inf else f"{low:g} to {high:g}"
+        raise InputError(f"{what} is {x:g}; {wanted} is needed")
+    return x
+
+
+def whole_number(what: str, value: object, low: int = 0, high: int | None = 2**31 - 1) -> int:
+    """`value` as an int in [low, high], of any size with None."""
+    if (
+        isinstance(value, bool)
+        or not isinstance(value, (int, np.integer))
+        or value < low
+        or (high is not None and value > high)
+    ):
+        upto = "" if high is None else f" to {high}"
+        raise InputError(f"{what} is {value!r}; a whole number from {low}{upto} is needed")
+    return int(value)
+
+
 def precision_of(*given: Any) -> str:
     """The word float32 where all of these are arrays of it, dense or sparse, or None, not all None; else float64."""
     types = {getattr(x, "dtype", None) for x in given if x is not None}

@@ -23,7 +23,7 @@ import scipy.sparse as sp
 from lavender._arrays import FloatArray
 from lavender.cones import Cones
 from lavender.errors import CapabilityError, InputError, SolveFailed
-from lavender.problem import Problem
+from lavender.problem import Problem, check_problem
 from lavender.residuals import residual
 from lavender.solve import solve
 from lavender_ext.pivot.principal import Pivoting, free_block
@@ -167,8 +167,7 @@ def redundancy(problem: Problem, *, tol: float = 1e-12) -> Redundancy:
     CapabilityError
         Asymmetric A with an island of more than 1,200 rows; numbers whose products are beyond float64.
     """
-    if not isinstance(problem, Problem):
-        raise InputError(f"problem is a {type(problem).__name__}; a lavender.Problem is needed")
+    check_problem(problem)
     if not 0.0 <= tol < 1.0:
         raise InputError(f"tol is {tol}; a share from 0 to 1 is needed")
     m = problem.m

@@ -25,7 +25,7 @@ from typing import Any, Protocol
 
 from lavender._arrays import FloatArray
 from lavender.errors import InputError, SolverUnavailable, UnknownName
-from lavender.problem import LAWS, OPERATORS, Problem
+from lavender.problem import LAWS, OPERATORS, Problem, check_problem
 from lavender.solution import Claim, Turn
 
 __all__ = ["Solver", "SolverSpec", "State", "available", "get", "known", "register"]
@@ -294,8 +294,8 @@ def get(name: str) -> SolverSpec:
 
 def known(problem: Problem | None = None) -> dict[str, str | None]:
     """Every solver: None where it can be used here (and takes `problem`), else the reason it cannot."""
-    if problem is not None and not isinstance(problem, Problem):
-        raise InputError(f"problem is a {type(problem).__name__}; a lavender.Problem is needed")
+    if problem is not None:
+        check_problem(problem)
     return {
         name: spec.missing() or (spec.refuses(problem) if problem is not None else None)
         for name, spec in sorted(specs().items())

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from lavender._arrays import ArrayLike, FloatArray, equal
+from lavender._arrays import ArrayLike, FloatArray, equal, whole_number
 from lavender.deadline import Deadline
 from lavender.errors import CapabilityError, InputError, InUse, UnknownName
 from lavender.foreign import Foreign
@@ -31,7 +31,7 @@ from lavender.outcome import (
     decide_empty_rows,
     finish,
 )
-from lavender.problem import Problem
+from lavender.problem import Problem, check_problem
 from lavender.registry import SolverSpec, State, get
 from lavender.residuals import Residual, reference, residual, told
 from lavender.solution import Claim, History, Solution, SolverRun, Status
@@ -518,8 +518,7 @@ def _rest(
 
 
 def _check_problem(problem: Problem, spec: SolverSpec) -> None:
-    if not isinstance(problem, Problem):
-        raise InputError(f"problem is a {type(problem).__name__}; a lavender.Problem is needed")
+    check_problem(problem)
     reason = spec.refuses(problem)
     if reason:
         raise CapabilityError(f"solver {spec.name!r} {reason}")
@@ -530,15 +529,12 @@ def _check_budget(
 ) -> tuple[float, int, float | None]:
     if not isinstance(tol, (int, float, np.number)) or not 0.0 <= tol < math.inf:
         raise InputError(f"tol is {tol!r}; a number >= 0 is needed (0 runs the whole budget)")
-    if max_iter is None:
-        max_iter = spec.max_iter
-    if isinstance(max_iter, bool) or not isinstance(max_iter, (int, np.integer)) or not 0 <= max_iter < 2**31:
-        raise InputError(f"max_iter is {max_iter!r}; a whole number from 0 to 2^31 - 1 is needed")
+    max_iter = whole_number("max_iter", spec.max_iter if max_iter is None else max_iter)
     if time_limit is not None and (
         not isinstance(time_limit, (int, float, np.number)) or not time_limit > 0.0
     ):
         raise InputError(f"time_limit is {time_limit!r}; seconds above 0, or None")
-    return float(tol), int(max_iter), time_limit
+    return float(tol), max_iter, time_limit
 
 
 def _check_records(spec: SolverSpec, history: bool, callback: Callback | None) -> None:

@@ -17,9 +17,10 @@ from typing import Any
 import numpy as np
 
 from lavender.cones import CONTACT, CONTACT_BOX, CONTACT_ROLLING, CONTACT_SPIN, ROW
-from lavender.engine.layout import CAP_CONTACT, CAP_PAIR, HEAD, N_SIZES, SETTING, SIZE
+from lavender.engine.layout import HEAD, SETTING, SIZE
 from lavender.engine.state import KEPT, State
 from lavender.errors import InputError
+from lavender_ext.engine.arrays import CAP_CONTACT, CAP_PAIR, N_SIZES
 
 __all__ = ["same_scene", "whole_state"]
 

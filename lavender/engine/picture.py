@@ -16,10 +16,10 @@ import numpy as np
 
 from lavender._arrays import FloatArray
 from lavender.engine.film import Film
-from lavender.engine.layout import BOX, PLANE, SPHERE
 from lavender.errors import InputError
 from lavender.io.stored import write_atomically, write_figure
 from lavender.scene.parts import rotation
+from lavender_ext.engine.arrays import BOX, PLANE, SPHERE
 
 __all__ = ["PICTURES", "save_picture"]
 

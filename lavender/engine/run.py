@@ -11,12 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from lavender._arrays import FloatArray
+from lavender._arrays import FloatArray, whole_number
 from lavender.engine.picture import PICTURES, save_picture
 from lavender.engine.simulation import SOLVER_FIELDS, Simulation
 from lavender.io.stored import folder_for_steps, write_figure, write_text
 from lavender.scene import Scene
-from lavender.scene.parts import whole
 
 __all__ = ["Trace", "run", "run_scene"]
 
@@ -87,7 +86,7 @@ def run(
     `record`: a folder for the problem of every step after the first `skip`; `replace` takes the problems of another
     recording out of it, which is refused otherwise. `watch(step, observation, info)` is called after every step.
     """
-    steps, skip = whole("steps", steps, 1), whole("skip", skip)
+    steps, skip = whole_number("steps", steps, 1), whole_number("skip", skip)
     recorded = 0
     folder = None if record is None else folder_for_steps(record, replace)
     solver, depth, cost, time = np.zeros((steps, 8)), np.zeros(steps), np.zeros(steps), np.zeros(steps)
@@ -161,7 +160,7 @@ def run_scene(
     `film`: `.gif`, `.mp4`, `.png`, `.svg` or `.pdf` are pictures, anything else is for `lavender view`. `view` shows
     the run in a page, no faster than it would go, and after it until Ctrl-C.
     """
-    every = whole("every", every, 1)
+    every = whole_number("every", every, 1)
     given = dict(parameters or {})
     if iterations is not None:
         given["solver_iterations"] = iterations

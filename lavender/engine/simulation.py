@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lavender import io
-from lavender._arrays import read_only
+from lavender._arrays import read_only, whole_number
 from lavender.engine.check import same_scene, well_formed, whole_state
 from lavender.engine.film import Film, header_of
-from lavender.engine.layout import HEAD, NEED_ROOM
+from lavender.engine.layout import HEAD
 from lavender.engine.picture import save_picture
 from lavender.engine.snapshot import Snapshot
 from lavender.engine.state import State
@@ -18,8 +18,7 @@ from lavender.engine.stepping import HALF, SOLVER_FIELDS, Stepping, alone, make_
 from lavender.errors import InputError, LavenderError, UnknownName
 from lavender.io.stored import folder_for_steps
 from lavender.problem import Problem
-from lavender.scene.parts import whole
-from lavender_ext.engine.arrays import lengths
+from lavender_ext.engine.arrays import NEED_ROOM, lengths
 
 if TYPE_CHECKING:
     from lavender.web.view import Viewer
@@ -139,7 +138,7 @@ class Simulation(Stepping):
         """
         if form not in ("npz", "fclib"):
             raise UnknownName("form", form, ("npz", "fclib"))
-        steps = whole("steps", steps, 1)
+        steps = whole_number("steps", steps, 1)
         folder = Path(folder)
         if folder.resolve() != self._recorded:
             self._recorded = folder_for_steps(folder).resolve()
@@ -174,7 +173,7 @@ class Simulation(Stepping):
         Film
             steps + 1 frames; `save` writes a file that `lavender view` opens.
         """
-        steps = whole("steps", steps, 1)
+        steps = whole_number("steps", steps, 1)
         film = self.start_film()
         try:
             for _ in range(steps):

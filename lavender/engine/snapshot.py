@@ -16,10 +16,9 @@ from typing import Any
 import numpy as np
 
 from lavender.engine.check import well_formed
-from lavender.engine.layout import N_SIZES
 from lavender.errors import InputError
 from lavender.io.stored import as_path, framed, unframed, whole_file, write_atomically
-from lavender_ext.engine.arrays import lengths
+from lavender_ext.engine.arrays import N_SIZES, lengths
 
 __all__ = ["Snapshot"]
 

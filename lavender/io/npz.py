@@ -27,7 +27,7 @@ from lavender.cones import CONTACT, ROW, Cones
 from lavender.errors import InputError
 from lavender.generalized import Generalized
 from lavender.io.stored import MAX_BYTES, NUMBER, Budget, Stored, write_atomically
-from lavender.problem import PRECISIONS, Problem
+from lavender.problem import PRECISIONS, Problem, check_problem
 from lavender.rows import Rows
 
 __all__ = ["VERSION", "Archive", "read", "write"]
@@ -215,8 +215,7 @@ def write(problem: Problem, path: str | os.PathLike[str], *, impulse: Any = None
 
     `read(path).problem == problem`, bit for bit.
     """
-    if not isinstance(problem, Problem):
-        raise InputError(f"problem is a {type(problem).__name__}; a lavender.Problem is needed")
+    check_problem(problem)
     arrays: dict[str, Any] = {"lavender_format": np.int64(VERSION), "b": problem.b}
     for name in CONES:
         arrays[name] = getattr(problem.cones, name.removeprefix("cones_"))

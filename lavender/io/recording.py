@@ -14,7 +14,7 @@ from zipfile import BadZipFile
 
 import numpy as np
 
-from lavender._arrays import FloatArray, as_array
+from lavender._arrays import FloatArray, as_array, whole_number
 from lavender.errors import InputError, LavenderError
 from lavender.io import mujoco as adapter
 from lavender.io import npz
@@ -93,9 +93,7 @@ def record(
         recording.
     """
     mj = adapter._mujoco(model, data)
-    for word, value in (("steps", steps), ("every", every)):
-        if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
-            raise InputError(f"{word} is {value!r}; a whole number from 1 is needed")
+    steps, every = whole_number("steps", steps, 1), whole_number("every", every, 1)
     if precision not in PRECISIONS:
         raise InputError(f"precision is {precision!r}; {' or '.join(map(repr, PRECISIONS))} is needed")
     drive = _drive(model, control, seed)

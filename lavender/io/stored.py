@@ -13,7 +13,7 @@ from threading import get_native_id
 from types import MappingProxyType
 from typing import Any
 
-from lavender._arrays import FloatArray
+from lavender._arrays import FloatArray, whole_number
 from lavender.errors import InputError
 from lavender.problem import Problem
 
@@ -177,9 +177,7 @@ class Budget:
     """Bytes that a file may still make; spent before anything is allocated."""
 
     def __init__(self, max_bytes: int) -> None:
-        if isinstance(max_bytes, bool) or not isinstance(max_bytes, int) or max_bytes < 0:
-            raise InputError(f"max_bytes is {max_bytes!r}; a whole number of bytes is needed")
-        self.limit = self.left = max_bytes
+        self.limit = self.left = whole_number("max_bytes", max_bytes, high=None)
 
     def spend(self, count: int, what: str) -> None:
         """Take `count` bytes off for `what`."""

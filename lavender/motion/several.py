@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.sparse as sp
 
-from lavender._arrays import FloatArray
+from lavender._arrays import FloatArray, whole_number
 from lavender.cones import ROW, project
 from lavender.errors import CapabilityError, InputError, LavenderError
 from lavender.motion.bound import difference
@@ -24,7 +24,7 @@ from lavender.motion.modes import enumerated
 from lavender.motion.reference import Reference, as_reference, judged, kept
 from lavender.motion.reference import reference as reference_of
 from lavender.motion.unique import uniqueness
-from lavender.problem import Problem
+from lavender.problem import Problem, check_problem
 from lavender.registry import available, get
 from lavender.residuals import residual
 from lavender.solve import solve
@@ -219,11 +219,8 @@ def motions(problem: Problem, n: int = RUNS, seed: int = 0, *, always: bool = Fa
     InputError
         `n` or `seed` is no whole number, or negative.
     """
-    if not isinstance(problem, Problem):
-        raise InputError(f"problem is a {type(problem).__name__}; a lavender.Problem is needed")
-    for name, value in (("n", n), ("seed", seed)):
-        if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 0:
-            raise InputError(f"{name} is {value!r}; a whole number from 0 is needed")
+    check_problem(problem)
+    n, seed = whole_number("n", n), whole_number("seed", seed, high=None)
     proof = uniqueness(problem)
     own = reference_of(problem)
     found = [(own, "auto")] if own.accepted else []
@@ -243,7 +240,7 @@ def motions(problem: Problem, n: int = RUNS, seed: int = 0, *, always: bool = Fa
         )
         whole |= modes[1] and len(single) <= MANY and max(beside, default=1.0) < BESIDE
     if always or not whole:
-        for label, impulse in _runs(problem, own, int(n), int(seed)):
+        for label, impulse in _runs(problem, own, n, seed):
             candidate = judged(problem, impulse, label)
             if candidate.accepted:
                 found.append((candidate, label))
@@ -444,8 +441,7 @@ def motion_error(problem: Problem, impulse: Any, reference: Any = None) -> Motio
     CapabilityError
         Generalised coordinates in which M couples more than 2000 velocities.
     """
-    if not isinstance(problem, Problem):
-        raise InputError(f"problem is a {type(problem).__name__}; a lavender.Problem is needed")
+    check_problem(problem)
     x = problem.impulse_array(impulse)
     with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is told in `note`
         if reference is not None:

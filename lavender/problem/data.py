@@ -289,6 +289,12 @@ class ProblemData:
         return table_of(facts, self.name or "Problem")
 
 
+def check_problem(problem: Any) -> None:
+    """Raise where what stands for a problem is none."""
+    if not isinstance(problem, ProblemData):
+        raise InputError(f"problem is a {type(problem).__name__}; a lavender.Problem is needed")
+
+
 def _many(n: int, what: str) -> str:
     return f"{n} {what}" if n == 1 else f"{n} {what}s"
 

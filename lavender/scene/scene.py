@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from lavender._arrays import FloatArray
+from lavender._arrays import FloatArray, number, whole_number
 from lavender.cones import check_shape
 from lavender.errors import InputError, UnknownName
 from lavender.ordering import ENGINE_ORDERS
@@ -28,10 +28,8 @@ from lavender.scene.parts import (
     Plane,
     Sphere,
     normalised,
-    number,
     numbers,
     unit,
-    whole,
 )
 from lavender.scene.steppers import StepperSpec, get_stepper
 
@@ -127,12 +125,12 @@ class Parameters:
         projections: Any = self.position_iterations
         if projections is None:
             projections = stepper.position_iterations
-        put(self, "position_iterations", whole("position_iterations", projections, 0, 1000))
+        put(self, "position_iterations", whole_number("position_iterations", projections, 0, 1000))
         if self.position_iterations and not stepper.position_iterations:
             raise InputError(
                 f"position_iterations is {projections}; stepper {stepper.name!r} has no position projection"
             )
-        put(self, "seed", whole("seed", self.seed))
+        put(self, "seed", whole_number("seed", self.seed))
         if self.on_failure not in ON_FAILURE:
             raise UnknownName("on_failure", self.on_failure, ON_FAILURE)
 
@@ -143,13 +141,13 @@ class Parameters:
                 raise InputError(
                     f"stepper {stepper.name!r} takes no solver {self.solver!r}; leave solver= out, or take 'impulses'"
                 )
-            return whole("solver_iterations", spec.max_iter if given is None else given, 1)
+            return whole_number("solver_iterations", spec.max_iter if given is None else given, 1)
         if self.solver_options:
             raise InputError(
                 f"solver_options {sorted(self.solver_options)} are for other solvers; sequential_impulses "
                 "takes order= and seed= of the scene"
             )
-        return 16 if given is None else whole("solver_iterations", given, *stepper.sweeps)
+        return 16 if given is None else whole_number("solver_iterations", given, *stepper.sweeps)
 
     def _count_of_substeps(self) -> int:
         given: Any = self.substeps
@@ -161,7 +159,7 @@ class Parameters:
                     "give a shorter dt, a longer max_substep, or substeps= if that many are meant"
                 )
             given = max(1, math.ceil(ratio))
-        return whole("substeps", given, 1)
+        return whole_number("substeps", given, 1)
 
 
 COMMON = tuple(f.name for f in fields(Parameters))

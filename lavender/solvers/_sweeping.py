@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from lavender._arrays import FloatArray
+from lavender._arrays import FloatArray, whole_number
 from lavender.errors import InputError
 from lavender.ordering import Order, block_order
 from lavender.problem import Problem
@@ -172,13 +172,9 @@ class Threaded(Sweeping):
     threads: int = 1
 
     def __post_init__(self) -> None:
-        if (
-            isinstance(self.threads, bool)
-            or not isinstance(self.threads, (int, np.integer))
-            or self.threads < 1
+        if whole_number("threads", self.threads, 1) > 1 and not (
+            isinstance(self.order, str) and self.order == "colored"
         ):
-            raise InputError(f"threads is {self.threads!r}; a whole number from 1 is needed")
-        if self.threads > 1 and not (isinstance(self.order, str) and self.order == "colored"):
             raise InputError(
                 f"threads={self.threads} needs order='colored': only blocks of one colour share nothing"
             )

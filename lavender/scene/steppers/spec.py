@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from lavender._arrays import number, whole_number
 from lavender.errors import InputError, UnknownName
-from lavender.scene.parts import number, whole
 
 __all__ = ["Option", "StepperSpec"]
 
@@ -58,7 +58,7 @@ class StepperSpec:
             x = given.get(name, option.default)
             label = f"{name} of stepper {self.name!r}"
             if option.is_whole:
-                found[name] = whole(label, x, int(option.low), int(option.high))
+                found[name] = whole_number(label, x, int(option.low), int(option.high))
             else:
                 found[name] = number(label, x, low=option.low, high=option.high)
         return found
