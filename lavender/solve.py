@@ -33,7 +33,7 @@ from lavender.outcome import (
 )
 from lavender.problem import Problem, check_problem
 from lavender.registry import SolverSpec, State, get
-from lavender.residuals import Residual, reference, residual, told
+from lavender.residuals import Residual, reference, residual, told, unstretched
 from lavender.solution import Claim, History, Solution, SolverRun, Status
 from lavender_ext.judge.measure import all_finite
 
@@ -158,6 +158,7 @@ class Prepared:
     def __init__(self, problem: Problem, spec: SolverSpec, options: dict[str, Any]) -> None:
         start = perf_counter()  # a check may form A, which is set-up
         _check_problem(problem, spec)
+        self._given, problem = problem, problem.disk
         for name in options:
             if name not in spec.accepts:
                 if name in ("order", "ground", "seed", "threads") or name in FRONT_DOOR:
@@ -210,9 +211,11 @@ class Prepared:
     def _loop(
         self, impulse: Any, tol: float, time_limit: float | None, history: bool, callback: Callback | None
     ) -> _Loop:
-        problem = self.problem
+        problem, given = self.problem, self._given
+        if given is not problem and callback is not None:
+            callback = _in_rows_of(given, given.cones.stretch, callback)
         if impulse is not None:
-            lam = problem.impulse_array(impulse)
+            lam = given.on_disk(problem.impulse_array(impulse))
         else:
             lam = problem.start() if problem.guess is None else problem.guess.copy()
         if time_limit is not None and hasattr(self._solver, "ready"):
@@ -233,18 +236,20 @@ class Prepared:
             claim = Claim(NUMERICAL_ERROR, 0, {}, self._broken)
         else:
             claim = loop.run(max_iter) if spec.resumable else loop.run_once(max_iter)
-        return finish(
+        solution = finish(
             problem, spec, self.options, loop.impulse, claim, loop.tol, setup_time, loop.time, loop.recorded(),
             float(getattr(self._state, "sweeps_per_decade", math.nan)),
         )  # fmt: skip
+        return solution if self._given is problem else solution.unstretched(self._given)
 
     def _refresh(self, problem: Problem | None) -> None:
-        if problem is None or problem is self.problem:
+        if problem is None or problem is self._given:
             if not self._fresh:
                 self._set_up(self.problem, anew=False)
         else:
             start = perf_counter()
             _check_problem(problem, self.spec)
+            self._given, problem = problem, problem.disk
             self._set_up(problem, anew=not same_structure(self.problem, problem))
             self.setup_time = perf_counter() - start
             self.problem = problem
@@ -264,6 +269,15 @@ class Prepared:
                 self._state = self._solver.update(self._state, problem)
         except BREAKDOWN as error:
             self._state, self._broken = None, _last_words(error)
+
+
+def _in_rows_of(given: Problem, stretch: FloatArray, callback: Callback) -> Callback:
+    """A callback of a problem with ellipses, for what is solved in its place."""
+
+    def call(done: int, impulse: FloatArray, found: Residual) -> Any:
+        return callback(done, stretch * impulse, unstretched(given, found))
+
+    return call
 
 
 def _last_words(error: BaseException) -> str:
@@ -447,6 +461,8 @@ def solve_few(problem: Problem, spec: SolverSpec, impulse: Any, tol: float) -> S
     Claim, counts and residual are put in words when somebody asks for them.
     """
     if type(problem) is not Problem or not isinstance(tol, float) or not 0.0 < tol < math.inf:
+        return None
+    if problem.cones.has_ellipse:
         return None
     start = perf_counter()
     if impulse is None:

@@ -30,7 +30,7 @@ def save_reference(problem: Problem, path: str | PathLike[str]) -> Path:
 
     InputError where nothing solved the problem: then there is nothing to keep.
     """
-    found = reference(problem)
+    found = reference(problem.disk)
     if not found.accepted:
         raise InputError(f"{path}: nothing reached the floor ({found}); there is no reference to write")
     out = _beside(path)
@@ -45,7 +45,7 @@ def load_reference(problem: Problem, path: str | PathLike[str]) -> Reference | N
 
     None without a file, and where what it holds solves another problem: then the reference is solved for anew.
     """
-    place = _beside(path)
+    place, problem = _beside(path), problem.disk
     if not place.is_file():
         return None
     try:
