@@ -4,8 +4,8 @@ A solver is an object that holds only its options, made by `SolverSpec.factory(*
 
     prepare(problem) -> state         factor, colour, allocate
     update(state, problem) -> state   the same structure with new numbers, and a fresh start
-    run(state, impulse, n, tol, time_limit) -> Claim
-        n more iterations on `impulse` (m,) in place, fewer only when its own test stops it. With
+    run(state, impulse, max_iter, tol, time_limit) -> Claim
+        `max_iter` more iterations on `impulse` (m,) in place, fewer only when its own test stops it. With
         `resumable`, n1 then n2 iterations give the bits of n1 + n2 and time_limit is None.
 
 Third parties register through the entry point group "lavender.solvers" (an object that is a
@@ -86,8 +86,10 @@ class Solver(Protocol):
     def update(self, state: Any, problem: Problem) -> Any:
         """The same structure with new numbers, and a fresh start."""
 
-    def run(self, state: Any, impulse: FloatArray, n: int, tol: float, time_limit: float | None) -> Claim:
-        """n more iterations on `impulse` (m,) in place."""
+    def run(
+        self, state: Any, impulse: FloatArray, max_iter: int, tol: float, time_limit: float | None
+    ) -> Claim:
+        """`max_iter` more iterations on `impulse` (m,) in place."""
 
 
 @dataclass(frozen=True)

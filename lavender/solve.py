@@ -357,10 +357,10 @@ class _Loop:
             self.impulse[:] = start_point
         return claim
 
-    def _call(self, n: int, time_limit: float | None) -> Claim:
-        """At most n iterations of the solver; what its arithmetic could not do is a claim."""
+    def _call(self, max_iter: int, time_limit: float | None) -> Claim:
+        """At most so many iterations of the solver; what its arithmetic could not do is a claim."""
         try:
-            return self.solver.run(self.state, self.impulse, n, self.tol, time_limit)
+            return self.solver.run(self.state, self.impulse, max_iter, self.tol, time_limit)
         except BREAKDOWN as error:
             self.broken = True
             return Claim(NUMERICAL_ERROR, 0, {}, _last_words(error))

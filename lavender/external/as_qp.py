@@ -249,7 +249,7 @@ def impulse_form(problem: Problem, *, unit_diagonal: bool = True, equality: bool
                 put.row([(t, -disk.ratios[0] / ratio)])
         matrix = put.matrix(k)
         rhs = np.zeros(matrix.shape[0])
-    return QP(
+    return parts.program(
         form="impulse",
         P=p,
         q=q,
@@ -257,14 +257,9 @@ def impulse_form(problem: Problem, *, unit_diagonal: bool = True, equality: bool
         b=rhs,
         n_zero=n_zero,
         n_nonneg=2 * len(rows.pairs),
-        soc=tuple(1 + len(disk.tangents) for disk in rows.disks),
+        soc=rows.cones,
         lb=lb,
         ub=ub,
-        problem=problem,
-        kept=kept,
-        fixed=parts.fixed,
-        root=root,
-        sigma=sigma,
         back=sp.csr_matrix((k, len(rhs))),
         shift=np.zeros(k),
         lift=sp.csr_matrix((k, 0)),
@@ -311,7 +306,7 @@ def velocity_form(problem: Problem) -> QP:
     diagonal = np.zeros(n)
     diagonal[:ny] = 1.0
     n_nonneg = len(lower) + len(upper) + 2 * len(rows.pairs) + n_alone
-    return QP(
+    return parts.program(
         form="velocity",
         P=sp.csc_matrix(sp.diags_array(diagonal)),
         q=q,
@@ -319,14 +314,9 @@ def velocity_form(problem: Problem) -> QP:
         b=-(back.T @ g),
         n_zero=len(free),
         n_nonneg=n_nonneg,
-        soc=tuple(1 + len(disk.tangents) for disk in rows.disks),
+        soc=rows.cones,
         lb=lb,
         ub=ub,
-        problem=problem,
-        kept=kept,
-        fixed=parts.fixed,
-        root=root,
-        sigma=sigma,
         back=back,
         shift=shift,
         lift=lift,
@@ -424,6 +414,10 @@ class _FrictionRows:
     disks: list[_Disk]
 
     @property
+    def cones(self) -> tuple[int, ...]:
+        return tuple(1 + len(disk.tangents) for disk in self.disks)
+
+    @property
     def members(self) -> list[int]:
         return [i for p in self.pairs for i in p[:2]] + [
             i for d in self.disks for i in (d.normal, *d.tangents)
@@ -466,6 +460,12 @@ class _Parts:
         if not unit_diagonal and len(d):
             d = np.full(len(d), np.exp(np.mean(np.log(d))))
         return cls(problem, kept, fixed, 1.0 / np.sqrt(d), _sigma(problem), np.array(stays, int))
+
+    def program(self, **own: Any) -> QP:
+        """A program of these rows."""
+        return QP(
+            problem=self.problem, kept=self.kept, fixed=self.fixed, root=self.root, sigma=self.sigma, **own
+        )
 
     def friction_rows(self) -> _FrictionRows:
         c = self.problem.cones

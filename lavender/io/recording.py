@@ -143,11 +143,8 @@ def record_file(
     folder: str | os.PathLike[str],
     steps: int,
     *,
-    every: int = 1,
     control: Control = "zero",
-    seed: int = 0,
-    replace: bool = False,
-    precision: str = "float64",
+    **options: Any,
 ) -> Recording:
     """`record` of a model by its file (MJCF); an array of controls may be given by its file (.npy), too."""
     try:
@@ -160,17 +157,7 @@ def record_file(
         raise InputError(f"{os.fspath(path)}: {error}") from None
     if isinstance(control, str) and control not in CONTROLS:
         control = _controls(control)
-    found = record(
-        made,
-        mj.MjData(made),
-        folder,
-        steps,
-        every=every,
-        control=control,
-        seed=seed,
-        replace=replace,
-        precision=precision,
-    )
+    found = record(made, mj.MjData(made), folder, steps, control=control, **options)
     if not found.files:
         raise InputError(
             f"{os.fspath(path)}: no step had a constraint that could be kept: more steps, or other controls"
