@@ -201,7 +201,7 @@ BAD_PROBLEMS = {
     ),
     "neither form": (lambda: lv.Problem(np.ones(2), lv.Cones.free(2)), "one of them"),
     "cones": (lambda: lv.Problem(np.ones(2), None, I2), "a Cones is needed"),
-    "kind": (lambda: lv.Cones([0, 1], [7], [0], [1], [0], [0]), r"\[7\]"),
+    "kind": (lambda: lv.Cones([0, 1], [99], [0], [1], [0], [0]), r"\[99\]"),
     "ptr": (lambda: lv.Cones([0, 2, 1], [0, 0], [0], [1], [0, 0], [0, 0]), "increase"),
 }
 
