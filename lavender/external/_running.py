@@ -28,10 +28,8 @@ __all__ = [
     "Limits",
     "ask",
     "at_least",
-    "definite_refusal",
     "proof",
     "quiet",
-    "symmetric_refusal",
 ]
 
 EPS_MIN = 1e-14  # asked of a backend at the least: its own arithmetic stops there
@@ -197,26 +195,6 @@ def _once(
         dual=dual,
         certificate=certificate,
     )
-
-
-def symmetric_refusal(problem: Problem) -> str | None:
-    """A quadratic program has a symmetric P: anything else would be another problem."""
-    if problem.is_symmetric:
-        return None
-    return (
-        f"needs a symmetric A; here max|A - A^T| / max|A| = {problem.asymmetry:.1e} "
-        "(pgs takes it as it is; a Problem of (A + A^T)/2 is another problem, if that error is small enough)"
-    )
-
-
-def definite_refusal(problem: Problem) -> str | None:
-    """A negative diagonal entry shows that no QP solver can take this A; a factorisation sees the rest."""
-    if problem.rows is None and problem.m:
-        diagonal = problem.csr.diagonal()
-        i = int(np.argmin(diagonal))
-        if diagonal[i] < 0.0:
-            return f"needs a positive semidefinite A; A[{i}, {i}] = {diagonal[i]:.3g}"
-    return None
 
 
 @contextlib.contextmanager

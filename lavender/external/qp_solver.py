@@ -11,7 +11,7 @@ import numpy as np
 from lavender._arrays import FloatArray
 from lavender.errors import CapabilityError, InputError
 from lavender.external import _apart
-from lavender.external._running import ask, definite_refusal, symmetric_refusal
+from lavender.external._running import ask
 from lavender.external.as_qp import QP, impulse_form, pick_form, velocity_form
 from lavender.external.backend import Backend
 from lavender.problem import Problem
@@ -100,5 +100,15 @@ class QPSolver:
 
 
 def refusal(problem: Problem) -> str | None:
-    """Why no QP backend can take this problem, before any conversion."""
-    return symmetric_refusal(problem) or definite_refusal(problem)
+    """Why no QP backend can take this problem, before any conversion; a factorisation sees the rest."""
+    if not problem.is_symmetric:
+        return (
+            f"needs a symmetric A; here max|A - A^T| / max|A| = {problem.asymmetry:.1e} "
+            "(pgs takes it as it is; a Problem of (A + A^T)/2 is another problem, if that error is small enough)"
+        )
+    if problem.rows is None and problem.m:
+        diagonal = problem.csr.diagonal()
+        i = int(np.argmin(diagonal))
+        if diagonal[i] < 0.0:
+            return f"needs a positive semidefinite A; A[{i}, {i}] = {diagonal[i]:.3g}"
+    return None

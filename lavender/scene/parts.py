@@ -12,8 +12,6 @@ from lavender.scene.arithmetic import norm, sine_cosine, turned_back
 
 __all__ = ["BALL", "DISTANCE", "HINGE", "Body", "Box", "Joint", "Plane", "Sphere"]
 
-Shape = "Plane | Sphere | Box"
-
 
 @dataclass(frozen=True)
 class Plane:
