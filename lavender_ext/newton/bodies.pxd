@@ -186,9 +186,13 @@ cdef inline void lay_bodies(newton_t* s, bodies_t* w, const pattern_t* a, double
     s.lam = s.s.bt + a.small
     s.problem.w, s.problem.error, s.problem.x = s.lam + m, s.lam + 2 * m, s.lam + 3 * m
     rest = s.problem.x + 12 * n
-    s.problem.p, s.problem.a, s.problem.r, s.problem.g = p[0], NULL, r, NULL
-    s.keep, s.fixed, s.scale, s.speed = NULL, NULL, scale, speed
-    s.s.e, s.s.f, s.s.others = &w.e, &w.f, NULL
+    s.problem.p, s.problem.r = p[0], r                  # null is not of one type: a pair of two would have none
+    s.problem.a = NULL
+    s.problem.g = NULL
+    s.keep = NULL
+    s.fixed = NULL
+    s.scale, s.speed, s.s.e, s.s.f = scale, speed, &w.e, &w.f
+    s.s.others = NULL
     s.s.form, s.s.symmetric, s.s.wide, s.s.augmented, s.s.factorisations = BODIES, 1, 0, 0, 0
     s.exchange.side = a.side
     s.without = 0

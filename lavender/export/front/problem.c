@@ -32,6 +32,7 @@ static void take_blocks(lav_solver *s, const lav_problem *q) {
   s->p.upper = TAKE(s, double, m);
   s->p.mu = TAKE(s, double, k);
   s->p.patch_radius = TAKE(s, double, k);
+  s->p.rolling = TAKE(s, double, k);
   s->p.b = TAKE(s, double, m);
   s->p.d = TAKE(s, double, m);
   s->p.nu = TAKE(s, double, m);
@@ -48,6 +49,7 @@ static void take_blocks(lav_solver *s, const lav_problem *q) {
   s->n_v = q->form == LAV_BODIES ? 6 * q->n_bodies : q->form == LAV_VELOCITIES ? q->n_velocities : 0;
   s->v_free = TAKE(s, double, s->n_v);
   s->v = TAKE(s, double, s->n_v + 12);
+  s->compare = TAKE(s, double, 2 * m + s->n_v);
   s->watch.v = TAKE(s, double, q->form == LAV_BODIES ? 12 * n : q->form == LAV_VELOCITIES ? nv + m : 0);
 }
 
@@ -128,6 +130,7 @@ static int32_t fill_blocks(lav_solver *s, const lav_problem *q) {
     }
   copy_or(s->p.mu, q->mu, k, 0.0);
   copy_or(s->p.patch_radius, q->patch_radius, k, 0.0);
+  copy_or(s->p.rolling, q->rolling, k, 0.0);
   s->has_keys = q->key != NULL;
   if (q->key) COPY(s->key, q->key, k);
   s->mode = q->order ? core_order_GIVEN : s->options.order == LAV_REVERSE ? core_order_GIVEN : s->options.order;
