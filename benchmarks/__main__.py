@@ -11,8 +11,10 @@ for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(variable, "1")  # before NumPy is imported
 
 NAMES = (
+    "auto",
     "branches",
     "engine",
+    "film",
     "float32",
     "gallery",
     "islands",
@@ -21,9 +23,11 @@ NAMES = (
     "motions",
     "newton",
     "page",
+    "peers",
     "shapes",
     "stability",
     "stand",
+    "steppers",
     "wasm",
 )
 

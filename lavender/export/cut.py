@@ -46,13 +46,15 @@ MODULES = (
     "driver.driver",
     "pivot.principal",
     "pivot.tableau",
-    "few.islands",
     "factor.graph",
     "engine.arrays",
     "engine.substep",
     "host.memory",
 )
-PROLOGUE, FRONT = "prologue.c", ("front.c", "problem.c", "solve.c", "methods.c", "full.c")
+PROLOGUE, FRONT = (
+    "prologue.c",
+    ("front.c", "problem.c", "judge.c", "solve.c", "methods.c", "pivots.c", "full.c"),
+)
 CIMPORT = re.compile(r"^from lavender_ext\.([\w.]+) cimport", re.MULTILINE)
 
 #: The condition of `front` under which the small build leaves things out.

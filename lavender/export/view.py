@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from lavender import registry
+from lavender.cones import CONTACT_ROLLING
 from lavender.errors import InputError
 from lavender.export.bindings import constants, struct_fields
 from lavender.export.library import HEADER
@@ -64,9 +65,11 @@ def view(problem: Problem) -> View:
     Raises
     ------
     NotTaken
-        Generalised velocities in an order of lavender's own.
+        Ellipses; generalised velocities in an order of lavender's own.
     """
     c = problem.cones
+    if max(c.kind, default=0) > CONTACT_ROLLING:
+        raise NotTaken("the library has no ellipses: give it the same in longer rows, `problem.disk`")
     arrays: dict[str, Any] = dict.fromkeys(ARRAYS)
     arrays |= {"block_ptr": c.ptr, "kind": c.kind, "lower": c.lower, "upper": c.upper, "mu": c.mu}
     arrays |= {"patch_radius": c.patch_radius, "b": problem.b, "impulse": problem.guess, "rolling": c.rolling}
