@@ -47,6 +47,7 @@ MODULES = (
     "pivot.principal",
     "pivot.tableau",
     "factor.graph",
+    "factor.sparse",
     "engine.arrays",
     "engine.substep",
     "host.memory",

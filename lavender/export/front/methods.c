@@ -200,9 +200,9 @@ static int32_t factor_shifted(lav_solver *s) {
     row[i] += s->splitting.rho;
     for (j = 0; j < i; j++) {
       const double *to = s->table + (int64_t)j * m;
-      row[j] = (row[j] - accelerate_mixing_product(row, to, j)) / to[j];
+      row[j] = (row[j] - core_generalized_dot(row, to, j)) / to[j];
     }
-    row[i] -= accelerate_mixing_product(row, row, i);
+    row[i] -= core_generalized_dot(row, row, i);
     if (!(row[i] > 0.0)) return 0;
     row[i] = sqrt(row[i]);
   }
@@ -233,7 +233,7 @@ static int32_t prepare_admm(lav_solver *s) {
   double *x, *root, *shift, size[2] = {0.0, 0.0};
   int32_t i, bands[2];
   GIVE_BACK(form_matrix(s));
-  if (m > 0 && s->a.indptr[m] > 0) k_csr_scan(&s->a, (int32_t)m, s->marks, bands, size);
+  if (m > 0 && s->a.indptr[m] > 0) core_csr_scan_entries(&s->a, (int32_t)m, s->marks, bands, size);
   if (size[1] > 0.0 && size[0] / size[1] > 1e-14) return LAV_ERROR_UNSUPPORTED; /* L L^T alone: A is not symmetric */
   s->table = TAKE(s, double, m * m);
   x = TAKE(s, double, (10 + 2 * (int64_t)memory) * m + CONTROL + GRAM + 4);

@@ -12,7 +12,7 @@ static int32_t prepare_pivots(lav_solver *s) {
   int64_t n = m;
   double size[2] = {0.0, 0.0};
   GIVE_BACK(form_matrix(s));
-  if (m > 0 && s->a.indptr[m] > 0) k_csr_scan(&s->a, (int32_t)m, s->marks, bands, size);
+  if (m > 0 && s->a.indptr[m] > 0) core_csr_scan_entries(&s->a, (int32_t)m, s->marks, bands, size);
   s->is_symmetric = size[1] == 0.0 || size[0] / size[1] <= 1e-14;
   s->band = !s->is_symmetric ? (int32_t)m - 1 : bands[0] > bands[1] ? bands[0] : bands[1];
   s->is_linear = 1;
@@ -67,9 +67,9 @@ static int32_t refine(lav_solver *s, double relative) {
   int32_t i;
   for (i = 0; i < CORRECTIONS && !is_good(s) && relative < 0.5 * previous; i++) {
     previous = relative;
-    k_pivot_correct(&s->pivots);
-    k_pivot_slack(&s->pivots);
-    if (k_pivot_exchange(&s->pivots)) return pivot_principal_ROUNDS;
+    pivot_principal_pivots_correct(&s->pivots);
+    pivot_principal_pivots_slack(&s->pivots);
+    if (pivot_principal_pivots_exchange(&s->pivots)) return pivot_principal_ROUNDS;
     relative = look(s);
   }
   return pivot_principal_SOLVED;
@@ -80,7 +80,7 @@ static int32_t after_rounds(lav_solver *s, int32_t code) {
   if (code == pivot_principal_SMALL || code == pivot_principal_INDEFINITE) return code;
   relative = look(s);
   if (code != pivot_principal_SOLVED || s->pivots.shift != 0.0 || is_good(s)) return code;
-  k_pivot_slack(&s->pivots);
+  pivot_principal_pivots_slack(&s->pivots);
   return refine(s, relative);
 }
 
@@ -89,7 +89,7 @@ static int32_t rounds(lav_solver *s, const lav_budget *budget) {
   int32_t code, before;
   do {
     before = s->pivots.n_rounds;
-    code = after_rounds(s, k_pivot_rounds(&s->pivots, s->left < BATCH ? s->left : BATCH));
+    code = after_rounds(s, pivot_principal_pivots_rounds(&s->pivots, s->left < BATCH ? s->left : BATCH));
     s->left -= s->pivots.n_rounds - before;
   } while (code == pivot_principal_ROUNDS && !is_good(s) && s->left > 0 && !is_late(s, budget));
   return code;
@@ -102,7 +102,7 @@ static int32_t descend(lav_solver *s, const lav_budget *budget) {
   double *x = s->search, *w = x + m, *step = w + m, length, promised, gained;
   int32_t *at = s->pivot_marks + 3 * m, i, half, fixed, same, whole, done;
   clip_rows(s, t->x);
-  k_pivot_slack(t);
+  pivot_principal_pivots_slack(t);
   COPY(x, t->x, m);
   COPY(w, t->w, m);
   for (; s->left > 0; s->left--) {
@@ -114,18 +114,18 @@ static int32_t descend(lav_solver *s, const lav_budget *budget) {
     }
     if (!same) {
       COPY(t->at, at, m);
-      k_pivot_factor(t);
+      pivot_principal_factor_free(t, NULL);
       if (t->found.negative > 0) return pivot_principal_INDEFINITE;
       if (t->found.small > 0) return pivot_principal_SMALL;
     }
-    k_pivot_correct(t);
+    pivot_principal_pivots_correct(t);
     for (i = 0; i < m; i++) step[i] = t->x[i] - x[i];
     for (half = 0, length = 1.0; half < HALVINGS; half++) {
       for (i = 0; i < m; i++) {
         const double y = x[i] + length * step[i];
         t->x[i] = y < s->q.lower[i] ? s->q.lower[i] : y > s->q.upper[i] ? s->q.upper[i] : y;
       }
-      k_pivot_slack(t);
+      pivot_principal_pivots_slack(t);
       for (i = 0, promised = gained = 0.0; i < m; i++) { /* phi(y) - phi(x) = 1/2 (w(x) + w(y)).(y - x) */
         promised += w[i] * (t->x[i] - x[i]);
         gained += (w[i] + t->w[i]) * (t->x[i] - x[i]);
@@ -190,9 +190,9 @@ static int32_t proximal(lav_solver *s, const lav_budget *budget, int32_t stuck) 
     for (i = 0, previous = INFINITY; i < CORRECTIONS && !is_good(s) && relative < 0.5 * previous; i++) {
       previous = relative;
       COPY(t->center, t->x, m);
-      k_pivot_slack(t);
-      k_pivot_correct(t);
-      k_pivot_slack(t);
+      pivot_principal_pivots_slack(t);
+      pivot_principal_pivots_correct(t);
+      pivot_principal_pivots_slack(t);
       relative = look(s);
       if (!(relative < previous)) COPY(t->x, t->center, m);
     }
@@ -208,20 +208,20 @@ static int32_t pivot_all(lav_solver *s, const lav_budget *budget, lav_result *ou
   struct pivot_principal_pivoting_t *t = &s->pivots;
   int32_t code, swept = 0;
   if (s->is_linear) {
-    k_pivot_factor_all(t);
+    pivot_principal_pivots_factor_all(t);
     s->left -= 1;
     if (t->found.negative > 0) return LAV_FAILED; /* the package goes on with LAPACK */
     if (t->found.small == 0) {
-      k_pivot_solve_free(t);
+      pivot_principal_pivots_solve_free(t);
       if (look(s) > 0.0 && !is_good(s)) {
-        k_pivot_slack(t);
+        pivot_principal_pivots_slack(t);
         refine(s, s->best);
       }
       return is_end(s) ? LAV_CONVERGED : s->is_symmetric ? proximal(s, budget, 0) : LAV_STALLED;
     }
     return s->is_symmetric ? proximal(s, budget, 0) : LAV_FAILED;
   }
-  code = k_pivot_solve(t, s->from, GUESS_SWEEPS, s->left < BATCH ? s->left : BATCH, &swept);
+  code = pivot_principal_pivots_solve(t, s->from, GUESS_SWEEPS, s->left < BATCH ? s->left : BATCH, &swept);
   s->left -= t->n_rounds;
   out->sweeps = 2 * GUESS_SWEEPS * swept;
   code = after_rounds(s, code);

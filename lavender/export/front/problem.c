@@ -56,7 +56,8 @@ static void take_blocks(lav_solver *s, const lav_problem *q) {
 static void take_form(lav_solver *s, const lav_problem *q) {
   const int64_t m = q->n_rows, k = q->n_blocks, n = q->n_bodies, c = k - q->n_joints, nv = q->n_velocities;
   const int32_t is_known = s->bytes > 0 && q->form == LAV_BODIES; /* who only counts reads no array */
-  const int64_t mj = !is_known ? m : q->block_ptr ? q->block_ptr[q->n_joints] : q->n_joints, mc = is_known ? m - mj : m;
+  const int64_t mj = is_known ? (q->block_ptr ? q->block_ptr[q->n_joints] : q->n_joints) : q->n_joints > 0 ? m - c : 0;
+  const int64_t mc = is_known ? m - mj : m - q->n_joints < 6 * c ? m - q->n_joints : 6 * c; /* at most */
   s->r.compliance = s->g.compliance = NULL;
   if (q->form == LAV_MATRIX) {
     s->a.indptr = TAKE(s, int32_t, m + 1);

@@ -277,6 +277,8 @@ static void run_method(lav_solver *s, const lav_budget *budget, lav_result *out)
 /* Numbers that a method has beside the problem; what depends on arrays is guessed. */
 static int64_t numbers_of(const lav_problem *q, int32_t method, int32_t memory, int32_t n_v) {
   const int64_t m = q->n_rows, k = q->n_blocks, nv = q->n_velocities, n = q->n_bodies;
+  const int32_t c = q->n_blocks - q->n_joints, mj = q->n_joints > 0 ? q->n_rows - c : 0; /* rows of joints at most */
+  const int32_t mc = q->n_rows - q->n_joints < 6 * (int64_t)c ? q->n_rows - q->n_joints : 6 * c;
   const int32_t one = LAV_CONTACT, ends[2] = {0, q->n_rows};
   struct driver_driver_view_t view;
   struct driver_driver_asked_t asked;
@@ -288,7 +290,7 @@ static int64_t numbers_of(const lav_problem *q, int32_t method, int32_t memory, 
       numbers += CONTROL + GRAM + 3 * (m + n_v) + (1 + 2 * (int64_t)memory) * m + 64;
       numbers += 9 * m + 26 * k; /* fall through: exact blocks, and pairs */
     case LAV_SEQUENTIAL_IMPULSES:
-      return numbers + (q->form == LAV_BODIES ? sweep_packed_room_for(q->n_joints, q->n_rows, q->n_blocks - q->n_joints, q->n_rows, q->n_bodies) : 0);
+      return numbers + (q->form == LAV_BODIES ? sweep_packed_room_for(q->n_joints, mj, c, mc, q->n_bodies) : 0);
     case LAV_BLOCK_GAUSS_SEIDEL: return 9 * m + 26 * k;
     case LAV_NEWTON:
       if (q->form == LAV_VELOCITIES) return 70 * m + 50 * nv + 18 * k + 2 * (nv < 64 ? nv * nv : 64 * nv) + 2048;
