@@ -280,17 +280,16 @@ static int64_t numbers_of(const lav_problem *q, int32_t method, int32_t memory, 
   const int32_t c = q->n_blocks - q->n_joints, mj = q->n_joints > 0 ? q->n_rows - c : 0; /* rows of joints at most */
   const int32_t mc = q->n_rows - q->n_joints < 6 * (int64_t)c ? q->n_rows - q->n_joints : 6 * c;
   const int32_t one = LAV_CONTACT, ends[2] = {0, q->n_rows};
+  const int64_t pairs = q->form == LAV_BODIES ? sweep_packed_room_for(q->n_joints, mj, c, mc, q->n_bodies) : 0;
   struct driver_driver_view_t view;
   struct driver_driver_asked_t asked;
   struct driver_driver_room_t room;
   int64_t numbers = 0, band = m < 64 ? m : 64;
   csr_t none = {NULL, NULL, NULL};
   switch (method) {
-    case LAV_ANDERSON: case LAV_NNCG:
-      numbers += CONTROL + GRAM + 3 * (m + n_v) + (1 + 2 * (int64_t)memory) * m + 64;
-      numbers += 9 * m + 26 * k; /* fall through: exact blocks, and pairs */
-    case LAV_SEQUENTIAL_IMPULSES:
-      return numbers + (q->form == LAV_BODIES ? sweep_packed_room_for(q->n_joints, mj, c, mc, q->n_bodies) : 0);
+    case LAV_ANDERSON: case LAV_NNCG: /* with exact blocks */
+      return pairs + CONTROL + GRAM + 3 * (m + n_v) + (1 + 2 * (int64_t)memory) * m + 64 + 9 * m + 26 * k;
+    case LAV_SEQUENTIAL_IMPULSES: return pairs;
     case LAV_BLOCK_GAUSS_SEIDEL: return 9 * m + 26 * k;
     case LAV_NEWTON:
       if (q->form == LAV_VELOCITIES) return 70 * m + 50 * nv + 18 * k + 2 * (nv < 64 ? nv * nv : 64 * nv) + 2048;
