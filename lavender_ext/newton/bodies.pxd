@@ -154,14 +154,18 @@ cdef inline void lay_bodies(newton_t* s, bodies_t* w, pattern_t* a, double* real
     s.lam = s.s.bt + a.s.small
     s.problem.w, s.problem.error, s.problem.x = s.lam + m, s.lam + 2 * m, s.lam + 3 * m
     rest = s.problem.x + 12 * n
-    s.problem.p, s.problem.a, s.problem.r, s.problem.g = p[0], NULL, r, NULL
+    s.problem.p, s.problem.r = p[0], r                  # null has no type of its own: not one of a pair
+    s.problem.a = NULL
+    s.problem.g = NULL
     scale_elements(&a.s, p, NULL, r, s.problem.w, s.problem.x)
     w.s = a.s
-    s.keep, s.fixed = NULL, NULL
+    s.keep = NULL
+    s.fixed = NULL
     if not a.s.whole:
         s.keep, s.fixed = w.s.keep, w.s.fixed
     s.scale, s.speed = w.s.scale, w.s.speed
-    s.s.e, s.s.f, s.s.others = &w.s.e, &w.f, NULL
+    s.s.e, s.s.f = &w.s.e, &w.f
+    s.s.others = NULL
     s.s.form, s.s.symmetric, s.s.wide, s.s.augmented, s.s.factorisations = BODIES, 1, 0, 0, 0
     s.exchange.side = a.side
     s.without = 0
