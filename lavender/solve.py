@@ -233,7 +233,9 @@ class Prepared:
         else:
             lam = problem.start() if problem.guess is None else problem.guess.copy()
         if time_limit is not None and hasattr(self._solver, "ready"):
-            self._solver.ready()
+            start = perf_counter()
+            self._solver.ready(self._state)
+            self.setup_time += perf_counter() - start
         setup_time, self.setup_time = self.setup_time, 0.0
         proof = decide_empty_rows(problem, lam)
         loop = _Loop(problem, self._solver, self._state, lam, tol, time_limit, history, callback)

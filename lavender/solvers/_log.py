@@ -15,7 +15,9 @@ from lavender.solution import Claim, Status, Turn
 from lavender.solvers._few import said
 from lavender.solvers._islands import islands
 
-__all__ = ["SolveLog"]
+__all__ = ["CLOCK", "SolveLog"]
+
+CLOCK = 0.01  # s between two looks at the clock, as counted
 
 CAUTION = 0.999  # of what is left of the tolerance: sums are rounded
 STILL = 32  # turns in a row, most of them longer than those before, that leave
@@ -27,15 +29,13 @@ class SolveLog:
 
     def __init__(self, problem: Problem, tol: float, budget: int, deadline: Deadline | None = None) -> None:
         self.problem, self.tol, self.budget, self.deadline = problem, tol, budget, deadline or Deadline()
-        left = self.deadline.left()
-        self.limit = np.inf if left is None else left  # s
         self.best, self.impulse = np.inf, problem.start()  # least relative residual, (m,) N s
         self.given: FloatArray | None = None  # (m,) N s, a start that doing nothing is better than
         self.turns: list[Turn] = []
         self.work: dict[str, int] = {}
         self.iterations = 0
         self.certificate: FloatArray | None = None  # (m,)
-        self.pace = 1.0  # s for each counted ns, times 1e9, as far as a time limit asks for it
+        self.pace = 0.0  # s for each counted ns, times 1e9, as far as a time limit asks for it; 0: not known
         self._w, self._e = np.empty(problem.m), np.empty(problem.m)
 
     def offer(self, impulse: FloatArray) -> float:
@@ -86,7 +86,7 @@ class SolveLog:
 
     def ends_late(self, cost: float) -> bool:
         """What is counted for so long [ns] would end after the deadline, at the pace so far."""
-        return self.deadline.passed(1e-9 * self.pace * cost)
+        return self.deadline.passed(1e-9 * (self.pace or 1.0) * cost)
 
     @property
     def still(self) -> bool:

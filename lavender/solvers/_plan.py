@@ -62,7 +62,6 @@ TABLE: dict[str, dict[str, tuple[str, ...]]] = {
 }
 BOTH_WAYS = 2.0  # sweeps of an iteration in the symmetric order
 READ = 4.0  # times that what steps over velocities read is read before the first (fitted to curves: 3.6)
-SPARED = 0.25  # of the sweeps of the whole, that small islands take when each goes on for itself
 SIXTH = 6.0  # decades that counts of sweeps are fitted for
 
 
@@ -195,7 +194,7 @@ class Costs:
     def __init__(
         self,
         problem: Problem,
-        tol: float,
+        tol: float = 1e-6,
         given: Mapping[str, Any] | None = None,
         structure: Structure | None = None,
         plan: Plan | None = None,
@@ -247,8 +246,8 @@ class Costs:
             return self._relaxation() if s.is_loose else Cost(inf, 1.0, 1.0)
         if name == "islands":
             # The others have ended while sweeps of the whole go on for the one that needs most of them.
-            whole, share = self.of("anderson"), SPARED + (1.0 - SPARED) * s.largest
-            return Cost(whole.setup, whole.each, share * whole.count)
+            whole = self.of("anderson")
+            return Cost(whole.setup, whole.each, s.largest * whole.count)
         if name == "admm":
             a, (factored, fill) = r["admm"], s.admm(1.0)
             setup = a["start"] + r["formed"] * s.formed + a["factor"] * factored

@@ -16,7 +16,7 @@ from lavender.solution import Claim, Status
 from lavender.solvers import _rates as rates
 from lavender.solvers._few import WARM
 from lavender.solvers._gates import FIRST_LOOK, GENERAL_GATE, NO_GATE
-from lavender.solvers._log import SolveLog
+from lavender.solvers._log import CLOCK, SolveLog
 from lavender.solvers._newton import general
 from lavender_ext.core import assemble
 from lavender_ext.few.islands import BY_PIVOTS, BY_SWEEPS, BY_VELOCITIES, LEFT, Islands
@@ -27,7 +27,6 @@ __all__ = ["solve_together"]
 
 BAND_APART = 1e6  # ns of `direct` on a narrow band of an island, up to which it comes before sweeps
 LARGEST = 2000  # rows of an island that is solved so
-CLOCK = 0.01  # s between two looks at the clock, as counted
 # Sweeps of an island go on whatever they promise for such a share of what else there is, and for so many times that.
 HOPE, BELIEVED = 0.25, 2.0
 # What Newton's method may cost in an island of J and M [ns]: there is no other there.

@@ -11,10 +11,12 @@ from lavender import suite
 from lavender.cli import main
 from lavender.deadline import Deadline
 from lavender.problem import LAWS, OPERATORS
+from lavender.residuals import reference
 from lavender.solvers._log import SolveLog
 from lavender.solvers._methods import Sweeps, in_short_time
 from lavender.solvers._plan import METHODS, TABLE, Costs, candidates
 from lavender.solvers._structure import Structure
+from lavender.solvers.auto import Auto
 
 NAMES = (
     "stack(n=200)",
@@ -133,14 +135,17 @@ def test_a_matrix_of_many_entries_does_not_divide_and_nobody_looks():
 
 @pytest.mark.parametrize("name", ["wild(seed=12)", "wild(seed=24)", "wild(seed=3)", "granularF(n=9)"])
 def test_what_would_not_end_in_time_is_neither_counted_nor_begun(name, monkeypatch):
-    """With the least of time sweeps have all of it, though what factors is expected to be cheaper."""
+    """With the least of time sweeps, set up before its clock starts, have all of it."""
     problem = suite.case(name).problem
+    reference(problem)
+    state = Auto().prepare(problem)
+    monkeypatch.setattr(Costs, "least", lambda self, asked: self.of(asked) if asked == "anderson" else 1 / 0)
+    Auto().ready(state)
+    monkeypatch.setattr(Sweeps, "set_up", None)
     log = SolveLog(problem, 1e-12, 10**6, deadline=Deadline(1e-4))
     log.offer(problem.start())
-    costs = Costs(problem, 1e-12)
-    monkeypatch.setattr(Costs, "least", lambda self, asked: self.of(asked) if asked == "anderson" else 1 / 0)
-    (sweeps,) = in_short_time(log, costs)
-    assert sweeps.name == "anderson" and log.iterations > 0
+    (sweeps,) = in_short_time(log, state.sweeps)
+    assert sweeps is state.sweeps and sweeps.name == "anderson" and log.iterations > 0
     assert [turn.solver for turn in log.turns] == ["anderson"]
 
 
