@@ -75,6 +75,12 @@ else:
 class BuildKernels(build_ext):
     """Translates .pyx to C under build/, in parallel, only when an extension is built (not for an sdist)."""
 
+    def finalize_options(self):
+        """Built in place, in a checkout: what measures the kernels, too. No wheel has it."""
+        if self.inplace or self.editable_mode:
+            self.distribution.ext_modules += map(extension, sorted(Path("benchmarks").rglob("*.pyx")))
+        super().finalize_options()
+
     def run(self):
         """Translate, then compile; everything anew when flags or directives are others than last time."""
         out = Path("build", "cython")
@@ -96,11 +102,11 @@ class BuildKernels(build_ext):
             shared_utility_qualified_name=SHARED,
         )
         gc.enable()
-        for extension, c_extension in zip(self.extensions, translated, strict=True):
-            extension.sources = c_extension.sources
-            extension.depends = c_extension.depends
+        for module, c_module in zip(self.extensions, translated, strict=True):
+            module.sources = c_module.sources
+            module.depends = c_module.depends
         # The largest first: a long one that starts last holds up everybody.
-        self.extensions.sort(key=lambda extension: -os.path.getsize(extension.sources[0]))
+        self.extensions.sort(key=lambda module: -os.path.getsize(module.sources[0]))
         self.parallel = self.parallel or workers
         super().run()
         stamp.parent.mkdir(parents=True, exist_ok=True)
@@ -233,7 +239,7 @@ build.sub_commands = [*build.sub_commands, ("build_wasm", None), ("build_library
 
 def extension(path):
     """One module, named after its file."""
-    name = path.relative_to("lavender_ext").as_posix()
+    name = path.as_posix().removeprefix("lavender_ext/")
     limits = INLINE if name.startswith(WHOLE) else LIMITS
     level = ["-O2"] if limits and name.startswith(COLD) else []
     return Extension(

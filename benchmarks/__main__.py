@@ -11,9 +11,11 @@ for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(variable, "1")  # before NumPy is imported
 
 NAMES = (
+    "auto",
     "branches",
     "constants",
     "engine",
+    "film",
     "float32",
     "gallery",
     "islands",
@@ -22,9 +24,11 @@ NAMES = (
     "motions",
     "newton",
     "page",
+    "peers",
     "shapes",
     "stability",
     "stand",
+    "steppers",
     "wasm",
 )
 

@@ -22,8 +22,8 @@ import numpy as np
 
 import benchmarks.drawn  # noqa: F401  # its family is among those of the suite
 import lavender as lv
+from benchmarks.auto.regret import LEVELS, SHIFT
 from lavender import suite
-from lavender.bench.regret import LEVELS, SHIFT
 from lavender.bench.running.timing import one_thread
 from lavender.problem import Problem
 from lavender.residuals import reference

@@ -26,6 +26,7 @@ import click
 import numpy as np
 
 import lavender as lv
+from benchmarks.drawn import wild
 from benchmarks.islands import forms
 from benchmarks.output import folder_of, markdown, write_json
 from lavender import suite
@@ -143,7 +144,7 @@ def problems(args: Asked) -> Iterator[tuple[str, Problem]]:
         if name == "wild":
             first, last = map(int, args.seeds.split(":"))
             for seed in range(first, last):
-                yield f"wild({seed})", suite.wild(seed=seed, rows=args.rows).problem
+                yield f"wild({seed})", wild(seed=seed, rows=args.rows).problem
         elif name == "scenes":
             for scene in SCENES:
                 simulation = lv.Simulation(lv.Scene(scene, solver="newton"))

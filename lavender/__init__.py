@@ -11,7 +11,16 @@ from typing import TYPE_CHECKING, Any
 
 import lavender._built
 from lavender._version import __version__
-from lavender.cones import CONTACT, CONTACT_BOX, CONTACT_ROLLING, CONTACT_SPIN, ROUND, ROW, Cones
+from lavender.cones import (
+    CONTACT,
+    CONTACT_BOX,
+    CONTACT_ELLIPSE,
+    CONTACT_ROLLING,
+    CONTACT_SPIN,
+    ROUND,
+    ROW,
+    Cones,
+)
 from lavender.errors import (
     CapabilityError,
     InputError,
@@ -72,6 +81,7 @@ _LATER = {
 __all__ = [
     "CONTACT",
     "CONTACT_BOX",
+    "CONTACT_ELLIPSE",
     "CONTACT_ROLLING",
     "CONTACT_SPIN",
     "ROUND",

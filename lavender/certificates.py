@@ -27,7 +27,8 @@ def check_certificate(problem: Problem, y: Any) -> str | None:
     |A| |lambda| > 1e10 |b| in the weights |y|, whose floor is above 1e-6.
     """
     with np.errstate(all="ignore"):  # what overflows proves nothing
-        return _disproof(problem, np.asarray(y, float))
+        y = np.asarray(y, float)
+        return _disproof(problem.disk, problem.on_disk(y) if y.shape == (problem.m,) else y)
 
 
 def _disproof(problem: Problem, y: FloatArray) -> str | None:

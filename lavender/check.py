@@ -309,9 +309,10 @@ def _compare(problem: Problem, name: str, solution: Solution, optimum: Solution 
 
 def _distance(problem: Problem, one: Solution, two: Solution) -> tuple[float, float]:
     """|Delta|_A and the largest value of it that (1) allows, rounding included [sqrt J]."""
+    delta = problem.on_disk(one.impulse - two.impulse)
+    eps = problem.on_disk(one.residual.error - two.residual.error)
+    problem = problem.disk
     d: Any = problem.d
-    delta = one.impulse - two.impulse
-    eps = one.residual.error - two.residual.error
     a_delta, a_eps = _apply(problem, delta), _apply(problem, eps)
     distance = float(np.sqrt(max(delta @ a_delta, 0.0)))
     # The errors e themselves are known to the floor of both residuals, in the norm of D.

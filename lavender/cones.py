@@ -8,6 +8,8 @@ perhaps one spin row, perhaps two rows that roll. With lambda [N s] the bounds a
     CONTACT_SPIN  the same, and |lambda_s| <= mu r lambda_n, r = patch radius [m]
     CONTACT_BOX   0 <= lambda_n,  |lambda_1| <= mu lambda_n,  |lambda_2| <= mu q lambda_n: two tangents, each by itself,
                   as most engines have it; q = mu_2 / mu_1 stands in the place of the patch radius
+    CONTACT_ELLIPSE  0 <= lambda_n,  |(lambda_1 / mu, lambda_2 / (mu q))| <= lambda_n: the disk of tangents stretched
+                  by their share of the larger coefficient, in which it is solved and judged (`Problem.disk`)
     ROUND         0 <= lambda_n, |lambda_T| <= mu lambda_n over three to five tangents together: two that slide, one
                   that spins, two that roll; each row scaled by its own coefficient over mu, so that one mu bounds all
     CONTACT_ROLLING  a contact of two tangents, perhaps with spin, and |lambda_r| <= mu_r lambda_n on the two that roll,
@@ -28,6 +30,7 @@ from lavender_ext.core import blocks as kernels
 __all__ = [
     "CONTACT",
     "CONTACT_BOX",
+    "CONTACT_ELLIPSE",
     "CONTACT_ROLLING",
     "CONTACT_SPIN",
     "ROUND",
@@ -38,10 +41,11 @@ __all__ = [
     "project",
 ]
 
-ROW, CONTACT, CONTACT_SPIN, ROUND, CONTACT_BOX, CONTACT_ROLLING = kernels.KINDS
+ROW, CONTACT, CONTACT_SPIN, ROUND, CONTACT_BOX, CONTACT_ROLLING, CONTACT_ELLIPSE = kernels.KINDS
 # What bounds two tangents: their norm, or each by itself.
 SHAPES = ("disk", "box")
-# mu_1 = 0 beside mu_2 > 0 stands as this share of mu_2: its impulses vanish in any sum with those of mu_2.
+# mu_1 = 0 beside mu_2 > 0 stands as this share of mu_2 in a box: its impulses vanish in any sum with those of mu_2.
+# An ellipse is wider than that.
 LEAST_SHARE = 2.0**-60
 
 
@@ -67,13 +71,14 @@ class Cones:
     ptr : (k + 1,) int
         First row of each block, then m.
     kind : (k,) int
-        ROW, CONTACT, CONTACT_SPIN, ROUND, CONTACT_BOX or CONTACT_ROLLING of each block.
+        ROW, CONTACT, CONTACT_SPIN, ROUND, CONTACT_BOX, CONTACT_ROLLING or CONTACT_ELLIPSE of each block.
     lower, upper : (m,) N s
         Bounds of rows on ROW blocks; infinite ones are allowed, those of contacts are not read.
     mu : (k,) -
         Coefficient of friction of each contact.
     patch_radius : (k,) m
-        Of contacts with spin: their spin row is bounded by mu r lambda_n [N m s]. Of CONTACT_BOX mu_2 / mu_1 [-].
+        Of contacts with spin: their spin row is bounded by mu r lambda_n [N m s]. Of CONTACT_BOX and CONTACT_ELLIPSE
+        mu_2 / mu_1 [-].
     rolling : (k,) m, optional
         mu_r of CONTACT_ROLLING: what rolls is bounded by mu_r lambda_n [N m s]; default 0. Acary, Bourrier, Viano 2023.
 
@@ -98,11 +103,11 @@ class Cones:
     """
 
     ptr: IntArray  # (k + 1,) first row of each block, then m
-    kind: IntArray  # (k,) ROW | CONTACT | CONTACT_SPIN | ROUND | CONTACT_BOX | CONTACT_ROLLING
+    kind: IntArray  # (k,) ROW | CONTACT | CONTACT_SPIN | ROUND | CONTACT_BOX | CONTACT_ROLLING | CONTACT_ELLIPSE
     lower: FloatArray  # (m,) N s, read on ROW blocks, -inf allowed
     upper: FloatArray  # (m,) N s, read on ROW blocks, +inf allowed
     mu: FloatArray  # (k,) -, read on contacts
-    patch_radius: FloatArray  # (k,) m, read on contacts with spin; on CONTACT_BOX mu_2 / mu_1
+    patch_radius: FloatArray  # (k,) m, read on contacts with spin; on boxes and ellipses mu_2 / mu_1
     rolling: FloatArray = ()  # type: ignore[assignment]  # (k,) m, read on CONTACT_ROLLING; (): 0
     _blocks: ClassVar[kernels.Blocks]  # of an instance: the same arrays, as kernels read them
 
@@ -142,7 +147,8 @@ class Cones:
         if k and not np.isin(kind, kernels.KINDS).all():
             raise InputError(
                 f"cones.kind holds {sorted(set(kind.tolist()))}; ROW=0, CONTACT=1, CONTACT_SPIN=2, ROUND=3, "
-                f"CONTACT_BOX={CONTACT_BOX}, CONTACT_ROLLING={CONTACT_ROLLING} are known"
+                f"CONTACT_BOX={CONTACT_BOX}, CONTACT_ROLLING={CONTACT_ROLLING}, CONTACT_ELLIPSE={CONTACT_ELLIPSE} are "
+                "known"
             )
         size = np.diff(ptr)
         if np.any(kind == ROUND):
@@ -166,6 +172,14 @@ class Cones:
                 raise InputError(
                     f"block {bad[0]} is a box of {size[bad[0]]} rows; a normal and two tangents are known"
                 )
+        bad = np.flatnonzero(
+            (kind == CONTACT_ELLIPSE) & ((size != 3) | ~(np.asarray(self.patch_radius) > 0.0))
+        )
+        if len(bad):
+            raise InputError(
+                f"block {bad[0]} is an ellipse of {size[bad[0]]} rows; a normal, two tangents and mu_2 / mu_1 > 0 in "
+                "the place of the patch radius are needed"
+            )
         bad = np.flatnonzero((kind == CONTACT_ROLLING) & (size != 5) & (size != 6))
         if len(bad):
             raise InputError(
@@ -248,8 +262,9 @@ class Cones:
 
         Parameters
         ----------
-        mu : scalar or (k,), of boxes also (k, 2)
-            One for each contact, or one for each tangent of a box.
+        mu : scalar, (k,) or (k, 2)
+            One for each contact, or one for each of its two tangents: of an ellipse,
+            |(lambda_1 / mu_1, lambda_2 / mu_2)| <= lambda_n, or of a box.
         tangents : int, 0 to 5
             More than two make one round cone (ROUND) and take no patch radius.
         patch_radius : scalar or (k,) m, optional
@@ -263,12 +278,14 @@ class Cones:
 
         Examples
         --------
-        Four skates that glide along the first tangent and hold across:
+        Four skates that glide along the first tangent and hold across, as ellipses and as boxes:
 
         >>> import lavender as lv
-        >>> skates = lv.Cones.contacts([(0.02, 0.8)] * 4, shape="box")
+        >>> skates = lv.Cones.contacts([(0.02, 0.8)] * 4)
         >>> skates.n_rows, skates.coefficients[0].tolist()
         (12, [0.02, 0.8])
+        >>> skates.shaped("box") == lv.Cones.contacts([(0.02, 0.8)] * 4, shape="box")
+        True
         """
         if (
             isinstance(tangents, bool)
@@ -276,7 +293,7 @@ class Cones:
             or not 0 <= tangents <= 5
         ):
             raise InputError(f"tangents is {tangents!r}; a whole number from 0 to 5 is needed")
-        ratio = None
+        ratio, sides = None, 0
         if check_shape("shape", shape) == "box":
             if patch_radius is not None or rolling is not None or tangents > 2:
                 raise InputError(
@@ -284,13 +301,16 @@ class Cones:
                     "out, or give them as a disk's (shape='disk')"
                 )
             if tangents == 2:
+                sides = CONTACT_BOX
                 mu, ratio = _sides(mu)
-        elif np.ndim(mu) > 1:
-            raise InputError(
-                f"mu has shape {np.shape(mu)}; one for each contact is needed. Two make an ellipse of the disk: give "
-                "mu_1 here and stretch the second tangent by mu_2 / mu_1 (problem.stretched); shape='box' takes two as "
-                "they are"
-            )
+        elif type(mu) is not float and np.ndim(mu) > 1:
+            if patch_radius is not None or rolling is not None or tangents != 2:
+                raise InputError(
+                    f"mu has shape {np.shape(mu)}; one for each of two tangents makes an ellipse, which bounds no spin "
+                    "and no rolling: leave patch_radius, rolling and tangents out, or give one mu for each contact"
+                )
+            mu, ratio = _axes(mu)
+            sides = 0 if ratio is None else CONTACT_ELLIPSE
         spin = patch_radius is not None
         if tangents > 2 and spin:
             raise InputError(
@@ -319,7 +339,7 @@ class Cones:
             check_not_negative("rolling", rolling)
         if ratio is not None:
             patch_radius = np.ascontiguousarray(np.broadcast_to(ratio, (k,)))
-        made = kernels.contacts(k, tangents, mu, patch_radius, rolling, ratio is not None)
+        made = kernels.contacts(k, tangents, mu, patch_radius, rolling, sides)
         if made is None:
             raise InputError(f"{k} contacts have more rows than 32-bit numbers count")
         return cls._of(made)
@@ -360,6 +380,31 @@ class Cones:
         return bool((self.kind == CONTACT_BOX).any())
 
     @property
+    def has_ellipse(self) -> bool:
+        """Some contact bounds its two tangents by an ellipse."""
+        return bool(self._blocks.has_ellipse)
+
+    @property
+    def stretch(self) -> FloatArray:
+        """(m,) length of each row where disks bound the same impulses: mu_i / max(mu_1, mu_2) on ellipses, else 1."""
+        out, at = np.ones(self.n_rows), np.flatnonzero(self.kind == CONTACT_ELLIPSE)
+        q = self.patch_radius[at]
+        out[self.ptr[at] + 1] = np.where(q > 1.0, 1.0 / q, 1.0)
+        out[self.ptr[at] + 2] = np.where(q > 1.0, 1.0, q)
+        return out
+
+    @property
+    def disks(self) -> Cones:
+        """The same blocks with a disk of the larger coefficient for each ellipse."""
+        ellipse = self.kind == CONTACT_ELLIPSE
+        return replace(
+            self,
+            kind=np.where(ellipse, CONTACT, self.kind).astype(np.int32),
+            mu=np.where(ellipse, self.coefficients.max(axis=1), self.mu),
+            patch_radius=np.where(ellipse, 0.0, self.patch_radius),
+        )
+
+    @property
     def is_polyhedral(self) -> bool:
         """No bound is round: every row of friction is bounded by itself, so that Coulomb's law is an LCP."""
         return not bool(np.any(self.n_together > 1))
@@ -371,9 +416,9 @@ class Cones:
 
     @property
     def coefficients(self) -> FloatArray:
-        """(k, 2) mu of the first and of the second tangent: mu twice, but of a box; 0 on ROW."""
+        """(k, 2) mu of the first and of the second tangent: mu twice, but of a box or ellipse; 0 on ROW."""
         mu = np.where(self.kind == ROW, 0.0, self.mu)
-        second = mu * np.where(self.kind == CONTACT_BOX, self.patch_radius, 1.0)
+        second = mu * np.where(np.isin(self.kind, (CONTACT_BOX, CONTACT_ELLIPSE)), self.patch_radius, 1.0)
         return np.stack([np.where(mu <= LEAST_SHARE * second, 0.0, mu), second], axis=1)
 
     @property
@@ -384,32 +429,29 @@ class Cones:
         return np.where(self.kind == ROW, 0, own).astype(np.int32)
 
     def shaped(self, shape: str) -> Cones:
-        """The same blocks with contacts of another shape, "disk" or "box"; a box with two coefficients is no disk.
+        """The same blocks with contacts of another shape, "disk" (of two coefficients an ellipse) or "box".
 
         Raises
         ------
         UnknownName
             No such shape.
         InputError
-            A contact of two tangents and spin, or a round cone, as a box; a box of two coefficients as a disk.
+            A contact of two tangents and spin, or a round cone, as a box; a box without friction along one tangent as a
+            disk.
         """
         kind, radius, two = self.kind.copy(), self.patch_radius.copy(), self.n_tangents > 1
         if check_shape("shape", shape) == "box":
-            bad = np.flatnonzero(two & ~np.isin(self.kind, (CONTACT, CONTACT_BOX)))
+            bad = np.flatnonzero(two & ~np.isin(self.kind, (CONTACT, CONTACT_BOX, CONTACT_ELLIPSE)))
             if len(bad):
                 raise InputError(
                     f"block {bad[0]} has more rows than a normal and two tangents; no box bounds its spin or rolling"
                 )
             kind[two], radius[two & (self.kind == CONTACT)] = CONTACT_BOX, 1.0
         else:
-            bad = np.flatnonzero((self.kind == CONTACT_BOX) & (radius != 1.0))
-            if len(bad):
-                c = self.coefficients[bad[0]].tolist()
-                raise InputError(
-                    f"block {bad[0]} has mu {c}; a disk has one: give Cones.contacts a single mu"
-                )
-            radius[self.kind == CONTACT_BOX] = 0.0
-            kind[self.kind == CONTACT_BOX] = CONTACT
+            box = np.flatnonzero(self.kind == CONTACT_BOX)
+            ratio = _axes(self.coefficients[box])[1]
+            kind[box] = CONTACT if ratio is None else np.where(ratio == 1.0, CONTACT, CONTACT_ELLIPSE)
+            radius[box] = 0.0 if ratio is None else np.where(ratio == 1.0, 0.0, ratio)
         return replace(self, kind=kind, patch_radius=radius)
 
     @property
@@ -419,6 +461,8 @@ class Cones:
         out = np.repeat(np.where(self.kind == ROW, 0.0, self.mu), size)
         out[self.ptr[:-1]] = 0.0
         apart, rolling = self.apart_rows >= 0, self.rolling_rows >= 0
+        ellipse = self.ptr[:-1][self.kind == CONTACT_ELLIPSE] + 2
+        out[ellipse] *= self.patch_radius[self.kind == CONTACT_ELLIPSE]
         out[self.apart_rows[apart]] *= self.patch_radius[apart]
         for k in (0, 1):
             out[self.rolling_rows[rolling] + k] = self.rolling[rolling]
@@ -475,12 +519,31 @@ def _sides(mu: Any) -> tuple[Any, FloatArray]:
     return first, np.divide(second, first, out=np.zeros(len(first)), where=some)
 
 
+def _axes(mu: Any) -> tuple[FloatArray, FloatArray | None]:
+    """mu_1 (k,) of ellipses and mu_2 / mu_1 (k,), None where all are disks, from mu (k, 2)."""
+    given = as_array("mu", np.asarray(mu, float), (None,) * np.ndim(mu))
+    check_not_negative("mu", given.ravel())
+    if given.ndim != 2 or given.shape[1] != 2:
+        raise InputError(f"mu has shape {given.shape}; (k,) or (k, 2), one for each tangent, is needed")
+    flat = np.flatnonzero((given.min(axis=1) <= LEAST_SHARE * given.max(axis=1)) & (given.max(axis=1) > 0.0))
+    if len(flat):
+        raise InputError(
+            f"mu of contact {flat[0]} is {given[flat[0]].tolist()}; an ellipse needs two numbers above 0 (or no "
+            "friction at all), none 1e18 times the other: shape='box' takes a tangent without friction"
+        )
+    first, second = given[:, 0], given[:, 1]
+    ratio = np.divide(second, first, out=np.ones(len(first)), where=first > 0.0)
+    return first.copy(), ratio if (ratio != 1.0).any() else None
+
+
 def project(cones: Cones, impulse: FloatArray) -> FloatArray:
     """Nearest feasible normal and rows, then tangents, spin and rolling onto their bounds times lambda_n; (m,) [N s].
 
     This is the feasibility step of a sweep, not the projection onto the friction cone: the normal is
     clipped first and keeps its value.
     """
+    if cones.has_ellipse:
+        return cones.stretch * project(cones.disks, impulse / cones.stretch)
     out = np.clip(impulse, cones.lower, cones.upper)
     tangents, turning, rolling = cones.n_together, cones.apart_rows, cones.rolling_rows
     for i in np.flatnonzero((cones.kind != ROW) & (np.diff(cones.ptr) > 1)):

@@ -19,7 +19,6 @@ from lavender.problem import Problem
 from lavender.registry import SolverSpec, get
 from lavender.solution import Solution
 from lavender.solve import of_batch, solve, solve_few
-from lavender.solvers._few import ANY, GATE
 from lavender.solvers._newton import general
 from lavender_ext.few.many import Batch
 
@@ -74,7 +73,11 @@ def solve_many(
     together = (
         plain and spec.own and solver in ("auto", "newton") and isinstance(tol, float) and 0.0 < tol < np.inf
     )
-    at = [i for i, p in enumerate(given) if type(p) is Problem and p.generalized is not None]
+    at = [
+        i
+        for i, p in enumerate(given)
+        if type(p) is Problem and p.generalized is not None and not p.cones.has_ellipse
+    ]
 
     def batch(part: list[int]) -> None:
         _batch(given, starts, part, tol, spec, made)
@@ -115,7 +118,8 @@ def _batch(
         p, start = problems[i], starts[i]
         views.append(p.derived.view)
         given.append(p.guess if start is None else p.impulse_array(start))
-    work = Batch(views, given, tol, GATE if spec.name == "auto" else ANY, general.ROOM)
+    assert spec.few is not None
+    work = Batch(views, given, tol, spec.few.gate, general.ROOM)
     work.run()
     seconds = (perf_counter() - begin) / max(1, len(at))
     work.hand_out(Solution, of_batch, (work, [problems[i] for i in at], spec, tol, seconds, given), at, made)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lavender._arrays import ArrayLike, FloatArray
-from lavender.cones import ROUND, ROW
+from lavender.cones import CONTACT_ELLIPSE, ROUND, ROW
 from lavender.errors import InputError
 from lavender.problem import Problem
 
@@ -60,8 +60,10 @@ def siconos_error(problem: Problem, impulse: ArrayLike) -> dict[str, float]:
         if c.kind[i] == ROW:
             out[s] = lam[s] - np.clip(lam[s] - u[s], c.lower[s], c.upper[s])
             continue
-        if c.apart_rows[i] >= 0 or c.kind[i] == ROUND:
-            raise InputError("siconos_error has no spin rows, and no boxes: its friction is a disk")
+        if c.apart_rows[i] >= 0 or c.kind[i] in (ROUND, CONTACT_ELLIPSE):
+            raise InputError(
+                "siconos_error has no spin rows, and no boxes or ellipses: its friction is a disk"
+            )
         z = lam[s] - u[s]
         parts = [(slice(1, 1 + int(c.n_tangents[i])), float(c.mu[i]))]
         if c.rolling_rows[i] >= 0:

@@ -45,6 +45,7 @@ def explain(problem: Problem, tol: float = 1e-6) -> Plan:
     reason = get("auto").refuses(problem)
     if reason is not None:
         raise CapabilityError(f"solver 'auto' {reason}")
+    problem = problem.disk  # where it has ellipses
     reference(problem)
     plan = made(problem, float(tol))
     if not plan.candidates:

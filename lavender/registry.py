@@ -39,6 +39,10 @@ TABLES = ("lavender.solvers", "lavender.external")
 class Few(Protocol):
     """Solves a problem of few rows to tol with the bits of `run`, or leaves it to `run`."""
 
+    @property
+    def gate(self) -> Any:
+        """What it may cost over generalised velocities."""
+
     def solve(self, problem: Problem, impulse: FloatArray | None, tol: float) -> Any:
         """(what the judge finds, counts) from an impulse (m,) or from doing nothing; None where it is left."""
 
@@ -168,14 +172,14 @@ class SolverSpec:
 
     def refuses(self, problem: Problem) -> str | None:
         """None when the solver takes this problem, else the reason."""
+        asked, problem = problem, problem.disk
         law = problem.law
-        apart = law in self.boxes and problem.cones.is_polyhedral
         if law in self.laws and law not in ("linear", "lcp", *self.boxes) and problem.cones.has_box:
             return (
                 "takes no boxes, contacts that bound each tangent by itself: use one of those that do, "
                 "lavender.available(problem) lists them, or give the problem cones.shaped('disk')"
             )
-        if law not in self.laws and not apart:
+        if law not in self.laws and not (law in self.boxes and problem.cones.is_polyhedral):
             takes = ", ".join(law for law in LAWS if law in self.laws)
             way = _way_round(law, self.laws)
             if law == "coulomb" and "cone" in self.boxes and problem.cones.is_polyhedral:
@@ -185,6 +189,8 @@ class SolverSpec:
             makers = {"rows": "Problem.from_rows", "generalized": "Problem.from_jacobian"}
             needs = " or ".join(f"{o} ({makers[o]})" for o in OPERATORS if o in self.operators)
             given = "as a matrix" if problem.operator == "matrix" else f"by its {problem.operator} form"
+            if asked.operator != problem.operator:
+                given = f"by its {asked.operator} form with ellipses, which becomes a matrix (problem.disk)"
             return f"needs a problem with {needs}; this one was given {given}"
         if problem.cones.has_round and not self.round_cones:
             return (

@@ -27,6 +27,9 @@ itself, so squares add up; entry by entry (A^2 is A o A), x = M^-1 J^T lambda, w
 generalised coordinates, where every row that acts is soft. The floor is the root of (1) + (2, 3 or 4) + (5) in the two
 norms. Numbers that a matrix holds in float32 already cost nothing; forming A and b of J and M in float32 costs about
 what rounding these does.
+
+An ellipse is measured as the disk of stretched tangents, `Problem.disk`: energy as it is, velocity along each tangent
+by its share mu_i / max(mu_1, mu_2), its share in what sliding dissipates. e and w come back in the problem's rows.
 """
 
 from __future__ import annotations
@@ -109,7 +112,7 @@ class Residual:
             return AT_FLOOR
         if self.nothing_to_do and self.rounds:
             # Relative to nothing 1 means nothing: an impulse that ran away has more error than b.
-            return AT_FLOOR if self.energy <= measure.rhs_norms(self._problem.metric)[0] else WRONG
+            return AT_FLOOR if self.energy <= measure.rhs_norms(self._problem.disk.metric)[0] else WRONG
         return EARLY if self.relative < 1.0 else WRONG
 
     @property
@@ -137,7 +140,8 @@ class Residual:
     @property
     def velocity_by_row(self) -> FloatArray:
         """sqrt(nu d) |e| (m,) [m/s]; each tangent of a pair alone."""
-        return self._problem.metric.weight * np.abs(self.error)
+        p = self._problem
+        return p.disk.metric.weight * np.abs(p.on_disk(self.error))
 
     def __str__(self) -> str:
         worst = f", worst {self.worst_name} {self.velocity:.2g} m/s" if self.worst_row >= 0 else ""
@@ -179,6 +183,7 @@ def nothing_to_do(problem: Problem) -> bool:
     Such a problem is neither solved nor failed by anybody. Relative to nothing, rounding is everything: a residual of
     it means something in units alone.
     """
+    problem = problem.disk
     kept = problem.derived
     if kept.nothing is None:
         m = problem.m
@@ -260,11 +265,20 @@ def residual(problem: Problem, impulse: ArrayLike, precision: str | None = None)
         raise InputError(f"impulse is not an array of numbers ({error})") from None
     if impulse.shape != (problem.m,):
         raise InputError(f"impulse has shape {impulse.shape}; ({problem.m},) is needed")
+    if problem.cones.has_ellipse:
+        return unstretched(problem, residual(problem.disk, problem.on_disk(impulse), precision))
     last, problem.derived.judged = problem.derived.judged, None
     if last is None or last.data is not problem.metric or not measure.same_bits(last.impulse, impulse):
         last = judged(problem, impulse)
     found = told(problem, last)
     return found if precision == "float64" else _in_float32(problem, found, impulse)
+
+
+def unstretched(problem: Problem, found: Residual) -> Residual:
+    """The residual of a problem with ellipses, from that of its disks."""
+    s = problem.cones.stretch
+    error, slack = read_only(s * found.error), read_only(found.slack / s)
+    return replace(found, error=error, slack=slack, _problem=problem)
 
 
 def _in_float32(problem: Problem, found: Residual, impulse: FloatArray) -> Residual:

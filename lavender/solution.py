@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from enum import Enum
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lavender._arrays import FloatArray, table_of
+from lavender._arrays import FloatArray, read_only, table_of
 from lavender.errors import InputError, SolveFailed
-from lavender.residuals import Residual
+from lavender.problem import Problem
+from lavender.residuals import Residual, unstretched
 
 if TYPE_CHECKING:
     from lavender.motion import MotionError
@@ -303,6 +304,15 @@ class Solution:
     def success(self) -> bool:
         """The judge's relative residual is at most `tol`."""
         return self.residual.relative <= self.tol
+
+    def unstretched(self, problem: Problem) -> Solution:
+        """The same of a problem with ellipses, from that of its disks."""
+        s = problem.cones.stretch
+        impulse, proof = read_only(s * self.impulse), self.certificate
+        found = unstretched(problem, self.residual)
+        return replace(
+            self, impulse=impulse, residual=found, certificate=None if proof is None else read_only(s * proof)
+        )
 
     def motion_error(self, reference: Any = None) -> MotionError:
         """How wrong the motion is, in units, with a bound: see `lavender.motion_error`."""

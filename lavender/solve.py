@@ -32,7 +32,7 @@ from lavender.outcome import (
 )
 from lavender.problem import Problem
 from lavender.registry import SolverSpec, State, get
-from lavender.residuals import Residual, reference, residual, told
+from lavender.residuals import Residual, reference, residual, told, unstretched
 from lavender.solution import Claim, History, Solution, SolverRun, Status
 from lavender_ext.judge.measure import all_finite
 
@@ -161,6 +161,7 @@ class Prepared:
     def __init__(self, problem: Problem, spec: SolverSpec, options: dict[str, Any]) -> None:
         start = perf_counter()  # a check may form A, which is set-up
         _check_problem(problem, spec)
+        self._given, problem = problem, problem.disk
         for name in options:
             if name not in spec.accepts:
                 if name in ("order", "ground", "seed", "threads") or name in FRONT_DOOR:
@@ -202,6 +203,13 @@ class Prepared:
                 "make another one for every thread (lavender.prepare)"
             )
         try:
+            plain = max_iter is None and time_limit is None and callback is None
+            if plain and self.spec.delegates and self.spec.few is not None and not (self.options or history):
+                self._refresh(problem)  # nothing was prepared that one compiled call would not do without
+                made = solve_few(self._given, self.spec, impulse, tol)
+                if made is not None:
+                    return made
+                problem = None
             return self._solve(problem, impulse, tol, max_iter, time_limit, history, callback)
         finally:
             self._lock.release()
@@ -227,9 +235,10 @@ class Prepared:
                 f"solver {spec.name!r} runs in one call; it takes no callback and records no history"
             )
         self._refresh(problem)
-        problem = self.problem
+        problem, given = self.problem, self._given
+        stretch = given.cones.stretch if given is not problem else None
         if impulse is not None:
-            lam = problem.impulse_array(impulse)
+            lam = given.on_disk(problem.impulse_array(impulse))
         else:
             lam = problem.start() if problem.guess is None else problem.guess.copy()
         if time_limit is not None and hasattr(self._solver, "ready"):
@@ -238,6 +247,8 @@ class Prepared:
             self.setup_time += perf_counter() - start
         setup_time, self.setup_time = self.setup_time, 0.0
         proof = decide_empty_rows(problem, lam)
+        if stretch is not None and callback is not None:
+            callback = _in_rows_of(given, stretch, callback)
         loop = _Loop(problem, self._solver, self._state, lam, tol, time_limit, history, callback)
         if proof is not None:
             claim = Claim(INFEASIBLE, 0, {}, proof[0], certificate=proof[1])
@@ -245,18 +256,20 @@ class Prepared:
             claim = Claim(NUMERICAL_ERROR, 0, {}, self._broken)
         else:
             claim = loop.run(max_iter) if spec.resumable else loop.run_once(max_iter)
-        return finish(
+        solution = finish(
             problem, spec, self.options, loop.impulse, claim, tol, setup_time, loop.time, loop.recorded(),
             float(getattr(self._state, "sweeps_per_decade", math.nan)),
         )  # fmt: skip
+        return solution if stretch is None else solution.unstretched(given)
 
     def _refresh(self, problem: Problem | None) -> None:
-        if problem is None or problem is self.problem:
+        if problem is None or problem is self._given:
             if not self._fresh:
                 self._set_up(self.problem, anew=False)
         else:
             start = perf_counter()
             _check_problem(problem, self.spec)
+            self._given, problem = problem, problem.disk
             self._set_up(problem, anew=not same_structure(self.problem, problem))
             self.setup_time = perf_counter() - start
             self.problem = problem
@@ -276,6 +289,15 @@ class Prepared:
                 self._state = self._solver.update(self._state, problem)
         except BREAKDOWN as error:
             self._state, self._broken = None, _last_words(error)
+
+
+def _in_rows_of(given: Problem, stretch: FloatArray, callback: Callback) -> Callback:
+    """A callback of a problem with ellipses, for what is solved in its place."""
+
+    def call(done: int, impulse: FloatArray, found: Residual) -> Any:
+        return callback(done, stretch * impulse, unstretched(given, found))
+
+    return call
 
 
 def _last_words(error: BaseException) -> str:
@@ -472,6 +494,8 @@ def solve_few(problem: Problem, spec: SolverSpec, impulse: Any, tol: float) -> S
     Claim, counts and residual are put in words when somebody asks for them.
     """
     if type(problem) is not Problem or not isinstance(tol, float) or not 0.0 < tol < math.inf:
+        return None
+    if problem.cones.has_ellipse:
         return None
     start = perf_counter()
     if impulse is None:

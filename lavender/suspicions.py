@@ -101,9 +101,10 @@ def _of(problem: Problem, kind: str, reason: str, blocks: Any = (), **data: Any)
 
 def _friction(p: Problem) -> Iterator[Suspicion]:
     c = p.cones
-    wild = np.flatnonzero((c.kind != ROW) & (c.mu > MU))
+    mu = c.coefficients.max(axis=1)
+    wild = np.flatnonzero(mu > MU)
     if len(wild):
-        most = float(c.mu[wild].max())
+        most = float(mu[wild].max())
         yield _of(p, "friction", f"mu up to {most:g}; dry materials have 0.1 to 2", wild, mu=most)
 
 

@@ -1,7 +1,8 @@
 """Kernels, small calls and whole jobs: time, time per unit of work, bytes per unit, share of the machine's limit.
 
 Every case is timed beside its limit, in turns, as the least CPU time of many short batches (other programs only
-add time). The limit is measured in the same run (`lavender_ext/bench/`, compiled with the kernels' flags):
+add time). The limit is measured in the same run (`microbenchmarks.pyx`, which a build in place compiles with the
+kernels' flags):
 
     bare     the same mathematics in a loop with nothing else around it
     stream   the bytes that a unit needs at the speed of the memory they fit in

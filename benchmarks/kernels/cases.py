@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.kernels import microbenchmarks
 from benchmarks.kernels.limits import least, stream_time
 from benchmarks.kernels.problems import (
     bare_contacts,
@@ -28,7 +29,6 @@ from lavender.residuals import residual
 from lavender.scene.scene import Scene
 from lavender.solve import Prepared, prepare, solve
 from lavender.suite import granular
-from lavender_ext.bench import microbenchmarks
 from lavender_ext.core import assemble
 from lavender_ext.judge import measure
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from lavender_ext.bench import microbenchmarks
+from benchmarks.kernels import microbenchmarks
 
 __all__ = ["FOOTPRINTS", "Limit", "least", "measure_limits", "stream_time"]
 

@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.kernels import microbenchmarks
 from lavender.problem import Problem
 from lavender.rows import Rows
 from lavender.suite.families import at_least
-from lavender_ext.bench import microbenchmarks
 
 __all__ = ["bare_contacts", "contact_bytes", "csr_bytes", "lattice_pile", "raw_bytes", "tridiagonal"]
 

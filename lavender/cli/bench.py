@@ -26,12 +26,10 @@ __all__ = ["bench"]
 
 
 class Suites(ManyValues):
-    """`lavender bench auto`, `mujoco`, `peers` are commands; other first words are files (or ./peers)."""
+    """`lavender bench mujoco` is a command; other first words are files (or ./mujoco)."""
 
     OWN = {  # noqa: RUF012 - a constant of the class
-        "auto": "lavender.cli.bench_auto:auto",
         "mujoco": "lavender.cli.bench_mujoco:mujoco",
-        "peers": "lavender.cli.bench_peers:peers",
     }
 
     def make_context(
@@ -75,8 +73,7 @@ def bench(
 ) -> None:
     """As `report`, but only the records: a .jsonl file that `lavender report` shows later.
 
-    `lavender bench peers` compares with other engines and solvers instead, `lavender bench auto` measures what auto
-    loses against the best of our own solvers; see their own --help.
+    `lavender bench mujoco` compares with MuJoCo on models of your own instead; see its own --help.
     """
     refuse_idle(context, solvers)
     plan = make_plan(files, levels, budgets, orders, repeats, time_limit, pass_limit, motion, speed_levels)

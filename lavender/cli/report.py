@@ -70,12 +70,6 @@ __all__ = ["report"]
     metavar="S,S,...",
     help="Seconds for which a solver is recommended; default: three decades about the fastest times.",
 )
-@click.option(
-    "--peers",
-    type=click.Path(path_type=Path),
-    metavar="FILE",
-    help="What `lavender bench peers --out FILE` measured, to show beside.",
-)
 @click.option("--steps", default=500, show_default=True, help="Of MODEL.xml: steps of its simulation.")
 @click.option("--every", default=5, show_default=True, help="Of MODEL.xml: steps between two problems.")
 @click.option(
@@ -108,7 +102,6 @@ def report(
     backend: str,
     compare: Path | None,
     time_budgets: tuple[float, ...],
-    peers: Path | None,
     steps: int,
     every: int,
     controls: str,
@@ -128,7 +121,6 @@ def report(
     another report writes the folder.
     """
     from lavender import bench
-    from lavender.bench.peers import read as read_peers
     from lavender.report.engine import ENGINES, contestants
     from lavender.report.engine import lines as engine_lines
     from lavender.report.terminal import print_report
@@ -143,7 +135,6 @@ def report(
     taken: set[Path] = set()
     files = tuple(_recorded(f, out, steps, every, controls, fresh, taken) for f in files)
     old = None if compare is None else bench.read(compare)
-    rivals = None if peers is None else read_peers(peers)
     shown = [Path(f) for f in files if f.endswith(".jsonl")]
     if shown:
         if len(files) > 1:
@@ -191,7 +182,6 @@ def report(
         old=old,
         times=time_budgets,
         sweeps=sweeps,
-        peers=rivals,
         engines=engines,
     )
     if paper:
@@ -221,7 +211,7 @@ def _refuse_unused(context: click.Context, files: tuple[str, ...], solvers: tupl
     """Every option that would be ignored is an error."""
     campaign = context.params["campaign"]
     if any(f.endswith(".jsonl") for f in files):
-        kept = {"files", "out", "compare", "time_budgets", "budgets", "peers", "tables", "no_figures"}
+        kept = {"files", "out", "compare", "time_budgets", "budgets", "tables", "no_figures"}
         rest = [p.name for p in context.command.params if p.name and p.name not in kept]
         refuse_unused(context, rest, "where records are shown again and nothing is solved")
     elif campaign:

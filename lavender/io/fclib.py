@@ -539,6 +539,8 @@ def _cannot_hold(problem: Problem, form: str, drop: Collection[str]) -> list[str
         rows = np.repeat(c.kind == ROW, np.diff(c.ptr))
         what = "free rows" if np.all(free[rows]) else "bounded rows"
         reasons.append(f"ROW blocks ({int(rows.sum())} {what}; contacts only)")
+    if c.has_ellipse:
+        reasons.append("ellipses (give problem.disk, whose impulses are problem.on_disk of those here)")
     if c.has_box:
         reasons.append("boxes (its friction is a disk: give cones.shaped('disk'), which is another law)")
     if np.any(c.spin_rows >= 0) or c.has_round:

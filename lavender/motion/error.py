@@ -132,7 +132,12 @@ def motion_error(problem: Problem, impulse: Any, reference: Any = None) -> Motio
     """
     if not isinstance(problem, Problem):
         raise InputError(f"problem is a {type(problem).__name__}; a lavender.Problem is needed")
-    x = problem.impulse_array(impulse)
+    x = problem.on_disk(problem.impulse_array(impulse))
+    if problem.cones.has_ellipse:  # rows are those of its disks
+        if reference is not None and not isinstance(reference, Reference):
+            given = problem.impulse_array(getattr(reference, "impulse", reference), "reference")
+            reference = problem.on_disk(given)
+        problem = problem.disk
     with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is told in `note`
         if reference is not None:
             return measure(problem, x, as_reference(problem, reference))

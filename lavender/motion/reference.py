@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from lavender._arrays import FloatArray, read_only
-from lavender.errors import InputError
+from lavender.errors import CapabilityError, InputError
 from lavender.motion import operator as operators
 from lavender.motion.bound import Witness, witness
 from lavender.problem import Problem
@@ -60,7 +60,17 @@ class Kept:
 
 
 def kept(problem: Problem) -> Kept:
-    """What is kept with a problem, made when first asked for."""
+    """What is kept with a problem, made when first asked for.
+
+    Raises
+    ------
+    CapabilityError
+        A problem with ellipses, whose motion is that of its disks.
+    """
+    if problem.cones.has_ellipse:
+        raise CapabilityError(
+            "the motions of ellipses are those of problem.disk: give that, and impulses as problem.on_disk(impulse)"
+        )
     with problem.derived.lock:
         own = problem.derived.motion
         if own is None:

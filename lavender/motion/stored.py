@@ -41,7 +41,7 @@ def save_reference(problem: Problem, path: str | PathLike[str]) -> Path:
     InputError
         The file cannot be written, or nothing solved the problem: then there is nothing to keep.
     """
-    found = reference(problem)
+    found = reference(problem.disk)
     if not found.accepted:
         raise InputError(f"{path}: nothing reached the floor ({found}); there is no reference to write")
     out = _beside(path)
@@ -72,7 +72,7 @@ def load_reference(problem: Problem, path: str | PathLike[str]) -> Reference | N
     InputError
         A file of that name that holds no reference.
     """
-    place = _beside(path)
+    place, problem = _beside(path), problem.disk
     if not place.is_file():
         return None
     try:

@@ -60,8 +60,9 @@ class Builders(Operators):
         A : (m, m) 1/kg, array or sparse
         b : (m,) m/s
             Normal first in every contact.
-        mu : scalar or (k,)
+        mu : scalar, (k,) or (k, 2)
             One for each contact. A scalar stands for all of them, which then have two tangents, or for a single one.
+            Two: an ellipse, see `Cones.contacts`.
         patch_radius : scalar or (k,) m, optional
             Gives each contact a spin row.
         rolling : scalar or (k,) m, optional
@@ -73,6 +74,8 @@ class Builders(Operators):
             The rows do not part among the contacts; mu > 0 where contacts have no row for friction.
         """
         b = as_array("b", b, (None,), unit="m/s")
+        if np.ndim(mu) > 1:
+            return cls(b, Cones.contacts(mu, 2, patch_radius, rolling=rolling), A, **more)
         turns = (patch_radius is not None) + 2 * (rolling is not None)
         if np.ndim(mu) == 0:
             each = 3 + turns

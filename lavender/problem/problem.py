@@ -10,6 +10,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from lavender._arrays import ArrayLike, FloatArray, as_array, check_not_negative
+from lavender._derived import once
 from lavender.cones import ROW, Cones
 from lavender.errors import InputError
 from lavender.generalized import Generalized
@@ -151,7 +152,7 @@ class Problem(Builders):
 
             A' = S A S,   b' = S b,   lambda = S lambda',   w' = S w,   S = diag(scale)
 
-        Rows of bodies become a matrix. A disk of stretched tangents is an ellipse of those here.
+        Rows of bodies become a matrix.
 
         Parameters
         ----------
@@ -163,18 +164,6 @@ class Problem(Builders):
         InputError
             A scale that is not above 0, or not 1 at the normal of a contact.
 
-        Examples
-        --------
-        An ellipse, mu 0.5 along the first tangent and 0.2 along the second:
-
-        >>> import numpy as np
-        >>> import lavender as lv
-        >>> A, b = np.eye(3), np.array([10.0, 9.0, 9.0])
-        >>> scale = np.array([1.0, 1.0, 0.2 / 0.5])
-        >>> ellipse = lv.Problem.contact(A, b, [0.5]).stretched(scale)
-        >>> impulse = scale * lv.solve(ellipse, tol=1e-9).impulse
-        >>> round(float(np.hypot(impulse[1] / 0.5, impulse[2] / 0.2) / impulse[0]), 6)  # it slides: on the rim
-        1.0
         """
         s = as_array("scale", scale, (self.m,))
         c = self.cones
@@ -200,6 +189,41 @@ class Problem(Builders):
         return Problem(
             s * self.b, cones, generalized=made, compliance=s * s * self.compliance, copy=False, **more
         )
+
+    @property
+    def disk(self) -> Problem:
+        """The problem whose contacts are disks: this one, or where it has ellipses the same in stretched tangents.
+
+        There mu is max(mu_1, mu_2), rows are `cones.stretch` as long and impulses those here over it. Both laws hold
+        here as they hold there: friction takes most energy from sliding, lambda_t = -mu^2 w_t lambda_n / |mu w_t| with
+        mu = diag(mu_1, mu_2). It is what solvers get and the judge measures; results come back in the
+        rows of this problem.
+
+        Examples
+        --------
+        An ellipse, mu 0.5 along the first tangent and 0.2 along the second:
+
+        >>> import numpy as np
+        >>> import lavender as lv
+        >>> problem = lv.Problem.contact(np.eye(3), [10.0, 9.0, 9.0], mu=[(0.5, 0.2)])
+        >>> impulse = lv.solve(problem, tol=1e-9).impulse
+        >>> round(float(np.hypot(impulse[1] / 0.5, impulse[2] / 0.2) / impulse[0]), 6)  # it slides: on the rim
+        1.0
+        >>> problem.disk.cones.mu.tolist(), problem.disk.b.tolist()
+        ([0.5], [10.0, 9.0, 3.6])
+        """
+        return self._disk if self.cones.has_ellipse else self
+
+    def on_disk(self, impulse: FloatArray) -> FloatArray:
+        """Impulses (m,) [N s] of this problem as those of `disk`."""
+        return impulse / self.cones.stretch if self.cones.has_ellipse else impulse
+
+    @once
+    def _disk(self) -> Problem:
+        made = replace(self.stretched(self.cones.stretch), cones=self.cones.disks, copy=False)
+        if self.rows is not None:
+            made.metric.weigh_as(self.metric, True)
+        return made
 
     def boxed(self, normal_impulse: ArrayLike) -> Problem:
         """Friction bounded by fixed normals: |lambda_t| <= mu N on each tangent alone: a square, not the disk.

@@ -27,7 +27,6 @@ from lavender.report.text import count, residual, seconds, suspicions, times
 from lavender.report.verdict import Verdict, verdict
 
 if TYPE_CHECKING:
-    from lavender.bench.peers import Peers
     from lavender.report.engine import Contestant
 
 __all__ = ["page"]
@@ -63,7 +62,6 @@ def page(
     budgets: Sequence[float] = (),
     sweeps: Sequence[int] = (),
     saved: bool = True,
-    peers: Peers | None = None,
     engines: Sequence[Contestant] = (),
 ) -> str:
     """The whole page. Every text that came from a file, a problem or a backend is escaped.
@@ -81,13 +79,11 @@ def page(
         Budgets of sweeps of the recommendation.
     saved : bool
         The figures are beside the page as SVG and PNG.
-    peers : Peers, optional
-        A run of `lavender bench peers`, whose figures are among `figures`.
     engines : sequence of Contestant
         Answers of the engines that recorded the steps.
     """
     environment = _environment()
-    content = _content(records, figures, old, tuple(budgets), tuple(sweeps), peers)
+    content = _content(records, figures, old, tuple(budgets), tuple(sweeps))
     return environment.get_template("index.html.j2").render(
         title=title,
         saved=saved,
@@ -105,7 +101,6 @@ def _content(
     old: Records | None,
     budgets: Sequence[float],
     sweeps: Sequence[int],
-    peers: Peers | None,
 ) -> dict[str, Any]:
     still = idle(records)
     records = working(records)
@@ -137,11 +132,6 @@ def _content(
     ]
     changes = tables.changes(old, records) if old is not None else []
     lines = [] if campaign else tables.advice(records, budgets)
-    rivals = None
-    if peers is not None:
-        from lavender.report.rivals import content  # with the engine behind it
-
-        rivals = content(peers)
     return {
         "drawings": {  # each escapes what it holds
             file_name(figure.name): svg(figure, number, found.leaders, titles.get(figure.name))
@@ -199,8 +189,6 @@ def _content(
         "n_changes": len(changes),
         "n_records": len(records),
         "n_cases": len({r.case for r in records if r.step < 0}),
-        "peers": rivals,
-        "peer_figures": {place: _keys(some) for place, some in figures.peers.items()},
     }
 
 

@@ -15,9 +15,7 @@ from lavender.solution import Claim, Status, Turn
 from lavender.solvers._few import said
 from lavender.solvers._islands import islands
 
-__all__ = ["CLOCK", "SolveLog"]
-
-CLOCK = 0.01  # s between two looks at the clock, as counted
+__all__ = ["SolveLog"]
 
 CAUTION = 0.999  # of what is left of the tolerance: sums are rounded
 STILL = 32  # turns in a row, most of them longer than those before, that leave

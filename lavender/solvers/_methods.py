@@ -16,11 +16,10 @@ from lavender.registry import SolverSpec, get
 from lavender.residuals import remember
 from lavender.solution import Claim, Status
 from lavender.solvers._accelerated import operator
-from lavender.solvers._log import CLOCK, SolveLog
+from lavender.solvers._log import SolveLog
 from lavender.solvers._newton import general
 from lavender.solvers._plan import BOTH_WAYS, METHODS, TABLE, Cost, Costs
 from lavender.solvers._schedule import AGAIN, remainder
-from lavender.solvers._split import solve_together
 from lavender.solvers._sweeping import STATUS
 from lavender.solvers.direct import Enough, Impatient
 from lavender.solvers.newton import NewtonState
@@ -31,6 +30,7 @@ __all__ = ["FIRST", "Candidate", "Sweeps", "in_short_time", "make"]
 FIRST = 32  # sweeps before the first look at what they promise
 SURE = 4.0  # times what a finite solver is expected to cost, that has to be left for it to begin
 ALL = 1e18  # ns: until the time is up
+CLOCK = 0.01  # s between two looks at the clock, as counted
 GROWTH = 8  # times the iterations of the last look at the clock, before the next
 
 
@@ -321,22 +321,13 @@ class Direct(Finite):
         return claim
 
 
-class Islands(Candidate):
-    """One turn: every small island by itself, to its share of the tolerance; what that leaves is for the others."""
-
-    def run(self, work: float, others: float) -> bool:
-        log = self.log
-        solve_together(log, log.left, min(work, others) / log.problem.m)
-        return False
-
-
 def _offer(log: SolveLog, impulse: FloatArray) -> None:
     if np.isfinite(impulse).all():
         log.offer(impulse)
 
 
 KINDS: dict[str, type[Candidate]] = {
-    "newton": Newton, "direct": Direct, "anderson": Sweeps, "islands": Islands, "relaxation": Relaxation,
+    "newton": Newton, "direct": Direct, "anderson": Sweeps, "relaxation": Relaxation,
 }  # fmt: skip
 
 

@@ -3,7 +3,7 @@
     cost = start + formed * entries + count * (row * m + work * w)                                            (1)
 
 m rows; w multiply-adds of one iteration, counted from the structure (`_structure.py`); start, row, work [ns] and count,
-iterations to the end, are rates of `rates.json`, which `lavender bench auto --fit` writes from recorded runs of single
+iterations to the end, are rates of `rates.json`, which `python -m benchmarks auto --fit` writes from runs of single
 solvers. No clock is read: the same problem has the same plan everywhere.
 """
 
@@ -20,7 +20,6 @@ from typing import Any
 
 from lavender.errors import InputError
 from lavender.problem import Problem
-from lavender.registry import FEW
 from lavender.solvers._structure import Structure
 
 __all__ = ["METHODS", "READ", "TABLE", "Cost", "Costs", "Plan", "candidates", "made", "rates", "structure_of"]
@@ -37,17 +36,16 @@ METHODS: dict[str, tuple[str, dict[str, Any]]] = {
     "admm": ("admm", {}),
     # Of Coulomb's law: its answer is the law's own wherever contacts stick.
     "relaxation": ("anderson", {}),
-    # Each island by itself, in compiled code (`_split.py`): sweeps, pivots or velocities.
-    "islands": ("anderson", {}),
 }
+# Where contacts roll: Newton's method sees each round of these as a problem of its own.
+ROLLING = ("anderson", "nncg", "newton", "admm")
 _GIVEN = {
     "linear": ("direct", "anderson", "newton"),
     "lcp": ("anderson", "direct", "newton", "nncg"),
     "cone": ("anderson", "newton"),
     "coulomb": ("anderson", "newton", "admm"),
 }
-#: At most four for each law and operator, `islands` in place of the last where the problem divides; "round": cones of
-#: more than two tangents.
+#: At most four for each law and operator; "round": cones of more than two tangents.
 TABLE: dict[str, dict[str, tuple[str, ...]]] = {
     "rows": _GIVEN
     | {"lcp": ("anderson", "direct", "newton"), "coulomb": ("anderson", "newton", "relaxation")},
@@ -244,10 +242,6 @@ class Costs:
             return self._finite("direct", s.direct)
         if name == "relaxation":
             return self._relaxation() if s.is_loose else Cost(inf, 1.0, 1.0)
-        if name == "islands":
-            # The others have ended while sweeps of the whole go on for the one that needs most of them.
-            whole = self.of("anderson")
-            return Cost(whole.setup, whole.each, s.largest * whole.count)
         if name == "admm":
             a, (factored, fill) = r["admm"], s.admm(1.0)
             setup = a["start"] + r["formed"] * s.formed + a["factor"] * factored
@@ -283,16 +277,14 @@ def candidates(structure: Structure) -> tuple[str, ...]:
     problem = structure.problem
     if problem.cones.has_round:
         return TABLE["generalized"]["round"]
+    if problem.cones.has_rolling:
+        return ROLLING
     names = TABLE[problem.operator][problem.law]
-    if problem.law != "linear" and structure.divides:
-        names = (*names[:3], "islands")
     return names if structure.is_definite else tuple(name for name in names if name != "direct")
 
 
 def made(problem: Problem, tol: float) -> Plan:
     """The plan of a problem to `tol`, counted in full; nothing is run."""
-    from lavender.solvers._few import FEW_GENERAL
-    from lavender.solvers._gates import general_first
     from lavender.solvers._log import SolveLog
     from lavender.solvers._methods import make
     from lavender.solvers._schedule import first
@@ -301,12 +293,8 @@ def made(problem: Problem, tol: float) -> Plan:
     methods = make(SolveLog(problem, tol, 2**31 - 1), costs, candidates(costs.structure))
     chosen = first(methods)
     counted = sorted(((m.name, costs.of(m.name)) for m in methods), key=lambda pair: pair[1].total)
-    kernel = costs.structure.kernel
-    over_velocities = (
-        kernel is not None and problem.m <= FEW_GENERAL and general_first(problem, kernel.largest)
-    )
     return Plan(
         rows=problem.m, law=problem.law, operator=problem.operator, structure=structure_of(problem), tol=tol,
-        small=problem.m <= FEW or over_velocities, first=(chosen.name, chosen.steps(chosen.rest)),
+        small=costs.structure.is_small, first=(chosen.name, chosen.steps(chosen.rest)),
         candidates=tuple((name, cost) for name, cost in counted if cost.total < inf),
     )  # fmt: skip

@@ -30,9 +30,6 @@ from lavender.suite.families import (
     toy_stack,
     two_particles,
 )
-from lavender.suite.foreign import foreign
-from lavender.suite.foreign_new import foreign_new
-from lavender.suite.wild import wild
 
 __all__ = [
     "FAMILIES",
@@ -46,8 +43,6 @@ __all__ = [
     "chain",
     "default",
     "families",
-    "foreign",
-    "foreign_new",
     "friction",
     "granular",
     "hang",
@@ -58,7 +53,6 @@ __all__ = [
     "stack",
     "toy_stack",
     "two_particles",
-    "wild",
 ]
 
 #: Lists of cases by name. "default" is what `lavender report` runs with no files: one case for each thing that

@@ -11,6 +11,7 @@ cdef class Blocks:
     cdef readonly bint is_bounded_rows                  # every row has constant bounds
     cdef readonly bint has_round                        # some contact has more than two tangents
     cdef readonly bint has_rolling                      # some contact has rows that roll, bounded by themselves
+    cdef readonly bint has_ellipse                      # some contact bounds its two tangents by an ellipse
     cdef readonly bint single_rows                      # every block is one ROW
 
     cdef bint point(self, const int32_t[::1] ptr, const int32_t[::1] kind, const double[::1] lower,

@@ -9,8 +9,11 @@ import numpy as np
 
 from lavender_ext.core.block cimport CONTACT, CONTACT_BOX, CONTACT_ROLLING, CONTACT_SPIN, ROUND, ROW
 
+cdef enum:
+    CONTACT_ELLIPSE = 7                                 # no kernel meets it: `Problem.disk` is solved and judged
+
 #: Kinds of blocks by the kernels' numbers.
-KINDS = (ROW, CONTACT, CONTACT_SPIN, ROUND, CONTACT_BOX, CONTACT_ROLLING)
+KINDS = (ROW, CONTACT, CONTACT_SPIN, ROUND, CONTACT_BOX, CONTACT_ROLLING, CONTACT_ELLIPSE)
 
 cdef double INF = 1.0 / 0.0
 cdef object ndarray = np.ndarray, new = np.empty, F8 = np.dtype(np.float64), I4 = np.dtype(np.int32)
@@ -49,7 +52,7 @@ cdef class Blocks:
         cdef blocks_t* p = &self.at
         cdef int32_t i, j, size, kind
         self.is_free = self.is_bounded_rows = self.single_rows = True
-        self.has_round = self.has_rolling = False
+        self.has_round = self.has_rolling = self.has_ellipse = False
         for i in range(p.n_blocks):
             size = p.ptr[i + 1] - p.ptr[i]
             kind = p.kind[i]
@@ -60,8 +63,10 @@ cdef class Blocks:
                 self.has_round = True
                 if not 3 < size <= 6:
                     return False
-            elif kind == CONTACT_BOX:
-                if size != 3:
+            elif kind == CONTACT_BOX or kind == CONTACT_ELLIPSE:
+                if kind == CONTACT_ELLIPSE:
+                    self.has_ellipse = True
+                if size != 3 or kind == CONTACT_ELLIPSE and not p.patch_radius[i] > 0.0:
                     return False
             elif kind == CONTACT_ROLLING:
                 self.has_rolling = True
@@ -148,6 +153,7 @@ def joined(Blocks a, Blocks b):
     made.is_bounded_rows = a.is_bounded_rows and b.is_bounded_rows
     made.has_round = a.has_round or b.has_round
     made.has_rolling = a.has_rolling or b.has_rolling
+    made.has_ellipse = a.has_ellipse or b.has_ellipse
     made.single_rows = a.single_rows and b.single_rows
     return made
 
@@ -232,21 +238,21 @@ cdef Blocks rows_between(Py_ssize_t m, const double* lower, const double* upper)
     return made if made.look() else None
 
 
-def contacts(Py_ssize_t k, int32_t tangents, mu, radius, rolling, bint box=False):
+def contacts(Py_ssize_t k, int32_t tangents, mu, radius, rolling, int32_t sides=0):
     """k contacts of so many tangents, with a spin row where there is a radius (k,), two that roll where there is mu_r (k,).
 
     mu is a float or (k,) array.
 
-    Boxes have two tangents, and as radius mu_2 / mu_1.
+    sides: CONTACT_BOX or CONTACT_ELLIPSE, which have two tangents, and as radius mu_2 / mu_1; else 0.
 
     None where anything is amiss.
     """
-    cdef bint spin = radius is not None and not box, rolls = rolling is not None
+    cdef bint spin = radius is not None and not sides, rolls = rolling is not None
     cdef int32_t size = 1 + tangents + spin + 2 * rolls, kind
     cdef const double[::1] each = None, patch = None, moment = None
     cdef double one = 0.0
     cdef Py_ssize_t i, j
-    kind = CONTACT_BOX if box else ROUND if tangents > 2 else CONTACT_ROLLING if rolls else CONTACT_SPIN if spin else CONTACT
+    kind = sides if sides else ROUND if tangents > 2 else CONTACT_ROLLING if rolls else CONTACT_SPIN if spin else CONTACT
     if not 0 <= k < 2147483647 // size:
         return None
     if type(mu) is float:

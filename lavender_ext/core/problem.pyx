@@ -454,9 +454,13 @@ cdef class Data:
             self._d = _read_only(self.part(0))
         return self._d
 
-    def weigh_as(self, Data other):
-        """Take nu of the same problem given by rows: in A alone nothing tells an angular row from a linear one."""
-        memcpy(<double*>self.blocks.nu, other.blocks.nu, self.blocks.n_rows * sizeof(double))
+    def weigh_as(self, Data other, bint joints=False):
+        """Take nu of the same problem given by rows: in A alone nothing tells an angular row from a linear one.
+
+        joints: only of the ROW blocks before the first contact, of a problem whose contacts are others.
+        """
+        cdef int32_t rows = self.blocks.ptr[other.rows.n_joints] if joints else self.blocks.n_rows
+        memcpy(<double*>self.blocks.nu, other.blocks.nu, rows * sizeof(double))
         self._nu = self._weight = None
 
     @property

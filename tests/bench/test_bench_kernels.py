@@ -10,7 +10,7 @@ from click.testing import CliRunner
 
 import lavender as lv
 from benchmarks import kernels
-from lavender_ext.bench import microbenchmarks
+from benchmarks.kernels import microbenchmarks
 
 
 @pytest.mark.parametrize("shuffle", [False, True])

@@ -27,8 +27,9 @@ WILD = (
     None, "CONVERGED", -1, 1.5, 10**30, True, [], {}, {"sweeps": None}, {"sweeps": 1e400}, [1.0, 2.0], "a", [[1], 2],
 )  # fmt: skip
 WORDS = (
-    ("report", "two_particles", "--campaign", "--workers", "{}"), ("report", "wild", "--campaign", "--seeds", "0:{}"),
-    ("bench", "auto", "--seeds", "{}:0"), ("solve", "random_spd(n={})"), ("solve", "two_particles", "--tol", "{}"),
+    ("report", "two_particles", "--campaign", "--workers", "{}"),
+    ("report", "granular", "--campaign", "--seeds", "0:{}"),
+    ("solve", "random_spd(n={})"), ("solve", "two_particles", "--tol", "{}"),
     ("solve", "two_particles", "--max-iter", "{}"), ("solve", "two_particles", "--time-limit", "{}"),
     ("check", "two_particles", "--tol", "{}", "--solvers", "pgs"), ("view", "{}"), ("record", "{}", "--out", "{}"),
 )  # fmt: skip
@@ -321,7 +322,7 @@ def far(spec):
 def command(spec):
     """A documented status and no traceback, whatever number is asked for."""
     if (
-        spec["words"][:2] in (["report", "two_particles"], ["report", "wild"])
+        spec["words"][:2] in (["report", "two_particles"], ["report", "granular"])
         and spec["words"][-1].strip("0:-") == "1"
     ):
         return  # which starts processes

@@ -8,6 +8,7 @@ import numpy as np
 from strategies import generators, numbers, plain, positive
 
 import lavender as lv
+from benchmarks.drawn import wild
 from lavender import suite
 from lavender.suite import hard
 
@@ -92,7 +93,7 @@ def build(spec):
         return lv.Problem.from_jacobian(
             jac, np.array(spec["M"]), spec["v_free"], cones=cones, friction=friction
         )
-    problem = suite.case(f"wild(seed={spec['seed']}, rows=200)").problem
+    problem = wild(seed=spec["seed"], rows=200).problem
     if source == "wild":
         return problem
     rng = np.random.default_rng(spec["seed"])

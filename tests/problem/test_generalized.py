@@ -12,8 +12,9 @@ from random_problems import seeds
 from random_trees import chain, random_general, random_tree, tree_mass
 
 import lavender as lv
+from benchmarks.drawn import wild
 from lavender import generalized as coordinates
-from lavender import registry, suite
+from lavender import registry
 from lavender.solvers._islands import islands, restrict, rows_of
 from lavender.solvers._newton import general
 from lavender.solvers._plan import candidates
@@ -336,7 +337,7 @@ def test_a_warm_start_saves_steps():
 
 @pytest.mark.parametrize("limit", [None, 2.0])
 def test_many_islands_are_not_cut_between_two_looks_at_the_clock(limit, monkeypatch):
-    problem = suite.wild(seed=5192).problem  # 152 islands
+    problem = wild(seed=5192).problem  # 152 islands
     cut = lv.solve(problem, "newton", time_limit=limit, tol=1e-9)
     assert cut.success and cut.iterations > general.CLOCK
     monkeypatch.setattr(general, "CLOCK", 10**6)

@@ -6,7 +6,7 @@ import scipy.sparse as sp
 from random_problems import as_matrix, random_contact_problem, random_lcp
 
 import lavender as lv
-from lavender import suite
+from benchmarks.drawn import wild
 from lavender.deadline import Deadline
 from lavender.solvers import admm
 
@@ -282,7 +282,7 @@ def test_a_large_factor_is_left_to_run_with_the_same_bits(monkeypatch):
 
 def test_under_a_limit_nothing_long_is_begun_in_setting_up():
     """A of J and M is not formed, and a matrix of many entries not analysed, where that would end too late."""
-    problem = suite.case("wild(seed=109, rows=3000)").problem
+    problem = wild(seed=109, rows=3000).problem
     assert problem.operator == "generalized"
     late = lv.solve(problem, "admm", time_limit=1e-4)
     assert late.status is lv.Status.TIME_LIMIT and late.iterations == 0 and not late.work

@@ -9,7 +9,7 @@ from hypothesis import assume, given
 from random_problems import as_matrix, random_contact_problem, random_lcp, seeds
 
 import lavender as lv
-from lavender import suite
+from benchmarks.drawn import wild
 from lavender._lu import sparse_lu
 from lavender.certificates import check_certificate
 from lavender.solvers._factor import TooDear
@@ -438,9 +438,9 @@ def test_a_factor_that_would_end_after_the_deadline_is_not_begun():
 
 
 def test_more_sweeps_guess_the_free_rows_where_a_factor_costs_as_much():
-    narrow = lv.solve(suite.wild(seed=3131).problem, "direct", tol=1e-6)
+    narrow = lv.solve(wild(seed=3131).problem, "direct", tol=1e-6)
     assert narrow.solver.form == "band" and narrow.work["sweeps"] == 4
-    sparse = lv.solve(suite.wild(seed=3170).problem, "direct", tol=1e-6)  # 480 rows
+    sparse = lv.solve(wild(seed=3170).problem, "direct", tol=1e-6)  # 480 rows
     assert sparse.solver.form == "sparse" and sparse.work["sweeps"] == 48
     assert sparse.work["factorisations"] <= 3  # 6 after 4 sweeps
 

@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from random_problems import as_matrix, random_contact_problem, random_lcp, seeds
 
 import lavender as lv
+from benchmarks.drawn import wild
 from lavender import suite
-from lavender.bench.cases import resolve
 from lavender.certificates import check_certificate
 from lavender.web import compile as wasm
 from lavender_ext.driver.driver import Driver
@@ -74,8 +74,8 @@ def test_turns_of_any_length_give_the_same_bits(seed):
 
 def test_generalised_coordinates_are_driven_by_the_same_names():
     taken = 0
-    for item in resolve(["wild(seed=44017)", "wild(seed=44027)", "wild(seed=44030)"]):
-        problem = item.problem
+    for seed in (44017, 44027, 44030):
+        problem = wild(seed=seed).problem
         assert problem.generalized is not None
         how, done, _, impulse = driven(problem, 1e-8)
         assert how == REACHED and done > 0
@@ -112,10 +112,9 @@ def test_a_budget_ends_it_and_a_proof_too():
 def test_what_the_method_does_not_take_is_said_at_once():
     problem = lv.Problem.contact(np.eye(3), np.ones(3), [0.5])
     assert driven(problem) is not None
-    (item,) = resolve(["wild(seed=44017)"])
     still = random_contact_problem(3, friction="cone", bodies=4, contacts=6)
     assert driven(replace(still, cones=replace(still.cones, mu=np.zeros(still.n_blocks)))) is None
-    assert driven(item.problem) is not None
+    assert driven(wild(seed=44017).problem) is not None
 
 
 # -- without Python --------------------------------------------------------------------------------------------

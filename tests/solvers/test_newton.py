@@ -12,8 +12,8 @@ from hypothesis import given, settings
 from random_problems import as_matrix, random_contact_problem, random_lcp, seeds
 
 import lavender as lv
+from benchmarks.drawn import wild
 from lavender import suite
-from lavender.bench.cases import resolve
 from lavender.solvers._newton import pattern, sparse, systems
 from lavender.solvers._newton import scaled as scaling
 from lavender.solvers._newton.systems import make_system
@@ -69,8 +69,7 @@ def test_usual_problems_are_scaled_as_any_other(problem, monkeypatch):
 def test_many_bodies_on_one_leave_half_of_the_rows():
     # 26 % of A is nonzero; of 228 rows, half of them of bodies that touch nothing else, elimination leaves a quarter of
     # the entries of a full factor and an eighth of its work.
-    (item,) = resolve(["wild(seed=7012)"])
-    problem = item.problem
+    problem = wild(seed=7012).problem
     assert problem.matrix is not None
     assert systems.BOUNDED_FILL < problem.csr.nnz / problem.m**2 < systems.DENSE_FILL
     system = make_system(problem, "impulse")
@@ -88,8 +87,7 @@ def test_many_bodies_on_one_leave_half_of_the_rows():
 
 
 def test_bounded_rows_as_full_as_that_stay_full():
-    (item,) = resolve(["wild(seed=7566)"])
-    problem = item.problem
+    problem = wild(seed=7566).problem
     assert problem.law == "lcp"
     assert problem.csr.nnz / problem.m**2 < systems.DENSE_FILL
     assert make_system(problem, "impulse").dense
@@ -249,7 +247,7 @@ def test_an_exchange_is_newtons_step_on_the_natural_map(seed):
 
 @pytest.mark.parametrize("seed", [6, 70, 239, 3146])
 def test_exchanges_from_swept_impulses_take_few_factorisations(seed):
-    problem = as_matrix(suite.wild(seed=seed).problem)
+    problem = as_matrix(wild(seed=seed).problem)
     swept = lv.solve(problem, "anderson", tol=0.0, max_iter=60).impulse
     solution = lv.solve(problem, "newton", impulse=swept, tol=1e-6)
     assert good(solution, 1e-6)
@@ -259,7 +257,7 @@ def test_exchanges_from_swept_impulses_take_few_factorisations(seed):
 
 @pytest.mark.parametrize("seed, most", [(5080, 2), (5229, 2), (177, 2), (5122, 2), (242, 1)])
 def test_joints_that_nearly_depend_on_each_other_take_two_factorisations(seed, most):
-    solution = lv.solve(suite.wild(seed=seed).problem, "newton", tol=1e-6)
+    solution = lv.solve(wild(seed=seed).problem, "newton", tol=1e-6)
     assert good(solution, 1e-6)
     assert solution.work["factorisations"] <= most  # interior points: 23 to 35
 
@@ -276,7 +274,7 @@ def test_a_circle_of_exchanges_ends_by_count(n):
 
 
 def test_exchanges_that_go_in_circles_are_given_up():
-    problem = suite.wild(seed=3).problem  # rows depend on each other
+    problem = wild(seed=3).problem  # rows depend on each other
     solution = lv.solve(problem, "newton", tol=1e-6)
     assert good(solution, 1e-6)
     assert "exchanges" in solution.message and "interior point steps" in solution.message
@@ -386,7 +384,7 @@ def test_postorder_keeps_the_fill():
 
 
 def test_spheres_turned_by_rounding_alone_have_three_unknowns_each():
-    problem = suite.case("wild(seed=239)").problem
+    problem = wild(seed=239).problem
     rows = problem.rows
     assert rows is not None and rows.inv_inertia.any()
     system = make_system(problem, "velocity")

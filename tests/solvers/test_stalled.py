@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import lavender as lv
+from benchmarks.drawn import wild
 from lavender import registry, suite
 from lavender.suite import hard
 
@@ -40,7 +41,7 @@ def recorded():
 def drawn():
     """Problems of `wild`, cold, and from the answer to targets that are a little different."""
     for seed in range(90):
-        problem = suite.case(f"wild(seed={seed}, rows={ROWS})").problem
+        problem = wild(seed=seed, rows=ROWS).problem
         yield f"wild {seed}", problem
         solution = lv.solve(problem, tol=1e-9)
         if solution.success:

@@ -21,6 +21,7 @@ def with_motion(record: Record, problem: Problem, impulse: Any) -> Record:
     """
     if impulse is None:
         return record
+    problem, impulse = problem.disk, problem.on_disk(impulse)
     found = motion.motions_of(problem, SEARCH) if problem.law == "coulomb" else None
     error = (
         motion.motion_error(problem, impulse) if found is None else motion.nearest(problem, impulse, found)

@@ -15,12 +15,13 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from benchmarks.output import markdown
 from lavender import registry
 from lavender.bench.running.runner import is_foreign
 from lavender.bench.running.timing import Task, measure
 from lavender.problem import Problem
 
-__all__ = ["SHIFT", "Regret", "Summary", "regrets", "summary"]
+__all__ = ["SHIFT", "Regret", "Summary", "regrets", "summary", "table"]
 
 SHIFT = 50e-6  # s: below it the difference of two solvers is Python's share
 LEVELS = (1e-3, 1e-6, 1e-9)
@@ -199,3 +200,33 @@ def summary(found: Iterable[Regret]) -> Summary:
         plain_p95=plain[1],
         plain_worst=plain[2],
     )
+
+
+def table(found: Sequence[Regret], rows: int = 12) -> str:
+    """The summary and the `rows` worst of `found`, markdown."""
+    s = summary(found)
+    counts = (
+        f"{s.count} problems and levels that one of our solvers reached, {s.unsolved} of them not by auto; "
+        f"{s.nobody} that nobody reached"
+    )
+    kinds = {
+        f"(t + {1e6 * SHIFT:.0f} us) / (best + same)": (s.mean, s.p95, s.worst),
+        "t / best": (s.plain_mean, s.plain_p95, s.plain_worst),
+    }
+    head = ("regret", "geometric mean", "95th percentile", "worst")
+    lines = [
+        counts,
+        "",
+        markdown(head, [(kind, *(f"{x:.2f}" for x in of)) for kind, of in kinds.items()]),
+        "",
+    ]
+    for r in sorted(found, key=lambda r: -r.shifted)[:rows]:
+        if r.best:
+            word = f"{r.shifted:7.2f}" if r.auto_solved else " failed"
+            times = f"auto {1e3 * r.auto_time:.3f} ms, {r.best} {1e3 * r.best_time:.3f} ms"
+            lines += [
+                f"{word}  {r.case}, {r.rows} rows, {r.law}, to {r.level:.0e}: {times}",
+                f"         {r.reason}",
+                f"         {r.auto_ran[:160]}",
+            ]
+    return "\n".join(lines)

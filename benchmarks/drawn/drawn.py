@@ -16,15 +16,15 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.spatial import cKDTree
 
+from benchmarks.drawn.foreign import PART, UP, Matrix
+from benchmarks.drawn.foreign import drawn as draw
+from benchmarks.drawn.wild import LARGEST_DENSE, Structure, World, between, on_floor
 from lavender.cones import Cones
 from lavender.errors import UnknownName
 from lavender.problem import Problem
 from lavender.suite.build import Bodies, Contacts, manifold, sideways
 from lavender.suite.case import Draft, family
 from lavender.suite.families import BOX, ROD, SPHERE, at_least
-from lavender.suite.foreign import PART, UP, Matrix
-from lavender.suite.foreign import drawn as draw
-from lavender.suite.wild import LARGEST_DENSE, Structure, World, between, on_floor
 
 __all__ = ["JUDGED", "TUNED", "drawn"]
 

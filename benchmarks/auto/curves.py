@@ -153,7 +153,7 @@ def _several(problem: Problem, candidate: str, limit: float) -> tuple[float, lis
 def _fresh(problem: Problem, candidate: str) -> tuple[Problem, Problem, Any]:
     """Nothing derived yet: the problem, what is solved in its place, and the solver."""
     name, options, relaxed = CANDIDATES[candidate]
-    fresh = replace(problem, copy=False)
+    fresh = replace(problem.disk, copy=False)
     reference(fresh)
     return fresh, fresh.relaxed("cone") if relaxed else fresh, registry.get(name).load()(**options)
 

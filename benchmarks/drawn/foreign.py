@@ -17,13 +17,7 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.spatial import cKDTree
 
-from lavender.cones import Cones
-from lavender.errors import UnknownName
-from lavender.problem import Problem
-from lavender.suite.build import Bodies, Contacts, manifold, sideways
-from lavender.suite.case import Draft, family
-from lavender.suite.families import BOX, ROD, SPHERE, at_least
-from lavender.suite.wild import (
+from benchmarks.drawn.wild import (
     FORMS,
     LARGEST_DENSE,
     LAWS,
@@ -36,6 +30,12 @@ from lavender.suite.wild import (
     on_floor,
     problem_of,
 )
+from lavender.cones import Cones
+from lavender.errors import UnknownName
+from lavender.problem import Problem
+from lavender.suite.build import Bodies, Contacts, manifold, sideways
+from lavender.suite.case import Draft, family
+from lavender.suite.families import BOX, ROD, SPHERE, at_least
 
 __all__ = ["JUDGED", "TUNED", "drawn", "foreign"]
 

@@ -15,14 +15,14 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.spatial import cKDTree
 
+from benchmarks.drawn.foreign import PART, UP, Matrix, drawn
+from benchmarks.drawn.wild import LARGEST_DENSE, Structure, World, between, on_floor
 from lavender.cones import Cones
 from lavender.errors import UnknownName
 from lavender.problem import Problem
 from lavender.suite.build import Contacts
 from lavender.suite.case import Draft, family
 from lavender.suite.families import BOX, ROD, SPHERE, at_least
-from lavender.suite.foreign import PART, UP, Matrix, drawn
-from lavender.suite.wild import LARGEST_DENSE, Structure, World, between, on_floor
 
 __all__ = ["foreign_new"]
 

@@ -14,13 +14,13 @@ from typing import Any
 
 import numpy as np
 
-from lavender.bench.curves import Curve
+from benchmarks.auto.curves import Curve
 from lavender.problem import Problem
 from lavender.registry import FEW
 from lavender.solvers._plan import READ
 from lavender.solvers._structure import Structure
 
-__all__ = ["LEAST", "count_rates", "fit", "gathered"]
+__all__ = ["DRAWN", "LEAST", "count_rates", "fit", "gathered", "least_squares", "middle"]
 
 LEAST = 30  # problems that a rate stands on at least
 DRAWN = 10  # problems that the median of all laws counts for beside those of one
@@ -63,23 +63,23 @@ def fit(cases: Iterable[Recorded]) -> dict[str, Any]:
 
     rates: dict[str, Any] = {}
     sweeps, back = of("anderson"), of("nncg")
-    start, each_row, *work = _least_squares(sweeps, lambda s, n: [1.0, n * s.m, *given(s, n * s.sweep)])
+    start, each_row, *work = least_squares(sweeps, lambda s, n: [1.0, n * s.m, *given(s, n * s.sweep)])
     rates["anderson"] = {"start": start, "row": each_row, "work": dict(zip(KINDS, work, strict=True))}
     rates["nncg"] = {}
     finite = [(s, c) for s, c in of("direct") if s.is_definite]
-    start, each_row, one, formed = _least_squares(finite, lambda s, n: [1.0, n * s.m, n * s.direct, s.formed])
+    start, each_row, one, formed = least_squares(finite, lambda s, n: [1.0, n * s.m, n * s.direct, s.formed])
     rates["direct"] = {"start": start, "row": each_row, "work": one}
     rates["formed"] = formed
     newton = [(s, c) for s, c in of("newton", "newton over rows") if _is_over_rows(s, c)]
-    start, one, *row = _least_squares(
+    start, one, *row = least_squares(
         newton, lambda s, n: [1.0, n * s.newton, *given(s, n * s.m)], lambda s: formed * s.formed
     )
     rates["newton"] = {"start": start, "row": dict(zip(KINDS, row, strict=True)), "work": one}
     steps = [(s, c) for s, c in of("newton over velocities") if s.kernel is not None]
-    step, entry, one = _least_squares(steps, lambda s, n: [n, READ * s.sweep + n * s.read, n * s.velocities])
+    step, entry, one = least_squares(steps, lambda s, n: [n, READ * s.sweep + n * s.read, n * s.velocities])
     rates["velocities"] = {"step": step, "entry": entry, "work": one}
     split = of("admm")
-    start, factor, one = _least_squares(split, lambda s, n: [1.0, *s.admm(n)], lambda s: formed * s.formed)
+    start, factor, one = least_squares(split, lambda s, n: [1.0, *s.admm(n)], lambda s: formed * s.formed)
     rates["admm"] = {"start": start, "factor": factor, "work": one}
     chosen = {
         "anderson": sweeps,
@@ -91,13 +91,13 @@ def fit(cases: Iterable[Recorded]) -> dict[str, Any]:
     }
     for name, part in chosen.items():
         kinds = {kind: [x for x in part if x[0].problem.law in laws] for kind, laws in KINDS.items()}
-        whole = _middle(part)
-        by_kind = {kind: _round(_middle(those, whole)) for kind, those in kinds.items()}
+        whole = middle(part)
+        by_kind = {kind: _round(middle(those, whole)) for kind, those in kinds.items()}
         rates[name] = rates[name] | {"count": by_kind if name in ("newton", "velocities") else _round(whole)}
     return rates
 
 
-def _middle(part: list[tuple[Structure, Curve]], pooled: float | None = None) -> float:
+def middle(part: list[tuple[Structure, Curve]], pooled: float | None = None) -> float:
     """Iterations of an island to LEVEL, the median of those that end; `pooled` counts for DRAWN problems more."""
     counts = [
         (curve.iterations(LEVEL), s.steps if "velocities" in curve.candidate else 1.0) for s, curve in part
@@ -118,13 +118,13 @@ def _points(curve: Curve) -> list[tuple[int, float, float]]:
     return [curve.points[i] for i in at]
 
 
-def _least_squares(
+def least_squares(
     chosen: list[tuple[Structure, Curve]],
     terms: Callable[[Structure, float], Terms],
     known: Callable[[Structure], float] = lambda s: 0.0,
 ) -> list[float]:
     """Positive rates by (1), robust: a curve that is far off counts by its distance, not by its square."""
-    from scipy.optimize import least_squares
+    from scipy import optimize
 
     if len(chosen) < LEAST:
         raise ValueError(
@@ -139,7 +139,9 @@ def _least_squares(
     a, time, rest = np.array(x), np.array(y), np.array(z)
     scale = np.array([np.median(column[column > 0.0]) if (column > 0.0).any() else 1.0 for column in a.T])
     start = np.log(np.median(time) / scale / a.shape[1])
-    found = least_squares(lambda q: np.log(a @ np.exp(q) + rest + 1.0) - np.log(time), start, loss="soft_l1")
+    found = optimize.least_squares(
+        lambda q: np.log(a @ np.exp(q) + rest + 1.0) - np.log(time), start, loss="soft_l1"
+    )
     return [_round(rate) for rate in np.exp(found.x)]
 
 

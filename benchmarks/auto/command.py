@@ -1,28 +1,27 @@
-"""`lavender bench auto`."""
+"""The command `python -m benchmarks auto`."""
 
 from __future__ import annotations
 
 import json
 import statistics
 from collections.abc import Iterator
-from dataclasses import asdict
 from pathlib import Path
 
 import click
 
+import benchmarks.drawn  # noqa: F401 - makes them families of the suite
+from benchmarks.auto.curves import curves, read, write
+from benchmarks.auto.rates import count_rates, fit, gathered
+from benchmarks.auto.regret import Regret, regrets, summary, table
+from benchmarks.auto.replay import regret
+from benchmarks.output import folder_of, write_json
 from lavender.bench import machine
+from lavender.bench import seeds as from_seeds
 from lavender.bench.cases import resolve
-from lavender.bench.curves import curves, read, write
-from lavender.bench.rates import count_rates, fit, gathered
-from lavender.bench.regret import Regret, regrets, summary
-from lavender.bench.replay import regret
-from lavender.bench.running.campaign import seeds as from_seeds
 from lavender.errors import InputError
-from lavender.io.stored import write_text
 from lavender.problem import Problem
-from lavender.report.regret import table
 
-__all__ = ["auto"]
+__all__ = ["command"]
 
 
 @click.command("auto")
@@ -60,7 +59,7 @@ __all__ = ["auto"]
     multiple=True,
     help="Fit the rates of auto to recorded curves and print them, or write them to --out; several are read as one.",
 )
-def auto(
+def command(
     files: tuple[str, ...],
     families: str,
     seeds: str,
@@ -76,9 +75,8 @@ def auto(
 
     On FILES, or on families of the suite with seeds. Published seeds should be others than those tuned on.
     """
-    for path in (out, record):
-        if path is not None and not path.parent.is_dir():
-            raise InputError(f"{path}: there is no folder {path.parent}")
+    folder_of(out)
+    folder_of(record)
     if recorded:
         cases_of = gathered(read(recorded), lambda name: resolve([name])[0].problem)
         found_rates = fit(cases_of)
@@ -119,4 +117,4 @@ def auto(
         if found:
             click.echo(table(found, worst))
             if out is not None:
-                write_text(out, json.dumps([asdict(r) for r in found], indent=1) + "\n")
+                write_json(out, found)

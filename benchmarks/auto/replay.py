@@ -11,9 +11,9 @@ from collections.abc import Iterable, Mapping
 from types import SimpleNamespace
 from typing import Any
 
+from benchmarks.auto.curves import LEVELS, Curve
+from benchmarks.auto.regret import SHIFT
 from lavender import registry
-from lavender.bench.curves import LEVELS, Curve
-from lavender.bench.regret import SHIFT
 from lavender.solution import Claim, Status
 from lavender.solvers._methods import FIRST, Candidate, first_turn
 from lavender.solvers._plan import METHODS, Costs, candidates

@@ -1,0 +1,297 @@
+"""Two coefficients of a disk: an ellipse. Closed forms, a twin that never stretches anything, every solver, units."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from random_problems import as_matrix, random_contact_problem, seeds
+
+import lavender as lv
+from lavender import registry
+from lavender.certificates import check_certificate
+
+OURS = [n for n in lv.available() if registry.specs()[n].own and not registry.specs()[n].external]
+TAKES = [n for n in (*OURS, "clarabel_cone") if registry.specs()[n].laws & {"coulomb", "cone"}]
+LAWS = ("coulomb", "cone")
+
+
+def free(seed, contacts=3, friction="coulomb", mu=None):
+    """J and M of contacts alone, pressed on and dragged."""
+    rng = np.random.default_rng(seed)
+    m, nv = 3 * contacts, 3 * contacts + 3
+    mu = rng.uniform(0.1, 1.0, (contacts, 2)) if mu is None else mu
+    target = rng.normal(size=m)
+    target[::3] += 1.0
+    return lv.Problem.from_jacobian(
+        rng.normal(size=(m, nv)), np.eye(nv), rng.normal(size=nv), target=target, cones=lv.Cones.contacts(mu),
+        friction=friction,
+    )  # fmt: skip
+
+
+def on_rows(seed, friction="coulomb", **sizes):
+    """Bodies with joints and contacts, an ellipse each."""
+    base = random_contact_problem(seed, friction, tangents=2, spin=False, **sizes)
+    rng, c = np.random.default_rng(seed + 7), base.cones
+    contact = c.kind == lv.CONTACT
+    radius = np.where(contact, rng.uniform(0.2, 3.0, c.n_blocks), 0.0)
+    cones = replace(c, kind=np.where(contact, lv.CONTACT_ELLIPSE, c.kind), patch_radius=radius)
+    return replace(base, cones=cones, compliance=base.compliance + 0.3)
+
+
+FORMS = {"generalized": free, "matrix": lambda *a, **k: as_matrix(free(*a, **k)), "rows": on_rows}
+
+
+def takes(problem, name):
+    return registry.specs()[name].refuses(problem) is None
+
+
+# -- blocks ------------------------------------------------------------------------------------------------------------
+
+
+def test_coefficients_come_back_and_equal_ones_are_a_disk():
+    mu = np.array([[0.5, 0.2], [0.02, 0.8], [0.3, 0.3], [0.0, 0.0]])
+    cones = lv.Cones.contacts(mu)
+    assert cones.has_ellipse
+    assert not cones.is_polyhedral
+    np.testing.assert_allclose(cones.coefficients, mu, rtol=1e-15)
+    np.testing.assert_allclose(cones.reach.reshape(-1, 3)[:, 1:], mu, rtol=1e-15)
+    np.testing.assert_allclose(cones.stretch.reshape(-1, 3)[:2], [[1, 1, 0.4], [1, 0.025, 1]], rtol=1e-15)
+    assert lv.Cones.contacts([(0.5, 0.5), (0.0, 0.0)]) == lv.Cones.contacts([0.5, 0.0])
+    assert (lv.Cones.free(2) + cones).has_ellipse
+    assert lv.Problem.contact(np.eye(3), np.ones(3), [(0.5, 0.5)]).disk.cones.kind.tolist() == [lv.CONTACT]
+    x = np.array([1.0, 3.0, 4.0, 1.0, 0.0, 0.1, 1.0, 0.3, 0.0, -1.0, 1.0, 1.0])
+    t = lv.cones.project(cones, x).reshape(-1, 3)
+    np.testing.assert_allclose(np.hypot(*(t[0, 1:] / mu[0])), 1.0)
+    np.testing.assert_allclose(t[1:, 1:], [[0, 0.1], [0.3, 0.0], [0, 0]], atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: lv.Cones.contacts([(0.5, 0.0)]), r"contact 0 is \[0.5, 0.0\].*two numbers above 0"),
+        (lambda: lv.Cones.contacts([(0.5, 0.5), (1e-30, 0.5)]), "contact 1 is"),
+        (lambda: lv.Cones.contacts([(0.5, -0.2)]), "mu"),
+        (lambda: lv.Cones.contacts([(0.5, np.nan)]), "mu"),
+        (lambda: lv.Cones.contacts([(0.5, np.inf)]), "mu"),
+        (lambda: lv.Cones.contacts([(0.5, 0.1, 0.2)]), "one for each tangent"),
+        (lambda: lv.Cones.contacts([(0.5, 0.1)], 1), "bounds no spin"),
+        (lambda: lv.Cones.contacts([(0.5, 0.1)], patch_radius=0.1), "bounds no spin"),
+        (lambda: lv.Cones.contacts([(0.5, 0.1)], rolling=0.1), "no rolling"),
+        (lambda: lv.Problem.contact(np.eye(3), np.ones(3), [(0.5, 0.1)], 0.1), "bounds no spin"),
+        (lambda: lv.Cones([0, 2], [7], np.zeros(2), np.ones(2), [0.5], [1.0]), "ellipse of 2 rows"),
+        (lambda: lv.Cones([0, 3], [7], np.zeros(3), np.ones(3), [0.5], [0.0]), "mu_2 / mu_1 > 0"),
+        (lambda: lv.motions(free(0)), "problem.disk"),
+        (lambda: free(0).to_findex(), "bounds its tangents together"),
+        (lambda: free(0).save("x.hdf5"), "ellipses"),
+    ],
+)
+def test_what_is_no_ellipse_or_takes_none_is_told(make, words):
+    with pytest.raises(lv.LavenderError, match=words):
+        make()
+
+
+# -- closed forms ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("name", TAKES)
+def test_a_block_that_is_pushed_slips_on_the_ellipse(name, law):
+    # 2 kg under its weight for one second; a push along any direction holds while it is within the ellipse of N
+    mass, load, mu = 2.0, 19.62, np.array([0.5, 0.2])
+    for angle in np.linspace(0.1, 6.2, 7):
+        along = np.array([np.cos(angle), np.sin(angle)])
+        limit = load / np.hypot(*(along / mu))
+        for share in (0.99, 1.01):
+            push = share * limit * along
+            b = np.array([load, *-push]) / mass
+            problem = lv.Problem.contact(np.eye(3) / mass, b, [mu], friction=law)
+            if not takes(problem, name):
+                pytest.skip(registry.specs()[name].refuses(problem))
+            found = lv.solve(problem, name, tol=1e-9, max_iter=20_000)
+            assert found.success or found.residual.at_floor or name == "clarabel_cone", found
+            if share < 1.0:
+                np.testing.assert_allclose(found.impulse, [load, *-push], rtol=1e-5)
+                continue
+            x, w = found.impulse, found.slack
+            if law == "coulomb":
+                assert x[0] == pytest.approx(load, rel=1e-7)
+            size = np.hypot(*(mu * w[1:]))
+            assert size > 1e-3, "it slides"
+            most = -(mu**2) * w[1:] / size * x[0]  # what dissipates most
+            np.testing.assert_allclose(x[1:], most, atol=1e-4 * x[0])
+
+
+# -- the twin ----------------------------------------------------------------------------------------------------------
+
+
+def onto_ellipse(y, axes):
+    """The nearest point of |t / axes| <= 1, by bisection on its multiplier: x_i = y_i a_i^2 / (a_i^2 + s)."""
+    if np.hypot(*(y / axes)) <= 1.0:
+        return y
+    low, high = 0.0, np.abs(y).sum() * axes.max() * 4.0
+    for _ in range(200):
+        s = 0.5 * (low + high)
+        low, high = (s, high) if np.hypot(*(y * axes / (axes**2 + s))) > 1.0 else (low, s)
+    return y * axes**2 / (axes**2 + high)
+
+
+def off(problem, x):
+    """How far an impulse is from the conditions of its law, over its size; nothing is stretched."""
+    w, c, worst = problem.dense() @ x - problem.b, problem.cones, 0.0
+    size = np.abs(x).max() + 1e-300
+    speed = np.abs(problem.b).max()
+    for i in np.flatnonzero(c.kind == lv.CONTACT_ELLIPSE):
+        n, t = c.ptr[i], slice(c.ptr[i] + 1, c.ptr[i] + 3)
+        mu, step = c.coefficients[i], 1.0 / np.diag(problem.dense())[t].max()
+        worst = max(worst, -x[n] / size, np.hypot(*(x[t] / mu)) / size - x[n] / size)
+        lift = w[n] - (np.hypot(*(mu * w[t])) if problem.friction == "cone" else 0.0)  # w in the dual cone
+        worst = max(worst, -lift / speed, abs(x[n]) / size * abs(lift) / speed)
+        if x[n] > 1e-7 * size:
+            worst = max(worst, np.abs(x[t] - onto_ellipse(x[t] - step * w[t], mu * x[n])).max() / size)
+    rows = np.repeat(c.kind == lv.ROW, np.diff(c.ptr))
+    y = np.clip(x - w / np.diag(problem.dense()), c.lower, c.upper)
+    return max(worst, np.abs((x - y)[rows]).max(initial=0.0) / size)
+
+
+@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("name", TAKES)
+def test_what_a_solver_finds_meets_the_conditions_on_the_ellipse(name, law, form):
+    taken = 0
+    for seed in range(4):
+        problem = FORMS[form](seed, friction=law)
+        if not problem.cones.has_ellipse or not takes(problem, name):
+            continue
+        found = lv.solve(problem, name, tol=1e-9, max_iter=20_000)
+        assert not found.contradicted
+        if found.residual.relative < 1e-8:
+            taken += 1
+            assert off(problem, found.impulse) < 1e-5, (
+                seed,
+                found,
+            )  # e is a share of the error of doing nothing
+            moved = found.impulse * np.where(problem.cones.stretch < 1.0, 1.01, 1.0)
+            assert off(problem, moved) > 1e-5 or not np.any(moved != found.impulse)
+    if not any(takes(FORMS[form](s, friction=law), name) for s in range(4)):
+        pytest.skip("refused")
+    assert taken or name in ("jacobi", "clarabel_cone"), "solved none"
+
+
+@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("name", TAKES)
+def test_an_ellipse_with_equal_coefficients_has_the_bits_of_the_disk(name, law):
+    for form in (free, FORMS["matrix"]):
+        disk = form(5, friction=law, mu=np.full((3, 2), 0.4))
+        c = disk.cones
+        cones = replace(c, kind=np.full(3, lv.CONTACT_ELLIPSE), patch_radius=np.ones(3))
+        ellipse = replace(disk, cones=cones)
+        assert ellipse.cones.has_ellipse
+        assert not c.has_ellipse
+        if takes(disk, name):
+            one, two = (lv.solve(p, name, tol=0.0, max_iter=30) for p in (disk, ellipse))
+            assert one.impulse.tobytes() == two.impulse.tobytes()
+            assert one.slack.tobytes() == two.slack.tobytes()
+            assert one.residual.relative == two.residual.relative
+
+
+# -- the judge ---------------------------------------------------------------------------------------------------------
+
+
+@given(seed=seeds)
+@settings(max_examples=30)
+def test_units_and_the_order_of_tangents_do_not_matter(seed):
+    rng = np.random.default_rng(seed)
+    p = as_matrix(free(seed, friction=LAWS[seed % 2]))
+    x = lv.cones.project(p.cones, rng.normal(size=p.m) + 1.0)
+    r = lv.residual(p, x)
+    mass, speed = 4.0 ** rng.integers(-10, 10), 2.0 ** rng.integers(-20, 20)
+    other = lv.Problem(speed * p.b, p.cones, p.dense() / mass, friction=p.friction)
+    scaled = lv.residual(other, mass * speed * x)
+    assert scaled.relative == r.relative  # powers of two, whose roots are, too: to the bit
+    assert scaled.velocity == speed * r.velocity
+    swap = np.arange(p.m).reshape(-1, 3)[:, [0, 2, 1]].ravel()
+    turned = lv.Problem.contact(
+        p.dense()[swap][:, swap], p.b[swap], p.cones.coefficients[:, ::-1], friction=p.friction
+    )
+    assert lv.residual(turned, x[swap]).relative == pytest.approx(r.relative, rel=1e-12)
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_what_comes_back_is_in_the_rows_of_the_problem(form):
+    problem = FORMS[form](3, friction="cone")
+    s, calls = problem.cones.stretch, []
+    found = lv.solve(
+        problem, "anderson", tol=1e-6, max_iter=5, callback=lambda n, x, r: calls.append((x, r)) and None
+    )
+    r = lv.residual(problem, found.impulse)
+    np.testing.assert_allclose(
+        found.slack, problem.dense() @ found.impulse - problem.b, rtol=1e-9, atol=1e-12
+    )
+    np.testing.assert_allclose(found.residual.error, r.error, rtol=1e-9, atol=1e-12)
+    assert found.residual.relative == pytest.approx(r.relative, rel=1e-9)
+    for x, at in calls:
+        np.testing.assert_allclose(at.slack, problem.dense() @ x - problem.b, rtol=1e-9, atol=1e-12)
+    pairs = [int(i) for i in problem.cones.ptr[:-1][problem.cones.kind == lv.CONTACT_ELLIPSE]]
+    rows = r.velocity_by_row.copy()
+    for n in pairs:
+        rows[n + 1] = np.hypot(rows[n + 1], rows[n + 2])
+    assert rows.max() == pytest.approx(r.velocity, rel=1e-12)
+    p = problem.disk
+    assert not p.cones.has_ellipse
+    assert p.disk is p
+    assert lv.residual(p, problem.on_disk(found.impulse)).relative == pytest.approx(r.relative, rel=1e-12)
+    np.testing.assert_allclose(p.dense(), s[:, None] * problem.dense() * s, rtol=1e-12)
+    assert problem.row_name(r.worst_row) == r.worst_name == p.row_name(r.worst_row)
+
+
+def test_angular_rows_of_joints_are_weighed_as_beside_disks():
+    problem = on_rows(2)
+    joints = problem.cones.ptr[problem.rows.n_joints]
+    assert joints > 0
+    np.testing.assert_array_equal(problem.disk.metric.nu[:joints], problem.metric.nu[:joints])
+
+
+@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("law", LAWS)
+def test_every_door_gives_the_same(form, law, tmp_path):
+    problem = FORMS[form](1, friction=law)
+    found = lv.solve(problem, tol=1e-9)
+    assert found.success
+    assert lv.solve_many([problem, problem], tol=1e-9)[1].impulse.tobytes() == found.impulse.tobytes()
+    prepared = lv.prepare(problem, "newton")
+    first = prepared.solve(tol=1e-9).impulse
+    again = prepared.solve(replace(problem, name="again"), impulse=first, tol=1e-8)
+    assert again.success
+    np.testing.assert_allclose(again.impulse, first, rtol=1e-6, atol=1e-9)
+    assert lv.solve(problem, "newton", impulse=found.impulse, tol=1e-8, max_iter=1).success
+    path = tmp_path / "ellipse.npz"
+    problem.save(path)
+    back = lv.load(path)
+    assert back == problem
+    assert lv.residual(back, found.impulse).relative == lv.residual(problem, found.impulse).relative
+    best = lv.solve(problem, tol=1e-12)
+    assert best.motion_error(best).rows == 0.0
+    error = lv.motion_error(problem, 1.1 * found.impulse)
+    assert error.rows > 1e-3
+    near = lv.motion_error(problem, found.impulse)
+    assert near.rows < 1e-6
+    if law == "cone":
+        assert near.bound < 1e-6 * error.bound
+        assert lv.cross_check(problem, ["newton", "admm", "anderson"]).ok
+    np.testing.assert_array_equal(problem.carry(found), found.impulse)
+    single = np.float32(found.impulse)
+    assert lv.residual(problem, single, "float32").verdict == "at its floor"
+    assert lv.residual(problem, 1.001 * single, "float32").verdict == "stopped early"
+    assert str(lv.explain(problem))
+
+
+def test_a_certificate_comes_in_the_rows_of_the_problem():
+    # pressed along the rim of the dual cone with nothing to resist it: A is zero
+    mu = np.array([0.5, 0.2])
+    problem = lv.Problem.contact(np.zeros((3, 3)), [0.0, 0.3, 0.5], [mu], friction="cone")
+    y = np.array([1.0, 0.0, 0.1])
+    assert check_certificate(problem, y) is None
+    assert "leaves" in check_certificate(problem, np.array([1.0, 0.0, 0.3]))
+    found = lv.solve(problem)
+    assert found.status is not lv.Status.INFEASIBLE or check_certificate(problem, found.certificate) is None
