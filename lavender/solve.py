@@ -243,7 +243,7 @@ class Prepared:
             lam = problem.start() if problem.guess is None else problem.guess.copy()
         if time_limit is not None and hasattr(self._solver, "ready"):
             start = perf_counter()
-            self._solver.ready(self._state)
+            self._solver.ready(self._state, time_limit)
             self.setup_time += perf_counter() - start
         setup_time, self.setup_time = self.setup_time, 0.0
         proof = decide_empty_rows(problem, lam)

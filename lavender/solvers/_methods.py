@@ -12,6 +12,7 @@ import numpy as np
 
 from lavender._arrays import FloatArray
 from lavender.deadline import Stopwatch
+from lavender.problem import Problem
 from lavender.registry import SolverSpec, get
 from lavender.residuals import remember
 from lavender.solution import Claim, Status
@@ -159,8 +160,13 @@ class Sweeps(Resumed):
         problem = self.costs.problem
         split = 0 if problem.rows is None else problem.rows.n_joints
         self.state = Looks(problem.metric, operator(problem), problem.law == "cone", split)
-        self.least = min(map(self.costs.floor, TABLE[problem.operator][problem.law]))
         self.count()
+
+    def run_first(self, log: SolveLog) -> None:
+        """For as long as others take at least; where none of them would end in time by that, for all of it."""
+        self.log = log
+        if not self.run(ALL if log.ends_late(SURE * self.least) else self.least, np.inf):
+            self.rest = np.inf
 
     def begin(self) -> None:
         log = self.log
@@ -331,17 +337,16 @@ KINDS: dict[str, type[Candidate]] = {
 }  # fmt: skip
 
 
-def in_short_time(log: SolveLog, sweeps: Sweeps) -> list[Candidate]:
-    """Sweeps that have had a turn, where others may end late: for as long as one of these takes at least.
-
-    Where not one of them would end in time by the least that it takes, sweeps have all of it.
-    """
-    if not log.ends_late(SURE * SURE * sweeps.least):
-        return []
-    sweeps.log = log
-    if not sweeps.run(ALL if log.ends_late(SURE * sweeps.least) else sweeps.least, np.inf):
-        sweeps.rest = np.inf
-    return [sweeps]
+def in_short_time(problem: Problem, limit: float) -> Sweeps | None:
+    """Sweeps that are set up, where others may not end within the limit [ns]: by the least that these take."""
+    costs = Costs(problem)
+    least = min(map(costs.floor, TABLE[problem.operator][problem.law]))
+    if limit > SURE * SURE * least:
+        return None
+    sweeps = Sweeps("anderson", None, costs, get("anderson"))
+    sweeps.least = least
+    sweeps.set_up()
+    return sweeps
 
 
 def make(

@@ -37,8 +37,7 @@ METHODS: dict[str, tuple[str, dict[str, Any]]] = {
     # Of Coulomb's law: its answer is the law's own wherever contacts stick.
     "relaxation": ("anderson", {}),
 }
-# Where contacts roll: Newton's method sees each round of these as a problem of its own.
-ROLLING = ("anderson", "nncg", "newton", "admm")
+ROLLING = ("anderson", "nncg", "newton")  # where contacts resist rolling, however given
 _GIVEN = {
     "linear": ("direct", "anderson", "newton"),
     "lcp": ("anderson", "direct", "newton", "nncg"),

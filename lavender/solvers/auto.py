@@ -19,7 +19,7 @@ import numpy as np
 from lavender._arrays import FloatArray
 from lavender.deadline import Deadline
 from lavender.problem import OPERATORS, Problem
-from lavender.registry import SolverSpec, get
+from lavender.registry import SolverSpec
 from lavender.solution import Claim, Status
 from lavender.solvers._certify import certify
 from lavender.solvers._few import AUTO, call_ends_within
@@ -66,11 +66,10 @@ class Auto:
     def update(self, state: State, problem: Problem) -> State:
         return self.prepare(problem)
 
-    def ready(self, state: State) -> None:
-        """Before the clock of a time limit starts: what sweeps need, which are there when it ends."""
-        if state.problem.m and not state.problem.cones.has_round:
-            state.sweeps = Sweeps("anderson", None, Costs(state.problem), get("anderson"))
-            state.sweeps.set_up()
+    def ready(self, state: State, time_limit: float) -> None:
+        """Before the clock of a limit [s] starts in which others may not end: set up sweeps, which then come first."""
+        if state.problem.m and self.plan is None and not state.problem.cones.has_round:
+            state.sweeps = in_short_time(state.problem, 1e9 * time_limit)
 
     def run(
         self, state: State, impulse: FloatArray, n: int, tol: float, time_limit: float | None = None
@@ -112,8 +111,9 @@ class Auto:
 def solve(log: SolveLog, plan: Plan | None = None, sweeps: Sweeps | None = None) -> None:
     """To the end, by a plan where one is given; `sweeps`: what is set up for a time limit."""
     begun: list[Candidate] = []
-    if sweeps is not None and plan is None:
-        begun = in_short_time(log, sweeps)
+    if sweeps is not None:
+        begun = [sweeps]
+        sweeps.run_first(log)
         if log.late or log.done():
             return
     with np.errstate(all="ignore"):  # what overflows is judged
