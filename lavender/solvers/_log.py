@@ -10,7 +10,7 @@ from lavender._arrays import FloatArray, IntArray
 from lavender.certificates import check_certificate
 from lavender.deadline import Deadline
 from lavender.problem import Problem
-from lavender.residuals import at_floor, known, quick, reference
+from lavender.residuals import at_floor, judged, known, quick, reference, remember
 from lavender.solution import Claim, Status, Turn
 from lavender.solvers._few import said
 from lavender.solvers._islands import islands
@@ -37,11 +37,16 @@ class SolveLog:
         self._w, self._e = np.empty(problem.m), np.empty(problem.m)
 
     def offer(self, impulse: FloatArray) -> float:
-        """Judge an impulse (m,) and keep it if it is the best."""
-        found = known(self.problem, impulse)
-        relative = quick(self.problem, impulse, self._w, self._e)[0] if found is None else found
+        """Judge an impulse (m,) and keep it if it is the best, for who judges the result as well."""
+        relative = known(self.problem, impulse)
+        impulse = impulse.copy()
+        if relative is None:
+            last = judged(self.problem, impulse)
+            relative = float(last.relative)
+            if relative < self.best:
+                remember(self.problem, last)
         if relative < self.best:
-            self.best, self.impulse = relative, impulse.copy()
+            self.best, self.impulse = relative, impulse
         return relative
 
     def note(self, name: str, claim: Claim, before: float) -> None:

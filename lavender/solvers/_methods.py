@@ -117,8 +117,8 @@ class Resumed(Candidate):
         done, work, last = 0, dict[str, int](), Claim(Status.MAX_ITERATIONS, 0)
         step = max(1, int(1e9 * CLOCK / self.cost.each))
         left = log.deadline.left()
-        if left is not None:  # half of it, since what an iteration takes in truth is not known yet
-            step = max(1, min(step, int(0.5e9 * left / self.cost.each)))
+        if left is not None:
+            step = max(1, min(step, int(1e9 * left / self.cost.each)))
         while done < n and not (done and log.late):
             watch = Stopwatch()
             step = min(step, n - done)
@@ -163,9 +163,10 @@ class Sweeps(Resumed):
         self.count()
 
     def run_first(self, log: SolveLog) -> None:
-        """For as long as others take at least; where none of them would end in time by that, for all of it."""
+        """Half of the time, and all of it where the other half is too short for any other."""
         self.log = log
-        if not self.run(ALL if log.ends_late(SURE * self.least) else self.least, np.inf):
+        half = 0.5e9 * (log.deadline.left() or 0.0)
+        if not self.run(self.cost.setup + half if half > SURE * self.least else ALL, np.inf):
             self.rest = np.inf
 
     def begin(self) -> None:

@@ -42,7 +42,7 @@ _GIVEN = {
     "linear": ("direct", "anderson", "newton"),
     "lcp": ("anderson", "direct", "newton", "nncg"),
     "cone": ("anderson", "newton"),
-    "coulomb": ("anderson", "newton", "admm"),
+    "coulomb": ("anderson", "newton", "admm", "nncg"),
 }
 #: At most four for each law and operator; "round": cones of more than two tangents.
 TABLE: dict[str, dict[str, tuple[str, ...]]] = {
@@ -53,7 +53,7 @@ TABLE: dict[str, dict[str, tuple[str, ...]]] = {
         "linear": ("newton", "direct", "anderson", "newton over rows"),
         "lcp": ("newton", "anderson", "direct"),
         "cone": ("newton", "anderson", "newton over rows"),
-        "coulomb": ("newton", "anderson", "nncg", "newton over rows"),
+        "coulomb": ("newton", "anderson", "admm", "newton over rows"),
         "round": ("newton", "nncg", "admm"),
     },
 }
