@@ -250,7 +250,7 @@ def test_what_an_engine_raises_is_told_and_its_process_stays():
         for _ in range(2):
             found = apart.track(dataclasses.replace(OTHERS[0], name="nobody's"), scene, 1.0, 0.1)
             assert found == 'it failed: KeyError: "nobody\'s"'
-            assert apart._process.alive
+            assert apart.alive
     finally:
         apart.end()
 
@@ -347,9 +347,12 @@ def test_a_program_is_asked_by_lines_and_its_end_is_told():
             lines.ask(7)
     finally:
         lines.end()
-    lines = Lines([sys.executable, "-c", "import time; time.sleep(60)"])
+    sleeper = "import os, time; input(); print(os.getpid(), flush=True); time.sleep(60)"
+    lines = Lines([sys.executable, "-c", sleeper])
+    pid = lines.ask({})
     lines.end()
-    assert lines._process.returncode is not None
+    with pytest.raises(ProcessLookupError):
+        os.kill(pid, 0)
 
 
 def test_a_stepper_that_does_not_take_a_scene_is_a_note_and_the_others_go_on():

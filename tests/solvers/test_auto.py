@@ -183,19 +183,6 @@ def test_every_random_lcp_is_solved(seed):
         assert good(solution, 1e-10), solution
 
 
-@given(seed=seeds)
-@settings(max_examples=25)
-def test_every_random_compliant_problem_is_solved(seed):
-    for friction in ("coulomb", "cone"):
-        base = random_contact_problem(seed, friction=friction, bodies=5, contacts=8)
-        problem = lv.Problem(
-            base.b, base.cones, rows=base.rows, compliance=base.compliance + 0.1, friction=friction
-        )
-        for given_as in (problem, as_matrix(problem)):
-            solution = lv.solve(given_as, "auto", tol=1e-9)
-            assert good(solution, 1e-9), solution
-
-
 def test_what_gave_up_at_once_is_not_called_solved():
     cones = lv.Cones.contacts([0.0], 2)
     jac = np.sqrt(np.arange(1.0, 7.0)).reshape(3, 2)
@@ -247,14 +234,11 @@ def test_what_has_no_solution_gets_a_certificate():
         assert not solution.contradicted
 
 
-def test_budget_clock_and_warm_start():
+def test_budget_and_warm_start():
     problem = suite.pyramid(k=6, friction="coulomb", sliding=0.5).problem
     none = lv.solve(problem, "auto", tol=1e-9, max_iter=0)
     assert none.status is lv.Status.MAX_ITERATIONS
     assert np.array_equal(none.impulse, problem.start())
-    short = lv.solve(problem, "auto", tol=0.0, time_limit=0.1)
-    assert short.status in (lv.Status.TIME_LIMIT, lv.Status.FLOOR, lv.Status.STALLED)
-    assert short.solve_time < 0.1 * 1.1 + 0.15  # 10 % and 50 ms, and a busy machine
     full = lv.solve(problem, "auto", tol=1e-8)
     assert full.success, full
     again = lv.solve(problem, "auto", tol=1e-7, impulse=full.impulse)

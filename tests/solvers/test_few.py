@@ -2,7 +2,6 @@
 
 import pickle
 import re
-import threading
 from dataclasses import fields, replace
 
 import numpy as np
@@ -187,39 +186,6 @@ def test_a_late_solution_is_a_solution():
     with pytest.raises(AttributeError, match="no attribute 'nothing'"):
         _ = lv.solve(problem).nothing
     assert repr(lv.solve(problem)).startswith("<Solution auto: CONVERGED")
-
-
-def test_threads_share_a_problem_of_few_rows():
-    problem = draw("general coulomb", 5)
-    expected = facts(long_way(problem, "auto"))
-    found, failed = [], []
-
-    def work():
-        try:
-            for _ in range(200):
-                found.append(facts(lv.solve(problem)))
-        except Exception as error:
-            failed.append(error)
-
-    team = [threading.Thread(target=work) for _ in range(4)]
-    for t in team:
-        t.start()
-    for t in team:
-        t.join()
-    assert not failed and len(found) == 800
-    assert all(f == expected for f in found)
-
-
-def test_what_is_refused_is_refused_the_same_way():
-    problem = draw("matrix coulomb", 1)
-    with pytest.raises(lv.errors.CapabilityError, match="takes laws"):
-        lv.solve(lv.Problem.contact(np.eye(3), np.ones(3), 0.5), "direct")
-    with pytest.raises(lv.errors.InputError, match="impulse"):
-        lv.solve(problem, impulse=np.zeros(problem.m + 1))
-    with pytest.raises(lv.errors.InputError, match="tol"):
-        lv.solve(problem, tol=float("nan"))
-    with pytest.raises(lv.errors.InputError, match=r"lavender\.Problem is needed"):
-        lv.solve(3)
 
 
 def test_round_cones_are_never_solved_over_rows_of_a():
