@@ -621,8 +621,6 @@ def suite_page(site):
 
 def part_pages(site):
     """Tables that hand-written pages include."""
-    rows = [(f"`{s.name}`", s.value) for s in lv.Status]
-    site.write("parts/statuses.md", table(("status", "claim"), rows))
     text = inspect.getdoc(sys.modules["lavender.ordering"])
     assert all(order in text for order in ORDERS)
     site.write("parts/orders.md", docstrings.markdown(text.partition("\n")[2]))

@@ -96,19 +96,15 @@ def _timed(
 
 
 def _backend(backend: Backend, form: str) -> Contestant:
-    from lavender.external.generic import through_qpsolvers
-
-    call = functools.partial(through_qpsolvers, backend) if backend.call is None else backend.call
-
     def runs(problem: Problem, limit: float) -> Iterator[Call]:
-        qp = QPSolver(backend, form=form).prepare(problem).qp
+        qp = QPSolver(backend, form=form).prepare(problem)
         if form == "velocity" and backend.definite and not qp.is_definite:
             return
         start = problem.start()
 
         def once(eps: float) -> tuple[float, FloatArray]:
             def solve() -> tuple[FloatArray | None, FloatArray | None]:
-                answer = call(qp, start, _limits(eps, backend.max_iter, limit), {})
+                answer = backend.run(qp, start, _limits(eps, backend.max_iter, limit), {})
                 return answer.x, answer.zeta
 
             return _timed(qp, solve)
