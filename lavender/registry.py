@@ -176,13 +176,12 @@ class SolverSpec:
         """None when the solver takes this problem, else the reason."""
         asked, problem = problem, problem.disk
         law = problem.law
-        apart = law in self.boxes and problem.cones.is_polyhedral
         if law in self.laws and law not in ("linear", "lcp", *self.boxes) and problem.cones.has_box:
             return (
                 "takes no boxes, contacts that bound each tangent by itself: use one of those that do, "
                 "lavender.available(problem) lists them, or give the problem cones.shaped('disk')"
             )
-        if law not in self.laws and not apart:
+        if law not in self.laws and not (law in self.boxes and problem.cones.is_polyhedral):
             takes = ", ".join(law for law in LAWS if law in self.laws)
             way = _way_round(law, self.laws)
             if law == "coulomb" and "cone" in self.boxes and problem.cones.is_polyhedral:

@@ -200,9 +200,16 @@ class Prepared:
                 "make another one for every thread (lavender.prepare)"
             )
         try:
+            plain = max_iter is None and time_limit is None and callback is None
             tol, max_iter, time_limit = _check_budget(self.spec, tol, max_iter, time_limit)
             _check_records(self.spec, history, callback)
             self._refresh(problem)
+            if plain and self.spec.delegates and self.spec.few is not None and not (self.options or history):
+                made = solve_few(
+                    self._given, self.spec, impulse, tol
+                )  # nothing was prepared that it would need
+                if made is not None:
+                    return made
             loop = self._loop(impulse, tol, time_limit, history, callback)
             return self._run(loop, max_iter)
         finally:
@@ -219,7 +226,9 @@ class Prepared:
         else:
             lam = problem.start() if problem.guess is None else problem.guess.copy()
         if time_limit is not None and hasattr(self._solver, "ready"):
-            self._solver.ready()
+            start = perf_counter()
+            self._solver.ready(self._state, time_limit)
+            self.setup_time += perf_counter() - start
         records: list[Record] | None = [] if history else None
         return _Loop(
             problem=problem, solver=self._solver, state=self._state, impulse=lam, tol=tol, time_limit=time_limit,
