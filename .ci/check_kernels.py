@@ -48,7 +48,7 @@ CYTHONS_OWN = "ISO C forbids conversion of function pointer to object pointer ty
 
 #: Modules of these names are exempt from the check of what a core reaches, with the reason. `threaded` yields and
 #: sleeps by the system's calls; `chain` and `looks` call the Python faces of kernels one after the other, `many` the
-#: kernels themselves, and allocates what they need, `islands` copies parts of a problem for them besides; `gate` and
+#: kernels themselves, and allocates what they need; `gate` and
 #: `blocks` look at arrays of Python, `elements` and `solve` are the driver's newton for Python. The arithmetic of all
 #: is that of other modules, which this check sees, but for the logarithms by which `looks` guesses about sweeps.
 EXEMPT = {
@@ -58,7 +58,6 @@ EXEMPT = {
     "gate": "reads arrays of Python, computes nothing",
     "blocks": "reads and fills arrays of Python, computes nothing",
     "many": "allocates and calls kernels, computes nothing",
-    "islands": "copies, allocates and calls kernels",
     "elements": "reads arrays of Python; its arithmetic is in the driver's core",
     "solve": "calls the turns that the driver calls, in arrays of Python",
 }

@@ -14,6 +14,7 @@ NAMES = (
     "auto",
     "branches",
     "engine",
+    "film",
     "float32",
     "gallery",
     "islands",
@@ -22,9 +23,11 @@ NAMES = (
     "motions",
     "newton",
     "page",
+    "peers",
     "shapes",
     "stability",
     "stand",
+    "steppers",
     "wasm",
 )
 

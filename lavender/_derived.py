@@ -24,13 +24,12 @@ class Derived:
     __slots__ = (
         "chain",
         "factor",
-        "first",
         "judged",
         "lock",
         "motion",
         "nothing",
-        "seen",
         "spread",
+        "vain",
         "view",
     )
 
@@ -40,10 +39,9 @@ class Derived:
         self.judged: Judged | None = None  # the judge's pass over a result that is about to be returned
         self.view: Data | None = None  # in generalised coordinates: what kernels read, from the beginning
         self.spread: int | None = None  # how far apart blocks that share a body stand
-        self.seen = False  # whether `solve` has had it, once: repeated ones are spared more
         self.chain: Any = None  # of a problem of few rows, False where it has none
         self.factor: Any = None  # the factorisation that suits A: its name, half bandwidth, order
-        self.first: bool | None = None  # in generalised coordinates: newton over velocities before all else
+        self.vain: tuple[str, float, bytes] | None = None  # whose one compiled call did not end, from where
         self.motion: Kept | None = None  # the reference that motion errors are told from, and its operator
 
 

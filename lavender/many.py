@@ -19,7 +19,6 @@ from lavender.problem import Problem
 from lavender.registry import SolverSpec, get
 from lavender.solution import Solution
 from lavender.solve import of_batch, solve, solve_few
-from lavender.solvers._few import ANY, GATE
 from lavender.solvers._newton import general
 from lavender_ext.few.many import Batch
 
@@ -119,7 +118,8 @@ def _batch(
         p, start = problems[i], starts[i]
         views.append(p.derived.view)
         given.append(p.guess if start is None else p.impulse_array(start))
-    work = Batch(views, given, tol, GATE if spec.name == "auto" else ANY, general.ROOM)
+    assert spec.few is not None
+    work = Batch(views, given, tol, spec.few.gate, general.ROOM)
     work.run()
     seconds = (perf_counter() - begin) / max(1, len(at))
     work.hand_out(Solution, of_batch, (work, [problems[i] for i in at], spec, tol, seconds, given), at, made)

@@ -39,6 +39,10 @@ TABLES = ("lavender.solvers", "lavender.external")
 class Few(Protocol):
     """Solves a problem of few rows to tol with the bits of `run`, or leaves it to `run`."""
 
+    @property
+    def gate(self) -> Any:
+        """What it may cost over generalised velocities."""
+
     def solve(self, problem: Problem, impulse: FloatArray | None, tol: float) -> Any:
         """(what the judge finds, counts) from an impulse (m,) or from doing nothing; None where it is left."""
 

@@ -1,5 +1,8 @@
 """Small random problems for property tests: rows with joints and contacts of every kind, and plain matrices."""
 
+from dataclasses import replace
+from functools import partial
+
 import hypothesis.strategies as st
 import numpy as np
 import scipy.sparse as sp
@@ -97,6 +100,35 @@ def as_matrix(problem):
         guess=problem.guess,
         name=problem.name,
     )
+
+
+def general(problem):
+    """The same problem by J and M."""
+    minv, free = problem.rows.inverse_mass_matrix().toarray(), problem.rows.v_free.ravel()
+    return lv.Problem.from_jacobian(
+        problem.jacobian, np.linalg.inv(minv), free, target=problem.b + problem.jacobian @ free,
+        cones=problem.cones, compliance=problem.compliance, friction=problem.friction,
+    )  # fmt: skip
+
+
+def random_boxes(seed, friction="coulomb", **sizes):
+    """Joints and contacts that bound each tangent by itself, two coefficients on most."""
+    base = random_contact_problem(seed, friction, tangents=2, spin=False, **sizes)
+    c, rng = base.cones.shaped("box"), np.random.default_rng(seed + 7)
+    radius = np.where(c.kind == lv.CONTACT_BOX, rng.uniform(0.2, 3.0, c.n_blocks), 0.0)
+    return replace(base, cones=replace(c, patch_radius=radius))
+
+
+#: Every way to give a problem, made of one given by rows.
+FORMS = {"rows": lambda problem: problem, "matrix": as_matrix, "J and M": general}
+#: Every kind of contact that rows may have: (seed, friction, sizes) to a problem of rows.
+CONTACTS = {
+    "disks": partial(random_contact_problem, tangents=2, spin=False),
+    "spin": random_contact_problem,
+    "rolling": partial(random_contact_problem, spin=False, rolling=True),
+    "rolling and spin": partial(random_contact_problem, rolling=True),
+    "boxes": random_boxes,
+}
 
 
 def random_lcp(seed, m=12, rank=None, boxed=True):

@@ -51,10 +51,10 @@ def self_test() -> dict[str, str]:
         made[f"{name}, {law}"] = solve(_contacts(law), name, tol=0.0, max_iter=12).impulse
     for name in ("sequential_impulses", "anderson"):
         made[f"{name}, bodies"] = solve(_bodies(), name, tol=0.0, max_iter=12).impulse
-    made["stack, 60 steps"] = _steps("stack", 60)
+    made["stack, 60 steps"] = steps_of("stack", 60)
     # starts of scenes, too; NumPy draws the turns of a pile, which may pass through the mathematical library
     own = [name for name, build in SCENES.items() if build.__module__ == "lavender.scene.gallery"]
-    made["gallery, 5 steps"] = np.concatenate([_steps(name, 5) for name in sorted(own) if name != "pile"])
+    made["gallery, 5 steps"] = np.concatenate([steps_of(name, 5) for name in sorted(own) if name != "pile"])
     return {
         name: hashlib.sha256(np.ascontiguousarray(x).tobytes()).hexdigest()[:16] for name, x in made.items()
     }
@@ -96,7 +96,7 @@ def version_of(solver: str) -> str:
     return ", ".join(f"{name} {v}" for name, v in found.items()) or "installed"
 
 
-def _steps(scene: str, n: int) -> Any:
+def steps_of(scene: str, n: int) -> Any:
     simulation = Simulation(scene)
     for _ in range(n):
         positions = simulation.step()[0]["positions"]

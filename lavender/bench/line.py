@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from lavender import registry
 from lavender.bench.record import Record, level_name
 
-__all__ = ["C_METHODS", "c_of", "code_of", "needs_more"]
+if TYPE_CHECKING:
+    from lavender.bench.running.timing import Task
+
+__all__ = ["C_METHODS", "asked_of", "c_of", "code_of", "needs_more"]
 
 #: Solvers that the C library has (`lavender export c`), by its numbers.
 C_METHODS = {
@@ -24,7 +27,7 @@ C_WORDS = {
 CARRIED = (
     "before, impulse = problems[0], None",
     "for problem in problems:",
-    "    start = None if impulse is None else lv.bench.carry(before, impulse, problem)",
+    "    start = problem.start() if impulse is None else lv.bench.carry(before, impulse, problem)",
 )
 
 
@@ -34,15 +37,36 @@ def needs_more(solver: str, iterations: int) -> bool:
     return spec is not None and iterations > spec.max_iter
 
 
+def asked_of(what: Task | Record, iterations: int) -> dict[str, Any]:
+    """What the line of a measurement passes to `lv.solve` beside problem, name and start: timed, and printed.
+
+    Parameters
+    ----------
+    what : Task or Record
+    iterations : that a solve took
+    """
+    asked: dict[str, Any] = {"tol": what.tol}
+    given = what.turns and what.max_iter  # in turns with others: what all of the cases need
+    if what.mode == "budget" or given or needs_more(what.solver, iterations):
+        asked["max_iter"] = what.max_iter
+    if what.mode == "time":
+        asked["time_limit"] = what.time_limit
+    return asked
+
+
+def _exact(x: float, short: str) -> str:
+    """A number's short form where that is the number, else all of its digits."""
+    return short if float(short) == x else repr(x)
+
+
 def code_of(record: Record) -> tuple[str, ...]:
     """The lines that a record is of."""
-    asked: dict[str, Any] = {"tol": level_name(record.tol) if record.tol else "0"}
-    given = record.turns and record.max_iter  # in turns with others: what all of the cases need
-    if record.mode == "budget" or given or needs_more(record.solver, record.iterations):
-        asked["max_iter"] = record.max_iter
-    if record.mode == "time":
-        asked["time_limit"] = level_name(record.time_limit)
-    words = ", ".join(f"{name}={value}" for name, value in asked.items())
+    asked = asked_of(record, record.iterations)
+    text = {
+        name: str(x) if name == "max_iter" else _exact(x, level_name(x) if x else "0")
+        for name, x in asked.items()
+    }
+    words = ", ".join(f"{name}={value}" for name, value in text.items())
     if record.way == "batch":
         return (f'solutions = lv.solve_many(problems, "{record.solver}", {words})',)
     if record.start != "carried":
@@ -70,9 +94,10 @@ def c_of(record: Record) -> tuple[str, ...]:
             return ()
     if record.seed and record.order == "random":
         out.append(f"options.seed = {record.seed}")
+    asked = asked_of(record, record.iterations)
     out.append("lav_default_budget(&budget)")
-    out.append(f"budget.tol = {record.tol:g}")
-    out.append(f"budget.iterations = {record.max_iter or registry.specs()[record.solver].max_iter}")
-    if record.mode == "time":
-        out.append(f"budget.seconds = {record.time_limit:g}")
+    out.append(f"budget.tol = {_exact(record.tol, f'{record.tol:g}')}")
+    out.append(f"budget.iterations = {asked.get('max_iter') or registry.specs()[record.solver].max_iter}")
+    if "time_limit" in asked:
+        out.append(f"budget.seconds = {_exact(record.time_limit, f'{record.time_limit:g}')}")
     return tuple(out)

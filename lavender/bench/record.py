@@ -10,6 +10,7 @@ from dataclasses import dataclass, field, fields
 from typing import Any
 
 __all__ = [
+    "KINDS",
     "CaseInfo",
     "Done",
     "Entry",
@@ -243,12 +244,12 @@ def measurement_key(what: Any) -> tuple[Any, ...]:
 
 
 Entry = Run | CaseInfo | Skip | Done | Record
-_KINDS: dict[str, type] = {"run": Run, "case": CaseInfo, "skip": Skip, "done": Done, "record": Record}
+KINDS: dict[str, type] = {"run": Run, "case": CaseInfo, "skip": Skip, "done": Done, "record": Record}
 
 
 def to_json(entry: Entry) -> dict[str, Any]:
     """A dictionary that JSON can hold: inf and nan become words."""
-    kind = next(name for name, cls in _KINDS.items() if isinstance(entry, cls))
+    kind = next(name for name, cls in KINDS.items() if isinstance(entry, cls))
     return {"kind": kind, **{f.name: _plain(getattr(entry, f.name)) for f in fields(entry)}}
 
 
@@ -260,9 +261,9 @@ def from_json(line: Any) -> Entry:
     ValueError
         Not an entry of a records file: a field that is missing, of another type or out of its range.
     """
-    if not isinstance(line, Mapping) or not isinstance(line.get("kind"), str) or line["kind"] not in _KINDS:
+    if not isinstance(line, Mapping) or not isinstance(line.get("kind"), str) or line["kind"] not in KINDS:
         raise ValueError("not an entry of a records file")
-    cls = _KINDS[line["kind"]]
+    cls = KINDS[line["kind"]]
     values = {}
     for f in fields(cls):
         if f.name not in line:

@@ -13,9 +13,9 @@ from lavender.cli.measuring import measure
 from lavender.cli.options import (
     EXIT_INTERRUPTED,
     EXIT_UNMET,
+    Asked,
     ManyValues,
     console,
-    make_plan,
     one_thread,
     plan_options,
     refuse_idle,
@@ -26,11 +26,10 @@ __all__ = ["bench"]
 
 
 class Suites(ManyValues):
-    """`lavender bench mujoco` and `peers` are commands; other first words are files (or ./peers)."""
+    """`lavender bench mujoco` is a command; other first words are files (or ./mujoco)."""
 
     OWN = {  # noqa: RUF012 - a constant of the class
         "mujoco": "lavender.cli.bench_mujoco:mujoco",
-        "peers": "lavender.cli.bench_peers:peers",
     }
 
     def make_context(
@@ -59,26 +58,15 @@ class Suites(ManyValues):
 def bench(
     context: click.Context,
     files: tuple[str, ...],
-    solvers: tuple[str, ...] | None,
-    levels: tuple[float, ...],
-    motion: bool,
-    speed_levels: tuple[float, ...],
-    budgets: tuple[int, ...],
-    orders: tuple[str, ...] | None,
-    repeats: int,
-    time_limit: float | None,
-    pass_limit: float | None,
-    memory: float | None,
-    in_process: bool,
+    asked: Asked,
     out: Path,
 ) -> None:
     """As `report`, but only the records: a .jsonl file that `lavender report` shows later.
 
-    `lavender bench peers` compares with other engines and solvers instead; see its own --help.
+    `lavender bench mujoco` compares with MuJoCo on models of your own instead; see its own --help.
     """
-    refuse_idle(context, solvers)
-    plan = make_plan(files, levels, budgets, orders, repeats, time_limit, pass_limit, motion, speed_levels)
-    done = measure(files, solvers, plan, out, memory, in_process, given=partial(was_given, context))
+    refuse_idle(context, asked.solvers)
+    done = measure(files, asked, asked.plan(files), out, given=partial(was_given, context))
     shown_on = console()
     shown_on.print(f"{len(done.records)} runs in {out}", highlight=False, markup=False, soft_wrap=True)
     if done.note:

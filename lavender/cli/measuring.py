@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from lavender.cli.options import bytes_of, console, one_thread
+from lavender.cli.options import Asked, console, one_thread
 from lavender.errors import InputError
 
 if TYPE_CHECKING:
@@ -59,11 +59,9 @@ def check_named(items: Sequence[Item]) -> None:
 
 def measure(
     files: Sequence[str],
-    solvers: Sequence[str] | None,
+    asked: Asked,
     plan: Plan,
     path: Path,
-    memory: float | None,
-    in_process: bool,
     sequence: bool | None = None,
     fresh: bool = False,
     *,
@@ -88,7 +86,7 @@ def measure(
     from lavender.report.contenders import time_lines
 
     one_thread()
-    bench.solver_names(solvers)  # before anything is loaded: names first
+    bench.solver_names(asked.solvers)  # before anything is loaded: names first
     if sequence and not files:
         raise InputError("--sequence needs a folder of problem files, one for each step")
     reused = 0
@@ -108,8 +106,8 @@ def measure(
 
             stopped = False
             try:
-                more: dict[str, Any] = {"isolate": not in_process, "memory": bytes_of(memory)}
-                bench.run(items, solvers, plan, store, watch=watch, into=found, fresh=fresh, **more)
+                more = asked.process
+                bench.run(items, asked.solvers, plan, store, watch=watch, into=found, fresh=fresh, **more)
                 if lines:
                     time_lines(items, found[0], plan, store, watch=watch, fresh=fresh, **more)
             except KeyboardInterrupt:
@@ -120,31 +118,27 @@ def measure(
 
 def run_campaign(
     words: Sequence[str],
-    solvers: Sequence[str] | None,
-    plan: Any,
+    asked: Asked,
     path: Path,
     *,
     workers: int,
     backend: str,
-    memory: float | None,
 ) -> Measured:
     """Run a campaign with a progress bar; raises as `measure`."""
     from lavender import bench
 
     one_thread()
     check_named(bench.resolve(words))
+    plan = bench.CampaignPlan(
+        levels=asked.levels, budgets=asked.budgets, orders=asked.orders or (), motion=asked.motion,
+        speed_levels=asked.speed_levels,
+    )  # fmt: skip
     with bench.Store(path) as store, _Progress() as watch:
         try:
             made = bench.campaign(
-                words,
-                solvers,
-                plan,
-                store,
-                workers=workers,
-                backend=backend,
-                watch=watch,
-                memory=bytes_of(memory),
-            )
+                words, asked.solvers, plan, store, workers=workers, backend=backend, watch=watch,
+                memory=asked.process["memory"],
+            )  # fmt: skip
         except KeyboardInterrupt:
             return Measured(bench.read(path).latest(), True)
         return Measured(made, False)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 import os
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,13 +27,13 @@ __all__ = [
     "EXIT_INFEASIBLE",
     "EXIT_INTERRUPTED",
     "EXIT_UNMET",
+    "Asked",
     "ManyValues",
     "Names",
     "Numbers",
     "Seeds",
     "bytes_of",
     "console",
-    "make_plan",
     "one_thread",
     "parameters_of",
     "plain",
@@ -214,120 +216,89 @@ def refuse_idle(context: click.Context, solvers: Sequence[str] | None) -> None:
         refuse_unused(context, ["memory", "in_process"], "where no solver of another package runs")
 
 
+@dataclass(frozen=True)
+class Asked:
+    """What the options of a plan say, by their names."""
+
+    solvers: tuple[str, ...] | None
+    levels: tuple[float, ...]
+    motion: bool
+    speed_levels: tuple[float, ...]
+    budgets: tuple[int, ...]
+    orders: tuple[str, ...] | None
+    repeats: int
+    time_limit: float | None
+    pass_limit: float | None
+    memory: float | None
+    in_process: bool
+
+    def plan(self, files: Sequence[str], times: Sequence[float] = (), sweeps: Sequence[int] = ()) -> Plan:
+        """The plan that they mean.
+
+        Raises
+        ------
+        InputError
+            A level, budget or limit that means nothing.
+        """
+        from lavender.bench import Plan
+
+        names = ("levels", "budgets", "repeats", "motion", "speed_levels")
+        more = {name: getattr(self, name) for name in names}
+        # without files: all of the suite in a minute
+        more["time_limit"] = (1.0 if files else 0.25) if self.time_limit is None else self.time_limit
+        for name in ("orders", "pass_limit"):
+            if getattr(self, name) is not None:
+                more[name] = getattr(self, name)
+        return Plan(times=times, sweeps=sweeps, **more)
+
+    @property
+    def process(self) -> dict[str, Any]:
+        """Where backends of other packages run, as `lavender.bench.run` takes it.
+
+        Raises
+        ------
+        InputError
+            A memory that means nothing.
+        """
+        return {"isolate": not self.in_process, "memory": bytes_of(self.memory)}
+
+
+PLAN_OPTIONS: tuple[tuple[str, dict[str, Any]], ...] = (
+    ("--solvers", {"type": Names(), "help": "Solvers by name; all that are installed if not given."}),
+    ("--levels", {"type": Numbers(), "default": "1e-3,1e-6,1e-9", "show_default": True,
+                  "help": "Relative residuals to reach."}),
+    ("--motion", {"is_flag": True, "help": "Tell how wrong the bodies move, too: distance to a reference that is "
+                  "solved for once a case."}),
+    ("--speed-levels", {"type": Numbers(), "default": (), "metavar": "M/S,M/S,...",
+                        "help": "Motion errors to reach, in metres per second; implies --motion."}),
+    ("--budgets", {"type": Numbers(int), "default": "4,8,16,32,64", "show_default": True,
+                   "help": "Exact iteration counts."}),
+    ("--orders", {"type": Names(), "default": None,
+                  "help": "Sweep orders beside 'given', at the middle budget; random:3 is seed 3."}),
+    ("--repeats", {"type": int, "default": 3, "show_default": True,
+                   "help": "Solves of each kind; minimum and median count."}),
+    ("--time-limit", {"type": float, "default": None, "metavar": "S",
+                      "help": "Of one solve; 1 s, or 0.25 s for the built-in suite."}),
+    ("--pass-limit", {"type": float, "default": None, "metavar": "S",
+                      "help": "Of one solver over all steps of a sequence, at one budget or level; 5 s."}),
+    ("--memory", {"type": float, "default": None, "metavar": "GB", "help": "Limit of each process of a backend of "
+                  "another package; default: half of the machine's memory, shared by the workers of a campaign."}),
+    ("--in-process", {"is_flag": True, "help": "Run backends of other packages here, not in a process of their own."}),
+)  # fmt: skip
+
+
 def plan_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """The options of what is measured."""
-    options = (
-        click.option("--solvers", type=Names(), help="Solvers by name; all that are installed if not given."),
-        click.option(
-            "--levels",
-            type=Numbers(),
-            default="1e-3,1e-6,1e-9",
-            show_default=True,
-            help="Relative residuals to reach.",
-        ),
-        click.option(
-            "--motion",
-            is_flag=True,
-            help="Tell how wrong the bodies move, too: distance to a reference that is solved for once a case.",
-        ),
-        click.option(
-            "--speed-levels",
-            type=Numbers(),
-            default=(),
-            metavar="M/S,M/S,...",
-            help="Motion errors to reach, in metres per second; implies --motion.",
-        ),
-        click.option(
-            "--budgets",
-            type=Numbers(int),
-            default="4,8,16,32,64",
-            show_default=True,
-            help="Exact iteration counts.",
-        ),
-        click.option(
-            "--orders",
-            type=Names(),
-            default=None,
-            help="Sweep orders beside 'given', at the middle budget; random:3 is seed 3.",
-        ),
-        click.option(
-            "--repeats",
-            type=int,
-            default=3,
-            show_default=True,
-            help="Solves of each kind; minimum and median count.",
-        ),
-        click.option(
-            "--time-limit",
-            type=float,
-            default=None,
-            metavar="S",
-            help="Of one solve; 1 s, or 0.25 s for the built-in suite.",
-        ),
-        click.option(
-            "--pass-limit",
-            type=float,
-            default=None,
-            metavar="S",
-            help="Of one solver over all steps of a sequence, at one budget or level; 5 s.",
-        ),
-        click.option(
-            "--memory",
-            type=float,
-            default=None,
-            metavar="GB",
-            help="Limit of each process of a backend of another package; default: half of the machine's memory, "
-            "shared by the workers of a campaign.",
-        ),
-        click.option(
-            "--in-process",
-            is_flag=True,
-            help="Run backends of other packages here, not in a process of their own.",
-        ),
-    )
-    for option in reversed(options):
-        command = option(command)
-    return command
+    """The options of what is measured, which the command gets as one argument `asked`."""
 
+    @functools.wraps(command)
+    def collected(*args: Any, **given: Any) -> Any:
+        asked = Asked(**{f.name: given.pop(f.name) for f in fields(Asked)})
+        return command(*args, asked=asked, **given)
 
-def make_plan(
-    files: Sequence[str],
-    levels: Sequence[float],
-    budgets: Sequence[int],
-    orders: Sequence[str] | None,
-    repeats: int,
-    time_limit: float | None,
-    pass_limit: float | None = None,
-    motion: bool = False,
-    speed_levels: Sequence[float] = (),
-    times: Sequence[float] = (),
-    sweeps: Sequence[int] = (),
-) -> Plan:
-    """The plan that those options mean.
-
-    Raises
-    ------
-    InputError
-        A level, budget or limit that means nothing.
-    """
-    from lavender.bench import Plan
-
-    if time_limit is None:
-        time_limit = 1.0 if files else 0.25  # all of the suite in a minute
-    more: dict[str, Any] = {} if orders is None else {"orders": orders}
-    if pass_limit is not None:
-        more["pass_limit"] = pass_limit
-    return Plan(
-        levels=levels,
-        budgets=budgets,
-        repeats=repeats,
-        time_limit=time_limit,
-        motion=motion,
-        speed_levels=speed_levels,
-        times=times,
-        sweeps=sweeps,
-        **more,
-    )
+    made: Callable[..., Any] = collected
+    for name, what in reversed(PLAN_OPTIONS):
+        made = click.option(name, **what)(made)
+    return made
 
 
 def bytes_of(gigabytes: float | None) -> int | None:

@@ -10,13 +10,9 @@ import click
 
 from lavender.bench.machine import cpu_name, versions
 from lavender.cli.options import parameters_of
-from lavender.engine.picture import PICTURES
-from lavender.phenomena import WAYS, Record, Track, chosen, run
-from lavender.phenomena import motion as motions
+from lavender.phenomena import WAYS, Record, chosen, run
 from lavender.phenomena import table as tables
 from lavender.phenomena.engines import versions_of_node
-from lavender.phenomena.film import save_film
-from lavender.scene.steppers import STEPPERS
 
 __all__ = ["phenomena"]
 
@@ -44,20 +40,6 @@ def _names(text: str | None) -> list[str] | None:
 )  # fmt: skip
 @click.option("--out", type=click.Path(path_type=Path), default=None, help="Every measurement, JSON.")
 @click.option(
-    "--motion", is_flag=True, help="Steppers' distance from a reference on six scenes, against time."
-)
-@click.option(
-    "--plot", type=click.Path(path_type=Path), default=None, help="Figure of --motion (.svg, .png)."
-)
-@click.option(
-    "--film", type=click.Path(path_type=Path), default=None,
-    help="One phenomenon as each engine does it, beside each other: .gif, .mp4 (animations), .png, .svg (strips).",
-)  # fmt: skip
-@click.option(
-    "--magnify", type=click.FloatRange(min=1.0), default=1.0, show_default=True,
-    help="Show distances from the first engine of --film so many times as large.",
-)  # fmt: skip
-@click.option(
     "--list", "listed", is_flag=True, help="Tell what each is, its truth and its bounds; run nothing."
 )
 def phenomena(
@@ -67,10 +49,6 @@ def phenomena(
     parameters: tuple[str, ...],
     limit: float,
     out: Path | None,
-    motion: bool,
-    plot: Path | None,
-    film: Path | None,
-    magnify: float,
     listed: bool,
 ) -> None:
     """Scenes whose motion is known, measured in every stepper, and in the engines of others.
@@ -81,28 +59,11 @@ def phenomena(
     if listed:
         click.echo(tables.described(chosen(names)))
         return
-    for path in (out, plot, film):
-        if path is not None and not path.parent.is_dir():
-            raise click.UsageError(f"{path}: there is no folder {path.parent}")
-    if motion:
-        if names or parameters or engines != "none" or film is not None:
-            raise click.UsageError("--motion goes with --steppers, --out and --plot; its scenes are its own")
-        _motion(_names(steppers), out, plot)
-        return
-    if plot is not None:
-        raise click.UsageError("--plot goes with --motion")
-    if film is not None and (len(names) != 1 or film.suffix.lower() not in PICTURES):
-        raise click.UsageError(f"--film takes one phenomenon, and a file that ends in {', '.join(PICTURES)}")
+    if out is not None and not out.parent.is_dir():
+        raise click.UsageError(f"{out}: there is no folder {out.parent}")
     case = parameters_of(parameters) if parameters else None
-    if film is not None and case is None:
-        case = dict(chosen(names)[0].cases[0])
     some = {"steppers": _names(steppers), "engines": _names(engines)}
     found: list[Record] = []
-    tracks: dict[str, Track] = {}
-
-    def keep(record: Record, track: Track) -> None:
-        if film is not None:
-            tracks[record.engine] = track
 
     def show(record: Record) -> None:
         found.append(record)
@@ -117,10 +78,7 @@ def phenomena(
         parameters=case,
         limit=limit,
         show=show,
-        keep=keep,
     )
-    if film is not None:
-        save_film(chosen(names)[0], found[0].case, tracks, film, magnify)
     for heading, lines in (
         ("Ours out of their bounds", tables.losses(found)),
         ("Without values", tables.notes(found)),
@@ -130,20 +88,6 @@ def phenomena(
     click.echo(tables.table(found))
     ran = {r.engine for r in found}
     click.echo("\n" + "\n".join(f"- {way.name}: {way.text}" for way in WAYS.values() if way.name in ran))
-
-
-def _motion(steppers: list[str] | None, out: Path | None, plot: Path | None) -> None:
-    def show(point: motions.Point) -> None:
-        words = point.note or f"{1e3 * point.distance:.3g} mm, {1e3 * point.cpu:.3g} ms a second"
-        click.echo(f"{point.scene}, {point.stepper} {point.substeps} x {point.sweeps}: {words}", err=True)
-
-    found = motions.measure(steppers=steppers or tuple(STEPPERS), show=show)
-    if out is not None:
-        points = [asdict(p) for p in found]
-        out.write_text(json.dumps({"cpu": cpu_name(), "points": points}, indent=1) + "\n", encoding="utf-8")
-    if plot is not None:
-        motions.plot(found, plot)
-    click.echo(motions.table(found))
 
 
 def _told(found: list[Record]) -> dict[str, object]:

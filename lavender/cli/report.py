@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -14,11 +16,11 @@ from lavender.cli.measuring import Measured, measure, run_campaign
 from lavender.cli.options import (
     EXIT_INTERRUPTED,
     EXIT_UNMET,
+    Asked,
     ManyValues,
     Numbers,
     Seeds,
     console,
-    make_plan,
     plan_options,
     refuse_idle,
     refuse_unused,
@@ -26,6 +28,10 @@ from lavender.cli.options import (
 )
 from lavender.errors import InputError
 from lavender.io.stored import write_text
+
+if TYPE_CHECKING:
+    from lavender.bench import Records
+    from lavender.report.engine import Contestant
 
 __all__ = ["report"]
 
@@ -70,12 +76,6 @@ __all__ = ["report"]
     metavar="S,S,...",
     help="Seconds for which a solver is recommended; default: three decades about the fastest times.",
 )
-@click.option(
-    "--peers",
-    type=click.Path(path_type=Path),
-    metavar="FILE",
-    help="What `lavender bench peers --out FILE` measured, to show beside.",
-)
 @click.option("--steps", default=500, show_default=True, help="Of MODEL.xml: steps of its simulation.")
 @click.option("--every", default=5, show_default=True, help="Of MODEL.xml: steps between two problems.")
 @click.option(
@@ -89,17 +89,7 @@ __all__ = ["report"]
 def report(
     context: click.Context,
     files: tuple[str, ...],
-    solvers: tuple[str, ...] | None,
-    levels: tuple[float, ...],
-    motion: bool,
-    speed_levels: tuple[float, ...],
-    budgets: tuple[int, ...],
-    orders: tuple[str, ...] | None,
-    repeats: int,
-    time_limit: float | None,
-    pass_limit: float | None,
-    memory: float | None,
-    in_process: bool,
+    asked: Asked,
     out: Path,
     sequence: bool | None,
     campaign: bool,
@@ -108,7 +98,6 @@ def report(
     backend: str,
     compare: Path | None,
     time_budgets: tuple[float, ...],
-    peers: Path | None,
     steps: int,
     every: int,
     controls: str,
@@ -128,100 +117,84 @@ def report(
     another report writes the folder.
     """
     from lavender import bench
-    from lavender.bench.peers import read as read_peers
-    from lavender.report.engine import ENGINES, contestants
-    from lavender.report.engine import lines as engine_lines
-    from lavender.report.terminal import print_report
+    from lavender.report.engine import contestants
     from lavender.report.text import count
-    from lavender.report.write import write
 
     for limit in time_budgets:
         if not (math.isfinite(limit) and limit > 0.0):
             raise InputError(f"time budget {limit} must be a positive number of seconds")
-    _refuse_unused(context, files, solvers)
-    shown_on = console()
+    _refuse_unused(context, files, asked.solvers)
     taken: set[Path] = set()
     files = tuple(_recorded(f, out, steps, every, controls, fresh, taken) for f in files)
     old = None if compare is None else bench.read(compare)
-    rivals = None if peers is None else read_peers(peers)
-    shown = [Path(f) for f in files if f.endswith(".jsonl")]
-    if shown:
+    named = partial(was_given, context)
+    sweeps = asked.budgets if named("budgets") else ()
+    path = out / "records.jsonl"
+    again = [f for f in files if f.endswith(".jsonl")]
+    if again:
         if len(files) > 1:
             raise InputError("a records.jsonl is shown alone: give one, and no problems")
-        done = Measured(bench.read(shown[0]), False)
+        done = Measured(bench.read(again[0]), False)
     elif campaign:
-        many = bench.CampaignPlan(
-            levels=levels, budgets=budgets, orders=orders or (), motion=motion, speed_levels=speed_levels
-        )
         words = bench.seeds(files, len(seeds), seeds.start)
-        done = run_campaign(
-            words, solvers, many, out / "records.jsonl", workers=workers, backend=backend, memory=memory
-        )
+        done = run_campaign(words, asked, path, workers=workers, backend=backend)
     else:
-        named = partial(was_given, context)
-        plan = make_plan(
-            files,
-            levels,
-            budgets,
-            orders,
-            repeats,
-            time_limit,
-            pass_limit,
-            motion,
-            speed_levels,
-            times=time_budgets,
-            sweeps=budgets if named("budgets") else (),
-        )
-        path = out / "records.jsonl"
-        done = measure(
-            files, solvers, plan, path, memory, in_process, sequence, fresh, given=named, lines=True
-        )
-    records = done.records
-    engines = [] if campaign else contestants(files, records.latest())
-    sweeps = budgets if was_given(context, "budgets") else ()
-    print_report(records, shown_on, old=old, times=time_budgets, sweeps=sweeps, whole=tables)
-    if engines:
-        shown_on.print(f"\n{ENGINES}", highlight=False, markup=False, soft_wrap=True)
-        for line in engine_lines(engines):
-            shown_on.print(line, highlight=False, markup=False, soft_wrap=True)
-    index = write(
-        records,
-        out,
+        plan = asked.plan(files, time_budgets, sweeps)
+        done = measure(files, asked, plan, path, sequence, fresh, given=named, lines=True)
+    engines = [] if campaign else contestants(files, done.records.latest())
+    index = _show(
+        done.records, out, old=old, times=time_budgets, sweeps=sweeps, engines=engines, tables=tables, paper=paper,
         figures=not no_figures,
-        old=old,
-        times=time_budgets,
-        sweeps=sweeps,
-        peers=rivals,
-        engines=engines,
-    )
+    )  # fmt: skip
+    _say(f"\n{len(done.records)} runs in {out / 'records.csv'}, page: {index}")
+    if done.note:
+        _say(done.note)
+    if done.stopped:
+        console().print("[yellow]Stopped; the same command goes on from here.[/]")
+        raise click.exceptions.Exit(EXIT_INTERRUPTED)
+    if done.lost and not again:
+        _say(f"{count(done.lost, 'case')} of a folder did not load", style="yellow")
+        raise click.exceptions.Exit(EXIT_UNMET)
+
+
+def _say(text: str, **more: Any) -> None:
+    console().print(text, highlight=False, markup=False, soft_wrap=True, **more)
+
+
+def _show(
+    records: Records,
+    out: Path,
+    *,
+    old: Records | None,
+    times: Sequence[float],
+    sweeps: Sequence[int],
+    engines: Sequence[Contestant],
+    tables: bool,
+    paper: bool,
+    figures: bool,
+) -> Path:
+    """On the terminal, and everything in the folder; the path of the page."""
+    from lavender.report.engine import ENGINES
+    from lavender.report.engine import lines as engine_lines
+    from lavender.report.terminal import print_report
+    from lavender.report.write import write
+
+    print_report(records, console(), old=old, times=times, sweeps=sweeps, whole=tables)
+    for line in [f"\n{ENGINES}", *engine_lines(engines)] if engines else ():
+        _say(line)
+    index = write(records, out, figures=figures, old=old, times=times, sweeps=sweeps, engines=engines)
     if paper:
         from lavender.report.paper import write_paper
 
-        shown_on.print(
-            f"figures, tables and method of a paper: {write_paper(records, out / 'paper', time_budgets)}"
-        )
-    shown_on.print(
-        f"\n{len(records)} runs in {out / 'records.csv'}, page: {index}",
-        highlight=False,
-        markup=False,
-        soft_wrap=True,
-    )
-    if done.note:
-        shown_on.print(done.note, highlight=False, markup=False, soft_wrap=True)
-    if done.stopped:
-        shown_on.print("[yellow]Stopped; the same command goes on from here.[/]")
-        raise click.exceptions.Exit(EXIT_INTERRUPTED)
-    if done.lost and not shown:
-        said = f"{count(done.lost, 'case')} of a folder did not load"
-        shown_on.print(said, style="yellow", highlight=False, markup=False)
-        raise click.exceptions.Exit(EXIT_UNMET)
+        _say(f"figures, tables and method of a paper: {write_paper(records, out / 'paper', times)}")
+    return index
 
 
 def _refuse_unused(context: click.Context, files: tuple[str, ...], solvers: tuple[str, ...] | None) -> None:
     """Every option that would be ignored is an error."""
     campaign = context.params["campaign"]
     if any(f.endswith(".jsonl") for f in files):
-        kept = {"files", "out", "compare", "time_budgets", "budgets", "peers", "tables", "no_figures"}
+        kept = {"files", "out", "compare", "time_budgets", "budgets", "tables", "no_figures"}
         rest = [p.name for p in context.command.params if p.name and p.name not in kept]
         refuse_unused(context, rest, "where records are shown again and nothing is solved")
     elif campaign:

@@ -43,7 +43,7 @@ MODULES = (
     "accelerate.accelerated",
     "generalized.newton",
     "pivot.principal",
-    "few.islands",
+    "few.chain",
     "factor.graph",
     "engine.arrays",
     "engine.substep",

@@ -37,7 +37,7 @@ def _pendulum(p: Values, more: Mapping[str, Any]) -> Scene:
     return scene
 
 
-def _period(p: Values) -> float:
+def period_of(p: Values) -> float:
     about = (ROD[0] ** 2 + ROD[2] ** 2) / 12 + ROD[2] ** 2 / 4
     return pendulum_period(about, 0.5 * GRAVITY * ROD[2], p["angle"])
 
@@ -50,39 +50,42 @@ def _swings(p: Values, track: Track) -> dict[str, float]:
     energy = 0.5 * (v[:, :3] ** 2).sum(axis=1) + 0.5 * own * v[:, 4] ** 2
     energy += GRAVITY * (x[:, 2] + 0.5 * ROD[2])
     start = 0.5 * GRAVITY * ROD[2] * (1.0 - math.cos(p["angle"]))
-    late = track.time >= track.time[-1] - 2.0 * _period(p)
-    return {"period": abs(period / _period(p) - 1.0), "energy": abs(float(energy[late].mean()) / start - 1.0)}
+    late = track.time >= track.time[-1] - 2.0 * period_of(p)
+    return {
+        "period": abs(period / period_of(p) - 1.0),
+        "energy": abs(float(energy[late].mean()) / start - 1.0),
+    }
 
 
 def _free(p: Values, more: Mapping[str, Any]) -> Scene:
     scene = Scene(**{"gravity": 0.0, **more})
-    scene.add_box(BLOCK, angular_velocity=_omega(p))
+    scene.add_box(BLOCK, angular_velocity=spin_of(p))
     return scene
 
 
-def _omega(p: Values) -> tuple[float, float, float]:
+def spin_of(p: Values) -> tuple[float, float, float]:
     return (p["aside"] * p["spin"], p["spin"], 0.0)
 
 
-def _moments() -> FloatArray:
+def moments_of_inertia() -> FloatArray:
     x, y, z = (s * s for s in BLOCK)
     return np.array([y + z, x + z, x + y]) / 12.0
 
 
-def _flip(p: Values) -> float:
-    return flip_period(_moments(), np.array(_omega(p)))
+def flip_of(p: Values) -> float:
+    return flip_period(moments_of_inertia(), np.array(spin_of(p)))
 
 
 def _rotation(p: Values, track: Track) -> dict[str, float]:
     axes = np.stack([track.axis(0, i) for i in range(3)], axis=1)  # (k, axis, world)
     omega = np.einsum("kaw,kw->ka", axes, track.velocities[:, 0, 3:])
-    energy = 0.5 * omega**2 @ _moments()
-    momentum = np.einsum("ka,kaw->kw", omega * _moments(), axes)
+    energy = 0.5 * omega**2 @ moments_of_inertia()
+    momentum = np.einsum("ka,kaw->kw", omega * moments_of_inertia(), axes)
     zeros = _zeros(track.time, omega[:, 1])
     flips = 2.0 * float(np.diff(zeros).mean()) if len(zeros) > 1 else math.inf
     away = np.linalg.norm(momentum - momentum[0], axis=1).max() / np.linalg.norm(momentum[0])
     return {
-        "period": abs(flips / _flip(p) - 1.0),
+        "period": abs(flips / flip_of(p) - 1.0),
         "energy": float(np.abs(energy / energy[0] - 1.0).max()),
         "momentum": float(away),
     }
@@ -128,7 +131,7 @@ JOINTS = (
         ),
         needs=frozenset({"hinge"}),
         build=_pendulum,
-        seconds=lambda p: p["swings"] * _period(p),
+        seconds=lambda p: p["swings"] * period_of(p),
         measure=_swings,
     ),
     Phenomenon(
@@ -148,7 +151,7 @@ JOINTS = (
         ),
         needs=frozenset({"box"}),
         build=_free,
-        seconds=lambda p: TURNS * _flip(p),
+        seconds=lambda p: TURNS * flip_of(p),
         measure=_rotation,
     ),
     Phenomenon(

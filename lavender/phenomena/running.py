@@ -45,6 +45,11 @@ class Apart:
         except Ended as end:
             return f"its process ended: {end}"
 
+    @property
+    def alive(self) -> bool:
+        """A process runs."""
+        return self._process.alive
+
     def end(self) -> None:
         """End the process."""
         self._process.end()

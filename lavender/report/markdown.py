@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Sequence
 
@@ -11,8 +10,8 @@ from lavender.bench.store import Records
 from lavender.report import tables
 from lavender.report.engine import ENGINES, Contestant
 from lavender.report.engine import lines as engine_lines
-from lavender.report.moved import advice_by_speed, moved, robustness_by_speed, speed_levels, speed_name
-from lavender.report.text import count, in_time, residual, seconds, to_level
+from lavender.report.moved import robustness_by_speed, speed_levels, speed_name
+from lavender.report.text import advice_rows, moved_rows, residual, seconds, speed_rows, sweeps_rows, who
 from lavender.report.verdict import verdict
 
 __all__ = ["summary"]
@@ -40,17 +39,9 @@ def summary(
         lines += [_cell(found.text), "", "```python", *found.code, "```", ""]
     advice = [] if tables.is_campaign(records) else tables.advice(records, times)
     if advice:
-        head = [*(f"to {level_name(x)}" for x in levels), *(f"in {seconds(t)}" for t in times)]
-        lines += ["| structure | " + " | ".join(head) + " |", "|---" * (len(head) + 1) + "|"]
-        for line in advice:
-            cells = [line.name, *map(to_level, line.by_level.values()), *map(in_time, line.by_time.values())]
-            lines.append("| " + " | ".join(map(_cell, cells)) + " |")
-        lines.append("")
-        budgets = sorted({n for line in advice for n in line.by_sweeps})
-        rows = [[line.name, *map(in_time, line.by_sweeps.values())] for line in advice if line.by_sweeps]
-        lines += (
-            [*_table(["structure", *(count(int(n), "sweep") for n in budgets)], rows), ""] if rows else []
-        )
+        lines += [*_table(*advice_rows(records, advice, times)), ""]
+        heads, rows = sweeps_rows(advice)
+        lines += [*_table(heads, rows), ""] if rows else []
     if tables.is_campaign(records):
         lines += _campaign(tables.robustness(records), [f"to {level_name(x)}" for x in levels])
         if by_speed := robustness_by_speed(records):
@@ -58,14 +49,17 @@ def summary(
         return "\n".join([*lines, *_failed(records)]) + "\n"
     if engines:
         lines += [ENGINES, "", *engine_lines(engines), ""]
-    lines += _motion(records, speeds)
-    lines += ["| case | solver | " + " | ".join(f"to {level_name(x)}" for x in levels) + " | best | status |"]
-    lines += ["|---" * (len(levels) + 4) + "|"]
-    for r in tables.reaches(records):
-        solver = r.solver if r.start == "cold" else f"{r.solver} ({r.start})"
-        mark = " **claim contradicted**" if r.contradicted else ""
-        cells = [r.case, solver, *(seconds(r.times[x]) for x in levels), residual(r.best), r.status]
-        lines.append("| " + " | ".join(map(_cell, cells)) + f"{mark} |")
+    if speeds:  # who gets to each motion error, by structure and by case
+        lines += [MOTION, "", *_table(*speed_rows(records)), "", *_table(*moved_rows(records)), ""]
+    heads = ["case", "solver", *(f"to {level_name(x)}" for x in levels), "best", "status"]
+    rows = [
+        [r.case, who(r.solver, r.start), *(seconds(r.times[x]) for x in levels), residual(r.best), r.status]
+        for r in tables.reaches(records)
+    ]
+    marks = [" **claim contradicted**" if r.contradicted else "" for r in tables.reaches(records)]
+    first = _table(heads, rows)
+    lines += first[:2]
+    lines += [f"{line[:-2]}{mark} |" for line, mark in zip(first[2:], marks, strict=True)]
     return "\n".join([*lines, *_failed(records)]) + "\n"
 
 
@@ -74,31 +68,6 @@ def _failed(records: Records) -> list[str]:
     if not wrong:
         return []
     return ["", f"{len(wrong)} runs missed what they were asked for, or claimed falsely; see the page."]
-
-
-def _motion(records: Records, levels: Sequence[float]) -> list[str]:
-    """Who gets to each motion error, by structure and by case; nothing where none was told."""
-    if not levels:
-        return []
-    by_family: dict[str, list[str]] = {}
-    for advice in advice_by_speed(records):
-        by_family.setdefault(advice.family, []).append(to_level(advice))
-    heads = [f"to {speed_name(x)}" for x in levels]
-    lines = [
-        MOTION,
-        "",
-        *_table(["structure", *heads], [[name, *row] for name, row in by_family.items()]),
-        "",
-    ]
-    rows = []
-    for m in moved(records, levels):
-        solver = m.solver if m.start == "cold" else f"{m.solver} ({m.start})"
-        known = [
-            f"{residual(x)}{unit}" if math.isfinite(x) else "–"
-            for x, unit in ((m.best, " m/s"), (m.relative, ""), (m.bound, " √J"))
-        ]
-        rows.append([m.case, solver, *(seconds(m.times[x]) for x in levels), *known])
-    return [*lines, *_table(["case", "solver", *heads, "best", "relative", "bound"], rows), ""]
 
 
 def _campaign(rows: Sequence[tables.Robustness], heads: Sequence[str]) -> list[str]:

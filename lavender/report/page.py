@@ -27,7 +27,6 @@ from lavender.report.text import count, residual, seconds, suspicions, times
 from lavender.report.verdict import Verdict, verdict
 
 if TYPE_CHECKING:
-    from lavender.bench.peers import Peers
     from lavender.report.engine import Contestant
 
 __all__ = ["page"]
@@ -63,7 +62,6 @@ def page(
     budgets: Sequence[float] = (),
     sweeps: Sequence[int] = (),
     saved: bool = True,
-    peers: Peers | None = None,
     engines: Sequence[Contestant] = (),
 ) -> str:
     """The whole page. Every text that came from a file, a problem or a backend is escaped.
@@ -81,13 +79,11 @@ def page(
         Budgets of sweeps of the recommendation.
     saved : bool
         The figures are beside the page as SVG and PNG.
-    peers : Peers, optional
-        A run of `lavender bench peers`, whose figures are among `figures`.
     engines : sequence of Contestant
         Answers of the engines that recorded the steps.
     """
     environment = _environment()
-    content = _content(records, figures, old, tuple(budgets), tuple(sweeps), peers)
+    content = _content(records, figures, old, tuple(budgets), tuple(sweeps))
     return environment.get_template("index.html.j2").render(
         title=title,
         saved=saved,
@@ -105,62 +101,28 @@ def _content(
     old: Records | None,
     budgets: Sequence[float],
     sweeps: Sequence[int],
-    peers: Peers | None,
 ) -> dict[str, Any]:
+    """Everything that the template names."""
     still = idle(records)
     records = working(records)
     found = verdict(records, budgets, sweeps)
     budgets = budgets or tables.time_budgets(records)
-    names = sorted({r.solver for r in records} | {c.solver for f in figures for c in f.curves})
-    number = {name: i for i, name in enumerate(names)}
-    # Under the heading of a case or a family its name says nothing new.
-    titles = {f.name: "" for some in figures.cases.values() for f in some} | {
-        f.name: "" for f in figures.families.values()
-    }
-    titles |= {f"motion {name}": "" for name in titles}
     levels = tables.levels_of(records)
     campaign = tables.is_campaign(records)
-    by_case: dict[str, list[tables.Reach]] = {}
-    if not campaign:  # thousands of cases: the tables over all of them say it
-        for reach in tables.reaches(records, levels):
-            by_case.setdefault(reach.case, []).append(reach)
-    other = figures.moved or Figures({}, {}, {}, {})
-    cases = [
-        {
-            "info": records.cases[name],
-            "reaches": rows,
-            "figures": _keys(figures.cases.get(name, ())),
-            "moved": _keys(other.cases.get(name, ())),
-            "best": _fastest(rows, levels[len(levels) // 2]),
-        }
-        for name, rows in by_case.items()
-    ]
-    changes = tables.changes(old, records) if old is not None else []
     lines = [] if campaign else tables.advice(records, budgets)
-    rivals = None
-    if peers is not None:
-        from lavender.report.rivals import content  # with the engine behind it
-
-        rivals = content(peers)
     return {
-        "drawings": {  # each escapes what it holds
-            file_name(figure.name): svg(figure, number, found.leaders, titles.get(figure.name))
-            for figure in figures
-        },
+        **_drawings(records, figures, found),
+        **_cases(records, figures, levels),
+        **_changes(old, records),
         "verdict": found,
-        "over": _keys(figures.over),
-        "moved_over": _keys(other.over),
         "others": [] if campaign else _others(records, lines, found, levels, budgets),
         "idle": still,
         "suspicions": suspicions(records),
         "moved": [] if campaign else moved(records),
         "speeds": speed_levels(records),
         "speed_advice": {} if campaign else _by_family(advice_by_speed(records)),
-        "has_stored": any(math.isfinite(info.stored) for info in records.cases.values()),
         "noise": NOISE,
         "residual_noise": RESIDUAL_NOISE,
-        "solvers": names,
-        "number": number,
         "level": levels[len(levels) // 2],
         "runs": list(records.runs.values()),
         "levels": levels,
@@ -169,17 +131,10 @@ def _content(
         "lines": line_table(records),
         "ways": {way: head for way, head in WAYS.items() if any(r.turns and r.way == way for r in records)},
         "families": tables.families(records),
-        "family_figures": {f: file_name(figure.name) for f, figure in figures.families.items()},
         "claims": tables.claims(records),
         "failures": tables.failures(records),
         "most": MOST,
         "most_spreads": MOST_SPREADS,
-        "cases": cases,
-        "profiles": {law: _keys(some) for law, some in figures.profiles.items()},
-        "by_motion": figures.moved is not None,
-        "moved_families": {f: file_name(figure.name) for f, figure in other.families.items()},
-        "moved_profiles": {law: _keys(some) for law, some in other.profiles.items()},
-        "moved_sequences": {name: _keys(some) for name, some in other.sequences.items()},
         "means": tables.geometric_means(records),
         "backends": tables.backends(records),
         "shift": tables.SHIFT,
@@ -192,15 +147,68 @@ def _content(
         "robustness_by_speed": robustness_by_speed(records) if campaign else [],
         "budgets": sorted({r.max_iter for r in records if r.mode == "budget"}),
         "sequences": tables.by_sequence(records),
-        "sequence_figures": {name: _keys(some) for name, some in figures.sequences.items()},
-        "compared": old is not None,
-        "drift": 1.0 if old is None else tables.drift(old, records),
-        "changes": [c for c in changes if c.kind != "same"],
-        "n_changes": len(changes),
         "n_records": len(records),
         "n_cases": len({r.case for r in records if r.step < 0}),
-        "peers": rivals,
-        "peer_figures": {place: _keys(some) for place, some in figures.peers.items()},
+    }
+
+
+def _drawings(records: Records, figures: Figures, found: Verdict) -> dict[str, Any]:
+    """The figures, and by section the names of its own; of motion errors beside those of residuals."""
+    names = sorted({r.solver for r in records} | {c.solver for f in figures for c in f.curves})
+    number = {name: i for i, name in enumerate(names)}
+    # Under the heading of a case or a family its name says nothing new.
+    titles = {f.name: "" for some in figures.cases.values() for f in some} | {
+        f.name: "" for f in figures.families.values()
+    }
+    titles |= {f"motion {name}": "" for name in titles}
+    other = figures.moved or Figures({}, {}, {}, {})
+    return {
+        "drawings": {  # each escapes what it holds
+            file_name(figure.name): svg(figure, number, found.leaders, titles.get(figure.name))
+            for figure in figures
+        },
+        "solvers": names,
+        "number": number,
+        "by_motion": figures.moved is not None,
+        "over": _keys(figures.over),
+        "moved_over": _keys(other.over),
+        "family_figures": {f: file_name(figure.name) for f, figure in figures.families.items()},
+        "moved_families": {f: file_name(figure.name) for f, figure in other.families.items()},
+        "profiles": {law: _keys(some) for law, some in figures.profiles.items()},
+        "moved_profiles": {law: _keys(some) for law, some in other.profiles.items()},
+        "sequence_figures": {name: _keys(some) for name, some in figures.sequences.items()},
+        "moved_sequences": {name: _keys(some) for name, some in other.sequences.items()},
+    }
+
+
+def _cases(records: Records, figures: Figures, levels: Sequence[float]) -> dict[str, Any]:
+    """Each case with its solvers; none of a campaign: of thousands the tables over all of them say it."""
+    by_case: dict[str, list[tables.Reach]] = {}
+    if not tables.is_campaign(records):
+        for reach in tables.reaches(records, levels):
+            by_case.setdefault(reach.case, []).append(reach)
+    moved_figures = {} if figures.moved is None else figures.moved.cases
+    cases = [
+        {
+            "info": records.cases[name],
+            "reaches": rows,
+            "figures": _keys(figures.cases.get(name, ())),
+            "moved": _keys(moved_figures.get(name, ())),
+            "best": _fastest(rows, levels[len(levels) // 2]),
+        }
+        for name, rows in by_case.items()
+    ]
+    return {"cases": cases, "has_stored": any(math.isfinite(x.stored) for x in records.cases.values())}
+
+
+def _changes(old: Records | None, records: Records) -> dict[str, Any]:
+    """What differs from an earlier run beyond noise."""
+    found = tables.changes(old, records) if old is not None else []
+    return {
+        "compared": old is not None,
+        "drift": 1.0 if old is None else tables.drift(old, records),
+        "changes": [c for c in found if c.kind != "same"],
+        "n_changes": len(found),
     }
 
 

@@ -2,23 +2,24 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from lavender.bench.record import level_name, printable
 from lavender.bench.store import Records
 from lavender.report import tables
-from lavender.report.moved import (
-    advice_by_speed,
-    idle,
-    moved,
-    robustness_by_speed,
-    speed_levels,
-    speed_name,
-    working,
+from lavender.report.moved import idle, robustness_by_speed, speed_levels, working
+from lavender.report.text import (
+    advice_rows,
+    count,
+    moved_rows,
+    residual,
+    seconds,
+    speed_rows,
+    suspicions,
+    sweeps_rows,
+    who,
 )
-from lavender.report.text import count, in_time, residual, seconds, suspicions, to_level
 from lavender.report.verdict import verdict
 
 if TYPE_CHECKING:
@@ -79,7 +80,7 @@ def reach_table(records: Records, levels: Sequence[float]) -> Any:
     table.add_column("claim", no_wrap=True)
     shown = ""
     for row in tables.reaches(records, levels):
-        name = row.solver + ("" if row.start == "cold" else f" ({row.start})")
+        name = who(row.solver, row.start)
         cells = [
             Text(seconds(row.times[level]), style="" if row.times[level] < float("inf") else "dim")
             for level in levels
@@ -94,30 +95,14 @@ def reach_table(records: Records, levels: Sequence[float]) -> Any:
     return table
 
 
-def advice_table(records: Records, advice: Sequence[tables.Line], times: Sequence[float] = ()) -> Any:
-    """Per structure or sequence, at each level and in each time: the recommended solver and how it does."""
-    levels, times = tables.levels_of(records), tuple(times) or tables.time_budgets(records)
+def _folding(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> Any:
+    """A table whose columns but the first fold where the terminal is narrow."""
     table = _table()
-    table.add_column("structure")
-    for head in (*(f"to {level_name(x)}" for x in levels), *(f"in {seconds(t)}" for t in times)):
+    table.add_column(heads[0])
+    for head in heads[1:]:
         table.add_column(head, overflow="fold")
-    for line in advice:
-        cells = [*map(to_level, line.by_level.values()), *map(in_time, line.by_time.values())]
-        table.add_row(line.name, *cells)
-    return table
-
-
-def sweeps_table(advice: Sequence[tables.Line]) -> Any:
-    """Per structure and sequence, with each budget of sweeps: the recommended solver and how it does."""
-    budgets = sorted({n for line in advice for n in line.by_sweeps})
-    table = _table()
-    table.add_column("structure")
-    for n in budgets:
-        table.add_column(count(int(n), "sweep"), overflow="fold")
-    for line in advice:
-        table.add_row(
-            line.name, *(in_time(line.by_sweeps[n]) if n in line.by_sweeps else "–" for n in budgets)
-        )
+    for row in rows:
+        table.add_row(*row)
     return table
 
 
@@ -181,8 +166,14 @@ def change_table(old: Records, new: Records) -> Any:
     for c in found:
         bad = c.kind in ("lost", "slower")
         factor = f" {c.new / c.old:.3g} times" if c.kind in ("faster", "slower") else ""
-        name = c.solver if c.start == "cold" else f"{c.solver} ({c.start})"
-        cells = (c.case, name, level_name(c.level), seconds(c.old), seconds(c.new), c.kind + factor)
+        cells = (
+            c.case,
+            who(c.solver, c.start),
+            level_name(c.level),
+            seconds(c.old),
+            seconds(c.new),
+            c.kind + factor,
+        )
         table.add_row(*cells, style="red" if bad else "green")
     return table
 
@@ -225,11 +216,13 @@ def print_report(
             "sweeps: share of cases served, residual at the 90th percentile; ≈ as good within noise)",
             highlight=False,
         )
-        advice = tables.advice(records, times)
-        _show_advice(console, advice_table(records, advice, times))
-        if any(line.by_sweeps for line in advice):
+        asked = tuple(times) or tables.time_budgets(records)
+        advice = tables.advice(records, asked)
+        _show_advice(console, _folding(*advice_rows(records, advice, asked)))
+        heads, rows = sweeps_rows(advice)
+        if rows:
             console.print("\n[bold]By sweeps[/]", highlight=False)
-            _show_advice(console, sweeps_table(advice))
+            _show_advice(console, _folding(heads, rows))
         _print_motion(records, console, whole)
     for case in still[:FEW]:
         console.print(
@@ -259,43 +252,26 @@ def print_report(
             console.print(f"  and {len(wrong) - FEW} more", highlight=False)
 
 
-def motion_table(records: Records) -> Any:
-    """Per case and solver: time to each motion error in m/s, the smallest, relative, and its bound."""
-    levels = speed_levels(records)
+def _print_motion(records: Records, console: Console, whole: bool) -> None:
+    """Who gets to each motion error, by structure; each case where that is asked for or few."""
+    if not speed_levels(records):
+        return
+    console.print(BY_MOTION, highlight=False)
+    _show_advice(console, _folding(*speed_rows(records)))
+    heads, rows = moved_rows(records)
+    if not whole and len(rows) > FEW:
+        return
     table = _table()
-    table.add_column("case", overflow="fold")
-    table.add_column("solver", no_wrap=True)
-    for head in (*(f"to {speed_name(x)}" for x in levels), "best", "relative", "bound"):
+    table.add_column(heads[0], overflow="fold")
+    table.add_column(heads[1], no_wrap=True)
+    for head in heads[2:]:
         table.add_column(head, justify="right", no_wrap=True)
     shown = ""
-    for row in moved(records, levels):
-        name = row.solver + ("" if row.start == "cold" else f" ({row.start})")
-        known = [
-            f"{residual(x)}{unit}" if math.isfinite(x) else "–"
-            for x, unit in ((row.best, " m/s"), (row.relative, ""), (row.bound, " √J"))
-        ]
-        times = [seconds(row.times[x]) for x in levels]
-        table.add_row("" if row.case == shown else row.case, name, *times, *known)
-        shown = row.case
-    return table
-
-
-def _print_motion(records: Records, console: Console, whole: bool) -> None:
-    levels = speed_levels(records)
-    if not levels:
-        return
-    found = advice_by_speed(records)
-    table = _table()
-    table.add_column("structure")
-    for x in levels:
-        table.add_column(f"to {speed_name(x)}", overflow="fold")
-    for name in dict.fromkeys(a.family for a in found):
-        table.add_row(name, *(to_level(a) for a in found if a.family == name))
-    console.print(BY_MOTION, highlight=False)
-    _show_advice(console, table)
-    if whole or len(moved(records, levels)) <= FEW:
-        console.print()
-        _show(console, motion_table(records))
+    for case, *cells in rows:
+        table.add_row("" if case == shown else case, *cells)
+        shown = case
+    console.print()
+    _show(console, table)
 
 
 def _print_lost(records: Records, console: Console) -> None:

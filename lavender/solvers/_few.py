@@ -1,7 +1,8 @@
-"""Problems of few rows in one compiled call (`lavender_ext/few/chain.pyx`), and the claim that goes with its counts.
+"""Small problems in one compiled call, and the claim that goes with its counts.
 
-What Python costs outweighs such a problem. The call ends with a solution or not at all: then the solver runs as on any
-problem, from the beginning.
+Few rows of bodies or of A (`lavender_ext/few/chain.pyx`), generalised coordinates where Newton's method is counted to
+cost little (`lavender_ext/few/many.pyx`): what Python costs outweighs such a problem. The call ends with a solution or
+not at all: then the solver runs as on any problem, from the beginning.
 """
 
 from __future__ import annotations
@@ -14,35 +15,54 @@ from typing import Any
 import numpy as np
 
 from lavender._arrays import FloatArray
-from lavender.problem import Problem
+from lavender.problem import LAWS, Problem
 from lavender.registry import FEW
 from lavender.residuals import judged, reference
 from lavender.solution import Claim, Status, Turn
 from lavender.solvers import _rates as rates
 from lavender.solvers._counts import sweep_cost
-from lavender.solvers._gates import (
-    CARRIED_GATE,
-    GENERAL_GATE,
-    NO_GATE,
-    first_look,
-    general_cost,
-    general_first,
-    is_carried,
-)
 from lavender.solvers._newton import general
-from lavender_ext.few.chain import PIVOTS, SWEEPS, VELOCITIES, Chain
+from lavender_ext.few.chain import Chain
 from lavender_ext.few.many import Gate, solve_first
 
-FEW_GENERAL = 1000  # rows in generalised coordinates, where nothing of Python's grows with them
-GATE, ANY = Gate(GENERAL_GATE, CARRIED_GATE), Gate(None)
-LOOSE = Gate(
-    (*GENERAL_GATE[:6], NO_GATE), CARRIED_GATE
-)  # of `newton`, before which no sweeps come on few rows
+FIRST_LOOK, LAST_LOOK = 16, 64  # sweeps before the first look at the residual: so many at least and at most,
+LOOKED = 60e3  # ns, or as cost so much: a look and a cut in the sweeps are not free
 WARM = 1e-3  # relative residual from which an iterate is worth starting from
+# All that `general_cost` reads, by law.
+GENERAL = (
+    rates.GENERAL_START,
+    tuple(rates.GENERAL_ROW[law] for law in LAWS),
+    tuple(rates.GENERAL[law] for law in LAWS),
+    tuple(rates.GENERAL_COUNT[law] for law in LAWS),
+)
+
+
+def general_cost(problem: Problem, largest: int) -> float:
+    """Newton over generalised velocities, `largest` of them in one island [ns]."""
+    law = problem.law
+    step = rates.GENERAL_ROW[law] * problem.m + rates.GENERAL[law] * general.factor_flops(problem, largest)
+    return rates.GENERAL_START + rates.GENERAL_COUNT[law] * step
+
+
+def first_look(per: float) -> int:
+    """Sweeps, each of cost `per` [ns], before their residual is looked at."""
+    return int(min(max(FIRST_LOOK, LOOKED / per), LAST_LOOK))
+
+
+def call_ends_within(problem: Problem, time_limit: float | None) -> bool:
+    """The compiled call takes a quarter of the limit [s] at most: without an end it leaves nothing."""
+    if time_limit is None or (problem.generalized is None and problem.law in ("linear", "lcp")):
+        return True
+    if problem.generalized is not None:
+        cost = general_cost(problem, problem.generalized.nv)
+    else:
+        per = sweep_cost(problem)
+        cost = first_look(per) * per
+    return 4e-9 * cost <= time_limit
 
 
 def prepared(problem: Problem) -> Chain | None:
-    """The chain of a problem, kept with it; None where it has none."""
+    """The chain of a problem of few rows, kept with it; None where it has none."""
     kept = problem.derived.chain
     if kept is None:
         kept = problem.derived.chain = _make(problem) or False
@@ -50,28 +70,12 @@ def prepared(problem: Problem) -> Chain | None:
 
 
 def _make(problem: Problem) -> Chain | None:
-    if not 0 < problem.m <= (FEW if problem.generalized is None else FEW_GENERAL):
+    if not 0 < problem.m <= FEW:
         return None
     reference(problem)
     data, start = problem.metric, problem._start
     relative = data.start_relative
-    if len(data.empty) or relative < 0.0:
-        return None
-    if problem.generalized is not None:
-        if is_carried(problem):
-            return None
-        looked = general.looked_at(problem)
-        if looked.crowded and problem.m > FEW and problem.law in ("linear", "lcp"):
-            return None  # sweeps, or `direct`, may be the end before what fills is counted
-        kernel = general.prepare(problem) if looked.crowded else looked if looked.fits else None
-        if kernel is None:
-            problem.derived.first = False
-            return None
-        problem.derived.first = general_first(problem, kernel.largest)
-        if not problem.derived.first and general_cost(problem, kernel.largest) > rates.GENERAL_FIRST:
-            return None
-        return Chain(data, start, relative, newton=kernel)
-    if problem.cones.has_round or problem.cones.has_rolling:
+    if len(data.empty) or relative < 0.0 or problem.cones.has_round or problem.cones.has_rolling:
         return None
     law = problem.law
     if law in ("linear", "lcp"):
@@ -82,42 +86,43 @@ def _make(problem: Problem) -> Chain | None:
             data, start, relative, matrix=problem.csr_data, band=band, linear=linear, symmetric=symmetric
         )
     split = 0 if problem.rows is None else problem.rows.n_joints
-    return Chain(
-        data, start, relative, split=split, exact=law == "cone", first_look=first_look(sweep_cost(problem))
-    )
+    look = first_look(sweep_cost(problem))
+    return Chain(data, start, relative, split=split, exact=law == "cone", first_look=look)
 
 
 @dataclass(frozen=True)
 class Few:
-    """What `SolverSpec.few` holds: problems of few rows as that solver solves them."""
+    """What `SolverSpec.few` holds: small problems as that solver solves them."""
 
     name: str
-    kinds: tuple[int, ...]
+    gate: Gate | None  # what it may cost over generalised velocities; None: not at all
+    pivots: bool  # bounded rows
+    sweeps: bool  # and cones
     looks: bool = False  # a start that is a solution is the result, one that is none is not started from
 
     def solve(self, problem: Problem, impulse: FloatArray | None, tol: float) -> Any:
         """(what the judge finds, counts) from an impulse (m,) or from doing nothing; None where it is left."""
-        kept = problem.derived
-        if problem.generalized is not None and VELOCITIES not in self.kinds:
+        if not tol > 0.0:
             return None
-        if kept.chain is None and kept.view is not None and VELOCITIES in self.kinds:
-            # Its first solve: what repeated ones are spared, room and islands, is not kept yet.
-            if kept.seen or not 0 < problem.m <= FEW_GENERAL:
-                chain = prepared(problem)
-            else:
-                kept.seen = True
-                gate = GATE if self.looks else LOOSE
-                found = solve_first(kept.view, impulse, tol, gate, general.ROOM) if tol > 0.0 else None
-                if found is not None:
-                    return found or None  # the chain would take the same steps in vain
-                chain = prepared(problem)
-        else:
-            chain = prepared(problem)
-        if chain is None or chain.kind not in self.kinds or not tol > 0.0:
+        if problem.generalized is not None:
+            return None if self.gate is None else self._over_velocities(problem, impulse, tol)
+        chain = prepared(problem)
+        if chain is None or not (self.pivots if chain.pivots else self.sweeps):
             return None
-        if self.looks and kept.first is False:
-            return None  # sweeps come before
         return chain.run(impulse, tol, self.looks, WARM, self.looks)
+
+    def _over_velocities(self, problem: Problem, impulse: FloatArray | None, tol: float) -> Any:
+        kept = problem.derived
+        if problem.m == 0:
+            return None
+        if kept.vain is not None:
+            at = (problem._start if impulse is None else impulse).tobytes()
+            if kept.vain == (self.name, tol, at):
+                return None
+        found = solve_first(kept.view, impulse, tol, self.gate, general.ROOM)
+        if found is False:  # the steps of who solves it the long way need not come twice before
+            kept.vain = (self.name, tol, (problem._start if impulse is None else impulse).tobytes())
+        return found or None
 
     def turns(
         self, problem: Problem, claim: Claim, start: FloatArray | None, after: float
@@ -129,10 +134,9 @@ class Few:
         """What the solver says of a chain that did so much, word for word."""
         if counts is None:
             return Claim(Status.CONVERGED, 0, {}, "the start is a solution")
-        kind = VELOCITIES if problem.generalized is not None else problem.derived.chain.kind
-        if kind == VELOCITIES:
+        if problem.generalized is not None:
             return general.named(general.claim(Status.CONVERGED, counts), self.name)
-        if kind == PIVOTS:
+        if problem.derived.chain.pivots:
             done, swept, refined, factored, exchanged, shifts, rank, path = counts
             named = {
                 "sweeps": 4 * swept,
@@ -188,6 +192,6 @@ def said(name: str, work: Mapping[str, int]) -> str:
     return name
 
 
-AUTO = Few("auto", (VELOCITIES, PIVOTS, SWEEPS), looks=True)
-DIRECT = Few("direct", (PIVOTS,))
-NEWTON = Few("newton", (VELOCITIES,))
+AUTO = Few("auto", Gate(GENERAL, rates.GENERAL_FIRST), True, True, looks=True)
+DIRECT = Few("direct", None, True, False)
+NEWTON = Few("newton", Gate(GENERAL, rates.GENERAL_MOST), False, False)

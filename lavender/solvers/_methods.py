@@ -21,7 +21,6 @@ from lavender.solvers._log import SolveLog
 from lavender.solvers._newton import general
 from lavender.solvers._plan import BOTH_WAYS, METHODS, TABLE, Cost, Costs
 from lavender.solvers._schedule import AGAIN, GIVEN_UP, remainder
-from lavender.solvers._split import solve_together
 from lavender.solvers._sweeping import STATUS
 from lavender.solvers.direct import Enough, Impatient
 from lavender.solvers.newton import NewtonState
@@ -336,22 +335,13 @@ class Direct(Finite):
         return claim
 
 
-class Islands(Candidate):
-    """One turn: every small island by itself, to its share of the tolerance; what that leaves is for the others."""
-
-    def run(self, work: float, others: float) -> bool:
-        log = self.log
-        solve_together(log, log.left, min(work, others) / log.problem.m)
-        return False
-
-
 def _offer(log: SolveLog, impulse: FloatArray) -> None:
     if np.isfinite(impulse).all():
         log.offer(impulse)
 
 
 KINDS: dict[str, type[Candidate]] = {
-    "newton": Newton, "direct": Direct, "anderson": Sweeps, "islands": Islands, "relaxation": Relaxation,
+    "newton": Newton, "direct": Direct, "anderson": Sweeps, "relaxation": Relaxation,
 }  # fmt: skip
 
 

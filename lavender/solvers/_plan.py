@@ -20,7 +20,6 @@ from typing import Any
 
 from lavender.errors import InputError
 from lavender.problem import Problem
-from lavender.registry import FEW
 from lavender.solvers._structure import Structure
 
 __all__ = ["METHODS", "READ", "TABLE", "Cost", "Costs", "Plan", "candidates", "made", "rates", "structure_of"]
@@ -37,8 +36,6 @@ METHODS: dict[str, tuple[str, dict[str, Any]]] = {
     "admm": ("admm", {}),
     # Of Coulomb's law: its answer is the law's own wherever contacts stick.
     "relaxation": ("anderson", {}),
-    # Each island by itself, in compiled code (`_split.py`): sweeps, pivots or velocities.
-    "islands": ("anderson", {}),
 }
 _GIVEN = {
     "linear": ("direct", "anderson", "newton"),
@@ -46,8 +43,7 @@ _GIVEN = {
     "cone": ("anderson", "newton"),
     "coulomb": ("anderson", "newton", "admm"),
 }
-#: At most four for each law and operator, `islands` in place of the last where the problem divides; "round": cones of
-#: more than two tangents.
+#: At most four for each law and operator; "round": cones of more than two tangents.
 TABLE: dict[str, dict[str, tuple[str, ...]]] = {
     "rows": _GIVEN
     | {"lcp": ("anderson", "direct", "newton"), "coulomb": ("anderson", "newton", "relaxation")},
@@ -62,7 +58,6 @@ TABLE: dict[str, dict[str, tuple[str, ...]]] = {
 }
 BOTH_WAYS = 2.0  # sweeps of an iteration in the symmetric order
 READ = 4.0  # times that what steps over velocities read is read before the first (fitted to curves: 3.6)
-SPARED = 0.25  # of the sweeps of the whole, that small islands take when each goes on for itself
 SIXTH = 6.0  # decades that counts of sweeps are fitted for
 
 
@@ -245,10 +240,6 @@ class Costs:
             return self._finite("direct", s.direct)
         if name == "relaxation":
             return self._relaxation() if s.is_loose else Cost(inf, 1.0, 1.0)
-        if name == "islands":
-            # The others have ended while sweeps of the whole go on for the one that needs most of them.
-            whole, share = self.of("anderson"), SPARED + (1.0 - SPARED) * s.largest
-            return Cost(whole.setup, whole.each, share * whole.count)
         if name == "admm":
             a, (factored, fill) = r["admm"], s.admm(1.0)
             setup = a["start"] + r["formed"] * s.formed + a["factor"] * factored
@@ -285,15 +276,11 @@ def candidates(structure: Structure) -> tuple[str, ...]:
     if problem.cones.has_round:
         return TABLE["generalized"]["round"]
     names = TABLE[problem.operator][problem.law]
-    if problem.law != "linear" and structure.divides:
-        names = (*names[:3], "islands")
     return names if structure.is_definite else tuple(name for name in names if name != "direct")
 
 
 def made(problem: Problem, tol: float) -> Plan:
     """The plan of a problem to `tol`, counted in full; nothing is run."""
-    from lavender.solvers._few import FEW_GENERAL
-    from lavender.solvers._gates import general_first
     from lavender.solvers._log import SolveLog
     from lavender.solvers._methods import make
     from lavender.solvers._schedule import first
@@ -302,12 +289,8 @@ def made(problem: Problem, tol: float) -> Plan:
     methods = make(SolveLog(problem, tol, 2**31 - 1), costs, candidates(costs.structure))
     chosen = first(methods)
     counted = sorted(((m.name, costs.of(m.name)) for m in methods), key=lambda pair: pair[1].total)
-    kernel = costs.structure.kernel
-    over_velocities = (
-        kernel is not None and problem.m <= FEW_GENERAL and general_first(problem, kernel.largest)
-    )
     return Plan(
         rows=problem.m, law=problem.law, operator=problem.operator, structure=structure_of(problem), tol=tol,
-        small=problem.m <= FEW or over_velocities, first=(chosen.name, chosen.steps(chosen.rest)),
+        small=costs.structure.is_small, first=(chosen.name, chosen.steps(chosen.rest)),
         candidates=tuple((name, cost) for name, cost in counted if cost.total < inf),
     )  # fmt: skip

@@ -23,16 +23,7 @@ GENERAL_START = 60e3
 GENERAL_ROW = {"linear": 40.0, "lcp": 100.0, "cone": 140.0, "coulomb": 400.0}
 GENERAL = {"linear": 0.1, "lcp": 0.06, "cone": 0.06, "coulomb": 0.02}
 GENERAL_COUNT = {"linear": 5.0, "lcp": 5.0, "cone": 12.0, "coulomb": 30.0}
-GENERAL_FIRST = 0.6e6  # ns of it up to which nothing else is looked at first
-FORM = 1.0  # of each multiply-add of Y Y^T
-# The same under Coulomb's law on few rows as it usually is: a call, steps, each row and multiply-add in one of them;
-# and sweeps: all that Python does for them, so many as end half of these, and each row in one of them.
-FEW_CALL, FEW_STEPS, FEW_STEP_ROW, FEW_STEP_FLOP = 30e3, 22.0, 60.0, 0.09
-FEW_LOOK, FEW_SWEEPS, FEW_SWEEP_ROW = 40e3, 25.0, 40.0
-SOFT = 1e-3  # of d, that rows of soft contacts have of their own (`soften` in lavender_ext/generalized/newton.pxd)
+GENERAL_FIRST = 0.9e6  # ns of it up to which nothing else is looked at first,
+GENERAL_MOST = 1e7  # and up to which nobody looks at the clock in between
 FORMED_START, FORMED = 60e3, 2.0  # of A formed of J and M, and of each of its entries,
 FORMED_ROWS = 6.0  # or over bodies
-# Sweeps that A costs at least as much to form as, with their call, where one body carries many.
-SWEEP_START, CARRIED = 80e3, 12.0
-# Of islands in compiled code: half bandwidth up to which a band is factored, and factors of `direct` to expect.
-NARROW, DIRECT = 40, {"linear": 1.5, "lcp": 6.0}

@@ -13,16 +13,14 @@ from typing import Any
 
 import numpy as np
 
-from lavender._arrays import IntArray
 from lavender.problem import Problem
 from lavender.registry import FEW
 from lavender.solvers import _rates as weights
 from lavender.solvers._accelerated import sweep_work
 from lavender.solvers._counts import dense_factor, newton_factor, sparse_factor
 from lavender.solvers._factor import PanelsLU, choose, filled_cost, panels_cost
-from lavender.solvers._few import FEW_GENERAL
-from lavender.solvers._gates import general_first
-from lavender.solvers._islands import block_bodies, islands
+from lavender.solvers._few import general_cost
+from lavender.solvers._islands import block_bodies
 from lavender.solvers._newton import general
 from lavender.solvers._newton.systems import System, make_system
 from lavender.solvers._sweeping import reads_whitened
@@ -70,32 +68,12 @@ class Structure:
         return lu * entries * (1.0 + self.m / 1000.0), n * lu * fill
 
     @cached_property
-    def islands(self) -> tuple[int, IntArray]:
-        """How many, and the island of each block."""
-        return islands(self.problem)
-
-    @cached_property
-    def largest(self) -> float:
-        """Share of the rows that the largest island has."""
-        rows = np.bincount(self.islands[1], weights=np.diff(self.problem.cones.ptr))
-        return float(rows.max() / self.m)
-
-    @cached_property
     def is_loose(self) -> bool:
         """Nearly every contact between two bodies of its own, not one of a face: sweeps then settle which stick."""
         p = self.problem
         if p.rows is None or not p.rows.n_bodies:
             return False
         return 4 * graph.body_pairs(block_bodies(p), p.rows.n_bodies, True) > 3 * p.n_blocks
-
-    @property
-    def divides(self) -> bool:
-        """No island has more than half of the rows, and some have more than a block, which a sweep solves."""
-        p = self.problem
-        if p.generalized is not None or 2.0 * self.entries > float(p.m) ** 2:
-            return False  # islands of half of the rows at most have no more entries than that
-        count = self.islands[0]
-        return 1 < count < p.n_blocks and self.largest <= 0.5
 
     # -- factors of A ------------------------------------------------------------------------------
 
@@ -192,8 +170,13 @@ class Structure:
     @cached_property
     def goes_first(self) -> bool:
         """It is what the compiled call for few rows does."""
-        few = self.m <= FEW_GENERAL and self.kernel is not None
-        return few and general_first(self.problem, self.kernel.largest)
+        kernel = self.kernel
+        return kernel is not None and general_cost(self.problem, kernel.largest) <= weights.GENERAL_FIRST
+
+    @property
+    def is_small(self) -> bool:
+        """One compiled call is tried before all else."""
+        return self.goes_first or (self.problem.generalized is None and self.m <= FEW)
 
     @cached_property
     def velocities(self) -> float:

@@ -19,11 +19,10 @@ import numpy as np
 from lavender._arrays import FloatArray
 from lavender.deadline import Deadline
 from lavender.problem import OPERATORS, Problem
-from lavender.registry import FEW, SolverSpec
+from lavender.registry import SolverSpec
 from lavender.solution import Claim, Status
 from lavender.solvers._certify import certify
-from lavender.solvers._few import AUTO, FEW_GENERAL
-from lavender.solvers._gates import call_ends_within
+from lavender.solvers._few import AUTO, call_ends_within
 from lavender.solvers._log import SolveLog
 from lavender.solvers._methods import in_short_time, make
 from lavender.solvers._plan import Costs, Plan, candidates
@@ -64,8 +63,7 @@ class Auto:
     ) -> Claim:
         problem = state
         deadline = Deadline(time_limit)
-        most = FEW if problem.generalized is None else FEW_GENERAL
-        if problem.m <= most and n >= ONE_CALL and call_ends_within(problem, time_limit):
+        if n >= ONE_CALL and call_ends_within(problem, time_limit):
             made = AUTO.solve(problem, impulse, tol)
             claim = None if made is None else AUTO.claim(problem, made[1])
             if made is not None and claim is not None and claim.iterations <= n:

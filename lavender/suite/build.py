@@ -21,6 +21,7 @@ __all__ = [
     "manifold",
     "sideways",
     "static_loads",
+    "tower",
 ]
 
 GRAVITY = 9.81  # m/s^2, along -z
@@ -112,6 +113,13 @@ def manifold(body: Any, centre: Any, half_x: Any, half_y: float = 0.5) -> Contac
     point[:, 0] += (half[:, None] * sign[:, 0]).ravel()
     point[:, 1] += np.tile(half_y * sign[:, 1], len(body))
     return Contacts(np.repeat(np.asarray(body), 4, axis=0), point, [0.0, 0.0, 1.0])
+
+
+def tower(n: int) -> tuple[FloatArray, IntArray, FloatArray]:
+    """Unit bodies on each other: positions (n, 3), pairs (n, 2) from the ground on, and feet (n, 3) [m]."""
+    k = np.arange(n)
+    foot = np.stack([0.0 * k, 0.0 * k, k], 1)
+    return foot + np.array([0.0, 0.0, 0.5]), np.stack([k - 1, k], 1), foot
 
 
 def sideways(bodies: Bodies, speed: float, seed: int = 5) -> None:

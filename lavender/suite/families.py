@@ -25,6 +25,7 @@ from lavender.suite.build import (
     manifold,
     sideways,
     static_loads,
+    tower,
 )
 from lavender.suite.case import Draft, Reference, family
 from lavender.suite.exact import at_rest, solve_boxed, solve_linear
@@ -81,10 +82,10 @@ def stack(n: int = 64, mass_ratio: float = 1.0, friction: str = "none", sliding:
     positive(mass_ratio=mass_ratio)
     mass = np.ones(n)
     mass[-1] = mass_ratio
-    k = np.arange(n)
-    bodies = Bodies(np.stack([0.0 * k, 0.0 * k, 0.5 + k], 1), mass, SPHERE)
+    position, pairs, foot = tower(n)
+    bodies = Bodies(position, mass, SPHERE)
     sideways(bodies, sliding)
-    contacts = Contacts(np.stack([k - 1, k], 1), np.stack([0.0 * k, 0.0 * k, k], 1), [0.0, 0.0, 1.0])
+    contacts = Contacts(pairs, foot, [0.0, 0.0, 1.0])
     problem = contact_problem(bodies, contacts, friction, MU)
     reason = "information must travel from the ground to the top: sweeps grow as n^2, a tridiagonal factorisation as n"
     if friction != "none" and sliding != 0.0:
@@ -126,11 +127,10 @@ def box_stack(n: int = 10, mass_ratio: float = 1.0, friction: str = "none", slid
 def _column(n: int, mass_ratio: float) -> tuple[Bodies, Contacts]:
     at_least(1, n=n)
     positive(mass_ratio=mass_ratio)
-    k = np.arange(n)
     mass = np.ones(n)
     mass[-1] = mass_ratio
-    bodies = Bodies(np.stack([0.0 * k, 0.0 * k, 0.5 + k], 1), mass, BOX)
-    return bodies, manifold(np.stack([k - 1, k], 1), np.stack([0.0 * k, 0.0 * k, k], 1), 0.5)
+    position, pairs, foot = tower(n)
+    return Bodies(position, mass, BOX), manifold(pairs, foot, 0.5)
 
 
 @family(pyramidF=WITH_FRICTION)
@@ -388,17 +388,17 @@ def toy_stack(kick: float = 1.0, friction: str = "none") -> Draft:
         raise InputError(f"kick is {kick}; upwards (0 or more) is needed")
     if friction not in ("none", "box"):
         raise InputError(f"friction is {friction!r}; none, box are known")
-    k = np.arange(n)
-    bodies = Bodies(np.stack([0.0 * k, 0.0 * k, 0.5 + k], 1), 1.0, SPHERE)
+    position, pairs, foot = tower(n)
+    bodies = Bodies(position, 1.0, SPHERE)
     bodies.v_free[4, 2] += kick
-    contacts = Contacts(np.stack([k - 1, k], 1), np.stack([0.0 * k, 0.0 * k, k], 1), [0.0, 0.0, 1.0])
+    contacts = Contacts(pairs, foot, [0.0, 0.0, 1.0])
     reason = "eight contacts that fit on a page, one of which must open"
     if friction == "none":
         problem = contact_problem(bodies, contacts)
         return Draft(
             problem, reason, lambda: Reference(_toy_solution(problem.b), "active set known: contact 4 open")
         )
-    bodies.v_free[:, 0] = 0.05 * (k + 1)
+    bodies.v_free[:, 0] = 0.05 * np.arange(1, n + 1)
     problem = _boxed(bodies, contacts)
     return Draft(problem, reason + ", with friction bounded by fixed loads", boxed_reference(problem))
 

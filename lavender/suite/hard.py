@@ -12,7 +12,16 @@ import numpy as np
 from lavender.errors import InputError
 from lavender.problem import Problem
 from lavender.rows import Rows
-from lavender.suite.build import FALL, Bodies, Contacts, contact_problem, joint_problem, manifold, sideways
+from lavender.suite.build import (
+    FALL,
+    Bodies,
+    Contacts,
+    contact_problem,
+    joint_problem,
+    manifold,
+    sideways,
+    tower,
+)
 from lavender.suite.case import Draft, Reference, family
 from lavender.suite.exact import solve_linear
 from lavender.suite.families import BOX, MU, SPHERE, at_least, ball_joints, positive, rest_reference
@@ -241,9 +250,8 @@ def units(kg: float = 1e12, m: float = 1.0, s: float = 1.0, n: int = 5) -> Draft
     """The box stack in other units: masses times kg, lengths times m, times times s. No relative error may move."""
     positive(kg=kg, m=m, s=s)
     at_least(1, n=n)
-    k = np.arange(n)
-    bodies = Bodies(np.stack([0.0 * k, 0.0 * k, 0.5 + k], 1), 1.0, BOX)
-    contacts = manifold(np.stack([k - 1, k], 1), np.stack([0.0 * k, 0.0 * k, k], 1), 0.5)
+    position, pairs, foot = tower(n)
+    bodies, contacts = Bodies(position, 1.0, BOX), manifold(pairs, foot, 0.5)
     arm_a, arm_b = contacts.arms(bodies.position)
     speed = np.repeat([m / s, 1.0 / s], 3)
     rows = Rows(
@@ -259,7 +267,7 @@ def units(kg: float = 1e12, m: float = 1.0, s: float = 1.0, n: int = 5) -> Draft
     problem = Problem.from_rows(rows)
 
     def closed_form() -> Reference:
-        load = FALL * kg * m / s * (n - k)
+        load = FALL * kg * m / s * (n - np.arange(n))
         return Reference(np.repeat(0.25 * load, 4), "closed form: the weight above", "slack")
 
     return Draft(problem, "tolerances with a hidden unit show", closed_form)

@@ -1,1 +1,1 @@
-"""Problems of few rows: look, solve and judge in one call, over kernels of other rooms; islands as such problems."""
+"""Small problems: look, solve and judge in one call, over kernels of other rooms; batches of them."""

@@ -1,20 +1,20 @@
 """Many problems in generalised coordinates, one after the other without the interpreter: prepare, solve, judge.
 
-The same kernels in the same order as on one problem alone (`chain.pyx`), so the same bits and counts. Of what is worked
-out of a problem's data the error of doing nothing stays with it; d and Y are made in the same room for one after the
-other, since fresh pages for each cost more than both. A problem that does not end below tol on the judge's own measure,
-has empty rows or is more than what Newton's method is asked for first, is left to the caller.
+The same kernels in the same order as on one problem alone (`generalized/newton.pyx`), so the same bits and counts. Of
+what is worked out of a problem's data the error of doing nothing stays with it; d and Y are made in the same room for
+one after the other, since fresh pages for each cost more than both. A problem that does not end below tol on the judge's
+own measure, has empty rows or is counted to cost more than is asked for, is left to the caller.
 """
 from cpython.exc cimport PyErr_CheckSignals
 from libc.stdint cimport int32_t
-from libc.stdlib cimport calloc, free
+from libc.stdlib cimport calloc, free, malloc
 from libc.string cimport memcpy
 
 import numpy as np
 
 from lavender_ext.core.block cimport COULOMB, ROW, blocks_t
-from lavender_ext.core.problem cimport MADE, Data, entries_of, made_t, make_numbers
-from lavender_ext.few.many cimport LEFT, SOLVED, Gate, gate_t, job_t, space_t, with_marks, with_numbers
+from lavender_ext.core.generalized cimport generalized_t
+from lavender_ext.core.problem cimport MADE, Data, made_t, make_numbers
 from lavender_ext.generalized.islands cimport aim_at, furnish, marks_of, need_t, numbers_of, settle
 from lavender_ext.generalized.flow cimport flow_t
 from lavender_ext.generalized.newton cimport DONE, descend_all
@@ -24,11 +24,67 @@ from lavender_ext.judge.score cimport are_numbers, relative, score_rows, score_t
 
 
 cdef enum:
+    LEFT = 0                    # to the caller
+    SOLVED = 1
+
+cdef enum:
     STEPS = 64                  # of newton
     AT_A_TIME = 256             # problems between two looks for Ctrl-C
 
 
-cdef void begin(job_t* j, double* w) noexcept nogil:
+cdef struct gate_t:             # what Newton's method may be counted to cost [ns] to be asked at all
+    double start
+    double row[4]               # by law: linear, lcp, coulomb, cone
+    double factor[4]
+    double count[4]             # factorisations by law
+    double most
+
+
+cdef struct job_t:
+    blocks_t p
+    generalized_t g
+    made_t made                 # of the data, or in this call; NULL between
+    double begin[3]             # E0, V0, relative residual of doing nothing; E0 < 0 where not known
+    int32_t law                 # as `gate_t.count`
+    int32_t cold                # 1: from doing nothing, else from lam as it is
+    int32_t end
+    int32_t counts[5]           # steps, factorisations, updates, rounds, evaluations
+    double* lam                 # (m)
+    double* both                # (2 m + 1) w, e
+    score_t score
+    double relative, floor
+
+
+cdef struct space_t:            # one after the other in the same room
+    int32_t* marks
+    ssize_t n_marks
+    double* numbers
+    ssize_t n_numbers
+
+
+cdef inline int32_t with_numbers(space_t* s, ssize_t n) noexcept nogil:
+    if n > s.n_numbers:
+        free(s.numbers)
+        s.n_numbers = 2 * n
+        s.numbers = <double*>malloc(s.n_numbers * sizeof(double))
+        if s.numbers == NULL:
+            s.n_numbers = 0
+            return 0
+    return 1
+
+
+cdef inline int32_t with_marks(space_t* s, ssize_t n) noexcept nogil:
+    if n > s.n_marks:
+        free(s.marks)
+        s.n_marks = 2 * n
+        s.marks = <int32_t*>malloc(s.n_marks * sizeof(int32_t))
+        if s.marks == NULL:
+            s.n_marks = 0
+            return 0
+    return 1
+
+
+cdef inline void begin(job_t* j, double* w) noexcept nogil:
     """E0, V0 and the relative residual of doing nothing; w (3 m + n) is scratch."""
     cdef score_t s = score_t(0.0, 0.0, 0.0, 0.0, -1, 1)
     cdef int32_t m = j.p.n_rows
@@ -42,67 +98,15 @@ cdef void begin(job_t* j, double* w) noexcept nogil:
     reference_of(&j.p, &s, moves, False, j.begin)
 
 
-cdef inline bint are_soft(const blocks_t* p, const generalized_t* g, double share) noexcept nogil:
-    """Has every row of every contact `share` d of its own?"""
-    cdef int32_t i, k
-    for i in range(p.n_blocks):
-        if p.kind[i] != ROW:
-            for k in range(p.ptr[i], p.ptr[i + 1]):
-                if not g.compliance[k] >= share * p.d[k]:
-                    return False
-    return True
-
-
-def contacts_are_soft(Data p, double share):
-    """Has every row of every contact of J and M `share` d of its own?"""
-    if not (p.is_general and p.ready):
-        raise ValueError("J and M are needed, and d")
-    return bool(are_soft(&p.blocks, &p.general, share))
-
-
-cdef inline bint is_first(const job_t* j, const gate_t* gate, int32_t largest) noexcept nogil:
-    """The first tests of `general_first` in lavender/solvers/_gates.py, in the same order of operations."""
-    cdef double flops, cost, entries
-    if gate.is_open:
-        return True
-    flops = <double>j.g.n * (<double>largest * <double>largest) / 6.0
+cdef inline bint is_cheap(const job_t* j, const gate_t* gate, int32_t largest) noexcept nogil:
+    """`general_cost` of lavender/solvers/_few.py, in the same order of operations, is no more than the gate lets in."""
+    cdef double flops = <double>j.g.n * (<double>largest * <double>largest) / 6.0
     if j.law == 2:
         flops = 2.0 * flops
-    cost = gate.start + gate.count[j.law] * (gate.row[j.law] * j.p.n_rows + gate.factor[j.law] * flops)
-    if j.law == 2 and j.p.n_rows <= gate.rigid[0]:
-        if gate.rigid[1] * j.p.n_rows + gate.rigid[2] * flops <= gate.rigid[3]:
-            return True
-        if not are_soft(&j.p, &j.g, gate.rigid[4]):
-            return False
-    if cost <= gate.most:
-        return True
-    entries = 0.5 * (<double>(2 * <ssize_t>j.g.pval[j.g.n_panels] + 4 * <ssize_t>j.p.n_rows) - 4.0 * j.p.n_rows)
-    return cost <= gate.form * entries * entries / <double>(j.g.n if j.g.n > 1 else 1)
+    return gate.start + gate.count[j.law] * (gate.row[j.law] * j.p.n_rows + gate.factor[j.law] * flops) <= gate.most
 
 
-cdef inline bint is_swept(const job_t* j, const gate_t* gate, double* w) noexcept nogil:
-    """`is_carried` of lavender/solvers/_gates.py; w (n) is scratch."""
-    cdef int32_t m = j.p.n_rows
-    cdef double work
-    if gate.is_open or j.law != 1 or m <= gate.few:
-        return False
-    work = <double>(2 * <ssize_t>j.g.pval[j.g.n_panels] + 4 * <ssize_t>m)
-    return gate.formed * entries_of(&j.g, w) >= gate.call + gate.carried * (gate.swept * work + gate.of_row * m)
-
-
-cdef void solve_job(job_t* j, space_t* space, const gate_t* gate, double tol, double most) noexcept nogil:
-    cdef bint known = j.made.marks != NULL
-    if not known and make_numbers(&j.p, &j.g, &j.made) != MADE:
-        return
-    solve_made(j, space, gate, tol, most)
-    if not known:
-        free(j.made.marks)
-        free(j.made.numbers)
-    j.made.marks = NULL
-    j.made.numbers = NULL
-
-
-cdef void solve_made(job_t* j, space_t* space, const gate_t* gate, double tol, double most) noexcept nogil:
+cdef inline void solve_made(job_t* j, space_t* space, const gate_t* gate, double tol, double most) noexcept nogil:
     cdef flow_t f
     cdef need_t need
     cdef int32_t m = j.p.n_rows, end, i
@@ -113,12 +117,10 @@ cdef void solve_made(job_t* j, space_t* space, const gate_t* gate, double tol, d
         if not with_numbers(space, 3 * <ssize_t>m + j.g.n):
             return
         begin(j, space.numbers)
-    if not with_numbers(space, j.g.n) or is_swept(j, gate, space.numbers):
-        return
     if not with_marks(space, marks_of(&j.p, &j.g, PER_COLUMN)):
         return
     settle(&f, &j.p, &j.g, PER_COLUMN, space.marks, &need)
-    if need.crowded or need.values > most or not is_first(j, gate, need.wide):
+    if need.crowded or need.values > most or not is_cheap(j, gate, need.wide):
         return
     if not with_numbers(space, numbers_of(&f, &need)):
         return
@@ -157,7 +159,19 @@ cdef void solve_made(job_t* j, space_t* space, const gate_t* gate, double tol, d
         j.end = SOLVED
 
 
-cdef int32_t law_of(const blocks_t* p) noexcept nogil:
+cdef inline void solve_job(job_t* j, space_t* space, const gate_t* gate, double tol, double most) noexcept nogil:
+    cdef bint known = j.made.marks != NULL
+    if not known and make_numbers(&j.p, &j.g, &j.made) != MADE:
+        return
+    solve_made(j, space, gate, tol, most)
+    if not known:
+        free(j.made.marks)
+        free(j.made.numbers)
+    j.made.marks = NULL
+    j.made.numbers = NULL
+
+
+cdef inline int32_t law_of(const blocks_t* p) noexcept nogil:
     """0 where every row is free, 1 where bounds are constants, 2 with Coulomb's friction, 3 with the cone's."""
     cdef int32_t i, k, law = 0
     cdef double inf = 1.0 / 0.0
@@ -175,28 +189,22 @@ cdef int32_t law_of(const blocks_t* p) noexcept nogil:
 
 
 cdef class Gate:
-    """What Newton's method may cost to be asked first, in the words of `general_first`; and where sweeps are, of `is_carried`.
+    """What Newton's method may be counted to cost to be asked, in the words of `general_cost`.
 
     Parameters
     ----------
-    gate : tuple (start, rows, factors, most, form, counts, rigid) or None
-        None: whatever it costs.
-    sweeps : tuple (few, formed, call, carried, per, row), optional
-        None: nowhere.
+    rates : tuple (start, rows, factors, counts)
+        ns; by law.
+    most : float
+        ns
     """
+    cdef gate_t at
 
-    def __init__(self, gate, sweeps=None):
-        self.at.is_open = gate is None
-        self.at.few = 2**31 - 1
-        if sweeps is not None:
-            (self.at.few, self.at.formed, self.at.call, self.at.carried, self.at.swept, self.at.of_row) = sweeps
-        if gate is not None:
-            (self.at.start, rows, factors, self.at.most, self.at.form, counts, rigid) = gate
-            for i in range(5):
-                self.at.rigid[i] = rigid[i]
-            for i in range(4):
-                self.at.row[i], self.at.factor[i] = rows[i], factors[i]
-                self.at.count[i] = counts[i]
+    def __init__(self, rates, double most):
+        self.at.start, rows, factors, counts = rates
+        self.at.most = most
+        for i in range(4):
+            self.at.row[i], self.at.factor[i], self.at.count[i] = rows[i], factors[i], counts[i]
 
 
 def solve_first(Data p, start, double tol, Gate gate, double most):

@@ -4,8 +4,8 @@ import dataclasses
 import itertools
 import json
 import math
-import os
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,9 +14,9 @@ import lavender as lv
 from lavender import bench, registry
 from lavender.bench import cases as bench_cases
 from lavender.bench import machine, store
+from lavender.bench.line import c_of, code_of
 from lavender.bench.record import Record, from_json, to_json
 from lavender.bench.running import runner, timing
-from lavender.bench.running.worker import Worker
 
 
 def chain(n, name="chain", **more):
@@ -253,13 +253,6 @@ def test_an_unwritable_place_is_known_before_anything_runs(tmp_path):
         bench.Store(tmp_path / "file" / "records.jsonl")
 
 
-@pytest.mark.parametrize("text", ['{"kind": "record"}', '{"kind": "other"}', "[1]", "words"])
-def test_a_file_of_something_else_is_refused(tmp_path, text):
-    (tmp_path / "records.jsonl").write_text(text + "\n")
-    with pytest.raises(lv.InputError, match="line 1"):
-        bench.read(tmp_path)
-
-
 def test_json_and_csv_hold_every_number(tmp_path):
     records = bench.run([stack(6), chain(4, guess=np.ones(4))], ["pgs", "direct"], QUICK)
     store.write_json(records, tmp_path / "r.json")
@@ -401,95 +394,6 @@ def test_a_fingerprint_sees_every_number():
     assert bench_cases.fingerprint(stack(5, "renamed")) == prints[0]
 
 
-# -- a process of its own ------------------------------------------------------------------------
-
-BACKENDS = """
-import os, signal, sys, time
-import numpy as np
-import lavender as lv
-
-class Backend:
-    def __init__(self, what): self.what = what
-    def prepare(self, problem): return problem
-    def update(self, state, problem): return problem
-    def run(self, state, impulse, n, tol, time_limit=None):
-        if self.what == "hang":
-            while True: time.sleep(1)
-        if self.what == "segfault": os.kill(os.getpid(), signal.SIGSEGV)
-        if self.what == "exit": os._exit(3)
-        if self.what == "eat": self.all = [np.empty(4 * 10**7) for _ in range(1000)]
-        if self.what == "talk":
-            print("noise" * 10000, flush=True); os.write(1, b"more noise"); print("noise", file=sys.stderr)
-            impulse[:] = state.b / state.matrix.diagonal()
-        return lv.Claim(lv.Status.CONVERGED, 1, {"calls": 1}, str(os.getpid()))
-
-def make(what):
-    def factory(): return Backend(what)
-    return factory
-
-hang, segfault, exit_, eat, talk = map(make, ("hang", "segfault", "exit", "eat", "talk"))
-
-def spec(name, factory):
-    return lv.SolverSpec(name, "fake_backends:" + factory, laws={"linear", "lcp"}, summary="test", resumable=False,
-                         requires=("fake_backends",))
-names = {"hang": "hang", "segfault": "segfault", "exit": "exit_", "eat": "eat", "talk": "talk"}
-HANG, SEGFAULT, EXIT, EAT, TALK = (spec(name, factory) for name, factory in names.items())
-"""
-
-
-@pytest.fixture
-def plugin(tmp_path, monkeypatch):
-    """An installed plug-in, as the worker process finds it: through its entry points."""
-    folder = tmp_path / "site"
-    info = folder / "fake_backends-1.0.dist-info"
-    info.mkdir(parents=True)
-    (folder / "fake_backends.py").write_text(BACKENDS)
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: fake-backends\nVersion: 1.0\n")
-    names = ("hang", "segfault", "exit", "eat", "talk")
-    lines = [f"{n} = fake_backends:{n.upper()}" for n in names]
-    (info / "entry_points.txt").write_text("[lavender.solvers]\n" + "\n".join(lines) + "\n")
-    monkeypatch.setattr(registry, "_registered", dict(registry.specs()))
-    monkeypatch.syspath_prepend(str(folder))
-    registry._load_builtin_and_plugins.cache_clear()
-    yield names
-    registry._load_builtin_and_plugins.cache_clear()
-
-
-def task(problem, solver, **more):
-    return bench.Task("run", "case", bench_cases.fingerprint(problem), solver, "tol", 1e-6, 0, 0.05, **more)
-
-
-def test_a_backend_that_hangs_or_dies_costs_its_own_record(plugin):
-    p = lv.Problem.linear(np.diag([1.0, 2.0]), np.ones(2))
-    with Worker(memory=2**31, grace=1.0) as worker:
-        found = {
-            name: worker.measure(p, task(p, name)) for name in ("talk", "hang", "segfault", "exit", "eat")
-        }
-        after = worker.measure(p, task(p, "talk"))
-    assert found["hang"].status == "KILLED"
-    assert found["segfault"].status == "CRASHED (SIGSEGV)"
-    assert found["exit"].status == "CRASHED (exit status 3)"
-    assert found["eat"].status == "NUMERICAL_ERROR"
-    assert "MemoryError" in found["eat"].message
-    for record in (found["talk"], after):
-        assert record.status == "CONVERGED"
-        assert record.relative == 0.0
-        assert int(record.message) != os.getpid()
-
-
-def test_a_whole_run_survives_its_backends(plugin, monkeypatch):
-    from lavender.bench.running import worker
-
-    monkeypatch.setattr(worker, "GRACE", 0.5)
-    plan = bench.Plan(levels=(1e-3,), budgets=(), repeats=1, time_limit=0.05)
-    started = time.monotonic()
-    records = bench.run([stack(4)], ["hang", "segfault", "pgs", "talk"], plan)
-    assert [r.solver for r in records] == ["hang", "segfault", "pgs", "talk"]
-    assert [r.status.split()[0] for r in records] == ["KILLED", "CRASHED", "CONVERGED", "CONVERGED"]
-    assert records.records[3].contradicted  # its diagonal step does not solve a stack, and it says so
-    assert time.monotonic() - started < 60.0  # hangs are cut off
-
-
 # -- sequences ------------------------------------------------------------------------------------
 
 
@@ -621,28 +525,89 @@ def test_a_level_of_a_sequence_is_solved_to_that_level():
         )
 
 
-def test_what_is_timed_is_the_line_that_is_printed(monkeypatch):
-    """Whatever the front door of `lv.solve` costs is in the time, once for each repeat."""
+@pytest.fixture
+def timed(monkeypatch):
+    """What each call that is timed is given; every one takes 20 ms more."""
     calls = []
     true = timing.solve
 
     def slow(problem, solver, **asked):
-        calls.append((solver, asked))
+        calls.append((solver, asked, problem.guess))
         time.sleep(0.02)
         return true(problem, solver, **asked)
 
     monkeypatch.setattr(timing, "solve", slow)
-    records = bench.run([stack(6)], ["pgs"], bench.Plan(levels=(1e-6,), budgets=(4,), repeats=2, orders=()))
-    assert calls == [("pgs", {"tol": 1e-6}), ("pgs", {"tol": 0.0, "max_iter": 4})]
-    for r in records:
+    return calls
+
+
+def said(record, problem):
+    """What the line that is printed of a record passes to `lv.solve`; of a loop its first pass."""
+    calls = []
+
+    def solve(problem, solver, **asked):
+        calls.append((solver, asked))
+        return SimpleNamespace(impulse=None)
+
+    names = {"lv": SimpleNamespace(solve=solve, bench=bench), "problem": problem, "problems": [problem]}
+    exec("\n".join(code_of(record)), names)
+    return calls[0]
+
+
+def plainly(solver, asked):
+    return solver, {name: x.tolist() if name == "impulse" else x for name, x in asked.items()}
+
+
+LEVEL = 1.23456e-6  # whose short form is another number
+
+
+def test_what_is_timed_is_the_line_that_is_printed(timed):
+    """Whatever the front door of `lv.solve` costs is in the time, and nothing but the line is asked for."""
+    plan = bench.Plan(levels=(LEVEL,), budgets=(4,), repeats=2, orders=())
+    problem = stack(6, guess=np.ones(6))
+    records = bench.run([problem], ["pgs"], plan)
+    assert len(timed) == len(records) == 4
+    for r, (solver, asked, guess) in zip(records, timed, strict=True):
+        assert (solver, asked) == said(r, problem)
+        assert (guess is None) == (r.start == "cold")
         assert r.way == "call"
         assert len(r.times) == 1
         assert r.time_min >= 0.02 > r.setup_min + r.solve_min
-    calls.clear()
-    bench.run(
-        bench.sequence(moving_stack(2), "load"), ["pgs"], bench.Plan(levels=(1e-6,), budgets=(), repeats=1)
+    timed.clear()
+    steps = moving_stack(2)
+    records = bench.run(
+        bench.sequence(steps, "load"), ["pgs"], dataclasses.replace(plan, budgets=(), repeats=1)
     )
-    assert ["impulse" in asked for _, asked in calls] == [False, False, True, True]
+    assert ["impulse" in asked for _, asked, _ in timed] == [r.start == "carried" for r in records]
+    for r, (solver, asked, _) in zip(records, timed, strict=True):
+        if r.step == 0:
+            assert plainly(solver, asked) == plainly(*said(r, steps[0]))
+
+
+def test_lines_in_turns_are_those_that_are_printed_and_c_asks_for_the_same(timed):
+    asks = [
+        bench.Ask("pgs", "tol", LEVEL),
+        bench.Ask("pgs", "tol", LEVEL, 20_000),
+        bench.Ask("pgs", "budget", 0.0, 4),
+        bench.Ask("pgs", "time", LEVEL, time_limit=1.23456e-3),
+    ]
+    problem, plan = stack(6, guess=np.ones(6)), bench.Plan(levels=(1e-3,), budgets=(), repeats=1, orders=())
+    known = bench.run([problem], ["pgs"], plan)
+    n = len(known)
+    timed.clear()
+    made = bench.finals([problem], asks, known, plan).records[n:]
+    for r in made:
+        line = said(r, problem)
+        assert [asked for solver, asked, _ in timed if (solver, asked) == line]
+        in_c = dict(word.split(" = ") for word in c_of(r) if word.startswith("budget."))
+        asked = line[1]
+        assert float(in_c["budget.tol"]) == asked["tol"]
+        assert int(in_c["budget.iterations"]) == asked.get("max_iter", registry.get("pgs").max_iter)
+        assert float(in_c.get("budget.seconds", 0.0)) == asked.get("time_limit", 0.0)
+    assert all(guess is not None for *_, guess in timed)  # as the line says: from the guess
+    (plain,) = (r for r in known if not r.turns and r.start == "cold")
+    assert int(dict(w.split(" = ") for w in c_of(plain) if "iterations" in w)["budget.iterations"]) == (
+        registry.get("pgs").max_iter
+    )
 
 
 def test_lines_are_timed_in_turns_and_kept(tmp_path):

@@ -21,9 +21,9 @@ from lavender.bench import cases as bench_cases
 from lavender.bench import machine
 from lavender.bench.line import c_of, code_of
 from lavender.bench.lock import Lock
-from lavender.bench.record import _KINDS, file_name, printable, to_json
+from lavender.bench.record import KINDS, file_name, printable, to_json
 from lavender.bench.running import timing
-from lavender.bench.running.worker import Worker
+from lavender.bench.running.worker import Worker, outcome_in
 from lavender.report.terminal import print_report
 
 POSIX = pytest.mark.skipif(os.name != "posix", reason="processes and file names of POSIX")
@@ -217,12 +217,12 @@ def show_all(records, figure=True):
     return matplotlib_figure(drawn[0], looks({r.solver for r in records})) if drawn else None
 
 
-@pytest.mark.parametrize("kind", sorted(_KINDS))
+@pytest.mark.parametrize("kind", sorted(KINDS))
 def test_records_of_any_content_are_shown_or_refused(tmp_path, lines, kind):
     path = tmp_path / "records.jsonl"
     place = next(i for i, e in enumerate(lines) if e["kind"] == kind)
     refused = shown = 0
-    for f in dataclasses.fields(_KINDS[kind]):
+    for f in dataclasses.fields(KINDS[kind]):
         taken = {}
         for value in HOSTILE:
             changed = [dict(e) for e in lines]
@@ -341,7 +341,7 @@ def test_a_lock_of_another_host_is_believed_and_one_process_locks_against_itself
 # -- backends -------------------------------------------------------------------------------------
 
 BACKENDS = """
-import json, os, pickle, signal, struct, time
+import json, os, pickle, signal, struct, sys, time
 import numpy as np
 import lavender as lv
 
@@ -351,6 +351,13 @@ class Backend:
     def update(self, state, problem): return problem
     def run(self, state, impulse, n, tol, time_limit=None):
         note = os.environ.get("FAKE_NOTE", "")
+        if self.what == "hang":
+            while True: time.sleep(1)
+        if self.what == "segfault": os.kill(os.getpid(), signal.SIGSEGV)
+        if self.what == "leave": os._exit(3)
+        if self.what == "talk":
+            print("noise" * 10000, flush=True); os.write(1, b"more noise"); print("noise", file=sys.stderr)
+            impulse[:] = state.b / state.matrix.diagonal()
         if self.what == "fork":
             child = os.fork()
             if child:
@@ -381,18 +388,18 @@ class Backend:
             import ctypes  # read-only or not: the problem that it holds is its own, and convinces nobody
             ctypes.memset(state.b.ctypes.data, 0, 8 * state.m)
             impulse[:] = 0.0
-        return lv.Claim(lv.Status.CONVERGED, 1)
+        return lv.Claim(lv.Status.CONVERGED, 1, {"calls": 1}, str(os.getpid()))
 
 def make(what):
     def factory(): return Backend(what)
     return factory
 
-names = ("fork", "escape", "eat", "forge", "flood", "lie")
-fork, escape, eat, forge, flood, lie = map(make, names)
-FORK, ESCAPE, EAT, FORGE, FLOOD, LIE = (
-    lv.SolverSpec("x_" + n, "hostile_backends:" + n, laws={"linear", "lcp"}, summary="test", resumable=False,
-                  requires=("hostile_backends",)) for n in names)
+for n in NAMES:
+    globals()[n] = make(n)
+    globals()[n.upper()] = lv.SolverSpec("x_" + n, "hostile_backends:" + n, laws={"linear", "lcp"}, summary="test",
+                                         resumable=False, requires=("hostile_backends",))
 """
+HARM = ("hang", "segfault", "leave", "talk", "fork", "escape", "eat", "forge", "flood", "lie")
 
 
 @pytest.fixture
@@ -401,10 +408,9 @@ def hostile(tmp_path, monkeypatch):
     folder = tmp_path / "site"
     info = folder / "hostile_backends-1.0.dist-info"
     info.mkdir(parents=True)
-    (folder / "hostile_backends.py").write_text(BACKENDS)
+    (folder / "hostile_backends.py").write_text(f"NAMES = {HARM}\n{BACKENDS}")
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: hostile-backends\nVersion: 1.0\n")
-    names = ("fork", "escape", "eat", "forge", "flood", "lie")
-    points = [f"x_{n} = hostile_backends:{n.upper()}" for n in names]
+    points = [f"x_{n} = hostile_backends:{n.upper()}" for n in HARM]
     (info / "entry_points.txt").write_text("[lavender.solvers]\n" + "\n".join(points) + "\n")
     monkeypatch.setattr(registry, "_registered", dict(registry.specs()))
     monkeypatch.syspath_prepend(str(folder))
@@ -479,7 +485,7 @@ def test_a_child_that_left_the_group_and_keeps_the_pipe_keeps_nobody_waiting(hos
 HANGS = """
 import sys
 from lavender import bench
-from lavender.bench.running.worker import Worker
+from lavender.bench.running.worker import Worker, outcome_in
 sys.path[:0] = [sys.argv[1]]
 from test_hostile_folder import stack, task
 p = stack()
@@ -540,6 +546,26 @@ def test_workers_of_a_campaign_end_when_it_is_killed():
     parent.kill()
     parent.wait()
     assert wait_until(lambda: not any(map(runs, family)), 4.0)
+
+
+def test_a_backend_that_hangs_or_dies_costs_its_own_record(hostile, watchdog):
+    p = lv.Problem.linear(np.diag([1.0, 2.0]), np.ones(2))
+    with Worker(memory=2**31, grace=1.0) as worker:
+        names = ("talk", "hang", "segfault", "leave", "talk")
+        found = [worker.measure(p, task(p, f"x_{name}", time_limit=0.05)) for name in names]
+    said = [r.status for r in found]
+    assert said == ["CONVERGED", "KILLED", "CRASHED (SIGSEGV)", "CRASHED (exit status 3)", "CONVERGED"]
+    for record in (found[0], found[-1]):
+        assert record.relative == 0.0
+        assert int(record.message) != os.getpid()
+
+
+def test_a_whole_run_survives_its_backends(hostile, watchdog, monkeypatch):
+    monkeypatch.setattr("lavender.bench.running.worker.GRACE", 0.5)
+    plan = bench.Plan(levels=(1e-3,), budgets=(), repeats=1, time_limit=0.05)
+    records = bench.run([stack(4)], ["x_hang", "x_segfault", "pgs", "x_talk"], plan)
+    assert [r.status.split()[0] for r in records] == ["KILLED", "CRASHED", "CONVERGED", "CONVERGED"]
+    assert records.records[3].contradicted  # its diagonal step does not solve a stack, and it says so
 
 
 def test_memory_is_limited_without_asking(hostile, watchdog):
@@ -604,16 +630,14 @@ def test_what_a_worker_says_is_what_this_process_says():
     ],
 )
 def test_an_answer_that_is_none_is_refused(said):
-    from lavender.bench.running.worker import _outcome
-
     good = {
         "status": "CONVERGED", "iterations": 3, "work": {"sweeps": 3}, "message": "", "form": "",
         "setups": [0.01], "solves": [0.02], "times": [0.04], "pace": 1e-4, "certificate": False,
     }  # fmt: skip
     numbers = np.ones(4).tobytes()
-    assert _outcome((json.dumps(good).encode(), numbers), 4, 1.0).iterations == 3
+    assert outcome_in((json.dumps(good).encode(), numbers), 4, 1.0).iterations == 3
     wrong = {} if not said else good | said
     with pytest.raises(ValueError, match=r".+"):
-        _outcome((json.dumps(wrong).encode(), numbers), 4, 1.0)
+        outcome_in((json.dumps(wrong).encode(), numbers), 4, 1.0)
     with pytest.raises(ValueError, match=r".+"):
-        _outcome((pickle.dumps(good), numbers), 4, 1.0)
+        outcome_in((pickle.dumps(good), numbers), 4, 1.0)

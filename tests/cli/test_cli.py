@@ -13,6 +13,7 @@ import pytest
 import lavender as lv
 from lavender import bench, cli, io, registry
 from lavender import check as checking
+from lavender.bench.record import Skip, to_json
 
 
 def problem(n=8):
@@ -490,13 +491,14 @@ def test_a_line_without_end_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize("tail", [b"", b"torn", b"x" * 70_000, b"x" * 65_536])
-@pytest.mark.parametrize("head", [b"", b"\n", b"a line\n" * 3, b"y" * 65_535 + b"\n"])
-def test_a_torn_line_is_cut_wherever_it_begins(tmp_path, head, tail):
-    from lavender.bench.store import _cut_torn_line
-
-    (tmp_path / "a").write_bytes(head + tail)
-    _cut_torn_line(tmp_path / "a")
-    assert (tmp_path / "a").read_bytes() == head
+@pytest.mark.parametrize("reasons", [[], ["why"] * 3, ["y" * 65_400, "why"], ["y" * 70_000]])
+def test_a_torn_line_is_cut_wherever_it_begins(tmp_path, reasons, tail):
+    entries = [to_json(Skip("run", f"case {i}", "", reason)) for i, reason in enumerate(reasons)]
+    head = b"".join(json.dumps(entry).encode() + b"\n" for entry in entries)
+    (tmp_path / "a.jsonl").write_bytes(head + tail)
+    with bench.Store(tmp_path / "a.jsonl") as store:
+        assert [skip.reason for skip in store.records.skips] == reasons
+    assert (tmp_path / "a.jsonl").read_bytes() == head
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="signals of POSIX")

@@ -1,23 +1,13 @@
 """The engine's examples run, and the relations that they show hold."""
 
-import importlib.util
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 import pytest
+from worked import example
 
 import lavender as lv
 from lavender.engine.layout import HEAD
-
-FOLDER = Path(__file__).resolve().parent.parent.parent / "examples"
-
-
-def example(name):
-    spec = importlib.util.spec_from_file_location(name, FOLDER / f"{name}.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 @pytest.fixture(scope="module")

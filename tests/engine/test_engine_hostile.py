@@ -376,30 +376,27 @@ def test_the_state_is_copied_only_where_a_registered_solver_may_stop_half_way(mo
 COINCIDENT = """
 import resource, sys
 import lavender as lv
-n = int(sys.argv[1])
-scene = lv.Scene(substeps=1)
-scene.add_sphere(0.5, position=(0, 0, 1))
-scene.bodies = scene.bodies * n
 resource.setrlimit(resource.RLIMIT_AS, (3 * 2**30, 3 * 2**30))
-sim = lv.Simulation(scene)
-try:
-    contacts = len(sim.step()[0]["contacts"]["depth"])
-except lv.InputError as error:
-    assert "move" in str(error) and str(n) in str(error), error
-    assert sim.steps == 0
-    print("refused")
-else:
-    assert contacts == n * (n - 1) // 2, contacts
+for n in (300, 65_537, 92_682):
+    scene = lv.Scene(substeps=1)
+    scene.add_sphere(0.5, position=(0, 0, 1))
+    scene.bodies = scene.bodies * n
+    sim = lv.Simulation(scene)
+    try:
+        contacts = len(sim.step()[0]["contacts"]["depth"])
+    except lv.InputError as error:
+        assert "move" in str(error) and str(n) in str(error), error
+        assert sim.steps == 0 and n > 300
+    else:
+        assert contacts == n * (n - 1) // 2 and n == 300, contacts
 """
 
 
-@pytest.mark.parametrize(("n", "refused"), [(300, False), (65_537, True), (92_682, True)])
-def test_coincident_spheres_touch_or_are_refused(n, refused):
+def test_coincident_spheres_touch_or_are_refused():
     # 65,537 of them are 2,147,516,416 pairs, 92,682 are 2^32 and some: beyond int32, then beyond uint32
     pytest.importorskip("resource")
-    done = run_apart(COINCIDENT, 120.0, str(n))
+    done = run_apart(COINCIDENT, 120.0)
     assert done.returncode == 0, done.stderr
-    assert ("refused" in done.stdout) == refused
 
 
 def test_room_for_more_contacts_than_memory_is_refused():

@@ -133,7 +133,7 @@ def test_a_port_that_is_taken_is_refused_and_nothing_is_filmed():
 @pytest.mark.parametrize(("dt", "rate"), [(1 / 60, 30), (1 / 7, 30), (1 / 240, 24)])
 def test_a_gif_takes_the_time_of_its_film_and_is_480_pixels_wide(dt, rate, tmp_path):
     image = pytest.importorskip("PIL.Image")
-    film = lv.Simulation(lv.Scene("stack", n=1, dt=dt)).film(round(1.0 / dt))
+    film = lv.Simulation(lv.Scene("stack", n=1, dt=dt)).film(round(0.4 / dt))
     shown = 0.0
     with image.open(save_picture(film, tmp_path / "a.gif", rate=rate)) as found:
         assert found.size[0] >= 480

@@ -357,11 +357,3 @@ def test_a_builder_registers_itself_and_is_a_scene_like_those_of_the_gallery(mon
     for build in (clash, bare):
         with pytest.raises(lv.InputError, match="parameter"):
             table.named_scene()(build)
-
-
-def test_a_step_that_would_not_end_is_refused():
-    for parameters in ({"dt": 1e6}, {"dt": 1e300}, {"dt": 1.0, "max_substep": 1e-300}):
-        with pytest.raises(lv.InputError, match="substeps= if that many"):
-            lv.Scene(**parameters)
-    assert lv.Scene(dt=1e6, substeps=3).parameters.substeps == 3
-    assert lv.Scene(dt=40.0).parameters.substeps == 9_600

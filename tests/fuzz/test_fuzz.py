@@ -4,6 +4,7 @@ import json
 import subprocess
 import sys
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 
 import hypothesis.strategies as st
@@ -19,6 +20,7 @@ sys.path.insert(0, str(FUZZ))
 
 import checks
 import crowds
+import doors
 import judge
 import problems
 from strategies import plain
@@ -130,7 +132,7 @@ sys.path.insert(0, {fuzz!r})
 import checks, fuzz
 def broken(spec):
     how = {how!r}
-    if spec["options"]["tol"] == 2.0:
+    if spec["tol"] != 1e-6:
         if how == "crash":
             os.abort()
         if how == "hang":
@@ -139,7 +141,7 @@ def broken(spec):
         if how == "raw":
             raise ZeroDivisionError("in a kernel")
     return ()
-checks.CHECKS["solve"] = broken
+checks.CHECKS["promise"] = broken
 sys.argv[0] = "fuzz.py"
 sys.exit(fuzz.main())
 """
@@ -153,13 +155,14 @@ def test_crashes_hangs_and_raw_exceptions_are_found_and_kept(tmp_path, monkeypat
     monkeypatch.setenv("LAVENDER_FUZZ_SCRIPT", str(script))
     limit = "1" if how == "hang" else "60"
     done = subprocess.run(
-        [sys.executable, str(script), "1", "--seed", "4", "--kinds", "solve", "--most", "30", "--limit", limit],
-        capture_output=True, text=True, timeout=200, check=False,
+        [sys.executable, str(script), "30", "--seed", "1", "--kinds", "promise", "--most", "3", "--limit", limit],
+        capture_output=True, text=True, timeout=1800, check=False,
     )  # fmt: skip
     assert done.returncode == 1, done.stdout + done.stderr
+    assert (tmp_path / "found").exists(), done.stdout + done.stderr
     found = list((tmp_path / "found").iterdir())
     assert {path.name.split("-")[1] for path in found} == {how}
-    assert all(json.loads(path.read_text())["spec"]["options"]["tol"] == 2.0 for path in found)
+    assert all(json.loads(path.read_text())["spec"]["tol"] != 1e-6 for path in found)
 
 
 # -- what the fuzzer draws for hours, for some seconds --------------------------------------------------------------
@@ -186,6 +189,13 @@ def test_drawn_by_hypothesis_every_promise_holds(kind):
     ):  # of files and snapshots that are damaged most are refused
         refused = checks.COUNTS["refused"] - refused
         assert refused < 0.7 * EXAMPLES[kind], "nearly every input was refused: nothing is tested"
+
+
+@pytest.mark.parametrize("lie", doors.LIES)
+def test_no_lie_of_a_plug_in_changes_a_problem_or_a_verdict(lie):
+    for field, value, resumable in product(doors.CLAIMED, range(len(doors.WILD)), (False, True)):
+        spec = {"kind": "door", "what": "plug-in", "seed": value, "lie": lie, "field": field, "value": value}
+        assert checks.run(spec | {"resumable": resumable}) == [], (field, doors.WILD[value])
 
 
 # -- what was found ---------------------------------------------------------------------------------------------

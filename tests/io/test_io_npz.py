@@ -14,7 +14,8 @@ import pytest
 import scipy.sparse as sp
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from random_problems import random_contact_problem, random_lcp, seeds
+from random_problems import CONTACTS, FORMS, random_contact_problem, random_lcp, seeds
+from random_trees import random_general
 
 import lavender as lv
 import lavender.io
@@ -41,6 +42,15 @@ def variants():
     yield "csr", lv.Problem.linear(a, np.linspace(-1.0, 1.0, 9))
     yield "csr, contacts", lv.Problem.contact(a, np.ones(9), [0.0, 0.5, 1e300], name="contacts")
     yield "spin", lv.Problem.contact(np.eye(8), np.ones(8), [0.5, 0.2], patch_radius=[0.1, 0.0])
+    jac, mass = np.arange(12.0).reshape(3, 4), np.diag([1.0, 2.0, 3.0, 4.0])
+    mass[-1, :-1] = mass[:-1, -1] = 0.5  # fills in as it is given: kept in another order
+    yield (
+        "J and M, everything",
+        lv.Problem.from_jacobian(
+            jac, mass, np.ones(4), cones=lv.Cones.contacts(0.3), friction="cone", compliance=0.1, names=["foot"],
+            dof_names=["hip", "knee", "ankle", "toe"],
+        ),
+    )  # fmt: skip
     yield "empty", lv.Problem.linear(np.zeros((0, 0)), [])
     yield "empty csr", lv.Problem.linear(sp.csr_array((0, 0)), [])
     yield (
@@ -64,12 +74,14 @@ def test_a_saved_problem_is_the_same_problem(tmp_path, problem):
 
 
 @given(seeds)
-@settings(max_examples=25)
-def test_random_problems_come_back(tmp_path_factory, seed):
+@settings(max_examples=5)
+def test_every_kind_of_block_comes_back_in_every_form(tmp_path_factory, seed):
     path = tmp_path_factory.mktemp("npz") / "p.npz"
-    for problem in (random_contact_problem(seed), random_lcp(seed)):
+    bodies = [given_by(make(seed)) for make in CONTACTS.values() for given_by in FORMS.values()]
+    for problem in (*bodies, random_lcp(seed), random_general(seed, tangents=5)):
         lavender.io.save(problem, path)
         assert lavender.io.load(path) == problem
+        assert pickle.loads(pickle.dumps(problem)) == problem
 
 
 def test_two_saves_give_the_same_bytes(tmp_path):

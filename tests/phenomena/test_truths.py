@@ -10,7 +10,7 @@ from scipy.special import ellipk
 
 import lavender as lv
 from lavender.phenomena import PHENOMENA, Track
-from lavender.phenomena.joints import _flip, _moments, _omega, _period
+from lavender.phenomena.joints import flip_of, moments_of_inertia, period_of, spin_of
 from lavender.phenomena.truths import arch_thrust, elliptic, thinnest_arch, tipping_time
 
 G = 9.81
@@ -34,12 +34,12 @@ def test_a_pendulum_integrated_has_the_period(angle):
 
     below.terminal, below.direction = True, -1
     found = solve_ivp(motion, (0, 50), [angle, 0.0], events=below, rtol=1e-10, atol=1e-12, method="DOP853")
-    assert 4 * found.t_events[0][0] == pytest.approx(_period({"angle": angle}), rel=1e-8)
+    assert 4 * found.t_events[0][0] == pytest.approx(period_of({"angle": angle}), rel=1e-8)
 
 
 @pytest.mark.parametrize("aside", [0.01, 0.05, 0.5])
 def test_eulers_equations_integrated_flip_with_the_period(aside):
-    p, i = {"spin": 5.0, "aside": aside}, _moments()
+    p, i = {"spin": 5.0, "aside": aside}, moments_of_inertia()
 
     def motion(_, w):
         x, y, z = w
@@ -48,8 +48,8 @@ def test_eulers_equations_integrated_flip_with_the_period(aside):
     def middle(_, w):
         return w[1]
 
-    found = solve_ivp(motion, (0, 40), _omega(p), events=middle, rtol=1e-10, atol=1e-12, method="DOP853")
-    assert 2 * np.diff(found.t_events[0]).mean() == pytest.approx(_flip(p), rel=1e-7)
+    found = solve_ivp(motion, (0, 40), spin_of(p), events=middle, rtol=1e-10, atol=1e-12, method="DOP853")
+    assert 2 * np.diff(found.t_events[0]).mean() == pytest.approx(flip_of(p), rel=1e-7)
 
 
 @pytest.mark.parametrize(("width", "over"), [(0.5, 1.02), (0.5, 1.5), (1.0, 1.1), (0.1, 2.0)])

@@ -49,21 +49,10 @@ def says(status, **more):
 # -- finite numbers -----------------------------------------------------------------------------------
 
 # Worked out anew at each call, and the caller's own.
-ANEW = (
-    *(
-        f"cones.{name}"
-        for name in (
-            "n_tangents",
-            "n_together",
-            "apart_rows",
-            "spin_rows",
-            "rolling_rows",
-            "reach",
-            "coefficients",
-        )
-    ),
-    "operator.parents",
-)
+ANEW = {
+    "n_tangents", "n_together", "apart_rows", "spin_rows", "rolling_rows", "reach", "coefficients", "stretch",
+    "parents",
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", lv.available(FLOORLESS, external=False))
@@ -83,18 +72,6 @@ def test_a_claim_of_floor_needs_finite_numbers(plug_in):
     assert solution.contradicted
     with pytest.raises(lv.errors.SolveFailed):
         solution.raise_for_status()
-
-
-@pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_values_that_are_not_finite_are_divergence(plug_in, value):
-    def run(problem, impulse):
-        impulse[0] = value
-        return says(lv.Status.CONVERGED)
-
-    solution = lv.solve(random_lcp(3), plug_in(run))
-    assert solution.status is lv.Status.DIVERGED
-    assert solution.residual.relative == np.inf
-    assert not solution.success
 
 
 @pytest.mark.parametrize("name", lv.available(external=False))
@@ -179,14 +156,6 @@ def test_a_solver_that_does_nothing_is_stopped(plug_in):
     assert "none of the" in solution.message
 
 
-def test_an_exception_of_a_callback_is_its_callers():
-    def callback(iterations, impulse, residual):
-        raise ZeroDivisionError("mine")
-
-    with pytest.raises(ZeroDivisionError, match="mine"):
-        lv.solve(random_lcp(6), "pgs", tol=1e-12, callback=callback)
-
-
 # -- the problem is out of reach ----------------------------------------------------------------------
 
 
@@ -212,7 +181,8 @@ def problems():
 def test_every_array_of_a_problem_is_read_only(form):
     problem = problems()[form]
     lv.solve(problem, "pgs", max_iter=3)
-    kept = [(name, array) for name, array in arrays_of(problem, "problem", set()) if not name.endswith(ANEW)]
+    found = arrays_of(problem, "problem", set())
+    kept = [(name, array) for name, array in found if name.rpartition(".")[2] not in ANEW]
     names = {name for name, _ in kept}
     assert {"problem.b", "problem.csr.data", "problem.csr_data.d", "problem.cones.lower"} <= names
     assert ("problem.jacobian.data" in names) == (form in ("rows", "generalized"))
@@ -266,30 +236,6 @@ def test_a_verdict_on_another_problem_is_not_taken(plug_in):
 
 
 # -- plug-ins that lie --------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("resumable", [False, True])
-def test_an_impulse_kept_by_a_solver_and_changed_later_changes_no_solution(plug_in, resumable):
-    kept = []
-    problem = random_lcp(10)
-    answer = lv.solve(problem, "pgs", tol=1e-9).impulse
-
-    def run(problem, impulse):
-        for old in kept:
-            old.flags.writeable = True
-            old[:] = 7.0
-        impulse[:] = answer
-        kept.append(impulse[:])
-        return says(lv.Status.CONVERGED)
-
-    name = plug_in(run, resumable=resumable)
-    first = lv.solve(problem, name)
-    before = first.impulse.copy()
-    second = lv.solve(problem, name)
-    for solution in (first, second):
-        assert solution.success
-        assert solution.impulse.tobytes() == before.tobytes()
-        assert lv.residual(problem, solution.impulse).relative == solution.residual.relative
 
 
 @pytest.mark.parametrize("form", ["rows", "csr", "dense", "generalized"])
@@ -354,54 +300,6 @@ def test_what_is_no_claim_is_a_numerical_error_that_names_the_solver(plug_in, cl
     assert solution.success  # the judge reads the impulse, whatever was said of it
     assert str(solution)
     assert lv.solve_many([problem], name)[0].status is lv.Status.NUMERICAL_ERROR
-
-
-@pytest.mark.parametrize("change", ["shape", "dtype"])
-def test_an_impulse_made_another_array_is_not_taken_over(plug_in, change):
-    def run(problem, impulse):
-        if change == "shape":
-            impulse.shape = (problem.m, 1)
-        else:
-            impulse.dtype = np.int64
-        return says(lv.Status.CONVERGED)
-
-    problem = random_lcp(12)
-    name = plug_in(run)
-    solution = lv.solve(problem, name)
-    assert solution.status is lv.Status.NUMERICAL_ERROR
-    assert f"solver {name!r} made of the impulse" in solution.message
-    np.testing.assert_array_equal(solution.impulse, problem.start())
-
-
-@pytest.mark.parametrize("relative", [0.0, np.nan, None])
-@pytest.mark.parametrize("value", [np.nan, np.inf, 1e9, "words", (3,)])
-def test_the_best_iterate_of_a_solver_is_judged_before_it_is_taken(relative, value):
-    problem = random_lcp(13)
-    answer = lv.solve(problem, "pgs", tol=1e-9).impulse
-    best = np.full(problem.m, value) if isinstance(value, float) else value
-    best = np.zeros(best) if isinstance(best, tuple) else best
-
-    class Boasts:
-        def prepare(self, problem):
-            self.best, self.sweeps_per_decade = (relative, best), value
-            return self
-
-        def update(self, state, problem):
-            return self.prepare(problem)
-
-        def run(self, state, impulse, n, tol, time_limit=None):
-            impulse[:] = answer
-            return says(lv.Status.CONVERGED)
-
-    registry.register(lv.SolverSpec(name="boasts", factory=Boasts, laws={"lcp"}, summary=""))
-    try:
-        solution = lv.solve(problem, "boasts")
-        assert solution.status is lv.Status.CONVERGED
-        assert solution.impulse.tobytes() == answer.tobytes()
-        numbers = isinstance(value, float)  # NaN is what has no pace
-        np.testing.assert_equal(solution.sweeps_per_decade, value if numbers else np.nan)
-    finally:
-        del registry._registered["boasts"]
 
 
 def test_ctrl_c_leaves_what_a_plug_in_has_come_to(plug_in):

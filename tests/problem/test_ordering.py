@@ -79,13 +79,6 @@ def test_levels_count_from_the_ground():
         block_order(matrix, "bottom_up")
 
 
-def test_random_order_depends_on_the_seed_alone():
-    problem = random_lcp(2)
-    x = sweeps(problem, "pgs", 9, order="random", seed=5)
-    np.testing.assert_array_equal(x, sweeps(problem, "pgs", 9, order="random", seed=5))
-    assert not np.array_equal(x, sweeps(problem, "pgs", 9, order="random", seed=6))
-
-
 def test_symmetric_is_forwards_then_backwards():
     problem = random_lcp(4)
     forwards = lv.solve(problem, "pgs", tol=0.0, max_iter=1)

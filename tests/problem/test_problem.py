@@ -201,8 +201,6 @@ BAD_PROBLEMS = {
     ),
     "neither form": (lambda: lv.Problem(np.ones(2), lv.Cones.free(2)), "one of them"),
     "cones": (lambda: lv.Problem(np.ones(2), None, I2), "a Cones is needed"),
-    "kind": (lambda: lv.Cones([0, 1], [7], [0], [1], [0], [0]), r"\[7\]"),
-    "ptr": (lambda: lv.Cones([0, 2, 1], [0, 0], [0], [1], [0, 0], [0, 0]), "increase"),
 }
 
 
@@ -245,35 +243,6 @@ def test_bad_rows_say_what_came_and_what_was_needed(case):
         rows_with(**changes)
 
 
-BAD_CALLS = {
-    "negative tol": ({"tol": -1e-3}, lv.InputError, "tol is -0.001"),
-    "NaN tol": ({"tol": NAN}, lv.InputError, "tol is nan"),
-    "tol as text": ({"tol": "tight"}, lv.InputError, "'tight'"),
-    "negative max_iter": ({"max_iter": -1}, lv.InputError, "max_iter is -1"),
-    "fractional max_iter": ({"max_iter": 2.5}, lv.InputError, "max_iter is 2.5"),
-    "zero time": ({"time_limit": 0.0}, lv.InputError, "time_limit is 0.0"),
-    "short warm start": (
-        {"impulse": [1.0]},
-        lv.InputError,
-        r"impulse \[N s\] has shape \(1,\); \(12,\) is needed",
-    ),
-    "NaN warm start": ({"impulse": [NAN] * 12}, lv.InputError, "must be finite"),
-    "seed": ({"order": "random", "seed": -1}, lv.InputError, "seed is -1"),
-    "ground": ({"order": "given", "ground": [0]}, lv.InputError, "bottom_up"),
-    "ground beside an array": ({"order": range(12), "ground": [0]}, lv.InputError, "bottom_up"),
-    "seed of an order without lots": ({"order": "given", "seed": 3}, lv.InputError, "random"),
-    "callback": ({"callback": 3}, lv.InputError, "callback is 3"),
-    "unknown option": ({"omga": 1.0}, lv.UnknownName, "omga"),
-}
-
-
-@pytest.mark.parametrize("case", BAD_CALLS)
-def test_bad_calls_say_what_came_and_what_was_needed(case):
-    options, kind, message = BAD_CALLS[case]
-    with pytest.raises(kind, match=message):
-        lv.solve(random_lcp(0), "pgs", **options)
-
-
 def test_options_of_the_wrong_type_are_input_errors():
     with pytest.raises(lv.InputError, match=r"'jacobi' cannot take the options .*omega"):
         lv.solve(random_lcp(0), "jacobi", omega="0.5")
@@ -305,16 +274,6 @@ def test_a_solution_cannot_be_changed():
             array[0] = 1.0
     with pytest.raises(TypeError):
         solution.work["sweeps"] = 0
-
-
-def test_history_does_not_depend_on_the_clock(monkeypatch):
-    problem = random_lcp(0)
-    usual = lv.solve(problem, "pgs", tol=0.0, max_iter=300, history=True).history
-    # Five sweeps at a time, as on a huge problem: chunks end between the counts.
-    monkeypatch.setattr(sys.modules["lavender.solve"]._Loop, "_next_chunk", lambda *_: 5)
-    slow = lv.solve(problem, "pgs", tol=0.0, max_iter=300, history=True).history
-    np.testing.assert_array_equal(slow.iterations, usual.iterations)
-    np.testing.assert_array_equal(slow.relative, usual.relative)
 
 
 def test_history_is_there_where_empty_rows_decide():
@@ -363,91 +322,15 @@ def test_raise_for_status():
 # -- the registry --------------------------------------------------------------------------------------------
 
 
-def test_a_plug_in_is_registered_and_solved_with(monkeypatch):
-    class Zero:
-        def prepare(self, problem):
-            return problem
-
-        update = run = None
-
-        def run(self, state, impulse, n, tol, time_limit):  # noqa: F811
-            impulse[:] = 0.0
-            return lv.Claim(lv.Status.CONVERGED, 1, {"nothing": 1})
-
-    spec = lv.SolverSpec(
-        "zero", Zero, {"linear", "lcp"}, "does nothing, and claims to be done", resumable=False
-    )
-    from lavender import registry
-
-    monkeypatch.setattr(registry, "_registered", dict(registry.specs()))
-    lv.register(spec)
-    with pytest.raises(lv.InputError, match="registered already"):
-        lv.register(spec)
-    lv.register(spec, replace=True)
-    problem = lv.Problem.lcp(I2, [1.0, 1.0])
-    assert "zero" in lv.available(problem)
-    solution = lv.solve(problem, "zero")
-    assert not solution.success
-    assert "CONTRADICTED" in str(solution)
-    assert "says CONVERGED" in solution.contradicted
-    with pytest.raises(lv.InputError, match="SolverSpec"):
-        lv.register("pgs")
-    with pytest.raises(lv.InputError, match="laws"):
-        lv.SolverSpec("odd", Zero, {"quadratic"}, "")
-
-
-def test_a_broken_plug_in_warns_by_name_and_breaks_nothing(tmp_path):
-    info = tmp_path / "broken-1.0.dist-info"
-    info.mkdir()
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: broken\nVersion: 1.0\n")
-    (info / "entry_points.txt").write_text("[lavender.solvers]\nbroken = no_such_module:SPEC\n")
-    code = (
-        f"import sys; sys.path.insert(0, {str(tmp_path)!r})\n"
-        "import warnings, lavender as lv\n"
-        "with warnings.catch_warnings(record=True) as w:\n"
-        "    warnings.simplefilter('always')\n"
-        "    names = lv.available()\n"
-        "assert 'pgs' in names\n"
-        "assert any(\"'broken'\" in str(x.message) for x in w), [str(x.message) for x in w]\n"
-    )
-    subprocess.run([sys.executable, "-c", code], check=True)
-
-
-def test_import_is_light():
-    code = (
-        "import sys, lavender; lavender.available()\n"
-        "heavy = {'matplotlib', 'qpsolvers', 'osqp', 'clarabel', 'h5py', 'qdldl', 'rich', 'click', 'pandas'}\n"
-        "assert not heavy & set(sys.modules), heavy & set(sys.modules)\n"
-    )
-    subprocess.run([sys.executable, "-c", code], check=True)
-
-
-def test_ctrl_c_returns_the_iterate(monkeypatch):
-    front_door = sys.modules[lv.solve.__module__]  # the function shadows its module
-    problem = random_lcp(0)
-    calls = []
-    original = front_door._Loop._next_chunk
-
-    def interrupt(self, n, elapsed):
-        calls.append(n)
-        if len(calls) == 3:
-            raise KeyboardInterrupt
-        return original(self, n, elapsed)
-
-    monkeypatch.setattr(front_door._Loop, "_next_chunk", interrupt)
-    solution = lv.solve(problem, "pgs", tol=0.0, max_iter=2**31 - 1)
-    assert solution.status is lv.Status.INTERRUPTED
-    assert solution.iterations > 0
-    assert solution.residual.relative < 1.0
-
-
 def test_ctrl_c_from_a_real_signal(tmp_path):
     code = (
         "import _thread, threading, numpy as np, lavender as lv\n"
         "problem = lv.Problem.lcp(np.eye(3) * 2 - np.eye(3, k=1) - np.eye(3, k=-1), [1.0, 1.0, 1.0])\n"
         "lv.solve(problem, 'pgs')\n"  # first: what is imported at first use takes its time
-        "threading.Timer(0.3, _thread.interrupt_main).start()\n"
-        "solution = lv.solve(problem, 'pgs', tol=0.0, max_iter=2**31 - 1)\n"
+        "seen = threading.Event()\n"
+        "threading.Thread(target=lambda: seen.wait() and _thread.interrupt_main()).start()\n"
+        "watch = lambda n, impulse, residual: seen.set() if n > 1000 else None\n"
+        "solution = lv.solve(problem, 'pgs', tol=0.0, max_iter=2**31 - 1, callback=watch)\n"
         "assert solution.status is lv.Status.INTERRUPTED, solution\n"
         "assert solution.iterations > 1000 and solution.residual.relative < 1e-9, solution\n"
     )

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from random_problems import as_matrix, random_contact_problem, random_lcp
+from random_problems import FORMS, random_contact_problem, random_lcp
 
 import lavender as lv
 import lavender_ext
@@ -79,25 +79,6 @@ for name in {modules}:
     assert done.returncode == 0, done.stderr
 
 
-def test_every_solver_in_threads_at_once_has_the_bits_of_one_by_one():
-    """Each thread a problem of its own, of another form and size: nothing is shared but the kernels."""
-    jobs = [
-        (seed, form, name)
-        for seed in range(3)
-        for form in ("rows", "matrix")
-        for name in lv.available(unseen(seed, form), external=False)
-    ]
-
-    def solved(job):
-        seed, form, name = job
-        return lv.solve(unseen(seed, form), name, max_iter=200).impulse.tobytes()
-
-    alone = [solved(job) for job in jobs]
-    with ThreadPoolExecutor(8) as pool:
-        beside = list(pool.map(solved, jobs))
-    assert [job for job, one, other in zip(jobs, alone, beside, strict=True) if one != other] == []
-
-
 @pytest.fixture
 def often():
     """Threads change as often as they can."""
@@ -110,12 +91,12 @@ def often():
 def unseen(seed, form):
     """A problem without friction of which nothing was worked out yet."""
     problem = random_contact_problem(seed, tangents=0, spin=False, joints=0, contacts=12)
-    return as_matrix(problem) if form == "matrix" else problem
+    return FORMS[form](problem)
 
 
 @pytest.mark.parametrize(
     ("form", "name"),
-    [(form, name) for form in ("rows", "matrix") for name in lv.available(unseen(0, form), external=False)],
+    [(form, name) for form in FORMS for name in lv.available(unseen(0, form), external=False)],
 )
 def test_threads_share_a_problem_that_nobody_has_looked_at(name, form, often):
     """Everything derived is worked out at first use, by whichever thread comes first: the bits are those of one."""

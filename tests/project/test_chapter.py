@@ -8,7 +8,6 @@ further numbers but those claimed elsewhere on the page.
 """
 
 import contextlib
-import importlib.util
 import io
 import re
 import shlex
@@ -17,6 +16,7 @@ from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
+from worked import example
 
 import benchmarks.__main__ as benchmarks
 from lavender.cli import cli
@@ -59,12 +59,9 @@ def printed(command):
         assert result.exit_code == 0, result.output
         return result.output
     if words[0] == "python":
-        spec = importlib.util.spec_from_file_location(Path(words[1]).stem, ROOT / words[1])
-        module = importlib.util.module_from_spec(spec)
-        spec.loader.exec_module(module)
         out, figure = io.StringIO(), io.BytesIO()
         with contextlib.redirect_stdout(out):
-            module.main(figure)
+            example(Path(words[1]).stem).main(figure)
         assert figure.getvalue().startswith(b"\x89PNG")
         return out.getvalue()
     assert words[0] == "lavender"

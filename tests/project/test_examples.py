@@ -1,22 +1,12 @@
 """The examples run, and the relations that they show hold."""
 
-import importlib.util
 import itertools
-from pathlib import Path
 
 import numpy as np
 import pytest
+from worked import example
 
 import lavender as lv
-
-FOLDER = Path(__file__).resolve().parent.parent.parent / "examples"
-
-
-def example(name):
-    spec = importlib.util.spec_from_file_location(name, FOLDER / f"{name}.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 # Those of the chapter are run by test_chapter.py.
@@ -218,9 +208,10 @@ def test_every_motion_of_the_example_is_a_solution_and_they_differ():
     assert found["cone"].lift > 0.1
 
 
-def test_drift_follows_the_motion_error_over_runs(tmp_path):
+def test_drift_follows_the_motion_error_over_runs(monkeypatch):
     module = example("motion_over_a_run")
-    module.STEPS, module.SWEEPS = 30, (4, 64)
+    monkeypatch.setattr(module, "STEPS", 30)
+    monkeypatch.setattr(module, "SWEEPS", (4, 64))
     found = module.numbers()
     assert all(value > 0.8 for value in module.ranks(found).values())
     by = {(run["sweeps"], run["order"], run["warm"]): run for run in found}

@@ -21,7 +21,8 @@ KERNEL_LEVELS = [
     {"generalized", "local", "newton", "pivot", "sweep"},
     {"accelerate", "engine"},
     {"warm"},
-    {"driver", "few", "host"},
+    {"driver", "host"},
+    {"few"},
 ]
 KERNEL_HEIGHT = {name: height for height, level in enumerate(KERNEL_LEVELS) for name in level}
 

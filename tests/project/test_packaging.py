@@ -12,6 +12,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from worked import syntax_of_package
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -91,34 +92,25 @@ def test_no_text_offers_the_package_of_someone_else():
     assert not offers.search("pip install 'lavender-contact[wasm]'")
 
 
-def test_pictures_of_the_long_description_are_absolute_where_an_address_is_known():
-    def described(**env):
-        done = subprocess.run(
-            [sys.executable, "setup.py", "--long-description"],
-            capture_output=True, text=True, check=True, cwd=ROOT, env={**os.environ, **env},
-        )  # fmt: skip
-        return done.stdout
-
-    text = (ROOT / "README.md").read_text(encoding="utf-8")
-    assert described().strip() == text.strip()
-    links = re.findall(r"\]\(([^)]+)\)", described(LAVENDER_FILES_URL="https://example.org/v1/"))
-    assert "https://example.org/v1/docs/static/web.gif" in links
-    assert len(links) >= 6 and all(link.startswith("https://") for link in links)
-
-
-def test_urls_stand_below_an_address_that_is_known_and_nowhere_else(tmp_path):
-    def urls(**env):
+def test_links_of_the_metadata_stand_below_an_address_that_is_known_and_nowhere_else(tmp_path):
+    def metadata(**env):
         run = [sys.executable, "setup.py", "-q", "egg_info", "--egg-base", str(tmp_path)]
         subprocess.run(run, capture_output=True, check=True, cwd=ROOT, env={**os.environ, **env})
         (info,) = tmp_path.glob("*/PKG-INFO")
-        return re.findall(r"^Project-URL: (\w+), (.+)$", info.read_text(encoding="utf-8"), re.MULTILINE)
+        head, _, description = info.read_text(encoding="utf-8").partition("\n\n")
+        return dict(re.findall(r"^Project-URL: (\w+), (.+)$", head, re.MULTILINE)), description
 
-    assert urls(LAVENDER_FILES_URL="") == []
-    found = dict(urls(LAVENDER_FILES_URL="https://example.org/v1/"))
-    assert found.pop("Source") == "https://example.org/v1"
-    assert found
-    for url in found.values():
+    urls, description = metadata(LAVENDER_FILES_URL="")
+    assert urls == {}
+    assert description.strip() == (ROOT / "README.md").read_text(encoding="utf-8").strip()
+    urls, description = metadata(LAVENDER_FILES_URL="https://example.org/v1/")
+    assert urls.pop("Source") == "https://example.org/v1"
+    assert urls
+    for url in urls.values():
         assert (ROOT / url.removeprefix("https://example.org/v1/")).is_file()
+    links = re.findall(r"\]\(([^)]+)\)", description)
+    assert "https://example.org/v1/docs/static/web.gif" in links
+    assert len(links) >= 6 and all(link.startswith("https://") for link in links)
 
 
 def test_the_citation_names_this_version_and_licence():
@@ -169,20 +161,32 @@ def test_kernel_is_compiled_from_source_that_ships(name):
     assert (KERNELS / f"{name.replace('.', '/')}.pyx").exists()
 
 
-def test_import_is_light():
+def test_import_is_light_and_listing_loads_no_backend():
     # What a user waits for, counted: NumPy, SciPy's sparse arrays and what these load are 470 modules; SciPy's
     # optimisers alone would add 300.
-    code = "import sys, lavender; print(len(sys.modules))"
-    assert int(python(code)) < 600
-    loaded = set(json.loads(python("import sys, json, lavender; print(json.dumps(list(sys.modules)))")))
-    assert loaded & {"scipy.optimize", "scipy.sparse.linalg", "scipy.linalg", "scipy.spatial"} == set()
-
-
-def test_import_loads_no_backend_and_no_plots():
-    loaded = set(json.loads(python("import sys, json, lavender; print(json.dumps(list(sys.modules)))")))
-    heavy = {"matplotlib", "h5py", "qpsolvers", "osqp", "clarabel", "piqp", "daqp", "quadprog", "scs"}
-    heavy |= {"proxsuite", "highspy", "qpalm", "rich", "click"}
-    assert loaded & heavy == set()
+    code = """
+import json, sys, lavender as lv
+first = list(sys.modules)
+lv.known(), lv.available(law="lcp")
+print(json.dumps([first, list(sys.modules)]))
+"""
+    first, listed = map(set, json.loads(python(code)))
+    assert len(first) < 600
+    assert first & {"scipy.optimize", "scipy.sparse.linalg", "scipy.linalg", "scipy.spatial"} == set()
+    heavy = {
+        "matplotlib",
+        "h5py",
+        "qpsolvers",
+        "osqp",
+        "clarabel",
+        "piqp",
+        "daqp",
+        "quadprog",
+        "scs",
+        "pandas",
+    }
+    heavy |= {"proxsuite", "highspy", "qpalm", "qdldl", "rich", "click"}
+    assert listed & heavy == set()
 
 
 def test_public_names_are_there():
@@ -219,8 +223,8 @@ def test_every_import_is_declared():
     known |= {"ray"}  # a cluster that campaigns can use where it is installed
     known |= set(sys.stdlib_module_names) | {"lavender", "lavender_ext"}
     found = set()
-    for path in Path(lavender.__file__).parent.rglob("*.py"):
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for tree in syntax_of_package().values():
+        for node in ast.walk(tree):
             if isinstance(node, ast.Import):
                 found |= {alias.name.split(".")[0] for alias in node.names}
             elif isinstance(node, ast.ImportFrom) and not node.level:

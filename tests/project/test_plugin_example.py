@@ -16,10 +16,16 @@ if importlib.util.find_spec("pip") is None:
     pytest.skip("pip is not installed: plug-ins are installed with it", allow_module_level=True)
 
 SOLVES = """
+import sys, warnings
 import numpy as np
 import lavender as lv
 from lavender import suite
+from lavender.cli import main
 
+with warnings.catch_warnings(record=True) as caught:
+    warnings.simplefilter("always")
+    assert "pgs" in lv.available()
+assert ["nonsense" in str(w.message) for w in caught] == [True], caught
 assert "apgd" in lv.available(law="lcp"), lv.known()
 for name in ("stack(n=6)", "granular(n=3)", "random_spd(n=30, condition=100)"):
     problem = suite.case(name).problem
@@ -29,6 +35,7 @@ for name in ("stack(n=6)", "granular(n=3)", "random_spd(n=30, condition=100)"):
     # Slack is unique; both are within 1e-9 of the largest right-hand side, times the conditioning (below 1e3).
     np.testing.assert_allclose(found.slack, exact.slack, rtol=0.0, atol=1e-6 * abs(problem.b).max())
 assert "symmetric" in lv.known(lv.Problem.lcp([[2.0, 1.0], [0.0, 2.0]], [1.0, 1.0]))["apgd"]
+main(["solvers"])
 """
 
 
@@ -61,12 +68,13 @@ def run(command, environment):
     return done.stdout
 
 
-def test_is_found_by_name_and_solves(environment):
-    run([sys.executable, "-c", SOLVES], environment)
-
-
-def test_the_command_line_lists_it(environment):
-    assert "apgd" in run([sys.executable, "-m", "lavender.cli", "solvers"], environment)
+def test_is_found_by_name_and_solves_beside_a_plug_in_that_is_broken(environment, tmp_path):
+    info = tmp_path / "broken-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: broken\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text("[lavender.solvers]\nnonsense = no_such_module:SPEC\n")
+    path = os.pathsep.join([str(tmp_path), environment["PYTHONPATH"]])
+    assert "apgd" in run([sys.executable, "-c", SOLVES], {**environment, "PYTHONPATH": path})
 
 
 def test_keeps_the_contract_of_every_solver(environment):
@@ -85,19 +93,3 @@ def test_keeps_the_contract_of_every_solver(environment):
     # Each general property of a resumable solver that takes a start; the spec declares no order, seed or threads.
     assert "passed" in report
     assert int(report.split(" passed")[0].split()[-1]) >= 15
-
-
-def test_a_broken_plug_in_warns_by_name_and_harms_nobody(environment, tmp_path):
-    info = tmp_path / "broken-1.0.dist-info"
-    info.mkdir()
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: broken\nVersion: 1.0\n")
-    (info / "entry_points.txt").write_text("[lavender.solvers]\nnonsense = no_such_module:SPEC\n")
-    path = os.pathsep.join([str(tmp_path), environment["PYTHONPATH"]])
-    code = (
-        "import warnings, lavender as lv\n"
-        "with warnings.catch_warnings(record=True) as caught:\n"
-        "    warnings.simplefilter('always')\n"
-        "    assert 'pgs' in lv.available()\n"
-        "assert ['nonsense' in str(w.message) for w in caught] == [True], caught\n"
-    )
-    run([sys.executable, "-c", code], {**environment, "PYTHONPATH": path})

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from random_problems import random_contact_problem, random_lcp
+from random_problems import random_lcp
 
 import lavender as lv
 
@@ -60,12 +60,3 @@ def test_a_step_that_goes_wrong_is_undone():
     solution = lv.solve(problem, "anderson", tol=0.0, max_iter=400)
     assert solution.work["restarts"] > 0
     assert solution.residual.relative < lv.solve(problem, "pgs", tol=0.0, max_iter=400).residual.relative
-
-
-def test_no_row_and_no_motion():
-    empty = lv.Problem.lcp(np.zeros((0, 0)), np.zeros(0))
-    assert lv.solve(empty, "anderson").success
-    problem = random_contact_problem(3)
-    solved = lv.solve(problem, "anderson", tol=1e-8, max_iter=100_000)
-    assert solved.success
-    assert lv.solve(problem, "anderson", impulse=solved.impulse, tol=1e-7).iterations <= 1

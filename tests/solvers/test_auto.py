@@ -1,7 +1,5 @@
 """auto: what it chooses, that it says so, islands, certificates, and that it gets there."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import scipy.sparse as sp
@@ -137,12 +135,7 @@ def test_small_islands_of_generalized_velocities_go_to_newton_at_once():
     assert solution.message.startswith("newton")
     rigid = lv.solve(problem, tol=1e-6)
     assert good(rigid, 1e-6)
-    assert rigid.message.startswith("anderson"), (
-        "under Coulomb's law sweeps cost less, of which half end in 25"
-    )
-    soft = lv.solve(replace(problem, compliance=1e-2 * problem.d, copy=False), tol=1e-6)
-    assert good(soft, 1e-6)
-    assert soft.message.startswith("newton"), "to soft contacts it adds nothing of its own"
+    assert rigid.message.startswith("newton")
 
 
 def test_a_step_that_would_end_after_the_deadline_is_refused(monkeypatch):
@@ -188,19 +181,6 @@ def test_every_random_lcp_is_solved(seed):
     for rank in (None, 5):
         solution = lv.solve(random_lcp(seed, m=12, rank=rank), "auto", tol=1e-10)
         assert good(solution, 1e-10), solution
-
-
-@given(seed=seeds)
-@settings(max_examples=25)
-def test_every_random_compliant_problem_is_solved(seed):
-    for friction in ("coulomb", "cone"):
-        base = random_contact_problem(seed, friction=friction, bodies=5, contacts=8)
-        problem = lv.Problem(
-            base.b, base.cones, rows=base.rows, compliance=base.compliance + 0.1, friction=friction
-        )
-        for given_as in (problem, as_matrix(problem)):
-            solution = lv.solve(given_as, "auto", tol=1e-9)
-            assert good(solution, 1e-9), solution
 
 
 def test_what_gave_up_at_once_is_not_called_solved():
@@ -254,14 +234,11 @@ def test_what_has_no_solution_gets_a_certificate():
         assert not solution.contradicted
 
 
-def test_budget_clock_and_warm_start():
+def test_budget_and_warm_start():
     problem = suite.pyramid(k=6, friction="coulomb", sliding=0.5).problem
     none = lv.solve(problem, "auto", tol=1e-9, max_iter=0)
     assert none.status is lv.Status.MAX_ITERATIONS
     assert np.array_equal(none.impulse, problem.start())
-    short = lv.solve(problem, "auto", tol=0.0, time_limit=0.1)
-    assert short.status in (lv.Status.TIME_LIMIT, lv.Status.FLOOR, lv.Status.STALLED)
-    assert short.solve_time < 0.1 * 1.1 + 0.15  # 10 % and 50 ms, and a busy machine
     full = lv.solve(problem, "auto", tol=1e-8)
     assert full.success, full
     again = lv.solve(problem, "auto", tol=1e-7, impulse=full.impulse)

@@ -6,7 +6,7 @@ import pytest
 import scipy.sparse as sp
 from enumeration import enumerate_lcp
 from hypothesis import assume, given
-from random_problems import as_matrix, random_contact_problem, random_lcp, seeds
+from random_problems import random_lcp, seeds
 
 import lavender as lv
 from benchmarks.drawn import wild
@@ -224,14 +224,6 @@ def test_an_lcp_without_a_solution_gets_a_certificate(seed, m):
     assert check_certificate(problem, solution.certificate) is None
 
 
-def test_rows_are_solved_through_their_assembled_matrix():
-    problem = random_contact_problem(3, tangents=0, spin=False)
-    rows, matrix = (lv.solve(p, "direct", tol=1e-9) for p in (problem, as_matrix(problem)))
-    assert rows.success
-    assert matrix.success
-    np.testing.assert_allclose(rows.slack, matrix.slack, atol=1e-8)
-
-
 def test_warm_starts_choose_among_solutions():
     """Two equal contacts share a load: the answer stays at the split it is given."""
     problem = lv.Problem.lcp(np.ones((2, 2)), [1.0, 1.0])
@@ -361,8 +353,7 @@ def test_budgets():
     assert few.iterations <= 3
     assert few.residual.relative <= 1.0, "no worse than doing nothing"
     short = lv.solve(problem, "direct", time_limit=1e-3)
-    assert short.solve_time < 0.051
-    assert not short.contradicted
+    assert short.status in (lv.Status.TIME_LIMIT, lv.Status.CONVERGED) and not short.contradicted
 
 
 def test_a_problem_of_tiny_numbers_is_not_taken_for_solved():

@@ -2,7 +2,6 @@
 
 import pickle
 import re
-import threading
 from dataclasses import fields, replace
 
 import numpy as np
@@ -15,13 +14,11 @@ from random_trees import random_general
 import lavender as lv
 from benchmarks.drawn import wild
 from lavender import registry, suite
-from lavender.cones import ROW
 from lavender.registry import FEW
 from lavender.solvers import _rates as rates
-from lavender.solvers._few import GATE
-from lavender.solvers._gates import general_first
+from lavender.solvers._few import AUTO, general_cost
 from lavender.solvers._newton import general
-from lavender_ext.few.many import contacts_are_soft, solve_first
+from lavender_ext.few.many import solve_first
 
 SHORT = ("auto", "direct", "newton")
 TIMES = ("setup_time", "solve_time", "_rest")
@@ -191,39 +188,6 @@ def test_a_late_solution_is_a_solution():
     assert repr(lv.solve(problem)).startswith("<Solution auto: CONVERGED")
 
 
-def test_threads_share_a_problem_of_few_rows():
-    problem = draw("general coulomb", 5)
-    expected = facts(long_way(problem, "auto"))
-    found, failed = [], []
-
-    def work():
-        try:
-            for _ in range(200):
-                found.append(facts(lv.solve(problem)))
-        except Exception as error:
-            failed.append(error)
-
-    team = [threading.Thread(target=work) for _ in range(4)]
-    for t in team:
-        t.start()
-    for t in team:
-        t.join()
-    assert not failed and len(found) == 800
-    assert all(f == expected for f in found)
-
-
-def test_what_is_refused_is_refused_the_same_way():
-    problem = draw("matrix coulomb", 1)
-    with pytest.raises(lv.errors.CapabilityError, match="takes laws"):
-        lv.solve(lv.Problem.contact(np.eye(3), np.ones(3), 0.5), "direct")
-    with pytest.raises(lv.errors.InputError, match="impulse"):
-        lv.solve(problem, impulse=np.zeros(problem.m + 1))
-    with pytest.raises(lv.errors.InputError, match="tol"):
-        lv.solve(problem, tol=float("nan"))
-    with pytest.raises(lv.errors.InputError, match=r"lavender\.Problem is needed"):
-        lv.solve(3)
-
-
 def test_round_cones_are_never_solved_over_rows_of_a():
     problem = random_general(0, "cone", n=8, compliance=False, contacts=4, tangents=5)
     with pytest.raises(lv.errors.CapabilityError, match="over velocities alone"):
@@ -233,18 +197,15 @@ def test_round_cones_are_never_solved_over_rows_of_a():
     assert np.isfinite(hard.residual.relative) and not hard.contradicted
 
 
-@pytest.mark.parametrize(
-    ("seed", "ran"), [(6662, ["anderson"]), (7021, ["anderson", "newton"]), (7597, ["anderson", "newton"])]
-)
-def test_sweeps_over_few_velocities_make_way_for_newton(seed, ran):
-    """Forests under Coulomb's law that sweeps end at once, that newton does after them, that neither does at first."""
+@pytest.mark.parametrize("seed", [6662, 7021, 7597])
+def test_what_newton_leaves_of_few_velocities_goes_on_the_same_way_everywhere(seed):
+    """Forests under Coulomb's law that the one call ends, that sweeps end after it, that neither does at first."""
     problem = wild(seed=seed).problem
     assert problem.generalized is not None
     short = check(problem, "auto", tol=1e-6)
-    assert short.success
-    assert [step.split()[0] for step in short.message.split(" -> ")][:2] == ran
+    assert short.success and short.message.startswith("newton")
     told = sum(int(count) for count in re.findall(r"(\d+) sweeps", short.message))
-    assert told == short.work["sweeps"], "sweeps that go on are counted once"
+    assert told == short.work.get("sweeps", 0), "sweeps that go on are counted once"
     (together,) = lv.solve_many([replace(problem, copy=False)])
     assert facts(together) == facts(short)
     limited = lv.solve(replace(problem, copy=False), time_limit=10.0)
@@ -254,35 +215,20 @@ def test_sweeps_over_few_velocities_make_way_for_newton(seed, ran):
 @pytest.mark.parametrize("seed", [1076, 3352])  # of 48 rows, for which newton takes more than 64 steps
 def test_steps_over_few_velocities_that_were_in_vain_are_not_taken_twice_in_one_call(seed):
     problem = wild(seed=seed).problem
-    assert solve_first(replace(problem, copy=False).metric, None, 1e-6, GATE, general.ROOM) is False
+    assert solve_first(replace(problem, copy=False).metric, None, 1e-6, AUTO.gate, general.ROOM) is False
     fresh = replace(problem, copy=False)
     assert registry.get("auto").few.solve(fresh, None, 1e-6) is None
-    assert fresh.derived.chain is None
+    assert fresh.derived.vain is not None
     check(problem, "auto", tol=1e-6)
 
 
-@pytest.mark.parametrize("seed", range(8))
-def test_contacts_are_soft_where_each_of_their_rows_is(seed):
-    problem = random_general(seed, "coulomb", n=20, compliance=False, contacts=6)
-    rows = np.repeat(problem.cones.kind != ROW, np.diff(problem.cones.ptr))
-    assert rows.any()
-    for share, soft in ((0.5, False), (2.0, True)):
-        compliance = share * rates.SOFT * problem.d * rows  # joints and limits do not count
-        made = replace(problem, compliance=compliance, copy=False)
-        assert contacts_are_soft(made.metric, rates.SOFT) is soft
-    compliance = np.where(np.arange(problem.m) == np.flatnonzero(rows)[-1], 0.1, 1.0) * compliance
-    assert not contacts_are_soft(replace(problem, compliance=compliance, copy=False).metric, rates.SOFT)
-
-
 @pytest.mark.parametrize("seed", range(40))
-def test_the_compiled_gate_lets_in_what_comes_first(seed):
-    """`general_first` and the gate of the compiled loops say the same of each law, soft contacts and rigid ones."""
+def test_the_compiled_gate_lets_in_what_is_counted_to_cost_little(seed):
+    """`general_cost` and the gate of the compiled loops say the same of each law."""
     rng = np.random.default_rng(seed)
     friction = ("coulomb", "cone")[seed % 2]
-    contacts = int(rng.integers(0, 30))
-    problem = random_general(seed, friction, n=int(rng.integers(6, 40)), compliance=False, contacts=contacts)
-    for share in (0.0, 0.5, 2.0):
-        made = replace(problem, compliance=share * rates.SOFT * problem.d, copy=False)
-        kernel = general.prepare(made)
-        found = solve_first(made.metric, None, np.inf, GATE, general.ROOM)
-        assert (found is not None) == general_first(made, kernel.largest)
+    n, contacts = int(rng.integers(6, 60)), int(rng.integers(0, 60))
+    problem = random_general(seed, friction, n=n, compliance=False, contacts=contacts)
+    found = solve_first(problem.metric, None, np.inf, AUTO.gate, general.ROOM)
+    cost = general_cost(problem, general.prepare(problem).largest)
+    assert (found is not None) == (cost <= rates.GENERAL_FIRST)

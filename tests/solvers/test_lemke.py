@@ -120,14 +120,6 @@ def test_degenerate_semidefinite_problems_end(seed, m, rank):
         np.testing.assert_allclose(solution.slack, w, atol=1e-7)
 
 
-@given(seed=seeds, rank=st.integers(2, 12))
-def test_agrees_with_direct(seed, rank):
-    problem = random_lcp(seed, m=12, rank=rank)
-    x, y = (lv.solve(problem, name, tol=1e-9) for name in ("lemke", "direct"))
-    assert x.success, x
-    np.testing.assert_allclose(x.slack, y.slack, atol=1e-6 * max(1.0, np.abs(y.slack).max()))
-
-
 def test_a_saddle_point_needs_no_split():
     """Free rows with a zero block are eliminated together with the rows they act on."""
     rng = np.random.default_rng(1)

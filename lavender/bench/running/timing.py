@@ -22,7 +22,7 @@ import numpy as np
 
 from lavender import registry
 from lavender._arrays import FloatArray
-from lavender.bench.line import needs_more
+from lavender.bench.line import asked_of
 from lavender.bench.record import ERROR, Record, measurement_key
 from lavender.external.stopwatch import own_time
 from lavender.outcome import finish
@@ -268,20 +268,16 @@ def just_written(problem: Problem) -> Problem:
 
 def _line(problem: Problem, task: Task, impulse: Any, guard: Solution | None) -> tuple[Solution, float]:
     """One call of the line, and its time."""
-    more: dict[str, Any] = dict(task.options)
-    needs = guard is not None and needs_more(task.solver, guard.iterations)
-    if task.mode == "budget" or needs or (task.turns and task.max_iter):
-        more["max_iter"] = task.max_iter
-    if task.mode == "time":
-        more["time_limit"] = task.time_limit
-    guessed = (
-        problem.guess is not None and not task.turns
-    )  # in turns: what the line says, from the guess if there is one
-    if task.start == "carried" or (task.start == "cold" and guessed):
-        more["impulse"] = problem.start() if impulse is None else impulse
+    more = {**task.options, **asked_of(task, 0 if guard is None else guard.iterations)}
     fresh = just_written(problem)
+    if task.start == "carried":
+        more["impulse"] = problem.start() if impulse is None else impulse
+    elif (
+        task.start == "cold" and not task.turns
+    ):  # in turns: what the line does, from the guess if there is one
+        fresh = replace(fresh, guess=None, copy=False)
     begun = perf_counter()
-    solution = solve(fresh, task.solver, tol=task.tol, **more)
+    solution = solve(fresh, task.solver, **more)
     return _uninterrupted(solution), perf_counter() - begun + task.lead
 
 

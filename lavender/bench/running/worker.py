@@ -24,7 +24,7 @@ from lavender.bench.running.timing import Outcome, Task, judged
 from lavender.problem import Problem
 from lavender.solution import Status
 
-__all__ = ["Worker"]
+__all__ = ["Worker", "outcome_in"]
 
 _SERVED = "lavender.bench.running.served"
 _ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
@@ -79,7 +79,7 @@ class Worker:
         except Ended as end:
             return task.record(status=f"{CRASHED} ({end})", message="the process of the backend died"), None
         try:
-            return judged(problem, task, _outcome(answer, problem.m, time.monotonic() - begun))
+            return judged(problem, task, outcome_in(answer, problem.m, time.monotonic() - begun))
         except ValueError as error:
             process.end()
             text = f"the process of the backend sent what is no answer ({error}); it was killed"
@@ -96,7 +96,7 @@ class Worker:
         self.close()
 
 
-def _outcome(answer: tuple[bytes, bytes], m: int, took: float) -> Outcome | str:
+def outcome_in(answer: tuple[bytes, bytes], m: int, took: float) -> Outcome | str:
     """What an answer says, every part of it checked.
 
     Raises

@@ -51,7 +51,9 @@ struct lav_solver {
   double *pair_room;
   int32_t pairs_asked;
   struct generalized_flow_flow_t flow;
-  struct few_island_desk_t desk;
+  struct driver_driver_view_t view;
+  struct few_pivots_trial_t trial;
+  int32_t *sides;
   int32_t band, is_linear, doubt; /* doubt: Newton's tol is tighter than what was asked */
 #endif
 };

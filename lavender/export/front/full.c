@@ -140,10 +140,13 @@ static int32_t prepare_direct(lav_solver *s) {
   if (s->p.n_rows > 0 && s->a.indptr[s->p.n_rows] > 0) k_csr_scan(&s->a, s->p.n_rows, s->marks, bands, size);
   if (!(size[1] == 0.0 || size[0] / size[1] <= 1e-14)) return LAV_ERROR_UNSUPPORTED; /* not symmetric */
   s->band = bands[0] > bands[1] ? bands[0] : bands[1];
-  x = TAKE(s, double, few_island_numbers_for(s->p.n_rows, 0, s->band));
-  s->desk.marks = TAKE(s, int32_t, 2 * (int64_t)s->p.n_rows + s->p.n_blocks);
+  s->view.p = s->p;
+  s->view.a = &s->a;
+  x = TAKE(s, double, few_pivots_pivots_real(&s->view, s->band));
+  s->sides = TAKE(s, int32_t, few_pivots_pivots_index(&s->view));
   if (s->is_short) return LAV_ERROR_ROOM;
-  few_island_furnish_desk(&s->desk, s->p.n_rows, 0, x);
+  few_pivots_lay_pivots(&s->trial, &s->view, x);
+  s->trial.symmetric = 1;
   s->is_linear = 1;
   for (i = 0; i < s->p.n_blocks; i++)
     if (s->p.kind[i] != LAV_ROW) s->is_linear = 0;
@@ -153,24 +156,19 @@ static int32_t prepare_direct(lav_solver *s) {
 }
 
 static void run_direct(lav_solver *s, const lav_budget *budget, lav_result *out) {
-  struct few_layout_view_t view;
-  struct few_island_asked_t asked;
-  int32_t counts[6] = {0, 0, 0, 0, 0, 0};
-  double relative = INFINITY;
-  const double tol = budget->tol > 0.0 ? budget->tol : INFINITY;
-  memset(&view, 0, sizeof view);
-  memset(&asked, 0, sizeof asked);
-  view.p = view.q = s->p;
-  view.a = s->a;
-  asked.linear = s->is_linear;
+  struct few_pivots_trial_t *t = &s->trial;
+  t->linear = s->is_linear;
+  t->e0 = s->start[0];
+  t->v0 = s->start[1];
+  t->tol = budget->tol > 0.0 ? budget->tol : INFINITY;
+  few_pivots_begin_pivots(t, &s->a, &s->p, s->band, s->sides);
   out->outcome = LAV_FAILED;
-  if (!few_island_pivot(&view, few_layout_MATRIX, &asked, s->start, s->impulse, tol, s->band, &s->desk, counts, &relative))
-    return;
-  COPY(s->impulse, s->desk.best, s->p.n_rows);
+  if (!few_pivots_pivot(t, s->impulse)) return;
+  COPY(s->impulse, t->best, s->p.n_rows);
   out->outcome = LAV_CONVERGED;
-  out->iterations = counts[0];
-  out->sweeps = counts[1] ? 2 : 0;
-  out->restarts = counts[3];
+  out->iterations = t->done;
+  out->sweeps = t->swept ? 2 : 0;
+  out->restarts = t->s.factorisations;
 }
 
 static int32_t prepare_full(lav_solver *s) {

@@ -6,17 +6,16 @@ import math
 import multiprocessing
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import asdict
 from time import monotonic
 from typing import Any
 
-from lavender.bench.peers.contest import SCRATCH, TARGETS, Contestant, Result
+from benchmarks.peers.contest import SCRATCH, TARGETS, Contestant, Result
 from lavender.bench.running.timing import one_thread
 from lavender.external._running import quiet
 from lavender.problem import Problem
 from lavender.residuals import residual
 
-__all__ = ["as_records", "from_records", "race"]
+__all__ = ["race"]
 
 REPEATS, REPEAT_TIME = 30, 0.1  # of one setting: at most so many, and as long as they take so long [s]
 AGAIN = 4.0  # a contestant runs again in later rounds when it is within so many times the fastest of its side
@@ -128,19 +127,3 @@ def _near(one: Result, all_of: Sequence[Result]) -> bool:
         if math.isfinite(one.time(target)) and one.time(target) <= AGAIN * fastest:
             return True
     return False
-
-
-def as_records(results: Sequence[Result]) -> list[dict[str, Any]]:
-    """Plain dictionaries."""
-    return [asdict(r) for r in results]
-
-
-def from_records(records: Iterable[dict[str, Any]]) -> list[Result]:
-    """What `as_records` gave, perhaps through JSON.
-
-    Raises
-    ------
-    TypeError, ValueError
-        Not such records.
-    """
-    return [Result(**{**r, "runs": [(float(t), float(x)) for t, x in r["runs"]]}) for r in records]

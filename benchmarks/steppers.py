@@ -1,4 +1,5 @@
-"""Motion against truth: how far a stepper's bodies go from a reference run, against its CPU time.
+"""Motion against truth, `python -m benchmarks steppers`: how far a stepper's bodies go from a reference run, against
+its CPU time.
 
     distance = max over bodies and looks of |x - x*|                                             (1)
 
@@ -18,8 +19,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import click
 import numpy as np
 
+from benchmarks.output import folder_of, markdown, write_json
 from lavender._arrays import FloatArray
 from lavender.errors import InputError
 from lavender.io.stored import write_figure
@@ -31,7 +34,7 @@ from lavender.report.style import looks
 from lavender.scene import Scene
 from lavender.scene.steppers import STEPPERS, get_stepper
 
-__all__ = ["BUDGETS", "SCENES", "Point", "measure", "plot", "reference", "table"]
+__all__ = ["BUDGETS", "SCENES", "Point", "command", "measure", "plot", "reference", "table"]
 
 SECONDS = 2.0
 DT = 1.0 / 60.0
@@ -171,15 +174,15 @@ def _best(points: Sequence[Point], most: float) -> str:
 
 def table(points: Sequence[Point], budgets: Sequence[float] = (300.0, 1200.0, 5000.0, 20000.0)) -> str:
     """Markdown: least distance [mm] that a stepper reaches with so many sweeps a second, and how."""
-    heads = ["scene", "stepper", *(f"{b:g} sweeps/s" for b in budgets), "known to [mm]"]
-    lines = [f"| {' | '.join(heads)} |", "|---" * len(heads) + "|"]
+    cells = []
     for scene in dict.fromkeys(p.scene for p in points):
         for stepper in dict.fromkeys(p.stepper for p in points):
             some = [p for p in points if (p.scene, p.stepper) == (scene, stepper)]
             if some:
-                cells = [_best(some, b) for b in budgets]
-                lines.append(f"| {scene} | {stepper} | {' | '.join(cells)} | {1e3 * some[0].floor:.1g} |")
-    return "\n".join(lines)
+                least = (_best(some, b) for b in budgets)
+                cells.append((scene, stepper, *least, f"{1e3 * some[0].floor:.1g}"))
+    heads = ("scene", "stepper", *(f"{b:g} sweeps/s" for b in budgets), "known to [mm]")
+    return markdown(heads, cells)
 
 
 def plot(points: Sequence[Point], path: Path) -> None:
@@ -220,3 +223,24 @@ def _figure(scene: str, points: Sequence[Point]) -> Figure:
         curves=tuple(curves),
         floor=max(some[0].floor, TINY) if some else math.nan,
     )
+
+
+@click.command("steppers")
+@click.option("--steppers", default=",".join(STEPPERS), show_default=True, help="Names with commas.")
+@click.option("--out", type=click.Path(path_type=Path), default=None, help="Every run, JSON.")
+@click.option("--plot", "figure", type=click.Path(path_type=Path), default=None, help="Figure (.svg, .png).")
+def command(steppers: str, out: Path | None, figure: Path | None) -> None:
+    """Steppers' distance from a reference on six scenes, against CPU time."""
+    folder_of(out)
+    folder_of(figure)
+
+    def show(point: Point) -> None:
+        words = point.note or f"{1e3 * point.distance:.3g} mm, {1e3 * point.cpu:.3g} ms a second"
+        click.echo(f"{point.scene}, {point.stepper} {point.substeps} x {point.sweeps}: {words}", err=True)
+
+    found = measure(steppers=steppers.replace(",", " ").split(), show=show)
+    if out is not None:
+        write_json(out, found)
+    if figure is not None:
+        plot(found, figure)
+    click.echo(table(found))

@@ -1,27 +1,18 @@
-"""`lavender bench peers`: engines on the same scenes, solvers on the same problems, error beside time.
-
-Everything runs in one go and in turns, and is given as a ratio to ours: times of a machine that others use say
-nothing by themselves. What is not installed is named; where another is faster, it is said.
-"""
+"""What the solvers are given: cases of the suite, files, and scenes that an engine exports."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from importlib.util import find_spec
-from pathlib import Path
 
-from lavender.bench.cases import resolve
-from lavender.bench.peers import engines, race
-from lavender.bench.peers.contest import Result
+from benchmarks.peers import engines
+from lavender.bench import resolve
 from lavender.engine import Simulation
 from lavender.errors import InputError, UnknownName
-from lavender.io.stored import whole_file
 from lavender.problem import Problem
 from lavender.scene import Scene
 
-__all__ = ["PACKAGES", "PROBLEMS", "Peers", "problems", "read"]
+__all__ = ["PROBLEMS", "problems"]
 
 #: Cases of the suite, `mujoco:SCENE:CONE` (what MuJoCo exports), `scene:SCENE` (what LavenderSim exports).
 PROBLEMS = (
@@ -58,46 +49,6 @@ PROBLEMS = (
     "mujoco:pyramid55:pyramidal",
     "scene:pyramid55",
 )
-PACKAGES = ("mujoco", "pybullet", "pin", "clarabel", "daqp", "highspy", "piqp", "proxsuite", "qoco", "qpalm",
-            "quadprog", "scs")  # fmt: skip
-
-
-@dataclass(frozen=True)
-class Peers:
-    """What a run of `lavender bench peers --out` measured."""
-
-    cpu: str
-    versions: dict[str, str]
-    steps: list[engines.Step]
-    results: list[Result]
-
-
-def read(path: str | Path) -> Peers:
-    """The file of `lavender bench peers --out`.
-
-    Raises
-    ------
-    InputError
-        No such file, or another one.
-    """
-    path = Path(path)
-    try:
-        text = whole_file(path, "the measurements").decode()
-    except (InputError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: {error}; a file of `lavender bench peers --out` is needed") from None
-    try:
-        found = json.loads(text)
-        return Peers(
-            str(found["cpu"]),
-            dict(found["versions"]),
-            engines.from_records(found["steps"]),
-            race.from_records(found["solvers"]),
-        )
-    except (ValueError, TypeError, KeyError, AttributeError) as error:
-        kind = type(error).__name__
-        raise InputError(
-            f"{path} is no file of `lavender bench peers --out` ({kind}: {error}); give the one it wrote"
-        ) from None
 
 
 def problems(

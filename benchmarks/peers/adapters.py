@@ -24,9 +24,9 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
+from benchmarks.peers.contest import SCRATCH, TARGETS, Call, Contestant
 from lavender import registry
 from lavender._arrays import FloatArray
-from lavender.bench.peers.contest import SCRATCH, TARGETS, Call, Contestant
 from lavender.cones import CONTACT
 from lavender.errors import CapabilityError, InputError
 from lavender.external._running import Limits

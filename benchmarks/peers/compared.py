@@ -8,8 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lavender.bench.peers.contest import SCIPY, SCRATCH, TARGETS, Result
-from lavender.bench.peers.engines import Step
+from benchmarks.output import markdown
+from benchmarks.peers.contest import SCIPY, SCRATCH, TARGETS, Result
+from benchmarks.peers.engines import Step
 
 __all__ = [
     "Comparison",
@@ -156,23 +157,20 @@ def losses(compared: Sequence[Comparison]) -> list[Comparison]:
 def solvers_tables(results: Sequence[Result]) -> list[str]:
     """Markdown: every problem and error, geometric means, losses, and what nobody reached."""
     compared = compare(results)
-    lines = [
-        "| problem | rows | law | error | ours | fastest peer | ours / peer | from scratch | auto |",
-        "|---|---|---|---|---|---|---|---|---|",
+    head = ("problem", "rows", "law", "error", "ours", "fastest peer", "ours / peer", "from scratch", "auto")
+    cells = [
+        (c.problem, c.rows, c.law, f"{c.target:.0e}", c.ours, c.peer,
+         *(_ratio(c.over_peer(t)) for t in (c.our_time, c.scratch, c.auto)))
+        for c in compared
+        if math.isfinite(c.peer_time) or math.isfinite(c.our_time)
+    ]  # fmt: skip
+    lines = [markdown(head, cells), ""]
+    head = ("problems", "error", "ours / peer", "from scratch", "auto", "compared")
+    cells = [
+        (m.which, f"{m.target:.0e}", *map(_ratio, (m.ours, m.scratch, m.auto)), m.compared)
+        for m in geometric_means(results)
     ]
-    for c in compared:
-        if math.isfinite(c.peer_time) or math.isfinite(c.our_time):
-            ratios = (_ratio(c.over_peer(t)) for t in (c.our_time, c.scratch, c.auto))
-            start = f"| {c.problem} | {c.rows} | {c.law} | {c.target:.0e} | {c.ours} | {c.peer} | "
-            lines.append(start + " | ".join(ratios) + " |")
-    lines += [
-        "",
-        "| problems | error | ours / peer | from scratch | auto | compared |",
-        "|---|---|---|---|---|---|",
-    ]
-    for mean in geometric_means(results):
-        ratios = (_ratio(x) for x in (mean.ours, mean.scratch, mean.auto))
-        lines.append(f"| {mean.which} | {mean.target:.0e} | " + " | ".join(ratios) + f" | {mean.compared} |")
+    lines.append(markdown(head, cells))
     lost = losses(compared)
     lines += ["", f"Lost: {len(lost)} of {sum(math.isfinite(c.peer_time) for c in compared)}."]
     lines += [f"- {c.problem} at {c.target:.0e}: {c.peer} against {c.ours}, {_ratio(c.ratio)}" for c in lost]
@@ -195,22 +193,19 @@ def _ratio(x: float) -> str:
 
 def engines_table(steps: Sequence[Step]) -> list[str]:
     """Markdown: each engine beside ours in the same mode, then where ours takes longer."""
-    lines = [
-        "| scene | engine | time / ours | contacts | depth [mm] | speed left [m/s] | residual |",
-        "|---|---|---|---|---|---|---|",
-    ]
+    cells: list[tuple[str | int, ...]] = []
     for s in steps:
         if not np.isfinite(s.time):
-            lines.append(f"| {s.scene} | {s.engine} | {s.note} | | | | |")
+            cells.append((s.scene, s.engine, s.note, "", "", "", ""))
             continue
         ratio = over_ours(s, steps)
         shown = f"{ratio:.2f}" if np.isfinite(ratio) else "-"
         if s.engine.startswith("lavender"):
             shown = f"1 ({1e3 * s.time:.3g} ms)"
         known = f"{s.relative:.1e}" if np.isfinite(s.relative) else "not known"
-        lines.append(
-            f"| {s.scene} | {s.engine} | {shown} | {s.contacts} | {1e3 * s.depth:.3g} | {s.speed:.1e} | {known} |"
-        )
+        cells.append((s.scene, s.engine, shown, s.contacts, f"{1e3 * s.depth:.3g}", f"{s.speed:.1e}", known))
+    head = ("scene", "engine", "time / ours", "contacts", "depth [mm]", "speed left [m/s]", "residual")
+    lines = [markdown(head, cells)]
     lost = sorted(((over_ours(s, steps), s) for s in steps if over_ours(s, steps) < 1.0), key=lambda x: x[0])
     if lost:
         lines += ["", f"Lost: {len(lost)}."]

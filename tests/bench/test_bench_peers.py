@@ -1,4 +1,4 @@
-"""`lavender bench peers`: what is compared is the same problem and the same scene, and losses are kept."""
+"""`python -m benchmarks peers`: what is compared is the same problem and the same scene, and losses are kept."""
 
 import importlib.util
 import json
@@ -11,13 +11,11 @@ import pytest
 from click.testing import CliRunner
 
 import lavender as lv
+from benchmarks.peers import adapters, command, engines, race
+from benchmarks.peers import compared as comparison
+from benchmarks.peers.contest import Contestant, Result
+from benchmarks.peers.problems import problems
 from lavender import suite
-from lavender.bench import peers
-from lavender.bench.peers import adapters, engines, race
-from lavender.bench.peers.contest import Contestant, Result
-from lavender.cli import bench_peers
-from lavender.report import compared as comparison
-from lavender.report import rivals
 
 SMALL = {  # laws and kinds of bounds that adapters must translate
     "lcp": "box_stack(n=2)",
@@ -32,6 +30,10 @@ def reached(contestant, problem, limit=5.0):
     """The least residual of a contestant's settings, in this process; None where it has no way."""
     found = [lv.residual(problem, call()[1]).relative for call in contestant.runs(problem, limit)]
     return min(found, default=None)
+
+
+def by_name(name, siconos=""):
+    return next(c for c in adapters.contestants(siconos) if c.name == name)
 
 
 def is_adapter(name):
@@ -55,7 +57,7 @@ def test_every_adapter_solves_the_same_problem(kind):
 
 def test_quadprog_needs_a_definite_matrix_and_constraints():
     pytest.importorskip("quadprog", reason="needs quadprog: pip install 'lavender-contact[qp]'")
-    contestant = adapters._direct("quadprog", "impulse")
+    contestant = by_name("quadprog, own interface (impulse)")
     assert reached(contestant, suite.case("stack(n=4)").problem) < 1e-9
     with pytest.raises(lv.CapabilityError, match="without constraints"):
         reached(contestant, suite.case("chain(n=4)").problem)
@@ -63,10 +65,9 @@ def test_quadprog_needs_a_definite_matrix_and_constraints():
 
 def test_race_keeps_times_residuals_and_sides():
     problem = suite.case("stack(n=4)").problem
-    chosen = [c for c in adapters.contestants() if c.name in ("pgs", "direct", "direct, from scratch")]
-    linear = adapters._scipy("spsolve")
+    names = ("pgs", "direct", "direct, from scratch", "scipy spsolve")
     told = []
-    (results,) = race.race([("a", problem)], [*chosen, linear], rounds=2, watch=told.append)
+    (results,) = race.race([("a", problem)], list(map(by_name, names)), rounds=2, watch=told.append)
     assert {r.solver for r in results} == {"pgs", "direct", "direct, from scratch"}  # an LCP is not linear
     for r in results:
         assert r.note == "" and not r.peer
@@ -150,12 +151,12 @@ def test_ratios_means_and_losses():
 
 
 def test_names_of_problems():
-    (found,) = peers.problems(["scene:stack6"])
+    (found,) = problems(["scene:stack6"])
     assert found[0] == "scene:stack6" and found[1].law == "coulomb" and found[1].n_blocks == 24
     with pytest.raises(lv.UnknownName, match="stack6"):
-        list(peers.problems(["scene:stack7"]))
+        list(problems(["scene:stack7"]))
     with pytest.raises(lv.InputError, match="elliptic"):
-        list(peers.problems(["mujoco:stack6"]))
+        list(problems(["mujoco:stack6"]))
 
 
 def test_another_interpreter_without_siconos_is_named():
@@ -168,7 +169,7 @@ def test_siconos_solves_the_same_problems():
     if not python:
         pytest.skip("LAVENDER_SICONOS names no interpreter with Siconos")
     for kind, name in (("coulomb", "NSGS"), ("coulomb", "NSGS dense"), ("coulomb", "NSN_AC"), ("lcp", "PGS")):
-        contestant = adapters._siconos(python, name, kind == "coulomb")
+        contestant = by_name(f"siconos {name}", python)
         assert reached(contestant, suite.case(SMALL[kind]).problem) < 1e-6
 
 
@@ -185,7 +186,7 @@ def test_engines_step_the_same_scene():
         assert 24 <= s.contacts <= 40
         assert 0.0 <= s.depth < 0.01 and s.speed < 0.1
         assert math.isnan(s.relative) == ("pybullet" in s.engine)
-    text = comparison.engines_table(steps)
+    text = "\n".join(comparison.engines_table(steps)).splitlines()
     lost = [s for s in steps if comparison.over_ours(s, steps) < 1.0]
     assert len(text) == 2 + len(steps) + (2 + len(lost) if lost else 0)
     assert all(any(f"- stack6: {s.engine}," in line for line in text) for s in lost)
@@ -214,13 +215,13 @@ def test_an_engine_that_does_not_settle_is_left_out_and_said(monkeypatch):
     monkeypatch.setattr(engines, "SETTLE_LIMIT", 0.0)
     steps = engines.measure_scene("stack6", engines=["lavender"], rounds=1)
     assert all("did not settle" in s.note and math.isnan(s.time) for s in steps)
-    assert "did not settle" in comparison.engines_table(steps)[2]
+    assert "did not settle" in comparison.engines_table(steps)[0].splitlines()[2]
 
 
 def test_command(tmp_path):
     out = tmp_path / "peers.json"
     done = CliRunner().invoke(
-        bench_peers.peers, ["--no-solvers", "--scenes", "stack6", "--out", str(out)], catch_exceptions=False
+        command, ["--no-solvers", "--scenes", "stack6", "--out", str(out)], catch_exceptions=False
     )
     assert done.exit_code == 0
     record = json.loads(out.read_text())
@@ -228,69 +229,3 @@ def test_command(tmp_path):
     if importlib.util.find_spec("pybullet") is not None:
         assert any("pybullet" in s["engine"] for s in record["steps"])
     assert "not here: " in done.output and "| stack6 | lavender newton |" in done.output
-
-
-def test_command_line_finds_it_below_bench(capsys):
-    from lavender import cli
-
-    with pytest.raises(SystemExit) as stop:
-        cli.main(["bench", "peers", "--no-solvers", "--scenes", "stack7"])
-    assert stop.value.code == 2
-    assert "unknown scene 'stack7'" in capsys.readouterr().err
-
-
-# -- in the report ---------------------------------------------------------------------------------
-
-
-def written(tmp_path):
-    """A run of `lavender bench peers --out`: engines on one scene by hand, and `results_by_hand`."""
-    step = engines.Step("stack6", "lavender, 16 sweeps", False, 1e-5, 24, 1e-4, 1e-9, 1e-6)
-    other = engines.Step("stack6", "<b>other</b>", False, 5e-6, 24, 1e-4, 1e-3, math.nan)
-    late = engines.Step("stack6", "late", False, math.nan, 0, math.nan, math.nan, math.nan, "did not settle")
-    path = tmp_path / "peers.json"
-    steps = engines.as_records([step, other, late])
-    solvers = race.as_records(results_by_hand())
-    path.write_text(
-        json.dumps({"cpu": "a cpu", "versions": {"osqp": "1"}, "steps": steps, "solvers": solvers})
-    )
-    return path
-
-
-def test_what_was_written_is_read(tmp_path):
-    found = peers.read(written(tmp_path))
-    assert found.results == results_by_hand()
-    assert [s.engine for s in found.steps] == ["lavender, 16 sweeps", "<b>other</b>", "late"]
-    assert found.cpu == "a cpu" and found.versions == {"osqp": "1"}
-
-
-@pytest.mark.parametrize(
-    "text", ["", "{", "[]", "{}", '{"cpu": "", "versions": {}, "steps": [{"no": 1}], "solvers": []}', "\0"]
-)
-def test_other_files_are_refused(tmp_path, text):
-    path = tmp_path / "p.json"
-    path.write_text(text)
-    with pytest.raises(lv.InputError, match=r"bench peers --out"):
-        peers.read(path)
-    with pytest.raises(lv.InputError, match="cannot read"):
-        peers.read(tmp_path / "absent.json")
-
-
-def test_the_report_shows_peers_with_losses(tmp_path):
-    records = lv.bench.run(
-        ["stack(n=2)"], ["pgs"], plan=lv.bench.Plan(levels=(1e-3,), budgets=(4,), repeats=1)
-    )
-    index = lv.report.write(records, tmp_path / "r", peers=peers.read(written(tmp_path)))
-    text = index.read_text()
-    assert "Other engines and solvers" in text
-    assert 'aria-label="ours over the fastest peer' in text
-    assert "Lost: 3 of 6." in text
-    assert "did not settle" in text
-    assert "<b>other</b>" not in text.replace("\\u003cb", "") and "&lt;b&gt;other" in text
-    for name in ("peers", "peers_scene_stack6", "peers_big"):
-        assert (tmp_path / "r" / "figures" / f"{name}.svg").stat().st_size > 1000
-    (over,) = rivals.figures(peers.read(written(tmp_path)))["over"]
-    ratios = {c.label: dict(zip(c.x, c.y, strict=True)) for c in over.curves}
-    assert ratios["to 1e-3"] == {2000.0: 0.1, 8.0: 3.0}
-    assert all(c.points for c in over.curves)
-    without = lv.report.write(records, tmp_path / "q", figures=False).read_text()
-    assert "Other engines and solvers" not in without

@@ -9,9 +9,9 @@ beside it, and the judge's residual where the engine's problem is known: ours, a
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from time import process_time
 from typing import Any
 
@@ -378,19 +378,3 @@ def measure_scene(
             else Step(scene, e.name, e.accurate, float(best[i]), **e.left())
             for i, e in enumerate(made)
         ]
-
-
-def as_records(steps: Sequence[Step]) -> list[dict[str, Any]]:
-    """Plain dictionaries."""
-    return [asdict(s) for s in steps]
-
-
-def from_records(records: Iterable[dict[str, Any]]) -> list[Step]:
-    """What `as_records` gave, perhaps through JSON.
-
-    Raises
-    ------
-    TypeError
-        Not such records.
-    """
-    return [Step(**r) for r in records]

@@ -1,19 +1,23 @@
-"""One phenomenon in several engines beside each other, as pictures."""
+"""`python -m benchmarks film`: one phenomenon in several engines beside each other, as pictures."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
 
+import click
 import numpy as np
 
+from benchmarks.output import folder_of
 from lavender._arrays import FloatArray
+from lavender.cli.options import parameters_of
 from lavender.engine import Film, Simulation
-from lavender.engine.picture import save_picture
+from lavender.engine.picture import PICTURES, save_picture
 from lavender.errors import InputError
-from lavender.phenomena.parts import Phenomenon, Track, Values
+from lavender.phenomena import chosen, run
+from lavender.phenomena.parts import Phenomenon, Record, Track, Values
 
-__all__ = ["save_film"]
+__all__ = ["command", "save_film"]
 
 FRAMES = 40  # of an animation, about
 SIZE = 2.0  # inch, of one engine's picture
@@ -62,3 +66,40 @@ def _at(track: Track, time: FloatArray) -> FloatArray:
     flat = track.positions.reshape(k, -1)
     found = np.stack([np.interp(time, track.time, column) for column in flat.T], axis=1)
     return found.reshape(len(time), n, 3)
+
+
+@click.command("film")
+@click.argument("name")
+@click.argument("out", type=click.Path(path_type=Path))
+@click.option("--steppers", default="impulses newton", show_default=True, help="With commas.")
+@click.option("--engines", default="", help="Engines of others, with commas.")
+@click.option(
+    "--set", "parameters", multiple=True, metavar="NAME=VALUE", help="A parameter of the phenomenon."
+)
+@click.option("--magnify", type=click.FloatRange(min=1.0), default=1.0, show_default=True,
+              help="Show distances from the first engine so many times as large.")  # fmt: skip
+def command(
+    name: str,
+    out: Path,
+    steppers: str,
+    engines: str,
+    parameters: tuple[str, ...],
+    magnify: float,
+) -> None:
+    """The phenomenon NAME as each engine does it, beside each other: .gif, .mp4 (animations), .png, .svg (strips)."""
+    folder_of(out)
+    if out.suffix.lower() not in PICTURES:
+        raise InputError(f"{out}: a file that ends in {', '.join(PICTURES)} is needed")
+    (phenomenon,) = chosen([name])
+    case = parameters_of(parameters) if parameters else dict(phenomenon.cases[0])
+    tracks: dict[str, Track] = {}
+
+    def keep(record: Record, track: Track) -> None:
+        tracks[record.engine] = track
+
+    some = {
+        what: [word.strip() for word in text.split(",") if word.strip()]
+        for what, text in (("steppers", steppers), ("engines", engines))
+    }
+    found = run([name], **some, parameters=case, keep=keep)
+    click.echo(save_film(phenomenon, found[0].case, tracks, out, magnify))

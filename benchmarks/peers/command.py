@@ -1,22 +1,24 @@
-"""`lavender bench peers`."""
+"""The command `python -m benchmarks peers`."""
 
 from __future__ import annotations
 
-import json
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 import click
 
+from benchmarks.output import folder_of, write_json
+from benchmarks.peers import adapters, race
+from benchmarks.peers import engines as peer_engines
+from benchmarks.peers.compared import engines_table, solvers_tables
+from benchmarks.peers.contest import Result
+from benchmarks.peers.problems import PROBLEMS, problems
 from lavender.bench import machine
-from lavender.bench import peers as bench_peers
-from lavender.bench.peers import adapters, race
-from lavender.bench.peers import engines as peer_engines
-from lavender.bench.peers.contest import Result
-from lavender.io.stored import write_text
-from lavender.report.compared import engines_table, solvers_tables
 
-__all__ = ["peers"]
+__all__ = ["command"]
+
+PACKAGES = ("mujoco", "pybullet", "pin", "clarabel", "daqp", "highspy", "piqp", "proxsuite", "qoco", "qpalm",
+            "quadprog", "scs")  # fmt: skip
 
 
 @click.command("peers")
@@ -46,7 +48,7 @@ __all__ = ["peers"]
     help="Interpreter that has Siconos (Debian: python3-siconos).",
 )
 @click.option("--out", type=click.Path(path_type=Path), default=None, help="Write every run here too, JSON.")
-def peers(
+def command(
     files: tuple[str, ...],
     engines: bool,
     solvers: bool,
@@ -61,28 +63,27 @@ def peers(
 
     FILES are problems for the solvers; without them a fixed list of small and large ones.
     """
+    folder_of(out)
 
     def note(text: str) -> None:
         click.echo(text, err=True)
 
-    versions = machine.versions(bench_peers.PACKAGES)
+    versions = machine.versions(PACKAGES)
     click.echo(f"{machine.cpu_name()}; " + ", ".join(f"{k} {v}" for k, v in versions.items()))
-    absent = [name for name in bench_peers.PACKAGES if name not in versions] + (
+    absent = [name for name in PACKAGES if name not in versions] + (
         [] if siconos else ["siconos (--siconos)"]
     )
     click.echo("not here: " + (", ".join(absent) or "nothing") + "\n")
-    record: dict[str, Any] = {"versions": versions, "cpu": machine.cpu_name(), "steps": [], "solvers": []}
+    steps: list[peer_engines.Step] = []
+    results: list[Result] = []
     if engines:
-        steps: list[peer_engines.Step] = []
         for scene in filter(None, scenes.split(",")):
             note(scene)
             steps += peer_engines.measure_scene(scene, sweeps)
         click.echo("\n".join(engines_table(steps)) + "\n")
-        record["steps"] = peer_engines.as_records(steps)
     if solvers:
-        results: list[Result] = []
         rounds_of_all = race.race(
-            bench_peers.problems(files or bench_peers.PROBLEMS, note),
+            problems(files or PROBLEMS, note),
             adapters.contestants(siconos),
             limit=limit,
             rounds=rounds,
@@ -91,14 +92,15 @@ def peers(
         try:
             for found in rounds_of_all:
                 results += found
-                record["solvers"] = race.as_records(results)
-                _write(out, record)  # an interruption costs one problem
+                _write(out, steps, results, versions)  # an interruption costs one problem
         except KeyboardInterrupt:
             note("stopped")
         click.echo("\n".join(solvers_tables(results)))
-    _write(out, record)
+    _write(out, steps, results, versions)
 
 
-def _write(out: Path | None, record: dict[str, Any]) -> None:
+def _write(
+    out: Path | None, steps: list[peer_engines.Step], results: list[Result], versions: dict[str, str]
+) -> None:
     if out is not None:
-        write_text(out, json.dumps(record, indent=1))
+        write_json(out, results, versions=versions, steps=list(map(asdict, steps)))
