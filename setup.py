@@ -54,7 +54,6 @@ COLD = (
     "core/order",
     "factor/graph",
     "factor/narrow",
-    "factor/symbolic",
 )
 
 LINK_ARGS, INLINE, LIMITS = [], [], []

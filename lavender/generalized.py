@@ -19,7 +19,7 @@ import scipy.sparse as sp
 from lavender._arrays import FloatArray, IntArray, as_array, borrowed, equal, precision_of, read_only
 from lavender.errors import InputError
 from lavender_ext.core import generalized as kernels
-from lavender_ext.core.problem import dense_to_csr
+from lavender_ext.core.assemble import dense_to_csr
 from lavender_ext.factor.dissection import dissection
 from lavender_ext.judge.measure import all_finite
 

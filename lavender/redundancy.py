@@ -26,7 +26,7 @@ from lavender.errors import CapabilityError, InputError, SolveFailed
 from lavender.problem import Problem
 from lavender.residuals import residual
 from lavender.solve import solve
-from lavender_ext.pivot.principal import Pivoting, free_block
+from lavender_ext.pivot.principal import Pivoting
 
 __all__ = ["Redundancy", "redundancy"]
 
@@ -345,11 +345,8 @@ def _sparse(a: sp.csr_array, limit: float) -> Places:
     import qdldl
 
     m = a.shape[0]
-    place = np.arange(m, dtype=np.int32)
-    a.sort_indices()
-    parts = (a.indptr.astype(np.int32), a.indices.astype(np.int32), a.data)
-    upper = free_block(*parts, place, np.ones(m), SHIFT, m)
-    _, pivot, order = qdldl.Solver(sp.csc_matrix(upper, shape=(m, m)), upper=True).factors()
+    upper = sp.triu(a + SHIFT * sp.eye_array(m), format="csc")
+    _, pivot, order = qdldl.Solver(sp.csc_matrix(upper), upper=True).factors()
     return np.sort(np.asarray(order, np.intp)[pivot <= limit])
 
 

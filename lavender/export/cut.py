@@ -45,6 +45,7 @@ MODULES = (
     "pivot.principal",
     "few.chain",
     "factor.graph",
+    "factor.sparse",
     "engine.arrays",
     "engine.substep",
     "host.memory",

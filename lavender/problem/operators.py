@@ -13,10 +13,11 @@ from lavender._derived import once
 from lavender.errors import CapabilityError, InputError
 from lavender.problem.data import ProblemData
 from lavender_ext.core import assemble
+from lavender_ext.core.assemble import dense_to_csr
 from lavender_ext.core.problem import LAWS as FRICTION_NUMBER
-from lavender_ext.core.problem import Data, dense_to_csr, nothing_done
+from lavender_ext.core.problem import Data, nothing_done
+from lavender_ext.factor import sparse
 from lavender_ext.judge import measure
-from lavender_ext.pivot import principal
 
 
 class Operators(ProblemData):
@@ -35,11 +36,11 @@ class Operators(ProblemData):
         """Lower and upper half bandwidth of A: the largest i - j and j - i of a stored entry."""
         if self.rows is None:
             return self._scan[:2]
-        return principal.bandwidth(*self._compressed[:2])
+        return sparse.bandwidth(*self._compressed[:2])
 
     @cached_property
     def _scan(self) -> tuple[int, int, float, float]:
-        return principal.scan(*self._compressed)
+        return sparse.scan(*self._compressed)
 
     @property
     def is_symmetric(self) -> bool:

@@ -187,14 +187,30 @@ def _mirrored(problem: Problem) -> tuple[IntArray, IntArray, FloatArray]:
     return a.indptr.astype(np.int32), a.indices.astype(np.int32), a.data
 
 
+def _scaled(problem: Problem) -> tuple[FloatArray, sp.csr_array]:
+    """D^-1/2 (m,), and D^-1/2 A D^-1/2."""
+    scale = 1.0 / np.sqrt(problem.csr_data.d)
+    return scale, sp.csr_array(sp.diags_array(scale) @ problem.csr @ sp.diags_array(scale))
+
+
+def _superlu(a: sp.csc_array) -> tuple[Any, FloatArray]:
+    """LU with pivoting and the sizes of its pivots; one of 0 alone where it is exactly singular."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            lu = sparse_lu(a)
+        return lu, np.abs(lu.U.diagonal())
+    except RuntimeError:
+        return None, np.zeros(1)
+
+
 class LUFactor:
     """LU of D^-1/2 A_FF D^-1/2, of an A that is not symmetric."""
 
     def __init__(self, problem: Problem) -> None:
-        m, a = problem.m, problem.csr
-        self.scale = 1.0 / np.sqrt(problem.csr_data.d)
-        scaled = sp.csr_array(sp.diags_array(self.scale) @ a @ sp.diags_array(self.scale))
-        self.sparse = a.nnz < DENSE_SHARE * m * m or m > DENSE_LIMIT
+        m = problem.m
+        self.scale, scaled = _scaled(problem)
+        self.sparse = problem.csr.nnz < DENSE_SHARE * m * m or m > DENSE_LIMIT
         self.a: Any = scaled if self.sparse else scaled.toarray()
 
     def factor(self, place: IntArray, n_free: int, shift: float, tiny: float = TINY) -> int:
@@ -216,13 +232,8 @@ class LUFactor:
         a = sp.csc_array(self.a[self.free][:, self.free])
         if shift > 0.0:
             a = sp.csc_array(a + shift * sp.eye_array(len(self.free)))
-        try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")
-                self.lu = sparse_lu(a)
-        except RuntimeError:  # exactly singular
-            return len(self.free)
-        return int(np.count_nonzero(~(np.abs(self.lu.U.diagonal()) > tiny)))
+        self.lu, pivot = _superlu(a)
+        return len(self.free) if self.lu is None else int(np.count_nonzero(~(pivot > tiny)))
 
     def solve(self, rhs: FloatArray) -> FloatArray:
         if len(rhs) == 0:
@@ -268,13 +279,11 @@ class GeneralFactor:
     """
 
     def __init__(self, problem: Problem) -> None:
-        m, a = problem.m, problem.csr
-        self.scale = 1.0 / np.sqrt(problem.csr_data.d)
-        self.rank = m
+        self.rank = m = problem.m
+        self.scale, scaled = _scaled(problem)
         self.lu: Any = None
         self.dense: FloatArray | None = None
-        scaled = sp.csr_array(sp.diags_array(self.scale) @ a @ sp.diags_array(self.scale))
-        if a.nnz >= DENSE_SHARE * m * m or m <= SMALL_SIZE:
+        if problem.csr.nnz >= DENSE_SHARE * m * m or m <= SMALL_SIZE:
             self._factor_dense(scaled.toarray())
         else:
             self._factor_sparse(sp.csc_array(scaled))
@@ -289,13 +298,7 @@ class GeneralFactor:
             self.lu = (lu, pivot)
 
     def _factor_sparse(self, a: sp.csc_array) -> None:
-        try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")
-                self.lu = sparse_lu(a)
-            pivot = np.abs(self.lu.U.diagonal())
-        except RuntimeError:  # exactly singular
-            pivot = np.zeros(1)
+        self.lu, pivot = _superlu(a)
         if pivot.min(initial=np.inf) > TINY * max(1.0, pivot.max(initial=0.0)):
             return
         self.lu = None

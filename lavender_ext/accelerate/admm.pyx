@@ -26,12 +26,15 @@ from libc.stdint cimport int32_t, int64_t
 
 import numpy as np
 
-from lavender_ext.accelerate.mixing cimport CONTROL, MAX_MEMORY, UNDONE, forget, mix, mixing_t, product, take
+from lavender_ext.accelerate.mixing cimport CONTROL, MAX_MEMORY, UNDONE, forget, mix, mixing_t, take
 from lavender_ext.core.block cimport (CONE, CONTACT_ROLLING, ROUND, ROW, blocks_t, clip, ends_apart, n_tangents, norm2,
                                       rolling_section, round_group, round_section, round_share)
+from lavender_ext.core.generalized cimport dot
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.rolling cimport part_of, part_size
-from lavender_ext.factor.sparse cimport SparsePanels, sparse_solve, sparse_t
+from lavender_ext.factor.blocks cimport sparse_t
+from lavender_ext.factor.sparse cimport SparsePanels
+from lavender_ext.factor.supernodal cimport sparse_solve
 
 
 cdef enum:
@@ -78,7 +81,7 @@ cdef inline void solve_dense(const factor_t* f, double* x) noexcept nogil:
     cdef const double* row
     for i in range(n):
         row = f.dense + <int64_t>n * i
-        x[i] = (x[i] - product(row, x, i)) / row[i]
+        x[i] = (x[i] - dot(row, x, i)) / row[i]
     i = n - 1
     while i >= 0:
         row = f.dense + <int64_t>n * i

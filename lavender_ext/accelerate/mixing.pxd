@@ -9,6 +9,8 @@ All sums run in a fixed order.
 from libc.math cimport sqrt
 from libc.stdint cimport int32_t
 
+from lavender_ext.core.generalized cimport dot
+
 
 cdef enum:
     MAX_MEMORY = 16
@@ -36,21 +38,6 @@ cdef struct mixing_t:
     double* g                   # (m)
     double* dv                  # (memory, m) differences, a ring
     double* dg                  # (memory, m)
-
-
-cdef inline double product(const double* x, const double* y, int32_t m) noexcept nogil:
-    cdef double s0 = 0.0, s1 = 0.0, s2 = 0.0, s3 = 0.0
-    cdef int32_t i = 0
-    while i + 4 <= m:
-        s0 += x[i] * y[i]
-        s1 += x[i + 1] * y[i + 1]
-        s2 += x[i + 2] * y[i + 2]
-        s3 += x[i + 3] * y[i + 3]
-        i += 4
-    while i < m:
-        s0 += x[i] * y[i]
-        i += 1
-    return (s0 + s1) + (s2 + s3)
 
 
 cdef inline int32_t least_squares(int32_t n, int32_t head, int32_t memory, const double* gram, const double* rhs,
@@ -109,7 +96,7 @@ cdef inline int32_t mix(const mixing_t* c, double* u) noexcept nogil:
         return 0
     for k in range(kept):
         j = (head - 1 - k + 2 * c.memory) % c.memory
-        rhs[j] = product(c.dg + j * c.m, c.g, c.m)
+        rhs[j] = dot(c.dg + j * c.m, c.g, c.m)
     if least_squares(kept, head, c.memory, c.gram, rhs, gamma) == 0:
         return 0
     for j in range(c.memory):
@@ -129,7 +116,7 @@ cdef inline void forget(const mixing_t* c) noexcept nogil:
 cdef inline int32_t take(const mixing_t* c, int32_t mixed, double* v, const double* g) noexcept nogil:
     """Remember the evaluation (v, g) of a u; 0 where that u is undone, v then being the one before."""
     cdef int32_t kept = <int32_t>c.control[KEPT], head = <int32_t>c.control[HEAD], i, j, k
-    cdef double size = sqrt(product(g, g, c.m)), x
+    cdef double size = sqrt(dot(g, g, c.m)), x
     cdef double* dv
     cdef double* dg
     if mixed and not size <= 2.0 * c.control[LAST]:
@@ -162,7 +149,7 @@ cdef inline int32_t take(const mixing_t* c, int32_t mixed, double* v, const doub
             kept += 1
         for k in range(kept):
             j = (head - k + 2 * c.memory) % c.memory
-            x = product(c.dg + j * c.m, dg, c.m)
+            x = dot(c.dg + j * c.m, dg, c.m)
             c.gram[MAX_MEMORY * head + j] = x
             c.gram[MAX_MEMORY * j + head] = x
         c.control[KEPT] = kept

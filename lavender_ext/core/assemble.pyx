@@ -10,6 +10,7 @@ from libc.stdint cimport int32_t, int64_t
 import numpy as np
 
 from lavender_ext.core.block cimport blocks_t, n_directions, n_turns
+from lavender_ext.core.csr cimport by_columns
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.rows cimport contact_jacobian, minv_times, rows_t
 
@@ -233,22 +234,27 @@ def delassus(Data p, Py_ssize_t most, int32_t[::1] start, int32_t[::1] blocks):
     return (indptr_, *found)
 
 
-cdef public void lav_by_columns(int32_t m, int32_t n, const int32_t* indptr, const int32_t* indices, const double* data,
-                                int32_t* ptr, int32_t* row, double* value) noexcept nogil:
-    """A matrix (m, n) in compressed rows by its columns, rows ascending; ptr (n + 2)."""
-    cdef int32_t i, j, q
-    for j in range(n + 2):
-        ptr[j] = 0
-    for q in range(indptr[m]):
-        ptr[indices[q] + 2] += 1
-    for j in range(2, n + 2):
-        ptr[j] += ptr[j - 1]
-    for i in range(m):
-        for q in range(indptr[i], indptr[i + 1]):
-            j = indices[q] + 1
-            row[ptr[j]] = i
-            value[ptr[j]] = data[q]
-            ptr[j] += 1
+def dense_to_csr(const double[:, ::1] a):
+    """Nonzeros of a dense matrix as (indptr, indices, data), int32; nnz must be below 2^31."""
+    cdef Py_ssize_t i, j, n = a.shape[0], m = a.shape[1], nnz = 0, q = 0
+    for i in range(n):
+        for j in range(m):
+            nnz += a[i, j] != 0.0
+    whole, numbers = np.empty(n + 1 + nnz, np.int32), np.empty(nnz)
+    cdef int32_t[::1] indptr = whole
+    cdef double[::1] data = numbers
+    cdef int32_t* indices = &indptr[0] + n + 1
+    indptr[0] = 0
+    for i in range(n):
+        for j in range(m):
+            if a[i, j] != 0.0:
+                indices[q] = <int32_t>j
+                data[q] = a[i, j]
+                q += 1
+        indptr[i + 1] = <int32_t>q
+    whole.setflags(False)
+    numbers.setflags(False)
+    return whole[:n + 1], whole[n + 1:], numbers
 
 
 cdef public void lav_gram_pattern(int32_t m, const int32_t* indptr, const int32_t* indices, const int32_t* ptr,
@@ -335,7 +341,7 @@ def gram(const double[::1] data, const int32_t[::1] indices, const int32_t[::1] 
         return count_array, np.empty(0, np.int32), np.empty(0)
     count = count_array
     with nogil:
-        lav_by_columns(m, n, &indptr[0], columns, numbers, ptr, row, &value[0])
+        by_columns(m, n, &indptr[0], columns, numbers, ptr, row, &value[0])
         lav_gram_pattern(m, &indptr[0], columns, ptr, row, scratch, &count[0])
     out_array, entry_array = np.empty(count[m], np.int32), np.empty(count[m])
     out, entry = out_array, entry_array

@@ -73,3 +73,64 @@ cdef inline double csr_dot_size(const csr_t* a, int32_t i, const double* x, doub
                 f2 += fabs(t)
     size[0] = (f0 + f1) + (f2 + f3)
     return (s0 + s1) + (s2 + s3)
+
+
+cdef inline void by_columns(int32_t m, int32_t n, const int32_t* indptr, const int32_t* indices, const double* data,
+                            int32_t* ptr, int32_t* row, double* value) noexcept nogil:
+    """A matrix (m, n) in compressed rows by its columns, rows ascending; ptr (n + 2)."""
+    cdef int32_t i, j, q
+    for j in range(n + 2):
+        ptr[j] = 0
+    for q in range(indptr[m]):
+        ptr[indices[q] + 2] += 1
+    for j in range(2, n + 2):
+        ptr[j] += ptr[j - 1]
+    for i in range(m):
+        for q in range(indptr[i], indptr[i + 1]):
+            j = indices[q] + 1
+            row[ptr[j]] = i
+            value[ptr[j]] = data[q]
+            ptr[j] += 1
+
+
+cdef inline void scan_entries(const csr_t* a, int32_t n, int32_t* cursor, int32_t* band, double* size) noexcept nogil:
+    """Lower and upper bandwidth into band[2]; max |A - A^T|, max |A| into size[2]; columns are sorted.
+
+    cursor (n) is scratch: the first entry of row j that no earlier row has looked up as its mirror image.
+    """
+    cdef int32_t i, j, q
+    cdef double x, gap = 0.0, big = 0.0
+    band[0] = 0
+    band[1] = 0
+    for i in range(n):
+        cursor[i] = a.indptr[i]
+    for i in range(n):
+        if a.indptr[i] < a.indptr[i + 1]:
+            j = i - a.indices[a.indptr[i]]
+            if j > band[0]:
+                band[0] = j
+            j = a.indices[a.indptr[i + 1] - 1] - i
+            if j > band[1]:
+                band[1] = j
+        for q in range(a.indptr[i], a.indptr[i + 1]):
+            x = fabs(a.data[q])
+            if x > big:
+                big = x
+            j = a.indices[q]
+            if j < i:
+                if q >= cursor[i] and x > gap:
+                    gap = x                             # no mirror image above the diagonal
+                continue
+            if j == i:
+                continue
+            while cursor[j] < a.indptr[j + 1] and a.indices[cursor[j]] < i:
+                if fabs(a.data[cursor[j]]) > gap:
+                    gap = fabs(a.data[cursor[j]])
+                cursor[j] += 1
+            if cursor[j] < a.indptr[j + 1] and a.indices[cursor[j]] == i:
+                x = fabs(a.data[q] - a.data[cursor[j]])
+                cursor[j] += 1
+            if x > gap:
+                gap = x
+    size[0] = gap
+    size[1] = big

@@ -4,16 +4,10 @@ from libc.stdint cimport int32_t
 
 import numpy as np
 
-from lavender_ext.core.generalized cimport (generalized_t, jac_push, jac_row, tree_factor, tree_pattern, tree_solve,
+from lavender_ext.core.generalized cimport (jac_push, jac_row, tree_factor, tree_pattern, tree_solve,
                                             tree_unwhiten)
 
 cdef object new = np.empty, I4 = np.dtype(np.int32)
-
-
-cdef public int32_t lav_tree_pattern(int32_t n, const int32_t* mptr, const int32_t* midx, int32_t room, int32_t* lptr,
-                                     int32_t* lidx, int32_t* parent, int32_t* scratch) noexcept nogil:
-    """Pattern of L; scratch (3 n). Entries, or -1 where `room` is too small."""
-    return tree_pattern(n, mptr, midx, room, lptr, lidx, parent, scratch, scratch + n, scratch + 2 * n)
 
 
 cdef public int32_t lav_tree_factor(int32_t n, const int32_t* mptr, const int32_t* midx, const double* mval,
@@ -21,11 +15,6 @@ cdef public int32_t lav_tree_factor(int32_t n, const int32_t* mptr, const int32_
                                     double* inv_pivot) noexcept nogil:
     """L and 1 / D; -1, or the row that shows M to be no positive definite matrix."""
     return tree_factor(n, mptr, midx, mval, lptr, lidx, lval, pivot, inv_pivot)
-
-
-cdef public void lav_tree_solve(const generalized_t* g, double* x) noexcept nogil:
-    """x <- M^-1 x."""
-    tree_solve(g, x)
 
 
 cdef class Operator:
@@ -75,8 +64,8 @@ cdef class Operator:
         self.g.root = &numbers[n]                       # the factor's pivots, until it is there
         self.failed = -1
         if n:
-            self.failed = tree_factor(n, &mptr[0], &midx[0], &mval[0], &whole[0], self.g.lidx, &numbers[2 * n],
-                                      &numbers[n], &numbers[0])
+            self.failed = lav_tree_factor(n, &mptr[0], &midx[0], &mval[0], &whole[0], self.g.lidx, &numbers[2 * n],
+                                          &numbers[n], &numbers[0])
         for i in range(n):
             numbers[n + i] = sqrt(numbers[i])
 

@@ -6,19 +6,6 @@ import numpy as np
 from lavender_ext.core.order cimport block_levels, body_levels, color_by_bodies, sort_by_level
 
 
-cdef public int32_t lav_body_levels(int32_t n_blocks, const int32_t* body, int32_t n_bodies, int32_t* level,
-                                    int32_t* out) noexcept nogil:
-    """Level of every block (n_blocks) from the static bodies; level (n_bodies) is scratch. Returns the number of levels."""
-    cdef int32_t n = body_levels(n_blocks, body, n_bodies, level)
-    block_levels(n_blocks, body, level, out)
-    return n + 2
-
-
-cdef public int32_t lav_body_colors(int32_t n_blocks, const int32_t* body, int32_t n_bodies, uint64_t* used,
-                                    int32_t* color) noexcept nogil:
-    return color_by_bodies(n_blocks, body, n_bodies, used, color)
-
-
 cdef public int32_t lav_graph_colors(int32_t n_blocks, const int32_t* block_ptr, const int32_t* block_of,
                                      const int32_t* indptr, const int32_t* indices, int32_t* mark,
                                      int32_t* color) noexcept nogil:
@@ -46,16 +33,13 @@ cdef public int32_t lav_graph_colors(int32_t n_blocks, const int32_t* block_ptr,
     return top
 
 
-cdef public void lav_sort_by_key(int32_t n, const int32_t* key, int32_t n_keys, int32_t* start, int32_t* order) noexcept nogil:
-    sort_by_level(n, key, n_keys, start, order)
-
-
 def body_order_levels(const int32_t[:, ::1] body, int n_bodies):
     """Level (k,) of each block from the static bodies; `body` (k, 2)."""
     cdef int32_t k = <int32_t>body.shape[0]
     cdef int32_t[::1] level = np.empty(n_bodies + 1, np.int32), out = np.empty(k + 1, np.int32)
     if k:
-        lav_body_levels(k, &body[0, 0], n_bodies, &level[0], &out[0])
+        body_levels(k, &body[0, 0], n_bodies, &level[0])
+        block_levels(k, &body[0, 0], &level[0], &out[0])
     return np.asarray(out)[:k]
 
 
@@ -65,7 +49,7 @@ def body_colors(const int32_t[:, ::1] body, int n_bodies):
     cdef uint64_t[::1] used = np.zeros(n_bodies + 1, np.uint64)
     cdef int32_t[::1] color = np.empty(k + 1, np.int32)
     if k:
-        lav_body_colors(k, &body[0, 0], n_bodies, &used[0], &color[0])
+        color_by_bodies(k, &body[0, 0], n_bodies, &used[0], &color[0])
     return np.asarray(color)[:k]
 
 
@@ -89,5 +73,5 @@ def stable_order(const int32_t[::1] key):
             top = key[i]
     cdef int32_t[::1] start = np.zeros(top + 2, np.int32), order = np.empty(n + 1, np.int32)
     if n:
-        lav_sort_by_key(n, &key[0], top + 1, &start[0], &order[0])
+        sort_by_level(n, &key[0], top + 1, &start[0], &order[0])
     return np.asarray(order)[:n], np.asarray(start)

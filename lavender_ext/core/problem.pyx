@@ -35,7 +35,7 @@ LAWS = {"coulomb": COULOMB, "cone": CONE}
 cdef public int32_t lav_csr_diagonal(const blocks_t* p, const csr_t* a, double* d, double* step,
                                      int32_t* empty) noexcept nogil:
     """d and step of (1), (3) from the rows of A; marks empty rows, returns how many."""
-    cdef int32_t i, j, k, t, q, nt, kind, n_empty = 0, n_positive = 0
+    cdef int32_t i, j, q, nt, kind, n_empty = 0, n_positive = 0
     cdef double diag, big, total = 0.0, mean, x, e, roll
     for i in range(p.n_rows):
         diag = 0.0
@@ -68,12 +68,7 @@ cdef public int32_t lav_csr_diagonal(const blocks_t* p, const csr_t* a, double* 
             e = csr_largest(a, j + 1, nt, d, step)
         if kind == CONTACT_ROLLING:
             roll = csr_largest(a, j + q - 2, 2, d, step)
-        for k in range(j, p.ptr[i + 1]):
-            step[k] = reciprocal(d[k])
-        if kind != ROUND:                               # which no sweep relaxes
-            for t in range(1, 1 + nt):
-                step[j + t] = reciprocal(e)
-        roll_step(p, i, roll, d, step)
+        block_steps(p, i, nt, e, roll, d, step)
     return n_empty
 
 
@@ -88,11 +83,17 @@ cdef inline double csr_largest(const csr_t* a, int32_t j, int32_t n, const doubl
     return e if e > 1e-10 * most else d[j]
 
 
-cdef inline void roll_step(const blocks_t* p, int32_t i, double e, const double* d, double* step) noexcept nogil:
-    # (3) on the two rows of block i that roll, where it has such
-    cdef int32_t k = p.ptr[i + 1] - 2
+cdef inline void block_steps(const blocks_t* p, int32_t i, int32_t nt, double e, double roll, const double* d,
+                             double* step) noexcept nogil:
+    # (3) of block i: e, roll are lambda_max of its nt tangents and of the two rows that roll, d where not positive
+    cdef int32_t j = p.ptr[i], end = p.ptr[i + 1], k
+    for k in range(j, end):
+        step[k] = reciprocal(d[k])
+    if nt > 0 and p.kind[i] != ROUND:                   # which no sweep relaxes
+        for k in range(j + 1, j + 1 + nt):
+            step[k] = reciprocal(e if e > 0.0 else d[j + 1])
     if p.kind[i] == CONTACT_ROLLING:
-        step[k] = step[k + 1] = reciprocal(e if e > 0.0 else d[k])
+        step[end - 2] = step[end - 1] = reciprocal(roll if roll > 0.0 else d[end - 2])
 
 
 cdef inline void pair_means(int32_t kind, int32_t size, double* d) noexcept nogil:
@@ -122,7 +123,7 @@ cdef public int32_t lav_rows_diagonal(const blocks_t* p, const rows_t* r, double
                                       int32_t* empty, double* minv_jac, double* coupling,
                                       double* swing) noexcept nogil:
     """d, nu, step, M^-1 J^T of joints, coupling and swing of contacts, from the factored form."""
-    cdef int32_t i, j, q, c, t, nt, end, n_empty = 0, n_positive = 0, a, b
+    cdef int32_t i, j, q, c, nt, end, n_empty = 0, n_positive = 0, a, b
     cdef double total = 0.0, mean, e, roll
     cdef double off[2]
     for i in range(r.n_joints):
@@ -167,13 +168,9 @@ cdef public int32_t lav_rows_diagonal(const blocks_t* p, const rows_t* r, double
         end = p.ptr[i + 1]
         nt = 0 if p.kind[i] == ROW else n_tangents(p.kind[i], end - j)
         pair_means(p.kind[i], end - j, d + j)
-        e = step[j + 1] if nt > 0 and step[j + 1] > 0.0 else (d[j + 1] if nt > 0 else 0.0)
+        e = step[j + 1] if nt > 0 else 0.0
         roll = step[end - 2] if p.kind[i] == CONTACT_ROLLING else 0.0
-        for q in range(j, end):
-            step[q] = reciprocal(d[q])
-        for t in range(1, 1 + nt):
-            step[j + t] = reciprocal(e)
-        roll_step(p, i, roll, d, step)
+        block_steps(p, i, nt, e, roll, d, step)
     block_weights(p, d, nu)
     joint_weights(p, r, nu)
     return n_empty
@@ -220,14 +217,7 @@ cdef public int32_t lav_general_diagonal(const blocks_t* p, const generalized_t*
             row = y + g.pval[b] + (k - g.prow[b]) * nc
             roll = largest_eigenvalue(d[k], dot(row, row + nc, nc), d[k + 1])
         pair_means(p.kind[i], p.ptr[i + 1] - j, d + j)
-        for k in range(j, p.ptr[i + 1]):
-            step[k] = reciprocal(d[k])
-        if nt > 0 and p.kind[i] != ROUND:
-            if not e > 0.0:
-                e = d[j + 1]
-            for k in range(1, 1 + nt):
-                step[j + k] = reciprocal(e)
-        roll_step(p, i, roll, d, step)
+        block_steps(p, i, nt, e, roll, d, step)
     block_weights(p, d, nu)
     return n_empty
 
@@ -586,29 +576,6 @@ _NONE.flags.writeable = False
 def _read_only(x):
     x.flags.writeable = False
     return x
-
-
-def dense_to_csr(const double[:, ::1] a):
-    """Nonzeros of a dense matrix as (indptr, indices, data), int32; nnz must be below 2^31."""
-    cdef Py_ssize_t i, j, n = a.shape[0], m = a.shape[1], nnz = 0, q = 0
-    for i in range(n):
-        for j in range(m):
-            nnz += a[i, j] != 0.0
-    whole, numbers = new(n + 1 + nnz, I4), new(nnz)
-    cdef int32_t[::1] indptr = whole
-    cdef double[::1] data = numbers
-    cdef int32_t* indices = &indptr[0] + n + 1
-    indptr[0] = 0
-    for i in range(n):
-        for j in range(m):
-            if a[i, j] != 0.0:
-                indices[q] = <int32_t>j
-                data[q] = a[i, j]
-                q += 1
-        indptr[i + 1] = <int32_t>q
-    whole.setflags(False)
-    numbers.setflags(False)
-    return whole[:n + 1], whole[n + 1:], numbers
 
 
 def rows_velocity(Data p, const double[:, ::1] v, double[::1] out):

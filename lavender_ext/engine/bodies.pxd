@@ -115,6 +115,19 @@ cdef inline void drift_rotation(double* q, double* omega, const double* inertia,
     world_times(r, inv_inertia, momentum, omega)
 
 
+cdef inline int32_t is_lost(const engine_t* e, int32_t body) noexcept nogil:
+    # Is its state not finite?
+    cdef double total = 0.0
+    cdef int32_t k
+    for k in range(6):
+        total += e.v[6 * body + k] - e.v[6 * body + k]
+    for k in range(3):
+        total += e.x[3 * body + k] - e.x[3 * body + k]
+    for k in range(4):
+        total += e.q[4 * body + k] - e.q[4 * body + k]
+    return total != 0.0
+
+
 cdef inline void start_bodies(engine_t* e) noexcept nogil:
     """Frames, world inverse inertia and v* = v + h g of the coming substep."""
     cdef int32_t i, k, b
@@ -138,7 +151,7 @@ cdef inline int32_t drift_bodies(engine_t* e, int32_t shifted) noexcept nogil:
     Returns the first body whose state is not finite, or -1.
     """
     cdef int32_t i, k, b, lost = -1
-    cdef double h = e.setting[S_H], total
+    cdef double h = e.setting[S_H]
     cdef double* v
     cdef double* x
     cdef double* q
@@ -159,13 +172,6 @@ cdef inline int32_t drift_bodies(engine_t* e, int32_t shifted) noexcept nogil:
             for k in range(3):
                 x[k] += e.shift[6 * i + k]
             turn(q, e.shift + 6 * i + 3, 1.0)
-        total = 0.0
-        for k in range(6):
-            total += v[k] - v[k]
-        for k in range(3):
-            total += x[k] - x[k]
-        for k in range(4):
-            total += q[k] - q[k]
-        if total != 0.0 and lost < 0:
+        if lost < 0 and is_lost(e, b):
             lost = b
     return lost

@@ -140,6 +140,16 @@ cdef inline double normal_velocity(const engine_t* e, int32_t a, int32_t b, int3
     return dot3(e.normal + 3 * c, u)
 
 
+cdef inline void local_arm(const engine_t* e, int32_t body, const double* arm, double* out) noexcept nogil:
+    # a sphere's contact does not turn with it; a box's does
+    cdef int32_t k
+    if e.kind_of_shape[body] == BOX:
+        to_body(e.rot + 9 * body, arm, out)
+    else:
+        for k in range(3):
+            out[k] = arm[k]
+
+
 cdef inline void make_contact(engine_t* e, const rows_t* r, int32_t c, int32_t row, int32_t a, int32_t b,
                               const manifold_t* m, int32_t at, const double* tangent, int32_t nt,
                               int32_t turns) noexcept nogil:
@@ -159,17 +169,8 @@ cdef inline void make_contact(engine_t* e, const rows_t* r, int32_t c, int32_t r
         e.normal[3 * c + k] = m.normal[k]
         e.arm_a[3 * c + k] = m.point[3 * at + k] - e.x[3 * a + k]
         e.arm_b[3 * c + k] = m.point[3 * at + k] - e.x[3 * b + k]
-    # a sphere's contact does not turn with it; a box's does
-    if e.kind_of_shape[a] == BOX:
-        to_body(e.rot + 9 * a, e.arm_a + 3 * c, e.local + 6 * c)
-    else:
-        for k in range(3):
-            e.local[6 * c + k] = e.arm_a[3 * c + k]
-    if e.kind_of_shape[b] == BOX:
-        to_body(e.rot + 9 * b, e.arm_b + 3 * c, e.local + 6 * c + 3)
-    else:
-        for k in range(3):
-            e.local[6 * c + 3 + k] = e.arm_b[3 * c + k]
+    local_arm(e, a, e.arm_a + 3 * c, e.local + 6 * c)
+    local_arm(e, b, e.arm_b + 3 * c, e.local + 6 * c + 3)
     if nt > 0:
         for k in range(3):
             e.tangent[3 * c + k] = tangent[k]

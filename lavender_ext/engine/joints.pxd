@@ -24,27 +24,23 @@ from lavender_ext.engine.arrays cimport (BALL, DISTANCE, HINGE, H_WARM_START, J_
 from lavender_ext.engine.bodies cimport to_world
 
 
-cdef inline void anchor(const engine_t* e, int32_t body, const double* local, double* arm,
-                        double* point) noexcept nogil:
-    # arm from the centre and point, world; body -1 is the world
-    cdef int32_t k
-    if body < 0:
-        for k in range(3):
-            arm[k] = local[k]
-            point[k] = local[k]
-    else:
-        to_world(e.rot + 9 * body, local, arm)
-        for k in range(3):
-            point[k] = e.x[3 * body + k] + arm[k]
-
-
 cdef inline void direction(const engine_t* e, int32_t body, const double* local, double* out) noexcept nogil:
+    # of a body's frame in the world; body -1 is the world
     cdef int32_t k
     if body < 0:
         for k in range(3):
             out[k] = local[k]
     else:
         to_world(e.rot + 9 * body, local, out)
+
+
+cdef inline void anchor(const engine_t* e, int32_t body, const double* local, double* arm,
+                        double* point) noexcept nogil:
+    # arm from the centre and point, world
+    cdef int32_t k
+    direction(e, body, local, arm)
+    for k in range(3):
+        point[k] = arm[k] if body < 0 else e.x[3 * body + k] + arm[k]
 
 
 cdef inline void point_row(double* jac, const double* axis, const double* arm_a,

@@ -181,6 +181,44 @@ cdef inline int32_t clip_side(int32_t n, const double* p, const int32_t* code, i
     return kept
 
 
+cdef inline void pick_four(const double* p, int32_t kept, double margin, int32_t* pick) noexcept nogil:
+    # The outermost along four directions, askew so that no two corners of a square tie; the deepest
+    # takes the place of its neighbour if it is among none of them.
+    cdef double s, best, deep
+    cdef int32_t i, j, at, other
+    for i in range(4):
+        best = -1.0 / 0.0
+        pick[i] = 0
+        for j in range(kept):
+            if i & 1:
+                s = p[3 * j + 1] - 0.3 * p[3 * j]
+            else:
+                s = p[3 * j] + 0.3 * p[3 * j + 1]
+            if i < 2:
+                s = -s
+            if s > best:
+                best = s
+                pick[i] = j
+    at = 0
+    for j in range(kept):
+        if p[3 * j + 2] < p[3 * at + 2]:
+            at = j
+    deep = 1.0 / 0.0
+    for i in range(4):
+        if p[3 * pick[i] + 2] < deep:
+            deep = p[3 * pick[i] + 2]
+    if p[3 * at + 2] < deep - 1e-3 * margin:
+        best = 1.0 / 0.0
+        other = 0
+        for i in range(4):
+            s = (p[3 * pick[i]] - p[3 * at]) * (p[3 * pick[i]] - p[3 * at])
+            s += (p[3 * pick[i] + 1] - p[3 * at + 1]) * (p[3 * pick[i] + 1] - p[3 * at + 1])
+            if s < best:
+                best = s
+                other = i
+        pick[other] = at
+
+
 cdef inline void face_points(const double* xr, const double* rr, const double* hr, int32_t axis, double sign,
                              const double* xo, const double* ro, const double* ho, int32_t on_b,
                              double margin, manifold_t* m) noexcept nogil:
@@ -194,9 +232,9 @@ cdef inline void face_points(const double* xr, const double* rr, const double* h
     cdef double c[3]
     cdef double u[3]
     cdef double w[3]
-    cdef double s, best, hx, hy, tol, deep
+    cdef double s, best, hx, hy, tol
     cdef int32_t i, j, k, ax = axis + 1 if axis < 2 else 0, ay = axis - 1 if axis > 0 else 2
-    cdef int32_t face = 0, fx, fy, count, kept, at, other, feature
+    cdef int32_t face = 0, fx, fy, count, kept, at, feature
     cdef int32_t pick[4]
     hx = hr[ax]
     hy = hr[ay]
@@ -265,39 +303,7 @@ cdef inline void face_points(const double* xr, const double* rr, const double* h
                 more[3 * kept + k] = poly[3 * i + k]
             kept += 1
     if kept > 4:
-        # The outermost along four directions, askew so that no two corners of a square tie; the deepest
-        # takes the place of its neighbour if it is among none of them.
-        for i in range(4):
-            best = -1.0 / 0.0
-            pick[i] = 0
-            for j in range(kept):
-                if i & 1:
-                    s = more[3 * j + 1] - 0.3 * more[3 * j]
-                else:
-                    s = more[3 * j] + 0.3 * more[3 * j + 1]
-                if i < 2:
-                    s = -s
-                if s > best:
-                    best = s
-                    pick[i] = j
-        at = 0
-        for j in range(kept):
-            if more[3 * j + 2] < more[3 * at + 2]:
-                at = j
-        deep = 1.0 / 0.0
-        for i in range(4):
-            if more[3 * pick[i] + 2] < deep:
-                deep = more[3 * pick[i] + 2]
-        if more[3 * at + 2] < deep - 1e-3 * margin:
-            best = 1.0 / 0.0
-            other = 0
-            for i in range(4):
-                s = (more[3 * pick[i]] - more[3 * at]) * (more[3 * pick[i]] - more[3 * at])
-                s += (more[3 * pick[i] + 1] - more[3 * at + 1]) * (more[3 * pick[i] + 1] - more[3 * at + 1])
-                if s < best:
-                    best = s
-                    other = i
-            pick[other] = at
+        pick_four(more, kept, margin, pick)
     else:
         for i in range(kept):
             pick[i] = i

@@ -22,7 +22,7 @@ from libc.stdint cimport int32_t
 from lavender_ext.core.rows cimport joint_velocity, push_bodies, reciprocal
 from lavender_ext.engine.arrays cimport (H_CONTACTS, N_DYNAMIC, N_JOINT, S_BOUNCE, S_H, S_HERTZ, S_PUSH, S_RATIO,
                                          engine_t)
-from lavender_ext.engine.bodies cimport drift_rotation, rotation, turn, world_times
+from lavender_ext.engine.bodies cimport drift_rotation, is_lost, rotation, turn, world_times
 from lavender_ext.engine.contacts cimport normal_velocity
 from lavender_ext.engine.projection cimport normal_speed, rigid_row
 
@@ -130,7 +130,7 @@ cdef inline int32_t drift_relaxed(engine_t* e) noexcept nogil:
     Returns the first body whose state is not finite, or -1.
     """
     cdef int32_t i, k, b, lost = -1
-    cdef double h = e.setting[S_H], total
+    cdef double h = e.setting[S_H]
     cdef double r[9]
     cdef double moving[6]
     cdef double momentum[3]
@@ -155,13 +155,6 @@ cdef inline int32_t drift_relaxed(engine_t* e) noexcept nogil:
             world_times(r, e.inv_inertia_body + 9 * b, momentum, v + 3)
         elif moving[3] != 0.0 or moving[4] != 0.0 or moving[5] != 0.0:
             turn(q, moving + 3, h)
-        total = 0.0
-        for k in range(6):
-            total += v[k] - v[k]
-        for k in range(3):
-            total += x[k] - x[k]
-        for k in range(4):
-            total += q[k] - q[k]
-        if total != 0.0 and lost < 0:
+        if lost < 0 and is_lost(e, b):
             lost = b
     return lost

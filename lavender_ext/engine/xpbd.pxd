@@ -27,7 +27,7 @@ from lavender_ext.core.rows cimport cross, dot3, joint_push, joint_velocity, pus
 from lavender_ext.engine.arrays cimport (BOX, DISTANCE, HINGE, H_CONTACTS, H_ITERATIONS, J_ANCHOR_A, J_ANCHOR_B,
                                          J_AXIS_A, J_AXIS_B, J_DAMPING, J_HERTZ, J_LENGTH, N_DYNAMIC, N_JOINT,
                                          N_JOINT_REAL, S_BOUNCE, S_H, engine_t)
-from lavender_ext.engine.bodies cimport drift_rotation, rotation, to_world, turn
+from lavender_ext.engine.bodies cimport drift_rotation, is_lost, rotation, to_world, turn
 from lavender_ext.engine.contacts cimport normal_velocity
 from lavender_ext.engine.projection cimport normal_speed
 
@@ -385,17 +385,10 @@ cdef inline void correct_all(engine_t* e) noexcept nogil:
 cdef inline int32_t keep_velocities(engine_t* e) noexcept nogil:
     """v = v* + dv, poses as they are. Returns the first body whose state is not finite, or -1."""
     cdef int32_t i, k, b, lost = -1
-    cdef double total
     for i in range(e.size[N_DYNAMIC]):
         b = e.body_of[i]
-        total = 0.0
         for k in range(6):
             e.v[6 * b + k] = e.v_free[6 * i + k] + e.dv[6 * i + k]
-            total += e.v[6 * b + k] - e.v[6 * b + k]
-        for k in range(3):
-            total += e.x[3 * b + k] - e.x[3 * b + k]
-        for k in range(4):
-            total += e.q[4 * b + k] - e.q[4 * b + k]
-        if total != 0.0 and lost < 0:
+        if lost < 0 and is_lost(e, b):
             lost = b
     return lost

@@ -1,23 +1,30 @@
-"""A sparse matrix of square blocks and its factor: patterns by block rows and columns, made by symbolic.pyx."""
+"""Factors of sparse matrices: by dense panels, and of square blocks by block rows and columns; patterns by symbolic.pyx."""
 from libc.stdint cimport int32_t, int64_t
 
 
-cdef struct supernodes_t:       # block columns of one pattern, as dense panels (supernodal.pxd)
-    int32_t n                   # panels
+cdef struct sparse_t:
+    int32_t n                   # rows
+    int32_t panels
     int32_t wide                # 1 where four lanes are one instruction
-    const int32_t* first        # (n + 1) block columns
-    const int32_t* of           # (blocks) panel of a block column
-    const int32_t* rptr         # (n + 1) block rows below a panel, ascending
+    int32_t lu
+    const int32_t* order        # (n) row at each place
+    const int32_t* place        # (n) place of each row
+    const int32_t* first        # (panels + 1) places
+    const int32_t* of           # (n) panel of a place
+    const int32_t* rptr         # (panels + 1) places below a panel, ascending
     const int32_t* rows
-    const int32_t* height       # (n) rows of a panel
-    const int64_t* at           # (n + 1) of a panel in `val`
-    const int64_t* spot         # of each lower block of N in `val`
+    const int64_t* at           # (panels + 1) of a panel in `val`,
+    const int64_t* beside       # (panels + 1) and of what is beside it in `up`
     double* val
-    double* temp                # what one panel takes from another, at most
-    int32_t* place              # (blocks) first row of a block row in the present panel
-    int32_t* head               # (n) panels that take from a panel next
-    int32_t* link               # (n)
-    int32_t* next               # (n) first row not yet taken
+    double* up                  # L U only
+    double* temp                # what one panel takes from another, at most, or STRIP rows of one
+    double* scale               # (n) L U: of each place; else the least pivot of each
+    double* y                   # (n)
+    int32_t* swap               # (n) L U: the place within the panel that came here
+    int32_t* rel                # (n) row of a place in the present panel
+    int32_t* head               # (panels) panels that take from a panel next
+    int32_t* link               # (panels)
+    int32_t* next               # (panels) first row not yet taken
 
 
 cdef struct factor_t:
@@ -38,4 +45,5 @@ cdef struct factor_t:
     double* work2
     int32_t* pivot              # (n s), unsymmetric only
     int32_t* next               # (n)
-    const supernodes_t* super   # or NULL: L then stands in `lval` and `dval`
+    const sparse_t* super       # panels, or NULL: L then stands in `lval` and `dval`
+    const int64_t* spot         # of each lower block of N in their values

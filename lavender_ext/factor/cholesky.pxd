@@ -6,7 +6,7 @@ from libc.math cimport sqrt
 from libc.stdint cimport int32_t, int64_t
 
 from lavender_ext.factor.blocks cimport factor_t
-from lavender_ext.factor.supernodal cimport super_cholesky, super_solve
+from lavender_ext.factor.supernodal cimport panels_solve, super_cholesky
 
 
 cdef inline void sub_transposed(double* wt, const double* yt, const double* lt, const int32_t s) noexcept nogil:
@@ -188,7 +188,7 @@ cdef inline void solve_blocks(const factor_t* f, double* x, const int32_t s) noe
 cdef inline void block_solve(const factor_t* f, double* x) noexcept nogil:
     """x <- N^-1 x after `block_cholesky`, x (n, s)."""
     if f.super != NULL:
-        super_solve(f, x)
+        panels_solve(f.super, x, 0)
         return
     if f.s == 1:
         solve_blocks(f, x, 1)

@@ -150,19 +150,6 @@ cdef public int32_t lav_body_pairs(int32_t k, const int32_t* body, int32_t n_bod
     return count
 
 
-cdef public void lav_body_order(int32_t k, const int32_t* body, int32_t n, int32_t words, uint64_t* near,
-                                uint64_t* given, int32_t* degree, int32_t* rank) noexcept nogil:
-    """rank (n): place of each body in the elimination; near, given (n, words) hold neighbours, scratch and kept."""
-    body_order(k, body, n, words, near, given, degree, rank)
-
-
-cdef public void lav_body_pattern(int32_t k, const int32_t* body, int32_t n, int32_t words, const uint64_t* given,
-                                  const int32_t* rank, int32_t* at, int32_t* nptr, int32_t* nind, int32_t* node,
-                                  int32_t* slot, int32_t* turned) noexcept nogil:
-    """Lower block rows in elimination order, and of each block its two places (larger first) and three slots."""
-    lower_pattern(k, body, n, words, given, rank, at, nptr, nind, node, slot, turned)
-
-
 def body_pattern(const int32_t[:, ::1] body, int n):
     """(nptr, nind, node, slot, turned) of the normal matrix over n bodies, blocks between bodies (k, 2).
 
@@ -178,9 +165,9 @@ def body_pattern(const int32_t[:, ::1] body, int n):
     cdef int32_t[:, ::1] node = node_array, slot = slot_array
     if k and n:
         with nogil:
-            lav_body_order(k, &body[0, 0], n, words, &near[0], &given[0], &degree[0], &rank[0])
-            lav_body_pattern(k, &body[0, 0], n, words, &given[0], &rank[0], &degree[0], &nptr[0], &nind[0],
-                             &node[0, 0], &slot[0, 0], &turned[0])
+            body_order(k, &body[0, 0], n, words, &near[0], &given[0], &degree[0], &rank[0])
+            lower_pattern(k, &body[0, 0], n, words, &given[0], &rank[0], &degree[0], &nptr[0], &nind[0], &node[0, 0],
+                          &slot[0, 0], &turned[0])
     return nptr_array, nind_array[:nptr_array[n]].copy(), node_array, slot_array, turned_array
 
 

@@ -107,18 +107,10 @@ cdef inline int32_t gather(quotient_t* g, int32_t p, int32_t room) noexcept nogi
     return g.length[p]
 
 
-cdef inline void degree_order(int32_t n, const int32_t* size, int32_t room, int32_t* list, int32_t* whole, int64_t* left,
-                              int32_t* head, int32_t* order) noexcept nogil:
-    """order (n): the vertex eliminated first, second, ...
-
-    list (room): the neighbours of each, without itself, at list[whole[i]:whole[i + 1]]; room is their number and n or
-    more. size (n) > 0 is the weight of each. whole (8 n + 1), left (n), head (sum of size + 1) are scratch.
-    """
-    cdef quotient_t g
-    cdef int32_t i, j, e, p, k, q, to, first, count = 0, last = n, least = 0, deg, weight = 0, total = 0, rest, middle
-    cdef int64_t stamp = 1
-    cdef double many
-    g.n, g.list, g.left, g.head = n, list, left, head
+cdef inline int32_t begin_graph(quotient_t* g, const int32_t* size, int32_t* whole, int32_t* last, int32_t* order) noexcept nogil:
+    """Degrees of all vertices but those of very many neighbours, from order[last] on; the weight of the others."""
+    cdef int32_t i, q, deg, total = 0, n = g.n
+    cdef double many = 10.0 * sqrt(<double>n)
     g.at = whole
     g.length = whole + n + 1
     g.elements = whole + 2 * n + 1
@@ -128,32 +120,46 @@ cdef inline void degree_order(int32_t n, const int32_t* size, int32_t room, int3
     g.before = whole + 6 * n + 1
     g.seen = whole + 7 * n + 1
     g.free = g.at[n]
-    many = 10.0 * sqrt(<double>n)
+    last[0] = n
     for i in range(n):
         total += size[i]
         g.length[i] = g.at[i + 1] - g.at[i]
         g.elements[i] = 0
         g.kind[i] = VERTEX
         g.seen[i] = -1
-        left[i] = 0
+        g.left[i] = 0
     for i in range(total + 1):
-        head[i] = -1
+        g.head[i] = -1
     for i in range(n - 1, -1, -1):
         if g.length[i] > many and g.length[i] > 16:
-            last -= 1
-            order[last] = i
+            last[0] -= 1
+            order[last[0]] = i
             total -= size[i]
             g.kind[i] = GONE
-    rest = total
     for i in range(n - 1, -1, -1):
         if g.kind[i] != VERTEX:
             continue
         deg = 0
         for q in range(g.at[i], g.at[i] + g.length[i]):
-            if g.kind[list[q]] == VERTEX:
-                deg += size[list[q]]
+            if g.kind[g.list[q]] == VERTEX:
+                deg += size[g.list[q]]
         g.degree[i] = deg
-        link(&g, i)
+        link(g, i)
+    return total
+
+
+cdef inline void degree_order(int32_t n, const int32_t* size, int32_t room, int32_t* list, int32_t* whole, int64_t* left,
+                              int32_t* head, int32_t* order) noexcept nogil:
+    """order (n): the vertex eliminated first, second, ...
+
+    list (room): the neighbours of each, without itself, at list[whole[i]:whole[i + 1]]; room is their number and n or
+    more. size (n) > 0 is the weight of each. whole (8 n + 1), left (n), head (sum of size + 1) are scratch.
+    """
+    cdef quotient_t g
+    cdef int32_t i, j, e, p, k, q, to, first, count = 0, last, least = 0, deg, weight, total, rest, middle
+    cdef int64_t stamp = 1
+    g.n, g.list, g.left, g.head = n, list, left, head
+    total = rest = begin_graph(&g, size, whole, &last, order)
     while count < last:
         while head[least] < 0:
             least += 1

@@ -22,11 +22,10 @@ cdef inline void block_tree(int32_t n, const int32_t* nptr, const int32_t* nind,
                 j = parent[j]
 
 
-cdef inline void block_pattern(int32_t n, const int32_t* nptr, const int32_t* nind, const int32_t* parent, int32_t* mark,
-                               const int32_t* lptr, const int32_t* rptr, int32_t* next, int32_t* lind,
-                               int32_t* rind) noexcept nogil:
-    """Rows of every column of L, and columns of every row, both ascending."""
-    cdef int32_t k, q, j, p
+cdef inline void column_pattern(int32_t n, const int32_t* nptr, const int32_t* nind, const int32_t* parent, int32_t* mark,
+                                const int32_t* lptr, int32_t* next, int32_t* lind) noexcept nogil:
+    """Rows of every column of L, ascending; mark, next (n) are scratch."""
+    cdef int32_t k, q, j
     for k in range(n):
         mark[k] = k
         next[k] = lptr[k]
@@ -37,6 +36,14 @@ cdef inline void block_pattern(int32_t n, const int32_t* nptr, const int32_t* ni
                 lind[next[j]] = k
                 next[j] += 1
                 j = parent[j]
+
+
+cdef inline void block_pattern(int32_t n, const int32_t* nptr, const int32_t* nind, const int32_t* parent, int32_t* mark,
+                               const int32_t* lptr, const int32_t* rptr, int32_t* next, int32_t* lind,
+                               int32_t* rind) noexcept nogil:
+    """Rows of every column of L, and columns of every row, both ascending."""
+    cdef int32_t j, k, p
+    column_pattern(n, nptr, nind, parent, mark, lptr, next, lind)
     for k in range(n):
         next[k] = rptr[k]
     for j in range(n):

@@ -1,22 +1,209 @@
-"""Elimination trees and patterns of block factors, and the pattern of a chain of bodies in its own order."""
+"""What a pattern alone tells of a factor: elimination trees, patterns of block factors, panels, their rows and places.
+
+Of a sparse matrix rows of one pattern are taken as one vertex, in an order of least degree; of a matrix of blocks each
+block column is one, as they stand. A chain of bodies has its pattern in its own order.
+"""
 from libc.stdint cimport int32_t, int64_t
 
 import numpy as np
 
-from lavender_ext.factor.symbolic cimport block_pattern, block_tree, postorder_of
+from lavender_ext.factor.minimum_degree cimport degree_order
+from lavender_ext.factor.symbolic cimport block_pattern, block_tree, column_pattern, postorder_of
 
 
-cdef public void lav_block_tree(int32_t n, const int32_t* nptr, const int32_t* nind, int32_t* parent,
-                                int32_t* mark, int32_t* row_count, int32_t* column_count) noexcept nogil:
-    """Elimination tree of the lower pattern, and how many blocks each row and column of L holds."""
-    block_tree(n, nptr, nind, parent, mark, row_count, column_count)
+cdef enum:
+    FEW = 6                     # columns of a panel up to which zeros are held for four times the share
 
 
-cdef public void lav_block_pattern(int32_t n, const int32_t* nptr, const int32_t* nind, const int32_t* parent,
-                                   int32_t* mark, const int32_t* lptr, const int32_t* rptr, int32_t* next,
-                                   int32_t* lind, int32_t* rind) noexcept nogil:
-    """Rows of every column of L, and columns of every row, both ascending."""
-    block_pattern(n, nptr, nind, parent, mark, lptr, rptr, next, lind, rind)
+ZEROS = 0.1                     # share of a panel that zeros held as numbers may be
+
+
+cdef public int32_t lav_same_rows(int32_t n, const int32_t* indptr, const int32_t* indices, int32_t* node,
+                                  int32_t* first) noexcept nogil:
+    """Runs of rows with the same columns: their number, the run of each row, the first row of each."""
+    cdef int32_t i, q, count = 0, length
+    cdef bint same
+    for i in range(n):
+        length = indptr[i + 1] - indptr[i]
+        same = i > 0 and length == indptr[i] - indptr[i - 1]
+        if same:
+            for q in range(length):
+                if indices[indptr[i] + q] != indices[indptr[i - 1] + q]:
+                    same = False
+                    break
+        if not same:
+            first[count] = i
+            count += 1
+        node[i] = count - 1
+    first[count] = n
+    return count
+
+
+cdef public int32_t lav_node_graph(int32_t count, const int32_t* indptr, const int32_t* indices, const int32_t* node,
+                                   const int32_t* first, int32_t* ptr, int32_t* near) noexcept nogil:
+    """Neighbours of each run of rows, without itself; how many there are in all. Columns ascend."""
+    cdef int32_t k, q, j, last, total = 0
+    for k in range(count):
+        ptr[k] = total
+        last = k
+        for q in range(indptr[first[k]], indptr[first[k] + 1]):
+            j = node[indices[q]]
+            if j != last and j != k:
+                near[total] = j
+                total += 1
+                last = j
+    ptr[count] = total
+    return total
+
+
+cdef public void lav_lower(int32_t n, const int32_t* ptr, const int32_t* near, const int32_t* rank, const int32_t* order,
+                           int32_t* nptr, int32_t* nind) noexcept nogil:
+    """Lower pattern of a graph in an order, the diagonal last in each row."""
+    cdef int32_t k, i, q, to = 0
+    for k in range(n):
+        nptr[k] = to
+        i = order[k]
+        for q in range(ptr[i], ptr[i + 1]):
+            if rank[near[q]] < k:
+                nind[to] = rank[near[q]]
+                to += 1
+        nind[to] = k
+        to += 1
+    nptr[n] = to
+
+
+cdef public int32_t lav_sparse_order(int32_t n, const int32_t* indptr, const int32_t* indices, int32_t room,
+                                     int32_t* scratch, int64_t* left, int32_t* begin, int32_t* order, int32_t* size,
+                                     int32_t* nptr, int32_t* nind, int32_t* parent, int32_t* lptr) noexcept nogil:
+    """Runs of rows with the same columns, in their order of elimination, and how many vertices are below each.
+
+    begin (n + 1): the first row of each run as they stand; order, size (n), nptr (n + 1), nind (nnz / 2 + n + 1),
+    parent (n) and lptr (n + 1) belong to the order. scratch has 11 n + 2 + room numbers, room is nnz and n or more; left
+    (n). The number of runs, or -1 where the factor has 2^31 entries or more.
+    """
+    cdef int32_t* node = scratch
+    cdef int32_t* gptr = scratch + n                    # n + 1
+    cdef int32_t* head = scratch + 2 * n + 1            # n + 1
+    cdef int32_t* whole = scratch + 3 * n + 2           # 8 n + 1
+    cdef int32_t* near = scratch + 11 * n + 3
+    cdef int32_t* rank = node
+    cdef int32_t count, i, k, total
+    cdef int64_t below = 0
+    count = lav_same_rows(n, indptr, indices, node, begin)
+    total = lav_node_graph(count, indptr, indices, node, begin, gptr, near)
+    for i in range(count):
+        whole[i] = gptr[i]
+        size[i] = begin[i + 1] - begin[i]
+    whole[count] = total
+    degree_order(count, size, room, near, whole, left, head, order)
+    # The quotient graph has used up its lists: once more.
+    total = lav_node_graph(count, indptr, indices, node, begin, gptr, near)
+    for i in range(count):
+        rank[order[i]] = i
+    lav_lower(count, gptr, near, rank, order, nptr, nind)
+    block_tree(count, nptr, nind, parent, whole, whole + n, whole + 2 * n)
+    postorder_of(count, parent, whole, whole + n, whole + 2 * n, whole + 3 * n)
+    for i in range(count):
+        rank[i] = whole[3 * n + rank[i]]
+    for i in range(count):
+        order[rank[i]] = i
+    lav_lower(count, gptr, near, rank, order, nptr, nind)
+    for i in range(count):
+        size[i] = begin[order[i] + 1] - begin[order[i]]
+    block_tree(count, nptr, nind, parent, whole, whole + n, lptr + 1)
+    lptr[0] = 0
+    for k in range(count):
+        below += lptr[k + 1]
+        if below >= 2147483647:
+            return -1
+        lptr[k + 1] += lptr[k]
+    return count
+
+
+cdef public int32_t lav_sparse_pattern(int32_t count, const int32_t* nptr, const int32_t* nind, const int32_t* parent,
+                                       const int32_t* size, const int32_t* lptr, int32_t* lind, int32_t* scratch,
+                                       double share, int32_t* group, int64_t* below) noexcept nogil:
+    """Panels of vertices: their number, the first vertex of each in group (count + 1), rows below all of them.
+
+    lind (lptr[count]) gets the vertices below each; scratch (2 count).
+    """
+    cdef int32_t i, c, q, k
+    column_pattern(count, nptr, nind, parent, scratch, lptr, scratch + count, lind)
+    k = lav_panels(count, lptr, lind, size, FEW, share, group)
+    below[0] = 0
+    for i in range(k):
+        c = group[i + 1] - 1
+        for q in range(lptr[c], lptr[c + 1]):
+            below[0] += size[lind[q]]
+    return k
+
+
+cdef public int32_t lav_panels(int32_t n, const int32_t* lptr, const int32_t* lind, const int32_t* size, int32_t few,
+                               double share, int32_t* first) noexcept nogil:
+    """Panels of neighbouring vertices, each the parent of the one before: their number, `first` of each (n + 1).
+
+    size (n): columns of a vertex. One joins the panel before it where its pattern is that panel's, or where the zeros that
+    are then held as numbers are at most `share` of the panel (panels up to `few` columns: four times as many).
+    """
+    cdef int32_t j, k = 0, q
+    cdef double width = 0.0, below, before = 0.0, held = 0.0, more, all_
+    for j in range(n):
+        below = 0.0
+        for q in range(lptr[j], lptr[j + 1]):
+            below += size[lind[q]]
+        if j > 0 and lptr[j] > lptr[j - 1] and lind[lptr[j - 1]] == j:
+            # Every column before gets the rows below j; it has those of its own already.
+            more = held + width * (below + size[j] - before)
+            all_ = 0.5 * (width + size[j]) * (width + size[j] + 1.0) + (width + size[j]) * below
+            if more <= (4.0 * share if width < few else share) * all_:
+                held = more
+                width += size[j]
+                before = below
+                continue
+        first[k] = j
+        k += 1
+        held = 0.0
+        width = size[j]
+        before = below
+    first[k] = n
+    return k
+
+
+cdef public void lav_panel_rows(int32_t n, int32_t count, int32_t panels, const int32_t* begin, const int32_t* order,
+                                 const int32_t* size, const int32_t* lptr, const int32_t* lind, const int32_t* group,
+                                 int32_t* starts, int32_t* by_place, int32_t* place, int32_t* first, int32_t* of,
+                                 int32_t* rptr, int32_t* rows, int64_t* at, int64_t* beside,
+                                 double* work) noexcept nogil:
+    """From vertices to rows, as `sparse_t` has them; work of L L^T; starts (count + 1) is scratch."""
+    cdef int32_t i, j, c = 0, q, k, width, below
+    for i in range(count):
+        starts[i] = c
+        for j in range(begin[order[i]], begin[order[i] + 1]):
+            by_place[c] = j
+            place[j] = c
+            c += 1
+    starts[count] = n
+    rptr[0] = 0
+    at[0] = 0
+    beside[0] = 0
+    work[0] = 0.0
+    for i in range(panels):
+        first[i] = starts[group[i]]
+        c = rptr[i]
+        for q in range(lptr[group[i + 1] - 1], lptr[group[i + 1]]):
+            for k in range(starts[lind[q]], starts[lind[q] + 1]):
+                rows[c] = k
+                c += 1
+        rptr[i + 1] = c
+        width = starts[group[i + 1]] - first[i]
+        below = c - rptr[i]
+        at[i + 1] = at[i] + <int64_t>width * (width + below)
+        beside[i + 1] = beside[i] + <int64_t>width * below
+        for j in range(first[i], first[i] + width):
+            of[j] = i
+        # Half of the sum of the squares of its columns' heights.
+        work[0] += width * (0.5 * (<double>below * below + <double>below * width) + <double>width * width / 6.0)
+    first[panels] = n
 
 
 def factor_pattern(const int32_t[::1] nptr, const int32_t[::1] nind):
@@ -28,7 +215,7 @@ def factor_pattern(const int32_t[::1] nptr, const int32_t[::1] nind):
     cdef int32_t[::1] lptr = lptr_array, rptr = rptr_array
     cdef int64_t total = 0
     cdef int32_t i
-    lav_block_tree(n, &nptr[0], &nind[0], &parent[0], &mark[0], &row_count[0], &column_count[0])
+    block_tree(n, &nptr[0], &nind[0], &parent[0], &mark[0], &row_count[0], &column_count[0])
     for i in range(n):
         total += column_count[i]
     if total >= 2**31:
@@ -39,7 +226,7 @@ def factor_pattern(const int32_t[::1] nptr, const int32_t[::1] nind):
         rptr[i + 1] = rptr[i] + row_count[i]
     lind_array, rind_array = np.empty(lptr[n] + 1, np.int32), np.empty(lptr[n] + 1, np.int32)
     cdef int32_t[::1] lind = lind_array, rind = rind_array
-    lav_block_pattern(n, &nptr[0], &nind[0], &parent[0], &mark[0], &lptr[0], &rptr[0], &row_count[0], &lind[0], &rind[0])
+    block_pattern(n, &nptr[0], &nind[0], &parent[0], &mark[0], &lptr[0], &rptr[0], &row_count[0], &lind[0], &rind[0])
     return lptr_array, lind_array, rptr_array, rind_array
 
 
@@ -80,12 +267,6 @@ def chain_pattern(const int32_t[:, ::1] body, int n):
     return nptr_array, nind_array[:nptr_array[n]].copy(), node_array, slot_array, turned_array
 
 
-cdef public void lav_postorder(int32_t n, const int32_t* parent, int32_t* child, int32_t* sibling, int32_t* stack,
-                               int32_t* rank) noexcept nogil:
-    """rank (n): place of each column after its children and beside them; roots, and siblings, in their order."""
-    postorder_of(n, parent, child, sibling, stack, rank)
-
-
 def postorder(const int32_t[::1] nptr, const int32_t[::1] nind):
     """(n,) places that keep the fill and put columns of one pattern beside each other."""
     cdef int32_t n = <int32_t>nptr.shape[0] - 1
@@ -94,85 +275,85 @@ def postorder(const int32_t[::1] nptr, const int32_t[::1] nind):
     out = np.empty(n, np.int32)
     cdef int32_t[::1] rank = out
     if n:
-        lav_block_tree(n, &nptr[0], &nind[0], &parent[0], &a[0], &b[0], &c[0])
-        lav_postorder(n, &parent[0], &a[0], &b[0], &c[0], &rank[0])
+        block_tree(n, &nptr[0], &nind[0], &parent[0], &a[0], &b[0], &c[0])
+        postorder_of(n, &parent[0], &a[0], &b[0], &c[0], &rank[0])
     return out
 
 
-cdef public int32_t lav_supernodes(int32_t n, const int32_t* lptr, const int32_t* lind, int32_t few, double share,
-                                   int32_t* first, int32_t* zeros) noexcept nogil:
-    """Panels of neighbouring block columns, each the parent of the one before: their number, `first` of each.
+def analysed(indptr, indices):
+    """(numbers, places in the values, work of L L^T) of `sparse_t`, for a matrix whose pattern is symmetric."""
+    cdef int32_t n = <int32_t>len(indptr) - 1, nnz = <int32_t>len(indices), count, k, room = nnz + nnz // 4 + n + 1
+    cdef const int32_t[::1] ptr = indptr, ind = indices
+    cdef const int32_t* entries = &ind[0] if nnz else NULL
+    cdef int64_t below
+    cdef double work, share = ZEROS
+    cdef int32_t[::1] scratch = np.empty(19 * n + nnz // 2 + room + 9, np.int32), lind, whole
+    cdef int64_t[::1] left = np.empty(2 * n + 2, np.int64), places
+    cdef int32_t* begin = &scratch[0]                   # n + 1
+    cdef int32_t* order = begin + n + 1
+    cdef int32_t* size = order + n
+    cdef int32_t* parent = size + n
+    cdef int32_t* nptr = parent + n                     # n + 1
+    cdef int32_t* lptr = nptr + n + 1                   # n + 1
+    cdef int32_t* group = lptr + n + 1                  # n + 1
+    cdef int32_t* nind = group + n + 1                  # nnz / 2 + n + 1
+    cdef int32_t* s = nind + nnz // 2 + n + 1           # 11 n + 3 + room
+    cdef int32_t* first
+    cdef int32_t* rptr
+    with nogil:
+        count = lav_sparse_order(n, &ptr[0], entries, room, s, &left[0], begin, order, size, nptr, nind, parent, lptr)
+    if count < 0:
+        raise OverflowError("the factor has 2^31 entries or more")
+    lind = np.empty(lptr[count] + 1, np.int32)
+    with nogil:
+        k = lav_sparse_pattern(count, nptr, nind, parent, size, lptr, &lind[0], s, share, group, &below)
+    if below >= 2**31:
+        raise OverflowError("the factor has 2^31 rows of panels or more")
+    whole_array, places_array = np.empty(5 * n + 5 * k + 2 + below, np.int32), np.empty(2 * k + 2, np.int64)
+    whole, places = whole_array, places_array
+    first = &whole[0] + 5 * n
+    rptr = first + k + 1
+    with nogil:
+        lav_panel_rows(n, count, k, begin, order, size, lptr, &lind[0], group, s, &whole[0], &whole[0] + n, first,
+                        &whole[0] + 2 * n, rptr, rptr + k + 1 + 3 * k, &places[0], &places[0] + k + 1, &work)
+    return whole_array, places_array, work
 
-    A column joins the panel before it where its pattern is that panel's, or where the zeros that are then held as numbers
-    are at most `share` of the panel (panels up to `few` columns: four times as many). zeros (n) is scratch.
+
+def block_panels(const int32_t[::1] nptr, const int32_t[::1] nind, const int32_t[::1] lptr, const int32_t[::1] lind, int s,
+                 int few, double share):
+    """As `analysed` of a lower block pattern as it stands, blocks of s rows; before it the place of each block in the values.
+
+    lptr, lind are from `factor_pattern`; few: blocks.
     """
-    cdef int32_t j, k = 0, width, below
-    cdef double held, all_
-    if n == 0:
-        return 0
-    first[0] = 0
-    zeros[0] = 0
-    for j in range(1, n):
-        below = lptr[j + 1] - lptr[j]
-        if lptr[j] > lptr[j - 1] and lind[lptr[j - 1]] == j:
-            width = j - first[k]
-            # Every column before gets the rows of j; it has those of its own below j already.
-            held = zeros[k] + <double>width * (below + 1 - (lptr[j] - lptr[j - 1]))
-            all_ = 0.5 * (width + 1.0) * (width + 2.0) + (width + 1.0) * below
-            if held <= (4.0 * share if width < few else share) * all_:
-                zeros[k] = <int32_t>held
-                continue
-        k += 1
-        first[k] = j
-        zeros[k] = 0
-    first[k + 1] = n
-    return k + 1
-
-
-def supernodes(const int32_t[::1] nptr, const int32_t[::1] nind, const int32_t[::1] lptr, const int32_t[::1] lind, int s,
-               int few, double share):
-    """(first, of, rptr, rows, height, at, spot, temp) of `supernodes_t`; temp: room for one product at most."""
-    cdef int32_t n = <int32_t>nptr.shape[0] - 1, k, i, j, q, c, width, rows, most = 0, run
-    first_array = np.empty(n + 1, np.int32)
-    cdef int32_t[::1] first = first_array, zeros = np.empty(n + 1, np.int32)
-    k = lav_supernodes(n, &lptr[0], &lind[0], few, share, &first[0], &zeros[0])
-    of_array, rptr_array = np.empty(n + 1, np.int32), np.zeros(k + 1, np.int32)
-    height_array, at_array = np.zeros(k + 1, np.int32), np.zeros(k + 1, np.int64)
-    cdef int32_t[::1] of = of_array, rptr = rptr_array, height = height_array, rows_
-    cdef int64_t[::1] at = at_array, spot
+    cdef int32_t n = <int32_t>nptr.shape[0] - 1, i, j, q, k, p, below = 0
+    cdef int32_t[::1] group = np.empty(n + 1, np.int32), one = np.ones(n + 1, np.int32), whole
+    cdef int32_t[::1] begin = s * np.arange(n + 1, dtype=np.int32), order = np.arange(n + 1, dtype=np.int32)
+    cdef int32_t[::1] size = np.full(n + 1, s, np.int32), starts = np.empty(n + 1, np.int32)
+    cdef int64_t[::1] places, spot = np.empty(nind.shape[0] + 1, np.int64)
+    cdef int32_t* of
+    cdef int32_t* first
+    cdef int32_t* rptr
+    cdef int32_t* rows
+    cdef double work
+    k = lav_panels(n, &lptr[0], &lind[0], &one[0], few, share, &group[0])
     for i in range(k):
-        c = first[i + 1] - 1                            # its last column has the rows below
-        rptr[i + 1] = rptr[i] + lptr[c + 1] - lptr[c]
-        width = s * (first[i + 1] - first[i])
-        height[i] = width + s * (rptr[i + 1] - rptr[i])
-        at[i + 1] = at[i] + <int64_t>width * height[i]
-        for j in range(first[i], first[i + 1]):
-            of[j] = i
-    rows_array, spot_array = np.empty(rptr[k] + 1, np.int32), np.empty(nind.shape[0] + 1, np.int64)
-    rows_ = rows_array
-    spot = spot_array
-    for i in range(k):
-        c = first[i + 1] - 1
-        for q in range(lptr[c + 1] - lptr[c]):
-            rows_[rptr[i] + q] = lind[lptr[c] + q]
-        run = 0                                         # rows in one later panel: what it takes at a time
-        for q in range(rptr[i], rptr[i + 1]):
-            run = run + 1 if q > rptr[i] and of[rows_[q]] == of[rows_[q - 1]] else 1
-            width = s * s * run * (rptr[i + 1] - q + run - 1)
-            if width > most:
-                most = width
-        if s * (rptr[i + 1] - rptr[i]) > most:
-            most = s * (rptr[i + 1] - rptr[i])
+        below += s * (lptr[group[i + 1]] - lptr[group[i + 1] - 1])
+    whole_array, places_array = np.empty(5 * n * s + 5 * k + 2 + below, np.int32), np.empty(2 * k + 2, np.int64)
+    whole, places = whole_array, places_array
+    of = &whole[0] + 2 * n * s
+    first = of + 3 * n * s
+    rptr = first + k + 1
+    rows = rptr + 4 * k + 1
+    lav_panel_rows(n * s, n, k, &begin[0], &order[0], &size[0], &lptr[0], &lind[0], &group[0], &starts[0], &whole[0],
+                   &whole[0] + n * s, first, of, rptr, rows, &places[0], &places[0] + k + 1, &work)
     for j in range(n):
         for q in range(nptr[j], nptr[j + 1]):
-            c = nind[q]
-            i = of[c]
-            if j < first[i + 1]:
-                rows = s * (j - first[i])
-            else:
-                width = rptr[i]
-                while rows_[width] != j:
-                    width += 1
-                rows = s * (first[i + 1] - first[i] + width - rptr[i])
-            spot[q] = at[i] + rows + <int64_t>s * (c - first[i]) * height[i]
-    return first_array[: k + 1].copy(), of_array, rptr_array, rows_array, height_array, at_array, spot_array, most
+            i = of[s * nind[q]]
+            p = s * j - first[i]
+            if s * j >= first[i + 1]:
+                p = rptr[i]
+                while rows[p] != s * j:
+                    p += 1
+                p += first[i + 1] - first[i] - rptr[i]
+            spot[q] = places[i] + p + <int64_t>(s * nind[q] - first[i]) * (first[i + 1] - first[i] + rptr[i + 1] - rptr[i])
+    return spot.base, whole_array, places_array, work

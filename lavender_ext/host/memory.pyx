@@ -15,10 +15,8 @@ from lavender_ext.core.csr cimport csr_t
 from lavender_ext.core.rows cimport rows_t
 from lavender_ext.engine.arrays cimport (CAP_CONTACT, CAP_PAIR, H_ITERATIONS, H_NEED_CONTACTS, H_NEED_PAIRS,
                                          H_ORDER, H_PAIRS_VALID, H_POSITION_ITERATIONS, H_SEED, H_WARM_START,
-                                         N_BODY, N_CACHE_IMPULSE, N_DYNAMIC, N_EXCLUDED, N_HEAD, N_JOINT,
-                                         N_JOINT_REAL, N_JOINT_ROW, N_SETTINGS, N_SIZES, S_BETA, S_BOUNCE,
-                                         S_GRAVITY, S_H, S_MARGIN, S_MATCH, S_MAX_PUSH, S_OUT, S_SKIN, S_SLOP,
-                                         bind, engine_t)
+                                         N_CACHE_IMPULSE, N_JOINT, N_SIZES, S_MARGIN, S_MATCH, S_OUT, S_SKIN, bind,
+                                         engine_t)
 from lavender_ext.engine.kept cimport copy_ints, copy_keys, copy_reals
 from lavender_ext.judge.score cimport score_t
 
@@ -30,7 +28,7 @@ cdef struct settings_t:
     int32_t order               # as engine/arrays.pxd numbers them
     int32_t seed
     int32_t unused              # 0
-    double h                    # s, substep
+    double h                    # s, substep; from here on as engine/arrays.pxd has `setting`
     double gravity[3]           # m/s^2
     double slop                 # m
     double margin               # m
@@ -117,7 +115,6 @@ cdef public void lav_engine_read_settings(const int32_t* size, double* real, int
                                           settings_t* out) noexcept nogil:
     cdef engine_t e
     cdef int64_t n[3]
-    cdef int32_t k
     bind(size, real, index, keys, &e, n)
     out.iterations = e.head[H_ITERATIONS]
     out.warm_start = e.head[H_WARM_START]
@@ -125,16 +122,7 @@ cdef public void lav_engine_read_settings(const int32_t* size, double* real, int
     out.order = e.head[H_ORDER]
     out.seed = e.head[H_SEED]
     out.unused = 0
-    out.h = e.setting[S_H]
-    for k in range(3):
-        out.gravity[k] = e.setting[S_GRAVITY + k]
-    out.slop = e.setting[S_SLOP]
-    out.margin = e.setting[S_MARGIN]
-    out.skin = e.setting[S_SKIN]
-    out.beta = e.setting[S_BETA]
-    out.max_push = e.setting[S_MAX_PUSH]
-    out.bounce = e.setting[S_BOUNCE]
-    out.match_distance = e.setting[S_MATCH]
+    copy_reals(e.setting, &out.h, S_MATCH + 1)          # from h to match_distance they stand in one order
 
 
 cdef public void lav_engine_write_settings(const int32_t* size, double* real, int32_t* index, uint64_t* keys,
@@ -142,7 +130,6 @@ cdef public void lav_engine_write_settings(const int32_t* size, double* real, in
     """Settings from the next substep on; the pair list is made anew, since margin and skin are its own."""
     cdef engine_t e
     cdef int64_t n[3]
-    cdef int32_t k
     bind(size, real, index, keys, &e, n)
     e.head[H_ITERATIONS] = given.iterations
     e.head[H_WARM_START] = given.warm_start
@@ -151,16 +138,7 @@ cdef public void lav_engine_write_settings(const int32_t* size, double* real, in
     e.head[H_SEED] = given.seed
     if e.setting[S_MARGIN] != given.margin or e.setting[S_SKIN] != given.skin:
         e.head[H_PAIRS_VALID] = 0
-    e.setting[S_H] = given.h
-    for k in range(3):
-        e.setting[S_GRAVITY + k] = given.gravity[k]
-    e.setting[S_SLOP] = given.slop
-    e.setting[S_MARGIN] = given.margin
-    e.setting[S_SKIN] = given.skin
-    e.setting[S_BETA] = given.beta
-    e.setting[S_MAX_PUSH] = given.max_push
-    e.setting[S_BOUNCE] = given.bounce
-    e.setting[S_MATCH] = given.match_distance
+    copy_reals(&given.h, e.setting, S_MATCH + 1)
 
 
 cdef public void lav_engine_values(const int32_t* size, double* real, int32_t* index, uint64_t* keys,
@@ -211,38 +189,17 @@ cdef public void lav_engine_move(const int32_t* size, double* real, int32_t* ind
     """Into zeroed buffers with more room: what is carried from one substep to the next; scratch stays behind."""
     cdef engine_t a, b
     cdef int64_t used[3]
-    cdef int64_t n = size[N_BODY], nd = size[N_DYNAMIC], kj = size[N_JOINT], mj = size[N_JOINT_ROW]
-    cdef int64_t c = size[CAP_CONTACT]
+    cdef int64_t kj = size[N_JOINT], c = size[CAP_CONTACT]
     bind(size, real, index, keys, &a, used)
     bind(to_size, to_real, to_index, to_keys, &b, used)
-    copy_reals(a.setting, b.setting, N_SETTINGS)
-    copy_reals(a.x, b.x, 3 * n)
-    copy_reals(a.q, b.q, 4 * n)
-    copy_reals(a.v, b.v, 6 * n)
-    copy_reals(a.inv_mass_body, b.inv_mass_body, n)
-    copy_reals(a.inertia, b.inertia, 9 * n)
-    copy_reals(a.inv_inertia_body, b.inv_inertia_body, 9 * n)
-    copy_reals(a.shape, b.shape, 4 * n)
-    copy_reals(a.friction, b.friction, n)
-    copy_reals(a.restitution, b.restitution, n)
-    copy_reals(a.patch, b.patch, n)
-    copy_reals(a.fat, b.fat, 6 * n)
-    copy_reals(a.joint, b.joint, N_JOINT_REAL * kj)
-    copy_reals(a.joint_impulse, b.joint_impulse, mj)
-    copy_reals(a.inv_mass, b.inv_mass, nd)
-    copy_reals(a.inv_inertia, b.inv_inertia, 9 * nd)
+    # What lies side by side and does not depend on the room at once.
+    copy_reals(a.setting, b.setting, a.rot - a.setting)
+    copy_reals(a.fat, b.fat, a.joint_error - a.fat)
+    copy_reals(a.joint_impulse, b.joint_impulse, a.v_free - a.joint_impulse)
     copy_reals(a.cache_impulse, b.cache_impulse, N_CACHE_IMPULSE * c)
     copy_reals(a.cache_local, b.cache_local, 6 * c)
-    copy_ints(a.head, b.head, N_HEAD)
-    copy_ints(a.kind_of_shape, b.kind_of_shape, n)
-    copy_ints(a.dyn, b.dyn, n)
-    copy_ints(a.uneven, b.uneven, n)
-    copy_ints(a.body_of, b.body_of, nd)
-    copy_ints(a.joint_kind, b.joint_kind, kj)
-    copy_ints(a.joint_motor, b.joint_motor, kj)
-    copy_ints(a.joint_bodies, b.joint_bodies, 2 * kj)
+    copy_ints(a.head, b.head, a.pair - a.head)
     copy_ints(a.joint_body, b.joint_body, 2 * kj)
-    copy_ints(a.excluded, b.excluded, 2 * size[N_EXCLUDED])
     copy_ints(a.ptr, b.ptr, kj + c + 1)
     copy_keys(a.cache_key, b.cache_key, c)
     b.head[H_PAIRS_VALID] = 0

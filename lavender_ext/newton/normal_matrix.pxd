@@ -1,13 +1,12 @@
 """The normal matrix N = I + K^T V K, block by block, a run of elements between the same two bodies at once."""
 from libc.stdint cimport int32_t, int64_t
 
-from lavender_ext.factor.blocks cimport factor_t, supernodes_t
+from lavender_ext.factor.blocks cimport factor_t
 from lavender_ext.newton.elements cimport elements_t
 
 
 cdef class Factor:
     cdef factor_t f
-    cdef supernodes_t p
     cdef list keep
     cdef readonly int n, s
     cdef bint lu, unsymmetric

@@ -4,10 +4,10 @@ from libc.stdint cimport int32_t, int64_t
 import numpy as np
 
 from lavender_ext.core.arrays cimport address
-from lavender_ext.factor.blocks cimport factor_t, supernodes_t
+from lavender_ext.factor.blocks cimport factor_t, sparse_t
 from lavender_ext.factor.cholesky cimport block_cholesky, block_solve
 from lavender_ext.factor.lu cimport block_lu, block_lu_solve
-from lavender_ext.factor.tiles cimport has_wide
+from lavender_ext.factor.sparse cimport SparsePanels
 from lavender_ext.newton.elements cimport Elements, elements_t
 from lavender_ext.newton.normal_matrix cimport normal_matrix
 from lavender_ext.newton.panel cimport to_bodies, to_rows
@@ -44,7 +44,7 @@ cdef public void lav_to_rows(const elements_t* e, const double* y, double* x) no
 cdef class Factor:
     """N = I + K^T V K and its block factor; arrays as in `factor_t`, the pattern from `factor_pattern`.
 
-    `panels`: what `symbolic.supernodes` gives, for a factor by dense panels; L U has none.
+    `panels`: what `symbolic.block_panels` gives, for a factor by dense panels; L U has none.
     """
     def __init__(self, nptr, nind, lptr, lind, rptr, rind, int s, bint unsymmetric, panels=None, bint wide=True):
         n = len(nptr) - 1
@@ -58,30 +58,22 @@ cdef class Factor:
         uval = zeros(int(lptr[n]) * blocks) if unsymmetric else zeros(0)
         dval, work, work2 = zeros(n * blocks), zeros(n * blocks), zeros(n * blocks if unsymmetric else 0)
         pivot, nxt = np.zeros(n * s + 1, np.int32), np.zeros(n + 1, np.int32)
-        cdef supernodes_t* none = NULL
+        cdef sparse_t* none = NULL
         self.keep = [nptr, nind, lptr, lind, rptr, rind, nval, lval, mval, uval, dval, work, work2, pivot, nxt]
         self.n, self.s, self.unsymmetric, self.lu = n, s, unsymmetric, False
         self.f = factor_t(
             n, s, <int32_t*>address(nptr), <int32_t*>address(nind), <int32_t*>address(rptr), <int32_t*>address(rind),
             <int32_t*>address(lptr), <int32_t*>address(lind), <double*>address(nval), <double*>address(mval),
             <double*>address(lval), <double*>address(uval), <double*>address(dval), <double*>address(work),
-            <double*>address(work2), <int32_t*>address(pivot), <int32_t*>address(nxt), none)
+            <double*>address(work2), <int32_t*>address(pivot), <int32_t*>address(nxt), none, NULL)
+        cdef SparsePanels held_panels
+        cdef const int64_t[::1] spot
         if panels is not None:
-            self._hold(panels, wide)
-
-    def _hold(self, panels, bint wide):
-        first, of, rptr, rows, height, at, spot, temp = panels
-        k = len(first) - 1
-        val, room = np.empty(int(at[k]) + 1), np.empty(temp + 1)
-        place, head, link, nxt = (np.empty(self.n + 1, np.int32) for _ in range(4))
-        self.keep += [panels, val, room, place, head, link, nxt]
-        self.p = supernodes_t(
-            k, wide and has_wide(), <int32_t*>address(first), <int32_t*>address(of), <int32_t*>address(rptr),
-            <int32_t*>address(rows), <int32_t*>address(height), <int64_t*>address(at.view(np.float64)),
-            <int64_t*>address(spot.view(np.float64)),
-            <double*>address(val), <double*>address(room), <int32_t*>address(place), <int32_t*>address(head),
-            <int32_t*>address(link), <int32_t*>address(nxt))
-        self.f.super = &self.p
+            held_panels = SparsePanels.of_blocks(panels[1:], self.n * s, wide)
+            spot = panels[0]
+            self.keep += [held_panels, panels[0]]
+            self.f.super = &held_panels.f
+            self.f.spot = &spot[0]
 
     def factor(self, Elements e, const double[::1] v, bint lu=False):
         """Forms N of V and factors it; returns the number of pivots lost to rounding."""

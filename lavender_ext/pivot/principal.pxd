@@ -14,6 +14,12 @@ cpdef enum:                     # outcomes
     STUCK = 4                   # patience used up
 
 
+cdef enum:                      # sides of a row
+    FREE = 0
+    AT_LOWER = -1
+    AT_UPPER = 1
+
+
 cdef struct pivoting_t:
     const csr_t* a
     const blocks_t* p           # b, d, lower, upper
@@ -56,4 +62,3 @@ cdef void pivots_restart(pivoting_t* s) noexcept nogil
 cdef void pivots_slack(pivoting_t* s) noexcept nogil
 cdef void pivots_correct(pivoting_t* s) noexcept nogil
 cdef int32_t pivots_exchange(pivoting_t* s) noexcept nogil
-cdef void scan_entries(const csr_t* a, int32_t n, int32_t* cursor, int32_t* band, double* size) noexcept nogil

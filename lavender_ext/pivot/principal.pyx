@@ -21,60 +21,11 @@ from lavender_ext.core.problem cimport Data
 from lavender_ext.factor.band cimport ldl_back_all, ldl_factor, ldl_factor_2, ldl_solve, no_pivots
 from lavender_ext.factor.dense_lu cimport lu_factor, lu_solve
 from lavender_ext.judge.score cimport unit_roundoff
-from lavender_ext.pivot.principal cimport INDEFINITE, ROUNDS, SMALL, SOLVED, STUCK, pivoting_t
+from lavender_ext.pivot.principal cimport AT_LOWER, AT_UPPER, FREE, INDEFINITE, ROUNDS, SMALL, SOLVED, STUCK, pivoting_t
 
-
-cdef enum:
-    FREE = 0
-    AT_LOWER = -1
-    AT_UPPER = 1
 
 cdef enum:
     PATIENCE = 8                # exchanges without a new least number of infeasible rows
-
-
-cdef public void lav_csr_scan(const csr_t* a, int32_t n, int32_t* cursor, int32_t* band,
-                              double* size) noexcept nogil:
-    """Lower and upper bandwidth into band[2]; max |A - A^T|, max |A| into size[2]; columns are sorted.
-
-    cursor (n) is scratch: the first entry of row j that no earlier row has looked up as its mirror image.
-    """
-    cdef int32_t i, j, q
-    cdef double x, gap = 0.0, big = 0.0
-    band[0] = 0
-    band[1] = 0
-    for i in range(n):
-        cursor[i] = a.indptr[i]
-    for i in range(n):
-        if a.indptr[i] < a.indptr[i + 1]:
-            j = i - a.indices[a.indptr[i]]
-            if j > band[0]:
-                band[0] = j
-            j = a.indices[a.indptr[i + 1] - 1] - i
-            if j > band[1]:
-                band[1] = j
-        for q in range(a.indptr[i], a.indptr[i + 1]):
-            x = fabs(a.data[q])
-            if x > big:
-                big = x
-            j = a.indices[q]
-            if j < i:
-                if q >= cursor[i] and x > gap:
-                    gap = x                             # no mirror image above the diagonal
-                continue
-            if j == i:
-                continue
-            while cursor[j] < a.indptr[j + 1] and a.indices[cursor[j]] < i:
-                if fabs(a.data[cursor[j]]) > gap:
-                    gap = fabs(a.data[cursor[j]])
-                cursor[j] += 1
-            if cursor[j] < a.indptr[j + 1] and a.indices[cursor[j]] == i:
-                x = fabs(a.data[q] - a.data[cursor[j]])
-                cursor[j] += 1
-            if x > gap:
-                gap = x
-    size[0] = gap
-    size[1] = big
 
 
 cdef inline void factor_lu(pivoting_t* s) noexcept nogil:
@@ -106,7 +57,7 @@ cdef inline void factor_lu(pivoting_t* s) noexcept nogil:
 
 
 cdef inline void factor_free(pivoting_t* s, double* x) noexcept nogil:
-    # x: what ldl_factor takes along, or NULL
+    # of A_FF + s D_FF, (1); x: what ldl_factor takes along, or NULL
     cdef int32_t i, j, k = 0, q, r, at, to, in_place
     cdef const csr_t* a = s.a
     cdef double* col
@@ -162,12 +113,7 @@ cdef inline void solve_factored(const pivoting_t* s, double* y) noexcept nogil:
         y[j] *= s.size[j]
 
 
-cdef public void lav_pivot_factor(pivoting_t* s) noexcept nogil:
-    """A factor of A_FF + s D_FF, (1)."""
-    factor_free(s, NULL)
-
-
-cdef public void lav_pivot_factor_all(pivoting_t* s) noexcept nogil:
+cdef void pivots_factor_all(pivoting_t* s) noexcept nogil:
     """A factor of A, all rows free and no shift; of LDL^T with the first half of x = A^-1 b on the way."""
     cdef int32_t i, q, end
     cdef const csr_t* a = s.a
@@ -200,16 +146,9 @@ cdef public void lav_pivot_factor_all(pivoting_t* s) noexcept nogil:
     s.is_factored = 1
 
 
-cdef public void lav_pivot_correct(pivoting_t* s) noexcept nogil:
+cdef void pivots_correct(pivoting_t* s) noexcept nogil:
     """x_F <- x_F - (A_FF + s D_FF)^-1 w_F."""
     cdef int32_t i
-    if s.natural and s.n_free == s.n:
-        for i in range(s.n):
-            s.y[i] = s.w[i]
-        solve_factored(s, s.y)
-        for i in range(s.n):
-            s.x[i] -= s.y[i]
-        return
     for i in range(s.n):
         if s.place[i] >= 0:
             s.y[s.place[i]] = s.w[i]
@@ -219,7 +158,7 @@ cdef public void lav_pivot_correct(pivoting_t* s) noexcept nogil:
             s.x[i] -= s.y[s.place[i]]
 
 
-cdef public void lav_pivot_slack(pivoting_t* s) noexcept nogil:
+cdef void pivots_slack(pivoting_t* s) noexcept nogil:
     """w of (2) and its rounding f."""
     cdef int32_t i, q, end
     cdef const int32_t* idx = s.a.indices
@@ -267,7 +206,7 @@ cdef inline int32_t wanted(const pivoting_t* s, int32_t i) noexcept nogil:
     return FREE
 
 
-cdef public int32_t lav_pivot_exchange(pivoting_t* s) noexcept nogil:
+cdef int32_t pivots_exchange(pivoting_t* s) noexcept nogil:
     """(3), (4); the number of infeasible rows before, as a negative number where patience was used up."""
     cdef int32_t i, bad = 0
     for i in range(s.n):
@@ -288,7 +227,7 @@ cdef public int32_t lav_pivot_exchange(pivoting_t* s) noexcept nogil:
     return bad
 
 
-cdef public void lav_pivot_place(pivoting_t* s) noexcept nogil:
+cdef inline void pivots_place(pivoting_t* s) noexcept nogil:
     """x of bound rows."""
     cdef int32_t i
     for i in range(s.n):
@@ -298,7 +237,7 @@ cdef public void lav_pivot_place(pivoting_t* s) noexcept nogil:
             s.x[i] = s.p.upper[i]
 
 
-cdef public void lav_pivot_predict(pivoting_t* s) noexcept nogil:
+cdef inline void pivots_predict(pivoting_t* s) noexcept nogil:
     """Sides from x and w: where x - w / d falls; w of this x."""
     cdef int32_t i
     cdef double y
@@ -313,7 +252,7 @@ cdef public void lav_pivot_predict(pivoting_t* s) noexcept nogil:
     s.is_factored = 0
 
 
-cdef public void lav_pivot_sweep(pivoting_t* s, int32_t n) noexcept nogil:
+cdef inline void pivots_sweep(pivoting_t* s, int32_t n) noexcept nogil:
     """n times: all rows upwards, then downwards, x_i <- clip(x_i - omega w_i / d_i), omega = 1.7, then 1.
 
     Along a stack each contact gets 0.85 of what the one before got: over-relaxed, the news travels 4000
@@ -332,7 +271,7 @@ cdef public void lav_pivot_sweep(pivoting_t* s, int32_t n) noexcept nogil:
             x[i] = relax_row(x[i], w, omega * s.p.step[i], s.p.lower[i], s.p.upper[i])
 
 
-cdef public void lav_pivot_solve_free(pivoting_t* s) noexcept nogil:
+cdef void pivots_solve_free(pivoting_t* s) noexcept nogil:
     """x = A^-1 b, all rows free and factored; w is left alone."""
     cdef int32_t i
     cdef double* y = s.x if s.natural else s.y
@@ -348,17 +287,17 @@ cdef public void lav_pivot_solve_free(pivoting_t* s) noexcept nogil:
             s.x[i] = y[s.place[i]]
 
 
-cdef public int32_t lav_pivot_all_free(pivoting_t* s) noexcept nogil:
+cdef inline int32_t pivots_all_free(pivoting_t* s) noexcept nogil:
     """Are all rows free at the solution? 1, with x, where A is positive definite and x within its bounds."""
     cdef int32_t i
     for i in range(s.n):
         if s.p.lower[i] == s.p.upper[i]:
             return 0
-    lav_pivot_factor_all(s)
+    pivots_factor_all(s)
     if s.found.negative > 0 or s.found.small > 0:
         s.is_factored = 0
         return 0
-    lav_pivot_solve_free(s)
+    pivots_solve_free(s)
     for i in range(s.n):
         if not s.p.lower[i] <= s.x[i] <= s.p.upper[i]:
             s.is_factored = 0
@@ -366,22 +305,22 @@ cdef public int32_t lav_pivot_all_free(pivoting_t* s) noexcept nogil:
     return 1
 
 
-cdef public int32_t lav_pivot_rounds(pivoting_t* s, int32_t rounds) noexcept nogil:
+cdef int32_t pivots_rounds(pivoting_t* s, int32_t rounds) noexcept nogil:
     """At most `rounds` rounds of: factor, solve, exchange; until no row is infeasible."""
     cdef int32_t _r, bad
     for _r in range(rounds):
         s.n_rounds += 1
-        lav_pivot_place(s)
-        lav_pivot_slack(s)
+        pivots_place(s)
+        pivots_slack(s)
         if not s.is_factored:
-            lav_pivot_factor(s)
+            factor_free(s, NULL)
         if s.found.negative > 0:
             return INDEFINITE
         if s.found.small > 0 and (s.shift == 0.0 or s.swap != NULL):
             return SMALL
-        lav_pivot_correct(s)
-        lav_pivot_slack(s)
-        bad = lav_pivot_exchange(s)
+        pivots_correct(s)
+        pivots_slack(s)
+        bad = pivots_exchange(s)
         if bad == 0:
             return SOLVED
         if bad < 0:
@@ -389,28 +328,49 @@ cdef public int32_t lav_pivot_rounds(pivoting_t* s, int32_t rounds) noexcept nog
     return ROUNDS
 
 
-cdef public int32_t lav_pivot_solve(pivoting_t* s, const double* start, int32_t sweeps, int32_t n,
+cdef int32_t pivots_solve(pivoting_t* s, const double* start, int32_t sweeps, int32_t n,
                                     int32_t* swept) noexcept nogil:
     """A boxed problem, as `Pivoting.solve` says; the outcome."""
     cdef int32_t i
     # Multiply-adds: (band + 1)^2 / 2 a row against two for each nonzero and sweep.
     cdef bint cheap = s.band >= 0 and n > 0 and s.n > 0 and (
         (s.band + 1.0) * (s.band + 1) * s.n <= 4.0 * sweeps * s.a.indptr[s.n])
-    swept[0] = not (cheap and lav_pivot_all_free(s))
+    swept[0] = not (cheap and pivots_all_free(s))
     if not swept[0]:
         s.n_rounds += 1
         return SOLVED
     for i in range(s.n):
         s.x[i] = start[i]
-    lav_pivot_sweep(s, sweeps)
-    lav_pivot_slack(s)
-    lav_pivot_predict(s)
-    return lav_pivot_rounds(s, n)
+    pivots_sweep(s, sweeps)
+    pivots_slack(s)
+    pivots_predict(s)
+    return pivots_rounds(s, n)
+
+
+cdef void pivots_restart(pivoting_t* s) noexcept nogil:
+    s.best = s.n + 1
+    s.patience = PATIENCE
+
+
+cdef void pivots_start(pivoting_t* s, double shift) noexcept nogil:
+    s.shift = shift
+    s.is_factored = 0
+    pivots_restart(s)
+
+
+cdef inline void renew(pivoting_t* s) noexcept nogil:
+    # as if made anew: no row at a bound, nothing factored, nothing counted
+    cdef int32_t i
+    for i in range(s.n):
+        s.at[i] = FREE
+    s.is_half_solved = s.exchanged = s.factorisations = s.n_rounds = 0
+    no_pivots(&s.found)
+    pivots_start(s, 0.0)
 
 
 cdef inline void lay_out(pivoting_t* s, const csr_t* a, const blocks_t* p, int32_t band, const int32_t* order, double tiny,
                          double* real, int32_t* whole) noexcept nogil:
-    # real: 6 m numbers and the factor's; whole: 2 m, zero; order: NULL as they stand
+    # real: 6 m numbers and the factor's; whole: 2 m; order: NULL as they stand
     cdef int32_t i, m = p.n_rows
     s.a = a
     s.p = p
@@ -432,17 +392,7 @@ cdef inline void lay_out(pivoting_t* s, const csr_t* a, const blocks_t* p, int32
     s.at = whole
     s.place = whole + m
     s.swap = NULL
-
-
-cdef inline void begin_again(pivoting_t* s) noexcept nogil:
-    s.best = s.n + 1
-    s.patience = PATIENCE
-
-
-cdef inline void begin(pivoting_t* s, double shift) noexcept nogil:
-    s.shift = shift
-    s.is_factored = 0
-    begin_again(s)
+    renew(s)
 
 
 cdef public int32_t lav_pivot_boxed(const blocks_t* p, const csr_t* a, int32_t band, const int32_t* order, double tiny,
@@ -452,133 +402,14 @@ cdef public int32_t lav_pivot_boxed(const blocks_t* p, const csr_t* a, int32_t b
     cdef pivoting_t s
     cdef int32_t swept, code
     lay_out(&s, a, p, band, order, tiny, real, whole)
-    s.is_half_solved = s.exchanged = s.factorisations = s.n_rounds = 0
-    no_pivots(&s.found)
-    begin(&s, 0.0)
-    code = lav_pivot_solve(&s, start, sweeps, n, &swept)
-    lav_pivot_slack(&s)
+    code = pivots_solve(&s, start, sweeps, n, &swept)
+    pivots_slack(&s)
     return code
 
 
 cdef void pivots_on(pivoting_t* s, const csr_t* a, const blocks_t* p, int32_t band, double tiny, double* real,
                     int32_t* whole) noexcept nogil:
-    cdef int32_t i
     lay_out(s, a, p, band, NULL, tiny, real, whole)
-    for i in range(p.n_rows):
-        s.at[i] = FREE
-    s.is_half_solved = s.exchanged = s.factorisations = s.n_rounds = 0
-    no_pivots(&s.found)
-    begin(s, 0.0)
-
-
-cdef void pivots_factor_all(pivoting_t* s) noexcept nogil:
-    lav_pivot_factor_all(s)
-
-
-cdef void pivots_solve_free(pivoting_t* s) noexcept nogil:
-    lav_pivot_solve_free(s)
-
-
-cdef int32_t pivots_solve(pivoting_t* s, const double* start, int32_t sweeps, int32_t n, int32_t* swept) noexcept nogil:
-    return lav_pivot_solve(s, start, sweeps, n, swept)
-
-
-cdef int32_t pivots_rounds(pivoting_t* s, int32_t n) noexcept nogil:
-    return lav_pivot_rounds(s, n)
-
-
-cdef void pivots_start(pivoting_t* s, double shift) noexcept nogil:
-    begin(s, shift)
-
-
-cdef void pivots_restart(pivoting_t* s) noexcept nogil:
-    begin_again(s)
-
-
-cdef void pivots_slack(pivoting_t* s) noexcept nogil:
-    lav_pivot_slack(s)
-
-
-cdef void pivots_correct(pivoting_t* s) noexcept nogil:
-    lav_pivot_correct(s)
-
-
-cdef int32_t pivots_exchange(pivoting_t* s) noexcept nogil:
-    return lav_pivot_exchange(s)
-
-
-cdef void scan_entries(const csr_t* a, int32_t n, int32_t* cursor, int32_t* band, double* size) noexcept nogil:
-    lav_csr_scan(a, n, cursor, band, size)
-
-
-def bandwidth(const int32_t[::1] indptr, const int32_t[::1] indices):
-    """(lower, upper) bandwidth of a canonical CSR matrix, from the ends of its rows."""
-    cdef Py_ssize_t i, n = indptr.shape[0] - 1
-    cdef int32_t lower = 0, upper = 0
-    for i in range(n):
-        if indptr[i] < indptr[i + 1]:
-            lower = max(lower, <int32_t>i - indices[indptr[i]])
-            upper = max(upper, indices[indptr[i + 1] - 1] - <int32_t>i)
-    return lower, upper
-
-
-def scan(const int32_t[::1] indptr, const int32_t[::1] indices, const double[::1] data):
-    """(lower bandwidth, upper bandwidth, max |A - A^T|, max |A|) of a canonical CSR matrix."""
-    cdef int32_t n = <int32_t>indptr.shape[0] - 1
-    cdef int32_t band[2]
-    cdef double size[2]
-    cdef csr_t a
-    cdef int32_t[::1] cursor
-    if n <= 0 or data.shape[0] == 0:
-        return 0, 0, 0.0, 0.0
-    a.indptr = &indptr[0]
-    a.indices = &indices[0]
-    a.data = &data[0]
-    cursor = np.empty(n, np.int32)
-    with nogil:
-        lav_csr_scan(&a, n, &cursor[0], band, size)
-    return band[0], band[1], size[0], size[1]
-
-
-def free_block(const int32_t[::1] indptr, const int32_t[::1] indices, const double[::1] data,
-               const int32_t[::1] place, const double[::1] d, double shift, int n_free):
-    """Upper triangle of A_FF + shift D_FF by columns: (data, indices, indptr); place (m,) of `Pivoting`."""
-    cdef int32_t i, j, q, k = 0, at, n = <int32_t>indptr.shape[0] - 1, missing
-    cdef int32_t[::1] ptr = np.empty(n_free + 1, np.int32)
-    cdef int32_t[::1] idx
-    cdef double[::1] val
-    # Rows in order: place increases with the row, so column `at` holds the lower half of row i.
-    for i in range(n):
-        if place[i] >= 0:
-            for q in range(indptr[i], indptr[i + 1]):
-                k += indices[q] < i and place[indices[q]] >= 0
-            k += 1
-    idx = np.empty(max(k, 1), np.int32)
-    val = np.empty(max(k, 1))
-    k = 0
-    for i in range(n):
-        at = place[i]
-        if at < 0:
-            continue
-        ptr[at] = k
-        missing = 1
-        for q in range(indptr[i], indptr[i + 1]):
-            j = indices[q]
-            if j > i:
-                break
-            if place[j] >= 0:
-                idx[k] = place[j]
-                val[k] = data[q]
-                if j == i:
-                    val[k] += shift * d[i]
-                    missing = 0
-                k += 1
-        if missing:
-            idx[k] = at
-            val[k] = shift * d[i]
-            k += 1
-    ptr[n_free] = k
-    return np.asarray(val)[:k], np.asarray(idx)[:k], np.asarray(ptr)
 
 
 cdef class Pivoting:
@@ -626,7 +457,6 @@ cdef class Pivoting:
         lay_out(&self.s, &p.csr, &p.blocks, band, first, tiny, &reals[0], &ints[0])
         if not symmetric:
             self.s.swap = &ints[2 * m]
-        begin(&self.s, 0.0)
 
     @property
     def x(self):
@@ -660,20 +490,15 @@ cdef class Pivoting:
 
     def start(self, double shift):
         """A fresh count of infeasible rows, with this shift; nothing factored."""
-        begin(&self.s, shift)
+        pivots_start(&self.s, shift)
 
     def renew(self):
         """As if made anew: no row at a bound, nothing factored, nothing counted."""
-        cdef int32_t i
-        for i in range(self.s.n):
-            self.s.at[i] = FREE
-        self.s.is_half_solved = 0
-        self.s.exchanged = self.s.factorisations = self.s.n_rounds = 0
-        self.start(0.0)
+        renew(&self.s)
 
     def restart(self):
         """A fresh count of infeasible rows; the factor stays."""
-        begin_again(&self.s)
+        pivots_restart(&self.s)
 
     def recenter(self):
         """center <- x."""
@@ -684,24 +509,24 @@ cdef class Pivoting:
     def factor(self):
         """Factor the free rows; (small, negative) pivots."""
         with nogil:
-            lav_pivot_factor(&self.s)
+            factor_free(&self.s, NULL)
         return self.s.found.small, self.s.found.negative
 
     def factor_all(self):
         """Factor A, all rows free; (small, negative) pivots."""
         with nogil:
-            lav_pivot_factor_all(&self.s)
+            pivots_factor_all(&self.s)
         return self.s.found.small, self.s.found.negative
 
     def correct(self):
         """x_F less the solve of w_F."""
         with nogil:
-            lav_pivot_correct(&self.s)
+            pivots_correct(&self.s)
 
     def solve_free(self):
         """x = A^-1 b with all rows free and factored; w is left alone."""
         with nogil:
-            lav_pivot_solve_free(&self.s)
+            pivots_solve_free(&self.s)
 
     def solve(self, const double[::1] start, int sweeps, int n):
         """A boxed problem: (code as of `rounds`, whether it was swept).
@@ -712,20 +537,20 @@ cdef class Pivoting:
         cdef int32_t code, swept
         cdef const double* first = &start[0] if self.s.n else NULL
         with nogil:
-            code = lav_pivot_solve(&self.s, first, sweeps, n, &swept)
+            code = pivots_solve(&self.s, first, sweeps, n, &swept)
         return code, bool(swept)
 
     def slack(self):
         with nogil:
-            lav_pivot_slack(&self.s)
+            pivots_slack(&self.s)
 
     def exchange(self):
         """Number of infeasible rows, which have changed sides; negative: out of patience, none has."""
-        return lav_pivot_exchange(&self.s)
+        return pivots_exchange(&self.s)
 
     def put_bounds(self):
         """x of bound rows."""
-        lav_pivot_place(&self.s)
+        pivots_place(&self.s)
 
     def number(self):
         """Places of the free rows in order of rows; their number."""
@@ -751,16 +576,12 @@ cdef class Pivoting:
         """At most n rounds; 0 solved, 1 rounds used, 2 small pivot, 3 negative pivot, 4 stuck."""
         cdef int32_t code
         with nogil:
-            code = lav_pivot_rounds(&self.s, n)
+            code = pivots_rounds(&self.s, n)
         return code
 
     @property
     def shift(self):
         return self.s.shift
-
-    @property
-    def n_free(self):
-        return self.s.n_free
 
     @property
     def exchanged(self):
@@ -776,14 +597,8 @@ cdef class Pivoting:
 
     def skipped(self):
         """Rows whose pivots were small in the last factorisation, in order of elimination."""
-        cdef int32_t i, at, row
-        found = []
-        for i in range(self.s.n):
-            row = i if self.s.natural else self.s.order[i]
-            at = self.s.place[row]
-            if at >= 0 and self.s.c[<int64_t>at * self.s.width] == 0.0:
-                found.append(row)
-        return found
+        rows = self.order if self.order is not None else range(self.s.n)
+        return [i for i in rows if self.s.place[i] >= 0 and self.s.c[<int64_t>self.s.place[i] * self.s.width] == 0.0]
 
     @property
     def pivots(self):

@@ -22,6 +22,7 @@ import numpy as np
 from lavender_ext.core.block cimport blocks_t
 from lavender_ext.core.csr cimport csr_t
 from lavender_ext.core.problem cimport Data
+from lavender_ext.pivot.principal cimport AT_LOWER, AT_UPPER, FREE
 
 
 cpdef enum:                     # how a path ended
@@ -29,11 +30,6 @@ cpdef enum:                     # how a path ended
     PIVOTS = 1                  # all pivots used
     RAY = 2                     # nothing limits the entering variable
     HELD = 3                    # a free row is not reached by a pivot of its own
-
-cdef enum:                      # as in principal.pyx
-    FREE = 0
-    AT_LOWER = -1
-    AT_UPPER = 1
 
 
 cdef struct dictionary_t:

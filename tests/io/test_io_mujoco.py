@@ -200,12 +200,6 @@ def test_the_problem_knows_velocities_keys_and_the_engines_own_impulse():
     assert list(problem.names) == names
 
 
-def test_a_folder_of_steps_keeps_every_bit(tmp_path):
-    problem = lv.io.from_mujoco(*state(condim=4))
-    lv.io.save(problem, tmp_path / "step.npz")
-    assert lv.io.load(tmp_path / "step.npz") == problem
-
-
 def test_an_integrator_that_puts_damping_into_m_is_refused():
     if not hasattr(mj.mjtIntegrator, "mjINT_DISCRETE"):
         pytest.skip("this MuJoCo has no such integrator")

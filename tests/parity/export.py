@@ -24,8 +24,9 @@ import lavender as lv  # noqa: E402
 from lavender.ordering import block_order  # noqa: E402
 from lavender.solvers._factor import TINY, choose  # noqa: E402
 from lavender.solvers._pivoting import SWEEPS as GUESSES  # noqa: E402
+from lavender_ext.factor.sparse import scan  # noqa: E402
 from lavender_ext.host import memory  # noqa: E402
-from lavender_ext.pivot.principal import Pivoting, scan  # noqa: E402
+from lavender_ext.pivot.principal import Pivoting  # noqa: E402
 
 MAGIC = b"LAOVPAR1"
 ROWS = ("jac", "normal", "tangent", "arm_a", "arm_b", "inv_mass", "inv_inertia")

@@ -173,7 +173,7 @@ def test_lemke_finds_one_of_all_solutions(seed):
 
 
 @pytest.mark.parametrize("name", ["lemke", "direct"])
-@pytest.mark.parametrize("seed", range(60))
+@pytest.mark.parametrize("seed", range(14))
 def test_pivoting_ends_on_every_problem(seed, name):
     problem = free(seed, contacts=2 + seed % 7)
     solution = lv.solve(problem, name, tol=1e-10)

@@ -348,21 +348,6 @@ def test_round_cones_are_never_handed_to_the_form_over_rows():
 # -- many at once -------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("solver", ["auto", "newton"])
-@pytest.mark.parametrize("threads", [1, 2])
-def test_many_at_once_have_the_bits_of_one_by_one(solver, threads):
-    problems = [random_general(s, ["cone", "coulomb"][s % 2], compliance=s % 3 > 0) for s in range(12)]
-    problems.insert(3, as_matrix(problems[0]))  # one that does not go through the compiled loop
-    many = lv.solve_many(problems, solver, threads=threads, tol=1e-8)
-    assert len(many) == 13
-    for problem, found in zip(problems, many, strict=True):
-        one = lv.solve(copy.deepcopy(problem), solver, tol=1e-8)
-        assert found.impulse.tobytes() == one.impulse.tobytes()
-        assert (found.status, found.iterations, found.message) == (one.status, one.iterations, one.message)
-        assert dict(found.work) == dict(one.work)
-    assert [s.iterations for s in many[2:5]] == [many[i].iterations for i in (2, 3, 4)]
-
-
 def test_many_start_where_they_are_told():
     problem = random_general(4, "cone")
     cold = lv.solve(problem, tol=1e-9)
@@ -517,18 +502,6 @@ def test_room_for_a_pattern_grows():
     assert kernel.fits and kernel.largest < 200
     assert lv.solve(problem, "newton", form="velocity", tol=1e-9).success
     assert lv.solve_many([problem], tol=1e-6)[0].success
-
-
-@pytest.mark.parametrize("tangents", [3, 4, 5])
-@pytest.mark.parametrize("seed", range(3))
-def test_auto_solves_round_cones_given_by_a_matrix(tangents, seed):
-    problem = random_general(seed, "cone", contacts=4, tangents=tangents)
-    matrix = as_matrix(problem)
-    solution = lv.solve(matrix, tol=1e-9)
-    assert solution.success
-    # Soft by 0.01 / kg or more: residuals of 1e-9 are impulses of 1e-6 of their size.
-    own = lv.solve(problem, tol=1e-9).impulse
-    np.testing.assert_allclose(solution.impulse, own, atol=1e-5 * (1 + np.abs(own).max()))
 
 
 @given(seed=seeds, friction=st.sampled_from(["cone", "coulomb"]), warm=st.booleans())

@@ -236,6 +236,22 @@ def test_update_equals_a_fresh_solve_to_the_bit(name):
         assert first.impulse.tobytes() == again.impulse.tobytes()
         assert changed.impulse.tobytes() == fresh.impulse.tobytes()
         assert (changed.status, changed.iterations) == (fresh.status, fresh.iterations)
+        for unlike in examples(spec):  # of another law, form and structure
+            fresh = lv.solve(unlike, name, **kwargs).impulse
+            assert prepared.solve(unlike, **kwargs).impulse.tobytes() == fresh.tobytes()
+
+
+@pytest.mark.parametrize("name", OURS)
+def test_many_at_once_have_the_bits_of_one_by_one(name):
+    """Every kind of block in every form, in one call and by two threads."""
+    spec = registry.get(name)
+    options = {"tol": 1e-6, "max_iter": 60 if spec.resumable else None}
+    taken = [p for forms, _ in samples().values() for p in forms if spec.refuses(p) is None]
+    for problem, found in zip(taken, lv.solve_many(taken, name, threads=2, **options), strict=True):
+        one = lv.solve(replace(problem, copy=False), name, **options)  # of which nothing was worked out yet
+        assert found.impulse.tobytes() == one.impulse.tobytes()
+        assert (found.status, found.iterations, found.message) == (one.status, one.iterations, one.message)
+        assert dict(found.work) == dict(one.work)
 
 
 @pytest.mark.parametrize("name", HERE)

@@ -134,14 +134,6 @@ def test_a_claim_above_tol_is_contradicted_and_no_success(monkeypatch):
         solution.raise_for_status()
 
 
-def test_a_prepared_solver_takes_problems_of_the_same_structure_and_others():
-    prepared = lv.prepare(TINY, "direct")
-    same = lv.Problem.lcp([[3.0, 1.0], [1.0, 2.0]], [1.0, 2.0])
-    other = lv.Problem.lcp(np.eye(3), np.ones(3))
-    for problem in (same, other, TINY):
-        assert prepared.solve(problem).impulse.tobytes() == lv.solve(problem, "direct").impulse.tobytes()
-
-
 def test_zero_iterations_judge_the_start():
     solution = lv.solve(TINY, "pgs", max_iter=0)
     assert solution.iterations == 0

@@ -137,7 +137,7 @@ static int32_t prepare_direct(lav_solver *s) {
   const double inf = INFINITY;
   int32_t bands[2] = {0, 0}, i;
   double size[2] = {0.0, 0.0}, *x;
-  if (s->p.n_rows > 0 && s->a.indptr[s->p.n_rows] > 0) k_csr_scan(&s->a, s->p.n_rows, s->marks, bands, size);
+  if (s->p.n_rows > 0 && s->a.indptr[s->p.n_rows] > 0) core_csr_scan_entries(&s->a, s->p.n_rows, s->marks, bands, size);
   if (!(size[1] == 0.0 || size[0] / size[1] <= 1e-14)) return LAV_ERROR_UNSUPPORTED; /* not symmetric */
   s->band = bands[0] > bands[1] ? bands[0] : bands[1];
   s->view.p = s->p;

@@ -145,7 +145,7 @@ class VelocitySystem(System):
             nptr, nind, node, slot, again = postordered(n, node, nptr, nind)
             turned = (turned != again).astype(np.int32)
             structure = symbolic.factor_pattern(nptr, nind)
-            self.panels = symbolic.supernodes(nptr, nind, *structure[:2], s, FEW_COLUMNS, ZEROS)
+            self.panels = symbolic.block_panels(nptr, nind, *structure[:2], s, FEW_COLUMNS, ZEROS)
         self.structure = (nptr, nind, *structure)
         self.pattern = (bodies, node, slot, turned)
 
