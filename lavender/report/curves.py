@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 from lavender.bench.record import Record, level_name
 from lavender.bench.store import Records
 from lavender.report import tables
 from lavender.report.moved import by_speed, speed_levels
-from lavender.report.text import count
+from lavender.report.text import count, who
 
 __all__ = [
     "Curve",
@@ -58,8 +58,6 @@ class Figure:
     y_log: bool = True
     levels: tuple[float, ...] = ()
     floor: float = math.nan
-    start: float = math.nan
-    notes: Mapping[str, str] = field(default_factory=dict)
 
 
 def _asked(r: Record) -> str:
@@ -82,7 +80,7 @@ def work_precision(records: Records, case: str) -> Figure:
             curves.append(
                 Curve(
                     solver,
-                    solver if start == "cold" else f"{solver} ({start})",
+                    who(solver, start),
                     tuple(r.time_min for r in runs),
                     tuple(max(r.relative, TINY) for r in runs),
                     tuple(map(_asked, runs)),
@@ -183,7 +181,7 @@ def budget_figure(records: Records, case: str) -> Figure:
             curves.append(
                 Curve(
                     solver,
-                    solver if start == "cold" else f"{solver} ({start})",
+                    who(solver, start),
                     tuple(float(n) for n, _ in points),
                     tuple(max(r, TINY) for _, r in points),
                     thin=start != "cold",

@@ -12,28 +12,17 @@ from dataclasses import dataclass
 __all__ = ["Look", "looks"]
 
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#8C6D31", "#7F7F7F")
-# Names of dashes and marks, ours and matplotlib's.
-DASHES = (("solid", "-"), ("dash", "--"), ("dot", ":"), ("dashdot", "-."))
-MARKS = (
-    ("circle", "o"),
-    ("square", "s"),
-    ("triangle-up", "^"),
-    ("diamond", "D"),
-    ("x", "X"),
-    ("star", "*"),
-    ("triangle-down", "v"),
-)
+LINES = ("-", "--", ":", "-.")  # dashes and marks of matplotlib
+MARKERS = ("o", "s", "^", "D", "X", "*", "v")
 
 
 @dataclass(frozen=True)
 class Look:
-    """Colour, dash and mark of a saved figure."""
+    """Colour, dash and mark of a saved figure, as matplotlib names them."""
 
     color: str
-    dash: str
-    mark: str
-    line: str  # matplotlib
-    marker: str  # matplotlib
+    line: str
+    marker: str
 
 
 # These come first, so that what is compared most often never shares a colour.
@@ -48,6 +37,7 @@ def looks(solvers: Iterable[str]) -> dict[str, Look]:
     place = {name: i for i, name in enumerate((*FIRST, *rest))}
     for name in sorted(names):
         i = place[name]
-        dash, mark = DASHES[i // len(COLORS) % len(DASHES)], MARKS[i % len(MARKS)]
-        out[name] = Look(COLORS[i % len(COLORS)], dash[0], mark[0], dash[1], mark[1])
+        out[name] = Look(
+            COLORS[i % len(COLORS)], LINES[i // len(COLORS) % len(LINES)], MARKERS[i % len(MARKERS)]
+        )
     return out

@@ -89,17 +89,6 @@ def permuted_band(problem: Problem, order: IntArray) -> int:
     return int(np.abs(row - place[a.indices]).max(initial=0))
 
 
-class TooDear(Exception):
-    """A factor, counted before its first number, takes more than it may."""
-
-
-def counted(panels: SparsePanels, most: float) -> SparsePanels:
-    """The same, where a factor takes `most` nanoseconds at most."""
-    if PANELS_WORK * panels.work > most:
-        raise TooDear
-    return panels
-
-
 def filled_cost(problem: Problem) -> float:
     """Of one factor of A by panels [ns], by its fill, which is counted anew."""
     indptr, indices, _ = _mirrored(problem)
@@ -151,10 +140,9 @@ class DenseFactor:
 class SparseFactor:
     """Cholesky by panels, in an order of least degree."""
 
-    def __init__(self, problem: Problem, most: float = np.inf) -> None:
+    def __init__(self, problem: Problem) -> None:
         self.d = problem.csr_data.d
         self.m = problem.m
-        self.most = most  # ns that a factor of all rows may take
         self.pattern = _mirrored(problem)
         self.whole: SparsePanels | None = None  # of all rows, kept
 
@@ -165,7 +153,7 @@ class SparseFactor:
         indptr, indices, data = self.pattern
         if n_free == self.m:
             if self.whole is None:
-                self.whole = counted(SparsePanels(indptr, indices, False, WIDE), self.most)
+                self.whole = SparsePanels(indptr, indices, False, WIDE)
             self.panels, d = self.whole, self.d
         else:
             indptr, indices, data = free_part(indptr, indices, data, place, n_free)
@@ -253,9 +241,9 @@ class PanelsLU:
         No pivot is lost to rounding.
     """
 
-    def __init__(self, problem: Problem, most: float = np.inf) -> None:
+    def __init__(self, problem: Problem) -> None:
         indptr, indices, data = problem._compressed
-        self.panels = counted(SparsePanels(indptr, indices, True, WIDE), most)
+        self.panels = SparsePanels(indptr, indices, True, WIDE)
         self.rank = problem.m
         self.usable = self.panels.factor(data, problem.csr_data.d, 0.0, TINY) == 0
 

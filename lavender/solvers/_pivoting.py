@@ -20,7 +20,6 @@ from lavender.solvers._factor import (
     Factor,
     LUFactor,
     SparseFactor,
-    TooDear,
     choose,
     permuted_band,
 )
@@ -42,7 +41,7 @@ class PivotState:
 
     chosen: tuple[str, int, IntArray | None]
 
-    def __init__(self, problem: Problem, like: PivotState | None = None, most: float = np.inf) -> None:
+    def __init__(self, problem: Problem, like: PivotState | None = None) -> None:
         self.problem = problem
         self.symmetric = problem.is_symmetric
         self.factor: Factor | None = None
@@ -50,11 +49,9 @@ class PivotState:
             same = like is not None and like.symmetric and _same_pattern(like.problem, problem)
             self.chosen = like.chosen if like is not None and same else choose(problem)
             self.form, band, order = self.chosen
-            if self.form == "dense" and 1e9 * DENSE * problem.m**3 / 3.0 > most:
-                raise TooDear
             if self.form != "band":
                 band = -1
-                self.factor = DenseFactor(problem) if self.form == "dense" else SparseFactor(problem, most)
+                self.factor = DenseFactor(problem) if self.form == "dense" else SparseFactor(problem)
         else:
             self.chosen = self.form, band, order = "LU", problem.m - 1, None
             if problem.m > SMALL_SIZE:

@@ -67,10 +67,6 @@ class Direct:
     patience: ClassVar[bool] = True  # to go on where pivoting on one shift is stuck
     exact: ClassVar[bool] = True  # to rounding, whatever the tolerance
 
-    def allowed(self) -> float:
-        """What a sparse factor of a linear system may be counted for [ns], else `TooDear`."""
-        return np.inf
-
     def otherwise(self) -> Any:
         """What follows where exchanges go round in circles on friction as bounded rows: one pivot after the other."""
         from lavender.solvers.lemke import Lemke
@@ -80,8 +76,8 @@ class Direct:
     def prepare(self, problem: Problem, like: PivotState | None = None) -> DirectState:
         linear = problem.law == "linear"
         if linear and not problem.is_symmetric and problem.m > SMALL_SIZE:
-            return _unsymmetric(problem, self.allowed())
-        state = DirectState(problem, PivotState(problem, like, self.allowed()))
+            return _unsymmetric(problem)
+        state = DirectState(problem, PivotState(problem, like))
         if linear and state.pivot is not None:
             state.outcome = state.pivot.factorise(whole=True)
             if state.outcome == INDEFINITE:
@@ -120,19 +116,15 @@ class Enough(Direct):
     """As `auto` asks where every row is free: what meets the tolerance is not refined."""
 
     exact: ClassVar[bool] = False
-    most: float = np.inf  # `allowed`
-
-    def allowed(self) -> float:
-        return self.most
 
 
 @np.errstate(all="ignore")  # what overflows is judged
-def _unsymmetric(problem: Problem, most: float) -> DirectState:
+def _unsymmetric(problem: Problem) -> DirectState:
     """LU by panels where A has few entries, else with pivoting."""
     why = "A is not symmetric"
     if not PanelsLU.takes(problem):
         return _general(problem, why)
-    factor = PanelsLU(problem, most)
+    factor = PanelsLU(problem)
     if factor.usable:
         return DirectState(problem, general=factor, note=why)
     return replace(_general(problem, f"{why}; LU by panels lost a pivot"), begun=1)

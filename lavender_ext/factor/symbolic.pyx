@@ -72,6 +72,23 @@ cdef public void lav_lower(int32_t n, const int32_t* ptr, const int32_t* near, c
     nptr[n] = to
 
 
+cdef inline void tree_of(int32_t n, const int32_t* nptr, const int32_t* nind, int32_t* parent,
+                         int32_t* above) noexcept nogil:
+    # Elimination tree of a lower pattern, ancestors remembered (Liu 1986); above (n) is scratch.
+    cdef int32_t k, q, j, after
+    for k in range(n):
+        parent[k] = -1
+        above[k] = -1
+        for q in range(nptr[k], nptr[k + 1]):
+            j = nind[q]
+            while j >= 0 and j < k:
+                after = above[j]
+                above[j] = k
+                if after < 0:
+                    parent[j] = k
+                j = after
+
+
 cdef public int32_t lav_sparse_order(int32_t n, const int32_t* indptr, const int32_t* indices, int32_t room,
                                      int32_t* scratch, int64_t* left, int32_t* begin, int32_t* order, int32_t* size,
                                      int32_t* nptr, int32_t* nind, int32_t* parent, int32_t* lptr) noexcept nogil:
@@ -101,7 +118,7 @@ cdef public int32_t lav_sparse_order(int32_t n, const int32_t* indptr, const int
     for i in range(count):
         rank[order[i]] = i
     lav_lower(count, gptr, near, rank, order, nptr, nind)
-    block_tree(count, nptr, nind, parent, whole, whole + n, whole + 2 * n)
+    tree_of(count, nptr, nind, parent, whole)
     postorder_of(count, parent, whole, whole + n, whole + 2 * n, whole + 3 * n)
     for i in range(count):
         rank[i] = whole[3 * n + rank[i]]

@@ -15,7 +15,7 @@ from libc.stdint cimport int32_t, int64_t
 
 import numpy as np
 
-from lavender_ext.core.block cimport blocks_t, relax_row
+from lavender_ext.core.block cimport blocks_t, clip, relax_row
 from lavender_ext.core.csr cimport csr_dot, csr_t
 from lavender_ext.core.problem cimport Data
 from lavender_ext.factor.band cimport ldl_back_all, ldl_factor, ldl_factor_2, ldl_solve, no_pivots
@@ -492,10 +492,6 @@ cdef class Pivoting:
         """A fresh count of infeasible rows, with this shift; nothing factored."""
         pivots_start(&self.s, shift)
 
-    def renew(self):
-        """As if made anew: no row at a bound, nothing factored, nothing counted."""
-        renew(&self.s)
-
     def restart(self):
         """A fresh count of infeasible rows; the factor stays."""
         pivots_restart(&self.s)
@@ -566,11 +562,8 @@ cdef class Pivoting:
     def clipped(self, double[::1] out):
         """x within its bounds, into out (m,)."""
         cdef int32_t i
-        cdef double v
         for i in range(self.s.n):
-            v = self.s.x[i]
-            out[i] = self.s.p.lower[i] if v < self.s.p.lower[i] else (
-                self.s.p.upper[i] if v > self.s.p.upper[i] else v)
+            out[i] = clip(self.s.x[i], self.s.p.lower[i], self.s.p.upper[i])
 
     def rounds(self, int n):
         """At most n rounds; 0 solved, 1 rounds used, 2 small pivot, 3 negative pivot, 4 stuck."""

@@ -441,7 +441,7 @@ def test_built_in_problems_are_not_called_yours():
 def test_looks_tell_solvers_apart():
     names = [f"s{i}" for i in range(24)] + ["pgs", "direct"]
     found = looks(names)
-    assert len({(k.color, k.dash, k.mark) for k in found.values()}) == len(names)
+    assert len({(k.color, k.line, k.marker) for k in found.values()}) == len(names)
     assert found["pgs"].color != found["direct"].color
     assert found == looks(reversed(names))
 

@@ -8,22 +8,28 @@ import pytest
 
 import lavender as lv
 from lavender import suite
-from lavender.suite import build, exact
+from lavender.certificates import check_certificate
+from lavender.suite import build, exact, hard
 
 DEFAULT = suite.SETS["default"]
+EVERY = sorted({*DEFAULT, *hard.SET})
+LARGE = {"hang(n=10000)"}  # seconds
 
 
 # -- names ----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", DEFAULT)
+@pytest.mark.parametrize("name", EVERY)
 def test_a_name_makes_the_same_case_again(name):
-    one, two = suite.case(name), suite.case(suite.case(name).name)
-    assert one.name == two.name == one.problem.name
-    assert one.problem == two.problem
-    assert one.problem.b.tobytes() == two.problem.b.tobytes()
+    one = suite.case(name)
+    assert one.name == one.problem.name == name  # spelled in the one way
     assert one.reason
     assert "\n" not in one.reason
+    if name in LARGE:
+        return
+    two = suite.case(name)
+    assert one.problem == two.problem
+    assert one.problem.b.tobytes() == two.problem.b.tobytes()
     assert one.parameters == two.parameters
 
 
@@ -205,7 +211,7 @@ def test_chains_are_banded_and_hold_their_weight():
 @pytest.mark.parametrize(
     "name",
     [
-        *(n for n in DEFAULT if n != "granular(n=9)"),  # half a second
+        *sorted(set(EVERY) - LARGE - {"granular(n=9)"}),  # half a second
         "stack(n=300, mass_ratio=1e6)",
         "stackF(n=20, mass_ratio=7)",
         "box_stack(n=5, mass_ratio=1e8)",
@@ -220,13 +226,25 @@ def test_chains_are_banded_and_hold_their_weight():
 )
 def test_a_reference_is_a_solution(name):
     case = suite.case(name)
-    if case.reference is None:
+    reference = case.reference
+    if reference is None:
         assert case.problem.law in ("coulomb", "cone")
         return
-    judged = lv.residual(case.problem, case.reference.impulse)
-    # Rounded to float64, and no worse than what rounding costs.
-    assert judged.relative <= max(1e-15, 2.0 * judged.floor), str(judged)
-    assert case.reference.source
+    assert reference.source
+    if reference.impulse is None:
+        assert check_certificate(case.problem, reference.certificate) is None
+        assert reference.compare == "nothing"
+        return
+    judged = lv.residual(case.problem, reference.impulse)
+    # 1e-14: the sums of the judge itself, of up to a hundred terms, where the floor is as low as 1e-16.
+    least = 1e-14 if name in hard.SET else 1e-15
+    assert judged.relative <= max(least, 2.0 * judged.floor), str(judged)
+    assert reference.compare in ("impulse", "slack", "error")
+
+
+def test_only_what_slides_at_large_ratios_has_no_reference():
+    without = [name for name in set(hard.SET) - LARGE if suite.case(name).reference is None]
+    assert all("sliding=0.5" in name or name == "box_stackF(n=10, mass_ratio=1e6)" for name in without)
 
 
 def test_the_toy_stack_is_solved_by_trying_all_active_sets_in_fractions():

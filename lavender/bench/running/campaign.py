@@ -139,14 +139,7 @@ def campaign(
         A backend that joblib does not have here, another number of workers than -1 or 1 to 4096, or workers that were
         lost again and again.
     """
-    if (
-        isinstance(workers, bool)
-        or not isinstance(workers, int)
-        or not (workers == -1 or 1 <= workers <= MOST_WORKERS)
-    ):
-        raise InputError(
-            f"workers is {workers!r}; -1 (one for each core) or a whole number from 1 to {MOST_WORKERS} is needed"
-        )
+    _check(workers)
     plan = plan or CampaignPlan()
     items = resolve(cases)
     names = solver_names(solvers)
@@ -164,16 +157,11 @@ def campaign(
         for i, item in enumerate(items)
         for j, name in enumerate(names)
     ]
-    known: dict[tuple[str, str], list[Any]] = {}
-    if store is not None:
-        known = _finished(store.records, this.run)
+    known = {} if store is None else _finished(store.records, this.run)
     out = Records(source=str(store.path) if store is not None else "")
-    done: dict[int, list[Any]] = {
-        p.index: known[p.case, p.solver] for p in pairs if (p.case, p.solver) in known
-    }
+    done = {p.index: known[p.case, p.solver] for p in pairs if (p.case, p.solver) in known}
     out.add(this)
-    if store is not None:
-        store.add(this)
+    _keep(store, [this])
     with _backend(backend) as name:
         for attempt in range(ATTEMPTS + 1):
             left = [p for p in pairs if p.index not in done]
@@ -185,18 +173,28 @@ def campaign(
                     "run the same command again, with fewer workers if memory is short"
                 )
             for index, entries in _hand_out(left, Order(plan, this.run, memory), workers, name):
-                done[index] = entries
-                if store is not None:
-                    for entry in entries:
-                        store.add(entry)
-                    store.add(Done(this.run, pairs[index].case, pairs[index].solver))
+                done[index], pair = entries, pairs[index]
+                _keep(store, [*entries, Done(this.run, pair.case, pair.solver)])
                 if watch is not None:
-                    pair = pairs[index]
                     watch(Event(len(done), len(pairs), pair.case, pair.solver))
     for index in sorted(done):
         for entry in done[index]:
             out.add(entry)
     return out
+
+
+def _keep(store: Store | None, entries: Iterable[Any]) -> None:
+    if store is not None:
+        for entry in entries:
+            store.add(entry)
+
+
+def _check(workers: Any) -> None:
+    whole = isinstance(workers, int) and not isinstance(workers, bool)
+    if not whole or not (workers == -1 or 1 <= workers <= MOST_WORKERS):
+        raise InputError(
+            f"workers is {workers!r}; -1 (one for each core) or a whole number from 1 to {MOST_WORKERS} is needed"
+        )
 
 
 def _finished(records: Records, run: str) -> dict[tuple[str, str], list[Any]]:

@@ -61,7 +61,6 @@ class Race:
     ranking: tuple[tuple[Final, Choice], ...]  # the recommended one first
     shares: tuple[float, ...]  # of the resamplings that each wins, in this order
     loss: float  # score of the recommended over the best's where it does not win, median; 1 where it always wins
-    noise: float  # factor within which two scores are the same
 
     @property
     def named(self) -> tuple[str, ...]:
@@ -268,5 +267,4 @@ def _race(
         ranking=tuple((some[i], choice(i, float(whole[i]))) for i in order),
         shares=tuple(float(shares[i]) for i in order),
         loss=float(np.median(losses[head])) if losses[head] else 1.0,
-        noise=noise,
     )
