@@ -18,8 +18,8 @@ from libc.stdint cimport int32_t, int64_t
 
 from lavender_ext.core.block cimport CONTACT, CONTACT_BOX, CONTACT_SPIN, blocks_t, relax_tangents
 from lavender_ext.core.rows cimport cross, relax_rows_block, rows_t
-from lavender_ext.sweep.pair cimport (LANES, all_within, any_beyond, at, both, clip_pair, gather, gather_six,
-                                      not_below_zero, pair_t, scatter_six)
+from lavender_ext.sweep.pair cimport (LANES, all_within, any_beyond, at, both, clip_pair, gather, gather_six, not_below_zero, pair_t,
+                                      scatter_six)
 
 
 cdef enum:                      # kinds
