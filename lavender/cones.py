@@ -216,6 +216,9 @@ class Cones:
                 f"block {bad[0]} is an ellipse of {size[bad[0]]} rows with mu_2 / mu_1 = {radius[bad[0]]:g}; a normal, "
                 "two tangents and mu_2 / mu_1 from 1e-18 to 1e18 in the place of the patch radius are needed"
             )
+        with np.errstate(over="ignore"):
+            second = np.where(np.isin(kind, (CONTACT_BOX, CONTACT_ELLIPSE)), mu * radius, 0.0)
+        as_array("mu_2", second, (k,))
         rolling = as_array("rolling", self.rolling, (k,), unit="m")
         check_not_negative("rolling", rolling)
         return kernels.Blocks(ptr, kind, lower, upper, mu, radius, rolling)

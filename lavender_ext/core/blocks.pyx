@@ -66,7 +66,9 @@ cdef class Blocks:
             elif kind == CONTACT_BOX or kind == CONTACT_ELLIPSE:
                 if kind == CONTACT_ELLIPSE:
                     self.has_ellipse = True
-                if size != 3 or kind == CONTACT_ELLIPSE and not 1.0 / WIDEST <= p.patch_radius[i] <= WIDEST:
+                if size != 3 or not p.mu[i] * p.patch_radius[i] < INF:
+                    return False
+                if kind == CONTACT_ELLIPSE and not 1.0 / WIDEST <= p.patch_radius[i] <= WIDEST:
                     return False
             elif kind == CONTACT_ROLLING:
                 self.has_rolling = True

@@ -81,6 +81,7 @@ def test_coefficients_come_back_and_equal_ones_are_a_disk():
         (lambda: lv.Problem.contact(np.eye(3), np.ones(3), [(0.5, 0.1)], 0.1), "bounds no spin"),
         (lambda: lv.Cones([0, 2], [7], np.zeros(2), np.ones(2), [0.5], [1.0]), "ellipse of 2 rows"),
         (lambda: lv.Cones([0, 3], [7], np.zeros(3), np.ones(3), [0.5], [0.0]), "mu_2 / mu_1 = 0"),
+        (lambda: lv.Cones([0, 3], [7], np.zeros(3), np.ones(3), [1e300], [1e12]), "mu_2 must be finite"),
         (lambda: lv.motions(free(0)), "problem.disk"),
         (lambda: free(0).to_findex(), "bounds its tangents together"),
         (lambda: free(0).save("x.hdf5"), "ellipses"),
