@@ -172,14 +172,6 @@ class Cones:
                 raise InputError(
                     f"block {bad[0]} is a box of {size[bad[0]]} rows; a normal and two tangents are known"
                 )
-        bad = np.flatnonzero(
-            (kind == CONTACT_ELLIPSE) & ((size != 3) | ~(np.asarray(self.patch_radius) > 0.0))
-        )
-        if len(bad):
-            raise InputError(
-                f"block {bad[0]} is an ellipse of {size[bad[0]]} rows; a normal, two tangents and mu_2 / mu_1 > 0 in "
-                "the place of the patch radius are needed"
-            )
         bad = np.flatnonzero((kind == CONTACT_ROLLING) & (size != 5) & (size != 6))
         if len(bad):
             raise InputError(
@@ -217,6 +209,16 @@ class Cones:
         check_not_negative("mu", mu)
         radius = as_array("patch_radius", self.patch_radius, (k,), unit="m")
         check_not_negative("patch_radius", radius)
+        wide = ~((radius >= LEAST_SHARE) & (radius <= 1.0 / LEAST_SHARE))
+        bad = np.flatnonzero((kind == CONTACT_ELLIPSE) & ((size != 3) | wide))
+        if len(bad):
+            raise InputError(
+                f"block {bad[0]} is an ellipse of {size[bad[0]]} rows with mu_2 / mu_1 = {radius[bad[0]]:g}; a normal, "
+                "two tangents and mu_2 / mu_1 from 1e-18 to 1e18 in the place of the patch radius are needed"
+            )
+        with np.errstate(over="ignore"):
+            second = np.where(np.isin(kind, (CONTACT_BOX, CONTACT_ELLIPSE)), mu * radius, 0.0)
+        as_array("mu_2", second, (k,))
         rolling = as_array("rolling", self.rolling, (k,), unit="m")
         check_not_negative("rolling", rolling)
         return kernels.Blocks(ptr, kind, lower, upper, mu, radius, rolling)
@@ -525,7 +527,9 @@ def _axes(mu: Any) -> tuple[FloatArray, FloatArray | None]:
     check_not_negative("mu", given.ravel())
     if given.ndim != 2 or given.shape[1] != 2:
         raise InputError(f"mu has shape {given.shape}; (k,) or (k, 2), one for each tangent, is needed")
-    flat = np.flatnonzero((given.min(axis=1) <= LEAST_SHARE * given.max(axis=1)) & (given.max(axis=1) > 0.0))
+    flat = np.flatnonzero(
+        (given.min(axis=1) < 2.0 * LEAST_SHARE * given.max(axis=1)) & (given.max(axis=1) > 0.0)
+    )
     if len(flat):
         raise InputError(
             f"mu of contact {flat[0]} is {given[flat[0]].tolist()}; an ellipse needs two numbers above 0 (or no "

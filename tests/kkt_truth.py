@@ -7,12 +7,13 @@ tangent); where a disk slides a square root stands in the equations, and they ho
 """
 
 from fractions import Fraction
+from itertools import product
 from math import isqrt
 
 import numpy as np
 
 import lavender as lv
-from lavender.cones import CONTACT_SPIN, ROW
+from lavender.cones import ROW
 
 HAS_WIDE = np.finfo(np.longdouble).eps < 1e-18
 ROUNDS = 6  # of reading the conditions anew
@@ -134,8 +135,30 @@ def inverse_times(m, x):
 
 
 def curved(problem):
-    """Whether a square root stands in the conditions: a disk of two tangents."""
-    return bool(np.any((problem.cones.kind != ROW) & (problem.cones.n_tangents > 1)))
+    """Whether a square root stands in the conditions: two rows bounded by their norm."""
+    return any(len(rows) > 1 for i in contacts(problem) for rows, _ in parts(problem, i))
+
+
+def contacts(problem):
+    """Blocks with friction or rows that turn."""
+    c = problem.cones
+    return np.flatnonzero((c.kind != ROW) & (np.diff(c.ptr) > 1))
+
+
+def parts(problem, i, number=float):
+    """(rows, most of their norm over the normal impulse) of all that a contact bounds by itself."""
+    c = problem.cones
+    mu, first = number(c.mu[i]), c.ptr[i] + 1
+    found = [(np.arange(first, first + c.n_together[i]), mu)] if c.n_together[i] else []
+    if c.apart_rows[i] >= 0:  # spin, or the other side of a box
+        found.append((c.apart_rows[i : i + 1], mu * number(c.patch_radius[i])))
+    if c.rolling_rows[i] >= 0:
+        found.append((c.rolling_rows[i] + np.arange(2), number(c.rolling[i])))
+    return found
+
+
+def norm(x, numbers):
+    return abs(x[0]) if len(x) == 1 else numbers.sqrt(np.sum(x**2))
 
 
 def solution_in(problem, a, b, numbers):
@@ -164,24 +187,30 @@ def solution_in(problem, a, b, numbers):
 
 
 def conditions(problem, x, w, d, numbers):
-    """For every row None (free) or the bound it lies on; for the first row of a contact "open" or (slides, turns)."""
-    c, modes = problem.cones, {}
+    """For every row None (free) or the bound it lies on; of a contact "open" or, for each part, whether it slides."""
+    c, modes = problem.cones, dict.fromkeys(range(problem.m))
     z = x - w / d
-    for i in range(c.n_blocks):
-        j, end = c.ptr[i], c.ptr[i + 1]
-        if c.kind[i] == ROW or end - j == 1:
-            for k in range(j, end):
-                low, high = (c.lower[k], c.upper[k]) if c.kind[i] == ROW else (0.0, np.inf)
-                modes[k] = low if z[k] < low else high if z[k] > high else None
-            continue
-        nt, spin = c.n_tangents[i], c.kind[i] == CONTACT_SPIN
-        n, mu = x[j], numbers.number(c.mu[i])
+    for k, low, high in bounded(problem):
+        modes[k] = low if z[k] < low else high if z[k] > high else None
+    for i in contacts(problem):
+        j = c.ptr[i]
         # A share of the rim decides: on it, what is left of w moves the projection's argument outwards.
-        rim = mu * n * numbers.number(1 + 1e-12)
-        slides = nt > 0 and numbers.sqrt(np.sum(z[j + 1 : j + 1 + nt] ** 2)) > rim
-        turns = spin and abs(z[end - 1]) > rim * numbers.number(c.patch_radius[i])
-        modes[j] = "open" if z[j] <= 0 and n <= 0 else (bool(slides), bool(turns))
+        rim = x[j] * numbers.number(1 + 1e-12)
+        slides = tuple(
+            bool(norm(z[rows], numbers) > reach * rim) for rows, reach in parts(problem, i, numbers.number)
+        )
+        modes[j] = "open" if z[j] <= 0 and x[j] <= 0 else slides
     return modes
+
+
+def bounded(problem):
+    """(row, lower, upper) of every row with constant bounds."""
+    c = problem.cones
+    for i in range(c.n_blocks):
+        if c.kind[i] == ROW:
+            yield from ((k, c.lower[k], c.upper[k]) for k in range(c.ptr[i], c.ptr[i + 1]))
+        elif c.ptr[i + 1] == c.ptr[i] + 1:
+            yield c.ptr[i], 0.0, np.inf
 
 
 def equations(problem, modes, a, x, w, numbers):
@@ -194,39 +223,28 @@ def equations(problem, modes, a, x, w, numbers):
         f[k], slope[k], impulse[k] = x[k] - value, none, True
         slope[k, k] = one
 
-    for i in range(c.n_blocks):
-        j, end = c.ptr[i], c.ptr[i + 1]
-        if c.kind[i] == ROW or end - j == 1:
-            for k in range(j, end):
-                if modes[k] is not None:
-                    given(k, numbers.number(modes[k]))
-            continue
+    for k, _, _ in bounded(problem):
+        if modes[k] is not None:
+            given(k, numbers.number(modes[k]))
+    for i in contacts(problem):
+        j = c.ptr[i]
         if modes[j] == "open":
-            for k in range(j, end):
+            for k in range(j, c.ptr[i + 1]):
                 given(k, none)
             continue
-        nt, mu = c.n_tangents[i], numbers.number(c.mu[i])
-        slides, turns = modes[j]
-        if slides:
-            t = np.arange(j + 1, j + 1 + nt)
-            size = numbers.sqrt(np.sum(w[t] ** 2))
-            u = w[t] / size if size > 0 else 0 * w[t]
-            along = u @ a[t]
-            f[j] -= mu * size
-            slope[j] = slope[j] - mu * along
-            for k, uk in zip(t, u, strict=True):
-                given(k, -mu * x[j] * uk)
-                slope[k, j] += mu * uk
-                if size > 0:
-                    slope[k] = slope[k] + mu * x[j] / size * (a[k] - uk * along)
-        if turns:
-            k = end - 1
-            reach = mu * numbers.number(c.patch_radius[i])
-            way = one if w[k] > 0 else -one if w[k] < 0 else none
-            f[j] -= reach * abs(w[k])
-            slope[j] = slope[j] - reach * way * a[k]
-            given(k, -reach * x[j] * way)
-            slope[k, j] += reach * way
+        for (rows, reach), slides in zip(parts(problem, i, numbers.number), modes[j], strict=True):
+            if not slides:
+                continue
+            size = norm(w[rows], numbers)
+            u = w[rows] / size if size > 0 else 0 * w[rows]
+            along = u @ a[rows]
+            f[j] -= reach * size
+            slope[j] = slope[j] - reach * along
+            for k, uk in zip(rows, u, strict=True):
+                given(k, -reach * x[j] * uk)
+                slope[k, j] += reach * uk
+                if size > 0 and len(rows) > 1:
+                    slope[k] = slope[k] + reach * x[j] / size * (a[k] - uk * along)
     return f, slope, impulse
 
 
@@ -241,24 +259,18 @@ def holds(problem, modes, a, b, x, w, numbers):
     for k in range(problem.m):
         if abs(f[k]) > numbers.equal * (most if impulse[k] else size):
             return False
-    for i in range(c.n_blocks):
-        j, end = c.ptr[i], c.ptr[i + 1]
-        if c.kind[i] == ROW or end - j == 1:
-            for k in range(j, end):
-                low, high = (c.lower[k], c.upper[k]) if c.kind[i] == ROW else (0.0, np.inf)
-                if x[k] - low < -small or x[k] - high > small:
-                    return False
-                if low < high and ((modes[k] == low and w[k] < -slow) or (modes[k] == high and w[k] > slow)):
-                    return False
-            continue
-        nt, mu, spin = c.n_tangents[i], numbers.number(c.mu[i]), c.kind[i] == CONTACT_SPIN
-        t = slice(j + 1, j + 1 + nt)
-        pulled, slip = numbers.sqrt(np.sum(x[t] ** 2)), numbers.sqrt(np.sum(w[t] ** 2))
-        reach = mu * numbers.number(c.patch_radius[i]) if spin else 0 * mu
-        twist, turn = (abs(x[end - 1]), abs(w[end - 1])) if spin else (0 * mu, 0 * mu)
-        if x[j] < -small or pulled > mu * x[j] + small or twist > reach * x[j] + small:
+    for k, low, high in bounded(problem):
+        if x[k] - low < -small or x[k] - high > small:
             return False
-        if w[j] < mu * slip + reach * turn - slow:
+        if low < high and ((modes[k] == low and w[k] < -slow) or (modes[k] == high and w[k] > slow)):
+            return False
+    for i in contacts(problem):
+        j, lift = c.ptr[i], 0 * x[0]
+        for rows, reach in parts(problem, i, numbers.number):
+            if norm(x[rows], numbers) > reach * x[j] + small:
+                return False
+            lift += reach * norm(w[rows], numbers)
+        if x[j] < -small or w[j] < lift - slow:
             return False
     return True
 
@@ -268,40 +280,31 @@ def shift_in(problem, a, y, numbers):
     d, c, y = numbers.array(problem.d), problem.cones, numbers.array(y)
     z = y - (a @ y - numbers.array(problem.b)) / d
     p = z.copy()
-    for i in range(c.n_blocks):
+    for k, low, high in bounded(problem):
+        p[k] = numbers.number(low) if z[k] < low else numbers.number(high) if z[k] > high else z[k]
+    for i in contacts(problem):
         j, end = c.ptr[i], c.ptr[i + 1]
-        if c.kind[i] == ROW or end - j == 1:
-            for k in range(j, end):
-                low, high = (c.lower[k], c.upper[k]) if c.kind[i] == ROW else (0.0, np.inf)
-                p[k] = numbers.number(low) if z[k] < low else numbers.number(high) if z[k] > high else z[k]
-            continue
-        spin = c.kind[i] == CONTACT_SPIN
-        p[j:end] = project_cone(
-            z[j:end], d[j:end], float(c.mu[i]), float(c.patch_radius[i]), int(c.n_tangents[i]), spin, numbers
-        )
+        bounds = [(rows - j, reach) for rows, reach in parts(problem, i, numbers.number)]
+        p[j:end] = project_cone(z[j:end], d[j:end], bounds, numbers)
     return d * (y - p)
 
 
-def project_cone(z, d, mu, radius, nt, spin, numbers=Wide):
-    """Nearest point of {|t| <= mu n, |s| <= mu r n} in the metric of d.
+def project_cone(z, d, bounds, numbers=Wide):
+    """Nearest point of {|z_g| <= a_g n for each part g} in the metric of d; bounds: (places, a_g) of the parts.
 
-    Its normal part n is where the slope of 1/2 d_n (n - z_n)^2 + 1/2 d_t (t - mu n)+^2 + 1/2 d_s (s - mu r n)+^2
-    vanishes: each part counts or does not, and the slope of all that do, a line, is the largest there is at its root.
+    Its normal part n is where the slope of 1/2 d_n (n - z_n)^2 + sum_g 1/2 d_g (|z_g| - a_g n)+^2 vanishes: each part
+    counts or does not, and the slope of all that do, a line, is the largest there is at its root.
     """
-    mu, radius = numbers.number(mu), numbers.number(radius)
-    none = 0 * d[0]
-    t = numbers.sqrt(np.sum(z[1 : 1 + nt] ** 2)) if nt else none
-    s = abs(z[-1]) if spin else none
-    dt, ds = d[1] if nt else none, d[-1] if spin else none
-    n = none
-    for along in (0, 1):
-        for about in (0, 1):
-            pull = d[0] * z[0] + along * dt * mu * t + about * ds * mu * radius * s
-            n = max(n, pull / (d[0] + along * dt * mu**2 + about * ds * (mu * radius) ** 2))
+    size = [norm(z[at], numbers) for at, _ in bounds]
+    n = 0 * d[0]
+    for counts in product((0, 1), repeat=len(bounds)):
+        pull, weight = d[0] * z[0], d[0]
+        for use, (at, reach), t in zip(counts, bounds, size, strict=True):
+            pull, weight = pull + use * d[at[0]] * reach * t, weight + use * d[at[0]] * reach**2
+        n = max(n, pull / weight)
     out = z.copy()
     out[0] = n
-    if nt and t > mu * n:
-        out[1 : 1 + nt] = out[1 : 1 + nt] * (mu * n / t)
-    if spin:
-        out[-1] = min(max(z[-1], -mu * radius * n), mu * radius * n)
+    for (at, reach), t in zip(bounds, size, strict=True):
+        if t > reach * n:
+            out[at] = out[at] * (reach * n / t)
     return out

@@ -9,6 +9,7 @@ does not settle in rational numbers alone; it says how many bounds are broken, a
 import sys
 import time
 from collections import Counter
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -18,6 +19,8 @@ from random_problems import as_matrix, random_contact_problem, random_lcp
 import lavender as lv
 from lavender.motion.bound import difference, witness
 from lavender.motion.operator import make
+
+SHAPES = ("disk", "disk", "box", "rolling")
 
 
 class Draw(NamedTuple):
@@ -51,13 +54,18 @@ def random_problem(rng):
         "joints": int(rng.integers(0, 3)),
         "contacts": int(rng.integers(0, 4)),
     }
+    tangents, turns = 0 if kind == 1 else int(rng.integers(1, 3)), int(rng.integers(2)) * (kind != 1)
+    shape = SHAPES[int(rng.integers(len(SHAPES)))] if tangents == 2 else "disk"
     problem = random_contact_problem(
         seed,
         friction="cone",
-        tangents=0 if kind == 1 else int(rng.integers(1, 3)),
-        spin=bool(rng.integers(2)) and kind != 1,
+        tangents=tangents,
+        spin=bool(turns) and shape != "box",
+        rolling=shape == "rolling",
         **sizes,
     )
+    if shape == "box":
+        problem = replace(problem, cones=problem.cones.shaped("box"))
     return as_matrix(problem) if rng.random() < 0.25 else problem
 
 

@@ -144,7 +144,9 @@ class Resumed(Candidate):
     def close(self) -> None:
         """Offer what came of a turn."""
         self.log.offer(self.impulse)
-        best = self.state.best
+        best = getattr(
+            self.state, "best", (np.inf, None)
+        )  # some states only say why nothing could be prepared
         if best[1] is not None and best[0] < self.log.best:
             self.log.offer(best[1])
 

@@ -280,28 +280,36 @@ cdef inline double weighed(double lam, double w, double d, double r) noexcept no
 cdef inline double rolling_section(const double* a, const double* t, double yn, double* bound) noexcept nogil:
     """s of (7) and a_g s in bound (3) for three parts, |y_g| = t_g <= a_g s each; a_g = 0 where one is not there.
 
-    The largest of the eight candidates (y_n + sum a_g t_g) / (1 + sum a_g^2) over subsets, as before. b s with b = max(1, a_g)
-    is what keeps its digits where a cone is wide.
+    The largest of the eight candidates (y_n + sum a_g t_g) / (1 + sum a_g^2) over subsets, as before, each over the widest
+    part in it. b s with b = max(1, a_g) is what keeps its digits where a cone is wide.
     """
-    cdef double b = 1.0, sb, up, down, f
+    cdef double b = 1.0, s = 0.0, sb = 0.0, up, down, f, most
     cdef int32_t g, subset
     for g in range(3):
         if a[g] > b:
             b = a[g]
-    sb = b * yn if yn > 0.0 else 0.0
+    if yn > 0.0:
+        s = yn
+        sb = b * yn
     for subset in range(1, 8):
-        up = yn / b
-        down = 1.0 / b / b
+        most = 1.0
+        for g in range(3):
+            if subset >> g & 1 and a[g] > most:
+                most = a[g]
+        up = yn / most
+        down = 1.0 / most / most
         for g in range(3):
             if subset >> g & 1:
-                f = a[g] / b
+                f = a[g] / most
                 up += f * t[g]
                 down += f * f
-        if up > sb * down:
-            sb = up / down
+        up = up / down
+        if up / most > s or up * (b / most) > sb:
+            s = up / most
+            sb = up * (b / most)
     for g in range(3):
-        bound[g] = a[g] / b * sb
-    return sb / b
+        bound[g] = a[g] / b * sb if a[g] > 1e140 else a[g] * s
+    return s
 
 
 cdef inline void project_rolling(const double* lam, const double* w, const double* d, double mu, double patch_radius,

@@ -15,7 +15,7 @@ cdef enum:
 #: Kinds of blocks by the kernels' numbers.
 KINDS = (ROW, CONTACT, CONTACT_SPIN, ROUND, CONTACT_BOX, CONTACT_ROLLING, CONTACT_ELLIPSE)
 
-cdef double INF = 1.0 / 0.0
+cdef double INF = 1.0 / 0.0, WIDEST = 2.0 ** 60          # of mu_2 / mu_1 of an ellipse, and of mu_1 / mu_2
 cdef object ndarray = np.ndarray, new = np.empty, F8 = np.dtype(np.float64), I4 = np.dtype(np.int32)
 
 
@@ -66,7 +66,9 @@ cdef class Blocks:
             elif kind == CONTACT_BOX or kind == CONTACT_ELLIPSE:
                 if kind == CONTACT_ELLIPSE:
                     self.has_ellipse = True
-                if size != 3 or kind == CONTACT_ELLIPSE and not p.patch_radius[i] > 0.0:
+                if size != 3 or not p.mu[i] * p.patch_radius[i] < INF:
+                    return False
+                if kind == CONTACT_ELLIPSE and not 1.0 / WIDEST <= p.patch_radius[i] <= WIDEST:
                     return False
             elif kind == CONTACT_ROLLING:
                 self.has_rolling = True

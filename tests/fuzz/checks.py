@@ -80,7 +80,7 @@ def data_of(problem):
     """Hash of everything a solver could have changed."""
     out = hashlib.sha256()
     c, parts = problem.cones, [problem.b, problem.d, problem.guess]
-    parts += [c.ptr, c.kind, c.lower, c.upper, c.mu, c.patch_radius]
+    parts += [c.ptr, c.kind, c.lower, c.upper, c.mu, c.patch_radius, c.rolling]
     if problem.generalized is None:
         a = problem.csr
         parts += [a.indptr, a.indices, a.data]
@@ -222,7 +222,7 @@ def claims(spec, problem, solution):
                 "wrong number",
                 f"{name}: relative {r.relative:.6e}, in long double {j.relative:.6e}, {j.allowed:.1e} allowed",
             )
-        if not abs(problem.d - np.array(twin.d, float)).max(initial=0.0) <= 1e-6 * float(
+        if not abs(problem.disk.d - np.array(twin.d, float)).max(initial=0.0) <= 1e-6 * float(
             np.abs(twin.d).max(initial=0)
         ):
             yield "wrong number", f"{name}: d"

@@ -28,6 +28,8 @@ def cones(specs):
         key: one_list(s["cones"][key] for s in specs)
         for key in ("kind", "lower", "upper", "mu", "patch_radius")
     }
+    if any("rolling" in s["cones"] for s in specs):
+        found["rolling"] = one_list(s["cones"].get("rolling", [0.0] * len(s["cones"]["kind"])) for s in specs)
     sizes = np.concatenate([np.diff(s["cones"]["ptr"]) for s in specs])
     return found | {"ptr": np.concatenate([[0], np.cumsum(sizes)]).astype(int).tolist()}
 
@@ -90,7 +92,7 @@ def reordered(spec, order, joints):
     out = dict(spec)
     out["cones"] = {
         "ptr": np.concatenate([[0], np.cumsum([len(x) for x in of])]).astype(int).tolist(),
-        **{key: [c[key][i] for i in order] for key in ("kind", "mu", "patch_radius")},
+        **{key: [c[key][i] for i in order] for key in ("kind", "mu", "patch_radius", "rolling") if key in c},
         **{key: [c[key][i] for i in row] for key in ("lower", "upper")},
     }
     for key in ("b", "target", "compliance", "guess"):

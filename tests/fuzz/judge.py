@@ -9,12 +9,13 @@ it rounds is far below what float64 may round. `Judgement.allowed` is what float
 operations of a row rounds by 2^-53, or by the smallest denormal.
 """
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
 
 L = np.longdouble
-ROW, CONTACT, CONTACT_SPIN, ROUND = 0, 1, 2, 3
+ROW, CONTACT, CONTACT_SPIN, ROUND, CONTACT_BOX, CONTACT_ROLLING, CONTACT_ELLIPSE = 0, 1, 2, 3, 4, 5, 7
 NORMAL = L(2.0) ** -1022
 DENORMAL = L(2.0) ** -1074
 ZERO = L(0.0)
@@ -47,8 +48,10 @@ class Problem:
             self.b = np.array(spec["b"], L)
             self.b_size = np.abs(self.b)
         self.cones = {key: np.array(value) for key, value in spec["cones"].items()}
+        self.cones.setdefault("rolling", np.zeros(len(self.cones["kind"])))
         self.law = spec["friction"]
         self.m = len(self.b)
+        self.stretch = self._stretch()
         self.roundings = self.m + 20
         if general:
             self._of_general(
@@ -58,9 +61,21 @@ class Problem:
             self._of_rows(spec)
         else:
             self.A = np.array(spec["A"], L).reshape(self.m, self.m)
+            self.A *= np.outer(self.stretch, self.stretch)
             self.size = np.abs(self.A)
             self._of_matrix()
+        self.b, self.b_size = self.stretch * self.b, self.stretch * self.b_size
         self._pairs()
+
+    def _stretch(self):
+        """An ellipse is measured as the disk of its larger coefficient in rows that are so long (m,)."""
+        c, out = self.cones, np.ones(self.m, L)
+        self.mu = np.array(c["mu"], L)
+        for k in np.flatnonzero(c["kind"] == CONTACT_ELLIPSE):
+            both = self.mu[k] * np.array([1.0, c["patch_radius"][k]], L)
+            self.mu[k] = both.max()
+            out[c["ptr"][k] + 1 : c["ptr"][k + 1]] = both / both.max() if both.max() > 0 else L(1.0)
+        return out
 
     # -- the operator ------------------------------------------------------------------------------
 
@@ -94,8 +109,11 @@ class Problem:
             k = joints + c
             normal, tangent = np.array(r["normal"][c], L), np.array(r["tangent"][c], L)
             axes = [normal, tangent, np.cross(normal, tangent)]
-            spin = kind[k] == CONTACT_SPIN
             rows = range(ptr[k], ptr[k + 1])
+            slides = len(rows) - (kind[k] == CONTACT_SPIN)
+            if kind[k] == CONTACT_ROLLING:
+                slides = 3
+            turns = axes if len(rows) - slides == 3 else axes[:1] if len(rows) - slides == 1 else axes[1:]
             for q, row in enumerate(rows):
                 for sign, arm, body in (
                     (-1, r["arm_a"][c], r["contact_body"][c][0]),
@@ -103,9 +121,9 @@ class Problem:
                 ):
                     if body < 0:
                         continue
-                    if spin and q == len(rows) - 1:
-                        jac[row, body, 3:] = sign * normal
-                        size[row, body, 3:] = np.abs(normal)
+                    if q >= slides:
+                        jac[row, body, 3:] = sign * turns[q - slides]
+                        size[row, body, 3:] = np.abs(turns[q - slides])
                     else:
                         arm = np.array(arm, L)
                         jac[row, body, :3], jac[row, body, 3:] = sign * axes[q], sign * np.cross(arm, axes[q])
@@ -137,6 +155,8 @@ class Problem:
     def _of_general(self, jac, mass, soft):
         """M = C C^T, Y = J C^-T, A = Y Y^T + compliance; |Y| |Y|^T for the sums of absolute products."""
         n = len(mass)
+        jac = self.stretch[:, None] * jac
+        soft = self.stretch**2 * soft
         lower, y = np.zeros((n, n), L), np.zeros((self.m, n), L)
         for i in range(n):
             for j in range(i):
@@ -160,24 +180,42 @@ class Problem:
     def _pairs(self):
         ptr, kind = self.cones["ptr"], self.cones["kind"]
         for k in range(len(kind)):
-            j, nt = ptr[k], self.tangents(k)
-            if nt == 2:
-                same = self.nu[j + 1] == self.d[j + 1]
-                self.d[j + 1 : j + 3] = L(0.5) * (self.d[j + 1] + self.d[j + 2])
+            j = ptr[k]
+            for at in self.pairs(k):
+                same = (self.nu[at] == self.d[at]).all()
+                self.d[at] = L(0.5) * self.d[at].sum()
                 if same:
-                    self.nu[j + 1 : j + 3] = self.d[j + 1]
-            if kind[k] == CONTACT_SPIN:
-                self.nu[ptr[k + 1] - 1] = self.d[j]
+                    self.nu[at] = self.d[at]
+            if kind[k] in (CONTACT_SPIN, CONTACT_ROLLING):
+                self.nu[j + self.slide(k) + 1 : ptr[k + 1]] = self.d[j]
 
-            if kind[k] == ROUND and ptr[k + 1] - j == 6:
-                self.d[j + 4 : j + 6] = self.nu[j + 4 : j + 6] = L(0.5) * (self.d[j + 4] + self.d[j + 5])
+    def slide(self, k):
+        """Rows behind the normal of a contact that slide."""
+        size, kind = int(self.cones["ptr"][k + 1] - self.cones["ptr"][k]), self.cones["kind"][k]
+        if kind == ROW:
+            return 0
+        return 2 if kind in (ROUND, CONTACT_ROLLING) else size - 1 - (kind == CONTACT_SPIN)
 
-    def tangents(self, k):
-        """Rows behind the normal that share a limit; of a round cone those that slide."""
-        kind, ptr = self.cones["kind"], self.cones["ptr"]
-        if kind[k] == ROUND:
-            return 2
-        return 0 if kind[k] == ROW else int(ptr[k + 1] - ptr[k] - kind[k])
+    def pairs(self, k):
+        """Two rows that have one d, and count by their norm: those that slide in a disk, those that roll."""
+        j, end, kind = self.cones["ptr"][k], self.cones["ptr"][k + 1], self.cones["kind"][k]
+        found = [slice(j + 1, j + 3)] if self.slide(k) == 2 and kind != CONTACT_BOX else []
+        rolls = kind == CONTACT_ROLLING or (kind == ROUND and end - j == 6)
+        return [*found, slice(end - 2, end)] if rolls else found
+
+    def parts(self, k):
+        """(places, most of their norm over lam_n) of all that a contact bounds by itself; no round cone."""
+        c, slide, mu = self.cones, self.slide(k), self.mu[k]
+        size, kind = int(c["ptr"][k + 1] - c["ptr"][k]), c["kind"][k]
+        apart = mu * L(c["patch_radius"][k])
+        if kind == CONTACT_BOX:
+            return [([1], mu), ([2], apart)]
+        found = [(list(range(1, 1 + slide)), mu)] if slide else []
+        if kind == CONTACT_SPIN or (kind == CONTACT_ROLLING and size == 6):
+            found.append(([1 + slide], apart))
+        if kind == CONTACT_ROLLING:
+            found.append(([size - 2, size - 1], L(c["rolling"][k])))
+        return found
 
     # -- the error of an impulse -------------------------------------------------------------------
 
@@ -202,51 +240,41 @@ class Problem:
         return e
 
     def _coulomb(self, k, lam, step):
-        c, nt = self.cones, self.tangents(k)
         e = step.copy()
         e[0] = min(step[0], lam[0])
-        rim = L(c["mu"][k]) * max(ZERO, lam[0])
-        if nt:
-            y = lam[1 : 1 + nt] - step[1 : 1 + nt]
-            size = np.sqrt(y @ y)
-            if size > rim:
-                e[1 : 1 + nt] = lam[1 : 1 + nt] - y * (rim / size)
-        if c["kind"][k] == CONTACT_SPIN:
-            edge = rim * L(c["patch_radius"][k])
-            e[-1] = min(max(step[-1], lam[-1] - edge), lam[-1] + edge)
+        for at, reach in self.parts(k):
+            y, rim = lam[at] - step[at], reach * max(ZERO, lam[0])
+            if len(at) == 1:
+                e[at] = np.minimum(np.maximum(step[at], lam[at] - rim), lam[at] + rim)
+            elif np.sqrt(y @ y) > rim:
+                e[at] = lam[at] - y * (rim / np.sqrt(y @ y))
         return e
 
     def _cone(self, k, lam, step):
-        """Error of the projection in the metric of d, by the formula of the five candidates."""
-        c, nt, j = self.cones, self.tangents(k), self.cones["ptr"][k]
-        root = np.sqrt(self.d[j : c["ptr"][k + 1]])
+        """Error of the projection in the metric of d: each part counts or does not, the normal is the largest."""
+        j, parts = self.cones["ptr"][k], self.parts(k)
+        root = np.sqrt(self.d[j : self.cones["ptr"][k + 1]])
         y = root * (lam - step)
-        spin = c["kind"][k] == CONTACT_SPIN
-        mu, radius = L(c["mu"][k]), L(c["patch_radius"][k])
-        t = np.sqrt(y[1 : 1 + nt] @ y[1 : 1 + nt]) if nt else ZERO
-        s = abs(y[-1]) if spin else ZERO
-        at = mu * root[1] / root[0] if nt else ZERO
-        a_s = mu * radius * root[-1] / root[0] if spin else ZERO
-        top = max(
-            ZERO,
-            y[0],
-            (y[0] + at * t) / (1 + at * at),
-            (y[0] + a_s * s) / (1 + a_s * a_s),
-            (y[0] + at * t + a_s * s) / (1 + at * at + a_s * a_s),
-        )
+        a = [reach * root[at[0]] / root[0] for at, reach in parts]
+        size = [np.sqrt(y[at] @ y[at]) for at, _ in parts]
+        top = max(ZERO, y[0])
+        for some in itertools.product((0, 1), repeat=len(parts)):
+            pull, weight = y[0], L(1.0)
+            for use, slope, t in zip(some, a, size, strict=True):
+                pull, weight = pull + use * slope * t, weight + use * slope * slope
+            top = max(top, pull / weight)
         e = step.copy()
         if top != y[0]:
             e[0] = lam[0] - top / root[0]
-        if nt and t > at * top:
-            e[1 : 1 + nt] = lam[1 : 1 + nt] - y[1 : 1 + nt] * (at * top / t) / root[1 : 1 + nt]
-        if spin and s > a_s * top:
-            e[-1] = lam[-1] - np.copysign(a_s * top, y[-1]) / root[-1]
+        for (at, _), slope, t in zip(parts, a, size, strict=True):
+            if t > slope * top:
+                e[at] = lam[at] - y[at] * (slope * top / t) / root[at]
         return e
 
     def _round(self, k, lam, step):
         """Error of the projection on sum (|y_g| / a_g)^2 <= y_n^2 by bisection on its multiplier."""
         c, j = self.cones, self.cones["ptr"][k]
-        d, mu = self.d[j : c["ptr"][k + 1]], L(c["mu"][k])
+        d, mu = self.d[j : c["ptr"][k + 1]], self.mu[k]
         root = np.sqrt(d)
         y = root * (lam - step)
         normal, y = y[0], y[1:]
@@ -291,16 +319,13 @@ class Problem:
         c, weight = self.cones, np.sqrt(self.nu * self.d)
         size = np.abs(e)
         for k in range(len(c["kind"])):
-            nt, j = self.tangents(k), c["ptr"][k]
-            if nt == 2:
-                size[j + 1 : j + 3] = np.sqrt(e[j + 1] ** 2 + e[j + 2] ** 2)
-            if c["kind"][k] == ROUND and c["ptr"][k + 1] - j == 6:
-                size[j + 4 : j + 6] = np.sqrt(e[j + 4] ** 2 + e[j + 5] ** 2)
+            for at in self.pairs(k):
+                size[at] = np.sqrt((e[at] ** 2).sum())
         return np.sqrt((self.d * e * e).sum()), (weight * size).max(initial=ZERO)
 
     def judge(self, impulse):
         """Judgement of an impulse (m,) float64."""
-        lam = np.array(impulse, L)
+        lam = np.array(impulse, L) / self.stretch
         if not np.isfinite(lam).all():
             return Judgement(np.inf, 0.0, 0.0, np.inf, np.inf, False, np.inf)
         with np.errstate(all="ignore"):
@@ -365,6 +390,7 @@ class Problem:
         y = np.array(y, L)
         if y.shape != (self.m,) or not np.isfinite(y).all():
             return "not finite numbers"
+        y /= self.stretch
         c = self.cones
         gain, most = self.b @ y, np.abs(self.b) @ np.abs(y)
         if not gain > 0:
@@ -374,7 +400,6 @@ class Problem:
         pull = ZERO
         for k in range(len(c["kind"])):
             part = slice(c["ptr"][k], c["ptr"][k + 1])
-            nt = self.tangents(k) if c["kind"][k] != ROUND else c["ptr"][k + 1] - c["ptr"][k] - 1
             if c["kind"][k] == ROW:
                 low, high = np.array(c["lower"][part], L), np.array(c["upper"][part], L)
                 if np.any((y[part] > 0) & np.isfinite(high)) or np.any((y[part] < 0) & np.isfinite(low)):
@@ -384,20 +409,15 @@ class Problem:
                     x * (h if x > 0 else lo) for x, lo, h in zip(z[part], low, high, strict=True) if x != 0
                 )
                 continue
-            mu = L(c["mu"][k])
-            spin = L(c["patch_radius"][k]) if c["kind"][k] == CONTACT_SPIN else ZERO
             yk, zk = y[part], z[part]
-            limit = mu * yk[0] * (1 + L(1e-11))
-            if (
-                yk[0] < 0
-                or np.sqrt(yk[1 : 1 + nt] @ yk[1 : 1 + nt]) > limit
-                or (spin and abs(yk[-1]) > limit * spin)
-            ):
+            parts = self.parts(k)
+            if c["kind"][k] == ROUND:
+                parts = [(list(range(1, len(yk))), self.mu[k])]
+            limit = yk[0] * (1 + L(1e-11))
+            if yk[0] < 0 or any(np.sqrt(yk[at] @ yk[at]) > reach * limit for at, reach in parts):
                 return "y leaves a cone"
             if self.law == "coulomb" and yk[1:].any():
                 return "y is not along a normal"
-            rim = np.sqrt(zk[1 : 1 + nt] @ zk[1 : 1 + nt]) + (
-                spin * abs(zk[-1]) if c["kind"][k] == CONTACT_SPIN else ZERO
-            )
-            pull += max(ZERO, zk[0] + mu * rim) * LARGEST
+            rim = sum(reach * np.sqrt(zk[at] @ zk[at]) for at, reach in parts)
+            pull += max(ZERO, zk[0] + rim) * LARGEST
         return None if gain > pull else "impulses within the bounds can meet b.y"

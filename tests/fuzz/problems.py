@@ -11,6 +11,12 @@ import lavender as lv
 ORDERS = ("given", "reverse", "symmetric", "random", "bottom_up", "top_down", "colored", "local")
 STYLES = ("tame", "tame", "scales", "wild", "special")
 LAWS = st.sampled_from(("coulomb", "cone"))
+# Kinds of contacts, plain ones most often, and how many rows each may have.
+FRICTION = (
+    *[lv.CONTACT] * 8, *[lv.CONTACT_SPIN] * 2, *[lv.CONTACT_BOX] * 2, *[lv.CONTACT_ROLLING] * 2, lv.CONTACT_ELLIPSE,
+)  # fmt: skip
+SIZES = {lv.CONTACT: (1, 2, 3, 3, 3), lv.CONTACT_SPIN: (2, 3, 4, 4), lv.CONTACT_BOX: (3,), lv.CONTACT_ROLLING: (5, 6),
+         lv.CONTACT_ELLIPSE: (3,)}  # fmt: skip
 
 
 def problem_specs(largest=12):
@@ -63,10 +69,10 @@ def cones(draw, rows):
     kind, size = [], []
     while sum(size) < rows:
         contact = law == "contacts" or (law == "mixed" and draw(st.booleans()))
-        spin = contact and draw(chance(0.2))
-        kind.append(contact + spin)
+        shape = draw(st.sampled_from(FRICTION)) if contact else lv.ROW
+        kind.append(shape)
         if contact:
-            size.append(1 + draw(st.sampled_from((0, 1, 2, 2, 2))) + spin)
+            size.append(draw(st.sampled_from(SIZES[shape])))
         else:
             size.append(draw(st.sampled_from((1, 1, 1, 2, 3))) if law == "mixed" else 1)
     m, k = sum(size), len(size)
@@ -88,8 +94,22 @@ def cones(draw, rows):
         "lower": lower,
         "upper": upper,
         "mu": np.minimum(mu, 1.0) if draw(chance(0.7)) else mu,
-        "patch_radius": np.minimum(radius, 1.0) if draw(chance(0.7)) else radius,
-    }
+        "patch_radius": radii(kind, np.minimum(radius, 1.0) if draw(chance(0.7)) else radius),
+    } | draw(rolling(kind))
+
+
+def radii(kind, radius):
+    """Patch radii; of ellipses, which have none, mu_2 / mu_1 above 0."""
+    ellipse = np.array(kind) == lv.CONTACT_ELLIPSE
+    return np.where(ellipse, np.clip(np.where(radius == 0.0, 2.0, radius), 1e-12, 1e12), radius)
+
+
+@st.composite
+def rolling(draw, kind):
+    """mu_r of blocks, where one rolls."""
+    if lv.CONTACT_ROLLING not in kind:
+        return {}
+    return {"rolling": draw(choices((0.0, 0.01, 0.5, 1e-12, 1e8), len(kind)))}
 
 
 def choices(options, n):
@@ -155,9 +175,9 @@ def bodies(draw):
     if mj and draw(st.booleans()):
         jac[: draw(st.integers(1, mj)), [0, 1, 2, 6, 7, 8]] = 0.0
     normal, tangent = draw(directions(contacts))
-    spin = draw(chance(0.3))
-    tangents = draw(st.lists(st.sampled_from((0, 1, 2, 2)), min_size=contacts, max_size=contacts))
-    size = [*np.diff(joint_ptr).tolist(), *(1 + t + spin for t in tangents)]
+    shape = draw(st.sampled_from([k for k in FRICTION if k != lv.CONTACT_ELLIPSE]))
+    sizes = draw(st.lists(st.sampled_from(SIZES[shape]), min_size=contacts, max_size=contacts))
+    size, kind = [*np.diff(joint_ptr).tolist(), *sizes], [lv.ROW] * joints + [shape] * contacts
     m = sum(size)
     high = np.where(draw(some(m, 0.4)), draw(positive(m)), np.inf)
     arm_style = draw(st.sampled_from(("tame", "tame", "scales", "special")))
@@ -179,12 +199,13 @@ def bodies(draw):
         },
         "cones": {
             "ptr": np.cumsum([0, *size]).tolist(),
-            "kind": [0] * joints + [1 + spin] * contacts,
+            "kind": kind,
             "lower": -high,
             "upper": high,
             "mu": [0.0] * joints + draw(choices((0.0, 0.3, 0.8, 1.0, 10.0, 1e-12, 1e300), contacts)).tolist(),
             "patch_radius": [0.0] * joints + draw(choices((0.0, 0.1, 1.0), contacts)).tolist(),
-        },
+        }
+        | draw(rolling(kind)),
         "b": draw(numbers(m)) if draw(chance(0.9)) else np.zeros(m),
     }
     return spec | draw(optional(compliance=numbers(m).map(np.abs), guess=numbers(m)))
@@ -279,6 +300,7 @@ def build(spec):
         np.array(c["ptr"], np.int32),
         np.array(c["kind"], np.int32),
         *(np.array(c[key], float) for key in ("lower", "upper", "mu", "patch_radius")),
+        rolling=np.array(c.get("rolling", np.zeros(len(c["kind"]))), float),
     )
     more = {"friction": spec["friction"], "guess": spec.get("guess")}
     if spec["operator"] == "general":

@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 
@@ -30,7 +31,8 @@ def spec_of(problem):
     c = problem.cones
     spec = {"operator": problem.operator, "friction": problem.friction, "b": problem.b.tolist()}
     spec["cones"] = {
-        key: getattr(c, key).tolist() for key in ("ptr", "kind", "lower", "upper", "mu", "patch_radius")
+        key: getattr(c, key).tolist()
+        for key in ("ptr", "kind", "lower", "upper", "mu", "patch_radius", "rolling")
     }
     if problem.rows is None:
         return spec | {"operator": "dense", "A": problem.csr.toarray().tolist()}
@@ -62,12 +64,21 @@ def test_a_crowd_is_its_parts_side_by_side(parts, seed):
 @pytest.mark.parametrize("seed", range(12))
 def test_both_judges_say_the_same(seed):
     law = ("coulomb", "cone")[seed % 2]
-    for problem in (random_contact_problem(seed, friction=law), random_lcp(seed), random_lcp(seed, rank=4)):
+    box = random_contact_problem(seed, friction=law, spin=False)
+    box = replace(box, cones=box.cones.shaped("box"))
+    c = box.cones
+    ratio = np.where(c.kind == lv.CONTACT_BOX, np.random.default_rng(seed).uniform(0.2, 5.0, c.n_blocks), 0.0)
+    of = np.where(c.kind == lv.CONTACT_BOX, lv.CONTACT_ELLIPSE, c.kind)
+    ellipses = replace(c, kind=of, patch_radius=ratio)
+    ellipse = lv.Problem(box.b, ellipses, box.dense(), friction=law)
+    rolls = random_contact_problem(seed, friction=law, rolling=True, spin=seed % 3 == 0)
+    plain = (random_contact_problem(seed, friction=law), random_lcp(seed), random_lcp(seed, rank=4))
+    for problem in (*plain, box, rolls, ellipse):
         spec = json.loads(json.dumps(spec_of(problem)))
         assert problems.build(spec) == problem or problem.name
         twin = judge.Problem(spec)
-        np.testing.assert_allclose(np.array(twin.d, float), problem.d, rtol=1e-12)
-        np.testing.assert_allclose(np.array(twin.nu, float), problem.data.nu, rtol=1e-12)
+        np.testing.assert_allclose(np.array(twin.d, float), problem.disk.d, rtol=1e-12)
+        np.testing.assert_allclose(np.array(twin.nu, float), problem.disk.data.nu, rtol=1e-12)
         rng = np.random.default_rng(seed)
         for impulse in (rng.normal(size=problem.m), lv.solve(problem, "auto", tol=1e-9).impulse):
             r, j = lv.residual(problem, impulse), twin.judge(impulse)
