@@ -29,7 +29,7 @@ class Foreign:
     def __init__(self, name: str, solver: Any) -> None:
         self.name, self.solver = name, solver
         if hasattr(solver, "ready"):
-            self.ready = lambda held, time_limit: solver.ready()
+            self.ready = lambda held, time_limit: solver.ready(held.state, time_limit)
         if hasattr(solver, "until"):
             self.until = lambda held, deadline: solver.until(held.state, deadline)
 

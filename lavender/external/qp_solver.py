@@ -93,7 +93,7 @@ class QPSolver:
         where = "to its end" if apart is None else apart.where
         return replace(claim, message=f"{claim.message}; takes no time limit and ran {where}")
 
-    def ready(self) -> None:
+    def ready(self, qp: QP, time_limit: float) -> None:
         """A time limit was given, and its clock has not begun: have that process ready."""
         if self.isolate:
             _apart.ready()
