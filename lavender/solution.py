@@ -13,7 +13,7 @@ import numpy as np
 from lavender._arrays import FloatArray, read_only, table_of
 from lavender.errors import InputError, SolveFailed
 from lavender.problem import Problem
-from lavender.residuals import Residual, unstretched
+from lavender.residuals import Residual, residual
 
 if TYPE_CHECKING:
     from lavender.motion import MotionError
@@ -221,7 +221,7 @@ class Solution:
         """The same of a problem with ellipses, from that of its disks."""
         s = problem.cones.stretch
         impulse, proof = read_only(s * self.impulse), self.certificate
-        found = unstretched(problem, self.residual)
+        found = residual(problem, impulse)  # of the numbers that are handed out: s (lambda / s) rounds
         return replace(
             self, impulse=impulse, residual=found, certificate=None if proof is None else read_only(s * proof)
         )

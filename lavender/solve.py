@@ -258,10 +258,10 @@ class Prepared:
         else:
             start = perf_counter()
             _check_problem(problem, self.spec)
-            self._given, problem = problem, problem.disk
+            given, problem = problem, problem.disk
             self._set_up(problem, anew=not same_structure(self.problem, problem))
             self.setup_time = perf_counter() - start
-            self.problem = problem
+            self._given, self.problem = given, problem  # not before: what cannot be set up is refused again
         self._fresh = False
 
     _broken = ""  # why there is no state

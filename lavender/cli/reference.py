@@ -32,7 +32,7 @@ def reference(files: tuple[str, ...]) -> None:
             if not Path(item.source).is_file():
                 raise InputError(f"{item.source} is no file; a reference is written beside one")
             written = motion.save_reference(item.problem, item.source)
-            told = f"{item.name}: {motion.reference(item.problem)}, written: {written}"
+            told = f"{item.name}: {motion.reference(item.problem.disk)}, written: {written}"
             out.print(told, highlight=False, markup=False, soft_wrap=True)
         except LavenderError as error:
             out.print(f"{item.name}: {error}", style="yellow", highlight=False, markup=False, soft_wrap=True)

@@ -147,49 +147,6 @@ class Problem(Builders):
         """
         return replace(self, friction=friction, copy=False)
 
-    def stretched(self, scale: ArrayLike) -> Problem:
-        """The same problem with rows `scale` times as long, whose impulses are those here over `scale`.
-
-            A' = S A S,   b' = S b,   lambda = S lambda',   w' = S w,   S = diag(scale)
-
-        Rows of bodies become a matrix.
-
-        Parameters
-        ----------
-        scale : scalar or (m,)
-            Above 0; of a contact's normal 1.
-
-        Raises
-        ------
-        InputError
-            A scale that is not above 0, or not 1 at the normal of a contact.
-
-        """
-        s = as_array("scale", scale, (self.m,))
-        c = self.cones
-        normal = c.ptr[:-1][c.kind != ROW]
-        wrong = np.flatnonzero(~(s > 0.0))
-        if len(wrong) or np.any(s[normal] != 1.0):
-            i = int(wrong[0]) if len(wrong) else int(normal[s[normal] != 1.0][0])
-            needed = "a number above 0" if len(wrong) else "1"
-            raise InputError(f"scale of {self.row_name(i)} is {s[i]}; {needed} is needed")
-        rows = np.repeat(c.kind == ROW, np.diff(c.ptr))
-        low, high = (np.where(rows, x / s, x) for x in (c.lower, c.upper))
-        cones = replace(c, lower=low, upper=high)
-        guess = None if self.guess is None else self.guess / s
-        more: dict[str, Any] = {"guess": guess, "key": self.key, "names": self.names, "name": self.name}
-        more |= {"friction": self.friction, "precision": self.precision}
-        if self.generalized is None:
-            a = sp.csr_array(sp.diags_array(s) @ self.csr @ sp.diags_array(s))
-            return Problem(s * self.b, cones, a, copy=False, **more)
-        g = self.generalized
-        jac = sp.csr_array(sp.diags_array(s) @ g.jac)
-        assert self.compliance is not None
-        made = Generalized(jac, g.mass, g.v_free, g.names)
-        return Problem(
-            s * self.b, cones, generalized=made, compliance=s * s * self.compliance, copy=False, **more
-        )
-
     @property
     def disk(self) -> Problem:
         """The problem whose contacts are disks: this one, or where it has ellipses the same in stretched tangents.
@@ -220,7 +177,21 @@ class Problem(Builders):
 
     @once
     def _disk(self) -> Problem:
-        made = replace(self.stretched(self.cones.stretch), cones=self.cones.disks, copy=False)
+        # A' = S A S,   b' = S b,   lambda = S lambda',   w' = S w,   S = diag(stretch), 1 but at tangents of ellipses
+        s, cones = self.cones.stretch, self.cones.disks
+        guess = None if self.guess is None else self.guess / s
+        more: dict[str, Any] = {"guess": guess, "key": self.key, "names": self.names, "name": self.name}
+        more |= {"friction": self.friction, "precision": self.precision}
+        if self.generalized is None:
+            a = sp.csr_array(sp.diags_array(s) @ self.csr @ sp.diags_array(s))
+            made = Problem(s * self.b, cones, a, copy=False, **more)
+        else:
+            g = self.generalized
+            jac = sp.csr_array(sp.diags_array(s) @ g.jac)
+            assert self.compliance is not None
+            soft = s * s * self.compliance
+            given = Generalized(jac, g.mass, g.v_free, g.names)
+            made = Problem(s * self.b, cones, generalized=given, compliance=soft, copy=False, **more)
         if self.rows is not None:
             made.metric.weigh_as(self.metric, True)
         return made

@@ -58,8 +58,7 @@ def _parts(log: SolveLog) -> Any:
         yield problem, slice(None)
         return
     blocks = blocks_of_each(*log.islands)
-    wrong = log.wrong_islands()[0]
-    for i in sorted(wrong, key=lambda i: len(blocks[i])):
+    for i in sorted(log.wrong_islands(), key=lambda i: len(blocks[i])):
         rows = rows_of(problem, blocks[i])
         yield restrict(problem, blocks[i], rows), rows
 

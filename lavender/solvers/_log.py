@@ -17,7 +17,6 @@ from lavender.solvers._islands import islands
 
 __all__ = ["SolveLog"]
 
-CAUTION = 0.999  # of what is left of the tolerance: sums are rounded
 STILL = 32  # turns in a row, most of them longer than those before, that leave
 GAIN = 0.99  # of the residual: then nobody gets anywhere
 
@@ -131,8 +130,8 @@ class SolveLog:
         """How many, and the island of each block."""
         return islands(self.problem)
 
-    def wrong_islands(self) -> tuple[IntArray, IntArray, float]:
-        """Which islands miss their share of the whole tolerance, the island of each row (m,), and the share [sqrt J].
+    def wrong_islands(self) -> IntArray:
+        """Which islands miss their share of the whole tolerance.
 
         Of the energy error each may have as much as makes the tolerance with those that have less,
         sum min(e_i, share)^2 = (tol E0)^2. A pair of tangents counts by its norm, at most sqrt(2) times its
@@ -153,8 +152,4 @@ class SolveLog:
         fast = np.zeros(count)
         np.maximum.at(fast, of_row, problem.metric.weight * np.abs(self._e))
         wrong = (own > share) | ~(np.sqrt(2.0) * fast <= self.tol * velocity)
-        return (
-            np.flatnonzero(wrong).astype(np.int32),
-            of_row.astype(np.int32),
-            CAUTION * float(np.sqrt(share)),
-        )
+        return np.flatnonzero(wrong).astype(np.int32)

@@ -121,7 +121,10 @@ class Plan:
                 (c["name"], Cost(*(float(c[k]) for k in ("setup", "each", "count"))))
                 for c in values["candidates"]
             ]
-            found = cls(**(values | {"candidates": tuple(costs), "first": tuple(values["first"])}))
+            name, n = values["first"]
+            if name not in dict(costs):
+                raise ValueError(f"{name!r}, who is first, is no candidate")
+            found = cls(**(values | {"candidates": tuple(costs), "first": (name, int(n))}))
         except (TypeError, ValueError, KeyError) as error:
             raise InputError(
                 f"plan is a {type(given).__name__} that is no plan ({error}); what lavender.explain(problem) "

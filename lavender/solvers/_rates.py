@@ -26,4 +26,3 @@ GENERAL_COUNT = {"linear": 5.0, "lcp": 5.0, "cone": 12.0, "coulomb": 30.0}
 GENERAL_FIRST = 0.9e6  # ns of it up to which nothing else is looked at first,
 GENERAL_MOST = 1e7  # and up to which nobody looks at the clock in between
 FORMED_START, FORMED = 60e3, 2.0  # of A formed of J and M, and of each of its entries,
-FORMED_ROWS = 6.0  # or over bodies

@@ -115,6 +115,10 @@ def test_a_problem_with_a_mistake_is_refused_and_said(library, mistake):
     assert ERRORS[code] == f"LAV_ERROR_{error}"
     assert len(library.c.lav_text(code)) > 20
     assert solver.whole()
+    result = Result()
+    result.size = ct.sizeof(Result)
+    budget = library.budget(5, 0.0)
+    assert library.c.lav_run(solver.at, ct.byref(budget), ct.byref(result)) == -14  # not the problem before
     assert library.c.lav_set(solver.at, ct.byref(library.problem(self_test_problem()))) == 0  # and goes on
 
 
@@ -150,10 +154,13 @@ def test_null_and_no_solver_are_told_apart(library):
 )
 def test_too_little_room_is_said_and_nothing_is_written_behind_it(library, method):
     problem, options, room = library.problem(self_test_problem()), library.options(method), ct.c_uint64()
+    seen, turns = set(), np.array([METHODS["anderson"], 3], np.int32)
+    options.n_turns, options.turns = int(method == "auto"), turns.ctypes.data
     assert library.c.lav_room(ct.byref(problem), ct.byref(options), ct.byref(room)) == 0
-    seen = set()
     for bytes_ in [*range(0, room.value, room.value // 40), room.value]:
+        turns[:] = METHODS["anderson"], 3
         solver = Guarded(library, problem, options, bytes_)
+        turns[:] = -1  # they were copied: nobody reads them again
         if solver.code == 0:
             code = library.c.lav_set(solver.at, ct.byref(problem))
             seen.add(code)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 from hypothesis import given, settings
-from random_problems import as_matrix, random_boxes, random_contact_problem, seeds
+from random_problems import as_matrix, random_contact_problem, seeds
 
 import lavender as lv
 from lavender import registry
@@ -380,38 +380,6 @@ def test_fclib_has_no_boxes(tmp_path):
 
 
 # -- longer rows ------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("form", ["matrix", "generalized", "rows"])
-def test_stretched_rows_have_the_same_solution(form):
-    base = random_boxes(11, "cone") if form == "rows" else free(11, friction="cone")
-    base = replace(
-        base, cones=base.cones.shaped("box") if form == "rows" else lv.Cones.contacts(0.4, count=4)
-    )
-    base = as_matrix(base) if form == "matrix" else base
-    rng = np.random.default_rng(0)
-    s = np.where(base.cones.lower == 0.0, 1.0, rng.uniform(0.3, 3.0, base.m))
-    if form != "rows":  # a disk stays one where both tangents are as long
-        s[2::3] = s[1::3]
-        mu = base.cones.mu / s[1::3]
-    else:
-        mu = base.cones.mu
-    long = base.stretched(s)
-    c = long.cones
-    if form == "rows":  # each side of a box by its own
-        first, second = (s[c.ptr[:-1][c.kind == lv.CONTACT_BOX] + k] for k in (1, 2))
-        box = c.kind == lv.CONTACT_BOX
-        mu, radius = c.mu.copy(), c.patch_radius.copy()
-        mu[box], radius[box] = mu[box] / first, radius[box] * first / second
-    else:
-        radius = c.patch_radius
-    long = replace(long, cones=lv.Cones(c.ptr, c.kind, c.lower, c.upper, mu, radius))
-    x = s * lv.solve(long, "newton", tol=1e-10).raise_for_status().impulse
-    assert lv.residual(base, x).relative < 1e-8
-    with pytest.raises(lv.InputError, match="normal is 2"):
-        free(1).stretched(2.0)
-    with pytest.raises(lv.InputError, match="above 0"):
-        free(1).stretched(np.tile([1.0, 0.0, 1.0], 4))
 
 
 def test_a_snapshot_of_another_shape_is_refused():

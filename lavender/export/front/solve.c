@@ -377,6 +377,7 @@ int32_t lav_open(void *memory, uint64_t bytes, const lav_problem *largest, const
   s->asked.tol = 1e-6;
   s->asked.budget = 1000;
   if (options->n_turns > 0) COPY(s->given_turns, options->turns, 2 * options->n_turns);
+  s->options.turns = s->given_turns; /* `lav_set` looks at them when the caller's may be gone */
 #endif
   s->magic = MAGIC;
   *out = s;
@@ -389,11 +390,11 @@ uint64_t lav_needed(const lav_solver *solver) {
 
 static int32_t set_problem(lav_solver *s, const lav_problem *q) {
   int32_t code = LAV_OK;
+  keep_impulses(s);
+  s->ready = s->begun = 0; /* whatever is wrong below: no answer of the problem before passes for this one's */
   GIVE_BACK(check_problem(q));
   GIVE_BACK(takes(q, &s->options));
   if (q->n_blocks > s->kept.most_blocks || q->n_rows > s->kept.most_rows) return LAV_ERROR_ROOM;
-  keep_impulses(s);
-  s->ready = s->begun = 0;
   s->used = s->begin;
   s->is_short = 0;
   take_blocks(s, q);
