@@ -621,8 +621,6 @@ def suite_page(site):
 
 def part_pages(site):
     """Tables that hand-written pages include."""
-    rows = [(f"`{s.name}`", s.value) for s in lv.Status]
-    site.write("parts/statuses.md", table(("status", "claim"), rows))
     text = inspect.getdoc(sys.modules["lavender.ordering"])
     assert all(order in text for order in ORDERS)
     site.write("parts/orders.md", docstrings.markdown(text.partition("\n")[2]))
@@ -667,19 +665,10 @@ def api_page(site):
             "SolveFailed",
         ),
     }
-    constants = {
-        "CONTACT",
-        "CONTACT_BOX",
-        "CONTACT_ROLLING",
-        "CONTACT_SPIN",
-        "ROUND",
-        "ROW",
-        "SOLVER_FIELDS",
-        "__version__",
-    }
-    modules = {"bench", "engine", "io", "motion", "report", "scene", "suite"}
     listed = {name for names in rooms.values() for name in names}
-    rest = sorted(set(lv.__all__) - listed - constants - modules)
+    rest = sorted(
+        name for name in set(lv.__all__) - listed if callable(getattr(lv, name))
+    )  # no constants, no rooms
     if rest:
         rooms["More"] = tuple(rest)
     parts = [

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+import scipy.sparse as sp
 
 from lavender.errors import InputError
 from lavender_ext.core import gate
@@ -18,7 +19,7 @@ IntArray = npt.NDArray[np.int32]
 ArrayLike = npt.ArrayLike  #: numbers, nested sequences of them, or an array; the docstring has shape and unit
 
 
-_PLAIN: dict[Any, np.dtype[Any]] = {np.float64: np.dtype(np.float64), np.int32: np.dtype(np.int32)}
+FLOAT64, INT32 = np.dtype(np.float64), np.dtype(np.int32)
 
 
 def _fits(given: tuple[int, ...], wanted: tuple[int | None, ...]) -> bool:
@@ -60,27 +61,12 @@ def as_array(
         made = gate.plain(value, shape, finite, copy)
         if made is not None:
             return made
-    if type(value) is np.ndarray:
-        if value.dtype is _PLAIN.get(dtype) and (value.shape == shape or _fits(value.shape, shape)):
-            plain: np.ndarray = value.copy() if copy or not value.flags.c_contiguous else value
-            if (
-                not finite
-                or dtype is not np.float64
-                or all_finite(plain if plain.ndim == 1 else plain.ravel())
-            ):
-                plain.setflags(write=False)
-                return plain
-    elif (
-        type(value) is float
-        and dtype is np.float64
-        and isfinite(value)
-        and len(shape) == 1
-        and shape[0] is not None
-    ):
-        plain = np.empty(shape[0])
-        plain.fill(value)
-        plain.setflags(write=False)
-        return plain
+        if type(value) is float and isfinite(value) and len(shape) == 1 and shape[0] is not None:
+            plain = np.empty(shape[0])
+            plain.fill(value)
+            return read_only(plain)
+    elif type(value) is np.ndarray and value.dtype is INT32 and _fits(value.shape, shape):
+        return read_only(value.copy() if copy or not value.flags.c_contiguous else value)
     what = f"{name} [{unit}]" if unit else name
     try:
         given = np.asarray(value)
@@ -98,15 +84,9 @@ def as_array(
     if given.ndim == 0 and len(shape) == 1 and shape[0] is not None:
         given = np.full(shape[0], given)
         copy = False
-    if given.ndim != len(shape) or any(
-        n is not None and n != s for n, s in zip(shape, given.shape, strict=True)
-    ):
-        wanted = (
-            "("
-            + ", ".join("any" if n is None else str(n) for n in shape)
-            + ("," if len(shape) == 1 else "")
-            + ")"
-        )
+    if not _fits(given.shape, shape):
+        sizes = ", ".join("any" if n is None else str(n) for n in shape)
+        wanted = f"({sizes}{',' * (len(shape) == 1)})"
         raise InputError(f"{what} has shape {given.shape}; {wanted} is needed")
     if dtype is np.int32 and given.size and (float(given.min()) < -(2**31) or float(given.max()) >= 2**31):
         raise InputError(f"{what} holds numbers beyond 32 bits")
@@ -116,6 +96,57 @@ def as_array(
     if finite and array.dtype.kind == "f":
         _check_finite(what, array)
     return read_only(array)
+
+
+def number(
+    what: str, value: object, *, low: float = -np.inf, high: float = np.inf, above: float | None = None
+) -> float:
+    """`value` as a finite float in [low, high], or above `above`."""
+    if isinstance(value, bool) or not isinstance(value, (int, float, np.integer, np.floating)):
+        raise InputError(f"{what} is {value!r}; a number is needed")
+    x = float(value)
+    if not np.isfinite(x):
+        raise InputError(f"{what} is {x}; a finite number is needed")
+    if above is not None and not x > above:
+        raise InputError(f"{what} is {x:g}; more than {above:g} is needed")
+    if x < low or x > high:
+        wanted = f"at least {low:g}" if high == np.inf else f"{low:g} to {high:g}"
+        raise InputError(f"{what} is {x:g}; {wanted} is needed")
+    return x
+
+
+def whole_number(what: str, value: object, low: int = 0, high: int | None = 2**31 - 1) -> int:
+    """`value` as an int in [low, high], of any size with None."""
+    if (
+        isinstance(value, bool)
+        or not isinstance(value, (int, np.integer))
+        or value < low
+        or (high is not None and value > high)
+    ):
+        upto = "" if high is None else f" to {high}"
+        raise InputError(f"{what} is {value!r}; a whole number from {low}{upto} is needed")
+    return int(value)
+
+
+def as_csr(name: str, given: Any, *, copy: bool = True, unit: str = "", too_many: str = "") -> sp.csr_array:
+    """A sparse matrix as compressed rows of float64 and int32, columns in order, finite, read-only: checked whole."""
+    if given.nnz >= 2**31:
+        raise InputError(f"{name} has {given.nnz} nonzeros, more than 32-bit indices reach{too_many}")
+    if given.dtype.kind not in "buif":
+        raise InputError(f"{name} has dtype {given.dtype}; real numbers are needed")
+    a = sp.csr_array(given, copy=copy)
+    try:
+        a.check_format(full_check=True)  # kernels trust every index
+    except ValueError as error:
+        raise InputError(
+            f"{name} is not a valid compressed matrix ({error}); check its indices and pointers"
+        ) from None
+    if not a.has_canonical_format:
+        a = a if copy else a.copy()
+        a.sum_duplicates()
+    as_array(name, a.data, (None,), unit=unit, copy=False)
+    parts = ((a.data, np.float64), (a.indices, np.int32), (a.indptr, np.int32))
+    return sp.csr_array(tuple(read_only(np.ascontiguousarray(x, kind)) for x, kind in parts), shape=a.shape)
 
 
 def precision_of(*given: Any) -> str:
@@ -151,7 +182,7 @@ def check_not_nan(what: str, array: np.ndarray) -> None:
 
 
 def check_not_negative(what: str, array: np.ndarray) -> None:
-    plain = array.ndim == 1 and array.dtype is _PLAIN[np.float64] and array.flags.c_contiguous
+    plain = array.ndim == 1 and array.dtype is FLOAT64 and array.flags.c_contiguous
     if gate.has_negative(array) if plain else array.size and array.min() < 0:
         i = int(np.argmin(array))
         raise InputError(f"{what} must not be negative; entry [{i}] is {array[i]}")

@@ -8,13 +8,7 @@ MODULE = "lavender_ext.judge.measure"
 
 
 def check(module: str = MODULE) -> None:
-    """Raise ImportError where a compiled module of the kernels cannot be found.
-
-    Raises
-    ------
-    ImportError
-        The sources lie there without having been built, as in a fresh clone.
-    """
+    """Raise ImportError where a compiled module of the kernels cannot be found."""
     if importlib.util.find_spec(module) is None:
         spec = importlib.util.find_spec("lavender_ext")
         where = Path(spec.origin).parent if spec is not None and spec.origin else Path("lavender_ext")

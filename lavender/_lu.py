@@ -15,13 +15,7 @@ __all__ = ["sparse_lu"]
 
 
 def sparse_lu(matrix: Any, **options: Any) -> Any:
-    """SuperLU's factor of a square sparse matrix (n, n), n > 0; `options` as of `scipy.sparse.linalg.splu`.
-
-    Raises
-    ------
-    RuntimeError
-        The matrix is singular.
-    """
+    """SuperLU's factor of a square sparse matrix (n, n), n > 0; RuntimeError where it is singular."""
     from scipy.sparse.linalg import splu  # 0.1 s to import, needed only here
 
     a = sp.csc_array(matrix)

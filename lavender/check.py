@@ -12,7 +12,7 @@ the difference of velocities, which is unique where impulses are not.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -107,17 +107,8 @@ class CrossCheck:
 
     def __str__(self) -> str:
         head = (
-            "solver",
-            "verdict",
-            "status",
-            "relative",
-            "floor",
-            "distance",
-            "allowed",
-            "objective",
-            "ms",
-            "",
-        )
+            "solver", "verdict", "status", "relative", "floor", "distance", "allowed", "objective", "ms", "",
+        )  # fmt: skip
         body = [
             (
                 r.solver, r.verdict, r.status, _short(r.relative), _short(r.floor), _short(r.distance),
@@ -318,7 +309,7 @@ def _distance(problem: Problem, one: Solution, two: Solution) -> tuple[float, fl
     # The errors e themselves are known to the floor of both residuals, in the norm of D.
     fuzz = float(sum(s.residual.floor * s.residual.energy_start for s in (one, two)))
     root = 1.0 / np.sqrt(d)
-    stiff = float(np.sqrt(np.max(root * _apply_abs(problem, root), initial=0.0)))
+    stiff = float(np.sqrt(np.max(root * _apply(problem, root, abs), initial=0.0)))
     eps_d = float(np.sqrt(np.sum(d * eps * eps))) + fuzz
     eps_a = float(np.sqrt(max(eps @ a_eps, 0.0))) + stiff * fuzz
     delta_d = float(np.sqrt(np.sum(d * delta * delta)))
@@ -328,28 +319,16 @@ def _distance(problem: Problem, one: Solution, two: Solution) -> tuple[float, fl
     return distance, float(allowed * (1.0 + 1e-9) + np.sqrt(rounding * stiff * delta_d))
 
 
-def _apply(problem: Problem, x: Any) -> Any:
-    """A x (m,), without forming A where J and M are known."""
+def _apply(problem: Problem, x: Any, part: Callable[[Any], Any] = lambda a: a) -> Any:
+    """A x (m,), without forming A where J and M are known; with `abs` a bound of abs(A) x for x >= 0."""
     if problem.generalized is not None:
-        y = problem.whitened
+        y = part(problem.whitened)
         return y @ (y.T @ x) + problem.compliance * x
     if problem.rows is None:
-        return problem.csr @ x
+        return part(problem.csr) @ x
     assert problem.compliance is not None
-    jac = problem.jacobian
-    return jac @ (problem.rows.inverse_mass_matrix() @ (jac.T @ x)) + problem.compliance * x
-
-
-def _apply_abs(problem: Problem, x: Any) -> Any:
-    """A bound of abs(A) x for x >= 0."""
-    if problem.generalized is not None:
-        y = abs(problem.whitened)
-        return y @ (y.T @ x) + problem.compliance * x
-    if problem.rows is None:
-        return abs(problem.csr) @ x
-    assert problem.compliance is not None
-    jac = abs(problem.jacobian)
-    return jac @ (abs(problem.rows.inverse_mass_matrix()) @ (jac.T @ x)) + problem.compliance * x
+    jac = part(problem.jacobian)
+    return jac @ (part(problem.rows.inverse_mass_matrix()) @ (jac.T @ x)) + problem.compliance * x
 
 
 def _objective(problem: Problem, solution: Solution) -> float:

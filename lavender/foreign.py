@@ -29,7 +29,7 @@ class Foreign:
     def __init__(self, name: str, solver: Any) -> None:
         self.name, self.solver = name, solver
         if hasattr(solver, "ready"):
-            self.ready = solver.ready
+            self.ready = lambda held, time_limit: solver.ready(held.state, time_limit)
         if hasattr(solver, "until"):
             self.until = lambda held, deadline: solver.until(held.state, deadline)
 
@@ -41,12 +41,14 @@ class Foreign:
         """The same structure with new numbers."""
         return Held(problem, self.solver.update(held.state, _private(problem)))
 
-    def run(self, held: Held, impulse: FloatArray, n: int, tol: float, time_limit: float | None) -> Claim:
-        """n more iterations on an impulse of its own; what it ends with is copied."""
+    def run(
+        self, held: Held, impulse: FloatArray, max_iter: int, tol: float, time_limit: float | None
+    ) -> Claim:
+        """`max_iter` more iterations on an impulse of its own; what it ends with is copied."""
         handed = impulse.copy()
         kept = False
         try:
-            claim = self.solver.run(held.state, handed, n, tol, time_limit)
+            claim = self.solver.run(held.state, handed, max_iter, tol, time_limit)
         finally:  # Ctrl-C: what it has come to is the result
             kept = handed.shape == impulse.shape and handed.dtype == impulse.dtype
             if kept:
@@ -84,14 +86,13 @@ class Foreign:
                 wrong = wrong or f"gives a certificate that is no array of {m} numbers ({certificate!r:.60})"
         if wrong:
             return Claim(Status.NUMERICAL_ERROR, iterations, {}, f"solver {self.name!r} {wrong}")
-        return Claim(
-            status=claim.status,
+        return replace(
+            claim,
             iterations=iterations,
             work={k: int(n) for k, n in work.items()},
-            message=claim.message,
-            form=claim.form,
             dual=read_only(dual.copy()) if isinstance(dual, np.ndarray) else dual,
             certificate=certificate,
+            turns=(),
         )
 
 

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from lavender._arrays import FloatArray, IntArray, as_array, borrowed, equal, precision_of, read_only
+from lavender._arrays import FloatArray, IntArray, as_array, as_csr, borrowed, equal, precision_of, read_only
 from lavender.errors import InputError
 from lavender_ext.core import generalized as kernels
 from lavender_ext.core.assemble import dense_to_csr
@@ -318,25 +318,15 @@ def _refuse(i: int, j: int, x: float, y: float, names: Sequence[str] | None) -> 
 
 
 def _compressed(name: str, given: Any) -> sp.csr_array:
-    if given.dtype.kind not in "buif":
-        raise InputError(f"{name} has dtype {given.dtype}; real numbers are needed")
-    if given.nnz >= 2**31:
-        raise InputError(f"{name} has {given.nnz} nonzeros, more than 32-bit indices reach")
-    out = sp.csr_array(given, dtype=np.float64, copy=True)
-    try:
-        out.check_format(full_check=True)  # kernels trust every index
-    except ValueError as error:
-        raise InputError(f"{name} is not a valid compressed matrix ({error})") from None
-    out.sum_duplicates()
-    as_array(name, out.data, (None,), copy=False)
-    out.data.setflags(write=True)
-    out.eliminate_zeros()
-    parts = (
-        read_only(np.ascontiguousarray(out.data, np.float64)),
-        read_only(np.ascontiguousarray(out.indices, np.int32)),
-        read_only(np.ascontiguousarray(out.indptr, np.int32)),
-    )
-    return sp.csr_array(parts, shape=out.shape)
+    """Without entries that are zero."""
+    out = as_csr(name, given)
+    if out.nnz and not out.data.all():
+        out = out.copy()
+        out.data.setflags(write=True)
+        out.eliminate_zeros()
+        for part in (out.data, out.indices, out.indptr):
+            read_only(part)
+    return out
 
 
 # -- orders without fill -----------------------------------------------------------------------------

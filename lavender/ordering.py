@@ -19,7 +19,7 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
-from lavender._arrays import IntArray, as_array
+from lavender._arrays import IntArray, as_array, whole_number
 from lavender.errors import CapabilityError, InputError, UnknownName
 from lavender.problem import Problem
 from lavender_ext.core.order import (
@@ -85,9 +85,7 @@ def block_order(
     split = 0 if problem.rows is None else problem.rows.n_joints
     if type(order) is str and order == "given" and ground is None and type(seed) is int and seed == 0:
         return Order(np.arange(k, dtype=np.int32), split, GIVEN, np.zeros(1, np.uint64), is_given=True)
-    if not isinstance(seed, (int, np.integer)) or seed < 0:
-        raise InputError(f"seed is {seed!r}; a whole number >= 0 is needed")
-    rng = np.array([int(seed) % 2**64], np.uint64)
+    rng = np.array([whole_number("seed", seed, high=None) % 2**64], np.uint64)
     if seed and not (isinstance(order, str) and order == "random"):
         raise InputError(f"seed={seed} goes with order='random'; no other order draws lots")
     if not isinstance(order, str):

@@ -23,7 +23,7 @@ import scipy.sparse as sp
 from lavender._arrays import FloatArray
 from lavender.cones import Cones
 from lavender.errors import CapabilityError, InputError, SolveFailed
-from lavender.problem import Problem
+from lavender.problem import Problem, check_problem
 from lavender.residuals import residual
 from lavender.solve import solve
 from lavender_ext.pivot.principal import Pivoting
@@ -167,83 +167,89 @@ def redundancy(problem: Problem, *, tol: float = 1e-12) -> Redundancy:
     CapabilityError
         Asymmetric A with an island of more than 1,200 rows; numbers whose products are beyond float64.
     """
-    if not isinstance(problem, Problem):
-        raise InputError(f"problem is a {type(problem).__name__}; a lavender.Problem is needed")
+    check_problem(problem)
     if not 0.0 <= tol < 1.0:
         raise InputError(f"tol is {tol}; a share from 0 to 1 is needed")
     m = problem.m
     unique = np.ones(m, bool)
     dependent: list[int] = []
+    null: list[tuple[Places, FloatArray]] = []
     used, methods = tol, set()
     with np.errstate(all="ignore"):  # what is not finite is told below
         scale = 1.0 / np.sqrt(problem.csr_data.d)
         unit = _unit(problem, scale)
-    null: list[tuple[Places, FloatArray]] = []
-    if m:
-        from scipy.sparse import csgraph
-
-        roots: tuple[Any, ...] = ()
-        with np.errstate(all="ignore"):
-            scaled = sp.csr_array(sp.diags_array(unit) @ problem.csr @ sp.diags_array(unit))
-            if problem.matrix is None and not np.any(problem.compliance):
-                roots = _roots(problem)
-        if not all(np.isfinite(part.data).all() for part in (scaled, *roots)):
-            raise CapabilityError(
-                "the rank cannot be told: rows of unit size are beyond float64 (give the problem in other units)"
-            )
-        count, label = csgraph.connected_components(scaled, directed=False)
-        by_island = np.split(
-            np.argsort(label, kind="stable"), np.cumsum(np.bincount(label, minlength=count))[:-1]
+        scaled = sp.csr_array(sp.diags_array(unit) @ problem.csr @ sp.diags_array(unit))
+        roots = _roots(problem) if m and problem.matrix is None and not np.any(problem.compliance) else ()
+    if not all(np.isfinite(part.data).all() for part in (scaled, *roots)):
+        raise CapabilityError(
+            "the rank cannot be told: rows of unit size are beyond float64 (give the problem in other units)"
         )
-        for island in by_island:
-            part = scaled[island][:, island]
-            if len(island) > DENSE:
-                if not problem.is_symmetric:
-                    raise CapabilityError(
-                        f"A is asymmetric and {len(island)} of its rows hang together; the rank of at most "
-                        f"{DENSE} can be told: ask for parts, or for the symmetric part of A"
-                    )
-                limit = max(tol, 10.0 * SHIFT * len(island))
-                found, used = _sparse(part, limit), max(used, limit)
-                methods.add(f"LDL^T of A + {SHIFT:.0e} D, {limit:.0e}")
-                unique[island] = len(found) == 0
-            elif not problem.is_symmetric:
-                found = _by_qr(part.toarray().T, tol)
-                methods.add(f"QR with pivoting, {tol:.0e}")
-                unique[island] = len(found) == 0
-            else:
-                dense = part.toarray()
-                if roots:
-                    tails = [_by_qr(root[island].toarray().T, tol) for root in roots]
-                    tail = min(tails, key=len)
-                    methods.add(f"QR of J M^-1/2 with pivoting, {tol:.0e}")
-                    if len({len(t) for t in tails}) > 1:
-                        methods.add(
-                            f"of {len(island)} rows {len(island) - len(tails[0])} by the masses and "
-                            f"{len(island) - len(tails[1])} without them: the larger number counts"
-                        )
-                else:
-                    tail = _by_cholesky(dense, tol)
-                    methods.add(f"Cholesky with pivoting, {tol:.0e}")
-                found = _in_order(dense, tail, tol)
-                if len(found):
-                    basis = _null_basis(dense, found)
-                    if unit is not scale:  # to the metric of d
-                        basis = np.linalg.qr(basis * (unit[island] / scale[island])[:, None])[0]
-                    null.append((island, basis))
-                    unique[island] = np.abs(basis).max(axis=1) <= UNMOVED
-            dependent += island[found].tolist()
-    method = "; ".join(sorted(methods)) or "no rows"
+    for island in _islands(scaled):
+        a = scaled[island][:, island]
+        if problem.is_symmetric and len(island) <= DENSE:
+            found, words = _dense_island(a.toarray(), [root[island] for root in roots], tol)
+            if len(found):
+                basis = _null_basis(a.toarray(), found)
+                if unit is not scale:  # to the metric of d
+                    basis = np.linalg.qr(basis * (unit[island] / scale[island])[:, None])[0]
+                null.append((island, basis))
+                unique[island] = np.abs(basis).max(axis=1) <= UNMOVED
+        else:
+            found, limit, words = _other_island(a, problem.is_symmetric, tol)
+            used = max(used, limit)
+            unique[island] = len(found) == 0
+        methods.update(words)
+        dependent += island[found].tolist()
     return Redundancy(
         problem=problem,
         rank=m - len(dependent),
         tol=used,
-        method=method,
+        method="; ".join(sorted(methods)) or "no rows",
         rows=tuple(sorted(dependent)),
         impulse_is_unique=unique,
         _scale=scale,
         _null=tuple(null),
     )
+
+
+def _islands(scaled: sp.csr_array) -> list[Places]:
+    """Rows that hang together, directly or through others."""
+    from scipy.sparse import csgraph
+
+    if not scaled.shape[0]:
+        return []
+    count, label = csgraph.connected_components(scaled, directed=False)
+    sizes = np.bincount(label, minlength=count)
+    return np.split(np.argsort(label, kind="stable"), np.cumsum(sizes)[:-1])
+
+
+def _dense_island(a: FloatArray, roots: list[sp.csr_array], tol: float) -> tuple[Places, list[str]]:
+    """Dependent rows of a symmetric island, each of those before it, and how they were found."""
+    if not roots:
+        tail, words = _by_cholesky(a, tol), [f"Cholesky with pivoting, {tol:.0e}"]
+    else:
+        tails = [_by_qr(root.toarray().T, tol) for root in roots]
+        tail, words = min(tails, key=len), [f"QR of J M^-1/2 with pivoting, {tol:.0e}"]
+        if len({len(t) for t in tails}) > 1:
+            words.append(
+                f"of {len(a)} rows {len(a) - len(tails[0])} by the masses and "
+                f"{len(a) - len(tails[1])} without them: the larger number counts"
+            )
+    return _in_order(a, tail, tol), words
+
+
+def _other_island(a: sp.csr_array, symmetric: bool, tol: float) -> tuple[Places, float, list[str]]:
+    """Dependent rows of a large or asymmetric island, the share that counts as nothing, how they were found."""
+    n = a.shape[0]
+    if symmetric:
+        limit = max(tol, 10.0 * SHIFT * n)
+        return _sparse(a, limit), limit, [f"LDL^T of A + {SHIFT:.0e} D, {limit:.0e}"]
+    if n > DENSE:
+        raise CapabilityError(
+            f"A is asymmetric and {n} of its rows hang together; the rank of at most "
+            f"{DENSE} can be told: ask for parts, or for the symmetric part of A"
+        )
+    return _by_qr(a.toarray().T, tol), tol, [f"QR with pivoting, {tol:.0e}"]
 
 
 def _unit(problem: Problem, scale: FloatArray) -> FloatArray:

@@ -4,8 +4,8 @@ A solver is an object that holds only its options, made by `SolverSpec.factory(*
 
     prepare(problem) -> state         factor, colour, allocate
     update(state, problem) -> state   the same structure with new numbers, and a fresh start
-    run(state, impulse, n, tol, time_limit) -> Claim
-        n more iterations on `impulse` (m,) in place, fewer only when its own test stops it. With
+    run(state, impulse, max_iter, tol, time_limit) -> Claim
+        `max_iter` more iterations on `impulse` (m,) in place, fewer only when its own test stops it. With
         `resumable`, n1 then n2 iterations give the bits of n1 + n2 and time_limit is None.
 
 Third parties register through the entry point group "lavender.solvers" (an object that is a
@@ -25,7 +25,7 @@ from typing import Any, Protocol
 
 from lavender._arrays import FloatArray
 from lavender.errors import InputError, SolverUnavailable, UnknownName
-from lavender.problem import LAWS, OPERATORS, Problem
+from lavender.problem import LAWS, OPERATORS, Problem, check_problem
 from lavender.solution import Claim, Turn
 
 __all__ = ["Solver", "SolverSpec", "State", "available", "get", "known", "register"]
@@ -86,8 +86,10 @@ class Solver(Protocol):
     def update(self, state: Any, problem: Problem) -> Any:
         """The same structure with new numbers, and a fresh start."""
 
-    def run(self, state: Any, impulse: FloatArray, n: int, tol: float, time_limit: float | None) -> Claim:
-        """n more iterations on `impulse` (m,) in place."""
+    def run(
+        self, state: Any, impulse: FloatArray, max_iter: int, tol: float, time_limit: float | None
+    ) -> Claim:
+        """`max_iter` more iterations on `impulse` (m,) in place."""
 
 
 @dataclass(frozen=True)
@@ -174,13 +176,12 @@ class SolverSpec:
         """None when the solver takes this problem, else the reason."""
         asked, problem = problem, problem.disk
         law = problem.law
-        apart = law in self.boxes and problem.cones.is_polyhedral
         if law in self.laws and law not in ("linear", "lcp", *self.boxes) and problem.cones.has_box:
             return (
                 "takes no boxes, contacts that bound each tangent by itself: use one of those that do, "
                 "lavender.available(problem) lists them, or give the problem cones.shaped('disk')"
             )
-        if law not in self.laws and not apart:
+        if law not in self.laws and not (law in self.boxes and problem.cones.is_polyhedral):
             takes = ", ".join(law for law in LAWS if law in self.laws)
             way = _way_round(law, self.laws)
             if law == "coulomb" and "cone" in self.boxes and problem.cones.is_polyhedral:
@@ -300,15 +301,9 @@ def get(name: str) -> SolverSpec:
 
 
 def known(problem: Problem | None = None) -> dict[str, str | None]:
-    """Every solver: None where it can be used here (and takes `problem`), else the reason it cannot.
-
-    Raises
-    ------
-    InputError
-        Not a Problem.
-    """
-    if problem is not None and not isinstance(problem, Problem):
-        raise InputError(f"problem is a {type(problem).__name__}; a lavender.Problem is needed")
+    """Every solver: None where it can be used here (and takes `problem`), else the reason it cannot."""
+    if problem is not None:
+        check_problem(problem)
     return {
         name: spec.missing() or (spec.refuses(problem) if problem is not None else None)
         for name, spec in sorted(specs().items())

@@ -253,13 +253,7 @@ class Rows:
 
 
 def check_inertia(name: str, tensors: FloatArray) -> FloatArray:
-    """Tensors (n, 3, 3) that bodies have; what float32 leaves of symmetry and of eigenvalues that are 0 is made whole.
-
-    Raises
-    ------
-    InputError
-        Not symmetric, or not positive semidefinite, beyond such rounding: names the first body.
-    """
+    """Tensors (n, 3, 3) that bodies have, made whole where float32 left symmetry or eigenvalues of 0 a little off."""
     if gate.are_definite(tensors):
         return tensors
     size = np.abs(tensors).max(axis=(1, 2))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from enum import Enum
@@ -20,12 +19,6 @@ if TYPE_CHECKING:
     from lavender.motion import MotionError
 
 __all__ = ["Claim", "History", "Solution", "SolverRun", "Status", "Turn"]
-
-
-def _fill(made: object, values: dict[str, Any]) -> None:
-    # All fields of a frozen dataclass at once: its own __init__ writes them one by one, which takes three times as
-    # long, and a solve of a few rows makes several of these.
-    object.__setattr__(made, "__dict__", values)
 
 
 class Status(str, Enum):
@@ -55,7 +48,7 @@ class Turn:
     after: float
 
 
-@dataclass(frozen=True, init=False)
+@dataclass(frozen=True)
 class Claim:
     """What one call of a solver's `run` says of itself."""
 
@@ -67,31 +60,6 @@ class Claim:
     dual: Any = None  # the backend's own multipliers, as it returned them
     certificate: FloatArray | None = None  # (m,), with INFEASIBLE
     turns: tuple[Turn, ...] = ()  # of a solver that hands over to others
-
-    def __init__(
-        self,
-        status: Status,
-        iterations: int,
-        work: Mapping[str, int] | None = None,
-        message: str = "",
-        form: str = "",
-        dual: Any = None,
-        certificate: FloatArray | None = None,
-        turns: tuple[Turn, ...] = (),
-    ) -> None:
-        _fill(
-            self,
-            {
-                "status": status,
-                "iterations": iterations,
-                "work": {} if work is None else work,
-                "message": message,
-                "form": form,
-                "dual": dual,
-                "certificate": certificate,
-                "turns": turns,
-            },
-        )
 
 
 @dataclass(frozen=True)
@@ -113,11 +81,6 @@ class History:
         Parameters
         ----------
         against : {"iterations", "time"}
-
-        Raises
-        ------
-        InputError
-            Another word.
         """
         if against not in ("iterations", "time"):
             raise InputError(f"against is {against!r}; 'iterations' or 'time' is needed")
@@ -136,7 +99,7 @@ class History:
         return figure
 
 
-@dataclass(frozen=True, init=False)
+@dataclass(frozen=True)
 class SolverRun:
     """Which solver ran, how."""
 
@@ -144,11 +107,8 @@ class SolverRun:
     options: Mapping[str, Any]
     form: str = ""
 
-    def __init__(self, name: str, options: Mapping[str, Any], form: str = "") -> None:
-        _fill(self, {"name": name, "options": options, "form": form})
 
-
-@dataclass(frozen=True, init=False, repr=False)
+@dataclass(frozen=True, repr=False)
 class Solution:
     """Result of `solve`; returned for every status, with the iterate. `str()` is one line.
 
@@ -207,52 +167,11 @@ class Solution:
     sweeps_per_decade: float
     turns: tuple[Turn, ...]  # of `auto`: who ran, in order, and what came of it; () of other solvers
 
-    def __init__(
-        self,
-        impulse: FloatArray,
-        residual: Residual,
-        status: Status,
-        tol: float,
-        iterations: int,
-        work: Mapping[str, int],
-        setup_time: float,
-        solve_time: float,
-        solver: SolverRun,
-        message: str = "",
-        history: History | None = None,
-        dual: Any = None,
-        certificate: FloatArray | None = None,
-        contradicted: str = "",
-        sweeps_per_decade: float = math.nan,
-        turns: tuple[Turn, ...] = (),
-    ) -> None:
-        _fill(
-            self,
-            {
-                "impulse": impulse,
-                "residual": residual,
-                "status": status,
-                "tol": tol,
-                "iterations": iterations,
-                "work": MappingProxyType(dict(work)),
-                "setup_time": setup_time,
-                "solve_time": solve_time,
-                "solver": solver,
-                "message": message,
-                "history": history,
-                "dual": dual,
-                "certificate": certificate,
-                "contradicted": contradicted,
-                "sweeps_per_decade": sweeps_per_decade,
-                "turns": turns,
-            },
-        )
-
     @classmethod
     def of(cls, values: dict[str, Any]) -> Solution:
         """The solution of all its fields by name, kept as they are."""
         made: Solution = object.__new__(cls)
-        _fill(made, values)
+        made.__dict__.update(values)
         return made
 
     @classmethod
@@ -271,13 +190,6 @@ class Solution:
         kept["setup_time"], kept["solve_time"], kept["_rest"] = 0.0, solve_time, rest
         return made
 
-    @classmethod
-    def later(cls, rest: tuple[Callable[..., dict[str, Any]], tuple[Any, ...]]) -> Solution:
-        """As `late`, with every field left for later."""
-        made: Solution = object.__new__(cls)
-        made.__dict__["_rest"] = rest
-        return made
-
     def __getattr__(self, name: str) -> Any:
         # Only what is not there comes here: the first of the fields that `late` left for later, or no field at all.
         kept = self.__dict__
@@ -293,7 +205,7 @@ class Solution:
     def __reduce__(self) -> tuple[Any, ...]:
         # A read-only view of a dict has no pickle.
         values = {f.name: getattr(self, f.name) for f in fields(self)}
-        return type(self), (*(values | {"work": dict(self.work)}).values(),)
+        return _restored, (values | {"work": dict(self.work)},)
 
     @property
     def slack(self) -> FloatArray:
@@ -359,3 +271,7 @@ class Solution:
             f"{work or f'{self.iterations} iterations'}, "
             f"{1e3 * (self.setup_time + self.solve_time):.3g} ms{note}{wrong}"
         )
+
+
+def _restored(values: dict[str, Any]) -> Solution:
+    return Solution.of(values | {"work": MappingProxyType(values["work"])})

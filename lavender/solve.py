@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 from threading import Lock
 from time import perf_counter
 from types import MappingProxyType
@@ -16,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from lavender._arrays import ArrayLike, FloatArray, equal
+from lavender._arrays import ArrayLike, FloatArray, equal, whole_number
 from lavender.deadline import Deadline
 from lavender.errors import CapabilityError, InputError, InUse, UnknownName
 from lavender.foreign import Foreign
@@ -30,7 +31,7 @@ from lavender.outcome import (
     decide_empty_rows,
     finish,
 )
-from lavender.problem import Problem
+from lavender.problem import Problem, check_problem
 from lavender.registry import SolverSpec, State, get
 from lavender.residuals import Residual, reference, residual, told, unstretched
 from lavender.solution import Claim, History, Solution, SolverRun, Status
@@ -41,6 +42,7 @@ __all__ = ["Prepared", "prepare", "solve"]
 CHUNK_TIME = 0.025  # s, aim; twice that is still below what a person notices on Ctrl-C
 FIRST_CHUNK = 256  # iterations: 25 ms at 100 us each, slower than any compiled sweep of few rows
 Callback = Callable[[int, FloatArray, Residual], Any]
+Record = tuple[int, float, float, float, float]  # iterations, s, relative, energy, velocity
 NOTHING_DONE = Claim(Status.MAX_ITERATIONS, 0)
 # What arithmetic on legal numbers may end in: a result, with the solver's last word as its message.
 BREAKDOWN = (ArithmeticError, np.linalg.LinAlgError, MemoryError)
@@ -127,11 +129,6 @@ def prepare(problem: Problem, solver: str, **options: Any) -> Prepared:
         Its `solve(problem2, impulse=..., tol=...)` gives a `Solution` of this problem, or of another with the same
         structure (blocks, pattern of A or J), as often as wanted; `setup_time` [s] is what preparing took.
 
-    Raises
-    ------
-    LavenderError
-        As `solve`.
-
     Examples
     --------
     Ten steps of one structure, each from the impulses (m,) [N s] of the last:
@@ -203,44 +200,45 @@ class Prepared:
                 "make another one for every thread (lavender.prepare)"
             )
         try:
-            return self._solve(problem, impulse, tol, max_iter, time_limit, history, callback)
+            plain = max_iter is None and time_limit is None and callback is None
+            tol, max_iter, time_limit = _check_budget(self.spec, tol, max_iter, time_limit)
+            _check_records(self.spec, history, callback)
+            self._refresh(problem)
+            if plain and self.spec.delegates and self.spec.few is not None and not (self.options or history):
+                made = solve_few(
+                    self._given, self.spec, impulse, tol
+                )  # nothing was prepared that it would need
+                if made is not None:
+                    return made
+            loop = self._loop(impulse, tol, time_limit, history, callback)
+            return self._run(loop, max_iter)
         finally:
             self._lock.release()
 
-    def _solve(
-        self,
-        problem: Problem | None,
-        impulse: Any,
-        tol: float,
-        max_iter: int | None,
-        time_limit: float | None,
-        history: bool,
-        callback: Callback | None,
-    ) -> Solution:
-        spec = self.spec
-        tol, max_iter, time_limit = _check_budget(spec, tol, max_iter, time_limit)
-        if callback is not None and not callable(callback):
-            raise InputError(
-                f"callback is {callback!r}; a function of (iterations, impulse, residual) is needed"
-            )
-        if (callback is not None and not spec.callback) or (history and not spec.history):
-            raise CapabilityError(
-                f"solver {spec.name!r} runs in one call; it takes no callback and records no history"
-            )
-        self._refresh(problem)
+    def _loop(
+        self, impulse: Any, tol: float, time_limit: float | None, history: bool, callback: Callback | None
+    ) -> _Loop:
         problem, given = self.problem, self._given
-        stretch = given.cones.stretch if given is not problem else None
+        if given is not problem and callback is not None:
+            callback = _in_rows_of(given, given.cones.stretch, callback)
         if impulse is not None:
             lam = given.on_disk(problem.impulse_array(impulse))
         else:
             lam = problem.start() if problem.guess is None else problem.guess.copy()
         if time_limit is not None and hasattr(self._solver, "ready"):
-            self._solver.ready()
+            start = perf_counter()
+            self._solver.ready(self._state, time_limit)
+            self.setup_time += perf_counter() - start
+        records: list[Record] | None = [] if history else None
+        return _Loop(
+            problem=problem, solver=self._solver, state=self._state, impulse=lam, tol=tol, time_limit=time_limit,
+            callback=callback, records=records,
+        )  # fmt: skip
+
+    def _run(self, loop: _Loop, max_iter: int) -> Solution:
+        spec, problem = self.spec, self.problem
         setup_time, self.setup_time = self.setup_time, 0.0
-        proof = decide_empty_rows(problem, lam)
-        if stretch is not None and callback is not None:
-            callback = _in_rows_of(given, stretch, callback)
-        loop = _Loop(problem, self._solver, self._state, lam, tol, time_limit, history, callback)
+        proof = decide_empty_rows(problem, loop.impulse)
         if proof is not None:
             claim = Claim(INFEASIBLE, 0, {}, proof[0], certificate=proof[1])
         elif self._broken:
@@ -248,10 +246,10 @@ class Prepared:
         else:
             claim = loop.run(max_iter) if spec.resumable else loop.run_once(max_iter)
         solution = finish(
-            problem, spec, self.options, loop.impulse, claim, tol, setup_time, loop.time, loop.recorded(),
+            problem, spec, self.options, loop.impulse, claim, loop.tol, setup_time, loop.time, loop.recorded(),
             float(getattr(self._state, "sweeps_per_decade", math.nan)),
         )  # fmt: skip
-        return solution if stretch is None else solution.unstretched(given)
+        return solution if self._given is problem else solution.unstretched(self._given)
 
     def _refresh(self, problem: Problem | None) -> None:
         if problem is None or problem is self._given:
@@ -337,26 +335,21 @@ def same_structure(p: Problem, q: Problem) -> bool:
     return equal(p.csr.indptr, q.csr.indptr) and equal(p.csr.indices, q.csr.indices)
 
 
+@dataclass
 class _Loop:
     """Chunks, clock, history and Ctrl-C around one solver's `run`."""
 
-    def __init__(
-        self,
-        problem: Problem,
-        solver: Any,
-        state: Any,
-        impulse: FloatArray,
-        tol: float,
-        time_limit: float | None,
-        history: bool,
-        callback: Callback | None,
-    ) -> None:
-        self.problem, self.solver, self.state, self.impulse = problem, solver, state, impulse
-        self.tol, self.time_limit, self.callback = tol, time_limit, callback
-        self.rows: list[tuple[int, float, float, float, float]] | None = [] if history else None
-        self.time = 0.0
-        self.done = 0
-        self.work: dict[str, int] = {}
+    problem: Problem
+    solver: Any
+    state: Any
+    impulse: FloatArray  # (m,) N s, in place
+    tol: float
+    time_limit: float | None  # s
+    callback: Callback | None
+    records: list[Record] | None
+    time: float = 0.0  # s, of the solver alone
+    done: int = 0  # iterations
+    work: dict[str, int] = field(default_factory=dict)
 
     def run_once(self, max_iter: int) -> Claim:
         start_point = self.impulse.copy()
@@ -373,10 +366,10 @@ class _Loop:
             self.impulse[:] = start_point
         return claim
 
-    def _call(self, n: int, time_limit: float | None) -> Claim:
-        """At most n iterations of the solver; what its arithmetic could not do is a claim."""
+    def _call(self, max_iter: int, time_limit: float | None) -> Claim:
+        """At most so many iterations of the solver; what its arithmetic could not do is a claim."""
         try:
-            return self.solver.run(self.state, self.impulse, n, self.tol, time_limit)
+            return self.solver.run(self.state, self.impulse, max_iter, self.tol, time_limit)
         except BREAKDOWN as error:
             self.broken = True
             return Claim(NUMERICAL_ERROR, 0, {}, _last_words(error))
@@ -386,7 +379,7 @@ class _Loop:
     def run(self, max_iter: int) -> Claim:
         # About a nanosecond per unit of work: the first guess, then measured. Capped, for solvers in Python.
         chunk = min(FIRST_CHUNK, max(1, int(CHUNK_TIME * 1e9) // max(1, self.problem.metric.work)))
-        records = self.rows is not None or self.callback is not None
+        records = self.records is not None or self.callback is not None
         claim = NOTHING_DONE
         if self.time_limit is not None:
             chunk = 1  # what a solver takes need not be what is counted: over J and M some sweep over A
@@ -445,8 +438,8 @@ class _Loop:
 
     def _record(self) -> bool:
         r = residual(self.problem, self.impulse)
-        if self.rows is not None:
-            self.rows.append((self.done, self.time, r.relative, r.energy, r.velocity))
+        if self.records is not None:
+            self.records.append((self.done, self.time, r.relative, r.energy, r.velocity))
         self._next_record = next_count(self.done)
         return bool(self.callback(self.done, self.impulse.copy(), r)) if self.callback is not None else False
 
@@ -455,22 +448,14 @@ class _Loop:
     def _total(self, claim: Claim) -> Claim:
         if claim.iterations == self.done and claim.work == self.work:
             return claim  # of a single chunk
-        return Claim(
-            status=claim.status,
-            iterations=self.done,
-            work=self.work,
-            message=claim.message,
-            form=claim.form,
-            dual=claim.dual,
-            certificate=claim.certificate,
-        )
+        return replace(claim, iterations=self.done, work=self.work)
 
     def recorded(self) -> History | None:
-        if self.rows is None:
+        if self.records is None:
             return None
-        if not self.rows or self.rows[-1][0] != self.done:
+        if not self.records or self.records[-1][0] != self.done:
             self._record()
-        columns = list(zip(*self.rows, strict=True))
+        columns = list(zip(*self.records, strict=True))
         return History(np.array(columns[0], np.int64), *(np.array(c, float) for c in columns[1:]))
 
 
@@ -558,8 +543,7 @@ def _rest(
 
 
 def _check_problem(problem: Problem, spec: SolverSpec) -> None:
-    if not isinstance(problem, Problem):
-        raise InputError(f"problem is a {type(problem).__name__}; a lavender.Problem is needed")
+    check_problem(problem)
     reason = spec.refuses(problem)
     if reason:
         raise CapabilityError(f"solver {spec.name!r} {reason}")
@@ -570,12 +554,18 @@ def _check_budget(
 ) -> tuple[float, int, float | None]:
     if not isinstance(tol, (int, float, np.number)) or not 0.0 <= tol < math.inf:
         raise InputError(f"tol is {tol!r}; a number >= 0 is needed (0 runs the whole budget)")
-    if max_iter is None:
-        max_iter = spec.max_iter
-    if isinstance(max_iter, bool) or not isinstance(max_iter, (int, np.integer)) or not 0 <= max_iter < 2**31:
-        raise InputError(f"max_iter is {max_iter!r}; a whole number from 0 to 2^31 - 1 is needed")
+    max_iter = whole_number("max_iter", spec.max_iter if max_iter is None else max_iter)
     if time_limit is not None and (
         not isinstance(time_limit, (int, float, np.number)) or not time_limit > 0.0
     ):
         raise InputError(f"time_limit is {time_limit!r}; seconds above 0, or None")
-    return float(tol), int(max_iter), time_limit
+    return float(tol), max_iter, time_limit
+
+
+def _check_records(spec: SolverSpec, history: bool, callback: Callback | None) -> None:
+    if callback is not None and not callable(callback):
+        raise InputError(f"callback is {callback!r}; a function of (iterations, impulse, residual) is needed")
+    if (callback is not None and not spec.callback) or (history and not spec.history):
+        raise CapabilityError(
+            f"solver {spec.name!r} runs in one call; it takes no callback and records no history"
+        )

@@ -23,8 +23,7 @@ import scipy.sparse as sp
 
 from lavender._arrays import FloatArray
 from lavender.cones import ROUND, ROW
-from lavender.errors import InputError
-from lavender.problem import Problem
+from lavender.problem import Problem, check_problem
 from lavender.residuals import residual
 
 __all__ = ["Suspicion", "diagnose"]
@@ -80,8 +79,7 @@ def diagnose(problem: Problem, impulse: Any = None) -> tuple[Suspicion, ...]:
     >>> [s.kind for s in lv.diagnose(problem)]
     ['friction', 'tangents first']
     """
-    if not isinstance(problem, Problem):
-        raise InputError(f"problem is a {type(problem).__name__}; a lavender.Problem is needed")
+    check_problem(problem)
     given = problem.guess if impulse is None else problem.impulse_array(impulse)
     with np.errstate(all="ignore"):  # what is beyond float64 is no larger and no smaller than anything
         found = [s for check in _CHECKS for s in check(problem)]

@@ -2,23 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from pathlib import Path
 
 import click
 
-from benchmarks.output import folder_of, write_json
-from benchmarks.peers import adapters, race
-from benchmarks.peers import engines as peer_engines
+from benchmarks.output import folder_of
 from benchmarks.peers.compared import engines_table, solvers_tables
-from benchmarks.peers.contest import Result
-from benchmarks.peers.problems import PROBLEMS, problems
-from lavender.bench import machine
+from lavender.bench.peers import PROBLEMS, Peers, adapters, problems, race
+from lavender.bench.peers import engines as peer_engines
 
 __all__ = ["command"]
-
-PACKAGES = ("mujoco", "pybullet", "pin", "clarabel", "daqp", "highspy", "piqp", "proxsuite", "qoco", "qpalm",
-            "quadprog", "scs")  # fmt: skip
 
 
 @click.command("peers")
@@ -68,19 +61,19 @@ def command(
     def note(text: str) -> None:
         click.echo(text, err=True)
 
-    versions = machine.versions(PACKAGES)
-    click.echo(f"{machine.cpu_name()}; " + ", ".join(f"{k} {v}" for k, v in versions.items()))
-    absent = [name for name in PACKAGES if name not in versions] + (
-        [] if siconos else ["siconos (--siconos)"]
-    )
+    def keep() -> None:
+        if out is not None:
+            found.write(out)
+
+    found = Peers()
+    click.echo(f"{found.cpu}; " + ", ".join(f"{k} {v}" for k, v in found.versions.items()))
+    absent = found.absent + ([] if siconos else ["siconos (--siconos)"])
     click.echo("not here: " + (", ".join(absent) or "nothing") + "\n")
-    steps: list[peer_engines.Step] = []
-    results: list[Result] = []
     if engines:
         for scene in filter(None, scenes.split(",")):
             note(scene)
-            steps += peer_engines.measure_scene(scene, sweeps)
-        click.echo("\n".join(engines_table(steps)) + "\n")
+            found.steps += peer_engines.measure_scene(scene, sweeps)
+        click.echo("\n".join(engines_table(found.steps)) + "\n")
     if solvers:
         rounds_of_all = race.race(
             problems(files or PROBLEMS, note),
@@ -90,17 +83,10 @@ def command(
             watch=note,
         )
         try:
-            for found in rounds_of_all:
-                results += found
-                _write(out, steps, results, versions)  # an interruption costs one problem
+            for results in rounds_of_all:
+                found.results += results
+                keep()  # an interruption costs one problem
         except KeyboardInterrupt:
             note("stopped")
-        click.echo("\n".join(solvers_tables(results)))
-    _write(out, steps, results, versions)
-
-
-def _write(
-    out: Path | None, steps: list[peer_engines.Step], results: list[Result], versions: dict[str, str]
-) -> None:
-    if out is not None:
-        write_json(out, results, versions=versions, steps=list(map(asdict, steps)))
+        click.echo("\n".join(solvers_tables(found.results)))
+    keep()

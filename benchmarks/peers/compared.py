@@ -1,183 +1,39 @@
-"""Engines and solvers of others beside ours: ratios of times, means, losses, and their tables as text."""
+"""Engines and solvers of others beside ours, as Markdown with what was lost."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-
-import numpy as np
 
 from benchmarks.output import markdown
-from benchmarks.peers.contest import SCIPY, SCRATCH, TARGETS, Result
-from benchmarks.peers.engines import Step
+from lavender.bench.peers.contest import Result
+from lavender.bench.peers.engines import Step
+from lavender.report.compared import (
+    Comparison,
+    compare,
+    losses,
+    mean_rows,
+    over_ours,
+    ratio,
+    solver_rows,
+    step_rows,
+)
 
-__all__ = [
-    "Comparison",
-    "Mean",
-    "compare",
-    "engines_table",
-    "geometric_means",
-    "losses",
-    "over_ours",
-    "solvers_tables",
-]
-
-LARGE = 1000  # rows from which a problem counts as large
-
-
-def over_ours(step: Step, steps: Sequence[Step]) -> float:
-    """Time over that of ours on the same scene in the same mode, sweeps or accurate; nan where there is none."""
-    own = [
-        s.time
-        for s in steps
-        if s.engine.startswith("lavender") and (s.scene, s.accurate) == (step.scene, step.accurate)
-    ]
-    return step.time / own[0] if own else math.nan
-
-
-@dataclass(frozen=True)
-class Comparison:
-    """The fastest of ours and of others at one error on one problem."""
-
-    problem: str
-    rows: int
-    law: str
-    target: float
-    ours: str
-    our_time: float  # s, inf: nobody reached it
-    peer: str
-    peer_time: float
-    scratch: float  # s, the fastest of ours from scratch
-    auto: float  # s, "auto"
-
-    @property
-    def ratio(self) -> float:
-        """Ours over theirs; nan where no peer reached the error, inf where only a peer did."""
-        return self.over_peer(self.our_time)
-
-    def over_peer(self, time: float) -> float:
-        """A time over the fastest peer's; nan where there is none."""
-        return time / self.peer_time if math.isfinite(self.peer_time) else math.nan
-
-
-def compare(results: Sequence[Result], scipy: bool = True) -> list[Comparison]:
-    """One line for each problem and error; `scipy` False leaves out SciPy's factorisations of linear systems."""
-    results = [r for r in results if scipy or not r.solver.startswith(SCIPY)]
-    found = []
-    for name in dict.fromkeys(r.problem for r in results):
-        here = [r for r in results if r.problem == name]
-        scratch = [r for r in here if r.solver.endswith(SCRATCH)]
-        ours = [r for r in here if not r.peer and not r.solver.endswith(SCRATCH)]
-        for target in TARGETS:
-            best = [_fastest(side, target) for side in (ours, [r for r in here if r.peer])]
-            found.append(
-                Comparison(
-                    problem=name,
-                    rows=here[0].rows,
-                    law=here[0].law,
-                    target=target,
-                    ours=best[0][0],
-                    our_time=best[0][1],
-                    peer=best[1][0],
-                    peer_time=best[1][1],
-                    scratch=_fastest(scratch, target)[1],
-                    auto=next((r.time(target) for r in ours if r.solver == "auto"), math.inf),
-                )
-            )
-    return found
-
-
-def _fastest(side: Sequence[Result], target: float) -> tuple[str, float]:
-    best = min(side, key=lambda r: r.time(target), default=None)
-    if best is None or not math.isfinite(best.time(target)):
-        return "-", math.inf
-    return best.solver, best.time(target)
-
-
-@dataclass(frozen=True)
-class Mean:
-    """Geometric means of times over the fastest peer's, where both sides reached the error."""
-
-    which: str  # problems
-    target: float
-    ours: float
-    scratch: float
-    auto: float
-    compared: int
-
-
-def geometric_means(results: Sequence[Result]) -> list[Mean]:
-    """For cases (and files) and for what engines export, large and smaller, at each error.
-
-    Peers are QP and cone backends, Pinocchio and Siconos; the last group counts SciPy's factorisations of linear
-    systems among them, which are no solvers of constraint problems.
-    """
-    plain, every = compare(results, scipy=False), compare(results)
-    groups = (
-        ("cases", [c for c in plain if ":" not in c.problem]),
-        ("exported by engines", [c for c in plain if ":" in c.problem]),
-        ("all, SciPy too", every),
-    )
-    out = []
-    for group, compared in groups:
-        for size, large in ((f"{LARGE} rows and more", True), ("smaller", False)):
-            of_size = [c for c in compared if (c.rows >= LARGE) is large and math.isfinite(c.peer_time)]
-            for target in TARGETS:
-                some = [c for c in of_size if c.target == target]
-                if some:
-                    out.append(_mean_of(f"{group}, {size}", target, some))
-    return out
-
-
-def _mean_of(which: str, target: float, some: Sequence[Comparison]) -> Mean:
-    ours = _mean([c.ratio for c in some])
-    scratch = _mean([c.over_peer(c.scratch) for c in some])
-    auto = _mean([c.over_peer(c.auto) for c in some])
-    return Mean(
-        which=which,
-        target=target,
-        ours=ours,
-        scratch=scratch,
-        auto=auto,
-        compared=sum(math.isfinite(c.our_time) for c in some),
-    )
-
-
-def _mean(ratios: Sequence[float]) -> float:
-    known = [x for x in ratios if math.isfinite(x)]
-    return float(np.exp(np.mean(np.log(known)))) if known else math.nan
-
-
-def losses(compared: Sequence[Comparison]) -> list[Comparison]:
-    """Where a peer is faster, or alone, worst first."""
-    return sorted((c for c in compared if c.ratio > 1.0), key=lambda c: -c.ratio)
+__all__ = ["engines_table", "solvers_tables"]
 
 
 def solvers_tables(results: Sequence[Result]) -> list[str]:
-    """Markdown: every problem and error, geometric means, losses, and what nobody reached."""
+    """Every problem and error, geometric means, losses, and what nobody reached."""
     compared = compare(results)
-    head = ("problem", "rows", "law", "error", "ours", "fastest peer", "ours / peer", "from scratch", "auto")
-    cells = [
-        (c.problem, c.rows, c.law, f"{c.target:.0e}", c.ours, c.peer,
-         *(_ratio(c.over_peer(t)) for t in (c.our_time, c.scratch, c.auto)))
-        for c in compared
-        if math.isfinite(c.peer_time) or math.isfinite(c.our_time)
-    ]  # fmt: skip
-    lines = [markdown(head, cells), ""]
-    head = ("problems", "error", "ours / peer", "from scratch", "auto", "compared")
-    cells = [
-        (m.which, f"{m.target:.0e}", *map(_ratio, (m.ours, m.scratch, m.auto)), m.compared)
-        for m in geometric_means(results)
-    ]
-    lines.append(markdown(head, cells))
+    reached = [c for c in compared if math.isfinite(min(c.our_time, c.peer_time))]
     lost = losses(compared)
+    lines = [markdown(*solver_rows(reached)), "", markdown(*mean_rows(results))]
     lines += ["", f"Lost: {len(lost)} of {sum(math.isfinite(c.peer_time) for c in compared)}."]
-    lines += [f"- {c.problem} at {c.target:.0e}: {c.peer} against {c.ours}, {_ratio(c.ratio)}" for c in lost]
-    alone = [c for c in compared if math.isinf(c.peer_time) and math.isfinite(c.our_time)]
+    lines += [f"- {c.problem} at {c.target:.0e}: {c.peer} against {c.ours}, {ratio(c.ratio)}" for c in lost]
+    alone = [c for c in reached if math.isinf(c.peer_time)]
     if alone:
         lines += ["", "Reached by no peer: " + _list(alone)]
-    nobody = [c for c in compared if math.isinf(c.peer_time) and math.isinf(c.our_time)]
+    nobody = [c for c in compared if c not in reached]
     if nobody:
         lines += ["", "Reached by nobody: " + _list(nobody)]
     return lines
@@ -187,27 +43,11 @@ def _list(compared: Sequence[Comparison]) -> str:
     return ", ".join(f"{c.problem} at {c.target:.0e}" for c in compared) + "."
 
 
-def _ratio(x: float) -> str:
-    return "-" if math.isnan(x) else "only the peer" if math.isinf(x) else f"{x:.3g}"
-
-
 def engines_table(steps: Sequence[Step]) -> list[str]:
-    """Markdown: each engine beside ours in the same mode, then where ours takes longer."""
-    cells: list[tuple[str | int, ...]] = []
-    for s in steps:
-        if not np.isfinite(s.time):
-            cells.append((s.scene, s.engine, s.note, "", "", "", ""))
-            continue
-        ratio = over_ours(s, steps)
-        shown = f"{ratio:.2f}" if np.isfinite(ratio) else "-"
-        if s.engine.startswith("lavender"):
-            shown = f"1 ({1e3 * s.time:.3g} ms)"
-        known = f"{s.relative:.1e}" if np.isfinite(s.relative) else "not known"
-        cells.append((s.scene, s.engine, shown, s.contacts, f"{1e3 * s.depth:.3g}", f"{s.speed:.1e}", known))
-    head = ("scene", "engine", "time / ours", "contacts", "depth [mm]", "speed left [m/s]", "residual")
-    lines = [markdown(head, cells)]
+    """Each engine beside ours in the same mode, then where ours takes longer."""
+    lines = [markdown(*step_rows(steps))]
     lost = sorted(((over_ours(s, steps), s) for s in steps if over_ours(s, steps) < 1.0), key=lambda x: x[0])
     if lost:
         lines += ["", f"Lost: {len(lost)}."]
-        lines += [f"- {s.scene}: {s.engine}, {ratio:.2f} of the time of ours" for ratio, s in lost]
+        lines += [f"- {s.scene}: {s.engine}, {over:.2f} of the time of ours" for over, s in lost]
     return lines

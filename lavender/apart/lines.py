@@ -15,13 +15,7 @@ __all__ = ["Lines"]
 
 
 class Lines:
-    """`ask` it, and `end` it.
-
-    Raises
-    ------
-    OSError
-        The system does not start it.
-    """
+    """`ask` it, and `end` it; OSError where the system does not start it."""
 
     def __init__(self, command: Sequence[str]) -> None:
         self._name = command[0]
@@ -30,15 +24,7 @@ class Lines:
         )
 
     def ask(self, message: Any) -> Any:
-        """Its answer.
-
-        Raises
-        ------
-        EOFError
-            It ended instead.
-        ValueError
-            The answer is no JSON.
-        """
+        """Its answer; EOFError where it ended instead, ValueError where the answer is no JSON."""
         asks, answers = self._process.stdin, self._process.stdout
         assert asks is not None and answers is not None
         with contextlib.suppress(OSError):  # it died: there is no answer

@@ -29,13 +29,7 @@ END_TIME = 10.0  # s, for the system to end a killed process; one that waits for
 
 
 def _read(stream: IO[bytes], size: int) -> bytes:
-    """Exactly so many bytes of an unbuffered stream.
-
-    Raises
-    ------
-    EOFError
-        The stream ended before.
-    """
+    """Exactly so many bytes of an unbuffered stream; EOFError where it ended before."""
     parts = []
     while size:
         part = stream.read(min(size, PIECE))

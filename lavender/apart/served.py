@@ -102,13 +102,7 @@ def end_with_parent(lifeline: int) -> None:
 
 
 def receive(stream: IO[bytes]) -> Any:
-    """The next message.
-
-    Raises
-    ------
-    EOFError
-        There is none any more.
-    """
+    """The next message; EOFError where there is none any more."""
     head = stream.read(8)
     if len(head) < 8:
         raise EOFError

@@ -10,13 +10,8 @@ from lavender.bench.record import Record, level_name
 if TYPE_CHECKING:
     from lavender.bench.running.timing import Task
 
-__all__ = ["C_METHODS", "asked_of", "c_of", "code_of", "needs_more"]
+__all__ = ["asked_of", "c_of", "code_of", "needs_more"]
 
-#: Solvers that the C library has (`lavender export c`), by its numbers.
-C_METHODS = {
-    "sequential_impulses": 1, "pgs": 2, "sor": 3, "gauss_seidel": 4, "jacobi": 5, "block_gauss_seidel": 6,
-    "anderson": 7, "nncg": 8, "newton": 9, "direct": 10,
-}  # fmt: skip
 C_OPTIONS = {"memory": "{}", "convex": "{}", "omega": "{!r}"}
 C_WORDS = {
     ("order", "symmetric"): "order = LAV_SYMMETRIC", ("order", "random"): "order = LAV_RANDOM",
@@ -80,7 +75,8 @@ def code_of(record: Record) -> tuple[str, ...]:
 
 def c_of(record: Record) -> tuple[str, ...]:
     """The C calls of a record, on `options` and `budget`; none where the library lacks the solver or an option."""
-    if record.solver not in C_METHODS or record.way == "batch":
+    spec = registry.specs().get(record.solver)
+    if spec is None or spec.external or not spec.own or record.way == "batch":
         return ()
     out = [f"lav_default_options(LAV_{record.solver.upper()}, &options)"]
     for key, value in {"order": record.order or "given", **record.options}.items():
@@ -97,7 +93,7 @@ def c_of(record: Record) -> tuple[str, ...]:
     asked = asked_of(record, record.iterations)
     out.append("lav_default_budget(&budget)")
     out.append(f"budget.tol = {_exact(record.tol, f'{record.tol:g}')}")
-    out.append(f"budget.iterations = {asked.get('max_iter') or registry.specs()[record.solver].max_iter}")
+    out.append(f"budget.iterations = {asked.get('max_iter') or spec.max_iter}")
     if "time_limit" in asked:
         out.append(f"budget.seconds = {_exact(record.time_limit, f'{record.time_limit:g}')}")
     return tuple(out)

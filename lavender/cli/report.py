@@ -31,6 +31,7 @@ from lavender.io.stored import write_text
 
 if TYPE_CHECKING:
     from lavender.bench import Records
+    from lavender.bench.peers import Peers
     from lavender.report.engine import Contestant
 
 __all__ = ["report"]
@@ -76,6 +77,12 @@ __all__ = ["report"]
     metavar="S,S,...",
     help="Seconds for which a solver is recommended; default: three decades about the fastest times.",
 )
+@click.option(
+    "--peers",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="Engines and solvers of others, as `python -m benchmarks peers --out FILE` measured them, to show beside.",
+)
 @click.option("--steps", default=500, show_default=True, help="Of MODEL.xml: steps of its simulation.")
 @click.option("--every", default=5, show_default=True, help="Of MODEL.xml: steps between two problems.")
 @click.option(
@@ -98,6 +105,7 @@ def report(
     backend: str,
     compare: Path | None,
     time_budgets: tuple[float, ...],
+    peers: Path | None,
     steps: int,
     every: int,
     controls: str,
@@ -117,6 +125,7 @@ def report(
     another report writes the folder.
     """
     from lavender import bench
+    from lavender.bench.peers import read as read_peers
     from lavender.report.engine import contestants
     from lavender.report.text import count
 
@@ -127,6 +136,7 @@ def report(
     taken: set[Path] = set()
     files = tuple(_recorded(f, out, steps, every, controls, fresh, taken) for f in files)
     old = None if compare is None else bench.read(compare)
+    rivals = None if peers is None else read_peers(peers)
     named = partial(was_given, context)
     sweeps = asked.budgets if named("budgets") else ()
     path = out / "records.jsonl"
@@ -143,8 +153,8 @@ def report(
         done = measure(files, asked, plan, path, sequence, fresh, given=named, lines=True)
     engines = [] if campaign else contestants(files, done.records.latest())
     index = _show(
-        done.records, out, old=old, times=time_budgets, sweeps=sweeps, engines=engines, tables=tables, paper=paper,
-        figures=not no_figures,
+        done.records, out, old=old, times=time_budgets, sweeps=sweeps, peers=rivals, engines=engines, tables=tables,
+        paper=paper, figures=not no_figures,
     )  # fmt: skip
     _say(f"\n{len(done.records)} runs in {out / 'records.csv'}, page: {index}")
     if done.note:
@@ -168,6 +178,7 @@ def _show(
     old: Records | None,
     times: Sequence[float],
     sweeps: Sequence[int],
+    peers: Peers | None,
     engines: Sequence[Contestant],
     tables: bool,
     paper: bool,
@@ -182,7 +193,9 @@ def _show(
     print_report(records, console(), old=old, times=times, sweeps=sweeps, whole=tables)
     for line in [f"\n{ENGINES}", *engine_lines(engines)] if engines else ():
         _say(line)
-    index = write(records, out, figures=figures, old=old, times=times, sweeps=sweeps, engines=engines)
+    index = write(
+        records, out, figures=figures, old=old, times=times, sweeps=sweeps, peers=peers, engines=engines
+    )
     if paper:
         from lavender.report.paper import write_paper
 
@@ -194,7 +207,7 @@ def _refuse_unused(context: click.Context, files: tuple[str, ...], solvers: tupl
     """Every option that would be ignored is an error."""
     campaign = context.params["campaign"]
     if any(f.endswith(".jsonl") for f in files):
-        kept = {"files", "out", "compare", "time_budgets", "budgets", "tables", "no_figures"}
+        kept = {"files", "out", "compare", "time_budgets", "budgets", "peers", "tables", "no_figures"}
         rest = [p.name for p in context.command.params if p.name and p.name not in kept]
         refuse_unused(context, rest, "where records are shown again and nothing is solved")
     elif campaign:

@@ -17,9 +17,10 @@ from typing import Any
 import numpy as np
 
 from lavender.cones import CONTACT, CONTACT_BOX, CONTACT_ROLLING, CONTACT_SPIN, ROW
-from lavender.engine.layout import CAP_CONTACT, CAP_PAIR, HEAD, N_SIZES, SETTING, SIZE
+from lavender.engine.layout import HEAD, SETTING, SIZE
 from lavender.engine.state import KEPT, State
 from lavender.errors import InputError
+from lavender_ext.engine.arrays import CAP_CONTACT, CAP_PAIR, N_SIZES
 
 __all__ = ["same_scene", "whole_state"]
 
@@ -33,13 +34,7 @@ UNIT = 1e-9  # -, quaternions are normalised in every substep
 
 
 def same_scene(own: State, size: np.ndarray) -> None:
-    """Raise where sizes other than the capacities differ from the simulation's.
-
-    Raises
-    ------
-    InputError
-        They do, or a capacity is negative.
-    """
+    """Raise where sizes other than the capacities differ from the simulation's."""
     free = (CAP_PAIR, CAP_CONTACT)
     fixed = [k for k in range(N_SIZES) if k not in free]
     if not np.array_equal(size[fixed], own.size[fixed]) or size[list(free)].min() < 0:
@@ -47,21 +42,10 @@ def same_scene(own: State, size: np.ndarray) -> None:
 
 
 def whole_state(own: State, new: State, sweeps: tuple[int, int], lost: bool) -> None:
-    """Raise where `new`, of the sizes that `same_scene` has let pass, is no state of the same scene.
+    """Raise where `new`, of the sizes that `same_scene` has let pass, is no state of the scene of `own`.
 
-    Parameters
-    ----------
-    own, new : State
-        The simulation's, whose `given` arrays are right, and the one to be checked.
-    sweeps : (int, int)
-        Least and largest budget.
-    lost : bool
-        The state is said to be not finite: numbers may be anything then, for no step follows.
-
-    Raises
-    ------
-    InputError
-        The message names the array.
+    `sweeps`: least and largest budget. `lost`: the state is said to be not finite; numbers may be anything then, for no
+    step follows.
     """
     a, b = own.a, new.a
     for name in GIVEN:
@@ -162,13 +146,7 @@ def _damaged(what: str) -> InputError:
 
 
 def well_formed(snapshot: Any) -> None:
-    """Raise where the fields of a snapshot are not of their types.
-
-    Raises
-    ------
-    InputError
-        The message names the field.
-    """
+    """Raise where the fields of a snapshot are not of their types."""
     for name in ("steps", "failed"):
         x = getattr(snapshot, name)
         if isinstance(x, bool) or not isinstance(x, int) or not 0 <= x < 2**53:

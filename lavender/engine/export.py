@@ -18,22 +18,7 @@ __all__ = ["problem_of"]
 
 
 def problem_of(state: State, bodies: Sequence[str], joints: Sequence[str], name: str) -> Problem:
-    """The velocity problem of a prepared substep; its arrays are copies.
-
-    Parameters
-    ----------
-    state : State
-        After `kernel.prepare()`.
-    bodies, joints : sequence of str
-        Names, for those of the blocks.
-    name : str
-        Of the problem.
-
-    Raises
-    ------
-    InputError
-        A number that is not finite.
-    """
+    """The velocity problem of a substep after `kernel.prepare()`, with names of bodies and joints, in copies."""
     a = state.a
     kj, mj = int(state.size[SIZE["joints"]]), int(state.size[SIZE["joint_rows"]])
     c = int(state.head[HEAD["contacts"]])

@@ -7,7 +7,6 @@ position (3) [m] and quaternion (4) of each body.
 
 from __future__ import annotations
 
-import json
 import threading
 from os import PathLike
 from typing import Any
@@ -18,7 +17,7 @@ from lavender._arrays import FloatArray
 from lavender.engine.layout import HEAD, JOINT
 from lavender.engine.state import State
 from lavender.errors import InputError
-from lavender.io.stored import whole_file, write_bytes
+from lavender.io.stored import framed, unframed, whole_file, write_bytes
 from lavender.scene import Scene
 
 __all__ = ["Film"]
@@ -102,36 +101,19 @@ class Film:
         return found.reshape(len(found), -1, 7)
 
     def save(self, path: str | PathLike[str]) -> None:
-        """Write to a file; one of that name is replaced when the new one is whole.
-
-        Raises
-        ------
-        InputError
-            A path that cannot be written.
-        """
+        """Write to a file; one of that name is replaced when the new one is whole."""
         write_bytes(path, self.to_bytes())
 
     def to_bytes(self) -> bytes:
         """The bytes of a file."""
-        head = json.dumps({"version": VERSION, **self.header}).encode()
-        return b"".join([MAGIC, len(head).to_bytes(8, "little"), head, self.frames().astype("<f4").tobytes()])
+        return framed(MAGIC, {"version": VERSION, **self.header}) + self.frames().astype("<f4").tobytes()
 
     @classmethod
     def load(cls, path: str | PathLike[str]) -> Film:
-        """Read a file written by `save`.
-
-        Raises
-        ------
-        InputError
-            No such file, or no film.
-        """
+        """Read a file written by `save`."""
         data = whole_file(path, "the film")
-        start = len(MAGIC) + 8
-        end = start + int.from_bytes(data[len(MAGIC) : start], "little")
         try:
-            if not data.startswith(MAGIC) or not start < end <= min(len(data), start + MOST_HEADER):
-                raise ValueError
-            header = json.loads(data[start:end])
+            header, end = unframed(data, MAGIC, MOST_HEADER)
             if header.pop("version") != VERSION:
                 raise ValueError
             _check(header)

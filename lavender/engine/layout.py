@@ -1,41 +1,8 @@
 """Places of numbers in the engine's small arrays, by name, as `lavender_ext/engine/arrays.pxd` numbers them."""
 
 from lavender_ext.engine import arrays
-from lavender_ext.engine.arrays import (
-    BOX,
-    CAP_CONTACT,
-    CAP_PAIR,
-    MOST_PAIRS,
-    N_SIZES,
-    NEED_ROOM,
-    NO_SHAPE,
-    NOT_FINITE,
-    OK,
-    PLANE,
-    SPHERE,
-    TOO_MANY,
-)
 
-__all__ = [
-    "BOX",
-    "CAP_CONTACT",
-    "CAP_PAIR",
-    "HEAD",
-    "JOINT",
-    "JOINT_KINDS",
-    "MOST_PAIRS",
-    "NEED_ROOM",
-    "NOT_FINITE",
-    "NO_SHAPE",
-    "N_SIZES",
-    "OK",
-    "ORDER_NUMBER",
-    "PLANE",
-    "SETTING",
-    "SIZE",
-    "SPHERE",
-    "TOO_MANY",
-]
+__all__ = ["HEAD", "JOINT", "JOINT_KINDS", "ORDER_NUMBER", "SETTING", "SIZE"]
 
 
 def _numbers(prefix: str) -> dict[str, int]:

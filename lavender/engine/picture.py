@@ -16,10 +16,10 @@ import numpy as np
 
 from lavender._arrays import FloatArray
 from lavender.engine.film import Film
-from lavender.engine.layout import BOX, PLANE, SPHERE
 from lavender.errors import InputError
 from lavender.io.stored import write_atomically, write_figure
 from lavender.scene.parts import rotation
+from lavender_ext.engine.arrays import BOX, PLANE, SPHERE
 
 __all__ = ["PICTURES", "save_picture"]
 
@@ -49,28 +49,11 @@ def save_picture(
     size: float = 3.0,
     rate: int = 30,
 ) -> Path:
-    """Write a film as pictures.
+    """Write a film, or several by name (beside each other, in a strip below each other), as pictures.
 
-    Parameters
-    ----------
-    film : Film, or mapping of name to Film
-        Several are seen beside each other, in a strip below each other.
-    path : path
-        `.gif`, or `.mp4` where ffmpeg is: an animation in the time of the film; `.png`, `.svg`, `.pdf`: `frames` of
-        them side by side, evenly spaced.
-    frames : int
-        In a strip.
-    turn, tilt : float, rad
-        Where the eye is.
-    size : float, inch
-        Width of one frame, 160 pixels an inch in an animation; its height is that of what is seen.
-    rate : int, 1/s
-        Frames of an animation in a second; of a GIF the nearest that whole hundredths of a second allow.
-
-    Raises
-    ------
-    InputError
-        An empty film, a path that cannot be written, another suffix, `.mp4` without ffmpeg.
+    `.gif`, or `.mp4` where ffmpeg is: an animation in the time of the film, `rate` frames in a second (of a GIF the
+    nearest that whole hundredths of a second allow). `.png`, `.svg`, `.pdf`: `frames` of them side by side, evenly
+    spaced. `turn` and `tilt` [rad] say where the eye is, `size` [inch] how wide one frame is.
     """
     path = Path(path)
     suffix = path.suffix.lower()

@@ -11,13 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from lavender import io
-from lavender._arrays import FloatArray
+from lavender._arrays import FloatArray, whole_number
 from lavender.engine.picture import PICTURES, save_picture
 from lavender.engine.simulation import SOLVER_FIELDS, Simulation
 from lavender.io.stored import folder_for_steps, write_figure, write_text
 from lavender.scene import Scene
-from lavender.scene.parts import whole
 
 __all__ = ["Trace", "run", "run_scene"]
 
@@ -44,13 +42,7 @@ class Trace:
         return self.solver[:, SOLVER_FIELDS.index(name)]
 
     def save(self, path: str | PathLike[str]) -> None:
-        """Write as CSV, one line for each step.
-
-        Raises
-        ------
-        InputError
-            A path that cannot be written.
-        """
+        """Write as CSV, one line for each step."""
         lines = [["step", "time", *SOLVER_FIELDS, "depth", "cost", "order"]]
         for i in range(len(self)):
             row = [self.time[i], *self.solver[i], self.depth[i], self.cost[i]]
@@ -58,13 +50,7 @@ class Trace:
         write_text(path, "".join(",".join(line) + "\r\n" for line in lines))
 
     def plot(self, path: str | PathLike[str]) -> None:
-        """Residuals, contacts with matches, and depth over time, as a figure.
-
-        Raises
-        ------
-        InputError
-            A path that cannot be written, or a suffix that matplotlib does not know.
-        """
+        """Residuals, contacts with matches, and depth over time, as a figure."""
         from matplotlib.figure import Figure
 
         canvas = Figure(figsize=(8, 7), layout="constrained")
@@ -97,27 +83,17 @@ def run(
 ) -> Trace:
     """Step a simulation and keep its trace; stops where the state is no longer finite.
 
-    Parameters
-    ----------
-    simulation : Simulation
-    steps : int
-    record : path, optional
-        Folder for the problem of every step, one file each; made if it does not exist.
-    skip : int
-        Steps before the first that is recorded.
-    replace : bool
-        Take the problem files of another recording out of that folder, which is refused otherwise.
-    watch : callable (step, observation, info), optional
-        Called after every step.
+    `record`: a folder for the problem of every step after the first `skip`; `replace` takes the problems of another
+    recording out of it, which is refused otherwise. `watch(step, observation, info)` is called after every step.
     """
-    steps, skip = whole("steps", steps, 1), whole("skip", skip)
+    steps, skip = whole_number("steps", steps, 1), whole_number("skip", skip)
     recorded = 0
     folder = None if record is None else folder_for_steps(record, replace)
     solver, depth, cost, time = np.zeros((steps, 8)), np.zeros(steps), np.zeros(steps), np.zeros(steps)
     lost, done = "", 0
     while done < steps and not lost:
         if folder is not None and done >= skip:
-            recorded += _write_problem(simulation, folder)
+            recorded += simulation.write_problem(folder, 6) is not None
         start = perf_counter()
         observation, _, _, _, info = simulation.step()
         cost[done] = perf_counter() - start
@@ -142,13 +118,6 @@ def run(
         f"{'warm' if simulation.warm_start else 'cold'}, order {order}",
         order=order,
     )
-
-
-def _write_problem(simulation: Simulation, folder: Path) -> bool:
-    problem = simulation.constraint_problem()
-    if problem.m:
-        io.save(problem, folder / f"{simulation.scene.name or 'scene'}-{simulation.steps + 1:06d}.npz")
-    return problem.m > 0
 
 
 def line(step: int, observation: Mapping[str, Any], info: Mapping[str, Any]) -> str:
@@ -186,39 +155,12 @@ def run_scene(
     every: int = 1,
     show: Callable[[str], Any] = print,
 ) -> Trace:
-    """`lavender run NAME`: a gallery scene, a live line, and files on request.
+    """`lavender run NAME`: a gallery scene, a line of every `every`-th step for `show`, and files on request.
 
-    Parameters
-    ----------
-    name : str
-        Of the gallery.
-    steps, iterations, warm_start
-        Number of steps, sweep budget (None: the scene's), and mode.
-    parameters : mapping, optional
-        Further parameters of the scene.
-    residual : bool
-        Judge all rows of every step.
-    trace, plot, record : path, optional
-        CSV of the trace, figure, folder of the problems.
-    skip : int
-        Steps before the first that is recorded.
-    replace : bool
-        Take the problem files of another recording out of the folder, which is refused otherwise.
-    film : path, optional
-        Film of the run: `.gif`, `.mp4`, `.png`, `.svg` or `.pdf` are pictures, anything else is for `lavender view`.
-    view : bool
-        Show the run in a page while it goes on, no faster than it would, and after it until Ctrl-C.
-    every : int
-        Show one line in so many, and always the last.
-    show : callable
-        Takes each line; a terminal may overwrite the one before.
-
-    Raises
-    ------
-    UnknownName, InputError, LavenderError
-        As `Scene` and `Simulation`.
+    `film`: `.gif`, `.mp4`, `.png`, `.svg` or `.pdf` are pictures, anything else is for `lavender view`. `view` shows
+    the run in a page, no faster than it would go, and after it until Ctrl-C.
     """
-    every = whole("every", every, 1)
+    every = whole_number("every", every, 1)
     given = dict(parameters or {})
     if iterations is not None:
         given["solver_iterations"] = iterations

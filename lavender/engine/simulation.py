@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lavender import io
-from lavender._arrays import read_only
+from lavender._arrays import read_only, whole_number
 from lavender.engine.check import same_scene, well_formed, whole_state
 from lavender.engine.film import Film, header_of
-from lavender.engine.layout import HEAD, NEED_ROOM
+from lavender.engine.layout import HEAD
 from lavender.engine.picture import save_picture
 from lavender.engine.snapshot import Snapshot
 from lavender.engine.state import State
@@ -18,8 +18,7 @@ from lavender.engine.stepping import HALF, SOLVER_FIELDS, Stepping, alone, make_
 from lavender.errors import InputError, LavenderError, UnknownName
 from lavender.io.stored import folder_for_steps
 from lavender.problem import Problem
-from lavender.scene.parts import whole
-from lavender_ext.engine.arrays import lengths
+from lavender_ext.engine.arrays import NEED_ROOM, lengths
 
 if TYPE_CHECKING:
     from lavender.web.view import Viewer
@@ -139,23 +138,26 @@ class Simulation(Stepping):
         """
         if form not in ("npz", "fclib"):
             raise UnknownName("form", form, ("npz", "fclib"))
-        steps = whole("steps", steps, 1)
+        steps = whole_number("steps", steps, 1)
         folder = Path(folder)
         if folder.resolve() != self._recorded:
             self._recorded = folder_for_steps(folder).resolve()
-        more: dict[str, Any] = {} if form == "npz" else {"drop": ("names", "key")}
-        suffix = ".npz" if form == "npz" else ".hdf5"
-        name, digits = self.scene.name or "scene", len(str(self._steps + steps))
-        written = []
+        digits, written = len(str(self._steps + steps)), []
         for _ in range(steps):
-            problem = self.constraint_problem()
-            if problem.m:
-                path = folder / f"{name}-{self._steps + 1:0{digits}d}{suffix}"
-                io.save(problem, path, **more)
-                written.append(path)
+            written.append(self.write_problem(folder, digits, form))
             if self.step()[2]:
                 break
-        return written
+        return [path for path in written if path is not None]
+
+    def write_problem(self, folder: Path, digits: int, form: str = "npz") -> Path | None:
+        """Write the next substep's problem, where it has rows, under the scene's name and the step's number."""
+        problem = self.constraint_problem()
+        if not problem.m:
+            return None
+        suffix, drop = (".npz", ()) if form == "npz" else (".hdf5", ("names", "key"))
+        path = folder / f"{self.scene.name or 'scene'}-{self._steps + 1:0{digits}d}{suffix}"
+        io.save(problem, path, drop=drop)
+        return path
 
     # -- pictures -------------------------------------------------------------------------------
 
@@ -171,7 +173,7 @@ class Simulation(Stepping):
         Film
             steps + 1 frames; `save` writes a file that `lavender view` opens.
         """
-        steps = whole("steps", steps, 1)
+        steps = whole_number("steps", steps, 1)
         film = self.start_film()
         try:
             for _ in range(steps):
@@ -320,11 +322,5 @@ class Simulation(Stepping):
         self.snapshot().save(path)
 
     def load(self, path: str | PathLike[str]) -> None:
-        """Continue from a file written by `save`.
-
-        Raises
-        ------
-        InputError
-            Not such a file, damaged, or of another scene.
-        """
+        """Continue from a file written by `save`."""
         self.restore(Snapshot.load(path))

@@ -8,7 +8,6 @@ and the SHA-256 of all before. Nothing in it is executed when it is read.
 from __future__ import annotations
 
 import hashlib
-import json
 from dataclasses import dataclass, field
 from os import PathLike, fsync
 from pathlib import Path
@@ -17,16 +16,16 @@ from typing import Any
 import numpy as np
 
 from lavender.engine.check import well_formed
-from lavender.engine.layout import N_SIZES
 from lavender.errors import InputError
-from lavender.io.stored import whole_file, write_atomically
-from lavender_ext.engine.arrays import lengths
+from lavender.io.stored import as_path, framed, unframed, whole_file, write_atomically
+from lavender_ext.engine.arrays import N_SIZES, lengths
 
 __all__ = ["Snapshot"]
 
 MAGIC = b"LAVENDER-SNAPSHOT\n"
 VERSION = 1
 MOST_HEADER = 2**20  # bytes
+WORDS = ("fingerprint", "steps", "failed", "lost")
 ARRAYS = (("size", "<i4"), ("real", "<f8"), ("index", "<i4"), ("keys", "<u8"))
 
 
@@ -44,39 +43,19 @@ class Snapshot:
     keys: np.ndarray = field(repr=False)  # uint64
 
     def save(self, path: str | PathLike[str]) -> None:
-        """Write to a file, versioned and checksummed; a file of that name is replaced when the new one is whole.
-
-        Raises
-        ------
-        InputError
-            The path cannot be written, the disk is full (the old file stays), or a field is of a wrong type.
-        """
+        """Write to a file, versioned and checksummed; a file of that name is replaced when the new one is whole."""
         well_formed(self)
         arrays = [np.ascontiguousarray(getattr(self, name), code).tobytes() for name, code in ARRAYS]
-        header = json.dumps(
-            {
-                "version": VERSION,
-                "fingerprint": self.fingerprint,
-                "steps": self.steps,
-                "failed": self.failed,
-                "lost": self.lost,
-                "lengths": [len(getattr(self, name)) for name, _ in ARRAYS],
-            }
-        ).encode()
-        body = b"".join([MAGIC, len(header).to_bytes(8, "little"), header, *arrays])
+        header = {name: getattr(self, name) for name in WORDS}
+        lengths_of = [len(getattr(self, name)) for name, _ in ARRAYS]
+        body = framed(MAGIC, {"version": VERSION, **header, "lengths": lengths_of}) + b"".join(arrays)
         checksum = hashlib.sha256(body).digest()
-        write_atomically(_path(path), lambda part: _write(part, body + checksum))
+        write_atomically(as_path(path), lambda part: _write(part, body + checksum))
 
     @classmethod
     def load(cls, path: str | PathLike[str]) -> Snapshot:
-        """Read a file written by `save`.
-
-        Raises
-        ------
-        InputError
-            No such file, not a snapshot, of another version, or damaged.
-        """
-        data = _read(path)
+        """Read a file written by `save`."""
+        data = whole_file(as_path(path), "the snapshot")
         if not data.startswith(MAGIC):
             raise InputError(f"{str(path)!r} is not a lavender snapshot")
         body, checksum = data[:-32], data[-32:]
@@ -92,14 +71,10 @@ class Snapshot:
 
     @classmethod
     def _parsed(cls, body: bytes) -> Snapshot:
-        start = len(MAGIC) + 8
-        end = start + int.from_bytes(body[len(MAGIC) : start], "little")
-        if not start < end <= min(len(body), start + MOST_HEADER):
-            raise ValueError("header")
-        header: Any = json.loads(body[start:end])
+        header, end = unframed(body, MAGIC, MOST_HEADER)
         if header["version"] != VERSION:
             raise InputError(f"it has version {str(header['version'])[:40]}; {VERSION} is read here")
-        arrays = {}
+        arrays: dict[str, Any] = {}
         for (name, code), n in zip(ARRAYS, header["lengths"], strict=True):
             if type(n) is not int or n < 0:
                 raise ValueError("lengths")
@@ -111,23 +86,9 @@ class Snapshot:
         used = lengths(arrays["size"])
         if [max(n, 1) for n in used] != [max(n, 1) for n in header["lengths"][1:]]:
             raise ValueError("lengths")
-        found = cls(header["fingerprint"], header["steps"], header["failed"], header["lost"], **arrays)
+        found = cls(**{name: header[name] for name in WORDS} | arrays)
         well_formed(found)
         return found
-
-
-def _path(path: str | PathLike[str]) -> Path:
-    try:
-        found = Path(path)
-    except TypeError:
-        raise InputError(f"path is a {type(path).__name__}; the name of a file is needed") from None
-    if "\0" in str(found):
-        raise InputError(f"path is {str(path)!r}; the name of a file has no zero byte")
-    return found
-
-
-def _read(path: str | PathLike[str]) -> bytes:
-    return whole_file(_path(path), "the snapshot")
 
 
 def _write(part: Path, data: bytes) -> None:

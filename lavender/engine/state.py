@@ -8,30 +8,28 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lavender.engine import layout
-from lavender.engine.layout import (
-    CAP_CONTACT,
-    CAP_PAIR,
-    HEAD,
-    JOINT,
-    JOINT_KINDS,
-    MOST_PAIRS,
-    N_SIZES,
-    ORDER_NUMBER,
-    SETTING,
-    SIZE,
-    TOO_MANY,
-)
+from lavender.engine.layout import HEAD, JOINT, JOINT_KINDS, ORDER_NUMBER, SETTING, SIZE
 from lavender.errors import InputError
 from lavender.scene import Box, Plane, Scene, Sphere, arithmetic
 from lavender.scene.parts import Body, Joint
 from lavender.scene.scene import SCENE_ORDERS, Parameters
 from lavender.scene.steppers import get_stepper
 from lavender_ext.engine import substep
-from lavender_ext.engine.arrays import lengths
+from lavender_ext.engine.arrays import (
+    BOX,
+    CAP_CONTACT,
+    CAP_PAIR,
+    MOST_PAIRS,
+    N_SIZES,
+    NO_SHAPE,
+    PLANE,
+    SPHERE,
+    TOO_MANY,
+    lengths,
+)
 from lavender_ext.warm.start import Warm
 
-__all__ = ["ORDER_NUMBER", "State"]
+__all__ = ["State"]
 
 Copy = Callable[[], np.ndarray]
 
@@ -135,13 +133,7 @@ class State:
         self.keys[:] = other.keys
 
     def grown(self) -> State:
-        """A copy with room for what the last substep found missing.
-
-        Raises
-        ------
-        InputError
-            More than `MOST_PAIRS` pairs of bodies are close together, or more than `MOST_BYTES` are needed.
-        """
+        """A copy with room for what the last substep found missing."""
         size = self.size.copy()
         if self.head[HEAD["need_pairs"]] == TOO_MANY:
             raise InputError(
@@ -286,9 +278,9 @@ def _is_even(inertia: np.ndarray) -> bool:
 
 def _shape(shape: Any) -> tuple[int, list[float]]:
     if isinstance(shape, Plane):
-        return layout.PLANE, [*shape.normal, shape.offset]
+        return PLANE, [*shape.normal, shape.offset]
     if isinstance(shape, Sphere):
-        return layout.SPHERE, [shape.radius, shape.radius, shape.radius, 0.0]
+        return SPHERE, [shape.radius, shape.radius, shape.radius, 0.0]
     if isinstance(shape, Box):
-        return layout.BOX, [*(0.5 * np.array(shape.size)), 0.0]
-    return layout.NO_SHAPE, [0.0, 0.0, 0.0, 0.0]
+        return BOX, [*(0.5 * np.array(shape.size)), 0.0]
+    return NO_SHAPE, [0.0, 0.0, 0.0, 0.0]

@@ -8,30 +8,27 @@ from functools import wraps
 from pathlib import Path
 from threading import RLock
 from time import perf_counter
-from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, TypeVar
+from typing import Any, Concatenate, ParamSpec, TypeVar
 
 import numpy as np
 
-from lavender._arrays import FloatArray
+from lavender._arrays import FloatArray, whole_number
 from lavender.engine.export import problem_of
 from lavender.engine.film import Film
 from lavender.engine.judge import judged, moved
-from lavender.engine.layout import HEAD, NEED_ROOM, OK, SIZE
+from lavender.engine.layout import HEAD, SIZE
 from lavender.engine.state import State
 from lavender.errors import InputError, LavenderError, SolveFailed
 from lavender.outcome import finish
 from lavender.problem import Problem
 from lavender.registry import get
 from lavender.scene import Scene
-from lavender.scene.parts import whole
 from lavender.scene.steppers import get_stepper
 from lavender.solution import Solution, Status
 from lavender.solve import solve
 from lavender.solvers.newton import SPEC as NEWTON_SPEC
 from lavender.solvers.warm_start import Tried, claim_of
-
-if TYPE_CHECKING:
-    pass
+from lavender_ext.engine.arrays import NEED_ROOM, OK
 
 __all__ = ["SOLVER_FIELDS", "Stepping", "alone", "make_pairs_anew"]
 
@@ -178,7 +175,7 @@ class Stepping:
             Not a whole number of 4 to 64 for sequential_impulses (1 to 64 under other steppers than "impulses"), of at
             least 1 for other solvers.
         """
-        self._state.head[HEAD["iterations"]] = whole("solver_iterations", n, *self._sweeps)
+        self._state.head[HEAD["iterations"]] = whole_number("solver_iterations", n, *self._sweeps)
 
     @alone
     def set_warm_start(self, flag: bool) -> None:
@@ -200,7 +197,7 @@ class Stepping:
         """
         sweeps, warm = self.solver_iterations, self.warm_start
         if seed is not None:
-            self.scene = self.scene.with_parameters(seed=whole("seed", seed))
+            self.scene = self.scene.with_parameters(seed=whole_number("seed", seed))
         self._load(self.scene)
         self._state.head[HEAD["iterations"]] = sweeps
         self._state.head[HEAD["warm_start"]] = warm

@@ -6,7 +6,7 @@ import re
 
 __all__ = ["constants", "functions", "javascript", "rust", "struct_fields"]
 
-STRUCTS = ("lav_problem", "lav_options", "lav_budget", "lav_verdict", "lav_result")
+STRUCTS = ("lav_problem", "lav_options", "lav_budget", "lav_verdict", "lav_motion", "lav_result")
 RUST = {
     "int32_t": "i32",
     "uint32_t": "u32",

@@ -33,6 +33,7 @@ __all__ = ["FRONT", "MODULES", "CutFailed", "Item", "amalgamate", "cut", "read",
 
 #: Modules of lavender_ext that the library reaches into, and C of ours: what comes before the kernels, what after them.
 MODULES = (
+    "core.assemble",
     "core.generalized",
     "core.order",
     "core.problem",
@@ -41,16 +42,20 @@ MODULES = (
     "sweep.serial",
     "local.gauss_seidel",
     "accelerate.accelerated",
-    "generalized.newton",
+    "accelerate.admm",
+    "driver.driver",
     "pivot.principal",
-    "few.chain",
+    "pivot.tableau",
     "factor.graph",
     "factor.sparse",
     "engine.arrays",
     "engine.substep",
     "host.memory",
 )
-PROLOGUE, FRONT = "prologue.c", ("front.c", "problem.c", "solve.c", "full.c")
+PROLOGUE, FRONT = (
+    "prologue.c",
+    ("front.c", "problem.c", "judge.c", "solve.c", "methods.c", "pivots.c", "full.c"),
+)
 CIMPORT = re.compile(r"^from lavender_ext\.([\w.]+) cimport", re.MULTILINE)
 
 #: The condition of `front` under which the small build leaves things out.

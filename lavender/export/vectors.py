@@ -19,9 +19,10 @@ from lavender.bench.line import c_of
 from lavender.bench.store import read
 from lavender.errors import InputError
 from lavender.export.library import HERE, put
-from lavender.export.view import METHODS, NotTaken, choices, view
+from lavender.export.view import METHODS, OTHER_BITS, NotTaken, choices, view
 from lavender.io.stored import write_bytes
 from lavender.report.verdict import verdict
+from lavender.solvers._plan import METHODS as METHODS_OF_PLANS
 
 __all__ = ["chosen", "pack", "write"]
 
@@ -72,7 +73,13 @@ def write(path: Path, out: Path, solver: str | None, most: int, *, replace: bool
         f"/* What the report measured: {record.solver}, to a relative residual of {record.tol:g}. */\n"
         '#include "lavender.h"\n\n'
         "static inline void lav_chosen(lav_options *options, lav_budget *budget) {\n"
+        + _turns_of(record)
         + "".join(f"  {_by_pointer(line)};\n" for line in c_of(record))
+        + (
+            "  options->turns = turns;\n  options->n_turns = sizeof turns / sizeof *turns / 2;\n"
+            if record.solver == "auto"
+            else ""
+        )
         + "}\n"
     )
     check = (HERE / "front" / "check.c").read_text(encoding="utf-8")
@@ -81,6 +88,23 @@ def write(path: Path, out: Path, solver: str | None, most: int, *, replace: bool
 
 def _by_pointer(line: str) -> str:
     return line.replace("&", "").replace("options.", "options->").replace("budget.", "budget->")
+
+
+def _turns_of(record: Any) -> str:
+    """The plan of `auto` for the record's problem as turns in C; empty for the others."""
+    if record.solver != "auto":
+        return ""
+    plan = lv.explain(bench.resolve([record.case])[0].problem, record.tol)
+    return (
+        f"  static const int32_t turns[] = {{{', '.join(map(str, turns(plan)))}}}; /* lavender.explain */\n"
+    )
+
+
+def turns(plan: lv.Plan) -> list[int]:
+    """`lav_options.turns` of a plan: each candidate's number and expected iterations, the least expected cost first."""
+    solvers = [(METHODS[METHODS_OF_PLANS[name][0]], cost) for name, cost in plan.candidates]
+    first = {number: max(1, round(cost.count)) for number, cost in reversed(solvers)}
+    return [x for number, _ in solvers if number in first for x in (number, first.pop(number))]
 
 
 def chosen(records: Any, solver: str | None) -> Any:
@@ -108,8 +132,12 @@ def pack(problem: Any, solver: str, tol: float, max_iter: int, options: Mapping[
         raise NotTaken(f"{solver} formed A, which the library does not")
     numbers, doubles = choices(solver, options)
     out = struct.pack("<6q", METHODS[solver], *numbers) + struct.pack("<Q", 0) + struct.pack("<d", doubles)
-    out += struct.pack("<qd", max_iter, tol) + struct.pack("<9q", *given.counts)
+    steps = turns(lv.explain(problem, tol)) if solver == "auto" else []
+    out += struct.pack("<qd", max_iter, tol) + struct.pack(f"<{len(steps) + 1}q", len(steps) // 2, *steps)
+    out += struct.pack("<9q", *given.counts)
     for values in given.arrays.values():
         data = b"" if values is None else np.ascontiguousarray(values).tobytes()
         out += struct.pack("<q", -1 if values is None else len(data)) + data + bytes(-len(data) % 8)
-    return out + struct.pack("<d", found.residual.relative) + found.impulse.tobytes()
+    is_met = solver in OTHER_BITS  # by the judge's verdict alone
+    relative = tol if is_met else found.residual.relative
+    return out + struct.pack("<qd", is_met, relative) + (b"" if is_met else found.impulse.tobytes())

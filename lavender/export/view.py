@@ -8,20 +8,41 @@ from typing import Any
 
 import numpy as np
 
-from lavender.bench.line import C_METHODS as METHODS
-from lavender.cones import CONTACT_SPIN
+from lavender import registry
+from lavender.cones import CONTACT_ROLLING
 from lavender.errors import InputError
+from lavender.export.bindings import constants, struct_fields
+from lavender.export.library import HEADER
 from lavender.problem import Problem
 
 __all__ = ["ARRAYS", "METHODS", "NotTaken", "View", "choices", "view"]
 
-#: Arrays in the order of the struct.
-ARRAYS = (
-    "block_ptr", "kind", "lower", "upper", "mu", "patch_radius", "b", "target", "velocity", "compliance", "impulse",
-    "key", "order", "index_ptr", "index", "value", "mass_ptr", "mass_index", "mass_value", "inv_mass", "inv_inertia",
-    "joint_body", "jac", "contact_body", "normal", "tangent", "arm_a", "arm_b",
-)  # fmt: skip
-BODIES = ARRAYS[19:]
+_HEADER = HEADER.read_text(encoding="utf-8")
+#: Arrays in the order of the struct, with what they hold.
+ARRAYS: dict[str, Any] = {
+    name: np.dtype({"double": "f8", "int32_t": "i4", "uint64_t": "u8"}[kind.split()[1]])
+    for kind, name in struct_fields(_HEADER, "lav_problem")
+    if "*" in kind
+}
+BODIES = (
+    "inv_mass",
+    "inv_inertia",
+    "joint_body",
+    "jac",
+    "contact_body",
+    "normal",
+    "tangent",
+    "arm_a",
+    "arm_b",
+)
+#: Solvers by their numbers in the library.
+METHODS = {
+    name: constants(_HEADER)[f"LAV_{name.upper()}"]
+    for name, spec in registry.specs().items()
+    if spec.own and not spec.external
+}
+#: Those whose factor is LAPACK's in the package, or whose turns are chosen there: others bits, the same judge.
+OTHER_BITS = ("lemke", "admm", "auto")
 ORDERS = {"given": 0, "symmetric": 1, "random": 2, "reverse": 3}
 SWEEPS = {None: 0, "pgs": 1, "blocks": 2}
 
@@ -44,14 +65,14 @@ def view(problem: Problem) -> View:
     Raises
     ------
     NotTaken
-        Round cones; generalised velocities in an order of lavender's own.
+        Ellipses; generalised velocities in an order of lavender's own.
     """
     c = problem.cones
-    if max(c.kind, default=0) > CONTACT_SPIN:
-        raise NotTaken("of blocks the library has rows, contacts of up to two tangents, and such with spin")
+    if max(c.kind, default=0) > CONTACT_ROLLING:
+        raise NotTaken("the library has no ellipses: give it the same in longer rows, `problem.disk`")
     arrays: dict[str, Any] = dict.fromkeys(ARRAYS)
     arrays |= {"block_ptr": c.ptr, "kind": c.kind, "lower": c.lower, "upper": c.upper, "mu": c.mu}
-    arrays |= {"patch_radius": c.patch_radius, "b": problem.b, "impulse": problem.guess}
+    arrays |= {"patch_radius": c.patch_radius, "b": problem.b, "impulse": problem.guess, "rolling": c.rolling}
     form, entries, bodies, joints, velocities, mass = 1, 0, 0, 0, 0, 0
     if problem.rows is not None:
         r, form = problem.rows, 2
@@ -74,21 +95,9 @@ def view(problem: Problem) -> View:
         arrays |= {"index_ptr": a.indptr, "index": a.indices, "value": a.data}
     if arrays["value"] is not None:
         entries = len(arrays["value"])
-    whole = {
-        "block_ptr",
-        "kind",
-        "order",
-        "index_ptr",
-        "index",
-        "mass_ptr",
-        "mass_index",
-        "joint_body",
-        "contact_body",
-    }
     for key, values in arrays.items():
         if values is not None:
-            kind = np.uint64 if key == "key" else np.int32 if key in whole else np.float64
-            arrays[key] = np.ascontiguousarray(values, kind)
+            arrays[key] = np.ascontiguousarray(values, ARRAYS[key])
     law = int(problem.friction == "cone")
     return View((form, law, problem.n_blocks, problem.m, entries, bodies, joints, velocities, mass), arrays)
 
@@ -104,7 +113,12 @@ def choices(solver: str, options: Mapping[str, Any]) -> tuple[tuple[int, ...], f
     left = dict(options)
     order = left.pop("order", "given")
     sweep, restart = left.pop("sweep", None), left.pop("restart", "growth")
-    numbers = left.pop("memory", 5), SWEEPS.get(sweep, -1), left.pop("convex", 0), int(restart == "against")
+    numbers = (
+        left.pop("memory", 10 if solver == "admm" else 5),
+        SWEEPS.get(sweep, -1),
+        left.pop("convex", 0),
+        int(restart == "against"),
+    )
     omega = left.pop("omega", {"sor": 1.5, "gauss_seidel": 1.0}.get(solver)) or 0.0
     if left or order not in ORDERS or solver not in METHODS:
         what = ", ".join(left) or (f"order={order!r}" if order not in ORDERS else solver)

@@ -11,7 +11,6 @@ import atexit
 import json
 import os
 import pickle
-from functools import partial
 from threading import Lock
 from typing import Any
 
@@ -20,11 +19,12 @@ import numpy as np
 from lavender._arrays import FloatArray
 from lavender.apart.process import Ended, Process
 from lavender.errors import InputError
-from lavender.external._running import Answer, Elsewhere, Failed, Limits
+from lavender.external._running import Answer, Failed, Limits
 from lavender.external.as_qp import QP
+from lavender.external.backend import Backend
 from lavender.solution import Status
 
-__all__ = ["ARRAYS", "call", "elsewhere", "ready"]
+__all__ = ["ARRAYS", "Elsewhere", "call", "ready"]
 
 SERVED = "lavender.external._served"
 ARRAYS = ("x", "zeta", "xi", "direction", "contradiction")  # of an answer, in the order they are sent
@@ -44,9 +44,20 @@ def ready() -> None:
         _keep(process)
 
 
-def elsewhere(name: str, stoppable: bool) -> Elsewhere:
-    """How the backend of that name is run within a limit; `stoppable`: it takes one itself."""
-    return partial(call, name, GRACE if stoppable else 1.0)
+class Elsewhere:
+    """Runs a backend within a limit in a process of its own, or here where the system starts none."""
+
+    def __init__(self, backend: Backend) -> None:
+        self.backend = backend
+        self.where = "to its end"
+
+    def __call__(self, qp: QP, impulse: FloatArray, limit: Limits, settings: dict[str, Any]) -> Answer:
+        backend = self.backend
+        found = call(backend.name, GRACE if backend.stoppable else 1.0, qp, impulse, limit, settings)
+        if found is None:
+            return backend.run(qp, impulse, limit, settings)
+        self.where = "in a process of its own"
+        return found
 
 
 def call(

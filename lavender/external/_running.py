@@ -9,13 +9,13 @@ import sys
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from time import perf_counter
 from typing import Any
 
 import numpy as np
 
 from lavender._arrays import FloatArray
 from lavender.certificates import check_certificate
+from lavender.deadline import Deadline
 from lavender.errors import InputError
 from lavender.external.as_qp import QP, target
 from lavender.problem import Problem
@@ -24,16 +24,12 @@ from lavender.solution import Claim, Status
 
 __all__ = [
     "Answer",
-    "Elsewhere",
     "Failed",
     "Limits",
     "ask",
     "at_least",
-    "check_options",
-    "definite_refusal",
     "proof",
     "quiet",
-    "symmetric_refusal",
 ]
 
 EPS_MIN = 1e-14  # asked of a backend at the least: its own arithmetic stops there
@@ -51,14 +47,6 @@ class Limits:
     gap_relative: float  # the same, of the objective; either will do
     max_iter: int
     time_limit: float | None  # s
-
-
-def check_options(settings: Any, isolate: Any) -> None:
-    """`settings` maps the backend's own names to values, `isolate` is true or false."""
-    if not isinstance(settings, Mapping):
-        raise InputError(f"settings is a {type(settings).__name__}; a mapping of names to values is needed")
-    if not isinstance(isolate, bool):
-        raise InputError(f"isolate is {isolate!r}; True or False is needed")
 
 
 @dataclass(frozen=True)
@@ -89,7 +77,6 @@ def proof(
 
 
 Call = Callable[[QP, FloatArray, Limits, dict[str, Any]], Answer]
-Elsewhere = Callable[[QP, FloatArray, Limits, dict[str, Any]], "Answer | None"]
 
 
 class Failed(Exception):
@@ -97,79 +84,45 @@ class Failed(Exception):
 
 
 def ask(
-    problem: Problem,
     qp: QP,
     impulse: FloatArray,
     call: Call,
-    n: int,
+    max_iter: int,
     tol: float,
     time_limit: float | None,
     settings: Mapping[str, Any],
-    *,
-    stoppable: bool,
-    noisy: bool = False,
-    apart: Elsewhere | None = None,
+    noisy: bool,
 ) -> Claim:
     """Run the backend and write its iterate to `impulse`, or leave the start point and say why.
 
     A backend that says it is done where the judge does not find `tol` is asked again, 100 times more
-    closely, at most three times in all: its tests are not the judge's. `apart`, where given, runs it in a
-    process of its own, or answers None where there is none. An interior-point method leaves
+    closely, at most three times in all: its tests are not the judge's. An interior-point method leaves
     sqrt(x w) on a row where impulse and slack both vanish, so its gap falls towards eps^2.
     """
+    problem, deadline = qp.problem, Deadline(time_limit)
+    start, best = impulse.copy(), None
     work: dict[str, int] = {"backend_calls": 0}
-    if not len(qp.kept):
-        impulse[:] = qp.fixed
-        return Claim(Status.CONVERGED, 0, work, "every row was decided by its bounds", qp.form)
-    if n == 0:
-        return Claim(Status.MAX_ITERATIONS, 0, work, "", qp.form)
-    if not qp.fits:
-        words = "as a quadratic program the problem has numbers that overflow; the backend was not called"
-        return Claim(Status.NUMERICAL_ERROR, 0, work, words, qp.form)
-    start = impulse.copy()
-    eps = max(0.5 * target(problem, tol), EPS_MIN)
-    # Unknowns are near 1, so objectives lie between 1 and m: a gap below 1e-13 is often lost in its own sums.
-    levels = [
-        (eps, 1e-2 * eps, GAP_RELATIVE),
-        (max(1e-2 * eps, EPS_MIN), max(1e-5 * eps, 1e-13), 1e-2 * GAP_RELATIVE),
-        (max(1e-4 * eps, EPS_MIN), max(1e-2 * eps * eps, GAP_MIN), GAP_RELATIVE_MIN),
-    ]
-    if tol == 0.0:
-        levels = levels[-1:]
-    best: tuple[float, Claim, FloatArray] | None = None
-    clock = perf_counter()
-    where = "and ran to its end"
-
-    def run(qp: QP, impulse: FloatArray, limit: Limits, settings: dict[str, Any]) -> Answer:
-        nonlocal where
-        found = None if apart is None else apart(qp, impulse, limit, settings)
-        if found is None:
-            return call(qp, impulse, limit, settings)
-        where = "and ran in a process of its own"
-        return found
-
-    left, time_left = n, time_limit
     w, e = np.empty(problem.m), np.empty(problem.m)
-    for level, gap, gap_relative in levels:
-        claim = _once(qp, impulse, run, Limits(level, gap, gap_relative, left, time_left), settings, noisy)
-        for kind, count in claim.work.items():
+    limits = _levels(problem, tol, max_iter, time_limit)
+    while limits:
+        last = _once(qp, impulse, call, limits.pop(0), settings, noisy)
+        for kind, count in last.work.items():
             work[kind] = work.get(kind, 0) + count
         relative, floor = quick(problem, impulse, w, e, floor=True)
         if best is None or relative < best[0]:
-            best = (relative, claim, impulse.copy())
-        left -= claim.iterations
-        if time_limit is not None:
-            time_left = time_limit - (perf_counter() - clock)
+            best = (relative, last, impulse.copy())
+        left = max_iter - work.get("iterations", 0)
         if (
-            claim.status is not Status.CONVERGED
+            last.status is not Status.CONVERGED
             or relative <= max(tol, 2.0 * floor)
             or left <= 0
-            or (time_left is not None and time_left <= 0.0)
+            or deadline.passed()
         ):
             break
-        impulse[:] = start
+        limits = [replace(level, max_iter=left, time_limit=deadline.left()) for level in limits]
+        if limits:
+            impulse[:] = start
     assert best is not None
-    last = claim
     relative, claim, impulse[:] = best
     status, words = claim.status, claim.message
     if last is not claim and last.status is not Status.CONVERGED and relative > tol:
@@ -181,9 +134,19 @@ def ask(
         status = Status.STALLED
     if tol == 0.0 and status is Status.CONVERGED:
         status, words = Status.STALLED, f"{words}; tol=0: ran at its tightest tolerance"
-    if time_limit is not None and not stoppable:
-        words = f"{words}; takes no time limit {where}"
     return replace(claim, status=status, message=words, work=work, iterations=work.get("iterations", 0))
+
+
+def _levels(problem: Problem, tol: float, max_iter: int, time_limit: float | None) -> list[Limits]:
+    """What is asked for first, and then more closely."""
+    eps = max(0.5 * target(problem, tol), EPS_MIN)
+    # Unknowns are near 1, so objectives lie between 1 and m: a gap below 1e-13 is often lost in its own sums.
+    levels = [
+        (eps, 1e-2 * eps, GAP_RELATIVE),
+        (max(1e-2 * eps, EPS_MIN), max(1e-5 * eps, 1e-13), 1e-2 * GAP_RELATIVE),
+        (max(1e-4 * eps, EPS_MIN), max(1e-2 * eps * eps, GAP_MIN), GAP_RELATIVE_MIN),
+    ]
+    return [Limits(*level, max_iter, time_limit) for level in (levels[-1:] if tol == 0.0 else levels)]
 
 
 def _once(
@@ -232,26 +195,6 @@ def _once(
         dual=dual,
         certificate=certificate,
     )
-
-
-def symmetric_refusal(problem: Problem) -> str | None:
-    """A quadratic program has a symmetric P: anything else would be another problem."""
-    if problem.is_symmetric:
-        return None
-    return (
-        f"needs a symmetric A; here max|A - A^T| / max|A| = {problem.asymmetry:.1e} "
-        "(pgs takes it as it is; a Problem of (A + A^T)/2 is another problem, if that error is small enough)"
-    )
-
-
-def definite_refusal(problem: Problem) -> str | None:
-    """A negative diagonal entry shows that no QP solver can take this A; a factorisation sees the rest."""
-    if problem.rows is None and problem.m:
-        diagonal = problem.csr.diagonal()
-        i = int(np.argmin(diagonal))
-        if diagonal[i] < 0.0:
-            return f"needs a positive semidefinite A; A[{i}, {i}] = {diagonal[i]:.3g}"
-    return None
 
 
 @contextlib.contextmanager

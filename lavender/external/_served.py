@@ -19,19 +19,15 @@ def serve(lifeline: int) -> None:
 
 
 def _runner() -> apart.Handler:
+    from lavender.external import clarabel_cone
     from lavender.external.backends import BACKENDS
-    from lavender.external.clarabel_cone import NAME
-    from lavender.external.native import clarabel
 
-    runs = {backend.name: (backend.run, backend.noisy) for backend in BACKENDS} | {
-        NAME: (clarabel.call, False)
-    }
+    by_name = {backend.name: backend for backend in (*BACKENDS, clarabel_cone.BACKEND)}
 
     def run(message: Any) -> tuple[dict[str, Any], bytes]:
         name, qp, impulse, limit, settings = message
-        call, noisy = runs[name]
-        with quiet(noisy) as said:
-            found = call(qp, impulse, limit, settings)
+        with quiet(by_name[name].noisy) as said:
+            found = by_name[name].run(qp, impulse, limit, settings)
         return _as_data(found, "; ".join(said))
 
     return run

@@ -182,13 +182,6 @@ def pick_form(problem: Problem, form: str, definite: bool = False) -> str:
 
     "auto" takes the velocity form where rows are known and m > 6 n, the mass ratio is 1e3 or more, or
     the backend needs a definite P (`definite`).
-
-    Raises
-    ------
-    InputError
-        No such form.
-    CapabilityError
-        "velocity" for a problem given as a matrix.
     """
     if form not in FORMS:
         raise InputError(f"form is {form!r}; one of {', '.join(map(repr, FORMS))} is needed")
@@ -227,12 +220,8 @@ def target(problem: Problem, tol: float) -> float:
 def impulse_form(problem: Problem, *, unit_diagonal: bool = True, equality: bool = False) -> QP:
     """min 1/2 l.A l - b.l over the bounds or friction cones of a symmetric problem.
 
-    Parameters
-    ----------
-    unit_diagonal : bool
-        Scale by D^-1/2; otherwise by one number, so that P is A in other units.
-    equality : bool
-        Write a linear system as min 1/2 x.P x subject to P x = -q, for backends that need a row.
+    `unit_diagonal` scales by D^-1/2, otherwise by one number, so that P is A in other units; `equality` writes a linear
+    system as min 1/2 x.P x subject to P x = -q, for backends that need a row.
     """
     parts = _Parts.of(problem, unit_diagonal)
     c, kept, root, sigma = problem.cones, parts.kept, parts.root, parts.sigma
@@ -260,7 +249,7 @@ def impulse_form(problem: Problem, *, unit_diagonal: bool = True, equality: bool
                 put.row([(t, -disk.ratios[0] / ratio)])
         matrix = put.matrix(k)
         rhs = np.zeros(matrix.shape[0])
-    return QP(
+    return parts.program(
         form="impulse",
         P=p,
         q=q,
@@ -268,14 +257,9 @@ def impulse_form(problem: Problem, *, unit_diagonal: bool = True, equality: bool
         b=rhs,
         n_zero=n_zero,
         n_nonneg=2 * len(rows.pairs),
-        soc=tuple(1 + len(disk.tangents) for disk in rows.disks),
+        soc=rows.cones,
         lb=lb,
         ub=ub,
-        problem=problem,
-        kept=kept,
-        fixed=parts.fixed,
-        root=root,
-        sigma=sigma,
         back=sp.csr_matrix((k, len(rhs))),
         shift=np.zeros(k),
         lift=sp.csr_matrix((k, 0)),
@@ -283,13 +267,7 @@ def impulse_form(problem: Problem, *, unit_diagonal: bool = True, equality: bool
 
 
 def velocity_form(problem: Problem) -> QP:
-    """The mass-scaled velocity form of a problem with rows.
-
-    Raises
-    ------
-    CapabilityError
-        The problem was given as a matrix.
-    """
+    """The mass-scaled velocity form of a problem with rows."""
     form = problem.velocity_form()
     parts = _Parts.of(problem, True)
     c, kept, root, sigma = problem.cones, parts.kept, parts.root, parts.sigma
@@ -312,7 +290,43 @@ def velocity_form(problem: Problem) -> QP:
     upper = np.flatnonzero(plain & ~has_low & has_high)
     shift = np.zeros(k)
     shift[lower], shift[upper] = low[lower], high[upper]
-    # Columns of T, and the entries of the t unknowns in their rows.
+    put, slack, n, n_alone = _velocity_rows(rows, free, lower, both, upper, ny)
+    back = sp.csr_matrix(put.matrix(k).T)
+    velocities = sp.hstack([-(back.T @ lift), sp.csc_matrix((back.shape[1], n - ny))])
+    matrix = sp.csc_matrix(velocities + slack.matrix(n))
+    q = np.zeros(n)
+    known = np.zeros(ny)
+    known[: jac.shape[1]] = jac.T @ (parts.fixed / (form.scale * sigma))
+    q[:ny] = -(lift.T @ shift) - known
+    q[ny : ny + len(both)] = high[both] - low[both]
+    lb = ub = None
+    if n > ny:
+        lb, ub = np.full(n, -np.inf), np.full(n, np.inf)
+        lb[ny:] = 0.0
+    diagonal = np.zeros(n)
+    diagonal[:ny] = 1.0
+    n_nonneg = len(lower) + len(upper) + 2 * len(rows.pairs) + n_alone
+    return parts.program(
+        form="velocity",
+        P=sp.csc_matrix(sp.diags_array(diagonal)),
+        q=q,
+        A=matrix,
+        b=-(back.T @ g),
+        n_zero=len(free),
+        n_nonneg=n_nonneg,
+        soc=rows.cones,
+        lb=lb,
+        ub=ub,
+        back=back,
+        shift=shift,
+        lift=lift,
+    )
+
+
+def _velocity_rows(
+    rows: _FrictionRows, free: IntpArray, lower: IntpArray, both: IntpArray, upper: IntpArray, ny: int
+) -> tuple[_Entries, _Entries, int, int]:
+    """Columns of T, entries of the t in their rows, number of unknowns, normals bounded by a sum of t alone."""
     put, slack = _Entries(), _Entries()
     t_of = {int(i): ny + j for j, i in enumerate(both)}
     n = ny + len(both)
@@ -349,41 +363,7 @@ def velocity_form(problem: Problem) -> QP:
         for tangent, ratio in zip(disk.tangents, disk.ratios, strict=True):
             put.row([(tangent, ratio)])
             slack.row([])
-    back = sp.csr_matrix(put.matrix(k).T)
-    velocities = sp.hstack([-(back.T @ lift), sp.csc_matrix((back.shape[1], n - ny))])
-    matrix = sp.csc_matrix(velocities + slack.matrix(n))
-    q = np.zeros(n)
-    known = np.zeros(ny)
-    known[: jac.shape[1]] = jac.T @ (parts.fixed / (form.scale * sigma))
-    q[:ny] = -(lift.T @ shift) - known
-    q[ny : ny + len(both)] = high[both] - low[both]
-    lb = ub = None
-    if n > ny:
-        lb, ub = np.full(n, -np.inf), np.full(n, np.inf)
-        lb[ny:] = 0.0
-    diagonal = np.zeros(n)
-    diagonal[:ny] = 1.0
-    n_nonneg = len(lower) + len(upper) + 2 * len(rows.pairs) + len(alone)
-    return QP(
-        form="velocity",
-        P=sp.csc_matrix(sp.diags_array(diagonal)),
-        q=q,
-        A=matrix,
-        b=-(back.T @ g),
-        n_zero=len(free),
-        n_nonneg=n_nonneg,
-        soc=tuple(1 + len(disk.tangents) for disk in rows.disks),
-        lb=lb,
-        ub=ub,
-        problem=problem,
-        kept=kept,
-        fixed=parts.fixed,
-        root=root,
-        sigma=sigma,
-        back=back,
-        shift=shift,
-        lift=lift,
-    )
+    return put, slack, n, len(alone)
 
 
 def _sigma(problem: Problem) -> float:
@@ -434,6 +414,10 @@ class _FrictionRows:
     disks: list[_Disk]
 
     @property
+    def cones(self) -> tuple[int, ...]:
+        return tuple(1 + len(disk.tangents) for disk in self.disks)
+
+    @property
     def members(self) -> list[int]:
         return [i for p in self.pairs for i in p[:2]] + [
             i for d in self.disks for i in (d.normal, *d.tangents)
@@ -476,6 +460,12 @@ class _Parts:
         if not unit_diagonal and len(d):
             d = np.full(len(d), np.exp(np.mean(np.log(d))))
         return cls(problem, kept, fixed, 1.0 / np.sqrt(d), _sigma(problem), np.array(stays, int))
+
+    def program(self, **own: Any) -> QP:
+        """A program of these rows."""
+        return QP(
+            problem=self.problem, kept=self.kept, fixed=self.fixed, root=self.root, sigma=self.sigma, **own
+        )
 
     def friction_rows(self) -> _FrictionRows:
         c = self.problem.cones

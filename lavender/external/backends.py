@@ -3,7 +3,7 @@
     min 1/2 l.A l - b.l,  lower <= l <= upper        (impulse form), or the velocity form of `as_qp`
 
 Backends of which qpsolvers passes on the iterate but not what happened (iterations, exit flag,
-certificates, warm start) are called by their own interface (`native/`), the others through it (`generic.py`).
+certificates, warm start) are called by their own interface (`native/`), the others through it (`backend.py`).
 """
 
 from __future__ import annotations
@@ -22,15 +22,8 @@ __all__ = ["BACKENDS", "SPECS"]
 # -- settings of those that go through qpsolvers -----------------------------------------------------
 
 
-def _piqp(limit: Limits) -> dict[str, Any]:
-    return {
-        "eps_abs": limit.eps, "eps_rel": 0.0, "max_iter": limit.max_iter,
-        "check_duality_gap": True, "eps_duality_gap_abs": limit.gap, "eps_duality_gap_rel": limit.gap_relative,
-    }  # fmt: skip
-
-
-def _proxqp(limit: Limits) -> dict[str, Any]:
-    # Without the gap it accepts multipliers on bounds that are not active (met on a redundant stack).
+def _proximal(limit: Limits) -> dict[str, Any]:
+    # Without the gap proxqp accepts multipliers on bounds that are not active (met on a redundant stack).
     return {
         "eps_abs": limit.eps, "eps_rel": 0.0, "max_iter": limit.max_iter,
         "check_duality_gap": True, "eps_duality_gap_abs": limit.gap, "eps_duality_gap_rel": limit.gap_relative,
@@ -42,21 +35,12 @@ def _scs(limit: Limits) -> dict[str, Any]:
     return {"eps_abs": limit.eps, "eps_rel": 0.0, "eps_infeas": 1e-11, "max_iters": limit.max_iter, **more}
 
 
-def _cvxopt(limit: Limits) -> dict[str, Any]:
+def _cvxopt(limit: Limits, count: str = "maxiters") -> dict[str, Any]:
     return {
         "feastol": limit.eps,
         "abstol": limit.gap,
         "reltol": limit.gap_relative,
-        "maxiters": limit.max_iter,
-    }
-
-
-def _ecos(limit: Limits) -> dict[str, Any]:
-    return {
-        "feastol": limit.eps,
-        "abstol": limit.gap,
-        "reltol": limit.gap_relative,
-        "max_iters": limit.max_iter,
+        count: limit.max_iter,
     }
 
 
@@ -97,9 +81,9 @@ BACKENDS: tuple[Backend, ...] = (
     Backend("clarabel", ("clarabel",), "clarabel", "interior point, homogeneous embedding",
             "Goulart, Chen 2024, Clarabel", call=clarabel.call, max_iter=200, stoppable=True),
     Backend("piqp", ("qpsolvers", "piqp"), "piqp", "proximal interior point",
-            "Schwan, Jiang, Kuhn, Jones 2023, PIQP", settings=_piqp, max_iter=250),
+            "Schwan, Jiang, Kuhn, Jones 2023, PIQP", settings=_proximal, max_iter=250),
     Backend("proxqp", ("qpsolvers", "proxsuite"), "proxsuite", "proximal augmented Lagrangian",
-            "Bambade et al. 2022, ProxQP", settings=_proxqp, warm=True),
+            "Bambade et al. 2022, ProxQP", settings=_proximal, warm=True),
     Backend("qpalm", ("qpalm",), "qpalm", "proximal augmented Lagrangian, semismooth Newton",
             "Hermans, Themelis, Patrinos 2022, QPALM", call=qpalm.call, warm=True, stoppable=True),
     Backend("daqp", ("daqp",), "daqp", "dual active set", "Arnström, Bemporad, Axehill 2022, DAQP",
@@ -115,8 +99,8 @@ BACKENDS: tuple[Backend, ...] = (
     Backend("kvxopt", ("qpsolvers", "kvxopt"), "kvxopt", "interior point, CVXOPT with more factorisations",
             "Vandenberghe 2010, CVXOPT", settings=_cvxopt, max_iter=100),
     Backend("ecos", ("qpsolvers", "ecos"), "ecos", "interior point for second-order cones",
-            "Domahidi, Chu, Boyd 2013, ECOS", settings=_ecos, max_iter=100, dense=True, definite=True,
-            linear="equality", finite=True),
+            "Domahidi, Chu, Boyd 2013, ECOS", settings=partial(_cvxopt, count="max_iters"), max_iter=100,
+            dense=True, definite=True, linear="equality", finite=True),
     Backend("gurobi", ("qpsolvers", "gurobipy"), "gurobipy", "interior point and simplex", "Gurobi manual",
             settings=_gurobi, stoppable=True, noisy=True),
     Backend("copt", ("qpsolvers", "coptpy"), "coptpy", "interior point", "COPT manual",

@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from lavender._arrays import FloatArray
-from lavender.errors import CapabilityError
+from lavender.errors import CapabilityError, InputError
 from lavender.external import _apart
-from lavender.external._running import ask, check_options, definite_refusal, symmetric_refusal
+from lavender.external._running import ask
 from lavender.external.as_qp import QP, impulse_form, pick_form, velocity_form
 from lavender.external.backend import Backend
 from lavender.problem import Problem
-from lavender.solution import Claim
+from lavender.solution import Claim, Status
 
 __all__ = ["OPTIONS", "QPSolver", "refusal"]
 
@@ -28,29 +28,9 @@ OPTIONS = {
 }
 
 
-@dataclass
-class State:
-    """A converted problem."""
-
-    problem: Problem
-    qp: QP
-
-
 @dataclass(frozen=True)
 class QPSolver:
-    """A backend with its options.
-
-    Parameters
-    ----------
-    backend : Backend
-    form : {"auto", "impulse", "velocity"}
-    unit_diagonal : bool
-        Impulse form: scale P to a unit diagonal.
-    settings : mapping
-        Passed to the backend as they are, over those that `tol` gives.
-    isolate : bool
-        Under a time limit, run the backend in a process of its own, which is ended where it does not end itself.
-    """
+    """A backend with its options, which OPTIONS says in words."""
 
     backend: Backend
     form: str = "auto"
@@ -59,10 +39,15 @@ class QPSolver:
     isolate: bool = True
 
     def __post_init__(self) -> None:
-        check_options(self.settings, self.isolate)
+        if not isinstance(self.settings, Mapping):
+            raise InputError(
+                f"settings is a {type(self.settings).__name__}; a mapping of names to values is needed"
+            )
+        if not isinstance(self.isolate, bool):
+            raise InputError(f"isolate is {self.isolate!r}; True or False is needed")
 
     @np.errstate(all="ignore")  # what overflows is judged
-    def prepare(self, problem: Problem) -> State:
+    def prepare(self, problem: Problem) -> QP:
         b = self.backend
         qp = velocity_form(problem) if pick_form(problem, self.form, b.definite) == "velocity" else None
         if qp is not None and b.definite and self.form == "auto" and not qp.is_definite:
@@ -83,28 +68,47 @@ class QPSolver:
                 f"solver {b.name!r} takes dense matrices only: {max(qp.n, len(qp.b))} x {qp.n} would need more "
                 f"than {DENSE_LIMIT >> 20} MiB; use a sparse backend (osqp, piqp, clarabel)"
             )
-        return State(problem, qp)
+        return qp
 
-    def update(self, state: State, problem: Problem) -> State:
+    def update(self, state: QP, problem: Problem) -> QP:
         return self.prepare(problem)
 
     @np.errstate(all="ignore")  # what overflows is judged
     def run(
-        self, state: State, impulse: FloatArray, n: int, tol: float, time_limit: float | None = None
+        self, state: QP, impulse: FloatArray, max_iter: int, tol: float, time_limit: float | None = None
     ) -> Claim:
-        b = self.backend
-        apart = _apart.elsewhere(b.name, b.stoppable) if self.isolate and time_limit is not None else None
-        return ask(
-            state.problem, state.qp, impulse, b.run, n, tol, time_limit, self.settings,
-            stoppable=b.stoppable, noisy=b.noisy, apart=apart,
-        )  # fmt: skip
+        qp, b, none = state, self.backend, {"backend_calls": 0}
+        if not len(qp.kept):
+            impulse[:] = qp.fixed
+            return Claim(Status.CONVERGED, 0, none, "every row was decided by its bounds", qp.form)
+        if max_iter == 0:
+            return Claim(Status.MAX_ITERATIONS, 0, none, "", qp.form)
+        if not qp.fits:
+            words = "as a quadratic program the problem has numbers that overflow; the backend was not called"
+            return Claim(Status.NUMERICAL_ERROR, 0, none, words, qp.form)
+        apart = _apart.Elsewhere(b) if self.isolate and time_limit is not None else None
+        claim = ask(qp, impulse, apart or b.run, max_iter, tol, time_limit, self.settings, b.noisy)
+        if time_limit is None or b.stoppable:
+            return claim
+        where = "to its end" if apart is None else apart.where
+        return replace(claim, message=f"{claim.message}; takes no time limit and ran {where}")
 
-    def ready(self) -> None:
+    def ready(self, qp: QP, time_limit: float) -> None:
         """A time limit was given, and its clock has not begun: have that process ready."""
         if self.isolate:
             _apart.ready()
 
 
 def refusal(problem: Problem) -> str | None:
-    """Why no QP backend can take this problem, before any conversion."""
-    return symmetric_refusal(problem) or definite_refusal(problem)
+    """Why no QP backend can take this problem, before any conversion; a factorisation sees the rest."""
+    if not problem.is_symmetric:
+        return (
+            f"needs a symmetric A; here max|A - A^T| / max|A| = {problem.asymmetry:.1e} "
+            "(pgs takes it as it is; a Problem of (A + A^T)/2 is another problem, if that error is small enough)"
+        )
+    if problem.rows is None and problem.m:
+        diagonal = problem.csr.diagonal()
+        i = int(np.argmin(diagonal))
+        if diagonal[i] < 0.0:
+            return f"needs a positive semidefinite A; A[{i}, {i}] = {diagonal[i]:.3g}"
+    return None

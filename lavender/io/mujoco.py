@@ -149,11 +149,6 @@ def impulse(model: Any, data: Any) -> FloatArray:
     """MuJoCo's own answer as impulses of the problem's rows (m,) [N s]: dt efc_force over `scaling`.
 
     After `noslip_iterations` it is no solution of the problem.
-
-    Raises
-    ------
-    InputError
-        Not a model and its data.
     """
     mj = _mujoco(model, data)
     dt = _timestep(model.opt)
@@ -165,24 +160,13 @@ def scaling(model: Any, data: Any) -> FloatArray:
     """Factor of each row (m,) of the problem: row of the problem = factor times MuJoCo's row.
 
     1, and friction[j] / friction[0] on the tangents of an elliptic cone. Impulses are MuJoCo's over it.
-
-    Raises
-    ------
-    InputError
-        Not a model and its data.
     """
     mj = _mujoco(model, data)
     return _blocks(mj, model, data, _Held.of(data), _timestep(model.opt))[1]
 
 
 def acceleration(model: Any, data: Any, impulse: Any) -> FloatArray:
-    """MuJoCo's `qacc` (nv,) under impulses (m,) [N s] of the problem's rows: a0 + M^-1 J^T lambda / dt.
-
-    Raises
-    ------
-    InputError
-        Not a model and its data, or another number of impulses than constraints.
-    """
+    """MuJoCo's `qacc` (nv,) under impulses (m,) [N s] of the problem's rows: a0 + M^-1 J^T lambda / dt."""
     mj = _mujoco(model, data)
     lam = np.asarray(impulse, float)
     m = int(data.nefc)
@@ -195,13 +179,7 @@ def acceleration(model: Any, data: Any, impulse: Any) -> FloatArray:
 
 
 def jacobian(model: Any, data: Any) -> sp.csr_array:
-    """J (m, nv) of all constraints, from either way in which MuJoCo stores it.
-
-    Raises
-    ------
-    InputError
-        Not a model and its data.
-    """
+    """J (m, nv) of all constraints, from either way in which MuJoCo stores it."""
     mj = _mujoco(model, data)
     m, n = int(data.nefc), int(model.nv)
     indptr, indices, values = _rows(mj, model, data, m, n, np.ones(m))

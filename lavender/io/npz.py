@@ -27,10 +27,10 @@ from lavender.cones import CONTACT, ROW, Cones
 from lavender.errors import InputError
 from lavender.generalized import Generalized
 from lavender.io.stored import MAX_BYTES, NUMBER, Budget, Stored, write_atomically
-from lavender.problem import PRECISIONS, Problem
+from lavender.problem import PRECISIONS, Problem, check_problem
 from lavender.rows import Rows
 
-__all__ = ["VERSION", "read", "write"]
+__all__ = ["VERSION", "Archive", "read", "write"]
 
 VERSION = 1
 MAX_HEADER = 10_000  # bytes of a .npy header: 100 are usual
@@ -83,10 +83,10 @@ class _Header:
         return np.frombuffer(raw, self.dtype).reshape(self.shape, order="F" if self.fortran else "C")
 
 
-class _Archive(Mapping[str, np.ndarray]):
+class Archive(Mapping[str, np.ndarray]):
     """Arrays of an .npz by name, each read once when asked for."""
 
-    def __init__(self, path: str | os.PathLike[str], max_bytes: int) -> None:
+    def __init__(self, path: str | os.PathLike[str], max_bytes: int = MAX_BYTES) -> None:
         self.path = path
         self._arrays: dict[str, np.ndarray] = {}
         self._headers: dict[str, _Header] = {}
@@ -147,11 +147,13 @@ class _Archive(Mapping[str, np.ndarray]):
         return len(self._headers)
 
     def close(self) -> None:
+        """No entry is read any more."""
         for header in self._headers.values():
             header.stream.close()
         self._zip.close()
 
     def scalar(self, name: str) -> Any:
+        """The one value of an entry."""
         value = self[name]
         if value.size != 1:
             raise InputError(f"{self.path}: entry {name!r} has shape {value.shape}; one value is needed")
@@ -185,14 +187,8 @@ def _npy_header(stream: IO[bytes], size: int) -> _Header:
 
 
 def read(path: str | os.PathLike[str], *, max_bytes: int = MAX_BYTES) -> Stored:
-    """A problem from an .npz archive of any layout that `docs/formats.md` lists.
-
-    Raises
-    ------
-    InputError
-        Truncated, foreign or inconsistent; the message names the entry.
-    """
-    archive = _Archive(path, max_bytes)
+    """A problem from an .npz archive of any layout that `docs/formats.md` lists."""
+    archive = Archive(path, max_bytes)
     try:
         if "lavender_format" in archive:
             return _read_own(archive)
@@ -219,8 +215,7 @@ def write(problem: Problem, path: str | os.PathLike[str], *, impulse: Any = None
 
     `read(path).problem == problem`, bit for bit.
     """
-    if not isinstance(problem, Problem):
-        raise InputError(f"problem is a {type(problem).__name__}; a lavender.Problem is needed")
+    check_problem(problem)
     arrays: dict[str, Any] = {"lavender_format": np.int64(VERSION), "b": problem.b}
     for name in CONES:
         arrays[name] = getattr(problem.cones, name.removeprefix("cones_"))
@@ -272,7 +267,7 @@ def write(problem: Problem, path: str | os.PathLike[str], *, impulse: Any = None
     write_atomically(path, write_to)
 
 
-def _read_own(archive: _Archive) -> Stored:
+def _read_own(archive: Archive) -> Stored:
     version = archive.scalar("lavender_format")
     if version != VERSION or isinstance(version, bool):
         raise InputError(
@@ -312,7 +307,7 @@ def _read_own(archive: _Archive) -> Stored:
     return Stored(problem, "lavender", impulse=_vector(archive, "impulse", problem))
 
 
-def _meta(archive: _Archive) -> dict[str, Any]:
+def _meta(archive: Archive) -> dict[str, Any]:
     try:
         meta = json.loads(archive["meta"].astype(np.uint8, casting="safe").tobytes())
     except (ValueError, TypeError, RecursionError) as error:
@@ -335,7 +330,7 @@ def _meta(archive: _Archive) -> dict[str, Any]:
     return meta
 
 
-def _generalized(archive: _Archive, names: list[str] | None) -> Generalized:
+def _generalized(archive: Archive, names: list[str] | None) -> Generalized:
     v_free = archive["general_v_free"]
     n, m = v_free.size, archive["b"].size
     jac, mass = (
@@ -355,7 +350,7 @@ def _is_names(value: Any) -> bool:
     return value is None or (isinstance(value, list) and all(isinstance(name, str) for name in value))
 
 
-def _check_entries(archive: _Archive, needed: Collection[str], optional: Collection[str]) -> None:
+def _check_entries(archive: Archive, needed: Collection[str], optional: Collection[str]) -> None:
     missing = [name for name in needed if name not in archive]
     if missing:
         raise InputError(f"entries {', '.join(missing)} are missing; the file is not complete")
@@ -367,7 +362,7 @@ def _check_entries(archive: _Archive, needed: Collection[str], optional: Collect
 # -- plain box format and the benchmark generator's -----------------------------------------------
 
 
-def _read_box(archive: _Archive) -> Stored:
+def _read_box(archive: Archive) -> Stored:
     """w = A l - b, lo <= l <= hi complementary to w; rows of a friction cone are one contact."""
     b = archive["b"]
     if b.ndim != 1:
@@ -384,7 +379,7 @@ def _read_box(archive: _Archive) -> Stored:
     )
 
 
-def _box_cones(archive: _Archive, m: int) -> Cones:
+def _box_cones(archive: Archive, m: int) -> Cones:
     lower, upper = (_numbers(archive, name, (m,)) for name in ("lo", "hi"))
     if "cone_start" not in archive or archive["cone_start"].size == 0:
         return Cones.bounded(lower, upper)
@@ -417,7 +412,7 @@ def _box_cones(archive: _Archive, m: int) -> Cones:
     )
 
 
-def _read_generated(archive: _Archive) -> Stored:
+def _read_generated(archive: Archive) -> Stored:
     """Layout of a benchmark generator: A, b, and `kind` lcp (l >= 0), free, or cone (3 rows per contact)."""
     kind = archive.scalar("kind")
     b = archive["b"]
@@ -435,7 +430,7 @@ def _read_generated(archive: _Archive) -> Stored:
     return Stored(problem, "generated")
 
 
-def _numbers(archive: _Archive, name: str, shape: tuple[int, ...]) -> np.ndarray:
+def _numbers(archive: Archive, name: str, shape: tuple[int, ...]) -> np.ndarray:
     value = archive[name]
     if value.dtype.kind not in "buif" or value.shape != shape:
         raise InputError(
@@ -444,11 +439,11 @@ def _numbers(archive: _Archive, name: str, shape: tuple[int, ...]) -> np.ndarray
     return value
 
 
-def _vector(archive: _Archive, name: str, problem: Problem) -> FloatArray | None:
+def _vector(archive: Archive, name: str, problem: Problem) -> FloatArray | None:
     return problem.impulse_array(archive[name], f"entry {name!r}") if name in archive else None
 
 
-def _matrix(archive: _Archive) -> Any:
+def _matrix(archive: Archive) -> Any:
     """Dense `A`, or compressed rows whose every index has been checked."""
     if "A" in archive:
         return archive["A"]
@@ -460,13 +455,7 @@ def _matrix(archive: _Archive) -> Any:
 
 
 def compressed(indptr: np.ndarray, indices: np.ndarray, data: np.ndarray, m: int, n: int) -> sp.csr_array:
-    """CSR matrix (m, n) of arrays from a file; `data` may be longer than the pointers say.
-
-    Raises
-    ------
-    InputError
-        Pointers that do not start with 0 or decrease, indices outside the matrix, wrong lengths.
-    """
+    """CSR matrix (m, n) of arrays from a file; `data` may be longer than the pointers say."""
     for what, x, kinds in (("pointers", indptr, "iu"), ("indices", indices, "iu"), ("values", data, "buif")):
         if x.ndim != 1 or x.dtype.kind not in kinds:
             raise InputError(

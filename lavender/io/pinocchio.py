@@ -14,14 +14,13 @@ A contact's z axis points from the first joint's side to the second's: w > 0 alo
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
 
-from lavender._arrays import as_array
+from lavender._arrays import as_array, number
 from lavender.cones import Cones
 from lavender.errors import CapabilityError, InputError, LavenderError
 from lavender.problem import Problem
@@ -89,21 +88,7 @@ def from_pinocchio(
         raise InputError(
             f"got a {type(model).__name__} and a {type(data).__name__}; a pinocchio.Model and its Data are needed"
         )
-    for word, given in (("models", constraint_models), ("data", constraint_datas)):
-        if not (hasattr(given, "__len__") and hasattr(given, "__iter__")):
-            raise InputError(f"constraint {word}: got a {type(given).__name__}; a sequence is needed")
-    if len(constraint_models) != len(constraint_datas):
-        raise InputError(
-            f"{len(constraint_datas)} constraint data for {len(constraint_models)} models; one for each is needed"
-        )
-    try:
-        dt, correction = float(dt), float(correction)
-    except (TypeError, ValueError):
-        raise InputError(f"dt is {dt!r}, correction {correction!r}; numbers are needed") from None
-    if not 0.0 < dt < math.inf or not 0.0 <= correction <= 1.0:
-        raise InputError(
-            f"dt is {dt:g} s, correction {correction:g}; a time above 0 and a share in [0, 1] are needed"
-        )
+    dt, correction = _check_given(constraint_models, constraint_datas, dt, correction)
     _check_model(model, data)
     nv = int(model.nv)
     q = np.array(as_array("q", q, (int(model.nq),)))
@@ -113,17 +98,7 @@ def from_pinocchio(
         raise InputError(
             "q holds a rotation that is none: pinocchio.normalize(model, q) makes quaternions unit ones"
         )
-    with told("Pinocchio", OTHER_MODEL):
-        a = np.array(pin.aba(model, data, q, v, tau))
-        force = tau - np.array(pin.nle(model, data, q, v))
-        upper = np.triu(np.array(pin.crba(model, data, q)))
-    mass = upper + np.triu(upper, 1).T
-    if np.abs(mass @ a - force).max(initial=0.0) > UNSEEN * float(
-        (np.abs(mass) @ np.abs(a) + np.abs(force)).max()
-    ):
-        raise CapabilityError(
-            "M aba(q, v, tau) differs from tau - nle(q, v): these are not accelerations of this M"
-        )
+    mass, a = _mass_and_acceleration(pin, model, data, q, v, tau)
     with told("Pinocchio", OTHER_MODEL):
         pin.forwardKinematics(model, data, q, v)
         pin.computeJointJacobians(model, data, q)
@@ -154,6 +129,30 @@ def from_pinocchio(
         names=names,
         name=name,
     )
+
+
+def _check_given(models: Any, datas: Any, dt: Any, correction: Any) -> tuple[float, float]:
+    for word, given in (("models", models), ("data", datas)):
+        if not (hasattr(given, "__len__") and hasattr(given, "__iter__")):
+            raise InputError(f"constraint {word}: got a {type(given).__name__}; a sequence is needed")
+    if len(models) != len(datas):
+        raise InputError(f"{len(datas)} constraint data for {len(models)} models; one for each is needed")
+    return number("dt", dt, above=0.0), number("correction", correction, low=0.0, high=1.0)
+
+
+def _mass_and_acceleration(pin: Any, model: Any, data: Any, q: Any, v: Any, tau: Any) -> tuple[Any, Any]:
+    with told("Pinocchio", OTHER_MODEL):
+        a = np.array(pin.aba(model, data, q, v, tau))
+        force = tau - np.array(pin.nle(model, data, q, v))
+        upper = np.triu(np.array(pin.crba(model, data, q)))
+    mass = upper + np.triu(upper, 1).T
+    if np.abs(mass @ a - force).max(initial=0.0) > UNSEEN * float(
+        (np.abs(mass) @ np.abs(a) + np.abs(force)).max()
+    ):
+        raise CapabilityError(
+            "M aba(q, v, tau) differs from tau - nle(q, v): these are not accelerations of this M"
+        )
+    return mass, a
 
 
 @contextmanager

@@ -14,7 +14,7 @@ from zipfile import BadZipFile
 
 import numpy as np
 
-from lavender._arrays import FloatArray, as_array
+from lavender._arrays import FloatArray, as_array, whole_number
 from lavender.errors import InputError, LavenderError
 from lavender.io import mujoco as adapter
 from lavender.io import npz
@@ -93,9 +93,7 @@ def record(
         recording.
     """
     mj = adapter._mujoco(model, data)
-    for word, value in (("steps", steps), ("every", every)):
-        if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
-            raise InputError(f"{word} is {value!r}; a whole number from 1 is needed")
+    steps, every = whole_number("steps", steps, 1), whole_number("every", every, 1)
     if precision not in PRECISIONS:
         raise InputError(f"precision is {precision!r}; {' or '.join(map(repr, PRECISIONS))} is needed")
     drive = _drive(model, control, seed)
@@ -145,19 +143,10 @@ def record_file(
     folder: str | os.PathLike[str],
     steps: int,
     *,
-    every: int = 1,
     control: Control = "zero",
-    seed: int = 0,
-    replace: bool = False,
-    precision: str = "float64",
+    **options: Any,
 ) -> Recording:
-    """`record` of a model by its file (MJCF); an array of controls may be given by its file (.npy), too.
-
-    Raises
-    ------
-    InputError
-        As `record`; MuJoCo cannot be imported, or cannot read the model; the controls cannot be read.
-    """
+    """`record` of a model by its file (MJCF); an array of controls may be given by its file (.npy), too."""
     try:
         import mujoco as mj
     except ImportError:
@@ -168,17 +157,7 @@ def record_file(
         raise InputError(f"{os.fspath(path)}: {error}") from None
     if isinstance(control, str) and control not in CONTROLS:
         control = _controls(control)
-    found = record(
-        made,
-        mj.MjData(made),
-        folder,
-        steps,
-        every=every,
-        control=control,
-        seed=seed,
-        replace=replace,
-        precision=precision,
-    )
+    found = record(made, mj.MjData(made), folder, steps, control=control, **options)
     if not found.files:
         raise InputError(
             f"{os.fspath(path)}: no step had a constraint that could be kept: more steps, or other controls"
@@ -188,7 +167,7 @@ def record_file(
 
 def _controls(path: str) -> Any:
     try:
-        first_bytes(Path(path))  # of a regular file
+        first_bytes(path)  # of a regular file
         found = np.load(
             path, mmap_mode="r", allow_pickle=False
         )  # as long as the file is, whatever its head says

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import stat
 from collections.abc import Callable, Mapping
@@ -10,9 +11,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from threading import get_native_id
 from types import MappingProxyType
-from typing import Any, BinaryIO
+from typing import Any
 
-from lavender._arrays import FloatArray
+from lavender._arrays import FloatArray, whole_number
 from lavender.errors import InputError
 from lavender.problem import Problem
 
@@ -43,16 +44,7 @@ class Stored:
 def folder_for_steps(path: str | os.PathLike[str], replace: bool = False) -> Path:
     """A folder, made where it is not, that holds no problem file: steps of two recordings are no sequence.
 
-    Parameters
-    ----------
-    path : path
-    replace : bool
-        Take the problem files out that it holds.
-
-    Raises
-    ------
-    InputError
-        It holds problem files and `replace` is False, or it cannot be made or written.
+    `replace` takes the problem files out that it holds.
     """
     folder = Path(path)
     try:
@@ -73,10 +65,7 @@ def folder_for_steps(path: str | os.PathLike[str], replace: bool = False) -> Pat
 def destination(path: str | os.PathLike[str]) -> Path:
     """Where a file of that path is written: behind its symbolic links, a regular file or a new one.
 
-    Raises
-    ------
-    InputError
-        A folder, a pipe, a socket or a device, which is never replaced; links without end.
+    InputError for a folder, a pipe, a socket or a device, which is never replaced, and for links without end.
     """
     try:
         target = Path(os.path.realpath(path))
@@ -99,12 +88,6 @@ def write_atomically(path: str | os.PathLike[str], write: Callable[[Path], Any])
     """Call `write` with a path beside `path`, then rename: readers see the old file or the new one.
 
     Symbolic links are followed: the file behind them is replaced, they stay.
-
-    Raises
-    ------
-    InputError
-        The folder does not exist or cannot be written, the path is a folder, a pipe or a device (see `destination`),
-        the disk is full.
     """
     target = destination(path)
     temporary = target.with_name(f".{target.name}.{os.getpid()}.{get_native_id()}.part")
@@ -122,35 +105,17 @@ def write_atomically(path: str | os.PathLike[str], write: Callable[[Path], Any])
 
 
 def write_bytes(path: str | os.PathLike[str], data: bytes) -> None:
-    """`write_atomically` of bytes.
-
-    Raises
-    ------
-    InputError
-        As `write_atomically`.
-    """
+    """`write_atomically` of bytes."""
     write_atomically(path, lambda part: part.write_bytes(data))
 
 
 def write_text(path: str | os.PathLike[str], text: str) -> None:
-    """`write_atomically` of a text.
-
-    Raises
-    ------
-    InputError
-        As `write_atomically`.
-    """
+    """`write_atomically` of a text."""
     write_bytes(path, text.encode())
 
 
 def write_figure(canvas: Any, path: str | os.PathLike[str], **how: Any) -> None:
-    """`write_atomically` of a figure of matplotlib, whose format the suffix says; png without one.
-
-    Raises
-    ------
-    InputError
-        As `write_atomically`; a suffix that matplotlib does not know.
-    """
+    """`write_atomically` of a figure of matplotlib, whose format the suffix says; png without one."""
     path = Path(path)
     path = path if path.suffix else path.with_name(path.name + ".png")
     try:
@@ -162,13 +127,7 @@ def write_figure(canvas: Any, path: str | os.PathLike[str], **how: Any) -> None:
 
 
 def as_path(path: str | os.PathLike[str]) -> Path:
-    """A path; numbers, which the operating system takes for open files, are refused.
-
-    Raises
-    ------
-    InputError
-        Not a text or a path, or not one that a file can have.
-    """
+    """A path; numbers, which the operating system takes for open files, are refused."""
     if not isinstance(path, (str, os.PathLike)) or not isinstance(os.fspath(path), str):
         raise InputError(f"path is {path!r} ({type(path).__name__}); the path of a file as text is needed")
     if "\0" in os.fspath(path):
@@ -176,68 +135,52 @@ def as_path(path: str | os.PathLike[str]) -> Path:
     return Path(path)
 
 
-def first_bytes(path: Path, count: int = 8) -> bytes:
-    """The first bytes of a file.
-
-    Raises
-    ------
-    InputError
-        The file does not exist, is no regular file (reading a pipe would wait), or cannot be read.
-    """
+def first_bytes(path: str | os.PathLike[str], count: int = 8, what: str = "") -> bytes:
+    """The first bytes of a regular file, all of them with `count` -1; reading a pipe would wait."""
+    named = f"{what} {str(path)!r}" if what else path
     try:
-        if not stat.S_ISREG(path.stat().st_mode):
-            what = "a folder" if path.is_dir() else "a pipe, a socket or a device"
-            raise InputError(f"cannot read {path}: it is {what}; a file is needed")
-        stream: BinaryIO
+        found = os.stat(path)
+        if not stat.S_ISREG(found.st_mode):
+            kind = "a folder" if stat.S_ISDIR(found.st_mode) else "a pipe, a socket or a device"
+            raise InputError(f"cannot read {named}: it is no file but {kind}; a file is needed")
+        if count < 0 and found.st_size > MAX_BYTES:
+            raise InputError(f"cannot read {named}: it holds {found.st_size} bytes, more than {MAX_BYTES}")
         with open(path, "rb") as stream:
             return stream.read(count)
     except (OSError, ValueError) as error:
         if isinstance(error, InputError):
             raise
-        raise InputError(f"cannot read {path}: {getattr(error, 'strerror', None) or error}") from None
+        raise InputError(f"cannot read {named}: {getattr(error, 'strerror', None) or error}") from None
 
 
-def whole_file(path: str | os.PathLike[str], what: str, max_bytes: int = MAX_BYTES) -> bytes:
-    """All bytes of a regular file of at most so many.
+def whole_file(path: str | os.PathLike[str], what: str) -> bytes:
+    """All bytes of a regular file of at most 2 GiB."""
+    return first_bytes(path, -1, what)
 
-    Raises
-    ------
-    InputError
-        The file does not exist, is no regular file, is larger, or cannot be read.
-    """
-    try:
-        found = os.stat(path)
-        if not stat.S_ISREG(found.st_mode):  # a pipe or a device has no end
-            raise InputError(f"cannot read {what} {str(path)!r}: it is no file")
-        if found.st_size > max_bytes:
-            raise InputError(
-                f"cannot read {what} {str(path)!r}: it holds {found.st_size} bytes, more than {max_bytes}"
-            )
-        return Path(path).read_bytes()
-    except (OSError, ValueError) as error:
-        if isinstance(error, InputError):
-            raise
-        raise InputError(
-            f"cannot read {what} {str(path)!r}: {getattr(error, 'strerror', None) or error}"
-        ) from None
+
+def framed(magic: bytes, header: Mapping[str, Any]) -> bytes:
+    """The beginning of a file: a magic word, the length of a JSON header (8 bytes, little-endian), the header."""
+    head = json.dumps(header).encode()
+    return magic + len(head).to_bytes(8, "little") + head
+
+
+def unframed(data: bytes, magic: bytes, most: int) -> tuple[Any, int]:
+    """The header of such a file, of at most `most` bytes, and where the rest begins; ValueError where there is none."""
+    start = len(magic) + 8
+    end = start + int.from_bytes(data[len(magic) : start], "little")
+    if not data.startswith(magic) or not start < end <= min(len(data), start + most):
+        raise ValueError("header")
+    return json.loads(data[start:end]), end
 
 
 class Budget:
     """Bytes that a file may still make; spent before anything is allocated."""
 
     def __init__(self, max_bytes: int) -> None:
-        if isinstance(max_bytes, bool) or not isinstance(max_bytes, int) or max_bytes < 0:
-            raise InputError(f"max_bytes is {max_bytes!r}; a whole number of bytes is needed")
-        self.limit = self.left = max_bytes
+        self.limit = self.left = whole_number("max_bytes", max_bytes, high=None)
 
     def spend(self, count: int, what: str) -> None:
-        """Take `count` bytes off for `what`.
-
-        Raises
-        ------
-        InputError
-            More than is left.
-        """
+        """Take `count` bytes off for `what`."""
         self.left -= count
         if self.left < 0:
             raise InputError(

@@ -8,9 +8,18 @@ lv.motions(problem).spread                             # m/s that Coulomb's law 
 """
 
 from lavender.motion.bound import Witness
-from lavender.motion.error import MotionError, measure, motion_error, nearest
+from lavender.motion.error import MotionError, measure
 from lavender.motion.reference import Reference, adopt, reference
-from lavender.motion.several import Motion, Motions, branch, distance, motions, motions_of
+from lavender.motion.several import (
+    Motion,
+    Motions,
+    branch,
+    distance,
+    motion_error,
+    motions,
+    motions_of,
+    nearest,
+)
 from lavender.motion.stored import load_reference, save_reference
 from lavender.motion.unique import uniqueness
 

@@ -5,20 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from lavender._arrays import FloatArray
-from lavender.errors import InputError
 from lavender.motion.bound import difference
 from lavender.motion.operator import U
-from lavender.motion.reference import Reference, as_reference, kept
-from lavender.motion.reference import reference as reference_of
+from lavender.motion.reference import Reference, kept
 from lavender.problem import Problem
-
-if TYPE_CHECKING:
-    from lavender.motion.several import Motions
 
 # Motions nearer than this are one, as a share of the constraints' own motion: a residual of 1e-10 moves by up to
 # 1e-7 of it on the worst conditioned piles of the suite.
@@ -28,7 +23,7 @@ NUMBERS = (
     "kinetic", "energy", "speed", "spin", "rows", "bound", "bound_speed", "bound_spin", "moved",
 )  # fmt: skip
 
-__all__ = ["MotionError", "motion_error"]
+__all__ = ["MotionError", "measure", "told"]
 
 
 @dataclass(frozen=True)
@@ -97,92 +92,16 @@ class MotionError:
         return f"motion error: {', '.join(parts)}"
 
 
-def motion_error(problem: Problem, impulse: Any, reference: Any = None) -> MotionError:
-    """How wrong the motion of an impulse is: its distance to the solution, with a bound.
-
-    With lambda* the reference and M^-1 J^T (lambda - lambda*) the difference dv of body velocities,
-
-        kinetic = sqrt(1/2 dv.M dv)        energy = sqrt(1/2 (lambda - lambda*).A (lambda - lambda*))
-
-    so that two impulses which differ by what moves nothing (a table on four legs) are at distance 0. The
-    bound needs no trust in the reference: with e the judge's error of lambda* and targets moved by d e,
-    the solution is within sqrt(1/2) |e|_A of it (proof in `lavender.motion.bound`).
-
-    Parameters
-    ----------
-    problem : Problem
-    impulse : (m,) N s
-    reference : (m,) N s, Solution or Reference, optional
-        What stands for the solution. Default: what `auto` finds at the floor, solved for once and kept
-        with the problem; under Coulomb's law the nearest of the motions that `lavender.motions` finds and of the
-        one that the impulse itself leads to.
-
-    Returns
-    -------
-    MotionError
-        No estimate where the reference is no solution (relative above 1e-10 and above twice its floor); no
-        energies where A is asymmetric or indefinite; no bound under Coulomb's law. `note` says so.
-
-    Raises
-    ------
-    InputError
-        An impulse or reference of the wrong length, or one that is not finite.
-    CapabilityError
-        Generalised coordinates in which M couples more than 2000 velocities.
-    """
-    if not isinstance(problem, Problem):
-        raise InputError(f"problem is a {type(problem).__name__}; a lavender.Problem is needed")
-    x = problem.on_disk(problem.impulse_array(impulse))
-    if problem.cones.has_ellipse:  # rows are those of its disks
-        if reference is not None and not isinstance(reference, Reference):
-            given = problem.impulse_array(getattr(reference, "impulse", reference), "reference")
-            reference = problem.on_disk(given)
-        problem = problem.disk
-    with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is told in `note`
-        if reference is not None:
-            return measure(problem, x, as_reference(problem, reference))
-        if problem.law != "coulomb":
-            return measure(problem, x, reference_of(problem))
-        from lavender.motion.several import motions_of
-
-        return nearest(problem, x, motions_of(problem))
-
-
-def nearest(problem: Problem, x: FloatArray, found: Motions) -> MotionError:
-    """The distance of an impulse x (m,) to the nearest of several motions, and of the one that it leads to."""
-    from lavender.motion.several import branch, distance
-
-    references = [motion.reference for motion in found]
-    spread, energy = found.spread, found.spread_energy
-    if not found.unique:
-        own = branch(problem, x)
-        far = [distance(problem, own.impulse, motion.impulse) for motion in found]
-        if own.accepted and all(d.share > SAME for d in far):
-            references.append(own)
-            spread = max([spread, *(d.speed for d in far)])
-            energy = None if energy is None else max([energy, *(d.energy for d in far)])
-    if not references:
-        return measure(problem, x, reference_of(problem))
-    best = min((measure(problem, x, reference) for reference in references), key=_distance)
-    made = replace(best, spread=energy, spread_speed=spread, count=len(references), unique=found.unique)
-    return _told(made, ("spread", "spread_speed"))
-
-
-def _distance(error: MotionError) -> float:
-    known = error.energy if error.energy is not None else error.rows
-    return math.inf if known is None else known
-
-
 def measure(problem: Problem, x: FloatArray, reference: Reference) -> MotionError:
     """The distance of an impulse x (m,) [N s] to one reference; None for what float64 cannot hold, as `note` says."""
-    found = _told(_measured(problem, x, reference), NUMBERS)
+    found = told(_measured(problem, x, reference), NUMBERS)
     if found.relative == math.inf:
         words = "relative to next to nothing, as the solution moves no more"
         return replace(found, note="; ".join(n for n in (found.note, words) if n))
     return found
 
 
-def _told(found: MotionError, names: Sequence[str]) -> MotionError:
+def told(found: MotionError, names: Sequence[str]) -> MotionError:
     """None in the place of numbers that float64 cannot hold, which `note` names."""
     beyond = [n for n in names if (value := getattr(found, n)) is not None and not math.isfinite(value)]
     if not beyond:

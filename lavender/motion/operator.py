@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
@@ -42,36 +42,39 @@ class Size:
     most: float  # no less than `energy` of any x within the fuzz, rounding included
 
 
-class Operator(Protocol):
-    """What both kinds of operator offer; x (m,) [N s]."""
+class Operator:
+    """What every kind of operator offers; x (m,) [N s]. Here what a matrix can tell: nothing of velocities."""
 
     def refusal(self) -> str | None:
         """Why (1) is no energy, or None where it is one."""
-        ...
+        raise NotImplementedError
 
     def slack(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         """w = A x - b (m,) [m/s] and a bound of its rounding."""
-        ...
+        raise NotImplementedError
 
     def size(self, x: FloatArray, fuzz: FloatArray) -> Size:
         """Energy norm of x, every entry known up to `fuzz` (m,)."""
-        ...
+        return _in_range(self._size, x, fuzz)
+
+    def _size(self, x: FloatArray, fuzz: FloatArray) -> Size:
+        raise NotImplementedError
 
     def velocity(self, x: FloatArray, fuzz: FloatArray) -> tuple[FloatArray, FloatArray] | None:
         """M^-1 J^T x, (n, 6) or (nv,) [m/s, rad/s], and a bound of what is lost in it; None where M is not known."""
-        ...
+        return None
 
     def lengths(self, velocity: FloatArray) -> tuple[FloatArray, FloatArray | None]:
         """Speed and spin of each body, or the size of each generalised velocity and None."""
-        ...
+        raise NotImplementedError
 
     def name(self, i: int) -> str:
         """Name of body or velocity i."""
-        ...
+        return ""
 
     def reach(self, energy: float) -> tuple[float, float | None] | None:
         """Largest speed and spin of any body (size of any velocity, None) at a kinetic energy of energy^2 [J]."""
-        ...
+        return None
 
 
 def make(problem: Problem) -> Operator:
@@ -81,7 +84,7 @@ def make(problem: Problem) -> Operator:
     return _Matrix(problem) if problem.generalized is None else _Velocities(problem)
 
 
-class _Factored:
+class _Factored(Operator):
     """J and M^-1, which is known up to `off` (same shape, or None where it is as stored)."""
 
     def __init__(self, problem: Problem, minv: sp.csr_array, off: sp.csr_array | None) -> None:
@@ -107,9 +110,6 @@ class _Factored:
         if self.off is not None:
             off += 1.01 * (self.size_of_jac @ (self.off @ g))
         return w, off
-
-    def size(self, x: FloatArray, fuzz: FloatArray) -> Size:
-        return _in_range(self._size, x, fuzz)
 
     def _size(self, x: FloatArray, fuzz: FloatArray) -> Size:
         g = self.jac_t @ x
@@ -218,7 +218,7 @@ class _Velocities(_Factored):
         return float(self.fast.max(initial=0.0)) * energy * (1.0 + 1e-9), None
 
 
-class _Matrix:
+class _Matrix(Operator):
     def __init__(self, problem: Problem) -> None:
         self.b = problem.b
         a = problem.csr
@@ -236,9 +236,6 @@ class _Matrix:
     def slack(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         return self.a @ x - self.b, self.of_slack * (self.size_of_a @ np.abs(x) + np.abs(self.b))
 
-    def size(self, x: FloatArray, fuzz: FloatArray) -> Size:
-        return _in_range(self._size, x, fuzz)
-
     def _size(self, x: FloatArray, fuzz: FloatArray) -> Size:
         y = np.abs(x)
         square = max(float(x @ (self.a @ x)), 0.0)
@@ -246,18 +243,6 @@ class _Matrix:
         wrong = float(fuzz @ (self.size_of_a @ fuzz))
         most = np.sqrt(0.5) * (np.sqrt(square + rounding) + np.sqrt(wrong)) * (1.0 + _gamma(len(x) + 64))
         return Size(None, float(np.sqrt(0.5 * square)), float(most))
-
-    def velocity(self, x: FloatArray, fuzz: FloatArray) -> tuple[FloatArray, FloatArray] | None:
-        return None
-
-    def lengths(self, velocity: FloatArray) -> tuple[FloatArray, FloatArray | None]:
-        raise NotImplementedError("a matrix knows no velocities")
-
-    def name(self, i: int) -> str:
-        return ""
-
-    def reach(self, energy: float) -> tuple[float, float | None] | None:
-        return None
 
 
 def _in_range(size: Callable[[FloatArray, FloatArray], Size], x: FloatArray, fuzz: FloatArray) -> Size:

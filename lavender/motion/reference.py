@@ -82,14 +82,7 @@ def kept(problem: Problem) -> Kept:
 def reference(problem: Problem) -> Reference:
     """The problem's reference; solved for by `auto` when first asked, then kept with the problem.
 
-    Parameters
-    ----------
-    problem : Problem
-
-    Returns
-    -------
-    Reference
-        The best that was found, also where it is no solution: ask `accepted`.
+    The best that was found, also where it is no solution: ask `accepted`.
     """
     own = kept(problem)
     if own.reference is None:
@@ -99,13 +92,7 @@ def reference(problem: Problem) -> Reference:
 
 
 def adopt(problem: Problem, impulse: Any, solver: str = "given") -> Reference:
-    """Judge an impulse (m,) [N s] and keep it as the problem's reference if it is better than the one kept.
-
-    Raises
-    ------
-    InputError
-        Wrong length, or not finite.
-    """
+    """Judge an impulse (m,) [N s] and keep it as the problem's reference if it is better than the one kept."""
     own = kept(problem)
     new = judged(problem, problem.impulse_array(impulse, "reference"), solver)
     if own.reference is None or new.residual.relative < own.reference.residual.relative:
@@ -124,13 +111,7 @@ def judged(problem: Problem, impulse: FloatArray, solver: str) -> Reference:
 
 
 def as_reference(problem: Problem, given: Any) -> Reference:
-    """A reference of what a caller gave: one already, a Solution, or an impulse (m,) [N s].
-
-    Raises
-    ------
-    InputError
-        Of another problem's length, or not finite.
-    """
+    """A reference of what a caller gave: one already, a Solution, or an impulse (m,) [N s]."""
     if isinstance(given, Reference):
         if given.impulse.shape != (problem.m,):
             raise InputError(f"the reference has {len(given.impulse)} rows; the problem has {problem.m}")

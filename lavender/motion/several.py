@@ -7,6 +7,7 @@ contacts with one tangent are enumerated whole (`lavender/motion/modes.py`).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
@@ -14,21 +15,31 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.sparse as sp
 
-from lavender._arrays import FloatArray
+from lavender._arrays import FloatArray, whole_number
 from lavender.cones import ROW, project
 from lavender.errors import CapabilityError, InputError, LavenderError
 from lavender.motion.bound import difference
-from lavender.motion.error import SAME
+from lavender.motion.error import SAME, MotionError, measure, told
 from lavender.motion.modes import enumerated
-from lavender.motion.reference import Reference, judged, kept
+from lavender.motion.reference import Reference, as_reference, judged, kept
 from lavender.motion.reference import reference as reference_of
 from lavender.motion.unique import uniqueness
-from lavender.problem import Problem
+from lavender.problem import Problem, check_problem
 from lavender.registry import available, get
 from lavender.residuals import residual
 from lavender.solve import solve
 
-__all__ = ["CHOICES", "Motion", "Motions", "Pick", "branch", "motions", "motions_of"]
+__all__ = [
+    "CHOICES",
+    "Motion",
+    "Motions",
+    "Pick",
+    "branch",
+    "motion_error",
+    "motions",
+    "motions_of",
+    "nearest",
+]
 
 RUNS = 12  # of a search, after `auto` itself
 SOLVERS = ("anderson", "newton", "sequential_impulses", "block_gauss_seidel", "admm", "nncg")
@@ -208,11 +219,8 @@ def motions(problem: Problem, n: int = RUNS, seed: int = 0, *, always: bool = Fa
     InputError
         `n` or `seed` is no whole number, or negative.
     """
-    if not isinstance(problem, Problem):
-        raise InputError(f"problem is a {type(problem).__name__}; a lavender.Problem is needed")
-    for name, value in (("n", n), ("seed", seed)):
-        if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 0:
-            raise InputError(f"{name} is {value!r}; a whole number from 0 is needed")
+    check_problem(problem)
+    n, seed = whole_number("n", n), whole_number("seed", seed, high=None)
     proof = uniqueness(problem)
     own = reference_of(problem)
     found = [(own, "auto")] if own.accepted else []
@@ -232,7 +240,7 @@ def motions(problem: Problem, n: int = RUNS, seed: int = 0, *, always: bool = Fa
         )
         whole |= modes[1] and len(single) <= MANY and max(beside, default=1.0) < BESIDE
     if always or not whole:
-        for label, impulse in _runs(problem, own, int(n), int(seed)):
+        for label, impulse in _runs(problem, own, n, seed):
             candidate = judged(problem, impulse, label)
             if candidate.accepted:
                 found.append((candidate, label))
@@ -398,3 +406,74 @@ def distance(problem: Problem, x: FloatArray, y: FloatArray) -> Distance:
         far = size.energy
         whole = max(operator.size(z, np.zeros(problem.m)).energy for z in (x, y))
     return Distance(fastest, far, far / whole if whole > 0.0 else (0.0 if far == 0.0 else np.inf))
+
+
+def motion_error(problem: Problem, impulse: Any, reference: Any = None) -> MotionError:
+    """How wrong the motion of an impulse is: its distance to the solution, with a bound.
+
+    With lambda* the reference and M^-1 J^T (lambda - lambda*) the difference dv of body velocities,
+
+        kinetic = sqrt(1/2 dv.M dv)        energy = sqrt(1/2 (lambda - lambda*).A (lambda - lambda*))
+
+    so that two impulses which differ by what moves nothing (a table on four legs) are at distance 0. The
+    bound needs no trust in the reference: with e the judge's error of lambda* and targets moved by d e,
+    the solution is within sqrt(1/2) |e|_A of it (proof in `lavender.motion.bound`).
+
+    Parameters
+    ----------
+    problem : Problem
+    impulse : (m,) N s
+    reference : (m,) N s, Solution or Reference, optional
+        What stands for the solution. Default: what `auto` finds at the floor, solved for once and kept
+        with the problem; under Coulomb's law the nearest of the motions that `lavender.motions` finds and of the
+        one that the impulse itself leads to.
+
+    Returns
+    -------
+    MotionError
+        No estimate where the reference is no solution (relative above 1e-10 and above twice its floor); no
+        energies where A is asymmetric or indefinite; no bound under Coulomb's law. `note` says so.
+
+    Raises
+    ------
+    InputError
+        An impulse or reference of the wrong length, or one that is not finite.
+    CapabilityError
+        Generalised coordinates in which M couples more than 2000 velocities.
+    """
+    check_problem(problem)
+    x = problem.on_disk(problem.impulse_array(impulse))
+    if problem.cones.has_ellipse:  # rows are those of its disks
+        if reference is not None and not isinstance(reference, Reference):
+            given = problem.impulse_array(getattr(reference, "impulse", reference), "reference")
+            reference = problem.on_disk(given)
+        problem = problem.disk
+    with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is told in `note`
+        if reference is not None:
+            return measure(problem, x, as_reference(problem, reference))
+        if problem.law != "coulomb":
+            return measure(problem, x, reference_of(problem))
+        return nearest(problem, x, motions_of(problem))
+
+
+def nearest(problem: Problem, x: FloatArray, found: Motions) -> MotionError:
+    """The distance of an impulse x (m,) to the nearest of several motions, and of the one that it leads to."""
+    references = [motion.reference for motion in found]
+    spread, energy = found.spread, found.spread_energy
+    if not found.unique:
+        own = branch(problem, x)
+        far = [distance(problem, own.impulse, motion.impulse) for motion in found]
+        if own.accepted and all(d.share > SAME for d in far):
+            references.append(own)
+            spread = max([spread, *(d.speed for d in far)])
+            energy = None if energy is None else max([energy, *(d.energy for d in far)])
+    if not references:
+        return measure(problem, x, reference_of(problem))
+    best = min((measure(problem, x, reference) for reference in references), key=_distance)
+    made = replace(best, spread=energy, spread_speed=spread, count=len(references), unique=found.unique)
+    return told(made, ("spread", "spread_speed"))
+
+
+def _distance(error: MotionError) -> float:
+    known = error.energy if error.energy is not None else error.rows
+    return math.inf if known is None else known

@@ -76,18 +76,10 @@ class Uniqueness:
 
 
 def uniqueness(problem: Problem) -> Uniqueness:
-    """Whether the motion that solves a problem is proved to be the only one.
+    """Whether the motion that solves a problem is proved to be the only one, by which criterion, or where none holds.
 
-    Parameters
-    ----------
-    problem : Problem
-        One with friction that is not small is solved by `auto`, once, for the last criterion.
-
-    Returns
-    -------
-    Uniqueness
-        With the criterion, or the first island for which none holds. Islands of more than 600 rows with
-        friction are not looked at.
+    A problem with friction that is not small is solved by `auto`, once, for the last criterion. Islands of more than
+    600 rows with friction are not looked at.
     """
     refusal = kept(problem).refusal
     if refusal:

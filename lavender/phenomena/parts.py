@@ -8,10 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from lavender._arrays import FloatArray
+from lavender._arrays import FloatArray, number, whole_number
 from lavender.errors import InputError, UnknownName
 from lavender.scene import Scene
-from lavender.scene.parts import number, whole
 
 __all__ = ["GRAVITY", "Parameter", "Phenomenon", "Quantity", "Record", "Track", "crossing"]
 
@@ -105,7 +104,7 @@ class Phenomenon:
             label = f"{name} of {self.name!r} ({p.text})"
             x = given.get(name, p.default)
             if isinstance(p.default, int):
-                found[name] = whole(label, x, int(p.low), int(p.high))
+                found[name] = whole_number(label, x, int(p.low), int(p.high))
             else:
                 found[name] = number(label, x, low=p.low, high=p.high)
         return found

@@ -9,7 +9,7 @@ Four files, each over the one before: `data.py` (fields and their checks), `oper
 `builders.py` (ways to make one), `problem.py` (`Problem` itself and its other forms).
 """
 
-from lavender.problem.data import FRICTION, LAWS, OPERATORS, PRECISIONS, Names
+from lavender.problem.data import FRICTION, LAWS, OPERATORS, PRECISIONS, Names, check_problem
 from lavender.problem.problem import Problem, VelocityForm
 
-__all__ = ["FRICTION", "LAWS", "OPERATORS", "PRECISIONS", "Names", "Problem", "VelocityForm"]
+__all__ = ["FRICTION", "LAWS", "OPERATORS", "PRECISIONS", "Names", "Problem", "VelocityForm", "check_problem"]

@@ -154,11 +154,6 @@ class Builders(Operators):
         >>> import lavender as lv
         >>> lv.Problem.findex_order([-1, -1, 0, 0, 1, 1]).tolist()  # all normals first, as Bullet has them
         [0, 2, 3, 1, 4, 5]
-
-        Raises
-        ------
-        InputError
-            As `from_findex`.
         """
         return order_of(findex)
 
@@ -319,11 +314,6 @@ class Builders(Operators):
             Default: float32 where J, M and v_free are arrays of float32; they are widened exactly.
         names, dof_names : sequence of str (k,), (nv,), optional
             Names of blocks and of velocities.
-
-        Raises
-        ------
-        InputError
-            As `Generalized` and `Problem`.
 
         Examples
         --------

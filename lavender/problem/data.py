@@ -10,7 +10,16 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from lavender._arrays import ArrayLike, FloatArray, as_array, check_not_negative, equal, read_only, table_of
+from lavender._arrays import (
+    ArrayLike,
+    FloatArray,
+    as_array,
+    as_csr,
+    check_not_negative,
+    equal,
+    read_only,
+    table_of,
+)
 from lavender._derived import Derived
 from lavender.cones import ROUND, ROW, Cones
 from lavender.errors import InputError
@@ -239,22 +248,8 @@ class ProblemData:
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, ProblemData):
             return NotImplemented
-        if not all(
-            equal(getattr(self, n), getattr(other, n))
-            for n in (
-                "b",
-                "cones",
-                "rows",
-                "generalized",
-                "friction",
-                "compliance",
-                "guess",
-                "key",
-                "names",
-                "name",
-                "precision",
-            )
-        ):
+        given = (f.name for f in fields(self) if f.init and f.name not in ("matrix", "copy"))
+        if not all(equal(getattr(self, name), getattr(other, name)) for name in given):
             return False
         if sp.issparse(self.matrix) and sp.issparse(other.matrix):
             return all(
@@ -289,6 +284,12 @@ class ProblemData:
         return table_of(facts, self.name or "Problem")
 
 
+def check_problem(problem: Any) -> None:
+    """Raise where what stands for a problem is none."""
+    if not isinstance(problem, ProblemData):
+        raise InputError(f"problem is a {type(problem).__name__}; a lavender.Problem is needed")
+
+
 def _many(n: int, what: str) -> str:
     return f"{n} {what}" if n == 1 else f"{n} {what}s"
 
@@ -299,30 +300,6 @@ def checked_matrix(matrix: Any, m: int, copy: bool) -> Any:
         return as_array("A", matrix, (m, m), unit="1/kg", copy=copy)
     if matrix.shape != (m, m):
         raise InputError(f"A has shape {matrix.shape}; ({m}, {m}) is needed, as b has {m} rows")
-    if matrix.nnz >= 2**31:
-        raise InputError(
-            f"A has {matrix.nnz} nonzeros, more than 32-bit indices reach; give J and M^-1 instead "
-            "(Problem.from_rows)"
-        )
-    if matrix.dtype.kind not in "buif":
-        raise InputError(f"A has dtype {matrix.dtype}; real numbers are needed")
-    given = sp.csr_array(matrix, copy=copy)
-    try:
-        given.check_format(full_check=True)  # kernels trust every index
-    except ValueError as error:
-        raise InputError(
-            f"A is not a valid compressed matrix ({error}); check its indices and pointers"
-        ) from None
-    as_array("A", given.data, (None,), unit="1/kg", copy=False)
-    return _canonical(given, m)
-
-
-def _canonical(a: sp.csr_array, m: int) -> sp.csr_array:
-    if not a.has_canonical_format:
-        a = a.copy()
-        a.sum_duplicates()
-    parts = [
-        read_only(np.ascontiguousarray(x, t))
-        for x, t in ((a.data, np.float64), (a.indices, np.int32), (a.indptr, np.int32))
-    ]
-    return sp.csr_array(tuple(parts), shape=(m, m))
+    return as_csr(
+        "A", matrix, copy=copy, unit="1/kg", too_many="; give J and M^-1 instead (Problem.from_rows)"
+    )

@@ -18,13 +18,7 @@ __all__ = ["arrays_of", "blocks_of", "order_of"]
 
 
 def order_of(findex: Any, count: int | None = None) -> IntArray:
-    """(m,) row of the arrays for each row of the problem: every normal, then those that follow it.
-
-    Raises
-    ------
-    InputError
-        A findex that is out of range, the row's own, or that of a row which follows another one itself.
-    """
+    """(m,) row of the arrays for each row of the problem: every normal, then those that follow it."""
     findex = as_array("findex", findex, (count,), dtype=np.int32)
     m = len(findex)
     rows = np.flatnonzero(findex >= 0)
@@ -103,13 +97,7 @@ def blocks_of(lower: Any, upper: Any, findex: Any, m: int) -> tuple[IntArray, Co
 
 
 def arrays_of(cones: Cones) -> tuple[FloatArray, FloatArray, IntArray]:
-    """lower, upper, findex (m,) of blocks.
-
-    Raises
-    ------
-    InputError
-        A disk, which has no bound for each tangent by itself.
-    """
+    """lower, upper, findex (m,) of blocks."""
     round_ = np.flatnonzero(cones.n_together > 1)
     if len(round_):
         raise InputError(

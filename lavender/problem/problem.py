@@ -292,13 +292,7 @@ class Problem(Builders):
         return VelocityForm(k, scale * self.b, self.compliance * scale**2, scale)  # type: ignore[operator]
 
     def save(self, path: str | PathLike[str], **more: Any) -> None:
-        """Write the problem to a file; `lavender.io.save`, whose options `more` are.
-
-        Raises
-        ------
-        InputError
-            The suffix is of no format, or the file cannot be written.
-        """
+        """Write the problem to a file; `lavender.io.save`, whose options `more` are."""
         from lavender.io import save
 
         save(self, path, **more)

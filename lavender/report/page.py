@@ -27,6 +27,7 @@ from lavender.report.text import count, residual, seconds, suspicions, times
 from lavender.report.verdict import Verdict, verdict
 
 if TYPE_CHECKING:
+    from lavender.bench.peers import Peers
     from lavender.report.engine import Contestant
 
 __all__ = ["page"]
@@ -62,6 +63,7 @@ def page(
     budgets: Sequence[float] = (),
     sweeps: Sequence[int] = (),
     saved: bool = True,
+    peers: Peers | None = None,
     engines: Sequence[Contestant] = (),
 ) -> str:
     """The whole page. Every text that came from a file, a problem or a backend is escaped.
@@ -79,14 +81,22 @@ def page(
         Budgets of sweeps of the recommendation.
     saved : bool
         The figures are beside the page as SVG and PNG.
+    peers : Peers, optional
+        Engines and solvers of others, whose figures are among `figures`.
     engines : sequence of Contestant
         Answers of the engines that recorded the steps.
     """
     environment = _environment()
+    rivals = None
+    if peers is not None:
+        from lavender.report.rivals import content as content_of_peers  # with the engine behind it
+
+        rivals = content_of_peers(peers)
     content = _content(records, figures, old, tuple(budgets), tuple(sweeps))
     return environment.get_template("index.html.j2").render(
         title=title,
         saved=saved,
+        peers=rivals,
         engines=engines,
         count=count,
         inf=math.inf,
@@ -178,6 +188,7 @@ def _drawings(records: Records, figures: Figures, found: Verdict) -> dict[str, A
         "moved_profiles": {law: _keys(some) for law, some in other.profiles.items()},
         "sequence_figures": {name: _keys(some) for name, some in figures.sequences.items()},
         "moved_sequences": {name: _keys(some) for name, some in other.sequences.items()},
+        "peer_figures": {place: _keys(some) for place, some in figures.peers.items()},
     }
 
 

@@ -11,9 +11,10 @@ from typing import Any
 
 import numpy as np
 
+from lavender._arrays import number, whole_number
 from lavender.errors import UnknownName
 from lavender.scene.arithmetic import frame_quaternion, norm, sine_cosine, turned
-from lavender.scene.parts import number, quaternion, rotation, whole
+from lavender.scene.parts import quaternion, rotation
 from lavender.scene.scene import SCENES, Scene, named_scene
 
 __all__ = ["SCENES"]
@@ -25,7 +26,7 @@ def stack(scene: Scene, n: int = 6, size: float = 1.0, mass: float = 1.0) -> Non
 
     Six unit boxes: 7 bodies, 24 contacts, 24 rows without friction and 72 with.
     """
-    whole("n", n, 1)
+    whole_number("n", n, 1)
     size = number("size", size, above=0.0)
     scene.add_plane()
     for i in range(n):
@@ -39,7 +40,7 @@ def pyramid(scene: Scene, base: int = 10, size: float = 1.0, mass: float = 1.0, 
     base 10: 55 boxes, 400 contacts; base 20: 210 boxes, 1,600 contacts. `gap` is the room between neighbours
     as a share of their size.
     """
-    whole("base", base, 1)
+    whole_number("base", base, 1)
     size, pitch = number("size", size, above=0.0), size * (1.0 + number("gap", gap, low=0.0))
     scene.add_plane()
     for row in range(base):
@@ -54,7 +55,7 @@ def card_house(scene: Scene, levels: int = 2, lean: float = 0.3) -> None:
 
     2 levels: 3 pairs, 1 card across, 7 cards; 3 levels: 15 cards. `lean` is the angle from upright.
     """
-    whole("levels", levels, 1)
+    whole_number("levels", levels, 1)
     lean = number("lean", lean, low=0.05, high=0.7)
     thick, width, tall, mass = 0.04, 0.7, 1.0, 0.2
     s, c = sine_cosine(lean)
@@ -89,7 +90,7 @@ def pile(scene: Scene, n: int = 100, kind: str = "spheres", size: float = 0.5, w
 
     1,000 spheres: some 2,500 contacts when they have come down. `seed` shakes the start.
     """
-    whole("n", n, 1)
+    whole_number("n", n, 1)
     size = number("size", size, above=0.0)
     if kind not in ("spheres", "boxes", "mixed"):
         raise UnknownName("kind of pile", kind, ("spheres", "boxes", "mixed"))
@@ -119,7 +120,7 @@ def chain(scene: Scene, n: int = 20, tip_mass: float = 1.0, length: float = 0.25
 
     3 n rows. `angle` is that of the straight chain from the vertical, at the start.
     """
-    whole("n", n, 1)
+    whole_number("n", n, 1)
     length = number("length", length, above=0.0)
     s, c = sine_cosine(angle)
     down = np.array([s, 0.0, -c])
@@ -144,7 +145,7 @@ def bridge(scene: Scene, n: int = 16, load: float = 10.0) -> None:
 
     5 (n + 1) joint rows and the contacts of the load.
     """
-    whole("n", n, 2)
+    whole_number("n", n, 2)
     planks = []
     for i in range(n):
         planks.append(
@@ -164,7 +165,7 @@ def heavy_on_light(scene: Scene, ratio: float = 100.0, n: int = 2) -> None:
 
     n = 2: 8 contacts.
     """
-    whole("n", n, 2)
+    whole_number("n", n, 2)
     ratio = number("ratio", ratio, above=0.0)
     scene.add_plane()
     for i in range(n):
@@ -177,7 +178,7 @@ def table(scene: Scene, legs: int = 9, top_mass: float = 10.0) -> None:
 
     9 legs: 10 bodies, 72 contacts. `legs` stand on a square grid, row by row.
     """
-    whole("legs", legs, 3)
+    whole_number("legs", legs, 3)
     side = int(np.ceil(np.sqrt(legs)))
     pitch = 0.8
     scene.add_plane()
@@ -217,8 +218,8 @@ def newtons_cradle(scene: Scene, n: int = 5, lifted: int = 1, angle: float = 0.6
 
     2 n rows of strings. `gap` separates the balls, so that impacts come in turn.
     """
-    whole("n", n, 2)
-    whole("lifted", lifted, 0, n)
+    whole_number("n", n, 2)
+    whole_number("lifted", lifted, 0, n)
     radius, string, apart = 0.25, 2.0, 0.5
     drop = np.sqrt(string * string - apart * apart)
     for i in range(n):

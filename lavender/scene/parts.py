@@ -12,8 +12,6 @@ from lavender.scene.arithmetic import norm, sine_cosine, turned_back
 
 __all__ = ["BALL", "DISTANCE", "HINGE", "Body", "Box", "Joint", "Plane", "Sphere"]
 
-Shape = "Plane | Sphere | Box"
-
 
 @dataclass(frozen=True)
 class Plane:
@@ -135,30 +133,6 @@ def numbers(what: str, value: object, n: int) -> FloatArray:
     if not np.isfinite(x).all():
         raise InputError(f"{what} must be finite; it is {x.tolist()}")
     return x
-
-
-def number(
-    what: str, value: object, *, low: float = -np.inf, high: float = np.inf, above: float | None = None
-) -> float:
-    """`value` as a finite float in [low, high], or above `above`."""
-    if isinstance(value, bool) or not isinstance(value, (int, float, np.integer, np.floating)):
-        raise InputError(f"{what} is {value!r}; a number is needed")
-    x = float(value)
-    if not np.isfinite(x):
-        raise InputError(f"{what} is {x}; a finite number is needed")
-    if above is not None and not x > above:
-        raise InputError(f"{what} is {x:g}; more than {above:g} is needed")
-    if x < low or x > high:
-        wanted = f"at least {low:g}" if high == np.inf else f"{low:g} to {high:g}"
-        raise InputError(f"{what} is {x:g}; {wanted} is needed")
-    return x
-
-
-def whole(what: str, value: object, low: int = 0, high: int = 2**31 - 1) -> int:
-    """`value` as an int in [low, high]."""
-    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or not low <= value <= high:
-        raise InputError(f"{what} is {value!r}; a whole number from {low} to {high} is needed")
-    return int(value)
 
 
 def unit(what: str, value: object) -> FloatArray:

@@ -12,11 +12,11 @@ from typing import Any
 
 import numpy as np
 
-from lavender._arrays import FloatArray
+from lavender._arrays import FloatArray, number, whole_number
 from lavender.cones import check_shape
 from lavender.errors import InputError, UnknownName
 from lavender.ordering import ENGINE_ORDERS
-from lavender.registry import get
+from lavender.registry import SolverSpec, get
 from lavender.scene import arithmetic
 from lavender.scene.parts import (
     BALL,
@@ -28,18 +28,24 @@ from lavender.scene.parts import (
     Plane,
     Sphere,
     normalised,
-    number,
     numbers,
     unit,
-    whole,
 )
-from lavender.scene.steppers import get_stepper
+from lavender.scene.steppers import StepperSpec, get_stepper
 
 __all__ = ["ON_FAILURE", "SCENES", "Parameters", "Scene", "named_scene"]
 
 SCENE_ORDERS = (*ENGINE_ORDERS, "alternating")  # alternating: contacts turned round every substep
 ON_FAILURE = ("use", "keep", "damp", "raise")
-MOST = {"restitution": 1.0, "friction": 1e100}  # the product of two coefficients of friction is finite
+RANGES: dict[str, dict[str, float]] = {  # of plain numbers
+    "dt": {"above": 0.0},
+    "friction": {"low": 0.0, "high": 1e100},  # the product of two coefficients of friction is finite
+    "restitution": {"low": 0.0, "high": 1.0},
+    **{
+        key: {"low": 0.0}
+        for key in ("patch_radius", "rolling_radius", "slop", "restitution_threshold", "margin")
+    },
+}
 MOST_SUBSTEPS = 10_000  # of a step where their number is not given; more are asked for by name
 MAX_SUBSTEP = 1.0 / 240.0  # s, within which four warm sweeps hold a stack
 MAX_BODIES = 2**24 - 1  # a contact's key has 24 bits for each body
@@ -81,48 +87,25 @@ class Parameters:
 
     def __post_init__(self) -> None:
         put = object.__setattr__
-        put(self, "dt", number("dt", self.dt, above=0.0))
+        for name, allowed in RANGES.items():
+            put(self, name, number(name, getattr(self, name), **allowed))
         gravity: Any = self.gravity
         if isinstance(gravity, (int, float)):
             gravity = (0.0, 0.0, -number("gravity", gravity))
         put(self, "gravity", tuple(numbers("gravity", gravity, 3).tolist()))
-        spec = get(self.solver)
-        if not isinstance(self.solver_options, Mapping):
-            raise InputError(f"solver_options is {self.solver_options!r}; a mapping is needed")
+        for name in ("solver_options", "stepper_options"):
+            options = getattr(self, name)
+            if not isinstance(options, Mapping):
+                raise InputError(f"{name} is {options!r}; a mapping is needed")
         put(self, "solver_options", dict(self.solver_options))
-        sweeps, own = self.solver_iterations, self.solver == "sequential_impulses"
-        stepper = get_stepper(self.stepper)
-        if not own and not stepper.solvers:
-            raise InputError(
-                f"stepper {stepper.name!r} takes no solver {self.solver!r}; leave solver= out, or take 'impulses'"
-            )
-        if not isinstance(self.stepper_options, Mapping):
-            raise InputError(f"stepper_options is {self.stepper_options!r}; a mapping is needed")
+        own, stepper = self.solver == "sequential_impulses", get_stepper(self.stepper)
+        put(self, "solver_iterations", self._sweeps(get(self.solver), stepper))
         put(self, "stepper_options", stepper.values(self.stepper_options))
         longest: Any = self.max_substep
         if longest is None:
             longest = MAX_SUBSTEP if own else self.dt
         put(self, "max_substep", number("max_substep", longest, above=0.0))
-        substeps: Any = self.substeps
-        if substeps is None:
-            ratio = self.dt / self.max_substep - 1e-9  # whole steps whatever their rounding
-            if ratio > MOST_SUBSTEPS:
-                raise InputError(
-                    f"dt is {self.dt:g} s, more than {MOST_SUBSTEPS} substeps of max_substep = {self.max_substep:g} s; "
-                    "give a shorter dt, a longer max_substep, or substeps= if that many are meant"
-                )
-            substeps = max(1, math.ceil(ratio))
-        put(self, "substeps", whole("substeps", substeps, 1))
-        if own:
-            if self.solver_options:
-                raise InputError(
-                    f"solver_options {sorted(self.solver_options)} are for other solvers; sequential_impulses "
-                    "takes order= and seed= of the scene"
-                )
-            sweeps = 16 if sweeps is None else whole("solver_iterations", sweeps, *stepper.sweeps)
-        elif sweeps is None:
-            sweeps = spec.max_iter
-        put(self, "solver_iterations", whole("solver_iterations", sweeps, 1))
+        put(self, "substeps", self._count_of_substeps())
         if not isinstance(self.warm_start, (bool, np.bool_)):
             raise InputError(f"warm_start is {self.warm_start!r}; True or False is needed")
         put(self, "warm_start", bool(self.warm_start))
@@ -135,35 +118,48 @@ class Parameters:
             raise InputError(
                 f"order={self.order!r} is for sequential_impulses; give {self.solver} its own in solver_options"
             )
-        for name in (
-            "friction",
-            "restitution",
-            "patch_radius",
-            "rolling_radius",
-            "slop",
-            "restitution_threshold",
-        ):
-            put(
-                self,
-                name,
-                number(name, getattr(self, name), low=0.0, high=MOST.get(name, np.inf)),
-            )
         if check_shape("friction_shape", self.friction_shape) == "box" and not stepper.boxes:
             raise InputError(
                 f"stepper {stepper.name!r} bounds friction by a disk: leave friction_shape out, or take 'impulses'"
             )
-        put(self, "margin", number("margin", self.margin, low=0.0))
         projections: Any = self.position_iterations
         if projections is None:
             projections = stepper.position_iterations
-        put(self, "position_iterations", whole("position_iterations", projections, 0, 1000))
+        put(self, "position_iterations", whole_number("position_iterations", projections, 0, 1000))
         if self.position_iterations and not stepper.position_iterations:
             raise InputError(
                 f"position_iterations is {projections}; stepper {stepper.name!r} has no position projection"
             )
-        put(self, "seed", whole("seed", self.seed))
+        put(self, "seed", whole_number("seed", self.seed))
         if self.on_failure not in ON_FAILURE:
             raise UnknownName("on_failure", self.on_failure, ON_FAILURE)
+
+    def _sweeps(self, spec: SolverSpec, stepper: StepperSpec) -> int:
+        given = self.solver_iterations
+        if self.solver != "sequential_impulses":
+            if not stepper.solvers:
+                raise InputError(
+                    f"stepper {stepper.name!r} takes no solver {self.solver!r}; leave solver= out, or take 'impulses'"
+                )
+            return whole_number("solver_iterations", spec.max_iter if given is None else given, 1)
+        if self.solver_options:
+            raise InputError(
+                f"solver_options {sorted(self.solver_options)} are for other solvers; sequential_impulses "
+                "takes order= and seed= of the scene"
+            )
+        return 16 if given is None else whole_number("solver_iterations", given, *stepper.sweeps)
+
+    def _count_of_substeps(self) -> int:
+        given: Any = self.substeps
+        if given is None:
+            ratio = self.dt / self.max_substep - 1e-9  # whole steps whatever their rounding
+            if ratio > MOST_SUBSTEPS:
+                raise InputError(
+                    f"dt is {self.dt:g} s, more than {MOST_SUBSTEPS} substeps of max_substep = {self.max_substep:g} s; "
+                    "give a shorter dt, a longer max_substep, or substeps= if that many are meant"
+                )
+            given = max(1, math.ceil(ratio))
+        return whole_number("substeps", given, 1)
 
 
 COMMON = tuple(f.name for f in fields(Parameters))
@@ -371,15 +367,9 @@ class Scene:
             quaternion=unit_q,
             velocity=v,
             angular_velocity=omega,
-            friction=None
-            if friction is None
-            else number(f"friction of {label}", friction, low=0.0, high=MOST["friction"]),
-            restitution=None
-            if restitution is None
-            else number(f"restitution of {label}", restitution, low=0.0, high=1.0),
-            patch_radius=None
-            if patch_radius is None
-            else number(f"patch_radius of {label} [m]", patch_radius, low=0.0),
+            friction=_given(f"friction of {label}", friction, **RANGES["friction"]),
+            restitution=_given(f"restitution of {label}", restitution, **RANGES["restitution"]),
+            patch_radius=_given(f"patch_radius of {label} [m]", patch_radius, low=0.0),
         )
         self.bodies.append(body)
         return number_
@@ -468,21 +458,12 @@ class Scene:
             raise InputError(
                 f"{label} joins {a} and {b}; two bodies are needed, at least one of them dynamic"
             )
-        hertz = number(f"hertz of {label}", hertz, low=0.0)
-        damping = number(f"damping of {label}", damping, low=0.0)
-        if kind == DISTANCE:
-            if anchor is not None or axis is not None:
-                raise InputError(f"{label} takes anchor_a and anchor_b, no anchor or axis")
-            pa, pb = (self._anchor(label, i, p) for i, p in ((a, anchor_a), (b, anchor_b)))
-            with np.errstate(over="ignore"):
-                far = arithmetic.norm(pb - pa)
-            length = number(f"length of {label} [m]", far if length is None else length, low=0.0)
-            if length == 0.0:
-                raise InputError(f"{label} has length 0; use a ball joint")
-        else:
-            if anchor is None or anchor_a is not None or anchor_b is not None or length is not None:
-                raise InputError(f"{label} takes anchor=, one world point, and no length")
-            pa = pb = numbers(f"anchor of {label} [m]", anchor, 3)
+        ends = (anchor, anchor_a, anchor_b, length)
+        pa, pb, length = (
+            self._distance_ends(label, (a, b), *ends, axis)
+            if kind == DISTANCE
+            else _common_point(label, *ends)
+        )
         if (axis is None) == (kind == HINGE):
             raise InputError(f"{label}: axis= goes with a hinge, and a hinge needs one")
         world_axis = unit(f"axis of {label}", axis) if kind == HINGE else np.array([0.0, 0.0, 1.0])
@@ -499,19 +480,28 @@ class Scene:
             anchor_b=self._local(label, b, pb),
             axis_a=world_axis if a < 0 else self.bodies[a].direction_to_local(world_axis),
             axis_b=world_axis if b < 0 else self.bodies[b].direction_to_local(world_axis),
-            length=length or 0.0,
-            hertz=hertz,
-            damping=damping,
-            motor_speed=None
-            if motor_speed is None
-            else number(f"motor_speed of {label} [rad/s]", motor_speed),
-            motor_torque=0.0
-            if motor_torque is None
-            else number(f"motor_torque of {label} [N m]", motor_torque, low=0.0),
+            length=length,
+            hertz=number(f"hertz of {label}", hertz, low=0.0),
+            damping=number(f"damping of {label}", damping, low=0.0),
+            motor_speed=_given(f"motor_speed of {label} [rad/s]", motor_speed),
+            motor_torque=_given(f"motor_torque of {label} [N m]", motor_torque, low=0.0) or 0.0,
             collide=bool(collide),
         )
         self.joints.append(joint)
         return len(self.joints) - 1
+
+    def _distance_ends(
+        self, label: str, bodies: tuple[int, int], anchor: Any, a: Any, b: Any, length: Any, axis: Any
+    ) -> tuple[FloatArray, FloatArray, float]:
+        if anchor is not None or axis is not None:
+            raise InputError(f"{label} takes anchor_a and anchor_b, no anchor or axis")
+        pa, pb = (self._anchor(label, i, p) for i, p in zip(bodies, (a, b), strict=True))
+        with np.errstate(over="ignore"):
+            far = arithmetic.norm(pb - pa)
+        length = number(f"length of {label} [m]", far if length is None else length, low=0.0)
+        if length == 0.0:
+            raise InputError(f"{label} has length 0; use a ball joint")
+        return pa, pb, length
 
     def _anchor(self, label: str, body: int, point: Any) -> FloatArray:
         if point is not None:
@@ -549,6 +539,19 @@ class Scene:
 
     def __repr__(self) -> str:
         return f"<Scene {self.name or 'by hand'!r}: {self.n_bodies} bodies, {self.n_joints} joints>"
+
+
+def _given(what: str, value: Any, **allowed: float) -> float | None:
+    return None if value is None else number(what, value, **allowed)
+
+
+def _common_point(
+    label: str, anchor: Any, a: Any, b: Any, length: Any
+) -> tuple[FloatArray, FloatArray, float]:
+    if anchor is None or a is not None or b is not None or length is not None:
+        raise InputError(f"{label} takes anchor=, one world point, and no length")
+    point = numbers(f"anchor of {label} [m]", anchor, 3)
+    return point, point, 0.0
 
 
 def _inertia(label: str, given: Any, shape: Any, mass: float) -> FloatArray:

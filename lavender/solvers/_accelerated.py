@@ -92,16 +92,16 @@ class Accelerated(Sweeping):
         self,
         state: AcceleratedState,
         impulse: FloatArray,
-        n: int,
+        max_iter: int,
         tol: float,
         time_limit: float | None = None,
     ) -> Claim:
-        """n iterations, or fewer where a check ends them."""
+        """`max_iter` iterations, or fewer where a check ends them."""
         o, data = state.order, state.data
         if state.first and (data.factored or data.is_general):
             measure.velocity_change(data, impulse, state.space[3])
         status, done, sweeps, restarts = accelerated.run(
-            data, state.watch, impulse, n, tol, state.memory, state.prepared, state.exact, state.convex,
+            data, state.watch, impulse, max_iter, tol, state.memory, state.prepared, state.exact, state.convex,
             state.space, o.blocks, o.split, o.mode, o.rng, self._keeps,
         )  # fmt: skip
         work = {"sweeps": sweeps, "restarts": restarts - state.restarts}

@@ -102,24 +102,22 @@ class Few:
 
     def solve(self, problem: Problem, impulse: FloatArray | None, tol: float) -> Any:
         """(what the judge finds, counts) from an impulse (m,) or from doing nothing; None where it is left."""
-        if not tol > 0.0:
-            return None
-        if problem.generalized is not None:
-            return None if self.gate is None else self._over_velocities(problem, impulse, tol)
-        chain = prepared(problem)
-        if chain is None or not (self.pivots if chain.pivots else self.sweeps):
-            return None
-        return chain.run(impulse, tol, self.looks, WARM, self.looks)
-
-    def _over_velocities(self, problem: Problem, impulse: FloatArray | None, tol: float) -> Any:
         kept = problem.derived
-        if problem.m == 0:
+        if not tol > 0.0 or problem.m == 0:
             return None
         if kept.vain is not None:
             at = (problem._start if impulse is None else impulse).tobytes()
             if kept.vain == (self.name, tol, at):
                 return None
-        found = solve_first(kept.view, impulse, tol, self.gate, general.ROOM)
+        if problem.generalized is not None:
+            if self.gate is None:
+                return None
+            found = solve_first(kept.view, impulse, tol, self.gate, general.ROOM)
+        else:
+            chain = prepared(problem)
+            if chain is None or not (self.pivots if chain.pivots else self.sweeps):
+                return None
+            found = chain.run(impulse, tol, self.looks, WARM, self.looks) or False
         if found is False:  # the steps of who solves it the long way need not come twice before
             kept.vain = (self.name, tol, (problem._start if impulse is None else impulse).tobytes())
         return found or None

@@ -10,7 +10,7 @@ from lavender._arrays import FloatArray, IntArray
 from lavender.certificates import check_certificate
 from lavender.deadline import Deadline
 from lavender.problem import Problem
-from lavender.residuals import at_floor, known, quick, reference
+from lavender.residuals import at_floor, judged, known, quick, reference, remember
 from lavender.solution import Claim, Status, Turn
 from lavender.solvers._few import said
 from lavender.solvers._islands import islands
@@ -27,23 +27,26 @@ class SolveLog:
 
     def __init__(self, problem: Problem, tol: float, budget: int, deadline: Deadline | None = None) -> None:
         self.problem, self.tol, self.budget, self.deadline = problem, tol, budget, deadline or Deadline()
-        left = self.deadline.left()
-        self.limit = np.inf if left is None else left  # s
         self.best, self.impulse = np.inf, problem.start()  # least relative residual, (m,) N s
         self.given: FloatArray | None = None  # (m,) N s, a start that doing nothing is better than
         self.turns: list[Turn] = []
         self.work: dict[str, int] = {}
         self.iterations = 0
         self.certificate: FloatArray | None = None  # (m,)
-        self.pace = 1.0  # s for each counted ns, times 1e9, as far as a time limit asks for it
+        self.pace = 0.0  # s for each counted ns, times 1e9, as far as a time limit asks for it; 0: not known
         self._w, self._e = np.empty(problem.m), np.empty(problem.m)
 
     def offer(self, impulse: FloatArray) -> float:
-        """Judge an impulse (m,) and keep it if it is the best."""
-        found = known(self.problem, impulse)
-        relative = quick(self.problem, impulse, self._w, self._e)[0] if found is None else found
+        """Judge an impulse (m,) and keep it if it is the best, for who judges the result as well."""
+        relative = known(self.problem, impulse)
+        impulse = impulse.copy()
+        if relative is None:
+            last = judged(self.problem, impulse)
+            relative = float(last.relative)
+            if relative < self.best:
+                remember(self.problem, last)
         if relative < self.best:
-            self.best, self.impulse = relative, impulse.copy()
+            self.best, self.impulse = relative, impulse
         return relative
 
     def note(self, name: str, claim: Claim, before: float) -> None:
@@ -86,7 +89,7 @@ class SolveLog:
 
     def ends_late(self, cost: float) -> bool:
         """What is counted for so long [ns] would end after the deadline, at the pace so far."""
-        return self.deadline.passed(1e-9 * self.pace * cost)
+        return self.deadline.passed(1e-9 * (self.pace or 1.0) * cost)
 
     @property
     def still(self) -> bool:

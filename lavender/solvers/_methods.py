@@ -12,33 +12,27 @@ import numpy as np
 
 from lavender._arrays import FloatArray
 from lavender.deadline import Stopwatch
+from lavender.problem import Problem
 from lavender.registry import SolverSpec, get
 from lavender.residuals import remember
 from lavender.solution import Claim, Status
 from lavender.solvers._accelerated import operator
-from lavender.solvers._few import WARM
 from lavender.solvers._log import SolveLog
 from lavender.solvers._newton import general
 from lavender.solvers._plan import BOTH_WAYS, METHODS, TABLE, Cost, Costs
-from lavender.solvers._schedule import AGAIN, GIVEN_UP, remainder
+from lavender.solvers._schedule import AGAIN, remainder
 from lavender.solvers._sweeping import STATUS
 from lavender.solvers.direct import Enough, Impatient
 from lavender.solvers.newton import NewtonState
 from lavender_ext.few.looks import Looks, sweeps_left
 
-__all__ = ["FIRST", "Candidate", "in_short_time", "make"]
+__all__ = ["FIRST", "Candidate", "Sweeps", "in_short_time", "make"]
 
 FIRST = 32  # sweeps before the first look at what they promise
-STEPS = (
-    64  # over velocities that the compiled call for few rows takes, and so does the first turn in its place
-)
-CLOCK = 0.01  # s between two looks at the clock, as counted
-CLOSEST = 1e-2  # of tol, to which the relaxation is solved where Coulomb's residual has not followed
-SHORT = 2e7  # ns of time left, below which sweeps come before anything is counted,
-LEAST = 1e6  # ns of them at most
-SURE = 4.0  # times its cost, that has to be left for a finite solver to come before any sweep
+SURE = 4.0  # times what a finite solver is expected to cost, that has to be left for it to begin
 ALL = 1e18  # ns: until the time is up
-SHARE = 0.7  # of the time that is left, between two looks at the clock
+CLOCK = 0.01  # s between two looks at the clock, as counted
+GROWTH = 8  # times the iterations of the last look at the clock, before the next
 
 
 class Candidate:
@@ -49,18 +43,16 @@ class Candidate:
     patient = False  # has another turn, though the last ended above the tolerance by itself
     others = np.inf  # least remainder of the others [ns]
 
-    def __init__(self, name: str, log: SolveLog, costs: Costs, spec: SolverSpec) -> None:
+    def __init__(self, name: str, log: Any, costs: Costs, spec: SolverSpec) -> None:
         self.name, self.log, self.costs, self.spec = name, log, costs, spec
         self.cost: Cost = costs.least(name)
         self.rest, self.counted = self.cost.total, False
-        self.expected = self.rest
         self.spent = 0.0  # ns, as counted
         self.state: Any = None
 
     def count(self) -> None:
         self.cost = self.costs.of(self.name)
         self.rest, self.counted = self.cost.total, True
-        self.expected = self.rest
 
     @property
     def shown(self) -> str:
@@ -89,10 +81,9 @@ class Candidate:
         last = setup + max(claim.iterations, 1) * self.cost.each
         self.spent += last
         self.rest = 2.0 * last if self.again else remainder(self.spent, self.promise())
-        more = claim.status is Status.MAX_ITERATIONS or self.patient
         if self.again and claim.iterations >= self.spec.max_iter:
             return False  # it would have no more the next time
-        return more and self.spent < GIVEN_UP * self.expected
+        return claim.status is Status.MAX_ITERATIONS or self.patient
 
     def turn(self, n: int) -> Claim:
         """At most n iterations; what came of them is offered to the log."""
@@ -106,7 +97,7 @@ class Candidate:
 class Resumed(Candidate):
     """A solver that goes on where it stood, in short runs for the clock and Ctrl-C: cut anywhere, the same bits."""
 
-    def __init__(self, name: str, log: SolveLog, costs: Costs, spec: SolverSpec) -> None:
+    def __init__(self, name: str, log: Any, costs: Costs, spec: SolverSpec) -> None:
         super().__init__(name, log, costs, spec)
         self.solver: Any = None
         self.impulse = np.empty(0)  # (m,) N s
@@ -121,28 +112,27 @@ class Resumed(Candidate):
 
     def turn(self, n: int) -> Claim:
         log = self.log
-        if self.state is None:
+        if not self.spent:
             self.begin()
         done, work, last = 0, dict[str, int](), Claim(Status.MAX_ITERATIONS, 0)
-        chunk = max(1, int(1e9 * CLOCK / self.cost.each))
+        step = max(1, int(1e9 * CLOCK / self.cost.each))
+        left = log.deadline.left()
+        if left is not None:
+            step = max(1, min(step, int(1e9 * left / self.cost.each)))
         while done < n and not (done and log.late):
-            step = min(chunk, n - done)
             watch = Stopwatch()
-            if log.deadline.is_set:
-                # The first share is one of the whole limit: what Python took before was not for nothing.
-                left = log.limit if log.iterations + done == 0 else log.deadline.left() or 0.0
-                step = max(1, min(step, int(SHARE * 1e9 * left / (log.pace * self.cost.each))))
+            step = min(step, n - done)
             last = self.iterate(step)
             done += last.iterations
             for kind, count in last.work.items():
                 work[kind] = work.get(kind, 0) + count
             if last.status is not Status.MAX_ITERATIONS or last.iterations < step:
                 break
-            if log.deadline.is_set:
-                pace = 1e9 * watch.seconds / (step * self.cost.each)
-                log.pace = (
-                    pace if log.pace == 1.0 else min(pace, log.pace)
-                )  # a pause of the machine tells nothing
+            left = log.deadline.left()
+            if left is not None:
+                each = watch.seconds / step
+                log.pace = 1e9 * each / self.cost.each
+                step = max(1, min(GROWTH * step, int(min(left, CLOCK) / each)))
         self.close()
         return Claim(last.status, done, work)
 
@@ -165,13 +155,28 @@ class Sweeps(Resumed):
     """Accelerated sweeps, with looks at what they promise in compiled code (`lavender_ext/few/looks.pyx`)."""
 
     relative = 1.0  # residual of the last look
+    least = 0.0  # ns that another method takes at least
+
+    def set_up(self) -> None:
+        """All that needs no impulse, and what is to be known when time is short."""
+        problem = self.costs.problem
+        split = 0 if problem.rows is None else problem.rows.n_joints
+        self.state = Looks(problem.metric, operator(problem), problem.law == "cone", split)
+        self.count()
+
+    def run_first(self, log: SolveLog) -> None:
+        """Half of the time, and all of it where the other half is too short for any other."""
+        self.log = log
+        half = 0.5e9 * (log.deadline.left() or 0.0)
+        if not self.run(self.cost.setup + half if half > SURE * self.least else ALL, np.inf):
+            self.rest = np.inf
 
     def begin(self) -> None:
-        problem = self.log.problem
-        split = 0 if problem.rows is None else problem.rows.n_joints
-        self.impulse = self.log.impulse.copy() if self.log.given is None else self.log.given.copy()
-        self.relative = self.log.best
-        self.state = Looks(problem.metric, operator(problem), problem.law == "cone", split)
+        log = self.log
+        self.impulse = log.impulse.copy() if log.given is None else log.given.copy()
+        self.relative = log.best
+        if self.state is None:
+            self.set_up()
 
     def iterate(self, n: int) -> Claim:
         """At most n, given up where they promise no end for less than the others."""
@@ -208,7 +213,6 @@ class Relaxation(Resumed):
         self.solver = self.spec.load()()
         self.state = self.solver.prepare(self.log.problem.relaxed("cone"))
         self.impulse = self.log.problem.start()
-        self.tol = self.log.tol
 
     def turn(self, n: int) -> Claim:
         if self.slow and self.name == self.shown_by:
@@ -228,7 +232,7 @@ class Relaxation(Resumed):
         follows = self.shown_by == "nncg"
         while done < n:
             step = min(max((self.done + done) // 2, FIRST), n - done)
-            claim = self.solver.run(self.state, self.impulse, step, log.tol if follows else self.tol, None)
+            claim = self.solver.run(self.state, self.impulse, step, log.tol, None)
             done += claim.iterations
             for kind, count in claim.work.items():
                 work[kind] = work.get(kind, 0) + count
@@ -236,9 +240,7 @@ class Relaxation(Resumed):
             self.left = sweeps_left(claim.iterations, before, self.relative, log.tol)
             if self.relative <= log.tol or log.late:
                 break
-            if claim.status is Status.CONVERGED and not follows and self.tol > CLOSEST * log.tol:
-                self.tol *= 0.1  # solved; Coulomb's residual may follow to a closer one
-            elif claim.status is not Status.MAX_ITERATIONS:
+            if claim.status is not Status.MAX_ITERATIONS:
                 if follows:
                     return Claim(Status.STALLED, done, work)
                 break
@@ -268,8 +270,7 @@ class Velocities(Candidate):
     def turn(self, n: int) -> Claim:
         log = self.log
         if not self.begun:
-            n = min(max(n, STEPS), log.left) if self.costs.structure.goes_first else n
-            self.impulse = log.impulse.copy() if log.best <= WARM else log.problem.start()
+            self.impulse = log.impulse.copy()
         kernel = self.costs.structure.kernel
         claim = general.run(log.problem, kernel, self.impulse, n, log.tol, log.time_left, self.begun)
         self.begun = True
@@ -280,7 +281,7 @@ class Velocities(Candidate):
 
 
 class Finite(Candidate):
-    """A solver that begins anew in each turn: from the best impulse where that is near, else from doing nothing."""
+    """A solver that begins anew in each turn, from the best impulse."""
 
     again = is_finite = True
 
@@ -289,7 +290,7 @@ class Finite(Candidate):
         solver = self.make()
         if self.state is None:
             self.state = self.prepare(solver)
-        impulse = self.start()
+        impulse = self.log.impulse.copy()
         claim: Claim = solver.run(self.state, impulse, n, log.tol, log.time_left)
         _offer(log, impulse)
         return claim
@@ -299,9 +300,6 @@ class Finite(Candidate):
 
     def prepare(self, solver: Any) -> Any:
         return solver.prepare(self.log.problem)
-
-    def start(self) -> FloatArray:
-        return self.log.impulse.copy() if self.log.best <= WARM else self.log.problem.start()
 
 
 class Newton(Finite):
@@ -316,15 +314,12 @@ class Newton(Finite):
 
 
 class Direct(Finite):
-    """From where sweeps have stopped, since they know which rows are free; a linear system no closer than tol."""
+    """A linear system no closer than tol."""
 
     def make(self) -> Any:
         if self.log.problem.law == "linear":
             return Enough()
         return super().make() if self.spent > 0.0 else Impatient()
-
-    def start(self) -> FloatArray:
-        return self.log.impulse.copy()
 
     def turn(self, n: int) -> Claim:
         self.state = None  # after a turn its rows are those of the end; the problem keeps their order
@@ -345,21 +340,16 @@ KINDS: dict[str, type[Candidate]] = {
 }  # fmt: skip
 
 
-def in_short_time(log: SolveLog, costs: Costs) -> list[Candidate]:
-    """Sweeps that have had a turn, where time is so short that what the others cost is not worth counting before.
-
-    Nor after it, where not one of those that factor would end in time: then they have all of it.
-    """
-    names = TABLE[log.problem.operator][log.problem.law]
-    if not log.ends_late(SHORT) or log.problem.cones.has_round:
-        return []
-    sweeps = Sweeps("anderson", log, costs, get("anderson"))
-    sweeps.count()
-    if all(log.ends_late(SURE * costs.floor(name)) for name in names):
-        sweeps.run(ALL, np.inf)
-        return [sweeps]
-    more = sweeps.run(sweeps.cost.setup + min(LEAST, SHARE * 1e9 * log.limit), np.inf)
-    return [sweeps] if more else []
+def in_short_time(problem: Problem, limit: float) -> Sweeps | None:
+    """Sweeps that are set up, where others may not end within the limit [ns]: by the least that these take."""
+    costs = Costs(problem)
+    least = min(map(costs.floor, TABLE[problem.operator][problem.law]))
+    if limit > SURE * SURE * least:
+        return None
+    sweeps = Sweeps("anderson", None, costs, get("anderson"))
+    sweeps.least = least
+    sweeps.set_up()
+    return sweeps
 
 
 def make(

@@ -37,11 +37,12 @@ METHODS: dict[str, tuple[str, dict[str, Any]]] = {
     # Of Coulomb's law: its answer is the law's own wherever contacts stick.
     "relaxation": ("anderson", {}),
 }
+ROLLING = ("anderson", "nncg", "newton")  # where contacts resist rolling, however given
 _GIVEN = {
     "linear": ("direct", "anderson", "newton"),
     "lcp": ("anderson", "direct", "newton", "nncg"),
     "cone": ("anderson", "newton"),
-    "coulomb": ("anderson", "newton", "admm"),
+    "coulomb": ("anderson", "newton", "admm", "nncg"),
 }
 #: At most four for each law and operator; "round": cones of more than two tangents.
 TABLE: dict[str, dict[str, tuple[str, ...]]] = {
@@ -52,7 +53,7 @@ TABLE: dict[str, dict[str, tuple[str, ...]]] = {
         "linear": ("newton", "direct", "anderson", "newton over rows"),
         "lcp": ("newton", "anderson", "direct"),
         "cone": ("newton", "anderson", "newton over rows"),
-        "coulomb": ("newton", "anderson", "nncg", "newton over rows"),
+        "coulomb": ("newton", "anderson", "admm", "newton over rows"),
         "round": ("newton", "nncg", "admm"),
     },
 }
@@ -190,7 +191,7 @@ class Costs:
     def __init__(
         self,
         problem: Problem,
-        tol: float,
+        tol: float = 1e-6,
         given: Mapping[str, Any] | None = None,
         structure: Structure | None = None,
         plan: Plan | None = None,
@@ -275,6 +276,8 @@ def candidates(structure: Structure) -> tuple[str, ...]:
     problem = structure.problem
     if problem.cones.has_round:
         return TABLE["generalized"]["round"]
+    if problem.cones.has_rolling:
+        return ROLLING
     names = TABLE[problem.operator][problem.law]
     return names if structure.is_definite else tuple(name for name in names if name != "direct")
 

@@ -21,11 +21,10 @@ from collections.abc import Callable
 from math import inf
 from typing import Any, Protocol
 
-__all__ = ["AGAIN", "BELIEVED", "GIVEN_UP", "Method", "first", "race", "remainder"]
+__all__ = ["AGAIN", "BELIEVED", "Method", "first", "race", "remainder"]
 
 BELIEVED = 8.0  # times what a method has spent, that its promise of a remainder may be
 AGAIN = 10.0  # times its remainder, that a turn of a method may be which cannot go on where it stood
-GIVEN_UP = 1000.0  # times what was expected of a method, after which it has no more turns
 
 
 class Method(Protocol):

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from lavender._arrays import FloatArray
+from lavender._arrays import FloatArray, whole_number
 from lavender.errors import InputError
 from lavender.ordering import Order, block_order
 from lavender.problem import Problem
@@ -79,21 +79,22 @@ def claim(status: int, done: int) -> Claim:
 def run_kernel(
     state: SweepState,
     impulse: FloatArray,
-    n: int,
+    max_iter: int,
     tol: float,
     kind: int,
     omega: float = 1.0,
     scratch: FloatArray | None = None,
     packing: Any = None,
 ) -> Claim:
-    """n sweeps in one call of `serial.run`, or fewer where a check ends them; tol = 0 checks nothing."""
+    """`max_iter` sweeps in one call of `serial.run`, or fewer where a check ends them; tol = 0 checks nothing."""
     o = state.order
     # The same bits with or without an order array; without one the kernel skips two look-ups a row.
     rows = kind == serial.PGS and state.data.single_rows and not state.data.is_general
     blocks = _ROW_BY_ROW if rows and o.is_given else o.blocks
     return claim(
         *serial.run(
-            kind, state.data, state.watch, impulse, n, tol, blocks, o.split, o.mode, o.rng, omega, scratch, packing,
+            kind, state.data, state.watch, impulse, max_iter, tol, blocks, o.split, o.mode, o.rng, omega, scratch,
+            packing,
         )
     )  # fmt: skip
 
@@ -101,7 +102,7 @@ def run_kernel(
 def run_threads(
     state: SweepState,
     impulse: FloatArray,
-    n: int,
+    max_iter: int,
     tol: float,
     threads: int,
     velocity: FloatArray | None = None,
@@ -112,7 +113,7 @@ def run_threads(
     team = threaded.Team(state.data, state.watch, impulse, o.blocks, o.color_ptr, threads, velocity, **alone)
     for thread in range(1, threads):
         _helpers().submit(team.help, thread)
-    result = claim(*team.lead(n, tol))
+    result = claim(*team.lead(max_iter, tol))
     state.alone = {"alone": team.alone}
     return result
 
@@ -172,13 +173,9 @@ class Threaded(Sweeping):
     threads: int = 1
 
     def __post_init__(self) -> None:
-        if (
-            isinstance(self.threads, bool)
-            or not isinstance(self.threads, (int, np.integer))
-            or self.threads < 1
+        if whole_number("threads", self.threads, 1) > 1 and not (
+            isinstance(self.order, str) and self.order == "colored"
         ):
-            raise InputError(f"threads is {self.threads!r}; a whole number from 1 is needed")
-        if self.threads > 1 and not (isinstance(self.order, str) and self.order == "colored"):
             raise InputError(
                 f"threads={self.threads} needs order='colored': only blocks of one colour share nothing"
             )

@@ -24,7 +24,7 @@ from lavender.solution import Claim, Status
 from lavender.solvers._certify import certify
 from lavender.solvers._few import AUTO, call_ends_within
 from lavender.solvers._log import SolveLog
-from lavender.solvers._methods import in_short_time, make
+from lavender.solvers._methods import Candidate, Sweeps, in_short_time, make
 from lavender.solvers._plan import Costs, Plan, candidates
 from lavender.solvers._schedule import race
 
@@ -32,6 +32,14 @@ from lavender.solvers._schedule import race
 # is worth it. Under limits of 1 and 10 ms residuals from stale guesses are then 1.8 and 1.3 times smaller.
 STALE = 1e3
 ONE_CALL = 200  # iterations that a problem of few rows, solved in one call, takes, unless its path is long
+
+
+@dataclass
+class State:
+    """What `auto` has prepared: nothing, but sweeps and what they cost where a time limit is given."""
+
+    problem: Problem
+    sweeps: Sweeps | None = None
 
 
 @dataclass(frozen=True)
@@ -50,18 +58,23 @@ class Auto:
         if self.plan is not None:
             object.__setattr__(self, "plan", Plan.of(self.plan))
 
-    def prepare(self, problem: Problem) -> Problem:
+    def prepare(self, problem: Problem) -> State:
         if self.plan is not None:
             self.plan.check(problem)
-        return problem
+        return State(problem)
 
-    def update(self, state: Problem, problem: Problem) -> Problem:
+    def update(self, state: State, problem: Problem) -> State:
         return self.prepare(problem)
 
+    def ready(self, state: State, time_limit: float) -> None:
+        """Before the clock of a limit [s] starts in which others may not end: set up sweeps, which then come first."""
+        if state.problem.m and self.plan is None and not state.problem.cones.has_round:
+            state.sweeps = in_short_time(state.problem, 1e9 * time_limit)
+
     def run(
-        self, state: Problem, impulse: FloatArray, n: int, tol: float, time_limit: float | None = None
+        self, state: State, impulse: FloatArray, n: int, tol: float, time_limit: float | None = None
     ) -> Claim:
-        problem = state
+        problem = state.problem
         deadline = Deadline(time_limit)
         if n >= ONE_CALL and call_ends_within(problem, time_limit):
             made = AUTO.solve(problem, impulse, tol)
@@ -80,7 +93,7 @@ class Auto:
         interrupted = False
         try:
             if n > 0 and not log.done():
-                solve(log, self.plan)
+                solve(log, self.plan, state.sweeps)
         except KeyboardInterrupt:
             interrupted = True  # the best impulse goes back all the same
         impulse[:] = log.impulse
@@ -95,14 +108,24 @@ class Auto:
         )
 
 
-@np.errstate(all="ignore")  # what overflows is judged
-def solve(log: SolveLog, plan: Plan | None = None) -> None:
-    """To the end, by a plan where one is given."""
-    costs = Costs(log.problem, log.tol, plan=plan)
-    begun = in_short_time(log, costs) if log.deadline.is_set and plan is None else []
-    if not log.done():
-        names = candidates(costs.structure) if plan is None else tuple(name for name, _ in plan.candidates)
-        race(list(make(log, costs, names, None if plan is None else plan.first, begun)), log.done)
+def solve(log: SolveLog, plan: Plan | None = None, sweeps: Sweeps | None = None) -> None:
+    """To the end, by a plan where one is given; `sweeps`: what is set up for a time limit."""
+    begun: list[Candidate] = []
+    if sweeps is not None:
+        begun = [sweeps]
+        sweeps.run_first(log)
+        if log.late or log.done():
+            return
+    with np.errstate(all="ignore"):  # what overflows is judged
+        others(log, plan, begun)
+
+
+def others(log: SolveLog, plan: Plan | None, begun: list[Candidate]) -> None:
+    """All candidates, of which one may have begun, and at last the certificate."""
+    structure = begun[0].costs.structure if begun else None
+    costs = Costs(log.problem, log.tol, structure=structure, plan=plan)
+    names = candidates(costs.structure) if plan is None else tuple(name for name, _ in plan.candidates)
+    race(list(make(log, costs, names, None if plan is None else plan.first, begun)), log.done)
     if log.best > log.tol and log.certificate is None and log.left > 0:
         certify(log)
 

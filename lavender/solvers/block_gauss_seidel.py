@@ -44,7 +44,12 @@ class BlockGaussSeidel(Sweeping):
         return BlockState(problem, swept(problem), order)
 
     def run(
-        self, state: BlockState, impulse: FloatArray, n: int, tol: float, time_limit: float | None = None
+        self,
+        state: BlockState,
+        impulse: FloatArray,
+        max_iter: int,
+        tol: float,
+        time_limit: float | None = None,
     ) -> Claim:
         o, data = state.order, state.data
         if state.velocity is None:
@@ -57,7 +62,7 @@ class BlockGaussSeidel(Sweeping):
             data,
             state.watch,
             impulse,
-            n,
+            max_iter,
             tol,
             *state.prepared,
             state.velocity,

@@ -57,9 +57,14 @@ class Jacobi:
         return self.prepare(problem)
 
     def run(
-        self, state: JacobiState, impulse: FloatArray, n: int, tol: float, time_limit: float | None = None
+        self,
+        state: JacobiState,
+        impulse: FloatArray,
+        max_iter: int,
+        tol: float,
+        time_limit: float | None = None,
     ) -> Claim:
-        return run_kernel(state, impulse, n, tol, serial.JACOBI, state.omega, state.scratch)
+        return run_kernel(state, impulse, max_iter, tol, serial.JACOBI, state.omega, state.scratch)
 
 
 @np.errstate(all="ignore")  # what overflows is judged

@@ -37,7 +37,6 @@ from lavender.residuals import quick
 from lavender.solution import Claim, Status
 from lavender.solvers._few import NEWTON
 from lavender.solvers._newton import general
-from lavender.solvers._newton.scaled import Scaled
 from lavender.solvers._newton.systems import System, make_system
 from lavender.solvers.warm_start import claim_of, warm_start
 from lavender_ext.newton.solve import COUNTED, OUTCOMES
@@ -235,7 +234,7 @@ def _turns(
     return _ENDS[end], None
 
 
-def _proof(problem: Problem, sc: Scaled, y: FloatArray) -> FloatArray | None:
+def _proof(problem: Problem, sc: Any, y: FloatArray) -> FloatArray | None:
     """The direction y (scaled) as a certificate (m,), if it proves that there is no solution."""
     whole = np.zeros(problem.m)
     whole[sc.keep] = y * sc.scale

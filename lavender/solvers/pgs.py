@@ -6,7 +6,8 @@ In generalised coordinates over u = Y^T lambda, J M^-1 J^T = Y Y^T, where that c
     contact   lambda_n <- max(0, lambda_n - w_n / d_n), then the tangents together with one scalar step
               1 / lambda_max(A_tt) projected radially on mu lambda_n, then spin
 
-Linear convergence for symmetric positive semidefinite A; the update is that of `lavender_ext/core/block.pxd`.
+Linear convergence for symmetric positive semidefinite A. A sweep over A is `relax_csr_block` of
+`lavender_ext/sweep/pgs.pxd` for one block after the other.
 """
 
 from __future__ import annotations
@@ -37,17 +38,17 @@ class PGS(Threaded):
     """Projected Gauss-Seidel; `order`, `ground`, `seed` as in `lavender.ordering`; `threads` with "colored"."""
 
     def run(
-        self, state: PGSState, impulse: FloatArray, n: int, tol: float, time_limit: float | None = None
+        self, state: PGSState, impulse: FloatArray, max_iter: int, tol: float, time_limit: float | None = None
     ) -> Claim:
         if state.data.is_general:
             if state.velocity is None:
                 state.velocity = np.zeros(state.data.n_velocities + 1)
                 measure.velocity_change(state.data, impulse, state.velocity[:, None])
-            made = run_kernel(state, impulse, n, tol, serial.PGS, scratch=state.velocity)
+            made = run_kernel(state, impulse, max_iter, tol, serial.PGS, scratch=state.velocity)
             return replace(made, form="whitened J")
         if self.uses_threads(state):
-            return run_threads(state, impulse, n, tol, self.threads)
-        return run_kernel(state, impulse, n, tol, serial.PGS)
+            return run_threads(state, impulse, max_iter, tol, self.threads)
+        return run_kernel(state, impulse, max_iter, tol, serial.PGS)
 
     def _state(self, problem: Problem, order: Order, before: Any) -> PGSState:
         data = problem.metric if reads_whitened(problem) else problem.csr_data

@@ -71,7 +71,12 @@ class SequentialImpulses(Threaded):
         return ImpulseState(problem, order, before)
 
     def run(
-        self, state: ImpulseState, impulse: FloatArray, n: int, tol: float, time_limit: float | None = None
+        self,
+        state: ImpulseState,
+        impulse: FloatArray,
+        max_iter: int,
+        tol: float,
+        time_limit: float | None = None,
     ) -> Claim:
         lam = impulse
         if state.layout is not None:
@@ -83,9 +88,11 @@ class SequentialImpulses(Threaded):
             measure.velocity_change(state.data, lam, state.velocity)
         velocity = state.velocity.ravel()
         if self.uses_threads(state):
-            claim = run_threads(state, lam, n, tol, self.threads, velocity)
+            claim = run_threads(state, lam, max_iter, tol, self.threads, velocity)
         else:
-            claim = run_kernel(state, lam, n, tol, serial.IMPULSES, scratch=velocity, packing=state.packing)
+            claim = run_kernel(
+                state, lam, max_iter, tol, serial.IMPULSES, scratch=velocity, packing=state.packing
+            )
         if state.layout is not None:
             state.layout.put(lam, impulse)
         return claim

@@ -32,9 +32,14 @@ class SOR(Sweeping):
             raise InputError(f"omega is {self.omega}; 0 < omega < 2 is needed, outside it SOR diverges")
 
     def run(
-        self, state: SweepState, impulse: FloatArray, n: int, tol: float, time_limit: float | None = None
+        self,
+        state: SweepState,
+        impulse: FloatArray,
+        max_iter: int,
+        tol: float,
+        time_limit: float | None = None,
     ) -> Claim:
-        return run_kernel(state, impulse, n, tol, serial.SOR, self.omega)
+        return run_kernel(state, impulse, max_iter, tol, serial.SOR, self.omega)
 
 
 SPEC = SolverSpec(

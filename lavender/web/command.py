@@ -8,12 +8,15 @@ import click
 
 __all__ = ["view", "web"]
 
-
-@click.group(invoke_without_command=True)
-@click.option(
+PORT = click.option(
     "--port", type=click.IntRange(0, 65535), default=0, help="Of the page's server; 0 takes a free one."
 )
-@click.option("--no-browser", is_flag=True, help="Only say where the page is.")
+NO_BROWSER = click.option("--no-browser", is_flag=True, help="Only say where the page is.")
+
+
+@click.group(invoke_without_command=True)
+@PORT
+@NO_BROWSER
 @click.pass_context
 def web(context: click.Context, port: int, no_browser: bool) -> None:
     """The kernels in WebAssembly: without a subcommand, open the page that runs them in a browser."""
@@ -75,10 +78,8 @@ def page(folder: Path) -> None:
 
 @click.command()
 @click.argument("film", type=click.Path(path_type=Path), metavar="FILM")
-@click.option(
-    "--port", type=click.IntRange(0, 65535), default=0, help="Of the page's server; 0 takes a free one."
-)
-@click.option("--no-browser", is_flag=True, help="Only say where the page is.")
+@PORT
+@NO_BROWSER
 def view(film: Path, port: int, no_browser: bool) -> None:
     """Show a film that `lavender run NAME --film FILM` has written, in a page on this machine."""
     from lavender.engine import Film

@@ -25,27 +25,7 @@ SHIPPED = HERE  # the folder of the modules that come with the package
 
 
 def build_module(out: Path, name: str = "lavender") -> wasm.Built:
-    """Compile the kernels of a part of the page to one WebAssembly module.
-
-    Parameters
-    ----------
-    out : Path
-        File to write.
-    name : {"lavender", "newton"}
-        The module that stands alone, or the one that is loaded beside it.
-
-    Returns
-    -------
-    Built
-        size [bytes], functions, imports (none, or the memory), compiler.
-
-    Raises
-    ------
-    LavenderError
-        No compiler here, or kernels that WebAssembly cannot run.
-    InputError
-        A folder that does not exist.
-    """
+    """Compile the kernels to a WebAssembly module: "lavender", which stands alone, or "newton" beside it."""
     if not out.resolve().parent.is_dir():
         raise InputError(f"the folder {out.resolve().parent} does not exist; make it first")
     part = wasm.PARTS[name]
@@ -58,21 +38,7 @@ def build_module(out: Path, name: str = "lavender") -> wasm.Built:
 def module(say: Callable[[str], Any] = lambda text: None, name: str = "lavender") -> bytes:
     """A module of the kernels as they are: the one that lies in the package, or a new one, kept there.
 
-    Parameters
-    ----------
-    say : callable
-        Told when something takes time.
-    name : {"lavender", "newton"}
-        Which one.
-
-    Returns
-    -------
-    bytes
-
-    Raises
-    ------
-    LavenderError
-        There is none for these sources, and none can be built.
+    `say` is told when something takes time.
     """
     shipped = SHIPPED / f"{name}.wasm"
     if wasm.is_current(shipped, ROOT, wasm.PARTS[name]):
@@ -97,27 +63,7 @@ def module(say: Callable[[str], Any] = lambda text: None, name: str = "lavender"
 
 
 def write_page(folder: Path, say: Callable[[str], Any] = lambda text: None) -> Path:
-    """Write the page into a folder that any file server can serve; nothing in it needs Python or a network.
-
-    Parameters
-    ----------
-    folder : Path
-        Made if it does not exist; files of the page in it are replaced.
-    say : callable
-        Told when something takes time.
-
-    Returns
-    -------
-    Path
-        The page, index.html.
-
-    Raises
-    ------
-    InputError
-        A folder that cannot be written.
-    LavenderError
-        No module; see `module`.
-    """
+    """Write the page into a folder for any file server; nothing in it needs Python or a network. Returns index.html."""
     modules = {name: module(say, name) for name in wasm.PARTS}
     try:
         shutil.copytree(HERE / "page", folder, dirs_exist_ok=True)
@@ -159,16 +105,14 @@ class Handler(SimpleHTTPRequestHandler):
 
 
 def server(folder: Path, port: int = 0) -> ThreadingHTTPServer:
-    """A server of `folder` on the loopback address, not yet running; port 0 takes a free one.
+    """A server of `folder` on the loopback address, not yet running; port 0 takes a free one."""
+    return bound(partial(Handler, directory=str(folder)), port)
 
-    Raises
-    ------
-    InputError
-        A port that is taken.
-    """
+
+def bound(handler: Callable[..., Any], port: int) -> ThreadingHTTPServer:
+    """A server on the loopback address that answers by `handler`."""
     try:
-        return ThreadingHTTPServer(("127.0.0.1", port), partial(Handler, directory=str(folder)))
-    except OSError as error:
-        raise InputError(
-            f"port {port} cannot be used ({error.strerror or error}); give another with --port"
-        ) from None
+        return ThreadingHTTPServer(("127.0.0.1", port), handler)
+    except (OSError, OverflowError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise InputError(f"port {port} cannot be used ({reason}); give another") from None

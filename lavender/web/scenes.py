@@ -7,11 +7,10 @@ from typing import Any
 import numpy as np
 
 from lavender.engine import Simulation
-from lavender.engine.layout import CAP_CONTACT, CAP_PAIR, HEAD, JOINT, JOINT_KINDS, SETTING, SIZE
+from lavender.engine.layout import HEAD, JOINT, JOINT_KINDS, ORDER_NUMBER, SETTING, SIZE
 from lavender.engine.snapshot import Snapshot
-from lavender.engine.state import ORDER_NUMBER
 from lavender.scene import Scene
-from lavender_ext.engine.arrays import SHAPES, offsets
+from lavender_ext.engine.arrays import CAP_CONTACT, CAP_PAIR, SHAPES, offsets
 from lavender_ext.host import memory
 
 __all__ = ["PAGE", "PRESETS", "describe", "layout", "page_scenes"]
@@ -179,15 +178,7 @@ def _stepper(name: str) -> dict[str, dict[str, Any]]:
 def describe(start: Snapshot) -> dict[str, Any]:
     """Sizes, and every array that is not all zero as a list of numbers, of a snapshot.
 
-    Parameters
-    ----------
-    start : Snapshot
-
-    Returns
-    -------
-    dict
-        size (10,), arrays: name -> numbers; exact when written as JSON, since the shortest text of a double
-        that reads back as the same double is written.
+    Exact when written as JSON, since the shortest text of a double that reads back as the same double is written.
     """
     first = offsets(start.size)
     arrays = {}

@@ -7,13 +7,11 @@ import threading
 from collections.abc import Callable
 from functools import partial
 from http import HTTPStatus
-from http.server import ThreadingHTTPServer
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
 from lavender.engine.film import Film
-from lavender.errors import InputError
-from lavender.web.pages import HERE, Handler
+from lavender.web.pages import HERE, Handler, bound
 
 __all__ = ["Viewer"]
 
@@ -45,13 +43,7 @@ class Viewer:
     ) -> None:
         self.film = film
         self._end: Callable[[], Any] | None = end
-        handler = partial(_FilmHandler, film)
-        try:
-            self._server = ThreadingHTTPServer(("127.0.0.1", port), handler)
-        except (OSError, OverflowError) as error:
-            raise InputError(
-                f"port {port} cannot be used ({getattr(error, 'strerror', None) or error}); give another"
-            ) from None
+        self._server = bound(partial(_FilmHandler, film), port)
         self._server.daemon_threads = True
         self._thread = threading.Thread(target=self._server.serve_forever, daemon=True)
         self._thread.start()

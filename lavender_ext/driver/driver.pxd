@@ -13,7 +13,7 @@ arrays of v.
 
 | method | over A | over bodies | over J and M |
 |---|---|---|---|
-| NEWTON | bounded rows, cones, Coulomb's law; dense | the same, of up to 1,500 bodies, where every row moves | the same, islands |
+| NEWTON | bounded rows, cones, Coulomb's law; dense | the same, of up to 1,500 bodies | the same, islands |
 
 After CERTIFICATE `asked_t.proven` = 1 ends it; without, the next step goes on.
 """

@@ -5,17 +5,15 @@ from libc.string cimport memset
 import numpy as np
 
 from lavender_ext.core.arrays cimport address
-from lavender_ext.core.block cimport COULOMB, blocks_t, has_friction
+from lavender_ext.core.block cimport COULOMB, has_friction
 from lavender_ext.core.problem cimport Data
 from lavender_ext.driver.driver cimport NEWTON, ROOM, UNFIT, asked_t, room_t, said_t, view_t
-from lavender_ext.driver.scaling cimport (dense_matrix, is_known, lay_scaled, make_scaled, scaled_index, scaled_real,
-                                          scaled_t)
 from lavender_ext.factor.tiles cimport has_wide
 from lavender_ext.generalized.flow cimport flow_t
 from lavender_ext.generalized.islands cimport aim_at, furnish, marks_of, need_t, numbers_of, settle
 from lavender_ext.generalized.newton cimport DONE as G_DONE
 from lavender_ext.generalized.newton cimport SPENT as G_SPENT
-from lavender_ext.generalized.newton cimport solve_island
+from lavender_ext.generalized.newton cimport descend_all
 from lavender_ext.generalized.sparse cimport PER_COLUMN
 from lavender_ext.judge.measure cimport do_nothing, general_judge, judge_into, reference_of
 from lavender_ext.judge.score cimport are_numbers, score_rows, score_t
@@ -23,6 +21,8 @@ from lavender_ext.newton.bodies cimport (bodies_t, index_room, lay_bodies, lay_p
                                          real_room)
 from lavender_ext.newton.plan cimport CERTIFICATE, MORE, REACHED, SPENT, STUCK, newton_start, newton_step
 from lavender_ext.newton.run cimport VECTORS, impulse_of, lay_vectors, newton_t
+from lavender_ext.newton.scaling cimport (dense_matrix, find_elements, is_known, lay_elements, lay_numbers, scale_elements,
+                                          scaled_index, scaled_real, scaled_t)
 from lavender_ext.newton.system cimport DENSE, dense_room
 
 
@@ -95,11 +95,11 @@ cdef inline void begin(state_t* s, const asked_t* o, const double* lam, bint cou
 
 
 cdef inline void rows_need(const view_t* v, room_t* r) noexcept nogil:
-    """More than enough: as if every row moved, in contacts of four rows."""
+    """More than enough: as if every row moved, in contacts of six rows."""
     cdef int64_t m = v.p.n_rows
     cdef bint cones = has_friction(&v.p)
     r.n_index = scaled_index(m) + 3 * m
-    r.n_real = (state_room() + judge_room(v) + scaled_real(m) + (VECTORS + 5 * 4) * m + 2 * m * m + dense_room(m, cones)
+    r.n_real = (state_room() + judge_room(v) + scaled_real(m) + (VECTORS + 5 * 6) * m + 2 * m * m + dense_room(m, cones)
                 + 8)
 
 
@@ -114,8 +114,10 @@ cdef inline int32_t start_rows(const view_t* v, const asked_t* o, room_t* r, con
     s.rows = x
     x += judge_room(v)
     reference(v, s)
-    lay_scaled(&s.s, m, r.index, x)
-    make_scaled(&s.s, &v.p, v.a)
+    lay_elements(&s.s, m, r.index)
+    lay_numbers(&s.s, m, x)
+    find_elements(&s.s, &v.p, v.a, NULL)
+    scale_elements(&s.s, &v.p, v.a, NULL, NULL, NULL)
     x += scaled_real(m)
     lay_vectors(n, x, m)
     x += VECTORS * m
@@ -137,18 +139,6 @@ cdef inline int32_t start_rows(const view_t* v, const asked_t* o, room_t* r, con
 # -- over bodies -----------------------------------------------------------------------------------------------
 
 
-cdef inline bint all_move(const blocks_t* p) noexcept nogil:
-    cdef int32_t i, j
-    for i in range(p.n_blocks):
-        for j in range(p.ptr[i], p.ptr[i + 1]):
-            if not p.d[j] > 0.0 or (p.kind[i] == 0 and p.lower[j] == p.upper[j]):
-                return False
-        if p.kind[i] != 0 and p.ptr[i + 1] - p.ptr[i] > 1 and (
-                p.mu[i] == 0.0 or (p.kind[i] == 2 and p.patch_radius[i] == 0.0)):
-            return False
-    return True
-
-
 cdef inline int32_t start_bodies(const view_t* v, const asked_t* o, room_t* r, const double* lam) noexcept nogil:
     cdef state_t* s = <state_t*>r.real
     cdef pattern_t a
@@ -161,7 +151,7 @@ cdef inline int32_t start_bodies(const view_t* v, const asked_t* o, room_t* r, c
     s.rows = r.real + state_room()
     reference(v, s)
     lay_bodies(&s.n, &s.w, &a, r.real + own, &v.p, v.r)
-    begin(s, o, lam, v.p.law == COULOMB and s.w.e.n < s.w.e.m)
+    begin(s, o, lam, v.p.law == COULOMB and s.w.s.e.n < s.w.s.e.m)
     return MORE
 
 
@@ -196,20 +186,15 @@ cdef inline int32_t start_general(const view_t* v, const asked_t* o, room_t* r) 
 
 cdef inline int32_t step_general(const asked_t* o, state_t* s, int32_t work, double* lam) noexcept nogil:
     """All islands, the one that waits first."""
-    cdef int32_t i, end, cold = o.cold, worst = G_DONE, first = 0, left = s.n.budget
+    cdef int32_t end, left = s.n.budget
     if o.stop or left <= 0:
         return SPENT
-    if s.f.wait.island >= 0:
-        first, worst, cold = s.f.wait.island, s.f.wait.worst, s.f.wait.cold
     s.f.steps = work if work < left else left
     s.n.budget -= s.f.steps
-    for i in range(first, s.f.n_islands):
-        end = solve_island(&s.f, i, lam, cold)
-        if end == G_SPENT:
-            s.f.wait.worst, s.f.wait.cold = worst, cold
-            return MORE if s.n.budget > 0 else SPENT
-        worst = end if end > worst else worst
-    return REACHED if worst == G_DONE else STUCK
+    end = descend_all(&s.f, lam, o.cold)
+    if end == G_SPENT:
+        return MORE if s.n.budget > 0 else SPENT
+    return REACHED if end == G_DONE else STUCK
 
 
 # -- the three -------------------------------------------------------------------------------------------------
@@ -231,7 +216,7 @@ cdef public int32_t lav_room(const view_t* v, const asked_t* o, room_t* r) noexc
     if v.a != NULL:
         rows_need(v, r)
         return 1
-    if v.r != NULL and all_move(&v.p):
+    if v.r != NULL:
         most = index_room(&v.p, v.r)
         r.n_index, r.n_real = most, state_room() + judge_room(v)
     return most > 0

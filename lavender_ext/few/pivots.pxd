@@ -119,7 +119,9 @@ cdef inline bint shifted(trial_t* t, const double* start) noexcept nogil:
     cdef int32_t before, _
     cdef double previous, reference = INFINITY
     cdef bint whole
-    memcpy(s.x, t.best if t.relative < INFINITY and not t.floor > 1e-6 else start, s.n * sizeof(double))
+    memcpy(s.x, start, s.n * sizeof(double))
+    if t.relative < INFINITY and not t.floor > 1e-6:
+        memcpy(s.x, t.best, s.n * sizeof(double))
     t.shifts = 1
     for _ in range(PASSES):
         recenter(t)

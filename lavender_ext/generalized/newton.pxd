@@ -25,7 +25,6 @@ from libc.stdint cimport int32_t
 
 from lavender_ext.core.block cimport CONE, CONTACT_ROLLING, COULOMB, ROW, n_apart, n_tangents
 from lavender_ext.core.generalized cimport dot
-from lavender_ext.core.problem cimport Data
 from lavender_ext.generalized.flow cimport (blank, block_end, block_from, flow_t, gather, measure, renew, respond_all,
                                             row_end, row_from)
 from lavender_ext.generalized.normal cimport factor, form, newton_step
@@ -498,15 +497,19 @@ cdef inline int32_t solve_island(flow_t* f, int32_t island, double* impulse, bin
     return end
 
 
-cdef int32_t descend_all(flow_t* f, double* impulse, int32_t cold) noexcept nogil
-
-
-cdef class Newton:
-    cdef flow_t f
-    cdef Data data
-    cdef list keep
-    cdef readonly int largest
-    cdef readonly bint fits, crowded
-
-    cdef void aim(self, double tol, int32_t steps) noexcept
-    cdef int32_t go(self, double* impulse, bint cold) noexcept nogil
+cdef inline int32_t descend_all(flow_t* f, double* impulse, int32_t cold) noexcept nogil:
+    """All islands from `impulse` (m), or from the one that waits on, into it: DONE, or how the worst of them ended."""
+    cdef int32_t i, end, first = 0, worst = DONE
+    if f.wait.island >= 0:
+        first = f.wait.island
+        worst = f.wait.worst
+        cold = f.wait.cold
+    for i in range(first, f.n_islands):
+        end = solve_island(f, i, impulse, cold)
+        if end == SPENT:                                # N is of this one
+            f.wait.worst = worst
+            f.wait.cold = cold
+            return SPENT
+        if end > worst:
+            worst = end
+    return worst

@@ -1,20 +1,21 @@
 """Newton's method over bodies from a problem's own arrays: elements, an order of elimination, a panel, all in given room.
 
 First what the pattern needs (`index_room`, `lay_pattern`, `make_pattern`), then, with it, the numbers (`real_room`,
-`lay_bodies`). Every row moves; six columns stand for a body.
+`lay_bodies`). Six columns stand for a body.
 """
 from libc.math cimport sqrt
 from libc.stdint cimport int32_t, int64_t, uint64_t
+from libc.string cimport memmove
 
-from lavender_ext.core.block cimport CONTACT, CONTACT_ROLLING, CONTACT_SPIN as SPIN, ROW, blocks_t, ends_apart
+from lavender_ext.core.block cimport blocks_t
 from lavender_ext.core.rows cimport rows_t
 from lavender_ext.factor.blocks cimport factor_t
 from lavender_ext.factor.graph cimport body_order, lower_pattern
 from lavender_ext.factor.symbolic cimport block_pattern, block_tree
-from lavender_ext.newton.cones cimport KEPT
-from lavender_ext.newton.elements cimport elements_t
 from lavender_ext.newton.panel cimport fill_panel, inertia_root
 from lavender_ext.newton.run cimport VECTORS, lay_vectors, newton_t
+from lavender_ext.newton.scaling cimport (find_elements, is_known, lay_elements, lay_numbers, scale_elements, scaled_index,
+                                          scaled_real, scaled_t)
 from lavender_ext.newton.system cimport BODIES
 
 
@@ -23,37 +24,18 @@ cdef enum:
 
 
 cdef struct bodies_t:           # what a `newton_t` over bodies points into
-    elements_t e
+    scaled_t s
     factor_t f
 
 
-cdef inline int32_t count_elements(const blocks_t* p, int32_t* small) noexcept nogil:
-    # bounded rows and contacts; small: entries of their small matrices
-    cdef int32_t i, nr, n = 0
-    small[0] = 0
-    for i in range(p.n_blocks):
-        nr = p.ptr[i + 1] - p.ptr[i]
-        if p.kind[i] == ROW or nr == 1:
-            n += nr
-            small[0] += nr
-        else:
-            n += 1
-            small[0] += nr * nr
-    return n
-
-
 cdef inline int64_t index_room(const blocks_t* p, const rows_t* r) noexcept nogil:
-    """Whole numbers that `lay_pattern` hands out; 0 where a walk does not apply."""
-    cdef int32_t small
-    cdef int64_t k = count_elements(p, &small), n = r.n_bodies
-    cdef int32_t i
-    for i in range(p.n_blocks):
-        if p.kind[i] == CONTACT_ROLLING:
-            return 0
-    if n == 0 or n > MOST_BODIES or k == 0:
+    """Whole numbers that `lay_pattern` hands out, as if every row were an element; 0 where a walk does not apply."""
+    cdef int64_t k = p.n_rows, n = r.n_bodies
+    if n == 0 or n > MOST_BODIES or k == 0 or not is_known(p):
         return 0
     # neighbours twice, eight vectors of bodies and their pivots, the pattern of N and of L, elements, sides of rows
-    return 4 * n * ((n + 63) // 64) + 16 * (n + 1) + (n + k + 1) + n * (n - 1) + 2 + 13 * (k + 1) + p.n_rows
+    return (4 * n * ((n + 63) // 64) + 16 * (n + 1) + (n + k + 1) + n * (n - 1) + 2 + scaled_index(k) + 9 * (k + 1)
+            + p.n_rows)
 
 
 cdef struct pattern_t:
@@ -71,23 +53,18 @@ cdef struct pattern_t:
     int32_t* rind
     int32_t* pivot
     int32_t* next
-    int32_t* ptr
-    int32_t* kind
-    int32_t* wptr
     int32_t* group
     int32_t* body
     int32_t* node
     int32_t* slot
     int32_t* turned
     int32_t* side
-    int32_t k                   # elements
-    int32_t small
+    scaled_t s
 
 
 cdef inline void lay_pattern(pattern_t* a, int32_t* index, const blocks_t* p, const rows_t* r) noexcept nogil:
     """Places in index (`index_room`), which begins at a multiple of 8 bytes."""
-    cdef int64_t n = r.n_bodies, words = (n + 63) // 64
-    a.k = count_elements(p, &a.small)
+    cdef int64_t n = r.n_bodies, words = (n + 63) // 64, k = p.n_rows
     a.near = <uint64_t*>index
     a.given = a.near + n * words
     a.degree = index + 4 * n * words
@@ -100,45 +77,28 @@ cdef inline void lay_pattern(pattern_t* a, int32_t* index, const blocks_t* p, co
     a.next = a.rptr + n + 1
     a.pivot = a.next + n + 1
     a.nind = a.pivot + 6 * n + 1
-    a.lind = a.nind + n + a.k + 1
+    a.lind = a.nind + n + k + 1
     a.rind = a.lind + n * (n - 1) // 2 + 1
-    a.ptr = a.rind + n * (n - 1) // 2 + 1
-    a.kind = a.ptr + a.k + 1
-    a.wptr = a.kind + a.k + 1
-    a.group = a.wptr + a.k + 1
-    a.body = a.group + a.k + 1
-    a.node = a.body + 2 * a.k
-    a.slot = a.node + 2 * a.k
-    a.turned = a.slot + 3 * a.k
-    a.side = a.turned + a.k
+    lay_elements(&a.s, k, a.rind + n * (n - 1) // 2 + 1)
+    a.group = a.rind + n * (n - 1) // 2 + 1 + scaled_index(k)
+    a.body = a.group + k + 1
+    a.node = a.body + 2 * k
+    a.slot = a.node + 2 * k
+    a.turned = a.slot + 3 * k
+    a.side = a.turned + k
 
 
 cdef inline void make_pattern(pattern_t* a, const blocks_t* p, const rows_t* r) noexcept nogil:
     """Elements, an elimination order of the bodies, the blocks of N and of its factor."""
-    cdef int32_t i, j, k = 0, c, nr, n = r.n_bodies
+    cdef int32_t i, c, k, n = r.n_bodies
     cdef const int32_t* body
-    a.ptr[0] = 0
-    a.wptr[0] = 0
-    for i in range(p.n_blocks):
-        j = p.ptr[i]
-        nr = p.ptr[i + 1] - j
-        c = i - r.n_joints
-        body = r.joint_body + 2 * i if c < 0 else r.contact_body + 2 * c
-        if p.kind[i] == ROW or nr == 1:
-            for c in range(nr):
-                a.kind[k] = ROW
-                a.ptr[k + 1] = j + c + 1
-                a.wptr[k + 1] = a.wptr[k] + 1
-                a.body[2 * k] = body[0]
-                a.body[2 * k + 1] = body[1]
-                k += 1
-        else:
-            a.kind[k] = SPIN if ends_apart(p.kind[i]) else CONTACT
-            a.ptr[k + 1] = j + nr
-            a.wptr[k + 1] = a.wptr[k] + nr * nr
-            a.body[2 * k] = body[0]
-            a.body[2 * k + 1] = body[1]
-            k += 1
+    find_elements(&a.s, p, NULL, r)
+    k = a.s.e.n
+    for i in range(k):
+        c = a.s.block[i] - r.n_joints
+        body = r.joint_body + 2 * a.s.block[i] if c < 0 else r.contact_body + 2 * c
+        a.body[2 * i] = body[0]
+        a.body[2 * i + 1] = body[1]
     body_order(k, a.body, n, (n + 63) // 64, a.near, a.given, a.degree, a.rank)
     lower_pattern(k, a.body, n, (n + 63) // 64, a.given, a.rank, a.degree, a.nptr, a.nind, a.node, a.slot, a.turned)
     block_tree(n, a.nptr, a.nind, a.parent, a.mark, a.rptr + 1, a.lptr + 1)
@@ -153,42 +113,59 @@ cdef inline void make_pattern(pattern_t* a, const blocks_t* p, const rows_t* r) 
 cdef inline int64_t real_room(const pattern_t* a, const blocks_t* p, const rows_t* r) noexcept nogil:
     """Doubles that `lay_bodies` hands out, after `make_pattern`."""
     cdef int64_t n = r.n_bodies, m = p.n_rows
-    return (12 * m + 9 * m + VECTORS * m + 12 * n + 5 * <int64_t>a.small + 2 * <int64_t>a.k + 2 * KEPT * <int64_t>a.k + 16 * n
+    return (12 * m + scaled_real(m) + (VECTORS + 3) * m + 28 * n + 5 * <int64_t>a.s.small
             + 36 * (2 * <int64_t>a.nptr[n] + 2 * <int64_t>a.lptr[n] + 3 * n))
 
 
-cdef inline void lay_bodies(newton_t* s, bodies_t* w, const pattern_t* a, double* real, const blocks_t* p,
+cdef inline void keep_rows(const pattern_t* a, double* panel) noexcept nogil:
+    """Of the panel the rows that move, the larger place first, as the pattern has it."""
+    cdef int32_t i, j, k
+    cdef double x
+    cdef double* row
+    for k in range(a.s.e.n):
+        for j in range(a.s.e.ptr[k], a.s.e.ptr[k + 1]):
+            row = panel + 12 * <int64_t>j
+            if a.s.keep[j] != j:
+                memmove(row, panel + 12 * <int64_t>a.s.keep[j], 12 * sizeof(double))
+            for i in range(6 if a.turned[k] else 0):
+                x = row[i]
+                row[i] = row[6 + i]
+                row[6 + i] = x
+
+
+cdef inline void lay_bodies(newton_t* s, bodies_t* w, pattern_t* a, double* real, const blocks_t* p,
                             const rows_t* r) noexcept nogil:
     """System, problem, vectors, elements and factor of s in real (`real_room`): panel, scale, g, theta, bounds, cones."""
-    cdef int32_t i, j, k, n = r.n_bodies, m = p.n_rows, h, last = -1, soft = 0
+    cdef int32_t i, k, n = r.n_bodies, m = p.n_rows, h = 0, last = -1, soft = 0
     cdef int64_t b
-    cdef double x
     cdef double* panel = real
-    cdef double* theta = panel + 12 * <int64_t>m
-    cdef double* g = theta + m
-    cdef double* lower = g + m
-    cdef double* upper = lower + m
-    cdef double* at = upper + m
-    cdef double* spin = at + a.k
-    cdef double* scaling = spin + a.k
-    cdef double* root = scaling + 2 * KEPT * <int64_t>a.k
+    cdef double* root = panel + 12 * <int64_t>m
     cdef double* root_mass = root + 9 * n
     cdef double* rest = root_mass + n
-    cdef double* scale = rest
-    cdef double* speed = scale + m
-    lay_vectors(s, speed + m, m)
-    s.s.y = speed + m + VECTORS * <int64_t>m
+    lay_numbers(&a.s, m, rest)
+    rest += scaled_real(m)
+    lay_vectors(s, rest, m)
+    s.s.y = rest + VECTORS * <int64_t>m
     s.s.p = s.s.y + 6 * n
-    s.s.einv = s.s.p + a.small
-    s.s.v = s.s.einv + a.small
-    s.s.pair = s.s.v + a.small
-    s.s.bt = s.s.pair + a.small
-    s.lam = s.s.bt + a.small
+    s.s.einv = s.s.p + a.s.small
+    s.s.v = s.s.einv + a.s.small
+    s.s.pair = s.s.v + a.s.small
+    s.s.bt = s.s.pair + a.s.small
+    s.lam = s.s.bt + a.s.small
     s.problem.w, s.problem.error, s.problem.x = s.lam + m, s.lam + 2 * m, s.lam + 3 * m
     rest = s.problem.x + 12 * n
-    s.problem.p, s.problem.a, s.problem.r, s.problem.g = p[0], NULL, r, NULL
-    s.keep, s.fixed, s.scale, s.speed = NULL, NULL, scale, speed
-    s.s.e, s.s.f, s.s.others = &w.e, &w.f, NULL
+    s.problem.p, s.problem.r = p[0], r                  # null has no type of its own: not one of a pair
+    s.problem.a = NULL
+    s.problem.g = NULL
+    scale_elements(&a.s, p, NULL, r, s.problem.w, s.problem.x)
+    w.s = a.s
+    s.keep = NULL
+    s.fixed = NULL
+    if not a.s.whole:
+        s.keep, s.fixed = w.s.keep, w.s.fixed
+    s.scale, s.speed = w.s.scale, w.s.speed
+    s.s.e, s.s.f = &w.s.e, &w.f
+    s.s.others = NULL
     s.s.form, s.s.symmetric, s.s.wide, s.s.augmented, s.s.factorisations = BODIES, 1, 0, 0, 0
     s.exchange.side = a.side
     s.without = 0
@@ -196,46 +173,17 @@ cdef inline void lay_bodies(newton_t* s, bodies_t* w, const pattern_t* a, double
     for i in range(n):
         root_mass[i] = sqrt(r.inv_mass[i])
     fill_panel(p, r, root, root_mass, panel)
-    k = 0
-    for i in range(p.n_blocks):
-        for j in range(p.ptr[i], p.ptr[i + 1]):
-            scale[j] = 1.0 / sqrt(p.d[j])
-            speed[j] = sqrt(p.nu[j] * p.d[j]) * scale[j]
-            soft += r.compliance[j] != 0.0
-            g[j] = p.b[j] * scale[j]
-            theta[j] = r.compliance[j] * scale[j] * scale[j]
-            lower[j] = p.lower[j] / scale[j] if p.kind[i] == ROW else 0.0
-            upper[j] = p.upper[j] / scale[j] if p.kind[i] == ROW else 1.0 / 0.0
-    for k in range(a.k):
-        at[k] = 0.0
-        spin[k] = 0.0
-    k = 0
-    for i in range(p.n_blocks):
-        j = p.ptr[i]
-        if p.kind[i] == ROW or p.ptr[i + 1] - j == 1:
-            k += p.ptr[i + 1] - j
-            continue
-        at[k] = p.mu[i] * scale[j] / scale[j + 1]
-        if ends_apart(p.kind[i]):
-            h = p.ptr[i + 1] - 1
-            spin[k] = p.mu[i] * p.patch_radius[i] * scale[j] / scale[h]
-        k += 1
-    h = 0
-    for k in range(a.k):
-        # the larger place first, as the pattern has it
-        if a.turned[k]:
-            for j in range(a.ptr[k], a.ptr[k + 1]):
-                for i in range(6):
-                    x = panel[12 * <int64_t>j + i]
-                    panel[12 * <int64_t>j + i] = panel[12 * <int64_t>j + 6 + i]
-                    panel[12 * <int64_t>j + 6 + i] = x
+    keep_rows(a, panel)
+    for i in range(a.s.e.m):
+        soft += a.s.e.theta[i] != 0.0
+    for k in range(a.s.e.n):
         if last < 0 or a.node[2 * k] != a.node[2 * last] or a.node[2 * k + 1] != a.node[2 * last + 1]:
             a.group[h] = k
             h += 1
         last = k
-    a.group[h] = a.k
-    w.e = elements_t(a.k, m, 6, a.ptr, a.kind, a.wptr, a.node, a.slot, h, a.group, panel, theta, g, lower, upper, at, spin,
-                     scaling, 2, NULL)
+    a.group[h] = a.s.e.n
+    w.s.e.s, w.s.e.panel = 6, panel
+    w.s.e.node, w.s.e.slot, w.s.e.group, w.s.e.n_groups = a.node, a.slot, a.group, h
     b = 36 * <int64_t>a.nptr[n]
     w.f.n = n
     w.f.s = 6
@@ -257,5 +205,5 @@ cdef inline void lay_bodies(newton_t* s, bodies_t* w, const pattern_t* a, double
     w.f.super = NULL
     for i in range(72 * n):
         w.f.work[i] = 0.0
-    if a.k == m or soft:                                # B is for rigid cones
+    if a.s.e.n == a.s.e.m or soft:                      # B is for rigid cones
         s.s.bt = NULL

@@ -1,5 +1,9 @@
 """One block of projected Gauss-Seidel over A in compressed rows, or over J and M; over bodies see core/rows.pxd.
 
+    w_q   = sum_j A_qj lam_j - b_q                              of this moment                           (1)
+    lam_q <- clip(lam_q - w_q / d_q, lower_q, upper_q)          a row; a normal has the bounds 0, inf    (2)
+    lam_t <- the part of lam_t - w_t / step that is within mu lam_n, tangents together; spin, rolling alike (3)
+
 Over J and M the whitened velocities u = Y^T lam are kept: w = Y u + c lam - b, then u += Y^T (change).
 """
 from libc.stdint cimport int32_t

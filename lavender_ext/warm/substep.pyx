@@ -24,6 +24,7 @@ from lavender_ext.newton.bodies cimport (bodies_t, index_room, lay_bodies, lay_p
                                          real_room)
 from lavender_ext.newton.elements cimport MAP_AUGMENTED
 from lavender_ext.newton.phases cimport LIMITLESS, begin_rounds, enter_rounds, go_rounds
+from lavender_ext.newton.scaling cimport find_elements
 from lavender_ext.newton.run cimport INNER, N_ROUNDS, impulse_of, newton_t
 from lavender_ext.warm.start cimport (JUDGED, MOST_SWEEPS, MOST_TRACED, UNDECIDED, WALKED, band_width, judged, lay_out,
                                       observe, room_of, scored, start_errors, warm_solve, warm_t)
@@ -147,6 +148,7 @@ cdef inline int32_t newton_substep(const blocks_t* p, const rows_t* r, warm_t* s
     if not scratch[1]:
         return UNDECIDED
     lay_pattern(&a, scratch + HEAD, p, r)
+    find_elements(&a.s, p, NULL, r)                     # the pattern stands from `lav_newton_plan`
     lay_bodies(&n, &w, &a, room, p, r)
     n.problem.e0, n.problem.v0 = e0, v0
     return solve_with_walks(p, r, s, &n, tol, lam, v)

@@ -8,8 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import lavender as lv
-from lavender.engine.layout import CAP_CONTACT, HEAD
+from lavender.engine.layout import HEAD
 from lavender.scene.parts import rotation
+from lavender_ext.engine.arrays import CAP_CONTACT
 
 MARGIN = 0.05
 

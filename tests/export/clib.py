@@ -7,7 +7,7 @@ import numpy as np
 
 from lavender.export import HEADER
 from lavender.export.bindings import struct_fields
-from lavender.export.view import view
+from lavender.export.view import METHODS, view
 
 COUNTS = (
     "form",
@@ -30,12 +30,10 @@ def _struct(name):
     return type(name, (ct.Structure,), {"_fields_": fields})
 
 
-Verdict = _struct("lav_verdict")
+Verdict, Motion = _struct("lav_verdict"), _struct("lav_motion")
 Problem, Options, Budget, Result = (
     _struct(f"lav_{name}") for name in ("problem", "options", "budget", "result")
 )
-METHODS = ("sequential_impulses", "pgs", "sor", "gauss_seidel", "jacobi", "block_gauss_seidel", "anderson", "nncg",
-           "newton", "direct", "lemke", "admm", "auto")  # fmt: skip
 
 
 class Library:
@@ -53,7 +51,7 @@ class Library:
 
     def options(self, method, **given):
         made = Options()
-        assert self.c.lav_default_options(METHODS.index(method) + 1, ct.byref(made)) == 0
+        assert self.c.lav_default_options(METHODS[method], ct.byref(made)) == 0
         for key, value in given.items():
             setattr(made, key, value)
         return made

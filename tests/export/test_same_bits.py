@@ -6,12 +6,15 @@ import itertools
 import numpy as np
 import pytest
 import random_problems as rp
-from clib import METHODS, Refused
+from clib import METHODS, Motion, Refused
 from tower import self_test_hash, self_test_problem
 
 import lavender as lv
-from lavender.export.view import METHODS as IN_LIBRARY
-from lavender.export.view import NotTaken
+from lavender.export.vectors import METHODS_OF_PLANS
+from lavender.export.vectors import turns as turns_of
+from lavender.export.view import OTHER_BITS, NotTaken
+from lavender_ext.driver.driver import Driver
+from lavender_ext.newton.solve import OUTCOMES
 
 
 def problems():
@@ -34,10 +37,27 @@ def problems():
         jac = rng.normal(size=(9, 12))
         cones = lv.Cones.contacts(0.5, count=3)
         yield lv.Problem.from_jacobian(jac, root, rng.normal(size=12), cones=cones, friction=friction)
+        yield from kinds_of(friction)
+
+
+def kinds_of(friction):
+    """Boxes, contacts that resist rolling, and round cones; bodies have none of the last."""
+    rng = np.random.default_rng(11)
+    shapes = [({"shape": "box"}, 3), ({"rolling": 0.1, "tangents": 2}, 5)]
+    shapes += [({"tangents": 4}, 5)] if friction == "cone" else []
+    tower = self_test_problem().rows
+    for more in ({"shape": "box"}, {"rolling": 0.05}):
+        yield lv.Problem.from_rows(tower, mu=0.3, friction=friction, **more)
+    for given, rows in shapes:
+        cones = lv.Cones.contacts(0.4, count=3, **given)
+        jac = rng.normal(size=(3 * rows, 20))
+        yield lv.Problem(rng.normal(size=3 * rows), cones, jac @ jac.T, friction=friction)
+        yield lv.Problem.from_jacobian(jac, np.eye(20), rng.normal(size=20), cones=cones, friction=friction)
 
 
 GIVEN = list(problems())
 UNSUPPORTED = -11
+MORE, CERTIFICATE = OUTCOMES["more"], OUTCOMES["certificate"]
 
 
 def test_the_self_test_is_of_the_package(library):
@@ -47,9 +67,19 @@ def test_the_self_test_is_of_the_package(library):
 
 
 def test_methods_are_numbered_and_named_as_in_the_header(library):
-    for number, name in enumerate(METHODS, 1):
+    assert sorted(METHODS.values()) == list(range(1, 14))
+    for name, number in METHODS.items():
         assert library.c.lav_name(number).decode() == name
-    assert {METHODS[number - 1]: number for number in IN_LIBRARY.values()} == IN_LIBRARY
+
+
+def driven(given, tol, budget):
+    """Impulse and factorisations of `newton` by the package's own compiled driver."""
+    lv.residual(given, given.start())  # d, nu and J M^-1 J^T of a problem are known once it is judged
+    driver, impulse, how = Driver(given.metric, tol, budget), given.start().copy(), MORE
+    assert driver.start(impulse, True)
+    while how in (MORE, CERTIFICATE):
+        how, done, _, _ = driver.step(10**6, impulse)
+    return impulse.tobytes(), done
 
 
 @pytest.mark.parametrize("at", range(len(GIVEN)))
@@ -60,8 +90,8 @@ def test_every_method_has_the_bits_of_the_package(library, at):
         problem = library.problem(given, impulse=start)
     except NotTaken as reason:
         pytest.skip(str(reason))
-    for name, (n, tol) in itertools.product(IN_LIBRARY, ((1, 0.0), (9, 0.0), (40, 0.0), (300, 1e-7))):
-        if name in ("newton", "direct") and tol == 0.0:
+    for name, (n, tol) in itertools.product(METHODS, ((1, 0.0), (9, 0.0), (40, 0.0), (300, 1e-7))):
+        if name in OTHER_BITS or (name in ("newton", "direct") and tol == 0.0):
             continue  # no fixed budget
         if library.c.lav_takes(ct.byref(problem), ct.byref(library.options(name))) == UNSUPPORTED:
             continue
@@ -71,12 +101,15 @@ def test_every_method_has_the_bits_of_the_package(library, at):
             if (name, refused.code) != ("direct", UNSUPPORTED):
                 raise  # `direct` finds an asymmetric A when it has its numbers
             continue
+        if name == "newton" and given.generalized is None:
+            wanted = driven(given, tol, n)
+            said = solver.run(n, tol)
+            assert (solver.impulse().tobytes(), said.iterations) == wanted
+            continue
         found = lv.solve(given, name, tol=tol, max_iter=n, impulse=start)
         if given.matrix is None and "rows of A" in found.solver.form:
             continue  # the package formed A, where that costs less
         said = solver.run(n, tol)
-        if name == "direct" and said.outcome == 6:
-            continue  # FAILED: the package goes on by a line search, which is not in the library
         ran += 1
         case = (name, n, tol, found.solver.form)
         assert solver.impulse().tobytes() == found.impulse.tobytes(), case
@@ -144,3 +177,89 @@ def test_islands_are_what_shares_no_body(library):
     label = np.full(given.n_blocks, -1, np.int32)
     count = library.c.lav_islands(solver.at, label.ctypes.data, given.n_blocks)
     assert count >= 1 and sorted(set(label.tolist())) == list(range(count))
+
+
+@pytest.mark.parametrize("name", ["newton", *OTHER_BITS])
+def test_methods_with_bits_of_their_own_meet_the_tolerance_where_the_package_does(library, name):
+    met = 0
+    for given in GIVEN:
+        try:
+            solver = library.open(library.problem(given), library.options(name))
+        except (NotTaken, Refused):
+            continue
+        said = solver.run(10_000, 1e-7)
+        truth = lv.residual(given, solver.impulse()).relative
+        assert said.verdict.relative == truth
+        assert (said.outcome == 1) == (truth <= 1e-7)
+        assert said.outcome == 1 or not lv.solve(given, name, tol=1e-7, max_iter=10_000).success
+        met += said.outcome == 1
+    assert met >= 7
+
+
+def test_auto_takes_the_turns_that_it_is_given_and_says_who_ended_it(library):
+    given = self_test_problem()
+    turns = np.array([METHODS["anderson"], 3, METHODS["newton"], 50], np.int32)
+    options = library.options("auto", n_turns=2, turns=turns.ctypes.data)
+    solver = library.open(library.problem(given), options)
+    turns[:] = 0  # they were copied
+    said = solver.run(1000, 1e-9)
+    assert (said.outcome, said.method) == (1, METHODS["newton"]) and said.iterations > 3
+    plan = lv.explain(given)
+    assert turns_of(plan)[::2] == list(
+        dict.fromkeys(METHODS[METHODS_OF_PLANS[name][0]] for name, _ in plan.candidates)
+    )
+    options.n_turns = 0  # the library's own
+    short = library.open(library.problem(given), options).run(3, 1e-9)
+    assert short.iterations == 3 and short.outcome == 0
+
+
+def test_a_line_search_ends_singular_rows_on_which_exchanges_go_round(library):
+    descended = 0
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        g = rng.normal(size=(14, 6)) * 10.0 ** rng.uniform(-3, 3, size=(14, 1))
+        given = lv.Problem.lcp(g @ g.T, g @ rng.normal(size=6), upper=rng.uniform(0.1, 2.0, size=14))
+        found = lv.solve(given, "direct", tol=1e-9)
+        solver = library.open(library.problem(given), library.options("direct"))
+        said = solver.run(1000, 1e-9)
+        if "line_searches" in found.work:
+            descended += 1
+            assert said.verdict.relative <= max(1e-9, 10.0 * found.residual.relative)
+        else:
+            assert solver.impulse().tobytes() == found.impulse.tobytes()
+    assert descended
+
+
+def test_motion_errors_are_those_of_the_package(library):
+    looked = 0
+    for given in GIVEN:
+        try:
+            solver = library.open(library.problem(given), library.options("auto"))
+        except (NotTaken, Refused):
+            continue
+        if solver.run(5000, 1e-12).verdict.relative > 1e-11:
+            continue
+        reference = solver.impulse()
+        x = reference * (1.0 + 0.01 * np.cos(np.arange(given.m)))
+        out = Motion()
+        out.size = ct.sizeof(Motion)
+        at = [np.ascontiguousarray(a).ctypes.data_as(ct.c_void_p) for a in (x, reference)]
+        assert library.c.lav_motion_error(solver.at, *at, given.m, ct.byref(out)) == 0
+        wanted = lv.motion_error(given, x, reference)
+        if wanted.energy is None:
+            continue
+        looked += 1
+        assert out.energy == pytest.approx(wanted.energy, rel=1e-6)
+        assert out.kinetic == pytest.approx(
+            wanted.energy if wanted.kinetic is None else wanted.kinetic, rel=1e-6
+        )
+        assert out.relative == pytest.approx(wanted.relative, rel=1e-6)
+        assert (out.row, out.rows) == (wanted.row, pytest.approx(wanted.rows, rel=1e-6))
+        if wanted.speed is not None:
+            assert (out.body, out.speed) == (wanted.body, pytest.approx(wanted.speed, rel=1e-6))
+            assert out.spin == pytest.approx(wanted.spin or 0.0, rel=1e-6)
+        if wanted.bound is not None:
+            assert out.bound == pytest.approx(wanted.bound, rel=1e-4)
+        else:
+            assert out.bound == np.inf or given.law != "coulomb"
+    assert looked >= 5

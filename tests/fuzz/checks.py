@@ -237,7 +237,13 @@ def check_file(spec):
     path = Path(FOLDER.name, f"{os.getpid()}{spec['suffix']}")
     path.write_bytes(base64.b64decode(spec["data"]))
     COUNTS["files"] += 1
-    stored = lv.io.read(path, max_bytes=spec.get("max_bytes", 10**7))
+    try:
+        stored = lv.io.read(path, max_bytes=spec.get("max_bytes", 10**7))
+    except REFUSED as error:
+        if str(path) not in str(error):
+            yield "unnamed file", str(error)
+        COUNTS["refused"] += 1
+        return
     COUNTS["loaded"] += 1
     problem = stored.problem
     for x in (problem.b, problem.cones.mu, *stored.guesses):

@@ -169,7 +169,7 @@ def test_crashes_hangs_and_raw_exceptions_are_found_and_kept(tmp_path, monkeypat
 
 
 # some seconds each
-EXAMPLES = {"solve": 200, "file": 100, "steps": 60, "snapshot": 60, "folder": 2, "door": 60, "promise": 60}
+EXAMPLES = {"solve": 200, "file": 250, "steps": 60, "snapshot": 60, "folder": 2, "door": 60, "promise": 60}
 
 
 @pytest.mark.parametrize("kind", checks.INPUTS)

@@ -45,11 +45,7 @@ def test_contacts_are_solved_as_newton_solves_them(friction, seed):
     base = random_contact_problem(seed, friction=friction, bodies=5, contacts=6, joints=2)
     for problem in forms(base):
         expected = lv.solve(problem, "newton", tol=1e-9)
-        found = driven(problem)
-        if found is None:  # rows that cannot move, over bodies
-            assert problem.rows is not None
-            continue
-        how, done, relative, impulse = found
+        how, done, relative, impulse = driven(problem)
         truth = lv.residual(problem, impulse).relative
         assert relative == pytest.approx(truth, rel=1e-9, abs=1e-300)
         if how == REACHED:
@@ -90,13 +86,31 @@ def test_rows_that_cannot_move_stay_and_push_the_others():
     how, _, _, impulse = driven(problem, 1e-12)
     assert how == REACHED
     np.testing.assert_allclose(impulse, [0.5, 0.0, 1.0 / 3.0], rtol=0, atol=1e-14)
-    base = as_matrix(random_contact_problem(3, friction="cone", bodies=4, contacts=6))
-    still = replace(
-        base, cones=replace(base.cones, mu=np.where(np.arange(base.n_blocks) % 2, base.cones.mu, 0.0))
-    )
-    how, _, _, impulse = driven(still)
-    assert how == REACHED
-    assert lv.residual(still, impulse).relative <= 1e-9
+    for base in forms(random_contact_problem(3, friction="cone", bodies=4, contacts=6, joints=2)):
+        c = base.cones
+        held = np.arange(base.m) == 1
+        still = replace(
+            base,
+            cones=replace(
+                c,
+                mu=np.where(np.arange(base.n_blocks) % 2, c.mu, 0.0),
+                lower=np.where(held, 0.2, c.lower),
+                upper=np.where(held, 0.2, c.upper),
+            ),
+        )
+        how, _, _, impulse = driven(still)
+        assert how == REACHED and impulse[1] == 0.2
+        assert lv.residual(still, impulse).relative <= 1e-9
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("friction", ["coulomb", "cone"])
+def test_contacts_that_roll_are_solved_over_bodies_and_rows(friction, seed):
+    for problem in forms(random_contact_problem(seed, friction, rolling=True, bodies=4, contacts=5)):
+        how, _, _, impulse = driven(problem)
+        expected = lv.solve(problem, "newton", tol=1e-9)
+        assert (how == REACHED) == expected.success
+        assert how != REACHED or lv.residual(problem, impulse).relative <= 1e-9
 
 
 def test_a_budget_ends_it_and_a_proof_too():
@@ -112,9 +126,9 @@ def test_a_budget_ends_it_and_a_proof_too():
 def test_what_the_method_does_not_take_is_said_at_once():
     problem = lv.Problem.contact(np.eye(3), np.ones(3), [0.5])
     assert driven(problem) is not None
-    still = random_contact_problem(3, friction="cone", bodies=4, contacts=6)
-    assert driven(replace(still, cones=replace(still.cones, mu=np.zeros(still.n_blocks)))) is None
     assert driven(wild(seed=44017).problem) is not None
+    cone = lv.Problem(np.ones(5), lv.Cones.contacts([0.5], 4), np.eye(5), friction="cone")
+    assert driven(cone) is None
 
 
 # -- without Python --------------------------------------------------------------------------------------------

@@ -13,8 +13,8 @@ from random_problems import as_matrix, random_contact_problem, random_lcp, seeds
 import lavender as lv
 from benchmarks.drawn import wild
 from lavender import suite
+from lavender.cones import CONTACT_SPIN, ROW
 from lavender.solvers._newton import pattern, sparse, systems
-from lavender.solvers._newton import scaled as scaling
 from lavender.solvers._newton.systems import make_system
 from lavender_ext.factor import symbolic
 from lavender_ext.factor.sparse import SparsePanels
@@ -43,23 +43,41 @@ def dense_small(system, values):
     return out
 
 
-@pytest.mark.parametrize(
-    "problem",
-    [
-        suite.pyramid(k=3, mass_ratio=1e3, friction="coulomb", sliding=0.5).problem,
-        suite.pyramid(k=3).problem,
-        random_lcp(1, m=6),
-    ],
-    ids=["contacts alone", "rows over bodies", "rows of a matrix, boxed"],
-)
-def test_usual_problems_are_scaled_as_any_other(problem, monkeypatch):
-    quick = scaling.scaled(problem)
-    monkeypatch.setattr(scaling, "_elements", scaling._mixed_elements)
-    general = scaling.scaled(problem)
-    assert quick.whole
-    for name, value in vars(general).items():
-        if name != "problem":
-            assert np.array_equal(getattr(quick, name), value), name
+@pytest.mark.parametrize("form", ["velocity", "impulse"])
+@given(seed=seeds)
+@settings(max_examples=30)
+def test_a_problem_is_scaled_by_its_definition(form, seed):
+    """Rows that stay, g, theta and openings from A, bounds and reach alone; contacts that spin, roll, or do not rub."""
+    rng = np.random.default_rng(seed)
+    base = random_contact_problem(seed, "cone", 2, bool(seed % 2), bodies=4, joints=2, contacts=6)
+    cones, soft = base.cones, rng.uniform(0.1, 1.0, base.m) * base.d
+    mu = np.where(rng.random(base.n_blocks) < 0.3, 0.0, cones.mu)
+    upper = np.where(
+        (cones.kind[np.repeat(np.arange(base.n_blocks), np.diff(cones.ptr))] == ROW), 0.3, np.inf
+    )
+    free = np.isposinf(upper) | (rng.random(base.m) < 0.5)
+    lower = np.where(free, cones.lower, 0.3)
+    cones = replace(cones, mu=mu, lower=lower, upper=np.where(free, cones.upper, 0.3))
+    problem = replace(base, cones=cones, compliance=soft if seed % 3 else base.compliance)
+    sc = make_system(problem, form).sc
+    reach, contact = cones.reach, np.repeat(cones.kind != ROW, np.diff(cones.ptr))
+    first = np.isin(np.arange(problem.m), cones.ptr[:-1])
+    stays = (cones.lower == cones.upper) | (contact & ~first & (reach == 0.0))
+    assert np.array_equal(sc.keep, np.flatnonzero(~stays))
+    np.testing.assert_array_equal(sc.fixed, np.where(stays & ~contact, cones.lower, 0.0))
+    root, pushed = np.sqrt(problem.d), problem.dense() @ sc.fixed
+    size = np.abs(problem.b) + np.abs(problem.dense()) @ np.abs(sc.fixed)
+    np.testing.assert_allclose(
+        sc.g, ((problem.b - pushed) / root)[sc.keep], rtol=0, atol=1e-13 * (size / root).max()
+    )
+    theta = problem.compliance / problem.d if form == "velocity" else np.zeros(problem.m)
+    np.testing.assert_allclose(sc.theta, theta[sc.keep], rtol=1e-13)
+    for i, at in enumerate(sc.ptr[:-1]):
+        rows = sc.keep[at : sc.ptr[i + 1]]
+        open_ = reach[rows] * root[rows] / root[rows[0]]
+        assert sc.a_t[i] == pytest.approx(open_[1] if len(rows) > 1 else 0.0, rel=1e-13)
+        assert sc.a_s[i] == pytest.approx(open_[-1] if sc.kind[i] == CONTACT_SPIN else 0.0, rel=1e-13)
+        assert np.all(cones.ptr[sc.block[i]] <= rows) and np.all(rows < cones.ptr[sc.block[i] + 1])
 
 
 # -- linear algebra ---------------------------------------------------------------------------------

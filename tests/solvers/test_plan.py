@@ -6,15 +6,19 @@ import numpy as np
 import pytest
 from random_trees import random_general
 
+import benchmarks.drawn  # noqa: F401  # families of the suite
 import lavender as lv
 from lavender import suite
 from lavender.cli import main
 from lavender.deadline import Deadline
 from lavender.problem import LAWS, OPERATORS
+from lavender.residuals import reference
 from lavender.solvers._log import SolveLog
-from lavender.solvers._methods import Sweeps, in_short_time
+from lavender.solvers._methods import Sweeps
 from lavender.solvers._plan import METHODS, TABLE, Costs, candidates
 from lavender.solvers._structure import Structure
+from lavender.solvers.auto import Auto, solve
+from lavender.suite.build import Bodies, Contacts, contact_problem
 
 NAMES = (
     "stack(n=200)",
@@ -125,15 +129,41 @@ def test_no_more_than_four_are_asked(name):
 
 @pytest.mark.parametrize("name", ["wild(seed=12)", "wild(seed=24)", "wild(seed=3)", "granularF(n=9)"])
 def test_what_would_not_end_in_time_is_neither_counted_nor_begun(name, monkeypatch):
-    """With the least of time sweeps have all of it, though what factors is expected to be cheaper."""
+    """With the least of time sweeps, set up before its clock starts, have all of it."""
     problem = suite.case(name).problem
+    reference(problem)
+    state = Auto().prepare(problem)
+    monkeypatch.setattr(Costs, "least", lambda self, asked: self.of(asked) if asked == "anderson" else 1 / 0)
+    Auto().ready(state, 1e-4)
+    monkeypatch.setattr(Sweeps, "set_up", None)
     log = SolveLog(problem, 1e-12, 10**6, deadline=Deadline(1e-4))
     log.offer(problem.start())
-    costs = Costs(problem, 1e-12)
-    monkeypatch.setattr(Costs, "least", lambda self, asked: self.of(asked) if asked == "anderson" else 1 / 0)
-    (sweeps,) = in_short_time(log, costs)
-    assert sweeps.name == "anderson" and log.iterations > 0
+    solve(log, None, state.sweeps)
+    assert log.iterations > 0
     assert [turn.solver for turn in log.turns] == ["anderson"]
+
+
+def test_with_time_enough_nothing_is_set_up_before_the_clock():
+    state = Auto().prepare(suite.stack(n=200).problem)
+    Auto().ready(state, 10.0)
+    assert state.sweeps is None
+
+
+@pytest.mark.parametrize("form", OPERATORS[:2])
+def test_where_contacts_roll_sweeps_come_before_newton(form):
+    """Newton's method takes a round for each guess of what rolls; no island is solved apart."""
+    rng = np.random.default_rng(3)
+    position = np.array([[1.0 * (k % 4), 0.0, 0.5 + k // 4] for k in range(12)])
+    pairs = [(k - 4 if k >= 4 else -1, k) for k in range(12)]
+    contacts = Contacts(pairs, position - [0.0, 0.0, 0.5], [0.0, 0.0, 1.0])
+    bodies = Bodies(position, 1.0, 0.4)
+    bodies.v_free += 0.2 * rng.standard_normal(bodies.v_free.shape)
+    problem = contact_problem(bodies, contacts, "coulomb", rolling=0.02)
+    if form == "matrix":
+        problem = lv.Problem(problem.b, problem.cones, problem.delassus())
+    assert lv.explain(problem).first[0] == "anderson"
+    solution = lv.solve(problem, tol=1e-9)
+    assert solution.success and solution.turns[0].solver == "anderson"
 
 
 def test_a_floor_is_below_what_is_counted():

@@ -15,7 +15,9 @@
  *            write it. Fields are only ever added, at the end.
  *
  * Rows of a block: ROW one or more bounded rows; CONTACT a normal, then 0 to 2 tangents; CONTACT_SPIN the same, then one
- * row of spin about the normal. 32-bit integers and doubles, C order, without gaps.
+ * row of spin about the normal; CONTACT_BOX a normal and two tangents, each bounded by itself; CONTACT_ROLLING a normal, two
+ * tangents, perhaps a spin, two rows that roll; ROUND a normal and three to five tangents in one cone (not of bodies).
+ * 32-bit integers and doubles, C order, without gaps.
  */
 #ifndef LAVENDER_H
 #define LAVENDER_H
@@ -66,7 +68,7 @@ enum { /* what functions return */
 
 enum { LAV_MATRIX = 1, LAV_BODIES = 2, LAV_VELOCITIES = 3 };      /* form: A; bodies, joints, contacts; J and M */
 enum { LAV_COULOMB = 0, LAV_CONE = 1 };                           /* law */
-enum { LAV_ROW = 0, LAV_CONTACT = 1, LAV_CONTACT_SPIN = 2 };      /* kind */
+enum { LAV_ROW = 0, LAV_CONTACT = 1, LAV_CONTACT_SPIN = 2, LAV_ROUND = 3, LAV_CONTACT_BOX = 4, LAV_CONTACT_ROLLING = 5 }; /* kind */
 enum { LAV_GIVEN = 0, LAV_SYMMETRIC = 1, LAV_RANDOM = 2, LAV_REVERSE = 3 }; /* order of a sweep */
 enum { LAV_DEFAULT_SWEEP = 0, LAV_PGS_SWEEP = 1, LAV_BLOCK_SWEEP = 2 };
 
@@ -79,11 +81,11 @@ enum { /* methods; names as in Python, by `lav_name` */
   LAV_BLOCK_GAUSS_SEIDEL = 6,  /* all forms */
   LAV_ANDERSON = 7,            /* all forms */
   LAV_NNCG = 8,                /* all forms */
-  LAV_NEWTON = 9,              /* J and M */
-  LAV_DIRECT = 10,             /* A, symmetric, rows alone */
-  LAV_LEMKE = 11,              /* not in this library */
-  LAV_ADMM = 12,               /* not in this library */
-  LAV_AUTO = 13                /* not in this library */
+  LAV_NEWTON = 9,              /* all forms; rolling and round cones with J and M alone */
+  LAV_DIRECT = 10,             /* A, bodies; rows alone */
+  LAV_LEMKE = 11,              /* A, bodies; rows alone */
+  LAV_ADMM = 12,               /* A, bodies; dense */
+  LAV_AUTO = 13                /* all forms: others in turns, `turns` of the options */
 };
 
 enum { /* how a run ended; a claim, which `relative` beside it may contradict */
@@ -112,7 +114,7 @@ typedef struct lav_problem {
   const int32_t *kind;         /* (k); null: ROW */
   const double *lower, *upper; /* (m) N s, read on ROW blocks; null: no bound */
   const double *mu;            /* (k) >= 0; null: 0 */
-  const double *patch_radius;  /* (k) m, >= 0; null: 0 */
+  const double *patch_radius;  /* (k) m, of CONTACT_BOX mu_2 / mu_1, >= 0; null: 0 */
   const double *b;             /* (m) m/s; null: target - J velocity */
   const double *target;        /* (m) m/s; null: 0 */
   const double *velocity;      /* v*: (n_bodies, 6) linear, then angular; (nv); null: 0 */
@@ -134,19 +136,22 @@ typedef struct lav_problem {
   const double *normal;        /* (contacts, 3) unit, from a to b */
   const double *tangent;       /* (contacts, 3) unit, at a right angle to it; the second tangent is normal x tangent */
   const double *arm_a, *arm_b; /* (contacts, 3) m, contact point minus centre */
+  const double *rolling;       /* (k) m, bound of rolling over the normal impulse, >= 0; null: 0 */
 } lav_problem;
 
 typedef struct lav_options {
   uint32_t size;
   int32_t method;
   int32_t order;               /* LAV_GIVEN | LAV_SYMMETRIC | LAV_RANDOM | LAV_REVERSE */
-  int32_t memory;              /* anderson: sweeps that are combined, 1 to 16 */
+  int32_t memory;              /* anderson, admm: iterations that are combined, 1 to 16 */
   int32_t sweep;               /* anderson, nncg: LAV_DEFAULT_SWEEP (blocks under the cone law, else pgs) | ... */
   int32_t convex;              /* anderson, nncg: iterations under the cone law first */
   int32_t keeps;               /* nncg: 1 restarts only against the sweep */
-  int32_t unused;
+  int32_t n_turns;             /* auto: of `turns`, 0 to 16; 0: the library's own for the problem */
   uint64_t seed;               /* of LAV_RANDOM */
   double omega;                /* sor: 0 to 2; jacobi: > 0, or 0 for the safe damping */
+  const int32_t *turns;        /* (n_turns, 2) auto: method and iterations of each turn; after the last one the first again, with
+                                  four times as many; copied by `lav_open` */
 } lav_options;
 
 typedef struct lav_budget {
@@ -167,12 +172,25 @@ typedef struct lav_verdict { /* the judge's, of any impulse */
   double floor;                /* what rounding of the impulse alone costs, relative */
 } lav_verdict;
 
+typedef struct lav_motion { /* how far an impulse's motion is from that of a reference */
+  uint32_t size;
+  int32_t row;                 /* of `rows`, -1 without one */
+  int32_t body;                /* of `speed`: body or generalised velocity, -1 without one */
+  int32_t unused;
+  double kinetic;              /* sqrt J, of the difference of velocities; of A alone as `energy` */
+  double energy;               /* sqrt J, with what compliance stores */
+  double relative;             /* kinetic over that of the reference's own impulses; infinite where these move nothing */
+  double speed, spin;          /* m/s and rad/s of the bodies furthest off; of a generalised velocity its own unit, and 0 */
+  double rows;                 /* m/s, largest |A (lambda - reference)| */
+  double bound;                /* sqrt J: `energy` to the solution is no more, to rounding; infinite under Coulomb's law */
+} lav_motion;
+
 typedef struct lav_result {
   uint32_t size;
   int32_t outcome;
   int32_t iterations;          /* of this run */
   int32_t sweeps;
-  int32_t restarts;            /* of anderson and nncg; blocks without an exact answer; Newton's factorisations */
+  int32_t restarts;            /* of anderson and nncg; blocks without an exact answer; factorisations of the others */
   int32_t method;              /* that made the impulse: auto names another one */
   lav_verdict verdict;
 } lav_result;
@@ -210,6 +228,9 @@ LAV_API int32_t lav_velocity(lav_solver *solver, double *out, int32_t n); /* v+,
 /* The judge on any impulse (m): slack w and error e (m) where not null. */
 LAV_API int32_t lav_judge(lav_solver *solver, const double *impulse, int32_t n, double *slack, double *error,
                           lav_verdict *out);
+/* How wrong the motion of an impulse (m) is, beside a reference (m) that was solved further. */
+LAV_API int32_t lav_motion_error(lav_solver *solver, const double *impulse, const double *reference, int32_t n,
+                                 lav_motion *out);
 /* Number of the island of each block (k), which share no moving body, velocity or entry of A; how many, or an error. */
 LAV_API int32_t lav_islands(lav_solver *solver, int32_t *label, int32_t n);
 /* Hash of the bits of numbers, as test vectors have it. */

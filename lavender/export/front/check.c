@@ -39,25 +39,28 @@ static int solve_one(int64_t number) {
   lav_result result;
   lav_solver *solver = NULL;
   uint64_t bytes, i;
-  double relative, *impulse, *found;
+  double relative, *impulse = NULL, *found;
+  int32_t turns[32], is_met;
   CHECK(lav_default_options((int32_t)whole(), &options));
   CHECK(lav_default_budget(&budget));
   options.order = (int32_t)whole(), options.memory = (int32_t)whole(), options.sweep = (int32_t)whole();
   options.convex = (int32_t)whole(), options.keeps = (int32_t)whole(), options.seed = (uint64_t)whole(), options.omega = real();
   budget.iterations = (int32_t)whole(), budget.tol = real();
+  options.n_turns = (int32_t)whole(), options.turns = turns;
+  for (i = 0; i < 2 * (uint64_t)options.n_turns && i < 32; i++) turns[i] = (int32_t)whole();
   CHECK(lav_default_problem((int32_t)whole(), &q));
   q.law = (int32_t)whole(), q.n_blocks = (int32_t)whole(), q.n_rows = (int32_t)whole(), q.n_entries = (int32_t)whole();
   q.n_bodies = (int32_t)whole(), q.n_joints = (int32_t)whole(), q.n_velocities = (int32_t)whole();
   q.n_mass_entries = (int32_t)whole();
   {
-    const void **at = (const void **)(void *)&q.block_ptr; /* 28 pointers, one behind the other */
-    for (i = 0; i < 28; i++) {
+    const void **at = (const void **)(void *)&q.block_ptr, **end = (const void **)(void *)(&q + 1); /* pointers to the end */
+    for (; at < end; at++) {
       const int64_t size = whole();
-      at[i] = size < 0 ? NULL : array(size);
+      *at = size < 0 ? NULL : array(size);
     }
   }
-  relative = real();
-  impulse = (double *)array(8 * (int64_t)q.n_rows);
+  is_met = (int32_t)whole(), relative = real(); /* a residual to be met, or bits */
+  if (!is_met) impulse = (double *)array(8 * (int64_t)q.n_rows);
   found = (double *)calloc((size_t)q.n_rows + 1, 8);
   memset(&result, 0, sizeof result);
   result.size = sizeof result;
@@ -75,8 +78,9 @@ static int solve_one(int64_t number) {
   CHECK(lav_run(solver, &budget, &result));
   CHECK(lav_impulse(solver, found, q.n_rows));
   {
-    const int same = memcmp(found, impulse, 8 * (size_t)q.n_rows) == 0 && memcmp(&relative, &result.verdict.relative, 8) == 0;
-    printf("%s  %016llx  %s on %d rows: %s, residual %.2e\n", same ? "same   " : "DIFFERS",
+    const int same = is_met ? result.verdict.relative <= relative
+                            : memcmp(found, impulse, 8 * (size_t)q.n_rows) == 0 && memcmp(&relative, &result.verdict.relative, 8) == 0;
+    printf("%s  %016llx  %s on %d rows: %s, residual %.2e\n", !same ? "DIFFERS" : is_met ? "met    " : "same   ",
            (unsigned long long)lav_hash(found, q.n_rows, 0), lav_name(options.method), q.n_rows, lav_outcome(result.outcome),
            result.verdict.relative);
     (void)number;

@@ -7,7 +7,8 @@ typedef struct core_generalized_generalized_t general_t;
 typedef struct judge_score_score_t score_t;
 typedef void (*sweep_t)(void *, double *, int32_t, int32_t);
 
-enum { MAGIC = 0x4C415631, PATIENCE = 64, LONG_PATIENCE = 500, AGAIN = 64, CONTROL = 9, GRAM = 256 };
+enum { MAGIC = 0x4C415631, PATIENCE = 64, LONG_PATIENCE = 500, SPLIT_PATIENCE = 5000, AGAIN = 64, CONTROL = 9, GRAM = 256 };
+enum { MOST_TURNS = 16, FEW_ROWS = 600 }; /* of auto, and up to which it forms dense matrices */
 enum { PACK_FROM = 24, FAR_FROM = 4000 }; /* blocks from which sweeps run in pairs, and from which they leave the cache */
 
 typedef struct kept_t { /* impulses of the problem before, by key */
@@ -32,7 +33,7 @@ struct lav_solver {
   rows_t r;
   general_t g;
   uint64_t *key;
-  double *impulse, *v_free, *v, *score_room;
+  double *impulse, *v_free, *v, *score_room, *compare;
   double start[3]; /* E0 [sqrt J], V0 [m/s], relative residual of doing nothing */
   int32_t *order, *empty, *marks;
   int32_t split, mode;
@@ -41,6 +42,7 @@ struct lav_solver {
   sweep_t step;
   void *context;
   struct sweep_serial_context_t swept;
+  double deadline;  /* by the clock of the budget */
 #ifndef LAV_SWEEPS_ONLY
   struct sweep_serial_packing_t packing;
   struct local_gauss_seidel_context_t local;
@@ -50,11 +52,23 @@ struct lav_solver {
   struct sweep_packed_packed_t pairs;
   double *pair_room;
   int32_t pairs_asked;
-  struct generalized_flow_flow_t flow;
   struct driver_driver_view_t view;
-  struct few_pivots_trial_t trial;
-  int32_t *sides;
-  int32_t band, is_linear, doubt; /* doubt: Newton's tol is tighter than what was asked */
+  struct driver_driver_asked_t asked;
+  struct driver_driver_room_t drive;
+  int32_t driven;              /* Newton's method has begun, as `asked` says */
+  blocks_t q;                  /* with d, nu and step of A, where a method goes over A */
+  struct pivot_principal_pivoting_t pivots;
+  int32_t band, is_linear, is_symmetric, left; /* left: of the budget */
+  double *pivot_room, *from, *tried, *search, best, best_floor;
+  int32_t *pivot_marks, *whole;
+  double *table;               /* Lemke's dictionary, or the factor of admm */
+  struct accelerate_admm_admm_t splitting;
+  struct accelerate_admm_factor_t factor;
+  struct accelerate_mixing_mixing_t mixing;
+  int32_t factors, is_broken;
+  int32_t turns[2 * MOST_TURNS], given_turns[2 * MOST_TURNS], n_turns, at_turn; /* of auto */
+  uint64_t common;             /* where the memory of a turn begins */
+  double *chosen;
 #endif
 };
 
@@ -133,7 +147,7 @@ int32_t lav_default_options(int32_t method, lav_options *out) {
   memset(out, 0, sizeof *out);
   out->size = (uint32_t)sizeof *out;
   out->method = method;
-  out->memory = 5;
+  out->memory = method == LAV_ADMM ? 10 : 5;
   out->omega = method == LAV_SOR ? 1.5 : method == LAV_GAUSS_SEIDEL ? 1.0 : 0.0;
   return LAV_OK;
 }
@@ -185,6 +199,7 @@ static int32_t check_counts(const lav_problem *q) {
 }
 
 static int32_t check_options(const lav_options *o) {
+  int32_t i;
   if (o->size != sizeof *o) return LAV_ERROR_VERSION;
   if (!lav_name(o->method) || o->order < LAV_GIVEN || o->order > LAV_REVERSE) return LAV_ERROR_OPTION;
   if (o->memory < 1 || o->memory > 16 || o->sweep < LAV_DEFAULT_SWEEP || o->sweep > LAV_BLOCK_SWEEP) return LAV_ERROR_OPTION;
@@ -192,6 +207,9 @@ static int32_t check_options(const lav_options *o) {
   if (o->method == LAV_SOR && !(o->omega > 0.0 && o->omega < 2.0)) return LAV_ERROR_OPTION;
   if (o->method == LAV_JACOBI && !(o->omega >= 0.0 && o->omega < 1e300)) return LAV_ERROR_OPTION;
   if (o->method == LAV_GAUSS_SEIDEL && o->omega != 1.0) return LAV_ERROR_OPTION;
+  if (o->n_turns < 0 || o->n_turns > MOST_TURNS || (o->n_turns > 0 && !o->turns)) return LAV_ERROR_OPTION;
+  for (i = 0; i < o->n_turns; i++)
+    if (!lav_name(o->turns[2 * i]) || o->turns[2 * i] == LAV_AUTO || o->turns[2 * i + 1] < 1) return LAV_ERROR_OPTION;
   return LAV_OK;
 }
 
@@ -205,26 +223,43 @@ static int32_t takes_form(int32_t method, int32_t form) {
     case LAV_PGS: return form != LAV_BODIES;
     case LAV_SOR: case LAV_GAUSS_SEIDEL: case LAV_JACOBI: return form == LAV_MATRIX;
 #ifndef LAV_SWEEPS_ONLY
-    case LAV_BLOCK_GAUSS_SEIDEL: case LAV_ANDERSON: case LAV_NNCG: return 1;
-    case LAV_NEWTON: return form == LAV_VELOCITIES;
-    case LAV_DIRECT: return form == LAV_MATRIX;
+    case LAV_BLOCK_GAUSS_SEIDEL: case LAV_ANDERSON: case LAV_NNCG: case LAV_NEWTON: case LAV_AUTO: return 1;
+    case LAV_DIRECT: case LAV_LEMKE: case LAV_ADMM: return form != LAV_VELOCITIES; /* over A, which is formed of bodies */
 #endif
     default: return 0;
   }
 }
 
+/* Does it take contacts whose rolling is bounded, and cones of more than two tangents? */
+static int32_t takes_kind(int32_t method, int32_t form, int32_t kind) {
+  const int32_t is_general = method == LAV_BLOCK_GAUSS_SEIDEL || method == LAV_ADMM || method == LAV_AUTO ||
+                             (method == LAV_NEWTON && form == LAV_VELOCITIES) || method == LAV_NNCG;
+  if (kind == LAV_ROUND) return is_general && form != LAV_BODIES;
+  return kind != LAV_CONTACT_ROLLING || is_general || method == LAV_ANDERSON || method <= LAV_PGS || method == LAV_JACOBI;
+}
+
+/* Bounds that no other impulse moves. */
+static int32_t are_rows(const lav_problem *q) {
+  int32_t i;
+  for (i = 0; q->kind && i < q->n_blocks; i++)
+    if (q->kind[i] != LAV_ROW && (!q->block_ptr || q->block_ptr[i + 1] - q->block_ptr[i] > 1)) return 0;
+  return 1;
+}
+
 static int32_t takes(const lav_problem *q, const lav_options *o) {
-  int32_t i, free_rows = 1, rows_alone = 1;
+  const int32_t rows_alone = are_rows(q);
+  int32_t i, free_rows = 1;
   if (!takes_form(o->method, q->form)) return LAV_ERROR_UNSUPPORTED;
   for (i = 0; q->kind && i < q->n_blocks; i++)
     if (q->kind[i] != LAV_ROW) {
       free_rows = 0;
-      if (!q->block_ptr || q->block_ptr[i + 1] - q->block_ptr[i] > 1) rows_alone = 0;
+      if (!takes_kind(o->method, q->form, q->kind[i])) return LAV_ERROR_UNSUPPORTED;
+      if (q->kind[i] == LAV_ROUND && q->law != LAV_CONE) return LAV_ERROR_UNSUPPORTED;
     }
   for (i = 0; i < q->n_rows; i++)
     if ((q->lower && q->lower[i] > -DBL_MAX) || (q->upper && q->upper[i] < DBL_MAX)) free_rows = 0;
   if ((o->method == LAV_SOR || o->method == LAV_GAUSS_SEIDEL) && !free_rows) return LAV_ERROR_UNSUPPORTED;
-  if (o->method == LAV_DIRECT && !rows_alone) return LAV_ERROR_UNSUPPORTED;
+  if ((o->method == LAV_DIRECT || o->method == LAV_LEMKE) && !rows_alone) return LAV_ERROR_UNSUPPORTED;
   if (q->law == LAV_CONE && !rows_alone) {
     if (o->method <= LAV_JACOBI) return LAV_ERROR_UNSUPPORTED; /* no update for that law */
     if ((o->method == LAV_ANDERSON || o->method == LAV_NNCG) && o->sweep == LAV_PGS_SWEEP) return LAV_ERROR_UNSUPPORTED;
@@ -233,6 +268,7 @@ static int32_t takes(const lav_problem *q, const lav_options *o) {
 }
 
 static int32_t check_blocks(const lav_problem *q) {
+  static const int32_t least_rows[6] = {1, 1, 2, 4, 3, 5}, most_rows[6] = {1, 3, 4, 6, 3, 6}; /* by kind */
   int32_t i, j;
   if (q->n_rows > 0 && !q->block_ptr && q->n_blocks != q->n_rows) return LAV_ERROR_BLOCKS;
   if (q->block_ptr) {
@@ -244,10 +280,11 @@ static int32_t check_blocks(const lav_problem *q) {
     const int32_t first = q->block_ptr ? q->block_ptr[i] : i, end = q->block_ptr ? q->block_ptr[i + 1] : i + 1;
     const int32_t kind = q->kind ? q->kind[i] : LAV_ROW;
     const double mu = q->mu ? q->mu[i] : 0.0, radius = q->patch_radius ? q->patch_radius[i] : 0.0;
-    if (kind < LAV_ROW || kind > LAV_CONTACT_SPIN) return LAV_ERROR_BLOCKS;
-    if (kind != LAV_ROW && (end - first < kind || end - first > kind + 2)) return LAV_ERROR_BLOCKS;
+    if (kind < LAV_ROW || kind > LAV_CONTACT_ROLLING) return LAV_ERROR_BLOCKS;
+    if (end - first < least_rows[kind] || (kind != LAV_ROW && end - first > most_rows[kind])) return LAV_ERROR_BLOCKS;
     if (q->form == LAV_BODIES && (kind == LAV_ROW) != (i < q->n_joints)) return LAV_ERROR_BLOCKS;
     if (!(mu >= 0.0 && mu <= DBL_MAX && radius >= 0.0 && radius <= DBL_MAX)) return LAV_ERROR_FRICTION;
+    if (q->rolling && !(q->rolling[i] >= 0.0 && q->rolling[i] <= DBL_MAX)) return LAV_ERROR_FRICTION;
     if (kind == LAV_CONTACT && end - first == 1 && mu > 0.0 && q->form == LAV_BODIES) return LAV_ERROR_FRICTION;
     for (j = first; kind == LAV_ROW && j < end; j++) {
       const double low = q->lower ? q->lower[j] : -INFINITY, high = q->upper ? q->upper[j] : INFINITY;

@@ -32,6 +32,7 @@ static void take_blocks(lav_solver *s, const lav_problem *q) {
   s->p.upper = TAKE(s, double, m);
   s->p.mu = TAKE(s, double, k);
   s->p.patch_radius = TAKE(s, double, k);
+  s->p.rolling = TAKE(s, double, k);
   s->p.b = TAKE(s, double, m);
   s->p.d = TAKE(s, double, m);
   s->p.nu = TAKE(s, double, m);
@@ -48,13 +49,15 @@ static void take_blocks(lav_solver *s, const lav_problem *q) {
   s->n_v = q->form == LAV_BODIES ? 6 * q->n_bodies : q->form == LAV_VELOCITIES ? q->n_velocities : 0;
   s->v_free = TAKE(s, double, s->n_v);
   s->v = TAKE(s, double, s->n_v + 12);
+  s->compare = TAKE(s, double, 2 * m + s->n_v);
   s->watch.v = TAKE(s, double, q->form == LAV_BODIES ? 12 * n : q->form == LAV_VELOCITIES ? nv + m : 0);
 }
 
 static void take_form(lav_solver *s, const lav_problem *q) {
   const int64_t m = q->n_rows, k = q->n_blocks, n = q->n_bodies, c = k - q->n_joints, nv = q->n_velocities;
   const int32_t is_known = s->bytes > 0 && q->form == LAV_BODIES; /* who only counts reads no array */
-  const int64_t mj = !is_known ? m : q->block_ptr ? q->block_ptr[q->n_joints] : q->n_joints, mc = is_known ? m - mj : m;
+  const int64_t mj = is_known ? (q->block_ptr ? q->block_ptr[q->n_joints] : q->n_joints) : q->n_joints > 0 ? m - c : 0;
+  const int64_t mc = is_known ? m - mj : m - q->n_joints < 6 * c ? m - q->n_joints : 6 * c; /* at most */
   s->r.compliance = s->g.compliance = NULL;
   if (q->form == LAV_MATRIX) {
     s->a.indptr = TAKE(s, int32_t, m + 1);
@@ -128,6 +131,7 @@ static int32_t fill_blocks(lav_solver *s, const lav_problem *q) {
     }
   copy_or(s->p.mu, q->mu, k, 0.0);
   copy_or(s->p.patch_radius, q->patch_radius, k, 0.0);
+  copy_or(s->p.rolling, q->rolling, k, 0.0);
   s->has_keys = q->key != NULL;
   if (q->key) COPY(s->key, q->key, k);
   s->mode = q->order ? core_order_GIVEN : s->options.order == LAV_REVERSE ? core_order_GIVEN : s->options.order;

@@ -1,37 +1,3 @@
-/* -- judging ---------------------------------------------------------------------------------------------------------- */
-
-#ifndef LAV_SWEEPS_ONLY
-static const general_t *general_of(const lav_solver *s) { return s->form == LAV_VELOCITIES ? &s->g : NULL; }
-#else
-static const general_t *general_of(const lav_solver *s) { return (void)s, (const general_t *)NULL; }
-#endif
-
-static void judge(lav_solver *s, const double *impulse, int32_t floor, lav_verdict *out) {
-  score_t t = {0.0, 0.0, 0.0, 0.0, -1, 1};
-  if (s->p.n_rows > 0)
-    judge_watch_look(&s->watch, &s->p, &s->a, &s->r, general_of(s), s->form == LAV_BODIES, impulse, floor, &t);
-  out->worst = t.worst;
-  out->energy = t.finite ? t.energy : INFINITY;
-  out->velocity = t.finite ? t.velocity : INFINITY;
-  out->relative = judge_measure_relative_of(&t, s->watch.w, s->p.n_rows, s->start[0], s->start[1]);
-  out->floor = floor ? judge_score_relative(t.floor_energy, t.floor_velocity, s->start[0], s->start[1]) : 0.0;
-}
-
-/* E0, V0 of doing nothing, which is left in x (m). */
-static void do_nothing(lav_solver *s, double *x) {
-  score_t t = {0.0, 0.0, 0.0, 0.0, -1, 1};
-  int32_t moves = 0;
-  if (s->p.n_rows > 0) {
-    moves = judge_measure_do_nothing(&s->p, x, s->watch.w);
-    if (!moves) judge_score_score_rows(&s->p, x, s->watch.w, s->watch.e, &t);
-    else {
-      judge_watch_look(&s->watch, &s->p, &s->a, &s->r, general_of(s), s->form == LAV_BODIES, x, 0, &t);
-      t.finite = t.finite && judge_score_are_numbers(s->watch.w, s->p.n_rows);
-    }
-  }
-  judge_measure_reference_of(&s->p, &t, moves, 0, s->start);
-}
-
 /* -- impulses carried by key ------------------------------------------------------------------------------------------ */
 
 static void keep_impulses(lav_solver *s) {
@@ -178,8 +144,15 @@ static void form_velocity(lav_solver *s) {
 }
 
 #ifndef LAV_SWEEPS_ONLY
-static int32_t prepare_full(lav_solver *s);
-static void run_full(lav_solver *s, const lav_budget *budget, lav_result *out);
+static int32_t prepare_accelerated(lav_solver *s);
+static int32_t prepare_newton(lav_solver *s);
+static int32_t prepare_pivots(lav_solver *s);
+static int32_t prepare_admm(lav_solver *s);
+static int32_t usual_turns(const lav_problem *q, int32_t *turns);
+static int32_t prepare_auto(lav_solver *s, const lav_problem *q);
+static void run_newton(lav_solver *s, const lav_budget *budget, lav_result *out);
+static void run_pivots(lav_solver *s, const lav_budget *budget, lav_result *out);
+static int32_t run_auto(lav_solver *s, const lav_budget *budget, lav_result *out);
 static void pack_pairs(lav_solver *s, int32_t n);
 static int32_t restarts_of(const lav_solver *s);
 static int32_t begins_again(lav_solver *s);
@@ -189,10 +162,19 @@ static int32_t prepare(lav_solver *s) {
   switch (s->options.method) {
 #ifndef LAV_SWEEPS_ONLY
     case LAV_BLOCK_GAUSS_SEIDEL: return prepare_blocks(s);
-    case LAV_ANDERSON: case LAV_NNCG: case LAV_NEWTON: case LAV_DIRECT: return prepare_full(s);
+    case LAV_ANDERSON: case LAV_NNCG: return prepare_accelerated(s);
+    case LAV_NEWTON: return prepare_newton(s);
+    case LAV_DIRECT: case LAV_LEMKE: return prepare_pivots(s);
+    case LAV_ADMM: return prepare_admm(s);
 #endif
     default: return prepare_sweeps(s);
   }
+}
+
+static int32_t is_timed(const lav_budget *budget) { return budget->seconds > 0.0; }
+
+static int32_t is_late(const lav_solver *s, const lav_budget *budget) {
+  return is_timed(budget) && !(budget->clock(budget->clock_data) < s->deadline);
 }
 
 /* n sweeps, fewer where a check ends them; tol = 0 checks nothing. */
@@ -218,25 +200,30 @@ static int32_t watched(lav_solver *s, int32_t n, double tol, int32_t *done) {
 
 /* Sweeps until a check, the budget or the clock ends them. */
 static void run_sweeps(lav_solver *s, const lav_budget *budget, lav_result *out) {
-  const double begin = budget->seconds > 0.0 ? budget->clock(budget->clock_data) : 0.0;
+  const double begin = is_timed(budget) ? budget->clock(budget->clock_data) : 0.0;
   double now = begin, left;
-  int32_t status = judge_watch_RUNNING, n = budget->seconds > 0.0 ? 1 : budget->iterations, done;
+  int32_t status = judge_watch_RUNNING, n = is_timed(budget) ? 1 : budget->iterations, done;
+  lav_verdict best;
 #ifndef LAV_SWEEPS_ONLY
-  const int32_t fallbacks = (int32_t)s->local.fallbacks;
+  const int32_t before = s->options.method == LAV_BLOCK_GAUSS_SEIDEL || s->options.method == LAV_ADMM ? restarts_of(s) : 0;
 #endif
   while (out->iterations < budget->iterations && status == judge_watch_RUNNING) {
     if (n > budget->iterations - out->iterations) n = budget->iterations - out->iterations;
 #ifndef LAV_SWEEPS_ONLY
-    if (s->options.method == LAV_ANDERSON || s->options.method == LAV_NNCG) pack_pairs(s, n);
+    pack_pairs(s, n);
 #endif
     status = watched(s, n, budget->tol, &done);
     out->iterations += done;
 #ifndef LAV_SWEEPS_ONLY
     if (status == judge_watch_STALLED && begins_again(s)) status = judge_watch_RUNNING;
+    if (s->is_broken) {
+      out->outcome = LAV_FAILED;
+      break;
+    }
 #endif
-    if (budget->seconds > 0.0 && status == judge_watch_RUNNING) {
+    if (is_timed(budget) && status == judge_watch_RUNNING) {
       now = budget->clock(budget->clock_data);
-      left = begin + budget->seconds - now;
+      left = s->deadline - now;
       if (!(left > 0.0)) {
         out->outcome = LAV_TIME_LIMIT;
         break;
@@ -248,36 +235,78 @@ static void run_sweeps(lav_solver *s, const lav_budget *budget, lav_result *out)
   if (status != judge_watch_RUNNING) out->outcome = status; /* numbered alike */
   out->sweeps = out->iterations;
 #ifndef LAV_SWEEPS_ONLY
-  if (s->options.method == LAV_BLOCK_GAUSS_SEIDEL) out->restarts = (int32_t)s->local.fallbacks - fallbacks;
-  if (s->options.method == LAV_ANDERSON || s->options.method == LAV_NNCG) {
-    if (s->mode == core_order_SYMMETRIC) out->sweeps *= 2;
-    out->restarts = restarts_of(s);
+  out->restarts = restarts_of(s) - before;
+  if (s->mode == core_order_SYMMETRIC && (s->options.method == LAV_ANDERSON || s->options.method == LAV_NNCG)) out->sweeps *= 2;
+#endif
+  if (budget->tol > 0.0 && s->watch.best_at >= 0 && out->outcome != LAV_CONVERGED) {
+    judge(s, s->impulse, 0, &best); /* a residual may rise: the best check counts */
+    if (!(best.relative <= s->watch.best_relative)) {
+      COPY(s->impulse, s->watch.best, s->p.n_rows);
+      form_velocity(s);
+    }
+  }
+}
+
+static void begin_method(lav_solver *s) {
+  const int32_t method = s->options.method;
+  judge_watch_begin_watch(&s->watch, s->start[0], s->start[1],
+                          method == LAV_ANDERSON || method == LAV_NNCG ? LONG_PATIENCE
+                          : method == LAV_ADMM                         ? SPLIT_PATIENCE
+                                                                       : PATIENCE,
+                          s->score_room, s->p.n_rows);
+  form_velocity(s);
+}
+
+static void run_method(lav_solver *s, const lav_budget *budget, lav_result *out) {
+#ifndef LAV_SWEEPS_ONLY
+  if (s->options.method == LAV_NEWTON) {
+    run_newton(s, budget, out);
+    return;
+  }
+  if (s->options.method == LAV_DIRECT || s->options.method == LAV_LEMKE) {
+    run_pivots(s, budget, out);
+    return;
   }
 #endif
+  run_sweeps(s, budget, out);
 }
 
 /* -- the calls -------------------------------------------------------------------------------------------------------- */
 
-static int32_t enter(lav_solver *s) {
-  if (!s) return LAV_ERROR_NULL;
-  if ((uintptr_t)s % 16 != 0 || s->magic != MAGIC) return LAV_ERROR_SOLVER;
-#if defined(__GNUC__)
-  return __atomic_exchange_n(&s->busy, 1, __ATOMIC_ACQUIRE) ? LAV_ERROR_BUSY : LAV_OK;
-#else
-  if (s->busy) return LAV_ERROR_BUSY;
-  s->busy = 1;
-  return LAV_OK;
-#endif
+#ifndef LAV_SWEEPS_ONLY
+/* Numbers that a method has beside the problem; what depends on arrays is guessed. */
+static int64_t numbers_of(const lav_problem *q, int32_t method, int32_t memory, int32_t n_v) {
+  const int64_t m = q->n_rows, k = q->n_blocks, nv = q->n_velocities, n = q->n_bodies;
+  const int32_t c = q->n_blocks - q->n_joints, mj = q->n_joints > 0 ? q->n_rows - c : 0; /* rows of joints at most */
+  const int32_t mc = q->n_rows - q->n_joints < 6 * (int64_t)c ? q->n_rows - q->n_joints : 6 * c;
+  const int32_t one = LAV_CONTACT, ends[2] = {0, q->n_rows};
+  const int64_t pairs = q->form == LAV_BODIES ? sweep_packed_room_for(q->n_joints, mj, c, mc, q->n_bodies) : 0;
+  struct driver_driver_view_t view;
+  struct driver_driver_asked_t asked;
+  struct driver_driver_room_t room;
+  int64_t numbers = 0, band = m < 64 ? m : 64;
+  csr_t none = {NULL, NULL, NULL};
+  switch (method) {
+    case LAV_ANDERSON: case LAV_NNCG: /* with exact blocks */
+      return pairs + CONTROL + GRAM + 3 * (m + n_v) + (1 + 2 * (int64_t)memory) * m + 64 + 9 * m + 26 * k;
+    case LAV_SEQUENTIAL_IMPULSES: return pairs;
+    case LAV_BLOCK_GAUSS_SEIDEL: return 9 * m + 26 * k;
+    case LAV_NEWTON:
+      if (q->form == LAV_VELOCITIES) return 70 * m + 50 * nv + 18 * k + 2 * (nv < 64 ? nv * nv : 64 * nv) + 2048;
+      if (q->form == LAV_BODIES) return 130 * m + 12 * k + 300 * n + 2048;
+      memset(&view, 0, sizeof view);
+      memset(&asked, 0, sizeof asked);
+      view.p.n_blocks = m > 0, view.p.n_rows = q->n_rows, view.p.kind = &one, view.p.ptr = ends, view.a = &none;
+      asked.method = driver_driver_NEWTON;
+      k_room(&view, &asked, &room);
+      return room.n_index / 2 + room.n_real + 16;
+    default: break;
+  }
+  if (method == LAV_LEMKE || method == LAV_DIRECT) numbers = 20 * m + (method == LAV_LEMKE ? 4 * m * m + 12 * m : m * band);
+  if (method == LAV_ADMM) numbers = m * m + (10 + 2 * (int64_t)memory) * m + CONTROL + GRAM;
+  return numbers + (q->form == LAV_BODIES ? 90 * m + 6 * k + n : 0) + 64;
 }
-
-static int32_t leave(lav_solver *s, int32_t code) {
-#if defined(__GNUC__)
-  __atomic_store_n(&s->busy, 0, __ATOMIC_RELEASE);
-#else
-  s->busy = 0;
 #endif
-  return code;
-}
 
 int32_t lav_room(const lav_problem *problem, const lav_options *options, uint64_t *bytes) {
   lav_solver s; /* of no memory: it only counts */
@@ -299,14 +328,22 @@ int32_t lav_room(const lav_problem *problem, const lav_options *options, uint64_
     numbers += m * nv < 4 * (int64_t)problem->n_entries + 256 ? m * nv : 4 * (int64_t)problem->n_entries + 256;
   }
 #ifndef LAV_SWEEPS_ONLY
-  if (options->method == LAV_SEQUENTIAL_IMPULSES || options->method == LAV_ANDERSON || options->method == LAV_NNCG)
-    numbers += problem->form == LAV_BODIES ? sweep_packed_room_for(problem->n_joints, m, k - problem->n_joints, m, n) : 0;
-  if (options->method == LAV_BLOCK_GAUSS_SEIDEL || options->method == LAV_ANDERSON || options->method == LAV_NNCG)
-    numbers += 9 * m + 26 * k;
-  if (options->method == LAV_ANDERSON || options->method == LAV_NNCG)
-    numbers += CONTROL + GRAM + 3 * (m + s.n_v) + (1 + 2 * (int64_t)options->memory) * m + 64;
-  if (options->method == LAV_NEWTON) numbers += 60 * m + 48 * nv + 16 * k + 2 * (nv < 64 ? nv * nv : 64 * nv) + 2048;
-  if (options->method == LAV_DIRECT) numbers += 40 * m + CONTROL + GRAM + m * (m < 64 ? m : 64) + 64;
+  {
+    int32_t turns[2 * MOST_TURNS] = {0}, count = 1, i;
+    int64_t most = 0;
+    turns[0] = options->method;
+    if (options->method == LAV_AUTO && options->n_turns > 0) COPY(turns, options->turns, 2 * (count = options->n_turns));
+    else if (options->method == LAV_AUTO) {
+      lav_problem bare = *problem; /* no array is read: as if it were rows alone, which has most turns */
+      bare.kind = NULL;
+      count = usual_turns(&bare, turns);
+    }
+    for (i = 0; i < count; i++) {
+      const int64_t here = numbers_of(problem, turns[2 * i], options->memory, s.n_v);
+      if (here > most) most = here;
+    }
+    numbers += most + (options->method == LAV_AUTO ? m : 0);
+  }
 #endif
   *bytes = s.used + 8 * (uint64_t)numbers + 4096;
   return LAV_OK;
@@ -336,6 +373,11 @@ int32_t lav_open(void *memory, uint64_t bytes, const lav_problem *largest, const
   s->options = *options;
   take_kept(s, largest);
   s->begin = s->used;
+#ifndef LAV_SWEEPS_ONLY
+  s->asked.tol = 1e-6;
+  s->asked.budget = 1000;
+  if (options->n_turns > 0) COPY(s->given_turns, options->turns, 2 * options->n_turns);
+#endif
   s->magic = MAGIC;
   *out = s;
   return LAV_OK;
@@ -371,7 +413,12 @@ static int32_t set_problem(lav_solver *s, const lav_problem *q) {
   do_nothing(s, s->impulse);
   if (q->impulse) COPY(s->impulse, q->impulse, q->n_rows);
   else carry(s);
-  GIVE_BACK(prepare(s));
+#ifndef LAV_SWEEPS_ONLY
+  s->is_broken = 0;
+  if (s->options.method == LAV_AUTO) GIVE_BACK(prepare_auto(s, q));
+  else
+#endif
+    GIVE_BACK(prepare(s));
   s->ready = 1;
   return LAV_OK;
 }
@@ -391,7 +438,7 @@ int32_t lav_set(lav_solver *solver, const lav_problem *problem) {
 }
 
 static int32_t run(lav_solver *s, const lav_budget *budget, lav_result *out) {
-  lav_verdict best;
+  int32_t code = LAV_OK;
   if (!s->ready) return LAV_ERROR_NO_PROBLEM;
   if (budget->size != sizeof *budget || out->size != sizeof *out) return LAV_ERROR_VERSION;
   if (budget->iterations < 0 || !(budget->tol >= 0.0 && budget->tol < INFINITY)) return LAV_ERROR_OPTION;
@@ -400,38 +447,31 @@ static int32_t run(lav_solver *s, const lav_budget *budget, lav_result *out) {
   out->outcome = LAV_MAX_ITERATIONS;
   out->iterations = out->sweeps = out->restarts = 0;
   out->method = s->options.method;
-  if (!s->begun) {
-    judge_watch_begin_watch(&s->watch, s->start[0], s->start[1],
-                            s->options.method == LAV_ANDERSON || s->options.method == LAV_NNCG ? LONG_PATIENCE : PATIENCE,
-                            s->score_room, s->p.n_rows);
-    form_velocity(s);
-    s->begun = 1;
-  }
+  s->deadline = is_timed(budget) ? budget->clock(budget->clock_data) + budget->seconds : 0.0;
+  if (!s->begun) begin_method(s);
+  s->begun = 1;
   if (s->p.n_rows == 0) {
     if (budget->tol > 0.0) out->outcome = LAV_CONVERGED;
     else out->iterations = budget->iterations;
   }
 #ifndef LAV_SWEEPS_ONLY
-  else if (s->options.method == LAV_NEWTON || s->options.method == LAV_DIRECT) run_full(s, budget, out);
+  else if (s->options.method == LAV_AUTO) code = run_auto(s, budget, out);
 #endif
-  else {
-    run_sweeps(s, budget, out);
-    if (budget->tol > 0.0 && s->watch.best_at >= 0 && out->outcome != LAV_CONVERGED) {
-      judge(s, s->impulse, 0, &best); /* a residual may rise: the best check counts */
-      if (!(best.relative <= s->watch.best_relative)) {
-        COPY(s->impulse, s->watch.best, s->p.n_rows);
-        form_velocity(s);
-      }
-    }
-  }
+  else run_method(s, budget, out);
   out->verdict.size = (uint32_t)sizeof out->verdict;
   judge(s, s->impulse, 1, &out->verdict);
-  return LAV_OK;
+  return code;
 }
 
 int32_t lav_run(lav_solver *solver, const lav_budget *budget, lav_result *out) {
+  lav_result found;
+  int32_t code;
   GIVE_BACK(enter(solver));
-  return leave(solver, budget && out ? run(solver, budget, out) : LAV_ERROR_NULL);
+  if (!budget || !out) return leave(solver, LAV_ERROR_NULL);
+  found = *out;
+  code = run(solver, budget, &found);
+  if (code == LAV_OK) *out = found;
+  return leave(solver, code);
 }
 
 int32_t lav_run_many(lav_solver *const *solvers, int32_t n, int32_t first, int32_t stride, const lav_budget *budget,
@@ -464,29 +504,7 @@ int32_t lav_velocity(lav_solver *solver, double *out, int32_t n) {
   if (n != solver->n_v) return leave(solver, LAV_ERROR_COUNT);
   if (!out && n > 0) return leave(solver, LAV_ERROR_NULL);
   if (n == 0) return leave(solver, LAV_OK);
-  memset(out, 0, (size_t)n * sizeof(double));
-#ifndef LAV_SWEEPS_ONLY
-  if (solver->form == LAV_VELOCITIES && solver->p.n_rows > 0) {
-    core_generalized_jac_push(&solver->g, solver->impulse, out);
-    core_generalized_tree_solve(&solver->g, out);
-  } else
-#endif
-      if (solver->p.n_rows > 0) k_rows_velocity(&solver->p, &solver->r, solver->impulse, out);
+  change_of(solver, solver->impulse, out);
   for (i = 0; i < n; i++) out[i] = solver->v_free[i] + out[i];
-  return leave(solver, LAV_OK);
-}
-
-int32_t lav_judge(lav_solver *solver, const double *impulse, int32_t n, double *slack, double *error, lav_verdict *out) {
-  lav_verdict found;
-  GIVE_BACK(enter(solver));
-  if (!solver->ready) return leave(solver, LAV_ERROR_NO_PROBLEM);
-  if (n != solver->p.n_rows) return leave(solver, LAV_ERROR_COUNT);
-  if (!out || (!impulse && n > 0)) return leave(solver, LAV_ERROR_NULL);
-  if (out->size != sizeof *out) return leave(solver, LAV_ERROR_VERSION);
-  found.size = out->size;
-  judge(solver, impulse, 1, &found);
-  *out = found;
-  if (slack && n > 0) COPY(slack, solver->watch.w, n);
-  if (error && n > 0) COPY(error, solver->watch.e, n);
   return leave(solver, LAV_OK);
 }

@@ -14,13 +14,7 @@ STEPPERS = {spec.name: spec for spec in (impulses.SPEC, soft_step.SPEC, xpbd.SPE
 
 
 def get_stepper(name: str) -> StepperSpec:
-    """The stepper of that name.
-
-    Raises
-    ------
-    UnknownName
-        No such stepper; the nearest names are listed.
-    """
+    """The stepper of that name."""
     spec = STEPPERS.get(name) if isinstance(name, str) else None
     if spec is None:
         raise UnknownName("stepper", name, STEPPERS)

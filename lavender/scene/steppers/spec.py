@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from lavender._arrays import number, whole_number
 from lavender.errors import InputError, UnknownName
-from lavender.scene.parts import number, whole
 
 __all__ = ["Option", "StepperSpec"]
 
@@ -49,15 +49,7 @@ class StepperSpec:
     options: Mapping[str, Option] = field(default_factory=dict)
 
     def values(self, given: Mapping[str, Any]) -> dict[str, float]:
-        """Every option, as given or by default.
-
-        Raises
-        ------
-        UnknownName
-            An option that it does not have.
-        InputError
-            A value outside its range.
-        """
+        """Every option, as given or by default."""
         for name in given:
             if name not in self.options:
                 raise UnknownName(f"option of stepper {self.name!r}", name, self.options)
@@ -66,7 +58,7 @@ class StepperSpec:
             x = given.get(name, option.default)
             label = f"{name} of stepper {self.name!r}"
             if option.is_whole:
-                found[name] = whole(label, x, int(option.low), int(option.high))
+                found[name] = whole_number(label, x, int(option.low), int(option.high))
             else:
                 found[name] = number(label, x, low=option.low, high=option.high)
         return found

@@ -63,12 +63,13 @@ class Augmented:
         return np.ascontiguousarray(x[n:])
 
     def _make(self) -> None:
-        sc, rows = self.system.sc, self.system.sc.problem.rows
-        assert rows is not None and sc.bodies is not None
-        panel = np.zeros((sc.problem.m, 12))
-        scaled_jacobian(sc.problem.data, rows.inv_inertia, np.sqrt(rows.inv_mass), panel)
+        sc, problem = self.system.sc, self.system.problem
+        rows = problem.rows
+        assert rows is not None
+        panel = np.zeros((problem.m, 12))
+        scaled_jacobian(problem.data, rows.inv_inertia, np.sqrt(rows.inv_mass), panel)
         size, m = np.diff(sc.ptr), sc.m
-        body = np.repeat(sc.bodies, size, axis=0)
+        body = np.repeat(self.system.bodies, size, axis=0)
         values = panel[sc.keep].reshape(m, 2, 6)
         row = np.broadcast_to(np.arange(m)[:, None, None], values.shape)
         column = np.maximum(body, 0)[:, :, None] * 6 + np.arange(6)

@@ -45,12 +45,6 @@ def prepare(problem: Problem) -> Newton | None:
     return kernel if kernel.fits else None
 
 
-def looked_at(problem: Problem) -> Newton:
-    """The same where that takes next to no time; where a factor fills much, `crowded`, and no room for anything."""
-    reference(problem)
-    return Newton(problem.metric, ROOM, False)
-
-
 def factor_flops(problem: Problem, largest: int) -> float:
     """Multiply-adds of the factors of all islands at most, the costliest as of `largest` velocities."""
     assert problem.generalized is not None

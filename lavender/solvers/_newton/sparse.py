@@ -19,7 +19,6 @@ import scipy.sparse as sp
 from lavender._arrays import FloatArray, IntArray
 from lavender._lu import sparse_lu
 from lavender.solvers._factor import TINY, WIDE
-from lavender.solvers._newton.scaled import Scaled
 from lavender_ext.factor.sparse import SparsePanels, is_mirrored
 from lavender_ext.newton.coupled import coupled, coupled_entries, coupled_rows, element_graph
 from lavender_ext.newton.elements import Elements
@@ -70,7 +69,7 @@ class Panelled:
 class Coupled:
     """H on the pattern of its elements, and what Newton's method makes of it."""
 
-    def __init__(self, sc: Scaled, h: sp.csr_array, elements: Elements) -> None:
+    def __init__(self, sc: Any, h: sp.csr_array, elements: Elements) -> None:
         self.elements = elements
         self.h: FloatArray = h.data
         if len(sc.kind) == sc.m and is_mirrored(h.indptr, h.indices) and h.diagonal().all():
@@ -169,7 +168,7 @@ class SparseRows:
             self.made = None
 
 
-def _graph(sc: Scaled, a: sp.csr_array) -> tuple[IntArray, IntArray]:
+def _graph(sc: Any, a: sp.csr_array) -> tuple[IntArray, IntArray]:
     """(indptr, indices) of the elements that A couples, either way, each with itself."""
     n = len(sc.kind)
     of = np.repeat(np.arange(n, dtype=np.int32), np.diff(sc.ptr))

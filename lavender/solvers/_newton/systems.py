@@ -16,15 +16,16 @@ import scipy.sparse as sp
 from lavender._arrays import FloatArray, IntArray
 from lavender.problem import Problem
 from lavender.residuals import reference
+from lavender.solvers._islands import block_bodies
 from lavender.solvers._newton.augmented import Augmented
 from lavender.solvers._newton.pattern import block_pattern, dissected, postordered
-from lavender.solvers._newton.scaled import Scaled, scaled
 from lavender.solvers._newton.sparse import Coupled, SparseRows
 from lavender_ext.factor import symbolic
 from lavender_ext.newton.coupled import scaled_entries
 from lavender_ext.newton.elements import Elements
 from lavender_ext.newton.normal_matrix import Factor
 from lavender_ext.newton.panel import narrow, scaled_jacobian
+from lavender_ext.newton.scaling import Scaled
 from lavender_ext.newton.solve import Solve
 
 DENSE_ROWS = 150  # below: a dense factor beats sparse bookkeeping
@@ -60,8 +61,8 @@ class System:
     pace = 1e-9  # s for each of them at most, on any machine of the last ten years
     elements: Any
 
-    def __init__(self, sc: Scaled) -> None:
-        self.sc = sc
+    def __init__(self, problem: Problem, sc: Any) -> None:
+        self.problem, self.sc = problem, sc
 
     @property
     def seconds(self) -> float:
@@ -75,14 +76,14 @@ class System:
         sc = self.sc
         return Elements(
             sc.ptr, sc.kind, sc.wptr, node, slot, panel, sc.theta, sc.g, sc.lower, sc.upper,
-            np.ascontiguousarray(sc.a_t, float), np.ascontiguousarray(sc.a_s, float), s, sc.a_r,
+            sc.a_t, sc.a_s, s, sc.a_r,
         )  # fmt: skip
 
     def _solve(self, matrix: Any, symmetric: bool, cones: bool, others: Any = None) -> Solve:
         sc = self.sc
-        reference(sc.problem)
+        reference(self.problem)
         return Solve(
-            sc.problem.metric, self.elements, matrix, symmetric, cones, sc.scale, sc.fixed,
+            self.problem.metric, self.elements, matrix, symmetric, cones, sc.scale, sc.fixed,
             None if sc.whole else sc.keep, sc.speed, others, WIDE,
         )  # fmt: skip
 
@@ -101,22 +102,24 @@ class VelocitySystem(System):
     structure: tuple[Any, ...]
     pattern: tuple[IntArray, ...]  # the elements' bodies (k, 2), their places, slots, and which were turned
 
-    def __init__(self, sc: Scaled, like: System | None = None) -> None:
+    def __init__(self, problem: Problem, like: System | None = None) -> None:
         """`like`: an earlier system, whose order of elimination and pattern serve again between the same bodies."""
-        super().__init__(sc)
-        rows = sc.problem.rows
-        assert rows is not None and sc.bodies is not None
-        full = np.zeros((sc.problem.m, 12)) if rows.n_bodies == 0 else np.empty((sc.problem.m, 12))
-        used = scaled_jacobian(sc.problem.data, rows.inv_inertia, np.sqrt(rows.inv_mass), full)
+        sc = Scaled(problem.metric)
+        super().__init__(problem, sc)
+        rows = problem.rows
+        assert rows is not None
+        self.bodies = np.ascontiguousarray(block_bodies(problem)[sc.block], np.int32)
+        full = np.zeros((problem.m, 12)) if rows.n_bodies == 0 else np.empty((problem.m, 12))
+        used = scaled_jacobian(problem.data, rows.inv_inertia, np.sqrt(rows.inv_mass), full)
         columns = [c for c in range(6) if used >> c & 1]
         s = next(k for k in (1, 2, 3, 6) if k >= len(columns))
         columns = sorted((columns + [c for c in range(6) if not used >> c & 1])[:s])
         self.s, self.n = s, rows.n_bodies
-        if isinstance(like, VelocitySystem) and like.serves(s, rows.n_bodies, sc.bodies):
+        if isinstance(like, VelocitySystem) and like.serves(s, rows.n_bodies, self.bodies):
             self.cost, self.panels = like.cost, like.panels
             self.pattern, self.structure = like.pattern, like.structure
         else:
-            self._analyse(rows.n_bodies, sc.bodies)
+            self._analyse(rows.n_bodies, self.bodies)
         _, node, slot, turned = self.pattern
         halves = np.empty((sc.m, 2, s))
         narrow(full, sc.keep, sc.ptr, turned, np.array(columns, np.int32), halves)
@@ -154,7 +157,7 @@ class VelocitySystem(System):
         """Newton's method on it, with the augmented system where that is asked for."""
         sc = self.sc
         cones = len(sc.kind) < sc.m
-        lu = cones and sc.problem.law == "coulomb"
+        lu = cones and self.problem.law == "coulomb"
         factor = Factor(*self.structure, self.s, lu, self.panels, WIDE)
         return self._solve(factor, True, cones and not sc.theta.any(), Augmented(self))
 
@@ -164,13 +167,14 @@ class MatrixSystem(System):
 
     form = "impulse"
 
-    def __init__(self, sc: Scaled) -> None:
-        super().__init__(sc)
+    def __init__(self, problem: Problem) -> None:
+        sc = Scaled(problem.metric, problem.csr_data)
+        super().__init__(problem, sc)
         m = sc.m
-        a = sc.problem.csr
+        a = problem.csr
         if not sc.whole:
             a = a[sc.keep][:, sc.keep]
-        self.symmetric = sc.problem.is_symmetric
+        self.symmetric = problem.is_symmetric
         self.dense = m <= DENSE_ROWS or (is_full(a.nnz, m, len(sc.kind) == m) and m <= DENSE_LIMIT)
         # Of a sparse factor by its fill, which grows with the size: nanoseconds, as `_rates.py` has them.
         self.cost = m**3 / 3.0 if self.dense else 100.0 * a.nnz * (1.0 + m / 1000.0)
@@ -183,8 +187,6 @@ class MatrixSystem(System):
         else:
             values = scaled_entries(a.indptr, a.indices, a.data, sc.scale)
             self.h = sp.csr_array((values, a.indices, a.indptr), shape=(m, m))
-        # theta is on the diagonal of A already.
-        sc.theta = np.zeros(m)
         n = len(sc.kind)
         self.elements = self._elements(
             np.full((n, 2), -1, np.int32), np.zeros((n, 3), np.int32), np.zeros((m, 2)), 1
@@ -221,5 +223,4 @@ class MatrixSystem(System):
 
 def make_system(problem: Problem, form: str, like: System | None = None) -> System:
     """The system of a problem; form "velocity" or "impulse". `like`: one of the same structure."""
-    sc = scaled(problem)
-    return VelocitySystem(sc, like) if form == "velocity" else MatrixSystem(sc)
+    return VelocitySystem(problem, like) if form == "velocity" else MatrixSystem(problem)

@@ -1,6 +1,6 @@
 // The page: two simulations of one scene with settings of their own, stepped together, drawn and plotted.
 
-import { View, colors } from "./draw.js";
+import { View, colors, rows } from "./draw.js";
 import { Kernels, Newton, ORDERS, Simulation, SOLVER_FIELDS, TOL } from "./lavender.js";
 
 const KEPT = 720; // steps in the plots over time
@@ -13,7 +13,6 @@ const PULL = 200; // 1/s^2 and, as 2 sqrt of it, 1/s: the spring a held body han
 const PLAIN = ["scene", "a", "b", "speed", "play"];
 // Of joints, which the eight values of a step say nothing of: how far the worst is open, and its largest impulse.
 const OF_JOINTS = ["joints open", "joint impulse"];
-const UNITS = { "joints open": "m", "joint impulse": "N s", residual_initial: "N s", residual_final: "N s", violation_initial: "m/s", violation_final: "m/s" };
 
 const find = (id) => document.getElementById(id);
 
@@ -138,19 +137,7 @@ class Side {
     this.told = pick(".told");
     this.canvas = pick("canvas");
     this.order.append(...ORDERS.map((name, i) => new Option(name.replace("_", " "), i)));
-    this.cells = {};
-    for (const field of [...OF_JOINTS, ...SOLVER_FIELDS]) {
-      const row = pick("tbody").insertRow();
-      const head = document.createElement("th");
-      head.scope = "row";
-      head.textContent = field.replace("_", " ");
-      if (UNITS[field]) {
-        head.append(Object.assign(document.createElement("small"), { textContent: UNITS[field] }));
-      }
-      this.cells[field] = document.createElement("td");
-      this.cells[field].dataset.field = field;
-      row.append(head, this.cells[field]);
-    }
+    this.cells = rows(pick("tbody"), [...OF_JOINTS, ...SOLVER_FIELDS]);
     this.sweeps.addEventListener("input", () => this.set({ iterations: Number(this.sweeps.value) }));
     this.warm.addEventListener("change", () => this.set({ warm_start: Number(this.warm.checked) }));
     this.box.addEventListener("change", () => this.set({ box: Number(this.box.checked) }));

@@ -57,6 +57,26 @@ export function colors() {
   };
 }
 
+const UNITS = {
+  "joints open": "m", "joint impulse": "N s", residual_initial: "N s", residual_final: "N s", violation_initial: "m/s",
+  violation_final: "m/s",
+};
+
+// A row of a table for each field, with its unit; returns the cells of the values by field.
+export function rows(table, fields) {
+  return Object.fromEntries(fields.map((field) => {
+    const row = table.insertRow();
+    const head = Object.assign(document.createElement("th"), { scope: "row", textContent: field.replace("_", " ") });
+    if (UNITS[field]) {
+      head.append(Object.assign(document.createElement("small"), { textContent: UNITS[field] }));
+    }
+    const cell = document.createElement("td");
+    cell.dataset.field = field;
+    row.append(head, cell);
+    return [field, cell];
+  }));
+}
+
 export class View {
   constructor(canvas) {
     this.canvas = canvas;

@@ -13,13 +13,7 @@ const NEED_ROOM = 1;
 const NOT_FINITE = 2;
 
 export const SOLVER_FIELDS = [
-  "iterations",
-  "warm_start",
-  "contacts",
-  "cache_matches",
-  "residual_initial",
-  "residual_final",
-  "violation_initial",
+  "iterations", "warm_start", "contacts", "cache_matches", "residual_initial", "residual_final", "violation_initial",
   "violation_final",
 ];
 export const ORDERS = ["given", "reverse", "symmetric", "random", "bottom_up", "top_down", "colored", "alternating"];
@@ -113,12 +107,6 @@ export class Kernels {
   }
 
   // Copies of arrays in the module's memory; returns where.
-  putReals(values) {
-    const place = this.alloc(8 * Math.max(values.length, 1));
-    this.f64(place, values.length).set(values);
-    return place;
-  }
-
   putInts(values) {
     const place = this.alloc(4 * Math.max(values.length, 1));
     this.i32(place, values.length).set(values);

@@ -1,16 +1,12 @@
 // A film: poses of a run, frame by frame, live from the Python that steps it or out of a file.
 
-import { View, colors } from "./draw.js";
+import { View, colors, rows } from "./draw.js";
+import { SOLVER_FIELDS } from "./lavender.js";
 
 const [PLANE, SPHERE] = [1, 2];
 const LEAD = 9; // numbers of a frame before the poses: time, then the eight solver values
 const MAGIC = "LAVENDER-FILM\n";
 const POLL = 60; // ms between two questions for new frames
-const FIELDS = [
-  "iterations", "warm_start", "contacts", "cache_matches", "residual_initial", "residual_final", "violation_initial",
-  "violation_final",
-];
-const UNITS = { residual_initial: "N s", residual_final: "N s", violation_initial: "m/s", violation_final: "m/s" };
 
 const find = (id) => document.getElementById(id);
 
@@ -101,18 +97,7 @@ class Player {
   constructor() {
     this.view = new View(document.querySelector("canvas"));
     this.view.onlook = () => this.show();
-    this.cells = Object.fromEntries(FIELDS.map((field) => {
-      const row = document.querySelector("tbody").insertRow();
-      const head = document.createElement("th");
-      head.scope = "row";
-      head.textContent = field.replace("_", " ");
-      if (UNITS[field]) {
-        head.append(Object.assign(document.createElement("small"), { textContent: UNITS[field] }));
-      }
-      const cell = document.createElement("td");
-      row.append(head, cell);
-      return [field, cell];
-    }));
+    this.cells = rows(document.querySelector("tbody"), SOLVER_FIELDS);
     this.playing = true;
     this.following = true;
     find("play").addEventListener("click", () => this.play(!this.playing));
@@ -216,7 +201,7 @@ class Player {
     }
     this.state.set(this.frames[Math.min(this.at, this.frames.length - 1)]);
     this.view.draw(this.state, colors());
-    FIELDS.forEach((field, i) => {
+    SOLVER_FIELDS.forEach((field, i) => {
       const value = this.state.values[i];
       this.cells[field].textContent = i < 4 || value === 0 ? String(value) : value.toExponential(3);
     });

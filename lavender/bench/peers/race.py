@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from time import monotonic
 from typing import Any
 
-from benchmarks.peers.contest import SCRATCH, TARGETS, Contestant, Result
+from lavender.bench.peers.contest import SCRATCH, TARGETS, Contestant, Result
 from lavender.bench.running.timing import one_thread
 from lavender.external._running import quiet
 from lavender.problem import Problem

@@ -24,9 +24,9 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from benchmarks.peers.contest import SCRATCH, TARGETS, Call, Contestant
 from lavender import registry
 from lavender._arrays import FloatArray
+from lavender.bench.peers.contest import SCRATCH, TARGETS, Call, Contestant
 from lavender.cones import CONTACT
 from lavender.errors import CapabilityError, InputError
 from lavender.external._running import Limits
@@ -96,19 +96,15 @@ def _timed(
 
 
 def _backend(backend: Backend, form: str) -> Contestant:
-    from lavender.external.generic import through_qpsolvers
-
-    call = functools.partial(through_qpsolvers, backend) if backend.call is None else backend.call
-
     def runs(problem: Problem, limit: float) -> Iterator[Call]:
-        qp = QPSolver(backend, form=form).prepare(problem).qp
+        qp = QPSolver(backend, form=form).prepare(problem)
         if form == "velocity" and backend.definite and not qp.is_definite:
             return
         start = problem.start()
 
         def once(eps: float) -> tuple[float, FloatArray]:
             def solve() -> tuple[FloatArray | None, FloatArray | None]:
-                answer = call(qp, start, _limits(eps, backend.max_iter, limit), {})
+                answer = backend.run(qp, start, _limits(eps, backend.max_iter, limit), {})
                 return answer.x, answer.zeta
 
             return _timed(qp, solve)

@@ -1,18 +1,29 @@
-"""What the solvers are given: cases of the suite, files, and scenes that an engine exports."""
+"""Engines of others on the same scenes, solvers of others on the same problems: error beside time.
+
+`engines.measure_scene` steps a scene in each engine that is installed, `race.race` gives problems to the
+contestants of `adapters`, both in turns. Times of a machine that others use say nothing by themselves: ratios to
+ours do. A run that was written is read again here, for `lavender report --peers`.
+"""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, field
 from importlib.util import find_spec
+from pathlib import Path
 
-from benchmarks.peers import engines
-from lavender.bench import resolve
+from lavender.bench import machine
+from lavender.bench.cases import resolve
+from lavender.bench.peers import engines
+from lavender.bench.peers.contest import Result
 from lavender.engine import Simulation
 from lavender.errors import InputError, UnknownName
+from lavender.io.stored import whole_file, write_text
 from lavender.problem import Problem
 from lavender.scene import Scene
 
-__all__ = ["PROBLEMS", "problems"]
+__all__ = ["PACKAGES", "PROBLEMS", "Peers", "problems", "read"]
 
 #: Cases of the suite, `mujoco:SCENE:CONE` (what MuJoCo exports), `scene:SCENE` (what LavenderSim exports).
 PROBLEMS = (
@@ -49,6 +60,51 @@ PROBLEMS = (
     "mujoco:pyramid55:pyramidal",
     "scene:pyramid55",
 )
+PACKAGES = ("mujoco", "pybullet", "pin", "clarabel", "daqp", "highspy", "piqp", "proxsuite", "qoco", "qpalm",
+            "quadprog", "scs")  # fmt: skip
+
+
+@dataclass
+class Peers:
+    """What a run measured: steps of engines, results of solvers, where and with which versions."""
+
+    cpu: str = field(default_factory=machine.cpu_name)
+    versions: dict[str, str] = field(default_factory=lambda: machine.versions(PACKAGES))
+    steps: list[engines.Step] = field(default_factory=list)
+    results: list[Result] = field(default_factory=list)
+
+    @property
+    def absent(self) -> list[str]:
+        """Packages that were not there to be measured."""
+        return [name for name in PACKAGES if name not in self.versions]
+
+    def write(self, path: str | Path) -> None:
+        """As JSON, which `read` takes; the file is whole or absent."""
+        record = asdict(self)
+        write_text(Path(path), json.dumps(record | {"solvers": record.pop("results")}, indent=1))
+
+
+def read(path: str | Path) -> Peers:
+    """The file of `Peers.write`.
+
+    Raises
+    ------
+    InputError
+        No such file, or another one.
+    """
+    needed = "a file of `python -m benchmarks peers --out FILE` is needed"
+    try:
+        found = json.loads(whole_file(Path(path), "the measurements").decode())
+        return Peers(
+            str(found["cpu"]),
+            dict(found["versions"]),
+            [engines.Step(**s) for s in found["steps"]],
+            [Result(**{**r, "runs": [(float(t), float(x)) for t, x in r["runs"]]}) for r in found["solvers"]],
+        )
+    except InputError as error:
+        raise InputError(f"{error}; {needed}") from None
+    except (ValueError, TypeError, KeyError, AttributeError) as error:
+        raise InputError(f"{path} holds something else ({type(error).__name__}: {error}); {needed}") from None
 
 
 def problems(

@@ -1,0 +1,146 @@
+
+/* -- judging ---------------------------------------------------------------------------------------------------------- */
+
+#ifndef LAV_SWEEPS_ONLY
+static const general_t *general_of(const lav_solver *s) { return s->form == LAV_VELOCITIES ? &s->g : NULL; }
+#else
+static const general_t *general_of(const lav_solver *s) { return (void)s, (const general_t *)NULL; }
+#endif
+
+static void judge(lav_solver *s, const double *impulse, int32_t floor, lav_verdict *out) {
+  score_t t = {0.0, 0.0, 0.0, 0.0, -1, 1};
+  if (s->p.n_rows > 0)
+    judge_watch_look(&s->watch, &s->p, &s->a, &s->r, general_of(s), s->form == LAV_BODIES, impulse, floor, &t);
+  out->worst = t.worst;
+  out->energy = t.finite ? t.energy : INFINITY;
+  out->velocity = t.finite ? t.velocity : INFINITY;
+  out->relative = judge_measure_relative_of(&t, s->watch.w, s->p.n_rows, s->start[0], s->start[1]);
+  out->floor = floor ? judge_score_relative(t.floor_energy, t.floor_velocity, s->start[0], s->start[1]) : 0.0;
+}
+
+/* E0, V0 of doing nothing, which is left in x (m). */
+static void do_nothing(lav_solver *s, double *x) {
+  score_t t = {0.0, 0.0, 0.0, 0.0, -1, 1};
+  int32_t moves = 0;
+  if (s->p.n_rows > 0) {
+    moves = judge_measure_do_nothing(&s->p, x, s->watch.w);
+    if (!moves) judge_score_score_rows(&s->p, x, s->watch.w, s->watch.e, &t);
+    else {
+      judge_watch_look(&s->watch, &s->p, &s->a, &s->r, general_of(s), s->form == LAV_BODIES, x, 0, &t);
+      t.finite = t.finite && judge_score_are_numbers(s->watch.w, s->p.n_rows);
+    }
+  }
+  judge_measure_reference_of(&s->p, &t, moves, 0, s->start);
+}
+
+static int32_t enter(lav_solver *s) {
+  if (!s) return LAV_ERROR_NULL;
+  if ((uintptr_t)s % 16 != 0 || s->magic != MAGIC) return LAV_ERROR_SOLVER;
+#if defined(__GNUC__)
+  return __atomic_exchange_n(&s->busy, 1, __ATOMIC_ACQUIRE) ? LAV_ERROR_BUSY : LAV_OK;
+#else
+  if (s->busy) return LAV_ERROR_BUSY;
+  s->busy = 1;
+  return LAV_OK;
+#endif
+}
+
+static int32_t leave(lav_solver *s, int32_t code) {
+#if defined(__GNUC__)
+  __atomic_store_n(&s->busy, 0, __ATOMIC_RELEASE);
+#else
+  s->busy = 0;
+#endif
+  return code;
+}
+
+int32_t lav_judge(lav_solver *solver, const double *impulse, int32_t n, double *slack, double *error, lav_verdict *out) {
+  lav_verdict found;
+  GIVE_BACK(enter(solver));
+  if (!solver->ready) return leave(solver, LAV_ERROR_NO_PROBLEM);
+  if (n != solver->p.n_rows) return leave(solver, LAV_ERROR_COUNT);
+  if (!out || (!impulse && n > 0)) return leave(solver, LAV_ERROR_NULL);
+  if (out->size != sizeof *out) return leave(solver, LAV_ERROR_VERSION);
+  found.size = out->size;
+  judge(solver, impulse, 1, &found);
+  *out = found;
+  if (slack && n > 0) COPY(slack, solver->watch.w, n);
+  if (error && n > 0) COPY(error, solver->watch.e, n);
+  return leave(solver, LAV_OK);
+}
+
+/* v = M^-1 J^T x of bodies or generalised velocities. */
+static void change_of(lav_solver *s, const double *x, double *v) {
+  if (s->n_v > 0) memset(v, 0, (size_t)s->n_v * sizeof(double));
+  if (s->n_v == 0 || s->p.n_rows == 0) return;
+#ifndef LAV_SWEEPS_ONLY
+  if (s->form == LAV_VELOCITIES) {
+    core_generalized_jac_push(&s->g, x, v);
+    core_generalized_tree_solve(&s->g, v);
+    return;
+  }
+#endif
+  k_rows_velocity(&s->p, &s->r, x, v);
+}
+
+/* A x into out (m), what compliance adds into soft: 1/2 x.A x is an energy [J]; v: scratch of change_of. */
+static double energy_of(lav_solver *s, const double *x, double *v, double *out, double *elastic) {
+  double whole = 0.0, soft = 0.0, theta;
+  int32_t i;
+  change_of(s, x, v);
+  if (s->form == LAV_BODIES) core_rows_rows_times(&s->p, &s->r, v, out);
+  for (i = 0; i < s->p.n_rows; i++) {
+    if (s->form == LAV_MATRIX) out[i] = core_csr_csr_dot(&s->a, i, x);
+#ifndef LAV_SWEEPS_ONLY
+    if (s->form == LAV_VELOCITIES) out[i] = core_generalized_jac_row(&s->g, i, v);
+#endif
+    theta = s->form == LAV_MATRIX ? 0.0 : s->r.compliance[i] * x[i];
+    out[i] += theta;
+    whole += 0.5 * x[i] * out[i];
+    soft += 0.5 * x[i] * theta;
+  }
+  *elastic = soft;
+  return whole > 0.0 ? whole : 0.0;
+}
+
+int32_t lav_motion_error(lav_solver *solver, const double *impulse, const double *reference, int32_t n, lav_motion *out) {
+  lav_solver *s = solver;
+  lav_motion found;
+  lav_verdict verdict;
+  double *delta, *slope, *v, soft, own, wrong, x, y;
+  int32_t i, k;
+  GIVE_BACK(enter(s));
+  if (!s->ready) return leave(s, LAV_ERROR_NO_PROBLEM);
+  if (n != s->p.n_rows) return leave(s, LAV_ERROR_COUNT);
+  if (!out || ((!impulse || !reference) && n > 0)) return leave(s, LAV_ERROR_NULL);
+  if (out->size != sizeof *out) return leave(s, LAV_ERROR_VERSION);
+  if (n > 0 && (!are_finite(impulse, n) || !are_finite(reference, n))) return leave(s, LAV_ERROR_NUMBER);
+  memset(&found, 0, sizeof found);
+  found.size = out->size;
+  found.row = found.body = -1;
+  delta = s->compare, slope = delta + n, v = slope + n;
+  judge(s, reference, 0, &verdict);
+  wrong = n > 0 ? energy_of(s, s->watch.e, v, slope, &soft) : 0.0;
+  own = n > 0 ? energy_of(s, reference, v, slope, &soft) : 0.0;
+  own -= s->form == LAV_MATRIX ? 0.0 : soft;
+  for (i = 0; i < n; i++) delta[i] = impulse[i] - reference[i];
+  x = n > 0 ? energy_of(s, delta, v, slope, &soft) : 0.0;
+  y = s->form == LAV_MATRIX ? x : x > soft ? x - soft : 0.0;
+  found.energy = sqrt(x);
+  found.kinetic = sqrt(y);
+  found.relative = y == 0.0 ? 0.0 : sqrt(y / own);
+  found.bound = s->p.law == LAV_COULOMB && core_block_has_friction(&s->p) ? INFINITY : found.energy + sqrt(wrong);
+  for (i = 0; i < n; i++)
+    if (fabs(slope[i]) > found.rows || found.row < 0) found.rows = fabs(slope[i]), found.row = i;
+  for (i = 0; n > 0 && i < (s->form == LAV_BODIES ? s->n_v / 6 : s->n_v); i++) {
+    const double *at = s->form == LAV_BODIES ? v + 6 * i : v + i;
+    for (k = 0, x = y = 0.0; k < (s->form == LAV_BODIES ? 3 : 1); k++) {
+      x += at[k] * at[k];
+      y += s->form == LAV_BODIES ? at[3 + k] * at[3 + k] : 0.0;
+    }
+    if (sqrt(x) > found.speed || found.body < 0) found.speed = sqrt(x), found.body = i;
+    if (sqrt(y) > found.spin) found.spin = sqrt(y);
+  }
+  *out = found;
+  return leave(s, LAV_OK);
+}

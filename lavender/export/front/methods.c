@@ -1,0 +1,375 @@
+
+#ifndef LAV_SWEEPS_ONLY
+/* -- accelerated sweeps ----------------------------------------------------------------------------------------------- */
+
+enum { PACK_ACCELERATED = 16 };
+
+static int32_t prepare_accelerated(lav_solver *s) {
+  const int32_t rubs = core_block_has_friction(&s->p), is_cone = s->p.law == LAV_CONE && rubs;
+  const int32_t memory = s->options.method == LAV_NNCG ? 0 : s->options.memory;
+  const int64_t m = s->p.n_rows, work = 3 * (m + s->n_v) + (1 + 2 * (int64_t)memory) * m + 1;
+  double *x;
+  memset(&s->fast, 0, sizeof s->fast);
+  s->fast.exact = s->options.sweep == LAV_BLOCK_SWEEP || (s->options.sweep == LAV_DEFAULT_SWEEP && is_cone);
+  s->fast.convex = rubs && !is_cone ? s->options.convex : 0;
+  if (s->fast.exact || s->fast.convex > 0) {
+    GIVE_BACK(prepare_blocks(s));
+    s->fast.start = s->prepared_at;
+    s->fast.g = s->prepared;
+  }
+  x = TAKE(s, double, CONTROL + GRAM + work);
+  s->pair_room = NULL;
+  s->pairs_asked = s->fast.exact || s->mode == core_order_RANDOM || s->form != LAV_BODIES || s->p.n_blocks < PACK_FROM ||
+                   s->split != s->r.n_joints;
+  if (!s->pairs_asked) s->pair_room = TAKE(s, double, sweep_packed_room_of(&s->p, &s->r));
+  if (s->is_short) return LAV_ERROR_ROOM;
+  memset(x, 0, (size_t)(CONTROL + GRAM + work) * sizeof(double));
+  s->fast.control = x;
+  s->fast.gram = x + CONTROL;
+  s->fast.work = x + CONTROL + GRAM;
+  s->fast.blocks = &s->p;
+  s->fast.csr = s->form == LAV_BODIES ? NULL : &s->a;
+  s->fast.rows = &s->r;
+  s->fast.general = general_of(s);
+  s->fast.cone = s->p;
+  s->fast.cone.law = LAV_CONE;
+  s->fast.order = s->order;
+  s->fast.split = s->split;
+  s->fast.mode = s->mode;
+  s->fast.memory = memory;
+  s->fast.keeps = s->options.keeps;
+  s->fast.rng = &s->rng;
+  s->fast.v = s->v;
+  s->fast.nv = s->n_v;
+  s->context = &s->fast;
+  s->step = memory == 0 ? accelerate_accelerated_nncg_step : accelerate_accelerated_anderson_step;
+  return LAV_OK;
+}
+
+static int32_t is_accelerated(const lav_solver *s) {
+  return s->options.method == LAV_ANDERSON || s->options.method == LAV_NNCG;
+}
+
+/* Blocks in pairs, once sweeps are many: the same bits. */
+static void pack_pairs(lav_solver *s, int32_t n) {
+  if (!is_accelerated(s) || s->pairs_asked || s->fast.turn + (int64_t)n < PACK_ACCELERATED) return;
+  s->pairs_asked = 1;
+  s->fast.backwards = 0;
+  if (sweep_packed_pack_order(&s->p, &s->r, s->order, 1, s->pair_room, s->impulse, &s->pairs)) s->fast.packed = &s->pairs;
+}
+
+static int32_t restarts_of(const lav_solver *s) {
+  if (s->options.method == LAV_BLOCK_GAUSS_SEIDEL) return (int32_t)s->local.fallbacks;
+  if (s->options.method == LAV_ADMM) return s->factors;
+  return is_accelerated(s) ? (int32_t)s->fast.control[s->fast.memory == 0 ? 1 : accelerate_mixing_UNDONE] : 0;
+}
+
+static int32_t begins_again(lav_solver *s) {
+  if (!is_accelerated(s) || !judge_watch_begins_again(&s->watch, AGAIN)) return 0;
+  accelerate_accelerated_forget_all(&s->fast, s->impulse);
+  return 1;
+}
+
+/* -- methods over A: of bodies it is formed first --------------------------------------------------------------------- */
+
+static int32_t form_matrix(lav_solver *s) {
+  const int64_t m = s->p.n_rows, k = s->p.n_blocks;
+  int32_t *start, *blocks, *near, *indptr, *index;
+  double *data, *jac;
+  int64_t most;
+  s->q = s->p;
+  if (s->form == LAV_MATRIX) return LAV_OK;
+  if (s->form == LAV_VELOCITIES) return LAV_ERROR_UNSUPPORTED;
+  start = TAKE(s, int32_t, s->r.n_bodies + 1);
+  blocks = TAKE(s, int32_t, 2 * k + 1);
+  if (s->is_short) return LAV_ERROR_ROOM;
+  k_body_blocks(&s->p, &s->r, start, blocks, &most);
+  if (most >= 2147483647) return LAV_ERROR_COUNT;
+  near = TAKE(s, int32_t, 4 * k + 2 + m);
+  indptr = TAKE(s, int32_t, m + 1);
+  index = TAKE(s, int32_t, most);
+  data = TAKE(s, double, most);
+  jac = TAKE(s, double, 24 * m);
+  s->q.d = TAKE(s, double, m);
+  s->q.nu = TAKE(s, double, m);
+  s->q.step = TAKE(s, double, m);
+  if (s->is_short) return LAV_ERROR_ROOM;
+  k_expand_rows(&s->p, &s->r, jac, jac + 12 * m);
+  k_assemble(&s->p, &s->r, jac, jac + 12 * m, start, blocks, near, near + 2 * k + 1, near + 4 * k + 2, indptr, index, data);
+  s->a.indptr = indptr;
+  s->a.indices = index;
+  s->a.data = data;
+  k_csr_diagonal(&s->q, &s->a, (double *)(uintptr_t)s->q.d, (double *)(uintptr_t)s->q.step, near);
+  k_matrix_nu(&s->q, (double *)(uintptr_t)s->q.nu);
+  return LAV_OK;
+}
+
+/* -- newton ----------------------------------------------------------------------------------------------------------- */
+
+static const double CLOSEST = 1e-2;
+
+/* On the impulse as it stands; rows of a formed A where it does not go over bodies. */
+static int32_t start_newton(lav_solver *s, double tol, int32_t budget) {
+  int32_t i, cold = 1, same = 1;
+  judge_measure_do_nothing(&s->p, s->watch.e, s->watch.w);
+  for (i = 0; i < s->p.n_rows; i++) {
+    if (s->impulse[i] != 0.0) cold = 0;
+    if (s->impulse[i] != s->watch.e[i]) same = 0;
+  }
+  s->asked.tol = tol;
+  s->asked.budget = budget;
+  s->asked.cold = cold || same;
+  return k_start(&s->view, &s->asked, &s->drive, s->impulse);
+}
+
+static int32_t prepare_newton(lav_solver *s) {
+  uint64_t from = s->used;
+  int32_t how = driver_driver_ROOM;
+  memset(&s->view, 0, sizeof s->view);
+  s->asked.method = driver_driver_NEWTON;
+  s->asked.wide = LAVENDER_HAS_WIDE();
+  s->view.p = s->p;
+  if (s->form == LAV_MATRIX) s->view.a = &s->a;
+  else if (s->form == LAV_BODIES) s->view.r = &s->r;
+  else s->view.g = &s->g;
+  s->driven = 0;
+  if (s->p.n_rows == 0) return LAV_OK;
+  if (!k_room(&s->view, &s->asked, &s->drive)) {
+    GIVE_BACK(form_matrix(s));
+    s->view.r = NULL;
+    s->view.a = &s->a;
+    if (!k_room(&s->view, &s->asked, &s->drive)) return LAV_ERROR_UNSUPPORTED;
+    from = s->used;
+  }
+  while (how == driver_driver_ROOM) {
+    s->used = from;
+    s->drive.index = TAKE(s, int32_t, s->drive.n_index);
+    s->drive.real = TAKE(s, double, s->drive.n_real);
+    if (s->is_short) return LAV_ERROR_ROOM;
+    how = s->view.a ? newton_plan_MORE : start_newton(s, s->asked.tol, s->asked.budget); /* as the last run: it tells the room */
+  }
+  s->driven = s->view.a == NULL;
+  return LAV_OK;
+}
+
+static void run_newton(lav_solver *s, const lav_budget *budget, lav_result *out) {
+  struct driver_driver_said_t said = {0, 0.0, NULL};
+  double closer = 1.0;
+  int32_t how = newton_plan_MORE, before = 0;
+  lav_verdict now;
+  if (!s->driven || budget->tol != s->asked.tol || budget->iterations != s->asked.budget)
+    how = start_newton(s, budget->tol, budget->iterations);
+  s->driven = 0;
+  while (out->outcome == LAV_MAX_ITERATIONS && out->iterations < budget->iterations) {
+    how = k_step(&s->view, &s->asked, &s->drive, is_timed(budget) ? 1 : 1 << 30, s->impulse, &said);
+    out->iterations = before + said.factorisations;
+    if (how == newton_plan_SPENT) break;
+    if (how == newton_plan_REACHED) {
+      judge(s, s->impulse, 1, &now); /* over velocities sums are rounded in another order, and vanish where squares do */
+      if (now.relative <= budget->tol) out->outcome = LAV_CONVERGED;
+      else if (closer <= CLOSEST || budget->iterations <= out->iterations) out->outcome = LAV_STALLED;
+      else {
+        before = out->iterations;
+        closer *= 0.25;
+        start_newton(s, closer * budget->tol, budget->iterations - before);
+      }
+    } else if (how == newton_plan_FLOOR) out->outcome = LAV_FLOOR;
+    else if (how == newton_plan_STUCK) out->outcome = LAV_STALLED;
+    else if (is_late(s, budget)) out->outcome = LAV_TIME_LIMIT;
+  }
+  s->asked.tol = budget->tol;
+  s->asked.budget = budget->iterations;
+  out->restarts = out->iterations;
+}
+
+/* -- admm on a dense factor ------------------------------------------------------------------------------------------- */
+
+static const double FIRST_RHO = 0.1, RELAXATION = 1.6;
+
+/* L L^T = D^-1/2 A D^-1/2 + rho, row by row; 0 where a pivot is not positive. */
+static int32_t factor_shifted(lav_solver *s) {
+  const int32_t m = s->p.n_rows;
+  const double *root = s->splitting.root;
+  int32_t i, j, q;
+  s->factors += 1;
+  for (i = 0; i < m; i++) {
+    double *row = s->table + (int64_t)i * m;
+    memset(row, 0, (size_t)(i + 1) * sizeof(double));
+    for (q = s->a.indptr[i]; q < s->a.indptr[i + 1]; q++)
+      if (s->a.indices[q] <= i) row[s->a.indices[q]] += s->a.data[q] / (root[i] * root[s->a.indices[q]]);
+    row[i] += s->splitting.rho;
+    for (j = 0; j < i; j++) {
+      const double *to = s->table + (int64_t)j * m;
+      row[j] = (row[j] - core_generalized_dot(row, to, j)) / to[j];
+    }
+    row[i] -= core_generalized_dot(row, row, i);
+    if (!(row[i] > 0.0)) return 0;
+    row[i] = sqrt(row[i]);
+  }
+  return 1;
+}
+
+static void admm_step(void *context, double *lam, int32_t first, int32_t n) {
+  lav_solver *s = (lav_solver *)context;
+  struct accelerate_admm_admm_t *c = &s->splitting;
+  int32_t i;
+  if (first) { /* at a solution the first iteration stays there */
+    for (i = 0; i < s->p.n_rows; i++) c->x[i] = core_csr_csr_dot(&s->a, i, lam) - s->p.b[i];
+    k_admm_start(&s->p, lam, c->x, c->root, c->rho, c->u, c->y);
+  }
+  while (n > 0 && !s->is_broken) {
+    const double rho = k_admm(c, &s->factor, &s->mixing, lam, &n);
+    if (rho > 0.0) {
+      c->rho = rho;
+      s->is_broken = !factor_shifted(s);
+    }
+  }
+}
+
+static int32_t prepare_admm(lav_solver *s) {
+  const int64_t m = s->p.n_rows;
+  struct accelerate_admm_admm_t *c = &s->splitting;
+  const int32_t memory = s->options.memory;
+  double *x, *root, *shift, size[2] = {0.0, 0.0};
+  int32_t i, bands[2];
+  GIVE_BACK(form_matrix(s));
+  if (m > 0 && s->a.indptr[m] > 0) core_csr_scan_entries(&s->a, (int32_t)m, s->marks, bands, size);
+  if (size[1] > 0.0 && size[0] / size[1] > 1e-14) return LAV_ERROR_UNSUPPORTED; /* L L^T alone: A is not symmetric */
+  s->table = TAKE(s, double, m * m);
+  x = TAKE(s, double, (10 + 2 * (int64_t)memory) * m + CONTROL + GRAM + 4);
+  if (s->is_short) return LAV_ERROR_ROOM;
+  memset(x, 0, (size_t)((10 + 2 * (int64_t)memory) * m + CONTROL + GRAM + 4) * sizeof(double));
+  c->blocks = &s->p;
+  c->turn = x;
+  s->mixing.control = x + 4;
+  s->mixing.gram = s->mixing.control + CONTROL;
+  root = s->mixing.gram + GRAM;
+  shift = root + m;
+  c->u = shift + m;
+  c->z = c->u + m;
+  c->y = c->z + m;
+  c->x = c->y + m;
+  c->g = c->x + m;
+  c->before = c->g + m;
+  c->work = NULL;
+  s->mixing.v = c->before + m;
+  s->mixing.g = s->mixing.v + m;
+  s->mixing.dv = s->mixing.g + m;
+  s->mixing.dg = s->mixing.dv + memory * m;
+  s->mixing.m = (int32_t)m;
+  s->mixing.memory = memory;
+  for (i = 0; i < m; i++) {
+    root[i] = sqrt(s->p.d[i]);
+    shift[i] = s->p.b[i] / root[i];
+  }
+  c->root = root;
+  c->c = shift;
+  c->rho = FIRST_RHO;
+  c->alpha = RELAXATION;
+  memset(&s->factor, 0, sizeof s->factor);
+  s->factor.kind = accelerate_admm_DENSE;
+  s->factor.n = (int32_t)m;
+  s->factor.dense = s->table;
+  s->factors = 0;
+  s->is_broken = !factor_shifted(s);
+  s->context = s;
+  s->step = admm_step;
+  return LAV_OK;
+}
+
+/* -- auto: one method after the other, each for its share ------------------------------------------------------------- */
+
+/* Turns of the library's own, by form, size and what the blocks are; returns how many. */
+static int32_t usual_turns(const lav_problem *q, int32_t *turns) {
+  const int32_t few = q->n_rows <= FEW_ROWS, rows = are_rows(q);
+  int32_t n = 0;
+  if (q->form == LAV_VELOCITIES) turns[n++] = LAV_NEWTON, turns[n++] = 200;
+  else if (rows && few) turns[n++] = LAV_DIRECT, turns[n++] = 100;
+  turns[n++] = LAV_ANDERSON, turns[n++] = 200;
+  if (q->form == LAV_BODIES || (q->form == LAV_MATRIX && few)) turns[n++] = LAV_NEWTON, turns[n++] = 100;
+  turns[n++] = LAV_NNCG, turns[n++] = 200;
+  if (q->form != LAV_VELOCITIES && few) {
+    turns[n++] = LAV_ADMM, turns[n++] = 400;
+    if (rows) turns[n++] = LAV_LEMKE, turns[n++] = 8 * q->n_rows;
+  }
+  return n / 2;
+}
+
+/* The method of turn i laid out in the memory behind the problem. */
+static int32_t take_turn(lav_solver *s, int32_t i) {
+  s->options.method = s->turns[2 * i];
+  s->used = s->common;
+  s->is_short = 0;
+  return prepare(s);
+}
+
+static int32_t prepare_auto(lav_solver *s, const lav_problem *q) {
+  int32_t i, kept = 0, code = LAV_ERROR_UNSUPPORTED;
+  s->n_turns = s->options.n_turns;
+  if (s->n_turns > 0) COPY(s->turns, s->given_turns, 2 * s->n_turns);
+  else s->n_turns = usual_turns(q, s->turns);
+  s->chosen = TAKE(s, double, s->p.n_rows);
+  s->common = s->used;
+  for (i = 0; i < s->n_turns; i++) { /* those that take it */
+    s->options.method = s->turns[2 * i];
+    if (takes(q, &s->options) != LAV_OK) continue;
+    s->turns[2 * kept] = s->turns[2 * i];
+    s->turns[2 * kept++ + 1] = s->turns[2 * i + 1];
+  }
+  s->n_turns = kept;
+  if (kept > 0) code = s->is_short ? LAV_ERROR_ROOM : take_turn(s, 0);
+  s->options.method = LAV_AUTO;
+  s->at_turn = 0;
+  return code;
+}
+
+static int32_t run_auto(lav_solver *s, const lav_budget *budget, lav_result *out) {
+  double best = INFINITY;
+  int32_t i = 0, n, round = 1, worked, code = LAV_OK, short_of = 0;
+  COPY(s->chosen, s->impulse, s->p.n_rows);
+  out->method = s->turns[0];
+  for (worked = 0;; i++) {
+    lav_budget turn = *budget;
+    lav_result part = *out;
+    lav_verdict found;
+    if (i == s->n_turns) { /* again, four times as long; none of them works: there is nothing to do */
+      if (!worked || out->iterations >= budget->iterations) break;
+      i = worked = 0;
+      if (round < 1 << 20) round *= 4;
+    }
+    n = s->turns[2 * i + 1] < (1 << 30) / round ? round * s->turns[2 * i + 1] : 1 << 30;
+    turn.iterations = n < budget->iterations - out->iterations ? n : budget->iterations - out->iterations;
+    if (turn.iterations <= 0 || is_late(s, budget)) break;
+    if (s->at_turn != i) {
+      COPY(s->impulse, s->chosen, s->p.n_rows);
+      code = take_turn(s, i);
+      if (code == LAV_ERROR_ROOM) short_of = s->used + 32 > s->needed ? (s->needed = s->used + 32, 1) : 1;
+      s->at_turn = code == LAV_OK ? i : -1;
+      if (code != LAV_OK) continue;
+    } else s->options.method = s->turns[2 * i];
+    part.outcome = LAV_MAX_ITERATIONS;
+    part.iterations = part.sweeps = part.restarts = 0;
+    begin_method(s);
+    run_method(s, &turn, &part);
+    s->at_turn = -1;
+    out->iterations += part.iterations;
+    out->sweeps += part.sweeps;
+    worked += part.iterations;
+    judge(s, s->impulse, 1, &found);
+    if (found.relative < best || best == INFINITY) {
+      best = found.relative;
+      COPY(s->chosen, s->impulse, s->p.n_rows);
+      out->method = s->options.method;
+    }
+    if (best <= budget->tol || (best <= 2.0 * found.floor && best < 1.0 && found.relative == best)) {
+      out->outcome = best <= budget->tol ? LAV_CONVERGED : LAV_FLOOR;
+      break;
+    }
+  }
+  COPY(s->impulse, s->chosen, s->p.n_rows);
+  s->options.method = LAV_AUTO;
+  if (out->outcome == LAV_MAX_ITERATIONS && is_late(s, budget)) out->outcome = LAV_TIME_LIMIT;
+  else if (out->outcome == LAV_MAX_ITERATIONS && out->iterations < budget->iterations) out->outcome = LAV_STALLED;
+  return short_of && out->outcome != LAV_CONVERGED ? LAV_ERROR_ROOM : LAV_OK;
+}
+#endif

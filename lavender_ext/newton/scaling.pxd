@@ -1,0 +1,252 @@
+"""The rows of a problem that move, in the scaled unknown of Newton's method, from the problem's own arrays.
+
+    z = D^1/2 lambda,   H = D^-1/2 A D^-1/2,   g = D^-1/2 (b - A fixed)
+
+An element is a bounded row, or a contact with the tangents, the spin and the rolling that move. Rows of equal bounds,
+tangents without friction and empty rows of A stay where they are. Whole numbers come first (`find_elements`), since the
+room of a factor over bodies depends on them, then the numbers (`scale_elements`).
+"""
+from libc.math cimport fabs, sqrt
+from libc.stdint cimport int32_t, int64_t
+from libc.string cimport memset
+
+from lavender_ext.core.block cimport (CONTACT, CONTACT_ROLLING, CONTACT_SPIN as SPIN, ROUND, ROW, blocks_t, n_apart,
+                                      n_tangents)
+from lavender_ext.core.csr cimport csr_t
+from lavender_ext.core.rows cimport rows_t
+from lavender_ext.core.velocity cimport rows_velocity
+from lavender_ext.judge.measure cimport rows_slack
+from lavender_ext.newton.cones cimport KEPT, PARTS
+from lavender_ext.newton.elements cimport elements_t
+
+
+cdef struct scaled_t:
+    elements_t e
+    int32_t* keep               # (m) rows that move
+    int32_t* block              # (n) of each element
+    double* fixed               # (rows) impulse of the others
+    double* scale               # (m) D^-1/2
+    double* speed               # (m) velocity error per unit of the natural map
+    int32_t small               # entries of small matrices
+    int32_t whole               # every row moves
+
+
+cdef inline bint is_known(const blocks_t* p) noexcept nogil:
+    """No round cones of more than two tangents."""
+    cdef int32_t i
+    for i in range(p.n_blocks):
+        if p.kind[i] == ROUND:
+            return False
+    return True
+
+
+cdef inline bint is_row(const blocks_t* p, int32_t i) noexcept nogil:
+    return p.kind[i] == ROW or p.ptr[i + 1] - p.ptr[i] == 1
+
+
+cdef inline double low_of(const blocks_t* p, int32_t i, int32_t j) noexcept nogil:
+    return p.lower[j] if p.kind[i] == ROW else 0.0
+
+
+cdef inline double high_of(const blocks_t* p, int32_t i, int32_t j) noexcept nogil:
+    return p.upper[j] if p.kind[i] == ROW else 1.0 / 0.0
+
+
+cdef inline int32_t apart_of(const blocks_t* p, int32_t i) noexcept nogil:
+    """The row of contact i whose bound is mu r lam_n, -1 where there is none."""
+    cdef int32_t size = p.ptr[i + 1] - p.ptr[i]
+    return p.ptr[i] + 1 + n_tangents(p.kind[i], size) if n_apart(p.kind[i], size) & 1 else -1
+
+
+cdef inline double reach_of(const blocks_t* p, int32_t i, int32_t j) noexcept nogil:
+    """Largest impulse of row j of contact i, behind its normal, over lam_n."""
+    if p.kind[i] == CONTACT_ROLLING and j >= p.ptr[i + 1] - 2:
+        return p.rolling[i]
+    return p.mu[i] * p.patch_radius[i] if j == apart_of(p, i) else p.mu[i]
+
+
+cdef inline bint is_empty(const blocks_t* p, const csr_t* a, const rows_t* r, int32_t i, int32_t j) noexcept nogil:
+    """Nothing stands in row j of A, of block i."""
+    cdef int32_t q, b
+    cdef double x = 0.0
+    if a != NULL:
+        for q in range(a.indptr[j], a.indptr[j + 1]):
+            x += fabs(a.data[q])
+        return x == 0.0
+    x = fabs(r.compliance[j])
+    if i < r.n_joints:
+        for q in range(12 * j, 12 * j + 12):
+            x += fabs(r.minv_jac[q])
+        return x == 0.0
+    for q in range(2):
+        b = r.contact_body[2 * (i - r.n_joints) + q]
+        if b >= 0:
+            x += r.inv_mass[b]
+    for q in range(6 * (j - p.ptr[r.n_joints]), 6 * (j - p.ptr[r.n_joints]) + 6):
+        x += fabs(r.swing[q])
+    return x == 0.0
+
+
+cdef inline bint stays(const blocks_t* p, const csr_t* a, const rows_t* r, int32_t i, int32_t j, double* at) noexcept nogil:
+    """Row j of block i cannot move; its impulse into `at`."""
+    cdef double x, low, high
+    at[0] = 0.0
+    if not is_row(p, i):
+        return j > p.ptr[i] and reach_of(p, i, j) == 0.0
+    low, high = low_of(p, i, j), high_of(p, i, j)
+    if low == high:
+        at[0] = low
+        return True
+    if not is_empty(p, a, r, i, j):
+        return False
+    x = high if p.b[j] > 0.0 else low if p.b[j] < 0.0 else 0.0
+    x = x if fabs(x) < 1.0 / 0.0 else 0.0
+    at[0] = low if x < low else high if x > high else x
+    return True
+
+
+cdef inline int64_t scaled_index(int64_t m) noexcept nogil:
+    return 5 * m + 2
+
+
+cdef inline int64_t scaled_real(int64_t m) noexcept nogil:
+    return (10 + PARTS * KEPT) * m
+
+
+cdef inline void lay_elements(scaled_t* s, int64_t m, int32_t* index) noexcept nogil:
+    """Places in index (`scaled_index`), of at most m rows."""
+    s.keep = index
+    s.block = index + m
+    s.e.ptr = index + 2 * m
+    s.e.kind = index + 3 * m + 1
+    s.e.wptr = index + 4 * m + 1
+    s.e.node = s.e.slot = s.e.group = NULL              # of bodies
+    s.e.n_groups = 0
+    s.e.panel = NULL
+    s.e.s = 1
+
+
+cdef inline void lay_numbers(scaled_t* s, int64_t m, double* real) noexcept nogil:
+    """Places in real (`scaled_real`)."""
+    s.fixed, s.scale, s.speed = real, real + m, real + 2 * m
+    s.e.theta, s.e.g, s.e.lower, s.e.upper = real + 3 * m, real + 4 * m, real + 5 * m, real + 6 * m
+    s.e.at, s.e.as_, s.e.ar = real + 7 * m, real + 8 * m, real + 9 * m
+    s.e.scaling = real + 10 * m
+
+
+cdef inline void find_elements(scaled_t* s, const blocks_t* p, const csr_t* a, const rows_t* r) noexcept nogil:
+    """Which rows move, and how they stand together, of A or of bodies; in the places of `lay_elements`."""
+    cdef int32_t i, j, q, n = 0, m = 0, first, last
+    cdef int32_t* ptr = <int32_t*>s.e.ptr
+    cdef int32_t* kind = <int32_t*>s.e.kind
+    cdef int32_t* wptr = <int32_t*>s.e.wptr
+    cdef double x
+    s.e.parts = 2
+    for i in range(p.n_blocks):
+        first = m
+        for j in range(p.ptr[i], p.ptr[i + 1]):
+            if stays(p, a, r, i, j, &x):
+                continue
+            s.keep[m] = j
+            m += 1
+            if is_row(p, i) or m == first + 1:
+                ptr[n] = m - 1
+                kind[n] = ROW
+                s.block[n] = i
+                n += 1
+        if m > first + 1 and not is_row(p, i):
+            last = s.keep[m - 1]
+            kind[n - 1] = CONTACT
+            if last == apart_of(p, i):
+                kind[n - 1] = SPIN
+            elif p.kind[i] == CONTACT_ROLLING and m - first >= 5:
+                kind[n - 1] = CONTACT_ROLLING           # without tangents that move what rolls takes their place
+                s.e.parts = PARTS
+    ptr[n] = m
+    wptr[0] = 0
+    for i in range(n):
+        q = ptr[i + 1] - ptr[i]
+        wptr[i + 1] = wptr[i] + q * q
+    s.small = wptr[n]
+    s.e.n, s.e.m = n, m
+    s.whole = m == p.n_rows
+
+
+cdef inline double opening(const scaled_t* s, const blocks_t* p, int32_t i, int32_t at) noexcept nogil:
+    """Of the cone of element i at its row `at`, in the metric of d."""
+    return reach_of(p, s.block[i], s.keep[at]) * (1.0 / s.scale[at]) / (1.0 / s.scale[s.e.ptr[i]])
+
+
+cdef inline bint hold(scaled_t* s, const blocks_t* p, const csr_t* a, const rows_t* r) noexcept nogil:
+    """Impulses of the rows that stay; is any of them other than 0?"""
+    cdef int32_t i, j
+    cdef double x
+    cdef bint pushed = False
+    memset(s.fixed, 0, p.n_rows * sizeof(double))
+    for i in range(0 if s.whole else p.n_blocks):
+        for j in range(p.ptr[i], p.ptr[i + 1]):
+            if stays(p, a, r, i, j, &x):
+                s.fixed[j] = x
+                pushed = pushed or x != 0.0
+    return pushed
+
+
+cdef inline void scale_elements(scaled_t* s, const blocks_t* p, const csr_t* a, const rows_t* r, double* w,
+                                double* v) noexcept nogil:
+    """Their numbers, in the places of `lay_numbers`; w (rows) and, over bodies, v (6 n) are scratch."""
+    cdef int32_t i, j, q, h, size
+    cdef double x
+    cdef bint pushed = hold(s, p, a, r)
+    cdef double* at = <double*>s.e.at
+    cdef double* spin = <double*>s.e.as_
+    cdef double* roll = <double*>s.e.ar
+    if pushed and a == NULL:
+        rows_velocity(p, r, s.fixed, v)
+        rows_slack(p, r, s.fixed, v, w)
+    for i in range(s.e.n):
+        for q in range(s.e.ptr[i], s.e.ptr[i + 1]):
+            j = s.keep[q]
+            s.scale[q] = 1.0 / sqrt(p.d[j])
+            s.speed[q] = sqrt(p.nu[j]) * sqrt(p.d[j]) * s.scale[q]
+            (<double*>s.e.lower)[q] = low_of(p, s.block[i], j) / s.scale[q]
+            (<double*>s.e.upper)[q] = high_of(p, s.block[i], j) / s.scale[q]
+            (<double*>s.e.theta)[q] = r.compliance[j] * s.scale[q] * s.scale[q] if a == NULL else 0.0
+            x = 0.0                                     # (A fixed)_j; theta stands on the diagonal of a given A
+            if pushed and a == NULL:
+                x = w[j] + p.b[j]
+            elif pushed:
+                for h in range(a.indptr[j], a.indptr[j + 1]):
+                    x += a.data[h] * s.fixed[a.indices[h]]
+            (<double*>s.e.g)[q] = (p.b[j] - x) * s.scale[q]
+    for i in range(s.e.n):
+        at[i] = spin[i] = roll[i] = 0.0
+        q = s.e.ptr[i]
+        size = s.e.ptr[i + 1] - q
+        if s.e.kind[i] != ROW:
+            at[i] = opening(s, p, i, q + 1)
+        if s.e.kind[i] == SPIN or (s.e.kind[i] == CONTACT_ROLLING and size == 6):
+            spin[i] = opening(s, p, i, q + size - 1 if s.e.kind[i] == SPIN else q + 3)
+        if s.e.kind[i] == CONTACT_ROLLING:
+            roll[i] = opening(s, p, i, q + size - 2)
+
+
+cdef inline bint dense_matrix(const scaled_t* s, const csr_t* a, int32_t rows, int32_t* place, double* h) noexcept nogil:
+    """H (m, m) of the rows that move; place (rows) is scratch. Whether it is symmetric."""
+    cdef int32_t i, j, q, m = s.e.m
+    cdef double x
+    cdef bint same = True
+    for j in range(rows):
+        place[j] = -1
+    for i in range(m):
+        place[s.keep[i]] = i
+    memset(h, 0, <int64_t>m * m * sizeof(double))
+    for i in range(m):
+        for q in range(a.indptr[s.keep[i]], a.indptr[s.keep[i] + 1]):
+            j = place[a.indices[q]]
+            if j >= 0:
+                h[<int64_t>i * m + j] = a.data[q] * s.scale[i] * s.scale[j]
+    for i in range(m):
+        for j in range(i):
+            x = h[<int64_t>i * m + j] - h[<int64_t>j * m + i]
+            same = same and fabs(x) <= 1e-14
+    return same
