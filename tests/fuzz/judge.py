@@ -72,9 +72,9 @@ class Problem:
         c, out = self.cones, np.ones(self.m, L)
         self.mu = np.array(c["mu"], L)
         for k in np.flatnonzero(c["kind"] == CONTACT_ELLIPSE):
-            both = self.mu[k] * np.array([1.0, c["patch_radius"][k]], L)
-            self.mu[k] = both.max()
-            out[c["ptr"][k] + 1 : c["ptr"][k + 1]] = both / both.max() if both.max() > 0 else L(1.0)
+            sides = np.array([1.0, c["patch_radius"][k]], L)
+            self.mu[k] *= sides.max()
+            out[c["ptr"][k] + 1 : c["ptr"][k + 1]] = sides / sides.max()
         return out
 
     # -- the operator ------------------------------------------------------------------------------
