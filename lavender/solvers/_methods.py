@@ -219,10 +219,10 @@ class Relaxation(Resumed):
             self.shown_by = "nncg"
             self.solver = get("nncg").load()(**METHODS["nncg"][1])
             self.state = self.solver.prepare(self.log.problem)
-        if self.slow:
-            n = max(1, n // int(BOTH_WAYS))
-        claim = super().turn(n)
-        return replace(claim, iterations=int(BOTH_WAYS) * claim.iterations) if self.slow else claim
+        if not self.slow:
+            return super().turn(n)
+        claim = super().turn(max(1, n // int(BOTH_WAYS)))
+        return replace(claim, iterations=min(n, int(BOTH_WAYS) * claim.iterations))
 
     shown_by = "relaxation"
 
