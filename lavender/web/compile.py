@@ -79,7 +79,7 @@ class Part:
 
 
 #: Modules of the page by name; the first stands alone.
-PARTS = {"lavender": Part(MODULES, LARGEST), "newton": Part(("warm.substep",), 125_000, beside=True)}
+PARTS = {"lavender": Part(MODULES, LARGEST), "newton": Part(("warm.substep",), 130_000, beside=True)}
 MEMORY = "env.memory"
 CIMPORT = re.compile(r"^from lavender_ext\.([\w.]+) cimport", re.MULTILINE)
 #: Name of the custom section with the hash of the sources.
