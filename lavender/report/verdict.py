@@ -176,7 +176,10 @@ def _told(final: Final, time: float, what: str) -> list[str]:
     timed = f"{seconds(time)}, {what}"
     timed = timed if final.line.times else f"not timed as a line: {timed}"
     calls = ", ".join(c_of(final.line))
-    in_c = [f"# in C (lavender export c): {calls}, lav_run(solver, &budget, &result);"] if calls else []
+    made = "lavender export c"
+    if final.line.solver == "auto":
+        made += " --for RECORD, which writes the turns that options are to name"
+    in_c = [f"# in C ({made}): {calls}, lav_run(solver, &budget, &result);"] if calls else []
     if final.line.start == "carried":
         return [f"{before[0]}  # {timed}", *before[1:], last, *in_c]
     return [*before, f"{last}  # {timed}", *in_c]
