@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from lavender._arrays import ArrayLike, FloatArray, equal, whole_number
-from lavender.deadline import Deadline
+from lavender.deadline import CHUNK_TIME, Deadline
 from lavender.errors import CapabilityError, InputError, InUse, UnknownName
 from lavender.foreign import Foreign
 from lavender.outcome import (
@@ -39,7 +39,6 @@ from lavender_ext.judge.measure import all_finite
 
 __all__ = ["Prepared", "prepare", "solve"]
 
-CHUNK_TIME = 0.025  # s, aim; twice that is still below what a person notices on Ctrl-C
 FIRST_CHUNK = 256  # iterations: 25 ms at 100 us each, slower than any compiled sweep of few rows
 Callback = Callable[[int, FloatArray, Residual], Any]
 Record = tuple[int, float, float, float, float]  # iterations, s, relative, energy, velocity
