@@ -118,7 +118,7 @@ class Resumed(Candidate):
         self.work, done, left = {}, 0, log.deadline.left()
         while True:  # as many iterations as are likely to end in time; a look at the end costs about one
             time = CHUNK_TIME if left is None else min(CHUNK_TIME, left if log.pace else PROBE * left)
-            step = min(max(1, round(1e9 * time / ((log.pace or 1.0) * each))), n - done)
+            step = min(max(1, int(1e9 * time / ((log.pace or 1.0) * each))), n - done)
             last = self.iterate(step)
             done += last
             if left is not None:
