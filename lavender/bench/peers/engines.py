@@ -178,12 +178,20 @@ def measure_scene(
                 best[i] = min(best[i], (process_time() - start) / size[i])
         found = []
         for i, (mode, one) in enumerate(zip(modes, made, strict=True)):
-            head = (scene, mode.name.format(sweeps), mode.accurate)
             if i in notes:
-                found.append(Step(*head, NAN, 0, NAN, NAN, NAN, notes[i]))
-                continue
-            one.step()
-            contacts, depth, relative = one.left()
-            speed = np.linalg.norm(one.state()[2][:, :3], axis=1).max(initial=0.0)
-            found.append(Step(*head, float(best[i]), contacts, depth, float(speed), relative))
+                left: dict[str, Any] = {
+                    "time": NAN,
+                    "contacts": 0,
+                    "depth": NAN,
+                    "speed": NAN,
+                    "relative": NAN,
+                    "note": notes[i],
+                }
+            else:
+                one.step()
+                contacts, depth, relative = one.left()
+                speed = float(np.linalg.norm(one.state()[2][:, :3], axis=1).max(initial=0.0))
+                left = {"time": float(best[i]), "contacts": contacts, "depth": depth, "speed": speed}
+                left["relative"] = relative
+            found.append(Step(scene=scene, engine=mode.name.format(sweeps), accurate=mode.accurate, **left))
         return found
