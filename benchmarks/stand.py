@@ -11,17 +11,15 @@ second of simulation: sweeps x substeps / dt.
 
 LavenderSim is stepped as a user steps it, with its observation; the others by their own call for a step. MuJoCo,
 PyBullet and lavendersim are Python packages; Rapier (`@dimforge/rapier3d-compat`) and Jolt (`jolt-physics`) run under
-Node, by the adapters of `lavender phenomena`.
+Node. All of them by the adapters of `lavender phenomena`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
-from importlib.util import find_spec
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from time import process_time
-from typing import Any, ClassVar
+from typing import Any
 
 import click
 import numpy as np
@@ -29,18 +27,15 @@ import numpy as np
 from benchmarks.output import folder_of, markdown, write_json
 from lavender._arrays import FloatArray
 from lavender.bench.machine import versions
-from lavender.engine import Simulation
 from lavender.errors import InputError, UnknownName
-from lavender.external._running import quiet
-from lavender.phenomena.engines import PACKAGES_OF_NODE, missing_in_node, versions_of_node
-from lavender.phenomena.engines.node import Engine as Node
+from lavender.phenomena.engines import PACKAGES_OF_NODE, Stepping, engine, lacks, versions_of_node
 from lavender.scene import Scene
 from lavender.scene.scene import SCENE_ORDERS
 
 __all__ = [
     "ENGINES",
-    "Engine",
     "Line",
+    "Standing",
     "Tower",
     "command",
     "installed",
@@ -93,268 +88,84 @@ class Line:
         return self.sweeps * self.substeps / self.dt
 
 
-class Engine:
-    """One engine with one tower."""
+@dataclass(frozen=True)
+class Standing:
+    """One engine with one tower, and what it is asked for."""
 
-    name = ""
-    sweeps = 0
-    substeps = 1
-    up = 2  # axis
-
-    def step(self) -> Any:
-        """One step of dt."""
-        raise NotImplementedError
-
-    def advance(self, steps: int) -> None:
-        """So many steps."""
-        for _ in range(steps):
-            self.step()
-
-    def clock(self) -> float:
-        """CPU time that steps took, from any moment on [s]."""
-        return process_time()
+    engine: Stepping
+    name: str
+    sweeps: int  # of one substep; 0: solved to a tolerance
+    substeps: int  # of one step
 
     def centres(self) -> FloatArray:
         """Centres of the boxes (n, 3) [m]."""
-        raise NotImplementedError
-
-    def close(self) -> None:
-        """Let go of what the engine holds."""
-
-
-class Lavender(Engine):
-    """LavenderSim with its sweeps."""
-
-    name = "lavender"
-    solver = "sequential_impulses"
-    stepper = "impulses"
-
-    def __init__(self, tower: Tower) -> None:
-        own = self.solver == "sequential_impulses"
-        scene = Scene(
-            "stack", n=tower.boxes, dt=tower.dt, friction=FRICTION, solver=self.solver, substeps=tower.substeps,
-            solver_iterations=tower.sweeps if own else None, order=tower.order if own else None, stepper=self.stepper,
-        )  # fmt: skip
-        p = scene.parameters
-        self.sim = Simulation(scene)
-        self.step = self.sim.step  # type: ignore[method-assign]
-        self.substeps = p.substeps
-        self.sweeps = self.sim.solver_iterations if own else 0
-        if own and tower.order is not None:
-            self.name = f"{self.name}, {p.order}"
-
-    def centres(self) -> FloatArray:
-        """See `Engine.centres`."""
-        x: FloatArray = self.sim._state.a["x"][1:]
+        x: FloatArray = self.engine.state()[0][1:]
         return x.copy()
-
-
-class SoftStep(Lavender):
-    """LavenderSim with `soft_step`: as many sweeps again as there are substeps relax."""
-
-    name = "lavender soft_step"
-    stepper = "soft_step"
-
-
-class BlockDescent(Lavender):
-    """LavenderSim with `avbd`."""
-
-    name = "lavender avbd"
-    stepper = "avbd"
-
-
-class LavenderNewton(Lavender):
-    """LavenderSim with `newton`."""
-
-    name = "lavender newton"
-    solver = "newton"
-
-
-class Lavendersim(Engine):
-    """The C++ engine of PyPI's lavendersim; it divides a step into substeps of 1/240 s by itself. y is up."""
-
-    name = "lavendersim"
-    up = 1
-
-    def __init__(self, tower: Tower) -> None:
-        import lavendersim
-
-        self.sweeps = 22 if tower.sweeps is None else tower.sweeps
-        self.substeps = max(1, int(np.ceil(240.0 * tower.dt - 1e-9)))
-        material = {"static_friction": FRICTION, "dynamic_friction": FRICTION, "torsional_friction": 0.0}
-        scene = lavendersim.Scene(
-            "tower", gravity=-9.81, solver_iterations=self.sweeps, ground_rolling_friction=0.0,
-            **{f"ground_{k}": v for k, v in material.items()},
-        )  # fmt: skip
-        for i in range(tower.boxes):
-            scene.box(
-                f"box {i}", size=(1.0, 1.0, 1.0), mass=1.0, position=(0.0, i + 0.5, 0.0), restitution=0.0,
-                rolling_friction=0.0, **material,
-            )  # fmt: skip
-        self.env = lavendersim.CodeSceneEnv(scene, control_dt=tower.dt, horizon=None)
-        self.env.reset()
-        self.step = self.env.step  # type: ignore[method-assign]
-        state = self.env.body_state()
-        self.boxes = slice(len(state) - tower.boxes, len(state))
-
-    def centres(self) -> FloatArray:
-        """See `Engine.centres`."""
-        return np.array(self.env.body_state()[self.boxes, :3], float)
-
-    def close(self) -> None:
-        """See `Engine.close`."""
-        self.env.close()
-
-
-def _mjcf(tower: Tower, option: str) -> str:
-    boxes = "".join(
-        f'<body pos="0 0 {i + 0.5}"><freejoint/><geom type="box" size=".5 .5 .5" mass="1"/></body>'
-        for i in range(tower.boxes)
-    )
-    return (
-        f'<mujoco><option timestep="{tower.dt!r}" cone="elliptic" {option}/>'
-        f'<default><geom friction="{FRICTION} 0.005 0.0001" condim="3"/></default>'
-        f'<worldbody><geom type="plane" size="50 50 1"/>{boxes}</worldbody></mujoco>'
-    )
-
-
-class MuJoCoNewton(Engine):
-    """`mj_step` with Newton to 1e-8, elliptic cones."""
-
-    name = "mujoco Newton"
-
-    def __init__(self, tower: Tower) -> None:
-        import mujoco
-
-        model = mujoco.MjModel.from_xml_string(_mjcf(tower, self._option(tower)))
-        self.data = mujoco.MjData(model)
-        mujoco.mj_kinematics(model, self.data)  # the centres before the first step
-        self.step = lambda: mujoco.mj_step(model, self.data)  # type: ignore[method-assign]
-
-    def _option(self, tower: Tower) -> str:
-        return 'solver="Newton" tolerance="1e-8"'
-
-    def centres(self) -> FloatArray:
-        """See `Engine.centres`."""
-        return np.array(self.data.xpos[1:], float)
-
-
-class MuJoCoPGS(MuJoCoNewton):
-    """`mj_step` with a number of sweeps."""
-
-    name = "mujoco PGS"
-
-    def _option(self, tower: Tower) -> str:
-        self.sweeps = 100 if tower.sweeps is None else tower.sweeps
-        return f'solver="PGS" tolerance="0" iterations="{self.sweeps}"'
-
-
-class PyBullet(Engine):
-    """`stepSimulation`, sequential impulses in maximal coordinates."""
-
-    name = "pybullet"
-
-    def __init__(self, tower: Tower) -> None:
-        with quiet(noisy=True):  # it greets
-            import pybullet as p
-
-        self.p, self.client = p, p.connect(p.DIRECT)
-        at = {"physicsClientId": self.client}
-        self.sweeps = 50 if tower.sweeps is None else tower.sweeps
-        self.substeps = 1 if tower.substeps is None else tower.substeps
-        p.setGravity(0.0, 0.0, -9.81, **at)
-        p.setPhysicsEngineParameter(
-            fixedTimeStep=tower.dt, numSolverIterations=self.sweeps, numSubSteps=self.substeps,
-            solverResidualThreshold=0.0, **at,
-        )  # fmt: skip
-        plane = p.createCollisionShape(p.GEOM_PLANE, **at)
-        box = p.createCollisionShape(p.GEOM_BOX, halfExtents=[0.5, 0.5, 0.5], **at)
-        ground = p.createMultiBody(0.0, plane, **at)
-        self.boxes = [
-            p.createMultiBody(1.0, box, basePosition=[0.0, 0.0, i + 0.5], useMaximalCoordinates=True, **at)
-            for i in range(tower.boxes)
-        ]
-        for body in (ground, *self.boxes):  # Bullet multiplies the coefficients of two bodies
-            p.changeDynamics(
-                body, -1, lateralFriction=FRICTION**0.5, rollingFriction=0, spinningFriction=0, linearDamping=0,
-                angularDamping=0, **at,
-            )  # fmt: skip
-            p.changeDynamics(body, -1, activationState=p.ACTIVATION_STATE_DISABLE_SLEEPING, **at)
-        self.step = lambda: p.stepSimulation(**at)  # type: ignore[method-assign]
-
-    def centres(self) -> FloatArray:
-        """See `Engine.centres`."""
-        return np.array(
-            [self.p.getBasePositionAndOrientation(b, physicsClientId=self.client)[0] for b in self.boxes]
-        )
-
-    def close(self) -> None:
-        """See `Engine.close`."""
-        self.p.disconnect(self.client)
-
-
-class Rapier(Engine):
-    """`World.step`, iterations of which each is a substep."""
-
-    name = "rapier"
-    default = 4
-    option = "iterations"
-    more: ClassVar[dict[str, float]] = {}
-
-    def __init__(self, tower: Tower) -> None:
-        self.sweeps = self.default if tower.sweeps is None else tower.sweeps
-        scene = Scene("stack", n=tower.boxes, friction=FRICTION)
-        options = {self.option: self.sweeps, **self.more}
-        self.made = made = Node(scene, self.name, dt=tower.dt, **options)
-        self.advance, self.clock, self.close = made.advance, made.clock, made.close  # type: ignore[method-assign]
-
-    def centres(self) -> FloatArray:
-        """See `Engine.centres`."""
-        return self.made.state()[0][1:]
-
-
-class Jolt(Rapier):
-    """`Step` with velocity steps."""
-
-    name = "jolt"
-    default = 10
-    option = "sweeps"
-    more: ClassVar[dict[str, float]] = {"substeps": 1, "gyroscopic": False}
 
 
 @dataclass(frozen=True)
 class Contestant:
-    """How an engine is made, what it needs, and what it lets one choose."""
+    """An engine of `lavender.phenomena` with a setting, what it needs, and what it lets one choose."""
 
-    make: Callable[[Tower], Engine]
-    needs: str | None = None  # Python package, or npm package
-    sweeps: bool = True
+    name: str
+    module: str = "own"
+    needs: str = ""  # Python package, or npm package
+    default: int = 0  # sweeps where nobody says a number; of ours the scene does
+    sweeps: str = "sweeps"  # option of their number; empty: it solves to a tolerance
     substeps: bool = False
+    options: Mapping[str, Any] = field(default_factory=dict)  # of the engine, of ours of the scene
+
+    def make(self, tower: Tower) -> Standing:
+        """The engine with a tower."""
+        if self.module == "own":
+            return self._ours(tower)
+        sweeps = (self.default if tower.sweeps is None else tower.sweeps) if self.sweeps else 0
+        options = {"dt": tower.dt, **self.options}
+        options |= {self.sweeps: sweeps} if self.sweeps else {}
+        options |= {"substeps": tower.substeps or 1} if self.substeps else {}
+        made = engine(self.module, Scene("stack", n=tower.boxes, friction=FRICTION), **options)
+        return Standing(made, self.name, sweeps, getattr(made, "substeps", options.get("substeps", 1)))
+
+    def _ours(self, tower: Tower) -> Standing:
+        asked = {"solver_iterations": tower.sweeps, "order": tower.order} if self.sweeps else {}
+        scene = Scene(
+            "stack",
+            n=tower.boxes,
+            dt=tower.dt,
+            friction=FRICTION,
+            substeps=tower.substeps,
+            **asked,
+            **self.options,
+        )
+        made: Any = engine("own", scene)
+        p = scene.parameters
+        name = f"{self.name}, {p.order}" if self.sweeps and tower.order is not None else self.name
+        return Standing(made, name, made.sim.solver_iterations if self.sweeps else 0, p.substeps)
 
 
 #: Engines by the name that `--engines` takes.
 ENGINES: dict[str, Contestant] = {
-    "lavender": Contestant(Lavender, substeps=True),
-    "newton": Contestant(LavenderNewton, sweeps=False),
-    "soft_step": Contestant(SoftStep, substeps=True),
-    "avbd": Contestant(BlockDescent, substeps=True),
-    "lavendersim": Contestant(Lavendersim, "lavendersim"),
-    "mujoco_newton": Contestant(MuJoCoNewton, "mujoco", sweeps=False),
-    "mujoco_pgs": Contestant(MuJoCoPGS, "mujoco"),
-    "pybullet": Contestant(PyBullet, "pybullet", substeps=True),
-    "rapier": Contestant(Rapier, PACKAGES_OF_NODE["rapier"]),
-    "jolt": Contestant(Jolt, PACKAGES_OF_NODE["jolt"]),
-}
+    "lavender": Contestant("lavender", substeps=True),
+    "newton": Contestant("lavender newton", sweeps="", options={"solver": "newton"}),
+    "soft_step": Contestant("lavender soft_step", substeps=True, options={"stepper": "soft_step"}),
+    "avbd": Contestant("lavender avbd", substeps=True, options={"stepper": "avbd"}),
+    "lavendersim": Contestant("lavendersim", "lavender_sim", "lavendersim", 22),
+    "mujoco_newton": Contestant("mujoco Newton", "mujoco", "mujoco", sweeps="", options={"cone": "elliptic"}),
+    "mujoco_pgs": Contestant("mujoco PGS", "mujoco", "mujoco", 100, options={"cone": "elliptic"}),
+    "pybullet": Contestant("pybullet", "bullet", "pybullet", 50, substeps=True, options={"bodies": True}),
+    "rapier": Contestant(
+        "rapier", "node", PACKAGES_OF_NODE["rapier"], 4, sweeps="iterations", options={"engine": "rapier"}
+    ),
+    "jolt": Contestant(
+        "jolt", "node", PACKAGES_OF_NODE["jolt"], 10,
+        options={"engine": "jolt", "substeps": 1, "gyroscopic": False},
+    ),
+}  # fmt: skip
 
 
 def missing(name: str) -> str:
     """What the engine of that name lacks here; empty where it can run."""
-    found = ENGINES[name]
-    if found.needs is None:
-        return ""
-    if found.needs in PACKAGES_OF_NODE.values():
-        return missing_in_node(found.needs)
-    return "" if find_spec(found.needs) else f"pip install {found.needs}"
+    return lacks(ENGINES[name].needs)
 
 
 def installed() -> list[str]:
@@ -381,23 +192,23 @@ def measure(engine: str, tower: Tower) -> Line:
     try:
         return _watch(made, tower)
     finally:
-        made.close()
+        made.engine.close()
 
 
-def _watch(engine: Engine, tower: Tower) -> Line:
+def _watch(made: Standing, tower: Tower) -> Line:
     every = max(1, round(LOOK / tower.dt))
     looks = max(1, round(tower.seconds / (every * tower.dt)))
     spent, drift, start, stood, steps = 0.0, 0.0, None, tower.seconds, 0
-    first = engine.centres()
+    first = made.centres()
     for _ in range(looks):
-        begin = engine.clock()
-        engine.advance(every)
-        spent += engine.clock() - begin
+        begin = made.engine.clock()
+        made.engine.advance(every)
+        spent += made.engine.clock() - begin
         steps += every
         time = steps * tower.dt
-        now = engine.centres()
+        now = made.centres()
         away = now - first
-        away[:, engine.up] = np.minimum(away[:, engine.up], 0.0)
+        away[:, 2] = np.minimum(away[:, 2], 0.0)
         if not np.linalg.norm(away, axis=1).max() <= FELL:
             stood = time
             break
@@ -405,11 +216,11 @@ def _watch(engine: Engine, tower: Tower) -> Line:
             start = now if start is None else start
             drift = max(drift, float(np.linalg.norm(now - start, axis=1).max()))
     return Line(
-        engine=engine.name,
+        engine=made.name,
         boxes=tower.boxes,
         dt=tower.dt,
-        sweeps=engine.sweeps,
-        substeps=engine.substeps,
+        sweeps=made.sweeps,
+        substeps=made.substeps,
         seconds=tower.seconds,
         stood=stood,
         drift=drift,
@@ -436,7 +247,7 @@ def lines(
         for rate in rates:
             for name in engines:
                 c = ENGINES[name]
-                own = isinstance(c.make, type) and c.make in (Lavender, SoftStep, BlockDescent)
+                own = c.module == "own" and bool(c.sweeps)
                 budgets: list[int | None] = [*sweeps] if c.sweeps else []
                 if not own:
                     budgets.append(None)

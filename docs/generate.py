@@ -32,13 +32,13 @@ from lavender import bench, registry, suite
 from lavender.bench import level_name, structure_of
 from lavender.ordering import ORDERS
 from lavender.problem import LAWS
-from lavender.report import advice, claims, geometric_means, reaches
+from lavender.report import advice, claims, contents, geometric_means, reaches
 from lavender.report.curves import figures as report_figures
 from lavender.report.page import page as report_page
 from lavender.report.style import looks
 from lavender.report.tables import SHIFT
 from lavender.report.tables.advice import NOISE, RESIDUAL_NOISE
-from lavender.report.text import count, residual, seconds, share
+from lavender.report.text import residual, seconds
 from lavender.scene.gallery import SCENES
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -420,31 +420,16 @@ def solver_pages(site, records, figures):
 def by_structure(records):
     """The table of the report's page as markdown: what to take for each structure, to a level and in a time."""
 
-    def cell(found, said):
-        best = found.best
-        if best is None:
-            return "nobody"
-        more = (
-            [", ".join(found.ties[:2]) + (f" +{len(found.ties) - 2}" if len(found.ties) > 2 else "")]
-            if found.ties
-            else []
-        )
-        lines = [
-            f"**{best.solver}** {said(best.score)}{share(best.solved, best.cases)}",
-            *(f"≈ {t}" for t in more),
-        ]
-        return "<br>".join([*lines, *([best.how] if best.how else [])])
+    def cell(c):
+        words = (f"**{c.lead}** {c.text}" if c.lead else c.text.replace(" / ", "<br>"), c.after.lstrip(", "))
+        return "<br>".join(filter(None, words))
 
     lines = advice(records)
-    names = [f"{line.name.replace(' / ', '<br>')}<br>{count(line.size, 'case')}" for line in lines]
-    to_level = table(
-        ("structure", *(f"to {level_name(x)}" for x in lines[0].by_level)),
-        [(n, *(cell(a, seconds) for a in x.by_level.values())) for n, x in zip(names, lines, strict=True)],
-    )
-    in_time = table(
-        ("structure", *(f"in {seconds(t)}" for t in lines[0].by_time)),
-        [(n, *(cell(a, residual) for a in x.by_time.values())) for n, x in zip(names, lines, strict=True)],
-    )
+    found = contents.advice_table(records, lines, tuple(lines[0].by_time))
+    rows = [(f"{cell(name)}<br>{name.more}", *map(cell, cells)) for name, *cells in found.rows]
+    first = 1 + len(lines[0].by_level)
+    to_level = table(found.heads[:first], [row[:first] for row in rows])
+    in_time = table(("structure", *found.heads[first:]), [(row[0], *row[first:]) for row in rows])
     return f"{ADVICE}\n\n:::{{container}} wide\n{to_level}\n\n{in_time}\n:::"
 
 

@@ -1,7 +1,7 @@
 """The front door: check the request, run the solver in short chunks, judge what comes back.
 
 Only this module loops over time: it reads the clock, records history, calls back, and turns Ctrl-C into
-a result. Chunks last about 25 ms and change no result, because every solver's own checks fall at fixed
+a result. Chunks last about 10 ms and change no result, because every solver's own checks fall at fixed
 iteration counts.
 """
 
@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from lavender._arrays import ArrayLike, FloatArray, equal, whole_number
-from lavender.deadline import Deadline
+from lavender.deadline import CHUNK_TIME, Deadline
 from lavender.errors import CapabilityError, InputError, InUse, UnknownName
 from lavender.foreign import Foreign
 from lavender.outcome import (
@@ -39,8 +39,7 @@ from lavender_ext.judge.measure import all_finite
 
 __all__ = ["Prepared", "prepare", "solve"]
 
-CHUNK_TIME = 0.025  # s, aim; twice that is still below what a person notices on Ctrl-C
-FIRST_CHUNK = 256  # iterations: 25 ms at 100 us each, slower than any compiled sweep of few rows
+FIRST_CHUNK = 256  # iterations: 10 ms at 40 us each, slower than any compiled sweep of few rows
 Callback = Callable[[int, FloatArray, Residual], Any]
 Record = tuple[int, float, float, float, float]  # iterations, s, relative, energy, velocity
 NOTHING_DONE = Claim(Status.MAX_ITERATIONS, 0)

@@ -5,19 +5,19 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from benchmarks.output import markdown
 from lavender.bench.peers.contest import Result
 from lavender.bench.peers.engines import Step
 from lavender.report.compared import (
     Comparison,
     compare,
     losses,
-    mean_rows,
+    mean_table,
     over_ours,
     ratio,
-    solver_rows,
-    step_rows,
+    solver_table,
+    step_table,
 )
+from lavender.report.table import markdown
 
 __all__ = ["engines_table", "solvers_tables"]
 
@@ -27,7 +27,7 @@ def solvers_tables(results: Sequence[Result]) -> list[str]:
     compared = compare(results)
     reached = [c for c in compared if math.isfinite(min(c.our_time, c.peer_time))]
     lost = losses(compared)
-    lines = [markdown(*solver_rows(reached)), "", markdown(*mean_rows(results))]
+    lines = [*markdown(solver_table(reached)), "", *markdown(mean_table(results))]
     lines += ["", f"Lost: {len(lost)} of {sum(math.isfinite(c.peer_time) for c in compared)}."]
     lines += [f"- {c.problem} at {c.target:.0e}: {c.peer} against {c.ours}, {ratio(c.ratio)}" for c in lost]
     alone = [c for c in reached if math.isinf(c.peer_time)]
@@ -45,7 +45,7 @@ def _list(compared: Sequence[Comparison]) -> str:
 
 def engines_table(steps: Sequence[Step]) -> list[str]:
     """Each engine beside ours in the same mode, then where ours takes longer."""
-    lines = [markdown(*step_rows(steps))]
+    lines = markdown(step_table(steps))
     lost = sorted(((over_ours(s, steps), s) for s in steps if over_ours(s, steps) < 1.0), key=lambda x: x[0])
     if lost:
         lines += ["", f"Lost: {len(lost)}."]

@@ -185,14 +185,16 @@ def _show(
     figures: bool,
 ) -> Path:
     """On the terminal, and everything in the folder; the path of the page."""
+    from lavender.report.contents import engine_table
     from lavender.report.engine import ENGINES
-    from lavender.report.engine import lines as engine_lines
+    from lavender.report.table import print_table
     from lavender.report.terminal import print_report
     from lavender.report.write import write
 
     print_report(records, console(), old=old, times=times, sweeps=sweeps, whole=tables)
-    for line in [f"\n{ENGINES}", *engine_lines(engines)] if engines else ():
-        _say(line)
+    if engines:
+        _say(f"\n{ENGINES}")
+        print_table(console(), engine_table(engines))
     index = write(
         records, out, figures=figures, old=old, times=times, sweeps=sweeps, peers=peers, engines=engines
     )

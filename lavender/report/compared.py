@@ -10,7 +10,8 @@ import numpy as np
 
 from lavender.bench.peers.contest import SCIPY, SCRATCH, TARGETS, Result
 from lavender.bench.peers.engines import Step
-from lavender.report.text import Rows, residual, seconds
+from lavender.report.table import Table
+from lavender.report.text import residual, seconds
 
 __all__ = [
     "Comparison",
@@ -18,11 +19,11 @@ __all__ = [
     "compare",
     "geometric_means",
     "losses",
-    "mean_rows",
+    "mean_table",
     "over_ours",
     "ratio",
-    "solver_rows",
-    "step_rows",
+    "solver_table",
+    "step_table",
 ]
 
 LARGE = 1000  # rows from which a problem counts as large
@@ -161,7 +162,7 @@ def ratio(x: float) -> str:
     return "-" if math.isnan(x) else "only the peer" if math.isinf(x) else f"{x:.3g}"
 
 
-def solver_rows(compared: Sequence[Comparison]) -> Rows:
+def solver_table(compared: Sequence[Comparison]) -> Table:
     """Each problem and error: who is fastest on both sides, in what time, and ratios to the fastest peer."""
     head = ["problem", "rows", "law", "error", "ours", "fastest peer", "ours / peer", "from scratch", "auto"]
     rows = [
@@ -169,24 +170,24 @@ def solver_rows(compared: Sequence[Comparison]) -> Rows:
          *(ratio(c.over_peer(t)) for t in (c.our_time, c.scratch, c.auto))]
         for c in compared
     ]  # fmt: skip
-    return head, rows
+    return Table(head, rows, ["bad" if c.ratio > 1.0 else "" for c in compared])
 
 
 def _timed(name: str, time: float) -> str:
     return f"{name}, {seconds(time)}" if math.isfinite(time) else name
 
 
-def mean_rows(results: Sequence[Result]) -> Rows:
+def mean_table(results: Sequence[Result]) -> Table:
     """`geometric_means`."""
     head = ["problems", "error", "ours / peer", "from scratch", "auto", "compared"]
     rows = [
         [m.which, f"{m.target:.0e}", *map(ratio, (m.ours, m.scratch, m.auto)), str(m.compared)]
         for m in geometric_means(results)
     ]
-    return head, rows
+    return Table(head, rows)
 
 
-def step_rows(steps: Sequence[Step]) -> Rows:
+def step_table(steps: Sequence[Step]) -> Table:
     """Each engine beside ours in the same mode; of one that was left out its note."""
     head = ["scene", "engine", "time / ours", "contacts", "depth [mm]", "speed left [m/s]", "residual"]
     rows = []
@@ -199,4 +200,4 @@ def step_rows(steps: Sequence[Step]) -> Rows:
         rows.append(
             [s.scene, s.engine, shown, str(s.contacts), f"{1e3 * s.depth:.3g}", residual(s.speed), known]
         )
-    return head, rows
+    return Table(head, rows, ["bad" if over_ours(s, steps) < 1.0 else "" for s in steps])

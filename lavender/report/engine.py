@@ -19,7 +19,7 @@ from lavender.io.recording import ENGINE
 from lavender.io.stored import whole_file
 from lavender.residuals import AT_FLOOR
 
-__all__ = ["ENGINES", "Contestant", "contestants", "lines"]
+__all__ = ["ENGINES", "Contestant", "contestants"]
 
 ENGINES = (
     "Inside the engine: its own answers, judged like ours; its time holds no copy of the problem and no judge"
@@ -106,32 +106,3 @@ def _fastest(sequence: str, records: Records) -> tuple[str, float, float]:
             if not time >= best[1]:
                 best = (f"{solver}, {start}", time, max(errors))
     return best
-
-
-def lines(found: Sequence[Contestant]) -> list[str]:
-    """As Markdown."""
-    if not found:
-        return []
-    first = (
-        "recorded",
-        "steps",
-        "rows",
-        "engine's own",
-        "time",
-        "residual, median",
-        "worst",
-        "early in float32",
-    )
-    head = (*first, "fastest here", "time", "worst")
-    out = [f"| {' | '.join(head)} |", "|---" * len(head) + "|"]
-    for c in found:
-        here = (
-            f"{c.ours} | {1e6 * c.our_seconds:.3g} µs | {c.our_worst:.1e}"
-            if c.ours
-            else "none in every step | – | –"
-        )
-        out.append(
-            f"| {c.folder} | {c.steps} | {c.rows:g} | {c.solver} | {1e6 * c.seconds:.3g} µs | {c.relative:.1e} "
-            f"| {c.worst:.1e} | {'–' if c.early is None else c.early} | {here} |"
-        )
-    return out

@@ -9,21 +9,13 @@ from typing import TYPE_CHECKING, Any
 
 from lavender.bench.record import file_name, level_name
 from lavender.bench.store import Records
-from lavender.report import tables
+from lavender.report import contents, tables
 from lavender.report.curves import Figure, Figures
-from lavender.report.moved import (
-    advice_by_speed,
-    idle,
-    moved,
-    robustness_by_speed,
-    speed_levels,
-    speed_name,
-    working,
-)
+from lavender.report.moved import robustness_by_speed, speed_levels, working
 from lavender.report.svg import svg
 from lavender.report.tables.advice import NOISE, RESIDUAL_NOISE
 from lavender.report.tables.finals import WAYS, line_table
-from lavender.report.text import count, residual, seconds, suspicions, times
+from lavender.report.text import count, residual, seconds, suspicions
 from lavender.report.verdict import Verdict, verdict
 
 if TYPE_CHECKING:
@@ -48,9 +40,7 @@ def _environment() -> Any:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters.update(
-        seconds=seconds, residual=residual, level=level_name, anchor=file_name, times=times, speed=speed_name
-    )
+    environment.filters.update(seconds=seconds, residual=residual, level=level_name, anchor=file_name)
     return environment
 
 
@@ -97,7 +87,7 @@ def page(
         title=title,
         saved=saved,
         peers=rivals,
-        engines=engines,
+        engines=contents.engine_table(engines),
         count=count,
         inf=math.inf,
         isfinite=math.isfinite,
@@ -113,8 +103,12 @@ def _content(
     sweeps: Sequence[int],
 ) -> dict[str, Any]:
     """Everything that the template names."""
-    still = idle(records)
+    still = contents.idle_table(records)
     records = working(records)
+    failures, spreads = (
+        tables.failures(records),
+        sorted(tables.spreads(records), key=lambda s: -s.factor),
+    )
     found = verdict(records, budgets, sweeps)
     budgets = budgets or tables.time_budgets(records)
     levels = tables.levels_of(records)
@@ -128,35 +122,42 @@ def _content(
         "others": [] if campaign else _others(records, lines, found, levels, budgets),
         "idle": still,
         "suspicions": suspicions(records),
-        "moved": [] if campaign else moved(records),
-        "speeds": speed_levels(records),
-        "speed_advice": {} if campaign else _by_family(advice_by_speed(records)),
+        "moved": None if campaign else contents.moved_table(records),
+        "speed_advice": None if campaign else contents.speed_table(records),
         "noise": NOISE,
         "residual_noise": RESIDUAL_NOISE,
         "level": levels[len(levels) // 2],
         "runs": list(records.runs.values()),
         "levels": levels,
         "budgets_of_time": budgets,
-        "advice": lines,
+        "advice": contents.advice_table(records, lines, budgets, _links(lines, figures)),
+        "swept": contents.sweeps_table(lines),
         "lines": line_table(records),
         "ways": {way: head for way, head in WAYS.items() if any(r.turns and r.way == way for r in records)},
         "families": tables.families(records),
-        "claims": tables.claims(records),
-        "failures": tables.failures(records),
+        "claims": contents.claim_table(records),
+        "n_failures": len(failures),
+        "failures": contents.failure_table(failures[:MOST], campaign),
         "most": MOST,
         "most_spreads": MOST_SPREADS,
-        "means": tables.geometric_means(records),
-        "backends": tables.backends(records),
+        "means": {law: contents.mean_table(by) for law, by in tables.geometric_means(records).items()},
+        "backends": contents.backend_table(records),
         "shift": tables.SHIFT,
         "limit": tables.limit_of(records),
-        "spreads": sorted(tables.spreads(records), key=lambda s: -s.factor),
+        "n_spreads": len(spreads),
+        "spreads": contents.spread_table(spreads[:MOST_SPREADS]),
         "lost": [s for s in records.skips if not s.solver],
-        "refused": [s for s in records.skips if s.solver],
+        "refused": contents.skip_table([s for s in records.skips if s.solver]),
         "campaign": campaign,
-        "robustness": tables.robustness(records) if campaign else [],
-        "robustness_by_speed": robustness_by_speed(records) if campaign else [],
-        "budgets": sorted({r.max_iter for r in records if r.mode == "budget"}),
-        "sequences": tables.by_sequence(records),
+        "robustness": contents.robustness_table(tables.robustness(records) if campaign else [], levels),
+        "robustness_by_speed": contents.robustness_table(
+            robustness_by_speed(records) if campaign else [], speed_levels(records), " m/s"
+        ),
+        "sequences": {
+            name: contents.pass_table(passes).without("sequence", "steps")
+            for name, passes in tables.by_sequence(records).items()
+        },
+        "steps": {name: passes[0].steps for name, passes in tables.by_sequence(records).items()},
         "n_records": len(records),
         "n_cases": len({r.case for r in records if r.step < 0}),
     }
@@ -199,17 +200,29 @@ def _cases(records: Records, figures: Figures, levels: Sequence[float]) -> dict[
         for reach in tables.reaches(records, levels):
             by_case.setdefault(reach.case, []).append(reach)
     moved_figures = {} if figures.moved is None else figures.moved.cases
+    level = levels[len(levels) // 2]
+    fastest = {name: _fastest(rows, level) for name, rows in by_case.items()}
+    stored = any(math.isfinite(x.stored) for x in records.cases.values())
     cases = [
         {
             "info": records.cases[name],
-            "reaches": rows,
+            "reaches": contents.reach_table(rows, levels).without("case"),
             "figures": _keys(figures.cases.get(name, ())),
             "moved": _keys(moved_figures.get(name, ())),
-            "best": _fastest(rows, levels[len(levels) // 2]),
         }
         for name, rows in by_case.items()
     ]
-    return {"cases": cases, "has_stored": any(math.isfinite(x.stored) for x in records.cases.values())}
+    return {"cases": cases, "case_list": contents.case_table(records, fastest, level, stored)}
+
+
+def _links(lines: Sequence[tables.Line], figures: Figures) -> dict[str, str]:
+    """Where on the page more is said of a structure or sequence."""
+    parts = {line.name: "sequence" if line.sequence else "family" for line in lines}
+    return {
+        name: f"{part}-{file_name(name)}"
+        for name, part in parts.items()
+        if part == "sequence" or name in figures.families
+    }
 
 
 def _changes(old: Records | None, records: Records) -> dict[str, Any]:
@@ -218,7 +231,7 @@ def _changes(old: Records | None, records: Records) -> dict[str, Any]:
     return {
         "compared": old is not None,
         "drift": 1.0 if old is None else tables.drift(old, records),
-        "changes": [c for c in found if c.kind != "same"],
+        "changes": None if old is None else contents.change_table(old, records),
         "n_changes": len(found),
     }
 
@@ -255,13 +268,6 @@ def _others(
         for name, some in sorted(by_solver.items(), key=lambda pair: -len(pair[1]))
     ]
     return told[:MOST_OTHERS]
-
-
-def _by_family(found: Iterable[tables.Advice]) -> dict[str, dict[float, tables.Advice]]:
-    out: dict[str, dict[float, tables.Advice]] = {}
-    for a in found:
-        out.setdefault(a.family, {})[a.target] = a
-    return out
 
 
 def _fastest(rows: Sequence[tables.Reach], level: float) -> tables.Reach | None:

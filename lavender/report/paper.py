@@ -9,7 +9,6 @@ paper/method.tex            what was measured, how, on which machine, with its n
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -17,13 +16,14 @@ from pathlib import Path
 from lavender.bench.record import file_name, level_name
 from lavender.bench.store import Records
 from lavender.errors import InputError
-from lavender.report import tables
+from lavender.report import contents, tables
 from lavender.report.curves import LINES, Figure, figures
 from lavender.report.draw import matplotlib_figure
 from lavender.report.moved import working
 from lavender.report.style import looks
+from lavender.report.table import Table, latex, tex
 from lavender.report.tables.advice import NOISE
-from lavender.report.text import count, seconds, share
+from lavender.report.text import count, seconds
 from lavender.report.verdict import verdict
 
 __all__ = ["write_paper"]
@@ -90,66 +90,27 @@ def _leading(figure: Figure, records: Records, times: Sequence[float]) -> Figure
 # -- LaTeX ------------------------------------------------------------------------------------------------
 
 
-_SPECIAL = {
-    "\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "µ": r"$\mu$", "≈": r"$\approx$",
-    "–": "--", **{c: "\\" + c for c in "&%$#_{}"},
-}  # fmt: skip
-
-
-def _tex(text: str) -> str:
-    """Text as LaTeX prints it, with no meaning of its own."""
-    return re.sub(r"[\\~^&%$#_{}µ≈–]", lambda found: _SPECIAL[found[0]], " ".join(text.split()))
-
-
-def _table(caption: str, label: str, heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    line = " & ".join
-    body = "".join(f"{line(map(_tex, row))} \\\\\n" for row in rows)
-    return (
-        f"\\begin{{table}}\n\\centering\n\\caption{{{_tex(caption)}}}\n\\label{{tab:{label}}}\n"
-        f"\\begin{{tabular}}{{l{'r' * (len(heads) - 1)}}}\n\\toprule\n{line(map(_tex, heads))} \\\\\n\\midrule\n"
-        f"{body}\\bottomrule\n\\end{{tabular}}\n\\end{{table}}\n"
-    )
-
-
 def _tables(records: Records, times: Sequence[float]) -> str:
-    levels = tables.levels_of(records)
-    heads = [f"to {level_name(x)}" for x in levels]
-    rows = []
-    for found in tables.advice(records, times):
-        best = [found.by_level[x].best for x in levels]
-        told = [f"{b.solver} {seconds(b.score)}{share(b.solved, b.cases)}" if b else "nobody" for b in best]
-        rows.append([found.name, str(found.size), *told])
+    shift = seconds(tables.SHIFT)
     caption = (
         "Recommended solver, its mean time, and the cases that it brings to the level where that is not all. Within "
         f"{NOISE:g} times of each other solvers count as equal."
     )
-    made = [_table(caption, "recommended", ["structure", "cases", *heads], rows)]
-    shift = seconds(tables.SHIFT)
+    lines = tables.advice(records, times)
+    advice = contents.advice_table(records, lines, ())
+    rows = [
+        [row[0], str(line.size), *row[1 : len(advice.heads)]]
+        for row, line in zip(advice.rows, lines, strict=True)
+    ]
+    made = [latex(Table(["structure", "cases", *advice.heads[1:]], rows), caption, "recommended")]
     for law, by_level in tables.geometric_means(records).items():
-        names = by_level[levels[0]]
-        rows = [
-            [
-                name,
-                *(
-                    f"{seconds(by_level[x][name][0])} {by_level[x][name][1]}/{by_level[x][name][2]}"
-                    for x in levels
-                ),
-            ]
-            for name in names
-        ]
         caption = (
             f"Law {law}: geometric mean of times with {shift} added, and cases brought to the level; a miss costs "
             f"{seconds(tables.limit_of(records))}. Solvers that take every case."
         )
-        made.append(_table(caption, f"means-{law}", ["solver", *heads], rows))
-    rows = [
-        [c.solver, str(c.runs), str(c.claims), str(c.wrong), f"{c.reached}/{c.asked}", str(c.crashed)]
-        for c in tables.claims(records)
-    ]
+        made.append(latex(contents.mean_table(by_level), caption, f"means-{law}"))
     caption = "Claims of solvers against the judge, who recomputes every residual from the problem's data."
-    made.append(
-        _table(caption, "claims", ["solver", "runs", "claims", "wrong", "levels reached", "died"], rows)
-    )
+    made.append(latex(contents.claim_table(records), caption, "claims"))
     return "% \\usepackage{booktabs}\n" + "\n".join(made)
 
 
@@ -182,4 +143,4 @@ def _method(records: Records) -> str:
         f"and Moré (2002). Machine: {run.cpu}, {run.cores} cores, {run.platform}; lavender {run.lavender}, Python",
         f"{run.python}, {versions}; run {run.run}, {run.started}.",
     )
-    return _tex(" ".join(parts)) + "\n"
+    return tex(" ".join(parts)) + "\n"

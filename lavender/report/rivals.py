@@ -15,7 +15,7 @@ from lavender.bench.peers.engines import Step
 from lavender.bench.record import level_name
 from lavender.report import compared
 from lavender.report.curves import TINY, Curve, Figure
-from lavender.report.text import Rows, seconds
+from lavender.report.text import seconds
 
 __all__ = ["content", "figures"]
 
@@ -42,18 +42,12 @@ def content(peers: Peers) -> dict[str, Any]:
         "versions": peers.versions,
         "absent": peers.absent,
         "notes": [f"{r.solver} on {r.problem}: {r.note}" for r in peers.results if r.note],
-        "means": _marked(compared.mean_rows(peers.results)),
-        "compared": _marked(compared.solver_rows(reached), [c.ratio > 1.0 for c in reached]),
-        "steps": _marked(
-            compared.step_rows(peers.steps), [compared.over_ours(s, peers.steps) < 1.0 for s in peers.steps]
-        ),
+        "means": compared.mean_table(peers.results),
+        "compared": compared.solver_table(reached),
+        "steps": compared.step_table(peers.steps),
         "lost": len(compared.losses(found)),
         "known": sum(math.isfinite(c.peer_time) for c in found),
     }
-
-
-def _marked(rows: Rows, lost: Sequence[bool] = ()) -> tuple[list[str], list[tuple[list[str], bool]]]:
-    return rows[0], list(zip(rows[1], lost or [False] * len(rows[1]), strict=True))
 
 
 def _ratios(results: Sequence[Result]) -> Figure:

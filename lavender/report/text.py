@@ -1,35 +1,17 @@
-"""Numbers and recommendations as people read them."""
+"""Numbers as people read them."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
-from lavender.bench.record import level_name
 from lavender.bench.store import Records
-from lavender.report.moved import advice_by_speed, moved, speed_levels, speed_name
-from lavender.report.tables import Advice, Line, levels_of
 
-__all__ = [
-    "advice_rows",
-    "count",
-    "in_time",
-    "moved_rows",
-    "residual",
-    "seconds",
-    "share",
-    "speed_rows",
-    "suspicions",
-    "sweeps_rows",
-    "times",
-    "to_level",
-    "who",
-]
+__all__ = ["NONE", "count", "residual", "seconds", "share", "suspicions", "times", "who"]
 
-Rows = tuple[list[str], list[list[str]]]  # heads of columns, and the cells of each row
+NONE = "–"  # where there is no number
 
 
-def seconds(t: float, missing: str = "–") -> str:
+def seconds(t: float, missing: str = NONE) -> str:
     """Three digits and a unit: 12.3 µs, 4.56 ms, 7.89 s."""
     if not math.isfinite(t):
         return missing
@@ -54,7 +36,7 @@ def residual(x: float) -> str:
 def times(x: float) -> str:
     """A ratio as a word: 1.3 times, 850 times; beyond a million its power of ten, where digits say nothing."""
     if not math.isfinite(x):
-        return "–"
+        return NONE
     return f"{x:.2g} times" if x < 100.0 else f"{x:.0f} times" if x < 1e6 else f"10^{math.log10(x):.0f} times"
 
 
@@ -81,77 +63,6 @@ def share(solved: int, cases: int) -> str:
     return "" if solved == cases else f" ({solved}/{cases})"
 
 
-def to_level(advice: Advice) -> str:
-    """Who gets to a level, in what time, on how many cases and with which budget, in one line."""
-    best = advice.best
-    if best is None:
-        return "nobody"
-    return (
-        f"{best.solver} {seconds(best.score)}{share(best.solved, best.cases)}{_how(best.how)}{_ties(advice)}"
-    )
-
-
-def in_time(advice: Advice) -> str:
-    """Who serves most cases within a time or a budget, and how close it comes, in one line."""
-    best = advice.best
-    if best is None:
-        return "nobody"
-    return f"{best.solver} to {residual(best.score)}{share(best.solved, best.cases)}{_how(best.how)}{_ties(advice)}"
-
-
-def _how(how: str) -> str:
-    return f", {how}" if how else ""
-
-
-def _ties(advice: Advice, most: int = 2) -> str:
-    names = advice.ties
-    if not names:
-        return ""
-    more = f" and {len(names) - most} more" if len(names) > most else ""
-    return f" ≈ {', '.join(names[:most])}{more}"
-
-
 def who(solver: str, start: str) -> str:
     """A solver, and from where it started if not cold: newton (warm)."""
     return solver if start == "cold" else f"{solver} ({start})"
-
-
-def advice_rows(records: Records, lines: Sequence[Line], times: Sequence[float]) -> Rows:
-    """Each structure and sequence: who gets to each level, and who serves most within each time [s]."""
-    heads = [*(f"to {level_name(x)}" for x in levels_of(records)), *(f"in {seconds(t)}" for t in times)]
-    rows = [
-        [line.name, *map(to_level, line.by_level.values()), *map(in_time, line.by_time.values())]
-        for line in lines
-    ]
-    return ["structure", *heads], rows
-
-
-def sweeps_rows(lines: Sequence[Line]) -> Rows:
-    """The same with each budget of sweeps; no rows where none was run."""
-    budgets = sorted({n for line in lines for n in line.by_sweeps})
-    heads = [count(int(n), "sweep") for n in budgets]
-    rows = [[line.name, *(in_time(line.by_sweeps[n]) for n in budgets)] for line in lines if line.by_sweeps]
-    return ["structure", *heads], rows
-
-
-def speed_rows(records: Records) -> Rows:
-    """Each structure: who gets to each motion error [m/s]."""
-    by_family: dict[str, list[str]] = {}
-    for advice in advice_by_speed(records):
-        by_family.setdefault(advice.family, []).append(to_level(advice))
-    heads = [f"to {speed_name(x)}" for x in speed_levels(records)]
-    return ["structure", *heads], [[name, *row] for name, row in by_family.items()]
-
-
-def moved_rows(records: Records) -> Rows:
-    """Each case and solver: time to each motion error, the smallest, relative, and its bound."""
-    levels = speed_levels(records)
-    rows = []
-    for m in moved(records, levels):
-        known = [
-            f"{residual(x)}{unit}" if math.isfinite(x) else "–"
-            for x, unit in ((m.best, " m/s"), (m.relative, ""), (m.bound, " √J"))
-        ]
-        rows.append([m.case, who(m.solver, m.start), *(seconds(m.times[x]) for x in levels), *known])
-    heads = [f"to {speed_name(x)}" for x in levels]
-    return ["case", "solver", *heads, "best", "relative", "bound"], rows

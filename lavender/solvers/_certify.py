@@ -24,6 +24,7 @@ __all__ = ["certify"]
 CERTIFICATE_ROWS = (
     3000  # rows up to which a linear program is asked for a certificate, of all islands together
 )
+LINEAR_PROGRAM = 5e6  # ns that scipy takes for the smallest
 CERTIFICATE_STEPS = 100  # of the simplex method for each row at most
 
 
@@ -31,12 +32,12 @@ CERTIFICATE_STEPS = 100  # of the simplex method for each row at most
 def certify(log: SolveLog) -> None:
     """Look for a proof that an LCP without upper bounds has no solution, whatever its A."""
     problem = log.problem
-    if problem.law not in ("linear", "lcp") or log.best < 1e-6 or log.late:
+    if problem.law not in ("linear", "lcp") or log.best < 1e-6 or log.ends_late(LINEAR_PROGRAM):
         return
     asked = 0
     for part, rows in _parts(log):
         asked += part.m
-        if asked > CERTIFICATE_ROWS or log.late:
+        if asked > CERTIFICATE_ROWS or log.ends_late(LINEAR_PROGRAM):
             return
         if not _is_open(part):
             continue

@@ -14,6 +14,7 @@ from lavender.residuals import at_floor, judged, known, quick, reference, rememb
 from lavender.solution import Claim, Status, Turn
 from lavender.solvers._few import said
 from lavender.solvers._islands import islands
+from lavender_ext.judge.measure import Judged
 
 __all__ = ["SolveLog"]
 
@@ -26,26 +27,29 @@ class SolveLog:
 
     def __init__(self, problem: Problem, tol: float, budget: int, deadline: Deadline | None = None) -> None:
         self.problem, self.tol, self.budget, self.deadline = problem, tol, budget, deadline or Deadline()
-        self.best, self.impulse = np.inf, problem.start()  # least relative residual, (m,) N s
+        self.best, self.impulse = np.inf, problem._start  # least relative residual, (m,) N s
         self.given: FloatArray | None = None  # (m,) N s, a start that doing nothing is better than
         self.turns: list[Turn] = []
         self.work: dict[str, int] = {}
         self.iterations = 0
         self.certificate: FloatArray | None = None  # (m,)
         self.pace = 0.0  # s for each counted ns, times 1e9, as far as a time limit asks for it; 0: not known
-        self._w, self._e = np.empty(problem.m), np.empty(problem.m)
 
     def offer(self, impulse: FloatArray) -> float:
-        """Judge an impulse (m,) and keep it if it is the best, for who judges the result as well."""
+        """Judge an impulse (m,) and keep it if it is the best."""
         relative = known(self.problem, impulse)
-        impulse = impulse.copy()
         if relative is None:
-            last = judged(self.problem, impulse)
-            relative = float(last.relative)
-            if relative < self.best:
-                remember(self.problem, last)
+            return self.take(judged(self.problem, impulse.copy()))
         if relative < self.best:
-            self.best, self.impulse = relative, impulse
+            self.best, self.impulse = relative, impulse.copy()
+        return relative
+
+    def take(self, last: Judged) -> float:
+        """Keep what was judged if it is the best, for who judges the result as well; its relative residual."""
+        relative = float(last.relative)
+        if relative < self.best:
+            self.best, self.impulse = relative, last.impulse
+            remember(self.problem, last)
         return relative
 
     def note(self, name: str, claim: Claim, before: float) -> None:
@@ -109,7 +113,11 @@ class SolveLog:
     def at_floor(self) -> bool:
         if self.best > 1e-5:
             return False
-        return at_floor(*quick(self.problem, self.impulse, self._w, self._e, True))
+        return at_floor(*quick(self.problem, self.impulse, *self._room, True))
+
+    @cached_property
+    def _room(self) -> tuple[FloatArray, FloatArray]:
+        return np.empty(self.problem.m), np.empty(self.problem.m)
 
     @property
     def status(self) -> Status:
@@ -140,9 +148,10 @@ class SolveLog:
         count, label = self.islands
         problem = self.problem
         energy, velocity = reference(problem)
-        quick(problem, self.impulse, self._w, self._e)
+        _, error = room = self._room
+        quick(problem, self.impulse, *room)
         of_row = np.repeat(label, np.diff(problem.cones.ptr))
-        own = np.bincount(of_row, problem.d * self._e**2, minlength=count)
+        own = np.bincount(of_row, problem.d * error**2, minlength=count)
         own[np.isnan(own)] = np.inf
         least = np.sort(own)
         below = np.concatenate([[0.0], np.cumsum(least[:-1])])
@@ -150,6 +159,6 @@ class SolveLog:
         above = np.flatnonzero(least > level)
         share = max(0.0, float(level[above[0]])) if len(above) else np.inf
         fast = np.zeros(count)
-        np.maximum.at(fast, of_row, problem.metric.weight * np.abs(self._e))
+        np.maximum.at(fast, of_row, problem.metric.weight * np.abs(error))
         wrong = (own > share) | ~(np.sqrt(2.0) * fast <= self.tol * velocity)
         return np.flatnonzero(wrong).astype(np.int32)

@@ -11,10 +11,9 @@ from typing import Any
 import numpy as np
 
 from lavender._arrays import FloatArray
-from lavender.deadline import Stopwatch
+from lavender.deadline import CHUNK_TIME
 from lavender.problem import Problem
 from lavender.registry import SolverSpec, get
-from lavender.residuals import remember
 from lavender.solution import Claim, Status
 from lavender.solvers._accelerated import operator
 from lavender.solvers._log import SolveLog
@@ -30,9 +29,8 @@ __all__ = ["FIRST", "Candidate", "Sweeps", "in_short_time", "make"]
 
 FIRST = 32  # sweeps before the first look at what they promise
 SURE = 4.0  # times what a finite solver is expected to cost, that has to be left for it to begin
-ALL = 1e18  # ns: until the time is up
-CLOCK = 0.01  # s between two looks at the clock, as counted
-GROWTH = 8  # times the iterations of the last look at the clock, before the next
+ALL = 1e18  # iterations: until the time is up
+PROBE = 0.5  # of the time that is left: for iterations whose pace is not known yet
 
 
 class Candidate:
@@ -73,12 +71,16 @@ class Candidate:
         n = self.steps(AGAIN * work if self.again else work)
         if n <= 0:
             return False
-        begun = self.spent > 0.0
-        setup = self.cost.setup if self.again or not begun else 0.0
         before = self.log.best
         claim = self.turn(n)
         self.log.note(self.shown, claim, before)
-        last = setup + max(claim.iterations, 1) * self.cost.each
+        return self.has_done(claim)
+
+    def has_done(self, claim: Claim) -> bool:
+        """What a turn took, and what is left; whether it may have another."""
+        last = max(claim.iterations, 1) * self.cost.each
+        if self.again or self.spent == 0.0:
+            last += self.cost.setup
         self.spent += last
         self.rest = 2.0 * last if self.again else remainder(self.spent, self.promise())
         if self.again and claim.iterations >= self.spec.max_iter:
@@ -97,11 +99,10 @@ class Candidate:
 class Resumed(Candidate):
     """A solver that goes on where it stood, in short runs for the clock and Ctrl-C: cut anywhere, the same bits."""
 
-    def __init__(self, name: str, log: Any, costs: Costs, spec: SolverSpec) -> None:
-        super().__init__(name, log, costs, spec)
-        self.solver: Any = None
-        self.impulse = np.empty(0)  # (m,) N s
-        self.done, self.sweeps = 0, dict[str, int]()  # iterations and work of all turns
+    solver: Any = None
+    impulse: FloatArray  # (m,) N s
+    status = Status.MAX_ITERATIONS  # of the last run
+    work: dict[str, int]  # of the last turn
 
     def begin(self) -> None:
         self.solver = self.spec.load()(**METHODS[self.name][1])
@@ -111,42 +112,38 @@ class Resumed(Candidate):
             self.solver.until(self.state, self.log.deadline)
 
     def turn(self, n: int) -> Claim:
-        log = self.log
+        log, each = self.log, self.cost.each
         if not self.spent:
             self.begin()
-        done, work, last = 0, dict[str, int](), Claim(Status.MAX_ITERATIONS, 0)
-        step = max(1, int(1e9 * CLOCK / self.cost.each))
-        left = log.deadline.left()
-        if left is not None:
-            step = max(1, min(step, int(1e9 * left / self.cost.each)))
-        while done < n and not (done and log.late):
-            watch = Stopwatch()
-            step = min(step, n - done)
+        self.work, done, left = {}, 0, log.deadline.left()
+        while True:  # as many iterations as are likely to end in time; a look at the end costs about one
+            time = CHUNK_TIME if left is None else min(CHUNK_TIME, left if log.pace else PROBE * left)
+            step = min(max(1, int(1e9 * time / ((log.pace or 1.0) * each))), n - done)
             last = self.iterate(step)
-            done += last.iterations
-            for kind, count in last.work.items():
-                work[kind] = work.get(kind, 0) + count
-            if last.status is not Status.MAX_ITERATIONS or last.iterations < step:
-                break
-            left = log.deadline.left()
+            done += last
             if left is not None:
-                each = watch.seconds / step
-                log.pace = 1e9 * each / self.cost.each
-                step = max(1, min(GROWTH * step, int(min(left, CLOCK) / each)))
+                before, left = left, log.deadline.left()
+                log.pace = 1e9 * (before - left) / ((last + 1) * each)
+                if 2e9 * left <= log.pace * each:
+                    break
+            if self.status is not Status.MAX_ITERATIONS or last < step or done >= n:
+                break
         self.close()
-        return Claim(last.status, done, work)
+        return Claim(self.status, done, self.work)
 
-    def iterate(self, n: int) -> Claim:
-        """At most n iterations."""
+    def iterate(self, n: int) -> int:
+        """At most n iterations; how many there were."""
         claim: Claim = self.solver.run(self.state, self.impulse, n, self.log.tol, None)
-        return claim
+        self.status = claim.status
+        for kind, count in claim.work.items():
+            self.work[kind] = self.work.get(kind, 0) + count
+        return claim.iterations
 
     def close(self) -> None:
         """Offer what came of a turn."""
         self.log.offer(self.impulse)
-        best = getattr(
-            self.state, "best", (np.inf, None)
-        )  # some states only say why nothing could be prepared
+        # some states only say why nothing could be prepared
+        best = getattr(self.state, "best", (np.inf, None))
         if best[1] is not None and best[0] < self.log.best:
             self.log.offer(best[1])
 
@@ -156,6 +153,7 @@ class Sweeps(Resumed):
 
     relative = 1.0  # residual of the last look
     least = 0.0  # ns that another method takes at least
+    told = 0, 0  # sweeps and restarts of the turns before
 
     def set_up(self) -> None:
         """All that needs no impulse, and what is to be known when time is short."""
@@ -164,12 +162,18 @@ class Sweeps(Resumed):
         self.state = Looks(problem.metric, operator(problem), problem.law == "cone", split)
         self.count()
 
-    def run_first(self, log: SolveLog) -> None:
-        """Half of the time, and all of it where the other half is too short for any other."""
-        self.log = log
+    def run_first(self, log: SolveLog) -> bool:
+        """Half of the time, and all of it where the other half is too short for any other; whether any may follow."""
+        self.log, before = log, log.best
         half = 0.5e9 * (log.deadline.left() or 0.0)
-        if not self.run(self.cost.setup + half if half > SURE * self.least else ALL, np.inf):
+        n = half / self.cost.each if half > SURE * self.least else ALL
+        claim = self.turn(int(min(max(n, 1.0), log.left)))
+        log.note(self.name, claim, before)
+        if log.ends_late(self.least) or log.done():
+            return False
+        if not self.has_done(claim):
             self.rest = np.inf
+        return True
 
     def begin(self) -> None:
         log = self.log
@@ -178,24 +182,23 @@ class Sweeps(Resumed):
         if self.state is None:
             self.set_up()
 
-    def iterate(self, n: int) -> Claim:
+    def iterate(self, n: int) -> int:
         """At most n, given up where they promise no end for less than the others."""
         looks = self.state
-        done, swept, restarts = looks.done, looks.sweeps, looks.restarts
-        step = min(max(done // 2, FIRST), n)
+        done, step = looks.done, min(max(looks.done // 2, FIRST), n)
         looks.run(
             self.impulse, self.relative, done + n, self.log.tol, step, FIRST, self.others / self.cost.each
         )
-        self.relative = looks.now.relative
-        work = {"sweeps": looks.sweeps - swept, "restarts": looks.restarts - restarts}
-        return Claim(STATUS[looks.status], looks.done - done, work)
+        self.relative, self.status = looks.now.relative, STATUS[looks.status]
+        return int(looks.done) - done
 
     def close(self) -> None:
-        remember(self.log.problem, self.state.now)
-        self.log.offer(self.state.now.impulse)
-        best = self.state.watch.best
-        if best[1] is not None and best[0] < self.log.best:
-            self.log.offer(best[1])
+        looks, told = self.state, self.told
+        self.told = looks.sweeps, looks.restarts
+        self.work = {"sweeps": looks.sweeps - told[0], "restarts": looks.restarts - told[1]}
+        self.log.take(looks.now)
+        if looks.watch.best_relative < self.log.best:
+            self.log.offer(looks.watch.best[1])
 
     def promise(self) -> float:
         looks = self.state
@@ -208,6 +211,7 @@ class Relaxation(Resumed):
     relative = 1.0  # by Coulomb's law, at the last look
     left = np.inf  # sweeps, by (1)
     slow = False  # the relaxation is not the answer, or not soon
+    done = 0  # iterations of all turns
 
     def begin(self) -> None:
         self.solver = self.spec.load()()
@@ -226,28 +230,22 @@ class Relaxation(Resumed):
 
     shown_by = "relaxation"
 
-    def iterate(self, n: int) -> Claim:
+    def iterate(self, n: int) -> int:
         """With looks at Coulomb's residual, which goes on falling with the relaxation's where contacts stick."""
-        log, done, work = self.log, 0, dict[str, int]()
-        follows = self.shown_by == "nncg"
+        log, done = self.log, 0
         while done < n:
             step = min(max((self.done + done) // 2, FIRST), n - done)
-            claim = self.solver.run(self.state, self.impulse, step, log.tol, None)
-            done += claim.iterations
-            for kind, count in claim.work.items():
-                work[kind] = work.get(kind, 0) + count
+            last = super().iterate(step)
+            done += last
             before, self.relative = self.relative, log.offer(self.impulse)
-            self.left = sweeps_left(claim.iterations, before, self.relative, log.tol)
-            if self.relative <= log.tol or log.late:
+            self.left = sweeps_left(last, before, self.relative, log.tol)
+            if self.status is not Status.MAX_ITERATIONS:
+                self.status = Status.STALLED if self.shown_by == "nncg" else Status.MAX_ITERATIONS
                 break
-            if claim.status is not Status.MAX_ITERATIONS:
-                if follows:
-                    return Claim(Status.STALLED, done, work)
-                break
-            if self.left * self.cost.each > self.others:
+            if self.relative <= log.tol or log.late or self.left * self.cost.each > self.others:
                 break
         self.done += done
-        return Claim(Status.MAX_ITERATIONS, done, work)
+        return done
 
     def close(self) -> None:
         """Offered at each look; where the relaxation brought no end, the next turn is of another kind."""

@@ -209,7 +209,12 @@ class Costs:
         """ns that a method which factors takes at least, told by rows alone; inf for sweeps, which take any time."""
         r, law, m = self.rates, self.problem.law, self.structure.m
         if name == "newton" and self.problem.generalized is not None:
-            return float(r["velocities"]["entry"] * READ * self.structure.sweep)
+            v, half = (
+                r["velocities"],
+                0.5 if law == "linear" else 1.0,
+            )  # of the steps, where all rows are soft
+            n = half * _of(v["count"], law)
+            return float(n * v["step"] + (READ + n) * v["entry"] * self.structure.sweep)
         if name in ("direct", "newton", "newton over rows"):
             part = r["direct" if name == "direct" else "newton"]
             return float(part["start"] + _of(part["count"], law) * _of(part["row"], law) * m)

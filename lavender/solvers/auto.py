@@ -19,7 +19,7 @@ import numpy as np
 from lavender._arrays import FloatArray
 from lavender.deadline import Deadline
 from lavender.problem import OPERATORS, Problem
-from lavender.registry import SolverSpec
+from lavender.registry import FEW, SolverSpec
 from lavender.solution import Claim, Status
 from lavender.solvers._certify import certify
 from lavender.solvers._few import AUTO, call_ends_within
@@ -76,7 +76,8 @@ class Auto:
     ) -> Claim:
         problem = state.problem
         deadline = Deadline(time_limit)
-        if n >= ONE_CALL and call_ends_within(problem, time_limit):
+        few = problem.m <= FEW or problem.generalized is not None
+        if few and n >= ONE_CALL and call_ends_within(problem, time_limit):
             made = AUTO.solve(problem, impulse, tol)
             claim = None if made is None else AUTO.claim(problem, made[1])
             if made is not None and claim is not None and claim.iterations <= n:
@@ -92,7 +93,7 @@ class Auto:
             log.offer(problem.start())  # doing nothing is better
         interrupted = False
         try:
-            if n > 0 and not log.done():
+            if n > 0 and log.best > tol:
                 solve(log, self.plan, state.sweeps)
         except KeyboardInterrupt:
             interrupted = True  # the best impulse goes back all the same
@@ -110,14 +111,10 @@ class Auto:
 
 def solve(log: SolveLog, plan: Plan | None = None, sweeps: Sweeps | None = None) -> None:
     """To the end, by a plan where one is given; `sweeps`: what is set up for a time limit."""
-    begun: list[Candidate] = []
-    if sweeps is not None:
-        begun = [sweeps]
-        sweeps.run_first(log)
-        if log.late or log.done():
-            return
+    if log.done() if sweeps is None else not sweeps.run_first(log):
+        return
     with np.errstate(all="ignore"):  # what overflows is judged
-        others(log, plan, begun)
+        others(log, plan, [] if sweeps is None else [sweeps])
 
 
 def others(log: SolveLog, plan: Plan | None, begun: list[Candidate]) -> None:

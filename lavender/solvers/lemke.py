@@ -27,7 +27,7 @@ from scipy.linalg import lapack
 
 from lavender._arrays import FloatArray, IntArray
 from lavender.certificates import check_certificate
-from lavender.deadline import Deadline
+from lavender.deadline import CHUNK_TIME, Deadline
 from lavender.problem import Problem
 from lavender.registry import SolverSpec
 from lavender.residuals import at_floor, quick
@@ -43,7 +43,6 @@ TINY, FINER = 1e-11, 1e-13
 REGULAR = 1e-13  # -, reciprocal condition above which a block can be eliminated: the result is refined anyway
 STABLE = 1e-2  # -, a diagonal entry of this share of its row and column makes a fair pivot of its own
 BATCH = 200  # pivots after which the dictionary is formed anew, which drops what rounding left
-CLOCK = 0.01  # s between two looks at the clock, at
 ENTRY, FORMED = 1e-9, 5e-10  # s for each entry of the dictionary in a pivot, and n^3 times to form it anew
 STEP = 1e-3  # s that pivots have at least, whatever it took to form their dictionary
 LAID_OUT = 5e-8  # s for each entry of the first dictionary; FORMED for each that a free row's pivot touches
@@ -346,7 +345,7 @@ class Walk:
         self.pivots += 1
         last = self.pivots + PIVOTS_A_ROW * n + BATCH
         self.count("paths")
-        chunk = max(1, int(CLOCK / (ENTRY * n * n)))
+        chunk = max(1, int(CHUNK_TIME / (ENTRY * n * n)))
         while True:
             code, left = PIVOTS, BATCH
             while code == PIVOTS and left:

@@ -24,7 +24,7 @@ def test_a_box_stands_in_every_engine_that_is_installed(name):
     # one box on a plane: soft contacts sink before two seconds are over
     assert found.stands and 0.0 <= found.drift < 1e-3 and found.cost > 0.0
     assert (found.boxes, found.dt, found.seconds) == (1, 1 / 60, 3.0)
-    assert (found.sweeps > 0) == ENGINES[name].sweeps and found.substeps >= 1
+    assert (found.sweeps > 0) == bool(ENGINES[name].sweeps) and found.substeps >= 1
 
 
 def test_ours_is_what_the_scene_says_and_its_centres_are_the_boxes():
@@ -35,7 +35,7 @@ def test_ours_is_what_the_scene_says_and_its_centres_are_the_boxes():
     np.testing.assert_allclose(engine.centres(), [[0, 0, 0.5], [0, 0, 1.5], [0, 0, 2.5]], atol=1e-12)
     sim = lv.Simulation(lv.Scene("stack", n=3, dt=1 / 60, solver_iterations=8, substeps=2, order="top_down"))
     for _ in range(5):
-        engine.step()
+        engine.engine.step()
         seen = sim.step()[0]
     np.testing.assert_array_equal(engine.centres(), seen["positions"][1:])
 
@@ -98,13 +98,12 @@ def test_lavender_is_always_installed():
     assert installed()[:2] == ["lavender", "newton"]
 
 
-@pytest.mark.parametrize("name", [n for n, c in ENGINES.items() if not isinstance(c.make, str)])
+@pytest.mark.parametrize("name", ENGINES)
 def test_centres_before_the_first_step_are_where_the_boxes_were_put(name):
     if missing(name):
         pytest.skip(missing(name))
     engine = ENGINES[name].make(Tower(3, 1 / 60))
-    up = 1 if name == "lavendersim" else 2
     np.testing.assert_allclose(
-        engine.centres()[:, up], [0.5, 1.5, 2.5], atol=1e-6
+        engine.centres()[:, 2], [0.5, 1.5, 2.5], atol=1e-6
     )  # some are single precision
-    engine.close()
+    engine.engine.close()

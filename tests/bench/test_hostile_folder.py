@@ -91,7 +91,7 @@ def test_files_of_any_name_are_reported(lavender, tmp_path):
         rows = [line for line in summary.splitlines() if "| pgs |" in line]
         assert len(rows) >= len(os.listdir(folder))
         for row in rows:
-            assert len([c for i, c in enumerate(row) if c == "|" and row[i - 1] != "\\"]) == 6, row
+            assert len([c for i, c in enumerate(row) if c == "|" and row[i - 1] != "\\"]) == 7, row
     code, out, err = lavender("report", "--campaign", folder, "--out", "many", *QUICK[:6], "--workers", 1)
     assert (code, err.strip()) == (0, "")
 

@@ -20,8 +20,8 @@ from lavender.bench.cases import describe
 from lavender.bench.record import from_json, to_json
 from lavender.bench.store import Records
 from lavender.cli.entry import cli
+from lavender.report.contents import engine_table
 from lavender.report.engine import contestants
-from lavender.report.engine import lines as engine_lines
 from lavender.residuals import UNIT32, rounded
 
 
@@ -307,6 +307,7 @@ def test_a_recording_of_a_float32_engine_counts_its_early_answers(tmp_path):
     assert early > 0  # at its tolerance, far above the floor
     (engine,) = contestants([str(tmp_path)], Records())
     assert engine.early == early
-    assert f"| {early} |" in "\n".join(engine_lines([engine]))
+    (row,) = engine_table([engine]).texts
+    assert str(early) in row
     with pytest.raises(lv.InputError, match="precision is 'half'"):
         lv.io.record(model, mujoco.MjData(model), tmp_path / "other", 1, precision="half")

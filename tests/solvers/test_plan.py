@@ -13,6 +13,7 @@ from lavender.cli import main
 from lavender.deadline import Deadline
 from lavender.problem import LAWS, OPERATORS
 from lavender.residuals import reference
+from lavender.solvers._certify import certify
 from lavender.solvers._log import SolveLog
 from lavender.solvers._methods import Sweeps
 from lavender.solvers._plan import METHODS, TABLE, Costs, candidates
@@ -147,6 +148,43 @@ def test_what_would_not_end_in_time_is_neither_counted_nor_begun(name, monkeypat
     solve(log, None, state.sweeps)
     assert log.iterations > 0
     assert [turn.solver for turn in log.turns] == ["anderson"]
+
+
+@pytest.mark.parametrize("pace", [0.1, 1.0, 2.0])
+def test_sweeps_that_cost_more_than_counted_end_in_time(pace, monkeypatch):
+    """The clock stands but for them; past the limit is one of them and a look at the most."""
+    problem = suite.case("granularF(n=4)").problem
+    reference(problem)
+    state, now = Auto().prepare(problem), [0.0]
+    Auto().ready(state, 1e-3)
+    monkeypatch.setattr("lavender.deadline.perf_counter", lambda: now[0])
+    original, each = Sweeps.iterate, 1e-9 * pace * state.sweeps.cost.each
+
+    def iterate(self, n):
+        found = original(self, n)
+        now[0] += (n + 1) * each
+        return found
+
+    monkeypatch.setattr(Sweeps, "iterate", iterate)
+    log = SolveLog(problem, 1e-15, 10**6, deadline=Deadline(1e-3))
+    log.offer(problem.start())
+    state.sweeps.run_first(log)
+    assert 0.8e-3 <= now[0] <= 1e-3 + 2.5 * each
+
+
+def test_no_certificate_is_begun_that_would_end_late(monkeypatch):
+    problem = suite.case("infeasible").problem
+    log = SolveLog(problem, 1e-6, 10**6, deadline=Deadline(1e-3))
+    log.offer(problem.start())
+    monkeypatch.setattr("lavender.solvers._certify._proof", lambda *asked: 1 / 0)
+    certify(log)
+    assert not log.turns
+
+
+def test_steps_over_few_velocities_end_too_late_for_the_least_limits():
+    state = Auto().prepare(random_general(5, contacts=0))
+    Auto().ready(state, 1e-4)
+    assert state.sweeps is not None
 
 
 def test_with_time_enough_nothing_is_set_up_before_the_clock():

@@ -25,7 +25,9 @@ __all__ = [
     "WAYS",
     "Stepping",
     "Way",
+    "engine",
     "follow",
+    "lacks",
     "make",
     "missing_in_node",
     "node_folder",
@@ -41,6 +43,7 @@ NO_ROLLING = "it has no friction against rolling"
 class Stepping:
     """One engine with one scene."""
 
+    scene: Scene
     dt = 0.0  # s, of one `step`
     setting = ""  # step, substeps and sweeps, as run
 
@@ -61,9 +64,23 @@ class Stepping:
         """Positions (n, 3) [m], quaternions (n, 4) w x y z, velocities (n, 6) [m/s, rad/s] in the world."""
         raise NotImplementedError
 
+    def placed(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """A state with every body at rest where the scene has it."""
+        x, q = (
+            np.array([getattr(b, name) for b in self.scene.bodies]) for name in ("position", "quaternion")
+        )
+        return x, q, np.zeros((len(x), 6))
+
     def force(self) -> float:
         """Force of the first joint [N]; nan where the engine does not tell it."""
         return float("nan")
+
+    def left(self) -> tuple[int, float, float]:
+        """What the last step left: contacts, deepest penetration or gap of a joint [m], the judge's relative residual.
+
+        The latter is nan where the engine's problem is not known.
+        """
+        raise NotImplementedError
 
     def close(self) -> None:
         """Let go of what the engine holds."""
@@ -83,12 +100,17 @@ class Way:
 
     def missing(self) -> str:
         """What it lacks here; empty where it can run."""
-        if self.module == "node":
-            lack = missing_in_node(self.package)
-            return f"not installed: {lack}" if lack else ""
-        if not self.package or importlib.util.find_spec(self.package):
-            return ""
-        return f"not installed: pip install {self.package.replace('pydrake', 'drake')}"
+        lack = lacks(self.package)
+        return f"not installed: {lack}" if lack else ""
+
+
+def lacks(package: str) -> str:
+    """How a package of Python or of npm would be installed; empty where it is here, or none is asked for."""
+    if package in PACKAGES_OF_NODE.values():
+        return missing_in_node(package)
+    if not package or importlib.util.find_spec(package):
+        return ""
+    return f"pip install {package.replace('pydrake', 'drake')}"
 
 
 def node_folder(package: str) -> Path | None:
@@ -122,111 +144,76 @@ def _own() -> list[Way]:
     for name, spec in STEPPERS.items():
         cannot = {} if spec.spin else {"spin": "the stepper has no spin friction"}
         cannot |= {} if spec.rolling else {"rolling": "the stepper has no rolling friction"}
-        for more, words in (({}, "4 substeps of 16 sweeps"), (FINE, "16 substeps of 4 sweeps")):
-            full = f"{name} 16x4" if more else name
+        settings: list[tuple[str, dict[str, Any], str]] = [
+            (name, {}, "4 substeps of 16 sweeps"), (f"{name} 16x4", FINE, "16 substeps of 4 sweeps"),
+        ]  # fmt: skip
+        if spec.solvers:
+            newton = {"solver": "newton", "substeps": 4}
+            settings.append((f"{name} newton", newton, "4 substeps, Newton to 1e-6"))
+        for full, more, words in settings:
             asked = {"stepper": name, "dt": 1 / 60, **more}
             found.append(Way(full, "own", "", {}, f"1/60 s, {words}", scene=asked, cannot=cannot))
-        if spec.solvers:
-            asked = {"stepper": name, "dt": 1 / 60, "solver": "newton", "substeps": 4}
-            found.append(
-                Way(
-                    f"{name} newton",
-                    "own",
-                    "",
-                    {},
-                    "1/60 s, 4 substeps, Newton to 1e-6",
-                    scene=asked,
-                    cannot=cannot,
-                )
-            )
     return found
 
 
-def _others() -> list[Way]:
-    found = []
-    for cone in ("pyramidal", "elliptic"):
-        for noslip in (0, 10):
-            more = f", {noslip} iterations of noslip" if noslip else ""
-            found.append(
-                Way(
-                    f"mujoco {cone}{' noslip' if noslip else ''}", "mujoco", "mujoco",
-                    {"cone": cone, "noslip": noslip}, f"2 ms, Newton to 1e-8{more}",
-                )
-            )  # fmt: skip
-    found += [
-        Way("pybullet", "bullet", "pybullet", {"sweeps": 50, "substeps": 1}, "1/240 s, 50 sweeps"),
-        Way(
-            "pybullet 4x100",
-            "bullet",
-            "pybullet",
-            {"sweeps": 100, "substeps": 4},
-            "1/240 s in 4 of 100 sweeps",
-        ),
-    ]
-    for name, options, text in (
-        ("drake", {"approximation": "lagged", "hydroelastic": False}, "1 ms, point contacts: its defaults"),
+_PATCHES = {"spin": NO_SPIN, "rolling": NO_ROLLING}
+_JOLT = {"engine": "jolt", "sweeps": 10}
+_RAPIER, _VBD = {"engine": "rapier"}, {"solver": "VBD", "iterations": 10}
+#: Engines of others: name, file, settings and their words, what a scene may not ask of it.
+_OTHERS: tuple[tuple[str, str, dict[str, Any], str, dict[str, str]], ...] = (
+    *(
         (
-            "drake lagged",
-            {"approximation": "lagged", "hydroelastic": True},
-            "1 ms, hydroelastic bodies of 1e8 Pa",
-        ),
-        (
-            "drake sap",
-            {"approximation": "sap", "hydroelastic": True},
-            "1 ms, SAP, hydroelastic bodies of 1e8 Pa",
-        ),
-    ):
-        found.append(
-            Way(name, "drake", "pydrake", options, text, cannot={"spin": NO_SPIN, "rolling": NO_ROLLING})
+            f"mujoco {cone}{' noslip' if noslip else ''}", "mujoco", {"cone": cone, "noslip": noslip},
+            "2 ms, Newton to 1e-8" + (f", {noslip} iterations of noslip" if noslip else ""), {},
         )
-    for sweeps in (22, 64):
-        more = f" {sweeps}" if sweeps != 22 else ""
-        text = f"1/60 s in 4 of {sweeps} sweeps"
-        found.append(Way(f"lavendersim{more}", "lavender_sim", "lavendersim", {"sweeps": sweeps}, text))
-    return found
+        for cone in ("pyramidal", "elliptic") for noslip in (0, 10)
+    ),
+    ("pybullet", "bullet", {"sweeps": 50, "substeps": 1}, "1/240 s, 50 sweeps", {}),
+    ("pybullet 4x100", "bullet", {"sweeps": 100, "substeps": 4}, "1/240 s in 4 of 100 sweeps", {}),
+    ("drake", "drake", {"approximation": "lagged", "hydroelastic": False}, "1 ms, point contacts: its defaults",
+     _PATCHES),
+    ("drake lagged", "drake", {"approximation": "lagged", "hydroelastic": True}, "1 ms, hydroelastic bodies of 1e8 Pa",
+     _PATCHES),
+    ("drake sap", "drake", {"approximation": "sap", "hydroelastic": True}, "1 ms, SAP, hydroelastic bodies of 1e8 Pa",
+     _PATCHES),
+    ("lavendersim", "lavender_sim", {"sweeps": 22}, "1/60 s in 4 of 22 sweeps", {}),
+    ("lavendersim 64", "lavender_sim", {"sweeps": 64}, "1/60 s in 4 of 64 sweeps", {}),
+    ("rapier", "node", {**_RAPIER, "iterations": 4}, "1/60 s, 4 iterations: its defaults", NO_TORSION),
+    ("rapier 16", "node", {**_RAPIER, "iterations": 16}, "1/60 s, 16 iterations", NO_TORSION),
+    ("jolt", "node", {**_JOLT, "substeps": 1, "gyroscopic": False}, "1/60 s, 10 sweeps: its defaults", NO_TORSION),
+    ("jolt 4", "node", {**_JOLT, "substeps": 4, "gyroscopic": True}, "1/60 s in 4 of 10 sweeps, gyroscopic torques",
+     NO_TORSION),
+    ("newton xpbd", "newton", {"solver": "XPBD", "iterations": 2}, "1/60 s in 4 of 2 iterations, its default", {}),
+    ("newton xpbd 20", "newton", {"solver": "XPBD", "iterations": 20}, "1/60 s in 4 of 20 iterations", {}),
+    ("newton vbd", "newton", _VBD, "1/60 s in 4 of 10 iterations, its default", NO_TORSION),
+)  # fmt: skip
+PACKAGES = {
+    "bullet": "pybullet",
+    "drake": "pydrake",
+    "lavender_sim": "lavendersim",
+}  # file -> module, of another name
 
 
-def _under_node() -> list[Way]:
-    settings: tuple[tuple[str, dict[str, Any], str], ...] = (
-        ("rapier", {"iterations": 4}, "1/60 s, 4 iterations: its defaults"),
-        ("rapier 16", {"iterations": 16}, "1/60 s, 16 iterations"),
-        ("jolt", {"sweeps": 10, "substeps": 1, "gyroscopic": False}, "1/60 s, 10 sweeps: its defaults"),
-        (
-            "jolt 4",
-            {"sweeps": 10, "substeps": 4, "gyroscopic": True},
-            "1/60 s in 4 of 10 sweeps, gyroscopic torques",
-        ),
-    )
-    found = []
-    for name, options, text in settings:
-        engine = name.split()[0]
-        options["engine"] = engine
-        found.append(Way(name, "node", PACKAGES_OF_NODE[engine], options, text, cannot=NO_TORSION))
-    return found
-
-
-def _newton() -> list[Way]:
-    found = []
-    for name, solver, iterations, text in (
-        ("newton xpbd", "XPBD", 2, "2 iterations, its default"),
-        ("newton xpbd 20", "XPBD", 20, "20 iterations"),
-        ("newton vbd", "VBD", 10, "10 iterations, its default"),
-    ):
-        options = {"solver": solver, "iterations": iterations}
-        cannot = NO_TORSION if solver == "VBD" else {}
-        found.append(Way(name, "newton", "newton", options, f"1/60 s in 4 of {text}", cannot=cannot))
-    return found
+def _package(module: str, options: Mapping[str, Any]) -> str:
+    return PACKAGES_OF_NODE[options["engine"]] if module == "node" else PACKAGES.get(module, module)
 
 
 #: Name -> way; ours first.
-WAYS: dict[str, Way] = {way.name: way for way in (*_own(), *_others(), *_under_node(), *_newton())}
+WAYS: dict[str, Way] = {way.name: way for way in _own()} | {
+    name: Way(name, module, _package(module, options), options, text, cannot=cannot)
+    for name, module, options, text, cannot in _OTHERS
+}
+
+
+def engine(module: str, scene: Scene, **options: Any) -> Stepping:
+    """The engine of a file of this folder with a scene."""
+    made: Stepping = importlib.import_module(f"lavender.phenomena.engines.{module}").Engine(scene, **options)
+    return made
 
 
 def make(way: Way, scene: Scene) -> Stepping:
     """The engine of a way with a scene."""
-    module = importlib.import_module(f"lavender.phenomena.engines.{way.module}")
-    made: Stepping = module.Engine(scene, **way.options)
-    return made
+    return engine(way.module, scene, **way.options)
 
 
 def follow(engine: Stepping, seconds: float, look: float) -> Track:

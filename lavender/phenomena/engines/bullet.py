@@ -8,8 +8,9 @@ from lavender._arrays import FloatArray
 from lavender.errors import CapabilityError
 from lavender.external._running import quiet
 from lavender.phenomena.engines import Stepping
-from lavender.phenomena.engines.tree import parents, relative
-from lavender.scene import Body, Box, Plane, Scene, Sphere
+from lavender.phenomena.engines.tree import parents, relative, xyzw
+from lavender.scene import Body, Box, Joint, Plane, Scene, Sphere
+from lavender.scene.parts import rotation
 
 with quiet(noisy=True):  # it greets
     import pybullet
@@ -17,23 +18,32 @@ with quiet(noisy=True):  # it greets
 __all__ = ["Engine"]
 
 
-def _xyzw(q: FloatArray) -> list[float]:
-    return [*map(float, q[1:]), float(q[0])]
-
-
 class Engine(Stepping):
-    """`stepSimulation` at 1/240 s."""
+    """`stepSimulation`, by default of 1/240 s.
 
-    def __init__(self, scene: Scene, sweeps: int, substeps: int) -> None:
-        self.scene, self.up = scene, parents(scene, "pybullet")
-        self.dt = 1.0 / 240.0
+    Parameters
+    ----------
+    sweeps, substeps : int
+    dt : float, s
+    bodies : bool
+        Bodies in maximal coordinates where there are no joints, joints as constraints between bodies, and every sweep
+        made; False: Bullet's own ways, and joints those of a tree.
+    """
+
+    def __init__(
+        self, scene: Scene, sweeps: int, substeps: int = 1, dt: float = 1.0 / 240.0, bodies: bool = False
+    ) -> None:
+        self.scene, self.up = scene, {} if bodies else parents(scene, "pybullet")
+        self.dt = dt
         self.client = pybullet.connect(pybullet.DIRECT)
         self.at = {"physicsClientId": self.client}
-        self.setting = f"4.17 ms in {substeps} of {sweeps} sweeps"
+        self.maximal = {"useMaximalCoordinates": True} if bodies and not scene.joints else {}
+        self.setting = f"{1e3 * dt:.3g} ms in {substeps} of {sweeps} sweeps"
         pybullet.setGravity(*scene.parameters.gravity, **self.at)
         pybullet.setPhysicsEngineParameter(
-            fixedTimeStep=self.dt, numSolverIterations=sweeps, numSubSteps=substeps, **self.at
-        )
+            fixedTimeStep=self.dt, numSolverIterations=sweeps, numSubSteps=substeps,
+            **({"solverResidualThreshold": 0.0} if bodies else {}), **self.at,
+        )  # fmt: skip
         self.ids: dict[int, tuple[int, int]] = {}  # body -> multibody, link; link -1 is its base
         for i in range(scene.n_bodies):
             if i not in self.up:
@@ -45,6 +55,8 @@ class Engine(Stepping):
             self._tree()
         for body, link in self.ids.values():
             self._material(body, link)
+        for joint in scene.joints if bodies else ():
+            self._tie(joint)
 
     def _shape(self, body: Body) -> int:
         if isinstance(body.shape, Plane):
@@ -64,13 +76,25 @@ class Engine(Stepping):
         body = self.scene.bodies[i]
         made = pybullet.createMultiBody(
             body.mass, self._shape(body), basePosition=body.position.tolist(),
-            baseOrientation=_xyzw(body.quaternion), **self.at,
+            baseOrientation=xyzw(body.quaternion), **self.maximal, **self.at,
         )  # fmt: skip
         if body.mass:
             pybullet.resetBaseVelocity(
                 made, body.velocity.tolist(), body.angular_velocity.tolist(), **self.at
             )
         self.ids[i] = (made, -1)
+
+    def _tie(self, joint: Joint) -> None:
+        # The world is body -1 and stands second; anchors are in the frames of their bodies.
+        flip = joint.a < 0
+        first, second = (joint.b, joint.a) if flip else (joint.a, joint.b)
+        anchors = (joint.anchor_b, joint.anchor_a) if flip else (joint.anchor_a, joint.anchor_b)
+        pybullet.createConstraint(
+            self.ids[first][0], -1, -1 if second < 0 else self.ids[second][0], -1, pybullet.JOINT_POINT2POINT,
+            [0, 0, 0], *(list(map(float, x)) for x in anchors), **self.at,
+        )  # fmt: skip
+        for i in (i for i in (first, second) if i >= 0):
+            pybullet.setCollisionFilterGroupMask(self.ids[i][0], -1, 0, 0, **self.at)
 
     def _tree(self) -> None:
         # a link's frame stands at its joint and is turned as its parent's; its body stands in it
@@ -84,7 +108,7 @@ class Engine(Stepping):
             if abs(abs(q[0]) - 1.0) > 1e-12 and joint.a >= 0:
                 raise CapabilityError("pybullet is given trees whose bodies stand alike")
             place.append((joint.anchor_a - before).tolist())
-            turn.append(_xyzw(q))
+            turn.append(xyzw(q))
             shift.append((-joint.anchor_b).tolist())
             axis.append(joint.axis_b.tolist())
         kinds = {"hinge": pybullet.JOINT_REVOLUTE, "ball": pybullet.JOINT_SPHERICAL}
@@ -131,8 +155,7 @@ class Engine(Stepping):
 
     def state(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """See `Stepping.state`."""
-        n = self.scene.n_bodies
-        x, q, v = np.zeros((n, 3)), np.zeros((n, 4)), np.zeros((n, 6))
+        x, q, v = self.placed()
         for i, (body, link) in self.ids.items():
             if link < 0:
                 x[i], turn = pybullet.getBasePositionAndOrientation(body, **self.at)
@@ -144,6 +167,18 @@ class Engine(Stepping):
                 x[i], turn, v[i] = found[0], found[1], np.concatenate(found[6:8])
             q[i] = np.roll(turn, 1)
         return x, q, v
+
+    def left(self) -> tuple[int, float, float]:
+        """See `Stepping.left`; Bullet does not publish its problem."""
+        points = pybullet.getContactPoints(**self.at) or ()
+        x, q, _ = self.state()
+
+        def point(i: int, anchor: FloatArray) -> FloatArray:
+            return anchor if i < 0 else x[i] + rotation(q[i]) @ anchor
+
+        gaps = [np.linalg.norm(point(j.b, j.anchor_b) - point(j.a, j.anchor_a)) for j in self.scene.joints]
+        depth = max(gaps) if gaps else max((-p[8] for p in points), default=0.0)
+        return len(points), max(0.0, float(depth)), float("nan")
 
     def close(self) -> None:
         """See `Stepping.close`."""

@@ -129,11 +129,9 @@ class Engine(Stepping):
 
     def state(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """See `Stepping.state`."""
-        n = self.scene.n_bodies
-        x, q, v = np.zeros((n, 3)), np.zeros((n, 4)), np.zeros((n, 6))
+        x, q, v = self.placed()
         for i, body in enumerate(self.bodies):
             if body is None:
-                x[i], q[i] = self.scene.bodies[i].position, self.scene.bodies[i].quaternion
                 continue
             pose = self.plant.EvalBodyPoseInWorld(self.context, body)
             speed = self.plant.EvalBodySpatialVelocityInWorld(self.context, body)

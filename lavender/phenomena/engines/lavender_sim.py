@@ -8,7 +8,7 @@ import numpy as np
 from lavender._arrays import FloatArray
 from lavender.errors import CapabilityError
 from lavender.phenomena.engines import Stepping
-from lavender.phenomena.engines.tree import parents
+from lavender.phenomena.engines.tree import parents, xyzw
 from lavender.scene import Body, Box, Plane, Scene, Sphere
 from lavender.scene.arithmetic import frame_quaternion
 from lavender.scene.parts import rotation
@@ -27,12 +27,12 @@ def _frame(up: FloatArray) -> FloatArray:
 
 
 class Engine(Stepping):
-    """`CodeSceneEnv.step` at 1/60 s, which it divides into substeps of 1/240 s by itself."""
+    """`CodeSceneEnv.step`, by default of 1/60 s, which it divides into substeps of 1/240 s by itself."""
 
-    def __init__(self, scene: Scene, sweeps: int) -> None:
-        self.scene = scene
-        self.dt = 1.0 / 60.0
-        self.setting = f"16.7 ms in 4 of {sweeps} sweeps"
+    def __init__(self, scene: Scene, sweeps: int, dt: float = 1.0 / 60.0) -> None:
+        self.scene, self.dt = scene, dt
+        self.substeps = max(1, int(np.ceil(240.0 * dt - 1e-9)))
+        self.setting = f"{1e3 * dt:.3g} ms in {self.substeps} of {sweeps} sweeps"
         up, p = parents(scene, "lavendersim"), scene.parameters
         g = np.asarray(p.gravity, float)
         size = float(np.linalg.norm(g))
@@ -73,7 +73,7 @@ class Engine(Stepping):
                 size=WIDE,
                 mass=0.0,
                 position=place,
-                rotation=_xyzw(frame_quaternion(turn)),
+                rotation=xyzw(frame_quaternion(turn)),
                 **self.material,
             )
         more = {
@@ -88,7 +88,7 @@ class Engine(Stepping):
         raise CapabilityError(f"{body.name} has no shape that lavendersim could be given")
 
     def _turned(self, body: Body) -> list[float]:
-        return _xyzw(frame_quaternion(self.frame @ rotation(body.quaternion)))
+        return xyzw(frame_quaternion(self.frame @ rotation(body.quaternion)))
 
     def state(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """See `Stepping.state`."""
@@ -100,7 +100,3 @@ class Engine(Stepping):
     def close(self) -> None:
         """See `Stepping.close`."""
         self.env.close()
-
-
-def _xyzw(q: FloatArray) -> list[float]:
-    return [*map(float, q[1:]), float(q[0])]

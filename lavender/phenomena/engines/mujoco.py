@@ -9,9 +9,12 @@ import numpy as np
 
 from lavender._arrays import FloatArray
 from lavender.errors import CapabilityError
+from lavender.io.mujoco import from_mujoco, impulse
 from lavender.phenomena.engines import Stepping
 from lavender.phenomena.engines.tree import parents, relative
-from lavender.scene import Box, Plane, Scene, Sphere
+from lavender.problem import Problem
+from lavender.residuals import residual
+from lavender.scene import Box, Joint, Plane, Scene, Sphere
 from lavender.scene.parts import rotation
 
 __all__ = ["Engine"]
@@ -21,23 +24,59 @@ def _text(x: Any) -> str:
     return " ".join(repr(float(v)) for v in x)
 
 
-class Engine(Stepping):
-    """`mj_step` at its default of 2 ms with Newton to 1e-8."""
+def _tie(joint: Joint) -> str:
+    # The first body must not be the world; the anchor is in its frame.
+    first, second, anchor = (
+        (joint.b, joint.a, joint.anchor_b) if joint.a < 0 else (joint.a, joint.b, joint.anchor_a)
+    )
+    other = "" if second < 0 else f'body2="b{second}"'
+    return f'<connect body1="b{first}" {other} anchor="{_text(anchor)}"/>'
 
-    def __init__(self, scene: Scene, cone: str, noslip: int) -> None:
-        self.scene, self.up = scene, parents(scene, "mujoco")
+
+class Engine(Stepping):
+    """`mj_step`, by default of 2 ms with Newton to 1e-8.
+
+    Parameters
+    ----------
+    cone : {"pyramidal", "elliptic"}
+    noslip : int
+        Its iterations.
+    dt : float, optional, s
+    sweeps : int, optional
+        PGS with so many at tolerance 0, in place of Newton.
+    tree : bool
+        Joints are those of a tree; False: equalities between free bodies.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        cone: str,
+        noslip: int = 0,
+        dt: float | None = None,
+        sweeps: int = 0,
+        tree: bool = True,
+    ) -> None:
+        self.scene, self.up = scene, parents(scene, "mujoco") if tree else {}
+        ties = [] if tree else scene.joints
         p = scene.parameters
         spin = ' condim="6"' if p.rolling_radius else ' condim="4"' if p.patch_radius else ""
         friction = f'friction="{p.friction!r} {p.friction * p.patch_radius!r} {p.rolling_radius!r}"'
-        option = f'<option cone="{cone}" noslip_iterations="{noslip}" gravity="{_text(p.gravity)}"/>'
+        step = f' timestep="{dt!r}"' if dt else ""
+        solver = f' solver="PGS" iterations="{sweeps}" tolerance="0"' if sweeps else ""
+        option = (
+            f'<option cone="{cone}" noslip_iterations="{noslip}" gravity="{_text(p.gravity)}"{step}{solver}/>'
+        )
+        self.apart = ' contype="0" conaffinity="0"' if scene.joints else ""
         trees = "".join(self._body(i) for i in range(scene.n_bodies) if i not in self.up or self.up[i].a < 0)
         self.model = mujoco.MjModel.from_xml_string(
-            f"<mujoco>{option}<size memory='64M'/><default><geom {friction}{spin}/></default>"
-            f"<worldbody>{trees}</worldbody></mujoco>"
+            f"<mujoco>{option}<size memory='1G'/><default><geom {friction}{spin}/></default>"
+            f"<worldbody>{trees}</worldbody><equality>{''.join(map(_tie, ties))}</equality></mujoco>"
         )
         self.data = mujoco.MjData(self.model)
         self.dt = float(self.model.opt.timestep)
-        self.setting = f"2 ms, Newton, {cone}" + (f", noslip {noslip}" if noslip else "")
+        how = f"{sweeps} sweeps" if sweeps else "Newton"
+        self.setting = f"{1e3 * self.dt:.3g} ms, {how}, {cone}" + (f", noslip {noslip}" if noslip else "")
         self.ids = [
             mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_BODY, f"b{i}") for i in range(scene.n_bodies)
         ]
@@ -64,8 +103,8 @@ class Engine(Stepping):
         above = None if joint is None or joint.a < 0 else self.scene.bodies[joint.a]
         place, turn = relative(above, body)
         tie = "" if body.is_static else "<freejoint/>"
+        geom += self.apart if not body.is_static else ""
         if joint is not None:
-            geom += ' contype="0" conaffinity="0"'
             kind = f'type="hinge" axis="{_text(joint.axis_b)}"' if joint.kind == "hinge" else 'type="ball"'
             tie = f'<joint {kind} pos="{_text(joint.anchor_b)}"/>'
         inside = "".join(self._body(j) for j, other in self.up.items() if other.a == i)
@@ -75,6 +114,18 @@ class Engine(Stepping):
     def step(self) -> None:
         """See `Stepping.step`."""
         mujoco.mj_step(self.model, self.data)
+
+    def problem(self) -> Problem:
+        """The constraint problem of the last step."""
+        return from_mujoco(self.model, self.data, name=f"mujoco {self.scene.name}")
+
+    def left(self) -> tuple[int, float, float]:
+        """See `Stepping.left`."""
+        d = self.data
+        depth = max(0.0, -float(d.contact.dist[: d.ncon].min())) if d.ncon else 0.0
+        if self.scene.joints:
+            depth = float(np.abs(d.efc_pos[: d.nefc]).max(initial=0.0))
+        return int(d.ncon), depth, residual(self.problem(), impulse(self.model, d)).relative
 
     def state(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """See `Stepping.state`; poses belong to the velocities of the same time."""

@@ -9,7 +9,7 @@ import warp as wp
 from lavender._arrays import FloatArray
 from lavender.errors import CapabilityError
 from lavender.phenomena.engines import Stepping
-from lavender.phenomena.engines.tree import parents, relative
+from lavender.phenomena.engines.tree import parents, relative, xyzw
 from lavender.scene import Box, Plane, Scene, Sphere
 
 __all__ = ["Engine"]
@@ -88,15 +88,12 @@ class Engine(Stepping):
     def state(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """See `Stepping.state`; it keeps 32 bits."""
         places, speeds = self.now.body_q.numpy().astype(float), self.now.body_qd.numpy().astype(float)
-        n = self.scene.n_bodies
-        x, q, v = np.zeros((n, 3)), np.zeros((n, 4)), np.zeros((n, 6))
+        x, q, v = self.placed()
         for i, k in enumerate(self.bodies):
-            if k < 0:
-                x[i], q[i] = self.scene.bodies[i].position, self.scene.bodies[i].quaternion
-            else:
+            if k >= 0:
                 x[i], q[i], v[i] = places[k, :3], np.roll(places[k, 3:], 1), speeds[k]
         return x, q, v
 
 
 def _place(x: FloatArray, q: FloatArray) -> wp.transform:
-    return wp.transform(tuple(map(float, x)), (*map(float, q[1:]), float(q[0])))
+    return wp.transform(tuple(map(float, x)), tuple(xyzw(q)))

@@ -16,7 +16,7 @@ class Engine(Stepping):
     """`Simulation.step` with its observation."""
 
     def __init__(self, scene: Scene) -> None:
-        self.sim = Simulation(scene)
+        self.scene, self.sim = scene, Simulation(scene)
         p = scene.parameters
         self.dt, self.substep = p.dt, p.dt / p.substeps
         self.seen = self.sim.reset()[0]
@@ -32,6 +32,12 @@ class Engine(Stepping):
     def state(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """See `Stepping.state`."""
         return self.seen["positions"], self.seen["quaternions"], self.seen["velocities"]
+
+    def left(self) -> tuple[int, float, float]:
+        """See `Stepping.left`."""
+        gap = np.abs(self.sim._state.a["joint_error"]).max(initial=0.0)
+        depth = max(self.seen["contacts"]["depth"].max(initial=0.0), gap)
+        return int(self.seen["solver"][2]), float(depth), float(self.sim.residual()["relative"])
 
     def force(self) -> float:
         """See `Stepping.force`; the first joint is a ball's three rows."""

@@ -9,7 +9,7 @@ from lavender.errors import CapabilityError
 from lavender.scene import Scene
 from lavender.scene.parts import Body, Joint, rotation
 
-__all__ = ["parents", "relative"]
+__all__ = ["parents", "relative", "xyzw"]
 
 
 def parents(scene: Scene, engine: str) -> dict[int, Joint]:
@@ -40,3 +40,8 @@ def relative(parent: Body | None, child: Body) -> tuple[FloatArray, FloatArray]:
     w, v = parent.quaternion[0], -parent.quaternion[1:]
     s, u = child.quaternion[0], child.quaternion[1:]
     return place, np.concatenate([[w * s - v @ u], w * u + s * v + np.cross(v, u)])
+
+
+def xyzw(q: FloatArray) -> list[float]:
+    """A quaternion (4,) w x y z with w last."""
+    return [*map(float, q[1:]), float(q[0])]
