@@ -16,7 +16,7 @@ import numpy as np
 
 from lavender._arrays import FloatArray
 from lavender.problem import LAWS, Problem
-from lavender.registry import FEW
+from lavender.registry import SMALL_ROWS
 from lavender.residuals import judged, reference
 from lavender.solution import Claim, Status, Turn
 from lavender.solvers import _rates as rates
@@ -70,7 +70,7 @@ def prepared(problem: Problem) -> Chain | None:
 
 
 def _make(problem: Problem) -> Chain | None:
-    if not 0 < problem.m <= FEW:
+    if not 0 < problem.m <= SMALL_ROWS:
         return None
     reference(problem)
     data, start = problem.metric, problem._start
