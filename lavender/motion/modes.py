@@ -44,7 +44,8 @@ def enumerated(problem: Problem) -> tuple[list[FloatArray], bool] | None:
     """Impulses (m,) [N s] of every mode that has a solution, and whether their motions are all there are.
 
     None where the problem has more than eight contacts or 65,536 modes, a contact with friction in two tangents or
-    spin, or numbers beyond float64 on the way. Not all: a mode with motions next to each other without end, or too many singular modes.
+    spin, or numbers beyond float64 on the way. Not all: a mode with motions next to each other without end, or too
+    many singular modes.
     """
     c = problem.cones
     contact = c.kind != ROW
