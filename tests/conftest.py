@@ -14,10 +14,11 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 import hypothesis
 import pytest
 
-# Timings say nothing on a shared machine, so no deadline; the same examples every run, so a failure repeats.
-# HYPOTHESIS_PROFILE=search draws new ones.
-hypothesis.settings.register_profile("repeat", deadline=None, derandomize=True, print_blob=True)
-hypothesis.settings.register_profile("search", deadline=None, max_examples=1000)
+# Timings say nothing on a shared machine, so no deadline, of an example or of drawing it; the same examples every run,
+# so a failure repeats. HYPOTHESIS_PROFILE=search draws new ones.
+timeless = hypothesis.settings(deadline=None, suppress_health_check=[hypothesis.HealthCheck.too_slow])
+hypothesis.settings.register_profile("repeat", timeless, derandomize=True, print_blob=True)
+hypothesis.settings.register_profile("search", timeless, max_examples=1000)
 hypothesis.settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "repeat"))
 
 PROBLEMS = os.environ.get("LAVENDER_PROBLEMS", "")

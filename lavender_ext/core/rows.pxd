@@ -184,8 +184,9 @@ cdef inline void relax_contact(const double* normal, const double* tangent, cons
             w[1] = (dot3(t2, u) + (compliance[2] * lam[2] - rhs[2])) + coupling[1] * dn
         if box:
             lam[1] = relax_row(lam[1], w[0], step[1], -(mu * y), mu * y)
-            w[1] += coupling[2] * (lam[1] - old[0])
-            lam[2] = relax_row(lam[2], w[1], step[2], -(mu * patch_radius * y), mu * patch_radius * y)
+            # What the first moved comes last, so that all else need not wait for it.
+            lam[2] = relax_row(old[1] - w[1] * step[2], lam[1] - old[0], coupling[2] * step[2],
+                               -(mu * patch_radius * y), mu * patch_radius * y)
         else:
             relax_tangents(lam + 1, w, step[1], mu * y, nt)
         d0 = lam[1] - old[0]

@@ -18,8 +18,8 @@ from libc.stdint cimport int32_t, int64_t
 
 from lavender_ext.core.block cimport CONTACT, CONTACT_BOX, CONTACT_SPIN, blocks_t, relax_tangents
 from lavender_ext.core.rows cimport cross, relax_rows_block, rows_t
-from lavender_ext.sweep.pair cimport (LANES, all_within, at, both, clip_pair, gather, gather_six, not_below_zero, pair_t,
-                                      scatter_six)
+from lavender_ext.sweep.pair cimport (LANES, all_within, any_beyond, at, both, clip_pair, gather, gather_six,
+                                      not_below_zero, pair_t, scatter_six)
 
 
 cdef enum:                      # kinds
@@ -141,7 +141,12 @@ cdef inline void pack_contact(const blocks_t* p, const rows_t* r, int32_t i, int
         m[0] = p.mu[i] * p.patch_radius[i]
         m[1] = p.mu[j] * p.patch_radius[j]
         out[T_SIZE] = gather(m, m + 1)
-        put(out + T_SIZE + 1, 3 if n == SPIN else 1, r.coupling + 5 * c + 2, r.coupling + 5 * d + 2)
+        if n == SPIN:
+            put(out + T_SIZE + 1, 3, r.coupling + 5 * c + 2, r.coupling + 5 * d + 2)
+            return
+        m[0] = r.coupling[5 * c + 2] * p.step[e + 2]
+        m[1] = r.coupling[5 * d + 2] * p.step[f + 2]
+        out[T_SIZE + 1] = gather(m, m + 1)
 
 
 cdef inline void pack_joint(const blocks_t* p, const rows_t* r, int32_t i, int32_t j, int32_t n,
@@ -240,10 +245,14 @@ cdef inline void relax_contact_lanes(const contact_t* c, pair_t* lam, double* v,
         x[1] = (dot_pair(t + 3, u) + (row[0] * d1 - row[1])) + t[T_COUPLING + 1] * dn
         if contact_t is square_t:
             z = t[T_MU] * y
-            x[0] = clip_pair(x[0], -z, z)
-            x[1] = d1 - (x[1] + t[T_SIZE + 1] * (x[0] - d0)) * row[2]
+            # What the first moved comes last; one that holds is not clipped, so that nothing waits for its bound.
+            x[1] = d1 - x[1] * row[2]
+            if any_beyond(x[0], z):
+                x[0] = clip_pair(x[0], -z, z)
+            x[1] = x[1] - (x[0] - d0) * t[T_SIZE + 1]
             z = t[T_SIZE] * y
-            x[1] = clip_pair(x[1], -z, z)
+            if any_beyond(x[1], z):
+                x[1] = clip_pair(x[1], -z, z)
         else:
             x[1] = d1 - x[1] * z
             project_tangents(x, t[T_MU] * y)

@@ -46,6 +46,10 @@ cdef extern from *:
         return (lavender_pair)((m & (lavender_pair_bits)x) | (~m & (lavender_pair_bits)y));
     }
     static inline lavender_pair lavender_clip(lavender_pair x, lavender_pair low, lavender_pair high) {
+    #ifdef __SSE2__
+        /* min(a, b) is a < b ? a : b, and max likewise: where one is NaN, or both are zeros, b */
+        return __builtin_ia32_maxpd(low, __builtin_ia32_minpd(high, x));
+    #endif
         return lavender_select((lavender_pair_bits)(x < low), low,
                                lavender_select((lavender_pair_bits)(x > high), high, x));
     }
@@ -54,6 +58,10 @@ cdef extern from *:
         lavender_pair_bits m = (lavender_pair_bits)(s > low) & (lavender_pair_bits)(s < high)
                                & ~(lavender_pair_bits)(s > bound);
         return (m[0] & m[1]) < 0;
+    }
+    static inline int lavender_any_beyond(lavender_pair x, lavender_pair bound) {
+        lavender_pair_bits m = (lavender_pair_bits)(x > bound) | (lavender_pair_bits)(x < -bound);
+        return (m[0] | m[1]) != 0;
     }
     #else
     #define LAVENDER_LANES 1
@@ -76,6 +84,7 @@ cdef extern from *:
     static inline int lavender_all_within(lavender_pair s, lavender_pair bound) {
         return s > 1e-280 && s < 1e280 && !(s > bound);
     }
+    static inline int lavender_any_beyond(lavender_pair x, lavender_pair bound) { return x > bound || x < -bound; }
     #endif
     #endif
     """
@@ -93,5 +102,7 @@ cdef extern from *:
     pair_t clip_pair "lavender_clip"(pair_t x, pair_t low, pair_t high) noexcept nogil
     # y, or 0 where y < 0
     pair_t not_below_zero "lavender_not_below_zero"(pair_t y) noexcept nogil
+    # whether |x| > bound in some lane
+    int any_beyond "lavender_any_beyond"(pair_t x, pair_t bound) noexcept nogil
     # 1 where both lanes of s are in (1e-280, 1e280) and not above those of bound
     int all_within "lavender_all_within"(pair_t s, pair_t bound) noexcept nogil

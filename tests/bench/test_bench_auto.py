@@ -63,8 +63,8 @@ def test_a_run_times_what_solved():
     for r in found:
         assert r.best in regret.own_solvers()
         assert r.auto_solved
-        assert 0.0 < r.best_time < 1.0
-        assert 0.0 < r.auto_time < 1.0
+        assert r.best_time > 0.0
+        assert r.auto_time > 0.0
         assert r.shifted <= r.plain or r.plain <= 1.0
 
 

@@ -8,7 +8,7 @@ import lavender as lv
 from lavender import bench, suite
 from lavender.bench.record import from_json, to_json
 
-SHORT = {"budgets": (4,), "repeats": 1, "orders": (), "time_limit": 0.5}
+SHORT = {"budgets": (4,), "repeats": 1, "orders": (), "time_limit": 60.0}
 
 
 def test_a_record_has_the_motion_error_of_its_run():

@@ -151,10 +151,8 @@ def test_a_cluster_that_loses_a_worker_midway_loses_no_record():
                 os.kill(pids[0], signal.SIGKILL)
 
         found = bench.campaign(names, ["pgs", "jacobi"], plan, backend="dask", watch=watch)
-        deadline = time.monotonic() + 10.0
-        while pids[0] in client.run(os.getpid).values() and time.monotonic() < deadline:
+        while pids[0] in client.run(os.getpid, on_error="ignore").values():  # until the cluster has noticed
             time.sleep(0.1)
-        assert pids[0] not in client.run(os.getpid).values()
     assert half.is_set()
     assert lines(found) == lines(expected)
 

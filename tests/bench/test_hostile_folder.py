@@ -290,7 +290,7 @@ import sys, time
 from lavender import bench
 store = bench.Store(sys.argv[1])
 print("held", flush=True)
-time.sleep(60)
+time.sleep(600)
 """
 
 
@@ -367,7 +367,7 @@ class Backend:
             if os.fork() == 0:
                 os.setsid()
                 open(note, "w").write(str(os.getpid()))
-                time.sleep(30)
+                time.sleep(600)
                 os._exit(0)
             while True: time.sleep(1)
         if self.what == "eat": self.all = [np.empty(4 * 10**7) for _ in range(1000)]
@@ -422,27 +422,27 @@ def hostile(tmp_path, monkeypatch):
 
 @pytest.fixture
 def watchdog():
-    """An exception after a minute, where something waits for ever."""
+    """An exception after ten minutes, where something waits for ever."""
 
     def bark(*_):
         raise TimeoutError("it hangs")
 
     before = signal.signal(signal.SIGALRM, bark)
-    signal.alarm(60)
+    signal.alarm(600)
     yield
     signal.alarm(0)
     signal.signal(signal.SIGALRM, before)
 
 
-def task(problem, solver, time_limit=10.0, **more):
-    # Seconds, for machines that are busy with something else; what hangs asks for less.
+def task(problem, solver, time_limit=100.0, **more):
+    # Minutes, for machines that are busy with something else; what hangs asks for less.
     sha = bench_cases.fingerprint(problem)
     return bench.Task("run", "case", sha, solver, "tol", 1e-6, 0, time_limit, **more)
 
 
-def wait_until(true, seconds=5.0):
-    """Whether it comes true in the time."""
-    until = time.monotonic() + seconds
+def wait_until(true):
+    """Whether it comes true, soon or on a busy machine some time later."""
+    until = time.monotonic() + 600.0
     while time.monotonic() < until:
         if true():
             return True
@@ -466,7 +466,7 @@ PROC = pytest.mark.skipif(not os.path.exists("/proc/self/stat"), reason="process
 def test_a_backend_that_forks_and_hangs_ends_with_its_child(hostile, watchdog):
     p = stack()
     with Worker(grace=0.5) as worker:
-        assert worker.measure(p, task(p, "x_fork", time_limit=2.0)).status == "KILLED"
+        assert worker.measure(p, task(p, "x_fork", time_limit=1.5)).status == "KILLED"
         pids = list(map(int, hostile.read_text().split()))
         assert len(pids) == 2
         assert wait_until(lambda: not any(map(runs, pids)))
@@ -477,7 +477,7 @@ def test_a_backend_that_forks_and_hangs_ends_with_its_child(hostile, watchdog):
 def test_a_child_that_left_the_group_and_keeps_the_pipe_keeps_nobody_waiting(hostile, watchdog):
     p = stack()
     with Worker(grace=0.5) as worker:
-        assert worker.measure(p, task(p, "x_escape", time_limit=2.0)).status == "KILLED"
+        assert worker.measure(p, task(p, "x_escape", time_limit=1.5)).status == "KILLED"
         assert worker.measure(p, task(p, "pgs")).status == "CONVERGED"
     os.kill(int(hostile.read_text()), signal.SIGKILL)
 
@@ -489,7 +489,7 @@ from lavender.bench.running.worker import Worker, outcome_in
 sys.path[:0] = [sys.argv[1]]
 from test_hostile_folder import stack, task
 p = stack()
-Worker().measure(p, task(p, "x_fork", time_limit=30.0))
+Worker().measure(p, task(p, "x_fork", time_limit=600.0))
 """
 
 
@@ -498,12 +498,12 @@ def test_a_worker_ends_when_its_parent_is_killed(hostile):
     root = os.path.dirname(__file__)
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([root, *filter(None, sys.path)])}
     parent = subprocess.Popen([sys.executable, "-c", HANGS, root], env=environment)
-    assert wait_until(lambda: hostile.exists() and len(hostile.read_text().split()) == 2, 60.0)
+    assert wait_until(lambda: hostile.exists() and len(hostile.read_text().split()) == 2)
     pids = list(map(int, hostile.read_text().split()))
     assert all(map(runs, pids))
     parent.kill()
     parent.wait()
-    assert wait_until(lambda: not any(map(runs, pids)), 3.0)
+    assert wait_until(lambda: not any(map(runs, pids)))
 
 
 LONG = """
@@ -541,18 +541,19 @@ def test_workers_of_a_campaign_end_when_it_is_killed():
             return (int(words[11]) + int(words[12])) / os.sysconf("SC_CLK_TCK")
         return 0.0
 
-    assert wait_until(lambda: len(busy()) >= 1, 60.0)
+    assert wait_until(lambda: len(busy()) >= 1)
     family = children(parent.pid)
     parent.kill()
     parent.wait()
-    assert wait_until(lambda: not any(map(runs, family)), 4.0)
+    assert wait_until(lambda: not any(map(runs, family)))
 
 
 def test_a_backend_that_hangs_or_dies_costs_its_own_record(hostile, watchdog):
     p = lv.Problem.linear(np.diag([1.0, 2.0]), np.ones(2))
     with Worker(memory=2**31, grace=1.0) as worker:
+        limits = {"talk": 100.0, "hang": 0.05, "segfault": 100.0, "leave": 100.0}
         names = ("talk", "hang", "segfault", "leave", "talk")
-        found = [worker.measure(p, task(p, f"x_{name}", time_limit=0.05)) for name in names]
+        found = [worker.measure(p, task(p, f"x_{name}", time_limit=limits[name])) for name in names]
     said = [r.status for r in found]
     assert said == ["CONVERGED", "KILLED", "CRASHED (SIGSEGV)", "CRASHED (exit status 3)", "CONVERGED"]
     for record in (found[0], found[-1]):
@@ -562,7 +563,7 @@ def test_a_backend_that_hangs_or_dies_costs_its_own_record(hostile, watchdog):
 
 def test_a_whole_run_survives_its_backends(hostile, watchdog, monkeypatch):
     monkeypatch.setattr("lavender.bench.running.worker.GRACE", 0.5)
-    plan = bench.Plan(levels=(1e-3,), budgets=(), repeats=1, time_limit=0.05)
+    plan = bench.Plan(levels=(1e-3,), budgets=(), repeats=1, time_limit=1.0)  # a hundred times what they take
     records = bench.run([stack(4)], ["x_hang", "x_segfault", "pgs", "x_talk"], plan)
     assert [r.status.split()[0] for r in records] == ["KILLED", "CRASHED", "CONVERGED", "CONVERGED"]
     assert records.records[3].contradicted  # its diagonal step does not solve a stack, and it says so

@@ -255,13 +255,11 @@ def test_ctrl_c_keeps_the_records_and_writes_the_page(tmp_path):
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True
     )
     records = out / "records.jsonl"
-    deadline = time.monotonic() + 60.0
-    while time.monotonic() < deadline:
-        if records.exists() and '"case": "hard"' in records.read_text():
-            break
+    while not (records.exists() and '"case": "hard"' in records.read_text()):
+        assert process.poll() is None
         time.sleep(0.05)
     os.killpg(process.pid, signal.SIGINT)
-    printed, said = process.communicate(timeout=60)
+    printed, said = process.communicate(timeout=600)
     assert process.returncode == 130, said
     assert b"Traceback" not in said
     assert b"goes on from here" in printed
@@ -501,30 +499,35 @@ def test_a_torn_line_is_cut_wherever_it_begins(tmp_path, reasons, tail):
     assert (tmp_path / "a.jsonl").read_bytes() == head
 
 
+INTERRUPT = """
+import os, signal, sys
+class Finder:
+    def find_spec(self, name, path=None, target=None):
+        if name == os.environ["INTERRUPTED"]:
+            signal.raise_signal(signal.SIGINT)
+sys.meta_path.insert(0, Finder())
+"""
+
+
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="signals of POSIX")
 @pytest.mark.parametrize("way", [("-m", "lavender"), ("-m", "lavender.cli")])
 @pytest.mark.parametrize(
     "module", ["numpy", "lavender.problem", "lavender.cli.options", "lavender.cli.solve"]
 )
-def test_ctrl_c_while_the_command_is_imported_ends_with_130(way, module):
-    """-X importtime writes a line when a module is there: so far the command has come."""
-    command = [sys.executable, "-X", "importtime", *way, "solvers"]
-    with subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True) as started:
-        text = ""
-        for line in started.stderr:
-            text += line
-            if line.rpartition("|")[2].strip() == module:
-                started.send_signal(signal.SIGINT)
-                break
-        text += started.stderr.read()
-        assert started.wait(timeout=60) == 130
-    assert "lavender: stopped" in text
-    assert "Traceback" not in text
+def test_ctrl_c_while_the_command_is_imported_ends_with_130(way, module, tmp_path):
+    """The signal comes where the import of a module begins, whatever the machine's speed."""
+    (tmp_path / "sitecustomize.py").write_text(INTERRUPT)  # which Python imports first
+    environment = {**os.environ, "PYTHONPATH": str(tmp_path), "INTERRUPTED": module}
+    command = [sys.executable, *way, "solvers"]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=600, check=False)
+    assert done.returncode == 130
+    assert "lavender: stopped" in done.stderr
+    assert "Traceback" not in done.stderr
 
 
 def test_another_program_keeps_its_own_ctrl_c():
     words = "import signal, lavender, lavender.cli; assert signal.getsignal(2) is signal.default_int_handler"
-    subprocess.run([sys.executable, "-c", words, "lavender"], check=True, timeout=120)
+    subprocess.run([sys.executable, "-c", words, "lavender"], check=True, timeout=600)
 
 
 MODEL = """<mujoco><option timestep="0.01"/><worldbody><geom type="plane" size="1 1 1"/>

@@ -77,7 +77,7 @@ def test_a_long_film_drops_every_other_frame_and_keeps_its_end(monkeypatch):
 
 def get(viewer, path, **headers):
     request = urllib.request.Request(viewer.address.replace("view.html", path), headers=headers)
-    with urllib.request.urlopen(request, timeout=20) as answer:
+    with urllib.request.urlopen(request, timeout=600) as answer:
         return answer.read(), answer.headers
 
 

@@ -230,7 +230,7 @@ def test_warm_start_is_used_where_the_spec_says_so(name):
 @pytest.mark.parametrize("name", BACKENDS)
 def test_no_time_limit_is_said(name):
     backend = next((b for b in backends.BACKENDS if b.name == name), None)
-    solution = lv.solve(lv.Problem.lcp(*spd(5)), name, time_limit=10.0)
+    solution = lv.solve(lv.Problem.lcp(*spd(5)), name, time_limit=600.0)
     stoppable = backend is None or backend.stoppable
     assert ("takes no time limit" in solution.message) == (not stoppable)
 
@@ -246,10 +246,10 @@ def test_under_a_time_limit_a_backend_runs_in_a_process_of_its_own(name, monkeyp
     plain = lv.solve(problem, name)
     calls, call = [], _apart.call
     monkeypatch.setattr(_apart, "call", lambda *a: calls.append(call(*a)) or calls[-1])
-    apart = lv.solve(problem, name, time_limit=60.0)
+    apart = lv.solve(problem, name, time_limit=600.0)
     assert calls and all(answer is not None for answer in calls)
     calls.clear()
-    here = lv.solve(problem, name, time_limit=60.0, isolate=False)
+    here = lv.solve(problem, name, time_limit=600.0, isolate=False)
     assert not calls
     if name in APART:
         assert "ran in a process of its own" in apart.message and "ran to its end" in here.message
@@ -288,7 +288,7 @@ def test_a_backend_that_does_not_end_is_ended_and_the_next_call_finds_another():
     assert "ended at the time limit" in late.message
     assert late.impulse.tobytes() == problem.start().tobytes()
     small = lv.Problem.lcp(*spd(5))
-    after = lv.solve(small, "quadprog", time_limit=60.0)
+    after = lv.solve(small, "quadprog", time_limit=600.0)
     assert after.success and "ran in a process of its own" in after.message
 
 
@@ -297,14 +297,14 @@ def test_the_process_is_kept_and_its_death_costs_one_call_at_most():
     from lavender.external import _apart
 
     problem = lv.Problem.lcp(*spd(5))
-    lv.solve(problem, APART[0], time_limit=60.0)
+    lv.solve(problem, APART[0], time_limit=600.0)
     kept = list(_apart._idle)
     assert len(kept) == 1
-    lv.solve(problem, APART[0], time_limit=60.0)
+    lv.solve(problem, APART[0], time_limit=600.0)
     assert _apart._idle == kept
     kept[0]._process.kill()
     kept[0]._process.wait()
-    assert lv.solve(problem, APART[0], time_limit=60.0).success
+    assert lv.solve(problem, APART[0], time_limit=600.0).success
     assert _apart._idle != kept
 
 
@@ -314,10 +314,10 @@ def test_errors_of_a_process_of_its_own_are_told():
     with pytest.raises(lv.InputError, match="isolate"):
         lv.solve(problem, APART[0], isolate="yes")
     with pytest.raises(lv.InputError, match="isolate=False"):
-        lv.solve(problem, APART[0], time_limit=60.0, settings={"verbose": lambda: None})
+        lv.solve(problem, APART[0], time_limit=600.0, settings={"verbose": lambda: None})
     wrong = {"settings": {"bogus": 1}}
-    here = lv.solve(problem, APART[0], time_limit=60.0, isolate=False, **wrong)
-    apart = lv.solve(problem, APART[0], time_limit=60.0, **wrong)
+    here = lv.solve(problem, APART[0], time_limit=600.0, isolate=False, **wrong)
+    apart = lv.solve(problem, APART[0], time_limit=600.0, **wrong)
     assert apart.status is here.status
     assert apart.message.split(";")[0] == here.message.split(";")[0]
 

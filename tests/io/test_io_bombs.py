@@ -218,7 +218,7 @@ def test_a_small_file_that_would_make_large_arrays_is_refused_first(tmp_path, na
         [sys.executable, "-c", LOAD, str(good), str(path)],
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=600,
         check=False,
     )
     assert done.returncode == 0, done.stderr

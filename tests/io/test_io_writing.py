@@ -160,9 +160,9 @@ def test_threads_that_write_one_path_do_not_share_their_parts(tmp_path):
 
     def write(part):
         parts.append(part)
-        both.wait(timeout=30.0)
+        both.wait(timeout=600.0)
         part.write_text(str(part))
-        both.wait(timeout=30.0)
+        both.wait(timeout=600.0)
 
     threads = [Thread(target=write_atomically, args=(tmp_path / "a", write)) for _ in range(2)]
     for thread in threads:

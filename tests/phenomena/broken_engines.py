@@ -16,14 +16,14 @@ def serve(lifeline):
     if name == "dies":
         os.abort()
     if name == "sleeps":
-        time.sleep(60)
+        time.sleep(600)
     if name.startswith("waits"):  # for a program of its own, whose number it leaves in a file
         lines = Lines(
-            [sys.executable, "-c", "import os, time; print(os.getpid(), flush=True); time.sleep(60)"]
+            [sys.executable, "-c", "import os, time; print(os.getpid(), flush=True); time.sleep(600)"]
         )
         Path(name.removeprefix("waits ")).write_text(str(lines.ask(None)))
         lines.ask(None)
     if name == "babbles":
         answer(answers, '{"looks": 3, "bodies": 1, "setting": ""}', b"12345678")
-        time.sleep(60)
+        time.sleep(600)
     sys.exit(0)

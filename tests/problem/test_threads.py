@@ -24,12 +24,12 @@ def test_a_prepared_solver_refuses_a_second_thread():
 
     def callback(iterations, impulse, residual):
         inside.set()
-        assert leave.wait(60)
+        assert leave.wait(600)
         return True
 
     with ThreadPoolExecutor(1) as pool:
         first = pool.submit(solver.solve, tol=1e-12, callback=callback)
-        assert inside.wait(60)
+        assert inside.wait(600)
         with pytest.raises(InUse, match="make another one for every thread"):
             solver.solve()
         leave.set()
@@ -56,7 +56,7 @@ def at_once(function, n=8):
     gate = threading.Barrier(n)
 
     def run():
-        gate.wait(60)
+        gate.wait(600)
         return function()
 
     with ThreadPoolExecutor(n) as pool:

@@ -14,7 +14,7 @@ def run(*arguments, seed="0"):
         capture_output=True,
         text=True,
         env={**os.environ, "PYTHONHASHSEED": seed},
-        timeout=300,
+        timeout=1800,
         check=False,
     )
     assert done.returncode in (0, 1), done.stderr

@@ -20,7 +20,7 @@ from lavender.report.verdict import verdict
 from lavender.report.write import write
 
 PLAN = bench.Plan(
-    levels=(1e-3,), speed_levels=(1e-2, 1e-4), budgets=(8,), repeats=1, orders=(), time_limit=0.5
+    levels=(1e-3,), speed_levels=(1e-2, 1e-4), budgets=(8,), repeats=1, orders=(), time_limit=60.0
 )
 
 

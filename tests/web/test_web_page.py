@@ -19,6 +19,7 @@ from lavender.web.scenes import PRESETS
 pytestmark = pytest.mark.slow  # the module is the same whatever checks the native kernels are built with
 
 SCENES = ("stack", "pyramid", "chain", "spinner")  # of the page's, which are those of the gallery
+PATIENCE = 600_000  # ms, for what hangs: on a loaded machine a page takes its time
 WHOLE = ("iterations", "warm_start", "contacts", "cache_matches")
 
 
@@ -47,16 +48,22 @@ def browser():
         pytest.skip(f"none of {', '.join(names)} is installed, and CHROMIUM names no browser")
     with playwright.sync_playwright() as p:
         # Containers and root have no user namespaces to build the sandbox from.
-        browser = p.chromium.launch(executable_path=found, args=["--no-sandbox"])
+        browser = p.chromium.launch(executable_path=found, args=["--no-sandbox"], timeout=PATIENCE)
         yield browser
         browser.close()
+
+
+def new_context(browser, **options):
+    context = browser.new_context(**options)
+    context.set_default_timeout(PATIENCE)
+    return context
 
 
 class Visit:
     """A page with what it complained of and what it asked for."""
 
     def __init__(self, browser, address, **options):
-        self.context = browser.new_context(**{"viewport": {"width": 1280, "height": 900}, **options})
+        self.context = new_context(browser, **{"viewport": {"width": 1280, "height": 900}, **options})
         self.page = self.context.new_page()
         self.complaints, self.requests = [], []
         self.page.on("console", lambda m: m.type in ("error", "warning") and self.complaints.append(m.text))
@@ -310,7 +317,7 @@ def test_phone_without_network(visit, scene):
 
 
 def test_a_page_that_cannot_start_says_so(browser, address):
-    context = browser.new_context()
+    context = new_context(browser)
     page = context.new_page()
     page.route("**/scenes.json", lambda route: route.fulfill(body="{", content_type="application/json"))
     page.goto(address)
@@ -457,7 +464,7 @@ def test_the_module_of_newton_is_fetched_when_it_is_asked_for(visit):
 
 
 def test_without_the_module_of_newton_both_sides_sweep(browser, address):
-    context = browser.new_context()
+    context = new_context(browser)
     page = context.new_page()
     page.route("**/newton.wasm", lambda route: route.fulfill(status=404))
     page.goto(address + "#newton-against-sweeps")
