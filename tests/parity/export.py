@@ -23,7 +23,7 @@ from record import NEWTON_SCENES, NEWTON_STEPS, SCENES, STEPS, problems  # noqa:
 import lavender as lv  # noqa: E402
 from lavender.ordering import block_order  # noqa: E402
 from lavender.solvers._factor import TINY, choose  # noqa: E402
-from lavender.solvers._pivoting import SWEEPS as GUESSES  # noqa: E402
+from lavender.solvers.pivoting import SWEEPS as GUESSES  # noqa: E402
 from lavender_ext.factor.sparse import scan  # noqa: E402
 from lavender_ext.host import memory  # noqa: E402
 from lavender_ext.pivot.principal import Pivoting  # noqa: E402
