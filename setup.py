@@ -34,7 +34,7 @@ MODE = os.environ.get("LAVENDER_DEBUG", "")
 DEBUG = MODE not in ("", "0")
 OPTIONS = runpy.run_path("lavender_ext/build_options.py")
 WASM = runpy.run_path("lavender/web/compile.py")
-CUT = runpy.run_path("lavender/export/cut.py")
+LIBRARY = runpy.run_path("lavender/export/amalgamate.py")
 DIRECTIVES = OPTIONS["directives"](debug=DEBUG)
 #: Holds what Cython would otherwise write into every module (memoryviews): half of all that is compiled.
 SHARED = "lavender_ext._utility"
@@ -158,7 +158,7 @@ class BuildWasm(Command):
 
 
 class BuildLibrary(Command):
-    """Cuts the C library out of the kernels (lavender/export/cut.py); into a wheel with it, its header and bindings."""
+    """Makes the C library of the kernels (lavender/export/amalgamate.py); into a wheel with it, header and bindings."""
 
     user_options = [("build-lib=", None, "folder of what is installed")]  # noqa: RUF012 - as the base class asks
 
@@ -199,8 +199,8 @@ class BuildLibrary(Command):
 def make_library():
     """lavender/export/c/lavender.c of the kernels as they are, its path."""
     out = Path("lavender", "export", "c", "lavender.c")
-    if not (out.exists() and CUT["source_hash"](Path()) in out.read_text(encoding="utf-8")[:1000]):
-        out.write_text(CUT["amalgamate"](Path().resolve(), Path("build", "cython")), encoding="utf-8")
+    if not (out.exists() and LIBRARY["source_hash"](Path()) in out.read_text(encoding="utf-8")[:1000]):
+        out.write_text(LIBRARY["amalgamate"](Path().resolve(), Path("build", "cython")), encoding="utf-8")
     return out
 
 

@@ -10,7 +10,8 @@ from tempfile import TemporaryDirectory
 
 import lavender_ext
 from lavender.errors import InputError, LavenderError
-from lavender.export import bindings, cut
+from lavender.export import bindings
+from lavender.export.amalgamate import CutFailed, amalgamate, source_hash
 from lavender.io.stored import write_text
 from lavender.web import compile as wasm
 
@@ -33,14 +34,14 @@ def source() -> str:
         Neither: the kernels were changed, or come without one, and Cython is not installed.
     """
     kept = HERE / "c" / "lavender.c"
-    wanted = cut.source_hash(ROOT)
+    wanted = source_hash(ROOT)
     if kept.exists():
         text = kept.read_text(encoding="utf-8")
         if wanted in text[:1000]:
             return text
     try:
-        text = cut.amalgamate(ROOT, ROOT / "build" / "cython")
-    except cut.CutFailed as error:
+        text = amalgamate(ROOT, ROOT / "build" / "cython")
+    except CutFailed as error:
         raise LavenderError(
             f"lavender.c does not lie in {kept.parent} and cannot be made: {str(error)[-500:]}; "
             "install a wheel, or Cython"

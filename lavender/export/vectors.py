@@ -7,7 +7,7 @@ numbers of 8 bytes and arrays (bytes, data, padded to 8) in the order of `lav_pr
 from __future__ import annotations
 
 import struct
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,12 +19,12 @@ from lavender.bench.line import c_of
 from lavender.bench.store import read
 from lavender.errors import InputError
 from lavender.export.library import HERE, put
-from lavender.export.view import METHODS, OTHER_BITS, NotTaken, choices, view
+from lavender.export.view import METHODS, OTHER_BITS, NotTaken, choices, takes, view
 from lavender.io.stored import write_bytes
 from lavender.report.verdict import verdict
 from lavender.solvers._plan import METHODS as METHODS_OF_PLANS
 
-__all__ = ["chosen", "pack", "write"]
+__all__ = ["chosen", "pack", "pack_problem", "write", "write_packed"]
 
 MAGIC = b"LAVVEC1\0"
 
@@ -68,7 +68,7 @@ def write(path: Path, out: Path, solver: str | None, most: int, *, replace: bool
         raise InputError(
             f"no problem of {record.solver} in {path} makes a test vector: {'; '.join(left[:3])}"
         )
-    write_bytes(out / "vectors.bin", MAGIC + struct.pack("<q", len(packed)) + b"".join(packed))
+    write_packed(out, packed)
     text = (
         f"/* What the report measured: {record.solver}, to a relative residual of {record.tol:g}. */\n"
         '#include "lavender.h"\n\n'
@@ -84,6 +84,11 @@ def write(path: Path, out: Path, solver: str | None, most: int, *, replace: bool
     )
     check = (HERE / "front" / "check.c").read_text(encoding="utf-8")
     return [out / "vectors.bin", *put(out, {"check.c": check, "chosen.h": text}, replace)]
+
+
+def write_packed(out: Path, packed: Sequence[bytes]) -> None:
+    """Write `vectors.bin` of what `pack` has made."""
+    write_bytes(out / "vectors.bin", MAGIC + struct.pack("<q", len(packed)) + b"".join(packed))
 
 
 def _by_pointer(line: str) -> str:
@@ -125,19 +130,30 @@ def chosen(records: Any, solver: str | None) -> Any:
 
 def pack(problem: Any, solver: str, tol: float, max_iter: int, options: Mapping[str, Any]) -> bytes:
     """One vector; NotTaken where the library does not do what the package did."""
-    given = view(problem)
+    numbers, doubles = choices(solver, options)
+    given = pack_problem(problem, solver)
     max_iter = max_iter or registry.specs()[solver].max_iter
     found = lv.solve(problem, solver, tol=tol, max_iter=max_iter, **options)
-    if problem.matrix is None and "rows of A" in found.solver.form:
+    form = found.solver.form
+    if problem.matrix is None and ("rows of A" in form or (solver == "pgs" and form != "whitened J")):
         raise NotTaken(f"{solver} formed A, which the library does not")
-    numbers, doubles = choices(solver, options)
     out = struct.pack("<6q", METHODS[solver], *numbers) + struct.pack("<Q", 0) + struct.pack("<d", doubles)
     steps = turns(lv.explain(problem, tol)) if solver == "auto" else []
     out += struct.pack("<qd", max_iter, tol) + struct.pack(f"<{len(steps) + 1}q", len(steps) // 2, *steps)
-    out += struct.pack("<9q", *given.counts)
+    is_met = solver in OTHER_BITS  # by the judge's verdict alone
+    relative = tol if is_met else found.residual.relative
+    return out + given + struct.pack("<qd", is_met, relative) + (b"" if is_met else found.impulse.tobytes())
+
+
+def pack_problem(problem: Any, solver: str) -> bytes:
+    """The problem itself: counts, then arrays in the order of `lav_problem`; NotTaken where the method refuses it."""
+    given = view(problem)
+    if not takes(problem, solver):
+        raise NotTaken(
+            f"{solver} of the library does not take {problem.name or 'this problem'}: see lav_takes"
+        )
+    out = struct.pack("<9q", *given.counts)
     for values in given.arrays.values():
         data = b"" if values is None else np.ascontiguousarray(values).tobytes()
         out += struct.pack("<q", -1 if values is None else len(data)) + data + bytes(-len(data) % 8)
-    is_met = solver in OTHER_BITS  # by the judge's verdict alone
-    relative = tol if is_met else found.residual.relative
-    return out + struct.pack("<qd", is_met, relative) + (b"" if is_met else found.impulse.tobytes())
+    return out

@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 
 from lavender import registry
-from lavender.cones import CONTACT_ROLLING
+from lavender.cones import CONTACT_ROLLING, ROUND, ROW
 from lavender.errors import InputError
 from lavender.export.bindings import constants, struct_fields
 from lavender.export.library import HEADER
 from lavender.problem import Problem
 
-__all__ = ["ARRAYS", "METHODS", "NotTaken", "View", "choices", "view"]
+__all__ = ["ARRAYS", "METHODS", "NotTaken", "View", "choices", "takes", "view"]
 
 _HEADER = HEADER.read_text(encoding="utf-8")
 #: Arrays in the order of the struct, with what they hold.
@@ -45,6 +45,11 @@ METHODS = {
 OTHER_BITS = ("lemke", "admm", "auto")
 ORDERS = {"given": 0, "symmetric": 1, "random": 2, "reverse": 3}
 SWEEPS = {None: 0, "pgs": 1, "blocks": 2}
+
+
+#: Forms (1 a matrix, 2 bodies, 3 J and M) of those that do not take all of them.
+FORMS = {"sequential_impulses": (2,), "pgs": (1, 3), "direct": (1, 2), "lemke": (1, 2), "admm": (1, 2)}
+FORMS |= dict.fromkeys(("sor", "gauss_seidel", "jacobi"), (1,))
 
 
 class NotTaken(InputError):
@@ -100,6 +105,18 @@ def view(problem: Problem) -> View:
             arrays[key] = np.ascontiguousarray(values, ARRAYS[key])
     law = int(problem.friction == "cone")
     return View((form, law, problem.n_blocks, problem.m, entries, bodies, joints, velocities, mass), arrays)
+
+
+def takes(problem: Problem, solver: str) -> bool:
+    """Whether the library's method takes a problem that the package's solver takes, as `lav_takes` says it."""
+    form = 2 if problem.rows is not None else 3 if problem.generalized is not None else 1
+    kinds = set(problem.cones.kind.tolist())
+    if form not in FORMS.get(solver, (1, 2, 3)):
+        return False
+    if solver in ("direct", "lemke"):
+        c = problem.cones
+        return not np.any((c.kind != ROW) & (np.diff(c.ptr) > 1))
+    return solver != "newton" or form == 3 or not kinds & {ROUND, CONTACT_ROLLING}
 
 
 def choices(solver: str, options: Mapping[str, Any]) -> tuple[tuple[int, ...], float]:

@@ -1,4 +1,4 @@
-"""The kernels as WebAssembly modules without Python: Cython's C, a C compiler for wasm32, a linker.
+"""The kernels as WebAssembly modules without Python: what cut.py takes out of Cython's C, a compiler for wasm32.
 
     python lavender/web/compile.py FOLDER          from the root of the project, or wherever lavender_ext lies
 
@@ -7,12 +7,11 @@ it: it works on the memory of the first and imports nothing else.
 
 Only the standard library and Cython are imported, so that setup.py can run this before anything is built.
 
-Cython translates a module to C that holds its Python part and its core. The linker keeps what the exported
-core functions reach, and nothing else; three checks make that safe:
+The core functions `cdef public ... lav_*` of the modules are cut out with what they reach. Three checks make that safe:
 
-* no symbol may stay undefined, so a core that calls Python, libm or malloc does not link;
-* no data may be left (`__data_end == __global_base`), since a module-level variable or an imported function
-  pointer is filled by the initialisation of a Python module, which never runs here;
+* what is reached must not name Python, and no symbol may stay undefined: a core that calls Python, a function of
+  another module by pointer, a variable of a module, libm or malloc does not build;
+* no data may be left (`__data_end == __global_base`);
 * the finished module is read back: no imports (the memory alone, of one that works beside another), exactly the
   expected functions, a size below its limit.
 
@@ -25,21 +24,18 @@ as `clang --target=wasm32-wasi` and `wasm-ld`.
 
 from __future__ import annotations
 
-import hashlib
 import importlib.util
 import os
-import re
 import runpy
 import shlex
 import shutil
 import subprocess
 import sys
-import sysconfig
 import tempfile
 from collections.abc import Iterable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 __all__ = [
     "LARGEST",
@@ -81,39 +77,11 @@ class Part:
 #: Modules of the page by name; the first stands alone.
 PARTS = {"lavender": Part(MODULES, LARGEST), "newton": Part(("warm.substep",), 130_000, beside=True)}
 MEMORY = "env.memory"
-CIMPORT = re.compile(r"^from lavender_ext\.([\w.]+) cimport", re.MULTILINE)
+CUT: dict[str, Any] = runpy.run_path(str(Path(__file__).resolve().with_name("cut.py")))
 #: Name of the custom section with the hash of the sources.
 SECTION = "lavender.sources"
 #: What the host needs beside the functions: where free memory begins, and the proof that no data is left.
 EDGES = ("__heap_base", "__data_end", "__global_base")
-
-#: CPython's headers describe the machine they were installed on; wasm32 has 4-byte pointers. This file stands
-#: in for their pyconfig.h.
-PYCONFIG = "\n".join(
-    [
-        "#ifndef Py_PYCONFIG_H",
-        "#define Py_PYCONFIG_H",
-        *(
-            f"#define {name} {value}"
-            for name, value in {
-                "SIZEOF_SHORT": 2, "SIZEOF_INT": 4, "SIZEOF_LONG": 4, "SIZEOF_LONG_LONG": 8, "SIZEOF_VOID_P": 4,
-                "SIZEOF_SIZE_T": 4, "SIZEOF_UINTPTR_T": 4, "SIZEOF_WCHAR_T": 4, "SIZEOF_TIME_T": 8, "SIZEOF_OFF_T": 8,
-                "SIZEOF_FLOAT": 4, "SIZEOF_DOUBLE": 8, "SIZEOF_FPOS_T": 16, "SIZEOF_PID_T": 4, "ALIGNOF_LONG": 4,
-                "ALIGNOF_SIZE_T": 4,
-            }.items()
-        ),
-        *(
-            f"#define {name} 1"
-            for name in (
-                "STDC_HEADERS", "HAVE_STDINT_H", "HAVE_STDDEF_H", "HAVE_STDLIB_H", "HAVE_STRING_H", "HAVE_SYS_TYPES_H",
-                "HAVE_PROTOTYPES", "HAVE_DECL_ISINF", "HAVE_DECL_ISNAN", "HAVE_DECL_ISFINITE", "HAVE_SSIZE_T",
-                "HAVE_PTHREAD_STUBS",
-            )
-        ),
-        "#endif",
-        "",
-    ]
-)  # fmt: skip
 
 
 class BuildFailed(Exception):
@@ -130,9 +98,9 @@ class Built:
     compiler: str
 
 
-def why_not() -> str:
-    """Why no module can be built here; empty when it can."""
-    if importlib.util.find_spec("Cython") is None:
+def why_not(of_kernels: bool = True) -> str:
+    """Why no module can be built here, of kernels or of C that is there; empty when it can."""
+    if of_kernels and importlib.util.find_spec("Cython") is None:
         return "Cython is not installed (pip install 'lavender-contact[wasm]')"
     named = os.environ.get("LAVENDER_WASM_CC", "")
     if named and shutil.which(shlex.split(named)[0]) is None:
@@ -142,35 +110,12 @@ def why_not() -> str:
             "no compiler for WebAssembly: pip install 'lavender-contact[wasm]' brings ziglang, or set "
             "LAVENDER_WASM_CC and LAVENDER_WASM_LD"
         )
-    if not named and sys.version_info < (3, 11):
-        return (
-            f"the headers of CPython {sys.version_info[0]}.{sys.version_info[1]} do not compile for wasm32; "
-            "build with CPython 3.11 or newer"
-        )
-    if not Path(sysconfig.get_paths()["include"], "Python.h").exists():
-        return f"CPython's headers are not in {sysconfig.get_paths()['include']}: install them (python3-dev)"
     return ""
 
 
-def core_functions(text: str) -> list[str]:
-    """Names of the core functions `cdef public ... lav_*` in the source of a module."""
-    return re.findall(r"^cdef public [^(\n]*?\b(lav_\w+)\(", text, re.MULTILINE)
-
-
 def source_hash(root: Path, modules: Iterable[str | Path] = MODULES) -> str:
-    """Hash of everything that a build of these modules reads of lavender_ext; arguments as for `build`."""
-    open_, seen = _paths(root, modules), set()
-    while open_:
-        path = open_.pop()
-        if path in seen or not path.exists():
-            continue
-        seen.add(path)
-        text = path.read_text(encoding="utf-8")
-        open_ += [path.with_suffix(".pxd"), *(_path(root, name, ".pxd") for name in CIMPORT.findall(text))]
-    found = hashlib.sha256()
-    for path in sorted({*seen, _path(root, "build_options", ".py")}):
-        found.update(path.name.encode() + b"\0" + path.read_text(encoding="utf-8").encode() + b"\0")
-    return found.hexdigest()
+    """Hash of everything that a build of these modules reads; arguments as for `build`."""
+    return str(CUT["source_hash"](root, modules))
 
 
 def is_current(path: Path, root: Path, part: Part) -> bool:
@@ -178,20 +123,11 @@ def is_current(path: Path, root: Path, part: Part) -> bool:
     return path.exists() and read_module(path.read_bytes()).sources == source_hash(root, part.modules)
 
 
-def _path(root: Path, name: str, suffix: str) -> Path:
-    return root.joinpath("lavender_ext", *name.split(".")).with_suffix(suffix)
-
-
-def _paths(root: Path, modules: Iterable[str | Path]) -> list[Path]:
-    return [m if isinstance(m, Path) else _path(root, m, ".pyx") for m in modules]
-
-
 def build(
     out: Path,
     root: Path,
     modules: Iterable[str | Path] = MODULES,
     *,
-    include: Path | None = None,
     largest: int | None = None,
     beside: bool = False,
 ) -> Built:
@@ -205,8 +141,6 @@ def build(
         Folder that holds the package lavender_ext with its sources.
     modules : iterable of str or Path
         Names in lavender_ext, as `judge.measure`, or paths of .pyx files.
-    include : Path, optional
-        CPython's headers; None: those of this interpreter.
     largest : int, optional
         Size that is refused [bytes]; `LARGEST`.
     beside : bool
@@ -224,62 +158,49 @@ def build(
     reason = why_not()
     if reason:
         raise BuildFailed(reason)
-    paths = _paths(root, modules)
-    names = [name for path in paths for name in core_functions(path.read_text(encoding="utf-8"))]
-    compiler, linker, named = _tools()
-    options = runpy.run_path(str(root / "lavender_ext" / "build_options.py"))
+    modules = list(modules)
+    names = CUT["core_functions"](root, modules)
     with tempfile.TemporaryDirectory(prefix="lavender-wasm-") as folder:
-        work = Path(folder)
-        headers = work / "include"
-        shutil.copytree(include or sysconfig.get_paths()["include"], headers)
-        (headers / "pyconfig.h").write_text(PYCONFIG)
-        directives = [f"-X{name}={value}" for name, value in options["directives"]().items()]
-        flags = [
-            *options["COMPILE_FLAGS"],
-            *["-O3", "-g0", "-w", "-ffunction-sections", "-fdata-sections"],
-            # Older clangs call memset and memcpy where zig writes the instructions that stand for them.
-            *(["-mbulk-memory"] if named else []),
-            f"-I{headers}",
-        ]
-
-        def compile_one(path: Path) -> Path:
-            name = f"{path.parent.name}-{path.stem}"
-            source, target = work / f"{name}.c", work / f"{name}.o"
-            _run([sys.executable, "-m", "cython", *directives, str(path), "-o", str(source)], root)
-            _run([*compiler, *flags, "-c", str(source), "-o", str(target)], root)
-            return target
-
-        with ThreadPoolExecutor(os.cpu_count()) as pool:
-            objects = list(pool.map(compile_one, paths))
-        module = work / "module.wasm"
-        keep = ["--no-entry", "--gc-sections", "-s", *(f"--export={name}" for name in (*names, *EDGES))]
-        keep += ["--import-memory"] if beside else []
+        source = Path(folder, "module.c")
         try:
-            _run([*linker, *keep, *map(str, objects), "-o", str(module)], root)
-        except BuildFailed as error:
-            if "undefined symbol" not in str(error):
-                raise
-            raise BuildFailed(
-                f"a kernel needs Python, libm or malloc, which are not there:\n{error}"
-            ) from None
-        data = module.read_bytes()
-        found = read_module(data)
-        _check(found, names, len(data), LARGEST if largest is None else largest, (MEMORY,) if beside else ())
-        data += _section(SECTION, source_hash(root, paths).encode())
-        # Moved into place in one step: whoever reads `out` at the same time sees the old file or the new one.
-        out = out.resolve()  # a link stays, what is behind it is replaced
-        part = out.with_name(out.name + f".{os.getpid()}")
-        if out.exists() and not out.is_file():
-            raise BuildFailed(
-                f"cannot write {out}: it is no file, and is not replaced; give the name of a file"
-            )
-        try:
-            part.write_bytes(data)
-            part.replace(out)
-        except OSError as error:
-            part.unlink(missing_ok=True)
-            raise BuildFailed(f"cannot write {out}: {error.strerror or error}") from None
-    return Built(len(data), tuple(sorted(names)), found.imports, shlex.join(compiler))
+            parts = CUT["translate"](root, modules, source.parent, root / "build" / "cython")
+            source.write_text(CUT["cut"](parts, roots=names), encoding="utf-8")
+        except CUT["CutFailed"] as error:
+            raise BuildFailed(str(error)) from None
+        data = _compiled(source, names, ["--import-memory"] if beside else [])
+    found = read_module(data)
+    _check(found, names, len(data), LARGEST if largest is None else largest, (MEMORY,) if beside else ())
+    data += _section(SECTION, source_hash(root, modules).encode())
+    # Moved into place in one step: whoever reads `out` at the same time sees the old file or the new one.
+    out = out.resolve()  # a link stays, what is behind it is replaced
+    part = out.with_name(out.name + f".{os.getpid()}")
+    if out.exists() and not out.is_file():
+        raise BuildFailed(f"cannot write {out}: it is no file, and is not replaced; give the name of a file")
+    try:
+        part.write_bytes(data)
+        part.replace(out)
+    except OSError as error:
+        part.unlink(missing_ok=True)
+        raise BuildFailed(f"cannot write {out}: {error.strerror or error}") from None
+    return Built(len(data), tuple(sorted(names)), found.imports, shlex.join(_tools()[0]))
+
+
+def _compiled(source: Path, names: Iterable[str], more: Iterable[str] = ()) -> bytes:
+    """The module of one C file that needs no header of Python's: what these functions reach."""
+    compiler, linker, named = _tools()
+    # Older clangs call memset and memcpy where zig writes the instructions that stand for them.
+    flags = ["-std=c11", "-O3", "-g0", "-w", "-ffp-contract=off", "-ffunction-sections"]
+    flags += ["-mbulk-memory"] if named else []
+    compiled, linked = source.with_suffix(".o"), source.with_suffix(".wasm")
+    _run([*compiler, *flags, "-c", str(source), "-o", str(compiled)], source.parent)
+    keep = ["--no-entry", "--gc-sections", "-s", *(f"--export={name}" for name in (*names, *EDGES)), *more]
+    try:
+        _run([*linker, *keep, str(compiled), "-o", str(linked)], source.parent)
+    except BuildFailed as error:
+        if "undefined symbol" not in str(error):
+            raise
+        raise BuildFailed(f"a kernel needs Python, libm or malloc, which are not there:\n{error}") from None
+    return linked.read_bytes()
 
 
 def _tools() -> tuple[list[str], list[str], bool]:
@@ -290,32 +211,22 @@ def _tools() -> tuple[list[str], list[str], bool]:
     return named or [*zig, "cc", "-target", "wasm32-wasi"], linker, bool(named)
 
 
-def build_library(out: Path, source: Path, names: Iterable[str]) -> Module:
-    """One C file that needs no header of Python's, its functions exported with the memory; nothing is imported.
+def build_library(out: Path, source: Path, names: Iterable[str]) -> None:
+    """A module of one C file, its functions exported with the memory, nothing imported; works in the file's folder.
 
     Raises
     ------
     BuildFailed
         No compiler, or the file needs a function that is not in it.
     """
-    compiler, linker, named = _tools()
-    if not named and importlib.util.find_spec("ziglang") is None:
-        raise BuildFailed(
-            "no compiler for WebAssembly: pip install 'lavender-contact[wasm]' brings ziglang, or set "
-            "LAVENDER_WASM_CC and LAVENDER_WASM_LD"
-        )
-    with tempfile.TemporaryDirectory(prefix="lavender-wasm-") as folder:
-        compiled, linked = Path(folder, "library.o"), Path(folder, "library.wasm")
-        flags = ["-std=c11", "-O3", "-g0", "-ffp-contract=off", *(["-mbulk-memory"] if named else [])]
-        _run([*compiler, *flags, "-c", str(source), "-o", str(compiled)], source.parent)
-        keep = ["--no-entry", "--gc-sections", "-s", *(f"--export={name}" for name in (*names, *EDGES))]
-        _run([*linker, *keep, str(compiled), "-o", str(linked)], source.parent)
-        data = linked.read_bytes()
-    found = read_module(data)
-    if found.imports:
-        raise BuildFailed(f"the module imports {', '.join(found.imports)}; it must stand alone")
+    reason = why_not(of_kernels=False)
+    if reason:
+        raise BuildFailed(reason)
+    data = _compiled(source, names)
+    imports = read_module(data).imports
+    if imports:
+        raise BuildFailed(f"the module imports {', '.join(imports)}; it must stand alone")
     out.write_bytes(data)
-    return found
 
 
 def _run(command: list[str], folder: Path) -> None:

@@ -10,9 +10,9 @@ from clib import METHODS, Motion, Refused
 from tower import self_test_hash, self_test_problem
 
 import lavender as lv
-from lavender.export.vectors import METHODS_OF_PLANS
+from lavender.export.vectors import METHODS_OF_PLANS, pack
 from lavender.export.vectors import turns as turns_of
-from lavender.export.view import OTHER_BITS, NotTaken
+from lavender.export.view import OTHER_BITS, NotTaken, takes
 from lavender_ext.driver.driver import Driver
 from lavender_ext.newton.solve import OUTCOMES
 
@@ -121,6 +121,30 @@ def test_every_method_has_the_bits_of_the_package(library, at):
         if tol and name not in ("newton", "direct"):
             assert said.iterations == found.iterations, case
     assert ran >= 4
+
+
+def test_vectors_are_of_methods_that_the_library_takes(library):
+    looked = set()
+    for given in GIVEN:
+        problem = library.problem(given)
+        for name in METHODS:
+            try:
+                lv.solve(given, name, tol=0, max_iter=1)
+            except lv.CapabilityError:
+                continue
+            code = library.c.lav_takes(ct.byref(problem), ct.byref(library.options(name)))
+            assert takes(given, name) == (code == 0), (name, given.law, given.cones.kind)
+            looked.add((name, code))
+    assert len(looked) > len(METHODS)
+
+
+def test_no_vector_of_sweeps_over_a_matrix_that_the_library_does_not_form():
+    rng = np.random.default_rng(0)
+    given = lv.Problem.from_jacobian(
+        rng.normal(size=(9, 12)), np.eye(12) + 0.1, rng.normal(size=12), cones=lv.Cones.contacts(0.5, count=3)
+    )
+    with pytest.raises(NotTaken, match="formed A"):
+        pack(given, "pgs", 0.0, 5, {})
 
 
 @pytest.mark.parametrize("order", ["symmetric", "random", "reverse"])

@@ -1,7 +1,7 @@
 """C without Python, cut out of the C that Cython writes: what given functions reach, and nothing else.
 
-    cut(translations, front)      one C file of the kernels that `front` (C of ours) uses, `front` at its end
-    amalgamate(root)              the library of lavender.h
+    translate(root, modules, work)      the C of modules of lavender_ext
+    cut(translations, front, roots)     one C file of what `front` (C of ours, at its end) and `roots` use
 
 Cython writes a module's core (`cdef ... noexcept nogil`) and its Python part into one file, and what several modules
 cimport into each of them. Every file is read token by token into its declarations (structs, enums, typedefs, functions,
@@ -18,49 +18,60 @@ Only the standard library is imported, so that setup.py can run this before anyt
 from __future__ import annotations
 
 import hashlib
+import json
 import re
 import runpy
 import subprocess
 import sys
-import tempfile
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import ClassVar
 
-__all__ = ["FRONT", "MODULES", "CutFailed", "Item", "amalgamate", "cut", "read", "source_hash", "translate"]
+__all__ = ["CutFailed", "Item", "core_functions", "cut", "path_of", "read", "source_hash", "translate"]
 
-#: Modules of lavender_ext that the library reaches into, and C of ours: what comes before the kernels, what after them.
-MODULES = (
-    "core.assemble",
-    "core.generalized",
-    "core.order",
-    "core.problem",
-    "judge.measure",
-    "judge.watch",
-    "sweep.serial",
-    "local.gauss_seidel",
-    "accelerate.accelerated",
-    "accelerate.admm",
-    "driver.driver",
-    "pivot.principal",
-    "pivot.tableau",
-    "factor.graph",
-    "factor.sparse",
-    "engine.arrays",
-    "engine.substep",
-    "host.memory",
-)
-PROLOGUE, FRONT = (
-    "prologue.c",
-    ("front.c", "problem.c", "judge.c", "solve.c", "methods.c", "pivots.c", "full.c"),
-)
+PUBLIC = re.compile(r"^cdef public [^(\n]*?\b(lav_\w+)\(", re.MULTILINE)
 CIMPORT = re.compile(r"^from lavender_ext\.([\w.]+) cimport", re.MULTILINE)
 
 #: The condition of `front` under which the small build leaves things out.
 SMALL = "LAV_SWEEPS_ONLY"
-#: Words of Cython for which `front` has its own.
+#: What stands before everything: how floating point must be compiled, and words of Cython's own.
+PROLOGUE = """\
+#include <float.h>
+#include <math.h>
+#include <stddef.h>
+#include <stdint.h>
+#include <string.h>
+
+#if defined(__FAST_MATH__) || (defined(_MSC_VER) && defined(_M_FP_FAST))
+#error "lavender: -ffast-math changes what the kernels compute; build lavender.c without it"
+#endif
+#if defined(__clang__)
+#pragma STDC FP_CONTRACT OFF
+#elif defined(__GNUC__)
+#pragma GCC optimize("fp-contract=off", "no-tree-slp-vectorize")
+#elif defined(_MSC_VER)
+#pragma fp_contract(off)
+#endif
+
+/* The kernels below come out of a translator: what it declares and never uses is no mistake of theirs. */
+#if defined(__GNUC__)
+#pragma GCC diagnostic ignored "-Wunused-function"
+#pragma GCC diagnostic ignored "-Wunused-parameter"
+#pragma GCC diagnostic ignored "-Wunused-variable"
+#pragma GCC diagnostic ignored "-Wunused-but-set-variable"
+#if !defined(__clang__) /* which guesses at arrays that a loop over the size of a block fills */
+#pragma GCC diagnostic ignored "-Wmaybe-uninitialized"
+#endif
+#define CYTHON_UNUSED __attribute__((unused))
+#else
+#define CYTHON_UNUSED
+#endif
+#define likely(x) (x)
+#define unlikely(x) (x)
+"""
+#: Those words.
 PROVIDED = frozenset(
     {"CYTHON_INLINE", "CYTHON_UNUSED", "__PYX_EXTERN_C", "likely", "unlikely", "NULL", "DL_IMPORT"}
 )
@@ -355,7 +366,7 @@ def cut(translations: Iterable[tuple[str, str]], front: str = "", roots: Iterabl
     str
     """
     kept = frozenset(roots)
-    table, includes = _Table(), {}
+    table = _Table()
     for name, text in translations:
         items = read(text, name)
         for item in items:
@@ -364,9 +375,6 @@ def cut(translations: Iterable[tuple[str, str]], front: str = "", roots: Iterabl
     reached: dict[int, Item] = {}
     small: dict[int, Item] = {}
     own = read(front, "front")
-    for item in own:
-        if item.kind == "include":
-            includes[item.text] = item
     made = set().union(*(item.makes for item in own), KEYWORDS)
     table.reach(set().union(*(item.small for item in own if not item.only_full), kept) - made, True, small)
     table.reach(set().union(*(item.uses for item in own), kept) - made, False, reached)
@@ -381,7 +389,7 @@ def cut(translations: Iterable[tuple[str, str]], front: str = "", roots: Iterabl
         parts.append(_private(item, kept))
     if hidden:
         parts.append("#endif")
-    return "\n\n".join(parts) + "\n\n" + front
+    return "\n\n".join([PROLOGUE, *parts, front])
 
 
 def _private(item: Item, kept: frozenset[str]) -> str:
@@ -430,9 +438,22 @@ def _plain(name: str, kept: frozenset[str]) -> str:
 # -- Cython -------------------------------------------------------------------------------------------------
 
 
-def _sources(root: Path, module: str) -> set[Path]:
+def path_of(root: Path, module: str | Path, suffix: str = ".pyx") -> Path:
+    """The file of a module of lavender_ext, or a path of one elsewhere as it is."""
+    if isinstance(module, Path):
+        return module
+    return root.joinpath("lavender_ext", *module.split(".")).with_suffix(suffix)
+
+
+def core_functions(root: Path, modules: Iterable[str | Path]) -> list[str]:
+    """Names of the core functions `cdef public ... lav_*` in the sources of modules."""
+    texts = [path_of(root, module).read_text(encoding="utf-8") for module in modules]
+    return [name for text in texts for name in PUBLIC.findall(text)]
+
+
+def _sources(root: Path, module: str | Path) -> set[Path]:
     """Files of lavender_ext that the translation of a module reads."""
-    open_, seen = [root.joinpath("lavender_ext", *module.split(".")).with_suffix(".pyx")], set()
+    open_, seen = [path_of(root, module)], set()
     while open_:
         path = open_.pop()
         if path in seen or not path.exists():
@@ -440,35 +461,39 @@ def _sources(root: Path, module: str) -> set[Path]:
         seen.add(path)
         names = CIMPORT.findall(path.read_text(encoding="utf-8"))
         open_ += [path.with_suffix(".pxd")]
-        open_ += [root.joinpath("lavender_ext", *name.split(".")).with_suffix(".pxd") for name in names]
+        open_ += [path_of(root, name, ".pxd") for name in names]
     return seen
 
 
-def source_hash(root: Path, modules: Iterable[str] = MODULES) -> str:
-    """Hash of everything that the library is made of."""
-    here = Path(__file__).resolve().parent
+def source_hash(root: Path, modules: Iterable[str | Path], more: Iterable[Path] = ()) -> str:
+    """Hash of everything that a cut of these modules is made of, and of `more` files."""
     paths = {path for name in modules for path in _sources(root, name)}
+    how = (root / "lavender_ext" / "build_options.py", Path(__file__))
     found = hashlib.sha256()
-    for path in [*sorted(paths), Path(__file__), *(here / "front" / name for name in (PROLOGUE, *FRONT))]:
+    for path in [*sorted(paths), *how, *more]:
         found.update(path.name.encode() + b"\0" + path.read_text(encoding="utf-8").encode() + b"\0")
     return found.hexdigest()
 
 
 def translate(
-    root: Path, modules: Iterable[str], work: Path, made: Path | None = None
+    root: Path, modules: Iterable[str | Path], work: Path, made: Path | None = None
 ) -> list[tuple[str, str]]:
-    """The C of modules of lavender_ext below `root`, by Cython.
+    """The C of modules of lavender_ext below `root` (or of paths of .pyx files), by Cython.
 
     made : folder of translations of an ordinary build; one that is newer than all its sources is taken.
     """
     directives = runpy.run_path(str(root / "lavender_ext" / "build_options.py"))["directives"]()
     given = [f"-X{name}={value}" for name, value in directives.items()]
+    how = made / "how.json" if made else None
+    if not (how and how.exists() and directives in json.loads(how.read_text(encoding="utf-8"))):
+        made = None  # with every check on, or unfinished
 
-    def one(name: str) -> tuple[str, str]:
-        source = Path("lavender_ext", *name.split(".")).with_suffix(".pyx")
-        there = made / source.with_suffix(".c") if made else None
+    def one(module: str | Path) -> tuple[str, str]:
+        source = path_of(root, module)
+        name = module.stem if isinstance(module, Path) else module
+        there = made.joinpath("lavender_ext", *name.split(".")).with_suffix(".c") if made else None
         if there and there.exists():
-            newest = max(path.stat().st_mtime for path in _sources(root, name))
+            newest = max(path.stat().st_mtime for path in _sources(root, module))
             if there.stat().st_mtime > newest:
                 return name, there.read_text(encoding="utf-8")
         out = work / f"{name}.c"
@@ -482,17 +507,3 @@ def translate(
 
     with ThreadPoolExecutor(2) as pool:
         return list(pool.map(one, modules))
-
-
-def amalgamate(root: Path, made: Path | None = None) -> str:
-    """lavender.c, from the sources of lavender_ext below `root`; `made` as for `translate`."""
-    here = Path(__file__).resolve().parent / "front"
-    front = "".join((here / name).read_text(encoding="utf-8") for name in FRONT)
-    version = runpy.run_path(str(here.parent.parent / "_version.py"))["__version__"]
-    with tempfile.TemporaryDirectory() as work:
-        kernels = cut(translate(root, MODULES, Path(work), made), front)
-    head = (
-        f"/* liblavender of lavender {version}: the kernels without Python, then the functions of lavender.h.\n"
-        f" * Made, not written: changes belong into the kernels. Sources {source_hash(root)}\n */\n"
-    )
-    return head + (here / PROLOGUE).read_text(encoding="utf-8") + kernels
