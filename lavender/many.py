@@ -18,7 +18,7 @@ from lavender.errors import InputError
 from lavender.problem import Problem
 from lavender.registry import SolverSpec, get
 from lavender.solution import Solution
-from lavender.solve import of_batch, solve, solve_few
+from lavender.solve import check_budget, of_batch, solve, solve_few
 from lavender.solvers._newton import general
 from lavender_ext.few.many import Batch
 
@@ -56,7 +56,7 @@ def solve_many(
     Raises
     ------
     InputError
-        `threads` is not a whole number from 1, or `impulses` of another length than `problems`.
+        `threads` is not a whole number from 1, `impulses` of another length than `problems`, or as `solve`.
     UnknownName, CapabilityError, SolverUnavailable
         As `solve`, for the first problem that is refused.
     """
@@ -68,6 +68,7 @@ def solve_many(
     starts = [None] * len(given) if impulses is None else list(impulses)
     made: list[Solution | None] = [None] * len(given)
     spec = get(solver)
+    check_budget(spec, tol, max_iter, options.get("time_limit"))
     more = {"tol": tol, "max_iter": max_iter, **options}
     plain = not options and max_iter is None
     together = (

@@ -200,7 +200,7 @@ class Prepared:
             )
         try:
             plain = max_iter is None and time_limit is None and callback is None
-            tol, max_iter, time_limit = _check_budget(self.spec, tol, max_iter, time_limit)
+            tol, max_iter, time_limit = check_budget(self.spec, tol, max_iter, time_limit)
             _check_records(self.spec, history, callback)
             self._refresh(problem)
             if plain and self.spec.delegates and self.spec.few is not None and not (self.options or history):
@@ -548,15 +548,24 @@ def _check_problem(problem: Problem, spec: SolverSpec) -> None:
         raise CapabilityError(f"solver {spec.name!r} {reason}")
 
 
-def _check_budget(
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)
+
+
+def check_budget(
     spec: SolverSpec, tol: float, max_iter: int | None, time_limit: float | None
 ) -> tuple[float, int, float | None]:
-    if not isinstance(tol, (int, float, np.number)) or not 0.0 <= tol < math.inf:
+    """The three as numbers, `max_iter` the spec's where it is None.
+
+    Raises
+    ------
+    InputError
+        A wrong one.
+    """
+    if not _is_number(tol) or not 0.0 <= tol < math.inf:
         raise InputError(f"tol is {tol!r}; a number >= 0 is needed (0 runs the whole budget)")
     max_iter = whole_number("max_iter", spec.max_iter if max_iter is None else max_iter)
-    if time_limit is not None and (
-        not isinstance(time_limit, (int, float, np.number)) or not time_limit > 0.0
-    ):
+    if time_limit is not None and (not _is_number(time_limit) or not time_limit > 0.0):
         raise InputError(f"time_limit is {time_limit!r}; seconds above 0, or None")
     return float(tol), max_iter, time_limit
 

@@ -17,6 +17,7 @@ __all__ = [
     "Record",
     "Run",
     "Skip",
+    "asked_of",
     "file_name",
     "from_json",
     "level_name",
@@ -33,6 +34,11 @@ def level_name(level: float) -> str:
     mantissa, _, exponent = f"{level:.3e}".partition("e")
     mantissa = mantissa.rstrip("0").rstrip(".")
     return f"{mantissa}e{int(exponent)}"
+
+
+def asked_of(mode: str, tol: float, max_iter: int) -> str:
+    """What a run is asked for, in words: to 1e-6, or 16 iterations."""
+    return f"{max_iter} iterations" if mode == "budget" else f"to {level_name(tol)}"
 
 
 LONGEST_NAME = 120  # characters of a file's name: file systems take 255 bytes, with a suffix
@@ -229,6 +235,12 @@ class Record(_Texts):
     def key(self) -> tuple[Any, ...]:
         """What makes two records the same measurement."""
         return measurement_key(self)
+
+    @property
+    def asked(self) -> str:
+        """The budget or the level, and the order of sweeps where it is another."""
+        order = "" if self.order == "given" else f", order {self.order}"
+        return asked_of(self.mode, self.tol, self.max_iter) + order
 
     @property
     def usable(self) -> bool:

@@ -22,7 +22,7 @@ from lavender.bench.record import CaseInfo, Done, Entry, Record, Run, Skip, from
 from lavender.errors import InputError, UnknownName
 from lavender.io.stored import MAX_BYTES, destination, write_atomically, write_text
 
-__all__ = ["Records", "Store", "read", "write_csv", "write_json"]
+__all__ = ["Records", "Store", "opened", "read", "write_csv", "write_json"]
 
 MOST_LINE = 2**26  # bytes of a record; the longest of ours hold a few thousand
 BLOCK = 2**16  # bytes that are looked through at once for the end of a line
@@ -229,6 +229,16 @@ class Store:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+@contextlib.contextmanager
+def opened(store: Store | str | Path | None) -> Iterator[Store | None]:
+    """A store as it is; of a path, one that is closed at the end."""
+    if store is None or isinstance(store, Store):
+        yield store
+        return
+    with Store(store) as made:
+        yield made
 
 
 def _cut_torn_line(path: Path) -> None:

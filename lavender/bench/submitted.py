@@ -69,7 +69,7 @@ class Submission:
             numbers = [sum(v.agrees is said for v in mine) for said in (True, False, None)]
             out.append(" | ".join([solver, *map(str, numbers), *times]))
         for v in self.disagreements:
-            out.append(f"DISAGREES: {v.record.solver} on {v.record.case}, {_asked(v.record)}: {v.note}")
+            out.append(f"DISAGREES: {v.record.solver} on {v.record.case}, {v.record.asked}: {v.note}")
         out += [f"NOT VERIFIED: {text}" for text in self.others]
         notes = [v.note for v in self.lines if v.agrees is None]
         out += [f"not verified, {notes.count(note)}: {note}" for note in dict.fromkeys(notes)]
@@ -201,7 +201,3 @@ def _compared(
     near = math.isclose(r.relative, here.relative, rel_tol=1e-3) and "contradicted" not in one + two
     agrees = one == two or near
     return Verified(r, here, agrees, "" if agrees else f"{one} there, {two} here")
-
-
-def _asked(r: Record) -> str:
-    return f"to {r.tol:g}" if r.mode == "tol" else f"{r.max_iter} iterations"

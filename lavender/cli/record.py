@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -16,7 +17,12 @@ __all__ = ["record"]
 @click.option("--steps", default=500, show_default=True, help="Steps of the simulation.")
 @click.option("--every", default=5, show_default=True, help="Steps between two problems.")
 @click.option(
-    "--controls", default="zero", show_default=True, metavar="zero|random|FILE", help="FILE: .npy, (any, nu)."
+    "--controls",
+    "control",
+    default="zero",
+    show_default=True,
+    metavar="zero|random|FILE",
+    help="FILE: .npy, (any, nu).",
 )
 @click.option("--seed", default=0, show_default=True, help="Of random controls.")
 @click.option(
@@ -28,29 +34,11 @@ __all__ = ["record"]
 @precision_option
 @click.pass_context
 def record(
-    context: click.Context,
-    model: Path,
-    steps: int,
-    every: int,
-    controls: str,
-    seed: int,
-    out: Path,
-    replace: bool,
-    precision: str | None,
+    context: click.Context, /, model: Path, out: Path, steps: int, precision: str | None, **asked: Any
 ) -> None:
     """Run a MuJoCo model (MJCF) and keep its constraint problems, for `lavender report OUT`."""
     from lavender.io.recording import record_file
 
-    if controls != "random":
+    if asked["control"] != "random":
         refuse_unused(context, ["seed"], "without --controls random")
-    found = record_file(
-        model,
-        out,
-        steps,
-        every=every,
-        control=controls,
-        seed=seed,
-        replace=replace,
-        precision=precision or "float64",
-    )
-    click.echo(str(found))
+    click.echo(str(record_file(model, out, steps, precision=precision or "float64", **asked)))

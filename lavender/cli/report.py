@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
@@ -28,11 +27,6 @@ from lavender.cli.options import (
 )
 from lavender.errors import InputError
 from lavender.io.stored import write_text
-
-if TYPE_CHECKING:
-    from lavender.bench import Records
-    from lavender.bench.peers import Peers
-    from lavender.report.engine import Contestant
 
 __all__ = ["report"]
 
@@ -126,8 +120,12 @@ def report(
     """
     from lavender import bench
     from lavender.bench.peers import read as read_peers
-    from lavender.report.engine import contestants
+    from lavender.report.contents import engine_table
+    from lavender.report.engine import ENGINES, contestants
+    from lavender.report.table import print_table
+    from lavender.report.terminal import print_report
     from lavender.report.text import count
+    from lavender.report.write import write
 
     for limit in time_budgets:
         if not (math.isfinite(limit) and limit > 0.0):
@@ -152,10 +150,18 @@ def report(
         plan = asked.plan(files, time_budgets, sweeps)
         done = measure(files, asked, plan, path, sequence, fresh, given=named, lines=True)
     engines = [] if campaign else contestants(files, done.records.latest())
-    index = _show(
-        done.records, out, old=old, times=time_budgets, sweeps=sweeps, peers=rivals, engines=engines, tables=tables,
-        paper=paper, figures=not no_figures,
-    )  # fmt: skip
+    shown: dict[str, Any] = {"old": old, "times": time_budgets, "sweeps": sweeps}
+    print_report(done.records, console(), whole=tables, **shown)
+    if engines:
+        _say(f"\n{ENGINES}")
+        print_table(console(), engine_table(engines))
+    index = write(done.records, out, figures=not no_figures, peers=rivals, engines=engines, **shown)
+    if paper:
+        from lavender.report.paper import write_paper
+
+        _say(
+            f"figures, tables and method of a paper: {write_paper(done.records, out / 'paper', time_budgets)}"
+        )
     _say(f"\n{len(done.records)} runs in {out / 'records.csv'}, page: {index}")
     if done.note:
         _say(done.note)
@@ -169,40 +175,6 @@ def report(
 
 def _say(text: str, **more: Any) -> None:
     console().print(text, highlight=False, markup=False, soft_wrap=True, **more)
-
-
-def _show(
-    records: Records,
-    out: Path,
-    *,
-    old: Records | None,
-    times: Sequence[float],
-    sweeps: Sequence[int],
-    peers: Peers | None,
-    engines: Sequence[Contestant],
-    tables: bool,
-    paper: bool,
-    figures: bool,
-) -> Path:
-    """On the terminal, and everything in the folder; the path of the page."""
-    from lavender.report.contents import engine_table
-    from lavender.report.engine import ENGINES
-    from lavender.report.table import print_table
-    from lavender.report.terminal import print_report
-    from lavender.report.write import write
-
-    print_report(records, console(), old=old, times=times, sweeps=sweeps, whole=tables)
-    if engines:
-        _say(f"\n{ENGINES}")
-        print_table(console(), engine_table(engines))
-    index = write(
-        records, out, figures=figures, old=old, times=times, sweeps=sweeps, peers=peers, engines=engines
-    )
-    if paper:
-        from lavender.report.paper import write_paper
-
-        _say(f"figures, tables and method of a paper: {write_paper(records, out / 'paper', times)}")
-    return index
 
 
 def _refuse_unused(context: click.Context, files: tuple[str, ...], solvers: tuple[str, ...] | None) -> None:

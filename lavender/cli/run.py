@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -57,20 +58,12 @@ __all__ = ["run"]
 @click.pass_context
 def run(
     context: click.Context,
+    /,
     scene: str,
     steps: int,
-    iterations: int | None,
-    warm_start: bool,
     stepper: str | None,
     parameters: tuple[str, ...],
-    residual: bool,
-    plot: Path | None,
-    trace: Path | None,
-    record: Path | None,
-    skip: int,
-    view: bool,
-    film: Path | None,
-    replace: bool,
+    **asked: Any,
 ) -> None:
     """Run a LavenderSim scene of the gallery; record its steps as a sequence for `report`.
 
@@ -79,6 +72,7 @@ def run(
     """
     from lavender.engine import run_scene
 
+    record = asked["record"]
     if record is None:
         refuse_unused(context, ["skip", "replace"], "without --record")
 
@@ -91,19 +85,10 @@ def run(
     found = run_scene(
         scene,
         steps=steps,
-        iterations=iterations,
-        warm_start=warm_start,
         parameters={**parameters_of(parameters), **({} if stepper is None else {"stepper": stepper})},
-        residual=residual,
-        trace=trace,
-        plot=plot,
-        record=record,
-        skip=skip,
-        replace=replace,
-        view=view,
-        film=film,
         every=1 if live else max(1, steps // 20),
         show=show,
+        **asked,
     )
     if live:
         click.echo()
@@ -111,8 +96,8 @@ def run(
     click.echo(
         f"{found.scene}: {len(found)} steps, {found.time[-1]:.3f} s, order {found.order}, {best:.3g} ms a step at best"
     )
-    for name, path in (("trace", trace), ("figure", plot), ("film", film)):
-        if path is not None:
-            click.echo(f"{name}: {path}")
+    for name, option in (("trace", "trace"), ("figure", "plot"), ("film", "film")):
+        if asked[option] is not None:
+            click.echo(f"{name}: {asked[option]}")
     if record is not None:
         click.echo(f"{found.recorded} problems in {record}: lavender report {record}")

@@ -7,13 +7,15 @@ function (daqp, quadprog, scs) have that in it, too.
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from time import perf_counter
 from typing import Any
 from unittest.mock import patch
 
 __all__ = ["OWN", "own_time"]
+
+SETUP = ("setup", "init")  # methods of such classes that take the data
 
 #: module:class.method or module:function, as the calls in this package and in qpsolvers look them up.
 OWN = {
@@ -31,11 +33,13 @@ OWN = {
 
 
 class _Watched:
-    """An object of a backend, one of whose methods is timed."""
+    """An object of a backend, some of whose methods are timed."""
 
-    def __init__(self, inner: Any, method: str, timed: Callable[..., Any]) -> None:
+    def __init__(self, inner: Any, methods: Sequence[str], timed: Callable[..., Any]) -> None:
         object.__setattr__(self, "_inner", inner)
-        object.__setattr__(self, method, timed(getattr(inner, method)))
+        for method in methods:
+            if hasattr(inner, method):
+                object.__setattr__(self, method, timed(getattr(inner, method)))
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._inner, name)
@@ -45,17 +49,22 @@ class _Watched:
 
 
 @contextmanager
-def own_time(solver: str) -> Iterator[list[float]]:
-    """A list that receives the time [s] of each call into the backend; it stays empty where that is not known."""
+def own_time(
+    solver: str, clock: Callable[[], float] = perf_counter, setup: bool = False
+) -> Iterator[list[float]]:
+    """A list that receives the time [s] of each call into the backend; it stays empty where that is not known.
+
+    With `setup` what it works out of the data before it solves is in it, too.
+    """
     spent: list[float] = []
 
     def timed(function: Callable[..., Any]) -> Callable[..., Any]:
         def call(*args: Any, **kwargs: Any) -> Any:
-            begun = perf_counter()
+            begun = clock()
             try:
                 return function(*args, **kwargs)
             finally:
-                spent.append(perf_counter() - begun)
+                spent.append(clock() - begun)
 
         return call
 
@@ -67,7 +76,8 @@ def own_time(solver: str) -> Iterator[list[float]]:
             true = getattr(module, name)
 
             def watched(*args: Any, true: Any = true, method: str = method, **kwargs: Any) -> Any:
-                return _Watched(true(*args, **kwargs), method, timed)
+                make, more = (timed(true), SETUP) if setup else (true, ())
+                return _Watched(make(*args, **kwargs), (method, *more), timed)
 
             stack.enter_context(patch.object(module, name, watched if method else timed(true)))
         yield spent

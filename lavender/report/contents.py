@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 
-from lavender.bench.record import Skip, file_name, level_name
+from lavender.bench.record import Record, Skip, file_name, level_name
 from lavender.bench.store import Records
 from lavender.report import tables
 from lavender.report.engine import Contestant
@@ -177,7 +177,7 @@ def idle_table(records: Records) -> Table:
     return Table(["case", "rows", "solver", "velocity", "energy"], rows)
 
 
-def failure_table(failures: Sequence[tables.Failure], campaign: bool) -> Table:
+def failure_table(failures: Sequence[Record], campaign: bool) -> Table:
     """Runs that missed what they were asked for, and false claims; of a campaign cases have no part of the page."""
     rows: Rows = [
         [

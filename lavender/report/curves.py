@@ -60,10 +60,6 @@ class Figure:
     floor: float = math.nan
 
 
-def _asked(r: Record) -> str:
-    return f"to {level_name(r.tol)}" if r.mode == "tol" else f"{r.max_iter} iterations"
-
-
 def _in_order_of_work(runs: list[Record]) -> list[Record]:
     # Times of microseconds jitter; iterations and tolerances do not.
     if any(r.mode == "budget" for r in runs):
@@ -83,7 +79,7 @@ def work_precision(records: Records, case: str) -> Figure:
                     who(solver, start),
                     tuple(r.time_min for r in runs),
                     tuple(max(r.relative, TINY) for r in runs),
-                    tuple(map(_asked, runs)),
+                    tuple(r.asked for r in runs),
                     thin=start != "cold",
                 )
             )

@@ -1,8 +1,9 @@
 """Small problems in one compiled call, and the claim that goes with its counts.
 
-Few rows of bodies or of A (`lavender_ext/few/chain.pyx`), generalised coordinates where Newton's method is counted to
-cost little (`lavender_ext/few/many.pyx`): what Python costs outweighs such a problem. The call ends with a solution or
-not at all: then the solver runs as on any problem, from the beginning.
+Few rows of bodies or of A (`lavender_ext/few/chain.pyx`), islands of few rows under friction, however many
+(`lavender_ext/few/islands.pyx`), generalised coordinates where Newton's method is counted to cost little
+(`lavender_ext/few/many.pyx`): what Python costs outweighs such a problem. The call ends with a solution or not at all:
+then the solver runs as on any problem, from the beginning.
 """
 
 from __future__ import annotations
@@ -21,13 +22,21 @@ from lavender.residuals import judged, reference
 from lavender.solution import Claim, Status, Turn
 from lavender.solvers import _rates as rates
 from lavender.solvers._counts import sweep_cost
+from lavender.solvers._islands import islands
 from lavender.solvers._newton import general
 from lavender_ext.few.chain import Chain
+from lavender_ext.few.islands import Islands
 from lavender_ext.few.many import Gate, solve_first
 
 FIRST_LOOK, LAST_LOOK = 16, 64  # sweeps before the first look at the residual: so many at least and at most,
 LOOKED = 60e3  # ns, or as cost so much: a look and a cut in the sweeps are not free
 WARM = 1e-3  # relative residual from which an iterate is worth starting from
+# Rows of an island at most: dense factors of so many cost less than the sweeps and factors of all islands together,
+# which under the cone law are few.
+ISLAND = {"coulomb": 150, "cone": 12}
+SWEPT = 16  # sweeps of an island at most, before its factors
+IN_ALL = 10  # times as long, as sweeps and factors of all islands mostly take
+LONGEST = 2.5e8  # ns of SWEPT sweeps of all islands at most: nobody looks for Ctrl-C in between
 # All that `general_cost` reads, by law.
 GENERAL = (
     rates.GENERAL_START,
@@ -57,21 +66,21 @@ def call_ends_within(problem: Problem, time_limit: float | None) -> bool:
         cost = general_cost(problem, problem.generalized.nv)
     else:
         per = sweep_cost(problem)
-        cost = first_look(per) * per
+        cost = (first_look(per) if problem.m <= FEW else IN_ALL * SWEPT) * per
     return 4e-9 * cost <= time_limit
 
 
-def prepared(problem: Problem) -> Chain | None:
-    """The chain of a problem of few rows, kept with it; None where it has none."""
+def prepared(problem: Problem) -> Any:
+    """The chain of a problem of few rows, or its islands of few, kept with it; None where it has neither."""
     kept = problem.derived.chain
     if kept is None:
         kept = problem.derived.chain = _make(problem) or False
     return kept or None
 
 
-def _make(problem: Problem) -> Chain | None:
-    if not 0 < problem.m <= FEW:
-        return None
+def _make(problem: Problem) -> Chain | Islands | None:
+    if problem.m > FEW:
+        return _divided(problem)
     reference(problem)
     data, start = problem.metric, problem._start
     relative = data.start_relative
@@ -88,6 +97,22 @@ def _make(problem: Problem) -> Chain | None:
     split = 0 if problem.rows is None else problem.rows.n_joints
     look = first_look(sweep_cost(problem))
     return Chain(data, start, relative, split=split, exact=law == "cone", first_look=look)
+
+
+def _divided(problem: Problem) -> Islands | None:
+    cones = problem.cones
+    if problem.law in ("linear", "lcp") or cones.has_round or cones.has_rolling:
+        return None
+    if SWEPT * sweep_cost(problem) > LONGEST:
+        return None
+    count, label = islands(problem)
+    if count == 1 or np.bincount(label, np.diff(cones.ptr)).max() > ISLAND[problem.law]:
+        return None
+    reference(problem)
+    data = problem.metric
+    if len(data.empty) or data.start_relative < 0.0:
+        return None
+    return Islands(data, problem.csr_data, problem._start, label, count, SWEPT)
 
 
 @dataclass(frozen=True)
@@ -114,7 +139,7 @@ class Few:
                 return None
             found = solve_first(kept.view, impulse, tol, self.gate, general.ROOM)
         else:
-            chain = prepared(problem)
+            chain = prepared(problem) if problem.m <= FEW or self.sweeps else None
             if chain is None or not (self.pivots if chain.pivots else self.sweeps):
                 return None
             found = chain.run(impulse, tol, self.looks, WARM, self.looks) or False
@@ -158,9 +183,16 @@ class Few:
                 message += " -> " + said("lemke", {"pivots": path})
                 work["pivots"] = exchanged + path
             return Claim(Status.CONVERGED, done + path, work, message)
-        done, sweeps, restarts = counts
+        done, sweeps, restarts, *more = counts
         work = {"sweeps": sweeps, "restarts": restarts}
-        return Claim(Status.CONVERGED, done, work, said("anderson", work))
+        if not more:
+            return Claim(Status.CONVERGED, done, work, said("anderson", work))
+        factorisations, driven, count = more
+        message = said(f"anderson on {count} islands", work)
+        if driven:
+            work["factorisations"] = factorisations
+            message += " -> " + said(f"newton on {driven} islands", {"factorisations": factorisations})
+        return Claim(Status.CONVERGED, done, work, message)
 
 
 def turns_of(problem: Problem, claim: Claim, start: FloatArray | None, after: float) -> tuple[Turn, ...]:
@@ -170,14 +202,21 @@ def turns_of(problem: Problem, claim: Claim, start: FloatArray | None, after: fl
     cold = start is None or np.array_equal(start, problem._start)
     assert start is not None or cold
     before = float(problem.metric.start_relative) if cold else judged(problem, start.copy()).relative  # type: ignore
-    names = [part.split()[0] for part in claim.message.split(" -> ")]
-    if len(names) == 1:
-        return (Turn(names[0], dict(claim.work), before, after),)
-    path = int(
-        claim.message.split()[-2]
-    )  # of `lemke`, after exchanges that were stuck; nobody looked between them
-    work = dict(claim.work) | {"pivots": claim.work["pivots"] - path}
-    return Turn(names[0], work, before, nan), Turn(names[1], {"pivots": path}, nan, after)
+    parts = claim.message.split(" -> ")
+    if len(parts) == 1:
+        return (Turn(_who(parts[0]), dict(claim.work), before, after),)
+    # Of `lemke` after exchanges that were stuck, of `newton` on islands; nobody looked between the two.
+    count, what = parts[1].split()[-2:]
+    work = dict(claim.work)
+    work[what] -= int(count)
+    first = {kind: done for kind, done in work.items() if done}
+    return Turn(_who(parts[0]), first, before, nan), Turn(_who(parts[1]), {what: int(count)}, nan, after)
+
+
+def _who(words: str) -> str:
+    """The solver in what is said of it, and on how many islands."""
+    name, on, _ = words.partition(" islands")
+    return name + on if on else name.split()[0]
 
 
 def said(name: str, work: Mapping[str, int]) -> str:

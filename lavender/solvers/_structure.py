@@ -19,7 +19,7 @@ from lavender.solvers import _rates as weights
 from lavender.solvers._accelerated import sweep_work
 from lavender.solvers._counts import dense_factor, newton_factor, sparse_factor
 from lavender.solvers._factor import PanelsLU, choose, filled_cost, panels_cost
-from lavender.solvers._few import general_cost
+from lavender.solvers._few import general_cost, prepared
 from lavender.solvers._islands import block_bodies
 from lavender.solvers._newton import general
 from lavender.solvers._newton.systems import System, make_system
@@ -176,7 +176,9 @@ class Structure:
     @property
     def is_small(self) -> bool:
         """One compiled call is tried before all else."""
-        return self.goes_first or (self.problem.generalized is None and self.m <= FEW)
+        if self.problem.generalized is not None:
+            return self.goes_first
+        return self.m <= FEW or prepared(self.problem) is not None
 
     @cached_property
     def velocities(self) -> float:

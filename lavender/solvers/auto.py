@@ -19,7 +19,7 @@ import numpy as np
 from lavender._arrays import FloatArray
 from lavender.deadline import Deadline
 from lavender.problem import OPERATORS, Problem
-from lavender.registry import FEW, SolverSpec
+from lavender.registry import SolverSpec
 from lavender.solution import Claim, Status
 from lavender.solvers._certify import certify
 from lavender.solvers._few import AUTO, call_ends_within
@@ -76,8 +76,7 @@ class Auto:
     ) -> Claim:
         problem = state.problem
         deadline = Deadline(time_limit)
-        few = problem.m <= FEW or problem.generalized is not None
-        if few and n >= ONE_CALL and call_ends_within(problem, time_limit):
+        if n >= ONE_CALL and call_ends_within(problem, time_limit):
             made = AUTO.solve(problem, impulse, tol)
             claim = None if made is None else AUTO.claim(problem, made[1])
             if made is not None and claim is not None and claim.iterations <= n:
@@ -98,7 +97,9 @@ class Auto:
         except KeyboardInterrupt:
             interrupted = True  # the best impulse goes back all the same
         impulse[:] = log.impulse
-        nothing = "the start is a solution" if log.best <= tol else "no time for anything"
+        nothing = "no time for anything" if n > 0 else "no iterations were asked for"
+        if log.best <= tol:
+            nothing = "the start is a solution"
         return Claim(
             Status.INTERRUPTED if interrupted else log.status,
             log.iterations,

@@ -61,3 +61,9 @@ cdef struct said_t:
     int32_t factorisations
     double relative             # residual of lambda
     const double* direction     # (m) N s of a CERTIFICATE, or NULL
+
+
+cdef public int32_t lav_room(const view_t* v, const asked_t* o, room_t* r) noexcept nogil
+cdef public int32_t lav_start(const view_t* v, const asked_t* o, room_t* r, const double* lam) noexcept nogil
+cdef public int32_t lav_step(const view_t* v, const asked_t* o, const room_t* r, int32_t work, double* lam,
+                             said_t* said) noexcept nogil

@@ -178,7 +178,9 @@ def test_the_same_command_goes_on_where_it_was_killed(tmp_path, monkeypatch):
     path.write_bytes(b"".join(lines[:7]) + lines[7][: len(lines[7]) // 2])
     kept = len(bench.read(path))
     made = []
-    monkeypatch.setattr(runner, "measure", lambda p, task: made.append(task) or timing.measure(p, task))
+    monkeypatch.setattr(
+        runner, "measure_impulse", lambda *args: made.append(args[1]) or timing.measure_impulse(*args)
+    )
     again = bench.run(problems, ["pgs", "direct"], QUICK, path)
     assert [r.key for r in again] == [r.key for r in whole]
     assert len(made) == len(whole) - kept
@@ -521,7 +523,7 @@ def test_a_level_of_a_sequence_is_solved_to_that_level():
     assert {r.tol for r in records if r.solver == "pgs"} == set(plan.levels)
     for advice in lv.report.tables.advice_by_sequence(records)[0]:
         assert all(
-            float(c.how.removeprefix("tol ").partition(",")[0]) <= advice.target for c in advice.ranking
+            float(c.how.removeprefix("to ").partition(",")[0]) <= advice.target for c in advice.ranking
         )
 
 

@@ -63,7 +63,7 @@ def test_a_verdict_that_was_changed_is_found(submitted, tmp_path, solver, change
     path.write_text(lines_of(submitted, forge))
     done = CliRunner().invoke(cli, ["check", str(path), "--solvers", solver])
     assert done.exit_code == 1, done.output
-    assert f"DISAGREES: {solver} on {which.case}, to {which.tol:g}: {said}" in done.output
+    assert f"DISAGREES: {solver} on {which.case}, to {bench.level_name(which.tol)}: {said}" in done.output
 
 
 def test_a_residual_of_a_budget_that_was_changed_is_found(submitted):

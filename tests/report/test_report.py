@@ -675,7 +675,7 @@ def test_sequences_are_compared_carried_against_cold(tmp_path):
     assert (line.name, line.size, line.sequence) == ("load", 4, True)
     # Only an exact solver, or a run to the level, brings all four steps there; nothing is done in a nanosecond.
     best = line.by_level[1e-6].best
-    assert (best.solved, best.cases, best.how in ("tol 1e-6, cold", "tol 1e-6, carried")) == (4, 4, True)
+    assert (best.solved, best.cases, best.how in ("to 1e-6, cold", "to 1e-6, carried")) == (4, 4, True)
     assert line.by_time[1e-9].best is None
     reached = {c.solver: c for c in line.by_time[10.0].ranking}
     means = {

@@ -10,13 +10,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from random_problems import as_matrix, random_contact_problem, random_lcp, seeds
 from random_trees import random_general
+from scipy.sparse import block_diag
 
 import lavender as lv
 from benchmarks.drawn import wild
+from benchmarks.islands import forms, fresh, stacks
 from lavender import registry, suite
 from lavender.registry import FEW
 from lavender.solvers import _rates as rates
-from lavender.solvers._few import AUTO, general_cost
+from lavender.solvers._few import AUTO, ISLAND, call_ends_within, general_cost
 from lavender.solvers._newton import general
 from lavender_ext.few.many import solve_first
 
@@ -232,3 +234,65 @@ def test_the_compiled_gate_lets_in_what_is_counted_to_cost_little(seed):
     found = solve_first(problem.metric, None, np.inf, AUTO.gate, general.ROOM)
     cost = general_cost(problem, general.prepare(problem).largest)
     assert (found is not None) == (cost <= rates.GENERAL_FIRST)
+
+
+def side_by_side(parts):
+    """One problem, given by A, of which each is an island."""
+    cones = parts[0].cones
+    for part in parts[1:]:
+        cones = cones + part.cones
+    b = np.concatenate([part.b for part in parts])
+    return lv.Problem(b, cones, block_diag([p.csr for p in parts], format="csr"), friction=parts[0].friction)
+
+
+@pytest.mark.parametrize("friction", ["coulomb", "cone"])
+@pytest.mark.parametrize("form", ["bodies", "matrix"])
+@pytest.mark.parametrize("equal", [True, False])
+@pytest.mark.parametrize("tol", [1e-3, 1e-6, 1e-10])
+def test_islands_under_friction_are_one_call(friction, form, equal, tol):
+    problem = forms(stacks(40, 2, 0.4, equal, corners=1))[form].relaxed(friction)
+    found = check(problem, "auto", tol=tol)
+    assert found.success and "anderson on 40 islands" in found.message
+    near = found.impulse * (1.0 + 1e-4 * np.random.default_rng(1).normal(size=problem.m))
+    assert check(problem, "auto", tol=tol, impulse=near).success
+    assert check(problem, "auto", tol=tol, impulse=found.impulse).work == {}
+    each = found.impulse.reshape(40, -1)
+    assert np.array_equal(each, np.tile(each[0], (40, 1))) == equal
+
+
+@given(seed=seeds, law=st.sampled_from(["coulomb", "cone"]))
+@settings(max_examples=25)
+def test_random_islands_are_solved_whichever_comes_first(seed, law):
+    rng = np.random.default_rng(seed)
+    parts = [
+        as_matrix(random_contact_problem(seed + i, law, bodies=2, joints=0, contacts=int(rng.integers(1, 5))))
+        for i in range(24)
+    ]
+    parts = [part for part in parts if part.m <= ISLAND[law]] or parts
+    there, back = side_by_side(parts), side_by_side(parts[::-1])
+    found, turned = lv.solve(there, tol=1e-8), lv.solve(back, tol=1e-8)
+    assert found.success == turned.success
+    if not found.success or "on" not in found.message + turned.message:
+        return
+    # Each by itself, to its share: sums of the whole in another order move a share by a rounding, no answer.
+    at = np.cumsum([0, *(part.m for part in parts)])
+    pieces = np.split(found.impulse, at[1:-1])
+    np.testing.assert_array_equal(np.concatenate(pieces[::-1]), turned.impulse)
+
+
+def test_an_island_that_does_not_end_leaves_the_whole_to_the_long_way():
+    stack = forms(stacks(40, 2, 0.4, False, corners=1))["matrix"].relaxed("cone")
+    no_answer = lv.Problem(np.array([1.0, -1.0]), lv.Cones.free(2), np.ones((2, 2)), friction="cone")
+    problem = side_by_side([stack, no_answer])
+    assert registry.get("auto").few.solve(fresh(problem), None, 1e-6) is None
+    found = lv.solve(problem)
+    assert found.status.name == "INFEASIBLE" and found.certificate is not None
+
+
+def test_islands_are_no_one_call_where_that_may_take_too_long():
+    problem = forms(stacks(40, 2, 0.4, False))["matrix"]
+    assert registry.get("auto").few.solve(fresh(problem), None, 1e-6) is not None
+    assert not call_ends_within(problem, 1e-6) and call_ends_within(problem, 10.0)
+    pile = stacks(3, 1 + ISLAND["coulomb"] // 12, 0.4, False)  # 12 rows for each cube
+    assert registry.get("auto").few.solve(pile, None, 1e-6) is None
+    assert registry.get("newton").few.solve(fresh(problem), None, 1e-6) is None

@@ -25,7 +25,8 @@ def test_a_sweep_is_the_update_written_densely_in_every_form(kind, seed):
         twins.sweep(problem, a, lam, range(problem.n_blocks))
     # 1e-12 of the largest impulse: a few hundred roundings, none amplified; of J and M those of their inverses.
     size = np.abs(lam).max()
-    np.testing.assert_allclose(sweeps(problem, "sequential_impulses", 5), lam, atol=1e-12 * size, rtol=0)
+    if lv.get("sequential_impulses").refuses(problem) is None:
+        np.testing.assert_allclose(sweeps(problem, "sequential_impulses", 5), lam, atol=1e-12 * size, rtol=0)
     for form, given_by in FORMS.items():
         atol = 1e-9 * size if form == "J and M" else 1e-12 * size
         np.testing.assert_allclose(sweeps(given_by(problem), "pgs", 5), lam, atol=atol, rtol=0)

@@ -15,7 +15,7 @@ import functools
 import importlib.util
 import subprocess
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from time import monotonic, process_time
@@ -28,12 +28,14 @@ from lavender import registry
 from lavender._arrays import FloatArray
 from lavender.bench.peers.contest import SCRATCH, TARGETS, Call, Contestant
 from lavender.cones import CONTACT
-from lavender.errors import CapabilityError, InputError
+from lavender.errors import InputError
+from lavender.external import clarabel_cone
 from lavender.external._running import Limits
-from lavender.external.as_qp import QP, impulse_form, velocity_form
+from lavender.external.as_qp import FORMS, QP, bound_rows, impulse_form, velocity_form
 from lavender.external.backend import Backend
 from lavender.external.backends import BACKENDS
 from lavender.external.qp_solver import QPSolver, refusal
+from lavender.external.stopwatch import own_time
 from lavender.problem import Problem
 from lavender.residuals import reference
 from lavender.solve import prepare
@@ -43,6 +45,10 @@ __all__ = ["LADDER", "check_siconos", "contestants"]
 #: Settings of other solvers, loose to tight: their own measures, in units where unknowns are near 1.
 LADDER = (1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10, 1e-12, 1e-14)
 START = 60.0  # s, wall: imports of a backend on a loaded machine
+QUICK = {
+    **dict.fromkeys(("daqp", "quadprog"), (("", True),)),
+    **dict.fromkeys(("piqp", "proxqp"), ((" sparse", False), (" dense", True))),
+}
 DENSE_ROWS = 1700  # rows up to which Siconos' solvers of dense matrices are asked
 
 # -- ours ------------------------------------------------------------------------------------------
@@ -81,21 +87,15 @@ def _limits(eps: float, n: int, limit: float) -> Limits:
     return Limits(eps, max(1e-2 * eps, 1e-18), max(1e-4 * eps, 1e-16), n, limit)
 
 
-def _timed(
-    qp: QP, call: Callable[[], tuple[FloatArray | None, FloatArray | None]]
-) -> tuple[float, FloatArray]:
-    start = process_time()
-    x, zeta = call()
-    seconds = process_time() - start
-    blank = qp.problem.start()
-    if x is None or len(x) != qp.n:
-        return seconds, blank
-    if qp.form == "velocity" and (zeta is None or len(zeta) != len(qp.b)):
-        return seconds, blank
-    return seconds, qp.impulse(x, np.zeros(0) if zeta is None else zeta)
+def _impulse(qp: QP, x: FloatArray | None, zeta: FloatArray | None) -> FloatArray:
+    if x is None or len(x) != qp.n or (qp.form == "velocity" and (zeta is None or len(zeta) != len(qp.b))):
+        return qp.problem.start()
+    return qp.impulse(x, np.zeros(0) if zeta is None else zeta)
 
 
-def _backend(backend: Backend, form: str) -> Contestant:
+def _backend(backend: Backend, form: str, own: str = "") -> Contestant:
+    """A backend as `lavender.external` calls it; under the name `own` its own set-up and solve count alone."""
+
     def runs(problem: Problem, limit: float) -> Iterator[Call]:
         qp = QPSolver(backend, form=form).prepare(problem)
         if form == "velocity" and backend.definite and not qp.is_definite:
@@ -103,171 +103,27 @@ def _backend(backend: Backend, form: str) -> Contestant:
         start = problem.start()
 
         def once(eps: float) -> tuple[float, FloatArray]:
-            def solve() -> tuple[FloatArray | None, FloatArray | None]:
+            begun = process_time()
+            with own_time(backend.name if own else "", process_time, setup=True) as spent:
                 answer = backend.run(qp, start, _limits(eps, backend.max_iter, limit), {})
-                return answer.x, answer.zeta
+            seconds = sum(spent) if own else process_time() - begun
+            return seconds, _impulse(qp, answer.x, answer.zeta)
 
-            return _timed(qp, solve)
-
-        own = backend.call is None and backend.settings is None  # runs at its own tolerance
-        for eps in LADDER[:1] if own else LADDER:
+        untold = backend.call is None and backend.settings is None  # runs at its own tolerance
+        for eps in LADDER[:1] if untold else LADDER:
             yield functools.partial(once, eps)
 
     def refuses(problem: Problem) -> str | None:
         if form == "velocity" and problem.rows is None:
             return "no rows"
-        if problem.law not in registry.get(backend.name).laws:
+        spec = registry.get(backend.name)
+        if problem.law not in spec.laws or (backend is clarabel_cone.BACKEND and problem.law != "cone"):
             return "friction"
-        return registry.get(backend.name).refuses(problem)
-
-    return Contestant(f"{backend.name} ({form})", True, runs, refuses)
-
-
-def _direct(name: str, form: str) -> Contestant:
-    """Backends whose call is quick enough for an adapter to weigh: arrays ready, their own interface alone."""
-
-    def runs(problem: Problem, limit: float) -> Iterator[Call]:
-        qp = velocity_form(problem) if form == "velocity" else impulse_form(problem)
-        if name == "quadprog" and form == "velocity" and not qp.is_definite:
-            return
-        solve = {"daqp": _daqp, "quadprog": _quadprog}.get(name) or functools.partial(
-            {"piqp": _piqp, "proxqp": _proxqp}[name.split()[0]], dense=name.endswith("dense")
-        )
-        call = solve(qp, limit)
-        for eps in LADDER[-1:] if name == "quadprog" else LADDER:
-            yield functools.partial(_timed, qp, functools.partial(call, eps))
-
-    def refuses(problem: Problem) -> str | None:
-        if problem.law not in ("linear", "lcp"):
-            return "for bounded rows"
-        if form == "velocity" and problem.rows is None:
-            return "no rows"
-        if problem.m > DENSE_ROWS and not name.endswith("sparse"):
+        if own and backend.dense and problem.m > DENSE_ROWS:
             return "a dense matrix"
-        return refusal(problem)
+        return spec.refuses(problem)
 
-    return Contestant(f"{name}, own interface ({form})", True, runs, refuses)
-
-
-Solve = Callable[[float], tuple[FloatArray | None, FloatArray | None]]
-
-
-def _bounds(qp: QP) -> tuple[FloatArray, FloatArray]:
-    none = np.full(qp.n, np.inf)
-    return -none if qp.lb is None else qp.lb, none if qp.ub is None else qp.ub
-
-
-def _daqp(qp: QP, limit: float) -> Solve:
-    import daqp
-
-    low, high = _bounds(qp)
-    bounded = qp.lb is not None
-    k, z = qp.n if bounded else 0, qp.n_zero
-    below = np.full(len(qp.b), -1e30)
-    below[:z] = qp.b[:z]
-    upper = np.clip(np.concatenate([high[:k], qp.b]), -1e30, 1e30)
-    lower = np.clip(np.concatenate([low[:k], below]), -1e30, 1e30)
-    sense = np.zeros(len(upper), np.int32)
-    sense[k : k + z] = 5  # an equation
-    h, f, a = qp.P.toarray(), qp.q.copy(), np.ascontiguousarray(qp.A.toarray())
-
-    def solve(eps: float) -> tuple[Any, Any]:
-        x, _, _, info = daqp.solve(
-            h, f, a, upper, lower, sense, primal_tol=max(eps, 1e-11), dual_tol=max(eps, 1e-13),
-            iter_limit=100_000, time_limit=limit,
-        )  # fmt: skip
-        return np.asarray(x), np.asarray(info["lam"])[k:]
-
-    return solve
-
-
-def _quadprog(qp: QP, limit: float) -> Solve:
-    import quadprog
-
-    z = qp.n_zero
-    low, high = _bounds(qp)
-    at, to = np.flatnonzero(np.isfinite(low)), np.flatnonzero(np.isfinite(high))
-    eye = np.eye(qp.n)
-    rows, p = qp.A.toarray(), qp.P.toarray()
-    if not len(qp.b) + len(at) + len(to):
-        raise CapabilityError("quadprog takes no problem without constraints")
-    c = np.asfortranarray(np.vstack([rows[:z], -rows[z:], eye[at], -eye[to]]).T)
-    d = np.concatenate([qp.b[:z], -qp.b[z:], low[at], -high[to]])
-
-    def solve(eps: float) -> tuple[Any, Any]:
-        x, _, _, _, lagrangian, _ = quadprog.solve_qp(p, -qp.q, c, d, z)
-        zeta = lagrangian[: len(qp.b)].copy()
-        zeta[:z] *= -1.0
-        return x, zeta
-
-    return solve
-
-
-def _piqp(qp: QP, limit: float, dense: bool) -> Solve:
-    import piqp
-
-    z = qp.n_zero
-    low, high = _bounds(qp)
-    p, rows = (qp.P.toarray(), qp.A.toarray()) if dense else (qp.P, qp.A.tocsr())
-    equal, unequal = (rows[:z], rows[z:]) if dense else (sp.csc_matrix(rows[:z]), sp.csc_matrix(rows[z:]))
-    below = np.full(len(qp.b) - z, -np.inf)
-
-    def solve(eps: float) -> tuple[Any, Any]:
-        solver = piqp.DenseSolver() if dense else piqp.SparseSolver()
-        bounds = _limits(eps, 250, limit)
-        s = solver.settings
-        s.eps_abs, s.eps_rel, s.max_iter, s.check_duality_gap = bounds.eps, 0.0, 250, True
-        s.eps_duality_gap_abs, s.eps_duality_gap_rel = bounds.gap, bounds.gap_relative
-        solver.setup(p, qp.q, equal, qp.b[:z], unequal, below, qp.b[z:], low, high)
-        solver.solve()
-        found = solver.result
-        return np.array(found.x), np.concatenate([found.y, np.asarray(found.z_u) - np.asarray(found.z_l)])
-
-    return solve
-
-
-def _proxqp(qp: QP, limit: float, dense: bool) -> Solve:
-    from proxsuite import proxqp
-
-    z, n = qp.n_zero, qp.n
-    boxed = qp.lb is not None
-    low, high = (np.clip(x, -1e20, 1e20) for x in _bounds(qp))
-    below = np.full(len(qp.b) - z, -1e20)
-    if dense:
-        p, rows = qp.P.toarray(), qp.A.toarray()
-        equal, unequal = rows[:z], rows[z:]
-    else:
-        # Its sparse solver has no box: bounds are rows.
-        p, equal, unequal = qp.P, sp.csc_matrix(qp.A[:z]), sp.csc_matrix(qp.A[z:])
-        if boxed:
-            unequal = sp.csc_matrix(sp.vstack([unequal, sp.eye_array(n)]))
-    over = qp.b[z:]
-    if boxed and not dense:
-        below, over = np.concatenate([below, low]), np.concatenate([over, high])
-
-    def solve(eps: float) -> tuple[Any, Any]:
-        solver = proxqp.dense.QP(n, z, len(over), boxed) if dense else proxqp.sparse.QP(n, z, len(over))
-        s, bounds = solver.settings, _limits(eps, 10_000, limit)
-        s.eps_abs, s.eps_rel, s.max_iter, s.check_duality_gap = bounds.eps, 0.0, 10_000, True
-        s.eps_duality_gap_abs, s.eps_duality_gap_rel = bounds.gap, bounds.gap_relative
-        box = (low, high) if dense and boxed else ()
-        solver.init(p, qp.q, equal, qp.b[:z], unequal, below, over, *box)
-        solver.solve()
-        found = solver.results
-        return np.array(found.x), np.concatenate([found.y, np.asarray(found.z)[: len(qp.b) - z]])
-
-    return solve
-
-
-def _stacked(qp: QP, first: int) -> tuple[sp.csc_matrix, FloatArray, int]:
-    # Rows and right-hand side with the finite bounds put in after `first` rows, and how many there are.
-    if qp.lb is None or qp.ub is None:
-        return qp.A, qp.b, 0
-    low, high = np.flatnonzero(np.isfinite(qp.lb)), np.flatnonzero(np.isfinite(qp.ub))
-    eye = sp.csr_matrix(sp.eye_array(qp.n))
-    rows = sp.csc_matrix(sp.vstack([qp.A[:first], -eye[low], eye[high], qp.A[first:]]))
-    rhs = np.concatenate([qp.b[:first], -qp.lb[low], qp.ub[high], qp.b[first:]])
-    return rows, rhs, len(low) + len(high)
+    return Contestant(f"{own or backend.name} ({form})", True, runs, refuses)
 
 
 def _cone(name: str, form: str) -> Contestant:
@@ -275,12 +131,11 @@ def _cone(name: str, form: str) -> Contestant:
 
     def runs(problem: Problem, limit: float) -> Iterator[Call]:
         qp = velocity_form(problem) if form == "velocity" else impulse_form(problem)
-        first = qp.n_zero + qp.n_nonneg
-        rows, rhs, more = _stacked(qp, first)
+        first, bounds = qp.n_zero + qp.n_nonneg, bound_rows(qp)
+        more = sum(len(at) for *_, at in bounds)
+        rows = sp.csc_matrix(sp.vstack([qp.A[:first], *(sign * m for sign, m, _, _ in bounds), qp.A[first:]]))
+        rhs = np.concatenate([qp.b[:first], *(h for _, _, h, _ in bounds), qp.b[first:]])
         upper = sp.csc_matrix(sp.triu(qp.P))
-
-        def zeta(y: Any) -> FloatArray:
-            return np.delete(np.asarray(y, float), np.s_[first : first + more])
 
         def scs(eps: float) -> tuple[Any, Any]:
             import scs
@@ -291,21 +146,7 @@ def _cone(name: str, form: str) -> Contestant:
                 data, cone, eps_abs=eps, eps_rel=0.0, eps_infeas=1e-14, max_iters=10**7,
                 time_limit_secs=limit, verbose=False,
             ).solve()  # fmt: skip
-            return found["x"], zeta(found["y"])
-
-        def clarabel(eps: float) -> tuple[Any, Any]:
-            import clarabel
-
-            cones: list[Any] = [clarabel.ZeroConeT(qp.n_zero)] if qp.n_zero else []
-            cones += [clarabel.NonnegativeConeT(qp.n_nonneg + more)] if qp.n_nonneg + more else []
-            cones += [clarabel.SecondOrderConeT(size) for size in qp.soc]
-            settings = clarabel.DefaultSettings()
-            settings.verbose, settings.max_threads, settings.time_limit = False, 1, limit
-            bounds = _limits(eps, 200, limit)
-            settings.tol_feas, settings.tol_gap_abs = bounds.eps, bounds.gap
-            settings.tol_gap_rel = bounds.gap_relative
-            found = clarabel.DefaultSolver(upper, qp.q, rows, rhs, cones, settings).solve()
-            return np.asarray(found.x), zeta(found.z)
+            return found["x"], found["y"]
 
         def qoco(eps: float) -> tuple[Any, Any]:
             import qoco
@@ -319,11 +160,16 @@ def _cone(name: str, form: str) -> Contestant:
                 max_iters=200,
             )  # fmt: skip
             found = solver.solve()
-            return np.asarray(found.x), zeta(np.concatenate([np.asarray(found.y)[:z], np.asarray(found.z)]))
+            return np.asarray(found.x), np.concatenate([np.asarray(found.y)[:z], np.asarray(found.z)])
 
-        solve: Callable[[float], tuple[Any, Any]] = {"scs": scs, "clarabel": clarabel, "qoco": qoco}[name]
+        def once(eps: float) -> tuple[float, FloatArray]:
+            begun = process_time()
+            x, y = scs(eps) if name == "scs" else qoco(eps)
+            seconds = process_time() - begun
+            return seconds, _impulse(qp, x, np.delete(np.asarray(y, float), np.s_[first : first + more]))
+
         for eps in LADDER:
-            yield functools.partial(_timed, qp, functools.partial(solve, eps))
+            yield functools.partial(once, eps)
 
     def refuses(problem: Problem) -> str | None:
         if problem.law != "cone":
@@ -528,23 +374,19 @@ def contestants(siconos: str = "") -> list[Contestant]:
     """
     ours = [name for name, spec in registry.specs().items() if not spec.external and spec.missing() is None]
     made = [_ours(name, scratch) for name in ours for scratch in (False, True)]
-    direct = {
-        "daqp": ("",),
-        "quadprog": ("",),
-        "piqp": (" sparse", " dense"),
-        "proxqp": (" sparse", " dense"),
-    }
     for backend in BACKENDS:
         if registry.specs()[backend.name].missing() is not None:
             continue
-        for form in ("impulse", "velocity"):
-            ways = direct.get(backend.name)
-            made += (
-                [_backend(backend, form)] if ways is None else [_direct(backend.name + w, form) for w in ways]
-            )
-    for name in ("scs", "clarabel", "qoco"):
-        if _installed(name):
-            made += [_cone(name, "impulse"), _cone(name, "velocity")]
+        for form in FORMS[:2]:
+            # Those whose call is quick enough for an adapter to weigh, with dense matrices and with sparse ones.
+            ways = QUICK.get(backend.name)
+            made += [_backend(backend, form)] if ways is None else [
+                _backend(replace(backend, dense=dense, warm=False), form, f"{backend.name}{word}, own interface")
+                for word, dense in ways
+            ]  # fmt: skip
+    if _installed("clarabel"):
+        made += [_backend(clarabel_cone.BACKEND, form, "clarabel cones") for form in FORMS[:2]]
+    made += [_cone(name, form) for name in ("scs", "qoco") if _installed(name) for form in FORMS[:2]]
     if _installed("pinocchio"):
         made += [_pinocchio(None), _pinocchio(20)]
     made += [_scipy("banded"), _scipy("spsolve")]

@@ -28,7 +28,7 @@ from lavender.bench.running.plan import Plan
 from lavender.bench.running.runner import Event, Watch, is_foreign, not_loaded, solver_names
 from lavender.bench.running.timing import Task, measure_impulse, one_thread
 from lavender.bench.running.worker import Worker
-from lavender.bench.store import Records, Store
+from lavender.bench.store import Records, Store, opened
 from lavender.errors import InputError
 from lavender.problem import Problem
 
@@ -147,22 +147,18 @@ def campaign(
     this = machine.describe(
         {**plan.as_dict(), "campaign": True}, {m for n in names for m in specs[n].requires}
     )
-    if store is not None and not isinstance(store, Store):
-        with Store(store) as opened:
-            return campaign(
-                items, names, plan, opened, workers=workers, backend=backend, watch=watch, memory=memory
-            )
     pairs = [
         Pair(len(names) * i + j, item.name, _travels(item), item.reason, name)
         for i, item in enumerate(items)
         for j, name in enumerate(names)
     ]
-    known = {} if store is None else _finished(store.records, this.run)
-    out = Records(source=str(store.path) if store is not None else "")
-    done = {p.index: known[p.case, p.solver] for p in pairs if (p.case, p.solver) in known}
-    out.add(this)
-    _keep(store, [this])
-    with _backend(backend) as name:
+    out = Records()
+    with opened(store) as kept, _backend(backend) as name:
+        known = {} if kept is None else _finished(kept.records, this.run)
+        out.source = str(kept.path) if kept is not None else ""
+        done = {p.index: known[p.case, p.solver] for p in pairs if (p.case, p.solver) in known}
+        out.add(this)
+        _keep(kept, [this])
         for attempt in range(ATTEMPTS + 1):
             left = [p for p in pairs if p.index not in done]
             if not left:
@@ -174,7 +170,7 @@ def campaign(
                 )
             for index, entries in _hand_out(left, Order(plan, this.run, memory), workers, name):
                 done[index], pair = entries, pairs[index]
-                _keep(store, [*entries, Done(this.run, pair.case, pair.solver)])
+                _keep(kept, [*entries, Done(this.run, pair.case, pair.solver)])
                 if watch is not None:
                     watch(Event(len(done), len(pairs), pair.case, pair.solver))
     for index in sorted(done):
@@ -343,7 +339,6 @@ def _end_with(parent: int) -> None:
 
 
 def _work(pair: Pair, order: Order) -> tuple[int, list[Any]]:
-    global _worker
     plan, run = order.plan, order.run
     try:
         problem, info = _look(pair, run)
@@ -355,13 +350,9 @@ def _work(pair: Pair, order: Order) -> tuple[int, list[Any]]:
     if reason:
         return pair.index, [info, Skip(run, pair.case, pair.solver, reason)]
     entries: list[Any] = [info]
-    tasks = plan.tasks(info, problem, spec)
-    record: Record | None = None
-    while True:
-        try:
-            task = tasks.send(record)  # type: ignore[attr-defined]
-        except StopIteration:
-            return pair.index, entries
+
+    def one(task: Task) -> Record:
+        global _worker
         task = _by_iterations(task, plan.cap)
         if is_foreign(spec):
             if _worker is None:
@@ -373,6 +364,10 @@ def _work(pair: Pair, order: Order) -> tuple[int, list[Any]]:
         record = _without_times(with_motion(record, problem, impulse) if plan.motion else record)
         record = replace(record, time_limit=plan.time_limit)
         entries.append(record)
+        return record
+
+    plan.carry_out(info, problem, spec, one)
+    return pair.index, entries
 
 
 _seen: tuple[Any, tuple[Problem, CaseInfo]] | None = None  # the case before: pairs of one case come together

@@ -19,7 +19,7 @@ from lavender.bench.running.plan import Plan
 from lavender.bench.running.runner import Watch, _Runner, is_foreign
 from lavender.bench.running.timing import Task, just_written, one_thread, outcome_of, pace, record_of
 from lavender.bench.running.worker import Worker
-from lavender.bench.store import Records, Store
+from lavender.bench.store import Records, Store, opened
 from lavender.many import solve_many
 
 __all__ = ["ROUNDS", "Ask", "finals"]
@@ -45,10 +45,8 @@ class Ask:
 
     def task(self, info: CaseInfo, plan: Plan, turns: str) -> Task:
         """One repetition of it on one case."""
-        return Task(
-            run=info.run,
-            case=info.case,
-            sha=info.sha,
+        return Task.of(
+            info,
             solver=self.solver,
             mode=self.mode,
             tol=self.tol,
@@ -56,7 +54,6 @@ class Ask:
             time_limit=self.time_limit or plan.time_limit,
             start=self.start,
             repeats=1 if self.way == "steps" else 2,
-            step=info.step,
             way=self.way,
             turns=turns,
             guarded=False,
@@ -95,16 +92,9 @@ def finals(
     Records
         `known`, with the new records.
     """
-    if store is not None and not isinstance(store, Store):
-        with Store(store) as opened:
-            return finals(
-                cases, asks, known, plan, opened, watch=watch, isolate=isolate, memory=memory, fresh=fresh
-            )
     names = list(dict.fromkeys(ask.solver for ask in asks))
-    with Worker(memory) as worker, one_thread():
-        runner = _Runner(
-            list(known.runs.values())[-1], plan, names, store, watch, worker if isolate else None
-        )
+    with opened(store) as kept, Worker(memory) as worker, one_thread():
+        runner = _Runner(list(known.runs.values())[-1], plan, names, kept, watch, worker if isolate else None)
         runner.out = known
         if fresh:
             runner.known = {}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -116,10 +117,8 @@ class Plan:
             starts.append("warm")
 
         def task(mode: str, tol: float, max_iter: int, start: str, **options: Any) -> Task:
-            return Task(
-                run=info.run,
-                case=info.case,
-                sha=info.sha,
+            return Task.of(
+                info,
                 solver=spec.name,
                 mode=mode,
                 tol=tol,
@@ -128,7 +127,6 @@ class Plan:
                 start=start,
                 options=options,
                 repeats=self.repeats,
-                step=info.step,
                 way="" if options else self.way,
             )
 
@@ -155,6 +153,16 @@ class Plan:
                     continue  # without bodies nobody knows the ground
                 more = {"seed": int(seed)} if seed else {}
                 yield task("budget", 0.0, middle, "cold", order=name, **more)
+
+    def carry_out(
+        self, info: CaseInfo, problem: Problem, spec: SolverSpec, make: Callable[[Task], Record]
+    ) -> None:
+        """Make every measurement of `tasks`."""
+        tasks = self.tasks(info, problem, spec)
+        record: Record | None = None
+        with suppress(StopIteration):
+            while True:
+                record = make(tasks.send(record))  # type: ignore[attr-defined]
 
     def _to_speeds(self, task: Callable[..., Task], spec: SolverSpec, start: str) -> Iterator[Task | None]:
         """Solves to each speed level: the motion error follows the residual by a factor that the last solve tells."""

@@ -14,13 +14,13 @@ from lavender import registry
 from lavender._arrays import FloatArray
 from lavender.bench import machine
 from lavender.bench.cases import Item, Source, describe, resolve
-from lavender.bench.record import CaseInfo, Record, Run, Skip, level_name
+from lavender.bench.record import CaseInfo, Record, Run, Skip, asked_of
 from lavender.bench.running.moved import with_motion
 from lavender.bench.running.plan import Plan
 from lavender.bench.running.sequences import carry, passes
-from lavender.bench.running.timing import Task, measure, measure_impulse, one_thread
+from lavender.bench.running.timing import Task, measure_impulse, one_thread
 from lavender.bench.running.worker import Worker
-from lavender.bench.store import Records, Store
+from lavender.bench.store import Records, Store, opened
 from lavender.errors import LavenderError
 from lavender.motion import load_reference
 from lavender.problem import Problem
@@ -110,21 +110,8 @@ def run(
     specs = registry.specs()
     packages = {module for name in names for module in specs[name].requires}
     this = machine.describe(plan.as_dict(), packages)
-    if store is not None and not isinstance(store, Store):
-        with Store(store) as opened:
-            return run(
-                items,
-                names,
-                plan,
-                opened,
-                watch=watch,
-                isolate=isolate,
-                memory=memory,
-                into=into,
-                fresh=fresh,
-            )
-    with Worker(memory) as worker:
-        runner = _Runner(this, plan, names, store, watch, worker if isolate else None)
+    with opened(store) as kept, Worker(memory) as worker:
+        runner = _Runner(this, plan, names, kept, watch, worker if isolate else None)
         if fresh:
             runner.known = {}
         if into is not None:
@@ -143,14 +130,8 @@ class _Runner:
         watch: Watch | None,
         worker: Worker | None,
     ) -> None:
-        self.this, self.plan, self.names, self.store, self.watch, self.worker = (
-            this,
-            plan,
-            names,
-            store,
-            watch,
-            worker,
-        )
+        self.this, self.plan, self.names = this, plan, names
+        self.store, self.watch, self.worker = store, watch, worker
         self.specs = registry.specs()
         self.out = Records(source=str(store.path) if store else "")
         self.done = 0
@@ -246,10 +227,8 @@ class _Runner:
         """One pass. It ends where its steps have taken `Plan.pass_limit` together, and a note says so."""
         repeats = self.plan.repeats if len(steps) <= FEW_STEPS else 1
         tasks = [
-            Task(
-                run=self.this.run,
-                case=info.case,
-                sha=info.sha,
+            Task.of(
+                info,
                 solver=spec.name,
                 mode=mode,
                 tol=tol,
@@ -258,7 +237,6 @@ class _Runner:
                 start=start,
                 options={},
                 repeats=repeats,
-                step=info.step,
                 way="steps",
             )
             for _, info in steps
@@ -287,7 +265,7 @@ class _Runner:
             self.tell(record.case, spec.name, record)
             spent, made = spent + _cost(record), made + 1
         if made < len(tasks):
-            asked = f"{max_iter} iterations" if mode == "budget" else f"to {level_name(tol)}"
+            asked = asked_of(mode, tol, max_iter)
             reason = (
                 f"stopped after {made} of {len(tasks)} steps, which took more than the pass limit of {limit:.3g} s "
                 "together (--pass-limit)"
@@ -303,9 +281,7 @@ class _Runner:
             begun = perf_counter()
             start = problem.start() if before is None else carry(*before, problem)
             task = replace(task, lead=perf_counter() - begun)
-        record, impulse = self.make_impulse(problem, task, spec, start)
-        if self.plan.motion:
-            record = with_motion(record, problem, impulse)
+        record, impulse = self.make(problem, task, spec, start)
         return record, None if impulse is None else (problem, impulse)
 
     def pair(self, info: CaseInfo, problem: Problem, name: str) -> None:
@@ -314,36 +290,27 @@ class _Runner:
         if reason:
             self.keep(Skip(self.this.run, info.case, name, reason))
             return
-        tasks = self.plan.tasks(info, problem, spec)
-        record: Record | None = None
-        while True:
-            try:
-                task = tasks.send(record)  # type: ignore[attr-defined]
-            except StopIteration:
-                return
-            found = self.known.get(task.key)
-            if found is not None:
-                record = found
+
+        def one(task: Task) -> Record:
+            record = self.known.get(task.key)
+            reused = record is not None
+            if record is not None:
                 self.out.add(record)
             else:
-                record = self.make(problem, task, spec)
+                record = self.make(problem, task, spec, None)[0]
                 self.keep(record)
-            self.tell(info.case, name, record, found is not None)
+            self.tell(info.case, name, record, reused)
+            return record
 
-    def make(self, problem: Problem, task: Task, spec: SolverSpec) -> Record:
-        if self.plan.motion:
-            record, impulse = self.make_impulse(problem, task, spec, None)
-            return with_motion(record, problem, impulse)
-        if self.worker is not None and is_foreign(spec):
-            return self.worker.measure(replace(problem, copy=False), task)
-        return measure(problem, task)
+        self.plan.carry_out(info, problem, spec, one)
 
-    def make_impulse(
-        self, problem: Problem, task: Task, spec: SolverSpec, impulse: Any
-    ) -> tuple[Record, Any]:
+    def make(self, problem: Problem, task: Task, spec: SolverSpec, impulse: Any) -> tuple[Record, Any]:
+        """The record of a task, made here or in the worker, and the impulses (m,) [N s] that came out, or None."""
         if self.worker is not None and is_foreign(spec):
-            return self.worker.measure_impulse(replace(problem, copy=False), task, impulse)
-        return measure_impulse(problem, task, impulse)
+            record, found = self.worker.measure_impulse(replace(problem, copy=False), task, impulse)
+        else:
+            record, found = measure_impulse(problem, task, impulse)
+        return with_motion(record, problem, found) if self.plan.motion else record, found
 
 
 def _cost(record: Record) -> float:

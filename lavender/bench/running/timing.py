@@ -23,7 +23,7 @@ import numpy as np
 from lavender import registry
 from lavender._arrays import FloatArray
 from lavender.bench.line import asked_of
-from lavender.bench.record import ERROR, Record, measurement_key
+from lavender.bench.record import ERROR, CaseInfo, Record, measurement_key
 from lavender.external.stopwatch import own_time
 from lavender.outcome import finish
 from lavender.problem import Problem
@@ -62,6 +62,11 @@ class Task:
     def key(self) -> tuple[Any, ...]:
         """As `Record.key` of what comes out."""
         return measurement_key(self)
+
+    @classmethod
+    def of(cls, info: CaseInfo, **what: Any) -> Task:
+        """A task on a case."""
+        return cls(run=info.run, case=info.case, sha=info.sha, step=info.step, **what)
 
     def record(self, **what: Any) -> Record:
         """A record of this task."""

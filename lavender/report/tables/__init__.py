@@ -18,7 +18,6 @@ from lavender.report.tables.advice import (
 from lavender.report.tables.campaigns import Robustness, robustness
 from lavender.report.tables.cases import (
     Claims,
-    Failure,
     Reach,
     Spread,
     budgets,
@@ -51,7 +50,6 @@ __all__ = [
     "Change",
     "Choice",
     "Claims",
-    "Failure",
     "Final",
     "Line",
     "Pass",

@@ -7,6 +7,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from statistics import median
+from typing import Any
 
 from lavender.bench.record import Record
 from lavender.bench.store import Records
@@ -56,6 +57,20 @@ class Choice:
     how: str = ""  # the budget that does it, and for a sequence whether impulses are carried
     iterations: int = 0  # of that budget, 0 where there is none
     overrun: float = math.nan  # 95th percentile of the line's time over what it was to take
+
+    @classmethod
+    def of(cls, solver: str, values: Mapping[str, float], solved: int, score: float, **more: Any) -> Choice:
+        """From what ranks it on each case, a time [s] or what is left of the residual [-]."""
+        each = list(values.values())
+        return cls(
+            solver=solver,
+            solved=solved,
+            score=score,
+            p95=quantile(each, 0.95),
+            worst=max(each),
+            hardest=max(values, key=lambda c: values[c]),
+            **{"cases": len(each), **more},
+        )
 
 
 @dataclass(frozen=True)
@@ -153,19 +168,7 @@ def to_level(
         solved = [r for r in runs.values() if r is not None]
         times = {c: math.inf if r is None else r.time_min for c, r in runs.items()}
         charged = [min(t, limit) if math.isinf(t) else t for t in times.values()]
-        sweeps = [r.work["sweeps"] for r in solved if "sweeps" in r.work]
-        middle = round(median(sweeps)) if solved and len(sweeps) == len(solved) else 0
-        choice = Choice(
-            solver=solver,
-            solved=len(solved),
-            cases=len(cases),
-            score=geometric_mean(charged, SHIFT),
-            p95=quantile(list(times.values()), 0.95),
-            worst=max(times.values()),
-            hardest=max(times, key=lambda c: times[c]),
-            how=f"{middle} sweeps" if middle else "",
-            iterations=middle,
-        )
+        choice = Choice.of(solver, times, len(solved), geometric_mean(charged, SHIFT), **_budget(solved))
         lies = any((c, solver) in liars for c in cases)
         places.append(((lies, -len(solved)), choice))
     return ranked(family, level, places, NOISE)
@@ -232,9 +235,7 @@ def within(
         hoped = _residuals({c: _closest(groups.get((c, solver), ()), NOISE * limit) for c in cases})
         hopes[solver] = ((lies, -_served(hoped)), quantile(list(hoped.values()), QUANTILE))
         done = [r for r in got.values() if r is not None]
-        budgets = [r.work["sweeps"] for r in done if "sweeps" in r.work]
-        middle = round(median(budgets)) if done and len(budgets) == len(done) else 0
-        choice = _by_residual(solver, _residuals(got), f"{middle} sweeps" if middle else "", middle)
+        choice = _by_residual(solver, _residuals(got), **_budget(done))
         places.append(((lies, -choice.solved), choice))
     found = ranked(family, limit, places, RESIDUAL_NOISE)
     if found.best is None:
@@ -258,20 +259,21 @@ def _served(residuals: Mapping[str, float]) -> int:
     return sum(r <= HALF for r in residuals.values())
 
 
-def _by_residual(solver: str, residuals: Mapping[str, float], how: str, iterations: int) -> Choice:
+def _by_residual(solver: str, residuals: Mapping[str, float], **more: Any) -> Choice:
     """A standing by what is left on each case."""
-    values = list(residuals.values())
-    return Choice(
-        solver=solver,
-        solved=_served(residuals),
-        cases=len(values),
-        score=quantile(values, QUANTILE),
-        p95=quantile(values, 0.95),
-        worst=max(values),
-        hardest=max(residuals, key=lambda c: residuals[c]),
-        how=how,
-        iterations=iterations,
-    )
+    score = quantile(list(residuals.values()), QUANTILE)
+    return Choice.of(solver, residuals, _served(residuals), score, **more)
+
+
+def _budget(runs: Sequence[Record]) -> dict[str, Any]:
+    """The median of the sweeps of these runs, where all of them count sweeps."""
+    sweeps = [r.work["sweeps"] for r in runs if "sweeps" in r.work]
+    middle = round(median(sweeps)) if runs and len(sweeps) == len(runs) else 0
+    return {"how": f"{middle} sweeps" if middle else "", "iterations": middle}
+
+
+def _steps(values: Sequence[float]) -> dict[str, float]:
+    return {f"step {i}": x for i, x in enumerate(values)}
 
 
 def counts_sweeps(r: Record) -> bool:
@@ -301,7 +303,8 @@ def advice_by_sweeps(records: Records) -> list[Advice]:
             for (solver, budget, start), by_case in runs.items():
                 if budget != n or not any(c in by_case for c in cases):
                     continue
-                choice = _by_residual(solver, _residuals({c: by_case.get(c) for c in cases}), start, n)
+                residuals = _residuals({c: by_case.get(c) for c in cases})
+                choice = _by_residual(solver, residuals, how=start, iterations=n)
                 places.append(((any((c, solver) in liars for c in cases), -choice.solved), choice))
             out.append(ranked(family, float(n), _best_of_each(places), RESIDUAL_NOISE))
     return out
@@ -347,28 +350,20 @@ def over_steps(
             taken = [t for w in some for t in w.times[start]]
             left = [r for w in some for r in w.residuals[start]]
             first, wrong = some[0], any(w.wrong[start] for w in some)
-            n, how = first.max_iter if first.mode == "budget" else 0, f"{asked}, {start}"
+            budget = {
+                "how": f"{asked}, {start}",
+                "iterations": first.max_iter if first.mode == "budget" else 0,
+            }
             if timed:
                 got = [_score(r) if t <= target else 1.0 for t, r in zip(taken, left, strict=True)]
                 got += [1.0] * (whole - len(got))
-                choice = _by_residual(solver, {f"step {i}": r for i, r in enumerate(got)}, how, n)
+                choice = _by_residual(solver, _steps(got), **budget)
             elif first.mode == "tol" and first.tol > target:
                 continue
             else:
                 solved = sum(r <= target for r in left)
                 score = geometric_mean(taken, SHIFT)
-                slow = f"step {taken.index(max(taken))}"
-                choice = Choice(
-                    solver=solver,
-                    solved=solved,
-                    cases=whole,
-                    score=score,
-                    p95=quantile(taken, 0.95),
-                    worst=max(taken),
-                    hardest=slow,
-                    how=how,
-                    iterations=n,
-                )
+                choice = Choice.of(solver, _steps(taken), solved, score, cases=whole, **budget)
             places.append(((wrong, -choice.solved), choice))
         found = ranked(name, target, _best_of_each(places), RESIDUAL_NOISE if timed else NOISE)
         (by_time if timed else by_level).append(found)

@@ -11,11 +11,11 @@ from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from lavender.bench.record import Record, level_name
+from lavender.bench.record import Record
 from lavender.bench.store import Records
 from lavender.report.tables.groups import DIED, levels_of, pairs
 
-__all__ = ["Claims", "Failure", "Reach", "Spread", "budgets", "claims", "failures", "reaches", "spreads"]
+__all__ = ["Claims", "Reach", "Spread", "budgets", "claims", "failures", "reaches", "spreads"]
 
 
 @dataclass(frozen=True)
@@ -39,22 +39,6 @@ class Reach:
     def at_floor(self) -> bool:
         """No better residual can be asked of float64."""
         return self.best <= 2.0 * self.floor
-
-
-@dataclass(frozen=True)
-class Failure:
-    """A run that missed what it was asked for, or whose claim does not hold."""
-
-    case: str
-    solver: str
-    asked: str
-    start: str
-    status: str
-    relative: float
-    floor: float
-    worst_name: str
-    contradicted: str
-    message: str
 
 
 @dataclass(frozen=True)
@@ -123,7 +107,7 @@ def reaches(records: Records, levels: Sequence[float] | None = None) -> list[Rea
     return out
 
 
-def failures(records: Records) -> list[Failure]:
+def failures(records: Records) -> list[Record]:
     """Runs to a level that the judge does not confirm (nor the floor excuses), crashes, and false claims."""
     out = []
     for r in records:
@@ -133,25 +117,7 @@ def failures(records: Records) -> list[Failure]:
         proven = r.status == "INFEASIBLE" and not r.contradicted
         lost = not math.isfinite(r.relative) or r.status.startswith(DIED)
         if (missed and not proven) or lost or r.contradicted:
-            asked = (
-                f"relative residual {level_name(r.tol)}" if r.mode == "tol" else f"{r.max_iter} iterations"
-            )
-            if r.order != "given":
-                asked += f", order {r.order}"
-            out.append(
-                Failure(
-                    case=r.case,
-                    solver=r.solver,
-                    asked=asked,
-                    start=r.start,
-                    status=r.status,
-                    relative=r.relative,
-                    floor=r.floor,
-                    worst_name=r.worst_name,
-                    contradicted=r.contradicted,
-                    message=r.message,
-                )
-            )
+            out.append(r)
     return out
 
 

@@ -17,7 +17,7 @@ from lavender._arrays import FloatArray
 from lavender.bench.line import code_of
 from lavender.bench.record import Record
 from lavender.bench.store import Records
-from lavender.report.tables.advice import FIRST, HALF, QUANTILE, Choice, counts_sweeps, quantile
+from lavender.report.tables.advice import FIRST, HALF, QUANTILE, Choice, counts_sweeps
 from lavender.report.tables.means import SHIFT, limit_of
 
 __all__ = ["WAYS", "Final", "Race", "in_time", "line_table", "lines", "to_level"]
@@ -131,17 +131,10 @@ def to_level(records: Records, some: Sequence[Final], level: float, cases: int =
         return np.asarray(np.exp(np.log(_quantile(values, QUIET) + SHIFT).mean(axis=1)) - SHIFT)
 
     def choice(i: int, value: float) -> Choice:
-        names, each = list(some[i].runs), np.quantile(times[i], QUIET, axis=1)
-        each = np.where(missed[i], math.inf, each)
-        return Choice(
-            solver=some[i].line.solver,
-            solved=int((~missed[i]).sum()),
-            cases=max(cases, len(names)),
-            score=value,
-            p95=quantile(each.tolist(), 0.95),
-            worst=float(each.max()),
-            hardest=names[int(each.argmax())],
-        )
+        each = np.where(missed[i], math.inf, np.quantile(times[i], QUIET, axis=1))
+        found = dict(zip(some[i].runs, each.tolist(), strict=True))
+        solved = int((~missed[i]).sum())
+        return Choice.of(some[i].line.solver, found, solved, value, cases=max(cases, len(found)))
 
     return _race(records, some, charged, missed, score, choice)
 
@@ -166,17 +159,15 @@ def in_time(records: Records, some: Sequence[Final], limit: float, cases: int = 
         return np.asarray(np.maximum(_inverted_cdf(each, QUANTILE), 1e-17))
 
     def choice(i: int, value: float) -> Choice:
-        names, each = list(some[i].runs), np.quantile(got[i], LATE, axis=1, method="lower")
-        return Choice(
-            solver=some[i].line.solver,
-            solved=int(served[i].sum()),
-            cases=max(cases, len(names)),
-            score=value,
-            p95=quantile(each.tolist(), 0.95),
-            worst=float(each.max()),
-            hardest=names[int(each.argmax())],
-            how=f"{some[i].line.max_iter} sweeps" if some[i].line.mode == "budget" else "",
-            iterations=some[i].line.max_iter,
+        line, each = some[i].line, np.quantile(got[i], LATE, axis=1, method="lower")
+        return Choice.of(
+            line.solver,
+            dict(zip(some[i].runs, each.tolist(), strict=True)),
+            int(served[i].sum()),
+            value,
+            cases=max(cases, len(each)),
+            how=f"{line.max_iter} sweeps" if line.mode == "budget" else "",
+            iterations=line.max_iter,
             overrun=float(np.quantile(times[i], LATE, method="lower")) / limit,
         )
 

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from statistics import median
 
-from lavender.bench.record import Record, level_name
+from lavender.bench.record import Record, asked_of
 from lavender.bench.store import Records
 
 __all__ = ["Pass", "by_sequence", "passes"]
@@ -32,7 +32,7 @@ class Pass:
     @property
     def asked(self) -> str:
         """The budget or the level."""
-        return f"{self.max_iter} iterations" if self.mode == "budget" else f"tol {level_name(self.tol)}"
+        return asked_of(self.mode, self.tol, self.max_iter)
 
     @property
     def time(self) -> dict[str, float]:
