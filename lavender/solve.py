@@ -304,7 +304,7 @@ def _make(spec: SolverSpec, options: dict[str, Any]) -> Any:
         return Foreign(spec.name, made)
     if spec.boxes <= spec.laws:
         return made
-    from lavender.solvers._polyhedral import (
+    from lavender.solvers.polyhedral import (
         ThroughRows,  # with the table of solvers, which is imported by then
     )
 

@@ -22,8 +22,8 @@ from lavender.residuals import judged, reference
 from lavender.solution import Claim, Status, Turn
 from lavender.solvers import _rates as rates
 from lavender.solvers._counts import sweep_cost
-from lavender.solvers._islands import islands
 from lavender.solvers._newton import general
+from lavender.solvers.islands import islands
 from lavender_ext.few.chain import Chain
 from lavender_ext.few.islands import Islands
 from lavender_ext.few.many import Gate, solve_first
