@@ -16,8 +16,8 @@ import numpy as np
 
 from benchmarks.auto.curves import Curve
 from lavender.problem import Problem
-from lavender.registry import FEW
-from lavender.solvers._plan import READ
+from lavender.registry import SMALL_ROWS
+from lavender.solvers._plan import READ, Costs
 from lavender.solvers._structure import Structure
 
 __all__ = ["DRAWN", "LEAST", "count_rates", "fit", "gathered", "least_squares", "middle"]
@@ -26,6 +26,7 @@ LEAST = 30  # problems that a rate stands on at least
 DRAWN = 10  # problems that the median of all laws counts for beside those of one
 LEVEL = 1e-6  # that counts are for
 POINTS = 5  # of a curve, that are fitted at most
+NINE_IN_TEN = 0.9
 KINDS = {
     "rows": ("linear", "lcp"),
     "cone": ("cone",),
@@ -45,7 +46,7 @@ def gathered(curves: Iterable[Curve], problem_of: Callable[[str], Problem]) -> l
     """
     found: dict[str, dict[str, Curve]] = {}
     for curve in curves:
-        if curve.rows > FEW:  # others are mostly solved in one compiled call
+        if curve.rows > SMALL_ROWS:  # others are mostly solved in one compiled call
             found.setdefault(curve.case, {})[curve.candidate] = curve
     return [(Structure(problem_of(case)), made) for case, made in found.items()]
 
@@ -71,10 +72,10 @@ def fit(cases: Iterable[Recorded]) -> dict[str, Any]:
     rates["direct"] = {"start": start, "row": each_row, "work": one}
     rates["formed"] = formed
     newton = [(s, c) for s, c in of("newton", "newton over rows") if _is_over_rows(s, c)]
-    start, one, *row = least_squares(
-        newton, lambda s, n: [1.0, n * s.newton, *given(s, n * s.m)], lambda s: formed * s.formed
+    start, each_row, one = least_squares(
+        newton, lambda s, n: [1.0, n * s.m, n * s.newton], lambda s: formed * s.formed
     )
-    rates["newton"] = {"start": start, "row": dict(zip(KINDS, row, strict=True)), "work": one}
+    rates["newton"] = {"start": start, "row": each_row, "work": one}
     steps = [(s, c) for s, c in of("newton over velocities") if s.kernel is not None]
     step, entry, one = least_squares(steps, lambda s, n: [n, READ * s.sweep + n * s.read, n * s.velocities])
     rates["velocities"] = {"step": step, "entry": entry, "work": one}
@@ -94,7 +95,19 @@ def fit(cases: Iterable[Recorded]) -> dict[str, Any]:
         whole = middle(part)
         by_kind = {kind: _round(middle(those, whole)) for kind, those in kinds.items()}
         rates[name] = rates[name] | {"count": by_kind if name in ("newton", "velocities") else _round(whole)}
+    rates["sure"] = _round(surely({"direct": finite, "newton": newton + steps}, rates))
     return rates
+
+
+def surely(chosen: Mapping[str, list[tuple[Structure, Curve]]], rates: Mapping[str, Any]) -> float:
+    """Times its counted cost within which NINE_IN_TEN of who factors end, of those that reach LEVEL."""
+    shares = []
+    for solver, part in chosen.items():
+        for s, curve in part:
+            rows = "newton over rows"
+            name = rows if curve.candidate == rows and s.problem.generalized is not None else solver
+            shares.append(1e9 * curve.time(LEVEL) / Costs(s.problem, LEVEL, rates, s).of(name).total)
+    return float(np.quantile([share for share in shares if math.isfinite(share)], NINE_IN_TEN))
 
 
 def middle(part: list[tuple[Structure, Curve]], pooled: float | None = None) -> float:

@@ -20,15 +20,14 @@ from lavender.solvers._log import SolveLog
 from lavender.solvers._newton import general
 from lavender.solvers._plan import BOTH_WAYS, METHODS, TABLE, Cost, Costs
 from lavender.solvers._schedule import AGAIN, remainder
-from lavender.solvers._sweeping import STATUS
 from lavender.solvers.direct import Enough, Impatient
 from lavender.solvers.newton import NewtonState
+from lavender.solvers.sweeping import STATUS
 from lavender_ext.few.looks import Looks, sweeps_left
 
 __all__ = ["FIRST", "Candidate", "Sweeps", "in_short_time", "make"]
 
 FIRST = 32  # sweeps before the first look at what they promise
-SURE = 4.0  # times what a finite solver is expected to cost, that has to be left for it to begin
 ALL = 1e18  # iterations: until the time is up
 PROBE = 0.5  # of the time that is left: for iterations whose pace is not known yet
 
@@ -62,7 +61,8 @@ class Candidate:
         begun = self.spent > 0.0 and not self.again
         setup = 0.0 if begun else self.cost.setup
         n = max(1, int((work - setup) / self.cost.each))
-        if self.is_finite and self.log.ends_late(SURE * max(self.cost.total - self.spent * begun, 0.0)):
+        left = max(self.cost.total - self.spent * begun, 0.0)
+        if self.is_finite and self.log.ends_late(self.costs.sure * left):
             return 0  # what comes of it before its end is seldom worth its time
         return min(n, self.log.left, self.spec.max_iter if self.again else n)
 
@@ -166,7 +166,7 @@ class Sweeps(Resumed):
         """Half of the time, and all of it where the other half is too short for any other; whether any may follow."""
         self.log, before = log, log.best
         half = 0.5e9 * (log.deadline.left() or 0.0)
-        n = half / self.cost.each if half > SURE * self.least else ALL
+        n = half / self.cost.each if half > self.costs.sure * self.least else ALL
         claim = self.turn(int(min(max(n, 1.0), log.left)))
         log.note(self.name, claim, before)
         if log.ends_late(self.least) or log.done():
@@ -342,7 +342,7 @@ def in_short_time(problem: Problem, limit: float) -> Sweeps | None:
     """Sweeps that are set up, where others may not end within the limit [ns]: by the least that these take."""
     costs = Costs(problem)
     least = min(map(costs.floor, TABLE[problem.operator][problem.law]))
-    if limit > SURE * SURE * least:
+    if limit > costs.sure**2 * least:
         return None
     sweeps = Sweeps("anderson", None, costs, get("anderson"))
     sweeps.least = least

@@ -205,6 +205,11 @@ class Costs:
         self.planned = {} if plan is None else dict(plan.candidates)
         self.decades = -log10(min(max(tol, 1e-16), 0.1)) / SIXTH
 
+    @property
+    def sure(self) -> float:
+        """Times its counted cost that has to be left for who factors to begin: nine in ten end within it."""
+        return float(self.rates["sure"])
+
     def floor(self, name: str) -> float:
         """ns that a method which factors takes at least, told by rows alone; inf for sweeps, which take any time."""
         r, law, m = self.rates, self.problem.law, self.structure.m
@@ -217,7 +222,7 @@ class Costs:
             return float(n * v["step"] + (READ + n) * v["entry"] * self.structure.sweep)
         if name in ("direct", "newton", "newton over rows"):
             part = r["direct" if name == "direct" else "newton"]
-            return float(part["start"] + _of(part["count"], law) * _of(part["row"], law) * m)
+            return float(part["start"] + _of(part["count"], law) * part["row"] * m)
         return float(r["admm"]["start"]) if name == "admm" else inf
 
     def least(self, name: str) -> Cost:
@@ -271,7 +276,7 @@ class Costs:
         count = (
             1.0 if name == "direct" and self.problem.law == "linear" else _of(r["count"], self.problem.law)
         )
-        return Cost(setup, _of(r["row"], self.problem.law) * s.m + r["work"] * factor, count)
+        return Cost(setup, r["row"] * s.m + r["work"] * factor, count)
 
 
 def _of(rate: Any, law: str) -> float:

@@ -97,7 +97,9 @@ class Auto:
         except KeyboardInterrupt:
             interrupted = True  # the best impulse goes back all the same
         impulse[:] = log.impulse
-        nothing = "the start is a solution" if log.best <= tol else "no time for anything"
+        nothing = "no time for anything" if n > 0 else "no iterations were asked for"
+        if log.best <= tol:
+            nothing = "the start is a solution"
         return Claim(
             Status.INTERRUPTED if interrupted else log.status,
             log.iterations,

@@ -15,6 +15,7 @@ from benchmarks.auto.replay import CALL, Costs, candidates, replayed
 from benchmarks.drawn import wild
 from lavender import suite
 from lavender.errors import InputError, LavenderError
+from lavender.solvers._plan import rates as plan_rates
 
 ONE = regret.Regret(
     case="x",
@@ -166,6 +167,15 @@ def test_times_that_are_made_of_rates_give_them_back():
     assert found == pytest.approx([5e4, 12.0, 0.7], rel=0.02)  # three digits are kept
     with pytest.raises(ValueError, match="30 are needed"):
         rates.least_squares(chosen[:5], lambda s, n: [1.0, n * s.m, n * s.sweep])
+
+
+def test_nine_in_ten_end_within_what_is_sure():
+    now, problem = plan_rates(), suite.case("stack(n=100)").problem
+    structure = Structure(problem)
+    cost = Costs(problem, rates.LEVEL, now, structure).of("direct").total
+    curves = [_curve(problem, ((3, 1e-9 * share * cost, 1e-9),), setup=0.0) for share in range(1, 12)]
+    never = _curve(problem, ((3, 1.0, 0.5),), setup=0.0)
+    assert rates.surely({"direct": [(structure, c) for c in (*curves, never)]}, now) == pytest.approx(10.0)
 
 
 def test_the_file_holds_at_most_thirty_rates_and_every_candidate_has_its_cost():

@@ -94,6 +94,9 @@ def test_senseless_requests_are_refused():
     for plan in (3, "direct", {"rows": 8}, {**lv.explain(problem).data(), "candidates": [{"name": "x"}]}):
         with pytest.raises(lv.InputError, match="plan"):
             lv.solve(problem, plan=plan)
+    with pytest.raises(lv.InputError, match="no plan"):
+        lv.solve(problem, plan={**lv.explain(problem).data(), "candidates": []})
+    assert lv.solve(problem, max_iter=0).message == "no iterations were asked for"
     for first in (["islands", 3], ["newton", "x"], []):
         with pytest.raises(lv.InputError, match="no plan"):
             lv.solve(problem, plan={**lv.explain(problem).data(), "first": first})
