@@ -119,6 +119,15 @@ def random_boxes(seed, friction="coulomb", **sizes):
     return replace(base, cones=replace(c, patch_radius=radius))
 
 
+def random_ellipses(seed, friction="coulomb", **sizes):
+    """The same whose two tangents share an ellipse."""
+    base = random_boxes(seed, friction, **sizes)
+    c = base.cones
+    return replace(
+        base, cones=replace(c, kind=np.where(c.kind == lv.CONTACT_BOX, lv.CONTACT_ELLIPSE, c.kind))
+    )
+
+
 #: Every way to give a problem, made of one given by rows.
 FORMS = {"rows": lambda problem: problem, "matrix": as_matrix, "J and M": general}
 #: Every kind of contact that rows may have: (seed, friction, sizes) to a problem of rows.
@@ -128,6 +137,7 @@ CONTACTS = {
     "rolling": partial(random_contact_problem, spin=False, rolling=True),
     "rolling and spin": partial(random_contact_problem, rolling=True),
     "boxes": random_boxes,
+    "ellipses": random_ellipses,
 }
 
 

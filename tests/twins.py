@@ -7,7 +7,7 @@ import lavender as lv
 
 def parts_of(cones, i):
     """(rows within a contact, bound over lambda_n) of what it bounds together, behind its normal."""
-    size, mu, nt = int(np.diff(cones.ptr)[i]), cones.mu[i], int(cones.n_tangents[i])
+    size, mu, nt = int(np.diff(cones.ptr)[i]), cones.coefficients[i].max(), int(cones.n_tangents[i])
     if cones.kind[i] == lv.CONTACT_BOX:
         return [([1], cones.coefficients[i][0]), ([2], cones.coefficients[i][1])]
     rolls = cones.kind[i] == lv.CONTACT_ROLLING
@@ -25,6 +25,14 @@ def groups_of(cones, i):
     if cones.kind[i] == lv.ROUND:
         return [[0], [1, 2], *([[3], [4, 5]] if size == 6 else [[q] for q in range(3, size)])]
     return [[0], *(rows for rows, _ in parts_of(cones, i))]
+
+
+def stretch(cones):
+    """(m,) mu_i over the larger of the two on the tangents of ellipses, else 1: rows so long have disks for them."""
+    s = np.ones(cones.n_rows)
+    for i in np.flatnonzero(cones.kind == lv.CONTACT_ELLIPSE):
+        s[cones.ptr[i] + 1 : cones.ptr[i + 1]] = cones.coefficients[i] / cones.coefficients[i].max()
+    return s
 
 
 def diagonal(a, cones, factored):
@@ -79,9 +87,9 @@ def nearest_round(y, a, groups):
     return out.astype(float)
 
 
-def errors(problem, lam, a, d):
-    """e (m,): lambda less its projection, by the law."""
-    c, w, e = problem.cones, a @ lam - problem.b, np.zeros(problem.m)
+def errors(problem, lam, w, d):
+    """e (m,): lambda less its projection, by the law; all in the rows where ellipses are disks."""
+    c, e = problem.cones, np.zeros(problem.m)
     for i in range(c.n_blocks):
         s = slice(c.ptr[i], c.ptr[i + 1])
         x, y, root = lam[s], lam[s] - w[s] / d[s], np.sqrt(d[s])
@@ -116,9 +124,10 @@ def angular_weight(problem):
 
 def judged(problem, lam):
     """(e, E, V, the rows of which V is the speed) by the formulas."""
-    a, c = problem.dense(), problem.cones
+    c, s = problem.cones, stretch(problem.cones)
+    a = s[:, None] * problem.dense() * s
     d = diagonal(a, c, problem.operator != "matrix")
-    e, given = errors(problem, lam, a, d), angular_weight(problem)
+    e, given = errors(problem, lam / s, a @ (lam / s) - s * problem.b, d), angular_weight(problem)
     nu = np.where(np.isnan(given), d, given)
     speeds = [(0.0, [-1])]
     for i in range(c.n_blocks):
@@ -128,12 +137,14 @@ def judged(problem, lam):
                 nu[j + np.array(rows)] = d[j]
             weight = np.sqrt(nu[j + rows[0]] * d[j + rows[0]])
             speeds.append((weight * np.linalg.norm(e[j + np.array(rows)]), [j + q for q in rows]))
-    return e, np.sqrt(np.sum(d * e * e)), *max(speeds)
+    return s * e, np.sqrt(np.sum(d * e * e)), *max(speeds)
 
 
 def sweep(problem, a, lam, blocks):
     """One sweep over blocks under Coulomb's law, in place."""
-    c, d, b = problem.cones, problem.d, problem.b
+    c, s = problem.cones, stretch(problem.cones)
+    a, b, given = s[:, None] * a * s, s * problem.b, lam
+    lam, d = given / s, diagonal(a, c, problem.operator != "matrix")
     for i in blocks:
         j, end = c.ptr[i], c.ptr[i + 1]
         if c.kind[i] == lv.ROW:
@@ -147,3 +158,4 @@ def sweep(problem, a, lam, blocks):
             y = lam[t] - (a[t] @ lam - b[t]) / np.linalg.eigvalsh(0.5 * (block + block.T)).max()
             size = np.linalg.norm(y)
             lam[t] = y if size <= bound * lam[j] else y * (bound * lam[j] / size)
+    given[:] = s * lam

@@ -43,8 +43,9 @@ class _Ways(NamedTuple):
 def enumerated(problem: Problem) -> tuple[list[FloatArray], bool] | None:
     """Impulses (m,) [N s] of every mode that has a solution, and whether their motions are all there are.
 
-    None where the problem has more than eight contacts or 65,536 modes, or a contact with friction in two tangents or
-    spin. Not all: a mode with motions next to each other without end, or too many singular modes.
+    None where the problem has more than eight contacts or 65,536 modes, a contact with friction in two tangents or
+    spin, or numbers beyond float64 on the way. Not all: a mode with motions next to each other without end, or too
+    many singular modes.
     """
     c = problem.cones
     contact = c.kind != ROW
@@ -56,10 +57,13 @@ def enumerated(problem: Problem) -> tuple[list[FloatArray], bool] | None:
     counts[~contact] = [float(np.prod(sides[c.ptr[i] : c.ptr[i + 1]])) for i in np.flatnonzero(~contact)]
     if np.log(counts).sum() > np.log(MOST) + 1e-9:
         return None
-    scale = 1.0 / np.sqrt(problem.d)
-    a = scale[:, None] * problem.dense() * scale
-    b = scale * problem.b
-    ways = [w for i in range(c.n_blocks) for w in _ways(problem, i, a, b, scale)]
+    with np.errstate(all="ignore"):
+        scale = 1.0 / np.sqrt(problem.d)
+        a = scale[:, None] * problem.dense() * scale
+        b = scale * problem.b
+        ways = [w for i in range(c.n_blocks) for w in _ways(problem, i, a, b, scale)]
+    if not all(np.isfinite(part).all() for way in ways for part in way):
+        return None
     found, whole = [], True
     left = SINGULAR
     for equal, rhs, above, bound in _systems(ways):

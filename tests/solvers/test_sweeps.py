@@ -8,7 +8,7 @@ from random_problems import CONTACTS, FORMS, random_contact_problem, random_lcp,
 
 import lavender as lv
 from lavender.ordering import ORDERS
-from lavender.solvers import _sweeping
+from lavender.solvers import sweeping
 
 
 def sweeps(problem, name, n, **options):
@@ -25,7 +25,8 @@ def test_a_sweep_is_the_update_written_densely_in_every_form(kind, seed):
         twins.sweep(problem, a, lam, range(problem.n_blocks))
     # 1e-12 of the largest impulse: a few hundred roundings, none amplified; of J and M those of their inverses.
     size = np.abs(lam).max()
-    np.testing.assert_allclose(sweeps(problem, "sequential_impulses", 5), lam, atol=1e-12 * size, rtol=0)
+    if lv.get("sequential_impulses").refuses(problem) is None:
+        np.testing.assert_allclose(sweeps(problem, "sequential_impulses", 5), lam, atol=1e-12 * size, rtol=0)
     for form, given_by in FORMS.items():
         atol = 1e-9 * size if form == "J and M" else 1e-12 * size
         np.testing.assert_allclose(sweeps(given_by(problem), "pgs", 5), lam, atol=atol, rtol=0)
@@ -159,7 +160,7 @@ def test_heavy_on_light_contracts_by_r_over_one_plus_r(ratio):
 @pytest.mark.parametrize("name", ["pgs", "sequential_impulses"])
 def test_threads_change_no_bit(name, monkeypatch):
     """Small problems fall back to one thread; here they may not."""
-    monkeypatch.setattr(_sweeping, "GRAIN", 0)
+    monkeypatch.setattr(sweeping, "GRAIN", 0)
     problem = random_contact_problem(3, bodies=40, joints=20, contacts=200)
     results = {
         t: lv.solve(problem, name, order="colored", threads=t, tol=1e-8, max_iter=40) for t in (1, 2, 3, 4)
