@@ -32,7 +32,7 @@ __all__ = ["Solver", "SolverSpec", "State", "available", "get", "known", "regist
 
 
 # Modules whose SPECS are registered first, by name: they import this one.
-FEW = 64  # rows up to which Python's share decides what a solve costs: a spec's `few` is asked first
+SMALL_ROWS = 64  # rows up to which Python's share decides what a solve costs: a spec's `few` is asked first
 TABLES = ("lavender.solvers", "lavender.external")
 
 
@@ -120,7 +120,7 @@ class SolverSpec:
     delegates: bool = False  # may hand over to other solvers: only "auto"
     round_cones: bool = False  # takes contacts of more than two tangents in one cone
     # Of "coulomb" and "cone", with which it takes boxes: contacts whose tangents are bounded each by itself. A law that
-    # is not of `laws` besides is taken where there is no disk (of our own, as bounded rows: solvers/_polyhedral.py).
+    # is not of `laws` besides is taken where there is no disk (of our own, as bounded rows: solvers/polyhedral.py).
     boxes: frozenset[str] = frozenset()
     rolling: bool = False  # takes contacts that resist rolling, each part with a bound of its own
     external: bool = False  # another project's code solves; its claims are its own

@@ -11,6 +11,8 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     # As shells start what runs in the background; no test of Ctrl-C could interrupt its process.
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
+from functools import partial
+
 import hypothesis
 import pytest
 
@@ -33,6 +35,40 @@ def problem_dir() -> Path:
     if not any(folder.glob("*.npz")) and not any(folder.glob("*.hdf5")):
         pytest.fail(f"LAVENDER_PROBLEMS={PROBLEMS} holds no .npz or .hdf5 file")
     return folder
+
+
+@pytest.fixture
+def register(monkeypatch):
+    """As `lavender.register`, for one test, and in the place of a solver of the same name."""
+    from lavender import registry
+
+    monkeypatch.setattr(registry, "_registered", registry.specs())
+    return partial(registry.register, replace=True)
+
+
+@pytest.fixture
+def plug_in(register):
+    """Registers a solver whose `run(problem, impulse)` is given; its name."""
+    from lavender import SolverSpec
+
+    def add(run, name="plug-in", **more):
+        class PlugIn:
+            def prepare(self, problem):
+                return problem
+
+            def update(self, state, problem):
+                return problem
+
+            def run(self, state, impulse, n, tol, time_limit=None):
+                return run(state, impulse)
+
+        laws = {"linear", "lcp", "coulomb", "cone"}
+        register(
+            SolverSpec(name, PlugIn, **{"laws": laws, "summary": "of a test", "resumable": False, **more})
+        )
+        return name
+
+    return add
 
 
 @pytest.fixture

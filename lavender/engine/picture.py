@@ -66,7 +66,7 @@ def save_picture(
         raise InputError("frames must be at least 1, rate positive and size 0.5 to 50 inch")
     if suffix == ".mp4" and which("ffmpeg") is None:
         raise InputError("an .mp4 needs ffmpeg, which is not here; a .gif needs nothing")
-    stages = [_Stage(one, turn, tilt, name) for name, one in films.items()]
+    stages = [Stage(one, turn, tilt, name) for name, one in films.items()]
     ends = np.array([stage.bounds for stage in stages])
     for stage in stages:  # one scale for all
         stage.bounds = tuple(np.where([1, 0, 1, 0], ends.min(axis=0), ends.max(axis=0)))
@@ -77,7 +77,7 @@ def save_picture(
     return path
 
 
-class _Stage:
+class Stage:
     """One view for all frames: directions, bounds, and bodies as painted shapes."""
 
     def __init__(self, film: Film, turn: float, tilt: float, name: str = "") -> None:
@@ -159,7 +159,7 @@ class _Stage:
             axes.plot(*self.project(place), "k.", markersize=3, zorder=4)
 
 
-def _strip(stages: list[_Stage], path: Path, count: int, size: float) -> None:
+def _strip(stages: list[Stage], path: Path, count: int, size: float) -> None:
     from matplotlib.figure import Figure
 
     height = size * sum(stage.height for stage in stages) + 0.3 * len(stages)
@@ -173,7 +173,7 @@ def _strip(stages: list[_Stage], path: Path, count: int, size: float) -> None:
     write_figure(canvas, path, dpi=150)
 
 
-def _animate(stages: list[_Stage], path: Path, size: float, rate: float) -> None:
+def _animate(stages: list[Stage], path: Path, size: float, rate: float) -> None:
     from matplotlib.animation import FFMpegWriter, PillowWriter
     from matplotlib.figure import Figure
 

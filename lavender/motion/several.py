@@ -240,7 +240,7 @@ def motions(problem: Problem, n: int = RUNS, seed: int = 0, *, always: bool = Fa
         )
         whole |= modes[1] and len(single) <= MANY and max(beside, default=1.0) < BESIDE
     if always or not whole:
-        for label, impulse in _runs(problem, own, n, seed):
+        for label, impulse in search(problem, own, n, seed):
             candidate = judged(problem, impulse, label)
             if candidate.accepted:
                 found.append((candidate, label))
@@ -308,7 +308,7 @@ def softened(problem: Problem, share: float) -> Problem:
     return replace(problem, matrix=sp.csr_array(problem.csr + sp.diags_array(soft)), guess=None, copy=False)
 
 
-def _runs(problem: Problem, own: Reference, n: int, seed: int) -> Iterator[tuple[str, FloatArray]]:
+def search(problem: Problem, own: Reference, n: int, seed: int) -> Iterator[tuple[str, FloatArray]]:
     """n runs: what each was, and where it ended."""
     here = set(available(problem))
     solvers = [name for name in SOLVERS if name in here] or ["auto"]

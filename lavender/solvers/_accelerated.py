@@ -10,7 +10,7 @@ from lavender.errors import InputError, UnknownName
 from lavender.ordering import Order
 from lavender.problem import Problem
 from lavender.solution import Claim
-from lavender.solvers._sweeping import Sweeping, SweepState, claim, over, swept
+from lavender.solvers.sweeping import Sweeping, SweepState, claim, over, swept
 from lavender_ext.accelerate import accelerated
 from lavender_ext.core import assemble
 from lavender_ext.core.order import GIVEN

@@ -16,8 +16,8 @@ from lavender._arrays import FloatArray
 from lavender.deadline import Deadline
 from lavender.problem import Problem
 from lavender.solution import Claim, Status
-from lavender.solvers._islands import blocks_of_each, restrict, rows_of
 from lavender.solvers._log import SolveLog
+from lavender.solvers.islands import blocks_of_each, restrict, rows_of
 
 __all__ = ["certify"]
 

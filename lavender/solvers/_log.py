@@ -13,7 +13,7 @@ from lavender.problem import Problem
 from lavender.residuals import at_floor, judged, known, quick, reference, remember
 from lavender.solution import Claim, Status, Turn
 from lavender.solvers._few import said
-from lavender.solvers._islands import islands
+from lavender.solvers.islands import islands
 from lavender_ext.judge.measure import Judged
 
 __all__ = ["SolveLog"]

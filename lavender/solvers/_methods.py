@@ -20,9 +20,9 @@ from lavender.solvers._log import SolveLog
 from lavender.solvers._newton import general
 from lavender.solvers._plan import BOTH_WAYS, METHODS, TABLE, Cost, Costs
 from lavender.solvers._schedule import AGAIN, remainder
-from lavender.solvers._sweeping import STATUS
 from lavender.solvers.direct import Enough, Impatient
 from lavender.solvers.newton import NewtonState
+from lavender.solvers.sweeping import STATUS
 from lavender_ext.few.looks import Looks, sweeps_left
 
 __all__ = ["FIRST", "Candidate", "Sweeps", "in_short_time", "make"]

@@ -29,11 +29,11 @@ from lavender.solution import Claim, Status
 from lavender.solvers import _rates as rates
 from lavender.solvers._accelerated import LARGEST_MEMORY
 from lavender.solvers._factor import GENERAL_LIMIT, PANELS_WORK, TINY, WIDE
-from lavender.solvers._islands import block_bodies
 from lavender.solvers._newton.pattern import block_pattern
 from lavender.solvers._newton.sparse import BACKWARD
 from lavender.solvers._newton.systems import DENSE_FILL, factor_cost
-from lavender.solvers._sweeping import claim, watch_over
+from lavender.solvers.islands import block_bodies
+from lavender.solvers.sweeping import claim, watch_over
 from lavender_ext.accelerate import admm
 from lavender_ext.core import assemble
 from lavender_ext.factor import symbolic

@@ -21,7 +21,7 @@ from lavender.ordering import Order
 from lavender.problem import Problem
 from lavender.registry import SolverSpec
 from lavender.solution import Claim
-from lavender.solvers._sweeping import Sweeping, SweepState, claim, over, swept
+from lavender.solvers.sweeping import Sweeping, SweepState, claim, over, swept
 from lavender_ext.judge import measure
 from lavender_ext.local import gauss_seidel
 

@@ -13,7 +13,7 @@ Positive definite A: finite and exact to rounding, whatever `tol`. Singular posi
 message says so, and what cannot be refined to rounding is STALLED with the best iterate. Linear systems
 that are asymmetric or indefinite get LU with pivoting, and where that is singular its rank from an SVD.
 Bounded rows whose A is asymmetric are exchanged by LU: finite where exchanges do not go round in circles, which no
-energy then ends. Friction of boxes comes as such rows (`_polyhedral.py`); where its exchanges do, complementary pivots
+energy then ends. Friction of boxes comes as such rows (`polyhedral.py`); where its exchanges do, complementary pivots
 follow.
 """
 
@@ -33,7 +33,7 @@ from lavender.residuals import at_floor, judged, remember
 from lavender.solution import Claim, Status
 from lavender.solvers._factor import SMALL_SIZE, GeneralFactor, PanelsLU
 from lavender.solvers._few import DIRECT
-from lavender.solvers._pivoting import PivotState
+from lavender.solvers.pivoting import PivotState
 from lavender_ext.judge import measure
 from lavender_ext.pivot.principal import INDEFINITE, ROUNDS, SMALL, SOLVED, STUCK
 

@@ -19,7 +19,7 @@ from lavender.ordering import block_order
 from lavender.problem import Problem
 from lavender.registry import SolverSpec
 from lavender.solution import Claim
-from lavender.solvers._sweeping import SweepState, run_kernel
+from lavender.solvers.sweeping import SweepState, run_kernel
 from lavender_ext.sweep import serial
 
 

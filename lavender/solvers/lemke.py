@@ -32,7 +32,7 @@ from lavender.problem import Problem
 from lavender.registry import SolverSpec
 from lavender.residuals import at_floor, quick
 from lavender.solution import Claim, Status
-from lavender.solvers._polyhedral import count_rows
+from lavender.solvers.polyhedral import count_rows
 from lavender_ext.judge import measure
 from lavender_ext.pivot.tableau import PIVOTS, RAY, Dictionary
 

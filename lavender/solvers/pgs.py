@@ -22,7 +22,7 @@ from lavender.ordering import Order
 from lavender.problem import Problem
 from lavender.registry import SolverSpec
 from lavender.solution import Claim
-from lavender.solvers._sweeping import SweepState, Threaded, reads_whitened, run_kernel, run_threads
+from lavender.solvers.sweeping import SweepState, Threaded, reads_whitened, run_kernel, run_threads
 from lavender_ext.judge import measure
 from lavender_ext.sweep import serial
 

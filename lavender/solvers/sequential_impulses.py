@@ -20,9 +20,9 @@ from lavender.ordering import Order
 from lavender.problem import Problem
 from lavender.registry import SolverSpec
 from lavender.solution import Claim
-from lavender.solvers._layout import Layout, lay_out
-from lavender.solvers._layout import pays as layout_pays
-from lavender.solvers._sweeping import SweepState, Threaded, run_kernel, run_threads
+from lavender.solvers.layout import Layout, lay_out
+from lavender.solvers.layout import pays as layout_pays
+from lavender.solvers.sweeping import SweepState, Threaded, run_kernel, run_threads
 from lavender_ext.judge import measure
 from lavender_ext.sweep import serial
 

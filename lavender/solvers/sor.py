@@ -11,7 +11,7 @@ from lavender._arrays import FloatArray
 from lavender.errors import InputError
 from lavender.registry import SolverSpec
 from lavender.solution import Claim
-from lavender.solvers._sweeping import Sweeping, SweepState, run_kernel
+from lavender.solvers.sweeping import Sweeping, SweepState, run_kernel
 from lavender_ext.sweep import serial
 
 

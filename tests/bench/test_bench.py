@@ -58,13 +58,12 @@ class Fake:
 
 
 @pytest.fixture
-def fakes(monkeypatch):
+def fakes(register):
     """Registers solvers `fake_lie` and so on for one test."""
-    monkeypatch.setattr(registry, "_registered", registry.specs())
 
     def add(*whats):
         for what in whats:
-            registry.register(
+            register(
                 lv.SolverSpec(
                     f"fake_{what}",
                     lambda what=what: Fake(what),

@@ -71,19 +71,8 @@ def test_lists_take_commas_or_blanks_and_files_may_follow(lavender, path, tmp_pa
     assert {r.order for r in records} == {"given", "reverse"}
 
 
-def test_a_contradicted_claim_is_marked(lavender, path, monkeypatch):
-    monkeypatch.setattr(registry, "_registered", registry.specs())
-
-    class Liar:
-        def prepare(self, problem):
-            return problem
-
-        update = prepare
-
-        def run(self, *_):
-            return lv.Claim(lv.Status.CONVERGED, 1)
-
-    registry.register(lv.SolverSpec("liar", Liar, laws={"lcp"}, summary="says it did", resumable=False))
+def test_a_contradicted_claim_is_marked(lavender, path, plug_in):
+    plug_in(lambda problem, impulse: lv.Claim(lv.Status.CONVERGED, 1), "liar", laws={"lcp"})
     code, out, _ = lavender("report", path, "--solvers", "liar", *QUICK[:3], *QUICK[-3:])
     assert code == 0
     assert "✗ contradicted" in out

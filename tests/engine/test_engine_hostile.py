@@ -235,16 +235,13 @@ class Caller:
 
 
 @pytest.fixture
-def caller(monkeypatch):
+def caller(register):
     """`caller(now, at)` registers a solver that calls `now` in its run number `at`."""
-    from lavender import registry
-
-    monkeypatch.setattr(registry, "_registered", dict(specs()))
 
     def make(now, at, resumable=False):
         solver = type("Now", (Caller,), {"now": staticmethod(now), "at": at, "runs": 0})
         laws = {"linear", "lcp", "coulomb", "cone"}
-        lv.register(lv.SolverSpec("caller", solver, laws=laws, summary="calls", resumable=resumable))
+        register(lv.SolverSpec("caller", solver, laws=laws, summary="calls", resumable=resumable))
         return solver
 
     return make

@@ -167,12 +167,12 @@ def test_a_body_is_painted_where_it_is():
     # a ball alone, seen from the front: where it is dark in the picture is where it is in the film
     from matplotlib.figure import Figure
 
-    from lavender.engine.picture import _Stage
+    from lavender.engine.picture import Stage
 
     scene = lv.Scene(gravity=0.0)
     scene.add_sphere(0.5, position=(0, 0, 0), velocity=(2.0, 0, 0))
     film = lv.Simulation(scene).film(60)
-    stage = _Stage(film, 0.0, 0.0)
+    stage = Stage(film, 0.0, 0.0)
     axes = Figure().subplots()
     for frame in (0, 60):
         stage.paint(axes, frame)

@@ -19,14 +19,13 @@ PROVE_INFEASIBLE = {"osqp", "clarabel", "clarabel_cone", "piqp", "qpalm", "daqp"
 RNG = np.random.default_rng(12)
 
 
-def replaced(monkeypatch, name, call):
+def replaced(register, name, call):
     """The backend `name` with its call replaced, its spec otherwise as it is."""
     from dataclasses import replace
     from functools import partial
 
     backend = next(b for b in backends.BACKENDS if b.name == name)
-    fake = replace(registry.get(name), factory=partial(qp_solver.QPSolver, replace(backend, call=call)))
-    monkeypatch.setitem(registry._registered, name, fake)
+    register(replace(registry.get(name), factory=partial(qp_solver.QPSolver, replace(backend, call=call))))
 
 
 # -- listing ----------------------------------------------------------------------------------------
@@ -383,11 +382,11 @@ def test_unit_diagonal_is_a_choice():
     "error",
     [ValueError("it broke"), MemoryError("it broke"), type("Panic", (BaseException,), {})("it broke")],
 )
-def test_an_exception_becomes_a_result(monkeypatch, error):
+def test_an_exception_becomes_a_result(register, error):
     def call(*_):
         raise error
 
-    replaced(monkeypatch, "osqp", call)
+    replaced(register, "osqp", call)
     start = np.array([0.1, 0.2, 0.3])
     solution = lv.solve(lv.Problem.lcp(*spd(3)), "osqp", impulse=start)
     assert solution.status is lv.Status.NUMERICAL_ERROR
@@ -396,11 +395,11 @@ def test_an_exception_becomes_a_result(monkeypatch, error):
     assert solution.dual is None
 
 
-def test_ctrl_c_is_interrupted(monkeypatch):
+def test_ctrl_c_is_interrupted(register):
     def call(*_):
         raise KeyboardInterrupt
 
-    replaced(monkeypatch, "osqp", call)
+    replaced(register, "osqp", call)
     start = np.array([0.1, 0.2, 0.3])
     solution = lv.solve(lv.Problem.lcp(*spd(3)), "osqp", impulse=start)
     assert solution.status is lv.Status.INTERRUPTED
@@ -408,8 +407,8 @@ def test_ctrl_c_is_interrupted(monkeypatch):
 
 
 @pytest.mark.parametrize("x", [None, np.array([np.nan, 1.0, 1.0]), np.zeros(2)])
-def test_no_iterate_returns_the_start_point(monkeypatch, x):
-    replaced(monkeypatch, "osqp", lambda *_: Answer(lv.Status.CONVERGED, "gave up", x))
+def test_no_iterate_returns_the_start_point(register, x):
+    replaced(register, "osqp", lambda *_: Answer(lv.Status.CONVERGED, "gave up", x))
     start = np.array([0.1, 0.2, 0.3])
     solution = lv.solve(lv.Problem.lcp(*spd(3)), "osqp", impulse=start)
     assert solution.status is lv.Status.NUMERICAL_ERROR
@@ -417,7 +416,7 @@ def test_no_iterate_returns_the_start_point(monkeypatch, x):
     assert np.array_equal(solution.impulse, start)
 
 
-def test_a_claim_that_the_judge_does_not_find_is_asked_again_then_marked(monkeypatch):
+def test_a_claim_that_the_judge_does_not_find_is_asked_again_then_marked(register):
     asked = []
 
     def call(qp, impulse, limit, extra):
@@ -426,7 +425,7 @@ def test_a_claim_that_the_judge_does_not_find_is_asked_again_then_marked(monkeyp
             lv.Status.CONVERGED, "solved", np.full(qp.n, 0.5 + limit.eps), np.zeros(0), np.zeros(qp.n)
         )
 
-    replaced(monkeypatch, "osqp", call)
+    replaced(register, "osqp", call)
     solution = lv.solve(lv.Problem.lcp(*spd(3)), "osqp")
     assert len(asked) == solution.work["backend_calls"] > 1
     assert all(after < before for before, after in itertools.pairwise(asked))
@@ -434,7 +433,7 @@ def test_a_claim_that_the_judge_does_not_find_is_asked_again_then_marked(monkeyp
     assert "above tol" in solution.contradicted
 
 
-def test_the_best_of_several_answers_is_returned(monkeypatch):
+def test_the_best_of_several_answers_is_returned(register):
     problem = lv.Problem.lcp(np.eye(3), np.ones(3))
     answers = iter([1.5, 1.001, 1.2])
 
@@ -442,7 +441,7 @@ def test_the_best_of_several_answers_is_returned(monkeypatch):
         x = next(answers) / (qp.sigma * qp.root)
         return Answer(lv.Status.CONVERGED, "solved", x, np.zeros(0), np.zeros(qp.n), {"iterations": 7})
 
-    replaced(monkeypatch, "osqp", call)
+    replaced(register, "osqp", call)
     solution = lv.solve(problem, "osqp")
     assert np.allclose(solution.impulse, 1.001)
     assert solution.work == {"backend_calls": 3, "iterations": 21}

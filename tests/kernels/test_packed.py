@@ -9,7 +9,7 @@ from random_problems import random_contact_problem
 import lavender as lv
 from benchmarks.kernels import lattice_pile
 from lavender.engine.layout import HEAD
-from lavender.solvers import _layout
+from lavender.solvers import layout
 from lavender.solvers.sequential_impulses import SequentialImpulses
 
 CASES = [
@@ -224,8 +224,8 @@ def test_a_joint_on_top_of_a_tower_leaves_it_packed():
 
 def test_large_piles_pack_at_longer_runs_and_written_out(monkeypatch):
     pile = lattice_pile(5_000, shuffle=True)
-    for least in (_layout.LARGE, 1):
-        monkeypatch.setattr(_layout, "LARGE", least)
+    for least in (layout.LARGE, 1):
+        monkeypatch.setattr(layout, "LARGE", least)
         for counts, packed in (([8], False), ([16, 3], True)):
             lam, _, packing = in_chunks(pile, "reverse", counts, pile.start())
             one = in_chunks(pile, "reverse", counts, pile.start(), packs=False)[0]

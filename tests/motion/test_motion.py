@@ -14,7 +14,7 @@ from random_trees import random_general
 import lavender as lv
 from lavender import suite
 from lavender.motion.modes import enumerated
-from lavender.motion.several import _runs, distance
+from lavender.motion.several import distance, search
 
 LAWS = ("linear", "lcp", "cone")
 
@@ -374,7 +374,7 @@ def test_every_mode_holds_what_a_search_finds_and_beyond_them_there_are_at_least
         found = lv.motions(problem)
         assert found.all
         several += len(found) > 1
-        for label, end in _runs(problem, found[0].reference, 6, 1):
+        for label, end in search(problem, found[0].reference, 6, 1):
             if lv.residual(problem, end).relative < 1e-9:
                 assert min(distance(problem, end, one.impulse).share for one in found) < 1e-6, label
     assert several > 3  # else the draw asks for nothing

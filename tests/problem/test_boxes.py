@@ -12,7 +12,7 @@ from random_problems import as_matrix, random_contact_problem, seeds
 import lavender as lv
 from lavender import registry
 from lavender.certificates import check_certificate
-from lavender.solvers._polyhedral import as_rows
+from lavender.solvers.polyhedral import as_rows
 
 HERE = lv.available()
 OURS = {n for n in HERE if registry.specs()[n].own and not registry.specs()[n].external}

@@ -12,36 +12,6 @@ from lavender import registry
 FLOORLESS = lv.Problem.linear(1e-310 * np.eye(2), [1.0, 1.0])
 
 
-@pytest.fixture
-def plug_in():
-    """Registers a solver whose `run(problem, impulse)` is given; taken out again."""
-    names = []
-
-    def add(run, **more):
-        class PlugIn:
-            def prepare(self, problem):
-                return problem
-
-            def update(self, state, problem):
-                return problem
-
-            def run(self, state, impulse, n, tol, time_limit=None):
-                return run(state, impulse)
-
-        name = f"plug-in {len(names)}"
-        spec = lv.SolverSpec(
-            name=name, factory=PlugIn, laws=frozenset({"linear", "lcp", "coulomb", "cone"}), summary="a test",
-            **{"resumable": False, **more},
-        )  # fmt: skip
-        registry.register(spec)
-        names.append(name)
-        return name
-
-    yield add
-    for name in names:
-        del registry._registered[name]
-
-
 def says(status, **more):
     return lv.Claim(status, 1, **more)
 
@@ -123,7 +93,7 @@ def test_infeasible_and_a_success_exclude_each_other():
     "error", [FloatingPointError("underflow"), np.linalg.LinAlgError("singular"), MemoryError()]
 )
 @pytest.mark.parametrize("where", ["prepare", "run"])
-def test_what_arithmetic_breaks_on_is_a_result(error, where):
+def test_what_arithmetic_breaks_on_is_a_result(error, where, register):
     class Breaks:
         def prepare(self, problem):
             if where == "prepare":
@@ -136,16 +106,13 @@ def test_what_arithmetic_breaks_on_is_a_result(error, where):
             impulse[0] = np.nan
             raise error
 
-    registry.register(lv.SolverSpec(name="breaks", factory=Breaks, laws={"lcp"}, summary="", resumable=False))
-    try:
-        solver = lv.prepare(random_lcp(4), "breaks")
-        for _ in range(2):
-            solution = solver.solve()
-            assert solution.status is lv.Status.NUMERICAL_ERROR
-            assert type(error).__name__ in solution.message
-            assert np.isfinite(solution.impulse).all()
-    finally:
-        del registry._registered["breaks"]
+    register(lv.SolverSpec(name="breaks", factory=Breaks, laws={"lcp"}, summary="", resumable=False))
+    solver = lv.prepare(random_lcp(4), "breaks")
+    for _ in range(2):
+        solution = solver.solve()
+        assert solution.status is lv.Status.NUMERICAL_ERROR
+        assert type(error).__name__ in solution.message
+        assert np.isfinite(solution.impulse).all()
 
 
 def test_a_solver_that_does_nothing_is_stopped(plug_in):
@@ -312,17 +279,14 @@ def test_ctrl_c_leaves_what_a_plug_in_has_come_to(plug_in):
     np.testing.assert_array_equal(solution.impulse, 3.0)
 
 
-def test_the_short_way_of_few_rows_is_for_solvers_of_this_package_alone():
+def test_the_short_way_of_few_rows_is_for_solvers_of_this_package_alone(register):
     class Few:
         def solve(self, problem, impulse, tol):
             raise AssertionError("asked")
 
-    registry.register(
+    register(
         lv.SolverSpec(name="few", factory="lavender.solvers.pgs:PGS", laws={"lcp"}, summary="", few=Few())
     )
-    try:
-        assert lv.solve(random_lcp(15), "few", max_iter=2000).success
-        assert lv.solve_many([random_lcp(15)], "few")[0].iterations > 0
-        assert lv.solve(random_lcp(15), "few").iterations > 0
-    finally:
-        del registry._registered["few"]
+    assert lv.solve(random_lcp(15), "few", max_iter=2000).success
+    assert lv.solve_many([random_lcp(15)], "few")[0].iterations > 0
+    assert lv.solve(random_lcp(15), "few").iterations > 0

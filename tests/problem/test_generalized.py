@@ -15,11 +15,11 @@ import lavender as lv
 from benchmarks.drawn import wild
 from lavender import generalized as coordinates
 from lavender import registry
-from lavender.solvers._islands import islands, restrict, rows_of
 from lavender.solvers._newton import general
 from lavender.solvers._plan import candidates
 from lavender.solvers._structure import Structure
-from lavender.solvers._sweeping import reads_whitened
+from lavender.solvers.islands import islands, restrict, rows_of
+from lavender.solvers.sweeping import reads_whitened
 from lavender_ext.generalized.newton import ENDS
 
 

@@ -10,9 +10,9 @@ import lavender as lv
 from benchmarks.drawn import wild
 from lavender import registry, suite
 from lavender.solvers._certify import certify
-from lavender.solvers._islands import islands, restrict, rows_of
 from lavender.solvers._log import SolveLog
 from lavender.solvers._newton import general
+from lavender.solvers.islands import islands, restrict, rows_of
 
 
 def good(solution, tol):

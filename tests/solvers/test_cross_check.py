@@ -21,33 +21,6 @@ def bounded_problem(seed, stiff=0.3, contacts=8):
     return lv.Problem(problem.b, problem.cones, rows=problem.rows, compliance=problem.compliance + stiff)
 
 
-@pytest.fixture
-def register(monkeypatch):
-    """Adds a solver for one test; its `run` gets (problem, impulse) and returns a Claim."""
-
-    def add(name, run):
-        class Solver:
-            def prepare(self, problem):
-                return problem
-
-            update = prepare
-
-            def run(self, state, impulse, n, tol, time_limit=None):
-                return run(state, impulse)
-
-        spec = lv.SolverSpec(
-            name=name,
-            factory=Solver,
-            laws=frozenset({"linear", "lcp"}),
-            summary="for a test",
-            resumable=False,
-        )
-        registry.specs()
-        monkeypatch.setitem(registry._registered, name, spec)
-
-    return add
-
-
 # -- solvers against OSQP optima ------------------------------------------------------------------------
 
 
@@ -96,8 +69,8 @@ def test_a_residual_that_is_too_small_breaks_the_inequality():
 # -- the reference --------------------------------------------------------------------------------------
 
 
-def test_the_next_reference_is_taken_and_named(register):
-    register("hopeless", lambda problem, impulse: lv.Claim(lv.Status.MAX_ITERATIONS, 0))
+def test_the_next_reference_is_taken_and_named(plug_in):
+    plug_in(lambda problem, impulse: lv.Claim(lv.Status.MAX_ITERATIONS, 0), "hopeless")
     table = cross_check(bounded_problem(1), ["pgs"], reference="hopeless")
     assert table.reference == "osqp"
     assert "hopeless: relative 1.0e+00 above" in table.reference_note
@@ -148,8 +121,8 @@ def test_a_reference_with_a_wrong_multiplier_is_not_taken():
 # -- claims ---------------------------------------------------------------------------------------------
 
 
-def test_a_liar_is_contradicted(register):
-    register("liar", lambda problem, impulse: lv.Claim(lv.Status.CONVERGED, 1, {"sweeps": 1}))
+def test_a_liar_is_contradicted(plug_in):
+    plug_in(lambda problem, impulse: lv.Claim(lv.Status.CONVERGED, 1, {"sweeps": 1}), "liar")
     table = cross_check(bounded_problem(2), ["liar", "direct"])
     assert not table.ok
     assert [r.solver for r in table.contradicted] == ["liar"]

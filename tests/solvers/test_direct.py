@@ -12,7 +12,7 @@ import lavender as lv
 from benchmarks.drawn import wild
 from lavender._lu import sparse_lu
 from lavender.certificates import check_certificate
-from lavender.solvers._pivoting import PivotState
+from lavender.solvers.pivoting import PivotState
 from lavender_ext.factor.sparse import SparsePanels
 from lavender_ext.pivot import principal
 from lavender_ext.pivot.principal import SMALL

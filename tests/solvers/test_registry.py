@@ -14,13 +14,6 @@ SPEC = registry.get("pgs")
 TINY = lv.Problem.lcp(np.eye(2), np.ones(2))
 
 
-@pytest.fixture
-def table(monkeypatch):
-    """The registry with what a test adds taken out again."""
-    registry.specs()  # built-in ones and plug-ins are there
-    monkeypatch.setattr(registry, "_registered", dict(registry._registered))
-
-
 def named(name, **more):
     return dataclasses.replace(SPEC, name=name, **more)
 
@@ -112,7 +105,7 @@ def test_capabilities_select():
 # -- from outside -----------------------------------------------------------------------------------
 
 
-def test_register_takes_a_name_once_unless_told_to_replace(table):
+def test_register_takes_a_name_once_unless_told_to_replace(register):
     lv.register(named("mine"))
     assert lv.solve(TINY, "mine", tol=1e-9).solver.name == "mine"
     with pytest.raises(lv.InputError, match="replace=True"):

@@ -44,10 +44,10 @@ def test_a_senseless_request_is_refused_with_its_reason(name):
         call()
 
 
-def test_nothing_ran_where_a_request_is_refused(monkeypatch):
+def test_nothing_ran_where_a_request_is_refused(register):
     ran = []
     spec = dataclasses.replace(registry.get("pgs"), factory=lambda **options: ran.append(options))
-    monkeypatch.setitem(registry._registered, "pgs", spec)
+    register(spec)
     with pytest.raises(lv.LavenderError):
         lv.solve(TINY, "pgs", nothing=1)
     assert ran == []
@@ -107,9 +107,9 @@ class Interrupted:
         return Claim(Status.MAX_ITERATIONS, n)
 
 
-def test_ctrl_c_is_a_result(monkeypatch):
+def test_ctrl_c_is_a_result(register):
     spec = dataclasses.replace(registry.get("pgs"), name="interrupted", factory=Interrupted, options={})
-    monkeypatch.setitem(registry._registered, "interrupted", spec)
+    register(spec)
     problem = lv.Problem.lcp(np.eye(2), [50.0, 50.0])
     solution = lv.solve(problem, "interrupted", tol=1e-9, max_iter=10**6)
     assert solution.status is Status.INTERRUPTED
@@ -119,13 +119,13 @@ def test_ctrl_c_is_a_result(monkeypatch):
         solution.raise_for_status()
 
 
-def test_a_claim_above_tol_is_contradicted_and_no_success(monkeypatch):
+def test_a_claim_above_tol_is_contradicted_and_no_success(register):
     class Boasts(Interrupted):
         def run(self, state, impulse, n, tol, time_limit=None):
             return Claim(Status.CONVERGED, 1)
 
     spec = dataclasses.replace(registry.get("pgs"), name="boasts", factory=Boasts, options={})
-    monkeypatch.setitem(registry._registered, "boasts", spec)
+    register(spec)
     solution = lv.solve(TINY, "boasts")
     assert solution.status is Status.CONVERGED  # what it says,
     assert solution.contradicted  # what we say of that,

@@ -8,7 +8,7 @@ from random_problems import CONTACTS, FORMS, random_contact_problem, random_lcp,
 
 import lavender as lv
 from lavender.ordering import ORDERS
-from lavender.solvers import _sweeping
+from lavender.solvers import sweeping
 
 
 def sweeps(problem, name, n, **options):
@@ -160,7 +160,7 @@ def test_heavy_on_light_contracts_by_r_over_one_plus_r(ratio):
 @pytest.mark.parametrize("name", ["pgs", "sequential_impulses"])
 def test_threads_change_no_bit(name, monkeypatch):
     """Small problems fall back to one thread; here they may not."""
-    monkeypatch.setattr(_sweeping, "GRAIN", 0)
+    monkeypatch.setattr(sweeping, "GRAIN", 0)
     problem = random_contact_problem(3, bodies=40, joints=20, contacts=200)
     results = {
         t: lv.solve(problem, name, order="colored", threads=t, tol=1e-8, max_iter=40) for t in (1, 2, 3, 4)

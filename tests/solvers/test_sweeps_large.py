@@ -9,7 +9,7 @@ from random_problems import random_contact_problem
 import lavender as lv
 from benchmarks.kernels import lattice_pile
 from lavender.ordering import block_order, body_ranks
-from lavender.solvers import _layout, _sweeping
+from lavender.solvers import layout, sweeping
 from lavender_ext.sweep.threaded import Team
 
 ORDERS = ("reverse", "colored", "bottom_up", "top_down", "local")
@@ -29,7 +29,7 @@ def test_writing_out_changes_no_bit(order, pile, monkeypatch):
     """Cold start: v = 0 in any numbering, and every block then reads the same values in the same order."""
     monkeypatch.setattr("lavender.ordering.NEAR", 0)
     plain = sweeps(pile, order=order)
-    monkeypatch.setattr(_layout, "LARGE", 1)
+    monkeypatch.setattr(layout, "LARGE", 1)
     state = lv.prepare(pile, "sequential_impulses", order=order)._state
     assert state.layout is not None
     np.testing.assert_array_equal(sweeps(pile, order=order), plain)
@@ -41,7 +41,7 @@ def test_writing_out_keeps_joints_spin_and_warm_starts(seed, monkeypatch):
     monkeypatch.setattr("lavender.ordering.NEAR", 0)
     start = sweeps(problem, 3)
     plain = {o: sweeps(problem, 20, order=o, impulse=start) for o in ORDERS}
-    monkeypatch.setattr(_layout, "LARGE", 1)
+    monkeypatch.setattr(layout, "LARGE", 1)
     for order, impulse in plain.items():
         # v = M^-1 J^T lam of the warm start is summed in another order: rounding, carried through 20 sweeps.
         np.testing.assert_allclose(
@@ -53,7 +53,7 @@ def test_writing_out_keeps_joints_spin_and_warm_starts(seed, monkeypatch):
 
 
 def test_a_stalled_run_gives_its_best_iterate_in_the_problems_order(pile, monkeypatch):
-    monkeypatch.setattr(_layout, "LARGE", 1)
+    monkeypatch.setattr(layout, "LARGE", 1)
     solver = lv.prepare(pile, "sequential_impulses", order="local")
     solver.solve(tol=1e-30, max_iter=40)
     relative, impulse = solver._state.best
@@ -61,7 +61,7 @@ def test_a_stalled_run_gives_its_best_iterate_in_the_problems_order(pile, monkey
 
 
 def test_an_array_that_mixes_joints_and_contacts_is_not_written_out(monkeypatch):
-    monkeypatch.setattr(_layout, "LARGE", 1)
+    monkeypatch.setattr(layout, "LARGE", 1)
     problem = random_contact_problem(1, bodies=6, joints=3, contacts=9)
     blocks = np.arange(problem.n_blocks)[::-1]
     state = lv.prepare(problem, "sequential_impulses", order=blocks)._state
@@ -71,9 +71,9 @@ def test_an_array_that_mixes_joints_and_contacts_is_not_written_out(monkeypatch)
 @pytest.mark.parametrize("name", ["pgs", "sequential_impulses"])
 @pytest.mark.parametrize("large", [1, 10**9])
 def test_threads_change_no_bit(name, large, pile, monkeypatch):
-    monkeypatch.setattr(_layout, "LARGE", large)
-    monkeypatch.setattr(_sweeping, "GRAIN", 0)
-    monkeypatch.setattr(_sweeping, "LEAST", 0)
+    monkeypatch.setattr(layout, "LARGE", large)
+    monkeypatch.setattr(sweeping, "GRAIN", 0)
+    monkeypatch.setattr(sweeping, "LEAST", 0)
     results = [lv.solve(pile, name, order="colored", threads=t, tol=1e-6, max_iter=60) for t in (1, 2, 3, 5)]
     assert len({s.impulse.tobytes() for s in results}) == 1
     assert len({(s.iterations, s.status) for s in results}) == 1
@@ -123,13 +123,13 @@ def test_local_takes_a_matrix_too(pile):
 @pytest.mark.parametrize("order", ("given", *ORDERS, "symmetric", "random"))
 def test_update_keeps_what_comes_from_the_structure(order, pile, monkeypatch):
     monkeypatch.setattr("lavender.ordering.NEAR", 0)
-    monkeypatch.setattr(_layout, "LARGE", 1)
+    monkeypatch.setattr(layout, "LARGE", 1)
     other = replace(pile, b=pile.b * 1.25)
     prepared = lv.prepare(pile, "sequential_impulses", order=order)
     prepared.solve(tol=0.0, max_iter=3)
     fresh = sweeps(other, 3, order=order)
     found = []
-    for module, name in ((_sweeping, "block_order"), (_layout, "body_ranks")):
+    for module, name in ((sweeping, "block_order"), (layout, "body_ranks")):
         true = getattr(module, name)
         monkeypatch.setattr(module, name, lambda *a, _true=true, **kw: found.append(_true) or _true(*a, **kw))
     changed = prepared.solve(other, tol=0.0, max_iter=3)

@@ -16,10 +16,10 @@ import scipy.sparse as sp
 from lavender._arrays import FloatArray, IntArray
 from lavender.problem import Problem
 from lavender.residuals import reference
-from lavender.solvers._islands import block_bodies
 from lavender.solvers._newton.augmented import Augmented
 from lavender.solvers._newton.pattern import block_pattern, dissected, postordered
 from lavender.solvers._newton.sparse import Coupled, SparseRows
+from lavender.solvers.islands import block_bodies
 from lavender_ext.factor import symbolic
 from lavender_ext.newton.coupled import scaled_entries
 from lavender_ext.newton.elements import Elements

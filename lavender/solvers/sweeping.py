@@ -73,6 +73,7 @@ class SweepState:
 
 
 def claim(status: int, done: int) -> Claim:
+    """What a kernel of sweeps says: how it ended, and after how many."""
     return Claim(STATUS[status], done, {"sweeps": done})
 
 
